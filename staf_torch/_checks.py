@@ -1,0 +1,138 @@
+"""The wording of every ``ValueError`` that a user can meet, in one place.
+
+Each check returns the value it was given, converted where that is safe, so that a constructor reads
+``self.width = positive("GaussianKernel", "width", width)``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Sequence
+
+import torch
+from torch import Tensor
+
+
+def fail(call: str, name: str, rule: str, value: object) -> ValueError:
+    """The one sentence form of the library: what was called, what must hold, what came."""
+    return ValueError(f"`{call}({name}=...)` {rule}; got {_show(value)}.")
+
+
+def _show(value: object) -> str:
+    if isinstance(value, Tensor):
+        return repr(value.tolist()) if value.numel() <= 8 else f"a tensor {tuple(value.shape)}"
+    return repr(value)
+
+
+def number(call: str, name: str, value: object) -> float | Tensor:
+    """A finite real number, or a tensor of them."""
+    if isinstance(value, Tensor):
+        if not value.is_floating_point():
+            raise fail(call, name, "must be a floating-point tensor", value)
+        if not bool(torch.isfinite(value).all()):
+            raise fail(call, name, "must be finite", value)
+        return value
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise fail(call, name, "must be a number", value)
+    if not math.isfinite(value):
+        raise fail(call, name, "must be finite", value)
+    return float(value)
+
+
+def real(call: str, name: str, value: object) -> float:
+    """A finite Python number."""
+    if isinstance(value, Tensor):
+        raise fail(call, name, "must be a number", value)
+    checked = number(call, name, value)
+    assert isinstance(checked, float)
+    return checked
+
+
+def positive(call: str, name: str, value: object) -> Tensor:
+    """A positive number or tensor of them, as a floating-point tensor (float64 from a number)."""
+    checked = number(call, name, value)
+    tensor = torch.as_tensor(checked, dtype=None if isinstance(checked, Tensor) else torch.float64)
+    if not bool((tensor > 0).all()):
+        raise fail(call, name, "must be positive", value)
+    return tensor
+
+
+def non_negative(call: str, name: str, value: object) -> Tensor:
+    """Like `positive`, zero allowed."""
+    checked = number(call, name, value)
+    tensor = torch.as_tensor(checked, dtype=None if isinstance(checked, Tensor) else torch.float64)
+    if not bool((tensor >= 0).all()):
+        raise fail(call, name, "must not be negative", value)
+    return tensor
+
+
+def positive_real(call: str, name: str, value: object) -> float:
+    """A positive Python number."""
+    checked = real(call, name, value)
+    if checked <= 0:
+        raise fail(call, name, "must be positive", value)
+    return checked
+
+
+def integer(call: str, name: str, value: object, least: int) -> int:
+    """An integer that is at least ``least``."""
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise fail(call, name, "must be an integer", value)
+    if value < least:
+        raise fail(call, name, f"must be at least {least}", value)
+    return value
+
+
+def choice(call: str, name: str, value: object, allowed: Collection[object]) -> object:
+    """One of a few allowed values."""
+    if value not in allowed:
+        listed = ", ".join(repr(a) for a in allowed)
+        raise fail(call, name, f"must be one of {listed}", value)
+    return value
+
+
+def vector(call: str, name: str, value: object, length: int | None = None) -> list[float]:
+    """A sequence of finite numbers, of a stated length where one is stated."""
+    if isinstance(value, str) or not isinstance(value, Sequence):
+        raise fail(call, name, "must be a list of numbers", value)
+    numbers = [v for v in value if isinstance(v, int | float) and not isinstance(v, bool)]
+    if len(numbers) != len(value):
+        raise fail(call, name, "must be a list of numbers", list(value))
+    if length is not None and len(numbers) != length:
+        raise fail(call, name, f"must have {length} entries, one a state", list(value))
+    if not all(math.isfinite(v) for v in numbers):
+        raise fail(call, name, "must be finite", list(value))
+    return [float(v) for v in numbers]
+
+
+def trailing(call: str, name: str, value: Tensor, dims: int, last: int | None = None) -> Tensor:
+    """A tensor with at least ``dims`` dimensions, the last of a stated size where one is stated."""
+    if not isinstance(value, Tensor):
+        raise fail(call, name, "must be a tensor", value)
+    if not value.is_floating_point():
+        raise fail(call, name, "must be a floating-point tensor", value)
+    if value.dim() < dims:
+        raise ValueError(
+            f"`{call}({name}=...)` must have at least {dims} dimensions; "
+            f"got the shape {tuple(value.shape)}."
+        )
+    if last is not None and value.shape[-1] != last:
+        raise ValueError(
+            f"`{call}({name}=...)` must have {last} entries in its last dimension; "
+            f"got the shape {tuple(value.shape)}."
+        )
+    return value
+
+
+def sampled(target: object, values: object, points: Tensor) -> Tensor:
+    """What a target returned at ``points`` (..., n): one value a point, (...)."""
+    name = getattr(target, "__name__", type(target).__name__)
+    if not isinstance(values, Tensor):
+        raise ValueError(f"The target `{name}` must return a tensor; got {_show(values)}.")
+    if values.shape != points.shape[:-1]:
+        raise ValueError(
+            f"The target `{name}` must map points of shape (..., n) to values of shape (...): "
+            f"{tuple(points.shape)} must give {tuple(points.shape[:-1])}; "
+            f"got {tuple(values.shape)}."
+        )
+    return values

@@ -1,0 +1,129 @@
+"""A kernel and its state-following centers: what is needed at a state to approximate around it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from ._checks import sampled, trailing
+from .centers import StateFollowingCenters
+from .kernels import Kernel
+from .local import LocalSpace, local_space
+
+Target = Callable[[Tensor], Tensor]
+"""A function V to approximate: points (..., n) to values (...)."""
+
+
+class GramStructure(NamedTuple):
+    """K(c(x)) = e^{gain} S K0 S with S = diag(scale), at the states x."""
+
+    core: Tensor  # K0, (M, M) where one serves all states, else (..., M, M)
+    scale: Tensor | None  # e^{s(x, d_i)}, (..., M); None for ones
+    log_gain: Tensor | None  # g(x), (...); None for zeros
+
+    def scaled(self) -> Tensor:
+        """S K0 S = e^{-gain} K(c(x)): (..., M, M)."""
+        if self.scale is None:
+            return self.core
+        return self.scale.unsqueeze(-1) * self.core * self.scale.unsqueeze(-2)
+
+
+class StaFBasis(nn.Module):
+    """The StaF basis sigma_i(y; x) = k(y, c_i(x)), i = 1..M.
+
+    Example:
+        >>> basis = StaFBasis(ExponentialKernel(), StateFollowingCenters(rings(3), radius=0.1))
+        >>> x = torch.tensor([1.0, 0.0], dtype=torch.float64)
+        >>> basis.ideal_weights(x, targets.Paper()).shape
+        torch.Size([3])
+
+    Args:
+        kernel: the kernel k.
+        centers: the state-following centers c_i.
+
+    Raises:
+        ValueError: if an argument is of another type, or there are more centers than the kernel's
+            function space has dimensions (polynomial kernels).
+
+    Source: Rosenfeld et al., section 2.
+    """
+
+    def __init__(self, kernel: Kernel, centers: StateFollowingCenters) -> None:
+        super().__init__()
+        if not isinstance(kernel, Kernel):
+            raise ValueError(f"`StaFBasis(kernel=...)` must be a Kernel; got {kernel!r}.")
+        if not isinstance(centers, StateFollowingCenters):
+            raise ValueError(
+                f"`StaFBasis(centers=...)` must be a StateFollowingCenters; got {centers!r}."
+            )
+        rank = kernel.rank(centers.dim)
+        if rank is not None and centers.count > rank:
+            raise ValueError(
+                f"`StaFBasis(centers=...)` has {centers.count} centers, but the space of "
+                f"{type(kernel).__name__}({kernel.extra_repr()}) over R^{centers.dim} has "
+                f"{rank} dimensions: use at most {rank} centers, or a higher degree."
+            )
+        self.kernel = kernel
+        self.centers = centers
+
+    @property
+    def count(self) -> int:
+        """M, the number of basis functions."""
+        return self.centers.count
+
+    @property
+    def dim(self) -> int:
+        """n, the dimension of the state."""
+        return self.centers.dim
+
+    def forward(self, y: Tensor, x: Tensor) -> Tensor:
+        """sigma(y; x): (..., P, n), (..., n) -> (..., P, M)."""
+        trailing("StaFBasis", "y", y, dims=2, last=self.dim)
+        sigma: Tensor = self.kernel(y, self.centers(x))
+        return sigma
+
+    def gram(self, x: Tensor) -> Tensor:
+        """K(c(x)): (..., n) -> (..., M, M). Overflows with the kernel; see `gram_structure`."""
+        centers = self.centers(x)
+        gram: Tensor = self.kernel(centers, centers)
+        return gram
+
+    def gram_structure(self, x: Tensor) -> GramStructure:
+        """The factors of K(c(x)), none of which overflows: (..., n) -> `GramStructure`."""
+        shared = self.kernel.state_free and self.centers.radius.constant
+        d = self.centers.offsets(x)
+        d0 = self.centers.offsets(x.new_zeros(self.dim)) if shared else d
+        core = self.kernel.core(x.new_zeros(self.dim) if shared else x, d0, d0)
+        s = self.kernel.log_scale(x, d)
+        return GramStructure(core, None if s is None else s.exp(), self.kernel.log_gain(x))
+
+    def local(self, x: Tensor) -> LocalSpace:
+        """The span of the basis at the states x (..., n), in a basis that can be computed with."""
+        trailing("StaFBasis.local", "x", x, dims=1, last=self.dim)
+        return local_space(self.kernel, self.centers, x)
+
+    def values(self, x: Tensor, target: Target) -> Tensor:
+        """V(c(x)): (..., n) -> (..., M)."""
+        centers = self.centers(x)
+        return sampled(target, target(centers), centers)
+
+    def ideal_weights(self, x: Tensor, target: Target) -> Tensor:
+        """w = K(c(x))^-1 V(c(x)), the minimiser of the native-space error: (..., n) -> (..., M).
+
+        Source: Rosenfeld et al., eq. (5), and the normal equations of its quadratic.
+        """
+        space = self.local(x)
+        return space.weights(space.fit(self.values(x, target)))
+
+    def excess(self, weights: Tensor, x: Tensor, target: Target) -> Tensor:
+        """F(a, c) - F(w, c) = (a - w)'K(a - w) for weights a at the states x: (..., M) -> (...).
+
+        F itself is infinite where V is not in the kernel's space; its excess never is.
+        """
+        difference = weights - self.ideal_weights(x, target)
+        product = (self.gram(x) @ difference.unsqueeze(-1)).squeeze(-1)
+        excess: Tensor = torch.linalg.vecdot(difference, product)
+        return excess

@@ -1,0 +1,71 @@
+"""How far the centers stand from the state."""
+
+from __future__ import annotations
+
+import abc
+
+from torch import Tensor, nn
+
+from .._checks import non_negative, positive
+
+
+class Radius(nn.Module, abc.ABC):
+    """nu(x) >= 0, the radius of the ball of centers at the state x."""
+
+    constant: bool = False
+
+    @abc.abstractmethod
+    def forward(self, x: Tensor) -> Tensor:
+        """nu(x): (..., n) -> (...)."""
+
+
+class ConstantRadius(Radius):
+    """nu(x) = radius.
+
+    Args:
+        radius: positive, in the units of the state.
+
+    Raises:
+        ValueError: if ``radius`` is not positive and finite.
+    """
+
+    constant = True
+
+    def __init__(self, radius: float | Tensor) -> None:
+        super().__init__()
+        self.register_buffer("radius", positive("ConstantRadius", "radius", radius))
+        self.radius: Tensor
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.radius.to(x).expand(x.shape[:-1])
+
+
+class StateRadius(Radius):
+    """nu(x) = radius (x'x + offset) / (1 + gain x'x): centers that close in on the origin.
+
+    Args:
+        radius: positive; the radius far from the origin is radius / gain.
+        offset: not negative; radius * offset is the radius at the origin, where a zero offset lets
+            all centers meet.
+        gain: positive.
+
+    Raises:
+        ValueError: if an argument breaks its rule.
+
+    Source: the paper's appendix has radius 0.7, offset 0.01, gain 1.
+    """
+
+    def __init__(
+        self, radius: float | Tensor, offset: float | Tensor, gain: float | Tensor = 1.0
+    ) -> None:
+        super().__init__()
+        self.register_buffer("radius", positive("StateRadius", "radius", radius))
+        self.register_buffer("offset", non_negative("StateRadius", "offset", offset))
+        self.register_buffer("gain", positive("StateRadius", "gain", gain))
+        self.radius: Tensor
+        self.offset: Tensor
+        self.gain: Tensor
+
+    def forward(self, x: Tensor) -> Tensor:
+        square = x.square().sum(-1)
+        return self.radius * (square + self.offset) / (1 + self.gain * square)

@@ -1,0 +1,68 @@
+"""The sequential part of a gradient chase, in plain torch. This defines what a faster one computes."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..objective import NativeError
+from ..optim.base import LawState, UpdateLaw
+
+
+class Carry(NamedTuple):
+    """What passes from one time to the next. Weights are in units of e^{-log_gain}."""
+
+    weights: Tensor  # (B, M)
+    law_state: LawState
+    log_gain: Tensor  # (B,) g(x) of the last time
+    time: int  # index of the next time
+    diverged_at: Tensor  # (B,) int64, -1 while finite
+
+
+class Recursion(NamedTuple):
+    """The weights of one piece of time, in units of e^{-log_gain} of each time."""
+
+    before: Tensor  # (B, C, M) as brought to x_k
+    after: Tensor  # (B, C, M) as corrected at x_k
+    carry: Carry
+
+
+def recursion(
+    gram: Tensor, values: Tensor, log_gain: Tensor, law: UpdateLaw, inner_steps: int, carry: Carry
+) -> Recursion:
+    """Correct the weights at every time of a piece, one after the other.
+
+    Args:
+        gram: e^{-g} K(c(x_k)), (B, C, M, M).
+        values: V(c(x_k)), (B, C, M).
+        log_gain: g(x_k), (B, C).
+        law: the update law.
+        inner_steps: iterations a time.
+        carry: from the piece before.
+    """
+    weights, state, last_gain, start, diverged_at = carry
+    usable = torch.isfinite(values).all(-1) & torch.isfinite(gram).all(-1).all(-1)
+    before, after = [], []
+    for k in range(values.shape[1]):
+        unit = (log_gain[:, k] - last_gain).exp().unsqueeze(-1)
+        brought, brought_state = weights * unit, law.rescale(state, unit)
+        objective = NativeError(gram[:, k], values[:, k])
+        new, new_state = brought, brought_state
+        for _ in range(inner_steps):
+            new, new_state = law.step(objective, new, new_state)
+        # A row that is not finite stays behind, as it was; the rows beside it never see it.
+        fine = usable[:, k] & torch.isfinite(new).all(-1) & (diverged_at < 0)
+        diverged_at = torch.where(fine | (diverged_at >= 0), diverged_at, start + k)
+        keep = fine.unsqueeze(-1)
+        before.append(torch.where(keep, brought, weights))
+        weights = torch.where(keep, new, weights)
+        after.append(weights)
+        state = tuple(
+            torch.where(keep if part.dim() > 1 else fine, part, old)
+            for part, old in zip(new_state, state, strict=True)
+        )
+        last_gain = torch.where(fine, log_gain[:, k], last_gain)
+    carry = Carry(weights, state, last_gain, start + values.shape[1], diverged_at)
+    return Recursion(torch.stack(before, dim=1), torch.stack(after, dim=1), carry)

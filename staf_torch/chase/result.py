@@ -1,0 +1,47 @@
+"""What a gradient chase returns."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable
+
+import torch
+from torch import Tensor
+
+
+@dataclasses.dataclass(frozen=True)
+class ChaseResult:
+    """A gradient chase over T times. "Before" is at x_k with the weights brought from x_{k-1}; without
+    that word, after the correction at x_k.
+
+    From the time at which a trajectory diverged its weights stay what they last were, and all that
+    follows from them is NaN.
+    """
+
+    state: Tensor  # (B, T, n) as given
+    weights: Tensor  # (B, T, M) the paper's w
+    ideal_weights: Tensor  # (B, T, M)
+    coefficients: Tensor  # (B, T, M) b in V^(x+z) = e^{s(z)} sum_i b_i k0(z, d_i); never overflows
+    value: Tensor  # (B, T) V(x)
+    estimate: Tensor  # (B, T) V^(x)
+    estimate_before: Tensor  # (B, T)
+    ideal_estimate: Tensor  # (B, T) V^(x) with the ideal weights
+    excess: Tensor  # (B, T) F(a) - F(w)
+    excess_before: Tensor  # (B, T)
+    diverged_at: Tensor  # (B,) int64 index of the first time that is not finite, -1 if none
+
+    @property
+    def diverged(self) -> Tensor:
+        """(B,) bool: whether the trajectory, V, the Gram matrix or the weights became non-finite."""
+        return self.diverged_at >= 0
+
+
+def concatenate(pieces: Iterable[ChaseResult]) -> ChaseResult:
+    """Consecutive pieces of time as one result."""
+    parts = list(pieces)
+    joined = {
+        field.name: torch.cat([getattr(part, field.name) for part in parts], dim=1)
+        for field in dataclasses.fields(ChaseResult)
+        if field.name != "diverged_at"
+    }
+    return ChaseResult(**joined, diverged_at=parts[-1].diverged_at)

@@ -1,0 +1,174 @@
+"""From settings to library objects. Below this layer nothing knows that there are settings."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import math
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from hydra.utils import instantiate
+from omegaconf import DictConfig, OmegaConf
+from torch import Tensor, nn
+
+from .._checks import choice, fail, integer, positive_real, real, vector
+from ..basis import StaFBasis, Target
+from ..centers import (
+    Radius,
+    StateFollowingCenters,
+    StateRadius,
+    ball,
+    cross_polytope,
+    polygon,
+    rings,
+    simplex,
+)
+from ..optim import UpdateLaw
+from ..systems import ControlAffineSystem
+
+_DTYPES = {"float64": torch.float64, "float32": torch.float32}
+
+
+@dataclasses.dataclass(frozen=True)
+class ChaseProblem:
+    """Everything a gradient chase needs, checked."""
+
+    system: ControlAffineSystem  # or any module with its methods
+    basis: StaFBasis
+    target: Target
+    law: UpdateLaw
+    initial_states: Tensor  # (B, n)
+    dt: float  # s
+    steps: int  # T - 1
+    inner_steps: int
+    settle_time: float  # s
+
+
+def load(path: str, arguments: dict[str, Any] | None = None) -> Any:
+    """The object at a dotted path, for classes and functions outside the package.
+
+    A class is called with ``arguments``; anything else is returned as it is.
+
+    Raises:
+        ValueError: if nothing is there, or arguments are given to something that is not a class.
+    """
+    module, _, name = path.rpartition(".") if isinstance(path, str) else ("", "", "")
+    if not module:
+        raise fail("custom", "path", "must be a dotted path `package.module.name`", path)
+    try:
+        found = getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError) as error:
+        raise fail("custom", "path", f"cannot be imported ({error})", path) from error
+    if isinstance(found, type):
+        return found(**(arguments or {}))
+    if arguments:
+        raise fail("custom", "arguments", f"needs a class at {path}, which is none", arguments)
+    return found
+
+
+def chase_problem(cfg: DictConfig) -> ChaseProblem:
+    """The gradient chase that the settings describe.
+
+    Raises:
+        ValueError: if a setting breaks its rule; the message names it.
+    """
+    device, dtype = _placement(cfg.device, cfg.dtype)
+    system = _make(cfg.system)
+    if not callable(getattr(system, "drift", None)):
+        raise fail("staf", "system", "must be a plant with a method `drift`", system)
+    dim = getattr(system, "dim", None) or len(cfg.initial_state)
+    basis = StaFBasis(_make(cfg.kernel), _centers(cfg.centers, dim))
+    target = _make(cfg.target)
+    if not callable(target):
+        raise fail("staf", "target", "must be callable", target)
+    dt = positive_real("staf", "dt", cfg.dt)
+    duration = positive_real("staf", "duration", cfg.duration)
+    if duration < dt:
+        raise fail("staf", "duration", f"must be at least one step (dt={dt})", duration)
+    law, inner_steps = _law(cfg.optimizer)
+    for module in (system, basis, target):
+        if isinstance(module, nn.Module):
+            module.to(device=device, dtype=dtype)
+    return ChaseProblem(
+        system=system,
+        basis=basis,
+        target=target,
+        law=law,
+        initial_states=_initial_states(cfg, dim).to(device=device, dtype=dtype),
+        dt=dt,
+        steps=math.floor(duration / dt + 1e-9),
+        inner_steps=inner_steps,
+        settle_time=real("staf", "settle_time", cfg.settle_time),
+    )
+
+
+def _make(cfg: DictConfig) -> Any:
+    return instantiate(cfg, _convert_="all")
+
+
+def _placement(device: object, dtype: object) -> tuple[torch.device, torch.dtype]:
+    choice("staf", "dtype", dtype, tuple(_DTYPES))
+    try:
+        place = torch.device(str(device))
+        torch.empty(0, device=place)
+    except (RuntimeError, AssertionError) as error:
+        reason = str(error).splitlines()[0]
+        raise fail("staf", "device", f"cannot be used here ({reason})", device) from error
+    return place, _DTYPES[str(dtype)]
+
+
+def _centers(cfg: DictConfig, dim: int) -> StateFollowingCenters:
+    count, layout = cfg.count, cfg.layout
+    planar: dict[str, Callable[[int], Tensor]] = {"rings": rings, "polygon": polygon}
+    fixed: dict[str, Callable[[int], Tensor]] = {
+        "simplex": simplex,
+        "cross_polytope": cross_polytope,
+    }
+    choice("centers", "layout", layout, (*planar, *fixed, "ball"))
+    if layout in planar:
+        if dim != 2:
+            raise ValueError(
+                f"`centers={layout}` lies in the plane, but the system has {dim} states: "
+                "use simplex, cross_polytope or ball."
+            )
+        directions = planar[layout](count)
+    elif layout in fixed:
+        directions = fixed[layout](dim)
+        if count is not None and count != len(directions):
+            integer("centers", "count", count, least=1)
+            rule = f"must be {len(directions)} (or null) for {layout} with {dim} states"
+            raise fail("centers", "count", rule, count)
+    else:
+        directions = ball(count, dim)
+    return StateFollowingCenters(directions, _radius(cfg))
+
+
+def _radius(cfg: DictConfig) -> float | Radius:
+    if cfg.shrink.offset is None:
+        return cfg.radius  # type: ignore[no-any-return]
+    return StateRadius(cfg.radius, cfg.shrink.offset, cfg.shrink.gain)
+
+
+def _law(cfg: DictConfig) -> tuple[UpdateLaw, int]:
+    settings = OmegaConf.to_container(cfg, resolve=True)
+    assert isinstance(settings, dict)
+    inner_steps = integer("optimizer", "inner_steps", settings.pop("inner_steps"), least=1)
+    return _make(OmegaConf.create(settings)), inner_steps
+
+
+def _initial_states(cfg: DictConfig, dim: int) -> Tensor:
+    """The stated initial state first, the others uniform in a box around it: (B, n) float64.
+
+    The generator runs on the CPU in float64, so that one seed means the same states everywhere, and
+    the first k of them do not depend on how many follow.
+    """
+    stated = OmegaConf.to_container(cfg.initial_state) if cfg.initial_state is not None else None
+    first = torch.tensor(vector("staf", "initial_state", stated, dim), dtype=torch.float64)
+    batch = integer("staf", "trajectories", cfg.trajectories, least=1)
+    spread = positive_real("staf", "spread", cfg.spread)
+    generator = torch.Generator().manual_seed(integer("staf", "seed", cfg.seed, least=0))
+    rows = [torch.rand(dim, dtype=torch.float64, generator=generator) for _ in range(batch - 1)]
+    around = [first + spread * (2 * row - 1) for row in rows]
+    return torch.stack([first, *around])

@@ -1,0 +1,78 @@
+"""What a kernel is, and how it factors near a moving state."""
+
+from __future__ import annotations
+
+import abc
+
+from torch import Tensor, nn
+
+
+class Kernel(nn.Module, abc.ABC):
+    """A real, symmetric, positive definite kernel k(y, c).
+
+    A kernel of your own is a subclass with `forward` alone; gradients come from autograd. The other
+    methods say how the kernel factors around a state x, with offsets z and d small,
+
+        k(x + z, x + d) = e^{g(x)} e^{s(x, z)} k0(z, d) e^{s(x, d)},
+
+    with g the `log_gain`, s the `log_scale` and k0 the `core`. Where k0 does not depend on x
+    (`state_free`), the Gram matrix of constant offsets is factored once for all states. The defaults
+    say nothing of the sort: g = s = 0 and k0(z, d) = k(x + z, x + d).
+    """
+
+    state_free: bool = False
+
+    @abc.abstractmethod
+    def forward(self, x1: Tensor, x2: Tensor) -> Tensor:
+        """k(x1, x2): (..., P, n), (..., M, n) -> (..., P, M)."""
+
+    def core(self, x: Tensor, z: Tensor, d: Tensor) -> Tensor:
+        """k0(z, d) at the state x: (..., n), (..., P, n), (..., M, n) -> (..., P, M)."""
+        at = x.unsqueeze(-2)
+        result: Tensor = self(at + z, at + d)
+        return result
+
+    def log_gain(self, x: Tensor) -> Tensor | None:
+        """g(x): (..., n) -> (...), or None where it is zero."""
+        return None
+
+    def log_scale(self, x: Tensor, z: Tensor) -> Tensor | None:
+        """s(x, z): (..., n), (..., P, n) -> (..., P), or None where it is zero."""
+        return None
+
+    def exponent_rate(self) -> Tensor | None:
+        """q where k0(z, d) = exp(q z'd), and None for every other kernel."""
+        return None
+
+    def anchored(self, x1: Tensor, x2: Tensor) -> Tensor:
+        """k(y, c) - k(y, 0) k(0, c) / k(0, 0), see `AnchoredKernel`: (..., P, M)."""
+        zero = x1.new_zeros(1, x1.shape[-1])
+        left, right, corner = self(x1, zero), self(zero, x2), self(zero, zero)
+        result: Tensor = self(x1, x2) - left * right / corner
+        return result
+
+    def rank(self, dim: int) -> int | None:
+        """Dimension of the kernel's function space over R^dim, None where it is infinite."""
+        return None
+
+
+def per_entry(value: Tensor, extra: int) -> Tensor:
+    """A hyperparameter of shape (...) made to broadcast over ``extra`` trailing dimensions.
+
+    A scalar stays without dimensions: it then takes the dtype of what it meets, as a Python number
+    would.
+    """
+    return value if value.dim() == 0 else value[(..., *([None] * extra))]
+
+
+def inner(x1: Tensor, x2: Tensor) -> Tensor:
+    """x1'x2: (..., P, n), (..., M, n) -> (..., P, M)."""
+    return x1 @ x2.mT
+
+
+def squared_distance(x1: Tensor, x2: Tensor) -> Tensor:
+    """|x1 - x2|^2 from the differences: (..., P, n), (..., M, n) -> (..., P, M).
+
+    The expansion |x1|^2 - 2 x1'x2 + |x2|^2 would lose every digit of a small distance far from 0.
+    """
+    return (x1.unsqueeze(-2) - x2.unsqueeze(-3)).square().sum(-1)

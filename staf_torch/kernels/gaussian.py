@@ -1,0 +1,49 @@
+"""The Gaussian kernel: the exponential kernel, normalised."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from .._checks import positive
+from .base import Kernel, inner, per_entry, squared_distance
+
+
+class GaussianKernel(Kernel):
+    """k(y, c) = exp(-|y - c|^2 / (2 width^2)).
+
+    Translation invariant: its accuracy and conditioning do not depend on the state. Near a state,
+    k = e^{-|z|^2 / 2 width^2} e^{z'd / width^2} e^{-|d|^2 / 2 width^2}: the core is the exponential
+    kernel's at the rate 1 / width^2.
+
+    Args:
+        width: positive, in the units of the state; a tensor of shape (...) gives one a batch entry.
+
+    Raises:
+        ValueError: if ``width`` is not positive and finite.
+    """
+
+    state_free = True
+
+    def __init__(self, width: float | Tensor = 1.0) -> None:
+        super().__init__()
+        self.register_buffer("width", positive("GaussianKernel", "width", width))
+        self.width: Tensor
+
+    def forward(self, x1: Tensor, x2: Tensor) -> Tensor:
+        return (squared_distance(x1, x2) * (-0.5 * per_entry(self.exponent_rate(), 2))).exp()
+
+    def core(self, x: Tensor, z: Tensor, d: Tensor) -> Tensor:
+        return (inner(z, d) * per_entry(self.exponent_rate(), 2)).exp()
+
+    def log_scale(self, x: Tensor, z: Tensor) -> Tensor:
+        return z.square().sum(-1) * (-0.5 * per_entry(self.exponent_rate(), 1))
+
+    def exponent_rate(self) -> Tensor:
+        return self.width.square().reciprocal()
+
+    def anchored(self, x1: Tensor, x2: Tensor) -> Tensor:
+        rate = self.exponent_rate()
+        left = (x1.square().sum(-1) * (-0.5 * per_entry(rate, 1))).exp()
+        right = (x2.square().sum(-1) * (-0.5 * per_entry(rate, 1))).exp()
+        middle = (inner(x1, x2) * per_entry(rate, 2)).expm1()
+        return left.unsqueeze(-1) * middle * right.unsqueeze(-2)

@@ -1,0 +1,42 @@
+"""The polynomial kernel."""
+
+from __future__ import annotations
+
+import math
+
+from torch import Tensor
+
+from .._checks import integer, non_negative
+from .base import Kernel, inner, per_entry
+
+
+class PolynomialKernel(Kernel):
+    """k(y, c) = (bias + y'c)^degree.
+
+    Its space is finite: all polynomials of degree <= ``degree`` in n variables, of dimension
+    C(n + degree, degree); with ``bias`` zero the homogeneous ones alone, C(n + degree - 1, degree).
+
+    Args:
+        degree: at least 1.
+        bias: not negative.
+
+    Raises:
+        ValueError: if an argument breaks its rule.
+    """
+
+    def __init__(self, degree: int = 2, bias: float | Tensor = 1.0) -> None:
+        super().__init__()
+        self.degree = integer("PolynomialKernel", "degree", degree, least=1)
+        self.register_buffer("bias", non_negative("PolynomialKernel", "bias", bias))
+        self.bias: Tensor
+        self._homogeneous = bool((self.bias == 0).any())
+
+    def forward(self, x1: Tensor, x2: Tensor) -> Tensor:
+        return (inner(x1, x2) + per_entry(self.bias, 2)).pow(self.degree)
+
+    def rank(self, dim: int) -> int:
+        variables = dim - 1 if self._homogeneous else dim
+        return math.comb(variables + self.degree, self.degree)
+
+    def extra_repr(self) -> str:
+        return f"degree={self.degree}"

@@ -1,0 +1,36 @@
+"""Radial kernels: a profile of the squared distance, in units of a length scale."""
+
+from __future__ import annotations
+
+import abc
+
+from torch import Tensor
+
+from .._checks import positive
+from .base import Kernel, per_entry, squared_distance
+
+
+class RadialKernel(Kernel):
+    """k(y, c) = phi(|y - c|^2 / length_scale^2); a subclass gives the profile phi, phi(0) = 1.
+
+    Near a state the kernel is a function of z - d alone, so its core is itself.
+    """
+
+    state_free = True
+
+    def __init__(self, length_scale: float | Tensor = 1.0) -> None:
+        super().__init__()
+        self.register_buffer(
+            "length_scale", positive(type(self).__name__, "length_scale", length_scale)
+        )
+        self.length_scale: Tensor
+
+    @abc.abstractmethod
+    def profile(self, s: Tensor) -> Tensor:
+        """phi(s), elementwise, for s >= 0."""
+
+    def forward(self, x1: Tensor, x2: Tensor) -> Tensor:
+        return self.profile(squared_distance(x1, x2) / per_entry(self.length_scale, 2).square())
+
+    def core(self, x: Tensor, z: Tensor, d: Tensor) -> Tensor:
+        return self.forward(z, d)

@@ -1,0 +1,32 @@
+"""The rational quadratic kernel."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from .._checks import positive
+from .base import per_entry
+from .radial import RadialKernel
+
+
+class RationalQuadraticKernel(RadialKernel):
+    """k(y, c) = (1 + |y - c|^2 / (2 alpha length_scale^2))^(-alpha).
+
+    A scale mixture of Gaussian kernels; alpha -> infinity is the Gaussian of that width.
+
+    Args:
+        alpha: positive shape parameter.
+        length_scale: positive, in the units of the state.
+
+    Raises:
+        ValueError: if an argument is not positive and finite.
+    """
+
+    def __init__(self, alpha: float | Tensor = 1.0, length_scale: float | Tensor = 1.0) -> None:
+        super().__init__(length_scale)
+        self.register_buffer("alpha", positive("RationalQuadraticKernel", "alpha", alpha))
+        self.alpha: Tensor
+
+    def profile(self, s: Tensor) -> Tensor:
+        alpha = per_entry(self.alpha, 2)
+        return ((s / (2 * alpha)).log1p() * -alpha).exp()

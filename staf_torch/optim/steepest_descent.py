@@ -1,0 +1,32 @@
+"""The paper's update law."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ..objective import Objective
+from .base import LawState, UpdateLaw
+
+
+class SteepestDescent(UpdateLaw):
+    """a <- a + lambda g, g = 2 V(c) - 2 K a, lambda = g'g / (2 g'K g), the exact line search.
+
+    Each iteration multiplies the excess by at most ((kappa - 1) / (kappa + 1))^2 (Kantorovich). At the
+    ideal weights, where lambda is 0/0, the step is zero.
+
+    Source: Rosenfeld et al., eq. (6) and (7).
+    """
+
+    def step(
+        self, objective: Objective, weights: Tensor, state: LawState
+    ) -> tuple[Tensor, LawState]:
+        g = objective.descent(weights)
+        slope = torch.linalg.vecdot(g, g)
+        curvature = torch.linalg.vecdot(g, objective.curvature(g))
+        usable = curvature > 0
+        length = torch.where(usable, slope / (2 * torch.where(usable, curvature, 1.0)), 0.0)
+        return weights + length.unsqueeze(-1) * g, state
+
+    def contraction(self, condition_number: Tensor) -> Tensor:
+        return ((condition_number - 1) / (condition_number + 1)).square()

@@ -1,0 +1,78 @@
+"""Uncontrolled trajectories, in pieces of time so that memory does not grow with the horizon."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import torch
+from torch import Tensor
+
+from .._checks import integer, positive_real, trailing
+from .base import ControlAffineSystem
+
+
+def runge_kutta_step(field: Callable[[Tensor], Tensor], x: Tensor, dt: float) -> Tensor:
+    """One step of the classical fourth-order Runge-Kutta method: (..., n) -> (..., n)."""
+    k1 = field(x)
+    k2 = field(x + 0.5 * dt * k1)
+    k3 = field(x + 0.5 * dt * k2)
+    k4 = field(x + dt * k3)
+    return x + (dt / 6) * (k1 + 2 * k2 + 2 * k3 + k4)
+
+
+def trajectory(
+    system: ControlAffineSystem, x0: Tensor, *, dt: float, steps: int, chunk: int | None = None
+) -> Iterator[Tensor]:
+    """x(0), x(dt), ..., x(steps dt) without control, in pieces of at most ``chunk`` times.
+
+    The exact flow where the system has one, else Runge-Kutta steps of length dt. A trajectory that
+    escapes to infinity is non-finite from there on; the others do not notice.
+
+    Args:
+        system: the plant.
+        x0: (B, n).
+        dt: step, positive, in seconds.
+        steps: number of steps, at least 0.
+        chunk: times a piece, all by default.
+
+    Yields:
+        (B, C, n), together (B, steps + 1, n).
+
+    Raises:
+        ValueError: if an argument breaks its rule, or the plant returns another shape.
+    """
+    trailing("trajectory", "x0", x0, dims=2, last=getattr(system, "dim", None))
+    positive_real("trajectory", "dt", dt)
+    total = integer("trajectory", "steps", steps, least=0) + 1
+    size = total if chunk is None else integer("trajectory", "chunk", chunk, least=1)
+    flow = getattr(system, "flow", None)  # a user's module need not have one
+    x = x0
+    for start in range(0, total, size):
+        stop = min(start + size, total)
+        time = torch.arange(start, stop, dtype=torch.float64) * dt
+        exact = flow(x0, time) if flow is not None else None
+        if exact is not None:
+            yield exact
+            continue
+        piece = []
+        for _ in range(start, stop):
+            piece.append(x)
+            x = runge_kutta_step(lambda at: _drift(system, at), x, dt)
+        yield torch.stack(piece, dim=-2)
+
+
+def simulate(system: ControlAffineSystem, x0: Tensor, *, dt: float, steps: int) -> Tensor:
+    """The whole of `trajectory` at once: (B, n) -> (B, steps + 1, n)."""
+    (states,) = trajectory(system, x0, dt=dt, steps=steps)
+    return states
+
+
+def _drift(system: ControlAffineSystem, x: Tensor) -> Tensor:
+    rate = system.drift(x)
+    if not isinstance(rate, Tensor) or rate.shape != x.shape:
+        got = tuple(rate.shape) if isinstance(rate, Tensor) else rate
+        raise ValueError(
+            f"`{type(system).__name__}.drift` must map (..., n) to (..., n): "
+            f"{tuple(x.shape)} must give the same; got {got}."
+        )
+    return rate

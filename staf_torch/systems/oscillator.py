@@ -1,0 +1,40 @@
+"""The paper's simulated system."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from .._checks import positive_real
+from .base import ControlAffineSystem
+
+
+class Oscillator(ControlAffineSystem):
+    """x' = frequency (x2, -x1): circles, with the exact flow
+    x(t) = (cos(wt) x1 + sin(wt) x2, -sin(wt) x1 + cos(wt) x2).
+
+    Args:
+        frequency: w, positive, rad/s.
+
+    Raises:
+        ValueError: if ``frequency`` is not positive.
+
+    Source: Rosenfeld et al., section 7 (frequency 1).
+    """
+
+    dim = 2
+
+    def __init__(self, frequency: float = 1.0) -> None:
+        super().__init__()
+        self.frequency = positive_real("Oscillator", "frequency", frequency)
+
+    def drift(self, x: Tensor) -> Tensor:
+        x1, x2 = x.unbind(-1)
+        return torch.stack((self.frequency * x2, -self.frequency * x1), dim=-1)
+
+    def flow(self, x: Tensor, time: Tensor) -> Tensor:
+        # Angles in float64 even for a float32 state: over a long run t alone uses up its digits.
+        angle = self.frequency * time
+        cos, sin = angle.cos().to(x), angle.sin().to(x)
+        x1, x2 = x.unsqueeze(-2).unbind(-1)  # (..., 1)
+        return torch.stack((cos * x1 + sin * x2, cos * x2 - sin * x1), dim=-1)

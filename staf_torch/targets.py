@@ -1,0 +1,79 @@
+"""Functions V: R^n -> R to approximate. Any callable (..., n) -> (...) will do in their place."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from ._checks import fail, number, real, vector
+
+
+class Paper(nn.Module):
+    """V(x) = x1^2 + 5 x2^2 + tanh(x1 x2), n = 2.
+
+    It is not in the exponential kernel's space: its native norm there is infinite.
+
+    Source: Rosenfeld et al., section 7.
+    """
+
+    def forward(self, x: Tensor) -> Tensor:
+        x1, x2 = x.unbind(-1)
+        return x1.square() + 5 * x2.square() + (x1 * x2).tanh()
+
+
+class Quadratic(nn.Module):
+    """V(x) = x'Px.
+
+    Args:
+        matrix: P, (n, n), symmetric; a number p stands for p I in any dimension.
+
+    Raises:
+        ValueError: if ``matrix`` is neither, or not symmetric.
+    """
+
+    def __init__(self, matrix: float | Sequence[Sequence[float]] | Tensor = 1.0) -> None:
+        super().__init__()
+        entries: float | Tensor = matrix if not isinstance(matrix, Sequence) else _square(matrix)
+        p = torch.as_tensor(number("Quadratic", "matrix", entries), dtype=torch.float64)
+        if p.dim() not in (0, 2) or (p.dim() == 2 and p.shape[0] != p.shape[1]):
+            raise fail("Quadratic", "matrix", "must be a number or (n, n)", matrix)
+        if p.dim() == 2 and not torch.equal(p, p.mT):
+            raise fail("Quadratic", "matrix", "must be symmetric", matrix)
+        self.register_buffer("matrix", p)
+        self.matrix: Tensor
+
+    def forward(self, x: Tensor) -> Tensor:
+        if self.matrix.dim() == 0:
+            return self.matrix * x.square().sum(-1)
+        return ((x @ self.matrix.to(x)) * x).sum(-1)
+
+
+class Cosine(nn.Module):
+    """V(x) = cos(a'x + phase).
+
+    Args:
+        frequency: a, rad per unit of the state: n numbers, or one for every coordinate.
+        phase: rad.
+
+    Raises:
+        ValueError: if an argument is not finite.
+    """
+
+    def __init__(self, frequency: float | Sequence[float] = 1.0, phase: float = 0.0) -> None:
+        super().__init__()
+        if isinstance(frequency, Sequence):
+            a = torch.tensor(vector("Cosine", "frequency", frequency), dtype=torch.float64)
+        else:
+            a = torch.tensor(real("Cosine", "frequency", frequency), dtype=torch.float64)
+        self.register_buffer("frequency", a)
+        self.frequency: Tensor
+        self.phase = real("Cosine", "phase", phase)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return ((x * self.frequency.to(x)).sum(-1) + self.phase).cos()
+
+
+def _square(rows: Sequence[Sequence[float]]) -> Tensor:
+    return torch.tensor([vector("Quadratic", "matrix", row, len(rows)) for row in rows], dtype=torch.float64)
