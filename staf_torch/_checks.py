@@ -113,8 +113,7 @@ def trailing(call: str, name: str, value: Tensor, dims: int, last: int | None = 
         raise fail(call, name, "must be a floating-point tensor", value)
     if value.dim() < dims:
         raise ValueError(
-            f"`{call}({name}=...)` must have at least {dims} dimensions; "
-            f"got the shape {tuple(value.shape)}."
+            f"`{call}({name}=...)` must have at least {dims} dimensions; got the shape {tuple(value.shape)}."
         )
     if last is not None and value.shape[-1] != last:
         raise ValueError(

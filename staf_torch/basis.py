@@ -56,9 +56,7 @@ class StaFBasis(nn.Module):
         if not isinstance(kernel, Kernel):
             raise ValueError(f"`StaFBasis(kernel=...)` must be a Kernel; got {kernel!r}.")
         if not isinstance(centers, StateFollowingCenters):
-            raise ValueError(
-                f"`StaFBasis(centers=...)` must be a StateFollowingCenters; got {centers!r}."
-            )
+            raise ValueError(f"`StaFBasis(centers=...)` must be a StateFollowingCenters; got {centers!r}.")
         rank = kernel.rank(centers.dim)
         if rank is not None and centers.count > rank:
             raise ValueError(

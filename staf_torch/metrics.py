@@ -14,9 +14,7 @@ from .linalg import condition_number
 from .local import evaluate_scaled
 from .optim import UpdateLaw
 
-_PROBES = (
-    193  # points of the ball for a supremum: in the plane 64 angles on 3 circles, and the center
-)
+_PROBES = 193  # points of the ball for a supremum: in the plane 64 angles on 3 circles, and the center
 
 
 class ChaseMetrics:
@@ -83,9 +81,7 @@ class ChaseMetrics:
         }
         for name, quantity in found.items():
             worst = quantity.amax(dim=1)
-            self._worst[name] = (
-                torch.maximum(self._worst[name], worst) if name in self._worst else worst
-            )
+            self._worst[name] = torch.maximum(self._worst[name], worst) if name in self._worst else worst
         rate = self._law.contraction(kappa)
         if rate is not None:
             native = (result.ideal_weights[:, at] * self._basis.values(x, self._target)).sum(-1)

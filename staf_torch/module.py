@@ -55,8 +55,7 @@ class StaF(nn.Module):
         trailing("StaF.fit_", "x", x, dims=1, last=self.basis.dim)
         if x.shape != self.state.shape:
             raise ValueError(
-                f"`StaF.fit_(x=...)` must have the shape {tuple(self.state.shape)}; "
-                f"got {tuple(x.shape)}."
+                f"`StaF.fit_(x=...)` must have the shape {tuple(self.state.shape)}; got {tuple(x.shape)}."
             )
         with torch.no_grad():
             self.state.copy_(x)
@@ -69,7 +68,8 @@ class StaF(nn.Module):
         """V^(y; x): (..., P, n) -> (..., P)."""
         trailing("StaF", "y", y, dims=2, last=self.basis.dim)
         z = y - self.state.unsqueeze(-2)
-        return self.basis.local(self.state).evaluate(z, self.coefficients)
+        values: Tensor = self.basis.local(self.state).evaluate(z, self.coefficients)
+        return values
 
     def gradient(self, y: Tensor, mode: str = "partial", target: Target | None = None) -> Tensor:
         """Gradient of V^ at y: (..., P, n) -> (..., P, n).
@@ -103,7 +103,8 @@ class StaF(nn.Module):
         """V^(x~ + z; x~) with w of x: (..., P, n), (..., P, 1, n) -> (..., P)."""
         weights = self.weights.unsqueeze(-2).unsqueeze(-2)
         sigma = self.basis(moved.unsqueeze(-2) + z, moved)
-        return (sigma * weights).sum(-1).squeeze(-1)
+        values: Tensor = (sigma * weights).sum(-1).squeeze(-1)
+        return values
 
     def _moving(self, moved: Tensor, z: Tensor, target: Target) -> Tensor:
         """V^(x~ + z; x~) with the ideal weights of x~: (..., P, n), (..., P, 1, n) -> (..., P)."""

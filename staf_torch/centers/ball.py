@@ -80,9 +80,7 @@ def exponents(dim: int, degree: int) -> Tensor:
 def _cloud(size: int, dim: int) -> Tensor:
     """The origin, ``size``/2 points of the sphere and as many inside: a Kronecker sequence."""
     root = 2.0
-    for _ in range(
-        64
-    ):  # the positive root of g^(dim + 2) = g + 1: Roberts' generalised golden ratio
+    for _ in range(64):  # the positive root of g^(dim + 2) = g + 1: Roberts' generalised golden ratio
         root = (1 + root) ** (1 / (dim + 2))
     steps = torch.tensor([root ** -(k + 1) for k in range(dim + 1)], dtype=torch.float64)
     index = torch.arange(1, size + 1, dtype=torch.float64)
@@ -126,9 +124,7 @@ def _pivot_rows(matrix: Tensor, count: int) -> Tensor:
 
 def _exchange(matrix: Tensor, chosen: Tensor) -> Tensor:
     """Swap a chosen row for the candidate that multiplies |det| most, until none gains 1 %."""
-    cardinal = matrix @ torch.linalg.inv(
-        matrix[chosen]
-    )  # (N, M): 1 at its own row, 0 at the others
+    cardinal = matrix @ torch.linalg.inv(matrix[chosen])  # (N, M): 1 at its own row, 0 at the others
     for _ in range(_EXCHANGES):
         best = int(cardinal.abs().argmax())
         row, column = divmod(best, cardinal.shape[1])

@@ -55,9 +55,7 @@ class StateRadius(Radius):
     Source: the paper's appendix has radius 0.7, offset 0.01, gain 1.
     """
 
-    def __init__(
-        self, radius: float | Tensor, offset: float | Tensor, gain: float | Tensor = 1.0
-    ) -> None:
+    def __init__(self, radius: float | Tensor, offset: float | Tensor, gain: float | Tensor = 1.0) -> None:
         super().__init__()
         self.register_buffer("radius", positive("StateRadius", "radius", radius))
         self.register_buffer("offset", non_negative("StateRadius", "offset", offset))

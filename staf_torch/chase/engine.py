@@ -56,13 +56,9 @@ def chase(
     """
     trailing("chase", "states", states, dims=3, last=basis.dim)
     if states.dim() != 3 or 0 in states.shape:
-        raise ValueError(
-            f"`chase(states=...)` must have the shape (B, T, n); got {tuple(states.shape)}."
-        )
+        raise ValueError(f"`chase(states=...)` must have the shape (B, T, n); got {tuple(states.shape)}.")
     pieces = states.split(chunk_length(states.shape[0], basis, states.element_size()), dim=1)
-    return concatenate(
-        chase_pieces(pieces, basis, target, law, inner_steps=inner_steps, weights=weights)
-    )
+    return concatenate(chase_pieces(pieces, basis, target, law, inner_steps=inner_steps, weights=weights))
 
 
 def chunk_length(batch: int, basis: StaFBasis, itemsize: int) -> int:

@@ -75,9 +75,7 @@ def main() -> None:
     wants_trace = os.environ.get(_FULL_ERROR, "0") not in ("", "0")
     # Hydra then hands every exception on, and this function words it, once, for run and sweep alike.
     os.environ[_FULL_ERROR] = "1"
-    sys.path.insert(
-        0, os.getcwd()
-    )  # so that `target.path=my_module.my_function` finds the user's file
+    sys.path.insert(0, os.getcwd())  # so that `target.path=my_module.my_function` finds the user's file
     try:
         _task()
     except (ValueError, HydraException, OmegaConfBaseException, OSError) as error:

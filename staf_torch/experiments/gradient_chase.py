@@ -72,9 +72,7 @@ def solve(problem: ChaseProblem, writer: HistoryWriter | None = None) -> Outcome
     progress = Progress(times, "times")
     diverged_at = torch.full(x0.shape[:1], -1)
     states = trajectory(problem.system, x0, dt=problem.dt, steps=problem.steps, chunk=chunk)
-    chased = chase_pieces(
-        states, problem.basis, problem.target, problem.law, inner_steps=problem.inner_steps
-    )
+    chased = chase_pieces(states, problem.basis, problem.target, problem.law, inner_steps=problem.inner_steps)
     with torch.no_grad():
         for result in chased:
             metrics.add(result)
@@ -149,12 +147,8 @@ def _summarise(problem: ChaseProblem, metrics: dict[str, float | None]) -> None:
     _log.info(row, f"worst, t >= {problem.settle_time:g} s", "corrected", "before", "ideal weights")
     names = ("ultimate_error", "ultimate_error_before", "floor_error")
     _log.info(row, "error at the state", *map(show, names))
-    _log.info(
-        row, "excess F(a) - F(w)", *map(show, ("ultimate_excess", "ultimate_excess_before")), "0"
-    )
-    _log.info(
-        "  error on the ball %s, gradient error %s", show("ball_error"), show("gradient_error")
-    )
+    _log.info(row, "excess F(a) - F(w)", *map(show, ("ultimate_excess", "ultimate_excess_before")), "0")
+    _log.info("  error on the ball %s, gradient error %s", show("ball_error"), show("gradient_error"))
     _log.info(
         "  condition number %s, settled after %s s, contraction violations %s, diverged %s",
         *map(show, ("condition_number", "settling_time")),

@@ -40,9 +40,7 @@ class Progress:
         if self._terminal:
             filled = round(30 * share)
             bar = "#" * filled + "." * (30 - filled)
-            sys.stderr.write(
-                f"\r[{bar}] {share:4.0%} of {self._total} {self._what}, {left:.0f} s left "
-            )
+            sys.stderr.write(f"\r[{bar}] {share:4.0%} of {self._total} {self._what}, {left:.0f} s left ")
             sys.stderr.flush()
             self._drawn = True
         else:

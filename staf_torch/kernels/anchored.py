@@ -25,9 +25,7 @@ class AnchoredKernel(Kernel):
     def __init__(self, kernel: Kernel) -> None:
         super().__init__()
         if not isinstance(kernel, Kernel):
-            raise ValueError(
-                f"`AnchoredKernel(kernel=...)` must be a Kernel; got {type(kernel).__name__}."
-            )
+            raise ValueError(f"`AnchoredKernel(kernel=...)` must be a Kernel; got {type(kernel).__name__}.")
         zero = torch.zeros(1, 1, dtype=torch.float64)
         corner = kernel(zero, zero)
         if not bool((corner > 0).all()):

@@ -62,9 +62,7 @@ def _taylor(smoothness: float) -> tuple[float, ...]:
     """Taylor coefficients of p(t) e^{-t}."""
     decay = [(-1.0) ** k / math.factorial(k) for k in range(_TERMS)]
     poly = _POLYNOMIALS[smoothness]
-    coefficients = [
-        math.fsum(p * decay[k - i] for i, p in enumerate(poly) if i <= k) for k in range(_TERMS)
-    ]
+    coefficients = [math.fsum(p * decay[k - i] for i, p in enumerate(poly) if i <= k) for k in range(_TERMS)]
     # p is the [i/0] Pade numerator of e^t, so the first odd coefficients vanish exactly.
     return tuple(0.0 if k % 2 and k < 2 * smoothness else c for k, c in enumerate(coefficients))
 

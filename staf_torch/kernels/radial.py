@@ -20,9 +20,7 @@ class RadialKernel(Kernel):
 
     def __init__(self, length_scale: float | Tensor = 1.0) -> None:
         super().__init__()
-        self.register_buffer(
-            "length_scale", positive(type(self).__name__, "length_scale", length_scale)
-        )
+        self.register_buffer("length_scale", positive(type(self).__name__, "length_scale", length_scale))
         self.length_scale: Tensor
 
     @abc.abstractmethod

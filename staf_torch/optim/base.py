@@ -23,9 +23,7 @@ class UpdateLaw(abc.ABC):
         return ()
 
     @abc.abstractmethod
-    def step(
-        self, objective: Objective, weights: Tensor, state: LawState
-    ) -> tuple[Tensor, LawState]:
+    def step(self, objective: Objective, weights: Tensor, state: LawState) -> tuple[Tensor, LawState]:
         """One iteration: the new weights (..., M) and the new state."""
 
     def rescale(self, state: LawState, factor: Tensor) -> LawState:

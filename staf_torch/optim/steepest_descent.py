@@ -18,9 +18,7 @@ class SteepestDescent(UpdateLaw):
     Source: Rosenfeld et al., eq. (6) and (7).
     """
 
-    def step(
-        self, objective: Objective, weights: Tensor, state: LawState
-    ) -> tuple[Tensor, LawState]:
+    def step(self, objective: Objective, weights: Tensor, state: LawState) -> tuple[Tensor, LawState]:
         g = objective.descent(weights)
         slope = torch.linalg.vecdot(g, g)
         curvature = torch.linalg.vecdot(g, objective.curvature(g))

@@ -57,9 +57,7 @@ def draw_chase(history: ChaseHistory) -> Figure:
 
 def _states(axes: Axes, history: ChaseHistory) -> None:
     for i in range(history.state.shape[1]):
-        axes.plot(
-            history.time, history.state[:, i], _dash(i), color=_colour(i), label=f"$x_{i + 1}$"
-        )
+        axes.plot(history.time, history.state[:, i], _dash(i), color=_colour(i), label=f"$x_{i + 1}$")
     axes.set_ylabel("state $x$")
     _legend(axes, history.state.shape[1])
 
@@ -110,9 +108,7 @@ def _positive(values: np.ndarray) -> np.ndarray:
 
 def _legend(axes: Axes, columns: int) -> None:
     """Above the axes, where no data can be under it."""
-    axes.legend(
-        loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=min(columns, 5), borderaxespad=0.2
-    )
+    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=min(columns, 5), borderaxespad=0.2)
 
 
 def _colour(index: int) -> str:

@@ -26,9 +26,7 @@ class Linear(ControlAffineSystem):
         rows = matrix.tolist() if isinstance(matrix, Tensor) else matrix
         if isinstance(rows, str) or not isinstance(rows, Sequence) or not rows:
             raise fail("Linear", "matrix", "must be (n, n)", matrix)
-        a = torch.tensor(
-            [vector("Linear", "matrix", row, len(rows)) for row in rows], dtype=torch.float64
-        )
+        a = torch.tensor([vector("Linear", "matrix", row, len(rows)) for row in rows], dtype=torch.float64)
         self.register_buffer("matrix", a)
         self.matrix: Tensor
         self.dim = a.shape[0]
