@@ -12,10 +12,14 @@ from collections.abc import Collection, Sequence
 import torch
 from torch import Tensor
 
+COMMAND_LINE = "staf"
+"""As the name of a call: the setting of that name on the command line."""
+
 
 def fail(call: str, name: str, rule: str, value: object) -> ValueError:
     """The one sentence form of the library: what was called, what must hold, what came."""
-    return ValueError(f"`{call}({name}=...)` {rule}; got {_show(value)}.")
+    where = f"staf {name}=..." if call == COMMAND_LINE else f"{call}({name}=...)"
+    return ValueError(f"`{where}` {rule}; got {_show(value)}.")
 
 
 def _show(value: object) -> str:

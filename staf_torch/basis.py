@@ -91,10 +91,8 @@ class StaFBasis(nn.Module):
 
     def gram_structure(self, x: Tensor) -> GramStructure:
         """The factors of K(c(x)), none of which overflows: (..., n) -> `GramStructure`."""
-        shared = self.kernel.state_free and self.centers.radius.constant
         d = self.centers.offsets(x)
-        d0 = self.centers.offsets(x.new_zeros(self.dim)) if shared else d
-        core = self.kernel.core(x.new_zeros(self.dim) if shared else x, d0, d0)
+        core = self.kernel.core(x, d, d)
         s = self.kernel.log_scale(x, d)
         return GramStructure(core, None if s is None else s.exp(), self.kernel.log_gain(x))
 

@@ -31,7 +31,7 @@ class LocalSpace(NamedTuple):
 
     kernel: Kernel
     state: Tensor  # x, (..., n)
-    offsets: Tensor  # d, (..., M, n)
+    offsets: Tensor  # d, (..., M, n), or (M, n) for all states
     factor: PivotedCholesky  # of K0: without batch dimensions where one K0 serves all states
 
     @property
@@ -94,9 +94,6 @@ def evaluate_scaled(kernel: Kernel, offsets: Tensor, x: Tensor, z: Tensor, b: Te
 
 def local_space(kernel: Kernel, centers: StateFollowingCenters, x: Tensor) -> LocalSpace:
     """The local space at the states x (..., n). One factorisation serves all states where the kernel
-    is state-free and the offsets are constant."""
+    is state-free and the radius constant: the core then has no batch dimensions."""
     offsets = centers.offsets(x)
-    shared = kernel.state_free and centers.radius.constant
-    d = centers.offsets(x.new_zeros(centers.dim)) if shared else offsets
-    at = x.new_zeros(centers.dim) if shared else x
-    return LocalSpace(kernel, x, offsets, pivoted_cholesky(kernel.core(at, d, d)))
+    return LocalSpace(kernel, x, offsets, pivoted_cholesky(kernel.core(x, offsets, offsets)))

@@ -14,7 +14,8 @@ from .linalg import condition_number
 from .local import evaluate_scaled
 from .optim import UpdateLaw
 
-_PROBES = 193  # points of the ball for a supremum: in the plane 64 angles on 3 circles, and the center
+_PROBES = 97  # points of the ball to take a supremum over; in the plane 64 of them on its edge
+_BLOCK = 2**18  # numbers in a temporary of `ball_error`, so that it stays in cache
 
 
 class ChaseMetrics:
@@ -134,18 +135,24 @@ def ball_error(basis: StaFBasis, target: Target, x: Tensor, coefficients: Tensor
     """sup |V - V^| over a fixed set of points of the closed ball of radius nu(x) around x.
 
     Args:
-        x: states, (..., n).
-        coefficients: b of `ChaseResult.coefficients`, (..., M).
+        x: states, (..., T, n).
+        coefficients: b of `ChaseResult.coefficients`, (..., T, M).
 
     Returns:
-        (...).
+        (..., T).
     """
     probes = probe_points(_PROBES, basis.dim).to(x)
+    times = max(1, _BLOCK // (_PROBES * max(1, x.numel() // x.shape[-2])))
+    blocks = zip(x.split(times, dim=-2), coefficients.split(times, dim=-2), strict=True)
+    return torch.cat([_ball_error(basis, target, probes, *block) for block in blocks], dim=-1)
+
+
+def _ball_error(basis: StaFBasis, target: Target, probes: Tensor, x: Tensor, b: Tensor) -> Tensor:
+    nu, offsets = basis.centers.radius(x)[..., None, None], basis.centers.offsets(x)
     worst = x.new_zeros(x.shape[:-1])
-    nu = basis.centers.radius(x)[..., None, None]
-    for some in probes.split(32):  # pieces, so that (..., P, n) stays small for a large batch
+    for some in probes.split(64):
         z = nu * some
-        estimate = evaluate_scaled(basis.kernel, basis.centers.offsets(x), x, z, coefficients)
+        estimate = evaluate_scaled(basis.kernel, offsets, x, z, b)
         error = (target(x.unsqueeze(-2) + z) - estimate).abs().amax(-1)
         worst = torch.maximum(worst, error)
     return worst

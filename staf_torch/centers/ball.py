@@ -52,20 +52,22 @@ def ball(count: int, dim: int) -> Tensor:
 def probe_points(count: int, dim: int) -> Tensor:
     """Points of the closed unit ball to take a supremum over, the origin first: (count, dim), float64.
 
-    On a line they are equidistant; in the plane they stand on circles, two thirds of the way in and out;
-    in space half of them are on the sphere. Deterministic.
+    Errors of an interpolant are largest near the boundary. On a line the points are equidistant; in the
+    plane two thirds of them are on the unit circle and the rest on two inner ones; in space half of them
+    are on the sphere. Deterministic.
     """
     integer("probe_points", "count", count, least=2)
     if dim == 1:
         line = torch.linspace(-1, 1, count - 1, dtype=torch.float64).unsqueeze(-1)
         return torch.cat((line.new_zeros(1, 1), line))
-    if dim == 2:
-        index = torch.arange(count - 1)
-        angle = index.double() * (2 * math.pi / max(1, (count - 1) // 3))
-        radius = torch.tensor([1.0, 0.75, 0.45], dtype=torch.float64)[index * 3 // (count - 1)]
-        circles = radius[:, None] * torch.stack((angle.sin(), angle.cos()), dim=-1)
-        return torch.cat((circles.new_zeros(1, 2), circles))
-    return _cloud(count - 1, dim)
+    if dim > 2:
+        return _cloud(count - 1, dim)
+    inner, middle = (count - 1) // 12, (count - 1) // 4
+    circles = [torch.zeros(1, 2, dtype=torch.float64)]
+    for radius, points in ((1.0, count - 1 - middle - inner), (0.75, middle), (0.4, inner)):
+        angle = torch.arange(points, dtype=torch.float64) * (2 * math.pi / max(1, points))
+        circles.append(radius * torch.stack((angle.sin(), angle.cos()), dim=-1))
+    return torch.cat(circles)
 
 
 def exponents(dim: int, degree: int) -> Tensor:

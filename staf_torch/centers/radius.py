@@ -16,7 +16,7 @@ class Radius(nn.Module, abc.ABC):
 
     @abc.abstractmethod
     def forward(self, x: Tensor) -> Tensor:
-        """nu(x): (..., n) -> (...)."""
+        """nu(x): (..., n) -> (...), or what broadcasts to it where it does not depend on x."""
 
 
 class ConstantRadius(Radius):
@@ -37,7 +37,7 @@ class ConstantRadius(Radius):
         self.radius: Tensor
 
     def forward(self, x: Tensor) -> Tensor:
-        return self.radius.to(x).expand(x.shape[:-1])
+        return self.radius.to(x)
 
 
 class StateRadius(Radius):

@@ -45,7 +45,11 @@ class StateFollowingCenters(nn.Module):
         return self.directions.shape[1]
 
     def offsets(self, x: Tensor) -> Tensor:
-        """d_i(x) = nu(x) u_i: (..., n) -> (..., M, n)."""
+        """d_i(x) = nu(x) u_i: (..., n) -> (..., M, n); (M, n) alone where the radius is constant.
+
+        What follows from unbatched offsets, like the Gram core of a state-free kernel, is then computed
+        once for all states.
+        """
         nu: Tensor = self.radius(x)
         return nu[..., None, None] * self.directions.to(x)
 

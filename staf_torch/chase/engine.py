@@ -129,7 +129,7 @@ def _piece(
     objective = NativeError(gram, values)
     scale = zero.new_ones(()) if structure.scale is None else structure.scale
     inverse_gain = (-log_gain).exp()
-    here = zero[..., None, None].expand(*states.shape[:2], 1, basis.dim)
+    here = states.new_zeros(1, basis.dim)
     row = basis.kernel.core(states, here, space.offsets).squeeze(-2)  # k0(0, d_i), (..., M)
     times = torch.arange(carry.time, run.carry.time, device=states.device)
     end = run.carry.diverged_at[:, None]

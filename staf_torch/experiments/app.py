@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import inspect
 import logging
 import os
+import re
 import shutil
 import sys
 import warnings
@@ -20,6 +22,9 @@ from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from .._checks import choice
+
+USER_ERRORS = (ValueError, HydraException, OmegaConfBaseException, OSError)
+"""What a setting or the disk can bring about; anything else is a defect and keeps its trace."""
 
 _log = logging.getLogger(__name__)
 _FULL_ERROR = "HYDRA_FULL_ERROR"
@@ -50,11 +55,12 @@ def _task(cfg: DictConfig) -> dict[str, float | None]:
         with warnings.catch_warnings():
             warnings.showwarning = _log_warning
             metrics = _experiment(cfg, directory)
-    except Exception:
-        # A single run that came to nothing leaves nothing; a member of a sweep keeps its log.
-        if settings.mode == RunMode.RUN and not (directory / "metrics.json").exists():
-            shutil.rmtree(directory, ignore_errors=True)
-        raise
+    except USER_ERRORS as error:
+        if settings.mode != RunMode.RUN:  # a member of a sweep keeps its log, and the sweep goes on
+            _log.error("%s", sentence(error))
+            raise
+        _withdraw(directory)
+        raise Refused(error) from error
     _log.info("  run directory: %s", os.path.relpath(directory))
     return metrics
 
@@ -64,6 +70,23 @@ def _experiment(cfg: DictConfig, directory: Path) -> dict[str, float | None]:
     experiment = importlib.import_module(f"{__package__}.{cfg.task}")
     metrics: dict[str, float | None] = experiment.run(cfg, directory)
     return metrics
+
+
+class Refused(SystemExit):
+    """A run that ended by a user's error: Hydra lets it pass without a word of its own."""
+
+    def __init__(self, error: Exception) -> None:
+        super().__init__(f"staf: {sentence(error)}")
+
+
+def _withdraw(directory: Path) -> None:
+    """Take back what this run has written, and nothing else: the directory may be the user's own."""
+    if (directory / "metrics.json").exists():
+        return
+    shutil.rmtree(directory / ".hydra", ignore_errors=True)
+    (directory / "staf.log").unlink(missing_ok=True)
+    with contextlib.suppress(OSError):  # not empty: it was there before
+        directory.rmdir()
 
 
 def _log_warning(message: Warning | str, *_: Any, **__: Any) -> None:
@@ -78,15 +101,19 @@ def main() -> None:
     sys.path.insert(0, os.getcwd())  # so that `target.path=my_module.my_function` finds the user's file
     try:
         _task()
-    except (ValueError, HydraException, OmegaConfBaseException, OSError) as error:
+    except Refused as refused:
+        if wants_trace and refused.__cause__ is not None:
+            raise refused.__cause__ from None
+        raise
+    except USER_ERRORS as error:
         if wants_trace:
             raise
-        sys.exit(f"staf: {_sentence(error)}")
+        sys.exit(f"staf: {sentence(error)}")
     except KeyboardInterrupt:
         sys.exit("staf: interrupted")
 
 
-def _sentence(error: BaseException) -> str:
+def sentence(error: BaseException) -> str:
     """The library's own words where Hydra wrapped them, else the error's."""
     cause: BaseException | None = error
     while cause is not None:
@@ -95,4 +122,7 @@ def _sentence(error: BaseException) -> str:
         cause = cause.__cause__
     if isinstance(error, OSError) and not isinstance(error, HydraException) and error.filename:
         return f"cannot write {error.filename}: {error.strerror}"
+    unknown = re.match(r"Could not override '(.+?)'", str(error))
+    if unknown:
+        return f"there is no setting `{unknown[1]}`; `staf --help` lists them."
     return str(error)

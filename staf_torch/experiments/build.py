@@ -13,7 +13,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor, nn
 
-from .._checks import choice, fail, integer, positive_real, real, vector
+from .._checks import COMMAND_LINE, choice, fail, integer, positive_real, real, vector
 from ..basis import StaFBasis, Target
 from ..centers import (
     Radius,
@@ -77,16 +77,16 @@ def chase_problem(cfg: DictConfig) -> ChaseProblem:
     device, dtype = _placement(cfg.device, cfg.dtype)
     system = _make(cfg.system)
     if not callable(getattr(system, "drift", None)):
-        raise fail("staf", "system", "must be a plant with a method `drift`", system)
-    dim = getattr(system, "dim", None) or len(cfg.initial_state)
+        raise fail(COMMAND_LINE, "system", "must be a plant with a method `drift`", system)
+    dim = _dimension(system, cfg.initial_state)
     basis = StaFBasis(_make(cfg.kernel), _centers(cfg.centers, dim))
     target = _make(cfg.target)
     if not callable(target):
-        raise fail("staf", "target", "must be callable", target)
-    dt = positive_real("staf", "dt", cfg.dt)
-    duration = positive_real("staf", "duration", cfg.duration)
+        raise fail(COMMAND_LINE, "target", "must be callable", target)
+    dt = positive_real(COMMAND_LINE, "dt", cfg.dt)
+    duration = positive_real(COMMAND_LINE, "duration", cfg.duration)
     if duration < dt:
-        raise fail("staf", "duration", f"must be at least one step (dt={dt})", duration)
+        raise fail(COMMAND_LINE, "duration", f"must be at least one step (dt={dt})", duration)
     law, inner_steps = _law(cfg.optimizer)
     for module in (system, basis, target):
         if isinstance(module, nn.Module):
@@ -100,8 +100,17 @@ def chase_problem(cfg: DictConfig) -> ChaseProblem:
         dt=dt,
         steps=math.floor(duration / dt + 1e-9),
         inner_steps=inner_steps,
-        settle_time=real("staf", "settle_time", cfg.settle_time),
+        settle_time=real(COMMAND_LINE, "settle_time", cfg.settle_time),
     )
+
+
+def _dimension(system: ControlAffineSystem, initial_state: object) -> int:
+    """n: the system's, or for one that takes any, that of the initial state."""
+    stated = getattr(system, "dim", None)
+    if stated is not None:
+        return integer(type(system).__name__, "dim", stated, least=1)
+    entries = OmegaConf.to_container(initial_state) if OmegaConf.is_config(initial_state) else initial_state
+    return len(vector(COMMAND_LINE, "initial_state", entries))
 
 
 def _make(cfg: DictConfig) -> Any:
@@ -109,13 +118,13 @@ def _make(cfg: DictConfig) -> Any:
 
 
 def _placement(device: object, dtype: object) -> tuple[torch.device, torch.dtype]:
-    choice("staf", "dtype", dtype, tuple(_DTYPES))
+    choice(COMMAND_LINE, "dtype", dtype, tuple(_DTYPES))
     try:
         place = torch.device(str(device))
         torch.empty(0, device=place)
     except (RuntimeError, AssertionError) as error:
         reason = str(error).splitlines()[0]
-        raise fail("staf", "device", f"cannot be used here ({reason})", device) from error
+        raise fail(COMMAND_LINE, "device", f"cannot be used here ({reason})", device) from error
     return place, _DTYPES[str(dtype)]
 
 
@@ -126,7 +135,7 @@ def _centers(cfg: DictConfig, dim: int) -> StateFollowingCenters:
         "simplex": simplex,
         "cross_polytope": cross_polytope,
     }
-    choice("centers", "layout", layout, (*planar, *fixed, "ball"))
+    choice(COMMAND_LINE, "centers.layout", layout, (*planar, *fixed, "ball"))
     if layout in planar:
         if dim != 2:
             raise ValueError(
@@ -137,9 +146,9 @@ def _centers(cfg: DictConfig, dim: int) -> StateFollowingCenters:
     elif layout in fixed:
         directions = fixed[layout](dim)
         if count is not None and count != len(directions):
-            integer("centers", "count", count, least=1)
+            integer(COMMAND_LINE, "centers.count", count, least=1)
             rule = f"must be {len(directions)} (or null) for {layout} with {dim} states"
-            raise fail("centers", "count", rule, count)
+            raise fail(COMMAND_LINE, "centers.count", rule, count)
     else:
         directions = ball(count, dim)
     return StateFollowingCenters(directions, _radius(cfg))
@@ -154,7 +163,7 @@ def _radius(cfg: DictConfig) -> float | Radius:
 def _law(cfg: DictConfig) -> tuple[UpdateLaw, int]:
     settings = OmegaConf.to_container(cfg, resolve=True)
     assert isinstance(settings, dict)
-    inner_steps = integer("optimizer", "inner_steps", settings.pop("inner_steps"), least=1)
+    inner_steps = integer(COMMAND_LINE, "optimizer.inner_steps", settings.pop("inner_steps"), least=1)
     return _make(OmegaConf.create(settings)), inner_steps
 
 
@@ -164,11 +173,12 @@ def _initial_states(cfg: DictConfig, dim: int) -> Tensor:
     The generator runs on the CPU in float64, so that one seed means the same states everywhere, and
     the first k of them do not depend on how many follow.
     """
-    stated = OmegaConf.to_container(cfg.initial_state) if cfg.initial_state is not None else None
-    first = torch.tensor(vector("staf", "initial_state", stated, dim), dtype=torch.float64)
-    batch = integer("staf", "trajectories", cfg.trajectories, least=1)
-    spread = positive_real("staf", "spread", cfg.spread)
-    generator = torch.Generator().manual_seed(integer("staf", "seed", cfg.seed, least=0))
+    stated = cfg.initial_state
+    stated = OmegaConf.to_container(stated) if OmegaConf.is_config(stated) else stated
+    first = torch.tensor(vector(COMMAND_LINE, "initial_state", stated, dim), dtype=torch.float64)
+    batch = integer(COMMAND_LINE, "trajectories", cfg.trajectories, least=1)
+    spread = positive_real(COMMAND_LINE, "spread", cfg.spread)
+    generator = torch.Generator().manual_seed(integer(COMMAND_LINE, "seed", cfg.seed, least=0))
     rows = [torch.rand(dim, dtype=torch.float64, generator=generator) for _ in range(batch - 1)]
     around = [first + spread * (2 * row - 1) for row in rows]
     return torch.stack([first, *around])
