@@ -66,4 +66,5 @@ class StateRadius(Radius):
 
     def forward(self, x: Tensor) -> Tensor:
         square = x.square().sum(-1)
-        return self.radius * (square + self.offset) / (1 + self.gain * square)
+        radius, offset, gain = self.radius.to(x), self.offset.to(x), self.gain.to(x)
+        return radius * (square + offset) / (1 + gain * square)

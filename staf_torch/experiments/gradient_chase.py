@@ -97,7 +97,8 @@ class _Thinned:
     def add(self, result: ChaseResult) -> None:
         first = -self._time % self.stride
         for name, parts in self._parts.items():
-            parts.append(getattr(result, name)[0, first :: self.stride].cpu().numpy())
+            # A copy: a view would keep the whole piece in memory.
+            parts.append(getattr(result, name)[0, first :: self.stride].cpu().numpy().copy())
         self._time += result.state.shape[1]
 
     def arrays(self) -> dict[str, np.ndarray]:
