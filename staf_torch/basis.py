@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -11,7 +12,7 @@ from torch import Tensor, nn
 from ._checks import sampled, trailing
 from .centers import StateFollowingCenters
 from .kernels import Kernel
-from .local import LocalSpace, local_space
+from .local import GradedSpace, LocalSpace, graded_basis, newton_space
 
 Target = Callable[[Tensor], Tensor]
 """A function V to approximate: points (..., n) to values (...)."""
@@ -66,6 +67,18 @@ class StaFBasis(nn.Module):
             )
         self.kernel = kernel
         self.centers = centers
+        self._grade()
+        self.register_load_state_dict_post_hook(StaFBasis._grade_again)  # type: ignore[no-untyped-call]
+
+    @staticmethod
+    def _grade_again(module: nn.Module, _: object) -> None:
+        assert isinstance(module, StaFBasis)
+        module._grade()
+
+    def _grade(self) -> None:
+        """Set up what depends on the directions alone, again whenever others are loaded."""
+        structured = self.kernel.exponent_rate() is not None
+        self._graded = graded_basis(self.centers.directions) if structured else None
 
     @property
     def count(self) -> int:
@@ -99,7 +112,37 @@ class StaFBasis(nn.Module):
     def local(self, x: Tensor) -> LocalSpace:
         """The span of the basis at the states x (..., n), in a basis that can be computed with."""
         trailing("StaFBasis.local", "x", x, dims=1, last=self.dim)
-        return local_space(self.kernel, self.centers, x)
+        offsets = self.centers.offsets(x)
+        rate = self.kernel.exponent_rate()
+        if self._graded is None or rate is None:
+            return newton_space(self.kernel, x, offsets)
+        reach, bound = self._graded.reach.to(x), self.centers.radius.bound()
+        return GradedSpace(
+            kernel=self.kernel,
+            state=x,
+            offsets=offsets,
+            basis=self._graded,
+            radius=self.centers.radius(x) * reach,
+            rate=rate.to(x),
+            bound=None if bound is None else bound * self._graded.reach,
+        )
+
+    def check_reach(self, x: Tensor) -> None:
+        """Warn where the exponential kernel is a poor choice: |x| nu(x) > 1 at one of the states (..., n).
+
+        exp(y'c) then changes by more than e over the ball, with the state and not with V.
+        """
+        if self.kernel.log_gain(x) is None:
+            return
+        reach = x.norm(dim=-1) * self.centers.radius(x)
+        worst = float(reach.nan_to_num(0.0).max())
+        if worst > 1:
+            warnings.warn(
+                f"|x| r = {worst:.3g} > 1: around such states {type(self.kernel).__name__} changes by more "
+                "than a factor e within the ball, and the approximation degrades. Shrink the radius, or use "
+                "GaussianKernel, whose accuracy does not depend on the state.",
+                stacklevel=3,
+            )
 
     def values(self, x: Tensor, target: Target) -> Tensor:
         """V(c(x)): (..., n) -> (..., M)."""
@@ -108,6 +151,9 @@ class StaFBasis(nn.Module):
 
     def ideal_weights(self, x: Tensor, target: Target) -> Tensor:
         """w = K(c(x))^-1 V(c(x)), the minimiser of the native-space error: (..., n) -> (..., M).
+
+        Differentiable: dw/dx = K^-1 (dV(c)/dx - (dK/dx) w). A row in which w cannot be represented
+        (e^{-|x|^2} underflows, or the radius is too small) is NaN; `StaF` holds coefficients that never are.
 
         Source: Rosenfeld et al., eq. (5), and the normal equations of its quadratic.
         """

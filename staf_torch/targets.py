@@ -46,7 +46,7 @@ class Quadratic(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         if self.matrix.dim() == 0:
-            return self.matrix * x.square().sum(-1)
+            return self.matrix.to(x) * x.square().sum(-1)
         return ((x @ self.matrix.to(x)) * x).sum(-1)
 
 

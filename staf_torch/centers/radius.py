@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import abc
 
+import torch
 from torch import Tensor, nn
 
 from .._checks import non_negative, positive
@@ -13,6 +14,10 @@ class Radius(nn.Module, abc.ABC):
     """nu(x) >= 0, the radius of the ball of centers at the state x."""
 
     constant: bool = False
+
+    def bound(self) -> Tensor | None:
+        """sup nu(x) over all states, () or a batch entry; None where it is not known."""
+        return None
 
     @abc.abstractmethod
     def forward(self, x: Tensor) -> Tensor:
@@ -35,6 +40,9 @@ class ConstantRadius(Radius):
         super().__init__()
         self.register_buffer("radius", positive("ConstantRadius", "radius", radius))
         self.radius: Tensor
+
+    def bound(self) -> Tensor:
+        return self.radius
 
     def forward(self, x: Tensor) -> Tensor:
         return self.radius.to(x)
@@ -63,6 +71,10 @@ class StateRadius(Radius):
         self.radius: Tensor
         self.offset: Tensor
         self.gain: Tensor
+
+    def bound(self) -> Tensor:
+        # nu is monotone in x'x, between radius * offset at the origin and radius / gain far out.
+        return self.radius * torch.maximum(self.offset, 1 / self.gain)
 
     def forward(self, x: Tensor) -> Tensor:
         square = x.square().sum(-1)

@@ -116,6 +116,7 @@ def _piece(
     carry: Carry,
 ) -> tuple[ChaseResult, Carry]:
     """One piece of time: (B, C, n) and the carry to its result and the next carry."""
+    basis.check_reach(states)
     structure = basis.gram_structure(states)
     values = basis.values(states, target)
     gram = structure.scaled().expand(*states.shape[:2], basis.count, basis.count)

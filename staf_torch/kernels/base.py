@@ -44,6 +44,20 @@ class Kernel(nn.Module, abc.ABC):
         """q where k0(z, d) = exp(q z'd), and None for every other kernel."""
         return None
 
+    def follow(self, y: Tensor, step: Tensor) -> tuple[Tensor, Tensor] | None:
+        """Where the translation of all arguments by one step is a change of the point and a factor.
+
+        k(y + step, c + step) = e^{p} k(y + q, c) with p and q that do not depend on c.
+
+        Args:
+            y: (..., P, n).
+            step: (..., P, n).
+
+        Returns:
+            p (..., P) and q (..., P, n), or None where the kernel has no such rule.
+        """
+        return None
+
     def anchored(self, x1: Tensor, x2: Tensor) -> Tensor:
         """k(y, c) - k(y, 0) k(0, c) / k(0, 0), see `AnchoredKernel`: (..., P, M)."""
         zero = x1.new_zeros(1, x1.shape[-1])

@@ -32,6 +32,10 @@ class ExponentialKernel(Kernel):
     def log_scale(self, x: Tensor, z: Tensor) -> Tensor:
         return (z * x.unsqueeze(-2)).sum(-1)
 
+    def follow(self, y: Tensor, step: Tensor) -> tuple[Tensor, Tensor]:
+        # (y + h)'(c + h) = (y'h + h'h) + (y + h)'c
+        return (step * (y + step)).sum(-1), step
+
     def exponent_rate(self) -> Tensor:
         return torch.ones((), dtype=torch.float64)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 
 from .._checks import positive
@@ -31,6 +32,9 @@ class GaussianKernel(Kernel):
 
     def forward(self, x1: Tensor, x2: Tensor) -> Tensor:
         return (squared_distance(x1, x2) * (-0.5 * per_entry(self.exponent_rate(), 2))).exp()
+
+    def follow(self, y: Tensor, step: Tensor) -> tuple[Tensor, Tensor]:
+        return torch.zeros_like(y[..., 0]), torch.zeros_like(y)  # translation invariant
 
     def core(self, x: Tensor, z: Tensor, d: Tensor) -> Tensor:
         return (inner(z, d) * per_entry(self.exponent_rate(), 2)).exp()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import abc
 
+import torch
 from torch import Tensor
 
 from .._checks import positive
@@ -29,6 +30,9 @@ class RadialKernel(Kernel):
 
     def forward(self, x1: Tensor, x2: Tensor) -> Tensor:
         return self.profile(squared_distance(x1, x2) / per_entry(self.length_scale, 2).square())
+
+    def follow(self, y: Tensor, step: Tensor) -> tuple[Tensor, Tensor]:
+        return torch.zeros_like(y[..., 0]), torch.zeros_like(y)  # translation invariant
 
     def core(self, x: Tensor, z: Tensor, d: Tensor) -> Tensor:
         return self.forward(z, d)

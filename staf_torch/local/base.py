@@ -1,0 +1,80 @@
+"""What a local space offers, whatever basis it is held in."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from ..kernels import Kernel
+
+
+class LocalSpace(Protocol):
+    """span{k(., c_i(x))} at the states x, with coefficients beta in a basis that can be computed with.
+
+    V^(x + z) = e^{s(x, z)} sum_j psi_j(z) beta_j, finite where the paper's weights w overflow.
+    """
+
+    @property
+    def offsets(self) -> Tensor:
+        """d, (..., M, n), or (M, n) for all states."""
+
+    @property
+    def rank(self) -> Tensor:
+        """(...) or (): dimension of the span that is kept; below M the fit is a projection."""
+
+    def fit(self, values: Tensor) -> Tensor:
+        """The ideal coefficients from the values at the centers: (..., M) -> (..., M)."""
+
+    def evaluate(self, z: Tensor, coefficients: Tensor) -> Tensor:
+        """V^(x + z): (..., P, n), (..., M) -> (..., P)."""
+
+    def scaled_weights(self, coefficients: Tensor) -> Tensor:
+        """e^{g(x)} w, with w the paper's weights: (..., M) -> (..., M)."""
+
+    def weights(self, coefficients: Tensor) -> Tensor:
+        """The paper's w: (..., M) -> (..., M); NaN in a row where it cannot be represented."""
+
+    def coefficients(self, weights: Tensor) -> Tensor:
+        """beta from the paper's w: (..., M) -> (..., M)."""
+
+
+def scale(kernel: Kernel, x: Tensor, z: Tensor, sign: float = 1.0) -> Tensor:
+    """e^{sign s(x, z)}: (..., P), or () where s is zero."""
+    s = kernel.log_scale(x, z)
+    return z.new_ones(()) if s is None else (sign * s).exp()
+
+
+def from_scaled(kernel: Kernel, x: Tensor, scaled: Tensor) -> Tensor:
+    """w = e^{-g(x)} (e^{g(x)} w), (..., M); NaN in a row in which w overflows or all of it underflows."""
+    g = kernel.log_gain(x)
+    if g is None:
+        return torch.where(torch.isfinite(scaled), scaled, torch.nan)
+    factor = (-g).exp().unsqueeze(-1)
+    w = scaled * factor
+    lost = (factor < torch.finfo(factor.dtype).tiny) & (scaled != 0).any(-1, keepdim=True)
+    return torch.where(torch.isfinite(w) & ~lost, w, torch.nan)
+
+
+def to_scaled(kernel: Kernel, x: Tensor, weights: Tensor) -> Tensor:
+    """e^{g(x)} w: (..., M), zero for a zero weight at any state."""
+    g = kernel.log_gain(x)
+    return weights if g is None else torch.where(weights == 0, 0.0, weights * g.exp().unsqueeze(-1))
+
+
+def evaluate_scaled(kernel: Kernel, offsets: Tensor, x: Tensor, z: Tensor, b: Tensor) -> Tensor:
+    """V^(x + z) = e^{s(x, z)} sum_i b_i k0(z, d_i).
+
+    Args:
+        kernel: the kernel.
+        offsets: d, (..., M, n).
+        x: states, (..., n).
+        z: offsets of the points, (..., P, n).
+        b: e^{g + s(d)} w, (..., M).
+
+    Returns:
+        (..., P).
+    """
+    sums = (kernel.core(x, z, offsets) @ b.unsqueeze(-1)).squeeze(-1)
+    return sums * scale(kernel, x, z)
