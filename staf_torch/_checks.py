@@ -87,6 +87,13 @@ def integer(call: str, name: str, value: object, least: int) -> int:
     return value
 
 
+def flag(call: str, name: str, value: object) -> bool:
+    """True or false, and nothing that merely looks like it."""
+    if not isinstance(value, bool):
+        raise fail(call, name, "must be true or false", value)
+    return value
+
+
 def choice(call: str, name: str, value: object, allowed: Collection[object]) -> object:
     """One of a few allowed values."""
     if value not in allowed:

@@ -129,12 +129,13 @@ def _piece(
     ideal = space.scaled_weights(fitted)
     objective = NativeError(gram, values)
     scale = zero.new_ones(()) if structure.scale is None else structure.scale
-    inverse_gain = (-log_gain).exp()
     here = states.new_zeros(1, basis.dim)
     row = basis.kernel.core(states, here, space.offsets).squeeze(-2)  # k0(0, d_i), (..., M)
     times = torch.arange(carry.time, run.carry.time, device=states.device)
     end = run.carry.diverged_at[:, None]
     lost = (end >= 0) & (times >= end)
+    # Frozen weights stay in the units of the last state that they were corrected at.
+    inverse_gain = (-torch.where(lost, run.carry.log_gain[:, None], log_gain)).exp()
 
     def known(quantity: Tensor) -> Tensor:
         return torch.where(lost.view(*lost.shape, *[1] * (quantity.dim() - 2)), torch.nan, quantity)

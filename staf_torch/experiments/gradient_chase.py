@@ -12,6 +12,7 @@ import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
+from .._checks import COMMAND_LINE, flag
 from ..chase import ChaseResult, chase_pieces, chunk_length
 from ..metrics import ChaseMetrics
 from ..report import HistoryWriter, write_metrics
@@ -37,16 +38,18 @@ class Outcome(NamedTuple):
 def run(cfg: DictConfig, directory: Path) -> dict[str, float | None]:
     """Run what the settings describe and fill the run directory; `metrics.json` comes last."""
     problem = chase_problem(cfg)
+    figures = flag(COMMAND_LINE, "figures", cfg.figures)
+    history = flag(COMMAND_LINE, "history", cfg.history)
     batch, times = problem.initial_states.shape[0], problem.steps + 1
     with contextlib.ExitStack() as stack:
         writer = None
-        if cfg.history:
+        if history:
             writer = stack.enter_context(HistoryWriter(directory / "history.npz", batch, times))
         outcome = solve(problem, writer)
         if writer is not None:
             writer.close(time=_times(problem))
     _name_the_diverged(problem, outcome.diverged_at)
-    if cfg.figures:
+    if figures:
         _draw(outcome, directory)
     _summarise(problem, outcome.metrics)
     write_metrics(directory / "metrics.json", outcome.metrics)
