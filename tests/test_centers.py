@@ -81,7 +81,7 @@ def test_rings_of_three_are_the_triangle_of_the_paper() -> None:
 @pytest.mark.parametrize("dim", [1, 2, 3, 4, 7])
 def test_simplex_is_regular_and_centred(dim: int) -> None:
     corners = st.simplex(dim)
-    expected = torch.full((dim + 1, dim + 1), -1 / dim).double().fill_diagonal_(1.0)
+    expected = torch.full((dim + 1, dim + 1), -1 / dim, dtype=torch.float64).fill_diagonal_(1.0)
     torch.testing.assert_close(corners @ corners.mT, expected, rtol=1e-14, atol=1e-14)
     assert corners.sum(0).abs().max() < 1e-14
 
