@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
 
@@ -60,7 +61,7 @@ def test_runge_kutta_is_of_fourth_order(name: str) -> None:
         float((simulate(Integrated(plant), x0, dt=1 / n, steps=n)[:, -1] - exact).norm())
         for n in (16, 32, 64)
     ]
-    slopes = [math.log2(coarse / fine) for coarse, fine in zip(errors, errors[1:], strict=False)]
+    slopes = [math.log2(coarse / fine) for coarse, fine in itertools.pairwise(errors)]
     assert slopes == pytest.approx([4.0, 4.0], abs=0.25)
 
 
