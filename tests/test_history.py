@@ -60,9 +60,13 @@ def test_pieces_that_are_not_contiguous_are_stored_as_they_read(tmp_path: Path) 
 
 
 def test_an_exception_leaves_nothing(tmp_path: Path) -> None:
-    with pytest.raises(RuntimeError, match="stop"), HistoryWriter(tmp_path / "history.npz", 2, 5) as writer:
-        writer.add({name: array[:, :2] for name, array in arrays(2, 5).items()})
-        raise RuntimeError("stop")
+    def interrupted() -> None:
+        with HistoryWriter(tmp_path / "history.npz", 2, 5) as writer:
+            writer.add({name: array[:, :2] for name, array in arrays(2, 5).items()})
+            raise RuntimeError("stop")
+
+    with pytest.raises(RuntimeError, match="stop"):
+        interrupted()
     assert list(tmp_path.iterdir()) == []
 
 
@@ -74,9 +78,13 @@ def test_an_archive_that_is_not_closed_does_not_appear(tmp_path: Path) -> None:
 
 
 def test_an_incomplete_archive_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(AssertionError), HistoryWriter(tmp_path / "history.npz", 2, 5) as writer:
-        writer.add({name: array[:, :4] for name, array in arrays(2, 5).items()})
-        writer.close()
+    def cut_short() -> None:
+        with HistoryWriter(tmp_path / "history.npz", 2, 5) as writer:
+            writer.add({name: array[:, :4] for name, array in arrays(2, 5).items()})
+            writer.close()
+
+    with pytest.raises(AssertionError):
+        cut_short()
     assert list(tmp_path.iterdir()) == []
 
 
