@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
 from staf_torch import StateRadius
@@ -34,7 +35,10 @@ def settings(line: str) -> DictConfig:
     words = line.split()
     choices = [word for word in words if word.partition("=")[0] in GROUPS]
     values = [word for word in words if word not in choices]
-    return OmegaConf.unsafe_merge(composed(*choices).copy(), OmegaConf.from_dotlist(values))
+    cfg = composed(*choices).copy()
+    for value in OverridesParser.create().parse_overrides(values):
+        OmegaConf.update(cfg, value.key_or_group, value.value(), force_add=value.is_add())
+    return cfg
 
 
 def problem(line: str) -> ChaseProblem:
@@ -133,7 +137,7 @@ BAD: dict[str, tuple[str, tuple[str, ...]]] = {
     "asymmetric target": ("target=quadratic target.matrix=[[1,2],[0,1]]", ("must be symmetric",)),
     "path without a module": ("target=custom target.path=bowl", ("must be a dotted path",)),
     "arguments of a function": (
-        "target=custom target.path=math.cos target.arguments.a=1",
+        "target=custom target.path=math.cos +target.arguments.a=1",
         ("needs a class at math.cos",),
     ),
     "kernel that is none": ("kernel=custom kernel.path=math.cos", ("(kernel=...)` must be a Kernel",)),
