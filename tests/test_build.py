@@ -57,7 +57,7 @@ def test_defaults_are_the_simulation_of_the_paper() -> None:
     assert built.initial_states.tolist() == [[1.0, 0.0]]
     assert (built.dt, built.steps, built.inner_steps, built.settle_time) == (0.01, 1128, 10, 5.0)
     assert torch.equal(
-        built.basis.centers.offsets(torch.zeros(2).double())[0], torch.tensor([0.0, 0.1]).double()
+        built.basis.centers.offsets(torch.zeros(2).double())[0], torch.tensor([0.0, 0.1], dtype=torch.float64)
     )
 
 
