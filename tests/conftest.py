@@ -1,0 +1,24 @@
+"""What every test starts from."""
+
+from __future__ import annotations
+
+import os
+
+import hypothesis
+import pytest
+import torch
+
+hypothesis.settings.register_profile("suite", max_examples=25, deadline=None, derandomize=True)
+hypothesis.settings.load_profile("suite")
+
+
+@pytest.fixture(autouse=True)
+def _same_random_numbers_in_every_order() -> None:
+    torch.manual_seed(0)
+
+
+@pytest.fixture(autouse=True)
+def _no_trace_of_hydra(monkeypatch: pytest.MonkeyPatch) -> None:
+    """`main` sets this variable for Hydra; no test may see it from another one."""
+    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
+    assert "HYDRA_FULL_ERROR" not in os.environ

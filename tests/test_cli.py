@@ -1,0 +1,306 @@
+"""The command `staf`: every option runs, and a run directory holds what DESIGN.md section 5 promises."""
+
+from __future__ import annotations
+
+import json
+import math
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import Outcome, environment, run_all
+
+from staf_torch.experiments.app import config_directory
+
+KEYS = {
+    "ultimate_error",
+    "ultimate_error_before",
+    "floor_error",
+    "ultimate_excess",
+    "ultimate_excess_before",
+    "ball_error",
+    "gradient_error",
+    "condition_number",
+    "settling_time",
+    "contraction_violations",
+    "diverged_fraction",
+}
+SHORT = ["duration=0.05", "settle_time=0", "figures=false"]
+CUSTOM = {"kernel": "plants.Cauchy", "system": "plants.Escape", "target": "plants.bowl"}
+
+
+def _options() -> dict[str, list[str]]:
+    """Every file of every group of conf/, so that a new one is covered by being there."""
+    lines = {}
+    for path in sorted(Path(config_directory()).glob("*/*.yaml")):
+        group, option = path.parent.name, path.stem
+        more = [f"{group}.path={CUSTOM[group]}"] if option == "custom" else []
+        lines[f"{group}={option}"] = [f"{group}={option}", *more, *SHORT]
+    return lines
+
+
+OPTIONS = _options()
+RUNS = {
+    **OPTIONS,
+    "figures": ["duration=0.3", "settle_time=0.1"],
+    "no history": ["history=false", *SHORT],
+    "three": ["trajectories=3", *SHORT],
+    "five": ["trajectories=5", *SHORT],
+    "five again": ["trajectories=5", *SHORT],
+    "five of another seed": ["trajectories=5", "seed=1", *SHORT],
+    "polygon of five": ["centers=polygon", "centers.count=5", *SHORT],
+    "no window": ["duration=0.05", "settle_time=100", "figures=false"],
+    "single precision": ["dtype=float32", *SHORT],
+    "diverging": [
+        "system=custom",
+        "system.path=plants.Escape",
+        "initial_state=[0.3,-0.2]",
+        "trajectories=8",
+        "dt=0.02",
+        "duration=3",
+        "settle_time=0",
+        "figures=false",
+    ],
+    "sweep": ["-m", "centers.count=3,6", "centers.radius=0.1,-1", *SHORT],
+    "help": ["--help"],
+}
+
+
+@pytest.fixture(scope="module")
+def outcomes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Outcome]:
+    return run_all(RUNS, tmp_path_factory.mktemp("runs"))
+
+
+def run_directory(outcome: Outcome) -> Path:
+    assert outcome.code == 0, outcome
+    assert "Traceback" not in outcome.err
+    assert outcome.left == {"runs"}
+    (run,) = (outcome.folder / "runs").iterdir()
+    return run
+
+
+def metrics(run: Path) -> dict[str, float | None]:
+    found = json.loads((run / "metrics.json").read_text(), parse_constant=pytest.fail)
+    assert isinstance(found, dict)
+    return found
+
+
+def history(run: Path) -> dict[str, np.ndarray]:
+    with np.load(run / "history.npz") as archive:
+        return dict(archive)
+
+
+@pytest.mark.parametrize("name", [name for name in OPTIONS if not name.startswith(("experiment", "hydra"))])
+def test_every_option_of_every_group_runs(name: str, outcomes: dict[str, Outcome]) -> None:
+    run = run_directory(outcomes[name])
+    found = metrics(run)
+    assert set(found) == KEYS
+    assert all(found[key] is not None and math.isfinite(found[key]) for key in KEYS)
+    assert found["diverged_fraction"] == 0
+    assert {path.name for path in run.iterdir()} == {".hydra", "staf.log", "metrics.json", "history.npz"}
+
+
+@pytest.mark.parametrize("name", [name for name in OPTIONS if name.startswith("experiment")])
+def test_every_experiment_runs(name: str, outcomes: dict[str, Outcome]) -> None:
+    assert {".hydra", "staf.log", "metrics.json"} <= {
+        path.name for path in run_directory(outcomes[name]).iterdir()
+    }
+
+
+def test_a_run_directory_holds_exactly_what_is_promised(outcomes: dict[str, Outcome]) -> None:
+    run = run_directory(outcomes["figures"])
+    files = {str(path.relative_to(run)) for path in run.rglob("*") if path.is_file()}
+    stems = {
+        name.removeprefix("figures/").rpartition(".")[0] for name in files if name.startswith("figures/")
+    }
+    assert files == {
+        ".hydra/config.yaml",
+        ".hydra/hydra.yaml",
+        ".hydra/overrides.yaml",
+        "staf.log",
+        "metrics.json",
+        "history.npz",
+        *(f"figures/{stem}.{kind}" for stem in stems for kind in ("png", "pdf")),
+    }
+    assert len(stems) == 1
+    (stem,) = stems
+    assert (run / f"figures/{stem}.png").read_bytes().startswith(b"\x89PNG")
+    assert (run / f"figures/{stem}.pdf").read_bytes().startswith(b"%PDF")
+
+
+def test_history_has_the_fields_and_shapes_of_the_contract(outcomes: dict[str, Outcome]) -> None:
+    found = history(run_directory(outcomes["five"]))
+    assert {name: array.shape for name, array in found.items()} == {
+        "time": (6,),
+        "state": (5, 6, 2),
+        "value": (5, 6),
+        "estimate": (5, 6),
+        "weights": (5, 6, 3),
+        "ideal_weights": (5, 6, 3),
+        "excess": (5, 6),
+    }
+    np.testing.assert_allclose(found["time"], np.arange(6) * 0.01, rtol=1e-15)
+    assert all(array.dtype == np.float64 for array in found.values())
+    x1, x2 = found["state"][..., 0], found["state"][..., 1]
+    np.testing.assert_allclose(found["value"], x1**2 + 5 * x2**2 + np.tanh(x1 * x2), rtol=1e-13)
+
+
+def test_metrics_are_those_of_the_history(outcomes: dict[str, Outcome]) -> None:
+    run = run_directory(outcomes["five"])
+    found, past = metrics(run), history(run)
+    assert found["ultimate_error"] == pytest.approx(np.abs(past["value"] - past["estimate"]).max(), rel=1e-12)
+    assert found["ultimate_excess"] == pytest.approx(past["excess"].max(), rel=1e-12)
+
+
+def test_the_summary_is_printed_and_logged(outcomes: dict[str, Outcome]) -> None:
+    outcome = outcomes["kernel=gaussian"]
+    run = run_directory(outcome)
+    for words in ("Gradient chase", "GaussianKernel", "error at the state", run.name):
+        assert words in outcome.out
+        assert words in (run / "staf.log").read_text()
+    assert outcome.err == ""
+
+
+def test_more_trajectories_are_reproducible_by_seed_and_keep_the_first_ones(
+    outcomes: dict[str, Outcome],
+) -> None:
+    three, five, again, other = (
+        history(run_directory(outcomes[name]))
+        for name in ("three", "five", "five again", "five of another seed")
+    )
+    for name, array in five.items():
+        np.testing.assert_array_equal(array, again[name])
+        if name != "time":
+            np.testing.assert_allclose(three[name], array[:3], rtol=1e-9, atol=1e-9)
+    np.testing.assert_array_equal(three["state"], five["state"][:3])
+    np.testing.assert_array_equal(other["state"][0], five["state"][0])
+    assert (other["state"][1:] != five["state"][1:]).all()
+
+
+def test_figures_false_draws_nothing_and_history_false_keeps_nothing(outcomes: dict[str, Outcome]) -> None:
+    run = run_directory(outcomes["no history"])
+    assert {path.name for path in run.iterdir()} == {".hydra", "staf.log", "metrics.json"}
+
+
+def test_a_polygon_of_five_warns_in_the_log(outcomes: dict[str, Outcome]) -> None:
+    outcome = outcomes["polygon of five"]
+    log = (run_directory(outcome) / "staf.log").read_text()
+    assert "[WARNING]" in log
+    assert "lie on a conic" in log
+    assert "lie on a conic" in outcome.out + outcome.err
+
+
+def test_a_window_after_the_end_is_null_and_said_so(outcomes: dict[str, Outcome]) -> None:
+    outcome = outcomes["no window"]
+    found = metrics(run_directory(outcome))
+    assert set(found) == KEYS
+    assert found["ultimate_error"] is None
+    assert "nothing to report" in outcome.out
+
+
+def test_single_precision_runs_and_is_stored_so(outcomes: dict[str, Outcome]) -> None:
+    found = history(run_directory(outcomes["single precision"]))
+    assert {array.dtype for name, array in found.items() if name != "time"} == {np.dtype("float32")}
+
+
+def test_diverging_trajectories_are_counted_and_named_and_spare_the_others(
+    outcomes: dict[str, Outcome],
+) -> None:
+    run = run_directory(outcomes["diverging"])
+    found, past, log = metrics(run), history(run), (run / "staf.log").read_text()
+    escaped = {row for row, start in enumerate(past["state"][:, 0]) if start.max() > 1 / 3 + 0.02}
+    stayed = set(range(8)) - {
+        row for row, start in enumerate(past["state"][:, 0]) if start.max() > 1 / 3 - 0.02
+    }
+    lost = {row for row in range(8) if not np.isfinite(past["excess"][row]).all()}
+    assert escaped <= lost
+    assert stayed.isdisjoint(lost)
+    assert escaped
+    assert stayed
+    assert found["diverged_fraction"] == len(lost) / 8
+    named = {
+        int(line.split("trajectory ")[1].split()[0]) for line in log.splitlines() if "diverged at t" in line
+    }
+    assert named == lost
+    assert found["ultimate_error"] is not None
+    for row in lost:
+        first = int(np.argmin(np.isfinite(past["excess"][row])))
+        assert first > 0
+        assert np.isnan(past["estimate"][row, first:]).all()
+        np.testing.assert_array_equal(
+            past["weights"][row, first:],
+            np.broadcast_to(past["weights"][row, first - 1], past["weights"][row, first:].shape),
+        )
+    for row in stayed:
+        assert np.isfinite(past["weights"][row]).all()
+
+
+def test_a_bad_member_of_a_sweep_is_named_and_the_good_one_before_it_is_kept(
+    outcomes: dict[str, Outcome],
+) -> None:
+    outcome = outcomes["sweep"]
+    assert outcome.code == 1
+    assert "Traceback" not in outcome.err
+    assert "(radius=...)` must be positive; got -1." in outcome.err
+    (sweep,) = (outcome.folder / "runs").iterdir()
+    assert set(metrics(sweep / "0")) == KEYS
+
+
+def test_help_lists_the_groups_and_the_settings(outcomes: dict[str, Outcome]) -> None:
+    outcome = outcomes["help"]
+    assert outcome.code == 0
+    assert outcome.left == set()
+    for words in ("State Following", "kernel:", "exponential", "initial_state", "duration"):
+        assert words in outcome.out
+
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+import staf_torch.experiments.app as app
+import staf_torch.experiments.gradient_chase  # so that the children share it
+
+replace = os.replace
+for survived in range(3):
+    child = os.fork()
+    if child == 0:
+        folder = Path(f"killed{survived}")
+        folder.mkdir()
+        os.chdir(folder)
+        sys.stdout = sys.stderr = open(os.devnull, "w")
+        calls = []
+
+        def killing(*names):
+            calls.append(names)
+            if len(calls) > survived:
+                os.kill(os.getpid(), signal.SIGKILL)
+            replace(*names)
+
+        os.replace = killing
+        sys.argv = ["staf", "duration=0.05", "settle_time=0", "figures=false"]
+        app.main()
+        os._exit(0)
+    print(os.waitpid(child, 0)[1])
+"""
+
+
+def test_a_killed_run_leaves_no_file_that_reads_as_complete(tmp_path: Path) -> None:
+    """Killed just before a file gets its name: the history (0), the metrics (1), never (2)."""
+    line = [sys.executable, "-c", KILLED]
+    ended = subprocess.run(line, cwd=tmp_path, env=environment(), capture_output=True, text=True, check=True)
+    assert ended.stdout.split() == ["9", "9", "0"]
+    present = []
+    for survived in range(3):
+        (run,) = (tmp_path / f"killed{survived}" / "runs").iterdir()
+        present.append({path.name for path in run.glob("*.*") if not path.name.startswith(".")})
+    assert present == [{"staf.log"}, {"staf.log", "history.npz"}, {"staf.log", "history.npz", "metrics.json"}]
+
+
+def test_the_package_is_the_command(tmp_path: Path) -> None:
+    line = [sys.executable, "-m", "staf_torch", *SHORT]
+    ended = subprocess.run(line, cwd=tmp_path, env=environment(), capture_output=True, text=True, check=True)
+    assert ended.stderr == ""
+    (run,) = (tmp_path / "runs").iterdir()
+    assert set(metrics(run)) == KEYS
