@@ -127,15 +127,15 @@ class StaFBasis(nn.Module):
             bound=None if bound is None else bound * self._graded.reach,
         )
 
-    def check_reach(self, x: Tensor) -> None:
-        """Warn where the exponential kernel is a poor choice: |x| nu(x) > 1 at one of the states (..., n).
+    def check_reach(self, x: Tensor) -> bool:
+        """Warn, and say so, where the exponential kernel is a poor choice: |x| nu(x) > 1 at one of the states (..., n).
 
         exp(y'c) then changes by more than e over the ball, with the state and not with V.
         """
         if self.kernel.log_gain(x) is None:
-            return
-        reach = x.norm(dim=-1) * self.centers.radius(x)
-        worst = float(reach.nan_to_num(0.0).max())
+            return False
+        reach = (x.norm(dim=-1) * self.centers.radius(x)).detach()
+        worst = float(torch.where(torch.isfinite(reach), reach, 0.0).max())
         if worst > 1:
             warnings.warn(
                 f"|x| r = {worst:.3g} > 1: around such states {type(self.kernel).__name__} changes by more "
@@ -143,6 +143,7 @@ class StaFBasis(nn.Module):
                 "GaussianKernel, whose accuracy does not depend on the state.",
                 stacklevel=3,
             )
+        return worst > 1
 
     def values(self, x: Tensor, target: Target) -> Tensor:
         """V(c(x)): (..., n) -> (..., M)."""

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator
 import torch
 from torch import Tensor
 
-from .._checks import integer, trailing
+from .._checks import fail, integer, trailing
 from ..basis import StaFBasis, Target
 from ..objective import NativeError
 from ..optim.base import UpdateLaw
@@ -57,6 +57,8 @@ def chase(
     trailing("chase", "states", states, dims=3, last=basis.dim)
     if states.dim() != 3 or 0 in states.shape:
         raise ValueError(f"`chase(states=...)` must have the shape (B, T, n); got {tuple(states.shape)}.")
+    if predictor is not None:
+        raise fail("chase", "predictor", "must be None", predictor)
     pieces = states.split(chunk_length(states.shape[0], basis, states.element_size()), dim=1)
     return concatenate(chase_pieces(pieces, basis, target, law, inner_steps=inner_steps, weights=weights))
 
@@ -80,8 +82,9 @@ def chase_pieces(
     integer("chase", "inner_steps", inner_steps, least=0)
     if not isinstance(law, UpdateLaw):
         raise ValueError(f"`chase(law=...)` must be an UpdateLaw; got {law!r}.")
-    carry = None
+    carry, warned = None, False
     for states in pieces:
+        warned = warned or basis.check_reach(states)
         if carry is None:
             carry = _start(states, basis, law, weights)
         result, carry = _piece(states, basis, target, law, inner_steps, carry)
@@ -116,7 +119,6 @@ def _piece(
     carry: Carry,
 ) -> tuple[ChaseResult, Carry]:
     """One piece of time: (B, C, n) and the carry to its result and the next carry."""
-    basis.check_reach(states)
     structure = basis.gram_structure(states)
     values = basis.values(states, target)
     gram = structure.scaled().expand(*states.shape[:2], basis.count, basis.count)
