@@ -128,7 +128,7 @@ class StaFBasis(nn.Module):
         )
 
     def check_reach(self, x: Tensor) -> bool:
-        """Warn, and say so, where the exponential kernel is a poor choice: |x| nu(x) > 1 at one of the states (..., n).
+        """Warn, and say so, where the exponential kernel is a poor choice: |x| nu(x) > 1 at a state (..., n).
 
         exp(y'c) then changes by more than e over the ball, with the state and not with V.
         """

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import pytest
 import torch
 from helpers import KERNELS, RADII, basis_of, over, tensor, uniform
 
 import staf_torch as st
 from staf_torch.targets import Paper
+
+NEWTON = {name: KERNELS[name] for name in KERNELS if name not in ("exponential", "gaussian")}
 
 
 @over(KERNELS)
@@ -19,7 +20,7 @@ def test_weights_and_coefficients_are_two_names_of_one_function(name: str, radiu
     torch.testing.assert_close(space.coefficients(space.weights(beta)), beta, rtol=1e-8, atol=1e-8)
 
 
-@over(KERNELS)
+@over(NEWTON)
 def test_squared_length_of_the_coefficients_is_the_squared_native_norm(name: str) -> None:
     basis, x = basis_of(name, 6, 0.8), uniform(4, 2, low=0.4)
     space = basis.local(x)
@@ -36,7 +37,7 @@ def test_rank_is_full_for_well_separated_centers(name: str) -> None:
 
 
 def test_rank_says_where_the_gram_matrix_is_numerically_singular() -> None:
-    basis = basis_of("exponential", 15, 1e-3)
+    basis = basis_of("matern52", 15, 1e-4)
     space = basis.local(uniform(4, 2))
     assert int(space.rank) < 15
     beta = space.fit(basis.values(space.state, Paper()))
@@ -47,13 +48,12 @@ def test_rank_says_where_the_gram_matrix_is_numerically_singular() -> None:
 
 
 def test_centers_that_meet_leave_one_of_them() -> None:
-    basis = basis_of("gaussian", 6, st.StateRadius(0.5, 0.0))
+    basis = basis_of("rational_quadratic", 6, st.StateRadius(0.5, 0.0))
     space = basis.local(tensor([[0.0, 0.0], [1.0, 0.5]]))
     assert space.rank.tolist() == [1, 6]
     values = space.evaluate(torch.zeros(2, 1, 2).double(), space.fit(basis.values(space.state, Paper())))
     torch.testing.assert_close(values.squeeze(-1), Paper()(space.state), rtol=0, atol=2e-3)
 
 
-@pytest.mark.parametrize("kernel", ["exponential", "gaussian"])
-def test_one_factor_serves_all_states(kernel: str) -> None:
-    assert basis_of(kernel).local(uniform(5, 4, 2)).factor.factor.shape == (6, 6)
+def test_one_factor_serves_all_states() -> None:
+    assert basis_of("matern32").local(uniform(5, 4, 2)).factor.factor.shape == (6, 6)

@@ -95,7 +95,8 @@ def _log_warning(message: Warning | str, *_: Any, **__: Any) -> None:
 
 def main() -> None:
     """Run the command line. What a user got wrong ends as one sentence and the exit code 1."""
-    wants_trace = os.environ.get(_FULL_ERROR, "0") not in ("", "0")
+    before = os.environ.get(_FULL_ERROR)
+    wants_trace = before not in (None, "", "0")
     # Hydra then hands every exception on, and this function words it, once, for run and sweep alike.
     os.environ[_FULL_ERROR] = "1"
     sys.path.insert(0, os.getcwd())  # so that `target.path=my_module.my_function` finds the user's file
@@ -111,6 +112,9 @@ def main() -> None:
         sys.exit(f"staf: {sentence(error)}")
     except KeyboardInterrupt:
         sys.exit("staf: interrupted")
+    finally:
+        if before is None:
+            del os.environ[_FULL_ERROR]
 
 
 def sentence(error: BaseException) -> str:

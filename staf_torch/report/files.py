@@ -11,11 +11,14 @@ from pathlib import Path
 def write_text(path: Path, text: str) -> None:
     """Write a file under another name, flush it to disk, then rename it into place."""
     partial = path.with_name(f".{path.name}.partial")
-    with partial.open("w", encoding="utf-8") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(partial, path)
+    try:
+        with partial.open("w", encoding="utf-8") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
 
 
 def write_metrics(path: Path, metrics: Mapping[str, float | int | None]) -> None:
