@@ -11,8 +11,8 @@ from torch import Tensor, nn
 
 from ._checks import sampled, trailing
 from .centers import StateFollowingCenters
-from .kernels import Kernel
-from .local import GradedSpace, LocalSpace, graded_basis, newton_space
+from .kernels import Kernel, PolynomialKernel
+from .local import GradedSpace, LocalSpace, degrees_of, graded_basis, newton_space, polynomial_space
 
 Target = Callable[[Tensor], Tensor]
 """A function V to approximate: points (..., n) to values (...)."""
@@ -77,8 +77,14 @@ class StaFBasis(nn.Module):
 
     def _grade(self) -> None:
         """Set up what depends on the directions alone, again whenever others are loaded."""
+        directions = self.centers.directions
         structured = self.kernel.exponent_rate() is not None
-        self._graded = graded_basis(self.centers.directions) if structured else None
+        self._graded = graded_basis(directions) if structured else None
+        self._degrees = None
+        if isinstance(self.kernel, PolynomialKernel) and self.kernel.full:
+            degrees = degrees_of(directions.double() / directions.norm(dim=-1).max())
+            # A functional of a higher degree than the kernel's sees nothing: a case for the Newton basis.
+            self._degrees = degrees if len(degrees.sizes) <= self.kernel.degree + 1 else None
 
     @property
     def count(self) -> int:
@@ -114,6 +120,9 @@ class StaFBasis(nn.Module):
         trailing("StaFBasis.local", "x", x, dims=1, last=self.dim)
         offsets = self.centers.offsets(x)
         rate = self.kernel.exponent_rate()
+        if isinstance(self.kernel, PolynomialKernel) and self._degrees is not None:
+            reach = self.centers.radius(x) * self.centers.directions.to(x).norm(dim=-1).max()
+            return polynomial_space(self.kernel, x, offsets, reach, self._degrees)
         if self._graded is None or rate is None:
             return newton_space(self.kernel, x, offsets)
         reach, bound = self._graded.reach.to(x), self.centers.radius.bound()

@@ -8,7 +8,7 @@ from helpers import KERNELS, RADII, basis_of, over, tensor, uniform
 import staf_torch as st
 from staf_torch.targets import Paper
 
-NEWTON = {name: KERNELS[name] for name in KERNELS if name not in ("exponential", "gaussian")}
+NEWTON = {name: KERNELS[name] for name in KERNELS if name not in ("exponential", "gaussian", "polynomial")}
 
 
 @over(KERNELS)

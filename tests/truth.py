@@ -27,7 +27,13 @@ class Truth:
     """V^ of ideal weights at one state: values and gradients (centers frozen) at x + r zeta."""
 
     def __init__(
-        self, directions: Tensor, radius: float, x: Tensor, value: object, width: float | None
+        self,
+        directions: Tensor,
+        radius: float,
+        x: Tensor,
+        value: object,
+        width: float | None = None,
+        polynomial: tuple[int, float] | None = None,
     ) -> None:
         # kappa grows like r^(-2 degree); keep forty digits beyond it.
         degree = 1
@@ -36,7 +42,7 @@ class Truth:
         degree = max(degree, len(directions) // 2) if directions.shape[1] <= 2 else degree
         spread = 2 * float(x.norm()) * radius  # the exponential kernel's range over the ball, e^{+-spread}
         self.digits = 50 + int(2 * (degree + 1) * max(0.0, -math.log10(radius)) + 2 * spread)
-        self.width = width
+        self.width, self.polynomial = width, polynomial
         with mp.workdps(self.digits):
             self.radius = mp.mpf(radius)
             self.x = _exact(x)
@@ -50,6 +56,9 @@ class Truth:
 
     def _kernel(self, z: Point, d: Point) -> mp.mpf:
         """k(x + z, x + d) without the constant e^{x'x}."""
+        if self.polynomial is not None:
+            degree, bias = self.polynomial
+            return (mp.mpf(bias) + _dot(self._at(z), self._at(d))) ** degree
         if self.width is None:
             return mp.exp(_dot(self.x, z) + _dot(self.x, d) + _dot(z, d))
         gap = mp.fsum((a - e) ** 2 for a, e in zip(z, d, strict=True))

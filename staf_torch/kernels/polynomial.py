@@ -29,13 +29,14 @@ class PolynomialKernel(Kernel):
         self.degree = integer("PolynomialKernel", "degree", degree, least=1)
         self.register_buffer("bias", non_negative("PolynomialKernel", "bias", bias))
         self.bias: Tensor
-        self._homogeneous = bool((self.bias == 0).any())
+        self.full = bool((self.bias > 0).all())
+        """Whether the space holds all polynomials of the degree, not the homogeneous ones alone."""
 
     def forward(self, x1: Tensor, x2: Tensor) -> Tensor:
         return (inner(x1, x2) + per_entry(self.bias, 2)).pow(self.degree)
 
     def rank(self, dim: int) -> int:
-        variables = dim - 1 if self._homogeneous else dim
+        variables = dim if self.full else dim - 1
         return math.comb(variables + self.degree, self.degree)
 
     def extra_repr(self) -> str:
