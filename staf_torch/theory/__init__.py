@@ -1,0 +1,3 @@
+"""The theorems, computable."""
+
+from .power_function import power_function as power_function
