@@ -1,5 +1,6 @@
 """The open-loop engine: gradient chase along given trajectories."""
 
+from . import predictors as predictors
 from .engine import chase as chase
 from .engine import chase_pieces as chase_pieces
 from .engine import chunk_length as chunk_length
