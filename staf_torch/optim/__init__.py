@@ -11,3 +11,4 @@ from .normalised_lms import NormalisedLMS as NormalisedLMS
 from .preconditioned_descent import PreconditionedDescent as PreconditionedDescent
 from .recursive_least_squares import RecursiveLeastSquares as RecursiveLeastSquares
 from .steepest_descent import SteepestDescent as SteepestDescent
+from .torch_optimizer import ChaseOptimizer as ChaseOptimizer
