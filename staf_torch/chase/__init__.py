@@ -1,7 +1,9 @@
 """The open-loop engine: gradient chase along given trajectories."""
 
 from . import predictors as predictors
+from .certificate import Certificate as Certificate
 from .engine import chase as chase
 from .engine import chase_pieces as chase_pieces
 from .engine import chunk_length as chunk_length
+from .rates import gram_rates as gram_rates
 from .result import ChaseResult as ChaseResult

@@ -3,6 +3,7 @@ recursion, then everything that follows from the weights in bulk again."""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterable, Iterator
 
 import torch
@@ -12,6 +13,7 @@ from .._checks import integer, trailing
 from ..basis import StaFBasis, Target
 from ..objective import NativeError
 from ..optim.base import UpdateLaw
+from .certificate import Certificate, certify
 from .known import known as find_known
 from .predictors import Predictor
 from .recursion import Carry, recursion
@@ -29,6 +31,7 @@ def chase(
     inner_steps: int = 10,
     predictor: Predictor | None = None,
     weights: Tensor | None = None,
+    certificate: bool = False,
 ) -> ChaseResult:
     """Chase the ideal weights of ``target`` along given trajectories.
 
@@ -51,6 +54,7 @@ def chase(
         predictor: how the weights move between times, `predictors.Secant()` or `predictors.Tangent()`;
             None keeps them.
         weights: the paper's w before the first correction, (M,) or (B, M); zero by default.
+        certificate: whether the result has a `Certificate`.
 
     Raises:
         ValueError: if an argument breaks its rule, or the target returns another shape.
@@ -63,7 +67,14 @@ def chase(
     pieces = states.split(chunk_length(states.shape[0], basis, states.element_size()), dim=1)
     return concatenate(
         chase_pieces(
-            pieces, basis, target, law, inner_steps=inner_steps, predictor=predictor, weights=weights
+            pieces,
+            basis,
+            target,
+            law,
+            inner_steps=inner_steps,
+            predictor=predictor,
+            weights=weights,
+            certificate=certificate,
         )
     )
 
@@ -83,6 +94,7 @@ def chase_pieces(
     inner_steps: int = 10,
     predictor: Predictor | None = None,
     weights: Tensor | None = None,
+    certificate: bool = False,
 ) -> Iterator[ChaseResult]:
     """`chase` over consecutive pieces of time (B, C, n), a result a piece."""
     integer("chase", "inner_steps", inner_steps, least=0)
@@ -96,7 +108,7 @@ def chase_pieces(
             carry = _start(states, basis, law, weights)
             if predictor is not None:
                 carry = carry._replace(previous=carry.weights, states=states[:, [0, 0]])
-        result, carry = _piece(states, basis, target, law, inner_steps, predictor, carry)
+        result, carry = _piece(states, basis, target, law, inner_steps, predictor, certificate, carry)
         yield result
 
 
@@ -126,6 +138,7 @@ def _piece(
     law: UpdateLaw,
     inner_steps: int,
     predictor: Predictor | None,
+    certificate: bool,
     carry: Carry,
 ) -> tuple[ChaseResult, Carry]:
     """One piece of time: (B, C, n) and the carry to its result and the next carry."""
@@ -177,4 +190,14 @@ def _piece(
         excess_before=reached(objective.excess(run.before, ideal) * inverse_gain),
         diverged_at=run.carry.diverged_at,
     )
-    return result, run.carry
+    if not certificate:
+        return result, run.carry
+    vouched, link = certify(objective, log_gain, law, inner_steps, run.before, run.after, ideal, carry.link)
+    vouched = Certificate(
+        rate=reached(vouched.rate),
+        growth=reached(vouched.growth),
+        drift=reached(vouched.drift),
+        bound=reached(vouched.bound),
+        violated=vouched.violated & ~lost,
+    )
+    return dataclasses.replace(result, certificate=vouched), run.carry._replace(link=link)

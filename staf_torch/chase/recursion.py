@@ -9,6 +9,7 @@ from torch import Tensor
 
 from ..objective import Known, NativeError
 from ..optim.base import LawState, UpdateLaw
+from .certificate import Link
 from .predictors import Predictor
 from .predictors.base import Parts
 
@@ -23,6 +24,7 @@ class Carry(NamedTuple):
     diverged_at: Tensor  # (B,) int64, -1 while finite
     previous: Tensor | None = None  # (B, M) corrected weights of the time before the last; None: no predictor
     states: Tensor | None = None  # (B, 2, n) the last two states; None: no predictor
+    link: Link | None = None  # None: no certificate, or the start
 
 
 class Recursion(NamedTuple):
@@ -57,7 +59,7 @@ def recursion(
         predictor: moves the weights to the next time; None keeps them.
         parts: what the predictor prepared for the times of this piece.
     """
-    weights, state, last_gain, start, diverged_at, previous, states = carry
+    weights, state, last_gain, start, diverged_at, previous = carry[:6]
     usable = torch.isfinite(values).all(-1) & torch.isfinite(gram).all(-1).all(-1)
     before, after = [], []
     for k in range(values.shape[1]):
@@ -84,5 +86,6 @@ def recursion(
             for part, old in zip(new_state, state, strict=True)
         )
         last_gain = torch.where(fine, log_gain[:, k], last_gain)
-    carry = Carry(weights, state, last_gain, start + values.shape[1], diverged_at, previous, states)
+    time = start + values.shape[1]
+    carry = Carry(weights, state, last_gain, time, diverged_at, previous, carry.states, carry.link)
     return Recursion(torch.stack(before, dim=1), torch.stack(after, dim=1), carry)

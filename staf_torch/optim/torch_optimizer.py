@@ -80,24 +80,24 @@ class ChaseOptimizer(Optimizer):
         with torch.enable_grad():
             loss = closure()
         groups = [(group, p) for group in self.param_groups for p in group["params"] if p.requires_grad]
+        moved = []
         for (group, parameter), slope in zip(groups, _slopes(loss, [p for _, p in groups]), strict=True):
-            if slope is not None:
-                self._advance(group, parameter, LossObjective(parameter, slope))
+            if slope is not None and group.get("lr") != 0:
+                moved.append((parameter, self._advanced(group, parameter, slope)))
+        for parameter, weights in moved:  # only now: the curvature was taken at the old parameters
+            parameter.copy_(weights)
         return loss.detach()
 
-    def _advance(self, group: dict[str, Any], parameter: Tensor, objective: LossObjective) -> None:
-        law, rate = self.law, group.get("lr")
-        if rate is not None:
-            if rate == 0:
-                return
-            law = law.with_step_size(float(rate))
+    def _advanced(self, group: dict[str, Any], parameter: Tensor, slope: Tensor) -> Tensor:
+        """The parameter's new value."""
+        objective = LossObjective(parameter, slope)
+        law = self.law if "lr" not in group else self.law.with_step_size(float(group["lr"]))
         weights, memory = parameter.detach().clone(), self.state[parameter]
         state = law.begin(objective, weights, memory["law"] if "law" in memory else law.init(weights))
         for _ in range(group["inner_steps"]):
             weights, state = law.step(objective, weights, state)
         memory["law"] = state
-        objective.close()
-        parameter.copy_(weights)
+        return weights
 
 
 class LossObjective:
@@ -152,10 +152,6 @@ class LossObjective:
     def sample(self) -> tuple[Tensor, Tensor]:
         """A loss has none."""
         raise ValueError("A loss has no sample at a state.")
-
-    def close(self) -> None:
-        """Let go of the graph."""
-        del self._slope
 
 
 def _slopes(loss: object, parameters: list[Tensor]) -> tuple[Tensor | None, ...]:

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from ..._checks import choice
 from ...basis import StaFBasis, Target
+from ..rates import gram_rates
 from .base import Parts, Predictor
 
 
@@ -57,16 +58,10 @@ class Tangent(Predictor):
 
 def _tangent(basis: StaFBasis, target: Target, x: Tensor, dx: Tensor) -> tuple[Tensor, Tensor]:
     """K^-1 dV(c) and K^-1 dK at the states x along dx, with e^{-g} K for K: (B, C, M), (B, C, M, M)."""
-
-    def structure(at: Tensor) -> tuple[Tensor, Tensor]:
-        gram = basis.gram_structure(at).scaled()
-        return basis.values(at, target), gram.expand(*x.shape[:-1], basis.count, basis.count)
-
-    rates: tuple[Tensor, Tensor] = torch.func.jvp(structure, (x,), (dx,))[1]
-    values, gram = rates
+    rates = gram_rates(basis, target, x, dx)
     space = basis.local(x)
-    columns = [space.scaled_weights(space.fit(column)) for column in gram.unbind(-1)]
-    return space.scaled_weights(space.fit(values)), torch.stack(columns, dim=-1)
+    columns = [space.scaled_weights(space.fit(column)) for column in rates.gram_rate.unbind(-1)]
+    return space.scaled_weights(space.fit(rates.values_rate)), torch.stack(columns, dim=-1)
 
 
 def _apply(matrix: Tensor, vector: Tensor) -> Tensor:
