@@ -73,7 +73,8 @@ def recursion(
         for _ in range(inner_steps):
             new, new_state = law.step(objective, new, new_state)
         # A row that is not finite stays behind, as it was; the rows beside it never see it.
-        fine = usable[:, k] & torch.isfinite(new).all(-1) & (diverged_at < 0)
+        finite = torch.isfinite(new).all(-1) & torch.isfinite(brought).all(-1)
+        fine = usable[:, k] & finite & (diverged_at < 0)
         diverged_at = torch.where(fine | (diverged_at >= 0), diverged_at, start + k)
         keep = fine.unsqueeze(-1)
         before.append(torch.where(keep, brought, weights))

@@ -25,6 +25,7 @@ from ..centers import (
     rings,
     simplex,
 )
+from ..chase.predictors import Predictor
 from ..optim import UpdateLaw
 from ..systems import ControlAffineSystem
 
@@ -44,6 +45,8 @@ class ChaseProblem:
     steps: int  # T - 1
     inner_steps: int
     settle_time: float  # s
+    predictor: Predictor | None = None
+    certificate: bool = False
 
 
 def load(path: str, arguments: dict[str, Any] | None = None) -> Any:
@@ -101,6 +104,8 @@ def chase_problem(cfg: DictConfig) -> ChaseProblem:
         steps=math.floor(duration / dt + 1e-9),
         inner_steps=inner_steps,
         settle_time=real("staf", "settle_time", cfg.settle_time),
+        predictor=None if cfg.predictor.get("_target_") is None else _make(cfg.predictor),
+        certificate=bool(cfg.certificate),
     )
 
 

@@ -72,7 +72,15 @@ def solve(problem: ChaseProblem, writer: HistoryWriter | None = None) -> Outcome
     progress = Progress(times, "times")
     diverged_at = torch.full(x0.shape[:1], -1)
     states = trajectory(problem.system, x0, dt=problem.dt, steps=problem.steps, chunk=chunk)
-    chased = chase_pieces(states, problem.basis, problem.target, problem.law, inner_steps=problem.inner_steps)
+    chased = chase_pieces(
+        states,
+        problem.basis,
+        problem.target,
+        problem.law,
+        inner_steps=problem.inner_steps,
+        predictor=problem.predictor,
+        certificate=problem.certificate,
+    )
     with torch.no_grad():
         for result in chased:
             metrics.add(result)
@@ -128,7 +136,7 @@ def _summarise(problem: ChaseProblem, metrics: dict[str, float | None]) -> None:
 
     batch, count = problem.initial_states.shape[0], problem.basis.count
     _log.info(
-        "Gradient chase: %d %s, %d times, dt = %g s, %d centers, %s, %s x %d",
+        "Gradient chase: %d %s, %d times, dt = %g s, %d centers, %s, %s x %d%s",
         batch,
         "trajectory" if batch == 1 else "trajectories",
         problem.steps + 1,
@@ -137,6 +145,7 @@ def _summarise(problem: ChaseProblem, metrics: dict[str, float | None]) -> None:
         type(problem.basis.kernel).__name__,
         type(problem.law).__name__,
         problem.inner_steps,
+        "" if problem.predictor is None else f", {type(problem.predictor).__name__.lower()} predictor",
     )
     if metrics["ultimate_error"] is None:
         _log.warning(
