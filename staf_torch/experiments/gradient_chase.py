@@ -53,7 +53,9 @@ def run(cfg: DictConfig, directory: Path) -> dict[str, float | None]:
     return outcome.metrics
 
 
-def solve(problem: ChaseProblem, writer: HistoryWriter | None = None) -> Outcome:
+def solve(
+    problem: ChaseProblem, writer: HistoryWriter | None = None, progress: Progress | None = None
+) -> Outcome:
     """The simulation itself, in pieces of time."""
     metrics = ChaseMetrics(
         problem.basis,
@@ -69,7 +71,7 @@ def solve(problem: ChaseProblem, writer: HistoryWriter | None = None) -> Outcome
     # At least twenty pieces, so that progress is seen; the results do not depend on it.
     chunk = max(1, min(chunk, -(-times // 20)))
     thinned = _Thinned(times)
-    progress = Progress(times, "times")
+    progress = Progress(times, "times") if progress is None else progress
     diverged_at = torch.full(x0.shape[:1], -1)
     states = trajectory(problem.system, x0, dt=problem.dt, steps=problem.steps, chunk=chunk)
     chased = chase_pieces(
