@@ -5,5 +5,6 @@ from .certificate import Certificate as Certificate
 from .engine import chase as chase
 from .engine import chase_pieces as chase_pieces
 from .engine import chunk_length as chunk_length
+from .rates import along as along
 from .rates import gram_rates as gram_rates
 from .result import ChaseResult as ChaseResult

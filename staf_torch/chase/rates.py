@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import warnings
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -33,5 +35,14 @@ def gram_rates(basis: StaFBasis, target: Target, x: Tensor, dx: Tensor) -> GramR
         gram = basis.gram_structure(at).scaled()
         return basis.values(at, target), gram.expand(*x.shape[:-1], basis.count, basis.count)
 
-    (values, gram), (values_rate, gram_rate) = torch.func.jvp(structure, (x,), (dx,))[:2]
+    (values, gram), (values_rate, gram_rate) = along(structure, x, dx)
     return GramRates(values, gram, values_rate, gram_rate)
+
+
+def along(function: Callable[[Tensor], Any], x: Tensor, dx: Tensor) -> tuple[Any, Any]:
+    """f(x) and its derivative along dx, in forward mode: torch.func.jvp without the warning that torch 2.13
+    gives itself on first use, which would end a program in which warnings are errors."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*torch.jit.script", category=DeprecationWarning)
+        primal, tangent = torch.func.jvp(function, (x,), (dx,))[:2]
+    return primal, tangent

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from .._checks import positive_real, trailing
 from ..basis import StaFBasis, Target
+from ..chase import along
 from ..linalg import condition_number
 from ..optim import SteepestDescent
 
@@ -59,7 +60,7 @@ def paper_step(
     """
     positive_real("paper_step", "excess", excess)
     trailing("paper_step", "states", states, dims=2, last=basis.dim)
-    centers, moving = torch.func.jvp(basis.centers, (states,), (velocities,))[:2]
+    centers, moving = along(basis.centers, states, velocities)
     weights = basis.ideal_weights(states, target)
     radius = weights.norm(dim=-1).max()
     if initial_weights is not None:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from .._checks import fail, integer, positive_real, trailing
 from ..basis import StaFBasis, Target
-from ..chase import gram_rates
+from ..chase import along, gram_rates
 from ..linalg import condition_number
 from ..optim import UpdateLaw
 
@@ -172,6 +172,4 @@ def _gain(basis: StaFBasis, x: Tensor, velocity: Tensor) -> tuple[Tensor, Tensor
         assert found is not None
         return found
 
-    pair: tuple[Tensor, Tensor]
-    pair = torch.func.jvp(gain, (x,), (velocity,))  # type: ignore[assignment]
-    return pair
+    return along(gain, x, velocity)
