@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import math
 
+import mpmath
 import pytest
 import torch
 from helpers_laws import KERNELS, LAWS, PREDICTORS, TARGET, basis, states
@@ -128,6 +129,18 @@ def test_the_exact_law_leaves_no_excess(kernel: str, count: int) -> None:
     x = states(batch=3, steps=10)
     result = chase(x, basis(KERNELS[kernel], count), TARGET, optim.Exact(), inner_steps=1)
     assert bool((result.excess <= 1e-22 * result.value.square().clamp(min=1e-6)).all())
+
+
+@pytest.mark.parametrize("x", [(1.0, 0.0), (0.3, -0.9), (-0.7, 0.7)])
+def test_the_exact_law_leaves_no_excess_in_sixty_digits_either(x: tuple[float, float]) -> None:
+    at = torch.tensor([[x]], dtype=torch.float64)
+    result = chase(at, basis(), TARGET, optim.Exact(), inner_steps=1)
+    with mpmath.workdps(60):
+        centers = [[mpmath.mpf(value) for value in row] for row in basis().centers(at[0, 0]).tolist()]
+        values = mpmath.matrix([a**2 + 5 * b**2 + mpmath.tanh(a * b) for a, b in centers])
+        gram = mpmath.matrix([[mpmath.exp(a * c + b * d) for c, d in centers] for a, b in centers])
+        error = mpmath.matrix(result.weights[0, 0].tolist()) - mpmath.lu_solve(gram, values)
+        assert (error.T * gram * error)[0] <= 1e-22 * float(result.value) ** 2
 
 
 @pytest.mark.parametrize("law", LAWS)

@@ -68,8 +68,8 @@ def solve(
     x0 = problem.initial_states
     times = problem.steps + 1
     chunk = chunk_length(x0.shape[0], problem.basis, x0.element_size())
-    # At least twenty pieces, so that progress is seen; the results do not depend on it.
-    chunk = max(1, min(chunk, -(-times // 20)))
+    # Some twenty pieces of a long run, so that progress is seen; the results do not depend on it.
+    chunk = max(1, min(chunk, max(64, -(-times // 20))))
     thinned = _Thinned(times)
     progress = Progress(times, "times") if progress is None else progress
     diverged_at = torch.full(x0.shape[:1], -1)
