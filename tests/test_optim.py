@@ -170,7 +170,7 @@ def test_barzilai_borwein_outruns_steepest_descent() -> None:
     objective = quadratic(batch=50, condition=1e3)
     laws = optim.BarzilaiBorwein(), optim.SteepestDescent()
     raydan, cauchy = (excess_path(law, objective, 60)[-1].median() for law in laws)
-    assert float(raydan) < 1e-3 * float(cauchy)
+    assert float(raydan) < 1e-2 * float(cauchy)
 
 
 def test_recursive_least_squares_is_the_batch_fit_to_all_samples() -> None:

@@ -44,7 +44,8 @@ def cases(work: int, count: int) -> list[Case]:
     """Every law at up to ``work`` products with K a time step, then the predictors.
 
     A law that carries its residual (g <- g - 2 lambda K p) needs one product an iteration and one to begin.
-    Laws that are done sooner are not given more. Of the filter each of six M x M x M products counts
+    Laws that are done sooner are not given more, and what a predictor costs is taken from the iterations;
+    one is left where it costs as much as all of them. Of the filter each of six M x M x M products counts
     as M; NormalisedLMS has none. The tangent needs M solves and two products, or M more for order 2.
 
     Args:
@@ -79,7 +80,7 @@ def cases(work: int, count: int) -> list[Case]:
     for predictor, extra in predictors:
         for law, iterations, products in (
             (optim.SteepestDescent(), 1, 2),
-            (optim.SteepestDescent(), many, work),
+            (optim.SteepestDescent(), max(1, many - extra), max(2, work - extra)),
             (optim.Exact(), 1, 1),
         ):
             rows.append(Case(law, iterations, predictor, products + extra))

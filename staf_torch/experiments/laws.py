@@ -207,9 +207,9 @@ def _summarise(
             "  %-20s x%-3d %-16s %s", curve.case.name, curve.case.iterations, curve.case.predicted, slope
         )
     if promised:
-        show = {name: "-" if value is None else f"{value:.3g}" for name, value in promised.items()}
+        show = {name: "none" if value is None else f"{value:.3g}" for name, value in promised.items()}
         _log.info(
-            "A priori, steepest descent x%d at dt = %g s: excess <= %s before and %s after the correction",
+            "A priori bound, steepest descent x%d at dt = %g s: excess %s before and %s after the correction",
             problem.inner_steps,
             problem.dt,
             show["a_priori.ultimate_excess_before"],
