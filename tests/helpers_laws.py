@@ -48,6 +48,7 @@ DESCENDING = {
 PREDICTORS: dict[str, predictors.Predictor | None] = {
     "none": None,
     "secant": predictors.Secant(),
+    "secant, guarded": predictors.Secant(guarded=True),
     "tangent, order 1": predictors.Tangent(order=1),
     "tangent, order 2": predictors.Tangent(),
 }

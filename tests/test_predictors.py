@@ -131,6 +131,26 @@ def test_the_exact_law_leaves_no_excess(kernel: str, count: int) -> None:
     assert bool((result.excess <= 1e-22 * result.value.square().clamp(min=1e-6)).all())
 
 
+@pytest.mark.parametrize("name", LAWS)
+@pytest.mark.parametrize("predictor", ["none", "secant, guarded", "tangent, order 2"])
+def test_no_law_blows_up_however_fast_the_ideal_weights_move(name: str, predictor: str) -> None:
+    x = states(batch=2, steps=60, dt=0.3)
+    result = chase(x, basis(), TARGET, LAWS[name], inner_steps=5, predictor=PREDICTORS[predictor])
+    none = (result.ideal_weights * basis().values(x, TARGET)).sum(-1).amax(1, keepdim=True)
+    assert bool((result.excess_before < 100 * none).all())
+
+
+def test_a_guard_keeps_the_secant_from_running_away() -> None:
+    x = states(batch=4, steps=200, dt=0.02)
+    excess = {
+        name: chase(
+            x, basis(count=6), TARGET, LAWS["steepest descent"], predictor=PREDICTORS[name]
+        ).excess.max()
+        for name in ("secant", "secant, guarded")
+    }
+    assert float(excess["secant, guarded"]) < 1e-2 * float(excess["secant"])
+
+
 @pytest.mark.parametrize("x", [(1.0, 0.0), (0.3, -0.9), (-0.7, 0.7)])
 def test_the_exact_law_leaves_no_excess_in_sixty_digits_either(x: tuple[float, float]) -> None:
     at = torch.tensor([[x]], dtype=torch.float64)

@@ -65,10 +65,11 @@ def recursion(
     for k in range(values.shape[1]):
         unit = (log_gain[:, k] - last_gain).exp().unsqueeze(-1)
         brought, brought_state = weights * unit, law.rescale(state, unit)
+        objective = NativeError(gram[:, k], values[:, k], known.at(k))
         if predictor is not None and start + k > 0:
             assert previous is not None
-            brought = predictor.predict(tuple(part[:, k] for part in parts), weights, previous, unit)
-        objective = NativeError(gram[:, k], values[:, k], known.at(k))
+            predicted = predictor.predict(tuple(part[:, k] for part in parts), weights, previous, unit)
+            brought = _better(objective, predicted, brought) if predictor.guarded else predicted
         new, new_state = brought, law.begin(objective, brought, brought_state)
         for _ in range(inner_steps):
             new, new_state = law.step(objective, new, new_state)
@@ -90,3 +91,14 @@ def recursion(
     time = start + values.shape[1]
     carry = Carry(weights, state, last_gain, time, diverged_at, previous, carry.states, carry.link)
     return Recursion(torch.stack(before, dim=1), torch.stack(after, dim=1), carry)
+
+
+def _better(objective: NativeError, predicted: Tensor, held: Tensor) -> Tensor:
+    """The prediction, or the weights held in the rows where F(predicted) > F(held): (B, M).
+
+    Their difference from the two slopes, exact for a quadratic: F itself would lose the digits of a
+    small excess.
+    """
+    slopes = objective.descent(predicted) + objective.descent(held)
+    worse = torch.linalg.vecdot(predicted - held, slopes) < 0
+    return torch.where(worse.unsqueeze(-1), held, predicted)

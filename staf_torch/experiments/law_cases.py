@@ -92,7 +92,7 @@ def curves(work: int, count: int) -> list[Case]:
     exact, cheap, paper = ("exact", 1), ("steepest descent", 1), ("steepest descent", work - 1)
     shown = {
         "none": (paper, exact),
-        "secant": (paper,),
+        "secant": (paper, exact),
         "tangent order 1": (cheap, exact),
         "tangent order 2": (cheap, exact),
     }

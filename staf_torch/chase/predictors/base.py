@@ -17,7 +17,13 @@ class Predictor(abc.ABC):
 
     Like a law it is pure and holds hyperparameters only. The weights of a chase at x_k are e^{g(x_k)} times
     the paper's, with g the kernel's `log_gain`.
+
+    Attributes:
+        guarded: whether a prediction is dropped, row by row, where it is worse at its arrival than the
+            weights held, F(predicted) > F(held). It costs two products with K a time.
     """
+
+    guarded: bool = False
 
     def prepare(self, basis: StaFBasis, target: Target, states: Tensor, start: int) -> Parts:
         """What `predict` needs at the C arrivals of a piece of time, in bulk.
