@@ -8,7 +8,7 @@ import math
 import mpmath
 import pytest
 import torch
-from helpers_laws import KERNELS, LAWS, PREDICTORS, TARGET, basis, states
+from helpers_laws import KERNELS, LAWS, PAIRS, PREDICTORS, TARGET, basis, states
 from torch import Tensor
 
 from staf_torch import (
@@ -163,8 +163,7 @@ def test_the_exact_law_leaves_no_excess_in_sixty_digits_either(x: tuple[float, f
         assert (error.T * gram * error)[0] <= 1e-22 * float(result.value) ** 2
 
 
-@pytest.mark.parametrize("law", LAWS)
-@pytest.mark.parametrize("predictor", PREDICTORS)
+@pytest.mark.parametrize(("law", "predictor"), PAIRS)
 def test_pieces_of_time_do_not_change_a_chase(law: str, predictor: str) -> None:
     x = states(batch=2, steps=9)
 
@@ -189,8 +188,7 @@ def test_pieces_of_time_do_not_change_a_chase(law: str, predictor: str) -> None:
         torch.testing.assert_close(one, other, rtol=1e-7, atol=1e-9, equal_nan=True)
 
 
-@pytest.mark.parametrize("law", LAWS)
-@pytest.mark.parametrize("predictor", PREDICTORS)
+@pytest.mark.parametrize(("law", "predictor"), PAIRS)
 def test_a_batch_of_trajectories_is_the_trajectories_one_by_one(law: str, predictor: str) -> None:
     x = states(batch=3, steps=6)
     options = {"inner_steps": 2, "predictor": PREDICTORS[predictor]}
