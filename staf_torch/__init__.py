@@ -15,6 +15,7 @@ from .centers import rings as rings
 from .centers import simplex as simplex
 from .chase import ChaseResult as ChaseResult
 from .chase import chase as chase
+from .chase import predictors as predictors
 from .kernels import AnchoredKernel as AnchoredKernel
 from .kernels import ExponentialKernel as ExponentialKernel
 from .kernels import GaussianKernel as GaussianKernel

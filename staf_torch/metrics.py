@@ -33,6 +33,7 @@ class ChaseMetrics:
         condition_number: max kappa(K(c(x))).
         settling_time: the first time (s) from which the excess never again exceeds `ultimate_excess`.
         contraction_violations: steps whose excess shrank by less than the law's rate promises.
+        certificate_violations: times that break the bound of their `Certificate`; only where one was made.
         diverged_fraction: diverged trajectories / all.
     """
 
@@ -53,6 +54,7 @@ class ChaseMetrics:
         self._worst: dict[str, Tensor] = {}  # name -> (B,)
         self._early: list[Tensor] = []  # excess before the window, (B, C) a piece
         self._violations: Tensor | None = None  # (B,) int64
+        self._uncertified: Tensor | None = None  # (B,) int64, of the certificate
         self._diverged = torch.zeros(0, dtype=torch.bool)
 
     def add(self, result: ChaseResult) -> None:
@@ -90,6 +92,9 @@ class ChaseMetrics:
             broken = excess > rate**self._inner_steps * before * (1 + 1e-9) + rounding
             count = broken.sum(dim=1)
             self._violations = count if self._violations is None else self._violations + count
+        if rate is not None and result.certificate is not None:
+            count = result.certificate.violated[:, at].sum(dim=1)
+            self._uncertified = count if self._uncertified is None else self._uncertified + count
 
     def summary(self) -> dict[str, float | None]:
         """Name to number; None where there is nothing to report."""
@@ -98,10 +103,9 @@ class ChaseMetrics:
         if bool(kept.any()) and self._worst:
             metrics |= {name: float(worst[kept].max()) for name, worst in self._worst.items()}
         metrics["settling_time"] = self._settling_time(kept)
-        counted = self._violations is not None and bool(kept.any())
-        metrics["contraction_violations"] = (
-            float(self._violations[kept].sum()) if counted else None  # type: ignore[index]
-        )
+        metrics["contraction_violations"] = _count(self._violations, kept)
+        if self._uncertified is not None:
+            metrics["certificate_violations"] = _count(self._uncertified, kept)
         metrics["diverged_fraction"] = float(self._diverged.double().mean())
         return {
             name: number if number is not None and math.isfinite(number) else None
@@ -117,6 +121,10 @@ class ChaseMetrics:
         index = torch.arange(1, above.shape[1] + 1, device=above.device)
         last = torch.where(above, index, 0).amax(dim=1)
         return float(last[kept].max()) * self._dt
+
+
+def _count(violations: Tensor | None, kept: Tensor) -> float | None:
+    return None if violations is None or not bool(kept.any()) else float(violations[kept].sum())
 
 
 _WORST = (

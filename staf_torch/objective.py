@@ -7,15 +7,54 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
+from .linalg import pivoted_cholesky
+
 
 class Objective(Protocol):
-    """A convex quadratic F(a) in (..., M), one a row, given by its slope and its curvature."""
+    """A convex quadratic F(a) = const - 2 V'a + a'K a, one a row."""
+
+    @property
+    def gram(self) -> Tensor:
+        """K, half the Hessian of F: (..., M, M)."""
+
+    @property
+    def values(self) -> Tensor:
+        """V, half the descent direction at a = 0: (..., M)."""
 
     def descent(self, weights: Tensor) -> Tensor:
         """g = -grad F(a): (..., M) -> (..., M)."""
 
     def curvature(self, direction: Tensor) -> Tensor:
         """K v, half the Hessian of F times v: (..., M) -> (..., M)."""
+
+    def spectrum(self) -> tuple[Tensor, Tensor]:
+        """The smallest and the largest eigenvalue of K: (...), (...)."""
+
+    def solve(self, values: Tensor) -> Tensor:
+        """K^-1 v, as a preconditioner needs it: (..., M) -> (..., M)."""
+
+    def minimiser(self) -> Tensor:
+        """K^-1 V, as accurately as it can be had: (..., M)."""
+
+    def sample(self) -> tuple[Tensor, Tensor]:
+        """The one measurement of the online case: the row k(x, c_i), (..., M), and V(x), (...)."""
+
+
+class Known(NamedTuple):
+    """What has been computed of an objective in bulk, before the laws ask for it; None: not yet.
+
+    A law names in `needs` the fields that it will ask for.
+    """
+
+    extremes: Tensor | None = None  # (..., 2) smallest and largest eigenvalue of K
+    ideal: Tensor | None = None  # (..., M) K^-1 V
+    inverse: Tensor | None = None  # (..., M, M) K^-1, column by column from the local factor
+    row: Tensor | None = None  # (..., M) k(x, c_i)
+    sampled: Tensor | None = None  # (...) V(x)
+
+    def at(self, k: int) -> Known:
+        """The same of time k alone, where the fields are (B, C, ...)."""
+        return Known(*(None if field is None else field[:, k] for field in self))
 
 
 class NativeError(NamedTuple):
@@ -26,6 +65,7 @@ class NativeError(NamedTuple):
 
     gram: Tensor  # K, (..., M, M)
     values: Tensor  # V(c), (..., M)
+    known: Known = Known()
 
     def curvature(self, direction: Tensor) -> Tensor:
         """K v: (..., M) -> (..., M). Row by row, so that a row's bits do not depend on the batch."""
@@ -40,3 +80,41 @@ class NativeError(NamedTuple):
         difference = weights - ideal
         excess: Tensor = torch.linalg.vecdot(difference, self.curvature(difference))
         return excess
+
+    def spectrum(self) -> tuple[Tensor, Tensor]:
+        """The smallest and the largest eigenvalue of K: (...), (...)."""
+        found = extremes(self.gram) if self.known.extremes is None else self.known.extremes
+        return found[..., 0], found[..., 1]
+
+    def solve(self, values: Tensor) -> Tensor:
+        """K^-1 v: (..., M) -> (..., M)."""
+        if self.known.inverse is not None:
+            return (self.known.inverse * values.unsqueeze(-2)).sum(-1)
+        factor = pivoted_cholesky(self.gram)
+        return factor.solve_upper(factor.solve_lower(values))
+
+    def minimiser(self) -> Tensor:
+        """K^-1 V: (..., M)."""
+        return self.solve(self.values) if self.known.ideal is None else self.known.ideal
+
+    def sample(self) -> tuple[Tensor, Tensor]:
+        """k(x, c_i) and V(x) at the state.
+
+        Raises:
+            ValueError: if the objective was made without them.
+        """
+        row, sampled = self.known.row, self.known.sampled
+        if row is None or sampled is None:
+            raise ValueError(
+                "This law learns from V at the state alone: `NativeError(known=...)` must have the "
+                "fields `row` and `sampled`; got None."
+            )
+        return row, sampled
+
+
+def extremes(gram: Tensor) -> Tensor:
+    """Smallest and largest eigenvalue of K (..., M, M): (..., 2), NaN where K is not finite."""
+    finite = torch.isfinite(gram).all(-1).all(-1)[..., None, None]
+    identity = torch.eye(gram.shape[-1], dtype=gram.dtype, device=gram.device)
+    values = torch.linalg.eigvalsh(torch.where(finite, gram, identity))
+    return torch.where(finite.squeeze(-1), values[..., [0, -1]], torch.nan)

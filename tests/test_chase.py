@@ -22,7 +22,10 @@ def orbit(*starts: tuple[float, float], dt: float = 0.05, steps: int = 40) -> to
 
 
 def fields(result: ChaseResult) -> dict[str, torch.Tensor]:
-    return {field.name: getattr(result, field.name) for field in dataclasses.fields(result)}
+    """The tensors of a chase without a certificate."""
+    assert result.certificate is None
+    names = [field.name for field in dataclasses.fields(result) if field.name != "certificate"]
+    return {name: getattr(result, name) for name in names}
 
 
 def run(states: torch.Tensor, kernel: str = "exponential", **settings: object) -> ChaseResult:

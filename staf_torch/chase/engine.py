@@ -3,15 +3,19 @@ recursion, then everything that follows from the weights in bulk again."""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterable, Iterator
 
 import torch
 from torch import Tensor
 
-from .._checks import fail, integer, trailing
+from .._checks import integer, trailing
 from ..basis import StaFBasis, Target
 from ..objective import NativeError
 from ..optim.base import UpdateLaw
+from .certificate import Certificate, certify
+from .known import known as find_known
+from .predictors import Predictor
 from .recursion import Carry, recursion
 from .result import ChaseResult, concatenate
 
@@ -25,8 +29,9 @@ def chase(
     law: UpdateLaw,
     *,
     inner_steps: int = 10,
-    predictor: None = None,
+    predictor: Predictor | None = None,
     weights: Tensor | None = None,
+    certificate: bool = False,
 ) -> ChaseResult:
     """Chase the ideal weights of ``target`` along given trajectories.
 
@@ -46,8 +51,10 @@ def chase(
         target: V, (..., n) -> (...).
         law: the update law.
         inner_steps: iterations at every time, at least 0.
-        predictor: how the weights move between times; None keeps them.
+        predictor: how the weights move between times, `predictors.Secant()` or `predictors.Tangent()`;
+            None keeps them.
         weights: the paper's w before the first correction, (M,) or (B, M); zero by default.
+        certificate: whether the result has a `Certificate`.
 
     Raises:
         ValueError: if an argument breaks its rule, or the target returns another shape.
@@ -57,10 +64,19 @@ def chase(
     trailing("chase", "states", states, dims=3, last=basis.dim)
     if states.dim() != 3 or 0 in states.shape:
         raise ValueError(f"`chase(states=...)` must have the shape (B, T, n); got {tuple(states.shape)}.")
-    if predictor is not None:
-        raise fail("chase", "predictor", "must be None", predictor)
     pieces = states.split(chunk_length(states.shape[0], basis, states.element_size()), dim=1)
-    return concatenate(chase_pieces(pieces, basis, target, law, inner_steps=inner_steps, weights=weights))
+    return concatenate(
+        chase_pieces(
+            pieces,
+            basis,
+            target,
+            law,
+            inner_steps=inner_steps,
+            predictor=predictor,
+            weights=weights,
+            certificate=certificate,
+        )
+    )
 
 
 def chunk_length(batch: int, basis: StaFBasis, itemsize: int) -> int:
@@ -76,18 +92,24 @@ def chase_pieces(
     law: UpdateLaw,
     *,
     inner_steps: int = 10,
+    predictor: Predictor | None = None,
     weights: Tensor | None = None,
+    certificate: bool = False,
 ) -> Iterator[ChaseResult]:
     """`chase` over consecutive pieces of time (B, C, n), a result a piece."""
     integer("chase", "inner_steps", inner_steps, least=0)
     if not isinstance(law, UpdateLaw):
         raise ValueError(f"`chase(law=...)` must be an UpdateLaw; got {law!r}.")
+    if predictor is not None and not isinstance(predictor, Predictor):
+        raise ValueError(f"`chase(predictor=...)` must be a Predictor or None; got {predictor!r}.")
     carry, warned = None, False
     for states in pieces:
         warned = warned or basis.check_reach(states)
         if carry is None:
             carry = _start(states, basis, law, weights)
-        result, carry = _piece(states, basis, target, law, inner_steps, carry)
+            if predictor is not None:
+                carry = carry._replace(previous=carry.weights, states=states[:, [0, 0]])
+        result, carry = _piece(states, basis, target, law, inner_steps, predictor, certificate, carry)
         yield result
 
 
@@ -116,6 +138,8 @@ def _piece(
     target: Target,
     law: UpdateLaw,
     inner_steps: int,
+    predictor: Predictor | None,
+    certificate: bool,
     carry: Carry,
 ) -> tuple[ChaseResult, Carry]:
     """One piece of time: (B, C, n) and the carry to its result and the next carry."""
@@ -124,38 +148,58 @@ def _piece(
     gram = structure.scaled().expand(*states.shape[:2], basis.count, basis.count)
     zero = states.new_zeros(states.shape[:2])
     log_gain = zero if structure.log_gain is None else structure.log_gain
-    run = recursion(gram, values, log_gain, law, inner_steps, carry)
-
     space = basis.local(states)
     fitted = space.fit(values)
     ideal = space.scaled_weights(fitted)
-    objective = NativeError(gram, values)
     scale = zero.new_ones(()) if structure.scale is None else structure.scale
     here = states.new_zeros(1, basis.dim)
     row = basis.kernel.core(states, here, space.offsets).squeeze(-2)  # k0(0, d_i), (..., M)
+    value = target(states)
+    known = find_known(law.needs, space, gram, ideal, scale * row, value)
+
+    if predictor is None:
+        run = recursion(gram, values, log_gain, law, inner_steps, carry, known)
+    else:
+        assert carry.states is not None
+        around = torch.cat((carry.states, states), dim=1)
+        parts = predictor.prepare(basis, target, around, carry.time)
+        run = recursion(gram, values, log_gain, law, inner_steps, carry, known, predictor, parts)
+        run = run._replace(carry=run.carry._replace(states=around[:, -2:]))
+
+    objective = NativeError(gram, values)
     times = torch.arange(carry.time, run.carry.time, device=states.device)
     end = run.carry.diverged_at[:, None]
     lost = (end >= 0) & (times >= end)
     # Frozen weights stay in the units of the last state that they were corrected at.
     inverse_gain = (-torch.where(lost, run.carry.log_gain[:, None], log_gain)).exp()
 
-    def known(quantity: Tensor) -> Tensor:
+    def reached(quantity: Tensor) -> Tensor:
         return torch.where(lost.view(*lost.shape, *[1] * (quantity.dim() - 2)), torch.nan, quantity)
 
     def at_state(scaled_weights: Tensor) -> Tensor:
-        return known(torch.linalg.vecdot(row, scale * scaled_weights))
+        return reached(torch.linalg.vecdot(row, scale * scaled_weights))
 
     result = ChaseResult(
         state=states,
         weights=run.after * inverse_gain[..., None],
-        ideal_weights=known(ideal * inverse_gain[..., None]),
-        coefficients=known(scale * run.after),
-        value=known(target(states)),
+        ideal_weights=reached(ideal * inverse_gain[..., None]),
+        coefficients=reached(scale * run.after),
+        value=reached(value),
         estimate=at_state(run.after),
         estimate_before=at_state(run.before),
-        ideal_estimate=known(space.evaluate(here, fitted).squeeze(-1)),
-        excess=known(objective.excess(run.after, ideal) * inverse_gain),
-        excess_before=known(objective.excess(run.before, ideal) * inverse_gain),
+        ideal_estimate=reached(space.evaluate(here, fitted).squeeze(-1)),
+        excess=reached(objective.excess(run.after, ideal) * inverse_gain),
+        excess_before=reached(objective.excess(run.before, ideal) * inverse_gain),
         diverged_at=run.carry.diverged_at,
     )
-    return result, run.carry
+    if not certificate:
+        return result, run.carry
+    vouched, link = certify(objective, log_gain, law, inner_steps, run.before, run.after, ideal, carry.link)
+    vouched = Certificate(
+        rate=reached(vouched.rate),
+        growth=reached(vouched.growth),
+        drift=reached(vouched.drift),
+        bound=reached(vouched.bound),
+        violated=vouched.violated & ~lost,
+    )
+    return dataclasses.replace(result, certificate=vouched), run.carry._replace(link=link)

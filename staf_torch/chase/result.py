@@ -8,6 +8,8 @@ from collections.abc import Iterable
 import torch
 from torch import Tensor
 
+from .certificate import Certificate
+
 
 @dataclasses.dataclass(frozen=True)
 class ChaseResult:
@@ -29,6 +31,7 @@ class ChaseResult:
     excess: Tensor  # (B, T) F(a) - F(w)
     excess_before: Tensor  # (B, T)
     diverged_at: Tensor  # (B,) int64 index of the first time that is not finite, -1 if none
+    certificate: Certificate | None = None  # where it was asked for
 
     @property
     def diverged(self) -> Tensor:
@@ -42,6 +45,13 @@ def concatenate(pieces: Iterable[ChaseResult]) -> ChaseResult:
     joined = {
         field.name: torch.cat([getattr(part, field.name) for part in parts], dim=1)
         for field in dataclasses.fields(ChaseResult)
-        if field.name != "diverged_at"
+        if field.name not in ("diverged_at", "certificate")
     }
-    return ChaseResult(**joined, diverged_at=parts[-1].diverged_at)
+    vouched = [part.certificate for part in parts if part.certificate is not None]
+    return ChaseResult(
+        **joined,
+        diverged_at=parts[-1].diverged_at,
+        certificate=Certificate(*(torch.cat(terms, dim=1) for terms in zip(*vouched, strict=True)))
+        if vouched
+        else None,
+    )

@@ -13,7 +13,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor, nn
 
-from .._checks import COMMAND_LINE, choice, fail, integer, positive_real, real, vector
+from .._checks import COMMAND_LINE, choice, fail, flag, integer, positive_real, real, vector
 from ..basis import StaFBasis, Target
 from ..centers import (
     Radius,
@@ -25,6 +25,7 @@ from ..centers import (
     rings,
     simplex,
 )
+from ..chase.predictors import Predictor
 from ..optim import UpdateLaw
 from ..systems import ControlAffineSystem
 
@@ -44,6 +45,8 @@ class ChaseProblem:
     steps: int  # T - 1
     inner_steps: int
     settle_time: float  # s
+    predictor: Predictor | None = None
+    certificate: bool = False
 
 
 def load(path: str, arguments: dict[str, Any] | None = None) -> Any:
@@ -101,6 +104,8 @@ def chase_problem(cfg: DictConfig) -> ChaseProblem:
         steps=math.floor(duration / dt + 1e-9),
         inner_steps=inner_steps,
         settle_time=real(COMMAND_LINE, "settle_time", cfg.settle_time),
+        predictor=None if cfg.predictor.get("_target_") is None else _make(cfg.predictor),
+        certificate=flag(COMMAND_LINE, "certificate", cfg.certificate),
     )
 
 

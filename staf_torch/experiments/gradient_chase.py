@@ -56,7 +56,9 @@ def run(cfg: DictConfig, directory: Path) -> dict[str, float | None]:
     return outcome.metrics
 
 
-def solve(problem: ChaseProblem, writer: HistoryWriter | None = None) -> Outcome:
+def solve(
+    problem: ChaseProblem, writer: HistoryWriter | None = None, progress: Progress | None = None
+) -> Outcome:
     """The simulation itself, in pieces of time."""
     metrics = ChaseMetrics(
         problem.basis,
@@ -69,13 +71,21 @@ def solve(problem: ChaseProblem, writer: HistoryWriter | None = None) -> Outcome
     x0 = problem.initial_states
     times = problem.steps + 1
     chunk = chunk_length(x0.shape[0], problem.basis, x0.element_size())
-    # At least twenty pieces, so that progress is seen; the results do not depend on it.
-    chunk = max(1, min(chunk, -(-times // 20)))
+    # Some twenty pieces of a long run, so that progress is seen; the results do not depend on it.
+    chunk = max(1, min(chunk, max(64, -(-times // 20))))
     thinned = _Thinned(times)
-    progress = Progress(times, "times")
+    progress = Progress(times, "times") if progress is None else progress
     diverged_at = torch.full(x0.shape[:1], -1)
     states = trajectory(problem.system, x0, dt=problem.dt, steps=problem.steps, chunk=chunk)
-    chased = chase_pieces(states, problem.basis, problem.target, problem.law, inner_steps=problem.inner_steps)
+    chased = chase_pieces(
+        states,
+        problem.basis,
+        problem.target,
+        problem.law,
+        inner_steps=problem.inner_steps,
+        predictor=problem.predictor,
+        certificate=problem.certificate,
+    )
     with torch.no_grad():
         for result in chased:
             metrics.add(result)
@@ -132,7 +142,7 @@ def _summarise(problem: ChaseProblem, metrics: dict[str, float | None]) -> None:
 
     batch, count = problem.initial_states.shape[0], problem.basis.count
     _log.info(
-        "Gradient chase: %d %s, %d times, dt = %g s, %d centers, %s, %s x %d",
+        "Gradient chase: %d %s, %d times, dt = %g s, %d centers, %s, %s x %d%s",
         batch,
         "trajectory" if batch == 1 else "trajectories",
         problem.steps + 1,
@@ -141,6 +151,7 @@ def _summarise(problem: ChaseProblem, metrics: dict[str, float | None]) -> None:
         type(problem.basis.kernel).__name__,
         type(problem.law).__name__,
         problem.inner_steps,
+        "" if problem.predictor is None else f", {type(problem.predictor).__name__.lower()} predictor",
     )
     if metrics["ultimate_error"] is None:
         _log.warning(

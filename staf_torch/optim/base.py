@@ -4,35 +4,90 @@ from __future__ import annotations
 
 import abc
 
+import torch
 from torch import Tensor
 
 from ..objective import Objective
 
 LawState = tuple[Tensor, ...]
-"""What a law carries from one iteration to the next: tensors (..., M), or (...) a row."""
+"""What a law carries from one iteration to the next: tensors (...), (..., M) or (..., M, M) a row."""
 
 
 class UpdateLaw(abc.ABC):
     """A pure iteration on a quadratic: state goes in as an argument and comes out as a value.
 
     A law object holds hyperparameters only. Rows never touch each other.
+
+    Attributes:
+        needs: the fields of `Known` that the law will ask for at every time; a chase computes them in
+            bulk. Without them an `Objective` computes what it is asked for on the spot.
+        step_size: the hyperparameter that a learning-rate schedule may drive, None where there is none.
     """
+
+    needs: frozenset[str] = frozenset()
+    step_size: float | None = None
 
     def init(self, weights: Tensor) -> LawState:
         """The state before the first iteration, for weights (..., M)."""
         return ()
+
+    def begin(self, objective: Objective, weights: Tensor, state: LawState) -> LawState:
+        """The state when a new objective begins: once a time step, before its first iteration."""
+        return state
 
     @abc.abstractmethod
     def step(self, objective: Objective, weights: Tensor, state: LawState) -> tuple[Tensor, LawState]:
         """One iteration: the new weights (..., M) and the new state."""
 
     def rescale(self, state: LawState, factor: Tensor) -> LawState:
-        """The state when the unit of the weights changes, a -> factor a: (..., 1).
+        """The state when the unit of the weights changes, a -> factor a, K -> K / factor: (..., 1).
 
-        The default scales everything, as is right for velocities and directions.
+        The default scales everything, as is right for velocities.
         """
         return tuple(part * factor for part in state)
 
     def contraction(self, condition_number: Tensor) -> Tensor | None:
         """A bound on excess after / excess before of one iteration, from kappa(K); None: not known."""
         return None
+
+    def with_step_size(self, size: float) -> UpdateLaw:
+        """The same law with another `step_size`.
+
+        Raises:
+            ValueError: if the law has none, or the size breaks its rule.
+        """
+        raise ValueError(f"`{type(self).__name__}` has no step size to set; got {size!r}.")
+
+
+def line_search(objective: Objective, g: Tensor, direction: Tensor) -> Tensor:
+    """lambda = g'p / (2 p'K p), the minimiser of F(a + lambda p), and 0 where p'K p is not positive.
+
+    Args:
+        objective: F.
+        g: -grad F(a), (..., M).
+        direction: p, (..., M).
+
+    Returns:
+        (..., 1).
+    """
+    slope = torch.linalg.vecdot(g, direction)
+    curvature = torch.linalg.vecdot(direction, objective.curvature(direction))
+    usable = curvature > 0
+    length = torch.where(usable, slope / (2 * torch.where(usable, curvature, 1.0)), 0.0)
+    return length.unsqueeze(-1)
+
+
+def worse_than_none(objective: Objective, weights: Tensor, g: Tensor) -> Tensor:
+    """Whether F(a) > F(0): the sign, seen from outside, that a law with momentum has lost its row.
+
+    Args:
+        objective: F.
+        weights: a, (..., M).
+        g: -grad F(a), (..., M).
+
+    Returns:
+        (..., 1) bool; F(a) - F(0) = -a'(V + g/2) needs no further product with K.
+    """
+    rise = -torch.linalg.vecdot(weights, objective.values + g / 2)
+    worse: Tensor = (rise > 0).unsqueeze(-1)
+    return worse

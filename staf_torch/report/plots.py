@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 _DPI = 200
 _DECADES = 1e-6  # of its largest value a log axis shows at most
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
+_MARKERS = "osD^vP*X"
 _DASHES = ("-", "--", "-.", ":")  # so that the curves can be told apart in grey
 
 
@@ -28,6 +29,15 @@ class ChaseHistory(NamedTuple):
     weights: np.ndarray  # (T, M)
     ideal_weights: np.ndarray  # (T, M)
     excess: np.ndarray  # (T,)
+
+
+class ConvergenceCurve(NamedTuple):
+    """The ultimate excess of one law and predictor against the step."""
+
+    label: str
+    step: np.ndarray  # seconds
+    excess: np.ndarray
+    slope: float | None
 
 
 def save(figure: Figure, stem: Path) -> None:
@@ -52,6 +62,33 @@ def draw_chase(history: ChaseHistory) -> Figure:
         for axes in (low_left, low_right):
             axes.set_xlabel("time (s)")
         figure.draw_without_rendering()  # lays out under this style, not under the caller's
+        return figure
+
+
+def draw_convergence(curves: list[ConvergenceCurve]) -> Figure:
+    """Excess before the correction against the step, both logarithmic, with the slopes in the legend."""
+    style = importlib.resources.files(__package__) / "staf.mplstyle"
+    with importlib.resources.as_file(style) as path, matplotlib.rc_context(fname=path):
+        figure = Figure(figsize=(7.2, 3.6), layout="constrained")
+        axes = figure.subplots()
+        for i, curve in enumerate(curves):
+            slope = "-" if curve.slope is None else f"{curve.slope:.1f}"
+            axes.loglog(
+                curve.step,
+                _positive(curve.excess),
+                _dash(i),
+                marker=_MARKERS[i % len(_MARKERS)],
+                markersize=4,
+                color=_colour(i),
+                label=f"{curve.label}: {slope}",
+            )
+        steps = np.unique(np.concatenate([curve.step for curve in curves]))
+        axes.set_xticks(steps, [f"{step:g}" for step in steps])
+        axes.minorticks_off()
+        axes.set_xlabel("step $\\Delta t$ (s)")
+        axes.set_ylabel("ultimate excess before the correction")
+        axes.legend(title="law, iterations, predictor: slope", loc="center left", bbox_to_anchor=(1.0, 0.5))
+        figure.draw_without_rendering()
         return figure
 
 

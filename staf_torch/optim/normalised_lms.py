@@ -1,0 +1,45 @@
+"""The online case: one sample of V a time step."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from .._checks import fail, positive_real
+from ..objective import Objective
+from .base import LawState, UpdateLaw
+
+
+class NormalisedLMS(UpdateLaw):
+    """a <- a + s (V(x) - V^(x)) sigma / sigma'sigma, sigma_i = k(x, c_i(x)): only V at the state is measured.
+
+    With s = 1 the new weights are the nearest to a that reproduce the sample: a projection, so iterations
+    beyond one change nothing. The distance to any weights that reproduce it never grows for 0 < s < 2.
+    One sample a time step says nothing about the gradient of V; along a trajectory that does not excite
+    all M directions, the error at the state is small and the error on the ball is not.
+
+    Args:
+        step: s, 0 < s < 2.
+
+    Raises:
+        ValueError: if ``step`` breaks its rule.
+
+    Source: Haykin, "Adaptive Filter Theory" (2002), chapter 6; Kaczmarz (1937).
+    """
+
+    needs = frozenset({"row", "sampled"})
+
+    def __init__(self, step: float = 1.0) -> None:
+        self.step_size: float = positive_real("NormalisedLMS", "step", step)
+        if self.step_size >= 2:
+            raise fail("NormalisedLMS", "step", "must be below 2, or it diverges", step)
+
+    def step(self, objective: Objective, weights: Tensor, state: LawState) -> tuple[Tensor, LawState]:
+        row, sampled = objective.sample()
+        power = torch.linalg.vecdot(row, row)
+        error = sampled - torch.linalg.vecdot(row, weights)
+        length = torch.where(power > 0, error / torch.where(power > 0, power, 1.0), 0.0)
+        return weights + self.step_size * length.unsqueeze(-1) * row, state
+
+    def with_step_size(self, size: float) -> NormalisedLMS:
+        return NormalisedLMS(size)

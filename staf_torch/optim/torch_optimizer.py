@@ -1,0 +1,168 @@
+"""The update laws as a torch optimizer."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.optim.optimizer import Optimizer, ParamsT
+
+from .._checks import fail, integer
+from ..objective import NativeError
+from .base import UpdateLaw
+
+
+class ChaseOptimizer(Optimizer):
+    """An update law on any torch loss that is quadratic in its parameters.
+
+    A parameter (..., M) holds one independent problem a leading row: the loss is the sum over rows, or a
+    tensor of row losses, and no row's loss may depend on another row or on another parameter's rows. The
+    slope and the curvature come from autograd (double backward), the curvature exactly, one
+    Hessian-vector product where `chase` has a product with K. Each `step` is a new objective (`begin`)
+    and ``inner_steps`` iterations.
+
+    Example:
+        >>> weights = torch.zeros(5, 3, dtype=torch.float64, requires_grad=True)
+        >>> optimizer = optim.ChaseOptimizer([weights], optim.ConjugateGradient(), inner_steps=3)
+        >>> loss = optimizer.step(lambda: (weights @ factor - samples).square().sum(-1))
+
+    Parameter groups have ``inner_steps``, and ``lr`` where the law has a `step_size`, which it then sets:
+    learning-rate schedulers work on these laws. A rate of zero leaves the parameters alone.
+
+    Args:
+        params: parameters (..., M), or parameter groups.
+        law: the update law; not one that learns from a sample at a state (`NormalisedLMS`).
+        inner_steps: iterations a `step`, at least 1.
+
+    Raises:
+        ValueError: if an argument breaks its rule, or `step` gets no closure, or one that does not
+            return a differentiable loss.
+    """
+
+    def __init__(self, params: ParamsT, law: UpdateLaw, *, inner_steps: int = 1) -> None:
+        if not isinstance(law, UpdateLaw):
+            raise fail("ChaseOptimizer", "law", "must be an UpdateLaw", law)
+        if "sampled" in law.needs:
+            raise fail("ChaseOptimizer", "law", "must not need a sample at a state, as a loss has none", law)
+        self.law = law
+        defaults: dict[str, Any] = {"inner_steps": inner_steps}
+        if law.step_size is not None:
+            defaults["lr"] = law.step_size
+        super().__init__(params, defaults)
+
+    def add_param_group(self, param_group: dict[str, Any]) -> None:
+        """A further group of parameters, with its own ``inner_steps`` and ``lr``."""
+        super().add_param_group(param_group)
+        group = self.param_groups[-1]
+        integer("ChaseOptimizer", "inner_steps", group["inner_steps"], least=1)
+        for parameter in group["params"]:
+            if parameter.dim() == 0 or not parameter.is_floating_point():
+                raise ValueError(
+                    "`ChaseOptimizer(params=...)` must be floating-point tensors (..., M); "
+                    f"got the shape {tuple(parameter.shape)}."
+                )
+
+    @torch.no_grad()
+    def step(self, closure: Callable[[], Tensor] | None = None) -> Tensor:  # type: ignore[override]
+        """One time step of the law.
+
+        Args:
+            closure: returns the loss, a scalar or one number a row; it does not call ``backward``.
+
+        Returns:
+            The loss before the step, detached.
+        """
+        if closure is None:
+            raise ValueError("`ChaseOptimizer.step(closure=...)` must be a function that returns the loss.")
+        with torch.enable_grad():
+            loss = closure()
+        groups = [(group, p) for group in self.param_groups for p in group["params"] if p.requires_grad]
+        moved = []
+        for (group, parameter), slope in zip(groups, _slopes(loss, [p for _, p in groups]), strict=True):
+            if slope is not None and group.get("lr") != 0:
+                moved.append((parameter, self._advanced(group, parameter, slope)))
+        for parameter, weights in moved:  # only now: the curvature was taken at the old parameters
+            parameter.copy_(weights)
+        return loss.detach()
+
+    def _advanced(self, group: dict[str, Any], parameter: Tensor, slope: Tensor) -> Tensor:
+        """The parameter's new value."""
+        objective = LossObjective(parameter, slope)
+        law = self.law if "lr" not in group else self.law.with_step_size(float(group["lr"]))
+        weights, memory = parameter.detach().clone(), self.state[parameter]
+        state = law.begin(objective, weights, memory["law"] if "law" in memory else law.init(weights))
+        for _ in range(group["inner_steps"]):
+            weights, state = law.step(objective, weights, state)
+        memory["law"] = state
+        return weights
+
+
+class LossObjective:
+    """The quadratic that a loss is in one of its parameters: F with -grad F(a) = g and Hessian 2 K.
+
+    Args:
+        parameter: a_0, (..., M), where the slope was taken.
+        slope: grad F(a_0), (..., M), with its graph.
+    """
+
+    def __init__(self, parameter: Tensor, slope: Tensor) -> None:
+        self._parameter, self._slope = parameter, slope
+        self._at, self._descent = parameter.detach().clone(), -slope.detach()
+
+    def curvature(self, direction: Tensor) -> Tensor:
+        """K v: (..., M) -> (..., M)."""
+        if not self._slope.requires_grad:  # a loss that is linear in this parameter
+            return torch.zeros_like(direction)
+        with torch.enable_grad():
+            (product,) = torch.autograd.grad(
+                self._slope, self._parameter, direction, retain_graph=True, allow_unused=True
+            )
+        return torch.zeros_like(direction) if product is None else product.detach() / 2
+
+    def descent(self, weights: Tensor) -> Tensor:
+        """g at any weights, from the slope at a_0 and the curvature: (..., M) -> (..., M)."""
+        return self._descent - 2 * self.curvature(weights - self._at)
+
+    @functools.cached_property
+    def values(self) -> Tensor:
+        """V = g(0) / 2: (..., M)."""
+        return self.descent(torch.zeros_like(self._at)) / 2
+
+    @functools.cached_property
+    def gram(self) -> Tensor:
+        """K, column by column: (..., M, M)."""
+        units = torch.eye(self._at.shape[-1], dtype=self._at.dtype, device=self._at.device)
+        return torch.stack([self.curvature(unit.expand_as(self._at)) for unit in units], dim=-1)
+
+    def spectrum(self) -> tuple[Tensor, Tensor]:
+        """The smallest and the largest eigenvalue of K: (...), (...)."""
+        return NativeError(self.gram, self._descent).spectrum()
+
+    def solve(self, values: Tensor) -> Tensor:
+        """K^-1 v: (..., M) -> (..., M)."""
+        return NativeError(self.gram, self._descent).solve(values)
+
+    def minimiser(self) -> Tensor:
+        """K^-1 V: (..., M)."""
+        return self.solve(self.values)
+
+    def sample(self) -> tuple[Tensor, Tensor]:
+        """A loss has none."""
+        raise ValueError("A loss has no sample at a state.")
+
+
+def _slopes(loss: object, parameters: list[Tensor]) -> tuple[Tensor | None, ...]:
+    if not isinstance(loss, Tensor) or not loss.requires_grad:
+        got = f"a tensor {tuple(loss.shape)} without a graph" if isinstance(loss, Tensor) else repr(loss)
+        raise ValueError(f"`ChaseOptimizer.step(closure=...)` must return a differentiable loss; got {got}.")
+    try:
+        with torch.enable_grad():
+            return torch.autograd.grad(loss.sum(), parameters, create_graph=True, allow_unused=True)
+    except RuntimeError as error:
+        raise ValueError(
+            "`ChaseOptimizer.step(closure=...)` must return the loss without calling `backward` on it; "
+            f"autograd says: {error}"
+        ) from error

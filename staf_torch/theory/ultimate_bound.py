@@ -1,0 +1,175 @@
+"""How near a gradient chase comes, before it is run."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from .._checks import fail, integer, positive_real, trailing
+from ..basis import StaFBasis, Target
+from ..chase import along, gram_rates
+from ..linalg import condition_number
+from ..optim import UpdateLaw
+
+
+class DriftConstants(NamedTuple):
+    """The worst over a set of states, in the norm |v|^2 = v'K(c(x))v of each."""
+
+    condition_number: float  # kappa = max lambda_max(K) / lambda_min(K)
+    speed: float  # W = max |w'|, of the ideal weights, a second
+    growth: float  # G = max(0, max lambda_max(K^-1 K') / 2), 1/s: how fast the norm itself can grow
+
+
+class UltimateBound(NamedTuple):
+    """limsup of the excess F(a_k) - F(w_k); inf where nothing is promised."""
+
+    before: float  # as brought to x_k
+    after: float  # as corrected at x_k
+
+
+def drift_constants(basis: StaFBasis, target: Target, states: Tensor, velocities: Tensor) -> DriftConstants:
+    """The constants of `ultimate_bound` over given states.
+
+    They hold for trajectories that stay among these states; sample the region, or a trajectory, densely.
+
+    Args:
+        basis: kernel and centers.
+        target: V.
+        states: x, (..., n).
+        velocities: x' there, (..., n), in units of the state a second: ``system.drift(states)``.
+
+    Raises:
+        ValueError: if the shapes differ, or K is numerically singular at one of the states.
+    """
+    trailing("drift_constants", "states", states, dims=1, last=basis.dim)
+    if velocities.shape != states.shape:
+        raise ValueError(
+            f"`drift_constants(velocities=...)` must have the shape of the states, {tuple(states.shape)}; "
+            f"got {tuple(velocities.shape)}."
+        )
+    rates = gram_rates(basis, target, states, velocities)
+    factor, failed = torch.linalg.cholesky_ex(rates.gram)
+    if bool((failed > 0).any()) or not bool(torch.isfinite(rates.gram).all()):
+        raise fail("drift_constants", "states", "must have a positive definite K(c(x)) each", states)
+    gain, gain_rate = _gain(basis, states, velocities)
+
+    def lower(right: Tensor) -> Tensor:
+        solved: Tensor = torch.linalg.solve_triangular(factor, right, upper=False)
+        return solved
+
+    # With L L' = e^{-g} K, in orthonormal coordinates L'v: K^-1 K' is L^-1 gram' L^-T + g', and
+    # w' = e^{-g} (gram^-1 (V' - gram' w~) - g' w~), w~ = e^g w = gram^-1 V.
+    inner = lower(lower(rates.gram_rate).mT)
+    inner = (inner + inner.mT) / 2 + gain_rate[..., None, None] * torch.eye(basis.count).to(inner)
+    value = lower(rates.values.unsqueeze(-1))
+    speed = (lower(rates.values_rate.unsqueeze(-1)) - inner @ value).squeeze(-1).norm(dim=-1)
+    growth = torch.linalg.eigvalsh(inner)[..., -1] / 2
+    return DriftConstants(
+        condition_number=float(condition_number(rates.gram).max()),
+        speed=float((speed * (-gain / 2).exp()).max()),
+        growth=max(0.0, float(growth.max())),
+    )
+
+
+def ultimate_bound(
+    constants: DriftConstants, law: UpdateLaw, *, dt: float, inner_steps: int
+) -> UltimateBound:
+    """The a-priori radius that the excess of a chase without predictor ends in.
+
+    With q = delta(kappa)^{its/2} the law's contraction of sqrt(e) and D = W (e^{G dt} - 1) / G >= W dt the
+    way of the ideal weights in a step, sqrt(e) before the correction follows
+
+        s_{k+1} <= q e^{G dt} s_k + D,   so   limsup s <= D / (1 - q e^{G dt}),
+
+    and q times that after it: the excess is O(dt^2), where the theorem of the paper gives O(dt).
+
+    Args:
+        constants: of the region or trajectory, `drift_constants`.
+        law: an update law with a known `contraction`.
+        dt: step, s.
+        inner_steps: iterations a step.
+
+    Raises:
+        ValueError: if the law has no known rate, or a number breaks its rule.
+
+    Source: Rosenfeld et al., section 6, with the norm that changes along the way taken into account.
+    """
+    positive_real("ultimate_bound", "dt", dt)
+    q = _contraction("ultimate_bound", constants, law, inner_steps)
+    if constants.growth * dt > 700:
+        return UltimateBound(math.inf, math.inf)
+    left = 1 - q * math.exp(constants.growth * dt)
+    if left <= 0:
+        return UltimateBound(math.inf, math.inf)
+    growth = constants.growth * dt
+    way = constants.speed * dt * (math.expm1(growth) / growth if growth > 0 else 1.0)
+    return UltimateBound(before=(way / left) ** 2, after=(q * way / left) ** 2)
+
+
+def step_for_bound(
+    constants: DriftConstants, law: UpdateLaw, *, excess: float, inner_steps: int, before: bool = False
+) -> float:
+    """The largest dt (s) whose `ultimate_bound` is at most ``excess``, after the correction or before it.
+
+    Raises:
+        ValueError: if the law has no known rate, or a number breaks its rule.
+    """
+    radius = math.sqrt(positive_real("step_for_bound", "excess", excess))
+    q = _contraction("step_for_bound", constants, law, inner_steps)
+    way = constants.speed * (1.0 if before else q)  # W q expm1(G dt) / G + q r expm1(G dt) <= r (1 - q)
+    room, growth = radius * (1 - q), constants.growth
+    if way == 0 and q * growth == 0:
+        return math.inf
+    if growth == 0:
+        return room / way
+    return math.log1p(room / (way / growth + q * radius)) / growth
+
+
+def steps_for_bound(
+    constants: DriftConstants, law: UpdateLaw, *, excess: float, dt: float, before: bool = False
+) -> int | None:
+    """The fewest iterations a step whose `ultimate_bound` is at most ``excess``; None where none are enough.
+
+    Raises:
+        ValueError: if the law has no known rate, or a number breaks its rule.
+    """
+    radius = math.sqrt(positive_real("steps_for_bound", "excess", excess))
+    growth = positive_real("steps_for_bound", "dt", dt) * constants.growth
+    one = _contraction("steps_for_bound", constants, law, 1)
+    if growth > 700:
+        return None
+    way = constants.speed * dt * (math.expm1(growth) / growth if growth > 0 else 1.0)
+    # The largest contraction of a whole step that will do.
+    q = (1 - way / radius) * math.exp(-growth) if before else radius / (way + radius * math.exp(growth))
+    if q <= 0 or one >= 1:
+        return None
+    if one <= q:
+        return 1
+    count = math.ceil(math.log(q) / math.log(one) - 1e-12)
+    return max(count, 1)
+
+
+def _contraction(call: str, constants: DriftConstants, law: UpdateLaw, inner_steps: int) -> float:
+    """q = delta(kappa)^{its/2}."""
+    integer(call, "inner_steps", inner_steps, least=1)
+    rate = law.contraction(torch.tensor(constants.condition_number, dtype=torch.float64))
+    if rate is None:
+        raise fail(call, "law", "must have a known contraction an iteration", type(law).__name__)
+    return math.pow(float(rate), inner_steps / 2)
+
+
+def _gain(basis: StaFBasis, x: Tensor, velocity: Tensor) -> tuple[Tensor, Tensor]:
+    """g(x) and its derivative along the velocity: (...), (...)."""
+    zero = x.new_zeros(x.shape[:-1])
+    if basis.kernel.log_gain(x) is None:
+        return zero, zero
+
+    def gain(at: Tensor) -> Tensor:
+        found = basis.kernel.log_gain(at)
+        assert found is not None
+        return found
+
+    return along(gain, x, velocity)
