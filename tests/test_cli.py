@@ -97,7 +97,9 @@ def test_every_option_of_every_group_runs(name: str, outcomes: dict[str, Outcome
     run = run_directory(outcomes[name])
     found = metrics(run)
     assert set(found) == KEYS
-    assert all(found[key] is not None and math.isfinite(found[key]) for key in KEYS)
+    rated = KEYS - ({"contraction_violations"} if found["contraction_violations"] is None else set())
+    assert rated == KEYS or name.startswith("optimizer")  # not every law promises a rate
+    assert all(found[key] is not None and math.isfinite(found[key]) for key in rated)
     assert found["diverged_fraction"] == 0
     assert {path.name for path in run.iterdir()} == {".hydra", "staf.log", "metrics.json", "history.npz"}
 
