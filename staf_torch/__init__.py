@@ -3,6 +3,7 @@
 from . import optim as optim
 from . import systems as systems
 from . import targets as targets
+from . import theory as theory
 from .basis import StaFBasis as StaFBasis
 from .centers import ConstantRadius as ConstantRadius
 from .centers import StateFollowingCenters as StateFollowingCenters
