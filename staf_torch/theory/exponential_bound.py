@@ -203,8 +203,8 @@ class _Problem(NamedTuple):
             degree += 1
         raise ValueError(
             f"`exponential_bound(epsilon=...)` must be in the reach of polynomials of degree {degree - 1} "
-            f"({math.comb(dim + degree - 1, dim)} terms), but theirs leave {functions.what} an error of "
-            f"{shortfall:.3g} times what the proof allows ({float(functions.tolerance.min()):.3g}) on a ball: "
+            f"({math.comb(dim + degree - 1, dim)} terms), but theirs leave {functions.what} an error "
+            f"of {shortfall:.3g} times what is allowed ({float(functions.tolerance.min()):.3g}) on a ball: "
             f"a larger epsilon or max_degree, or a smaller radius or domain, may do; got {self.epsilon!r}."
         )
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -21,7 +21,8 @@ _DIRECTIONS = {1: 2, 2: 160}  # of each shell; in space 256
 _MOST_CENTERS = 500
 
 
-class MinimalCount(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class MinimalCount:
     """What `minimal_count` returns, over L layouts and the states (...) of a trajectory."""
 
     count: int  # the smallest M that does for all states
@@ -80,7 +81,7 @@ def minimal_count(
     trailing(call, "states", states, dims=1)
     allowed = positive_real(call, "epsilon", epsilon)
     families = standard_layouts(states.shape[-1]) if layouts is None else layouts
-    ordered = sorted(families, key=len)
+    ordered = sorted(_checked(call, families, states.shape[-1]), key=len)
     errors = layout_errors(target, kernel, states, radius, ordered)
     counts = torch.tensor([len(layout) for layout in ordered])
     good = errors <= allowed  # (L, ...)
@@ -124,10 +125,7 @@ def layout_errors(
     trailing(call, "states", states, dims=1)
     extent = positive_real(call, "radius", radius)
     dim = states.shape[-1]
-    if not layouts:
-        raise fail(call, "layouts", "must name at least one layout", layouts)
-    for layout in layouts:
-        trailing(call, "layouts", layout, dims=2, last=dim)
+    _checked(call, layouts, dim)
     grid = extent * ball_grid(dim, _SHELLS, _DIRECTIONS.get(dim, 256)).to(states)
     rows = states.reshape(-1, dim)
     with torch.no_grad():
@@ -136,6 +134,14 @@ def layout_errors(
             for u in layouts
         ]
     return torch.stack(found).reshape(len(found), *states.shape[:-1])
+
+
+def _checked(call: str, layouts: Sequence[Tensor], dim: int) -> Sequence[Tensor]:
+    if not layouts:
+        raise fail(call, "layouts", "must name at least one layout", layouts)
+    for layout in layouts:
+        trailing(call, "layouts", layout, dims=2, last=dim)
+    return layouts
 
 
 def _errors(

@@ -68,7 +68,9 @@ def near_best(points: Tensor, degree: int, values: Tensor, weight: Tensor, toler
     return NearBest(solved, error, lower)
 
 
-def _lawson(orthonormal: Tensor, f: Tensor, weight: Tensor, tolerance: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _lawson(
+    orthonormal: Tensor, f: Tensor, weight: Tensor, tolerance: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
     """`near_best` in a basis whose columns are orthonormal over the points: (P, C), (D, P)."""
     share = torch.full_like(f, 1 / f.shape[-1])  # of each point in the squared error, sums to one
     gamma = f.new_zeros(f.shape[0], orthonormal.shape[1])
