@@ -40,7 +40,7 @@ _HEADINGS = {
 def run(cfg: DictConfig, directory: Path) -> dict[str, float | None]:
     """Run what the settings describe and fill the run directory; `metrics.json` comes last."""
     found = solve(cfg)
-    rows = [{"radius": radius, "epsilon": epsilon} | row for (radius, epsilon), row in found.items()]
+    rows = [{"radius": radius, "epsilon": epsilon, **row} for (radius, epsilon), row in found.items()]
     lines = markdown_table(rows, _HEADINGS)
     write_text(directory / "exponential_bound.md", lines)
     write_text(directory / "exponential_bound.csv", csv_table(rows, list(_HEADINGS)))

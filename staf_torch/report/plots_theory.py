@@ -22,7 +22,7 @@ _SLOPES_UP_TO = 15  # centers: beyond, rounding takes over at small radii
 _BOUNDS = {
     "count": "two polynomials (paper)",
     "one_polynomial_count": "one polynomial",
-    "measured_count": "needed, ideal weights",
+    "measured_count": "measured with ideal weights",
 }
 
 
@@ -79,10 +79,22 @@ def draw_exponential_bound(found: Mapping[tuple[float, float], Mapping[str, floa
         for axes in list(grid.flat)[max(0, len(radii) - columns) : len(radii)]:
             axes.set_xlabel(r"largest error $\epsilon$")
             axes.tick_params(labelbottom=True)
+        _plain_ticks(grid[0, 0], found)
         handles, labels = grid[0, 0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside upper center", ncols=len(labels))
+        figure.legend(handles, labels, loc="outside upper center", ncols=len(labels), handlelength=3.2)
         figure.draw_without_rendering()  # lays out under this style, not under the caller's
         return figure
+
+
+def _plain_ticks(axes: Axes, found: Mapping[tuple[float, float], Mapping[str, float | None]]) -> None:
+    """Plain counts, and the values of epsilon that were computed; decades alone would be too few."""
+    most = max((row[name] or 1 for row in found.values() for name in _BOUNDS), default=1)
+    spread = [count for count in (1, 2, 3, 6, 10, 20, 50, 100, 200, 500, 1000) if count <= most]
+    axes.set_yticks(spread, [str(count) for count in spread])
+    epsilons = sorted({epsilon for _, epsilon in found})
+    shown = epsilons[:: -(-len(epsilons) // 6)]
+    axes.set_xticks(shown, [f"${_power(epsilon)}$" for epsilon in shown])
+    axes.minorticks_off()
 
 
 def _bounds(axes: Axes, rows: Mapping[float, Mapping[str, float | None]]) -> None:
@@ -121,7 +133,9 @@ def draw_feasibility(found: Feasibility) -> Figure:
         right.set_xlabel("radius $r$ of the ball")
         right.set_title("(b) along the whole trajectory", loc="left")
         handles, labels = right.get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside upper center", ncols=min(len(labels), 6))
+        figure.legend(
+            handles, labels, loc="outside upper center", ncols=min(len(labels), 6), handlelength=3.2
+        )
         figure.draw_without_rendering()
         return figure
 
@@ -150,7 +164,7 @@ def draw_layouts(curves: Sequence[LayoutCurve], radius: float, radii: np.ndarray
         left.set_xlabel("centers $M$")
         left.set_ylabel(r"$\sup\,|V - \hat V|$ on the ball")
         left.set_title(f"(a) $r = {radius:g}$", loc="left")
-        left.legend(loc="lower left")
+        left.legend(loc="lower left", handlelength=3.2)
         slopes = [_against_radius(right, curve, radii) for curve in _drawn(curves)]
         right.set_xscale("log")
         right.set_yscale("log")
@@ -158,7 +172,13 @@ def draw_layouts(curves: Sequence[LayoutCurve], radius: float, radii: np.ndarray
         right.minorticks_off()
         right.set_xlabel("radius $r$ of the ball")
         right.set_title("(b) slopes in $r$", loc="left")
-        right.legend(handles=slopes, title="layout, $M$: slope", loc="center left", bbox_to_anchor=(1.0, 0.5))
+        right.legend(
+            handles=slopes,
+            title="layout, $M$: slope",
+            handlelength=3.2,
+            loc="center left",
+            bbox_to_anchor=(1.0, 0.5),
+        )
         figure.draw_without_rendering()
         return figure
 
@@ -172,7 +192,7 @@ def _family(axes: Axes, curves: Sequence[LayoutCurve]) -> None:
     axes.plot(
         counts,
         _positive(errors),
-        "" if alone else _dash(i),
+        linestyle="none" if alone else _dash(i),
         marker=_MARKERS[i],
         markersize=8 if alone else 4,
         markerfacecolor="none" if alone else _colour(i),
