@@ -91,23 +91,18 @@ def solve(cfg: DictConfig) -> Bounds:
 def _bound(
     problem: ChaseProblem, domain: torch.Tensor, radius: float, epsilon: float, most: int
 ) -> dict[str, float | None]:
+    found: dict[str, float | None] = dict.fromkeys(list(_HEADINGS)[2:])
+    about = (problem.target, domain, radius, epsilon)
     try:
-        bound = theory.exponential_bound(problem.target, domain, radius, epsilon, max_degree=most)
+        one = theory.one_polynomial_bound(*about, max_degree=most)
+        found |= {"degree": one.degree, "one_polynomial_count": one.count}
+        found |= {"one_polynomial_m": one.m, "one_polynomial_error": one.error}
+        bound = theory.exponential_bound(*about, max_degree=most)
+        two = bound.two_polynomials
+        found |= {"N": bound.N, "S": bound.S, "count": two.count, "m": two.m, "error": two.error}
     except ValueError as error:
         _log.warning("r = %g: %s", radius, error)
-        return dict.fromkeys(list(_HEADINGS)[2:])
-    two, one = bound.two_polynomials, bound.one_polynomial
-    return {
-        "N": bound.N,
-        "S": bound.S,
-        "count": two.count,
-        "m": two.m,
-        "error": two.error,
-        "degree": one.degree,
-        "one_polynomial_count": one.count,
-        "one_polynomial_m": one.m,
-        "one_polynomial_error": one.error,
-    }
+    return found
 
 
 def _draw(found: Bounds, directory: Path) -> None:

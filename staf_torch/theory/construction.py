@@ -24,7 +24,7 @@ class Construction:
     Source: Rosenfeld et al., section 4, proof of the theorem on the exponential kernel.
     """
 
-    states: Tensor  # x, (D, n)
+    states: Tensor  # x, (D, n) float64
     radius: float  # of the balls
     m: int  # the centers stand 1/m apart
     factors: tuple[Tensor, ...]  # of each g_k the coefficients of (z / radius)^a, (D, C_k), graded
@@ -42,7 +42,7 @@ class Construction:
         return math.comb(self.states.shape[-1] + self.degree, self.degree)
 
     def __call__(self, z: Tensor) -> Tensor:
-        """F_m(x + z) at the offsets z (P, n), the same at each state, or (D, P, n): -> (D, P).
+        """F_m(x + z) at the offsets z (P, n), the same at each state, or (D, P, n): -> (D, P) float64.
 
         Raises:
             ValueError: if ``z`` has another shape.
@@ -51,8 +51,9 @@ class Construction:
         if z.dim() > 3 or (z.dim() == 3 and z.shape[0] != self.states.shape[0]):
             rule = f"must have the shape (P, n) or (D, P, n) with D = {self.states.shape[0]} states"
             raise fail("Construction", "z", rule, tuple(z.shape))
+        z = z.to(self.states)
         tau = self.m * torch.expm1(z / self.m) / self.radius
-        result = (self.states @ z.mT if z.dim() == 2 else (z @ self.states.unsqueeze(-1)).squeeze(-1)).exp()
+        result = (z @ self.states.unsqueeze(-1)).squeeze(-1).exp()
         for coefficients, degree in zip(self.factors, self.degrees, strict=True):
             result = result * (monomials(tau, degree) @ coefficients.unsqueeze(-1)).squeeze(-1)
         return result

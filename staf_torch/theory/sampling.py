@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
 
 from .._checks import integer, positive_real, vector
 from ..centers import probe_points
+
+_STARTS = 8  # points of the grid from which a supremum is sought
+_CLIMBS = 16
 
 
 def ball_grid(dim: int, shells: int, directions: int) -> Tensor:
@@ -50,6 +53,38 @@ def _directions(dim: int, shells: int, directions: int) -> Tensor:
     cloud = probe_points(shells * directions + 1, dim)[1:]
     unit: Tensor = cloud / cloud.norm(dim=-1, keepdim=True)
     return unit.reshape(shells, directions, dim)
+
+
+def supremum(function: Callable[[Tensor], Tensor], grid: Tensor, radius: float) -> Tensor:
+    """max f_j(z) over |z| <= radius for each of D functions: the largest values on a grid, then uphill.
+
+    From the points of the grid with the largest values a pattern search climbs on, in steps along the axes
+    that are halved where none of them gains; points that leave the ball go back to its surface.
+
+    Args:
+        function: f, offsets (P, n), the same for all, or (D, P, n), to values (D, P).
+        grid: of the ball, (P, n).
+        radius: of the ball.
+
+    Returns:
+        (D,), NaN where a value on the grid is.
+    """
+    values = function(grid)
+    best, where = values.topk(min(_STARTS, len(grid)))  # NaN counts as the largest
+    z = grid[where]  # (D, K, n)
+    axes = torch.eye(grid.shape[-1], dtype=grid.dtype, device=grid.device)
+    axes = torch.cat((axes, -axes))
+    step = torch.full_like(best, 0.25 * radius)
+    for _ in range(_CLIMBS):
+        trial = z.unsqueeze(-2) + step[..., None, None] * axes  # (D, K, 2n, n)
+        trial = trial * (radius / trial.norm(dim=-1, keepdim=True).clamp(min=radius))
+        gained, which = function(trial.flatten(1, 2)).unflatten(1, trial.shape[1:3]).max(-1)
+        better = gained > best
+        chosen = trial.gather(-2, which[..., None, None].expand(*which.shape, 1, trial.shape[-1])).squeeze(-2)
+        z = torch.where(better.unsqueeze(-1), chosen, z)
+        best = torch.where(better, gained, best)
+        step = torch.where(better, step, 0.5 * step)
+    return best.amax(-1)
 
 
 def disc(
