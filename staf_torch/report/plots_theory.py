@@ -18,7 +18,7 @@ from .plots import _colour, _dash, _positive
 
 _MARKERS = "osD^vP*X"
 _FAMILIES = ("rings", "ball", "polygon", "simplex", "cross_polytope")
-_SLOPES_UP_TO = 15  # centers: beyond, rounding takes over at small radii
+_SLOPES = 4  # layouts of a family: with more centers rounding takes over at small radii
 _BOUNDS = {
     "count": "two polynomials (paper)",
     "one_polynomial_count": "one polynomial",
@@ -204,8 +204,8 @@ def _family(axes: Axes, curves: Sequence[LayoutCurve]) -> None:
 def _drawn(curves: Sequence[LayoutCurve]) -> list[LayoutCurve]:
     """The curves of the right panel: rings in the plane, ball elsewhere, and the largest polygon."""
     family = "rings" if any(curve.family == "rings" for curve in curves) else "ball"
-    kept = [curve for curve in curves if curve.family == family and curve.count <= _SLOPES_UP_TO]
-    return kept + [curve for curve in curves if curve.family == "polygon"][-1:]
+    kept = [curve for curve in curves if curve.family == family]
+    return kept[:_SLOPES] + [curve for curve in curves if curve.family == "polygon"][-1:]
 
 
 def _against_radius(axes: Axes, curve: LayoutCurve, radii: np.ndarray) -> Line2D:

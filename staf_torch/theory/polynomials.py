@@ -43,8 +43,8 @@ def near_best(points: Tensor, degree: int, values: Tensor, weight: Tensor, toler
 
     Lawson's iteration: weighted least squares whose weights are multiplied by the errors they left.
     The error of every weighted fit bounds the best uniform error from below, so a row that cannot meet
-    its tolerance is known early; the iteration then stops, as the degree is of no use. It stops too when
-    every row is well within its tolerance.
+    its tolerance is known early; the iteration then stops for all, as the degree is of no use. A row that
+    is well within its tolerance is left as it is.
 
     Args:
         points: z, (P, n), well inside what is numerically fine for monomials: the unit ball.
@@ -76,6 +76,7 @@ def _lawson(
     gamma = f.new_zeros(f.shape[0], orthonormal.shape[1])
     best, error, lower = gamma, (weight * f).abs().amax(-1), torch.zeros_like(tolerance)
     rounding = 8 * torch.finfo(f.dtype).eps * error
+    enough = torch.maximum(_ENOUGH * tolerance, rounding)
     for _ in range(_ITERATIONS):
         # The correction of the last fit, not the fit anew: its rounding errors then shrink with it.
         pull = share * weight.square()
@@ -86,10 +87,9 @@ def _lawson(
         gamma = torch.where((failed == 0).unsqueeze(-1), gamma + step, gamma)
         left = weight * (f - gamma @ orthonormal.mT).abs()
         worst = left.amax(-1)
-        better = worst < error
+        better = (worst < error) & (error > enough)  # a row that is done stays as it is
         best, error = torch.where(better.unsqueeze(-1), gamma, best), torch.where(better, worst, error)
         lower = torch.maximum(lower, (share * left.square()).sum(-1).sqrt().where(failed == 0, 0.0))
-        enough = torch.maximum(_ENOUGH * tolerance, rounding)
         if bool((error <= enough).all()) or bool((lower > tolerance + rounding).any()):
             break
         share = share * left + _FLOOR * worst.unsqueeze(-1) / f.shape[-1]
