@@ -158,7 +158,6 @@ def _errors(
         def error(
             z: Tensor, x: Tensor = x, space: LocalSpace = space, coefficients: Tensor = coefficients
         ) -> Tensor:
-            z = z.expand(len(x), *z.shape[-2:])
             return (target(x.unsqueeze(-2) + z) - space.evaluate(z, coefficients)).abs()
 
         yield supremum(error, grid, radius)
