@@ -1,0 +1,6 @@
+"""Bases of a value function, one a file."""
+
+from .base import ValueBasis as ValueBasis
+from .quadratic import QuadraticBasis as QuadraticBasis
+from .rbf_grid import RBFGridBasis as RBFGridBasis
+from .staf import StaFValueBasis as StaFValueBasis
