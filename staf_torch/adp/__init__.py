@@ -1,0 +1,29 @@
+"""Adaptive dynamic programming: learn or compute a controller while, or before, it controls."""
+
+from .actor_critic import ActorCritic as ActorCritic
+from .bases import QuadraticBasis as QuadraticBasis
+from .bases import RBFGridBasis as RBFGridBasis
+from .bases import StaFValueBasis as StaFValueBasis
+from .bases import ValueBasis as ValueBasis
+from .bellman import bellman_error as bellman_error
+from .bellman import bellman_terms as bellman_terms
+from .bellman import hjb_residual as hjb_residual
+from .controller import Controller as Controller
+from .controller import Feedback as Feedback
+from .controller import Memory as Memory
+from .cost import BoundedInputCost as BoundedInputCost
+from .cost import Cost as Cost
+from .cost import QuadraticCost as QuadraticCost
+from .extrapolation import Extrapolation as Extrapolation
+from .extrapolation import QuadraturePoints as QuadraturePoints
+from .extrapolation import RandomPoints as RandomPoints
+from .laws import ActorCriticLaw as ActorCriticLaw
+from .laws import Gains as Gains
+from .laws import Information as Information
+from .laws import Published as Published
+from .laws import Weights as Weights
+from .lqr import LQR as LQR
+from .rollout import RolloutPolicy as RolloutPolicy
+from .simulation import LoopResult as LoopResult
+from .simulation import simulate as simulate
+from .supervisor import Supervised as Supervised

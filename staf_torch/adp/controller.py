@@ -6,7 +6,6 @@ import abc
 from collections.abc import Callable
 from typing import NamedTuple
 
-import torch
 from torch import Tensor, nn
 
 

@@ -126,7 +126,7 @@ def _centers(cfg: DictConfig, dim: int) -> StateFollowingCenters:
         "simplex": simplex,
         "cross_polytope": cross_polytope,
     }
-    choice("centers", "layout", layout, (*planar, *fixed, "ball"))
+    choice("centers", "layout", layout, (*planar, *fixed, "ball", "directions"))
     if layout in planar:
         if dim != 2:
             raise ValueError(
@@ -140,6 +140,9 @@ def _centers(cfg: DictConfig, dim: int) -> StateFollowingCenters:
             integer("centers", "count", count, least=1)
             rule = f"must be {len(directions)} (or null) for {layout} with {dim} states"
             raise fail("centers", "count", rule, count)
+    elif layout == "directions":
+        rows = [vector("centers", "directions", row, dim) for row in OmegaConf.to_container(cfg.directions)]
+        directions = torch.tensor(rows, dtype=torch.float64)
     else:
         directions = ball(count, dim)
     return StateFollowingCenters(directions, _radius(cfg))

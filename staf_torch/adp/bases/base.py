@@ -28,4 +28,5 @@ class ValueBasis(nn.Module, abc.ABC):
 
     def value(self, weights: Tensor, x: Tensor) -> Tensor:
         """V^(x) = W's(x; x): (..., M), (..., n) -> (...)."""
-        return (weights * self(x, x)).sum(-1)
+        values: Tensor = (weights * self(x, x)).sum(-1)
+        return values

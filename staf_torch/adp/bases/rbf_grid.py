@@ -27,7 +27,9 @@ class RBFGridBasis(ValueBasis):
         ValueError: if an argument breaks its rule.
     """
 
-    def __init__(self, dim: int, points: int = 5, half_width: float = 2.0, width: float | None = None) -> None:
+    def __init__(
+        self, dim: int, points: int = 5, half_width: float = 2.0, width: float | None = None
+    ) -> None:
         super().__init__()
         self.dim = integer("RBFGridBasis", "dim", dim, least=1)
         integer("RBFGridBasis", "points", points, least=2)

@@ -44,7 +44,9 @@ class StaFValueBasis(ValueBasis):
         self.count, self.dim = basis.count, basis.dim
         kernel, radius = basis.kernel, basis.centers.radius
         closed = isinstance(kernel, AnchoredKernel) and isinstance(kernel.kernel, ExponentialKernel)
-        self._closed = closed and (gradient == "partial" or radius.constant or isinstance(radius, StateRadius))
+        self._closed = closed and (
+            gradient == "partial" or radius.constant or isinstance(radius, StateRadius)
+        )
 
     def forward(self, y: Tensor, x: Tensor) -> Tensor:
         if self._closed:

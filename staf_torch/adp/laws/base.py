@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ..._checks import fail, real
+from ..._checks import fail, positive_real, real
 from ..bellman import BellmanTerms, bellman_error
 
 
@@ -71,10 +71,16 @@ class ActorCriticLaw(abc.ABC):
 
     Args:
         gains: the gains.
+        bound: of the norm of Wc and of Wa: after a step they are projected onto that ball. None for no
+            projection.
+
+    Raises:
+        ValueError: if ``bound`` is not positive.
     """
 
-    def __init__(self, gains: Gains | None = None) -> None:
+    def __init__(self, gains: Gains | None = None, bound: float | None = None) -> None:
         self.gains = Gains() if gains is None else gains
+        self.bound = None if bound is None else positive_real(type(self).__name__, "bound", bound)
 
     @abc.abstractmethod
     def init(self, critic: Tensor, actor: Tensor, gain: Tensor) -> Weights:
@@ -84,9 +90,20 @@ class ActorCriticLaw(abc.ABC):
     def rates(self, sums: BellmanSums, weights: Weights) -> Weights:
         """d/dt of the weights: the law in continuous time."""
 
-    @abc.abstractmethod
     def step(self, sums: BellmanSums, weights: Weights, dt: float) -> Weights:
-        """The weights after ``dt`` seconds with the sums held."""
+        """The weights after ``dt`` seconds with the sums held, projected."""
+        critic, actor, gain = self._move(sums, weights, dt)
+        return Weights(self._project(critic), self._project(actor), gain)
+
+    @abc.abstractmethod
+    def _move(self, sums: BellmanSums, weights: Weights, dt: float) -> Weights:
+        """The same without the projection."""
+
+    def _project(self, weights: Tensor) -> Tensor:
+        if self.bound is None:
+            return weights
+        norm = weights.square().sum(-1, keepdim=True).sqrt()
+        return torch.where(norm > self.bound, self.bound / norm, 1.0) * weights
 
     def sums(self, terms: BellmanTerms, masses: Tensor, weights: Weights) -> BellmanSums:
         """Sums over the points of ``terms``, the state first, the others of weights ``masses`` (N,)."""

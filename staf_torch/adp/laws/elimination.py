@@ -11,9 +11,9 @@ _UNROLLED = 12  # unknowns up to which elimination by whole-batch operations is 
 def solve_definite(matrix: Tensor, right: Tensor) -> Tensor:
     """M^-1 b for M positive definite: (..., M, M), (..., M) -> (..., M).
 
-    Gauss-Jordan elimination without pivoting, which is stable for a positive definite matrix, as operations over
-    the whole batch: a library call a row would take most of a step's time. A row whose matrix is not definite
-    comes out non-finite or wrong and is caught by the loop's monitor.
+    Gauss-Jordan elimination without pivoting, which is stable for a positive definite matrix, as operations
+    over the whole batch: a library call a row would take most of a step's time. A row whose matrix is not
+    finite comes out non-finite, and the loop's monitor catches it.
     """
     size = right.shape[-1]
     if size > _UNROLLED:

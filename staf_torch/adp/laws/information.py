@@ -36,7 +36,7 @@ class Information(ActorCriticLaw):
             gain=sums.information - self.gains.forgetting * weights.gain,
         )
 
-    def step(self, sums: BellmanSums, weights: Weights, dt: float) -> Weights:
+    def _move(self, sums: BellmanSums, weights: Weights, dt: float) -> Weights:
         gains = self.gains
         gain = math.exp(-gains.forgetting * dt) * weights.gain + dt * sums.information
         move = solve_definite(gain + dt * sums.curvature, dt * sums.critic_force)

@@ -34,6 +34,6 @@ class Published(ActorCriticLaw):
             gain=self.gains.forgetting * gain - shrink,
         )
 
-    def step(self, sums: BellmanSums, weights: Weights, dt: float) -> Weights:
+    def _move(self, sums: BellmanSums, weights: Weights, dt: float) -> Weights:
         rates = self.rates(sums, weights)
         return Weights(*(w + dt * rate for w, rate in zip(weights, rates, strict=True)))

@@ -1,22 +1,16 @@
-"""The closed loop: plant and controller advance together, all rows at once, one compiled step."""
+"""One step of the closed loop: plant and controller advance together, all rows at once."""
 
 from __future__ import annotations
 
-import dataclasses
-import logging
-from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from .._checks import choice, fail, integer, positive_real, trailing
+from .._checks import choice, positive_real
 from ..systems import ControlAffineSystem
 from .controller import Controller, Memory
 from .cost import Cost, matvec
-
-_log = logging.getLogger(__name__)
-_DRAWN_AHEAD = 256  # steps whose random numbers are drawn at once
 
 
 class LoopState(NamedTuple):
@@ -26,44 +20,6 @@ class LoopState(NamedTuple):
     cost: Tensor  # (B,) the integral of the cost rate so far
     alive: Tensor  # (B,) bool; a row that became non-finite keeps its last finite values
     memory: Memory
-
-
-class Record(NamedTuple):
-    """What is kept of one time: the state and memory there, and the control that starts there."""
-
-    x: Tensor
-    u: Tensor
-    cost: Tensor
-    critic: Tensor
-    actor: Tensor
-    alive: Tensor
-
-
-@dataclasses.dataclass(frozen=True)
-class LoopResult:
-    """A closed loop over the recorded times 0, dt every, 2 dt every, ..., the end included.
-
-    A row whose plant, control or weights became non-finite, or whose state left the ``limit``, is frozen at its
-    last good values from there on: `frozen_at` says when, and it counts as diverged.
-    """
-
-    time: Tensor  # (T,) seconds
-    state: Tensor  # (B, T, n)
-    control: Tensor  # (B, T, m)
-    actor_weights: Tensor  # (B, T, M); M = 0 for feedback laws
-    critic_weights: Tensor  # (B, T, M)
-    running_cost: Tensor  # (B, T) the cost from 0 to that time
-    frozen_at: Tensor  # (B,) seconds, inf for rows that never froze
-
-    @property
-    def cost(self) -> Tensor:
-        """(B,) the cost of the whole run; of a frozen row, until it froze."""
-        return self.running_cost[:, -1]
-
-    @property
-    def diverged(self) -> Tensor:
-        """(B,) bool."""
-        return torch.isfinite(self.frozen_at)
 
 
 class ClosedLoop(nn.Module):
@@ -76,6 +32,9 @@ class ClosedLoop(nn.Module):
         dt: s.
         integrator: of the plant over a step, ``runge_kutta`` (fourth order) or ``euler`` (as published).
         limit: a row whose state exceeds it in norm has diverged.
+
+    Raises:
+        ValueError: if an argument breaks its rule.
     """
 
     def __init__(
