@@ -8,6 +8,7 @@ from .bases import ValueBasis as ValueBasis
 from .bellman import bellman_error as bellman_error
 from .bellman import bellman_terms as bellman_terms
 from .bellman import hjb_residual as hjb_residual
+from .bellman import value_gradient as value_gradient
 from .controller import Controller as Controller
 from .controller import Feedback as Feedback
 from .controller import Memory as Memory
@@ -18,6 +19,7 @@ from .extrapolation import Extrapolation as Extrapolation
 from .extrapolation import QuadraturePoints as QuadraturePoints
 from .extrapolation import RandomPoints as RandomPoints
 from .laws import ActorCriticLaw as ActorCriticLaw
+from .laws import Frozen as Frozen
 from .laws import Gains as Gains
 from .laws import Information as Information
 from .laws import Published as Published

@@ -13,6 +13,13 @@ from .bases.base import ValueBasis
 from .cost import Cost, matvec
 
 
+def value_gradient(value: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:
+    """grad V, row by row: (..., n) -> (..., n)."""
+    with torch.enable_grad():
+        at = x.detach().requires_grad_()
+        return torch.autograd.grad(value(at).sum(), at)[0]
+
+
 def hjb_residual(
     system: ControlAffineSystem, cost: Cost, value: Callable[[Tensor], Tensor], x: Tensor
 ) -> Tensor:
@@ -29,7 +36,7 @@ def hjb_residual(
 
     Source: MATH.md section 4; for a quadratic cost x'Qx + f'grad V - 1/4 grad V' g R^-1 g' grad V.
     """
-    gradient: Tensor = torch.func.grad(lambda at: value(at).sum())(x)
+    gradient = value_gradient(value, x)
     g = system.effectiveness(x)
     u = cost.policy(g, gradient)
     return cost.rate(x, u) + (gradient * (system.drift(x) + matvec(g, u))).sum(-1)

@@ -74,13 +74,13 @@ def chase_problem(cfg: DictConfig) -> ChaseProblem:
     Raises:
         ValueError: if a setting breaks its rule; the message names it.
     """
-    device, dtype = _placement(cfg.device, cfg.dtype)
-    system = _make(cfg.system)
+    device, dtype = placement(cfg.device, cfg.dtype)
+    system = make(cfg.system)
     if not callable(getattr(system, "drift", None)):
         raise fail("staf", "system", "must be a plant with a method `drift`", system)
     dim = getattr(system, "dim", None) or len(cfg.initial_state)
-    basis = StaFBasis(_make(cfg.kernel), _centers(cfg.centers, dim))
-    target = _make(cfg.target)
+    basis = StaFBasis(make(cfg.kernel), make_centers(cfg.centers, dim))
+    target = make(cfg.target)
     if not callable(target):
         raise fail("staf", "target", "must be callable", target)
     dt = positive_real("staf", "dt", cfg.dt)
@@ -96,7 +96,7 @@ def chase_problem(cfg: DictConfig) -> ChaseProblem:
         basis=basis,
         target=target,
         law=law,
-        initial_states=_initial_states(cfg, dim).to(device=device, dtype=dtype),
+        initial_states=initial_states(cfg, dim).to(device=device, dtype=dtype),
         dt=dt,
         steps=math.floor(duration / dt + 1e-9),
         inner_steps=inner_steps,
@@ -104,11 +104,12 @@ def chase_problem(cfg: DictConfig) -> ChaseProblem:
     )
 
 
-def _make(cfg: DictConfig) -> Any:
+def make(cfg: DictConfig) -> Any:
+    """The object that a group of settings names."""
     return instantiate(cfg, _convert_="all")
 
 
-def _placement(device: object, dtype: object) -> tuple[torch.device, torch.dtype]:
+def placement(device: object, dtype: object) -> tuple[torch.device, torch.dtype]:
     choice("staf", "dtype", dtype, tuple(_DTYPES))
     try:
         place = torch.device(str(device))
@@ -119,7 +120,7 @@ def _placement(device: object, dtype: object) -> tuple[torch.device, torch.dtype
     return place, _DTYPES[str(dtype)]
 
 
-def _centers(cfg: DictConfig, dim: int) -> StateFollowingCenters:
+def make_centers(cfg: DictConfig, dim: int) -> StateFollowingCenters:
     count, layout = cfg.count, cfg.layout
     planar: dict[str, Callable[[int], Tensor]] = {"rings": rings, "polygon": polygon}
     fixed: dict[str, Callable[[int], Tensor]] = {
@@ -141,7 +142,8 @@ def _centers(cfg: DictConfig, dim: int) -> StateFollowingCenters:
             rule = f"must be {len(directions)} (or null) for {layout} with {dim} states"
             raise fail("centers", "count", rule, count)
     elif layout == "directions":
-        rows = [vector("centers", "directions", row, dim) for row in OmegaConf.to_container(cfg.directions)]
+        listed: Any = OmegaConf.to_container(cfg.directions)
+        rows = [vector("centers", "directions", row, dim) for row in listed]
         directions = torch.tensor(rows, dtype=torch.float64)
     else:
         directions = ball(count, dim)
@@ -158,10 +160,10 @@ def _law(cfg: DictConfig) -> tuple[UpdateLaw, int]:
     settings = OmegaConf.to_container(cfg, resolve=True)
     assert isinstance(settings, dict)
     inner_steps = integer("optimizer", "inner_steps", settings.pop("inner_steps"), least=1)
-    return _make(OmegaConf.create(settings)), inner_steps
+    return make(OmegaConf.create(settings)), inner_steps
 
 
-def _initial_states(cfg: DictConfig, dim: int) -> Tensor:
+def initial_states(cfg: DictConfig, dim: int) -> Tensor:
     """The stated initial state first, the others uniform in a box around it: (B, n) float64.
 
     The generator runs on the CPU in float64, so that one seed means the same states everywhere, and

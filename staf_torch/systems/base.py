@@ -65,7 +65,7 @@ class ControlAffineSystem(nn.Module, abc.ABC):
             ValueError: if ``dim`` is None.
         """
         at = self.equilibrium()
-        matrix = torch.func.jacfwd(self.smooth_drift)(at)
+        matrix = torch.func.jacrev(self.smooth_drift)(at)
         return Linearisation(matrix.detach(), self.effectiveness(at).detach())
 
     def optimal_value(self, x: Tensor, state_cost: Tensor, input_cost: Tensor) -> Tensor | None:

@@ -74,13 +74,15 @@ class StaFValueBasis(ValueBasis):
         return size * along
 
     def _automatic(self, y: Tensor, x: Tensor) -> Tensor:
-        """One forward derivative a coordinate: a (..., M, n) Jacobian without a batch loop."""
-        moves = self.mode == "total"
-        columns = []
-        for direction in torch.eye(self.dim, dtype=y.dtype, device=y.device):
-            tangent = direction.expand(y.shape)
-            columns.append(torch.func.jvp(self, (y, x), (tangent, tangent if moves else 0 * tangent))[1])
-        return torch.stack(columns, dim=-1)
+        """One backward pass a basis function: a (..., M, n) Jacobian without a loop over the batch."""
+        if self.mode == "total":
+            # y and x move together: the derivative along y = y0 + h, x = x0 + h.
+            values, pull = torch.func.vjp(lambda h: self(y + h, x + h), torch.zeros_like(y))[:2]
+        else:
+            values, pull = torch.func.vjp(lambda at: self(at, x), y)[:2]
+        selectors = torch.eye(self.count, dtype=values.dtype, device=values.device)
+        rows = [pull(selector.expand(values.shape))[0] for selector in selectors]
+        return torch.stack(rows, dim=-2)
 
 
 def _slope(radius: StateRadius, x: Tensor) -> Tensor:
