@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from .._checks import positive_real, vector
+from .._checks import positive_real, trailing, vector
 from ..systems import ControlAffineSystem
 from .bases.base import ValueBasis
 from .bellman import BellmanTerms, bellman_terms
@@ -13,6 +13,8 @@ from .controller import Controller, Memory
 from .cost import QuadraticCost
 from .extrapolation import Extrapolation
 from .laws import ActorCriticLaw, Information, Weights
+
+Initial = float | list[float] | Tensor
 
 
 class ActorCritic(Controller):
@@ -25,7 +27,7 @@ class ActorCritic(Controller):
         cost: x'Qx + u'Ru.
         extrapolation: the points.
         law: `Information` by default.
-        critic: Wc(0), a number for all or M numbers.
+        critic: Wc(0): a number for all, M numbers, or a tensor (M,) or (B, M), a row a trajectory.
         actor: Wa(0), likewise.
         gain: gamma > 0 in Gam(0) = gamma I.
 
@@ -43,8 +45,8 @@ class ActorCritic(Controller):
         extrapolation: Extrapolation,
         law: ActorCriticLaw | None = None,
         *,
-        critic: float | list[float] = 0.4,
-        actor: float | list[float] = 0.28,
+        critic: Initial = 0.4,
+        actor: Initial = 0.28,
         gain: float = 250.0,
     ) -> None:
         super().__init__()
@@ -67,11 +69,10 @@ class ActorCritic(Controller):
         self.gain = positive_real("ActorCritic", "gain", gain)
 
     def init(self, x0: Tensor) -> Memory:
-        batch, count = x0.shape[0], self.basis.count
-        gain = self.gain * torch.eye(count, dtype=x0.dtype, device=x0.device)
-        start = (self.critic.to(x0), self.actor.to(x0), gain)
-        weights = self.law.init(*start)
-        return Memory(*(part.expand(batch, *part.shape).clone() for part in weights))
+        rows = (x0.shape[0], self.basis.count)
+        gain = self.gain * torch.eye(self.basis.count, dtype=x0.dtype, device=x0.device)
+        critic, actor, gain = self.law.init(self.critic.to(x0), self.actor.to(x0), gain)
+        return Memory(critic.expand(rows).clone(), actor.expand(rows).clone(), gain.repeat(x0.shape[0], 1, 1))
 
     def terms(self, x: Tensor, actor: Tensor, uniform: Tensor) -> BellmanTerms:
         """The Bellman terms at the state (first) and at the extrapolated points."""
@@ -89,7 +90,9 @@ class ActorCritic(Controller):
         return self.basis.value(memory.critic, x)
 
 
-def _weights(name: str, value: float | list[float], count: int) -> Tensor:
+def _weights(name: str, value: Initial, count: int) -> Tensor:
+    if isinstance(value, Tensor):
+        return trailing("ActorCritic", name, value, dims=1, last=count)
     if isinstance(value, int | float):
         value = [value] * count
     return torch.tensor(vector("ActorCritic", name, value, count), dtype=torch.float64)
