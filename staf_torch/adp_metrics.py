@@ -70,3 +70,27 @@ def _median(values: Tensor) -> float | None:
 
 def _worst(values: Tensor) -> float | None:
     return float(values.max()) if values.numel() else None
+
+
+def comparison_row(result: LoopResult, ratio: Tensor) -> dict[str, float | None]:
+    """A method over many initial states, as a row of a table.
+
+    Args:
+        result: the closed loops.
+        ratio: cost / V*(x(0)), (B,), inf for rows that diverged.
+
+    Returns:
+        ``ratio_median`` over the rows that were regulated, as are ``ratio_mean`` and ``ratio_max``; the
+        fractions ``regulated`` and ``diverged`` of all; ``final_state_norm``, the median |x| at the end.
+    """
+    regulated = ~result.diverged & (result.state[:, -1].norm(dim=-1) < _REGULATED)
+    kept = ratio[regulated]
+    final = result.state[:, -1].norm(dim=-1)
+    return {
+        "ratio_median": _median(kept),
+        "ratio_mean": float(kept.mean()) if len(kept) else None,
+        "ratio_max": _worst(kept),
+        "regulated": float(regulated.double().mean()),
+        "diverged": float(result.diverged.double().mean()),
+        "final_state_norm": _median(final),
+    }

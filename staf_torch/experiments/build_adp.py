@@ -130,14 +130,18 @@ def controller(cfg: DictConfig, system: ControlAffineSystem, cost: Cost) -> Cont
         return Feedback(improved, improved.value)
     if not isinstance(cost, QuadraticCost):
         raise fail("adp", "cost.bound", "needs adp.policy=rollout or lqr", cfg.adp.cost.bound)
+    basis = value_basis(cfg, system)
+    critic, actor = _numbers(cfg.adp.critic), _numbers(cfg.adp.actor)
+    if not isinstance(basis, StaFValueBasis):
+        critic = actor = _weights_of_square(basis)
     learner = ActorCritic(
-        value_basis(cfg, system),
+        basis,
         system,
         cost,
         extrapolation(cfg.adp, system),
         _law(cfg),
-        critic=_numbers(cfg.adp.critic),
-        actor=_numbers(cfg.adp.actor),
+        critic=critic,
+        actor=actor,
         gain=cfg.adp.gain,
     )
     if cfg.adp.trust is None:
@@ -189,6 +193,15 @@ def _law(cfg: DictConfig) -> ActorCriticLaw:
     settings: Any = OmegaConf.to_container(cfg.adp.gains, resolve=True)
     law = Frozen if cfg.adp.policy == "none" else _LAWS[cfg.adp.law]
     return law(Gains(**settings), cfg.adp.bound)
+
+
+def _weights_of_square(basis: ValueBasis) -> list[float]:
+    """The weights with which a global basis is nearest to x'x over [-1, 1]^n: a start that stabilises."""
+    generator = torch.Generator().manual_seed(0)
+    y = 2 * torch.rand(1000, basis.dim, dtype=torch.float64, generator=generator) - 1
+    square = y.square().sum(-1, keepdim=True)
+    fitted: list[float] = torch.linalg.lstsq(basis(y, y), square, driver="gelsd").solution[:, 0].tolist()
+    return fitted
 
 
 def _numbers(value: Any) -> Any:

@@ -12,6 +12,8 @@ from matplotlib.figure import Figure
 
 from .plots import _colour, _dash, _legend, _positive
 
+_LEAST_EXCESS, _MOST_EXCESS = 1e-4, 1e2  # of the cost over the optimum, in the comparison
+
 
 class AdpHistory(NamedTuple):
     """One trajectory of a closed loop."""
@@ -99,3 +101,29 @@ def _cost(axes: Axes, history: AdpHistory) -> None:
     axes.set_ylim(bottom=0)
     axes.set_ylabel("cost")
     _legend(axes, 2)
+
+
+def draw_comparison(ratios: dict[str, np.ndarray]) -> Figure:
+    """The share of initial states whose cost is at most a multiple of the optimum, one curve a method.
+
+    Args:
+        ratios: method to cost / optimal cost, (B,); inf for trajectories that diverged.
+    """
+    style = importlib.resources.files(__package__) / "staf.mplstyle"
+    with importlib.resources.as_file(style) as path, matplotlib.rc_context(fname=path):
+        figure = Figure(figsize=(5.4, 3.2), layout="constrained")
+        axes = figure.subplots()
+        for i, (name, values) in enumerate(ratios.items()):
+            excess = np.sort(np.maximum(values - 1, _LEAST_EXCESS))
+            share = np.arange(1, len(excess) + 1) / len(excess)
+            finite = np.isfinite(excess)
+            dash = _dash(i // 7)  # seven colours, then dashed
+            axes.step(excess[finite], share[finite], dash, where="post", color=_colour(i), label=name)
+        axes.set_xscale("log")
+        axes.set_xlim(_LEAST_EXCESS, _MOST_EXCESS)
+        axes.set_ylim(0, 1.02)
+        axes.set_xlabel("excess cost $J/J^* - 1$")
+        axes.set_ylabel("share of initial states")
+        axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
+        figure.draw_without_rendering()
+        return figure
