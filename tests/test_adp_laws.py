@@ -45,7 +45,7 @@ def continuous(law: ActorCriticLaw, duration: float) -> tuple[Tensor, adp.Weight
     """The laws and the plant as one differential equation, by Runge-Kutta on steps that start short."""
     controller = learner(law, adp.QuadraturePoints(7, 2, BOX))
     x = torch.tensor([[-1.0, 1.0]], dtype=torch.float64)
-    y = (x, *controller.init(x), torch.zeros(1, dtype=torch.float64))
+    y = (x, *controller.init(x)[:3], torch.zeros(1, dtype=torch.float64))
     none = x.new_zeros(1, 0, 2)
 
     def field(y: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
@@ -102,7 +102,7 @@ def test_step_tends_to_the_rate(law: ActorCriticLaw) -> None:
     generator = torch.Generator().manual_seed(3)
     controller = learner(law, adp.QuadraturePoints(3, 2, BOX))
     x = uniform(5, 1.0, seed=4)
-    memory = adp.Weights(*controller.init(x))
+    memory = adp.Weights(*controller.init(x)[:3])
     memory = memory._replace(critic=torch.randn(5, 3, dtype=torch.float64, generator=generator))
     terms = controller.terms(x, memory.actor, x.new_zeros(5, 0, 2))
     sums = law.sums(terms, controller.extrapolation.weights, memory)
@@ -226,7 +226,7 @@ def test_optimal_weights_of_the_quadratic_basis_stay_put_but_for_the_actor_decay
     x = uniform(20, 1.0)
     memory = controller.init(x)
     terms = controller.terms(x, memory.actor, uniform(20, 1.0, seed=2).unsqueeze(1))
-    sums = controller.law.sums(terms, controller.extrapolation.weights, adp.Weights(*memory))
+    sums = controller.law.sums(terms, controller.extrapolation.weights, adp.Weights(*memory[:3]))
     assert isinstance(sums, BellmanSums)
     assert sums.critic_force.abs().max() < 1e-13
 

@@ -72,19 +72,33 @@ class ActorCritic(Controller):
         rows = (x0.shape[0], self.basis.count)
         gain = self.gain * torch.eye(self.basis.count, dtype=x0.dtype, device=x0.device)
         critic, actor, gain = self.law.init(self.critic.to(x0), self.actor.to(x0), gain)
-        return Memory(critic.expand(rows).clone(), actor.expand(rows).clone(), gain.repeat(x0.shape[0], 1, 1))
+        return Memory(
+            critic.expand(rows).clone(),
+            actor.expand(rows).clone(),
+            gain.repeat(x0.shape[0], 1, 1),
+            x0.new_zeros(x0.shape[0], 0),
+        )
 
-    def terms(self, x: Tensor, actor: Tensor, uniform: Tensor) -> BellmanTerms:
-        """The Bellman terms at the state (first) and at the extrapolated points."""
+    def terms(
+        self, x: Tensor, actor: Tensor, uniform: Tensor, model: ControlAffineSystem | None = None
+    ) -> BellmanTerms:
+        """The Bellman terms at the state (first) and at the extrapolated points, by ``model`` if given."""
         points = torch.cat((x.unsqueeze(-2), self.extrapolation(x, uniform)), dim=-2)
         at = points if self.extrapolation.moving else x.unsqueeze(-2).expand(points.shape)
-        return bellman_terms(self.basis, self.model, self.cost, points, at, actor)
+        return bellman_terms(self.basis, model or self.model, self.cost, points, at, actor)
 
     def step(self, x: Tensor, memory: Memory, uniform: Tensor, dt: float) -> tuple[Tensor, Memory]:
-        weights = Weights(*memory)
-        terms = self.terms(x, weights.actor, uniform)
+        return self.step_with(self.model, x, memory, uniform, dt)
+
+    def step_with(
+        self, model: ControlAffineSystem, x: Tensor, memory: Memory, uniform: Tensor, dt: float
+    ) -> tuple[Tensor, Memory]:
+        """`step` with a model of the moment, for instance one that is being identified."""
+        weights = Weights(memory.critic, memory.actor, memory.gain)
+        terms = self.terms(x, weights.actor, uniform, model)
         sums = self.law.sums(terms, self.extrapolation.weights, weights)
-        return terms.control[..., 0, :], Memory(*self.law.step(sums, weights, dt))
+        critic, actor, gain = self.law.step(sums, weights, dt)
+        return terms.control[..., 0, :], Memory(critic, actor, gain, memory.identifier)
 
     def value(self, x: Tensor, memory: Memory) -> Tensor | None:
         return self.basis.value(memory.critic, x)

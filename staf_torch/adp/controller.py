@@ -15,6 +15,7 @@ class Memory(NamedTuple):
     critic: Tensor  # Wc, (B, M)
     actor: Tensor  # Wa, (B, M)
     gain: Tensor  # Gam or Lam, (B, M, M)
+    identifier: Tensor  # what an identifier of the plant remembers, (B, K)
 
 
 class Controller(nn.Module, abc.ABC):
@@ -66,7 +67,7 @@ class Feedback(Controller):
 
     def init(self, x0: Tensor) -> Memory:
         empty = x0.new_zeros(x0.shape[0], 0)
-        return Memory(empty, empty, x0.new_zeros(x0.shape[0], 0, 0))
+        return Memory(empty, empty, x0.new_zeros(x0.shape[0], 0, 0), empty)
 
     def step(self, x: Tensor, memory: Memory, uniform: Tensor, dt: float) -> tuple[Tensor, Memory]:
         return self.policy(x), memory

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import copy
+
 import torch
 from torch import Tensor
 
-from .._checks import vector
+from .._checks import fail, number
 from ..systems import ControlAffineSystem
+from .cost import Matrix, QuadraticCost
 
 _TRUE = ((-1.0, -0.5), (1.0, 0.0), (0.0, -0.5))
 
@@ -19,15 +22,14 @@ class TwoStateTracking(ControlAffineSystem):
         f(x) = theta_true' s(x),  s = (x1, x2, x2 (1 - (cos 2 x1 + 2)^2)).
 
     The input is mu = u - ud, which vanishes where e does: the origin of e is an equilibrium for every xd, of
-    the cost e'Qe + mu'R mu. With an estimate theta the model believes in f = theta's, and the plant (its
-    ``feedforward``) applies the ud of the estimate.
+    the cost e'Qe + mu'R mu (`tracking_cost`).
 
     Args:
-        drift_parameters: theta of this model's drift, (3, 2); the true one by default.
-        feedforward: theta of ud, (3, 2); that of the drift by default.
+        theta: parameters of the drift and of ud, (3, 2) or (..., 3, 2), one a row of states; the true ones by
+            default, an estimate for a model.
 
     Raises:
-        ValueError: if a theta has another shape or is not finite.
+        ValueError: if theta has another shape or is not finite.
 
     Source: MATH.md section 4, after Kamalapurkar, Dinh, Bhasin and Dixon.
     """
@@ -35,26 +37,27 @@ class TwoStateTracking(ControlAffineSystem):
     dim = 4
     inputs = 1
 
-    def __init__(
-        self,
-        drift_parameters: Tensor | list[list[float]] | None = None,
-        feedforward: Tensor | list[list[float]] | None = None,
-    ) -> None:
+    def __init__(self, theta: Tensor | list[list[float]] | None = None) -> None:
         super().__init__()
-        theta = true_parameters() if drift_parameters is None else _theta("drift_parameters", drift_parameters)
-        self.register_buffer("theta", theta)
-        self.register_buffer(
-            "feedforward_theta", theta if feedforward is None else _theta("feedforward", feedforward)
-        )
+        chosen = true_parameters() if theta is None else torch.as_tensor(theta)
+        number("TwoStateTracking", "theta", chosen)
+        if chosen.shape[-2:] != (3, 2):
+            raise fail("TwoStateTracking", "theta", "must be (..., 3, 2)", tuple(chosen.shape))
+        self.register_buffer("theta", chosen)
         self.theta: Tensor
-        self.feedforward_theta: Tensor
 
     def drift(self, x: Tensor) -> Tensor:
         e, desired = x[..., :2], x[..., 2:]
         state, rate = e + desired, desired_rate(desired)
-        pushed = input_gain(state[..., 0]) * feedforward(desired, self.feedforward_theta)
-        known = apply(self.theta, regressor(state)) - rate
-        return torch.cat((known[..., :1], known[..., 1:] + pushed.unsqueeze(-1), rate), dim=-1)
+        pushed = input_gain(state[..., 0]) * feedforward(desired, self.theta)
+        error_rate = parametric_drift(self.theta, state) - rate
+        return torch.cat((error_rate[..., :1], error_rate[..., 1:] + pushed.unsqueeze(-1), rate), dim=-1)
+
+    def believing(self, theta: Tensor) -> TwoStateTracking:
+        """A copy with other parameters, (..., 3, 2); not checked, so that a row may go wrong alone."""
+        other = copy.copy(self)
+        other._buffers = {**self._buffers, "theta": theta}
+        return other
 
     def effectiveness(self, x: Tensor) -> Tensor:
         gain = input_gain(x[..., 0] + x[..., 2])
@@ -73,9 +76,9 @@ def regressor(x: Tensor) -> Tensor:
     return torch.stack((x1, x2, x2 * (1 - input_gain(x1).square())), dim=-1)
 
 
-def apply(theta: Tensor, s: Tensor) -> Tensor:
-    """theta's: (..., 3, 2), (..., 3) -> (..., 2)."""
-    return (theta.to(s) * s.unsqueeze(-1)).sum(-2)
+def parametric_drift(theta: Tensor, x: Tensor) -> Tensor:
+    """theta's(x): (..., 3, 2), (..., 2) -> (..., 2)."""
+    return (theta.to(x) * regressor(x).unsqueeze(-1)).sum(-2)
 
 
 def input_gain(x1: Tensor) -> Tensor:
@@ -91,12 +94,25 @@ def desired_rate(desired: Tensor) -> Tensor:
 
 def feedforward(desired: Tensor, theta: Tensor) -> Tensor:
     """ud = gd+ (hd - theta' s(xd)): (..., 2), (..., 3, 2) -> (...)."""
-    wanted = desired_rate(desired) - apply(theta, regressor(desired))
+    wanted = desired_rate(desired) - parametric_drift(theta, desired)
     return wanted[..., 1] / input_gain(desired[..., 0])
 
 
-def _theta(name: str, value: Tensor | list[list[float]]) -> Tensor:
-    rows = value.tolist() if isinstance(value, Tensor) else value
-    if len(rows) != 3:
-        raise ValueError(f"`TwoStateTracking({name}=...)` must be (3, 2); got {rows!r}.")
-    return torch.tensor([vector("TwoStateTracking", name, row, 2) for row in rows], dtype=torch.float64)
+def tracking_cost(error: Matrix, control: Matrix) -> QuadraticCost:
+    """e'Qe + mu'R mu in the state (e, xd): nothing is paid for xd itself.
+
+    Args:
+        error: Q, (2, 2) or a number.
+        control: R, (1, 1) or a number.
+
+    Raises:
+        ValueError: if Q or R is not symmetric positive definite.
+    """
+    cost = QuadraticCost(error, control, 2, 1)
+    cost.q = torch.block_diag(cost.q, torch.zeros_like(cost.q))
+    return cost
+
+
+def desired_trajectory(time: Tensor) -> Tensor:
+    """xd(t) = (sin t, cos t + sin t): (T,) -> (T, 2)."""
+    return torch.stack((time.sin(), time.cos() + time.sin()), dim=-1)

@@ -103,7 +103,7 @@ def _estimates(problem: AdpProblem, result: LoopResult) -> Tensor | None:
     pieces = []
     x, critic, actor = (t.flatten(0, 1) for t in (result.state, result.critic_weights, result.actor_weights))
     for at in torch.arange(len(x)).split(_AT_ONCE):
-        memory = Memory(critic[at], actor[at], critic.new_zeros(0))
+        memory = Memory(critic[at], actor[at], critic.new_zeros(0), critic.new_zeros(0))
         with torch.no_grad():
             value = problem.controller.value(x[at], memory)
         if value is None:
