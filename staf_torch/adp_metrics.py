@@ -94,3 +94,29 @@ def comparison_row(result: LoopResult, ratio: Tensor) -> dict[str, float | None]
         "diverged": float(result.diverged.double().mean()),
         "final_state_norm": _median(final),
     }
+
+
+def tracking_metrics(result: LoopResult, parameters: Tensor | None, truth: Tensor) -> dict[str, float | None]:
+    """The metrics of a tracking run, over the trajectories that did not diverge.
+
+    Args:
+        result: the closed loop in the state (e, xd).
+        parameters: theta^, (B, T, p, n); None where nothing is identified.
+        truth: theta, (p, n).
+
+    Returns:
+        ``cost``, the median; ``final_error``, the largest |e| of the last tenth of the time;
+        ``parameter_error``, the largest |theta^ - theta| at the end; ``diverged_fraction``.
+    """
+    kept = ~result.diverged
+    tail = max(1, result.state.shape[1] // 10)
+    error = result.state[kept, -tail:, :2].norm(dim=-1)
+    off = None
+    if parameters is not None:
+        off = _worst((parameters[kept, -1] - truth.to(parameters)).flatten(-2).norm(dim=-1))
+    return {
+        "cost": _median(result.cost[kept]),
+        "final_error": _worst(error),
+        "parameter_error": off,
+        "diverged_fraction": float(result.diverged.double().mean()),
+    }

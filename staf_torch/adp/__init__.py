@@ -1,6 +1,7 @@
 """Adaptive dynamic programming: learn or compute a controller while, or before, it controls."""
 
 from .actor_critic import ActorCritic as ActorCritic
+from .bases import LeadingCoordinates as LeadingCoordinates
 from .bases import QuadraticBasis as QuadraticBasis
 from .bases import RBFGridBasis as RBFGridBasis
 from .bases import StaFValueBasis as StaFValueBasis
@@ -18,6 +19,9 @@ from .cost import QuadraticCost as QuadraticCost
 from .extrapolation import Extrapolation as Extrapolation
 from .extrapolation import QuadraturePoints as QuadraturePoints
 from .extrapolation import RandomPoints as RandomPoints
+from .identification import ConcurrentLearning as ConcurrentLearning
+from .identification import Identified as Identified
+from .identifying import IdentifyingTracker as IdentifyingTracker
 from .laws import ActorCriticLaw as ActorCriticLaw
 from .laws import Frozen as Frozen
 from .laws import Gains as Gains
@@ -29,3 +33,6 @@ from .rollout import RolloutPolicy as RolloutPolicy
 from .simulation import LoopResult as LoopResult
 from .simulation import simulate as simulate
 from .supervisor import Supervised as Supervised
+from .tracking import TwoStateTracking as TwoStateTracking
+from .tracking import desired_trajectory as desired_trajectory
+from .tracking import tracking_cost as tracking_cost

@@ -33,6 +33,7 @@ class LoopResult:
     actor_weights: Tensor  # (B, T, M); M = 0 for feedback laws
     critic_weights: Tensor  # (B, T, M)
     running_cost: Tensor  # (B, T) the cost from 0 to that time
+    identifier: Tensor  # (B, T, K) what the controller remembers of the plant; K = 0 without identification
     frozen_at: Tensor  # (B,) seconds, inf for rows that never froze
 
     @property
@@ -127,13 +128,14 @@ def _run(
         if progress is not None and (k + 1) % 100 == 0:
             progress(100)
     rows.append(_record(state, torch.full_like(rows[-1][1], torch.nan)))
-    x, u, actor, critic, spent = (torch.stack(column, dim=1) for column in zip(*rows, strict=True))
+    x, u, actor, critic, spent, known = (torch.stack(column, dim=1) for column in zip(*rows, strict=True))
     time = torch.arange(0, steps + 1, every, dtype=torch.float64) * loop.dt
-    return LoopResult(time, x, u, actor, critic, spent, frozen_at)
+    return LoopResult(time, x, u, actor, critic, spent, known, frozen_at)
 
 
 def _record(state: LoopState, u: Tensor) -> tuple[Tensor, ...]:
-    return state.x, u, state.memory.actor, state.memory.critic, state.cost
+    memory = state.memory
+    return state.x, u, memory.actor, memory.critic, state.cost, memory.identifier
 
 
 def _uniform(x0: Tensor, draws: int, seed: int) -> Iterator[Tensor]:

@@ -23,7 +23,7 @@ from .build_adp import AdpProblem, adp_problem
 
 _log = logging.getLogger(__name__)
 _ROWS: dict[str, dict[str, Any]] = {
-    "StaF, as published": {"law": "published", "integrator": "euler", "trust": None},
+    "StaF, as published, 1 ms": {"law": "published", "integrator": "euler", "trust": None},
     "StaF, information form": {"trust": None},
     "StaF, information, quadrature": {"trust": None, "extrapolation": "quadrature"},
     "StaF, information, supervised": {},
@@ -33,6 +33,7 @@ _ROWS: dict[str, dict[str, Any]] = {
     "LQR": {"policy": "lqr"},
     "rollout policy": {"policy": "rollout"},
 }
+_PUBLISHED_STEP = 0.001  # s
 _COLUMNS = {
     "method": "method",
     "functions": "basis functions",
@@ -81,8 +82,10 @@ def methods(cfg: DictConfig) -> Iterator[tuple[str, AdpProblem]]:
         variant = cfg.copy()
         with open_dict(variant):
             variant.adp = OmegaConf.merge(cfg.adp, changes)
+            if changes.get("law") == "published":
+                variant.dt = min(cfg.dt, _PUBLISHED_STEP)  # its own step: Euler fails sooner at a longer one
         if variant.adp.record_every is None:
-            variant.adp.record_every = round(cfg.duration / cfg.dt)  # the ends are enough for the table
+            variant.adp.record_every = round(cfg.duration / variant.dt)  # the ends are enough for the table
         if changes.get("policy") == "rollout":
             variant.adp.record_every = 1
         with open_dict(variant):

@@ -23,7 +23,7 @@ from .._checks import choice
 
 _log = logging.getLogger(__name__)
 _FULL_ERROR = "HYDRA_FULL_ERROR"
-EXPERIMENTS = ("gradient_chase", "adp", "adp_comparison")
+EXPERIMENTS = ("gradient_chase", "adp", "adp_comparison", "adp_tracking")
 """Modules of this package with a function ``run(cfg, directory)``, by the name in ``task``."""
 
 

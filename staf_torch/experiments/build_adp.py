@@ -139,7 +139,7 @@ def controller(cfg: DictConfig, system: ControlAffineSystem, cost: Cost) -> Cont
         system,
         cost,
         extrapolation(cfg.adp, system),
-        _law(cfg),
+        actor_critic_law(cfg),
         critic=critic,
         actor=actor,
         gain=cfg.adp.gain,
@@ -169,7 +169,12 @@ def value_basis(cfg: DictConfig, system: ControlAffineSystem) -> ValueBasis:
     if cfg.adp.basis == "rbf_grid":
         grid = cfg.adp.rbf_grid
         return RBFGridBasis(system.dim, grid.points, grid.half_width, grid.width)
-    basis = StaFBasis(make(cfg.kernel), make_centers(cfg.centers, system.dim))
+    return staf_value_basis(cfg, system.dim)
+
+
+def staf_value_basis(cfg: DictConfig, dim: int) -> StaFValueBasis:
+    """The StaF basis of the settings in ``dim`` states."""
+    basis = StaFBasis(make(cfg.kernel), make_centers(cfg.centers, dim))
     return StaFValueBasis(basis, cfg.adp.gradient)
 
 
@@ -188,7 +193,8 @@ def extrapolation(cfg: DictConfig, system: ControlAffineSystem) -> Extrapolation
     return QuadraturePoints(cfg.order, system.dim, box, cfg.extrapolated_centers)
 
 
-def _law(cfg: DictConfig) -> ActorCriticLaw:
+def actor_critic_law(cfg: DictConfig) -> ActorCriticLaw:
+    """The law that `adp.law` names, without learning for `adp.policy=none`."""
     choice("adp", "law", cfg.adp.law, tuple(_LAWS))
     settings: Any = OmegaConf.to_container(cfg.adp.gains, resolve=True)
     law = Frozen if cfg.adp.policy == "none" else _LAWS[cfg.adp.law]
