@@ -12,6 +12,7 @@ from .closed_loop import ClosedLoop, LoopState
 
 _log = logging.getLogger(__name__)
 _PAYS = 60_000  # uncompiled steps of a small batch (some 1 ms each) that take as long as to compile twice
+_ONE_THREAD = 4096  # rows up to which one thread is enough
 
 Step = Callable[[LoopState, Tensor], tuple[LoopState, Tensor]]
 
@@ -33,7 +34,10 @@ def compiled(loop: ClosedLoop, x0: Tensor, steps: int, wanted: bool | str) -> St
         return loop
     state = loop.init(x0)
     uniform = x0.new_zeros(x0.shape[0], loop.controller.draws, x0.shape[1])
-    step: Step = torch.compile(loop, dynamic=False, fullgraph=True)
+    # A step is less than a millisecond's work: threads would spend it waiting for each other.
+    alone = x0.device.type == "cpu" and x0.shape[0] <= _ONE_THREAD
+    options: dict[str, str | int | bool | Callable[..., object]] = {"cpp.threads": 1} if alone else {}
+    step: Step = torch.compile(loop, dynamic=False, fullgraph=True, options=options)
     try:
         step(state, uniform)
     except Exception as error:  # the compiler raises errors of many kinds, none of them the run's
