@@ -25,7 +25,8 @@ def settings(*overrides: str):  # type: ignore[no-untyped-def]
     "overrides",
     [
         ["experiment=adp"],
-        ["experiment=adp", "adp.law=published", "adp.gradient=partial", "dt=0.001"],
+        ["experiment=adp", "adp.law=published", "dt=0.001"],
+        ["experiment=adp", "adp.gradient=partial", "adp.extrapolated_centers=fixed"],
         ["experiment=adp", "adp.extrapolation=quadrature", "adp.order=3", "adp.trust=0.5"],
         ["experiment=adp", "adp.policy=rollout", "adp.rollout.depth=1"],
         ["experiment=adp", "adp.policy=lqr", "system=pendulum"],
