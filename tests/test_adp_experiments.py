@@ -38,7 +38,8 @@ def settings(*overrides: str):  # type: ignore[no-untyped-def]
     ids=lambda o: " ".join(o),
 )
 def test_experiment_writes_its_run_directory(overrides: list[str], tmp_path: Path) -> None:
-    cfg = settings(*SHORT, *overrides)
+    drawn = len(overrides) == 1 or "adp.policy=lqr" in overrides  # with weights, without; figures are slow
+    cfg = settings(*SHORT, f"figures={drawn}", *overrides)
     metrics = adp_experiment.run(cfg, tmp_path)
     assert json.loads((tmp_path / "metrics.json").read_text()) == metrics
     assert metrics["diverged_fraction"] == 0
@@ -49,7 +50,7 @@ def test_experiment_writes_its_run_directory(overrides: list[str], tmp_path: Pat
         assert history["time"].shape == (times,)
         for name in ("control", "actor_weights", "critic_weights", "running_cost"):
             assert history[name].shape[:2] == (batch, times)
-    for ending in (".png", ".pdf"):
+    for ending in (".png", ".pdf") if drawn else ():
         assert (tmp_path / "figures" / cfg.task).with_suffix(ending).stat().st_size > 5000
 
 

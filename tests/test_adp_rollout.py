@@ -14,6 +14,7 @@ from staf_torch import (
     StateFollowingCenters,
     adp,
     ball,
+    cross_polytope,
     rings,
     systems,
 )
@@ -82,6 +83,25 @@ def test_three_state_beats_the_lqr_and_the_published_cost() -> None:
     assert float(lqr.cost) == pytest.approx(2.786, abs=2e-3)
     assert float(run.cost) <= 2.72
     assert run.state[0, -1].norm() < 0.02
+
+
+@torch.no_grad()
+def test_quadrotor_is_regulated_at_less_than_the_cost_of_the_lqr() -> None:
+    plant, cost = systems.PlanarQuadrotor(), adp.QuadraticCost(1.0, 1.0, 6, 2)
+    box = torch.tensor([1.0, 1.0, 0.5, 1.0, 1.0, 0.5], dtype=torch.float64)
+    generator = torch.Generator().manual_seed(0)
+    x0 = box * (2 * torch.rand(24, 6, dtype=torch.float64, generator=generator) - 1)
+    corners = cross_polytope(6)
+    cross = torch.cat((corners, torch.zeros_like(corners[:1])))
+    policy = rollout(plant, directions=cross, radius=0.05, cost=cost, horizon=0.5, steps=10)
+    base = adp.Feedback(adp.LQR(plant, cost))
+    whole = adp.simulate(base, plant, cost, x0, dt=0.01, steps=1200, every=1200)
+    start = adp.simulate(adp.Feedback(policy), plant, cost, x0, dt=0.01, steps=200, every=200)
+    rest = adp.simulate(base, plant, cost, start.state[:, -1], dt=0.01, steps=1000, every=1000)
+    ratio = (start.cost + rest.cost) / whole.cost
+    assert (rest.state[:, -1].norm(dim=-1) < 1e-3).all()
+    assert float(ratio.mean()) < 0.996
+    assert float(ratio.max()) < 1.001
 
 
 @torch.no_grad()

@@ -35,7 +35,7 @@ from ..adp import (
     ValueBasis,
 )
 from ..basis import StaFBasis
-from ..centers import ConstantRadius, Radius, StateFollowingCenters, StateRadius, ball, rings
+from ..centers import ConstantRadius, Radius, StateFollowingCenters, StateRadius, ball, cross_polytope, rings
 from ..kernels import ExponentialKernel
 from ..systems import ControlAffineSystem
 from .build import initial_states, make, make_centers, placement
@@ -152,12 +152,20 @@ def controller(cfg: DictConfig, system: ControlAffineSystem, cost: Cost) -> Cont
 def rollout_policy(cfg: DictConfig, system: ControlAffineSystem, cost: Cost, lqr: LQR) -> RolloutPolicy:
     """Rollouts of the LQR at centers in a ball around the state."""
     assert system.dim is not None
-    count = math.comb(system.dim + 2, 2) if cfg.centers is None else cfg.centers
-    directions = rings(6) if (system.dim, count) == (2, 6) else ball(count, system.dim)
+    directions = _rollout_directions(cfg.centers, system.dim)
     basis = StaFBasis(ExponentialKernel(), StateFollowingCenters(directions, cfg.radius))
     return RolloutPolicy(
         basis, system, cost, lqr, lqr.value, horizon=cfg.horizon, steps=cfg.steps, depth=cfg.depth
     )
+
+
+def _rollout_directions(count: int | None, dim: int) -> Tensor:
+    """Points whose fit has a gradient without bias at 0: all that quadratics need, or a symmetric cross."""
+    if count is None and dim > 3:
+        corners = cross_polytope(dim)
+        return torch.cat((corners, torch.zeros_like(corners[:1])))
+    number = math.comb(dim + 2, 2) if count is None else count
+    return rings(6) if (dim, number) == (2, 6) else ball(number, dim)
 
 
 def value_basis(cfg: DictConfig, system: ControlAffineSystem) -> ValueBasis:
