@@ -16,7 +16,7 @@ from .controller import Controller
 from .cost import Cost
 from .lqr import check_equilibrium
 
-_DRAWN_AHEAD = 256  # steps whose random numbers are drawn at once
+_DRAWN_AHEAD = 1024  # steps whose random numbers are drawn at once
 
 
 @dataclasses.dataclass(frozen=True)
