@@ -28,7 +28,7 @@ USER_ERRORS = (ValueError, HydraException, OmegaConfBaseException, OSError)
 
 _log = logging.getLogger(__name__)
 _FULL_ERROR = "HYDRA_FULL_ERROR"
-EXPERIMENTS = ("gradient_chase",)
+EXPERIMENTS = ("gradient_chase", "flat_limit")
 """Modules of this package with a function ``run(cfg, directory)``, by the name in ``task``."""
 
 

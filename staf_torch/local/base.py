@@ -10,7 +10,6 @@ from torch import Tensor
 
 from ..kernels import Kernel
 
-
 _ROWS = 4096  # of a block: its temporaries then stay in the cache
 
 
@@ -62,7 +61,8 @@ def in_blocks(function: Callable[[Tensor, Tensor], Tensor], values: Tensor, stat
     rows = values.expand(*shape, -1).flatten(0, -2).split(_ROWS)
     states = state.expand(*shape, -1).flatten(0, -2).split(_ROWS)
     blocks = [function(*pair) for pair in zip(rows, states, strict=True)]
-    return torch.cat(blocks).unflatten(0, shape)
+    together: Tensor = torch.cat(blocks).unflatten(0, shape)
+    return together
 
 
 def from_scaled(kernel: Kernel, x: Tensor, scaled: Tensor) -> Tensor:
