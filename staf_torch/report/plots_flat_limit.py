@@ -59,7 +59,7 @@ def _panel(axes: Axes, panel: ErrorPanel) -> None:
             drawn,
             _DASHES[i],
             marker=_MARKERS[i],
-            markersize=4.6 - 0.7 * i,
+            markersize=3.8 - 0.6 * i,
             color=_COLOURS[i],
             label=label,
         )
@@ -67,6 +67,8 @@ def _panel(axes: Axes, panel: ErrorPanel) -> None:
         # One row of marks a method, so that two that fail together are both seen.
         axes.plot(failed, np.full(len(failed), _FAILED * 4.0**i), "x", markersize=3, color=_COLOURS[i])
     axes.plot([], [], "kx", markersize=3, label="fails (in its colour)")
-    axes.axhline(panel.rounding, color="0.4", linewidth=0.8, linestyle=(0, (1, 1)), label=r"$\varepsilon$")
+    axes.axhline(
+        panel.rounding, color="0.4", linewidth=0.8, linestyle=(0, (1, 1)), label=r"$\varepsilon$ of the dtype"
+    )
     axes.set_ylim(0.05 * panel.rounding, _TOP * 4.0)
     axes.margins(x=0.02)
