@@ -95,7 +95,7 @@ class GradedSpace(NamedTuple):
         interpolation = Interpolation.of(self.basis, self._r2, bound, dtype)
 
         def solve(values: Tensor, state: Tensor) -> Tensor:
-            return interpolation.solve(values / scale(self.kernel, state, self.offsets))
+            return interpolation.solve(scale(self.kernel, state, self.offsets, -1.0) * values)
 
         if not interpolation.shared or self.offsets.dim() > 2:
             return solve(values, self.state)
