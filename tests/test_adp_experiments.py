@@ -82,8 +82,8 @@ def test_tracking_writes_its_run_directory(tmp_path: Path) -> None:
         (["adp.cost.control=0"], r"`QuadraticCost\(control=...\)` must be positive"),
         (["system=oscillator"], r"`adp\(system=...\)` must be a plant with inputs; got 'Oscillator'"),
         (["adp.cost.bound=1"], r"`adp\(cost.bound=...\)` needs adp.policy=rollout or lqr"),
-        (["initial_state=[1,2,3]"], r"`staf\(initial_state=...\)` must have 2 entries"),
-        (["duration=1e-9"], r"`staf\(duration=...\)` must be at least one step"),
+        (["initial_state=[1,2,3]"], r"`staf initial_state=...` must have 2 entries"),
+        (["duration=1e-9"], r"`staf duration=...` must be at least one step"),
     ],
 )
 def test_bad_setting_is_refused_by_name(overrides: list[str], message: str, tmp_path: Path) -> None:

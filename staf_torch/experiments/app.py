@@ -31,6 +31,7 @@ _FULL_ERROR = "HYDRA_FULL_ERROR"
 EXPERIMENTS = (
     "gradient_chase",
     "laws",
+    "flat_limit",
     "exponential_bound",
     "feasibility",
     "layouts",
