@@ -1,7 +1,9 @@
 """State Following (StaF) kernel approximation as a batched PyTorch engine."""
 
 from . import adp as adp
+from . import diagnostics as diagnostics
 from . import optim as optim
+from . import sensitivity as sensitivity
 from . import systems as systems
 from . import targets as targets
 from . import theory as theory

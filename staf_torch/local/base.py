@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ..kernels import Kernel
 
-_ROWS = 4096  # of a block: its temporaries then stay in the cache
+_ROWS = 4096  # rows a block: the temporaries of one stay in the inner caches
 
 
 class LocalSpace(Protocol):
@@ -60,8 +60,9 @@ def in_blocks(function: Callable[[Tensor, Tensor], Tensor], values: Tensor, stat
         return function(values, state)
     rows = values.expand(*shape, -1).flatten(0, -2).split(_ROWS)
     states = state.expand(*shape, -1).flatten(0, -2).split(_ROWS)
-    blocks = [function(*pair) for pair in zip(rows, states, strict=True)]
-    together: Tensor = torch.cat(blocks).unflatten(0, shape)
+    # Joined with the rows last, as the blocks are laid out: whole lines are copied.
+    blocks = [function(*pair).mT for pair in zip(rows, states, strict=True)]
+    together: Tensor = torch.cat(blocks, dim=-1).mT.unflatten(0, shape)
     return together
 
 

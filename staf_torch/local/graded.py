@@ -31,6 +31,7 @@ class GradedBasis(NamedTuple):
     directions: Tensor  # u, (M, n), scaled to max |u_i| = 1
     reach: Tensor  # (), the factor taken out of the directions
     weights: Tensor  # q_ij / sigma_j where k_j is degree number k, else 0: (M, K, M)
+    functionals: Tensor  # q_ij / sigma_j, (M, M)
     degrees: tuple[int, ...]  # the K different degrees, ascending
     degree: Tensor  # k_j, (M,) int64
     factorial: Tensor  # k_j!, (M,)
@@ -69,7 +70,7 @@ def graded_basis(directions: Tensor) -> GradedBasis:
         weights[:, degrees.index(k), j] = found.functionals[:, j] / found.strengths[j]
     degree = torch.tensor(found.degrees, device=u.device)
     factorial = torch.tensor([math.factorial(k) for k in found.degrees], dtype=u.dtype, device=u.device)
-    return GradedBasis(u, reach, weights, degrees, degree, factorial)
+    return GradedBasis(u, reach, weights, weights.sum(1), degrees, degree, factorial)
 
 
 class GradedSpace(NamedTuple):
@@ -91,8 +92,7 @@ class GradedSpace(NamedTuple):
     def fit(self, values: Tensor) -> Tensor:
         """beta with sum_j psi_j(u_i) beta_j = e^{-s(d_i)} V(c_i): (..., M) -> (..., M)."""
         bound = None if self.bound is None else (self.rate * self.bound.square()).amax()
-        dtype = torch.promote_types(values.dtype, self.state.dtype)
-        interpolation = Interpolation.of(self.basis, self._r2, bound, dtype)
+        interpolation = Interpolation.of(self.basis, self._r2, bound)
 
         def solve(values: Tensor, state: Tensor) -> Tensor:
             return interpolation.solve(scale(self.kernel, state, self.offsets, -1.0) * values)
@@ -124,7 +124,7 @@ class GradedSpace(NamedTuple):
     def coefficients(self, weights: Tensor) -> Tensor:
         """beta from the paper's w: (..., M) -> (..., M)."""
         b = to_scaled(self.kernel, self.state, weights) * scale(self.kernel, self.state, self.offsets)
-        full = self.basis.weights.sum(1)  # q_ij / sigma_j: orthogonal columns
+        full = self.basis.functionals  # orthogonal columns
         inverse = full / full.square().sum(0)
         return b @ inverse.to(b) / self._unscale()
 

@@ -15,33 +15,36 @@ class _Basis(Protocol):
     @property
     def directions(self) -> Tensor: ...
 
+    @property
+    def functionals(self) -> Tensor: ...
+
     def functions(self, zeta: Tensor, r2: Tensor) -> Tensor: ...
 
 
 class Interpolation(NamedTuple):
-    """Psi(r^2), Psi_ij = psi_j(u_i), and its inverse, as they depend on the radius.
+    """Psi^-1 with Psi_ij = psi_j(u_i), as the product T^-1 Q' of the functionals Q and T = Q' Psi.
 
-    Both are analytic in r^2 on the whole half-line, r = 0 included. For one radius they are one matrix
-    each; along a trajectory they are Chebyshev series in r^2, set up once, so that nothing is factored
-    again.
+    T(r^2) is block upper triangular at r = 0 with a well-conditioned diagonal, and analytic in r^2. Taken one
+    after the other, the two products keep the digits that Psi^-1 in one matrix, with its large entries of
+    both signs, would lose. For one radius T^-1 is one matrix; along a trajectory it is a Chebyshev series in
+    r^2, set up once, so that nothing is factored again.
     """
 
-    nodal: Tensor  # Psi: (M, M), (..., M, M), or the series (N, M, M)
-    inverse: Tensor  # Psi^-1, likewise
-    chebyshev: Tensor | None  # T_m(r^2), (..., N), where `nodal` and `inverse` are series
+    functionals: Tensor  # Q', (M, M)
+    inverse: Tensor  # T^-1: (M, M), (..., M, M), or the series (N, M, M)
+    chebyshev: Tensor | None  # T_m(r^2), (..., N), where `inverse` is a series
 
     @classmethod
-    def of(cls, basis: _Basis, r2: Tensor, bound: Tensor | None, dtype: torch.dtype) -> Interpolation:
-        """For the radii r^2, () or (...), with their known bound over all states, if any.
+    def of(cls, basis: _Basis, r2: Tensor, bound: Tensor | None) -> Interpolation:
+        """For the radii r^2, () or (...), with their known bound over all states, if any. In float64.
 
-        Set up in float64 and rounded to ``dtype`` at the end. Without a bound, or beyond a bound of 1, each
-        radius of a batch is inverted by itself.
+        Without a bound, or beyond a bound of 1, each radius of a batch is inverted by itself.
         """
         wide = r2.double()
-        u = basis.directions.to(wide.device)
+        u, functionals = basis.directions.to(wide.device), basis.functionals.to(wide.device).mT
         if wide.dim() == 0 or bound is None or not bool(bound <= _ANALYTIC):
             nodal = basis.functions(u, wide[..., None, None])
-            return cls(nodal.to(dtype), _inverse(nodal).to(dtype), None)
+            return cls(functionals, _inverse(functionals @ nodal), None)
         index = torch.arange(_NODES, dtype=torch.float64, device=u.device)
         angles = (index + 0.5) * (torch.pi / _NODES)
         transform = (index[:, None] * angles).cos() * (2 / _NODES)
@@ -49,33 +52,30 @@ class Interpolation(NamedTuple):
         # The bound is a constant of the series, not a quantity to differentiate.
         upper = bound.detach().double().to(u.device)
         nodal = basis.functions(u, (0.5 * upper * (1 + angles.cos()))[:, None, None])
-        series = [torch.einsum("mk,kij->mij", transform, samples) for samples in (nodal, _inverse(nodal))]
-        polynomials = _chebyshev(2 * wide / upper - 1)
-        return cls(series[0].to(dtype), series[1].to(dtype), polynomials.to(dtype))
+        series = torch.einsum("mk,kij->mij", transform, _inverse(functionals @ nodal))
+        return cls(functionals, series, _chebyshev(2 * wide / upper - 1))
 
     @property
     def shared(self) -> bool:
         """Whether one matrix serves all states."""
-        return self.chebyshev is None and self.nodal.dim() == 2
+        return self.chebyshev is None and self.inverse.dim() == 2
 
     def solve(self, values: Tensor) -> Tensor:
-        """Psi^-1 v with one step of refinement, which makes the residual, not Psi^-1, set the error."""
-        if self.shared and values.dim() == 2:  # the same in fused products, rows last: a third faster
-            columns = values.mT
-            first = self.inverse @ columns
-            return torch.addmm(first, self.inverse, torch.addmm(columns, self.nodal, first, alpha=-1)).mT
-        first = self._apply(self.inverse, values)
-        return first + self._apply(self.inverse, values - self._apply(self.nodal, first))
+        """Psi^-1 v: (..., M) -> (..., M), computed in float64 whatever the dtype of v."""
+        wide = values.double()
+        if self.shared and wide.dim() == 2:  # the same with rows last, which is faster
+            return (self.inverse @ (self.functionals @ wide.mT)).mT.to(values.dtype)
+        return self._apply_inverse(wide @ self.functionals.mT).to(values.dtype)
 
-    def _apply(self, matrix: Tensor, vector: Tensor) -> Tensor:
+    def _apply_inverse(self, vector: Tensor) -> Tensor:
         if self.chebyshev is not None:
-            columns = matrix.flatten(0, 1).mT  # (M, N M): one product for all terms of the series
-            terms: Tensor = (vector @ columns).unflatten(-1, (matrix.shape[0], matrix.shape[1]))
+            columns = self.inverse.flatten(0, 1).mT  # (M, N M): one product for all terms of the series
+            terms: Tensor = (vector @ columns).unflatten(-1, self.inverse.shape[:2])
             total: Tensor = (terms * self.chebyshev.unsqueeze(-1)).sum(-2)
             return total
-        if matrix.dim() == 2:
-            return vector @ matrix.mT
-        product: Tensor = (matrix @ vector.unsqueeze(-1)).squeeze(-1)
+        if self.inverse.dim() == 2:
+            return vector @ self.inverse.mT
+        product: Tensor = (self.inverse @ vector.unsqueeze(-1)).squeeze(-1)
         return product
 
 

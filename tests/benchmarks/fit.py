@@ -36,7 +36,7 @@ RATIO, SETUP_MS = 20.0, 50.0  # the goals
 def setup() -> Interpolation:
     """What a constant radius pays once."""
     basis = graded_basis(st.rings(SETUP_CENTERS))
-    return Interpolation.of(basis, torch.tensor(RADIUS**2, dtype=torch.float64), None, torch.float64)
+    return Interpolation.of(basis, torch.tensor(RADIUS**2, dtype=torch.float64), None)
 
 
 def programs(batch: int) -> dict[str, Callable[[], object]]:
