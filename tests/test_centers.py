@@ -14,7 +14,8 @@ from hypothesis import strategies as some
 
 import staf_torch as st
 from staf_torch.centers import probe_points
-from staf_torch.targets import Cosine
+from staf_torch.diagnostics import lebesgue_constant, sup_error
+from staf_torch.targets import Cosine, Paper
 
 
 def monomials(points: torch.Tensor, degree: int) -> torch.Tensor:
@@ -208,3 +209,23 @@ def test_permuted_centers_permute_the_weights_and_leave_the_estimate(
 def test_a_bad_argument_is_named_with_its_value(make, message: str) -> None:  # type: ignore[no-untyped-def]
     with pytest.raises(ValueError, match=re.escape(message)):
         make()
+
+
+@pytest.mark.parametrize(("dim", "degree"), [(6, 2), (8, 2), (12, 1), (12, 2), (2, 6), (3, 4)])
+def test_ball_is_unisolvent_and_well_conditioned_up_to_twelve_dimensions(dim: int, degree: int) -> None:
+    count = math.comb(dim + degree, degree)
+    basis = st.StaFBasis(st.GaussianKernel(), st.StateFollowingCenters(st.ball(count, dim), 1e-3))
+    sizes = [int((basis._graded.degree == k).sum()) for k in range(degree + 1)]
+    assert sizes == [math.comb(dim + k - 1, k) for k in range(degree + 1)]
+    # Of Fekete points at most the number of points; these stay well below it.
+    assert float(lebesgue_constant(basis, torch.zeros(dim).double(), points=2000)) < 0.4 * count + 1
+
+
+def test_ball_is_no_worse_than_the_rings_in_the_plane() -> None:
+    x = torch.tensor([[0.9, 0.2], [-0.3, 0.8], [0.1, -1.0]]).double()
+    for count in (3, 6, 10, 15, 21, 28):
+        errors = [
+            sup_error(st.StaFBasis(st.ExponentialKernel(), st.StateFollowingCenters(u, 0.1)), x, Paper())
+            for u in (st.ball(count, 2), st.rings(count))
+        ]
+        assert (errors[0] <= 3 * errors[1]).all()
