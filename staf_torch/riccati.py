@@ -69,7 +69,13 @@ def riccati(a: Tensor, b: Tensor, q: Tensor, r: Tensor, *, name: str = "the syst
             f"The linearisation of {name} at its equilibrium is not stabilisable: no input reaches "
             f"its mode with the eigenvalue {shown} 1/s."
         )
-    from scipy.linalg import solve_continuous_are  # here: half a second that no other import need pay
+    try:
+        from scipy.linalg import solve_continuous_are  # here: half a second that no other import need pay
+    except ImportError as error:
+        raise ValueError(
+            "The Riccati equation of the LQR needs SciPy, which is not installed: "
+            "pip install 'staf_torch[adp]'."
+        ) from error
 
     solution = solve_continuous_are(*(m.double().cpu().numpy() for m in (a, b, q, r)))
     p = torch.from_numpy(solution)

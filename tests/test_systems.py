@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import re
+import sys
 
 import pytest
 import torch
@@ -12,6 +13,7 @@ from helpers import SYSTEMS, over, tensor, uniform
 from torch import Tensor, nn
 
 from staf_torch import systems
+from staf_torch.riccati import riccati
 from staf_torch.systems import runge_kutta_step, simulate, trajectory
 
 
@@ -197,3 +199,10 @@ def test_a_bad_argument_is_named_with_its_value(make, message: str) -> None:  # 
 def test_a_matrix_that_is_not_square_is_called_so() -> None:
     with pytest.raises(ValueError, match="Linear"):
         systems.Linear(tensor([1.0, 2.0]))
+
+
+def test_a_missing_scipy_is_named_with_the_extra_that_brings_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "scipy.linalg", None)
+    one = torch.eye(2, dtype=torch.float64)
+    with pytest.raises(ValueError, match=r"needs SciPy.*staf_torch\[adp\]"):
+        riccati(one, one, one, one)
