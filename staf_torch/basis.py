@@ -21,7 +21,7 @@ class GramStructure(NamedTuple):
     """K(c(x)) = e^{gain} S K0 S with S = diag(scale), at the states x."""
 
     core: Tensor  # K0, (M, M) where one serves all states, else (..., M, M)
-    scale: Tensor | None  # e^{s(x, d_i)}, (..., M); None for ones
+    scale: Tensor | None  # e^{s(x, d_i)}, (..., M), (M,) where one serves all; None for ones
     log_gain: Tensor | None  # g(x), (...); None for zeros
 
     def scaled(self) -> Tensor:
@@ -29,6 +29,15 @@ class GramStructure(NamedTuple):
         if self.scale is None:
             return self.core
         return self.scale.unsqueeze(-1) * self.core * self.scale.unsqueeze(-2)
+
+    def quadratic(self, v: Tensor) -> Tensor:
+        """v'S K0 S v without S K0 S: (..., M) -> (...)."""
+        u = v if self.scale is None else self.scale * v
+        product = self.core[..., 0] * u[..., :1]
+        for j in range(1, u.shape[-1]):  # a column at a time: no (..., M, M), no bits from other rows
+            product = torch.addcmul(product, self.core[..., j], u[..., j : j + 1])
+        quadratic: Tensor = torch.linalg.vecdot(u, product)
+        return quadratic
 
 
 class StaFBasis(nn.Module):
@@ -92,9 +101,9 @@ class StaFBasis(nn.Module):
     def gram_structure(self, x: Tensor) -> GramStructure:
         """The factors of K(c(x)), none of which overflows: (..., n) -> `GramStructure`."""
         shared = self.kernel.state_free and self.centers.radius.constant
-        d = self.centers.offsets(x)
-        d0 = self.centers.offsets(x.new_zeros(self.dim)) if shared else d
-        core = self.kernel.core(x.new_zeros(self.dim) if shared else x, d0, d0)
+        at = x.new_zeros(self.dim) if shared else x
+        d = self.centers.offsets(at)
+        core = self.kernel.core(at, d, d)
         s = self.kernel.log_scale(x, d)
         return GramStructure(core, None if s is None else s.exp(), self.kernel.log_gain(x))
 

@@ -46,8 +46,11 @@ class StateFollowingCenters(nn.Module):
 
     def offsets(self, x: Tensor) -> Tensor:
         """d_i(x) = nu(x) u_i: (..., n) -> (..., M, n)."""
-        nu: Tensor = self.radius(x)
-        return nu[..., None, None] * self.directions.to(x)
+        directions = self.directions.to(x)
+        constant = self.radius.constant  # then one product, seen from all states
+        nu: Tensor = self.radius(x.new_zeros(self.dim) if constant else x)
+        offsets = nu[..., None, None] * directions
+        return offsets.expand(*x.shape[:-1], self.count, self.dim)
 
     def forward(self, x: Tensor) -> Tensor:
         """c_i(x): (..., n) -> (..., M, n)."""

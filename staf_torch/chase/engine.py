@@ -10,9 +10,10 @@ from torch import Tensor
 
 from .._checks import integer, trailing
 from ..basis import StaFBasis, Target
-from ..objective import NativeError
 from ..optim.base import UpdateLaw
-from .recursion import Carry, recursion
+from .correct import correct, lost, paper_units
+from .layout import batch_last
+from .recursion import Carry
 from .result import ChaseResult, concatenate
 
 _WORKING_BYTES = 2**26
@@ -54,9 +55,7 @@ def chase(
 
     Source: Rosenfeld et al., section 6.
     """
-    trailing("chase", "states", states, dims=3, last=basis.dim)
-    if states.dim() != 3 or 0 in states.shape:
-        raise ValueError(f"`chase(states=...)` must have the shape (B, T, n); got {tuple(states.shape)}.")
+    check_states("chase", states, basis)
     pieces = states.split(chunk_length(states.shape[0], basis, states.element_size()), dim=1)
     return concatenate(chase_pieces(pieces, basis, target, law, inner_steps=inner_steps, weights=weights))
 
@@ -78,17 +77,28 @@ def chase_pieces(
 ) -> Iterator[ChaseResult]:
     """`chase` over consecutive pieces of time (B, C, n), a result a piece."""
     integer("chase", "inner_steps", inner_steps, least=0)
-    if not isinstance(law, UpdateLaw):
-        raise ValueError(f"`chase(law=...)` must be an UpdateLaw; got {law!r}.")
+    check_law("chase", law)
     carry = None
     for states in pieces:
         if carry is None:
-            carry = _start(states, basis, law, weights)
+            carry = start(states, basis, law, weights)
         result, carry = _piece(states, basis, target, law, inner_steps, carry)
         yield result
 
 
-def _start(states: Tensor, basis: StaFBasis, law: UpdateLaw, weights: Tensor | None) -> Carry:
+def check_states(call: str, states: Tensor, basis: StaFBasis) -> None:
+    trailing(call, "states", states, dims=3, last=basis.dim)
+    if states.dim() != 3 or 0 in states.shape:
+        raise ValueError(f"`{call}(states=...)` must have the shape (B, T, n); got {tuple(states.shape)}.")
+
+
+def check_law(call: str, law: UpdateLaw) -> None:
+    if not isinstance(law, UpdateLaw):
+        raise ValueError(f"`{call}(law=...)` must be an UpdateLaw; got {law!r}.")
+
+
+def start(states: Tensor, basis: StaFBasis, law: UpdateLaw, weights: Tensor | None) -> Carry:
+    """The carry before the first time of the states (B, C, n)."""
     shape = (states.shape[0], basis.count)
     first = states.new_zeros(shape)
     if weights is not None:
@@ -116,42 +126,37 @@ def _piece(
     carry: Carry,
 ) -> tuple[ChaseResult, Carry]:
     """One piece of time: (B, C, n) and the carry to its result and the next carry."""
-    structure = basis.gram_structure(states)
-    values = basis.values(states, target)
-    gram = structure.scaled().expand(*states.shape[:2], basis.count, basis.count)
-    zero = states.new_zeros(states.shape[:2])
-    log_gain = zero if structure.log_gain is None else structure.log_gain
-    run = recursion(gram, values, log_gain, law, inner_steps, carry)
+    at = batch_last(states)
+    structure, values = basis.gram_structure(at), basis.values(at, target)
+    run = correct(structure, values, law, inner_steps, carry)
 
-    space = basis.local(states)
+    space = basis.local(at)
     fitted = space.fit(values)
     ideal = space.scaled_weights(fitted)
-    objective = NativeError(gram, values)
-    scale = zero.new_ones(()) if structure.scale is None else structure.scale
-    inverse_gain = (-log_gain).exp()
-    here = zero[..., None, None].expand(*states.shape[:2], 1, basis.dim)
-    row = basis.kernel.core(states, here, space.offsets).squeeze(-2)  # k0(0, d_i), (..., M)
-    times = torch.arange(carry.time, run.carry.time, device=states.device)
-    end = run.carry.diverged_at[:, None]
-    lost = (end >= 0) & (times >= end)
+    zero = at.new_zeros(())
+    inverse_gain = (zero if structure.log_gain is None else -structure.log_gain).exp()
+    scale = 1 if structure.scale is None else structure.scale
+    here = zero.expand(*at.shape[:2], 1, basis.dim)
+    row = basis.kernel.core(at, here, space.offsets).squeeze(-2)  # k0(0, d_i), (..., M)
+    gone = lost(run.carry, at.shape[1])
 
     def known(quantity: Tensor) -> Tensor:
-        return torch.where(lost.view(*lost.shape, *[1] * (quantity.dim() - 2)), torch.nan, quantity)
+        return torch.where(gone.view(*gone.shape, *[1] * (quantity.dim() - 2)), torch.nan, quantity)
 
     def at_state(scaled_weights: Tensor) -> Tensor:
         return known(torch.linalg.vecdot(row, scale * scaled_weights))
 
     result = ChaseResult(
         state=states,
-        weights=run.after * inverse_gain[..., None],
-        ideal_weights=known(ideal * inverse_gain[..., None]),
+        weights=run.after * paper_units(structure, run.carry, at.shape[1]),
+        ideal_weights=known(ideal * inverse_gain.unsqueeze(-1)),
         coefficients=known(scale * run.after),
-        value=known(target(states)),
+        value=known(target(at)),
         estimate=at_state(run.after),
         estimate_before=at_state(run.before),
         ideal_estimate=known(space.evaluate(here, fitted).squeeze(-1)),
-        excess=known(objective.excess(run.after, ideal) * inverse_gain),
-        excess_before=known(objective.excess(run.before, ideal) * inverse_gain),
+        excess=known(structure.quadratic(run.after - ideal) * inverse_gain),
+        excess_before=known(structure.quadratic(run.before - ideal) * inverse_gain),
         diverged_at=run.carry.diverged_at,
     )
     return result, run.carry

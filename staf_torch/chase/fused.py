@@ -1,0 +1,144 @@
+"""The sequential part of a gradient chase for the paper's law on the CPU: one call a piece of time.
+
+It computes what `recursion` defines, to rounding: g <- g - 2 lambda K g in place of a new residual an
+iteration, one product with K in place of two, all of it in registers with trajectories as lanes.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+from collections.abc import Callable, Iterable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.autograd import forward_ad
+
+from ..basis import GramStructure
+from ..optim import SteepestDescent, UpdateLaw
+from ._compiled import compiled
+from .recursion import Carry
+
+_REALS = {torch.float32: "float", torch.float64: "double"}
+
+
+class _Array(ctypes.Structure):
+    _fields_ = (
+        ("data", ctypes.c_void_p),
+        *((name, ctypes.c_int64) for name in ("row", "time", "entry")),
+    )
+
+
+class _Problem(ctypes.Structure):
+    _fields_ = (
+        *((n, ctypes.c_int64) for n in ("batch", "times", "count", "inner_steps", "start", "threads")),
+        ("core", ctypes.c_void_p),
+        *((n, ctypes.c_int64) for n in ("core_row", "core_time", "core_i", "core_j")),
+        ("values", _Array),
+        ("scale", _Array),
+        *((n, ctypes.c_void_p) for n in ("unit", "factor", "last_factor", "weights", "diverged_at")),
+        *((n, ctypes.c_void_p) for n in ("before", "after", "parallel")),
+    )
+
+
+class History(NamedTuple):
+    """Where the weights of a piece are written, each (C, M, B) contiguous or not at all."""
+
+    before: Tensor | None = None
+    after: Tensor | None = None
+    recorded: Tensor | None = None  # the paper's w in place of its units of e^{-g}; excludes the others
+
+
+def fusible(law: UpdateLaw, inner_steps: int, tensors: Iterable[Tensor | None]) -> bool:
+    """Whether the fused recursion computes this: the paper's law, plain CPU tensors without gradient."""
+    given = [tensor for tensor in tensors if tensor is not None]
+    return (
+        type(law) is SteepestDescent
+        and inner_steps > 0
+        and not torch.compiler.is_compiling()
+        and all(_plain(tensor, given[0].dtype) for tensor in given)
+        and compiled(_REALS[given[0].dtype]) is not None
+    )
+
+
+def _plain(tensor: Tensor, dtype: torch.dtype) -> bool:
+    return (
+        type(tensor) is Tensor
+        and tensor.device.type == "cpu"
+        and tensor.dtype is dtype
+        and dtype in _REALS
+        and not (tensor.requires_grad and torch.is_grad_enabled())
+        and not torch._C._functorch.is_functorch_wrapped_tensor(tensor)  # vmap, jvp, ...
+        and forward_ad.unpack_dual(tensor).tangent is None
+    )
+
+
+def fused(
+    structure: GramStructure, values: Tensor, inner_steps: int, carry: Carry, history: History
+) -> Carry:
+    """Correct the weights at every time of a piece, and write what ``history`` asks for.
+
+    Args:
+        structure: the Gram factors of the piece, (B, C).
+        values: V(c(x_k)), (B, C, M).
+        inner_steps: iterations a time, at least 1.
+        carry: from the piece before; not changed.
+        history: written.
+    """
+    batch, times, count = values.shape
+    core = structure.core.expand(batch, times, count, count)
+    scale = None if structure.scale is None else structure.scale.expand(values.shape)
+    weights = torch.empty(count, batch, dtype=values.dtype).copy_(carry.weights.mT)
+    diverged_at = carry.diverged_at.clone()
+    unit, factor, last_factor = _gains(structure.log_gain, carry.log_gain, history.recorded is not None)
+    after = history.after if history.recorded is None else history.recorded
+    problem = _Problem(
+        *(batch, times, count, inner_steps, carry.time, torch.get_num_threads()),
+        *(core.data_ptr(), *core.stride()),
+        _array(values),
+        _array(scale),
+        *(_pointer(unit), _pointer(factor), _pointer(last_factor), _pointer(weights)),
+        *(_pointer(diverged_at), _pointer(history.before), _pointer(after), _parallel()),
+    )
+    solve = compiled(_REALS[values.dtype])
+    assert solve is not None
+    solve(ctypes.byref(problem))
+    return Carry(weights.mT, (), last_gain(structure, carry, diverged_at), carry.time + times, diverged_at)
+
+
+def _gains(log_gain: Tensor | None, last: Tensor, recorded: bool) -> tuple[Tensor | None, ...]:
+    """e^{g(x_k) - g(x_{k-1})}, and where w is recorded e^{-g} of this time and of the last before."""
+    if log_gain is None:
+        return None, None, None
+    gain = log_gain.mT.contiguous()  # (C, B)
+    unit = torch.empty_like(gain)
+    torch.sub(gain[0], last, out=unit[0])
+    torch.sub(gain[1:], gain[:-1], out=unit[1:])
+    return unit.exp_(), *(((-gain).exp(), (-last).exp()) if recorded else (None, None))
+
+
+def last_gain(structure: GramStructure, carry: Carry, diverged_at: Tensor) -> Tensor:
+    """g of the last time that was finite, (B,): the unit in which the weights stand."""
+    if structure.log_gain is None:
+        return carry.log_gain
+    times = structure.log_gain.shape[1]
+    index = torch.where(diverged_at < 0, times, diverged_at - carry.time) - 1
+    gain = structure.log_gain.gather(1, index.clamp(min=0).unsqueeze(-1)).squeeze(-1)
+    return torch.where(index < 0, carry.log_gain, gain)
+
+
+def _array(tensor: Tensor | None) -> _Array:
+    return _Array() if tensor is None else _Array(tensor.data_ptr(), *tensor.stride())
+
+
+def _pointer(tensor: Tensor | None) -> int | None:
+    return None if tensor is None else tensor.data_ptr()
+
+
+@functools.cache
+def _parallel() -> int | None:
+    """The OpenMP entry that torch itself runs on: a second pool of threads on the same cores makes
+    both several times slower. Without it the library starts threads of its own."""
+    entry: Callable[..., object] | None = getattr(ctypes.CDLL(torch._C.__file__), "GOMP_parallel", None)
+    return None if entry is None else ctypes.cast(entry, ctypes.c_void_p).value  # type: ignore[arg-type]
