@@ -59,7 +59,8 @@ def _library(real: str) -> Path:
 def _key(command: list[str]) -> str:
     """What the machine code depends on: the source, the command, the compiler and the processor."""
     version = _run([command[0], "--version"])
-    parts = (_SOURCE.read_text(), *command, version, platform.platform(), _processor())
+    sources = (_SOURCE.read_text(), _SOURCE.with_name("_block.hpp").read_text())
+    parts = (*sources, *command, version, platform.platform(), _processor())
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:16]
 
 

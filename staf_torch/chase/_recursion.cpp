@@ -6,25 +6,15 @@
 
 #include <algorithm>
 #include <atomic>
-#include <cstdint>
-#include <cstring>
 #include <thread>
+#include <type_traits>
 #include <vector>
 
-#if defined(__AVX512F__)
-constexpr int register_bytes = 64, registers = 32;
-#elif defined(__AVX__)
-constexpr int register_bytes = 32, registers = 16;
-#else
-constexpr int register_bytes = 16, registers = 32;
-#endif
+#include "_block.hpp"
+
 constexpr int unrolled_count = 6;  // up to this M the Gram matrix is unrolled, above it is a loop over panels
 constexpr int panel = 4;           // rows of the Gram matrix in one pass over a vector
 constexpr int tile_lanes = 256;    // rows that advance together: what they carry stays in the first cache
-
-#define INLINE inline __attribute__((always_inline))
-#define UNROLL _Pragma("GCC unroll 8")
-#define LANES UNROLL for (int k = 0; k < N; ++k)
 
 // Strides count elements; a null pointer stands for ones, or for a history that nobody asked for.
 struct Array {  // (batch, times, count)
@@ -35,67 +25,31 @@ struct Problem {
     int64_t batch, times, count, inner_steps, start, threads;
     const void *core;  // K0, or one a state where core_row or core_time is not 0
     int64_t core_row, core_time, core_i, core_j;
-    Array values, scale;      // V(c), e^{s(x, d)}
-    const void *unit;         // (times, batch) e^{g(x_k) - g(x_{k-1})}
-    const void *factor;       // (times, batch) of the recorded weights after correction
-    const void *last_factor;  // (batch) the same at the time before the first
+    Array values, log_scale, log_gain;  // V(c), s(x, d), g(x)
+    void *last_gain;          // (batch) in and out: g in whose units e^{-g} the weights stand
     void *weights;            // (count, batch) in and out
     int64_t *diverged_at;     // (batch) in and out
     void *before, *after;     // (times, count, batch)
+    int64_t papers;           // whether "after" is the paper's w in place of its units of e^{-g}
     void (*parallel)(void (*)(void *), void *, unsigned, unsigned);  // the GOMP_parallel that torch uses, or null
 };
-
-template <typename T, int N> struct Block {
-    static constexpr int width = register_bytes / sizeof(T), lanes = N * width;
-    typedef T Vector __attribute__((vector_size(register_bytes)));
-    Vector v[N];
-};
-template <typename T, int N> INLINE Block<T, N> fill(T x) {
-    Block<T, N> r;
-    LANES r.v[k] = typename Block<T, N>::Vector{} + x;
-    return r;
-}
-template <typename T, int N> INLINE Block<T, N> operator*(const Block<T, N> &a, const Block<T, N> &b) {
-    Block<T, N> r;
-    LANES r.v[k] = a.v[k] * b.v[k];
-    return r;
-}
-template <typename T, int N> INLINE void add(Block<T, N> &sum, const Block<T, N> &a, const Block<T, N> &b) {
-    LANES sum.v[k] += a.v[k] * b.v[k];
-}
-template <typename T, int N> INLINE void add(Block<T, N> &sum, T a, const Block<T, N> &b) {
-    LANES sum.v[k] += a * b.v[k];
-}
-// where(lost, a, b)
-template <typename T, int N> INLINE Block<T, N> choose(const Block<T, N> &lost, const Block<T, N> &a, const Block<T, N> &b) {
-    Block<T, N> r;
-    LANES r.v[k] = lost.v[k] != 0 ? a.v[k] : b.v[k];
-    return r;
-}
-template <typename T, int N> INLINE Block<T, N> load(const T *from, int64_t stride, int rows) {
-    constexpr int lanes = Block<T, N>::lanes;
-    if (stride == 0) return fill<T, N>(*from);
-    Block<T, N> r;
-    if (rows == lanes && stride == 1) {
-        std::memcpy(&r, from, sizeof r);
-    } else {
-        T lane[lanes];
-        for (int l = 0; l < lanes; ++l) lane[l] = from[l < rows ? l * stride : 0];
-        std::memcpy(&r, lane, sizeof r);
-    }
-    return r;
-}
-template <typename T, int N> INLINE void store(T *to, int rows, const Block<T, N> &x) {
-    std::memcpy(to, &x, rows * sizeof(T));
-}
 
 // A block of rows between two times.
 template <typename T, int N> struct Standing {
     int64_t first;
     int rows;
-    Block<T, N> lost;    // not 0 where the row has diverged
-    Block<T, N> factor;  // of the recorded weights, at the last time that was finite
+    Block<T, N> lost;          // not 0 where the row has diverged
+    Block<T, N> gain, factor;  // g and e^{-g} of the last time that was finite
 };
+
+// The numbers of one time for a block of rows; entry i of the count.
+template <typename T, int N> INLINE Block<T, N> load(const Array &from, const Standing<T, N> &at, int64_t t, int i) {
+    const T *data = static_cast<const T *>(from.data) + at.first * from.row + t * from.time + i * from.entry;
+    return load<T, N>(data, from.row, at.rows);
+}
+template <typename T, int N> INLINE Block<T, N> scale(const Problem &p, const Standing<T, N> &at, int64_t t, int i) {
+    return exponential(load(p.log_scale, at, t, i));
+}
 
 // K of one state, M known to the compiler: its lower triangle.
 template <typename T, int N, int M> struct Unrolled {
@@ -112,10 +66,8 @@ template <typename T, int N, int M> struct Unrolled {
 
     INLINE void prepare(const Problem &p, const Standing<T, N> &at, int64_t t) {
         const T *core = static_cast<const T *>(p.core) + at.first * p.core_row + t * p.core_time;
-        const T *scale = static_cast<const T *>(p.scale.data) + at.first * p.scale.row + t * p.scale.time;
         B s[M];
-        for (int i = 0; i < M; ++i)
-            s[i] = p.scale.data ? load<T, N>(scale + i * p.scale.entry, p.scale.row, at.rows) : fill<T, N>(1);
+        for (int i = 0; i < M; ++i) s[i] = p.log_scale.data ? scale(p, at, t, i) : fill<T, N>(1);
         for (int i = 0, n = 0; i < M; ++i)
             for (int j = 0; j <= i; ++j, ++n) {
                 const T *entry = core + i * p.core_i + j * p.core_j;
@@ -150,9 +102,8 @@ template <typename T, int N, typename E> struct Panels {
 
     void prepare(const Problem &p, const Standing<T, N> &at_, int64_t t) {
         const T *core = static_cast<const T *>(p.core) + at_.first * p.core_row + t * p.core_time;
-        const T *scale = static_cast<const T *>(p.scale.data) + at_.first * p.scale.row + t * p.scale.time;
-        scaled = p.scale.data != nullptr;
-        for (int i = 0; scaled && i < m; ++i) s[i] = load<T, N>(scale + i * p.scale.entry, p.scale.row, at_.rows);
+        scaled = p.log_scale.data != nullptr;
+        for (int i = 0; scaled && i < m; ++i) s[i] = scale(p, at_, t, i);
         if constexpr (!shared)
             for (int i = 0; i < m; ++i)
                 for (int j = 0; j < m; ++j)
@@ -184,12 +135,15 @@ template <typename T, int N, typename Gram> struct Solver {
         const int m = gram.count(p);
         typename Gram::Vector a(m), g(m), y(m), old(m);
         T *weights = static_cast<T *>(p.weights) + at.first;
-        const T *values = static_cast<const T *>(p.values.data) + at.first * p.values.row + t * p.values.time;
-        const int64_t here = t * p.batch + at.first;
-        const B unit = p.unit ? load<T, N>(static_cast<const T *>(p.unit) + here, 1, at.rows) : fill<T, N>(1);
+        B gain = at.gain, unit = fill<T, N>(1);
+        if (p.last_gain) {
+            gain = load(p.log_gain, at, t, 0);
+            LANES unit.v[k] = gain.v[k] - at.gain.v[k];
+            unit = exponential(unit);
+        }
         gram.prepare(p, at, t);
         for (int i = 0; i < m; ++i) old[i] = load<T, N>(weights + i * p.batch, 1, at.rows);
-        for (int i = 0; i < m; ++i) g[i] = load<T, N>(values + i * p.values.entry, p.values.row, at.rows);
+        for (int i = 0; i < m; ++i) g[i] = load(p.values, at, t, i);
         UNROLL for (int i = 0; i < m; ++i) a[i] = old[i] * unit;
         gram.product(a, y);
         UNROLL for (int i = 0; i < m; ++i) LANES g[i].v[k] = 2 * (g[i].v[k] - y[i].v[k]);
@@ -197,9 +151,9 @@ template <typename T, int N, typename Gram> struct Solver {
 
         B lost = at.lost;
         UNROLL for (int i = 0; i < m; ++i) LANES lost.v[k] = a[i].v[k] - a[i].v[k] == 0 ? lost.v[k] : fill<T, N>(1).v[k];
-        note(at, lost, t);
-        if (p.factor)
-            at.factor = choose(lost, at.factor, load<T, N>(static_cast<const T *>(p.factor) + here, 1, at.rows));
+        if (std::memcmp(&at.lost, &lost, sizeof lost) != 0) note(at, lost, t);
+        if (p.last_gain) at.gain = choose(lost, at.gain, gain);
+        if (p.last_gain && p.papers) at.factor = inverse(at.gain);
         const int64_t entry = t * p.batch * m + at.first;
         for (int i = 0; p.before && i < m; ++i)
             store(static_cast<T *>(p.before) + entry + i * p.batch, at.rows, choose(lost, old[i], old[i] * unit));
@@ -208,6 +162,11 @@ template <typename T, int N, typename Gram> struct Solver {
             store(weights + i * p.batch, at.rows, kept);
             if (p.after) store(static_cast<T *>(p.after) + entry + i * p.batch, at.rows, kept * at.factor);
         }
+    }
+
+    static INLINE B inverse(B gain) {
+        LANES gain.v[k] = -gain.v[k];
+        return exponential(gain);
     }
 
     // a += lambda g, g -= 2 lambda K g, lambda = g'g / 2 g'Kg, zero where it is 0/0.
@@ -241,8 +200,8 @@ template <typename T, int N, typename Gram> struct Solver {
     void run(int64_t first, int64_t last) {
         std::vector<Standing<T, N>> tile;
         for (int64_t b = first; b < last; b += B::lanes) {
-            Standing<T, N> at{b, int(std::min<int64_t>(B::lanes, last - b)), {}, fill<T, N>(1)};
-            if (p.last_factor) at.factor = load<T, N>(static_cast<const T *>(p.last_factor) + b, 1, at.rows);
+            Standing<T, N> at{b, int(std::min<int64_t>(B::lanes, last - b)), {}, {}, fill<T, N>(1)};
+            if (p.last_gain) at.gain = load<T, N>(static_cast<const T *>(p.last_gain) + b, 1, at.rows);
             T lost[B::lanes] = {};
             for (int l = 0; l < at.rows; ++l) lost[l] = p.diverged_at[b + l] >= 0;
             std::memcpy(&at.lost, lost, sizeof lost);
@@ -250,6 +209,8 @@ template <typename T, int N, typename Gram> struct Solver {
         }
         for (int64_t t = 0; t < p.times; ++t)
             for (auto &at : tile) step(at, t);
+        for (auto &at : tile)
+            if (p.last_gain) store(static_cast<T *>(p.last_gain) + at.first, at.rows, at.gain);
     }
 };
 

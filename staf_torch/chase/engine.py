@@ -114,7 +114,7 @@ def start(states: Tensor, basis: StaFBasis, law: UpdateLaw, weights: Tensor | No
     first = first if gain is None else torch.where(first == 0, 0.0, first * gain.exp()[:, None])
     zero = states.new_zeros(states.shape[0])
     never = torch.full(zero.shape, -1, dtype=torch.int64, device=states.device)
-    return Carry(first, law.init(first), zero if gain is None else gain, 0, never)
+    return Carry(first, law.init(first), zero if gain is None else gain.clone(), 0, never)
 
 
 def _piece(
@@ -135,7 +135,7 @@ def _piece(
     ideal = space.scaled_weights(fitted)
     zero = at.new_zeros(())
     inverse_gain = (zero if structure.log_gain is None else -structure.log_gain).exp()
-    scale = 1 if structure.scale is None else structure.scale
+    scale = zero.exp() if structure.scale is None else structure.scale
     here = zero.expand(*at.shape[:2], 1, basis.dim)
     row = basis.kernel.core(at, here, space.offsets).squeeze(-2)  # k0(0, d_i), (..., M)
     gone = lost(run.carry, at.shape[1])

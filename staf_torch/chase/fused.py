@@ -36,9 +36,11 @@ class _Problem(ctypes.Structure):
         ("core", ctypes.c_void_p),
         *((n, ctypes.c_int64) for n in ("core_row", "core_time", "core_i", "core_j")),
         ("values", _Array),
-        ("scale", _Array),
-        *((n, ctypes.c_void_p) for n in ("unit", "factor", "last_factor", "weights", "diverged_at")),
-        *((n, ctypes.c_void_p) for n in ("before", "after", "parallel")),
+        ("log_scale", _Array),
+        ("log_gain", _Array),
+        *((n, ctypes.c_void_p) for n in ("last_gain", "weights", "diverged_at", "before", "after")),
+        ("papers", ctypes.c_int64),
+        ("parallel", ctypes.c_void_p),
     )
 
 
@@ -83,49 +85,28 @@ def fused(
         structure: the Gram factors of the piece, (B, C).
         values: V(c(x_k)), (B, C, M).
         inner_steps: iterations a time, at least 1.
-        carry: from the piece before; not changed.
+        carry: from the piece before; its tensors are taken over and written.
         history: written.
     """
     batch, times, count = values.shape
+    log_scale, log_gain = structure.log_scale, structure.log_gain
     core = structure.core.expand(batch, times, count, count)
-    scale = None if structure.scale is None else structure.scale.expand(values.shape)
-    weights = torch.empty(count, batch, dtype=values.dtype).copy_(carry.weights.mT)
-    diverged_at = carry.diverged_at.clone()
-    unit, factor, last_factor = _gains(structure.log_gain, carry.log_gain, history.recorded is not None)
+    weights = carry.weights.mT.contiguous()
     after = history.after if history.recorded is None else history.recorded
     problem = _Problem(
         *(batch, times, count, inner_steps, carry.time, torch.get_num_threads()),
         *(core.data_ptr(), *core.stride()),
         _array(values),
-        _array(scale),
-        *(_pointer(unit), _pointer(factor), _pointer(last_factor), _pointer(weights)),
-        *(_pointer(diverged_at), _pointer(history.before), _pointer(after), _parallel()),
+        _array(None if log_scale is None else log_scale.expand(values.shape)),
+        _array(None if log_gain is None else log_gain.unsqueeze(-1)),
+        None if log_gain is None else carry.log_gain.data_ptr(),
+        *(weights.data_ptr(), carry.diverged_at.data_ptr(), _pointer(history.before), _pointer(after)),
+        *(history.recorded is not None, _parallel()),
     )
     solve = compiled(_REALS[values.dtype])
     assert solve is not None
     solve(ctypes.byref(problem))
-    return Carry(weights.mT, (), last_gain(structure, carry, diverged_at), carry.time + times, diverged_at)
-
-
-def _gains(log_gain: Tensor | None, last: Tensor, recorded: bool) -> tuple[Tensor | None, ...]:
-    """e^{g(x_k) - g(x_{k-1})}, and where w is recorded e^{-g} of this time and of the last before."""
-    if log_gain is None:
-        return None, None, None
-    gain = log_gain.mT.contiguous()  # (C, B)
-    unit = torch.empty_like(gain)
-    torch.sub(gain[0], last, out=unit[0])
-    torch.sub(gain[1:], gain[:-1], out=unit[1:])
-    return unit.exp_(), *(((-gain).exp(), (-last).exp()) if recorded else (None, None))
-
-
-def last_gain(structure: GramStructure, carry: Carry, diverged_at: Tensor) -> Tensor:
-    """g of the last time that was finite, (B,): the unit in which the weights stand."""
-    if structure.log_gain is None:
-        return carry.log_gain
-    times = structure.log_gain.shape[1]
-    index = torch.where(diverged_at < 0, times, diverged_at - carry.time) - 1
-    gain = structure.log_gain.gather(1, index.clamp(min=0).unsqueeze(-1)).squeeze(-1)
-    return torch.where(index < 0, carry.log_gain, gain)
+    return carry._replace(weights=weights.mT, time=carry.time + times)
 
 
 def _array(tensor: Tensor | None) -> _Array:
