@@ -29,7 +29,8 @@ struct Problem {
     void *last_gain;          // (batch) in and out: g in whose units e^{-g} the weights stand
     void *weights;            // (count, batch) in and out
     int64_t *diverged_at;     // (batch) in and out
-    void *before, *after;     // (times, count, batch)
+    void *before, *after;     // (times, count, batch), whose last stride is 1
+    int64_t history_time, history_entry;
     int64_t papers;           // whether "after" is the paper's w in place of its units of e^{-g}
     void (*parallel)(void (*)(void *), void *, unsigned, unsigned);  // the GOMP_parallel that torch uses, or null
 };
@@ -154,13 +155,13 @@ template <typename T, int N, typename Gram> struct Solver {
         if (std::memcmp(&at.lost, &lost, sizeof lost) != 0) note(at, lost, t);
         if (p.last_gain) at.gain = choose(lost, at.gain, gain);
         if (p.last_gain && p.papers) at.factor = inverse(at.gain);
-        const int64_t entry = t * p.batch * m + at.first;
+        const int64_t here = t * p.history_time + at.first;
         for (int i = 0; p.before && i < m; ++i)
-            store(static_cast<T *>(p.before) + entry + i * p.batch, at.rows, choose(lost, old[i], old[i] * unit));
+            store(static_cast<T *>(p.before) + here + i * p.history_entry, at.rows, choose(lost, old[i], old[i] * unit));
         for (int i = 0; i < m; ++i) {
             const B kept = choose(lost, old[i], a[i]);
             store(weights + i * p.batch, at.rows, kept);
-            if (p.after) store(static_cast<T *>(p.after) + entry + i * p.batch, at.rows, kept * at.factor);
+            if (p.after) store(static_cast<T *>(p.after) + here + i * p.history_entry, at.rows, kept * at.factor);
         }
     }
 

@@ -39,13 +39,13 @@ class _Problem(ctypes.Structure):
         ("log_scale", _Array),
         ("log_gain", _Array),
         *((n, ctypes.c_void_p) for n in ("last_gain", "weights", "diverged_at", "before", "after")),
-        ("papers", ctypes.c_int64),
+        *((name, ctypes.c_int64) for name in ("history_time", "history_entry", "papers")),
         ("parallel", ctypes.c_void_p),
     )
 
 
 class History(NamedTuple):
-    """Where the weights of a piece are written, each (C, M, B) contiguous or not at all."""
+    """Where the weights of a piece are written, if at all: (C, M, B), contiguous in B, equally strided."""
 
     before: Tensor | None = None
     after: Tensor | None = None
@@ -101,6 +101,7 @@ def fused(
         _array(None if log_gain is None else log_gain.unsqueeze(-1)),
         None if log_gain is None else carry.log_gain.data_ptr(),
         *(weights.data_ptr(), carry.diverged_at.data_ptr(), _pointer(history.before), _pointer(after)),
+        *((0, 0) if after is None else after.stride()[:2]),
         *(history.recorded is not None, _parallel()),
     )
     solve = compiled(_REALS[values.dtype])

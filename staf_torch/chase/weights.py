@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 
 import torch
 from torch import Tensor
@@ -13,9 +13,11 @@ from ..optim.base import UpdateLaw
 from .correct import correct_weights, last_weights
 from .engine import check_law, check_states, chunk_length, start
 from .layout import batch_last
+from .recursion import Carry
 from .result import ChaseWeights
 
-_PIECE_BYTES = 2**22  # of V at the centers: a piece and what it is made from stay in the last cache
+_PIECE_BYTES = 2**20  # of V at the centers: a piece and what it is made from stay in the inner caches
+_ROWS = 4096  # trajectories a block
 
 
 def chase_weights(
@@ -47,35 +49,82 @@ def chase_weights(
     """
     integer("chase_weights", "inner_steps", inner_steps, least=0)
     check_law("chase_weights", law)
-    carry, done = None, 0
-    room: Tensor | None = None  # (T, M, B), so that every number is written once, where it stays
-    parts: list[Tensor] = []  # (C, M, B) each, views of the room wherever that was possible
-    for piece in _pieces(states, basis):
-        at = batch_last(piece)
-        if carry is None:
-            carry = start(at, basis, law, weights)
-        if history and (room is None or not isinstance(states, Tensor)):
-            times = states.shape[1] if isinstance(states, Tensor) else at.shape[1]
-            room, done = at.detach().new_empty(times, basis.count, at.shape[0]), 0
-        into = None if room is None else room[done : done + at.shape[1]]
-        structure, values = basis.gram_structure(at), basis.values(at, target)
-        found, carry = correct_weights(structure, values, law, inner_steps, carry, into)
-        done += at.shape[1]
-        if found is not None:
-            parts.append(found)
-    if carry is None:
-        raise ValueError("`chase_weights(states=...)` must have at least one piece of time; got none.")
-    if not history:
-        return ChaseWeights(last_weights(carry).unsqueeze(1), carry.diverged_at)
-    in_place = room is not None and all(part._base is room for part in parts)
-    joined = room if room is not None and in_place else torch.cat(parts)
-    return ChaseWeights(joined.permute(2, 0, 1), carry.diverged_at)
-
-
-def _pieces(states: Tensor | Iterable[Tensor], basis: StaFBasis) -> Iterator[Tensor]:
-    """Pieces (B, C, n) that stay in the last cache with what is made from them."""
+    blocks: list[_Block] = []
+    recorded: list[Tensor] = []  # (C, M, B) a piece
     for piece in [states] if isinstance(states, Tensor) else states:
         check_states("chase_weights", piece, basis)
-        longest = chunk_length(piece.shape[0], basis, piece.element_size())
-        cached = _PIECE_BYTES // (piece.shape[0] * basis.count * piece.element_size())
-        yield from piece.split(max(1, min(longest, cached)), dim=1)
+        height = _height(piece, basis)
+        if not blocks:
+            carry = start(piece, basis, law, weights)
+            blocks = [_Block(basis, target, law, inner_steps, part) for part in _split(carry, height)]
+        if not history:
+            for block, rows in zip(blocks, piece.split(height), strict=True):
+                block.advance(rows, None)
+            continue
+        # The whole piece at once, so that every number is written once, where it stays.
+        room = piece.detach().new_empty(piece.shape[1], basis.count, piece.shape[0])
+        rooms = room.split(height, dim=2)
+        found = [b.advance(*given) for b, *given in zip(blocks, piece.split(height), rooms, strict=True)]
+        in_place = all(part is None for part in found)
+        recorded.append(room if in_place else torch.cat([part for part in found if part is not None], dim=2))
+    if not blocks:
+        raise ValueError("`chase_weights(states=...)` must have at least one piece of time; got none.")
+    diverged_at = torch.cat([block.carry.diverged_at for block in blocks])
+    if history:
+        joined = recorded[0] if len(recorded) == 1 else torch.cat(recorded)
+        return ChaseWeights(joined.permute(2, 0, 1), diverged_at)
+    last = torch.cat([last_weights(block.carry) for block in blocks])
+    return ChaseWeights(last.unsqueeze(1), diverged_at)
+
+
+class _Block:
+    """Some rows on their way through time."""
+
+    def __init__(
+        self, basis: StaFBasis, target: Target, law: UpdateLaw, inner_steps: int, carry: Carry
+    ) -> None:
+        self._basis, self._target, self._law, self._inner_steps = basis, target, law, inner_steps
+        self.carry = carry
+
+    def advance(self, states: Tensor, room: Tensor | None) -> Tensor | None:
+        """Through the states (B, C, n): the weights (C, M, B), or None if they are in the room."""
+        size = states.shape[0] * states.element_size()
+        longest = min(
+            chunk_length(states.shape[0], self._basis, states.element_size()),
+            _PIECE_BYTES // (size * self._basis.count),
+        )
+        found, done = [], 0
+        for piece in states.split(max(1, longest), dim=1):
+            at = batch_last(piece)
+            structure, values = self._basis.gram_structure(at), self._basis.values(at, self._target)
+            into = None if room is None else room[done : done + at.shape[1]]
+            part, self.carry = correct_weights(
+                structure, values, self._law, self._inner_steps, self.carry, into
+            )
+            done += at.shape[1]
+            found.append((part, into))
+        if room is None or all(part is into for part, into in found):
+            return None
+        return torch.cat([part for part, _ in found if part is not None])
+
+
+def _height(states: Tensor, basis: StaFBasis) -> int:
+    """Rows a block; all of them where a hyperparameter has a value a row."""
+    modules = (basis.kernel, basis.centers.radius)
+    held = [held for module in modules for held in (*module.parameters(), *module.buffers())]
+    return _ROWS if all(each.dim() == 0 for each in held) else states.shape[0]
+
+
+def _split(carry: Carry, height: int) -> list[Carry]:
+    """The carries of blocks of rows, each with memory of its own."""
+    batch = carry.diverged_at.shape[0]
+    return [
+        Carry(
+            carry.weights[at].clone(),
+            tuple(part[at].clone() for part in carry.law_state),
+            carry.log_gain[at].clone(),
+            carry.time,
+            carry.diverged_at[at].clone(),
+        )
+        for at in (slice(first, first + height) for first in range(0, batch, height))
+    ]

@@ -110,7 +110,9 @@ def row(found: dict[str, Any]) -> str:
     best = max((name for name in speed if name.startswith("JAX")), key=speed.__getitem__, default=None)
     loops = speed.get("numba scalar loops")
     cells = [str(found["M"]), found["dtype"], str(found["B"]), f"{speed['staf_torch']:.2f}"]
-    cells += [f"{speed[best]:.2f}", best[4:], f"{speed['staf_torch'] / speed[best]:.1f}"] if best else ["-"] * 3
+    cells += (
+        [f"{speed[best]:.2f}", best[4:], f"{speed['staf_torch'] / speed[best]:.1f}"] if best else ["-"] * 3
+    )
     cells += [f"{loops:.2f}", f"{speed['staf_torch'] / loops:.1f}"] if loops else ["-"] * 2
     return "| " + " | ".join(cells) + " |"
 
@@ -170,7 +172,9 @@ def main() -> None:
     if not options.no_memory:
         results["memory"] = [memory(times) for times in MEMORY_TIMES]
         for found in results["memory"]:
-            print(f"\nB = {MEMORY_BATCH}, T = {found['T']:.0f}: {found['MiB']:.0f} MiB, {found['seconds']:.1f} s")
+            print(
+                f"\nB = {MEMORY_BATCH}, T = {found['T']:.0f}: {found['MiB']:.0f} MiB, {found['seconds']:.1f} s"
+            )
     if options.json:
         options.json.write_text(json.dumps(results, indent=1))
 

@@ -23,7 +23,10 @@ Program = Callable[[Any], Any]
 def programs(offsets: np.ndarray, inner_steps: int) -> dict[str, tuple[Program, bool]]:
     """Name to (program, whether it takes the states as (T, n, B) instead of (B, T, n))."""
     found = {"jit(vmap(scan))": (straightforward(offsets, inner_steps), False)}
-    variants: list[tuple[str, Any, bool]] = [("stacked", stacked, False), ("stacked, unrolled", stacked, True)]
+    variants: list[tuple[str, Any, bool]] = [
+        ("stacked", stacked, False),
+        ("stacked, unrolled", stacked, True),
+    ]
     if len(offsets) <= 6:  # XLA compiles the unrolled components of 15 centers for minutes
         variants.append(("components", components, False))
     if len(offsets) <= 3:
