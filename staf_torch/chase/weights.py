@@ -10,6 +10,7 @@ from torch import Tensor
 from .._checks import integer
 from ..basis import StaFBasis, Target
 from ..optim.base import UpdateLaw
+from ._workers import Workers, thread_count
 from .correct import correct_weights, last_weights
 from .engine import check_law, check_states, chunk_length, start
 from .layout import batch_last
@@ -18,6 +19,7 @@ from .result import ChaseWeights
 
 _PIECE_BYTES = 2**20  # of V at the centers: a piece and what it is made from stay in the inner caches
 _ROWS = 4096  # trajectories a block
+_FEW_ROWS = 64  # fewer are one block
 
 
 def chase_weights(
@@ -51,22 +53,21 @@ def chase_weights(
     check_law("chase_weights", law)
     blocks: list[_Block] = []
     recorded: list[Tensor] = []  # (C, M, B) a piece
-    for piece in [states] if isinstance(states, Tensor) else states:
-        check_states("chase_weights", piece, basis)
-        height = _height(piece, basis)
-        if not blocks:
-            carry = start(piece, basis, law, weights)
-            blocks = [_Block(basis, target, law, inner_steps, part) for part in _split(carry, height)]
-        if not history:
-            for block, rows in zip(blocks, piece.split(height), strict=True):
-                block.advance(rows, None)
-            continue
-        # The whole piece at once, so that every number is written once, where it stays.
-        room = piece.detach().new_empty(piece.shape[1], basis.count, piece.shape[0])
-        rooms = room.split(height, dim=2)
-        found = [b.advance(*given) for b, *given in zip(blocks, piece.split(height), rooms, strict=True)]
-        in_place = all(part is None for part in found)
-        recorded.append(room if in_place else torch.cat([part for part in found if part is not None], dim=2))
+    threads = thread_count()
+    with Workers(threads) as workers:
+        for piece in [states] if isinstance(states, Tensor) else states:
+            check_states("chase_weights", piece, basis)
+            height = _height(piece, basis, threads)
+            if not blocks:
+                carry = start(piece, basis, law, weights)
+                blocks = [_Block(basis, target, law, inner_steps, part) for part in _split(carry, height)]
+            # The room of the whole piece at once, so that every number is written once, where it stays.
+            shape = (piece.shape[1], basis.count, piece.shape[0])
+            room = piece.detach().new_empty(shape) if history else None
+            rooms = [None] * len(blocks) if room is None else list(room.split(height, dim=2))
+            found = workers.map(_Block.advance, blocks, piece.split(height), rooms)
+            if room is not None:
+                recorded.append(room if all(part is None for part in found) else torch.cat(found, dim=2))
     if not blocks:
         raise ValueError("`chase_weights(states=...)` must have at least one piece of time; got none.")
     diverged_at = torch.cat([block.carry.diverged_at for block in blocks])
@@ -108,11 +109,14 @@ class _Block:
         return torch.cat([part for part, _ in found if part is not None])
 
 
-def _height(states: Tensor, basis: StaFBasis) -> int:
+def _height(states: Tensor, basis: StaFBasis, threads: int) -> int:
     """Rows a block; all of them where a hyperparameter has a value a row."""
     modules = (basis.kernel, basis.centers.radius)
     held = [held for module in modules for held in (*module.parameters(), *module.buffers())]
-    return _ROWS if all(each.dim() == 0 for each in held) else states.shape[0]
+    batch = states.shape[0]
+    if any(each.dim() > 0 for each in held) or batch < _FEW_ROWS:
+        return batch
+    return min(_ROWS, -(-batch // threads))
 
 
 def _split(carry: Carry, height: int) -> list[Carry]:
