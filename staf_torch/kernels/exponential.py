@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from .base import Kernel, inner
+from .base import Kernel, dot, inner
 
 
 class ExponentialKernel(Kernel):
@@ -27,10 +27,12 @@ class ExponentialKernel(Kernel):
         return inner(z, d).exp()
 
     def log_gain(self, x: Tensor) -> Tensor:
-        return x.square().sum(-1)
+        return dot(x, x)
 
     def log_scale(self, x: Tensor, z: Tensor) -> Tensor:
-        return (z * x.unsqueeze(-2)).sum(-1)
+        # Points first and last again: the numbers of one point lie together as those of the states do.
+        z, x = torch.broadcast_tensors(z, x.unsqueeze(-2))
+        return dot(z.movedim(-2, 0), x.movedim(-2, 0)).movedim(0, -1)
 
     def follow(self, y: Tensor, step: Tensor) -> tuple[Tensor, Tensor]:
         # (y + h)'(c + h) = (y'h + h'h) + (y + h)'c
