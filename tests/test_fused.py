@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import logging
+import os
+import subprocess
 import sys
+import threading
+from pathlib import Path
 
 import pytest
 import torch
@@ -30,6 +34,7 @@ from staf_torch.basis import GramStructure
 
 fused_module = sys.modules["staf_torch.chase.fused"]
 correct_module = sys.modules["staf_torch.chase.correct"]
+chase_module = sys.modules["staf_torch.chase"]
 compiled_module = sys.modules["staf_torch.chase._compiled"]
 recursion_module = sys.modules["staf_torch.chase.recursion"]
 Carry, History, fused = recursion_module.Carry, fused_module.History, fused_module.fused
@@ -284,3 +289,91 @@ def test_chase_weights_refuses_states_of_another_shape(given: Tensor) -> None:
 def test_chase_weights_refuses_no_piece_at_all() -> None:
     with pytest.raises(ValueError, match="at least one piece"):
         chase_weights([], BASES["exponential"], targets.Paper(), LAW)
+
+
+def test_chase_weights_refuses_a_predictor() -> None:
+    with pytest.raises(ValueError, match=r"`chase_weights\(predictor=\.\.\.\)` must be None"):
+        chase_weights(
+            circles(2, 3),
+            BASES["exponential"],
+            targets.Paper(),
+            LAW,
+            predictor=chase_module.predictors.Secant(),
+        )
+
+
+@pytest.mark.parametrize("name", BASES)
+@pytest.mark.parametrize("law", [optim.Exact(), optim.NormalisedLMS(), optim.Nesterov()], ids=repr)
+def test_chase_weights_gives_every_law_what_it_needs(name: str, law: optim.UpdateLaw) -> None:
+    states, basis = circles(9, 12), BASES[name]
+    want = chase(states, basis, targets.Paper(), law, inner_steps=3).weights
+    got = chase_weights(states, basis, targets.Paper(), law, inner_steps=3).weights
+    torch.testing.assert_close(got, want, rtol=0, atol=1e-8 * float(want.abs().max()))
+
+
+@pytest.mark.parametrize("run_chase", [chase, chase_weights])
+def test_a_users_target_is_called_from_one_thread_with_all_rows_in_memory_order(run_chase) -> None:
+    states = circles(200, 4)
+    seen = []
+
+    def target(x: Tensor) -> Tensor:
+        seen.append((threading.get_ident(), x.shape[0]))
+        return x.view(-1, 2).square().sum(-1).view(x.shape[:-1])
+
+    got = run_chase(states, BASES["exponential"], target, LAW).weights
+    assert set(seen) == {(threading.get_ident(), 200)}
+    want = run_chase(states, BASES["exponential"], targets.Quadratic(), LAW).weights
+    torch.testing.assert_close(got, want, rtol=0, atol=1e-8 * float(want.abs().max()))
+
+
+def test_a_piece_keeps_its_record_of_divergence_when_the_next_one_diverges() -> None:
+    states = circles(3, 8)
+    states[1, 6] = torch.nan
+    first, second = chase_module.chase_pieces(
+        states.split(4, dim=1), BASES["exponential"], targets.Paper(), LAW
+    )
+    assert first.diverged_at.tolist() == [-1, -1, -1]
+    assert second.diverged_at.tolist() == [-1, 6, -1]
+
+
+@pytest.mark.parametrize("run_chase", [chase, chase_weights])
+def test_a_reach_beyond_one_is_warned_of_once(run_chase) -> None:
+    with pytest.warns(UserWarning, match="Shrink the radius") as seen:
+        run_chase(5 * circles(3, 8), BASES["exponential"], targets.Paper(), LAW)
+    assert len(seen) == 1
+
+
+FAULTS = {
+    "no compiler": {"PATH": "/nonexistent"},
+    "failing build": {"CXX": "/bin/false"},
+    "nowhere to write": {"HOME": "/proc", "TMPDIR": "/proc"},
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_no_fault_of_a_build_is_more_than_one_line_of_the_log(fault: str, tmp_path: Path) -> None:
+    program = """
+import tempfile, torch, staf_torch as st
+tempfile.tempdir = __import__("os").environ.get("TMPDIR")
+basis = st.StaFBasis(st.ExponentialKernel(), st.StateFollowingCenters(st.rings(3), 0.1))
+for dtype in (torch.float64, torch.float32):
+    for run in (st.chase, st.chase_weights):
+        weights = run(torch.ones(2, 3, 2, dtype=dtype), basis, st.targets.Paper(), st.optim.SteepestDescent())
+        assert weights.weights.isfinite().all()
+"""
+    unset = ("CXX", "XDG_CACHE_HOME")
+    environment = {name: value for name, value in os.environ.items() if name not in unset}
+    if "HOME" not in FAULTS[fault]:
+        environment["XDG_CACHE_HOME"] = str(tmp_path)
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", program],
+        env=environment | FAULTS[fault],
+        cwd=Path(__file__).parents[1],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == ""
+    assert len(done.stderr.splitlines()) == 1
+    assert "runs in plain torch" in done.stderr

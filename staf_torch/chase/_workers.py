@@ -20,16 +20,19 @@ from torch.utils._python_dispatch import _len_torch_dispatch_stack
 
 
 @functools.cache
-def _openmp() -> Callable[[int], None] | None:
-    """`omp_set_num_threads` of torch's own runtime: it sets the calling thread's number alone."""
-    return getattr(ctypes.CDLL(torch._C.__file__), "omp_set_num_threads", None)
+def openmp(name: str) -> Callable[..., None] | None:
+    """A function of the OpenMP runtime that torch itself runs on; None where there is none."""
+    try:
+        return getattr(ctypes.CDLL(torch._C.__file__), name, None)
+    except OSError:
+        return None
 
 
 def thread_count() -> int:
     """Threads for rows: torch's own number, 1 where something that is bound to this thread is at work."""
     modes = _len_torch_function_stack() + _len_torch_dispatch_stack()
     bound = modes > 0 or torch._C._functorch.maybe_current_level() is not None
-    return 1 if bound or _openmp() is None else torch.get_num_threads()
+    return 1 if bound or openmp("omp_set_num_threads") is None else torch.get_num_threads()
 
 
 class Workers:
@@ -62,6 +65,6 @@ class Workers:
 
 def _alone() -> None:
     torch.get_num_threads()  # torch sets a new thread's number when it first asks for it
-    set_threads = _openmp()
+    set_threads = openmp("omp_set_num_threads")  # of the calling thread alone
     assert set_threads is not None
     set_threads(1)

@@ -7,8 +7,7 @@ iteration, one product with K in place of two, all of it in registers with traje
 from __future__ import annotations
 
 import ctypes
-import functools
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import torch
@@ -18,6 +17,7 @@ from torch.autograd import forward_ad
 from ..basis import GramStructure
 from ..optim import SteepestDescent, UpdateLaw
 from ._compiled import compiled
+from ._workers import openmp
 from .recursion import Carry
 
 _REALS = {torch.float32: "float", torch.float64: "double"}
@@ -124,9 +124,8 @@ def _pointer(tensor: Tensor | None) -> int | None:
     return None if tensor is None else tensor.data_ptr()
 
 
-@functools.cache
 def _parallel() -> int | None:
     """The OpenMP entry that torch itself runs on: a second pool of threads on the same cores makes
     both several times slower. Without it the library starts threads of its own."""
-    entry: Callable[..., object] | None = getattr(ctypes.CDLL(torch._C.__file__), "GOMP_parallel", None)
+    entry = openmp("GOMP_parallel")
     return None if entry is None else ctypes.cast(entry, ctypes.c_void_p).value  # type: ignore[arg-type]
