@@ -17,7 +17,6 @@ from .certificate import Certificate, certify
 from .correct import correct, dense, lost, paper_units
 from .known import known as find_known
 from .known import state_row
-from .layout import batch_last, library_only
 from .predictors import Predictor
 from .recursion import Carry, recursion
 from .result import ChaseResult, concatenate
@@ -125,14 +124,13 @@ def _piece(
     carry: Carry,
 ) -> tuple[ChaseResult, Carry]:
     """One piece of time: (B, C, n) and the carry to its result and the next carry."""
-    at = batch_last(states) if library_only(basis, target) else states
-    structure, values = basis.gram_structure(at), basis.values(at, target)
-    space = basis.local(at)
+    structure, values = basis.gram_structure(states), basis.values(states, target)
+    space = basis.local(states)
     fitted = space.fit(values)
     ideal = space.scaled_weights(fitted)
     scale = states.new_ones(()) if structure.scale is None else structure.scale
-    row = state_row(basis, at, space)
-    value = target(at)
+    row = state_row(basis, states, space)
+    value = target(states)
     # Every K of its own only where somebody asks for it: the fused recursion does not.
     whole = dense(structure, values) if law.needs or certificate or predictor is not None else None
     gram = None if whole is None else whole.gram
@@ -175,9 +173,8 @@ def _piece(
     vouched, link = certify(
         objective, whole.log_gain, law, inner_steps, run.before, run.after, ideal, carry.link
     )
-    return dataclasses.replace(result, certificate=reached.certificate(vouched)), run.carry._replace(
-        link=link
-    )
+    result = dataclasses.replace(result, certificate=reached.certificate(vouched))
+    return result, run.carry._replace(link=link)
 
 
 class _Reached:
