@@ -1,5 +1,6 @@
 """State Following (StaF) kernel approximation as a batched PyTorch engine."""
 
+from . import adp as adp
 from . import optim as optim
 from . import systems as systems
 from . import targets as targets

@@ -4,6 +4,12 @@ from __future__ import annotations
 
 import os
 
+# One thread a process: small tensors gain nothing from two, and beside any other program the barriers
+# between threads cost tenfold. Before torch is imported, and inherited by the commands that tests run.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import os
+
 import hypothesis
 import pytest
 import torch

@@ -45,10 +45,17 @@ def problem(line: str) -> ChaseProblem:
     return chase_problem(settings(line))
 
 
+NEEDS = {  # what some options cannot do without
+    "centers=directions": "centers.directions=[[0,1],[1,0],[-1,0]]",
+    "system=planar_quadrotor": "centers=simplex initial_state=[0,0,0,0,0,0]",
+    "system=three_state": "centers=simplex initial_state=[0,0,0]",
+}
+
+
 @pytest.mark.parametrize("option", OPTIONS)
 def test_every_option_of_every_group_builds_its_problem(option: str) -> None:
-    built = problem(option)
-    assert built.initial_states.shape == (1, 2)
+    built = problem(f"{option} {NEEDS.get(option, '')}")
+    assert built.initial_states.shape == (1, built.basis.dim)
     assert built.basis.count >= 3
 
 

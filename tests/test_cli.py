@@ -28,6 +28,11 @@ KEYS = {
     "diverged_fraction",
 }
 SHORT = ["duration=0.05", "settle_time=0", "figures=false"]
+NEEDS = {  # what some options cannot do without
+    "centers=directions": ["centers.directions=[[0,1],[1,0],[-1,0]]"],
+    "system=planar_quadrotor": ["centers=simplex", "target=quadratic", "initial_state=[0.1,0,0,0,0,0]"],
+    "system=three_state": ["centers=simplex", "target=quadratic", "initial_state=[0.1,0,0]"],
+}
 CUSTOM = {"kernel": "plants.Cauchy", "system": "plants.Escape", "target": "plants.bowl"}
 
 
@@ -37,7 +42,9 @@ def _options() -> dict[str, list[str]]:
     for path in sorted(Path(config_directory()).glob("*/*.yaml")):
         group, option = path.parent.name, path.stem
         more = [f"{group}.path={CUSTOM[group]}"] if option == "custom" else []
-        lines[f"{group}={option}"] = [f"{group}={option}", *more, *SHORT]
+        more += NEEDS.get(f"{group}={option}", [])
+        if group != "adp":  # a group of the experiments of that name, which have tests of their own
+            lines[f"{group}={option}"] = [f"{group}={option}", *more, *SHORT]
     return lines
 
 

@@ -28,7 +28,17 @@ USER_ERRORS = (ValueError, HydraException, OmegaConfBaseException, OSError)
 
 _log = logging.getLogger(__name__)
 _FULL_ERROR = "HYDRA_FULL_ERROR"
-EXPERIMENTS = ("gradient_chase", "laws")
+EXPERIMENTS = (
+    "gradient_chase",
+    "laws",
+    "flat_limit",
+    "exponential_bound",
+    "feasibility",
+    "layouts",
+    "adp",
+    "adp_comparison",
+    "adp_tracking",
+)
 """Modules of this package with a function ``run(cfg, directory)``, by the name in ``task``."""
 
 

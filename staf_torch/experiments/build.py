@@ -77,13 +77,13 @@ def chase_problem(cfg: DictConfig) -> ChaseProblem:
     Raises:
         ValueError: if a setting breaks its rule; the message names it.
     """
-    device, dtype = _placement(cfg.device, cfg.dtype)
-    system = _make(cfg.system)
+    device, dtype = placement(cfg.device, cfg.dtype)
+    system = make(cfg.system)
     if not callable(getattr(system, "drift", None)):
         raise fail(COMMAND_LINE, "system", "must be a plant with a method `drift`", system)
     dim = _dimension(system, cfg.initial_state)
-    basis = StaFBasis(_make(cfg.kernel), _centers(cfg.centers, dim))
-    target = _make(cfg.target)
+    basis = StaFBasis(make(cfg.kernel), make_centers(cfg.centers, dim))
+    target = make(cfg.target)
     if not callable(target):
         raise fail(COMMAND_LINE, "target", "must be callable", target)
     dt = positive_real(COMMAND_LINE, "dt", cfg.dt)
@@ -99,12 +99,12 @@ def chase_problem(cfg: DictConfig) -> ChaseProblem:
         basis=basis,
         target=target,
         law=law,
-        initial_states=_initial_states(cfg, dim).to(device=device, dtype=dtype),
+        initial_states=initial_states(cfg, dim).to(device=device, dtype=dtype),
         dt=dt,
         steps=math.floor(duration / dt + 1e-9),
         inner_steps=inner_steps,
         settle_time=real(COMMAND_LINE, "settle_time", cfg.settle_time),
-        predictor=None if cfg.predictor.get("_target_") is None else _make(cfg.predictor),
+        predictor=None if cfg.predictor.get("_target_") is None else make(cfg.predictor),
         certificate=flag(COMMAND_LINE, "certificate", cfg.certificate),
     )
 
@@ -118,11 +118,12 @@ def _dimension(system: ControlAffineSystem, initial_state: object) -> int:
     return len(vector(COMMAND_LINE, "initial_state", entries))
 
 
-def _make(cfg: DictConfig) -> Any:
+def make(cfg: DictConfig) -> Any:
+    """The object that a group of settings names."""
     return instantiate(cfg, _convert_="all")
 
 
-def _placement(device: object, dtype: object) -> tuple[torch.device, torch.dtype]:
+def placement(device: object, dtype: object) -> tuple[torch.device, torch.dtype]:
     choice(COMMAND_LINE, "dtype", dtype, tuple(_DTYPES))
     try:
         place = torch.device(str(device))
@@ -133,14 +134,14 @@ def _placement(device: object, dtype: object) -> tuple[torch.device, torch.dtype
     return place, _DTYPES[str(dtype)]
 
 
-def _centers(cfg: DictConfig, dim: int) -> StateFollowingCenters:
+def make_centers(cfg: DictConfig, dim: int) -> StateFollowingCenters:
     count, layout = cfg.count, cfg.layout
     planar: dict[str, Callable[[int], Tensor]] = {"rings": rings, "polygon": polygon}
     fixed: dict[str, Callable[[int], Tensor]] = {
         "simplex": simplex,
         "cross_polytope": cross_polytope,
     }
-    choice(COMMAND_LINE, "centers.layout", layout, (*planar, *fixed, "ball"))
+    choice(COMMAND_LINE, "centers.layout", layout, (*planar, *fixed, "ball", "directions"))
     if layout in planar:
         if dim != 2:
             raise ValueError(
@@ -154,6 +155,10 @@ def _centers(cfg: DictConfig, dim: int) -> StateFollowingCenters:
             integer(COMMAND_LINE, "centers.count", count, least=1)
             rule = f"must be {len(directions)} (or null) for {layout} with {dim} states"
             raise fail(COMMAND_LINE, "centers.count", rule, count)
+    elif layout == "directions":
+        listed: Any = OmegaConf.to_container(cfg.directions)
+        rows = [vector(COMMAND_LINE, "centers.directions", row, dim) for row in listed]
+        directions = torch.tensor(rows, dtype=torch.float64)
     else:
         directions = ball(count, dim)
     return StateFollowingCenters(directions, _radius(cfg))
@@ -169,10 +174,10 @@ def _law(cfg: DictConfig) -> tuple[UpdateLaw, int]:
     settings = OmegaConf.to_container(cfg, resolve=True)
     assert isinstance(settings, dict)
     inner_steps = integer(COMMAND_LINE, "optimizer.inner_steps", settings.pop("inner_steps"), least=1)
-    return _make(OmegaConf.create(settings)), inner_steps
+    return make(OmegaConf.create(settings)), inner_steps
 
 
-def _initial_states(cfg: DictConfig, dim: int) -> Tensor:
+def initial_states(cfg: DictConfig, dim: int) -> Tensor:
     """The stated initial state first, the others uniform in a box around it: (B, n) float64.
 
     The generator runs on the CPU in float64, so that one seed means the same states everywhere, and

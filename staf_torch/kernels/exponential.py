@@ -30,9 +30,13 @@ class ExponentialKernel(Kernel):
         return dot(x, x)
 
     def log_scale(self, x: Tensor, z: Tensor) -> Tensor:
-        # Points first and last again: the numbers of one point lie together as those of the states do.
-        z, x = torch.broadcast_tensors(z, x.unsqueeze(-2))
-        return dot(z.movedim(-2, 0), x.movedim(-2, 0)).movedim(0, -1)
+        if z.dim() == 2 and x.dim() > 1:  # the same offsets at all states: one product, states last
+            return (z @ x.mT).mT
+        # Term by term: a sum over the last dimension would write all products to memory first.
+        total = x[..., :1] * z[..., 0]
+        for i in range(1, x.shape[-1]):
+            total = torch.addcmul(total, x[..., i : i + 1], z[..., i])
+        return total
 
     def follow(self, y: Tensor, step: Tensor) -> tuple[Tensor, Tensor]:
         # (y + h)'(c + h) = (y'h + h'h) + (y + h)'c

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Protocol
 
 import torch
 from torch import Tensor
 
 from ..kernels import Kernel
+
+_ROWS = 4096  # of a block: its temporaries then stay in the cache
 
 
 class LocalSpace(Protocol):
@@ -44,6 +47,22 @@ def scale(kernel: Kernel, x: Tensor, z: Tensor, sign: float = 1.0) -> Tensor:
     """e^{sign s(x, z)}: (..., P), or () where s is zero."""
     s = kernel.log_scale(x, z)
     return z.new_ones(()) if s is None else (sign * s).exp()
+
+
+def in_blocks(function: Callable[[Tensor, Tensor], Tensor], values: Tensor, state: Tensor) -> Tensor:
+    """A function of rows (..., M) and (..., n), called with a few thousand rows at a time.
+
+    Over a large batch its temporaries are otherwise written to memory and read again one by one, which
+    takes longer than the arithmetic.
+    """
+    shape = torch.broadcast_shapes(values.shape[:-1], state.shape[:-1])
+    if shape.numel() <= _ROWS:
+        return function(values, state)
+    rows = values.expand(*shape, -1).flatten(0, -2).split(_ROWS)
+    states = state.expand(*shape, -1).flatten(0, -2).split(_ROWS)
+    blocks = [function(*pair) for pair in zip(rows, states, strict=True)]
+    together: Tensor = torch.cat(blocks).unflatten(0, shape)
+    return together
 
 
 def from_scaled(kernel: Kernel, x: Tensor, scaled: Tensor) -> Tensor:

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from ..kernels import Kernel
-from .base import from_scaled, scale, to_scaled
+from .base import from_scaled, in_blocks, scale, to_scaled
 from .elimination import eliminate
 from .interpolation import Interpolation
 from .phi import phi
@@ -90,9 +90,16 @@ class GradedSpace(NamedTuple):
 
     def fit(self, values: Tensor) -> Tensor:
         """beta with sum_j psi_j(u_i) beta_j = e^{-s(d_i)} V(c_i): (..., M) -> (..., M)."""
-        scaled = values * scale(self.kernel, self.state, self.offsets, -1.0)
         bound = None if self.bound is None else (self.rate * self.bound.square()).amax()
-        return Interpolation.of(self.basis, self._r2, bound, scaled.dtype).solve(scaled)
+        dtype = torch.promote_types(values.dtype, self.state.dtype)
+        interpolation = Interpolation.of(self.basis, self._r2, bound, dtype)
+
+        def solve(values: Tensor, state: Tensor) -> Tensor:
+            return interpolation.solve(scale(self.kernel, state, self.offsets, -1.0) * values)
+
+        if not interpolation.shared or self.offsets.dim() > 2:
+            return solve(values, self.state)
+        return in_blocks(solve, values, self.state)
 
     def evaluate(self, z: Tensor, coefficients: Tensor) -> Tensor:
         """V^(x + z): (..., P, n), (..., M) -> (..., P)."""

@@ -1,4 +1,4 @@
-"""Figures. The only module that imports matplotlib; never through pyplot, which keeps global state."""
+"""Figures. Only modules named `plots*` import matplotlib; never through pyplot, which keeps global state."""
 
 from __future__ import annotations
 

@@ -1,8 +1,14 @@
 """Plants, one a file, and their trajectories."""
 
 from .base import ControlAffineSystem as ControlAffineSystem
+from .base import Linearisation as Linearisation
 from .integrators import runge_kutta_step as runge_kutta_step
 from .integrators import simulate as simulate
 from .integrators import trajectory as trajectory
 from .linear import Linear as Linear
 from .oscillator import Oscillator as Oscillator
+from .pendulum import Pendulum as Pendulum
+from .planar_quadrotor import PlanarQuadrotor as PlanarQuadrotor
+from .three_state import ThreeState as ThreeState
+from .two_state import TwoState as TwoState
+from .van_der_pol import VanDerPol as VanDerPol

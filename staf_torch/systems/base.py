@@ -3,8 +3,17 @@
 from __future__ import annotations
 
 import abc
+from typing import NamedTuple
 
+import torch
 from torch import Tensor, nn
+
+
+class Linearisation(NamedTuple):
+    """x' = A x + B u near the equilibrium 0."""
+
+    matrix: Tensor  # A, (n, n), 1/s
+    input_matrix: Tensor  # B, (n, m)
 
 
 class ControlAffineSystem(nn.Module, abc.ABC):
@@ -13,9 +22,13 @@ class ControlAffineSystem(nn.Module, abc.ABC):
 
     Attributes:
         dim: n, the number of states; None where the plant takes any.
+        inputs: m, the number of inputs.
+
+    The equilibrium is the origin without control: states and inputs are measured from there.
     """
 
     dim: int | None = None
+    inputs: int = 0
 
     @abc.abstractmethod
     def drift(self, x: Tensor) -> Tensor:
@@ -36,3 +49,39 @@ class ControlAffineSystem(nn.Module, abc.ABC):
             (..., T, n), or None where the flow is not known: it is then integrated.
         """
         return None
+
+    def smooth_drift(self, x: Tensor) -> Tensor:
+        """f without the terms that have no derivative at 0; what `linearisation` differentiates."""
+        return self.drift(x)
+
+    def equilibrium(self) -> Tensor:
+        """The state at which the plant rests without control: (n,), zeros."""
+        return torch.zeros(self._size(), dtype=torch.float64)
+
+    def linearisation(self) -> Linearisation:
+        """A = df/dx and B = g at the equilibrium, by automatic differentiation.
+
+        Raises:
+            ValueError: if ``dim`` is None.
+        """
+        at = self.equilibrium()
+        matrix = torch.func.jacrev(self.smooth_drift)(at)
+        return Linearisation(matrix.detach(), self.effectiveness(at).detach())
+
+    def optimal_value(self, x: Tensor, state_cost: Tensor, input_cost: Tensor) -> Tensor | None:
+        """V*(x) for the cost x'Qx + u'Ru, where it is known.
+
+        Args:
+            x: (..., n).
+            state_cost: Q, (n, n).
+            input_cost: R, (m, m).
+
+        Returns:
+            (...), or None where it is not known.
+        """
+        return None
+
+    def _size(self) -> int:
+        if self.dim is None:
+            raise ValueError(f"`{type(self).__name__}.dim` must be the number of states; got None.")
+        return self.dim

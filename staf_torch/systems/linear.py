@@ -1,4 +1,4 @@
-"""Linear systems of any size."""
+"""Linear systems of any size, with the linear-quadratic optimum as ground truth."""
 
 from __future__ import annotations
 
@@ -8,32 +8,66 @@ import torch
 from torch import Tensor
 
 from .._checks import fail, vector
+from ..riccati import riccati
 from .base import ControlAffineSystem
 
 
 class Linear(ControlAffineSystem):
-    """x' = A x, with the exact flow e^{At} x(0).
+    """x' = A x + B u; without control the flow is e^{At} x(0).
 
     Args:
         matrix: A, (n, n), in 1/s.
+        input_matrix: B, (n, m); None for a plant without inputs.
 
     Raises:
-        ValueError: if ``matrix`` is not square and finite.
+        ValueError: if ``matrix`` is not square and finite, or ``input_matrix`` has other than n rows.
     """
 
-    def __init__(self, matrix: Sequence[Sequence[float]] | Tensor) -> None:
+    def __init__(
+        self,
+        matrix: Sequence[Sequence[float]] | Tensor,
+        input_matrix: Sequence[Sequence[float]] | Tensor | None = None,
+    ) -> None:
         super().__init__()
-        rows = matrix.tolist() if isinstance(matrix, Tensor) else matrix
-        if isinstance(rows, str) or not isinstance(rows, Sequence) or not rows:
-            raise fail("Linear", "matrix", "must be (n, n)", matrix)
-        a = torch.tensor([vector("Linear", "matrix", row, len(rows)) for row in rows], dtype=torch.float64)
-        self.register_buffer("matrix", a)
+        rows = _rows("matrix", matrix, "must be (n, n)")
+        self.dim = len(rows)
+        self.register_buffer("matrix", _stack("matrix", rows, self.dim))
         self.matrix: Tensor
-        self.dim = a.shape[0]
+        given = _rows(
+            "input_matrix", [[]] * self.dim if input_matrix is None else input_matrix, "must be (n, m)"
+        )
+        if len(given) != self.dim:
+            raise fail("Linear", "input_matrix", f"must have {self.dim} rows, one a state", input_matrix)
+        self.register_buffer("input_matrix", _stack("input_matrix", given, len(given[0])))
+        self.input_matrix: Tensor
+        self.inputs = self.input_matrix.shape[1]
 
     def drift(self, x: Tensor) -> Tensor:
         return x @ self.matrix.to(x).mT
 
+    def effectiveness(self, x: Tensor) -> Tensor:
+        return self.input_matrix.to(x).expand(*x.shape, self.inputs)
+
     def flow(self, x: Tensor, time: Tensor) -> Tensor:
         propagators = torch.linalg.matrix_exp(time[:, None, None] * self.matrix.to(time))
         return torch.einsum("tij,...j->...ti", propagators.to(x), x)
+
+    def optimal_value(self, x: Tensor, state_cost: Tensor, input_cost: Tensor) -> Tensor | None:
+        """x'Px with P from the Riccati equation: (..., n) -> (...)."""
+        if self.inputs == 0:
+            return None
+        p = riccati(self.matrix, self.input_matrix, state_cost, input_cost).to(x)
+        return ((x @ p) * x).sum(-1)
+
+
+def _rows(name: str, matrix: object, rule: str) -> Sequence[Sequence[float]]:
+    rows = matrix.tolist() if isinstance(matrix, Tensor) else matrix
+    if isinstance(rows, str) or not isinstance(rows, Sequence) or not rows:
+        raise fail("Linear", name, rule, matrix)
+    if not all(isinstance(row, Sequence) and not isinstance(row, str) for row in rows):
+        raise fail("Linear", name, rule, matrix)
+    return rows
+
+
+def _stack(name: str, rows: Sequence[Sequence[float]], length: int) -> Tensor:
+    return torch.tensor([vector("Linear", name, row, length) for row in rows], dtype=torch.float64)

@@ -1,0 +1,112 @@
+"""Actor, critic and extrapolation together: a controller that learns while it controls."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from .._checks import positive_real, trailing, vector
+from ..systems import ControlAffineSystem
+from .bases.base import ValueBasis
+from .bellman import BellmanTerms, bellman_terms
+from .controller import Controller, Memory
+from .cost import QuadraticCost
+from .extrapolation import Extrapolation
+from .laws import ActorCriticLaw, Information, Weights
+
+Initial = float | list[float] | Tensor
+
+
+class ActorCritic(Controller):
+    """u = -1/2 R^-1 g' Ds' Wa, with Wc and Wa moved by a law on the Bellman error at the state and at
+    extrapolated points.
+
+    Args:
+        basis: of V^.
+        model: what the controller believes the plant to be.
+        cost: x'Qx + u'Ru.
+        extrapolation: the points.
+        law: `Information` by default.
+        critic: Wc(0): a number for all, M numbers, or a tensor (M,) or (B, M), a row a trajectory.
+        actor: Wa(0), likewise.
+        gain: gamma > 0 in Gam(0) = gamma I.
+
+    Raises:
+        ValueError: if sizes do not fit together, or an argument breaks its rule.
+
+    Source: Kamalapurkar, Rosenfeld and Dixon, via MATH.md section 4 (its defaults: two states).
+    """
+
+    def __init__(
+        self,
+        basis: ValueBasis,
+        model: ControlAffineSystem,
+        cost: QuadraticCost,
+        extrapolation: Extrapolation,
+        law: ActorCriticLaw | None = None,
+        *,
+        critic: Initial = 0.4,
+        actor: Initial = 0.28,
+        gain: float = 250.0,
+    ) -> None:
+        super().__init__()
+        if not isinstance(cost, QuadraticCost):
+            raise ValueError(
+                "`ActorCritic(cost=...)` must be a QuadraticCost: the laws are derived for it; "
+                f"got {type(cost).__name__}."
+            )
+        if model.dim != basis.dim:
+            raise ValueError(
+                f"`ActorCritic(basis=...)` has {basis.dim} states, but the plant has {model.dim}."
+            )
+        self.basis, self.model, self.cost, self.extrapolation = basis, model, cost, extrapolation
+        self.law = Information() if law is None else law
+        self.draws = extrapolation.draws
+        self.register_buffer("critic", _weights("critic", critic, basis.count))
+        self.register_buffer("actor", _weights("actor", actor, basis.count))
+        self.critic: Tensor
+        self.actor: Tensor
+        self.gain = positive_real("ActorCritic", "gain", gain)
+
+    def init(self, x0: Tensor) -> Memory:
+        rows = (x0.shape[0], self.basis.count)
+        gain = self.gain * torch.eye(self.basis.count, dtype=x0.dtype, device=x0.device)
+        critic, actor, gain = self.law.init(self.critic.to(x0), self.actor.to(x0), gain)
+        return Memory(
+            critic.expand(rows).clone(),
+            actor.expand(rows).clone(),
+            gain.repeat(x0.shape[0], 1, 1),
+            x0.new_zeros(x0.shape[0], 0),
+        )
+
+    def terms(
+        self, x: Tensor, actor: Tensor, uniform: Tensor, model: ControlAffineSystem | None = None
+    ) -> BellmanTerms:
+        """The Bellman terms at the state (first) and at the extrapolated points, by ``model`` if given."""
+        points = torch.cat((x.unsqueeze(-2), self.extrapolation(x, uniform)), dim=-2)
+        at = points if self.extrapolation.moving else x.unsqueeze(-2).expand(points.shape)
+        return bellman_terms(self.basis, model or self.model, self.cost, points, at, actor)
+
+    def step(self, x: Tensor, memory: Memory, uniform: Tensor, dt: float) -> tuple[Tensor, Memory]:
+        return self.step_with(self.model, x, memory, uniform, dt)
+
+    def step_with(
+        self, model: ControlAffineSystem, x: Tensor, memory: Memory, uniform: Tensor, dt: float
+    ) -> tuple[Tensor, Memory]:
+        """`step` with a model of the moment, for instance one that is being identified."""
+        weights = Weights(memory.critic, memory.actor, memory.gain)
+        terms = self.terms(x, weights.actor, uniform, model)
+        sums = self.law.sums(terms, self.extrapolation.weights, weights)
+        critic, actor, gain = self.law.step(sums, weights, dt)
+        return terms.control[..., 0, :], Memory(critic, actor, gain, memory.identifier)
+
+    def value(self, x: Tensor, memory: Memory) -> Tensor | None:
+        return self.basis.value(memory.critic, x)
+
+
+def _weights(name: str, value: Initial, count: int) -> Tensor:
+    if isinstance(value, Tensor):
+        return trailing("ActorCritic", name, value, dims=1, last=count)
+    if isinstance(value, int | float):
+        value = [value] * count
+    return torch.tensor(vector("ActorCritic", name, value, count), dtype=torch.float64)

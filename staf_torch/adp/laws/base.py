@@ -1,0 +1,129 @@
+"""What an actor-critic law is, and the sums over Bellman points that every law uses."""
+
+from __future__ import annotations
+
+import abc
+import dataclasses
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..._checks import fail, positive_real, real
+from ..bellman import BellmanTerms, bellman_error
+
+
+@dataclasses.dataclass(frozen=True)
+class Gains:
+    """Gains of the actor-critic laws; the defaults are the published ones of the two-state example.
+
+    Args:
+        critic: ec1, of the Bellman error at the state, 1/s.
+        critic_extrapolated: ec2, of the mean Bellman error at the extrapolated points, 1/s.
+        actor: ea1, towards the critic, 1/s.
+        actor_decay: ea2, towards zero, 1/s.
+        forgetting: beta of the least-squares gain, 1/s.
+        normalisation: nu in rho = 1 + nu w'w.
+        information: k1 of the least-squares gain; 1 in the published code, ec1 in its theory.
+        information_extrapolated: k2; 1 in the published code, ec2 in its theory.
+
+    Raises:
+        ValueError: if a gain is negative or not finite.
+
+    Source: MATH.md section 4.
+    """
+
+    critic: float = 0.001
+    critic_extrapolated: float = 0.25
+    actor: float = 1.2
+    actor_decay: float = 0.01
+    forgetting: float = 0.003
+    normalisation: float = 0.05
+    information: float = 1.0
+    information_extrapolated: float = 1.0
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if real("Gains", field.name, value) < 0:
+                raise fail("Gains", field.name, "must not be negative", value)
+
+
+class Weights(NamedTuple):
+    """The state of an actor-critic."""
+
+    critic: Tensor  # Wc, (..., M)
+    actor: Tensor  # Wa, (..., M)
+    gain: Tensor  # (..., M, M): Gam as published, Lam = Gam^-1 in information form
+
+
+class BellmanSums(NamedTuple):
+    """Sums over the state (index 0) and the extrapolated points of what drives the weights."""
+
+    critic_force: Tensor  # sum a_j w_j delta_j / rho_j, (..., M)
+    curvature: Tensor  # sum a_j w_j w_j' / rho_j, (..., M, M): d critic_force / d Wc
+    information: Tensor  # sum k_j w_j w_j' / rho_j^2, (..., M, M)
+    actor_force: Tensor  # sum a_j G_j Wa w_j'Wc / (4 rho_j), (..., M)
+
+
+class ActorCriticLaw(abc.ABC):
+    """How the weights move, given the Bellman terms.
+
+    Args:
+        gains: the gains.
+        bound: of the norm of Wc and of Wa: after a step they are projected onto that ball. None for no
+            projection.
+
+    Raises:
+        ValueError: if ``bound`` is not positive.
+    """
+
+    def __init__(self, gains: Gains | None = None, bound: float | None = None) -> None:
+        self.gains = Gains() if gains is None else gains
+        self.bound = None if bound is None else positive_real(type(self).__name__, "bound", bound)
+
+    @abc.abstractmethod
+    def init(self, critic: Tensor, actor: Tensor, gain: Tensor) -> Weights:
+        """Weights from Wc0 (..., M), Wa0 (..., M) and Gam0 (..., M, M)."""
+
+    @abc.abstractmethod
+    def rates(self, sums: BellmanSums, weights: Weights) -> Weights:
+        """d/dt of the weights: the law in continuous time."""
+
+    def step(self, sums: BellmanSums, weights: Weights, dt: float) -> Weights:
+        """The weights after ``dt`` seconds with the sums held, projected."""
+        critic, actor, gain = self._move(sums, weights, dt)
+        return Weights(self._project(critic), self._project(actor), gain)
+
+    @abc.abstractmethod
+    def _move(self, sums: BellmanSums, weights: Weights, dt: float) -> Weights:
+        """The same without the projection."""
+
+    def _project(self, weights: Tensor) -> Tensor:
+        if self.bound is None:
+            return weights
+        norm = weights.square().sum(-1, keepdim=True).sqrt()
+        return torch.where(norm > self.bound, self.bound / norm, 1.0) * weights
+
+    def sums(self, terms: BellmanTerms, masses: Tensor, weights: Weights) -> BellmanSums:
+        """Sums over the points of ``terms``, the state first, the others of weights ``masses`` (N,)."""
+        gains, w = self.gains, terms.regressor
+        masses = masses.to(w)
+        a = torch.cat((masses.new_full((1,), gains.critic), gains.critic_extrapolated * masses))
+        k = torch.cat((masses.new_full((1,), gains.information), gains.information_extrapolated * masses))
+        rho = 1 + gains.normalisation * w.square().sum(-1)  # (..., P)
+        share = a / rho
+        force = share * bellman_error(terms, weights.critic)
+        along = 0.25 * share * (w * weights.critic.unsqueeze(-2)).sum(-1)
+        outer = w.unsqueeze(-1) * w.unsqueeze(-2)  # (..., P, M, M)
+        return BellmanSums(
+            critic_force=(force.unsqueeze(-1) * w).sum(-2),
+            curvature=(share[..., None, None] * outer).sum(-3),
+            information=((k / rho.square())[..., None, None] * outer).sum(-3),
+            actor_force=(along.unsqueeze(-1) * terms.push).sum(-2),
+        )
+
+    def actor_rate(self, sums: BellmanSums, weights: Weights) -> Tensor:
+        """Wa' = -ea1 (Wa - Wc) - ea2 Wa + actor_force: (..., M)."""
+        pull = self.gains.actor * (weights.actor - weights.critic)
+        return sums.actor_force - pull - self.gains.actor_decay * weights.actor

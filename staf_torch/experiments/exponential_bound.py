@@ -1,0 +1,114 @@
+"""The theorem on the exponential kernel: what it says is enough, beside what is."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import torch
+from omegaconf import DictConfig
+
+from .. import theory
+from .._checks import COMMAND_LINE, fail, integer, positive_real
+from ..kernels import ExponentialKernel
+from ..report import write_metrics, write_text
+from ..report.tables import csv_table, markdown_table
+from .build import ChaseProblem, chase_problem
+from .build_theory import case_name, numbers
+from .progress import Progress
+
+Bounds = dict[tuple[float, float], dict[str, float | None]]
+"""What was found, by radius and epsilon."""
+
+_log = logging.getLogger(__name__)
+_HEADINGS = {
+    "radius": "r",
+    "epsilon": "epsilon",
+    "N": "N",
+    "S": "S",
+    "count": "C(n+N+S, n)",
+    "m": "m",
+    "error": "error",
+    "degree": "b",
+    "one_polynomial_count": "C(n+b, n)",
+    "one_polynomial_m": "m (one)",
+    "one_polynomial_error": "error (one)",
+    "measured_count": "M measured",
+}
+
+
+def run(cfg: DictConfig, directory: Path) -> dict[str, float | None]:
+    """Run what the settings describe and fill the run directory; `metrics.json` comes last."""
+    found = solve(cfg)
+    rows = [{"radius": radius, "epsilon": epsilon, **row} for (radius, epsilon), row in found.items()]
+    lines = markdown_table(rows, _HEADINGS)
+    write_text(directory / "exponential_bound.md", lines)
+    write_text(directory / "exponential_bound.csv", csv_table(rows, list(_HEADINGS)))
+    if cfg.figures:
+        _draw(found, directory)
+    for line in lines.splitlines():
+        _log.info("%s", line)
+    metrics = {
+        f"{case_name(*case)}.{name}": value for case, row in found.items() for name, value in row.items()
+    }
+    write_metrics(directory / "metrics.json", metrics)
+    return metrics
+
+
+def solve(cfg: DictConfig) -> Bounds:
+    """The bounds, and the smallest count of centers that does on the same states.
+
+    Raises:
+        ValueError: if a setting breaks its rule, or the kernel is another one.
+    """
+    name = "exponential_bound"
+    problem = chase_problem(cfg)
+    kernel = problem.basis.kernel
+    if not isinstance(kernel, ExponentialKernel):
+        raise fail(COMMAND_LINE, "kernel", "must be exponential: the theorem is about no other", kernel)
+    dim = problem.initial_states.shape[-1]
+    settings = cfg.exponential_bound
+    extent = positive_real(COMMAND_LINE, f"{name}.domain", settings.domain)
+    count = integer(COMMAND_LINE, f"{name}.states", settings.states, least=2)
+    most = integer(COMMAND_LINE, f"{name}.max_degree", settings.max_degree, least=0)
+    domain = theory.disc(extent, dim=dim, count=count).to(problem.initial_states)
+    radii, epsilons = numbers(cfg, f"{name}.radii"), numbers(cfg, f"{name}.epsilons")[::-1]
+    layouts = theory.standard_layouts(dim)
+    found: Bounds = {}
+    progress = Progress(len(radii) * len(epsilons), "bounds")
+    for radius in radii:
+        errors = theory.layout_errors(problem.target, kernel, domain, radius, layouts).amax(-1)  # (L,)
+        for epsilon in epsilons:
+            enough = torch.nonzero(errors <= epsilon).flatten().tolist()
+            measured = len(layouts[enough[0]]) if enough else None
+            row = _bound(problem, domain, radius, epsilon, most)
+            found[radius, epsilon] = row | {"measured_count": measured}
+            progress.advance(1)
+    progress.close()
+    return found
+
+
+def _bound(
+    problem: ChaseProblem, domain: torch.Tensor, radius: float, epsilon: float, most: int
+) -> dict[str, float | None]:
+    found: dict[str, float | None] = dict.fromkeys(list(_HEADINGS)[2:])
+    about = (problem.target, domain, radius, epsilon)
+    try:
+        one = theory.one_polynomial_bound(*about, max_degree=most)
+        found |= {"degree": one.degree, "one_polynomial_count": one.count}
+        found |= {"one_polynomial_m": one.m, "one_polynomial_error": one.error}
+        bound = theory.exponential_bound(*about, max_degree=most)
+        two = bound.two_polynomials
+        found |= {"N": bound.N, "S": bound.S, "count": two.count, "m": two.m, "error": two.error}
+    except ValueError as error:
+        _log.warning("r = %g: %s", radius, error)
+    return found
+
+
+def _draw(found: Bounds, directory: Path) -> None:
+    # Imported here: matplotlib takes a second, which figures=false need not pay.
+    from ..report import plots, plots_theory
+
+    folder = directory / "figures"
+    folder.mkdir(exist_ok=True)
+    plots.save(plots_theory.draw_exponential_bound(found), folder / "exponential_bound")

@@ -1,0 +1,48 @@
+"""An inverted pendulum."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from .._checks import non_negative, positive_real, real
+from .base import ControlAffineSystem
+
+
+class Pendulum(ControlAffineSystem):
+    """theta' = omega,  omega' = (gravity/length) sin(theta) + (u - damping omega) / (mass length^2).
+
+    theta = 0 is upright, so the open loop is unstable at the equilibrium.
+
+    Args:
+        mass: kg, positive.
+        length: m, positive.
+        damping: N m s, not negative.
+        gravity: m/s^2, positive.
+
+    Raises:
+        ValueError: if an argument breaks its rule.
+    """
+
+    dim = 2
+    inputs = 1
+
+    def __init__(
+        self, mass: float = 1.0, length: float = 1.0, damping: float = 0.1, gravity: float = 9.81
+    ) -> None:
+        super().__init__()
+        self.inertia = (
+            positive_real("Pendulum", "mass", mass) * positive_real("Pendulum", "length", length) ** 2
+        )
+        non_negative("Pendulum", "damping", damping)
+        self.damping = real("Pendulum", "damping", damping)
+        self.stiffness = positive_real("Pendulum", "gravity", gravity) / length  # 1/s^2
+
+    def drift(self, x: Tensor) -> Tensor:
+        angle, rate = x.unbind(-1)
+        acceleration = self.stiffness * angle.sin() - (self.damping / self.inertia) * rate
+        return torch.stack((rate, acceleration), dim=-1)
+
+    def effectiveness(self, x: Tensor) -> Tensor:
+        zero = torch.zeros_like(x[..., 0])
+        return torch.stack((zero, zero + 1 / self.inertia), dim=-1).unsqueeze(-1)

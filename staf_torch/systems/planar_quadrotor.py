@@ -1,0 +1,49 @@
+"""A quadrotor in a vertical plane, around hover."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from .._checks import positive_real
+from .base import ControlAffineSystem
+
+
+class PlanarQuadrotor(ControlAffineSystem):
+    """State (y, z, theta, y', z', theta'), input (thrust above hover, torque):
+
+        y'' = -(gravity + u1/mass) sin(theta),  z'' = (gravity + u1/mass) cos(theta) - gravity,
+        theta'' = u2 / inertia.
+
+    The input is measured from the hover thrust mass * gravity, so that f(0) = 0.
+
+    Args:
+        mass: kg, positive.
+        inertia: kg m^2, positive.
+        gravity: m/s^2, positive.
+
+    Raises:
+        ValueError: if an argument breaks its rule.
+    """
+
+    dim = 6
+    inputs = 2
+
+    def __init__(self, mass: float = 1.0, inertia: float = 0.1, gravity: float = 9.81) -> None:
+        super().__init__()
+        self.mass = positive_real("PlanarQuadrotor", "mass", mass)
+        self.inertia = positive_real("PlanarQuadrotor", "inertia", inertia)
+        self.gravity = positive_real("PlanarQuadrotor", "gravity", gravity)
+
+    def drift(self, x: Tensor) -> Tensor:
+        angle = x[..., 2]
+        fall = self.gravity * (angle.cos() - 1)
+        forces = torch.stack((-self.gravity * angle.sin(), fall, torch.zeros_like(angle)), dim=-1)
+        return torch.cat((x[..., 3:], forces), dim=-1)
+
+    def effectiveness(self, x: Tensor) -> Tensor:
+        angle = x[..., 2]
+        zero = torch.zeros_like(angle)
+        thrust = (zero, zero, zero, -angle.sin() / self.mass, angle.cos() / self.mass, zero)
+        torque = (zero, zero, zero, zero, zero, zero + 1 / self.inertia)
+        return torch.stack((torch.stack(thrust, dim=-1), torch.stack(torque, dim=-1)), dim=-1)

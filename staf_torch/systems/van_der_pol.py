@@ -1,0 +1,35 @@
+"""The forced Van der Pol oscillator."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from .._checks import real
+from .base import ControlAffineSystem
+
+
+class VanDerPol(ControlAffineSystem):
+    """x1' = x2,  x2' = damping (1 - x1^2) x2 - x1 + u.
+
+    Args:
+        damping: mu; for mu > 0 the origin is unstable inside a stable limit cycle.
+
+    Raises:
+        ValueError: if ``damping`` is not finite.
+    """
+
+    dim = 2
+    inputs = 1
+
+    def __init__(self, damping: float = 1.0) -> None:
+        super().__init__()
+        self.damping = real("VanDerPol", "damping", damping)
+
+    def drift(self, x: Tensor) -> Tensor:
+        x1, x2 = x.unbind(-1)
+        return torch.stack((x2, self.damping * (1 - x1.square()) * x2 - x1), dim=-1)
+
+    def effectiveness(self, x: Tensor) -> Tensor:
+        zero = torch.zeros_like(x[..., 0])
+        return torch.stack((zero, zero + 1), dim=-1).unsqueeze(-1)

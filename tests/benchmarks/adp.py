@@ -1,0 +1,119 @@
+"""Closed-loop speed: the information laws on the two-state plant, 10 s at 1 ms.
+
+    python tests/benchmarks/adp.py [rows ...]   # and by jit(vmap(scan)) where JAX is installed
+
+Prints seconds after warm-up, the median of some runs, torch and JAX in turn. Not collected by pytest.
+"""
+
+from __future__ import annotations
+
+import statistics
+import sys
+import time
+from collections.abc import Callable
+
+import torch
+
+from staf_torch import (
+    AnchoredKernel,
+    ExponentialKernel,
+    StaFBasis,
+    StateFollowingCenters,
+    StateRadius,
+    adp,
+    rings,
+    systems,
+)
+
+STEPS, DT, RUNS = 10_000, 1e-3, 3
+
+
+def torch_run(batch: int) -> Callable[[], float]:
+    """A run that returns the median cost; the compiled step is kept from call to call."""
+    plant, cost = systems.TwoState(), adp.QuadraticCost(1.0, 1.0, 2, 1)
+    centers = StateFollowingCenters(rings(3), StateRadius(0.7, 1e-5))
+    basis = adp.StaFValueBasis(StaFBasis(AnchoredKernel(ExponentialKernel()), centers))
+    learner = adp.ActorCritic(basis, plant, cost, adp.RandomPoints(1, StateRadius(2.1, 1e-5)))
+    x0 = torch.tensor([-1.0, 1.0], dtype=torch.float64).repeat(batch, 1)
+
+    def run() -> float:
+        result = adp.simulate(learner, plant, cost, x0, dt=DT, steps=STEPS, every=STEPS, compile=True)
+        return float(result.cost.median())
+
+    return run
+
+
+def jax_run(batch: int) -> Callable[[], float] | None:
+    """The same laws, plant integrator and number of random draws in JAX; None without JAX."""
+    try:
+        import jax
+        import jax.numpy as jnp
+    except ImportError:
+        return None
+    jax.config.update("jax_enable_x64", True)
+    directions = jnp.asarray(rings(3).numpy())
+
+    def field(x, u):  # type: ignore[no-untyped-def]
+        h = jnp.cos(2 * x[0]) + 2
+        return jnp.array([x[1] - x[0], -0.5 * x[0] - 0.5 * x[1] * (1 - h * h) + h * u])
+
+    def terms(y, actor):  # type: ignore[no-untyped-def]
+        q = y @ y
+        nu, slope = 0.7 * (q + 1e-5) / (1 + q), 1.4 * (1 - 1e-5) / (1 + q) ** 2 * y
+        c = y + nu * directions
+        ds = jnp.exp(c @ y)[:, None] * (c + y + (directions @ y)[:, None] * slope)
+        h = jnp.cos(2 * y[0]) + 2
+        u = -0.5 * h * (ds[:, 1] @ actor)
+        return u, ds @ field(y, u), y @ y + u * u, -2 * h * u * ds[:, 1]
+
+    def step(carry, draw):  # type: ignore[no-untyped-def]
+        x, spent, critic, actor, gain = carry
+        q = x @ x
+        points = jnp.stack((x, x + 2.1 * (q + 1e-5) / (1 + q) * draw))
+        u, w, r, push = jax.vmap(terms, (0, None))(points, actor)
+        a = jnp.array([0.001, 0.25])
+        rho = 1 + 0.05 * (w * w).sum(-1)
+        along = w @ critic
+        force = ((a / rho) * (r + along)) @ w
+        curvature = jnp.einsum("p,pi,pj->ij", a / rho, w, w)
+        gain = jnp.exp(-0.003 * DT) * gain + DT * jnp.einsum("p,pi,pj->ij", 1 / rho**2, w, w)
+        moved = critic - jnp.linalg.solve(gain + DT * curvature, DT * force)
+        actor = (actor + DT * (1.2 * moved + (a / rho * along / 4) @ push)) / (1 + DT * 1.21)
+        k1 = field(x, u[0])
+        k2 = field(x + DT / 2 * k1, u[0])
+        k3 = field(x + DT / 2 * k2, u[0])
+        k4 = field(x + DT * k3, u[0])
+        states = (x, x + DT / 2 * k1, x + DT / 2 * k2, x + DT * k3)
+        c = [s @ s for s in states]
+        spent = spent + DT * (u[0] ** 2 + (c[0] + 2 * (c[1] + c[2]) + c[3]) / 6)
+        return (x + DT / 6 * (k1 + 2 * (k2 + k3) + k4), spent, moved, actor, gain), None
+
+    def trajectory(key):  # type: ignore[no-untyped-def]
+        draws = jax.random.uniform(key, (STEPS, 2), minval=-1, maxval=1, dtype=jnp.float64)
+        start = (jnp.array([-1.0, 1.0]), 0.0, jnp.full(3, 0.4), jnp.full(3, 0.28), jnp.eye(3) / 250)
+        return jax.lax.scan(step, start, draws)[0][1]
+
+    fast = jax.jit(jax.vmap(trajectory))
+    keys = jax.random.split(jax.random.key(0), batch)
+    return lambda: float(jnp.median(fast(keys).block_until_ready()))
+
+
+def main() -> None:
+    """Time both, in turn."""
+    for batch in [int(argument) for argument in sys.argv[1:]] or [1, 1000]:
+        runs = {"torch": torch_run(batch), "jax": jax_run(batch)}
+        seconds: dict[str, list[float]] = {name: [] for name in runs}
+        costs = {name: run() for name, run in runs.items() if run is not None}  # warms up too
+        for _ in range(RUNS):
+            for name, run in runs.items():
+                if run is not None:
+                    start = time.perf_counter()
+                    run()
+                    seconds[name].append(time.perf_counter() - start)
+        for name, found in seconds.items():
+            if found:
+                print(f"B = {batch:5d}  {name:5s}  {statistics.median(found):7.2f} s  cost {costs[name]:.4f}")
+
+
+if __name__ == "__main__":
+    main()

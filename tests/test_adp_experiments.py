@@ -1,0 +1,92 @@
+"""The ADP experiments end to end, short."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hydra import compose, initialize_config_dir
+
+from staf_torch.experiments import adp as adp_experiment
+from staf_torch.experiments import adp_comparison, adp_tracking
+from staf_torch.experiments.app import config_directory
+
+SHORT = ["duration=0.1", "dt=0.005"]
+
+
+def settings(*overrides: str):  # type: ignore[no-untyped-def]
+    with initialize_config_dir(config_directory(), version_base="1.3"):
+        return compose("config", list(overrides))
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ["experiment=adp"],
+        ["experiment=adp", "adp.law=published", "dt=0.001"],
+        ["experiment=adp", "adp.gradient=partial", "adp.extrapolated_centers=fixed"],
+        ["experiment=adp", "adp.extrapolation=quadrature", "adp.order=3", "adp.trust=0.5"],
+        ["experiment=adp", "adp.policy=rollout", "adp.rollout.depth=1"],
+        ["experiment=adp", "adp.policy=lqr", "system=pendulum"],
+        ["experiment=adp", "adp.policy=none", "trajectories=3"],
+        ["experiment=adp", "system=two_state_as_printed"],
+        ["experiment=adp", "adp.basis=rbf_grid", "adp.rbf_grid.points=3"],
+        ["experiment=adp_three_state"],
+    ],
+    ids=lambda o: " ".join(o),
+)
+def test_experiment_writes_its_run_directory(overrides: list[str], tmp_path: Path) -> None:
+    drawn = len(overrides) == 1 or "adp.policy=lqr" in overrides  # with weights, without; figures are slow
+    cfg = settings(*SHORT, f"figures={drawn}", *overrides)
+    metrics = adp_experiment.run(cfg, tmp_path)
+    assert json.loads((tmp_path / "metrics.json").read_text()) == metrics
+    assert metrics["diverged_fraction"] == 0
+    names = {"cost", "optimal_cost", "cost_ratio", "final_state_norm", "control_error", "value_error"}
+    assert names | {"regulated_fraction", "diverged_fraction"} <= metrics.keys()
+    with np.load(tmp_path / "history.npz") as history:
+        batch, times = history["state"].shape[:2]
+        assert history["time"].shape == (times,)
+        for name in ("control", "actor_weights", "critic_weights", "running_cost"):
+            assert history[name].shape[:2] == (batch, times)
+    for ending in (".png", ".pdf") if drawn else ():
+        assert (tmp_path / "figures" / cfg.task).with_suffix(ending).stat().st_size > 5000
+
+
+def test_comparison_writes_a_row_a_method(tmp_path: Path) -> None:
+    cfg = settings("experiment=adp_comparison", "duration=0.1", "trajectories=4", "adp.order=2")
+    adp_comparison.run(cfg, tmp_path)
+    lines = (tmp_path / "comparison.csv").read_text().splitlines()
+    assert len(lines) == 10
+    assert lines[0].startswith("method,functions,points,ratio_median")
+    assert len((tmp_path / "comparison.md").read_text().splitlines()) == 11
+    assert (tmp_path / "figures" / "adp_comparison.png").stat().st_size > 5000
+
+
+def test_tracking_writes_its_run_directory(tmp_path: Path) -> None:
+    metrics = adp_tracking.run(settings("experiment=adp_tracking", "duration=0.1", "dt=0.01"), tmp_path)
+    assert metrics["identified_parameter_error"] < metrics["unidentified_parameter_error"]
+    with np.load(tmp_path / "history.npz") as history:
+        assert history["parameters"].shape == (1, 11, 3, 2)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["adp.policy=ppo"], r"`adp\(policy=...\)` must be one of"),
+        (["adp.law=newton"], r"`adp\(law=...\)` must be one of"),
+        (["adp.basis=fourier"], r"`adp\(basis=...\)` must be one of"),
+        (["adp.extrapolation=grid"], r"`adp\(extrapolation=...\)` must be one of"),
+        (["adp.cost.state=[[1,0],[0,-1]]"], r"`QuadraticCost\(state=...\)` must be positive definite"),
+        (["adp.cost.control=0"], r"`QuadraticCost\(control=...\)` must be positive"),
+        (["system=oscillator"], r"`adp\(system=...\)` must be a plant with inputs; got 'Oscillator'"),
+        (["adp.cost.bound=1"], r"`adp\(cost.bound=...\)` needs adp.policy=rollout or lqr"),
+        (["initial_state=[1,2,3]"], r"`staf initial_state=...` must have 2 entries"),
+        (["duration=1e-9"], r"`staf duration=...` must be at least one step"),
+    ],
+)
+def test_bad_setting_is_refused_by_name(overrides: list[str], message: str, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=message):
+        adp_experiment.run(settings("experiment=adp", *overrides), tmp_path)
+    assert not list(tmp_path.iterdir())
