@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import abc
 
-import torch
 from torch import Tensor, nn
 
 
@@ -83,19 +82,6 @@ def per_entry(value: Tensor, extra: int) -> Tensor:
 def inner(x1: Tensor, x2: Tensor) -> Tensor:
     """x1'x2: (..., P, n), (..., M, n) -> (..., P, M)."""
     return x1 @ x2.mT
-
-
-def dot(a: Tensor, b: Tensor) -> Tensor:
-    """a'b over the last dimension, term by term: (..., n), (..., n) -> (...).
-
-    A sum over the dimension would write its result row by row whatever the memory layout of its
-    arguments; this keeps the layout, and a row's bits do not depend on the rows beside it.
-    """
-    first, *rest = zip(a.unbind(-1), b.unbind(-1), strict=True)
-    total = first[0] * first[1]
-    for left, right in rest:
-        total = torch.addcmul(total, left, right)
-    return total
 
 
 def squared_distance(x1: Tensor, x2: Tensor) -> Tensor:
