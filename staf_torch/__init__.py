@@ -17,7 +17,9 @@ from .centers import polygon as polygon
 from .centers import rings as rings
 from .centers import simplex as simplex
 from .chase import ChaseResult as ChaseResult
+from .chase import ChaseWeights as ChaseWeights
 from .chase import chase as chase
+from .chase import chase_weights as chase_weights
 from .chase import predictors as predictors
 from .kernels import AnchoredKernel as AnchoredKernel
 from .kernels import ExponentialKernel as ExponentialKernel

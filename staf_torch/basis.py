@@ -19,17 +19,30 @@ Target = Callable[[Tensor], Tensor]
 
 
 class GramStructure(NamedTuple):
-    """K(c(x)) = e^{gain} S K0 S with S = diag(scale), at the states x."""
+    """K(c(x)) = e^{log_gain} S K0 S with S = diag(scale), at the states x."""
 
     core: Tensor  # K0, (M, M) where one serves all states, else (..., M, M)
-    scale: Tensor | None  # e^{s(x, d_i)}, (..., M); None for ones
+    log_scale: Tensor | None  # s(x, d_i), (..., M), (M,) where one serves all; None for zeros
     log_gain: Tensor | None  # g(x), (...); None for zeros
+
+    @property
+    def scale(self) -> Tensor | None:
+        """e^{s(x, d_i)}, (..., M); None for ones."""
+        return None if self.log_scale is None else self.log_scale.exp()
 
     def scaled(self) -> Tensor:
         """S K0 S = e^{-gain} K(c(x)): (..., M, M)."""
-        if self.scale is None:
-            return self.core
-        return self.scale.unsqueeze(-1) * self.core * self.scale.unsqueeze(-2)
+        scale = self.scale
+        return self.core if scale is None else scale.unsqueeze(-1) * self.core * scale.unsqueeze(-2)
+
+    def quadratic(self, v: Tensor) -> Tensor:
+        """v'S K0 S v without S K0 S: (..., M) -> (...)."""
+        u = v if self.log_scale is None else self.log_scale.exp() * v
+        product = self.core[..., 0] * u[..., :1]
+        for j in range(1, u.shape[-1]):  # a column at a time: no (..., M, M), no bits from other rows
+            product = torch.addcmul(product, self.core[..., j], u[..., j : j + 1])
+        quadratic: Tensor = torch.linalg.vecdot(u, product)
+        return quadratic
 
 
 class StaFBasis(nn.Module):
@@ -112,8 +125,7 @@ class StaFBasis(nn.Module):
         """The factors of K(c(x)), none of which overflows: (..., n) -> `GramStructure`."""
         d = self.centers.offsets(x)
         core = self.kernel.core(x, d, d)
-        s = self.kernel.log_scale(x, d)
-        return GramStructure(core, None if s is None else s.exp(), self.kernel.log_gain(x))
+        return GramStructure(core, self.kernel.log_scale(x, d), self.kernel.log_gain(x))
 
     def local(self, x: Tensor) -> LocalSpace:
         """The span of the basis at the states x (..., n), in a basis that can be computed with."""

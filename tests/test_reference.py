@@ -122,7 +122,9 @@ CHAOTIC = [(0.05, 1), (0.05, 5), (0.01, 1), (0.01, 5), (0.001, 1)]
 """One or five iterations a step: the recursion forgets nothing. Starts 1e-12 apart end up to 60 % apart
 over the window, and 60, 120 and 250 digits agree on .681 and 3.10 for (0.05, 5), on .808 and 1.11 for
 (0.01, 1), on .165 and .257 for (0.01, 5). The table has one realisation in float64, so that what can be
-held against it is the range of many. Even numbers of iterations agree to all digits."""
+held against it is the range of many: .532 is near the edge, 6 to 8 % of the runs are below it or within
+3 % (of 4096 with the fused recursion and as many with the reference), so that 32 of them all miss it once
+in ten times and 128 hardly ever. Even numbers of iterations agree to all digits."""
 
 
 @pytest.mark.parametrize(("dt", "inner_steps"), [entry for entry in TABLE if entry not in CHAOTIC])
@@ -140,16 +142,16 @@ def test_chaotic_entries_of_the_table_are_among_the_runs_that_rounding_tells_apa
     dt: float, inner_steps: int
 ) -> None:
     states = systems.simulate(systems.Oscillator(), tensor([[1.0, 0.0]]), dt=dt, steps=math.floor(END / dt))
-    weights = 1e-12 * uniform(32, 3, seed=1)
+    weights = 1e-12 * uniform(128, 3, seed=1)
     result = st.chase(
-        states.expand(32, -1, 2), BASIS, Paper(), SteepestDescent(), inner_steps=inner_steps, weights=weights
+        states.expand(128, -1, 2), BASIS, Paper(), SteepestDescent(), inner_steps=inner_steps, weights=weights
     )
     at = slice(math.ceil(5 / dt - 1e-9), None)
     after = (result.value - result.estimate)[:, at].abs().amax(1)
     excess_before = result.excess_before[:, at].amax(1)
     for found, reference in zip((after, excess_before), TABLE[dt, inner_steps], strict=True):
         assert 0.97 * float(found.min()) <= reference <= 1.03 * float(found.max())
-        assert float(found.max() / found.min()) < 2.5
+        assert float(found.quantile(0.95) / found.quantile(0.05)) < 2.0
 
 
 def test_window_in_parts_is_the_window_of_the_whole_run() -> None:

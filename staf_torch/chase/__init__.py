@@ -11,3 +11,5 @@ from .predictors import Tangent as Tangent
 from .rates import along as along
 from .rates import gram_rates as gram_rates
 from .result import ChaseResult as ChaseResult
+from .result import ChaseWeights as ChaseWeights
+from .weights import chase_weights as chase_weights

@@ -9,15 +9,18 @@ from collections.abc import Iterable, Iterator
 import torch
 from torch import Tensor
 
-from .._checks import integer, trailing
+from .._checks import integer
 from ..basis import StaFBasis, Target
 from ..objective import NativeError
 from ..optim.base import UpdateLaw
 from .certificate import Certificate, certify
+from .correct import correct, dense, lost, paper_units
 from .known import known as find_known
+from .known import state_row
 from .predictors import Predictor
 from .recursion import Carry, recursion
 from .result import ChaseResult, concatenate
+from .start import check_law, check_states, start
 
 _WORKING_BYTES = 2**26
 
@@ -61,9 +64,7 @@ def chase(
 
     Source: Rosenfeld et al., section 6.
     """
-    trailing("chase", "states", states, dims=3, last=basis.dim)
-    if states.dim() != 3 or 0 in states.shape:
-        raise ValueError(f"`chase(states=...)` must have the shape (B, T, n); got {tuple(states.shape)}.")
+    check_states("chase", states, basis)
     pieces = states.split(chunk_length(states.shape[0], basis, states.element_size()), dim=1)
     return concatenate(
         chase_pieces(
@@ -98,38 +99,18 @@ def chase_pieces(
 ) -> Iterator[ChaseResult]:
     """`chase` over consecutive pieces of time (B, C, n), a result a piece."""
     integer("chase", "inner_steps", inner_steps, least=0)
-    if not isinstance(law, UpdateLaw):
-        raise ValueError(f"`chase(law=...)` must be an UpdateLaw; got {law!r}.")
+    check_law("chase", law)
     if predictor is not None and not isinstance(predictor, Predictor):
         raise ValueError(f"`chase(predictor=...)` must be a Predictor or None; got {predictor!r}.")
     carry, warned = None, False
     for states in pieces:
         warned = warned or basis.check_reach(states)
         if carry is None:
-            carry = _start(states, basis, law, weights)
+            carry = start("chase", states, basis, law, weights)
             if predictor is not None:
                 carry = carry._replace(previous=carry.weights, states=states[:, [0, 0]])
         result, carry = _piece(states, basis, target, law, inner_steps, predictor, certificate, carry)
         yield result
-
-
-def _start(states: Tensor, basis: StaFBasis, law: UpdateLaw, weights: Tensor | None) -> Carry:
-    shape = (states.shape[0], basis.count)
-    first = states.new_zeros(shape)
-    if weights is not None:
-        trailing("chase", "weights", weights, dims=1, last=basis.count)
-        if weights.dim() > 2 or (weights.dim() == 2 and weights.shape != shape):
-            raise ValueError(
-                f"`chase(weights=...)` must have the shape {shape[1:]} or {shape}; "
-                f"got {tuple(weights.shape)}."
-            )
-        first = first + weights.to(states)
-    gain = basis.kernel.log_gain(states[:, 0])
-    # The units of the first weights: those of the first state, e^{-g(x_0)}.
-    first = first if gain is None else torch.where(first == 0, 0.0, first * gain.exp()[:, None])
-    zero = states.new_zeros(states.shape[0])
-    never = torch.full(zero.shape, -1, dtype=torch.int64, device=states.device)
-    return Carry(first, law.init(first), zero if gain is None else gain, 0, never)
 
 
 def _piece(
@@ -143,63 +124,76 @@ def _piece(
     carry: Carry,
 ) -> tuple[ChaseResult, Carry]:
     """One piece of time: (B, C, n) and the carry to its result and the next carry."""
-    structure = basis.gram_structure(states)
-    values = basis.values(states, target)
-    gram = structure.scaled().expand(*states.shape[:2], basis.count, basis.count)
-    zero = states.new_zeros(states.shape[:2])
-    log_gain = zero if structure.log_gain is None else structure.log_gain
+    structure, values = basis.gram_structure(states), basis.values(states, target)
     space = basis.local(states)
     fitted = space.fit(values)
     ideal = space.scaled_weights(fitted)
-    scale = zero.new_ones(()) if structure.scale is None else structure.scale
-    here = states.new_zeros(1, basis.dim)
-    row = basis.kernel.core(states, here, space.offsets).squeeze(-2)  # k0(0, d_i), (..., M)
+    scale = states.new_ones(()) if structure.scale is None else structure.scale
+    row = state_row(basis, states, space)
     value = target(states)
+    # Every K of its own only where somebody asks for it: the fused recursion does not.
+    whole = dense(structure, values) if law.needs or certificate or predictor is not None else None
+    gram = None if whole is None else whole.gram
     known = find_known(law.needs, space, gram, ideal, scale * row, value)
 
     if predictor is None:
-        run = recursion(gram, values, log_gain, law, inner_steps, carry, known)
+        run = correct(structure, values, law, inner_steps, carry, known, whole)
     else:
+        assert whole is not None
         assert carry.states is not None
         around = torch.cat((carry.states, states), dim=1)
         parts = predictor.prepare(basis, target, around, carry.time)
-        run = recursion(gram, values, log_gain, law, inner_steps, carry, known, predictor, parts)
+        run = recursion(whole.gram, values, whole.log_gain, law, inner_steps, carry, known, predictor, parts)
         run = run._replace(carry=run.carry._replace(states=around[:, -2:]))
 
-    objective = NativeError(gram, values)
-    times = torch.arange(carry.time, run.carry.time, device=states.device)
-    end = run.carry.diverged_at[:, None]
-    lost = (end >= 0) & (times >= end)
-    # Frozen weights stay in the units of the last state that they were corrected at.
-    inverse_gain = (-torch.where(lost, run.carry.log_gain[:, None], log_gain)).exp()
-
-    def reached(quantity: Tensor) -> Tensor:
-        return torch.where(lost.view(*lost.shape, *[1] * (quantity.dim() - 2)), torch.nan, quantity)
+    reached = _Reached(lost(run.carry, states.shape[1]))
+    gain = states.new_zeros(()) if structure.log_gain is None else structure.log_gain
+    inverse_gain = (-gain).exp()
 
     def at_state(scaled_weights: Tensor) -> Tensor:
         return reached(torch.linalg.vecdot(row, scale * scaled_weights))
 
     result = ChaseResult(
         state=states,
-        weights=run.after * inverse_gain[..., None],
+        weights=run.after * paper_units(structure, run.carry, states.shape[1]),
         ideal_weights=reached(ideal * inverse_gain[..., None]),
         coefficients=reached(scale * run.after),
         value=reached(value),
         estimate=at_state(run.after),
         estimate_before=at_state(run.before),
-        ideal_estimate=reached(space.evaluate(here, fitted).squeeze(-1)),
-        excess=reached(objective.excess(run.after, ideal) * inverse_gain),
-        excess_before=reached(objective.excess(run.before, ideal) * inverse_gain),
+        ideal_estimate=reached(space.evaluate(states.new_zeros(1, basis.dim), fitted).squeeze(-1)),
+        excess=reached(structure.quadratic(run.after - ideal) * inverse_gain),
+        excess_before=reached(structure.quadratic(run.before - ideal) * inverse_gain),
         diverged_at=run.carry.diverged_at,
     )
     if not certificate:
         return result, run.carry
-    vouched, link = certify(objective, log_gain, law, inner_steps, run.before, run.after, ideal, carry.link)
-    vouched = Certificate(
-        rate=reached(vouched.rate),
-        growth=reached(vouched.growth),
-        drift=reached(vouched.drift),
-        bound=reached(vouched.bound),
-        violated=vouched.violated & ~lost,
+    assert whole is not None
+    objective = NativeError(whole.gram, values)
+    vouched, link = certify(
+        objective, whole.log_gain, law, inner_steps, run.before, run.after, ideal, carry.link
     )
-    return dataclasses.replace(result, certificate=vouched), run.carry._replace(link=link)
+    result = dataclasses.replace(result, certificate=reached.certificate(vouched))
+    return result, run.carry._replace(link=link)
+
+
+class _Reached:
+    """NaN in place of what a trajectory did not reach."""
+
+    def __init__(self, gone: Tensor) -> None:
+        self._gone = gone  # (B, C) bool
+
+    def __call__(self, quantity: Tensor) -> Tensor:
+        """The same (B, C, ...), NaN there."""
+        gone = self._gone.view(*self._gone.shape, *[1] * (quantity.dim() - 2))
+        return torch.where(gone, torch.nan, quantity)
+
+    def certificate(self, vouched: Certificate) -> Certificate:
+        """The same, with nothing violated there."""
+        return Certificate(
+            rate=self(vouched.rate),
+            growth=self(vouched.growth),
+            drift=self(vouched.drift),
+            bound=self(vouched.bound),
+            violated=vouched.violated & ~self._gone,
+        )

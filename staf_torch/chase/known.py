@@ -7,30 +7,39 @@ from collections.abc import Set
 import torch
 from torch import Tensor
 
+from ..basis import StaFBasis
 from ..local import LocalSpace
 from ..objective import Known, extremes
 
 
 def known(
-    needs: Set[str], space: LocalSpace, gram: Tensor, ideal: Tensor, row: Tensor, sampled: Tensor
+    needs: Set[str], space: LocalSpace, gram: Tensor | None, ideal: Tensor, row: Tensor, sampled: Tensor
 ) -> Known:
     """The fields of `Known` that a law names in its `needs`, the others None.
 
     Args:
         needs: names of fields.
         space: the local space at the states (B, C).
-        gram: e^{-g} K, (B, C, M, M).
+        gram: e^{-g} K, (B, C, M, M); None only where nothing is needed.
         ideal: its ideal weights, (B, C, M).
-        row: e^{-g} k(x, c_i), (B, C, M).
+        row: e^{-g} k(x, c_i), (B, C, M) or (M,) for all states.
         sampled: V(x), (B, C).
     """
+    if not needs:
+        return Known()
+    assert gram is not None
     return Known(
         extremes=extremes(gram) if "extremes" in needs else None,
         ideal=ideal if "ideal" in needs else None,
         inverse=_inverse(space, gram) if "inverse" in needs else None,
-        row=row if "row" in needs else None,
+        row=row.expand(ideal.shape) if "row" in needs else None,
         sampled=sampled if "sampled" in needs else None,
     )
+
+
+def state_row(basis: StaFBasis, x: Tensor, space: LocalSpace) -> Tensor:
+    """k0(0, d_i) at the states x (..., n), (..., M): e^{-g} k(x, c_i) but for the Gram structure's scale."""
+    return basis.kernel.core(x, x.new_zeros(1, basis.dim), space.offsets).squeeze(-2)
 
 
 def _inverse(space: LocalSpace, gram: Tensor) -> Tensor:

@@ -39,9 +39,24 @@ class ChaseResult:
         return self.diverged_at >= 0
 
 
+@dataclasses.dataclass(frozen=True)
+class ChaseWeights:
+    """The weights of a gradient chase alone."""
+
+    weights: Tensor  # (B, T, M) the paper's w, corrected; (B, 1, M) at the last time for record="last"
+    diverged_at: Tensor  # (B,) int64 index of the first time that is not finite, -1 if none
+
+    @property
+    def diverged(self) -> Tensor:
+        """(B,) bool: whether the trajectory, V, the Gram matrix or the weights became non-finite."""
+        return self.diverged_at >= 0
+
+
 def concatenate(pieces: Iterable[ChaseResult]) -> ChaseResult:
     """Consecutive pieces of time as one result."""
     parts = list(pieces)
+    if len(parts) == 1:
+        return parts[0]
     joined = {
         field.name: torch.cat([getattr(part, field.name) for part in parts], dim=1)
         for field in dataclasses.fields(ChaseResult)
