@@ -40,6 +40,13 @@ recursion_module = sys.modules["staf_torch.chase.recursion"]
 Carry, History, fused = recursion_module.Carry, fused_module.History, fused_module.fused
 
 LAW = optim.SteepestDescent()
+
+
+@pytest.fixture(autouse=True)
+def _small_problems_are_fused_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(correct_module, "_WORTHWHILE", 0)
+
+
 needs_compiler = pytest.mark.skipif(
     fused_module.compiled("double") is None, reason="no C++ compiler: the reference runs instead"
 )
@@ -353,7 +360,8 @@ FAULTS = {
 @pytest.mark.parametrize("fault", FAULTS)
 def test_no_fault_of_a_build_is_more_than_one_line_of_the_log(fault: str, tmp_path: Path) -> None:
     program = """
-import tempfile, torch, staf_torch as st
+import sys, tempfile, torch, staf_torch as st
+sys.modules["staf_torch.chase.correct"]._WORTHWHILE = 0
 tempfile.tempdir = __import__("os").environ.get("TMPDIR")
 basis = st.StaFBasis(st.ExponentialKernel(), st.StateFollowingCenters(st.rings(3), 0.1))
 for dtype in (torch.float64, torch.float32):
@@ -377,3 +385,11 @@ for dtype in (torch.float64, torch.float32):
     assert done.stdout == ""
     assert len(done.stderr.splitlines()) == 1
     assert "runs in plain torch" in done.stderr
+
+
+def test_a_small_problem_does_not_pay_for_a_build(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.undo()
+    monkeypatch.setattr(correct_module, "fusible", lambda *_: pytest.fail("asked for the compiled recursion"))
+    assert chase(circles(1, 1129), BASES["exponential"], targets.Paper(), LAW).weights.shape == (1, 1129, 6)
+    with pytest.raises(pytest.fail.Exception, match="asked for"):
+        chase(circles(200, 120), BASES["exponential"], targets.Paper(), LAW)

@@ -13,6 +13,11 @@ from ..optim.base import UpdateLaw
 from .fused import History, fused, fusible
 from .recursion import Carry, Recursion, recursion
 
+# Below this many trajectory-steps and iterations in a row a piece takes the reference a second at most, and
+# the first build of the fused recursion takes several. By size alone, so that a result does not depend on
+# what has been built before.
+_WORTHWHILE = 20_000
+
 
 class Dense(NamedTuple):
     """What the reference recursion takes of a `GramStructure`."""
@@ -41,7 +46,8 @@ def correct(
         known: of the objectives, what the law needs, (B, C, ...).
         whole: `dense` of the structure, where it is at hand.
     """
-    if fusible(law, inner_steps, (*structure, values, carry.weights, carry.log_gain)):
+    given = (*structure, values, carry.weights, carry.log_gain)
+    if _worthwhile(values, inner_steps) and fusible(law, inner_steps, given):
         before, after = _batch_last(values), _batch_last(values)
         carry = fused(structure, values, inner_steps, carry, History(before, after))
         return Recursion(before.permute(2, 0, 1), after.permute(2, 0, 1), carry)
@@ -71,7 +77,8 @@ def correct_weights(
         into: (C, M, B) contiguous; None where nobody wants the history.
         known, whole: as in `correct`.
     """
-    if fusible(law, inner_steps, (*structure, values, carry.weights, carry.log_gain)):
+    given = (*structure, values, carry.weights, carry.log_gain)
+    if _worthwhile(values, inner_steps) and fusible(law, inner_steps, given):
         carry = fused(structure, values, inner_steps, carry, History(recorded=into))
         return into, carry
     run = correct(structure, values, law, inner_steps, carry, known, whole)
@@ -103,6 +110,11 @@ def lost(carry: Carry, times: int) -> Tensor:
     index = torch.arange(carry.time - times, carry.time, device=carry.diverged_at.device)
     end = carry.diverged_at.unsqueeze(-1)
     return (end >= 0) & (index >= end)
+
+
+def _worthwhile(values: Tensor, inner_steps: int) -> bool:
+    batch, times, _ = values.shape
+    return max(batch, inner_steps) * times >= _WORTHWHILE
 
 
 def _batch_last(values: Tensor) -> Tensor:
