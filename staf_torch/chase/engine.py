@@ -11,14 +11,14 @@ from torch import Tensor
 
 from .._checks import integer
 from ..basis import StaFBasis, Target
-from ..objective import NativeError
+from ..objective import Known, NativeError
 from ..optim.base import UpdateLaw
 from .certificate import Certificate, certify
-from .correct import correct, dense, lost, paper_units
+from .correct import Dense, correct, dense, lost, paper_units
 from .known import known as find_known
 from .known import state_row
 from .predictors import Predictor
-from .recursion import Carry, recursion
+from .recursion import Carry, Recursion, recursion
 from .result import ChaseResult, concatenate
 from .start import check_law, check_states, start
 
@@ -140,11 +140,7 @@ def _piece(
         run = correct(structure, values, law, inner_steps, carry, known, whole)
     else:
         assert whole is not None
-        assert carry.states is not None
-        around = torch.cat((carry.states, states), dim=1)
-        parts = predictor.prepare(basis, target, around, carry.time)
-        run = recursion(whole.gram, values, whole.log_gain, law, inner_steps, carry, known, predictor, parts)
-        run = run._replace(carry=run.carry._replace(states=around[:, -2:]))
+        run = _predicted(predictor, basis, target, states, whole, values, law, inner_steps, carry, known)
 
     reached = _Reached(lost(run.carry, states.shape[1]))
     gain = states.new_zeros(()) if structure.log_gain is None else structure.log_gain
@@ -155,8 +151,8 @@ def _piece(
 
     result = ChaseResult(
         state=states,
-        weights=run.after * paper_units(structure, run.carry, states.shape[1]),
-        ideal_weights=reached(ideal * inverse_gain[..., None]),
+        weights=_paper_weights(run.after, paper_units(structure, run.carry, states.shape[1])),
+        ideal_weights=reached(_paper_weights(ideal, inverse_gain[..., None])),
         coefficients=reached(scale * run.after),
         value=reached(value),
         estimate=at_state(run.after),
@@ -175,6 +171,32 @@ def _piece(
     )
     result = dataclasses.replace(result, certificate=reached.certificate(vouched))
     return result, run.carry._replace(link=link)
+
+
+def _predicted(
+    predictor: Predictor,
+    basis: StaFBasis,
+    target: Target,
+    states: Tensor,
+    whole: Dense,
+    values: Tensor,
+    law: UpdateLaw,
+    inner_steps: int,
+    carry: Carry,
+    known: Known,
+) -> Recursion:
+    """The recursion of one piece with a predictor, which looks at the two states before it as well."""
+    assert carry.states is not None
+    around = torch.cat((carry.states, states), dim=1)
+    parts = predictor.prepare(basis, target, around, carry.time)
+    run = recursion(whole.gram, values, whole.log_gain, law, inner_steps, carry, known, predictor, parts)
+    return run._replace(carry=run.carry._replace(states=around[:, -2:]))
+
+
+def _paper_weights(scaled: Tensor, units: Tensor) -> Tensor:
+    """w = e^{-g} (e^g w): (B, C, M), (B, C, 1); NaN where e^{-g} underflows and w is not zero."""
+    underflow = (units < torch.finfo(units.dtype).tiny) & (scaled != 0)
+    return torch.where(underflow, torch.nan, scaled * units)
 
 
 class _Reached:
