@@ -43,8 +43,8 @@ LAW = optim.SteepestDescent()
 
 
 @pytest.fixture(autouse=True)
-def _small_problems_are_fused_too(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(correct_module, "_WORTHWHILE", 0)
+def _chase_is_fused_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(correct_module, "_FUSE_CHASE", True)
 
 
 needs_compiler = pytest.mark.skipif(
@@ -361,7 +361,7 @@ FAULTS = {
 def test_no_fault_of_a_build_is_more_than_one_line_of_the_log(fault: str, tmp_path: Path) -> None:
     program = """
 import sys, tempfile, torch, staf_torch as st
-sys.modules["staf_torch.chase.correct"]._WORTHWHILE = 0
+sys.modules["staf_torch.chase.correct"]._FUSE_CHASE = True
 tempfile.tempdir = __import__("os").environ.get("TMPDIR")
 basis = st.StaFBasis(st.ExponentialKernel(), st.StateFollowingCenters(st.rings(3), 0.1))
 for dtype in (torch.float64, torch.float32):
@@ -387,9 +387,14 @@ for dtype in (torch.float64, torch.float32):
     assert "runs in plain torch" in done.stderr
 
 
-def test_a_small_problem_does_not_pay_for_a_build(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_chase_asks_for_no_build_and_its_rows_do_not_depend_on_the_batch(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.undo()
     monkeypatch.setattr(correct_module, "fusible", lambda *_: pytest.fail("asked for the compiled recursion"))
-    assert chase(circles(1, 1129), BASES["exponential"], targets.Paper(), LAW).weights.shape == (1, 1129, 6)
-    with pytest.raises(pytest.fail.Exception, match="asked for"):
-        chase(circles(200, 120), BASES["exponential"], targets.Paper(), LAW)
+    states = circles(400, 120)
+    together = chase(states, BASES["exponential"], targets.Paper(), LAW, inner_steps=5)
+    for row in (0, 199, 399):
+        alone = chase(states[row : row + 1], BASES["exponential"], targets.Paper(), LAW, inner_steps=5)
+        scale = float(alone.weights.abs().max())
+        torch.testing.assert_close(together.weights[row], alone.weights[0], rtol=0, atol=1e-12 * scale)

@@ -1,4 +1,4 @@
-"""The weight recursion of a piece of time: the fused one where it can run, the reference elsewhere."""
+"""The weight recursion of a piece of time: fused where that is wanted and can run, else the reference."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from ..optim.base import UpdateLaw
 from .fused import History, fused, fusible
 from .recursion import Carry, Recursion, recursion
 
-# Below this many trajectory-steps and iterations in a row a piece takes the reference a second at most, and
-# the first build of the fused recursion takes several. By size alone, so that a result does not depend on
-# what has been built before.
-_WORTHWHILE = 20_000
+# `chase` keeps the reference: the first build of the fused recursion takes longer than most chases, and a
+# rule by size would let a trajectory's rounding depend on how many run beside it. `chase_weights` is always
+# fused where it can be.
+_FUSE_CHASE = False
 
 
 class Dense(NamedTuple):
@@ -47,7 +47,7 @@ def correct(
         whole: `dense` of the structure, where it is at hand.
     """
     given = (*structure, values, carry.weights, carry.log_gain)
-    if _worthwhile(values, inner_steps) and fusible(law, inner_steps, given):
+    if _FUSE_CHASE and fusible(law, inner_steps, given):
         before, after = _batch_last(values), _batch_last(values)
         carry = fused(structure, values, inner_steps, carry, History(before, after))
         return Recursion(before.permute(2, 0, 1), after.permute(2, 0, 1), carry)
@@ -78,7 +78,7 @@ def correct_weights(
         known, whole: as in `correct`.
     """
     given = (*structure, values, carry.weights, carry.log_gain)
-    if _worthwhile(values, inner_steps) and fusible(law, inner_steps, given):
+    if fusible(law, inner_steps, given):
         carry = fused(structure, values, inner_steps, carry, History(recorded=into))
         return into, carry
     run = correct(structure, values, law, inner_steps, carry, known, whole)
@@ -110,11 +110,6 @@ def lost(carry: Carry, times: int) -> Tensor:
     index = torch.arange(carry.time - times, carry.time, device=carry.diverged_at.device)
     end = carry.diverged_at.unsqueeze(-1)
     return (end >= 0) & (index >= end)
-
-
-def _worthwhile(values: Tensor, inner_steps: int) -> bool:
-    batch, times, _ = values.shape
-    return max(batch, inner_steps) * times >= _WORTHWHILE
 
 
 def _batch_last(values: Tensor) -> Tensor:
