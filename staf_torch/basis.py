@@ -4,18 +4,38 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from ._checks import sampled, trailing
+from ._convention import decode, described, encode
 from .centers import StateFollowingCenters
 from .kernels import Kernel, PolynomialKernel
-from .local import GradedSpace, LocalSpace, degrees_of, graded_basis, newton_space, polynomial_space
+from .local import (
+    SERIES_BELOW,
+    Degrees,
+    GradedBasis,
+    GradedSpace,
+    LocalSpace,
+    degrees_of,
+    graded_basis,
+    newton_space,
+    polynomial_space,
+)
 
 Target = Callable[[Tensor], Tensor]
 """A function V to approximate: points (..., n) to values (...)."""
+
+_FORMAT = 2  # of the local bases; raised whenever the same coefficients come to mean another function
+_COMPARED = {
+    "format": "format of the local basis",
+    "kernel": "kernel",
+    "radius": "radius",
+    "centers": "number of centers and states",
+    "basis": "local basis",
+}
 
 
 class GramStructure(NamedTuple):
@@ -80,24 +100,113 @@ class StaFBasis(nn.Module):
             )
         self.kernel = kernel
         self.centers = centers
-        self._grade()
-        self.register_load_state_dict_post_hook(StaFBasis._grade_again)  # type: ignore[no-untyped-call]
+        self._kind, self._degrees = self._choose()
+        self.register_buffer("convention", encode(self._record()))
+        self.convention: Tensor
+        self._prepare()
+        self.register_load_state_dict_post_hook(StaFBasis._after_loading)  # type: ignore[no-untyped-call]
+
+    def _choose(self) -> tuple[str, Degrees | None]:
+        """The kind of local basis, and what fixes it for these directions."""
+        if self.kernel.exponent_rate() is not None:
+            return "graded", degrees_of(self.centers.directions)
+        if isinstance(self.kernel, PolynomialKernel) and self.kernel.full:
+            degrees = degrees_of(self.centers.directions)
+            # A functional of a higher degree than the kernel's sees nothing: a case for the Newton basis.
+            if len(degrees.sizes) <= self.kernel.degree + 1:
+                return "polynomial", degrees
+        return "newton", None
+
+    def _prepare(self) -> None:
+        """Set up what depends on fixed directions alone, again whenever others are loaded."""
+        directions, degrees = self.centers.directions, self._degrees
+        self._graded: GradedBasis | None = None
+        self._prepared_for: Tensor | None = None
+        self._narrow: tuple[Tensor, Tensor] | None = None
+        self._analytic = self._kind == "graded" and self._series_serves()
+        if self._kind == "graded" and not isinstance(directions, nn.Parameter) and not directions.is_meta:
+            self._graded = graded_basis(directions, degrees)
+            self._narrow = self._graded.narrow(directions)
+            self._prepared_for = directions
+
+    def _series_serves(self) -> bool:
+        """Whether one series in the squared radius serves the fits at all states, see `Interpolation`."""
+        rate, bound = self.kernel.exponent_rate(), self.centers.radius.bound()
+        if rate is None or bound is None or self._degrees is None or bound.is_meta:
+            return False
+        if any(True for part in (self.kernel, self.centers.radius) for _ in part.parameters()):
+            return False  # what is learned may grow, and has derivatives that the series' setup has not
+        return bool((rate * (bound * self._degrees.reach).square()).amax() <= SERIES_BELOW)
+
+    def _bound(self) -> Tensor | None:
+        """sup nu over all states where one series serves; as prepared where a compiler is tracing."""
+        serves = self._analytic if torch.compiler.is_compiling() else self._series_serves()
+        return self.centers.radius.bound() if serves else None
+
+    def _basis_of(self, directions: Tensor) -> tuple[GradedBasis, Tensor, Tensor]:
+        """The graded basis of the directions, with what an evaluation needs in their dtype."""
+        # Directions that were swapped in from outside (functional_call, a parametrization) are other ones.
+        exporting = torch.compiler.is_compiling() and not torch.compiler.is_dynamo_compiling()
+        if self._graded is not None and self._narrow is not None:
+            ours = "directions" in self.centers._buffers if exporting else directions is self._prepared_for
+            if ours:
+                return self._graded, *self._narrow
+        graded = graded_basis(directions, self._degrees)
+        return graded, *graded.narrow(directions)
+
+    def _record(self) -> dict[str, Any]:
+        """What coefficients mean, beside the tensors of the state_dict."""
+        record = {"format": _FORMAT, "kernel": described(self.kernel), "basis": self._kind}
+        record |= {"radius": described(self.centers.radius), "centers": [self.count, self.dim]}
+        return record if self._degrees is None else record | {"degrees": self._degrees._asdict()}
+
+    def check_convention(self, call: str, stored: Tensor) -> None:
+        """Whether coefficients that were saved with this `convention` mean the same function here.
+
+        Raises:
+            ValueError: if they do not, and why.
+        """
+        saved, own = decode(call, stored), self._record()
+        for key, name in _COMPARED.items():
+            if saved.get(key) != own[key]:
+                raise ValueError(
+                    f"`{call}`: coefficients mean another function here, as the {name} must be the same: "
+                    f"saved with {saved.get(key)}, loaded into {own[key]}. Build the same basis, or fit again."
+                )
+
+    def _load_from_state_dict(
+        self, state_dict: dict[str, Any], prefix: str, *arguments: Any, **keywords: Any
+    ) -> None:
+        key = f"{prefix}convention"
+        self._choose_again = key not in state_dict and f"{prefix}centers.directions" in state_dict
+        if key in state_dict:
+            self.check_convention("StaFBasis.load_state_dict", state_dict[key])
+            record = decode("StaFBasis.load_state_dict", state_dict[key])
+            if self._degrees is not None:
+                self._degrees = Degrees.of(record["degrees"])
+            state_dict[key] = self.convention = encode(record).to(self.convention.device)
+        super()._load_from_state_dict(state_dict, prefix, *arguments, **keywords)
 
     @staticmethod
-    def _grade_again(module: nn.Module, _: object) -> None:
+    def _after_loading(module: nn.Module, _: object) -> None:
         assert isinstance(module, StaFBasis)
-        module._grade()
+        if module._choose_again:
+            module._kind, module._degrees = module._choose()
+            module.convention = encode(module._record()).to(module.convention.device)
+        module._prepare()
 
-    def _grade(self) -> None:
-        """Set up what depends on the directions alone, again whenever others are loaded."""
-        directions = self.centers.directions
-        structured = self.kernel.exponent_rate() is not None
-        self._graded = graded_basis(directions) if structured else None
-        self._degrees = None
-        if isinstance(self.kernel, PolynomialKernel) and self.kernel.full:
-            degrees = degrees_of(directions.double() / directions.norm(dim=-1).max())
-            # A functional of a higher degree than the kernel's sees nothing: a case for the Newton basis.
-            self._degrees = degrees if len(degrees.sizes) <= self.kernel.degree + 1 else None
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> StaFBasis:
+        super()._apply(fn, recurse)
+        self._prepare()  # in the new dtype, on the new device
+        return self
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        if "convention" not in state.get("_buffers", {}):
+            raise ValueError(
+                "`StaFBasis` was pickled by an earlier version of staf_torch, whose coefficients mean another "
+                "function here: load its state with that version, save samples of it, and fit again."
+            )
+        super().__setstate__(state)
 
     @property
     def count(self) -> int:
@@ -130,22 +239,27 @@ class StaFBasis(nn.Module):
     def local(self, x: Tensor) -> LocalSpace:
         """The span of the basis at the states x (..., n), in a basis that can be computed with."""
         trailing("StaFBasis.local", "x", x, dims=1, last=self.dim)
-        offsets = self.centers.offsets(x)
+        centers, degrees = self.centers, self._degrees
+        if self._kind == "newton" or degrees is None:
+            return newton_space(self.kernel, x, centers.offsets(x))
+        directions = centers.directions
+        if self._kind == "polynomial":
+            assert isinstance(self.kernel, PolynomialKernel)
+            return polynomial_space(self.kernel, x, centers.radius(x), directions.to(x), degrees)
         rate = self.kernel.exponent_rate()
-        if isinstance(self.kernel, PolynomialKernel) and self._degrees is not None:
-            reach = self.centers.radius(x) * self.centers.directions.to(x).norm(dim=-1).max()
-            return polynomial_space(self.kernel, x, offsets, reach, self._degrees)
-        if self._graded is None or rate is None:
-            return newton_space(self.kernel, x, offsets)
-        reach, bound = self._graded.reach.to(x), self.centers.radius.bound()
+        assert rate is not None
+        graded, units, spread = self._basis_of(directions)
         return GradedSpace(
             kernel=self.kernel,
             state=x,
-            offsets=offsets,
-            basis=self._graded,
-            radius=self.centers.radius(x) * reach,
+            nu=centers.radius(x),
+            directions=directions.to(x),
+            units=units.to(x),
+            spread=spread.to(x),
+            basis=graded,
             rate=rate.to(x),
-            bound=None if bound is None else bound * self._graded.reach,
+            bound=self._bound,
+            meeting=not centers.radius.constant,
         )
 
     def check_reach(self, x: Tensor) -> bool:

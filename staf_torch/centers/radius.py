@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from .._checks import non_negative, positive
+from .._convention import hold
 
 
 class Radius(nn.Module, abc.ABC):
@@ -38,7 +39,7 @@ class ConstantRadius(Radius):
 
     def __init__(self, radius: float | Tensor) -> None:
         super().__init__()
-        self.register_buffer("radius", positive("ConstantRadius", "radius", radius))
+        hold(self, "radius", positive("ConstantRadius", "radius", radius))
         self.radius: Tensor
 
     def bound(self) -> Tensor:
@@ -65,9 +66,9 @@ class StateRadius(Radius):
 
     def __init__(self, radius: float | Tensor, offset: float | Tensor, gain: float | Tensor = 1.0) -> None:
         super().__init__()
-        self.register_buffer("radius", positive("StateRadius", "radius", radius))
-        self.register_buffer("offset", non_negative("StateRadius", "offset", offset))
-        self.register_buffer("gain", positive("StateRadius", "gain", gain))
+        hold(self, "radius", positive("StateRadius", "radius", radius))
+        hold(self, "offset", non_negative("StateRadius", "offset", offset))
+        hold(self, "gain", positive("StateRadius", "gain", gain))
         self.radius: Tensor
         self.offset: Tensor
         self.gain: Tensor

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from .._checks import fail, trailing
+from .._convention import hold
 from .radius import ConstantRadius, Radius
 
 
@@ -30,7 +31,7 @@ class StateFollowingCenters(nn.Module):
 
     def __init__(self, directions: Tensor, radius: float | Tensor | Radius) -> None:
         super().__init__()
-        self.register_buffer("directions", _checked(directions))
+        hold(self, "directions", _checked(directions))
         self.directions: Tensor
         self.radius = radius if isinstance(radius, Radius) else ConstantRadius(radius)
 
@@ -62,9 +63,9 @@ class StateFollowingCenters(nn.Module):
         return f"count={self.count}, dim={self.dim}"
 
 
-def _checked(directions: Tensor) -> Tensor:
+def _checked(given: Tensor) -> Tensor:
     call, name = "StateFollowingCenters", "directions"
-    trailing(call, name, directions, dims=2)
+    directions = trailing(call, name, given, dims=2).detach()
     if directions.dim() != 2 or 0 in directions.shape:
         raise fail(call, name, "must have the shape (M, n)", tuple(directions.shape))
     if not bool(torch.isfinite(directions).all()):
@@ -84,4 +85,4 @@ def _checked(directions: Tensor) -> Tensor:
     if bool((gaps == 0).any()):
         first = int((gaps == 0).any(-1).nonzero()[0])
         raise fail(call, name, f"must be distinct, but direction {first} is repeated", directions)
-    return directions
+    return given

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import abc
 
+import torch
 from torch import Tensor, nn
 
 
@@ -39,6 +40,19 @@ class Kernel(nn.Module, abc.ABC):
     def log_scale(self, x: Tensor, z: Tensor) -> Tensor | None:
         """s(x, z): (..., n), (..., P, n) -> (..., P), or None where it is zero."""
         return None
+
+    def log_scale_gradient(self, x: Tensor, z: Tensor) -> Tensor | None:
+        """ds/dz: (..., n), (..., P, n) -> what broadcasts to (..., P, n), or None where s is zero."""
+        if self.log_scale(x, z) is None:
+            return None
+
+        def total(at: Tensor) -> Tensor:
+            s = self.log_scale(x, at)
+            assert s is not None
+            return s.sum()
+
+        gradient: Tensor = torch.func.grad(total)(z)
+        return gradient
 
     def exponent_rate(self) -> Tensor | None:
         """q where k0(z, d) = exp(q z'd), and None for every other kernel."""

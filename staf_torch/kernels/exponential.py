@@ -32,11 +32,16 @@ class ExponentialKernel(Kernel):
     def log_scale(self, x: Tensor, z: Tensor) -> Tensor:
         if z.dim() == 2 and x.dim() > 1:  # the same offsets at all states: one product, states last
             return (z @ x.mT).mT
+        if x.dim() == 1:
+            return z @ x
         # Term by term: a sum over the last dimension would write all products to memory first.
         total = x[..., :1] * z[..., 0]
         for i in range(1, x.shape[-1]):
             total = torch.addcmul(total, x[..., i : i + 1], z[..., i])
         return total
+
+    def log_scale_gradient(self, x: Tensor, z: Tensor) -> Tensor:
+        return x.unsqueeze(-2)
 
     def follow(self, y: Tensor, step: Tensor) -> tuple[Tensor, Tensor]:
         # (y + h)'(c + h) = (y'h + h'h) + (y + h)'c

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from .._checks import positive
+from .._convention import hold
 from .base import Kernel, inner, per_entry, squared_distance
 
 
@@ -27,7 +28,7 @@ class GaussianKernel(Kernel):
 
     def __init__(self, width: float | Tensor = 1.0) -> None:
         super().__init__()
-        self.register_buffer("width", positive("GaussianKernel", "width", width))
+        hold(self, "width", positive("GaussianKernel", "width", width))
         self.width: Tensor
 
     def forward(self, x1: Tensor, x2: Tensor) -> Tensor:
@@ -41,6 +42,9 @@ class GaussianKernel(Kernel):
 
     def log_scale(self, x: Tensor, z: Tensor) -> Tensor:
         return z.square().sum(-1) * (-0.5 * per_entry(self.exponent_rate(), 1))
+
+    def log_scale_gradient(self, x: Tensor, z: Tensor) -> Tensor:
+        return z * -per_entry(self.exponent_rate(), 2)
 
     def exponent_rate(self) -> Tensor:
         return self.width.square().reciprocal()

@@ -7,6 +7,7 @@ import math
 from torch import Tensor
 
 from .._checks import integer, non_negative
+from .._convention import hold
 from .base import Kernel, inner, per_entry
 
 
@@ -27,7 +28,7 @@ class PolynomialKernel(Kernel):
     def __init__(self, degree: int = 2, bias: float | Tensor = 1.0) -> None:
         super().__init__()
         self.degree = integer("PolynomialKernel", "degree", degree, least=1)
-        self.register_buffer("bias", non_negative("PolynomialKernel", "bias", bias))
+        hold(self, "bias", non_negative("PolynomialKernel", "bias", bias))
         self.bias: Tensor
         self.full = bool((self.bias > 0).all())
         """Whether the space holds all polynomials of the degree, not the homogeneous ones alone."""

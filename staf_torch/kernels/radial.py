@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from .._checks import positive
+from .._convention import hold
 from .base import Kernel, per_entry, squared_distance
 
 
@@ -21,7 +22,7 @@ class RadialKernel(Kernel):
 
     def __init__(self, length_scale: float | Tensor = 1.0) -> None:
         super().__init__()
-        self.register_buffer("length_scale", positive(type(self).__name__, "length_scale", length_scale))
+        hold(self, "length_scale", positive(type(self).__name__, "length_scale", length_scale))
         self.length_scale: Tensor
 
     @abc.abstractmethod

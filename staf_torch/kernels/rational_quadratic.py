@@ -5,6 +5,7 @@ from __future__ import annotations
 from torch import Tensor
 
 from .._checks import positive
+from .._convention import hold
 from .base import per_entry
 from .radial import RadialKernel
 
@@ -24,7 +25,7 @@ class RationalQuadraticKernel(RadialKernel):
 
     def __init__(self, alpha: float | Tensor = 1.0, length_scale: float | Tensor = 1.0) -> None:
         super().__init__(length_scale)
-        self.register_buffer("alpha", positive("RationalQuadraticKernel", "alpha", alpha))
+        hold(self, "alpha", positive("RationalQuadraticKernel", "alpha", alpha))
         self.alpha: Tensor
 
     def profile(self, s: Tensor) -> Tensor:

@@ -7,10 +7,12 @@ analogue, all others the Newton basis.
 
 from .base import LocalSpace as LocalSpace
 from .base import evaluate_scaled as evaluate_scaled
+from .elimination import Degrees as Degrees
 from .elimination import degrees_of as degrees_of
 from .graded import GradedBasis as GradedBasis
 from .graded import GradedSpace as GradedSpace
 from .graded import graded_basis as graded_basis
+from .interpolation import SERIES_BELOW as SERIES_BELOW
 from .newton import NewtonSpace as NewtonSpace
 from .newton import newton_space as newton_space
 from .polynomial import PolynomialSpace as PolynomialSpace

@@ -1,18 +1,19 @@
 """The graded basis (RBF-QR): full accuracy at every radius, with the flat limit as its limit.
 
-For k0(z, d) = exp(q z'd) with d_i = nu u_i, the functional lambda_j of `eliminate` kills all polynomials
-of degree below k_j in u, hence all but the tail of the exponential series. What is left carries the
-factor r^(2 k_j), r = sqrt(q) nu, which is divided out on paper. With zeta = z / nu,
+For k0(z, d) = exp(q z'd) with d_i = nu u_i, the functional lambda_j of `functionals_of` kills all
+polynomials of degree below k_j in u, hence all but the tail of the exponential series. What is left carries
+the factor r^(2 k_j), r = sqrt(q) nu, which is divided out on paper. With zeta = z / nu,
 
-    psi_j(zeta) = sum_i (q_ij / sigma_j) (zeta'u_i)^k k! phi_k(r^2 zeta'u_i),   k = k_j,
+    psi_j(zeta) = sum_i (q_ij / sigma_j) p_k(zeta'u_i),   p_k(t) = t^k k! phi_k(r^2 t),   k = k_j,
 
 is analytic in r^2 and, at r = 0, a homogeneous polynomial of degree k_j: nothing small that was computed
-is ever divided by.
+is ever divided by. Its derivatives are of the same kind: p_k' = k p_{k-1} and p_0' = r^2 p_0.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -20,57 +21,59 @@ from torch import Tensor
 
 from ..kernels import Kernel
 from .base import from_scaled, in_blocks, scale, to_scaled
-from .elimination import eliminate
+from .elimination import Degrees, degrees_of, functionals_of
 from .interpolation import Interpolation
 from .phi import phi
 
 
 class GradedBasis(NamedTuple):
-    """What depends on the directions alone, computed once, in float64."""
+    """What depends on the directions alone, in float64."""
 
-    directions: Tensor  # u, (M, n), scaled to max |u_i| = 1
-    reach: Tensor  # (), the factor taken out of the directions
-    weights: Tensor  # q_ij / sigma_j where k_j is degree number k, else 0: (M, K, M)
+    directions: Tensor  # u, (M, n), in units of the reach
+    reach: float  # the factor taken out of the directions
     functionals: Tensor  # q_ij / sigma_j, (M, M)
-    degrees: tuple[int, ...]  # the K different degrees, ascending
+    weights: Tensor  # the same where k_j = k, else 0: (M, K, M), indexed i, k, j
+    degrees: tuple[int, ...]  # 0, 1, ..., K - 1
     degree: Tensor  # k_j, (M,) int64
     factorial: Tensor  # k_j!, (M,)
 
-    def ridges(self, zeta: Tensor, r2: Tensor) -> Tensor:
-        """(zeta'u_i)^k k! phi_k(r^2 zeta'u_i): (..., P, n), (..., 1, 1) -> (..., P, M, K)."""
-        tau = zeta @ self.directions.to(zeta).mT
-        tails = phi(r2 * tau, self.degrees[-1])
-        power, found = torch.ones_like(tau), []
-        for k, tail in enumerate(tails):
-            if k in self.degrees:
-                found.append(power * tail)
-            power = power * tau
-        return torch.stack(found, dim=-1)
-
     def functions(self, zeta: Tensor, r2: Tensor) -> Tensor:
         """psi(zeta): (..., P, n), (..., 1, 1) -> (..., P, M)."""
-        flat = self.weights.to(zeta).flatten(0, 1)
-        return self.ridges(zeta, r2).flatten(-2) @ flat
+        parts = ridges(zeta @ self.directions.to(zeta).mT, r2, self.degrees[-1])
+        return torch.stack(parts, dim=-1).flatten(-2) @ self.weights.to(zeta).flatten(0, 1)
+
+    def narrow(self, like: Tensor) -> tuple[Tensor, Tensor]:
+        """u / reach, (M, n), and the weights as (M, K M), indexed j, (k, i), in the dtype of ``like``."""
+        spread = self.weights.permute(2, 1, 0).flatten(1).contiguous()
+        return self.directions.to(like), spread.to(like)
 
 
-def graded_basis(directions: Tensor) -> GradedBasis:
-    """The graded basis of directions (M, n), distinct.
+def graded_basis(directions: Tensor, degrees: Degrees | None = None) -> GradedBasis:
+    """The graded basis of directions (M, n), distinct; differentiable once their degrees are known.
 
     Raises:
         ValueError: if directions coincide to rounding.
     """
-    u = directions.double()
-    reach = u.norm(dim=-1).max()
-    reach = torch.where(reach > 0, reach, 1.0)  # a single center at the state itself
-    u = u / reach
-    found = eliminate(u)
-    degrees = tuple(sorted(set(found.degrees)))
-    weights = u.new_zeros(len(u), len(degrees), len(u))
-    for j, k in enumerate(found.degrees):
-        weights[:, degrees.index(k), j] = found.functionals[:, j] / found.strengths[j]
-    degree = torch.tensor(found.degrees, device=u.device)
-    factorial = torch.tensor([math.factorial(k) for k in found.degrees], dtype=u.dtype, device=u.device)
-    return GradedBasis(u, reach, weights, weights.sum(1), degrees, degree, factorial)
+    degrees = degrees_of(directions) if degrees is None else degrees
+    u = directions.double() / degrees.reach
+    found = functionals_of(u, degrees)
+    functionals = found.functionals / found.strengths.unsqueeze(-2)
+    known = tuple(range(len(degrees.sizes)))
+    degree = torch.tensor(degrees.each, device=u.device)
+    members = degree == torch.tensor(known, device=u.device).unsqueeze(-1)  # (K, M)
+    weights = functionals.unsqueeze(-2) * members
+    factorial = torch.tensor([math.factorial(k) for k in degrees.each], dtype=u.dtype, device=u.device)
+    return GradedBasis(u, degrees.reach, functionals, weights, known, degree, factorial)
+
+
+def ridges(tau: Tensor, r2: Tensor, top: int) -> list[Tensor]:
+    """p_k(tau) = tau^k k! phi_k(r^2 tau) for k = 0..top, of the shape of tau."""
+    tails = phi(r2 * tau, top)
+    power, found = tau, [tails[0]]
+    for k, tail in enumerate(tails[1:], 1):
+        found.append(power * tail)
+        power = power * tau if k < top else power
+    return found
 
 
 class GradedSpace(NamedTuple):
@@ -78,43 +81,72 @@ class GradedSpace(NamedTuple):
 
     kernel: Kernel
     state: Tensor  # x, (..., n)
-    offsets: Tensor  # d, (..., M, n), or (M, n) for all states
+    nu: Tensor  # the radius of the centers, (...) or () for all states
+    directions: Tensor  # u, (M, n), in the dtype of the state and in units of the radius
+    units: Tensor  # of `GradedBasis.narrow`, (M, n), in the dtype of the state
+    spread: Tensor  # of `GradedBasis.narrow`, (M, K M), in the dtype of the state
     basis: GradedBasis
-    radius: Tensor  # nu * reach, (...) or () for all states
     rate: Tensor  # q, (...) or ()
-    bound: Tensor | None  # sup of the radius over all states, where it is known
+    bound: Callable[[], Tensor | None]  # sup of nu over all states, where q nu^2 is known to stay below 1
+    meeting: bool  # whether nu may be zero, where all centers meet
+
+    @property
+    def offsets(self) -> Tensor:
+        """d = nu u, (..., M, n), or (M, n) for all states."""
+        return self.nu[..., None, None] * self.directions
+
+    @property
+    def radius(self) -> Tensor:
+        """nu times the reach, (...) or () for all states."""
+        return self.nu * self.basis.reach
 
     @property
     def rank(self) -> Tensor:
         """M; 1 where the radius is zero and all centers meet."""
-        return torch.where(self.radius > 0, self.offsets.shape[-2], 1)
+        return torch.where(self.nu > 0, self.directions.shape[-2], 1)
 
     def fit(self, values: Tensor) -> Tensor:
         """beta with sum_j psi_j(u_i) beta_j = e^{-s(d_i)} V(c_i): (..., M) -> (..., M)."""
-        bound = None if self.bound is None else (self.rate * self.bound.square()).amax()
+        bound = None if self.nu.dim() == 0 else self.bound()
+        if bound is not None:
+            bound = (self.rate * (bound * self.basis.reach).square()).amax()
         interpolation = Interpolation.of(self.basis, self._r2, bound)
+        offsets = self.offsets
 
         def solve(values: Tensor, state: Tensor) -> Tensor:
-            return interpolation.solve(scale(self.kernel, state, self.offsets, -1.0) * values)
+            return interpolation.solve(scale(self.kernel, state, offsets, -1.0) * values)
 
-        if not interpolation.shared or self.offsets.dim() > 2:
+        if not interpolation.shared or offsets.dim() > 2:
             return solve(values, self.state)
         return in_blocks(solve, values, self.state)
 
     def evaluate(self, z: Tensor, coefficients: Tensor) -> Tensor:
         """V^(x + z): (..., P, n), (..., M) -> (..., P)."""
-        some = self.radius[..., None, None] > 0
-        zeta = torch.where(some, z / torch.where(some, self.radius[..., None, None], 1.0), 0.0)
-        ridges = self.basis.ridges(zeta, self._r2[..., None, None])
-        sums = (ridges * self._ridge_weights(coefficients).unsqueeze(-3)).sum((-1, -2))
-        return sums * scale(self.kernel, self.state, z)
+        terms = self._terms(z)
+        total = _combined(terms, self._ridge_weights(coefficients))
+        return total.sum(-1) * scale(self.kernel, self.state, z)
+
+    def evaluate_with_gradient(self, z: Tensor, coefficients: Tensor) -> tuple[Tensor, Tensor]:
+        """V^(x + z) and its gradient in z, in closed form: (..., P, n), (..., M) -> (..., P), (..., P, n)."""
+        terms, apart = self._terms(z), self._ridge_weights(coefficients)
+        sums = _combined(terms, apart).sum(-1)
+        inner = terms[0] * (self._r2[..., None, None] * apart[0])
+        for k in range(1, len(terms)):
+            inner = torch.addcmul(inner, terms[k - 1], apart[k], value=k)
+        slope = self._divided(inner @ self.units)
+        along = self.kernel.log_scale_gradient(self.state, z)
+        if along is None:
+            return sums, slope
+        factor = scale(self.kernel, self.state, z)
+        gradient = torch.addcmul(slope, sums.unsqueeze(-1), along) * factor.unsqueeze(-1)
+        return sums * factor, gradient
 
     def scaled_weights(self, coefficients: Tensor) -> Tensor:
         """e^g w, w_i = e^{-g - s(d_i)} sum_j (q_ij / sigma_j) k_j! r^(-2 k_j) beta_j: (..., M) -> (..., M).
 
         Not finite where r^(-2 k_j) is not.
         """
-        b = self._ridge_weights(coefficients * self._unscale()).sum(-1)
+        b = (coefficients * self._unscale()) @ self.basis.functionals.to(coefficients).mT
         return b * scale(self.kernel, self.state, self.offsets, -1.0)
 
     def weights(self, coefficients: Tensor) -> Tensor:
@@ -131,15 +163,35 @@ class GradedSpace(NamedTuple):
     @property
     def _r2(self) -> Tensor:
         """r^2 = q nu^2, (...) or ()."""
-        return self.rate.to(self.radius) * self.radius.square()
+        return self.rate.to(self.nu) * self.radius.square()
 
-    def _ridge_weights(self, coefficients: Tensor) -> Tensor:
-        """sum_j (q_ij / sigma_j) beta_j, apart for each degree: (..., M) -> (..., M, K)."""
-        weights = self.basis.weights.to(coefficients)
-        apart: Tensor = (coefficients @ weights.flatten(0, 1).mT).unflatten(-1, weights.shape[:2])
-        return apart
+    def _divided(self, z: Tensor) -> Tensor:
+        """z / radius, zero where the radius is: (..., P, n)."""
+        radius = self.radius[..., None, None]
+        if not self.meeting:
+            return z / radius
+        some = radius > 0
+        return torch.where(some, z / torch.where(some, radius, 1.0), 0.0)
+
+    def _terms(self, z: Tensor) -> list[Tensor]:
+        """p_k(zeta'u_i) for k < K: (..., P, n) -> K of (..., P, M)."""
+        return ridges(self._divided(z) @ self.units.mT, self._r2[..., None, None], self.basis.degrees[-1])
+
+    def _ridge_weights(self, coefficients: Tensor) -> tuple[Tensor, ...]:
+        """sum_j (q_ij / sigma_j) beta_j, apart for each degree: (..., M) -> K of (..., 1, M)."""
+        count = len(self.basis.degrees)
+        apart = (coefficients @ self.spread.to(coefficients)).unflatten(-1, (count, 1, -1))
+        return apart.unbind(-3)
 
     def _unscale(self) -> Tensor:
         """k_j! r^(-2 k_j): (..., M)."""
-        factor: Tensor = self.basis.factorial.to(self.radius) * self._r2.unsqueeze(-1) ** -self.basis.degree
+        factor: Tensor = self.basis.factorial.to(self.nu) * self._r2.unsqueeze(-1) ** -self.basis.degree
         return factor
+
+
+def _combined(terms: list[Tensor], apart: tuple[Tensor, ...]) -> Tensor:
+    """sum_k p_k c_k: (..., P, M)."""
+    total = terms[0] * apart[0]
+    for term, weight in zip(terms[1:], apart[1:], strict=True):
+        total = torch.addcmul(total, term, weight)
+    return total

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 _NODES = 24
-_ANALYTIC = 1.0  # up to this r^2 the inverse is taken from its Chebyshev series
+SERIES_BELOW = 1.0  # up to this r^2 the inverse is taken from its Chebyshev series
 
 
 class _Basis(Protocol):
@@ -38,11 +38,11 @@ class Interpolation(NamedTuple):
     def of(cls, basis: _Basis, r2: Tensor, bound: Tensor | None) -> Interpolation:
         """For the radii r^2, () or (...), with their known bound over all states, if any. In float64.
 
-        Without a bound, or beyond a bound of 1, each radius of a batch is inverted by itself.
+        Without a bound each radius of a batch is inverted by itself. A bound of more than 1 gives NaN.
         """
         wide = r2.double()
         u, functionals = basis.directions.to(wide.device), basis.functionals.to(wide.device).mT
-        if wide.dim() == 0 or bound is None or not bool(bound <= _ANALYTIC):
+        if wide.dim() == 0 or bound is None:
             nodal = basis.functions(u, wide[..., None, None])
             return cls(functionals, _inverse(functionals @ nodal), None)
         index = torch.arange(_NODES, dtype=torch.float64, device=u.device)
@@ -51,6 +51,7 @@ class Interpolation(NamedTuple):
         transform[0] *= 0.5
         # The bound is a constant of the series, not a quantity to differentiate.
         upper = bound.detach().double().to(u.device)
+        upper = torch.where(upper <= SERIES_BELOW, upper, torch.nan)
         nodal = basis.functions(u, (0.5 * upper * (1 + angles.cos()))[:, None, None])
         series = torch.einsum("mk,kij->mij", transform, _inverse(functionals @ nodal))
         return cls(functionals, series, _chebyshev(2 * wide / upper - 1))

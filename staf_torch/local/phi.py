@@ -5,8 +5,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-_TERMS = 18  # 1 / 18! = 1.6e-16: enough for |t| <= 1
-
 
 def phi(t: Tensor, top: int) -> list[Tensor]:
     """f_k(t) = k! phi_k(t) for k = 0..top, with phi_k(t) = sum_j t^j / (k + j)!, so that f_0 = exp.
@@ -17,17 +15,30 @@ def phi(t: Tensor, top: int) -> list[Tensor]:
     Returns:
         top + 1 tensors of the shape of t.
     """
-    near = t.abs() <= 1
-    small = torch.where(near, t, 0.0)
+    exponential = t.exp()
+    if top == 0:
+        return [exponential]
+    small = t.clamp(-1.0, 1.0)
+    near = small == t
     one = torch.ones_like(t)
-    current = one
-    for j in range(_TERMS - 1, 0, -1):
-        current = torch.addcmul(one, current, small, value=1 / (top + j))
-    below = [current]
-    for k in range(top, 0, -1):
+    below = [torch.add(one, small, alpha=1 / (top + _terms(top, t.dtype)))]
+    for j in range(_terms(top, t.dtype) - 1, 0, -1):
+        below[0] = torch.addcmul(one, below[0], small, value=1 / (top + j))
+    for k in range(top, 1, -1):
         below.append(torch.addcmul(one, below[-1], small, value=1 / k))
-    large = torch.where(near, 1.0, t)
-    above = [large.exp()]
+    large = torch.where(near, one, t)
+    above = [exponential]
     for k in range(top):
-        above.append((k + 1) * (above[-1] - 1) / large)
-    return [torch.where(near, b, a) for b, a in zip(reversed(below), above, strict=True)]
+        rest = (above[-1] - 1) / large
+        above.append(rest if k == 0 else (k + 1) * rest)
+    tails = [torch.where(near, b, a) for b, a in zip(reversed(below), above[1:], strict=True)]
+    return [exponential, *tails]
+
+
+def _terms(top: int, dtype: torch.dtype) -> int:
+    """N with the first neglected term of f_top, top! t^(N+1) / (top + N + 1)!, below rounding at |t| = 1."""
+    term, count = 1.0, 0
+    while term > 0.25 * torch.finfo(dtype).eps:
+        count += 1
+        term /= top + count
+    return count

@@ -12,13 +12,13 @@ binomial series in place of the exponential one; only its points d^ now depend o
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from ..kernels import PolynomialKernel
-from .elimination import Degrees, eliminate, follow
+from .elimination import Degrees, functionals_of
 
 
 class PolynomialSpace(NamedTuple):
@@ -108,57 +108,28 @@ class PolynomialSpace(NamedTuple):
 
 
 def polynomial_space(
-    kernel: PolynomialKernel, x: Tensor, offsets: Tensor, reach: Tensor, degrees: Degrees
+    kernel: PolynomialKernel, x: Tensor, radius: Tensor, directions: Tensor, degrees: Degrees
 ) -> PolynomialSpace:
     """The space at the states x (..., n).
 
     Args:
         kernel: with a positive bias, and of no lower degree than any of ``degrees``.
         x: (..., n).
-        offsets: d, (..., M, n), or (M, n) for all states.
-        reach: max |d_i|, (...) or ().
+        radius: nu(x), (...) or ().
+        directions: u, (M, n).
         degrees: of the directions, and so of the projected ones at every state.
     """
+    offsets = radius[..., None, None] * directions
     points = _root(kernel, x, offsets) / _projection(kernel, x, offsets).unsqueeze(-1)
     # Close to max |d^_i|, and smooth; any scale of this size would do.
-    radius = reach / _square(kernel, x).sqrt()
-    wide, scale = points.double(), radius.double()[..., None, None]
-    # Where all centers meet, or a state is not finite, any distinct directions keep the algebra defined.
+    size = radius * degrees.reach / _square(kernel, x).sqrt()
+    wide, scale = points.double(), size.double()[..., None, None]
+    # Where all centers meet, or a state is not finite, the directions keep the algebra defined.
     usable = torch.isfinite(scale) & (scale > 0)
-    stand_in = torch.eye(wide.shape[-2], wide.shape[-1], dtype=wide.dtype, device=wide.device)
-    directions = torch.where(usable, wide / torch.where(usable, scale, 1.0), stand_in)
-    functionals, strengths = _Elimination.apply(directions, degrees.sizes)  # type: ignore[no-untyped-call]
-    weights = follow(functionals, directions, degrees) / strengths.unsqueeze(-2)
-    each = tuple(k for k, size in enumerate(degrees.sizes) for _ in range(size))
-    return PolynomialSpace(kernel, x, offsets, directions.to(x), radius, weights.to(x), each)
-
-
-class _Elimination(torch.autograd.Function):
-    """`eliminate` as a constant of every derivative: `follow` carries what depends on the points.
-
-    Under nested function transforms neither `detach` nor `no_grad` reaches all levels; this does.
-    """
-
-    generate_vmap_rule = True
-
-    @staticmethod
-    def forward(directions: Tensor, sizes: tuple[int, ...]) -> tuple[Tensor, Tensor]:
-        found = eliminate(directions, sizes)
-        return found.functionals, found.strengths
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
-        ctx.save_for_backward(inputs[0], *output)
-        ctx.save_for_forward(inputs[0], *output)
-
-    @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None]:
-        return torch.zeros_like(ctx.saved_tensors[0]), None
-
-    @staticmethod
-    def jvp(ctx: Any, *tangents: Tensor) -> tuple[Tensor, Tensor]:
-        _, functionals, strengths = ctx.saved_tensors
-        return torch.zeros_like(functionals), torch.zeros_like(strengths)
+    scaled = torch.where(usable, wide / torch.where(usable, scale, 1.0), directions.double())
+    found = functionals_of(scaled, degrees)
+    weights = found.functionals / found.strengths.unsqueeze(-2)
+    return PolynomialSpace(kernel, x, offsets, scaled.to(x), size, weights.to(x), degrees.each)
 
 
 def _square(kernel: PolynomialKernel, x: Tensor) -> Tensor:

@@ -1,0 +1,51 @@
+"""What a file of coefficients has to say about the basis that they belong to, and how modules hold values."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+
+def hold(module: nn.Module, name: str, value: Tensor) -> None:
+    """Keep a hyperparameter: an `nn.Parameter` as one, to be learned; any other tensor as a fixed buffer."""
+    if isinstance(value, nn.Parameter):
+        module.register_parameter(name, value)
+    else:
+        module.register_buffer(name, value)
+
+
+def described(module: nn.Module) -> str:
+    """Class and settings that are not tensors, children included: what a state_dict does not hold."""
+    plain = {
+        name: value
+        for name, value in vars(module).items()
+        if not name.startswith("_") and name != "training" and isinstance(value, bool | int | float | str)
+    }
+    parts = [f"{name}={value!r}" for name, value in sorted(plain.items())]
+    parts += [f"{name}={described(child)}" for name, child in sorted(module.named_children())]
+    return f"{type(module).__name__}({', '.join(parts)})"
+
+
+def encode(record: dict[str, Any]) -> Tensor:
+    """A record as a uint8 tensor of JSON: what every tool that handles a state_dict can carry."""
+    return torch.tensor(list(json.dumps(record, sort_keys=True).encode()), dtype=torch.uint8)
+
+
+def decode(call: str, stored: Tensor) -> dict[str, Any]:
+    """The record of `encode`, also where averaging has made its numbers floating-point.
+
+    Raises:
+        ValueError: if it is not one.
+    """
+    try:
+        record = json.loads(bytes(stored.detach().cpu().round().to(torch.uint8).tolist()))
+    except ValueError:  # of JSON, or of the decoding
+        record = None
+    if not isinstance(record, dict):
+        raise ValueError(
+            f"`{call}`: the entry `convention` must be what a StaFBasis wrote; it is not readable."
+        )
+    return record
