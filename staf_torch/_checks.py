@@ -134,15 +134,16 @@ def trailing(call: str, name: str, value: Tensor, dims: int, last: int | None = 
     return value
 
 
-def sampled(target: object, values: object, points: Tensor) -> Tensor:
-    """What a target returned at ``points`` (..., n): one value a point, (...)."""
+def sampled(target: object, values: object, points: Tensor, outputs: int | None = None) -> Tensor:
+    """What a target returned at ``points`` (..., n): one value a point, (...), or k outputs, (..., k)."""
     name = getattr(target, "__name__", type(target).__name__)
     if not isinstance(values, Tensor):
         raise ValueError(f"The target `{name}` must return a tensor; got {_show(values)}.")
-    if values.shape != points.shape[:-1]:
+    expected = tuple(points.shape[:-1]) + (() if outputs is None else (outputs,))
+    if tuple(values.shape) != expected:
+        form = "(...)" if outputs is None else f"(..., {outputs})"
         raise ValueError(
-            f"The target `{name}` must map points of shape (..., n) to values of shape (...): "
-            f"{tuple(points.shape)} must give {tuple(points.shape[:-1])}; "
-            f"got {tuple(values.shape)}."
+            f"The target `{name}` must map points of shape (..., n) to values of shape {form}: "
+            f"{tuple(points.shape)} must give {expected}; got {tuple(values.shape)}."
         )
     return values

@@ -171,7 +171,7 @@ class StaFBasis(nn.Module):
             if saved.get(key) != own[key]:
                 raise ValueError(
                     f"`{call}`: coefficients mean another function here, as the {name} must be the same: "
-                    f"saved with {saved.get(key)}, loaded into {own[key]}. Build the same basis, or fit again."
+                    f"saved with {saved.get(key)}, loaded into {own[key]}. Build the same basis, or fit anew."
                 )
 
     def _load_from_state_dict(
@@ -196,17 +196,17 @@ class StaFBasis(nn.Module):
         module._prepare()
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> StaFBasis:
-        super()._apply(fn, recurse)
+        super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
         self._prepare()  # in the new dtype, on the new device
         return self
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         if "convention" not in state.get("_buffers", {}):
             raise ValueError(
-                "`StaFBasis` was pickled by an earlier version of staf_torch, whose coefficients mean another "
-                "function here: load its state with that version, save samples of it, and fit again."
+                "`StaFBasis` was pickled by an earlier version of staf_torch, whose coefficients mean "
+                "another function here: sample it with that version, and fit the samples anew."
             )
-        super().__setstate__(state)
+        super().__setstate__(state)  # type: ignore[no-untyped-call]
 
     @property
     def count(self) -> int:
@@ -280,10 +280,11 @@ class StaFBasis(nn.Module):
             )
         return worst > 1
 
-    def values(self, x: Tensor, target: Target) -> Tensor:
-        """V(c(x)): (..., n) -> (..., M)."""
+    def values(self, x: Tensor, target: Target, outputs: int | None = None) -> Tensor:
+        """V(c(x)): (..., n) -> (..., M); of a target with k outputs (k, ..., M)."""
         centers = self.centers(x)
-        return sampled(target, target(centers), centers)
+        values = sampled(target, target(centers), centers, outputs)
+        return values if outputs is None else values.movedim(-1, 0)
 
     def ideal_weights(self, x: Tensor, target: Target) -> Tensor:
         """w = K(c(x))^-1 V(c(x)), the minimiser of the native-space error: (..., n) -> (..., M).

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from ._checks import choice, trailing
+from ._checks import choice, fail, flag, integer, trailing
+from ._convention import hold
 from .basis import StaFBasis, Target
+from .derivatives import row_jacobian
 
 _MODES = ("partial", "total_frozen_weights", "total")
 
@@ -16,8 +20,10 @@ _MODES = ("partial", "total_frozen_weights", "total")
 class StaF(nn.Module):
     """V^(y; x) = sum_i w_i k(y, c_i(x)) around one state x a batch entry.
 
-    The parameters are coefficients in the local basis at x, which stay finite where the paper's
-    weights w overflow; `weights` derives w from them.
+    The coefficients are held in the local basis at x, where they stay finite while the paper's weights w
+    overflow; `weights` derives w from them. They are a parameter, or a buffer where they are not to be
+    learned; the state is a buffer. Hyperparameters of the basis are learned where it was given them as
+    `nn.Parameter`. `forward` changes nothing in the module.
 
     Example:
         >>> basis = StaFBasis(ExponentialKernel(), StateFollowingCenters(rings(6), radius=0.1))
@@ -29,25 +35,60 @@ class StaF(nn.Module):
     Args:
         basis: kernel and centers.
         batch_shape: leading dimensions (...), independent approximations side by side.
+        out_features: k, several functions over the same centers: targets then map (..., n) to (..., k), and
+            values are (..., P, k), coefficients and weights (..., k, M). None: one function, without that
+            dimension.
+        learnable: whether the coefficients are a parameter.
+        dtype: of the coefficients and the state; by default that of the directions.
+        device: likewise.
+
+    Raises:
+        ValueError: if an argument breaks its rule.
     """
 
-    def __init__(self, basis: StaFBasis, batch_shape: tuple[int, ...] = ()) -> None:
+    def __init__(
+        self,
+        basis: StaFBasis,
+        batch_shape: tuple[int, ...] = (),
+        out_features: int | None = None,
+        *,
+        learnable: bool = True,
+        dtype: torch.dtype | None = None,
+        device: torch.device | str | None = None,
+    ) -> None:
         super().__init__()
+        if not isinstance(basis, StaFBasis):
+            raise fail("StaF", "basis", "must be a StaFBasis", basis)
+        if out_features is not None:
+            integer("StaF", "out_features", out_features, least=1)
         self.basis = basis
-        like = basis.centers.directions
-        self.coefficients = nn.Parameter(like.new_zeros(*batch_shape, basis.count))
-        self.register_buffer("state", like.new_zeros(*batch_shape, basis.dim))
+        self.batch_shape, self.out_features = tuple(batch_shape), out_features
+        outputs = () if out_features is None else (out_features,)
+        like = basis.centers.directions.detach().new_empty((), dtype=dtype, device=device)
+        zero = like.new_zeros(*self.batch_shape, *outputs, basis.count)
+        hold(self, "coefficients", nn.Parameter(zero) if flag("StaF", "learnable", learnable) else zero)
+        self.register_buffer("state", like.new_zeros(*self.batch_shape, basis.dim))
+        self.coefficients: Tensor
         self.state: Tensor
-        self._target: Target | None = None
+        self._target: Target | None
+        self._remember(None)
+
+    def reset_parameters(self) -> None:
+        """Back to V^ = 0 at the state 0."""
+        with torch.no_grad():
+            self.coefficients.zero_()
+            self.state.zero_()
+        self._remember(None)
 
     @property
     def weights(self) -> Tensor:
-        """The paper's w: (..., M).
+        """The paper's w: (..., M), or (..., k, M).
 
         Raises:
             ValueError: if they cannot be represented in this dtype; the coefficients can.
         """
-        w = self.basis.local(self.state).weights(self.coefficients)
+        w = self._weights()
+        w = w if self.out_features is None else w.movedim(0, -2)
         lost = torch.isnan(w).any(-1) & torch.isfinite(self.coefficients).all(-1)
         if bool(lost.any()):
             rows = lost.nonzero().tolist() if lost.dim() else []
@@ -62,7 +103,8 @@ class StaF(nn.Module):
     def fit_(self, x: Tensor, target: Target) -> StaF:
         """Move to the states x (..., n) and take the ideal coefficients of ``target`` there.
 
-        A row whose samples are not finite gets coefficients that are not.
+        A row whose samples are not finite gets coefficients that are not. No gradient goes through a fit;
+        `StaFBasis.local` has one that does.
 
         Raises:
             ValueError: if x is not of the shape (*batch_shape, n), or the target returns another shape; the
@@ -76,27 +118,57 @@ class StaF(nn.Module):
         with torch.no_grad():
             x = x.to(self.state)
             self.basis.check_reach(x)
-            coefficients = self.basis.local(x).fit(self.basis.values(x, target))
+            coefficients = self.basis.local(x).fit(self.basis.values(x, target, self.out_features))
             self.state.copy_(x)
-            self.coefficients.copy_(coefficients)
-        self._target = target
+            self.coefficients.copy_(
+                coefficients if self.out_features is None else coefficients.movedim(0, -2)
+            )
+        self._remember(target)
         return self
 
     def forward(self, y: Tensor) -> Tensor:
-        """V^(y; x): (..., P, n) -> (..., P)."""
+        """V^(y; x): (..., P, n) -> (..., P), or (..., P, k)."""
         trailing("StaF", "y", y, dims=2, last=self.basis.dim)
         return self.at_offsets(y - self.state.unsqueeze(-2))
 
     def at_offsets(self, z: Tensor) -> Tensor:
-        """V^(x + z; x): (..., P, n) -> (..., P).
+        """V^(x + z; x): (..., P, n) -> (..., P), or (..., P, k).
 
         For radii near the rounding of x, where y - x has no digits left.
         """
-        values: Tensor = self.basis.local(self.state).evaluate(z, self.coefficients)
-        return values
+        coefficients = self._outputs_first(z.dim() - 2)
+        return self._outputs_last(self.basis.local(self.state).evaluate(z, coefficients))
+
+    def value_and_gradient(
+        self, y: Tensor, mode: str = "partial", target: Target | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """V^(y; x) and its gradient, for less than the two apart.
+
+        Args:
+            y: (..., P, n).
+            mode: of `gradient`. ``partial`` is in closed form for the exponential and Gaussian kernels.
+            target: of `gradient`.
+
+        Returns:
+            (..., P) and (..., P, n), or (..., P, k) and (..., P, k, n).
+
+        Raises:
+            ValueError: for another mode, or ``total`` without a target.
+        """
+        choice("StaF.gradient", "mode", mode, _MODES)
+        trailing("StaF.gradient", "y", y, dims=2, last=self.basis.dim)
+        z = y - self.state.unsqueeze(-2)
+        if mode != "partial":
+            return self(y), row_jacobian(self._along(y, z, mode, target), torch.zeros_like(z))[1]
+        space, coefficients = self.basis.local(self.state), self._outputs_first(z.dim() - 2)
+        values: Tensor
+        values, gradient = space.evaluate_with_gradient(z, coefficients)
+        if self.out_features is None:
+            return values, gradient
+        return values.movedim(0, -1), gradient.movedim(0, -2)
 
     def gradient(self, y: Tensor, mode: str = "partial", target: Target | None = None) -> Tensor:
-        """Gradient of V^ at y: (..., P, n) -> (..., P, n).
+        """Gradient of V^ at y: (..., P, n) -> (..., P, n), or (..., P, k, n).
 
         Modes, which differ by O(1):
             ``partial``: d/dy with the centers frozen at x.
@@ -108,24 +180,29 @@ class StaF(nn.Module):
         Raises:
             ValueError: for another mode, or ``total`` without a target.
         """
-        function = self._along(y, mode, target)
-        return _gradient(function, torch.zeros_like(y))
+        return self.value_and_gradient(y, mode, target)[1]
 
     def hessian(self, y: Tensor, mode: str = "partial", target: Target | None = None) -> Tensor:
-        """Second derivatives of V^ at y, in the modes of `gradient`: (..., P, n) -> (..., P, n, n)."""
-        function = self._along(y, mode, target)
-        rows = [
-            _gradient(lambda step, i=i: _gradient(function, step)[..., i], torch.zeros_like(y))  # type: ignore[misc]
-            for i in range(y.shape[-1])
-        ]
-        return torch.stack(rows, dim=-2)
+        """Second derivatives of V^ at y, in the modes of `gradient`: (..., P, n) -> (..., P, n, n).
 
-    def _along(self, y: Tensor, mode: str, target: Target | None) -> Callable[[Tensor], Tensor]:
-        """V^ as a function of a step from y, (..., P, n) -> (..., P), with what moves in this mode."""
-        choice("StaF.gradient", "mode", mode, _MODES)
-        trailing("StaF.gradient", "y", y, dims=2, last=self.basis.dim)
+        With several outputs (..., P, k, n, n).
+        """
+        choice("StaF.hessian", "mode", mode, _MODES)
+        trailing("StaF.hessian", "y", y, dims=2, last=self.basis.dim)
+        z = y - self.state.unsqueeze(-2)
+        start = torch.zeros_like(z)
         if mode == "partial":
-            return lambda step: self(y + step)
+            return row_jacobian(lambda step: self.value_and_gradient(y + step)[1], start)[1]
+        function = self._along(y, z, mode, target)
+        return row_jacobian(lambda step: row_jacobian(function, step)[1], start)[1]
+
+    def extra_repr(self) -> str:
+        outputs = "" if self.out_features is None else f", out_features={self.out_features}"
+        fixed = "" if isinstance(self.coefficients, nn.Parameter) else ", learnable=False"
+        return f"batch_shape={self.batch_shape}{outputs}{fixed}"
+
+    def _along(self, y: Tensor, z: Tensor, mode: str, target: Target | None) -> Callable[[Tensor], Tensor]:
+        """V^ as a function of a step of both y and x, with what else moves in this mode."""
         if mode == "total_frozen_weights":
             return lambda step: self._frozen(y, step)
         chosen = self._target if target is None else target
@@ -133,32 +210,72 @@ class StaF(nn.Module):
             raise ValueError(
                 '`StaF.gradient(mode="total")` needs a target: pass `target=...` or call `fit_`.'
             )
-        return lambda step: self._moving(y, step, chosen)
+        return lambda step: self._moving(z, step, chosen)
 
     def _frozen(self, y: Tensor, step: Tensor) -> Tensor:
-        """V^(y + h; x + h) with w of x: (..., P, n), (..., P, n) -> (..., P)."""
+        """V^(y + h; x + h) with w of x: (..., P, n), (..., P, n) -> (..., P), or (..., P, k).
+
+        NaN in a row in which w cannot be represented.
+        """
         rule = self.basis.kernel.follow(y, step) if self.basis.centers.radius.constant else None
         if rule is not None:
             # In coefficients, which keep their digits where w is huge and cancels.
             log_factor, shift = rule
-            values: Tensor = log_factor.exp() * self(y + shift)
-            return values
+            factor, values = log_factor.exp(), self(y + shift)
+            return factor * values if self.out_features is None else factor.unsqueeze(-1) * values
         moved = self.state.unsqueeze(-2) + step
-        sigma = self.basis((y + step).unsqueeze(-2), moved)
-        total: Tensor = (sigma * self.weights.unsqueeze(-2).unsqueeze(-2)).sum(-1).squeeze(-1)
-        return total
+        sigma = self.basis((y + step).unsqueeze(-2), moved)  # (..., P, 1, M)
+        weights = self._weights(step.dim() - 2).unsqueeze(-2).unsqueeze(-2)
+        return self._outputs_last((sigma * weights).sum(-1).squeeze(-1))
 
-    def _moving(self, y: Tensor, step: Tensor, target: Target) -> Tensor:
-        """V^(y + h; x + h) with the ideal weights of x + h: (..., P, n), (..., P, n) -> (..., P)."""
+    def _moving(self, z: Tensor, step: Tensor, target: Target) -> Tensor:
+        """V^(x + z + h; x + h) with the ideal weights of x + h: (..., P, n) -> (..., P), or (..., P, k)."""
         moved = self.state.unsqueeze(-2) + step
         space = self.basis.local(moved)
-        coefficients = space.fit(self.basis.values(moved, target))
-        z = (y - self.state.unsqueeze(-2)).unsqueeze(-2)
-        values: Tensor = space.evaluate(z, coefficients).squeeze(-1)
-        return values
+        coefficients = space.fit(self.basis.values(moved, target, self.out_features))
+        return self._outputs_last(space.evaluate(z.unsqueeze(-2), coefficients).squeeze(-1))
 
+    def _weights(self, leading: int = 0) -> Tensor:
+        """w, outputs first: NaN in a row where it cannot be represented."""
+        weights: Tensor = self.basis.local(self.state).weights(self._outputs_first(leading))
+        return weights
 
-def _gradient(function: Callable[[Tensor], Tensor], at: Tensor) -> Tensor:
-    """Row-wise gradient of (..., n) -> (...): (..., n)."""
-    gradient: Tensor = torch.func.grad(lambda point: function(point).sum())(at)
-    return gradient
+    def _outputs_first(self, leading: int) -> Tensor:
+        """The coefficients as (k, ..., M) with at least ``leading`` dimensions between, or as they are."""
+        if self.out_features is None:
+            return self.coefficients
+        missing = max(0, leading - len(self.batch_shape))
+        return self.coefficients.movedim(-2, 0)[(slice(None), *[None] * missing)]
+
+    def _outputs_last(self, values: Tensor) -> Tensor:
+        return values if self.out_features is None else values.movedim(0, -1)
+
+    def _remember(self, target: Target | None) -> None:
+        # Past `nn.Module`, which would make a target that is a module, and its parameters, a part of this.
+        object.__setattr__(self, "_target", target)
+
+    def _load_from_state_dict(
+        self, state_dict: dict[str, Any], prefix: str, *arguments: Any, **keywords: Any
+    ) -> None:
+        inner = f"{prefix}basis."
+        if f"{inner}convention" in state_dict:
+            self.basis.check_convention("StaF.load_state_dict", state_dict[f"{inner}convention"])
+        elif any(key.startswith(inner) for key in state_dict):
+            raise ValueError(
+                "`StaF.load_state_dict`: the coefficients come without the `convention` of their basis. An "
+                "earlier version of staf_torch wrote them, and they mean another function here: fit anew."
+            )
+        super()._load_from_state_dict(state_dict, prefix, *arguments, **keywords)
+        self._remember(None)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """For pickle: without the target of the last fit, which need not be picklable."""
+        return self.__dict__ | {"_target": None}
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> StaF:
+        clone = self.__class__.__new__(self.__class__)
+        memo[id(self)] = clone
+        target = self._target  # a function of the user's: shared, not copied
+        clone.__dict__.update({name: copy.deepcopy(v, memo) for name, v in self.__getstate__().items()})
+        clone._remember(target)
+        return clone

@@ -41,7 +41,7 @@ class ExponentialKernel(Kernel):
         return total
 
     def log_scale_gradient(self, x: Tensor, z: Tensor) -> Tensor:
-        return x.unsqueeze(-2)
+        return x if x.dim() == 1 else x.unsqueeze(-2)
 
     def follow(self, y: Tensor, step: Tensor) -> tuple[Tensor, Tensor]:
         # (y + h)'(c + h) = (y'h + h'h) + (y + h)'c

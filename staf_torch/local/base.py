@@ -8,6 +8,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from ..derivatives import row_jacobian
 from ..kernels import Kernel
 
 _ROWS = 4096  # rows a block: the temporaries of one stay in the inner caches
@@ -33,6 +34,9 @@ class LocalSpace(Protocol):
     def evaluate(self, z: Tensor, coefficients: Tensor) -> Tensor:
         """V^(x + z): (..., P, n), (..., M) -> (..., P)."""
 
+    def evaluate_with_gradient(self, z: Tensor, coefficients: Tensor) -> tuple[Tensor, Tensor]:
+        """V^(x + z) and its gradient in z: (..., P, n), (..., M) -> (..., P), (..., P, n)."""
+
     def scaled_weights(self, coefficients: Tensor) -> Tensor:
         """e^{g(x)} w, with w the paper's weights: (..., M) -> (..., M)."""
 
@@ -41,6 +45,18 @@ class LocalSpace(Protocol):
 
     def coefficients(self, weights: Tensor) -> Tensor:
         """beta from the paper's w: (..., M) -> (..., M)."""
+
+
+def with_gradient(function: Callable[[Tensor], Tensor], z: Tensor) -> tuple[Tensor, Tensor]:
+    """A function (..., P, n) -> (..., P) or (k, ..., P), and its gradient by autograd in a last dimension."""
+    leading = z.dim() - 1
+
+    def outputs_last(at: Tensor) -> Tensor:
+        values = function(at)
+        return values if values.dim() == leading else values.movedim(0, -1)
+
+    values, gradient = row_jacobian(outputs_last, z)
+    return (values, gradient) if values.dim() == leading else (values.movedim(-1, 0), gradient.movedim(-2, 0))
 
 
 def scale(kernel: Kernel, x: Tensor, z: Tensor, sign: float = 1.0) -> Tensor:

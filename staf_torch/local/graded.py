@@ -13,7 +13,7 @@ is ever divided by. Its derivatives are of the same kind: p_k' = k p_{k-1} and p
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
@@ -93,7 +93,7 @@ class GradedSpace(NamedTuple):
     @property
     def offsets(self) -> Tensor:
         """d = nu u, (..., M, n), or (M, n) for all states."""
-        return self.nu[..., None, None] * self.directions
+        return over_points(self.nu) * self.directions
 
     @property
     def radius(self) -> Tensor:
@@ -122,15 +122,15 @@ class GradedSpace(NamedTuple):
 
     def evaluate(self, z: Tensor, coefficients: Tensor) -> Tensor:
         """V^(x + z): (..., P, n), (..., M) -> (..., P)."""
-        terms = self._terms(z)
-        total = _combined(terms, self._ridge_weights(coefficients))
-        return total.sum(-1) * scale(self.kernel, self.state, z)
+        terms = self._terms(z, self._r2)
+        return _sums(terms, self._ridge_weights(coefficients)) * scale(self.kernel, self.state, z)
 
     def evaluate_with_gradient(self, z: Tensor, coefficients: Tensor) -> tuple[Tensor, Tensor]:
         """V^(x + z) and its gradient in z, in closed form: (..., P, n), (..., M) -> (..., P), (..., P, n)."""
-        terms, apart = self._terms(z), self._ridge_weights(coefficients)
-        sums = _combined(terms, apart).sum(-1)
-        inner = terms[0] * (self._r2[..., None, None] * apart[0])
+        r2, apart = self._r2, self._ridge_weights(coefficients)
+        terms = self._terms(z, r2)
+        sums = _sums(terms, apart)
+        inner = terms[0] * (over_points(r2) * apart[0])
         for k in range(1, len(terms)):
             inner = torch.addcmul(inner, terms[k - 1], apart[k], value=k)
         slope = self._divided(inner @ self.units)
@@ -138,8 +138,8 @@ class GradedSpace(NamedTuple):
         if along is None:
             return sums, slope
         factor = scale(self.kernel, self.state, z)
-        gradient = torch.addcmul(slope, sums.unsqueeze(-1), along) * factor.unsqueeze(-1)
-        return sums * factor, gradient
+        value = sums * factor
+        return value, torch.addcmul(slope * factor.unsqueeze(-1), value.unsqueeze(-1), along)
 
     def scaled_weights(self, coefficients: Tensor) -> Tensor:
         """e^g w, w_i = e^{-g - s(d_i)} sum_j (q_ij / sigma_j) k_j! r^(-2 k_j) beta_j: (..., M) -> (..., M).
@@ -167,21 +167,22 @@ class GradedSpace(NamedTuple):
 
     def _divided(self, z: Tensor) -> Tensor:
         """z / radius, zero where the radius is: (..., P, n)."""
-        radius = self.radius[..., None, None]
+        radius = over_points(self.radius)
         if not self.meeting:
             return z / radius
         some = radius > 0
         return torch.where(some, z / torch.where(some, radius, 1.0), 0.0)
 
-    def _terms(self, z: Tensor) -> list[Tensor]:
+    def _terms(self, z: Tensor, r2: Tensor) -> list[Tensor]:
         """p_k(zeta'u_i) for k < K: (..., P, n) -> K of (..., P, M)."""
-        return ridges(self._divided(z) @ self.units.mT, self._r2[..., None, None], self.basis.degrees[-1])
+        return ridges(self._divided(z) @ self.units.mT, over_points(r2), self.basis.degrees[-1])
 
     def _ridge_weights(self, coefficients: Tensor) -> tuple[Tensor, ...]:
         """sum_j (q_ij / sigma_j) beta_j, apart for each degree: (..., M) -> K of (..., 1, M)."""
         count = len(self.basis.degrees)
-        apart = (coefficients @ self.spread.to(coefficients)).unflatten(-1, (count, 1, -1))
-        return apart.unbind(-3)
+        together = coefficients @ self.spread.to(coefficients)
+        apart: tuple[Tensor, ...] = together.unsqueeze(-2).chunk(count, -1)
+        return apart
 
     def _unscale(self) -> Tensor:
         """k_j! r^(-2 k_j): (..., M)."""
@@ -189,9 +190,14 @@ class GradedSpace(NamedTuple):
         return factor
 
 
-def _combined(terms: list[Tensor], apart: tuple[Tensor, ...]) -> Tensor:
-    """sum_k p_k c_k: (..., P, M)."""
+def over_points(value: Tensor) -> Tensor:
+    """(...) -> (..., 1, 1), and a number as it is."""
+    return value if value.dim() == 0 else value[..., None, None]
+
+
+def _sums(terms: list[Tensor], apart: Sequence[Tensor]) -> Tensor:
+    """sum_ik p_k(i) c_k(i): (..., P)."""
     total = terms[0] * apart[0]
     for term, weight in zip(terms[1:], apart[1:], strict=True):
         total = torch.addcmul(total, term, weight)
-    return total
+    return total.sum(-1)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ..kernels import Kernel
 from ..linalg import PivotedCholesky, pivoted_cholesky
-from .base import evaluate_scaled, from_scaled, scale, to_scaled
+from .base import evaluate_scaled, from_scaled, scale, to_scaled, with_gradient
 
 
 class NewtonSpace(NamedTuple):
@@ -39,6 +39,10 @@ class NewtonSpace(NamedTuple):
         """V^(x + z): (..., P, n), (..., M) -> (..., P)."""
         b = self.factor.solve_upper(coefficients)
         return evaluate_scaled(self.kernel, self.offsets, self.state, z, b)
+
+    def evaluate_with_gradient(self, z: Tensor, coefficients: Tensor) -> tuple[Tensor, Tensor]:
+        """V^(x + z) and its gradient in z: (..., P, n), (..., M) -> (..., P), (..., P, n)."""
+        return with_gradient(lambda at: self.evaluate(at, coefficients), z)
 
     def scaled_weights(self, coefficients: Tensor) -> Tensor:
         """e^g w: (..., M) -> (..., M)."""

@@ -18,27 +18,28 @@ def phi(t: Tensor, top: int) -> list[Tensor]:
     exponential = t.exp()
     if top == 0:
         return [exponential]
+    one, terms = torch.ones_like(t), _terms(top, t.dtype)
     small = t.clamp(-1.0, 1.0)
     near = small == t
-    one = torch.ones_like(t)
-    below = [torch.add(one, small, alpha=1 / (top + _terms(top, t.dtype)))]
-    for j in range(_terms(top, t.dtype) - 1, 0, -1):
-        below[0] = torch.addcmul(one, below[0], small, value=1 / (top + j))
+    tail = torch.add(one, small, alpha=1 / (top + terms))
+    for j in range(top + terms - 1, top, -1):
+        tail = torch.addcmul(one, tail, small, value=1 / j)
+    below = [tail]
     for k in range(top, 1, -1):
         below.append(torch.addcmul(one, below[-1], small, value=1 / k))
     large = torch.where(near, one, t)
-    above = [exponential]
+    found, above = [exponential], exponential
     for k in range(top):
-        rest = (above[-1] - 1) / large
-        above.append(rest if k == 0 else (k + 1) * rest)
-    tails = [torch.where(near, b, a) for b, a in zip(reversed(below), above[1:], strict=True)]
-    return [exponential, *tails]
+        above = torch.sub(above, one) / large
+        above = torch.add(above, above, alpha=k) if k else above
+        found.append(torch.where(near, below[top - 1 - k], above))
+    return found
 
 
 def _terms(top: int, dtype: torch.dtype) -> int:
     """N with the first neglected term of f_top, top! t^(N+1) / (top + N + 1)!, below rounding at |t| = 1."""
-    term, count = 1.0, 0
-    while term > 0.25 * torch.finfo(dtype).eps:
+    small, term, count = (5e-17 if dtype == torch.float64 else 3e-8), 1.0, 0
+    while term > small:
         count += 1
         term /= top + count
     return count

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from ..kernels import PolynomialKernel
+from .base import with_gradient
 from .elimination import Degrees, functionals_of
 
 
@@ -53,6 +54,10 @@ class PolynomialSpace(NamedTuple):
         some = radius > 0
         zeta = torch.where(some, _root(self.kernel, self.state, z) / torch.where(some, radius, 1.0), 0.0)
         return _apply(self._functions(zeta, self._a(z)), coefficients)
+
+    def evaluate_with_gradient(self, z: Tensor, coefficients: Tensor) -> tuple[Tensor, Tensor]:
+        """V^(x + z) and its gradient in z: (..., P, n), (..., M) -> (..., P), (..., P, n)."""
+        return with_gradient(lambda at: self.evaluate(at, coefficients), z)
 
     def scaled_weights(self, coefficients: Tensor) -> Tensor:
         """The paper's w: (..., M) -> (..., M); this kernel has no gain."""
