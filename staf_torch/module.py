@@ -221,7 +221,8 @@ class StaF(nn.Module):
         if rule is not None:
             # In coefficients, which keep their digits where w is huge and cancels.
             log_factor, shift = rule
-            factor, values = log_factor.exp(), self(y + shift)
+            values: Tensor = self(y + shift)
+            factor = log_factor.exp()
             return factor * values if self.out_features is None else factor.unsqueeze(-1) * values
         moved = self.state.unsqueeze(-2) + step
         sigma = self.basis((y + step).unsqueeze(-2), moved)  # (..., P, 1, M)
@@ -245,7 +246,8 @@ class StaF(nn.Module):
         if self.out_features is None:
             return self.coefficients
         missing = max(0, leading - len(self.batch_shape))
-        return self.coefficients.movedim(-2, 0)[(slice(None), *[None] * missing)]
+        first: Tensor = self.coefficients.movedim(-2, 0)[(slice(None), *[None] * missing)]
+        return first
 
     def _outputs_last(self, values: Tensor) -> Tensor:
         return values if self.out_features is None else values.movedim(0, -1)

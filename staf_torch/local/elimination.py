@@ -129,7 +129,9 @@ def functionals_of(points: Tensor, degrees: Degrees) -> Elimination:
 def _chosen(points: Tensor, degrees: Degrees) -> Tensor:
     """u_i^alpha sqrt(k! / alpha!) for the chosen alpha, by ascending degree: (..., M, n) -> (..., M, M)."""
     alpha = [row for block in degrees.monomials for row in block]
-    norm = [math.sqrt(math.factorial(sum(row)) / math.prod(math.factorial(a) for a in row)) for row in alpha]
+    norm = [
+        math.sqrt(math.factorial(sum(row)) / math.prod([math.factorial(a) for a in row])) for row in alpha
+    ]
     table = _powers(points, len(degrees.monomials) - 1)
     monomials = torch.tensor(norm, dtype=points.dtype, device=points.device)
     for axis in range(points.shape[-1]):

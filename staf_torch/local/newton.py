@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import torch
 from torch import Tensor
 
 from ..kernels import Kernel
@@ -13,10 +12,12 @@ from .base import evaluate_scaled, from_scaled, scale, to_scaled, with_gradient
 
 
 class NewtonSpace(NamedTuple):
-    """span{k0(., d_i)} in its Newton basis, psi(z) = k0(z, d) P' L^-T with P K0 P' = L L'.
+    """span{k0(., d_i)}, held by the values at the centers and computed with in its Newton basis.
 
-    The basis is orthonormal in the kernel's own norm (up to e^{g/2}), so no K0^-1 is ever formed. Where
-    K0 is numerically singular the factor stops at its rank, and `rank` says so.
+    The Newton basis k0(z, d) P' L^-T, with P K0 P' = L L', is orthonormal in the kernel's own norm (up to
+    e^{g/2}), so no K0^-1 is ever formed. Where K0 is numerically singular the factor stops at its rank, and
+    `rank` says so. The order P of the pivots jumps as the centers or the kernel change, so that coefficients
+    in the Newton basis would too; the scaled values beta_i = e^{-s(d_i)} V^(c_i) do not.
 
     Source: Muller and Schaback, "A Newton basis for kernel spaces", J. Approx. Theory 161 (2009).
     """
@@ -32,13 +33,12 @@ class NewtonSpace(NamedTuple):
         return self.factor.rank
 
     def fit(self, values: Tensor) -> Tensor:
-        """beta = L^-1 P (e^{-s} V(c)): (..., M) -> (..., M), zero beyond the rank."""
-        return self.factor.solve_lower(values * scale(self.kernel, self.state, self.offsets, -1.0))
+        """beta = e^{-s} V(c): (..., M) -> (..., M)."""
+        return values * scale(self.kernel, self.state, self.offsets, -1.0)
 
     def evaluate(self, z: Tensor, coefficients: Tensor) -> Tensor:
         """V^(x + z): (..., P, n), (..., M) -> (..., P)."""
-        b = self.factor.solve_upper(coefficients)
-        return evaluate_scaled(self.kernel, self.offsets, self.state, z, b)
+        return evaluate_scaled(self.kernel, self.offsets, self.state, z, self._solve(coefficients))
 
     def evaluate_with_gradient(self, z: Tensor, coefficients: Tensor) -> tuple[Tensor, Tensor]:
         """V^(x + z) and its gradient in z: (..., P, n), (..., M) -> (..., P), (..., P, n)."""
@@ -46,19 +46,22 @@ class NewtonSpace(NamedTuple):
 
     def scaled_weights(self, coefficients: Tensor) -> Tensor:
         """e^g w: (..., M) -> (..., M)."""
-        return self.factor.solve_upper(coefficients) * scale(self.kernel, self.state, self.offsets, -1.0)
+        return self._solve(coefficients) * scale(self.kernel, self.state, self.offsets, -1.0)
 
     def weights(self, coefficients: Tensor) -> Tensor:
         """The paper's w: (..., M) -> (..., M); NaN in a row where it cannot be represented."""
         return from_scaled(self.kernel, self.state, self.scaled_weights(coefficients))
 
     def coefficients(self, weights: Tensor) -> Tensor:
-        """beta = L' P (e^{g + s} w): (..., M) -> (..., M)."""
+        """beta from the paper's w: (..., M) -> (..., M)."""
         scaled = to_scaled(self.kernel, self.state, weights)
         b = scaled * scale(self.kernel, self.state, self.offsets)
-        permuted = b.gather(-1, self.factor.order.expand(b.shape))
-        beta = (self.factor.factor.mT @ permuted.unsqueeze(-1)).squeeze(-1)
-        return torch.where(self.factor.kept, beta, 0.0)
+        core = self.kernel.core(self.state, self.offsets, self.offsets)
+        return (core @ b.unsqueeze(-1)).squeeze(-1)
+
+    def _solve(self, coefficients: Tensor) -> Tensor:
+        """e^{g + s} w = K0^-1 beta, projected where the rank is below M: (..., M) -> (..., M)."""
+        return self.factor.solve_upper(self.factor.solve_lower(coefficients))
 
 
 def newton_space(kernel: Kernel, x: Tensor, offsets: Tensor) -> NewtonSpace:
