@@ -29,6 +29,15 @@ def described(module: nn.Module) -> str:
     return f"{type(module).__name__}({', '.join(parts)})"
 
 
+def shown(module: nn.Module) -> str:
+    """The module's own tensors for its repr: numbers by value, others by shape."""
+    own = [(n, t) for n, t in (*module._parameters.items(), *module._buffers.items()) if t is not None]
+    return ", ".join(
+        f"{name}={float(t.detach()):.6g}" if t.dim() == 0 and not t.is_meta else f"{name}={tuple(t.shape)}"
+        for name, t in own
+    )
+
+
 def encode(record: dict[str, Any]) -> Tensor:
     """A record as a uint8 tensor of JSON: what every tool that handles a state_dict can carry."""
     return torch.tensor(list(json.dumps(record, sort_keys=True).encode()), dtype=torch.uint8)

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from .._checks import non_negative, positive
-from .._convention import hold
+from .._convention import hold, shown
 
 
 class Radius(nn.Module, abc.ABC):
@@ -23,6 +23,9 @@ class Radius(nn.Module, abc.ABC):
     @abc.abstractmethod
     def forward(self, x: Tensor) -> Tensor:
         """nu(x): (..., n) -> (...), or what broadcasts to it where it does not depend on x."""
+
+    def extra_repr(self) -> str:
+        return shown(self)
 
 
 class ConstantRadius(Radius):

@@ -7,6 +7,8 @@ import abc
 import torch
 from torch import Tensor, nn
 
+from .._convention import shown
+
 
 class Kernel(nn.Module, abc.ABC):
     """A real, symmetric, positive definite kernel k(y, c).
@@ -82,6 +84,9 @@ class Kernel(nn.Module, abc.ABC):
     def rank(self, dim: int) -> int | None:
         """Dimension of the kernel's function space over R^dim, None where it is infinite."""
         return None
+
+    def extra_repr(self) -> str:
+        return shown(self)
 
 
 def per_entry(value: Tensor, extra: int) -> Tensor:

@@ -55,7 +55,7 @@ class MaternKernel(RadialKernel):
         return torch.where(near, even + root * odd, far)
 
     def extra_repr(self) -> str:
-        return f"smoothness={self.smoothness}"
+        return f"smoothness={self.smoothness}, {super().extra_repr()}"
 
 
 def _taylor(smoothness: float) -> tuple[float, ...]:

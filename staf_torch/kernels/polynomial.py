@@ -41,4 +41,4 @@ class PolynomialKernel(Kernel):
         return math.comb(variables + self.degree, self.degree)
 
     def extra_repr(self) -> str:
-        return f"degree={self.degree}"
+        return f"degree={self.degree}, {super().extra_repr()}"
