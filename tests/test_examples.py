@@ -1,0 +1,55 @@
+"""The worked examples learn what they say, are short, and are what the README shows."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from examples import actor_critic, learned_dynamics, two_optimizers
+
+EXAMPLES = sorted(Path(actor_critic.__file__).parent.glob("*.py"))
+
+
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
+def test_an_example_is_shorter_than_forty_lines(path: Path) -> None:
+    assert len(path.read_text().splitlines()) < 40
+
+
+def test_the_actor_comes_close_to_the_optimal_policy() -> None:
+    before = actor_critic.train(1)
+    assert before > 0.8
+    assert actor_critic.train() < 0.12 < 0.15 * before
+
+
+def test_chasing_the_coefficients_beside_adam_beats_adam_alone() -> None:
+    torch.manual_seed(1)
+    together = two_optimizers.train()
+    torch.manual_seed(1)
+    alone = two_optimizers.train(chase=False)
+    assert together < 2e-3
+    assert together < 0.1 * alone
+
+
+def discounted_cost(gains: torch.Tensor) -> float:
+    """Of u = gains'x on the pendulum itself, from four states."""
+    x = torch.tensor([[0.8, 0.0], [0.0, 0.8], [0.5, -0.8], [-0.6, -0.4]], dtype=torch.float64)
+    total, discount = torch.zeros(4, dtype=torch.float64), 1.0
+    for _ in range(200):
+        u = x @ gains
+        total += discount * (0.1 * x.square().sum(-1) + 0.01 * u.square())
+        discount *= 0.95
+        x = x + 0.1 * torch.stack((x[:, 1], x[:, 0].sin() + u), dim=-1)
+    return float(total.mean())
+
+
+def test_the_policy_learned_through_value_and_dynamics_is_near_the_best() -> None:
+    model_error, bellman_error, gains = learned_dynamics.train()
+    assert model_error < 6e-3
+    assert bellman_error < 0.04
+    start = discounted_cost(torch.tensor([-1.5, -0.5], dtype=torch.float64))
+    grid = [
+        torch.tensor([-p, -q], dtype=torch.float64) for p in (2.0, 3.0, 4.0) for q in (2.0, 3.0, 4.0, 5.0)
+    ]
+    assert start > 0.9
+    assert discounted_cost(gains) < 1.01 * min(map(discounted_cost, grid))
