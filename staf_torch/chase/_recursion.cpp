@@ -30,6 +30,7 @@ struct Problem {
     void (*evaluate)(int64_t, int64_t, int64_t, const void *, const void *, const void *, void *);  // V, or null
     const void *parameters;             // of V
     Array values, log_scale, log_gain;  // else V(c), s(x, d) and g(x) are given; null stands for zeros
+    void *most;           // in and out, where exponential: the largest finite g(x)
     void *last_gain;      // (batch) in and out: g in whose units e^{-g} the weights stand; null: always 0
     void *weights;        // (COUNT, batch) in and out
     int64_t *diverged_at; // (batch) in and out
@@ -56,15 +57,24 @@ template <typename T, int M> struct Prepared {
     using B = Block<T, N>;
     const Problem &p;
     T *x, *scale, *value, *gain, *unit, *factor;  // unit e^{g - g of the time before}, factor e^{-g}
+    B most = fill<T, N>(0);
 
     explicit Prepared(const Problem &problem) : p(problem) {
         const int64_t numbers = (p.dim + 2 * M + 3) * room;
         x = static_cast<T *>(allocate(numbers * sizeof(T)));
-        for (int64_t n = 0; n < numbers; ++n) x[n] = 1;
+        for (int64_t n = 0; n < numbers; ++n) x[n] = n < p.dim * room ? 0 : 1;
         scale = x + p.dim * room, value = scale + M * room;
         gain = value + M * room, unit = gain + room, factor = unit + room;
     }
-    ~Prepared() { __builtin_free(x); }
+    ~Prepared() {
+        T each[lanes], *into = static_cast<T *>(p.most);
+        store(each, lanes, most);
+        for (int l = 0; l < lanes && p.exponential; ++l) {
+            T seen = *into;
+            while (each[l] > seen && !__atomic_compare_exchange(into, &seen, each + l, false, __ATOMIC_RELAXED, __ATOMIC_RELAXED)) {}
+        }
+        __builtin_free(x);
+    }
     Prepared(const Prepared &) = delete;
 
     // A row's numbers lie together in memory where the states come so; a time's, where torch made them so.
@@ -102,6 +112,7 @@ template <typename T, int M> struct Prepared {
                 add(square, at, at);
             }
             store(gain + rows + n, lanes, square);
+            LANES most.v[k] = square.v[k] > most.v[k] && square.v[k] - square.v[k] == 0 ? square.v[k] : most.v[k];
         }
         for (int i = 0; i < M; ++i)
             for (int n = 0; n < size; n += lanes) {

@@ -47,7 +47,7 @@ class _Problem(ctypes.Structure):
         ("values", _Array),
         ("log_scale", _Array),
         ("log_gain", _Array),
-        *((n, ctypes.c_void_p) for n in ("last_gain", "weights", "diverged_at", "before", "after")),
+        *((n, ctypes.c_void_p) for n in ("most", "last_gain", "weights", "diverged_at", "before", "after")),
         *((name, ctypes.c_int64) for name in ("history_time", "history_entry", "papers")),
         ("parallel", ctypes.c_void_p),
     )
@@ -108,6 +108,7 @@ def fused(
     inner_steps: int,
     carry: Carry,
     history: History,
+    most: Tensor | None = None,
 ) -> Carry:
     """Correct the weights at every time of a piece, and write what ``history`` asks for.
 
@@ -118,6 +119,7 @@ def fused(
         inner_steps: iterations a time, at least 1.
         carry: from the piece before, left as it is.
         history: written.
+        most: (1,), written where g(x) is found here: the largest of it that is finite.
     """
     batch, times, dim = states.shape
     count = structure.core.shape[-1]
@@ -137,6 +139,8 @@ def fused(
         held += [evaluate, parameters]
         problem.evaluate = ctypes.cast(evaluate, ctypes.c_void_p).value  # type: ignore[arg-type]
         problem.parameters = parameters.data_ptr()
+    most = states.new_zeros(1) if most is None else most
+    problem.most = most.data_ptr()
     # In and out, so copies: a result of the piece before may share them.
     weights, last_gain, diverged_at = map(_copy, (carry.weights.mT, carry.log_gain, carry.diverged_at))
     problem.weights, problem.diverged_at = weights.data_ptr(), diverged_at.data_ptr()

@@ -63,10 +63,8 @@ def chase_weights(
         raise fail("chase_weights", "predictor", "must be None; `chase` has predictors", predictor)
     run: _Run | None = None
     recorded: list[Tensor] = []  # (C, M, B) a piece
-    warned = False
     for piece in [states] if isinstance(states, Tensor) else states:
         check_states("chase_weights", piece, basis)
-        warned = warned or basis.check_reach(piece)
         if run is None:
             run = _Run(basis, target, law, inner_steps, start("chase_weights", piece, basis, law, weights))
         recorded += run.advance(piece, history)
@@ -85,7 +83,7 @@ class _Run:
         self, basis: StaFBasis, target: Target, law: UpdateLaw, inner_steps: int, carry: Carry
     ) -> None:
         self._basis, self._target, self._law, self._inner_steps = basis, target, law, inner_steps
-        self.carry = carry
+        self.carry, self._warned = carry, False
 
     def advance(self, states: Tensor, history: bool) -> list[Tensor]:
         """Through the states (B, C, n): the paper's weights (C, M, B) in parts; none without history."""
@@ -93,17 +91,29 @@ class _Run:
         batch, times, _ = states.shape
         # The room of the whole piece at once, so that every number is written once, where it stays.
         room = fresh(states, times, self._basis.count, batch) if history else None
+        most = states.new_zeros(1)
         found, done = [], 0
         for at in states.split(times if own.formula else self._longest(states), dim=1):
             into = None if room is None else room[done : done + at.shape[1]]
-            part = self._piece(at, own, into)
+            part = self._piece(at, own, into, most)
             done += at.shape[1]
             found.append((part, into))
+        self._check_reach(states, own, most)
         if room is None:
             return []
         if all(part is into for part, into in found):
             return [room]
         return [part for part, _ in found if part is not None]
+
+    def _check_reach(self, states: Tensor, own: Native, most: Tensor) -> None:
+        """Warn once of centers beyond the kernel's reach; the fused recursion has seen the largest x'x."""
+        if self._warned:
+            return
+        if own.structure is not None and own.structure.exponential:
+            worst = self._basis.centers.radius(states[0, 0]) * most.sqrt()
+            self._warned = self._basis.warn_reach(float(worst), stacklevel=5)
+        else:
+            self._warned = self._basis.check_reach(states, stacklevel=5)
 
     def _longest(self, states: Tensor) -> int:
         """Times a piece, where torch computes what depends on the states."""
@@ -111,7 +121,7 @@ class _Run:
         cached = _PIECE_BYTES // (batch * size * self._basis.count)
         return max(1, min(chunk_length(batch, self._basis, size), cached))
 
-    def _piece(self, at: Tensor, own: Native, into: Tensor | None) -> Tensor | None:
+    def _piece(self, at: Tensor, own: Native, into: Tensor | None, most: Tensor) -> Tensor | None:
         """Through the states (B, C, n): the weights (C, M, B), ``into`` itself from the fused recursion."""
         law, steps, carry = self._law, self._inner_steps, self.carry
         values = own.formula or self._basis.values(at, self._target)
@@ -119,7 +129,7 @@ class _Run:
         if structure is None or not runs_fused(at, structure, values, law, steps, carry):
             structure = self._basis.gram_structure(at)
         if runs_fused(at, structure, values, law, steps, carry):
-            self.carry = fused(at, structure, values, steps, carry, History(recorded=into))
+            self.carry = fused(at, structure, values, steps, carry, History(recorded=into), most)
             return into
         assert isinstance(structure, GramStructure)
         assert isinstance(values, Tensor)
