@@ -22,7 +22,7 @@ _FLAGS = ("-O3", "-march=native", "-std=c++17", "-shared", "-fPIC", "-pthread")
 _COMPILERS = ("g++", "c++", "clang++")
 _SECONDS = 120
 _one_at_a_time = threading.Lock()  # threads of a chase ask for the same at the same time
-_said: list[str] = []  # reasons so far, the first of them logged
+_said: set[str] = set()  # what has been logged
 
 
 @functools.cache
@@ -40,17 +40,17 @@ def compiled(name: str, *definitions: str) -> Callable[..., None] | None:
         call: Callable[..., None] = library[f"staf_{name}"]
         call.restype = None  # type: ignore[attr-defined]
     except Exception as error:  # whatever a machine lacks, the reference computes the same
-        _say(" ".join(str(error).split())[:200])
+        _say(name, " ".join(str(error).split())[:300])
         return None
     return call
 
 
-def _say(reason: str) -> None:
+def _say(name: str, reason: str) -> None:
     with _one_at_a_time:
-        first = not _said
-        _said.append(reason)
+        first = name not in _said
+        _said.add(name)
     if first:
-        _log.warning("the weight recursion runs in plain torch, slower: no compiled one (%s)", reason)
+        _log.warning("the %s of a chase runs in plain torch, slower: nothing compiled (%s)", name, reason)
 
 
 def _library(name: str, definitions: tuple[str, ...]) -> Path:

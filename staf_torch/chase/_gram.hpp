@@ -76,12 +76,12 @@ template <typename T, int N, int M, bool shared> struct Panels {
     }
     INLINE void product(const Vector &s, const Vector &v, Vector &y) const {
         Vector u;
-        for (int j = 0; j < M; ++j) u[j] = s[j] * v[j];
+        _Pragma("GCC unroll 1") for (int j = 0; j < M; ++j) u[j] = s[j] * v[j];
         const E *entry = K;
         for (int i = 0; i < M; i += panel) {
             B sum[panel];
             UNROLL for (int r = 0; r < panel; ++r) sum[r] = fill<T, N>(0);
-            for (int j = 0; j < M; ++j, entry += panel)
+            _Pragma("GCC unroll 1") for (int j = 0; j < M; ++j, entry += panel)
                 UNROLL for (int r = 0; r < panel; ++r) add(sum[r], entry[r], u[j]);
             for (int r = 0; r < panel && i + r < M; ++r) y[i + r] = s[i + r] * sum[r];
         }

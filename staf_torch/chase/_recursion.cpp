@@ -11,6 +11,11 @@
 #include "_gram.hpp"
 
 constexpr int unrolled_count = 6;      // up to this M the Gram matrix is unrolled, above it comes in panels
+#if COUNT <= 6
+#define EACH UNROLL
+#else
+#define EACH _Pragma("GCC unroll 1")
+#endif
 constexpr int tile_bytes = 4096;       // of one number a row and time: what a tile needs stays in the cache
 constexpr int tile_rows = 64;
 constexpr int most_threads = 256;
@@ -87,7 +92,7 @@ template <typename T, int M> struct Prepared {
             for (int r = 0; r < tile.rows; ++r)
                 for (int t = 0; t < tile.times; ++t) to[t * tile.rows + r] = data[r * from.row + t * from.time];
     }
-    void run(const Tile &tile) {
+    __attribute__((noinline)) void run(const Tile &tile) {
         const int size = tile.size();
         if (p.states.data) {
             for (int k = 0; k < p.dim; ++k) copy(p.states, k, tile, x + k * room);
@@ -169,22 +174,23 @@ template <typename T, int N, int M, typename Gram> struct Solver {
         }
         for (int t = 0; t < tile.times; ++t) {
             const int here = t * tile.rows + row;
-            const Vector old = a;
+            Vector old;
             const B unit = load<T, N>(ready.unit + here);
             Vector s, g, y;
-            UNROLL for (int i = 0; i < M; ++i) {
+            EACH for (int i = 0; i < M; ++i) {
+                old[i] = a[i];
                 s[i] = load<T, N>(ready.scale + i * Prepared<T, M>::room + here);
                 a[i] = old[i] * unit;
             }
             gram.prepare(s, core + (tile.time + t) * p.core_at.time, p.core_at, rows);
             gram.product(s, a, y);
-            UNROLL for (int i = 0; i < M; ++i)
+            EACH for (int i = 0; i < M; ++i)
                 g[i] = 2 * (load<T, N>(ready.value + i * Prepared<T, M>::room + here) - y[i]);
             for (int64_t n = 0; n < p.inner_steps; ++n) descend(s, a, g, y);
 
             // What is not finite stays behind: the row as it was, for ever.
             B now = gone;
-            UNROLL for (int i = 0; i < M; ++i)
+            EACH for (int i = 0; i < M; ++i)
                 LANES now.v[k] = a[i].v[k] - a[i].v[k] == 0 ? now.v[k] : fill<T, N>(1).v[k];
             if (__builtin_memcmp(&gone, &now, sizeof now) != 0) note(now, first, row, rows, tile.time + t);
             gone = now;
@@ -195,7 +201,7 @@ template <typename T, int N, int M, typename Gram> struct Solver {
             const int64_t place = (tile.time + t) * p.history_time + first;
             for (int i = 0; p.before && i < M; ++i)
                 store(static_cast<T *>(p.before) + place + i * p.history_entry, rows, choose(gone, old[i], old[i] * unit));
-            UNROLL for (int i = 0; i < M; ++i) {
+            EACH for (int i = 0; i < M; ++i) {
                 a[i] = choose(gone, old[i], a[i]);
                 if (p.after) store(static_cast<T *>(p.after) + place + i * p.history_entry, rows, a[i] * factor);
             }
@@ -208,7 +214,7 @@ template <typename T, int N, int M, typename Gram> struct Solver {
     INLINE void descend(const Vector &s, Vector &a, Vector &g, Vector &y) {
         gram.product(s, g, y);
         B slope = g[0] * g[0], curvature = g[0] * y[0];
-        UNROLL for (int i = 1; i < M; ++i) {
+        EACH for (int i = 1; i < M; ++i) {
             add(slope, g[i], g[i]);
             add(curvature, g[i], y[i]);
         }
@@ -217,7 +223,7 @@ template <typename T, int N, int M, typename Gram> struct Solver {
             twice.v[k] = curvature.v[k] > 0 ? slope.v[k] / curvature.v[k] : typename B::Vector{};
             length.v[k] = twice.v[k] * T(0.5);
         }
-        UNROLL for (int i = 0; i < M; ++i) {
+        EACH for (int i = 0; i < M; ++i) {
             add(a[i], length, g[i]);
             LANES g[i].v[k] -= twice.v[k] * y[i].v[k];
         }
