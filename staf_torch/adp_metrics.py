@@ -22,9 +22,9 @@ def adp_metrics(
 
     Args:
         result: the closed loop.
-        optimal_cost: V*(x(0)), (B,).
-        control_error: |u - u*| at the recorded times, (B, T).
-        value_error: |V - V^| at the recorded times, (B, T).
+        optimal_cost: V*(x(0)), (B,); NaN where it was not found.
+        control_error: |u - u*| at the recorded times, (B, T); NaN where it was not computed.
+        value_error: |V - V^|, likewise.
 
     Returns:
         ``cost``, ``optimal_cost``: medians over the trajectories that did not diverge (of one: itself).
@@ -39,13 +39,13 @@ def adp_metrics(
     norm = result.state[:, -1].norm(dim=-1)
     metrics: dict[str, float | None] = {
         "cost": _median(result.cost[kept]),
-        "optimal_cost": None if optimal_cost is None else _median(optimal_cost[kept]),
+        "optimal_cost": None if optimal_cost is None else _median(optimal_cost[kept & ~optimal_cost.isnan()]),
         "cost_ratio": None,
         "cost_ratio_mean": None,
         "cost_ratio_max": None,
         "final_state_norm": _worst(norm[kept]),
-        "control_error": None if control_error is None else _worst(_settled(control_error)[kept]),
-        "value_error": None if value_error is None else _worst(_settled(value_error)[kept]),
+        "control_error": _worst_known(control_error, kept),
+        "value_error": _worst_known(value_error, kept),
         "regulated_fraction": float((kept & (norm < _REGULATED)).double().mean()),
         "diverged_fraction": float(result.diverged.double().mean()),
     }
@@ -64,6 +64,14 @@ def _settled(errors: Tensor) -> Tensor:
     return errors[:, errors.shape[1] // 2 : -1]
 
 
+def _worst_known(errors: Tensor | None, kept: Tensor) -> float | None:
+    """The largest settled error of the rows ``kept``, of those that were computed (not NaN)."""
+    if errors is None:
+        return None
+    settled = _settled(errors)[kept]
+    return _worst(settled[~settled.isnan()])
+
+
 def _median(values: Tensor) -> float | None:
     return float(values.quantile(0.5)) if values.numel() else None
 
@@ -77,14 +85,14 @@ def comparison_row(result: LoopResult, ratio: Tensor) -> dict[str, float | None]
 
     Args:
         result: the closed loops.
-        ratio: cost / V*(x(0)), (B,), inf for rows that diverged.
+        ratio: cost / V*(x(0)), (B,), inf for rows that diverged, NaN where V* was not found.
 
     Returns:
         ``ratio_median`` over the rows that were regulated, as are ``ratio_mean`` and ``ratio_max``; the
         fractions ``regulated`` and ``diverged`` of all; ``final_state_norm``, the median |x| at the end.
     """
     regulated = ~result.diverged & (result.state[:, -1].norm(dim=-1) < _REGULATED)
-    kept = ratio[regulated]
+    kept = ratio[regulated & ~ratio.isnan()]
     final = result.state[:, -1].norm(dim=-1)
     return {
         "ratio_median": _median(kept),

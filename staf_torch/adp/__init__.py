@@ -30,6 +30,8 @@ from .laws import Published as Published
 from .laws import Weights as Weights
 from .lqr import LQR as LQR
 from .rollout import RolloutPolicy as RolloutPolicy
+from .shooting import DirectShooting as DirectShooting
+from .shooting import Optimum as Optimum
 from .simulation import LoopResult as LoopResult
 from .simulation import simulate as simulate
 from .supervisor import Supervised as Supervised

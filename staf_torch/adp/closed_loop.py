@@ -19,6 +19,7 @@ class LoopState(NamedTuple):
     x: Tensor  # (B, n)
     cost: Tensor  # (B,) the integral of the cost rate so far
     alive: Tensor  # (B,) bool; a row that became non-finite keeps its last finite values
+    lived: Tensor  # (B,) steps taken alive
     memory: Memory
 
 
@@ -57,7 +58,8 @@ class ClosedLoop(nn.Module):
     def init(self, x0: Tensor) -> LoopState:
         """The state at time 0 of the rows x0 (B, n)."""
         alive = torch.isfinite(x0).all(-1)
-        return LoopState(x0, x0.new_zeros(x0.shape[0]), alive, self.controller.init(x0))
+        zeros = x0.new_zeros(x0.shape[0])
+        return LoopState(x0, zeros, alive, zeros.clone(), self.controller.init(x0))
 
     def forward(self, state: LoopState, uniform: Tensor) -> tuple[LoopState, Tensor]:
         """The state after dt seconds, and the control held until then, (B, m)."""
@@ -69,7 +71,7 @@ class ClosedLoop(nn.Module):
         alive = state.alive & good
         kept = Memory(*(_where(alive, new, old) for new, old in zip(memory, state.memory, strict=True)))
         cost = state.cost + torch.where(alive, spent, 0.0)
-        return LoopState(_where(alive, x, state.x), cost, alive, kept), u
+        return LoopState(_where(alive, x, state.x), cost, alive, state.lived + alive, kept), u
 
     def _advance(self, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
         """The state after dt with u held, and the cost until then."""

@@ -11,6 +11,8 @@ from torch import Tensor, nn
 from .._checks import fail, positive_real, vector
 from ..riccati import positive_definite
 
+_EDGE = 1 - 1e-9  # of the bound, beyond which artanh is that of this share
+
 Matrix = float | Sequence[Sequence[float]] | Tensor
 
 
@@ -53,6 +55,14 @@ class Cost(nn.Module, abc.ABC):
     @abc.abstractmethod
     def policy(self, effectiveness: Tensor, gradient: Tensor) -> Tensor:
         """argmin_u of U(u) + p'g u, for g (..., n, m) and the value gradient p (..., n): (..., m)."""
+
+    def saturate(self, v: Tensor) -> Tensor:
+        """The admissible input that a free one stands for: (..., m) -> (..., m)."""
+        return v
+
+    def unsaturated(self, u: Tensor) -> Tensor:
+        """A free input that `saturate` maps to u, or near to it at the edge: (..., m) -> (..., m)."""
+        return u
 
     def _unconstrained(self, effectiveness: Tensor, gradient: Tensor) -> Tensor:
         """-1/2 R^-1 g'p: (..., m)."""
@@ -103,7 +113,15 @@ class BoundedInputCost(Cost):
         return 2 * self.bound**2 * (self.r.diagonal().to(u) * integral).sum(-1)
 
     def policy(self, effectiveness: Tensor, gradient: Tensor) -> Tensor:
-        return self.bound * (self._unconstrained(effectiveness, gradient) / self.bound).tanh()
+        return self.saturate(self._unconstrained(effectiveness, gradient))
+
+    def saturate(self, v: Tensor) -> Tensor:
+        """bound tanh(v / bound)."""
+        return self.bound * (v / self.bound).tanh()
+
+    def unsaturated(self, u: Tensor) -> Tensor:
+        """bound artanh(u / bound), finite at the bound itself."""
+        return self.bound * (u / self.bound).clamp(-_EDGE, _EDGE).atanh()
 
 
 def quadratic(matrix: Tensor, x: Tensor) -> Tensor:

@@ -116,12 +116,10 @@ def _run(
 ) -> LoopResult:
     state = loop.init(x0)
     rows: list[tuple[Tensor, ...]] = []
-    frozen_at = torch.where(state.alive, torch.inf, 0.0).to(x0)
     numbers = _uniform(x0, loop.controller.draws, seed)
     for k in range(steps):
         now = state
         state, u = step(now, next(numbers))
-        frozen_at = torch.where(now.alive & ~state.alive, k * loop.dt, frozen_at)
         if k % every == 0:
             held = torch.where(state.alive.unsqueeze(-1), u, torch.nan)
             rows.append(_record(now, held))
@@ -130,6 +128,7 @@ def _run(
     rows.append(_record(state, torch.full_like(rows[-1][1], torch.nan)))
     x, u, actor, critic, spent, known = (torch.stack(column, dim=1) for column in zip(*rows, strict=True))
     time = torch.arange(0, steps + 1, every, dtype=torch.float64) * loop.dt
+    frozen_at = torch.where(state.alive, torch.inf, state.lived * loop.dt)
     return LoopResult(time, x, u, actor, critic, spent, known, frozen_at)
 
 

@@ -4,30 +4,20 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
-import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
-from ..adp import LoopResult, Memory, QuadraticCost, simulate, value_gradient
+from ..adp import LoopResult, simulate
 from ..adp_metrics import adp_metrics
 from ..report import HistoryWriter, write_metrics
 from .build_adp import AdpProblem, adp_problem
+from .optimum import Reference, compare
 from .progress import Progress
 
 _log = logging.getLogger(__name__)
 _NAMED = 20  # diverged trajectories that the log lists by number
-_AT_ONCE = 4096  # states whose value is asked for at once
-
-
-class Optimum(NamedTuple):
-    """What is known of the optimum along a closed loop; None where nothing is."""
-
-    cost: Tensor | None  # V*(x(0)), (B,)
-    control_error: Tensor | None  # |u - u*|, (B, T)
-    value_error: Tensor | None  # |V* - V^|, (B, T)
 
 
 def run(cfg: DictConfig, directory: Path) -> dict[str, float | None]:
@@ -71,47 +61,6 @@ def solve(problem: AdpProblem) -> LoopResult:
     return result
 
 
-def compare(problem: AdpProblem, result: LoopResult, *, errors: bool = True) -> Optimum:
-    """The closed loop against the optimal value and control, where the plant knows them."""
-    system, cost = problem.system, problem.cost
-
-    value = None
-    if isinstance(cost, QuadraticCost):
-        value = system.optimal_value(result.state, cost.q, cost.r)
-    if value is None:
-        return Optimum(None, None, None)
-    if not errors:
-        return Optimum(value[:, 0], None, None)
-
-    def optimal(x: Tensor) -> Tensor:
-        known = system.optimal_value(x, cost.q, cost.r)
-        assert known is not None
-        return known
-
-    gradient = value_gradient(optimal, result.state)
-    u = cost.policy(system.effectiveness(result.state), gradient)
-    estimate = _estimates(problem, result)
-    return Optimum(
-        cost=value[:, 0],
-        control_error=(result.control - u).norm(dim=-1),
-        value_error=None if estimate is None else (value - estimate).abs(),
-    )
-
-
-def _estimates(problem: AdpProblem, result: LoopResult) -> Tensor | None:
-    """V^ at the recorded states with the weights of the time, (B, T)."""
-    pieces = []
-    x, critic, actor = (t.flatten(0, 1) for t in (result.state, result.critic_weights, result.actor_weights))
-    for at in torch.arange(len(x)).split(_AT_ONCE):
-        memory = Memory(critic[at], actor[at], critic.new_zeros(0), critic.new_zeros(0))
-        with torch.no_grad():
-            value = problem.controller.value(x[at], memory)
-        if value is None:
-            return None
-        pieces.append(value)
-    return torch.cat(pieces).reshape(result.state.shape[:2])
-
-
 def write_history(path: Path, result: LoopResult) -> None:
     """`history.npz`: time (T,), and (B, T, ...) arrays of everything recorded."""
     batch, times = result.state.shape[:2]
@@ -153,7 +102,7 @@ def _summarise(cfg: DictConfig, problem: AdpProblem, metrics: dict[str, float | 
     _log.info("  final |x| %s, regulated %s, diverged %s", *map(show, names))
 
 
-def _draw(result: LoopResult, optimum: Optimum, folder: Path, name: str) -> None:
+def _draw(result: LoopResult, optimum: Reference, folder: Path, name: str) -> None:
     # Imported here: matplotlib takes a second, which figures=false need not pay.
     from ..report import plots, plots_adp
 

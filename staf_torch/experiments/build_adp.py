@@ -10,7 +10,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
-from .._checks import choice, fail, integer, positive_real
+from .._checks import choice, fail, flag, integer, positive_real
 from ..adp import (
     LQR,
     ActorCritic,
@@ -46,6 +46,16 @@ _RECORDED = 200_000  # states of all trajectories together that are recorded unl
 
 
 @dataclasses.dataclass(frozen=True)
+class OptimumSettings:
+    """How the optimum is found where no formula knows it."""
+
+    shooting: bool
+    states: int  # recorded states, of all trajectories together, whose V* and u* are wanted
+    horizon: float | None  # s
+    intervals: int | None
+
+
+@dataclasses.dataclass(frozen=True)
 class AdpProblem:
     """A closed loop, checked."""
 
@@ -59,6 +69,7 @@ class AdpProblem:
     seed: int
     integrator: str
     compile: bool | str
+    optimum: OptimumSettings
 
 
 def adp_problem(cfg: DictConfig) -> AdpProblem:
@@ -94,6 +105,7 @@ def adp_problem(cfg: DictConfig) -> AdpProblem:
         seed=integer("staf", "seed", cfg.seed, least=0),
         integrator=cfg.adp.integrator,
         compile=cfg.adp.compile,
+        optimum=_optimum_settings(cfg.adp.optimum),
     )
 
 
@@ -216,6 +228,15 @@ def _weights_of_square(basis: ValueBasis) -> list[float]:
     square = y.square().sum(-1, keepdim=True)
     fitted: list[float] = torch.linalg.lstsq(basis(y, y), square, driver="gelsd").solution[:, 0].tolist()
     return fitted
+
+
+def _optimum_settings(cfg: DictConfig) -> OptimumSettings:
+    return OptimumSettings(
+        shooting=flag("adp", "optimum.shooting", cfg.shooting),
+        states=integer("adp", "optimum.states", cfg.states, least=0),
+        horizon=None if cfg.horizon is None else positive_real("adp", "optimum.horizon", cfg.horizon),
+        intervals=None if cfg.intervals is None else integer("adp", "optimum.intervals", cfg.intervals, 4),
+    )
 
 
 def _numbers(value: Any) -> Any:

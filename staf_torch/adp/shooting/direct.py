@@ -1,0 +1,161 @@
+"""The optimum where no formula knows it: direct shooting from every state of a batch."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..._checks import fail, integer, positive_real, trailing
+from ...systems import ControlAffineSystem
+from ..cost import Cost
+from ..lqr import LQR
+from .mesh import graded, halved, split
+from .minimise import Solution, follow, minimise
+from .newton import Plan, replay
+from .stage import Stage
+
+_DECAY = 9.2  # time constants of the slowest mode in the horizon: it falls to 1e-4
+_RESOLVED = 0.5  # mean interval in time constants of the fastest mode
+_LEAST = 80  # intervals
+_ROWS = 256  # states solved from at once: a graph of second derivatives is kept for each
+
+Policy = Callable[[Tensor], Tensor]
+Value = Callable[[Tensor], Tensor]
+
+
+class Optimum(NamedTuple):
+    """The optimal trajectories from x0, a row each; NaN in the rows that did not converge."""
+
+    value: Tensor  # V*(x0), (B,): the cost of the control that was found
+    gradient: Tensor  # grad V*(x0), (B, n)
+    control: Tensor  # u*(x0), (B, m)
+    state: Tensor  # (B, N + 1, n)
+    time: Tensor  # (N + 1,) seconds
+    mesh_error: Tensor  # relative change of the value since a mesh of half as many intervals, (B,)
+    horizon_error: Tensor  # share of the value that is the terminal cost, (B,)
+    iterations: Tensor  # Newton steps, both meshes together, (B,)
+    converged: Tensor  # (B,) bool
+
+
+class DirectShooting:
+    """min int_0^T (x'Qx + U(u)) dt + V_T(x(T)) over controls that are linear on each of N intervals, by
+    Newton's method with the exact second derivatives from automatic differentiation.
+
+    Each iteration solves the linear-quadratic problem of the second-order expansion around the current
+    trajectory by a backward Riccati recursion, and takes the longest share of its step that lowers the cost,
+    forward in time with the recursion's feedback. Where the expansion has no minimum, its absolute value
+    takes its place. It starts from the base policy. A row has converged when the model promises a relative
+    improvement of less than ``tolerance``. The problem is solved on N / 2 intervals first and then on N.
+
+    Every control that is found is admissible, so the value is an upper bound of V*, but for the errors of
+    the Runge-Kutta steps and of the horizon, which `Optimum` reports. The minimum is a local one.
+
+    Args:
+        system: the plant; its drift must have second derivatives.
+        cost: the cost rate.
+        base: the policy to start from, (..., n) -> (..., m); the LQR by default.
+        terminal: V_T, (..., n) -> (...), with two derivatives; the Riccati value by default.
+        horizon: T in s; by default so long that the slowest mode of the LQR has fallen to 1e-4.
+        intervals: N, even; by default so many that the fastest mode of the LQR is resolved.
+        tolerance: positive, relative.
+        iterations: at most, on each mesh.
+
+    Raises:
+        ValueError: if an argument breaks its rule, or the LQR that a default asks for does not exist.
+
+    Source: Dunn and Bertsekas, "Efficient dynamic programming implementations of Newton's method for
+    unconstrained optimal control problems", JOTA 63 (1989).
+    """
+
+    def __init__(
+        self,
+        system: ControlAffineSystem,
+        cost: Cost,
+        *,
+        base: Policy | None = None,
+        terminal: Value | None = None,
+        horizon: float | None = None,
+        intervals: int | None = None,
+        tolerance: float = 1e-12,
+        iterations: int = 50,
+    ) -> None:
+        self.stage = Stage(system, cost)
+        rates = (1.0, 1.0)
+        if base is None or terminal is None or horizon is None or intervals is None:
+            lqr = LQR(system, cost)
+            base, terminal = base or lqr, terminal or lqr.value
+            rates = _rates(system, lqr)
+        self.base, self.terminal = base, terminal
+        chosen = _DECAY / rates[0] if horizon is None else horizon
+        self.horizon = positive_real("DirectShooting", "horizon", chosen)
+        if intervals is None:
+            intervals = 2 * round(0.5 * max(_LEAST, self.horizon * rates[1] / _RESOLVED))
+        self.intervals = integer("DirectShooting", "intervals", intervals, least=4)
+        if self.intervals % 2:
+            raise fail("DirectShooting", "intervals", "must be even", intervals)
+        self.tolerance = positive_real("DirectShooting", "tolerance", tolerance)
+        self.iterations = integer("DirectShooting", "iterations", iterations, least=1)
+
+    def solve(self, x0: Tensor) -> Optimum:
+        """The optima from x0, (B, n).
+
+        Raises:
+            ValueError: if x0 is no batch of states of the plant.
+        """
+        trailing("DirectShooting.solve", "x0", x0, dims=2, last=self.stage.system.dim)
+        time = graded(self.horizon, self.intervals // 2).to(x0)
+        with torch.no_grad():
+            parts = [self._solve(rows, time) for rows in x0.split(_ROWS)]
+        columns = {name: torch.cat([getattr(part, name) for part in parts]) for name in Optimum._fields}
+        return Optimum(**columns | {"time": parts[0].time})
+
+    def _solve(self, x0: Tensor, time: Tensor) -> Optimum:
+        coarse = minimise(self, follow(self, x0, time.diff()), time.diff())
+        start = self._finer(coarse, time.diff())
+        time = halved(time)
+        fine = minimise(self, start, time.diff())
+        return self._optimum(fine, coarse, time)
+
+    def _finer(self, solution: Solution, lengths: Tensor) -> Plan:
+        """The same control on a mesh of half the intervals, with its cost there."""
+        plan, feedback = split(self.stage, solution.plan, solution.feedback, lengths)
+        halves = (0.5 * lengths).repeat_interleave(2)
+        none = torch.zeros_like(plan.control)
+        return replay(self.stage, plan, plan.state[:, 0], halves, self.terminal, feedback, none)
+
+    def _optimum(self, fine: Solution, coarse: Solution, time: Tensor) -> Optimum:
+        x0, plan = fine.plan.state[:, 0], fine.plan
+        value = self._finer(fine, time.diff()).cost  # the same control, more exactly integrated
+        converged = coarse.converged & fine.converged & torch.isfinite(value)
+        rest = (x0 == 0).all(-1)  # where the optimum is to stay
+        gradient = torch.where(rest.unsqueeze(-1), 0.0, fine.gradient)
+        value = torch.where(rest, 0.0, value)
+        control = self.stage.cost.policy(self.stage.system.effectiveness(x0), gradient)
+        known = converged | rest
+
+        def where_known(values: Tensor) -> Tensor:
+            return torch.where(known[(..., *([None] * (values.dim() - 1)))], values, torch.nan)
+
+        change = (plan.cost - coarse.plan.cost).abs() / value
+        share = self.terminal(plan.state[:, -1]) / value
+        return Optimum(
+            value=where_known(value),
+            gradient=where_known(gradient),
+            control=where_known(control),
+            state=where_known(plan.state),
+            time=time,
+            mesh_error=where_known(torch.where(rest, 0.0, change)),
+            horizon_error=where_known(torch.where(rest, 0.0, share)),
+            iterations=coarse.iterations + fine.iterations,
+            converged=known,
+        )
+
+
+def _rates(system: ControlAffineSystem, lqr: LQR) -> tuple[float, float]:
+    """The slowest decay and the fastest rate of the LQR's modes, 1/s."""
+    a, b = system.linearisation()
+    modes = torch.linalg.eigvals(a.to(lqr.p) - b.to(lqr.p) @ lqr.k)
+    return float(-modes.real.max()), float(modes.abs().max())
