@@ -7,7 +7,7 @@ import dataclasses
 import torch
 from torch import Tensor
 
-from .frame import Features, LocalFrame
+from .frame import LocalFrame
 
 
 @dataclasses.dataclass
@@ -52,58 +52,76 @@ class LocalFilter:
         """One sample a stream: (n, S), (S,). A stream whose sample is not finite stays as it was."""
         fine = _finite(x) & torch.isfinite(y)
         z = torch.where(fine, x - state.anchor, 0.0)
-        (far,) = (z.square().sum(0) > self.slack**2).nonzero(as_tuple=True)
+        away = _dot(z, z) > self.slack**2
+        far = away.nonzero().squeeze(-1)
         if len(far):  # a cost that only the streams which moved on pay; each is computed alone
-            self._follow(state, far, z[:, far])
-            z[:, far] = 0.0
-        psi, variance = _scaled(self.frame.features(state.anchor, z))
-        seen = (state.learned * psi).sum(1)  # D psi
-        spread = variance - self.forgetting * torch.linalg.vecdot(psi, seen, dim=0) + self.ratio
+            self._follow(state, far, z.index_select(1, far))
+            z = torch.where(away, 0.0, z)
+        found = self.frame.features(state.anchor, z)
+        psi, noise = found.functions, self.ratio
+        if found.log_factor is not None:
+            shrink = (-found.log_factor).exp()
+            y, noise = y * shrink, self.ratio * shrink.square()
+        seen = _apply(state.learned, psi).mul_(self.forgetting)  # lambda D psi
+        spread = found.variance - _dot(psi, seen) + noise
         fine = fine & (spread > 0)
         inverse = torch.where(fine, 1 / spread, 0.0)
-        error = torch.where(fine, y - torch.linalg.vecdot(psi, state.mean, dim=0), 0.0)
-        gain = psi - self.forgetting * seen
-        state.mean.addcmul_(gain, error * inverse)
+        error = torch.where(fine, y - _dot(psi, state.mean), 0.0)
+        gain = psi - seen
+        weighted = gain * inverse
+        state.mean.addcmul_(weighted, error)
         if self.forgetting < 1:
             state.learned.mul_(torch.where(fine, self.forgetting, 1.0).to(gain))
-        state.learned.addcmul_(gain.unsqueeze(1), (gain * inverse).unsqueeze(0))
+        state.learned.addcmul_(gain.unsqueeze(1), weighted.unsqueeze(0))
         state.samples.add_(fine)
         state.skipped.add_(~fine)
 
     def estimate(self, state: StreamState, x: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and variance of V at x (n, S), in units of the process: (S,), (S,)."""
-        psi, variance = _scaled(self.frame.features(state.anchor, x - state.anchor))
-        seen = (state.learned * psi).sum(1)
-        mean = torch.linalg.vecdot(psi, state.mean, dim=0)
-        return mean, variance - torch.linalg.vecdot(psi, seen, dim=0)
+        found = self.frame.features(state.anchor, x - state.anchor)
+        psi = found.functions
+        mean = _dot(psi, state.mean)
+        variance = found.variance - _dot(psi, _apply(state.learned, psi))
+        if found.log_factor is None:
+            return mean, variance
+        factor = found.log_factor.exp()
+        return mean * factor, variance * factor.square()
 
     def _follow(self, state: StreamState, rows: Tensor, step: Tensor) -> None:
         """Move the frame of the streams ``rows`` by (n, R)."""
-        anchor = state.anchor[:, rows]
-        transfer, factor = self.frame.transfer(anchor, step)
-        mean = (transfer * state.mean[:, rows]).sum(1)
-        half = _product(transfer, state.learned[..., rows])  # T D
-        state.anchor[:, rows] = anchor + step
-        state.mean[:, rows] = mean if factor is None else mean * factor
-        state.learned[..., rows] = _product(half, transfer.transpose(0, 1))
+        anchor = state.anchor.index_select(1, rows)
+        columns, factor = self.frame.transfer(anchor, step)
+        mean = _apply(columns, state.mean.index_select(1, rows))
+        half = _product(columns, state.learned.index_select(2, rows))  # T D
+        state.anchor.index_copy_(1, rows, anchor + step)
+        state.mean.index_copy_(1, rows, mean if factor is None else mean * factor)
+        state.learned.index_copy_(2, rows, _product(columns, half.transpose(0, 1)))
 
 
-def _product(a: Tensor, b: Tensor) -> Tensor:
-    """Matrix products with the batch last: (M, M, S), (M, M, S) -> (M, M, S)."""
-    total = a[:, 0].unsqueeze(1) * b[0]
-    for k in range(1, a.shape[1]):
-        total.addcmul_(a[:, k].unsqueeze(1), b[k])
+def _apply(columns: Tensor, vector: Tensor) -> Tensor:
+    """A v with the batch last, from A': (M, M, S), (M, S) -> (M, S)."""
+    total = columns[0] * vector[0]
+    for k in range(1, len(vector)):
+        total.addcmul_(columns[k], vector[k])
     return total
 
 
-def _scaled(found: Features) -> tuple[Tensor, Tensor]:
-    """psi and the variance at the point in units of V."""
-    if found.log_factor is None:
-        return found.functions, found.variance
-    factor = found.log_factor.exp()
-    return found.functions * factor, found.variance * factor.square()
+def _product(columns: Tensor, matrix: Tensor) -> Tensor:
+    """A B with the batch last, from A': (M, M, S), (M, M, S) -> (M, M, S)."""
+    total = columns[0].unsqueeze(1) * matrix[0]
+    for k in range(1, len(columns)):
+        total.addcmul_(columns[k].unsqueeze(1), matrix[k])
+    return total
+
+
+def _dot(a: Tensor, b: Tensor) -> Tensor:
+    """(M, S), (M, S) -> (S,), term by term."""
+    total = a[0] * b[0]
+    for k in range(1, len(a)):
+        total.addcmul_(a[k], b[k])
+    return total
 
 
 def _finite(x: Tensor) -> Tensor:
-    finite: Tensor = torch.isfinite(x).all(0)
-    return finite
+    total: Tensor = _dot(x, torch.zeros_like(x))  # 0 unless something is not finite
+    return total == 0

@@ -14,7 +14,7 @@ _JUMP = 4.0  # radii: beyond, a kernel whose scale grows with the state says not
 
 
 class Features(NamedTuple):
-    """The frame at some points: V = psi'u up to a rest of variance k0(z, z) - psi'psi, all times the factor."""
+    """The process at some points: V = e^{s(x, z)} (psi'u + rest), the rest of variance k0(z, z) - psi'psi."""
 
     functions: Tensor  # psi, (M, S)
     variance: Tensor  # k0(z, z), (S,)
@@ -57,39 +57,47 @@ class LocalFrame(NamedTuple):
         return Features(functions.to(z), self._variance(state, at).to(z), log_factor)
 
     def transfer(self, x: Tensor, step: Tensor) -> tuple[Tensor, Tensor | None]:
-        """What u becomes when the state x moves by h: u' = factor T u, and what was known of it T.
+        """What becomes of u when the state x moves by h: u' = e^f T u; T alone for what was known of it.
 
-        T = C'(x + h) diag(m) k0(h + d, d) C(x) with m_i = e^{s(x, h + d_i) - s(x + h, d_i) + (g(x) - g(x + h))/2}:
-        the local function at the new centers, fitted there. T is a compression of a translation, |T| <= 1.
-        For k0 = exp(q z'd) the spans at two states differ by the factor e^{-q h'z} alone, which m carries.
+        T = C'(x + h) diag(m) k0(h + d, d) C(x) with m_i = e^{s(x, h + d_i) - s(x + h, d_i) - f}, and
+        f = (g(x + h) - g(x))/2: the local function at the new centers, fitted there. T is the compression of
+        a unitary translation, so that |T| <= 1. For k0 = exp(q z'd) the spans at two states differ by the
+        factor e^{-q h'z} alone, which m carries.
 
         Args:
-            x: (n, S).
-            step: h, (n, S).
+            x: (n, R).
+            step: h, (n, R).
 
         Returns:
-            T (M, M, S), and the factor e^{(g(x + h) - g(x))/2}, (S,), None for ones.
+            T' (M, M, R), the columns of T first, and e^f, (R,), None for ones.
         """
-        state, h = x.mT.double(), step.mT.double()
-        d, moved = self.offsets, x.mT.double() + h
-        points = h.unsqueeze(-2) + d  # (S, M, n)
+        state, h, d = x.mT.double(), step.mT.double(), self.offsets
+        moved, points = state + h, h + d.unsqueeze(1)  # (R, n), (M, R, n)
         if self.shared is not None:
             core = self.kernel.core(torch.zeros_like(d[0]), points.flatten(0, 1), d)
-            before = after = self.shared
-            rows = (core @ before).unflatten(0, points.shape[:2])
+            rows = (self.shared.mT @ core.mT).unflatten(-1, points.shape[:2])
         else:
-            before, after = self._newton(state), self._newton(moved)
-            rows = self.kernel.core(state, points, d) @ before
-        here, there = self.kernel.log_scale(state, points), self.kernel.log_scale(moved, d)
-        if here is not None and there is not None:
-            rows = rows * (here - there).exp().unsqueeze(-1)
+            at = self.kernel.core(state, points.transpose(0, 1), d) @ self._newton(state)
+            rows = at.permute(2, 1, 0)
+        log_factor, half = self._factors(state, moved, points.transpose(0, 1))
+        if log_factor is not None:
+            rows = rows * log_factor.mT.exp()
+        if self.shared is not None:
+            columns = self.shared.mT @ rows
+        else:
+            columns = (rows.permute(2, 0, 1) @ self._newton(moved)).permute(1, 2, 0)
+        return columns.to(step), None if half is None else half.exp().to(step)
+
+    def _factors(self, state: Tensor, moved: Tensor, points: Tensor) -> tuple[Tensor | None, Tensor | None]:
+        """log m, (R, M), -inf after a jump, and f, (R,); None for zeros."""
+        here, there = self.kernel.log_scale(state, points), self.kernel.log_scale(moved, self.offsets)
+        log_factor = None if here is None or there is None else here - there
         g, g_moved = self.kernel.log_gain(state), self.kernel.log_gain(moved)
-        if g is None or g_moved is None:
-            return (after.mT @ rows).permute(1, 2, 0).to(step), None
-        near = h.square().sum(-1) <= (_JUMP**2) * d.square().sum(-1).amax()
+        if g is None or g_moved is None or log_factor is None:
+            return log_factor, None
+        near = (moved - state).square().sum(-1) <= _JUMP**2 * self.offsets.square().sum(-1).amax()
         half = torch.where(near, (g_moved - g) / 2, 0.0)
-        rows = torch.where(near[:, None, None], rows * (-half).exp()[:, None, None], 0.0)
-        return (after.mT @ rows).permute(1, 2, 0).to(step), half.exp().to(step)
+        return torch.where(near.unsqueeze(-1), log_factor - half.unsqueeze(-1), -torch.inf), half
 
     def _newton(self, state: Tensor) -> Tensor:
         return _newton(self.kernel.core(state, self.offsets, self.offsets))

@@ -154,7 +154,8 @@ class StaFRegressor:
             self._prepare(states)
         self._check_streams("partial_fit", states)
         like = self._state_.anchor
-        self._filter_.learn(self._state_, states.reshape(-1, states.shape[-1]).to(like).mT, self._units(values))
+        rows = states.reshape(-1, states.shape[-1]).to(like).mT.contiguous()
+        self._filter_.learn(self._state_, rows, self._units(values))
         return self
 
     def predict(self, x: Any, return_std: bool = False) -> Any:
