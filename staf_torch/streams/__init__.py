@@ -1,0 +1,3 @@
+"""Online regression on streams of samples."""
+
+from .regressor import StaFRegressor as StaFRegressor
