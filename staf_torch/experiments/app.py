@@ -77,9 +77,7 @@ def _task(cfg: DictConfig) -> dict[str, float | None]:
 
 def _experiment(cfg: DictConfig, directory: Path) -> dict[str, float | None]:
     choice("staf", "task", cfg.task, EXPERIMENTS)
-    experiment = importlib.import_module(f"{__package__}.{cfg.task}")
-    metrics: dict[str, float | None] = experiment.run(cfg, directory)
-    return metrics
+    return importlib.import_module(f"{__package__}.members").run(cfg, directory)  # type: ignore[no-any-return]
 
 
 class Refused(SystemExit):

@@ -107,9 +107,10 @@ class GradedSpace(NamedTuple):
 
     def fit(self, values: Tensor) -> Tensor:
         """beta with sum_j psi_j(u_i) beta_j = e^{-s(d_i)} V(c_i): (..., M) -> (..., M)."""
-        bound = None if self.nu.dim() == 0 else self.bound()
+        # Where the radius of a row is the same at all its states, its own inverse is exact and as cheap.
+        bound = self.bound() if self.meeting and self.nu.dim() > 0 else None
         if bound is not None:
-            bound = (self.rate * (bound * self.basis.reach).square()).amax()
+            bound = self.rate * (bound * self.basis.reach).square()
         interpolation = Interpolation.of(self.basis, self._r2, bound)
         offsets = self.offsets
 
