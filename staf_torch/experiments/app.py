@@ -7,7 +7,6 @@ import importlib
 import inspect
 import logging
 import os
-import re
 import shutil
 import sys
 import warnings
@@ -16,15 +15,12 @@ from typing import Any
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig
-from omegaconf.errors import OmegaConfBaseException
 
 from .._checks import choice
-
-USER_ERRORS = (ValueError, HydraException, OmegaConfBaseException, OSError)
-"""What a setting or the disk can bring about; anything else is a defect and keeps its trace."""
+from .sweep.records import RUN, RunRecord
+from .wording import USER_ERRORS, reason, sentence
 
 _log = logging.getLogger(__name__)
 _FULL_ERROR = "HYDRA_FULL_ERROR"
@@ -61,11 +57,18 @@ def _hydra_options() -> dict[str, Any]:
 def _task(cfg: DictConfig) -> dict[str, float | None]:
     settings = HydraConfig.get()
     directory = Path(settings.runtime.output_dir)
+    record = RunRecord(cfg, settings.runtime.choices, list(settings.overrides.task))
     try:
+        record.write(directory, "running")
         with warnings.catch_warnings():
             warnings.showwarning = _log_warning
             metrics = _experiment(cfg, directory)
-    except USER_ERRORS as error:
+        record.write(directory, "completed")
+    except BaseException as error:
+        with contextlib.suppress(OSError):
+            record.write(directory, "failed", reason(error))
+        if not isinstance(error, USER_ERRORS):
+            raise
         if settings.mode != RunMode.RUN:  # a member of a sweep keeps its log, and the sweep goes on
             _log.error("%s", sentence(error))
             raise
@@ -94,7 +97,8 @@ def _withdraw(directory: Path) -> None:
     if (directory / "metrics.json").exists():
         return
     shutil.rmtree(directory / ".hydra", ignore_errors=True)
-    (directory / "staf.log").unlink(missing_ok=True)
+    for name in (RUN, "staf.log"):
+        (directory / name).unlink(missing_ok=True)
     with contextlib.suppress(OSError):  # not empty: it was there before
         directory.rmdir()
 
@@ -125,18 +129,3 @@ def main() -> None:
     finally:
         if before is None:
             del os.environ[_FULL_ERROR]
-
-
-def sentence(error: BaseException) -> str:
-    """The library's own words where Hydra wrapped them, else the error's."""
-    cause: BaseException | None = error
-    while cause is not None:
-        if isinstance(cause, ValueError) and not isinstance(cause, OmegaConfBaseException):
-            return str(cause)
-        cause = cause.__cause__
-    if isinstance(error, OSError) and not isinstance(error, HydraException) and error.filename:
-        return f"cannot write {error.filename}: {error.strerror}"
-    unknown = re.match(r"Could not override '(.+?)'", str(error))
-    if unknown:
-        return f"there is no setting `{unknown[1]}`; `staf --help` lists them."
-    return str(error)
