@@ -19,7 +19,12 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 
 from .._checks import choice
-from .sweep.records import RUN, RunRecord
+from .composition import config_directory as config_directory
+from .plugin import find_launcher
+from .sweep import handoff, records
+from .sweep.objective import Metrics, objective
+from .sweep.resume import command_line
+from .sweep.session import session
 from .wording import USER_ERRORS, reason, sentence
 
 _log = logging.getLogger(__name__)
@@ -38,13 +43,6 @@ EXPERIMENTS = (
 """Modules of this package with a function ``run(cfg, directory)``, by the name in ``task``."""
 
 
-def config_directory() -> str:
-    """`conf/`: inside the package when it is installed from a wheel, beside it in a checkout."""
-    package = Path(__file__).resolve().parent.parent
-    inside = package / "conf"
-    return str(inside if inside.is_dir() else package.parent / "conf")
-
-
 def _hydra_options() -> dict[str, Any]:
     options: dict[str, Any] = {"config_path": config_directory(), "config_name": "config"}
     options["version_base"] = "1.3"
@@ -53,42 +51,65 @@ def _hydra_options() -> dict[str, Any]:
     return options
 
 
+find_launcher()
+
+
 @hydra.main(**_hydra_options())
-def _task(cfg: DictConfig) -> dict[str, float | None]:
+@handoff.takes_solved
+def _task(cfg: DictConfig) -> Metrics | float | tuple[float, ...]:
     settings = HydraConfig.get()
-    directory = Path(settings.runtime.output_dir)
-    record = RunRecord(cfg, settings.runtime.choices, list(settings.overrides.task))
+    directory, overrides = Path(settings.runtime.output_dir), list(settings.overrides.task)
+    if records.resumed(cfg):
+        finished = records.metrics_of(directory, overrides)
+        if finished is not None:
+            _log.info("completed before: %s", os.path.relpath(directory))
+            return objective(cfg, finished)
+    metrics = _recorded(cfg, directory, records.RunRecord(cfg, settings.runtime.choices, overrides))
+    _log.info("  run directory: %s", os.path.relpath(directory))
+    return objective(cfg, metrics)
+
+
+def _recorded(cfg: DictConfig, directory: Path, record: records.RunRecord) -> Metrics:
+    """The experiment, and in `run.json` how it ends."""
+    solved = handoff.current()
+    record.add_seconds(0.0 if solved is None else solved.seconds)
     try:
         record.write(directory, "running")
         with warnings.catch_warnings():
             warnings.showwarning = _log_warning
-            metrics = _experiment(cfg, directory)
+            metrics = _experiment(cfg, directory, solved)
         record.write(directory, "completed")
     except BaseException as error:
         with contextlib.suppress(OSError):
             record.write(directory, "failed", reason(error))
-        if not isinstance(error, USER_ERRORS):
-            raise
-        if settings.mode != RunMode.RUN:  # a member of a sweep keeps its log, and the sweep goes on
-            _log.error("%s", sentence(error))
-            raise
-        _withdraw(directory)
-        raise Refused(error) from error
-    _log.info("  run directory: %s", os.path.relpath(directory))
+        refused = isinstance(error, USER_ERRORS)
+        if HydraConfig.get().mode != RunMode.RUN:  # a member of a sweep keeps its log, and the sweep goes on
+            _log.error("%s", reason(error), exc_info=None if refused else error)
+        elif refused:
+            _withdraw(directory)
+            raise Refused(error) from error
+        raise
     return metrics
 
 
-def _experiment(cfg: DictConfig, directory: Path) -> dict[str, float | None]:
+def _experiment(cfg: DictConfig, directory: Path, solved: handoff.Solved | None) -> Metrics:
     choice("staf", "task", cfg.task, EXPERIMENTS)
-    experiment = importlib.import_module(f"{__package__}.{cfg.task}")
-    metrics: dict[str, float | None] = experiment.run(cfg, directory)
+    metrics: Metrics
+    if solved is None:
+        metrics = importlib.import_module(f"{__package__}.{cfg.task}").run(cfg, directory)
+    elif isinstance(solved.outcome, BaseException):
+        raise solved.outcome
+    else:
+        from . import members
+
+        metrics = members.write(cfg, directory, solved.outcome)
     return metrics
 
 
 class Refused(SystemExit):
     """A run that ended by a user's error: Hydra lets it pass without a word of its own."""
 
-    def __init__(self, error: Exception) -> None:
+    def __init__(self, error: BaseException) -> None:
         super().__init__(f"staf: {sentence(error)}")
 
 
@@ -97,7 +118,7 @@ def _withdraw(directory: Path) -> None:
     if (directory / "metrics.json").exists():
         return
     shutil.rmtree(directory / ".hydra", ignore_errors=True)
-    for name in (RUN, "staf.log"):
+    for name in (records.RUN, "staf.log"):
         (directory / name).unlink(missing_ok=True)
     with contextlib.suppress(OSError):  # not empty: it was there before
         directory.rmdir()
@@ -114,18 +135,27 @@ def main() -> None:
     # Hydra then hands every exception on, and this function words it, once, for run and sweep alike.
     os.environ[_FULL_ERROR] = "1"
     sys.path.insert(0, os.getcwd())  # so that `target.path=my_module.my_function` finds the user's file
-    try:
-        _task()
-    except Refused as refused:
-        if wants_trace and refused.__cause__ is not None:
-            raise refused.__cause__ from None
-        raise
-    except USER_ERRORS as error:
-        if wants_trace:
+    typed = sys.argv
+    with session() as running:
+        try:
+            sys.argv = [typed[0], *command_line(typed[1:])]
+            try:
+                _task()
+            except Exception:
+                running.close()
+                raise
+        except Refused as refused:
+            if wants_trace and refused.__cause__ is not None:
+                raise refused.__cause__ from None
             raise
-        sys.exit(f"staf: {sentence(error)}")
-    except KeyboardInterrupt:
-        sys.exit("staf: interrupted")
-    finally:
-        if before is None:
-            del os.environ[_FULL_ERROR]
+        except USER_ERRORS as error:
+            if wants_trace:
+                raise
+            sys.exit(f"staf: {sentence(error)}")
+        except KeyboardInterrupt:
+            sys.stderr.write(running.farewell + "\n")
+            sys.exit(130)  # as shells have it
+        finally:
+            sys.argv = typed
+            if before is None:
+                del os.environ[_FULL_ERROR]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -27,23 +28,20 @@ class RunRecord:
         cfg: all settings but Hydra's.
         choices: the option chosen of each group of settings.
         overrides: as typed.
-        seconds: spent on the run before it began, in a tensor batch that it shared.
     """
 
-    def __init__(
-        self,
-        cfg: DictConfig,
-        choices: Mapping[str, str | None],
-        overrides: Sequence[str],
-        seconds: float = 0.0,
-    ) -> None:
-        self._start = time.monotonic() - seconds
+    def __init__(self, cfg: DictConfig, choices: Mapping[str, str | None], overrides: Sequence[str]) -> None:
+        self._start = time.monotonic()
         self._about = {
             "version": __version__,
             "task": cfg.get("task"),
             "overrides": own(overrides),
             "settings": flat(cfg) | {g: c for g, c in choices.items() if not g.startswith("hydra/")},
         }
+
+    def add_seconds(self, seconds: float) -> None:
+        """Spent on the run before it began, its share of a tensor batch."""
+        self._start -= seconds
 
     def write(self, directory: Path, status: str, reason: str | None = None) -> None:
         """The record with that status: running, completed or failed."""
@@ -119,3 +117,38 @@ def metrics_of(directory: Path, overrides: Sequence[str]) -> dict[str, float | N
             f"where this sweep has {' '.join(own(overrides))!r}."
         )
     return read(directory / METRICS) if record.get("status") == "completed" else None
+
+
+def resumed(cfg: DictConfig) -> bool:
+    """Whether the sweep of these settings takes up an earlier one."""
+    return OmegaConf.select(cfg, f"{SETTINGS}.resume") is not None
+
+
+def without_hydra(config: DictConfig) -> DictConfig:
+    """The settings as a task sees them, a copy."""
+    return OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
+
+
+def begin_sweep(directory: Path, overrides: Sequence[str], hydra: Sequence[str]) -> None:
+    """`sweep.json` of a sweep that begins: what was typed."""
+    _write_sweep(directory, {"version": __version__, "overrides": own(overrides), "hydra": list(hydra)})
+
+
+def list_jobs(directory: Path, numbered: Mapping[int, Sequence[str]]) -> None:
+    """Add jobs to `sweep.json`, number to overrides, before the first of them starts."""
+    record = read(directory / SWEEP) or {"version": __version__}
+    jobs = {job["num"]: job["overrides"] for job in record.get("jobs", ())}
+    jobs |= {num: own(overrides) for num, overrides in numbered.items()}
+    listed = [{"num": num, "overrides": overrides} for num, overrides in sorted(jobs.items())]
+    _write_sweep(directory, {**record, "jobs": listed})
+
+
+def _write_sweep(directory: Path, record: Mapping[str, Any]) -> None:
+    write_text(directory / SWEEP, json.dumps({"jobs": [], **record}, indent=1, allow_nan=False) + "\n")
+
+
+def quoted(value: str) -> str:
+    """A text as a value in Hydra's grammar of overrides."""
+    if re.fullmatch(r"[A-Za-z0-9_./@+-]+", value):
+        return value
+    return "'" + value.replace("\\", "\\\\").replace("'", "\\'") + "'"

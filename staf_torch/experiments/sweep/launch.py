@@ -1,0 +1,170 @@
+"""The batched launcher at work: jobs that may share a tensor batch are solved together, then every job is
+replayed through Hydra's own `run_job`, which gives it its directory, `.hydra/`, log, callbacks and status."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import inspect
+import logging
+from collections.abc import Callable, Generator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from hydra.core.utils import JobReturn, JobStatus, configure_log, filter_overrides, run_job, setup_globals
+from omegaconf import DictConfig, OmegaConf, open_dict
+
+from ..._checks import integer
+from ..progress import listening
+from ..wording import reason
+from . import handoff, records
+from .composed import ComposeOnce
+from .executors import executor
+from .objective import objective
+from .progress import SweepProgress
+
+_log = logging.getLogger(__name__)
+
+
+class Job(NamedTuple):
+    """A job that is to run."""
+
+    num: int
+    overrides: list[str]
+    config: DictConfig  # with Hydra's node
+    settings: DictConfig  # without
+
+    @property
+    def name(self) -> str:
+        """`job 3 (kernel=gaussian seed=1)`."""
+        return f"job {self.num} ({' '.join(records.own(filter_overrides(self.overrides)))})"
+
+
+class Launch:
+    """One call of Hydra's: a list of jobs to run.
+
+    Args:
+        launcher: the plugin, with its settings and what Hydra set up.
+    """
+
+    def __init__(self, launcher: Any) -> None:
+        self._launcher, self._context = launcher, launcher.hydra_context
+        self._task: Callable[[DictConfig], Any] = launcher.task_function
+        self._master: DictConfig = launcher.config
+        self._directory = Path(str(self._master.hydra.sweep.dir))
+        self._progress = SweepProgress(0)
+        if launcher.batch is not None:
+            integer("hydra.launcher", "batch", launcher.batch, least=1)
+
+    def run(self, job_overrides: Sequence[Sequence[str]], first: int) -> list[JobReturn]:
+        """The returns of the jobs, in order."""
+        setup_globals()
+        self._hydra_logging()
+        self._directory.mkdir(parents=True, exist_ok=True)
+        numbered = {first + i: list(overrides) for i, overrides in enumerate(job_overrides)}
+        records.list_jobs(self._directory, numbered)
+        returns = self._finished(numbered)
+        jobs = [self._compose(num, overrides) for num, overrides in numbered.items() if num not in returns]
+        self._progress = SweepProgress(len(numbered), len(returns))
+        try:
+            with contextlib.closing(self._solved(jobs)) as solved_jobs:
+                for job, solved in solved_jobs:
+                    returns[job.num] = self._replay(job, solved)
+        finally:
+            self._progress.close()
+            self._hydra_logging()
+        failed = sum(ended.status == JobStatus.FAILED for ended in returns.values())
+        _log.info("%d of %d jobs completed, %d failed", len(returns) - failed, len(returns), failed)
+        return [returns[num] for num in numbered]
+
+    def _solved(self, jobs: list[Job]) -> Generator[tuple[Job, handoff.Solved | None], None, None]:
+        """Every job with what was computed for it, as the tensor batches end."""
+        if not jobs or not handoff.is_marked(self._task):  # nothing to batch, or another program's task
+            yield from ((job, None) for job in jobs)
+            return
+        about = self._launcher
+        with executor(about.executor, about.workers, about.arguments, self._directory) as workers:
+            batches = self._batches(jobs, workers.pieces)
+            _log.info("%d jobs in %d tensor batches, %s", len(jobs), len(batches), self._directory)
+            done = workers.map([[job.settings for job in batch] for batch in batches])
+            self._progress.expect([len(batch) for batch in batches])
+            with listening(self._progress.part):
+                for number, (outcomes, seconds) in done:
+                    batch = batches[number]
+                    self._progress.solved(len(batch))
+                    for job, outcome in zip(batch, outcomes, strict=True):
+                        yield job, handoff.Solved(outcome, seconds / len(batch))
+                    self._hydra_logging()  # what follows belongs to no job's log
+
+    def _replay(self, job: Job, solved: handoff.Solved | None) -> JobReturn:
+        with handoff.handed(solved):
+            ended = run_job(
+                hydra_context=self._context,
+                task_function=self._task if solved is None else _off_the_terminal(self._task),
+                config=job.config,
+                job_dir_key="hydra.sweep.dir",
+                job_subdir_key="hydra.sweep.subdir",
+            )
+        failure = ended._return_value if ended.status == JobStatus.FAILED else None
+        self._progress.ended(job.name, None if failure is None else reason(failure))
+        return ended
+
+    def _finished(self, numbered: dict[int, list[str]]) -> dict[int, JobReturn]:
+        """The jobs that an earlier start of this sweep completed."""
+        if not records.resumed(self._master):
+            return {}
+        found = {}
+        for num, overrides in numbered.items():
+            metrics = records.metrics_of(self._directory / self._subdirectory(num, overrides), overrides)
+            if metrics is not None:
+                ended = JobReturn(overrides=overrides, status=JobStatus.COMPLETED)
+                ended.return_value = objective(self._master, metrics)
+                found[num] = ended
+        return found
+
+    def _subdirectory(self, num: int, overrides: list[str]) -> str:
+        written = OmegaConf.to_container(self._master.hydra.sweep, resolve=False)
+        assert isinstance(written, dict)
+        if written["subdir"] == "${hydra.job.num}":  # ours; no need to compose what need not run
+            return str(num)
+        return str(self._compose(num, overrides).config.hydra.sweep.subdir)
+
+    def _compose(self, num: int, overrides: list[str]) -> Job:
+        loader = self._context.config_loader
+        assert isinstance(loader, ComposeOnce)
+        config = loader.take(self._master, overrides)
+        with open_dict(config):
+            config.hydra.job.id = str(num)
+            config.hydra.job.num = num
+        return Job(num, overrides, config, records.without_hydra(config))
+
+    def _batches(self, jobs: list[Job], pieces: int) -> list[list[Job]]:
+        """The jobs of every tensor batch: in order, at least so many where a group is large enough."""
+        from .. import members
+
+        settings = [job.settings for job in jobs]
+        found = []
+        for group in members.groups(settings):
+            most = min(self._launcher.batch or len(group), -(-len(group) // pieces))
+            for chunk in members.chunks(settings, group):
+                found += [chunk[i : i + most] for i in range(0, len(chunk), most)]
+        return [[jobs[i] for i in chunk] for chunk in sorted(found)]
+
+    def _hydra_logging(self) -> None:
+        trusted = {}
+        if "execution_whitelist" in inspect.signature(configure_log).parameters:  # Hydra 1.4
+            trusted = {"execution_whitelist": self._context.execution_whitelist}
+        configure_log(self._master.hydra.hydra_logging, self._master.hydra.verbose, **trusted)
+
+
+def _off_the_terminal(task: Callable[[DictConfig], Any]) -> Callable[[DictConfig], Any]:
+    """The task with its log in its file alone: a hundred summaries would bury the line of progress."""
+
+    @functools.wraps(task)
+    def quiet(cfg: DictConfig) -> Any:
+        for handler in logging.getLogger().handlers:
+            if isinstance(handler, logging.StreamHandler) and not isinstance(handler, logging.FileHandler):
+                handler.setLevel(logging.CRITICAL + 1)
+        return task(cfg)
+
+    return quiet
