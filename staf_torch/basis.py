@@ -146,6 +146,7 @@ class StaFBasis(nn.Module):
             radius=self.centers.radius(x) * reach,
             rate=rate.to(x),
             bound=None if bound is None else bound * self._graded.reach,
+            constant=self.centers.radius.constant,
         )
 
     def check_reach(self, x: Tensor) -> bool:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
+import json
 import math
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -71,26 +73,61 @@ def load(path: str, arguments: dict[str, Any] | None = None) -> Any:
     return found
 
 
-def chase_problem(cfg: DictConfig) -> ChaseProblem:
+class Parts:
+    """Objects of many configurations: equal settings make one object, once.
+
+    What a construction warns of is said again to every configuration that uses the object.
+    """
+
+    def __init__(self) -> None:
+        self._made: dict[tuple[object, ...], tuple[Any, list[str]]] = {}
+
+    def __call__(self, make: Callable[..., Any], *arguments: Any) -> Any:
+        """``make(*arguments)``; arguments are settings, or objects that come from here."""
+        key = (make, *map(_key, arguments))
+        if key not in self._made:
+            with warnings.catch_warnings(record=True) as given:
+                warnings.simplefilter("always")
+                made = make(*arguments)
+            self._made[key] = made, [str(warning.message) for warning in given]
+        made, said = self._made[key]
+        for message in said:
+            warnings.warn(message, stacklevel=2)
+        return made
+
+
+def _key(argument: object) -> object:
+    """Equal for equal settings; every other object is itself."""
+    if OmegaConf.is_config(argument):
+        return json.dumps(OmegaConf.to_container(argument, resolve=True), default=repr)
+    return argument if isinstance(argument, int | float | str | None) else id(argument)
+
+
+def chase_problem(cfg: DictConfig, parts: Parts | None = None) -> ChaseProblem:
     """The gradient chase that the settings describe.
+
+    Args:
+        cfg: the settings.
+        parts: of other problems of the same batch, to share what is equal.
 
     Raises:
         ValueError: if a setting breaks its rule; the message names it.
     """
+    parts = Parts() if parts is None else parts
     device, dtype = placement(cfg.device, cfg.dtype)
-    system = make(cfg.system)
+    system = parts(make, cfg.system)
     if not callable(getattr(system, "drift", None)):
         raise fail(COMMAND_LINE, "system", "must be a plant with a method `drift`", system)
     dim = _dimension(system, cfg.initial_state)
-    basis = StaFBasis(make(cfg.kernel), make_centers(cfg.centers, dim))
-    target = make(cfg.target)
+    basis = parts(StaFBasis, parts(make, cfg.kernel), parts(make_centers, cfg.centers, dim))
+    target = parts(make, cfg.target)
     if not callable(target):
         raise fail(COMMAND_LINE, "target", "must be callable", target)
     dt = positive_real(COMMAND_LINE, "dt", cfg.dt)
     duration = positive_real(COMMAND_LINE, "duration", cfg.duration)
     if duration < dt:
         raise fail(COMMAND_LINE, "duration", f"must be at least one step (dt={dt})", duration)
-    law, inner_steps = _law(cfg.optimizer)
+    law, inner_steps = parts(_law, cfg.optimizer)
     for module in (system, basis, target):
         if isinstance(module, nn.Module):
             module.to(device=device, dtype=dtype)
@@ -104,7 +141,7 @@ def chase_problem(cfg: DictConfig) -> ChaseProblem:
         steps=math.floor(duration / dt + 1e-9),
         inner_steps=inner_steps,
         settle_time=real(COMMAND_LINE, "settle_time", cfg.settle_time),
-        predictor=None if cfg.predictor.get("_target_") is None else make(cfg.predictor),
+        predictor=None if cfg.predictor.get("_target_") is None else parts(make, cfg.predictor),
         certificate=flag(COMMAND_LINE, "certificate", cfg.certificate),
     )
 

@@ -142,7 +142,7 @@ def _record(composed: DictConfig, parsed: Sequence[Override]) -> None:
 
 def settings(cfg: DictConfig) -> dict[str, Any]:
     """All settings but Hydra's, resolved: flat dotted key -> scalar or list."""
-    plain = OmegaConf.to_container(cfg, resolve=False)
+    plain = OmegaConf.to_container(cfg, resolve=True)
     assert isinstance(plain, dict)
     plain.pop("hydra", None)
     return _flat("", plain)

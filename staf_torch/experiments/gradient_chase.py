@@ -3,163 +3,269 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import logging
+import math
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
-import torch
 from omegaconf import DictConfig
-from torch import Tensor
 
 from .._checks import COMMAND_LINE, flag
-from ..chase import ChaseResult, chase_pieces, chunk_length
-from ..metrics import ChaseMetrics
 from ..report import HistoryWriter, write_metrics
-from ..systems import trajectory
-from .build import ChaseProblem, chase_problem
+from .build import ChaseProblem, Parts, chase_problem
+from .chase_batch import Outcome, simulate
 from .progress import Progress
 
 _log = logging.getLogger(__name__)
-_HISTORY = ("state", "value", "estimate", "weights", "ideal_weights", "excess")
-_DRAWN = (*_HISTORY, "ideal_estimate")
-_DRAWN_TIMES = 4000  # more could not be told apart in print
 _NAMED = 20  # diverged trajectories that the log lists by number
 
+BATCHABLE = frozenset(
+    {
+        *("seed", "initial_state", "spread", "trajectories", "dt", "duration", "settle_time"),
+        *("centers.radius", "centers.shrink.offset", "centers.shrink.gain"),
+        *("kernel.width", "kernel.length_scale", "kernel.alpha", "kernel.bias"),
+        *("target.matrix", "target.frequency", "target.phase"),
+        *("optimizer.step", "optimizer.momentum"),
+    }
+)
+"""Settings whose numbers may differ within a tensor batch; see `shape` for dt and duration."""
 
-class Outcome(NamedTuple):
-    """What a gradient chase leaves behind in memory."""
 
-    metrics: dict[str, float | None]
-    drawn: dict[str, np.ndarray]  # the first trajectory, thinned: name -> (T', ...)
-    diverged_at: Tensor  # (B,) index of time, -1 if none
+def shape(settings: Mapping[str, object]) -> object:
+    """What follows from batchable settings and must be equal all the same: the number of steps."""
+    dt, duration = settings["dt"], settings["duration"]
+    if not isinstance(dt, int | float) or not isinstance(duration, int | float) or dt <= 0:
+        return "none"
+    ratio = duration / dt
+    return math.floor(ratio + 1e-9) if math.isfinite(ratio) else "none"
+
+
+@dataclasses.dataclass(frozen=True)
+class Title:
+    """A problem in a few words, for the log."""
+
+    rows: int
+    times: int
+    dt: float
+    settle_time: float
+    method: str
+
+    @classmethod
+    def of(cls, problem: ChaseProblem) -> Title:
+        predictor = problem.predictor
+        method = (
+            f"{problem.basis.count} centers, {type(problem.basis.kernel).__name__}, "
+            f"{type(problem.law).__name__} x {problem.inner_steps}"
+            + ("" if predictor is None else f", {type(predictor).__name__.lower()} predictor")
+        )
+        batch = len(problem.initial_states)
+        return cls(batch, problem.steps + 1, problem.dt, problem.settle_time, method)
+
+
+@dataclasses.dataclass(frozen=True)
+class Solved:
+    """A problem that has been solved and has left nothing on disk yet. It can be pickled."""
+
+    title: Title
+    outcome: Outcome
+    starts: list[list[float]]  # initial states, (B, n)
+    history: dict[str, np.ndarray] | None = None  # name -> (B, T, ...)
+    warnings: tuple[str, ...] = ()
 
 
 def run(cfg: DictConfig, directory: Path) -> dict[str, float | None]:
-    """Run what the settings describe and fill the run directory; `metrics.json` comes last."""
+    """Run what the settings describe and fill the run directory; `metrics.json` comes last.
+
+    `write` of what `solve_members` gives, but that the history goes to disk as it arises.
+    """
     problem = chase_problem(cfg)
-    figures = flag(COMMAND_LINE, "figures", cfg.figures)
-    history = flag(COMMAND_LINE, "history", cfg.history)
+    figures, history = _wanted(cfg)
     batch, times = problem.initial_states.shape[0], problem.steps + 1
     with contextlib.ExitStack() as stack:
         writer = None
         if history:
             writer = stack.enter_context(HistoryWriter(directory / "history.npz", batch, times))
-        outcome = solve(problem, writer)
+        outcome = solve(problem, writer, drawn=figures)
         if writer is not None:
-            writer.close(time=_times(problem))
-    _name_the_diverged(problem, outcome.diverged_at)
-    if figures:
+            writer.close(time=_times(Title.of(problem)))
+    return _finish(directory, Solved(Title.of(problem), outcome, problem.initial_states.tolist()))
+
+
+def solve(
+    problem: ChaseProblem,
+    writer: HistoryWriter | None = None,
+    progress: Progress | None = None,
+    *,
+    drawn: bool = True,
+) -> Outcome:
+    """The simulation itself, in pieces of time."""
+    progress = Progress(problem.steps + 1, "times") if progress is None else progress
+    (outcome,) = simulate([problem], [None if writer is None else writer.add], [drawn], progress)
+    progress.close()
+    return outcome
+
+
+def solve_members(cfgs: Sequence[DictConfig]) -> list[Solved | Exception]:
+    """Several configurations of one group as one tensor batch.
+
+    Returns:
+        In their order; an exception in the place of one whose settings break a rule.
+
+    Raises:
+        Exception: what stops the batch as a whole.
+    """
+    parts = Parts()
+    prepared = [_prepared(cfg, parts) for cfg in cfgs]
+    ready = [member for member in prepared if isinstance(member, _Ready)]
+    common: list[str] = []
+    outcomes: list[Outcome] = []
+    if ready:
+        with _recorded(common):
+            outcomes = simulate(
+                [member.problem for member in ready],
+                [None if member.memory is None else member.memory.add for member in ready],
+                [member.figures for member in ready],
+            )
+    left = iter(outcomes)
+    return [
+        member.solved(next(left), common) if isinstance(member, _Ready) else member for member in prepared
+    ]
+
+
+def write(cfg: DictConfig, directory: Path, solved: Solved) -> dict[str, float | None]:
+    """Fill the run directory with what was solved; `metrics.json` comes last."""
+    for message in solved.warnings:
+        warnings.warn(message, stacklevel=2)
+    if solved.history is not None:
+        title = solved.title
+        with HistoryWriter(directory / "history.npz", title.rows, title.times) as writer:
+            writer.add(solved.history)
+            writer.close(time=_times(title))
+    return _finish(directory, solved)
+
+
+def size(settings: Mapping[str, object]) -> int:
+    """About how many bytes a member keeps until it is written."""
+    rows, times = settings.get("trajectories"), shape(settings)
+    count = settings.get("centers.count")
+    start = settings.get("initial_state")
+    if not isinstance(rows, int) or not isinstance(times, int):
+        return 0  # it will be refused
+    n, m = len(start) if isinstance(start, list) else 2, count if isinstance(count, int) else 12
+    kept = n + 4 + 2 * m if settings.get("history") else 1
+    return 8 * times * (rows * kept + (n + 5 + 2 * m))
+
+
+@dataclasses.dataclass(frozen=True)
+class _Ready:
+    """A member of a batch before it is solved."""
+
+    problem: ChaseProblem
+    figures: bool
+    memory: _Memory | None  # takes the history; None where nobody wants it
+    warnings: list[str]
+
+    def solved(self, outcome: Outcome, common: Sequence[str]) -> Solved:
+        """With what the whole batch was warned of."""
+        told = dict.fromkeys([*self.warnings, *common, *outcome.warnings])
+        history = None if self.memory is None else self.memory.arrays
+        starts = self.problem.initial_states.tolist()
+        return Solved(Title.of(self.problem), outcome, starts, history, tuple(told))
+
+
+def _prepared(cfg: DictConfig, parts: Parts) -> _Ready | Exception:
+    said: list[str] = []
+    try:
+        with _recorded(said):
+            problem = chase_problem(cfg, parts)
+            figures, history = _wanted(cfg)
+    except Exception as error:  # of this member alone
+        return error
+    memory = _Memory(len(problem.initial_states), problem.steps + 1) if history else None
+    return _Ready(problem, figures, memory, said)
+
+
+@contextlib.contextmanager
+def _recorded(messages: list[str]) -> Iterator[None]:
+    """Warnings go to the list."""
+    with warnings.catch_warnings(record=True) as given:
+        warnings.simplefilter("always")
+        yield
+    messages += [str(warning.message) for warning in given]
+
+
+class _Memory:
+    """A history kept in memory."""
+
+    def __init__(self, batch: int, times: int) -> None:
+        self._shape, self._done = (batch, times), 0
+        self.arrays: dict[str, np.ndarray] = {}
+
+    def add(self, pieces: Mapping[str, np.ndarray]) -> None:
+        length = 0
+        for name, piece in pieces.items():
+            length = piece.shape[1]
+            if name not in self.arrays:
+                self.arrays[name] = np.empty((*self._shape, *piece.shape[2:]), piece.dtype)
+            self.arrays[name][:, self._done : self._done + length] = piece
+        self._done += length
+
+
+def _wanted(cfg: DictConfig) -> tuple[bool, bool]:
+    return flag(COMMAND_LINE, "figures", cfg.figures), flag(COMMAND_LINE, "history", cfg.history)
+
+
+def _finish(directory: Path, solved: Solved) -> dict[str, float | None]:
+    """What follows the history: the log, the figure, the metrics."""
+    outcome = solved.outcome
+    _name_the_diverged(solved)
+    if outcome.drawn:
         _draw(outcome, directory)
-    _summarise(problem, outcome.metrics)
+    _summarise(solved.title, outcome.metrics)
     write_metrics(directory / "metrics.json", outcome.metrics)
     return outcome.metrics
 
 
-def solve(
-    problem: ChaseProblem, writer: HistoryWriter | None = None, progress: Progress | None = None
-) -> Outcome:
-    """The simulation itself, in pieces of time."""
-    metrics = ChaseMetrics(
-        problem.basis,
-        problem.target,
-        problem.law,
-        inner_steps=problem.inner_steps,
-        dt=problem.dt,
-        settle_time=problem.settle_time,
-    )
-    x0 = problem.initial_states
-    times = problem.steps + 1
-    chunk = chunk_length(x0.shape[0], problem.basis, x0.element_size())
-    # Some twenty pieces of a long run, so that progress is seen; the results do not depend on it.
-    chunk = max(1, min(chunk, max(64, -(-times // 20))))
-    thinned = _Thinned(times)
-    progress = Progress(times, "times") if progress is None else progress
-    diverged_at = torch.full(x0.shape[:1], -1)
-    states = trajectory(problem.system, x0, dt=problem.dt, steps=problem.steps, chunk=chunk)
-    chased = chase_pieces(
-        states,
-        problem.basis,
-        problem.target,
-        problem.law,
-        inner_steps=problem.inner_steps,
-        predictor=problem.predictor,
-        certificate=problem.certificate,
-    )
-    with torch.no_grad():
-        for result in chased:
-            metrics.add(result)
-            thinned.add(result)
-            if writer is not None:
-                writer.add({name: getattr(result, name).cpu().numpy() for name in _HISTORY})
-            diverged_at = result.diverged_at
-            progress.advance(result.state.shape[1])
-    progress.close()
-    drawn = thinned.arrays() | {"time": _times(problem)[:: thinned.stride]}
-    return Outcome(metrics.summary(), drawn, diverged_at.cpu())
+def _times(title: Title) -> np.ndarray:
+    return np.arange(title.times) * title.dt
 
 
-class _Thinned:
-    """The first trajectory at every so manieth time, for the figure."""
-
-    def __init__(self, times: int) -> None:
-        self.stride = -(-times // _DRAWN_TIMES)
-        self._time = 0
-        self._parts: dict[str, list[np.ndarray]] = {name: [] for name in _DRAWN}
-
-    def add(self, result: ChaseResult) -> None:
-        first = -self._time % self.stride
-        for name, parts in self._parts.items():
-            # A copy: a view would keep the whole piece in memory.
-            parts.append(getattr(result, name)[0, first :: self.stride].cpu().numpy().copy())
-        self._time += result.state.shape[1]
-
-    def arrays(self) -> dict[str, np.ndarray]:
-        return {name: np.concatenate(parts) for name, parts in self._parts.items()}
-
-
-def _times(problem: ChaseProblem) -> np.ndarray:
-    return np.arange(problem.steps + 1) * problem.dt
-
-
-def _name_the_diverged(problem: ChaseProblem, diverged_at: Tensor) -> None:
-    rows = (diverged_at >= 0).nonzero().flatten().tolist()
+def _name_the_diverged(solved: Solved) -> None:
+    rows = (solved.outcome.diverged_at >= 0).nonzero().flatten().tolist()
     for row in rows[:_NAMED]:
         _log.warning(
             "trajectory %d from %s diverged at t = %.6g s; its weights are frozen from there on",
             row,
-            problem.initial_states[row].tolist(),
-            float(diverged_at[row]) * problem.dt,
+            solved.starts[row],
+            float(solved.outcome.diverged_at[row]) * solved.title.dt,
         )
     if len(rows) > _NAMED:
         _log.warning("and %d more trajectories diverged", len(rows) - _NAMED)
 
 
-def _summarise(problem: ChaseProblem, metrics: dict[str, float | None]) -> None:
+def _summarise(title: Title, metrics: dict[str, float | None]) -> None:
     def show(name: str) -> str:
         number = metrics[name]
         return "-" if number is None else f"{number:.4g}"
 
-    batch, count = problem.initial_states.shape[0], problem.basis.count
     _log.info(
-        "Gradient chase: %d %s, %d times, dt = %g s, %d centers, %s, %s x %d%s",
-        batch,
-        "trajectory" if batch == 1 else "trajectories",
-        problem.steps + 1,
-        problem.dt,
-        count,
-        type(problem.basis.kernel).__name__,
-        type(problem.law).__name__,
-        problem.inner_steps,
-        "" if problem.predictor is None else f", {type(problem.predictor).__name__.lower()} predictor",
+        "Gradient chase: %d %s, %d times, dt = %g s, %s",
+        title.rows,
+        "trajectory" if title.rows == 1 else "trajectories",
+        title.times,
+        title.dt,
+        title.method,
     )
     if metrics["ultimate_error"] is None:
         _log.warning(
             "nothing to report: no trajectory is finite at a time t >= settle_time = %g s",
-            problem.settle_time,
+            title.settle_time,
         )
     row = "  %-22s %12s %12s %12s"
-    _log.info(row, f"worst, t >= {problem.settle_time:g} s", "corrected", "before", "ideal weights")
+    _log.info(row, f"worst, t >= {title.settle_time:g} s", "corrected", "before", "ideal weights")
     names = ("ultimate_error", "ultimate_error_before", "floor_error")
     _log.info(row, "error at the state", *map(show, names))
     _log.info(row, "excess F(a) - F(w)", *map(show, ("ultimate_excess", "ultimate_excess_before")), "0")

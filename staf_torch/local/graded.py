@@ -83,6 +83,7 @@ class GradedSpace(NamedTuple):
     radius: Tensor  # nu * reach, (...) or () for all states
     rate: Tensor  # q, (...) or ()
     bound: Tensor | None  # sup of the radius over all states, where it is known
+    constant: bool = False  # whether the radius is the same at all states of a row
 
     @property
     def rank(self) -> Tensor:
@@ -91,7 +92,7 @@ class GradedSpace(NamedTuple):
 
     def fit(self, values: Tensor) -> Tensor:
         """beta with sum_j psi_j(u_i) beta_j = e^{-s(d_i)} V(c_i): (..., M) -> (..., M)."""
-        bound = None if self.bound is None else (self.rate * self.bound.square()).amax()
+        bound = None if self.bound is None or self.constant else self.rate * self.bound.square()
         interpolation = Interpolation.of(self.basis, self._r2, bound)
 
         def solve(values: Tensor, state: Tensor) -> Tensor:

@@ -31,18 +31,22 @@ class Interpolation(NamedTuple):
     """
 
     functionals: Tensor  # Q', (M, M)
-    inverse: Tensor  # T^-1: (M, M), (..., M, M), or the series (N, M, M)
+    inverse: Tensor  # T^-1: (M, M), (..., M, M), or the series (N, M, M), (..., 1, N, M, M)
     chebyshev: Tensor | None  # T_m(r^2), (..., N), where `inverse` is a series
 
     @classmethod
     def of(cls, basis: _Basis, r2: Tensor, bound: Tensor | None) -> Interpolation:
-        """For the radii r^2, () or (...), with their known bound over all states, if any. In float64.
+        """For the radii r^2, () or (...), in float64.
 
-        Without a bound, or beyond a bound of 1, each radius of a batch is inverted by itself.
+        Args:
+            basis: of the functionals.
+            r2: r^2.
+            bound: over all states, () or (..., 1) where every row has its own; None where it is not known,
+                or r^2 the same at all states. Without one, or beyond 1, every r^2 is inverted by itself.
         """
         wide = r2.double()
         u, functionals = basis.directions.to(wide.device), basis.functionals.to(wide.device).mT
-        if wide.dim() == 0 or bound is None or not bool(bound <= _ANALYTIC):
+        if wide.dim() == 0 or bound is None or not bool((bound <= _ANALYTIC).all()):
             nodal = basis.functions(u, wide[..., None, None])
             return cls(functionals, _inverse(functionals @ nodal), None)
         index = torch.arange(_NODES, dtype=torch.float64, device=u.device)
@@ -51,8 +55,11 @@ class Interpolation(NamedTuple):
         transform[0] *= 0.5
         # The bound is a constant of the series, not a quantity to differentiate.
         upper = bound.detach().double().to(u.device)
-        nodal = basis.functions(u, (0.5 * upper * (1 + angles.cos()))[:, None, None])
-        series = torch.einsum("mk,kij->mij", transform, _inverse(functionals @ nodal))
+        if upper.dim() > 0 and upper.shape[-1] != 1:
+            upper = upper.amax()
+        nodes = 0.5 * upper[..., None] * (1 + angles.cos())
+        nodal = basis.functions(u, nodes[..., None, None])
+        series = torch.einsum("mk,...kij->...mij", transform, _inverse(functionals @ nodal))
         return cls(functionals, series, _chebyshev(2 * wide / upper - 1))
 
     @property
@@ -69,12 +76,17 @@ class Interpolation(NamedTuple):
 
     def _apply_inverse(self, vector: Tensor) -> Tensor:
         if self.chebyshev is not None:
-            columns = self.inverse.flatten(0, 1).mT  # (M, N M): one product for all terms of the series
-            terms: Tensor = (vector @ columns).unflatten(-1, self.inverse.shape[:2])
+            columns = self.inverse.flatten(-3, -2).mT  # (M, N M): one product for all terms of the series
+            columns = (
+                columns if columns.dim() == 2 else columns.squeeze(-3)
+            )  # a row's own, for all its states
+            terms: Tensor = (vector @ columns).unflatten(-1, self.inverse.shape[-3:-1])
             total: Tensor = (terms * self.chebyshev.unsqueeze(-1)).sum(-2)
             return total
         if self.inverse.dim() == 2:
             return vector @ self.inverse.mT
+        if self.inverse.dim() == vector.dim() + 1 and self.inverse.shape[-3] == 1:
+            return vector @ self.inverse.squeeze(-3).mT  # a row's own, for all its states
         product: Tensor = (self.inverse @ vector.unsqueeze(-1)).squeeze(-1)
         return product
 

@@ -59,7 +59,8 @@ class HeavyBall(UpdateLaw):
             q = torch.where(low > 0, low / high, 0.0).sqrt()
             step, momentum = 4 / (1 + q).square(), ((1 - q) / (1 + q)).square()
         else:
-            step, momentum = torch.full_like(high, self.step_size), torch.full_like(high, self.momentum)
+            one = torch.ones_like(high)
+            step, momentum = one * self.step_size, one * self.momentum
         moved = momentum * velocity + torch.where(used, step * g / (2 * high), 0.0)
         lost = worse_than_none(objective, weights, g)
         descent = line_search(objective, g, g) * g

@@ -1,0 +1,119 @@
+"""Bases and targets of several problems as one, each for rows of its own.
+
+What differs between the problems becomes a tensor with one entry a row; what they share stays shared.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from typing import TypeVar
+
+import torch
+from torch import Tensor, nn
+
+from .basis import GramStructure, StaFBasis, Target
+
+Module = TypeVar("Module", bound=nn.Module)
+
+
+class StackedBasis(StaFBasis):
+    """Bases of one kernel type and one layout; basis i serves the next ``rows[i]`` rows of every batch.
+
+    States are (B, T, n) with B = sum(rows). Hyperparameters that differ are (B, 1) in the kernel and the
+    radius, so that bulk work runs over all rows at once. The Gram structure, on which the weight recursion
+    hangs and with it every chaotic setting, is asked of each basis for its own rows: bit by bit the one that
+    the basis alone would give.
+
+    Args:
+        bases: equal but for scalar hyperparameters.
+        rows: of each, at least 1.
+
+    Raises:
+        ValueError: if the bases differ in more than scalar hyperparameters.
+    """
+
+    def __init__(self, bases: Sequence[StaFBasis], rows: Sequence[int]) -> None:
+        stacked = stack_hyperparameters(bases, rows)
+        super().__init__(stacked.kernel, stacked.centers)
+        self._bases, self._rows = list(bases), list(rows)
+
+    def gram_structure(self, x: Tensor) -> GramStructure:
+        apart = zip(self._bases, x.split(self._rows), strict=True)
+        parts = [basis.gram_structure(at) for basis, at in apart]
+        if len(parts) == 1:
+            return parts[0]
+        cores = [_rows_of(part.core, rows, 2) for part, rows in zip(parts, self._rows, strict=True)]
+        return GramStructure(
+            torch.cat(cores),
+            self._joined([part.log_scale for part in parts], 1),
+            self._joined([part.log_gain for part in parts], 0),
+        )
+
+    def check_reach(self, x: Tensor) -> bool:
+        """True, without a word: whoever runs several problems asks each basis about its own rows."""
+        return True
+
+    def _joined(self, parts: Sequence[Tensor | None], dims: int) -> Tensor | None:
+        given = [part for part in parts if part is not None]
+        if not given:
+            return None
+        assert len(given) == len(parts)  # one kernel type
+        return torch.cat([_rows_of(part, rows, dims) for part, rows in zip(given, self._rows, strict=True)])
+
+
+def _rows_of(quantity: Tensor, rows: int, dims: int) -> Tensor:
+    """(rows, T, ...) as it is; (...) of ``dims`` dimensions, which serves all states, as (rows, 1, ...)."""
+    return quantity if quantity.dim() > dims else quantity.expand(rows, 1, *quantity.shape)
+
+
+class StackedTarget(nn.Module):
+    """Targets V_i, each for the next ``rows[i]`` rows of every batch.
+
+    Args:
+        targets: functions (..., n) -> (...).
+        rows: of each, at least 1.
+    """
+
+    def __init__(self, targets: Sequence[Target], rows: Sequence[int]) -> None:
+        super().__init__()
+        self._targets, self._rows = list(targets), list(rows)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return torch.cat([target(at) for target, at in zip(self._targets, x.split(self._rows), strict=True)])
+
+
+def stack_hyperparameters(modules: Sequence[Module], rows: Sequence[int]) -> Module:
+    """One module in place of several whose scalar buffers differ: those are (B, 1), B = sum(rows).
+
+    Args:
+        modules: of one type.
+        rows: of each.
+
+    Raises:
+        ValueError: if they differ in more than scalar buffers.
+    """
+    first = modules[0]
+    stacked = copy.deepcopy(first)
+    found = [dict(module.named_buffers()) for module in modules]
+    form = _form(first)
+    if any(_form(module) != form for module in modules) or any(b.keys() != found[0].keys() for b in found):
+        raise ValueError("`stack_hyperparameters(modules=...)` must differ in scalar hyperparameters alone.")
+    counts = torch.tensor(rows)
+    for name, buffer in found[0].items():
+        values = [buffers[name] for buffers in found]
+        if all(torch.equal(value, buffer) for value in values):
+            continue
+        if any(value.dim() > 0 for value in values):
+            raise ValueError(
+                f"`stack_hyperparameters(modules=...)` must agree in `{name}`, which is no scalar."
+            )
+        owner, _, attribute = name.rpartition(".")
+        each = torch.stack(values).repeat_interleave(counts.to(buffer.device)).unsqueeze(-1)
+        setattr(stacked.get_submodule(owner), attribute, each)
+    return stacked
+
+
+def _form(module: nn.Module) -> list[tuple[str, type, str]]:
+    """Types and representations of all parts: what must be the same."""
+    return [(name, type(part), part.extra_repr()) for name, part in module.named_modules()]
