@@ -45,9 +45,10 @@ EXPERIMENTS = (
 
 def _hydra_options() -> dict[str, Any]:
     options: dict[str, Any] = {"config_path": config_directory(), "config_name": "config"}
-    options["version_base"] = "1.3"
     if "execution_whitelist" in inspect.signature(hydra.main).parameters:  # Hydra 1.4
         options["execution_whitelist"] = ("staf_torch.*",)
+    else:
+        options["version_base"] = "1.3"  # which 1.4 deprecates
     return options
 
 
