@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from hydra.core.utils import JobReturn, JobStatus, configure_log, filter_overrides, run_job, setup_globals
-from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf import DictConfig, open_dict
 
 from ..._checks import integer
 from ..progress import listening
@@ -63,37 +63,47 @@ class Launch:
         self._directory.mkdir(parents=True, exist_ok=True)
         numbered = {first + i: list(overrides) for i, overrides in enumerate(job_overrides)}
         records.list_jobs(self._directory, numbered)
-        returns = self._finished(numbered)
-        jobs = [self._compose(num, overrides) for num, overrides in numbered.items() if num not in returns]
-        self._progress = SweepProgress(len(numbered), len(returns))
+        jobs = [self._compose(num, overrides) for num, overrides in numbered.items()]
+        returns = self._finished(jobs)
+        self._progress = SweepProgress(len(jobs), len(returns))
         try:
-            with contextlib.closing(self._solved(jobs)) as solved_jobs:
+            with contextlib.closing(self._solved(jobs, set(returns))) as solved_jobs:
                 for job, solved in solved_jobs:
                     returns[job.num] = self._replay(job, solved)
         finally:
             self._progress.close()
             self._hydra_logging()
         failed = sum(ended.status == JobStatus.FAILED for ended in returns.values())
-        _log.info("%d of %d jobs completed, %d failed", len(returns) - failed, len(returns), failed)
+        _log.info("%d of %d jobs completed, %d failed", len(jobs) - failed, len(jobs), failed)
         return [returns[num] for num in numbered]
 
-    def _solved(self, jobs: list[Job]) -> Generator[tuple[Job, handoff.Solved | None], None, None]:
-        """Every job with what was computed for it, as the tensor batches end."""
-        if not jobs or not handoff.is_marked(self._task):  # nothing to batch, or another program's task
+    def _solved(
+        self, jobs: list[Job], finished: set[int]
+    ) -> Generator[tuple[Job, handoff.Solved | None], None, None]:
+        """Every job that is not finished with what was computed for it, as the tensor batches end.
+
+        A batch of which some jobs are finished is computed as a whole: rounding depends on the others in it,
+        and a sweep that was interrupted ends with the very numbers that it would have had.
+        """
+        if not handoff.is_marked(self._task):  # another program's task: nothing to batch
             yield from ((job, None) for job in jobs)
+            return
+        if len(finished) == len(jobs):
             return
         about = self._launcher
         with executor(about.executor, about.workers, about.arguments, self._directory) as workers:
             batches = self._batches(jobs, workers.pieces)
+            batches = [batch for batch in batches if not finished.issuperset(job.num for job in batch)]
             _log.info("%d jobs in %d tensor batches, %s", len(jobs), len(batches), self._directory)
             done = workers.map([[job.settings for job in batch] for batch in batches])
-            self._progress.expect([len(batch) for batch in batches])
+            self._progress.expect([sum(job.num not in finished for job in batch) for batch in batches])
             with listening(self._progress.part):
                 for number, (outcomes, seconds) in done:
                     batch = batches[number]
-                    self._progress.solved(len(batch))
+                    self._progress.solved(number)
                     for job, outcome in zip(batch, outcomes, strict=True):
-                        yield job, handoff.Solved(outcome, seconds / len(batch))
+                        if job.num not in finished:
+                            yield job, handoff.Solved(outcome, seconds / len(batch))
                     self._hydra_logging()  # what follows belongs to no job's log
 
     def _replay(self, job: Job, solved: handoff.Solved | None) -> JobReturn:
@@ -109,25 +119,19 @@ class Launch:
         self._progress.ended(job.name, None if failure is None else reason(failure))
         return ended
 
-    def _finished(self, numbered: dict[int, list[str]]) -> dict[int, JobReturn]:
+    def _finished(self, jobs: list[Job]) -> dict[int, JobReturn]:
         """The jobs that an earlier start of this sweep completed."""
+        found: dict[int, JobReturn] = {}
         if not records.resumed(self._master):
-            return {}
-        found = {}
-        for num, overrides in numbered.items():
-            metrics = records.metrics_of(self._directory / self._subdirectory(num, overrides), overrides)
+            return found
+        for job in jobs:
+            directory = self._directory / str(job.config.hydra.sweep.subdir)
+            metrics = records.metrics_of(directory, job.overrides)
             if metrics is not None:
-                ended = JobReturn(overrides=overrides, status=JobStatus.COMPLETED)
+                ended = JobReturn(overrides=job.overrides, status=JobStatus.COMPLETED)
                 ended.return_value = objective(self._master, metrics)
-                found[num] = ended
+                found[job.num] = ended
         return found
-
-    def _subdirectory(self, num: int, overrides: list[str]) -> str:
-        written = OmegaConf.to_container(self._master.hydra.sweep, resolve=False)
-        assert isinstance(written, dict)
-        if written["subdir"] == "${hydra.job.num}":  # ours; no need to compose what need not run
-            return str(num)
-        return str(self._compose(num, overrides).config.hydra.sweep.subdir)
 
     def _compose(self, num: int, overrides: list[str]) -> Job:
         loader = self._context.config_loader
@@ -139,13 +143,13 @@ class Launch:
         return Job(num, overrides, config, records.without_hydra(config))
 
     def _batches(self, jobs: list[Job], pieces: int) -> list[list[Job]]:
-        """The jobs of every tensor batch: in order, at least so many where a group is large enough."""
+        """The jobs of every tensor batch: in order, and at least so many batches where that can be."""
         from .. import members
 
         settings = [job.settings for job in jobs]
-        found = []
-        for group in members.groups(settings):
-            most = min(self._launcher.batch or len(group), -(-len(group) // pieces))
+        groups, found = members.groups(settings), []
+        for group in groups:
+            most = min(self._launcher.batch or len(group), -(-len(group) * len(groups) // pieces))
             for chunk in members.chunks(settings, group):
                 found += [chunk[i : i + most] for i in range(0, len(chunk), most)]
         return [[jobs[i] for i in chunk] for chunk in sorted(found)]

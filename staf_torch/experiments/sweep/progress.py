@@ -20,7 +20,7 @@ class SweepProgress:
 
     def __init__(self, total: int, done: int = 0) -> None:
         self._total, self._before, self._done, self._failed = total, done, done, 0
-        self._sizes: list[int] = []
+        self._sizes: dict[int, int] = {}
         self._solved, self._part = 0, 0.0
         self._terminal = sys.stderr.isatty()
         self._start = self._shown = time.monotonic()
@@ -28,17 +28,16 @@ class SweepProgress:
 
     def expect(self, sizes: Sequence[int]) -> None:
         """So many jobs in each tensor batch."""
-        self._sizes = list(sizes)[::-1]
+        self._sizes = dict(enumerate(sizes))
 
     def part(self, share: float) -> None:
-        """That share of the present tensor batch is computed."""
-        self._part = share * (self._sizes[-1] if self._sizes else 1)
+        """That share of the first tensor batch that is not computed is."""
+        self._part = share * next(iter(self._sizes.values()), 0)
         self._show()
 
-    def solved(self, jobs: int) -> None:
-        """So many more jobs are computed."""
-        self._solved, self._part = self._solved + jobs, 0.0
-        del self._sizes[-1:]
+    def solved(self, number: int) -> None:
+        """The tensor batch of that number is computed."""
+        self._solved, self._part = self._solved + self._sizes.pop(number), 0.0
         self._show()
 
     def ended(self, name: str, failure: str | None) -> None:
