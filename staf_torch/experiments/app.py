@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import importlib
 import inspect
 import logging
 import os
@@ -22,6 +21,7 @@ from .._checks import choice
 from .composition import config_directory as config_directory
 from .plugin import find_launcher
 from .sweep import handoff, records
+from .sweep.executors.work import Written
 from .sweep.objective import Metrics, objective
 from .sweep.resume import command_line
 from .sweep.session import session
@@ -95,14 +95,18 @@ def _recorded(cfg: DictConfig, directory: Path, record: records.RunRecord) -> Me
 
 def _experiment(cfg: DictConfig, directory: Path, solved: handoff.Solved | None) -> Metrics:
     choice("staf", "task", cfg.task, EXPERIMENTS)
+    from . import members  # which imports this module
+
     metrics: Metrics
     if solved is None:
-        metrics = importlib.import_module(f"{__package__}.{cfg.task}").run(cfg, directory)
+        metrics = members.run(cfg, directory)
     elif isinstance(solved.outcome, BaseException):
         raise solved.outcome
+    elif isinstance(solved.outcome, Written):
+        for level, line in solved.outcome.log:
+            _log.log(level, "%s", line)
+        metrics = solved.outcome.metrics
     else:
-        from . import members
-
         metrics = members.write(cfg, directory, solved.outcome)
     return metrics
 

@@ -75,6 +75,11 @@ class Solved:
     history: dict[str, np.ndarray] | None = None  # name -> (B, T, ...)
     warnings: tuple[str, ...] = ()
 
+    @property
+    def metrics(self) -> dict[str, float | None]:
+        """What `metrics.json` will hold."""
+        return self.outcome.metrics
+
 
 def run(cfg: DictConfig, directory: Path) -> dict[str, float | None]:
     """Run what the settings describe and fill the run directory; `metrics.json` comes last.

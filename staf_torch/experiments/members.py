@@ -3,7 +3,7 @@
 An experiment takes part by five names in its module: BATCHABLE, settings whose numbers may differ within a
 batch; `shape(settings)`, what follows from those and must be equal all the same; `size(settings)`, the bytes
 that a member keeps; `solve_members(cfgs)` and `write(cfg, directory, solved)`. Every other experiment is run
-one by one.
+one by one. Messages of the members of a batch are kept for `write`.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def solve(cfgs: Sequence[DictConfig]) -> list[Solved | Exception]:
     """
     try:
         experiment = _module(cfgs[0])
-        if not hasattr(experiment, "solve_members"):
+        if any(cfg.get("members") is not None for cfg in cfgs) or not hasattr(experiment, "solve_members"):
             return [Deferred() for _ in cfgs]
         solved: list[Solved | Exception] = experiment.solve_members(cfgs)
         return solved
@@ -88,11 +88,19 @@ def write(cfg: DictConfig, directory: Path, solved: Solved | Exception) -> Metri
     """
     if isinstance(solved, Exception):
         raise solved
-    experiment = _module(cfg)
     if isinstance(solved, Deferred):
-        metrics: Metrics = experiment.run(cfg, directory)
-    else:
-        metrics = experiment.write(cfg, directory, solved)
+        return run(cfg, directory)
+    metrics: Metrics = _module(cfg).write(cfg, directory, solved)
+    return metrics
+
+
+def run(cfg: DictConfig, directory: Path) -> Metrics:
+    """Run what the settings describe, one configuration or the `members` of one, and fill the directory."""
+    from . import batch_axis  # which imports this module
+
+    if cfg.get("members") is not None:
+        return batch_axis.run(cfg, directory)
+    metrics: Metrics = _module(cfg).run(cfg, directory)
     return metrics
 
 

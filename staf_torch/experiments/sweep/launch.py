@@ -19,7 +19,7 @@ from ..progress import listening
 from ..wording import reason
 from . import handoff, records
 from .composed import ComposeOnce
-from .executors import executor
+from .executors import executor, work
 from .objective import objective
 from .progress import SweepProgress
 
@@ -38,6 +38,11 @@ class Job(NamedTuple):
     def name(self) -> str:
         """`job 3 (kernel=gaussian seed=1)`."""
         return f"job {self.num} ({' '.join(records.own(filter_overrides(self.overrides)))})"
+
+    @property
+    def directory(self) -> Path:
+        """Of the run."""
+        return Path(str(self.config.hydra.sweep.dir)) / str(self.config.hydra.sweep.subdir)
 
 
 class Launch:
@@ -95,7 +100,7 @@ class Launch:
             batches = self._batches(jobs, workers.pieces)
             batches = [batch for batch in batches if not finished.issuperset(job.num for job in batch)]
             _log.info("%d jobs in %d tensor batches, %s", len(jobs), len(batches), self._directory)
-            done = workers.map([[job.settings for job in batch] for batch in batches])
+            done = workers.map([_work(batch) for batch in batches])
             self._progress.expect([sum(job.num not in finished for job in batch) for batch in batches])
             with listening(self._progress.part):
                 for number, (outcomes, seconds) in done:
@@ -125,8 +130,7 @@ class Launch:
         if not records.resumed(self._master):
             return found
         for job in jobs:
-            directory = self._directory / str(job.config.hydra.sweep.subdir)
-            metrics = records.metrics_of(directory, job.overrides)
+            metrics = records.metrics_of(job.directory, job.overrides)
             if metrics is not None:
                 ended = JobReturn(overrides=job.overrides, status=JobStatus.COMPLETED)
                 ended.return_value = objective(self._master, metrics)
@@ -159,6 +163,10 @@ class Launch:
         if "execution_whitelist" in inspect.signature(configure_log).parameters:  # Hydra 1.4
             trusted = {"execution_whitelist": self._context.execution_whitelist}
         configure_log(self._master.hydra.hydra_logging, self._master.hydra.verbose, **trusted)
+
+
+def _work(batch: Sequence[Job]) -> work.Batch:
+    return work.Batch([job.settings for job in batch], [str(job.directory) for job in batch])
 
 
 def _off_the_terminal(task: Callable[[DictConfig], Any]) -> Callable[[DictConfig], Any]:

@@ -8,10 +8,8 @@ from collections.abc import Iterator, Sequence
 from types import TracebackType
 from typing import Any
 
-from omegaconf import DictConfig
-
 from ...._checks import integer
-from .work import Done
+from .work import Batch, Done
 
 
 class Executor(abc.ABC):
@@ -45,7 +43,7 @@ class Executor(abc.ABC):
     ) -> None: ...
 
     @abc.abstractmethod
-    def submit(self, batch: Sequence[DictConfig]) -> Any:
+    def submit(self, batch: Batch) -> Any:
         """Begin a tensor batch; a handle on it."""
 
     @abc.abstractmethod
@@ -56,7 +54,7 @@ class Executor(abc.ABC):
     def result(self, handle: Any) -> Done:
         """What a batch left that has ended. Raises where the worker itself was lost."""
 
-    def map(self, batches: Sequence[Sequence[DictConfig]]) -> Iterator[tuple[int, Done]]:
+    def map(self, batches: Sequence[Batch]) -> Iterator[tuple[int, Done]]:
         """The number of a batch and what it left, as they end. A lost worker fails its batch alone."""
         running: dict[int, Any] = {}
         waiting = list(range(len(batches)))[::-1]
@@ -70,5 +68,5 @@ class Executor(abc.ABC):
                     done = self.result(handle)
                 except Exception as error:
                     lost = RuntimeError(f"the worker was lost ({type(error).__name__}: {error})")
-                    done = Done([lost] * len(batches[number]), 0.0)
+                    done = Done([lost] * len(batches[number].settings), 0.0)
                 yield number, done

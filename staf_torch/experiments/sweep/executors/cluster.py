@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from omegaconf import DictConfig
-
 from . import work
 from .base import Executor
-from .work import Done
+from .work import Batch, Done
 
 _POLL_LOCAL, _POLL = 0.2, 10.0  # s
 
@@ -53,7 +51,7 @@ class Submitit(Executor):
             for job in self._jobs:
                 job.cancel(check=False)
 
-    def submit(self, batch: Sequence[DictConfig]) -> Any:
+    def submit(self, batch: Batch) -> Any:
         job = self._executor.submit(work.solve_elsewhere, *work.pack(batch))
         self._jobs.append(job)
         return job

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from types import TracebackType
-
-from omegaconf import DictConfig
 
 from . import work
 from .base import Executor
-from .work import Done
+from .work import Batch, Done
 
 
 class Inline(Executor):
@@ -24,8 +21,8 @@ class Inline(Executor):
     ) -> None:
         return None
 
-    def submit(self, batch: Sequence[DictConfig]) -> Done:
-        return work.solve(batch)
+    def submit(self, batch: Batch) -> Done:
+        return work.solve(batch.settings)
 
     def wait(self, handles: dict[int, Done]) -> list[int]:
         return list(handles)

@@ -5,16 +5,14 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
-from collections.abc import Sequence
 from concurrent import futures
 from types import TracebackType
 
 from hydra.core.utils import env_override
-from omegaconf import DictConfig
 
 from . import work
 from .base import Executor
-from .work import Done
+from .work import Batch, Done
 
 
 class Process(Executor):
@@ -34,7 +32,7 @@ class Process(Executor):
             for process in workers:
                 process.terminate()
 
-    def submit(self, batch: Sequence[DictConfig]) -> futures.Future[bytes]:
+    def submit(self, batch: Batch) -> futures.Future[bytes]:
         threads = max(1, (os.cpu_count() or 1) // self.workers)
         with env_override({"OMP_NUM_THREADS": str(threads)}):  # a worker begins on a submission
             return self._pool.submit(work.solve_elsewhere, *work.pack(batch))

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from types import TracebackType
 from typing import Any
 
-from omegaconf import DictConfig
-
 from . import work
 from .base import Executor
-from .work import Done
+from .work import Batch, Done
 
 
 class Ray(Executor):
@@ -41,7 +39,7 @@ class Ray(Executor):
         if self._ours:
             self._ray.shutdown()
 
-    def submit(self, batch: Sequence[DictConfig]) -> Any:
+    def submit(self, batch: Batch) -> Any:
         return self._solve.remote(*work.pack(batch))
 
     def wait(self, handles: dict[int, Any]) -> list[int]:
