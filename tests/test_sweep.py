@@ -1,4 +1,4 @@
-"""Sweeps by the batched launcher: the same run directories as Hydra's own, and what can go wrong on the way."""
+"""Sweeps by the batched launcher: what they leave, beside Hydra's own, and what can go wrong on the way."""
 
 from __future__ import annotations
 
@@ -20,7 +20,12 @@ from staf_torch.experiments.sweep import launch, records
 from staf_torch.experiments.sweep.session import claim
 
 SHORT = ["duration=0.05", "settle_time=0", "figures=false", "history=false"]
-GRID = ["centers.count=3,4,6", "centers.radius=0.1,0.2", "trajectories=2", *SHORT]  # rings of 4: there are none
+GRID = [
+    "centers.count=3,4,6",
+    "centers.radius=0.1,0.2",
+    "trajectories=2",
+    *SHORT,
+]  # rings of 4: there are none
 
 
 @pytest.fixture(scope="module")
@@ -100,10 +105,17 @@ def test_a_batched_sweep_finds_the_numbers_of_the_basic_launcher(
 def test_a_count_that_the_layout_cannot_have_fails_alone_and_says_why(batched: tuple[Path, str]) -> None:
     directory, said = batched
     status = {num: record(directory / str(num))["status"] for num in range(6)}
-    assert status == {0: "completed", 1: "completed", 2: "failed", 3: "failed", 4: "completed", 5: "completed"}
+    assert status == {
+        0: "completed",
+        1: "completed",
+        2: "failed",
+        3: "failed",
+        4: "completed",
+        5: "completed",
+    }
     reason = "`rings(count=...)` must be one of 3, 6, 10, 15, 21, 28; got 4."
     assert record(directory / "2")["reason"] == reason
-    assert f"job 2 (centers.count=4 centers.radius=0.1" in said
+    assert "job 2 (centers.count=4 centers.radius=0.1" in said
     assert said.rstrip().endswith(f"staf: {reason}")
     assert reason in (directory / "2" / "staf.log").read_text()
 
