@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import torch
 from torch import Tensor, nn
 
 from .basis import GramStructure, StaFBasis, Target
+from .local import LocalSpace
 
 Module = TypeVar("Module", bound=nn.Module)
 
@@ -50,6 +51,13 @@ class StackedBasis(StaFBasis):
             self._joined([part.log_gain for part in parts], 0),
         )
 
+    def local(self, x: Tensor) -> LocalSpace:
+        """Each basis its own space, set up and solved as it is alone."""
+        if len(self._bases) == 1:
+            return self._bases[0].local(x)
+        spaces = [basis.local(at) for basis, at in zip(self._bases, x.split(self._rows), strict=True)]
+        return StackedSpace(spaces, self._rows, self.centers.offsets(x))
+
     def check_reach(self, x: Tensor) -> bool:
         """True, without a word: whoever runs several problems asks each basis about its own rows."""
         return True
@@ -65,6 +73,45 @@ class StackedBasis(StaFBasis):
 def _rows_of(quantity: Tensor, rows: int, dims: int) -> Tensor:
     """(rows, T, ...) as it is; (...) of ``dims`` dimensions, which serves all states, as (rows, 1, ...)."""
     return quantity if quantity.dim() > dims else quantity.expand(rows, 1, *quantity.shape)
+
+
+class StackedSpace(NamedTuple):
+    """Local spaces, each at the states of its own rows; see `LocalSpace`."""
+
+    spaces: list[LocalSpace]
+    rows: list[int]
+    offsets: Tensor  # d, (B, T or 1, M, n), or (M, n) for all states
+
+    @property
+    def rank(self) -> Tensor:
+        """(B, T) or (B, 1)."""
+        return torch.cat([_rows_of(s.rank, rows, 0) for s, rows in zip(self.spaces, self.rows, strict=True)])
+
+    def fit(self, values: Tensor) -> Tensor:
+        """The ideal coefficients: (B, T, M) -> (B, T, M)."""
+        return self._each("fit", values)
+
+    def evaluate(self, z: Tensor, coefficients: Tensor) -> Tensor:
+        """V^(x + z): (P, n) for all states, (B, T, M) -> (B, T, P)."""
+        assert z.dim() == 2
+        apart = zip(self.spaces, coefficients.split(self.rows), strict=True)
+        return torch.cat([space.evaluate(z, beta) for space, beta in apart])
+
+    def scaled_weights(self, coefficients: Tensor) -> Tensor:
+        """e^{g(x)} w: (B, T, M) -> (B, T, M)."""
+        return self._each("scaled_weights", coefficients)
+
+    def weights(self, coefficients: Tensor) -> Tensor:
+        """The paper's w: (B, T, M) -> (B, T, M)."""
+        return self._each("weights", coefficients)
+
+    def coefficients(self, weights: Tensor) -> Tensor:
+        """beta from the paper's w: (B, T, M) -> (B, T, M)."""
+        return self._each("coefficients", weights)
+
+    def _each(self, method: str, given: Tensor) -> Tensor:
+        apart = zip(self.spaces, given.split(self.rows), strict=True)
+        return torch.cat([getattr(space, method)(rows) for space, rows in apart])
 
 
 class StackedTarget(nn.Module):
