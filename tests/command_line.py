@@ -85,7 +85,8 @@ def environment() -> dict[str, str]:
     return {**os.environ, "PYTHONPATH": path}
 
 
-def _one(folder: str, argv: list[str]) -> tuple[int, str, str]:
+def one(folder: str, argv: list[str]) -> tuple[int, str, str]:
+    """One command line in this process: exit code, output, errors."""
     from staf_torch.experiments.app import main
 
     os.chdir(folder)
@@ -113,4 +114,4 @@ def _one(folder: str, argv: list[str]) -> tuple[int, str, str]:
 if __name__ == "__main__":
     jobs = json.loads(Path(sys.argv[1]).read_text())
     target = Path(sys.argv[2])
-    target.write_text(json.dumps([_one(job["folder"], job["argv"]) for job in jobs]))
+    target.write_text(json.dumps([one(job["folder"], job["argv"]) for job in jobs]))

@@ -108,12 +108,18 @@ def test_every_option_of_every_group_runs(name: str, outcomes: dict[str, Outcome
     assert rated == KEYS or name.startswith("optimizer")  # not every law promises a rate
     assert all(found[key] is not None and math.isfinite(found[key]) for key in rated)
     assert found["diverged_fraction"] == 0
-    assert {path.name for path in run.iterdir()} == {".hydra", "staf.log", "metrics.json", "history.npz"}
+    assert {path.name for path in run.iterdir()} == {
+        ".hydra",
+        "run.json",
+        "staf.log",
+        "metrics.json",
+        "history.npz",
+    }
 
 
 @pytest.mark.parametrize("name", [name for name in OPTIONS if name.startswith("experiment")])
 def test_every_experiment_runs(name: str, outcomes: dict[str, Outcome]) -> None:
-    assert {".hydra", "staf.log", "metrics.json"} <= {
+    assert {".hydra", "run.json", "staf.log", "metrics.json"} <= {
         path.name for path in run_directory(outcomes[name]).iterdir()
     }
 
@@ -128,6 +134,7 @@ def test_a_run_directory_holds_exactly_what_is_promised(outcomes: dict[str, Outc
         ".hydra/config.yaml",
         ".hydra/hydra.yaml",
         ".hydra/overrides.yaml",
+        "run.json",
         "staf.log",
         "metrics.json",
         "history.npz",
@@ -190,7 +197,7 @@ def test_more_trajectories_are_reproducible_by_seed_and_keep_the_first_ones(
 
 def test_figures_false_draws_nothing_and_history_false_keeps_nothing(outcomes: dict[str, Outcome]) -> None:
     run = run_directory(outcomes["no history"])
-    assert {path.name for path in run.iterdir()} == {".hydra", "staf.log", "metrics.json"}
+    assert {path.name for path in run.iterdir()} == {".hydra", "run.json", "staf.log", "metrics.json"}
 
 
 def test_a_polygon_of_five_warns_in_the_log(outcomes: dict[str, Outcome]) -> None:

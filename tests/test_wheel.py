@@ -63,5 +63,11 @@ def test_wheel_runs_in_a_clean_environment_from_any_directory(wheel: Path, tmp_p
     said = _run(home / "bin" / "staf", "duration=0.1", "settle_time=0", "figures=false", cwd=work)
     assert "Gradient chase" in said
     (run,) = (work / "runs").iterdir()
-    assert {path.name for path in run.iterdir()} == {".hydra", "staf.log", "metrics.json", "history.npz"}
+    assert {path.name for path in run.iterdir()} == {
+        ".hydra",
+        "run.json",
+        "staf.log",
+        "metrics.json",
+        "history.npz",
+    }
     assert json.loads((run / "metrics.json").read_text())["diverged_fraction"] == 0

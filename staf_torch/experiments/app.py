@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-import importlib
 import inspect
 import logging
 import os
-import re
 import shutil
 import sys
 import warnings
@@ -16,15 +14,18 @@ from typing import Any
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig
-from omegaconf.errors import OmegaConfBaseException
 
 from .._checks import choice
-
-USER_ERRORS = (ValueError, HydraException, OmegaConfBaseException, OSError)
-"""What a setting or the disk can bring about; anything else is a defect and keeps its trace."""
+from .composition import config_directory as config_directory
+from .plugin import find_launcher
+from .sweep import handoff, records
+from .sweep.executors.work import Written
+from .sweep.objective import Metrics, objective
+from .sweep.resume import command_line
+from .sweep.session import session
+from .wording import USER_ERRORS, reason, sentence
 
 _log = logging.getLogger(__name__)
 _FULL_ERROR = "HYDRA_FULL_ERROR"
@@ -42,48 +43,78 @@ EXPERIMENTS = (
 """Modules of this package with a function ``run(cfg, directory)``, by the name in ``task``."""
 
 
-def config_directory() -> str:
-    """`conf/`: inside the package when it is installed from a wheel, beside it in a checkout."""
-    package = Path(__file__).resolve().parent.parent
-    inside = package / "conf"
-    return str(inside if inside.is_dir() else package.parent / "conf")
-
-
 def _hydra_options() -> dict[str, Any]:
     options: dict[str, Any] = {"config_path": config_directory(), "config_name": "config"}
-    options["version_base"] = "1.3"
     if "execution_whitelist" in inspect.signature(hydra.main).parameters:  # Hydra 1.4
         options["execution_whitelist"] = ("staf_torch.*",)
+    else:
+        options["version_base"] = "1.3"  # which 1.4 deprecates
     return options
 
 
+find_launcher()
+
+
 @hydra.main(**_hydra_options())
-def _task(cfg: DictConfig) -> dict[str, float | None]:
+@handoff.takes_solved
+def _task(cfg: DictConfig) -> Metrics | float | tuple[float, ...]:
     settings = HydraConfig.get()
-    directory = Path(settings.runtime.output_dir)
+    directory, overrides = Path(settings.runtime.output_dir), list(settings.overrides.task)
+    if records.resumed(cfg):
+        finished = records.metrics_of(directory, overrides)
+        if finished is not None:
+            _log.info("completed before: %s", os.path.relpath(directory))
+            return objective(cfg, finished)
+    metrics = _recorded(cfg, directory, records.RunRecord(cfg, settings.runtime.choices, overrides))
+    _log.info("  run directory: %s", os.path.relpath(directory))
+    return objective(cfg, metrics)
+
+
+def _recorded(cfg: DictConfig, directory: Path, record: records.RunRecord) -> Metrics:
+    """The experiment, and in `run.json` how it ends."""
+    solved = handoff.current()
+    record.add_seconds(0.0 if solved is None else solved.seconds)
     try:
+        record.write(directory, "running")
         with warnings.catch_warnings():
             warnings.showwarning = _log_warning
-            metrics = _experiment(cfg, directory)
-    except USER_ERRORS as error:
-        if settings.mode != RunMode.RUN:  # a member of a sweep keeps its log, and the sweep goes on
-            _log.error("%s", sentence(error))
-            raise
-        _withdraw(directory)
-        raise Refused(error) from error
-    _log.info("  run directory: %s", os.path.relpath(directory))
+            metrics = _experiment(cfg, directory, solved)
+        record.write(directory, "completed")
+    except BaseException as error:
+        with contextlib.suppress(OSError):
+            record.write(directory, "failed", reason(error))
+        refused = isinstance(error, USER_ERRORS)
+        if HydraConfig.get().mode != RunMode.RUN:  # a member of a sweep keeps its log, and the sweep goes on
+            _log.error("%s", reason(error), exc_info=None if refused else error)
+        elif refused:
+            _withdraw(directory)
+            raise Refused(error) from error
+        raise
     return metrics
 
 
-def _experiment(cfg: DictConfig, directory: Path) -> dict[str, float | None]:
+def _experiment(cfg: DictConfig, directory: Path, solved: handoff.Solved | None) -> Metrics:
     choice("staf", "task", cfg.task, EXPERIMENTS)
-    return importlib.import_module(f"{__package__}.members").run(cfg, directory)  # type: ignore[no-any-return]
+    from . import members  # which imports this module
+
+    metrics: Metrics
+    if solved is None:
+        metrics = members.run(cfg, directory)
+    elif isinstance(solved.outcome, BaseException):
+        raise solved.outcome
+    elif isinstance(solved.outcome, Written):
+        for level, line in solved.outcome.log:
+            _log.log(level, "%s", line)
+        metrics = solved.outcome.metrics
+    else:
+        metrics = members.write(cfg, directory, solved.outcome)
+    return metrics
 
 
 class Refused(SystemExit):
     """A run that ended by a user's error: Hydra lets it pass without a word of its own."""
 
-    def __init__(self, error: Exception) -> None:
+    def __init__(self, error: BaseException) -> None:
         super().__init__(f"staf: {sentence(error)}")
 
 
@@ -92,7 +123,8 @@ def _withdraw(directory: Path) -> None:
     if (directory / "metrics.json").exists():
         return
     shutil.rmtree(directory / ".hydra", ignore_errors=True)
-    (directory / "staf.log").unlink(missing_ok=True)
+    for name in (records.RUN, "staf.log"):
+        (directory / name).unlink(missing_ok=True)
     with contextlib.suppress(OSError):  # not empty: it was there before
         directory.rmdir()
 
@@ -108,33 +140,27 @@ def main() -> None:
     # Hydra then hands every exception on, and this function words it, once, for run and sweep alike.
     os.environ[_FULL_ERROR] = "1"
     sys.path.insert(0, os.getcwd())  # so that `target.path=my_module.my_function` finds the user's file
-    try:
-        _task()
-    except Refused as refused:
-        if wants_trace and refused.__cause__ is not None:
-            raise refused.__cause__ from None
-        raise
-    except USER_ERRORS as error:
-        if wants_trace:
+    typed = sys.argv
+    with session() as running:
+        try:
+            sys.argv = [typed[0], *command_line(typed[1:])]
+            try:
+                _task()
+            except Exception:
+                running.close()
+                raise
+        except Refused as refused:
+            if wants_trace and refused.__cause__ is not None:
+                raise refused.__cause__ from None
             raise
-        sys.exit(f"staf: {sentence(error)}")
-    except KeyboardInterrupt:
-        sys.exit("staf: interrupted")
-    finally:
-        if before is None:
-            del os.environ[_FULL_ERROR]
-
-
-def sentence(error: BaseException) -> str:
-    """The library's own words where Hydra wrapped them, else the error's."""
-    cause: BaseException | None = error
-    while cause is not None:
-        if isinstance(cause, ValueError) and not isinstance(cause, OmegaConfBaseException):
-            return str(cause)
-        cause = cause.__cause__
-    if isinstance(error, OSError) and not isinstance(error, HydraException) and error.filename:
-        return f"cannot write {error.filename}: {error.strerror}"
-    unknown = re.match(r"Could not override '(.+?)'", str(error))
-    if unknown:
-        return f"there is no setting `{unknown[1]}`; `staf --help` lists them."
-    return str(error)
+        except USER_ERRORS as error:
+            if wants_trace:
+                raise
+            sys.exit(f"staf: {sentence(error)}")
+        except KeyboardInterrupt:
+            sys.stderr.write(running.farewell + "\n")
+            sys.exit(130)  # as shells have it
+        finally:
+            sys.argv = typed
+            if before is None:
+                del os.environ[_FULL_ERROR]

@@ -2,14 +2,29 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import sys
 import time
+from collections.abc import Callable, Iterator
+from contextvars import ContextVar
 
 _log = logging.getLogger(__name__)
 _QUIET = 2.0  # seconds before anything is shown: short runs need none
 _BAR_EVERY = 0.2
 _LINE_EVERY = 10.0
+
+_listener: ContextVar[Callable[[float], None] | None] = ContextVar("listener", default=None)
+
+
+@contextlib.contextmanager
+def listening(listener: Callable[[float], None]) -> Iterator[None]:
+    """Progress inside is told to ``listener``, the share that is done, and not shown."""
+    token = _listener.set(listener)
+    try:
+        yield
+    finally:
+        _listener.reset(token)
 
 
 class Progress:
@@ -31,6 +46,10 @@ class Progress:
     def advance(self, steps: int) -> None:
         """``steps`` more are done."""
         self._done += steps
+        listener = _listener.get()
+        if listener is not None:
+            listener(self._done / self._total)
+            return
         now = time.monotonic()
         if now - self._start < _QUIET or now - self._shown < self._interval:
             return

@@ -1,0 +1,67 @@
+"""`hydra/launcher=batched`: the jobs of a sweep as tensor batches.
+
+Every Hydra program of the environment imports this module, so it imports neither torch nor staf_torch.
+"""
+
+# No postponed annotations: Hydra 1.3 runs this module before `sys.modules` has it, where dataclasses look.
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from hydra.core.config_store import ConfigStore
+from hydra.core.utils import JobReturn
+from hydra.plugins import launcher  # the module: a base class imported by name is listed as a plugin itself
+from hydra.types import HydraContext, TaskFunction
+from omegaconf import DictConfig
+
+
+@dataclass
+class BatchedLauncherConf:
+    """The settings of `hydra.launcher`, with what they mean."""
+
+    _target_: str = "hydra_plugins.staf_batched.BatchedLauncher"
+    executor: str = "inline"  # where tensor batches are computed: inline, process, submitit or ray
+    workers: int | None = None  # batches at once; null: one a core, or as many as the cluster takes
+    batch: int | None = None  # jobs in a tensor batch at most; null: as many as memory allows
+    submitit: dict[str, Any] = field(default_factory=dict)  # arguments of submitit's executor
+    ray: dict[str, Any] = field(default_factory=dict)  # arguments of ray.init
+
+
+ConfigStore.instance().store(
+    group="hydra/launcher", name="batched", node=BatchedLauncherConf, provider="staf_torch"
+)
+
+
+class BatchedLauncher(launcher.Launcher):
+    """Groups jobs that may share a tensor batch, solves the batches, replays every job as Hydra's own.
+
+    Args:
+        executor, workers, batch, submitit, ray: as in `BatchedLauncherConf`.
+    """
+
+    def __init__(
+        self,
+        executor: str = "inline",
+        workers: int | None = None,
+        batch: int | None = None,
+        submitit: dict[str, Any] | None = None,
+        ray: dict[str, Any] | None = None,
+    ) -> None:
+        self.executor, self.workers, self.batch = executor, workers, batch
+        self.arguments = {"submitit": submitit or {}, "ray": ray or {}}
+        self.hydra_context: HydraContext | None = None
+        self.task_function: TaskFunction | None = None
+        self.config: DictConfig | None = None
+
+    def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
+        """What Hydra hands over before the sweep."""
+        from staf_torch.experiments.sweep.composed import compose_once
+
+        compose_once(hydra_context, config)
+        self.hydra_context, self.task_function, self.config = hydra_context, task_function, config
+
+    def launch(self, job_overrides: Sequence[Sequence[str]], initial_job_idx: int) -> Sequence[JobReturn]:
+        """Run the jobs; their returns in order."""
+        from staf_torch.experiments.sweep.launch import Launch
+
+        return Launch(self).run(job_overrides, initial_job_idx)

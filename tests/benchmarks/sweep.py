@@ -1,0 +1,62 @@
+"""A hundred jobs by the batched launcher and by Hydra's basic one, and a thousand members in one job.
+
+`python tests/benchmarks/sweep.py [--json FILE] [--only batched,basic,members]`, on a machine with nothing else to do.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+LENGTH = ["duration=5", "settle_time=1", "figures=false"]  # 500 steps
+RADII, COUNTS = "centers.radius=0.05,0.1,0.15,0.2,0.3", "centers.count=3,6,10,15"
+JOBS = ["-m", RADII, COUNTS, "seed=range(5)", "trajectories=2", *LENGTH]
+COMMANDS = {
+    "batched": [*JOBS, "hydra.sweep.dir=sweep"],
+    "basic": [*JOBS, "hydra.sweep.dir=sweep", "hydra/launcher=basic"],
+    "members": [f"members=[{RADII},{COUNTS},seed=range(50)]", "trajectories=2", *LENGTH],
+}
+
+
+def measured(argv: list[str]) -> dict[str, float]:
+    """Wall and CPU seconds of a command, all its processes together."""
+    path = os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
+    with tempfile.TemporaryDirectory() as folder:
+        before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+        line = [sys.executable, "-m", "staf_torch", *argv]
+        subprocess.run(
+            line, cwd=folder, env={**os.environ, "PYTHONPATH": path}, check=True, stdout=subprocess.DEVNULL
+        )
+        wall, after = time.perf_counter() - start, resource.getrusage(resource.RUSAGE_CHILDREN)
+    cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return {"wall": round(wall, 2), "cpu": round(cpu, 2)}
+
+
+def main() -> None:
+    """Measure, print, and write where asked."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--only", default=",".join(COMMANDS))
+    chosen = parser.parse_args()
+    found: dict[str, dict[str, float] | float] = {}
+    for name in chosen.only.split(","):
+        found[name] = measured(COMMANDS[name])
+        print(f"{name:8s} {found[name]['wall']:7.2f} s wall {found[name]['cpu']:7.2f} s CPU", flush=True)
+    if {"batched", "basic"} <= set(found):
+        found["cpu_ratio"] = round(found["batched"]["cpu"] / found["basic"]["cpu"], 3)
+        print(f"the batched launcher takes {found['cpu_ratio']} of the basic one's CPU seconds")
+    print(json.dumps(found))
+    if chosen.json:
+        chosen.json.write_text(json.dumps(found, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
