@@ -35,6 +35,24 @@ class Kernel(nn.Module, abc.ABC):
         result: Tensor = self(at + z, at + d)
         return result
 
+    def gradient(self, x1: Tensor, x2: Tensor, b: Tensor) -> Tensor | None:
+        """d/dx1 of sum_i b_i k(x1, x2_i) in closed form, None where autograd has to find it.
+
+        Args:
+            x1: (..., P, n).
+            x2: (..., M, n).
+            b: (..., M).
+
+        Returns:
+            (..., P, n).
+        """
+        return None
+
+    def core_gradient(self, x: Tensor, z: Tensor, d: Tensor, b: Tensor) -> Tensor | None:
+        """d/dz of sum_i b_i k0(z, d_i) at the state x, likewise: (..., P, n)."""
+        at = x.unsqueeze(-2)
+        return self.gradient(at + z, at + d, b)
+
     def log_gain(self, x: Tensor) -> Tensor | None:
         """g(x): (..., n) -> (...), or None where it is zero."""
         return None
@@ -81,6 +99,15 @@ class Kernel(nn.Module, abc.ABC):
         result: Tensor = self(x1, x2) - left * right / corner
         return result
 
+    def anchored_gradient(self, x1: Tensor, x2: Tensor, b: Tensor) -> Tensor | None:
+        """`gradient` of `anchored`: (..., P, n)."""
+        zero = x1.new_zeros(1, x1.shape[-1])
+        own, left = self.gradient(x1, x2, b), self.gradient(x1, zero, x1.new_ones(1))
+        if own is None or left is None:
+            return None
+        right: Tensor = self(zero, x2) / self(zero, zero)
+        return own - left * (right * b.unsqueeze(-2)).sum(-1, keepdim=True)
+
     def rank(self, dim: int) -> int | None:
         """Dimension of the kernel's function space over R^dim, None where it is infinite."""
         return None
@@ -109,3 +136,8 @@ def squared_distance(x1: Tensor, x2: Tensor) -> Tensor:
     The expansion |x1|^2 - 2 x1'x2 + |x2|^2 would lose every digit of a small distance far from 0.
     """
     return (x1.unsqueeze(-2) - x2.unsqueeze(-3)).square().sum(-1)
+
+
+def weighted_differences(weights: Tensor, x1: Tensor, x2: Tensor) -> Tensor:
+    """sum_i w_i (x1_i - x2) by differences: (..., P, M), (..., M, n), (..., P, n) -> (..., P, n)."""
+    return (weights.unsqueeze(-1) * (x1.unsqueeze(-3) - x2.unsqueeze(-2))).sum(-2)

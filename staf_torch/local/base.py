@@ -65,6 +65,18 @@ def scale(kernel: Kernel, x: Tensor, z: Tensor, sign: float = 1.0) -> Tensor:
     return z.new_ones(()) if s is None else (sign * s).exp()
 
 
+def scaled_gradient(
+    kernel: Kernel, x: Tensor, z: Tensor, sums: Tensor, slope: Tensor
+) -> tuple[Tensor, Tensor]:
+    """e^{s(z)} v(z) and its gradient from v (..., P) and its gradient (..., P, n)."""
+    along = kernel.log_scale_gradient(x, z)
+    if along is None:
+        return sums, slope
+    factor = scale(kernel, x, z)
+    value = sums * factor
+    return value, torch.addcmul(slope * factor.unsqueeze(-1), value.unsqueeze(-1), along)
+
+
 def in_blocks(function: Callable[[Tensor, Tensor], Tensor], values: Tensor, state: Tensor) -> Tensor:
     """A function of rows (..., M) and (..., n), called with a few thousand rows at a time.
 

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from ..kernels import Kernel
-from .base import from_scaled, in_blocks, scale, to_scaled
+from .base import from_scaled, in_blocks, scale, scaled_gradient, to_scaled
 from .elimination import Degrees, degrees_of, functionals_of
 from .interpolation import Interpolation
 from .phi import phi
@@ -134,12 +134,7 @@ class GradedSpace(NamedTuple):
         for k in range(1, len(terms)):
             inner = torch.addcmul(inner, terms[k - 1], apart[k], value=k)
         slope = self._divided(inner @ self.units)
-        along = self.kernel.log_scale_gradient(self.state, z)
-        if along is None:
-            return sums, slope
-        factor = scale(self.kernel, self.state, z)
-        value = sums * factor
-        return value, torch.addcmul(slope * factor.unsqueeze(-1), value.unsqueeze(-1), along)
+        return scaled_gradient(self.kernel, self.state, z, sums, slope)
 
     def scaled_weights(self, coefficients: Tensor) -> Tensor:
         """e^g w, w_i = e^{-g - s(d_i)} sum_j (q_ij / sigma_j) k_j! r^(-2 k_j) beta_j: (..., M) -> (..., M).
