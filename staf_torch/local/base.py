@@ -59,6 +59,16 @@ def with_gradient(function: Callable[[Tensor], Tensor], z: Tensor) -> tuple[Tens
     return (values, gradient) if values.dim() == leading else (values.movedim(-1, 0), gradient.movedim(-2, 0))
 
 
+def rows_last(matrix: Tensor, rows: Tensor) -> Tensor:
+    """rows matrix', (M, K), (..., K) -> (..., M), with the rows last in memory.
+
+    What follows elementwise then runs along the many rows, and not along the few centers.
+    """
+    if rows.dim() <= 2:
+        return (matrix @ rows.mT).mT if rows.dim() == 2 else matrix @ rows
+    return (matrix @ rows.flatten(0, -2).mT).mT.unflatten(0, rows.shape[:-1])
+
+
 def scale(kernel: Kernel, x: Tensor, z: Tensor, sign: float = 1.0) -> Tensor:
     """e^{sign s(x, z)}: (..., P), or () where s is zero."""
     s = kernel.log_scale(x, z)
