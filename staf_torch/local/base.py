@@ -66,7 +66,8 @@ def rows_last(matrix: Tensor, rows: Tensor) -> Tensor:
     """
     if rows.dim() <= 2:
         return (matrix @ rows.mT).mT if rows.dim() == 2 else matrix @ rows
-    return (matrix @ rows.flatten(0, -2).mT).mT.unflatten(0, rows.shape[:-1])
+    together: Tensor = (matrix @ rows.flatten(0, -2).mT).mT
+    return together.unflatten(0, rows.shape[:-1])
 
 
 def scale(kernel: Kernel, x: Tensor, z: Tensor, sign: float = 1.0) -> Tensor:
