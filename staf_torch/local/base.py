@@ -67,7 +67,8 @@ def rows_last(matrix: Tensor, rows: Tensor) -> Tensor:
     if rows.dim() <= 2:
         return (matrix @ rows.mT).mT if rows.dim() == 2 else matrix @ rows
     together: Tensor = (matrix @ rows.flatten(0, -2).mT).mT
-    return together.unflatten(0, rows.shape[:-1])
+    product: Tensor = together.unflatten(0, rows.shape[:-1])
+    return product
 
 
 def scale(kernel: Kernel, x: Tensor, z: Tensor, sign: float = 1.0) -> Tensor:
