@@ -70,6 +70,31 @@ def test_value_and_gradient_are_those_of_autograd(name: str, radius: str) -> Non
     torch.testing.assert_close(gradient, expected, rtol=1e-9, atol=1e-12 * scale)
 
 
+ROW_BY_ROW = {
+    "gaussian": st.GaussianKernel,
+    "matern32": lambda v: st.MaternKernel(1.5, v),
+    "rational_quadratic": lambda v: st.RationalQuadraticKernel(v, 2 * v),
+    "inverse_multiquadric": st.InverseMultiquadricKernel,
+    "anchored": lambda v: st.AnchoredKernel(st.GaussianKernel(v)),
+}
+
+
+@over(ROW_BY_ROW)
+def test_a_hyperparameter_a_row_is_what_it_would_be_alone(name: str) -> None:
+    widths, radii = tensor([[0.6], [0.8], [1.1]]), tensor([[0.2], [0.3], [0.4]])
+    x, y = uniform(3, 4, 2, low=0.3), uniform(3, 4, 2, 2)
+
+    def made(width: torch.Tensor, radius: torch.Tensor, batch: tuple[int, ...]) -> st.StaF:
+        centers = st.StateFollowingCenters(st.rings(6), radius)
+        return st.StaF(st.StaFBasis(ROW_BY_ROW[name](width), centers), batch)
+
+    together = made(widths, radii, (3, 4)).fit_(x, Paper()).value_and_gradient(y)
+    for row in range(3):
+        alone = made(widths[row, 0], radii[row, 0], (4,)).fit_(x[row], Paper()).value_and_gradient(y[row])
+        for found, expected in zip(together, alone, strict=True):
+            torch.testing.assert_close(found[row], expected, rtol=1e-8, atol=1e-8)
+
+
 @over(KERNELS)
 @over(RADII, "radius")
 def test_gradients_reach_everything_that_is_learned_in_every_mode(name: str, radius: str) -> None:

@@ -21,6 +21,8 @@ class Kernel(nn.Module, abc.ABC):
     with g the `log_gain`, s the `log_scale` and k0 the `core`. Where k0 does not depend on x
     (`state_free`), the Gram matrix of constant offsets is factored once for all states. The defaults
     say nothing of the sort: g = s = 0 and k0(z, d) = k(x + z, x + d).
+
+    A hyperparameter that is given as an `nn.Parameter` is learned, a number or another tensor is fixed.
     """
 
     state_free: bool = False
