@@ -65,8 +65,8 @@ class StaFBasis(nn.Module):
         >>> basis.ideal_weights(x, targets.Paper()).shape
         torch.Size([3])
 
-    Hyperparameters that kernel, centers and radius were given as `nn.Parameter` are learned, others fixed. The
-    buffer `convention` says in a state_dict what coefficients beside it mean; see `check_convention`.
+    Hyperparameters that kernel, centers and radius were given as `nn.Parameter` are learned, others fixed.
+    The buffer `convention` says in a state_dict what coefficients beside it mean: `check_convention`.
 
     Args:
         kernel: the kernel k.
