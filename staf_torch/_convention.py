@@ -8,6 +8,17 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+FORMAT = 2
+"""Of the local bases; raised whenever the same coefficients come to mean another function."""
+
+_COMPARED = {
+    "format": "format of the local basis",
+    "kernel": "kernel",
+    "radius": "radius",
+    "centers": "number of centers and states",
+    "basis": "local basis",
+}
+
 
 def hold(module: nn.Module, name: str, value: Tensor) -> None:
     """Keep a hyperparameter: an `nn.Parameter` as one, to be learned; any other tensor as a fixed buffer."""
@@ -58,3 +69,17 @@ def decode(call: str, stored: Tensor) -> dict[str, Any]:
             f"`{call}`: the entry `convention` must be what a StaFBasis wrote; it is not readable."
         )
     return record
+
+
+def compare(call: str, saved: dict[str, Any], own: dict[str, Any]) -> None:
+    """Whether coefficients that were saved with one record mean the same function beside another.
+
+    Raises:
+        ValueError: if they do not, and why.
+    """
+    for key, name in _COMPARED.items():
+        if saved.get(key) != own[key]:
+            raise ValueError(
+                f"`{call}`: coefficients mean another function here, as the {name} must be the same: "
+                f"saved with {saved.get(key)}, loaded into {own[key]}. Build the same basis, or fit anew."
+            )

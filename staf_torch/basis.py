@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from ._checks import sampled, trailing
-from ._convention import decode, described, encode
+from ._convention import FORMAT, compare, decode, described, encode
 from .centers import StateFollowingCenters
 from .kernels import Kernel, PolynomialKernel
 from .local import (
@@ -19,7 +19,7 @@ from .local import (
     GradedBasis,
     GradedSpace,
     LocalSpace,
-    degrees_of,
+    choose,
     graded_basis,
     newton_space,
     polynomial_space,
@@ -27,15 +27,6 @@ from .local import (
 
 Target = Callable[[Tensor], Tensor]
 """A function V to approximate: points (..., n) to values (...)."""
-
-_FORMAT = 2  # of the local bases; raised whenever the same coefficients come to mean another function
-_COMPARED = {
-    "format": "format of the local basis",
-    "kernel": "kernel",
-    "radius": "radius",
-    "centers": "number of centers and states",
-    "basis": "local basis",
-}
 
 
 class GramStructure(NamedTuple):
@@ -74,6 +65,9 @@ class StaFBasis(nn.Module):
         >>> basis.ideal_weights(x, targets.Paper()).shape
         torch.Size([3])
 
+    Hyperparameters that kernel, centers and radius were given as `nn.Parameter` are learned, others fixed.
+    The buffer `convention` says in a state_dict what coefficients beside it mean: `check_convention`.
+
     Args:
         kernel: the kernel k.
         centers: the state-following centers c_i.
@@ -84,6 +78,8 @@ class StaFBasis(nn.Module):
 
     Source: Rosenfeld et al., section 2.
     """
+
+    _choose_again = False  # whether directions came without what fixes their local basis
 
     def __init__(self, kernel: Kernel, centers: StateFollowingCenters) -> None:
         super().__init__()
@@ -100,22 +96,11 @@ class StaFBasis(nn.Module):
             )
         self.kernel = kernel
         self.centers = centers
-        self._kind, self._degrees = self._choose()
+        self._kind, self._degrees = choose(kernel, centers.directions)
         self.register_buffer("convention", encode(self._record()))
         self.convention: Tensor
         self._prepare()
         self.register_load_state_dict_post_hook(StaFBasis._after_loading)  # type: ignore[no-untyped-call]
-
-    def _choose(self) -> tuple[str, Degrees | None]:
-        """The kind of local basis, and what fixes it for these directions."""
-        if self.kernel.exponent_rate() is not None:
-            return "graded", degrees_of(self.centers.directions)
-        if isinstance(self.kernel, PolynomialKernel) and self.kernel.full:
-            degrees = degrees_of(self.centers.directions)
-            # A functional of a higher degree than the kernel's sees nothing: a case for the Newton basis.
-            if len(degrees.sizes) <= self.kernel.degree + 1:
-                return "polynomial", degrees
-        return "newton", None
 
     def _prepare(self) -> None:
         """Set up what depends on fixed directions alone, again whenever others are loaded."""
@@ -156,7 +141,7 @@ class StaFBasis(nn.Module):
 
     def _record(self) -> dict[str, Any]:
         """What coefficients mean, beside the tensors of the state_dict."""
-        record = {"format": _FORMAT, "kernel": described(self.kernel), "basis": self._kind}
+        record = {"format": FORMAT, "kernel": described(self.kernel), "basis": self._kind}
         record |= {"radius": described(self.centers.radius), "centers": [self.count, self.dim]}
         return record if self._degrees is None else record | {"degrees": self._degrees._asdict()}
 
@@ -166,13 +151,7 @@ class StaFBasis(nn.Module):
         Raises:
             ValueError: if they do not, and why.
         """
-        saved, own = decode(call, stored), self._record()
-        for key, name in _COMPARED.items():
-            if saved.get(key) != own[key]:
-                raise ValueError(
-                    f"`{call}`: coefficients mean another function here, as the {name} must be the same: "
-                    f"saved with {saved.get(key)}, loaded into {own[key]}. Build the same basis, or fit anew."
-                )
+        compare(call, decode(call, stored), self._record())
 
     def _load_from_state_dict(
         self, state_dict: dict[str, Any], prefix: str, *arguments: Any, **keywords: Any
@@ -191,7 +170,7 @@ class StaFBasis(nn.Module):
     def _after_loading(module: nn.Module, _: object) -> None:
         assert isinstance(module, StaFBasis)
         if module._choose_again:
-            module._kind, module._degrees = module._choose()
+            module._kind, module._degrees = choose(module.kernel, module.centers.directions)
             module.convention = encode(module._record()).to(module.convention.device)
         module._prepare()
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import torch
-from helpers import Cauchy, uniform
+from helpers import Cauchy, basis_of, uniform
 from torch import Tensor, nn
 
 import staf_torch as st
@@ -48,6 +48,11 @@ def learnable(
     x = uniform(*batch, 2, low=0.3, seed=3)
     points = x.unsqueeze(-2) + uniform(*batch, 2, 2, low=-0.1, high=0.1, seed=4)
     return staf.fit_(x, target_of(outputs)), points
+
+
+def fixed(kernel: str, batch: tuple[int, ...] = (), outputs: int | None = None) -> st.StaF:
+    x = uniform(*batch, 2, low=0.3, high=1.2, seed=5)
+    return st.StaF(basis_of(kernel, radius=0.5), batch, outputs).fit_(x, target_of(outputs))
 
 
 def evaluated(staf: st.StaF, y: Tensor, mode: str, target: Callable[[Tensor], Tensor]) -> Tensor:

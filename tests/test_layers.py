@@ -2,27 +2,17 @@
 
 from __future__ import annotations
 
-import copy
-import io
-import pickle
-
 import pytest
 import torch
 from helpers import KERNELS as FIXED
 from helpers import RADII as FIXED_RADII
 from helpers import SMOOTH_KERNELS, basis_of, over, tensor, uniform
-from helpers_layers import KERNELS, MODES, RADII, as_function, evaluated, learnable, learned, target_of
-from torch import nn
+from helpers_layers import KERNELS, MODES, RADII, as_function, evaluated, fixed, learnable, target_of
 
 import staf_torch as st
 from staf_torch.targets import Paper
 
 BATCHES = ((), (4,), (2, 3))
-
-
-def fixed(kernel: str, batch: tuple[int, ...] = (), outputs: int | None = None) -> st.StaF:
-    x = uniform(*batch, 2, low=0.3, high=1.2, seed=5)
-    return st.StaF(basis_of(kernel, radius=0.5), batch, outputs).fit_(x, target_of(outputs))
 
 
 @over(FIXED)
@@ -70,16 +60,40 @@ def test_value_and_gradient_are_those_of_autograd(name: str, radius: str) -> Non
     torch.testing.assert_close(gradient, expected, rtol=1e-9, atol=1e-12 * scale)
 
 
+ROW_BY_ROW = {
+    "gaussian": st.GaussianKernel,
+    "matern32": lambda v: st.MaternKernel(1.5, v),
+    "rational_quadratic": lambda v: st.RationalQuadraticKernel(v, 2 * v),
+    "inverse_multiquadric": st.InverseMultiquadricKernel,
+    "anchored": lambda v: st.AnchoredKernel(st.GaussianKernel(v)),
+}
+
+
+@over(ROW_BY_ROW)
+def test_a_hyperparameter_a_row_is_what_it_would_be_alone(name: str) -> None:
+    widths, radii = tensor([[0.6], [0.8], [1.1]]), tensor([[0.2], [0.3], [0.4]])
+    x, y = uniform(3, 4, 2, low=0.3), uniform(3, 4, 2, 2)
+
+    def made(width: torch.Tensor, radius: torch.Tensor, batch: tuple[int, ...]) -> st.StaF:
+        centers = st.StateFollowingCenters(st.rings(6), radius)
+        return st.StaF(st.StaFBasis(ROW_BY_ROW[name](width), centers), batch)
+
+    together = made(widths, radii, (3, 4)).fit_(x, Paper()).value_and_gradient(y)
+    for row in range(3):
+        alone = made(widths[row, 0], radii[row, 0], (4,)).fit_(x[row], Paper()).value_and_gradient(y[row])
+        for found, expected in zip(together, alone, strict=True):
+            torch.testing.assert_close(found[row], expected, rtol=1e-8, atol=1e-8)
+
+
 @over(KERNELS)
 @over(RADII, "radius")
 def test_gradients_reach_everything_that_is_learned_in_every_mode(name: str, radius: str) -> None:
-    for outputs in (None, 2) if name in ("exponential", "matern52") else (None,):
-        staf, y = learnable(name, radius, outputs=outputs)
-        for mode in MODES:
-            function, at = as_function(staf, mode, target_of(outputs))
-            assert torch.autograd.gradcheck(
-                function, (y.requires_grad_(), *at), atol=1e-5, rtol=1e-4, fast_mode=True
-            ), mode
+    outputs = 2 if name in ("exponential", "user_defined") else None
+    staf, y = learnable(name, radius, outputs=outputs)
+    for mode in MODES if radius == "shrinking" else MODES[::2]:
+        function, at = as_function(staf, mode, target_of(outputs))
+        inputs = (y[:1].requires_grad_(), *at)
+        assert torch.autograd.gradcheck(function, inputs, atol=1e-5, rtol=1e-4, fast_mode=True), mode
 
 
 @pytest.mark.parametrize("name", ["exponential", "gaussian", "matern52", "polynomial"])
@@ -89,17 +103,6 @@ def test_second_derivatives_are_right(name: str) -> None:
     assert torch.autograd.gradgradcheck(
         function, (y.requires_grad_(), *at), atol=1e-4, rtol=1e-3, fast_mode=True
     )
-
-
-@over(KERNELS)
-def test_parameters_are_learned_and_tensors_are_fixed(name: str) -> None:
-    staf, _ = learnable(name, "shrinking")
-    learnt = {key.rsplit(".", 1)[-1] for key, _ in staf.named_parameters()}
-    assert {"coefficients", "directions", "radius", "offset", "gain"} <= learnt
-    assert [key for key, _ in fixed("gaussian").named_parameters()] == ["coefficients"]
-    frozen = st.StaF(basis_of("gaussian"), learnable=False).fit_(tensor([0.5, 0.2]), Paper())
-    assert not list(frozen.parameters())
-    assert "coefficients" in frozen.state_dict()
 
 
 def test_the_basis_turns_smoothly_with_its_directions() -> None:
@@ -125,20 +128,6 @@ def test_trained_hyperparameters_travel_with_the_state_dict() -> None:
     fresh.load_state_dict(staf.state_dict())
     assert torch.equal(fresh(y), staf(y))
     assert float(fresh.basis.kernel.width.detach()) != 0.8
-
-
-def test_a_parametrised_width_is_constrained_and_learned() -> None:
-    class Exp(nn.Module):
-        def forward(self, raw: torch.Tensor) -> torch.Tensor:
-            return raw.exp()
-
-    kernel = st.GaussianKernel(learned(0.8))
-    nn.utils.parametrize.register_parametrization(kernel, "width", Exp(), unsafe=True)
-    staf = st.StaF(st.StaFBasis(kernel, st.StateFollowingCenters(st.rings(3), 0.3)))
-    y = staf.fit_(tensor([0.4, 0.3]), Paper()).state.unsqueeze(0) + 0.1
-    staf(y).sum().backward()
-    assert float(kernel.width.detach()) == pytest.approx(2.718281828459045**0.8)
-    assert float(kernel.parametrizations.width.original.grad) != 0
 
 
 def test_directions_swapped_in_are_used() -> None:
@@ -180,101 +169,3 @@ def test_an_ensemble_is_called_by_vmap(name: str) -> None:
 
     together = torch.func.vmap(call)(parameters, buffers)
     torch.testing.assert_close(together, torch.stack([member(y) for member in members]))
-
-
-@over(FIXED)
-def test_copies_are_the_same_function_and_apart(name: str) -> None:
-    staf = fixed(name, (2,)).fit_(uniform(2, 2, low=0.3), lambda y: Paper()(y))
-    y = staf.state.unsqueeze(-2) + uniform(2, 3, 2, low=-0.2, high=0.2)
-    before = staf(y).detach()
-    saved = io.BytesIO()
-    if name != "user_defined":
-        torch.save(staf, saved)
-        saved.seek(0)
-        assert torch.equal(torch.load(saved, weights_only=False)(y), before)
-    copied, pickled = copy.deepcopy(staf), pickle.loads(pickle.dumps(staf))
-    assert torch.equal(copied.gradient(y, "total"), staf.gradient(y, "total"))
-    with pytest.raises(ValueError, match="needs a target"):  # a lambda could not be pickled
-        pickled.gradient(y, "total")
-    staf.reset_parameters()
-    assert torch.equal(staf(y), torch.zeros(2, 3).double())
-    assert torch.equal(copied(y), before)
-    assert torch.equal(pickled(y), before)
-
-
-@over(FIXED)
-def test_precision_is_changed_and_changed_back(name: str) -> None:
-    staf = fixed(name, (2,))
-    y = staf.state.unsqueeze(-2) + uniform(2, 3, 2, low=-0.2, high=0.2)
-    expected = staf(y).detach()
-    staf.float()
-    assert staf(y.float()).dtype == staf.gradient(y.float()).dtype == torch.float32
-    torch.testing.assert_close(staf(y.float()).double(), expected, rtol=1e-2, atol=1e-2)
-    staf.to(torch.float64)
-    centers = staf.fit_(staf.state.clone(), Paper()).basis.centers(staf.state)
-    torch.testing.assert_close(staf(centers), Paper()(centers), rtol=1e-9, atol=1e-9)
-
-
-@pytest.mark.parametrize("name", ["exponential", "matern52", "polynomial"])
-def test_a_layer_takes_dtype_and_device(name: str) -> None:
-    single = st.StaF(basis_of(name), (2,), dtype=torch.float32)
-    assert single.coefficients.dtype == single.state.dtype == torch.float32
-    single.fit_(uniform(2, 2, low=0.3).float(), Paper())
-    assert single(uniform(2, 3, 2).float()).dtype == torch.float32
-    shape = st.StaF(basis_of(name), (2,), 3, device="meta")
-    assert shape.coefficients.is_meta
-    assert shape.to("meta")(torch.zeros(2, 5, 2, device="meta")).shape == (2, 5, 3)
-
-
-def test_evaluation_leaves_the_module_alone() -> None:
-    for name in FIXED:
-        staf = fixed(name, (2,))
-        y = uniform(2, 3, 2)
-        tensors = {**dict(staf.named_parameters()), **dict(staf.named_buffers())}
-        before = {key: (id(value), value._version) for key, value in tensors.items()}
-        attributes = {key: id(value) for key, value in vars(staf.basis).items()}
-        for mode in MODES:
-            evaluated(staf, y, mode, Paper())
-        tensors = {**dict(staf.named_parameters()), **dict(staf.named_buffers())}
-        assert {key: (id(value), value._version) for key, value in tensors.items()} == before
-        assert {key: id(value) for key, value in vars(staf.basis).items()} == attributes
-        staf.load_state_dict(staf.state_dict())
-
-
-def test_distributed_data_parallel_trains_a_layer() -> None:
-    import torch.distributed as dist
-
-    dist.init_process_group("gloo", store=dist.HashStore(), rank=0, world_size=1)
-    try:
-        staf, y = learnable("gaussian", "shrinking")
-        plain = copy.deepcopy(staf)
-        nn.parallel.DistributedDataParallel(staf)(y).square().sum().backward()
-        plain(y).square().sum().backward()
-        for (key, found), expected in zip(staf.named_parameters(), plain.parameters(), strict=True):
-            torch.testing.assert_close(found.grad, expected.grad, msg=key)
-    finally:
-        dist.destroy_process_group()
-
-
-def test_repr_says_what_is_configured() -> None:
-    text = repr(st.StaF(basis_of("gaussian"), (2,), 3, learnable=False))
-    for part in ("batch_shape=(2,), out_features=3, learnable=False", "count=6, dim=2", "width=0.8"):
-        assert part in text
-
-
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: st.StaF(3), r"`StaF\(basis=...\)` must be a StaFBasis; got 3."),
-        (lambda: st.StaF(basis_of("gaussian"), out_features=0), r"out_features=...\)` must be at least 1"),
-        (lambda: st.StaF(basis_of("gaussian"), learnable=1), r"learnable=...\)` must be true or false"),
-        (
-            lambda: st.StaF(basis_of("gaussian"), (), 2).fit_(uniform(2), Paper()),
-            r"values of shape \(..., 2\): \(6, 2\) must give \(6, 2\); got \(6,\)",
-        ),
-        (lambda: st.GaussianKernel(learned(-1.0)), r"`GaussianKernel\(width=...\)` must be positive"),
-    ],
-)
-def test_a_bad_argument_is_named_with_its_value(make, message: str) -> None:  # type: ignore[no-untyped-def]
-    with pytest.raises(ValueError, match=message):
-        make()

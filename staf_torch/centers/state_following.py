@@ -11,7 +11,7 @@ from .radius import ConstantRadius, Radius
 
 
 class StateFollowingCenters(nn.Module):
-    """c_i(x) = x + nu(x) u_i with fixed directions u_i in the closed unit ball.
+    """c_i(x) = x + nu(x) u_i with directions u_i in the closed unit ball.
 
     Example:
         >>> centers = StateFollowingCenters(rings(6), radius=0.1)
@@ -19,7 +19,7 @@ class StateFollowingCenters(nn.Module):
         torch.Size([6, 2])
 
     Args:
-        directions: u, (M, n), distinct, |u_i| <= 1.
+        directions: u, (M, n), distinct, |u_i| <= 1; learned where it is an `nn.Parameter`.
         radius: a positive number (`ConstantRadius`) or a `Radius`, in the units of the state.
 
     Raises:

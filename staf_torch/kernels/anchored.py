@@ -38,6 +38,9 @@ class AnchoredKernel(Kernel):
     def forward(self, x1: Tensor, x2: Tensor) -> Tensor:
         return self.kernel.anchored(x1, x2)
 
+    def gradient(self, x1: Tensor, x2: Tensor, b: Tensor) -> Tensor | None:
+        return self.kernel.anchored_gradient(x1, x2, b)
+
     def rank(self, dim: int) -> int | None:
         base = self.kernel.rank(dim)
         return None if base is None else base - 1

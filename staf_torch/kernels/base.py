@@ -21,6 +21,8 @@ class Kernel(nn.Module, abc.ABC):
     with g the `log_gain`, s the `log_scale` and k0 the `core`. Where k0 does not depend on x
     (`state_free`), the Gram matrix of constant offsets is factored once for all states. The defaults
     say nothing of the sort: g = s = 0 and k0(z, d) = k(x + z, x + d).
+
+    A hyperparameter that is given as an `nn.Parameter` is learned, a number or another tensor is fixed.
     """
 
     state_free: bool = False
@@ -34,6 +36,24 @@ class Kernel(nn.Module, abc.ABC):
         at = x.unsqueeze(-2)
         result: Tensor = self(at + z, at + d)
         return result
+
+    def gradient(self, x1: Tensor, x2: Tensor, b: Tensor) -> Tensor | None:
+        """d/dx1 of sum_i b_i k(x1, x2_i) in closed form, None where autograd has to find it.
+
+        Args:
+            x1: (..., P, n).
+            x2: (..., M, n).
+            b: (..., M).
+
+        Returns:
+            (..., P, n).
+        """
+        return None
+
+    def core_gradient(self, x: Tensor, z: Tensor, d: Tensor, b: Tensor) -> Tensor | None:
+        """d/dz of sum_i b_i k0(z, d_i) at the state x, likewise: (..., P, n)."""
+        at = x.unsqueeze(-2)
+        return self.gradient(at + z, at + d, b)
 
     def log_gain(self, x: Tensor) -> Tensor | None:
         """g(x): (..., n) -> (...), or None where it is zero."""
@@ -81,6 +101,15 @@ class Kernel(nn.Module, abc.ABC):
         result: Tensor = self(x1, x2) - left * right / corner
         return result
 
+    def anchored_gradient(self, x1: Tensor, x2: Tensor, b: Tensor) -> Tensor | None:
+        """`gradient` of `anchored`: (..., P, n)."""
+        zero = x1.new_zeros(1, x1.shape[-1])
+        own, left = self.gradient(x1, x2, b), self.gradient(x1, zero, x1.new_ones(1))
+        if own is None or left is None:
+            return None
+        right: Tensor = self(zero, x2) / self(zero, zero)
+        return own - left * (right * b.unsqueeze(-2)).sum(-1, keepdim=True)
+
     def rank(self, dim: int) -> int | None:
         """Dimension of the kernel's function space over R^dim, None where it is infinite."""
         return None
@@ -109,3 +138,8 @@ def squared_distance(x1: Tensor, x2: Tensor) -> Tensor:
     The expansion |x1|^2 - 2 x1'x2 + |x2|^2 would lose every digit of a small distance far from 0.
     """
     return (x1.unsqueeze(-2) - x2.unsqueeze(-3)).square().sum(-1)
+
+
+def weighted_differences(weights: Tensor, x1: Tensor, x2: Tensor) -> Tensor:
+    """sum_i w_i (x1_i - x2) by differences: (..., P, M), (..., M, n), (..., P, n) -> (..., P, n)."""
+    return (weights.unsqueeze(-1) * (x1.unsqueeze(-3) - x2.unsqueeze(-2))).sum(-2)

@@ -23,6 +23,9 @@ class ExponentialKernel(Kernel):
     def forward(self, x1: Tensor, x2: Tensor) -> Tensor:
         return inner(x1, x2).exp()
 
+    def gradient(self, x1: Tensor, x2: Tensor, b: Tensor) -> Tensor:
+        return (inner(x1, x2).exp() * b.unsqueeze(-2)) @ x2
+
     def core(self, x: Tensor, z: Tensor, d: Tensor) -> Tensor:
         return inner(z, d).exp()
 
@@ -52,3 +55,6 @@ class ExponentialKernel(Kernel):
 
     def anchored(self, x1: Tensor, x2: Tensor) -> Tensor:
         return inner(x1, x2).expm1()
+
+    def anchored_gradient(self, x1: Tensor, x2: Tensor, b: Tensor) -> Tensor:
+        return self.gradient(x1, x2, b)

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from .._checks import positive
 from .._convention import hold
-from .base import Kernel, inner, per_entry, squared_distance
+from .base import Kernel, inner, per_entry, squared_distance, weighted_differences
 
 
 class GaussianKernel(Kernel):
@@ -34,6 +34,11 @@ class GaussianKernel(Kernel):
     def forward(self, x1: Tensor, x2: Tensor) -> Tensor:
         return (squared_distance(x1, x2) * (-0.5 * per_entry(self.exponent_rate(), 2))).exp()
 
+    def gradient(self, x1: Tensor, x2: Tensor, b: Tensor) -> Tensor:
+        return weighted_differences(self(x1, x2) * b.unsqueeze(-2), x2, x1) * per_entry(
+            self.exponent_rate(), 2
+        )
+
     def follow(self, y: Tensor, step: Tensor) -> tuple[Tensor, Tensor]:
         return torch.zeros_like(y[..., 0]), torch.zeros_like(y)  # translation invariant
 
@@ -55,3 +60,11 @@ class GaussianKernel(Kernel):
         right = (x2.square().sum(-1) * (-0.5 * per_entry(rate, 1))).exp()
         middle = (inner(x1, x2) * per_entry(rate, 2)).expm1()
         return left.unsqueeze(-1) * middle * right.unsqueeze(-2)
+
+    def anchored_gradient(self, x1: Tensor, x2: Tensor, b: Tensor) -> Tensor:
+        rate = self.exponent_rate()
+        right = b * (x2.square().sum(-1) * (-0.5 * per_entry(rate, 1))).exp()
+        left = (x1.square().sum(-1) * (-0.5 * per_entry(rate, 1))).exp().unsqueeze(-1)
+        exponent, weights = inner(x1, x2) * per_entry(rate, 2), right.unsqueeze(-2)
+        total = (exponent.expm1() * weights).sum(-1, keepdim=True)
+        return left * per_entry(rate, 2) * ((exponent.exp() * weights) @ x2 - total * x1)

@@ -19,3 +19,6 @@ class InverseMultiquadricKernel(RadialKernel):
 
     def profile(self, s: Tensor) -> Tensor:
         return (1 + s).rsqrt()
+
+    def slope(self, s: Tensor) -> Tensor:
+        return -0.5 * (1 + s) ** -1.5

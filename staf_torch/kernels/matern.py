@@ -36,26 +36,40 @@ class MaternKernel(RadialKernel):
         super().__init__(length_scale)
         choice("MaternKernel", "smoothness", smoothness, tuple(_POLYNOMIALS))
         self.smoothness = float(smoothness)
-        self._series = _taylor(self.smoothness)
 
     def profile(self, s: Tensor) -> Tensor:
+        return _profile(self.smoothness, s * (2 * self.smoothness))
+
+    def slope(self, s: Tensor) -> Tensor:
         t2 = s * (2 * self.smoothness)
-        near = t2 < _SERIES_BELOW**2
-        # Each branch sees only arguments at which it is differentiable, so that no 0 * inf reaches
-        # a gradient: phi is smooth in t^2 but for odd powers of t, and those vanish at t = 0.
-        positive = t2 > 0
-        root = torch.where(positive, torch.where(positive, t2, 1.0).sqrt(), 0.0)
-        small = torch.where(near, t2, 0.0)
-        even = _horner(self._series[0::2], small)
-        odd = _horner(self._series[1::2], small)
-        if self._series[1] == 0.0:  # t^3 and up: written as t^2 * t, whose two derivatives exist
-            odd = small * _horner(self._series[3::2], small)
-        t = torch.where(near, 1.0, root)
-        far = _horner(_POLYNOMIALS[self.smoothness], t) * (-t).exp()
-        return torch.where(near, even + root * odd, far)
+        if self.smoothness == 0.5:  # -e^{-t} / 2t, and zero at t = 0
+            positive = t2 > 0
+            t = torch.where(positive, t2, 1.0).sqrt()
+            return torch.where(positive, (-t).exp() / (-2 * t), 0.0)
+        # The profile of the next lower smoothness, -(1 + t) e^{-t} 5/6 or -e^{-t} 3/2.
+        factor = -5 / 6 if self.smoothness == 2.5 else -1.5
+        return factor * _profile(self.smoothness - 1, t2)
 
     def extra_repr(self) -> str:
         return f"smoothness={self.smoothness}, {super().extra_repr()}"
+
+
+def _profile(smoothness: float, t2: Tensor) -> Tensor:
+    """p(t) e^{-t} of t^2."""
+    series = _SERIES[smoothness]
+    near = t2 < _SERIES_BELOW**2
+    # Each branch sees only arguments at which it is differentiable, so that no 0 * inf reaches
+    # a gradient: phi is smooth in t^2 but for odd powers of t, and those vanish at t = 0.
+    positive = t2 > 0
+    root = torch.where(positive, torch.where(positive, t2, 1.0).sqrt(), 0.0)
+    small = torch.where(near, t2, 0.0)
+    even = _horner(series[0::2], small)
+    odd = _horner(series[1::2], small)
+    if series[1] == 0.0:  # t^3 and up: written as t^2 * t, whose two derivatives exist
+        odd = small * _horner(series[3::2], small)
+    t = torch.where(near, 1.0, root)
+    far = _horner(_POLYNOMIALS[smoothness], t) * (-t).exp()
+    return torch.where(near, even + root * odd, far)
 
 
 def _taylor(smoothness: float) -> tuple[float, ...]:
@@ -72,3 +86,6 @@ def _horner(coefficients: tuple[float, ...], t: Tensor) -> Tensor:
     for c in reversed(coefficients[:-1]):
         total = total * t + c
     return total
+
+
+_SERIES = {smoothness: _taylor(smoothness) for smoothness in _POLYNOMIALS}

@@ -36,6 +36,10 @@ class PolynomialKernel(Kernel):
     def forward(self, x1: Tensor, x2: Tensor) -> Tensor:
         return (inner(x1, x2) + per_entry(self.bias, 2)).pow(self.degree)
 
+    def gradient(self, x1: Tensor, x2: Tensor, b: Tensor) -> Tensor:
+        power = (inner(x1, x2) + per_entry(self.bias, 2)).pow(self.degree - 1)
+        return (self.degree * power * b.unsqueeze(-2)) @ x2
+
     def rank(self, dim: int) -> int:
         variables = dim if self.full else dim - 1
         return math.comb(variables + self.degree, self.degree)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from .._checks import positive
 from .._convention import hold
-from .base import Kernel, per_entry, squared_distance
+from .base import Kernel, per_entry, squared_distance, weighted_differences
 
 
 class RadialKernel(Kernel):
@@ -29,6 +29,10 @@ class RadialKernel(Kernel):
     def profile(self, s: Tensor) -> Tensor:
         """phi(s), elementwise, for s >= 0."""
 
+    def slope(self, s: Tensor) -> Tensor | None:
+        """phi'(s), elementwise; None where autograd has to find it."""
+        return None
+
     def forward(self, x1: Tensor, x2: Tensor) -> Tensor:
         return self.profile(squared_distance(x1, x2) / per_entry(self.length_scale, 2).square())
 
@@ -37,3 +41,14 @@ class RadialKernel(Kernel):
 
     def core(self, x: Tensor, z: Tensor, d: Tensor) -> Tensor:
         return self.forward(z, d)
+
+    def gradient(self, x1: Tensor, x2: Tensor, b: Tensor) -> Tensor | None:
+        scale = per_entry(self.length_scale, 2).square()
+        slope = self.slope(squared_distance(x1, x2) / scale)
+        if slope is None:
+            return None
+        total: Tensor = weighted_differences(slope * b.unsqueeze(-2), x2, x1) * (-2 / scale)
+        return total
+
+    def core_gradient(self, x: Tensor, z: Tensor, d: Tensor, b: Tensor) -> Tensor | None:
+        return self.gradient(z, d, b)

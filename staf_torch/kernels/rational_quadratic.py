@@ -31,3 +31,7 @@ class RationalQuadraticKernel(RadialKernel):
     def profile(self, s: Tensor) -> Tensor:
         alpha = per_entry(self.alpha, 2)
         return ((s / (2 * alpha)).log1p() * -alpha).exp()
+
+    def slope(self, s: Tensor) -> Tensor:
+        alpha = per_entry(self.alpha, 2)
+        return -0.5 * ((s / (2 * alpha)).log1p() * -(alpha + 1)).exp()

@@ -59,10 +59,34 @@ def with_gradient(function: Callable[[Tensor], Tensor], z: Tensor) -> tuple[Tens
     return (values, gradient) if values.dim() == leading else (values.movedim(-1, 0), gradient.movedim(-2, 0))
 
 
+def rows_last(matrix: Tensor, rows: Tensor) -> Tensor:
+    """rows matrix', (M, K), (..., K) -> (..., M), with the rows last in memory.
+
+    What follows elementwise then runs along the many rows, and not along the few centers.
+    """
+    if rows.dim() <= 2:
+        return (matrix @ rows.mT).mT if rows.dim() == 2 else matrix @ rows
+    together: Tensor = (matrix @ rows.flatten(0, -2).mT).mT
+    product: Tensor = together.unflatten(0, rows.shape[:-1])
+    return product
+
+
 def scale(kernel: Kernel, x: Tensor, z: Tensor, sign: float = 1.0) -> Tensor:
     """e^{sign s(x, z)}: (..., P), or () where s is zero."""
     s = kernel.log_scale(x, z)
     return z.new_ones(()) if s is None else (sign * s).exp()
+
+
+def scaled_gradient(
+    kernel: Kernel, x: Tensor, z: Tensor, sums: Tensor, slope: Tensor
+) -> tuple[Tensor, Tensor]:
+    """e^{s(z)} v(z) and its gradient from v (..., P) and its gradient (..., P, n)."""
+    along = kernel.log_scale_gradient(x, z)
+    if along is None:
+        return sums, slope
+    factor = scale(kernel, x, z)
+    value = sums * factor
+    return value, torch.addcmul(slope * factor.unsqueeze(-1), value.unsqueeze(-1), along)
 
 
 def in_blocks(function: Callable[[Tensor, Tensor], Tensor], values: Tensor, state: Tensor) -> Tensor:

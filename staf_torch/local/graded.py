@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from ..kernels import Kernel
-from .base import from_scaled, in_blocks, scale, to_scaled
+from .base import from_scaled, in_blocks, rows_last, scale, scaled_gradient, to_scaled
 from .elimination import Degrees, degrees_of, functionals_of
 from .interpolation import Interpolation
 from .phi import phi
@@ -43,8 +43,8 @@ class GradedBasis(NamedTuple):
         return torch.stack(parts, dim=-1).flatten(-2) @ self.weights.to(zeta).flatten(0, 1)
 
     def narrow(self, like: Tensor) -> tuple[Tensor, Tensor]:
-        """u / reach, (M, n), and the weights as (M, K M), indexed j, (k, i), in the dtype of ``like``."""
-        spread = self.weights.permute(2, 1, 0).flatten(1).contiguous()
+        """u / reach, (M, n), and the weights as (K M, M), indexed (k, i), j, in the dtype of ``like``."""
+        spread = self.weights.transpose(0, 1).flatten(0, 1)
         return self.directions.to(like), spread.to(like)
 
 
@@ -84,7 +84,7 @@ class GradedSpace(NamedTuple):
     nu: Tensor  # the radius of the centers, (...) or () for all states
     directions: Tensor  # u, (M, n), in the dtype of the state and in units of the radius
     units: Tensor  # of `GradedBasis.narrow`, (M, n), in the dtype of the state
-    spread: Tensor  # of `GradedBasis.narrow`, (M, K M), in the dtype of the state
+    spread: Tensor  # of `GradedBasis.narrow`, (K M, M), in the dtype of the state
     basis: GradedBasis
     rate: Tensor  # q, (...) or ()
     bound: Callable[[], Tensor | None]  # sup of nu over all states, where q nu^2 is known to stay below 1
@@ -134,13 +134,8 @@ class GradedSpace(NamedTuple):
         inner = terms[0] * (over_points(r2) * apart[0])
         for k in range(1, len(terms)):
             inner = torch.addcmul(inner, terms[k - 1], apart[k], value=k)
-        slope = self._divided(inner @ self.units)
-        along = self.kernel.log_scale_gradient(self.state, z)
-        if along is None:
-            return sums, slope
-        factor = scale(self.kernel, self.state, z)
-        value = sums * factor
-        return value, torch.addcmul(slope * factor.unsqueeze(-1), value.unsqueeze(-1), along)
+        slope = self._divided(rows_last(self.units.mT, inner))
+        return scaled_gradient(self.kernel, self.state, z, sums, slope)
 
     def scaled_weights(self, coefficients: Tensor) -> Tensor:
         """e^g w, w_i = e^{-g - s(d_i)} sum_j (q_ij / sigma_j) k_j! r^(-2 k_j) beta_j: (..., M) -> (..., M).
@@ -176,12 +171,12 @@ class GradedSpace(NamedTuple):
 
     def _terms(self, z: Tensor, r2: Tensor) -> list[Tensor]:
         """p_k(zeta'u_i) for k < K: (..., P, n) -> K of (..., P, M)."""
-        return ridges(self._divided(z) @ self.units.mT, over_points(r2), self.basis.degrees[-1])
+        return ridges(rows_last(self.units, self._divided(z)), over_points(r2), self.basis.degrees[-1])
 
     def _ridge_weights(self, coefficients: Tensor) -> tuple[Tensor, ...]:
         """sum_j (q_ij / sigma_j) beta_j, apart for each degree: (..., M) -> K of (..., 1, M)."""
         count = len(self.basis.degrees)
-        together = coefficients @ self.spread.to(coefficients)
+        together = rows_last(self.spread.to(coefficients), coefficients)
         apart: tuple[Tensor, ...] = together.unsqueeze(-2).chunk(count, -1)
         return apart
 

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from ..kernels import Kernel
 from ..linalg import PivotedCholesky, pivoted_cholesky
-from .base import evaluate_scaled, from_scaled, scale, to_scaled, with_gradient
+from .base import evaluate_scaled, from_scaled, scale, scaled_gradient, to_scaled, with_gradient
 
 
 class NewtonSpace(NamedTuple):
@@ -42,7 +42,12 @@ class NewtonSpace(NamedTuple):
 
     def evaluate_with_gradient(self, z: Tensor, coefficients: Tensor) -> tuple[Tensor, Tensor]:
         """V^(x + z) and its gradient in z: (..., P, n), (..., M) -> (..., P), (..., P, n)."""
-        return with_gradient(lambda at: self.evaluate(at, coefficients), z)
+        b = self._solve(coefficients)
+        slope = self.kernel.core_gradient(self.state, z, self.offsets, b)
+        if slope is None:
+            return with_gradient(lambda at: evaluate_scaled(self.kernel, self.offsets, self.state, at, b), z)
+        sums = (self.kernel.core(self.state, z, self.offsets) @ b.unsqueeze(-1)).squeeze(-1)
+        return scaled_gradient(self.kernel, self.state, z, sums, slope)
 
     def scaled_weights(self, coefficients: Tensor) -> Tensor:
         """e^g w: (..., M) -> (..., M)."""

@@ -18,7 +18,6 @@ import torch
 from torch import Tensor
 
 from ..kernels import PolynomialKernel
-from .base import with_gradient
 from .elimination import Degrees, functionals_of
 
 
@@ -50,14 +49,29 @@ class PolynomialSpace(NamedTuple):
 
     def evaluate(self, z: Tensor, coefficients: Tensor) -> Tensor:
         """V^(x + z): (..., P, n), (..., M) -> (..., P)."""
-        radius = self.radius[..., None, None]
-        some = radius > 0
-        zeta = torch.where(some, _root(self.kernel, self.state, z) / torch.where(some, radius, 1.0), 0.0)
-        return _apply(self._functions(zeta, self._a(z)), coefficients)
+        return _apply(self._functions(self._zeta(z), self._a(z)), coefficients)
 
     def evaluate_with_gradient(self, z: Tensor, coefficients: Tensor) -> tuple[Tensor, Tensor]:
         """V^(x + z) and its gradient in z: (..., P, n), (..., M) -> (..., P), (..., P, n)."""
-        return with_gradient(lambda at: self.evaluate(at, coefficients), z)
+        a, tau = self._a(z).unsqueeze(-1), self._zeta(z) @ self.directions.mT
+        value, by_tau, by_a = torch.zeros_like(tau), torch.zeros_like(tau), torch.zeros_like(tau)
+        p, r2 = self.kernel.degree, self.radius[..., None, None].square()
+        for k in dict.fromkeys(self.degrees):
+            members = [j for j, degree in enumerate(self.degrees) if degree == k]
+            apart = _apply(self.weights_[..., members], coefficients[..., members]).unsqueeze(-2)
+            for power in range(k, p + 1):
+                share = (math.comb(p, power) / math.comb(p, k)) * r2 ** (power - k) * apart
+                value = value + share * a ** (p - power) * tau**power
+                if power > 0:
+                    by_tau = by_tau + power * share * a ** (p - power) * tau ** (power - 1)
+                if power < p:
+                    by_a = by_a + (p - power) * share * a ** (p - power - 1) * tau**power
+        s = _square(self.kernel, self.state)[..., None, None]
+        # zeta is linear in z through a symmetric matrix.
+        slope = (
+            self._zeta(by_tau @ self.directions) + by_a.sum(-1, keepdim=True) * self.state.unsqueeze(-2) / s
+        )
+        return value.sum(-1), slope
 
     def scaled_weights(self, coefficients: Tensor) -> Tensor:
         """The paper's w: (..., M) -> (..., M); this kernel has no gain."""
@@ -77,6 +91,12 @@ class PolynomialSpace(NamedTuple):
         b = weights * (s * self._a(self.offsets)) ** self.kernel.degree
         inverse = self.weights_ / self.weights_.square().sum(-2, keepdim=True)
         return _apply(inverse.mT, b) / self._unscale()
+
+    def _zeta(self, z: Tensor) -> Tensor:
+        """a(z) z^ / radius, zero where all centers meet: (..., P, n)."""
+        radius = self.radius[..., None, None]
+        some = radius > 0
+        return torch.where(some, _root(self.kernel, self.state, z) / torch.where(some, radius, 1.0), 0.0)
 
     def _a(self, z: Tensor) -> Tensor:
         return _projection(self.kernel, self.state, z)
