@@ -79,7 +79,10 @@ def jax_programs(x: torch.Tensor, count: int) -> dict[str, Program]:
         return lambda: jax.block_until_ready(program(given))
 
     found = peer_jax.programs(offsets, INNER_STEPS)
-    return {f"JAX {n}": (call(f, last if batch_last else rows), x.shape[1]) for n, (f, batch_last) in found.items()}
+    return {
+        f"JAX {n}": (call(f, last if batch_last else rows), x.shape[1])
+        for n, (f, batch_last) in found.items()
+    }
 
 
 def numba_programs(x: torch.Tensor, count: int) -> dict[str, Program]:

@@ -1,4 +1,4 @@
-"""The gradient chase by `torch.compile` of one step, its batch last: exponential kernel, the paper's V and law,
+"""The gradient chase by `torch.compile` of one step, batch last: exponential kernel, the paper's V and law,
 K = S K0 S from M exponentials and g <- g - 2 lambda K g in place of a new residual."""
 
 from __future__ import annotations

@@ -49,9 +49,7 @@ def nanoseconds(batch: int, times: int) -> dict[str, float]:
 
 def _apart(times: int) -> dict[str, float]:
     """`memory` in a process of its own."""
-    done = subprocess.run(
-        [sys.executable, __file__, str(times)], capture_output=True, text=True, check=True
-    )
+    done = subprocess.run([sys.executable, __file__, str(times)], capture_output=True, text=True, check=True)
     found: dict[str, float] = json.loads(done.stdout)
     return found
 
