@@ -33,7 +33,7 @@ import staf_torch as st  # noqa: E402
 ROUNDS = 5
 INNER_STEPS = 10
 RADIUS = 0.1
-STEPS = {3: 1e6, 6: 1e6, 15: 2e5}  # centers: trajectory-steps a measurement
+STEPS = {3: 1e6, 6: 1e6, 15: 5e5}  # centers: trajectory-steps a measurement
 COMPILED_TIMES = 1000  # torch.compile of one step pays its overhead a time: more would only take longer
 OURS = {"staf_torch": "formula", "V in Python": "Python", "V compiled": "torch.compile"}
 NAMED = ("JAX jit(vmap(scan))", "JAX components, unrolled")  # the two programs that issue 4 names
@@ -105,7 +105,7 @@ def compiled_programs(x: torch.Tensor, count: int) -> dict[str, Program]:
 
 
 def as_rows(result: Any) -> np.ndarray:
-    """The first two times of whatever a program returns, as (B, 2, M); all but ours may have the batch last."""
+    """What a program returns, of components (T, B) each the first two times as rows."""
     if isinstance(result, list):  # components, (T, B) each
         return np.stack([np.asarray(part[:2]) for part in result]).transpose(2, 1, 0)
     return np.asarray(result)
