@@ -56,12 +56,11 @@ def _apart(times: int) -> dict[str, float]:
 
 def memory(times: int) -> dict[str, float]:
     """Growth of the peak memory (MiB) and the time (s) of a long chase in pieces without history."""
-    import resource
-
     import chase
 
-    def peak() -> float:
-        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    def peak() -> float:  # of this process: what getrusage says begins at the size of the parent
+        status = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
+        return float(status["VmHWM"].split()[0]) / 1024
 
     law, target, basis = st.optim.SteepestDescent(), st.targets.Paper(), chase.basis(3)
     x0 = chase.states(BATCH, 2, torch.float64)[:, 0]
