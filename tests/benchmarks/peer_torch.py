@@ -13,8 +13,8 @@ Step = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
 
 def program(offsets: Tensor, inner_steps: int, batch: int) -> Callable[[Tensor], Tensor]:
     """(T, 2, B) to (T, M, B)."""
-    make = components if len(offsets) <= 6 else stacked
-    step = torch.compile(make(offsets, inner_steps), fullgraph=True, dynamic=True)
+    make = components if len(offsets) <= 3 else stacked  # Inductor takes a minute over six
+    step = torch.compile(make(offsets, inner_steps), fullgraph=True)
 
     def run(states: Tensor) -> Tensor:
         a, gain = states.new_zeros(len(offsets), batch), states[0].square().sum(0)
