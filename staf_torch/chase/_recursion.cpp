@@ -57,7 +57,7 @@ template <typename T> INLINE T *at(const Array &array, int64_t row, int64_t time
 }
 
 template <typename T, int M> struct Prepared {
-    static constexpr int N = 2, lanes = Block<T, N>::lanes, limit = tile_bytes / sizeof(T);
+    static constexpr int N = 4, lanes = Block<T, N>::lanes, limit = tile_bytes / sizeof(T);
     static constexpr int room = limit + tile_rows + Block<T, 8>::lanes;  // vectors are read beyond the end
     using B = Block<T, N>;
     const Problem &p;
