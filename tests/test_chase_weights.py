@@ -11,6 +11,7 @@ from torch import Tensor
 
 from staf_torch import chase, chase_weights, optim, targets
 
+
 @pytest.mark.parametrize("name", BASES)
 def test_chase_weights_are_those_of_chase(name: str) -> None:
     states, basis = circles(9, 12), BASES[name]

@@ -14,6 +14,7 @@ from helpers_fused import BASES, LAW, circles, compiled_module
 
 from staf_torch import chase, chase_weights, targets
 
+
 def test_without_a_compiler_the_reference_runs_and_the_log_says_so_once(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -17,6 +17,7 @@ from helpers_fused import (
 
 from staf_torch.basis import GramStructure
 
+
 @needs_compiler
 @pytest.mark.parametrize(
     ("count", "shared", "dtype"),

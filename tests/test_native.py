@@ -1,4 +1,4 @@
-"""What the fused recursion finds by itself from the states is what torch computes, a row whatever beside it."""
+"""What the fused recursion finds by itself from the states is what torch computes, in any batch."""
 
 from __future__ import annotations
 

@@ -84,6 +84,24 @@ template <typename T, int N> INLINE void store(T *to, int rows, const Block<T, N
         for (int l = 0; l < rows; ++l) to[l] = lane[l];
     }
 }
+// Past the caches, where whole lines are written that nobody reads soon: they need not be fetched first.
+#if defined(__AVX__) && !defined(__clang__)
+template <typename T, int N> INLINE void stream(T *to, int rows, const Block<T, N> &x) {
+    if (rows < Block<T, N>::lanes || reinterpret_cast<uintptr_t>(to) % register_bytes != 0) return store(to, rows, x);
+    typedef long long Line __attribute__((vector_size(register_bytes)));
+    Line line[N];
+    __builtin_memcpy(line, &x, sizeof x);
+#ifdef __AVX512F__
+    LANES __builtin_ia32_movntdq512(reinterpret_cast<Line *>(to) + k, line[k]);
+#else
+    LANES __builtin_ia32_movntdq256(reinterpret_cast<Line *>(to) + k, line[k]);
+#endif
+}
+INLINE void streamed() { __builtin_ia32_sfence(); }
+#else
+template <typename T, int N> INLINE void stream(T *to, int rows, const Block<T, N> &x) { store(to, rows, x); }
+INLINE void streamed() {}
+#endif
 
 extern "C" void *aligned_alloc(__SIZE_TYPE__, __SIZE_TYPE__) noexcept;
 INLINE void *allocate(__SIZE_TYPE__ bytes) { return aligned_alloc(64, (bytes + 63) / 64 * 64); }

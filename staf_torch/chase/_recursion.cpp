@@ -57,7 +57,7 @@ template <typename T> INLINE T *at(const Array &array, int64_t row, int64_t time
 }
 
 template <typename T, int M> struct Prepared {
-    static constexpr int N = 2, lanes = Block<T, N>::lanes, limit = tile_bytes / sizeof(T);
+    static constexpr int N = 4, lanes = Block<T, N>::lanes, limit = tile_bytes / sizeof(T);
     static constexpr int room = limit + tile_rows + Block<T, 8>::lanes;  // vectors are read beyond the end
     using B = Block<T, N>;
     const Problem &p;
@@ -200,10 +200,10 @@ template <typename T, int N, int M, typename Gram> struct Solver {
             }
             const int64_t place = (tile.time + t) * p.history_time + first;
             for (int i = 0; p.before && i < M; ++i)
-                store(static_cast<T *>(p.before) + place + i * p.history_entry, rows, choose(gone, old[i], old[i] * unit));
+                stream(static_cast<T *>(p.before) + place + i * p.history_entry, rows, choose(gone, old[i], old[i] * unit));
             EACH for (int i = 0; i < M; ++i) {
                 a[i] = choose(gone, old[i], a[i]);
-                if (p.after) store(static_cast<T *>(p.after) + place + i * p.history_entry, rows, a[i] * factor);
+                if (p.after) stream(static_cast<T *>(p.after) + place + i * p.history_entry, rows, a[i] * factor);
             }
         }
         for (int i = 0; i < M; ++i) store(weights + i * p.batch, rows, a[i]);
@@ -246,6 +246,7 @@ template <typename Solve> struct Work {
         Solve solve(work.p);
         for (int64_t b; (b = __atomic_fetch_add(&work.next, work.rows, __ATOMIC_RELAXED)) < work.p.batch;)
             solve.run(b, b + work.rows < work.p.batch ? b + work.rows : work.p.batch);
+        streamed();
         return nullptr;
     }
     static void task(void *data) { run(data); }

@@ -8,7 +8,7 @@
 extern "C" void staf_target(
     int64_t size, int64_t room, int64_t count, const void *states, const void *offsets, const void *parameters, void *values
 ) {
-    constexpr int N = 2;
+    constexpr int N = 4;
     typedef REAL T;
     typedef Block<T, N> B;
     const T *d = static_cast<const T *>(offsets), *p = static_cast<const T *>(parameters);

@@ -125,7 +125,7 @@ def fused(
     count = structure.core.shape[-1]
     problem = _Problem(batch=batch, times=times, dim=dim, inner_steps=inner_steps, start=carry.time)
     problem.threads, problem.parallel = torch.get_num_threads(), _parallel()
-    held = [states, structure.core, values]  # what the problem points to
+    held: list[object] = [states, structure.core, values]  # what the problem points to
     core = structure.core.expand(batch, times, count, count)
     problem.core = core.data_ptr()
     problem.core_row, problem.core_time, problem.core_i, problem.core_j = core.stride()
