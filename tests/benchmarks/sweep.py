@@ -1,6 +1,6 @@
 """A hundred jobs by the batched launcher and by Hydra's basic one, and a thousand members in one job.
 
-`python tests/benchmarks/sweep.py [--json FILE] [--only batched,basic,members]`, on a machine with nothing else to do.
+`python tests/benchmarks/sweep.py [--json FILE] [--only batched,basic,members]`, with nothing else running.
 """
 
 from __future__ import annotations
