@@ -17,6 +17,7 @@ from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 
 from .. import __version__
@@ -77,8 +78,15 @@ def product(setting: Any, loader: ConfigLoader) -> list[list[str]]:
     lines = [lines] if isinstance(lines, str) else lines
     if not isinstance(lines, list) or not lines or not all(isinstance(line, str) for line in lines):
         raise fail(COMMAND_LINE, "members", "must be a list of overrides, like 'seed=range(100)'", lines)
-    overrides = OverridesParser.create(config_loader=loader).parse_overrides(lines)
-    for line, override in zip(lines, overrides, strict=True):
+    parser = OverridesParser.create(config_loader=loader)
+    overrides = []
+    for line in lines:
+        try:
+            (override,) = parser.parse_overrides([line])
+        except HydraException as error:
+            rule = f"must be overrides in Hydra's grammar ({str(error).splitlines()[0]})"
+            raise fail(COMMAND_LINE, "members", rule, line) from error
+        overrides.append(override)
         if override.is_hydra_override() or override.key_or_group == "members":
             raise fail(COMMAND_LINE, "members", "must be about the experiment alone", line)
     (batch,) = BasicSweeper.split_arguments(overrides, None)

@@ -108,9 +108,10 @@ class _Stacked:
         if len(problems) == 1:
             return cls(problems[0].basis, problems[0].target, problems[0].law)
         counts = [len(problem.initial_states) for problem in problems]
+        targets, rows = _runs([problem.target for problem in problems], counts)
         return cls(
             StackedBasis(*_runs([problem.basis for problem in problems], counts)),
-            StackedTarget(*_runs([problem.target for problem in problems], counts)),
+            targets[0] if len(targets) == 1 else StackedTarget(targets, rows),
             stack_laws(*_runs([problem.law for problem in problems], counts), problems[0].initial_states),
         )
 

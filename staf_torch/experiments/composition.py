@@ -112,9 +112,10 @@ class Composer:
 
     def _parse(self, line: str) -> Override:
         if line not in self._parsed:
-            self._parsed[line] = self._parser.parse_override(line)
-            if self._parsed[line].is_sweep_override():
+            (parsed,) = self._parser.parse_overrides([line])
+            if parsed.is_sweep_override():
                 self._load([line])  # refused there, in Hydra's words
+            self._parsed[line] = parsed
         return self._parsed[line]
 
     def _chooses(self, override: Override) -> bool:

@@ -51,7 +51,8 @@ class Linear(ControlAffineSystem):
     def flow(self, x: Tensor, time: Tensor) -> Tensor:
         propagators = torch.linalg.matrix_exp(time[:, None, None] * self.matrix.to(time))
         # Row by row, so that the bits of a trajectory do not depend on the batch.
-        return (propagators.to(x) * x[..., None, None, :]).sum(-1)
+        states: Tensor = (propagators.to(x) * x[..., None, None, :]).sum(-1)
+        return states
 
     def optimal_value(self, x: Tensor, state_cost: Tensor, input_cost: Tensor) -> Tensor | None:
         """x'Px with P from the Riccati equation: (..., n) -> (...)."""
