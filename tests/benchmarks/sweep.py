@@ -22,7 +22,7 @@ JOBS = ["-m", RADII, COUNTS, "seed=range(5)", "trajectories=2", *LENGTH]
 COMMANDS = {
     "batched": [*JOBS, "hydra.sweep.dir=sweep"],
     "basic": [*JOBS, "hydra.sweep.dir=sweep", "hydra/launcher=basic"],
-    "members": [f"members=[{RADII},{COUNTS},seed=range(50)]", "trajectories=2", *LENGTH],
+    "members": [f"members=['{RADII}','{COUNTS}','seed=range(50)']", "trajectories=2", *LENGTH],
 }
 
 
