@@ -83,10 +83,19 @@ def test_a_batched_sweep_leaves_what_the_basic_launcher_leaves(
     assert ours == hydras
     for num in range(6):
         one_, other = batched[0] / str(num), basic[0] / str(num)
+        assert hydra_of(one_) == hydra_of(other)
         assert (one_ / ".hydra/config.yaml").read_text() == (other / ".hydra/config.yaml").read_text()
         assert (one_ / ".hydra/overrides.yaml").read_text() == (other / ".hydra/overrides.yaml").read_text()
         same = {"task", "overrides", "settings", "status", "reason", "version"}
         assert {key: record(one_)[key] for key in same} == {key: record(other)[key] for key in same}
+
+
+def hydra_of(run: Path) -> Any:
+    """`.hydra/hydra.yaml` without the launcher and where it writes."""
+    node = OmegaConf.to_container(OmegaConf.load(run / ".hydra/hydra.yaml"), resolve=False)["hydra"]
+    del node["launcher"], node["sweep"]["dir"], node["overrides"]["hydra"]
+    del node["runtime"]["output_dir"], node["runtime"]["choices"]["hydra/launcher"]
+    return node
 
 
 def test_a_batched_sweep_finds_the_numbers_of_the_basic_launcher(

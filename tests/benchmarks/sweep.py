@@ -1,6 +1,6 @@
 """A hundred jobs by the batched launcher and by Hydra's basic one, and a thousand members in one job.
 
-`python tests/benchmarks/sweep.py [--json FILE] [--only batched,basic,members]`, on a machine with nothing else to do.
+`python tests/benchmarks/sweep.py [--json FILE] [--only batched,basic,members]`, with nothing else running.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ JOBS = ["-m", RADII, COUNTS, "seed=range(5)", "trajectories=2", *LENGTH]
 COMMANDS = {
     "batched": [*JOBS, "hydra.sweep.dir=sweep"],
     "basic": [*JOBS, "hydra.sweep.dir=sweep", "hydra/launcher=basic"],
-    "members": [f"members=[{RADII},{COUNTS},seed=range(50)]", "trajectories=2", *LENGTH],
+    "members": [f"members=['{RADII}','{COUNTS}','seed=range(50)']", "trajectories=2", *LENGTH],
 }
 
 

@@ -59,7 +59,8 @@ def solve_elsewhere(pickled: bytes, path: Sequence[str]) -> bytes:
         batch: Batch = pickle.loads(pickled)
         outcomes = solve(batch.settings).outcomes
         for i, outcome in enumerate(outcomes):
-            if isinstance(outcome, members.Deferred):
+            # A job with `members` of its own composes them, which takes the program's Hydra.
+            if isinstance(outcome, members.Deferred) and batch.settings[i].get("members") is None:
                 outcomes[i] = _run(batch.settings[i], Path(batch.directories[i]))
         portable = [_portable(outcome) for outcome in outcomes]
     return pickle.dumps(Done(portable, time.monotonic() - start))
