@@ -11,7 +11,7 @@ from .basis import StaFBasis, Target
 from .centers import probe_points
 from .chase import ChaseResult
 from .linalg import condition_number
-from .local import evaluate_scaled
+from .local import evaluate_scaled, scale
 from .optim import UpdateLaw
 
 _PROBES = 97  # points of the ball to take a supremum over; in the plane 64 of them on its edge
@@ -29,6 +29,8 @@ class ChaseMetrics:
             before it, and with the ideal weights.
         ultimate_excess, ultimate_excess_before: max (a - w)'K(a - w).
         ball_error: max over the closed ball of radius nu(x) of |V - V^|, after correction.
+        ball_floor_error: the same with the ideal weights: what kernel, radius and layout allow at best.
+        rounding_floor: eps max |V(x)|, with eps of the precision; no error below it means anything.
         gradient_error: max |grad V - grad V^| at the state, centers frozen.
         condition_number: max kappa(K(c(x))).
         settling_time: the first time (s) from which the excess never again exceeds `ultimate_excess`.
@@ -79,6 +81,8 @@ class ChaseMetrics:
             "ultimate_excess": excess,
             "ultimate_excess_before": before,
             "ball_error": ball_error(self._basis, self._target, x, coefficients),
+            "ball_floor_error": ball_floor_error(self._basis, self._target, x),
+            "rounding_floor": torch.finfo(value.dtype).eps * value.abs(),
             "gradient_error": gradient_error(self._basis, self._target, x, coefficients),
             "condition_number": kappa,
         }
@@ -134,6 +138,8 @@ _WORST = (
     "ultimate_excess",
     "ultimate_excess_before",
     "ball_error",
+    "ball_floor_error",
+    "rounding_floor",
     "gradient_error",
     "condition_number",
 )
@@ -163,6 +169,43 @@ def _ball_error(basis: StaFBasis, target: Target, probes: Tensor, x: Tensor, b: 
         estimate = evaluate_scaled(basis.kernel, offsets, x, z, b)
         error = (target(x.unsqueeze(-2) + z) - estimate).abs().amax(-1)
         worst = torch.maximum(worst, error)
+    return worst
+
+
+def ball_floor_error(basis: StaFBasis, target: Target, x: Tensor) -> Tensor:
+    """`ball_error` with the ideal weights, in the local basis: without the rounding of large weights.
+
+    Args:
+        x: states, (..., T, n).
+
+    Returns:
+        (..., T).
+    """
+    probes = probe_points(_PROBES, basis.dim).to(x)
+    shared = _shared_functions(basis, probes)
+    row = _PROBES * (1 if shared is not None else basis.count)  # numbers in a temporary of `_floor`
+    times = max(1, _BLOCK // (row * max(1, x.numel() // x.shape[-1] // x.shape[-2])))
+    return torch.cat([_floor(basis, target, probes, shared, some) for some in x.split(times, dim=-2)], dim=-1)
+
+
+def _shared_functions(basis: StaFBasis, probes: Tensor) -> Tensor | None:
+    """psi(z) at the probes, (M, P), where radius and core serve all states; else None."""
+    origin = probes.new_zeros(2, basis.dim)
+    if basis.centers.offsets(origin).dim() > 2 or basis.gram_structure(origin).core.dim() > 2:
+        return None
+    one = basis.local(origin[0])
+    z = basis.centers.radius(origin[0]) * probes
+    identity = torch.eye(basis.count, dtype=probes.dtype, device=probes.device)
+    functions: Tensor = one.evaluate(z, identity) / scale(basis.kernel, origin[0], z)
+    return functions
+
+
+def _floor(basis: StaFBasis, target: Target, probes: Tensor, shared: Tensor | None, x: Tensor) -> Tensor:
+    z = basis.centers.radius(x)[..., None, None] * probes
+    space = basis.local(x)
+    fitted = space.fit(basis.values(x, target))
+    estimate = space.evaluate(z, fitted) if shared is None else fitted @ shared * scale(basis.kernel, x, z)
+    worst: Tensor = (target(x.unsqueeze(-2) + z) - estimate).abs().amax(-1)
     return worst
 
 

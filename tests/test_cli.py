@@ -21,6 +21,8 @@ KEYS = {
     "ultimate_excess",
     "ultimate_excess_before",
     "ball_error",
+    "ball_floor_error",
+    "rounding_floor",
     "gradient_error",
     "condition_number",
     "settling_time",
