@@ -22,6 +22,7 @@ from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from .._checks import choice
+from . import sweep_callback
 
 USER_ERRORS = (ValueError, HydraException, OmegaConfBaseException, OSError)
 """What a setting or the disk can bring about; anything else is a defect and keeps its trace."""
@@ -123,6 +124,7 @@ def main() -> None:
     except KeyboardInterrupt:
         sys.exit("staf: interrupted")
     finally:
+        sweep_callback.finish()
         if before is None:
             del os.environ[_FULL_ERROR]
 

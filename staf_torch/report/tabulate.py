@@ -101,7 +101,7 @@ def _one_a_run(found: Collection, metrics: Sequence[str]) -> Table:
         cells = {c.name: run.metrics.get(c.name) if c.metric else run.value(c.name) for c in columns}
         reasons = {name: run.absence(name) for name in metrics if cells[name] is None}
         rows.append(Row(cells, reasons))
-    return Table(tuple(columns), tuple(rows), tuple(_notes(found.rows)))
+    return Table(tuple(columns), tuple(rows))
 
 
 def _grouped(found: Collection, layout: Layout, metrics: Sequence[str]) -> Table:

@@ -14,7 +14,9 @@ def markdown_text(table: Table, style: Style = Style()) -> str:  # noqa: B008 (i
         return text if number.spread is None else f"{text} ± {significant(number.spread, 2)}"
 
     columns = printed(table, show, style)
-    headings = [_escaped(f"{c.over}, {c.heading}" if c.over else c.heading) for c in columns]
+    over = {column.over for column in columns if column.over}
+    title = f"{_escaped(over.pop())}\n\n" if len(over) == 1 else ""
+    headings = [_escaped(f"{c.over}, {c.heading}" if c.over and not title else c.heading) for c in columns]
     lines = [[_cell(c, i, show) for c in columns] for i in range(len(table.rows))]
     widths = [max(3, *(len(line[k]) for line in [headings, *lines])) for k in range(len(columns))]
 
@@ -24,7 +26,7 @@ def markdown_text(table: Table, style: Style = Style()) -> str:  # noqa: B008 (i
 
     rule = ["-" * (w - 1) + ":" if c.numeric else "-" * w for w, c in zip(widths, columns, strict=True)]
     notes = "".join(f"\n{_escaped(note)}\n" for note in table.notes)
-    return joined(headings) + joined(rule) + "".join(joined(line) for line in lines) + notes
+    return title + joined(headings) + joined(rule) + "".join(joined(line) for line in lines) + notes
 
 
 def _cell(column: PrintedColumn, row: int, show: object) -> str:
@@ -39,7 +41,6 @@ def _cell(column: PrintedColumn, row: int, show: object) -> str:
 
 
 def _escaped(text: str) -> str:
-    """What would end the cell or begin a tag or a link."""
-    for character in "\\|<[*`":
-        text = text.replace(character, f"\\{character}")
-    return " ".join(text.split())
+    """On one line, without what would end the cell, begin a tag, or stay open; code in `backquotes` stays."""
+    special = "|<" if text.count("`") % 2 == 0 and "`" in text else "\\|<*`"
+    return "".join(f"\\{c}" if c in special else c for c in " ".join(text.split()))
