@@ -6,10 +6,12 @@ import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 
 from .plots import _colour
 from .plots_theory import _MARKERS, _style
@@ -36,6 +38,7 @@ def draw_error_against_radius(panels: Sequence[Panel], rounding: float | None) -
             axes.axhline(rounding, color="0.4", linestyle=_ROUNDING, linewidth=0.9)
         radii = sorted({point.x for curve in shown.curves for point in curve.points})
         axes.set_xticks(radii, [f"{radius:g}" for radius in radii])
+        axes.xaxis.minorticks_off()
         axes.set_xlabel("radius $r$ of the ball")
 
     more = [Line2D([], [], color="0.3", linestyle=":", label="ideal weights")]
@@ -66,14 +69,18 @@ def _panels(panels: Sequence[Panel], draw: Callable[[Axes, Panel], None], more: 
             axes.set_xscale("log")
             axes.set_yscale("log")
             draw(axes, shown)
-            axes.xaxis.minorticks_off()
             axes.set_title(shown.title, loc="left")
         _label_left(grid)
-        _frame(grid, [point for shown in panels for curve in shown.curves for point in curve.points])
+        points = [point for shown in panels for curve in shown.curves for point in curve.points]
+        _frame(grid, points)
         # The same label has the same line in every panel: one legend serves them all.
         lines = {line.get_label(): line for axes in grid for line in axes.get_lines()}
-        handles = [line for label, line in lines.items() if not str(label).startswith("_")] + more
-        columns = min(len(handles), 6)
+        handles: list[Artist] = [line for label, line in lines.items() if not str(label).startswith("_")]
+        handles += more
+        if any(point.low < point.high for point in points):
+            handles.append(Patch(color="0.4", alpha=0.25, linewidth=0, label="95 % over seeds"))
+        # A line of the legend holds what the figure has room for.
+        columns = max(1, min(len(handles), 7 if len(panels) > 1 else 3))
         figure.legend(handles=handles, loc="outside upper center", ncols=columns, handlelength=2.6)
         figure.draw_without_rendering()  # lays out under this style, not under the caller's
         return figure

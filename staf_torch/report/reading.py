@@ -126,7 +126,10 @@ def _of_axis(key: str) -> bool:
 
 def _without_record(directory: Path, why: str | None) -> Run:
     """What Hydra's own files and the metrics say: a run of a version without `run.json`, or a damaged one."""
-    overrides, settings = _of_hydra(directory)
+    try:
+        overrides, settings = _of_hydra(directory)
+    except UnreadableError as error:
+        raise UnreadableError("; ".join(filter(None, (why, str(error))))) from error
     reason, status = why, COMPLETED
     metrics: dict[str, float | None] = {}
     lost: dict[str, str] = {}

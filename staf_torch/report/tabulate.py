@@ -17,7 +17,6 @@ from .table import Column, Row, Table
 HEADLINES = (
     "ball_error",
     "ball_floor_error",
-    "ultimate_error",
     "gradient_error",
     "cost",
     "cost_ratio",

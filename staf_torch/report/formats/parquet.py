@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 from collections.abc import Sequence
 from json import dumps
 from typing import Any
@@ -24,16 +25,19 @@ def parquet_bytes(table: Table) -> bytes:
         raise ValueError(
             f"Parquet needs {error.name}: install the extra `tables`, pip install 'staf_torch[tables]'."
         ) from error
-    columns = {name: _uniform([row.cells.get(name) for row in table.rows]) for name in table.names}
+    columns = {
+        c.name: _uniform([row.cells.get(c.name) for row in table.rows], c.metric is not None)
+        for c in table.columns
+    }
     buffer = io.BytesIO()
     pandas.DataFrame(columns).to_parquet(buffer, engine="pyarrow", index=False)
     return buffer.getvalue()
 
 
-def _uniform(cells: Sequence[Value]) -> list[Any]:
-    kinds = {bool if isinstance(c, bool) else type(c) for c in cells if c is not None}
-    if kinds <= {int, float}:
-        return [None if cell is None else float(cell) for cell in cells] if kinds != {int} else list(cells)  # type: ignore[arg-type]
+def _uniform(cells: Sequence[Value], number: bool) -> list[Any]:
+    kinds = {bool if isinstance(cell, bool) else type(cell) for cell in cells if cell is not None}
+    if kinds <= {int, float} and (kinds or number):
+        return [math.nan if cell is None else cell for cell in cells]
     if kinds == {bool}:
         return list(cells)
     return [cell if cell is None or isinstance(cell, str) else dumps(cell) for cell in cells]
