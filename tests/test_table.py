@@ -179,7 +179,7 @@ def test_latex_prints_every_special_character_as_it_is() -> None:
     special = "\\ { } $ & # ^ _ % ~ < > | \" ' ` -- [ ] *"
     expected = (
         r"\textbackslash{} \{ \} \$ \& \# \textasciicircum{} \_ \% \textasciitilde{} \textless{} "
-        r"\textgreater{} \textbar{} \textquotedbl{} \textquotesingle{} \textasciigrave{} -{}-{} {[} {]} {*}"
+        r"\textgreater{} \textbar{} \symbol{34} \textquotesingle{} \textasciigrave{} -{}-{} {[} {]} {*}"
     )
     assert escape(special) == expected
     assert escape("two\nlines") == "two lines"

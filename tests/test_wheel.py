@@ -36,7 +36,11 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_wheel_holds_the_package_its_settings_and_nothing_else(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
         names = set(archive.namelist())
-    assert {name.partition("/")[0] for name in names} == {"staf_torch", "staf_torch-0.1.0.dist-info"}
+    assert {name.partition("/")[0] for name in names} == {
+        "staf_torch",
+        "staf_table.py",
+        "staf_torch-0.1.0.dist-info",
+    }
     sources = {
         f"staf_torch/{p.relative_to(ROOT / 'staf_torch')}" for p in (ROOT / "staf_torch").rglob("*.py")
     }
@@ -65,3 +69,5 @@ def test_wheel_runs_in_a_clean_environment_from_any_directory(wheel: Path, tmp_p
     (run,) = (work / "runs").iterdir()
     assert {path.name for path in run.iterdir()} == {".hydra", "staf.log", "metrics.json", "history.npz"}
     assert json.loads((run / "metrics.json").read_text())["diverged_fraction"] == 0
+    table = _run(home / "bin" / "staf-table", "runs", "--format", "csv", cwd=work)
+    assert "ball_error" in table.splitlines()[0]

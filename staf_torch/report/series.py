@@ -9,7 +9,7 @@ from typing import NamedTuple
 from .collection import Collection, identity
 from .cost import products_per_second
 from .run import Run
-from .statistics import deviation, half_width, mean
+from .statistics import half_width, mean
 from .tabulate import as_text, rank
 
 KERNEL, RADIUS, COUNT, SEED = "kernel", "centers.radius", "centers.count", "seed"
@@ -175,8 +175,9 @@ def _costs(runs: Sequence[Run]) -> tuple[Point, ...]:
 
 
 def _point(x: float, errors: Sequence[float]) -> Point:
+    if len(set(errors)) == 1:  # one seed says nothing about the spread, and equal errors have none
+        return Point(x, errors[0], errors[0], errors[0])
     logs = [math.log(error) for error in errors]
-    middle = mean(logs)
-    # One seed says nothing about the spread, and equal errors have none.
-    width = half_width(logs) if deviation(logs) else None
-    return Point(x, math.exp(middle), math.exp(middle - (width or 0.0)), math.exp(middle + (width or 0.0)))
+    middle, width = mean(logs), half_width(logs)
+    assert width is not None
+    return Point(x, math.exp(middle), math.exp(middle - width), math.exp(middle + width))
