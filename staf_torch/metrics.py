@@ -182,22 +182,25 @@ def ball_floor_error(basis: StaFBasis, target: Target, x: Tensor) -> Tensor:
         (..., T).
     """
     probes = probe_points(_PROBES, basis.dim).to(x)
-    shared = _shared_functions(basis, probes)
+    shared = _shared_functions(basis, x, probes)
     row = _PROBES * (1 if shared is not None else basis.count)  # numbers in a temporary of `_floor`
     times = max(1, _BLOCK // (row * max(1, x.numel() // x.shape[-1] // x.shape[-2])))
     return torch.cat([_floor(basis, target, probes, shared, some) for some in x.split(times, dim=-2)], dim=-1)
 
 
-def _shared_functions(basis: StaFBasis, probes: Tensor) -> Tensor | None:
-    """psi(z) at the probes, (M, P), where radius and core serve all states; else None."""
-    origin = probes.new_zeros(2, basis.dim)
-    if basis.centers.offsets(origin).dim() > 2 or basis.gram_structure(origin).core.dim() > 2:
+def _shared_functions(basis: StaFBasis, x: Tensor, probes: Tensor) -> Tensor | None:
+    """psi at the probes of the ball where radius and core do not depend on the state, else None: (M, P), or
+    (..., M, P) where each row has its own. One product then evaluates all states of a row."""
+    origin = torch.zeros_like(x[..., :1, :]).expand(*x.shape[:-2], 2, -1)
+    offsets, core = basis.centers.offsets(origin), basis.gram_structure(origin).core
+    if any(part.dim() > 2 and part.shape[-3] > 1 for part in (offsets, core)):
         return None
-    one = basis.local(origin[0])
-    z = basis.centers.radius(origin[0]) * probes
-    identity = torch.eye(basis.count, dtype=probes.dtype, device=probes.device)
-    functions: Tensor = one.evaluate(z, identity) / scale(basis.kernel, origin[0], z)
-    return functions
+    origin = origin[..., :1, :] if offsets.dim() > 2 or core.dim() > 2 else origin.new_zeros(1, basis.dim)
+    space, z = basis.local(origin), basis.centers.radius(origin)[..., None, None] * probes
+    ones = torch.eye(basis.count, dtype=x.dtype, device=x.device)
+    gain = scale(basis.kernel, origin, z)
+    found = [space.evaluate(z, one.expand(*origin.shape[:-1], -1)) / gain for one in ones]
+    return torch.stack(found, dim=-2).squeeze(-3)
 
 
 def _floor(basis: StaFBasis, target: Target, probes: Tensor, shared: Tensor | None, x: Tensor) -> Tensor:

@@ -6,7 +6,7 @@ import math
 from pathlib import Path
 
 import pytest
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 from sweeps import error, write_run, write_sweep
 
 from staf_torch.experiments import sweep_callback
@@ -24,8 +24,8 @@ def sweep(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_sweep(tmp_path_factory.mktemp("report") / "sweep")
 
 
-def settings(directory: Path) -> object:
-    return OmegaConf.create({"hydra": {"sweep": {"dir": str(directory)}}})
+def settings(directory: Path) -> DictConfig:
+    return OmegaConf.create({"figures": False, "hydra": {"sweep": {"dir": str(directory)}}})
 
 
 def left(directory: Path) -> set[str]:
@@ -46,7 +46,7 @@ def test_report_has_a_row_for_all_seeds_and_the_csv_a_row_a_run(sweep: Path) -> 
 
 def test_callback_reports_once_at_the_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     directory = write_sweep(tmp_path / "sweep")
-    callback, cfg = SweepReport(figures=False), settings(directory)
+    callback, cfg = SweepReport(), settings(directory)
     callback.on_multirun_start(cfg)
     callback.on_multirun_end(cfg)
     out = capsys.readouterr().out
@@ -60,7 +60,7 @@ def test_a_sweep_that_ends_by_an_error_is_reported_all_the_same(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     directory = write_sweep(tmp_path / "sweep")
-    SweepReport(figures=False).on_multirun_start(settings(directory))
+    SweepReport().on_multirun_start(settings(directory))
     sweep_callback.finish()
     assert "12 of 36 failed" in capsys.readouterr().out
     assert left(directory) == FILES
@@ -97,7 +97,7 @@ def test_an_error_of_a_figure_costs_that_figure_alone(
 
 def test_curves_are_the_geometric_means_over_the_seeds_with_their_interval(sweep: Path) -> None:
     panels = series.error_against_radius(collect(sweep))
-    assert [panel.title for panel in panels] == ["exponential kernel", "gaussian kernel"]
+    assert [panel.title for panel in panels] == ["exponential kernel", "Gaussian kernel"]
     assert [curve.label for curve in panels[0].curves] == ["3 centers", "6 centers"]
     point = panels[0].curves[1].points[1]
     logs = [math.log(error(0.1, 6, seed)) for seed in range(3)]

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from hydra.experimental.callback import Callback
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 _log = logging.getLogger(__name__)
-_open: list[SweepReport] = []  # sweeps that began and have not been reported: those that end by an error
+_open: list[DictConfig] = []  # sweeps that began and have not been reported: those that end by an error
 
 
 class SweepReport(Callback):
@@ -20,40 +20,37 @@ class SweepReport(Callback):
     Hydra says so only of sweeps in which no job failed; `finish` does it for the others.
 
     Args:
-        figures: whether to draw.
+        figures: whether to draw; None: as the runs do, by `figures` of the settings.
     """
 
-    def __init__(self, figures: bool = True) -> None:
-        self._figures = bool(figures)
-        self._directory: Path | None = None
+    def __init__(self, figures: bool | None = None) -> None:
+        self._figures = figures
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
-        """Remember where the sweep writes."""
-        self._directory = Path(config.hydra.sweep.dir)
-        _open.append(self)
+        """Remember the sweep."""
+        _open.append(config)
 
     def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
-        """Every job completed."""
-        self.report()
-
-    def report(self) -> None:
-        """Write the report once; nothing that goes wrong here may look like a sweep gone wrong."""
-        if self in _open:
-            _open.remove(self)
-        if self._directory is None or not self._directory.is_dir():
+        """Write the report; nothing that goes wrong here may look like a sweep gone wrong."""
+        directory = Path(str(config.hydra.sweep.dir))
+        _open[:] = [other for other in _open if Path(str(other.hydra.sweep.dir)) != directory]
+        figures = OmegaConf.select(config, "figures") if self._figures is None else self._figures
+        if not directory.is_dir():
             return
         from ..report.sweep_report import PAGE, write_report  # the jobs of a sweep import this module too
 
         try:
-            text = write_report(self._directory, figures=self._figures)
+            text = write_report(directory, figures=figures is not False)
         except Exception as error:
             _log.warning("no report of the sweep: %s", error)
             return
-        sys.stdout.write(f"\n{text}\n  report: {self._directory / PAGE}\n")
+        sys.stdout.write(f"\n{text}\n  report: {directory / PAGE}\n")
         sys.stdout.flush()
 
 
 def finish() -> None:
     """Report the sweeps that ended without Hydra's word of it: a job failed, or someone interrupted."""
     while _open:
-        _open[-1].report()
+        config = _open.pop()
+        figures = OmegaConf.select(config, "hydra.callbacks.report.figures")
+        SweepReport(figures).on_multirun_end(config)

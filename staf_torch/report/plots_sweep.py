@@ -19,6 +19,7 @@ from .series import Curve, HeatMap, Panel, Point
 
 _ERROR = r"$\sup\,|V - \hat V|$ on the ball"
 _ROUNDING = (0, (6, 2))  # dashes
+_VISIBLE = 1.2  # a band this wide can be seen: it has an entry in the legend
 _COLUMNS = 3
 _WIDTH, _HEIGHT = 7.2, 2.5
 
@@ -41,7 +42,7 @@ def draw_error_against_radius(panels: Sequence[Panel], rounding: float | None) -
         axes.xaxis.minorticks_off()
         axes.set_xlabel("radius $r$ of the ball")
 
-    more = [Line2D([], [], color="0.3", linestyle=":", label="ideal weights")]
+    more = [Line2D([], [], color="0.3", linestyle=":", label="ideal weights, local basis")]
     if not any(curve.floor for shown in panels for curve in shown.curves):
         more = []
     if rounding is not None:
@@ -77,10 +78,10 @@ def _panels(panels: Sequence[Panel], draw: Callable[[Axes, Panel], None], more: 
         lines = {line.get_label(): line for axes in grid for line in axes.get_lines()}
         handles: list[Artist] = [line for label, line in lines.items() if not str(label).startswith("_")]
         handles += more
-        if any(point.low < point.high for point in points):
+        if any(point.high > _VISIBLE * point.low for point in points):
             handles.append(Patch(color="0.4", alpha=0.25, linewidth=0, label="95 % over seeds"))
-        # A line of the legend holds what the figure has room for.
-        columns = max(1, min(len(handles), 7 if len(panels) > 1 else 3))
+        lines_of_legend = -(-len(handles) // (6 if len(panels) > 1 else 3))
+        columns = -(-len(handles) // lines_of_legend)
         figure.legend(handles=handles, loc="outside upper center", ncols=columns, handlelength=2.6)
         figure.draw_without_rendering()  # lays out under this style, not under the caller's
         return figure

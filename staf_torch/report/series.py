@@ -15,6 +15,7 @@ from .tabulate import as_text, rank
 KERNEL, RADIUS, COUNT, SEED = "kernel", "centers.radius", "centers.count", "seed"
 METRIC, FLOOR, ROUNDING = "ball_error", "ball_floor_error", "rounding_floor"
 _OF_COST = ("optimizer", "predictor", "optimizer.inner_steps", "dt", COUNT, SEED)
+_NAMES = {"gaussian": "Gaussian", "matern": "Matérn", "inverse_multiquadric": "inverse multiquadric"}
 _MOST_PANELS = 12
 
 
@@ -140,10 +141,11 @@ def json_key(run: Run, keys: Sequence[str]) -> str:
 
 
 def _title(run: Run, keys: Sequence[str]) -> str:
+    kernel = as_text(run.setting(KERNEL))
     if not keys:
-        return as_text(run.setting(KERNEL)) + " kernel" if run.setting(KERNEL) else ""
+        return f"{_NAMES.get(kernel, kernel)} kernel" if run.setting(KERNEL) else ""
     named = [key for key in keys if key != KERNEL]
-    parts = [f"{as_text(run.setting(KERNEL))} kernel"] if KERNEL in keys else []
+    parts = [f"{_NAMES.get(kernel, kernel)} kernel"] if KERNEL in keys else []
     return ", ".join(parts + [f"{key} = {as_text(run.setting(key))}" for key in named])
 
 
