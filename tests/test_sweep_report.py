@@ -41,6 +41,13 @@ def test_report_has_a_row_for_all_seeds_and_the_csv_a_row_a_run(sweep: Path) -> 
     assert "12 of 36 failed" in text
 
 
+def test_equal_sweeps_in_two_directories_have_equal_tables(tmp_path: Path) -> None:
+    one, two = (write_sweep(tmp_path / name) for name in ("one", "two"))
+    assert write_report(one, figures=False) == write_report(two, figures=False)
+    for name in ("table.csv", "table.tex"):
+        assert (one / name).read_bytes() == (two / name).read_bytes()
+
+
 # The callback
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 from collections.abc import Callable
 from pathlib import Path
@@ -26,7 +27,7 @@ def write_report(directory: Path, *, figures: bool = True) -> str:
     """Write `table.md`, `table.tex`, `table.csv`, `figures/` and `report.html` of the sweep in a directory.
 
     The first two and the page have one row for all seeds, where more than one was swept; the CSV has one row
-    a run and all metrics. A figure that cannot be drawn is a warning in the log.
+    a run and all metrics, its directory as seen from the sweep's. A figure that cannot be drawn is a warning in the log.
 
     Returns:
         The table in Markdown.
@@ -35,7 +36,7 @@ def write_report(directory: Path, *, figures: bool = True) -> str:
         ValueError: if there is no run in the directory.
         OSError: if it cannot be written.
     """
-    found = collect(directory)
+    found = _inside(collect(directory), directory)
     layout = Layout(aggregates=("mean", "std")) if series.SEED in found.swept else Layout()
     table = tabulate(found, layout)
     text = markdown_text(table, _STYLE)
@@ -45,6 +46,14 @@ def write_report(directory: Path, *, figures: bool = True) -> str:
     drawn = draw_sweep(found, directory / FIGURES) if figures else {}
     write_text(directory / PAGE, page(found, table, drawn, f"Sweep {directory.resolve().name}"))
     return text
+
+
+def _inside(found: Collection, directory: Path) -> Collection:
+    """With paths as seen from the sweep: equal sweeps in two directories have equal tables."""
+    rows = tuple(
+        dataclasses.replace(run, directory=run.directory.relative_to(directory)) for run in found.rows
+    )
+    return dataclasses.replace(found, rows=rows)
 
 
 def draw_sweep(found: Collection, folder: Path) -> dict[str, Path]:

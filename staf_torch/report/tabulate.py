@@ -197,4 +197,4 @@ def _notes(runs: Sequence[Run]) -> Iterator[str]:
     for (status, reason), those in reasons.items():
         shown = ", ".join(str(run.directory) for run in those[:_NAMED])
         more = f" and {len(those) - _NAMED} more" if len(those) > _NAMED else ""
-        yield f"{len(those)} of {len(runs)} {status}: {reason} ({shown}{more})"
+        yield f"{len(those)} of {len(runs)} {status}: {reason} (in {shown}{more})"
