@@ -27,7 +27,8 @@ def write_report(directory: Path, *, figures: bool = True) -> str:
     """Write `table.md`, `table.tex`, `table.csv`, `figures/` and `report.html` of the sweep in a directory.
 
     The first two and the page have one row for all seeds, where more than one was swept; the CSV has one row
-    a run and all metrics, its directory as seen from the sweep's. A figure that cannot be drawn is a warning in the log.
+    a run and all metrics, its directory as seen from the sweep's. A figure that cannot be drawn is a warning
+    in the log.
 
     Returns:
         The table in Markdown.
