@@ -137,13 +137,12 @@ def test_figures_are_only_those_that_the_swept_settings_allow(tmp_path: Path) ->
     assert set(draw_sweep(found, tmp_path / "figures")) == {"Cost against accuracy"}
 
 
-def test_more_panels_than_can_be_read_are_not_drawn(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_more_panels_than_can_be_read_are_refused(tmp_path: Path) -> None:
     for num in range(26):
-        write_run(
-            tmp_path / str(num), {"dt": 1 + num // 2, "centers.radius": 0.1 + num % 2}, {"ball_error": 1.0}
-        )
-    assert draw_sweep(collect(tmp_path), tmp_path / "figures").keys() == {"Cost against accuracy"}
-    assert "13 panels, by dt: too many to read" in caplog.messages[0]
+        overrides = {"dt": 1 + num // 2, "centers.radius": 0.1 + num % 2}
+        write_run(tmp_path / str(num), overrides, {"ball_error": 1.0})
+    with pytest.raises(series.TooManyError, match="13 panels, by dt: too many to read"):
+        series.error_against_radius(collect(tmp_path))
 
 
 def test_figures_are_the_same_bytes_on_every_run(sweep: Path, tmp_path: Path) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from ..table import Table
 from .printed import Number, PrintedColumn, Style, printed, significant
 
@@ -29,14 +31,13 @@ def markdown_text(table: Table, style: Style = Style()) -> str:  # noqa: B008 (i
     return title + joined(headings) + joined(rule) + "".join(joined(line) for line in lines) + notes
 
 
-def _cell(column: PrintedColumn, row: int, show: object) -> str:
+def _cell(column: PrintedColumn, row: int, show: Callable[[Number], str]) -> str:
     cell = column.cells[row]
     if cell is None:
         return "-"
     if isinstance(cell, str):
         return _escaped(cell)
-    assert callable(show)
-    text: str = show(cell)
+    text = show(cell)
     return f"**{text}**" if row in column.best else text
 
 
