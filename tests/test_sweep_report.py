@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from omegaconf import DictConfig, OmegaConf
-from sweeps import error, write_run, write_sweep
+from sweeps import BAD_COUNT, error, write_run, write_sweep
 
 from staf_torch.experiments import sweep_callback
 from staf_torch.experiments.law_cases import cases
@@ -46,6 +46,17 @@ def test_equal_sweeps_in_two_directories_have_equal_tables(tmp_path: Path) -> No
     assert write_report(one, figures=False) == write_report(two, figures=False)
     for name in ("table.csv", "table.tex"):
         assert (one / name).read_bytes() == (two / name).read_bytes()
+
+
+@pytest.mark.parametrize("seeds", [(0,), (0, 1)])
+def test_a_sweep_of_which_every_job_failed_has_a_table_of_reasons(
+    seeds: tuple[int, ...], tmp_path: Path
+) -> None:
+    directory = write_sweep(tmp_path / "sweep", kernels=["gaussian"], counts=(7,), seeds=seeds)
+    text = write_report(directory)
+    assert left(directory) == FILES
+    assert BAD_COUNT in text
+    assert BAD_COUNT in (directory / "table.csv").read_text()
 
 
 # The callback
@@ -146,7 +157,7 @@ def test_more_panels_than_can_be_read_are_refused(tmp_path: Path) -> None:
 
 
 def test_figures_are_the_same_bytes_on_every_run(sweep: Path, tmp_path: Path) -> None:
-    maps = series.heat_maps(collect(sweep))
+    maps = series.heat_maps(collect(sweep))[:1]
     for name in ("one", "two"):
         plots.save(plots_sweep.draw_heat_maps(maps), tmp_path / name)
     for kind in ("png", "pdf"):

@@ -146,6 +146,15 @@ def test_json_is_valid_and_says_why_a_number_is_missing(found: Collection) -> No
             assert row["reasons"] == {"settling_time": "not finite, or nothing to report"}
 
 
+def test_json_stays_valid_where_an_aggregate_overflows(tmp_path: Path) -> None:
+    for num, number in enumerate((1.7e308, -1.7e308)):
+        write_run(tmp_path / str(num), {"seed": num}, {"ball_error": number})
+    table = tabulate(collect(tmp_path), Layout(aggregates=("mean", "std")))
+    (row,) = json.loads(json_text(table), parse_constant=pytest.fail)["rows"]
+    assert (row["ball_error.mean"], row["ball_error.std"]) == (0.0, None)
+    assert row["reasons"] == {"ball_error.std": "inf is not a JSON number"}
+
+
 def test_markdown_joins_mean_and_spread_and_marks_the_best(found: Collection) -> None:
     text = markdown_text(tabulate(found, PIVOT), Style(bold=True))
     lines = text.splitlines()

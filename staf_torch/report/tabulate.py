@@ -90,9 +90,8 @@ def _metrics(found: Collection, every: bool) -> tuple[str, ...]:
 def _one_a_run(found: Collection, metrics: Sequence[str]) -> Table:
     troubled = any(run.status != COMPLETED or run.reason is not None for run in found.rows)
     about = ("status", "reason") if troubled else ("status",)
-    names = (*found.swept, *(name for name in about if name not in found.swept))
     columns = [Column(name) for name in found.swept] + [Column(name, metric=name) for name in metrics]
-    columns += [Column(name) for name in (*names[len(found.swept) :], "directory")]
+    columns += [Column(name) for name in (*about, "directory")]
     if any(run.member is not None for run in found.rows):
         columns.append(Column("member"))
     rows = []
