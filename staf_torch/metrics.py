@@ -50,6 +50,7 @@ class ChaseMetrics:
         settle_time: float,
     ) -> None:
         self._basis, self._target, self._law = basis, target, law
+        self._floor = BallFloor(basis, target)
         self._inner_steps, self._dt = inner_steps, dt
         self._first = math.ceil(settle_time / dt - 1e-9)  # index of the first settled time
         self._time = 0
@@ -81,7 +82,7 @@ class ChaseMetrics:
             "ultimate_excess": excess,
             "ultimate_excess_before": before,
             "ball_error": ball_error(self._basis, self._target, x, coefficients),
-            "ball_floor_error": ball_floor_error(self._basis, self._target, x),
+            "ball_floor_error": self._floor(x),
             "rounding_floor": torch.finfo(value.dtype).eps * value.abs(),
             "gradient_error": gradient_error(self._basis, self._target, x, coefficients),
             "condition_number": kappa,
@@ -181,11 +182,25 @@ def ball_floor_error(basis: StaFBasis, target: Target, x: Tensor) -> Tensor:
     Returns:
         (..., T).
     """
-    probes = probe_points(_PROBES, basis.dim).to(x)
-    shared = _shared_functions(basis, x, probes)
-    row = _PROBES * (1 if shared is not None else basis.count)  # numbers in a temporary of `_floor`
-    times = max(1, _BLOCK // (row * max(1, x.numel() // x.shape[-1] // x.shape[-2])))
-    return torch.cat([_floor(basis, target, probes, shared, some) for some in x.split(times, dim=-2)], dim=-1)
+    return BallFloor(basis, target)(x)
+
+
+class BallFloor:
+    """`ball_floor_error` of consecutive pieces (B, T, n) of the same rows; what they share is set up once."""
+
+    def __init__(self, basis: StaFBasis, target: Target) -> None:
+        self._basis, self._target = basis, target
+        self._begun = False
+        self._shared: Tensor | None = None
+
+    def __call__(self, x: Tensor) -> Tensor:
+        basis, probes = self._basis, probe_points(_PROBES, self._basis.dim).to(x)
+        if not self._begun:
+            self._begun, self._shared = True, _shared_functions(basis, x, probes)
+        row = _PROBES * (1 if self._shared is not None else basis.count)  # numbers in a temporary of `_floor`
+        times = max(1, _BLOCK // (row * max(1, x.numel() // x.shape[-1] // x.shape[-2])))
+        blocks = x.split(times, dim=-2)
+        return torch.cat([_floor(basis, self._target, probes, self._shared, some) for some in blocks], dim=-1)
 
 
 def _shared_functions(basis: StaFBasis, x: Tensor, probes: Tensor) -> Tensor | None:
