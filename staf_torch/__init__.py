@@ -7,6 +7,7 @@ from . import sensitivity as sensitivity
 from . import systems as systems
 from . import targets as targets
 from . import theory as theory
+from ._version import __version__ as __version__
 from .basis import StaFBasis as StaFBasis
 from .centers import ConstantRadius as ConstantRadius
 from .centers import StateFollowingCenters as StateFollowingCenters
@@ -30,5 +31,3 @@ from .kernels import MaternKernel as MaternKernel
 from .kernels import PolynomialKernel as PolynomialKernel
 from .kernels import RationalQuadraticKernel as RationalQuadraticKernel
 from .module import StaF as StaF
-
-__version__ = "0.1.0"

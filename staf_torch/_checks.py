@@ -1,4 +1,4 @@
-"""The wording of every ``ValueError`` that a user can meet, in one place.
+"""The checks behind every ``ValueError`` that a user can meet, in one place; `_wording` has its sentence.
 
 Each check returns the value it was given, converted where that is safe, so that a constructor reads
 ``self.width = positive("GaussianKernel", "width", width)``.
@@ -12,20 +12,9 @@ from collections.abc import Collection, Sequence
 import torch
 from torch import Tensor
 
-COMMAND_LINE = "staf"
-"""As the name of a call: the setting of that name on the command line."""
-
-
-def fail(call: str, name: str, rule: str, value: object) -> ValueError:
-    """The one sentence form of the library: what was called, what must hold, what came."""
-    where = f"staf {name}=..." if call == COMMAND_LINE else f"{call}({name}=...)"
-    return ValueError(f"`{where}` {rule}; got {_show(value)}.")
-
-
-def _show(value: object) -> str:
-    if isinstance(value, Tensor):
-        return repr(value.tolist()) if value.numel() <= 8 else f"a tensor {tuple(value.shape)}"
-    return repr(value)
+from ._wording import COMMAND_LINE as COMMAND_LINE
+from ._wording import fail as fail
+from ._wording import show
 
 
 def number(call: str, name: str, value: object) -> float | Tensor:
@@ -138,7 +127,7 @@ def sampled(target: object, values: object, points: Tensor, outputs: int | None 
     """What a target returned at ``points`` (..., n): one value a point, (...), or k outputs, (..., k)."""
     name = getattr(target, "__name__", type(target).__name__)
     if not isinstance(values, Tensor):
-        raise ValueError(f"The target `{name}` must return a tensor; got {_show(values)}.")
+        raise ValueError(f"The target `{name}` must return a tensor; got {show(values)}.")
     expected = tuple(points.shape[:-1]) + (() if outputs is None else (outputs,))
     if tuple(values.shape) != expected:
         form = "(...)" if outputs is None else f"(..., {outputs})"

@@ -10,14 +10,10 @@ import torch
 from torch import Tensor
 
 from .basis import StaFBasis, Target
-from .centers import probe_points
 from .chase import ChaseResult
 from .linalg import condition_number
-from .local import evaluate_scaled
+from .local_errors import BallFloor, ball_error, gradient_error
 from .optim import UpdateLaw
-
-_PROBES = 97  # points of the ball to take a supremum over; in the plane 64 of them on its edge
-_BLOCK = 2**18  # numbers in a temporary of `ball_error`, so that it stays in cache
 
 
 class Member(NamedTuple):
@@ -44,6 +40,8 @@ class ChaseMetrics:
             before it, and with the ideal weights.
         ultimate_excess, ultimate_excess_before: max (a - w)'K(a - w).
         ball_error: max over the closed ball of radius nu(x) of |V - V^|, after correction.
+        ball_floor_error: the same with the ideal weights: what kernel, radius and layout allow at best.
+        rounding_floor: eps max |V(x)|, with eps of the precision; no error below it means anything.
         gradient_error: max |grad V - grad V^| at the state, centers frozen.
         condition_number: max kappa(K(c(x))).
         settling_time: the first time (s) from which the excess never again exceeds `ultimate_excess`.
@@ -74,14 +72,13 @@ class ChaseMetrics:
         members: Sequence[Member] | None = None,
     ) -> None:
         self._basis, self._target, self._law = basis, target, law
+        self._floor = BallFloor(basis, target)
         self._inner_steps = inner_steps
         self._whole = Member(0, dt, settle_time)
         self._members = members
         firsts = [member.first for member in members or (self._whole,)]
-        self._first, self._last_first = (
-            min(firsts),
-            max(firsts),
-        )  # where the first window begins, and the last
+        # Where the first window begins, and the last.
+        self._first, self._last_first = min(firsts), max(firsts)
         self._time = 0
         self._worst: dict[str, Tensor] = {}  # name -> (B,)
         self._early: list[Tensor] = []  # excess before the window, -inf in it, (B, C) a piece
@@ -115,6 +112,8 @@ class ChaseMetrics:
             ultimate_excess=excess,
             ultimate_excess_before=before,
             ball_error=ball_error(self._basis, self._target, x, coefficients),
+            ball_floor_error=self._floor(x),
+            rounding_floor=torch.finfo(value.dtype).eps * value.abs(),
             gradient_error=gradient_error(self._basis, self._target, x, coefficients),
             condition_number=kappa,
         )
@@ -201,46 +200,8 @@ _WORST = (
     "ultimate_excess",
     "ultimate_excess_before",
     "ball_error",
+    "ball_floor_error",
+    "rounding_floor",
     "gradient_error",
     "condition_number",
 )
-
-
-def ball_error(basis: StaFBasis, target: Target, x: Tensor, coefficients: Tensor) -> Tensor:
-    """sup |V - V^| over a fixed set of points of the closed ball of radius nu(x) around x.
-
-    Args:
-        x: states, (..., T, n).
-        coefficients: b of `ChaseResult.coefficients`, (..., T, M).
-
-    Returns:
-        (..., T).
-    """
-    probes = probe_points(_PROBES, basis.dim).to(x)
-    times = max(1, _BLOCK // (_PROBES * max(1, x.numel() // x.shape[-2])))
-    blocks = zip(x.split(times, dim=-2), coefficients.split(times, dim=-2), strict=True)
-    return torch.cat([_ball_error(basis, target, probes, *block) for block in blocks], dim=-1)
-
-
-def _ball_error(basis: StaFBasis, target: Target, probes: Tensor, x: Tensor, b: Tensor) -> Tensor:
-    nu, offsets = basis.centers.radius(x)[..., None, None], basis.centers.offsets(x)
-    worst = x.new_zeros(x.shape[:-1])
-    for some in probes.split(64):
-        z = nu * some
-        estimate = evaluate_scaled(basis.kernel, offsets, x, z, b)
-        error = (target(x.unsqueeze(-2) + z) - estimate).abs().amax(-1)
-        worst = torch.maximum(worst, error)
-    return worst
-
-
-def gradient_error(basis: StaFBasis, target: Target, x: Tensor, coefficients: Tensor) -> Tensor:
-    """|grad V - grad V^| at the state, with the centers frozen: (..., n), (..., M) -> (...)."""
-    offsets = basis.centers.offsets(x)
-
-    def estimate(z: Tensor) -> Tensor:
-        return evaluate_scaled(basis.kernel, offsets, x, z.unsqueeze(-2), coefficients).sum()
-
-    approximate = torch.func.grad(estimate)(torch.zeros_like(x))
-    exact = torch.func.grad(lambda at: target(at).sum())(x)
-    error: Tensor = (exact - approximate).norm(dim=-1)
-    return error

@@ -92,10 +92,16 @@ class StackedSpace(NamedTuple):
         return self._each("fit", values)
 
     def evaluate(self, z: Tensor, coefficients: Tensor) -> Tensor:
-        """V^(x + z): (P, n) for all states, (B, T, M) -> (B, T, P)."""
-        assert z.dim() == 2
-        apart = zip(self.spaces, coefficients.split(self.rows), strict=True)
-        return torch.cat([space.evaluate(z, beta) for space, beta in apart])
+        """V^(x + z): (P, n) for all states or (B, T, P, n), (B, T, M) -> (B, T, P)."""
+        apart = zip(self.spaces, self._points(z), coefficients.split(self.rows), strict=True)
+        return torch.cat([space.evaluate(at, beta) for space, at, beta in apart])
+
+    def evaluate_with_gradient(self, z: Tensor, coefficients: Tensor) -> tuple[Tensor, Tensor]:
+        """V^(x + z) and its gradient in z: the same -> (B, T, P), (B, T, P, n)."""
+        apart = zip(self.spaces, self._points(z), coefficients.split(self.rows), strict=True)
+        found = [space.evaluate_with_gradient(at, beta) for space, at, beta in apart]
+        values, gradients = zip(*found, strict=True)
+        return torch.cat(values), torch.cat(gradients)
 
     def scaled_weights(self, coefficients: Tensor) -> Tensor:
         """e^{g(x)} w: (B, T, M) -> (B, T, M)."""
@@ -108,6 +114,10 @@ class StackedSpace(NamedTuple):
     def coefficients(self, weights: Tensor) -> Tensor:
         """beta from the paper's w: (B, T, M) -> (B, T, M)."""
         return self._each("coefficients", weights)
+
+    def _points(self, z: Tensor) -> Sequence[Tensor]:
+        """Points of each basis."""
+        return [z] * len(self.spaces) if z.dim() == 2 else z.split(self.rows)
 
     def _each(self, method: str, given: Tensor) -> Tensor:
         apart = zip(self.spaces, given.split(self.rows), strict=True)

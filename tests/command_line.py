@@ -22,6 +22,7 @@ PLANTS = '''
 import torch
 from torch import nn
 from staf_torch import Kernel
+from staf_torch.report.trackers import Tracker
 
 class Escape(nn.Module):
     """x' = x^2: a user's plant without a flow, a dimension or a base class."""
@@ -38,6 +39,12 @@ class Cauchy(Kernel):
         self.width = width
     def forward(self, x1, x2):
         return 1 / (1 + (x1.unsqueeze(-2) - x2.unsqueeze(-3)).square().sum(-1) / self.width ** 2)
+
+class Lines(Tracker):
+    """A user's tracker: a line a run."""
+    def record(self, run):
+        with open(run.directory / "staf.log", "a") as file:
+            file.write(f"tracked {run.settings['kernel']} {run.metrics['ball_error']}\\n")
 
 def bowl(x):
     return x.square().sum(-1)

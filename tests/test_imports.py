@@ -6,7 +6,7 @@ import subprocess
 import sys
 
 import pytest
-from command_line import environment
+from command_line import ROOT, environment
 
 import staf_torch
 from staf_torch import _checks
@@ -54,6 +54,20 @@ def test_importing_the_library_imports_no_hydra_and_no_matplotlib() -> None:
     loaded = set(ended.stdout.split())
     assert "torch" in loaded
     assert loaded.isdisjoint({"hydra", "omegaconf", "matplotlib", "antlr4"})
+
+
+def test_the_command_for_tables_imports_no_torch() -> None:
+    code = (
+        "import sys, runpy; sys.argv = ['staf-table', '--version-of-nothing'];"
+        "main = runpy.run_path(sys.orig_argv[-1])['main']\n"
+        "try: main()\n"
+        "except SystemExit: print(*{name.partition('.')[0] for name in sys.modules})"
+    )
+    line = [sys.executable, "-W", "error", "-c", code, str(ROOT / "staf_torch" / "report" / "staf_table.py")]
+    ended = subprocess.run(line, env=environment(), capture_output=True, text=True, check=True)
+    loaded = set(ended.stdout.split())
+    assert "staf_torch" in loaded
+    assert loaded.isdisjoint({"torch", "hydra", "omegaconf", "matplotlib", "pandas"})
 
 
 def test_a_sentence_names_call_rule_and_value() -> None:

@@ -11,10 +11,13 @@ import torch
 from helpers import KERNELS, basis_of, over, tensor, uniform
 
 import staf_torch as st
+from staf_torch import metrics as metrics_module
 from staf_torch import systems
 from staf_torch.chase import ChaseResult, chase_pieces
+from staf_torch.diagnostics import sup_error
 from staf_torch.linalg import condition_number
-from staf_torch.metrics import ChaseMetrics, ball_error, gradient_error
+from staf_torch.local_errors import ball_error, ball_floor_error, gradient_error
+from staf_torch.metrics import ChaseMetrics
 from staf_torch.optim import SteepestDescent
 from staf_torch.targets import Paper
 
@@ -25,6 +28,8 @@ KEYS = {
     "ultimate_excess",
     "ultimate_excess_before",
     "ball_error",
+    "ball_floor_error",
+    "rounding_floor",
     "gradient_error",
     "condition_number",
     "settling_time",
@@ -62,6 +67,8 @@ def test_metrics_are_the_worst_over_the_window(name: str) -> None:
         "ultimate_excess": result.excess[:, window].max(),
         "ultimate_excess_before": result.excess_before[:, window].max(),
         "condition_number": condition_number(basis.gram(result.state[:, window])).max(),
+        "ball_floor_error": sup_error(basis, result.state[:, window], Paper(), 97).max(),
+        "rounding_floor": torch.finfo(torch.float64).eps * value.abs().max(),
     }
     assert set(found) == KEYS
     for key, number in expected.items():
@@ -158,6 +165,18 @@ def test_ball_error_is_close_to_a_dense_supremum(radius: object, dim: int) -> No
     dense = (target(y) - staf(y)).abs().amax(-1).detach()
     assert (found <= dense * 1.01).all()
     assert (found >= dense * 0.7).all()
+
+
+@pytest.mark.parametrize("radius", [0.1, st.StateRadius(0.2, 0.1)])
+@over(KERNELS)
+def test_ball_floor_error_is_that_of_the_local_basis_in_pieces_of_any_size(
+    name: str, radius: object, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    basis, x = basis_of(name, 6, radius), uniform(4, 9, 2)
+    expected = sup_error(basis, x, Paper(), 97)
+    torch.testing.assert_close(ball_floor_error(basis, Paper(), x), expected, rtol=1e-9, atol=1e-12)
+    monkeypatch.setattr(metrics_module, "_BLOCK", 1)
+    torch.testing.assert_close(ball_floor_error(basis, Paper(), x), expected, rtol=1e-9, atol=1e-12)
 
 
 @over(KERNELS)

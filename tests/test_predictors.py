@@ -26,7 +26,7 @@ from staf_torch import (
 )
 from staf_torch.chase import chase_pieces
 from staf_torch.chase.result import concatenate
-from staf_torch.metrics import ball_error, gradient_error
+from staf_torch.local_errors import ball_error, gradient_error
 
 
 @functools.cache

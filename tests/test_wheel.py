@@ -36,12 +36,13 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_wheel_holds_the_package_its_settings_and_nothing_else(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
         names = set(archive.namelist())
-    tops = {"staf_torch", "hydra_plugins", "staf_torch-0.1.0.dist-info"}  # Hydra 1.3 looks into the second
-    assert {name.partition("/")[0] for name in names} == tops
+    packages = {"staf_torch", "hydra_plugins", "staf_table.py"}  # Hydra 1.3 looks into the second
+    assert {name.partition("/")[0] for name in names} == packages | {"staf_torch-0.1.0.dist-info"}
     assert {name for name in names if name.startswith("hydra_plugins")} == {"hydra_plugins/staf_batched.py"}
     sources = {
         f"staf_torch/{p.relative_to(ROOT / 'staf_torch')}" for p in (ROOT / "staf_torch").rglob("*.py")
     }
+    sources.remove("staf_torch/report/staf_table.py")  # stands beside the package
     settings = {f"staf_torch/{p.relative_to(ROOT)}" for p in (ROOT / "conf").rglob("*.yaml")}
     assert sources | settings | {"staf_torch/py.typed"} <= names
     assert any(name.endswith("LICENSE") for name in names)
@@ -73,3 +74,5 @@ def test_wheel_runs_in_a_clean_environment_from_any_directory(wheel: Path, tmp_p
         "history.npz",
     }
     assert json.loads((run / "metrics.json").read_text())["diverged_fraction"] == 0
+    table = _run(home / "bin" / "staf-table", "runs", "--format", "csv", cwd=work)
+    assert "ball_error" in table.splitlines()[0]

@@ -146,7 +146,7 @@ def main() -> None:
             sys.argv = [typed[0], *command_line(typed[1:])]
             try:
                 _task()
-            except Exception:
+            except (Exception, KeyboardInterrupt):
                 running.close()
                 raise
         except Refused as refused:

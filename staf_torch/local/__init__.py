@@ -7,6 +7,7 @@ analogue, all others the Newton basis.
 
 from .base import LocalSpace as LocalSpace
 from .base import evaluate_scaled as evaluate_scaled
+from .base import scale as scale
 from .choice import choose as choose
 from .elimination import Degrees as Degrees
 from .elimination import degrees_of as degrees_of
