@@ -11,8 +11,7 @@ import torch
 from helpers import KERNELS, basis_of, over, tensor, uniform
 
 import staf_torch as st
-from staf_torch import metrics as metrics_module
-from staf_torch import systems
+from staf_torch import local_errors, systems
 from staf_torch.chase import ChaseResult, chase_pieces
 from staf_torch.diagnostics import sup_error
 from staf_torch.linalg import condition_number
@@ -175,7 +174,7 @@ def test_ball_floor_error_is_that_of_the_local_basis_in_pieces_of_any_size(
     basis, x = basis_of(name, 6, radius), uniform(4, 9, 2)
     expected = sup_error(basis, x, Paper(), 97)
     torch.testing.assert_close(ball_floor_error(basis, Paper(), x), expected, rtol=1e-9, atol=1e-12)
-    monkeypatch.setattr(metrics_module, "_BLOCK", 1)
+    monkeypatch.setattr(local_errors, "_BLOCK", 1)
     torch.testing.assert_close(ball_floor_error(basis, Paper(), x), expected, rtol=1e-9, atol=1e-12)
 
 
