@@ -17,7 +17,7 @@ from command_line import environment, one
 from omegaconf import OmegaConf
 
 from staf_torch.experiments.sweep import launch, records
-from staf_torch.experiments.sweep.session import claim
+from staf_torch.experiments.sweep.session import SweepSession, claim
 
 SHORT = ["duration=0.05", "settle_time=0", "figures=false", "history=false"]
 GRID = [
@@ -205,6 +205,7 @@ def test_a_directory_with_another_run_in_it_is_named(tmp_path: Path) -> None:
 
 
 def test_an_unknown_swept_key_starts_nothing(place: Path) -> None:
+    (place / "runs").mkdir(exist_ok=True)
     before = set((place / "runs").iterdir())
     code, _, err = one(str(place), ["-m", "centers.raduis=0.1,0.2", *SHORT])
     assert code == 1
@@ -303,3 +304,15 @@ def test_the_plugin_imports_no_torch() -> None:
     )
     root = Path(__file__).resolve().parent.parent
     subprocess.run([sys.executable, "-c", program], cwd=root, env=environment(), check=True)
+
+
+def test_a_sweep_with_a_failure_is_told_to_be_over(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Hydra forgets its callbacks then, and the table is made by one."""
+    told = []
+
+    def note(self: SweepSession, config: Any, **_: Any) -> None:
+        told.append(str(config.hydra.sweep.dir))
+
+    monkeypatch.setattr(SweepSession, "on_multirun_end", note)
+    sweep(place, "told", "centers.count=4", *SHORT, code=1)
+    assert told == ["runs/told"]
