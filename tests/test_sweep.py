@@ -17,6 +17,7 @@ from command_line import environment, one
 from omegaconf import OmegaConf
 
 from staf_torch.experiments.sweep import launch, records
+from staf_torch.experiments.sweep.resume import command_line
 from staf_torch.experiments.sweep.session import SweepSession, claim
 
 SHORT = ["duration=0.05", "settle_time=0", "figures=false", "history=false"]
@@ -195,6 +196,18 @@ def test_what_is_no_sweep_of_this_version_is_not_resumed(place: Path, tmp_path: 
     (tmp_path / "sweep.json").write_text('{"version": "0.0.1", "overrides": [], "hydra": [], "jobs": []}')
     _, _, err = one(str(place), ["-m", f"sweep.resume={tmp_path}"])
     assert "written by 0.0.1" in err
+
+
+def test_a_resumed_sweep_keeps_hydras_settings_but_those_that_change(tmp_path: Path) -> None:
+    hydra = ["hydra.mode=MULTIRUN", "hydra.launcher.batch=2", "hydra.verbose=true", "hydra.sweep.dir=old"]
+    records.begin_sweep(tmp_path, ["seed=0,1", "sweep.objective=ball_error"], hydra)
+    place = records.quoted(str(tmp_path))
+    end = [f"hydra.sweep.dir={place}", f"sweep.resume={place}"]
+    kept = ["--multirun", "seed=0,1", "hydra.launcher.batch=2", "hydra.verbose=true", *end]
+    assert command_line([f"sweep.resume={tmp_path}"]) == kept
+    other = ["-m", "seed=0,1", "hydra.verbose=true", "hydra/launcher=basic", *end]
+    assert command_line(["-m", f"sweep.resume={tmp_path}", "hydra/launcher=basic"]) == other
+    assert command_line(["-m", "sweep.resume=null", "seed=0"]) == ["-m", "sweep.resume=null", "seed=0"]
 
 
 def test_a_directory_with_another_run_in_it_is_named(tmp_path: Path) -> None:

@@ -74,7 +74,9 @@ def _key(line: str) -> str:
 def _merged(before: Sequence[str], now: Sequence[str]) -> list[str]:
     """Hydra's own settings may change: where and how the jobs run does not change what they find."""
     replaced = {*map(_key, now), *_NOT_TAKEN_OVER}
-    kept = [line for line in before if _key(line) not in replaced]
+    # The settings of a launcher that is exchanged for another one go with it.
+    gone = tuple(f"{key.replace('/', '.')}." for key in replaced if key.startswith("hydra/"))
+    kept = [line for line in before if _key(line) not in replaced and not _key(line).startswith(gone)]
     return kept + [line for line in now if _key(line) not in _NOT_TAKEN_OVER]
 
 
