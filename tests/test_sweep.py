@@ -203,10 +203,12 @@ def test_a_resumed_sweep_keeps_hydras_settings_but_those_that_change(tmp_path: P
     records.begin_sweep(tmp_path, ["seed=0,1", "sweep.objective=ball_error"], hydra)
     place = records.quoted(str(tmp_path))
     end = [f"hydra.sweep.dir={place}", f"sweep.resume={place}"]
-    kept = ["--multirun", "seed=0,1", "hydra.launcher.batch=2", "hydra.verbose=true", *end]
+    kept = ["--multirun", "seed=0,1", "hydra.launcher.batch=2", "hydra.verbose=true"]
+    kept += ["sweep.objective=ball_error", *end]
     assert command_line([f"sweep.resume={tmp_path}"]) == kept
-    other = ["-m", "seed=0,1", "hydra.verbose=true", "hydra/launcher=basic", *end]
-    assert command_line(["-m", f"sweep.resume={tmp_path}", "hydra/launcher=basic"]) == other
+    other = ["-m", "seed=0,1", "hydra.verbose=true", "sweep.objective=null", "hydra/launcher=basic", *end]
+    changed = ["sweep.objective=null", "hydra/launcher=basic"]
+    assert command_line(["-m", f"sweep.resume={tmp_path}", *changed]) == other
     assert command_line(["-m", "sweep.resume=null", "seed=0"]) == ["-m", "sweep.resume=null", "seed=0"]
 
 

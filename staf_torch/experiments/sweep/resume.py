@@ -12,7 +12,7 @@ from ... import __version__
 from . import records
 
 _RESUME = "sweep.resume="
-_NOT_TAKEN_OVER = ("hydra.mode", "hydra.sweep.dir")
+_NOT_TAKEN_OVER = ("hydra.mode", "hydra.sweep.dir", "sweep.resume")
 
 
 def command_line(argv: Sequence[str]) -> list[str]:
@@ -36,8 +36,7 @@ def command_line(argv: Sequence[str]) -> list[str]:
     return [
         *(flags if {"-m", "--multirun"} & set(flags) else [*flags, "--multirun"]),
         *typed,
-        *about_sweep,
-        *_merged(hydra, [line for line in given if _is_hydra(line)]),
+        *_merged(hydra, [*about_sweep, *filter(_is_hydra, given)]),
         f"hydra.sweep.dir={place}",
         f"{_RESUME}{place}",
     ]
