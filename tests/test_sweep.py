@@ -17,7 +17,8 @@ from command_line import environment, one
 from omegaconf import OmegaConf
 
 from staf_torch.experiments.sweep import launch, records
-from staf_torch.experiments.sweep.session import claim
+from staf_torch.experiments.sweep.resume import command_line
+from staf_torch.experiments.sweep.session import SweepSession, claim
 
 SHORT = ["duration=0.05", "settle_time=0", "figures=false", "history=false"]
 GRID = [
@@ -197,6 +198,20 @@ def test_what_is_no_sweep_of_this_version_is_not_resumed(place: Path, tmp_path: 
     assert "written by 0.0.1" in err
 
 
+def test_a_resumed_sweep_keeps_hydras_settings_but_those_that_change(tmp_path: Path) -> None:
+    hydra = ["hydra.mode=MULTIRUN", "hydra.launcher.batch=2", "hydra.verbose=true", "hydra.sweep.dir=old"]
+    records.begin_sweep(tmp_path, ["seed=0,1", "sweep.objective=ball_error"], hydra)
+    place = records.quoted(str(tmp_path))
+    end = [f"hydra.sweep.dir={place}", f"sweep.resume={place}"]
+    kept = ["--multirun", "seed=0,1", "hydra.launcher.batch=2", "hydra.verbose=true"]
+    kept += ["sweep.objective=ball_error", *end]
+    assert command_line([f"sweep.resume={tmp_path}"]) == kept
+    other = ["-m", "seed=0,1", "hydra.verbose=true", "sweep.objective=null", "hydra/launcher=basic", *end]
+    changed = ["sweep.objective=null", "hydra/launcher=basic"]
+    assert command_line(["-m", f"sweep.resume={tmp_path}", *changed]) == other
+    assert command_line(["-m", "sweep.resume=null", "seed=0"]) == ["-m", "sweep.resume=null", "seed=0"]
+
+
 def test_a_directory_with_another_run_in_it_is_named(tmp_path: Path) -> None:
     about = {"version": records.__version__, "overrides": ["seed=1"], "status": "completed"}
     (tmp_path / "run.json").write_text(json.dumps(about))
@@ -205,6 +220,7 @@ def test_a_directory_with_another_run_in_it_is_named(tmp_path: Path) -> None:
 
 
 def test_an_unknown_swept_key_starts_nothing(place: Path) -> None:
+    (place / "runs").mkdir(exist_ok=True)
     before = set((place / "runs").iterdir())
     code, _, err = one(str(place), ["-m", "centers.raduis=0.1,0.2", *SHORT])
     assert code == 1
@@ -303,3 +319,15 @@ def test_the_plugin_imports_no_torch() -> None:
     )
     root = Path(__file__).resolve().parent.parent
     subprocess.run([sys.executable, "-c", program], cwd=root, env=environment(), check=True)
+
+
+def test_a_sweep_with_a_failure_is_told_to_be_over(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Hydra forgets its callbacks then, and the table is made by one."""
+    told = []
+
+    def note(self: SweepSession, config: Any, **_: Any) -> None:
+        told.append(str(config.hydra.sweep.dir))
+
+    monkeypatch.setattr(SweepSession, "on_multirun_end", note)
+    sweep(place, "told", "centers.count=4", *SHORT, code=1)
+    assert told == ["runs/told"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import sys
 from pathlib import Path
@@ -18,10 +19,17 @@ def find_launcher() -> None:
     folder = str(_PLUGINS)
     if folder in sys.path:
         return
+    installed = _is_installed()
     sys.path.insert(0, folder)
-    # Workers of other launchers unpickle names of `hydra_plugins` before they import this package.
+    if installed:
+        return
+    # A bare checkout: workers of other launchers unpickle names of `hydra_plugins` before they import us.
     inherited = os.environ.get("PYTHONPATH", "")
-    if folder not in inherited.split(os.pathsep):
-        os.environ["PYTHONPATH"] = os.pathsep.join(
-            filter(None, [inherited, folder, str(_PLUGINS.parents[1])])
-        )
+    os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [inherited, folder, str(_PLUGINS.parents[1])]))
+
+
+def _is_installed() -> bool:
+    try:
+        return importlib.util.find_spec("hydra_plugins.staf_batched") is not None
+    except ModuleNotFoundError:  # there is no `hydra_plugins` at all
+        return False

@@ -130,8 +130,10 @@ def without_hydra(config: DictConfig) -> DictConfig:
 
 
 def begin_sweep(directory: Path, overrides: Sequence[str], hydra: Sequence[str]) -> None:
-    """`sweep.json` of a sweep that begins: what was typed."""
-    _write_sweep(directory, {"version": __version__, "overrides": own(overrides), "hydra": list(hydra)})
+    """`sweep.json` of a sweep that begins: what was typed, of the jobs and of Hydra and the sweep."""
+    jobs = own(overrides)
+    others = [*hydra, *(line for line in overrides if line not in jobs)]
+    _write_sweep(directory, {"version": __version__, "overrides": jobs, "hydra": others})
 
 
 def list_jobs(directory: Path, numbered: Mapping[int, Sequence[str]]) -> None:

@@ -12,7 +12,7 @@ from ... import __version__
 from . import records
 
 _RESUME = "sweep.resume="
-_NOT_TAKEN_OVER = ("hydra.mode", "hydra.sweep.dir")
+_NOT_TAKEN_OVER = ("hydra.mode", "hydra.sweep.dir", "sweep.resume")
 
 
 def command_line(argv: Sequence[str]) -> list[str]:
@@ -36,8 +36,7 @@ def command_line(argv: Sequence[str]) -> list[str]:
     return [
         *(flags if {"-m", "--multirun"} & set(flags) else [*flags, "--multirun"]),
         *typed,
-        *about_sweep,
-        *_merged(hydra, [line for line in given if _is_hydra(line)]),
+        *_merged(hydra, [*about_sweep, *filter(_is_hydra, given)]),
         f"hydra.sweep.dir={place}",
         f"{_RESUME}{place}",
     ]
@@ -74,7 +73,9 @@ def _key(line: str) -> str:
 def _merged(before: Sequence[str], now: Sequence[str]) -> list[str]:
     """Hydra's own settings may change: where and how the jobs run does not change what they find."""
     replaced = {*map(_key, now), *_NOT_TAKEN_OVER}
-    kept = [line for line in before if _key(line) not in replaced]
+    # The settings of a launcher that is exchanged for another one go with it.
+    gone = tuple(f"{key.replace('/', '.')}." for key in replaced if key.startswith("hydra/"))
+    kept = [line for line in before if _key(line) not in replaced and not _key(line).startswith(gone)]
     return kept + [line for line in now if _key(line) not in _NOT_TAKEN_OVER]
 
 
