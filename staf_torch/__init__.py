@@ -30,5 +30,6 @@ from .kernels import MaternKernel as MaternKernel
 from .kernels import PolynomialKernel as PolynomialKernel
 from .kernels import RationalQuadraticKernel as RationalQuadraticKernel
 from .module import StaF as StaF
+from .streams import StaFRegressor as StaFRegressor
 
 __version__ = "0.1.0"

@@ -76,16 +76,18 @@ class LocalFilter:
         state.samples.add_(fine)
         state.skipped.add_(~fine)
 
-    def estimate(self, state: StreamState, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and variance of V at x (n, S), in units of the process: (S,), (S,)."""
+    def mean(self, state: StreamState, x: Tensor) -> Tensor:
+        """The expected V at x (n, S), in units of the process: (S,)."""
+        found = self.frame.features(state.anchor, x - state.anchor)
+        mean = _dot(found.functions, state.mean)
+        return mean if found.log_factor is None else mean * found.log_factor.exp()
+
+    def variance(self, state: StreamState, x: Tensor) -> Tensor:
+        """The variance of V at x (n, S), in units of the process's: (S,)."""
         found = self.frame.features(state.anchor, x - state.anchor)
         psi = found.functions
-        mean = _dot(psi, state.mean)
         variance = found.variance - _dot(psi, _apply(state.learned, psi))
-        if found.log_factor is None:
-            return mean, variance
-        factor = found.log_factor.exp()
-        return mean * factor, variance * factor.square()
+        return variance if found.log_factor is None else variance * (2 * found.log_factor).exp()
 
     def _follow(self, state: StreamState, rows: Tensor, step: Tensor) -> None:
         """Move the frame of the streams ``rows`` by (n, R)."""

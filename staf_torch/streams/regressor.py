@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import inspect
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -87,7 +88,7 @@ class StaFRegressor:
         noise: float = 1e-2,
         amplitude: float = 1.0,
         forgetting: float = 0.999,
-        follow: float = 0.5,
+        follow: float = 1.0,
     ) -> None:
         self.kernel = kernel
         self.radius = radius
@@ -177,16 +178,17 @@ class StaFRegressor:
         own = 1 if self.n_streams_ is None else 2
         several = points.dim() == own + 1
         self._check_streams("predict", points.select(-2, 0) if several else points)
-        like = self._state_.anchor
-        at = points.to(like).reshape(like.shape[1], -1, like.shape[0])
-        means, variances = zip(
-            *(self._filter_.estimate(self._state_, at[:, p].mT) for p in range(at.shape[1])), strict=True
-        )
-        mean = torch.stack(means, dim=-1).reshape(points.shape[:-1]) * float(self.amplitude_)
+        mean = self._at(points, self._filter_.mean) * self.amplitude_
         if not return_std:
             return _like(x, mean)
-        std = torch.stack(variances, dim=-1).reshape(points.shape[:-1]).sqrt() * float(self.amplitude_)
-        return _like(x, mean), _like(x, std)
+        return _like(x, mean), _like(x, self._at(points, self._filter_.variance).sqrt() * self.amplitude_)
+
+    def _at(self, points: Tensor, function: Callable[[StreamState, Tensor], Tensor]) -> Tensor:
+        """A function of one point a stream, at (..., n) points: (...)."""
+        like = self._state_.anchor
+        at = points.to(like).reshape(like.shape[1], -1, like.shape[0]).unbind(1)
+        found = [function(self._state_, point.mT.contiguous()) for point in at]
+        return torch.stack(found, dim=-1).reshape(points.shape[:-1])
 
     @property
     def n_samples_seen_(self) -> Tensor:
