@@ -4,8 +4,8 @@
 scikit-learn's KernelRidge and ALD-KRLS (Engel et al.), all on the same streams: a drifting function, the
 paper's V along a trajectory, noisy samples. The error is prequential, root mean square: every sample is
 predicted before it is learned. Each method takes the settings of its list that predict the first samples
-best, and is scored on the rest. A time is the median over the last steps of predicting and learning, over
-streams: each method on as many of them side by side as its entry says, one thread. A peer that is not
+best, and is scored on the rest. A time is the processor's, one thread, the median over the last steps of
+predicting and learning, over streams: each method on as many side by side as its entry says. A peer that is not
 installed is named and skipped: `pip install -e '.[bench]'`. Exit status 1 where a goal is missed.
 """
 
@@ -152,12 +152,12 @@ def timed(method: Method, settings: dict[str, Any], kind: str) -> tuple[float, f
     xs, ys = ([part.contiguous() for part in whole.unbind(1)] for whole in (data.x, data.y))
     model, both, learning = method.make(**settings), [], []
     for k, (x, y) in enumerate(zip(xs, ys, strict=True)):
-        start = time.perf_counter()
+        start = time.process_time()
         if k:
             model.predict(x)
-        middle = time.perf_counter()
+        middle = time.process_time()
         model.partial_fit(x, y)
-        end = time.perf_counter()
+        end = time.process_time()
         if k >= 100:
             both.append((end - start) / method.batch)
             learning.append((end - middle) / method.batch)
