@@ -14,9 +14,9 @@ _NEAREST = 1e-4  # of the reach, squared: closer than that a model counts alone,
 class ExperienceMemory(nn.Module):
     """V^(y) = sum_j omega_j(y) V^_j(y), a partition of unity over the states x_j at which models were stored.
 
-    With t_j = |y - x_j|^2 / (reach nu(x_j))^2 the weights are omega_j ~ (1 - t_j)_+^3 / (t_j + 1e-4)^2: compact,
-    twice continuously differentiable, and nearest first, as the error of a local model grows like a power
-    of the distance. Where no support reaches, V^ is NaN: `covered` says where.
+    With t_j = |y - x_j|^2 / (reach nu(x_j))^2 the weights are omega_j ~ (1 - t_j)_+^3 / (t_j + 1e-4)^2:
+    compact, twice continuously differentiable, and nearest first, as the error of a local model grows like a
+    power of the distance. Where no support reaches, V^ is NaN: `covered` says where.
 
     A model within spacing nu(x_j) of a stored state takes its place, being fresher, but for the one stored
     last: until the state has left that, nothing is stored. Elsewhere, once the memory is full, it takes

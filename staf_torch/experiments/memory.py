@@ -61,7 +61,7 @@ def run(cfg: DictConfig, directory: Path) -> dict[str, float | None]:
     states = torch.cat(
         list(trajectory(problem.system, problem.initial_states, dt=problem.dt, steps=problem.steps)), dim=1
     )
-    found = chase(states, problem.basis, problem.target, problem.law, **_chase_arguments(problem))
+    found = _chase(problem, states)
     coefficients = problem.basis.local(states).coefficients(found.weights)
     memory = remember(problem, settings, states[:, first:], coefficients[:, first:])
     index = first + (torch.arange(settings.states) * (problem.steps - first)) // settings.states
@@ -81,14 +81,19 @@ def settings_of(cfg: DictConfig) -> Settings:
     Raises:
         ValueError: if a setting breaks its rule; the message names it.
     """
-    group, real = cfg.memory, ("reach", "spacing")
-    checked = {name: positive_real(COMMAND_LINE, f"memory.{name}", group[name]) for name in real}
-    counts = {
-        name: integer(COMMAND_LINE, f"memory.{name}", group[name], least=1)
-        for name in Settings._fields
-        if name not in real
-    }
-    return Settings(**checked, **counts)
+    group = cfg.memory
+
+    def count(name: str) -> int:
+        return integer(COMMAND_LINE, f"memory.{name}", group[name], least=1)
+
+    return Settings(
+        capacity=count("capacity"),
+        reach=positive_real(COMMAND_LINE, "memory.reach", group.reach),
+        spacing=positive_real(COMMAND_LINE, "memory.spacing", group.spacing),
+        states=count("states"),
+        revisits=count("revisits"),
+        steps=count("steps"),
+    )
 
 
 def remember(problem: ChaseProblem, settings: Settings, states: Tensor, kept: Tensor) -> ExperienceMemory:
@@ -146,9 +151,8 @@ def revisits(
     }
     excess = {}
     for name, start in chosen.items():
-        arguments = _chase_arguments(problem) | {"weights": start.flatten(0, 1)}
-        run_ = chase(pieces.flatten(0, 1), problem.basis, problem.target, problem.law, **arguments)
-        excess[name] = run_.excess.unflatten(0, pieces.shape[:2])
+        again = _chase(problem, pieces.flatten(0, 1), start.flatten(0, 1))
+        excess[name] = again.excess.unflatten(0, pieces.shape[:2])
     return Revisits(excess, found.excess[:, first:].amax(-1))
 
 
@@ -170,8 +174,16 @@ def summary(memory: ExperienceMemory, region: Region, again: Revisits) -> dict[s
     return found
 
 
-def _chase_arguments(problem: ChaseProblem) -> dict[str, object]:
-    return {"inner_steps": problem.inner_steps, "predictor": problem.predictor}
+def _chase(problem: ChaseProblem, states: Tensor, weights: Tensor | None = None) -> ChaseResult:
+    return chase(
+        states,
+        problem.basis,
+        problem.target,
+        problem.law,
+        inner_steps=problem.inner_steps,
+        predictor=problem.predictor,
+        weights=weights,
+    )
 
 
 def _finite(number: Tensor) -> float | None:
@@ -190,7 +202,9 @@ def _write(directory: Path, metrics: dict[str, float | None]) -> None:
     text = (
         markdown_table(region, {"by": "error over the visited balls", "rms": "rms", "max": "max"})
         + "\n"
-        + markdown_table(again, {"by": "start at a revisit", "excess": "excess after a step", "steps": "steps"})
+        + markdown_table(
+            again, {"by": "start at a revisit", "excess": "excess after a step", "steps": "steps"}
+        )
     )
     write_text(directory / "memory.md", text)
     write_text(directory / "memory.csv", csv_table([metrics], list(metrics)))
@@ -198,9 +212,7 @@ def _write(directory: Path, metrics: dict[str, float | None]) -> None:
         _log.info("%s", line)
 
 
-def _draw(
-    directory: Path, path: Tensor, memory: ExperienceMemory, region: Region, again: Revisits
-) -> None:
+def _draw(directory: Path, path: Tensor, memory: ExperienceMemory, region: Region, again: Revisits) -> None:
     # Imported here: matplotlib takes a second, which figures=false need not pay.
     from ..report import plots, plots_memory
 

@@ -57,11 +57,11 @@ class LocalFilter:
         if len(far):  # a cost that only the streams which moved on pay; each is computed alone
             self._follow(state, far, z.index_select(1, far))
             z = torch.where(away, 0.0, z)
-        psi, noise = self.frame.functions(state.anchor, z), self.ratio
+        psi, noise = self.frame.functions(state.anchor, z), torch.full_like(y, self.ratio)
         log_factor = self.frame.log_factor(state.anchor, z)
         if log_factor is not None:
             shrink = (-log_factor).exp()
-            y, noise = y * shrink, self.ratio * shrink.square()
+            y, noise = y * shrink, noise * shrink.square()
         seen = _apply(state.learned, psi).mul_(self.forgetting)  # lambda D psi
         spread = self.frame.variance(state.anchor, z) - _dot(psi, seen) + noise
         fine = fine & (spread > 0)

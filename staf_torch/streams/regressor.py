@@ -44,10 +44,10 @@ _PLAIN = 64  # rounding errors of the covariance: less noise than that would lea
 class StaFRegressor:
     """Online regression on streams whose inputs move: constant memory and constant time a sample.
 
-    y_k = V_k(x_k) + e_k is filtered by a Kalman filter of V's values at M centers around the latest x, V being
-    a Gaussian process with the kernel as covariance. When x moves on, the centers follow: the posterior at the
-    old centers predicts the values at the new ones, and what it cannot say there is uncertain again. The
-    memory is M (M + 1) numbers a stream, whatever its length.
+    y_k = V_k(x_k) + e_k is filtered by a Kalman filter of V's values at M centers around the latest x, V
+    being a Gaussian process with the kernel as covariance. When x moves on, the centers follow: the posterior
+    at the old centers predicts the values at the new ones, and what it cannot say there is uncertain again.
+    The memory is M (M + 1) numbers a stream, whatever its length. No stream influences another.
 
     Example:
         >>> model = StaFRegressor(GaussianKernel(0.8), radius=0.3, count=6)
@@ -66,7 +66,8 @@ class StaFRegressor:
         amplitude: standard deviation of V before any sample, in the units of y. Predictions depend on
             noise / amplitude alone.
         forgetting: in (0, 1]: the share of what was learned that is still believed one sample later.
-        follow: the centers stay until x has moved by follow * radius, not negative.
+        follow: the centers stay until x has moved by follow * radius, not negative: by default until it
+            leaves their ball.
 
     Attributes:
         n_features_in_: n, from the first sample on.
@@ -225,7 +226,10 @@ class StaFRegressor:
         if follow < 0:
             raise fail(_NAME, "follow", "must not be negative", self.follow)
         offsets = radius * directions.to(x.device)
-        frame = LocalFrame.of(_kernel(self.kernel).to(x.device), offsets)
+        kernel = _kernel(self.kernel).to(x.device)
+        if kernel.core(torch.zeros_like(offsets[0]), offsets, offsets).dim() != 2:
+            raise fail(_NAME, "kernel", "must have one value a hyperparameter for all streams", self.kernel)
+        frame = LocalFrame.of(kernel, offsets)
         rows = x.reshape(-1, dim).mT
         self.n_features_in_ = dim
         self.n_streams_ = None if x.dim() == 1 else x.shape[0]
@@ -235,7 +239,9 @@ class StaFRegressor:
         self._state_ = StreamState.at(rows.contiguous(), len(offsets))
 
     def _check_streams(self, call: str, x: Tensor) -> None:
-        expected = (self.n_features_in_,) if self.n_streams_ is None else (self.n_streams_, self.n_features_in_)
+        expected = (
+            (self.n_features_in_,) if self.n_streams_ is None else (self.n_streams_, self.n_features_in_)
+        )
         if tuple(x.shape) != expected:
             raise ValueError(
                 f"`{_NAME}.{call}(x=...)` must have the shape {expected} of the first sample; "
@@ -245,7 +251,7 @@ class StaFRegressor:
 
 def _kernel(stated: Kernel | str) -> Kernel:
     if isinstance(stated, Kernel):
-        return copy.deepcopy(stated).double()
+        return copy.deepcopy(stated).double().requires_grad_(False)
     chosen = choice(_NAME, "kernel", stated, tuple(KERNELS))
     return KERNELS[str(chosen)]()
 

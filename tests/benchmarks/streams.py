@@ -1,12 +1,12 @@
-"""Online regression on streams: `python tests/benchmarks/streams.py [--json FILE] [--streams 32] [--batch 10000]`.
+"""Online regression on streams: `python tests/benchmarks/streams.py [--json FILE] [--streams S] [--batch B]`.
 
 `StaFRegressor` beside a batched exact Gaussian process (GPyTorch), SciPy's RBFInterpolator(neighbors=),
 scikit-learn's KernelRidge and ALD-KRLS (Engel et al.), all on the same streams: a drifting function, the
 paper's V along a trajectory, noisy samples. The error is prequential, root mean square: every sample is
 predicted before it is learned. Each method takes the settings of its list that predict the first samples
 best, and is scored on the rest. A time is the processor's, one thread, the median over the last steps of
-predicting and learning, over streams: each method on as many side by side as its entry says. A peer that is not
-installed is named and skipped: `pip install -e '.[bench]'`. Exit status 1 where a goal is missed.
+predicting and learning, over streams: each method on as many side by side as its entry says. A peer that is
+not installed is named and skipped: `pip install -e '.[bench]'`. Exit status 1 where a goal is missed.
 """
 
 from __future__ import annotations
@@ -166,7 +166,9 @@ def timed(method: Method, settings: dict[str, Any], kind: str) -> tuple[float, f
 
 def case(method: Method, data: Stream, kind: str) -> dict[str, Any]:
     """The method tuned, scored and timed on one kind of stream."""
-    tuned = [(rms(errors(method.make(**s), data, PREFIX)[:, BURN:]), i) for i, s in enumerate(method.settings)]
+    tuned = [
+        (rms(errors(method.make(**s), data, PREFIX)[:, BURN:]), i) for i, s in enumerate(method.settings)
+    ]
     settings = method.settings[min(tuned)[1]]
     score = rms(errors(method.make(**settings), data, STEPS)[:, PREFIX:])
     both, learning = timed(method, settings, kind)
@@ -219,9 +221,14 @@ def met(rows: list[dict[str, Any]]) -> bool:
             continue
         for row in own:
             ratio, excess = peer["us"] / row["us"], row["error"] / peer["error"] - 1
-            print(f"{row['method']} against {peer['method']}: {ratio:.0f} times the speed, error {excess:+.1%}")
+            print(
+                f"{row['method']} against {peer['method']}: {ratio:.0f} times the speed, error {excess:+.1%}"
+            )
         good &= any(peer["us"] / row["us"] >= RATIO and row["error"] <= peer["error"] for row in own)
-    print(f"goals ({RATE:g} a second, {RATIO:g} times the speed at no higher error): {'met' if good else 'missed'}")
+    print(
+        f"goals ({RATE:g} a second, {RATIO:g} times the speed at no higher error): "
+        f"{'met' if good else 'missed'}"
+    )
     return good
 
 
