@@ -125,20 +125,28 @@ class ExperienceMemory(nn.Module):
         return (self._weights(y) > 0).any(-1)
 
     def start(self, x: Tensor) -> Tensor:
-        """Coefficients in ``basis.local(x)`` to start from at the states x: (..., n) -> (..., M).
+        """Coefficients in ``basis.local(x)`` to start from at the states x.
 
         The blend at the centers of x, and where it does not reach one of them the nearest stored model,
-        fitted as if they were values of V. NaN in an entry whose state itself is not covered.
+        fitted as if they were values of V. NaN at a state that is not covered itself.
+
+        Args:
+            x: (..., n), one state a memory, or (..., P, n).
+
+        Returns:
+            (..., M) or (..., P, M).
         """
         trailing("ExperienceMemory.start", "x", x, dims=1, last=self.basis.dim)
-        centers = self.basis.centers(x)
+        if x.dim() == self.stored.dim():
+            return self.start(x.unsqueeze(-2)).squeeze(-2)
+        several = (x.shape[-2], self.basis.count)
+        centers = self.basis.centers(x).flatten(-3, -2)  # (..., P M, n)
+        nearest = self._relative(x).argmin(-1, keepdim=True).repeat_interleave(self.basis.count, dim=-2)
+        single = self._local(centers).gather(-1, nearest).squeeze(-1)
         blend = self.query(centers)
-        nearest = self._relative(x.unsqueeze(-2)).argmin(-1)  # (..., 1)
-        apart = self._local(centers)
-        single = apart.gather(-1, nearest.unsqueeze(-2).expand(*apart.shape[:-1], 1)).squeeze(-1)
-        values = torch.where(torch.isnan(blend), single, blend)
+        values = torch.where(torch.isnan(blend), single, blend).unflatten(-1, several)
         found = self.basis.local(x).fit(values)
-        return torch.where(self.covered(x.unsqueeze(-2)), found, torch.nan)
+        return torch.where(self.covered(x).unsqueeze(-1), found, torch.nan)
 
     def _relative(self, y: Tensor) -> Tensor:
         """t_j, (..., P, n) -> (..., P, N); inf where nothing is stored."""
@@ -169,7 +177,10 @@ class ExperienceMemory(nn.Module):
         closest, nearest = self._relative(x.unsqueeze(-2)).squeeze(-2).min(-1)
         near = closest < (self.spacing / self.reach) ** 2
         free = self.stored.logical_not()
-        elsewhere = torch.where(free.any(-1), free.to(torch.int8).argmax(-1), self._redundant())
+        some = free.any(-1)
+        elsewhere = free.to(torch.int8).argmax(-1)
+        if not bool(some.all()):  # saves work, and decides nothing: rows with room take no part in it
+            elsewhere = torch.where(some, elsewhere, self._redundant())
         return torch.where(near, nearest, elsewhere), ~near | (nearest != self.latest)
 
     def _redundant(self) -> Tensor:

@@ -141,9 +141,7 @@ def revisits(
     at = first + (torch.arange(settings.revisits) * (times - first - steps)) // settings.revisits
     pieces = torch.stack([found.state[:, k : k + steps] for k in at.tolist()], dim=1)  # (B, R, S, n)
     x = pieces[:, :, 0]
-    # One state of every trajectory at a time: a memory serves the rows of its own trajectory.
-    starts = torch.stack([memory.start(point) for point in x.unbind(1)], dim=1)
-    weights = problem.basis.local(x).weights(starts)
+    weights = problem.basis.local(x).weights(memory.start(x))
     chosen = {
         "memory": weights,
         "carried": found.weights[:, -1:].expand(weights.shape),
