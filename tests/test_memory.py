@@ -100,7 +100,10 @@ def test_fresher_model_takes_the_place_of_the_stale_one() -> None:
 
 
 def test_every_row_has_a_memory_of_its_own() -> None:
-    basis, x = basis_of("exponential", radius=0.1), torch.stack((circle(30), 0.5 * circle(30, 0.4), circle(30)))
+    basis, x = (
+        basis_of("exponential", radius=0.1),
+        torch.stack((circle(30), 0.5 * circle(30, 0.4), circle(30))),
+    )
     x[2, 5] = torch.nan
     together = filled(st.ExperienceMemory(basis, 16, (3,)), x)
     y = x[:, ::7] + 0.01
@@ -137,13 +140,13 @@ def test_start_is_the_ideal_fit_of_what_is_remembered() -> None:
 
 def test_bad_arguments_are_named() -> None:
     basis = basis_of("gaussian")
-    with pytest.raises(ValueError, match="basis.*must be a StaFBasis"):
+    with pytest.raises(ValueError, match=r"basis.*must be a StaFBasis"):
         st.ExperienceMemory(None, 3)  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="capacity.*at least 1"):
+    with pytest.raises(ValueError, match=r"capacity.*at least 1"):
         st.ExperienceMemory(basis, 0)
-    with pytest.raises(ValueError, match="reach.*must be positive"):
+    with pytest.raises(ValueError, match=r"reach.*must be positive"):
         st.ExperienceMemory(basis, 3, reach=0.0)
-    with pytest.raises(ValueError, match="spacing.*must be positive"):
+    with pytest.raises(ValueError, match=r"spacing.*must be positive"):
         st.ExperienceMemory(basis, 3, spacing=-1.0)
     memory = st.ExperienceMemory(basis, 3, (2,))
     with pytest.raises(ValueError, match=r"x=.*must have the shape \(2, 2\)"):

@@ -91,7 +91,9 @@ def test_around_one_anchor_the_filter_is_gaussian_process_regression(kernel: str
     psi = frame.functions(x, z) * factor
     rest = frame.variance(x, z) * factor.square() - psi.square().sum(0) + ratio
     covariance = psi.mT @ psi + rest.diag()
-    torch.testing.assert_close(state.mean[:, 0], psi @ torch.linalg.solve(covariance, y), rtol=1e-7, atol=1e-8)
+    torch.testing.assert_close(
+        state.mean[:, 0], psi @ torch.linalg.solve(covariance, y), rtol=1e-7, atol=1e-8
+    )
     expected = psi @ torch.linalg.solve(covariance, psi.mT)
     torch.testing.assert_close(state.learned[..., 0], expected, rtol=1e-7, atol=1e-8)
 
@@ -125,7 +127,9 @@ def test_standard_deviation_says_how_large_the_errors_are() -> None:
 def test_streams_do_not_touch_each_other() -> None:
     x, y = walks(5, 60)
     together = learned(st.StaFRegressor(radius=0.3), x, y).predict(x[-1] + 0.1)
-    alone = [learned(st.StaFRegressor(radius=0.3), x[:, i], y[:, i]).predict(x[-1, i] + 0.1) for i in range(5)]
+    alone = [
+        learned(st.StaFRegressor(radius=0.3), x[:, i], y[:, i]).predict(x[-1, i] + 0.1) for i in range(5)
+    ]
     torch.testing.assert_close(together, torch.stack(alone), rtol=1e-10, atol=1e-10)
 
 

@@ -82,33 +82,47 @@ class LocalFrame(NamedTuple):
             T (M, M, R), and e^f, (R,), None for ones.
         """
         state, h, d = x.mT.double(), step.double(), self.offsets
-        moved, points = state + h.mT, (h + d.unsqueeze(-1)).permute(2, 0, 1)  # (R, n), (R, M, n)
-        log_factor, half = self._factors(state, moved, points)
-        if self.shared is None:
-            left = self._newton(moved).mT
-            left = left if log_factor is None else left * log_factor.exp().unsqueeze(-2)
-            found = (left @ self.kernel.core(state, points, d) @ self._newton(state)).permute(1, 2, 0)
-            return found.to(step), None if half is None else half.exp().to(step)
-        if self.rate is not None and self.pairs is not None:  # k0(h + d_i, d_j) = k0(d_i, d_j) e^{q h'd_j}
-            rows = (self.pairs @ ((self.rate * d) @ h).exp()).unflatten(0, (len(d), -1))
+        half = self._half(state, h.mT)
+        if self.rate is not None and self.shared is not None and self.pairs is not None:
+            exponent = (self.rate * d) @ h  # q h'd, (M, R)
+            rows = (self.pairs @ exponent.exp()).unflatten(0, (len(d), -1))
+            lost = self.rate * h.square().sum(0) / 2
+            rows = rows * (-exponent - lost).exp().unsqueeze(1)
+            found = (self.shared.mT @ rows.flatten(1)).unflatten(-1, rows.shape[1:])
         else:
-            core = self.kernel.core(torch.zeros_like(d[0]), points.transpose(0, 1).flatten(0, 1), d)
-            rows = (core @ self.shared).unflatten(0, (len(d), -1)).transpose(1, 2)
-        if log_factor is not None:
-            rows = rows * log_factor.mT.exp().unsqueeze(1)
-        found = (self.shared.mT @ rows.flatten(1)).unflatten(-1, rows.shape[1:])
-        return found.to(step), None if half is None else half.exp().to(step)
+            found = self._dense(state, h)
+        if half is None:
+            return found.to(step), None
+        # After a jump a kernel that grows with the state has nothing to say: start afresh.
+        near = h.square().sum(0) <= _JUMP**2 * d.square().sum(-1).amax()
+        growth = torch.where(near, half, 0.0).exp()
+        return torch.where(near, found, 0.0).to(step), growth.to(step)
 
-    def _factors(self, state: Tensor, moved: Tensor, points: Tensor) -> tuple[Tensor | None, Tensor | None]:
-        """log m, (R, M), -inf after a jump, and f, (R,); None for zeros."""
-        here, there = self.kernel.log_scale(state, points), self.kernel.log_scale(moved, self.offsets)
-        log_factor = None if here is None or there is None else here - there
-        g, g_moved = self.kernel.log_gain(state), self.kernel.log_gain(moved)
-        if g is None or g_moved is None or log_factor is None:
-            return log_factor, None
-        near = (moved - state).square().sum(-1) <= _JUMP**2 * self.offsets.square().sum(-1).amax()
-        half = torch.where(near, (g_moved - g) / 2, 0.0)
-        return torch.where(near.unsqueeze(-1), log_factor - half.unsqueeze(-1), -torch.inf), half
+    def _dense(self, state: Tensor, h: Tensor) -> Tensor:
+        """T for kernels without an exponent rate: (R, n), (n, R) -> (M, M, R)."""
+        d, moved = self.offsets, state + h.mT
+        points = (h + d.unsqueeze(-1)).permute(2, 0, 1)  # (R, M, n)
+        here, there = self.kernel.log_scale(state, points), self.kernel.log_scale(moved, d)
+        half = self._half(state, h.mT)
+        if self.shared is None:
+            core = self.kernel.core(state, points, d) @ self._newton(state)
+            left = self._newton(moved).mT
+        else:  # all points around one state
+            zero = torch.zeros_like(d[0])
+            core = (self.kernel.core(zero, points.flatten(0, 1), d) @ self.shared).unflatten(
+                0, points.shape[:2]
+            )
+            left = self.shared.mT
+        if here is not None and there is not None:
+            core = core * (here - there).exp().unsqueeze(-1)
+        if half is not None:
+            core = core * (-half).exp()[:, None, None]
+        return (left @ core).permute(1, 2, 0)
+
+    def _half(self, state: Tensor, h: Tensor) -> Tensor | None:
+        """f, (R, n), (R, n) -> (R,); None for zeros."""
+        before, after = self.kernel.log_gain(state), self.kernel.log_gain(state + h)
+        return None if before is None or after is None else (after - before) / 2
 
     def _newton(self, state: Tensor) -> Tensor:
         return _newton(self.kernel.core(state, self.offsets, self.offsets))

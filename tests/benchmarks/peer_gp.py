@@ -66,5 +66,5 @@ def methods(noise: float) -> list[Method]:
             memory=[float("inf"), 1000.0, 200.0],
             noise=[noise, 2 * noise],
         )
-        found.append(Method(f"GPyTorch, exact GP of {window} samples", GP, choices, 1000))
+        found.append(Method(f"GPyTorch, exact GP of {window} samples", GP, choices, 500))
     return found
