@@ -18,10 +18,11 @@ class ExperienceMemory(nn.Module):
     compact, twice continuously differentiable, and nearest first, as the error of a local model grows like a
     power of the distance. Where no support reaches, V^ is NaN: `covered` says where.
 
-    A model within spacing nu(x_j) of a stored state takes its place, being fresher, but for the one stored
-    last: until the state has left that, nothing is stored. Elsewhere, once the memory is full, it takes
-    the place of the most redundant one: of the closest pair of states the one whose second neighbour is
-    closer too, so that no gap opens while another one is twice covered.
+    A model within spacing nu(x_j) of a stored state takes its place, being fresher. The one stored last is so
+    replaced while the state is within half of that of where it was first stored, and then left alone until
+    the state is further away: models do not travel with the state. Elsewhere, once the memory is full, a
+    new model takes the place of the most redundant one: of the closest pair of states the one whose second
+    neighbour is closer too, so that no gap opens while another one is twice covered.
 
     Every batch entry has a memory of its own. To share one among trajectories, leave ``batch_shape``
     empty and add their models one after the other.
@@ -67,7 +68,9 @@ class ExperienceMemory(nn.Module):
         self.register_buffer("coefficients", like.new_zeros(*batch_shape, capacity, basis.count))
         self.register_buffer("stored", torch.zeros(*batch_shape, capacity, dtype=torch.bool))
         self.register_buffer("latest", torch.full(batch_shape, -1))  # the place written last
+        self.register_buffer("origin", like.new_zeros(*batch_shape, basis.dim))  # where it was first stored
         self.latest: Tensor
+        self.origin: Tensor
         self.states: Tensor
         self.coefficients: Tensor
         self.stored: Tensor
@@ -94,15 +97,18 @@ class ExperienceMemory(nn.Module):
                 )
         with torch.no_grad():
             fine = torch.isfinite(x).all(-1) & torch.isfinite(coefficients).all(-1)
-            slot, left = self._slot(torch.where(fine.unsqueeze(-1), x, 0.0).to(self.states))
-            place = nn.functional.one_hot(slot, self.capacity).bool() & (fine & left).unsqueeze(-1)
+            slot, keeps = self._slot(torch.where(fine.unsqueeze(-1), x, 0.0).to(self.states))
+            fine = fine & keeps
+            place = nn.functional.one_hot(slot, self.capacity).bool() & fine.unsqueeze(-1)
             mark = place.unsqueeze(-1)
             self.states.copy_(torch.where(mark, x.to(self.states).unsqueeze(-2), self.states))
             self.coefficients.copy_(
                 torch.where(mark, coefficients.to(self.states).unsqueeze(-2), self.coefficients)
             )
             self.stored.copy_(self.stored | place)
-            self.latest.copy_(torch.where(fine & left, slot, self.latest))
+            another = (fine & (slot != self.latest)).unsqueeze(-1)
+            self.origin.copy_(torch.where(another, x.to(self.states), self.origin))
+            self.latest.copy_(torch.where(fine, slot, self.latest))
         return self
 
     def forward(self, y: Tensor) -> Tensor:
@@ -173,7 +179,7 @@ class ExperienceMemory(nn.Module):
         return torch.where(far, 0.0, values).mT
 
     def _slot(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Where a model at x (..., n) goes, (...) int64, and whether it goes anywhere."""
+        """Where a model at x (..., n) goes, (...) int64, and whether it is kept at all."""
         closest, nearest = self._relative(x.unsqueeze(-2)).squeeze(-2).min(-1)
         near = closest < (self.spacing / self.reach) ** 2
         free = self.stored.logical_not()
@@ -181,7 +187,9 @@ class ExperienceMemory(nn.Module):
         elsewhere = free.to(torch.int8).argmax(-1)
         if not bool(some.all()):  # saves work, and decides nothing: rows with room take no part in it
             elsewhere = torch.where(some, elsewhere, self._redundant())
-        return torch.where(near, nearest, elsewhere), ~near | (nearest != self.latest)
+        limit = self.spacing * self.basis.centers.radius(self.origin) / 2
+        still = (x - self.origin).square().sum(-1) < limit.square()
+        return torch.where(near, nearest, elsewhere), ~near | (nearest != self.latest) | still
 
     def _redundant(self) -> Tensor:
         """Of the closest pair of states the one with the closer second neighbour: (...) int64."""

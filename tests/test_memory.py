@@ -99,6 +99,15 @@ def test_fresher_model_takes_the_place_of_the_stale_one() -> None:
     assert float((memory.query(circle(300)) - V(circle(300))).abs().max()) < 0.01
 
 
+def test_last_model_is_refreshed_while_the_state_stays() -> None:
+    basis, x = basis_of("gaussian", radius=0.1), tensor([1.0, 0.0])
+    memory = st.ExperienceMemory(basis, 5)
+    for share in (0.0, 0.5, 1.0):
+        memory.add(x, share * basis.local(x).fit(basis.values(x, V)))
+    assert int(memory.count) == 1
+    assert abs(float(memory.query(x.unsqueeze(0)) - V(x))) < 1e-3
+
+
 def test_every_row_has_a_memory_of_its_own() -> None:
     basis, x = (
         basis_of("exponential", radius=0.1),
