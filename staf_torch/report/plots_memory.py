@@ -60,6 +60,10 @@ def _map(axes: Axes, picture: MemoryPicture) -> None:
         )
     )
     axes.plot(points[:, 0], points[:, 1], ".", color=_colour(0), markersize=3, label="stored model")
+    axes.plot(
+        [], [], "o", color=_colour(0), markerfacecolor="none", markersize=8, label="ball of its centers"
+    )
+    axes.margins(0.12)
     axes.set_xlabel("$x_1$")
     axes.set_ylabel(f"$x_{second + 1}$")
     axes.set_aspect("equal", adjustable="datalim")
