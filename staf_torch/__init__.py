@@ -30,4 +30,6 @@ from .kernels import Kernel as Kernel
 from .kernels import MaternKernel as MaternKernel
 from .kernels import PolynomialKernel as PolynomialKernel
 from .kernels import RationalQuadraticKernel as RationalQuadraticKernel
+from .memory import ExperienceMemory as ExperienceMemory
 from .module import StaF as StaF
+from .streams import StaFRegressor as StaFRegressor

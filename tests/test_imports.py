@@ -14,6 +14,8 @@ from staf_torch import _checks
 PUBLIC = (
     "StaF",
     "StaFBasis",
+    "StaFRegressor",
+    "ExperienceMemory",
     "ExponentialKernel",
     "GaussianKernel",
     "MaternKernel",

@@ -36,6 +36,7 @@ EXPERIMENTS = (
     "exponential_bound",
     "feasibility",
     "layouts",
+    "memory",
     "adp",
     "adp_comparison",
     "adp_tracking",

@@ -57,13 +57,13 @@ class LocalFilter:
         if len(far):  # a cost that only the streams which moved on pay; each is computed alone
             self._follow(state, far, z.index_select(1, far))
             z = torch.where(away, 0.0, z)
-        found = self.frame.features(state.anchor, z)
-        psi, noise = found.functions, self.ratio
-        if found.log_factor is not None:
-            shrink = (-found.log_factor).exp()
-            y, noise = y * shrink, self.ratio * shrink.square()
+        psi, noise = self.frame.functions(state.anchor, z), torch.full_like(y, self.ratio)
+        log_factor = self.frame.log_factor(state.anchor, z)
+        if log_factor is not None:
+            shrink = (-log_factor).exp()
+            y, noise = y * shrink, noise * shrink.square()
         seen = _apply(state.learned, psi).mul_(self.forgetting)  # lambda D psi
-        spread = found.variance - _dot(psi, seen) + noise
+        spread = self.frame.variance(state.anchor, z) - _dot(psi, seen) + noise
         fine = fine & (spread > 0)
         inverse = torch.where(fine, 1 / spread, 0.0)
         error = torch.where(fine, y - _dot(psi, state.mean), 0.0)
@@ -76,21 +76,26 @@ class LocalFilter:
         state.samples.add_(fine)
         state.skipped.add_(~fine)
 
-    def estimate(self, state: StreamState, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and variance of V at x (n, S), in units of the process: (S,), (S,)."""
-        found = self.frame.features(state.anchor, x - state.anchor)
-        psi = found.functions
-        mean = _dot(psi, state.mean)
-        variance = found.variance - _dot(psi, _apply(state.learned, psi))
-        if found.log_factor is None:
-            return mean, variance
-        factor = found.log_factor.exp()
-        return mean * factor, variance * factor.square()
+    def mean(self, state: StreamState, x: Tensor) -> Tensor:
+        """The expected V at x (n, S), in units of the process: (S,)."""
+        z = x - state.anchor
+        mean = _dot(self.frame.functions(state.anchor, z), state.mean)
+        log_factor = self.frame.log_factor(state.anchor, z)
+        return mean if log_factor is None else mean * log_factor.exp()
+
+    def variance(self, state: StreamState, x: Tensor) -> Tensor:
+        """The variance of V at x (n, S), in units of the process's: (S,)."""
+        z = x - state.anchor
+        psi = self.frame.functions(state.anchor, z)
+        variance = self.frame.variance(state.anchor, z) - _dot(psi, _apply(state.learned, psi))
+        log_factor = self.frame.log_factor(state.anchor, z)
+        return variance if log_factor is None else variance * (2 * log_factor).exp()
 
     def _follow(self, state: StreamState, rows: Tensor, step: Tensor) -> None:
         """Move the frame of the streams ``rows`` by (n, R)."""
         anchor = state.anchor.index_select(1, rows)
-        columns, factor = self.frame.transfer(anchor, step)
+        transfer, factor = self.frame.transfer(anchor, step)
+        columns = transfer.transpose(0, 1)
         mean = _apply(columns, state.mean.index_select(1, rows))
         half = _product(columns, state.learned.index_select(2, rows))  # T D
         state.anchor.index_copy_(1, rows, anchor + step)

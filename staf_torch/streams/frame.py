@@ -13,14 +13,6 @@ from ..linalg import pivoted_cholesky
 _JUMP = 4.0  # radii: beyond, a kernel whose scale grows with the state says nothing about the new one
 
 
-class Features(NamedTuple):
-    """The process at some points: V = e^{s(x, z)} (psi'u + rest), the rest of variance k0(z, z) - psi'psi."""
-
-    functions: Tensor  # psi, (M, S)
-    variance: Tensor  # k0(z, z), (S,)
-    log_factor: Tensor | None  # s(x, z), (S,); None for zeros
-
-
 class LocalFrame(NamedTuple):
     """An orthonormal basis psi(z) = k0(z, d) C of the span of the kernels at the centers x + d.
 
@@ -35,26 +27,44 @@ class LocalFrame(NamedTuple):
     kernel: Kernel
     offsets: Tensor  # d, (M, n)
     shared: Tensor | None  # C, (M, M), for a state-free kernel
+    rate: Tensor | None  # q, where k0(z, d) = exp(q z'd)
+    pairs: Tensor | None  # with it, k0(d_i, d_j) C_jl in row (i, l), column j: (M M, M)
 
     @classmethod
     def of(cls, kernel: Kernel, offsets: Tensor) -> LocalFrame:
         """The frame of centers at the offsets (M, n), float64."""
         zero = offsets.new_zeros(offsets.shape[-1])
-        shared = _newton(kernel.core(zero, offsets, offsets)) if kernel.state_free else None
-        return cls(kernel, offsets, shared)
+        if not kernel.state_free:
+            return cls(kernel, offsets, None, None, None)
+        gram = kernel.core(zero, offsets, offsets)
+        shared, rate = _newton(gram), kernel.exponent_rate()
+        pairs = None if rate is None else (gram.unsqueeze(1) * shared.mT).flatten(0, 1)
+        return cls(kernel, offsets, shared, rate, pairs)
 
-    def features(self, x: Tensor, z: Tensor) -> Features:
-        """psi at x + z: (n, S), (n, S) -> `Features`, in the dtype of z."""
-        state, at = x.mT.double(), z.mT.double()
-        if self.shared is not None:  # all streams are points around one state
-            core = self.kernel.core(torch.zeros_like(self.offsets[0]), at, self.offsets)
-            functions = self.shared.mT @ core.mT
-        else:
-            core = self.kernel.core(state, at.unsqueeze(-2), self.offsets)
-            functions = (core @ self._newton(state)).squeeze(-2).mT
-        scale = self.kernel.log_scale(state, at.unsqueeze(-2))
-        log_factor = None if scale is None else scale.squeeze(-1).to(z)
-        return Features(functions.to(z), self._variance(state, at).to(z), log_factor)
+    def functions(self, x: Tensor, z: Tensor) -> Tensor:
+        """psi at x + z: (n, S), (n, S) -> (M, S), in the dtype of z."""
+        wide = z.double()
+        if self.shared is None:
+            state = x.mT.double()
+            core = self.kernel.core(state, wide.mT.unsqueeze(-2), self.offsets)
+            return (core @ self._newton(state)).squeeze(-2).mT.to(z)
+        if self.rate is not None:
+            return (self.shared.mT @ ((self.rate * self.offsets) @ wide).exp()).to(z)
+        # All streams are points around one state.
+        core = self.kernel.core(torch.zeros_like(self.offsets[0]), wide.mT, self.offsets)
+        return (self.shared.mT @ core.mT).to(z)
+
+    def variance(self, x: Tensor, z: Tensor) -> Tensor:
+        """k0(z, z), of which psi'psi is what the centers explain: (n, S), (n, S) -> (S,)."""
+        if self.rate is not None:
+            return (z.square().sum(0) * self.rate).exp().to(z)
+        point = z.mT.double().unsqueeze(-2)
+        return self.kernel.core(x.mT.double(), point, point).flatten().to(z)
+
+    def log_factor(self, x: Tensor, z: Tensor) -> Tensor | None:
+        """s(x, z): (n, S), (n, S) -> (S,), None for zeros."""
+        scale = self.kernel.log_scale(x.mT, z.mT.unsqueeze(-2))
+        return None if scale is None else scale.squeeze(-1)
 
     def transfer(self, x: Tensor, step: Tensor) -> tuple[Tensor, Tensor | None]:
         """What becomes of u when the state x moves by h: u' = e^f T u; T alone for what was known of it.
@@ -69,46 +79,53 @@ class LocalFrame(NamedTuple):
             step: h, (n, R).
 
         Returns:
-            T' (M, M, R), the columns of T first, and e^f, (R,), None for ones.
+            T (M, M, R), and e^f, (R,), None for ones.
         """
-        state, h, d = x.mT.double(), step.mT.double(), self.offsets
-        moved, points = state + h, h + d.unsqueeze(1)  # (R, n), (M, R, n)
-        if self.shared is not None:
-            core = self.kernel.core(torch.zeros_like(d[0]), points.flatten(0, 1), d)
-            rows = (self.shared.mT @ core.mT).unflatten(-1, points.shape[:2])
+        state, h, d = x.mT.double(), step.double(), self.offsets
+        half = self._half(state, h.mT)
+        if self.rate is not None and self.shared is not None and self.pairs is not None:
+            exponent = (self.rate * d) @ h  # q h'd, (M, R)
+            rows = (self.pairs @ exponent.exp()).unflatten(0, (len(d), -1))
+            lost = self.rate * h.square().sum(0) / 2
+            rows = rows * (-exponent - lost).exp().unsqueeze(1)
+            found = (self.shared.mT @ rows.flatten(1)).unflatten(-1, rows.shape[1:])
         else:
-            at = self.kernel.core(state, points.transpose(0, 1), d) @ self._newton(state)
-            rows = at.permute(2, 1, 0)
-        log_factor, half = self._factors(state, moved, points.transpose(0, 1))
-        if log_factor is not None:
-            rows = rows * log_factor.mT.exp()
-        if self.shared is not None:
-            columns = self.shared.mT @ rows
-        else:
-            columns = (rows.permute(2, 0, 1) @ self._newton(moved)).permute(1, 2, 0)
-        return columns.to(step), None if half is None else half.exp().to(step)
+            found = self._dense(state, h)
+        if half is None:
+            return found.to(step), None
+        # After a jump a kernel that grows with the state has nothing to say: start afresh.
+        near = h.square().sum(0) <= _JUMP**2 * d.square().sum(-1).amax()
+        growth = torch.where(near, half, 0.0).exp()
+        return torch.where(near, found, 0.0).to(step), growth.to(step)
 
-    def _factors(self, state: Tensor, moved: Tensor, points: Tensor) -> tuple[Tensor | None, Tensor | None]:
-        """log m, (R, M), -inf after a jump, and f, (R,); None for zeros."""
-        here, there = self.kernel.log_scale(state, points), self.kernel.log_scale(moved, self.offsets)
-        log_factor = None if here is None or there is None else here - there
-        g, g_moved = self.kernel.log_gain(state), self.kernel.log_gain(moved)
-        if g is None or g_moved is None or log_factor is None:
-            return log_factor, None
-        near = (moved - state).square().sum(-1) <= _JUMP**2 * self.offsets.square().sum(-1).amax()
-        half = torch.where(near, (g_moved - g) / 2, 0.0)
-        return torch.where(near.unsqueeze(-1), log_factor - half.unsqueeze(-1), -torch.inf), half
+    def _dense(self, state: Tensor, h: Tensor) -> Tensor:
+        """T for kernels without an exponent rate: (R, n), (n, R) -> (M, M, R)."""
+        d, moved = self.offsets, state + h.mT
+        points = (h + d.unsqueeze(-1)).permute(2, 0, 1)  # (R, M, n)
+        here, there = self.kernel.log_scale(state, points), self.kernel.log_scale(moved, d)
+        half = self._half(state, h.mT)
+        if self.shared is None:
+            core = self.kernel.core(state, points, d) @ self._newton(state)
+            left = self._newton(moved).mT
+        else:  # all points around one state
+            zero = torch.zeros_like(d[0])
+            core = (self.kernel.core(zero, points.flatten(0, 1), d) @ self.shared).unflatten(
+                0, points.shape[:2]
+            )
+            left = self.shared.mT
+        if here is not None and there is not None:
+            core = core * (here - there).exp().unsqueeze(-1)
+        if half is not None:
+            core = core * (-half).exp()[:, None, None]
+        return (left @ core).permute(1, 2, 0)
+
+    def _half(self, state: Tensor, h: Tensor) -> Tensor | None:
+        """f, (R, n), (R, n) -> (R,); None for zeros."""
+        before, after = self.kernel.log_gain(state), self.kernel.log_gain(state + h)
+        return None if before is None or after is None else (after - before) / 2
 
     def _newton(self, state: Tensor) -> Tensor:
         return _newton(self.kernel.core(state, self.offsets, self.offsets))
-
-    def _variance(self, state: Tensor, z: Tensor) -> Tensor:
-        """k0(z, z): (S, n), (S, n) -> (S,)."""
-        rate = self.kernel.exponent_rate()
-        if rate is not None:
-            return (z.square().sum(-1) * rate).exp()
-        point = z.unsqueeze(-2)
-        return self.kernel.core(state, point, point).flatten()
 
 
 def _newton(gram: Tensor) -> Tensor:

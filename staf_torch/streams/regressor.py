@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import inspect
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -43,10 +44,10 @@ _PLAIN = 64  # rounding errors of the covariance: less noise than that would lea
 class StaFRegressor:
     """Online regression on streams whose inputs move: constant memory and constant time a sample.
 
-    y_k = V_k(x_k) + e_k is filtered by a Kalman filter of V's values at M centers around the latest x, V being
-    a Gaussian process with the kernel as covariance. When x moves on, the centers follow: the posterior at the
-    old centers predicts the values at the new ones, and what it cannot say there is uncertain again. The
-    memory is M (M + 1) numbers a stream, whatever its length.
+    y_k = V_k(x_k) + e_k is filtered by a Kalman filter of V's values at M centers around the latest x, V
+    being a Gaussian process with the kernel as covariance. When x moves on, the centers follow: the posterior
+    at the old centers predicts the values at the new ones, and what it cannot say there is uncertain again.
+    The memory is M (M + 1) numbers a stream, whatever its length. No stream influences another.
 
     Example:
         >>> model = StaFRegressor(GaussianKernel(0.8), radius=0.3, count=6)
@@ -65,7 +66,8 @@ class StaFRegressor:
         amplitude: standard deviation of V before any sample, in the units of y. Predictions depend on
             noise / amplitude alone.
         forgetting: in (0, 1]: the share of what was learned that is still believed one sample later.
-        follow: the centers stay until x has moved by follow * radius, not negative.
+        follow: the centers stay until x has moved by follow * radius, not negative: by default until it
+            leaves their ball.
 
     Attributes:
         n_features_in_: n, from the first sample on.
@@ -87,7 +89,7 @@ class StaFRegressor:
         noise: float = 1e-2,
         amplitude: float = 1.0,
         forgetting: float = 0.999,
-        follow: float = 0.5,
+        follow: float = 1.0,
     ) -> None:
         self.kernel = kernel
         self.radius = radius
@@ -177,16 +179,17 @@ class StaFRegressor:
         own = 1 if self.n_streams_ is None else 2
         several = points.dim() == own + 1
         self._check_streams("predict", points.select(-2, 0) if several else points)
-        like = self._state_.anchor
-        at = points.to(like).reshape(like.shape[1], -1, like.shape[0])
-        means, variances = zip(
-            *(self._filter_.estimate(self._state_, at[:, p].mT) for p in range(at.shape[1])), strict=True
-        )
-        mean = torch.stack(means, dim=-1).reshape(points.shape[:-1]) * float(self.amplitude_)
+        mean = self._at(points, self._filter_.mean) * self.amplitude_
         if not return_std:
             return _like(x, mean)
-        std = torch.stack(variances, dim=-1).reshape(points.shape[:-1]).sqrt() * float(self.amplitude_)
-        return _like(x, mean), _like(x, std)
+        return _like(x, mean), _like(x, self._at(points, self._filter_.variance).sqrt() * self.amplitude_)
+
+    def _at(self, points: Tensor, function: Callable[[StreamState, Tensor], Tensor]) -> Tensor:
+        """A function of one point a stream, at (..., n) points: (...)."""
+        like = self._state_.anchor
+        at = points.to(like).reshape(like.shape[1], -1, like.shape[0]).unbind(1)
+        found = [function(self._state_, point.mT.contiguous()) for point in at]
+        return torch.stack(found, dim=-1).reshape(points.shape[:-1])
 
     @property
     def n_samples_seen_(self) -> Tensor:
@@ -223,7 +226,10 @@ class StaFRegressor:
         if follow < 0:
             raise fail(_NAME, "follow", "must not be negative", self.follow)
         offsets = radius * directions.to(x.device)
-        frame = LocalFrame.of(_kernel(self.kernel).to(x.device), offsets)
+        kernel = _kernel(self.kernel).to(x.device)
+        if kernel.core(torch.zeros_like(offsets[0]), offsets, offsets).dim() != 2:
+            raise fail(_NAME, "kernel", "must have one value a hyperparameter for all streams", self.kernel)
+        frame = LocalFrame.of(kernel, offsets)
         rows = x.reshape(-1, dim).mT
         self.n_features_in_ = dim
         self.n_streams_ = None if x.dim() == 1 else x.shape[0]
@@ -233,7 +239,9 @@ class StaFRegressor:
         self._state_ = StreamState.at(rows.contiguous(), len(offsets))
 
     def _check_streams(self, call: str, x: Tensor) -> None:
-        expected = (self.n_features_in_,) if self.n_streams_ is None else (self.n_streams_, self.n_features_in_)
+        expected = (
+            (self.n_features_in_,) if self.n_streams_ is None else (self.n_streams_, self.n_features_in_)
+        )
         if tuple(x.shape) != expected:
             raise ValueError(
                 f"`{_NAME}.{call}(x=...)` must have the shape {expected} of the first sample; "
@@ -243,7 +251,7 @@ class StaFRegressor:
 
 def _kernel(stated: Kernel | str) -> Kernel:
     if isinstance(stated, Kernel):
-        return copy.deepcopy(stated).double()
+        return copy.deepcopy(stated).double().requires_grad_(False)
     chosen = choice(_NAME, "kernel", stated, tuple(KERNELS))
     return KERNELS[str(chosen)]()
 

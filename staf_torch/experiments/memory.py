@@ -1,0 +1,229 @@
+"""Memory beyond the ball: the error over the visited region, and the start at a revisit, with and without."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from omegaconf import DictConfig
+from torch import Tensor
+
+from .._checks import COMMAND_LINE, fail, flag, integer, positive_real
+from ..centers import probe_points
+from ..chase import ChaseResult, chase
+from ..memory import ExperienceMemory
+from ..report import write_metrics, write_text
+from ..report.tables import Cell, csv_table, markdown_table
+from ..systems import trajectory
+from .build import ChaseProblem, chase_problem
+from .progress import Progress
+
+_log = logging.getLogger(__name__)
+_PROBES = 13  # points of the ball around each state
+APPROXIMANTS = {"memory": "memory", "passing": "chase, in passing", "last": "last local model"}
+STARTS = {"memory": "memory", "carried": "carried weights", "zero": "zero"}
+
+
+class Settings(NamedTuple):
+    """The group `memory`, checked."""
+
+    capacity: int
+    reach: float
+    spacing: float
+    states: int
+    revisits: int
+    steps: int
+
+
+class Region(NamedTuple):
+    """Errors over the region that the settled chase visited."""
+
+    time: Tensor  # (K,) s
+    errors: dict[str, Tensor]  # approximant -> |V - V^|, (B, K, P); NaN where the memory does not reach
+
+
+class Revisits(NamedTuple):
+    """The chase after the state has come back."""
+
+    excess: dict[str, Tensor]  # start -> after each step, (B, R, S)
+    settled: Tensor  # the largest excess of the settled chase, (B,)
+
+
+def run(cfg: DictConfig, directory: Path) -> dict[str, float | None]:
+    """Run what the settings describe and fill the run directory; `metrics.json` comes last."""
+    problem, settings = chase_problem(cfg), settings_of(cfg)
+    figures = flag(COMMAND_LINE, "figures", cfg.figures)
+    first = round(problem.settle_time / problem.dt)
+    if not 0 <= first < problem.steps:
+        raise fail(COMMAND_LINE, "settle_time", "must lie within the duration", problem.settle_time)
+    states = torch.cat(
+        list(trajectory(problem.system, problem.initial_states, dt=problem.dt, steps=problem.steps)), dim=1
+    )
+    found = _chase(problem, states)
+    coefficients = problem.basis.local(states).coefficients(found.weights)
+    memory = remember(problem, settings, states[:, first:], coefficients[:, first:])
+    index = first + (torch.arange(settings.states) * (problem.steps - first)) // settings.states
+    region = errors(problem, memory, states, coefficients, index.unique())
+    again = revisits(problem, settings, memory, found, first)
+    metrics = summary(memory, region, again)
+    _write(directory, metrics)
+    if figures:
+        _draw(directory, states[0, first:], memory, region, again)
+    write_metrics(directory / "metrics.json", metrics)
+    return metrics
+
+
+def settings_of(cfg: DictConfig) -> Settings:
+    """The group `memory`.
+
+    Raises:
+        ValueError: if a setting breaks its rule; the message names it.
+    """
+    group = cfg.memory
+
+    def count(name: str) -> int:
+        return integer(COMMAND_LINE, f"memory.{name}", group[name], least=1)
+
+    return Settings(
+        capacity=count("capacity"),
+        reach=positive_real(COMMAND_LINE, "memory.reach", group.reach),
+        spacing=positive_real(COMMAND_LINE, "memory.spacing", group.spacing),
+        states=count("states"),
+        revisits=count("revisits"),
+        steps=count("steps"),
+    )
+
+
+def remember(problem: ChaseProblem, settings: Settings, states: Tensor, kept: Tensor) -> ExperienceMemory:
+    """A memory a trajectory, fed with the models (B, T, M) at the states (B, T, n) as they come."""
+    memory = ExperienceMemory(
+        problem.basis,
+        settings.capacity,
+        (len(states),),
+        reach=settings.reach,
+        spacing=settings.spacing,
+    ).to(states)
+    progress = Progress(states.shape[1], "times")
+    for x, model in zip(states.unbind(1), kept.unbind(1), strict=True):
+        memory.add(x, model)
+        progress.advance(1)
+    progress.close()
+    return memory
+
+
+def errors(
+    problem: ChaseProblem, memory: ExperienceMemory, states: Tensor, models: Tensor, index: Tensor
+) -> Region:
+    """What the memory, the model of that time and the last model leave over the balls at some times."""
+    x = states[:, index]
+    radius = problem.basis.centers.radius(x)[..., None, None].to(x)
+    z = radius * probe_points(_PROBES, x.shape[-1]).to(x)
+    y = x.unsqueeze(-2) + z  # (B, K, P, n)
+    truth, local = problem.target(y), problem.basis.local
+    flat = y.flatten(1, 2)
+    last = local(states[:, -1]).evaluate(flat - states[:, -1:], models[:, -1])
+    estimates = {
+        "memory": memory.query(flat).unflatten(1, y.shape[1:3]),
+        "passing": local(x).evaluate(z.expand(y.shape), models[:, index]),
+        "last": last.unflatten(1, y.shape[1:3]),
+    }
+    return Region(index.to(x) * problem.dt, {k: (v - truth).abs() for k, v in estimates.items()})
+
+
+def revisits(
+    problem: ChaseProblem, settings: Settings, memory: ExperienceMemory, found: ChaseResult, first: int
+) -> Revisits:
+    """The state returns to earlier ones: a chase from the memory's weights, from the last ones, from none."""
+    times = found.state.shape[1]
+    steps = min(settings.steps, times - first)
+    at = first + (torch.arange(settings.revisits) * (times - first - steps)) // settings.revisits
+    pieces = torch.stack([found.state[:, k : k + steps] for k in at.tolist()], dim=1)  # (B, R, S, n)
+    x = pieces[:, :, 0]
+    weights = problem.basis.local(x).weights(memory.start(x))
+    chosen = {
+        "memory": weights,
+        "carried": found.weights[:, -1:].expand(weights.shape),
+        "zero": torch.zeros_like(weights),
+    }
+    excess = {}
+    for name, start in chosen.items():
+        again = _chase(problem, pieces.flatten(0, 1), start.flatten(0, 1))
+        excess[name] = again.excess.unflatten(0, pieces.shape[:2])
+    return Revisits(excess, found.excess[:, first:].amax(-1))
+
+
+def summary(memory: ExperienceMemory, region: Region, again: Revisits) -> dict[str, float | None]:
+    """The worst over trajectories."""
+    found: dict[str, float | None] = {"models": float(memory.count.max())}
+    found["covered_fraction"] = float((~region.errors["memory"].isnan()).double().mean())
+    for name, error in region.errors.items():
+        covered = ~error.isnan()
+        total = torch.where(covered, error.square(), 0.0).sum((1, 2)) / covered.sum((1, 2))
+        found[f"{name}_rms_error"] = _finite(total.sqrt().max())
+        found[f"{name}_max_error"] = _finite(torch.where(covered, error, 0.0).max())
+    found["settled_excess"] = _finite(again.settled.max())
+    for name, excess in again.excess.items():
+        found[f"revisit_excess_{name}"] = _finite(excess[..., 0].max())
+        done = excess <= again.settled[:, None, None]
+        taken = torch.where(done.any(-1), done.to(torch.int8).argmax(-1) + 1.0, torch.nan).max()
+        found[f"revisit_steps_{name}"] = _finite(taken)
+    return found
+
+
+def _chase(problem: ChaseProblem, states: Tensor, weights: Tensor | None = None) -> ChaseResult:
+    return chase(
+        states,
+        problem.basis,
+        problem.target,
+        problem.law,
+        inner_steps=problem.inner_steps,
+        predictor=problem.predictor,
+        weights=weights,
+    )
+
+
+def _finite(number: Tensor) -> float | None:
+    return float(number) if bool(torch.isfinite(number)) else None
+
+
+def _write(directory: Path, metrics: dict[str, float | None]) -> None:
+    region: list[dict[str, Cell]] = [
+        {"by": label, "rms": metrics[f"{key}_rms_error"], "max": metrics[f"{key}_max_error"]}
+        for key, label in APPROXIMANTS.items()
+    ]
+    again: list[dict[str, Cell]] = [
+        {"by": label, "excess": metrics[f"revisit_excess_{key}"], "steps": metrics[f"revisit_steps_{key}"]}
+        for key, label in STARTS.items()
+    ]
+    text = (
+        markdown_table(region, {"by": "error over the visited balls", "rms": "rms", "max": "max"})
+        + "\n"
+        + markdown_table(
+            again, {"by": "start at a revisit", "excess": "excess after a step", "steps": "steps"}
+        )
+    )
+    write_text(directory / "memory.md", text)
+    write_text(directory / "memory.csv", csv_table([metrics], list(metrics)))
+    for line in text.splitlines():
+        _log.info("%s", line)
+
+
+def _draw(directory: Path, path: Tensor, memory: ExperienceMemory, region: Region, again: Revisits) -> None:
+    # Imported here: matplotlib takes a second, which figures=false need not pay.
+    from ..report import plots, plots_memory
+
+    folder = directory / "figures"
+    folder.mkdir(exist_ok=True)
+    stored = memory.states[0][memory.stored[0]]
+    picture = plots_memory.MemoryPicture(
+        path=path.cpu().numpy(),
+        stored=stored.cpu().numpy(),
+        radius=memory.basis.centers.radius(stored).expand(len(stored)).cpu().numpy(),
+        time=region.time.cpu().numpy(),
+        errors={APPROXIMANTS[k]: v[0].amax(-1).cpu().numpy() for k, v in region.errors.items()},
+        excess={STARTS[k]: v[0].amax(0).cpu().numpy() for k, v in again.excess.items()},
+        settled=float(again.settled[0]),
+    )
+    plots.save(plots_memory.draw_memory(picture), folder / "memory")
