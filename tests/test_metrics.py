@@ -11,8 +11,7 @@ import torch
 from helpers import KERNELS, basis_of, over, tensor, uniform
 
 import staf_torch as st
-from staf_torch import ball_floor
-from staf_torch import systems
+from staf_torch import ball_floor, systems
 from staf_torch.chase import ChaseResult, chase_pieces
 from staf_torch.diagnostics import sup_error
 from staf_torch.linalg import condition_number
