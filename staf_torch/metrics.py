@@ -9,10 +9,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from .ball_floor import BallFloor
 from .basis import StaFBasis, Target
 from .chase import ChaseResult
 from .linalg import condition_number
-from .local_errors import BallFloor, ball_error, gradient_error
+from .local_errors import PROBES, ball_error, gradient_error
 from .optim import UpdateLaw
 
 
@@ -72,7 +73,6 @@ class ChaseMetrics:
         members: Sequence[Member] | None = None,
     ) -> None:
         self._basis, self._target, self._law = basis, target, law
-        self._floor = BallFloor(basis, target)
         self._inner_steps = inner_steps
         self._whole = Member(0, dt, settle_time)
         self._members = members
@@ -85,6 +85,7 @@ class ChaseMetrics:
         self._violations: Tensor | None = None  # (B,) int64
         self._uncertified: Tensor | None = None  # (B,) int64, of the certificate
         self._diverged = torch.zeros(0, dtype=torch.bool)
+        self._floor = BallFloor(basis, target, PROBES)
 
     def add(self, result: ChaseResult) -> None:
         """Take in the next piece of time."""

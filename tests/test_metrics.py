@@ -11,11 +11,11 @@ import torch
 from helpers import KERNELS, basis_of, over, tensor, uniform
 
 import staf_torch as st
-from staf_torch import local_errors, systems
+from staf_torch import ball_floor, systems
 from staf_torch.chase import ChaseResult, chase_pieces
 from staf_torch.diagnostics import sup_error
 from staf_torch.linalg import condition_number
-from staf_torch.local_errors import ball_error, ball_floor_error, gradient_error
+from staf_torch.local_errors import ball_error, gradient_error
 from staf_torch.metrics import ChaseMetrics
 from staf_torch.optim import SteepestDescent
 from staf_torch.targets import Paper
@@ -168,14 +168,15 @@ def test_ball_error_is_close_to_a_dense_supremum(radius: object, dim: int) -> No
 
 @pytest.mark.parametrize("radius", [0.1, st.StateRadius(0.2, 0.1)])
 @over(KERNELS)
-def test_ball_floor_error_is_that_of_the_local_basis_in_pieces_of_any_size(
+def test_ball_floor_is_that_of_the_local_basis_in_pieces_of_any_size(
     name: str, radius: object, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     basis, x = basis_of(name, 6, radius), uniform(4, 9, 2)
     expected = sup_error(basis, x, Paper(), 97)
-    torch.testing.assert_close(ball_floor_error(basis, Paper(), x), expected, rtol=1e-9, atol=1e-12)
-    monkeypatch.setattr(local_errors, "_BLOCK", 1)
-    torch.testing.assert_close(ball_floor_error(basis, Paper(), x), expected, rtol=1e-9, atol=1e-12)
+    floor = ball_floor.BallFloor(basis, Paper(), 97)
+    torch.testing.assert_close(floor(x), expected, rtol=1e-9, atol=1e-12)
+    monkeypatch.setattr(ball_floor, "_BLOCK", 1)
+    torch.testing.assert_close(floor(x), expected, rtol=1e-9, atol=1e-12)
 
 
 @over(KERNELS)

@@ -1,0 +1,66 @@
+"""The error that the ideal weights leave on the ball, along trajectories."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from .basis import StaFBasis, Target
+from .centers import probe_points
+from .local import scale
+
+_BLOCK = 2**18  # numbers in a temporary, so that it stays in cache
+
+
+class BallFloor:
+    """max over the closed ball of radius nu(x) of |V - V^| with the ideal weights, in the local basis.
+
+    The best that kernel, radius and layout allow, without the rounding of large weights. Called with
+    consecutive pieces of the same rows; what they share is set up once.
+
+    Args:
+        basis: of V^.
+        target: V.
+        points: of the ball over which the maximum is taken, at least 2.
+    """
+
+    def __init__(self, basis: StaFBasis, target: Target, points: int) -> None:
+        self._basis, self._target, self._points = basis, target, points
+        self._begun = False
+        self._shared: Tensor | None = None
+
+    def __call__(self, x: Tensor) -> Tensor:
+        """At the states (..., T, n): (..., T)."""
+        basis, probes = self._basis, probe_points(self._points, self._basis.dim).to(x)
+        if not self._begun:
+            self._begun, self._shared = True, _shared_functions(basis, x, probes)
+        row = self._points * (
+            1 if self._shared is not None else basis.count
+        )  # numbers in a temporary of `_floor`
+        times = max(1, _BLOCK // (row * max(1, x.numel() // x.shape[-1] // x.shape[-2])))
+        blocks = x.split(times, dim=-2)
+        return torch.cat([_floor(basis, self._target, probes, self._shared, some) for some in blocks], dim=-1)
+
+
+def _shared_functions(basis: StaFBasis, x: Tensor, probes: Tensor) -> Tensor | None:
+    """psi at the probes of the ball where radius and core do not depend on the state, else None: (M, P), or
+    (..., M, P) where each row has its own. One product then evaluates all states of a row."""
+    origin = torch.zeros_like(x[..., :1, :]).expand(*x.shape[:-2], 2, -1)
+    offsets, core = basis.centers.offsets(origin), basis.gram_structure(origin).core
+    if any(part.dim() > 2 and part.shape[-3] > 1 for part in (offsets, core)):
+        return None
+    origin = origin[..., :1, :] if offsets.dim() > 2 or core.dim() > 2 else origin.new_zeros(1, basis.dim)
+    space, z = basis.local(origin), basis.centers.radius(origin)[..., None, None] * probes
+    ones = torch.eye(basis.count, dtype=x.dtype, device=x.device)
+    gain = scale(basis.kernel, origin, z)
+    found = [space.evaluate(z, one.expand(*origin.shape[:-1], -1)) / gain for one in ones]
+    return torch.stack(found, dim=-2).squeeze(-3)
+
+
+def _floor(basis: StaFBasis, target: Target, probes: Tensor, shared: Tensor | None, x: Tensor) -> Tensor:
+    z = basis.centers.radius(x)[..., None, None] * probes
+    space = basis.local(x)
+    fitted = space.fit(basis.values(x, target))
+    estimate = space.evaluate(z, fitted) if shared is None else fitted @ shared * scale(basis.kernel, x, z)
+    worst: Tensor = (target(x.unsqueeze(-2) + z) - estimate).abs().amax(-1)
+    return worst
