@@ -52,8 +52,8 @@ struct Tile {
     INLINE int size() const { return rows * times; }
 };
 
-template <typename T> INLINE T *at(const Array &array, int64_t row, int64_t time, int64_t entry) {
-    return static_cast<T *>(const_cast<void *>(array.data)) + row * array.row + time * array.time + entry * array.entry;
+template <typename T> INLINE const T *at(const Array &array, int64_t row, int64_t time, int64_t entry) {
+    return static_cast<const T *>(array.data) + row * array.row + time * array.time + entry * array.entry;
 }
 
 template <typename T, int M> struct Prepared {
@@ -94,9 +94,7 @@ template <typename T, int M> struct Prepared {
     }
     __attribute__((noinline)) void run(const Tile &tile) {
         const int size = tile.size();
-        if (p.states.data) {
-            for (int k = 0; k < p.dim; ++k) copy(p.states, k, tile, x + k * room);
-        }
+        for (int k = 0; k < p.dim && (p.exponential || p.evaluate); ++k) copy(p.states, k, tile, x + k * room);
         if (p.evaluate) p.evaluate(size, room, M, x, p.offsets, p.parameters, value);
         for (int i = 0; i < M && !p.evaluate; ++i) copy(p.values, i, tile, value + i * room);
         if (p.exponential) exponential(size, tile.rows);
