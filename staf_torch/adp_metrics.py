@@ -46,7 +46,7 @@ def adp_metrics(
         "final_state_norm": _worst(norm[kept]),
         "control_error": _worst_known(control_error, kept),
         "value_error": _worst_known(value_error, kept),
-        "regulated_fraction": float((kept & (norm < _REGULATED)).double().mean()),
+        "regulated_fraction": float(regulated(result).double().mean()),
         "diverged_fraction": float(result.diverged.double().mean()),
     }
     if optimal_cost is not None:
@@ -80,6 +80,12 @@ def _worst(values: Tensor) -> float | None:
     return float(values.max()) if values.numel() else None
 
 
+def regulated(result: LoopResult) -> Tensor:
+    """|x| < 1e-3 at the end and not diverged: (B,) bool."""
+    near: Tensor = result.state[:, -1].norm(dim=-1) < _REGULATED
+    return near & ~result.diverged
+
+
 def comparison_row(result: LoopResult, ratio: Tensor) -> dict[str, float | None]:
     """A method over many initial states, as a row of a table.
 
@@ -91,14 +97,14 @@ def comparison_row(result: LoopResult, ratio: Tensor) -> dict[str, float | None]
         ``ratio_median`` over the rows that were regulated, as are ``ratio_mean`` and ``ratio_max``; the
         fractions ``regulated`` and ``diverged`` of all; ``final_state_norm``, the median |x| at the end.
     """
-    regulated = ~result.diverged & (result.state[:, -1].norm(dim=-1) < _REGULATED)
-    kept = ratio[regulated & ~ratio.isnan()]
+    good = regulated(result)
+    kept = ratio[good & ~ratio.isnan()]
     final = result.state[:, -1].norm(dim=-1)
     return {
         "ratio_median": _median(kept),
         "ratio_mean": float(kept.mean()) if len(kept) else None,
         "ratio_max": _worst(kept),
-        "regulated": float(regulated.double().mean()),
+        "regulated": float(good.double().mean()),
         "diverged": float(result.diverged.double().mean()),
         "final_state_norm": _median(final),
     }

@@ -37,6 +37,7 @@ EXPERIMENTS = (
     "layouts",
     "adp",
     "adp_comparison",
+    "adp_initial_weights",
     "adp_tracking",
 )
 """Modules of this package with a function ``run(cfg, directory)``, by the name in ``task``."""
