@@ -110,16 +110,19 @@ def comparison_row(result: LoopResult, ratio: Tensor) -> dict[str, float | None]
     }
 
 
-def tracking_metrics(result: LoopResult, parameters: Tensor | None, truth: Tensor) -> dict[str, float | None]:
+def tracking_metrics(
+    result: LoopResult, parameters: Tensor | None, truth: Tensor, optimal_cost: Tensor | None
+) -> dict[str, float | None]:
     """The metrics of a tracking run, over the trajectories that did not diverge.
 
     Args:
         result: the closed loop in the state (e, xd).
         parameters: theta^, (B, T, p, n); None where nothing is identified.
         truth: theta, (p, n).
+        optimal_cost: V*(x(0)) of the known plant, (B,); NaN where it was not found.
 
     Returns:
-        ``cost``, the median; ``final_error``, the largest |e| of the last tenth of the time;
+        ``cost``, the median; ``cost_ratio``, the median of cost / V*(x(0)); ``final_error``, the largest |e| of the last tenth of the time;
         ``parameter_error``, the largest |theta^ - theta| at the end; ``diverged_fraction``.
     """
     kept = ~result.diverged
@@ -128,8 +131,13 @@ def tracking_metrics(result: LoopResult, parameters: Tensor | None, truth: Tenso
     off = None
     if parameters is not None:
         off = _worst((parameters[kept, -1] - truth.to(parameters)).flatten(-2).norm(dim=-1))
+    ratio = None
+    if optimal_cost is not None:
+        ratios = (result.cost / optimal_cost.to(result.cost))[kept]
+        ratio = _median(ratios[~ratios.isnan()])
     return {
         "cost": _median(result.cost[kept]),
+        "cost_ratio": ratio,
         "final_error": _worst(error),
         "parameter_error": off,
         "diverged_fraction": float(result.diverged.double().mean()),
