@@ -122,8 +122,9 @@ def tracking_metrics(
         optimal_cost: V*(x(0)) of the known plant, (B,); NaN where it was not found.
 
     Returns:
-        ``cost``, the median; ``cost_ratio``, the median of cost / V*(x(0)); ``final_error``, the largest |e| of the last tenth of the time;
-        ``parameter_error``, the largest |theta^ - theta| at the end; ``diverged_fraction``.
+        ``cost``, the median; ``cost_ratio``, the median of cost / V*(x(0)); ``final_error``, the largest |e|
+        of the last tenth of the time; ``parameter_error``, the largest |theta^ - theta| at the end;
+        ``diverged_fraction``.
     """
     kept = ~result.diverged
     tail = max(1, result.state.shape[1] // 10)

@@ -58,7 +58,7 @@ def test_gradient_and_control_solve_the_hjb_equation(
     plant: systems.ControlAffineSystem, cost: adp.Cost
 ) -> None:
     x = 0.2 * torch.randn(5, plant.dim, dtype=torch.float64, generator=torch.Generator().manual_seed(4))
-    best = adp.DirectShooting(plant, cost).solve(x)
+    best = adp.DirectShooting(plant, cost, intervals=100).solve(x)
     assert best.converged.all()
     g = plant.effectiveness(x)
     rate = plant.drift(x) + (g @ best.control.unsqueeze(-1)).squeeze(-1)

@@ -15,7 +15,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from torch import Tensor
 
 from ..adp import ActorCritic, Feedback, LoopResult, RolloutPolicy, Supervised
-from ..adp_metrics import comparison_row
+from ..adp_metrics import comparison_row, regulated
 from ..report import write_metrics, write_text
 from .adp import solve
 from .build_adp import AdpProblem, adp_problem
@@ -118,7 +118,8 @@ def _optimum(problem: AdpProblem) -> Tensor:
 def _row(problem: AdpProblem, result: LoopResult, best: Tensor) -> tuple[dict[str, Any], Tensor]:
     ratio = torch.where(result.diverged, torch.inf, result.cost / best)
     functions, points = _size(problem.controller)
-    return {"functions": functions, "points": points} | comparison_row(result, ratio), ratio
+    row = {"functions": functions, "points": points} | comparison_row(result, ratio)
+    return row, torch.where(regulated(result), ratio, torch.inf)
 
 
 def _size(controller: object) -> tuple[int, int]:

@@ -128,6 +128,12 @@ def _parameters(result: LoopResult) -> Tensor | None:
     return result.identifier[..., :_PARAMETERS].reshape(*result.identifier.shape[:2], 3, 2)
 
 
+def _errors(result: LoopResult) -> Tensor:
+    """|e|, (B, T); NaN from where a row diverged on."""
+    time = result.time.to(result.frozen_at)
+    return torch.where(time > result.frozen_at.unsqueeze(-1), torch.nan, result.state[..., :2].norm(dim=-1))
+
+
 def _write_history(path: Path, result: LoopResult) -> None:
     batch, times = result.state.shape[:2]
     parameters = _parameters(result)
@@ -152,7 +158,7 @@ def _draw(results: dict[str, LoopResult], theta: Tensor, folder: Path) -> None:
     history = plots_tracking.TrackingHistory(
         time=results["identified"].time.numpy(),
         state=first(results["identified"].state),
-        errors={name: first(result.state[..., :2].norm(dim=-1)) for name, result in results.items()},
+        errors={name: first(_errors(result)) for name, result in results.items()},
         parameters=first(parameters.flatten(-2)),
         truth=theta.flatten().cpu().numpy(),
         critic_weights=first(results["identified"].critic_weights),
