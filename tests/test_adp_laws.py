@@ -268,6 +268,19 @@ def test_global_basis_needs_points_in_a_fixed_box() -> None:
     assert shares[1] < 0.9
 
 
+def test_partial_gradient_is_the_same_law_from_twice_the_weights() -> None:
+    x0 = uniform(20, 1.0, seed=5)
+    costs = []
+    for mode, scale in (("total", 1.0), ("partial", 2.0)):
+        controller = adp.ActorCritic(
+            staf_basis(mode), PLANT, COST, adp.RandomPoints(1, BOX), critic=0.4 * scale, actor=0.28 * scale
+        )
+        run = adp.simulate(controller, PLANT, COST, x0, dt=0.005, steps=1000, every=1000)
+        assert not run.diverged.any()
+        costs.append(run.cost)
+    assert float(costs[1].median()) < 1.3 * float(costs[0].median())
+
+
 def test_flat_rbf_basis_has_neither_value_nor_gradient_at_the_origin() -> None:
     at = torch.zeros(1, 2, dtype=torch.float64)
     for flat in (True, False):

@@ -169,7 +169,9 @@ def rollout_policy(cfg: DictConfig, system: ControlAffineSystem, cost: Cost, lqr
     """Rollouts of the LQR at centers in a ball around the state."""
     assert system.dim is not None
     directions = _rollout_directions(cfg.centers, system.dim)
-    basis = StaFBasis(ExponentialKernel(), StateFollowingCenters(directions, cfg.radius))
+    shrink = cfg.shrink
+    radius = cfg.radius if shrink.offset is None else StateRadius(cfg.radius, shrink.offset, gain=shrink.gain)
+    basis = StaFBasis(ExponentialKernel(), StateFollowingCenters(directions, radius))
     return RolloutPolicy(
         basis, system, cost, lqr, lqr.value, horizon=cfg.horizon, steps=cfg.steps, depth=cfg.depth
     )
