@@ -105,7 +105,7 @@ def _value_error(axes: Axes, history: AdpHistory) -> None:
 def _logarithmic(axes: Axes, time: np.ndarray, values: np.ndarray, name: str) -> None:
     known = np.isfinite(values)  # an optimum found by shooting is known at some of the times alone
     marker = "" if known.sum() > _MARKED else "."
-    axes.semilogy(time[known], _positive(values[known]), color=_colour(0), marker=marker)
+    axes.semilogy(time[known], _positive(values[known]), color=_colour(0), marker=marker, markersize=3)
     axes.set_ylabel(name)
 
 

@@ -2,8 +2,8 @@
 
     python tests/benchmarks/adp_claims.py [--json FILE]
 
-The suite tests the same on shorter runs and fewer rows; `staf experiment=adp_three_state`, `adp_comparison` and
-`adp_initial_weights` measure the rest. Takes some minutes. Not collected by pytest.
+The suite tests the same on shorter runs and fewer rows; the experiments adp_three_state, adp_comparison and
+adp_initial_weights measure the rest. Takes some minutes. Not collected by pytest.
 """
 
 from __future__ import annotations
