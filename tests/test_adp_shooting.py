@@ -58,7 +58,7 @@ def test_gradient_and_control_solve_the_hjb_equation(
     plant: systems.ControlAffineSystem, cost: adp.Cost
 ) -> None:
     x = 0.2 * torch.randn(5, plant.dim, dtype=torch.float64, generator=torch.Generator().manual_seed(4))
-    best = adp.DirectShooting(plant, cost, intervals=100).solve(x)
+    best = adp.DirectShooting(plant, cost).solve(x)
     assert best.converged.all()
     g = plant.effectiveness(x)
     rate = plant.drift(x) + (g @ best.control.unsqueeze(-1)).squeeze(-1)
@@ -87,6 +87,14 @@ def test_tracking_has_an_optimum_with_a_base_and_a_terminal_value_of_its_own() -
 class HalfBroken(systems.TwoState):
     def drift(self, x: Tensor) -> Tensor:
         return torch.where(x[..., :1] > 1.0, torch.nan, super().drift(x))
+
+
+def test_row_that_fails_on_the_coarse_mesh_starts_again_on_the_fine_one() -> None:
+    x = uniform(6, 2.0)
+    best = adp.DirectShooting(PLANT, COST, intervals=40, iterations=10).solve(x)
+    assert torch.isinf(best.mesh_error).all()  # nothing to compare with
+    assert best.converged.all()
+    assert (best.value / PLANT.optimal_value(x, COST.q, COST.r) - 1).abs().max() < 1e-4
 
 
 def test_rows_are_alone_and_a_row_without_optimum_is_reported() -> None:
