@@ -46,7 +46,7 @@ def adp_metrics(
         "final_state_norm": _worst(norm[kept]),
         "control_error": _worst_known(control_error, kept),
         "value_error": _worst_known(value_error, kept),
-        "regulated_fraction": float((kept & (norm < _REGULATED)).double().mean()),
+        "regulated_fraction": float(regulated(result).double().mean()),
         "diverged_fraction": float(result.diverged.double().mean()),
     }
     if optimal_cost is not None:
@@ -80,6 +80,12 @@ def _worst(values: Tensor) -> float | None:
     return float(values.max()) if values.numel() else None
 
 
+def regulated(result: LoopResult) -> Tensor:
+    """|x| < 1e-3 at the end and not diverged: (B,) bool."""
+    near: Tensor = result.state[:, -1].norm(dim=-1) < _REGULATED
+    return near & ~result.diverged
+
+
 def comparison_row(result: LoopResult, ratio: Tensor) -> dict[str, float | None]:
     """A method over many initial states, as a row of a table.
 
@@ -91,30 +97,34 @@ def comparison_row(result: LoopResult, ratio: Tensor) -> dict[str, float | None]
         ``ratio_median`` over the rows that were regulated, as are ``ratio_mean`` and ``ratio_max``; the
         fractions ``regulated`` and ``diverged`` of all; ``final_state_norm``, the median |x| at the end.
     """
-    regulated = ~result.diverged & (result.state[:, -1].norm(dim=-1) < _REGULATED)
-    kept = ratio[regulated & ~ratio.isnan()]
+    good = regulated(result)
+    kept = ratio[good & ~ratio.isnan()]
     final = result.state[:, -1].norm(dim=-1)
     return {
         "ratio_median": _median(kept),
         "ratio_mean": float(kept.mean()) if len(kept) else None,
         "ratio_max": _worst(kept),
-        "regulated": float(regulated.double().mean()),
+        "regulated": float(good.double().mean()),
         "diverged": float(result.diverged.double().mean()),
         "final_state_norm": _median(final),
     }
 
 
-def tracking_metrics(result: LoopResult, parameters: Tensor | None, truth: Tensor) -> dict[str, float | None]:
+def tracking_metrics(
+    result: LoopResult, parameters: Tensor | None, truth: Tensor, optimal_cost: Tensor | None
+) -> dict[str, float | None]:
     """The metrics of a tracking run, over the trajectories that did not diverge.
 
     Args:
         result: the closed loop in the state (e, xd).
         parameters: theta^, (B, T, p, n); None where nothing is identified.
         truth: theta, (p, n).
+        optimal_cost: V*(x(0)) of the known plant, (B,); NaN where it was not found.
 
     Returns:
-        ``cost``, the median; ``final_error``, the largest |e| of the last tenth of the time;
-        ``parameter_error``, the largest |theta^ - theta| at the end; ``diverged_fraction``.
+        ``cost``, the median; ``cost_ratio``, the median of cost / V*(x(0)); ``final_error``, the largest |e|
+        of the last tenth of the time; ``parameter_error``, the largest |theta^ - theta| at the end;
+        ``diverged_fraction``.
     """
     kept = ~result.diverged
     tail = max(1, result.state.shape[1] // 10)
@@ -122,8 +132,13 @@ def tracking_metrics(result: LoopResult, parameters: Tensor | None, truth: Tenso
     off = None
     if parameters is not None:
         off = _worst((parameters[kept, -1] - truth.to(parameters)).flatten(-2).norm(dim=-1))
+    ratio = None
+    if optimal_cost is not None:
+        ratios = (result.cost / optimal_cost.to(result.cost))[kept]
+        ratio = _median(ratios[~ratios.isnan()])
     return {
         "cost": _median(result.cost[kept]),
+        "cost_ratio": ratio,
         "final_error": _worst(error),
         "parameter_error": off,
         "diverged_fraction": float(result.diverged.double().mean()),

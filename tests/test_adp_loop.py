@@ -63,6 +63,26 @@ def test_row_of_a_plant_that_returns_nan_freezes_and_the_others_do_not_notice() 
     assert torch.isnan(run.control[1, frozen:]).all()
 
 
+class BrokenStrip(systems.TwoState):
+    """Returns NaN in a strip that the state from (-1, 1) runs into."""
+
+    def drift(self, x: Tensor) -> Tensor:
+        return torch.where((x[..., :1] + 0.5).abs() < 0.3, torch.nan, super().drift(x))
+
+
+def test_weights_of_a_row_whose_plant_returns_nan_freeze_with_it() -> None:
+    x0 = torch.tensor([[0.1, 0.1], [-1.0, 1.0]], dtype=torch.float64)
+    controller = learner(adp.Information(), adp.RandomPoints(1, 1e-3))
+    run = adp.simulate(controller, BrokenStrip(), COST, x0, dt=0.01, steps=60)
+    alone = adp.simulate(controller, PLANT, COST, x0[:1], dt=0.01, steps=60)
+    assert run.diverged.tolist() == [False, True]
+    torch.testing.assert_close(run.critic_weights[0], alone.critic_weights[0], rtol=1e-12, atol=0)
+    frozen = round(float(run.frozen_at[1]) / 0.01)
+    assert 0 < frozen < 60
+    assert torch.isfinite(run.critic_weights).all()
+    assert torch.equal(run.critic_weights[1, frozen], run.critic_weights[1, -1])
+
+
 def test_state_that_leaves_the_limit_counts_as_diverged() -> None:
     idle = adp.Feedback(lambda x: torch.zeros_like(x[..., :1]))
     plant = systems.Linear([[1.0, 0.0], [0.0, 2.0]], [[1.0], [1.0]])
@@ -176,10 +196,11 @@ def test_what_cannot_be_compiled_runs_uncompiled_with_one_line(
 def test_compiled_step_is_the_same_loop() -> None:
     x0 = uniform(3, 1.0)
     settings = {"dt": 0.01, "steps": 20}
-    plain = adp.simulate(adp.Feedback(LQR), PLANT, COST, x0, **settings)
-    fast = adp.simulate(adp.Feedback(LQR), PLANT, COST, x0, compile=True, **settings)
-    torch.testing.assert_close(fast.state, plain.state, rtol=1e-12, atol=1e-14)
-    torch.testing.assert_close(fast.cost, plain.cost, rtol=1e-12, atol=1e-14)
+    controller = learner(adp.Information())
+    plain = adp.simulate(controller, PLANT, COST, x0, **settings)
+    fast = adp.simulate(controller, PLANT, COST, x0, compile=True, **settings)
+    for name in ("state", "cost", "critic_weights", "actor_weights"):
+        torch.testing.assert_close(getattr(fast, name), getattr(plain, name), rtol=1e-10, atol=1e-12)
 
 
 class WrongShape(systems.TwoState):

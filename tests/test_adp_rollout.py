@@ -12,6 +12,7 @@ from staf_torch import (
     Kernel,
     StaFBasis,
     StateFollowingCenters,
+    StateRadius,
     adp,
     ball,
     cross_polytope,
@@ -77,12 +78,14 @@ def test_two_state_is_regulated_at_almost_the_optimal_cost() -> None:
 def test_three_state_beats_the_lqr_and_the_published_cost() -> None:
     plant, cost = systems.ThreeState(), adp.QuadraticCost(10.0, 1.0, 3, 2)
     x0 = torch.tensor([[-0.5, 0.5, -0.25]], dtype=torch.float64)
-    policy = rollout(plant, directions=ball(10, 3), radius=0.05, cost=cost, horizon=1.0, steps=10)
+    # The radius shrinks: the plant has no derivative at 0, and a constant ball around the state would hold 0.
+    radius = StateRadius(0.1, 1e-5)
+    policy = rollout(plant, directions=ball(10, 3), radius=radius, cost=cost, horizon=1.0, steps=10)
     run = adp.simulate(adp.Feedback(policy), plant, cost, x0, dt=0.02, steps=400, every=400)
     lqr = adp.simulate(adp.Feedback(adp.LQR(plant, cost)), plant, cost, x0, dt=0.005, steps=2000, every=2000)
     assert float(lqr.cost) == pytest.approx(2.786, abs=2e-3)
-    assert float(run.cost) <= 2.72
-    assert run.state[0, -1].norm() < 0.02
+    assert 2.7047 <= float(run.cost) <= 2.7055  # the optimum is 2.70471
+    assert run.state[0, -1].norm() < 1e-3
 
 
 @torch.no_grad()

@@ -9,17 +9,21 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from .._checks import integer
+from .._checks import choice, integer
 from ..centers import ConstantRadius, Radius
 
 
 class Extrapolation(nn.Module, abc.ABC):
     """N points y_i = x + b(x) z_i of the box [-b, b]^n around the state, with weights that sum to 1.
 
+    Around the ``origin`` they are y_i = b z_i, wherever the state is. That is what a global basis needs: its
+    weights hold everywhere, and points around the state alone let it forget the rest, so that it stalls.
+
     Args:
         half_width: b(x), a positive number or a `Radius`, in the units of the state.
         centers: ``moving`` (each point carries its own centers, the published laws) or ``fixed`` (the
             centers of the state serve all points).
+        around: ``state`` or ``origin``; the latter needs a constant b.
 
     Attributes:
         count: N.
@@ -31,13 +35,17 @@ class Extrapolation(nn.Module, abc.ABC):
     draws: int = 0
     weights: Tensor
 
-    def __init__(self, half_width: float | Radius, centers: str = "moving") -> None:
+    def __init__(self, half_width: float | Radius, centers: str = "moving", *, around: str = "state") -> None:
         super().__init__()
         name = type(self).__name__
+        choice(name, "around", around, ("state", "origin"))
         if centers not in ("moving", "fixed"):
             raise ValueError(f"`{name}(centers=...)` must be 'moving' or 'fixed'; got {centers!r}.")
         self.half_width = half_width if isinstance(half_width, Radius) else ConstantRadius(half_width)
         self.moving = centers == "moving"
+        self.fixed_box = around == "origin"
+        if self.fixed_box and not self.half_width.constant:
+            raise ValueError(f"`{name}(half_width=...)` must be constant for a box around the origin.")
 
     @abc.abstractmethod
     def cube(self, uniform: Tensor) -> Tensor:
@@ -46,7 +54,8 @@ class Extrapolation(nn.Module, abc.ABC):
     def forward(self, x: Tensor, uniform: Tensor) -> Tensor:
         """y_i: (..., n), (..., draws, n) -> (..., N, n)."""
         width: Tensor = self.half_width(x)
-        return x.unsqueeze(-2) + width[..., None, None] * self.cube(uniform).to(x)
+        middle = torch.zeros_like(x) if self.fixed_box else x
+        return middle.unsqueeze(-2) + width[..., None, None] * self.cube(uniform).to(x)
 
 
 class RandomPoints(Extrapolation):
@@ -56,13 +65,16 @@ class RandomPoints(Extrapolation):
         count: N, at least 1.
         half_width: as in `Extrapolation`.
         centers: as in `Extrapolation`.
+        around: as in `Extrapolation`.
 
     Raises:
         ValueError: if an argument breaks its rule.
     """
 
-    def __init__(self, count: int, half_width: float | Radius, centers: str = "moving") -> None:
-        super().__init__(half_width, centers)
+    def __init__(
+        self, count: int, half_width: float | Radius, centers: str = "moving", *, around: str = "state"
+    ) -> None:
+        super().__init__(half_width, centers, around=around)
         self.count = self.draws = integer("RandomPoints", "count", count, least=1)
         self.register_buffer("weights", torch.full((count,), 1 / count, dtype=torch.float64))
 
@@ -78,13 +90,22 @@ class QuadraturePoints(Extrapolation):
         dim: n.
         half_width: as in `Extrapolation`.
         centers: as in `Extrapolation`.
+        around: as in `Extrapolation`.
 
     Raises:
         ValueError: if an argument breaks its rule.
     """
 
-    def __init__(self, order: int, dim: int, half_width: float | Radius, centers: str = "moving") -> None:
-        super().__init__(half_width, centers)
+    def __init__(
+        self,
+        order: int,
+        dim: int,
+        half_width: float | Radius,
+        centers: str = "moving",
+        *,
+        around: str = "state",
+    ) -> None:
+        super().__init__(half_width, centers, around=around)
         integer("QuadraturePoints", "order", order, least=1)
         integer("QuadraturePoints", "dim", dim, least=1)
         nodes, masses = np.polynomial.legendre.leggauss(order)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import dataclasses
 import io
 import logging
 import time
@@ -16,20 +15,24 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from torch import Tensor
 
 from ..adp import ActorCritic, Feedback, LoopResult, RolloutPolicy, Supervised
-from ..adp_metrics import comparison_row
+from ..adp_metrics import comparison_row, regulated
 from ..report import write_metrics, write_text
 from .adp import solve
 from .build_adp import AdpProblem, adp_problem
 from .optimum import optimal_cost
 
 _log = logging.getLogger(__name__)
+_FIXED = {"extrapolated_around": "origin", "half_width": {"radius": 1.0, "offset": None}, "trust": None}
 _ROWS: dict[str, dict[str, Any]] = {
     "StaF, as published, 1 ms": {"law": "published", "integrator": "euler", "trust": None},
     "StaF, information form": {"trust": None},
     "StaF, information, quadrature": {"trust": None, "extrapolation": "quadrature"},
     "StaF, information, supervised": {},
-    "global quadratic, same laws": {"basis": "quadratic", "trust": None},
-    "RBF grid, same laws": {"basis": "rbf_grid", "trust": None},
+    "StaF, points in a fixed box": _FIXED,
+    "global quadratic, points around x": {"basis": "quadratic", "trust": None},
+    "global quadratic, fixed box": {"basis": "quadratic"} | _FIXED,
+    "RBF grid, points around x": {"basis": "rbf_grid", "trust": None},
+    "RBF grid, fixed box": {"basis": "rbf_grid"} | _FIXED,
     "StaF, no learning": {"policy": "none", "trust": None},
     "LQR": {"policy": "lqr"},
     "rollout policy": {"policy": "rollout"},
@@ -65,7 +68,7 @@ def run(cfg: DictConfig, directory: Path) -> dict[str, float | None]:
         ratios[name] = ratio
         shown = ("ratio_median", "ratio_max", "regulated")
         numbers = ["-" if row[key] is None else f"{row[key]:.4g}" for key in shown]
-        _log.info("%-30s J/J* median %s, max %s, regulated %s", name, *numbers)
+        _log.info("%-34s J/J* median %s, max %s, regulated %s", name, *numbers)
     _write_table(directory, rows)
     if cfg.figures:
         _draw(ratios, directory / "figures")
@@ -82,20 +85,24 @@ def run(cfg: DictConfig, directory: Path) -> dict[str, float | None]:
 def methods(cfg: DictConfig) -> Iterator[tuple[str, AdpProblem]]:
     """Name and closed loop of every row of the table."""
     for name, changes in _ROWS.items():
-        variant = cfg.copy()
-        with open_dict(variant):
-            variant.adp = OmegaConf.merge(cfg.adp, changes)
-            if changes.get("law") == "published":
-                variant.dt = min(cfg.dt, _PUBLISHED_STEP)  # its own step: Euler fails sooner at a longer one
-        if variant.adp.record_every is None:
-            variant.adp.record_every = round(cfg.duration / variant.dt)  # the ends are enough for the table
+        yield name, variant(cfg, changes)
+
+
+def variant(cfg: DictConfig, changes: dict[str, Any]) -> AdpProblem:
+    """The closed loop of the settings with other ones under `adp`, recorded at its ends."""
+    changed = cfg.copy()
+    with open_dict(changed):
+        changed.adp = OmegaConf.merge(cfg.adp, changes)
+        if changes.get("law") == "published":
+            changed.dt = min(cfg.dt, _PUBLISHED_STEP)  # its own step: Euler fails sooner at a longer one
+        if changed.adp.record_every is None:
+            changed.adp.record_every = round(cfg.duration / changed.dt)  # the ends are enough for a table
         if changes.get("policy") == "rollout":
-            variant.adp.record_every = 1
-        with open_dict(variant):
-            variant.trajectories = cfg.trajectories + 1
-        problem = adp_problem(variant)
-        # The first state is the middle of the box, the equilibrium: nothing can be compared there.
-        yield name, dataclasses.replace(problem, initial_states=problem.initial_states[1:])
+            changed.adp.record_every = 1
+        changed.trajectories = cfg.trajectories + 1
+    problem = adp_problem(changed)
+    # The first state is the middle of the box, the equilibrium: nothing can be compared there.
+    return problem.with_states(problem.initial_states[1:])
 
 
 def _optimum(problem: AdpProblem) -> Tensor:
@@ -111,7 +118,8 @@ def _optimum(problem: AdpProblem) -> Tensor:
 def _row(problem: AdpProblem, result: LoopResult, best: Tensor) -> tuple[dict[str, Any], Tensor]:
     ratio = torch.where(result.diverged, torch.inf, result.cost / best)
     functions, points = _size(problem.controller)
-    return {"functions": functions, "points": points} | comparison_row(result, ratio), ratio
+    row = {"functions": functions, "points": points} | comparison_row(result, ratio)
+    return row, torch.where(regulated(result), ratio, torch.inf)
 
 
 def _size(controller: object) -> tuple[int, int]:

@@ -39,6 +39,7 @@ EXPERIMENTS = (
     "memory",
     "adp",
     "adp_comparison",
+    "adp_initial_weights",
     "adp_tracking",
 )
 """Modules of this package with a function ``run(cfg, directory)``, by the name in ``task``."""

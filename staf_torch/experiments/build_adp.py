@@ -71,6 +71,10 @@ class AdpProblem:
     compile: bool | str
     optimum: OptimumSettings
 
+    def with_states(self, states: Tensor) -> AdpProblem:
+        """The same from other initial states (B, n)."""
+        return dataclasses.replace(self, initial_states=states)
+
 
 def adp_problem(cfg: DictConfig) -> AdpProblem:
     """The closed loop that the settings describe.
@@ -165,7 +169,9 @@ def rollout_policy(cfg: DictConfig, system: ControlAffineSystem, cost: Cost, lqr
     """Rollouts of the LQR at centers in a ball around the state."""
     assert system.dim is not None
     directions = _rollout_directions(cfg.centers, system.dim)
-    basis = StaFBasis(ExponentialKernel(), StateFollowingCenters(directions, cfg.radius))
+    shrink = cfg.shrink
+    radius = cfg.radius if shrink.offset is None else StateRadius(cfg.radius, shrink.offset, gain=shrink.gain)
+    basis = StaFBasis(ExponentialKernel(), StateFollowingCenters(directions, radius))
     return RolloutPolicy(
         basis, system, cost, lqr, lqr.value, horizon=cfg.horizon, steps=cfg.steps, depth=cfg.depth
     )
@@ -188,7 +194,7 @@ def value_basis(cfg: DictConfig, system: ControlAffineSystem) -> ValueBasis:
         return QuadraticBasis(system.dim)
     if cfg.adp.basis == "rbf_grid":
         grid = cfg.adp.rbf_grid
-        return RBFGridBasis(system.dim, grid.points, grid.half_width, grid.width)
+        return RBFGridBasis(system.dim, grid.points, grid.half_width, grid.width, flat=grid.flat)
     return staf_value_basis(cfg, system.dim)
 
 
@@ -208,9 +214,11 @@ def extrapolation(cfg: DictConfig, system: ControlAffineSystem) -> Extrapolation
         else StateRadius(width.radius, width.offset, width.gain)
     )
     if cfg.extrapolation == "random":
-        return RandomPoints(cfg.points, box, cfg.extrapolated_centers)
+        return RandomPoints(cfg.points, box, cfg.extrapolated_centers, around=cfg.extrapolated_around)
     assert system.dim is not None
-    return QuadraturePoints(cfg.order, system.dim, box, cfg.extrapolated_centers)
+    return QuadraturePoints(
+        cfg.order, system.dim, box, cfg.extrapolated_centers, around=cfg.extrapolated_around
+    )
 
 
 def actor_critic_law(cfg: DictConfig) -> ActorCriticLaw:

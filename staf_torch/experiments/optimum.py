@@ -77,7 +77,9 @@ def optima(problem: AdpProblem, x: Tensor) -> Optima | None:
     lost = int((~found.converged).sum())
     if lost:
         _log.warning("direct shooting found no optimum from %d of %d states", lost, len(found.value))
-    mesh, horizon = (float(error.nan_to_num().max()) for error in (found.mesh_error, found.horizon_error))
+    mesh, horizon = (
+        float(error.nan_to_num(posinf=torch.inf).max()) for error in (found.mesh_error, found.horizon_error)
+    )
     _log.info(
         "V* by direct shooting from %d states, %d intervals over %.3g s: mesh error <= %.1e, horizon <= %.1e",
         *(len(found.value), shooting.intervals, shooting.horizon, mesh, horizon),

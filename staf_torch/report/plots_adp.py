@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 
 from .plots import _colour, _dash, _legend, _positive
 
+_MARKED = 200  # times at most that are drawn with a marker each
 _LEAST_EXCESS, _MOST_EXCESS = 1e-4, 1e2  # of the cost over the optimum, in the comparison
 
 
@@ -60,7 +61,19 @@ def _lines(axes: Axes, time: np.ndarray, values: np.ndarray, name: str, label: s
     for i in range(count):
         axes.plot(time, values[:, i], _dash(i), color=_colour(i), label=label % (i + 1))
     axes.set_ylabel(name)
-    _legend(axes, min(count, 5))
+    if count <= 5:
+        _legend(axes, count)
+    else:  # two short rows, beside the letter of the panel and not over it
+        columns = -(-count // 2)
+        axes.legend(
+            loc="lower right",
+            bbox_to_anchor=(1.0, 1.0),
+            ncols=columns,
+            borderaxespad=0.2,
+            handlelength=1.3,
+            columnspacing=0.8,
+            handletextpad=0.4,
+        )
 
 
 def _states(axes: Axes, history: AdpHistory) -> None:
@@ -90,7 +103,9 @@ def _value_error(axes: Axes, history: AdpHistory) -> None:
 
 
 def _logarithmic(axes: Axes, time: np.ndarray, values: np.ndarray, name: str) -> None:
-    axes.semilogy(time, _positive(values), color=_colour(0))
+    known = np.isfinite(values)  # an optimum found by shooting is known at some of the times alone
+    marker = "" if known.sum() > _MARKED else "."
+    axes.semilogy(time[known], _positive(values[known]), color=_colour(0), marker=marker, markersize=3)
     axes.set_ylabel(name)
 
 
@@ -104,10 +119,10 @@ def _cost(axes: Axes, history: AdpHistory) -> None:
 
 
 def draw_comparison(ratios: dict[str, np.ndarray]) -> Figure:
-    """The share of initial states whose cost is at most a multiple of the optimum, one curve a method.
+    """The share of initial states regulated at most at a multiple of the optimal cost, one curve a method.
 
     Args:
-        ratios: method to cost / optimal cost, (B,); inf for trajectories that diverged.
+        ratios: method to cost / optimal cost, (B,); inf for trajectories that were not regulated.
     """
     style = importlib.resources.files(__package__) / "staf.mplstyle"
     with importlib.resources.as_file(style) as path, matplotlib.rc_context(fname=path):
@@ -123,7 +138,7 @@ def draw_comparison(ratios: dict[str, np.ndarray]) -> Figure:
         axes.set_xlim(_LEAST_EXCESS, _MOST_EXCESS)
         axes.set_ylim(0, 1.02)
         axes.set_xlabel("excess cost $J/J^* - 1$")
-        axes.set_ylabel("share of initial states")
+        axes.set_ylabel("share of initial states regulated")
         axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
         figure.draw_without_rendering()
         return figure

@@ -18,7 +18,7 @@ class TrackingHistory(NamedTuple):
 
     time: np.ndarray  # (T,) seconds
     state: np.ndarray  # (T, 4) of the identified run: e and xd
-    errors: dict[str, np.ndarray]  # variant -> |e|, (T,)
+    errors: dict[str, np.ndarray]  # variant -> |e|, (T,); NaN once it diverged
     parameters: np.ndarray  # (T, 6) theta^ row by row
     truth: np.ndarray  # (6,) theta
     critic_weights: np.ndarray  # (T, M)

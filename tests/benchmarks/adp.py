@@ -1,16 +1,24 @@
 """Closed-loop speed: the information laws on the two-state plant, 10 s at 1 ms.
 
-    python tests/benchmarks/adp.py [rows ...]   # and by jit(vmap(scan)) where JAX is installed
+    python tests/benchmarks/adp.py [rows ...] [--json FILE]
 
-Prints seconds after warm-up, the median of some runs, torch and JAX in turn. Not collected by pytest.
+Prints a table: seconds after warm-up, the median of some runs, torch and JAX's jit(vmap(scan)) in turn. A
+peer that is not installed is named and left out. Exits with 1 where a goal is missed. Not collected by
+pytest.
 """
 
 from __future__ import annotations
 
+import argparse
+import json
+import os
+import platform
 import statistics
 import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -25,7 +33,9 @@ from staf_torch import (
     systems,
 )
 
-STEPS, DT, RUNS = 10_000, 1e-3, 3
+STEPS, DT, RUNS = 10_000, 1e-3, 5
+GOALS = {1: 2.0, 1000: 10.0}  # s, of staf_torch
+NO_SLOWER = 1000  # rows at which JAX must not be faster
 
 
 def torch_run(batch: int) -> Callable[[], float]:
@@ -98,21 +108,65 @@ def jax_run(batch: int) -> Callable[[], float] | None:
     return lambda: float(jnp.median(fast(keys).block_until_ready()))
 
 
+def measure(batch: int) -> list[dict[str, Any]]:
+    """Both programs in turn, a row each."""
+    runs = {"staf_torch": torch_run(batch), "JAX": jax_run(batch)}
+    seconds: dict[str, list[float]] = {}
+    rows: dict[str, dict[str, Any]] = {}
+    for name, run in runs.items():
+        if run is None:
+            print(f"{name} is not installed: left out", file=sys.stderr)
+            continue
+        start = time.perf_counter()
+        cost = run()
+        warm_up = time.perf_counter() - start
+        rows[name] = {"program": name, "B": batch, "warm_up": warm_up, "median_cost": cost}
+        seconds[name] = []
+    for _ in range(RUNS):
+        for name in rows:
+            start = time.perf_counter()
+            runs[name]()  # type: ignore[misc]
+            seconds[name].append(time.perf_counter() - start)
+    for name, row in rows.items():
+        row["seconds"] = statistics.median(seconds[name])
+        row["microseconds_a_step"] = 1e6 * row["seconds"] / STEPS
+    return list(rows.values())
+
+
+def missed(rows: list[dict[str, Any]]) -> list[str]:
+    """The goals that the rows do not reach."""
+    took = {(row["program"], row["B"]): row["seconds"] for row in rows}
+    late = [
+        f"B = {batch}: {took['staf_torch', batch]:.2f} s, wanted {goal:g} s"
+        for batch, goal in GOALS.items()
+        if took.get(("staf_torch", batch), 0.0) > goal
+    ]
+    peer = took.get(("JAX", NO_SLOWER))
+    if peer is not None and took["staf_torch", NO_SLOWER] > peer:
+        late.append(f"B = {NO_SLOWER}: slower than JAX")
+    return late
+
+
 def main() -> None:
-    """Time both, in turn."""
-    for batch in [int(argument) for argument in sys.argv[1:]] or [1, 1000]:
-        runs = {"torch": torch_run(batch), "jax": jax_run(batch)}
-        seconds: dict[str, list[float]] = {name: [] for name in runs}
-        costs = {name: run() for name, run in runs.items() if run is not None}  # warms up too
-        for _ in range(RUNS):
-            for name, run in runs.items():
-                if run is not None:
-                    start = time.perf_counter()
-                    run()
-                    seconds[name].append(time.perf_counter() - start)
-        for name, found in seconds.items():
-            if found:
-                print(f"B = {batch:5d}  {name:5s}  {statistics.median(found):7.2f} s  cost {costs[name]:.4f}")
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("rows", type=int, nargs="*", default=[1, 1000])
+    parser.add_argument("--json", type=Path, help="write the results here as well")
+    options = parser.parse_args()
+    print("| program | B | warm-up (s) | 10 s at 1 ms (s) | us a step | median cost |")
+    print("|---|---|---|---|---|---|")
+    found = []
+    for batch in options.rows:
+        for row in measure(batch):
+            found.append(row)
+            timed = f"{row['warm_up']:.1f} | {row['seconds']:.2f} | {row['microseconds_a_step']:.0f}"
+            print(f"| {row['program']} | {row['B']} | {timed} | {row['median_cost']:.4f} |", flush=True)
+    about = {"torch": torch.__version__, "cores": os.cpu_count(), "machine": platform.machine()}
+    if options.json:
+        options.json.write_text(
+            json.dumps(about | {"cases": found, "missed": missed(found)}, indent=1) + "\n"
+        )
+    print("\n".join(missed(found)) or "goals: met")
+    sys.exit(1 if missed(found) else 0)
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ from ..cost import Cost
 from ..lqr import LQR
 from .mesh import graded, halved, split
 from .minimise import Solution, follow, minimise
-from .newton import Plan, replay
+from .newton import Plan, choose, replay
 from .stage import Stage
 
 _DECAY = 9.2  # time constants of the slowest mode in the horizon: it falls to 1e-4
@@ -34,7 +34,8 @@ class Optimum(NamedTuple):
     control: Tensor  # u*(x0), (B, m)
     state: Tensor  # (B, N + 1, n)
     time: Tensor  # (N + 1,) seconds
-    mesh_error: Tensor  # relative change of the value since a mesh of half as many intervals, (B,)
+    mesh_error: Tensor  # relative change of the value since a mesh of half as many intervals, (B,); inf if
+    # that mesh was too coarse to converge on
     horizon_error: Tensor  # share of the value that is the terminal cost, (B,)
     iterations: Tensor  # Newton steps, both meshes together, (B,)
     converged: Tensor  # (B,) bool
@@ -116,6 +117,8 @@ class DirectShooting:
         coarse = minimise(self, follow(self, x0, time.diff()), time.diff())
         start = self._finer(coarse, time.diff())
         time = halved(time)
+        if not bool(coarse.converged.all()):  # costs time alone: the other rows go on from where they are
+            start = choose(coarse.converged, start, follow(self, x0, time.diff()))
         fine = minimise(self, start, time.diff())
         return self._optimum(fine, coarse, time)
 
@@ -129,7 +132,7 @@ class DirectShooting:
     def _optimum(self, fine: Solution, coarse: Solution, time: Tensor) -> Optimum:
         x0, plan = fine.plan.state[:, 0], fine.plan
         value = self._finer(fine, time.diff()).cost  # the same control, more exactly integrated
-        converged = coarse.converged & fine.converged & torch.isfinite(value)
+        converged = fine.converged & torch.isfinite(value)
         rest = (x0 == 0).all(-1)  # where the optimum is to stay
         gradient = torch.where(rest.unsqueeze(-1), 0.0, fine.gradient)
         value = torch.where(rest, 0.0, value)
@@ -140,6 +143,7 @@ class DirectShooting:
             return torch.where(known[(..., *([None] * (values.dim() - 1)))], values, torch.nan)
 
         change = (plan.cost - coarse.plan.cost).abs() / value
+        change = torch.where(coarse.converged, change, torch.inf)
         share = self.terminal(plan.state[:, -1]) / value
         return Optimum(
             value=where_known(value),

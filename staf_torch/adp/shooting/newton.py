@@ -97,7 +97,7 @@ def improved(
     x0 = plan.state[:, 0]
     tried = replay(stage, plan, x0, lengths, terminal, step.feedback, step.offset)
     lower = tried.cost < plan.cost
-    best = _choose(lower, tried, plan)
+    best = choose(lower, tried, plan)
     if not bool(lower.all()):  # costs time alone: rows that took the whole step keep it
         shares = torch.tensor(_SHORTER, dtype=x0.dtype, device=x0.device)
         several = x0.expand(len(shares), *x0.shape)
@@ -107,11 +107,12 @@ def improved(
         rows = torch.arange(len(x0), device=x0.device)
         shortened = Plan(tried.state[which, rows], tried.control[which, rows], cost)
         pays = ~lower & (cost < plan.cost)
-        best, lower = _choose(pays, shortened, best), lower | pays
+        best, lower = choose(pays, shortened, best), lower | pays
     return best, lower
 
 
-def _choose(rows: Tensor, new: Plan, old: Plan) -> Plan:
+def choose(rows: Tensor, new: Plan, old: Plan) -> Plan:
+    """The new plan in ``rows`` (B,), the old one in the others."""
     state = torch.where(rows[:, None, None], new.state, old.state)
     control = torch.where(rows[:, None, None], new.control, old.control)
     return Plan(state, control, torch.where(rows, new.cost, old.cost))
