@@ -3,4 +3,9 @@ package or C."""
 
 from .approximators import LocalApproximator as LocalApproximator
 from .approximators import approximator as approximator
+from .controllers import ActorPolicy as ActorPolicy
+from .controllers import SupervisedPolicy as SupervisedPolicy
+from .controllers import policy_of as policy_of
 from .ridges import RidgeApproximator as RidgeApproximator
+from .rollouts import FoldedRollout as FoldedRollout
+from .tracing import trace as trace
