@@ -6,6 +6,10 @@ from .approximators import approximator as approximator
 from .controllers import ActorPolicy as ActorPolicy
 from .controllers import SupervisedPolicy as SupervisedPolicy
 from .controllers import policy_of as policy_of
+from .formats import export_onnx as export_onnx
+from .formats import export_package as export_package
+from .formats import export_program as export_program
+from .formats import load_program as load_program
 from .ridges import RidgeApproximator as RidgeApproximator
 from .rollouts import FoldedRollout as FoldedRollout
 from .tracing import trace as trace

@@ -36,10 +36,12 @@ def trace(module: nn.Module, example: Tensor, *, batch: int | None = None) -> Ex
     with warnings.catch_warnings(), torch.no_grad():
         warnings.simplefilter("ignore")  # of the tracer, about its own internals
         try:
-            graph = make_fx(module, tracing_mode="symbolic", _allow_non_fake_inputs=True)(x)
+            # First to operations, derivatives and all, which `torch.export` alone does not take.
+            mode = "symbolic" if batch is None else "real"
+            graph = make_fx(module, tracing_mode=mode, _allow_non_fake_inputs=True)(x)
             program = torch.export.export(fold(graph), (x,), dynamic_shapes=shapes)
             return program.run_decompositions({})
-        except Exception as error:
+        except Exception as error:  # the tracer raises errors of all sorts
             raise ValueError(
                 f"`{type(module).__name__}` cannot be exported for "
                 f"{'any batch' if batch is None else f'a batch of {batch}'}: {str(error).splitlines()[0]}"
