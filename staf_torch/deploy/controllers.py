@@ -97,5 +97,3 @@ def _policy_of(controller: Controller | nn.Module, weights: Tensor | None) -> nn
     if isinstance(controller, Controller) or not isinstance(controller, nn.Module):
         raise fail("policy_of", "controller", "must be a feedback law without memory or an actor", controller)
     return copy.deepcopy(controller)
-
-

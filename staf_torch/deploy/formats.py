@@ -90,7 +90,9 @@ def load_program(path: str | Path) -> tuple[ExportedProgram, dict[str, object]]:
         program = torch.export.load(path, extra_files=note)
     except Exception as error:  # torch raises errors of all sorts for what is no archive
         reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise fail("load_program", "path", f"must be a .pt2 file of staf-export ({reason})", str(path)) from error
+        raise fail(
+            "load_program", "path", f"must be a .pt2 file of staf-export ({reason})", str(path)
+        ) from error
     if not note[_NOTE]:
         raise fail("load_program", "path", "must have been written by staf-export", str(path))
     said = json.loads(note[_NOTE])

@@ -70,5 +70,7 @@ def foldable(policy: RolloutPolicy) -> bool:
     kernel, radius = policy.basis.kernel, policy.basis.centers.radius
     bound = radius.bound()
     # Only the exponential kernel's factor e^{s(x, d)} depends on the state.
-    known = kernel.state_free and (isinstance(kernel, ExponentialKernel) or kernel.log_gain(torch.zeros(1)) is None)
+    known = kernel.state_free and (
+        isinstance(kernel, ExponentialKernel) or kernel.log_gain(torch.zeros(1)) is None
+    )
     return radius.constant and bound is not None and bound.dim() == 0 and known

@@ -51,7 +51,17 @@ class Work:
 _FUNCTIONS = {"exp", "expm1", "sin", "cos", "tanh", "sqrt", "rsqrt", "pow", "log", "log1p", "atan", "sigmoid"}
 _FREE = {"view", "slice", "select", "unsqueeze", "squeeze", "expand", "permute", "transpose", "cat", "clone"}
 _FREE |= {"full", "scalar_tensor", "empty", "ones_like", "zeros_like", "full_like", "new_ones", "new_zeros"}
-_FREE |= {"_to_copy", "alias", "split_with_sizes", "getitem", "reshape", "arange", "t", "_unsafe_view", "copy"}
+_FREE |= {
+    "_to_copy",
+    "alias",
+    "split_with_sizes",
+    "getitem",
+    "reshape",
+    "arange",
+    "t",
+    "_unsafe_view",
+    "copy",
+}
 
 
 def work(program: ExportedProgram) -> Work:
@@ -74,7 +84,9 @@ def work(program: ExportedProgram) -> Work:
             flops += _count(node.args[0].meta["val"]) - _count(out)
         else:
             flops += _count(out)
-    constants = [t for t in (*program.state_dict.values(), *program.constants.values()) if isinstance(t, Tensor)]
+    constants = [
+        t for t in (*program.state_dict.values(), *program.constants.values()) if isinstance(t, Tensor)
+    ]
     placeholders = [n for n in program.graph.nodes if n.op == "placeholder"]
     fed = set(program.graph_signature.user_inputs)
     given = set(program.graph_signature.user_outputs)

@@ -145,7 +145,9 @@ def _reproduced(name: str, found: Tensor, recorded: np.ndarray, precise: bool) -
     """Whatever wrote the run: what is built from it must give the recorded numbers."""
     wanted = torch.from_numpy(np.asarray(recorded, dtype=np.float64))
     if not bool(torch.isfinite(wanted).all()):
-        raise fail("staf-export", "row", "must be a trajectory that did not diverge", f"a recorded {name} of NaN")
+        raise fail(
+            "staf-export", "row", "must be a trajectory that did not diverge", f"a recorded {name} of NaN"
+        )
     worst = float((found - wanted).abs().max() / wanted.abs().max().clamp(min=1e-3))
     if not worst <= (1e-8 if precise else 1e-3):
         raise ValueError(
