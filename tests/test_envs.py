@@ -126,5 +126,5 @@ def test_bad_input_is_refused_by_name() -> None:
         env.step(np.array([21.0]))
     with pytest.raises(ValueError, match=r"`step\(action=...\)` must have the shape \(1,\)"):
         env.step(np.array([1.0, 2.0]))
-    with pytest.raises(ValueError, match="must be .1, 2. and finite"):
+    with pytest.raises(ValueError, match=r"must be \(1, 2\) and finite"):
         env.reset(options={"state": [1.0, 2.0, 3.0]})

@@ -30,7 +30,7 @@ class LocalApproximator(nn.Module):
         super().__init__()
         if staf.state.dim() != 1:
             raise ValueError(
-                f"`LocalApproximator(staf=...)` must be around one state; got the batch {staf.state.shape[:-1]}."
+                f"`LocalApproximator(staf=...)` must have one state; got the batch {staf.state.shape[:-1]}."
             )
         own = copy.deepcopy(staf).double()
         self.dtype = dtype
@@ -73,7 +73,7 @@ def approximator(staf: StaF, dtype: torch.dtype = torch.float64, reach: float = 
         ValueError: if the approximation is of a batch of states, or ``reach`` is not positive.
     """
     space = staf.basis.local(staf.state.detach())
-    alone = staf.state.dim() == 1 and isinstance(space, GradedSpace)
-    if alone and space.rate.dim() == 0 and space.radius.dim() == 0:
+    graded = isinstance(space, GradedSpace) and space.rate.dim() == space.radius.dim() == 0
+    if staf.state.dim() == 1 and graded:
         return RidgeApproximator(staf, dtype, reach)
     return LocalApproximator(staf, dtype)

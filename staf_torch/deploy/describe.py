@@ -14,7 +14,7 @@ def markdown(sheet: Mapping[str, Any]) -> str:
     """
     work, late = sheet["work"], sheet["latency"]
     ports = [
-        f"| {way} | `{port['name']}` | ({', '.join(['B'] + [str(port['size'])] * (port['size'] is not None))}) "
+        f"| {way} | `{port['name']}` | {'(B,)' if port['size'] is None else f'(B, {port["size"]})'} "
         f"| {sheet['dtype']} | {port['unit']} | {port['region']} |"
         for way in ("input", "output")
         for port in sheet[way + "s"]

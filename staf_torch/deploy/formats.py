@@ -46,8 +46,8 @@ def need_compiler() -> None:
     compiler = os.environ.get("CXX") or next((c for c in ("g++", "clang++") if shutil.which(c)), None)
     if compiler is None or shutil.which(compiler) is None:
         raise ValueError(
-            "AOTInductor compiles C++, and there is no compiler here: install g++ (on Debian: apt-get install "
-            f"g++), or name one in the variable CXX; got {compiler!r}. ONNX and pt2 need none."
+            "AOTInductor compiles C++, and there is no compiler here: install g++ (apt-get install g++) "
+            f"or name one in the variable CXX; got {compiler!r}. ONNX and pt2 need none."
         )
 
 

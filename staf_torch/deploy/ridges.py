@@ -116,7 +116,7 @@ def _expand(space: GradedSpace, beta: Tensor, eps: float, reach: float) -> _Seri
 
 
 def _negligible(terms: list[Tensor], eps: float, reach: float) -> bool:
-    """Whether the last term, and its derivative, are below the rounding of the value wherever |tau| <= reach."""
+    """Whether the last term and its derivative are below the rounding of the value where |tau| <= reach."""
     last, p = float(terms[-1].abs().sum()), len(terms) - 1
     for at in (1.0, reach):
         size = max(float(term.abs().sum()) * at**q for q, term in enumerate(terms))

@@ -31,8 +31,8 @@ class FoldedRollout(nn.Module):
         super().__init__()
         if not foldable(policy):
             raise ValueError(
-                "`FoldedRollout(policy=...)` must have a constant radius and an exponential or radial kernel; "
-                f"got {policy.basis}."
+                "`FoldedRollout(policy=...)` must have a constant radius and an exponential or radial "
+                f"kernel; got {policy.basis}."
             )
         basis = policy.basis
         zero = torch.zeros(basis.dim, dtype=torch.float64)

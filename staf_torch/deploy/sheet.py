@@ -71,7 +71,7 @@ def work(program: ExportedProgram) -> Work:
         out = node.meta.get("val")
         if node.op != "call_function" or not isinstance(out, Tensor):
             continue
-        name = getattr(node.target, "_opname", "") or str(node.target).split(".")[1]
+        name = getattr(node.target, "_opname", None) or node.target.__name__
         if name in _FREE:
             continue
         if name in _FUNCTIONS:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, fx, nn
@@ -37,10 +37,11 @@ def trace(module: nn.Module, example: Tensor, *, batch: int | None = None) -> Ex
         warnings.simplefilter("ignore")  # of the tracer, about its own internals
         try:
             # First to operations, derivatives and all, which `torch.export` alone does not take.
-            mode = "symbolic" if batch is None else "real"
+            mode: Literal["symbolic", "real"] = "symbolic" if batch is None else "real"
             graph = make_fx(module, tracing_mode=mode, _allow_non_fake_inputs=True)(x)
-            program = torch.export.export(fold(graph), (x,), dynamic_shapes=shapes)
-            return program.run_decompositions({})
+            program: ExportedProgram = torch.export.export(fold(graph), (x,), dynamic_shapes=shapes)
+            decomposed: ExportedProgram = program.run_decompositions({})
+            return decomposed
         except Exception as error:  # the tracer raises errors of all sorts
             raise ValueError(
                 f"`{type(module).__name__}` cannot be exported for "

@@ -1,9 +1,9 @@
 """The plants as Gymnasium environments. Importing this registers them: `staf_torch/TwoState-v0` and so on."""
 
-try:
-    import gymnasium as _gymnasium  # noqa: F401
-except ImportError as error:
-    raise ImportError("staf_torch.envs needs Gymnasium: pip install 'staf_torch[gym]'.") from error
+from importlib.util import find_spec as _find_spec
+
+if _find_spec("gymnasium") is None:
+    raise ImportError("staf_torch.envs needs Gymnasium: pip install 'staf_torch[gym]'.")
 
 from .agent import Agent as Agent
 from .episodes import Episodes as Episodes

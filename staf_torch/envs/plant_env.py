@@ -36,7 +36,7 @@ class PlantEnv(gymnasium.Env):
         ValueError: if an argument breaks its rule.
     """
 
-    metadata = {"render_modes": []}  # noqa: RUF012
+    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012
 
     def __init__(
         self,
@@ -63,7 +63,7 @@ class PlantEnv(gymnasium.Env):
     ) -> tuple[Numbers, dict[str, Any]]:
         """A new episode: its first observation."""
         super().reset(seed=seed)
-        x0 = start(options, [self.np_random], self.spread, self.observation_space.shape[0])
+        x0 = start(options, [self.np_random], self.spread, self.episodes.state.shape[1])
         self.episodes.begin(torch.ones(1, dtype=torch.bool), x0)
         return self._observation(), {}
 
@@ -73,7 +73,7 @@ class PlantEnv(gymnasium.Env):
         Raises:
             ValueError: if the action is not in the action space.
         """
-        u = to_control(action, self.action_space.shape, self.bound)
+        u = to_control(action, (self.plant.inputs,), self.bound)
         reward, terminated, truncated = self.episodes.step(u.unsqueeze(0))
         return self._observation(), float(reward), bool(terminated), bool(truncated), {}
 

@@ -37,7 +37,7 @@ class PlantVectorEnv(VectorEnv):
         ValueError: if an argument breaks its rule.
     """
 
-    metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012
+    metadata: dict[str, Any] = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012
 
     def __init__(
         self,
@@ -86,7 +86,7 @@ class PlantVectorEnv(VectorEnv):
         Raises:
             ValueError: if an action is not in the action space.
         """
-        u = to_control(actions, self.action_space.shape, self.bound)
+        u = to_control(actions, (self.num_envs, self.plant.inputs), self.bound)
         anew = self._over if self.mode is AutoresetMode.NEXT_STEP else torch.zeros_like(self._over)
         reward, terminated, truncated = self.episodes.step(u)
         if bool(anew.any()):
@@ -106,7 +106,7 @@ class PlantVectorEnv(VectorEnv):
 
     def _begin(self, rows: Tensor, options: dict[str, Any] | None) -> None:
         # A row draws from its own generator, and only when it begins: no row depends on another.
-        dim = self.single_observation_space.shape[0]
+        dim = self.episodes.state.shape[1]
         chosen = rows.nonzero().flatten().tolist()
         stated = options is not None and options.get("state") is not None
         x0 = self.episodes.state.clone()

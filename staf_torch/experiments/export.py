@@ -138,8 +138,8 @@ def parser() -> argparse.ArgumentParser:
     """The arguments of `staf-export`."""
     found = argparse.ArgumentParser(
         prog="staf-export",
-        description="Write a run's controller (adp) or approximation (gradient_chase) for a device, with a sheet "
-        "of parameters, flops, latency and errors beside it.",
+        description="Write a run's controller (adp) or approximation (gradient_chase) for a device, with a "
+        "sheet of parameters, flops, latency and errors beside it.",
     )
     found.add_argument("run", type=Path, help="run directory")
     found.add_argument("--to", required=True, choices=tuple(ENDINGS), help="ONNX, torch.export, AOTInductor")
@@ -147,6 +147,7 @@ def parser() -> argparse.ArgumentParser:
     found.add_argument("--output", type=Path, help="file; RUN/export/... by default")
     found.add_argument("--row", type=int, default=0, help="trajectory (0)")
     found.add_argument("--batch", type=int, help="rows of every call; any by default")
+    found.add_argument("--calls", type=int, default=sheet.CALLS, help=f"timed ({sheet.CALLS})")
     found.add_argument("--trust", action="store_true", help="import code of your own that the settings name")
     return found
 
@@ -162,6 +163,7 @@ def main(arguments: list[str] | None = None) -> None:
             output=given.output,
             row=given.row,
             batch=given.batch,
+            calls=given.calls,
             trust=given.trust,
         )
     except (ValueError, OSError) as error:

@@ -120,7 +120,7 @@ def _history(run: Path) -> dict[str, np.ndarray]:
     path = run / "history.npz"
     if not path.is_file():
         raise ValueError(
-            f"{run} has no history.npz, which holds the weights: it was run with history=false, or did not end."
+            f"{run} has no history.npz, which holds the weights: run with history=false, or not ended."
         )
     try:
         with np.load(path, allow_pickle=False) as arrays:
