@@ -64,9 +64,9 @@ def actor(kernel: Kernel, gradient: str = "total") -> adp.ActorCritic:
     return adp.ActorCritic(basis, PLANT, COST, BOX, actor=[0.2, 0.8, -0.2])
 
 
-def rollout(kernel: Kernel, radius: float | StateRadius = 0.1, **settings: int) -> adp.RolloutPolicy:
+def rollout(kernel: Kernel, radius: float | StateRadius = 0.1, **settings: float) -> adp.RolloutPolicy:
     basis = StaFBasis(kernel, StateFollowingCenters(rings(6), radius))
-    return adp.RolloutPolicy(basis, PLANT, COST, LQR, LQR.value, **{"steps": 2, **settings})
+    return adp.RolloutPolicy(basis, PLANT, COST, LQR, LQR.value, **{"steps": 2, "horizon": 0.1, **settings})
 
 
 CONTROLLERS = {
@@ -195,7 +195,7 @@ def test_program_file_comes_back_with_its_note_and_another_format_is_refused(
     assert note == {"format": formats.FORMAT, "what": "lqr"}
     torch.testing.assert_close(loaded.module()(x), LQR(x))
     monkeypatch.setattr(formats, "FORMAT", formats.FORMAT + 1)
-    with pytest.raises(ValueError, match="has format 1 .* reads format 2: export the run anew"):
+    with pytest.raises(ValueError, match=r"has format 1 .* reads format 2: export the run anew"):
         deploy.load_program(path)
     torch.export.save(program, path)
     with pytest.raises(ValueError, match="must have been written by staf-export"):

@@ -14,7 +14,7 @@ def markdown(sheet: Mapping[str, Any]) -> str:
     """
     work, late = sheet["work"], sheet["latency"]
     ports = [
-        f"| {way} | `{port['name']}` | {'(B,)' if port['size'] is None else f'(B, {port["size"]})'} "
+        f"| {way} | `{port['name']}` | {_shape(port['size'])} "
         f"| {sheet['dtype']} | {port['unit']} | {port['region']} |"
         for way in ("input", "output")
         for port in sheet[way + "s"]
@@ -53,3 +53,7 @@ def markdown(sheet: Mapping[str, Any]) -> str:
         "Errors are the largest difference over the largest value, at 1000 random points of the region.",
     ]
     return "\n".join(lines) + "\n"
+
+
+def _shape(size: int | None) -> str:
+    return "(B,)" if size is None else f"(B, {size})"

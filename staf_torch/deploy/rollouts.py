@@ -38,12 +38,9 @@ class FoldedRollout(nn.Module):
         zero = torch.zeros(basis.dim, dtype=torch.float64)
         space = copy.deepcopy(basis).double().local(zero)
         unit = space.fit(torch.eye(basis.count, dtype=torch.float64))  # a row a center
-        value = space.evaluate(zero.expand(basis.count, 1, -1), unit).squeeze(-1)
-
-        def along(z: Tensor) -> Tensor:
-            return space.evaluate(z.expand(basis.count, 1, -1), unit).squeeze(-1)
-
-        slope = torch.func.jacfwd(along)(zero)  # (M, n)
+        at = zero.expand(basis.count, 1, -1)
+        value = space.evaluate(at, unit).squeeze(-1)
+        slope = torch.func.grad(lambda z: space.evaluate(z, unit).sum())(at).squeeze(-2)  # (M, n)
         self.moving = isinstance(basis.kernel, ExponentialKernel)
         self.policy = copy.deepcopy(policy)
         if isinstance(policy.base, RolloutPolicy):

@@ -148,4 +148,5 @@ def machine() -> str:
 def worst_difference(found: tuple[Tensor, ...], wanted: tuple[Tensor, ...]) -> list[float]:
     """A number an output: the largest |found - wanted|, over the largest |wanted|."""
     pairs = zip(found, wanted, strict=True)
-    return [float((a.double() - b.double()).abs().max() / b.double().abs().max()) for a, b in pairs]
+    wide = [(a.detach().double(), b.detach().double()) for a, b in pairs]
+    return [float((a - b).abs().max() / b.abs().max()) for a, b in wide]
