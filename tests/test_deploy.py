@@ -16,6 +16,7 @@ from staf_torch import (
     GaussianKernel,
     Kernel,
     MaternKernel,
+    RationalQuadraticKernel,
     StaF,
     StaFBasis,
     StateFollowingCenters,
@@ -145,7 +146,7 @@ def test_deployed_controller_equals_the_one_of_the_loop(name: str, dtype: torch.
 
 CASES: dict[str, nn.Module] = {
     "exponential": deploy.approximator(fitted(ExponentialKernel(), 0.1)),
-    "matern": deploy.approximator(fitted(MaternKernel(), 0.3, rings(3))),
+    "rational_quadratic": deploy.approximator(fitted(RationalQuadraticKernel(), 0.3, rings(3))),
     "lqr": deploy.policy_of(LQR),
     "actor": deploy.policy_of(actor(ExponentialKernel())),
 }

@@ -74,8 +74,11 @@ def fold(graph: fx.GraphModule) -> fx.GraphModule:
         node.replace_all_uses_with(constant)
     graph.graph.eliminate_dead_code()
     used = {str(node.target) for node in graph.graph.nodes if node.op == "get_attr"}
-    for name in [name for name, _ in graph.named_buffers() if name not in used]:
-        delattr(graph, name)
+    for name, constant in list(graph.named_buffers()):
+        if name in used:
+            setattr(graph, name, constant.detach().clone())  # not a view of more than a file should hold
+        else:
+            delattr(graph, name)
     graph.recompile()
     return graph
 
