@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import shutil
 from pathlib import Path
 
 import pytest
@@ -29,6 +30,7 @@ from staf_torch import (
     targets,
 )
 from staf_torch.deploy import formats, sheet
+from staf_torch.deploy.c_header import runner_c
 
 PLANT = systems.TwoState()
 COST = adp.QuadraticCost(1.0, 1.0, 2, 1)
@@ -37,6 +39,10 @@ BOX = adp.RandomPoints(1, StateRadius(2.1, 1e-5))
 needs_onnx = pytest.mark.skipif(
     any(importlib.util.find_spec(name) is None for name in ("onnx", "onnxscript", "onnxruntime")),
     reason="needs the extra onnx",
+)
+
+needs_cc = pytest.mark.skipif(
+    not any(shutil.which(name) for name in ("cc", "gcc", "g++", "clang")), reason="needs a C compiler"
 )
 
 
@@ -168,6 +174,37 @@ def test_rollout_of_a_fixed_batch_is_traced() -> None:
     program = deploy.trace(policy, x, batch=1)
     torch.testing.assert_close(program.module()(x), policy(x), rtol=1e-12, atol=1e-13)
     assert sheet.work(program).functions > 0
+
+
+class Thirds(nn.Module):
+    """Numbers that float32 does not hold."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        return 0.1 * x + (x - 1 / 3).square() / 0.7
+
+
+@needs_onnx
+def test_onnx_keeps_the_digits_of_numbers_in_the_code(tmp_path: Path) -> None:
+    x = torch.rand(4, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    deploy.export_onnx(deploy.trace(Thirds(), x), tmp_path / "a.onnx", ["state"], ["value"])
+    assert sheet.worst_difference(formats.runner_onnx(tmp_path / "a.onnx")(x), (Thirds()(x),))[0] <= 1e-15
+
+
+@needs_cc
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize("name", ["exponential", "rational_quadratic", "lqr", "actor", "rollout"])
+def test_c_header_computes_the_same(name: str, dtype: torch.dtype, tmp_path: Path) -> None:
+    staf = fitted(RationalQuadraticKernel() if name == "rational_quadratic" else ExponentialKernel(), 0.1)
+    given = {"lqr": LQR, "actor": CONTROLLERS["actor"], "rollout": rollout(ExponentialKernel(), steps=1)}
+    module = deploy.policy_of(given[name], dtype=dtype) if name in given else deploy.approximator(staf, dtype)
+    x = around(staf, 1.0, 5).to(dtype)
+    wanted = formats.as_tuple(module(x))
+    outputs = [f"out{k}" for k in range(len(wanted))]
+    deploy.export_c(deploy.trace(module, x, batch=1), tmp_path / "a.h", outputs, dtype=dtype)
+    run = runner_c(tmp_path / "a.h", [None if out.dim() == 1 else out.shape[1] for out in wanted], dtype)
+    loss = 100 if name in ("rollout", "rational_quadratic") else 1  # their cancellation, in float
+    tolerance = 1e-12 if dtype == torch.float64 else loss * 1e-6
+    assert max(sheet.worst_difference(run(x), wanted)) <= tolerance
 
 
 @needs_onnx

@@ -3,6 +3,7 @@ package or C."""
 
 from .approximators import LocalApproximator as LocalApproximator
 from .approximators import approximator as approximator
+from .c_header import export_c as export_c
 from .controllers import ActorPolicy as ActorPolicy
 from .controllers import SupervisedPolicy as SupervisedPolicy
 from .controllers import policy_of as policy_of

@@ -73,10 +73,11 @@ def runner_c(path: Path, sizes: Sequence[int | None], dtype: torch.dtype) -> Run
     kind = "float" if dtype == torch.float32 else "double"
     names = ", ".join(f"o{k}" for k in range(len(sizes)))
     declared = ", ".join(f"{kind} *o{k}" for k in range(len(sizes)))
-    source = f'#include "{path.resolve()}"\nvoid call(const {kind} *state, {declared}) {{ staf(state, {names}); }}\n'
+    source = f'#include "{path.resolve()}"\n'
+    source += f"void call(const {kind} *state, {declared}) {{ staf(state, {names}); }}\n"
     with tempfile.TemporaryDirectory() as folder:
         (Path(folder) / "call.c").write_text(source, encoding="utf-8")
-        line = [_compiler(), "-O2", "-shared", "-fPIC", "-x", "c", "call.c", "-o", "call.so", "-lm"]
+        line = [need_c_compiler(), "-O2", "-shared", "-fPIC", "-x", "c", "call.c", "-o", "call.so", "-lm"]
         subprocess.run(line, cwd=folder, check=True, capture_output=True)
         call = ctypes.CDLL(str(Path(folder) / "call.so")).call
 
@@ -89,7 +90,12 @@ def runner_c(path: Path, sizes: Sequence[int | None], dtype: torch.dtype) -> Run
     return run
 
 
-def _compiler() -> str:
+def need_c_compiler() -> str:
+    """The C compiler here.
+
+    Raises:
+        ValueError: if there is none.
+    """
     wanted = os.environ.get("CC")
     found = wanted or next((c for c in ("cc", "gcc", "g++", "clang") if shutil.which(c)), None)
     if found is None or shutil.which(found) is None:

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import torch
 from torch import Tensor, fx
 from torch.export import ExportedProgram
 
@@ -28,12 +29,13 @@ _INFIX: dict[str, tuple[str, Callable[[Any, Any], Any]]] = {
 _CALLS: dict[str, Callable[[float], float]] = {
     "exp": math.exp,
     "expm1": math.expm1,
+    "log1p": math.log1p,
     "sin": math.sin,
     "cos": math.cos,
     "tanh": math.tanh,
     "sqrt": math.sqrt,
 }
-_SHAPES: dict[str, Callable[..., Array]] = {
+_SHAPES: dict[str, Callable[..., Any]] = {
     "unsqueeze": lambda a, dim: np.expand_dims(a, dim),
     "squeeze": lambda a, dim: np.squeeze(a, axis=tuple(dim) if isinstance(dim, list) else dim),
     "view": lambda a, shape: a.reshape(shape),
@@ -53,7 +55,6 @@ _SHAPES: dict[str, Callable[..., Array]] = {
     "getitem": operator.getitem,
     "clone": lambda a, **_: a,
     "alias": lambda a: a,
-    "_to_copy": lambda a, **_: a,
     "cat": lambda parts, dim=0: np.concatenate(parts, axis=dim),
     "slice": lambda a, dim=0, start=0, end=None, step=1: _slice(a, dim, start, end, step),
 }
@@ -89,7 +90,7 @@ class Scalars(fx.Interpreter):
             constant = self._given[self._lifted[target]]
             assert isinstance(constant, Tensor)
             return np.array(constant.tolist(), dtype=object)
-        (node,) = (n for n in self.module.graph.nodes if n.name == target)  # type: ignore[union-attr]
+        (node,) = (n for n in self.module.graph.nodes if n.name == target)
         size = int(node.meta["val"].shape[-1])
         return np.array([[f"state[{k}]" for k in range(size)]], dtype=object)
 
@@ -105,6 +106,11 @@ class Scalars(fx.Interpreter):
         if own is None:
             raise ValueError(f"`{target}` has no C here: export this run as ONNX, pt2 or aoti.")
         return own(*args, **kwargs)
+
+    def _do__to_copy(self, a: Array, dtype: torch.dtype | None = None, **_: Any) -> Array:
+        if self.suffix and dtype == torch.float64:
+            raise ValueError("This needs float64 inside, or float32 loses its digits: use --dtype float64.")
+        return a
 
     def _do_neg(self, a: Array) -> Array:
         return self._each(lambda x: self._infix("sub", 0.0, x), a)
@@ -133,6 +139,9 @@ class Scalars(fx.Interpreter):
     def _do_mm(self, a: Array, b: Array) -> Array:
         products = self._each(lambda x, y: self._infix("mul", x, y), a[:, None, :], b.T[None, :, :])
         return self._fold(products)
+
+    def _do_bmm(self, a: Array, b: Array) -> Array:
+        return np.stack([self._do_mm(x, y) for x, y in zip(a, b, strict=True)])
 
     def _do_addmm(self, bias: Array, a: Array, b: Array) -> Array:
         return self._each(lambda x, y: self._infix("add", x, y), self._do_mm(a, b), bias)
@@ -197,5 +206,3 @@ def _slice(a: Array, dim: int, start: int | None, end: int | None, step: int) ->
     at[dim] = slice(start, None if end is None or end > 2**62 else end, step)
     out: Array = a[tuple(at)]
     return out
-
-

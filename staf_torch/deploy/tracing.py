@@ -7,10 +7,12 @@ from typing import Any, Literal
 
 import torch
 from torch import Tensor, fx, nn
+from torch._decomp import core_aten_decompositions
 from torch.export import Dim, ExportedProgram
 from torch.fx.experimental.proxy_tensor import make_fx
 
 from .._checks import integer, trailing
+from .lifting import lift_numbers
 
 _TRACED = 3  # rows of the batch while tracing: a size that no other dimension is taken for by chance
 
@@ -38,8 +40,11 @@ def trace(module: nn.Module, example: Tensor, *, batch: int | None = None) -> Ex
         try:
             # First to operations, derivatives and all, which `torch.export` alone does not take.
             mode: Literal["symbolic", "real"] = "symbolic" if batch is None else "real"
-            graph = make_fx(module, tracing_mode=mode, _allow_non_fake_inputs=True)(x)
-            program: ExportedProgram = torch.export.export(fold(graph), (x,), dynamic_shapes=shapes)
+            table = core_aten_decompositions()
+            graph = make_fx(module, table, tracing_mode=mode, _allow_non_fake_inputs=True)(x)
+            program: ExportedProgram = torch.export.export(
+                lift_numbers(fold(graph)), (x,), dynamic_shapes=shapes
+            )
             decomposed: ExportedProgram = program.run_decompositions({})
             return decomposed
         except Exception as error:  # the tracer raises errors of all sorts

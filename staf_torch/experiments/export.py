@@ -6,6 +6,7 @@ import argparse
 import dataclasses
 import json
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +14,22 @@ import torch
 
 from .. import __version__
 from .._checks import choice
-from ..deploy import describe, formats, sheet, trace
+from ..deploy import c_header, describe, formats, sheet, trace
 from ..report import write_text
 from .export_run import Deployable, deployable
 
-ENDINGS = {"onnx": ".onnx", "pt2": ".pt2", "aoti": ".aoti.pt2"}
-_RUNTIMES = {"onnx": "onnxruntime", "pt2": "eager torch", "aoti": "AOTInductor"}
+ENDINGS = {"onnx": ".onnx", "pt2": ".pt2", "aoti": ".aoti.pt2", "c": ".h"}
+_RUNTIMES = {
+    "onnx": "onnxruntime",
+    "pt2": "eager torch",
+    "aoti": "AOTInductor",
+    "c": "C at -O2, called by ctypes",
+}
+_NEEDS: dict[str, Callable[[], object]] = {
+    "onnx": formats.need_onnx,
+    "aoti": formats.need_compiler,
+    "c": c_header.need_c_compiler,
+}
 _DTYPES = {"float64": torch.float64, "float32": torch.float32}
 _SAME = {"float64": 1e-9, "float32": 1e-3}  # farther from the library a file is broken, and not left behind
 
@@ -38,7 +49,7 @@ def export(
 
     Args:
         run: the run directory.
-        to: onnx, pt2 (a `torch.export` program) or aoti (an AOTInductor package).
+        to: onnx, pt2 (a `torch.export` program), aoti (an AOTInductor package) or c (a header, one row a call).
         dtype: float64 or float32.
         output: of the file; RUN/export/<kind> and an ending by default.
         row: the trajectory.
@@ -52,13 +63,15 @@ def export(
     """
     choice("staf-export", "to", to, tuple(ENDINGS))
     choice("staf-export", "dtype", dtype, tuple(_DTYPES))
-    {"onnx": formats.need_onnx, "aoti": formats.need_compiler}.get(to, lambda: None)()
+    _NEEDS.get(to, lambda: None)()
+    if to == "c":
+        batch = 1
     found = deployable(run, row, trust=trust)
     path = run / "export" / f"{found.kind}{ENDINGS[to]}" if output is None else output
     path.parent.mkdir(parents=True, exist_ok=True)
     module = found.module(_DTYPES[dtype])
     program = trace(module, found.points.to(_DTYPES[dtype]), batch=batch)
-    call = _write(program, path, to, found, {"run": str(run), "row": row})
+    call = _write(program, path, to, found, {"run": str(run), "row": row}, _DTYPES[dtype])
     facts = _measure(call, module, found, dtype, batch, calls)
     worst = max(facts["equality"].values())
     if not worst <= _SAME[dtype]:
@@ -88,7 +101,12 @@ def export(
 
 
 def _write(
-    program: torch.export.ExportedProgram, path: Path, to: str, found: Deployable, origin: dict[str, object]
+    program: torch.export.ExportedProgram,
+    path: Path,
+    to: str,
+    found: Deployable,
+    origin: dict[str, object],
+    dtype: torch.dtype,
 ) -> formats.Run:
     names = [port.name for port in found.outputs]
     if to == "onnx":
@@ -98,6 +116,10 @@ def _write(
         ports = {"input": dataclasses.asdict(found.input), "outputs": names, "what": found.what}
         formats.export_program(program, path, {"version": __version__, **origin, **ports})
         return formats.runner_program(path)
+    if to == "c":
+        note = f"{found.what}\nFrom {origin['run']}, trajectory {origin['row']}, staf_torch {__version__}."
+        c_header.export_c(program, path, names, dtype=dtype, note=note)
+        return c_header.runner_c(path, [port.size for port in found.outputs], dtype)
     formats.export_package(program, path)
     return formats.runner_package(path)
 
@@ -142,7 +164,9 @@ def parser() -> argparse.ArgumentParser:
         "sheet of parameters, flops, latency and errors beside it.",
     )
     found.add_argument("run", type=Path, help="run directory")
-    found.add_argument("--to", required=True, choices=tuple(ENDINGS), help="ONNX, torch.export, AOTInductor")
+    found.add_argument(
+        "--to", required=True, choices=tuple(ENDINGS), help="ONNX, torch.export, AOTInductor, C header"
+    )
     found.add_argument("--dtype", default="float64", choices=tuple(_DTYPES))
     found.add_argument("--output", type=Path, help="file; RUN/export/... by default")
     found.add_argument("--row", type=int, default=0, help="trajectory (0)")

@@ -1,6 +1,6 @@
 """One evaluation of V^ and its gradient, M = 6, n = 2, exported: microseconds a call from Python, one core.
 
-    python tests/benchmarks/export.py FOLDER       # exports what FOLDER lacks, then times 10000 calls of each
+python tests/benchmarks/export.py FOLDER       # exports what FOLDER lacks, then times 10000 calls of each
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def main() -> None:
         for name, run in runners(folder, dtype, y).items():
             late = latency(run, y)
             numbers = f"{late.median_us:8.2f} {late.p99_us:8.2f} {late.worst_us:9.1f}"
-            print(f"{str(dtype):14} {name:32} {numbers}   us (median, 99 %, worst of {late.calls})")
+            print(f"{dtype!s:14} {name:32} {numbers}   us (median, 99 %, worst of {late.calls})")
     staf, y = fitted(), (STATE + 0.03)[None]
     late = latency(lambda x: (staf(x), staf.gradient(x)), y, 2000)
     print(f"StaF in eager torch, float64: {late.median_us:.1f} us")
