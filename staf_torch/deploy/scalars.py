@@ -75,9 +75,13 @@ class Scalars(fx.Interpreter):
     """
 
     def __init__(self, program: ExportedProgram, suffix: str = "") -> None:
-        super().__init__(program.graph_module)  # type: ignore[no-untyped-call]
+        super().__init__(program.graph_module)
         self.lines: list[str] = []
         self.suffix = suffix
+        inputs = (node for node in program.graph.nodes if node.op == "placeholder" and node.meta["val"].dim())
+        self._sizes = {
+            node.name: int(node.meta["val"].shape[-1]) for node in inputs if node.meta["val"].dim()
+        }
         self._given = {**program.state_dict, **program.constants}
         self._lifted = {
             **program.graph_signature.inputs_to_buffers,
@@ -90,8 +94,7 @@ class Scalars(fx.Interpreter):
             constant = self._given[self._lifted[target]]
             assert isinstance(constant, Tensor)
             return np.array(constant.tolist(), dtype=object)
-        (node,) = (n for n in self.module.graph.nodes if n.name == target)
-        size = int(node.meta["val"].shape[-1])
+        size = self._sizes[target]
         return np.array([[f"state[{k}]" for k in range(size)]], dtype=object)
 
     def call_function(self, target: Any, args: Any, kwargs: Any) -> Any:

@@ -40,11 +40,10 @@ def trace(module: nn.Module, example: Tensor, *, batch: int | None = None) -> Ex
         try:
             # First to operations, derivatives and all, which `torch.export` alone does not take.
             mode: Literal["symbolic", "real"] = "symbolic" if batch is None else "real"
-            table = core_aten_decompositions()
+            table: Any = core_aten_decompositions()
             graph = make_fx(module, table, tracing_mode=mode, _allow_non_fake_inputs=True)(x)
-            program: ExportedProgram = torch.export.export(
-                lift_numbers(fold(graph)), (x,), dynamic_shapes=shapes
-            )
+            graph = lift_numbers(fold(graph))
+            program: ExportedProgram = torch.export.export(graph, (x,), dynamic_shapes=shapes)
             decomposed: ExportedProgram = program.run_decompositions({})
             return decomposed
         except Exception as error:  # the tracer raises errors of all sorts
@@ -79,9 +78,9 @@ def fold(graph: fx.GraphModule) -> fx.GraphModule:
         node.replace_all_uses_with(constant)
     graph.graph.eliminate_dead_code()
     used = {str(node.target) for node in graph.graph.nodes if node.op == "get_attr"}
-    for name, constant in list(graph.named_buffers()):
+    for name, buffer in list(graph.named_buffers()):
         if name in used:
-            setattr(graph, name, constant.detach().clone())  # not a view of more than a file should hold
+            setattr(graph, name, buffer.detach().clone())  # not a view of more than a file should hold
         else:
             delattr(graph, name)
     graph.recompile()

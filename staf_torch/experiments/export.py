@@ -23,7 +23,7 @@ _RUNTIMES = {
     "onnx": "onnxruntime",
     "pt2": "eager torch",
     "aoti": "AOTInductor",
-    "c": "C at -O2, called by ctypes",
+    "c": "C by ctypes",
 }
 _NEEDS: dict[str, Callable[[], object]] = {
     "onnx": formats.need_onnx,
@@ -49,7 +49,7 @@ def export(
 
     Args:
         run: the run directory.
-        to: onnx, pt2 (a `torch.export` program), aoti (an AOTInductor package) or c (a header, one row a call).
+        to: onnx, pt2 (a `torch.export` program), aoti (an AOTInductor package) or c (a header).
         dtype: float64 or float32.
         output: of the file; RUN/export/<kind> and an ending by default.
         row: the trajectory.
@@ -164,9 +164,7 @@ def parser() -> argparse.ArgumentParser:
         "sheet of parameters, flops, latency and errors beside it.",
     )
     found.add_argument("run", type=Path, help="run directory")
-    found.add_argument(
-        "--to", required=True, choices=tuple(ENDINGS), help="ONNX, torch.export, AOTInductor, C header"
-    )
+    found.add_argument("--to", required=True, choices=tuple(ENDINGS), help="the format")
     found.add_argument("--dtype", default="float64", choices=tuple(_DTYPES))
     found.add_argument("--output", type=Path, help="file; RUN/export/... by default")
     found.add_argument("--row", type=int, default=0, help="trajectory (0)")
