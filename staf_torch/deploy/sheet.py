@@ -1,0 +1,152 @@
+"""What an embedded programmer asks of an exported file, measured here."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import os
+import platform
+import time
+from collections.abc import Callable, Iterator
+
+import torch
+from torch import Tensor
+from torch.export import ExportedProgram
+
+CALLS = 10_000
+_WARM = 500
+
+
+@dataclasses.dataclass(frozen=True)
+class Port:
+    """An input or an output, a row of the batch each."""
+
+    name: str
+    size: int | None  # entries a row; None for a scalar a row
+    unit: str
+    region: str  # where it is meant to be, or what it is
+
+
+@dataclasses.dataclass(frozen=True)
+class Latency:
+    """Wall time of a call with one row, on one core."""
+
+    calls: int
+    median_us: float
+    p99_us: float
+    worst_us: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Work:
+    """One call with one row, by the operations of the program."""
+
+    parameters: int  # constants
+    flops: int  # additions and multiplications one each, a division and a comparison too
+    functions: int  # exp, sin, cos, tanh, sqrt, pow: calls beside the flops
+    bytes_constants: int
+    bytes_in_out: int
+
+
+_FUNCTIONS = {"exp", "expm1", "sin", "cos", "tanh", "sqrt", "rsqrt", "pow", "log", "log1p", "atan", "sigmoid"}
+_FREE = {"view", "slice", "select", "unsqueeze", "squeeze", "expand", "permute", "transpose", "cat", "clone"}
+_FREE |= {"full", "scalar_tensor", "empty", "ones_like", "zeros_like", "full_like", "new_ones", "new_zeros"}
+_FREE |= {
+    "_to_copy",
+    "alias",
+    "split_with_sizes",
+    "getitem",
+    "reshape",
+    "arange",
+    "t",
+    "_unsafe_view",
+    "copy",
+}
+
+
+def work(program: ExportedProgram) -> Work:
+    """What one call costs: a program of `trace`, at one row."""
+    flops = functions = 0
+    for node in program.graph.nodes:
+        out = node.meta.get("val")
+        if node.op != "call_function" or not isinstance(out, Tensor):
+            continue
+        name = getattr(node.target, "_opname", None) or node.target.__name__
+        if name in _FREE:
+            continue
+        if name in _FUNCTIONS:
+            functions += _count(out)
+        elif name in ("mm", "bmm", "addmm"):
+            left = node.args[1 if name == "addmm" else 0].meta["val"]
+            inner = int(left.shape[-1]) if not isinstance(left.shape[-1], torch.SymInt) else 1
+            flops += _count(out) * (2 * inner - 1) + (_count(out) if name == "addmm" else 0)
+        elif name in ("sum", "mean", "prod", "amax", "amin"):
+            flops += _count(node.args[0].meta["val"]) - _count(out)
+        else:
+            flops += _count(out)
+    constants = [
+        t for t in (*program.state_dict.values(), *program.constants.values()) if isinstance(t, Tensor)
+    ]
+    placeholders = [n for n in program.graph.nodes if n.op == "placeholder"]
+    fed = set(program.graph_signature.user_inputs)
+    given = set(program.graph_signature.user_outputs)
+    ends = [n.meta["val"] for n in placeholders if n.name in fed]
+    ends += [n.meta["val"] for n in program.graph.nodes if n.name in given]
+    return Work(
+        parameters=sum(t.numel() for t in constants),
+        flops=flops,
+        functions=functions,
+        bytes_constants=sum(t.numel() * t.element_size() for t in constants),
+        bytes_in_out=sum(_count(t) * t.element_size() for t in ends),
+    )
+
+
+def _count(value: Tensor) -> int:
+    """Entries of a tensor for a batch of one row."""
+    total = 1
+    for size in value.shape:
+        total *= 1 if isinstance(size, torch.SymInt) else int(size)
+    return total
+
+
+def latency(run: Callable[[Tensor], object], x: Tensor, calls: int = CALLS) -> Latency:
+    """Time calls one by one with the input x (1, n), on one core where the system lets us choose."""
+    taken = torch.empty(calls, dtype=torch.float64)
+    with torch.no_grad(), _one_core():
+        for _ in range(_WARM):
+            run(x)
+        for k in range(calls):
+            start = time.perf_counter_ns()
+            run(x)
+            taken[k] = time.perf_counter_ns() - start
+    micro = taken / 1000
+    return Latency(calls, float(micro.median()), float(micro.quantile(0.99)), float(micro.max()))
+
+
+@contextlib.contextmanager
+def _one_core() -> Iterator[None]:
+    if not hasattr(os, "sched_setaffinity"):
+        yield
+        return
+    before = os.sched_getaffinity(0)
+    try:
+        os.sched_setaffinity(0, {max(before)})
+        yield
+    finally:
+        os.sched_setaffinity(0, before)
+
+
+def machine() -> str:
+    """The processor that the latency is of."""
+    with contextlib.suppress(OSError), open("/proc/cpuinfo", encoding="utf-8") as lines:
+        for line in lines:
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
+
+
+def worst_difference(found: tuple[Tensor, ...], wanted: tuple[Tensor, ...]) -> list[float]:
+    """A number an output: the largest |found - wanted|, over the largest |wanted|."""
+    pairs = zip(found, wanted, strict=True)
+    wide = [(a.detach().double(), b.detach().double()) for a, b in pairs]
+    return [float((a - b).abs().max() / b.abs().max()) for a, b in wide]
