@@ -149,7 +149,7 @@ class StaFBasis(nn.Module):
             constant=self.centers.radius.constant,
         )
 
-    def check_reach(self, x: Tensor) -> bool:
+    def check_reach(self, x: Tensor, stacklevel: int = 3) -> bool:
         """Warn, and say so, where the exponential kernel is a poor choice: |x| nu(x) > 1 at a state (..., n).
 
         exp(y'c) then changes by more than e over the ball, with the state and not with V.
@@ -157,13 +157,16 @@ class StaFBasis(nn.Module):
         if self.kernel.log_gain(x) is None:
             return False
         reach = (x.norm(dim=-1) * self.centers.radius(x)).detach()
-        worst = float(torch.where(torch.isfinite(reach), reach, 0.0).max())
+        return self.warn_reach(float(torch.where(torch.isfinite(reach), reach, 0.0).max()), stacklevel + 1)
+
+    def warn_reach(self, worst: float, stacklevel: int = 2) -> bool:
+        """`check_reach` where the largest |x| nu(x) is known."""
         if worst > 1:
             warnings.warn(
                 f"|x| r = {worst:.3g} > 1: around such states {type(self.kernel).__name__} changes by more "
                 "than a factor e within the ball, and the approximation degrades. Shrink the radius, or use "
                 "GaussianKernel, whose accuracy does not depend on the state.",
-                stacklevel=3,
+                stacklevel=stacklevel,
             )
         return worst > 1
 

@@ -151,16 +151,22 @@ def test_a_guard_keeps_the_secant_from_running_away() -> None:
     assert float(excess["secant, guarded"]) < 1e-2 * float(excess["secant"])
 
 
+# At 15 centers the rounding of V(c) alone, half a unit in the last place, is worth 1e-21.
+@pytest.mark.parametrize(("count", "least"), [(3, 1e-22), (6, 1e-22), (10, 1e-22), (15, 1e-19)])
 @pytest.mark.parametrize("x", [(1.0, 0.0), (0.3, -0.9), (-0.7, 0.7)])
-def test_the_exact_law_leaves_no_excess_in_sixty_digits_either(x: tuple[float, float]) -> None:
+def test_the_exact_law_leaves_no_excess_in_sixty_digits_either(
+    x: tuple[float, float], count: int, least: float
+) -> None:
     at = torch.tensor([[x]], dtype=torch.float64)
-    result = chase(at, basis(), TARGET, optim.Exact(), inner_steps=1)
+    result = chase(at, basis(count=count), TARGET, optim.Exact(), inner_steps=1)
     with mpmath.workdps(60):
-        centers = [[mpmath.mpf(value) for value in row] for row in basis().centers(at[0, 0]).tolist()]
+        centers = [
+            [mpmath.mpf(value) for value in row] for row in basis(count=count).centers(at[0, 0]).tolist()
+        ]
         values = mpmath.matrix([a**2 + 5 * b**2 + mpmath.tanh(a * b) for a, b in centers])
         gram = mpmath.matrix([[mpmath.exp(a * c + b * d) for c, d in centers] for a, b in centers])
         error = mpmath.matrix(result.weights[0, 0].tolist()) - mpmath.lu_solve(gram, values)
-        assert (error.T * gram * error)[0] <= 1e-22 * float(result.value) ** 2
+        assert (error.T * gram * error)[0] <= least * float(result.value) ** 2
 
 
 @pytest.mark.parametrize(("law", "predictor"), PAIRS)

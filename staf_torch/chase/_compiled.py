@@ -1,4 +1,4 @@
-"""`_recursion.cpp`, compiled where it is first used and kept in the user's cache."""
+"""C++ beside this file, compiled where it is first used and kept in the user's cache."""
 
 from __future__ import annotations
 
@@ -17,43 +17,50 @@ from collections.abc import Callable
 from pathlib import Path
 
 _log = logging.getLogger(__name__)
-_SOURCE = Path(__file__).with_name("_recursion.cpp")
+_FOLDER = Path(__file__).parent
 _FLAGS = ("-O3", "-march=native", "-std=c++17", "-shared", "-fPIC", "-pthread")
 _COMPILERS = ("g++", "c++", "clang++")
 _SECONDS = 120
 _one_at_a_time = threading.Lock()  # threads of a chase ask for the same at the same time
-_said: list[str] = []  # reasons so far, the first of them logged
+_said: set[str] = set()  # what has been logged
 
 
 @functools.cache
-def compiled(real: str) -> Callable[[object], None] | None:
-    """The recursion in the C type ``real``; None where it cannot be built, said once in the log."""
+def compiled(name: str, *definitions: str) -> Callable[..., None] | None:
+    """The function ``staf_<name>`` of ``_<name>.cpp``; None where it cannot be built, said once in the log.
+
+    Args:
+        name: of the source.
+        definitions: of the preprocessor, NAME=value: what is built is for these alone, and built in about
+            a second.
+    """
     try:
         with _one_at_a_time:
-            library = ctypes.CDLL(str(_library(real)))
-        call: Callable[[object], None] = library.staf_recursion
+            library = ctypes.CDLL(str(_library(name, definitions)))
+        call: Callable[..., None] = library[f"staf_{name}"]
         call.restype = None  # type: ignore[attr-defined]
     except Exception as error:  # whatever a machine lacks, the reference computes the same
-        _say(" ".join(str(error).split())[:200])
+        _say(name, " ".join(str(error).split())[:300])
         return None
     return call
 
 
-def _say(reason: str) -> None:
+def _say(name: str, reason: str) -> None:
     with _one_at_a_time:
-        first = not _said
-        _said.append(reason)
+        first = name not in _said
+        _said.add(name)
     if first:
-        _log.warning("the weight recursion runs in plain torch, slower: no compiled one (%s)", reason)
+        _log.warning("the %s of a chase runs in plain torch, slower: nothing compiled (%s)", name, reason)
 
 
-def _library(real: str) -> Path:
+def _library(name: str, definitions: tuple[str, ...]) -> Path:
     """The path of the shared object, built if it is not in the cache."""
     compiler = next(filter(None, map(shutil.which, (os.environ.get("CXX", ""), *_COMPILERS))), None)
     if compiler is None:
         raise FileNotFoundError(f"none of {', '.join(_COMPILERS)} is on the path")
-    command = [compiler, *_FLAGS, f"-DREAL={real}", str(_SOURCE)]
-    path = _cache() / f"recursion-{real}-{_key(command)}.so"
+    source = _FOLDER / f"_{name}.cpp"
+    command = [compiler, *_FLAGS, *(f"-D{each}" for each in definitions), str(source)]
+    path = _cache() / f"{name}-{_key(command)}.so"
     if not path.exists():
         # Under a name of its own first: another process may be building the same.
         with tempfile.TemporaryDirectory(dir=path.parent) as scratch:
@@ -66,7 +73,7 @@ def _library(real: str) -> Path:
 def _key(command: list[str]) -> str:
     """What the machine code depends on: the source, the command, the compiler and the processor."""
     version = _run([command[0], "--version"])
-    sources = (_SOURCE.read_text(), _SOURCE.with_name("_block.hpp").read_text())
+    sources = [path.read_text() for path in sorted((Path(command[-1]), *_FOLDER.glob("_*.hpp")))]
     parts = (*sources, *command, version, platform.platform(), _processor())
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:16]
 

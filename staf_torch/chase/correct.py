@@ -1,4 +1,4 @@
-"""The weight recursion of a piece of time: fused where that is wanted and can run, else the reference."""
+"""The weight recursion of a piece of time: fused where it can run, else the reference."""
 
 from __future__ import annotations
 
@@ -7,16 +7,14 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ..basis import GramStructure
+from ..basis import GramStructure, StaFBasis, Target
 from ..objective import Known
 from ..optim.base import UpdateLaw
-from .fused import History, fused, fusible
+from ..targets import Formula
+from ._pages import fresh
+from .fused import History, built, evaluator, fused, fusible
+from .native import NativeStructure, formula_of, native_structure
 from .recursion import Carry, Recursion, recursion
-
-# `chase` keeps the reference: the first build of the fused recursion takes longer than most chases, and a
-# rule by size would let a trajectory's rounding depend on how many run beside it. `chase_weights` is always
-# fused where it can be.
-_FUSE_CHASE = False
 
 
 class Dense(NamedTuple):
@@ -26,9 +24,52 @@ class Dense(NamedTuple):
     log_gain: Tensor  # g(x_k), (B, C)
 
 
+class Native(NamedTuple):
+    """What the fused recursion finds by itself from the states; None: what it reads from tensors."""
+
+    structure: NativeStructure | None = None
+    formula: Formula | None = None
+
+
+def native(
+    states: Tensor, basis: StaFBasis, target: Target, law: UpdateLaw, inner_steps: int, carry: Carry
+) -> Native:
+    """What it finds by itself of these states (B, C, n), basis and target; nothing where it cannot run."""
+    if not fusible(law, inner_steps, (states, carry.weights, carry.log_gain)):
+        return Native()
+    structure = native_structure(basis, states)
+    if structure is None or not fusible(law, inner_steps, (states, structure.core, structure.offsets)):
+        return Native()
+    if built(states.dtype, basis.count, shared=True) is None:
+        return Native()
+    formula = formula_of(target, basis.dim)
+    if formula is not None and evaluator(formula, states.dtype, basis.dim) is None:
+        formula = None
+    return Native(structure, formula)
+
+
+def runs_fused(
+    states: Tensor,
+    structure: GramStructure | NativeStructure,
+    values: Tensor | Formula,
+    law: UpdateLaw,
+    inner_steps: int,
+    carry: Carry,
+) -> bool:
+    """Whether `fused` computes this and is at hand."""
+    given = [states, carry.weights, carry.log_gain]
+    given += [part for part in (*structure, values) if isinstance(part, Tensor)]
+    if not fusible(law, inner_steps, given):
+        return False
+    core = structure.core
+    return built(states.dtype, core.shape[-1], shared=core.dim() == 2) is not None
+
+
 def correct(
+    states: Tensor,
     structure: GramStructure,
     values: Tensor,
+    own: Native,
     law: UpdateLaw,
     inner_steps: int,
     carry: Carry,
@@ -38,19 +79,22 @@ def correct(
     """Correct the weights at every time of a piece (B, C), see `recursion`.
 
     Args:
+        states: x_k, (B, C, n).
         structure: the factors of K(c(x_k)), (B, C).
         values: V(c(x_k)), (B, C, M).
+        own: what need not be read from these two.
         law: the update law.
         inner_steps: iterations a time.
         carry: from the piece before.
         known: of the objectives, what the law needs, (B, C, ...).
         whole: `dense` of the structure, where it is at hand.
     """
-    given = (*structure, values, carry.weights, carry.log_gain)
-    if _FUSE_CHASE and fusible(law, inner_steps, given):
-        before, after = _batch_last(values), _batch_last(values)
-        carry = fused(structure, values, inner_steps, carry, History(before, after))
-        return Recursion(before.permute(2, 0, 1), after.permute(2, 0, 1), carry)
+    factors, sampled = own.structure or structure, own.formula or values
+    if runs_fused(states, factors, sampled, law, inner_steps, carry):
+        batch, times, count = values.shape
+        before, after = (fresh(values, times, count, batch) for _ in range(2))
+        end = fused(states, factors, sampled, inner_steps, carry, History(before, after))
+        return Recursion(before.permute(2, 0, 1), after.permute(2, 0, 1), end)
     whole = dense(structure, values) if whole is None else whole
     return recursion(whole.gram, values, whole.log_gain, law, inner_steps, carry, known)
 
@@ -59,33 +103,6 @@ def dense(structure: GramStructure, values: Tensor) -> Dense:
     """The matrices of a piece with the values (B, C, M), every time its own."""
     gram, gain = structure.scaled().expand(*values.shape, values.shape[-1]), structure.log_gain
     return Dense(gram, values.new_zeros(values.shape[:2]) if gain is None else gain)
-
-
-def correct_weights(
-    structure: GramStructure,
-    values: Tensor,
-    law: UpdateLaw,
-    inner_steps: int,
-    carry: Carry,
-    into: Tensor | None,
-    known: Known = Known(),  # noqa: B008
-    whole: Dense | None = None,
-) -> tuple[Tensor | None, Carry]:
-    """As `correct`, and only the paper's w comes back, (C, M, B): ``into`` itself from the fused recursion.
-
-    Args:
-        into: (C, M, B) contiguous; None where nobody wants the history.
-        known, whole: as in `correct`.
-    """
-    given = (*structure, values, carry.weights, carry.log_gain)
-    if fusible(law, inner_steps, given):
-        carry = fused(structure, values, inner_steps, carry, History(recorded=into))
-        return into, carry
-    run = correct(structure, values, law, inner_steps, carry, known, whole)
-    if into is None:
-        return None, run.carry
-    recorded = run.after * paper_units(structure, run.carry, values.shape[1])
-    return recorded.permute(1, 2, 0), run.carry
 
 
 def last_weights(carry: Carry) -> Tensor:
@@ -110,7 +127,3 @@ def lost(carry: Carry, times: int) -> Tensor:
     index = torch.arange(carry.time - times, carry.time, device=carry.diverged_at.device)
     end = carry.diverged_at.unsqueeze(-1)
     return (end >= 0) & (index >= end)
-
-
-def _batch_last(values: Tensor) -> Tensor:
-    return values.new_empty(values.shape[1], values.shape[2], values.shape[0])

@@ -14,7 +14,7 @@ from ..basis import StaFBasis, Target
 from ..objective import Known, NativeError
 from ..optim.base import UpdateLaw
 from .certificate import Certificate, certify
-from .correct import Dense, correct, dense, lost, paper_units
+from .correct import Dense, correct, dense, lost, native, paper_units
 from .known import known as find_known
 from .known import state_row
 from .predictors import Predictor
@@ -137,7 +137,8 @@ def _piece(
     known = find_known(law.needs, space, gram, ideal, scale * row, value)
 
     if predictor is None:
-        run = correct(structure, values, law, inner_steps, carry, known, whole)
+        own = native(states, basis, target, law, inner_steps, carry)
+        run = correct(states, structure, values, own, law, inner_steps, carry, known, whole)
     else:
         assert whole is not None
         run = _predicted(predictor, basis, target, states, whole, values, law, inner_steps, carry, known)

@@ -1,13 +1,15 @@
 """The sequential part of a gradient chase for the paper's law on the CPU: one call a piece of time.
 
 It computes what `recursion` defines, to rounding: g <- g - 2 lambda K g in place of a new residual an
-iteration, one product with K in place of two, all of it in registers with trajectories as lanes.
+iteration, one product with K in place of two, all of it in registers with trajectories as lanes. What the
+weights do not touch, e^{s(x, d)}, g(x) and V at the centers, it finds a cacheful at a time from the states,
+where a formula is known, and else reads from tensors.
 """
 
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 import torch
@@ -16,8 +18,10 @@ from torch.autograd import forward_ad
 
 from ..basis import GramStructure
 from ..optim import SteepestDescent, UpdateLaw
+from ..targets import Formula
 from ._compiled import compiled
-from ._workers import openmp
+from ._openmp import openmp
+from .native import NativeStructure
 from .recursion import Carry
 
 _REALS = {torch.float32: "float", torch.float64: "double"}
@@ -32,13 +36,18 @@ class _Array(ctypes.Structure):
 
 class _Problem(ctypes.Structure):
     _fields_ = (
-        *((n, ctypes.c_int64) for n in ("batch", "times", "count", "inner_steps", "start", "threads")),
+        *((n, ctypes.c_int64) for n in ("batch", "times", "dim", "inner_steps", "start", "threads")),
         ("core", ctypes.c_void_p),
         *((n, ctypes.c_int64) for n in ("core_row", "core_time", "core_i", "core_j")),
+        ("states", _Array),
+        ("offsets", ctypes.c_void_p),
+        ("exponential", ctypes.c_int64),
+        ("evaluate", ctypes.c_void_p),
+        ("parameters", ctypes.c_void_p),
         ("values", _Array),
         ("log_scale", _Array),
         ("log_gain", _Array),
-        *((n, ctypes.c_void_p) for n in ("last_gain", "weights", "diverged_at", "before", "after")),
+        *((n, ctypes.c_void_p) for n in ("most", "last_gain", "weights", "diverged_at", "before", "after")),
         *((name, ctypes.c_int64) for name in ("history_time", "history_entry", "papers")),
         ("parallel", ctypes.c_void_p),
     )
@@ -60,7 +69,6 @@ def fusible(law: UpdateLaw, inner_steps: int, tensors: Iterable[Tensor | None]) 
         and inner_steps > 0
         and not torch.compiler.is_compiling()
         and all(_plain(tensor, given[0].dtype) for tensor in given)
-        and compiled(_REALS[given[0].dtype]) is not None
     )
 
 
@@ -76,40 +84,96 @@ def _plain(tensor: Tensor, dtype: torch.dtype) -> bool:
     )
 
 
+def built(dtype: torch.dtype, count: int, *, shared: bool) -> Callable[..., None] | None:
+    """The compiled recursion for this many centers, None where there is none.
+
+    Args:
+        dtype: of all tensors.
+        count: M.
+        shared: whether one K0 serves all states.
+    """
+    real, one = _REALS[dtype], str(shared).lower()
+    return compiled("recursion", f"REAL={real}", f"COUNT={count}", f"SHARED={one}")
+
+
+def evaluator(formula: Formula, dtype: torch.dtype, dim: int) -> Callable[..., None] | None:
+    """The compiled formula of a target, None where it cannot be built."""
+    return compiled("target", f"REAL={_REALS[dtype]}", f"DIM={dim}", f"FORMULA={formula.expression}")
+
+
 def fused(
-    structure: GramStructure, values: Tensor, inner_steps: int, carry: Carry, history: History
+    states: Tensor,
+    structure: GramStructure | NativeStructure,
+    values: Tensor | Formula,
+    inner_steps: int,
+    carry: Carry,
+    history: History,
+    most: Tensor | None = None,
 ) -> Carry:
     """Correct the weights at every time of a piece, and write what ``history`` asks for.
 
     Args:
-        structure: the Gram factors of the piece, (B, C).
-        values: V(c(x_k)), (B, C, M).
+        states: x, (B, C, n).
+        structure: the Gram factors of the piece, (B, C), or those of all states.
+        values: V(c(x_k)), (B, C, M), or the formula of V, which goes with a `NativeStructure`.
         inner_steps: iterations a time, at least 1.
         carry: from the piece before, left as it is.
         history: written.
+        most: (1,), written where g(x) is found here: the largest of it that is finite.
     """
-    batch, times, count = values.shape
-    log_scale, log_gain = structure.log_scale, structure.log_gain
+    batch, times, dim = states.shape
+    count = structure.core.shape[-1]
+    problem = _Problem(batch=batch, times=times, dim=dim, inner_steps=inner_steps, start=carry.time)
+    problem.threads, problem.parallel = torch.get_num_threads(), _parallel()
+    held: list[object] = [states, structure.core, values]  # what the problem points to
     core = structure.core.expand(batch, times, count, count)
+    problem.core = core.data_ptr()
+    problem.core_row, problem.core_time, problem.core_i, problem.core_j = core.stride()
+    problem.states = _array(states)
+    has_gain = _structure(problem, structure, (batch, times, count), held)
+    if isinstance(values, Tensor):
+        problem.values = _array(values)
+    else:
+        evaluate = evaluator(values, states.dtype, dim)
+        parameters = torch.tensor(values.parameters, dtype=states.dtype)
+        held += [evaluate, parameters]
+        problem.evaluate = ctypes.cast(evaluate, ctypes.c_void_p).value  # type: ignore[arg-type]
+        problem.parameters = parameters.data_ptr()
+    most = states.new_zeros(1) if most is None else most
+    problem.most = most.data_ptr()
     # In and out, so copies: a result of the piece before may share them.
     weights, last_gain, diverged_at = map(_copy, (carry.weights.mT, carry.log_gain, carry.diverged_at))
+    problem.weights, problem.diverged_at = weights.data_ptr(), diverged_at.data_ptr()
+    problem.last_gain = last_gain.data_ptr() if has_gain else None
     after = history.after if history.recorded is None else history.recorded
-    problem = _Problem(
-        *(batch, times, count, inner_steps, carry.time, torch.get_num_threads()),
-        *(core.data_ptr(), *core.stride()),
-        _array(values),
-        _array(None if log_scale is None else log_scale.expand(values.shape)),
-        _array(None if log_gain is None else log_gain.expand(batch, times).unsqueeze(-1)),
-        None if log_gain is None else last_gain.data_ptr(),
-        *(weights.data_ptr(), diverged_at.data_ptr(), _pointer(history.before), _pointer(after)),
-        *((0, 0) if after is None else after.stride()[:2]),
-        *(history.recorded is not None, _parallel()),
-    )
-    solve = compiled(_REALS[values.dtype])
+    problem.before, problem.after = _pointer(history.before), _pointer(after)
+    problem.papers = history.recorded is not None
+    if after is not None:
+        problem.history_time, problem.history_entry = after.stride()[:2]
+    solve = built(states.dtype, count, shared=structure.core.dim() == 2)
     assert solve is not None
     solve(ctypes.byref(problem))
-    time = carry.time + times
-    return carry._replace(weights=weights.mT, log_gain=last_gain, time=time, diverged_at=diverged_at)
+    return carry._replace(
+        weights=weights.mT, log_gain=last_gain, time=carry.time + times, diverged_at=diverged_at
+    )
+
+
+def _structure(
+    problem: _Problem,
+    structure: GramStructure | NativeStructure,
+    shape: tuple[int, int, int],
+    held: list[object],
+) -> bool:
+    """Enter what is beside K0; whether the weights have a unit."""
+    if isinstance(structure, NativeStructure):
+        offsets = structure.offsets.contiguous()
+        held.append(offsets)
+        problem.offsets, problem.exponential = offsets.data_ptr(), structure.exponential
+        return structure.exponential
+    log_scale, log_gain = structure.log_scale, structure.log_gain
+    problem.log_scale = _array(None if log_scale is None else log_scale.expand(shape))
+    problem.log_gain = _array(None if log_gain is None else log_gain.expand(shape[:2]).unsqueeze(-1))
+    return log_gain is not None
 
 
 def _copy(tensor: Tensor) -> Tensor:

@@ -10,19 +10,18 @@ from torch import Tensor
 from .._checks import fail, integer
 from ..basis import GramStructure, StaFBasis, Target
 from ..objective import Known
-from ..optim import SteepestDescent, UpdateLaw
-from ._workers import Workers, thread_count
-from .correct import Dense, correct_weights, dense, last_weights
+from ..optim.base import UpdateLaw
+from ._pages import fresh
+from .correct import Dense, Native, dense, last_weights, native, paper_units, runs_fused
 from .engine import chunk_length
+from .fused import History, fused
 from .known import known, state_row
-from .layout import batch_last, library_only
-from .recursion import Carry
+from .native import NativeStructure
+from .recursion import Carry, recursion
 from .result import ChaseWeights
 from .start import check_law, check_states, start
 
 _PIECE_BYTES = 2**20  # of V at the centers: a piece and what it is made from stay in the inner caches
-_ROWS = 4096  # trajectories a block
-_FEW_ROWS = 64  # fewer are one block
 
 
 def chase_weights(
@@ -38,9 +37,9 @@ def chase_weights(
 ) -> ChaseWeights:
     """The weights of `chase`, and nothing that follows from them: several times faster.
 
-    Rows are shared out to threads, as many as torch has, where the law is the paper's and the target, the
-    kernel and the radius are the library's own. Anything else is called from this thread alone and with
-    all rows at once: a callable of yours may keep state, or hold a number a row.
+    Fastest with the paper's law, a constant radius and a target that gives its `targets.Formula`: the states
+    are then read and the weights written once, and nothing else reaches memory. A callable of yours is called
+    with some times of all rows at once; `torch.compile` makes it one pass.
 
     Example:
         >>> pieces = systems.trajectory(systems.Oscillator(), x0, dt=0.01, steps=10**6, chunk=100)
@@ -62,110 +61,92 @@ def chase_weights(
     check_law("chase_weights", law)
     if predictor is not None:
         raise fail("chase_weights", "predictor", "must be None; `chase` has predictors", predictor)
-    apart = type(law) is SteepestDescent and library_only(basis, target)
-    threads = thread_count() if apart else 1
-    blocks: list[_Block] = []
+    run: _Run | None = None
     recorded: list[Tensor] = []  # (C, M, B) a piece
-    warned = False
-    with Workers(threads) as workers:
-        for piece in [states] if isinstance(states, Tensor) else states:
-            check_states("chase_weights", piece, basis)
-            warned = warned or basis.check_reach(piece)
-            height = _height(piece, basis, threads) if apart else piece.shape[0]
-            if not blocks:
-                carry = start("chase_weights", piece, basis, law, weights)
-                blocks = [_Block(basis, target, law, inner_steps, part) for part in _split(carry, height)]
-            # The room of the whole piece at once, so that every number is written once, where it stays.
-            shape = (piece.shape[1], basis.count, piece.shape[0])
-            room = piece.detach().new_empty(shape) if history else None
-            rooms = [None] * len(blocks) if room is None else list(room.split(height, dim=2))
-            found = workers.map(_Block.advance, blocks, piece.split(height), rooms)
-            if room is not None:
-                recorded.append(room if all(part is None for part in found) else _joined(found, rooms))
-    if not blocks:
+    for piece in [states] if isinstance(states, Tensor) else states:
+        check_states("chase_weights", piece, basis)
+        if run is None:
+            run = _Run(basis, target, law, inner_steps, start("chase_weights", piece, basis, law, weights))
+        recorded += run.advance(piece, history)
+    if run is None:
         raise ValueError("`chase_weights(states=...)` must have at least one piece of time; got none.")
-    diverged_at = torch.cat([block.carry.diverged_at for block in blocks])
     if history:
         joined = recorded[0] if len(recorded) == 1 else torch.cat(recorded)
-        return ChaseWeights(joined.permute(2, 0, 1), diverged_at)
-    last = torch.cat([last_weights(block.carry) for block in blocks])
-    return ChaseWeights(last.unsqueeze(1), diverged_at)
+        return ChaseWeights(joined.permute(2, 0, 1), run.carry.diverged_at)
+    return ChaseWeights(last_weights(run.carry).unsqueeze(1), run.carry.diverged_at)
 
 
-class _Block:
-    """Some rows on their way through time."""
+class _Run:
+    """All rows on their way through time."""
 
     def __init__(
         self, basis: StaFBasis, target: Target, law: UpdateLaw, inner_steps: int, carry: Carry
     ) -> None:
         self._basis, self._target, self._law, self._inner_steps = basis, target, law, inner_steps
-        self._own = library_only(basis, target)
-        self.carry = carry
+        self.carry, self._warned = carry, False
 
-    def advance(self, states: Tensor, room: Tensor | None) -> Tensor | None:
-        """Through the states (B, C, n): the weights (C, M, B), or None if they are in the room."""
-        size = states.shape[0] * states.element_size()
-        longest = min(
-            chunk_length(states.shape[0], self._basis, states.element_size()),
-            _PIECE_BYTES // (size * self._basis.count),
-        )
+    def advance(self, states: Tensor, history: bool) -> list[Tensor]:
+        """Through the states (B, C, n): the paper's weights (C, M, B) in parts; none without history."""
+        own = native(states, self._basis, self._target, self._law, self._inner_steps, self.carry)
+        batch, times, _ = states.shape
+        # The room of the whole piece at once, so that every number is written once, where it stays.
+        room = fresh(states, times, self._basis.count, batch) if history else None
+        most = states.new_zeros(1)
         found, done = [], 0
-        for piece in states.split(max(1, longest), dim=1):
-            at = batch_last(piece) if self._own else piece
-            structure, values = self._basis.gram_structure(at), self._basis.values(at, self._target)
+        for at in states.split(times if own.formula else self._longest(states), dim=1):
             into = None if room is None else room[done : done + at.shape[1]]
-            part, self.carry = correct_weights(
-                structure,
-                values,
-                self._law,
-                self._inner_steps,
-                self.carry,
-                into,
-                *self._needed(at, structure, values),
-            )
+            part = self._piece(at, own, into, most)
             done += at.shape[1]
             found.append((part, into))
-        if room is None or all(part is into for part, into in found):
-            return None
-        return torch.cat([part for part, _ in found if part is not None])
+        self._check_reach(states, own, most)
+        if room is None:
+            return []
+        if all(part is into for part, into in found):
+            return [room]
+        return [part for part, _ in found if part is not None]
 
-    def _needed(self, at: Tensor, structure: GramStructure, values: Tensor) -> tuple[Known, Dense | None]:
-        """What the law needs beside the structure of a piece."""
+    def _check_reach(self, states: Tensor, own: Native, most: Tensor) -> None:
+        """Warn once of centers beyond the kernel's reach; the fused recursion has seen the largest x'x."""
+        if self._warned:
+            return
+        if own.structure is not None and own.structure.exponential:
+            worst = self._basis.centers.radius(states[0, 0]) * most.sqrt()
+            self._warned = self._basis.warn_reach(float(worst), stacklevel=5)
+        else:
+            self._warned = self._basis.check_reach(states, stacklevel=5)
+
+    def _longest(self, states: Tensor) -> int:
+        """Times a piece, where torch computes what depends on the states."""
+        batch, size = states.shape[0], states.element_size()
+        cached = _PIECE_BYTES // (batch * size * self._basis.count)
+        return max(1, min(chunk_length(batch, self._basis, size), cached))
+
+    def _piece(self, at: Tensor, own: Native, into: Tensor | None, most: Tensor) -> Tensor | None:
+        """Through the states (B, C, n): the weights (C, M, B), ``into`` itself from the fused recursion."""
+        law, steps, carry = self._law, self._inner_steps, self.carry
+        values = own.formula or self._basis.values(at, self._target)
+        structure: NativeStructure | GramStructure | None = own.structure
+        if structure is None or not runs_fused(at, structure, values, law, steps, carry):
+            structure = self._basis.gram_structure(at)
+        if runs_fused(at, structure, values, law, steps, carry):
+            self.carry = fused(at, structure, values, steps, carry, History(recorded=into), most)
+            return into
+        assert isinstance(structure, GramStructure)
+        assert isinstance(values, Tensor)
+        needed, whole = self._needed(at, structure, values)
+        run = recursion(whole.gram, values, whole.log_gain, law, steps, carry, needed)
+        self.carry = run.carry
+        if into is None:
+            return None
+        return (run.after * paper_units(structure, run.carry, at.shape[1])).permute(1, 2, 0)
+
+    def _needed(self, at: Tensor, structure: GramStructure, values: Tensor) -> tuple[Known, Dense]:
+        """What the law needs beside the structure of a piece, and that as matrices."""
+        whole = dense(structure, values)
         if not self._law.needs:
-            return Known(), None
-        space, whole = self._basis.local(at), dense(structure, values)
+            return Known(), whole
+        space = self._basis.local(at)
         ideal = space.scaled_weights(space.fit(values))
         row = state_row(self._basis, at, space)
         row = row if structure.scale is None else structure.scale * row
         return known(self._law.needs, space, whole.gram, ideal, row, self._target(at)), whole
-
-
-def _joined(found: list[Tensor | None], rooms: list[Tensor | None]) -> Tensor:
-    """Blocks of rows (C, M, B) side by side, each as it came back or in its room."""
-    parts = [room if part is None else part for part, room in zip(found, rooms, strict=True)]
-    return torch.cat([part for part in parts if part is not None], dim=2)
-
-
-def _height(states: Tensor, basis: StaFBasis, threads: int) -> int:
-    """Rows a block; all of them where a hyperparameter has a value a row."""
-    modules = (basis.kernel, basis.centers.radius)
-    held = [held for module in modules for held in (*module.parameters(), *module.buffers())]
-    batch = states.shape[0]
-    if any(each.dim() > 0 for each in held) or batch < _FEW_ROWS:
-        return batch
-    return min(_ROWS, -(-batch // threads))
-
-
-def _split(carry: Carry, height: int) -> list[Carry]:
-    """The carries of blocks of rows, each with memory of its own."""
-    batch = carry.diverged_at.shape[0]
-    return [
-        Carry(
-            carry.weights[at].clone(),
-            tuple(part[at].clone() for part in carry.law_state),
-            carry.log_gain[at].clone(),
-            carry.time,
-            carry.diverged_at[at].clone(),
-        )
-        for at in (slice(first, first + height) for first in range(0, batch, height))
-    ]

@@ -1,8 +1,9 @@
-"""The speed of the gradient chase beside JAX and numba: `python tests/benchmarks/chase.py [--json FILE]`.
+"""The speed of the gradient chase beside JAX, numba and torch.compile: `python tests/benchmarks/chase.py`.
 
 Every program does the same work in the same run: states given, V at the centers, the Gram structure, ten
-iterations, the weights of every time returned; exponential kernel, the paper's V, rings. The rounds of
-the programs alternate, and a speed is the median of five. Peers that are not installed are skipped by name.
+iterations, the weights of every time returned; exponential kernel, the paper's V, rings. The rounds of the
+programs alternate, and a speed is the median of five. Peers that are not installed are skipped by name
+(extra `bench` installs them). Prints the tables, and writes all numbers to runs/benchmarks/chase.json.
 """
 
 from __future__ import annotations
@@ -12,10 +13,10 @@ import json
 import os
 import platform
 import statistics
-import subprocess
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,13 +26,18 @@ import torch
 ROOT = Path(__file__).parents[2]
 sys.path[:0] = [str(ROOT), str(Path(__file__).parent)]
 
+import scaling  # noqa: E402
+
 import staf_torch as st  # noqa: E402
 
 ROUNDS = 5
 INNER_STEPS = 10
 RADIUS = 0.1
-STEPS = {3: 2e6, 6: 1e6, 15: 2e5}  # centers: trajectory-steps a measurement
-MEMORY_BATCH, MEMORY_TIMES = 100_000, (200, 2000)
+STEPS = {3: 1e6, 6: 1e6, 15: 2e5}  # centers: trajectory-steps a measurement
+COMPILED_TIMES = 1000  # torch.compile of one step pays its overhead a time: more would only take longer
+OURS = {"staf_torch": "formula", "V in Python": "Python", "V compiled": "torch.compile"}
+NAMED = ("JAX jit(vmap(scan))", "JAX components, unrolled")  # the two programs that issue 4 names
+Program = tuple[Callable[[], Any], int]  # what to call, times
 
 
 def states(batch: int, times: int, dtype: torch.dtype) -> torch.Tensor:
@@ -46,12 +52,23 @@ def basis(count: int) -> st.StaFBasis:
     return st.StaFBasis(st.ExponentialKernel(), st.StateFollowingCenters(st.rings(count), RADIUS))
 
 
-def ours(x: torch.Tensor, count: int) -> Callable[[], np.ndarray]:
-    at, target, law = basis(count), st.targets.Paper(), st.optim.SteepestDescent()
-    return lambda: st.chase_weights(x, at, target, law, inner_steps=INNER_STEPS).weights.numpy()
+def users_value(x: torch.Tensor) -> torch.Tensor:
+    """The paper's V as a user writes it."""
+    x1, x2 = x[..., 0], x[..., 1]
+    return x1**2 + 5 * x2**2 + torch.tanh(x1 * x2)
 
 
-def jax_programs(x: torch.Tensor, count: int) -> dict[str, Callable[[], Any]]:
+def ours(x: torch.Tensor, count: int) -> dict[str, Program]:
+    at, law = basis(count), st.optim.SteepestDescent()
+    values = (st.targets.Paper(), users_value, torch.compile(users_value, dynamic=True))
+
+    def run(value: Callable[[torch.Tensor], torch.Tensor]) -> np.ndarray:
+        return st.chase_weights(x, at, value, law, inner_steps=INNER_STEPS).weights.numpy()
+
+    return {name: (partial(run, value), x.shape[1]) for name, value in zip(OURS, values, strict=True)}
+
+
+def jax_programs(x: torch.Tensor, count: int) -> dict[str, Program]:
     import jax
     import peer_jax
 
@@ -62,21 +79,35 @@ def jax_programs(x: torch.Tensor, count: int) -> dict[str, Callable[[], Any]]:
         return lambda: jax.block_until_ready(program(given))
 
     found = peer_jax.programs(offsets, INNER_STEPS)
-    return {f"JAX {name}": call(f, last if batch_last else rows) for name, (f, batch_last) in found.items()}
+    return {
+        f"JAX {n}": (call(f, last if batch_last else rows), x.shape[1])
+        for n, (f, batch_last) in found.items()
+    }
 
 
-def numba_programs(x: torch.Tensor, count: int) -> dict[str, Callable[[], Any]]:
+def numba_programs(x: torch.Tensor, count: int) -> dict[str, Program]:
     import peer_numba
 
     d = (RADIUS * st.rings(count)).to(x.dtype).numpy()
-    given, core = x.numpy(), np.exp(d @ d.T)
-    return {"numba scalar loops": lambda: peer_numba.chase(given, d, core, INNER_STEPS)}
+    rows, last, core = x.numpy(), x.permute(1, 2, 0).contiguous().numpy(), np.exp(d @ d.T)
+    return {
+        "numba loops": (lambda: peer_numba.chase(rows, d, core, INNER_STEPS), x.shape[1]),
+        "numba blocks": (lambda: peer_numba.chase_blocks(last, d, core, INNER_STEPS), x.shape[1]),
+    }
+
+
+def compiled_programs(x: torch.Tensor, count: int) -> dict[str, Program]:
+    import peer_torch
+
+    given = x[:, :COMPILED_TIMES].permute(1, 2, 0).contiguous()
+    run = peer_torch.program((RADIUS * st.rings(count)).to(x), INNER_STEPS, x.shape[0])
+    return {"torch.compile of a step": (lambda: run(given), len(given))}
 
 
 def as_rows(result: Any) -> np.ndarray:
-    """Whatever layout a program returns, as (B, T, M)."""
+    """The first two times of whatever a program returns, as (B, 2, M); all but ours may have the batch last."""
     if isinstance(result, list):  # components, (T, B) each
-        return np.stack([np.asarray(part) for part in result]).transpose(2, 1, 0)
+        return np.stack([np.asarray(part[:2]) for part in result]).transpose(2, 1, 0)
     return np.asarray(result)
 
 
@@ -84,61 +115,36 @@ def case(count: int, dtype: torch.dtype, batch: int) -> dict[str, Any]:
     """Millions of trajectory-steps a second of every program, and how far it is from ours."""
     times = max(2, int(STEPS[count] * (0.1 if batch == 1 else 1)) // batch)
     x = states(batch, times, dtype)
-    programs = {"staf_torch": ours(x, count)}
-    for peers in (jax_programs, numba_programs):
+    programs = ours(x, count)
+    for peers in (jax_programs, numba_programs, compiled_programs):
         try:
             programs |= peers(x, count)
         except ModuleNotFoundError as error:
             print(f"skipped: {peers.__name__.split('_')[0]} ({error})", file=sys.stderr)
-    want = programs["staf_torch"]()
+    want = programs["staf_torch"][0]()[:, :2]
     apart, seconds = {}, {name: [] for name in programs}
-    for name, program in programs.items():
+    for name, (program, _) in programs.items():
         got = as_rows(program())
-        got = got if got.shape == want.shape else got.transpose(2, 0, 1)
-        apart[name] = float(np.abs(got[:, :2] - want[:, :2]).max() / np.abs(want).max())
+        got = got[:, :2] if got.shape[0] == batch and got.shape[2] == count else got[:2].transpose(2, 0, 1)
+        apart[name] = float(np.abs(got - want).max() / np.abs(want).max())
     for _ in range(ROUNDS):
-        for name, program in programs.items():
+        for name, (program, _) in programs.items():
             start = time.perf_counter()
             program()
             seconds[name].append(time.perf_counter() - start)
-    speed = {name: batch * times / statistics.median(each) / 1e6 for name, each in seconds.items()}
+    speed = {n: batch * programs[n][1] / statistics.median(each) / 1e6 for n, each in seconds.items()}
     return {"M": count, "dtype": str(dtype)[6:], "B": batch, "T": times, "speed": speed, "apart": apart}
 
 
 def row(found: dict[str, Any]) -> str:
-    speed = found["speed"]
-    best = max((name for name in speed if name.startswith("JAX")), key=speed.__getitem__, default=None)
-    loops = speed.get("numba scalar loops")
-    cells = [str(found["M"]), found["dtype"], str(found["B"]), f"{speed['staf_torch']:.2f}"]
-    cells += (
-        [f"{speed[best]:.2f}", best[4:], f"{speed['staf_torch'] / speed[best]:.1f}"] if best else ["-"] * 3
-    )
-    cells += [f"{loops:.2f}", f"{speed['staf_torch'] / loops:.1f}"] if loops else ["-"] * 2
-    return "| " + " | ".join(cells) + " |"
-
-
-def memory(times: int) -> dict[str, float]:
-    """Growth of the peak memory (MiB) and the time (s) of a long chase in pieces without history."""
-    done = subprocess.run(
-        [sys.executable, __file__, "--memory-of", str(times)], capture_output=True, text=True, check=True
-    )
-    found: dict[str, float] = json.loads(done.stdout)
-    return found
-
-
-def memory_of(times: int) -> dict[str, float]:
-    import resource
-
-    def peak() -> float:
-        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-
-    law, target = st.optim.SteepestDescent(), st.targets.Paper()
-    x0 = states(MEMORY_BATCH, 2, torch.float64)[:, 0]
-    st.chase_weights(x0[:8, None].clone(), basis(3), target, law)  # loads what a chase loads
-    before, start = peak(), time.perf_counter()
-    pieces = st.systems.trajectory(st.systems.Oscillator(), x0, dt=0.01, steps=times - 1, chunk=4)
-    st.chase_weights(pieces, basis(3), target, law, history=False)
-    return {"T": times, "MiB": peak() - before, "seconds": time.perf_counter() - start}
+    speed, own = found["speed"], found["speed"]["staf_torch"]
+    jax = [name for name in speed if name.startswith("JAX")]
+    best, named = max(jax, key=speed.__getitem__, default=""), [speed[n] for n in NAMED if n in speed]
+    cells = [str(found["M"]), found["dtype"], str(found["B"]), *(f"{speed[name]:.2f}" for name in OURS)]
+    cells += [f"{speed[best]:.2f}", best[4:], f"{own / speed[best]:.1f}"] if jax else ["-"] * 3
+    cells += [f"{max(named):.2f}", f"{own / max(named):.1f}"] if named else ["-"] * 2
+    others = ("numba loops", "numba blocks", "torch.compile of a step")
+    return "| " + " | ".join(cells + [f"{speed[n]:.2f}" if n in speed else "-" for n in others]) + " |"
 
 
 def machine() -> str:
@@ -150,34 +156,31 @@ def machine() -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--json", type=Path, help="write the results here as well")
+    parser.add_argument("--json", type=Path, default=ROOT / "runs" / "benchmarks" / "chase.json")
     parser.add_argument("--centers", type=int, nargs="*", default=[3, 6, 15])
+    parser.add_argument("--dtype", nargs="*", default=["float64", "float32"])
     parser.add_argument("--batch", type=int, nargs="*", default=[1, 64, 1000, 100_000])
-    parser.add_argument("--no-memory", action="store_true")
-    parser.add_argument("--memory-of", type=int, help=argparse.SUPPRESS)
+    parser.add_argument("--no-scaling", action="store_true", help="leave out memory and linearity")
     options = parser.parse_args()
-    if options.memory_of:
-        print(json.dumps(memory_of(options.memory_of)))
-        return
-    print(f"{machine()}\nMillions of trajectory-steps a second, {INNER_STEPS} iterations each\n")
-    print("| M | dtype | B | staf_torch | best JAX | which | ratio | numba | ratio |")
-    print("|---|---|---|---|---|---|---|---|---|")
+    print(f"{machine()}\nMillions of trajectory-steps a second, {INNER_STEPS} iterations each.")
+    print("staf_torch with V as a formula | in Python | by torch.compile; the best JAX that we could write;")
+    print("the better of jit(vmap(scan)) and components with the inner loop unrolled; the other peers\n")
+    print("| M | dtype | B | staf_torch | V in Python | V compiled | best JAX | which | ratio "
+          "| named JAX | ratio | numba loops | numba blocks | torch.compile |")  # fmt: skip
+    print("|" + "---|" * 14)
     cases = []
     for count in options.centers:
-        for dtype in (torch.float64, torch.float32):
+        for dtype in options.dtype:
+            torch._dynamo.reset()
             for batch in options.batch:
-                cases.append(case(count, dtype, batch))
+                cases.append(case(count, getattr(torch, dtype), batch))
                 print(row(cases[-1]), flush=True)
     results: dict[str, Any] = {"machine": machine(), "cases": cases}
-    if not options.no_memory:
-        results["memory"] = [memory(times) for times in MEMORY_TIMES]
-        for found in results["memory"]:
-            print(
-                f"\nB = {MEMORY_BATCH}, T = {found['T']:.0f}, no history: "
-                f"{found['MiB']:.0f} MiB, {found['seconds']:.1f} s"
-            )
-    if options.json:
-        options.json.write_text(json.dumps(results, indent=1))
+    if not options.no_scaling:
+        results |= scaling.report()
+    options.json.parent.mkdir(parents=True, exist_ok=True)
+    options.json.write_text(json.dumps(results, indent=1))
+    print(f"\nwritten to {options.json}")
 
 
 if __name__ == "__main__":
