@@ -238,9 +238,19 @@ def gradient_error(basis: StaFBasis, target: Target, x: Tensor, coefficients: Te
     offsets = basis.centers.offsets(x)
 
     def estimate(z: Tensor) -> Tensor:
-        return evaluate_scaled(basis.kernel, offsets, x, z.unsqueeze(-2), coefficients).sum()
+        return evaluate_scaled(basis.kernel, offsets, x, z.unsqueeze(-2), coefficients)
 
-    approximate = torch.func.grad(estimate)(torch.zeros_like(x))
-    exact = torch.func.grad(lambda at: target(at).sum())(x)
+    approximate, exact = _gradient(estimate, torch.zeros_like(x)), _gradient(target, x.detach())
     error: Tensor = (exact - approximate).norm(dim=-1)
     return error
+
+
+def _gradient(function: Target, at: Tensor) -> Tensor:
+    """grad f, row by row: (..., n). Not by torch.func, whose first use imports the compiler for a second."""
+    with torch.enable_grad():
+        at = at.clone().requires_grad_()
+        values = function(at)
+        if not values.requires_grad:  # a constant
+            return torch.zeros_like(at).detach()
+        (gradient,) = torch.autograd.grad(values.sum(), at)
+    return gradient
