@@ -6,6 +6,8 @@ What differs between the problems becomes a tensor with one entry a row; what th
 from __future__ import annotations
 
 import copy
+import itertools
+from bisect import bisect_right
 from collections.abc import Sequence
 from typing import NamedTuple, TypeVar
 
@@ -61,6 +63,10 @@ class StackedBasis(StaFBasis):
     def check_reach(self, x: Tensor, stacklevel: int = 3) -> bool:
         """True, without a word: whoever runs several problems asks each basis about its own rows."""
         return True
+
+    def pieces(self) -> tuple[list[int], list[StaFBasis]]:
+        """Where the rows of each basis end, and the bases."""
+        return list(itertools.accumulate(self._rows)), self._bases
 
     def _joined(self, parts: Sequence[Tensor | None], dims: int) -> Tensor | None:
         given = [part for part in parts if part is not None]
@@ -136,8 +142,33 @@ class StackedTarget(nn.Module):
         super().__init__()
         self._targets, self._rows = list(targets), list(rows)
 
+    def pieces(self) -> tuple[list[int], list[Target]]:
+        """Where the rows of each target end, and the targets."""
+        return list(itertools.accumulate(self._rows)), self._targets
+
     def forward(self, x: Tensor) -> Tensor:
         return torch.cat([target(at) for target, at in zip(self._targets, x.split(self._rows), strict=True)])
+
+
+class Part(NamedTuple):
+    """Rows of a batch with one basis and one target."""
+
+    rows: slice
+    basis: StaFBasis
+    target: Target
+
+
+def parts(basis: StaFBasis, target: Target) -> list[Part]:
+    """What a basis and a target, stacked or not, are made of, in the order of the rows."""
+    base_ends, bases = basis.pieces() if isinstance(basis, StackedBasis) else ([], [basis])
+    target_ends, targets = target.pieces() if isinstance(target, StackedTarget) else ([], [target])
+    cuts = sorted({0, *base_ends, *target_ends})
+    if len(bases) == len(targets) == 1:
+        return [Part(slice(None), bases[0], targets[0])]
+    return [
+        Part(slice(at, stop), bases[bisect_right(base_ends, at)], targets[bisect_right(target_ends, at)])
+        for at, stop in itertools.pairwise(cuts)
+    ]
 
 
 def stack_hyperparameters(modules: Sequence[Module], rows: Sequence[int]) -> Module:

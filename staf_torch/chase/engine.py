@@ -14,9 +14,10 @@ from ..basis import StaFBasis, Target
 from ..objective import Known, NativeError
 from ..optim.base import UpdateLaw
 from .certificate import Certificate, certify
-from .correct import Dense, correct, dense, lost, native, paper_units
+from .correct import Dense, dense, lost, paper_units
 from .known import known as find_known
 from .known import state_row
+from .parts import correct_parts
 from .predictors import Predictor
 from .recursion import Carry, Recursion, recursion
 from .result import ChaseResult, concatenate
@@ -137,8 +138,7 @@ def _piece(
     known = find_known(law.needs, space, gram, ideal, scale * row, value)
 
     if predictor is None:
-        own = native(states, basis, target, law, inner_steps, carry)
-        run = correct(states, structure, values, own, law, inner_steps, carry, known, whole)
+        run = correct_parts(states, basis, target, structure, values, law, inner_steps, carry, known, whole)
     else:
         assert whole is not None
         run = _predicted(predictor, basis, target, states, whole, values, law, inner_steps, carry, known)
