@@ -7,7 +7,8 @@ from torch import Tensor
 
 from .basis import StaFBasis, Target
 from .centers import probe_points
-from .local import scale
+from .local import NewtonSpace, scale
+from .stacking import StackedSpace
 
 _BLOCK = 2**18  # numbers in a temporary, so that it stays in cache
 
@@ -34,9 +35,7 @@ class BallFloor:
         basis, probes = self._basis, probe_points(self._points, self._basis.dim).to(x)
         if not self._begun:
             self._begun, self._shared = True, _shared_functions(basis, x, probes)
-        row = self._points * (
-            1 if self._shared is not None else basis.count
-        )  # numbers in a temporary of `_floor`
+        row = self._points * (1 if self._shared is not None else basis.count)  # numbers in a temporary
         times = max(1, _BLOCK // (row * max(1, x.numel() // x.shape[-1] // x.shape[-2])))
         blocks = x.split(times, dim=-2)
         return torch.cat([_floor(basis, self._target, probes, self._shared, some) for some in blocks], dim=-1)
@@ -44,7 +43,15 @@ class BallFloor:
 
 def _shared_functions(basis: StaFBasis, x: Tensor, probes: Tensor) -> Tensor | None:
     """psi at the probes of the ball where radius and core do not depend on the state, else None: (M, P), or
-    (..., M, P) where each row has its own. One product then evaluates all states of a row."""
+    (..., M, P) where each row has its own. One product then evaluates all states of a row.
+
+    None for a Newton space too: its coefficients are nodal values, and cardinal functions, one by one, lose the
+    digits that a smooth V keeps.
+    """
+    space = basis.local(x[..., :1, :])
+    spaces = space.spaces if isinstance(space, StackedSpace) else [space]
+    if any(isinstance(each, NewtonSpace) for each in spaces):
+        return None
     origin = torch.zeros_like(x[..., :1, :]).expand(*x.shape[:-2], 2, -1)
     offsets, core = basis.centers.offsets(origin), basis.gram_structure(origin).core
     if any(part.dim() > 2 and part.shape[-3] > 1 for part in (offsets, core)):

@@ -74,7 +74,9 @@ def test_chase_weights_refuses_a_predictor() -> None:
 
 
 @pytest.mark.parametrize("name", BASES)
-@pytest.mark.parametrize("law", [optim.Exact(), optim.NormalisedLMS(), optim.Nesterov()], ids=repr)
+@pytest.mark.parametrize(
+    "law", [optim.Exact(), optim.NormalisedLMS(), optim.Nesterov()], ids=lambda law: type(law).__name__
+)
 def test_chase_weights_gives_every_law_what_it_needs(name: str, law: optim.UpdateLaw) -> None:
     states, basis = circles(9, 12), BASES[name]
     want = chase(states, basis, targets.Paper(), law, inner_steps=3).weights

@@ -35,7 +35,6 @@ def test_a_configuration_is_the_one_that_hydra_composes(job: list[str]) -> None:
     expected = loader.load_configuration("config", ["dt=0.02", *job], RunMode.RUN)
     first, again = compose(["dt=0.02"], [job, job], loader=loader)
     for found in (first, again):
-        assert found == expected
         assert OmegaConf.to_yaml(found) == OmegaConf.to_yaml(expected)
         assert pickle.dumps(OmegaConf.to_container(found)) == pickle.dumps(OmegaConf.to_container(expected))
         assert OmegaConf.is_struct(found)
