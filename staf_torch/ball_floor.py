@@ -45,8 +45,8 @@ def _shared_functions(basis: StaFBasis, x: Tensor, probes: Tensor) -> Tensor | N
     """psi at the probes of the ball where radius and core do not depend on the state, else None: (M, P), or
     (..., M, P) where each row has its own. One product then evaluates all states of a row.
 
-    None for a Newton space too: its coefficients are nodal values, and cardinal functions, one by one, lose the
-    digits that a smooth V keeps.
+    None for a Newton space too: its coefficients are nodal values, and cardinal functions, one by one, lose
+    the digits that a smooth V keeps.
     """
     space = basis.local(x[..., :1, :])
     spaces = space.spaces if isinstance(space, StackedSpace) else [space]
