@@ -24,7 +24,7 @@ class PivotedCholesky(NamedTuple):
 
     def solve_lower(self, values: Tensor) -> Tensor:
         """L^-1 P v, zero beyond the rank: (..., M) -> (..., M)."""
-        shape = torch.broadcast_shapes(self.order.shape, values.shape)
+        shape = torch.broadcast_tensors(self.order, values)[0].shape
         permuted = values.expand(shape).gather(-1, self.order.expand(shape))
         solved = torch.linalg.solve_triangular(self.factor, permuted.unsqueeze(-1), upper=False)
         return torch.where(self.kept, solved.squeeze(-1), 0.0)

@@ -14,6 +14,7 @@ from typing import NamedTuple, TypeVar
 import torch
 from torch import Tensor, nn
 
+from ._convention import described
 from .basis import GramStructure, StaFBasis, Target
 from .local import LocalSpace
 
@@ -184,8 +185,8 @@ def stack_hyperparameters(modules: Sequence[Module], rows: Sequence[int]) -> Mod
     first = modules[0]
     stacked = copy.deepcopy(first)
     found = [dict(module.named_buffers()) for module in modules]
-    form = _form(first)
-    if any(_form(module) != form for module in modules) or any(b.keys() != found[0].keys() for b in found):
+    forms = [(described(module), held.keys()) for module, held in zip(modules, found, strict=True)]
+    if any(form != forms[0] for form in forms):
         raise ValueError("`stack_hyperparameters(modules=...)` must differ in scalar hyperparameters alone.")
     counts = torch.tensor(rows)
     for name, buffer in found[0].items():
@@ -200,8 +201,3 @@ def stack_hyperparameters(modules: Sequence[Module], rows: Sequence[int]) -> Mod
         each = torch.stack(values).repeat_interleave(counts.to(buffer.device)).unsqueeze(-1)
         setattr(stacked.get_submodule(owner), attribute, each)
     return stacked
-
-
-def _form(module: nn.Module) -> list[tuple[str, type, str]]:
-    """Types and representations of all parts: what must be the same."""
-    return [(name, type(part), part.extra_repr()) for name, part in module.named_modules()]

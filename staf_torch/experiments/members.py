@@ -11,6 +11,7 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import json
+import logging
 from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
@@ -21,7 +22,9 @@ from omegaconf.errors import OmegaConfBaseException
 
 from .._checks import choice
 from .composition import settings
+from .wording import reason
 
+_log = logging.getLogger(__name__)
 Metrics = dict[str, float | None]
 _KEPT_BYTES = 2**28
 """What the members of a chunk may keep until they are written."""
@@ -77,6 +80,7 @@ def solve(cfgs: Sequence[DictConfig]) -> list[Solved | Exception]:
     except Exception as error:
         if len(cfgs) == 1:
             return [error]
+        _log.warning("a batch of %d cannot run as one (%s); each runs alone", len(cfgs), reason(error))
         return [found for cfg in cfgs for found in solve([cfg])]
 
 

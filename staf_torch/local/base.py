@@ -95,7 +95,8 @@ def in_blocks(function: Callable[[Tensor, Tensor], Tensor], values: Tensor, stat
     Over a large batch its temporaries are otherwise written to memory and read again one by one, which
     takes longer than the arithmetic.
     """
-    shape = torch.broadcast_shapes(values.shape[:-1], state.shape[:-1])
+    # Not torch.broadcast_shapes, whose first call imports sympy for half a second.
+    shape = torch.broadcast_tensors(values[..., 0], state[..., 0])[0].shape
     if shape.numel() <= _ROWS:
         return function(values, state)
     rows = values.expand(*shape, -1).flatten(0, -2).split(_ROWS)
