@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from omegaconf import DictConfig
 
-from staf_torch.experiments import gradient_chase, members
+from staf_torch.experiments import adp, gradient_chase, members
 from staf_torch.experiments.batch_axis import product
 from staf_torch.experiments.composition import Composer, config_loader
 
@@ -77,6 +77,43 @@ def test_a_member_gets_what_it_gets_alone(name: str) -> None:
         numbers = [{k: v for k, v in one.metrics.items() if v is not None} for one in (found, alone)]
         assert numbers[0] == pytest.approx(numbers[1], rel=digits, abs=digits / 10)
         assert np.array_equal(found.outcome.diverged_at, alone.outcome.diverged_at)
+
+
+CLOSED = ("dt=0.005", "duration=0.5", "adp.compile=false", "figures=false")
+GAINS = ("adp.gains.actor=1.2,2.0", "adp.gains.forgetting=0.003,0.01", "adp.gain=250,100")
+LOOPS = {
+    "information": ([], ["seed=0,1", "adp.critic=0.4,0.8", *GAINS]),
+    "published": (
+        ["adp.law=published", "trajectories=2"],
+        ["adp.gains.critic_extrapolated=0.25,0.1", *GAINS],
+    ),
+    "supervised": (["adp.trust=0.5"], ["adp.actor=[0.2,0.3,0.4],[0.5,0.5,0.5]", "seed=0,1"]),
+    "quadratic": (["adp.basis=quadratic"], ["adp.gains.normalisation=0.05,0.5", "seed=0,1"]),
+    "lqr": (["adp.policy=lqr"], ["initial_state=[-1.0,1.0],[0.5,0.5]"]),
+    "single precision": (["dtype=float32"], ["adp.gains.information=1,2", "seed=0,1"]),
+}
+
+
+@pytest.mark.parametrize("name", LOOPS)
+def test_a_closed_loop_in_a_batch_is_the_one_alone(name: str) -> None:
+    base, lines = LOOPS[name]
+    cfgs = compose(["experiment=adp", *CLOSED, *base], lines)
+    (group,) = members.groups(cfgs)
+    assert group == list(range(len(cfgs)))
+    together = adp.solve_members(cfgs)
+    digits = 1e-9 if name != "single precision" else 1e-3
+    apart = []
+    for cfg, found in list(zip(cfgs, together, strict=True))[:: max(1, len(cfgs) // 4)]:
+        (alone,) = adp.solve_members([cfg])
+        assert isinstance(found, adp.Solved), found
+        assert isinstance(alone, adp.Solved)
+        for key in ("state", "control", "critic_weights", "actor_weights", "running_cost"):
+            ours, theirs = getattr(found.result, key).numpy(), getattr(alone.result, key).numpy()
+            np.testing.assert_allclose(ours, theirs, rtol=digits, atol=digits)
+        numbers = [{k: v for k, v in one.metrics.items() if v is not None} for one in (found, alone)]
+        assert numbers[0] == pytest.approx(numbers[1], rel=100 * digits, abs=digits)
+        apart.append(found.result.cost.sum().item())
+    assert len(set(apart)) == len(apart)  # the settings made a difference
 
 
 def test_only_what_may_differ_within_a_batch_shares_a_group() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from .._checks import positive_real, trailing, vector
+from .._checks import positive, trailing, vector
 from ..systems import ControlAffineSystem
 from .bases.base import ValueBasis
 from .bellman import BellmanTerms, bellman_terms
@@ -29,7 +29,7 @@ class ActorCritic(Controller):
         law: `Information` by default.
         critic: Wc(0): a number for all, M numbers, or a tensor (M,) or (B, M), a row a trajectory.
         actor: Wa(0), likewise.
-        gain: gamma > 0 in Gam(0) = gamma I.
+        gain: gamma > 0 in Gam(0) = gamma I, a number or a tensor (B,).
 
     Raises:
         ValueError: if sizes do not fit together, or an argument breaks its rule.
@@ -47,7 +47,7 @@ class ActorCritic(Controller):
         *,
         critic: Initial = 0.4,
         actor: Initial = 0.28,
-        gain: float = 250.0,
+        gain: float | Tensor = 250.0,
     ) -> None:
         super().__init__()
         if not isinstance(cost, QuadraticCost):
@@ -66,16 +66,18 @@ class ActorCritic(Controller):
         self.register_buffer("actor", _weights("actor", actor, basis.count))
         self.critic: Tensor
         self.actor: Tensor
-        self.gain = positive_real("ActorCritic", "gain", gain)
+        self.register_buffer("gain", positive("ActorCritic", "gain", gain))
+        self.gain: Tensor
 
     def init(self, x0: Tensor) -> Memory:
         rows = (x0.shape[0], self.basis.count)
-        gain = self.gain * torch.eye(self.basis.count, dtype=x0.dtype, device=x0.device)
+        one = torch.eye(self.basis.count, dtype=x0.dtype, device=x0.device)
+        gain = self.gain.to(x0)[..., None, None] * one
         critic, actor, gain = self.law.init(self.critic.to(x0), self.actor.to(x0), gain)
         return Memory(
             critic.expand(rows).clone(),
             actor.expand(rows).clone(),
-            gain.repeat(x0.shape[0], 1, 1),
+            gain.expand(x0.shape[0], -1, -1).clone(),
             x0.new_zeros(x0.shape[0], 0),
         )
 

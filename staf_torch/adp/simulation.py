@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 
 import torch
 from torch import Tensor
@@ -56,7 +56,7 @@ def simulate(
     dt: float = 0.001,
     steps: int,
     every: int = 1,
-    seed: int = 0,
+    seed: int | Sequence[int] = 0,
     integrator: str = "runge_kutta",
     limit: float = 1e6,
     compile: bool | str = False,
@@ -82,7 +82,7 @@ def simulate(
         dt: s; the control is held that long.
         steps: at least 1.
         every: steps from one recorded time to the next; divides ``steps``.
-        seed: of the first row.
+        seed: of the first row, the next row having the next; or one a row.
         integrator: as in `ClosedLoop`.
         limit: as in `ClosedLoop`.
         compile: one compiled step: True, False, or ``auto`` (where the run is long enough to pay for it);
@@ -102,7 +102,7 @@ def simulate(
     loop.to(x0.device)
     with torch.no_grad():
         step = compiled(loop, x0, steps, compile)
-        return _run(loop, step, x0, steps, every, integer("simulate", "seed", seed, least=0), progress)
+        return _run(loop, step, x0, steps, every, _seeds(seed, len(x0)), progress)
 
 
 def _run(
@@ -111,12 +111,12 @@ def _run(
     x0: Tensor,
     steps: int,
     every: int,
-    seed: int,
+    seeds: Sequence[int],
     progress: Callable[[int], None] | None,
 ) -> LoopResult:
     state = loop.init(x0)
     rows: list[tuple[Tensor, ...]] = []
-    numbers = _uniform(x0, loop.controller.draws, seed)
+    numbers = _uniform(x0, loop.controller.draws, seeds)
     for k in range(steps):
         now = state
         state, u = step(now, next(numbers))
@@ -137,10 +137,21 @@ def _record(state: LoopState, u: Tensor) -> tuple[Tensor, ...]:
     return state.x, u, memory.actor, memory.critic, state.cost, memory.identifier
 
 
-def _uniform(x0: Tensor, draws: int, seed: int) -> Iterator[Tensor]:
+def _seeds(seed: int | Sequence[int], batch: int) -> Sequence[int]:
+    """The seed of every row."""
+    if isinstance(seed, Sequence):
+        seeds = [integer("simulate", "seed", each, least=0) for each in seed]
+        if len(seeds) != batch:
+            raise fail("simulate", "seed", f"must be one a row, {batch}", len(seeds))
+        return seeds
+    first = integer("simulate", "seed", seed, least=0)
+    return range(first, first + batch)
+
+
+def _uniform(x0: Tensor, draws: int, seeds: Sequence[int]) -> Iterator[Tensor]:
     """Uniform numbers of [-1, 1], (B, draws, n) a step, one generator a row."""
     batch, dim = x0.shape
-    generators = [torch.Generator().manual_seed(seed + row) for row in range(batch if draws else 0)]
+    generators = [torch.Generator().manual_seed(seed) for seed in (seeds if draws else ())]
     while True:
         if not draws:
             yield x0.new_zeros(batch, 0, dim)

@@ -9,13 +9,23 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ..._checks import fail, positive_real, real
+from ..._checks import fail, number, positive_real
 from ..bellman import BellmanTerms, bellman_error
+
+Gain = float | Tensor
+"""A number, or (B, 1)."""
+
+
+def over_matrices(gain: Gain) -> Gain:
+    """A gain as a factor of (B, M, M)."""
+    return gain.unsqueeze(-1) if isinstance(gain, Tensor) else gain
 
 
 @dataclasses.dataclass(frozen=True)
 class Gains:
     """Gains of the actor-critic laws; the defaults are the published ones of the two-state example.
+
+    Each is a number, or a tensor (B, 1) with one a trajectory.
 
     Args:
         critic: ec1, of the Bellman error at the state, 1/s.
@@ -33,19 +43,21 @@ class Gains:
     Source: MATH.md section 4.
     """
 
-    critic: float = 0.001
-    critic_extrapolated: float = 0.25
-    actor: float = 1.2
-    actor_decay: float = 0.01
-    forgetting: float = 0.003
-    normalisation: float = 0.05
-    information: float = 1.0
-    information_extrapolated: float = 1.0
+    critic: Gain = 0.001
+    critic_extrapolated: Gain = 0.25
+    actor: Gain = 1.2
+    actor_decay: Gain = 0.01
+    forgetting: Gain = 0.003
+    normalisation: Gain = 0.05
+    information: Gain = 1.0
+    information_extrapolated: Gain = 1.0
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
-            value = getattr(self, field.name)
-            if real("Gains", field.name, value) < 0:
+            value = number("Gains", field.name, getattr(self, field.name))
+            if isinstance(value, Tensor) and (value.dim() != 2 or value.shape[-1] != 1):
+                raise fail("Gains", field.name, "must be a number or of the shape (B, 1)", tuple(value.shape))
+            if bool((torch.as_tensor(value) < 0).any()):
                 raise fail("Gains", field.name, "must not be negative", value)
 
 
@@ -109,8 +121,8 @@ class ActorCriticLaw(abc.ABC):
         """Sums over the points of ``terms``, the state first, the others of weights ``masses`` (N,)."""
         gains, w = self.gains, terms.regressor
         masses = masses.to(w)
-        a = torch.cat((masses.new_full((1,), gains.critic), gains.critic_extrapolated * masses))
-        k = torch.cat((masses.new_full((1,), gains.information), gains.information_extrapolated * masses))
+        a = _shares(gains.critic, gains.critic_extrapolated, masses)
+        k = _shares(gains.information, gains.information_extrapolated, masses)
         rho = 1 + gains.normalisation * w.square().sum(-1)  # (..., P)
         share = a / rho
         force = share * bellman_error(terms, weights.critic)
@@ -127,3 +139,10 @@ class ActorCriticLaw(abc.ABC):
         """Wa' = -ea1 (Wa - Wc) - ea2 Wa + actor_force: (..., M)."""
         pull = self.gains.actor * (weights.actor - weights.critic)
         return sums.actor_force - pull - self.gains.actor_decay * weights.actor
+
+
+def _shares(here: Gain, there: Gain, masses: Tensor) -> Tensor:
+    """The gain at the state, then those at the points: (P,), or (B, P) where each trajectory has its own."""
+    first, rest = here * masses.new_ones(1), there * masses
+    rows = torch.broadcast_tensors(first.sum(-1), rest.sum(-1))[0].shape
+    return torch.cat((first.expand(*rows, -1), rest.expand(*rows, -1)), dim=-1)

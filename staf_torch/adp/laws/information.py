@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from .base import ActorCriticLaw, BellmanSums, Weights
+from .base import ActorCriticLaw, BellmanSums, Gain, Weights, over_matrices
 from .elimination import solve_definite
 
 
@@ -33,14 +33,21 @@ class Information(ActorCriticLaw):
         return Weights(
             critic=-solve_definite(weights.gain, sums.critic_force),
             actor=self.actor_rate(sums, weights),
-            gain=sums.information - self.gains.forgetting * weights.gain,
+            gain=sums.information - over_matrices(self.gains.forgetting) * weights.gain,
         )
 
     def _move(self, sums: BellmanSums, weights: Weights, dt: float) -> Weights:
         gains = self.gains
-        gain = math.exp(-gains.forgetting * dt) * weights.gain + dt * sums.information
+        gain = _decay(gains.forgetting, dt) * weights.gain + dt * sums.information
         move = solve_definite(gain + dt * sums.curvature, dt * sums.critic_force)
         critic = weights.critic - move
         decay = gains.actor + gains.actor_decay
         actor = (weights.actor + dt * (gains.actor * critic + sums.actor_force)) / (1 + dt * decay)
         return Weights(critic, actor, gain)
+
+
+def _decay(forgetting: Gain, dt: float) -> Gain:
+    """e^{-beta dt} as a factor of (B, M, M)."""
+    if isinstance(forgetting, Tensor):
+        return over_matrices((-forgetting * dt).exp())
+    return math.exp(-forgetting * dt)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from torch import Tensor
 
 from ..cost import matvec
-from .base import ActorCriticLaw, BellmanSums, Weights
+from .base import ActorCriticLaw, BellmanSums, Weights, over_matrices
 
 
 class Published(ActorCriticLaw):
@@ -31,7 +31,7 @@ class Published(ActorCriticLaw):
         return Weights(
             critic=-matvec(gain, sums.critic_force),
             actor=self.actor_rate(sums, weights),
-            gain=self.gains.forgetting * gain - shrink,
+            gain=over_matrices(self.gains.forgetting) * gain - shrink,
         )
 
     def _move(self, sums: BellmanSums, weights: Weights, dt: float) -> Weights:
