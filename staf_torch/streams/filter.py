@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from .frame import Local, LocalFrame
-from .scratch import Scratch
 
 _FADED = 1e-6  # the table's D is as large as 1 / fading
 
@@ -84,7 +83,6 @@ class LocalFilter:
 
     def __init__(self, frame: LocalFrame, ratio: float, forgetting: float, slack: float) -> None:
         self.frame, self.ratio, self.forgetting, self.slack = frame, ratio, forgetting, slack
-        self._scratch = Scratch()
 
     def learn(self, state: StreamState, x: Tensor, y: Tensor, ahead: Ahead | None = None) -> None:
         """One sample a stream: (n, S), (S,). A stream whose sample is not finite stays as it was.
@@ -119,14 +117,14 @@ class LocalFilter:
             shrink = (-log_factor).exp()
             y, noise = y * shrink, noise * shrink.square()
         share = self.forgetting * state.fading
-        seen = _apply(learned, psi, out=self._scratch("seen", psi.shape, psi))  # D psi, to be multiplied by the share
+        seen = _apply(learned, psi)  # D psi, to be multiplied by the share
         spread = _dot(psi, seen).mul_(-share).add_(variance + noise)
         inverse, error = 1 / spread, y - ahead.mean
         if fine is not None or not bool(spread.min() > 0):
             fine = spread > 0 if fine is None else fine & (spread > 0)
             inverse, error = torch.where(fine, inverse, 0.0), torch.where(fine, error, 0.0)
-        gain = torch.sub(psi, seen, alpha=share, out=seen)
-        weighted = torch.mul(gain, inverse, out=self._scratch("weighted", gain.shape, gain))
+        gain = torch.sub(psi, seen, alpha=share)
+        weighted = gain * inverse
         mean.addcmul_(weighted, error)
         self._fade(state, learned, fine)
         learned.addcmul_(gain.unsqueeze(1), weighted.unsqueeze(0), value=1 / state.fading)
@@ -150,7 +148,7 @@ class LocalFilter:
         return self._ahead(state, x, x - state.anchor)
 
     def _ahead(self, state: StreamState, x: Tensor, z: Tensor) -> Ahead:
-        local = self.frame.local(state.anchor, z, self._scratch)
+        local = self.frame.local(state.anchor, z)
         return Ahead(x, z, local, _dot(local.psi, state.mean))
 
     def mean(self, ahead: Ahead) -> Tensor:
@@ -166,17 +164,17 @@ class LocalFilter:
 
     def _follow(self, state: StreamState, rows: Tensor, z: Tensor, ahead: Ahead | None) -> Ahead | None:
         """Move the frame of the streams ``rows`` (R,) by their z, of (n, S); what is ahead of it there."""
-        step, shape = _take(z, rows), (len(state.table), len(rows))
-        old = _take(state.table, rows, out=self._scratch("old", shape, z))
-        new = self._scratch("new", shape, z)
+        step = _take(z, rows)
+        old = _take(state.table, rows)
+        new = torch.empty_like(old)
         (anchor, mean, learned), (there, moved, fewer) = state.parts(old), state.parts(new)
-        transfer, factor = self.frame.transfer(anchor, step, self._scratch)
+        transfer, factor = self.frame.transfer(anchor, step)
         columns = transfer.transpose(0, 1)
         torch.add(anchor, step, out=there)
         _apply(columns, mean, out=moved)
         if factor is not None:
             moved.mul_(factor)
-        half = _product(columns, learned, out=self._scratch("half", learned.shape, learned))  # T D
+        half = _product(columns, learned)  # T D
         _product(columns, half.transpose(0, 1), out=fewer)
         _put(state.table, rows, new)
         if ahead is None:
@@ -189,9 +187,9 @@ class LocalFilter:
         return ahead
 
 
-def _take(table: Tensor, rows: Tensor, out: Tensor | None = None) -> Tensor:
+def _take(table: Tensor, rows: Tensor) -> Tensor:
     """The streams ``rows`` (R,) of a table: (K, S) -> (K, R). Twice as fast as index_select."""
-    return torch.gather(table, 1, rows.expand(len(table), -1), out=out)
+    return table.gather(1, rows.expand(len(table), -1))
 
 
 def _put(table: Tensor, rows: Tensor, source: Tensor) -> None:

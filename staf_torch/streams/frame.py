@@ -9,7 +9,6 @@ from torch import Tensor
 
 from ..kernels import Kernel
 from ..linalg import pivoted_cholesky
-from .scratch import Scratch
 
 _JUMP = 4.0  # radii: beyond, a kernel whose scale grows with the state says nothing about the new one
 
@@ -74,14 +73,12 @@ class LocalFrame(NamedTuple):
         """Whether k(x, x) is the same everywhere: then e^s goes into the functions, to spare passes."""
         return self.rate is not None and self.kernel.log_gain(self.offsets) is None
 
-    def local(self, x: Tensor, z: Tensor, scratch: Scratch | None = None) -> Local:
+    def local(self, x: Tensor, z: Tensor) -> Local:
         """What V is made of at x + z: (n, S), (n, S)."""
         if self.rate is None or self.shared is None or not self.stationary:
             return Local(self.functions(x, z), self.log_factor(x, z))
         wide = z.double()
-        shrink = wide.square().sum(0) * (-self.rate / 2)
-        out = None if scratch is None else scratch("exponent", (len(self.offsets), len(shrink)), wide)
-        exponent = torch.addmm(shrink, self.rate * self.offsets, wide, out=out)
+        exponent = torch.addmm(wide.square().sum(0) * (-self.rate / 2), self.rate * self.offsets, wide)
         return Local((self.shared.mT @ exponent.exp_()).to(z), None)
 
     def prior(self, x: Tensor, z: Tensor) -> Tensor | float:
@@ -93,9 +90,7 @@ class LocalFrame(NamedTuple):
         scale = self.kernel.log_scale(x.mT, z.mT.unsqueeze(-2))
         return None if scale is None else scale.squeeze(-1)
 
-    def transfer(
-        self, x: Tensor, step: Tensor, scratch: Scratch | None = None
-    ) -> tuple[Tensor, Tensor | None]:
+    def transfer(self, x: Tensor, step: Tensor) -> tuple[Tensor, Tensor | None]:
         """What becomes of u when the state x moves by h: u' = e^f T u; T alone for what was known of it.
 
         T = C'(x + h) diag(m) k0(h + d, d) C(x) with m_i = e^{s(x, h + d_i) - s(x + h, d_i) - f}, and
@@ -106,7 +101,6 @@ class LocalFrame(NamedTuple):
         Args:
             x: (n, R).
             step: h, (n, R).
-            scratch: where temporaries and T may be kept.
 
         Returns:
             T (M, M, R), and e^f, (R,), None for ones.
@@ -114,7 +108,11 @@ class LocalFrame(NamedTuple):
         state, h, d = x.mT.double(), step.double(), self.offsets
         half = self._half(state, h.mT)
         if self.rate is not None and self.shared is not None and self.pairs is not None:
-            found = self._product(self.rate, self.shared, self.pairs, h, scratch or Scratch())
+            exponent = (self.rate * d) @ h  # q h'd, (M, R)
+            rows = (self.pairs @ exponent.exp()).unflatten(0, (len(d), -1))
+            lost = self.rate * h.square().sum(0) / 2
+            rows = rows * (-exponent - lost).exp().unsqueeze(1)
+            found = (self.shared.mT @ rows.flatten(1)).unflatten(-1, rows.shape[1:])
         else:
             found = self._dense(state, h)
         if half is None:
@@ -123,16 +121,6 @@ class LocalFrame(NamedTuple):
         near = h.square().sum(0) <= _JUMP**2 * d.square().sum(-1).amax()
         growth = torch.where(near, half, 0.0).exp()
         return torch.where(near, found, 0.0).to(step), growth.to(step)
-
-    def _product(self, rate: Tensor, shared: Tensor, pairs: Tensor, h: Tensor, scratch: Scratch) -> Tensor:
-        """T for kernels with an exponent rate: (n, R) -> (M, M, R)."""
-        count, moves = len(self.offsets), h.shape[1]
-        exponent = (rate * self.offsets) @ h  # q h'd, (M, R)
-        rows = torch.mm(pairs, exponent.exp(), out=scratch("rows", (len(pairs), moves), h))
-        rows = rows.view(count, count, moves)
-        rows.mul_((-exponent - rate * h.square().sum(0) / 2).exp_().unsqueeze(1))
-        found = torch.mm(shared.mT, rows.flatten(1), out=scratch("found", (count, count * moves), h))
-        return found.view(count, count, moves)
 
     def _dense(self, state: Tensor, h: Tensor) -> Tensor:
         """T for kernels without an exponent rate: (R, n), (n, R) -> (M, M, R)."""
