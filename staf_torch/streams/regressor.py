@@ -79,6 +79,8 @@ class StaFRegressor:
     process given its values at inducing points, Snelson and Ghahramani (2006).
     """
 
+    _ahead_: Ahead | None  # the last prediction, until a sample is learned
+
     def __init__(
         self,
         kernel: Kernel | str = "gaussian",
@@ -138,7 +140,7 @@ class StaFRegressor:
         return self
 
     def partial_fit(self, x: Any, y: Any) -> StaFRegressor:
-        """Learn from one sample a stream.
+        """Learn from one sample a stream; a prediction just before, at the same x, is work that is shared.
 
         Args:
             x: (n,) for a single stream, (S, n) for S streams side by side; tensors or arrays.
@@ -247,7 +249,7 @@ class StaFRegressor:
         self.amplitude_ = amplitude
         self._filter_ = LocalFilter(frame, ratio, forgetting, follow * radius)
         self._state_ = StreamState.at(rows.contiguous(), len(offsets))
-        self._ahead_: Ahead | None = None
+        self._ahead_ = None
 
     def _check_streams(self, call: str, x: Tensor) -> None:
         expected = (
