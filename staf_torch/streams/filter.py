@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import NamedTuple
 
 import torch
@@ -96,7 +97,7 @@ class LocalFilter:
             ahead: of the same state at the same x, where there is one.
         """
         fine = None
-        if not bool((x.sum() + y.sum()).isfinite()):
+        if not math.isfinite(float(x.sum() + y.sum())):
             fine, ahead = _finite(x) & torch.isfinite(y), None
         z = ahead.z if ahead is not None else x - state.anchor
         if fine is not None:
