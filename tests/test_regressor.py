@@ -149,6 +149,38 @@ def test_samples_that_are_not_finite_are_skipped_and_counted() -> None:
     assert torch.isfinite(found).all()
 
 
+@pytest.mark.parametrize("kernel", ["exponential", "gaussian", "matern52", "user_defined"])
+def test_prediction_before_a_sample_changes_nothing_of_what_is_learned(kernel: str) -> None:
+    x, y = walks(4, 60)
+    plain, asked = (st.StaFRegressor(KERNELS[kernel].make(), 0.3, noise=0.05) for _ in range(2))
+    for k, (state, value) in enumerate(zip(x, y, strict=True)):
+        if k:
+            point = state + (k % 3 == 0)  # every third is another one than is learned
+            found = asked.predict(point, return_std=k % 2 == 0)
+            kept = copy.deepcopy(found)
+            point.copy_(state)  # in place: it is the values that count
+            asked.partial_fit(point, value)
+            assert torch.equal(torch.stack((*found,)), torch.stack((*kept,)))
+        else:
+            asked.partial_fit(state, value)
+        plain.partial_fit(state, value)
+    torch.testing.assert_close(asked._state_.mean, plain._state_.mean, rtol=1e-8, atol=1e-8)
+    torch.testing.assert_close(asked._state_.learned, plain._state_.learned, rtol=1e-8, atol=1e-8)
+
+
+def test_what_was_learned_fades_alike_beside_streams_that_skip() -> None:
+    """By a number for all while all learn, stream by stream otherwise; the number is renewed now and then."""
+    x, y = walks(2, 60)
+    broken = y.clone()
+    broken[::7, 1] = torch.nan
+    for forgetting in (0.999, 0.6):
+        whole = learned(st.StaFRegressor(radius=0.3, noise=0.05, forgetting=forgetting), x, y)
+        beside = learned(st.StaFRegressor(radius=0.3, noise=0.05, forgetting=forgetting), x, broken)
+        for name in ("mean", "learned"):
+            found, expected = getattr(beside._state_, name)[..., 0], getattr(whole._state_, name)[..., 0]
+            torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-10)
+
+
 def test_skipped_sample_leaves_the_stream_as_it_was() -> None:
     x, y = walks(2, 30)
     model = learned(st.StaFRegressor(radius=0.3), x, y)

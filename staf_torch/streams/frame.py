@@ -13,6 +13,13 @@ from ..linalg import pivoted_cholesky
 _JUMP = 4.0  # radii: beyond, a kernel whose scale grows with the state says nothing about the new one
 
 
+class Local(NamedTuple):
+    """The local functions at a point of every stream: e^{log_factor} psi."""
+
+    psi: Tensor  # (M, S)
+    log_factor: Tensor | None  # (S,), None for zeros
+
+
 class LocalFrame(NamedTuple):
     """An orthonormal basis psi(z) = k0(z, d) C of the span of the kernels at the centers x + d.
 
@@ -60,6 +67,23 @@ class LocalFrame(NamedTuple):
             return (z.square().sum(0) * self.rate).exp().to(z)
         point = z.mT.double().unsqueeze(-2)
         return self.kernel.core(x.mT.double(), point, point).flatten().to(z)
+
+    @property
+    def stationary(self) -> bool:
+        """Whether k(x, x) is the same everywhere: then e^s goes into the functions, to spare passes."""
+        return self.rate is not None and self.kernel.log_gain(self.offsets) is None
+
+    def local(self, x: Tensor, z: Tensor) -> Local:
+        """What V is made of at x + z: (n, S), (n, S)."""
+        if self.rate is None or self.shared is None or not self.stationary:
+            return Local(self.functions(x, z), self.log_factor(x, z))
+        wide = z.double()
+        exponent = torch.addmm(wide.square().sum(0) * (-self.rate / 2), self.rate * self.offsets, wide)
+        return Local((self.shared.mT @ exponent.exp_()).to(z), None)
+
+    def prior(self, x: Tensor, z: Tensor) -> Tensor | float:
+        """The variance of V at x + z before any sample, in the units of `local`: (n, S), (n, S) -> (S,)."""
+        return 1.0 if self.stationary else self.variance(x, z)
 
     def log_factor(self, x: Tensor, z: Tensor) -> Tensor | None:
         """s(x, z): (n, S), (n, S) -> (S,), None for zeros."""

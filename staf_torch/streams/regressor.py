@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import inspect
 import math
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -23,7 +22,7 @@ from ..kernels import (
     PolynomialKernel,
     RationalQuadraticKernel,
 )
-from .filter import LocalFilter, StreamState
+from .filter import Ahead, LocalFilter, StreamState
 from .frame import LocalFrame
 
 KERNELS: dict[str, type[Kernel]] = {
@@ -79,6 +78,8 @@ class StaFRegressor:
     Source: Rosenfeld et al., section 2, for the centers; Kalman (1960) and, for the exactness of a Gaussian
     process given its values at inducing points, Snelson and Ghahramani (2006).
     """
+
+    _ahead_: Ahead | None  # the last prediction, until a sample is learned
 
     def __init__(
         self,
@@ -139,7 +140,7 @@ class StaFRegressor:
         return self
 
     def partial_fit(self, x: Any, y: Any) -> StaFRegressor:
-        """Learn from one sample a stream.
+        """Learn from one sample a stream; a prediction just before, at the same x, is work that is shared.
 
         Args:
             x: (n,) for a single stream, (S, n) for S streams side by side; tensors or arrays.
@@ -155,9 +156,11 @@ class StaFRegressor:
         if not self._is_fitted():
             self._prepare(states)
         self._check_streams("partial_fit", states)
-        like = self._state_.anchor
-        rows = states.reshape(-1, states.shape[-1]).to(like).mT.contiguous()
-        self._filter_.learn(self._state_, rows, self._units(values))
+        rows, ahead = self._rows(states), self._ahead_
+        if ahead is not None and not torch.equal(rows, ahead.x):  # values: a tensor can change in place
+            ahead = None
+        self._ahead_ = None
+        self._filter_.learn(self._state_, rows, self._units(values), ahead)
         return self
 
     def predict(self, x: Any, return_std: bool = False) -> Any:
@@ -179,17 +182,26 @@ class StaFRegressor:
         own = 1 if self.n_streams_ is None else 2
         several = points.dim() == own + 1
         self._check_streams("predict", points.select(-2, 0) if several else points)
-        mean = self._at(points, self._filter_.mean) * self.amplitude_
+        at = points.unbind(-2) if several else (points,)
+        ahead = [self._filter_.ahead(self._state_, self._rows(point)) for point in at]
+        if not several:
+            self._ahead_ = ahead[0]
+        mean = self._joined(points, [self._filter_.mean(a) for a in ahead])
         if not return_std:
             return _like(x, mean)
-        return _like(x, mean), _like(x, self._at(points, self._filter_.variance).sqrt() * self.amplitude_)
+        variances = [self._filter_.variance(self._state_, a).sqrt() for a in ahead]
+        return _like(x, mean), _like(x, self._joined(points, variances))
 
-    def _at(self, points: Tensor, function: Callable[[StreamState, Tensor], Tensor]) -> Tensor:
-        """A function of one point a stream, at (..., n) points: (...)."""
-        like = self._state_.anchor
-        at = points.to(like).reshape(like.shape[1], -1, like.shape[0]).unbind(1)
-        found = [function(self._state_, point.mT.contiguous()) for point in at]
-        return torch.stack(found, dim=-1).reshape(points.shape[:-1])
+    def _rows(self, x: Tensor) -> Tensor:
+        """(n,) or (S, n) -> (n, S), a copy."""
+        like = self._state_.table
+        rows = like.new_empty(x.shape[-1], like.shape[1])
+        return rows.copy_(x.mT if x.dim() == 2 else x.unsqueeze(-1))
+
+    def _joined(self, points: Tensor, found: list[Tensor]) -> Tensor:
+        """One (S,) a point, in units of the process, as the points (..., n) are and in units of y: (...)."""
+        values = found[0] if len(found) == 1 else torch.stack(found, dim=-1)
+        return (values * self.amplitude_).reshape(points.shape[:-1])
 
     @property
     def n_samples_seen_(self) -> Tensor:
@@ -206,7 +218,7 @@ class StaFRegressor:
         return hasattr(self, "_state_")
 
     def _units(self, values: Tensor) -> Tensor:
-        return values.reshape(-1).to(self._state_.anchor) / self.amplitude_
+        return values.reshape(-1).to(self._state_.table) / self.amplitude_
 
     def _prepare(self, x: Tensor) -> None:
         """Infer the dimension from the first sample, (n,) or (S, n), and check the arguments."""
@@ -237,6 +249,7 @@ class StaFRegressor:
         self.amplitude_ = amplitude
         self._filter_ = LocalFilter(frame, ratio, forgetting, follow * radius)
         self._state_ = StreamState.at(rows.contiguous(), len(offsets))
+        self._ahead_ = None
 
     def _check_streams(self, call: str, x: Tensor) -> None:
         expected = (
