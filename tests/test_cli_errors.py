@@ -16,6 +16,13 @@ BAD: dict[str, tuple[str, tuple[str, ...]]] = {
         "kernel=nope",
         ("there is no `kernel/nope`; there are anchored, custom, exponential, ",),
     ),
+    "launcher of an extra": (
+        "hydra/launcher=nope",
+        (
+            "there is no `hydra/launcher/nope`; there are basic, batched",
+            "extras joblib, slurm, ray and optuna.",
+        ),
+    ),
     "unknown layout": ("centers=nope", ("centers/nope", "rings")),
     "unknown key": ("nonsense=1", ("nonsense",)),
     "unknown key of a group": ("kernel=gaussian kernel.wdth=2", ("wdth",)),

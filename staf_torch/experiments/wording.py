@@ -25,7 +25,8 @@ def sentence(error: BaseException) -> str:
         return f"there is no setting `{unknown[1]}`; `staf --help` lists them."
     if isinstance(error, MissingConfigException) and error.options:
         name = (error.missing_cfg_file or "").removesuffix(".yaml")
-        return f"there is no `{name}`; there are {', '.join(error.options)}."
+        more = "; others come with the extras joblib, slurm, ray and optuna" if "hydra/" in name else ""
+        return f"there is no `{name}`; there are {', '.join(error.options)}{more}."
     return str(error)
 
 
