@@ -230,7 +230,9 @@ def test_a_window_after_the_end_is_null_and_said_so(outcomes: dict[str, Outcome]
     found = metrics(run_directory(outcome))
     assert set(found) == KEYS
     assert found["ultimate_error"] is None
-    assert "nothing to report" in outcome.out
+    assert (
+        "nothing to report: the run ends at 0.05 s, and metrics begin at settle_time = 100 s" in outcome.out
+    )
 
 
 def test_single_precision_runs_and_is_stored_so(outcomes: dict[str, Outcome]) -> None:

@@ -12,7 +12,17 @@ from command_line import Outcome, environment, run_all
 SHORT = ("duration=0.05", "figures=false")
 
 BAD: dict[str, tuple[str, tuple[str, ...]]] = {
-    "unknown kernel": ("kernel=nope", ("kernel/nope", "exponential")),
+    "unknown kernel": (
+        "kernel=nope",
+        ("there is no `kernel/nope`; there are anchored, custom, exponential, ",),
+    ),
+    "launcher of an extra": (
+        "hydra/launcher=nope",
+        (
+            "there is no `hydra/launcher/nope`; there are basic, batched",
+            "extras joblib, slurm, ray and optuna.",
+        ),
+    ),
     "unknown layout": ("centers=nope", ("centers/nope", "rings")),
     "unknown key": ("nonsense=1", ("nonsense",)),
     "unknown key of a group": ("kernel=gaussian kernel.wdth=2", ("wdth",)),

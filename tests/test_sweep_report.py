@@ -141,6 +141,15 @@ def test_more_panels_than_can_be_read_are_refused(tmp_path: Path) -> None:
         series.error_against_radius(collect(tmp_path))
 
 
+@pytest.mark.parametrize(("rounding", "seen"), [(1e-15, False), (1e-4, True)])
+def test_rounding_out_of_the_picture_is_said_to_be_below(rounding: float, seen: bool) -> None:
+    curve = series.Curve("3 centers", tuple(series.Point(r, r, r, r) for r in (0.1, 0.2)))
+    figure = plots_sweep.draw_error_against_radius([series.Panel("exponential kernel", (curve,))], rounding)
+    (words,) = [t.get_text() for t in figure.legends[0].get_texts() if "rounding" in t.get_text()]
+    assert words.endswith(", below") is not seen
+    assert bool(figure.axes[0].get_ylim()[0] < rounding) is seen
+
+
 def test_figures_are_the_same_bytes_on_every_run(sweep: Path, tmp_path: Path) -> None:
     maps = series.heat_maps(collect(sweep))[:1]
     for name in ("one", "two"):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
+import logging
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -177,6 +178,8 @@ def parser() -> argparse.ArgumentParser:
 def main(arguments: list[str] | None = None) -> None:
     """Run the command. What a user got wrong ends as one sentence and the exit code 1."""
     given = parser().parse_args(arguments)
+    # The exporter warns that torchvision is not there, for operators that nothing here has.
+    logging.getLogger("torch.onnx._internal.exporter._registration").setLevel(logging.ERROR)
     try:
         page = export(
             given.run,

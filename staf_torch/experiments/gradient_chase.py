@@ -265,21 +265,26 @@ def _summarise(title: Title, metrics: dict[str, float | None]) -> None:
         title.method,
     )
     if metrics["ultimate_error"] is None:
-        _log.warning(
-            "nothing to report: no trajectory is finite at a time t >= settle_time = %g s",
-            title.settle_time,
-        )
+        _log.warning("nothing to report: %s", _why_nothing(title))
     row = "  %-22s %12s %12s %12s"
     _log.info(row, f"worst, t >= {title.settle_time:g} s", "corrected", "before", "ideal weights")
     names = ("ultimate_error", "ultimate_error_before", "floor_error")
     _log.info(row, "error at the state", *map(show, names))
-    _log.info(row, "excess F(a) - F(w)", *map(show, ("ultimate_excess", "ultimate_excess_before")), "0")
+    ideal = "-" if metrics["ultimate_excess"] is None else "0"
+    _log.info(row, "excess F(a) - F(w)", *map(show, ("ultimate_excess", "ultimate_excess_before")), ideal)
     _log.info("  error on the ball %s, gradient error %s", show("ball_error"), show("gradient_error"))
     _log.info(
         "  condition number %s, settled after %s s, contraction violations %s, diverged %s",
         *map(show, ("condition_number", "settling_time")),
         *map(show, ("contraction_violations", "diverged_fraction")),
     )
+
+
+def _why_nothing(title: Title) -> str:
+    end = (title.times - 1) * title.dt
+    if end < title.settle_time:
+        return f"the run ends at {end:g} s, and metrics begin at settle_time = {title.settle_time:g} s"
+    return f"no trajectory is finite at a time t >= settle_time = {title.settle_time:g} s"
 
 
 def _draw(outcome: Outcome, directory: Path) -> None:

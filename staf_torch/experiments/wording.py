@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from hydra.errors import HydraException
+from hydra.errors import HydraException, MissingConfigException
 from omegaconf.errors import OmegaConfBaseException
 
 USER_ERRORS = (ValueError, HydraException, OmegaConfBaseException, OSError)
@@ -23,6 +23,10 @@ def sentence(error: BaseException) -> str:
     unknown = re.match(r"Could not override '(.+?)'", str(error))
     if unknown:
         return f"there is no setting `{unknown[1]}`; `staf --help` lists them."
+    if isinstance(error, MissingConfigException) and error.options:
+        name = (error.missing_cfg_file or "").removesuffix(".yaml")
+        more = "; others come with the extras joblib, slurm, ray and optuna" if "hydra/" in name else ""
+        return f"there is no `{name}`; there are {', '.join(error.options)}{more}."
     return str(error)
 
 

@@ -29,7 +29,8 @@ def draw_error_against_radius(panels: Sequence[Panel], rounding: float | None) -
 
     Args:
         panels: one a kernel.
-        rounding: the error that rounding of V alone explains; a line, where it is not far below the data.
+        rounding: the error that rounding of V alone explains; a line, where it is not far below the data,
+            and in the legend with its number.
     """
 
     def panel(axes: Axes, shown: Panel) -> None:
@@ -47,7 +48,9 @@ def draw_error_against_radius(panels: Sequence[Panel], rounding: float | None) -
         more = []
     if rounding is not None:
         floor = Line2D([], [], color="0.4", linestyle=_ROUNDING, linewidth=0.9)
-        floor.set_label(r"rounding, $\varepsilon\,\max|V|$")
+        points = [point for shown in panels for curve in shown.curves for point in curve.points]
+        far = ", below" if rounding <= _far_below(points) else ""
+        floor.set_label(rf"rounding, $\varepsilon\,\max|V|$ = {rounding:.0e}{far}")
         more.append(floor)
     return _panels(panels, panel, more)
 
@@ -104,8 +107,13 @@ def _frame(grid: Sequence[Axes], points: Sequence[Point]) -> None:
     middle = [point.middle for point in points]
     bottom, top = min(middle) / 3, max(middle) * 3
     drawn = [y for axes in grid for line in axes.get_lines() for y in np.asarray(line.get_ydata(), float)]
-    near = [y for y in drawn if np.isfinite(y) and y > bottom * 1e-9]
+    near = [y for y in drawn if np.isfinite(y) and y > _far_below(points)]
     grid[0].set_ylim(min([bottom, *(y / 4 for y in near)]), top)
+
+
+def _far_below(points: Sequence[Point]) -> float:
+    """What is not above this would squeeze the errors into the top of the picture: it is left out."""
+    return 1e-9 / 3 * min(point.middle for point in points)
 
 
 def draw_heat_maps(maps: Sequence[HeatMap]) -> Figure:
