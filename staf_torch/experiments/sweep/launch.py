@@ -64,6 +64,10 @@ class Launch:
 
     def run(self, job_overrides: Sequence[Sequence[str]], first: int) -> list[JobReturn]:
         """The returns of the jobs, in order."""
+        with _seldom_collecting():
+            return self._run(job_overrides, first)
+
+    def _run(self, job_overrides: Sequence[Sequence[str]], first: int) -> list[JobReturn]:
         setup_globals()
         self._hydra_logging()
         self._directory.mkdir(parents=True, exist_ok=True)
@@ -73,7 +77,7 @@ class Launch:
         returns = self._finished(jobs)
         self._progress = SweepProgress(len(jobs), len(returns))
         try:
-            with _seldom_collecting(), contextlib.closing(self._solved(jobs, set(returns))) as solved_jobs:
+            with contextlib.closing(self._solved(jobs, set(returns))) as solved_jobs:
                 for job, solved in solved_jobs:
                     returns[job.num] = self._replay(job, solved)
         finally:
@@ -171,11 +175,13 @@ def _seldom_collecting() -> Iterator[None]:
     """Hydra copies configurations a dozen times a job, and Python would look through all of them for cycles
     after every few: a fifth of the time of a sweep."""
     before = gc.get_threshold()
-    gc.set_threshold(200_000, *before[1:])
+    gc.freeze()  # the half a million objects of torch are here to stay
+    gc.set_threshold(200_000, 50, 50)
     try:
         yield
     finally:
         gc.set_threshold(*before)
+        gc.unfreeze()
 
 
 def _work(batch: Sequence[Job]) -> work.Batch:
