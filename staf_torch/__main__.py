@@ -1,6 +1,6 @@
 """`python -m staf_torch` is the command `staf`."""
 
-from .experiments.app import main
+from .cli.staf import main
 
 if __name__ == "__main__":
     main()

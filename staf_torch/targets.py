@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from ._checks import fail, number, real, vector
+from .numerics.checks import fail, number, real, vector
 
 
 class Formula(NamedTuple):

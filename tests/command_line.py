@@ -22,7 +22,8 @@ PLANTS = '''
 import torch
 from torch import nn
 from staf_torch import Kernel
-from staf_torch.report.trackers import Tracker
+from staf_torch.metrics import Metric
+from staf_torch.sweeps.callbacks import Tracker
 
 class Escape(nn.Module):
     """x' = x^2: a user's plant without a flow, a dimension or a base class."""
@@ -39,6 +40,12 @@ class Cauchy(Kernel):
         self.width = width
     def forward(self, x1, x2):
         return 1 / (1 + (x1.unsqueeze(-2) - x2.unsqueeze(-3)).square().sum(-1) / self.width ** 2)
+
+class Largest(Metric):
+    """A user's metric: the norm of the state."""
+    name = "largest_state"
+    def __call__(self, result, problem):
+        return result.state.norm(dim=-1)
 
 class Lines(Tracker):
     """A user's tracker: a line a run."""
@@ -70,12 +77,12 @@ class Outcome(NamedTuple):
         }
 
 
-def run_all(jobs: Mapping[str, Sequence[str]], base: Path) -> dict[str, Outcome]:
-    """Every command line (without the program's name) in a fresh folder that holds `plants.py`."""
+def run_all(jobs: Mapping[str, Sequence[str]], base: Path, module: str = PLANTS) -> dict[str, Outcome]:
+    """Every command line (without the program) in a fresh folder that holds ``module`` as `plants.py`."""
     folders = {name: base / str(index) for index, name in enumerate(jobs)}
     for folder in folders.values():
         folder.mkdir()
-        (folder / "plants.py").write_text(PLANTS)
+        (folder / "plants.py").write_text(module)
         (folder / "blocked").write_text("a file where a directory should be\n")
     listed = [{"folder": str(folders[name]), "argv": list(argv)} for name, argv in jobs.items()]
     (base / "jobs.json").write_text(json.dumps(listed))
@@ -94,7 +101,7 @@ def environment() -> dict[str, str]:
 
 def one(folder: str, argv: list[str]) -> tuple[int, str, str]:
     """One command line in this process: exit code, output, errors."""
-    from staf_torch.experiments.app import main
+    from staf_torch.cli.staf import main
 
     os.chdir(folder)
     os.environ.pop("HYDRA_FULL_ERROR", None)

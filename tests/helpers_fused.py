@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import sys
-
 import pytest
 import torch
 from torch import Tensor
 
-import staf_torch.chase.fused  # noqa: F401  (the module; the package's name `chase` is the function)
 from staf_torch import (
     ExponentialKernel,
     GaussianKernel,
@@ -21,20 +18,18 @@ from staf_torch import (
     optim,
     rings,
     systems,
+    targets,
 )
-from staf_torch.basis import GramStructure
-
-fused_module = sys.modules["staf_torch.chase.fused"]
-chase_module = sys.modules["staf_torch.chase"]
-native_module = sys.modules["staf_torch.chase.native"]
-correct_module = sys.modules["staf_torch.chase.correct"]
-compiled_module = sys.modules["staf_torch.chase._compiled"]
-recursion_module = sys.modules["staf_torch.chase.recursion"]
-Carry, History, fused = recursion_module.Carry, fused_module.History, fused_module.fused
+from staf_torch.approximation.basis import GramStructure
+from staf_torch.engine import compiled
+from staf_torch.engine.compiled import CompiledInputs, History
+from staf_torch.engine.problem import Problem
+from staf_torch.engine.recursion import Carry, Inputs, Recursion, recursion
+from staf_torch.lanes import build as compiled_module  # noqa: F401  (for tests of the build)
 
 LAW = optim.SteepestDescent()
 needs_compiler = pytest.mark.skipif(
-    fused_module.built(torch.float64, 3, shared=True) is None,
+    compiled.library(torch.float64, 3, shared=True) is None,
     reason="no C++ compiler: the reference runs instead",
 )
 # Steepest descent passes rounding on, some ten times an iteration at worst; ten iterations, well conditioned.
@@ -61,9 +56,9 @@ def copied(carry: Carry) -> Carry:
     return Carry(carry.weights.clone(), (), carry.log_gain.clone(), carry.time, carry.diverged_at.clone())
 
 
-def reference(structure: GramStructure, values: Tensor, carry: Carry, steps: int = 10):
-    gram = structure.scaled().expand(*values.shape, values.shape[-1])
-    return recursion_module.recursion(gram, values, structure.log_gain, LAW, steps, carry)
+def reference(structure: GramStructure, values: Tensor, carry: Carry, steps: int = 10) -> Recursion:
+    problem = Problem("chase", BASES["exponential"], targets.Paper(), LAW, steps)  # law and iterations count
+    return recursion(problem, Inputs.of(structure, values), carry)
 
 
 def run(structure: GramStructure, values: Tensor, carry: Carry, steps: int = 10):
@@ -71,7 +66,8 @@ def run(structure: GramStructure, values: Tensor, carry: Carry, steps: int = 10)
     batch, times, count = values.shape
     before, after = values.new_empty(times, count, batch), values.new_empty(times, count, batch)
     states = values.new_zeros(batch, times, 2)  # not looked at where everything else is given
-    carry = fused(states, structure, values, steps, copied(carry), History(before, after))
+    given = CompiledInputs(structure, values)
+    carry = compiled.advance(steps, states, given, copied(carry), History(before, after))
     return before.permute(2, 0, 1), after.permute(2, 0, 1), carry
 
 

@@ -1,77 +1,22 @@
-"""Every update law, predictor, kernel and system once, for the tests of the laws."""
+"""Trajectories and quadratics for the tests of the laws and of the chase."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
+from variants import SYSTEMS
 
 from staf_torch import (
-    AnchoredKernel,
     ExponentialKernel,
-    GaussianKernel,
-    InverseMultiquadricKernel,
     Kernel,
-    MaternKernel,
-    PolynomialKernel,
-    RationalQuadraticKernel,
     StaFBasis,
     StateFollowingCenters,
     optim,
-    predictors,
     rings,
     systems,
     targets,
 )
-from staf_torch.objective import Known, NativeError
-
-LAWS: dict[str, optim.UpdateLaw] = {
-    "steepest descent": optim.SteepestDescent(),
-    "fixed step": optim.FixedStep(),
-    "fixed absolute step": optim.FixedStep(0.1, relative=False),
-    "heavy ball": optim.HeavyBall(),
-    "heavy ball, stated": optim.HeavyBall(1.0, 0.9),
-    "nesterov": optim.Nesterov(),
-    "nesterov, stated": optim.Nesterov(0.9, 0.8),
-    "conjugate gradient": optim.ConjugateGradient(),
-    "preconditioned by the core": optim.PreconditionedDescent("core"),
-    "jacobi": optim.PreconditionedDescent("jacobi"),
-    "exact": optim.Exact(),
-    "barzilai-borwein": optim.BarzilaiBorwein(),
-    "recursive least squares": optim.RecursiveLeastSquares(process_noise=0.0, measurement_noise=1e-3),
-    "normalised lms": optim.NormalisedLMS(),
-}
-RATED = {name: law for name, law in LAWS.items() if law.contraction(torch.ones(())) is not None}
-DESCENDING = {
-    name: LAWS[name]
-    for name in ("steepest descent", "fixed step", "fixed absolute step", "conjugate gradient", "jacobi")
-}
-PREDICTORS: dict[str, predictors.Predictor | None] = {
-    "none": None,
-    "secant": predictors.Secant(),
-    "secant, guarded": predictors.Secant(guarded=True),
-    "tangent, order 1": predictors.Tangent(order=1),
-    "tangent, order 2": predictors.Tangent(),
-}
-# Every law, and every predictor with one law of each kind of state.
-PAIRS = [(law, "none") for law in LAWS] + [
-    (law, predictor)
-    for predictor in PREDICTORS
-    for law in ("steepest descent", "heavy ball", "recursive least squares")
-    if predictor != "none"
-]
-KERNELS: dict[str, Kernel] = {
-    "exponential": ExponentialKernel(),
-    "gaussian": GaussianKernel(),
-    "matern": MaternKernel(),
-    "inverse multiquadric": InverseMultiquadricKernel(),
-    "rational quadratic": RationalQuadraticKernel(),
-    "polynomial": PolynomialKernel(),
-    "anchored": AnchoredKernel(ExponentialKernel()),
-}
-SYSTEMS: dict[str, systems.ControlAffineSystem] = {
-    "oscillator": systems.Oscillator(),
-    "linear": systems.Linear([[-0.1, 1.0], [-1.0, -0.1]]),
-}
+from staf_torch.optim.objective import NativeError, Precomputed
 
 
 def basis(kernel: Kernel | None = None, count: int = 3, radius: float = 0.1) -> StaFBasis:
@@ -84,7 +29,7 @@ def states(batch: int = 1, steps: int = 60, dt: float = 0.05, system: str = "osc
     generator = torch.Generator().manual_seed(1)
     around = 2 * torch.rand(batch, 2, generator=generator, dtype=torch.float64) - 1
     around[0] = torch.tensor([1.0, 0.0])
-    return systems.simulate(SYSTEMS[system], around, dt=dt, steps=steps)
+    return systems.simulate(SYSTEMS[system](), around, dt=dt, steps=steps)
 
 
 def quadratic(batch: int = 5, count: int = 4, condition: float = 30.0, seed: int = 0) -> NativeError:
@@ -94,7 +39,7 @@ def quadratic(batch: int = 5, count: int = 4, condition: float = 30.0, seed: int
     q = torch.linalg.qr(random[..., :count])[0]
     eigenvalues = torch.logspace(0, 1, count, base=condition, dtype=torch.float64)
     gram = (q * eigenvalues) @ q.mT
-    known = Known(row=random[..., count + 1], sampled=random[:, 0, 0])
+    known = Precomputed(row=random[..., count + 1], sampled=random[:, 0, 0])
     return NativeError((gram + gram.mT) / 2, random[..., count], known)
 
 

@@ -5,26 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import torch
-from helpers import Cauchy, basis_of, uniform
+from helpers import basis_of, uniform
 from torch import Tensor, nn
+from variants import LEARNABLE_KERNELS, learned
 
 import staf_torch as st
 from staf_torch.targets import Paper
 
-
-def learned(value: float | Tensor) -> nn.Parameter:
-    return nn.Parameter(torch.as_tensor(value, dtype=torch.float64).clone())
-
-
-KERNELS: dict[str, Callable[[], st.Kernel]] = {
-    "exponential": st.ExponentialKernel,
-    "gaussian": lambda: st.GaussianKernel(learned(0.8)),
-    "matern52": lambda: st.MaternKernel(2.5, learned(1.1)),
-    "rational_quadratic": lambda: st.RationalQuadraticKernel(learned(1.7), learned(0.9)),
-    "polynomial": lambda: st.PolynomialKernel(3, learned(0.7)),
-    "anchored": lambda: st.AnchoredKernel(st.GaussianKernel(learned(0.8))),
-    "user_defined": Cauchy,
-}
 RADII: dict[str, Callable[[], Tensor | st.StateRadius]] = {
     "constant": lambda: learned(0.4),
     "shrinking": lambda: st.StateRadius(learned(0.5), learned(0.1), learned(1.0)),
@@ -44,7 +31,7 @@ def learnable(
 ) -> tuple[st.StaF, Tensor]:
     """A fitted approximation of learnable hyperparameters, and points of its ball."""
     centers = st.StateFollowingCenters(nn.Parameter(st.rings(count)), RADII[radius]())
-    staf = st.StaF(st.StaFBasis(KERNELS[kernel](), centers), batch, outputs)
+    staf = st.StaF(st.StaFBasis(LEARNABLE_KERNELS[kernel](), centers), batch, outputs)
     x = uniform(*batch, 2, low=0.3, seed=3)
     points = x.unsqueeze(-2) + uniform(*batch, 2, 2, low=-0.1, high=0.1, seed=4)
     return staf.fit_(x, target_of(outputs)), points

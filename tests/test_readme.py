@@ -1,23 +1,227 @@
-"""Every Python block of the README runs as it stands."""
+"""The manuals: Python blocks run, links lead somewhere, every command and file that they name exists."""
 
 from __future__ import annotations
 
+import importlib.util
 import re
+import shlex
+from collections.abc import Iterator
 from pathlib import Path
 
+import hydra
 import pytest
 from command_line import ROOT
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import OmegaConf
+
+from staf_torch import __version__
+from staf_torch._renamed import RENAMED
+from staf_torch.cli import export, table
+from staf_torch.cli.staf import main as main  # its import registers the launcher of `staf -m`
 
 README = ROOT / "README.md"
-BLOCKS = re.findall(r"^```python\n(.*?)^```$", README.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
+MANUALS = sorted(
+    path
+    for folder in ("conf", "runs", "staf_torch", "tests")
+    for path in (ROOT / folder).rglob("*.md")
+    if folder != "runs" or path.parent.name == "runs"  # below it lie what experiments left
+)
+PAGES = [README, ROOT / "CHANGELOG.md", *MANUALS]
+TEST = re.compile(r"^def (test_\w+)", re.MULTILINE)
+EXTRAS = {"optuna": "optuna_sweeper", "joblib": "joblib_launcher", "ray": "ray_launcher"}
+EXTRAS["submitit_local"] = EXTRAS["submitit_slurm"] = "submitit_launcher"
 
 
-def test_readme_is_there() -> None:
-    assert README.read_text(encoding="utf-8").startswith("# ")
+def name(path: Path) -> str:
+    return str(path.relative_to(ROOT))
 
 
-@pytest.mark.parametrize("index", range(len(BLOCKS)))
-def test_python_block_runs(index: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def read(path: Path) -> str:
+    return path.read_text(encoding="utf-8")
+
+
+def test_changelog_names_every_module_that_moved() -> None:
+    text = read(ROOT / "CHANGELOG.md")
+    for old, new in RENAMED.items():
+        row = rf"`staf_torch\.{re.escape(old)}`[^|]*\| `staf_torch\.{re.escape(new)}`"
+        assert re.search(row, text), old
+
+
+def test_citation_is_of_this_version_and_names_the_paper() -> None:
+    citation = OmegaConf.create(read(ROOT / "CITATION.cff"))
+    assert citation["cff-version"] == "1.2.0"
+    assert citation.version == __version__
+    paper = citation["preferred-citation"]
+    assert paper.title == "State Following (StaF) Kernel Functions for Function Approximation"
+    assert [author["family-names"] for author in paper.authors] == ["Rosenfeld", "Kamalapurkar", "Dixon"]
+    assert f"version = {{{__version__}}}" in read(README)
+
+
+# --- Python -------------------------------------------------------------------------------------------------
+
+
+def python_blocks(path: Path) -> list[tuple[int, str]]:
+    """Line and text of each ```python block; blocks that are only shown are marked ```py."""
+    text = read(path)
+    found = re.finditer(r"^```python\n(.*?)^```$", text, re.DOTALL | re.MULTILINE)
+    return [(text[: block.start(1)].count("\n"), block[1]) for block in found]
+
+
+@pytest.mark.parametrize("path", [p for p in [README, *MANUALS] if python_blocks(p)], ids=name)
+def test_python_blocks_of_a_page_run_one_after_another(
+    path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
-    code = compile(BLOCKS[index], f"README.md, Python block {index + 1}", "exec")
-    exec(code, {"__name__": "__main__"})
+    names: dict[str, object] = {"__name__": "__main__"}
+    for line, text in python_blocks(path):
+        exec(compile("\n" * line + text, name(path), "exec"), names)
+
+
+# --- the front page -----------------------------------------------------------------------------------------
+
+
+def test_front_page_is_two_screens() -> None:
+    lines = read(README).splitlines()
+    assert lines[0].startswith("# ")
+    assert len(lines) <= 160
+
+
+def test_first_commands_end_with_pytest() -> None:
+    """They are what `.ci/run` executes."""
+    first = re.search(r"^```bash\n(.*?)^```$", read(README), re.DOTALL | re.MULTILINE)
+    assert first is not None
+    assert first[1].splitlines()[-1] == "pytest"
+    assert len(first[1].splitlines()) == 2
+
+
+def test_every_manual_is_reached_from_the_front_page() -> None:
+    reached, waiting = set(), [README]
+    while waiting:
+        page = waiting.pop()
+        reached.add(page)
+        linked = (target for target, _ in links(page) if target.suffix == ".md" and target.exists())
+        waiting += [target for target in linked if target not in reached]
+    assert {name(path) for path in PAGES} - {name(path) for path in reached} == set()
+
+
+# --- links --------------------------------------------------------------------------------------------------
+
+
+def without_blocks(text: str) -> str:
+    return re.sub(r"^```.*?^```$", "", text, flags=re.DOTALL | re.MULTILINE)
+
+
+def links(path: Path) -> Iterator[tuple[Path, str]]:
+    """File and anchor of every link that is no address."""
+    for target in re.findall(r"\]\(([^()\s]+)\)", without_blocks(read(path))):
+        if "://" not in target and not target.startswith("mailto:"):
+            file, _, anchor = target.partition("#")
+            yield ((path.parent / file).resolve() if file else path), anchor
+
+
+def anchors(path: Path) -> set[str]:
+    """Those that a heading gets: lower case, no punctuation, a hyphen a space."""
+    headings = re.findall(r"^#+ (.*)$", without_blocks(read(path)), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("path", PAGES, ids=name)
+def test_links_of_a_page_lead_somewhere(path: Path) -> None:
+    missing = [str(target) for target, _ in links(path) if not target.exists()]
+    assert missing == []
+    lost = [
+        f"{target}#{anchor}" for target, anchor in links(path) if anchor and anchor not in anchors(target)
+    ]
+    assert lost == []
+
+
+@pytest.mark.parametrize("path", [README, *MANUALS], ids=name)
+def test_files_that_a_page_names_exist(path: Path) -> None:
+    text = re.sub(r"\]\([^()]*\)", "", read(path))  # links have a test of their own
+    named = re.findall(r"\b((?:tests|conf|staf_torch)/[\w./]*\w\.(?:py|md|yaml))\b", text)
+    assert [file for file in named if not (ROOT / file).exists()] == []
+
+
+@pytest.mark.parametrize("path", [README, *MANUALS], ids=name)
+def test_tests_that_a_page_names_exist(path: Path) -> None:
+    named = set(re.findall(r"`(test_\w+)`", read(path)))
+    written = {test for file in (ROOT / "tests").rglob("test_*.py") for test in TEST.findall(read(file))}
+    assert named - written == set()
+
+
+# --- commands -----------------------------------------------------------------------------------------------
+
+
+def commands(path: Path, program: str) -> list[str]:
+    """Command lines of a program: in `code` of the text, and in blocks for the terminal."""
+    text = read(path)
+    blocks = re.findall(r"^```(?:text|bash)?\n(.*?)^```$", text, re.DOTALL | re.MULTILINE)
+    inline = re.findall(r"`([^`\n]+)`", without_blocks(text))
+    lines = [re.sub(r"(^|\s)#.*", "", line) for block in blocks for line in block.splitlines()]
+    lines = [part for line in lines for part in line.split("&&")] + inline
+    own = ("--config-dir", "-cd ", "hydra.searchpath")  # settings from a folder of the reader's own
+    start = re.compile(rf"{program} (?!=)")
+    return [line.strip() for line in lines if start.match(line.strip()) and not any(o in line for o in own)]
+
+
+def overrides(command: str) -> list[str]:
+    """Those of a `staf` command, without flags, what is left to the reader, and extras that are not here."""
+    words = [word for word in shlex.split(command)[1:] if not word.startswith("-") and word != "..."]
+    words = [word for word in words if "<" not in word]
+    for word in list(words):
+        group, _, choice = word.partition("=")
+        plugin = EXTRAS.get(choice) if group in ("hydra/launcher", "hydra/sweeper") else None
+        if plugin is not None and importlib.util.find_spec(f"hydra_plugins.hydra_{plugin}") is None:
+            prefix = group.replace("/", ".") + "."
+            words = [w for w in words if w != word and not w.startswith(prefix)]
+    return words
+
+
+def jobs(words: list[str]) -> list[list[str]]:
+    """Plain overrides: each choice of a swept group once, and of every other sweep the first value."""
+    parsed = OverridesParser.create().parse_overrides(words)
+    values: list[list[str]] = []
+    for word, override in zip(words, parsed, strict=True):
+        if not override.is_sweep_override():
+            values.append([word])
+        elif override.is_discrete_sweep():
+            swept = [f"{override.get_key_element()}={value}" for value in override.sweep_string_iterator()]
+            values.append(swept if (ROOT / "conf" / override.key_or_group).is_dir() else swept[:1])
+        else:
+            values.append([f"{override.get_key_element()}={override.value().start}"])
+    first = [choices[0] for choices in values]
+    others = [
+        [*first[:i], choice, *first[i + 1 :]] for i, choices in enumerate(values) for choice in choices[1:]
+    ]
+    return [first, *others]
+
+
+STAF = {command: name(path) for path in [README, *MANUALS] for command in commands(path, "staf")}
+
+
+def test_the_front_page_has_a_table_of_commands() -> None:
+    assert len(commands(README, "staf")) >= 10
+
+
+@pytest.mark.parametrize(
+    "command",
+    [line for line in STAF if line != "staf doctor"],  # which has no settings
+    ids=lambda command: command.replace("::", ":"),
+)
+def test_settings_of_a_command_compose(command: str) -> None:
+    with hydra.initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+        for job in jobs(overrides(command)):
+            settings = hydra.compose("config", job)
+            assert OmegaConf.select(settings, "task"), STAF[command]
+
+
+def test_options_of_the_other_programs_exist() -> None:
+    checked = 0
+    for program, parser in (("staf-table", table._parser()), ("staf-export", export.parser())):
+        known = set(parser._option_string_actions)
+        for path in [README, *MANUALS]:
+            for command in commands(path, program):
+                used = {word for word in command.split() if word.startswith("--")}
+                assert used <= known, f"{name(path)}: {command}"
+                checked += 1
+    assert checked >= 1

@@ -7,7 +7,8 @@ import re
 
 import pytest
 import torch
-from helpers import TARGETS, over, tensor, uniform
+from helpers import tensor, uniform
+from variants import TARGETS, over
 
 from staf_torch.targets import Cosine, Quadratic
 

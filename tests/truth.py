@@ -6,7 +6,10 @@ import math
 from collections.abc import Sequence
 
 import mpmath as mp
+import torch
 from torch import Tensor
+
+import staf_torch as st
 
 Point = Sequence[mp.mpf]
 
@@ -21,6 +24,19 @@ def smooth(x: Point) -> mp.mpf:
 
 def smooth_target(x: Tensor) -> Tensor:
     return 2 + (x.sum(-1) + 0.25).cos()
+
+
+RADII = (1e-8, 3.7e-5, 1e-3, 0.1, 0.5)
+LAYOUTS = {f"rings{count}": (lambda count=count: st.rings(count)) for count in (3, 6, 10, 15, 21, 28)} | {
+    "polygon4": lambda: st.polygon(4),
+    "simplex5": lambda: st.simplex(5),
+    "cross_polytope3": lambda: st.cross_polytope(3),
+    "ball10_2": lambda: st.ball(10, 2),
+    "ball15_4": lambda: st.ball(15, 4),
+    "ball45_8": lambda: st.ball(45, 8),
+    "ball6_1": lambda: st.ball(6, 1),
+    "ball8_2": lambda: st.ball(8, 2),
+}
 
 
 class Truth:
@@ -83,6 +99,17 @@ def worst(found: Tensor, expected: Sequence[mp.mpf]) -> float:
     """max |found - expected| / max |expected|."""
     gap = max(abs(mp.mpf(float(f)) - e) for f, e in zip(found.detach().flatten(), expected, strict=True))
     return float(gap / max(abs(e) for e in expected))
+
+
+def ball_points(count: int, dim: int, generator: torch.Generator) -> torch.Tensor:
+    z = torch.randn(count, dim, dtype=torch.float64, generator=generator)
+    z /= z.norm(dim=-1, keepdim=True)
+    return z * torch.rand(count, 1, dtype=torch.float64, generator=generator) ** (1 / (dim + 1))
+
+
+def value_error(staf: st.StaF, truth: Truth, radius: float, zeta: torch.Tensor) -> float:
+    found = staf.at_offsets((radius * zeta).to(staf.state))
+    return worst(found, [truth.value(z) for z in zeta])
 
 
 def _exact(values: Tensor) -> list[mp.mpf]:

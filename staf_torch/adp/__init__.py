@@ -1,5 +1,7 @@
 """Adaptive dynamic programming: learn or compute a controller while, or before, it controls."""
 
+import warnings
+
 from .actor_critic import ActorCritic as ActorCritic
 from .bases import LeadingCoordinates as LeadingCoordinates
 from .bases import QuadraticBasis as QuadraticBasis
@@ -10,9 +12,11 @@ from .bellman import bellman_error as bellman_error
 from .bellman import bellman_terms as bellman_terms
 from .bellman import hjb_residual as hjb_residual
 from .bellman import value_gradient as value_gradient
-from .controller import Controller as Controller
-from .controller import Feedback as Feedback
-from .controller import Memory as Memory
+from .controllers import LQR as LQR
+from .controllers import Controller as Controller
+from .controllers import ControllerState as ControllerState
+from .controllers import Feedback as Feedback
+from .controllers import Supervised as Supervised
 from .cost import BoundedInputCost as BoundedInputCost
 from .cost import Cost as Cost
 from .cost import QuadraticCost as QuadraticCost
@@ -21,20 +25,32 @@ from .extrapolation import QuadraturePoints as QuadraturePoints
 from .extrapolation import RandomPoints as RandomPoints
 from .identification import ConcurrentLearning as ConcurrentLearning
 from .identification import Identified as Identified
-from .identifying import IdentifyingTracker as IdentifyingTracker
+from .identification import IdentifyingTracker as IdentifyingTracker
 from .laws import ActorCriticLaw as ActorCriticLaw
 from .laws import Frozen as Frozen
 from .laws import Gains as Gains
 from .laws import Information as Information
 from .laws import Published as Published
 from .laws import Weights as Weights
-from .lqr import LQR as LQR
 from .rollout import RolloutPolicy as RolloutPolicy
+from .sampling import HeldStability as HeldStability
+from .sampling import held_stability as held_stability
 from .shooting import DirectShooting as DirectShooting
 from .shooting import Optimum as Optimum
 from .simulation import LoopResult as LoopResult
 from .simulation import simulate as simulate
-from .supervisor import Supervised as Supervised
 from .tracking import TwoStateTracking as TwoStateTracking
 from .tracking import desired_trajectory as desired_trajectory
 from .tracking import tracking_cost as tracking_cost
+
+
+def __getattr__(name: str) -> type:
+    """Serve `Memory`, the name of `ControllerState` until 0.2, for one release.
+
+    Raises:
+        AttributeError: for every other name.
+    """
+    if name != "Memory":
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    warnings.warn("staf_torch.adp.Memory is now staf_torch.adp.ControllerState.", FutureWarning, stacklevel=2)
+    return ControllerState

@@ -5,11 +5,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from .._checks import positive, trailing, vector
+from ..numerics.checks import positive, trailing, vector
 from ..systems import ControlAffineSystem
-from .bases.base import ValueBasis
+from .bases import ValueBasis
 from .bellman import BellmanTerms, bellman_terms
-from .controller import Controller, Memory
+from .controllers import Controller, ControllerState
 from .cost import QuadraticCost
 from .extrapolation import Extrapolation
 from .laws import ActorCriticLaw, Information, Weights
@@ -69,12 +69,16 @@ class ActorCritic(Controller):
         self.register_buffer("gain", positive("ActorCritic", "gain", gain))
         self.gain: Tensor
 
-    def init(self, x0: Tensor) -> Memory:
+    @property
+    def label(self) -> str:
+        return f"actor-critic ({type(self.law).__name__})"
+
+    def init(self, x0: Tensor) -> ControllerState:
         rows = (x0.shape[0], self.basis.count)
         one = torch.eye(self.basis.count, dtype=x0.dtype, device=x0.device)
         gain = self.gain.to(x0)[..., None, None] * one
         critic, actor, gain = self.law.init(self.critic.to(x0), self.actor.to(x0), gain)
-        return Memory(
+        return ControllerState(
             critic.expand(rows).clone(),
             actor.expand(rows).clone(),
             gain.expand(x0.shape[0], -1, -1).clone(),
@@ -89,21 +93,23 @@ class ActorCritic(Controller):
         at = points if self.extrapolation.moving else x.unsqueeze(-2).expand(points.shape)
         return bellman_terms(self.basis, model or self.model, self.cost, points, at, actor)
 
-    def step(self, x: Tensor, memory: Memory, uniform: Tensor, dt: float) -> tuple[Tensor, Memory]:
-        return self.step_with(self.model, x, memory, uniform, dt)
+    def step(
+        self, x: Tensor, carried: ControllerState, uniform: Tensor, dt: float
+    ) -> tuple[Tensor, ControllerState]:
+        return self.step_with(self.model, x, carried, uniform, dt)
 
     def step_with(
-        self, model: ControlAffineSystem, x: Tensor, memory: Memory, uniform: Tensor, dt: float
-    ) -> tuple[Tensor, Memory]:
+        self, model: ControlAffineSystem, x: Tensor, carried: ControllerState, uniform: Tensor, dt: float
+    ) -> tuple[Tensor, ControllerState]:
         """`step` with a model of the moment, for instance one that is being identified."""
-        weights = Weights(memory.critic, memory.actor, memory.gain)
+        weights = Weights(carried.critic, carried.actor, carried.gain)
         terms = self.terms(x, weights.actor, uniform, model)
         sums = self.law.sums(terms, self.extrapolation.weights, weights)
         critic, actor, gain = self.law.step(sums, weights, dt)
-        return terms.control[..., 0, :], Memory(critic, actor, gain, memory.identifier)
+        return terms.control[..., 0, :], ControllerState(critic, actor, gain, carried.identifier)
 
-    def value(self, x: Tensor, memory: Memory) -> Tensor | None:
-        return self.basis.value(memory.critic, x)
+    def value(self, x: Tensor, carried: ControllerState) -> Tensor | None:
+        return self.basis.value(carried.critic, x)
 
 
 def _weights(name: str, value: Initial, count: int) -> Tensor:

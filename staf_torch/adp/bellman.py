@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ..systems import ControlAffineSystem
-from .bases.base import ValueBasis
+from .bases import ValueBasis
 from .cost import Cost, matvec
 
 

@@ -1,16 +1,22 @@
-"""One step of the closed loop: plant and controller advance together, all rows at once."""
+"""One step of the closed loop, plant and controller together and all rows at once, and many of them."""
 
 from __future__ import annotations
 
+from collections.abc import Hashable
 from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from .._checks import choice, positive_real
+from ..lanes import Program
+from ..lanes.content import content
+from ..numerics.checks import choice, positive_real
 from ..systems import ControlAffineSystem
-from .controller import Controller, Memory
-from .cost import Cost, matvec
+from .controllers import Controller, ControllerState
+from .cost import Cost
+
+_KEPT = 16
+_kept: dict[Hashable, Program] = {}
 
 
 class LoopState(NamedTuple):
@@ -20,7 +26,7 @@ class LoopState(NamedTuple):
     cost: Tensor  # (B,) the integral of the cost rate so far
     alive: Tensor  # (B,) bool; a row that became non-finite keeps its last finite values
     lived: Tensor  # (B,) steps taken alive
-    memory: Memory
+    carried: ControllerState
 
 
 class ClosedLoop(nn.Module):
@@ -63,13 +69,15 @@ class ClosedLoop(nn.Module):
 
     def forward(self, state: LoopState, uniform: Tensor) -> tuple[LoopState, Tensor]:
         """The state after dt seconds, and the control held until then, (B, m)."""
-        u, memory = self.controller.step(state.x, state.memory, uniform, self.dt)
+        u, carried = self.controller.step(state.x, state.carried, uniform, self.dt)
         x, spent = self._advance(state.x, u)
         good = torch.isfinite(spent) & (x.square().sum(-1) <= self.limit**2)
-        for part in (u, *memory):
+        for part in (u, *carried):
             good = good & torch.isfinite(part).flatten(1).all(-1)
         alive = state.alive & good
-        kept = Memory(*(_where(alive, new, old) for new, old in zip(memory, state.memory, strict=True)))
+        kept = ControllerState(
+            *(_where(alive, new, old) for new, old in zip(carried, state.carried, strict=True))
+        )
         cost = state.cost + torch.where(alive, spent, 0.0)
         return LoopState(_where(alive, x, state.x), cost, alive, state.lived + alive, kept), u
 
@@ -77,24 +85,54 @@ class ClosedLoop(nn.Module):
         """The state after dt with u held, and the cost until then."""
         h = self.dt
         paid = self.cost.input_rate(u)
-        k1 = self._field(x, u)
+        k1 = self.system.rate(x, u)
         c1 = self.cost.state_rate(x)
         if self.euler:
             return x + h * k1, h * (c1 + paid)
         x2 = x + 0.5 * h * k1
-        k2 = self._field(x2, u)
+        k2 = self.system.rate(x2, u)
         x3 = x + 0.5 * h * k2
-        k3 = self._field(x3, u)
+        k3 = self.system.rate(x3, u)
         x4 = x + h * k3
-        k4 = self._field(x4, u)
+        k4 = self.system.rate(x4, u)
         middle = self.cost.state_rate(x2) + self.cost.state_rate(x3)
         spent = h * (paid + (c1 + 2 * middle + self.cost.state_rate(x4)) / 6)
         return x + (h / 6) * (k1 + 2 * (k2 + k3) + k4), spent
 
-    def _field(self, x: Tensor, u: Tensor) -> Tensor:
-        rate: Tensor = self.system.drift(x) + matvec(self.system.effectiveness(x), u)
-        return rate
-
 
 def _where(alive: Tensor, new: Tensor, old: Tensor) -> Tensor:
     return torch.where(alive[(..., *([None] * (new.dim() - 1)))], new, old)
+
+
+def program(loop: ClosedLoop, compile: bool) -> Program:
+    """Return ``loop`` over many steps: it records the state before every step, and the control.
+
+    The last few programs are kept with what they were made of: a loop of the same numbers, settings and
+    classes is not traced again.
+
+    Args:
+        loop: one step.
+        compile: whether to compile it at all; what cannot be compiled runs in plain torch.
+    """
+    key = content(loop) if compile else None
+    found = _kept.pop(key, None)
+    if found is None:
+        found = Program(lambda state, uniform, _: recorded(loop, state, uniform), name="the closed loop")
+        found.compile = compile
+    if key is not None:
+        _kept[key] = found
+        while len(_kept) > _KEPT:
+            del _kept[next(iter(_kept))]
+    return found
+
+
+def recorded(loop: ClosedLoop, state: LoopState, uniform: Tensor) -> tuple[LoopState, tuple[Tensor, ...]]:
+    """Return the state after one step, and what is recorded of the time before it."""
+    after, u = loop(state, uniform)
+    return after, record(state, torch.where(after.alive.unsqueeze(-1), u, torch.nan))
+
+
+def record(state: LoopState, u: Tensor) -> tuple[Tensor, ...]:
+    """Return x, u, Wa, Wc, the cost and the identifier."""
+    carried = state.carried
+    return state.x, u, carried.actor, carried.critic, state.cost, carried.identifier

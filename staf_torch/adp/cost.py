@@ -8,8 +8,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from .._checks import fail, positive_real, vector
-from ..riccati import positive_definite
+from ..numerics.checks import fail, positive_real, vector
+from ..numerics.linalg import positive_definite
 
 _EDGE = 1 - 1e-9  # of the bound, beyond which artanh is that of this share
 

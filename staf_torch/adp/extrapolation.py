@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from .._checks import choice, integer
 from ..centers import ConstantRadius, Radius
+from ..numerics.checks import choice, integer
 
 
 class Extrapolation(nn.Module, abc.ABC):

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from .._checks import fail, integer, positive_real
-from ..basis import StaFBasis
+from ..approximation.basis import StaFBasis
+from ..centers import Radius, StateFollowingCenters, ball, cross_polytope, rings
+from ..kernels import ExponentialKernel
+from ..lanes import each, repeat, scan
+from ..lanes.function import RowFunction
+from ..numerics.checks import fail, integer, positive_real
 from ..systems import ControlAffineSystem
-from .cost import Cost, matvec
-
-Policy = Callable[[Tensor], Tensor]
-"""u from x: (..., n) -> (..., m)."""
-Value = Callable[[Tensor], Tensor]
-"""V from x: (..., n) -> (...)."""
+from .controllers import LQR, Policy, Value
+from .cost import Cost
 
 
 class RolloutPolicy(nn.Module):
@@ -38,6 +39,7 @@ class RolloutPolicy(nn.Module):
         horizon: s, positive.
         steps: Runge-Kutta steps over the horizon, at least 1.
         depth: how many times the policy is improved, at least 1.
+        period: least time for which a closed loop holds the control, s, positive; None where any will do.
 
     Raises:
         ValueError: if an argument breaks its rule.
@@ -57,6 +59,7 @@ class RolloutPolicy(nn.Module):
         horizon: float = 0.5,
         steps: int = 10,
         depth: int = 1,
+        period: float | None = None,
     ) -> None:
         super().__init__()
         if model.dim != basis.dim:
@@ -65,13 +68,65 @@ class RolloutPolicy(nn.Module):
         self.horizon = positive_real("RolloutPolicy", "horizon", horizon)
         self.steps = integer("RolloutPolicy", "steps", steps, least=1)
         self.depth = integer("RolloutPolicy", "depth", depth, least=1)
+        self.period = None if period is None else positive_real("RolloutPolicy", "period", period)
+        self._compiled = RowFunction(self.control, self, "a rollout policy")
         self.base: Policy = base
         if depth > 1:
             settings = {"horizon": horizon, "steps": steps, "depth": depth - 1}
             self.base = RolloutPolicy(basis, model, cost, base, terminal, **settings)  # type: ignore[arg-type]
 
+    @classmethod
+    def of_lqr(
+        cls,
+        system: ControlAffineSystem,
+        cost: Cost,
+        *,
+        centers: int | None = None,
+        radius: float | Radius = 0.1,
+        horizon: float = 0.5,
+        steps: int = 10,
+        depth: int = 1,
+        period: float | None = None,
+    ) -> RolloutPolicy:
+        """Improve the LQR of the plant, with centers of the exponential kernel in a ball around the state.
+
+        Example:
+            >>> plant = systems.Pendulum()
+            >>> policy = adp.RolloutPolicy.of_lqr(plant, adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1))
+            >>> policy(torch.tensor([0.4, 0.0], dtype=torch.float64)).shape
+            torch.Size([1])
+
+        Args:
+            system: the plant, at rest in 0.
+            cost: the cost rate.
+            centers: their number; None for as many as quadratics need, and with four states or more for the
+                cross-polytope and its middle.
+            radius: of the ball, a positive number or a `Radius`, in the units of the state.
+            horizon: as in `RolloutPolicy`, and so are ``steps``, ``depth`` and ``period``.
+
+        Raises:
+            ValueError: if an argument breaks its rule, or the plant has no LQR.
+        """
+        lqr = LQR(system, cost)
+        directions = _ball(centers, lqr.k.shape[-1])
+        basis = StaFBasis(ExponentialKernel(), StateFollowingCenters(directions, radius))
+        return cls(
+            basis, system, cost, lqr, lqr.value, horizon=horizon, steps=steps, depth=depth, period=period
+        )
+
     def forward(self, x: Tensor) -> Tensor:
         """u: (..., n) -> (..., m)."""
+        return self._compiled(x)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "_compiled": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__(state)  # type: ignore[no-untyped-call]
+        self._compiled = RowFunction(self.control, self, "a rollout policy")
+
+    def control(self, x: Tensor) -> Tensor:
+        """`forward` in plain torch: (..., n) -> (..., m)."""
         return self.cost.policy(self.model.effectiveness(x), self.gradient(x))
 
     def gradient(self, x: Tensor) -> Tensor:
@@ -92,17 +147,39 @@ class RolloutPolicy(nn.Module):
     def rollout(self, x: Tensor) -> Tensor:
         """Cost of the base policy over the horizon, and the terminal value: (..., n) -> (...)."""
         h = self.horizon / self.steps
-        spent = torch.zeros_like(x[..., 0])
-        for _ in range(self.steps):
-            k1, c1 = self._field(x)
-            k2, c2 = self._field(x + 0.5 * h * k1)
-            k3, c3 = self._field(x + 0.5 * h * k2)
-            k4, c4 = self._field(x + h * k3)
-            x = x + (h / 6) * (k1 + 2 * (k2 + k3) + k4)
-            spent = spent + (h / 6) * (c1 + 2 * (c2 + c3) + c4)
-        return spent + self.terminal(x)
+        # Classical Runge-Kutta: the times at which a stage asks, and the shares of what it answers.
+        asked = x.new_tensor((0.0, 0.5 * h, 0.5 * h, h))
+        shares = x.new_tensor((h / 6, h / 3, h / 3, h / 6))
+
+        def step(now: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+            start = now[0]
+
+            def stage(
+                carry: tuple[Tensor, Tensor, Tensor], at: tuple[Tensor, Tensor]
+            ) -> tuple[tuple[Tensor, Tensor, Tensor], tuple[()]]:
+                slope, end, spent = carry
+                slope, rate = self._field(start + at[0] * slope)
+                return (slope, end + at[1] * slope, spent + at[1] * rate), ()
+
+            (_, end, spent), _ = scan(stage, (torch.zeros_like(start), *now), (asked, shares), dim=0)
+            return end, spent
+
+        def whole(x: Tensor) -> Tensor:
+            x, spent = repeat(self.steps, step, (x, torch.zeros_like(x[..., 0])))
+            total: Tensor = spent + self.terminal(x)
+            return total
+
+        return each(whole, x, dim=x.dim() - 2) if x.dim() > 1 else whole(x)
 
     def _field(self, x: Tensor) -> tuple[Tensor, Tensor]:
         u = self.base(x)
-        rate = self.model.drift(x) + matvec(self.model.effectiveness(x), u)
-        return rate, self.cost.rate(x, u)
+        return self.model.rate(x, u), self.cost.rate(x, u)
+
+
+def _ball(count: int | None, dim: int) -> Tensor:
+    """Directions whose fit has an unbiased gradient at 0: all that quadratics need, or a symmetric cross."""
+    if count is None and dim > 3:
+        corners = cross_polytope(dim)
+        return torch.cat((corners, torch.zeros_like(corners[:1])))
+    number = math.comb(dim + 2, 2) if count is None else count
+    return rings(6) if (dim, number) == (2, 6) else ball(number, dim)

@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
 
-from .._checks import choice, fail, integer, trailing
+from ..lanes import Program
+from ..numerics.checks import choice, fail, integer, trailing
 from ..systems import ControlAffineSystem
-from .closed_loop import ClosedLoop, LoopState
-from .compilation import Step, compiled
-from .controller import Controller
+from .closed_loop import ClosedLoop, program, record
+from .controllers import Controller, check_equilibrium
 from .cost import Cost
-from .lqr import check_equilibrium
 
 _DRAWN_AHEAD = 1024  # steps whose random numbers are drawn at once
+_NUMBERS = 1 << 24  # at most, of all rows together
+_PAYS = 3000  # steps of a small batch in plain torch (some 1 ms each) that take as long as to compile
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,7 +60,7 @@ def simulate(
     seed: int | Sequence[int] = 0,
     integrator: str = "runge_kutta",
     limit: float = 1e6,
-    compile: bool | str = False,
+    compile: bool | str = "auto",
     progress: Callable[[int], None] | None = None,
 ) -> LoopResult:
     """The closed loop of a controller and a plant from the initial states x0.
@@ -85,8 +86,9 @@ def simulate(
         seed: of the first row, the next row having the next; or one a row.
         integrator: as in `ClosedLoop`.
         limit: as in `ClosedLoop`.
-        compile: one compiled step: True, False, or ``auto`` (where the run is long enough to pay for it);
-            what cannot be compiled runs uncompiled, with one line in the log.
+        compile: whether the loop is compiled by `lanes`: True, False, or ``auto`` (where the run is long
+            enough to pay for it). What cannot be compiled runs in plain torch, which is the definition,
+            with one line in the log.
         progress: called with the number of steps done since its last call.
 
     Raises:
@@ -98,16 +100,16 @@ def simulate(
     if steps % every:
         raise fail("simulate", "every", f"must divide the {steps} steps", every)
     choice("simulate", "compile", compile, (True, False, "auto"))
+    worth = steps * (1 + len(x0) / 200) >= _PAYS if compile == "auto" else bool(compile)
     loop = ClosedLoop(controller, system, cost, dt=dt, integrator=integrator, limit=limit)
     loop.to(x0.device)
     with torch.no_grad():
-        step = compiled(loop, x0, steps, compile)
-        return _run(loop, step, x0, steps, every, _seeds(seed, len(x0)), progress)
+        return _run(loop, program(loop, worth), x0, steps, every, _seeds(seed, len(x0)), progress)
 
 
 def _run(
     loop: ClosedLoop,
-    step: Step,
+    steps_of: Program,
     x0: Tensor,
     steps: int,
     every: int,
@@ -115,26 +117,27 @@ def _run(
     progress: Callable[[int], None] | None,
 ) -> LoopResult:
     state = loop.init(x0)
-    rows: list[tuple[Tensor, ...]] = []
-    numbers = _uniform(x0, loop.controller.draws, seeds)
-    for k in range(steps):
-        now = state
-        state, u = step(now, next(numbers))
-        if k % every == 0:
-            held = torch.where(state.alive.unsqueeze(-1), u, torch.nan)
-            rows.append(_record(now, held))
-        if progress is not None and (k + 1) % 100 == 0:
-            progress(100)
-    rows.append(_record(state, torch.full_like(rows[-1][1], torch.nan)))
-    x, u, actor, critic, spent, known = (torch.stack(column, dim=1) for column in zip(*rows, strict=True))
+    pieces: list[tuple[Tensor, ...]] = []
+    draws, done = loop.controller.draws, 0
+    generators = [torch.Generator().manual_seed(seed) for seed in (seeds if draws else ())]
+    ahead = max(1, min(_DRAWN_AHEAD, _NUMBERS // (x0.numel() * max(draws, 1))))
+    while done < steps:
+        # A piece ends at a recorded time, or there is none inside.
+        count = ahead // every * every if every <= ahead else min(ahead, every - done % every)
+        count = min(count, steps - done)
+        uniform = _uniform(x0, count, draws, generators)
+        state, out = steps_of(state, uniform, every=min(every, count))
+        if done % every == 0:
+            pieces.append(out)
+        done += count
+        if progress is not None:
+            progress(count)
+    last = record(state, torch.full_like(pieces[-1][1][:, -1], torch.nan))
+    pieces.append(tuple(part.unsqueeze(1) for part in last))
+    x, u, actor, critic, spent, known = (torch.cat(column, dim=1) for column in zip(*pieces, strict=True))
     time = torch.arange(0, steps + 1, every, dtype=torch.float64) * loop.dt
     frozen_at = torch.where(state.alive, torch.inf, state.lived * loop.dt)
     return LoopResult(time, x, u, actor, critic, spent, known, frozen_at)
-
-
-def _record(state: LoopState, u: Tensor) -> tuple[Tensor, ...]:
-    memory = state.memory
-    return state.x, u, memory.actor, memory.critic, state.cost, memory.identifier
 
 
 def _seeds(seed: int | Sequence[int], batch: int) -> Sequence[int]:
@@ -148,19 +151,13 @@ def _seeds(seed: int | Sequence[int], batch: int) -> Sequence[int]:
     return range(first, first + batch)
 
 
-def _uniform(x0: Tensor, draws: int, seeds: Sequence[int]) -> Iterator[Tensor]:
-    """Uniform numbers of [-1, 1], (B, draws, n) a step, one generator a row."""
-    batch, dim = x0.shape
-    generators = [torch.Generator().manual_seed(seed) for seed in (seeds if draws else ())]
-    while True:
-        if not draws:
-            yield x0.new_zeros(batch, 0, dim)
-            continue
-        ahead = [
-            torch.rand(_DRAWN_AHEAD, draws, dim, dtype=torch.float64, generator=generator)
-            for generator in generators
-        ]
-        yield from (2 * torch.stack(ahead, dim=1) - 1).to(x0).unbind(0)
+def _uniform(x0: Tensor, count: int, draws: int, generators: Sequence[torch.Generator]) -> Tensor:
+    """The next ``count`` steps' uniform numbers of [-1, 1], (B, count, draws, n), one generator a row."""
+    rows, dim = x0.shape
+    drawn = torch.empty(rows, count, draws, dim, dtype=torch.float64)
+    for row, generator in zip(drawn.unbind(0), generators, strict=False):
+        row.uniform_(generator=generator)
+    return drawn.mul_(2).sub_(1).to(x0)
 
 
 def _check(system: ControlAffineSystem, cost: Cost, x0: Tensor) -> None:

@@ -7,7 +7,7 @@ import copy
 import torch
 from torch import Tensor
 
-from .._checks import fail, number
+from ..numerics.checks import fail, number
 from ..systems import ControlAffineSystem
 from .cost import Matrix, QuadraticCost
 

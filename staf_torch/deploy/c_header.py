@@ -3,60 +3,122 @@
 from __future__ import annotations
 
 import ctypes
+import math
 import os
 import shutil
 import subprocess
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
-import numpy as np
 import torch
-from torch import Tensor
-from torch.export import ExportedProgram
+from torch import Tensor, nn
 
-from .formats import Run
-from .scalars import Scalars
+from ..adp import Controller
+from ..lanes import Program
+from ..lanes.combinators import Tree
+from ..lanes.graph import WIDE, Graph
+from ..lanes.program import Given, trace
+from ..lanes.schedule import Schedule
+from ..lanes.tracer import NotLoweredError
+from .formats import Run, as_tuple
+
+_CHEAP = set("add sub mul div lt le eq ne and or xor neg abs min max not where sqrt".split())  # noqa: SIM905
+_FREE = set("const elem result collect carry state row now load pack cast loop".split())  # noqa: SIM905
+
+
+class Source(NamedTuple):
+    """What one call of a header costs."""
+
+    constants: int  # numbers in it
+    flops: int
+    functions: int  # calls of exp and the like
 
 
 def export_c(
-    program: ExportedProgram, path: Path, outputs: Sequence[str], *, dtype: torch.dtype, note: str = ""
-) -> None:
-    """Write a program of `trace` for a batch of one row as ``static inline void staf(const T state[n], T
-    value[...], ...)``. It needs math.h, and no memory but the stack.
+    module: nn.Module, example: Tensor, path: Path, outputs: Sequence[str], *, note: str = ""
+) -> Source:
+    """Write a module at one row as ``static inline void staf(const T state[n], T value[...], ...)``.
 
     Args:
-        program: the program, of batch 1.
+        module: (1, n) -> a tensor or a tuple of tensors (1, ...).
+        example: an input (1, n); float64 makes T double, float32 float.
         path: of the header.
-        outputs: the names of its outputs.
-        dtype: float64 (double) or float32 (float).
+        outputs: the names of the outputs.
         note: lines for the comment at its head.
 
     Raises:
-        ValueError: if an operation of the program has no C here.
+        ValueError: if an operation of the module has no C here.
     """
-    kind, suffix = ("float", "f") if dtype == torch.float32 else ("double", "")
-    scalars = Scalars(program, suffix)
+
+    program = Program(lambda carry, now, row: (carry, as_tuple(module(row["state"]))), name="the header")
+    return _write(path, program, (), {"state": example[:1]}, outputs, note)
+
+
+def export_learning_c(controller: Controller, x0: Tensor, path: Path, *, dt: float, note: str = "") -> Source:
+    """Write a controller that learns: a structure ``staf_state``, ``staf_start`` that fills it, and
+
+        static inline void staf(staf_state *state, const T x[n], const T uniform[...], T u[m]);
+
+    which returns the control to hold for ``dt`` seconds and moves the weights. ``uniform`` are random numbers
+    of [-1, 1] that the caller draws; the argument is missing where the controller needs none.
+
+    Args:
+        controller: of `adp`.
+        x0: the first state, (1, n); float64 makes T double, float32 float.
+        path: of the header.
+        dt: s.
+        note: lines for the comment at its head.
+
+    Raises:
+        ValueError: if an operation of the controller has no C here.
+    """
+    first = controller.init(x0[:1])
+    carry = {key: part for key, part in first._asdict().items() if part.numel()}
+    inputs = {"x": x0[:1]}
+    if controller.draws:
+        inputs["uniform"] = x0.new_zeros(1, controller.draws, x0.shape[-1])
+
+    def step(carry: Tree, now: Tree, row: Tree) -> tuple[Tree, Tree]:
+        uniform = row.get("uniform", x0.new_zeros(1, 0, x0.shape[-1]))
+        u, after = controller.step(row["x"], first._replace(**carry), uniform, dt)
+        return {key: getattr(after, key) for key in carry}, (u,)
+
+    return _write(path, Program(step, name="the header"), carry, inputs, ["u"], note)
+
+
+def _write(path: Path, program: Program, carry: Tree, row: Tree, outputs: Sequence[str], note: str) -> Source:
     try:
-        found = scalars.run(*[None] * len(program.graph_signature.input_specs))
-    except ValueError as error:
-        raise ValueError(str(error).splitlines()[0]) from error  # without the tracer's epilogue
-    size = int(next(iter(_inputs(program))).shape[-1])
-    ends = [np.asarray(out, dtype=object).reshape(-1) for out in found]
-    arguments = [f"const {kind} state[{size}]"]
-    arguments += [f"{kind} {name}[{len(end)}]" for name, end in zip(outputs, ends, strict=True)]
-    stores = [
-        f"{name}[{k}] = {scalars.text(entry)};"
-        for name, end in zip(outputs, ends, strict=True)
-        for k, entry in enumerate(end)
-    ]
-    comment = "".join(f" * {line}\n" for line in note.replace("*/", "* /").splitlines())
-    body = "\n".join(f"    {line}" for line in (*scalars.lines, *stores))
-    path.write_text(
-        f"/*\n{comment} */\n#ifndef STAF_H\n#define STAF_H\n\n#include <math.h>\n\n"
-        f"static inline void staf({', '.join(arguments)})\n{{\n{body}\n}}\n\n#endif\n",
-        encoding="utf-8",
-    )
+        text = program.c_source("staf", carry, (), row, outputs=outputs, note=note)
+        graph, _, following, ends = trace(program.step, Given.of(carry, (), row, 1)).program
+    except NotLoweredError as error:
+        raise ValueError(f"This has no C here, export it as ONNX, pt2 or aoti: {error}") from error
+    if graph.single and WIDE in graph.type:
+        raise ValueError("This needs float64 inside, or float32 loses its digits: use --dtype float64.")
+    path.write_text(text, encoding="utf-8")
+    schedule = Schedule(graph, following, ends)
+    constants = sum(graph.op[node] == "const" for node in schedule.live)
+    return Source(constants, *_cost(graph, schedule))
+
+
+def _cost(graph: Graph, schedule: Schedule) -> tuple[int, int]:
+    """Return the additions and the like, and the calls of exp and the like, of one call."""
+    flops = functions = 0
+    for node in schedule.live:
+        op, count, owner = graph.op[node], 1, schedule._owner.get(node)
+        while owner is not None:
+            count *= graph.loops[owner].count
+            owner = schedule._owner.get(graph.loops[owner].node)
+        if op in ("map", "dot"):
+            aux = graph.aux[node]
+            count *= math.prod(aux[1]) if op == "map" else 2 * aux[0] * aux[1]
+            op = aux[0] if op == "map" else "add"
+        if op in _CHEAP:
+            flops += count
+        elif op not in _FREE:
+            functions += count
+    return flops, functions
 
 
 def runner_c(path: Path, sizes: Sequence[int | None], dtype: torch.dtype) -> Run:
@@ -97,15 +159,10 @@ def need_c_compiler() -> str:
         ValueError: if there is none.
     """
     wanted = os.environ.get("CC")
-    found = wanted or next((c for c in ("cc", "gcc", "g++", "clang") if shutil.which(c)), None)
-    if found is None or shutil.which(found) is None:
+    compiler = wanted or next((c for c in ("cc", "gcc", "g++", "clang") if shutil.which(c)), None)
+    if compiler is None or shutil.which(compiler) is None:
         raise ValueError(
             "The C header is compiled once to compare it with the library, and there is no C compiler here: "
-            f"install gcc, or name one in the variable CC; got {found!r}."
+            f"install gcc, or name one in the variable CC; got {compiler!r}."
         )
-    return found
-
-
-def _inputs(program: ExportedProgram) -> list[Tensor]:
-    fed = set(program.graph_signature.user_inputs)
-    return [n.meta["val"] for n in program.graph.nodes if n.op == "placeholder" and n.name in fed]
+    return compiler

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from torch.export import ExportedProgram
 
-from .._checks import fail
+from ..numerics.checks import fail
 
 FORMAT = 1
 """Of the note inside a .pt2 file; raised when an older reader would go wrong."""

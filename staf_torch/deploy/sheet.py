@@ -1,4 +1,4 @@
-"""What an embedded programmer asks of an exported file, measured here."""
+"""What an embedded programmer asks of an exported file: measured, and as text."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ import dataclasses
 import os
 import platform
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -52,7 +53,6 @@ _FUNCTIONS = {"exp", "expm1", "sin", "cos", "tanh", "sqrt", "rsqrt", "pow", "log
 _FREE = {"view", "slice", "select", "unsqueeze", "squeeze", "expand", "permute", "transpose", "cat", "clone"}
 _FREE |= {"full", "scalar_tensor", "empty", "ones_like", "zeros_like", "full_like", "new_ones", "new_zeros"}
 _FREE |= {
-    "_to_copy",
     "alias",
     "split_with_sizes",
     "getitem",
@@ -61,6 +61,7 @@ _FREE |= {
     "t",
     "_unsafe_view",
     "copy",
+    "_to_copy",
 }
 
 
@@ -145,8 +146,61 @@ def machine() -> str:
     return platform.processor() or platform.machine()
 
 
-def worst_difference(found: tuple[Tensor, ...], wanted: tuple[Tensor, ...]) -> list[float]:
-    """A number an output: the largest |found - wanted|, over the largest |wanted|."""
-    pairs = zip(found, wanted, strict=True)
+def worst_difference(got: tuple[Tensor, ...], wanted: tuple[Tensor, ...]) -> list[float]:
+    """A number an output: the largest |got - wanted|, over the largest |wanted|."""
+    pairs = zip(got, wanted, strict=True)
     wide = [(a.detach().double(), b.detach().double()) for a, b in pairs]
     return [float((a - b).abs().max() / b.abs().max()) for a, b in wide]
+
+
+def markdown(sheet: Mapping[str, Any]) -> str:
+    """The sheet of `staf-export`, for reading.
+
+    Args:
+        sheet: as in the JSON beside it.
+    """
+    work, late = sheet["work"], sheet["latency"]
+    ports = [
+        f"| {way} | `{port['name']}` | {_shape(port['size'])} "
+        f"| {sheet['dtype']} | {port['unit']} | {port['region']} |"
+        for way in ("input", "output")
+        for port in sheet[way + "s"]
+    ]
+    errors = [
+        f"| `{name}` | {sheet['equality'][name]:.2g} | {sheet['float32_error'][name]:.2g} |"
+        for name in sheet["equality"]
+    ]
+    lines = [
+        f"# {sheet['file']}",
+        "",
+        sheet["what"],
+        "",
+        f"From `{sheet['run']}`, trajectory {sheet['row']}, by staf_torch {sheet['version']} and torch "
+        f"{sheet['torch']}. Batch B: {sheet['batch']}.",
+        "",
+        "| | name | shape | dtype | unit | region |",
+        "|---|---|---|---|---|---|",
+        *ports,
+        "",
+        "| a call with one row | |",
+        "|---|---|",
+        f"| constants | {work['parameters']} ({work['bytes_constants']} bytes) |",
+        f"| flops | {work['flops']}, and {work['functions']} calls of exp, sin, ... |",
+        f"| bytes | {work['bytes_constants'] + work['bytes_in_out']}: constants, input and output once |",
+        f"| latency, median | {late['median_us']:.1f} us |",
+        f"| latency, 99 % | {late['p99_us']:.1f} us |",
+        f"| latency, worst of {late['calls']} | {late['worst_us']:.1f} us |",
+        "",
+        f"Latency: from Python, {sheet['runtime']}, one core of {sheet['machine']}.",
+        "",
+        "| output | file against library, same dtype | float32 against float64 |",
+        "|---|---|---|",
+        *errors,
+        "",
+        "Errors are the largest difference over the largest value, at 1000 random points of the region.",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _shape(size: int | None) -> str:
+    return "(B,)" if size is None else f"(B, {size})"

@@ -5,11 +5,12 @@ from importlib.util import find_spec as _find_spec
 if _find_spec("gymnasium") is None:
     raise ImportError("staf_torch.envs needs Gymnasium: pip install 'staf_torch[gym]'.")
 
-from .agent import Agent as Agent
+from .episodes import Agent as Agent
 from .episodes import Episodes as Episodes
+from .plant_env import OWN_PLANT as OWN_PLANT
+from .plant_env import PLANTS as PLANTS
 from .plant_env import PlantEnv as PlantEnv
-from .registration import PLANTS as PLANTS
-from .registration import register_plants
-from .vector_env import PlantVectorEnv as PlantVectorEnv
+from .plant_env import PlantVectorEnv as PlantVectorEnv
+from .plant_env import register_plants
 
 register_plants()

@@ -1,32 +1,115 @@
-"""Episodes of a controlled plant, many side by side, in torch: what both environments run on."""
+"""Episodes of a controlled plant, many side by side, in torch, and controllers of `adp` that play them."""
 
 from __future__ import annotations
 
 import math
+import pkgutil
+from collections.abc import Callable
+from typing import Any
 
+import numpy as np
 import torch
+from gymnasium import spaces
 from torch import Tensor
 
-from .._checks import fail, positive_real
-from ..adp import Controller, Cost, Memory
+from .. import systems
+from ..adp import Controller, ControllerState, Cost, Feedback, QuadraticCost
 from ..adp.closed_loop import ClosedLoop, LoopState
+from ..numerics.checks import choice, fail, positive_real
 from ..systems import ControlAffineSystem
+
+Plant = str | type[ControlAffineSystem] | ControlAffineSystem
+Numbers = np.ndarray[Any, np.dtype[np.float64]]
+NAMES = tuple(
+    name
+    for name, plant in vars(systems).items()
+    if isinstance(plant, type) and issubclass(plant, ControlAffineSystem) and plant.dim and plant.inputs
+)
+"""The plants of `systems` with inputs and a number of states, by the name of their class."""
+
+
+def make_plant(plant: Plant) -> ControlAffineSystem:
+    """Return the plant given, or one of the class, the name in `systems` or the dotted path given."""
+    made: object = plant
+    if isinstance(plant, str) and "." in plant:
+        try:
+            made = pkgutil.resolve_name(plant)
+        except (ImportError, AttributeError, ValueError) as error:
+            raise fail("PlantEnv", "plant", f"cannot be imported ({error})", plant) from error
+    elif isinstance(plant, str):
+        made = getattr(systems, str(choice("PlantEnv", "plant", plant, NAMES)))
+    if isinstance(made, type):
+        made = made()
+    if not isinstance(made, ControlAffineSystem) or made.dim is None or not made.inputs:
+        raise fail("PlantEnv", "plant", "must be a ControlAffineSystem with states and inputs", made)
+    return made
+
+
+def make_cost(plant: ControlAffineSystem, cost: Cost | None) -> Cost:
+    """The cost given, or x'x + u'u."""
+    assert plant.dim is not None
+    return QuadraticCost(1.0, 1.0, plant.dim, plant.inputs) if cost is None else cost
+
+
+def make_spaces(plant: ControlAffineSystem, limit: float, bound: float) -> tuple[spaces.Box, spaces.Box]:
+    """Observations: the state, each coordinate within the limit. Actions: each input within the bound."""
+    assert plant.dim is not None
+    positive_real("PlantEnv", "bound", bound)
+    seen = spaces.Box(-limit, limit, (plant.dim,), np.float64)
+    return seen, spaces.Box(-bound, bound, (plant.inputs,), np.float64)
+
+
+def to_control(action: Numbers | Tensor, shape: tuple[int, ...], bound: float) -> Tensor:
+    """An action of NumPy or torch as float64, in the action space.
+
+    Raises:
+        ValueError: if it has another shape or leaves the bound: nothing is clipped behind your back.
+    """
+    u = torch.as_tensor(action).detach().to("cpu", torch.float64)
+    if u.shape != shape:
+        raise fail("step", "action", f"must have the shape {shape}", tuple(u.shape))
+    if not bool((u.abs() <= bound).all()):
+        rule = f"must lie in [-{bound:g}, {bound:g}] (make the environment with a larger `bound`, or clip)"
+        raise fail("step", "action", rule, u)
+    return u
+
+
+def start(
+    options: dict[str, Any] | None, generators: list[np.random.Generator], spread: float, dim: int
+) -> Tensor:
+    """The initial states, (B, n): those of options["state"], or uniform in [-spread, spread]^n, a generator
+    a row.
+
+    Raises:
+        ValueError: if the stated ones have another shape or are not finite.
+    """
+    stated = None if options is None else options.get("state")
+    if stated is None:
+        return torch.stack([torch.from_numpy(g.uniform(-spread, spread, dim)) for g in generators])
+    states = torch.as_tensor(stated).to("cpu", torch.float64)
+    if states.dim() == 1:
+        states = states.expand(len(generators), -1)
+    if states.shape != (len(generators), dim) or not bool(torch.isfinite(states).all()):
+        raise fail("reset", 'options["state"]', f"must be ({len(generators)}, {dim}) and finite", states)
+    return states.clone()
 
 
 class _Held(Controller):
-    """u is what the memory holds: the loop's controller is outside."""
+    """u = what is carried: whoever steps the environment chooses it."""
 
-    def init(self, x0: Tensor) -> Memory:
+    def init(self, x0: Tensor) -> ControllerState:
         return holding(x0.new_zeros(x0.shape[0], 0))
 
-    def step(self, x: Tensor, memory: Memory, uniform: Tensor, dt: float) -> tuple[Tensor, Memory]:
-        return memory.actor, memory
+    def step(
+        self, x: Tensor, carried: ControllerState, uniform: Tensor, dt: float
+    ) -> tuple[Tensor, ControllerState]:
+        return carried.actor, carried
 
 
-def holding(u: Tensor) -> Memory:
-    """A memory that holds the control u (B, m) and nothing else."""
+def holding(u: Tensor) -> ControllerState:
+    """A controller's state that carries the control u (B, m) and nothing else."""
     empty = u.new_zeros(u.shape[0], 0)
-    return Memory(empty, u, u.new_zeros(u.shape[0], 0, 0), empty)
+    return ControllerState(empty, u, u.new_zeros(u.shape[0], 0, 0), empty)
 
 
 class Episodes:
@@ -94,3 +177,57 @@ class Episodes:
         self.age = self.age + 1
         reward = -torch.where(after.alive, after.cost, self.penalty)
         return reward, ~after.alive, self.age >= self.steps
+
+
+Policy = Callable[[Tensor], Tensor]
+"""u from x: (..., n) -> (..., m)."""
+
+
+class Agent:
+    """Observations of NumPy in, actions of NumPy out, from a feedback law or a learning controller.
+
+    A learning controller learns on from step to step, row by row; `begin` makes it forget.
+
+    Example:
+        >>> env = gymnasium.make("staf_torch/TwoState-v0")
+        >>> agent = envs.Agent(adp.LQR(env.unwrapped.plant, env.unwrapped.cost))
+        >>> observation, _ = env.reset(seed=0)
+        >>> agent(observation).shape
+        (1,)
+
+    Args:
+        controller: a `Controller`, or a policy (..., n) -> (..., m).
+        dt: s, between two actions.
+        seed: of the random numbers that the controller draws; row b draws from seed + b, as in
+            `adp.simulate`.
+    """
+
+    def __init__(self, controller: Controller | Policy, *, dt: float = 0.01, seed: int = 0) -> None:
+        self.controller = controller if isinstance(controller, Controller) else Feedback(controller)
+        self.dt, self.seed = positive_real("Agent", "dt", dt), seed
+        self._carried: ControllerState | None = None
+        self._generators: list[torch.Generator] = []
+
+    def begin(self) -> None:
+        """Forget what was learned, and begin the sequence of random numbers anew."""
+        self._carried = None
+
+    def __call__(self, observation: Numbers | Tensor) -> Numbers:
+        """u: (n,) -> (m,), or (B, n) -> (B, m) with the same B until the next `begin`."""
+        seen = torch.as_tensor(observation).to("cpu", torch.float64)
+        x = seen.reshape(-1, seen.shape[-1])
+        with torch.no_grad():
+            if self._carried is None:
+                self._carried = self.controller.init(x)
+                self._generators = [torch.Generator().manual_seed(self.seed + row) for row in range(len(x))]
+            u, self._carried = self.controller.step(x, self._carried, self._uniform(x), self.dt)
+        action: Numbers = u.reshape(*seen.shape[:-1], -1).numpy()
+        return action
+
+    def _uniform(self, x: Tensor) -> Tensor:
+        draws = self.controller.draws
+        if not draws:
+            return x.new_zeros(len(x), 0, x.shape[-1])
+        shape = (draws, x.shape[-1])
+        rows = [torch.rand(*shape, dtype=x.dtype, generator=generator) for generator in self._generators]
+        return 2 * torch.stack(rows) - 1

@@ -1,17 +1,22 @@
-"""One plant as a Gymnasium environment."""
+"""A plant as a Gymnasium environment, alone or in many rows as one tensor program, and their names."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import gymnasium
+import numpy as np
 import torch
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
 from torch import Tensor
 
-from .._checks import positive_real
 from ..adp import Cost
-from .episodes import Episodes
-from .settings import Numbers, Plant, make_cost, make_plant, make_spaces, start, to_control
+from ..numerics.checks import integer, positive_real
+from ..systems import ControlAffineSystem
+from .episodes import NAMES, Episodes, Numbers, Plant, make_cost, make_plant, make_spaces, start, to_control
+
+Flags = np.ndarray[Any, np.dtype[np.bool_]]
 
 
 class PlantEnv(gymnasium.Env):
@@ -23,11 +28,12 @@ class PlantEnv(gymnasium.Env):
         >>> observation, _ = env.reset(seed=0)
 
     Args:
-        plant: the name of a plant of `systems`, or a plant.
+        plant: the name of a plant of `systems`, a class of your own or its dotted path, or a plant.
         cost: the cost rate; x'x + u'u by default.
         dt: s.
         horizon: s; the episode is truncated there.
-        spread: initial states are uniform in [-spread, spread]^n; `reset(options={"state": x})` sets one.
+        spread: initial states are uniform in [-spread, spread]^n, by default the plant's own;
+            `reset(options={"state": x})` sets one.
         bound: largest |u_i|; an action beyond it is refused.
         limit: an episode whose |x| would exceed it terminates.
         penalty: cost of that.
@@ -45,7 +51,7 @@ class PlantEnv(gymnasium.Env):
         *,
         dt: float = 0.01,
         horizon: float = 10.0,
-        spread: float = 1.0,
+        spread: float | None = None,
         bound: float = 20.0,
         limit: float = 100.0,
         penalty: float = 1e4,
@@ -56,7 +62,7 @@ class PlantEnv(gymnasium.Env):
         self.episodes = Episodes(
             self.plant, self.cost, 1, dt=dt, horizon=horizon, limit=limit, penalty=penalty
         )
-        self.bound, self.spread = bound, positive_real("PlantEnv", "spread", spread)
+        self.bound, self.spread = bound, _spread("PlantEnv", self.plant, spread)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -80,3 +86,129 @@ class PlantEnv(gymnasium.Env):
     def _observation(self) -> Numbers:
         seen: Numbers = self.episodes.state[0].numpy().copy()
         return seen
+
+
+class PlantVectorEnv(VectorEnv):
+    """`PlantEnv` in B rows that never touch each other: row b is the single environment seeded seed + b.
+
+    Example:
+        >>> envs = gymnasium.make_vec("staf_torch/TwoState-v0", num_envs=1000)
+        >>> observations, _ = envs.reset(seed=0)
+
+    Args:
+        plant, cost, dt, horizon, spread, bound, limit, penalty: as in `PlantEnv`.
+        num_envs: B.
+        autoreset_mode: when a finished row begins anew: at its next step, whose action is then ignored
+            (Gymnasium's default), in the same step (the last observation is ``info["final_obs"]``), or by
+            ``reset(options={"reset_mask": mask})`` alone.
+
+    Raises:
+        ValueError: if an argument breaks its rule.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012
+
+    def __init__(
+        self,
+        plant: Plant = "TwoState",
+        cost: Cost | None = None,
+        *,
+        num_envs: int = 1,
+        dt: float = 0.01,
+        horizon: float = 10.0,
+        spread: float | None = None,
+        bound: float = 20.0,
+        limit: float = 100.0,
+        penalty: float = 1e4,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+    ) -> None:
+        self.num_envs = integer("PlantVectorEnv", "num_envs", num_envs, least=1)
+        self.mode = AutoresetMode(autoreset_mode)
+        self.metadata = {**type(self).metadata, "autoreset_mode": self.mode}
+        self.plant = make_plant(plant)
+        self.cost = make_cost(self.plant, cost)
+        self.single_observation_space, self.single_action_space = make_spaces(self.plant, limit, bound)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.episodes = Episodes(
+            self.plant, self.cost, num_envs, dt=dt, horizon=horizon, limit=limit, penalty=penalty
+        )
+        self.bound, self.spread = bound, _spread("PlantVectorEnv", self.plant, spread)
+        self._generators: list[np.random.Generator] = []
+        self._over = torch.zeros(num_envs, dtype=torch.bool)
+
+    def reset(
+        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Numbers, dict[str, Any]]:
+        """New episodes in all rows, or in those of ``options["reset_mask"]``: the observations."""
+        if seed is not None or not self._generators:
+            count = range(self.num_envs)
+            seeds = seed if isinstance(seed, list) else [None if seed is None else seed + k for k in count]
+            self._generators = [gymnasium.utils.seeding.np_random(one)[0] for one in seeds]
+        mask = None if options is None else options.get("reset_mask")
+        rows = torch.ones_like(self._over) if mask is None else torch.as_tensor(mask, dtype=torch.bool)
+        self._begin(rows, options)
+        return self._observation(), {}
+
+    def step(self, actions: Numbers | Tensor) -> tuple[Numbers, Numbers, Flags, Flags, dict[str, Any]]:
+        """Hold the actions (B, m) for dt: observations, rewards, terminated, truncated, info.
+
+        Raises:
+            ValueError: if an action is not in the action space.
+        """
+        u = to_control(actions, (self.num_envs, self.plant.inputs), self.bound)
+        anew = self._over if self.mode is AutoresetMode.NEXT_STEP else torch.zeros_like(self._over)
+        reward, terminated, truncated = self.episodes.step(u)
+        if bool(anew.any()):
+            self._begin(anew, None)
+            reward = torch.where(anew, 0.0, reward)
+            terminated, truncated = terminated & ~anew, truncated & ~anew
+        self._over = terminated | truncated
+        info: dict[str, Any] = {}
+        if self.mode is AutoresetMode.SAME_STEP and bool(self._over.any()):
+            over = self._over.numpy().copy()
+            final = np.full(self.num_envs, None, dtype=object)
+            for row in np.flatnonzero(over):
+                final[row] = self.episodes.state[row].numpy().copy()
+            info = {"final_obs": final, "_final_obs": over, "final_info": {}, "_final_info": over.copy()}
+            self._begin(self._over, None)
+        return self._observation(), reward.numpy(), terminated.numpy(), truncated.numpy(), info
+
+    def _begin(self, rows: Tensor, options: dict[str, Any] | None) -> None:
+        # A row draws from its own generator, and only when it begins: no row depends on another.
+        dim = self.episodes.state.shape[1]
+        chosen = rows.nonzero().flatten().tolist()
+        stated = options is not None and options.get("state") is not None
+        x0 = self.episodes.state.clone()
+        if stated:
+            x0 = start(options, self._generators, self.spread, dim)
+        elif chosen:
+            x0[rows] = start(None, [self._generators[row] for row in chosen], self.spread, dim)
+        self.episodes.begin(rows, x0)
+        self._over = self._over & ~rows
+
+    def _observation(self) -> Numbers:
+        seen: Numbers = self.episodes.state.numpy().copy()
+        return seen
+
+
+PLANTS = {f"staf_torch/{name}-v0": name for name in NAMES}
+"""Id of the environment: name of its plant."""
+OWN_PLANT = "staf_torch/Plant-v0"
+"""Id of the environment of your own plant: ``gymnasium.make_vec(OWN_PLANT, plant="my_module.Rocket")``."""
+
+
+def register_plants() -> None:
+    """Register every plant with Gymnasium, once."""
+    for name, plant in (*PLANTS.items(), (OWN_PLANT, None)):
+        if name not in gymnasium.registry:
+            gymnasium.register(
+                name,
+                entry_point="staf_torch.envs:PlantEnv",
+                vector_entry_point="staf_torch.envs:PlantVectorEnv",
+                kwargs={} if plant is None else {"plant": plant},
+            )
+
+
+def _spread(call: str, plant: ControlAffineSystem, stated: float | None) -> float:
+    return positive_real(call, "spread", plant.spread if stated is None else stated)

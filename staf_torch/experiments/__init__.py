@@ -1,1 +1,1 @@
-"""Experiments, one a module, and the command line over them."""
+"""Experiments, one a module; `registry` knows them by the setting `task`."""

@@ -2,53 +2,36 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
-from ..adp import LoopResult
-from ..adp_metrics import adp_metrics
-from ..report import HistoryWriter, write_metrics
-from .adp_batch import simulate_together
-from .build_adp import AdpProblem, adp_problem
-from .optimum import Reference, compare
-from .progress import Progress
+from ..adp import ActorCritic, Controller, Gains, LoopResult, Supervised, simulate
+from ..adp.problem import AdpProblem
+from ..adp.reference_optimum import Reference, compare
+from ..figures.closed_loop import AdpHistory, draw_adp
+from ..figures.style import images
+from ..metrics.closed_loop import adp_metrics
+from ..results.progress import SHOWN, Progress
+from ..results.run_directory import RunDirectory
+from ..settings.adp import adp_problem
+from ..settings.chase import make_metrics
+from ..tables.columns import significant
+from .registry import BatchedExperiment, Metrics
 
 _log = logging.getLogger(__name__)
 _NAMED = 20  # diverged trajectories that the log lists by number
 
 
-_GAINS = (
-    *("critic", "critic_extrapolated", "actor", "actor_decay", "forgetting", "normalisation"),
-    *("information", "information_extrapolated"),
-)
-BATCHABLE = frozenset(
-    {"seed", "initial_state", "spread", "adp.critic", "adp.actor", "adp.gain"}
-    | {f"adp.gains.{name}" for name in _GAINS}
-)
-"""Settings whose numbers may differ within a tensor batch."""
-
-
-def shape(settings: Mapping[str, object]) -> object:
-    """Nothing more follows from batchable settings."""
-    return None
-
-
-def size(settings: Mapping[str, object]) -> int:
-    """About how many bytes a member keeps until it is written: no more than 200 000 states are recorded."""
-    rows, dt, duration = (settings.get(name) for name in ("trajectories", "dt", "duration"))
-    if not all(isinstance(number, int | float) and number > 0 for number in (rows, dt, duration)):
-        return 0  # it will be refused
-    return int(8 * 40 * min(rows * duration / dt, 2e5))  # type: ignore[operator]
-
-
 @dataclasses.dataclass(frozen=True)
-class Solved:
+class LoopSolution:
     """A closed loop that has been run and has left nothing on disk yet. It can be pickled."""
 
     result: LoopResult
@@ -56,31 +39,56 @@ class Solved:
     method: str  # plant and policy, for the log
     dt: float  # s
     steps: int
-    metrics: dict[str, float | None]  # what `metrics.json` will hold
+    metrics: Metrics  # what `metrics.json` will hold
 
 
-def run(cfg: DictConfig, directory: Path) -> dict[str, float | None]:
-    """Run what the settings describe and fill the run directory; `metrics.json` comes last."""
-    problem = adp_problem(cfg)
-    return write(cfg, directory, _solved(cfg, problem, solve(problem)))
+class ClosedLoop(BatchedExperiment[LoopSolution]):
+    """Optimal regulation; initial states, seeds, initial weights and gains share a tensor batch."""
 
+    batchable = frozenset(
+        {"seed", "initial_state", "spread", "adp.critic", "adp.actor", "adp.gain", "adp.policy.gain"}
+        | {
+            f"adp.{node}.{field.name}"
+            for node in ("gains", "law.gains")
+            for field in dataclasses.fields(Gains)
+        }
+    )
 
-def solve_members(cfgs: Sequence[DictConfig]) -> list[Solved | Exception]:
-    """Several configurations of one group as one tensor batch.
+    def __call__(self, cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics:
+        """Run what the settings describe and fill the run directory; `metrics.json` comes last."""
+        problem = adp_problem(cfg)
+        return self.write(cfg, directory, _solved(cfg, problem, solve(problem, progress)))
 
-    Returns:
-        In their order; an exception in the place of one whose settings break a rule.
+    def solve(self, cfgs: Sequence[DictConfig], progress: Progress) -> list[LoopSolution | Exception]:
+        """Solve several configurations of one group as one tensor batch."""
+        prepared = [_prepared(cfg) for cfg in cfgs]
+        problems = [problem for problem in prepared if isinstance(problem, AdpProblem)]
+        results: Iterator[LoopResult] = iter(())
+        if problems:
+            with progress.over(problems[0].steps, "steps") as advance:
+                results = iter(simulate_together(problems, advance))
+        return [
+            _solved(cfg, problem, next(results)) if isinstance(problem, AdpProblem) else problem
+            for cfg, problem in zip(cfgs, prepared, strict=True)
+        ]
 
-    Raises:
-        Exception: what stops the batch as a whole.
-    """
-    prepared = [_prepared(cfg) for cfg in cfgs]
-    problems = [problem for problem in prepared if isinstance(problem, AdpProblem)]
-    results = iter(simulate_together(problems) if problems else ())
-    return [
-        _solved(cfg, problem, next(results)) if isinstance(problem, AdpProblem) else problem
-        for cfg, problem in zip(cfgs, prepared, strict=True)
-    ]
+    def write(self, cfg: DictConfig, directory: Path, solution: LoopSolution) -> Metrics:
+        """Fill the run directory with what was solved; `metrics.json` comes last."""
+        out = RunDirectory(directory)
+        if cfg.history:
+            write_history(out, solution.result)
+        name_the_diverged(solution.result)
+        if cfg.figures:
+            out.figure(cfg.task, images(draw_adp(_drawn(solution.result, solution.optimum))))
+        _summarise(solution)
+        return out.metrics(solution.metrics)
+
+    def size(self, settings: Mapping[str, object]) -> int:
+        """Return about how many bytes the records take: no more than 200 000 states are kept."""
+        rows, dt, duration = (settings.get(name) for name in ("trajectories", "dt", "duration"))
+        if not all(isinstance(number, int | float) and number > 0 for number in (rows, dt, duration)):
+            return 0  # it will be refused
+        return int(8 * 40 * min(rows * duration / dt, 2e5))  # type: ignore[operator]
 
 
 def _prepared(cfg: DictConfig) -> AdpProblem | Exception:
@@ -90,7 +98,7 @@ def _prepared(cfg: DictConfig) -> AdpProblem | Exception:
         return error
 
 
-def _solved(cfg: DictConfig, problem: AdpProblem, result: LoopResult) -> Solved:
+def _solved(cfg: DictConfig, problem: AdpProblem, result: LoopResult) -> LoopSolution:
     optimum = compare(problem, result)
     metrics = adp_metrics(
         result,
@@ -98,37 +106,89 @@ def _solved(cfg: DictConfig, problem: AdpProblem, result: LoopResult) -> Solved:
         control_error=optimum.control_error,
         value_error=optimum.value_error,
     )
-    policy = f"{cfg.adp.law} actor-critic" if cfg.adp.policy == "actor_critic" else cfg.adp.policy
-    method = f"{type(problem.system).__name__} with {policy}"
-    return Solved(result, optimum, method, problem.dt, problem.steps, metrics)
+    own = make_metrics(cfg.get("metric"))
+    metrics |= {metric.name: metric.worst(result, problem) for metric in own}
+    method = f"{type(problem.system).__name__} with {problem.controller.label}"
+    return LoopSolution(result, optimum, method, problem.dt, problem.steps, metrics)
 
 
-def write(cfg: DictConfig, directory: Path, solved: Solved) -> dict[str, float | None]:
-    """Fill the run directory with what was solved; `metrics.json` comes last."""
-    if cfg.history:
-        write_history(directory / "history.npz", solved.result)
-    name_the_diverged(solved.result)
-    if cfg.figures:
-        _draw(solved.result, solved.optimum, directory / "figures", cfg.task)
-    _summarise(solved)
-    write_metrics(directory / "metrics.json", solved.metrics)
-    return solved.metrics
-
-
-def solve(problem: AdpProblem) -> LoopResult:
-    """The closed loop."""
-    progress = Progress(problem.steps, "steps")
-    (result,) = simulate_together([problem], progress.advance)
-    progress.close()
+def solve(problem: AdpProblem, progress: Progress = SHOWN) -> LoopResult:
+    """Run the closed loop."""
+    with progress.over(problem.steps, "steps") as advance:
+        (result,) = simulate_together([problem], advance)
     return result
 
 
-def write_history(path: Path, result: LoopResult) -> None:
-    """`history.npz`: time (T,), and (B, T, ...) arrays of everything recorded."""
-    batch, times = result.state.shape[:2]
-    with HistoryWriter(path, batch, times) as writer:
-        names = ("state", "control", "actor_weights", "critic_weights", "running_cost")
-        writer.add({name: getattr(result, name).cpu().numpy() for name in names})
+def simulate_together(
+    problems: Sequence[AdpProblem], progress: Callable[[int], None] | None = None
+) -> list[LoopResult]:
+    """Run problems that differ in initial states, seeds, initial weights and gains alone.
+
+    Args:
+        problems: at least one, alike in everything else.
+        progress: as in `simulate`.
+    """
+    first = problems[0]
+    rows = [len(problem.initial_states) for problem in problems]
+    together = simulate(
+        _stacked([problem.controller for problem in problems], rows),
+        first.system,
+        first.cost,
+        torch.cat([problem.initial_states for problem in problems]),
+        dt=first.dt,
+        steps=first.steps,
+        every=first.every,
+        seed=[
+            problem.seed + row for problem, batch in zip(problems, rows, strict=True) for row in range(batch)
+        ],
+        integrator=first.integrator,
+        compile=first.compile,
+        progress=progress,
+    )
+    fields = [field.name for field in dataclasses.fields(together) if field.name != "time"]
+    parts = zip(*(getattr(together, name).split(rows) for name in fields), strict=True)
+    return [LoopResult(together.time, **dict(zip(fields, part, strict=True))) for part in parts]
+
+
+def _stacked(controllers: Sequence[Controller], rows: Sequence[int]) -> Controller:
+    """One controller in place of several whose initial weights and gains differ."""
+    if len(controllers) == 1:
+        return controllers[0]
+    stacked = copy.deepcopy(controllers[0])
+    target = learner(stacked)
+    if target is None:
+        return stacked
+    given = [one for each in controllers if (one := learner(each)) is not None]
+    counts = torch.tensor(rows)
+    for name in ("critic", "actor", "gain"):
+        values = torch.stack([getattr(one, name) for one in given])
+        setattr(target, name, values.repeat_interleave(counts.to(values.device), dim=0))
+    target.law.gains = _gains([one.law.gains for one in given], counts, target.critic)
+    return stacked
+
+
+def _gains(gains: Sequence[Gains], counts: Tensor, like: Tensor) -> Gains:
+    """Numbers where all agree, else (B, 1) of the dtype and on the device of ``like``."""
+    given: dict[str, float | Tensor] = {}
+    for field in dataclasses.fields(Gains):
+        values = [getattr(each, field.name) for each in gains]
+        rows = torch.tensor(values, dtype=torch.float64).repeat_interleave(counts).to(like)
+        given[field.name] = values[0] if len(set(values)) == 1 else rows.unsqueeze(-1)
+    return Gains(**given)
+
+
+def learner(controller: Controller) -> ActorCritic | None:
+    """Return what learns in a controller, with or without a supervisor; None where nothing does."""
+    inner = controller.controller if isinstance(controller, Supervised) else controller
+    return inner if isinstance(inner, ActorCritic) else None
+
+
+def write_history(out: RunDirectory, result: LoopResult, **more: Tensor) -> None:
+    """Write `history.npz`: time (T,), and (B, T, ...) arrays of everything recorded, and ``more`` of them."""
+    names = ("state", "control", "actor_weights", "critic_weights", "running_cost")
+    arrays = {name: getattr(result, name) for name in names} | more
+    with out.history(*result.state.shape[:2]) as writer:
+        writer.add({name: array.cpu().numpy() for name, array in arrays.items()})
         writer.close(time=result.time.numpy())
 
 
@@ -142,10 +202,9 @@ def name_the_diverged(result: LoopResult) -> None:
         _log.warning("and %d more trajectories diverged", len(rows) - _NAMED)
 
 
-def _summarise(solved: Solved) -> None:
+def _summarise(solved: LoopSolution) -> None:
     def show(name: str) -> str:
-        number = solved.metrics[name]
-        return "-" if number is None else f"{number:.5g}"
+        return significant(solved.metrics[name], 5)
 
     batch = len(solved.result.state)
     _log.info(
@@ -162,14 +221,13 @@ def _summarise(solved: Solved) -> None:
     _log.info("  final |x| %s, regulated %s, diverged %s", *map(show, names))
 
 
-def _draw(result: LoopResult, optimum: Reference, folder: Path, name: str) -> None:
-    # Imported here: matplotlib takes a second, which figures=false need not pay.
-    from ..report import plots, plots_adp
+def _drawn(result: LoopResult, optimum: Reference) -> AdpHistory:
+    """The first trajectory."""
 
     def first(rows: Tensor | None) -> np.ndarray | None:
         return None if rows is None else rows[0].cpu().numpy()
 
-    history = plots_adp.AdpHistory(
+    return AdpHistory(
         time=result.time.numpy(),
         state=result.state[0].cpu().numpy(),
         control=result.control[0].cpu().numpy(),
@@ -180,5 +238,3 @@ def _draw(result: LoopResult, optimum: Reference, folder: Path, name: str) -> No
         value_error=first(optimum.value_error),
         optimal_cost=None if optimum.cost is None else float(optimum.cost[0]),
     )
-    folder.mkdir(exist_ok=True)
-    plots.save(plots_adp.draw_adp(history), folder / name)

@@ -1,25 +1,31 @@
-"""Every method on the same initial states: one table, a row a method, and one figure."""
+"""Every method on the same initial states, a row a method, and every law from the same initial weights."""
 
 from __future__ import annotations
 
-import csv
-import io
+import dataclasses
 import logging
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import torch
-from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf import DictConfig, open_dict
 from torch import Tensor
 
-from ..adp import ActorCritic, Feedback, LoopResult, RolloutPolicy, Supervised
-from ..adp_metrics import comparison_row, regulated
-from ..report import write_metrics, write_text
-from .adp import solve
-from .build_adp import AdpProblem, adp_problem
-from .optimum import optimal_cost
+from ..adp import Controller, Feedback, LoopResult, RolloutPolicy
+from ..adp.problem import AdpProblem
+from ..adp.reference_optimum import optimal_cost
+from ..figures.closed_loop import draw_comparison
+from ..figures.style import images
+from ..metrics.closed_loop import comparison_row, regulated
+from ..numerics.checks import fail, positive_real, vector
+from ..results.progress import SHOWN, Progress
+from ..results.run_directory import RunDirectory
+from ..settings.adp import adp_problem, changed, updated
+from ..settings.chase import plain
+from ..tables import Style, Table
+from ..tables.columns import significant
+from .adp import learner, solve
 
 _log = logging.getLogger(__name__)
 _FIXED = {"extrapolated_around": "origin", "half_width": {"radius": 1.0, "offset": None}, "trust": None}
@@ -37,6 +43,11 @@ _ROWS: dict[str, dict[str, Any]] = {
     "LQR": {"policy": "lqr"},
     "rollout policy": {"policy": "rollout"},
 }
+_LAWS: dict[str, dict[str, Any]] = {
+    "published": {"law": "published", "integrator": "euler", "trust": None},
+    "information": {"law": "information", "trust": None},
+    "supervised": {"law": "information"},
+}
 _PUBLISHED_STEP = 0.001  # s
 _COLUMNS = {
     "method": "method",
@@ -52,55 +63,49 @@ _COLUMNS = {
 }
 
 
-def run(cfg: DictConfig, directory: Path) -> dict[str, float | None]:
+def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> dict[str, float | None]:
     """Run every method and fill the run directory; `metrics.json` comes last."""
     rows: list[dict[str, Any]] = []
     ratios: dict[str, Tensor] = {}
     best: Tensor | None = None
-    for name, problem in methods(cfg):
+    for name, changes in _ROWS.items():
+        problem = variant(cfg, changes)
         best = _optimum(problem) if best is None else best  # the initial states are the same for all
         start = time.perf_counter()
-        result = solve(problem)
+        result = solve(problem, progress)
         seconds = (time.perf_counter() - start) / (problem.steps * len(problem.initial_states))
         row, ratio = _row(problem, result, best)
         row |= {"method": name, "microseconds": 1e6 * seconds}
         rows.append(row)
         ratios[name] = ratio
         shown = ("ratio_median", "ratio_max", "regulated")
-        numbers = ["-" if row[key] is None else f"{row[key]:.4g}" for key in shown]
+        numbers = [significant(row[key], 4) for key in shown]
         _log.info("%-34s J/J* median %s, max %s, regulated %s", name, *numbers)
-    _write_table(directory, rows)
+    out = RunDirectory(directory)
+    out.table("comparison", dataclasses.replace(Table.of(rows, _COLUMNS), style=Style(digits=4)))
     if cfg.figures:
-        _draw(ratios, directory / "figures")
-    metrics = {
-        f"{_slug(row['method'])}_{key}": value
-        for row in rows
-        for key, value in row.items()
-        if key not in ("method", "microseconds")
-    }
-    write_metrics(directory / "metrics.json", metrics)
-    return metrics
-
-
-def methods(cfg: DictConfig) -> Iterator[tuple[str, AdpProblem]]:
-    """Name and closed loop of every row of the table."""
-    for name, changes in _ROWS.items():
-        yield name, variant(cfg, changes)
+        drawn = {name: ratio.cpu().numpy() for name, ratio in ratios.items()}
+        out.figure("adp_comparison", images(draw_comparison(drawn)))
+    metrics: dict[str, float | None] = {}
+    for row in rows:
+        prefix = "_".join(row["method"].lower().replace(",", "").replace("-", "_").split())
+        measured = {key: value for key, value in row.items() if key not in ("method", "microseconds")}
+        metrics |= {f"{prefix}_{key}": value for key, value in measured.items()}
+    return out.metrics(metrics)
 
 
 def variant(cfg: DictConfig, changes: dict[str, Any]) -> AdpProblem:
     """The closed loop of the settings with other ones under `adp`, recorded at its ends."""
-    changed = cfg.copy()
-    with open_dict(changed):
-        changed.adp = OmegaConf.merge(cfg.adp, changes)
+    chosen = changed(updated(cfg), changes)
+    with open_dict(chosen):
         if changes.get("law") == "published":
-            changed.dt = min(cfg.dt, _PUBLISHED_STEP)  # its own step: Euler fails sooner at a longer one
-        if changed.adp.record_every is None:
-            changed.adp.record_every = round(cfg.duration / changed.dt)  # the ends are enough for a table
+            chosen.dt = min(cfg.dt, _PUBLISHED_STEP)  # its own step: Euler fails sooner at a longer one
+        if chosen.adp.record_every is None:
+            chosen.adp.record_every = round(cfg.duration / chosen.dt)  # the ends are enough for a table
         if changes.get("policy") == "rollout":
-            changed.adp.record_every = 1
-        changed.trajectories = cfg.trajectories + 1
-    problem = adp_problem(changed)
+            chosen.adp.record_every = 1
+        chosen.trajectories = cfg.trajectories + 1
+    problem = adp_problem(chosen)
     # The first state is the middle of the box, the equilibrium: nothing can be compared there.
     return problem.with_states(problem.initial_states[1:])
 
@@ -122,44 +127,58 @@ def _row(problem: AdpProblem, result: LoopResult, best: Tensor) -> tuple[dict[st
     return row, torch.where(regulated(result), ratio, torch.inf)
 
 
-def _size(controller: object) -> tuple[int, int]:
+def _size(controller: Controller) -> tuple[int, int]:
     """Basis functions, and states of the model asked a step."""
-    if isinstance(controller, Supervised):
-        return _size(controller.controller)
-    if isinstance(controller, ActorCritic):
-        return controller.basis.count, controller.extrapolation.count
+    learning = learner(controller)
+    if learning is not None:
+        return learning.basis.count, learning.extrapolation.count
     if isinstance(controller, Feedback) and isinstance(controller.policy, RolloutPolicy):
         policy = controller.policy
         return policy.basis.count, policy.basis.count * policy.steps
     return 0, 0
 
 
-def _write_table(directory: Path, rows: list[dict[str, Any]]) -> None:
-    """`comparison.csv` with every digit, `comparison.md` to read."""
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(_COLUMNS), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    write_text(directory / "comparison.csv", text.getvalue())
-    lines = ["| " + " | ".join(_COLUMNS.values()) + " |", "|---" * len(_COLUMNS) + "|"]
-    lines += ["| " + " | ".join(_cell(row[key]) for key in _COLUMNS) + " |" for row in rows]
-    write_text(directory / "comparison.md", "\n".join(lines) + "\n")
+def initial_weights(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> dict[str, float | None]:
+    """Run every law from every pair of weights and state: a row a law; `metrics.json` comes last."""
+    weights = _weights(cfg)
+    headings = [*(f"W0 = {w:g}" for w in weights), "all"]
+    metrics: dict[str, float | None] = {}
+    table: list[dict[str, str]] = []
+    for name, changes in _LAWS.items():
+        problem = _from_weights(variant(cfg, changes), weights, cfg.adp.actor / cfg.adp.critic)
+        result = solve(problem, progress)
+        shares = regulated(result).double().reshape(len(weights), -1).mean(-1).tolist()
+        metrics |= {f"{name}_regulated_W{w:g}": share for w, share in zip(weights, shares, strict=True)}
+        metrics[f"{name}_regulated_fraction"] = sum(shares) / len(shares)
+        metrics[f"{name}_diverged_fraction"] = float(result.diverged.double().mean())
+        shown = [*shares, sum(shares) / len(shares)]
+        table.append({"law": name} | {h: f"{share:.4g}" for h, share in zip(headings, shown, strict=True)})
+        _log.info(
+            "%-12s regulated %.4g of all, %.4g at the worst W0, diverged %.4g",
+            name,
+            metrics[f"{name}_regulated_fraction"],
+            min(shares),
+            metrics[f"{name}_diverged_fraction"],
+        )
+    out = RunDirectory(directory)
+    out.table(cfg.task, Table.of(table))
+    return out.metrics(metrics)
 
 
-def _cell(value: object) -> str:
-    if value is None:
-        return "-"
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
+def _weights(cfg: DictConfig) -> list[float]:
+    weights = vector("staf", "initial_weights", plain(cfg.initial_weights))
+    if not weights:
+        raise fail("staf", "initial_weights", "must have at least one entry", weights)
+    for name in ("critic", "actor"):
+        positive_real("adp", name, cfg.adp[name])
+    return weights
 
 
-def _slug(name: str) -> str:
-    return "_".join(name.lower().replace(",", "").replace("-", "_").split())
-
-
-def _draw(ratios: dict[str, Tensor], folder: Path) -> None:
-    # Imported here: matplotlib takes a second, which figures=false need not pay.
-    from ..report import plots, plots_adp
-
-    folder.mkdir(exist_ok=True)
-    values = {name: ratio.cpu().numpy() for name, ratio in ratios.items()}
-    plots.save(plots_adp.draw_comparison(values), folder / "adp_comparison")
+def _from_weights(problem: AdpProblem, weights: list[float], actor: float) -> AdpProblem:
+    """Every initial state once with every weight, one batch."""
+    x0, learning = problem.initial_states, learner(problem.controller)
+    assert learning is not None
+    critic: Tensor = torch.tensor(weights).to(x0).repeat_interleave(len(x0)).unsqueeze(-1)
+    learning.critic = critic.expand(-1, learning.basis.count)
+    learning.actor = actor * learning.critic
+    return problem.with_states(x0.repeat(len(weights), 1))

@@ -8,16 +8,17 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from torch import Tensor
 
-from .._checks import integer, positive_real
 from ..adp import (
     LQR,
     ActorCritic,
+    ActorCriticLaw,
     ConcurrentLearning,
     Controller,
     DirectShooting,
+    Extrapolation,
     IdentifyingTracker,
     LeadingCoordinates,
     LoopResult,
@@ -26,24 +27,30 @@ from ..adp import (
     simulate,
     tracking_cost,
 )
-from ..adp_metrics import tracking_metrics
-from ..report import HistoryWriter, write_metrics
+from ..figures.closed_loop import TrackingHistory, draw_tracking
+from ..figures.style import images
+from ..metrics.closed_loop import tracking_metrics
+from ..numerics.checks import integer, positive_real
+from ..results.progress import SHOWN, Progress
+from ..results.run_directory import RunDirectory
+from ..settings.adp import build, updated, value_basis
+from ..settings.chase import initial_states, placement, plain
 from ..systems import TwoState
-from .build import initial_states, placement
-from .build_adp import actor_critic_law, extrapolation, staf_value_basis
+from ..tables.columns import significant
+from .adp import write_history
 
 _log = logging.getLogger(__name__)
 _PARAMETERS = 6
 _HORIZON, _INTERVALS = 8.0, 160  # of direct shooting: the error has fallen to 1e-5 of itself
 
 
-def run(cfg: DictConfig, directory: Path) -> dict[str, float | None]:
+def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> dict[str, float | None]:
     """Run the three variants and fill the run directory; `metrics.json` comes last."""
     device, dtype = placement(cfg.device, cfg.dtype)
     plant = TwoStateTracking().to(device)
-    settings = OmegaConf.to_container(cfg.adp.cost, resolve=True)
-    assert isinstance(settings, dict)
-    cost = tracking_cost(settings["state"], settings["control"]).to(device)
+    cfg = updated(cfg)
+    weights = plain(cfg.adp.cost)
+    cost = tracking_cost(weights["state"], weights["control"]).to(device)
     x0 = initial_states(cfg, plant.dim).to(device=device, dtype=dtype)
     dt = positive_real("staf", "dt", cfg.dt)
     steps = max(1, round(positive_real("staf", "duration", cfg.duration) / dt))
@@ -63,20 +70,22 @@ def run(cfg: DictConfig, directory: Path) -> dict[str, float | None]:
     best = _optimal_cost(plant, cost, x0)
     metrics: dict[str, float | None] = {"optimal_cost": None if best is None else float(best.nanmedian())}
     for name, result in results.items():
-        found = tracking_metrics(result, _parameters(result), plant.theta, best)
-        metrics |= {f"{name}_{key}": value for key, value in found.items()}
-        shown = ["-" if value is None else f"{value:.4g}" for value in found.values()]
+        measured = tracking_metrics(result, _parameters(result), plant.theta, best)
+        metrics |= {f"{name}_{key}": value for key, value in measured.items()}
+        shown = [significant(value, 4) for value in measured.values()]
         _log.info(
             "%-11s cost %s, over the optimum %s, final |e| %s, final |theta error| %s, diverged %s",
             name,
             *shown,
         )
+    out, identified = RunDirectory(directory), results["identified"]
+    parameters = _parameters(identified)
+    assert parameters is not None
     if cfg.history:
-        _write_history(directory / "history.npz", results["identified"])
+        write_history(out, identified, parameters=parameters)
     if cfg.figures:
-        _draw(results, plant.theta, directory / "figures")
-    write_metrics(directory / "metrics.json", metrics)
-    return metrics
+        out.figure("adp_tracking", images(draw_tracking(_drawn(results, parameters, plant.theta))))
+    return out.metrics(metrics)
 
 
 def _optimal_cost(plant: TwoStateTracking, cost: QuadraticCost, x0: Tensor) -> Tensor | None:
@@ -100,16 +109,16 @@ def _optimal_cost(plant: TwoStateTracking, cost: QuadraticCost, x0: Tensor) -> T
 
 def _controllers(cfg: DictConfig, plant: TwoStateTracking, cost: QuadraticCost) -> dict[str, Controller]:
     chosen = cfg.adp.identification
-    theta = torch.tensor(OmegaConf.to_container(chosen.theta), dtype=torch.float64)
+    theta = torch.tensor(plain(chosen.theta), dtype=torch.float64)
     # 1e-300 keeps the first estimate: the same code without learning.
     learning = ConcurrentLearning(3, 2, chosen.size, chosen.gain)
     frozen = ConcurrentLearning(3, 2, chosen.size, 1e-300)
     learner = ActorCritic(
-        LeadingCoordinates(staf_value_basis(cfg, 2), plant.dim),
+        LeadingCoordinates(value_basis(cfg, 2), plant.dim),
         plant,
         cost,
-        extrapolation(cfg.adp, plant),
-        actor_critic_law(cfg),
+        build(cfg, "extrapolation", Extrapolation, dim=lambda: plant.dim),
+        build(cfg, "law", ActorCriticLaw),
         critic=cfg.adp.critic,
         actor=cfg.adp.actor,
         gain=cfg.adp.gain,
@@ -134,28 +143,13 @@ def _errors(result: LoopResult) -> Tensor:
     return torch.where(time > result.frozen_at.unsqueeze(-1), torch.nan, result.state[..., :2].norm(dim=-1))
 
 
-def _write_history(path: Path, result: LoopResult) -> None:
-    batch, times = result.state.shape[:2]
-    parameters = _parameters(result)
-    assert parameters is not None
-    with HistoryWriter(path, batch, times) as writer:
-        names = ("state", "control", "actor_weights", "critic_weights", "running_cost")
-        arrays = {name: getattr(result, name).cpu().numpy() for name in names}
-        writer.add(arrays | {"parameters": parameters.cpu().numpy()})
-        writer.close(time=result.time.numpy())
-
-
-def _draw(results: dict[str, LoopResult], theta: Tensor, folder: Path) -> None:
-    # Imported here: matplotlib takes a second, which figures=false need not pay.
-    from ..report import plots, plots_tracking
-
-    parameters = _parameters(results["identified"])
-    assert parameters is not None
+def _drawn(results: dict[str, LoopResult], parameters: Tensor, theta: Tensor) -> TrackingHistory:
+    """The first trajectory."""
 
     def first(rows: Tensor) -> np.ndarray:
         return rows[0].cpu().numpy()
 
-    history = plots_tracking.TrackingHistory(
+    return TrackingHistory(
         time=results["identified"].time.numpy(),
         state=first(results["identified"].state),
         errors={name: first(_errors(result)) for name, result in results.items()},
@@ -163,5 +157,3 @@ def _draw(results: dict[str, LoopResult], theta: Tensor, folder: Path) -> None:
         truth=theta.flatten().cpu().numpy(),
         critic_weights=first(results["identified"].critic_weights),
     )
-    folder.mkdir(exist_ok=True)
-    plots.save(plots_tracking.draw_tracking(history), folder / "adp_tracking")

@@ -9,13 +9,14 @@ import torch
 from omegaconf import DictConfig
 
 from .. import theory
-from .._checks import COMMAND_LINE, fail, integer, positive_real
+from ..figures.style import images
+from ..figures.theory import draw_exponential_bound
 from ..kernels import ExponentialKernel
-from ..report import write_metrics, write_text
-from ..report.tables import csv_table, markdown_table
-from .build import ChaseProblem, chase_problem
-from .build_theory import case_name, numbers
-from .progress import Progress
+from ..numerics.checks import COMMAND_LINE, fail, integer, positive_real
+from ..results.progress import SHOWN, Progress
+from ..results.run_directory import RunDirectory
+from ..settings.chase import ChaseProblem, case_name, chase_problem, numbers
+from ..tables import Table
 
 Bounds = dict[tuple[float, float], dict[str, float | None]]
 """What was found, by radius and epsilon."""
@@ -37,25 +38,23 @@ _HEADINGS = {
 }
 
 
-def run(cfg: DictConfig, directory: Path) -> dict[str, float | None]:
+def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> dict[str, float | None]:
     """Run what the settings describe and fill the run directory; `metrics.json` comes last."""
-    found = solve(cfg)
+    found = solve(cfg, progress)
     rows = [{"radius": radius, "epsilon": epsilon, **row} for (radius, epsilon), row in found.items()]
-    lines = markdown_table(rows, _HEADINGS)
-    write_text(directory / "exponential_bound.md", lines)
-    write_text(directory / "exponential_bound.csv", csv_table(rows, list(_HEADINGS)))
+    out = RunDirectory(directory)
+    text = out.table("exponential_bound", Table.of(rows, _HEADINGS))
     if cfg.figures:
-        _draw(found, directory)
-    for line in lines.splitlines():
+        out.figure("exponential_bound", images(draw_exponential_bound(found)))
+    for line in text.splitlines():
         _log.info("%s", line)
     metrics = {
         f"{case_name(*case)}.{name}": value for case, row in found.items() for name, value in row.items()
     }
-    write_metrics(directory / "metrics.json", metrics)
-    return metrics
+    return out.metrics(metrics)
 
 
-def solve(cfg: DictConfig) -> Bounds:
+def solve(cfg: DictConfig, progress: Progress = SHOWN) -> Bounds:
     """The bounds, and the smallest count of centers that does on the same states.
 
     Raises:
@@ -75,16 +74,13 @@ def solve(cfg: DictConfig) -> Bounds:
     radii, epsilons = numbers(cfg, f"{name}.radii"), numbers(cfg, f"{name}.epsilons")[::-1]
     layouts = theory.standard_layouts(dim)
     found: Bounds = {}
-    progress = Progress(len(radii) * len(epsilons), "bounds")
-    for radius in radii:
+    for radius in progress.each(radii, "radii"):
         errors = theory.layout_errors(problem.target, kernel, domain, radius, layouts).amax(-1)  # (L,)
         for epsilon in epsilons:
             enough = torch.nonzero(errors <= epsilon).flatten().tolist()
             measured = len(layouts[enough[0]]) if enough else None
             row = _bound(problem, domain, radius, epsilon, most)
             found[radius, epsilon] = row | {"measured_count": measured}
-            progress.advance(1)
-    progress.close()
     return found
 
 
@@ -103,12 +99,3 @@ def _bound(
     except ValueError as error:
         _log.warning("r = %g: %s", radius, error)
     return found
-
-
-def _draw(found: Bounds, directory: Path) -> None:
-    # Imported here: matplotlib takes a second, which figures=false need not pay.
-    from ..report import plots, plots_theory
-
-    folder = directory / "figures"
-    folder.mkdir(exist_ok=True)
-    plots.save(plots_theory.draw_exponential_bound(found), folder / "exponential_bound")

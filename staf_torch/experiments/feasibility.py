@@ -12,13 +12,14 @@ from omegaconf import DictConfig
 from torch import Tensor
 
 from .. import theory
-from ..report import write_metrics, write_text
-from ..report.tables import csv_table, markdown_table
-from .build_theory import LocalProblem, case_name, local_problem, numbers
-from .progress import Progress
+from ..figures.style import images
+from ..figures.theory import Feasibility, draw_feasibility
+from ..results.progress import SHOWN, Progress
+from ..results.run_directory import RunDirectory
+from ..settings.chase import LocalProblem, case_name, local_problem, numbers
+from ..tables import Table
 
 _log = logging.getLogger(__name__)
-_COLUMNS = ("radius", "epsilon", "count", "least_pointwise", "error")
 
 
 class Needed(NamedTuple):
@@ -30,34 +31,34 @@ class Needed(NamedTuple):
     overall: Tensor  # (R, E) the smallest M for all states, 0 if none does
 
 
-def run(cfg: DictConfig, directory: Path) -> dict[str, float | None]:
+def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> dict[str, float | None]:
     """Run what the settings describe and fill the run directory; `metrics.json` comes last."""
     problem = local_problem(cfg, "feasibility.states")
     radii = numbers(cfg, "feasibility.radii")
     epsilons = numbers(cfg, "feasibility.epsilons")[::-1]
     shown = sorted({*radii, problem.radius})
-    needed = solve(problem, shown, epsilons)
-    metrics = _write(directory, problem, needed, shown, epsilons)
+    needed = solve(problem, shown, epsilons, progress)
+    out = RunDirectory(directory)
+    metrics = _write(out, needed, shown, epsilons)
+    pointwise = needed.pointwise[shown.index(problem.radius)]  # (E, T)
+    out.text("feasibility_pointwise.csv", _pointwise(problem, pointwise, epsilons).csv())
     if cfg.figures:
-        _draw(directory, problem, needed, shown, epsilons)
-    write_metrics(directory / "metrics.json", metrics)
-    return metrics
+        out.figure("feasibility", images(draw_feasibility(_drawn(problem, needed, shown, epsilons))))
+    return out.metrics(metrics)
 
 
-def solve(problem: LocalProblem, radii: list[float], epsilons: list[float]) -> Needed:
+def solve(
+    problem: LocalProblem, radii: list[float], epsilons: list[float], progress: Progress = SHOWN
+) -> Needed:
     """All counts. One pass over the layouts a radius serves every epsilon."""
     layouts = theory.standard_layouts(problem.states.shape[-1])
-    progress = Progress(len(radii) * len(layouts), "layouts")
     found = []
-    for radius in radii:
-        of_layouts = []
-        for layout in layouts:
-            of_layouts.append(
-                theory.layout_errors(problem.target, problem.kernel, problem.states, radius, [layout])[0]
-            )
-            progress.advance(1)
+    for radius in progress.each(radii, "radii"):
+        of_layouts = [
+            theory.layout_errors(problem.target, problem.kernel, problem.states, radius, [layout])[0]
+            for layout in layouts
+        ]
         found.append(torch.stack(of_layouts))
-    progress.close()
     errors = torch.stack(found).cpu()  # (R, L, T)
     counts = torch.tensor([len(layout) for layout in layouts])
     allowed = torch.tensor(epsilons, dtype=errors.dtype)
@@ -71,7 +72,7 @@ def _first(good: Tensor, counts: Tensor) -> Tensor:
 
 
 def _write(
-    directory: Path, problem: LocalProblem, needed: Needed, radii: list[float], epsilons: list[float]
+    out: RunDirectory, needed: Needed, radii: list[float], epsilons: list[float]
 ) -> dict[str, float | None]:
     rows: list[dict[str, float | int | None]] = []
     wide: list[dict[str, float | int | None]] = []
@@ -82,51 +83,34 @@ def _write(
             count, least = int(needed.overall[i, j]) or None, int(needed.pointwise[i, j].min()) or None
             layout = int((needed.counts == count).int().argmax()) if count else None
             error = float(needed.errors[i, layout].max()) if layout is not None else None
-            rows.append(dict(zip(_COLUMNS, (radius, epsilon, count, least, error), strict=True)))
+            row = {"radius": radius, "epsilon": epsilon, "count": count}
+            rows.append(row | {"least_pointwise": least, "error": error})
             wide[-1][f"{epsilon:g}"] = metrics[f"{case_name(radius, epsilon)}.count"] = count
     headings = {"radius": "r"} | {f"{epsilon:g}": f"eps = {epsilon:g}" for epsilon in epsilons}
-    lines = markdown_table(wide, headings)
-    write_text(directory / "feasibility.md", lines)
-    write_text(directory / "feasibility.csv", csv_table(rows, _COLUMNS))
-    _write_pointwise(directory, problem, needed.pointwise[radii.index(problem.radius)], epsilons)
+    text = out.table("feasibility", Table.of(rows), shown=Table.of(wide, headings))
     _log.info("Smallest M with sup |V - V^| <= eps on the ball along the trajectory, ideal weights:")
-    for line in lines.splitlines():
+    for line in text.splitlines():
         _log.info("%s", line)
     return metrics
 
 
-def _write_pointwise(
-    directory: Path, problem: LocalProblem, pointwise: Tensor, epsilons: list[float]
-) -> None:
+def _pointwise(problem: LocalProblem, pointwise: Tensor, epsilons: list[float]) -> Table:
     """At the radius of the settings: time, state and M for each epsilon, one row a state."""
     names = ["time", *(f"x{i + 1}" for i in range(problem.states.shape[-1]))]
     names += [f"eps{epsilon:g}" for epsilon in epsilons]
-    rows: list[dict[str, float | int | None]] = []
-    for time, state, counts in zip(
-        problem.time.tolist(), problem.states.tolist(), pointwise.mT.tolist(), strict=True
-    ):
-        rows.append(dict(zip(names, [time, *state, *(count or None for count in counts)], strict=True)))
-    write_text(directory / "feasibility_pointwise.csv", csv_table(rows, names))
+    cells = zip(problem.time.tolist(), problem.states.tolist(), pointwise.mT.tolist(), strict=True)
+    rows = [[time, *state, *(count or None for count in counts)] for time, state, counts in cells]
+    return Table.of([dict(zip(names, row, strict=True)) for row in rows])
 
 
-def _draw(
-    directory: Path, problem: LocalProblem, needed: Needed, radii: list[float], epsilons: list[float]
-) -> None:
-    # Imported here: matplotlib takes a second, which figures=false need not pay.
-    from ..report import plots, plots_theory
-
-    folder = directory / "figures"
-    folder.mkdir(exist_ok=True)
-    figure = plots_theory.draw_feasibility(
-        plots_theory.Feasibility(
-            time=problem.time.cpu().numpy(),
-            state=problem.states.cpu().numpy(),
-            radius=problem.radius,
-            radii=np.array(radii),
-            epsilons=np.array(epsilons),
-            counts=needed.counts.numpy(),
-            pointwise=needed.pointwise[radii.index(problem.radius)].numpy(),
-            overall=needed.overall.numpy(),
-        )
+def _drawn(problem: LocalProblem, needed: Needed, radii: list[float], epsilons: list[float]) -> Feasibility:
+    return Feasibility(
+        time=problem.time.cpu().numpy(),
+        state=problem.states.cpu().numpy(),
+        radius=problem.radius,
+        radii=np.array(radii),
+        epsilons=np.array(epsilons),
+        counts=needed.counts.numpy(),
+        pointwise=needed.pointwise[radii.index(problem.radius)].numpy(),
+        overall=needed.overall.numpy(),
     )
-    plots.save(figure, folder / "feasibility")

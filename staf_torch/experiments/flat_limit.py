@@ -1,32 +1,178 @@
-"""How many digits are left as the centers close in on the state: the flat limit."""
+"""How many digits are left as the centers close in on the state: the flat limit.
+
+The truth in high precision needs nothing but the standard library.
+"""
 
 from __future__ import annotations
 
 import copy
+import itertools
 import logging
 import math
+from collections.abc import Callable, Sequence
+from decimal import Decimal, localcontext
 from pathlib import Path
 from typing import NamedTuple
 
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from torch import Tensor
 
-from .._checks import COMMAND_LINE, fail, flag, integer, positive_real
-from ..basis import StaFBasis, Target
+from ..approximation.basis import StaFBasis, Target
 from ..centers import StateFollowingCenters, probe_points, rings
+from ..figures.style import images
+from ..figures.theory import ErrorPanel, draw_errors
 from ..kernels import ExponentialKernel, GaussianKernel, Kernel
-from ..report import write_metrics, write_text
-from ..report.tables import Cell, csv_table, markdown_table
+from ..local_basis import evaluate_scaled, newton_space
+from ..numerics.checks import COMMAND_LINE, fail, flag, integer, positive_real
+from ..results.progress import SHOWN, Progress
+from ..results.reader import Value
+from ..results.run_directory import RunDirectory
+from ..settings.chase import DTYPES, chase_problem, plain
+from ..tables import Table
 from ..targets import Paper
-from .build import chase_problem
-from .decimal_truth import interpolant, relative_error
-from .flat_limit_methods import LABELS, METHODS
-from .progress import Progress
+from .registry import finite
 
 _log = logging.getLogger(__name__)
-_DTYPES = {"float64": torch.float64, "float32": torch.float32}
 _POINTS = 9  # of the ball at which the approximants are compared
+
+JITTER = 1e-12
+Method = Callable[[StaFBasis, Target, Tensor, Tensor], Tensor]
+"""Basis, V, x (n,), offsets z (P, n) to V^(x + z) (P,): not finite where the method fails."""
+
+
+def cholesky(basis: StaFBasis, target: Target, x: Tensor, z: Tensor, jitter: float = 0.0) -> Tensor:
+    """K0 + jitter I = L L' and two triangular solves."""
+    structure = basis.gram_structure(x)
+    scale = torch.ones(()).to(x) if structure.scale is None else structure.scale
+    identity = torch.eye(basis.count, dtype=x.dtype)
+    factor, info = torch.linalg.cholesky_ex(structure.core + jitter * identity)
+    right = basis.values(x, target) / scale
+    b = torch.cholesky_solve(right.unsqueeze(-1), factor).squeeze(-1)
+    value = evaluate_scaled(basis.kernel, basis.centers.offsets(x), x, z, b)
+    return torch.where(info == 0, value, torch.nan)
+
+
+def jittered(basis: StaFBasis, target: Target, x: Tensor, z: Tensor) -> Tensor:
+    """The usual remedy: the diagonal of K0 raised by 1e-12."""
+    return cholesky(basis, target, x, z, JITTER)
+
+
+def pivoted(basis: StaFBasis, target: Target, x: Tensor, z: Tensor) -> Tensor:
+    """The library's Newton basis, cut off at the numerical rank of K0."""
+    space = newton_space(basis.kernel, x, basis.centers.offsets(x))
+    return space.evaluate(z, space.fit(basis.values(x, target)))
+
+
+def graded(basis: StaFBasis, target: Target, x: Tensor, z: Tensor) -> Tensor:
+    """What the library uses for these kernels."""
+    space = basis.local(x)
+    return space.evaluate(z, space.fit(basis.values(x, target)))
+
+
+METHODS: dict[str, tuple[str, Method]] = {
+    "cholesky": ("Cholesky", cholesky),
+    "jitter": ("Cholesky, jitter 1e-12", jittered),
+    "pivoted": ("pivoted Cholesky", pivoted),
+    "graded": ("graded basis", graded),
+}
+"""By the prefix of the metrics: name for people, and method."""
+
+
+Point = list[Decimal]
+
+
+def paper(x: Point) -> Decimal:
+    """V(x) = x1^2 + 5 x2^2 + tanh(x1 x2), as `targets.Paper`."""
+    square = (2 * x[0] * x[1]).exp()
+    return x[0] * x[0] + 5 * x[1] * x[1] + (square - 1) / (square + 1)
+
+
+def interpolant(
+    directions: Tensor, radius: float, x: Tensor, zeta: Tensor, width: float | None
+) -> list[Decimal]:
+    """V^(x + r zeta) of the ideal weights for V of `paper`, by elimination on the textbook Gram matrix.
+
+    Every float argument is taken as the exact number that it is. The condition number grows like
+    r^(-2 degree), and the digits with it.
+
+    Args:
+        directions: u, (M, 2).
+        radius: r.
+        x: the state, (2,).
+        zeta: points of the unit ball, (P, 2).
+        width: of the Gaussian kernel, or None for the exponential one.
+
+    Returns:
+        P numbers, to 30 digits or more.
+    """
+    count = len(directions)
+    with localcontext() as context:
+        context.prec = _digits(count, radius)
+        r, at = Decimal(radius), _exact(x)
+        offsets = [[r * e for e in _exact(u)] for u in directions]
+        points = [[r * e for e in _exact(z)] for z in zeta]
+        gram = [[_core(d, e, width) for e in offsets] for d in offsets]
+        samples = [
+            paper([p + q for p, q in zip(at, d, strict=True)]) * _scale(at, d, width, -1) for d in offsets
+        ]
+        b = _solve(gram, samples)
+        return [
+            _scale(at, z, width, 1)
+            * sum((_core(z, d, width) * c for d, c in zip(offsets, b, strict=True)), Decimal(0))
+            for z in points
+        ]
+
+
+def relative_error(found: Tensor, truth: Sequence[Decimal]) -> float:
+    """max |found - truth| / max |truth|; not finite where a value found is not."""
+    if not bool(found.isfinite().all()):
+        return math.inf
+    gaps = [abs(Decimal(float(f)) - t) for f, t in zip(found.flatten(), truth, strict=True)]
+    return float(max(gaps) / max(abs(t) for t in truth))
+
+
+def _digits(count: int, radius: float) -> int:
+    """Forty digits beyond log10 of the condition number, whose degree M points of the plane cannot exceed
+    by more than the layouts here do: (k + 1)(k + 2) / 2 >= M, and one degree to spare."""
+    degree = math.ceil((math.sqrt(8 * count + 1) - 3) / 2) + 1
+    return 50 + math.ceil(2 * degree * max(0.0, -math.log10(radius)))
+
+
+def _core(z: Point, d: Point, width: float | None) -> Decimal:
+    """k0(z, d) = exp(q z'd), q = 1 or 1 / width^2."""
+    rate = Decimal(1) if width is None else 1 / Decimal(width) ** 2
+    return (rate * _dot(z, d)).exp()
+
+
+def _scale(x: Point, z: Point, width: float | None, sign: int) -> Decimal:
+    """e^{sign s(x, z)}, s = x'z or -|z|^2 / (2 width^2)."""
+    s = _dot(x, z) if width is None else -_dot(z, z) / (2 * Decimal(width) ** 2)
+    return (sign * s).exp()
+
+
+def _solve(matrix: list[Point], right: Point) -> Point:
+    """Gaussian elimination of a positive definite matrix, which needs no pivoting."""
+    rows = [[*row, value] for row, value in zip(matrix, right, strict=True)]
+    size = len(rows)
+    for k in range(size):
+        for row in rows[k + 1 :]:
+            factor = row[k] / rows[k][k]
+            for j in range(k + 1, size + 1):
+                row[j] -= factor * rows[k][j]
+    solved = [Decimal(0)] * size
+    for k in reversed(range(size)):
+        known = sum((rows[k][j] * solved[j] for j in range(k + 1, size)), Decimal(0))
+        solved[k] = (rows[k][size] - known) / rows[k][k]
+    return solved
+
+
+def _exact(values: Tensor) -> Point:
+    return [Decimal(float(v)) for v in values]
+
+
+def _dot(a: Point, b: Point) -> Decimal:
+    return sum((p * q for p, q in zip(a, b, strict=True)), Decimal(0))
 
 
 class Problem(NamedTuple):
@@ -49,22 +195,20 @@ class Sample(NamedTuple):
     error: dict[str, float]  # a method; inf where it fails
 
 
-def run(cfg: DictConfig, directory: Path) -> dict[str, float | None]:
+def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> dict[str, float | None]:
     """Run what the settings describe and fill the run directory; `metrics.json` comes last."""
     problem = problem_of(cfg)
     figures = flag(COMMAND_LINE, "figures", cfg.figures)
-    samples = solve(problem)
+    samples = solve(problem, progress)
     found = summary(samples)
-    table = _table(problem, samples)
-    write_text(directory / "flat_limit.md", table)
-    write_text(directory / "flat_limit.csv", _csv(samples))
+    out = RunDirectory(directory)
+    text = out.table("flat_limit", _every(samples), shown=_shown(problem, samples))
     if figures:
-        _draw(samples, directory)
+        out.figure("flat_limit", images(draw_errors(_panels(samples), rows=len(DTYPES))))
     _log.info("Relative value error against the radius, %s:", type(problem.kernel).__name__)
-    for line in table.splitlines():
+    for line in text.splitlines():
         _log.info("%s", line)
-    write_metrics(directory / "metrics.json", found)
-    return found
+    return out.metrics(found)
 
 
 def problem_of(cfg: DictConfig) -> Problem:
@@ -87,27 +231,24 @@ def problem_of(cfg: DictConfig) -> Problem:
     return Problem(kernel, target, state, _counts(cfg), _radii(cfg, per_decade), per_decade)
 
 
-def solve(problem: Problem) -> list[Sample]:
+def solve(problem: Problem, progress: Progress = SHOWN) -> list[Sample]:
     """Every method in both dtypes, at every count and radius."""
-    progress = Progress(len(problem.counts) * len(problem.radii), "radii")
     zeta = probe_points(_POINTS, 2).float().double()
     width = float(problem.kernel.width) if isinstance(problem.kernel, GaussianKernel) else None
     found = []
-    for count in problem.counts:
+    pairs = list(itertools.product(problem.counts, problem.radii))
+    for count, radius in progress.each(pairs, "radii and counts"):
         directions = rings(count)
-        for radius in problem.radii:
-            truth = interpolant(directions, radius, problem.state, zeta, width)
-            for name, dtype in _DTYPES.items():
-                kernel = copy.deepcopy(problem.kernel)
-                basis = StaFBasis(kernel, StateFollowingCenters(directions, radius)).to(dtype)
-                x, z = problem.state.to(dtype), (radius * zeta).to(dtype)
-                error = {
-                    key: relative_error(method(basis, problem.target, x, z), truth)
-                    for key, method in METHODS.items()
-                }
-                found.append(Sample(count, name, radius, error))
-            progress.advance(1)
-    progress.close()
+        truth = interpolant(directions, radius, problem.state, zeta, width)
+        for name, dtype in DTYPES.items():
+            kernel = copy.deepcopy(problem.kernel)
+            basis = StaFBasis(kernel, StateFollowingCenters(directions, radius)).to(dtype)
+            x, z = problem.state.to(dtype), (radius * zeta).to(dtype)
+            error = {
+                key: relative_error(method(basis, problem.target, x, z), truth)
+                for key, (_, method) in METHODS.items()
+            }
+            found.append(Sample(count, name, radius, error))
     return found
 
 
@@ -116,21 +257,20 @@ def summary(samples: list[Sample]) -> dict[str, float | None]:
     and the largest radius at which it fails (null where it never does)."""
     found: dict[str, float | None] = {}
     for key in METHODS:
-        for dtype in _DTYPES:
+        for dtype in DTYPES:
             chosen = [s for s in samples if s.dtype == dtype]
-            found[f"{key}_error_{dtype}"] = _finite(max(s.error[key] for s in chosen))
+            found[f"{key}_error_{dtype}"] = finite(max(s.error[key] for s in chosen))
             for count in sorted({s.centers for s in chosen}):
                 rows = [s for s in chosen if s.centers == count]
                 failed = [s.radius for s in rows if not math.isfinite(s.error[key])]
-                found[f"{key}_error_{dtype}_{count}"] = _finite(max(s.error[key] for s in rows))
+                found[f"{key}_error_{dtype}_{count}"] = finite(max(s.error[key] for s in rows))
                 found[f"{key}_fails_at_{dtype}_{count}"] = max(failed) if failed else None
     return found
 
 
 def _counts(cfg: DictConfig) -> list[int]:
-    stated = cfg.flat_limit.counts
-    counts = OmegaConf.to_container(stated) if OmegaConf.is_list(stated) else [stated]
-    assert isinstance(counts, list)
+    stated = plain(cfg.flat_limit.counts)
+    counts = stated if isinstance(stated, list) else [stated]
     if not counts:
         raise fail(COMMAND_LINE, "flat_limit.counts", "must not be empty", counts)
     return [integer(COMMAND_LINE, "flat_limit.counts", count, least=1) for count in counts]
@@ -149,55 +289,46 @@ def _radii(cfg: DictConfig, per_decade: int) -> list[float]:
     return torch.tensor([*grid, largest], dtype=torch.float32).tolist()
 
 
-def _table(problem: Problem, samples: list[Sample]) -> str:
+def _shown(problem: Problem, samples: list[Sample]) -> Table:
     """Methods against the radii of whole decades from the smallest up, and the worst of all radii."""
     shown = problem.radii[: -1 : problem.per_decade]
     headings = {"dtype": "dtype", "centers": "centers", "method": "method"}
     headings |= {f"{radius:.0e}": f"r = {radius:.0e}" for radius in shown} | {"worst": "worst"}
     rows = []
-    for dtype in _DTYPES:
+    for dtype in DTYPES:
         for count in problem.counts:
             chosen = [s for s in samples if (s.dtype, s.centers) == (dtype, count)]
-            for key, label in LABELS.items():
-                row: dict[str, Cell] = {"dtype": dtype, "centers": count, "method": label}
+            for key, (label, _) in METHODS.items():
+                row: dict[str, Value] = {"dtype": dtype, "centers": count, "method": label}
                 row |= {f"{s.radius:.0e}": _cell(s.error[key]) for s in chosen if s.radius in shown}
                 rows.append(row | {"worst": _cell(max(s.error[key] for s in chosen))})
-    return markdown_table(rows, headings)
+    return Table.of(rows, headings)
 
 
-def _csv(samples: list[Sample]) -> str:
-    rows: list[dict[str, Cell]] = []
+def _every(samples: list[Sample]) -> Table:
+    rows: list[dict[str, Value]] = []
     for s in samples:
-        about: dict[str, Cell] = {"dtype": s.dtype, "centers": s.centers, "radius": s.radius}
-        rows.append(about | {key: _finite(error) for key, error in s.error.items()})
-    return csv_table(rows, list(rows[0]))
+        about: dict[str, Value] = {"dtype": s.dtype, "centers": s.centers, "radius": s.radius}
+        rows.append(about | {key: finite(error) for key, error in s.error.items()})
+    return Table.of(rows)
 
 
 def _cell(error: float) -> str:
     return f"{error:.0e}" if math.isfinite(error) else "fails"
 
 
-def _finite(error: float) -> float | None:
-    return error if math.isfinite(error) else None
-
-
-def _draw(samples: list[Sample], directory: Path) -> None:
-    # Imported here: matplotlib takes a second, which figures=false need not pay.
-    from ..report import plots, plots_flat_limit
-
-    panels = [
-        plots_flat_limit.ErrorPanel(
+def _panels(samples: list[Sample]) -> list[ErrorPanel]:
+    """A panel for each dtype and count."""
+    return [
+        ErrorPanel(
             title=f"{count} centers, {name}",
             rounding=torch.finfo(dtype).eps,
             radius=[s.radius for s in samples if (s.centers, s.dtype) == (count, name)],
             error={
                 label: [s.error[key] for s in samples if (s.centers, s.dtype) == (count, name)]
-                for key, label in LABELS.items()
+                for key, (label, _) in METHODS.items()
             },
         )
-        for name, dtype in _DTYPES.items()
+        for name, dtype in DTYPES.items()
         for count in dict.fromkeys(s.centers for s in samples)
     ]
-    folder = directory / "figures"
-    folder.mkdir(exist_ok=True)
-    plots.save(plots_flat_limit.draw_errors(panels, rows=len(_DTYPES)), folder / "flat_limit")

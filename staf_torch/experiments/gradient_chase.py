@@ -7,40 +7,27 @@ import dataclasses
 import logging
 import math
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+import torch
 from omegaconf import DictConfig
 
-from .._checks import COMMAND_LINE, flag
-from ..report import HistoryWriter, write_metrics
-from .build import ChaseProblem, Parts, chase_problem
+from ..figures.animation import ChaseScene, animate_chase
+from ..figures.chase import ChaseHistory, draw_chase
+from ..figures.style import images
+from ..numerics.checks import COMMAND_LINE, fail, flag
+from ..results.progress import SHOWN, Progress
+from ..results.run_directory import HistoryWriter, RunDirectory
+from ..settings.chase import ChaseProblem, Parts, chase_problem
+from ..tables.columns import significant
 from .chase_batch import Outcome, simulate
-from .progress import Progress
+from .registry import BatchedExperiment, Metrics
 
 _log = logging.getLogger(__name__)
+_FRAMES = 60  # of an animation: six seconds
 _NAMED = 20  # diverged trajectories that the log lists by number
-
-BATCHABLE = frozenset(
-    {
-        *("seed", "initial_state", "spread", "trajectories", "dt", "duration", "settle_time"),
-        *("centers.radius", "centers.shrink.offset", "centers.shrink.gain"),
-        *("kernel.width", "kernel.length_scale", "kernel.alpha", "kernel.bias"),
-        *("target.matrix", "target.frequency", "target.phase"),
-        *("optimizer.step", "optimizer.momentum"),
-    }
-)
-"""Settings whose numbers may differ within a tensor batch; see `shape` for dt and duration."""
-
-
-def shape(settings: Mapping[str, object]) -> object:
-    """What follows from batchable settings and must be equal all the same: the number of steps."""
-    dt, duration = settings["dt"], settings["duration"]
-    if not isinstance(dt, int | float) or not isinstance(duration, int | float) or dt <= 0:
-        return "none"
-    ratio = duration / dt
-    return math.floor(ratio + 1e-9) if math.isfinite(ratio) else "none"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,6 +39,7 @@ class Title:
     dt: float
     settle_time: float
     method: str
+    work: float  # products of an M x M matrix with a vector, a second of trajectory
 
     @classmethod
     def of(cls, problem: ChaseProblem) -> Title:
@@ -62,11 +50,14 @@ class Title:
             + ("" if predictor is None else f", {type(predictor).__name__.lower()} predictor")
         )
         batch = len(problem.initial_states)
-        return cls(batch, problem.steps + 1, problem.dt, problem.settle_time, method)
+        count = problem.basis.count
+        work = problem.law.products(count, problem.inner_steps)
+        work += 0 if predictor is None else predictor.products(count)
+        return cls(batch, problem.steps + 1, problem.dt, problem.settle_time, method, work / problem.dt)
 
 
 @dataclasses.dataclass(frozen=True)
-class Solved:
+class ChaseSolution:
     """A problem that has been solved and has left nothing on disk yet. It can be pickled."""
 
     title: Title
@@ -76,92 +67,106 @@ class Solved:
     warnings: tuple[str, ...] = ()
 
     @property
-    def metrics(self) -> dict[str, float | None]:
+    def metrics(self) -> Metrics:
         """What `metrics.json` will hold."""
-        return self.outcome.metrics
-
-
-def run(cfg: DictConfig, directory: Path) -> dict[str, float | None]:
-    """Run what the settings describe and fill the run directory; `metrics.json` comes last.
-
-    `write` of what `solve_members` gives, but that the history goes to disk as it arises.
-    """
-    problem = chase_problem(cfg)
-    figures, history = _wanted(cfg)
-    batch, times = problem.initial_states.shape[0], problem.steps + 1
-    with contextlib.ExitStack() as stack:
-        writer = None
-        if history:
-            writer = stack.enter_context(HistoryWriter(directory / "history.npz", batch, times))
-        outcome = solve(problem, writer, drawn=figures)
-        if writer is not None:
-            writer.close(time=_times(Title.of(problem)))
-    return _finish(directory, Solved(Title.of(problem), outcome, problem.initial_states.tolist()))
+        return {**self.outcome.metrics, "products_per_second": self.title.work}
 
 
 def solve(
     problem: ChaseProblem,
     writer: HistoryWriter | None = None,
-    progress: Progress | None = None,
+    advance: Callable[[int], None] | None = None,
     *,
     drawn: bool = True,
 ) -> Outcome:
-    """The simulation itself, in pieces of time."""
-    progress = Progress(problem.steps + 1, "times") if progress is None else progress
-    (outcome,) = simulate([problem], [None if writer is None else writer.add], [drawn], progress)
-    progress.close()
+    """Run the simulation itself, in pieces of time."""
+    (outcome,) = simulate([problem], [None if writer is None else writer.add], [drawn], advance)
     return outcome
 
 
-def solve_members(cfgs: Sequence[DictConfig]) -> list[Solved | Exception]:
-    """Several configurations of one group as one tensor batch.
+class GradientChase(BatchedExperiment[ChaseSolution]):
+    """The chase of the ideal weights; initial states and scalar hyperparameters share a tensor batch."""
 
-    Returns:
-        In their order; an exception in the place of one whose settings break a rule.
+    batchable = frozenset(
+        {
+            *("seed", "initial_state", "spread", "trajectories", "dt", "duration", "settle_time"),
+            *("centers.radius", "centers.shrink.offset", "centers.shrink.gain"),
+            *("kernel.width", "kernel.length_scale", "kernel.alpha", "kernel.bias"),
+            *("target.matrix", "target.frequency", "target.phase"),
+            *("optimizer.step", "optimizer.momentum"),
+        }
+    )
 
-    Raises:
-        Exception: what stops the batch as a whole.
-    """
-    parts = Parts()
-    prepared = [_prepared(cfg, parts) for cfg in cfgs]
-    ready = [member for member in prepared if isinstance(member, _Ready)]
-    common: list[str] = []
-    outcomes: list[Outcome] = []
-    if ready:
-        with _recorded(common):
-            outcomes = simulate(
-                [member.problem for member in ready],
-                [None if member.memory is None else member.memory.add for member in ready],
-                [member.figures for member in ready],
-            )
-    left = iter(outcomes)
-    return [
-        member.solved(next(left), common) if isinstance(member, _Ready) else member for member in prepared
-    ]
+    def __call__(self, cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics:
+        """Run what the settings describe and fill the run directory; `metrics.json` comes last.
 
+        The history goes to disk as it arises, where `solve` keeps it in memory for `write`.
+        """
+        problem = chase_problem(cfg)
+        figures, history = _wanted(cfg)
+        batch, times = problem.initial_states.shape[0], problem.steps + 1
+        out = RunDirectory(directory)
+        with contextlib.ExitStack() as stack:
+            writer = None
+            if history:
+                writer = stack.enter_context(out.history(batch, times))
+            advance = stack.enter_context(progress.over(times, "times"))
+            sink = None if writer is None else writer.add
+            (outcome,) = simulate([problem], [sink], [figures or _animated(cfg, problem)], advance)
+            if writer is not None:
+                writer.close(time=_times(Title.of(problem)))
+        return _finish(out, ChaseSolution(Title.of(problem), outcome, problem.initial_states.tolist()), cfg)
 
-def write(cfg: DictConfig, directory: Path, solved: Solved) -> dict[str, float | None]:
-    """Fill the run directory with what was solved; `metrics.json` comes last."""
-    for message in solved.warnings:
-        warnings.warn(message, stacklevel=2)
-    if solved.history is not None:
-        title = solved.title
-        with HistoryWriter(directory / "history.npz", title.rows, title.times) as writer:
-            writer.add(solved.history)
-            writer.close(time=_times(title))
-    return _finish(directory, solved)
+    def solve(self, cfgs: Sequence[DictConfig], progress: Progress) -> list[ChaseSolution | Exception]:
+        """Solve several configurations of one group as one tensor batch."""
+        parts = Parts()
+        prepared = [_prepared(cfg, parts) for cfg in cfgs]
+        ready = [member for member in prepared if isinstance(member, _Ready)]
+        common: list[str] = []
+        outcomes: list[Outcome] = []
+        if ready:
+            times = sum(member.problem.steps + 1 for member in ready)
+            with _recorded(common), progress.over(times, "times") as advance:
+                outcomes = simulate(
+                    [member.problem for member in ready],
+                    [None if member.memory is None else member.memory.add for member in ready],
+                    [member.figures for member in ready],
+                    advance,
+                )
+        left = iter(outcomes)
+        return [
+            member.solved(next(left), common) if isinstance(member, _Ready) else member for member in prepared
+        ]
 
+    def write(self, cfg: DictConfig, directory: Path, solution: ChaseSolution) -> Metrics:
+        """Fill the run directory with what was solved; `metrics.json` comes last."""
+        for message in solution.warnings:
+            warnings.warn(message, stacklevel=2)
+        out, title = RunDirectory(directory), solution.title
+        if solution.history is not None:
+            with out.history(title.rows, title.times) as writer:
+                writer.add(solution.history)
+                writer.close(time=_times(title))
+        return _finish(out, solution, cfg)
 
-def size(settings: Mapping[str, object]) -> int:
-    """About how many bytes a member keeps until it is written."""
-    rows, times = settings.get("trajectories"), shape(settings)
-    count = settings.get("centers.count")
-    start = settings.get("initial_state")
-    if not isinstance(rows, int) or not isinstance(times, int):
-        return 0  # it will be refused
-    n, m = len(start) if isinstance(start, list) else 2, count if isinstance(count, int) else 12
-    kept = n + 4 + 2 * m if settings.get("history") else 1
-    return 8 * times * (rows * kept + (n + 5 + 2 * m))
+    def shape(self, settings: Mapping[str, object]) -> object:
+        """Return the number of steps."""
+        dt, duration = settings["dt"], settings["duration"]
+        if not isinstance(dt, int | float) or not isinstance(duration, int | float) or dt <= 0:
+            return "none"
+        ratio = duration / dt
+        return math.floor(ratio + 1e-9) if math.isfinite(ratio) else "none"
+
+    def size(self, settings: Mapping[str, object]) -> int:
+        """Return about how many bytes the history and the drawn trajectory take."""
+        rows, times = settings.get("trajectories"), self.shape(settings)
+        count = settings.get("centers.count")
+        start = settings.get("initial_state")
+        if not isinstance(rows, int) or not isinstance(times, int):
+            return 0  # it will be refused
+        n, m = len(start) if isinstance(start, list) else 2, count if isinstance(count, int) else 12
+        kept = n + 4 + 2 * m if settings.get("history") else 1
+        return 8 * times * (rows * kept + (n + 5 + 2 * m))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -169,16 +174,16 @@ class _Ready:
     """A member of a batch before it is solved."""
 
     problem: ChaseProblem
-    figures: bool
+    figures: bool  # whether the first trajectory is drawn, at rest or in motion
     memory: _Memory | None  # takes the history; None where nobody wants it
     warnings: list[str]
 
-    def solved(self, outcome: Outcome, common: Sequence[str]) -> Solved:
+    def solved(self, outcome: Outcome, common: Sequence[str]) -> ChaseSolution:
         """With what the whole batch was warned of."""
         told = dict.fromkeys([*self.warnings, *common, *outcome.warnings])
         history = None if self.memory is None else self.memory.arrays
         starts = self.problem.initial_states.tolist()
-        return Solved(Title.of(self.problem), outcome, starts, history, tuple(told))
+        return ChaseSolution(Title.of(self.problem), outcome, starts, history, tuple(told))
 
 
 def _prepared(cfg: DictConfig, parts: Parts) -> _Ready | Exception:
@@ -187,6 +192,7 @@ def _prepared(cfg: DictConfig, parts: Parts) -> _Ready | Exception:
         with _recorded(said):
             problem = chase_problem(cfg, parts)
             figures, history = _wanted(cfg)
+            figures = figures or _animated(cfg, problem)
     except Exception as error:  # of this member alone
         return error
     memory = _Memory(len(problem.initial_states), problem.steps + 1) if history else None
@@ -223,22 +229,71 @@ def _wanted(cfg: DictConfig) -> tuple[bool, bool]:
     return flag(COMMAND_LINE, "figures", cfg.figures), flag(COMMAND_LINE, "history", cfg.history)
 
 
-def _finish(directory: Path, solved: Solved) -> dict[str, float | None]:
-    """What follows the history: the log, the figure, the metrics."""
+def _animated(cfg: DictConfig, problem: ChaseProblem) -> bool:
+    """Whether an animation is wanted.
+
+    Raises:
+        ValueError: if it is, and the state has not two coordinates.
+    """
+    wanted = flag(COMMAND_LINE, "animation", cfg.get("animation", False))
+    if wanted and problem.basis.dim != 2:
+        raise fail(
+            COMMAND_LINE, "animation", f"needs a state in the plane, not in R^{problem.basis.dim}", True
+        )
+    return wanted
+
+
+def _scene(problem: ChaseProblem, drawn: Mapping[str, np.ndarray]) -> ChaseScene:
+    """What moves: the first trajectory at sixty times."""
+    at = np.unique(np.linspace(0, len(drawn["time"]) - 1, _FRAMES).round().astype(int))
+    like = problem.initial_states
+    x = torch.as_tensor(drawn["state"][at]).to(like)
+    weights, ideal = drawn["weights"][at], drawn["ideal_weights"][at]
+    way = torch.as_tensor(np.gradient(drawn["state"], axis=0)[at]).to(like)
+    way = way / way.norm(dim=-1, keepdim=True).clamp_min(torch.finfo(like.dtype).tiny)
+    along = torch.linspace(-1, 1, 41).to(like)
+    radius = problem.basis.centers.radius(x).expand(len(at))
+    points = x[:, None] + (radius[:, None] * along)[..., None] * way[:, None]  # (F, S, 2)
+    reach = float(x.abs().max() + 1.4 * radius.max())
+    line = torch.linspace(-reach, reach, 81).to(like)
+    plane = torch.stack(torch.meshgrid(line, line, indexing="xy"), dim=-1)
+    with torch.no_grad():
+        estimate = (problem.basis(points, x) * torch.as_tensor(weights).to(like)[:, None]).sum(-1)
+        arrays = [problem.basis.centers(x), radius, along, problem.target(points), estimate]
+        centers, size, places, value, guess = (array.cpu().numpy() for array in arrays)
+        level = problem.target(plane.reshape(-1, 2)).reshape(81, 81).cpu().numpy()
+    ticks = line.cpu().numpy()
+    return ChaseScene(
+        time=drawn["time"][at],
+        state=drawn["state"][at],
+        centers=centers,
+        radius=size,
+        weights=weights,
+        ideal_weights=ideal,
+        along=places,
+        value=value,
+        estimate=guess,
+        grid=(ticks, ticks, level),
+    )
+
+
+def _finish(out: RunDirectory, solved: ChaseSolution, cfg: DictConfig) -> dict[str, float | None]:
+    """What follows the history: the log, the figure, the animation, the metrics."""
     outcome = solved.outcome
     _name_the_diverged(solved)
-    if outcome.drawn:
-        _draw(outcome, directory)
+    if cfg.get("animation", False):
+        out.figure("chase", {"gif": animate_chase(_scene(chase_problem(cfg), outcome.drawn))})
+    if cfg.figures:
+        out.figure("gradient_chase", images(draw_chase(ChaseHistory(**outcome.drawn))))
     _summarise(solved.title, outcome.metrics)
-    write_metrics(directory / "metrics.json", outcome.metrics)
-    return outcome.metrics
+    return out.metrics(solved.metrics)
 
 
 def _times(title: Title) -> np.ndarray:
     return np.arange(title.times) * title.dt
 
 
-def _name_the_diverged(solved: Solved) -> None:
+def _name_the_diverged(solved: ChaseSolution) -> None:
     rows = (solved.outcome.diverged_at >= 0).nonzero().flatten().tolist()
     for row in rows[:_NAMED]:
         _log.warning(
@@ -253,8 +308,7 @@ def _name_the_diverged(solved: Solved) -> None:
 
 def _summarise(title: Title, metrics: dict[str, float | None]) -> None:
     def show(name: str) -> str:
-        number = metrics[name]
-        return "-" if number is None else f"{number:.4g}"
+        return significant(metrics[name], 4)
 
     _log.info(
         "Gradient chase: %d %s, %d times, dt = %g s, %s",
@@ -285,12 +339,3 @@ def _why_nothing(title: Title) -> str:
     if end < title.settle_time:
         return f"the run ends at {end:g} s, and metrics begin at settle_time = {title.settle_time:g} s"
     return f"no trajectory is finite at a time t >= settle_time = {title.settle_time:g} s"
-
-
-def _draw(outcome: Outcome, directory: Path) -> None:
-    # Imported here: matplotlib takes a second, which figures=false need not pay.
-    from ..report import plots
-
-    folder = directory / "figures"
-    folder.mkdir(exist_ok=True)
-    plots.save(plots.draw_chase(plots.ChaseHistory(**outcome.drawn)), folder / "gradient_chase")

@@ -6,23 +6,26 @@ import dataclasses
 import json
 import logging
 import math
-from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from .. import optim, theory
-from .._checks import fail, integer, positive_real, vector
-from ..report import write_metrics, write_text
-from ..report.tables import Row, csv_table, markdown_table
+from ..engine.predictors import Predictor, Secant, Tangent
+from ..figures.chase import ConvergenceCurve, draw_convergence
+from ..figures.style import images
+from ..numerics.checks import fail, integer, positive_real, vector
+from ..optim import UpdateLaw
+from ..results.progress import SHOWN, Progress
+from ..results.run_directory import RunDirectory
+from ..settings.chase import ChaseProblem, chase_problem, plain
 from ..systems import trajectory
-from .build import ChaseProblem, chase_problem
+from ..tables import Table
 from .gradient_chase import solve
-from .law_cases import Case, cases, curves
-from .progress import Progress
+from .registry import finite, log_slope
 
 _log = logging.getLogger(__name__)
 _STATES = 400  # at which the a-priori constants are taken
@@ -41,6 +44,89 @@ _HEADINGS = {
 }
 
 
+class Case(NamedTuple):
+    """One row of the comparison."""
+
+    law: UpdateLaw
+    iterations: int  # a time step
+    predictor: Predictor | None
+    products: int  # M x M products a time step: with K, with K^-1, and of the predictor
+
+    @property
+    def name(self) -> str:
+        """The law alone, as in a sentence."""
+        return self.law.title
+
+    @property
+    def predicted(self) -> str:
+        """The predictor, as in a sentence."""
+        return "none" if self.predictor is None else self.predictor.title
+
+    @property
+    def key(self) -> str:
+        """The prefix of the row's metrics."""
+        words = f"{self.name} x{self.iterations} {'' if self.predictor is None else self.predicted}"
+        return "_".join(words.replace("(", "").replace(")", "").split()).lower()
+
+
+def cases(work: int, count: int) -> list[Case]:
+    """Every law at up to ``work`` products with K a time step, then the predictors.
+
+    Laws that are done sooner are not given more, and what a predictor costs is taken from the iterations;
+    one is left where it costs as much as all of them.
+
+    Args:
+        work: products a time step, at least 2.
+        count: M.
+    """
+    many = work - 1
+    rows = [
+        _case(law, iterations, None, count)
+        for law, iterations in (
+            (optim.FixedStep(), 1),
+            (optim.FixedStep(), many),
+            (optim.SteepestDescent(), 1),
+            (optim.SteepestDescent(), many),
+            (optim.PreconditionedDescent("jacobi"), many),
+            (optim.BarzilaiBorwein(), many),
+            (optim.HeavyBall(), many),
+            (optim.Nesterov(), many),
+            (optim.ConjugateGradient(), min(2, count)),
+            (optim.ConjugateGradient(), min(count, many)),
+            (optim.PreconditionedDescent("core"), 1),
+            (optim.Exact(), 1),
+            (optim.RecursiveLeastSquares(), 1),
+            (optim.NormalisedLMS(), 1),
+        )
+    ]
+    for predictor in (Secant(), Tangent(order=1), Tangent(order=2)):
+        rest = max(1, many - predictor.products(count))
+        for law, iterations in (
+            (optim.SteepestDescent(), 1),
+            (optim.SteepestDescent(), rest),
+            (optim.Exact(), 1),
+        ):
+            rows.append(_case(law, iterations, predictor, count))
+    return list({case.key: case for case in rows}.values())  # with two centers a row would repeat itself
+
+
+def _case(law: UpdateLaw, iterations: int, predictor: Predictor | None, count: int) -> Case:
+    extra = 0 if predictor is None else predictor.products(count)
+    return Case(law, iterations, predictor, law.products(count, iterations) + extra)
+
+
+def curves(work: int, count: int) -> list[Case]:
+    """The rows worth a curve over the step: each predictor, with the cheapest law and with the exact one."""
+    exact, cheap, paper = ("exact", 1), ("steepest descent", 1), ("steepest descent", work - 1)
+    shown = {
+        "none": (paper, exact),
+        "secant": (paper, exact),
+        "tangent order 1": (cheap, exact),
+        "tangent order 2": (cheap, exact),
+    }
+    return [row for row in cases(work, count) if (row.name, row.iterations) in shown[row.predicted]]
+
+
 class Curve(NamedTuple):
     """The excess before the correction against the step."""
 
@@ -49,29 +135,38 @@ class Curve(NamedTuple):
     slope: float | None  # d log(excess) / d log(dt), least squares
 
 
-def run(cfg: DictConfig, directory: Path) -> dict[str, float | None]:
+def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> dict[str, float | None]:
     """Run what the settings describe and fill the run directory; `metrics.json` comes last."""
     problem = dataclasses.replace(chase_problem(cfg), certificate=True)
     work = integer("laws", "work", cfg.laws.work, least=2)
     excess = positive_real("laws", "excess", cfg.laws.excess)
     steps = _steps(cfg, problem)
-    rows = table(problem, cases(work, problem.basis.count))
-    swept = sweep(problem, curves(work, problem.basis.count), steps)
+    rows = table(problem, cases(work, problem.basis.count), progress)
+    swept = sweep(problem, curves(work, problem.basis.count), steps, progress)
     promised = promises(problem, excess)
-    _write(directory, rows)
+    out = RunDirectory(directory)
+    every = Table.of([{name: value for name, value in row.items() if name != "key"} for row in rows])
+    text = out.table("laws", every, shown=Table.of(rows, _HEADINGS))
+    out.text("laws.json", json.dumps(rows, indent=2, allow_nan=False) + "\n")
     if cfg.figures:
-        _draw(swept, steps, directory)
-    _summarise(problem, rows, swept, promised, excess)
-    metrics = _flat(rows) | {f"{curve.case.key}.slope": curve.slope for curve in swept} | promised
-    write_metrics(directory / "metrics.json", metrics)
-    return metrics
+        out.figure("laws", images(draw_convergence(_lines(swept, steps))))
+    _summarise(problem, text, swept, promised, excess)
+    metrics = {
+        f"{row['key']}.{name}": value
+        for row in rows
+        for name, value in row.items()
+        if not isinstance(value, str)
+    }
+    metrics |= {f"{curve.case.key}.slope": curve.slope for curve in swept} | promised
+    return out.metrics(metrics)
 
 
-def table(problem: ChaseProblem, compared: list[Case]) -> list[dict[str, str | float | None]]:
+def table(
+    problem: ChaseProblem, compared: list[Case], progress: Progress = SHOWN
+) -> list[dict[str, str | float | None]]:
     """One row a case: what it is, what it costs, and the metrics of its gradient chase."""
     rows: list[dict[str, str | float | None]] = []
-    progress = Progress(len(compared) * (problem.steps + 1), "times")
-    for case in compared:
+    for case in progress.each(compared, "laws"):
         about: dict[str, str | float | None] = {
             "key": case.key,
             "law": case.name,
@@ -79,25 +174,26 @@ def table(problem: ChaseProblem, compared: list[Case]) -> list[dict[str, str | f
             "predictor": case.predicted,
             "products": case.products / problem.dt,
         }
-        about.update(solve(_with(problem, case), progress=progress).metrics)
+        about.update(solve(_with(problem, case)).metrics)
         rows.append(about)
     return rows
 
 
-def sweep(problem: ChaseProblem, drawn: list[Case], steps: list[float]) -> list[Curve]:
+def sweep(
+    problem: ChaseProblem, drawn: list[Case], steps: list[float], progress: Progress = SHOWN
+) -> list[Curve]:
     """Each case over the same horizon at every step."""
     duration = problem.dt * problem.steps
     counts = [math.floor(duration / dt + 1e-9) for dt in steps]
-    progress = Progress(len(drawn) * (sum(counts) + len(counts)), "times of the sweep over dt")
     found = []
-    for case in drawn:
+    for case in progress.each(drawn, "laws over all dt"):
         excess = [
-            solve(dataclasses.replace(_with(problem, case), dt=dt, steps=count), progress=progress).metrics[
+            solve(dataclasses.replace(_with(problem, case), dt=dt, steps=count)).metrics[
                 "ultimate_excess_before"
             ]
             for dt, count in zip(steps, counts, strict=True)
         ]
-        found.append(Curve(case, excess, _slope(steps, excess)))
+        found.append(Curve(case, excess, log_slope(steps, excess)))
     return found
 
 
@@ -125,9 +221,7 @@ def promises(problem: ChaseProblem, excess: float) -> dict[str, float | None]:
     except ValueError as error:
         _log.warning("no a-priori bound: %s", error)
         return {}
-    return {
-        name: value if value is not None and math.isfinite(value) else None for name, value in found.items()
-    }
+    return {name: finite(value) for name, value in found.items()}
 
 
 def _with(problem: ChaseProblem, case: Case) -> ChaseProblem:
@@ -135,48 +229,16 @@ def _with(problem: ChaseProblem, case: Case) -> ChaseProblem:
 
 
 def _steps(cfg: DictConfig, problem: ChaseProblem) -> list[float]:
-    stated = OmegaConf.to_container(cfg.laws.steps) if OmegaConf.is_list(cfg.laws.steps) else cfg.laws.steps
-    steps = [positive_real("laws", "steps", dt) for dt in vector("laws", "steps", stated)]
+    steps = [positive_real("laws", "steps", dt) for dt in vector("laws", "steps", plain(cfg.laws.steps))]
     duration = problem.dt * problem.steps
     if len(steps) < 2 or max(steps) > duration:
         raise fail("laws", "steps", f"must be two or more steps within the duration ({duration:g} s)", steps)
     return steps
 
 
-def _slope(steps: list[float], excess: list[float | None]) -> float | None:
-    points = [
-        (math.log(dt), math.log(e)) for dt, e in zip(steps, excess, strict=True) if e is not None and e > 0
-    ]
-    if len(points) < 2:
-        return None
-    log_dt, log_excess = np.array(points).T
-    return float(np.polyfit(log_dt, log_excess, 1)[0])
-
-
-def _flat(rows: list[dict[str, str | float | None]]) -> dict[str, float | None]:
-    return {
-        f"{row['key']}.{name}": value
-        for row in rows
-        for name, value in row.items()
-        if not isinstance(value, str)
-    }
-
-
-def _write(directory: Path, rows: Sequence[Row]) -> None:
-    columns = [name for name in rows[0] if name != "key"]
-    write_text(directory / "laws.md", markdown_table(rows, _HEADINGS))
-    write_text(directory / "laws.csv", csv_table(rows, columns))
-    write_text(directory / "laws.json", json.dumps(rows, indent=2, allow_nan=False) + "\n")
-
-
-def _draw(swept: list[Curve], steps: list[float], directory: Path) -> None:
-    # Imported here: matplotlib takes a second, which figures=false need not pay.
-    from ..report import plots
-
-    folder = directory / "figures"
-    folder.mkdir(exist_ok=True)
-    lines = [
-        plots.ConvergenceCurve(
+def _lines(swept: list[Curve], steps: list[float]) -> list[ConvergenceCurve]:
+    return [
+        ConvergenceCurve(
             label=f"{curve.case.name} x{curve.case.iterations}"
             + (f", {curve.case.predicted}" if curve.case.predictor is not None else ""),
             step=np.array(steps),
@@ -185,12 +247,11 @@ def _draw(swept: list[Curve], steps: list[float], directory: Path) -> None:
         )
         for curve in swept
     ]
-    plots.save(plots.draw_convergence(lines), folder / "laws")
 
 
 def _summarise(
     problem: ChaseProblem,
-    rows: list[dict[str, str | float | None]],
+    text: str,
     swept: list[Curve],
     promised: dict[str, float | None],
     excess: float,
@@ -198,7 +259,7 @@ def _summarise(
     _log.info(
         "Worst over t >= %g s, dt = %g s, %d centers:", problem.settle_time, problem.dt, problem.basis.count
     )
-    for line in markdown_table(rows, _HEADINGS).splitlines():
+    for line in text.splitlines():
         _log.info("%s", line)
     _log.info("Excess before the correction ~ dt^slope:")
     for curve in swept:

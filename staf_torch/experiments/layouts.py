@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import logging
 import math
 import warnings
@@ -16,10 +15,13 @@ from torch import Tensor
 
 from .. import theory
 from ..centers import ball, cross_polytope, polygon, rings, simplex
-from ..report import write_metrics, write_text
-from ..report.tables import csv_table, markdown_table
-from .build_theory import LocalProblem, local_problem, numbers
-from .progress import Progress
+from ..figures.style import images
+from ..figures.theory import LayoutCurve, draw_layouts
+from ..results.progress import SHOWN, Progress
+from ..results.run_directory import RunDirectory
+from ..settings.chase import LocalProblem, local_problem, numbers
+from ..tables import Table
+from .registry import finite, log_slope
 
 _log = logging.getLogger(__name__)
 _DEGREES = 7  # of `ball`: C(n + k, n) points for k = 0 .. 6
@@ -28,43 +30,32 @@ _RESOLVED = 100  # rounding errors of V: what is below says nothing about the sl
 _HEADINGS = {"layout": "layout", "count": "M", "error": "error", "order": "order", "slope": "slope"}
 
 
-@dataclasses.dataclass(frozen=True)
-class Layout:
+class Layout(NamedTuple):
     """One layout of a family."""
 
     family: str
     directions: Tensor  # (M, n)
     order: int  # k + 1: the error is O(r^{k+1})
 
-    @property
-    def count(self) -> int:
-        """M."""
-        return len(self.directions)
 
-
-class LayoutError(NamedTuple):
-    """What a layout leaves, with ideal weights, at the worst state."""
-
-    layout: Layout
-    error: float  # at the radius of the settings
-    errors: list[float]  # at the radii of the experiment
-    slope: float | None  # d log(error) / d log(r), least squares
-
-
-def run(cfg: DictConfig, directory: Path) -> dict[str, float | None]:
+def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> dict[str, float | None]:
     """Run what the settings describe and fill the run directory; `metrics.json` comes last."""
     problem = local_problem(cfg, "layouts.states")
     radii = numbers(cfg, "layouts.radii")
-    found = solve(problem, radii)
-    _write(directory, problem, found, radii)
+    found = solve(problem, radii, progress)
+    out = RunDirectory(directory)
+    rows = _rows(found, radii)
+    text = out.table("layouts", Table.of(rows), shown=Table.of(rows, _HEADINGS))
+    _log.info("sup |V - V^| on the ball, r = %g, ideal weights, and its slope in r:", problem.radius)
+    for line in text.splitlines():
+        _log.info("%s", line)
     if cfg.figures:
-        _draw(directory, problem, found, radii)
+        out.figure("layouts", images(draw_layouts(found, problem.radius, np.array(radii))))
     metrics: dict[str, float | None] = {}
-    for result in found:
-        key = f"{result.layout.family}{result.layout.count}"
-        metrics |= {f"{key}.error": _finite(result.error), f"{key}.slope": result.slope}
-    write_metrics(directory / "metrics.json", metrics)
-    return metrics
+    for curve in found:
+        key = f"{curve.family}{curve.centers}"
+        metrics |= {f"{key}.error": finite(curve.error), f"{key}.slope": curve.slope}
+    return out.metrics(metrics)
 
 
 def layouts(dim: int) -> list[Layout]:
@@ -84,69 +75,29 @@ def layouts(dim: int) -> list[Layout]:
     return [*planar, *spread, *corners]
 
 
-def solve(problem: LocalProblem, radii: list[float]) -> list[LayoutError]:
-    """The errors of all layouts."""
+def solve(problem: LocalProblem, radii: list[float], progress: Progress = SHOWN) -> list[LayoutCurve]:
+    """The errors that all layouts leave at the worst state, with ideal weights, and their slopes in r."""
     compared = layouts(problem.states.shape[-1])
     at = sorted({*radii, problem.radius})
     errors: dict[float, list[float]] = {}
-    progress = Progress(len(at), "radii")
-    for radius in at:
-        directions = [layout.directions for layout in compared]
-        worst = theory.layout_errors(problem.target, problem.kernel, problem.states, radius, directions)
+    shapes = [layout.directions for layout in compared]
+    for radius in progress.each(at, "radii"):
+        worst = theory.layout_errors(problem.target, problem.kernel, problem.states, radius, shapes)
         errors[radius] = worst.amax(-1).tolist()
-        progress.advance(1)
-    progress.close()
     rounding = torch.finfo(problem.states.dtype).eps * float(problem.target(problem.states).abs().max())
     found = []
-    for i, layout in enumerate(compared):
+    for i, (family, directions, order) in enumerate(compared):
         swept = [errors[radius][i] for radius in radii]
-        slope = _slope(radii, swept, _RESOLVED * rounding)
-        found.append(LayoutError(layout, errors[problem.radius][i], swept, slope))
+        slope = log_slope(radii, swept, _RESOLVED * rounding)
+        error = errors[problem.radius][i]
+        found.append(LayoutCurve(family, len(directions), order, error, np.array(swept), slope))
     return found
 
 
-def _slope(radii: list[float], errors: list[float], least: float) -> float | None:
-    points = [(math.log(r), math.log(e)) for r, e in zip(radii, errors, strict=True) if e > least]
-    if len(points) < 2:
-        return None
-    log_radius, log_error = np.array(points).T
-    return float(np.polyfit(log_radius, log_error, 1)[0])
-
-
-def _finite(number: float) -> float | None:
-    return number if math.isfinite(number) else None
-
-
-def _write(directory: Path, problem: LocalProblem, found: list[LayoutError], radii: list[float]) -> None:
-    rows: list[dict[str, str | float | int | None]] = []
-    for result in found:
-        layout = result.layout
-        row: dict[str, str | float | int | None] = {"layout": layout.family, "count": layout.count}
-        row |= {"error": _finite(result.error), "order": layout.order, "slope": result.slope}
-        rows.append(row | {f"r{r:g}": _finite(e) for r, e in zip(radii, result.errors, strict=True)})
-    lines = markdown_table(rows, _HEADINGS)
-    write_text(directory / "layouts.md", lines)
-    write_text(directory / "layouts.csv", csv_table(rows, list(rows[0])))
-    _log.info("sup |V - V^| on the ball, r = %g, ideal weights, and its slope in r:", problem.radius)
-    for line in lines.splitlines():
-        _log.info("%s", line)
-
-
-def _draw(directory: Path, problem: LocalProblem, found: list[LayoutError], radii: list[float]) -> None:
-    # Imported here: matplotlib takes a second, which figures=false need not pay.
-    from ..report import plots, plots_theory
-
-    folder = directory / "figures"
-    folder.mkdir(exist_ok=True)
-    curves = [
-        plots_theory.LayoutCurve(
-            family=result.layout.family,
-            count=result.layout.count,
-            error=result.error,
-            errors=np.array(result.errors),
-            slope=result.slope,
-        )
-        for result in found
-    ]
-    figure = plots_theory.draw_layouts(curves, problem.radius, np.array(radii))
-    plots.save(figure, folder / "layouts")
+def _rows(found: list[LayoutCurve], radii: list[float]) -> list[dict[str, str | float | None]]:
+    rows: list[dict[str, str | float | None]] = []
+    for curve in found:
+        row: dict[str, str | float | None] = {"layout": curve.family, "count": curve.centers}
+        row |= {"error": finite(curve.error), "order": curve.order, "slope": curve.slope}
+        rows.append(row | {f"r{r:g}": finite(e) for r, e in zip(radii, curve.errors, strict=True)})
+    return rows

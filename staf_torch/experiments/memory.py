@@ -10,15 +10,18 @@ import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
-from .._checks import COMMAND_LINE, fail, flag, integer, positive_real
 from ..centers import probe_points
-from ..chase import ChaseResult, chase
-from ..memory import ExperienceMemory
-from ..report import write_metrics, write_text
-from ..report.tables import Cell, csv_table, markdown_table
+from ..engine import ChaseResult, chase
+from ..figures.chase import MemoryPicture, draw_memory
+from ..figures.style import images
+from ..numerics.checks import COMMAND_LINE, fail, flag, integer, positive_real
+from ..online.experience_memory import ExperienceMemory
+from ..results.progress import SHOWN, Progress
+from ..results.run_directory import RunDirectory
+from ..settings.chase import ChaseProblem, chase_problem
 from ..systems import trajectory
-from .build import ChaseProblem, chase_problem
-from .progress import Progress
+from ..tables import Table
+from .registry import finite
 
 _log = logging.getLogger(__name__)
 _PROBES = 13  # points of the ball around each state
@@ -51,7 +54,7 @@ class Revisits(NamedTuple):
     settled: Tensor  # the largest excess of the settled chase, (B,)
 
 
-def run(cfg: DictConfig, directory: Path) -> dict[str, float | None]:
+def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> dict[str, float | None]:
     """Run what the settings describe and fill the run directory; `metrics.json` comes last."""
     problem, settings = chase_problem(cfg), settings_of(cfg)
     figures = flag(COMMAND_LINE, "figures", cfg.figures)
@@ -63,16 +66,18 @@ def run(cfg: DictConfig, directory: Path) -> dict[str, float | None]:
     )
     found = _chase(problem, states)
     coefficients = problem.basis.local(states).coefficients(found.weights)
-    memory = remember(problem, settings, states[:, first:], coefficients[:, first:])
+    memory = remember(problem, settings, states[:, first:], coefficients[:, first:], progress)
     index = first + (torch.arange(settings.states) * (problem.steps - first)) // settings.states
     region = errors(problem, memory, states, coefficients, index.unique())
     again = revisits(problem, settings, memory, found, first)
     metrics = summary(memory, region, again)
-    _write(directory, metrics)
+    out = RunDirectory(directory)
+    text = out.table("memory", Table.of([metrics]), shown=_shown(metrics))
+    for line in text.splitlines():
+        _log.info("%s", line)
     if figures:
-        _draw(directory, states[0, first:], memory, region, again)
-    write_metrics(directory / "metrics.json", metrics)
-    return metrics
+        out.figure("memory", images(draw_memory(_picture(states[0, first:], memory, region, again))))
+    return out.metrics(metrics)
 
 
 def settings_of(cfg: DictConfig) -> Settings:
@@ -81,22 +86,17 @@ def settings_of(cfg: DictConfig) -> Settings:
     Raises:
         ValueError: if a setting breaks its rule; the message names it.
     """
-    group = cfg.memory
-
-    def count(name: str) -> int:
-        return integer(COMMAND_LINE, f"memory.{name}", group[name], least=1)
-
-    return Settings(
-        capacity=count("capacity"),
-        reach=positive_real(COMMAND_LINE, "memory.reach", group.reach),
-        spacing=positive_real(COMMAND_LINE, "memory.spacing", group.spacing),
-        states=count("states"),
-        revisits=count("revisits"),
-        steps=count("steps"),
+    counts = ("capacity", "states", "revisits", "steps")
+    checked = {name: integer(COMMAND_LINE, f"memory.{name}", cfg.memory[name], least=1) for name in counts}
+    reach, spacing = (
+        positive_real(COMMAND_LINE, f"memory.{name}", cfg.memory[name]) for name in ("reach", "spacing")
     )
+    return Settings(reach=reach, spacing=spacing, **checked)
 
 
-def remember(problem: ChaseProblem, settings: Settings, states: Tensor, kept: Tensor) -> ExperienceMemory:
+def remember(
+    problem: ChaseProblem, settings: Settings, states: Tensor, kept: Tensor, progress: Progress = SHOWN
+) -> ExperienceMemory:
     """A memory a trajectory, fed with the models (B, T, M) at the states (B, T, n) as they come."""
     memory = ExperienceMemory(
         problem.basis,
@@ -105,11 +105,9 @@ def remember(problem: ChaseProblem, settings: Settings, states: Tensor, kept: Te
         reach=settings.reach,
         spacing=settings.spacing,
     ).to(states)
-    progress = Progress(states.shape[1], "times")
-    for x, model in zip(states.unbind(1), kept.unbind(1), strict=True):
+    pairs = list(zip(states.unbind(1), kept.unbind(1), strict=True))
+    for x, model in progress.each(pairs, "times"):
         memory.add(x, model)
-        progress.advance(1)
-    progress.close()
     return memory
 
 
@@ -161,14 +159,14 @@ def summary(memory: ExperienceMemory, region: Region, again: Revisits) -> dict[s
     for name, error in region.errors.items():
         covered = ~error.isnan()
         total = torch.where(covered, error.square(), 0.0).sum((1, 2)) / covered.sum((1, 2))
-        found[f"{name}_rms_error"] = _finite(total.sqrt().max())
-        found[f"{name}_max_error"] = _finite(torch.where(covered, error, 0.0).max())
-    found["settled_excess"] = _finite(again.settled.max())
+        found[f"{name}_rms_error"] = finite(total.sqrt().max())
+        found[f"{name}_max_error"] = finite(torch.where(covered, error, 0.0).max())
+    found["settled_excess"] = finite(again.settled.max())
     for name, excess in again.excess.items():
-        found[f"revisit_excess_{name}"] = _finite(excess[..., 0].max())
+        found[f"revisit_excess_{name}"] = finite(excess[..., 0].max())
         done = excess <= again.settled[:, None, None]
         taken = torch.where(done.any(-1), done.to(torch.int8).argmax(-1) + 1.0, torch.nan).max()
-        found[f"revisit_steps_{name}"] = _finite(taken)
+        found[f"revisit_steps_{name}"] = finite(taken)
     return found
 
 
@@ -184,40 +182,26 @@ def _chase(problem: ChaseProblem, states: Tensor, weights: Tensor | None = None)
     )
 
 
-def _finite(number: Tensor) -> float | None:
-    return float(number) if bool(torch.isfinite(number)) else None
-
-
-def _write(directory: Path, metrics: dict[str, float | None]) -> None:
-    region: list[dict[str, Cell]] = [
+def _shown(metrics: dict[str, float | None]) -> list[Table]:
+    """One table of the errors over the region, one of the revisits."""
+    region = [
         {"by": label, "rms": metrics[f"{key}_rms_error"], "max": metrics[f"{key}_max_error"]}
         for key, label in APPROXIMANTS.items()
     ]
-    again: list[dict[str, Cell]] = [
+    again = [
         {"by": label, "excess": metrics[f"revisit_excess_{key}"], "steps": metrics[f"revisit_steps_{key}"]}
         for key, label in STARTS.items()
     ]
-    text = (
-        markdown_table(region, {"by": "error over the visited balls", "rms": "rms", "max": "max"})
-        + "\n"
-        + markdown_table(
-            again, {"by": "start at a revisit", "excess": "excess after a step", "steps": "steps"}
-        )
-    )
-    write_text(directory / "memory.md", text)
-    write_text(directory / "memory.csv", csv_table([metrics], list(metrics)))
-    for line in text.splitlines():
-        _log.info("%s", line)
+    return [
+        Table.of(region, {"by": "error over the visited balls", "rms": "rms", "max": "max"}),
+        Table.of(again, {"by": "start at a revisit", "excess": "excess after a step", "steps": "steps"}),
+    ]
 
 
-def _draw(directory: Path, path: Tensor, memory: ExperienceMemory, region: Region, again: Revisits) -> None:
-    # Imported here: matplotlib takes a second, which figures=false need not pay.
-    from ..report import plots, plots_memory
-
-    folder = directory / "figures"
-    folder.mkdir(exist_ok=True)
+def _picture(path: Tensor, memory: ExperienceMemory, region: Region, again: Revisits) -> MemoryPicture:
+    """The first trajectory and its memory."""
     stored = memory.states[0][memory.stored[0]]
-    picture = plots_memory.MemoryPicture(
+    return MemoryPicture(
         path=path.cpu().numpy(),
         stored=stored.cpu().numpy(),
         radius=memory.basis.centers.radius(stored).expand(len(stored)).cpu().numpy(),
@@ -226,4 +210,3 @@ def _draw(directory: Path, path: Tensor, memory: ExperienceMemory, region: Regio
         excess={STARTS[k]: v[0].amax(0).cpu().numpy() for k, v in again.excess.items()},
         settled=float(again.settled[0]),
     )
-    plots.save(plots_memory.draw_memory(picture), folder / "memory")

@@ -28,7 +28,7 @@ class AnchoredKernel(Kernel):
             raise ValueError(f"`AnchoredKernel(kernel=...)` must be a Kernel; got {type(kernel).__name__}.")
         zero = torch.zeros(1, 1, dtype=torch.float64)
         corner = kernel(zero, zero)
-        if not bool((corner > 0).all()):
+        if not corner.is_meta and not bool((corner > 0).all()):
             raise ValueError(
                 "`AnchoredKernel(kernel=...)` must have k(0, 0) > 0; "
                 f"got {corner.flatten().tolist()} from {type(kernel).__name__}."

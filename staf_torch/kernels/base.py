@@ -7,7 +7,7 @@ import abc
 import torch
 from torch import Tensor, nn
 
-from .._convention import shown
+from ..numerics.checks import shown
 
 
 class Kernel(nn.Module, abc.ABC):
@@ -26,6 +26,8 @@ class Kernel(nn.Module, abc.ABC):
     """
 
     state_free: bool = False
+    scale_slope: float | None = None
+    """q where s(x, z) = q x'z plus a function of z alone, None where s has another form."""
 
     @abc.abstractmethod
     def forward(self, x1: Tensor, x2: Tensor) -> Tensor:
@@ -51,7 +53,7 @@ class Kernel(nn.Module, abc.ABC):
         return None
 
     def core_gradient(self, x: Tensor, z: Tensor, d: Tensor, b: Tensor) -> Tensor | None:
-        """d/dz of sum_i b_i k0(z, d_i) at the state x, likewise: (..., P, n)."""
+        """d/dz of sum_i b_i k0(z, d_i) at the state x, None where autograd has to find it: (..., P, n)."""
         at = x.unsqueeze(-2)
         return self.gradient(at + z, at + d, b)
 
@@ -78,6 +80,10 @@ class Kernel(nn.Module, abc.ABC):
 
     def exponent_rate(self) -> Tensor | None:
         """q where k0(z, d) = exp(q z'd), and None for every other kernel."""
+        return None
+
+    def polynomial_degree(self) -> int | None:
+        """k where the function space is that of all polynomials of degree <= k, None otherwise."""
         return None
 
     def follow(self, y: Tensor, step: Tensor) -> tuple[Tensor, Tensor] | None:

@@ -19,6 +19,7 @@ class ExponentialKernel(Kernel):
     """
 
     state_free = True
+    scale_slope = 1.0
 
     def forward(self, x1: Tensor, x2: Tensor) -> Tensor:
         return inner(x1, x2).exp()

@@ -5,8 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from .._checks import positive
-from .._convention import hold
+from ..numerics.checks import hold, positive
 from .base import Kernel, inner, per_entry, squared_distance, weighted_differences
 
 
@@ -25,6 +24,7 @@ class GaussianKernel(Kernel):
     """
 
     state_free = True
+    scale_slope = 0.0
 
     def __init__(self, width: float | Tensor = 1.0) -> None:
         super().__init__()

@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from .._checks import choice
+from ..numerics.checks import choice
 from .radial import RadialKernel
 
 # phi(t) = p(t) e^{-t} with t = sqrt(2 smoothness) |y - c| / length_scale; p by its coefficients.

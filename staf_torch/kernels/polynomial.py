@@ -6,8 +6,7 @@ import math
 
 from torch import Tensor
 
-from .._checks import integer, non_negative
-from .._convention import hold
+from ..numerics.checks import hold, integer, non_negative
 from .base import Kernel, inner, per_entry
 
 
@@ -30,7 +29,7 @@ class PolynomialKernel(Kernel):
         self.degree = integer("PolynomialKernel", "degree", degree, least=1)
         hold(self, "bias", non_negative("PolynomialKernel", "bias", bias))
         self.bias: Tensor
-        self.full = bool((self.bias > 0).all())
+        self.full = self.bias.is_meta or bool((self.bias > 0).all())
         """Whether the space holds all polynomials of the degree, not the homogeneous ones alone."""
 
     def forward(self, x1: Tensor, x2: Tensor) -> Tensor:
@@ -43,6 +42,9 @@ class PolynomialKernel(Kernel):
     def rank(self, dim: int) -> int:
         variables = dim if self.full else dim - 1
         return math.comb(variables + self.degree, self.degree)
+
+    def polynomial_degree(self) -> int | None:
+        return self.degree if self.full else None
 
     def extra_repr(self) -> str:
         return f"degree={self.degree}, {super().extra_repr()}"

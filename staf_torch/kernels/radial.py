@@ -7,8 +7,7 @@ import abc
 import torch
 from torch import Tensor
 
-from .._checks import positive
-from .._convention import hold
+from ..numerics.checks import hold, positive
 from .base import Kernel, per_entry, squared_distance, weighted_differences
 
 
@@ -19,6 +18,7 @@ class RadialKernel(Kernel):
     """
 
     state_free = True
+    scale_slope = 0.0
 
     def __init__(self, length_scale: float | Tensor = 1.0) -> None:
         super().__init__()

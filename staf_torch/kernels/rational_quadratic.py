@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from .._checks import positive
-from .._convention import hold
+from ..numerics.checks import hold, positive
 from .base import per_entry
 from .radial import RadialKernel
 

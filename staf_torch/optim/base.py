@@ -7,7 +7,7 @@ import abc
 import torch
 from torch import Tensor
 
-from ..objective import Objective
+from .objective import Objective
 
 LawState = tuple[Tensor, ...]
 """What a law carries from one iteration to the next: tensors (...), (..., M) or (..., M, M) a row."""
@@ -19,7 +19,7 @@ class UpdateLaw(abc.ABC):
     A law object holds hyperparameters only. Rows never touch each other.
 
     Attributes:
-        needs: the fields of `Known` that the law will ask for at every time; a chase computes them in
+        needs: the fields of `Precomputed` that the law will ask for at every time; a chase computes them in
             bulk. Without them an `Objective` computes what it is asked for on the spot.
         step_size: the hyperparameter that a learning-rate schedule may drive, None where there is none.
     """
@@ -50,8 +50,24 @@ class UpdateLaw(abc.ABC):
         """A bound on excess after / excess before of one iteration, from kappa(K); None: not known."""
         return None
 
+    def products(self, count: int, iterations: int) -> int:
+        """Work of one time step, in products of an M x M matrix with a vector: with K and with K^-1.
+
+        The default is a law that carries its residual: one product an iteration, and one to begin.
+
+        Args:
+            count: M.
+            iterations: in the time step.
+        """
+        return iterations + 1
+
+    @property
+    def title(self) -> str:
+        """The law as in a sentence, from the name of its class: `steepest descent`."""
+        return "".join(" " + c.lower() if c.isupper() else c for c in type(self).__name__).strip()
+
     def with_step_size(self, size: float) -> UpdateLaw:
-        """The same law with another `step_size`.
+        """Return a copy of the law with another `step_size`.
 
         Raises:
             ValueError: if the law has none, or the size breaks its rule.

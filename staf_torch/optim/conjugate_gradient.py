@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ..objective import Objective
 from .base import LawState, UpdateLaw, line_search
+from .objective import Objective
 
 
 class ConjugateGradient(UpdateLaw):

@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ..objective import Objective
 from .base import LawState, UpdateLaw
+from .objective import Objective
 
 
 class Exact(UpdateLaw):
@@ -23,6 +23,9 @@ class Exact(UpdateLaw):
 
     def step(self, objective: Objective, weights: Tensor, state: LawState) -> tuple[Tensor, LawState]:
         return objective.minimiser(), state
+
+    def products(self, count: int, iterations: int) -> int:
+        return iterations
 
     def contraction(self, condition_number: Tensor) -> Tensor:
         return torch.zeros_like(condition_number)

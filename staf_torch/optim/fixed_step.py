@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from .._checks import fail, positive_real
-from ..objective import Objective
+from ..numerics.checks import fail, positive_real
 from .base import LawState, UpdateLaw, line_search
+from .objective import Objective
 
 
 class FixedStep(UpdateLaw):

@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from .._checks import fail, non_negative, positive_real, real
-from ..objective import Objective
+from ..numerics.checks import fail, non_negative, positive_real, real
 from .base import LawState, UpdateLaw, line_search, worse_than_none
+from .objective import Objective
 
 
 class HeavyBall(UpdateLaw):

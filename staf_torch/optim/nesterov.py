@@ -5,10 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from .._checks import fail, non_negative, positive_real, real
-from ..objective import Objective
+from ..numerics.checks import fail, non_negative, positive_real, real
 from .base import LawState, UpdateLaw, worse_than_none
 from .fixed_step import over_lipschitz
+from .objective import Objective
 
 
 class Nesterov(UpdateLaw):

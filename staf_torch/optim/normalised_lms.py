@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from .._checks import fail, positive_real
-from ..objective import Objective
+from ..numerics.checks import fail, positive_real
 from .base import LawState, UpdateLaw
+from .objective import Objective
 
 
 class NormalisedLMS(UpdateLaw):
@@ -40,6 +40,13 @@ class NormalisedLMS(UpdateLaw):
         error = sampled - torch.linalg.vecdot(row, weights)
         length = torch.where(power > 0, error / torch.where(power > 0, power, 1.0), 0.0)
         return weights + self.step_size * length.unsqueeze(-1) * row, state
+
+    def products(self, count: int, iterations: int) -> int:
+        return 0
+
+    @property
+    def title(self) -> str:
+        return "normalised LMS"
 
     def with_step_size(self, size: float) -> NormalisedLMS:
         return NormalisedLMS(size)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from .._checks import choice
-from ..objective import Objective
+from ..numerics.checks import choice
 from .base import LawState, UpdateLaw, line_search
+from .objective import Objective
 
 
 class PreconditionedDescent(UpdateLaw):
@@ -42,3 +42,10 @@ class PreconditionedDescent(UpdateLaw):
             diagonal = objective.gram.diagonal(dim1=-2, dim2=-1)
             direction = torch.where(diagonal > 0, g / torch.where(diagonal > 0, diagonal, 1.0), 0.0)
         return weights + line_search(objective, g, direction) * direction, state
+
+    def products(self, count: int, iterations: int) -> int:
+        return (2 if self.preconditioner == "core" else 1) * iterations + 1
+
+    @property
+    def title(self) -> str:
+        return f"{super().title} ({self.preconditioner})"

@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from .._checks import non_negative, positive_real, real
-from ..objective import Objective
+from ..numerics.checks import non_negative, positive_real, real
 from .base import LawState, UpdateLaw
+from .objective import Objective
 
 
 class RecursiveLeastSquares(UpdateLaw):
@@ -65,6 +65,9 @@ class RecursiveLeastSquares(UpdateLaw):
             torch.where(fine.squeeze(-1), corrected, weights),
             (torch.where(fine, posterior, covariance),),
         )
+
+    def products(self, count: int, iterations: int) -> int:
+        return 6 * count * iterations  # six of M x M x M numbers, each M products
 
     def rescale(self, state: LawState, factor: Tensor) -> LawState:
         (covariance,) = state

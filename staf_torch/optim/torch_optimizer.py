@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 from torch.optim.optimizer import Optimizer, ParamsT
 
-from .._checks import fail, integer
-from ..objective import NativeError
+from ..numerics.checks import fail, integer
 from .base import UpdateLaw
+from .objective import NativeError
 
 
 class ChaseOptimizer(Optimizer):

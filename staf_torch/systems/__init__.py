@@ -2,6 +2,7 @@
 
 from .base import ControlAffineSystem as ControlAffineSystem
 from .base import Linearisation as Linearisation
+from .base import Units as Units
 from .integrators import runge_kutta_step as runge_kutta_step
 from .integrators import simulate as simulate
 from .integrators import trajectory as trajectory

@@ -16,6 +16,13 @@ class Linearisation(NamedTuple):
     input_matrix: Tensor  # B, (n, m)
 
 
+class Units(NamedTuple):
+    """Units of a plant's quantities, entry by entry where they differ: ``rad, rad/s``."""
+
+    state: str = "1"
+    input: str = "1"
+
+
 class ControlAffineSystem(nn.Module, abc.ABC):
     """x' = f(x) + g(x) u, batched. A plant of your own is a subclass with `drift` and, where it has
     inputs, `effectiveness`; its trajectories then come from a fourth-order Runge-Kutta method.
@@ -23,12 +30,16 @@ class ControlAffineSystem(nn.Module, abc.ABC):
     Attributes:
         dim: n, the number of states; None where the plant takes any.
         inputs: m, the number of inputs.
+        units: of states and inputs, for the sheet of `staf-export`.
+        spread: episodes of `envs` begin uniformly in [-spread, spread]^n unless told otherwise.
 
     The equilibrium is the origin without control: states and inputs are measured from there.
     """
 
     dim: int | None = None
     inputs: int = 0
+    units: Units = Units()
+    spread: float = 1.0
 
     @abc.abstractmethod
     def drift(self, x: Tensor) -> Tensor:
@@ -37,6 +48,11 @@ class ControlAffineSystem(nn.Module, abc.ABC):
     def effectiveness(self, x: Tensor) -> Tensor:
         """g(x): (..., n) -> (..., n, m). Without inputs, m = 0."""
         return x.new_zeros(*x.shape, 0)
+
+    def rate(self, x: Tensor, u: Tensor) -> Tensor:
+        """x' = f(x) + g(x) u: (..., n), (..., m) -> (..., n)."""
+        # Not a matrix product: a compiler fuses this where it would call a library for that.
+        return self.drift(x) + (self.effectiveness(x) * u.unsqueeze(-2)).sum(-1)
 
     def flow(self, x: Tensor, time: Tensor) -> Tensor | None:
         """x(t) from x(0) without control, where it is known in closed form.

@@ -7,8 +7,12 @@ from collections.abc import Callable, Iterator
 import torch
 from torch import Tensor
 
-from .._checks import integer, positive_real, trailing
+from ..lanes import Program
+from ..lanes.combinators import Tree
+from ..numerics.checks import integer, positive_real, trailing
 from .base import ControlAffineSystem
+
+_PAYS = 10_000  # steps of a small batch in plain torch (some .1 ms each) that take as long as to compile
 
 
 def runge_kutta_step(field: Callable[[Tensor], Tensor], x: Tensor, dt: float) -> Tensor:
@@ -47,6 +51,7 @@ def trajectory(
     size = total if chunk is None else integer("trajectory", "chunk", chunk, least=1)
     flow = getattr(system, "flow", None)  # a user's module need not have one
     x = x0
+    program = _program(system, dt, compile=total * (1 + len(x0) / 200) >= _PAYS)
     for start in range(0, total, size):
         stop = min(start + size, total)
         time = torch.arange(start, stop, dtype=torch.float64) * dt
@@ -54,17 +59,23 @@ def trajectory(
         if exact is not None:
             yield exact
             continue
-        piece = []
-        for _ in range(start, stop):
-            piece.append(x)
-            x = runge_kutta_step(lambda at: _drift(system, at), x, dt)
-        yield torch.stack(piece, dim=-2)
+        x, piece = program(x, steps=stop - start)
+        yield piece
 
 
 def simulate(system: ControlAffineSystem, x0: Tensor, *, dt: float, steps: int) -> Tensor:
     """The whole of `trajectory` at once: (B, n) -> (B, steps + 1, n)."""
     (states,) = trajectory(system, x0, dt=dt, steps=steps)
     return states
+
+
+def _program(system: ControlAffineSystem, dt: float, compile: bool) -> Program:
+    """Return the Runge-Kutta steps of a plant, which record the state before every step."""
+
+    def step(x: Tensor, now: Tree, row: Tree) -> tuple[Tensor, Tensor]:
+        return runge_kutta_step(lambda at: _drift(system, at), x, dt), x
+
+    return Program(step, name="a trajectory", compile=compile)
 
 
 def _drift(system: ControlAffineSystem, x: Tensor) -> Tensor:

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from .._checks import fail, vector
-from ..riccati import riccati
+from ..numerics.checks import fail, vector
+from ..numerics.linalg import riccati
 from .base import ControlAffineSystem
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from .._checks import positive_real
+from ..numerics.checks import positive_real
 from .base import ControlAffineSystem
 
 

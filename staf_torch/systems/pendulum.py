@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from .._checks import non_negative, positive_real, real
-from .base import ControlAffineSystem
+from ..numerics.checks import non_negative, positive_real, real
+from .base import ControlAffineSystem, Units
 
 
 class Pendulum(ControlAffineSystem):
@@ -26,6 +26,8 @@ class Pendulum(ControlAffineSystem):
 
     dim = 2
     inputs = 1
+    units = Units("rad, rad/s", "N m")
+    spread = 0.5
 
     def __init__(
         self, mass: float = 1.0, length: float = 1.0, damping: float = 0.1, gravity: float = 9.81

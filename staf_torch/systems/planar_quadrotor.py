@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from .._checks import positive_real
-from .base import ControlAffineSystem
+from ..numerics.checks import positive_real
+from .base import ControlAffineSystem, Units
 
 
 class PlanarQuadrotor(ControlAffineSystem):
@@ -28,6 +28,8 @@ class PlanarQuadrotor(ControlAffineSystem):
 
     dim = 6
     inputs = 2
+    units = Units("m, m, rad, m/s, m/s, rad/s", "N above hover, N m")
+    spread = 0.2
 
     def __init__(self, mass: float = 1.0, inertia: float = 0.1, gravity: float = 9.81) -> None:
         super().__init__()

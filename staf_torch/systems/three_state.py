@@ -18,6 +18,7 @@ class ThreeState(ControlAffineSystem):
 
     dim = 3
     inputs = 2
+    spread = 0.5
 
     def drift(self, x: Tensor) -> Tensor:
         x1, x2, x3 = x.unbind(-1)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from .._checks import real
+from ..numerics.checks import real
 from .base import ControlAffineSystem
 
 

@@ -24,8 +24,7 @@ ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT))
 
 import staf_torch as st  # noqa: E402
-from staf_torch.local import graded_basis  # noqa: E402
-from staf_torch.local.interpolation import Interpolation  # noqa: E402
+from staf_torch.local_basis import Interpolation, graded_basis  # noqa: E402
 
 ROUNDS = 5
 CENTERS, RADIUS = 15, 0.1

@@ -10,8 +10,9 @@ from __future__ import annotations
 import sys
 import time
 
-from staf_torch.experiments import members
-from staf_torch.experiments.composition import compose
+from staf_torch.results.progress import SHOWN
+from staf_torch.sweeps.batching import batches, solve
+from staf_torch.sweeps.hydra_compat import Composer, config_loader
 
 ALONE = 3
 
@@ -21,16 +22,16 @@ def main(kernel: str = "gaussian", count: str = "25") -> None:
     jobs = [[f"centers.radius={radii[i % 5]}", f"seed={i // 5}", "trajectories=2"] for i in range(int(count))]
     base = [f"kernel={kernel}", "centers.count=6", "duration=5", "settle_time=2.5", "figures=false"]
     start = time.perf_counter()
-    cfgs = compose(base, jobs, hydra_node=False)
+    composer = Composer(config_loader(), hydra_node=False)
+    cfgs = [composer([*base, *job]) for job in jobs]
     composed = time.perf_counter()
-    members.solve(cfgs[:1])
+    solve(cfgs[:1], SHOWN)
     warm = time.perf_counter()
-    for group in members.groups(cfgs):
-        for chunk in members.chunks(cfgs, group):
-            members.solve([cfgs[i] for i in chunk])
+    for batch_ in batches(cfgs):
+        solve([cfgs[i] for i in batch_], SHOWN)
     batch = time.perf_counter()
     for cfg in cfgs[:ALONE]:
-        members.solve([cfg])
+        solve([cfg], SHOWN)
     alone = time.perf_counter()
     print(f"{count} members, {kernel}: composed in {composed - start:.3f} s")
     print(f"  batch {batch - warm:.3f} s, {(batch - warm) / len(cfgs) * 1e3:.1f} ms a member")

@@ -10,7 +10,7 @@ from typing import Any
 
 import gpytorch
 import torch
-from streams import Method, grid
+from drifting_streams import Method, grid
 from torch import Tensor
 
 

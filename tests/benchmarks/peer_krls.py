@@ -8,7 +8,7 @@ whose dictionaries grow at a step are computed apart, all others pay for the upd
 from __future__ import annotations
 
 import torch
-from streams import Method, grid
+from drifting_streams import Method, grid
 from torch import Tensor
 
 CAPACITY = 128

@@ -4,8 +4,8 @@ no batch, so one stream after the other."""
 from __future__ import annotations
 
 import torch
+from drifting_streams import Method, grid
 from scipy.interpolate import RBFInterpolator
-from streams import Method, grid
 from torch import Tensor
 
 WINDOW = 64

@@ -4,8 +4,8 @@ so one stream after the other."""
 from __future__ import annotations
 
 import torch
+from drifting_streams import Method, grid
 from sklearn.kernel_ridge import KernelRidge
-from streams import Method, grid
 from torch import Tensor
 
 

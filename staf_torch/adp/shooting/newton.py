@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple, Protocol, TypeVar
 
 import torch
 from torch import Tensor
 
-from .stage import Expansion, Stage
+from .stage import Expansion, Stage, closed_stage
 
+Rows = TypeVar("Rows", "Plan", "Direction")
+
+_ROUNDING = 1e-9  # relative promise below which a step that does not pay is one that rounding hides
 _LEAST_CURVATURE = 1e-6  # of its largest eigenvalue, that a convexified interval keeps
 _SHORTER = (0.5, 0.25, 0.1, 0.03, 0.01)  # shares of the Newton step, where the whole one does not pay
 
@@ -111,8 +115,95 @@ def improved(
     return best, lower
 
 
-def choose(rows: Tensor, new: Plan, old: Plan) -> Plan:
-    """The new plan in ``rows`` (B,), the old one in the others."""
-    state = torch.where(rows[:, None, None], new.state, old.state)
-    control = torch.where(rows[:, None, None], new.control, old.control)
-    return Plan(state, control, torch.where(rows, new.cost, old.cost))
+def choose(rows: Tensor, new: Rows, old: Rows) -> Rows:
+    """The tensors of ``new`` in ``rows`` (B,), those of ``old`` in the others."""
+
+    def pick(a: Tensor, b: Tensor) -> Tensor:
+        return torch.where(rows[(..., *([None] * (a.dim() - 1)))], a, b)
+
+    return type(new)(*map(pick, new, old))
+
+
+class Problem(Protocol):
+    """What the iteration needs to know; `DirectShooting` has it."""
+
+    stage: Stage
+    base: Callable[[Tensor], Tensor]
+    terminal: Callable[[Tensor], Tensor]
+    tolerance: float
+    iterations: int
+
+
+class Solution(NamedTuple):
+    """Where the iteration ended, a row each."""
+
+    plan: Plan
+    feedback: Tensor  # of the last expansion, (B, N, 2m, n)
+    gradient: Tensor  # of the cost in x(0), (B, n)
+    converged: Tensor  # (B,) bool
+    iterations: Tensor  # (B,)
+
+
+def follow(problem: Problem, x0: Tensor, lengths: Tensor) -> Plan:
+    """The base policy's trajectories on a mesh: (B, n), (N,)."""
+    stage = problem.stage
+    x, spent, states, controls = x0, torch.zeros_like(x0[:, 0]), [x0], []
+    for h in lengths.unbind():
+        ahead = closed_stage(stage, problem.base, x, h)
+        v = torch.cat([stage.cost.unsaturated(problem.base(at)) for at in (x, ahead)], dim=-1)
+        x, c = stage.advance(x, v, h)
+        spent = spent + c
+        states.append(x)
+        controls.append(v)
+    cost = spent + problem.terminal(x)
+    cost = torch.where(torch.isfinite(cost), cost, torch.inf)
+    return Plan(torch.stack(states, dim=1), torch.stack(controls, dim=1), cost)
+
+
+def minimise(problem: Problem, plan: Plan, lengths: Tensor) -> Solution:
+    """Newton's iteration from a plan on a mesh of interval lengths (N,)."""
+    batch = len(plan.cost)
+    done = torch.zeros(batch, dtype=torch.bool, device=plan.cost.device)
+    stuck, rough = ~torch.isfinite(plan.cost), torch.zeros_like(done)
+    count = torch.zeros(batch, dtype=torch.int64, device=plan.cost.device)
+    kept, rough = _step(problem, plan, lengths, rough)
+    for _ in range(problem.iterations):
+        promise = kept.decrement / plan.cost
+        done = done | (~stuck & kept.definite & (promise <= problem.tolerance))
+        if bool((done | stuck).all()):  # costs time alone: rows that are done no longer move
+            break
+        moved, lower = improved(problem.stage, plan, lengths, problem.terminal, kept)
+        moving = ~done & ~stuck
+        plan = choose(moving & lower, moved, plan)
+        count = count + moving
+        done = done | (moving & ~lower & (promise <= _ROUNDING))
+        stuck = stuck | (moving & ~lower & ~done & rough)
+        step, rough = _step(problem, plan, lengths, moving & ~lower)  # convexified where it did not pay
+        kept = choose(done | stuck, kept, step)
+    return Solution(plan, kept.feedback, kept.gradient, done, count)
+
+
+def _step(problem: Problem, plan: Plan, lengths: Tensor, rough: Tensor) -> tuple[Direction, Tensor]:
+    """The Newton step, of the convexified model in the rows ``rough`` and where it has no minimum."""
+    slope, curvature = _derivatives(problem.terminal, plan.state[:, -1])
+    batch, intervals = plan.control.shape[:2]
+    spread = lengths.expand(batch, intervals)
+    expansion = problem.stage.expand(plan.state[:, :-1], plan.control, spread, slope)
+    step = direction(expansion, slope, curvature)
+    rough = rough | ~step.definite
+    if bool(rough.any()):  # costs time alone
+        step = choose(~rough, step, direction(convexified(expansion), slope, curvature))
+    return step, rough
+
+
+def _derivatives(value: Callable[[Tensor], Tensor], x: Tensor) -> tuple[Tensor, Tensor]:
+    """First and second derivatives of V_T: (B, n) -> (B, n), (B, n, n)."""
+    with torch.enable_grad():
+        at = x.detach().requires_grad_()
+        (slope,) = torch.autograd.grad(value(at).sum(), at, create_graph=True)
+        rows = [
+            torch.autograd.grad(s.sum(), at, retain_graph=True, materialize_grads=True)[0]
+            for s in slope.unbind(-1)
+        ]
+    curvature = torch.stack(rows, dim=-2)
+    return slope.detach(), 0.5 * (curvature + curvature.mT)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ...systems import ControlAffineSystem, runge_kutta_step
-from ..cost import Cost, matvec
+from ..cost import Cost
 
 
 class Expansion(NamedTuple):
@@ -62,8 +62,7 @@ class Stage:
         return Expansion(slope, gradient, 0.5 * (curvature + curvature.mT))
 
     def _field(self, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
-        rate = self.system.drift(x) + matvec(self.system.effectiveness(x), u)
-        return rate, self.cost.rate(x, u)
+        return self.system.rate(x, u), self.cost.rate(x, u)
 
 
 def adjoint(slope: Tensor, gradient: Tensor, end: Tensor) -> Tensor:
@@ -82,9 +81,4 @@ def _gradient(values: Tensor, z: Tensor) -> Tensor:
 
 def closed_stage(stage: Stage, policy: Callable[[Tensor], Tensor], x: Tensor, h: Tensor) -> Tensor:
     """x+ under a policy that sees the state all the time, by one Runge-Kutta step: (B, n), () -> (B, n)."""
-
-    def field(at: Tensor) -> Tensor:
-        rate: Tensor = stage.system.drift(at) + matvec(stage.system.effectiveness(at), policy(at))
-        return rate
-
-    return runge_kutta_step(field, x, float(h))
+    return runge_kutta_step(lambda at: stage.system.rate(at, policy(at)), x, float(h))

@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from hydra.core.config_store import ConfigStore
-from hydra.core.utils import JobReturn
 from hydra.plugins import launcher  # the module: a base class imported by name is listed as a plugin itself
 from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig
@@ -54,14 +53,14 @@ class BatchedLauncher(launcher.Launcher):
         self.config: DictConfig | None = None
 
     def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
-        """What Hydra hands over before the sweep."""
-        from staf_torch.experiments.sweep.composed import compose_once
+        """Keep what Hydra hands over before the sweep."""
+        from staf_torch.sweeps.hydra_compat import ComposeOnce
 
-        compose_once(hydra_context, config)
+        ComposeOnce.install(hydra_context, config)
         self.hydra_context, self.task_function, self.config = hydra_context, task_function, config
 
-    def launch(self, job_overrides: Sequence[Sequence[str]], initial_job_idx: int) -> Sequence[JobReturn]:
-        """Run the jobs; their returns in order."""
-        from staf_torch.experiments.sweep.launch import Launch
+    def launch(self, job_overrides: Sequence[Sequence[str]], initial_job_idx: int) -> Sequence[Any]:
+        """Run the jobs and return Hydra's records of them (`JobReturn`), in order."""
+        from staf_torch.sweeps.launcher import Launch
 
         return Launch(self).run(job_overrides, initial_job_idx)

@@ -1,0 +1,216 @@
+"""What a controller in a closed loop is; feedback without a state of its own: the LQR; the supervisor."""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from ..numerics.checks import real
+from ..numerics.linalg import riccati
+from ..systems import ControlAffineSystem
+from .cost import BoundedInputCost, Cost, matvec, quadratic
+from .sampling import held_riccati
+
+Policy = Callable[[Tensor], Tensor]
+"""u from x: (..., n) -> (..., m)."""
+Value = Callable[[Tensor], Tensor]
+"""V from x: (..., n) -> (...)."""
+
+
+class ControllerState(NamedTuple):
+    """What a controller carries from step to step. Feedback laws leave all of it empty."""
+
+    critic: Tensor  # Wc, (B, M)
+    actor: Tensor  # Wa, (B, M)
+    gain: Tensor  # Gam or Lam, (B, M, M)
+    identifier: Tensor  # what an identifier of the plant remembers, (B, K)
+
+
+class Controller(nn.Module, abc.ABC):
+    """u and what the controller carries on, from the state and what it carried until then.
+
+    Attributes:
+        draws: uniform random points of [-1, 1]^n that a step needs, a row.
+        period: least time for which a control is held, s; None where any time will do.
+        label: a few words for a log or a sheet.
+    """
+
+    draws: int = 0
+    period: float | None = None
+
+    @property
+    def label(self) -> str:
+        return type(self).__name__
+
+    @abc.abstractmethod
+    def init(self, x0: Tensor) -> ControllerState:
+        """What is carried into the first step, a row each of the states x0 (B, n)."""
+
+    @abc.abstractmethod
+    def step(
+        self, x: Tensor, carried: ControllerState, uniform: Tensor, dt: float
+    ) -> tuple[Tensor, ControllerState]:
+        """The control to hold for ``dt`` seconds, and what is carried on after them.
+
+        Args:
+            x: (B, n).
+            carried: from the step before, or from `init`.
+            uniform: (B, draws, n), uniform on [-1, 1].
+            dt: s.
+
+        Returns:
+            u (B, m), and what the next step gets as ``carried``.
+        """
+
+    def value(self, x: Tensor, carried: ControllerState) -> Tensor | None:
+        """V^(x) where the controller has an idea of it: (..., n) -> (...)."""
+        return None
+
+
+class Feedback(Controller):
+    """u = policy(x), which carries nothing.
+
+    Args:
+        policy: (..., n) -> (..., m).
+        value: of the policy or of its design, (..., n) -> (...), for the record.
+    """
+
+    def __init__(self, policy: Policy, value: Value | None = None) -> None:
+        super().__init__()
+        self.policy = policy
+        self.period = getattr(policy, "period", None)
+        self._value = value
+
+    @property
+    def label(self) -> str:
+        return getattr(self.policy, "__name__", type(self.policy).__name__)
+
+    def init(self, x0: Tensor) -> ControllerState:
+        empty = x0.new_zeros(x0.shape[0], 0)
+        return ControllerState(empty, empty, x0.new_zeros(x0.shape[0], 0, 0), empty)
+
+    def step(
+        self, x: Tensor, carried: ControllerState, uniform: Tensor, dt: float
+    ) -> tuple[Tensor, ControllerState]:
+        return self.policy(x), carried
+
+    def value(self, x: Tensor, carried: ControllerState) -> Tensor | None:
+        return None if self._value is None else self._value(x)
+
+
+class LQR(nn.Module):
+    """u = -K x with K = R^-1 B'P and P from the Riccati equation of the linearisation at 0.
+
+    With a `BoundedInputCost` it is u = -bound tanh(K x / bound). A control that is held for long needs other
+    gains: with a ``period`` P and K are those of the linear plant whose control is held for that time.
+
+    Args:
+        system: the plant.
+        cost: the cost rate.
+        period: s, positive, for which the control will be held; None for one that follows the state.
+
+    Attributes:
+        p: P, (n, n): x'Px is the value of the linear plant.
+        k: K, (m, n).
+
+    Raises:
+        ValueError: if the plant does not rest at 0, or its linearisation cannot be stabilised.
+    """
+
+    def __init__(self, system: ControlAffineSystem, cost: Cost, period: float | None = None) -> None:
+        super().__init__()
+        check_equilibrium(system)
+        a, b = system.linearisation()
+        name = type(system).__name__
+        if period is None:
+            p = riccati(a, b, cost.q, cost.r, name=name)
+            k = cost.r_inverse @ b.to(p).mT @ p
+        else:
+            p, k = held_riccati(a, b, cost, period, name=name)
+        self.period = period
+        self.register_buffer("p", p)
+        self.register_buffer("k", k)
+        self.p: Tensor
+        self.k: Tensor
+        self.bound = cost.bound if isinstance(cost, BoundedInputCost) else None
+
+    def forward(self, x: Tensor) -> Tensor:
+        """u: (..., n) -> (..., m)."""
+        u = -matvec(self.k, x)
+        return u if self.bound is None else self.bound * (u / self.bound).tanh()
+
+    def value(self, x: Tensor) -> Tensor:
+        """x'Px: (..., n) -> (...)."""
+        return quadratic(self.p, x)
+
+
+def check_equilibrium(system: ControlAffineSystem) -> None:
+    """Refuse a plant with f(0) != 0.
+
+    Raises:
+        ValueError: if f(0) is not 0, with its value.
+    """
+    at = system.drift(system.equilibrium())
+    if not bool((at.abs() <= 1e-9).all()):
+        raise ValueError(
+            f"`{type(system).__name__}.drift` must be 0 at the origin, the state to regulate to; "
+            f"got {at.tolist()}. Measure states and inputs from the equilibrium."
+        )
+
+
+class Supervised(Controller):
+    """The control of another controller, drawn towards the LQR just as far as it must be:
+
+        u_applied = u_LQR + s (u - u_LQR),  s <= 1 the largest with |u_applied - u_LQR|_R <= trust |u_LQR|_R.
+
+    For a linear plant and trust <= 1/2 the Riccati value then falls at the rate of x'Qx at least, whatever
+    the weights are: V_P' <= -x'Qx - (1 - 2 trust) u_LQR'R u_LQR. It bounds a control that is too weak as
+    well as one that is too strong for its time step. The controller learns on as if its own control had
+    been applied: the laws ask the model, not the plant.
+
+    Args:
+        controller: the controller to supervise.
+        lqr: the base feedback, of the same plant and cost.
+        cost: the cost rate.
+        trust: in (0, 1].
+
+    Raises:
+        ValueError: if ``trust`` is not in (0, 1].
+    """
+
+    def __init__(self, controller: Controller, lqr: LQR, cost: Cost, trust: float = 0.5) -> None:
+        super().__init__()
+        if not 0 < real("Supervised", "trust", trust) <= 1:
+            raise ValueError(f"`Supervised(trust=...)` must be in (0, 1]; got {trust!r}.")
+        self.controller, self.lqr, self.cost, self.trust = controller, lqr, cost, trust
+        self.draws, self.period = controller.draws, controller.period
+
+    @property
+    def label(self) -> str:
+        return f"supervised {self.controller.label}"
+
+    def init(self, x0: Tensor) -> ControllerState:
+        return self.controller.init(x0)
+
+    def step(
+        self, x: Tensor, carried: ControllerState, uniform: Tensor, dt: float
+    ) -> tuple[Tensor, ControllerState]:
+        u, after = self.controller.step(x, carried, uniform, dt)
+        return self.restrain(x, u), after
+
+    def restrain(self, x: Tensor, u: Tensor) -> Tensor:
+        """The control to apply in place of u: (..., n), (..., m) -> (..., m)."""
+        base = self.lqr(x)
+        apart = u - base
+        allowed = self.trust * quadratic(self.cost.r, base).sqrt()
+        wanted = quadratic(self.cost.r, apart).sqrt()
+        share = torch.where(wanted > allowed, allowed / wanted, 1.0)
+        restrained: Tensor = base + share.unsqueeze(-1) * apart
+        return restrained
+
+    def value(self, x: Tensor, carried: ControllerState) -> Tensor | None:
+        return self.controller.value(x, carried)

@@ -1,0 +1,1 @@
+"""Approximation around a state: basis, module, coefficient format, conditioning, sensitivity."""

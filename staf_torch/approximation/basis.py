@@ -1,0 +1,186 @@
+"""A kernel and its state-following centers: what is needed at a state to approximate around it."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..centers import StateFollowingCenters
+from ..kernels import Kernel
+from ..local_basis import Degrees, LocalBasis, LocalSpace
+from ..numerics.checks import sampled, trailing
+from .coefficient_format import ConventionModule, record
+
+Target = Callable[[Tensor], Tensor]
+"""A function V to approximate: points (..., n) to values (...)."""
+
+
+REACH = r"\|x\| r = "
+"""Start of the warning of `StaFBasis.check_reach`, as a regular expression."""
+
+
+class GramStructure(NamedTuple):
+    """K(c(x)) = e^{log_gain} S K0 S with S = diag(scale), at the states x."""
+
+    core: Tensor  # K0, (M, M) where one serves all states, else (..., M, M)
+    log_scale: Tensor | None  # s(x, d_i), (..., M), (M,) where one serves all; None for zeros
+    log_gain: Tensor | None  # g(x), (...); None for zeros
+
+    @property
+    def scale(self) -> Tensor | None:
+        """e^{s(x, d_i)}, (..., M); None for ones."""
+        return None if self.log_scale is None else self.log_scale.exp()
+
+    def scaled(self) -> Tensor:
+        """S K0 S = e^{-gain} K(c(x)): (..., M, M)."""
+        scale = self.scale
+        return self.core if scale is None else scale.unsqueeze(-1) * self.core * scale.unsqueeze(-2)
+
+    def quadratic(self, v: Tensor) -> Tensor:
+        """v'S K0 S v without S K0 S: (..., M) -> (...)."""
+        u = v if self.log_scale is None else self.log_scale.exp() * v
+        product = self.core[..., 0] * u[..., :1]
+        for j in range(1, u.shape[-1]):  # a column at a time: no (..., M, M), no bits from other rows
+            product = torch.addcmul(product, self.core[..., j], u[..., j : j + 1])
+        quadratic: Tensor = torch.linalg.vecdot(u, product)
+        return quadratic
+
+
+class StaFBasis(ConventionModule):
+    """The StaF basis sigma_i(y; x) = k(y, c_i(x)), i = 1..M.
+
+    Example:
+        >>> basis = StaFBasis(ExponentialKernel(), StateFollowingCenters(rings(3), radius=0.1))
+        >>> x = torch.tensor([1.0, 0.0], dtype=torch.float64)
+        >>> basis.ideal_weights(x, targets.Paper()).shape
+        torch.Size([3])
+
+    Hyperparameters that kernel, centers and radius were given as `nn.Parameter` are learned, others fixed.
+    The buffer `convention` says in a state_dict what coefficients beside it mean: `check_convention`.
+
+    Args:
+        kernel: the kernel k.
+        centers: the state-following centers c_i.
+
+    Raises:
+        ValueError: if an argument is of another type, or there are more centers than the kernel's
+            function space has dimensions (polynomial kernels).
+
+    Source: Rosenfeld et al., section 2.
+    """
+
+    def __init__(self, kernel: Kernel, centers: StateFollowingCenters) -> None:
+        super().__init__()
+        if not isinstance(kernel, Kernel):
+            raise ValueError(f"`StaFBasis(kernel=...)` must be a Kernel; got {kernel!r}.")
+        if not isinstance(centers, StateFollowingCenters):
+            raise ValueError(f"`StaFBasis(centers=...)` must be a StateFollowingCenters; got {centers!r}.")
+        rank = kernel.rank(centers.dim)
+        if rank is not None and centers.count > rank:
+            raise ValueError(
+                f"`StaFBasis(centers=...)` has {centers.count} centers, but the space of "
+                f"{type(kernel).__name__}({kernel.extra_repr()}) over R^{centers.dim} has "
+                f"{rank} dimensions: use at most {rank} centers, or a higher degree."
+            )
+        self.kernel = kernel
+        self.centers = centers
+        self._local_basis = LocalBasis(kernel, centers.directions)
+        self._keep_convention()
+        self._prepare()
+
+    @property
+    def count(self) -> int:
+        """M, the number of basis functions."""
+        return self.centers.count
+
+    @property
+    def dim(self) -> int:
+        """n, the dimension of the state."""
+        return self.centers.dim
+
+    def forward(self, y: Tensor, x: Tensor) -> Tensor:
+        """sigma(y; x): (..., P, n), (..., n) -> (..., P, M)."""
+        trailing("StaFBasis", "y", y, dims=2, last=self.dim)
+        sigma: Tensor = self.kernel(y, self.centers(x))
+        return sigma
+
+    def gram(self, x: Tensor) -> Tensor:
+        """K(c(x)): (..., n) -> (..., M, M). Overflows with the kernel; see `gram_structure`."""
+        centers = self.centers(x)
+        gram: Tensor = self.kernel(centers, centers)
+        return gram
+
+    def gram_structure(self, x: Tensor) -> GramStructure:
+        """The factors of K(c(x)), none of which overflows: (..., n) -> `GramStructure`."""
+        d = self.centers.offsets(x)
+        core = self.kernel.core(x, d, d)
+        return GramStructure(core, self.kernel.log_scale(x, d), self.kernel.log_gain(x))
+
+    def local(self, x: Tensor) -> LocalSpace:
+        """The span of the basis at the states x (..., n), in a basis that can be computed with."""
+        trailing("StaFBasis.local", "x", x, dims=1, last=self.dim)
+        return self._local_basis.space(self.kernel, self.centers, x)
+
+    def check_reach(self, x: Tensor, stacklevel: int = 3) -> bool:
+        """Warn, and say so, where the exponential kernel is a poor choice: |x| nu(x) > 1 at a state (..., n).
+
+        exp(y'c) then changes by more than e over the ball, with the state and not with V.
+        """
+        if self.kernel.log_gain(x) is None:
+            return False
+        reach = (x.norm(dim=-1) * self.centers.radius(x)).detach()
+        return self.warn_reach(float(torch.where(torch.isfinite(reach), reach, 0.0).max()), stacklevel + 1)
+
+    def warn_reach(self, worst: float, stacklevel: int = 2) -> bool:
+        """`check_reach` where the largest |x| nu(x) is known."""
+        if worst > 1:
+            warnings.warn(
+                f"|x| r = {worst:.3g} > 1: around such states {type(self.kernel).__name__} changes by more "
+                "than a factor e within the ball, and the approximation degrades. Shrink the radius, or use "
+                "GaussianKernel, whose accuracy does not depend on the state.",
+                stacklevel=stacklevel,
+            )
+        return worst > 1
+
+    def values(self, x: Tensor, target: Target, outputs: int | None = None) -> Tensor:
+        """V(c(x)): (..., n) -> (..., M); of a target with k outputs (k, ..., M)."""
+        centers = self.centers(x)
+        values = sampled(target, target(centers), centers, outputs)
+        return values if outputs is None else values.movedim(-1, 0)
+
+    def ideal_weights(self, x: Tensor, target: Target) -> Tensor:
+        """w = K(c(x))^-1 V(c(x)), the minimiser of the native-space error: (..., n) -> (..., M).
+
+        Differentiable: dw/dx = K^-1 (dV(c)/dx - (dK/dx) w). A row in which w cannot be represented
+        (e^{-|x|^2} underflows, or the radius is too small) is NaN; `StaF` holds coefficients that never are.
+
+        Source: Rosenfeld et al., eq. (5), and the normal equations of its quadratic.
+        """
+        space = self.local(x)
+        return space.weights(space.fit(self.values(x, target)))
+
+    def excess(self, weights: Tensor, x: Tensor, target: Target) -> Tensor:
+        """F(a, c) - F(w, c) = (a - w)'K(a - w) for weights a at the states x: (..., M) -> (...).
+
+        F itself is infinite where V is not in the kernel's space; its excess never is.
+        """
+        difference = weights - self.ideal_weights(x, target)
+        product = (self.gram(x) @ difference.unsqueeze(-1)).squeeze(-1)
+        excess: Tensor = torch.linalg.vecdot(difference, product)
+        return excess
+
+    def _record(self) -> dict[str, Any]:
+        return record(self.kernel, self.centers, self._local_basis.kind, self._local_basis.degrees)
+
+    def _adopt(self, saved: dict[str, Any] | None) -> None:
+        if saved is None:
+            self._local_basis = LocalBasis(self.kernel, self.centers.directions)
+        elif "degrees" in saved:
+            self._local_basis.degrees = Degrees.of(saved["degrees"])
+
+    def _prepare(self) -> None:
+        self._local_basis.prepare(self.kernel, self.centers)

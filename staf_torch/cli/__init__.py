@@ -1,0 +1,1 @@
+"""The commands `staf`, `staf-table` and `staf-export`."""

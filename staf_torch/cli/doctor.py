@@ -1,0 +1,94 @@
+"""`staf doctor`: what a report of a problem should say, and a self-test whose number is known."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import platform
+import shutil
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import torch
+
+from .. import __version__
+from ..approximation.basis import StaFBasis
+from ..centers import StateFollowingCenters, rings
+from ..engine import chase
+from ..kernels import ExponentialKernel
+from ..lanes.build import _COMPILERS, _cache
+from ..optim import SteepestDescent
+from ..systems import Oscillator, simulate
+from ..targets import Paper
+
+_PACKAGES = ("torch", "numpy", "hydra-core", "omegaconf", "matplotlib", "scipy", "pandas", "pyarrow")
+_EXPECTED = 6.23712254984
+"""Excess of the self-test at its last time."""
+_TOLERANCE = 1e-6  # relative
+
+
+def version() -> str:
+    """Return what `staf --version` prints."""
+    return f"staf_torch {__version__}"
+
+
+def main() -> int:
+    """Print one line a finding; return 0 if the self-test has its number and all places can be written."""
+    sound = True
+    for name, found, good in _findings():
+        sys.stdout.write(f"{name + ':':<12}{found}{'' if good else '   <- problem'}\n")
+        sound = sound and good
+    return 0 if sound else 1
+
+
+def _findings() -> Iterator[tuple[str, str, bool]]:
+    yield "staf_torch", f"{__version__} in {Path(__file__).resolve().parent.parent}", True
+    yield "python", f"{platform.python_version()}, {platform.platform()}", True
+    yield "packages", ", ".join(f"{name} {_installed(name)}" for name in _PACKAGES), True
+    compiler = next(filter(None, map(shutil.which, (os.environ.get("CXX", ""), *_COMPILERS))), None)
+    yield "compiler", compiler or "none: everything runs in plain torch, slower", True
+    cores = os.cpu_count()
+    set_by = os.environ.get("OMP_NUM_THREADS", "not set")
+    yield "threads", f"{torch.get_num_threads()} of torch, {cores} cores, OMP_NUM_THREADS {set_by}", True
+    yield "gpu", torch.cuda.get_device_name(0) if torch.cuda.is_available() else "none", True
+    for name, place in (
+        ("cache", _cache()),
+        ("runs", Path("runs")),
+        ("scratch", Path(tempfile.gettempdir())),
+    ):
+        yield name, *_place(place)
+    yield "self-test", *_self_test()
+
+
+def _installed(name: str) -> str:
+    try:
+        return importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return "-"
+
+
+def _place(folder: Path) -> tuple[str, bool]:
+    """Return the folder, and whether it, or the folder in which it would be made, can be written."""
+    there = folder.absolute()
+    while not there.exists():
+        there = there.parent
+    good = os.access(there, os.W_OK)
+    files = sum(1 for path in folder.glob("*.so")) if folder.is_dir() else 0
+    return (
+        f"{folder.absolute()}{f', {files} libraries' if files else ''}{'' if good else ', read-only'}",
+        good,
+    )
+
+
+def _self_test() -> tuple[str, bool]:
+    """Run the paper's chase for a second of its time and compare the excess at the end."""
+    start = time.perf_counter()
+    basis = StaFBasis(ExponentialKernel(), StateFollowingCenters(rings(6), radius=0.1))
+    x = torch.tensor([[1.0, 0.0]], dtype=torch.float64)
+    states = simulate(Oscillator(), x, dt=0.01, steps=100)
+    found = float(chase(states, basis, Paper(), SteepestDescent(), inner_steps=10).excess[0, -1])
+    good = abs(found - _EXPECTED) <= _TOLERANCE * _EXPECTED
+    return f"{found:.12g}, expected {_EXPECTED:.12g}, in {time.perf_counter() - start:.1f} s", good

@@ -1,0 +1,53 @@
+"""The command `staf`: a Hydra application over `conf/`, whose task is `staf_torch.sweeps.job.execute`.
+
+`staf -m sweep.resume=runs/<sweep>` becomes the command line of the sweep that is taken up again.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+
+from ..sweeps import callbacks
+from ..sweeps.batching import USER_ERRORS, sentence
+from ..sweeps.hydra_compat import broken_sweep, find_launcher, full_errors, program
+from ..sweeps.hydra_compat import config_directory as config_directory
+from ..sweeps.job import Refused, execute
+from ..sweeps.resume import command_line
+from . import doctor
+
+find_launcher()
+_staf = program(execute)
+
+
+def main() -> None:
+    """Run the command line. What a user got wrong ends as one sentence and the exit code 1.
+
+    `staf doctor` and `staf --version` are no runs, and Hydra is not asked.
+    """
+    if sys.argv[1:] == ["--version"]:
+        sys.exit(print(doctor.version()))
+    if sys.argv[1:] == ["doctor"]:
+        sys.exit(doctor.main())
+    sys.path.insert(0, os.getcwd())  # so that `target.path=my_module.my_function` finds the user's file
+    typed = sys.argv
+    with full_errors() as wants_trace:
+        try:
+            sys.argv = [typed[0], *command_line(typed[1:])]
+            _staf()
+        except Refused as refused:
+            if wants_trace and refused.__cause__ is not None:
+                raise refused.__cause__ from None
+            raise
+        except (Exception, KeyboardInterrupt) as error:
+            sweep = broken_sweep(error)
+            if sweep is not None:
+                callbacks.close(sweep)
+            if isinstance(error, KeyboardInterrupt):
+                sys.stderr.write(callbacks.farewell(sweep) + "\n")
+                sys.exit(130)  # as shells have it
+            if wants_trace or not isinstance(error, USER_ERRORS):
+                raise
+            sys.exit(f"staf: {sentence(error)}")
+        finally:
+            sys.argv = typed

@@ -1,0 +1,129 @@
+"""The command `staf-table`."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from ..results.files import RUNNING, UNFINISHED, write_bytes
+from ..results.reader import Collection, collect
+from ..tables import Layout, Style, Table, json_text, latex_text, parquet_bytes, tabulate
+from ..tables.aggregate import AGGREGATES
+
+_READ: dict[str, Callable[[Table], str]] = {"md": Table.markdown, "tex": latex_text}
+"""For people: few digits, mean and deviation in one column."""
+_PLAIN: dict[str, Callable[[Table], str]] = {"csv": Table.csv, "json": json_text}
+"""For programs: all columns and every digit."""
+
+_EXAMPLES = """\
+examples:
+  staf-table runs/<sweep>
+  staf-table runs/<sweep> --rows kernel,centers.radius --columns centers.count --metric ball_error
+  staf-table runs/* --aggregate mean,ci95 --metric ball_error,gradient_error --sort ball_error:desc
+  staf-table runs/<sweep> --format tex --best bold --output table.tex
+"""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line; what a user got wrong ends as one sentence and the exit code 1."""
+    options = _parser().parse_args(arguments)
+    if options.watch is None:
+        return _once(options)
+    with contextlib.suppress(KeyboardInterrupt):
+        while _going_on(options.path):
+            sys.stdout.write("\x1b[H\x1b[2J" if sys.stdout.isatty() else "")
+            _once(options)
+            sys.stdout.flush()
+            time.sleep(options.watch)
+    return _once(options)
+
+
+def _going_on(paths: Sequence[Path]) -> bool:
+    """Whether a run has not ended, or a job of a sweep has not begun."""
+    try:
+        found = collect(paths)
+    except ValueError:  # nothing is there so far
+        return any(path.is_dir() for path in paths)
+    waiting = any("have not started" in skipped.reason for skipped in found.skipped)
+    return waiting or any(run.status in (RUNNING, UNFINISHED) for run in found.rows)
+
+
+def _once(options: argparse.Namespace) -> int:
+    try:
+        found = collect(options.path)
+        for skipped in found.skipped:
+            print(f"skipped {skipped.path}: {skipped.reason}", file=sys.stderr)
+        for remark in found.remarks:
+            print(f"note: {remark}", file=sys.stderr)
+        content = _rendered(found, options)
+        if options.output is None:
+            sys.stdout.write(content.decode())
+        else:
+            write_bytes(options.output, content)
+    except (ValueError, OSError) as error:
+        print(f"staf-table: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="staf-table",
+        description="The runs of sweeps as a table: one row a run, or aggregated over what is neither in "
+        "--rows nor in --columns, such as the seed.",
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("path", nargs="+", type=Path, help="a run, a sweep, or a folder of such")
+    kinds = (*_READ, *_PLAIN, "parquet")
+    parser.add_argument("--format", choices=kinds, default="md", help="md (default), csv, tex, json, parquet")
+    lists = {
+        "rows": "settings that tell rows apart (all that were swept)",
+        "columns": "settings over whose values a metric is spread",
+        "metric": "metrics (md, tex: the headlines; else all)",
+        "aggregate": f"of {', '.join(AGGREGATES)}; n and failed, the numbers of runs, come with them",
+        "sort": "columns, each maybe with :desc for the largest first",
+    }
+    for name, text in lists.items():
+        parser.add_argument(f"--{name}", help=text, type=_names, default=(), metavar="NAME,...")
+    parser.add_argument("--best", choices=("bold",), help="the best number of each column (md, tex)")
+    parser.add_argument("--digits", type=int, default=3, help="significant digits of md and tex (3)")
+    parser.add_argument(
+        "--watch",
+        type=float,
+        nargs="?",
+        const=2.0,
+        metavar="SECONDS",
+        help="print again every 2 seconds, or so many, until the sweep has ended",
+    )
+    parser.add_argument("--output", type=Path, metavar="FILE", help="write there, not to the terminal")
+    return parser
+
+
+def _names(text: str) -> tuple[str, ...]:
+    return tuple(name for part in text.split(",") if (name := part.strip()))
+
+
+def _rendered(found: Collection, options: argparse.Namespace) -> bytes:
+    kind = options.format
+    if options.digits < 1:
+        raise ValueError(f"`staf-table --digits` must be at least 1; got {options.digits}.")
+    layout = Layout(
+        rows=options.rows,
+        columns=options.columns,
+        metrics=options.metric,
+        aggregates=options.aggregate,
+        sort=options.sort,
+        every_metric=kind not in _READ,
+        style=Style(options.digits, options.best == "bold"),
+    )
+    table = tabulate(found, layout)
+    if kind != "parquet":
+        return (_READ | _PLAIN)[kind](table).encode()
+    if options.output is None:
+        raise ValueError("`staf-table --format parquet` needs --output FILE.")
+    return parquet_bytes(table)

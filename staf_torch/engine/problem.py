@@ -1,0 +1,78 @@
+"""What a gradient chase is asked to do."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import torch
+from torch import Tensor
+
+from ..approximation.basis import StaFBasis, Target
+from ..numerics.checks import fail, integer, trailing
+from ..optim.base import UpdateLaw
+from .predictors import Predictor
+
+
+@dataclasses.dataclass(frozen=True)
+class Problem:
+    """A gradient chase but for its states, which come in chunks of time.
+
+    Args:
+        call: the public function that was called, for messages.
+        basis: kernel and centers.
+        target: V, (..., n) -> (...).
+        law: the update law.
+        inner_steps: iterations at every time, at least 0.
+        predictor: how the weights move between times; None keeps them.
+        certificate: whether a `Certificate` is wanted.
+
+    Raises:
+        ValueError: if the law, the iterations or the predictor break their rule.
+    """
+
+    call: str
+    basis: StaFBasis
+    target: Target
+    law: UpdateLaw
+    inner_steps: int
+    predictor: Predictor | None = None
+    certificate: bool = False
+
+    def __post_init__(self) -> None:
+        integer(self.call, "inner_steps", self.inner_steps, least=0)
+        if not isinstance(self.law, UpdateLaw):
+            raise fail(self.call, "law", "must be an UpdateLaw", self.law)
+        if self.predictor is not None and not isinstance(self.predictor, Predictor):
+            raise fail(self.call, "predictor", "must be a Predictor or None", self.predictor)
+
+    def check_states(self, states: Tensor) -> None:
+        """Refuse states that are not (B, T, n) with at least one of each."""
+        trailing(self.call, "states", states, dims=3, last=self.basis.dim)
+        if states.dim() != 3 or 0 in states.shape:
+            raise ValueError(
+                f"`{self.call}(states=...)` must have the shape (B, T, n); got {tuple(states.shape)}."
+            )
+
+    def first_weights(self, states: Tensor, weights: Tensor | None) -> Tensor:
+        """Return e^g w before the first correction, (B, M), in units of the first state.
+
+        Args:
+            states: the first chunk, (B, C, n).
+            weights: the paper's w, (M,) or (B, M); None for zero.
+
+        Raises:
+            ValueError: if the weights have another shape.
+        """
+        shape = (states.shape[0], self.basis.count)
+        first = states.new_zeros(shape)
+        if weights is None:
+            return first
+        trailing(self.call, "weights", weights, dims=1, last=self.basis.count)
+        if weights.dim() > 2 or (weights.dim() == 2 and weights.shape != shape):
+            raise ValueError(
+                f"`{self.call}(weights=...)` must have the shape {shape[1:]} or {shape}; "
+                f"got {tuple(weights.shape)}."
+            )
+        first = first + weights.to(states)
+        gain = self.basis.kernel.log_gain(states[:, 0])
+        return first if gain is None else torch.where(first == 0, 0.0, first * gain.exp()[:, None])

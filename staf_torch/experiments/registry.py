@@ -1,0 +1,156 @@
+"""What an experiment is, and those that the setting `task` knows by name.
+
+An experiment of your own needs no change here. Write a function or a class in a module that Python can import
+(the working directory counts), and a YAML file that names it, in a folder of your own::
+
+    # mine.py
+    def energy(cfg, directory, progress=None):
+        run = RunDirectory(directory)                # staf_torch.results.run_directory
+        return run.metrics({"energy": float(cfg.initial_state[0]) ** 2})
+
+    # my_conf/experiment/energy.yaml
+    # @package _global_
+    task: mine.energy
+
+Then `staf --config-dir my_conf experiment=energy` runs the experiment and `staf -m --config-dir my_conf
+experiment=energy seed=0,1` sweeps it; `hydra.searchpath=[file://my_conf]` does what `--config-dir` does.
+Derive a class from `BatchedExperiment` where many jobs can be computed as one tensor batch.
+"""
+
+from __future__ import annotations
+
+import importlib
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import ClassVar, Generic, Protocol, TypeVar
+
+import numpy as np
+from omegaconf import DictConfig
+from torch import Tensor
+
+from ..numerics.checks import COMMAND_LINE, choice, fail
+from ..results.progress import SHOWN, Progress
+
+Metrics = dict[str, float | None]
+"""Name to number; None where there is nothing finite to report."""
+
+
+def finite(number: float | Tensor | None) -> float | None:
+    """Return a number as `metrics.json` holds it: None where it is not finite."""
+    return float(number) if number is not None and math.isfinite(number) else None
+
+
+def log_slope(x: Sequence[float], y: Sequence[float | None], above: float = 0.0) -> float | None:
+    """Return d log(y) / d log(x) by least squares over the points with y > above; None for fewer than two."""
+    points = [(math.log(p), math.log(q)) for p, q in zip(x, y, strict=True) if q is not None and q > above]
+    if len(points) < 2:
+        return None
+    log_x, log_y = np.array(points).T
+    return float(np.polyfit(log_x, log_y, 1)[0])
+
+
+class Experiment(Protocol):
+    """A study: a function, or an object that is called like one."""
+
+    def __call__(self, cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics:
+        """Run what the settings describe and fill the run directory; `metrics.json` comes last.
+
+        Args:
+            cfg: all settings but Hydra's.
+            directory: the run directory; it exists.
+            progress: shows how far long loops are.
+
+        Returns:
+            What `metrics.json` holds.
+
+        Raises:
+            ValueError: if a setting breaks its rule.
+        """
+        ...
+
+
+class Solution(Protocol):
+    """A problem that is solved and has left nothing on disk yet. It can be pickled."""
+
+    @property
+    def metrics(self) -> Metrics:
+        """What `metrics.json` will hold."""
+        ...
+
+
+S = TypeVar("S", bound=Solution)
+
+
+class BatchedExperiment(ABC, Generic[S]):
+    """An experiment that solves many configurations as one tensor batch and writes each by itself.
+
+    Configurations share a batch where they differ in numbers of `batchable` settings alone and `shape` is
+    equal. What a member gets must not depend on the others.
+    """
+
+    batchable: ClassVar[frozenset[str]]  # settings, dotted, whose numbers may differ within a batch
+
+    @abstractmethod
+    def __call__(self, cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics:
+        """Run one configuration; see `Experiment`."""
+
+    @abstractmethod
+    def solve(self, cfgs: Sequence[DictConfig], progress: Progress) -> list[S | Exception]:
+        """Return the solutions, in order; an exception in the place of settings that break a rule.
+
+        Raises:
+            Exception: what stops the batch as a whole; each of its members is then tried alone.
+        """
+
+    @abstractmethod
+    def write(self, cfg: DictConfig, directory: Path, solution: S) -> Metrics:
+        """Fill the run directory with a solution; `metrics.json` comes last."""
+
+    def shape(self, settings: Mapping[str, object]) -> object:
+        """Return what follows from batchable settings and must be equal in a batch all the same (JSON)."""
+        return None
+
+    def size(self, settings: Mapping[str, object]) -> int:
+        """Return about how many bytes a solution keeps until it is written."""
+        return 0
+
+
+EXPERIMENTS: Mapping[str, str] = {
+    "gradient_chase": "gradient_chase.GradientChase",
+    "laws": "laws.run",
+    "flat_limit": "flat_limit.run",
+    "exponential_bound": "exponential_bound.run",
+    "feasibility": "feasibility.run",
+    "layouts": "layouts.run",
+    "memory": "memory.run",
+    "adp": "adp.ClosedLoop",
+    "adp_comparison": "adp_comparison.run",
+    "adp_initial_weights": "adp_comparison.initial_weights",
+    "adp_tracking": "adp_tracking.run",
+}
+"""Name in `task` -> path within this package. They are imported when they are asked for."""
+
+
+def experiment(task: object) -> Experiment | BatchedExperiment[Solution]:
+    """Return the experiment that the setting `task` names: one of `EXPERIMENTS`, or a dotted path.
+
+    Raises:
+        ValueError: if there is no such name, or nothing that can be called at the path.
+    """
+    own = isinstance(task, str) and "." in task
+    if not own:
+        choice(COMMAND_LINE, "task", task, tuple(EXPERIMENTS))
+    path = str(task) if own else f"{__package__}.{EXPERIMENTS[str(task)]}"
+    module, _, name = path.rpartition(".")
+    try:
+        found = getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError, ValueError) as error:
+        if not own:
+            raise
+        raise fail(COMMAND_LINE, "task", f"cannot be imported ({error})", task) from error
+    made: Experiment | BatchedExperiment[Solution] = found() if isinstance(found, type) else found
+    if not callable(made):
+        raise fail(COMMAND_LINE, "task", "must be an experiment, which can be called", task)
+    return made

@@ -1,0 +1,361 @@
+"""The figures of a sweep: error against the radius, over radius and count, and against the cost.
+
+First the curves that the swept settings allow, and their points; then the pictures of them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from ..results.reader import Collection, Run, identity
+from ..tables.aggregate import as_text, half_width, mean, rank
+from .style import WIDTH, colour, marker, page, subplots, ticks
+
+if TYPE_CHECKING:
+    from matplotlib.artist import Artist
+    from matplotlib.axes import Axes
+    from matplotlib.colors import LogNorm
+    from matplotlib.figure import Figure
+
+KERNEL, RADIUS, COUNT, SEED = "kernel", "centers.radius", "centers.count", "seed"
+METRIC, FLOOR, ROUNDING = "ball_error", "ball_floor_error", "rounding_floor"
+COST = "products_per_second"
+_OF_COST = ("optimizer", "predictor", "optimizer.inner_steps", "dt", COUNT, SEED)
+_NAMES = {"gaussian": "Gaussian", "matern": "Matérn", "inverse_multiquadric": "inverse multiquadric"}
+_MOST_PANELS = 12
+_ERROR = r"$\sup\,|V - \hat V|$ on the ball"
+_ROUNDING = (0, (6, 2))  # dashes
+_VISIBLE = 1.2  # a band this wide can be seen: it has an entry in the legend
+_COLUMNS = 3
+_HEIGHT = 2.5  # inches a row of panels
+
+
+class Point(NamedTuple):
+    """The errors of the runs that differ by their seed: on a logarithmic axis, so of their logarithms."""
+
+    x: float
+    middle: float  # geometric mean
+    low: float  # of the 95 % confidence interval; the mean for a single run
+    high: float
+
+
+class Curve(NamedTuple):
+    """One line of a panel."""
+
+    label: str
+    points: tuple[Point, ...]
+    floor: tuple[Point, ...] = ()  # with the ideal weights
+
+
+class Panel(NamedTuple):
+    """One panel of a figure."""
+
+    title: str
+    curves: tuple[Curve, ...]
+
+
+class HeatMap(NamedTuple):
+    """The errors of one panel, radius by count."""
+
+    title: str
+    radii: tuple[float, ...]
+    counts: tuple[int, ...]
+    errors: tuple[tuple[float | None, ...], ...]  # a row a count
+
+
+class TooManyError(Exception):
+    """More panels than can be read."""
+
+
+def error_against_radius(found: Collection) -> list[Panel]:
+    """Return a panel a kernel (and other swept setting) with a line a count; nothing where not swept."""
+    runs = _usable(found, METRIC)
+    if not _several(runs, RADIUS):
+        return []
+    panels = []
+    for title, group in _panels(found, runs, (RADIUS, COUNT, SEED)):
+        curves = []
+        for _, line in _split(group, lambda run: run.setting(COUNT)):
+            count = line[0].setting(COUNT)
+            label = f"{count} centers" if isinstance(count, int) else "all centers"
+            curves.append(Curve(label, _points(line, RADIUS, METRIC), _points(line, RADIUS, FLOOR)))
+        panels.append(Panel(title, tuple(curves)))
+    return panels
+
+
+def rounding_floor(found: Collection) -> float | None:
+    """Return the largest error that rounding of V alone explains in any of the runs."""
+    floors = [run.metrics.get(ROUNDING) for run in found.rows]
+    return max((floor for floor in floors if floor is not None), default=None)
+
+
+def heat_maps(found: Collection) -> list[HeatMap]:
+    """Return the error over radius and count, a map a kernel; nothing where they were not both swept."""
+    runs = _usable(found, METRIC)
+    if not _several(runs, RADIUS) or not _several(runs, COUNT):
+        return []
+    radii = tuple(
+        sorted({float(r) for run in found.rows if isinstance(r := run.setting(RADIUS), int | float)})
+    )
+    counts = tuple(sorted({c for run in found.rows if isinstance(c := run.setting(COUNT), int)}))
+    maps = []
+    for title, group in _panels(found, runs, (RADIUS, COUNT, SEED)):
+        cells = []
+        for count in counts:
+            row = _points([run for run in group if run.setting(COUNT) == count], RADIUS, METRIC)
+            at = {point.x: point.middle for point in row}
+            cells.append(tuple(at.get(radius) for radius in radii))
+        maps.append(HeatMap(title, radii, counts, tuple(cells)))
+    return maps
+
+
+def cost_against_accuracy(found: Collection) -> list[Panel]:
+    """Return panels of the error against products with K a second, a line a law and predictor."""
+    runs = [run for run in _usable(found, METRIC) if run.metrics.get(COST) is not None]
+    if len({run.metrics[COST] for run in runs}) < 2:
+        return []
+    panels = []
+    for title, group in _panels(found, runs, _OF_COST):
+        lines = _split(group, lambda run: f"{run.setting('optimizer')}|{run.setting('predictor')}")
+        curves = [Curve(_law(line[0]), _costs(line)) for _, line in lines]
+        panels.append(Panel(title, tuple(curves)))
+    return panels
+
+
+def _law(run: Run) -> str:
+    law, predictor = (str(run.setting(key)).replace("_", " ") for key in ("optimizer", "predictor"))
+    return law if predictor in ("none", "None") else f"{law}, {predictor} predictor"
+
+
+def _usable(found: Collection, metric: str) -> list[Run]:
+    """The runs with a number that a logarithmic axis can show."""
+    return [run for run in found.rows if (run.metrics.get(metric) or 0) > 0]
+
+
+def _several(runs: Sequence[Run], key: str) -> bool:
+    numbers = {run.setting(key) for run in runs if isinstance(run.setting(key), int | float)}
+    return len(numbers) > 1
+
+
+def _panels(found: Collection, runs: Sequence[Run], inside: Sequence[str]) -> list[tuple[str, list[Run]]]:
+    """The runs by all that was swept but what a panel shows, with a title each."""
+    outside = [key for key in found.swept if key not in inside]
+    groups = _split(runs, lambda run: _agreeing(run, outside))
+    if len(groups) > _MOST_PANELS:
+        raise TooManyError(f"{len(groups)} panels, by {', '.join(outside)}: too many to read")
+    return [(_title(group[0], outside), group) for _, group in groups]
+
+
+def _agreeing(run: Run, keys: Sequence[str]) -> str:
+    """Equal texts for runs that agree in those settings."""
+    return "|".join(identity(run.setting(key)) for key in keys)
+
+
+def _title(run: Run, keys: Sequence[str]) -> str:
+    kernel = as_text(run.setting(KERNEL))
+    if not keys:
+        return f"{_NAMES.get(kernel, kernel)} kernel" if run.setting(KERNEL) else ""
+    named = [key for key in keys if key != KERNEL]
+    parts = [f"{_NAMES.get(kernel, kernel)} kernel"] if KERNEL in keys else []
+    return ", ".join(parts + [f"{key} = {as_text(run.setting(key))}" for key in named])
+
+
+def _split(runs: Sequence[Run], key: Callable[[Run], object]) -> list[tuple[object, list[Run]]]:
+    """By a key: numbers in order, then the others as they came."""
+    groups: dict[object, list[Run]] = {}
+    for run in runs:
+        groups.setdefault(key(run), []).append(run)
+    return sorted(groups.items(), key=lambda item: rank(item[0]))  # type: ignore[arg-type]
+
+
+def _points(runs: Sequence[Run], key: str, metric: str) -> tuple[Point, ...]:
+    at: dict[float, list[float]] = {}
+    for run in runs:
+        x, error = run.setting(key), run.metrics.get(metric)
+        if isinstance(x, int | float) and error is not None and error > 0:
+            at.setdefault(float(x), []).append(error)
+    return tuple(_point(x, errors) for x, errors in sorted(at.items()))
+
+
+def _costs(runs: Sequence[Run]) -> tuple[Point, ...]:
+    points = []
+    for _, group in _split(runs, lambda run: _agreeing(run, _OF_COST[:-1])):
+        cost = group[0].metrics[COST]
+        assert cost is not None
+        points.append(_point(cost, [error for run in group if (error := run.metrics[METRIC]) is not None]))
+    return tuple(sorted(points))
+
+
+def _point(x: float, errors: Sequence[float]) -> Point:
+    if len(set(errors)) == 1:  # one seed says nothing about the spread, and equal errors have none
+        return Point(x, errors[0], errors[0], errors[0])
+    logs = [math.log(error) for error in errors]
+    middle, width = mean(logs), half_width(logs)
+    assert width is not None
+    return Point(x, math.exp(middle), math.exp(middle - width), math.exp(middle + width))
+
+
+def draw_error_against_radius(panels: Sequence[Panel], rounding: float | None) -> Figure:
+    """Both axes logarithmic; a line a count with its 95 % band over the seeds, dotted with ideal weights.
+
+    Args:
+        panels: one a kernel.
+        rounding: the error that rounding of V alone explains; a line, where it is not far below the data,
+            and in the legend with its number.
+    """
+    with page(*_size(len(panels))) as figure:
+        grid = subplots(figure, len(panels), min(len(panels), _COLUMNS), sharey=True)
+        for axes, shown in zip(grid, panels, strict=True):
+            _lines(axes, shown)
+            ticks(axes, "x", sorted({point.x for curve in shown.curves for point in curve.points}))
+            axes.set_xlabel("radius $r$ of the ball")
+        if any(curve.floor for shown in panels for curve in shown.curves):
+            grid[0].plot([], [], color="0.3", linestyle=":", label="ideal weights, local basis")
+        if rounding is not None:
+            far = ", below" if rounding <= _far_below(panels) else ""
+            for axes in grid:
+                floor = axes.axhline(rounding, color="0.4", linestyle=_ROUNDING, linewidth=0.9)
+                floor.set_label(rf"rounding, $\varepsilon\,\max|V|$ = {rounding:.0e}{far}")
+        _finish(figure, grid, panels)
+    return figure
+
+
+def draw_cost_against_accuracy(panels: Sequence[Panel]) -> Figure:
+    """Both axes logarithmic; a line a law and predictor with its 95 % band over the seeds."""
+    with page(*_size(len(panels))) as figure:
+        grid = subplots(figure, len(panels), min(len(panels), _COLUMNS), sharey=True)
+        for axes, shown in zip(grid, panels, strict=True):
+            _lines(axes, shown)
+            axes.set_xlabel("products with $K$ a second of trajectory")
+        _finish(figure, grid, panels)
+    return figure
+
+
+def _lines(axes: Axes, shown: Panel) -> None:
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    axes.set_title(shown.title, loc="left")
+    for i, curve in enumerate(shown.curves):
+        x = [point.x for point in curve.points]
+        (line,) = axes.plot(x, [point.middle for point in curve.points], color=colour(i), label=curve.label)
+        line.set(marker=marker(i), markersize=3.5)
+        if any(point.low < point.high for point in curve.points):
+            low, high = [point.low for point in curve.points], [point.high for point in curve.points]
+            axes.fill_between(x, low, high, color=colour(i), alpha=0.2, linewidth=0)
+        if curve.floor:
+            floor = [point.middle for point in curve.floor]
+            axes.plot([point.x for point in curve.floor], floor, ":", color=colour(i), linewidth=0.9)
+
+
+def _finish(figure: Figure, grid: Sequence[Axes], panels: Sequence[Panel]) -> None:
+    """The frame of the errors, and one legend for all panels."""
+    from matplotlib.patches import Patch
+
+    _label_left(grid)
+    _frame(grid, panels)
+    # The same label has the same line in every panel: one legend serves them all.
+    lines: dict[str, Artist] = {str(line.get_label()): line for axes in grid for line in axes.get_lines()}
+    handles = [line for label, line in lines.items() if not label.startswith("_")]
+    if any(point.high > _VISIBLE * point.low for point in _points_of(panels)):
+        handles.append(Patch(color="0.4", alpha=0.25, linewidth=0, label="95 % over seeds"))
+    lines_of_legend = -(-len(handles) // (6 if len(panels) > 1 else 3))
+    columns = -(-len(handles) // lines_of_legend)
+    figure.legend(handles=handles, loc="outside upper center", ncols=columns, handlelength=2.6)
+
+
+def _frame(grid: Sequence[Axes], panels: Sequence[Panel]) -> None:
+    """Half a decade around the errors, and what lies below only if it is near: wide bands are cut."""
+    middle = [point.middle for point in _points_of(panels)]
+    bottom, top = min(middle) / 3, max(middle) * 3
+    drawn = [y for axes in grid for line in axes.get_lines() for y in np.asarray(line.get_ydata(), float)]
+    near = [y for y in drawn if np.isfinite(y) and y > _far_below(panels)]
+    grid[0].set_ylim(min([bottom, *(y / 4 for y in near)]), top)
+
+
+def _far_below(panels: Sequence[Panel]) -> float:
+    """What is not above this would squeeze the errors into the top of the picture: it is left out."""
+    return 1e-9 / 3 * min(point.middle for point in _points_of(panels))
+
+
+def _points_of(panels: Sequence[Panel]) -> list[Point]:
+    return [point for shown in panels for curve in shown.curves for point in curve.points]
+
+
+def draw_heat_maps(maps: Sequence[HeatMap]) -> Figure:
+    """The error by colour and number over radius and count, one scale for all kernels; grey: no result."""
+    from matplotlib.colors import LogNorm
+
+    errors = [e for shown in maps for row in shown.errors for e in row if e is not None]
+    norm = LogNorm(min(errors), max(errors) if max(errors) > min(errors) else 10 * min(errors))
+    with page(*_size(len(maps), 0.9 + 0.33 * max(len(m.counts) for m in maps))) as figure:
+        grid = subplots(figure, len(maps), min(len(maps), _COLUMNS))
+        for axes, shown in zip(grid, maps, strict=True):
+            values = np.array([[np.nan if e is None else e for e in row] for row in shown.errors])
+            axes.set_facecolor("0.92")
+            image = axes.imshow(values, norm=norm, cmap="viridis", origin="lower", aspect="auto")
+            axes.grid(False)
+            _numbers(axes, values, norm)
+            axes.set_xticks(range(len(shown.radii)), [f"{radius:g}" for radius in shown.radii])
+            axes.set_yticks(range(len(shown.counts)), [str(count) for count in shown.counts])
+            axes.tick_params(length=0)
+            axes.set_xlabel("radius $r$ of the ball")
+            axes.set_title(shown.title, loc="left")
+        _label_left(grid, "centers $M$")
+        figure.colorbar(image, ax=grid, label=_ERROR, pad=0.01, aspect=30)
+    return figure
+
+
+def _numbers(axes: Axes, values: np.ndarray, norm: LogNorm) -> None:
+    """Each cell's error, white on dark and black on light colours."""
+    for (row, column), error in np.ndenumerate(values):
+        lost = not np.isfinite(error)
+        shade = "0.3" if lost else "white" if float(norm(error)) < 0.6 else "black"
+        axes.text(column, row, "-" if lost else _short(error), ha="center", va="center", color=shade, size=6)
+
+
+def _short(error: float) -> str:
+    """Two digits without a plus or a zero in the exponent: a cell is narrow."""
+    mantissa, _, exponent = f"{error:.1e}".partition("e")
+    return f"{error:.2g}" if 0.01 <= error < 1000 else f"{mantissa}e{int(exponent)}"
+
+
+def _size(count: int, height: float = _HEIGHT) -> tuple[float, float]:
+    columns = min(count, _COLUMNS)
+    return (WIDTH if columns > 1 else 4.4), 0.5 + height * -(-count // columns)
+
+
+def _label_left(grid: Sequence[Axes], label: str = _ERROR) -> None:
+    for axes in grid:
+        spec = axes.get_subplotspec()
+        if spec is not None and spec.is_first_col():
+            axes.set_ylabel(label)
+
+
+def radius_figure(found: Collection) -> Figure | None:
+    """Draw `error_against_radius` of a sweep; None where the radius was not swept."""
+    panels = error_against_radius(found)
+    return draw_error_against_radius(panels, rounding_floor(found)) if panels else None
+
+
+def map_figure(found: Collection) -> Figure | None:
+    """Draw `heat_maps` of a sweep; None where radius and count were not both swept."""
+    maps = heat_maps(found)
+    return draw_heat_maps(maps) if maps else None
+
+
+def cost_figure(found: Collection) -> Figure | None:
+    """Draw `cost_against_accuracy` of a sweep; None where nothing that costs was swept."""
+    panels = cost_against_accuracy(found)
+    return draw_cost_against_accuracy(panels) if panels else None
+
+
+SWEEP_FIGURES: dict[str, tuple[str, Callable[[Collection], Figure | None]]] = {
+    "error_against_radius": ("Error against the radius", radius_figure),
+    "error_map": ("Error over radius and number of centers", map_figure),
+    "cost_against_accuracy": ("Cost against accuracy", cost_figure),
+}
+"""By the name of the file: what a figure shows, and the function that draws it."""

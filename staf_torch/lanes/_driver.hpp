@@ -1,0 +1,130 @@
+// Tiles of rows through pieces of time. What a program must define before: the numbers of entries ROWS, NOWS,
+// CARRIES, FIXED, the slots SLOTS_*, COPIES of a vector that advance together, and `prepare` and `advance`.
+
+#pragma once
+
+struct Slot {  // strides of (rows, times, entries), in numbers
+    int64_t row, time, entry, entries;
+};
+struct Call {
+    int64_t rows, times, every;
+    const REAL *table;
+    const Slot *slots;
+    void (*parallel)(void (*)(void *), void *, unsigned, unsigned);
+};
+
+constexpr int lanes = COPIES * W, tile_rows = TILE > lanes ? TILE : lanes, room = tile_rows + lanes;
+constexpr int now_bytes = 1 << 15, most_times = 256, most_kept = 1 << 22;
+
+struct Frame {
+    REAL *fixed, *carry, *now;
+    const REAL *c;
+    const Slot *outputs;
+    REAL *const *data;  // of the outputs
+    int rows, times, span;
+    int64_t first, time, every;
+};
+static void prepare(const Frame &f, int b);
+static void advance(const Frame &f, int b, int rows);
+
+// One number a row; beyond the rows they come again.
+INLINE void gather(const Slot *slot, REAL *const *data, int slots, int64_t first, int rows, REAL *to) {
+    const int whole = (rows + lanes - 1) / lanes * lanes;
+    for (int s = 0; s < slots; ++s, ++slot)
+        for (int64_t e = 0; e < slot->entries; ++e, to += room) {
+            const REAL *from = data[s] + first * slot->row + e * slot->entry;
+            for (int r = 0; r < rows; ++r) to[r] = from[r * slot->row];
+            for (int r = rows; r < whole; ++r) to[r] = to[r - rows];
+        }
+}
+INLINE void gather_times(const Slot *slot, REAL *const *data, int slots, const Frame &f, REAL *to) {
+    for (int s = 0; s < slots; ++s, ++slot)
+        for (int64_t e = 0; e < slot->entries; ++e, to += f.span) {
+            const REAL *from = data[s] + f.first * slot->row + f.time * slot->time + e * slot->entry;
+            for (int r = 0; r < lanes; ++r) to[f.times * f.rows + r] = from[0];
+            if (slot->row == 1)
+                for (int t = 0; t < f.times; ++t)
+                    for (int r = 0; r < f.rows; ++r) to[t * f.rows + r] = from[t * slot->time + r];
+            else
+                for (int r = 0; r < f.rows; ++r)
+                    for (int t = 0; t < f.times; ++t) to[t * f.rows + r] = from[r * slot->row + t * slot->time];
+        }
+}
+INLINE REAL *allocate(int64_t numbers) {
+    return static_cast<REAL *>(__builtin_aligned_alloc(64, (numbers * sizeof(REAL) + 127) / 64 * 64));
+}
+
+// A thread's memory stays with it from call to call: fresh pages cost more than a short program.
+struct Memory {
+    REAL *data = nullptr;
+    int64_t held = 0;
+    REAL *of(int64_t numbers) {
+        if (numbers > held) __builtin_free(data), data = allocate(held = numbers);
+        return data;
+    }
+    void give_back() {
+        if (held * int64_t(sizeof(REAL)) > most_kept) __builtin_free(data), data = nullptr, held = 0;
+    }
+    ~Memory() { __builtin_free(data); }
+};
+static thread_local Memory memory;
+
+struct Work {
+    const Call &call;
+    REAL *const *data;
+    int64_t tile, next;
+
+    void run() {
+        int most = now_bytes / int(sizeof(REAL)) / (tile * (NOWS > 0 ? NOWS : 1));
+        most = most < 1 ? 1 : most < most_times ? most : most_times;
+        most = most < call.times ? most : int(call.times);
+        const int span = most * int(tile) + lanes;
+        const int64_t numbers = int64_t(ROWS + FIXED + CARRIES) * room + int64_t(NOWS) * span;
+        const Slot *now = call.slots + SLOTS_ROW, *carry = now + SLOTS_NOW, *out = carry + SLOTS_CARRY;
+        REAL *const *now_data = data + SLOTS_ROW, *const *carry_data = now_data + SLOTS_NOW;
+        REAL *const *out_data = carry_data + SLOTS_CARRY;
+        Frame f;
+        f.fixed = memory.of(numbers + lanes), f.carry = f.fixed + (ROWS + FIXED) * room, f.now = f.carry + CARRIES * room;
+        f.c = call.table, f.outputs = out + SLOTS_CARRY, f.data = out_data + SLOTS_CARRY;
+        f.every = call.every, f.span = span;
+        for (int64_t first; (first = __atomic_fetch_add(&next, tile, __ATOMIC_RELAXED)) < call.rows;) {
+            f.first = first, f.rows = int(call.rows - first < tile ? call.rows - first : tile);
+            gather(call.slots, data, SLOTS_ROW, first, f.rows, f.fixed);
+            gather(carry, carry_data, SLOTS_CARRY, first, f.rows, f.carry);
+            for (int b = 0; b < f.rows; b += lanes) prepare(f, b);
+            for (f.time = 0; f.time < call.times; f.time += most) {
+                f.times = int(call.times - f.time < most ? call.times - f.time : most);
+                gather_times(now, now_data, SLOTS_NOW, f, f.now);
+                for (int b = 0; b < f.rows; b += lanes) advance(f, b, f.rows - b < lanes ? f.rows - b : lanes);
+            }
+            const REAL *from = f.carry;
+            for (int s = 0; s < SLOTS_CARRY; ++s)
+                for (int64_t e = 0; e < out[s].entries; ++e, from += room) {
+                    REAL *to = out_data[s] + first * out[s].row + e * out[s].entry;
+                    for (int r = 0; r < f.rows; ++r) to[r * out[s].row] = from[r];
+                }
+        }
+        memory.give_back();
+    }
+    static void task(void *data) { static_cast<Work *>(data)->run(); }
+};
+
+// Entry e of output s at time t: rows b.. of the tile.
+INLINE void put(const Frame &f, int s, int64_t e, int t, int b, int rows, V x) {
+    const Slot &slot = f.outputs[s];
+    REAL *to = f.data[s] + f.first + b + (f.time + t) / f.every * slot.time + e * slot.entry;
+    if (rows >= W) return store(to, x);
+    REAL lane[W];
+    store(lane, x);
+    for (int l = 0; l < rows; ++l) to[l] = lane[l];
+}
+
+extern "C" void lanes_run(const Call *call, REAL *const *data, int64_t most_threads) {
+    const int64_t even = (call->rows + most_threads - 1) / most_threads;
+    const int64_t wanted = (even + lanes - 1) / lanes * lanes, tile = wanted < tile_rows ? wanted : tile_rows;
+    const int64_t tiles = (call->rows + tile - 1) / tile, few = call->rows < tile ? call->rows : tile;
+    Work work{*call, data, few, 0};
+    const int threads = int(tiles < most_threads ? tiles : most_threads);
+    if (threads > 1 && call->parallel) return call->parallel(Work::task, &work, unsigned(threads), 0);
+    work.run();
+}

@@ -1,0 +1,116 @@
+"""C++ of the package, compiled where it is first used and kept in the user's cache."""
+
+from __future__ import annotations
+
+import atexit
+import ctypes
+import functools
+import hashlib
+import logging
+import os
+import platform
+import shutil
+import subprocess
+import tempfile
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+_log = logging.getLogger(__name__)
+_FOLDER = Path(__file__).parent
+_FLAGS = ("-O3", "-march=native", "-std=c++17", "-shared", "-fPIC", "-pthread")
+_COMPILERS = ("g++", "c++", "clang++")
+_SECONDS = 120
+_one_at_a_time = threading.Lock()  # threads of a chase ask for the same at the same time
+_said: set[str] = set()  # what has been logged
+
+
+@functools.cache
+def compiled(source: Path, *definitions: str) -> Callable[..., None] | None:
+    """Return the function ``staf_<name>`` of ``_<name>.cpp``; None, logged once, where none can be built.
+
+    Args:
+        source: the file, which finds the headers of this folder by their names.
+        definitions: of the preprocessor, NAME=value: what is built is for these alone, and built in about
+            a second.
+    """
+    name = source.stem.removeprefix("_")
+    try:
+        with _one_at_a_time:
+            library = ctypes.CDLL(str(_library(source, definitions)))
+        call: Callable[..., None] = library[f"staf_{name}"]
+        call.restype = None  # type: ignore[attr-defined]
+    except Exception as error:  # whatever a machine lacks, the reference computes the same
+        _say(name, " ".join(str(error).split())[:300])
+        return None
+    return call
+
+
+def _say(name: str, reason: str) -> None:
+    with _one_at_a_time:
+        first = name not in _said
+        _said.add(name)
+    if first:
+        _log.warning("the %s of a chase runs in plain torch, slower: nothing compiled (%s)", name, reason)
+
+
+def _library(source: Path, definitions: tuple[str, ...]) -> Path:
+    """The path of the shared object, built if it is not in the cache."""
+    compiler = next(filter(None, map(shutil.which, (os.environ.get("CXX", ""), *_COMPILERS))), None)
+    if compiler is None:
+        raise FileNotFoundError(f"none of {', '.join(_COMPILERS)} is on the path")
+    command = [compiler, *_FLAGS, f"-I{_FOLDER}", *(f"-D{each}" for each in definitions), str(source)]
+    path = _cache() / f"{source.stem.removeprefix('_')}-{_key(command)}.so"
+    if not path.exists():
+        # Under a name of its own first: another process may be building the same.
+        with tempfile.TemporaryDirectory(dir=path.parent) as scratch:
+            built = Path(scratch) / path.name
+            _run([*command, "-o", str(built)])
+            os.replace(built, path)
+    return path
+
+
+def _key(command: list[str]) -> str:
+    """What the machine code depends on: the source, the command, the compiler and the processor."""
+    version = _run([command[0], "--version"])
+    sources = [
+        path.read_text()
+        for path in sorted(
+            (Path(command[-1]), *Path(command[-1]).parent.glob("_*.hpp"), *_FOLDER.glob("_*.hpp"))
+        )
+    ]
+    parts = (*sources, *command, version, platform.platform(), _processor())
+    return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:16]
+
+
+def _processor() -> str:
+    """-march=native follows the processor: a home directory may be shared between several."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor()
+    return "\n".join(sorted({line for line in lines if line.startswith(("model name", "flags", "Features"))}))
+
+
+def _cache() -> Path:
+    home = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
+    folder = Path(home) / "staf_torch"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if os.access(folder, os.W_OK):
+            return folder
+    except OSError:
+        pass
+    folder = Path(tempfile.mkdtemp(prefix="staf_torch-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return folder
+
+
+def _run(command: list[str]) -> str:
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=_SECONDS, check=False)
+    except subprocess.TimeoutExpired as error:
+        raise OSError(f"{command[0]} took more than {_SECONDS} s") from error
+    if done.returncode != 0:
+        raise OSError(f"{command[0]} failed: {done.stderr.strip() or done.returncode}")
+    return done.stdout

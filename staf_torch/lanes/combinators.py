@@ -1,0 +1,269 @@
+"""Loops that a compiled program keeps as loops; everywhere else they are plain Python."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from .graph import STEP, Ids, Loop
+from .tracer import NotLoweredError, Tracer
+from .tree import flatten, unflatten
+
+Tree = Any
+"""Nested tuples, lists, dictionaries or named tuples of tensors."""
+_active = threading.local()
+
+
+def repeat(count: int, body: Callable[[Tree], Tree], carry: Tree) -> Tree:
+    """body(...body(body(carry))), ``count`` times.
+
+    Args:
+        count: of passes, at least 0.
+        body: maps the carry to the next one of the same shapes and dtypes.
+        carry: a tree of tensors.
+    """
+    if count > 1 and (tracer := _tracer(carry)) is not None:
+        return _loop(tracer, count, lambda now, _: (body(now), ()), carry, (), 1)[0]
+    for _ in range(count):
+        carry = body(carry)
+    return carry
+
+
+def scan(
+    body: Callable[[Tree, Tree], tuple[Tree, Tree]], carry: Tree, inputs: Tree, *, dim: int = 1
+) -> tuple[Tree, Tree]:
+    """carry, out_k = body(carry, input_k) for k = 0, 1, ...; the last carry and all outputs.
+
+    Args:
+        body: maps a carry and the inputs of one k to the next carry and the outputs of this k.
+        carry: a tree of tensors.
+        inputs: a tree of tensors; entry k along ``dim`` is the input of pass k.
+        dim: of inputs and outputs, counted from the front: 1 where the rows come first.
+
+    Returns:
+        The carry after the last pass, and the outputs stacked along ``dim``.
+    """
+    leaves, structure = flatten(inputs)
+    count = leaves[0].shape[dim]
+    if count > 1 and (tracer := _tracer((carry, inputs))) is not None:
+        return _loop(tracer, count, body, carry, inputs, dim)
+    outputs, shape = [], None
+    for k in range(count):
+        now = unflatten(structure, iter([leaf.select(dim, k) for leaf in leaves]))
+        carry, out = body(carry, now)
+        parts, shape = flatten(out)
+        outputs.append(parts)
+    stacked = [torch.stack(column, dim=dim) for column in zip(*outputs, strict=True)]
+    return carry, unflatten(shape, iter(stacked))
+
+
+def reduce(
+    body: Callable[[Tree], Tensor],
+    points: Tree,
+    operation: Literal["sum", "max", "min"] = "sum",
+    *,
+    dim: int = 1,
+) -> Tensor:
+    """The sum, the maximum or the minimum over points of what ``body`` computes at each.
+
+    Plain torch calls ``body`` once with all points; a compiled program has them one after the other and
+    keeps none of the values.
+
+    Args:
+        body: a tree of tensors (..., P, ...) to (..., P, ...), P in the place ``dim``; no point sees another.
+        points: such a tree.
+        operation: over the points.
+        dim: of the points, counted from the front.
+    """
+    leaves, structure = flatten(points)
+    count = leaves[0].shape[dim]
+    if count > 1 and (tracer := _tracer(points)) is not None:
+        first = _reduced(body(_slice(leaves, structure, dim, 0)), operation, dim)
+
+        def step(carry: Tensor, now: Tree) -> tuple[Tensor, tuple[()]]:
+            one = _reduced(body(_unsqueezed(now, dim)), operation, dim)
+            return _COMBINE[operation](carry, one), ()
+
+        rest = unflatten(structure, iter([leaf.narrow(dim, 1, count - 1) for leaf in leaves]))
+        return (
+            _loop(tracer, count - 1, step, first, rest, dim)[0]
+            if count > 2
+            else step(first, unflatten(structure, iter([leaf.select(dim, 1) for leaf in leaves])))[0]
+        )
+    return _reduced(body(points), operation, dim)
+
+
+def each(body: Callable[[Tensor], Tensor], points: Tensor, *, dim: int = 1, together: int = 4) -> Tensor:
+    """What ``body`` computes at every point: (..., P, ...) to (..., P, ...), P in the place ``dim``.
+
+    Plain torch calls ``body`` once with all points; a compiled program goes through them, some at a time, so
+    that its text is short.
+
+    Args:
+        body: of which no point sees another.
+        points: a tensor.
+        dim: of the points, counted from the front.
+        together: points at a time.
+    """
+    count = points.shape[dim]
+    if count <= together or (tracer := _tracer(points)) is None:
+        return body(points)
+    passes = -(-count // together)
+    spare = points.narrow(dim, 0, 1).expand(
+        *points.shape[:dim], passes * together - count, *points.shape[dim + 1 :]
+    )
+    grouped = torch.cat((points, spare), dim=dim).unflatten(dim, (passes, together))
+    done: Tensor = _loop(tracer, passes, lambda _, now: ((), body(now)), (), grouped, dim)[1]
+    return done.flatten(dim, dim + 1).narrow(dim, 0, count)
+
+
+_COMBINE: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
+    "sum": torch.add,
+    "max": torch.maximum,
+    "min": torch.minimum,
+}
+
+
+def _reduced(values: Tensor, operation: str, dim: int) -> Tensor:
+    return values.sum(dim) if operation == "sum" else getattr(values, f"a{operation}")(dim)
+
+
+def _slice(leaves: list[Tensor], structure: Any, dim: int, k: int) -> Tree:
+    return unflatten(structure, iter([leaf.narrow(dim, k, 1) for leaf in leaves]))
+
+
+def _unsqueezed(tree: Tree, dim: int) -> Tree:
+    leaves, structure = flatten(tree)
+    return unflatten(structure, iter([leaf.unsqueeze(dim) for leaf in leaves]))
+
+
+class tracing:  # noqa: N801
+    """Context: the combinators of this thread write loops of ``tracer``."""
+
+    def __init__(self, tracer: Tracer) -> None:
+        self._tracer = tracer
+
+    def __enter__(self) -> Tracer:
+        _active.tracer = self._tracer
+        return self._tracer
+
+    def __exit__(self, *_: object) -> None:
+        _active.tracer = None
+
+
+def tracing_now() -> bool:
+    """Return whether somebody traces on this thread, here or in torch."""
+    return (
+        getattr(_active, "tracer", None) is not None
+        or torch._C._len_torch_dispatch_stack() > 0
+        or torch.compiler.is_compiling()
+    )
+
+
+def _tracer(tree: Tree) -> Tracer | None:
+    """Who traces the program now; None where nobody does, or a derivative is taken through the loop."""
+    tracer: Tracer | None = getattr(_active, "tracer", None)
+    if tracer is None or torch._C._functorch.peek_interpreter_stack() is not None:
+        return None
+    return None if any(leaf.requires_grad for leaf in flatten(tree)[0]) else tracer
+
+
+def _loop(
+    tracer: Tracer,
+    count: int,
+    body: Callable[[Tree, Tree], tuple[Tree, Tree]],
+    carry: Tree,
+    inputs: Tree,
+    dim: int,
+) -> tuple[Tree, Tree]:
+    """Trace one pass and write the loop: the trees that come out of it."""
+    graph = tracer.graph
+    tracer.inside += 1
+    loop = Loop(count, depth=STEP + tracer.inside)
+    number = len(graph.loops)
+    graph.loops.append(loop)
+    given, structure = flatten(carry)
+    fed, feed = flatten(inputs)
+    now = [_fed(tracer, leaf, dim, number, loop) for leaf in fed]
+    inner = []
+    for leaf in given:
+        initial = tracer.nodes(leaf).reshape(-1).tolist()
+        start = len(loop.initial)
+        loop.initial += initial
+        kind = tracer.kind(leaf.dtype)
+        nodes = [graph.add("carry", (), kind, (number, start + k), loop.depth) for k in range(len(initial))]
+        loop.carry += nodes
+        inner.append(
+            tracer.attach(leaf.detach().clone(), np.array(nodes, dtype=np.int64).reshape(leaf.shape))
+        )
+    after, outputs = body(unflatten(structure, iter(inner)), unflatten(feed, iter(now)))
+    tracer.inside -= 1
+    ends, end_structure = flatten(after)
+    if [(e.shape, e.dtype) for e in ends] != [
+        (g.shape, g.dtype) for g in given
+    ] or end_structure != structure:
+        raise NotLoweredError(
+            "the body of a loop returns a carry of other shapes or dtypes than it was given"
+        )
+    loop.following = [node for end in ends for node in tracer.nodes(end).reshape(-1).tolist()]
+    out_leaves, out_structure = flatten(outputs)
+    loop.collected = [tracer.nodes(leaf).reshape(-1).tolist() for leaf in out_leaves]
+    _place(tracer, loop, number)
+    results, done = [], 0
+    for leaf in given:
+        kind, size = tracer.kind(leaf.dtype), leaf.numel()
+        nodes = [graph.add("result", (loop.node,), kind, (number, done + k)) for k in range(size)]
+        done += size
+        results.append(
+            tracer.attach(leaf.detach().clone(), np.array(nodes, dtype=np.int64).reshape(leaf.shape))
+        )
+    stacked = [_collected(tracer, leaf, dim, loop, number, k) for k, leaf in enumerate(out_leaves)]
+    return unflatten(structure, iter(results)), unflatten(out_structure, iter(stacked))
+
+
+def _fed(tracer: Tracer, leaf: Tensor, dim: int, number: int, loop: Loop) -> Tensor:
+    """The input of one pass: entries of an array, at a place that the pass says."""
+    graph = tracer.graph
+    nodes = np.moveaxis(tracer.nodes(leaf), dim, 0)
+    kind, size = tracer.kind(leaf.dtype), nodes[0].size
+    array, places = tracer.array(nodes.reshape(-1), kind)
+    table = places.reshape(loop.count, size)
+    steps = np.diff(table, axis=0)
+    if steps.size and not (steps == steps[0, 0]).all():
+        array, table = tracer.pack(nodes.reshape(-1), kind), np.arange(nodes.size).reshape(loop.count, size)
+    stride = int(table[1, 0] - table[0, 0])
+    new = [graph.add("load", (array,), kind, (number, int(at), stride), loop.depth) for at in table[0]]
+    like = leaf.detach().select(dim, 0).clone(memory_format=torch.contiguous_format)
+    return tracer.attach(like, np.array(new, dtype=np.int64).reshape(like.shape))
+
+
+def _collected(tracer: Tracer, leaf: Tensor, dim: int, loop: Loop, number: int, k: int) -> Tensor:
+    """The outputs of all passes as one tensor."""
+    graph, kind = tracer.graph, tracer.kind(leaf.dtype)
+    array = graph.add("collect", (loop.node,), kind, (number, k, loop.count * leaf.numel()))
+    nodes: Ids = tracer.entries(array, kind, loop.count * leaf.numel()).reshape(loop.count, *leaf.shape)
+    whole = torch.stack([leaf.detach()] * loop.count, dim=dim)
+    return tracer.attach(whole.contiguous(), np.moveaxis(nodes, 0, dim))
+
+
+def _place(tracer: Tracer, loop: Loop, number: int) -> None:
+    """Where the loop stands: as far outside as what it needs allows."""
+    graph = tracer.graph
+    ends = [*loop.following, *(node for part in loop.collected for node in part)]
+    free, seen, stack = set(loop.initial), set(), ends
+    while stack:
+        node = stack.pop()
+        if node in seen:
+            continue
+        seen.add(node)
+        if graph.depth[node] < loop.depth:
+            free.add(node)
+        else:
+            stack += graph.args[node]
+    loop.home = max((graph.depth[node] for node in free), default=0)
+    loop.node = graph.add("loop", sorted(free), "none", number, loop.home)

@@ -1,0 +1,87 @@
+"""C++ text to a function that can be called, kept in the user's cache."""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import hashlib
+import os
+import shutil
+import tempfile
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+from .build import _COMPILERS, _cache, _processor, _run
+
+_FOLDER = Path(__file__).parent
+_HEADERS = ("_lanes.hpp", "_lanes_functions.hpp", "_driver.hpp")
+_FLAGS: tuple[str, ...] = ("-O2", "-march=native", "-std=c++17", "-shared", "-fPIC", "-w")
+_FLAGS += ("-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math", "-fno-signaling-nans")
+_DIGEST = 32
+_one_at_a_time = threading.Lock()
+_loaded: dict[str, Callable[..., None]] = {}
+
+
+def function(source: str) -> Callable[..., None]:
+    """The entry ``lanes_run`` of a program.
+
+    Args:
+        source: of `emission.emit`.
+
+    Raises:
+        OSError: if there is no compiler, or it refuses the text.
+    """
+    with _one_at_a_time:
+        found = _loaded.get(source)
+        if found is None:
+            found = _loaded[source] = _open(source)
+        return found
+
+
+def _open(source: str) -> Callable[..., None]:
+    path = _cache() / f"lanes-{_key(source)}.so"
+    if not _whole(path):
+        _build(source, path)
+    call: Callable[..., None] = ctypes.CDLL(str(path)).lanes_run
+    call.restype = None  # type: ignore[attr-defined]
+    call.argtypes = (ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64)  # type: ignore[attr-defined]
+    return call
+
+
+def _whole(path: Path) -> bool:
+    """Whether a library is there and ends with its own digest: half of one would crash the process."""
+    try:
+        content = path.read_bytes()
+    except OSError:
+        return False
+    return content[-_DIGEST:] == hashlib.sha256(content[:-_DIGEST]).digest()
+
+
+def _build(source: str, path: Path) -> None:
+    # Under a name of its own first: another process may be building the same.
+    with tempfile.TemporaryDirectory(dir=path.parent) as scratch:
+        text, built = Path(scratch) / "program.cpp", Path(scratch) / path.name
+        text.write_text(source, encoding="utf-8")
+        _run([_compiler(), *_FLAGS, "-I", str(_FOLDER), str(text), "-o", str(built)])
+        with built.open("ab") as file:
+            file.write(hashlib.sha256(built.read_bytes()).digest())
+        os.replace(built, path)
+
+
+def _compiler() -> str:
+    compiler = next(filter(None, map(shutil.which, (os.environ.get("CXX", ""), *_COMPILERS))), None)
+    if compiler is None:
+        raise FileNotFoundError(f"none of {', '.join(_COMPILERS)} is on the path")
+    return compiler
+
+
+def _key(source: str) -> str:
+    return hashlib.sha256("\0".join((source, *_surroundings(_compiler()))).encode()).hexdigest()[:24]
+
+
+@functools.cache
+def _surroundings(compiler: str) -> tuple[str, ...]:
+    """What the machine code depends on beside the text."""
+    headers = (_FOLDER.joinpath(name).read_text(encoding="utf-8") for name in _HEADERS)
+    return (*headers, *_FLAGS, _run([compiler, "--version"]), _processor())

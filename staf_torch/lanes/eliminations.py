@@ -1,0 +1,152 @@
+"""Dense factorisations of small matrices in plain torch operations that have a scalar form.
+
+What `lower` finds here it traces in place of the operation of torch. Matrices are (..., M, M).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from .combinators import repeat
+
+
+def cholesky(gram: Tensor, *, upper: bool = False, check_errors: bool = False) -> tuple[Tensor, Tensor]:
+    """L with L L' = K, and 0 or, where a pivot is not positive, its place: (...)."""
+    rest, columns = gram, []
+    failed = torch.zeros_like(gram[..., 0, 0], dtype=torch.int32)
+    for k in range(gram.shape[-1]):
+        pivot = rest[..., k, k]
+        failed = torch.where((failed == 0) & ~(pivot > 0), k + 1, failed)
+        below = rest[..., k:, k] / pivot.sqrt().unsqueeze(-1)
+        column = torch.cat((torch.zeros_like(gram[..., :k, k]), below), dim=-1)
+        columns.append(column)
+        rest = rest - column.unsqueeze(-1) * column.unsqueeze(-2)
+    factor = torch.stack(columns, dim=-1)
+    return factor.mT.clone() if upper else factor, failed.to(torch.int32)
+
+
+def triangular(
+    matrix: Tensor, right: Tensor, *, upper: bool, left: bool = True, unitriangular: bool = False
+) -> Tensor:
+    """T^-1 B: (..., M, M), (..., M, P); B T^-1 where not ``left``."""
+    if not left:
+        return triangular(matrix.mT, right.mT, upper=not upper, unitriangular=unitriangular).mT.clone()
+    size = matrix.shape[-1]
+    found: dict[int, Tensor] = {}
+    for i in reversed(range(size)) if upper else range(size):
+        row = right[..., i, :]
+        for j, known in found.items():
+            row = row - matrix[..., i, j, None] * known
+        found[i] = row if unitriangular else row / matrix[..., i, i, None]
+    return torch.stack([found[i] for i in range(size)], dim=-2)
+
+
+def cholesky_solve(right: Tensor, factor: Tensor, upper: bool = False) -> Tensor:
+    """K^-1 B from a factor of K."""
+    lower = factor.mT if upper else factor
+    return triangular(lower.mT, triangular(lower, right, upper=False), upper=True)
+
+
+def inverse(matrix: Tensor, *, check_errors: bool = False) -> tuple[Tensor, Tensor]:
+    """A^-1, by elimination with pivots of the largest size in a column, and 0: (...)."""
+    size = matrix.shape[-1]
+    identity = torch.eye(size, dtype=matrix.dtype, device=matrix.device).expand_as(matrix)
+    whole = torch.cat((matrix, identity), dim=-1)
+    for k in range(size):
+        best, chosen = whole[..., k, :], whole[..., k, k].abs()
+        others = []
+        for i in range(k + 1, size):
+            row = whole[..., i, :]
+            larger = (row[..., k].abs() > chosen).unsqueeze(-1)
+            chosen = torch.where(larger.squeeze(-1), row[..., k].abs(), chosen)
+            best, row = torch.where(larger, row, best), torch.where(larger, best, row)
+            others.append(row)
+        best = best / best[..., k, None]
+        above = [whole[..., i, :] for i in range(k)]
+        cleared = [row - row[..., k, None] * best for row in (*above, *others)]
+        whole = torch.stack([*cleared[:k], best, *cleared[k:]], dim=-2)
+    failed = torch.zeros_like(matrix[..., 0, 0], dtype=torch.int32)
+    return whole[..., size:].clone(), failed
+
+
+def orthogonal(matrix: Tensor, mode: str = "reduced") -> tuple[Tensor, Tensor]:
+    """Q and R of a square matrix by Householder's reflections."""
+    size = matrix.shape[-1]
+    rest = matrix
+    q = torch.eye(size, dtype=matrix.dtype, device=matrix.device).expand_as(matrix)
+    for k in range(size - 1):
+        column = rest[..., k:, k]
+        length = column.square().sum(-1).sqrt()
+        head = torch.where(column[..., 0] < 0, column[..., 0] - length, column[..., 0] + length)
+        vector = torch.cat((head.unsqueeze(-1), column[..., 1:]), dim=-1)
+        square = vector.square().sum(-1)
+        factor = torch.where(square > 0, 2 / torch.where(square > 0, square, 1.0), 0.0)
+        v = torch.cat((torch.zeros_like(rest[..., :k, k]), vector), dim=-1)
+        scaled = factor.unsqueeze(-1) * v
+        rest = rest - scaled.unsqueeze(-1) * (v.unsqueeze(-1) * rest).sum(-2, keepdim=True)
+        q = q - (q * v.unsqueeze(-2)).sum(-1, keepdim=True) * scaled.unsqueeze(-2)
+    return q.clone(), rest.triu()
+
+
+def eigen(gram: Tensor, UPLO: str = "L", compute_v: bool = True) -> tuple[Tensor, Tensor]:
+    """The eigenvalues of symmetric matrices, ascending, and eigenvectors in columns, by Jacobi's rotations.
+
+    One pass rotates the pairs (0, 1), (2, 3), ... at once and then moves all indices but the first one
+    place on, so that after size - 1 passes every pair has met: Brent and Luk (1985).
+    """
+    count = gram.shape[-1]
+    size = count + count % 2
+    if size > count:  # one more, which no rotation touches
+        gram = torch.constant_pad_nd(gram, [0, 1, 0, 1])
+    top, bottom = list(range(0, size, 2)), list(range(1, size, 2))
+    if size > 2:
+        top, bottom = [top[0], bottom[0], *top[1:-1]], [*bottom[1:], top[-1]]
+    following = [place for pair in zip(top, bottom, strict=True) for place in pair]
+
+    def rotate(carry: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+        matrix, vectors = carry
+        diagonal = matrix.diagonal(dim1=-2, dim2=-1)
+        between = matrix.diagonal(offset=1, dim1=-2, dim2=-1)[..., 0::2]
+        some = between != 0
+        theta = (diagonal[..., 1::2] - diagonal[..., 0::2]) / (2 * torch.where(some, between, 1.0))
+        tangent = 1 / (theta.abs() + (theta.square() + 1).sqrt())
+        tangent = torch.where(some, torch.where(theta < 0, -tangent, tangent), 0.0)
+        cosine = 1 / (tangent.square() + 1).sqrt()
+        turned = _turn(_turn(matrix, cosine, tangent * cosine).mT, cosine, tangent * cosine)
+        moved = turned[..., following, :][..., following]
+        return moved, _turn(vectors, cosine, tangent * cosine)[..., following, :]
+
+    units = torch.eye(size, dtype=gram.dtype, device=gram.device).expand_as(gram)
+    passes = (size - 1) * (4 + count.bit_length())
+    matrix, vectors = repeat(passes, rotate, (gram.clone(), units.clone()))
+    values = list(matrix.diagonal(dim1=-2, dim2=-1)[..., :count].unbind(-1))
+    columns = list(vectors[..., :count, :count].unbind(-2))
+    for end in range(count - 1, 0, -1):
+        for k in range(end):
+            wrong = values[k] > values[k + 1]
+            values[k], values[k + 1] = torch.minimum(*values[k : k + 2]), torch.maximum(*values[k : k + 2])
+            low, high = columns[k : k + 2]
+            swap = wrong.unsqueeze(-1)
+            columns[k : k + 2] = torch.where(swap, high, low), torch.where(swap, low, high)
+    return torch.stack(values, dim=-1), torch.stack(columns, dim=-1)
+
+
+def _turn(matrix: Tensor, cosine: Tensor, sine: Tensor) -> Tensor:
+    """Rotate the rows 2 k and 2 k + 1: (..., M, M), (..., M / 2)."""
+    p, q = matrix[..., 0::2, :], matrix[..., 1::2, :]
+    c, s = cosine.unsqueeze(-1), sine.unsqueeze(-1)
+    return torch.stack((c * p - s * q, s * p + c * q), dim=-2).flatten(-3, -2)
+
+
+FACTORISATIONS: dict[str, Callable[..., Any]] = {
+    "linalg_cholesky_ex": cholesky,
+    "linalg_solve_triangular": triangular,
+    "cholesky_solve": cholesky_solve,
+    "linalg_inv_ex": inverse,
+    "linalg_qr": orthogonal,
+    "_linalg_eigh": eigen,
+}

@@ -1,0 +1,187 @@
+"""A scalar program as C++: a row in every lane, the loops inside."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from .graph import FLAG, REAL, ROW, STEP, WHOLE, Graph
+from .schedule import Schedule
+from .statements import Layout, Writer
+
+_FEW = 400  # nodes of a program of which two vectors fit the registers and caches side by side
+_INFIX = {"add": "+", "sub": "-", "mul": "*", "div": "/", "lt": "<", "le": "<=", "eq": "==", "ne": "!="}
+_INFIX |= {"and": "&", "or": "|", "xor": "^"}
+_PREFIX = {"neg": "-", "not": "~", "cast": ""}
+
+
+class Text(NamedTuple):
+    """A program and the numbers that it reads from a table, so that other numbers need no other program."""
+
+    source: str
+    table: list[float]
+
+
+def emit(
+    graph: Graph, layout: Layout, following: Sequence[int], outputs: Sequence[int], copies: int = 0
+) -> Text:
+    """Write a program.
+
+    Args:
+        graph: the nodes.
+        layout: of inputs and outputs.
+        following: nodes of the carry after a step.
+        outputs: nodes of what a step puts out.
+        copies: vectors that advance side by side; 0 for as many as suit many rows.
+    """
+    schedule = Schedule(graph, following, outputs)
+    writer = _Writer(graph, schedule, layout, copies or _copies(graph, schedule))
+    return writer.write(following, outputs)
+
+
+def _copies(graph: Graph, schedule: Schedule) -> int:
+    """How many vectors advance side by side, so that the processor always has something to do."""
+    if any(graph.op[n] == "dot" and _fixed(graph, graph.args[n]) for n in schedule.live):
+        return 4  # every number of the matrix is read once for all of them
+    return 2 if len(schedule.live) < _FEW else 1
+
+
+def _fixed(graph: Graph, operands: Sequence[int]) -> bool:
+    return any(graph.op[n] == "pack" and graph.op[graph.args[n][0]] == "const" for n in operands)
+
+
+class _Writer(Writer):
+    def __init__(self, graph: Graph, schedule: Schedule, layout: Layout, copies: int) -> None:
+        super().__init__(graph, schedule, layout, {REAL: "V", WHOLE: "V", FLAG: "M"}, copies)
+        self.table: list[float] = []
+
+    def write(self, following: Sequence[int], outputs: Sequence[int]) -> Text:
+        rows, fixed, stored = sum(self.layout.rows), 0, dict[int, int]()
+        for node in self.schedule.cut():
+            if self._in_place(node) is not None:
+                continue
+            stored[node] = rows + fixed
+            fixed += self._size(node)
+        prepare = self._function(lambda: self._prepare(stored))
+        self._stored = stored
+        advance = self._function(lambda: self._advance(following, outputs))
+        counts = {
+            "ROWS": rows,
+            "FIXED": fixed,
+            "NOWS": sum(self.layout.nows),
+            "CARRIES": sum(self.layout.carries),
+            "SLOTS_ROW": len(self.layout.rows),
+            "SLOTS_NOW": len(self.layout.nows),
+            "SLOTS_CARRY": len(self.layout.carries),
+            "COPIES": self.copies,
+            "TILE": 64,
+        }
+        single = self.graph.single
+        head = [f"#define LANES_SINGLE {int(single)}", f"#define REAL {'float' if single else 'double'}"]
+        head += [
+            '#include "_lanes.hpp"',
+            f"constexpr int {', '.join(f'{k} = {v}' for k, v in counts.items())};",
+        ]
+        source = [*head, '#include "_driver.hpp"', *prepare, *advance]
+        return Text("\n".join(source) + "\n", self.table)
+
+    def _prepare(self, stored: dict[int, int]) -> None:
+        self._lines.append("static void prepare(const Frame &f, int b) {")
+        self._line("const REAL *const c = f.c, *const fixed = f.fixed + b;")
+        self._line("(void)c, (void)fixed;")
+        self._block(self.schedule.block(ROW))
+        for node, place in stored.items():
+            for k in range(self._size(node)):
+                for j in range(self.copies):
+                    value = self._read(node, str(k), j) if self._is_array(node) else self._ref(node, j)
+                    self._line(
+                        f"store(f.fixed + b + {place + k} * room + {j} * W, {self._number(node, value)});"
+                    )
+        self._lines.append("}")
+
+    def _advance(self, following: Sequence[int], outputs: Sequence[int]) -> None:
+        self._lines.append("static void advance(const Frame &f, int b, int rows) {")
+        self._line("const REAL *const c = f.c, *const fixed = f.fixed + b;")
+        self._line("(void)c, (void)fixed, (void)rows;")
+        for k, node in enumerate(following):
+            for j in range(self.copies):
+                read = "load_flag" if self.graph.type[node] == FLAG else "load"
+                self._line(
+                    f"{self._type(node)} s{k}{self._copy(j)} = {read}(f.carry + b + {k} * room + {j} * W);"
+                )
+        self._line("for (int t = 0; t < f.times; ++t) {")
+        self._level += 1
+        self._line("const REAL *const now = f.now + t * f.rows + b;")
+        self._line("(void)now;")
+        self._block(self.schedule.block(STEP))
+        self._outputs(outputs)
+        self._assign([(f"s{k}", node) for k, node in enumerate(following)])
+        self._level -= 1
+        self._line("}")
+        for k, node in enumerate(following):
+            for j in range(self.copies):
+                value = f"s{k}{self._copy(j)}"
+                self._line(f"store(f.carry + b + {k} * room + {j} * W, {self._number(node, value)});")
+        self._lines.append("}")
+
+    def _outputs(self, outputs: Sequence[int]) -> None:
+        if not outputs:
+            return
+        self._line("if ((f.time + t) % f.every == 0) {")
+        self._level += 1
+        done = 0
+        for slot, size in enumerate(self.layout.outputs):
+            for e in range(size):
+                node = outputs[done + e]
+                for j in range(self.copies):
+                    value = self._number(node, self._ref(node, j))
+                    self._line(f"put(f, {slot}, {e}, t, b + {j} * W, rows - {j} * W, {value});")
+            done += size
+        self._level -= 1
+        self._line("}")
+
+    def _operation(self, op: str, values: Sequence[str], type: str) -> str:
+        if op in _INFIX:
+            return f"{values[0]} {_INFIX[op]} {values[1]}"
+        if op in _PREFIX:
+            return f"{_PREFIX[op]}{values[0]}"
+        return f"{op}({', '.join(values)})"
+
+    def _fma(self, a: str, b: str, c: str) -> str:
+        return f"fma({a}, {b}, {c})"
+
+    def _buffer(self, op: str, place: int, j: int, at: str = "0") -> str:
+        where, stride = ("fixed", "room") if op == "row" else ("now", "f.span")
+        index = f"{place}" if at == "0" else f"({place} + {at})"
+        return f"load({where} + {index} * {stride}{f' + {j} * W' if j else ''})"
+
+    def _typed(self, node: int, text: str) -> str:
+        return f"({text} != V{{}})" if self.graph.type[node] == FLAG else text
+
+    def _number(self, node: int, text: str) -> str:
+        return f"number({text})" if self.graph.type[node] == FLAG else text
+
+    def _literal(self, node: int) -> str:
+        value = self.graph.value(node)
+        if isinstance(value, bool):
+            return f"all_of({str(value).lower()})"
+        assert value is not None
+        if math.isnan(value):
+            return 'splat(REAL(__builtin_nan("")))'
+        if math.isinf(value):
+            return f"splat(REAL({'-' if value < 0 else ''}__builtin_inf()))"
+        if abs(value) <= 1024 and value * 64 == int(value * 64):
+            return f"splat(REAL({value!r}))"
+        key = ("const", node)
+        if key not in self._index:
+            self._index[key] = len(self.table)
+            self.table.append(value)
+        return f"splat(c[{self._index[key]}])"
+
+    def _table(self, pack: int, at: str) -> str:
+        key = ("pack", pack)
+        if key not in self._index:
+            self._index[key] = len(self.table)
+            self.table += [float(self.graph.value(a) or 0.0) for a in self.graph.args[pack]]
+        return self._typed(pack, f"splat(c[{self._index[key]} + {at}])")

@@ -1,0 +1,251 @@
+"""A scalar program: single numbers of one row, each an operation on others, no two of them equal."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Hashable, Sequence
+from typing import Any
+
+import numpy as np
+
+Ids = np.ndarray[Any, np.dtype[np.int64]]
+"""Numbers of a tensor: the nodes of its entries."""
+
+REAL, WIDE, FLAG, WHOLE = "real", "wide", "flag", "whole"
+"""Types of a node: the program's float, float64 within a program of float32, bool, integer."""
+
+ROW, NOW, STEP = 0, 1, 2
+"""Depths: what a row has once, what a time brings whatever the carry is, what depends on the carry.
+Loops inside a step are deeper."""
+
+
+@dataclasses.dataclass
+class Loop:
+    """A body that runs ``count`` times with numbers that pass from one pass to the next."""
+
+    count: int
+    depth: int
+    home: int = ROW  # depth at which the loop itself stands
+    node: int = -1
+    carry: list[int] = dataclasses.field(default_factory=list)
+    initial: list[int] = dataclasses.field(default_factory=list)
+    following: list[int] = dataclasses.field(default_factory=list)
+    collected: list[list[int]] = dataclasses.field(default_factory=list)  # a pass's entries of every output
+
+
+_FOLD: dict[str, Callable[..., Any]] = {
+    "add": np.add,
+    "sub": np.subtract,
+    "mul": np.multiply,
+    "div": np.divide,
+    "neg": np.negative,
+    "abs": np.abs,
+    "min": np.minimum,
+    "max": np.maximum,
+    "sqrt": np.sqrt,
+    "exp": np.exp,
+    "expm1": np.expm1,
+    "log": np.log,
+    "log1p": np.log1p,
+    "sin": np.sin,
+    "cos": np.cos,
+    "tan": np.tan,
+    "tanh": np.tanh,
+    "atan2": np.arctan2,
+    "floor": np.floor,
+    "ceil": np.ceil,
+    "trunc": np.trunc,
+    "round": np.rint,
+    "lt": np.less,
+    "le": np.less_equal,
+    "eq": np.equal,
+    "ne": np.not_equal,
+    "and": np.logical_and,
+    "or": np.logical_or,
+    "xor": np.logical_xor,
+    "not": np.logical_not,
+}
+_COMMUTE = frozenset({"add", "mul", "eq", "ne", "and", "or", "xor"})
+_COMPARE = frozenset({"lt", "le", "eq", "ne"})
+
+
+class Graph:
+    """Nodes in topological order; a node that has been made before is not made again.
+
+    What is simplified is exact in every bit, infinities, NaN and signed zeros included: constants, x * 1,
+    x / 1, x - 0, x + (-0), -(-x), choices between equals.
+
+    Args:
+        single: whether the program's float is float32.
+    """
+
+    def __init__(self, single: bool) -> None:
+        self.single = single
+        self.op: list[str] = []
+        self.args: list[tuple[int, ...]] = []
+        self.aux: list[Any] = []
+        self.type: list[str] = []
+        self.depth: list[int] = []
+        self.loops: list[Loop] = []
+        self._known: dict[Hashable, int] = {}
+        self._signed: list[bool] = []  # whether a node may be -0
+
+    def add(self, op: str, args: Sequence[int], type: str, aux: Any = None, depth: int | None = None) -> int:
+        """The node of an operation, simplified nowhere."""
+        key = (op, tuple(args), aux, type)
+        found = self._known.get(key)
+        if found is None:
+            found = len(self.op)
+            self._known[key] = found
+            self.op.append(op)
+            self.args.append(tuple(args))
+            self.aux.append(aux)
+            self.type.append(type)
+            self.depth.append(max([self.depth[a] for a in args], default=ROW) if depth is None else depth)
+            self._signed.append(self._may_be_negative_zero(found))
+        return found
+
+    def constant(self, value: float | bool, type: str) -> int:
+        """The node of a number."""
+        if type == FLAG:
+            return self.add("const", (), type, bool(value))
+        number = float(value)
+        if type == REAL and self.single:
+            with np.errstate(all="ignore"):
+                number = float(np.float32(number))
+        # 0 and -0 are equal and NaN is not equal to itself: the sign and the text tell them apart.
+        return self.add(
+            "const", (), type, (number, math.copysign(1.0, number)) if number == number else "nan"
+        )
+
+    def value(self, node: int) -> float | bool | None:
+        """The number of a constant, else None."""
+        if self.op[node] != "const":
+            return None
+        aux = self.aux[node]
+        return math.nan if aux == "nan" else aux if isinstance(aux, bool) else aux[0]
+
+    def apply(self, op: str, *args: int) -> int:
+        """The node of an operation on numbers, simplified."""
+        values = [self.value(a) for a in args]
+        type = FLAG if op in _COMPARE else self.type[args[0]]
+        if op in _FOLD and all(v is not None for v in values):
+            return self.constant(self._fold(op, self.type[args[0]], values), type)
+        known = self._simpler(op, args, values)
+        if known is not None:
+            return known
+        if op in _COMMUTE and args[0] > args[1]:
+            args = (args[1], args[0])
+        return self.add(op, args, type)
+
+    def where(self, chosen: int, a: int, b: int) -> int:
+        """a where chosen, else b."""
+        flag = self.value(chosen)
+        if flag is not None:
+            return a if flag else b
+        if a == b:
+            return a
+        if self.op[chosen] == "not":
+            return self.where(self.args[chosen][0], b, a)
+        if self.type[a] == FLAG:
+            one, other = self.value(a), self.value(b)
+            if one is True and other is False:
+                return chosen
+            if one is False and other is True:
+                return self.apply("not", chosen)
+        return self.add("where", (chosen, a, b), self.type[a])
+
+    def convert(self, node: int, type: str) -> int:
+        """The same number as another type."""
+        old = self.type[node]
+        if old == type:
+            return node
+        value = self.value(node)
+        if value is not None:
+            if type == FLAG:
+                return self.constant(bool(value), FLAG)
+            number = float(value)
+            return self.constant(
+                math.trunc(number) if type == WHOLE and math.isfinite(number) else number, type
+            )
+        if old == FLAG:
+            return self.where(node, self.constant(1.0, type), self.constant(0.0, type))
+        if type == FLAG:
+            return self.apply("ne", node, self.constant(0.0, old))
+        if type == WHOLE and old != WHOLE:
+            node = self.apply("trunc", node)
+        return self.add("cast", (node,), type)
+
+    def _fold(self, op: str, type: str, values: Sequence[Any]) -> Any:
+        kind: Any = bool if type == FLAG else np.float32 if type == REAL and self.single else np.float64
+        with np.errstate(all="ignore"):
+            return _FOLD[op](*(kind(v) for v in values)).item()
+
+    def _simpler(self, op: str, args: Sequence[int], values: Sequence[Any]) -> int | None:
+        """A node that is equal in every bit, None where there is none."""
+        a, b = args[0], args[-1]
+        left, right = values[0], values[-1]
+        if op == "add":
+            for x, y, v in ((a, b, right), (b, a, left)):
+                if v == 0 and (math.copysign(1.0, v) < 0 or not self._signed[x]):
+                    return x
+                if self.op[y] == "neg":
+                    return self.apply("sub", x, self.args[y][0])
+        elif op == "sub":
+            if right == 0 and (math.copysign(1.0, right) > 0 or not self._signed[a]):
+                return a
+            if left == 0 and math.copysign(1.0, left) < 0:
+                return self.apply("neg", b)
+            if self.op[b] == "neg":
+                return self.apply("add", a, self.args[b][0])
+        elif op == "mul":
+            for x, v in ((a, right), (b, left)):
+                if v == 1:
+                    return x
+                if v == -1:
+                    return self.apply("neg", x)
+        elif op == "div":
+            if right == 1:
+                return a
+            if right == -1:
+                return self.apply("neg", a)
+            if right is not None and _power_of_two(right):
+                return self.apply("mul", a, self.constant(1 / right, self.type[a]))
+        elif (op in ("neg", "not") and self.op[a] == op) or (op == "abs" and self.op[a] == "neg"):
+            return self.args[a][0] if op != "abs" else self.apply("abs", self.args[a][0])
+        elif (op == "abs" and self.op[a] == "abs") or (op in ("min", "max", "and", "or") and a == b):
+            return a
+        elif op in ("and", "or"):
+            for x, v in ((a, right), (b, left)):
+                if v is not None:
+                    return x if bool(v) == (op == "and") else self.constant(op == "or", FLAG)
+        elif op in ("floor", "ceil", "trunc", "round") and self.type[a] == WHOLE:
+            return a
+        return None
+
+    def _may_be_negative_zero(self, node: int) -> bool:
+        op, args = self.op[node], self.args[node]
+        if op == "const":
+            return self.aux[node] != "nan" and not isinstance(self.aux[node], bool) and self.aux[node][1] < 0
+        if op in ("add", "min", "max"):
+            # A sum of numbers that cancel is +0: only -0 + -0 is -0.
+            both = [self._signed[a] for a in args]
+            return all(both) if op == "add" else any(both)
+        if op == "sub":
+            return self._signed[args[0]]
+        if op == "mul":
+            return args[0] != args[1]
+        if op == "where":
+            return self._signed[args[1]] or self._signed[args[2]]
+        return op not in ("exp", "abs") and self.type[node] != FLAG
+
+
+def _power_of_two(value: float) -> bool:
+    # Within the normal numbers of both dtypes, and so their reciprocals.
+    return (
+        value != 0
+        and math.isfinite(value)
+        and abs(math.frexp(value)[0]) == 0.5
+        and 2**-100 < abs(value) < 2**100
+    )

@@ -1,0 +1,176 @@
+"""A compiled program for inputs of fixed shapes: nothing is found out twice."""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import itertools
+from array import array
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.autograd import forward_ad
+
+from .openmp import openmp
+from .pages import LARGE, fresh
+from .tree import Shared, plain
+
+Form = tuple[torch.Size, tuple[int, ...], torch.dtype, bool]
+"""Shape, strides and dtype of an input, and whether all rows share it."""
+
+
+class _Slot(ctypes.Structure):
+    _fields_ = tuple((n, ctypes.c_int64) for n in ("row", "time", "entry", "entries"))
+
+
+class _Call(ctypes.Structure):
+    _fields_ = (
+        *((n, ctypes.c_int64) for n in ("rows", "times", "every")),
+        *((n, ctypes.c_void_p) for n in ("table", "slots", "parallel")),
+    )
+
+
+class Compiled(NamedTuple):
+    """A program for inputs of some shapes and dtypes."""
+
+    call: Callable[..., None]
+    table: Tensor
+    real: torch.dtype
+    carry: tuple[tuple[torch.Size, torch.dtype], ...]  # of one row
+    outputs: tuple[tuple[torch.Size, torch.dtype], ...]
+    structure: Any  # of the outputs
+
+
+def ordinary(leaves: Sequence[Any]) -> bool:
+    """Return whether tensors are plain ones on the CPU of which nobody wants a derivative.
+
+    Under a tracer, a transform of torch.func or another mode the operations themselves are wanted.
+    """
+    if (
+        torch._C._functorch.peek_interpreter_stack() is not None
+        or forward_ad._current_level >= 0
+        or torch._C._len_torch_dispatch_stack()
+    ):
+        return False
+    recorded = torch.is_grad_enabled()
+    for leaf in leaves:
+        tensor = plain(leaf)
+        if type(tensor) not in _TENSORS or not tensor.is_cpu or (recorded and tensor.requires_grad):
+            return False
+    return True
+
+
+_TENSORS = (Tensor, torch.nn.Parameter)
+
+
+def form(leaf: Any) -> Form:
+    """Return what a plan must know about an input."""
+    tensor = plain(leaf)
+    return tensor.shape, tensor.stride(), tensor.dtype, type(leaf) is Shared
+
+
+class Plan:
+    """One call of a compiled program.
+
+    Args:
+        compiled: the program.
+        leaves: examples of the inputs: what a row has once, what times bring, the carry.
+        times: for each of them, whether a dimension of times comes first (after the rows).
+        rows, steps, every: of the call.
+
+    Attributes:
+        structure: of the outputs.
+    """
+
+    def __init__(
+        self,
+        compiled: Compiled,
+        leaves: Sequence[Any],
+        times: Sequence[bool],
+        *,
+        rows: int,
+        steps: int,
+        every: int,
+    ) -> None:
+        self._compiled, self.structure = compiled, compiled.structure
+        self._copied: list[int] = []  # inputs of another dtype, or without one stride from entry to entry
+        self._large: list[int] = []
+        slots = [
+            self._input(k, leaf, timed) for k, (leaf, timed) in enumerate(zip(leaves, times, strict=True))
+        ]
+        recorded = -(-steps // every)
+        ends = [((rows, *s), (1, *_inner(s, rows)), s.numel(), 0) for s, _ in compiled.carry]
+        histories = [
+            ((rows, recorded, *s), (1, s.numel() * rows, *_inner(s, rows)), s.numel(), s.numel() * rows)
+            for s, _ in compiled.outputs
+        ]
+        slots += [_Slot(1, time, rows, entries) for _, _, entries, time in (*ends, *histories)]
+        real = compiled.real
+        self._rooms = [(shape, strides) for shape, strides, _, _ in (*ends, *histories)]
+        self._dtypes = [
+            (k, dtype) for k, (_, dtype) in enumerate((*compiled.carry, *compiled.outputs)) if dtype != real
+        ]
+        self._like = torch.empty(0, dtype=real)
+        for k, (shape, _) in enumerate(self._rooms):
+            if torch.Size(shape).numel() * self._like.element_size() >= LARGE:
+                self._large.append(k)
+        self._slots = (_Slot * max(len(slots), 1))(*slots)
+        self._call = _Call(rows, steps, every, compiled.table.data_ptr(), ctypes.addressof(self._slots))
+        self._call.parallel = _parallel()
+        self._reference = ctypes.addressof(self._call)
+
+    def _input(self, k: int, leaf: Any, timed: bool) -> _Slot:
+        shared, tensor = type(leaf) is Shared, plain(leaf)
+        lead = 1 + timed - shared
+        inner = tensor.shape[lead:]
+        strides = tensor.stride()
+        if tensor.dtype != self._compiled.real or not _even(inner, strides[lead:]):
+            self._copied.append(k)
+            strides = _inner(tensor.shape, 1)
+        row = 0 if shared else strides[0]
+        longer = [stride for size, stride in zip(inner, strides[lead:], strict=True) if size > 1]
+        return _Slot(row, strides[lead - 1] if timed else 0, longer[-1] if longer else 1, inner.numel())
+
+    def __call__(self, leaves: Sequence[Any]) -> list[Tensor]:
+        """Return the carry after the last step and the outputs, all new.
+
+        Args:
+            leaves: inputs of the forms that the examples had.
+        """
+        given = [leaf.tensor if type(leaf) is Shared else leaf for leaf in leaves]
+        real = self._compiled.real
+        for k in self._copied:
+            given[k] = given[k].to(real).contiguous()
+        rooms = [torch.empty_strided(shape, strides, dtype=real) for shape, strides in self._rooms]
+        for k in self._large:
+            shape, strides = self._rooms[k]
+            rooms[k] = fresh(self._like, torch.Size(shape).numel()).as_strided(shape, strides)
+        addresses = array("q", [tensor.data_ptr() for tensor in (*given, *rooms)])
+        self._compiled.call(self._reference, addresses.buffer_info()[0], torch.get_num_threads())
+        for k, dtype in self._dtypes:
+            rooms[k] = rooms[k].to(dtype)
+        return rooms
+
+
+def _inner(shape: Sequence[int], unit: int) -> tuple[int, ...]:
+    """The strides of contiguous entries that lie ``unit`` numbers apart."""
+    strides = []
+    for size in reversed(shape):
+        strides.append(unit)
+        unit *= size
+    return tuple(reversed(strides))
+
+
+def _even(shape: Sequence[int], strides: Sequence[int]) -> bool:
+    """Whether entries in their order lie equally far apart."""
+    longer = [(size, stride) for size, stride in zip(shape, strides, strict=True) if size > 1]
+    return all(a[1] == b[0] * b[1] for a, b in itertools.pairwise(longer))
+
+
+@functools.cache
+def _parallel() -> int | None:
+    """The OpenMP entry that torch itself runs on: a second pool of threads would fight for the same cores."""
+    entry = openmp("GOMP_parallel")
+    return None if entry is None else ctypes.cast(entry, ctypes.c_void_p).value  # type: ignore[arg-type]

@@ -1,0 +1,357 @@
+"""Row programs: a step of one row over many times and rows, in plain torch or compiled."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Hashable, Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from . import compiler
+from .combinators import Tree, tracing
+from .emission import emit
+from .graph import NOW, STEP, Graph
+from .lowering import lower
+from .plan import Compiled, Plan, form, ordinary
+from .scalar_text import Names, c_text
+from .statements import Layout
+from .tracer import NotLoweredError, Tracer
+from .tree import Shared, flatten, labels, plain, unflatten
+
+_log = logging.getLogger(__name__)
+_said: set[tuple[str, str]] = set()  # what has been logged
+_PREPARED = 64  # calls of other shapes that a program remembers
+Step = Callable[[Tree, Tree, Tree], tuple[Tree, Tree]]
+
+
+class Program:
+    """A step of a row, taken at all times: carry, out_k = step(carry, now_k, row).
+
+    Example:
+        >>> def step(x, u, row):
+        ...     gain, = row
+        ...     x = x + 0.01 * (u - gain * x.sin())
+        ...     return x, x
+        >>> program = lanes.Program(step)
+        >>> x0, u, gain = torch.zeros(5), torch.ones(5, 100), torch.rand(5)
+        >>> x, history = program(x0, u, (gain,))
+        >>> history.shape
+        torch.Size([5, 100])
+
+    The definition is plain torch: ``step`` with all rows, time after time. The compiled program runs ``step``
+    once with a single row, (1, ...), writes down what it does as a scalar program and computes that with a
+    row in every vector lane. Where that cannot be done, one line of the log says why and the definition runs;
+    so it does where a derivative is wanted or a tensor is not on the CPU.
+
+    What ``step`` finds elsewhere (attributes, closures) is a constant: make a new program when that changes.
+    Rows never see each other.
+
+    Args:
+        step: maps (carry, now, row), trees of tensors (B, ...), to the next carry and the outputs (B, ...).
+        name: in the log.
+        compile: whether to compile at all.
+        copies: vectors of rows that advance side by side: 1 where there will be few rows, 0 by the program.
+    """
+
+    def __init__(self, step: Step, *, name: str = "program", compile: bool = True, copies: int = 0) -> None:
+        self.step, self.name, self.compile, self.copies = step, name, compile, copies
+        self._compiled: dict[Hashable, Compiled | None] = {}
+        self._prepared: dict[Hashable, Prepared] = {}
+
+    def __call__(
+        self, carry: Tree, now: Tree = (), row: Tree = (), *, steps: int | None = None, every: int = 1
+    ) -> tuple[Tree, Tree]:
+        """The carry after the last step, and the outputs at the times 0, ``every``, 2 ``every``, ...
+
+        Args:
+            carry: a tree of tensors (B, ...).
+            now: a tree of tensors (B, T, ...), or `Shared` (T, ...).
+            row: a tree of tensors (B, ...), or `Shared` (...).
+            steps: T where ``now`` is empty.
+            every: times from one recorded output to the next.
+
+        Returns:
+            The carry, (B, ...), and the outputs, (B, ceil(T / every), ...).
+        """
+        leaves, structure = flatten((row, now, carry))
+        key = structure, tuple(map(form, leaves)), steps, every
+        prepared = self._prepared.get(key)
+        if prepared is None:
+            if len(self._prepared) >= _PREPARED:
+                self._prepared.clear()
+            prepared = self._prepared[key] = self.prepare(carry, now, row, steps=steps, every=every)
+        return prepared.run(leaves, carry, now, row)
+
+    def prepare(
+        self, carry: Tree, now: Tree = (), row: Tree = (), *, steps: int | None = None, every: int = 1
+    ) -> Prepared:
+        """Return the call for inputs of the forms of these, with everything found out that does not change.
+
+        For one state and few steps: a call then costs some 20 microseconds and the arithmetic.
+
+        Args:
+            carry, now, row, steps, every: as in a call; only shapes, strides and dtypes matter.
+        """
+        return Prepared(self, Given.of(carry, now, row, steps), every)
+
+    def definition(
+        self, carry: Tree, now: Tree = (), row: Tree = (), *, steps: int | None = None, every: int = 1
+    ) -> tuple[Tree, Tree]:
+        """The same in plain torch."""
+        given = Given.of(carry, now, row, steps)
+        fixed = given.tree("row", [plain(leaf) for leaf in given.row])
+        columns: list[list[Tensor]] = []
+        shape: Any = ("fixed", ())
+        for k in range(given.times):
+            at = [leaf.tensor[k] if isinstance(leaf, Shared) else leaf[:, k] for leaf in given.now]
+            carry, out = self.step(carry, given.tree("now", at), fixed)
+            if k % every == 0:
+                parts, shape = flatten(out)
+                columns.append(parts)
+        stacked = [torch.stack(column, dim=1) for column in zip(*columns, strict=True)]
+        return carry, unflatten(shape, iter(stacked))
+
+    def compiles(self, carry: Tree, now: Tree = (), row: Tree = (), *, steps: int | None = None) -> bool:
+        """Whether the compiled program serves these inputs."""
+        return self.find(Given.of(carry, now, row, steps)) is not None
+
+    def text(self, carry: Tree, now: Tree = (), row: Tree = (), *, steps: int | None = None) -> str:
+        """The C++ of the program for such inputs.
+
+        Raises:
+            NotLoweredError: if there is none.
+        """
+        traced = trace(self.step, Given.of(carry, now, row, steps))
+        return emit(*traced.program, self.copies).source
+
+    def c_source(
+        self,
+        name: str,
+        carry: Tree = (),
+        now: Tree = (),
+        row: Tree = (),
+        *,
+        outputs: Sequence[str] | None = None,
+        note: str = "",
+    ) -> str:
+        """Return a C99 header that takes one step of one row: nothing but math.h and the stack.
+
+        ``NAME_start(state)`` sets the carry to the numbers of row 0 of ``carry``;
+        ``NAME(state, now..., row..., out...)`` advances it and writes the outputs. Without a carry there is
+        no ``state``. Arguments are called as the keys of a dictionary or the fields of a named tuple, else
+        ``carry0``, ``now``, ``out1``, ...
+
+        Args:
+            name: of the function.
+            carry, now, row: as in a call, with one time at least.
+            outputs: names of the outputs.
+            note: lines for the comment at the head.
+
+        Raises:
+            NotLoweredError: if an operation has no scalar form.
+            ValueError: if a name is not one of C, or is there twice.
+        """
+        given = Given.of(carry, now, row, 1)
+        traced = trace(self.step, given)
+        kinds = {"row": given.structures["row"], "now": given.structures["now"]}
+        kinds |= {"carry": given.structures["carry"], "out": traced.structure}
+        found = [labels(structure, kind) for kind, structure in kinds.items()]
+        rows, nows, carries, ends = found
+        names = Names(rows, nows, carries, ends if outputs is None else outputs)
+        start = [float(x) for leaf in given.carry for x in leaf[0].reshape(-1).tolist()]
+        return c_text(*traced.program, name=name, names=names, start=start, note=note)
+
+    def find(self, given: Given) -> Compiled | None:
+        """The compiled program for such inputs, None where there is none."""
+        if not self.compile or not given.ordinary():
+            return None
+        key = given.key()
+        if key not in self._compiled:
+            self._compiled[key] = self._build(given)
+        return self._compiled[key]
+
+    def _build(self, given: Given) -> Compiled | None:
+        real = given.real
+        try:
+            try:
+                traced = trace(self.step, given)
+                text = emit(*traced.program, self.copies)
+            except NotLoweredError:
+                if real == torch.float64:
+                    raise
+                # float64 within a program of float32: all of it in double, rounded where it ends.
+                real = torch.float64
+                traced = trace(self.step, given, widened=True)
+                text = emit(*traced.program, self.copies)
+            call = compiler.function(text.source)
+        except (NotLoweredError, OSError) as error:
+            reason = " ".join(str(error).split())[:400]
+            told = self.name, "no build" if isinstance(error, OSError) else reason
+            if told not in _said:
+                _said.add(told)
+                _log.warning("%s runs in plain torch, slower: %s", self.name, reason)
+            return None
+        table = torch.tensor(text.table or [0.0], dtype=real)
+        shapes = tuple((leaf.shape[1:], leaf.dtype) for leaf in given.carry)
+        return Compiled(call, table, real, shapes, traced.outputs, traced.structure)
+
+
+class Prepared:
+    """A call of a program for inputs of fixed shapes, strides and dtypes; `Program.prepare` makes one.
+
+    Called as the program is, without ``steps`` and ``every``. Inputs of other forms go to the program.
+    """
+
+    def __init__(self, program: Program, given: Given, every: int) -> None:
+        self._program, self._steps, self._every = program, given.times, every
+        leaves, self._structure = flatten(given.trees())
+        self._forms = tuple(map(form, leaves))
+        self._carries, self._carry = len(given.carry), given.structures["carry"]
+        self._plan: Plan | None = None
+        self._refused = given.rows == 0 or given.times == 0
+
+    def __call__(self, carry: Tree, now: Tree = (), row: Tree = ()) -> tuple[Tree, Tree]:
+        """The carry after the last step, and the outputs."""
+        leaves, structure = flatten((row, now, carry))
+        if structure != self._structure or tuple(map(form, leaves)) != self._forms:
+            return self._program(carry, now, row, steps=self._steps, every=self._every)
+        return self.run(leaves, carry, now, row)
+
+    def run(self, leaves: Sequence[Any], carry: Tree, now: Tree, row: Tree) -> tuple[Tree, Tree]:
+        """The same for inputs that are known to fit.
+
+        Args:
+            leaves: of (row, now, carry).
+            carry, now, row: as in a call.
+        """
+        if self._refused or not ordinary(leaves):
+            return self._program.definition(carry, now, row, steps=self._steps, every=self._every)
+        if self._plan is None:
+            given = Given.of(carry, now, row, self._steps)
+            compiled = self._program.find(given)
+            if compiled is None:
+                self._refused = True
+                return self.run(leaves, carry, now, row)
+            times = [False] * len(given.row) + [True] * len(given.now) + [False] * len(given.carry)
+            self._plan = Plan(compiled, leaves, times, rows=given.rows, steps=given.times, every=self._every)
+        rooms = iter(self._plan(leaves))
+        return unflatten(self._carry, rooms), unflatten(self._plan.structure, rooms)
+
+
+class Given(NamedTuple):
+    """The inputs of a call as lists."""
+
+    carry: list[Tensor]
+    now: list[Any]
+    row: list[Any]
+    structures: dict[str, Any]
+    rows: int
+    times: int
+
+    @classmethod
+    def of(cls, carry: Tree, now: Tree, row: Tree, steps: int | None) -> Given:
+        leaves, structures = {}, {}
+        for name, tree in (("carry", carry), ("now", now), ("row", row)):
+            leaves[name], structures[name] = flatten(tree)
+        own = [leaf for name in ("carry", "now", "row") for leaf in leaves[name] if isinstance(leaf, Tensor)]
+        if not own:
+            raise ValueError(
+                "`Program(...)` must be given at least one tensor with a dimension of rows; got none."
+            )
+        if leaves["now"]:
+            first = leaves["now"][0]
+            steps = len(first.tensor) if isinstance(first, Shared) else first.shape[1]
+        if steps is None:
+            raise ValueError("`Program(steps=...)` must be given where no input has times; got None.")
+        return cls(**leaves, structures=structures, rows=own[0].shape[0], times=steps)
+
+    @property
+    def real(self) -> torch.dtype:
+        floats = [plain(leaf).dtype for leaf in (*self.carry, *self.now, *self.row)]
+        return torch.float64 if torch.float64 in floats or torch.float32 not in floats else torch.float32
+
+    def trees(self) -> Tree:
+        """The trees (row, now, carry)."""
+        return tuple(self.tree(name, getattr(self, name)) for name in ("row", "now", "carry"))
+
+    def tree(self, name: str, leaves: Sequence[Any]) -> Tree:
+        return unflatten(self.structures[name], iter(leaves))
+
+    def key(self) -> Hashable:
+        parts: list[Hashable] = [(leaf.shape[1:], leaf.dtype) for leaf in self.carry]
+        for skip, leaves in ((2, self.now), (1, self.row)):
+            for leaf in leaves:
+                shared = isinstance(leaf, Shared)
+                tensor = plain(leaf)
+                parts.append((tensor.shape[skip - shared :], tensor.dtype, shared))
+        return tuple(parts), tuple(self.structures.values())
+
+    def ordinary(self) -> bool:
+        """Whether all tensors are ordinary ones on the CPU of which nobody wants a derivative."""
+        if self.rows == 0 or self.times == 0:
+            return False
+        return ordinary((*self.carry, *self.now, *self.row))
+
+
+class Traced(NamedTuple):
+    """A program as every back end takes it, and its outputs for one row."""
+
+    program: tuple[Graph, Layout, list[int], list[int]]
+    outputs: tuple[tuple[torch.Size, torch.dtype], ...]
+    structure: Any
+
+
+def trace(step: Step, given: Given, *, widened: bool = False) -> Traced:
+    """Write down what a step does with a single row.
+
+    Args:
+        step: of the program.
+        given: inputs.
+        widened: whether the numbers of a float32 program are carried in double.
+
+    Raises:
+        NotLoweredError: if an operation has no scalar form.
+    """
+    graph = Graph(given.real == torch.float32 and not widened)
+    tracer = Tracer(graph, lower, torch.is_grad_enabled(), widened)
+
+    def inputs(op: str, leaves: Sequence[Any], depth: int, times: int) -> list[Tensor]:
+        traced = []
+        for slot, leaf in enumerate(leaves):
+            at = plain(leaf).detach()
+            at = at if isinstance(leaf, Shared) else at[:1]
+            at = at.select(0 if isinstance(leaf, Shared) else 1, 0) if times else at
+            traced.append(tracer.input(at, op, slot, depth))
+        return traced
+
+    with torch.no_grad():
+        row = given.tree("row", inputs("row", given.row, 0, 0))
+        now = given.tree("now", inputs("now", given.now, NOW, 1))
+        carry = inputs("state", given.carry, STEP, 0)
+        with tracer, tracing(tracer):
+            after, out = step(given.tree("carry", carry), now, row)
+        ends, structure = flatten(after)
+        if structure != given.structures["carry"] or [(e.shape, e.dtype) for e in ends] != [
+            (c.shape, c.dtype) for c in carry
+        ]:
+            raise NotLoweredError("the step returns a carry of other shapes or dtypes than it was given")
+        leaves, shape = flatten(out)
+        if any(leaf.dim() == 0 or leaf.shape[0] != 1 for leaf in leaves):
+            raise NotLoweredError("an output of the step has no dimension of rows")
+        following = [node for end in ends for node in tracer.nodes(end).reshape(-1).tolist()]
+        outputs = [node for leaf in leaves for node in tracer.nodes(leaf).reshape(-1).tolist()]
+        layout = Layout(
+            [_entries(leaf, 1) for leaf in given.row],
+            [_entries(leaf, 2) for leaf in given.now],
+            [_entries(leaf, 1) for leaf in given.carry],
+            [leaf.numel() for leaf in leaves],
+        )
+    shapes = tuple((leaf.shape[1:], leaf.dtype) for leaf in leaves)
+    return Traced((graph, layout, following, outputs), shapes, shape)
+
+
+def _entries(leaf: Any, skip: int) -> int:
+    shape = leaf.tensor.shape[skip - 1 :] if isinstance(leaf, Shared) else leaf.shape[skip:]
+    return shape.numel()

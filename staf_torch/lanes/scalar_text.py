@@ -1,0 +1,277 @@
+"""A scalar program for single rows: plain C with the carry in a struct, or CUDA C with a thread a row."""
+
+from __future__ import annotations
+
+import bisect
+import math
+import re
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+from .graph import FLAG, REAL, ROW, STEP, WHOLE, WIDE, Graph
+from .schedule import Schedule
+from .statements import Layout, Writer
+
+_INFIX = {"add": "+", "sub": "-", "mul": "*", "div": "/", "lt": "<", "le": "<=", "eq": "==", "ne": "!="}
+_INFIX |= {"and": "&&", "or": "||", "xor": "!="}
+_PREFIX = {"neg": "-", "not": "!"}
+_NAMES = {"abs": "fabs", "round": "rint"}
+
+
+_IDENTIFIER = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
+_OWN = re.compile(r"([a-z]\d+(_\d+)?)|double|float|int|const|static|inline|void|for|if|else|struct")
+
+
+class Names(NamedTuple):
+    """What the arguments of a function are called."""
+
+    rows: Sequence[str]
+    nows: Sequence[str]
+    carries: Sequence[str]
+    outputs: Sequence[str]
+
+
+class _ScalarWriter(Writer):
+    def __init__(self, graph: Graph, schedule: Schedule, layout: Layout, names: Names) -> None:
+        self.real, self._suffix = ("float", "f") if graph.single else ("double", "")
+        types = {REAL: self.real, WHOLE: self.real, WIDE: "double", FLAG: "int"}
+        super().__init__(graph, schedule, layout, types)
+        self._names = {"row": names.rows, "now": names.nows, "state": names.carries}
+
+    def _operation(self, op: str, values: Sequence[str], type: str) -> str:
+        wide = type == WIDE
+        if op in _INFIX:
+            return f"{values[0]} {_INFIX[op]} {values[1]}"
+        if op in _PREFIX:
+            return f"{_PREFIX[op]}{values[0]}"
+        if op == "cast":
+            return f"({self.types[type]}){values[0]}"
+        if op == "where":
+            return f"{values[0]} ? {values[1]} : {values[2]}"
+        if op in ("min", "max"):
+            a, b = values  # NaN wins
+            return f"{a} {'<' if op == 'min' else '>'} {b} || {a} != {a} ? {a} : {b}"
+        return f"{_NAMES.get(op, op)}{'' if wide else self._suffix}({', '.join(values)})"
+
+    def _fma(self, a: str, b: str, c: str) -> str:
+        return f"{a} * {b} - {c[1:]}" if c.startswith("-") else f"{a} * {b} + {c}"
+
+    def _literal(self, node: int) -> str:
+        value = self.graph.value(node)
+        assert value is not None
+        return self._number(value, self.graph.type[node])
+
+    def _number(self, value: float | bool, type: str) -> str:
+        if isinstance(value, bool):
+            return str(int(value))
+        if math.isnan(value):
+            return "NAN"
+        if math.isinf(value):
+            return "INFINITY" if value > 0 else "(-INFINITY)"
+        narrow = self.graph.single and type != WIDE
+        text = f"{value:.9g}" if narrow else repr(value)
+        text += ("" if any(c in text for c in ".e") else ".0") + ("f" if narrow else "")
+        return f"({text})" if math.copysign(1.0, value) < 0 else text
+
+    def _table(self, pack: int, at: str) -> str:
+        graph, kind = self.graph, self.graph.type[pack]
+        values = (self._number(graph.value(a) or 0.0, kind) for a in graph.args[pack])
+        self._constant_array(f"c{pack}", self.types[kind], values)
+        return f"c{pack}[{at}]"
+
+    def _typed(self, node: int, text: str) -> str:
+        return f"({text} != 0)" if self.graph.type[node] == FLAG else text
+
+    def _slot(self, op: str, place: int) -> tuple[int, int]:
+        """The input that a place belongs to, and the entry in it."""
+        starts = self._starts[op]
+        slot = bisect.bisect_right(starts, place) - 1
+        while starts[slot + 1] == starts[slot]:
+            slot += 1
+        return slot, place - starts[slot]
+
+    def _in_place(self, pack: int) -> tuple[str, int] | None:
+        found = super()._in_place(pack)
+        if found is None or found[0] == "table":
+            return found
+        op, first = found
+        last = first + len(self.graph.args[pack]) - 1
+        return found if self._slot(op, first)[0] == self._slot(op, last)[0] else None
+
+    def _carries(self) -> list[tuple[int, int]]:
+        """Every node of the carry that is read, and its place."""
+        graph = self.graph
+        read = (n for n in sorted(self.schedule.live) if graph.op[n] == "state")
+        return [(n, self._starts["state"][graph.aux[n][0]] + graph.aux[n][1]) for n in read]
+
+
+class _CWriter(_ScalarWriter):
+    def _buffer(self, op: str, place: int, j: int, at: str = "0") -> str:
+        slot, entry = self._slot(op, place)
+        return f"{self._names[op][slot]}[{entry if at == '0' else f'{entry} + {at}' if entry else at}]"
+
+    def body(self, names: Names, following: Sequence[int], outputs: Sequence[int]) -> None:
+        self._lines.append("{")
+        for name in (*names.rows, *names.nows):
+            self._line(f"(void){name};")
+        if names.carries:
+            self._line("(void)state;")
+        for node, place in self._carries():
+            slot, entry = self._slot("state", place)
+            value = self._typed(node, f"state->{names.carries[slot]}[{entry}]")
+            self._line(f"const {self._type(node)} s{place} = {value};")
+        self._block(self.schedule.block(ROW))
+        self._block(self.schedule.block(STEP))
+        done = 0
+        for name, size in zip(names.outputs, self.layout.outputs, strict=True):
+            for e in range(size):
+                self._line(f"{name}[{e}] = {self._cast(outputs[done + e])};")
+            done += size
+        for place, node in enumerate(following):
+            slot, entry = self._slot("state", place)
+            if self._ref(node, 0) != f"s{place}":
+                self._line(f"state->{names.carries[slot]}[{entry}] = {self._cast(node)};")
+        self._lines.append("}")
+
+    def _cast(self, node: int) -> str:
+        return f"({self.real}){self._ref(node, 0)}" if self.graph.type[node] == FLAG else self._ref(node, 0)
+
+
+def c_text(
+    graph: Graph,
+    layout: Layout,
+    following: Sequence[int],
+    outputs: Sequence[int],
+    *,
+    name: str,
+    names: Names,
+    start: Sequence[float],
+    note: str = "",
+) -> str:
+    """Return a C99 header with one step of a program: it needs math.h, and no memory but the stack.
+
+    The carry is ``struct NAME_state``, which ``NAME_start`` sets to its first numbers and ``NAME`` advances.
+    All numbers, flags and integers too, are double (float for a program of float32).
+
+    Args:
+        graph, layout, following, outputs: as in `emission.emit`.
+        name: of the function.
+        names: of its arguments.
+        start: the numbers that the carry starts with.
+        note: lines for the comment at its head.
+
+    Raises:
+        ValueError: if a name is not one of C, or is there twice.
+    """
+    given_names = (name, *(each for part in names for each in part))
+    for each in given_names:
+        if not _IDENTIFIER.fullmatch(each) or _OWN.fullmatch(each) or (each == "state" and names.carries):
+            raise ValueError(f"`c_source(name=...)` must be given names of C that are free; got {each!r}.")
+    if len(set(given_names)) < len(given_names):
+        raise ValueError(f"`c_source(...)` must have every name once; got {', '.join(given_names)}.")
+    writer = _CWriter(graph, Schedule(graph, following, outputs), layout, names)
+    real, guard = writer.real, f"{name.upper()}_H"
+    lines = ["/*", *(f" * {line}".rstrip() for line in note.replace("*/", "* /").splitlines()), " */"]
+    lines = [*(lines if note else []), f"#ifndef {guard}", f"#define {guard}", "", "#include <math.h>", ""]
+    arguments = [f"{name}_state *state"] if names.carries else []
+    if names.carries:
+        fields = zip(names.carries, layout.carries, strict=True)
+        lines += [
+            "typedef struct {",
+            *(f"    {real} {n}[{size}];" for n, size in fields),
+            f"}} {name}_state;",
+        ]
+        lines += ["", f"static inline void {name}_start({name}_state *state)", "{"]
+        places = [(n, e) for n, size in zip(names.carries, layout.carries, strict=True) for e in range(size)]
+        lines += [
+            f"    state->{n}[{e}] = {writer._number(x, REAL)};"
+            for (n, e), x in zip(places, start, strict=True)
+        ]
+        lines += ["}", ""]
+    for given, sizes in ((names.nows, layout.nows), (names.rows, layout.rows)):
+        arguments += [f"const {real} {n}[{size}]" for n, size in zip(given, sizes, strict=True)]
+    arguments += [f"{real} {n}[{size}]" for n, size in zip(names.outputs, layout.outputs, strict=True)]
+    lines += [f"static inline void {name}({', '.join(arguments)})"]
+    lines += writer._function(lambda: writer.body(names, following, outputs))
+    return "\n".join([*lines, "", "#endif"]) + "\n"
+
+
+class _CudaWriter(_ScalarWriter):
+    def __init__(self, *given: Any, shared: Sequence[str]) -> None:
+        super().__init__(*given)
+        self._shared = frozenset(shared)
+
+    def _fma(self, a: str, b: str, c: str) -> str:
+        return f"fma{self._suffix}({a}, {b}, {c})"
+
+    def _buffer(self, op: str, place: int, j: int, at: str = "0") -> str:
+        slot, entry = self._slot(op, place)
+        name, sizes = self._names[op][slot], {"row": self.layout.rows, "now": self.layout.nows}[op]
+        index = f"{entry}" if at == "0" else f"({entry} + {at})"
+        if op == "now":
+            index = f"(t * {sizes[slot]} + {index})"
+        return f"{name}[{index}]" if name in self._shared else f"{name}[{index} * rows + r]"
+
+    def body(self, names: Names, following: Sequence[int], outputs: Sequence[int]) -> None:
+        self._lines.append("{")
+        self._line("const long long rows = row_count, times = time_count, every = period;")
+        self._line("const long long r = (long long)blockIdx.x * blockDim.x + threadIdx.x;")
+        self._line("if (r >= rows) return;")
+        self._block(self.schedule.block(ROW))
+        for place, node in enumerate(following):
+            slot, entry = self._slot("state", place)
+            value = self._typed(node, f"{names.carries[slot]}[{entry} * rows + r]")
+            self._line(f"{self._type(node)} s{place} = {value};")
+        self._line("for (long long t = 0; t < times; ++t) {")
+        self._level += 1
+        self._block(self.schedule.block(STEP))
+        self._line("if (t % every == 0) {")
+        done = 0
+        for name, size in zip(names.outputs, self.layout.outputs, strict=True):
+            for e in range(size):
+                value = self._ref(outputs[done + e], 0)
+                self._line(f"    {name}[(t / every * {size} + {e}) * rows + r] = {value};")
+            done += size
+        self._line("}")
+        self._assign([(f"s{k}", node) for k, node in enumerate(following)])
+        self._level -= 1
+        self._line("}")
+        for place in range(len(following)):
+            slot, entry = self._slot("state", place)
+            self._line(f"{names.carries[slot]}_end[{entry} * rows + r] = s{place};")
+        self._lines.append("}")
+
+
+def cuda_text(
+    graph: Graph,
+    layout: Layout,
+    following: Sequence[int],
+    outputs: Sequence[int],
+    *,
+    name: str,
+    shared: Sequence[str],
+) -> str:
+    """Return CUDA C of a program, a thread a row, all times inside.
+
+    ``NAME(row_count, time_count, period, row..., now..., carry..., carry_end..., out...)``; the numbers of a
+    time lie together, entry after entry, a row beside the other: (times, entries, rows), without rows where
+    shared.
+
+    Args:
+        graph, layout, following, outputs: as in `emission.emit`.
+        name: of the kernel.
+        shared: which of row0, row1, ..., now0, ... all rows share.
+    """
+    names = Names(
+        *([f"{kind}{k}" for k in range(len(sizes))] for kind, sizes in zip(_KINDS, layout, strict=True))
+    )
+    writer = _CudaWriter(graph, Schedule(graph, following, outputs), layout, names, shared=shared)
+    read = [f"const {writer.real} *{n}" for n in (*names.rows, *names.nows, *names.carries)]
+    written = [f"{writer.real} *{n}" for n in (*(f"{c}_end" for c in names.carries), *names.outputs)]
+    arguments = ["int row_count", "int time_count", "int period", *read, *written]
+    lines = [f'extern "C" __global__ void {name}({", ".join(arguments)})']
+    lines += writer._function(lambda: writer.body(names, following, outputs))
+    return "\n".join(lines) + "\n"
+
+
+_KINDS = ("row", "now", "carry", "out")

@@ -1,0 +1,340 @@
+"""Statements of a scalar program, in C or C++: what all back ends have in common."""
+
+from __future__ import annotations
+
+import abc
+import math
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from .graph import Graph
+from .schedule import Schedule
+from .tracer import NotLoweredError
+
+_INPUTS = ("const", "elem", "result", "collect", "carry", "state", "row", "now")
+_ARRAYS = ("pack", "map", "dot", "collect")
+
+
+class Layout(NamedTuple):
+    """How many entries a program reads and writes."""
+
+    rows: Sequence[int]  # of every input that a row has once
+    nows: Sequence[int]  # of every input of a time
+    carries: Sequence[int]
+    outputs: Sequence[int]
+
+
+class Writer(abc.ABC):
+    """Writes the statements of blocks and loops; a back end says how numbers are read and operations spelt.
+
+    Args:
+        graph: the nodes.
+        schedule: where each is computed.
+        layout: of inputs and outputs.
+        types: how the types of nodes are spelt.
+        copies: independent copies of every variable that advance side by side.
+    """
+
+    def __init__(
+        self, graph: Graph, schedule: Schedule, layout: Layout, types: dict[str, str], copies: int = 1
+    ) -> None:
+        self.types = types
+        self.graph, self.schedule, self.layout, self.copies = graph, schedule, layout, copies
+        self._index: dict[Any, int] = {}
+        self._lines: list[str] = []
+        self._arrays: set[str] = set()  # of constants, written already
+        self._level = 1
+        self._stored: dict[int, int] = {}  # what the steps read from memory instead
+        self._starts = {
+            "row": np.cumsum([0, *layout.rows]).tolist(),
+            "now": np.cumsum([0, *layout.nows]).tolist(),
+            "state": np.cumsum([0, *layout.carries]).tolist(),
+        }
+
+    # What a back end says.
+
+    @abc.abstractmethod
+    def _operation(self, op: str, values: Sequence[str], type: str) -> str:
+        """The expression of an operation."""
+
+    @abc.abstractmethod
+    def _fma(self, a: str, b: str, c: str) -> str:
+        """The expression of a b + c."""
+
+    @abc.abstractmethod
+    def _literal(self, node: int) -> str:
+        """The expression of a constant."""
+
+    @abc.abstractmethod
+    def _buffer(self, op: str, place: int, j: int, at: str = "0") -> str:
+        """The expression of an input, ``at`` further on in its buffer."""
+
+    @abc.abstractmethod
+    def _table(self, pack: int, at: str) -> str:
+        """The expression of an entry of an array of constants."""
+
+    def _typed(self, node: int, text: str) -> str:
+        """A number from memory as the node's type."""
+        return text
+
+    def _function(self, body: Callable[[], None]) -> list[str]:
+        self._lines, self._arrays = [], set()
+        body()
+        return self._lines
+
+    def _constant_array(self, name: str, kind: str, values: Iterable[str]) -> None:
+        """Write an array at the head of the function, once."""
+        if name not in self._arrays:
+            self._arrays.add(name)
+            self._lines.insert(1, f"    static const {kind} {name}[] = {{{', '.join(values)}}};")
+
+    def _line(self, text: str) -> None:
+        self._lines.append("    " * self._level + text)
+
+    def _assign(self, pairs: Sequence[tuple[str, int]]) -> None:
+        """Variables of a loop become other nodes, all at once."""
+        for j in range(self.copies):
+            named = {name + self._copy(j): self._ref(node, j) for name, node in pairs}
+            kinds = {name + self._copy(j): self._type(node) for name, node in pairs}
+            moving = [(name, value) for name, value in named.items() if name != value]
+            late = {name for name, _ in moving}
+            for value in dict.fromkeys(value for _, value in moving if value in late):
+                self._line(f"const {kinds[value]} old_{value} = {value};")
+            for name, value in moving:
+                self._line(f"{name} = {f'old_{value}' if value in late else value};")
+
+    # Statements.
+
+    def _block(self, nodes: Sequence[int]) -> None:
+        for node in nodes:
+            op = self.graph.op[node]
+            if op in _INPUTS:
+                continue
+            if op == "loop":
+                self._loop(self.graph.aux[node])
+            elif op in ("pack", "map", "dot"):
+                getattr(self, f"_{op}")(node)
+            else:
+                for j in range(self.copies):
+                    self._line(
+                        f"const {self._type(node)} t{node}{self._copy(j)} = {self._expression(node, j)};"
+                    )
+
+    def _loop(self, number: int) -> None:
+        loop, live = self.graph.loops[number], sorted(self.schedule.carries.get(number, ()))
+        for k in live:
+            kind = self._type(loop.carry[k])
+            for j in range(self.copies):
+                self._line(f"{kind} l{number}_{k}{self._copy(j)} = {self._ref(loop.initial[k], j)};")
+        for k in sorted(self.schedule.collected(number)):
+            kind, size = self._type(loop.collected[k][0]), loop.count * len(loop.collected[k])
+            self._line(f"{kind} y{number}_{k}[{size * self.copies}];")
+        self._line(f"for (int i{number} = 0; i{number} < {loop.count}; ++i{number}) {{")
+        self._level += 1
+        self._block(self.schedule.body(number))
+        for k in sorted(self.schedule.collected(number)):
+            size = len(loop.collected[k])
+            for e, node in enumerate(loop.collected[k]):
+                for j in range(self.copies):
+                    place = f"(i{number} * {size} + {e}) * {self.copies} + {j}"
+                    self._line(f"y{number}_{k}[{place}] = {self._ref(node, j)};")
+        self._assign([(f"l{number}_{k}", loop.following[k]) for k in live])
+        self._level -= 1
+        self._line("}")
+
+    def _pack(self, node: int) -> None:
+        if self._in_place(node) is not None:
+            return
+        self._declare(node)
+        for k, entry in enumerate(self.graph.args[node]):
+            for j in range(self.copies):
+                self._line(f"a{node}[{k * self.copies + j}] = {self._ref(entry, j)};")
+
+    def _map(self, node: int) -> None:
+        op, shape, *places = self.graph.aux[node]
+        self._declare(node)
+        sizes = [s for s in shape if s > 1]
+        indices = [self._affine(place, sizes) for place in places]
+        names = [f"p{d}" for d in range(len(sizes))]
+        whole = all(index is not None for index in indices)
+        if not whole:
+            names, sizes = ["p"], [math.prod(sizes)]
+        for name, size in zip(names, sizes, strict=True):
+            self._line(f"for (int {name} = 0; {name} < {size}; ++{name}) {{")
+            self._level += 1
+        target = self._sum(names, [math.prod(sizes[d + 1 :]) for d in range(len(sizes))], 0)
+        for j in range(self.copies):
+            values = []
+            for operand, place, index in zip(self.graph.args[node], places, indices, strict=True):
+                at = self._sum(names, *index) if whole and index is not None else self._lookup(place)
+                values.append(self._ref(operand, j) if place is None else self._read(operand, at, j))
+            result = self._operation(op, values, self.graph.type[node])
+            self._line(f"a{node}[({target}) * {self.copies} + {j}] = {result};")
+        for _ in names:
+            self._level -= 1
+            self._line("}")
+
+    def _dot(self, node: int) -> None:
+        """Sums of products, some rows of them in registers at once."""
+        outs, count, *places = self.graph.aux[node]
+        kind = self._type(node)
+        self._declare(node)
+        indices = [self._affine(place, [outs, count]) for place in places]
+        panel = min(outs, 4 if self.copies > 1 else 8)
+        full = outs // panel
+        for start, rows, passes in ((0, panel, full), (full * panel, outs % panel, 1)):
+            if rows == 0 or passes == 0:
+                continue
+            self._line(f"for (int p = {start}; p < {start + rows * passes}; p += {rows}) {{")
+            self._level += 1
+            for r in range(rows):
+                for j in range(self.copies):
+                    self._line(
+                        f"{kind} r{r}{self._copy(j)} = {self._product(node, indices, places, r, '0', j)[2]};"
+                    )
+            self._line(f"for (int q = 1; q < {count}; ++q) {{")
+            self._level += 1
+            for r in range(rows):
+                for j in range(self.copies):
+                    a, b, _ = self._product(node, indices, places, r, "q", j)
+                    name = f"r{r}{self._copy(j)}"
+                    self._line(f"{name} = {self._fma(a, b, name)};")
+            self._level -= 1
+            self._line("}")
+            for r in range(rows):
+                for j in range(self.copies):
+                    self._line(f"a{node}[(p + {r}) * {self.copies} + {j}] = r{r}{self._copy(j)};")
+            self._level -= 1
+            self._line("}")
+
+    def _product(self, node: int, indices: Any, places: Any, r: int, q: str, j: int) -> tuple[str, str, str]:
+        count, values = self.graph.aux[node][1], []
+        for operand, place, index in zip(self.graph.args[node], places, indices, strict=True):
+            if place is None:
+                values.append(self._ref(operand, j))
+            elif index is not None:
+                values.append(self._read(operand, self._sum([f"(p + {r})", q], *index), j))
+            else:
+                values.append(self._read(operand, self._lookup(place, f"(p + {r}) * {count} + {q}"), j))
+        return values[0], values[1], f"{values[0]} * {values[1]}"
+
+    def _declare(self, node: int) -> None:
+        self._line(f"{self._type(node)} a{node}[{self._size(node) * self.copies}];")
+
+    def _affine(self, place: Any, sizes: Sequence[int]) -> tuple[list[int], int] | None:
+        """Strides and start of places in an array, None where they are irregular."""
+        if place is None:
+            return [0] * len(sizes), 0
+        table = np.array(place).reshape(sizes)
+        start, strides = int(table.flat[0]), []
+        for d in range(len(sizes)):
+            step = np.diff(table, axis=d)
+            if step.size and not (step == step.flat[0]).all():
+                return None
+            strides.append(int(step.flat[0]) if step.size else 0)
+        return strides, start
+
+    def _sum(self, names: Sequence[str], strides: Sequence[int], start: int) -> str:
+        terms = [n if s == 1 else f"{n} * {s}" for n, s in zip(names, strides, strict=True) if s]
+        return " + ".join([*terms, str(start)] if start or not terms else terms)
+
+    def _lookup(self, place: Any, at: str = "p") -> str:
+        if place is None:
+            return "0"
+        name = f"m{self._index.setdefault(('places', place), len(self._index))}"
+        self._constant_array(name, "short", map(str, place))
+        return f"{name}[{at}]"
+
+    # Expressions.
+
+    def _expression(self, node: int, j: int) -> str:
+        graph, args = self.graph, self.graph.args[node]
+        op = graph.op[node]
+        if node in self.schedule.fused:
+            place = self.schedule.fused[node]
+            product = graph.args[args[place]]
+            a, b = (self._ref(factor, j) for factor in product)
+            other = self._ref(args[1 - place], j)
+            if op == "add":
+                return self._fma(a, b, other)
+            return self._fma(f"-{a}", b, other) if place == 1 else self._fma(a, b, f"-{other}")
+        if op == "load":
+            _, at, stride = graph.aux[node]
+            return self._read(args[0], f"{at} + i{graph.aux[node][0]} * {stride}", j)
+        return self._operation(op, [self._ref(a, j) for a in args], graph.type[node])
+
+    def _ref(self, node: int, j: int) -> str:
+        graph, op, copy = self.graph, self.graph.op[node], self._copy(j)
+        if op == "const":
+            return self._literal(node)
+        if op == "elem":
+            return self._read(graph.args[node][0], str(graph.aux[node]), j)
+        if op in ("row", "now"):
+            slot, k = graph.aux[node]
+            return self._typed(node, self._buffer(op, self._starts[op][slot] + k, j))
+        if op == "state":
+            slot, k = graph.aux[node]
+            return f"s{self._starts[op][slot] + k}{copy}"
+        if op in ("carry", "result"):
+            if op == "result" and node in self._stored:
+                return self._typed(node, self._buffer("row", self._stored[node], j))
+            number, k = graph.aux[node]
+            return f"l{number}_{k}{copy}"
+        if node in self._stored:
+            return self._typed(node, self._buffer("row", self._stored[node], j))
+        return f"t{node}{copy}"
+
+    def _read(self, array: int, at: str, j: int) -> str:
+        """Entry ``at`` of an array."""
+        graph = self.graph
+        if graph.op[array] == "pack" and all(graph.op[a] == "const" for a in graph.args[array]):
+            return self._table(array, at)
+        if array in self._stored:
+            return self._typed(array, self._buffer("row", self._stored[array], j, at))
+        place = self._in_place(array)
+        if place is not None:
+            return self._typed(array, self._buffer(*place, j, at))
+        name = f"a{array}"
+        if graph.op[array] == "collect":
+            number, k, _ = graph.aux[array]
+            name = f"y{number}_{k}"
+        return f"{name}[{at}]" if self.copies == 1 else f"{name}[({at}) * {self.copies} + {j}]"
+
+    def _in_place(self, pack: int) -> tuple[str, int] | None:
+        """Where in a buffer of inputs the entries of a pack lie one after the other already."""
+        graph = self.graph
+        if graph.op[pack] != "pack":
+            return None
+        args = graph.args[pack]
+        op = graph.op[args[0]]
+        if op == "const" and all(graph.op[a] == "const" for a in args):
+            return "table", 0
+        if op not in ("row", "now") or any(graph.op[a] != op for a in args):
+            return None
+        places = [self._starts[op][graph.aux[a][0]] + graph.aux[a][1] for a in args]
+        first = places[0]
+        return (op, first) if places == list(range(first, first + len(places))) else None
+
+    def _size(self, node: int) -> int:
+        graph, op = self.graph, self.graph.op[node]
+        if op == "pack":
+            return int(graph.aux[node])
+        if op == "map":
+            return math.prod(graph.aux[node][1])
+        if op == "collect":
+            return int(graph.aux[node][2])
+        return int(graph.aux[node][0]) if op == "dot" else 1
+
+    def _is_array(self, node: int) -> bool:
+        return self.graph.op[node] in _ARRAYS
+
+    def _type(self, node: int) -> str:
+        kind = self.graph.type[node]
+        if kind not in self.types:
+            raise NotLoweredError("float64 inside a program of float32 has no lanes here")
+        return self.types[kind]
+
+    def _copy(self, j: int) -> str:
+        return f"_{j}" if self.copies > 1 else ""

@@ -1,0 +1,256 @@
+"""Tensor operations of one row, written down as a scalar program while they run."""
+
+from __future__ import annotations
+
+import math
+import traceback
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from .graph import FLAG, REAL, ROW, WHOLE, WIDE, Graph, Ids
+
+_OWN = (str(Path(__file__).parent), str(Path(torch.__file__).parent))
+LARGE = 64  # entries above which an operation on a tensor stays a loop over an array in memory
+_READS = ("_local_scalar_dense", "equal", "is_nonzero", "nonzero", "allclose", "masked_select")
+
+
+class NotLoweredError(Exception):
+    """A program that cannot be compiled: the operation, and the line of user code that asked for it."""
+
+    def __init__(self, reason: str) -> None:
+        super().__init__(f"{reason}{_where()}")
+
+
+def _where() -> str:
+    """The innermost line of code outside of torch and this compiler."""
+    for frame in reversed(traceback.extract_stack()):
+        if not frame.filename.startswith((*_OWN, "<")):
+            return f" at {frame.filename}:{frame.lineno}: {frame.line}"
+    return ""
+
+
+class Tracer(TorchDispatchMode):
+    """Runs torch on a batch of one row and keeps beside every storage the nodes of its entries.
+
+    Views need no rule: they see the nodes of the storage that they look at. What does not depend on an input
+    is a constant and is not written down. Derivatives arrive here as ordinary operations.
+
+    Args:
+        graph: written.
+        lower: the nodes of what an operation returns, `lowering.lower`.
+        learning: whether somebody may want a derivative with respect to a constant.
+    """
+
+    def __init__(
+        self, graph: Graph, lower: Callable[..., Any], learning: bool = False, widened: bool = False
+    ) -> None:
+        super().__init__()  # type: ignore[no-untyped-call]
+        self.graph, self._lower, self._learning, self._widened = graph, lower, learning, widened
+        self.inside = 0  # loops around what is traced now
+        self._storages: dict[int, tuple[Any, Ids]] = {}  # keeps the storages: an address is used once
+
+    def kind(self, dtype: torch.dtype) -> str:
+        """The type of nodes for a dtype.
+
+        Raises:
+            NotLoweredError: where there is none.
+        """
+        if dtype == torch.bool:
+            return FLAG
+        if not dtype.is_floating_point and not dtype.is_complex:
+            return WHOLE
+        if dtype == (torch.float32 if self.graph.single else torch.float64):
+            return REAL
+        if dtype == torch.float32 and self._widened:  # a float32 program whose numbers are carried in double
+            return REAL
+        if dtype == torch.float64:
+            return WIDE
+        raise NotLoweredError(f"{dtype} has no lanes here")
+
+    def attach(self, tensor: Tensor, nodes: Ids) -> Tensor:
+        """Let the entries of a new tensor be these nodes."""
+        if tensor.numel():
+            storage = tensor.untyped_storage()
+            held = np.zeros(storage.nbytes() // tensor.element_size(), dtype=np.int64)
+            self._storages[storage.data_ptr()] = (storage, held)
+            self._view(held, tensor)[...] = nodes
+        return tensor
+
+    def input(self, like: Tensor, op: str, slot: Any, depth: int = ROW) -> Tensor:
+        """A tensor whose entries are new inputs; its values are those of ``like``."""
+        tensor = like.detach().clone(memory_format=torch.contiguous_format)
+        kind = self.kind(tensor.dtype)
+        new = [self.graph.add(op, (), kind, (slot, k), depth) for k in range(tensor.numel())]
+        return self.attach(tensor, np.array(new, dtype=np.int64).reshape(tensor.shape))
+
+    def traced(self, tensor: Tensor) -> bool:
+        """Whether anything of it depends on an input."""
+        if tensor.numel() == 0 or tensor._is_zerotensor():  # of forward mode: zeros without memory
+            return False
+        return tensor.untyped_storage().data_ptr() in self._storages
+
+    def nodes(self, value: Any, kind: str | None = None) -> Ids:
+        """The nodes of a tensor's or number's entries, as one type."""
+        if isinstance(value, Tensor):
+            own = self.kind(value.dtype)
+            if self.traced(value):
+                found = self._view(self._storages[value.untyped_storage().data_ptr()][1], value)
+            else:
+                found = self._constants(value, own)
+        else:
+            own = FLAG if isinstance(value, bool) else (kind or REAL)
+            found = np.array(self.graph.constant(value, own), dtype=np.int64)
+        if kind is None or kind == own:
+            return found
+        return self.each(lambda n: self.graph.convert(n, kind), found)
+
+    def each(self, function: Callable[..., int], *arrays: Ids) -> Ids:
+        """The function of every entry of arrays that broadcast."""
+        spread = np.broadcast_arrays(*arrays)
+        flat = [array.reshape(-1).tolist() for array in spread]
+        out = [function(*entries) for entries in zip(*flat, strict=True)]
+        return np.array(out, dtype=np.int64).reshape(spread[0].shape)
+
+    def map(self, op: str, *arrays: Ids) -> Ids:
+        """An operation of every entry of arrays that broadcast: scalar by scalar, or a loop over many."""
+        graph = self.graph
+        spread = np.broadcast_arrays(*arrays)
+        if spread[0].size > LARGE and not self._folds(spread):
+            operands = [self._operand(part.reshape(-1)) for part in spread]
+            type = FLAG if op in ("lt", "le", "eq", "ne") else graph.type[int(spread[-1].flat[0])]
+            aux = (op, spread[0].shape, *(places for _, places in operands))
+            array = graph.add("map", [node for node, _ in operands], type, aux)
+            return self.entries(array, type, spread[0].size).reshape(spread[0].shape)
+        if op == "where":
+            return self.each(graph.where, *spread)
+        return self.each(lambda *entries: graph.apply(op, *entries), *spread)
+
+    def cast(self, array: Ids, kind: str) -> Ids:
+        """Every entry as another type."""
+        return self.each(lambda node: self.graph.convert(node, kind), array)
+
+    def total(self, array: Ids) -> Ids:
+        """The sum over the last dimension."""
+        graph = self.graph
+        if array.size > LARGE and array.shape[-1] > 1:
+            node, places = self._operand(array.reshape(-1))
+            if places is not None and graph.op[node] == "map" and graph.aux[node][0] == "mul":
+                product, inner = graph.args[node], graph.aux[node][2:]
+                maps = [None if m is None else tuple(m[p] for p in places) for m in inner]
+                return self._dot(product[0], maps[0], product[1], maps[1], array.shape)
+            one = graph.constant(1.0, graph.type[int(array.flat[0])])
+            return self._dot(one, None, node, places, array.shape)
+        out: Ids = array[..., 0]
+        for k in range(1, array.shape[-1]):
+            out = self.map("add", out, array[..., k])
+        return out
+
+    def products(self, a: Ids, b: Ids) -> Ids:
+        """The sum over the last dimension of the product of arrays that broadcast."""
+        a, b = np.broadcast_arrays(a, b)
+        if a.size > LARGE and a.shape[-1] > 1 and not self._folds((a, b)):
+            return self._dot(*self._operand(a.reshape(-1)), *self._operand(b.reshape(-1)), a.shape)
+        return self.total(self.map("mul", a, b))
+
+    def _dot(self, a: int, at: Any, b: int, by: Any, shape: Sequence[int]) -> Ids:
+        """Sums of products as a loop: shape (..., K), summed over K."""
+        kind = self.graph.type[b]
+        outs = math.prod(shape[:-1])
+        array = self.graph.add("dot", (a, b), kind, (outs, shape[-1], at, by))
+        return self.entries(array, kind, outs).reshape(shape[:-1])
+
+    def _folds(self, arrays: Sequence[Ids]) -> bool:
+        op = self.graph.op
+        return all(op[n] == "const" for array in arrays for n in set(array.reshape(-1).tolist()))
+
+    def _operand(self, flat: Ids) -> tuple[int, tuple[int, ...] | None]:
+        """What a loop over these nodes reads: one node for all, or an array and the places in it."""
+        if (flat == flat[0]).all():
+            return int(flat[0]), None
+        array, places = self.array(flat, self.graph.type[int(flat[0])])
+        return array, tuple(places.tolist())
+
+    def array(self, flat: Ids, kind: str) -> tuple[int, Ids]:
+        """An array that holds these nodes, and their places in it."""
+        graph, first = self.graph, int(flat[0])
+        nodes = flat.tolist()
+        if graph.op[first] == "elem":
+            array = graph.args[first]
+            if all(graph.op[n] == "elem" and graph.args[n] == array for n in nodes):
+                return array[0], np.array([graph.aux[n] for n in nodes], dtype=np.int64)
+        few, places = np.unique(flat, return_inverse=True)
+        if 4 * len(few) <= len(nodes):  # a tensor that was broadcast
+            return self.pack(few, kind), places.reshape(-1)
+        return self.pack(flat, kind), np.arange(len(nodes))
+
+    def pack(self, flat: Ids, kind: str) -> int:
+        """A new array of these nodes."""
+        return self.graph.add("pack", flat.tolist(), kind, len(flat))
+
+    def entries(self, array: int, kind: str, count: int) -> Ids:
+        """The nodes of the entries of an array."""
+        new = [self.graph.add("elem", (array,), kind, k) for k in range(count)]
+        return np.array(new, dtype=np.int64)
+
+    def _constants(self, tensor: Tensor, kind: str) -> Ids:
+        numbers = tensor.detach().reshape(-1).tolist()
+        return np.array([self.graph.constant(n, kind) for n in numbers], dtype=np.int64).reshape(tensor.shape)
+
+    def _view(self, held: Ids, tensor: Tensor) -> Ids:
+        strides = [8 * s for s in tensor.stride()]
+        return np.lib.stride_tricks.as_strided(held[tensor.storage_offset() :], tensor.shape, strides)
+
+    def _dispatch(
+        self, func: Any, types: Any, args: Sequence[Any] = (), kwargs: dict[str, Any] | None = None
+    ) -> Any:
+        kwargs = kwargs or {}
+        tensors = [a for a in _leaves((args, kwargs)) if isinstance(a, Tensor)]
+        if self._learning and any(t.requires_grad and not self.traced(t) for t in tensors):
+            raise NotLoweredError("a derivative with respect to a constant of the program may be wanted")
+        if not any(self.traced(tensor) for tensor in tensors):
+            return func(*args, **kwargs)
+        name = func._schema.name.removeprefix("aten::")
+        if name in _READS:
+            raise NotLoweredError(f"`{func}` reads a value of a row")
+        if name.endswith("_") and not name.endswith("__"):
+            return self._in_place(func, name.removesuffix("_"), args, kwargs)
+        if any(argument.alias_info and argument.alias_info.is_write for argument in func._schema.arguments):
+            raise NotLoweredError(f"`{func}` writes to an argument")
+        out = func(*args, **kwargs)
+        results = [o for o in _leaves(out) if isinstance(o, Tensor)]
+        if all(self.traced(result) or not result.numel() for result in results):
+            return out  # views
+        nodes = self._lower(self, func, name, out, args, kwargs)
+        for result, entries in zip(results, nodes if isinstance(nodes, list) else [nodes], strict=True):
+            self.attach(result, np.broadcast_to(entries, result.shape))
+        return out
+
+    def _in_place(self, func: Any, name: str, args: Sequence[Any], kwargs: dict[str, Any]) -> Tensor:
+        """x.f_(...): the nodes of x become those of x.f(...)."""
+        target: Tensor = args[0]
+        if not self.traced(target):  # a tensor of constants that a row's numbers go into
+            storage = target.untyped_storage()
+            whole = torch.as_strided(target, (storage.nbytes() // target.element_size(),), (1,), 0)
+            self.attach(whole, self._constants(whole, self.kind(target.dtype)))
+        nodes = self._lower(self, func, name, target, args, kwargs)
+        held = self._storages[target.untyped_storage().data_ptr()][1]
+        self._view(held, target)[...] = nodes
+        return target
+
+
+# Set here and not in the class, where torch would wrap the method and import its compiler, three seconds.
+Tracer.__torch_dispatch__ = Tracer._dispatch  # type: ignore[assignment]
+
+
+def _leaves(value: Any) -> list[Any]:
+    if isinstance(value, list | tuple):
+        return [leaf for part in value for leaf in _leaves(part)]
+    if isinstance(value, dict):
+        return [leaf for part in value.values() for leaf in _leaves(part)]
+    return [value]

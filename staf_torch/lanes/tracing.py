@@ -1,0 +1,100 @@
+"""A module as one graph of tensor operations: what every format starts from."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any, Literal
+
+import torch
+from torch import Tensor, fx, nn
+from torch._decomp import core_aten_decompositions
+from torch.export import Dim, ExportedProgram
+from torch.fx.experimental.proxy_tensor import make_fx
+
+from ..numerics.checks import integer, trailing
+from .float64_constants import lift_numbers
+
+_TRACED = 3  # rows of the batch while tracing: a size that no other dimension is taken for by chance
+
+
+def trace(module: nn.Module, example: Tensor, *, batch: int | None = None) -> ExportedProgram:
+    """The module as a `torch.export` program of core operations, with its constants folded.
+
+    Derivatives inside the module become ordinary operations.
+
+    Args:
+        module: (B, n) -> a tensor or a tuple of tensors.
+        example: an input, (B, n) with any B; its values do not matter, its dtype does.
+        batch: B; any by default.
+
+    Raises:
+        ValueError: if an argument breaks its rule, or the module cannot be traced for every batch.
+    """
+    trailing("trace", "example", example, dims=2)
+    rows = _TRACED if batch is None else integer("trace", "batch", batch, least=1)
+    x = example[:1].detach().expand(rows, -1).clone()
+    shapes = ({0: Dim("batch", min=1)},) if batch is None else None
+    module = module.eval().requires_grad_(False)
+    with warnings.catch_warnings(), torch.no_grad():
+        warnings.simplefilter("ignore")  # of the tracer, about its own internals
+        try:
+            # First to operations, derivatives and all, which `torch.export` alone does not take.
+            mode: Literal["symbolic", "real"] = "symbolic" if batch is None else "real"
+            table: Any = core_aten_decompositions()
+            graph = make_fx(module, table, tracing_mode=mode, _allow_non_fake_inputs=True)(x)
+            graph = lift_numbers(fold(graph))
+            program: ExportedProgram = torch.export.export(graph, (x,), dynamic_shapes=shapes)
+            decomposed: ExportedProgram = program.run_decompositions({})
+            return decomposed
+        except Exception as error:  # the tracer raises errors of all sorts
+            raise ValueError(
+                f"`{type(module).__name__}` cannot be exported for "
+                f"{'any batch' if batch is None else f'a batch of {batch}'}: {str(error).splitlines()[0]}"
+            ) from error
+
+
+def fold(graph: fx.GraphModule) -> fx.GraphModule:
+    """The same graph with every operation on constants alone done once, here."""
+    known: dict[fx.Node, Any] = {}
+    for node in graph.graph.nodes:
+        if node.op == "get_attr":
+            known[node] = _attribute(graph, str(node.target))
+        elif node.op == "call_function" and all(parent in known for parent in node.all_input_nodes):
+            if not node.all_input_nodes and not _returns_tensor(node):
+                continue
+            args, kwargs = fx.map_arg((node.args, node.kwargs), known.__getitem__)
+            assert callable(node.target)
+            known[node] = node.target(*args, **kwargs)
+    for number, (node, value) in enumerate(known.items()):
+        if node.op == "get_attr" or not isinstance(value, Tensor):
+            continue
+        if all(user in known for user in node.users):
+            continue
+        name = f"folded_{number}"
+        graph.register_buffer(name, value.detach().clone())
+        with graph.graph.inserting_before(node):
+            constant = graph.graph.get_attr(name)
+        constant.meta = dict(node.meta)
+        node.replace_all_uses_with(constant)
+    graph.graph.eliminate_dead_code()
+    used = {str(node.target) for node in graph.graph.nodes if node.op == "get_attr"}
+    for name, buffer in list(graph.named_buffers()):
+        if name in used:
+            setattr(graph, name, buffer.detach().clone())  # not a view of more than a file should hold
+        else:
+            delattr(graph, name)
+    graph.recompile()
+    return graph
+
+
+def _attribute(graph: fx.GraphModule, path: str) -> Any:
+    found: Any = graph
+    for part in path.split("."):
+        found = getattr(found, part)
+    return found
+
+
+def _returns_tensor(node: fx.Node) -> bool:
+    return isinstance(node.meta.get("val"), Tensor) and not any(
+        isinstance(size, torch.SymInt) for size in node.meta["val"].shape
+    )

@@ -1,0 +1,92 @@
+"""Nested tuples, lists, dictionaries and named tuples of tensors as flat lists, and back."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Iterator
+from typing import Any
+
+from torch import Tensor
+
+
+def flatten(tree: Any) -> tuple[list[Any], Hashable]:
+    """The tensors of a tree, and what is needed to build the tree again from others.
+
+    Anything that is neither a container nor a tensor (None, numbers) is part of the structure.
+    """
+    leaves: list[Any] = []
+    return leaves, _structure(tree, leaves)
+
+
+def unflatten(structure: Any, leaves: Iterator[Any]) -> Any:
+    """The tree of a structure with these leaves."""
+    kind, parts = structure
+    if kind == "leaf":
+        return next(leaves)
+    if kind == "fixed":
+        return parts
+    if isinstance(kind, tuple):
+        return {name: unflatten(part, leaves) for name, part in zip(kind, parts, strict=True)}
+    values = [unflatten(part, leaves) for part in parts]
+    return kind(*values) if hasattr(kind, "_fields") else kind(values)
+
+
+def _structure(tree: Any, leaves: list[Any]) -> Hashable:
+    kind = type(tree)
+    if kind is Tensor or kind is Shared:  # first what there is most of
+        leaves.append(tree)
+        return _LEAF
+    if kind is tuple:
+        return (kind, tuple([_structure(part, leaves) for part in tree])) if tree else _EMPTY
+    if isinstance(tree, dict):
+        return tuple(tree), tuple(_structure(part, leaves) for part in tree.values())
+    if isinstance(tree, list | tuple):
+        return kind, tuple(_structure(part, leaves) for part in tree)
+    if isinstance(tree, Tensor):
+        leaves.append(tree)
+        return _LEAF
+    return "fixed", tree
+
+
+_LEAF, _EMPTY = ("leaf", None), (tuple, ())
+
+
+class Shared:
+    """A tensor without the dimension of rows: one for all rows.
+
+    Args:
+        tensor: (...), or (T, ...) among the inputs of every time.
+    """
+
+    def __init__(self, tensor: Tensor) -> None:
+        self.tensor = tensor
+
+
+def labels(structure: Any, prefix: str) -> list[str]:
+    """A name for every leaf of a structure: its keys and fields, numbers where there are none."""
+    kind, parts = structure
+    if kind == "leaf":
+        return [prefix]
+    if kind == "fixed":
+        return []
+    named = kind if isinstance(kind, tuple) else getattr(kind, "_fields", None)
+    if named is None:
+        named = [f"{prefix}{k}" for k in range(len(parts))]
+    elif prefix not in _ROOTS:
+        named = [f"{prefix}_{name}" for name in named]
+    return [label for name, part in zip(named, parts, strict=True) for label in labels(part, str(name))]
+
+
+_ROOTS = ("row", "now", "carry", "out")
+
+
+def plain(leaf: Any) -> Tensor:
+    """The tensor of a leaf, shared or not."""
+    tensor: Tensor = leaf.tensor if type(leaf) is Shared else leaf
+    return tensor
+
+
+def moved(tree: Any, device: str) -> Any:
+    """The tree with its tensors on a device."""
+    leaves, structure = flatten(tree)
+    to = (Shared(x.tensor.to(device)) if isinstance(x, Shared) else x.to(device) for x in leaves)
+    return unflatten(structure, to)

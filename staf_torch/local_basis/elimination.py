@@ -1,0 +1,171 @@
+"""Degree by degree: which combinations of point values see nothing of the lower polynomials."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..centers.layouts import exponents
+
+_SINGULAR = 1e-12  # of the monomials' Fischer norm 1: below this a direction belongs to a higher degree
+
+
+class Elimination(NamedTuple):
+    """Orthonormal functionals lambda_j(p) = sum_i q_ij p(u_i), with lambda_j(p) = 0 for every polynomial
+    of degree below k_j, ordered by k_j."""
+
+    functionals: Tensor  # q, (..., M, M), orthonormal columns
+    strengths: Tensor  # sigma_j > 0, (..., M): norm of lambda_j on the homogeneous polynomials of degree k_j
+    degrees: tuple[int, ...]  # k_j, M of them, non-decreasing
+
+
+class Degrees(NamedTuple):
+    """What fixes the local basis of points for good, and every projective map of the points keeps."""
+
+    monomials: tuple[tuple[tuple[int, ...], ...], ...]
+    """Exponents of as many monomials of degree 0, 1, ... as tell the points apart at that degree."""
+    reach: float
+    """max |u_i| when the degrees were found, the unit of length of the basis."""
+
+    @classmethod
+    def of(cls, record: dict[str, Any]) -> Degrees:
+        """From `_asdict`, also where tuples have become lists."""
+        monomials = (tuple(tuple(row) for row in block) for block in record["monomials"])
+        return cls(tuple(monomials), float(record["reach"]))
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """How many functionals each degree has."""
+        return tuple(len(block) for block in self.monomials)
+
+    @property
+    def each(self) -> tuple[int, ...]:
+        """k_j, the degree of every functional: M of them, non-decreasing."""
+        return tuple(k for k, block in enumerate(self.monomials) for _ in block)
+
+
+def eliminate(directions: Tensor) -> Elimination:
+    """The functionals of the points u_i: (M, n), distinct, max |u_i| = 1.
+
+    The monomial matrix u_i^alpha sqrt(k! / alpha!), |alpha| = k, is reduced one degree k at a time by
+    orthogonal row operations; the left singular vectors of what is left of degree k are the functionals
+    of degree k, and the rest goes on to degree k + 1. Distinct points are told apart by some degree
+    below M, so that the process ends.
+
+    Raises:
+        ValueError: if points coincide to rounding.
+
+    Source: de Boor and Ron, "The least solution for the polynomial interpolation problem", Math. Z. 210
+    (1992); Fornberg, Larsson and Flyer, SIAM J. Sci. Comput. 33 (2011).
+    """
+    count = directions.shape[-2]
+    rest = torch.eye(count, dtype=directions.dtype, device=directions.device)
+    functionals, strengths, degrees = [], [], []
+    for degree in itertools.count():
+        monomials = homogeneous(directions, degree)
+        left, sigma, _ = torch.linalg.svd(rest.mT @ monomials, full_matrices=True)
+        size = int((sigma > _SINGULAR).sum())
+        functionals.append(rest @ left[..., :size])
+        strengths.append(sigma[..., :size])
+        degrees += [degree] * size
+        rest = rest @ left[..., size:]
+        if rest.shape[-1] == 0:
+            break
+        if degree > count:
+            raise ValueError(
+                f"`StateFollowingCenters(directions=...)` must be told apart by polynomials: "
+                f"{rest.shape[-1]} of {count} directions coincide with others to rounding."
+            )
+    return Elimination(torch.cat(functionals, dim=-1), torch.cat(strengths, dim=-1), tuple(degrees))
+
+
+def degrees_of(directions: Tensor) -> Degrees:
+    """The degrees of the points u_i, (M, n), and monomials that tell them apart.
+
+    Raises:
+        ValueError: if points coincide to rounding.
+    """
+    points = directions.detach().double()
+    reach = float(points.norm(dim=-1).max()) or 1.0  # one center at the state itself
+    points = points / reach
+    found = eliminate(points)
+    monomials, taken = [], 0
+    for degree in range(found.degrees[-1] + 1):
+        size = found.degrees.count(degree)
+        rest = found.functionals[:, taken : taken + size].mT @ homogeneous(points, degree)
+        alpha = exponents(points.shape[-1], degree)[list(_independent(rest, size))]
+        monomials.append(tuple(tuple(row) for row in alpha.tolist()))
+        taken += size
+    return Degrees(tuple(monomials), reach)
+
+
+def functionals_of(points: Tensor, degrees: Degrees) -> Elimination:
+    """Functionals as in `eliminate`, as a smooth function of the points that has one value.
+
+    The singular vectors of `eliminate` turn freely within a degree: coefficients in that basis would mean
+    another function on another machine, and the basis would have no derivative. Here the functionals are
+    the orthogonal factor of the chosen monomials, by ascending degree, with a positive diagonal: column j
+    is orthogonal to all polynomials of lower degree.
+
+    Args:
+        points: u, (..., M, n), as many as the degrees were found for.
+        degrees: which monomials.
+    """
+    q, r = torch.linalg.qr(_chosen(points, degrees))
+    diagonal = r.diagonal(dim1=-2, dim2=-1)
+    q = torch.where(diagonal.unsqueeze(-2) < 0, -q, q)
+    strengths, start = [], 0
+    for size in degrees.sizes:
+        block = r[..., start : start + size, start : start + size]
+        strengths.append(block.norm(dim=-1))
+        start += size
+    return Elimination(q, torch.cat(strengths, dim=-1), degrees.each)
+
+
+def _chosen(points: Tensor, degrees: Degrees) -> Tensor:
+    """u_i^alpha sqrt(k! / alpha!) for the chosen alpha, by ascending degree: (..., M, n) -> (..., M, M)."""
+    alpha = [row for block in degrees.monomials for row in block]
+    norm = [
+        math.sqrt(math.factorial(sum(row)) / math.prod([math.factorial(a) for a in row])) for row in alpha
+    ]
+    table = _powers(points, len(degrees.monomials) - 1)
+    monomials = torch.tensor(norm, dtype=points.dtype, device=points.device)
+    for axis in range(points.shape[-1]):
+        monomials = monomials * table[..., axis, [row[axis] for row in alpha]]
+    return monomials
+
+
+def _independent(matrix: Tensor, count: int) -> tuple[int, ...]:
+    """Greedy choice of columns far from the span of those before it, the same whatever the rounding."""
+    rest, chosen = matrix.clone(), []
+    for _ in range(count):
+        square = rest.square().sum(0)
+        # The first that is long enough and not the longest: symmetric layouts have ties.
+        column = int((square >= 0.37 * square.max()).to(torch.int8).argmax())
+        chosen.append(column)
+        unit = rest[:, column] / rest[:, column].norm()
+        rest = rest - unit[:, None] * (unit @ rest)
+    return tuple(sorted(chosen))
+
+
+def homogeneous(directions: Tensor, degree: int) -> Tensor:
+    """u_i^alpha sqrt(k! / alpha!) for all |alpha| = k, so that rows have the norm |u_i|^k: (..., M, C)."""
+    alpha = exponents(directions.shape[-1], degree)
+    norm = [math.sqrt(math.factorial(degree) / math.prod(map(math.factorial, row))) for row in alpha.tolist()]
+    table = _powers(directions, degree)
+    monomials = torch.tensor(norm, dtype=directions.dtype, device=directions.device)
+    for axis, exponent in enumerate(alpha.unbind(-1)):
+        monomials = monomials * table[..., axis, exponent.to(directions.device)]
+    return monomials
+
+
+def _powers(points: Tensor, top: int) -> Tensor:
+    """1, u, ..., u^top: (..., top + 1). By products: the second derivative of pow is NaN at 0^0 and 0^1."""
+    powers = [torch.ones_like(points)]
+    for _ in range(top):
+        powers.append(powers[-1] * points)
+    return torch.stack(powers, dim=-1)

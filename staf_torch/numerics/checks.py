@@ -1,0 +1,169 @@
+"""The checks behind every ``ValueError`` that a user can meet, in one place, and what modules hold.
+
+Each check returns the value it was given, converted where that is safe, so that a constructor reads
+``self.width = positive("GaussianKernel", "width", width)``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Sequence
+
+import torch
+from torch import Tensor, nn
+
+from . import COMMAND_LINE as COMMAND_LINE
+from . import fail as fail
+from . import show
+
+
+def number(call: str, name: str, value: object) -> float | Tensor:
+    """A finite real number, or a tensor of them."""
+    if isinstance(value, Tensor):
+        if not value.is_floating_point():
+            raise fail(call, name, "must be a floating-point tensor", value)
+        if not value.is_meta and not bool(torch.isfinite(value).all()):
+            raise fail(call, name, "must be finite", value)
+        return value
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise fail(call, name, "must be a number", value)
+    if not math.isfinite(value):
+        raise fail(call, name, "must be finite", value)
+    return float(value)
+
+
+def real(call: str, name: str, value: object) -> float:
+    """A finite Python number."""
+    if isinstance(value, Tensor):
+        raise fail(call, name, "must be a number", value)
+    checked = number(call, name, value)
+    assert isinstance(checked, float)
+    return checked
+
+
+def positive(call: str, name: str, value: object) -> Tensor:
+    """A positive number or tensor of them, as a floating-point tensor (float64 from a number)."""
+    checked = number(call, name, value)
+    tensor = torch.as_tensor(checked, dtype=None if isinstance(checked, Tensor) else torch.float64)
+    if not tensor.is_meta and not bool((tensor > 0).all()):
+        raise fail(call, name, "must be positive", value)
+    return tensor
+
+
+def non_negative(call: str, name: str, value: object) -> Tensor:
+    """Like `positive`, zero allowed."""
+    checked = number(call, name, value)
+    tensor = torch.as_tensor(checked, dtype=None if isinstance(checked, Tensor) else torch.float64)
+    if not tensor.is_meta and not bool((tensor >= 0).all()):
+        raise fail(call, name, "must not be negative", value)
+    return tensor
+
+
+def positive_real(call: str, name: str, value: object) -> float:
+    """A positive Python number."""
+    checked = real(call, name, value)
+    if checked <= 0:
+        raise fail(call, name, "must be positive", value)
+    return checked
+
+
+def integer(call: str, name: str, value: object, least: int) -> int:
+    """An integer that is at least ``least``."""
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise fail(call, name, "must be an integer", value)
+    if value < least:
+        raise fail(call, name, f"must be at least {least}", value)
+    return value
+
+
+def flag(call: str, name: str, value: object) -> bool:
+    """True or false, and nothing that merely looks like it."""
+    if not isinstance(value, bool):
+        raise fail(call, name, "must be true or false", value)
+    return value
+
+
+def choice(call: str, name: str, value: object, allowed: Collection[object]) -> object:
+    """One of a few allowed values."""
+    if value not in allowed:
+        listed = ", ".join(repr(a) for a in allowed)
+        raise fail(call, name, f"must be one of {listed}", value)
+    return value
+
+
+def vector(call: str, name: str, value: object, length: int | None = None) -> list[float]:
+    """A sequence of finite numbers, of a stated length where one is stated."""
+    if isinstance(value, str) or not isinstance(value, Sequence):
+        raise fail(call, name, "must be a list of numbers", value)
+    numbers = [v for v in value if isinstance(v, int | float) and not isinstance(v, bool)]
+    if len(numbers) != len(value):
+        raise fail(call, name, "must be a list of numbers", list(value))
+    if length is not None and len(numbers) != length:
+        raise fail(call, name, f"must have {length} entries, one a state", list(value))
+    if not all(math.isfinite(v) for v in numbers):
+        raise fail(call, name, "must be finite", list(value))
+    return [float(v) for v in numbers]
+
+
+def trailing(call: str, name: str, value: Tensor, dims: int, last: int | None = None) -> Tensor:
+    """A tensor with at least ``dims`` dimensions, the last of a stated size where one is stated."""
+    if not isinstance(value, Tensor):
+        raise fail(call, name, "must be a tensor", value)
+    if not value.is_floating_point():
+        raise fail(call, name, "must be a floating-point tensor", value)
+    if value.dim() < dims:
+        raise ValueError(
+            f"`{call}({name}=...)` must have at least {dims} dimensions; got the shape {tuple(value.shape)}."
+        )
+    if last is not None and value.shape[-1] != last:
+        raise ValueError(
+            f"`{call}({name}=...)` must have {last} entries in its last dimension; "
+            f"got the shape {tuple(value.shape)}."
+        )
+    return value
+
+
+def sampled(target: object, values: object, points: Tensor, outputs: int | None = None) -> Tensor:
+    """What a target returned at ``points`` (..., n): one value a point, (...), or k outputs, (..., k)."""
+    name = getattr(target, "__name__", type(target).__name__)
+    if not isinstance(values, Tensor):
+        raise ValueError(f"The target `{name}` must return a tensor; got {show(values)}.")
+    expected = tuple(points.shape[:-1]) + (() if outputs is None else (outputs,))
+    if tuple(values.shape) != expected:
+        form = "(...)" if outputs is None else f"(..., {outputs})"
+        raise ValueError(
+            f"The target `{name}` must map points of shape (..., n) to values of shape {form}: "
+            f"{tuple(points.shape)} must give {expected}; got {tuple(values.shape)}."
+        )
+    return values
+
+
+def hold(module: nn.Module, name: str, value: Tensor) -> None:
+    """Keep a hyperparameter: an `nn.Parameter` as one, to be learned; any other tensor as a fixed buffer."""
+    if isinstance(value, nn.Parameter):
+        module.register_parameter(name, value)
+    else:
+        module.register_buffer(name, value)
+
+
+def scalar_hyperparameters(holder: object) -> dict[str, float]:
+    """Return the numbers in which objects of one tensor batch may differ, by argument of their constructor.
+
+    Args:
+        holder: a kernel, radius, target or plant, whose fixed scalars are buffers; or an update law, whose
+            numbers are attributes. An attribute ``step_size`` is the argument ``step``, as in every law.
+    """
+    if isinstance(holder, nn.Module):
+        scalars = {n: t for n, t in holder._buffers.items() if t is not None and t.dim() == 0}
+        return {name: float(t) for name, t in scalars.items() if t.is_floating_point()}
+    numbers = {name: value for name, value in vars(holder).items() if isinstance(value, float)}
+    return {"step" if name == "step_size" else name: value for name, value in numbers.items()}
+
+
+def shown(module: nn.Module) -> str:
+    """The module's own tensors for its repr: numbers by value, others by shape."""
+    own = [(n, t) for n, t in (*module._parameters.items(), *module._buffers.items()) if t is not None]
+    return ", ".join(
+        f"{name}={float(t.detach()):.6g}" if t.dim() == 0 and not t.is_meta else f"{name}={tuple(t.shape)}"
+        for name, t in own
+    )

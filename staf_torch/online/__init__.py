@@ -1,0 +1,4 @@
+"""Online regression on streams of samples."""
+
+from .regressor import StaFRegressor as StaFRegressor
+from .river_adapter import RiverRegressor as RiverRegressor

@@ -1,0 +1,240 @@
+// The Kalman filter of kalman_filter.py with a Gaussian kernel, a stream in every lane.
+//
+// All arithmetic is double, whatever the table holds. No number passes from one lane to another, and a stream
+// alone takes the same path as a thousand: the bits of a stream do not depend on what stands beside it.
+// DIM, COUNT (centers) and OUTPUTS are given on the command line of the compiler.
+
+#pragma once
+
+#include <cmath>
+#include <cstdint>
+#include <limits>
+
+#define INLINE static inline __attribute__((always_inline))
+typedef double V __attribute__((vector_size(64)));
+typedef int64_t Mask __attribute__((vector_size(64)));  // lanes of 0 or -1
+constexpr int lanes = 8, n = DIM, M = COUNT, K = OUTPUTS;
+constexpr double infinity = std::numeric_limits<double>::infinity();
+constexpr double surprise = 25, streak_limit = 8;
+
+INLINE V all(double x) { return V{} + x; }
+INLINE V maximum(V a, V b) { return a > b ? a : b; }
+INLINE V minimum(V a, V b) { return a < b ? a : b; }
+INLINE V absolute(V a) { return a < 0 ? -a : a; }
+INLINE V root(V a) {
+    for (int l = 0; l < lanes; ++l) a[l] = std::sqrt(a[l]);
+    return a;
+}
+INLINE Mask finite(V a) { return a - a == V{}; }
+INLINE bool any(Mask m) {
+    int64_t found = 0;
+    for (int l = 0; l < lanes; ++l) found |= m[l];
+    return found != 0;
+}
+
+// e^x to an ulp or two; 0 below -708, e^709 above it.
+INLINE V exponential(V x) {
+    const V at = x > 709. ? all(709.) : x < -708. ? all(-708.) : x, shifted = at * 1.4426950408889634 + 0x1.8p52;
+    const V whole = shifted - 0x1.8p52, r = (at - whole * 0x1.62e42feep-1) - whole * 0x1.a39ef35793c76p-33;
+    constexpr double over[] = {1. / 6227020800, 1. / 479001600, 1. / 39916800, 1. / 3628800, 1. / 362880,
+                               1. / 40320, 1. / 5040, 1. / 720, 1. / 120, 1. / 24, 1. / 6, 1. / 2, 1, 1};
+    V sum = all(over[0]);
+    for (int j = 1; j < 14; ++j) sum = sum * r + over[j];
+    const Mask power = ((Mask)shifted - (Mask)all(0x1.8p52) + 1022) << 52;  // 2^709 e^.3 fits in two steps
+    const V found = sum * (V)power * 2.;
+    return x < -708. ? V{} : x != x ? x : found;
+}
+
+struct Functions {  // of local_functions.py, in float64
+    const double *offsets, *squares, *newton, *gram;  // d (M, n), |d|^2 (M), C (M, M), K0 (M, M)
+    double rate, reach;                               // q; the largest |d|
+};
+
+struct Filter {  // of lanes streams
+    V anchor[n], last[n], mean[K][M], learned[M][M], errors[K], largest, since;
+};
+
+struct Law {
+    V ratio, forgetting, slack2, robust, base;  // base: variance of the process in the units of y, at first
+    double tiny, most, limit;  // the square root of the precision of the streams, their largest number, its 3/4th power
+};
+
+INLINE void functions_at(const Functions &f, const V *z, V *psi) {
+    V e[M];
+    for (int j = 0; j < M; ++j) {
+        V apart{};
+        for (int i = 0; i < n; ++i) {
+            const V d = z[i] - f.offsets[j * n + i];
+            apart += d * d;
+        }
+        e[j] = exponential(f.rate / 2 * (f.squares[j] - apart));
+    }
+    for (int i = 0; i < M; ++i) {
+        psi[i] = V{};
+        for (int j = 0; j < M; ++j) psi[i] += f.newton[j * M + i] * e[j];
+    }
+}
+
+// u <- T u and D <- T D T' for a step h, and nothing where the step is too far for the kernel.
+static void transfer(const Functions &f, const V *h, V mean[K][M], V learned[M][M]) {
+    V square{}, before[M], after[M], T[M][M], half[M][M];
+    for (int i = 0; i < n; ++i) square += (h[i] / f.reach) * (h[i] / f.reach);
+    const Mask near = square <= 1e16;
+    V step[n];
+    square = V{};
+    for (int i = 0; i < n; ++i) step[i] = near ? h[i] : V{}, square += step[i] * step[i];
+    const V shift = f.rate * root(square) * f.reach, lost = f.rate * square / 2;
+    for (int j = 0; j < M; ++j) {
+        V along{};
+        for (int i = 0; i < n; ++i) along += f.offsets[j * n + i] * step[i];
+        before[j] = exponential(f.rate * along - shift);
+        after[j] = exponential(minimum(shift - f.rate * along - lost, all(700)));
+    }
+    for (int i = 0; i < M; ++i)
+        for (int l = 0; l < M; ++l) {
+            V sum{};
+            for (int j = 0; j < M; ++j) sum += before[j] * (f.gram[i * M + j] * f.newton[j * M + l]);
+            half[i][l] = sum * after[i];
+        }
+    for (int k = 0; k < M; ++k)
+        for (int l = 0; l < M; ++l) {
+            V sum{};
+            for (int i = 0; i < M; ++i) sum += f.newton[i * M + k] * half[i][l];
+            T[k][l] = near ? sum : V{};
+        }
+    for (int o = 0; o < K; ++o) {
+        V moved[M];
+        for (int k = 0; k < M; ++k) {
+            moved[k] = V{};
+            for (int l = 0; l < M; ++l) moved[k] += T[k][l] * mean[o][l];
+        }
+        for (int k = 0; k < M; ++k) mean[o][k] = moved[k];
+    }
+    for (int k = 0; k < M; ++k)
+        for (int l = 0; l < M; ++l) {
+            V sum{};
+            for (int j = 0; j < M; ++j) sum += T[k][j] * learned[j][l];
+            half[k][l] = sum;
+        }
+    for (int k = 0; k < M; ++k)
+        for (int l = 0; l <= k; ++l) {
+            V sum{};
+            for (int j = 0; j < M; ++j) sum += half[k][j] * T[l][j];
+            learned[k][l] = learned[l][k] = sum;
+        }
+}
+
+INLINE V running_scale(const Law &law, V errors, V since) {
+    const V trust = minimum(since, all(20)) / 20.;
+    return maximum(errors * trust + law.base * (1. - trust), 1e-6 * law.base);
+}
+
+INLINE Mask is_fresh(const Filter &s) {
+    V sum{};
+    for (int i = 0; i < n; ++i) sum += s.anchor[i];
+    return sum != sum;
+}
+
+// Mean and variance of the next y at x.
+static void predict(const Functions &f, const Law &law, const Filter &s, const V *x, V mean[K], V variance[K]) {
+    V z[n], psi[M];
+    for (int i = 0; i < n; ++i) z[i] = (x[i] != x[i] ? s.last[i] : x[i]) - s.anchor[i];
+    functions_at(f, z, psi);
+    V prior = all(1);
+    for (int i = 0; i < M; ++i) {
+        V sum{};
+        for (int j = 0; j < M; ++j) sum += s.learned[i][j] * psi[j];
+        prior -= psi[i] * sum;
+    }
+    const Mask fresh = is_fresh(s);
+    for (int o = 0; o < K; ++o) {
+        V sum{};
+        for (int i = 0; i < M; ++i) sum += psi[i] * s.mean[o][i];
+        mean[o] = fresh ? V{} : sum;
+        variance[o] = fresh ? law.base * (1. + law.ratio) : (prior + law.ratio) * running_scale(law, s.errors[o], s.since);
+    }
+}
+
+struct Verdict {  // on a sample
+    Mask fine, afresh, moves;
+    V streak, z[n];
+};
+
+// What is to be done with the sample: nothing is changed yet, but for the coordinates that were measured.
+INLINE Verdict judge(const Law &law, Filter &s, V *x, V *y, Mask *seen, V streak) {
+    Verdict v;
+    V size{}, sum{};
+    Mask some{}, sound{};
+    for (int i = 0; i < n; ++i) sound |= x[i] == x[i];
+    for (int i = 0; i < n; ++i) x[i] = x[i] != x[i] ? s.last[i] : x[i], sound &= finite(x[i]);
+    for (int o = 0; o < K; ++o) {
+        seen[o] = y[o] == y[o];
+        some |= seen[o];
+        y[o] = seen[o] ? y[o] : V{};
+        sound &= finite(y[o]);
+        size = maximum(size, absolute(y[o]));
+    }
+    sound &= some;
+    const Mask huge = (s.since > 0.) & (s.largest > 0.) & (size * law.tiny > s.largest);
+    const Mask small = (size > 0.) & (size < s.largest * law.tiny);
+    v.streak = sound ? (huge | small ? streak + 1. : size == 0. ? streak : V{}) : streak;
+    v.afresh = sound & ((v.streak >= streak_limit) | is_fresh(s));
+    v.fine = sound & (~huge | v.afresh);
+    for (int i = 0; i < n; ++i) {
+        v.z[i] = v.fine & ~v.afresh ? x[i] - s.anchor[i] : V{};
+        sum += v.z[i] * v.z[i];
+    }
+    v.moves = v.fine & (v.afresh | (sum > law.slack2));
+    for (int i = 0; i < n; ++i) s.last[i] = finite(x[i]) ? x[i] : s.last[i];
+    for (int o = 0; o < K; ++o) s.errors[o] = v.afresh ? V{} : s.errors[o];
+    return v;
+}
+
+// The Kalman update at z from the anchor, where the result is finite: these lanes are returned.
+INLINE Mask update(const Functions &f, const Law &law, Filter &s, const V *z, const V *y, const Mask *seen, V lapse,
+                   Mask fine) {
+    V psi[M], known[M], gain[M], change[K], spread = 1. + law.ratio, share, total{}, peak{};
+    functions_at(f, z, psi);
+    share = lapse == 1. ? law.forgetting : V{};
+    if (any(lapse != 1.))
+        for (int l = 0; l < lanes; ++l) share[l] = lapse[l] == 1. ? share[l] : std::pow(law.forgetting[l], lapse[l]);
+    for (int i = 0; i < M; ++i) {
+        V sum{};
+        for (int j = 0; j < M; ++j) sum += s.learned[i][j] * psi[j];
+        known[i] = sum * share;
+        spread -= psi[i] * known[i];
+        gain[i] = psi[i] - known[i];
+        total += gain[i] * 0.;  // not a number where one of them is not finite
+    }
+    const V rate = maximum(1. / (s.since + 1.), all(.01));
+    V size = s.largest, errors[K];
+    for (int o = 0; o < K; ++o) {
+        V error = y[o];
+        for (int i = 0; i < M; ++i) error -= psi[i] * s.mean[o][i];
+        const V square = minimum(error * error / spread, all(law.most));
+        const V limited = minimum(square, all(law.limit));
+        const V kept = minimum(law.robust * root(running_scale(law, s.errors[o], s.since) / square), all(1));
+        change[o] = seen[o] ? (law.robust < infinity ? kept : all(1)) * error / spread : V{};
+        const V counted = s.since < streak_limit ? limited : minimum(limited, surprise * s.errors[o]);
+        errors[o] = seen[o] ? s.errors[o] + rate * (counted - s.errors[o]) : s.errors[o];
+        size = maximum(size, absolute(y[o]));
+        for (int i = 0; i < M; ++i) {
+            const V next = s.mean[o][i] + gain[i] * change[o];
+            total += next * 0., peak = maximum(peak, absolute(next));
+        }
+    }
+    const Mask good = fine & (spread > 0.) & (total == 0.) & finite(spread) & (peak <= law.most);
+    const V inverse = 1. / spread;
+    s.largest = good ? size : s.largest;
+    s.since = good ? s.since + 1. : s.since;
+    for (int o = 0; o < K; ++o) {
+        s.errors[o] = good ? errors[o] : s.errors[o];
+        for (int i = 0; i < M; ++i) s.mean[o][i] = good ? s.mean[o][i] + gain[i] * change[o] : s.mean[o][i];
+    }
+    for (int i = 0; i < M; ++i)
+        for (int j = 0; j <= i; ++j) {
+            const V next = s.learned[i][j] * share + gain[i] * (gain[j] * inverse);
+            s.learned[i][j] = s.learned[j][i] = good ? next : s.learned[i][j];
+        }
+    return good;
+}

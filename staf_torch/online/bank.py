@@ -1,0 +1,153 @@
+"""A bank of local models over remembered samples and of models carried along, mixed by predictive scores."""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from ..centers import simplex
+from ..kernels import GaussianKernel
+from ..lanes.build import compiled
+from .bank_definition import BankDefinition
+from .bank_rules import CARRIED_RADIUS, CARRIED_WIDTH, BankShape, Rules, size
+from .compiled_filter import FunctionPointers
+from .local_functions import LocalFunctions
+
+_NUMBERS = 114  # in `Rules`
+
+
+class _Rules(ctypes.Structure):
+    """`Rules` of _bank.cpp: numbers, then the local functions of the filters."""
+
+    _fields_ = (("numbers", ctypes.c_double * _NUMBERS), ("functions", FunctionPointers))
+
+
+class _Call(ctypes.Structure):
+    _fields_ = (
+        ("streams", ctypes.c_int64),
+        ("mode", ctypes.c_int64),
+        *((name, ctypes.c_void_p) for name in ("table", "x", "y", "lapse", "mean", "variance", "rules")),
+    )
+
+
+class Bank:
+    """Bounded memory, local Gaussian processes on it, and carried models, for many streams.
+
+    A stream keeps C samples: the latest `RECENT` and others spread in space, as a full store gives up the
+    older of the closest pair of those that are not recent. At x a linear model (recursive least squares)
+    predicts, and 24 Gaussian processes on k samples correct what it leaves: the k nearest, without and
+    with two rates of fading by age, and the k latest, each with three widths and two noises, amplitudes
+    y'K^-1 y / k. Beside them stand eight filters (`LocalFilter`, M = n + 1), that linear model and the
+    last value.
+
+    Every member's variance is scaled by its running squared error. The members are mixed by discounted
+    scores, part Student-t likelihood with the member's variance, part with the common running error, at
+    three rates of discount; the three mixtures are mixed alike. The mixture's variance follows its running
+    squared error.
+
+    Args:
+        shape: sizes.
+        streams: S.
+        scaling: whether the units of x and y are learned, from the first 2, 5, 10, 20 and 40 samples.
+    """
+
+    def __init__(self, shape: BankShape, streams: int, scaling: bool) -> None:
+        self.shape, self.scaling, self.dtype = shape, scaling, torch.float64
+        width = CARRIED_WIDTH * math.sqrt(shape.dim)
+        functions = LocalFunctions.of(GaussianKernel(width), CARRIED_RADIUS * width * simplex(shape.dim))
+        rules = Rules.of(shape.dim, scaling)
+        pointers, self._held = FunctionPointers.of(functions)
+        self._rules = _Rules((ctypes.c_double * _NUMBERS)(*rules.numbers()), pointers)
+        self._call, self._run = _Call(), _built(shape)
+        self._definition = BankDefinition(shape, rules, functions)
+        self.table = torch.zeros(0, size(shape), dtype=torch.float64)
+        self.add(streams)
+
+    @property
+    def compiled(self) -> bool:
+        """Whether compiled code runs, and not the definition."""
+        return self._run is not None
+
+    def add(self, streams: int) -> None:
+        """Begin further streams, behind the others."""
+        old = len(self.table)
+        self.replace(torch.cat((self.table, self.table.new_zeros(streams, self.table.shape[1]))))
+        self.clear(torch.arange(old, old + streams))
+
+    def replace(self, table: Tensor) -> None:
+        """Hold these streams, (S, size), instead."""
+        self.table = table.contiguous()
+        self._call.streams, self._call.table = len(table), self.table.data_ptr()
+        self._call.rules = ctypes.addressof(self._rules)
+
+    def clear(self, rows: Tensor) -> None:
+        """Let the streams with these numbers begin anew."""
+        part = self.table[rows]
+        for stream in self._definition.each(part):
+            self._definition.clear(stream)
+        self.table[rows] = part
+
+    @property
+    def count(self) -> int:
+        """S."""
+        return len(self.table)
+
+    def keep(self, rows: Tensor) -> None:
+        """Go on with the streams with these numbers alone."""
+        self.replace(self.table[rows])
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """A copy of all that learning changes."""
+        return {"table": self.table.clone()}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Take over what `state_dict` has."""
+        self.replace(state["table"].clone())
+
+    @property
+    def learned(self) -> Tensor:
+        """Samples learned, (S,) int64."""
+        return self.table[:, 4].long()
+
+    @property
+    def skipped(self) -> Tensor:
+        """Samples skipped, (S,) int64."""
+        return self.table[:, 3].long()
+
+    def predict(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and variance of the next y at x (S, n), contiguous float64: (S, K), (S, K)."""
+        shape = len(self.table), self.shape.outputs
+        mean, variance = x.new_empty(shape), x.new_empty(shape)
+        if self._run is None:
+            streams = self._definition.each(self.table)
+            pairs = [self._definition.predict(s, point) for s, point in zip(streams, x, strict=True)]
+            return torch.stack([pair[0] for pair in pairs]), torch.stack([pair[1] for pair in pairs])
+        call = self._call
+        call.mode, call.x, call.mean, call.variance = 1, x.data_ptr(), mean.data_ptr(), variance.data_ptr()
+        self._run(ctypes.byref(call))
+        return mean, variance
+
+    def learn(self, x: Tensor, y: Tensor, lapse: Tensor | None = None) -> None:
+        """Learn one sample a stream: (S, n), (S, K), contiguous float64; time since the last sample, (S,)."""
+        if self._run is None:
+            lapses = [1.0] * len(x) if lapse is None else lapse.tolist()
+            for s, *sample in zip(self._definition.each(self.table), x, y, lapses, strict=True):
+                self._definition.learn(s, *sample)
+            return
+        call = self._call
+        call.mode, call.x, call.y = 2, x.data_ptr(), y.data_ptr()
+        call.lapse = None if lapse is None else lapse.data_ptr()
+        self._run(ctypes.byref(call))
+
+
+@functools.cache
+def _built(shape: BankShape) -> Callable[..., None] | None:
+    sizes = f"DIM={shape.dim}", f"COUNT={shape.dim + 1}", f"OUTPUTS={shape.outputs}"
+    kept = f"CAPACITY={shape.capacity}", f"NEIGHBOURS={shape.neighbours}"
+    return compiled(Path(__file__).with_name("_bank.cpp"), *sizes, *kept)

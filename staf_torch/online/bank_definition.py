@@ -1,0 +1,331 @@
+"""What `Bank` computes, in plain torch: the definition, and the fallback without a compiler.
+
+Streams are taken one by one, so that none can touch another; the members of the bank are a tensor dimension.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from .bank_rules import BankShape, Rules, layout
+from .filter_streams import units_of
+from .kalman_filter import STREAK, SURPRISE, LocalFilter, StreamState
+from .local_functions import LocalFunctions
+
+_RESET = ("skipped", "learned")  # what a stream that begins anew keeps
+
+
+class Views(dict[str, Tensor]):
+    """One stream's part of the table, by name."""
+
+    def number(self, name: str) -> float:
+        """A part that is one number."""
+        return float(self[name])
+
+
+class BankDefinition:
+    """The methods of the compiled bank on a table (S, size), in place.
+
+    Args:
+        shape: sizes.
+        rules: constants.
+        functions: local functions of the carried filters.
+    """
+
+    def __init__(self, shape: BankShape, rules: Rules, functions: LocalFunctions) -> None:
+        self.shape, self.rules, self.functions = shape, rules, functions
+        ratio = torch.full((len(rules.forgetting),), rules.carried_ratio, dtype=torch.float64)
+        forgetting = torch.tensor(rules.forgetting, dtype=torch.float64)
+        self.filter = LocalFilter(functions, ratio, forgetting, rules.carried_slack)
+
+    def each(self, table: Tensor) -> list[Views]:
+        """The streams of a table."""
+        sizes = [math.prod(dims) for _, dims in layout(self.shape)]
+        found = []
+        for row in table:
+            cells = zip(layout(self.shape), row.split(sizes), strict=True)
+            found.append(Views({name: part.view(dims) for (name, dims), part in cells}))
+        return found
+
+    def clear(self, s: Views) -> None:
+        """Begin anew."""
+        for name, part in s.items():
+            if name not in _RESET:
+                part.zero_()
+        s["last_x"].fill_(torch.nan)
+        s["asked"].fill_(torch.nan)
+        for name in ("spread", "excess", "error", "calibration"):
+            s[name].fill_(1.0)
+        s["order"].fill_(-1.0)
+        s["gap"].fill_(torch.inf)
+        s["low"].fill_(torch.inf)
+        s["high"].fill_(-torch.inf)
+        self._restart_linear(s)
+
+    def _restart_linear(self, s: Views) -> None:
+        s["covariance"].copy_(self.rules.linear_prior * torch.eye(self.shape.dim + 1, dtype=torch.float64))
+        s["linear"].zero_()
+        s["filters"].zero_()
+        s["filters"][: 2 * self.shape.dim].fill_(torch.nan)
+
+    def _units(self, s: Views) -> tuple[Tensor, Tensor]:
+        if self.rules.scaling:
+            return s["center"], s["spread"]
+        return torch.zeros_like(s["center"]), torch.ones_like(s["spread"])
+
+    def _filters(self, s: Views) -> StreamState:
+        """The carried filters as streams of a `LocalFilter`, one a lane."""
+        state = StreamState.empty(
+            s["x"], len(self.rules.forgetting), self.shape.dim, self.shape.dim + 1, len(s["error"])
+        )
+        state.table.copy_(s["filters"][:-1])
+        state.counts[3].copy_(s["filters"][-1])
+        return state
+
+    def predict(self, s: Views, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and variance at x (n,): (K,), (K,)."""
+        x = torch.where(torch.isnan(x), s["last_x"], x)
+        if s.number("count") == 0:
+            return torch.zeros_like(s["mean"]), torch.ones_like(s["mean"])
+        self._ask(s, x)
+        center, spread = (part[self.shape.dim :] for part in self._units(s))
+        return s["mean"] * spread + center, s["variance"] * spread.square()
+
+    def _ask(self, s: Views, x: Tensor) -> None:
+        """What every member says at x, and their mixture."""
+        r, n = self.rules, self.shape.dim
+        center, spread = self._units(s)
+        u = torch.cat((torch.ones(1, dtype=torch.float64), (x - center[:n]) / spread[:n]))
+        line = (s["linear"] * u).sum(-1)
+        process = self._local_processes(s, x, u[1:], line)
+        carried = self.filter.predict(self._filters(s), u[1:].expand(len(r.forgetting), -1))
+        last = ((s["last_y"] - center[n:]) / spread[n:])[:, None]
+        common = (1 + (u * (s["covariance"] * u).sum(-1)).sum()).expand_as(last)
+        means = torch.cat((process[0], carried[0].mT, line[:, None], last), 1)
+        variances = torch.cat((process[1], carried[1].mT, common, torch.ones_like(last)), 1)
+        low, high = ((s[name] - center[n:]) / spread[n:] for name in ("low", "high"))
+        wide = r.margin * (high - low)
+        means = torch.where(torch.isfinite(means), means, last)
+        means = torch.maximum(torch.minimum(means, (high + wide)[:, None]), (low - wide)[:, None])
+        s["means"].copy_(means)
+        s["variances"].copy_(torch.where(variances < 1e300, variances, 1e300))
+        weights = (s["weights"] - s["weights"].amax(-1, keepdim=True)).exp()
+        weights = torch.where(weights < r.drop, 0.0, weights)
+        weights = weights / weights.sum(-1, keepdim=True)  # (K, clocks, members)
+        middle = (weights * means[:, None]).sum(-1)
+        own = (s["variances"] * s["excess"])[:, None] + (means[:, None] - middle[..., None]).square()
+        s["mixed"].copy_(middle)
+        s["mixed_variance"].copy_((weights * own).sum(-1))
+        clocks = s["clock_weights"].softmax(-1)
+        mean = (clocks * middle).sum(-1)
+        variance = (clocks * (s["mixed_variance"] + (middle - mean[:, None]).square())).sum(-1)
+        s["mean"].copy_(mean)
+        s["variance"].copy_(torch.maximum(variance, r.floor * s["error"]) * s["calibration"])
+        s["asked"].copy_(x)
+        s["answered"].fill_(1.0)
+
+    def _apart(self, s: Views, a: Tensor, b: Tensor) -> Tensor:
+        return ((a - b) / self._units(s)[1][: self.shape.dim]).square().sum(-1)
+
+    def _local_processes(self, s: Views, x: Tensor, u: Tensor, line: Tensor) -> tuple[Tensor, Tensor]:
+        """Means and variances of the 24 local processes of what the linear model leaves: (K, 24), (K, 24)."""
+        r, n, count = self.rules, self.shape.dim, int(s.number("count"))
+        latest = s["order"][:count].argsort(descending=True)
+        nearest = latest[self._apart(s, s["x"][:count][latest], x).argsort(stable=True)]
+        center, spread = self._units(s)
+        most = min(self.shape.neighbours, count)
+        sides, rests = [], []
+        when = torch.cat((s["when"][nearest[:most]], s["time"][None]))
+        ages = (when[:, None] - when[None]).abs()
+        for chosen in (nearest[:most], latest[:most]):
+            at = (s["x"][chosen] - center[:n]) / spread[:n]
+            y = (s["y"][chosen] - center[n:]) / spread[n:]
+            rests.append((y - s["linear"][:, 0] - at @ s["linear"][:, 1:].mT).mT)  # (K, k)
+            points = torch.cat((at, u[None]))
+            square = (points[:, None] - points[None]).square().sum(-1)
+            sides.append([(-rate * square).exp() for rate in r.width_rates])
+        fades = [torch.ones_like(ages), *((-rate * ages).exp() for rate in r.fade_rates)]
+        kernels = [sides[0][w] * fade for fade in fades for w in (0, 0, 1, 1, 2, 2)]
+        kernels += [sides[1][w] for w in (0, 0, 1, 1, 2, 2)]
+        noise = torch.tensor(r.noise, dtype=torch.float64)
+        rest = torch.stack([rests[select] for select in (0, 0, 0, 1) for _ in range(6)])  # (24, K, k)
+        return _processes(torch.stack(kernels), noise, rest, line)
+
+    def _carry(self, s: Views, x: Tensor, y: Tensor, lapse: float) -> None:
+        """The linear model and the filters learn (x, y)."""
+        r, n = self.rules, self.shape.dim
+        center, spread = self._units(s)
+        u = torch.cat((torch.ones(1, dtype=torch.float64), (x - center[:n]) / spread[:n]))
+        v = (y - center[n:]) / spread[n:]
+        gain = (s["covariance"] * u).sum(-1)
+        total = 1 + (u * gain).sum()
+        s["linear"].add_((v - (s["linear"] * u).sum(-1))[:, None] * gain / total)
+        s["covariance"].sub_(gain[:, None] * gain / total)
+        if float(s["covariance"].diagonal().max()) < 100 * r.linear_prior:
+            s["covariance"].div_(r.linear_forgetting**lapse)
+        state, lanes = self._filters(s), len(r.forgetting)
+        lapses = torch.full((lanes,), lapse, dtype=torch.float64)
+        self.filter.learn(state, u[1:].expand(lanes, -1), v.expand(lanes, -1), lapses)
+        s["filters"][:-1].copy_(state.table)
+        s["filters"][-1].copy_(state.counts[3])
+
+    def _rescale(self, s: Views) -> None:
+        """Units from the samples in the store, which has all of them; the carried models relearn."""
+        count = int(s.number("count"))
+        samples = torch.cat((s["x"], s["y"]), 1)[:count]
+        center, spread = units_of(samples)
+        s["center"].copy_(center)
+        s["spread"].copy_(spread)
+        s["low"].fill_(torch.inf)
+        s["high"].fill_(-torch.inf)
+        self._restart_linear(s)
+        for j in range(count):
+            if self._beyond(s, s["x"][j], s["y"][j]):
+                continue
+            torch.minimum(s["low"], s["y"][j], out=s["low"])
+            torch.maximum(s["high"], s["y"][j], out=s["high"])
+            self._carry(s, s["x"][j], s["y"][j], float(s["when"][j] - s["when"][j - 1]) if j else 1.0)
+
+    def _beyond(self, s: Views, x: Tensor, y: Tensor) -> bool:
+        both = torch.cat((x, y))
+        if not bool((both.abs() < 1e150).all()):
+            return True
+        near = (both - s["center"]).abs() < self.rules.far * s["spread"]
+        return s.number("clock") >= 40 and not bool(near.all())
+
+    def _judge(self, s: Views, value: Tensor, told: Tensor) -> None:
+        """The members are judged by their prediction of value (K,), where it was told."""
+        r, t = self.rules, s.number("clock")
+        error = value - s["mean"]
+        z2 = error.square() / (s["variance"] / s["calibration"]).clamp(min=1e-300)
+        before, floor = s["calibration"].clone(), max(r.error_rate, 1 / (t + 5))
+        found = before + floor * (torch.minimum(z2, SURPRISE * before) - before)
+        s["calibration"].copy_(torch.where(told, found.clamp(1e-6, 1e2), before))
+        old, rate = s["error"].clone(), max(r.error_rate, 1 / (t + 1))
+        s["error"].copy_(
+            torch.where(told, old + rate * (torch.minimum(error.square(), SURPRISE * old) - old), old)
+        )
+        away, v = value[:, None] - s["means"], s["variances"]
+        score = _scores(r, away, v * s["excess"], s["error"][:, None])
+        over = _scores(r, value[:, None] - s["mixed"], s["mixed_variance"], s["error"][:, None])
+        usual, pace = s["excess"].clone(), max(r.members_rate, 1 / (t + 3))
+        ratio = torch.minimum(away.square() / v.clamp(min=1e-30), SURPRISE * usual)
+        excess = (usual + pace * (ratio - usual)).clamp(1e-4, 1e8)
+        discounts = torch.tensor(r.discounts, dtype=torch.float64)[:, None]
+        weights = _reweighed(r, discounts * s["weights"] + score[:, None])
+        clocks = _reweighed(r, r.discount * s["clock_weights"] + over)
+        s["excess"].copy_(torch.where(told[:, None], excess, usual))
+        s["weights"].copy_(torch.where(told[:, None, None], weights, s["weights"]))
+        s["clock_weights"].copy_(torch.where(told[:, None], clocks, s["clock_weights"]))
+
+    def _keep(self, s: Views, x: Tensor, y: Tensor) -> None:
+        """Keep (x, y). A full store gives up the older of the closest pair of those that are not recent."""
+        old, count = s.number("clock") - self.rules.recent, int(s.number("count"))
+        order, gap = s["order"], s["gap"]
+        if count < self.shape.capacity:
+            slot, count = count, count + 1
+            s["count"].fill_(count)
+        else:
+            among = order <= old
+            closest = among & (gap == torch.where(among, gap, torch.inf).min())
+            slot = int(torch.where(closest, order, torch.inf).argmin())
+            others = among.clone()
+            others[slot] = False
+            distance = self._apart(s, s["x"], s["x"][slot])
+            for i in (others & (distance == gap)).nonzero().flatten().tolist():
+                rest = others.clone()
+                rest[i] = False
+                gap[i] = torch.where(rest, self._apart(s, s["x"], s["x"][i]), torch.inf).min()
+        s["x"][slot], s["y"][slot], s["when"][slot] = x, y, s["time"]
+        order[slot], gap[slot] = s["clock"], torch.inf
+        for i in (order == old + 1).nonzero().flatten().tolist():
+            distance = torch.where(
+                (order <= old) & (order >= 0), self._apart(s, s["x"], s["x"][i]), torch.inf
+            )
+            gap[i] = torch.minimum(gap[i], distance.min())
+            torch.minimum(gap, distance, out=gap)
+
+    def learn(self, s: Views, given: Tensor, told: Tensor, lapse: float) -> None:
+        """Learn one sample: (n,), (K,)."""
+        x = torch.where(torch.isnan(given), s["last_x"], given)
+        s["last_x"].copy_(torch.where(given.abs() < 1e150, given, s["last_x"]))
+        s["time"].add_(lapse)
+        seen = ~torch.isnan(told)
+        sound = bool(
+            torch.isfinite(x).all() & seen.any() & ~torch.isnan(given).all() & ~torch.isinf(told).any()
+        )
+        if not sound:
+            s["skipped"].add_(1)
+            return
+        known = s.number("count") > 0
+        if known and not (s.number("answered") and bool((x == s["asked"]).all())):
+            self._ask(s, x)
+        center, spread = (part[self.shape.dim :] for part in self._units(s))
+        y = torch.where(seen, told, s["mean"] * spread + center)
+        s["answered"].zero_()
+        s["far"].copy_(s["far"] + 1 if self._beyond(s, x, y) else torch.zeros(()))
+        if s.number("far") >= STREAK:  # the stream has gone elsewhere for good
+            time = s["time"].clone()
+            self.clear(s)
+            s["last_x"].copy_(x)
+            s["time"].copy_(time)
+            s["far"].fill_(float(STREAK) if self._beyond(s, x, y) else 0.0)
+        elif known and s.number("far") == 0:
+            self._judge(s, (y - center) / spread, seen)
+        if s.number("far") > 0:
+            s["skipped"].add_(1)
+            return
+        torch.minimum(s["low"], y, out=s["low"])
+        torch.maximum(s["high"], y, out=s["high"])
+        s["last_y"].copy_(y)
+        s["clock"].add_(1)
+        s["learned"].add_(1)
+        self._keep(s, x, y)
+        if s.number("clock") in self.rules.learned_at:
+            self._rescale(s)
+        else:
+            self._carry(s, x, y, lapse)
+
+
+def _processes(kernels: Tensor, noise: Tensor, rest: Tensor, line: Tensor) -> tuple[Tensor, Tensor]:
+    """Gaussian processes at the last of k + 1 points from the others, by elimination.
+
+    Args:
+        kernels: (members, k + 1, k + 1).
+        noise: variances in units of the amplitudes, (members,).
+        rest: values, (members, K, k).
+        line: what is added to the means, (K,).
+    """
+    a, count = kernels.clone(), kernels.shape[1] - 1
+    a[:, :count, :count] += noise[:, None, None] * torch.eye(count, dtype=a.dtype)
+    seen, mean = torch.zeros_like(noise), torch.zeros_like(rest[..., 0])
+    amplitude, right = torch.zeros_like(mean), rest.clone()
+    for k in range(count):
+        root = torch.maximum(a[:, k, k], noise).sqrt()  # a Schur complement is no smaller than the noise
+        column = a[:, k + 1 :, k] / root[:, None]
+        beta = right[..., k] / root[:, None]
+        mean, amplitude = mean + beta * column[:, -1:], amplitude + beta.square()
+        seen = seen + column[:, -1].square()
+        right[..., k + 1 :] -= beta[..., None] * column[:, None, :-1]
+        a[:, k + 1 :, k + 1 :] -= column[:, :, None] * column[:, None]
+    amplitude = amplitude / count
+    variance = torch.maximum(amplitude * (1 + noise - seen)[:, None], amplitude * noise[:, None])
+    return (line + mean).mT, variance.mT
+
+
+def _scores(r: Rules, error: Tensor, variance: Tensor, common: Tensor) -> Tensor:
+    """Part Student-t likelihood with a member's variance, part with the common squared error."""
+    variance, common = variance.clamp(min=1e-30), common.clamp(min=1e-30)
+    student: Callable[[Tensor], Tensor] = lambda v: (  # noqa: E731
+        -0.5 * (r.heavy + 1) * (error.square() / (r.heavy * v)).log1p()
+    )
+    return r.likelihood * (student(variance) - 0.5 * variance.log()) + (1 - r.likelihood) * student(common)
+
+
+def _reweighed(r: Rules, logs: Tensor) -> Tensor:
+    """Logarithms of the normalised weights, a share of them equal."""
+    return ((1 - r.share) * logs.softmax(-1) + r.share / logs.shape[-1]).log()

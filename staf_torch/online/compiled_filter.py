@@ -1,0 +1,111 @@
+"""The filter of many streams in one call of compiled code, and of one stream in a microsecond."""
+
+from __future__ import annotations
+
+import ctypes
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from ..lanes.build import compiled
+from .kalman_filter import LocalFilter, StreamState
+from .local_functions import LocalFunctions
+
+_REALS = {torch.float32: "float", torch.float64: "double"}
+_MOST = 66  # centers: beyond, unrolled loops and a stack frame of M^2 vectors no longer pay
+
+
+class FunctionPointers(ctypes.Structure):
+    """`Functions` of _filter.hpp."""
+
+    _fields_ = (
+        ("offsets", ctypes.c_void_p),
+        ("squares", ctypes.c_void_p),
+        ("newton", ctypes.c_void_p),
+        ("gram", ctypes.c_void_p),
+        ("rate", ctypes.c_double),
+        ("reach", ctypes.c_double),
+    )
+
+    @classmethod
+    def of(cls, functions: LocalFunctions) -> tuple[FunctionPointers, list[Tensor]]:
+        """The pointers, and the tensors that must live as long."""
+        offsets = functions.offsets.double().contiguous()
+        zero = torch.zeros_like(offsets[0])
+        gram = functions.kernel.core(zero, offsets, offsets).contiguous()
+        assert functions.shared is not None
+        assert functions.rate is not None
+        held = [offsets, offsets.square().sum(-1), functions.shared.contiguous(), gram]
+        reach = math.sqrt(max(float(offsets.square().sum(-1).amax()), 1e-300))
+        pointers = [tensor.data_ptr() for tensor in held]
+        return cls(*pointers, float(functions.rate), reach), held
+
+
+class _Call(ctypes.Structure):
+    _fields_ = (
+        ("streams", ctypes.c_int64),
+        ("stride", ctypes.c_int64),
+        ("mode", ctypes.c_int64),
+        *((name, ctypes.c_void_p) for name in ("table", "counts", "x", "y", "lapse", "ratio", "forgetting")),
+        ("mean", ctypes.c_void_p),
+        ("variance", ctypes.c_void_p),
+        ("functions", FunctionPointers),
+        *((name, ctypes.c_double) for name in ("slack2", "robust", "base", "tiny", "most", "limit")),
+    )
+
+
+class CompiledFilter:
+    """`LocalFilter.predict` and `learn` of one `StreamState`, a stream in every vector lane.
+
+    Args:
+        definition: the filter; a kernel with a constant diagonal and exponent rate, on the processor.
+        state: of the streams. Its tensors must not be replaced while this is in use.
+        call: the compiled function.
+    """
+
+    def __init__(self, definition: LocalFilter, state: StreamState, call: Callable[..., None]) -> None:
+        pointers, self._held = FunctionPointers.of(definition.functions)
+        self._held += [state.table, state.counts, definition.ratio, definition.forgetting]
+        streams = state.table.shape[1]
+        self._call = _Call(streams=streams, stride=streams, functions=pointers)
+        self._call.table, self._call.counts = state.table.data_ptr(), state.counts.data_ptr()
+        self._call.ratio, self._call.forgetting = (
+            definition.ratio.data_ptr(),
+            definition.forgetting.data_ptr(),
+        )
+        self._call.slack2, self._call.robust = definition.slack**2, definition.robust
+        numbers = torch.finfo(state.table.dtype)
+        self._call.base, self._call.tiny, self._call.most = definition.base, numbers.eps**0.5, numbers.max
+        self._call.limit = numbers.max**0.75
+        self._run, self._pointer = call, ctypes.byref(self._call)
+        self._shape = (streams, state.outputs)
+
+    @classmethod
+    def build(cls, definition: LocalFilter, state: StreamState) -> CompiledFilter | LocalFilter:
+        """The compiled filter, or the definition where there is none."""
+        functions, real = definition.functions, _REALS.get(state.table.dtype)
+        plain = functions.rate is not None and functions.shared is not None and functions.stationary
+        if not plain or real is None or state.count > _MOST or state.table.device.type != "cpu":
+            return definition
+        sizes = f"DIM={state.dim}", f"COUNT={state.count}", f"OUTPUTS={state.outputs}"
+        call = compiled(Path(__file__).with_name("_filter.cpp"), *sizes, f"REAL={real}")
+        return definition if call is None else cls(definition, state, call)
+
+    def predict(self, state: StreamState, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and variance of the next y at x (S, n), contiguous, in the table's dtype: (S, K) each."""
+        mean, variance = x.new_empty(self._shape), x.new_empty(self._shape)
+        call = self._call
+        call.mode, call.x = 1, x.data_ptr()
+        call.mean, call.variance = mean.data_ptr(), variance.data_ptr()
+        self._run(self._pointer)
+        return mean, variance
+
+    def learn(self, state: StreamState, x: Tensor, y: Tensor, lapse: Tensor | None = None) -> None:
+        """Learn one sample a stream: (S, n), (S, K), contiguous and in the table's dtype; (S,) float64."""
+        call = self._call
+        call.mode, call.x, call.y = 2, x.data_ptr(), y.data_ptr()
+        call.lapse = None if lapse is None else lapse.data_ptr()
+        self._run(self._pointer)

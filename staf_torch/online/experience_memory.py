@@ -1,0 +1,248 @@
+"""Local models kept along the way, blended into a global approximation."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from ..approximation.basis import StaFBasis
+from ..numerics.checks import integer, positive_real, trailing
+
+_DRIFT = 4.0  # usual distances between a model and the average of those before it
+_NEAREST = 1e-4  # of the reach, squared: closer than that a model counts alone, and the weights stay smooth
+
+
+class ExperienceMemory(nn.Module):
+    """V^(y) = sum_j omega_j(y) V^_j(y), a partition of unity over the states x_j at which models were stored.
+
+    With t_j = |y - x_j|^2 / (reach nu(x_j))^2 the weights are omega_j ~ (1 - t_j)_+^3 / (t_j + 1e-4)^2:
+    compact, twice continuously differentiable, and nearest first, as the error of a local model grows like a
+    power of the distance. Where no support reaches, V^ is NaN: `covered` says where.
+
+    A model within spacing nu(x_j) of a stored state joins that one. On a first revisit it takes the place,
+    being fresher, and its distance to the old one is noted; later ones are averaged at the centers of x_j, so
+    that noise goes down as 1/sqrt(visits), up to ``visits`` of them, beyond which the old ones fade. Where
+    one is further from the average than `_DRIFT` times the usual distance, the function has drifted there,
+    and the average begins anew. The one stored last is replaced while the state is within half the spacing
+    of where it was first stored, as a chase refines it, and then left alone until the state is further
+    away: models do not travel with the state. Elsewhere, once the memory is full, a new model takes the
+    place of the most redundant one: of the closest pair of states the one whose second neighbour is closer
+    too, so that no gap opens while another one is twice covered.
+
+    Every batch entry has a memory of its own. To share one among trajectories, leave ``batch_shape``
+    empty and add their models one after the other.
+
+    Example:
+        >>> memory = ExperienceMemory(basis, capacity=64)
+        >>> memory.add(x, basis.local(x).fit(basis.values(x, targets.Paper())))
+        >>> memory.query(x.unsqueeze(-2)).shape
+        torch.Size([1])
+
+    Args:
+        basis: kernel and centers; models are coefficients in ``basis.local(x)``.
+        capacity: N, models kept, at least 1.
+        batch_shape: leading dimensions (...), independent memories side by side.
+        reach: of a model, in radii nu(x_j) of its centers, positive.
+        spacing: least distance between stored states, in the same radii, positive.
+        visits: that an average is over, at most, at least 1; 1 keeps the latest model.
+
+    Raises:
+        ValueError: if an argument breaks its rule.
+
+    Source: the paper names a memory as future work (conclusion). Modified Shepard weights: Franke and
+    Nielson, Int. J. Numer. Meth. Eng. 15 (1980).
+    """
+
+    def __init__(
+        self,
+        basis: StaFBasis,
+        capacity: int,
+        batch_shape: tuple[int, ...] = (),
+        *,
+        reach: float = 2.0,
+        spacing: float = 0.5,
+        visits: int = 64,
+    ) -> None:
+        super().__init__()
+        if not isinstance(basis, StaFBasis):
+            raise ValueError(f"`ExperienceMemory(basis=...)` must be a StaFBasis; got {basis!r}.")
+        self.basis = basis
+        self.capacity = integer("ExperienceMemory", "capacity", capacity, least=1)
+        self.reach = positive_real("ExperienceMemory", "reach", reach)
+        self.spacing = positive_real("ExperienceMemory", "spacing", spacing)
+        self.visits = integer("ExperienceMemory", "visits", visits, least=1)
+        like = basis.centers.directions
+        self.register_buffer("states", like.new_zeros(*batch_shape, capacity, basis.dim))
+        self.register_buffer("coefficients", like.new_zeros(*batch_shape, capacity, basis.count))
+        self.register_buffer("stored", torch.zeros(*batch_shape, capacity, dtype=torch.bool))
+        self.register_buffer("latest", torch.full(batch_shape, -1))  # the place written last
+        self.register_buffer("origin", like.new_zeros(*batch_shape, basis.dim))  # where it was first stored
+        self.register_buffer(
+            "averaged", torch.zeros(*batch_shape, capacity, dtype=torch.int64)
+        )  # models in one
+        self.register_buffer(
+            "scatter", like.new_zeros(*batch_shape, capacity)
+        )  # usual distance to the average
+        self.averaged: Tensor
+        self.scatter: Tensor
+        self.latest: Tensor
+        self.origin: Tensor
+        self.states: Tensor
+        self.coefficients: Tensor
+        self.stored: Tensor
+
+    @property
+    def count(self) -> Tensor:
+        """Models stored, (...)."""
+        return self.stored.sum(-1)
+
+    def add(self, x: Tensor, coefficients: Tensor) -> ExperienceMemory:
+        """Store the models at the states x (..., n) with the coefficients (..., M), one a batch entry.
+
+        An entry whose state or coefficients are not finite stores nothing.
+
+        Raises:
+            ValueError: if a shape is not (*batch_shape, n) or (*batch_shape, M).
+        """
+        batch = self.stored.shape[:-1]
+        for name, value, last in (("x", x, self.basis.dim), ("coefficients", coefficients, self.basis.count)):
+            if trailing("ExperienceMemory.add", name, value, 1, last).shape[:-1] != batch:
+                raise ValueError(
+                    f"`ExperienceMemory.add({name}=...)` must have the shape {(*batch, last)}; "
+                    f"got {tuple(value.shape)}."
+                )
+        with torch.no_grad():
+            fine = torch.isfinite(x).all(-1) & torch.isfinite(coefficients).all(-1)
+            here = torch.where(fine.unsqueeze(-1), x, 0.0).to(self.states)
+            slot, keeps, joins = self._slot(here)
+            fine = fine & keeps
+            place = nn.functional.one_hot(slot, self.capacity).bool() & fine.unsqueeze(-1)
+            at, model = self._averaged(here, coefficients.to(self.states), place, joins & fine)
+            mark = place.unsqueeze(-1)
+            self.states.copy_(torch.where(mark, at.unsqueeze(-2), self.states))
+            self.coefficients.copy_(torch.where(mark, model.unsqueeze(-2), self.coefficients))
+            self.stored.copy_(self.stored | place)
+            another = (fine & (slot != self.latest)).unsqueeze(-1)
+            self.origin.copy_(torch.where(another, x.to(self.states), self.origin))
+            self.latest.copy_(torch.where(fine, slot, self.latest))
+        return self
+
+    def forward(self, y: Tensor) -> Tensor:
+        """`query`."""
+        return self.query(y)
+
+    def query(self, y: Tensor) -> Tensor:
+        """V^(y): (..., P, n) -> (..., P); NaN where no stored model reaches."""
+        weights = self._weights(y)
+        total = weights.sum(-1)
+        return (weights * self._local(y)).sum(-1) / torch.where(total > 0, total, torch.nan)
+
+    def gradient(self, y: Tensor) -> Tensor:
+        """Gradient of the blend at y: (..., P, n) -> (..., P, n)."""
+        found: Tensor = torch.func.grad(lambda point: self.query(point).sum())(y)
+        return found
+
+    def covered(self, y: Tensor) -> Tensor:
+        """Whether a stored model reaches y: (..., P, n) -> (..., P) bool."""
+        return (self._weights(y) > 0).any(-1)
+
+    def start(self, x: Tensor) -> Tensor:
+        """Coefficients in ``basis.local(x)`` to start from at the states x.
+
+        The blend at the centers of x, and where it does not reach one of them the nearest stored model,
+        fitted as if they were values of V. NaN at a state that is not covered itself.
+
+        Args:
+            x: (..., n), one state a memory, or (..., P, n).
+
+        Returns:
+            (..., M) or (..., P, M).
+        """
+        trailing("ExperienceMemory.start", "x", x, dims=1, last=self.basis.dim)
+        if x.dim() == self.stored.dim():
+            return self.start(x.unsqueeze(-2)).squeeze(-2)
+        several = (x.shape[-2], self.basis.count)
+        centers = self.basis.centers(x).flatten(-3, -2)  # (..., P M, n)
+        nearest = self._relative(x).argmin(-1, keepdim=True).repeat_interleave(self.basis.count, dim=-2)
+        single = self._local(centers).gather(-1, nearest).squeeze(-1)
+        blend = self.query(centers)
+        values = torch.where(torch.isnan(blend), single, blend).unflatten(-1, several)
+        found = self.basis.local(x).fit(values)
+        return torch.where(self.covered(x).unsqueeze(-1), found, torch.nan)
+
+    def _relative(self, y: Tensor) -> Tensor:
+        """t_j, (..., P, n) -> (..., P, N); inf where nothing is stored."""
+        trailing("ExperienceMemory", "y", y, dims=2, last=self.basis.dim)
+        z = y.unsqueeze(-2) - self.states.unsqueeze(-3)
+        support = self.reach * self.basis.centers.radius(self.states)
+        t = z.square().sum(-1) / support.square().expand(self.stored.shape).unsqueeze(-2)
+        return torch.where(self.stored.unsqueeze(-2), t, torch.inf)
+
+    def _weights(self, y: Tensor) -> Tensor:
+        """Not normalised: (..., P, n) -> (..., P, N)."""
+        t = self._relative(y)
+        inside = t < 1
+        near = torch.where(inside, t, 1.0)
+        return (1 - near) ** 3 / (near + _NEAREST) ** 2
+
+    def _local(self, y: Tensor) -> Tensor:
+        """V^_j(y) where model j reaches at all, else 0: (..., P, n) -> (..., P, N)."""
+        z = (y.unsqueeze(-3) - self.states.unsqueeze(-2)).expand(*self.stored.shape, *y.shape[-2:])
+        # Beyond this not even `start` asks, and a kernel that grows would overflow.
+        far = self._relative(y).mT > (1 + 1 / self.reach) ** 2
+        near = torch.where(far.unsqueeze(-1), 0.0, z)
+        values = self.basis.local(self.states).evaluate(near, self.coefficients)
+        return torch.where(far, 0.0, values).mT
+
+    def _averaged(self, x: Tensor, model: Tensor, place: Tensor, joins: Tensor) -> tuple[Tensor, Tensor]:
+        """State and coefficients to store: the model at x, or where it joins its average with what is there.
+
+        Args:
+            x: (..., n).
+            model: coefficients, (..., M).
+            place: where it goes, (..., N) bool, one at most.
+            joins: whether that is a revisit, (...).
+        """
+        pick = place.unsqueeze(-1).to(self.states)
+        there, old = (pick * self.states).sum(-2), (pick * self.coefficients).sum(-2)
+        there = torch.where(joins.unsqueeze(-1), there, x)
+        offsets = self.basis.centers(there) - x.unsqueeze(-2)
+        fresh = self.basis.local(there).fit(self.basis.local(x).evaluate(offsets, model))
+        scale = self.basis.local(there)
+        inside = self.basis.centers(there) - there.unsqueeze(-2)
+        distance = (scale.evaluate(inside, fresh) - scale.evaluate(inside, old)).square().mean(-1).sqrt()
+        usual, count = (place * self.scatter).sum(-1), (place * self.averaged).sum(-1)
+        drifted = (count >= 2) & (distance > _DRIFT * usual)
+        again = joins & (usual > 0) & (distance <= _DRIFT * usual)  # one more of the same function
+        weight = torch.where(again, (count + 1).clamp(max=self.visits), 1)
+        mean = old + (fresh - old) / weight.unsqueeze(-1)
+        found = torch.where(again.unsqueeze(-1), mean, torch.where(joins.unsqueeze(-1), fresh, model))
+        noted = torch.where(again, usual + (distance - usual) / weight.clamp(min=2), distance)
+        noted = torch.where(drifted, usual, noted) * joins
+        self.averaged.copy_(torch.where(place, weight.unsqueeze(-1), self.averaged))
+        self.scatter.copy_(torch.where(place, noted.unsqueeze(-1), self.scatter))
+        return there, found
+
+    def _slot(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Where a model at x (..., n) goes, (...) int64; whether it is kept; whether it is a revisit."""
+        closest, nearest = self._relative(x.unsqueeze(-2)).squeeze(-2).min(-1)
+        near = closest < (self.spacing / self.reach) ** 2
+        free = self.stored.logical_not()
+        some = free.any(-1)
+        elsewhere = free.to(torch.int8).argmax(-1)
+        if not bool(some.all()):  # saves work, and decides nothing: rows with room take no part in it
+            elsewhere = torch.where(some, elsewhere, self._redundant())
+        limit = self.spacing * self.basis.centers.radius(self.origin) / 2
+        still = (x - self.origin).square().sum(-1) < limit.square()
+        other = nearest != self.latest
+        return torch.where(near, nearest, elsewhere), ~near | other | still, near & other
+
+    def _redundant(self) -> Tensor:
+        """Of the closest pair of states the one with the closer second neighbour: (...) int64."""
+        own = torch.eye(self.capacity, dtype=torch.bool, device=self.states.device)
+        apart = torch.where(own, torch.inf, self._relative(self.states))
+        # Symmetric, so that both of a pair are found: t is in units of the one's radius, or the other's.
+        apart = torch.minimum(apart, apart.mT)
+        ordered = apart.sort(-1).values
+        closest = ordered[..., 0] <= ordered[..., :1].amin(-2)
+        return torch.where(closest, ordered[..., min(1, self.capacity - 1)], torch.inf).argmin(-1)

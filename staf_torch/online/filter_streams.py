@@ -1,0 +1,182 @@
+"""The streams of a filter: their states, their units, and how they come and go."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from .compiled_filter import CompiledFilter
+from .kalman_filter import LocalFilter, StreamState
+
+LEARNED_AT = (2, 5, 10, 20, 40)  # samples after which the units are learned
+OUTLYING = 30.0  # median deviations beyond which a value has no say in them
+
+
+class FilterStreams:
+    """S streams that a `LocalFilter` filters, in their own units where these are learned.
+
+    Args:
+        definition: the filter; its ratio and forgetting have an entry a stream, or one for all.
+        state: of the streams.
+        scaling: whether the units of x and y are learned from the first samples of each stream.
+        units: centers and spreads (S, 2 (n + K)) that are known instead.
+    """
+
+    def __init__(
+        self, definition: LocalFilter, state: StreamState, scaling: bool, units: Tensor | None = None
+    ) -> None:
+        self.scaling = scaling
+        self.dtype = state.table.dtype
+        size, wide = state.table.shape[1], state.dim + state.outputs
+        like = state.table.new_zeros(0, dtype=torch.float64)
+        self.units = torch.cat((like.new_zeros(size, wide), like.new_ones(size, wide)), 1)  # centers, spreads
+        self.first = like.new_zeros(size, LEARNED_AT[-1] if scaling else 0, wide + 1)  # samples and lapses
+        self.clock = torch.zeros(size, dtype=torch.int64)
+        if units is not None:
+            self.units, self.clock = units.double(), self.clock + LEARNED_AT[-1]
+        self._law = (definition.ratio[:1].clone(), definition.forgetting[:1].clone())
+        self._hold(definition, state)
+
+    def _hold(self, definition: LocalFilter, state: StreamState) -> None:
+        """Filter these streams from now on."""
+        self.definition, self.state = definition, state
+        self.count = state.table.shape[1]
+        self._filter = CompiledFilter.build(definition, state)
+        self.compiled = isinstance(self._filter, CompiledFilter) and not self.scaling
+        self._center, self._spread = self.units.to(self.dtype).split(state.dim + state.outputs, dim=1)
+
+    @property
+    def learned(self) -> Tensor:
+        """Samples learned, (S,) int64."""
+        return self.state.counts[0]
+
+    @property
+    def skipped(self) -> Tensor:
+        """Samples skipped, (S,) int64."""
+        return self.state.counts[1]
+
+    def predict(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and variance of the next y at x (S, n): (S, K), (S, K)."""
+        if not self.scaling:
+            return self._filter.predict(self.state, x)
+        n = self.state.dim
+        mean, variance = self._filter.predict(self.state, (x - self._center[:, :n]) / self._spread[:, :n])
+        return mean * self._spread[:, n:] + self._center[:, n:], variance * self._spread[:, n:].square()
+
+    def learn(self, x: Tensor, y: Tensor, lapse: Tensor | None = None) -> None:
+        """Learn one sample a stream: (S, n), (S, K), (S,)."""
+        if not self.scaling:
+            self._filter.learn(self.state, x, y, lapse)
+            return
+        n, young = self.state.dim, self.clock < LEARNED_AT[-1]
+        complete = torch.isfinite(x).all(1) & torch.isfinite(y).all(1) & young
+        due = torch.zeros_like(complete)
+        if bool(complete.any()):
+            rows = complete.nonzero().squeeze(1)
+            lapses = torch.ones(self.count, 1) if lapse is None else lapse.unsqueeze(1)
+            sample = torch.cat((x.double(), y.double(), lapses.double()), 1)
+            self.first[rows, self.clock[rows]] = sample[rows]
+            self.clock[rows] += 1
+            due = complete & torch.isin(self.clock, torch.tensor(LEARNED_AT))
+        rest = torch.where(due.unsqueeze(1), torch.nan, (y - self._center[:, n:]) / self._spread[:, n:])
+        self._filter.learn(self.state, (x - self._center[:, :n]) / self._spread[:, :n], rest, lapse)
+        if bool(due.any()):
+            self.state.counts[1] -= due.long()  # not skipped: it is learned with the others
+            for row in due.nonzero().squeeze(1).tolist():
+                self._rescale(row)
+
+    def _rescale(self, row: int) -> None:
+        """Take the units of a stream from its first samples, and learn these again."""
+        wide, n = self.state.dim + self.state.outputs, self.state.dim
+        samples = self.first[row, : self.clock[row]]
+        center, spread = units_of(samples[:, :wide])
+        self.units[row] = torch.cat((center, spread))
+        self._center, self._spread = self.units.to(self.dtype).split(wide, dim=1)
+        u = ((samples[:, :wide] - center) / spread).to(self.dtype)
+        alone = StreamState.empty(self.state.table, 1, n, self.state.count, self.state.outputs)
+        law = self.definition.with_law(
+            self.definition.ratio[row, None], self.definition.forgetting[row, None]
+        )
+        filter_ = CompiledFilter.build(law, alone)
+        for k in range(len(u)):
+            filter_.learn(
+                alone, u[k : k + 1, :n].contiguous(), u[k : k + 1, n:].contiguous(), samples[k, -1:].clone()
+            )
+        counts = self.state.counts[:2, row].clone()
+        self.state.table[:, row] = alone.table[:, 0]
+        self.state.counts[:, row] = alone.counts[:, 0]
+        self.state.counts[0, row] = torch.maximum(counts[0] + 1, alone.counts[0, 0])
+        self.state.counts[1, row] = counts[1]
+
+    def units_for(self, samples: Tensor) -> tuple[Tensor, Tensor]:
+        """Centers and spreads (S, n + K) for a whole record (T, S, n + K): from all of it, or as known."""
+        wide = self.units.shape[1] // 2
+        if not self.scaling or bool((self.clock >= LEARNED_AT[-1]).all()):
+            return self.units[:, :wide], self.units[:, wide:]
+        found = [units_of(row[torch.isfinite(row).all(1)]) for row in samples.unbind(1)]
+        return torch.stack([pair[0] for pair in found]), torch.stack([pair[1] for pair in found])
+
+    def clear(self, rows: Tensor) -> None:
+        """Let the streams with these numbers begin anew."""
+        fresh = StreamState.empty(self.state.table, len(rows), *self.state.sizes)
+        self.state.table[:, rows], self.state.counts[:, rows] = fresh.table, fresh.counts
+        self.clock[rows] = 0
+        wide = self.units.shape[1] // 2
+        self.units[rows, :wide], self.units[rows, wide:] = 0.0, 1.0
+        self._center, self._spread = self.units.to(self.dtype).split(wide, dim=1)
+
+    def add(self, streams: int) -> None:
+        """Begin further streams, behind the others."""
+        fresh = StreamState.empty(self.state.table, streams, *self.state.sizes)
+        self.state.table = torch.cat((self.state.table, fresh.table), 1).contiguous()
+        self.state.counts = torch.cat((self.state.counts, fresh.counts), 1).contiguous()
+        wide = self.units.shape[1] // 2
+        new = torch.cat((self.units.new_zeros(streams, wide), self.units.new_ones(streams, wide)), 1)
+        self.units = torch.cat((self.units, new))
+        self.first = torch.cat((self.first, self.first.new_zeros(streams, *self.first.shape[1:])))
+        self.clock = torch.cat((self.clock, self.clock.new_zeros(streams)))
+        old = self.definition
+        ratio, forgetting = (
+            torch.cat((a, b.expand(streams)))
+            for a, b in zip((old.ratio, old.forgetting), self._law, strict=True)
+        )
+        self._hold(old.with_law(ratio, forgetting), self.state)
+
+    def keep(self, rows: Tensor) -> None:
+        """Go on with the streams with these numbers alone."""
+        self.state.table = self.state.table[:, rows].contiguous()
+        self.state.counts = self.state.counts[:, rows].contiguous()
+        self.units, self.first, self.clock = self.units[rows], self.first[rows], self.clock[rows]
+        old = self.definition
+        self._hold(old.with_law(old.ratio[rows], old.forgetting[rows]), self.state)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Copies of all tensors that learning changes."""
+        kept = {
+            "table": self.state.table,
+            "counts": self.state.counts,
+            "units": self.units,
+            "clock": self.clock,
+        }
+        law = {"first": self.first, "ratio": self.definition.ratio, "forgetting": self.definition.forgetting}
+        return {name: tensor.clone() for name, tensor in (kept | law).items()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Take over what `state_dict` has."""
+        self.state.table, self.state.counts = state["table"].clone(), state["counts"].clone()
+        self.units, self.clock, self.first = (state[name].clone() for name in ("units", "clock", "first"))
+        self._hold(self.definition.with_law(state["ratio"].clone(), state["forgetting"].clone()), self.state)
+
+
+def units_of(samples: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean and standard deviation of every column of (N, D), outlying values aside."""
+    middle = samples.median(0).values
+    away = (samples - middle).abs()
+    typical = away.median(0).values
+    usual = (typical == 0) | (away <= OUTLYING * typical)
+    count = usual.sum(0)
+    mean = torch.where(usual, samples, 0.0).sum(0) / count
+    spread = (torch.where(usual, samples - mean, 0.0).square().sum(0) / count).sqrt()
+    return mean, torch.where(spread > 1e-12 * mean.abs(), spread, 1.0)

@@ -1,0 +1,252 @@
+"""The Kalman filter of a local Gaussian process, many streams side by side."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from .local_functions import LocalFunctions
+
+SURPRISE = 25.0  # standardised squared errors count at most so many times their running mean
+STREAK = 8  # samples in a row that are out of all proportion before a stream starts afresh
+
+
+@dataclasses.dataclass
+class StreamState:
+    """What is kept of every stream, in place; streams are the last dimension.
+
+    u is the mean of the weights, I - D their covariance: D, 0 <= D <= I, is what has been learned. The rows
+    of the table: the anchor, x as last measured, u output by output, D row by row, and for every output the
+    running mean of its squared standardised errors; then the largest |y| learned.
+    """
+
+    table: Tensor  # (2 n + K M + M M + K + 1, S)
+    counts: Tensor  # learned, skipped, out of proportion in a row, learned since it began: (4, S) int64
+    dim: int  # n
+    count: int  # M
+    outputs: int  # K
+
+    @classmethod
+    def empty(cls, like: Tensor, streams: int, dim: int, count: int, outputs: int) -> StreamState:
+        """Nothing learned, at NaN: a stream's first sample puts it somewhere."""
+        rows = 2 * dim + outputs * count + count * count + outputs + 1
+        table = like.new_zeros(rows, streams)
+        table[: 2 * dim] = torch.nan
+        counts = torch.zeros(4, streams, dtype=torch.int64, device=like.device)
+        return cls(table, counts, dim, count, outputs)
+
+    @property
+    def sizes(self) -> tuple[int, int, int]:
+        """n, M and K."""
+        return self.dim, self.count, self.outputs
+
+    def parts(self, table: Tensor) -> Parts:
+        """Views of the rows of a table (..., S)."""
+        n, m, k = self.dim, self.count, self.outputs
+        anchor, last, mean, learned, errors, largest = table.split([n, n, k * m, m * m, k, 1])
+        return Parts(anchor, last, mean.unflatten(0, (k, m)), learned.unflatten(0, (m, m)), errors, largest)
+
+    @property
+    def anchor(self) -> Tensor:
+        """The state that the centers surround, (n, S)."""
+        return self.parts(self.table).anchor
+
+    @property
+    def mean(self) -> Tensor:
+        """u, (K, M, S)."""
+        return self.parts(self.table).mean
+
+    @property
+    def learned(self) -> Tensor:
+        """D, (M, M, S)."""
+        return self.parts(self.table).learned
+
+
+class Parts(NamedTuple):
+    """The rows of a `StreamState`."""
+
+    anchor: Tensor  # (n, S)
+    last: Tensor  # (n, S)
+    mean: Tensor  # (K, M, S)
+    learned: Tensor  # (M, M, S)
+    errors: Tensor  # (K, S)
+    largest: Tensor  # (1, S)
+
+
+class _Sample(NamedTuple):
+    """What a stream learns from."""
+
+    z: Tensor  # from the anchor, (n, S)
+    y: Tensor  # (K, S), 0 where it was not measured
+    seen: Tensor  # whether it was, (K, S)
+    lapse: Tensor  # (S,)
+    fine: Tensor  # whether the stream learns, (S,)
+    most: float  # the largest number of the table
+
+
+class LocalFilter:
+    """y_k = V_k(x_k) + e_k, e ~ N(0, rho), with V a Gaussian process of unit amplitude around the state.
+
+    A sample: P <- I - lambda D (what was learned fades towards the prior), then the Kalman update. When the
+    state has left the anchor the centers move there, u <- T u and D <- T D T', |T| <= 1: D can only shrink,
+    so that no covariance winds up in directions that the stream does not visit. K outputs share D.
+
+    A coordinate that is NaN was not measured and is held; a target that is NaN is not learned. A sample whose
+    |y| is 1/sqrt(eps) times the largest so far, or whose local functions overflow, is skipped; a stream that
+    meets `STREAK` of those in a row, or as many values sqrt(eps) times smaller than the largest, starts
+    afresh.
+
+    Args:
+        functions: the local functions.
+        ratio: rho, variance of the noise in units of the process's, (S,).
+        forgetting: lambda, in (0, 1], for a step of time 1, (S,).
+        slack: distance from the anchor at which the centers follow.
+        robust: standard deviations beyond which an error counts no more than there (Huber); inf for none.
+        base: variance of the process in the units of y, before there are errors to tell.
+    """
+
+    def __init__(
+        self,
+        functions: LocalFunctions,
+        ratio: Tensor,
+        forgetting: Tensor,
+        slack: float,
+        robust: float = math.inf,
+        base: float = 1.0,
+    ) -> None:
+        self.functions, self.ratio, self.forgetting, self.slack = functions, ratio, forgetting, slack
+        self.robust, self.base = robust, base
+
+    def with_law(self, ratio: Tensor, forgetting: Tensor) -> LocalFilter:
+        """The filter for other streams, with these rho and lambda (S,)."""
+        law = ratio.contiguous(), forgetting.contiguous()
+        return LocalFilter(self.functions, *law, self.slack, self.robust, self.base)
+
+    def predict(self, state: StreamState, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and variance of the next y at x (S, n): (S, K), (S, K)."""
+        old = state.parts(state.table.double())
+        x = torch.where(torch.isnan(x.mT), old.last, x.mT.double())
+        local = self.functions.local(old.anchor, x - old.anchor)
+        prior = self.functions.prior(old.anchor, x - old.anchor)
+        factor: Tensor | float = 1.0 if local.log_factor is None else local.log_factor.exp()
+        mean = (local.psi * old.mean).sum(-2) * factor
+        variance = (prior - _quadratic(old.learned, local.psi)) * factor**2 + self.ratio
+        scale = self._scale(old.errors, state.counts[3])
+        fresh = torch.isnan(old.anchor).any(0)  # nothing is known before the first sample
+        mean, variance = torch.where(fresh, 0.0, mean), variance * scale
+        variance = torch.where(fresh, (1 + self.ratio) * self.base, variance)
+        return mean.mT.to(state.table), variance.mT.to(state.table)
+
+    def learn(self, state: StreamState, x: Tensor, y: Tensor, lapse: Tensor | None = None) -> None:
+        """Learn one sample a stream, in place, computed in float64.
+
+        Args:
+            state: of the streams.
+            x: (S, n).
+            y: (S, K).
+            lapse: time since the sample before, (S,), ones by default: what was learned fades by
+            lambda^lapse.
+        """
+        x, y = x.mT, y.mT
+        lapse = torch.ones_like(self.ratio) if lapse is None else lapse
+        table, (samples, skipped, streak, since) = state.table.double(), state.counts.unbind()
+        old = state.parts(table)
+        measured = ~torch.isnan(x).all(0)
+        x = torch.where(torch.isnan(x), old.last, x.double())
+        seen = ~torch.isnan(y)
+        y = torch.where(seen, y.double(), 0.0)
+        size, largest = y.abs().amax(0), old.largest[0]
+        tiny = torch.finfo(state.table.dtype).eps ** 0.5
+        sound = measured & seen.any(0) & torch.isfinite(x).all(0) & torch.isfinite(y).all(0)
+        huge = (since > 0) & (largest > 0) & (size * tiny > largest)
+        small = (size > 0) & (size < largest * tiny)
+        streak = torch.where(sound, torch.where(huge | small, streak + 1, streak * (size == 0)), streak)
+        afresh = sound & ((streak >= STREAK) | torch.isnan(old.anchor).any(0))
+        fine = sound & (~huge | afresh)
+
+        z = torch.where(fine & ~afresh, x - old.anchor, 0.0)
+        moves = fine & (afresh | ((z * z).sum(0) > self.slack**2))
+        anchor = torch.where(moves, x, old.anchor)
+        start = torch.where(afresh, 0.0, 1.0)
+        transfer, factor = self.functions.transfer(
+            torch.where(afresh, x, old.anchor), torch.where(moves, z, 0.0)
+        )
+        mean = torch.where(moves, _apply(transfer, old.mean) * (1.0 if factor is None else factor), old.mean)
+        learned = torch.where(moves, _congruence(transfer, old.learned), old.learned)
+        z = torch.where(moves, 0.0, z)
+        none = torch.zeros_like(largest)
+        since = torch.where(afresh, 0, since)
+        held = torch.where(torch.isfinite(x), x, old.last)
+        moved = Parts(
+            anchor,
+            held,
+            mean * start,
+            learned * start,
+            old.errors * start,
+            torch.where(afresh, none, largest)[None],
+        )
+        most = torch.finfo(state.table.dtype).max
+        found, good = self._update(moved, since, _Sample(z, y, seen, lapse, fine, most))
+        rows = [
+            torch.where(good, new, old_).reshape(-1, x.shape[1])
+            for new, old_ in zip(found, moved, strict=True)
+        ]
+        state.table.copy_(torch.cat(rows))
+        streak = torch.where(afresh & good, 0, streak)
+        state.counts.copy_(torch.stack((samples + good, skipped + ~good, streak, since + good)))
+
+    def _update(self, old: Parts, samples: Tensor, sample: _Sample) -> tuple[Parts, Tensor]:
+        """The Kalman update at z from the anchor; and the streams whose result is finite."""
+        z, y, seen, lapse, fine, most = sample
+        local = self.functions.local(old.anchor, z)
+        psi, noise = local.psi, self.ratio
+        largest = torch.maximum(old.largest, y.abs().amax(0))
+        prior = torch.zeros_like(lapse) + self.functions.prior(old.anchor, z)
+        if local.log_factor is not None:
+            shrink = (-local.log_factor).exp()
+            y, noise = y * shrink, noise * shrink.square()
+        share = self.forgetting**lapse
+        known = _apply(old.learned, psi) * share
+        spread = prior + noise - (psi * known).sum(0)
+        error = y - (psi * old.mean).sum(-2)
+        gain = psi - known
+        square = (error * error / spread).clamp(max=most)
+        limited = square.clamp(max=most**0.75)
+        scale = self._scale(old.errors, samples)
+        kept = (self.robust * (scale / square).sqrt()).clamp(max=1.0) if math.isfinite(self.robust) else 1.0
+        change = torch.where(seen, kept * error / spread, 0.0)
+        mean = old.mean + gain * change.unsqueeze(-2)
+        learned = old.learned * share + gain.unsqueeze(1) * (gain / spread)
+        rate = (1 / (samples + 1.0)).clamp(min=0.01)
+        counted = torch.where(samples < STREAK, limited, torch.minimum(limited, SURPRISE * old.errors))
+        errors = torch.where(seen, old.errors + rate * (counted - old.errors), old.errors)
+        good = fine & (spread > 0) & (mean.abs().amax((0, 1)) <= most) & torch.isfinite(learned.sum((0, 1)))
+        return Parts(old.anchor, old.last, mean, learned, errors, largest), good
+
+    def _scale(self, errors: Tensor, samples: Tensor) -> Tensor:
+        """Running residual variance in units of the predicted: the prior's at first, then what errors say."""
+        trust = samples.clamp(max=20) / 20.0
+        return (errors * trust + self.base * (1 - trust)).clamp(min=1e-6 * self.base)
+
+
+def _apply(matrix: Tensor, vector: Tensor) -> Tensor:
+    """A v with the batch last, term by term: (M, M, S), (..., M, S) -> (..., M, S)."""
+    total = matrix[:, 0] * vector[..., :1, :]
+    for k in range(1, len(matrix)):
+        total = total + matrix[:, k] * vector[..., k : k + 1, :]
+    return total
+
+
+def _congruence(transfer: Tensor, matrix: Tensor) -> Tensor:
+    """T D T' with the batch last: (M, M, S), (M, M, S) -> (M, M, S)."""
+    half = _apply(transfer, matrix.transpose(0, 1))  # rows of D T'
+    return _apply(transfer, half.transpose(0, 1))
+
+
+def _quadratic(matrix: Tensor, vector: Tensor) -> Tensor:
+    """v'A v with the batch last: (M, M, S), (M, S) -> (S,)."""
+    return (vector * _apply(matrix, vector)).sum(0)

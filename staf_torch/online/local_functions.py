@@ -1,0 +1,164 @@
+"""The functions that stand for a Gaussian process around a moving state."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..kernels import Kernel
+from ..numerics.linalg import pivoted_cholesky
+
+_JUMP = 4.0  # radii: beyond, a kernel whose scale grows with the state says nothing about the new one
+_FAR = 1e8  # radii: beyond, no kernel does, and the squares of a user's kernel may overflow
+
+
+class Local(NamedTuple):
+    """The local functions at a point of every stream: e^{log_factor} psi."""
+
+    psi: Tensor  # (M, S)
+    log_factor: Tensor | None  # (S,), None for zeros
+
+
+class LocalFunctions(NamedTuple):
+    """An orthonormal basis psi(z) = k0(z, d) C of the span of the kernels at the centers x + d.
+
+    With P K0 P' = L L' it is the Newton basis, C = P'L^-T. A Gaussian process with the covariance k is then
+    V(x + z) = e^{s(x, z)} (psi(z)'u + rest) with u ~ N(0, I) and a rest, independent of u, that vanishes at
+    the centers. Its amplitude is 1 at the state: the kernel's gain e^{g(x)} is left out.
+
+    Streams are the last dimension, S. Where the kernel is state-free one C serves all states. Computed in
+    float64 whatever the dtype of the streams: C has entries as large as the conditioning of K0 makes them.
+    """
+
+    kernel: Kernel
+    offsets: Tensor  # d, (M, n)
+    shared: Tensor | None  # C, (M, M), for a state-free kernel
+    rate: Tensor | None  # q, where k0(z, d) = exp(q z'd)
+    pairs: Tensor | None  # with it, k0(d_i, d_j) C_jl in row (i, l), column j: (M M, M)
+
+    @classmethod
+    def of(cls, kernel: Kernel, offsets: Tensor) -> LocalFunctions:
+        """The local functions of centers at the offsets (M, n), float64."""
+        zero = offsets.new_zeros(offsets.shape[-1])
+        if not kernel.state_free:
+            return cls(kernel, offsets, None, None, None)
+        gram = kernel.core(zero, offsets, offsets)
+        shared, rate = _newton(gram), kernel.exponent_rate()
+        pairs = None if rate is None else (gram.unsqueeze(1) * shared.mT).flatten(0, 1)
+        return cls(kernel, offsets, shared, rate, pairs)
+
+    def functions(self, x: Tensor, z: Tensor) -> Tensor:
+        """psi at x + z: (n, S), (n, S) -> (M, S), in the dtype of z."""
+        wide = z.double()
+        if self.shared is None:
+            state = x.mT.double()
+            core = self.kernel.core(state, wide.mT.unsqueeze(-2), self.offsets)
+            return (core @ self._newton(state)).squeeze(-2).mT.to(z)
+        if self.rate is not None:
+            return (self.shared.mT @ ((self.rate * self.offsets) @ wide).exp()).to(z)
+        # All streams are points around one state.
+        core = self.kernel.core(torch.zeros_like(self.offsets[0]), wide.mT, self.offsets)
+        return (self.shared.mT @ core.mT).to(z)
+
+    def variance(self, x: Tensor, z: Tensor) -> Tensor:
+        """k0(z, z), of which psi'psi is what the centers explain: (n, S), (n, S) -> (S,)."""
+        if self.rate is not None:
+            return (z.square().sum(0) * self.rate).exp().to(z)
+        point = z.mT.double().unsqueeze(-2)
+        return self.kernel.core(x.mT.double(), point, point).flatten().to(z)
+
+    @property
+    def stationary(self) -> bool:
+        """Whether k(x, x) is the same everywhere: then e^s goes into the functions, to spare passes."""
+        return self.rate is not None and self.kernel.log_gain(self.offsets) is None
+
+    def local(self, x: Tensor, z: Tensor) -> Local:
+        """What V is made of at x + z: (n, S), (n, S)."""
+        if self.rate is None or self.shared is None or not self.stationary:
+            return Local(self.functions(x, z), self.log_factor(x, z))
+        # exp(q z'd - q z'z / 2) from z - d: no difference of two large numbers, whatever z is.
+        apart = (z.double() - self.offsets.unsqueeze(-1)).square().sum(1)
+        exponent = self.rate / 2 * (self.offsets.square().sum(-1, keepdim=True) - apart)
+        return Local((self.shared.mT @ exponent.exp()).to(z), None)
+
+    def prior(self, x: Tensor, z: Tensor) -> Tensor | float:
+        """The variance of V at x + z before any sample, in the units of `local`: (n, S), (n, S) -> (S,)."""
+        return 1.0 if self.stationary else self.variance(x, z)
+
+    def log_factor(self, x: Tensor, z: Tensor) -> Tensor | None:
+        """s(x, z): (n, S), (n, S) -> (S,), None for zeros."""
+        scale = self.kernel.log_scale(x.mT, z.mT.unsqueeze(-2))
+        return None if scale is None else scale.squeeze(-1)
+
+    def transfer(self, x: Tensor, step: Tensor) -> tuple[Tensor, Tensor | None]:
+        """What becomes of u when the state x moves by h: u' = e^f T u; T alone for what was known of it.
+
+        T = C'(x + h) diag(m) k0(h + d, d) C(x) with m_i = e^{s(x, h + d_i) - s(x + h, d_i) - f}, and
+        f = (g(x + h) - g(x))/2: the local function at the new centers, fitted there. T is the compression of
+        a unitary translation, so that |T| <= 1. For k0 = exp(q z'd) the spans at two states differ by the
+        factor e^{-q h'z} alone, which m carries.
+
+        Args:
+            x: (n, R).
+            step: h, (n, R).
+
+        Returns:
+            T (M, M, R), and e^f, (R,), None for ones.
+        """
+        d = self.offsets
+        reach = d.square().sum(-1).amax().clamp(min=1e-300).sqrt()
+        most = _JUMP if self.kernel.log_gain(d) is not None else _FAR
+        near = (step.double() / reach).square().sum(0) <= most**2
+        state, h = x.mT.double(), torch.where(near, step.double(), 0.0)
+        half = self._half(state, h.mT)
+        if self.rate is not None and self.shared is not None and self.pairs is not None:
+            exponent = (self.rate * d) @ h  # q h'd, (M, R)
+            shift = self.rate * h.square().sum(0).sqrt() * reach  # so that neither exponential overflows
+            rows = (self.pairs @ (exponent - shift).exp()).unflatten(0, (len(d), -1))
+            lost = self.rate * h.square().sum(0) / 2
+            rows = rows * (shift - exponent - lost).clamp(max=700.0).exp().unsqueeze(1)
+            found = (self.shared.mT @ rows.flatten(1)).unflatten(-1, rows.shape[1:])
+        else:
+            found = self._dense(state, h)
+        # After a jump too far for the kernel there is nothing to say: start afresh.
+        found = torch.where(near, found, 0.0).to(step)
+        return found, None if half is None else torch.where(near, half, 0.0).exp().to(step)
+
+    def _dense(self, state: Tensor, h: Tensor) -> Tensor:
+        """T for kernels without an exponent rate: (R, n), (n, R) -> (M, M, R)."""
+        d, moved = self.offsets, state + h.mT
+        points = (h + d.unsqueeze(-1)).permute(2, 0, 1)  # (R, M, n)
+        here, there = self.kernel.log_scale(state, points), self.kernel.log_scale(moved, d)
+        half = self._half(state, h.mT)
+        if self.shared is None:
+            core = self.kernel.core(state, points, d) @ self._newton(state)
+            left = self._newton(moved).mT
+        else:  # all points around one state
+            zero = torch.zeros_like(d[0])
+            core = (self.kernel.core(zero, points.flatten(0, 1), d) @ self.shared).unflatten(
+                0, points.shape[:2]
+            )
+            left = self.shared.mT
+        if here is not None and there is not None:
+            core = core * (here - there).exp().unsqueeze(-1)
+        if half is not None:
+            core = core * (-half).exp()[:, None, None]
+        return (left @ core).permute(1, 2, 0)
+
+    def _half(self, state: Tensor, h: Tensor) -> Tensor | None:
+        """f, (R, n), (R, n) -> (R,); None for zeros."""
+        before, after = self.kernel.log_gain(state), self.kernel.log_gain(state + h)
+        return None if before is None or after is None else (after - before) / 2
+
+    def _newton(self, state: Tensor) -> Tensor:
+        return _newton(self.kernel.core(state, self.offsets, self.offsets))
+
+
+def _newton(gram: Tensor) -> Tensor:
+    """C = P'L^-T of K0 (..., M, M), with zero columns beyond the rank: (..., M, M)."""
+    factor = pivoted_cholesky(gram)
+    units = torch.eye(gram.shape[-1], dtype=gram.dtype, device=gram.device)
+    columns = [factor.solve_upper(unit.expand(factor.order.shape)) for unit in units]
+    return torch.stack(columns, dim=-1)

@@ -1,0 +1,49 @@
+"""The interface of river: samples as dictionaries, one at a time."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+
+from .regressor import StaFRegressor
+
+
+class RiverRegressor:
+    """`learn_one` and `predict_one` around a `StaFRegressor`, for river's pipelines and metrics.
+
+    Features are taken by the names of the first sample, in its order; one that is missing later was not
+    measured. Nothing of river is imported: where it is installed, its `compose.Pipeline` takes this as a
+    regressor.
+
+    Example:
+        >>> model = RiverRegressor(StaFRegressor(memory=500))
+        >>> _ = model.learn_one({"a": 1.0, "b": 2.0}, 3.0)
+        >>> model.predict_one({"a": 1.0, "b": 2.0})
+        3.0
+
+    Args:
+        model: of one stream, with arguments of your choice.
+    """
+
+    _supervised = True
+
+    def __init__(self, model: StaFRegressor | None = None) -> None:
+        self.model = StaFRegressor(memory=500) if model is None else model
+        self.features: tuple[Any, ...] = ()
+
+    def learn_one(self, x: Mapping[Any, float], y: float, **kwargs: Any) -> RiverRegressor:
+        """Learn one sample."""
+        if not self.features:
+            self.features = tuple(x)
+        self.model.partial_fit(self._row(x), torch.tensor(float(y), dtype=torch.float64))
+        return self
+
+    def predict_one(self, x: Mapping[Any, float], **kwargs: Any) -> float:
+        """The next y at x; 0 before the first sample."""
+        return float(self.model.predict(self._row(x))) if self.features else 0.0
+
+    def _row(self, x: Mapping[Any, float]) -> torch.Tensor:
+        return torch.tensor([float(x.get(name, math.nan)) for name in self.features], dtype=torch.float64)

@@ -1,0 +1,71 @@
+"""Samples as users give them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..numerics.checks import fail
+
+_NAME = "StaFRegressor"
+
+
+def tensor_of(call: str, name: str, value: Any) -> Tensor:
+    """A tensor as it is, without gradient; arrays and numbers as tensors; integers as float64."""
+    if isinstance(value, Tensor):
+        found = value.detach()
+    else:
+        try:
+            if hasattr(value, "toarray"):
+                raise TypeError("sparse data is not supported: use toarray()")
+            array = np.asarray(value)
+            if array.dtype == object:
+                array = array.astype(float)
+            if np.iscomplexobj(array):
+                raise ValueError("Complex data not supported")
+            found = torch.as_tensor(array)
+        except (TypeError, ValueError, RuntimeError) as error:
+            kind = TypeError if hasattr(value, "toarray") or "convert" not in str(error) else ValueError
+            kind = ValueError if isinstance(error, ValueError) else kind
+            told = fail(call, name, "must be a tensor or an array of numbers", value)
+            raise (ValueError if isinstance(value, str) else kind)(f"{told} {error}") from error
+    return found if found.is_floating_point() else found.double()
+
+
+def pair(call: str, x: Any, y: Any, dims: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    if y is None:
+        raise ValueError(f"`{_NAME}.{call}` requires y to be passed, but the target y is None.")
+    states, values = tensor_of(f"{_NAME}.{call}", "x", x), tensor_of(f"{_NAME}.{call}", "y", y)
+    if 0 in states.shape:
+        shape = tuple(states.shape)
+        what = f"{states.shape[-1]} feature(s)" if 0 in states.shape[-1:] else "0 sample(s)"
+        told = f"must not be empty: {what} (shape={shape}) while a minimum of 1 is required"
+        raise ValueError(f"`{_NAME}.{call}(x=...)` {told}.")
+    fits = states.dim() in dims and values.shape[: states.dim() - 1] == states.shape[:-1]
+    if not fits or values.dim() - states.dim() not in (-1, 0):
+        rule = (
+            "(n,) or (S, n)" if dims == (1, 2) else "(T, n) for one stream in time or (T, S, n) for S streams"
+        )
+        raise ValueError(
+            f"`{_NAME}.{call}(x=...)` must have the shape {rule}, and y that without n, or with K "
+            f"in its place; got {tuple(states.shape)} and {tuple(values.shape)}."
+        )
+    return states, values
+
+
+def lapses(time: Any, states: Tensor) -> Tensor | None:
+    """Time since the sample before, (T, S), 1 at the first; None without times."""
+    if time is None:
+        return None
+    given = tensor_of(f"{_NAME}.fit", "time", time).double()
+    if len(given) != len(states) or not bool((given.diff(dim=0) >= 0).all()):
+        raise fail(f"{_NAME}.fit", "time", "must be increasing, (T,) or (T, S)", time)
+    steps = torch.cat((torch.ones_like(given[:1]), given.diff(dim=0)))
+    return steps.reshape(len(states), -1)
+
+
+def like_given(x: Any, found: Tensor) -> Any:
+    return found if isinstance(x, Tensor) else found.numpy()

@@ -1,0 +1,70 @@
+"""Smoothing backwards over a recorded stream."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from .kalman_filter import LocalFilter, StreamState
+
+
+def smooth(
+    filter_: LocalFilter, state: StreamState, x: Tensor, y: Tensor, lapse: Tensor
+) -> tuple[Tensor, Tensor]:
+    """V at the recorded states from all samples, before and after: Rauch, Tung and Striebel (1965).
+
+    Forwards the filter stores u, I - D and what it expected before each sample: u' = T u with the covariance
+    P' = I - lambda T D T'. Backwards u_k <- u_k + G (u_k+1 - u'_k+1) with the gain G = P_k T' P'_k+1^-1, and
+    the covariances alike.
+
+    Args:
+        filter_: the definition.
+        state: of the streams at the beginning, updated to the end.
+        x: (T, S, n).
+        y: (T, S, K).
+        lapse: (T, S).
+
+    Returns:
+        Mean (T, S, K) and variance (T, S, 1), without noise, in units of the process.
+    """
+    eye = torch.eye(state.count, dtype=torch.float64)
+    means, covariances, expected, predicted, transfers, anchors = [], [], [], [], [], []
+    for k in range(len(x)):
+        old = state.parts(state.table.double().clone())
+        filter_.learn(state, x[k], y[k], lapse[k])
+        new = state.parts(state.table.double().clone())
+        known = ~torch.isnan(old.anchor).any(0)
+        step = torch.where(known, new.anchor - old.anchor, 0.0)
+        transfer, factor = filter_.functions.transfer(torch.where(known, old.anchor, new.anchor), step)
+        transfer = torch.where(step.abs().sum(0) > 0, transfer, eye.unsqueeze(-1)).permute(2, 0, 1)
+        scaled = transfer if factor is None else transfer * factor[:, None, None]
+        learned = old.learned.permute(2, 0, 1)
+        share = (filter_.forgetting ** lapse[k])[:, None, None]
+        means.append(new.mean.permute(2, 1, 0))
+        covariances.append(eye - new.learned.permute(2, 0, 1))
+        expected.append(scaled @ old.mean.permute(2, 1, 0))
+        predicted.append(eye - share * transfer @ learned @ transfer.mT)
+        transfers.append(scaled)
+        anchors.append(new.anchor)
+    return _backwards(filter_, (means, covariances, expected, predicted, transfers, anchors), x.double())
+
+
+def _backwards(filter_: LocalFilter, record: tuple[list[Tensor], ...], x: Tensor) -> tuple[Tensor, Tensor]:
+    means, covariances, expected, predicted, transfers, anchors = record
+    u, p = means[-1], covariances[-1]
+    found = []
+    for k in reversed(range(len(x))):
+        if k < len(x) - 1:
+            gain = torch.linalg.solve(predicted[k + 1], transfers[k + 1] @ covariances[k]).mT
+            u = means[k] + gain @ (u - expected[k + 1])
+            p = covariances[k] + gain @ (p - predicted[k + 1]) @ gain.mT
+        z = torch.where(torch.isnan(x[k].mT), 0.0, x[k].mT - anchors[k])
+        local = filter_.functions.local(anchors[k], z)
+        psi = local.psi.mT.unsqueeze(-1)  # (S, M, 1)
+        factor = torch.ones_like(z[0]) if local.log_factor is None else local.log_factor.exp()
+        prior = torch.zeros_like(z[0]) + filter_.functions.prior(anchors[k], z)
+        rest = prior - psi.square().sum((1, 2))
+        variance = (rest + (psi.mT @ p @ psi).squeeze(-1).squeeze(-1)) * factor.square()
+        found.append(((psi.mT @ u).squeeze(1) * factor[:, None], variance.unsqueeze(-1)))
+    mean, variances = zip(*reversed(found), strict=True)
+    return torch.stack(mean), torch.stack(variances)

@@ -1,0 +1,133 @@
+"""Hyperparameters from a recorded stretch: all candidates are streams of one tensor batch."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..kernels import GaussianKernel
+from .filter_streams import FilterStreams
+from .kalman_filter import LocalFilter, StreamState
+from .local_functions import LocalFunctions
+
+WIDTHS = (0.5, 1.0, 2.0, 4.0, 8.0)  # in standard deviations of x, times sqrt(n)
+NOISES = (1e-3, 1e-2, 0.1, 0.4)  # in standard deviations of y
+FORGETTING = (1.0, 0.999, 0.99, 0.97)
+RADII = (0.25, 0.5)  # in widths
+ROUNDS = (0.6, 0.3)  # spread of the logarithms of the candidates around the best so far
+AROUND = 48  # of these candidates a round
+
+
+class Tuning(NamedTuple):
+    """What a stretch says, a row a stream; the kernel's width is 1 in these units of x."""
+
+    center: Tensor  # (S, n + K)
+    spread: Tensor  # (S, n + K)
+    ratio: Tensor  # (S,) variance of the noise in units of the process's
+    forgetting: Tensor  # (S,)
+    radius: Tensor  # (S,) of the centers, in widths
+    likelihood: Tensor  # (S,) log of the one-step predictive density, a sample, y in standard deviations
+
+
+class _Candidates(NamedTuple):
+    width: Tensor  # (S, C, n) in standard deviations of x
+    noise: Tensor  # (S, C)
+    forgetting: Tensor  # (S, C)
+
+
+def tuning(x: Tensor, y: Tensor, directions: Tensor) -> Tuning:
+    """Widths a coordinate, noise, forgetting and radius a stream by the one-step predictive likelihood.
+
+    Args:
+        x: (T, S, n), a stretch of every stream.
+        y: (T, S, K).
+        directions: of the centers, (M, n).
+    """
+    both = torch.cat((x, y), -1).double()
+    seen = torch.isfinite(both)
+    count = seen.sum(0).clamp(min=1)
+    center = torch.where(seen, both, 0.0).sum(0) / count
+    spread = (torch.where(seen, both - center, 0.0).square().sum(0) / count).sqrt()
+    spread = torch.where(spread > 0, spread, 1.0)
+    samples = (both - center) / spread
+    n, streams = x.shape[-1], x.shape[1]
+    widths = torch.tensor(WIDTHS).double() * math.sqrt(n)
+    rows = torch.cartesian_prod(widths, torch.tensor(NOISES).double(), torch.tensor(FORGETTING).double())
+    first = _Candidates(*(rows[:, k].expand(streams, -1) for k in range(3)))
+    first = first._replace(width=first.width.unsqueeze(-1).expand(-1, -1, n))
+    found: list[tuple[Tensor, _Candidates]] = []
+    for radius in RADII:
+        best, score = _best(first, samples, n, radius * directions)
+        draw = torch.Generator().manual_seed(0)
+        for wide in ROUNDS:
+            again, better = _best(_around(best, wide, draw), samples, n, radius * directions)
+            gains = better > score
+            best = _Candidates(*(_choose(gains, new, old) for new, old in zip(again, best, strict=True)))
+            score = torch.where(gains, better, score)
+        found.append((score, best))
+    which = torch.stack([score for score, _ in found]).argmax(0)
+    one = which == 1
+    kept = _Candidates(
+        *(_choose(one, b, a).squeeze(1) for a, b in zip(found[0][1], found[1][1], strict=True))
+    )
+    units = torch.cat((spread[:, :n] * kept.width, spread[:, n:]), 1)
+    radii = torch.tensor(RADII).double()[which]
+    return Tuning(
+        center, units, kept.noise**2, kept.forgetting, radii, torch.where(one, found[1][0], found[0][0])
+    )
+
+
+def tuned_streams(
+    found: Tuning, directions: Tensor, dtype: torch.dtype, robust: float, follow: float
+) -> FilterStreams:
+    """Streams with these hyperparameters; the radius of the first serves all."""
+    n, outputs = directions.shape[1], found.center.shape[1] - directions.shape[1]
+    offsets = found.radius[0] * directions
+    functions = LocalFunctions.of(GaussianKernel(1.0), offsets)
+    law = found.ratio.clone(), found.forgetting.clone()
+    filter_ = LocalFilter(functions, *law, follow * float(found.radius[0]), robust)
+    state = StreamState.empty(torch.zeros(0, dtype=dtype), len(found.ratio), n, len(offsets), outputs)
+    return FilterStreams(filter_, state, True, torch.cat((found.center, found.spread), 1))
+
+
+def _best(candidates: _Candidates, samples: Tensor, n: int, offsets: Tensor) -> tuple[_Candidates, Tensor]:
+    """The candidate of each stream that predicts the later two thirds best, and how well."""
+    streams, count, _ = candidates.width.shape
+    outputs = samples.shape[-1] - n
+    functions = LocalFunctions.of(GaussianKernel(1.0), offsets)
+    slack = float(offsets.square().sum(-1).amax().sqrt())
+    filter_ = LocalFilter(functions, candidates.noise.flatten() ** 2, candidates.forgetting.flatten(), slack)
+    state = StreamState.empty(samples[:0, 0, 0], streams * count, n, len(offsets), outputs)
+    lanes = FilterStreams(filter_, state, False)
+    score = samples.new_zeros(streams, count)
+    for k, sample in enumerate(samples):
+        x = (sample[:, None, :n] / candidates.width).flatten(0, 1).contiguous()
+        y = sample[:, None, n:].expand(-1, count, -1).flatten(0, 1).contiguous()
+        if k > len(samples) // 3:
+            mean, variance = lanes.predict(x)
+            density = -0.5 * ((y - mean).square() / variance + variance.log())
+            score += torch.where(torch.isfinite(density), density, 0.0).sum(-1).unflatten(0, (streams, count))
+        lanes.learn(x, y)
+    best = score.argmax(1)
+    rows = torch.arange(streams)
+    scored = score[rows, best] / (len(samples) - len(samples) // 3)
+    return _Candidates(*(part[rows, best, None] for part in candidates)), scored
+
+
+def _around(best: _Candidates, wide: float, draw: torch.Generator) -> _Candidates:
+    """Candidates near the best of each stream: (S, 1, ...) -> (S, AROUND, ...)."""
+
+    def factor(like: Tensor) -> Tensor:
+        shape = (len(like), AROUND, *like.shape[2:])
+        return (wide * torch.randn(shape, generator=draw, dtype=torch.float64)).exp()
+
+    lost = (1 - best.forgetting).clamp(min=1e-4) * factor(best.forgetting)
+    noise = (best.noise * factor(best.noise) ** 2).clamp(min=1e-5)
+    return _Candidates(best.width * factor(best.width), noise, 1 - lost.clamp(max=0.2))
+
+
+def _choose(mask: Tensor, new: Tensor, old: Tensor) -> Tensor:
+    return torch.where(mask.reshape(-1, *[1] * (new.dim() - 1)), new, old)

@@ -1,0 +1,139 @@
+"""The files of run and sweep directories: their names, how they are written and how they are read.
+
+Files appear complete or not at all. Everything that reads a folder of results opens its files here.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+RUN, METRICS, HISTORY, MEMBERS = "run.json", "metrics.json", "history.npz", "members.json"
+SWEEP, PAGE, TABLE = "sweep.json", "report.html", "table"
+FIGURES, HYDRA = "figures", ".hydra"
+COMPLETED, FAILED, RUNNING, UNFINISHED = "completed", "failed", "running", "unfinished"
+"""Status of a run: it ended, it raised, it has not said that it ended, or there is no word of its end."""
+
+Value = str | float | int | bool | list[Any] | None
+"""What a setting holds; a list may hold lists."""
+_WORDS: Mapping[str, Value] = {"null": None, "none": None, "true": True, "false": False}
+
+
+class UnreadableError(Exception):
+    """A directory or file that cannot be read; the message says why."""
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a file under another name, flush it to disk, then rename it into place."""
+    write_bytes(path, text.encode())
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write bytes as `write_text` writes a text."""
+    partial = path.with_name(f".{path.name}.partial")
+    try:
+        with partial.open("wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def write_metrics(path: Path, metrics: Mapping[str, float | int | None]) -> None:
+    """Write a flat JSON object, name to number or null.
+
+    Raises:
+        ValueError: for a number that is not finite, which JSON does not have.
+    """
+    write_text(path, json.dumps(metrics, indent=2, allow_nan=False) + "\n")
+
+
+def read_text(path: Path) -> str:
+    """Return the text of a file.
+
+    Raises:
+        UnreadableError: if there is none.
+    """
+    try:
+        return path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise UnreadableError(f"{path.name} cannot be read: {error.strerror}") from error
+    except ValueError as error:
+        raise UnreadableError(f"{path.name} is not text: {error}") from error
+
+
+def read_object(path: Path) -> dict[str, Any]:
+    """Return the JSON object in a file.
+
+    Raises:
+        UnreadableError: if there is none.
+    """
+    try:
+        found = json.loads(read_text(path))
+    except ValueError as error:
+        raise UnreadableError(f"{path.name} is not JSON: {error}") from error
+    if not isinstance(found, dict):
+        raise UnreadableError(f"{path.name} holds no object")
+    return found
+
+
+def flatten(settings: Mapping[Any, Any], prefix: str = "") -> dict[str, Any]:
+    """Return nested settings with dotted keys: ``{"centers": {"count": 3}}`` -> ``{"centers.count": 3}``."""
+    flat: dict[str, Any] = {}
+    for key, value in settings.items():
+        if isinstance(value, Mapping) and value:
+            flat |= flatten(value, f"{prefix}{key}.")
+        else:
+            flat[f"{prefix}{key}"] = value
+    return flat
+
+
+def plain(value: Any) -> Any:
+    """Return what JSON can hold of a value; a number that is not finite becomes its name."""
+    if isinstance(value, float) and not math.isfinite(value):
+        return str(value)
+    if isinstance(value, list | tuple):
+        return [plain(v) for v in value]
+    if isinstance(value, dict):
+        return {str(k): plain(v) for k, v in value.items()}
+    return value if value is None or isinstance(value, bool | int | float | str) else str(value)
+
+
+def parse_overrides(lines: Iterable[str]) -> dict[str, Value]:
+    """Return overrides as typed: ``["kernel=gaussian", "+seed=3"]`` -> ``{"kernel": "gaussian", "seed": 3}``.
+
+    Hydra's own are left out. Hydra itself is not asked: it takes a second to import.
+    """
+    typed: dict[str, Value] = {}
+    for line in lines:
+        key, given, text = line.lstrip("+~").partition("=")
+        if given and not key.startswith(("hydra.", "hydra/")):
+            typed[key] = _parsed(text.strip())
+    return typed
+
+
+def _parsed(word: str) -> Value:
+    """A number, word, list or text; what is none of the first three stays as it was typed."""
+    if word.lower() in _WORDS:
+        return _WORDS[word.lower()]
+    if len(word) > 1 and word[0] == word[-1] and word[0] in "'\"":
+        return word[1:-1]
+    for kind in (int, float):
+        try:
+            number: float = kind(word)
+        except ValueError:
+            continue
+        return number if abs(number) < float("inf") else word  # neither nan nor inf is a JSON number
+    if word.startswith("["):
+        try:
+            listed = json.loads(word)
+        except ValueError:
+            return word
+        return listed if isinstance(listed, list) else word
+    return word

@@ -1,0 +1,67 @@
+"""What a reader of numbers must know about a metric: its unit, and which way it is better. Without torch."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+
+class MetricInfo(NamedTuple):
+    """A metric, as tables know it."""
+
+    name: str
+    unit: str = ""  # empty: that of V, or of what it is made of
+    larger_is_better: bool = False
+    headline: bool = False  # whether a table shows it where no metric is named
+
+    def record(self) -> dict[str, Any]:
+        """For `run.json`: everything but the name."""
+        return {key: value for key, value in self._asdict().items() if key != "name"}
+
+
+OWN = (
+    MetricInfo("ultimate_error"),
+    MetricInfo("ultimate_error_before"),
+    MetricInfo("floor_error"),
+    MetricInfo("ultimate_excess"),
+    MetricInfo("ultimate_excess_before"),
+    MetricInfo("ball_error", headline=True),
+    MetricInfo("ball_floor_error", headline=True),
+    MetricInfo("rounding_floor"),
+    MetricInfo("gradient_error", headline=True),
+    MetricInfo("condition_number", unit="1"),
+    MetricInfo("settling_time", unit="s"),
+    MetricInfo("contraction_violations", unit="times"),
+    MetricInfo("certificate_violations", unit="times"),
+    MetricInfo("products_per_second", unit="1/s"),
+    MetricInfo("cost", headline=True),
+    MetricInfo("optimal_cost"),
+    MetricInfo("cost_ratio", unit="1", headline=True),
+    MetricInfo("cost_ratio_mean", unit="1"),
+    MetricInfo("cost_ratio_max", unit="1"),
+    MetricInfo("final_state_norm"),
+    MetricInfo("final_error"),
+    MetricInfo("parameter_error"),
+    MetricInfo("control_error"),
+    MetricInfo("value_error"),
+    MetricInfo("regulated_fraction", unit="1", larger_is_better=True, headline=True),
+    MetricInfo("diverged_fraction", unit="1"),
+)
+"""The library's own metrics, headlines in the order in which a table shows them."""
+HEADLINES = tuple(info.name for info in OWN if info.headline)
+
+
+def read_infos(recorded: object) -> dict[str, MetricInfo]:
+    """Return the metrics that a record of a run declares, by name; anything malformed is passed over."""
+    if not isinstance(recorded, Mapping):
+        return {}
+    return {
+        str(name): MetricInfo(
+            str(name),
+            str(about.get("unit", "")),
+            about.get("larger_is_better") is True,
+            about.get("headline") is True,
+        )
+        for name, about in recorded.items()
+        if isinstance(about, Mapping)
+    }

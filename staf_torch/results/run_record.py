@@ -1,0 +1,139 @@
+"""`run.json` of a run and `sweep.json` of a sweep: what ran, with which settings, and how it ended."""
+
+from __future__ import annotations
+
+import json
+import re
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from .._version import __version__
+from .files import COMPLETED, METRICS, UnreadableError, flatten, plain, read_object, write_text
+from .files import RUN as RUN
+from .files import SWEEP as SWEEP
+from .metric_info import MetricInfo
+
+SETTINGS = "sweep"
+"""The group of settings that are about the sweep and not about its jobs."""
+
+
+class RunRecord:
+    """Write `run.json` when a run begins and again when it ends.
+
+    Args:
+        cfg: all settings but Hydra's.
+        choices: the option chosen of each group of settings.
+        overrides: as typed.
+    """
+
+    def __init__(self, cfg: DictConfig, choices: Mapping[str, str | None], overrides: Sequence[str]) -> None:
+        self._start = time.monotonic()
+        self._about = {
+            "version": __version__,
+            "task": cfg.get("task"),
+            "overrides": own(overrides),
+            "settings": flat(cfg) | {g: c for g, c in choices.items() if not g.startswith("hydra/")},
+        }
+
+    def declare(self, metrics: Sequence[MetricInfo]) -> None:
+        """Add metrics of the user's own, so that a table knows them without their code."""
+        if metrics:
+            self._about["metrics"] = {info.name: info.record() for info in metrics}
+
+    def add_seconds(self, seconds: float) -> None:
+        """Count time that was spent on the run before it began: its share of a tensor batch."""
+        self._start -= seconds
+
+    def write(self, directory: Path, status: str, reason: str | None = None) -> None:
+        """Write the record with a status: running, completed or failed."""
+        spent = round(time.monotonic() - self._start, 3)
+        record = {**self._about, "status": status, "reason": reason, "seconds": spent}
+        write_text(directory / RUN, json.dumps(record, indent=1, allow_nan=False) + "\n")
+
+
+def own(overrides: Sequence[str]) -> list[str]:
+    """Return the overrides of a job itself, without those about the sweep that it is part of."""
+    return [line for line in overrides if not line.lstrip("+~").startswith(f"{SETTINGS}.")]
+
+
+def flat(cfg: DictConfig) -> dict[str, Any]:
+    """Return every setting but those of the sweep: dotted key to number, text, null or list."""
+    try:
+        settings = OmegaConf.to_container(cfg, resolve=True)
+    except OmegaConfBaseException:  # something refers to what is not there: as it is written
+        settings = OmegaConf.to_container(cfg, resolve=False)
+    assert isinstance(settings, dict)
+    own_ones = {key: value for key, value in settings.items() if key not in (SETTINGS, "hydra")}
+    return {key: plain(value) for key, value in flatten(own_ones).items()}
+
+
+def read(path: Path) -> dict[str, Any] | None:
+    """Return a JSON object, or None where there is none that can be read."""
+    try:
+        return read_object(path)
+    except UnreadableError:
+        return None
+
+
+def metrics_of(directory: Path, overrides: Sequence[str]) -> dict[str, float | None] | None:
+    """Return the metrics of a run that was completed by this version with these overrides, else None.
+
+    Raises:
+        ValueError: if the directory holds a run of other settings or of another version.
+    """
+    record = read(directory / RUN)
+    if record is None:
+        return None
+    if record.get("version") != __version__:
+        raise ValueError(
+            f"{directory} was written by staf_torch {record.get('version')}, and this is {__version__}: "
+            "their numbers may differ. Run the sweep anew, or with that version."
+        )
+    if record.get("overrides") != own(overrides):
+        raise ValueError(
+            f"{directory} holds the run {' '.join(record.get('overrides', []))!r}, "
+            f"where this sweep has {' '.join(own(overrides))!r}."
+        )
+    return read(directory / METRICS) if record.get("status") == COMPLETED else None
+
+
+def resumed(cfg: DictConfig) -> bool:
+    """Return whether the sweep of these settings takes up an earlier one."""
+    return OmegaConf.select(cfg, f"{SETTINGS}.resume") is not None
+
+
+def without_hydra(config: DictConfig) -> DictConfig:
+    """Return a copy of the settings as a task sees them."""
+    return OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
+
+
+def begin_sweep(directory: Path, overrides: Sequence[str], hydra: Sequence[str]) -> None:
+    """Write `sweep.json` of a sweep that begins: what was typed, about the jobs and about the sweep."""
+    jobs = own(overrides)
+    others = [*hydra, *(line for line in overrides if line not in jobs)]
+    _write_sweep(directory, {"version": __version__, "overrides": jobs, "hydra": others})
+
+
+def list_jobs(directory: Path, numbered: Mapping[int, Sequence[str]]) -> None:
+    """Add jobs to `sweep.json`, number to overrides, before the first of them starts."""
+    record = read(directory / SWEEP) or {"version": __version__}
+    jobs = {job["num"]: job["overrides"] for job in record.get("jobs", ())}
+    jobs |= {num: own(overrides) for num, overrides in numbered.items()}
+    listed = [{"num": num, "overrides": overrides} for num, overrides in sorted(jobs.items())]
+    _write_sweep(directory, {**record, "jobs": listed})
+
+
+def _write_sweep(directory: Path, record: Mapping[str, Any]) -> None:
+    write_text(directory / SWEEP, json.dumps({"jobs": [], **record}, indent=1, allow_nan=False) + "\n")
+
+
+def quoted(value: str) -> str:
+    """Return a text as a value in Hydra's grammar of overrides."""
+    if re.fullmatch(r"[A-Za-z0-9_./@+-]+", value):
+        return value
+    return "'" + value.replace("\\", "\\\\").replace("'", "\\'") + "'"

@@ -1,0 +1,223 @@
+"""From settings to the objects of a closed loop: one config group each, nested under `adp`."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import warnings
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from hydra.utils import get_object, instantiate
+from omegaconf import DictConfig, OmegaConf, open_dict
+
+from ..adp import (
+    LQR,
+    ActorCriticLaw,
+    Controller,
+    Cost,
+    Extrapolation,
+    Feedback,
+    Supervised,
+    ValueBasis,
+)
+from ..adp.problem import AdpProblem, OptimumSettings
+from ..approximation.basis import StaFBasis
+from ..numerics.checks import choice, fail, flag, integer, positive_real
+from ..systems import ControlAffineSystem
+from . import config_directory
+from .chase import initial_states, make, make_centers, placement, plain
+
+_GROUPS = ("policy", "law", "basis", "extrapolation")  # that were strings before they were config groups
+_TARGETS = {  # of nodes that had none in version 0.1
+    "gains": "staf_torch.adp.Gains",
+    "half_width": "staf_torch.settings.chase.make_radius",
+    "cost": "staf_torch.adp.QuadraticCost",
+}
+_RECORDED = 200_000  # states of all trajectories together that are recorded unless asked for
+
+
+def adp_problem(cfg: DictConfig) -> AdpProblem:
+    """Build the closed loop that the settings describe.
+
+    Raises:
+        ValueError: if a setting breaks its rule; the message names it.
+    """
+    cfg = updated(cfg)
+    device, dtype = placement(cfg.device, cfg.dtype)
+    system = plant(cfg)
+    assert system.dim is not None
+    x0 = initial_states(cfg, system.dim).to(device=device, dtype=dtype)
+    cost = make_cost(cfg, system)
+    control = controller(cfg, system, cost)
+    dt = max(positive_real("staf", "dt", cfg.dt), control.period or 0.0)
+    duration = positive_real("staf", "duration", cfg.duration)
+    steps = round(duration / dt)
+    if steps < 1:
+        raise fail("staf", "duration", f"must be at least one step (dt={dt})", duration)
+    for module in (system, cost, control):
+        module.to(device=device, dtype=dtype)
+    return AdpProblem(
+        system=system,
+        cost=cost,
+        controller=control,
+        initial_states=x0,
+        dt=dt,
+        steps=steps,
+        every=_every(cfg.adp.record_every, steps, len(x0)),
+        seed=integer("staf", "seed", cfg.seed, least=0),
+        integrator=cfg.adp.integrator,
+        compile=cfg.adp.compile,
+        optimum=_optimum_settings(cfg.adp.optimum),
+    )
+
+
+def build(cfg: DictConfig, group: str, kind: type, **known: Callable[[], Any]) -> Any:
+    """Build the object of a group below `adp`, and hand over what its constructor asks for by name.
+
+    Args:
+        cfg: the settings.
+        group: a node with ``_target_`` and arguments.
+        kind: the type that the object must have.
+        known: functions that make an argument: each is called only where the constructor has a parameter of
+            that name and the node does not give it.
+
+    Raises:
+        ValueError: if the object is of another type.
+    """
+    node = cfg.adp[group]
+    asked = inspect.signature(get_object(node["_target_"])).parameters
+    given = {name: make_it() for name, make_it in known.items() if name in asked and name not in node}
+    # Not through instantiate's own keywords, which would copy the objects.
+    maker = instantiate(node, _convert_="all", _partial_=True)
+    made = functools.partial(maker, **given) if node.get("_partial_") else maker(**given)
+    if not isinstance(made, kind):
+        raise fail("adp", group, f"must be a {kind.__name__}", made)
+    return made
+
+
+def plant(cfg: DictConfig) -> ControlAffineSystem:
+    """Build the plant, which must have inputs."""
+    system = make(cfg.system)
+    if not isinstance(system, ControlAffineSystem) or system.dim is None:
+        raise fail("adp", "system", "must be a ControlAffineSystem with `dim`", system)
+    if _inputs(system) == 0:
+        raise fail("adp", "system", "must be a plant with inputs", type(system).__name__)
+    return system
+
+
+def _inputs(system: ControlAffineSystem) -> int:
+    """Return m."""
+    return system.effectiveness(torch.zeros(1, system.dim or 0, dtype=torch.float64)).shape[-1]
+
+
+def make_cost(cfg: DictConfig, system: ControlAffineSystem) -> Cost:
+    """Build the cost rate of the group `adp/cost` in the plant's sizes."""
+    cost: Cost = build(cfg, "cost", Cost, dim=lambda: system.dim, inputs=lambda: _inputs(system))
+    return cost
+
+
+def controller(cfg: DictConfig, system: ControlAffineSystem, cost: Cost) -> Controller:
+    """Build the controller of the group `adp/policy`; a callable from x to u becomes a `Feedback`."""
+    assert system.dim is not None
+    basis = functools.cache(functools.partial(value_basis, cfg, system.dim))
+
+    def start(weights: Any) -> Any:
+        return plain(weights) if basis().follows_state else basis().weights_near_square()
+
+    policy: Callable[..., Any] = build(
+        cfg,
+        "policy",
+        Callable,  # type: ignore[arg-type]
+        system=lambda: system,
+        model=lambda: system,
+        cost=lambda: cost,
+        dim=lambda: system.dim,
+        inputs=lambda: _inputs(system),
+        lqr=lambda: LQR(system, cost),
+        basis=basis,
+        extrapolation=lambda: build(cfg, "extrapolation", Extrapolation, dim=lambda: system.dim),
+        law=lambda: build(cfg, "law", ActorCriticLaw),
+        critic=lambda: start(cfg.adp.critic),
+        actor=lambda: start(cfg.adp.actor),
+    )
+    if not isinstance(policy, Controller):
+        return Feedback(policy, getattr(policy, "value", None))
+    if cfg.adp.trust is None:
+        return policy
+    return Supervised(policy, LQR(system, cost), cost, cfg.adp.trust)
+
+
+def value_basis(cfg: DictConfig, dim: int) -> ValueBasis:
+    """Build the basis of the group `adp/basis`; one that asks for ``basis`` gets kernel and centers."""
+
+    def kernel_and_centers() -> StaFBasis:
+        return StaFBasis(make(cfg.kernel), make_centers(cfg.centers, dim))
+
+    basis: ValueBasis = build(cfg, "basis", ValueBasis, dim=lambda: dim, basis=kernel_and_centers)
+    return basis
+
+
+def changed(cfg: DictConfig, changes: Mapping[str, Any]) -> DictConfig:
+    """Copy the settings with others under `adp`, where a string for a group names one of its options.
+
+    Raises:
+        ValueError: if the package brings no such option.
+    """
+    new = cfg.copy()
+    with open_dict(new):
+        for name, value in changes.items():
+            if name in _GROUPS:
+                options = {
+                    path.stem: path for path in sorted(Path(config_directory(), "adp", name).glob("*.yaml"))
+                }
+                choice("adp", name, value, tuple(options))
+                new.adp[name] = OmegaConf.load(options[value])
+            else:
+                OmegaConf.update(new.adp, name, value)
+    return new
+
+
+def updated(cfg: DictConfig) -> DictConfig:
+    """Copy the settings, with those under `adp` that version 0.1 wrote in today's form.
+
+    Warns:
+        FutureWarning: for each of them, with its new name.
+
+    Raises:
+        ValueError: if a string names no option of its group.
+    """
+    old = {group: cfg.adp[group] for group in _GROUPS if isinstance(cfg.adp[group], str)}
+    new = changed(cfg, old)
+    said = {f"adp.{group}={name}": f"adp/{group}={name}" for group, name in old.items()}
+    with open_dict(new):
+        for name, target in _TARGETS.items():
+            new.adp[name].setdefault("_target_", target)
+        cost = new.adp.cost
+        bound = cost.pop("bound", None) if cost["_target_"] == _TARGETS["cost"] else None
+        if bound is not None:
+            said[f"adp.cost.bound={bound}"] = f"adp/cost=bounded_input adp.cost.bound={bound}"
+            cost["_target_"], cost["bound"] = "staf_torch.adp.BoundedInputCost", bound
+    for before, now in said.items():
+        message = f"the setting `{before}` is now `{now}`; the old one goes in the next release."
+        warnings.warn(message, FutureWarning, stacklevel=3)
+    return new
+
+
+def _optimum_settings(cfg: DictConfig) -> OptimumSettings:
+    return OptimumSettings(
+        shooting=flag("adp", "optimum.shooting", cfg.shooting),
+        states=integer("adp", "optimum.states", cfg.states, least=0),
+        horizon=None if cfg.horizon is None else positive_real("adp", "optimum.horizon", cfg.horizon),
+        intervals=None if cfg.intervals is None else integer("adp", "optimum.intervals", cfg.intervals, 4),
+    )
+
+
+def _every(wanted: object, steps: int, batch: int) -> int:
+    """Steps between recorded times: the wanted number, else one that keeps the record within bounds."""
+    if wanted is not None:
+        return integer("adp", "record_every", wanted, least=1)
+    least = -(-steps * batch // _RECORDED)
+    return next(k for k in range(max(1, least), steps + 1) if steps % k == 0) if least < steps else steps

@@ -1,0 +1,319 @@
+"""From settings to the objects of a gradient chase, and of the experiments on the theorems."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import json
+import math
+import warnings
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import torch
+from hydra.utils import instantiate
+from omegaconf import DictConfig, OmegaConf
+from torch import Tensor, nn
+
+from ..approximation.basis import StaFBasis, Target
+from ..centers import (
+    Radius,
+    StateFollowingCenters,
+    StateRadius,
+    ball,
+    cross_polytope,
+    polygon,
+    rings,
+    simplex,
+)
+from ..engine.predictors import Predictor
+from ..kernels import Kernel
+from ..metrics import Metric
+from ..numerics.checks import COMMAND_LINE, choice, fail, flag, integer, positive_real, real, vector
+from ..optim import UpdateLaw
+from ..results.metric_info import OWN
+from ..systems import ControlAffineSystem, trajectory
+
+DTYPES = {"float64": torch.float64, "float32": torch.float32}
+
+
+@dataclasses.dataclass(frozen=True)
+class ChaseProblem:
+    """Everything a gradient chase needs, checked."""
+
+    system: ControlAffineSystem  # or any module with its methods
+    basis: StaFBasis
+    target: Target
+    law: UpdateLaw
+    initial_states: Tensor  # (B, n)
+    dt: float  # s
+    steps: int  # T - 1
+    inner_steps: int
+    settle_time: float  # s
+    predictor: Predictor | None = None
+    certificate: bool = False
+    metrics: tuple[Metric, ...] = ()  # of the user's own
+
+
+def load(path: str, arguments: dict[str, Any] | None = None) -> Any:
+    """Return the object at a dotted path, for classes and functions outside the package.
+
+    A class is called with ``arguments``; anything else is returned as it is.
+
+    Raises:
+        ValueError: if nothing is there, or arguments are given to something that is not a class.
+    """
+    module, _, name = path.rpartition(".") if isinstance(path, str) else ("", "", "")
+    if not module:
+        raise fail("custom", "path", "must be a dotted path `package.module.name`", path)
+    try:
+        named = getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError) as error:
+        raise fail("custom", "path", f"cannot be imported ({error})", path) from error
+    if isinstance(named, type):
+        return named(**(arguments or {}))
+    if arguments:
+        raise fail("custom", "arguments", f"needs a class at {path}, which is none", arguments)
+    return named
+
+
+class Parts:
+    """Cache: equal settings share one constructed object.
+
+    A warning of the construction is repeated for every configuration that uses the object.
+    """
+
+    def __init__(self) -> None:
+        self._made: dict[tuple[object, ...], tuple[Any, list[str]]] = {}
+
+    def __call__(self, make: Callable[..., Any], *arguments: Any) -> Any:
+        """``make(*arguments)``; arguments are settings, or objects that come from here."""
+        key = (make, *map(_key, arguments))
+        if key not in self._made:
+            with warnings.catch_warnings(record=True) as given:
+                warnings.simplefilter("always")
+                made = make(*arguments)
+            self._made[key] = made, [str(warning.message) for warning in given]
+        made, said = self._made[key]
+        for message in said:
+            warnings.warn(message, stacklevel=2)
+        return made
+
+
+def _key(argument: object) -> object:
+    """Return a key that is equal for equal settings; an object that is none is only equal to itself."""
+    if OmegaConf.is_config(argument):
+        return json.dumps(OmegaConf.to_container(argument, resolve=True), default=repr)
+    return argument if isinstance(argument, int | float | str | None) else id(argument)
+
+
+def chase_problem(cfg: DictConfig, parts: Parts | None = None) -> ChaseProblem:
+    """Build the gradient chase that the settings describe.
+
+    Args:
+        cfg: the settings.
+        parts: the cache of the batch, so that problems with equal settings share objects.
+
+    Raises:
+        ValueError: if a setting breaks its rule; the message names it.
+    """
+    parts = Parts() if parts is None else parts
+    device, dtype = placement(cfg.device, cfg.dtype)
+    system = parts(make, cfg.system)
+    if not callable(getattr(system, "drift", None)):
+        raise fail(COMMAND_LINE, "system", "must be a plant with a method `drift`", system)
+    dim = _dimension(system, cfg.initial_state)
+    basis = parts(StaFBasis, parts(make, cfg.kernel), parts(make_centers, cfg.centers, dim))
+    target = parts(make, cfg.target)
+    if not callable(target):
+        raise fail(COMMAND_LINE, "target", "must be callable", target)
+    dt = positive_real(COMMAND_LINE, "dt", cfg.dt)
+    duration = positive_real(COMMAND_LINE, "duration", cfg.duration)
+    if duration < dt:
+        raise fail(COMMAND_LINE, "duration", f"must be at least one step (dt={dt})", duration)
+    law, inner_steps = parts(_law, cfg.optimizer)
+    for module in (system, basis, target):
+        if isinstance(module, nn.Module):
+            module.to(device=device, dtype=dtype)
+    return ChaseProblem(
+        system=system,
+        basis=basis,
+        target=target,
+        law=law,
+        initial_states=initial_states(cfg, dim).to(device=device, dtype=dtype),
+        dt=dt,
+        steps=math.floor(duration / dt + 1e-9),
+        inner_steps=inner_steps,
+        settle_time=real(COMMAND_LINE, "settle_time", cfg.settle_time),
+        predictor=None if cfg.predictor.get("_target_") is None else parts(make, cfg.predictor),
+        certificate=flag(COMMAND_LINE, "certificate", cfg.certificate),
+        metrics=parts(make_metrics, cfg.get("metric")),
+    )
+
+
+def _dimension(system: ControlAffineSystem, initial_state: object) -> int:
+    """Return n: the system's, or that of the initial state where the system takes any."""
+    stated = getattr(system, "dim", None)
+    if stated is not None:
+        return integer(type(system).__name__, "dim", stated, least=1)
+    return len(vector(COMMAND_LINE, "initial_state", plain(initial_state)))
+
+
+def plain(value: Any) -> Any:
+    """Return a setting as Python has it: a list or dictionary, resolved, in place of OmegaConf's."""
+    return OmegaConf.to_container(value, resolve=True) if OmegaConf.is_config(value) else value
+
+
+def make(cfg: DictConfig) -> Any:
+    """Build the object that a group of settings names by ``_target_``."""
+    return instantiate(cfg, _convert_="all")
+
+
+def make_metrics(cfg: DictConfig | None) -> tuple[Metric, ...]:
+    """Return the metrics of the user's own that the group `metric` names: none, one, or a sequence of them.
+
+    Raises:
+        ValueError: if something else is named, or a name is taken.
+    """
+    if cfg is None or cfg.get("_target_") is None:
+        return ()
+    made = make(cfg)
+    metrics = (made,) if isinstance(made, Metric) else made
+    if not isinstance(metrics, list | tuple) or not all(isinstance(metric, Metric) for metric in metrics):
+        raise fail(COMMAND_LINE, "metric", "must be a `staf_torch.metrics.Metric`, or several", made)
+    taken = [info.name for info in OWN]
+    for metric in metrics:
+        if metric.name in taken:
+            raise fail(COMMAND_LINE, "metric", "must have a name that no other metric has", metric.name)
+        taken.append(metric.name)
+    return tuple(metrics)
+
+
+def placement(device: object, dtype: object) -> tuple[torch.device, torch.dtype]:
+    """Return device and dtype by name.
+
+    Raises:
+        ValueError: if the dtype is unknown, or the device cannot be used.
+    """
+    choice(COMMAND_LINE, "dtype", dtype, tuple(DTYPES))
+    try:
+        place = torch.device(str(device))
+        torch.empty(0, device=place)
+    except (RuntimeError, AssertionError) as error:
+        reason = str(error).splitlines()[0]
+        raise fail(COMMAND_LINE, "device", f"cannot be used here ({reason})", device) from error
+    return place, DTYPES[str(dtype)]
+
+
+def make_centers(cfg: DictConfig, dim: int) -> StateFollowingCenters:
+    """Build the centers of the group `centers` around states of ``dim`` coordinates.
+
+    Raises:
+        ValueError: if the layout does not exist in that dimension, or has another number of centers.
+    """
+    count, layout = cfg.count, cfg.layout
+    planar: dict[str, Callable[[int], Tensor]] = {"rings": rings, "polygon": polygon}
+    fixed: dict[str, Callable[[int], Tensor]] = {
+        "simplex": simplex,
+        "cross_polytope": cross_polytope,
+    }
+    choice(COMMAND_LINE, "centers.layout", layout, (*planar, *fixed, "ball", "directions"))
+    if layout in planar:
+        if dim != 2:
+            raise ValueError(
+                f"`centers={layout}` lies in the plane, but the system has {dim} states: "
+                "use simplex, cross_polytope or ball."
+            )
+        directions = planar[layout](count)
+    elif layout in fixed:
+        directions = fixed[layout](dim)
+        if count is not None and count != len(directions):
+            integer(COMMAND_LINE, "centers.count", count, least=1)
+            rule = f"must be {len(directions)} (or null) for {layout} with {dim} states"
+            raise fail(COMMAND_LINE, "centers.count", rule, count)
+    elif layout == "directions":
+        rows = [vector(COMMAND_LINE, "centers.directions", row, dim) for row in plain(cfg.directions)]
+        directions = torch.tensor(rows, dtype=torch.float64)
+    else:
+        directions = ball(count, dim)
+    return StateFollowingCenters(directions, make_radius(cfg.radius, cfg.shrink.offset, cfg.shrink.gain))
+
+
+def make_radius(radius: float, offset: float | None, gain: float) -> float | Radius:
+    """Return the radius: constant where the offset is None, else radius (x'x + offset) / (1 + gain x'x)."""
+    return radius if offset is None else StateRadius(radius, offset, gain)
+
+
+def _law(cfg: DictConfig) -> tuple[UpdateLaw, int]:
+    """Build the update law of the group `optimizer`; return it with the number of inner steps."""
+    settings = plain(cfg)
+    inner_steps = integer(COMMAND_LINE, "optimizer.inner_steps", settings.pop("inner_steps"), least=1)
+    return make(OmegaConf.create(settings)), inner_steps
+
+
+def initial_states(cfg: DictConfig, dim: int) -> Tensor:
+    """Return the stated initial state, then others uniform in a box around it: (B, n) float64.
+
+    The generator runs on the CPU in float64, so that one seed means the same states everywhere, and
+    the first k of them do not depend on how many follow.
+    """
+    stated = vector(COMMAND_LINE, "initial_state", plain(cfg.initial_state), dim)
+    first = torch.tensor(stated, dtype=torch.float64)
+    batch = integer(COMMAND_LINE, "trajectories", cfg.trajectories, least=1)
+    spread = positive_real(COMMAND_LINE, "spread", cfg.spread)
+    generator = torch.Generator().manual_seed(integer(COMMAND_LINE, "seed", cfg.seed, least=0))
+    rows = [torch.rand(dim, dtype=torch.float64, generator=generator) for _ in range(batch - 1)]
+    around = [first + spread * (2 * row - 1) for row in rows]
+    return torch.stack([first, *around])
+
+
+class LocalProblem(NamedTuple):
+    """A function to approximate around some states of a trajectory."""
+
+    kernel: Kernel
+    target: Target
+    radius: float  # of the balls
+    states: Tensor  # (T, n)
+    time: Tensor  # (T,) s
+
+
+def local_problem(cfg: DictConfig, states: str) -> LocalProblem:
+    """Build the first trajectory that the settings describe, at equally spaced times.
+
+    Args:
+        cfg: the settings.
+        states: name of the setting that says at how many, `experiment.states`.
+
+    Raises:
+        ValueError: if a setting breaks its rule; the message names it.
+    """
+    problem = chase_problem(cfg)
+    if cfg.centers.shrink.offset is not None:
+        rule = "must be null here: the experiment is about balls of a constant radius"
+        raise fail(COMMAND_LINE, "centers.shrink.offset", rule, cfg.centers.shrink.offset)
+    count = integer(COMMAND_LINE, states, OmegaConf.select(cfg, states), least=1)
+    pieces = trajectory(problem.system, problem.initial_states[:1], dt=problem.dt, steps=problem.steps)
+    path = torch.cat(list(pieces), dim=1)[0]
+    # Without the last one: over one period that is the first again.
+    index = (torch.arange(min(count, problem.steps)) * problem.steps) // min(count, problem.steps)
+    radius = positive_real(COMMAND_LINE, "centers.radius", cfg.centers.radius)
+    return LocalProblem(
+        problem.basis.kernel, problem.target, radius, path[index], index.to(path) * problem.dt
+    )
+
+
+def numbers(cfg: DictConfig, name: str) -> list[float]:
+    """Return a setting that lists positive numbers, sorted and without repetitions.
+
+    Raises:
+        ValueError: if the setting ``name`` is no such list.
+    """
+    listed = plain(OmegaConf.select(cfg, name))
+    if not isinstance(listed, list) or not listed:
+        raise fail(COMMAND_LINE, name, "must be a list of numbers", listed)
+    return sorted({positive_real(COMMAND_LINE, name, number) for number in listed})
+
+
+def case_name(radius: float, epsilon: float) -> str:
+    """Return the end of a metric's name: the radius and the epsilon that the metric belongs to."""
+    return f"r{radius:g}.eps{epsilon:g}"

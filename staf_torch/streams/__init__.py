@@ -1,3 +1,0 @@
-"""Online regression on streams of samples."""
-
-from .regressor import StaFRegressor as StaFRegressor

@@ -1,0 +1,215 @@
+"""Many configurations side by side: which may share a tensor batch, and what becomes of each."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import logging
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from hydra.errors import HydraException, MissingConfigException
+from omegaconf import DictConfig
+from omegaconf.errors import OmegaConfBaseException
+
+from ..experiments.registry import BatchedExperiment, Experiment, Metrics, Solution, experiment
+from ..results import run_record as records
+from ..results.progress import SHOWN, Progress
+
+_log = logging.getLogger(__name__)
+_KEPT_BYTES = 2**28
+"""What the members of a chunk may keep until they are written."""
+_CHUNK = 128
+"""Members of a chunk: more gain nothing, and what is done is written that much later."""
+_UNREADABLE = (ValueError, TypeError, KeyError, AttributeError, OmegaConfBaseException)
+"""What broken settings raise while they are grouped. The job itself says later what is wrong with it."""
+USER_ERRORS = (ValueError, HydraException, OmegaConfBaseException, OSError)
+"""What a setting or the disk can bring about; anything else is a defect and keeps its trace."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Computed:
+    """The outcome of a job that was solved in a tensor batch; its files are not written yet."""
+
+    solution: Solution
+
+    @property
+    def metrics(self) -> Metrics:
+        """What `metrics.json` will hold."""
+        return self.solution.metrics
+
+
+@dataclasses.dataclass(frozen=True)
+class Written:
+    """The outcome of a job that ran as a whole in a worker, and has its files."""
+
+    metrics: Metrics
+    log: Sequence[tuple[int, str]]  # level and message, for the log of the run
+
+    def replay(self, cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics:
+        """Say in the log of the run what the worker was told, and return the metrics."""
+        for level, line in self.log:
+            _log.log(level, "%s", line)
+        return self.metrics
+
+
+@dataclasses.dataclass(frozen=True)
+class Deferred:
+    """In place of an outcome: the experiment takes no part in batches and runs when it is finished."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Failed:
+    """The outcome of a job that raised."""
+
+    error: Exception
+
+
+Outcome = Computed | Written | Deferred | Failed
+DEFERRED = Deferred()
+
+
+class Batch(NamedTuple):
+    """The jobs of a tensor batch."""
+
+    settings: list[DictConfig]
+    directories: list[str]  # of the runs
+
+
+class Done(NamedTuple):
+    """A tensor batch that was computed."""
+
+    outcomes: list[Outcome]  # one a job
+    seconds: float
+
+
+def groups(cfgs: Sequence[DictConfig]) -> list[list[int]]:
+    """Return the indices of the configurations that may share one tensor batch, in order of appearance."""
+    found: dict[str, list[int]] = {}
+    for index, cfg in enumerate(cfgs):
+        found.setdefault(_group(cfg, index), []).append(index)
+    return list(found.values())
+
+
+def chunks(cfgs: Sequence[DictConfig], indices: Sequence[int]) -> list[list[int]]:
+    """Return the indices of a group in pieces that fit into memory together."""
+    parts: list[list[int]] = []
+    total = 0
+    for index in indices:
+        bytes_ = _size(cfgs[index])
+        if not parts or len(parts[-1]) >= _CHUNK or total + bytes_ > _KEPT_BYTES:
+            parts.append([])
+            total = 0
+        parts[-1].append(index)
+        total += bytes_
+    return parts
+
+
+def batches(cfgs: Sequence[DictConfig], *, least: int = 1, most: int | None = None) -> list[list[int]]:
+    """Return the indices of every tensor batch, in order.
+
+    Args:
+        cfgs: the settings of all jobs.
+        least: so many batches at least, where that can be, to keep that many workers busy.
+        most: jobs of a batch at most; None for as many as memory allows.
+    """
+    grouped, found = groups(cfgs), []
+    for group in grouped:
+        length = min(most or len(group), -(-len(group) * len(grouped) // least))
+        for chunk in chunks(cfgs, group):
+            found += [chunk[i : i + length] for i in range(0, len(chunk), length)]
+    return sorted(found)
+
+
+def solve(cfgs: Sequence[DictConfig], progress: Progress) -> list[Outcome]:
+    """Compute one tensor batch; return an outcome a configuration, in order.
+
+    Where the batch as a whole raises, its members are tried one by one, so that only the culprit fails.
+    """
+    try:
+        study = experiment(cfgs[0].task)
+        if not isinstance(study, BatchedExperiment) or any(cfg.get("members") is not None for cfg in cfgs):
+            return [DEFERRED for _ in cfgs]
+        solutions = study.solve(cfgs, progress)
+        return [Failed(each) if isinstance(each, Exception) else Computed(each) for each in solutions]
+    except Exception as error:
+        if len(cfgs) == 1:
+            return [Failed(error)]
+        _log.warning("a batch of %d cannot run as one (%s); each runs alone", len(cfgs), reason(error))
+        return [outcome for cfg in cfgs for outcome in solve([cfg], progress)]
+
+
+def completion(cfg: DictConfig, outcome: Outcome) -> Experiment:
+    """Return what is left to do for a job with that outcome, as a function like an experiment.
+
+    Raises:
+        Exception: that of a job that failed.
+    """
+    study = experiment(cfg.task)
+    match outcome:
+        case Failed(error):
+            raise error
+        case Deferred():
+            return study
+        case Computed(solution):
+            assert isinstance(study, BatchedExperiment)
+            return lambda cfg, directory, progress=SHOWN: study.write(cfg, directory, solution)
+        case Written():
+            return outcome.replay
+
+
+def _group(cfg: DictConfig, index: int) -> str:
+    """Return a text that is equal for the members of a group."""
+    try:
+        study, settings = experiment(cfg.task), records.flat(cfg)
+        if isinstance(study, BatchedExperiment):
+            names = study.batchable
+            static = [[name, _form(value) if name in names else value] for name, value in settings.items()]
+            return json.dumps([study.shape(settings), *static])
+    except _UNREADABLE:
+        pass
+    return json.dumps(index)
+
+
+def _form(value: Any) -> Any:
+    """Return what a batch shares of a batchable value: nothing of a number, the form of a list, a word."""
+    if isinstance(value, list):
+        return [_form(entry) for entry in value]
+    return "number" if isinstance(value, int | float) and not isinstance(value, bool) else [value]
+
+
+def _size(cfg: DictConfig) -> int:
+    try:
+        study = experiment(cfg.task)
+        return study.size(records.flat(cfg)) if isinstance(study, BatchedExperiment) else 0
+    except _UNREADABLE:
+        return 0
+
+
+def sentence(error: BaseException) -> str:
+    """The library's own words where Hydra wrapped them, else the error's."""
+    cause: BaseException | None = error
+    while cause is not None:
+        if isinstance(cause, ValueError) and not isinstance(cause, OmegaConfBaseException):
+            return str(cause)
+        cause = cause.__cause__
+    if isinstance(error, OSError) and not isinstance(error, HydraException) and error.filename:
+        return f"cannot write {error.filename}: {error.strerror}"
+    unknown = re.match(r"Could not override '(.+?)'", str(error))
+    if unknown:
+        return f"there is no setting `{unknown[1]}`; `staf --help` lists them."
+    if isinstance(error, MissingConfigException) and error.options:
+        name = (error.missing_cfg_file or "").removesuffix(".yaml")
+        more = "; others come with the extras joblib, slurm, ray and optuna" if "hydra/" in name else ""
+        return f"there is no `{name}`; there are {', '.join(error.options)}{more}."
+    return str(error)
+
+
+def reason(error: BaseException) -> str:
+    """One line for the records: the sentence, and the type of an error that is a defect."""
+    if isinstance(error, KeyboardInterrupt):
+        return "interrupted"
+    said = " ".join(sentence(error).split())
+    return said if isinstance(error, USER_ERRORS) and said else f"{type(error).__name__}: {said}"

@@ -1,0 +1,214 @@
+"""The Hydra callbacks of `conf/config.yaml`: the sweep's directory, its report, and trackers."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import logging
+import os
+import shutil
+import sys
+from abc import ABC, abstractmethod
+from pathlib import Path
+from typing import Any
+
+from hydra.experimental.callback import Callback
+from hydra.utils import instantiate
+from omegaconf import DictConfig, OmegaConf
+
+from ..numerics import COMMAND_LINE, fail
+from ..results import run_record as records
+from ..results.files import COMPLETED, PAGE
+from ..results.reader import Run, collect
+from .hydra_compat import BrokenSweep
+from .job import PRINTS
+from .report import write_report
+
+_log = logging.getLogger(__name__)
+
+_FOLDER = "tensorboard"
+
+
+class Tracker(ABC):
+    """Takes finished runs elsewhere: to event files, a server, a notebook.
+
+    Example:
+        >>> class Lines(Tracker):
+        ...     def record(self, run):
+        ...         with open("results.txt", "a") as file:
+        ...             print(run.settings["kernel"], run.metrics["ball_error"], file=file)
+
+        In `mine.py`, it is used by `staf tracker=custom tracker.path=mine.Lines`.
+
+    One is made before the first run, so that the constructor can refuse by a ValueError, and one for each job
+    that ended. An error of `record` is a warning in the log: the results are on the disk all the same.
+    """
+
+    @abstractmethod
+    def record(self, run: Run) -> None:
+        """Take in a completed run, once: with many members, each of them."""
+
+
+class TensorBoardTracker(Tracker):
+    """The metrics as scalars and the settings as hyperparameters, in `tensorboard/` of the run directory.
+
+    Raises:
+        ValueError: without TensorBoard.
+    """
+
+    def __init__(self) -> None:
+        if importlib.util.find_spec("tensorboard") is None:
+            raise ValueError(
+                "`tracker=tensorboard` needs TensorBoard: install the extra, "
+                "pip install 'staf_torch[tensorboard]'."
+            )
+
+    def record(self, run: Run) -> None:
+        """One event file; a metric without a number is left out."""
+        from torch.utils.tensorboard import SummaryWriter
+        from torch.utils.tensorboard.summary import hparams
+
+        folder = run.directory / _FOLDER
+        numbers = {name: float(value) for name, value in run.metrics.items() if value is not None}
+        known = {
+            key: value if isinstance(value, bool | int | float | str) else str(value)
+            for key, value in (run.settings or run.overrides).items()
+            if value is not None
+        }
+        with SummaryWriter(str(folder if run.member is None else folder / str(run.member))) as writer:
+            for summary in hparams(known, numbers):
+                writer._get_file_writer().add_summary(summary)
+            for name, number in numbers.items():
+                writer.add_scalar(name, number)
+
+
+class SweepDirectory(Callback):
+    """Takes a directory for a sweep that begins and notes there what was typed."""
+
+    def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
+        """Make the directory and `sweep.json`; a sweep that is resumed has both."""
+        if not records.resumed(config):
+            claim(config)
+            typed = config.hydra.overrides
+            records.begin_sweep(_directory(config), list(typed.task), list(typed.hydra))
+
+
+class SweepReport(Callback):
+    """Prints and saves the table of a sweep, draws its figures, and writes `report.html`, when it ends.
+
+    Args:
+        figures: whether to draw; None: as the runs do, by `figures` of the settings.
+    """
+
+    def __init__(self, figures: bool | None = None) -> None:
+        self._figures = figures
+
+    def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
+        """Write the report; nothing that goes wrong here may look like a sweep gone wrong."""
+        directory = _directory(config)
+        figures = OmegaConf.select(config, "figures") if self._figures is None else self._figures
+        if not directory.is_dir():
+            return
+        try:
+            text = write_report(directory, figures=figures is not False)
+        except Exception as error:
+            _log.warning("no report of the sweep: %s", error)
+            return
+        if PRINTS.get():
+            sys.stdout.write(f"\n{text}\n  report: {directory / PAGE}\n")
+            sys.stdout.flush()
+
+
+class TrackRuns(Callback):
+    """Hands completed runs to the tracker of the settings, which is made before and can refuse."""
+
+    def on_run_start(self, config: DictConfig, **_: Any) -> None:
+        """Make the tracker of a run or sweep that begins, and end the program where the tracker refuses."""
+        try:
+            tracker(config)
+        except Exception as error:  # Hydra turns other exceptions of callbacks into warnings
+            raise SystemExit(f"staf: {error}") from error
+
+    on_multirun_start = on_run_start
+
+    def on_job_end(self, config: DictConfig, job_return: Any, **_: Any) -> None:
+        """Hand over a run, or a job of a sweep, that has ended."""
+        try:
+            found = tracker(config)
+            if found is None:
+                return
+            for run in collect(config.hydra.runtime.output_dir).rows:
+                if run.status == COMPLETED:
+                    found.record(run)
+        except Exception as error:  # the results are on the disk
+            _log.warning("not tracked: %s: %s", type(error).__name__, error)
+
+
+def tracker(config: DictConfig) -> Tracker | None:
+    """Return the tracker that the settings name; None for `tracker=none`.
+
+    Raises:
+        ValueError: if it is no tracker, or something that it needs is not installed.
+    """
+    settings = OmegaConf.select(config, "tracker")
+    if settings is None or settings.get("_target_") is None:
+        return None
+    try:
+        found = instantiate(settings, _convert_="all")
+    except Exception as error:
+        if isinstance(error.__cause__, ValueError):  # Hydra wraps what a constructor raises
+            raise error.__cause__ from error
+        raise
+    if not isinstance(found, Tracker):
+        raise fail(COMMAND_LINE, "tracker", "must be a staf_torch.sweeps.callbacks.Tracker", found)
+    return found
+
+
+def claim(config: DictConfig) -> None:
+    """Make the sweep's directory; where another sweep has it, take the next name: `<name>-2`, ...
+
+    A directory that was asked for on the command line is used as it is.
+    """
+    wanted = str(config.hydra.sweep.dir)
+    if any(line.startswith("hydra.sweep.dir=") for line in config.hydra.overrides.hydra):
+        Path(wanted).mkdir(parents=True, exist_ok=True)
+        return
+    directory, attempt = Path(wanted), 1
+    while True:
+        try:
+            directory.mkdir(parents=True)
+        except FileExistsError:
+            attempt += 1
+            directory = Path(f"{wanted}-{attempt}")
+        else:
+            break
+    if attempt > 1:  # also for the jobs, whose settings are composed anew
+        config.hydra.sweep.dir = str(directory)
+        config.hydra.overrides.hydra.append(f"hydra.sweep.dir={records.quoted(str(directory))}")
+
+
+def close(sweep: BrokenSweep) -> None:
+    """End a sweep that an exception broke: with its report, or without a trace where no job has begun."""
+    directory = _directory(sweep.config)
+    if any(directory.glob(f"**/{records.RUN}")):
+        sweep.end()
+        return
+    for name in (records.SWEEP, "multirun.yaml"):
+        (directory / name).unlink(missing_ok=True)
+    shutil.rmtree(directory / ".submitit", ignore_errors=True)
+    with contextlib.suppress(OSError):  # not empty: it was there before
+        directory.rmdir()
+
+
+def farewell(sweep: BrokenSweep | None) -> str:
+    """Return what to say after Ctrl-C."""
+    runs = [] if sweep is None else list(_directory(sweep.config).glob(f"*/{records.RUN}"))
+    if sweep is None or not runs:
+        return "staf: interrupted"
+    complete = sum((records.read(path) or {}).get("status") == COMPLETED for path in runs)
+    place = os.path.relpath(_directory(sweep.config))
+    return f"staf: interrupted; {complete} jobs are complete. Resume with:\n  staf -m sweep.resume={place}"
+
+
+def _directory(config: DictConfig) -> Path:
+    return Path(str(config.hydra.sweep.dir))

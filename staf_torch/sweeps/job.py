@@ -1,0 +1,169 @@
+"""One job, from its settings to the end of its run directory: what Hydra calls, whatever the launcher."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import math
+import os
+import shutil
+import warnings
+from collections.abc import Iterator, Mapping
+from contextvars import ContextVar
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
+from omegaconf import DictConfig, OmegaConf
+
+from ..experiments.registry import Metrics
+from ..numerics.checks import choice
+from ..results import run_record as records
+from ..results.progress import SHOWN, Progress
+from ..settings.chase import make_metrics
+from . import members
+from .batching import DEFERRED, USER_ERRORS, Outcome, completion, reason, sentence
+
+_log = logging.getLogger(__name__)
+
+PRINTS: ContextVar[bool] = ContextVar("PRINTS", default=True)
+"""Whether the table and the count of a sweep go to stdout: for a command they do, for Python they do not."""
+
+
+class Origin(NamedTuple):
+    """Where the settings of a job come from."""
+
+    overrides: list[str]  # as typed
+    choices: Mapping[str, str | None]  # the option chosen of each group of settings
+    config_name: str | None = "config"
+    search: tuple[str, ...] = ()  # overrides of Hydra's search path
+
+
+class Refused(SystemExit):
+    """A run that ended by a user's error: Hydra lets it pass without a word of its own."""
+
+    def __init__(self, error: BaseException) -> None:
+        super().__init__(f"staf: {sentence(error)}")
+
+
+def execute(
+    cfg: DictConfig, outcome: Outcome = DEFERRED, seconds: float = 0.0, progress: Progress = SHOWN
+) -> Metrics | float | tuple[float, ...]:
+    """Run the job that Hydra has prepared and return what the sweeper is told.
+
+    Args:
+        cfg: all settings but Hydra's.
+        outcome: what was computed for the job already.
+        seconds: that were spent on it.
+        progress: shows how far long loops are.
+    """
+    node = HydraConfig.get()
+    directory = Path(node.runtime.output_dir)
+    search = tuple(line for line in node.overrides.hydra if line.startswith("hydra.searchpath"))
+    origin = Origin(list(node.overrides.task), node.runtime.choices, node.job.config_name, search)
+    if records.resumed(cfg):
+        finished = records.metrics_of(directory, origin.overrides)
+        if finished is not None:
+            _log.info("completed before: %s", os.path.relpath(directory))
+            return objective(cfg, finished)
+    try:
+        metrics = run(cfg, directory, origin, outcome, seconds, progress)
+    except BaseException as error:
+        refused = isinstance(error, USER_ERRORS)
+        if node.mode != RunMode.RUN:  # a job of a sweep keeps its log, and the sweep goes on
+            _log.error("%s", reason(error), exc_info=None if refused else error)
+        elif refused:
+            _take_back(directory)
+            raise Refused(error) from error
+        raise
+    _log.info("  run directory: %s", os.path.relpath(directory))
+    return objective(cfg, metrics)
+
+
+def run(
+    cfg: DictConfig,
+    directory: Path,
+    origin: Origin,
+    outcome: Outcome = DEFERRED,
+    seconds: float = 0.0,
+    progress: Progress = SHOWN,
+) -> Metrics:
+    """Run one job and fill its directory; `run.json` says how it ends.
+
+    Args:
+        cfg: all settings but Hydra's.
+        directory: the run directory; it exists.
+        origin: of the settings, for the record.
+        outcome: what was computed for the job already.
+        seconds: that were spent on it.
+        progress: shows how far long loops are.
+
+    Raises:
+        Exception: that of the experiment; the record has its reason.
+    """
+    record = records.RunRecord(cfg, origin.choices, origin.overrides)
+    with _recorded(record, directory, seconds):
+        record.declare([metric.info for metric in make_metrics(cfg.get("metric"))])
+        if cfg.get("members") is not None:
+            base = [*origin.search, *origin.overrides]
+            return members.run(cfg, directory, base, origin.config_name, progress)
+        return completion(cfg, outcome)(cfg, directory, progress)
+
+
+@contextlib.contextmanager
+def _recorded(record: records.RunRecord, directory: Path, seconds: float) -> Iterator[None]:
+    """Write `run.json` at the beginning and at the end, and send warnings to the log in between."""
+    record.add_seconds(seconds)
+    try:
+        record.write(directory, "running")
+        with warnings.catch_warnings():
+            warnings.showwarning = _log_warning
+            yield
+        record.write(directory, "completed")
+    except BaseException as error:
+        with contextlib.suppress(OSError):
+            record.write(directory, "failed", reason(error))
+        raise
+
+
+def _log_warning(message: Warning | str, *_: Any, **__: Any) -> None:
+    _log.warning("%s", message)
+
+
+def _take_back(directory: Path) -> None:
+    """Remove what this run has written, and nothing else: the directory may be the user's own."""
+    if (directory / "metrics.json").exists():
+        return
+    shutil.rmtree(directory / ".hydra", ignore_errors=True)
+    for name in (records.RUN, "staf.log"):
+        (directory / name).unlink(missing_ok=True)
+    with contextlib.suppress(OSError):  # not empty: it was there before
+        directory.rmdir()
+
+
+def silence_terminal() -> None:
+    """Let the log go to files alone, until it is configured anew."""
+    for handler in logging.getLogger().handlers:
+        if isinstance(handler, logging.StreamHandler) and not isinstance(handler, logging.FileHandler):
+            handler.setLevel(logging.CRITICAL + 1)
+
+
+def objective(cfg: DictConfig, metrics: Metrics) -> Metrics | float | tuple[float, ...]:
+    """Return all metrics, or those named in `sweep.objective` alone, for sweepers that optimise.
+
+    Raises:
+        ValueError: if there is no metric of that name.
+    """
+    named = OmegaConf.select(cfg, "sweep.objective")
+    if named is None:
+        return metrics
+    if isinstance(named, str):
+        return _number(named, metrics)
+    return tuple(_number(name, metrics) for name in named)
+
+
+def _number(name: str, metrics: Metrics) -> float:
+    choice("staf", "sweep.objective", name, tuple(metrics))
+    value = metrics[name]
+    return math.inf if value is None else float(value)  # null: there is no finite number

@@ -1,0 +1,230 @@
+"""The batched launcher at work: jobs that may share a tensor batch are solved together, then every job is
+replayed as Hydra runs one: with its directory, `.hydra/`, log, callbacks and status."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import gc
+import logging
+import sys
+import time
+from collections.abc import Callable, Generator, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from omegaconf import DictConfig
+from tqdm.auto import tqdm
+
+from ..numerics.checks import integer
+from ..results import run_record as records
+from ..results.progress import Progress
+from .batching import Outcome, reason
+from .executors import compute, executor
+from .hydra_compat import JobReturn, JobStatus, SweepContext, without_hydra_overrides
+from .job import PRINTS, execute, objective, silence_terminal
+
+_log = logging.getLogger(__name__)
+
+_BAR_EVERY, _LINE_EVERY = 0.2, 10.0  # s
+
+
+class SweepProgress:
+    """Jobs that are done and that failed, and the time left, on stderr.
+
+    Args:
+        total: jobs.
+        done: of them, from before.
+    """
+
+    def __init__(self, total: int, done: int = 0) -> None:
+        self._total, self._before, self._done, self._failed = total, done, done, 0
+        self._computed, self._running = 0.0, 0.0
+        self._start = self._shown = time.monotonic()
+        # Not the log: while a job is replayed, that is the job's own.
+        layout = "{percentage:3.0f}%|{bar:30}| {desc}"
+        self._bar = tqdm(total=total, bar_format=layout, leave=False, disable=None, file=sys.stderr)
+
+    def computed(self, jobs: float) -> None:
+        """Note how many of the jobs that were left are computed, with or without their files."""
+        self._computed = jobs
+        self._show()
+
+    def running(self, share: float) -> None:
+        """Note the share that is done of a job that runs alone."""
+        self._running = share
+        self._show()
+
+    def ended(self, name: str, failure: str | None) -> None:
+        """Note that one more job has its run directory; ``failure`` says why it has no result."""
+        self._done, self._running = self._done + 1, 0.0
+        if failure is not None:
+            self._failed += 1
+            tqdm.write(f"{name} failed: {failure}", file=sys.stderr)
+        self._show()
+
+    def close(self) -> None:
+        """Wipe the bar."""
+        self._bar.close()
+
+    @property
+    def line(self) -> str:
+        """`37 of 100 jobs done, 1 failed, 12 s left`."""
+        failed = f", {self._failed} failed" if self._failed else ""
+        share = self._share
+        spent = time.monotonic() - self._start
+        left = f", {spent * (1 - share) / share:.0f} s left" if 0 < share < 1 else ""
+        return f"{self._done} of {self._total} jobs done{failed}{left}"
+
+    @property
+    def _share(self) -> float:
+        """Share of the jobs that were left to do."""
+        computed = max(self._computed, self._done - self._before + self._running)
+        return min(1.0, computed / max(1, self._total - self._before))
+
+    def _show(self) -> None:
+        now = time.monotonic()
+        if now - self._shown < (_LINE_EVERY if self._bar.disable else _BAR_EVERY):
+            return
+        self._shown = now
+        if self._bar.disable:
+            sys.stderr.write(self.line + "\n")
+            sys.stderr.flush()
+            return
+        self._bar.n = self._share * self._total
+        self._bar.set_description_str(self.line)
+
+
+class Job(NamedTuple):
+    """A job that is to run."""
+
+    num: int
+    overrides: list[str]
+    config: DictConfig  # with Hydra's node
+    settings: DictConfig  # without
+
+    @property
+    def name(self) -> str:
+        """`job 3 (kernel=gaussian seed=1)`."""
+        return f"job {self.num} ({' '.join(records.own(without_hydra_overrides(self.overrides)))})"
+
+    @property
+    def directory(self) -> Path:
+        """The run directory."""
+        return Path(str(self.config.hydra.sweep.dir)) / str(self.config.hydra.sweep.subdir)
+
+
+class Launch:
+    """One call of Hydra's: a list of jobs to run.
+
+    Args:
+        launcher: the plugin, with its settings and what Hydra set up.
+    """
+
+    def __init__(self, launcher: Any) -> None:
+        self._launcher = launcher
+        self._context = SweepContext(launcher.hydra_context, launcher.config)
+        self._task: Callable[[DictConfig], Any] = launcher.task_function
+        self._directory = Path(str(launcher.config.hydra.sweep.dir))
+        if launcher.batch is not None:
+            integer("hydra.launcher", "batch", launcher.batch, least=1)
+
+    def run(self, job_overrides: Sequence[Sequence[str]], first: int) -> list[JobReturn]:
+        """Run the jobs, numbered from ``first``, and return Hydra's records of them, in order."""
+        with _seldom_collecting():
+            self._context.start()
+            self._sweep_logging()
+            self._directory.mkdir(parents=True, exist_ok=True)
+            numbered = {first + i: list(overrides) for i, overrides in enumerate(job_overrides)}
+            records.list_jobs(self._directory, numbered)
+            jobs = [self._job(num, overrides) for num, overrides in numbered.items()]
+            returns = self._finished(jobs)
+            progress = SweepProgress(len(jobs), len(returns))
+            try:
+                with contextlib.closing(self._computed(jobs, set(returns), progress)) as computed:
+                    for job, task in computed:
+                        ended = self._replay(job, task)
+                        failure = ended._return_value if ended.status == JobStatus.FAILED else None
+                        progress.ended(job.name, None if failure is None else reason(failure))
+                        returns[job.num] = ended
+            finally:
+                progress.close()
+                self._sweep_logging()
+        failed = sum(ended.status == JobStatus.FAILED for ended in returns.values())
+        _log.info("%d of %d jobs completed, %d failed", len(jobs) - failed, len(jobs), failed)
+        return [returns[num] for num in numbered]
+
+    def _replay(self, job: Job, task: Callable[[DictConfig], Any]) -> JobReturn:
+        """Run a job whose outcome is known as Hydra runs one."""
+        return self._context.run_job(task, job.config, job.settings)
+
+    def _sweep_logging(self) -> None:
+        """Send the log to the sweep's own handlers, of which the terminal is none where Python asks."""
+        self._context.sweep_logging()
+        if not PRINTS.get():
+            silence_terminal()
+
+    def _job(self, num: int, overrides: list[str]) -> Job:
+        config = self._context.job_config(num, overrides)
+        return Job(num, overrides, config, records.without_hydra(config))
+
+    def _finished(self, jobs: list[Job]) -> dict[int, JobReturn]:
+        """Return the jobs that an earlier start of this sweep completed."""
+        found: dict[int, JobReturn] = {}
+        if not records.resumed(self._context.master):
+            return found
+        for job in jobs:
+            metrics = records.metrics_of(job.directory, job.overrides)
+            if metrics is not None:
+                ended = JobReturn(overrides=job.overrides, status=JobStatus.COMPLETED)
+                ended.return_value = objective(self._context.master, metrics)
+                found[job.num] = ended
+        return found
+
+    def _computed(
+        self, jobs: list[Job], finished: set[int], progress: SweepProgress
+    ) -> Generator[tuple[Job, Callable[[DictConfig], Any]], None, None]:
+        """Yield every job that is not finished with the task that ends it, as the tensor batches end."""
+        if self._task is not execute:  # another program's task: nothing to batch
+            yield from ((job, self._task) for job in jobs)
+            return
+        if len(finished) == len(jobs):
+            return
+        about = self._launcher
+        with executor(about.executor, about.workers, about.arguments, self._directory) as workers:
+            outcomes = compute(
+                [job.settings for job in jobs],
+                [job.directory for job in jobs],
+                workers,
+                finished={i for i, job in enumerate(jobs) if job.num in finished},
+                most=about.batch,
+                tell=progress.computed,
+            )
+            for index, outcome, seconds in outcomes:
+                yield jobs[index], _off_the_terminal(outcome, seconds, Progress(progress.running))
+                self._sweep_logging()
+
+
+@contextlib.contextmanager
+def _seldom_collecting() -> Iterator[None]:
+    """Look for garbage seldom: Hydra copies configurations a dozen times a job, and Python would look through
+    all of them for cycles after every few, a fifth of the time of a sweep."""
+    before = gc.get_threshold()
+    gc.freeze()  # the half a million objects of torch are here to stay
+    gc.set_threshold(200_000, 50, 50)
+    try:
+        yield
+    finally:
+        gc.set_threshold(*before)
+        gc.unfreeze()
+
+
+def _off_the_terminal(outcome: Outcome, seconds: float, progress: Progress) -> Callable[[DictConfig], Any]:
+    """Return the task of a computed job, logging to its file alone: summaries would bury the bar."""
+
+    @functools.wraps(execute)
+    def quiet(cfg: DictConfig) -> Any:
+        silence_terminal()
+        return execute(cfg, outcome, seconds, progress)
+
+    return quiet

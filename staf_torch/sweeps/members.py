@@ -1,0 +1,134 @@
+"""The setting `members`: a sweep inside one job, for more members than run directories are good for.
+
+The members are the product of the lists, as `staf -m` would take it; they run in tensor batches and leave one
+row each in `members.json`, the row that the same job of a sweep leaves in its own directory.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import statistics
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from hydra.errors import HydraException
+from omegaconf import DictConfig, OmegaConf
+
+from .. import __version__
+from ..experiments.registry import Metrics
+from ..numerics.checks import COMMAND_LINE, fail, flag
+from ..results.files import MEMBERS
+from ..results.progress import Progress
+from ..results.reader import Value
+from ..results.run_directory import RunDirectory
+from ..tables import Table
+from .batching import Computed, Failed, Outcome, completion, reason
+from .executors import Inline, compute
+from .hydra_compat import Composer, ConfigLoader, config_loader, parse_override, product
+
+_log = logging.getLogger(__name__)
+_LISTED = 20  # members that the log shows one by one
+_SHOWN = ("ultimate_error", "floor_error", "ball_error", "ultimate_excess", "diverged_fraction")
+
+
+def run(
+    cfg: DictConfig, directory: Path, overrides: Sequence[str], config_name: str | None, progress: Progress
+) -> Metrics:
+    """Run all members and write `members.json` and `metrics.json`: how many there are, failed and diverged.
+
+    Args:
+        cfg: the settings; `members` is not null.
+        directory: the run directory.
+        overrides: that led to ``cfg``.
+        config_name: of the primary configuration that led to ``cfg``.
+        progress: shows how many members are done.
+
+    Raises:
+        ValueError, hydra.errors.HydraException: if `members` is no list of overrides, or names what is not
+            there. What is wrong with one member alone fails it alone.
+    """
+    base = [line for line in overrides if line.lstrip("+~").partition("=")[0] != "members"]
+    keep = flag(COMMAND_LINE, "history", cfg.history) and "history=true" in base
+    loader = config_loader()
+    jobs = member_overrides(cfg.members, loader)
+    composer = Composer(loader, config_name, hydra_node=False)
+    cfgs = [composer([*base, *job, "figures=false", f"history={str(keep).lower()}"]) for job in jobs]
+    places = [directory / "members" / str(number) for number in range(len(cfgs))]
+    rows: list[dict[str, Any]] = [{} for _ in cfgs]
+    with progress.over(len(cfgs), "members") as advance:
+        for index, outcome, _ in compute(cfgs, places, Inline(), tell=lambda jobs: None):
+            row = {"num": index, "overrides": jobs[index]}
+            rows[index] = row | _result(cfgs[index], outcome, places[index], keep, progress)
+            advance(1)
+    out = RunDirectory(directory)
+    lines = ",\n".join(json.dumps(row, allow_nan=False) for row in rows)  # one member a line
+    out.text(MEMBERS, f'{{"version": {json.dumps(__version__)}, "members": [\n{lines}\n]}}\n')
+    _report(rows)
+    counts: Metrics = {
+        "members": len(rows),
+        "failed": sum(row["status"] == "failed" for row in rows),
+        "diverged": sum(bool(row["metrics"].get("diverged_fraction")) for row in rows),
+    }
+    return out.metrics(counts)
+
+
+def member_overrides(setting: Any, loader: ConfigLoader) -> list[list[str]]:
+    """Return the overrides of every member, in the order of Hydra's own sweeper.
+
+    Raises:
+        ValueError: if the setting is not a list of overrides in Hydra's grammar.
+    """
+    lines = OmegaConf.to_container(setting) if OmegaConf.is_config(setting) else setting
+    lines = [lines] if isinstance(lines, str) else lines
+    if not isinstance(lines, list) or not lines or not all(isinstance(line, str) for line in lines):
+        raise fail(COMMAND_LINE, "members", "must be a list of overrides, like 'seed=range(100)'", lines)
+    overrides = []
+    for line in lines:
+        try:
+            override = parse_override(line, loader)
+        except HydraException as error:
+            rule = f"must be overrides in Hydra's grammar ({str(error).splitlines()[0]})"
+            raise fail(COMMAND_LINE, "members", rule, line) from error
+        overrides.append(override)
+        if override.is_hydra_override() or override.key_or_group == "members":
+            raise fail(COMMAND_LINE, "members", "must be about the experiment alone", line)
+    return product(overrides)
+
+
+def _result(
+    cfg: DictConfig, outcome: Outcome, directory: Path, keep: bool, progress: Progress
+) -> dict[str, Any]:
+    """Return what a row says of the end of a member; its files are written where they are kept."""
+    try:
+        if isinstance(outcome, Computed) and not keep:
+            metrics = outcome.metrics
+        else:
+            if not isinstance(outcome, Failed):
+                directory.mkdir(parents=True, exist_ok=True)
+            metrics = completion(cfg, outcome)(cfg, directory, progress)
+    except Exception as error:
+        return {"status": "failed", "reason": reason(error), "metrics": {}}
+    return {"status": "completed", "reason": None, "metrics": metrics}
+
+
+def _report(rows: Sequence[dict[str, Any]]) -> None:
+    """Log a short table: the members themselves where they are few, else the spread of each metric."""
+    for row in [row for row in rows if row["status"] == "failed"][:_LISTED]:
+        _log.error("member %d (%s): %s", row["num"], " ".join(row["overrides"]), row["reason"])
+    if len(rows) <= _LISTED:
+        shown = [name for name in _SHOWN if any(name in row["metrics"] for row in rows)]
+        cells: list[dict[str, Value]] = [
+            {"member": " ".join(row["overrides"]), **row["metrics"]} for row in rows
+        ]
+        names: tuple[str, ...] = ("member", *shown)
+    else:
+        cells, names = [], ("metric", "least", "median", "most", "members")
+        for name in dict.fromkeys(name for row in rows for name in row["metrics"]):
+            found = [row["metrics"][name] for row in rows if row["metrics"].get(name) is not None]
+            if found:
+                numbers = (name, min(found), statistics.median(found), max(found), len(found))
+                cells.append(dict(zip(names, numbers, strict=True)))
+    for line in Table.of(cells, {name: name for name in names}).markdown().splitlines():
+        _log.info("%s", line)

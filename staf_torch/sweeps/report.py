@@ -1,0 +1,132 @@
+"""What a sweep ends with: its table, its figures and one page with both, in its directory."""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import importlib.resources
+import logging
+from collections.abc import Mapping
+from pathlib import Path
+
+from ..figures.style import images
+from ..figures.sweep import SEED, SWEEP_FIGURES
+from ..results.files import COMPLETED, PAGE, TABLE
+from ..results.reader import Collection, Value, collect, identity
+from ..results.run_directory import RunDirectory
+from ..tables import Layout, Style, Table, latex_text, tabulate
+from ..tables.aggregate import as_text
+from ..tables.columns import PrintedColumn, show
+
+_log = logging.getLogger(__name__)
+_BOLD, _ON_THE_PAGE = Style(bold=True), Style(digits=4, bold=True)
+
+
+def write_report(directory: Path, *, figures: bool = True) -> str:
+    """Write `table.md`, `table.tex`, `table.csv`, `figures/` and `report.html` of the sweep in a directory.
+
+    The first two and the page have one row for all seeds, where more than one was swept; the CSV has one row
+    a run and all metrics, its directory as seen from the sweep's. A figure that cannot be drawn is a warning
+    in the log.
+
+    Returns:
+        The table in Markdown.
+
+    Raises:
+        ValueError: if there is no run in the directory.
+        OSError: if it cannot be written.
+    """
+    out = RunDirectory(directory)
+    found = collect(directory)
+    inside = (dataclasses.replace(r, directory=r.directory.relative_to(directory)) for r in found.rows)
+    found = dataclasses.replace(found, rows=tuple(inside))  # equal sweeps in two places have equal tables
+    aggregates = ("mean", "std") if SEED in found.swept else ()
+    table = tabulate(found, Layout(aggregates=aggregates, style=_BOLD))
+    text = out.table(TABLE, tabulate(found, Layout(every_metric=True)), shown=table)
+    out.text(f"{TABLE}.tex", latex_text(table))
+    drawn = draw_sweep(found, out) if figures else {}
+    out.text(PAGE, page(found, table, drawn, f"Sweep {directory.resolve().name}"))
+    return text
+
+
+def draw_sweep(found: Collection, out: RunDirectory) -> dict[str, bytes]:
+    """Draw the figures that the swept settings allow.
+
+    Returns:
+        What each shows, and its PNG.
+    """
+    drawn = {}
+    for name, (what, draw) in SWEEP_FIGURES.items():
+        try:
+            figure = draw(found)
+            if figure is not None:
+                kinds = images(figure)
+                out.figure(name, kinds)
+                drawn[what] = kinds["png"]
+        except Exception as error:  # the runs and their table are worth more than a picture of them
+            _log.warning("no figure %s: %s: %s", name, type(error).__name__, error)
+    return drawn
+
+
+def page(found: Collection, table: Table, figures: Mapping[str, bytes], title: str) -> str:
+    """Return `report.html`: one file without links with the table, the figures and the settings.
+
+    Args:
+        found: the runs.
+        table: of them.
+        figures: what each shows, and its PNG.
+        title: heading of the page.
+    """
+    import jinja2  # the callbacks of every run import this module
+
+    source = importlib.resources.files(__package__) / "report.html"
+    environment = jinja2.Environment(
+        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    columns = dataclasses.replace(table, style=_ON_THE_PAGE).printed()
+    skipped = [f"skipped {one.path}: {one.reason}" for one in found.skipped]
+    return environment.from_string(source.read_text(encoding="utf-8")).render(
+        title=title,
+        about=_about(found),
+        notes=[*table.notes, *skipped, *found.remarks],
+        headings=[_heading(column) for column in columns],
+        rows=[[_cell(column, row) for column in columns] for row in range(len(table.rows))],
+        figures={what: base64.b64encode(png).decode() for what, png in figures.items()},
+        settings={key: as_text(value) for key, value in _common(found).items()},
+    )
+
+
+def _about(found: Collection) -> str:
+    completed = sum(run.status == COMPLETED for run in found.rows)
+    tasks = ", ".join(dict.fromkeys(run.task for run in found.rows if run.task))
+    versions = ", ".join(dict.fromkeys(run.version for run in found.rows if run.version))
+    by = f", staf_torch {versions}" if versions else ""
+    return f"{tasks or 'runs'}: {len(found.rows)} runs, {completed} completed{by}"
+
+
+def _common(found: Collection) -> dict[str, Value]:
+    """The settings that are the same in all runs that know theirs."""
+    known = [run.settings for run in found.rows if run.settings]
+    if not known:
+        return {}
+    return {
+        key: value
+        for key, value in sorted(known[0].items())
+        if len({identity(settings.get(key)) for settings in known}) == 1
+    }
+
+
+def _heading(column: PrintedColumn) -> dict[str, str]:
+    text = ", ".join(filter(None, (column.over, column.heading)))
+    return {"text": text, "kind": "number" if column.numeric else "text"}
+
+
+def _cell(column: PrintedColumn, row: int) -> dict[str, str | None]:
+    """The text, the value to sort by with every digit (None: missing), the classes of the style sheet."""
+    cell, kind = column.cells[row], "number" if column.numeric else "text"
+    if cell is None:
+        return {"text": "-", "value": None, "kind": f"{kind} absent"}
+    if isinstance(cell, str):
+        return {"text": cell, "value": cell, "kind": kind}
+    best = " best" if row in column.best else ""
+    return {"text": show(cell, _ON_THE_PAGE.digits), "value": repr(cell.value), "kind": kind + best}

@@ -1,0 +1,13 @@
+"""Tables of runs, and of rows that an experiment has computed. Nothing here needs torch."""
+
+from ..results.reader import Collection as Collection
+from ..results.reader import Run as Run
+from ..results.reader import collect as collect
+from .aggregate import Layout as Layout
+from .aggregate import tabulate as tabulate
+from .columns import Style as Style
+from .model import Table as Table
+from .model import html_text as html_text
+from .model import json_text as json_text
+from .model import latex_text as latex_text
+from .model import parquet_bytes as parquet_bytes

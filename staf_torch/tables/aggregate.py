@@ -1,0 +1,300 @@
+"""Runs to a table: one row a run, or one row and its statistics for all runs that agree in some settings."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import json
+import math
+import statistics
+from collections.abc import Callable, Iterator, Mapping, Sequence
+
+from ..numerics import TABLE_COMMAND, fail
+from ..results.files import COMPLETED
+from ..results.metric_info import OWN
+from ..results.reader import Collection, Run, Value, identity
+from .columns import Column, Row, Style
+from .model import Table
+
+_SERIES = 200  # degrees of freedom from which the expansion is more accurate than 1e-12
+_MOST = 6  # metrics that a table shows where none is declared a headline
+_NAMED = 3  # runs without a result that a note names
+_SEED = "seed"
+_ASCENDING, _DESCENDING = ":asc", ":desc"
+
+
+def mean(numbers: Sequence[float]) -> float:
+    """The arithmetic mean."""
+    return math.fsum(number / len(numbers) for number in numbers)
+
+
+def deviation(numbers: Sequence[float]) -> float | None:
+    """The standard deviation with n - 1; None for a single number."""
+    if len(numbers) < 2:
+        return None
+    middle = mean(numbers)
+    return math.hypot(*(number - middle for number in numbers)) / math.sqrt(len(numbers) - 1)
+
+
+def half_width(numbers: Sequence[float]) -> float | None:
+    """Half the width of the 95 % confidence interval of the mean, t s / sqrt(n); None for a single number."""
+    s = deviation(numbers)
+    if s is None:
+        return None
+    return student_quantile(len(numbers) - 1) * s / math.sqrt(len(numbers))
+
+
+AGGREGATES: Mapping[str, Callable[[Sequence[float]], float | None]] = {
+    "mean": mean,
+    "std": deviation,
+    "ci95": half_width,
+    "min": min,
+    "max": max,
+    "median": statistics.median,
+}
+"""By the names of `staf-table --aggregate`; each of one or more finite numbers."""
+
+
+@functools.cache
+def student_quantile(freedom: int) -> float:
+    """t with P(|T| <= t) = 0.95 for Student's T with that many degrees of freedom, at least 1.
+
+    With theta = atan(t / sqrt(freedom)) the probability is a finite sum of sin(theta) cos(theta)^k, which is
+    solved by bisection; for many degrees of freedom, the expansion around the normal quantile.
+
+    Source: Abramowitz and Stegun, 26.7.3, 26.7.4 and 26.7.5.
+    """
+    if freedom >= _SERIES:
+        return _expansion(freedom)
+    low, high = 0.0, math.pi / 2
+    while True:
+        theta = (low + high) / 2
+        if theta in (low, high):
+            return math.tan(theta) * math.sqrt(freedom)
+        if _probability(theta, freedom) < 0.95:
+            low = theta
+        else:
+            high = theta
+
+
+def _probability(theta: float, freedom: int) -> float:
+    """P(|T| <= sqrt(freedom) tan(theta))."""
+    odd = freedom % 2
+    cosine = math.cos(theta)
+    term = math.sin(theta) * (cosine if odd else 1.0)
+    terms = []
+    for k in range(1 + odd, freedom, 2):  # the next factor is k / (k + 1) cos^2
+        terms.append(term)
+        term *= k / (k + 1) * cosine**2
+    total = math.fsum(terms)
+    return 2 / math.pi * (theta + total) if odd else total
+
+
+def _expansion(freedom: int) -> float:
+    x = statistics.NormalDist().inv_cdf(0.975)
+    terms = (
+        x,
+        (x**3 + x) / 4,
+        (5 * x**5 + 16 * x**3 + 3 * x) / 96,
+        (3 * x**7 + 19 * x**5 + 17 * x**3 - 15 * x) / 384,
+        (79 * x**9 + 776 * x**7 + 1482 * x**5 - 1920 * x**3 - 945 * x) / 92160,
+    )
+    return math.fsum(term / freedom**k for k, term in enumerate(terms))
+
+
+@dataclasses.dataclass(frozen=True)
+class Layout:
+    """What a table shall show; the options of `staf-table`.
+
+    Args:
+        rows: settings that tell rows apart; empty: all that were swept (without the seed where aggregated).
+        columns: settings over whose values a metric is spread.
+        metrics: empty: those that are declared headlines, or all of them.
+        aggregates: of `AGGREGATES`; empty: none, or mean and std where a row stands for several runs.
+        sort: names of columns, the best of a metric first; `:asc` the smallest, `:desc` the largest.
+        every_metric: all metrics where none is named.
+        style: how people see it.
+    """
+
+    rows: tuple[str, ...] = ()
+    columns: tuple[str, ...] = ()
+    metrics: tuple[str, ...] = ()
+    aggregates: tuple[str, ...] = ()
+    sort: tuple[str, ...] = ()
+    every_metric: bool = False
+    style: Style = dataclasses.field(default_factory=Style)
+
+
+def tabulate(found: Collection, layout: Layout | None = None) -> Table:
+    """Return the table of some runs.
+
+    Raises:
+        ValueError: for a metric, setting or aggregate that there is not; the message lists those that exist.
+    """
+    layout = Layout() if layout is None else layout
+    _check(found, layout)
+    metrics = layout.metrics or _metrics(found, layout.every_metric)
+    if layout.rows or layout.columns or layout.aggregates:
+        table = _grouped(found, layout, metrics)
+    else:
+        table = _one_a_run(found, metrics)
+    rows = _sorted(table, layout.sort)
+    return dataclasses.replace(table, rows=tuple(rows), style=layout.style)
+
+
+def _check(found: Collection, layout: Layout) -> None:
+    settings = sorted(found.keys)
+    for option, names, known in (
+        ("rows", layout.rows, settings),
+        ("columns", layout.columns, settings),
+        ("metric", layout.metrics, list(found.metrics)),
+        ("aggregate", layout.aggregates, list(AGGREGATES)),
+    ):
+        for name in names:
+            if name not in known:
+                raise fail(TABLE_COMMAND, option, _one_of(known), name)
+
+
+def _one_of(known: Sequence[str]) -> str:
+    return f"must be one of {', '.join(known)}" if known else "cannot be chosen: no run has any"
+
+
+def _metrics(found: Collection, every: bool) -> tuple[str, ...]:
+    """All metrics, or the headlines: the library's own as they are declared, then those of the user's own."""
+    own = [info.name for info in OWN]
+    ordered = sorted(found.metrics, key=lambda name: own.index(name) if name in own else len(own))
+    headlines = tuple(name for name in ordered if found.infos[name].headline)
+    return found.metrics if every else headlines or found.metrics[:_MOST]
+
+
+def _one_a_run(found: Collection, metrics: Sequence[str]) -> Table:
+    troubled = any(run.status != COMPLETED or run.reason is not None for run in found.rows)
+    about = ("status", "reason") if troubled else ("status",)
+    larger = {name for name, info in found.infos.items() if info.larger_is_better}
+    columns = [Column(name) for name in found.swept]
+    columns += [Column(name, metric=name, larger_is_better=name in larger) for name in metrics]
+    columns += [*map(Column, about), Column("directory", shown=False)]
+    if any(run.member is not None for run in found.rows):
+        columns.append(Column("member"))
+    rows = []
+    for run in found.rows:
+        cells = {c.name: run.metrics.get(c.name) if c.metric else run.value(c.name) for c in columns}
+        reasons = {name: run.absence(name) for name in metrics if cells[name] is None}
+        rows.append(Row(cells, reasons))
+    return Table(tuple(columns), tuple(rows))
+
+
+def _grouped(found: Collection, layout: Layout, metrics: Sequence[str]) -> Table:
+    keys = layout.rows or tuple(key for key in found.swept if key not in (*layout.columns, _SEED))
+    groups = _groups(found.rows, keys)
+    places = {place(run, layout.columns): [run.value(key) for key in layout.columns] for run in found.rows}
+    spread = sorted(places, key=lambda at: [rank(value) for value in places[at]])
+    several = any(len(group) > 1 for group in _groups(found.rows, (*keys, *layout.columns)).values())
+    aggregates = layout.aggregates or (("mean", "std") if several else ("mean",))
+    columns = [Column(key) for key in keys]
+    for metric in metrics:
+        larger = found.infos[metric].larger_is_better
+        for at in spread:
+            inside = f"[{at}]" if at else ""
+            columns += [
+                Column(f"{metric}.{statistic}{inside}", metric, statistic, at, larger_is_better=larger)
+                for statistic in (*aggregates, "n", "failed")
+            ]
+    columns.append(Column("reasons", shown=False))
+    rows = [_row(group, keys, layout.columns, columns) for group in groups.values()]
+    return Table(tuple(columns), tuple(rows), tuple(_notes(found.rows)))
+
+
+def _groups(runs: Sequence[Run], keys: Sequence[str]) -> Mapping[tuple[str, ...], list[Run]]:
+    groups: dict[tuple[str, ...], list[Run]] = {}
+    for run in runs:
+        groups.setdefault(tuple(identity(run.value(key)) for key in keys), []).append(run)
+    return groups
+
+
+def place(run: Run, keys: Sequence[str]) -> str:
+    """Return where a run stands among the columns: `key=value` of each."""
+    return ", ".join(f"{key}={as_text(run.value(key))}" for key in keys)
+
+
+def rank(value: Value) -> tuple[bool, float]:
+    """Return a sorting key: numbers in order, everything else after them as it came."""
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    return (not number, float(value) if number else 0.0)  # type: ignore[arg-type]
+
+
+def as_text(value: Value) -> str:
+    """Return a value as it would be typed."""
+    return value if isinstance(value, str) else json.dumps(value)
+
+
+def _row(runs: Sequence[Run], keys: Sequence[str], spread: Sequence[str], columns: Sequence[Column]) -> Row:
+    cells: dict[str, Value] = {key: runs[0].value(key) for key in keys}
+    reasons: dict[str, str] = {}
+    for column in columns:
+        if column.metric is None or column.statistic is None:
+            continue
+        here = [run for run in runs if place(run, spread) == column.at]
+        numbers = [n for run in here if (n := run.metrics.get(column.metric)) is not None]
+        if column.statistic in ("n", "failed"):
+            cells[column.name] = len(numbers) if column.statistic == "n" else len(here) - len(numbers)
+            continue
+        cells[column.name] = AGGREGATES[column.statistic](numbers) if numbers else None
+        if cells[column.name] is None:
+            reasons[column.name] = _why(here, column.metric)
+    cells["reasons"] = "; ".join(dict.fromkeys(_absences(runs, columns))) or None
+    return Row(cells, reasons)
+
+
+def _why(runs: Sequence[Run], metric: str) -> str:
+    if not runs:
+        return "there is no such run"
+    absent = dict.fromkeys(run.absence(metric) for run in runs if run.metrics.get(metric) is None)
+    return "; ".join(absent) or "needs two runs or more"
+
+
+def _absences(runs: Sequence[Run], columns: Sequence[Column]) -> Iterator[str]:
+    metrics = dict.fromkeys(column.metric for column in columns if column.metric is not None)
+    for run in runs:
+        for metric in metrics:
+            if run.metrics.get(metric) is None:
+                yield run.absence(metric)
+
+
+def _notes(runs: Sequence[Run]) -> Iterator[str]:
+    """One note for each reason for which runs have no result, or a reader should look twice."""
+    reasons: dict[tuple[str, str], list[Run]] = {}
+    for run in runs:
+        if run.reason is not None:
+            reasons.setdefault((run.status, run.reason), []).append(run)
+    for (status, reason), those in reasons.items():
+        shown = ", ".join(str(run.directory) for run in those[:_NAMED])
+        more = f" and {len(those) - _NAMED} more" if len(those) > _NAMED else ""
+        yield f"{len(those)} of {len(runs)} {status}: {reason} (in {shown}{more})"
+
+
+def _sorted(table: Table, names: Sequence[str]) -> list[Row]:
+    """By columns, the first counts most; numbers before texts, what is missing last in either direction."""
+    rows = list(table.rows)
+    for name in reversed(names):  # stable: the last sort is by the first name
+        column = _column(table, name.removesuffix(_ASCENDING).removesuffix(_DESCENDING))
+        largest = any(c.name == column and c.larger_is_better for c in table.columns)
+        descending = name.endswith(_DESCENDING) or (largest and not name.endswith(_ASCENDING))
+        present = [row for row in rows if row.cells.get(column) is not None]
+        missing = [row for row in rows if row.cells.get(column) is None]
+        present.sort(key=lambda row: _key(row.cells[column]), reverse=descending)
+        rows = present + missing
+    return rows
+
+
+def _column(table: Table, name: str) -> str:
+    """The column of that name, or the first of that metric."""
+    for known in (table.names, [column.metric for column in table.columns]):
+        if name in known:
+            return table.names[known.index(name)]
+    raise fail(TABLE_COMMAND, "sort", _one_of(table.names), name)
+
+
+def _key(value: Value) -> tuple[bool, float, str]:
+    number = isinstance(value, int | float)
+    return (False, float(value), "") if number else (True, 0.0, str(value))  # type: ignore[arg-type]

@@ -1,0 +1,265 @@
+"""A table: rows of plain values, as Markdown and LaTeX for people, as CSV, JSON and Parquet for programs."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import html
+import importlib
+import io
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from json import dumps
+from typing import Any
+
+from ..results.reader import Value
+from .columns import Column, Number, PrintedColumn, Row, Style, printed, show, significant
+
+_SPECIAL = {
+    "\\": r"\textbackslash{}",
+    "{": r"\{",
+    "}": r"\}",
+    "$": r"\$",
+    "&": r"\&",
+    "#": r"\#",
+    "_": r"\_",
+    "%": r"\%",
+    "^": r"\textasciicircum{}",
+    "~": r"\textasciitilde{}",
+    "<": r"\textless{}",
+    ">": r"\textgreater{}",
+    "|": r"\textbar{}",
+    '"': r"\symbol{34}",
+    "'": r"\textquotesingle{}",
+    "`": r"\textasciigrave{}",
+    "-": "-{}",  # not the ligature of two of them
+    "[": "{[}",  # not the argument of the line end before it
+    "]": "{]}",
+    "*": "{*}",
+    "±": r"\ensuremath{\pm}",
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Table:
+    """Rows of values under columns, and how people see them."""
+
+    columns: tuple[Column, ...]
+    rows: tuple[Row, ...]
+    notes: tuple[str, ...] = ()  # runs without a result, and why
+    style: Style = dataclasses.field(default_factory=Style)
+
+    @classmethod
+    def of(cls, rows: Sequence[Mapping[str, Value]], headings: Mapping[str, str] | None = None) -> Table:
+        """Return a table of rows that have been computed.
+
+        Args:
+            rows: one mapping a row; a missing cell is None.
+            headings: key of a column to its heading, in order; None: the keys themselves, all of them.
+        """
+        named = headings or {key: "" for row in rows for key in row}
+        columns = tuple(Column(key, heading=heading) for key, heading in named.items())
+        return cls(columns, tuple(Row(row) for row in rows))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of the columns."""
+        return tuple(column.name for column in self.columns)
+
+    def printed(self) -> list[PrintedColumn]:
+        """Return the columns as people read them."""
+        return printed(self.columns, self.rows, self.style)
+
+    def markdown(self) -> str:
+        """Return the table in Markdown, aligned as text too, then a line for each note."""
+        columns = self.printed()
+        over = {column.over for column in columns if column.over}
+        title = f"{_escaped(over.pop())}\n\n" if len(over) == 1 else ""
+        heads = [_escaped(f"{c.over}, {c.heading}" if c.over and not title else c.heading) for c in columns]
+        lines = [[self._shown(column, row) for column in columns] for row in range(len(self.rows))]
+        widths = [max(3, *(len(line[k]) for line in [heads, *lines])) for k in range(len(columns))]
+
+        def joined(cells: list[str]) -> str:
+            aligned = zip(cells, widths, columns, strict=True)
+            return "| " + " | ".join(t.rjust(w) if c.numeric else t.ljust(w) for t, w, c in aligned) + " |\n"
+
+        rule = ["-" * (w - 1) + ":" if c.numeric else "-" * w for w, c in zip(widths, columns, strict=True)]
+        notes = "".join(f"\n{_escaped(note)}\n" for note in self.notes)
+        return title + joined(heads) + joined(rule) + "".join(joined(line) for line in lines) + notes
+
+    def csv(self) -> str:
+        """Return the table as CSV: `float` of a cell gives the number back to the last bit.
+
+        Lists are JSON, and what is missing is an empty cell.
+        """
+        text = io.StringIO()
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerow(self.names)
+        for row in self.rows:
+            cells = [row.cells.get(name) for name in self.names]
+            writer.writerow([dumps(cell) if isinstance(cell, list | bool) else cell for cell in cells])
+        return text.getvalue()
+
+    def _shown(self, column: PrintedColumn, row: int) -> str:
+        cell = column.cells[row]
+        if not isinstance(cell, Number):
+            return "-" if cell is None else _escaped(cell)
+        text = show(cell, self.style.digits)
+        return f"**{text}**" if row in column.best else text
+
+
+def _escaped(text: str) -> str:
+    """On one line, without what would end the cell, begin a tag, or stay open; code in `backquotes` stays."""
+    code = "`" in text and text.count("`") % 2 == 0
+    special = "|<" if code else "\\|<`*" if text.count("*") > 1 else "\\|<`"
+    return "".join(f"\\{c}" if c in special else c for c in " ".join(text.split()))
+
+
+def latex_text(table: Table) -> str:
+    r"""Return a `tabular`; the document needs `\usepackage{booktabs}`, and `textcomp` before LaTeX of 2020.
+
+    Why runs have no result stands below it as comments.
+    """
+    columns, digits = table.printed(), table.style.digits
+    align = "".join("r" if column.numeric else "l" for column in columns)
+    lines = [r"\begin{tabular}{" + align + "}", r"\toprule", *_headings(columns), r"\midrule"]
+    rows = range(len(table.rows))
+    lines += [" & ".join(_cell(column, row, digits) for column in columns) + r" \\" for row in rows]
+    lines += [r"\bottomrule", r"\end{tabular}"]
+    lines += ["% " + " ".join(note.split()) for note in table.notes]
+    return "\n".join(lines) + "\n"
+
+
+def _headings(columns: list[PrintedColumn]) -> list[str]:
+    """One line, or two with a rule under what several columns share."""
+    lower = " & ".join(escape(column.heading) for column in columns) + r" \\"
+    if not any(column.over for column in columns):
+        return [lower]
+    upper, rules, at = [], [], 1
+    for over, group in itertools.groupby(columns, key=lambda column: column.over):
+        width = len(list(group))
+        if over:
+            upper.append(rf"\multicolumn{{{width}}}{{c}}{{{escape(over)}}}")
+            rules.append(rf"\cmidrule(lr){{{at}-{at + width - 1}}}")
+        else:
+            upper += [""] * width
+        at += width
+    return [" & ".join(upper) + r" \\", "".join(rules), lower]
+
+
+def _cell(column: PrintedColumn, row: int, digits: int) -> str:
+    cell = column.cells[row]
+    if cell is None:
+        return "--"
+    if isinstance(cell, str):
+        return escape(cell)
+    text = _number(cell, digits)
+    return rf"\boldmath\textbf{{{text}}}" if row in column.best else text
+
+
+def _number(number: Number, digits: int) -> str:
+    text = _power(significant(number.value, digits))
+    if number.spread is not None:
+        text += r" \pm " + _power(significant(number.spread, 2))
+    return f"${text}$"
+
+
+def _power(text: str) -> str:
+    """1.2e-05 as 1.2 x 10^-5."""
+    mantissa, e, exponent = text.partition("e")
+    return rf"{mantissa} \times 10^{{{int(exponent)}}}" if e else mantissa
+
+
+def escape(text: str) -> str:
+    """Return what makes LaTeX print a text as it is, on one line."""
+    return "".join(_SPECIAL.get(character, character) for character in " ".join(text.split()))
+
+
+def json_text(table: Table) -> str:
+    """``{"columns": [...], "rows": [{"ball_error": null, "reasons": {"ball_error": "..."}}], "notes": []}``.
+
+    NaN and infinity, which JSON does not have, are null with the reason.
+    """
+    content = {
+        "columns": list(table.names),
+        "rows": [_json_row(row) for row in table.rows],
+        "notes": list(table.notes),
+    }
+    return dumps(content, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
+
+
+def _json_row(row: Row) -> dict[str, Any]:
+    lost = {n: v for n, v in row.cells.items() if isinstance(v, float) and not math.isfinite(v)}
+    reasons = {**row.reasons, **{name: f"{value!r} is not a JSON number" for name, value in lost.items()}}
+    return {**row.cells, **dict.fromkeys(lost), "reasons": reasons}
+
+
+def parquet_bytes(table: Table) -> bytes:
+    """Return the table as a Parquet file; a column of several types becomes one of texts, a list JSON.
+
+    Raises:
+        ValueError: without pandas and pyarrow.
+    """
+    require("pyarrow", "Parquet")  # pandas writes through it
+    buffer = io.BytesIO()
+    data_frame(table, "Parquet").to_parquet(buffer, engine="pyarrow", index=False)
+    return buffer.getvalue()
+
+
+def data_frame(table: Table, what: str = "a DataFrame") -> Any:
+    """Return the table as a pandas `DataFrame`, columns as in `parquet_bytes`.
+
+    Raises:
+        ValueError: without pandas, which ``what`` needs.
+    """
+    columns = {
+        c.name: _uniform([row.cells.get(c.name) for row in table.rows], c.metric is not None)
+        for c in table.columns
+    }
+    return require("pandas", what).DataFrame(columns)
+
+
+def require(package: str, what: str) -> Any:
+    """Return a package of the extra `tables`.
+
+    Raises:
+        ValueError: if it is not installed; ``what`` says for what it is needed.
+    """
+    try:
+        return importlib.import_module(package)
+    except ImportError as error:
+        raise ValueError(
+            f"{what} needs {error.name}: install the extra `tables`, pip install 'staf_torch[tables]'."
+        ) from error
+
+
+def html_text(table: Table) -> str:
+    """Return the table as an HTML element, with the best numbers bold and a line for each note."""
+    columns = table.printed()
+    heads = "".join(
+        f"<th>{html.escape(f'{c.over}, {c.heading}' if c.over else c.heading)}</th>" for c in columns
+    )
+    rows = "".join(
+        "<tr>" + "".join(_html_cell(column, row, table.style.digits) for column in columns) + "</tr>"
+        for row in range(len(table.rows))
+    )
+    notes = "".join(f"<p>{html.escape(note)}</p>" for note in table.notes)
+    return f"<table><thead><tr>{heads}</tr></thead><tbody>{rows}</tbody></table>{notes}"
+
+
+def _html_cell(column: PrintedColumn, row: int, digits: int) -> str:
+    cell = column.cells[row]
+    if not isinstance(cell, Number):
+        return f"<td>{'-' if cell is None else html.escape(cell)}</td>"
+    text = html.escape(show(cell, digits))
+    return f"<td><b>{text}</b></td>" if row in column.best else f"<td>{text}</td>"
+
+
+def _uniform(cells: Sequence[Value], number: bool) -> list[Any]:
+    kinds = {bool if isinstance(cell, bool) else type(cell) for cell in cells if cell is not None}
+    if kinds <= {int, float} and (kinds or number):
+        return [math.nan if cell is None else cell for cell in cells]
+    if kinds == {bool}:
+        return list(cells)
+    return [cell if cell is None or isinstance(cell, str) else dumps(cell) for cell in cells]

@@ -1,0 +1,202 @@
+"""The basis at a state: Gram matrix, ideal weights, excess."""
+
+from __future__ import annotations
+
+import math
+import re
+
+import mpmath
+import pytest
+import torch
+from helpers import basis_of, centers_of, tensor, uniform
+from hypothesis import given
+from hypothesis import strategies as some
+from variants import KERNELS, TARGETS, over
+
+import staf_torch as st
+from staf_torch.targets import Cosine, Paper, Quadratic
+
+SEEDS = some.integers(0, 2**31)
+
+
+@over(KERNELS)
+@pytest.mark.parametrize("batch", [(), (4,), (2, 3)])
+def test_basis_is_the_kernel_at_the_centers(name: str, batch: tuple[int, ...]) -> None:
+    basis = basis_of(name)
+    x, y = uniform(*batch, 2), uniform(*batch, 5, 2)
+    assert basis(y, x).shape == (*batch, 5, 6)
+    assert torch.equal(basis(y, x), basis.kernel(y, basis.centers(x)))
+    assert torch.equal(basis.gram(x), basis(basis.centers(x), x))
+
+
+@over(KERNELS)
+@pytest.mark.parametrize("radius", [0.3, st.StateRadius(0.5, 0.1)])
+def test_gram_structure_multiplies_to_the_gram_matrix(name: str, radius: object) -> None:
+    basis = basis_of(name, radius=radius)
+    x = uniform(3, 4, 2)
+    structure = basis.gram_structure(x)
+    gain = torch.zeros(3, 4).double() if structure.log_gain is None else structure.log_gain
+    gram = structure.scaled() * gain.exp()[..., None, None]
+    torch.testing.assert_close(gram.expand(3, 4, 6, 6), basis.gram(x), rtol=1e-12, atol=1e-14)
+
+
+@over(KERNELS)
+def test_one_core_serves_all_states_where_kernel_and_radius_allow(name: str) -> None:
+    constant, moving = basis_of(name), basis_of(name, radius=st.StateRadius(0.5, 0.1))
+    x = uniform(5, 2)
+    shared = constant.kernel.state_free
+    assert constant.gram_structure(x).core.shape == ((6, 6) if shared else (5, 6, 6))
+    assert moving.gram_structure(x).core.shape == (5, 6, 6)
+
+
+@over(KERNELS)
+@over(TARGETS, "target")
+@pytest.mark.parametrize("radius", [0.8, st.StateRadius(1.5, 0.3)])
+def test_ideal_weights_interpolate_at_the_centers(name: str, target: str, radius: object) -> None:
+    basis, function = basis_of(name, radius=radius), TARGETS[target][0]()
+    x = uniform(5, 2, low=0.4, high=1.2)
+    weights = basis.ideal_weights(x, function)
+    assert weights.shape == (5, 6)
+    at_centers = (basis.gram(x) @ weights.unsqueeze(-1)).squeeze(-1)
+    torch.testing.assert_close(at_centers, basis.values(x, function), rtol=1e-10, atol=1e-10)
+
+
+@over(KERNELS)
+def test_ideal_weights_are_those_of_fifty_digits(name: str) -> None:
+    basis = basis_of(name, count=3, radius=0.2)
+    x = tensor([0.8, -0.5])
+    with mpmath.workdps(50):
+        gram, values = mpmath.matrix(basis.gram(x).tolist()), basis.values(x, Paper())
+        exact = [float(w) for w in mpmath.lu_solve(gram, mpmath.matrix(values.tolist()))]
+    found, kappa = basis.ideal_weights(x, Paper()), float(torch.linalg.cond(basis.gram(x)))
+    error = (found - tensor(exact)).norm() / tensor(exact).norm()
+    assert error < 20 * kappa * torch.finfo(torch.float64).eps
+
+
+@over(KERNELS)
+def test_batch_equals_loop(name: str) -> None:
+    basis = basis_of(name, radius=0.6)
+    x = uniform(2, 3, 2, low=0.3)
+    together = basis.ideal_weights(x, Paper()).reshape(6, 6)
+    alone = torch.stack([basis.ideal_weights(at, Paper()) for at in x.reshape(6, 2)])
+    torch.testing.assert_close(together, alone, rtol=1e-9, atol=1e-9)
+
+
+@over(KERNELS)
+@given(seed=SEEDS)
+def test_ideal_weights_minimise_the_native_error(name: str, seed: int) -> None:
+    basis = basis_of(name, radius=0.7)
+    x, step = uniform(2, low=0.3, seed=seed), uniform(6, seed=seed + 1)
+    ideal = basis.ideal_weights(x, Paper())
+    lengths = tensor([0.5, 1.0, 2.0, 4.0])
+    excess = basis.excess(ideal + lengths[:, None] * step, x.expand(4, 2), Paper())
+    floor = 1e-12 * float(basis.gram(x).abs().max() * ideal.square().sum())
+    assert (excess >= -floor).all()
+    assert (excess.diff() > -floor).all()  # it grows away from the ideal weights,
+    torch.testing.assert_close(excess, lengths**2 * excess[1], rtol=1e-6, atol=floor)  # as a square
+
+
+@over(KERNELS)
+def test_excess_is_the_difference_of_the_native_errors(name: str) -> None:
+    basis = basis_of(name, radius=0.8)
+    x, a = uniform(5, 2, low=0.4), uniform(5, 6)
+    gram, values, ideal = basis.gram(x), basis.values(x, Paper()), basis.ideal_weights(x, Paper())
+
+    def native(w: torch.Tensor) -> torch.Tensor:
+        """F(w) - |V|^2."""
+        return torch.einsum("bi,bij,bj->b", w, gram, w) - 2 * (values * w).sum(-1)
+
+    expected = native(a) - native(ideal)
+    torch.testing.assert_close(basis.excess(a, x, Paper()), expected, rtol=1e-7, atol=1e-7)
+
+
+def test_shifted_radial_problem_has_the_same_weights() -> None:
+    basis = basis_of("gaussian")
+    shift = tensor([30.0, -20.0])
+    near = basis.ideal_weights(tensor([0.2, 0.3]), Cosine([1.0, 2.0]))
+    far = basis.ideal_weights(tensor([0.2, 0.3]) + shift, lambda y: Cosine([1.0, 2.0])(y - shift))
+    torch.testing.assert_close(far, near, rtol=1e-7, atol=1e-8)
+
+
+@pytest.mark.parametrize("count", [3, 6])
+def test_exponential_gram_condition_follows_the_flat_limit(count: int) -> None:
+    constant, power = {3: (2.0, 2), 6: (28.8, 4)}[count]
+    radius = 0.03
+    core = basis_of("exponential", count, radius).gram_structure(torch.zeros(2).double()).core
+    assert float(torch.linalg.cond(core)) == pytest.approx(constant / radius**power, rel=0.01)
+
+
+@pytest.mark.parametrize(("count", "reference"), [(6, 2.4e-3), (10, 7.1e-5)])
+def test_rings_gain_an_order_each(count: int, reference: float) -> None:
+    """Sup error on the ball of radius 0.1 for the paper's V, of the size that MATH.md gives."""
+    basis = basis_of("exponential", count, 0.1)
+    angle = torch.arange(6).double() * math.pi / 3
+    x = torch.stack((angle.cos(), angle.sin()), -1)
+    y = x.unsqueeze(-2) + 0.1 * torch.cat([r * st.polygon(4) for r in (0.2, 0.5, 0.8, 1.0)])
+    found = st.StaF(basis, (6,)).fit_(x, Paper())(y).detach()
+    error = float((found - Paper()(y)).abs().max())
+    assert reference / 5 < error < reference * 1.05
+
+
+@pytest.mark.parametrize(("degree", "dim"), [(1, 2), (2, 2), (3, 2), (2, 3)])
+def test_a_polynomial_kernel_takes_as_many_centers_as_its_space_has_dimensions(degree: int, dim: int) -> None:
+    rank = math.comb(dim + degree, degree)
+    kernel = st.PolynomialKernel(degree)
+    full = st.StateFollowingCenters(st.ball(rank, dim), 0.5)
+    basis = st.StaFBasis(kernel, full)
+    x, y = uniform(dim), uniform(7, dim)
+
+    def polynomial(at: torch.Tensor) -> torch.Tensor:
+        return (at.sum(-1) - 0.3) ** degree
+
+    exact = st.StaF(basis).fit_(x, polynomial)(y)
+    torch.testing.assert_close(exact, polynomial(y), rtol=1e-8, atol=1e-9)
+    message = f"`StaFBasis(centers=...)` has {rank + 1} centers, but the space of PolynomialKernel(degree"
+    with pytest.raises(ValueError, match=re.escape(message)) as found:
+        st.StaFBasis(kernel, st.StateFollowingCenters(st.ball(rank + 1, dim), 0.5))
+    assert f"has {rank} dimensions: use at most {rank} centers" in str(found.value)
+
+
+def test_anchoring_takes_one_dimension_from_a_polynomial_space() -> None:
+    kernel = st.AnchoredKernel(st.PolynomialKernel(2))
+    st.StaFBasis(kernel, st.StateFollowingCenters(st.ball(5, 2), 0.5))
+    with pytest.raises(ValueError, match="use at most 5 centers"):
+        st.StaFBasis(kernel, centers_of(6))
+
+
+def test_count_and_dimension_are_those_of_the_centers() -> None:
+    basis = basis_of("gaussian", 10, dim=3)
+    assert (basis.count, basis.dim) == (10, 3)
+
+
+class _WrongShape(torch.nn.Module):
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        return x
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: st.StaFBasis("k", centers_of()), "`StaFBasis(kernel=...)` must be a Kernel; got 'k'."),
+        (lambda: st.StaFBasis(st.GaussianKernel(), 3), "`StaFBasis(centers=...)` must be a StateFollowing"),
+        (lambda: basis_of("gaussian")(uniform(2), uniform(2)), "(y=...)` must have at least 2 dimensions"),
+        (lambda: basis_of("gaussian")(uniform(4, 3), uniform(2)), "must have 2 entries in its last dim"),
+        (lambda: basis_of("gaussian").local(uniform(3)), "`StaFBasis.local(x=...)` must have 2 entries"),
+        (
+            lambda: basis_of("gaussian").ideal_weights(uniform(2), _WrongShape()),
+            "The target `_WrongShape` must map points of shape (..., n) to values of shape (...): "
+            "(6, 2) must give (6,); got (6, 2).",
+        ),
+        (
+            lambda: basis_of("gaussian").ideal_weights(uniform(2), lambda y: 1.0),
+            "The target `<lambda>` must return a tensor; got 1.0.",
+        ),
+        (
+            lambda: basis_of("gaussian").ideal_weights(uniform(3), Quadratic()),
+            "must have 2 entries in its last",
+        ),
+    ],
+)
+def test_a_bad_argument_is_named_with_its_value(make, message: str) -> None:  # type: ignore[no-untyped-def]
+    with pytest.raises(ValueError, match=re.escape(message)):
+        make()

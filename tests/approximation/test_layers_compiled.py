@@ -1,0 +1,105 @@
+"""Layers under `torch.compile(fullgraph=True)` and `torch.export`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from helpers import basis_of, uniform
+from helpers_layers import learnable, target_of
+from torch import Tensor, nn
+from variants import over
+
+import staf_torch as st
+from staf_torch.targets import Paper
+
+
+def fixed(
+    kernel: str, radius: float | st.StateRadius, batch: tuple[int, ...], outputs: int | None
+) -> st.StaF:
+    x = uniform(*batch, 2, low=0.3, seed=1)
+    return st.StaF(basis_of(kernel, 6, radius), batch, outputs).fit_(x, target_of(outputs))
+
+
+CASES: dict[str, Callable[[], st.StaF]] = {
+    "exponential": lambda: fixed("exponential", 0.4, (4,), 2),
+    "gaussian": lambda: fixed("gaussian", st.StateRadius(0.5, 0.1), (4,), None),
+    "matern52": lambda: fixed("matern52", 0.4, (4,), None),
+    "everything_learned": lambda: learnable("gaussian", "shrinking", (4,))[0],
+    "polynomial_learned": lambda: learnable("polynomial", "constant", (4,), count=6)[0],
+}
+MODES = {"exponential": "total_frozen_weights", "gaussian": "total", "everything_learned": "total"}
+
+
+@over(CASES)
+def test_the_whole_layer_is_one_graph(name: str) -> None:
+    staf = CASES[name]()
+    y = staf.state.unsqueeze(-2) + uniform(4, 3, 2, low=-0.2, high=0.2)
+    mode = MODES.get(name, "partial")
+
+    def everything(at: Tensor) -> tuple[Tensor, ...]:
+        return staf(at), *staf.value_and_gradient(at), staf.gradient(at, mode)
+
+    torch._dynamo.reset()
+    compiled = torch.compile(everything, fullgraph=True, backend="eager")(y)
+    for found, expected in zip(compiled, everything(y), strict=True):
+        torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-9)
+
+
+def test_compiled_gradients_reach_the_parameters() -> None:
+    staf, y = learnable("gaussian", "constant")
+    staf(y).square().sum().backward()
+    expected = {key: p.grad.clone() for key, p in staf.named_parameters()}
+    staf.zero_grad()
+    torch._dynamo.reset()
+    torch.compile(staf, fullgraph=True, backend="aot_eager")(y).square().sum().backward()
+    for key, p in staf.named_parameters():
+        torch.testing.assert_close(p.grad, expected[key], rtol=1e-9, atol=1e-9, msg=key)
+
+
+def test_compiled_layers_see_swapped_directions() -> None:
+    staf = fixed("exponential", 0.4, (), None)
+    y = staf.state + uniform(3, 2, low=-0.2, high=0.2)
+
+    def call(directions: Tensor) -> Tensor:
+        return torch.func.functional_call(staf, {"basis.centers.directions": directions}, (y,))
+
+    torch._dynamo.reset()
+    other = st.ball(6, 2)
+    found = torch.compile(call, fullgraph=True, backend="eager")(other)
+    torch.testing.assert_close(found, call(other), rtol=1e-12, atol=1e-12)
+    assert not torch.allclose(found, staf(y))
+
+
+class ValueAndGradient(nn.Module):
+    """What is shipped: both at once."""
+
+    def __init__(self, staf: st.StaF) -> None:
+        super().__init__()
+        self.staf = staf
+
+    def forward(self, y: Tensor) -> tuple[Tensor, Tensor]:
+        return self.staf.value_and_gradient(y)
+
+
+@pytest.mark.parametrize(
+    ("name", "strict"),
+    [
+        ("exponential", True),  # the front end of torch.compile; the others by the default one
+        *((name, False) for name in ("gaussian", "matern52", "polynomial", "anchored_gaussian")),
+    ],
+)
+def test_export_takes_batches_of_any_size(name: str, strict: bool) -> None:
+    staf = st.StaF(basis_of(name, 6, 0.4)).fit_(uniform(2, low=0.3), Paper())
+    module = ValueAndGradient(staf)
+    make = lambda *batch: staf.state + uniform(*batch, 2, low=-0.2, high=0.2)  # noqa: E731
+    sizes = ({0: torch.export.Dim("batch"), 1: torch.export.Dim("points")},)
+    with torch.no_grad():
+        program = torch.export.export(module, (make(3, 2),), dynamic_shapes=sizes, strict=strict)
+        for batch in ((3, 2), (7, 5)):
+            y = make(*batch)
+            for found, expected in zip(program.module()(y), module(y), strict=True):
+                torch.testing.assert_close(found, expected, rtol=1e-12, atol=1e-12)
+    if name in ("exponential", "gaussian"):  # nothing that depends on the directions alone is left to do
+        assert "qr" not in program.graph_module.code

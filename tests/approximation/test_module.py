@@ -1,0 +1,285 @@
+"""`StaF`, the module that users import."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+
+import pytest
+import torch
+from helpers import basis_of, centers_of, tensor, uniform
+from variants import KERNELS, RADII, over
+
+import staf_torch as st
+from staf_torch.targets import Cosine, Paper
+
+BATCHES = ((), (4,), (2, 3))
+STEP = 1e-5
+
+
+def fitted(kernel: str, batch: tuple[int, ...] = (), radius: object = 0.5) -> st.StaF:
+    x = uniform(*batch, 2, low=0.3, high=1.2, seed=5)
+    return st.StaF(basis_of(kernel, radius=radius), batch).fit_(x, Paper())
+
+
+def differences(function: Callable[[torch.Tensor], torch.Tensor], y: torch.Tensor) -> torch.Tensor:
+    """Central differences in every coordinate: (..., n)."""
+    steps = STEP * torch.eye(y.shape[-1], dtype=y.dtype)
+    return torch.stack([(function(y + h) - function(y - h)) / (2 * STEP) for h in steps], dim=-1)
+
+
+@over(KERNELS)
+@pytest.mark.parametrize("batch", BATCHES)
+def test_fit_interpolates_the_target_at_the_centers(name: str, batch: tuple[int, ...]) -> None:
+    staf = fitted(name, batch)
+    centers = staf.basis.centers(staf.state)
+    torch.testing.assert_close(staf(centers), Paper()(centers), rtol=1e-9, atol=1e-9)
+
+
+@over(KERNELS)
+@over(RADII, "radius")
+def test_estimate_is_the_weighted_sum_of_the_kernels(name: str, radius: str) -> None:
+    staf = fitted(name, (4,), RADII[radius][0]())
+    y = staf.state.unsqueeze(-2) + uniform(4, 5, 2, low=-0.2, high=0.2)
+    weights = staf.weights
+    assert weights.shape == (4, 6)
+    terms = staf.basis(y, staf.state) * weights.unsqueeze(-2)
+    scale = float(terms.detach().abs().sum(-1).max())
+    torch.testing.assert_close(staf(y), terms.sum(-1), rtol=0, atol=1e-12 * scale)
+
+
+@over(KERNELS)
+def test_weights_are_the_ideal_ones(name: str) -> None:
+    staf = fitted(name, (3,))
+    expected = staf.basis.ideal_weights(staf.state, Paper())
+    torch.testing.assert_close(staf.weights, expected, rtol=1e-12, atol=0)
+
+
+@over(KERNELS)
+@pytest.mark.parametrize("batch", BATCHES)
+def test_partial_gradient_is_that_of_the_estimate_with_the_centers_frozen(
+    name: str, batch: tuple[int, ...]
+) -> None:
+    staf = fitted(name, batch)
+    y = staf.state.unsqueeze(-2) + uniform(*batch, 3, 2, low=-0.2, high=0.2)
+    gradient = staf.gradient(y)
+    assert gradient.shape == y.shape
+    torch.testing.assert_close(gradient, differences(staf, y), rtol=1e-6, atol=1e-6)
+    assert torch.equal(gradient, staf.gradient(y, mode="partial"))
+
+
+@over(KERNELS)
+@over(RADII, "radius")
+def test_total_gradient_with_frozen_weights_moves_the_centers_with_the_point(name: str, radius: str) -> None:
+    staf = fitted(name, radius=0.3 if radius == "number" else RADII[radius][0]())
+    y = staf.state + uniform(3, 2, low=-0.1, high=0.1)
+    weights = staf.weights.detach()
+
+    def moving(at: torch.Tensor) -> torch.Tensor:
+        x = staf.state + (at - y)  # the state of every point, as far from it as before
+        return (staf.basis(at.unsqueeze(-2), x) * weights).sum(-1).squeeze(-1)
+
+    scale = float((staf.basis(y, staf.state) * weights).abs().sum(-1).max())
+    torch.testing.assert_close(
+        staf.gradient(y, mode="total_frozen_weights"), differences(moving, y), rtol=1e-6, atol=1e-9 * scale
+    )
+
+
+@pytest.mark.parametrize("batch", BATCHES)
+def test_frozen_total_gradient_of_the_exponential_kernel_is_the_partial_one_plus_y_times_the_estimate(
+    batch: tuple[int, ...],
+) -> None:
+    staf = fitted("exponential", batch)
+    x = staf.state.unsqueeze(-2)  # at the state itself: partial + x V^(x)
+    expected = staf.gradient(x) + x * staf(x).unsqueeze(-1)
+    torch.testing.assert_close(staf.gradient(x, mode="total_frozen_weights"), expected, rtol=1e-9, atol=1e-9)
+
+
+@over(KERNELS)
+@pytest.mark.parametrize("batch", BATCHES)
+def test_total_gradient_is_that_of_refitting_at_every_state(name: str, batch: tuple[int, ...]) -> None:
+    staf = fitted(name, batch)
+    shift = uniform(*batch, 3, 2, low=-0.1, high=0.1)
+    y = staf.state.unsqueeze(-2) + shift
+
+    def refitted(at: torch.Tensor) -> torch.Tensor:
+        fresh = st.StaF(staf.basis, tuple(at.shape[:-1]))
+        return fresh.fit_(at - shift, Paper())(at.unsqueeze(-2)).squeeze(-1)
+
+    torch.testing.assert_close(
+        staf.gradient(y, mode="total"), differences(refitted, y).detach(), rtol=1e-5, atol=1e-5
+    )
+    assert torch.equal(staf.gradient(y, "total"), staf.gradient(y, "total", target=Paper()))
+
+
+@over(KERNELS)
+def test_batch_entries_are_as_they_would_be_alone(name: str) -> None:
+    staf = fitted(name, (4,))
+    y = staf.state.unsqueeze(-2) + uniform(4, 3, 2, low=-0.2, high=0.2)
+    for mode in ("partial", "total_frozen_weights", "total"):
+        together = staf.gradient(y, mode)
+        for row in range(4):
+            alone = st.StaF(staf.basis).fit_(staf.state[row], Paper())
+            torch.testing.assert_close(together[row], alone.gradient(y[row], mode), rtol=1e-7, atol=1e-8)
+            torch.testing.assert_close(staf(y)[row], alone(y[row]), rtol=1e-9, atol=1e-10)
+
+
+@over(KERNELS)
+def test_state_dict_restores_the_approximation(name: str) -> None:
+    staf = fitted(name, (2,))
+    fresh = st.StaF(basis_of(name, radius=0.5), (2,))
+    fresh.load_state_dict(staf.state_dict())
+    y = uniform(2, 4, 2)
+    assert torch.equal(fresh(y), staf(y))
+    assert torch.equal(fresh.weights, staf.weights)
+
+
+@over(KERNELS)
+def test_single_precision_goes_through(name: str) -> None:
+    double = fitted(name, (3,))
+    single = st.StaF(basis_of(name, radius=0.5), (3,)).to(torch.float32)
+    single.fit_(double.state.float(), Paper())
+    y = double.state.unsqueeze(-2) + uniform(3, 4, 2, low=-0.3, high=0.3)
+    values = single(y.float())
+    assert values.dtype == torch.float32
+    assert single.weights.dtype == torch.float32
+    for mode in ("partial", "total_frozen_weights", "total"):
+        assert single.gradient(y.float(), mode).dtype == torch.float32
+    torch.testing.assert_close(values.double(), double(y), rtol=5e-3, atol=5e-3)
+
+
+@over(KERNELS)
+def test_single_precision_goes_through_for_one_state_with_a_shrinking_radius(name: str) -> None:
+    staf = st.StaF(basis_of(name, radius=st.StateRadius(0.7, 0.1))).to(torch.float32)
+    staf.fit_(torch.tensor([0.8, 0.4]), Paper())
+    assert staf(torch.tensor([[0.8, 0.4]])).dtype == torch.float32
+    assert staf.weights.dtype == torch.float32
+
+
+@pytest.mark.parametrize("norm", [30.0, 100.0, 1000.0])
+def test_exponential_kernel_does_not_overflow_far_from_the_origin(norm: float) -> None:
+    """The scaled form: V^(x + z) = e^{x'z} sum_i b_i e^{z'd_i}, b = K0^-1 [V(c_i) e^{-x'd_i}]."""
+    radius = 0.1 / norm
+    basis = st.StaFBasis(st.ExponentialKernel(), centers_of(3, radius))
+    x = norm * tensor([0.6, 0.8])
+    staf = st.StaF(basis).fit_(x, Cosine(0.5))
+    d = radius * st.rings(3)
+    z = radius * uniform(8, 2, low=-0.7, high=0.7)
+    b = torch.linalg.solve((d @ d.mT).exp(), Cosine(0.5)(x + d) * (-(d @ x)).exp())
+    expected = (z @ x).exp() * ((z @ d.mT).exp() @ b)
+    found = staf(x + z)
+    assert torch.isfinite(found).all()
+    assert torch.isfinite(staf.gradient(x + z)).all()
+    # x + z - x rounds z to eps |x|, and V^ has slopes of the size of b / radius there.
+    torch.testing.assert_close(found, expected, rtol=1e-8, atol=1e-8)
+    torch.testing.assert_close(found, Cosine(0.5)(x + z), rtol=0, atol=1e-2)
+
+
+def test_fit_returns_the_module_and_moves_its_state() -> None:
+    staf = st.StaF(basis_of("gaussian"))
+    x = tensor([0.5, 0.5])
+    assert staf.fit_(x, Paper()) is staf
+    assert torch.equal(staf.state, x)
+
+
+def test_coefficients_are_parameters_that_a_loss_can_train() -> None:
+    staf = fitted("gaussian")
+    y = uniform(4, 2)
+    staf(y).square().sum().backward()
+    assert staf.coefficients.grad is not None
+    assert torch.isfinite(staf.coefficients.grad).all()
+    assert [name for name, _ in staf.named_parameters()] == ["coefficients"]
+
+
+def test_an_unfitted_module_is_zero_everywhere() -> None:
+    assert torch.equal(st.StaF(basis_of("gaussian"))(uniform(5, 2)), torch.zeros(5).double())
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (
+            lambda s: s.gradient(uniform(1, 2), mode="frozen"),
+            "`StaF.gradient(mode=...)` must be one of 'partial'",
+        ),
+        (lambda s: s.gradient(uniform(1, 2), mode="total"), '`StaF.gradient(mode="total")` needs a target'),
+        (lambda s: s.gradient(uniform(2)), "`StaF.gradient(y=...)` must have at least 2 dimensions"),
+        (lambda s: s(uniform(2, 3)), "`StaF(y=...)` must have 2 entries in its last dimension"),
+        (
+            lambda s: s.fit_(uniform(3, 2), Paper()),
+            "`StaF.fit_(x=...)` must have the shape (2,); got (3, 2).",
+        ),
+        (lambda s: s.fit_([1.0, 0.0], Paper()), "`StaF.fit_(x=...)` must be a tensor; got [1.0, 0.0]."),
+        (lambda s: s.fit_(uniform(2), lambda y: y), "must map points of shape (..., n) to values"),
+    ],
+)
+def test_a_bad_argument_is_named_with_its_value(make, message: str) -> None:  # type: ignore[no-untyped-def]
+    with pytest.raises(ValueError, match=re.escape(message)):
+        make(st.StaF(basis_of("gaussian")))
+
+
+def test_a_failed_fit_leaves_the_module_as_it_was() -> None:
+    staf = fitted("gaussian")
+    before = {key: value.clone() for key, value in staf.state_dict().items()}
+    with pytest.raises(ValueError, match="must return a tensor"):
+        staf.fit_(tensor([5.0, 5.0]), lambda y: None)
+    for key, value in staf.state_dict().items():
+        assert torch.equal(value, before[key]), key
+
+
+# --- one point a batch entry --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("outputs", [None, 3])
+def test_rowwise_is_every_entry_at_its_own_point(outputs: int | None) -> None:
+    basis = st.StaFBasis(st.GaussianKernel(), st.StateFollowingCenters(st.rings(6), radius=0.1))
+    x = torch.rand(5, 2, dtype=torch.float64)
+    staf = st.StaF(basis, (5,), outputs)
+    with torch.no_grad():
+        staf.coefficients.copy_(torch.randn_like(staf.coefficients))
+        staf.state.copy_(x)
+    values = staf.rowwise(x + 0.02)
+    assert values.shape == (5,) if outputs is None else (5, 3)
+    for row in range(5):
+        torch.testing.assert_close(values[row], staf(x[:, None] + 0.02)[row, 0], rtol=1e-12, atol=1e-13)
+    several = staf.rowwise(torch.stack((x, x + 0.02)))
+    torch.testing.assert_close(several[1], values, rtol=1e-12, atol=1e-13)
+
+
+def test_a_shape_that_could_mean_either_names_both() -> None:
+    basis = st.StaFBasis(st.GaussianKernel(), st.StateFollowingCenters(st.rings(6), radius=0.1))
+    staf, x = st.StaF(basis, (64,)), torch.zeros(64, 2, dtype=torch.float64)
+    with pytest.raises(ValueError, match=r"StaF.rowwise\(y\)`\), or all of them .*unsqueeze\(0\)"):
+        staf(x)
+    with pytest.raises(ValueError, match=r"StaF.gradient\(y.unsqueeze\(-2\)\)"):
+        staf.gradient(x)
+    with pytest.raises(ValueError, match=r"ends with \(64, 2\); got \(63, 2\)"):
+        staf.rowwise(x[1:])
+    assert staf(x.unsqueeze(0)).shape == (64, 64)
+    assert staf.rowwise(x).shape == (64,)
+
+
+@pytest.mark.parametrize("assign", [True, False])
+@over(KERNELS)
+def test_a_model_built_on_the_meta_device_is_filled_by_a_state_dict(name: str, assign: bool) -> None:
+    def made() -> st.StaF:
+        return st.StaF(basis_of(name), (4,))
+
+    x = torch.rand(4, 2, dtype=torch.float64)
+    known = made().fit_(x, Paper())
+    with torch.device("meta"):
+        empty = made()
+    if not assign:
+        empty.to_empty(device="cpu")
+    empty.load_state_dict(known.state_dict(), assign=assign)
+    assert torch.equal(empty.rowwise(x + 0.01), known.rowwise(x + 0.01))
+
+
+def test_a_model_without_values_says_how_it_gets_them() -> None:
+    with torch.device("meta"):
+        empty = st.StaF(
+            st.StaFBasis(st.ExponentialKernel(), st.StateFollowingCenters(st.rings(6), radius=0.1))
+        )
+    empty.to_empty(device="cpu")
+    with pytest.raises(ValueError, match=r"built on the meta device must be given its values first"):
+        empty(torch.zeros(1, 2, dtype=torch.float64))

@@ -1,0 +1,236 @@
+"""Drifting streams: `python tests/benchmarks/drifting_streams.py [--json FILE] [--streams S] [--batch B]`.
+
+`StaFRegressor` beside a batched exact Gaussian process (GPyTorch), SciPy's RBFInterpolator(neighbors=),
+scikit-learn's KernelRidge and ALD-KRLS (Engel et al.), all on the same streams: a drifting function, the
+paper's V along a trajectory, noisy samples. The error is prequential, root mean square: every sample is
+predicted before it is learned. Each method takes the settings of its list that predict the first samples
+best, and is scored on the rest. A time is the processor's, one thread, the median over the last steps of
+predicting and learning, over streams: each method on as many side by side as its entry says. A peer that is
+not installed is named and skipped: `pip install -e '.[bench]'`. Exit status 1 where a goal is missed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import itertools
+import json
+import statistics
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+
+import torch
+from torch import Tensor
+
+ROOT = Path(__file__).parents[2]
+sys.path[:0] = [str(ROOT), str(Path(__file__).parent)]
+
+import staf_torch as st  # noqa: E402
+
+STEPS, PREFIX, BURN = 360, 140, 40  # a stream's samples, those to tune on, and of them not scored
+WARM, TIMED = 235, 30  # steps before the timed ones, which lie in the middle of the scored stretch
+PEERS = ("gp", "krls", "neighbours", "ridge")
+RATE, RATIO = 2e6, 100.0  # the goals: samples a second, speed against the GP and KRLS
+
+
+class Model(Protocol):
+    """Many streams side by side: (S, n), (S,)."""
+
+    def predict(self, x: Tensor) -> Tensor: ...
+
+    def partial_fit(self, x: Tensor, y: Tensor) -> object: ...
+
+
+class Method(NamedTuple):
+    """A method and the settings that it may choose from."""
+
+    name: str
+    make: Callable[..., Model]
+    settings: list[dict[str, Any]]
+    batch: int  # streams side by side when timed
+
+
+class Stream(NamedTuple):
+    """What every method sees: (S, T, n + 1), the last coordinate of x the time in samples, and (S, T)."""
+
+    x: Tensor
+    y: Tensor
+    noise: float
+
+
+def grid(**choices: list[Any]) -> list[dict[str, Any]]:
+    """All combinations."""
+    return [dict(zip(choices, row, strict=True)) for row in itertools.product(*choices.values())]
+
+
+def path(streams: int, steps: int, draw: torch.Generator) -> Tensor:
+    """Lissajous curves in the square [-1, 1]^2 with frequencies and phases of their own: (S, T, 2)."""
+    time_ = torch.arange(steps, dtype=torch.float64)
+    frequency = 0.006 + 0.004 * torch.rand(streams, 1, 2, generator=draw, dtype=torch.float64)
+    phase = torch.rand(streams, 1, 2, generator=draw, dtype=torch.float64)
+    return (2 * torch.pi * (frequency * time_[:, None] + phase)).sin()
+
+
+def waves(x: Tensor, drift: float, draw: torch.Generator) -> Tensor:
+    """Two plane waves of wavelength pi, their phases a random walk with that step: (S, T)."""
+    streams, steps, _ = x.shape
+    angle = 2 * torch.pi * torch.rand(streams, 2, generator=draw, dtype=torch.float64)
+    direction = 2 * torch.stack((angle.cos(), angle.sin()), dim=1)  # (S, n, 2)
+    start = 2 * torch.pi * torch.rand(streams, 1, 2, generator=draw, dtype=torch.float64)
+    walk = torch.randn(streams, steps, 2, generator=draw, dtype=torch.float64).cumsum(1)
+    return (x @ direction + start + drift * walk).sin().sum(-1)
+
+
+def stream(kind: str, streams: int, steps: int = STEPS, seed: int = 0) -> Stream:
+    """One of the three kinds: "drifting", "paper" or "noisy"."""
+    draw = torch.Generator().manual_seed(seed)
+    x = path(streams, steps, draw)
+    if kind == "paper":
+        y, noise = st.targets.Paper()(x), 1e-4
+    else:
+        drift, noise = (0.02, 0.05) if kind == "drifting" else (0.0, 0.3)
+        y = waves(x, drift, draw) + noise * torch.randn(streams, steps, generator=draw, dtype=torch.float64)
+    clock = torch.arange(steps, dtype=torch.float64).expand(streams, steps)
+    return Stream(torch.cat((x, clock.unsqueeze(-1)), dim=-1), y, noise)
+
+
+class StaF:
+    """The regressor on x alone; it needs no clock."""
+
+    def __init__(self, count: int, width: float, radius: float, noise: float, forgetting: float) -> None:
+        kernel = st.GaussianKernel(width)
+        self.model = st.StaFRegressor(kernel, radius * width, count, noise=noise, forgetting=forgetting)
+
+    def predict(self, x: Tensor) -> Tensor:
+        found: Tensor = self.model.predict(x[:, :2])
+        return found
+
+    def partial_fit(self, x: Tensor, y: Tensor) -> None:
+        self.model.partial_fit(x[:, :2], y)
+
+
+def methods(noise: float, batch: int) -> Iterator[Method | str]:
+    """Every method with its settings; a sentence for one that is not installed."""
+    for count in (3, 6, 15):
+        choices = grid(
+            count=[count],
+            width=[0.6, 0.9, 1.4],
+            radius=[0.3, 0.5],
+            noise=[noise, 2 * noise],
+            forgetting=[1.0, 0.999, 0.99],
+        )
+        yield Method(f"StaFRegressor, M = {count}", StaF, choices, batch)
+    for name in PEERS:
+        try:
+            yield from importlib.import_module(f"peer_{name}").methods(noise)
+        except ImportError as error:
+            yield f"peer_{name} skipped: {error}. Install it with pip install -e '.[bench]'."
+
+
+def errors(model: Model, data: Stream, steps: int) -> Tensor:
+    """Prequential errors of the first ``steps`` samples: (S, steps - 1)."""
+    found = []
+    for k in range(steps):
+        if k:
+            found.append(model.predict(data.x[:, k]) - data.y[:, k])
+        model.partial_fit(data.x[:, k], data.y[:, k])
+    return torch.stack(found, dim=1)
+
+
+def rms(found: Tensor) -> float:
+    """Root mean square; inf where something is not finite."""
+    value = float(found.square().mean().sqrt())
+    return value if value == value else float("inf")
+
+
+def timed(method: Method, settings: dict[str, Any], kind: str) -> tuple[float, float]:
+    """Seconds a sample: predicting and learning, and learning alone."""
+    data = stream(kind, method.batch, WARM + TIMED, seed=1)
+    xs, ys = ([part.contiguous() for part in whole.unbind(1)] for whole in (data.x, data.y))
+    model, both, learning = method.make(**settings), [], []
+    for k, (x, y) in enumerate(zip(xs, ys, strict=True)):
+        start = time.process_time()
+        if k:
+            model.predict(x)
+        middle = time.process_time()
+        model.partial_fit(x, y)
+        end = time.process_time()
+        if k >= WARM:
+            both.append((end - start) / method.batch)
+            learning.append((end - middle) / method.batch)
+    return statistics.median(both), statistics.median(learning)
+
+
+def case(method: Method, data: Stream, kind: str) -> dict[str, Any]:
+    """The method tuned, scored and timed on one kind of stream."""
+    tuned = [
+        (rms(errors(method.make(**s), data, PREFIX)[:, BURN:]), i) for i, s in enumerate(method.settings)
+    ]
+    settings = method.settings[min(tuned)[1]]
+    score = rms(errors(method.make(**settings), data, STEPS)[:, PREFIX:])
+    both, learning = timed(method, settings, kind)
+    about = {"stream": kind, "method": method.name, "settings": settings, "batch": method.batch}
+    return about | {"error": score, "us": 1e6 * both, "us_learning": 1e6 * learning}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--json", type=Path, help="write the results here as well")
+    parser.add_argument("--streams", type=int, default=32, help="streams that the errors are taken over")
+    parser.add_argument("--batch", type=int, default=10_000, help="streams side by side when timed")
+    parser.add_argument("--kinds", nargs="*", default=["drifting", "paper", "noisy"])
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    rows: list[dict[str, Any]] = []
+    print("| stream | method | streams timed | error | us a sample | learning alone | settings |")
+    print("|---|---|---:|---:|---:|---:|---|")
+    for kind in options.kinds:
+        data = stream(kind, options.streams)
+        for method in methods(data.noise, options.batch):
+            if isinstance(method, str):
+                print(method, file=sys.stderr)
+                continue
+            rows.append(found := case(method, data, kind))
+            chosen = ", ".join(f"{key} {value:g}" for key, value in found["settings"].items())
+            print(
+                f"| {kind} | {found['method']} | {found['batch']} | {found['error']:.3g} | {found['us']:.3g} "
+                f"| {found['us_learning']:.3g} | {chosen} |",
+                flush=True,
+            )
+    if options.json:
+        about = {"torch": torch.__version__, "threads": torch.get_num_threads(), "noise floor": "in `error`"}
+        options.json.write_text(json.dumps(about | {"rows": rows}, indent=1) + "\n")
+    sys.exit(0 if met(rows) else 1)
+
+
+def met(rows: list[dict[str, Any]]) -> bool:
+    """Whether the goals are reached on the drifting stream, said aloud."""
+    drifting = [row for row in rows if row["stream"] == "drifting"]
+    if not drifting:
+        return True
+    own = [row for row in drifting if row["method"].startswith("StaF")]
+    fastest = min(own, key=lambda row: row["us_learning"])
+    rate = 1e6 / fastest["us_learning"]
+    print(f"\n{fastest['method']}: {rate / 1e6:.2f} million samples a second learned, one thread")
+    good = rate >= RATE
+    for peer in drifting:
+        if "GP" not in peer["method"] and "KRLS" not in peer["method"]:
+            continue
+        for row in own:
+            ratio, excess = peer["us"] / row["us"], row["error"] / peer["error"] - 1
+            print(
+                f"{row['method']} against {peer['method']}: {ratio:.0f} times the speed, error {excess:+.1%}"
+            )
+        good &= any(peer["us"] / row["us"] >= RATIO and row["error"] <= peer["error"] for row in own)
+    print(
+        f"goals ({RATE:g} a second, {RATIO:g} times the speed at no higher error): "
+        f"{'met' if good else 'missed'}"
+    )
+    return good
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,204 @@
+"""Public streams: generated from the published equations, or shipped inside packages; at most 1600 samples.
+
+Every set is (x (T, n), y (T, k)) in the order of time: y is asked for at x, then told. The series of kafbox
+(Van Vaerenbergh, FreeBSD licence) are generated anew from their equations; packages: river, statsmodels,
+scikit-learn, pmdarima, arch, vega_datasets (`pip install -e '.[bench]'`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+MOST = 1600
+Array = np.ndarray
+
+
+class Series(NamedTuple):
+    """A stream."""
+
+    x: Array  # (T, n)
+    y: Array  # (T, k)
+
+
+def embedded(values: Array, size: int, ahead: int = 1, spacing: int = 1) -> Series:
+    """The value ``ahead`` steps on from the last ``size`` values, ``spacing`` steps apart."""
+    values = np.asarray(values, float)
+    first, last = (size - 1) * spacing, len(values) - ahead
+    x = np.stack([values[first - i * spacing : last - i * spacing] for i in range(size)], 1)
+    return Series(x[:MOST], values[first + ahead :][:MOST, None])
+
+
+def mackey_glass(delay: int, count: int, every: int = 6, start: float = 0.89) -> Array:
+    """x' = .2 x(t - delay) / (1 + x(t - delay)^10) - .1 x by Runge-Kutta with steps of .1, every 6 seconds.
+
+    With the delay 30 and x = .89 before 0 it is the series mg30 of kafbox, 24 seconds on.
+    """
+    fine = 10
+    past = delay * fine
+    x = np.empty(past + count * every * fine + 1)
+    x[: past + 1] = start
+
+    def rate(now: float, then: float) -> float:
+        return 0.2 * then / (1 + then**10) - 0.1 * now
+
+    for k in range(past, len(x) - 1):
+        old, new = x[k - past], x[k - past + 1] if past else x[k]
+        middle, h = (old + new) / 2, 1 / fine
+        a = rate(x[k], old)
+        b = rate(x[k] + h / 2 * a, middle)
+        c = rate(x[k] + h / 2 * b, middle)
+        d = rate(x[k] + h * c, new)
+        x[k + 1] = x[k] + h / 6 * (a + 2 * b + 2 * c + d)
+    return x[past :: every * fine][:count]
+
+
+def lorenz(count: int) -> Array:
+    """The third coordinate by Euler steps of .01 from (10, 7, 35): kafbox's lorenz.dat to its six digits."""
+    x, y, z = 10.0, 7.0, 35.0
+    found = []
+    for _ in range(count):
+        found.append(z)
+        x, y, z = x + 0.1 * (y - x), y + 0.01 * (x * (28 - z) - y), z + 0.01 * (x * y - 8 / 3 * z)
+    return np.array(found)
+
+
+def henon(count: int) -> Array:
+    x = [0.1, 0.1]
+    for _ in range(count):
+        x.append(1 - 1.4 * x[-1] ** 2 + 0.3 * x[-2])
+    return np.array(x[100:])
+
+
+def equalisation(count: int) -> Series:
+    """Find the symbol s_{k-2} behind a channel with memory and a square, five outputs at hand."""
+    draw = np.random.default_rng(1)
+    s = draw.choice([-1.0, 1.0], count + 10)
+    linear = s[1:] + 0.5 * s[:-1]
+    r = linear - 0.9 * linear**2 + 0.4 * draw.standard_normal(len(linear))
+    x = np.stack([r[4 - i : len(r) - i] for i in range(5)], 1)
+    return Series(x[:count], s[3 : 3 + len(x)][:count, None])
+
+
+def channel_switch(count: int = 1500, switch: int = 500) -> Series:
+    """kafbox's Wiener system tanh(h'x), five taps, 20 dB; h changes at a third."""
+    draw = np.random.default_rng(2)
+    s = draw.standard_normal(count + 4)
+    x = np.stack([s[4 - i : 4 - i + count] for i in range(5)], 1)
+    h = np.concatenate((np.ones((2, 1)), draw.standard_normal((2, 4))), 1)
+    y = np.tanh(np.where(np.arange(count) < switch, x @ h[0], x @ h[1]))
+    return Series(x, (y + 0.1 * y.std() * draw.standard_normal(count))[:, None])
+
+
+def arm(count: int) -> Series:
+    """Torques of both joints of a planar arm from angles, rates and accelerations; smooth random motion."""
+    draw = np.random.default_rng(3)
+    time = 0.02 * np.arange(count)
+    frequency, phase = draw.uniform(0.2, 1.2, (2, 6)), draw.uniform(0, 2 * np.pi, (2, 6))
+    wave = 2 * np.pi * frequency[..., None] * time + phase[..., None]
+    rate = 2 * np.pi * frequency[..., None]
+    q = 0.5 * np.sin(wave).sum(1)
+    v = 0.5 * (rate * np.cos(wave)).sum(1)
+    a = -0.5 * (rate**2 * np.sin(wave)).sum(1)
+    c2, s2 = np.cos(q[1]), np.sin(q[1])
+    gravity = 9.81 * np.cos(q[0] + q[1])
+    first = (3 + 2 * c2) * a[0] + (1 + c2) * a[1] - s2 * (2 * v[0] * v[1] + v[1] ** 2)
+    first += 2 * 9.81 * np.cos(q[0]) + gravity + 2 * np.tanh(5 * v[0])
+    second = (1 + c2) * a[0] + a[1] + s2 * v[0] ** 2 + gravity + np.tanh(5 * v[1])
+    y = np.stack((first, second), 1) / 20
+    return Series(np.concatenate((q, v, a)).T, y + 0.05 * draw.standard_normal(y.shape))
+
+
+def _seattle() -> Series:
+    from vega_datasets import local_data
+
+    return embedded(local_data.seattle_temps()["temp"].to_numpy(), 4)
+
+
+def _trump() -> Series:
+    from river.datasets import TrumpApproval
+
+    rows = list(TrumpApproval())
+    return Series(np.array([list(x.values()) for x, _ in rows], float), np.array([[y] for _, y in rows]))
+
+
+def _chick() -> Series:
+    from river.datasets import ChickWeights
+
+    rows = list(ChickWeights())
+    return Series(
+        np.array([list(x.values()) for x, _ in rows], float), np.array([[y] for _, y in rows], float)
+    )
+
+
+def _pmdarima(name: str) -> Array:
+    import pmdarima.datasets as packaged
+
+    return np.asarray(getattr(packaged, f"load_{name}")(), float)
+
+
+def _statsmodels(name: str, column: str) -> Array:
+    from statsmodels import datasets
+
+    values = getattr(datasets, name).load_pandas().data[column].astype(float)
+    return values.interpolate().to_numpy()
+
+
+def _el_nino() -> Array:
+    from statsmodels import datasets
+
+    return datasets.elnino.load_pandas().data.iloc[:, 1:].to_numpy(float).ravel()
+
+
+def _arch(name: str, column: str) -> Array:
+    import importlib
+
+    values = importlib.import_module(f"arch.data.{name}").load()[column].astype(float)
+    return values.dropna().to_numpy()
+
+
+def _water() -> Array:
+    from river.datasets import WaterFlow
+
+    return np.array([y for _, y in WaterFlow()])
+
+
+def _diabetes() -> Series:
+    from sklearn.datasets import load_diabetes
+
+    x, y = load_diabetes(return_X_y=True)
+    return Series(x, y[:, None])
+
+
+def _noisy() -> Array:
+    values = mackey_glass(30, 1620)
+    return values + 0.05 * values.std() * np.random.default_rng(4).standard_normal(len(values))
+
+
+SETS: dict[str, Callable[[], Series]] = {
+    "MG30 +1": lambda: embedded(mackey_glass(30, 1620)[10:], 7),
+    "MG17 +84": lambda: embedded(mackey_glass(17, 1720)[20:], 4, ahead=14),
+    "Henon": lambda: embedded(henon(1700), 2),
+    "Lorenz +5": lambda: embedded(lorenz(1700), 3, ahead=5),
+    "Lorenz +10": lambda: embedded(lorenz(1700), 6, ahead=10),
+    "channel equalisation": lambda: equalisation(MOST),
+    "channel switch": channel_switch,
+    "Seattle temperature": _seattle,
+    "Trump approval": _trump,
+    "Taylor load": lambda: embedded(_pmdarima("taylor"), 3),
+    "CO2": lambda: embedded(_statsmodels("co2", "co2"), 4),
+    "VIX": lambda: embedded(_arch("vix", "vix"), 3),
+    "arm": lambda: arm(1200),  # two outputs, two sets
+    "WaterFlow": lambda: embedded(_water(), 4),
+    "MG30 noisy": lambda: embedded(_noisy(), 7),
+    "chick weights": _chick,
+    "diabetes": _diabetes,
+    "airline": lambda: embedded(_pmdarima("airpassengers"), 3),
+    "El Nino": lambda: embedded(_el_nino(), 12),
+    "sunspots": lambda: embedded(_statsmodels("sunspots", "SUNACTIVITY"), 3),
+    "lynx": lambda: embedded(np.log(_pmdarima("lynx")), 2),
+    "crude oil": lambda: embedded(_arch("wti", "DCOILWTICO"), 3),
+    "heart rate": lambda: embedded(_pmdarima("heartrate"), 4),
+}

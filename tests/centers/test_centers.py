@@ -1,0 +1,232 @@
+"""Layouts, radii and the centers that they make."""
+
+from __future__ import annotations
+
+import math
+import re
+import warnings
+
+import pytest
+import torch
+from helpers import tensor, uniform
+from hypothesis import given
+from hypothesis import strategies as some
+from variants import KERNELS, LAYOUTS, RADII, directions_of, over
+
+import staf_torch as st
+from staf_torch.approximation.conditioning import lebesgue_constant, sup_error
+from staf_torch.centers import probe_points
+from staf_torch.targets import Cosine, Paper
+
+
+def monomials(points: torch.Tensor, degree: int) -> torch.Tensor:
+    """All products of at most ``degree`` coordinates, by recursion on the number of variables."""
+    if points.shape[1] == 0:
+        return points.new_ones(points.shape[0], 1)
+    first, rest = points[:, :1], points[:, 1:]
+    return torch.cat([first**k * monomials(rest, degree - k) for k in range(degree + 1)], dim=1)
+
+
+@over(LAYOUTS)
+def test_layout_has_the_count_and_dimension_that_it_says(name: str) -> None:
+    case = LAYOUTS[name]
+    directions = directions_of(name)
+    assert directions.shape == (case.count, case.dim)
+    assert directions.dtype == torch.float64
+
+
+@over(LAYOUTS)
+def test_layout_lies_in_the_closed_unit_ball_and_is_accepted(name: str) -> None:
+    directions = directions_of(name)
+    assert directions.norm(dim=-1).max() <= 1 + 4e-16
+    st.StateFollowingCenters(directions, 0.1)
+
+
+@over(LAYOUTS)
+def test_points_of_a_layout_keep_their_distance(name: str) -> None:
+    case = LAYOUTS[name]
+    distances = torch.pdist(directions_of(name))
+    if case.count > 1:
+        assert distances.min() > 0.5 * case.count ** (-1 / case.dim)
+
+
+@over(LAYOUTS)
+def test_layout_is_the_same_every_time(name: str) -> None:
+    first = directions_of(name)
+    torch.rand(3)
+    assert torch.equal(first, LAYOUTS[name].make())
+
+
+@over(LAYOUTS)
+def test_layout_determines_polynomials_of_its_degree(name: str) -> None:
+    case = LAYOUTS[name]
+    vandermonde = monomials(directions_of(name), case.degree)
+    singular = torch.linalg.svdvals(vandermonde)
+    assert singular.shape[0] == vandermonde.shape[1]
+    assert singular[-1] > 1e-3 * singular[0]
+
+
+@pytest.mark.parametrize("count", [3, 6, 10, 15, 21, 28])
+def test_rings_have_the_radii_of_bos(count: int) -> None:
+    sizes = {3: [3], 6: [5, 1], 10: [7, 3], 15: [9, 5, 1], 21: [11, 7, 3], 28: [13, 9, 5, 1]}[count]
+    radii = {3: [1], 6: [1, 0], 10: [1, 0.43], 15: [1, 0.63, 0], 21: [1, 0.75, 0.28], 28: [1, 0.82, 0.46, 0]}
+    expected = [r for size, r in zip(sizes, radii[count], strict=True) for _ in range(size)]
+    torch.testing.assert_close(st.rings(count).norm(dim=-1), tensor(expected), rtol=1e-15, atol=1e-15)
+
+
+def test_rings_of_three_are_the_triangle_of_the_paper() -> None:
+    expected = tensor([[0, 1], [math.sqrt(3) / 2, -0.5], [-math.sqrt(3) / 2, -0.5]])
+    torch.testing.assert_close(st.rings(3), expected, rtol=1e-15, atol=1e-15)
+    assert torch.equal(st.rings(3), st.polygon(3))
+
+
+@pytest.mark.parametrize("dim", [1, 2, 3, 4, 7])
+def test_simplex_is_regular_and_centred(dim: int) -> None:
+    corners = st.simplex(dim)
+    expected = torch.full((dim + 1, dim + 1), -1 / dim, dtype=torch.float64).fill_diagonal_(1.0)
+    torch.testing.assert_close(corners @ corners.mT, expected, rtol=1e-14, atol=1e-14)
+    assert corners.sum(0).abs().max() < 1e-14
+
+
+@pytest.mark.parametrize("dim", [1, 2, 3, 6])
+def test_cross_polytope_is_plus_and_minus_every_axis(dim: int) -> None:
+    rows = {tuple(row) for row in st.cross_polytope(dim).tolist()}
+    assert rows == {tuple(s * float(i == k) for i in range(dim)) for k in range(dim) for s in (1, -1)}
+
+
+def test_a_polygon_of_five_or_more_corners_warns_with_the_reason() -> None:
+    with pytest.warns(UserWarning, match=r"polygon\(5\).*conic.*second-order.*rings\(6\)"):
+        st.polygon(5)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        st.polygon(4)
+
+
+@pytest.mark.parametrize("dim", [1, 2, 3, 4])
+def test_probe_points_fill_the_ball_and_start_at_its_center(dim: int) -> None:
+    points = probe_points(193, dim)
+    assert points.shape == (193, dim)
+    assert torch.equal(points[0], torch.zeros(dim).double())
+    norms = points.norm(dim=-1)
+    assert norms.max() == pytest.approx(1, abs=1e-15)
+    assert norms.max() <= 1 + 4e-16
+    directions = torch.cat((st.cross_polytope(dim), st.simplex(dim)))
+    assert (directions @ points.mT).amax(-1).min() > (0.99 if dim <= 2 else 0.75)
+
+
+@over(RADII)
+@given(data=some.data())
+def test_radius_is_its_formula(name: str, data: some.DataObject) -> None:
+    make, formula = RADII[name]
+    point = data.draw(some.lists(some.floats(-5, 5), min_size=2, max_size=2))
+    centers = st.StateFollowingCenters(st.rings(3), make())
+    assert centers.radius(tensor(point)).item() == pytest.approx(formula(point), rel=1e-14)
+
+
+@over(RADII)
+@pytest.mark.parametrize("batch", [(), (4,), (2, 3)])
+def test_centers_are_the_state_plus_the_radius_times_the_directions(
+    name: str, batch: tuple[int, ...]
+) -> None:
+    make, formula = RADII[name]
+    directions = st.rings(6)
+    centers = st.StateFollowingCenters(directions, make())
+    x = uniform(*batch, 2)
+    got = centers(x)
+    assert got.shape == (*batch, 6, 2)
+    assert torch.equal(got, x.unsqueeze(-2) + centers.offsets(x))
+    for at, found in zip(x.reshape(-1, 2), got.reshape(-1, 6, 2), strict=True):
+        expected = at + formula(at.tolist()) * directions
+        torch.testing.assert_close(found, expected, rtol=1e-14, atol=1e-15)
+    assert centers(x.float()).dtype == torch.float32
+
+
+@over(RADII)
+def test_constant_radius_says_so(name: str) -> None:
+    radius = st.StateFollowingCenters(st.rings(3), RADII[name][0]()).radius
+    values = radius(tensor([[0.0, 0.0], [1.0, 2.0]])).expand(2)
+    assert radius.constant == bool(values[0] == values[1])
+
+
+def test_a_shrinking_radius_with_no_offset_lets_the_centers_meet_at_the_origin() -> None:
+    centers = st.StateFollowingCenters(st.rings(3), st.StateRadius(0.5, 0.0))
+    assert torch.equal(centers(torch.zeros(2).double()), torch.zeros(3, 2).double())
+
+
+def test_gradient_reaches_the_state_through_a_shrinking_radius() -> None:
+    centers = st.StateFollowingCenters(st.rings(6), st.StateRadius(0.7, 0.01))
+    assert torch.autograd.gradcheck(centers, (uniform(3, 2).requires_grad_(),))
+
+
+@over(KERNELS)
+@given(order=some.permutations(range(6)), seed=some.integers(0, 1000))
+def test_permuted_centers_permute_the_weights_and_leave_the_estimate(
+    name: str, order: list[int], seed: int
+) -> None:
+    kernel = KERNELS[name].make()
+    target = Cosine([1.0, 2.0])
+    x, y = uniform(2, low=0.5, seed=seed), uniform(4, 2, seed=seed + 1)
+    plain, moved = (
+        st.StaFBasis(kernel, st.StateFollowingCenters(directions, 0.4))
+        for directions in (st.rings(6), st.rings(6)[order])
+    )
+    first, second = plain.ideal_weights(x, target), moved.ideal_weights(x, target)
+    torch.testing.assert_close(second, first[order], rtol=1e-8, atol=1e-8 * float(first.abs().max()))
+    fits = [st.StaF(basis).fit_(x, target)(y) for basis in (plain, moved)]
+    torch.testing.assert_close(fits[1], fits[0], rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: st.rings(4), "`rings(count=...)` must be one of 3, 6, 10, 15, 21, 28; got 4."),
+        (lambda: st.rings(0), "`rings(count=...)` must be at least 1; got 0."),
+        (lambda: st.rings(3.0), "`rings(count=...)` must be an integer; got 3.0."),
+        (lambda: st.polygon(0), "`polygon(count=...)` must be at least 1; got 0."),
+        (lambda: st.simplex(0), "`simplex(dim=...)` must be at least 1; got 0."),
+        (lambda: st.cross_polytope(-1), "`cross_polytope(dim=...)` must be at least 1; got -1."),
+        (lambda: st.ball(0, 2), "`ball(count=...)` must be at least 1; got 0."),
+        (lambda: st.ball(3, 0), "`ball(dim=...)` must be at least 1; got 0."),
+        (lambda: st.ball(3, None), "`ball(dim=...)` must be an integer; got None."),
+        (lambda: st.ConstantRadius(-0.1), "`ConstantRadius(radius=...)` must be positive; got -0.1."),
+        (lambda: st.StateFollowingCenters(st.rings(3), 0.0), "(radius=...)` must be positive; got 0.0."),
+        (lambda: st.StateRadius(0.1, -1.0), "`StateRadius(offset=...)` must not be negative; got -1.0."),
+        (lambda: st.StateRadius(0.1, 0.1, 0.0), "`StateRadius(gain=...)` must be positive; got 0.0."),
+        (lambda: st.StateRadius(math.nan, 0.1), "`StateRadius(radius=...)` must be finite; got nan."),
+        (lambda: st.StateFollowingCenters(2 * st.rings(3), 0.1), "must lie in the closed unit ball"),
+        (lambda: st.StateFollowingCenters(torch.zeros(2, 2), 0.1), "must be distinct, but direction 0"),
+        (lambda: st.StateFollowingCenters(torch.zeros(0, 2), 0.1), "must have the shape (M, n); got (0, 2)"),
+        (lambda: st.StateFollowingCenters(torch.zeros(1, 2, 2), 0.1), "must have the shape (M, n)"),
+        (lambda: st.StateFollowingCenters(torch.zeros(2), 0.1), "must have at least 2 dimensions"),
+        (lambda: st.StateFollowingCenters(tensor([[math.nan, 0.0]]), 0.1), "must be finite"),
+        (lambda: st.StateFollowingCenters([[0.0]], 0.1), "(directions=...)` must be a tensor; got [[0.0]]."),
+        (lambda: st.StateFollowingCenters(torch.zeros(1, 2).int(), 0.1), "must be a floating-point tensor"),
+        (
+            lambda: st.StateFollowingCenters(st.rings(3), 0.1)(tensor([1.0])),
+            "must have 2 entries in its last",
+        ),
+    ],
+)
+def test_a_bad_argument_is_named_with_its_value(make, message: str) -> None:  # type: ignore[no-untyped-def]
+    with pytest.raises(ValueError, match=re.escape(message)):
+        make()
+
+
+@pytest.mark.parametrize(("dim", "degree"), [(6, 2), (8, 2), (12, 1), (12, 2), (2, 6), (3, 4)])
+def test_ball_is_unisolvent_and_well_conditioned_up_to_twelve_dimensions(dim: int, degree: int) -> None:
+    count = math.comb(dim + degree, degree)
+    basis = st.StaFBasis(st.GaussianKernel(), st.StateFollowingCenters(st.ball(count, dim), 1e-3))
+    sizes = [int((basis._local_basis.graded.degree == k).sum()) for k in range(degree + 1)]
+    assert sizes == [math.comb(dim + k - 1, k) for k in range(degree + 1)]
+    # Of Fekete points at most the number of points; these stay well below it.
+    assert float(lebesgue_constant(basis, torch.zeros(dim).double(), points=2000)) < 0.4 * count + 1
+
+
+def test_ball_is_no_worse_than_the_rings_in_the_plane() -> None:
+    x = torch.tensor([[0.9, 0.2], [-0.3, 0.8], [0.1, -1.0]]).double()
+    for count in (3, 6, 10, 15, 21, 28):
+        errors = [
+            sup_error(st.StaFBasis(st.ExponentialKernel(), st.StateFollowingCenters(u, 0.1)), x, Paper())
+            for u in (st.ball(count, 2), st.rings(count))
+        ]
+        assert (errors[0] <= 3 * errors[1]).all()

@@ -1,0 +1,15 @@
+"""Settings composed as the command composes them, many at once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from omegaconf import DictConfig
+
+from staf_torch.sweeps.hydra_compat import Composer, config_loader
+
+
+def compose(base: Sequence[str], jobs: Sequence[Sequence[str]]) -> list[DictConfig]:
+    """The settings of ``[*base, *job]`` for every job, without Hydra's node."""
+    composer = Composer(config_loader(), hydra_node=False)
+    return [composer((*base, *job)) for job in jobs]

@@ -1,0 +1,307 @@
+"""Fixed approximations and controllers, and what is written of them."""
+
+from __future__ import annotations
+
+import ctypes
+import importlib.util
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor, nn
+from variants import SMOOTH_KERNELS
+
+from staf_torch import (
+    AnchoredKernel,
+    ExponentialKernel,
+    GaussianKernel,
+    Kernel,
+    MaternKernel,
+    RationalQuadraticKernel,
+    StaF,
+    StaFBasis,
+    StateFollowingCenters,
+    StateRadius,
+    adp,
+    ball,
+    deploy,
+    rings,
+    systems,
+    targets,
+)
+from staf_torch.deploy import formats, sheet
+from staf_torch.deploy.c_header import need_c_compiler, runner_c
+
+PLANT = systems.TwoState()
+COST = adp.QuadraticCost(1.0, 1.0, 2, 1)
+LQR = adp.LQR(PLANT, COST)
+BOX = adp.RandomPoints(1, StateRadius(2.1, 1e-5))
+needs_onnx = pytest.mark.skipif(
+    any(importlib.util.find_spec(name) is None for name in ("onnx", "onnxscript", "onnxruntime")),
+    reason="needs the extra onnx",
+)
+
+needs_cc = pytest.mark.skipif(
+    not any(shutil.which(name) for name in ("cc", "gcc", "g++", "clang")), reason="needs a C compiler"
+)
+
+
+def fitted(kernel: Kernel, radius: float, directions: Tensor | None = None) -> StaF:
+    directions = rings(6) if directions is None else directions
+    x = torch.tensor([1.0, 0.3, -0.4], dtype=torch.float64)[: directions.shape[1]]
+    target = targets.Paper() if len(x) == 2 else targets.Cosine(0.7)
+    return StaF(StaFBasis(kernel, StateFollowingCenters(directions, radius))).fit_(x, target)
+
+
+def around(staf: StaF, reach: float, count: int = 50) -> Tensor:
+    generator = torch.Generator().manual_seed(1)
+    apart = torch.randn(count, staf.basis.dim, dtype=torch.float64, generator=generator)
+    share = torch.rand(count, 1, dtype=torch.float64, generator=generator)
+    radius = staf.basis.centers.radius(staf.state)
+    return staf.state + reach * radius * share * apart / apart.norm(dim=-1, keepdim=True)
+
+
+def relative(found: Tensor, wanted: Tensor) -> float:
+    return float(((found.double() - wanted).abs().max() / wanted.abs().max()).detach())
+
+
+def actor(kernel: Kernel, gradient: str = "total") -> adp.ActorCritic:
+    centers = StateFollowingCenters(rings(3), StateRadius(0.7, 1e-5))
+    basis = adp.StaFValueBasis(StaFBasis(AnchoredKernel(kernel), centers), gradient)
+    return adp.ActorCritic(basis, PLANT, COST, BOX, actor=[0.2, 0.8, -0.2])
+
+
+def rollout(kernel: Kernel, radius: float | StateRadius = 0.1, **settings: float) -> adp.RolloutPolicy:
+    basis = StaFBasis(kernel, StateFollowingCenters(rings(6), radius))
+    return adp.RolloutPolicy(basis, PLANT, COST, LQR, LQR.value, **{"steps": 2, "horizon": 0.1, **settings})
+
+
+CONTROLLERS = {
+    "lqr": adp.Feedback(LQR),
+    "bounded_lqr": adp.Feedback(adp.LQR(PLANT, adp.BoundedInputCost(1.0, 1.0, 2, 1, bound=2.0))),
+    "rollout": adp.Feedback(rollout(ExponentialKernel())),
+    "rollout_gaussian": adp.Feedback(rollout(GaussianKernel(0.9))),
+    "rollout_matern": adp.Feedback(rollout(MaternKernel())),
+    "rollout_twice": adp.Feedback(rollout(ExponentialKernel(), steps=1, depth=2)),
+    "rollout_of_moving_radius": adp.Feedback(rollout(ExponentialKernel(), StateRadius(0.3, 0.1))),
+    "actor": actor(ExponentialKernel()),
+    "actor_partial": actor(ExponentialKernel(), "partial"),
+    "actor_gaussian": actor(GaussianKernel()),
+    "supervised": adp.Supervised(actor(ExponentialKernel()), LQR, COST),
+    "quadratic": adp.ActorCritic(adp.QuadraticBasis(2), PLANT, COST, BOX),
+    "rbf_grid": adp.ActorCritic(adp.RBFGridBasis(2, 3), PLANT, COST, BOX),
+}
+
+
+@pytest.mark.parametrize("name", list(SMOOTH_KERNELS))
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_deployed_approximation_equals_the_module(name: str, dtype: torch.dtype) -> None:
+    staf = fitted(SMOOTH_KERNELS[name].make(), 0.1)
+    y = around(staf, 2.0).to(dtype)
+    value, gradient = deploy.approximator(staf, dtype)(y)
+    tolerance = 1e-12 if dtype == torch.float64 else 1e-6
+    assert value.dtype == gradient.dtype == dtype
+    assert relative(value, staf(y.double())) <= tolerance
+    assert relative(gradient, staf.gradient(y.double())) <= tolerance
+
+
+@pytest.mark.parametrize("radius", [1e-6, 1e-3, 0.1, 0.5])
+@pytest.mark.parametrize(
+    "kernel", [ExponentialKernel(), GaussianKernel(0.8)], ids=["exponential", "gaussian"]
+)
+@pytest.mark.parametrize("directions", [rings(3), rings(15), ball(10, 3)], ids=["3", "15", "in 3d"])
+def test_folded_series_keeps_the_digits_of_float32_at_every_radius(
+    radius: float, kernel: Kernel, directions: Tensor
+) -> None:
+    staf = fitted(kernel, radius, directions)
+    offsets = around(staf, 1.0) - staf.state
+    exact = staf.at_offsets(offsets.float().double())
+    single = deploy.RidgeApproximator(staf, torch.float32)
+    single.state.zero_() if isinstance(kernel, GaussianKernel) else None
+    at = offsets.float() if isinstance(kernel, GaussianKernel) else (staf.state + offsets).float()
+    exact = exact if isinstance(kernel, GaussianKernel) else staf(at.double())
+    if isinstance(kernel, GaussianKernel) or radius >= 1e-3:  # else x + z has no digits of z in float32
+        assert relative(single(at)[0], exact) <= 1e-6
+    double = deploy.RidgeApproximator(staf)
+    y = around(staf, 9.9)
+    assert relative(double(y)[0], staf(y)) <= 1e-12
+
+
+def test_point_beyond_the_reach_gives_nan_and_spares_its_neighbours() -> None:
+    staf = fitted(ExponentialKernel(), 0.1)
+    module = deploy.RidgeApproximator(staf, reach=3.0)
+    y = torch.stack((staf.state + 0.05, staf.state + 0.4))
+    value, gradient = module(y)
+    assert torch.isnan(value).tolist() == [False, True]
+    assert torch.isnan(gradient).all(-1).tolist() == [False, True]
+
+
+@pytest.mark.parametrize("name", list(CONTROLLERS))
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_deployed_controller_equals_the_one_of_the_loop(name: str, dtype: torch.dtype) -> None:
+    controller = CONTROLLERS[name]
+    x = 4 * torch.rand(20, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) - 2
+    x = x.to(dtype).double()
+    wanted, _ = controller.step(x, controller.init(x), x.new_zeros(20, controller.draws, 2), 0.01)
+    found = deploy.policy_of(controller, dtype=dtype)(x.to(dtype))
+    assert found.dtype == dtype
+    # A rollout differentiates differences of size r of its values: float32 loses a factor 1 / r there.
+    loss = 100 if "rollout" in name else 1
+    assert relative(found, wanted) <= (1e-12 if dtype == torch.float64 else loss * 1e-6)
+
+
+CASES: dict[str, nn.Module] = {
+    "exponential": deploy.approximator(fitted(ExponentialKernel(), 0.1)),
+    "rational_quadratic": deploy.approximator(fitted(RationalQuadraticKernel(), 0.3, rings(3))),
+    "lqr": deploy.policy_of(LQR),
+    "actor": deploy.policy_of(actor(ExponentialKernel())),
+}
+
+
+@pytest.mark.parametrize("name", list(CASES))
+def test_traced_program_equals_the_module_at_every_batch(name: str) -> None:
+    x = torch.rand(5, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    program = deploy.trace(CASES[name], x).module()
+    for rows in (1, 2, 5):
+        found, wanted = (formats.as_tuple(f(x[:rows])) for f in (program, CASES[name]))
+        for a, b in zip(found, wanted, strict=True):
+            torch.testing.assert_close(a, b, rtol=1e-12, atol=1e-13)
+
+
+def test_rollout_of_a_fixed_batch_is_traced() -> None:
+    policy = deploy.policy_of(rollout(ExponentialKernel(), steps=1))
+    x = torch.rand(1, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    program = deploy.trace(policy, x, batch=1)
+    torch.testing.assert_close(program.module()(x), policy(x), rtol=1e-12, atol=1e-13)
+    assert sheet.work(program).functions > 0
+
+
+class Thirds(nn.Module):
+    """Numbers that float32 does not hold."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        return 0.1 * x + (x - 1 / 3).square() / 0.7
+
+
+def test_c_header_in_float_is_refused_where_it_would_lose_its_digits(tmp_path: Path) -> None:
+    module = deploy.approximator(fitted(RationalQuadraticKernel(), 0.1), torch.float32)
+    with pytest.raises(ValueError, match="needs float64 inside"):
+        deploy.export_c(module, torch.ones(1, 2), tmp_path / "a.h", ["value", "gradient"])
+    assert not list(tmp_path.iterdir())
+
+
+@needs_onnx
+def test_onnx_keeps_the_digits_of_numbers_in_the_code(tmp_path: Path) -> None:
+    x = torch.rand(4, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    deploy.export_onnx(deploy.trace(Thirds(), x), tmp_path / "a.onnx", ["state"], ["value"])
+    assert sheet.worst_difference(formats.runner_onnx(tmp_path / "a.onnx")(x), (Thirds()(x),))[0] <= 1e-15
+
+
+@needs_cc
+@pytest.mark.parametrize("law", [adp.Information(), adp.Published()], ids=lambda law: type(law).__name__)
+def test_c_header_of_a_controller_that_learns_moves_the_same_weights(
+    law: adp.ActorCriticLaw, tmp_path: Path
+) -> None:
+    plant, cost = systems.TwoState(), adp.QuadraticCost(1.0, 1.0, 2, 1)
+    controller = adp.ActorCritic(adp.QuadraticBasis(2), plant, cost, adp.RandomPoints(1, 1.0), law, gain=1.0)
+    x = torch.tensor([[-1.0, 1.0]], dtype=torch.float64)
+    deploy.export_learning_c(controller, x, tmp_path / "a.h", dt=1e-3)
+    source = '#include "a.h"\nstatic staf_state s;\nvoid begin(void) { staf_start(&s); }\n'
+    source += "void call(const double *x, const double *z, double *u) { staf(&s, x, z, u); }\n"
+    source += "void learned(double *w) { for (int i = 0; i < 3; ++i) w[i] = s.critic[i]; }\n"
+    (tmp_path / "a.c").write_text(source)
+    line = [need_c_compiler(), "-O2", "-Wall", "-Werror", "-shared", "-fPIC", "a.c", "-o", "a.so", "-lm"]
+    subprocess.run(line, cwd=tmp_path, check=True)
+    device = ctypes.CDLL(str(tmp_path / "a.so"))
+    device.begin()
+    carried, generator = controller.init(x), torch.Generator().manual_seed(0)
+    for _ in range(50):
+        z = 2 * torch.rand(1, 1, 2, dtype=torch.float64, generator=generator) - 1
+        u, w = torch.empty(1, 1, dtype=torch.float64), torch.empty(1, 3, dtype=torch.float64)
+        wanted, carried = controller.step(x, carried, z, 1e-3)
+        device.call(*(ctypes.c_void_p(part.data_ptr()) for part in (x, z, u)))
+        torch.testing.assert_close(u, wanted, rtol=1e-12, atol=0)
+        x = x + 1e-3 * plant.rate(x, wanted)
+    device.learned(ctypes.c_void_p(w.data_ptr()))
+    torch.testing.assert_close(w, carried.critic, rtol=1e-12, atol=0)
+    assert not torch.equal(w, controller.init(x).critic)
+
+
+@needs_cc
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize("name", ["exponential", "lqr", "actor", "rollout"])
+def test_c_header_computes_the_same(name: str, dtype: torch.dtype, tmp_path: Path) -> None:
+    staf = fitted(ExponentialKernel(), 0.1)
+    given = {"lqr": LQR, "actor": CONTROLLERS["actor"], "rollout": rollout(ExponentialKernel(), steps=1)}
+    module = deploy.policy_of(given[name], dtype=dtype) if name in given else deploy.approximator(staf, dtype)
+    x = around(staf, 1.0, 5).to(dtype)
+    wanted = formats.as_tuple(module(x))
+    outputs = [f"out{k}" for k in range(len(wanted))]
+    deploy.export_c(module, x, tmp_path / "a.h", outputs)
+    run = runner_c(tmp_path / "a.h", [None if out.dim() == 1 else out.shape[1] for out in wanted], dtype)
+    loss = 100 if name == "rollout" else 1  # its differences, in float
+    tolerance = 1e-12 if dtype == torch.float64 else loss * 1e-6
+    assert max(sheet.worst_difference(run(x), wanted)) <= tolerance
+
+
+@needs_onnx
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_onnx_file_computes_the_same_in_onnxruntime(dtype: torch.dtype, tmp_path: Path) -> None:
+    staf = fitted(ExponentialKernel(), 0.1)
+    module = deploy.approximator(staf, dtype)
+    y = around(staf, 1.0).to(dtype)
+    deploy.export_onnx(deploy.trace(module, y), tmp_path / "a.onnx", ["state"], ["value", "gradient"])
+    run = formats.runner_onnx(tmp_path / "a.onnx")
+    for rows in (1, 7):
+        exact = (staf(y[:rows].double()), staf.gradient(y[:rows].double()))
+        assert max(sheet.worst_difference(run(y[:rows]), exact)) <= (
+            1e-12 if dtype == torch.float64 else 1e-6
+        )
+
+
+def test_program_file_comes_back_with_its_note_and_another_format_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    x = torch.ones(3, 2, dtype=torch.float64)
+    path = tmp_path / "lqr.pt2"
+    program = deploy.trace(CASES["lqr"], x)
+    deploy.export_program(program, path, {"what": "lqr"})
+    loaded, note = deploy.load_program(path)
+    assert note == {"format": formats.FORMAT, "what": "lqr"}
+    torch.testing.assert_close(loaded.module()(x), LQR(x))
+    monkeypatch.setattr(formats, "FORMAT", formats.FORMAT + 1)
+    with pytest.raises(ValueError, match=r"has format 1 .* reads format 2: export the run anew"):
+        deploy.load_program(path)
+    torch.export.save(program, path)
+    with pytest.raises(ValueError, match="must have been written by staf-export"):
+        deploy.load_program(path)
+    path.write_bytes(b"no archive")
+    with pytest.raises(ValueError, match=r"must be a \.pt2 file of staf-export"):
+        deploy.load_program(path)
+
+
+def test_work_of_a_linear_controller_is_counted() -> None:
+    counted = sheet.work(deploy.trace(CASES["lqr"], torch.ones(1, 2, dtype=torch.float64)))
+    assert counted == sheet.Work(parameters=2, flops=4, functions=0, bytes_constants=16, bytes_in_out=24)
+
+
+def test_what_cannot_be_deployed_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(ValueError, match=r"`policy_of\(controller=...\)` must be"):
+        deploy.policy_of(lambda x: x)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"`ActorPolicy\(weights=...\)` must be 3 finite numbers"):
+        deploy.policy_of(actor(ExponentialKernel()), torch.full((3,), torch.nan))
+    two = StaF(fitted(ExponentialKernel(), 0.1).basis, (2,))
+    with pytest.raises(ValueError, match=r"must have one state; got the batch"):
+        deploy.approximator(two)
+    with pytest.raises(ValueError, match=r"reach=...\)` must be smaller"):
+        deploy.RidgeApproximator(fitted(ExponentialKernel(), 0.9), reach=1000.0)
+    with pytest.raises(ValueError, match=r"FoldedRollout\(policy=...\)` must have a constant radius"):
+        deploy.FoldedRollout(rollout(ExponentialKernel(), StateRadius(0.3, 0.1)))
+    monkeypatch.setenv("CXX", "no-such-compiler")
+    with pytest.raises(ValueError, match="there is no compiler here: install g"):
+        formats.need_compiler()
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(ValueError, match=r"pip install 'staf_torch\[onnx\]'"):
+        formats.need_onnx()

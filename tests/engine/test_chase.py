@@ -1,0 +1,274 @@
+"""The gradient chase: its inequality, its rows, its pieces."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+
+import pytest
+import torch
+from helpers import basis_of, tensor, uniform
+from variants import KERNELS, LAWS, PAPER_LAW, over
+
+import staf_torch as st
+from staf_torch import systems
+from staf_torch.engine import ChaseResult, chase_pieces
+from staf_torch.engine import api as engine
+from staf_torch.numerics.linalg import condition_number
+from staf_torch.optim import SteepestDescent
+from staf_torch.targets import Cosine, Paper
+
+
+def orbit(*starts: tuple[float, float], dt: float = 0.05, steps: int = 40) -> torch.Tensor:
+    return systems.simulate(systems.Oscillator(), tensor(starts), dt=dt, steps=steps)
+
+
+def fields(result: ChaseResult) -> dict[str, torch.Tensor]:
+    """The tensors of a chase without a certificate."""
+    assert result.certificate is None
+    names = [field.name for field in dataclasses.fields(result) if field.name != "certificate"]
+    return {name: getattr(result, name) for name in names}
+
+
+def run(states: torch.Tensor, kernel: str = "exponential", **settings: object) -> ChaseResult:
+    basis = basis_of(kernel, count=3, radius=0.3)
+    return st.chase(states, basis, Paper(), SteepestDescent(), **settings)  # type: ignore[arg-type]
+
+
+STARTS = ((1.0, 0.0), (0.3, 0.9), (-1.2, 0.4), (0.5, -0.5))
+
+
+@over(KERNELS)
+@over([PAPER_LAW], "law")
+def test_result_is_what_its_fields_say(name: str, law: str) -> None:
+    basis, states = basis_of(name, count=3, radius=0.3), orbit(*STARTS)
+    result = st.chase(states, basis, Paper(), LAWS[law], inner_steps=4)
+    at = states.unsqueeze(-2)
+
+    def estimate(weights: torch.Tensor) -> torch.Tensor:
+        return (basis(at, states).squeeze(-2) * weights).sum(-1)
+
+    assert torch.equal(result.state, states)
+    torch.testing.assert_close(result.value, Paper()(states))
+    torch.testing.assert_close(
+        result.ideal_weights, basis.ideal_weights(states, Paper()), rtol=1e-9, atol=1e-9
+    )
+    torch.testing.assert_close(result.estimate, estimate(result.weights), rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(result.ideal_estimate, estimate(result.ideal_weights), rtol=1e-9, atol=1e-9)
+    excess = basis.excess(result.weights, states, Paper())
+    torch.testing.assert_close(result.excess, excess, rtol=1e-6, atol=1e-9)
+    assert result.diverged_at.tolist() == [-1] * 4
+    assert not result.diverged.any()
+    brought = torch.cat((torch.zeros(4, 1, 3).double(), result.weights[:, :-1]), dim=1)
+    torch.testing.assert_close(result.estimate_before, estimate(brought), rtol=1e-9, atol=1e-9)
+    before = basis.excess(brought, states, Paper())
+    torch.testing.assert_close(result.excess_before, before, rtol=1e-6, atol=1e-9)
+
+
+@over(KERNELS)
+@over([PAPER_LAW], "law")
+@pytest.mark.parametrize("inner_steps", [1, 10])
+def test_excess_contracts_at_every_time_of_the_run(name: str, law: str, inner_steps: int) -> None:
+    basis, states, rule = basis_of(name, count=3, radius=0.3), orbit(*STARTS, steps=126), LAWS[law]
+    result = st.chase(states, basis, Paper(), rule, inner_steps=inner_steps)
+    rate = rule.contraction(condition_number(basis.gram(states)))
+    if rate is None:
+        pytest.skip("the law promises no rate")
+    native = (result.ideal_weights * basis.values(states, Paper())).sum(-1)
+    bound = rate**inner_steps * result.excess_before * (1 + 1e-9) + 1e-12 * native
+    assert (result.excess <= bound).all()
+    assert (result.excess >= 0).all()
+
+
+@over(KERNELS)
+@pytest.mark.parametrize("radius", [0.3, st.StateRadius(0.5, 0.1)])
+def test_rows_are_as_they_would_be_alone(name: str, radius: object) -> None:
+    basis, states = basis_of(name, count=6, radius=radius), orbit(*STARTS)
+    together = fields(st.chase(states, basis, Paper(), SteepestDescent()))
+    for row in range(4):
+        alone = fields(st.chase(states[row : row + 1], basis, Paper(), SteepestDescent()))
+        for key in ("weights", "coefficients", "estimate", "estimate_before", "value", "state"):
+            torch.testing.assert_close(together[key][row], alone[key][0], rtol=1e-12, atol=1e-12)
+        for key in ("ideal_estimate", "excess", "excess_before"):
+            torch.testing.assert_close(together[key][row], alone[key][0], rtol=1e-9, atol=1e-11)
+
+
+@pytest.mark.parametrize("poison", [torch.nan, torch.inf])
+@over(KERNELS)
+def test_a_row_that_is_not_finite_freezes_alone_and_is_reported(name: str, poison: float) -> None:
+    basis, states = basis_of(name, count=3), orbit(*STARTS)
+    clean = fields(st.chase(states, basis, Paper(), SteepestDescent()))
+    states = states.clone()
+    states[1, 17:] = poison
+    states[3, 5, 0] = poison  # finite again afterwards: it stays frozen all the same
+    found = fields(st.chase(states, basis, Paper(), SteepestDescent()))
+    assert found["diverged_at"].tolist() == [-1, 17, -1, 5]
+    for key, value in found.items():
+        assert torch.equal(value[[0, 2]], clean[key][[0, 2]]), key
+    for row, first in ((1, 17), (3, 5)):
+        assert torch.equal(found["weights"][row, :first], clean["weights"][row, :first])
+        for key in ("estimate", "value", "excess", "ideal_weights", "coefficients"):
+            assert torch.isfinite(found[key][row, :first]).all(), key
+            assert torch.isnan(found[key][row, first:]).all(), key
+
+
+@pytest.mark.parametrize("kernel", ["gaussian", "exponential"])
+def test_weights_of_a_frozen_row_stay_what_they_last_were(kernel: str) -> None:
+    states = orbit(*STARTS)
+    states[1, 17:] = torch.nan
+    weights = run(states, kernel).weights[1]
+    assert torch.equal(weights[17:], weights[16].expand(24, 3))
+
+
+def test_a_row_that_is_never_finite_keeps_its_first_weights() -> None:
+    states = orbit(*STARTS)
+    states[2] = torch.nan
+    first = uniform(3)
+    result = run(states, "gaussian", weights=first)
+    assert result.diverged_at.tolist() == [-1, -1, 0, -1]
+    assert torch.equal(result.weights[2], first.expand(41, 3))
+
+
+def test_a_target_that_is_not_finite_somewhere_freezes_only_the_row_that_goes_there() -> None:
+    states = orbit((1.0, 0.0), (0.4, 0.0), steps=126)
+
+    def hole(x: torch.Tensor) -> torch.Tensor:
+        return (x[..., 0] + 0.9).sqrt()  # NaN for x1 < -0.9
+
+    result = st.chase(states, basis_of("gaussian", 3, 0.1), hole, SteepestDescent())
+    assert result.diverged.tolist() == [True, False]
+    assert torch.isfinite(result.estimate[1]).all()
+
+
+@pytest.mark.parametrize("size", [1, 3000, 100_000])
+@pytest.mark.parametrize("kernel", ["exponential", "user_defined"])
+def test_length_of_the_pieces_does_not_change_the_result(
+    size: int, kernel: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    states = orbit(*STARTS)
+    states[2, 11:] = torch.inf
+    whole = fields(run(states, kernel))
+    monkeypatch.setattr(engine, "_WORKING_BYTES", size)
+    assert engine.chunk_length(4, basis_of(kernel, 3), 8) < 41 or size > 3000
+    for key, value in fields(run(states, kernel)).items():
+        torch.testing.assert_close(value, whole[key], rtol=1e-12, atol=1e-12, equal_nan=True)
+
+
+def test_pieces_of_a_user_are_those_of_the_whole() -> None:
+    states, basis = orbit(*STARTS), basis_of("matern52", 3)
+    parts = chase_pieces(states.split([5, 1, 35], dim=1), basis, Paper(), SteepestDescent())
+    weights = torch.cat([part.weights for part in parts], dim=1)
+    whole = st.chase(states, basis, Paper(), SteepestDescent()).weights
+    torch.testing.assert_close(weights, whole, rtol=1e-12, atol=1e-12)
+
+
+def test_working_memory_bounds_the_length_of_a_piece() -> None:
+    basis = basis_of("exponential", 3)
+    assert engine.chunk_length(10**9, basis, 8) == 1
+    lengths = [engine.chunk_length(batch, basis, 8) for batch in (1, 10, 100)]
+    assert lengths == sorted(lengths, reverse=True)
+    assert lengths[0] * 4 * 9 * 8 <= engine._WORKING_BYTES
+
+
+@over(KERNELS)
+def test_a_chase_can_be_differentiated(name: str) -> None:
+    basis, law = basis_of(name, count=3), SteepestDescent()
+
+    def final(states: torch.Tensor, weights: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        result = st.chase(states, basis, Paper(), law, inner_steps=2, weights=weights)
+        return result.weights, result.estimate, result.excess
+
+    states = orbit(*STARTS[1:3], dt=0.3, steps=2).requires_grad_()
+    assert torch.autograd.gradcheck(final, (states, uniform(2, 3).requires_grad_()))
+
+
+@pytest.mark.parametrize("kernel", ["exponential", "gaussian", "user_defined"])
+def test_first_weights_are_those_given(kernel: str) -> None:
+    states = orbit(*STARTS)
+    one, each = uniform(3), uniform(4, 3)
+    for given in (one, each):
+        start = run(states, kernel, inner_steps=0, weights=given).weights
+        torch.testing.assert_close(start[:, 0], given.expand(4, 3), rtol=1e-13, atol=0)
+        torch.testing.assert_close(start[:, -1], given.expand(4, 3), rtol=1e-13, atol=0)
+    assert torch.equal(run(states, kernel, inner_steps=0).weights, torch.zeros(4, 41, 3).double())
+
+
+def test_a_run_goes_on_from_the_weights_where_another_stopped() -> None:
+    states = orbit(*STARTS)
+    whole, first = run(states), run(states[:, :20])
+    second = run(states[:, 20:], weights=first.weights[:, -1])
+    torch.testing.assert_close(second.weights, whole.weights[:, 20:], rtol=1e-10, atol=1e-10)
+
+
+def test_ideal_weights_at_a_standing_state_stay() -> None:
+    states = tensor([[0.7, 0.4]]).expand(1, 5, 2)
+    ideal = basis_of("exponential", 3).ideal_weights(states[:, 0], Paper())
+    result = run(states, weights=ideal)
+    torch.testing.assert_close(result.weights, ideal.unsqueeze(1).expand(1, 5, 3), rtol=1e-10, atol=0)
+    assert (result.excess < 1e-20).all()
+
+
+def test_single_precision_stays_single_and_close() -> None:
+    states = orbit(*STARTS)
+    single = st.chase(states.float(), basis_of("exponential", 3), Paper(), SteepestDescent())
+    for key, value in fields(single).items():
+        assert value.dtype == (torch.int64 if key == "diverged_at" else torch.float32), key
+    torch.testing.assert_close(single.estimate.double(), run(states).estimate, rtol=1e-3, atol=1e-3)
+
+
+def test_far_from_the_origin_nothing_overflows() -> None:
+    """exp(|x|^2) is infinite at |x| = 60, and so would the Gram matrix be."""
+    states = orbit((60.0, 0.0), dt=1e-4, steps=50)
+    basis = st.StaFBasis(st.ExponentialKernel(), st.StateFollowingCenters(st.rings(3), 0.01))
+    result = st.chase(states, basis, Cosine(0.5), SteepestDescent(), inner_steps=50)
+    assert not result.diverged.any()
+    assert torch.isfinite(result.estimate).all()
+    torch.testing.assert_close(result.ideal_estimate, result.value, rtol=0, atol=0.2)
+    assert ((result.estimate - result.ideal_estimate).abs()[:, -1] < 0.2).all()
+
+
+class _Law(SteepestDescent):
+    pass
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"states": uniform(5, 2)}, "`chase(states=...)` must have at least 3 dimensions"),
+        ({"states": uniform(1, 5, 3)}, "`chase(states=...)` must have 2 entries in its last dimension"),
+        (
+            {"states": uniform(1, 1, 5, 2)},
+            "`chase(states=...)` must have the shape (B, T, n); got (1, 1, 5, 2).",
+        ),
+        ({"states": uniform(1, 0, 2)}, "`chase(states=...)` must have the shape (B, T, n); got (1, 0, 2)."),
+        ({"states": [[[0.0, 0.0]]]}, "`chase(states=...)` must be a tensor"),
+        ({"inner_steps": -1}, "`chase(inner_steps=...)` must be at least 0; got -1."),
+        ({"inner_steps": 1.0}, "`chase(inner_steps=...)` must be an integer; got 1.0."),
+        ({"law": _Law}, "`chase(law=...)` must be an UpdateLaw"),
+        ({"weights": uniform(4)}, "`chase(weights=...)` must have 3 entries in its last dimension"),
+        ({"weights": uniform(3, 3)}, "`chase(weights=...)` must have the shape (3,) or (2, 3); got (3, 3)."),
+        (
+            {"target": lambda x: x},
+            "The target `<lambda>` must map points of shape (..., n) to values of shape",
+        ),
+        ({"predictor": "nonsense"}, "chase(predictor=...)"),
+    ],
+)
+def test_a_bad_argument_is_named_with_its_value(settings: dict[str, object], message: str) -> None:
+    standard = {"states": orbit(*STARTS[:2]), "basis": basis_of("exponential", 3), "target": Paper()}
+    with pytest.raises(ValueError, match=re.escape(message)):
+        st.chase(**{**standard, "law": SteepestDescent(), **settings})
+
+
+def test_weights_that_underflow_are_not_a_number_while_the_estimate_is_one() -> None:
+    states = 30 * orbit(*STARTS[:2], steps=20)
+    basis = st.StaFBasis(st.ExponentialKernel(), st.StateFollowingCenters(st.rings(3), 0.01))
+    result = st.chase(states, basis, Paper(), st.optim.Exact())
+    far = states.norm(dim=-1) > 28
+    assert far.any()
+    assert torch.isnan(result.weights[far]).all()
+    assert torch.isnan(result.ideal_weights[far]).all()
+    # Three centers at |x| r = .3 are 2 % off; the numbers themselves are good to rounding.
+    torch.testing.assert_close(result.ideal_estimate, result.value, rtol=5e-2, atol=0)
+    assert torch.isfinite(result.coefficients).all()
+    assert not result.diverged.any()

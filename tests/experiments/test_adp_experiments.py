@@ -1,0 +1,132 @@
+"""The ADP experiments end to end, short."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hydra import compose, initialize_config_dir
+
+from staf_torch.cli.staf import config_directory
+from staf_torch.experiments import adp as adp_experiment
+from staf_torch.experiments import adp_comparison, adp_tracking
+
+SHORT = ["duration=0.1", "dt=0.005"]
+
+
+def settings(*overrides: str):  # type: ignore[no-untyped-def]
+    with initialize_config_dir(config_directory(), version_base="1.3"):
+        return compose("config", list(overrides))
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ["experiment=adp"],
+        ["experiment=adp", "adp/law=published", "dt=0.001"],
+        ["experiment=adp", "adp.gradient=partial", "adp.extrapolated_centers=fixed"],
+        ["experiment=adp", "adp/extrapolation=quadrature", "adp.order=3", "adp.trust=0.5"],
+        ["experiment=adp", "adp/policy=rollout", "adp.rollout.depth=1"],
+        ["experiment=adp", "adp/policy=lqr", "system=pendulum"],
+        ["experiment=adp", "adp/policy=none", "trajectories=3"],
+        ["experiment=adp", "system=two_state_as_printed", "adp.optimum.shooting=false"],
+        ["experiment=adp", "adp/basis=rbf_grid", "adp.rbf_grid.points=3"],
+        ["experiment=adp_three_state"],
+    ],
+    ids=lambda o: " ".join(o),
+)
+def test_experiment_writes_its_run_directory(overrides: list[str], tmp_path: Path) -> None:
+    drawn = len(overrides) == 1 or "adp/policy=lqr" in overrides  # with weights, without; figures are slow
+    cfg = settings(*SHORT, f"figures={drawn}", *overrides)
+    metrics = adp_experiment.ClosedLoop()(cfg, tmp_path)
+    assert json.loads((tmp_path / "metrics.json").read_text()) == metrics
+    assert metrics["diverged_fraction"] == 0
+    if "adp.optimum.shooting=false" in overrides:
+        assert metrics["optimal_cost"] is None
+    else:  # by formula or by shooting, there is an optimum for every plant
+        assert metrics["optimal_cost"] > 0
+        assert metrics["cost_ratio"] > 0
+        assert metrics["control_error"] >= 0
+        assert metrics["value_error"] >= 0
+    names = {"cost", "optimal_cost", "cost_ratio", "final_state_norm", "control_error", "value_error"}
+    assert names | {"regulated_fraction", "diverged_fraction"} <= metrics.keys()
+    with np.load(tmp_path / "history.npz") as history:
+        batch, times = history["state"].shape[:2]
+        assert history["time"].shape == (times,)
+        for name in ("control", "actor_weights", "critic_weights", "running_cost"):
+            assert history[name].shape[:2] == (batch, times)
+    for ending in (".png", ".pdf") if drawn else ():
+        assert (tmp_path / "figures" / cfg.task).with_suffix(ending).stat().st_size > 5000
+
+
+def test_comparison_writes_a_row_a_method(tmp_path: Path) -> None:
+    cfg = settings("experiment=adp_comparison", "duration=0.1", "trajectories=4", "adp.order=2")
+    adp_comparison.run(cfg, tmp_path)
+    lines = (tmp_path / "comparison.csv").read_text().splitlines()
+    assert len(lines) == 13
+    assert lines[0].startswith("method,functions,points,ratio_median")
+    assert len((tmp_path / "comparison.md").read_text().splitlines()) == 14
+    assert (tmp_path / "figures" / "adp_comparison.png").stat().st_size > 5000
+
+
+def test_comparison_takes_a_plant_whose_optimum_no_formula_knows(tmp_path: Path) -> None:
+    overrides = ["system=van_der_pol", "duration=0.05", "trajectories=2", "adp.order=2", "figures=false"]
+    metrics = adp_comparison.run(settings("experiment=adp_comparison", *overrides), tmp_path)
+    assert metrics["lqr_diverged"] == 0
+    cfg = settings("experiment=adp_comparison", *overrides, "adp.optimum.shooting=false")
+    with pytest.raises(ValueError, match=r"needs a plant whose optimum is known.*got VanDerPol"):
+        adp_comparison.run(cfg, tmp_path)
+
+
+def test_initial_weights_leave_a_row_a_law(tmp_path: Path) -> None:
+    overrides = ["duration=2", "dt=0.02", "trajectories=5", "initial_weights=[0.1,1.0]"]
+    metrics = adp_comparison.initial_weights(settings("experiment=adp_initial_weights", *overrides), tmp_path)
+    assert metrics["supervised_diverged_fraction"] == 0
+    assert metrics["published_diverged_fraction"] > 0
+    assert json.loads((tmp_path / "metrics.json").read_text()) == metrics
+    lines = (tmp_path / "adp_initial_weights.csv").read_text().splitlines()
+    assert lines[0] == "law,W0 = 0.1,W0 = 1,all"
+    assert len(lines) == 4
+    for bad, message in (
+        ("[]", r"`staf initial_weights=...` must have at least one entry"),
+        ("1", r"`staf initial_weights=...` must be a list of numbers"),
+    ):
+        cfg = settings("experiment=adp_initial_weights", f"initial_weights={bad}")
+        with pytest.raises(ValueError, match=message):
+            adp_comparison.initial_weights(cfg, tmp_path)
+
+
+def test_tracking_writes_its_run_directory(tmp_path: Path) -> None:
+    metrics = adp_tracking.run(settings("experiment=adp_tracking", "duration=0.1", "dt=0.01"), tmp_path)
+    assert metrics["optimal_cost"] == pytest.approx(1.4223, abs=1e-3)
+    assert metrics["identified_parameter_error"] < metrics["unidentified_parameter_error"]
+    with np.load(tmp_path / "history.npz") as history:
+        assert history["parameters"].shape == (1, 11, 3, 2)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["adp.policy=ppo"], r"`adp\(policy=...\)` must be one of"),
+        (["adp.extrapolated_around=0"], r"`RandomPoints\(around=...\)` must be one of 'state', 'origin'"),
+        (["adp.extrapolated_around=origin"], r"`RandomPoints\(half_width=...\)` must be constant"),
+        (["adp.rbf_grid.flat=1", "adp/basis=rbf_grid"], r"`RBFGridBasis\(flat=...\)` must be true or false"),
+        (["adp.optimum.shooting=1"], r"`adp\(optimum.shooting=...\)` must be true or false"),
+        (["adp.optimum.states=-1"], r"`adp\(optimum.states=...\)` must be at least 0"),
+        (["adp.law=newton"], r"`adp\(law=...\)` must be one of"),
+        (["adp.basis=fourier"], r"`adp\(basis=...\)` must be one of"),
+        (["adp.extrapolation=grid"], r"`adp\(extrapolation=...\)` must be one of"),
+        (["adp.cost.state=[[1,0],[0,-1]]"], r"`QuadraticCost\(state=...\)` must be positive definite"),
+        (["adp.cost.control=0"], r"`QuadraticCost\(control=...\)` must be positive"),
+        (["system=oscillator"], r"`adp\(system=...\)` must be a plant with inputs; got 'Oscillator'"),
+        (["adp/cost=bounded_input"], r"`ActorCritic\(cost=...\)` must be a QuadraticCost"),
+        (["initial_state=[1,2,3]"], r"`staf initial_state=...` must have 2 entries"),
+        (["duration=1e-9"], r"`staf duration=...` must be at least one step"),
+    ],
+)
+def test_bad_setting_is_refused_by_name(overrides: list[str], message: str, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=message):
+        adp_experiment.ClosedLoop()(settings("experiment=adp", *overrides), tmp_path)
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,99 @@
+"""`staf experiment=laws`, its table and the options of the laws on the command line."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+from pathlib import Path
+
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from hydra.errors import HydraException
+from omegaconf import DictConfig
+from variants import LAWS
+
+from staf_torch import optim, predictors
+from staf_torch.cli.staf import config_directory
+from staf_torch.experiments import gradient_chase, laws
+from staf_torch.experiments.laws import cases
+from staf_torch.settings.chase import chase_problem
+
+
+def settings(*overrides: str) -> DictConfig:
+    with initialize_config_dir(version_base="1.3", config_dir=config_directory()):
+        return compose("config", list(overrides))
+
+
+def options(group: str) -> list[str]:
+    return sorted(path.stem for path in Path(config_directory(), group).glob("*.yaml"))
+
+
+def test_the_comparison_fills_its_run_directory(tmp_path: Path) -> None:
+    short = ("dt=0.05", "duration=1.0", "settle_time=0.5", "laws.steps=[0.1,0.05]", "laws.work=4")
+    metrics = laws.run(settings("experiment=laws", *short), tmp_path)
+    found = {os.path.relpath(path, tmp_path) for path in tmp_path.rglob("*") if path.is_file()}
+    assert found == {
+        *("laws.md", "laws.csv", "laws.json", "metrics.json", "figures/laws.png", "figures/laws.pdf")
+    }
+    rows = json.loads((tmp_path / "laws.json").read_text())
+    assert len(rows) == len(cases(4, 3)) == len({row["key"] for row in rows})
+    assert {row["predictor"] for row in rows} == {"none", "secant", "tangent order 1", "tangent order 2"}
+    read = list(csv.DictReader(io.StringIO((tmp_path / "laws.csv").read_text())))
+    assert [float(row["ultimate_excess"]) for row in read] == [row["ultimate_excess"] for row in rows]
+    assert json.loads((tmp_path / "metrics.json").read_text()) == metrics
+    assert metrics["exact_x1.slope"] == pytest.approx(2, abs=0.3)
+    assert metrics["a_priori.paper_step"] is not None
+    violated = [value for name, value in metrics.items() if name.endswith("certificate_violations")]
+    assert set(violated) == {0.0}
+
+
+def test_the_comparison_has_every_law() -> None:
+    assert {type(law) for law in LAWS.values()} == {type(case.law) for case in cases(11, 3)}
+    dear = [case.name for case in cases(11, 3) if case.products > 11]
+    assert dear == ["recursive least squares"]
+    assert len({case.key for case in cases(11, 2)}) == len(cases(11, 2))
+
+
+def test_steps_longer_than_the_run_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"laws\(steps=\.\.\.\)"):
+        laws.run(settings("experiment=laws", "duration=1.0", "laws.steps=[2.0,1.0]"), tmp_path)
+
+
+@pytest.mark.parametrize("name", options("optimizer"))
+def test_every_law_is_an_option_with_its_iterations(name: str) -> None:
+    problem = chase_problem(settings(f"optimizer={name}", "optimizer.inner_steps=3"))
+    assert isinstance(problem.law, optim.UpdateLaw)
+    assert problem.inner_steps == 3
+
+
+def test_there_is_an_option_for_every_law() -> None:
+    made = {type(chase_problem(settings(f"optimizer={name}")).law) for name in options("optimizer")}
+    assert made == {type(law) for law in LAWS.values()}
+
+
+def test_every_predictor_is_an_option() -> None:
+    made = {name: chase_problem(settings(f"predictor={name}")).predictor for name in options("predictor")}
+    assert made.pop("none") is None
+    assert {name: type(value) for name, value in made.items()} == {
+        "secant": predictors.Secant,
+        "tangent": predictors.Tangent,
+    }
+    with pytest.raises(HydraException):
+        settings("predictor=oracle")
+
+
+def test_a_certified_chase_counts_its_violations() -> None:
+    short = ("dt=0.05", "duration=2.0", "settle_time=1.0", "predictor=tangent", "optimizer.inner_steps=1")
+    metrics = gradient_chase.solve(chase_problem(settings("certificate=true", *short))).metrics
+    assert metrics["certificate_violations"] == 0
+    assert "certificate_violations" not in gradient_chase.solve(chase_problem(settings(*short))).metrics
+
+
+def test_single_precision_runs_every_law(tmp_path: Path) -> None:
+    short = ("dtype=float32", "dt=0.05", "duration=1.0", "settle_time=0.5", "laws.work=2", "figures=false")
+    metrics = laws.run(settings("experiment=laws", "laws.steps=[0.1,0.05]", *short), tmp_path)
+    assert all(value == 0 for name, value in metrics.items() if name.endswith("diverged_fraction"))
+    assert torch.get_default_dtype() == torch.float32

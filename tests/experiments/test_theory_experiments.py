@@ -1,0 +1,89 @@
+"""The experiments on the theorems, run small through their own settings."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import hydra
+import pytest
+from omegaconf import DictConfig
+
+from staf_torch.cli.staf import config_directory
+from staf_torch.experiments import exponential_bound, feasibility, layouts
+from staf_torch.experiments.registry import EXPERIMENTS
+
+MODULES = {"exponential_bound": exponential_bound, "feasibility": feasibility, "layouts": layouts}
+SMALL = {
+    "exponential_bound": ["exponential_bound.states=9", "exponential_bound.radii=[0.1]"],
+    "feasibility": ["feasibility.states=16", "feasibility.radii=[0.1]", "feasibility.epsilons=[0.1,0.01]"],
+    "layouts": ["layouts.states=4", "layouts.radii=[0.1,0.2]"],
+}
+
+
+def settings(name: str, *overrides: str) -> DictConfig:
+    with hydra.initialize_config_dir(config_directory(), version_base="1.3"):
+        return hydra.compose("config", [f"experiment={name}", *SMALL[name], *overrides])
+
+
+def run(name: str, directory: Path, *overrides: str) -> dict[str, float | None]:
+    metrics: dict[str, float | None] = MODULES[name].run(settings(name, *overrides), directory)
+    assert json.loads((directory / "metrics.json").read_text()) == metrics
+    return metrics
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_experiment_leaves_its_metrics_tables_and_figure(name: str, tmp_path: Path) -> None:
+    assert name in EXPERIMENTS
+    metrics = run(name, tmp_path)
+    assert metrics
+    rows = list(csv.DictReader((tmp_path / f"{name}.csv").read_text().splitlines()))
+    assert len((tmp_path / f"{name}.md").read_text().splitlines()) >= 3
+    assert len(rows) >= 2
+    for suffix in ("png", "pdf"):
+        assert (tmp_path / "figures" / f"{name}.{suffix}").stat().st_size > 5000
+
+
+def test_experiments_report_the_reference_numbers(tmp_path: Path) -> None:
+    bound = run("exponential_bound", tmp_path, "figures=false")
+    names = ("N", "S", "count", "one_polynomial_count", "measured_count")
+    assert [bound[f"r0.1.eps0.001.{name}"] for name in names] == [3, 2, 21, 10, 10]
+    counts = run("feasibility", tmp_path, "figures=false")
+    assert counts == {"r0.1.eps0.1.count": 3, "r0.1.eps0.01.count": 6}
+    found = run("layouts", tmp_path, "figures=false")
+    for count, order in ((3, 2), (6, 3), (10, 4)):
+        assert found[f"rings{count}.slope"] == pytest.approx(order, abs=0.15)
+    assert found["polygon15.slope"] == pytest.approx(2, abs=0.1)
+    assert not (tmp_path / "figures").exists()
+
+
+PLANE = "kernel=gaussian dtype=float32 centers.radius=0.2"
+SPACE = (
+    "target=quadratic system=linear system.matrix=[[-1,0,0],[0,-1,0],[0,0,-2]] "
+    "initial_state=[1,0.5,0.2] centers=ball"
+)
+
+
+@pytest.mark.parametrize("overrides", [PLANE.split(), SPACE.split()], ids=["plane", "space"])
+@pytest.mark.parametrize("name", ["feasibility", "layouts"])
+def test_common_settings_hold(name: str, overrides: list[str], tmp_path: Path) -> None:
+    assert any(value is not None for value in run(name, tmp_path, *overrides).values())
+
+
+@pytest.mark.parametrize(
+    ("name", "override", "message"),
+    [
+        ("exponential_bound", "kernel=gaussian", "must be exponential"),
+        ("exponential_bound", "exponential_bound.radii=[]", "list of numbers"),
+        ("exponential_bound", "exponential_bound.epsilons=[0]", "must be positive"),
+        ("feasibility", "feasibility.states=0", r"feasibility\.states.*at least 1"),
+        ("feasibility", "feasibility.radii=0.1", "list of numbers"),
+        ("layouts", "layouts.radii=[a]", "must be a number"),
+        ("layouts", "centers.shrink.offset=0.1", "constant radius"),
+    ],
+)
+def test_bad_settings_are_named(name: str, override: str, message: str, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=message):
+        run(name, tmp_path, override)
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,271 @@
+"""Kernels: each against its own formula, and the properties that hold for all of them."""
+
+from __future__ import annotations
+
+import math
+import re
+
+import pytest
+import torch
+from helpers import tensor, uniform
+from torch.autograd import gradcheck, gradgradcheck
+from variants import KERNELS, SMOOTH_KERNELS, over
+
+import staf_torch as st
+
+SHAPES = ((), (4,), (2, 3))
+
+
+@over(KERNELS)
+@pytest.mark.parametrize("dim", [1, 2, 5])
+def test_kernel_equals_its_formula(name: str, dim: int) -> None:
+    case = KERNELS[name]
+    y, c = uniform(6, dim), uniform(5, dim)
+    expected = tensor([[case.formula(a.tolist(), b.tolist()) for b in c] for a in y])
+    torch.testing.assert_close(case.make()(y, c), expected, rtol=1e-13, atol=1e-14)
+
+
+@over(KERNELS)
+def test_kernel_is_symmetric(name: str) -> None:
+    kernel = KERNELS[name].make()
+    y, c = uniform(4, 6, 3), uniform(4, 5, 3)
+    torch.testing.assert_close(kernel(y, c), kernel(c, y).mT, rtol=1e-14, atol=0)
+
+
+@over(KERNELS)
+@pytest.mark.parametrize("dim", [2, 4])
+def test_gram_matrix_of_distinct_points_is_positive_definite(name: str, dim: int) -> None:
+    points = uniform(20, 6, dim, low=-1.5, high=1.5)
+    gram = KERNELS[name].make()(points, points)
+    eigenvalues = torch.linalg.eigvalsh(gram)
+    assert (eigenvalues[:, 0] > 1e-12 * eigenvalues[:, -1]).all()
+
+
+@over(KERNELS)
+@pytest.mark.parametrize("batch", SHAPES)
+def test_batch_equals_loop(name: str, batch: tuple[int, ...]) -> None:
+    kernel = KERNELS[name].make()
+    y, c = uniform(*batch, 4, 2), uniform(*batch, 3, 2)
+    together = kernel(y, c)
+    assert together.shape == (*batch, 4, 3)
+    flat = [kernel(a, b) for a, b in zip(y.reshape(-1, 4, 2), c.reshape(-1, 3, 2), strict=True)]
+    torch.testing.assert_close(together.reshape(-1, 4, 3), torch.stack(flat), rtol=1e-14, atol=1e-15)
+
+
+@over(KERNELS)
+def test_points_and_centers_broadcast(name: str) -> None:
+    kernel = KERNELS[name].make()
+    y, c = uniform(5, 1, 4, 2), uniform(3, 2)
+    assert kernel(y, c).shape == (5, 1, 4, 3)
+
+
+@over(KERNELS)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_dtype_of_the_points_is_the_dtype_of_the_values(name: str, dtype: torch.dtype) -> None:
+    kernel = KERNELS[name].make()
+    y, c = uniform(4, 2), uniform(3, 2)
+    exact, x = kernel(y, c), y[0]
+    got = kernel(y.to(dtype), c.to(dtype))
+    assert got.dtype == dtype
+    tolerance = 30 * torch.finfo(dtype).eps
+    torch.testing.assert_close(got.double(), exact, rtol=tolerance, atol=tolerance)
+    for part in (
+        kernel.core(x.to(dtype), y.to(dtype), c.to(dtype)),
+        kernel.log_scale(x.to(dtype), y.to(dtype)),
+        kernel.log_gain(x.to(dtype)),
+    ):
+        assert part is None or part.dtype == dtype
+
+
+@over(KERNELS)
+def test_factors_near_a_state_multiply_to_the_kernel(name: str) -> None:
+    kernel = KERNELS[name].make()
+    x, z, d = uniform(7, 3, low=-2, high=2), uniform(7, 4, 3), uniform(7, 5, 3)
+    zero = x.new_zeros(())
+    gain = kernel.log_gain(x)
+    left, right = kernel.log_scale(x, z), kernel.log_scale(x, d)
+    exponent = (
+        (zero if gain is None else gain[:, None, None])
+        + (zero if left is None else left[:, :, None])
+        + (zero if right is None else right[:, None, :])
+    )
+    near = kernel.core(x, z, d) * exponent.exp()
+    at = x.unsqueeze(-2)
+    torch.testing.assert_close(near, kernel(at + z, at + d), rtol=1e-12, atol=1e-13)
+
+
+@over(KERNELS)
+def test_core_of_a_state_free_kernel_ignores_the_state(name: str) -> None:
+    kernel = KERNELS[name].make()
+    z, d = uniform(4, 2), uniform(3, 2)
+    if kernel.state_free:
+        assert torch.equal(kernel.core(tensor([0.3, -1.0]), z, d), kernel.core(tensor([0.0, 0.0]), z, d))
+
+
+@over(KERNELS)
+def test_exponent_rate_is_that_of_the_core(name: str) -> None:
+    kernel = KERNELS[name].make()
+    rate = kernel.exponent_rate()
+    z, d = uniform(4, 2), uniform(3, 2)
+    if rate is not None:
+        torch.testing.assert_close(kernel.core(z[0], z, d), (rate * z @ d.mT).exp(), rtol=1e-14, atol=0)
+
+
+@over(SMOOTH_KERNELS)
+def test_gradients_are_right(name: str) -> None:
+    kernel = KERNELS[name].make()
+    y, c = uniform(2, 3, 2).requires_grad_(), uniform(2, 2, 2).requires_grad_()
+    assert gradcheck(kernel, (y, c))
+    assert gradgradcheck(kernel, (y, c))
+
+
+def test_gradients_of_the_roughest_matern_kernel_are_right_away_from_the_center() -> None:
+    kernel = KERNELS["matern12"].make()
+    y, c = uniform(3, 2).requires_grad_(), (uniform(2, 2) + 4).requires_grad_()
+    assert gradcheck(kernel, (y, c))
+    assert gradgradcheck(kernel, (y, c))
+
+
+@over(KERNELS)
+def test_gradient_at_coincident_points_is_finite(name: str) -> None:
+    kernel = KERNELS[name].make()
+    y = uniform(3, 2)
+    gradient = torch.func.grad(lambda at: kernel(at, y).sum())(y.clone())
+    assert torch.isfinite(gradient).all()
+
+
+@pytest.mark.parametrize("smoothness", [0.5, 1.5, 2.5])
+@pytest.mark.parametrize("dim", [1, 3])
+def test_gradient_of_a_matern_kernel_vanishes_at_its_center(smoothness: float, dim: int) -> None:
+    kernel = st.MaternKernel(smoothness, 0.7)
+    c = uniform(1, dim)
+    gradient = torch.func.grad(lambda at: kernel(at, c).sum())(c.clone())
+    assert torch.equal(gradient, torch.zeros_like(gradient))
+
+
+@pytest.mark.parametrize("smoothness", [1.5, 2.5])
+@pytest.mark.parametrize("dim", [1, 2, 4])
+def test_hessian_of_a_matern_kernel_at_its_center_is_minus_nu_over_nu_minus_one(
+    smoothness: float, dim: int
+) -> None:
+    length = 0.7
+    kernel = st.MaternKernel(smoothness, length)
+    c = uniform(dim)
+    # Reverse mode twice: forward mode runs into a deprecation warning of torch itself.
+    hessian = torch.func.jacrev(torch.func.jacrev(lambda at: kernel(at[None], c[None]).sum()))(c.clone())
+    expected = -smoothness / (smoothness - 1) / length**2 * torch.eye(dim, dtype=torch.float64)
+    torch.testing.assert_close(hessian, expected, rtol=1e-13, atol=1e-13)
+
+
+@pytest.mark.parametrize("smoothness", [0.5, 1.5, 2.5])
+def test_matern_kernel_has_all_its_digits_across_the_change_of_branch(smoothness: float) -> None:
+    mpmath = pytest.importorskip("mpmath")
+    length = 0.7
+    kernel = st.MaternKernel(smoothness, length)
+    threshold = 0.5 * length / math.sqrt(2 * smoothness)  # where t = 1/2
+    r = tensor([1e-12, 1e-6, 1e-3, threshold * (1 - 1e-9), threshold * (1 + 1e-9), 1.0, 5.0, 40.0])
+
+    def profile(at: float) -> list[float]:
+        def function(x):  # type: ignore[no-untyped-def]
+            t = mpmath.sqrt(2 * mpmath.mpf(smoothness)) * x / mpmath.mpf(length)
+            return {0.5: 1, 1.5: 1 + t, 2.5: 1 + t + t**2 / 3}[smoothness] * mpmath.exp(-t)
+
+        with mpmath.workdps(50):
+            return [float(mpmath.diff(function, mpmath.mpf(at), k)) for k in (0, 1, 2)]
+
+    def value(at: torch.Tensor) -> torch.Tensor:
+        return kernel(at.reshape(1, 1), torch.zeros(1, 1, dtype=torch.float64)).sum()
+
+    first, second = torch.func.grad(value), torch.func.grad(torch.func.grad(value))
+    got = torch.stack([torch.stack([f(at) for f in (value, first, second)]) for at in r])
+    expected = tensor([profile(float(at)) for at in r])
+    if smoothness == 0.5:  # its second derivative is one of |r| through r^2: lost below r = sqrt(eps)
+        got[r < 1e-3, 2] = expected[r < 1e-3, 2]
+    torch.testing.assert_close(got, expected, rtol=2e-12, atol=1e-14)
+
+
+@over(KERNELS)
+def test_vmap_and_jacrev_go_through(name: str) -> None:
+    kernel = KERNELS[name].make()
+    y, c = uniform(5, 3, 2), uniform(5, 4, 2)
+    torch.testing.assert_close(torch.func.vmap(kernel)(y, c), kernel(y, c), rtol=1e-13, atol=1e-14)
+    jacobian = torch.func.jacrev(kernel)(y[0], c[0])
+    reference = torch.autograd.functional.jacobian(lambda at: kernel(at, c[0]), y[0])
+    torch.testing.assert_close(jacobian, reference, rtol=1e-12, atol=1e-14)
+
+
+@pytest.mark.parametrize("name", [name for name in KERNELS if not name.startswith("anchored")])
+def test_anchored_kernel_is_the_kernel_less_its_part_at_the_origin(name: str) -> None:
+    kernel = KERNELS[name].make()
+    anchored = st.AnchoredKernel(kernel)
+    y, c, zero = uniform(3, 4, 2), uniform(3, 5, 2), torch.zeros(1, 2, dtype=torch.float64)
+    expected = kernel(y, c) - kernel(y, zero) * kernel(zero, c) / kernel(zero, zero)
+    torch.testing.assert_close(anchored(y, c), expected, rtol=1e-12, atol=1e-14)
+    assert anchored(zero, c).abs().max() <= 1e-16
+    assert anchored(y, zero).abs().max() <= 1e-16
+
+
+def test_anchored_exponential_keeps_its_digits_near_the_origin() -> None:
+    kernel = st.AnchoredKernel(st.ExponentialKernel())
+    y = tensor([[1e-9, 2e-9]])
+    torch.testing.assert_close(kernel(y, y), tensor([[5e-18]]), rtol=1e-14, atol=0)
+
+
+def test_radial_kernels_keep_a_small_distance_far_from_the_origin() -> None:
+    far, step = tensor([[1e6, -1e6]]), 2.0**-20
+    exact = math.exp(-(step**2) / 2)
+    assert st.GaussianKernel()(far, far + tensor([step, 0.0])).item() == pytest.approx(exact, rel=1e-15)
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3])
+@pytest.mark.parametrize(("bias", "anchored"), [(1.0, False), (0.0, False), (1.0, True)])
+def test_rank_of_a_polynomial_kernel_is_the_rank_of_its_gram_matrix(
+    degree: int, bias: float, anchored: bool
+) -> None:
+    kernel: st.Kernel = st.PolynomialKernel(degree, bias)
+    kernel = st.AnchoredKernel(kernel) if anchored else kernel
+    points = uniform(40, 3)
+    assert kernel.rank(3) == int(torch.linalg.matrix_rank(kernel(points, points), rtol=1e-10))
+
+
+def test_a_width_per_batch_entry_equals_one_kernel_an_entry() -> None:
+    width = tensor([0.5, 1.0, 2.0])
+    y, c = uniform(3, 4, 2), uniform(3, 5, 2)
+    loop = [st.GaussianKernel(float(w))(a, b) for w, a, b in zip(width, y, c, strict=True)]
+    torch.testing.assert_close(st.GaussianKernel(width)(y, c), torch.stack(loop), rtol=1e-14, atol=0)
+
+
+def test_rational_quadratic_kernel_tends_to_the_gaussian() -> None:
+    y, c = uniform(4, 2), uniform(3, 2)
+    limit = st.RationalQuadraticKernel(alpha=1e9, length_scale=0.8)(y, c)
+    torch.testing.assert_close(limit, st.GaussianKernel(0.8)(y, c), rtol=1e-7, atol=0)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: st.GaussianKernel(width=-1.0), "`GaussianKernel(width=...)` must be positive; got -1.0."),
+        (lambda: st.GaussianKernel(width=0), "`GaussianKernel(width=...)` must be positive; got 0."),
+        (lambda: st.GaussianKernel(width=math.nan), "`GaussianKernel(width=...)` must be finite; got nan."),
+        (lambda: st.GaussianKernel(width=tensor([1.0, 0.0])), "must be positive; got [1.0, 0.0]."),
+        (lambda: st.GaussianKernel(width="w"), "`GaussianKernel(width=...)` must be a number; got 'w'."),
+        (lambda: st.GaussianKernel(width=torch.tensor([1])), "must be a floating-point tensor; got [1]."),
+        (lambda: st.MaternKernel(smoothness=2.0), "(smoothness=...)` must be one of 0.5, 1.5, 2.5; got 2.0."),
+        (lambda: st.MaternKernel(length_scale=0.0), "`MaternKernel(length_scale=...)` must be positive"),
+        (lambda: st.InverseMultiquadricKernel(-1.0), "`InverseMultiquadricKernel(length_scale=...)` must be"),
+        (
+            lambda: st.RationalQuadraticKernel(alpha=0.0),
+            "`RationalQuadraticKernel(alpha=...)` must be positive",
+        ),
+        (lambda: st.RationalQuadraticKernel(length_scale=math.inf), "(length_scale=...)` must be finite"),
+        (lambda: st.PolynomialKernel(degree=0), "`PolynomialKernel(degree=...)` must be at least 1; got 0."),
+        (lambda: st.PolynomialKernel(degree=1.5), "(degree=...)` must be an integer; got 1.5."),
+        (lambda: st.PolynomialKernel(degree=True), "(degree=...)` must be an integer; got True."),
+        (lambda: st.PolynomialKernel(bias=-0.1), "(bias=...)` must not be negative; got -0.1."),
+        (lambda: st.AnchoredKernel("k"), "`AnchoredKernel(kernel=...)` must be a Kernel; got str."),
+        (lambda: st.AnchoredKernel(st.PolynomialKernel(2, 0.0)), "must have k(0, 0) > 0; got [0.0]"),
+    ],
+)
+def test_a_bad_argument_is_named_with_its_value(make, message: str) -> None:  # type: ignore[no-untyped-def]
+    with pytest.raises(ValueError, match=re.escape(message)):
+        make()

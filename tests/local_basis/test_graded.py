@@ -1,0 +1,242 @@
+"""Full accuracy at every radius: the graded basis against interpolants in high precision."""
+
+from __future__ import annotations
+
+import copy
+import warnings
+
+import mpmath as mp
+import pytest
+import torch
+from truth import LAYOUTS, RADII, Truth, ball_points, paper, smooth, smooth_target, value_error, worst
+
+import staf_torch as st
+from staf_torch.approximation.conditioning import lebesgue_constant
+from staf_torch.local_basis import GradedSpace, graded_basis, phi
+
+KERNELS = {"exponential": (st.ExponentialKernel, None), "gaussian": (lambda: st.GaussianKernel(0.8), 0.8)}
+
+
+def problem(
+    directions: torch.Tensor, kernel: str, radius: float, seed: int
+) -> tuple[st.StaF, Truth, float, torch.Tensor]:
+    """The fitted module, its truth and points zeta of the unit ball, at a random state."""
+    generator = torch.Generator().manual_seed(seed)
+    dim = directions.shape[1]
+    make, width = KERNELS[kernel]
+    # What every dtype sees alike: numbers that float32 can hold.
+    x = ball_points(1, dim, generator)[0].float().double()
+    zeta = ball_points(4, dim, generator).float().double()
+    radius = float(torch.tensor(radius, dtype=torch.float32))
+    target, value = (st.targets.Paper(), paper) if dim == 2 else (smooth_target, smooth)
+    staf = st.StaF(st.StaFBasis(make(), st.StateFollowingCenters(directions, radius))).fit_(x, target)
+    return staf, Truth(directions, radius, x, value, width), radius, zeta
+
+
+def single(staf: st.StaF) -> st.StaF:
+    """The same problem in single precision."""
+    target = staf._target
+    assert target is not None
+    basis = copy.deepcopy(staf.basis).float()
+    return st.StaF(basis).float().fit_(staf.state.float(), target)
+
+
+@pytest.mark.parametrize(
+    ("layout", "kernel", "radius"),
+    [
+        (layout, kernel, radius)
+        for layout in LAYOUTS
+        for kernel in KERNELS
+        for radius in RADII
+        # The truth of 45 centers takes seconds: once each way there.
+        if layout != "ball45_8" or (kernel, radius) in (("exponential", 0.5), ("gaussian", 1e-3))
+    ],
+)
+def test_value_is_exact_to_rounding_at_every_radius(layout: str, kernel: str, radius: float) -> None:
+    found = problem(LAYOUTS[layout](), kernel, radius, 1)
+    assert value_error(*found) <= 5e-15
+    assert value_error(single(found[0]), *found[1:]) <= 5e-7
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_random_offsets_lose_no_more_than_their_lebesgue_constant(seed: int) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    dim = 1 + seed % 4
+    count = 2 + int(torch.randint(9, (), generator=generator))
+    directions = ball_points(count, dim, generator)
+    radius = float(10 ** (-8 * torch.rand((), generator=generator, dtype=torch.float64) - 0.3))
+    kernel = list(KERNELS)[seed % 2]
+    found = problem(directions, kernel, radius, seed)
+    constant = float(lebesgue_constant(found[0].basis, found[0].state))
+    assert constant >= 0.9
+    assert value_error(*found) <= 5e-15 * max(1.0, constant)
+    assert value_error(single(found[0]), *found[1:]) <= 5e-7 * max(1.0, constant)
+
+
+@pytest.mark.parametrize("radius", RADII)
+@pytest.mark.parametrize("kernel", KERNELS)
+@pytest.mark.parametrize("layout", ["rings6", "rings15", "rings28", "ball15_4"])
+def test_gradient_is_exact_up_to_the_division_by_the_radius(layout: str, kernel: str, radius: float) -> None:
+    directions = LAYOUTS[layout]()
+    staf, truth, radius, zeta = problem(directions, kernel, radius, 3)
+    y = staf.state + radius * zeta
+    z = (y - staf.state) / radius  # what is left of zeta beside x
+    expected = [e for row in z for e in truth.gradient(row)]
+    found = staf.gradient(y).detach().flatten()
+    gap = max(abs(mp.mpf(float(f)) - e) for f, e in zip(found, expected, strict=True))
+    constant = float(lebesgue_constant(staf.basis, staf.state))
+    # A sample is V at x + d rounded: an error of eps (|V| + |grad V|), which the 1/r of the gradient meets.
+    size = float(max(map(abs, expected)) + max(abs(truth.value(row)) for row in z))
+    assert float(gap) <= (1e-15 / radius + 1e-13) * constant * size
+
+
+def test_far_states_lose_nothing() -> None:
+    for norm in (20.0, 100.0, 1000.0):
+        x = norm * torch.tensor([0.6, -0.8], dtype=torch.float64)
+        basis = st.StaFBasis(st.ExponentialKernel(), st.StateFollowingCenters(st.rings(6), 1e-3 / norm * 20))
+        staf = st.StaF(basis).fit_(x, smooth_target)
+        radius = float(basis.centers.radius.radius)
+        truth = Truth(st.rings(6), radius, x, smooth, None)
+        zeta = ball_points(4, 2, torch.Generator().manual_seed(5))
+        assert value_error(staf, truth, radius, zeta) <= 1e-12
+
+
+def test_far_states_with_a_wide_ball_warn_and_are_still_exact() -> None:
+    x = torch.tensor([600.0, -800.0], dtype=torch.float64)
+    basis = st.StaFBasis(st.ExponentialKernel(), st.StateFollowingCenters(st.rings(6), 0.1))
+    with pytest.warns(UserWarning, match=r"\|x\| r = 100 > 1.*GaussianKernel"):
+        staf = st.StaF(basis).fit_(x, smooth_target)
+    truth = Truth(st.rings(6), 0.1, x, smooth, None)
+    # Each point by itself: over this ball V^ spans a factor e^200.
+    for z in ball_points(6, 2, torch.Generator().manual_seed(6)):
+        assert worst(staf.at_offsets((0.1 * z).unsqueeze(0)), [truth.value(z)]) <= 1e-12
+
+
+def test_weights_that_cannot_be_represented_are_refused_and_named() -> None:
+    basis = st.StaFBasis(st.ExponentialKernel(), st.StateFollowingCenters(st.rings(6), 1e-3))
+    x = torch.tensor([[1.0, 0.0], [600.0, -800.0]], dtype=torch.float64)
+    staf = st.StaF(basis, (2,)).fit_(x, smooth_target)
+    assert torch.isfinite(staf(x.unsqueeze(-2))).all()
+    weights = basis.ideal_weights(x, smooth_target)
+    assert torch.isfinite(weights[0]).all()
+    assert torch.isnan(weights[1]).all()
+    with pytest.raises(ValueError, match=r"`StaF.weights` of the batch entries \[\[1\]\] must be"):
+        _ = staf.weights
+
+
+@pytest.mark.parametrize("layout", ["rings6", "rings15", "ball15_4", "polygon4"])
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_state_dependent_radius_agrees_with_the_constant_one(layout: str, kernel: str) -> None:
+    directions = LAYOUTS[layout]()
+    generator = torch.Generator().manual_seed(7)
+    x = 3 * torch.randn(40, directions.shape[1], dtype=torch.float64, generator=generator)
+    zeta = ball_points(5, directions.shape[1], generator)
+    moving = st.StateFollowingCenters(directions, st.StateRadius(0.5, 1e-9))
+    make, _ = KERNELS[kernel]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # |x| r > 1 at some of these states
+        staf = st.StaF(st.StaFBasis(make(), moving), (40,)).fit_(x, smooth_target)
+        nu = moving.radius(x)
+        found = staf.at_offsets(nu[:, None, None] * zeta)
+        for row in range(0, 40, 3):
+            fixed = st.StateFollowingCenters(directions, float(nu[row]))
+            alone = st.StaF(st.StaFBasis(make(), fixed)).fit_(x[row], smooth_target)
+            expected = alone.at_offsets(nu[row] * zeta)
+            torch.testing.assert_close(found[row], expected, rtol=2e-13, atol=0)
+
+
+def test_centers_that_meet_leave_the_value_at_the_state() -> None:
+    centers = st.StateFollowingCenters(st.rings(6), st.StateRadius(0.5, 0.0))
+    basis = st.StaFBasis(st.ExponentialKernel(), centers)
+    x = torch.tensor([[0.0, 0.0], [1.0, 0.5]], dtype=torch.float64)
+    space = basis.local(x)
+    assert space.rank.tolist() == [1, 6]
+    estimate = space.evaluate(
+        torch.zeros(2, 1, 2, dtype=torch.float64), space.fit(basis.values(x, smooth_target))
+    )
+    torch.testing.assert_close(estimate[0, 0], smooth_target(x[0]), rtol=1e-14, atol=0)
+
+
+def test_a_sample_that_is_not_a_number_spoils_its_row_only() -> None:
+    basis = st.StaFBasis(st.GaussianKernel(), st.StateFollowingCenters(st.rings(6), st.StateRadius(0.5, 0.1)))
+    x = torch.randn(5, 2, dtype=torch.float64)
+    values = basis.values(x, smooth_target)
+    space = basis.local(x)
+    clean = space.fit(values)
+    values[3, 2] = torch.nan
+    spoiled = space.fit(values)
+    assert torch.isnan(spoiled[3]).all()
+    others = [0, 1, 2, 4]
+    torch.testing.assert_close(spoiled[others], clean[others], rtol=1e-14, atol=1e-14)
+
+
+def test_wide_radius_is_inverted_row_by_row() -> None:
+    centers = st.StateFollowingCenters(st.rings(6), st.StateRadius(0.9, 0.1, 0.5))
+    basis = st.StaFBasis(st.GaussianKernel(0.4), centers)
+    x = torch.randn(7, 2, dtype=torch.float64)
+    at = basis.centers(x)
+    torch.testing.assert_close(
+        st.StaF(basis, (7,)).fit_(x, smooth_target)(at), smooth_target(at), rtol=1e-11, atol=1e-11
+    )
+
+
+def test_phi_functions_agree_with_their_series() -> None:
+    t = torch.tensor(
+        [-30.0, -4.0, -1.01, -1.0, -0.3, -1e-9, 0.0, 1e-3, 0.7, 1.0, 1.2, 9.0], dtype=torch.float64
+    )
+    found = phi(t, 6)
+
+    def exact_phi(k: int, at: float) -> mp.mpf:
+        return mp.factorial(k) * mp.nsum(lambda j: mp.mpf(at) ** int(j) / mp.factorial(k + int(j)), [0, 200])
+
+    for k, values in enumerate(found):
+        for at, value in zip(t, values, strict=True):
+            with mp.workdps(60):
+                exact = exact_phi(k, float(at))
+            loss = 1.0 if abs(float(at)) <= 1 else mp.factorial(k)
+            assert abs(mp.mpf(float(value)) - exact) <= 4e-16 * loss * abs(exact) + 4e-16 * (loss > 1) * loss
+
+
+def test_functionals_kill_the_lower_polynomials() -> None:
+    for make in LAYOUTS.values():
+        basis = graded_basis(make())
+        for j, degree in enumerate(basis.degree.tolist()):
+            functional = basis.weights[:, :, j].sum(1)
+            for k in range(degree):
+                assert float((functional @ (basis.directions.sum(-1) ** k)).abs()) < 1e-9
+
+
+def test_directions_that_coincide_to_rounding_are_refused() -> None:
+    u = torch.tensor([[0.5, 0.0], [0.5 + 1e-15, 0.0], [0.0, 1.0]], dtype=torch.float64)
+    with pytest.raises(ValueError, match="must be told apart"):
+        st.StaFBasis(st.ExponentialKernel(), st.StateFollowingCenters(u, 0.1))
+
+
+def test_loading_other_directions_sets_the_basis_up_again() -> None:
+    make = lambda u: st.StaFBasis(st.ExponentialKernel(), st.StateFollowingCenters(u, 0.1))  # noqa: E731
+    here, there = make(st.rings(6)), make(st.ball(6, 2))
+    here.load_state_dict(there.state_dict())
+    x = torch.tensor([0.4, 0.3], dtype=torch.float64)
+    assert torch.equal(here.ideal_weights(x, smooth_target), there.ideal_weights(x, smooth_target))
+
+
+@pytest.mark.filterwarnings("ignore:.*torch.jit.script:DeprecationWarning")  # torch's own, in jacfwd
+def test_fit_and_evaluation_work_under_function_transforms() -> None:
+    basis = st.StaFBasis(
+        st.ExponentialKernel(), st.StateFollowingCenters(st.rings(6), st.StateRadius(0.5, 0.1))
+    )
+    x = torch.rand(4, 2, dtype=torch.float64)
+
+    def estimate(at: torch.Tensor) -> torch.Tensor:
+        space = basis.local(at)
+        assert isinstance(space, GradedSpace)
+        return space.evaluate(
+            torch.full((1, 2), 0.05, dtype=torch.float64), space.fit(basis.values(at, smooth_target))
+        )
+
+    together = estimate(x)
+    torch.testing.assert_close(torch.vmap(estimate)(x), together, rtol=1e-13, atol=0)
+    jacobian = torch.vmap(torch.func.jacrev(estimate))(x).squeeze(1)
+    forward = torch.vmap(torch.func.jacfwd(estimate))(x).squeeze(1)
+    torch.testing.assert_close(forward, jacobian, rtol=1e-10, atol=1e-10)
+    assert torch.autograd.gradcheck(lambda at: basis.ideal_weights(at, smooth_target), (x.requires_grad_(),))

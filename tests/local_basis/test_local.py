@@ -1,0 +1,60 @@
+"""The local space: coefficients that stay finite, and the paper's weights derived from them."""
+
+from __future__ import annotations
+
+import torch
+from helpers import basis_of, tensor, uniform
+from variants import KERNELS, RADII, over
+
+import staf_torch as st
+from staf_torch.targets import Paper
+
+NEWTON = {name: KERNELS[name] for name in KERNELS if name not in ("exponential", "gaussian", "polynomial")}
+
+
+@over(KERNELS)
+@over(RADII, "radius")
+def test_weights_and_coefficients_are_two_names_of_one_function(name: str, radius: str) -> None:
+    basis = basis_of(name, 3, RADII[radius][0]())
+    space = basis.local(uniform(4, 2, low=0.3, high=1.2))
+    beta = uniform(4, 3)
+    torch.testing.assert_close(space.coefficients(space.weights(beta)), beta, rtol=1e-8, atol=1e-8)
+
+
+@over(NEWTON)
+def test_squared_length_in_the_newton_basis_is_the_squared_native_norm(name: str) -> None:
+    basis, x = basis_of(name, 6, 0.8), uniform(4, 2, low=0.4)
+    space = basis.local(x)
+    beta = space.factor.solve_lower(space.fit(basis.values(x, Paper())))
+    gain = basis.kernel.log_gain(x)
+    native = (basis.ideal_weights(x, Paper()) * basis.values(x, Paper())).sum(-1)  # w'K w = w'V
+    scaled = beta.square().sum(-1) * (1.0 if gain is None else (-gain).exp())
+    torch.testing.assert_close(scaled, native, rtol=1e-8, atol=1e-10)
+
+
+@over(KERNELS)
+def test_rank_is_full_for_well_separated_centers(name: str) -> None:
+    assert (basis_of(name, 6, 0.8).local(uniform(4, 2, low=0.4)).rank == 6).all()
+
+
+def test_rank_says_where_the_gram_matrix_is_numerically_singular() -> None:
+    basis = basis_of("matern52", 15, 1e-4)
+    space = basis.local(uniform(4, 2))
+    assert int(space.rank) < 15
+    beta = space.fit(basis.values(space.state, Paper()))
+    assert torch.isfinite(beta).all()
+    here = torch.zeros(4, 1, 2).double()
+    estimate = space.evaluate(here, beta).squeeze(-1)
+    torch.testing.assert_close(estimate, Paper()(space.state), rtol=0, atol=1e-5)
+
+
+def test_centers_that_meet_leave_one_of_them() -> None:
+    basis = basis_of("rational_quadratic", 6, st.StateRadius(0.5, 0.0))
+    space = basis.local(tensor([[0.0, 0.0], [1.0, 0.5]]))
+    assert space.rank.tolist() == [1, 6]
+    values = space.evaluate(torch.zeros(2, 1, 2).double(), space.fit(basis.values(space.state, Paper())))
+    torch.testing.assert_close(values.squeeze(-1), Paper()(space.state), rtol=0, atol=2e-3)
+
+
+def test_one_factor_serves_all_states() -> None:
+    assert basis_of("matern32").local(uniform(5, 4, 2)).factor.factor.shape == (6, 6)

@@ -1,0 +1,203 @@
+"""From a chase to numbers."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+
+import pytest
+import torch
+from helpers import basis_of, tensor, uniform
+from variants import KERNELS, over
+
+import staf_torch as st
+from staf_torch import systems
+from staf_torch.approximation.conditioning import sup_error
+from staf_torch.engine import ChaseResult, chase_pieces
+from staf_torch.metrics import ball_error as ball_errors
+from staf_torch.metrics.ball_error import ball_error, gradient_error
+from staf_torch.metrics.chase import ChaseMetrics
+from staf_torch.numerics.linalg import condition_number
+from staf_torch.optim import SteepestDescent
+from staf_torch.targets import Paper
+
+KEYS = {
+    "ultimate_error",
+    "ultimate_error_before",
+    "floor_error",
+    "ultimate_excess",
+    "ultimate_excess_before",
+    "ball_error",
+    "ball_floor_error",
+    "rounding_floor",
+    "gradient_error",
+    "condition_number",
+    "settling_time",
+    "contraction_violations",
+    "diverged_fraction",
+}
+DT = 0.05
+STARTS = tensor([[1.0, 0.0], [0.3, 0.9], [-1.2, 0.4]])
+
+
+def states(steps: int = 100) -> torch.Tensor:
+    return systems.simulate(systems.Oscillator(), STARTS, dt=DT, steps=steps)
+
+
+def gather(
+    at: torch.Tensor, settle_time: float = 2.0, piece: int | None = None, kernel: str = "exponential"
+) -> tuple[dict[str, float | None], ChaseResult]:
+    basis, law = basis_of(kernel, 3), SteepestDescent()
+    metrics = ChaseMetrics(basis, Paper(), law, inner_steps=10, dt=DT, settle_time=settle_time)
+    parts = at.split(at.shape[1] if piece is None else piece, dim=1)
+    for result in chase_pieces(parts, basis, Paper(), law, inner_steps=10):
+        metrics.add(result)
+    return metrics.summary(), st.chase(at, basis, Paper(), law, inner_steps=10)
+
+
+@over(KERNELS)
+def test_metrics_are_the_worst_over_the_window(name: str) -> None:
+    found, result = gather(states(), kernel=name)
+    basis, window = basis_of(name, 3), slice(40, None)
+    value = result.value[:, window]
+    expected = {
+        "ultimate_error": (value - result.estimate[:, window]).abs().max(),
+        "ultimate_error_before": (value - result.estimate_before[:, window]).abs().max(),
+        "floor_error": (value - result.ideal_estimate[:, window]).abs().max(),
+        "ultimate_excess": result.excess[:, window].max(),
+        "ultimate_excess_before": result.excess_before[:, window].max(),
+        "condition_number": condition_number(basis.gram(result.state[:, window])).max(),
+        "ball_floor_error": sup_error(basis, result.state[:, window], Paper(), 97).max(),
+        "rounding_floor": torch.finfo(torch.float64).eps * value.abs().max(),
+    }
+    assert set(found) == KEYS
+    for key, number in expected.items():
+        assert found[key] == pytest.approx(float(number), rel=1e-6), key
+    assert found["contraction_violations"] == 0
+    assert found["diverged_fraction"] == 0
+
+
+@pytest.mark.parametrize("piece", [1, 7, 39, 40, 41])
+def test_pieces_of_time_do_not_change_the_metrics(piece: int) -> None:
+    found, whole = gather(states(), piece=piece)[0], gather(states())[0]
+    for key, number in whole.items():
+        assert found[key] == pytest.approx(number, rel=1e-9), key
+
+
+def test_settling_time_is_the_last_time_above_the_settled_excess() -> None:
+    found, result = gather(states())
+    above = result.excess[:, :40] > result.excess[:, 40:].amax(1, keepdim=True)
+    last = max(int(row.nonzero().max()) for row in above if row.any())
+    assert found["settling_time"] == pytest.approx((last + 1) * DT)
+    assert gather(states(), settle_time=0.0)[0]["settling_time"] == 0.0
+
+
+def test_a_window_after_the_end_has_nothing_to_report() -> None:
+    found, _ = gather(states(), settle_time=1e3)
+    assert found["diverged_fraction"] == 0.0
+    assert {key for key, number in found.items() if number is None} == KEYS - {"diverged_fraction"}
+
+
+def test_diverged_trajectories_are_counted_and_left_out() -> None:
+    poisoned = states()
+    poisoned[1, 60:] = torch.nan
+    found = gather(poisoned)[0]
+    basis, law = basis_of("exponential", 3), SteepestDescent()
+    metrics = ChaseMetrics(basis, Paper(), law, inner_steps=10, dt=DT, settle_time=2.0)
+    for result in chase_pieces([states()[[0, 2]]], basis, Paper(), law):
+        metrics.add(result)
+    others = metrics.summary()
+    assert found["diverged_fraction"] == pytest.approx(1 / 3)
+    for key in KEYS - {"diverged_fraction"}:
+        assert found[key] == pytest.approx(others[key], rel=1e-9), key
+
+
+def test_a_run_in_which_all_diverged_is_null_not_nan() -> None:
+    found, _ = gather(torch.full_like(states(), torch.nan))
+    assert found["diverged_fraction"] == 1.0
+    assert all(number is None for key, number in found.items() if key != "diverged_fraction")
+    json.dumps(found, allow_nan=False)
+
+
+class _Lazy(SteepestDescent):
+    """A law that promises the rate of the line search and walks a hundredth of its step."""
+
+    def step(self, objective, weights, state):  # type: ignore[no-untyped-def]
+        new, state = super().step(objective, weights, state)
+        return weights + 0.01 * (new - weights), state
+
+
+def test_a_law_that_breaks_its_promise_is_counted() -> None:
+    basis, law = basis_of("exponential", 3), _Lazy()
+    metrics = ChaseMetrics(basis, Paper(), law, inner_steps=10, dt=DT, settle_time=0.0)
+    for result in chase_pieces([states()], basis, Paper(), law):
+        metrics.add(result)
+    rate = law.contraction(condition_number(basis.gram(states())))
+    broken = int((result.excess > rate**10 * result.excess_before * (1 + 1e-9)).sum())
+    assert broken > 100
+    assert metrics.summary()["contraction_violations"] == broken
+
+
+def in_kernels(basis: st.StaFBasis, x: torch.Tensor, target: Callable[..., torch.Tensor]) -> torch.Tensor:
+    """b of the ideal weights in V^(x + z) = e^{s(z)} sum_i b_i k0(z, d_i)."""
+    space = basis.local(x)
+    scaled = space.scaled_weights(space.fit(basis.values(x, target)))
+    s = basis.kernel.log_scale(x, space.offsets)
+    return scaled if s is None else scaled * s.exp()
+
+
+@pytest.mark.parametrize("radius", [0.4, st.StateRadius(0.5, 0.1)])
+@pytest.mark.parametrize("dim", [1, 2, 3])
+def test_ball_error_is_close_to_a_dense_supremum(radius: object, dim: int) -> None:
+    basis = basis_of("gaussian", 3, radius, dim) if dim == 2 else basis_of("gaussian", 4, radius, dim)
+    x = uniform(5, dim)
+
+    def target(y: torch.Tensor) -> torch.Tensor:
+        return (y.sum(-1) + 0.3).exp()
+
+    coefficients = in_kernels(basis, x, target)
+    found = ball_error(basis, target, x, coefficients)
+    inside = torch.randn(20_000, dim).double()
+    inside /= inside.norm(dim=-1, keepdim=True).clamp(min=1.0)
+    inside[::2] /= inside[::2].norm(dim=-1, keepdim=True)
+    y = x.unsqueeze(-2) + basis.centers.radius(x)[..., None, None] * inside
+    staf = st.StaF(basis, (5,)).fit_(x, target)
+    dense = (target(y) - staf(y)).abs().amax(-1).detach()
+    assert (found <= dense * 1.01).all()
+    assert (found >= dense * 0.7).all()
+
+
+@pytest.mark.parametrize("radius", [0.1, st.StateRadius(0.2, 0.1)])
+@over(KERNELS)
+def test_ball_floor_is_that_of_the_local_basis_in_pieces_of_any_size(
+    name: str, radius: object, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    basis, x = basis_of(name, 6, radius), uniform(4, 9, 2)
+    expected = sup_error(basis, x, Paper(), 97)
+    floor = ball_errors.BallFloor(basis, Paper(), 97)
+    torch.testing.assert_close(floor(x), expected, rtol=1e-9, atol=1e-12)
+    monkeypatch.setattr(ball_errors, "_BLOCK", 1)
+    torch.testing.assert_close(floor(x), expected, rtol=1e-9, atol=1e-12)
+
+
+@over(KERNELS)
+def test_gradient_error_is_that_of_the_partial_gradient(name: str) -> None:
+    basis, x = basis_of(name, 6, 0.5), uniform(4, 2, low=0.3)
+    coefficients = in_kernels(basis, x, Paper())
+    staf = st.StaF(basis, (4,)).fit_(x, Paper())
+    exact = torch.func.grad(lambda at: Paper()(at).sum())(x)
+    expected = (staf.gradient(x.unsqueeze(-2)).squeeze(-2) - exact).norm(dim=-1)
+    torch.testing.assert_close(
+        gradient_error(basis, Paper(), x, coefficients), expected, rtol=1e-7, atol=1e-8
+    )
+
+
+def test_window_of_the_paper_starts_at_its_settling_time() -> None:
+    """5.0 / 0.05 is 100.00000000000001 in floating point on some steps: the first time must not move."""
+    for dt in (0.05, 0.01, 0.001, 0.1, 0.3):
+        metrics = ChaseMetrics(
+            basis_of("gaussian", 3), Paper(), SteepestDescent(), inner_steps=1, dt=dt, settle_time=30 * dt
+        )
+        assert metrics._first == 30
+        assert math.ceil(30 * dt / dt - 1e-9) == 30

@@ -1,0 +1,126 @@
+"""The accurate mode: a bank of local models over remembered samples."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+import staf_torch as st
+from staf_torch.online.bank import Bank
+from staf_torch.online.bank_rules import BankShape
+
+COMPILED = Bank(BankShape(2, 1, 128, 8), 1, True).compiled
+needs_compiler = pytest.mark.skipif(not COMPILED, reason="needs a C++ compiler")
+
+
+def streams(steps: int, count: int, outputs: int = 1, seed: int = 0) -> tuple[Tensor, Tensor]:
+    """Inputs that come back, a function with a little noise: (T, S, 2), (T, S, K)."""
+    draw = torch.Generator().manual_seed(seed)
+    x = torch.randn(steps, count, 2, generator=draw, dtype=torch.float64)
+    y = torch.stack([(x[..., 0] * (k + 1)).sin() + x[..., 1] for k in range(outputs)], -1)
+    return x, y + 0.1 * torch.randn(y.shape, generator=draw, dtype=torch.float64)
+
+
+def definition_of(bank: Bank) -> Bank:
+    bank._run = None
+    return bank
+
+
+@needs_compiler
+@pytest.mark.parametrize("outputs", [1, 2])
+def test_compiled_bank_is_what_the_definition_says(outputs: int) -> None:
+    shape = BankShape(2, outputs, 130, 12)
+    fast, slow = Bank(shape, 2, True), definition_of(Bank(shape, 2, True))
+    x, y = streams(190, 2, outputs)
+    x[50, 0, 1], y[60, 1, 0], x[70, 1, 0] = torch.nan, torch.nan, torch.inf
+    y[80, 0], x[90, 1] = 1e300, 1e12
+    x[150:160, 1] += 1e9  # gone for good: it starts afresh
+    for k in range(190):
+        lapse = None if k % 3 else torch.tensor([0.5, 2.0], dtype=torch.float64)
+        if k % 5:
+            for found, expected in zip(fast.predict(x[k]), slow.predict(x[k]), strict=True):
+                torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-6)
+        fast.learn(x[k], y[k].contiguous(), lapse)
+        slow.learn(x[k], y[k], lapse)
+        slow.table.copy_(fast.table)  # a step from equal states: rounding does not add up
+    assert torch.equal(fast.skipped, slow.skipped)
+    assert int(fast.skipped.sum()) > 3
+
+
+def test_bank_predicts_within_its_noise_and_says_so() -> None:
+    x, y = streams(400, 2)
+    model = st.StaFRegressor(memory=200, neighbours=16)
+    scores = []
+    for k in range(400):
+        if k > 200:
+            mean, std = model.predict(x[k], return_std=True)
+            scores.append(torch.stack((mean - y[k, :, 0], (mean - y[k, :, 0]) / std)))
+        model.partial_fit(x[k], y[k, :, 0])
+    error, z = torch.stack(scores, 1).square().mean((1, 2)).sqrt()
+    assert float(error) < 0.15  # the noise is 0.1
+    assert 0.85 < float(z) < 1.25
+
+
+def test_raw_units_predict_as_standard_ones() -> None:
+    x, y = streams(150, 1)
+    plain = st.StaFRegressor(memory=128, neighbours=12).fit(x[:, 0], y[:, 0, 0])
+    raw = st.StaFRegressor(memory=128, neighbours=12).fit(1e3 * x[:, 0] - 5e4, 1e-4 * y[:, 0, 0] + 7)
+    found = (raw.predict(1e3 * x[0, 0] - 5e4) - 7) / 1e-4
+    torch.testing.assert_close(
+        found, plain.predict(x[0, 0]), rtol=0, atol=0.01
+    )  # units count before they are known
+
+
+def test_streams_have_the_same_bits_alone_and_beside_others() -> None:
+    x, y = streams(150, 5)
+    y[40, 1], x[60, 3] = torch.nan, 1e250
+    together = st.StaFRegressor(memory=128, neighbours=8).fit(x, y[..., 0])
+    for i in range(5):
+        alone = st.StaFRegressor(memory=128, neighbours=8).fit(x[:, i], y[:, i, 0])
+        assert torch.equal(together.predict(x[0])[i], alone.predict(x[0, i]))
+
+
+def test_size_does_not_grow_with_the_stream() -> None:
+    x, y = streams(300, 1)
+    model = st.StaFRegressor(memory=128, neighbours=8).fit(x[:2], y[:2, :, 0])
+    before = model.state_dict()["table"].numel()
+    for state, value in zip(x[2:], y[2:, :, 0], strict=True):
+        model.partial_fit(state, value)
+    assert model.state_dict()["table"].numel() == before
+
+
+@pytest.mark.parametrize("memory", [None, 128])
+def test_saved_state_goes_on_bit_for_bit(memory: int | None, tmp_path: object) -> None:
+    x, y = streams(120, 3, outputs=2)
+    whole = st.StaFRegressor(memory=memory, neighbours=8, scaling=True)
+    again = st.StaFRegressor(memory=memory, neighbours=8, scaling=True)
+    for k in range(30):
+        whole.partial_fit(x[k], y[k])
+    torch.save(whole.state_dict(), f"{tmp_path}/state.pt")
+    again.load_state_dict(torch.load(f"{tmp_path}/state.pt", weights_only=True))
+    for k in range(30, 120):
+        whole.partial_fit(x[k], y[k])
+        again.partial_fit(x[k], y[k])
+    assert torch.equal(whole.predict(x[0]), again.predict(x[0]))
+
+
+@pytest.mark.parametrize("memory", [None, 128])
+def test_streams_come_and_go_without_touching_the_others(memory: int | None) -> None:
+    x, y = streams(140, 4)
+    model = st.StaFRegressor(memory=memory, neighbours=8)
+    alone = st.StaFRegressor(memory=memory, neighbours=8)
+    for k in range(60):
+        model.partial_fit(x[k, :3], y[k, :3, 0])
+        alone.partial_fit(x[k, 2], y[k, 2, 0])
+    model.drop([0]).add(2).reset(streams=[0])
+    assert model.n_streams_ == 4
+    assert model.n_samples_seen_.tolist()[1:] == [60, 0, 0]
+    fresh = st.StaFRegressor(memory=memory, neighbours=8)
+    for k in range(60, 140):
+        model.partial_fit(x[k, [1, 2, 3, 0]], y[k, [1, 2, 3, 0], 0])
+        alone.partial_fit(x[k, 2], y[k, 2, 0])
+        fresh.partial_fit(x[k, 1], y[k, 1, 0])
+    found = model.predict(x[0, [1, 2, 3, 0]])
+    assert torch.equal(found[1], alone.predict(x[0, 2]))
+    assert torch.equal(found[0], fresh.predict(x[0, 1]))

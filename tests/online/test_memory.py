@@ -1,0 +1,240 @@
+"""Local models kept along the way."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from pathlib import Path
+
+import hydra
+import pytest
+import torch
+from helpers import basis_of, tensor, uniform
+from omegaconf import DictConfig
+from torch import Tensor
+
+import staf_torch as st
+from staf_torch.cli.staf import config_directory
+from staf_torch.experiments import memory as experiment
+from staf_torch.experiments.registry import EXPERIMENTS
+
+V = st.targets.Paper()
+
+
+def circle(count: int, turns: float = 1.0) -> Tensor:
+    angle = turns * 2 * math.pi * torch.arange(count, dtype=torch.float64) / count
+    return torch.stack((angle.cos(), angle.sin()), dim=-1)
+
+
+def filled(memory: st.ExperienceMemory, x: Tensor, target: object = V) -> st.ExperienceMemory:
+    """With the ideal models at the states (..., T, n)."""
+    basis = memory.basis
+    for state in x.unbind(-2):
+        memory.add(state, basis.local(state).fit(basis.values(state, target)))  # type: ignore[arg-type]
+    return memory
+
+
+@pytest.mark.parametrize("kernel", ["exponential", "gaussian", "matern52", "polynomial", "user_defined"])
+def test_stored_state_answers_with_its_own_model(kernel: str) -> None:
+    basis = basis_of(kernel, radius=0.1)
+    x = circle(20)
+    memory = filled(st.ExperienceMemory(basis, 20), x)
+    assert int(memory.count) == 20
+    local = basis.local(x)
+    own = local.evaluate(torch.zeros(20, 1, 2, dtype=torch.float64), local.fit(basis.values(x, V)))
+    torch.testing.assert_close(memory.query(x), own.squeeze(-1), rtol=1e-4, atol=1e-4)
+
+
+def test_weights_are_a_partition_of_unity() -> None:
+    """What every local model has exactly, a quadratic, the blend has exactly, with its gradient."""
+    basis = basis_of("polynomial", radius=0.1)  # degree 3: six centers fit every quadratic
+    basis = st.StaFBasis(st.PolynomialKernel(2), basis.centers)
+    target = st.targets.Quadratic([[2.0, 0.5], [0.5, 1.0]])
+    memory = filled(st.ExperienceMemory(basis, 40), circle(40), target)
+    y = circle(171) * 1.05
+    torch.testing.assert_close(memory(y), target(y), rtol=0, atol=1e-9)
+    expected = 2 * y @ tensor([[2.0, 0.5], [0.5, 1.0]])
+    torch.testing.assert_close(memory.gradient(y), expected, rtol=0, atol=1e-7)
+
+
+def test_blend_is_smooth() -> None:
+    memory = filled(st.ExperienceMemory(basis_of("gaussian", radius=0.1), 30), circle(30))
+    y = 1.03 * circle(7)
+    assert torch.autograd.gradcheck(memory.query, (y.requires_grad_(),), atol=1e-5)
+    line = torch.linspace(0, 0.4, 4001, dtype=torch.float64)
+    path = torch.stack((line.cos(), line.sin()), dim=-1)
+    slopes = memory.gradient(path)
+    assert float((slopes[1:] - slopes[:-1]).norm(dim=-1).max()) < 0.02  # no jumps where supports begin
+
+
+def test_places_that_no_model_reaches_are_not_a_number() -> None:
+    memory = filled(st.ExperienceMemory(basis_of("exponential", radius=0.1), 8, reach=2.0), circle(1))
+    y = tensor([[1.15, 0.0], [1.25, 0.0], [-40.0, 0.0]])
+    assert memory.covered(y).tolist() == [True, False, False]
+    assert memory.query(y).isnan().tolist() == [False, True, True]
+    start = memory.start(y)
+    assert start.isnan().all(-1).tolist() == [False, True, True]
+    assert not memory.covered(tensor([[0.0, 0.0]])).item()
+
+
+def test_full_memory_leaves_no_gap_behind() -> None:
+    memory = filled(st.ExperienceMemory(basis_of("gaussian", radius=0.1), 48, reach=2.5), circle(500))
+    assert int(memory.count) == 48
+    assert memory.covered(circle(700)).all()
+    assert float((memory.query(circle(700)) - V(circle(700))).abs().max()) < 0.02
+
+
+def test_one_model_is_kept_where_there_is_room_for_one() -> None:
+    memory = filled(st.ExperienceMemory(basis_of("gaussian", radius=0.1), 1), circle(10))
+    assert int(memory.count) == 1
+    torch.testing.assert_close(memory.states[0], circle(10)[-1])
+
+
+def test_fresher_model_takes_the_place_of_the_stale_one() -> None:
+    memory = st.ExperienceMemory(basis_of("gaussian", radius=0.1), 60)
+    filled(memory, circle(200), st.targets.Quadratic(3.0))
+    count = int(memory.count)
+    filled(memory, circle(200))
+    assert int(memory.count) <= count + 2
+    assert float((memory.query(circle(300)) - V(circle(300))).abs().max()) < 0.01
+
+
+def test_last_model_is_refreshed_while_the_state_stays() -> None:
+    basis, x = basis_of("gaussian", radius=0.1), tensor([1.0, 0.0])
+    memory = st.ExperienceMemory(basis, 5)
+    for share in (0.0, 0.5, 1.0):
+        memory.add(x, share * basis.local(x).fit(basis.values(x, V)))
+    assert int(memory.count) == 1
+    assert abs(float(memory.query(x.unsqueeze(0)) - V(x))) < 1e-3
+
+
+def test_every_row_has_a_memory_of_its_own() -> None:
+    basis, x = (
+        basis_of("exponential", radius=0.1),
+        torch.stack((circle(30), 0.5 * circle(30, 0.4), circle(30))),
+    )
+    x[2, 5] = torch.nan
+    together = filled(st.ExperienceMemory(basis, 16, (3,)), x)
+    y = x[:, ::7] + 0.01
+    for i in range(2):
+        alone = filled(st.ExperienceMemory(basis, 16), x[i])
+        torch.testing.assert_close(together.states[i], alone.states)
+        torch.testing.assert_close(together.query(y)[i], alone.query(y[i]), equal_nan=True)
+        torch.testing.assert_close(together.start(x[:, 3])[i], alone.start(x[i, 3]), equal_nan=True)
+    assert torch.isfinite(together.states).all()
+    assert torch.isfinite(together.coefficients).all()
+    without = filled(st.ExperienceMemory(basis, 16), x[2, [k for k in range(30) if k != 5]])
+    torch.testing.assert_close(together.states[2], without.states)
+
+
+def test_state_dict_round_trip() -> None:
+    memory = filled(st.ExperienceMemory(basis_of("gaussian", radius=0.1), 20), circle(60))
+    other = st.ExperienceMemory(basis_of("gaussian", radius=0.1), 20)
+    other.load_state_dict(memory.state_dict())
+    y = 1.02 * circle(50)
+    torch.testing.assert_close(other.query(y), memory.query(y), rtol=0, atol=0, equal_nan=True)
+    filled(memory, circle(60) * 1.1)
+    filled(other, circle(60) * 1.1)  # what comes next is the same as well
+    assert torch.equal(other.states, memory.states)
+
+
+def test_start_is_the_ideal_fit_of_what_is_remembered() -> None:
+    basis = st.StaFBasis(st.PolynomialKernel(2), st.StateFollowingCenters(st.rings(6), 0.1))
+    target = st.targets.Quadratic(1.5)
+    memory = filled(st.ExperienceMemory(basis, 40, reach=1.0), circle(40), target)
+    x = circle(23)
+    ideal = basis.local(x).fit(basis.values(x, target))
+    torch.testing.assert_close(memory.start(x), ideal, rtol=0, atol=1e-8)  # also beyond the supports
+
+
+def test_bad_arguments_are_named() -> None:
+    basis = basis_of("gaussian")
+    with pytest.raises(ValueError, match=r"basis.*must be a StaFBasis"):
+        st.ExperienceMemory(None, 3)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"capacity.*at least 1"):
+        st.ExperienceMemory(basis, 0)
+    with pytest.raises(ValueError, match=r"reach.*must be positive"):
+        st.ExperienceMemory(basis, 3, reach=0.0)
+    with pytest.raises(ValueError, match=r"spacing.*must be positive"):
+        st.ExperienceMemory(basis, 3, spacing=-1.0)
+    memory = st.ExperienceMemory(basis, 3, (2,))
+    with pytest.raises(ValueError, match=r"x=.*must have the shape \(2, 2\)"):
+        memory.add(uniform(3, 2), uniform(3, 6))
+    with pytest.raises(ValueError, match=r"coefficients=.*6 entries"):
+        memory.add(uniform(2, 2), uniform(2, 3))
+
+
+def settings(*overrides: str) -> DictConfig:
+    small = ["memory.states=40", "memory.revisits=8", "memory.steps=40", "settle_time=2", "duration=5.2"]
+    with hydra.initialize_config_dir(config_directory(), version_base="1.3"):
+        return hydra.compose("config", ["experiment=memory", *small, *overrides])
+
+
+def test_revisited_region_settles_in_one_step_from_the_memory(tmp_path: Path) -> None:
+    assert "memory" in EXPERIMENTS
+    metrics = experiment.run(settings(), tmp_path)
+    assert json.loads((tmp_path / "metrics.json").read_text()) == metrics
+    found = {name: number for name, number in metrics.items() if number is not None}
+    assert found["revisit_steps_memory"] == 1
+    assert found["revisit_steps_carried"] > 5
+    assert found["revisit_steps_zero"] > 5
+    assert 100 * found["revisit_excess_memory"] < found["revisit_excess_carried"]
+    assert found["covered_fraction"] == 1
+    assert found["memory_max_error"] <= found["passing_max_error"]
+    assert 100 * found["memory_max_error"] < found["last_max_error"]
+    assert len(list(csv.DictReader((tmp_path / "memory.csv").read_text().splitlines()))) == 1
+    assert "carried weights" in (tmp_path / "memory.md").read_text()
+    for suffix in ("png", "pdf"):
+        assert (tmp_path / "figures" / f"memory.{suffix}").stat().st_size > 5000
+
+
+def test_common_settings_hold(tmp_path: Path) -> None:
+    overrides = ["trajectories=2", "kernel=gaussian", "centers.radius=0.2", "duration=7", "figures=false"]
+    metrics = experiment.run(settings(*overrides, "dt=0.05", "memory.capacity=16"), tmp_path)
+    assert metrics["models"] == 16
+    assert not (tmp_path / "figures").exists()
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("memory.capacity=0", r"memory\.capacity.*at least 1"),
+        ("memory.reach=-1", r"memory\.reach.*must be positive"),
+        ("settle_time=100", r"settle_time.*within the duration"),
+    ],
+)
+def test_bad_settings_are_named(override: str, message: str, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=message):
+        experiment.run(settings(override), tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+def noisy_laps(laps: int, scale: float, visits: int = 64) -> float:
+    """Error of a memory that met every place so often, each model with noise of its own."""
+    basis, x = basis_of("gaussian", radius=0.1), circle(30)
+    memory = st.ExperienceMemory(basis, 40, visits=visits)
+    draw = torch.Generator().manual_seed(0)
+    for _ in range(laps):
+        for state in x:
+            values = basis.values(state, V)
+            noise = scale * torch.randn(values.shape[-1:], generator=draw, dtype=torch.float64)
+            memory.add(state, basis.local(state).fit(values + noise))
+    return float((memory.query(x) - V(x)).square().mean().sqrt())
+
+
+def test_noise_goes_down_with_the_root_of_the_visits() -> None:
+    once, often = noisy_laps(1, 0.1), noisy_laps(50, 0.1)
+    assert often < 0.25 * once  # 1 / 7 but for the first visits
+    assert noisy_laps(50, 0.1, visits=1) > 0.5 * once
+
+
+def test_average_begins_anew_where_the_function_drifts() -> None:
+    basis, x = basis_of("gaussian", radius=0.1), circle(30)
+    memory = st.ExperienceMemory(basis, 40)
+    for lap in range(12):
+        share = 1.0 if lap < 8 else -1.0
+        for state in x:
+            noise = 1e-3 * uniform(6, seed=lap)
+            memory.add(state, basis.local(state).fit(share * basis.values(state, V) + noise))
+    assert float((memory.query(x) + V(x)).abs().max()) < 0.01

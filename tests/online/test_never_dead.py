@@ -1,0 +1,124 @@
+"""A stream survives whatever finite number comes, and says so in its counts."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as some
+from torch import Tensor
+
+import staf_torch as st
+
+KERNELS = ["gaussian", "exponential", "matern", "inverse_multiquadric", "rational_quadratic"]
+MAGNITUDES = some.floats(-1e300, 1e300) | some.sampled_from([math.nan, math.inf, -math.inf, 5e-324, 0.0])
+
+
+def path(steps: int, dtype: torch.dtype = torch.float64) -> tuple[Tensor, Tensor]:
+    time = 0.1 * torch.arange(steps, dtype=torch.float64)
+    x = torch.stack((time.sin(), (1.3 * time).cos()), -1)
+    return x.to(dtype), (2 * x).sin().sum(-1).to(dtype)
+
+
+def error_after(model: st.StaFRegressor, x: Tensor, y: Tensor) -> float:
+    """Prequential error over the later half."""
+    found = []
+    for state, value in zip(x, y, strict=True):
+        found.append(float(model.predict(state) - value))
+        model.partial_fit(state, value)
+    late = found[len(found) // 2 :]
+    return math.sqrt(sum(e * e for e in late) / len(late))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("kernel", KERNELS)
+@pytest.mark.parametrize("far", [1e3, 9999.0, 1e20, 1e37])
+def test_filter_recovers_from_a_far_input(kernel: str, far: float, dtype: torch.dtype) -> None:
+    x, y = path(100, dtype)
+    bad = x.clone()
+    bad[40] = far
+    bad[41] = -far
+    model = st.StaFRegressor(kernel, 0.4, noise=0.05)
+    for state, value in zip(bad, y, strict=True):
+        model.partial_fit(state, value)
+    assert error_after(model, x, y) < 0.3
+
+
+@pytest.mark.parametrize("memory", [None, 128])
+@pytest.mark.parametrize("value", [1e30, -1e200, 1e300])
+def test_target_out_of_all_proportion_is_not_believed(memory: int | None, value: float) -> None:
+    x, y = path(100)
+    bad = y.clone()
+    bad[45:48] = value
+    model = st.StaFRegressor(radius=0.4, noise=0.05, memory=memory, neighbours=8).fit(x, bad)
+    assert int(model.n_skipped_) == 3
+    assert error_after(model, x, y) < 0.3
+
+
+@pytest.mark.parametrize("memory", [None, 128])
+def test_stream_that_moves_away_for_good_starts_afresh_there(memory: int | None) -> None:
+    x, y = path(120)
+    model = st.StaFRegressor(radius=0.4, noise=0.05, memory=memory, neighbours=8).fit(x, y)
+    assert error_after(model, x + 1e7, y * 1e9) < 0.3e9
+    assert error_after(model, x, y) < 0.3
+
+
+@settings(max_examples=60, deadline=None)
+@given(some.lists(some.tuples(MAGNITUDES, MAGNITUDES, MAGNITUDES), min_size=1, max_size=25), some.booleans())
+def test_filter_is_alive_after_anything(samples: list[tuple[float, float, float]], single: bool) -> None:
+    dtype = torch.float32 if single else torch.float64
+    model = st.StaFRegressor(radius=0.4, noise=0.05)
+    for first, second, value in samples:
+        model.partial_fit(
+            torch.tensor([first, second], dtype=torch.float64).to(dtype), torch.tensor(value).to(dtype)
+        )
+    x, y = path(80, dtype)
+    for state, value in zip(x, y, strict=True):
+        model.partial_fit(state, value)
+    assert error_after(model, x, y) < 0.3
+
+
+@settings(max_examples=30, deadline=None)
+@given(some.lists(some.tuples(MAGNITUDES, MAGNITUDES, MAGNITUDES), min_size=1, max_size=25))
+def test_bank_is_alive_after_anything(samples: list[tuple[float, float, float]]) -> None:
+    model = st.StaFRegressor(memory=128, neighbours=8)
+    for first, second, value in samples:
+        model.partial_fit(
+            torch.tensor([first, second], dtype=torch.float64), torch.tensor(value, dtype=torch.float64)
+        )
+    x, y = path(80)
+    for state, value in zip(x, y, strict=True):
+        model.partial_fit(state, value)
+        assert torch.isfinite(model.predict(state))
+
+
+@pytest.mark.parametrize("memory", [None, 128])
+def test_constants_and_repeats_are_learned(memory: int | None) -> None:
+    model = st.StaFRegressor(radius=0.4, noise=0.05, memory=memory, neighbours=8)
+    for _ in range(150):
+        model.partial_fit(torch.zeros(3).double(), torch.tensor(2.5).double())
+    assert abs(float(model.predict(torch.zeros(3).double())) - 2.5) < 0.01
+
+
+@pytest.mark.parametrize("memory", [None, 128])
+def test_coordinate_that_was_not_measured_is_held_and_a_target_is_not_learned(memory: int | None) -> None:
+    x, y = path(100)
+    holed, told = x.clone(), y.clone()
+    holed[20::9, 0], told[25::10] = torch.nan, torch.nan
+    model = st.StaFRegressor(radius=0.4, noise=0.05, memory=memory, neighbours=8).fit(holed, told)
+    assert int(model.n_skipped_) == len(told[25::10])
+    assert math.isfinite(float(model.predict(torch.tensor([math.nan, 0.3], dtype=torch.float64))))
+    assert error_after(model, x, y) < 0.2
+
+
+def test_outliers_count_less_where_asked() -> None:
+    x, y = path(400)
+    draw = torch.Generator().manual_seed(0)
+    noisy = y + 0.05 * torch.randn(400, generator=draw, dtype=torch.float64)
+    noisy[20::25] += 20.0
+    plain = st.StaFRegressor(radius=0.4, noise=0.05).fit(x, noisy)
+    robust = st.StaFRegressor(radius=0.4, noise=0.05, robust=2.0).fit(x, noisy)
+    late = [float((m.predict(x[-4:]) - y[-4:]).abs().max()) for m in (plain, robust)]
+    assert late[1] < 0.5 * late[0]

@@ -1,0 +1,302 @@
+"""Online regression on streams."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+
+import numpy as np
+import pytest
+import torch
+from helpers import tensor, uniform
+from torch import Tensor
+from variants import KERNELS, Cauchy, over
+
+import staf_torch as st
+from staf_torch.online.kalman_filter import LocalFilter, StreamState
+from staf_torch.online.local_functions import LocalFunctions
+
+SEVERAL = tensor([[0.4, -0.7], [0.9, 0.3], [-0.2, 0.6]]).mT  # states (n, S)
+
+
+def frame_of(kernel: str, radius: float = 0.4, count: int = 6) -> LocalFunctions:
+    return LocalFunctions.of(KERNELS[kernel].make(), radius * st.rings(count))
+
+
+def walks(streams: int, steps: int, seed: int = 0) -> tuple[Tensor, Tensor]:
+    """Smooth paths (T, S, 2) and a function of them that drifts, with noise of 0.05."""
+    draw = torch.Generator().manual_seed(seed)
+    phase = 6.28 * torch.rand(2, streams, 2, generator=draw, dtype=torch.float64)
+    time = torch.arange(steps, dtype=torch.float64)[:, None, None]
+    x = (0.05 * time + phase[0]).sin() * tensor([1.0, 0.7])
+    noise = 0.05 * torch.randn(steps, streams, generator=draw, dtype=torch.float64)
+    return x, (2 * x + phase[1] + 0.01 * time).sin().sum(-1) + noise
+
+
+def learned(model: st.StaFRegressor, x: Tensor, y: Tensor) -> st.StaFRegressor:
+    for state, value in zip(x, y, strict=True):
+        model.partial_fit(state, value)
+    return model
+
+
+@over(KERNELS, "kernel")
+def test_function_at_the_new_centers_is_what_it_was(kernel: str) -> None:
+    frame = frame_of(kernel)
+    step, weights = 0.3 * uniform(2, 3, seed=1), uniform(6, 3, seed=2)
+    transfer, factor = frame.transfer(SEVERAL, step)
+    moved = (transfer * weights).sum(1) * (1.0 if factor is None else factor)
+
+    def value(x: Tensor, z: Tensor, u: Tensor) -> Tensor:
+        log_factor = frame.log_factor(x, z)
+        total = (frame.functions(x, z) * u).sum(0)
+        return total if log_factor is None else total * log_factor.exp()
+
+    for d in frame.offsets:
+        z = d.unsqueeze(-1).expand(2, 3)
+        new, old = value(SEVERAL + step, z, moved), value(SEVERAL, z + step, weights)
+        torch.testing.assert_close(new, old, rtol=1e-6, atol=1e-8)
+
+
+@over(KERNELS, "kernel")
+def test_transfer_is_a_contraction_and_no_move_changes_nothing(kernel: str) -> None:
+    frame = frame_of(kernel)
+    transfer = frame.transfer(SEVERAL, 0.5 * uniform(2, 3, seed=3))[0].permute(2, 0, 1)
+    assert float(torch.linalg.matrix_norm(transfer, 2).max()) <= 1 + 1e-7
+    stay = frame.transfer(SEVERAL, torch.zeros(2, 3, dtype=torch.float64))[0].permute(2, 0, 1)
+    torch.testing.assert_close(stay, torch.eye(6, dtype=torch.float64).expand(3, 6, 6), rtol=0, atol=1e-7)
+
+
+@over(KERNELS, "kernel")
+def test_basis_is_orthonormal_in_the_native_space(kernel: str) -> None:
+    """psi(d_i)'psi(d_j) = k0(d_i, d_j), so that the process is what the kernel says at the centers."""
+    frame = frame_of(kernel)
+    x = SEVERAL[:, :1].expand(2, 6)
+    psi = frame.functions(x, frame.offsets.mT)
+    expected = frame.kernel.core(SEVERAL[:, 0], frame.offsets, frame.offsets)
+    torch.testing.assert_close(psi.mT @ psi, expected, rtol=1e-7, atol=1e-9)
+    torch.testing.assert_close(frame.variance(x, frame.offsets.mT), expected.diagonal())
+
+
+@over(KERNELS, "kernel")
+def test_around_one_anchor_the_filter_is_gaussian_process_regression(kernel: str) -> None:
+    """u | y of y = psi'u + rest + noise in one solve, the rests independent."""
+    frame, ratio = frame_of(kernel), 1e-3
+    z, y = 0.3 * uniform(2, 20, seed=4), uniform(20, seed=5)
+    state = StreamState.empty(torch.zeros(0).double(), 1, 2, 6, 1)
+    filter_ = LocalFilter(frame, tensor([ratio]), tensor([1.0]), slack=1.0)
+    filter_.learn(state, SEVERAL[:, :1].mT, tensor([[0.0]]))  # the first sample says where the centers are
+    state.parts(state.table).mean.zero_()
+    state.parts(state.table).learned.zero_()
+    for k in range(20):
+        filter_.learn(state, (SEVERAL[:, :1] + z[:, k : k + 1]).mT, y[k : k + 1, None])
+    x = SEVERAL[:, :1].expand(2, 20)
+    log_factor = frame.log_factor(x, z)
+    factor = torch.ones(20, dtype=torch.float64) if log_factor is None else log_factor.exp()
+    psi = frame.functions(x, z) * factor
+    rest = frame.variance(x, z) * factor.square() - psi.square().sum(0) + ratio
+    covariance = psi.mT @ psi + rest.diag()
+    torch.testing.assert_close(
+        state.mean[0, :, 0], psi @ torch.linalg.solve(covariance, y), rtol=1e-7, atol=1e-8
+    )
+    expected = psi @ torch.linalg.solve(covariance, psi.mT)
+    torch.testing.assert_close(state.learned[..., 0], expected, rtol=1e-7, atol=1e-8)
+
+
+@pytest.mark.parametrize("kernel", ["exponential", "gaussian", "matern52", "polynomial", "user_defined"])
+def test_drifting_functions_are_predicted(kernel: str) -> None:
+    x, y = walks(8, 250)
+    model = st.StaFRegressor(KERNELS[kernel].make(), radius=0.4, noise=0.05)
+    errors = []
+    for state, value in zip(x, y, strict=True):
+        if hasattr(model, "n_streams_"):
+            errors.append(model.predict(state) - value)
+        model.partial_fit(state, value)
+    error = torch.stack(errors)[100:].square().mean().sqrt()
+    persistence = (y[1:] - y[:-1])[100:].square().mean().sqrt()
+    assert float(error) < 0.9 * float(persistence)
+    assert float(error) < 0.1  # the noise is 0.05
+
+
+def test_standard_deviation_says_how_large_the_errors_are() -> None:
+    x, y = walks(16, 200)
+    model = learned(st.StaFRegressor(st.GaussianKernel(0.9), 0.4, noise=0.05), x[:50], y[:50])
+    scores = []
+    for state, value in zip(x[50:], y[50:], strict=True):
+        mean, std = model.predict(state, return_std=True)
+        scores.append((mean - value).square() / std.square())
+        model.partial_fit(state, value)
+    assert 0.7 < float(torch.stack(scores).mean()) < 1.4
+
+
+def test_streams_do_not_touch_each_other() -> None:
+    x, y = walks(5, 60)
+    together = learned(st.StaFRegressor(radius=0.3), x, y).predict(x[-1] + 0.1)
+    alone = [
+        learned(st.StaFRegressor(radius=0.3), x[:, i], y[:, i]).predict(x[-1, i] + 0.1) for i in range(5)
+    ]
+    torch.testing.assert_close(together, torch.stack(alone), rtol=1e-10, atol=1e-10)
+
+
+def test_samples_that_are_not_finite_are_skipped_and_counted() -> None:
+    x, y = walks(4, 40)
+    bad_x, bad_y = x.clone(), y.clone()
+    bad_x[10, 1, 0], bad_y[20, 2], bad_x[0, 3] = torch.inf, torch.inf, torch.nan
+    model = learned(st.StaFRegressor(radius=0.3), bad_x, bad_y)
+    assert model.n_skipped_.tolist() == [0, 1, 1, 1]
+    assert model.n_samples_seen_.tolist() == [40, 39, 39, 39]
+    kept = [k for k in range(40) if k != 10]
+    alone = learned(st.StaFRegressor(radius=0.3), x[kept, 1], y[kept, 1])
+    whole = learned(st.StaFRegressor(radius=0.3), x, y)
+    found = model.predict(x[-1])
+    torch.testing.assert_close(found[1], alone.predict(x[-1, 1]), rtol=1e-10, atol=1e-10)
+    torch.testing.assert_close(found[0], whole.predict(x[-1])[0], rtol=1e-10, atol=1e-10)
+    assert torch.isfinite(found).all()
+
+
+@pytest.mark.parametrize("kernel", ["exponential", "gaussian", "matern52", "user_defined"])
+def test_prediction_before_a_sample_changes_nothing_of_what_is_learned(kernel: str) -> None:
+    x, y = walks(4, 60)
+    plain, asked = (st.StaFRegressor(KERNELS[kernel].make(), 0.3, noise=0.05) for _ in range(2))
+    for k, (state, value) in enumerate(zip(x, y, strict=True)):
+        if k:
+            point = state + (k % 3 == 0)  # every third is another one than is learned
+            found = asked.predict(point, return_std=k % 2 == 0)
+            kept = copy.deepcopy(found)
+            point.copy_(state)  # in place: it is the values that count
+            asked.partial_fit(point, value)
+            assert torch.equal(torch.stack((*found,)), torch.stack((*kept,)))
+        else:
+            asked.partial_fit(state, value)
+        plain.partial_fit(state, value)
+    torch.testing.assert_close(asked._streams_.state.mean, plain._streams_.state.mean, rtol=1e-8, atol=1e-8)
+    torch.testing.assert_close(
+        asked._streams_.state.learned, plain._streams_.state.learned, rtol=1e-8, atol=1e-8
+    )
+
+
+def test_what_was_learned_fades_alike_beside_streams_that_skip() -> None:
+    """By a number for all while all learn, stream by stream otherwise; the number is renewed now and then."""
+    x, y = walks(2, 60)
+    broken = y.clone()
+    broken[::7, 1] = torch.nan
+    for forgetting in (0.999, 0.6):
+        whole = learned(st.StaFRegressor(radius=0.3, noise=0.05, forgetting=forgetting), x, y)
+        beside = learned(st.StaFRegressor(radius=0.3, noise=0.05, forgetting=forgetting), x, broken)
+        for name in ("mean", "learned"):
+            found, expected = (
+                getattr(beside._streams_.state, name)[..., 0],
+                getattr(whole._streams_.state, name)[..., 0],
+            )
+            torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-10)
+
+
+def test_skipped_sample_leaves_the_stream_as_it_was() -> None:
+    x, y = walks(2, 30)
+    model = learned(st.StaFRegressor(radius=0.3), x, y)
+    before = copy.deepcopy(model._streams_.state)
+    model.partial_fit(torch.full_like(x[0], torch.nan), y[0])
+    for name in ("anchor", "mean", "learned"):
+        assert torch.equal(getattr(before, name), getattr(model._streams_.state, name))
+
+
+def test_nothing_winds_up_in_a_stream_that_stands_still() -> None:
+    model = st.StaFRegressor(radius=0.3, forgetting=0.9)
+    for k in range(1500):
+        model.partial_fit(tensor([0.3, 0.1]), tensor(1.0 + 0.01 * (-1) ** k))
+    values = torch.linalg.eigvalsh(model._streams_.state.learned[..., 0])
+    assert float(values.min()) >= -1e-12
+    assert float(values.max()) <= 1 + 1e-12
+    assert abs(float(model.predict(tensor([0.3, 0.1]))) - 1) < 0.02
+
+
+def test_memory_does_not_grow_with_the_stream() -> None:
+    x, y = walks(3, 80)
+    model = learned(st.StaFRegressor(radius=0.3, count=10), x[:2], y[:2])
+    size = len(pickle.dumps(model))
+    assert len(pickle.dumps(learned(model, x[2:], y[2:]))) == size
+
+
+@pytest.mark.parametrize("jump", [3.0, 30.0])
+@pytest.mark.parametrize("kernel", ["exponential", "gaussian", "polynomial"])
+def test_jump_leaves_a_stream_that_learns_on(kernel: str, jump: float) -> None:
+    x, y = walks(2, 40)
+    model = learned(st.StaFRegressor(KERNELS[kernel].make(), 0.3, noise=0.05), x, y)
+    learned(model, x.flip(0) + jump, y.flip(0))
+    assert torch.isfinite(model.predict(x[0] + jump)).all()
+    assert model.n_skipped_.sum() == 0
+
+
+def test_single_precision_is_close_to_double() -> None:
+    x, y = walks(4, 80)
+    double = learned(st.StaFRegressor(radius=0.3, noise=0.05), x, y).predict(x[-1])
+    single = learned(st.StaFRegressor(radius=0.3, noise=0.05), x.float(), y.float()).predict(x[-1].float())
+    assert single.dtype == torch.float32
+    torch.testing.assert_close(single.double(), double, rtol=0, atol=2e-3)
+
+
+def test_parameters_follow_the_conventions_of_scikit_learn() -> None:
+    model = st.StaFRegressor(st.MaternKernel(), radius=0.2, count=10)
+    again = st.StaFRegressor(**copy.deepcopy(model.get_params(deep=False)))
+    assert again.get_params(deep=False).keys() == model.get_params(deep=False).keys()
+    assert again.set_params(radius=0.4, noise=0.1) is again
+    assert (again.radius, again.noise, model.radius) == (0.4, 0.1, 0.2)
+    x, y = walks(1, 20)
+    model.partial_fit(x[0, 0], y[0, 0])
+    fitted = [name for name in vars(model) if name.endswith("_")]
+    assert {"n_features_in_", "n_streams_"} <= set(fitted)
+    assert model.n_features_in_ == 2
+    assert model.n_streams_ is None
+    model.fit(x, y)
+    assert model.n_streams_ == 1
+    expected = learned(st.StaFRegressor(st.MaternKernel(), radius=0.2, count=10), x, y)
+    torch.testing.assert_close(model.predict(x[-1]), expected.predict(x[-1]), rtol=0, atol=0)
+    torch.testing.assert_close(pickle.loads(pickle.dumps(model)).predict(x[-1]), model.predict(x[-1]))
+    assert "radius=0.2" in repr(model)
+
+
+def test_arrays_give_arrays_and_every_point_of_a_stream_can_be_asked_for() -> None:
+    x, y = walks(3, 30)
+    model = st.StaFRegressor("gaussian", 0.3).fit(x.numpy(), y.numpy())
+    points = x[-4:].transpose(0, 1)  # (S, P, n)
+    several = model.predict(points.numpy())
+    assert isinstance(several, np.ndarray)
+    assert several.shape == (3, 4)
+    torch.testing.assert_close(torch.from_numpy(several[:, -1].copy()), model.predict(x[-1]))
+    single = st.StaFRegressor("gaussian", 0.3).fit(x[:, 0], y[:, 0])
+    assert single.predict(x[-4:, 0]).shape == (4,)
+    assert single.predict(x[-1, 0]).shape == ()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"kernel": "cubic"}, "kernel.*must be one of"),
+        ({"kernel": st.GaussianKernel(tensor([1.0, 2.0]))}, "kernel.*one value a hyperparameter"),
+        ({"radius": 0.0}, "radius.*must be positive"),
+        ({"count": 0}, "count.*at least 1"),
+        ({"noise": 1e-9}, "noise.*at least"),
+        ({"amplitude": -1.0}, "amplitude.*must be positive"),
+        ({"forgetting": 1.5}, r"forgetting.*in \(0, 1\]"),
+        ({"follow": -1.0}, "follow.*must not be negative"),
+    ],
+)
+def test_bad_arguments_are_named(arguments: dict[str, object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        st.StaFRegressor(**arguments).partial_fit(tensor([0.0, 1.0]), 1.0)  # type: ignore[arg-type]
+
+
+def test_bad_samples_are_named() -> None:
+    model = st.StaFRegressor(Cauchy())
+    with pytest.raises(ValueError, match="needs a first sample"):
+        model.predict(tensor([0.0]))
+    with pytest.raises(ValueError, match=r"must have the shape \(n,\) or \(S, n\)"):
+        model.partial_fit(uniform(3, 2), uniform(4))
+    with pytest.raises(ValueError, match=r"params.*must be one of"):
+        model.set_params(width=1.0)
+    model.partial_fit(uniform(3, 2), uniform(3))
+    with pytest.raises(ValueError, match=r"must have the shape \(3, 2\).*got the shape \(4, 2\)"):
+        model.partial_fit(uniform(4, 2), uniform(4))
+    with pytest.raises(ValueError, match=r"predict.*must have the shape \(3, 2\)"):
+        model.predict(uniform(3, 5))
+    with pytest.raises(ValueError, match="array of numbers"):
+        model.predict("no")

@@ -1,0 +1,262 @@
+"""Each law by its textbook property, and what all laws have in common."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from helpers_laws import iterate, quadratic
+from torch import Tensor
+from variants import DESCENDING, LAWS, RATED
+
+from staf_torch import optim
+from staf_torch.optim.objective import NativeError, Precomputed
+
+
+def excess_path(law: optim.UpdateLaw, objective: NativeError, steps: int) -> Tensor:
+    path = iterate(law, objective, torch.zeros_like(objective.values), steps)
+    return objective.excess(path, torch.linalg.solve(objective.gram, objective.values))
+
+
+@pytest.mark.parametrize("name", LAWS)
+@pytest.mark.parametrize("seed", range(3))
+def test_every_law_treats_each_row_of_a_batch_alone(name: str, seed: int) -> None:
+    objective = quadratic(seed=seed)
+    together = iterate(LAWS[name], objective, torch.zeros_like(objective.values), 6)
+    for row in range(objective.values.shape[0]):
+        known = Precomputed(*(None if f is None else f[row] for f in objective.precomputed))
+        alone = NativeError(objective.gram[row], objective.values[row], known)
+        path = iterate(LAWS[name], alone, torch.zeros_like(alone.values), 6)
+        torch.testing.assert_close(together[:, row], path, rtol=1e-11, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_a_row_that_is_not_finite_leaves_the_others_alone(name: str) -> None:
+    good, bad = quadratic(), quadratic()
+    gram, values = bad.gram.clone(), bad.values.clone()
+    gram[2], values[2] = torch.nan, torch.nan
+    zero = torch.zeros_like(values)
+    broken = iterate(LAWS[name], NativeError(gram, values, bad.precomputed), zero, 4)
+    others = [0, 1, 3, 4]
+    assert torch.equal(broken[:, others], iterate(LAWS[name], good, zero, 4)[:, others])
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_every_law_keeps_the_dtype_of_the_weights(name: str) -> None:
+    objective = quadratic()
+    single = NativeError(
+        objective.gram.float(),
+        objective.values.float(),
+        Precomputed(*(None if f is None else f.float() for f in objective.precomputed)),
+    )
+    assert iterate(LAWS[name], single, torch.zeros_like(single.values), 3).dtype == torch.float32
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_the_unit_of_the_weights_does_not_matter(name: str) -> None:
+    law, objective = LAWS[name], quadratic()
+    if name == "fixed absolute step":
+        pytest.skip("its step is stated in the unit of the weights")
+    factor = torch.linspace(0.5, 3.0, 5, dtype=torch.float64)[:, None]
+    row = None if objective.precomputed.row is None else objective.precomputed.row / factor
+    scaled = NativeError(objective.gram / factor[..., None], objective.values, Precomputed(row=row))
+    scaled = scaled._replace(precomputed=scaled.precomputed._replace(sampled=objective.precomputed.sampled))
+    weights = torch.zeros_like(objective.values)
+    state = law.begin(objective, weights, law.init(weights))
+    for _ in range(3):
+        weights, state = law.step(objective, weights, state)
+    other, other_state = weights * factor, law.rescale(state, factor)
+    for _ in range(3):
+        weights, state = law.step(objective, weights, state)
+        other, other_state = law.step(scaled, other, other_state)
+    torch.testing.assert_close(other, weights * factor, rtol=1e-8, atol=1e-10)
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_what_a_law_needs_may_be_known_beforehand_or_found_on_the_spot(name: str) -> None:
+    objective = quadratic()
+    low_high = torch.stack(objective.spectrum(), dim=-1)
+    ideal = objective.minimiser()
+    inverse = torch.linalg.inv(objective.gram)
+    known = objective.precomputed._replace(extremes=low_high, ideal=ideal, inverse=inverse)
+    assert LAWS[name].needs <= set(Precomputed._fields)
+    zero = torch.zeros_like(objective.values)
+    given = objective._replace(precomputed=known)
+    torch.testing.assert_close(iterate(LAWS[name], given, zero, 5), iterate(LAWS[name], objective, zero, 5))
+
+
+@pytest.mark.parametrize("name", RATED)
+@pytest.mark.parametrize("seed", range(3))
+def test_the_excess_shrinks_as_fast_as_the_law_promises(name: str, seed: int) -> None:
+    objective = quadratic(seed=seed)
+    low, high = objective.spectrum()
+    rate = RATED[name].contraction(high / low)
+    assert rate is not None
+    excess = excess_path(RATED[name], objective, 4)
+    assert bool((excess[1:] <= rate * excess[:-1] * (1 + 1e-9) + 1e-20).all())
+
+
+@pytest.mark.parametrize("name", DESCENDING)
+def test_a_descent_law_never_raises_the_excess(name: str) -> None:
+    excess = excess_path(DESCENDING[name], quadratic(condition=1e4), 40)
+    assert bool((excess[1:] <= excess[:-1] * (1 + 1e-9) + 1e-20).all())
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 6])
+def test_conjugate_gradients_are_exact_after_as_many_iterations_as_weights(count: int) -> None:
+    excess = excess_path(optim.ConjugateGradient(), quadratic(count=count), count + 5)
+    assert bool((excess[count:] < 1e-20 * excess[0]).all())
+
+
+@pytest.mark.parametrize("name", ["exact", "preconditioned by the core"])
+def test_an_exact_solve_takes_one_iteration(name: str) -> None:
+    excess = excess_path(LAWS[name], quadratic(), 1)
+    assert bool((excess[1] < 1e-24 * excess[0]).all())
+
+
+def test_jacobi_takes_one_iteration_on_a_diagonal_gram_matrix() -> None:
+    diagonal = torch.tensor([1.0, 10.0, 300.0], dtype=torch.float64)
+    objective = NativeError(torch.diag(diagonal), torch.ones(3, dtype=torch.float64))
+    path = iterate(optim.PreconditionedDescent("jacobi"), objective, torch.zeros(3).double(), 1)
+    torch.testing.assert_close(path[1], 1 / diagonal)
+
+
+def test_steepest_descent_meets_kantorovich_with_equality_in_the_worst_case() -> None:
+    objective = NativeError(torch.diag(torch.tensor([1.0, 50.0]).double()), torch.tensor([1.0, 1.0]).double())
+    excess = excess_path(optim.SteepestDescent(), objective, 5)
+    torch.testing.assert_close(excess[1:] / excess[:-1], torch.full((5,), (49 / 51) ** 2).double())
+
+
+@pytest.mark.parametrize(("name", "power"), [("heavy ball", 2), ("nesterov", 1)])
+def test_momentum_converges_at_its_rate(name: str, power: int) -> None:
+    excess = excess_path(LAWS[name], quadratic(condition=400.0), 300)
+    q = 400.0**-0.5
+    rate = ((1 - q) / (1 + q)) ** 2 if power == 2 else (1 - q)
+    measured = (excess[150] / excess[50]) ** 0.01
+    assert bool((measured < rate * 1.05).all())
+
+
+def test_heavy_ball_outruns_steepest_descent() -> None:
+    objective = quadratic(condition=1e3)
+    heavy, plain = (
+        excess_path(law, objective, 150)[-1] for law in (LAWS["heavy ball"], LAWS["steepest descent"])
+    )
+    assert bool((heavy < 1e-2 * plain).all())
+
+
+@pytest.mark.parametrize("name", ["heavy ball", "nesterov", "barzilai-borwein"])
+def test_a_law_that_could_blow_up_stays_bounded_under_restarts(name: str) -> None:
+    law, objective = LAWS[name], quadratic(condition=1e6)
+    weights = torch.zeros_like(objective.values)
+    none = objective.excess(weights, objective.minimiser())
+    for _ in range(60):  # two iterations from rest, over and over: plain heavy ball grows ninefold each time
+        weights = iterate(law, objective, weights, 2)[-1]
+    assert bool((objective.excess(weights, objective.minimiser()) < 100 * none).all())
+
+
+def test_an_absolute_step_that_is_too_long_gives_way_to_the_line_search() -> None:
+    objective = quadratic()
+    zero = torch.zeros_like(objective.values)
+    guarded = iterate(optim.FixedStep(1e3, relative=False), objective, zero, 3)
+    torch.testing.assert_close(guarded, iterate(optim.SteepestDescent(), objective, zero, 3))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_barzilai_borwein_never_ends_a_time_step_worse_than_it_began(seed: int) -> None:
+    excess = excess_path(optim.BarzilaiBorwein(), quadratic(condition=1e5, seed=seed), 60)
+    assert bool((excess <= excess[0] * (1 + 1e-9)).all())
+
+
+def test_barzilai_borwein_outruns_steepest_descent() -> None:
+    objective = quadratic(batch=50, condition=1e3)
+    laws = optim.BarzilaiBorwein(), optim.SteepestDescent()
+    raydan, cauchy = (excess_path(law, objective, 60)[-1].median() for law in laws)
+    assert float(raydan) < 1e-2 * float(cauchy)
+
+
+def test_recursive_least_squares_is_the_batch_fit_to_all_samples() -> None:
+    noise, prior = 0.3, 7.0
+    law = optim.RecursiveLeastSquares(process_noise=0.0, measurement_noise=noise, prior=prior)
+    objectives = [quadratic(seed=seed) for seed in range(4)]
+    weights = torch.zeros_like(objectives[0].values)
+    state = law.init(weights)
+    for objective in objectives:
+        state = law.begin(objective, weights, state)
+        weights, state = law.step(objective, weights, state)
+    information = torch.eye(4).double() / prior + sum(o.gram @ o.gram / noise for o in objectives)
+    right = sum((o.curvature(o.values) / noise for o in objectives), torch.zeros(()).double())
+    torch.testing.assert_close(weights, torch.linalg.solve(information, right))
+    torch.testing.assert_close(state[0], torch.linalg.inv(information))
+
+
+def test_recursive_least_squares_is_the_kalman_filter_of_drifting_weights() -> None:
+    law = optim.RecursiveLeastSquares(process_noise=0.5, measurement_noise=0.2, prior=2.0)
+    gram = torch.tensor([[3.0]]).double()
+    mean, variance, weights = 0.0, 2.0, torch.zeros(1).double()
+    state = law.init(weights)
+    for sample in (1.0, -2.0, 0.5):
+        objective = NativeError(gram, torch.tensor([sample]).double())
+        state = law.begin(objective, weights, state)
+        weights, state = law.step(objective, weights, state)
+        variance += 0.5
+        gain = 3 * variance / (9 * variance + 0.2)
+        mean, variance = mean + gain * (sample - 3 * mean), (1 - 3 * gain) * variance
+    torch.testing.assert_close(weights, torch.tensor([mean]).double())
+    torch.testing.assert_close(state[0], torch.tensor([[variance]]).double())
+
+
+def test_normalised_lms_projects_onto_the_weights_that_reproduce_the_sample() -> None:
+    objective = quadratic()
+    row, sampled = objective.sample()
+    start = torch.ones_like(objective.values)
+    moved = iterate(optim.NormalisedLMS(), objective, start, 1)[-1]
+    torch.testing.assert_close((row * moved).sum(-1), sampled)
+    along = (moved - start) / row  # parallel to the row: the nearest such weights
+    torch.testing.assert_close(along, along[:, :1].expand_as(along))
+
+
+def test_normalised_lms_says_what_it_misses() -> None:
+    bare = quadratic()._replace(precomputed=Precomputed())
+    with pytest.raises(ValueError, match="`row` and `sampled`"):
+        iterate(optim.NormalisedLMS(), bare, torch.zeros(5, 4).double(), 1)
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_weights_that_are_ideal_stay_finite_and_stay(name: str) -> None:
+    objective = quadratic()
+    ideal = objective.minimiser()
+    row = objective.precomputed.row
+    assert row is not None
+    at_ideal = objective.precomputed._replace(sampled=(row * ideal).sum(-1))
+    path = iterate(LAWS[name], objective._replace(precomputed=at_ideal), ideal, 5)
+    slack = 0.05 if name == "recursive least squares" else 1e-12  # its prior pulls towards zero
+    torch.testing.assert_close(path[-1], ideal, rtol=slack, atol=slack)
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_a_zero_quadratic_moves_nothing(name: str) -> None:
+    zero = torch.zeros(2, 3, dtype=torch.float64)
+    objective = NativeError(torch.zeros(2, 3, 3).double(), zero, Precomputed(row=zero, sampled=zero[:, 0]))
+    assert torch.equal(iterate(LAWS[name], objective, zero, 3)[-1], zero)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: optim.FixedStep(2.0),
+        lambda: optim.FixedStep(-1.0, relative=False),
+        lambda: optim.HeavyBall(1.0),
+        lambda: optim.HeavyBall(4.0, 0.9),
+        lambda: optim.HeavyBall(1.0, 1.0),
+        lambda: optim.Nesterov(1.5),
+        lambda: optim.Nesterov(1.0, 1.0),
+        lambda: optim.PreconditionedDescent("ilu"),
+        lambda: optim.RecursiveLeastSquares(measurement_noise=0.0),
+        lambda: optim.RecursiveLeastSquares(process_noise=-1.0),
+        lambda: optim.NormalisedLMS(2.0),
+        lambda: optim.SteepestDescent().with_step_size(1.0),
+    ],
+)
+def test_a_setting_that_would_diverge_is_refused(make: object) -> None:
+    assert callable(make)
+    with pytest.raises(ValueError, match=r"`.*`"):
+        make()

@@ -1,0 +1,178 @@
+"""`ChaseOptimizer` as a torch optimizer, and as the law that it runs."""
+
+from __future__ import annotations
+
+import copy
+import io
+
+import pytest
+import torch
+from helpers_laws import TARGET, basis, quadratic
+from torch import Tensor, nn
+from variants import LAWS
+
+from staf_torch import optim
+from staf_torch.optim.objective import NativeError
+
+USABLE = {name: law for name, law in LAWS.items() if name != "normalised lms"}
+
+
+def losses(objective: NativeError, weights: Tensor) -> Tensor:
+    """F(a) - ||V||^2, one a row."""
+    return torch.linalg.vecdot(weights, objective.curvature(weights) - 2 * objective.values)
+
+
+@pytest.mark.parametrize("name", USABLE)
+@pytest.mark.parametrize("summed", [True, False])
+def test_a_step_is_the_step_of_the_law_on_the_staf_quadratic(name: str, summed: bool) -> None:
+    law = USABLE[name]
+    x = torch.tensor([[1.0, 0.0], [0.3, -0.8]], dtype=torch.float64)
+    objective = NativeError(basis(radius=0.4).gram(x), TARGET(basis(radius=0.4).centers(x)))
+    parameter = nn.Parameter(torch.zeros(2, 3, dtype=torch.float64))
+    optimizer = optim.ChaseOptimizer([parameter], law, inner_steps=2)
+
+    def closure() -> Tensor:
+        found = losses(objective, parameter)
+        return found.sum() if summed else found
+
+    weights = torch.zeros(2, 3, dtype=torch.float64)
+    state = law.init(weights)
+    for _ in range(4):
+        before = losses(objective, weights)
+        loss = optimizer.step(closure)
+        torch.testing.assert_close(loss, before.sum() if summed else before)
+        state = law.begin(objective, weights, state)
+        for _ in range(2):
+            weights, state = law.step(objective, weights, state)
+        torch.testing.assert_close(parameter.detach(), weights, rtol=1e-7, atol=1e-9)
+
+
+def test_it_works_beside_adam_on_the_other_parameters() -> None:
+    objective = quadratic()
+    mine = nn.Parameter(torch.zeros(5, 4, dtype=torch.float64))
+    other = nn.Parameter(torch.ones(3, dtype=torch.float64))
+    adam = torch.optim.Adam([other], lr=0.1)
+    chaser = optim.ChaseOptimizer([mine], optim.ConjugateGradient(), inner_steps=4)
+    for _ in range(3):
+        adam.zero_grad()
+        chaser.zero_grad()
+        chaser.step(lambda: losses(objective, mine).sum() + other.square().sum())
+        assert other.grad is None
+        other.square().sum().backward()
+        adam.step()
+    torch.testing.assert_close(mine.detach(), objective.minimiser())
+    assert bool((other < 1).all())
+
+
+def test_a_loss_of_several_parameters_moves_each_and_skips_what_it_does_not_use() -> None:
+    first, second = quadratic(seed=1), quadratic(seed=2)
+    a, b, unused, frozen = (nn.Parameter(torch.zeros(5, 4, dtype=torch.float64)) for _ in range(4))
+    frozen.requires_grad_(False)
+    optimizer = optim.ChaseOptimizer([a, b, unused, frozen], optim.Exact())
+    optimizer.step(lambda: losses(first, a).sum() + losses(second, b).sum())
+    torch.testing.assert_close(a.detach(), first.minimiser())
+    torch.testing.assert_close(b.detach(), second.minimiser())
+    assert not bool(unused.any())
+    assert not bool(frozen.any())
+
+
+@pytest.mark.parametrize(
+    "name", ["heavy ball", "recursive least squares", "barzilai-borwein", "steepest descent"]
+)
+def test_a_run_goes_on_from_its_state_dict(name: str) -> None:
+    objective = quadratic()
+
+    def fresh() -> tuple[nn.Parameter, optim.ChaseOptimizer]:
+        parameter = nn.Parameter(torch.zeros(5, 4, dtype=torch.float64))
+        return parameter, optim.ChaseOptimizer([parameter], USABLE[name])
+
+    def advance(parameter: nn.Parameter, optimizer: optim.ChaseOptimizer) -> None:
+        for _ in range(3):
+            optimizer.step(lambda: losses(objective, parameter))
+
+    parameter, optimizer = fresh()
+    advance(parameter, optimizer)
+    file = io.BytesIO()
+    torch.save(optimizer.state_dict(), file)
+    file.seek(0)
+    other, resumed = fresh()
+    other.data.copy_(parameter.data)
+    resumed.load_state_dict(torch.load(file, weights_only=True))
+    advance(parameter, optimizer)
+    advance(other, resumed)
+    assert torch.equal(parameter, other)
+
+
+def test_a_scheduler_drives_the_step_size() -> None:
+    objective = quadratic()
+    parameter = nn.Parameter(torch.zeros(5, 4, dtype=torch.float64))
+    optimizer = optim.ChaseOptimizer([parameter], optim.FixedStep(1.0))
+    scheduler = torch.optim.lr_scheduler.StepLR(optimizer, step_size=1, gamma=0.5)
+    weights = torch.zeros(5, 4, dtype=torch.float64)
+    for size in (1.0, 0.5, 0.25):
+        assert optimizer.param_groups[0]["lr"] == size
+        optimizer.step(lambda: losses(objective, parameter))
+        scheduler.step()
+        weights, _ = optim.FixedStep(size).step(objective, weights, ())
+        torch.testing.assert_close(parameter.detach(), weights)
+
+
+def test_a_rate_of_zero_stands_still_and_a_law_without_a_step_size_has_no_rate() -> None:
+    objective = quadratic()
+    parameter = nn.Parameter(torch.zeros(5, 4, dtype=torch.float64))
+    optimizer = optim.ChaseOptimizer([parameter], optim.Nesterov())
+    optimizer.param_groups[0]["lr"] = 0.0
+    optimizer.step(lambda: losses(objective, parameter))
+    assert not bool(parameter.any())
+    assert "lr" not in optim.ChaseOptimizer([parameter], optim.HeavyBall()).param_groups[0]
+
+
+def test_groups_have_their_own_number_of_iterations() -> None:
+    objective = quadratic()
+    one, many = (nn.Parameter(torch.zeros(5, 4, dtype=torch.float64)) for _ in range(2))
+    optimizer = optim.ChaseOptimizer([one], optim.ConjugateGradient())
+    optimizer.add_param_group({"params": [many], "inner_steps": 4})
+    optimizer.step(lambda: losses(objective, one) + losses(objective, many))
+    torch.testing.assert_close(many.detach(), objective.minimiser())
+    assert not torch.allclose(one.detach(), objective.minimiser())
+    assert copy.deepcopy(optimizer).param_groups[1]["inner_steps"] == 4
+
+
+def test_a_loss_that_is_linear_moves_nothing() -> None:
+    parameter = nn.Parameter(torch.zeros(2, 3, dtype=torch.float64))
+    optimizer = optim.ChaseOptimizer([parameter], optim.SteepestDescent())
+    optimizer.step(lambda: (2 * parameter).sum())
+    assert not bool(parameter.any())
+
+
+def test_a_vector_is_one_problem_and_single_precision_stays() -> None:
+    parameter = nn.Parameter(torch.zeros(3))
+    target = torch.tensor([1.0, -2.0, 0.5])
+    optimizer = optim.ChaseOptimizer([parameter], optim.SteepestDescent())
+    optimizer.step(lambda: (parameter - target).square().sum())
+    torch.testing.assert_close(parameter.detach(), target)
+
+
+def test_what_it_cannot_use_is_refused_in_a_sentence() -> None:
+    parameter = nn.Parameter(torch.zeros(2, 3, dtype=torch.float64))
+    with pytest.raises(ValueError, match=r"ChaseOptimizer\(law=\.\.\.\)` must not need a sample"):
+        optim.ChaseOptimizer([parameter], optim.NormalisedLMS())
+    with pytest.raises(ValueError, match=r"ChaseOptimizer\(law=\.\.\.\)` must be an UpdateLaw"):
+        optim.ChaseOptimizer([parameter], "exact")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"ChaseOptimizer\(inner_steps=\.\.\.\)` must be at least 1"):
+        optim.ChaseOptimizer([parameter], optim.Exact(), inner_steps=0)
+    with pytest.raises(ValueError, match=r"ChaseOptimizer\(params=\.\.\.\)` must be floating-point tensors"):
+        optim.ChaseOptimizer([nn.Parameter(torch.zeros(()))], optim.Exact())
+    optimizer = optim.ChaseOptimizer([parameter], optim.SteepestDescent())
+    with pytest.raises(ValueError, match="must be a function"):
+        optimizer.step()
+    with pytest.raises(ValueError, match="must return a differentiable loss"):
+        optimizer.step(lambda: torch.zeros(()))
+
+    def backward() -> Tensor:
+        loss = parameter.square().sum()
+        loss.backward()
+        return loss
+
+    with pytest.raises(ValueError, match="without calling `backward`"):
+        optimizer.step(backward)

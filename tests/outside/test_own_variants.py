@@ -1,0 +1,109 @@
+"""Variants from outside the package, one class and one YAML each: as in conf/README.md."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+from command_line import ROOT, environment
+
+from staf_torch import envs
+from staf_torch.tables import collect
+
+PAGE = (ROOT / "conf" / "README.md").read_text(encoding="utf-8")
+FILES = dict(re.findall(r"^`([\w./]+)`\n\n```(?:python|yaml)\n(.*?)^```$", PAGE, re.DOTALL | re.MULTILINE))
+COMMANDS = re.search(r"^## Run them\n\n```\n(.*?)^```$", PAGE, re.DOTALL | re.MULTILINE)[1].splitlines()
+TABLE, SHEET = 3, 5  # which of the commands
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A user's working directory, in which all commands have run."""
+    folder = tmp_path_factory.mktemp("outside")
+    for name, text in FILES.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(text)
+    (folder / "jobs.json").write_text(json.dumps(COMMANDS))
+    program = [sys.executable, str(Path(__file__).with_name("commands.py")), "jobs.json", "results.json"]
+    ended = subprocess.run(
+        program, cwd=folder, env=environment(), capture_output=True, text=True, check=False
+    )
+    assert ended.returncode == 0, ended.stderr
+    return folder
+
+
+@pytest.fixture(scope="module")
+def said(place: Path) -> list[str]:
+    """What each command wrote to the terminal."""
+    results = json.loads((place / "results.json").read_text())
+    for command, (code, text) in zip(COMMANDS, results, strict=True):
+        assert code == 0, f"{command}\n{text}"
+    return [text for _, text in results]
+
+
+def test_a_variant_is_one_class_and_one_yaml() -> None:
+    modules = [name for name in FILES if name.endswith(".py")]
+    groups = [Path(name).parent.name for name in FILES if name.endswith(".yaml")]
+    assert sorted(groups) == ["experiment", "kernel", "metric", "optimizer", "system", "target"]
+    assert len(modules) == len(groups)
+
+
+def test_own_variants_run_and_their_metric_is_declared_in_the_record(place: Path, said: list[str]) -> None:
+    metrics = json.loads((place / "runs/own/metrics.json").read_text())
+    record = json.loads((place / "runs/own/run.json").read_text())
+    assert metrics["digits"] > 1
+    assert metrics["products_per_second"] == pytest.approx(1100)
+    assert record["metrics"] == {"digits": {"unit": "digits", "larger_is_better": True, "headline": True}}
+    assert {key: record["settings"][key] for key in ("kernel", "optimizer", "system", "target")} == {
+        "kernel": "cauchy",
+        "optimizer": "cautious",
+        "system": "trolley",
+        "target": "valley",
+    }
+
+
+def test_a_sweep_over_own_hyperparameters_has_a_row_for_each(place: Path, said: list[str]) -> None:
+    runs = collect(place / "runs/sweep").rows
+    assert [run.status for run in runs] == ["completed"] * 4
+    points = {(run.setting("kernel.width"), run.setting("optimizer.share")) for run in runs}
+    assert points == {(width, share) for width in (0.7, 1.0) for share in (0.5, 1.0)}
+    assert len({run.metrics["digits"] for run in runs}) == 4
+
+
+def test_an_own_experiment_is_swept(place: Path, said: list[str]) -> None:
+    near, far = (run.metrics["distance"] for run in collect(place / "runs/closeness").rows)
+    assert near is not None
+    assert far is not None
+    assert 0 < near < far
+
+
+def test_a_table_sorts_and_marks_an_own_metric_by_its_declaration(place: Path, said: list[str]) -> None:
+    runs = collect(place / "runs/sweep").rows
+    best = max(run.metrics["digits"] for run in runs)
+    rows = [line for line in said[TABLE].splitlines() if line.startswith("|")][2:]
+    assert f"**{best:.3g}**" in rows[0]
+    shown = [float(row.replace("*", "").split("|")[-3]) for row in rows]  # before the ball error
+    assert shown == sorted(shown, reverse=True)
+
+
+def test_the_sheet_of_an_own_plant_has_its_units(place: Path, said: list[str]) -> None:
+    assert "m, m/s" in said[SHEET]
+    assert "| N |" in said[SHEET]
+
+
+def test_an_own_plant_is_an_environment_by_its_dotted_path(
+    place: Path, said: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(place))
+    plants = gymnasium.make_vec(envs.OWN_PLANT, num_envs=8, plant="trolley.Trolley")
+    seen, _ = plants.reset(seed=0)
+    assert seen.shape == (8, 2)
+    assert 0.1 < np.abs(seen).max() <= 0.25  # the plant's own spread
+    with pytest.raises(ValueError, match=r"`PlantEnv\(plant=...\)` cannot be imported"):
+        gymnasium.make_vec(envs.OWN_PLANT, num_envs=2, plant="trolley.Rocket")

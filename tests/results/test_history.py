@@ -1,0 +1,93 @@
+"""`history.npz`, streamed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as some
+
+from staf_torch.results.run_directory import HistoryWriter
+
+
+def arrays(batch: int, times: int, dtype: str = "float64") -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(0)
+    return {
+        "state": rng.normal(size=(batch, times, 3)).astype(dtype),
+        "value": rng.normal(size=(batch, times)).astype(dtype),
+        "weights": rng.normal(size=(batch, times, 2, 4)).astype(dtype),
+    }
+
+
+def write(path: Path, data: dict[str, np.ndarray], cuts: list[int], **whole: np.ndarray) -> None:
+    batch, times = data["value"].shape
+    with HistoryWriter(path, batch, times) as writer:
+        for start, stop in zip([0, *cuts], [*cuts, times], strict=True):
+            if stop > start:
+                writer.add({name: array[:, start:stop] for name, array in data.items()})
+        writer.close(**whole)
+
+
+@given(
+    batch=some.integers(1, 4),
+    times=some.integers(1, 12),
+    data=some.data(),
+    dtype=some.sampled_from(["f4", "f8"]),
+)
+def test_streamed_archive_equals_the_arrays_in_memory(
+    tmp_path_factory: pytest.TempPathFactory, batch: int, times: int, data: some.DataObject, dtype: str
+) -> None:
+    cuts = sorted(data.draw(some.lists(some.integers(0, times), max_size=4)))
+    expected = arrays(batch, times, dtype)
+    path = tmp_path_factory.mktemp("history") / "history.npz"
+    write(path, expected, cuts, time=np.arange(times) * 0.1)
+    with np.load(path) as found:
+        assert set(found) == {*expected, "time"}
+        for name, array in expected.items():
+            assert found[name].dtype == array.dtype
+            np.testing.assert_array_equal(found[name], array)
+        np.testing.assert_array_equal(found["time"], np.arange(times) * 0.1)
+    assert [entry.name for entry in path.parent.iterdir()] == ["history.npz"]
+
+
+def test_pieces_that_are_not_contiguous_are_stored_as_they_read(tmp_path: Path) -> None:
+    data = {"value": np.arange(12.0).reshape(3, 4).T.copy()[:, ::-1]}
+    write(tmp_path / "history.npz", data, [1])
+    with np.load(tmp_path / "history.npz") as found:
+        np.testing.assert_array_equal(found["value"], data["value"])
+
+
+def test_an_exception_leaves_nothing(tmp_path: Path) -> None:
+    def interrupted() -> None:
+        with HistoryWriter(tmp_path / "history.npz", 2, 5) as writer:
+            writer.add({name: array[:, :2] for name, array in arrays(2, 5).items()})
+            raise RuntimeError("stop")
+
+    with pytest.raises(RuntimeError, match="stop"):
+        interrupted()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_archive_that_is_not_closed_does_not_appear(tmp_path: Path) -> None:
+    with HistoryWriter(tmp_path / "history.npz", 2, 5) as writer:
+        writer.add(arrays(2, 5))
+        assert not (tmp_path / "history.npz").exists()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_incomplete_archive_is_refused(tmp_path: Path) -> None:
+    def cut_short() -> None:
+        with HistoryWriter(tmp_path / "history.npz", 2, 5) as writer:
+            writer.add({name: array[:, :4] for name, array in arrays(2, 5).items()})
+            writer.close()
+
+    with pytest.raises(AssertionError):
+        cut_short()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_directory_that_does_not_exist_is_an_os_error(tmp_path: Path) -> None:
+    with pytest.raises(OSError, match="nowhere"):
+        HistoryWriter(tmp_path / "nowhere" / "history.npz", 1, 1)

@@ -1,0 +1,162 @@
+"""Closed loops from settings: the groups below `adp`, a user's own options, the keys of version 0.1."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from omegaconf import DictConfig, OmegaConf
+
+from staf_torch import adp
+from staf_torch.adp.problem import AdpProblem
+from staf_torch.cli.staf import config_directory
+from staf_torch.settings.adp import adp_problem
+
+GROUPS = ("policy", "law", "basis", "extrapolation", "cost")
+OPTIONS = [
+    f"adp/{group}={path.stem}"
+    for group in GROUPS
+    for path in sorted((Path(config_directory()) / "adp" / group).glob("*.yaml"))
+]
+
+
+def settings(*overrides: str) -> DictConfig:
+    with initialize_config_dir(config_directory(), version_base="1.3"):
+        return compose("config", ["experiment=adp", *overrides])
+
+
+def problem(*overrides: str) -> AdpProblem:
+    return adp_problem(settings(*overrides))
+
+
+def control(built: AdpProblem) -> torch.Tensor:
+    """The first control from the first state."""
+    x = built.initial_states
+    uniform = x.new_full((len(x), built.controller.draws, x.shape[1]), 0.3)
+    return built.controller.step(x, built.controller.init(x), uniform, built.dt)[0]
+
+
+@pytest.mark.parametrize("option", OPTIONS)
+def test_every_option_builds_a_loop_with_a_finite_control(option: str) -> None:
+    needs = ["adp/policy=lqr"] if option == "adp/cost=bounded_input" else []
+    assert torch.isfinite(control(problem(option, *needs))).all()
+
+
+def test_options_combine() -> None:
+    built = problem(
+        "adp/policy=rollout", "adp/basis=quadratic", "adp/cost=bounded_input", "adp.cost.bound=0.2"
+    )
+    assert built.dt == 0.01  # the period of the rollout policy
+    assert control(built).abs().max() <= 0.2
+    learner = problem("adp/basis=quadratic", "adp/law=published", "adp/extrapolation=quadrature").controller
+    assert isinstance(learner, adp.ActorCritic)
+    assert (learner.basis.count, learner.extrapolation.count) == (3, 49)
+    assert isinstance(learner.law, adp.Published)
+    torch.testing.assert_close(learner.critic, torch.tensor([1.0, 0.0, 1.0], dtype=torch.float64))
+
+
+OLD = {
+    "adp.policy=rollout": ["adp/policy=rollout"],
+    "adp.policy=none": ["adp/policy=none"],
+    "adp.law=published": ["adp/law=published"],
+    "adp.basis=rbf_grid": ["adp/basis=rbf_grid"],
+    "adp.extrapolation=quadrature": ["adp/extrapolation=quadrature"],
+}
+
+
+@pytest.mark.parametrize("old", OLD)
+def test_a_string_of_the_last_version_says_its_new_name(old: str) -> None:
+    with pytest.warns(FutureWarning, match=f"`{old}` is now `{OLD[old][0]}`"):
+        before = problem(old)
+    assert torch.equal(control(before), control(problem(*OLD[old])))
+
+
+def test_a_bound_of_the_last_version_chooses_the_cost() -> None:
+    cfg = settings("adp/policy=lqr", "adp.cost.bound=2")
+    with pytest.warns(FutureWarning, match="is now `adp/cost=bounded_input adp.cost.bound=2`"):
+        built = adp_problem(cfg)
+    assert isinstance(built.cost, adp.BoundedInputCost)
+    assert cfg.adp.cost.bound == 2  # the settings are the caller's
+
+
+def test_settings_that_the_last_version_wrote_build_what_they_did() -> None:
+    cfg = settings()
+    OmegaConf.set_struct(cfg, False)
+    written = {"policy": "actor_critic", "law": "information", "basis": "staf", "extrapolation": "random"}
+    cfg.adp = OmegaConf.merge(cfg.adp, written, {"cost": None})
+    cfg.adp.cost = {"state": 1.0, "control": 1.0, "bound": None}
+    for name in ("q", "r"):
+        del cfg.adp[name]
+    for name in ("gains", "half_width"):
+        del cfg.adp[name]["_target_"]
+    with pytest.warns(FutureWarning):
+        before = adp_problem(cfg)
+    assert torch.equal(control(before), control(problem()))
+
+
+MODULE = '''
+import torch
+from staf_torch import adp
+
+class Pump(torch.nn.Module):
+    """A policy of x alone, which asks for the plant by name."""
+    def __init__(self, system, gain=2.0):
+        super().__init__()
+        self.inputs, self.gain = system.inputs, gain
+    def forward(self, x):
+        return -self.gain * x[..., :self.inputs]
+
+class Fourth(adp.ValueBasis):
+    def __init__(self, dim, scale):
+        super().__init__()
+        self.dim = self.count = dim
+        self.scale = scale
+    def forward(self, y, x):
+        return self.scale * (y.square() + y.pow(4))
+    def gradient(self, y, x):
+        return torch.diag_embed(self.scale * (2 * y + 4 * y.pow(3)))
+
+class Doubled(adp.QuadraticCost):
+    def __init__(self, factor, dim, inputs):
+        super().__init__(factor, factor, dim, inputs)
+
+def down(x):
+    return -x[..., 1:]
+'''
+
+
+@pytest.fixture
+def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A user's folder: a module, and an option of each group in YAML, found through Hydra's search path."""
+    (tmp_path / "my_control.py").write_text(MODULE)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    for name, text in {
+        "policy/pump": "_target_: my_control.Pump\ngain: 3.0",
+        "policy/down": "_target_: my_control.down\n_partial_: true",
+        "basis/fourth": "_target_: my_control.Fourth\nscale: 0.5",
+        "basis/pumped": "_target_: my_control.Pump\nsystem: {_target_: staf_torch.systems.TwoState}",
+        "cost/doubled": "_target_: my_control.Doubled\nfactor: 2.0",
+    }.items():
+        path = tmp_path / "settings" / "adp" / f"{name}.yaml"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text + "\n")
+    return tmp_path / "settings"
+
+
+def test_a_class_and_a_yaml_of_ones_own_make_a_variant(own: Path) -> None:
+    path = f"hydra.searchpath=[file://{own}]"
+    built = problem(path, "adp/policy=pump", "adp/cost=doubled")
+    assert torch.equal(control(built), -3.0 * built.initial_states[:, :1])
+    assert built.controller.label == "Pump"
+    assert torch.equal(built.cost.q, 2 * torch.eye(2, dtype=torch.float64))
+    assert torch.equal(control(problem(path, "adp/policy=down")), -built.initial_states[:, 1:])
+    learner = problem(path, "adp/basis=fourth").controller
+    assert isinstance(learner, adp.ActorCritic)
+    assert learner.basis.scale == 0.5
+
+
+def test_an_object_of_another_kind_is_refused_by_name(own: Path) -> None:
+    with pytest.raises(ValueError, match=r"`adp\(basis=...\)` must be a ValueBasis; got Pump"):
+        problem(f"hydra.searchpath=[file://{own}]", "adp/basis=pumped")

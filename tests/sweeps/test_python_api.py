@@ -1,0 +1,233 @@
+"""`staf_torch.run` and `staf_torch.sweep`: what the command does, in a process that goes on."""
+
+from __future__ import annotations
+
+import gc
+import json
+import logging
+import os
+import random
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from command_line import ROOT
+from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
+from matplotlib.figure import Figure
+
+import staf_torch
+from staf_torch.results.files import write_metrics
+from staf_torch.sweeps import python_api
+
+SHORT = ("duration=0.3", "settle_time=0.1")
+BARE = (*SHORT, "figures=false", "history=false")
+
+
+@pytest.fixture(autouse=True)
+def _elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture
+def _untouched() -> Iterator[None]:
+    """Compare all that a process shares before and after a test."""
+
+    def state() -> list[object]:
+        root = logging.getLogger()
+        instances = {kind.__name__: id(one) for kind, one in type(GlobalHydra)._instances.items()}
+        hydra = [instances.get(name) for name in ("GlobalHydra", "HydraConfig", "JobRuntime", "VersionBase")]
+        environment = {name: value for name, value in os.environ.items() if name != "PYTEST_CURRENT_TEST"}
+        return [
+            *(environment, sys.path[:], sys.argv[:], os.getcwd(), hydra, root.handlers[:], root.level),
+            *(random.getstate(), torch.get_rng_state().tolist(), np.random.get_state()[1].tolist()),  # noqa: NPY002
+            *(torch.get_num_threads(), torch.get_default_dtype(), gc.get_threshold(), sys.stdout, sys.stderr),
+        ]
+
+    before = state()
+    yield
+    assert state() == before
+
+
+@pytest.mark.usefixtures("_untouched")
+def test_a_run_leaves_what_the_command_leaves(capsys: pytest.CaptureFixture[str]) -> None:
+    found = staf_torch.run(*SHORT, "centers.radius=0.2", directory="one")
+    assert capsys.readouterr().out == ""
+    line = [sys.executable, "-m", "staf_torch", *SHORT, "centers.radius=0.2", "hydra.run.dir=two"]
+    subprocess.run(line, check=True, capture_output=True, env=os.environ | {"PYTHONPATH": str(ROOT)})
+    for name in ("metrics.json", ".hydra/config.yaml", "figures/gradient_chase.png"):
+        assert Path("one", name).read_bytes() == Path("two", name).read_bytes(), name
+    assert {path.name for path in Path("one").iterdir()} == {path.name for path in Path("two").iterdir()}
+    assert "Gradient chase" in Path("one/staf.log").read_text()
+    assert found.metrics == json.loads(Path("one/metrics.json").read_text())
+    assert found.settings["centers.radius"] == 0.2
+    assert found.history["state"].shape == (1, 31, 2)
+    other = np.load("two/history.npz")
+    assert sorted(found.history) == sorted(other)
+    assert all(np.array_equal(array, other[name]) for name, array in found.history.items())
+    (figure,) = found.figures().values()
+    assert isinstance(figure, Figure)
+    assert len(repr(found)) < 120
+    assert "data:image/png;base64," in found._repr_html_()
+    assert "<th>ball_error</th>" in found._repr_html_()
+
+
+@pytest.mark.usefixtures("_untouched")
+def test_a_sweep_is_that_of_the_command_and_shows_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+    lines = ("kernel=gaussian,matern", "centers.radius=0.2,0.1", *BARE)
+    found = staf_torch.sweep(*lines, directory="one")
+    assert capsys.readouterr().out == ""
+    line = [sys.executable, "-m", "staf_torch", "-m", *lines, "hydra.sweep.dir=two"]
+    subprocess.run(line, check=True, capture_output=True, env=os.environ | {"PYTHONPATH": str(ROOT)})
+    assert Path("one/table.csv").read_bytes() == Path("two/table.csv").read_bytes()
+    assert {path.name for path in Path("one").iterdir()} == {path.name for path in Path("two").iterdir()}
+    assert repr(found) == "<Runs 4 completed, over kernel, centers.radius>"
+    best = found.best("ball_error")
+    errors = [run.metrics["ball_error"] for run in found]
+    assert best.metrics["ball_error"] == min(errors)
+    assert [run.metrics["ball_error"] for run in found.sort("ball_error")] == sorted(errors)
+    assert [run.setting("centers.radius") for run in found.sort("centers.radius:desc")] == [
+        0.2,
+        0.2,
+        0.1,
+        0.1,
+    ]
+    assert len(found.filter("kernel=matern", lambda run: run.setting("centers.radius") == 0.1)) == 1
+    assert len(found[1:3]) == 2
+    assert found.filter("kernel=matern").sort("ball_error")[0].setting("kernel") == "matern"
+    assert "<b>" in found._repr_html_()
+    assert len(staf_torch.read_runs("two")) == 4
+
+
+def test_figures_of_a_run_that_drew_none_are_drawn_anew() -> None:
+    (found,) = staf_torch.sweep(*BARE, "seed=3")
+    assert list(found.figures()) == ["gradient_chase"]
+    assert not (found.directory / "figures").exists()
+
+
+@pytest.mark.usefixtures("_untouched")
+@pytest.mark.parametrize(
+    ("lines", "words"),
+    [
+        (["centers.radius=-1"], "must be positive; got -1"),
+        (["centers.radios=1"], "there is no setting `centers.radios`"),
+        (["kernel=gauss"], "there is no `kernel/gauss`; there are anchored"),
+        (["centers.radius=0.1,0.2"], "Ambiguous value"),
+        (["experiment=ablation"], "call `staf_torch.sweep`"),
+        (["target.path=nowhere.function", "target=custom"], "nowhere"),
+    ],
+)
+def test_what_a_user_got_wrong_is_a_value_error(lines: list[str], words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        staf_torch.run(*BARE, *lines)
+    assert not list(Path("runs").glob("*"))
+
+
+@pytest.mark.usefixtures("_untouched")
+def test_a_failed_job_is_a_row_with_its_reason_and_resume_tries_it_again() -> None:
+    found = staf_torch.sweep("centers.count=6,7", *BARE, directory="sweep")
+    assert [run.status for run in found] == ["completed", "failed"]
+    assert "must be one of 3, 6, 10" in found[1].reason
+    assert repr(found) == "<Runs 1 completed, 1 failed, over centers.count>"
+    again = staf_torch.sweep("sweep.resume=sweep")
+    assert [run.metrics for run in again] == [run.metrics for run in found]
+    with pytest.raises(ValueError, match="must have the overrides of that sweep"):
+        staf_torch.sweep("sweep.resume=sweep", "seed=3")
+
+
+def interrupted(cfg: object, directory: Path, progress: object = None) -> dict[str, float]:
+    """An experiment during which somebody presses Ctrl-C at the second seed."""
+    if cfg.seed == 1:
+        raise KeyboardInterrupt
+    write_metrics(directory / "metrics.json", {"answer": 42.0})
+    return {"answer": 42.0}
+
+
+@pytest.mark.usefixtures("_untouched")
+def test_ctrl_c_leaves_a_sweep_that_can_be_resumed_and_a_process_as_it_was() -> None:
+    with pytest.raises(KeyboardInterrupt, match=r"1 jobs are complete.*\n.*sweep.resume=sweep"):
+        staf_torch.sweep("task=test_python_api.interrupted", "seed=0,1,2", directory="sweep")
+    assert [run.status for run in staf_torch.read_runs("sweep")] == ["completed", "failed"]
+    with pytest.raises(KeyboardInterrupt):
+        staf_torch.run("task=test_python_api.interrupted", "seed=1", directory="one")
+
+
+def test_runs_inside_another_hydra_application_and_leaves_it_alone() -> None:
+    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+        before = GlobalHydra.instance()
+        found = staf_torch.run(*BARE)
+        assert GlobalHydra.instance() is before
+        assert compose("config").dt == 0.01
+    assert found.status == "completed"
+
+
+def test_log_handlers_of_the_process_go_on(tmp_path: Path) -> None:
+    handler = logging.FileHandler(tmp_path / "mine.log", mode="w")
+    logging.getLogger().addHandler(handler)
+    try:
+        logging.getLogger().error("before")
+        staf_torch.run(*BARE)
+        logging.getLogger().error("after")
+    finally:
+        logging.getLogger().removeHandler(handler)
+        handler.close()
+    assert (tmp_path / "mine.log").read_text() == "before\nafter\n"
+
+
+def test_a_data_frame_over_kernel_radius_and_count_in_three_lines() -> None:
+    pandas = pytest.importorskip("pandas")
+    from staf_torch import sweep
+
+    runs = sweep("kernel=gaussian,matern", "centers.radius=0.1,0.2", "centers.count=3,6", *BARE)
+    frame = runs.pivot("kernel", ["centers.radius", "centers.count"], "ball_error")
+    assert isinstance(frame, pandas.DataFrame)
+    assert frame.shape == (2, 4)
+    assert frame.loc["matern", (0.2, 6)] == runs[7].metrics["ball_error"]
+    whole = runs.to_pandas()
+    assert list(whole["ball_error"]) == [run.metrics["ball_error"] for run in runs]
+    pytest.importorskip("pyarrow")
+    assert runs.__arrow_c_stream__() is not None
+
+
+def test_a_pivot_has_no_number_where_a_run_has_none() -> None:
+    pytest.importorskip("pandas")
+    runs = staf_torch.sweep("centers.count=6,7", "seed=0,1", *BARE)
+    frame = runs.pivot("centers.count", "seed", "ball_error")
+    assert frame.loc[7].isna().all()
+    assert runs.pivot("centers.count", "task", "ball_error").loc[6].notna().all()
+
+
+def test_tables_for_pandas_name_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    runs = staf_torch.sweep(*BARE)
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(ValueError, match="a DataFrame needs pandas: install the extra `tables`"):
+        runs.to_pandas()
+
+
+def test_own_function_to_figure_in_six_lines_of_a_notebook() -> None:
+    Path("mine.py").write_text("def valley(x):\n    return x[..., 0] ** 2 + x[..., 0] * x[..., 1] ** 3\n")
+    # pip install staf_torch
+    from staf_torch import run
+
+    found = run("target=custom", "target.path=mine.valley", *SHORT)
+    assert found.metrics["ball_error"] < 0.1
+    assert isinstance(found.figures()["gradient_chase"], Figure)
+
+
+def test_memory_is_flat_over_ten_sweeps() -> None:
+    counts = []
+    for _ in range(10):
+        staf_torch.sweep("seed=range(4)", "trajectories=2", *BARE)
+        gc.collect()
+        counts.append(len(gc.get_objects()))
+    assert max(counts[3:]) < 1.01 * counts[2]
+
+
+def test_a_job_that_fails_alone_is_told_by_the_run_that_failed() -> None:
+    with pytest.raises(KeyboardInterrupt):
+        python_api.run("task=test_python_api.interrupted", "seed=1", directory="one")
+    assert json.loads(Path("one/run.json").read_text())["reason"] == "interrupted"

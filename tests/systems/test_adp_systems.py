@@ -1,0 +1,128 @@
+"""Plants with inputs: their equilibria, linearisations and known optima."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+from variants import PLANTS, over
+
+from staf_torch import adp, systems
+from staf_torch.numerics.linalg import riccati
+
+KNOWN = ("two_state", "linear", "linear_of_two_inputs")
+
+
+def states(dim: int, count: int = 100, seed: int = 0, box: float = 2.0) -> Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    return box * (2 * torch.rand(count, dim, dtype=torch.float64, generator=generator) - 1)
+
+
+def unit_cost(plant: systems.ControlAffineSystem) -> adp.QuadraticCost:
+    assert plant.dim is not None
+    return adp.QuadraticCost(1.0, 1.0, plant.dim, plant.inputs)
+
+
+@over(PLANTS)
+def test_every_plant_rests_at_its_equilibrium(name: str) -> None:
+    plant = PLANTS[name]()
+    assert torch.equal(plant.drift(plant.equilibrium()).abs(), torch.zeros(plant.dim, dtype=torch.float64))
+
+
+@over(PLANTS)
+def test_a_batch_gives_what_its_rows_give(name: str) -> None:
+    plant = PLANTS[name]()
+    x = states(plant.dim, 12).reshape(3, 4, plant.dim)
+    for method in (plant.drift, plant.effectiveness):
+        whole = method(x)
+        rows = torch.stack([torch.stack([method(row) for row in block]) for block in x])
+        torch.testing.assert_close(whole, rows, rtol=1e-14, atol=1e-15)
+    assert plant.effectiveness(x).shape == (3, 4, plant.dim, plant.inputs)
+
+
+@over(PLANTS)
+def test_linearisation_is_the_difference_quotient_of_the_smooth_drift(name: str) -> None:
+    plant = PLANTS[name]()
+    a, b = plant.linearisation()
+    step = 1e-6 * torch.eye(plant.dim, dtype=torch.float64)
+    quotient = (plant.smooth_drift(step) - plant.smooth_drift(-step)).mT / 2e-6
+    torch.testing.assert_close(a, quotient, rtol=1e-8, atol=1e-8)
+    torch.testing.assert_close(b, plant.effectiveness(plant.equilibrium()))
+
+
+@over(KNOWN)
+def test_known_optimal_value_solves_the_hjb_equation(name: str) -> None:
+    plant = PLANTS[name]()
+    cost = unit_cost(plant)
+    residual = adp.hjb_residual(
+        plant, cost, lambda x: plant.optimal_value(x, cost.q, cost.r), states(plant.dim)
+    )
+    assert residual.abs().max() < 1e-11
+
+
+def test_known_optimal_value_scales_with_the_cost() -> None:
+    plant, cost = systems.TwoState(), adp.QuadraticCost(10.0, 10.0, 2, 1)
+    residual = adp.hjb_residual(plant, cost, lambda x: plant.optimal_value(x, cost.q, cost.r), states(2))
+    assert residual.abs().max() < 1e-11
+    assert plant.optimal_value(states(2), 10 * cost.q, cost.r) is None
+
+
+def test_printed_plant_does_not_solve_the_hjb_equation_and_is_stable_without_control() -> None:
+    printed, right = systems.TwoState(as_printed=True), systems.TwoState()
+    cost = unit_cost(right)
+    line = torch.linspace(-2, 2, 401, dtype=torch.float64)
+    grid = torch.cartesian_prod(line, line)
+    residual = adp.hjb_residual(printed, cost, lambda x: right.optimal_value(x, cost.q, cost.r), grid)
+    # x2^2 (2 (cos 2 x1 + 2)^2 - 1), largest at (0, 2); MATH.md's 66.8 is that of a coarser grid.
+    assert float(residual.abs().max()) == pytest.approx(68.0, rel=1e-12)
+    assert torch.linalg.eigvals(printed.linearisation().matrix).real.max() < 0
+    assert torch.linalg.eigvals(right.linearisation().matrix).real.max() > 0
+
+
+def test_riccati_solution_satisfies_its_equation() -> None:
+    plant = PLANTS["linear_of_two_inputs"]()
+    a, b = plant.linearisation()
+    q = torch.diag(torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64))
+    r = torch.tensor([[2.0, 0.5], [0.5, 1.0]], dtype=torch.float64)
+    p = riccati(a, b, q, r)
+    residual = a.mT @ p + p @ a - p @ b @ torch.linalg.solve(r, b.mT @ p) + q
+    assert residual.abs().max() < 1e-12
+    assert torch.linalg.eigvals(a - b @ torch.linalg.solve(r, b.mT @ p)).real.max() < 0
+
+
+def test_uncontrollable_unstable_mode_is_named() -> None:
+    plant = systems.Linear([[1.5, 0.0], [0.0, -1.0]], [[0.0], [1.0]])
+    with pytest.raises(ValueError, match=r"linearisation of Linear .* not stabilisable.*eigenvalue 1.5 1/s"):
+        adp.LQR(plant, unit_cost(plant))
+
+
+def test_uncontrollable_stable_mode_is_no_obstacle() -> None:
+    plant = systems.Linear([[1.5, 0.0], [0.0, -1.0]], [[1.0], [0.0]])
+    assert torch.isfinite(adp.LQR(plant, unit_cost(plant)).k).all()
+
+
+@pytest.mark.parametrize(
+    ("q", "rule"),
+    [
+        (-1.0, "must be positive"),
+        ([[1.0, 0.0], [0.0, -1.0]], "must be positive definite"),
+        ([[1.0, 0.5], [0.0, 1.0]], "must be symmetric"),
+        (torch.eye(3, dtype=torch.float64), r"must be \(2, 2\)"),
+        ([[1.0, float("nan")], [0.0, 1.0]], "must be finite"),
+    ],
+)
+def test_bad_cost_matrix_is_refused_by_name(q: object, rule: str) -> None:
+    with pytest.raises(ValueError, match=rf"`QuadraticCost\(state=...\)` {rule}"):
+        adp.QuadraticCost(q, 1.0, 2, 1)
+    if not isinstance(q, Tensor):
+        with pytest.raises(ValueError, match=rf"`QuadraticCost\(control=...\)` {rule}"):
+            adp.QuadraticCost(torch.eye(2, dtype=torch.float64), q, 2, 2)
+
+
+def test_plant_that_does_not_rest_at_the_origin_is_refused() -> None:
+    class Pushed(systems.VanDerPol):
+        def drift(self, x: Tensor) -> Tensor:
+            return super().drift(x) + 1.0
+
+    with pytest.raises(ValueError, match=r"`Pushed.drift` must be 0 at the origin.*got \[1.0, 1.0\]"):
+        adp.LQR(Pushed(), unit_cost(Pushed()))
