@@ -10,9 +10,17 @@ import torch
 from torch import Tensor
 from torch.utils._python_dispatch import _disable_current_modes
 
-_OF_NO_VALUES = frozenset(
-    ["zeros_like", "ones_like", "full_like", "empty_like", "rand_like", "new_zeros", "new_ones", "new_full", "new_empty", "new_empty_strided", "_new_zeros_with_same_feature_meta", "lift_fresh", "lift_fresh_copy"]
+_LIKE = (
+    "zeros_like",
+    "ones_like",
+    "full_like",
+    "empty_like",
+    "rand_like",
+    "_new_zeros_with_same_feature_meta",
 )
+_NEW = ("new_zeros", "new_ones", "new_full", "new_empty", "new_empty_strided")
+_OF_NO_VALUES = frozenset((*_LIKE, *_NEW, "lift_fresh", "lift_fresh_copy"))
+"""Operations whose result does not depend on the numbers of their arguments."""
 
 
 class Recipe(NamedTuple):
