@@ -89,7 +89,7 @@ def optima(problem: AdpProblem, x: Tensor) -> Optima | None:
 
 def known_value(problem: AdpProblem, x: Tensor) -> Tensor | None:
     """V*(x) by a formula, (..., n) -> (...); None where the plant knows none for the cost."""
-    if not isinstance(problem.cost, QuadraticCost):
+    if not isinstance(problem.cost, QuadraticCost) or not problem.cost.around(problem.system).plain:
         return None
     return problem.system.optimal_value(x, problem.cost.q, problem.cost.r)
 
