@@ -26,6 +26,7 @@ from ..adp import (
 )
 from ..adp.problem import AdpProblem
 from ..adp.reference_optimum import Reference, compare
+from ..figures.animation import animate
 from ..figures.closed_loop import AdpHistory, draw_adp
 from ..figures.style import images
 from ..metrics.closed_loop import adp_metrics
@@ -36,6 +37,7 @@ from ..settings.adp import adp_problem
 from ..settings.chase import make_metrics
 from ..tables.columns import significant
 from .registry import BatchedExperiment, Metrics
+from .scenes import animation_kind, loop_scene
 
 _log = logging.getLogger(__name__)
 _LINEARISED = 8  # rows of a learning controller whose loop is linearised
@@ -58,6 +60,7 @@ class LoopSolution:
 class ClosedLoop(BatchedExperiment[LoopSolution]):
     """Optimal regulation; initial states, seeds, initial weights and gains share a tensor batch."""
 
+    animates = True
     batchable = frozenset(
         {"seed", "initial_state", "spread", "adp.critic", "adp.actor", "adp.gain", "adp.policy.gain"}
         | {
@@ -69,7 +72,7 @@ class ClosedLoop(BatchedExperiment[LoopSolution]):
 
     def __call__(self, cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics:
         """Run what the settings describe and fill the run directory; `metrics.json` comes last."""
-        problem = adp_problem(cfg)
+        problem = _problem(cfg)
         return self.write(cfg, directory, _solved(cfg, problem, solve(problem, progress)))
 
     def solve(self, cfgs: Sequence[DictConfig], progress: Progress) -> list[LoopSolution | Exception]:
@@ -91,6 +94,9 @@ class ClosedLoop(BatchedExperiment[LoopSolution]):
         if cfg.history:
             write_history(out, solution.result)
         name_the_diverged(solution.result)
+        kind = animation_kind(cfg)
+        if kind is not None:
+            out.figure("closed_loop", animate(loop_scene(adp_problem(cfg), solution.result), kind))
         if cfg.figures:
             out.figure(cfg.task, images(draw_adp(_drawn(solution))))
         _summarise(solution)
@@ -104,9 +110,15 @@ class ClosedLoop(BatchedExperiment[LoopSolution]):
         return int(8 * 40 * min(rows * duration / dt, 2e5))  # type: ignore[operator]
 
 
+def _problem(cfg: DictConfig) -> AdpProblem:
+    problem = adp_problem(cfg)
+    animation_kind(cfg, problem.system.dim)
+    return problem
+
+
 def _prepared(cfg: DictConfig) -> AdpProblem | Exception:
     try:
-        return adp_problem(cfg)
+        return _problem(cfg)
     except Exception as error:  # of this member alone
         return error
 
