@@ -57,7 +57,8 @@ def constructors() -> frozenset[str]:
         "staf_torch.adp": adp,
         **dict.fromkeys(("staf_torch.predictors", "staf_torch.engine.predictors"), predictors),
     }
-    found = {"staf_torch.settings.chase.make_radius", "staf_torch.adp.RolloutPolicy.of_lqr"}
+    found = {f"staf_torch.settings.chase.{name}" for name in ("centers_of", "make_radius")}
+    found.add("staf_torch.adp.RolloutPolicy.of_lqr")
     for room, module in rooms.items():
         for name, part in vars(module).items():
             if inspect.isclass(part) and issubclass(part, kinds) and not inspect.isabstract(part):
