@@ -46,6 +46,7 @@ from .untrusted import UnreadableError, parse_object, read_lines, read_object, t
 _OVERRIDES = "overrides.yaml"
 _LISTED = 8  # jobs that have not started, by their numbers
 _COLUMNS = 5000  # names of settings and metrics of all runs together
+_SHOWN = 3  # values of a setting that a remark names
 _DEEPEST = 16  # levels of folders
 _MOST_JOBS = 2**24  # bytes of `sweep.json`
 
@@ -88,7 +89,8 @@ def collect(path: str | Path | Sequence[str | Path]) -> Collection:
     skipped = [Skipped(one.path, visible(one.reason)) for one in skipped]
     if not rows and not skipped:
         raise fail("collect", "path", "must hold a run or a sweep of runs", [str(p) for p in paths])
-    return Collection(tuple(rows), tuple(skipped), tuple(_versions(rows)))
+    collection = Collection(tuple(rows), tuple(skipped))
+    return dataclasses.replace(collection, remarks=(*_versions(rows), *_mixed(collection)))
 
 
 def _further_names(known: set[str], runs: Sequence[Run]) -> set[str]:
@@ -171,6 +173,18 @@ def _versions(rows: Sequence[Run]) -> Iterator[str]:
             f"{len(those)} of {len(rows)} runs were written by staf_torch {version}, and this is "
             f"{__version__}: their numbers may mean something else (the first is {those[0].directory})"
         )
+
+
+def _mixed(found: Collection) -> Iterator[str]:
+    """One remark for each setting that differs although nobody swept it, and for different builds."""
+    for key in found.unswept:
+        values: dict[str, list[Run]] = {}
+        for run in found.rows:
+            value = run.value(key)
+            values.setdefault(value if isinstance(value, str) else json.dumps(value), []).append(run)
+        counts = [f"{value} in {len(runs)} (as {runs[0].directory})" for value, runs in values.items()]
+        more = f" and {len(counts) - _SHOWN} others" if len(counts) > _SHOWN else ""
+        yield f"`{key}` differs between runs although nobody swept it: {', '.join(counts[:_SHOWN])}{more}"
 
 
 def read_run(directory: Path) -> list[Run]:

@@ -106,8 +106,8 @@ class RunRecord:
             more = f"; and {len(told) - _TOLD} more" if len(told) > _TOLD else ""
             raise ValueError(
                 f"{directory} was not made as it would be now: {'; '.join(told[:_TOLD])}{more}. Numbers may "
-                "differ: run the sweep anew, or let `sweep.resume_anyway=true` keep what is there, and a table "
-                "tells the two apart."
+                "differ: run the sweep anew, or keep what is there by `sweep.resume_anyway=true`; tables "
+                "tell the two apart."
             )
 
 

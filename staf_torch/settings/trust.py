@@ -15,6 +15,7 @@ import resource
 import signal
 import threading
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from types import FrameType
 from typing import Any
 
@@ -27,7 +28,10 @@ from ..kernels import Kernel
 from ..optim import UpdateLaw
 from ..results.settings_file import SettingsFile
 from ..systems import ControlAffineSystem
+from . import config_directory
 
+_TARGET = re.compile(r"_target_: *(staf_torch\.[\w.]+)")
+_NOT_PARTS = ("staf_torch.settings.chase.load", "staf_torch.sweeps.")  # imports what it is told; end of runs
 _REFERENCE = re.compile(r"\$\{([A-Za-z_][\w.]*)\}")
 _MOST_NODES, _MOST_TEXT, _DEEPEST = 20_000, 1000, 30
 _SIZES: Mapping[str, float] = {
@@ -43,7 +47,10 @@ _SPECIAL = {"_target_", "_partial_", "_convert_", "_recursive_"}
 
 @functools.cache
 def constructors() -> frozenset[str]:
-    """Return the dotted paths that settings may name without trust: parts that are made of plain values."""
+    """Return the dotted paths that settings may name without trust: parts that are made of plain values.
+
+    They are what the package's own `conf/` names, and the other classes of the same kinds.
+    """
     kinds = (
         *(Kernel, UpdateLaw, ControlAffineSystem, Predictor),
         *(ActorCriticLaw, Controller, Cost, Extrapolation, Gains, ValueBasis, adp.LQR, adp.RolloutPolicy),
@@ -57,8 +64,12 @@ def constructors() -> frozenset[str]:
         "staf_torch.adp": adp,
         **dict.fromkeys(("staf_torch.predictors", "staf_torch.engine.predictors"), predictors),
     }
-    found = {f"staf_torch.settings.chase.{name}" for name in ("centers_of", "make_radius")}
-    found.add("staf_torch.adp.RolloutPolicy.of_lqr")
+    found = {
+        target
+        for path in Path(config_directory()).rglob("*.yaml")
+        for target in _TARGET.findall(path.read_text(encoding="utf-8"))
+        if not target.startswith(_NOT_PARTS)
+    }
     for room, module in rooms.items():
         for name, part in vars(module).items():
             if inspect.isclass(part) and issubclass(part, kinds) and not inspect.isabstract(part):

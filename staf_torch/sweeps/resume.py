@@ -33,8 +33,8 @@ _MAY_RUN = re.compile(r"_[a-z]+_\b|\$\{|\\|\bpath\b|\btask\b|\btracker\b|hydra|@
 def command_line(argv: Sequence[str]) -> list[str]:
     """Return the arguments with those of the sweep that `sweep.resume` names, if it names one.
 
-    Lines of the sweep that may run code of somebody else are shown, and need a yes at the terminal or `--yes`.
-    Those that the command line repeats do not.
+    Lines of the sweep that may run code of somebody else are shown, and need a yes at the terminal, `--yes`,
+    or to be repeated on the command line.
 
     Raises:
         ValueError: if no sweep is there, one of other settings or of another version is, or nobody said yes.
