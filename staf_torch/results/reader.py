@@ -31,6 +31,7 @@ from .files import (
     UNFINISHED,
     flatten,
     parse_overrides,
+    partial_name,
 )
 from .files import Value as Value
 from .metric_info import read_infos
@@ -203,7 +204,10 @@ def read_run(directory: Path) -> list[Run]:
     wrong = damaged(directory, record, thorough=False)
     if wrong is not None:
         return [dataclasses.replace(run, status=UNFINISHED, reason=wrong, metrics={})]
-    return _members(run) if os.path.lexists(directory / MEMBERS) else [run]
+    if os.path.lexists(directory / MEMBERS):
+        return _members(run, MEMBERS)
+    begun = run.status != COMPLETED and os.path.lexists(directory / partial_name(MEMBERS))
+    return [*_members(run, partial_name(MEMBERS)), run] if begun else [run]
 
 
 def read_record(directory: Path) -> Run:
@@ -249,21 +253,26 @@ def _status(record: Mapping[str, Any]) -> tuple[str, str | None]:
     return COMPLETED, reason
 
 
-def _members(run: Run) -> list[Run]:
-    """One a member; its overrides come on top of the run's."""
+def _members(run: Run, name: str) -> list[Run]:
+    """One a member in a file of that name; its overrides come on top of the run's."""
     shared = {key: value for key, value in run.settings.items() if not _of_axis(key)}
     typed = {key: value for key, value in run.overrides.items() if not _of_axis(key)}
     base = dataclasses.replace(run, settings=shared, overrides=typed, seconds=None)
-    return [_member(base, number, member) for number, member in enumerate(read_members(run.directory))]
+    return [_member(base, number, member) for number, member in enumerate(read_members(run.directory, name))]
 
 
-def read_members(directory: Path) -> Iterator[Mapping[str, Any]]:
+def read_members(directory: Path, name: str = MEMBERS) -> Iterator[Mapping[str, Any]]:
     """Yield the rows of `members.json`, one after the other: one line each, as the library writes them.
+
+    In a file that is not complete, which has another ``name``, the last line may be cut off.
 
     Raises:
         UnreadableError: if it has another form, and is too large to be read as a whole.
     """
-    lines = read_lines(directory / MEMBERS)
+    lines = read_lines(directory / name)
+    if name != MEMBERS:
+        yield from (parse_object(line[:-2], name) for line in lines if line.endswith(b"},\n"))
+        return
     if not re.fullmatch(rb'\{"version": "[^"]*", "members": \[\n', next(lines, b"")):
         listed = read_object(directory / MEMBERS, _MOST_JOBS).get("members")
         if not isinstance(listed, list) or not all(isinstance(member, dict) for member in listed):

@@ -24,7 +24,7 @@ from staf_torch.results.files import write_metrics
 
 def dying(cfg, directory, progress=None):
     """A task whose worker is killed: always with seed 1, the first time with seed 2."""
-    note = Path(f"note{cfg.seed}")
+    note = Path("PLACE", f"note{cfg.seed}")
     if cfg.seed == 1 or (cfg.seed == 2 and not note.exists()):
         note.touch()
         os.kill(os.getpid(), signal.SIGKILL)
@@ -36,7 +36,7 @@ def dying(cfg, directory, progress=None):
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     found = tmp_path_factory.mktemp("ray")
-    (found / "dying.py").write_text(DYING)
+    (found / "dying.py").write_text(DYING.replace("PLACE", str(found)))
     return found
 
 

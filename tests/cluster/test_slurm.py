@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 import subprocess
 import sys
@@ -67,6 +66,14 @@ def staf(node: SlurmNode, place: Path, *line: str) -> subprocess.Popen[str]:
     )
 
 
+def wait_for_the_first(run: subprocess.Popen[str], place: Path) -> None:
+    """Wait until the first job of the sweep is complete."""
+    done = place / "sweep" / "0" / "run.json"
+    while not (done.exists() and json.loads(done.read_text())["status"] == "completed"):
+        assert run.poll() is None
+        time.sleep(0.2)
+
+
 def running(node: SlurmNode, count: int) -> list[str]:
     """Wait until so many jobs run; return their numbers."""
     for _ in range(600):
@@ -89,10 +96,7 @@ def test_a_sweep_on_slurm_ends_with_the_bits_of_one_that_is_not(node: SlurmNode,
 
 def test_a_cancelled_job_fails_alone_and_is_told_in_a_line(node: SlurmNode, place: Path) -> None:
     run = staf(node, place, "task=slow.slow", "seed=3,99", *SHORT, *SLURM, "hydra.sweep.dir=sweep")
-    done = place / "sweep" / "0" / "run.json"
-    while not (done.exists() and json.loads(done.read_text())["status"] == "completed"):
-        assert run.poll() is None
-        time.sleep(0.2)
+    wait_for_the_first(run, place)
     node.run("scancel", running(node, 1)[-1])
     out, _ = run.communicate(timeout=120)
     assert run.returncode == 1
@@ -114,13 +118,13 @@ def test_a_job_out_of_time_is_told_and_not_taken_for_a_failed_batch(node: SlurmN
     assert "each runs alone" not in out
 
 
-def test_a_sweep_that_is_killed_leaves_no_job_and_is_resumed(node: SlurmNode, place: Path) -> None:
+def test_a_sweep_that_is_killed_leaves_no_job_behind(node: SlurmNode, place: Path) -> None:
     run = staf(node, place, "task=slow.slow", "seed=3,99", *SHORT, *SLURM, "hydra.sweep.dir=sweep")
-    running(node, 1)
-    time.sleep(1)
+    wait_for_the_first(run, place)
     run.terminate()
     out, _ = run.communicate(timeout=60)
     assert run.returncode == 143, out
+    assert "1 jobs are complete. Resume with:" in out
     for _ in range(100):
         left = node.run("squeue", "-h", "-o", "%i %T").stdout.split("\n")
         if not any(line and "COMPLETING" not in line for line in left):
@@ -128,4 +132,3 @@ def test_a_sweep_that_is_killed_leaves_no_job_and_is_resumed(node: SlurmNode, pl
         time.sleep(0.2)
     else:
         raise AssertionError(left)
-    assert os.path.exists(place / "sweep" / "sweep.json")

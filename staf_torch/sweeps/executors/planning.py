@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Collection, Generator, Sequence
 from pathlib import Path
+from typing import overload
 
 from omegaconf import DictConfig
 
@@ -13,6 +14,30 @@ from ..batching import Batch, Outcome, batches
 from .base import Executor
 
 _log = logging.getLogger(__name__)
+
+
+class _Batches(Sequence[Batch]):
+    """Batches whose settings are looked up when a batch begins."""
+
+    def __init__(
+        self, planned: Sequence[list[int]], settings: Sequence[DictConfig], directories: Sequence[Path]
+    ) -> None:
+        self._planned, self._settings, self._directories = planned, settings, directories
+
+    def __len__(self) -> int:
+        return len(self._planned)
+
+    @overload
+    def __getitem__(self, index: int) -> Batch: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> list[Batch]: ...
+
+    def __getitem__(self, index: int | slice) -> Batch | list[Batch]:
+        if isinstance(index, slice):
+            return [self[i] for i in range(*index.indices(len(self)))]
+        jobs = self._planned[index]
+        return Batch([self._settings[i] for i in jobs], [str(self._directories[i]) for i in jobs])
 
 
 def compute(
@@ -41,7 +66,7 @@ def compute(
     planned = batches(settings, least=workers.pieces, most=most)
     planned = [batch for batch in planned if not set(finished).issuperset(batch)]
     _log.info("%d jobs in %d tensor batches", len(settings), len(planned))
-    given = [Batch([settings[i] for i in b], [str(directories[i]) for i in b]) for b in planned]
+    given = _Batches(planned, settings, directories)
     wanted = [[i for i in batch if i not in finished] for batch in planned]
     left = [len(batch) for batch in wanted]
     listening = Progress(lambda share: tell(done + share * next(filter(None, left), 0)))
