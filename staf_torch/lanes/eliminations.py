@@ -175,7 +175,8 @@ def eigenvalues(gram: Tensor) -> Tensor:
     low, high = repeat(
         passes, halve, (low.expand(*low.shape[:-1], size).clone(), high.expand_as(gram[..., 0]).clone())
     )
-    return largest.squeeze(-1) * (low + 0.5 * (high - low))
+    values: Tensor = largest.squeeze(-1) * (low + 0.5 * (high - low))
+    return values
 
 
 def _tridiagonal(gram: Tensor) -> tuple[list[Tensor], list[Tensor]]:
