@@ -14,7 +14,7 @@ from ..sweeps.hydra_compat import broken_sweep, find_launcher, full_errors, prog
 from ..sweeps.hydra_compat import config_directory as config_directory
 from ..sweeps.job import Refused, execute
 from ..sweeps.resume import command_line
-from . import doctor
+from . import doctor, schema
 
 find_launcher()
 _staf = program(execute)
@@ -23,12 +23,14 @@ _staf = program(execute)
 def main() -> None:
     """Run the command line. What a user got wrong ends as one sentence and the exit code 1.
 
-    `staf doctor` and `staf --version` are no runs, and Hydra is not asked.
+    `staf doctor`, `staf schema` and `staf --version` are no runs, and Hydra is not asked.
     """
     if sys.argv[1:] == ["--version"]:
         sys.exit(print(doctor.version()))
     if sys.argv[1:] == ["doctor"]:
         sys.exit(doctor.main())
+    if sys.argv[1:2] == ["schema"]:
+        sys.exit(_schema(sys.argv[2:]))
     sys.path.insert(0, os.getcwd())  # so that `target.path=my_module.my_function` finds the user's file
     typed = sys.argv
     with full_errors() as wants_trace:
@@ -51,3 +53,12 @@ def main() -> None:
             sys.exit(f"staf: {sentence(error)}")
         finally:
             sys.argv = typed
+
+
+def _schema(words: list[str]) -> str | None:
+    """Print the JSON schema of the settings; return what to say where there is no such group."""
+    try:
+        sys.stdout.write(schema.main(words) + "\n")
+    except ValueError as error:
+        return f"staf: {error}"
+    return None

@@ -16,6 +16,7 @@ from torch import Tensor
 from ..adp import ActorCritic, Controller, Gains, LoopResult, Supervised, simulate
 from ..adp.problem import AdpProblem
 from ..adp.reference_optimum import Reference, compare
+from ..figures.animation import animate
 from ..figures.closed_loop import AdpHistory, draw_adp
 from ..figures.style import images
 from ..metrics.closed_loop import adp_metrics
@@ -25,6 +26,7 @@ from ..settings.adp import adp_problem
 from ..settings.chase import make_metrics
 from ..tables.columns import significant
 from .registry import BatchedExperiment, Metrics
+from .scenes import animation_kind, loop_scene
 
 _log = logging.getLogger(__name__)
 _NAMED = 20  # diverged trajectories that the log lists by number
@@ -45,6 +47,7 @@ class LoopSolution:
 class ClosedLoop(BatchedExperiment[LoopSolution]):
     """Optimal regulation; initial states, seeds, initial weights and gains share a tensor batch."""
 
+    animates = True
     batchable = frozenset(
         {"seed", "initial_state", "spread", "adp.critic", "adp.actor", "adp.gain", "adp.policy.gain"}
         | {
@@ -56,7 +59,7 @@ class ClosedLoop(BatchedExperiment[LoopSolution]):
 
     def __call__(self, cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics:
         """Run what the settings describe and fill the run directory; `metrics.json` comes last."""
-        problem = adp_problem(cfg)
+        problem = _problem(cfg)
         return self.write(cfg, directory, _solved(cfg, problem, solve(problem, progress)))
 
     def solve(self, cfgs: Sequence[DictConfig], progress: Progress) -> list[LoopSolution | Exception]:
@@ -78,6 +81,9 @@ class ClosedLoop(BatchedExperiment[LoopSolution]):
         if cfg.history:
             write_history(out, solution.result)
         name_the_diverged(solution.result)
+        kind = animation_kind(cfg)
+        if kind is not None:
+            out.figure("closed_loop", animate(loop_scene(adp_problem(cfg), solution.result), kind))
         if cfg.figures:
             out.figure(cfg.task, images(draw_adp(_drawn(solution.result, solution.optimum))))
         _summarise(solution)
@@ -91,9 +97,15 @@ class ClosedLoop(BatchedExperiment[LoopSolution]):
         return int(8 * 40 * min(rows * duration / dt, 2e5))  # type: ignore[operator]
 
 
+def _problem(cfg: DictConfig) -> AdpProblem:
+    problem = adp_problem(cfg)
+    animation_kind(cfg, problem.system.dim)
+    return problem
+
+
 def _prepared(cfg: DictConfig) -> AdpProblem | Exception:
     try:
-        return adp_problem(cfg)
+        return _problem(cfg)
     except Exception as error:  # of this member alone
         return error
 

@@ -17,7 +17,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from ..experiments.registry import Metrics
+from ..experiments.registry import Metrics, check_animation
 from ..numerics.checks import choice
 from ..results import run_record as records
 from ..results.progress import SHOWN, Progress
@@ -104,6 +104,7 @@ def run(
     """
     record = records.RunRecord(cfg, origin.choices, origin.overrides)
     with _recorded(record, directory, seconds):
+        check_animation(cfg)
         record.declare([metric.info for metric in make_metrics(cfg.get("metric"))])
         if cfg.get("members") is not None:
             base = [*origin.search, *origin.overrides]
