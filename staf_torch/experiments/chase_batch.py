@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 import torch
@@ -87,6 +87,9 @@ def _run(members: Sequence[_Member], advance: Callable[[int], None] | None, *, a
     # What a history holds of a time, it holds of all rows.
     together = len(starts) if any(member.keeps for member in members) else _ROWS
     blocks = starts.split(together)
+    chunk = chunk_length(min(together, len(starts)), first.basis, starts.element_size())
+    # Some twenty pieces of a long run, so that progress is seen; the results do not depend on it.
+    chunk = max(1, min(chunk, max(64, -(-times // 20))))
     reach = _Reach(first.basis) if len(blocks) > 1 else None
     done = 0
     with torch.no_grad(), warnings.catch_warnings():
@@ -95,7 +98,16 @@ def _run(members: Sequence[_Member], advance: Callable[[int], None] | None, *, a
         for block in blocks:
             if done:
                 metrics.next_rows()
-            for result in _pieces(first, block, times):
+            chased = chase_pieces(
+                trajectory(first.system, block, dt=first.dt, steps=first.steps, chunk=chunk),
+                first.basis,
+                first.target,
+                first.law,
+                inner_steps=first.inner_steps,
+                predictor=first.predictor,
+                certificate=first.certificate,
+            )
+            for result in chased:
                 metrics.add(result)
                 if reach is not None:
                     reach.see(result.state)
@@ -105,22 +117,6 @@ def _run(members: Sequence[_Member], advance: Callable[[int], None] | None, *, a
     if reach is not None and alone:
         reach.warn()
     return [member.outcome(found) for member, found in zip(members, metrics.summaries(), strict=True)]
-
-
-def _pieces(problem: ChaseProblem, starts: Tensor, times: int) -> Iterator[ChaseResult]:
-    """The chase from some initial states, in pieces of time."""
-    chunk = chunk_length(len(starts), problem.basis, starts.element_size())
-    # Some twenty pieces of a long run, so that progress is seen; the results do not depend on it.
-    chunk = max(1, min(chunk, max(64, -(-times // 20))))
-    return chase_pieces(
-        trajectory(problem.system, starts, dt=problem.dt, steps=problem.steps, chunk=chunk),
-        problem.basis,
-        problem.target,
-        problem.law,
-        inner_steps=problem.inner_steps,
-        predictor=problem.predictor,
-        certificate=problem.certificate,
-    )
 
 
 def _distribute(result: ChaseResult, first: int, members: Sequence[_Member], *, alone: bool) -> None:
