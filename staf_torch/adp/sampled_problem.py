@@ -179,8 +179,8 @@ class SampledProblem(nn.Module):
 
         def along(carry: tuple[()], pair: tuple[Tensor, Tensor]) -> tuple[tuple[()], tuple[Tensor, Tensor]]:
             one, other = (direction.expand_as(z) for direction in pair)
-            slope, bend = torch.func.jvp(lambda y: torch.func.jvp(both, (y,), (one,))[1], (z,), (other,))
-            return carry, (slope, bend)
+            found = torch.func.jvp(lambda y: torch.func.jvp(both, (y,), (one,))[1], (z,), (other,))
+            return carry, (found[0], found[1])
 
         unit = torch.eye(z.shape[-1], dtype=z.dtype)
         rows, columns = torch.tril_indices(len(unit), len(unit)).unbind(0)
