@@ -43,6 +43,49 @@ from .tracking import TwoStateTracking as TwoStateTracking
 from .tracking import desired_trajectory as desired_trajectory
 from .tracking import tracking_cost as tracking_cost
 
+__all__ = [
+    "LQR",
+    "ActorCritic",
+    "ActorCriticLaw",
+    "BoundedInputCost",
+    "ConcurrentLearning",
+    "Controller",
+    "ControllerState",
+    "Cost",
+    "DirectShooting",
+    "Extrapolation",
+    "Feedback",
+    "Frozen",
+    "Gains",
+    "HeldStability",
+    "Identified",
+    "IdentifyingTracker",
+    "Information",
+    "LeadingCoordinates",
+    "LoopResult",
+    "Optimum",
+    "Published",
+    "QuadraticBasis",
+    "QuadraticCost",
+    "QuadraturePoints",
+    "RBFGridBasis",
+    "RandomPoints",
+    "RolloutPolicy",
+    "StaFValueBasis",
+    "Supervised",
+    "TwoStateTracking",
+    "ValueBasis",
+    "Weights",
+    "bellman_error",
+    "bellman_terms",
+    "desired_trajectory",
+    "held_stability",
+    "hjb_residual",
+    "simulate",
+    "tracking_cost",
+    "value_gradient",
+]
+
 
 def __getattr__(name: str) -> type:
     """Serve `Memory`, the name of `ControllerState` until 0.2, for one release.

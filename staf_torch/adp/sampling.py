@@ -103,7 +103,14 @@ def held_riccati(f: Tensor, g: Tensor, cost: Cost, period: float, *, name: str) 
 
 
 class HeldStability(NamedTuple):
-    """The stability of a linearised loop whose control is held."""
+    """The stability of a linearised loop whose control is held.
+
+    Example:
+        >>> adp.HeldStability(spectral_radius=0.97, largest_period=None).spectral_radius < 1
+        True
+
+        Shown by `staf experiment=adp adp/policy=lqr`.
+    """
 
     spectral_radius: float  # of one period: below 1 the origin is asymptotically stable
     largest_period: float | None  # s, up to which every period is stable; None: unstable without holding too,
@@ -122,6 +129,8 @@ def held_stability(
         >>> lqr = adp.LQR(plant, adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1))
         >>> adp.held_stability(lqr, plant, 0.01).spectral_radius < 1
         True
+
+        Shown by `staf experiment=adp adp/policy=lqr`.
 
     Args:
         policy: u from x, (..., n) -> (..., m), with u(0) = 0.

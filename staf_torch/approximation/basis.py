@@ -59,6 +59,8 @@ class StaFBasis(ConventionModule):
         >>> basis.ideal_weights(x, targets.Paper()).shape
         torch.Size([3])
 
+        Shown by `staf experiment=gradient_chase`.
+
     Hyperparameters that kernel, centers and radius were given as `nn.Parameter` are learned, others fixed.
     The buffer `convention` says in a state_dict what coefficients beside it mean: `check_convention`.
 

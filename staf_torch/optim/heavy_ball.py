@@ -20,6 +20,15 @@ class HeavyBall(UpdateLaw):
     offered. In rows that nevertheless came to be worse than zero weights, F(a) > F(0), the exact line
     search replaces the step and the velocity is dropped; so F stays bounded.
 
+    Example:
+        >>> basis = StaFBasis(GaussianKernel(), StateFollowingCenters(rings(3), radius=0.5))
+        >>> states = torch.tensor([[[1.0, 0.5]]]).double().expand(1, 20, 2)  # at rest: (B, T, n)
+        >>> excess = chase(states, basis, targets.Paper(), optim.HeavyBall(), inner_steps=2).excess[0]
+        >>> bool(excess[-1] < 0.1 * excess[0])
+        True
+
+        Shown by `staf optimizer=heavy_ball`.
+
     Args:
         step: s, in units of 1 / L, 0 < s < 2 (1 + momentum); None for the optimal pair.
         momentum: beta, in [0, 1); given with ``step`` or not at all.

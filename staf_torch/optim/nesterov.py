@@ -20,6 +20,15 @@ class Nesterov(UpdateLaw):
     `contraction`. In rows whose y is worse than zero weights, F(y) > F(0), the velocity is dropped:
     what is left is a plain gradient step, which lowers F.
 
+    Example:
+        >>> basis = StaFBasis(GaussianKernel(), StateFollowingCenters(rings(3), radius=0.5))
+        >>> states = torch.tensor([[[1.0, 0.5]]]).double().expand(1, 20, 2)  # at rest: (B, T, n)
+        >>> excess = chase(states, basis, targets.Paper(), optim.Nesterov(), inner_steps=2).excess[0]
+        >>> bool(excess[-1] < 0.5 * excess[0])
+        True
+
+        Shown by `staf optimizer=nesterov`.
+
     Args:
         step: s, in units of 1 / L, 0 < s <= 1.
         momentum: beta, in [0, 1); None for the value above.

@@ -44,7 +44,15 @@ _LISTED = 8  # jobs that have not started, by their numbers
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class Run:
-    """A run, or a member of a run of many: what it was, how it ended, what it measured."""
+    """A run, or a member of a run of many: what it was, how it ended, what it measured.
+
+    Example:
+        >>> done = sweep("centers.radius=0.1,0.2", "duration=0.1", "settle_time=0", "figures=false")
+        >>> done[0].status, done[0].setting("centers.radius")
+        ('completed', 0.1)
+
+        Shown by `staf-table runs`.
+    """
 
     directory: Path
     overrides: Mapping[str, Value]  # key -> value, as typed
@@ -61,7 +69,8 @@ class Run:
 
     def __repr__(self) -> str:
         """`<Run completed: kernel=gaussian, ball_error=0.0762>`: overrides and the first headlines."""
-        typed = " ".join(f"{key}={value}" for key, value in self.overrides.items()) or "no overrides"
+        words = (f"{key}={_typed(value)}" for key, value in self.overrides.items())
+        typed = " ".join(words) or "no overrides"
         shown = [name for name in HEADLINES if self.metrics.get(name) is not None][:_SHOWN]
         return f"<Run {self.status}: {', '.join([typed, *(f'{n}={self.metrics[n]:.3g}' for n in shown)])}>"
 
@@ -97,9 +106,23 @@ class Skipped:
     reason: str
 
 
+def _typed(value: Value) -> str:
+    """Return a value as the command line has it: false, not False."""
+    return str(value).lower() if isinstance(value, bool) else "null" if value is None else str(value)
+
+
 @dataclasses.dataclass(frozen=True)
 class Collection:
-    """The runs that `collect` found."""
+    """The runs that `collect` found.
+
+    Example:
+        >>> done = sweep("centers.radius=0.1,0.2", "duration=0.1", "settle_time=0", "figures=false")
+        >>> found = collect([run.directory for run in done])
+        >>> len(found.rows), found.skipped
+        (2, ())
+
+        Shown by `staf-table runs`.
+    """
 
     rows: tuple[Run, ...]  # in the order of the sweep
     skipped: tuple[Skipped, ...]  # what has no row, and why
@@ -144,8 +167,14 @@ def collect(path: str | Path | Sequence[str | Path]) -> Collection:
     """Read every run directory at or under a path: also those of a sweep that goes on, or was killed.
 
     Example:
-        >>> for run in collect("runs/2026-11-21_18-40-59-589684_sweep").rows:
-        ...     print(run.overrides, run.status, run.metrics.get("ball_error"))
+        >>> lines = ("centers.radius=0.1,0.2", "duration=0.1", "settle_time=0", "figures=false")
+        >>> done = sweep(*lines, directory="runs/radii")
+        >>> for run in collect("runs/radii").rows:
+        ...     print(run.overrides["centers.radius"], run.status)
+        0.1 completed
+        0.2 completed
+
+        Shown by `staf-table runs`.
 
     Args:
         path: a run directory, a sweep's directory, a folder of such, or several of them.

@@ -15,3 +15,21 @@ from .planar_quadrotor import PlanarQuadrotor as PlanarQuadrotor
 from .three_state import ThreeState as ThreeState
 from .two_state import TwoState as TwoState
 from .van_der_pol import VanDerPol as VanDerPol
+
+__all__ = [
+    "Bounds",
+    "ControlAffineSystem",
+    "Linear",
+    "Linearisation",
+    "Oscillator",
+    "Pendulum",
+    "PlanarQuadrotor",
+    "Plant",
+    "ThreeState",
+    "TwoState",
+    "Units",
+    "VanDerPol",
+    "runge_kutta_step",
+    "simulate",
+    "trajectory",
+]
