@@ -83,7 +83,7 @@ def simulate(
         >>> cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
         >>> lqr = adp.Feedback(adp.LQR(plant, cost))
         >>> x0 = torch.tensor([[-1.0, 1.0]], dtype=torch.float64)
-        >>> adp.simulate(lqr, plant, cost, x0, dt=0.01, steps=1000).cost.shape
+        >>> adp.simulate(lqr, plant, cost, x0, dt=0.01, steps=100).cost.shape
         torch.Size([1])
 
         Shown by `staf experiment=adp`.

@@ -62,7 +62,7 @@ class StaFBasis(ConventionModule):
         Shown by `staf experiment=gradient_chase`.
 
     Hyperparameters that kernel, centers and radius were given as `nn.Parameter` are learned, others fixed.
-    The buffer `convention` says in a state_dict what coefficients beside it mean: `check_convention`.
+    A buffer named convention says in a state_dict what coefficients beside it mean.
 
     Args:
         kernel: the kernel k.

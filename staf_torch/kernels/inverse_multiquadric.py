@@ -21,7 +21,7 @@ class InverseMultiquadricKernel(RadialKernel):
         length_scale: positive, in the units of the state.
 
     Raises:
-        ValueError: if ``length_scale`` is not positive and finite.
+        ValueError: if the length scale is not positive and finite.
     """
 
     def profile(self, s: Tensor) -> Tensor:

@@ -17,7 +17,7 @@ class Nesterov(UpdateLaw):
 
     By default beta = (1 - q) / (1 + q) with q = kappa^-1/2 of the spectrum at hand; with s = 1 the excess
     then shrinks by 1 - q an iteration up to a constant, though not in every single one: there is no
-    `contraction`. In rows whose y is worse than zero weights, F(y) > F(0), the velocity is dropped:
+    `UpdateLaw.contraction`. In rows whose y is worse than zero weights, F(y) > F(0), the velocity is dropped:
     what is left is a plain gradient step, which lowers F.
 
     Example:

@@ -120,7 +120,7 @@ class ControlAffineSystem(Plant):
     """x' = f(x) + g(x) u, batched. A plant of your own is a subclass with `drift` and, where it has
     inputs, `effectiveness`; its trajectories then come from a fourth-order Runge-Kutta method.
 
-    It is regulated to the origin without control unless `equilibrium` and `resting_input` say else.
+    It is regulated to the origin without control unless `Plant.equilibrium` and `Plant.resting_input` say else.
 
     Example:
         >>> class Trolley(systems.ControlAffineSystem):
@@ -161,7 +161,7 @@ class ControlAffineSystem(Plant):
         return None
 
     def smooth_drift(self, x: Tensor) -> Tensor:
-        """f without the terms that have no derivative at 0; what `linearisation` differentiates."""
+        """f without the terms that have no derivative at 0; what `Plant.linearisation` differentiates."""
         return self.drift(x)
 
     def motion(self, x: Tensor, u: Tensor) -> Tensor:

@@ -24,7 +24,7 @@ class DriftConstants(NamedTuple):
     Example:
         >>> basis = StaFBasis(GaussianKernel(), StateFollowingCenters(rings(3), radius=0.1))
         >>> plant = systems.Oscillator()
-        >>> states = systems.simulate(plant, torch.tensor([[1.0, 0.0]]).double(), dt=0.1, steps=60)[0]
+        >>> states = systems.simulate(plant, torch.tensor([[1.0, 0.0]]).double(), dt=0.5, steps=12)[0]
         >>> constants = theory.drift_constants(basis, targets.Paper(), states, plant.drift(states))
         >>> constants.condition_number > 1, constants.speed > 0
         (True, True)
@@ -59,7 +59,7 @@ def drift_constants(basis: StaFBasis, target: Target, states: Tensor, velocities
     Example:
         >>> basis = StaFBasis(GaussianKernel(), StateFollowingCenters(rings(3), radius=0.1))
         >>> plant = systems.Oscillator()
-        >>> states = systems.simulate(plant, torch.tensor([[1.0, 0.0]]).double(), dt=0.1, steps=60)[0]
+        >>> states = systems.simulate(plant, torch.tensor([[1.0, 0.0]]).double(), dt=0.5, steps=12)[0]
         >>> constants = theory.drift_constants(basis, targets.Paper(), states, plant.drift(states))
         >>> constants.growth >= 0
         True
@@ -120,7 +120,7 @@ def ultimate_bound(
     Example:
         >>> basis = StaFBasis(GaussianKernel(), StateFollowingCenters(rings(3), radius=0.1))
         >>> plant = systems.Oscillator()
-        >>> states = systems.simulate(plant, torch.tensor([[1.0, 0.0]]).double(), dt=0.1, steps=60)[0]
+        >>> states = systems.simulate(plant, torch.tensor([[1.0, 0.0]]).double(), dt=0.5, steps=12)[0]
         >>> constants = theory.drift_constants(basis, targets.Paper(), states, plant.drift(states))
         >>> bound = theory.ultimate_bound(constants, optim.SteepestDescent(), dt=1e-6, inner_steps=10)
         >>> bound.after < bound.before
@@ -159,7 +159,7 @@ def step_for_bound(
     Example:
         >>> basis = StaFBasis(GaussianKernel(), StateFollowingCenters(rings(3), radius=0.1))
         >>> plant = systems.Oscillator()
-        >>> states = systems.simulate(plant, torch.tensor([[1.0, 0.0]]).double(), dt=0.1, steps=60)[0]
+        >>> states = systems.simulate(plant, torch.tensor([[1.0, 0.0]]).double(), dt=0.5, steps=12)[0]
         >>> constants = theory.drift_constants(basis, targets.Paper(), states, plant.drift(states))
         >>> dt = theory.step_for_bound(constants, optim.SteepestDescent(), excess=0.35, inner_steps=10)
         >>> 0 < dt < 1
@@ -189,7 +189,7 @@ def steps_for_bound(
     Example:
         >>> basis = StaFBasis(GaussianKernel(), StateFollowingCenters(rings(3), radius=0.1))
         >>> plant = systems.Oscillator()
-        >>> states = systems.simulate(plant, torch.tensor([[1.0, 0.0]]).double(), dt=0.1, steps=60)[0]
+        >>> states = systems.simulate(plant, torch.tensor([[1.0, 0.0]]).double(), dt=0.5, steps=12)[0]
         >>> constants = theory.drift_constants(basis, targets.Paper(), states, plant.drift(states))
         >>> theory.steps_for_bound(constants, optim.SteepestDescent(), excess=0.35, dt=1e-6) >= 1
         True
@@ -244,7 +244,7 @@ class PaperStep(NamedTuple):
     Example:
         >>> basis = StaFBasis(GaussianKernel(), StateFollowingCenters(rings(3), radius=0.1))
         >>> plant = systems.Oscillator()
-        >>> states = systems.simulate(plant, torch.tensor([[1.0, 0.0]]).double(), dt=0.1, steps=60)[0]
+        >>> states = systems.simulate(plant, torch.tensor([[1.0, 0.0]]).double(), dt=0.5, steps=12)[0]
         >>> found = theory.paper_step(basis, targets.Paper(), states, plant.drift(states), excess=0.35)
         >>> 0 < found.contraction < 1, found.radius > 0
         (True, True)
@@ -280,7 +280,7 @@ def paper_step(
     Example:
         >>> basis = StaFBasis(GaussianKernel(), StateFollowingCenters(rings(3), radius=0.1))
         >>> plant = systems.Oscillator()
-        >>> states = systems.simulate(plant, torch.tensor([[1.0, 0.0]]).double(), dt=0.1, steps=60)[0]
+        >>> states = systems.simulate(plant, torch.tensor([[1.0, 0.0]]).double(), dt=0.5, steps=12)[0]
         >>> found = theory.paper_step(basis, targets.Paper(), states, plant.drift(states), excess=0.35)
         >>> 0 < found.dt < 1  # s
         True
