@@ -13,10 +13,11 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from .._version import __version__
-from .files import COMPLETED, METRICS, UnreadableError, flatten, plain, read_object, write_text
+from .files import COMPLETED, METRICS, flatten, plain, write_text
 from .files import RUN as RUN
 from .files import SWEEP as SWEEP
 from .metric_info import MetricInfo
+from .untrusted import UnreadableError, read_object
 
 SETTINGS = "sweep"
 """The group of settings that are about the sweep and not about its jobs."""

@@ -69,6 +69,11 @@ class Plant(nn.Module, abc.ABC):
     bounds: Bounds | None = None
     period: float | None = None
 
+    @property
+    def traceable(self) -> bool:
+        """Whether the plant is torch all through, so that it can be differentiated and compiled."""
+        return True
+
     def equilibrium(self) -> Tensor:
         """The state at which the plant rests under `resting_input`, (n,): zeros unless it says else."""
         return torch.zeros(self._size(), dtype=torch.float64)
@@ -120,7 +125,8 @@ class ControlAffineSystem(Plant):
     """x' = f(x) + g(x) u, batched. A plant of your own is a subclass with `drift` and, where it has
     inputs, `effectiveness`; its trajectories then come from a fourth-order Runge-Kutta method.
 
-    It is regulated to the origin without control unless `Plant.equilibrium` and `Plant.resting_input` say else.
+    It is regulated to the origin without control unless `Plant.equilibrium` and `Plant.resting_input` say
+    else.
 
     Example:
         >>> class Trolley(systems.ControlAffineSystem):

@@ -245,10 +245,13 @@ def as_text(value: Value) -> str:
 def _row(runs: Sequence[Run], keys: Sequence[str], spread: Sequence[str], columns: Sequence[Column]) -> Row:
     cells: dict[str, Value] = {key: runs[0].value(key) for key in keys}
     reasons: dict[str, str] = {}
+    places: dict[str, list[Run]] = {}
+    for run in runs:
+        places.setdefault(place(run, spread), []).append(run)
     for column in columns:
         if column.metric is None or column.statistic is None:
             continue
-        here = [run for run in runs if place(run, spread) == column.at]
+        here = places.get(column.at, [])
         numbers = [n for run in here if (n := run.metrics.get(column.metric)) is not None]
         if column.statistic in ("n", "failed"):
             cells[column.name] = len(numbers) if column.statistic == "n" else len(here) - len(numbers)

@@ -135,7 +135,6 @@ def test_tracking_writes_its_run_directory(tmp_path: Path) -> None:
         (["adp.cost.state=[[1,0],[0,-1]]"], r"`QuadraticCost\(state=...\)` must be positive semidefinite"),
         (["adp.cost.control=0"], r"`QuadraticCost\(control=...\)` must be positive"),
         (["system=oscillator"], r"`adp\(system=...\)` must be a plant with inputs; got 'Oscillator'"),
-        (["adp/cost=bounded_input"], r"`ActorCritic\(cost=...\)` must be a QuadraticCost"),
         (["initial_state=[1,2,3]"], r"`staf initial_state=...` must have 2 entries"),
         (["duration=1e-9"], r"`staf duration=...` must be at least one step"),
     ],
