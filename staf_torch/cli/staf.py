@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import sys
 
@@ -14,6 +15,7 @@ from ..sweeps.hydra_compat import broken_sweep, find_launcher, full_errors, prog
 from ..sweeps.hydra_compat import config_directory as config_directory
 from ..sweeps.job import Refused, execute
 from ..sweeps.resume import command_line
+from ..sweeps.signals import name_and_code, stopped_by_signals
 from . import doctor, schema
 
 find_launcher()
@@ -33,7 +35,7 @@ def main() -> None:
         sys.exit(_schema(sys.argv[2:]))
     sys.path.insert(0, os.getcwd())  # so that `target.path=my_module.my_function` finds the user's file
     typed = sys.argv
-    with full_errors() as wants_trace:
+    with full_errors() as wants_trace, stopped_by_signals():
         try:
             sys.argv = [typed[0], *command_line(typed[1:])]
             _staf()
@@ -46,8 +48,10 @@ def main() -> None:
             if sweep is not None:
                 callbacks.close(sweep)
             if isinstance(error, KeyboardInterrupt):
-                sys.stderr.write(callbacks.farewell(sweep) + "\n")
-                sys.exit(130)  # as shells have it
+                said, code = name_and_code(error)
+                with contextlib.suppress(OSError):  # the terminal may be gone
+                    sys.stderr.write(callbacks.farewell(sweep, said) + "\n")
+                sys.exit(code)
             if wants_trace or not isinstance(error, USER_ERRORS):
                 raise
             sys.exit(f"staf: {sentence(error)}")

@@ -17,6 +17,7 @@ from typing import Any
 
 from .._version import __version__
 from ..numerics import fail
+from .build import damage, damaged, short
 from .files import (
     COMPLETED,
     FAILED,
@@ -45,6 +46,7 @@ from .untrusted import UnreadableError, parse_object, read_lines, read_object, t
 _OVERRIDES = "overrides.yaml"
 _LISTED = 8  # jobs that have not started, by their numbers
 _COLUMNS = 5000  # names of settings and metrics of all runs together
+_SHOWN = 3  # values of a setting that a remark names
 _DEEPEST = 16  # levels of folders
 _MOST_JOBS = 2**24  # bytes of `sweep.json`
 
@@ -93,7 +95,8 @@ def collect(path: str | Path | Sequence[str | Path]) -> Collection:
     skipped = [Skipped(one.path, visible(one.reason)) for one in skipped]
     if not rows and not skipped:
         raise fail("collect", "path", "must hold a run or a sweep of runs", [str(p) for p in paths])
-    return Collection(tuple(rows), tuple(skipped), tuple(_versions(rows)))
+    collection = Collection(tuple(rows), tuple(skipped))
+    return dataclasses.replace(collection, remarks=(*_versions(rows), *_mixed(collection)))
 
 
 def _further_names(known: set[str], runs: Sequence[Run]) -> set[str]:
@@ -178,6 +181,18 @@ def _versions(rows: Sequence[Run]) -> Iterator[str]:
         )
 
 
+def _mixed(found: Collection) -> Iterator[str]:
+    """One remark for each setting that differs although nobody swept it, and for different builds."""
+    for key in found.unswept:
+        values: dict[str, list[Run]] = {}
+        for run in found.rows:
+            value = run.value(key)
+            values.setdefault(value if isinstance(value, str) else json.dumps(value), []).append(run)
+        counts = [f"{value} in {len(runs)} (as {runs[0].directory})" for value, runs in values.items()]
+        more = f" and {len(counts) - _SHOWN} others" if len(counts) > _SHOWN else ""
+        yield f"`{key}` differs between runs although nobody swept it: {', '.join(counts[:_SHOWN])}{more}"
+
+
 def read_run(directory: Path) -> list[Run]:
     """Return the runs of a run directory: one, or one a member.
 
@@ -187,9 +202,13 @@ def read_run(directory: Path) -> list[Run]:
     if not os.path.lexists(directory / RUN):
         return [_without_record(directory, None)]
     try:
-        run = _of_record(directory, read_object(directory / RUN))
+        record = read_object(directory / RUN)
+        run = _of_record(directory, record)
     except UnreadableError as error:
         return [_without_record(directory, str(error))]
+    wrong = damaged(directory, record, thorough=False)
+    if wrong is not None:
+        return [dataclasses.replace(run, status=UNFINISHED, reason=wrong, metrics={})]
     return _members(run) if os.path.lexists(directory / MEMBERS) else [run]
 
 
@@ -204,7 +223,10 @@ def read_record(directory: Path) -> Run:
 
 def _of_record(directory: Path, record: Mapping[str, Any]) -> Run:
     status, reason = _status(record)
-    metrics, lost, unread = _measured(directory) if status == COMPLETED else ({}, {}, None)
+    metrics, lost, unread = _measured(directory, record) if status == COMPLETED else ({}, {}, None)
+    made_by = record.get("build")
+    if unread is not None:
+        status = UNFINISHED
     return Run(
         directory=directory,
         overrides=parse_overrides(_lines(record)),
@@ -217,6 +239,7 @@ def _of_record(directory: Path, record: Mapping[str, Any]) -> Run:
         seconds=_number(record.get("seconds")),
         declared=read_infos(record.get("metrics")),
         lost=lost,
+        build=short(made_by) if isinstance(made_by, dict) else None,
     )
 
 
@@ -290,7 +313,7 @@ def _without_record(directory: Path, why: str | None) -> Run:
         overrides, settings = _of_hydra(directory / HYDRA)
     except UnreadableError as error:
         raise UnreadableError("; ".join(filter(None, (why, str(error))))) from error
-    metrics, lost, unread = _measured(directory)
+    metrics, lost, unread = _measured(directory, {})
     if unread is not None and not (directory / METRICS).exists():
         unread = f"has no {METRICS}: it goes on, failed or was killed"
     reason = "; ".join(filter(None, (why, unread))) or None
@@ -318,8 +341,15 @@ def _of_hydra(folder: Path) -> tuple[dict[str, Value], dict[str, Value]]:
     return parse_overrides(str(line) for line in lines), settings
 
 
-def _measured(directory: Path) -> tuple[dict[str, float | None], dict[str, str], str | None]:
-    """`_metrics` of a run, and why they cannot be read."""
+def _measured(
+    directory: Path, record: Mapping[str, Any]
+) -> tuple[dict[str, float | None], dict[str, str], str | None]:
+    """`_metrics` of a run, and why they cannot be read or believed."""
+    files = found if isinstance(found := record.get("files"), dict) else {}
+    numbers = {name: about for name, about in files.items() if name in (METRICS, MEMBERS)}
+    wrong = damage(directory, numbers, thorough=True)
+    if wrong is not None:
+        return {}, {}, wrong
     try:
         return *_metrics(read_object(directory / METRICS)), None
     except UnreadableError as error:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections import ChainMap
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection as Collection_
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from .files import Value
@@ -128,12 +129,57 @@ class Collection:
         overridden = dict.fromkeys(key for run in self.rows for key in run.overrides)
         if len(self.rows) == 1:
             return tuple(overridden)
-        return tuple(key for key in overridden if len({identity(run.setting(key)) for run in self.rows}) > 1)
+        found = [key for key in overridden if len({identity(run.setting(key)) for run in self.rows}) > 1]
+        return (*found, *self.unswept)
+
+    @functools.cached_property
+    def unswept(self) -> tuple[str, ...]:
+        """Settings that differ between runs although nobody overrode them, and `build` where that differs.
+
+        Somebody edited a file between two of the runs. What an interpolation takes from an override is none.
+        """
+        overridden = dict.fromkeys(key for run in self.rows for key in run.overrides)
+        words = [key for key in overridden if any(isinstance(run.setting(key), str) for run in self.rows)]
+        first: dict[tuple[str, ...], Run] = {}
+        seen: set[int] = set()
+        found: dict[str, None] = {}
+        for run in self.rows:
+            base = layers(run.settings)[-1]
+            if id(base) in seen or not base:  # members share theirs
+                continue
+            seen.add(id(base))
+            other = first.setdefault(tuple(identity(run.setting(key)) for key in words), run)
+            if other is not run:
+                found |= dict.fromkeys(_differ(run, other))
+        builds = {run.build for run in self.rows}
+        return (*(key for key in found if not _explained(key, overridden)), *["build"] * (len(builds) > 1))
 
     @functools.cached_property
     def _settings(self) -> list[Mapping[str, Value]]:
         """The settings of all runs, those that members share once."""
         return list({id(part): part for run in self.rows for part in layers(run.settings)}.values())
+
+
+def _differ(run: Run, other: Run) -> Iterator[str]:
+    """The settings in which two runs differ, where neither takes its value from an override of its own."""
+    one, two = layers(run.settings)[-1], layers(other.settings)[-1]
+    for key in {**one, **two}:
+        if one.get(key) != two.get(key):
+            entries = [
+                value if isinstance(value, list) else [value] for value in (one.get(key), two.get(key))
+            ]
+            if len(entries[0]) != len(entries[1]):
+                yield key
+                continue
+            pairs = zip(*entries, strict=True)
+            typed = [list(each.overrides.values()) for each in (run, other)]
+            if any(a != b and a not in typed[0] and b not in typed[1] for a, b in pairs):
+                yield key
+
+
+def _explained(key: str, overridden: Collection_[str]) -> bool:
+    """Whether a key is overridden, or is above or below one that is."""
+    return any(key == o or key.startswith((f"{o}.", f"{o}/")) or o.startswith(f"{key}.") for o in overridden)
 
 
 def layers(settings: Mapping[str, Value]) -> Sequence[Mapping[str, Value]]:

@@ -95,7 +95,7 @@ def read_object(path: Path, most: int = MOST_BYTES) -> dict[str, Any]:
 def parse_object(content: bytes, name: str) -> dict[str, Any]:
     """Return a JSON object; ``name`` is for the message.
 
-    Whole numbers that 64 bits do not hold become floats, which may be infinite. Texts and keys are `visible`.
+    Whole numbers of more than 20 digits become floats, which may be infinite. Texts and keys are `visible`.
 
     Raises:
         UnreadableError: if it is none, or has too many or too deep parts.
@@ -107,7 +107,7 @@ def parse_object(content: bytes, name: str) -> dict[str, Any]:
         found = json.loads(text, parse_int=_integer)
         # Only escapes and letters beyond ASCII can make a character that is not seen.
         if not text.isascii() or "\x7f" in text or _ESCAPED.search(text):
-            found = _visible(found)
+            found = all_visible(found)
     except RecursionError as error:
         raise UnreadableError(f"{name} is nested too deep") from error
     except ValueError as error:
@@ -140,6 +140,17 @@ def visible(text: str) -> str:
     return "".join(
         c if c in "\n\t" or unicodedata.category(c) not in _UNSEEN else f"\\u{ord(c):04x}" for c in text
     )
+
+
+def all_visible(value: Any) -> Any:
+    """Return a JSON value with all its texts and keys `visible`."""
+    if isinstance(value, str):
+        return visible(value)
+    if isinstance(value, list):
+        return [all_visible(each) for each in value]
+    if isinstance(value, dict):
+        return {visible(key): all_visible(each) for key, each in value.items()}
+    return value
 
 
 def too_deep(value: Any, left: int = _DEEPEST) -> bool:
@@ -181,16 +192,4 @@ def _decoded(content: bytes, name: str) -> str:
 
 
 def _integer(text: str) -> int | float:
-    if len(text) > 18:  # 2^63 has 19 digits
-        return float(text)
-    return int(text)
-
-
-def _visible(value: Any) -> Any:
-    if isinstance(value, str):
-        return visible(value)
-    if isinstance(value, list):
-        return [_visible(each) for each in value]
-    if isinstance(value, dict):
-        return {visible(key): _visible(each) for key, each in value.items()}
-    return value
+    return int(text) if len(text) <= 20 else float(text)
