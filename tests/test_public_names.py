@@ -1,7 +1,7 @@
-"""The examples in the docstrings of public names do what they say.
+"""The examples in the docstrings of public names do what they say; `test_structure.py` asks each for one.
 
-They begin where a reader does: with `import torch`, `from pathlib import Path`, `from staf_torch import *` and
-the names of the package that the name itself is in. `test_structure.py` asks for an example of every name.
+They begin where a reader does: after `import torch`, `from pathlib import Path`, `from staf_torch import *`,
+and the names of the package that the name itself is in.
 """
 
 from __future__ import annotations

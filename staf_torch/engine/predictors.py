@@ -62,7 +62,7 @@ class Predictor(abc.ABC):
         """The weights to start from at an arrival.
 
         Args:
-            inputs: what `prepare` returned for this arrival.
+            inputs: what `Predictor.prepare` returned for this arrival.
             weights: as corrected at the time before, (B, M).
             previous: as corrected at the time before that, (B, M); at the start, the same as weights;
                 both in units of the state that they leave.
