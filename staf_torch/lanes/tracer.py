@@ -224,7 +224,10 @@ class Tracer(TorchDispatchMode):
 
     def _constants(self, tensor: Tensor, kind: str) -> Ids:
         with _disable_current_modes():
-            numbers = tensor.detach().reshape(-1).tolist()
+            # The tangent of a constant in forward mode is a zero without memory.
+            numbers = (
+                [0.0] * tensor.numel() if tensor._is_zerotensor() else tensor.detach().reshape(-1).tolist()
+            )
         return np.array([self.graph.constant(n, kind) for n in numbers], dtype=np.int64).reshape(tensor.shape)
 
     def _view(self, held: Ids, tensor: Tensor) -> Ids:
