@@ -53,10 +53,16 @@ class DirectShooting:
     the Runge-Kutta steps and of the horizon, which `Optimum` reports.
 
     Example:
-        >>> plant = systems.Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
-        >>> cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1, low=-1.0, high=1.0)
-        >>> adp.DirectShooting(plant, cost).solve(torch.tensor([[5.0, 0.0]], dtype=torch.float64))
-        Optimum(1 states, value 53.1619 to 53.1619, 1 converged, 80 intervals over 10.62 s)
+        >>> plant = systems.TwoState()
+        >>> cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
+        >>> x0 = torch.tensor([[0.2, 0.1]]).double()
+        >>> round(float(adp.DirectShooting(plant, cost).solve(x0).value), 5)  # V* = x1^2 / 2 + x2^2
+        0.03
+        >>> limited = adp.DirectShooting(plant, cost, low=-0.1, high=0.1)
+        >>> limited.solve(x0).plan.abs().max() <= 0.1
+        tensor(True)
+
+        Shown by `staf experiment=adp_three_state`.
 
     Args:
         system: the plant, in continuous time and in torch; its rate must have second derivatives.
