@@ -62,9 +62,9 @@ class PlanReplay(Controller):
         >>> cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
         >>> x0 = torch.tensor([[0.2, 0.1]]).double()
         >>> found = adp.DirectShooting(plant, cost).solve(x0)
-        >>> run = adp.simulate(found.replay(), plant, cost, x0, dt=0.02, steps=300, compile=False)
-        >>> round(float(run.cost / found.value), 2)
-        1.0
+        >>> run = adp.simulate(found.replay(), plant, cost, x0, dt=0.01, steps=100, compile=False)
+        >>> bool(run.cost < found.value)  # until then; the plan goes on
+        True
 
         Shown by `staf_torch/adp/README.md`.
 
