@@ -12,6 +12,7 @@ from torch import Tensor
 from . import compiler
 from .captured import Recipe
 from .combinators import Tree, tracing
+from .eliminations import WithoutVectors
 from .emission import Text, emit
 from .graph import NOW, STEP, Graph
 from .lowering import lower
@@ -40,6 +41,8 @@ class Program:
         >>> x, history = program(x0, u, (gain,))
         >>> history.shape
         torch.Size([5, 100])
+
+        Shown by `staf_torch/lanes/README.md`.
 
     The definition is plain torch: ``step`` with all rows, time after time. The compiled program runs ``step``
     once with a single row, (1, ...), writes down what it does as a scalar program and computes that with a
@@ -239,6 +242,9 @@ class Prepared:
     """A call of a program for inputs of fixed shapes, strides and dtypes; `Program.prepare` makes one.
 
     Called as the program is, without ``steps`` and ``every``. Inputs of other forms go to the program.
+
+    Attributes:
+        plan: of the compiled call, once there was one; None before, and where the definition runs.
     """
 
     def __init__(self, program: Program, given: Given, every: int) -> None:
@@ -246,7 +252,7 @@ class Prepared:
         leaves, self._structure = flatten(given.trees())
         self._forms = tuple(map(form, leaves))
         self._carries, self._carry = len(given.carry), given.structures["carry"]
-        self._plan: Plan | None = None
+        self.plan: Plan | None = None
         self._refused = given.rows == 0 or given.times == 0
 
     def __call__(self, carry: Tree, now: Tree = (), row: Tree = ()) -> tuple[Tree, Tree]:
@@ -265,16 +271,16 @@ class Prepared:
         """
         if self._refused or not ordinary(leaves):
             return self._program.definition(carry, now, row, steps=self._steps, every=self._every)
-        if self._plan is None:
+        if self.plan is None:
             given = Given.of(carry, now, row, self._steps)
             compiled = self._program.find(given)
             if compiled is None:
                 self._refused = True
                 return self.run(leaves, carry, now, row)
             times = [False] * len(given.row) + [True] * len(given.now) + [False] * len(given.carry)
-            self._plan = Plan(compiled, leaves, times, rows=given.rows, steps=given.times, every=self._every)
-        rooms = iter(self._plan(leaves))
-        return unflatten(self._carry, rooms), unflatten(self._plan.structure, rooms)
+            self.plan = Plan(compiled, leaves, times, rows=given.rows, steps=given.times, every=self._every)
+        rooms = iter(self.plan(leaves))
+        return unflatten(self._carry, rooms), unflatten(self.plan.structure, rooms)
 
 
 class Given(NamedTuple):
@@ -369,7 +375,7 @@ def trace(step: Step, given: Given, *, widened: bool = False, folded: bool = Fal
         row = given.tree("row", inputs("row", given.row, 0, 0))
         now = given.tree("now", inputs("now", given.now, NOW, 1))
         carry = inputs("state", given.carry, STEP, 0)
-        with tracer, tracing(tracer):
+        with tracer, tracing(tracer), WithoutVectors(tracer.traced):
             after, out = step(given.tree("carry", carry), now, row)
         ends, structure = flatten(after)
         if structure != given.structures["carry"] or [(e.shape, e.dtype) for e in ends] != [
