@@ -238,8 +238,7 @@ def _yaml(node: DictConfig, parent: str | None = None) -> str:
 
 @functools.lru_cache(1000)
 def _yaml_part(key: str, part: str, parent: str | None) -> str:
-    node = {key: json.loads(part)}
-    node = node if parent is None else {parent: node}
+    node = {key: json.loads(part)} if parent is None else {parent: {key: json.loads(part)}}
     dumper, as_hydra = get_omega_conf_dumper(), {"allow_unicode": True, "sort_keys": False}
     text: str = yaml.dump(node, Dumper=dumper, default_flow_style=False, **as_hydra)
     return text if parent is None else text.partition("\n")[2]
