@@ -15,7 +15,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from .._version import __version__
 from ..numerics import fail
 from .build import damage, damaged, short
 from .files import (
@@ -35,6 +34,7 @@ from .files import (
 )
 from .files import Value as Value
 from .metric_info import read_infos
+from .remarks import mixed, versions
 from .run import ABOUT as ABOUT
 from .run import Collection as Collection
 from .run import Run as Run
@@ -47,7 +47,6 @@ from .untrusted import UnreadableError, parse_object, read_lines, read_object, t
 _OVERRIDES = "overrides.yaml"
 _LISTED = 8  # jobs that have not started, by their numbers
 _COLUMNS = 5000  # names of settings and metrics of all runs together
-_SHOWN = 3  # values of a setting that a remark names
 _DEEPEST = 16  # levels of folders
 _MOST_JOBS = 2**24  # bytes of `sweep.json`
 
@@ -97,7 +96,7 @@ def collect(path: str | Path | Sequence[str | Path]) -> Collection:
     if not rows and not skipped:
         raise fail("collect", "path", "must hold a run or a sweep of runs", [str(p) for p in paths])
     collection = Collection(tuple(rows), tuple(skipped))
-    return dataclasses.replace(collection, remarks=(*_versions(rows), *_mixed(collection)))
+    return dataclasses.replace(collection, remarks=(*versions(rows), *mixed(collection)))
 
 
 def _further_names(known: set[str], runs: Sequence[Run]) -> set[str]:
@@ -169,29 +168,6 @@ def _not_started(directory: Path, rows: Sequence[Run]) -> Iterator[Skipped]:
 
 def _identity(overrides: Mapping[str, Value]) -> tuple[tuple[str, str], ...]:
     return tuple(sorted((key, identity(value)) for key, value in overrides.items()))
-
-
-def _versions(rows: Sequence[Run]) -> Iterator[str]:
-    """One remark for each other version of which there are runs."""
-    others = dict.fromkeys(run.version for run in rows if run.version not in (None, __version__))
-    for version in others:
-        those = [run for run in rows if run.version == version]
-        yield (
-            f"{len(those)} of {len(rows)} runs were written by staf_torch {version}, and this is "
-            f"{__version__}: their numbers may mean something else (the first is {those[0].directory})"
-        )
-
-
-def _mixed(found: Collection) -> Iterator[str]:
-    """One remark for each setting that differs although nobody swept it, and for different builds."""
-    for key in found.unswept:
-        values: dict[str, list[Run]] = {}
-        for run in found.rows:
-            value = run.value(key)
-            values.setdefault(value if isinstance(value, str) else json.dumps(value), []).append(run)
-        counts = [f"{value} in {len(runs)} (as {runs[0].directory})" for value, runs in values.items()]
-        more = f" and {len(counts) - _SHOWN} others" if len(counts) > _SHOWN else ""
-        yield f"`{key}` differs between runs although nobody swept it: {', '.join(counts[:_SHOWN])}{more}"
 
 
 def read_run(directory: Path) -> list[Run]:
