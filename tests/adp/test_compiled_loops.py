@@ -195,6 +195,20 @@ def test_what_cannot_be_compiled_runs_in_plain_torch_with_one_line(
     assert reason in line
 
 
+def test_a_sweep_over_gains_needs_no_other_program() -> None:
+    basis, x0 = adp.QuadraticBasis(2), uniform(1, 1.0)
+
+    def text(critic: float, beta: float) -> str:
+        law = adp.Information(adp.Gains(critic=critic, forgetting=beta))
+        loop = ClosedLoop(
+            adp.ActorCritic(basis, PLANT, COST, adp.RandomPoints(1, 1.0), law), PLANT, COST, dt=1e-3
+        )
+        given = loop.init(x0), x0.new_zeros(1, 2, 1, 2)
+        return program(loop, True).text(*given)
+
+    assert text(0.3, 0.003) == text(0.7, 0.009)
+
+
 def test_a_rollout_policy_that_is_asked_often_compiles_itself_and_sees_what_changes() -> None:
     policy = adp.RolloutPolicy.of_lqr(PLANT, COST, steps=4)
     x = uniform(50, 0.5)
