@@ -53,6 +53,10 @@ class Problem:
                 f"`{self.call}(states=...)` must have the shape (B, T, n); got {tuple(states.shape)}."
             )
 
+    def values(self, x: Tensor) -> Tensor:
+        """Return V(c(x)) at the states x (..., n): (..., M)."""
+        return self.basis.values(x, self.target)
+
     def first_weights(self, states: Tensor, weights: Tensor | None) -> Tensor:
         """Return e^g w before the first correction, (B, M), in units of the first state.
 
