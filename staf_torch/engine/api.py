@@ -15,7 +15,7 @@ from .certificate import before_each, certify, first_link
 from .predictors import Predictor
 from .problem import Problem
 from .quantities import Known, know, numbers, precompute, with_certificate
-from .recursion import Carry, Corrected, Inputs, Recursion, kept_gain, last_weights, lost, recursion, start
+from .recursion import Corrected, Inputs, Recursion, kept_gain, last_weights, lost, recursion, start
 from .result import ChaseResult, ChaseWeights, concatenate
 
 _WORKING_BYTES = 2**26
@@ -182,7 +182,9 @@ class _Run:
             result = found.numbers.result(states, self.carry.diverged_at)
             if found.certificate is None:
                 return result
-            return with_certificate(result, found.certificate, torch.zeros_like(result.value, dtype=torch.bool))
+            return with_certificate(
+                result, found.certificate, torch.zeros_like(result.value, dtype=torch.bool)
+            )
         self._warned = self._warned or problem.basis.check_reach(states, stacklevel=4)
         known, link = know(problem, states, local=True), self.carry.link
         run, inputs = self._corrected(known)
@@ -229,9 +231,7 @@ class _Run:
         after, outputs = program(given, states, every=every)
         now, old = after.chase, carry.diverged_at
         fresh = torch.where(now.diverged_at >= 0, now.diverged_at + (start - begins), -1)
-        self.carry = now._replace(
-            time=start + states.shape[1], diverged_at=torch.where(old >= 0, old, fresh)
-        )
+        self.carry = now._replace(time=start + states.shape[1], diverged_at=torch.where(old >= 0, old, fresh))
         if not self._warned:
             self._warned = self._problem.basis.warn_reach(float(after.reach.max()), stacklevel=5)
         found: row_program.Outputs = outputs

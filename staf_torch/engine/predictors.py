@@ -39,7 +39,9 @@ class Predictor(abc.ABC):
         """The predictor as in a sentence, from the name of its class."""
         return type(self).__name__.lower()
 
-    def prepare(self, basis: StaFBasis, target: Target, states: Tensor, start: int | Tensor) -> PredictorInputs:
+    def prepare(
+        self, basis: StaFBasis, target: Target, states: Tensor, start: int | Tensor
+    ) -> PredictorInputs:
         """What `predict` needs at the C arrivals of a chunk of time, in bulk.
 
         Args:
@@ -125,7 +127,9 @@ class Tangent(Predictor):
     def title(self) -> str:
         return f"tangent order {self.order}"
 
-    def prepare(self, basis: StaFBasis, target: Target, states: Tensor, start: int | Tensor) -> PredictorInputs:
+    def prepare(
+        self, basis: StaFBasis, target: Target, states: Tensor, start: int | Tensor
+    ) -> PredictorInputs:
         before, x, after = states[:, :-2], states[:, 1:-1], states[:, 2:]
         if self.order == 2:
             advance, relax = _tangent(basis, target, (x + after) / 2, after - x)

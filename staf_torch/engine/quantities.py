@@ -6,6 +6,7 @@ Leading dimensions ... are (B, C), a chunk of time at once, or (B,), one time of
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -59,7 +60,9 @@ def know(problem: Problem, x: Tensor, *, local: bool) -> Known:
     space = basis.local(x)
     fitted = space.fit(values)
     row = basis.kernel.core(x, x.new_zeros(1, basis.dim), space.offsets).squeeze(-2)
-    return Known(x, structure, values, Local(space, fitted, space.scaled_weights(fitted), row, problem.target(x)))
+    return Known(
+        x, structure, values, Local(space, fitted, space.scaled_weights(fitted), row, problem.target(x))
+    )
 
 
 def precompute(problem: Problem, known: Known, gram: Tensor) -> Precomputed:
@@ -109,7 +112,13 @@ class Numbers(NamedTuple):
         return ChaseResult(state=state, diverged_at=diverged_at, **self._asdict())
 
 
-def numbers(known: Known, run: Corrected, kept_gain: Tensor, lost: Tensor) -> Numbers:
+def numbers(
+    known: Known,
+    run: Corrected,
+    kept_gain: Tensor,
+    lost: Tensor,
+    product: Callable[[Tensor], Tensor] | None = None,
+) -> Numbers:
     """Return everything that follows from the weights.
 
     Args:
@@ -117,6 +126,7 @@ def numbers(known: Known, run: Corrected, kept_gain: Tensor, lost: Tensor) -> Nu
         run: weights before and after the correction.
         kept_gain: g in whose units e^{-g} the weights stand, (...): a row that diverged keeps its last.
         lost: whether the row has diverged, (...) bool.
+        product: e^{-g} K v, where somebody has it; else the Gram matrix stays in its factors.
     """
     structure, local = known.structure, known.local
     assert local is not None
@@ -131,6 +141,11 @@ def numbers(known: Known, run: Corrected, kept_gain: Tensor, lost: Tensor) -> Nu
     def at_state(scaled_weights: Tensor) -> Tensor:
         return reached(torch.linalg.vecdot(row.expand(ideal.shape), scale * scaled_weights))
 
+    def excess(weights: Tensor) -> Tensor:
+        error = weights - ideal
+        square = structure.quadratic(error) if product is None else torch.linalg.vecdot(error, product(error))
+        return reached(square * inverse_gain)
+
     origin = known.state.new_zeros(1, known.state.shape[-1])
     return Numbers(
         weights=_paper_weights(run.after, (-kept_gain).exp().unsqueeze(-1)),
@@ -140,8 +155,8 @@ def numbers(known: Known, run: Corrected, kept_gain: Tensor, lost: Tensor) -> Nu
         estimate=at_state(run.after),
         estimate_before=at_state(run.before),
         ideal_estimate=reached(space.evaluate(origin, fitted).squeeze(-1)),
-        excess=reached(structure.quadratic(run.after - ideal) * inverse_gain),
-        excess_before=reached(structure.quadratic(run.before - ideal) * inverse_gain),
+        excess=excess(run.after),
+        excess_before=excess(run.before),
     )
 
 

@@ -6,16 +6,14 @@ and ``inner_steps`` iterations of the law. All are pure functions of rows; `row_
 
 from __future__ import annotations
 
-from collections.abc import Set
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from ..approximation.basis import GramStructure, StaFBasis
-from ..local_basis import LocalSpace
+from ..approximation.basis import GramStructure
 from ..optim.base import LawState
-from ..optim.objective import NativeError, Objective, Precomputed, extremes
+from ..optim.objective import NativeError, Objective, Precomputed
 from .predictors import PredictorInputs
 from .problem import Problem
 

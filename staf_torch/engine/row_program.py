@@ -69,14 +69,19 @@ class Step:
             prepared = problem.predictor.prepare(problem.basis, problem.target, around, last.time)
             prediction, states = tuple(part.squeeze(1) for part in prepared), around[:, 1:]
         at = Moment(known.log_gain, _usable(structure, gram, known.values), prediction)
-        before, now = correct(problem, _objective(structure, gram, known.values, found), at, last)
+        objective = _objective(structure, gram, known.values, found)
+        before, now = correct(problem, objective, at, last)
         now = now._replace(states=states)
-        reach = torch.maximum(carry.reach, self._reach(x)) if known.structure.log_gain is not None else carry.reach
+        reach = (
+            torch.maximum(carry.reach, self._reach(x))
+            if known.structure.log_gain is not None
+            else carry.reach
+        )
         if not self.everything:
             return RowCarry(now, reach), Outputs(weights=now.weights * (-now.log_gain).exp().unsqueeze(-1))
         lost = now.diverged_at >= 0
         run = Corrected(before, now.weights, known.values, known.log_gain)
-        outputs = Outputs(numbers=numbers(known, run, now.log_gain, lost))
+        outputs = Outputs(numbers=numbers(known, run, now.log_gain, lost, objective.curvature))
         if problem.certificate:
             vouched, link = self._certified(known, gram, run, last)
             outputs = outputs._replace(certificate=Certificate(*(unless(lost, term) for term in vouched)))
@@ -136,7 +141,6 @@ def program(problem: Problem, states: Tensor, carry: RowCarry, *, everything: bo
         if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors):
             return None
         made = _of(problem, everything, structure, tensors)
-    problem.values(states[:1, 0])  # a target says here what it does not like, in its own words
     return made if made.compiles(carry, states) else None
 
 

@@ -74,7 +74,7 @@ class Captured:
 
     def stated(self, tensor: Tensor) -> bool:
         """Whether the numbers of a tensor are part of the text."""
-        if tensor.numel() == 0 or tensor._is_zerotensor():
+        if not _in_memory(tensor):
             return True
         address = tensor.untyped_storage().data_ptr()
         if address in self._stated:
@@ -84,7 +84,7 @@ class Captured:
     def ran(self, function: Any, args: Sequence[Any], kwargs: dict[str, Any], out: Any) -> None:
         """Note an operation on tensors of which no row has its own."""
         name = function._schema.name.removeprefix("aten::")
-        given = [t for t in tensors((args, kwargs)) if t.numel()]
+        given = [t for t in tensors((args, kwargs)) if _in_memory(t)]
         stated = name in _OF_NO_VALUES or all(self.stated(t) for t in given)
         if not stated:
             if name == "_local_scalar_dense":
@@ -97,7 +97,7 @@ class Captured:
                 self._forget(tensor)
             self._repeats = self._repeats and stated
         for tensor in tensors(out):
-            if tensor.numel() and not tensor._is_zerotensor():
+            if _in_memory(tensor):
                 storage = tensor.untyped_storage()
                 known = storage.data_ptr() in self._stated or storage.data_ptr() in self._derived
                 if not stated:
@@ -155,7 +155,7 @@ class Captured:
         return Recipe(_joined(self._values), operations, self._reads, numbers, self._checks)
 
     def _made_inside(self, tensor: Tensor) -> bool:
-        return tensor.numel() == 0 or tensor.untyped_storage().data_ptr() in self._stated
+        return not _in_memory(tensor) or tensor.untyped_storage().data_ptr() in self._stated
 
     def _forget(self, tensor: Tensor) -> None:
         """New numbers stand in this memory."""
@@ -182,6 +182,10 @@ def _read(tensor: Tensor, at: np.ndarray[Any, Any]) -> Tensor:
 
 def _joined(parts: Sequence[Tensor]) -> Tensor:
     return torch.cat(list(parts)) if parts else torch.zeros(0, dtype=torch.float64)
+
+
+def _in_memory(tensor: Tensor) -> bool:
+    return tensor.numel() > 0 and not tensor._is_zerotensor()  # forward mode has zeros without memory
 
 
 def _swapped(value: Any, known: Mapping[int, Tensor]) -> Any:

@@ -15,6 +15,9 @@ Ids = np.ndarray[Any, np.dtype[np.int64]]
 REAL, WIDE, FLAG, WHOLE = "real", "wide", "flag", "whole"
 """Types of a node: the program's float, float64 within a program of float32, bool, integer."""
 
+FIXED = ("const", "param")
+"""Operations of nodes that are the same for all rows and times."""
+
 ROW, NOW, STEP = 0, 1, 2
 """Depths: what a row has once, what a time brings whatever the carry is, what depends on the carry.
 Loops inside a step are deeper."""

@@ -9,14 +9,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .graph import Graph
+from .graph import FIXED, Graph
 from .schedule import Schedule
 from .tracer import NotLoweredError
 
 _INPUTS = ("const", "param", "elem", "result", "collect", "carry", "state", "row", "now")
 _ARRAYS = ("pack", "map", "dot", "collect")
-FIXED = ("const", "param")
-"""Nodes that are the same for all rows and times."""
 
 
 class Layout(NamedTuple):
@@ -48,7 +46,7 @@ class Writer(abc.ABC):
         self._lines: list[str] = []
         self._arrays: set[str] = set()  # of constants, written already
         self._level = 1
-        self._stored: dict[int, int] = {}  # what the steps read from memory instead
+        self._stored: dict[int, tuple[str, int]] = {}  # what is read from a buffer instead, and its place
         self._starts = {
             "row": np.cumsum([0, *layout.rows]).tolist(),
             "now": np.cumsum([0, *layout.nows]).tolist(),
@@ -184,7 +182,8 @@ class Writer(abc.ABC):
         kind = self._type(node)
         self._declare(node)
         indices = [self._affine(place, [outs, count]) for place in places]
-        panel = min(outs, 4 if self.copies > 1 else 8)
+        widths = range(4, 1 + (6 if self.copies > 1 else 8))
+        panel = min(outs, min(reversed(widths), key=lambda width: -(-outs // width) * width))
         full = outs // panel
         for start, rows, passes in ((0, panel, full), (full * panel, outs % panel, 1)):
             if rows == 0 or passes == 0:
@@ -281,11 +280,11 @@ class Writer(abc.ABC):
             return f"s{self._starts[op][slot] + k}{copy}"
         if op in ("carry", "result"):
             if op == "result" and node in self._stored:
-                return self._typed(node, self._buffer("row", self._stored[node], j))
+                return self._typed(node, self._buffer(*self._stored[node], j))
             number, k = graph.aux[node]
             return f"l{number}_{k}{copy}"
         if node in self._stored:
-            return self._typed(node, self._buffer("row", self._stored[node], j))
+            return self._typed(node, self._buffer(*self._stored[node], j))
         return f"t{node}{copy}"
 
     def _read(self, array: int, at: str, j: int) -> str:
@@ -294,7 +293,7 @@ class Writer(abc.ABC):
         if graph.op[array] == "pack" and all(graph.op[a] in FIXED for a in graph.args[array]):
             return self._table(array, at)
         if array in self._stored:
-            return self._typed(array, self._buffer("row", self._stored[array], j, at))
+            return self._typed(array, self._buffer(*self._stored[array], j, at))
         place = self._in_place(array)
         if place is not None:
             return self._typed(array, self._buffer(*place, j, at))
