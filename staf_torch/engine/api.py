@@ -160,7 +160,8 @@ class _Run:
         if self._program is not None:  # nothing but what it returns is kept
             return (states,)
         length = chunk_length(states.shape[0], self._problem.basis, states.element_size())
-        return states.split(length, dim=1)
+        parts: tuple[Tensor, ...] = states.split(length, dim=1)
+        return parts
 
     def weights(self, states: Tensor, history: bool) -> Tensor:
         """Return the paper's weights at the states (B, C, n): (B, C, M), or those of the first time alone."""

@@ -15,6 +15,7 @@ from torch import Tensor
 from ..approximation.basis import GramStructure
 from ..local_basis import LocalSpace
 from ..optim.objective import Precomputed, extremes
+from .certificate import Certificate
 from .problem import Problem
 from .recursion import Corrected
 from .result import ChaseResult
@@ -172,7 +173,6 @@ def _paper_weights(scaled: Tensor, units: Tensor) -> Tensor:
     return torch.where(underflow, torch.nan, scaled * units)
 
 
-def with_certificate(result: ChaseResult, vouched: NamedTuple, lost: Tensor) -> ChaseResult:
+def with_certificate(result: ChaseResult, vouched: Certificate, lost: Tensor) -> ChaseResult:
     """Return the result with a certificate, NaN and nothing violated where a trajectory is lost."""
-    terms = type(vouched)(*(unless(lost, term) for term in vouched))
-    return dataclasses.replace(result, certificate=terms)  # type: ignore[arg-type]
+    return dataclasses.replace(result, certificate=Certificate(*(unless(lost, term) for term in vouched)))

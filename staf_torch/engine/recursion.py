@@ -194,6 +194,7 @@ def kept_gain(log_gain: Tensor, carry: Carry) -> Tensor:
 
 def lost(carry: Carry, times: int) -> Tensor:
     """Return which of the last `times` times a row did not reach, (B, C) bool."""
+    assert isinstance(carry.time, int)
     index = torch.arange(carry.time - times, carry.time, device=carry.diverged_at.device)
     end = carry.diverged_at.unsqueeze(-1)
     return (end >= 0) & (index >= end)

@@ -63,7 +63,8 @@ class Step:
         structure = known.structure
         gram = _symmetric(structure.scaled()).expand(*x.shape[:-1], problem.basis.count, problem.basis.count)
         found = precompute(problem, known, gram)
-        prediction, states = (), last.states
+        prediction: tuple[Tensor, ...] = ()
+        states = last.states
         if problem.predictor is not None and states is not None:
             around = torch.cat((states, x.unsqueeze(1)), dim=1)
             prepared = problem.predictor.prepare(problem.basis, problem.target, around, last.time)
@@ -161,7 +162,7 @@ def _of(problem: Problem, everything: bool, structure: Hashable, tensors: list[T
 
 
 def _numbers_as_tensors(problem: Problem) -> Problem:
-    """Return the problem with the gains of the library's laws as tensors: a program then does not know them."""
+    """Return the problem with the gains of the library's laws as tensors, which no text knows."""
     law, target = problem.law, problem.target
     if type(law).__module__.startswith(UpdateLaw.__module__.rpartition(".")[0]):
         law = copy.copy(law)

@@ -32,7 +32,7 @@ def content(*objects: Any) -> Hashable | None:
 
 
 def skeleton(*objects: Any) -> tuple[Hashable, list[Tensor]] | None:
-    """Return a key of all settings inside of objects but the numbers of floating-point tensors, and these tensors.
+    """Return a key of all settings inside of objects but the floating-point numbers of tensors, and these tensors.
 
     They come in an order that equal keys share. None where an object holds a closure.
 

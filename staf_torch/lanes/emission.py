@@ -20,7 +20,7 @@ _FUNCTIONS = frozenset(
 )
 _INFIX = {"add": "+", "sub": "-", "mul": "*", "div": "/", "lt": "<", "le": "<=", "eq": "==", "ne": "!="}
 _INFIX |= {"and": "&", "or": "|", "xor": "^"}
-_PREFIX = {"neg": "-", "not": "~", "cast": ""}
+_PREFIX = {"neg": "-", "not": "~", "cast": "", "copy": ""}
 
 
 class Text(NamedTuple):
@@ -115,7 +115,7 @@ class _Writer(Writer):
         for node in nodes:
             if self._in_place(node) is None:
                 places[node] = buffer, start + taken
-                taken += self._size(node)
+                taken += self.graph.size(node)
         return places, taken
 
     def _ahead(self, stored: dict[int, tuple[str, int]]) -> None:
@@ -134,7 +134,7 @@ class _Writer(Writer):
 
     def _keep(self, stored: dict[int, tuple[str, int]], start: str, stride: str) -> None:
         for node, (_, place) in stored.items():
-            for k in range(self._size(node)):
+            for k in range(self.graph.size(node)):
                 for j in range(self.copies):
                     value = self._read(node, str(k), j) if self._is_array(node) else self._ref(node, j)
                     number = self._number(node, value)

@@ -122,6 +122,15 @@ class Graph:
             "const", (), type, (number, math.copysign(1.0, number)) if number == number else "nan"
         )
 
+    def size(self, node: int) -> int:
+        """The entries of an array, 1 for a number."""
+        op, aux = self.op[node], self.aux[node]
+        if op == "map":
+            return math.prod(aux[1])
+        if op in ("collect", "carrys", "results"):
+            return int(aux[2])
+        return int(aux if op == "pack" else aux[0]) if op in ("pack", "dot") else 1
+
     def parameter(self, number: int, type: str) -> int:
         """The node of a number that only the table of a program knows, so that no text depends on it."""
         return self.add("param", (), type, number)

@@ -21,8 +21,8 @@ class Schedule:
         carries: the numbers of every loop's carry that something needs.
         live: the nodes that something needs.
         uses: how often a node is used.
-        ahead: the nodes that times alone decide, whatever the row and its carry: found for all times and rows of a
-            tile before the steps, their lanes being times and rows alike.
+        ahead: the nodes that times alone decide, whatever the row and its carry: found for all times and rows
+            of a tile before the steps, their lanes being times and rows alike.
         fused: sums and differences with one product in them: the place (0 or 1) of the product.
     """
 
@@ -80,16 +80,13 @@ class Schedule:
     def _find_ahead(self) -> set[int]:
         """Nodes without a row's own numbers in them: those of times, and the bodies of loops over these."""
         graph, own = self._graph, set[int]()  # nodes with numbers of a row
-        inner: dict[int, set[int]] = {}  # of every loop: its body
-        for number, loop in enumerate(graph.loops):
-            inner[number] = self._body(number)
         for node in sorted(self.live):
             if graph.op[node] in ("row", "state") or any(a in own for a in graph.args[node]):
                 own.add(node)
         found = {n for n in self.live - own if graph.depth[n] == NOW}
         for number, loop in enumerate(graph.loops):
             if loop.node in found:
-                found |= inner[number]
+                found |= self._body(number)
         return found
 
     def shares_a_matrix(self, node: int) -> bool:
@@ -126,8 +123,8 @@ class Schedule:
                 continue
             self.live.add(node)
             waiting += self._arguments(node)
-            if graph.op[node] in ("carry", "result"):
-                number, k = graph.aux[node]
+            if graph.op[node] in ("carry", "result", "carrys", "results"):
+                number, k = graph.aux[node][:2]
                 if k not in self.carries.setdefault(number, set()):
                     self.carries[number].add(k)
                     loop = graph.loops[number]

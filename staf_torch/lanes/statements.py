@@ -13,8 +13,8 @@ from .graph import FIXED, Graph
 from .schedule import Schedule
 from .tracer import NotLoweredError
 
-_INPUTS = ("const", "param", "elem", "result", "collect", "carry", "state", "row", "now")
-_ARRAYS = ("pack", "map", "dot", "collect")
+_INPUTS = ("const", "param", "elem", "result", "results", "collect", "carry", "carrys", "state", "row", "now")
+_ARRAYS = ("pack", "map", "dot", "collect", "carrys", "results")
 
 
 class Layout(NamedTuple):
@@ -124,6 +124,12 @@ class Writer(abc.ABC):
 
     def _loop(self, number: int) -> None:
         loop, live = self.graph.loops[number], sorted(self.schedule.carries.get(number, ()))
+        arrays = [k for k in live if self._is_array(loop.carry[k])]
+        live = [k for k in live if k not in arrays]
+        for k in arrays:
+            size = self.graph.size(loop.carry[k]) * self.copies
+            self._line(f"{self._type(loop.carry[k])} l{number}_{k}[{size}];")
+            self._copy_array(f"l{number}_{k}", loop.initial[k])
         for k in live:
             kind = self._type(loop.carry[k])
             for j in range(self.copies):
@@ -141,8 +147,17 @@ class Writer(abc.ABC):
                     place = f"(i{number} * {size} + {e}) * {self.copies} + {j}"
                     self._line(f"y{number}_{k}[{place}] = {self._ref(node, j)};")
         self._assign([(f"l{number}_{k}", loop.following[k]) for k in live])
+        for k in arrays:
+            if loop.following[k] != loop.carry[k]:
+                self._copy_array(f"l{number}_{k}", loop.following[k])
         self._level -= 1
         self._line("}")
+
+    def _copy_array(self, name: str, array: int) -> None:
+        size = self.graph.size(array)
+        for j in range(self.copies):
+            target = self._sum(["p"], [self.copies], j)
+            self._line(f"for (int p = 0; p < {size}; ++p) {name}[{target}] = {self._read(array, 'p', j)};")
 
     def _pack(self, node: int) -> None:
         if self._in_place(node) is not None:
@@ -222,7 +237,7 @@ class Writer(abc.ABC):
         return values[0], values[1], f"{values[0]} * {values[1]}"
 
     def _declare(self, node: int) -> None:
-        self._line(f"{self._type(node)} a{node}[{self._size(node) * self.copies}];")
+        self._line(f"{self._type(node)} a{node}[{self.graph.size(node) * self.copies}];")
 
     def _affine(self, place: Any, sizes: Sequence[int]) -> tuple[list[int], int] | None:
         """Strides and start of places in an array, None where they are irregular."""
@@ -298,9 +313,9 @@ class Writer(abc.ABC):
         if place is not None:
             return self._typed(array, self._buffer(*place, j, at))
         name = f"a{array}"
-        if graph.op[array] == "collect":
+        if graph.op[array] in ("collect", "carrys", "results"):
             number, k, _ = graph.aux[array]
-            name = f"y{number}_{k}"
+            name = f"{'y' if graph.op[array] == 'collect' else 'l'}{number}_{k}"
         return f"{name}[{at}]" if self.copies == 1 else f"{name}[({at}) * {self.copies} + {j}]"
 
     def _in_place(self, pack: int) -> tuple[str, int] | None:
@@ -317,16 +332,6 @@ class Writer(abc.ABC):
         places = [self._starts[op][graph.aux[a][0]] + graph.aux[a][1] for a in args]
         first = places[0]
         return (op, first) if places == list(range(first, first + len(places))) else None
-
-    def _size(self, node: int) -> int:
-        graph, op = self.graph, self.graph.op[node]
-        if op == "pack":
-            return int(graph.aux[node])
-        if op == "map":
-            return math.prod(graph.aux[node][1])
-        if op == "collect":
-            return int(graph.aux[node][2])
-        return int(graph.aux[node][0]) if op == "dot" else 1
 
     def _is_array(self, node: int) -> bool:
         return self.graph.op[node] in _ARRAYS

@@ -51,7 +51,8 @@ tempfile.tempdir = __import__("os").environ.get("TMPDIR")
 basis = st.StaFBasis(st.ExponentialKernel(), st.StateFollowingCenters(st.rings(3), 0.1))
 for dtype in (torch.float64, torch.float32):
     for run in (st.chase, st.chase_weights):
-        weights = run(torch.ones(2, 17, 2, dtype=dtype), basis, st.targets.Paper(), st.optim.SteepestDescent())
+        states = torch.ones(2, 17, 2, dtype=dtype)
+        weights = run(states, basis, st.targets.Paper(), st.optim.SteepestDescent())
         assert weights.weights.isfinite().all()
 """
     unset = ("CXX", "XDG_CACHE_HOME")
