@@ -1,4 +1,4 @@
-"""The gradient chase: rows compiled from `row_program`, or else the definition, in bulk over chunks of time."""
+"""The gradient chase: rows compiled from `row_program`, or the definition in bulk over chunks of time."""
 
 from __future__ import annotations
 

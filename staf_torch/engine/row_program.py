@@ -1,7 +1,7 @@
 """One time of a chase as a step of a row program: what `recursion.py` defines, compiled by `lanes`.
 
-Everything is evaluated in the step from the state x_k alone: kernel, V at the centers, local space, predictor,
-law and results. No matrix and no value at a center ever reaches memory.
+Everything is evaluated in the step from the state x_k alone: kernel, V at the centers, local space,
+predictor, law and results. No matrix and no value at a center ever reaches memory.
 """
 
 from __future__ import annotations
@@ -122,8 +122,8 @@ def first_carry(problem: Problem, carry: Carry) -> RowCarry:
 def program(problem: Problem, states: Tensor, carry: RowCarry, *, everything: bool) -> Program | None:
     """Return the program of a chase, None where the definition serves.
 
-    Programs are kept: one that differs from another in tensors and gains alone takes over its text, and nothing
-    is traced or compiled.
+    Programs are kept: one that differs from another in tensors and gains alone takes over its text, and
+    nothing is traced or compiled.
 
     Args:
         problem: what is chased.

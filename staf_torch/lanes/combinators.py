@@ -192,7 +192,7 @@ def _loop(
     now = [_fed(tracer, leaf, dim, number, loop) for leaf in fed]
     inner = []
     for leaf in given:
-        kind, large = tracer.kind(leaf.dtype), leaf.numel() > LARGE
+        large = leaf.numel() > LARGE
         entries = _whole(tracer, leaf) if large else tracer.nodes(leaf).reshape(-1).tolist()
         start = len(loop.initial)
         loop.initial += entries
@@ -233,11 +233,12 @@ def _numbers(
     leaf: Tensor,
     depth: int | None = None,
 ) -> list[int]:
-    """New nodes of what passes through a loop: one a number, or the entries of one array where there are many."""
+    """New nodes of what passes through a loop: one a number, or the entries of one array of many."""
     graph, kind, size, (number, start) = tracer.graph, tracer.kind(leaf.dtype), leaf.numel(), first
     if size > LARGE:
         array = graph.add(f"{op}s", args, kind, (number, start, size), depth)
-        return tracer.entries(array, kind, size).tolist()
+        entries: list[int] = tracer.entries(array, kind, size).tolist()
+        return entries
     return [graph.add(op, args, kind, (number, start + k), depth) for k in range(size)]
 
 

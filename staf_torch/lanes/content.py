@@ -32,7 +32,7 @@ def content(*objects: Any) -> Hashable | None:
 
 
 def skeleton(*objects: Any) -> tuple[Hashable, list[Tensor]] | None:
-    """Return a key of all settings inside of objects but the floating-point numbers of tensors, and these tensors.
+    """Return a key of the settings inside of objects, and the floating-point tensors that it leaves out.
 
     They come in an order that equal keys share. None where an object holds a closure.
 

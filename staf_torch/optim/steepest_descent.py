@@ -40,6 +40,8 @@ class SteepestDescent(UpdateLaw):
             twice = torch.where(usable, slope / torch.where(usable, curvature, 1.0), 0.0).unsqueeze(-1)
             return weights + (twice / 2) * g, g - twice * curved
 
+        if type(self).step is not SteepestDescent.step:  # a law of its own
+            return super().iterate(objective, weights, state, count)
         if count:
             weights, _ = repeat(count, once, (weights, objective.descent(weights)))
         return weights, state

@@ -26,6 +26,8 @@ from staf_torch.engine import predictors, row_program
 from staf_torch.lanes import compiler
 from staf_torch.targets import Cosine, Paper
 
+pytestmark = pytest.mark.compiled
+
 TIMES = 20
 STATES = circles(9, TIMES)
 WELL = StaFBasis(ExponentialKernel(), StateFollowingCenters(rings(3), 0.6))
