@@ -9,11 +9,19 @@ from torch import Tensor, nn
 
 from .numerics.checks import fail, number, real, vector
 
+__all__ = ["Cosine", "Paper", "Quadratic"]
+
 
 class Paper(nn.Module):
     """V(x) = x1^2 + 5 x2^2 + tanh(x1 x2), n = 2.
 
     It is not in the exponential kernel's space: its native norm there is infinite.
+
+    Example:
+        >>> targets.Paper()(torch.tensor([1.0, 0.0]).double())
+        tensor(1., dtype=torch.float64)
+
+        Shown by `staf target=paper`.
 
     Source: Rosenfeld et al., section 7.
     """
@@ -25,6 +33,12 @@ class Paper(nn.Module):
 
 class Quadratic(nn.Module):
     """V(x) = x'Px.
+
+    Example:
+        >>> targets.Quadratic(2.0)(torch.tensor([1.0, 2.0]).double())
+        tensor(10., dtype=torch.float64)
+
+        Shown by `staf target=quadratic`.
 
     Args:
         matrix: P, (n, n), symmetric; a number p stands for p I in any dimension.
@@ -52,6 +66,12 @@ class Quadratic(nn.Module):
 
 class Cosine(nn.Module):
     """V(x) = cos(a'x + phase).
+
+    Example:
+        >>> targets.Cosine(frequency=2.0)(torch.tensor([0.0, 0.0]).double())
+        tensor(1., dtype=torch.float64)
+
+        Shown by `staf target=cosine`.
 
     Args:
         frequency: a, rad per unit of the state: n numbers, or one for every coordinate.

@@ -5,12 +5,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ..numerics.checks import positive, trailing, vector
+from ..numerics.checks import fail, positive, trailing, vector
 from ..systems import ControlAffineSystem
 from .bases import ValueBasis
 from .bellman import BellmanTerms, bellman_terms
 from .controllers import Controller, ControllerState
-from .cost import QuadraticCost
+from .cost import Cost
 from .extrapolation import Extrapolation
 from .laws import ActorCriticLaw, Information, Weights
 
@@ -21,10 +21,22 @@ class ActorCritic(Controller):
     """u = -1/2 R^-1 g' Ds' Wa, with Wc and Wa moved by a law on the Bellman error at the state and at
     extrapolated points.
 
+    Example:
+        >>> plant = systems.TwoState()
+        >>> cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
+        >>> centers = StateFollowingCenters(rings(3), StateRadius(0.7, offset=1e-5))
+        >>> basis = adp.StaFValueBasis(StaFBasis(AnchoredKernel(ExponentialKernel()), centers))
+        >>> learner = adp.ActorCritic(basis, plant, cost, adp.RandomPoints(1, half_width=0.5))
+        >>> x0 = torch.tensor([[-1.0, 1.0]]).double()
+        >>> adp.simulate(learner, plant, cost, x0, dt=0.01, steps=20).critic_weights.shape  # (B, T, M)
+        torch.Size([1, 21, 3])
+
+        Shown by `staf experiment=adp`.
+
     Args:
         basis: of V^.
         model: what the controller believes the plant to be.
-        cost: x'Qx + u'Ru.
+        cost: the cost rate, with or without bounds; the actor's force is that of the bounded input.
         extrapolation: the points.
         law: `Information` by default.
         critic: Wc(0): a number for all, M numbers, or a tensor (M,) or (B, M), a row a trajectory.
@@ -41,7 +53,7 @@ class ActorCritic(Controller):
         self,
         basis: ValueBasis,
         model: ControlAffineSystem,
-        cost: QuadraticCost,
+        cost: Cost,
         extrapolation: Extrapolation,
         law: ActorCriticLaw | None = None,
         *,
@@ -50,15 +62,15 @@ class ActorCritic(Controller):
         gain: float | Tensor = 250.0,
     ) -> None:
         super().__init__()
-        if not isinstance(cost, QuadraticCost):
-            raise ValueError(
-                "`ActorCritic(cost=...)` must be a QuadraticCost: the laws are derived for it; "
-                f"got {type(cost).__name__}."
-            )
         if model.dim != basis.dim:
             raise ValueError(
                 f"`ActorCritic(basis=...)` has {basis.dim} states, but the plant has {model.dim}."
             )
+        cost = cost.around(model)
+        if cost.target is not None or cost.discount:
+            what = "discount" if cost.discount else "target"
+            rule = f"must have no {what}: the laws regulate to the origin without a discount"
+            raise fail("ActorCritic", "cost", rule, getattr(cost, what))
         self.basis, self.model, self.cost, self.extrapolation = basis, model, cost, extrapolation
         self.law = Information() if law is None else law
         self.draws = extrapolation.draws

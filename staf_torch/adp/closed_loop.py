@@ -10,10 +10,11 @@ from torch import Tensor, nn
 
 from ..lanes import Program
 from ..lanes.content import content
-from ..numerics.checks import choice, positive_real
-from ..systems import ControlAffineSystem
+from ..numerics.checks import choice, integer, positive_real
+from ..systems import Plant
 from .controllers import Controller, ControllerState
 from .cost import Cost
+from .holding import Holding
 
 _KEPT = 16
 _kept: dict[Hashable, Program] = {}
@@ -30,14 +31,17 @@ class LoopState(NamedTuple):
 
 
 class ClosedLoop(nn.Module):
-    """One step of controller and plant: the control is computed at the state, then held for dt.
+    """One step of controller and plant: the control is computed at the state, clipped to the bounds of the
+    cost or the plant, and held for dt.
 
     Args:
         controller: the controller.
         system: the plant.
         cost: the cost rate.
         dt: s.
-        integrator: of the plant over a step, ``runge_kutta`` (fourth order) or ``euler`` (as published).
+        integrator: of the plant over a step, ``runge_kutta`` (fourth order) or ``euler`` (as published). A
+            plant in discrete time takes its own steps.
+        substeps: Runge-Kutta steps while the control is held, at least 1.
         limit: a row whose state exceeds it in norm has diverged.
 
     Raises:
@@ -47,19 +51,22 @@ class ClosedLoop(nn.Module):
     def __init__(
         self,
         controller: Controller,
-        system: ControlAffineSystem,
+        system: Plant,
         cost: Cost,
         *,
         dt: float,
         integrator: str = "runge_kutta",
+        substeps: int = 1,
         limit: float = 1e6,
     ) -> None:
         super().__init__()
         choice("ClosedLoop", "integrator", integrator, ("runge_kutta", "euler"))
-        self.controller, self.system, self.cost = controller, system, cost
+        self.controller, self.system, self.cost = controller, system, cost.around(system)
         self.dt = positive_real("ClosedLoop", "dt", dt)
+        self.substeps = integer("ClosedLoop", "substeps", substeps, least=1)
         self.limit = positive_real("ClosedLoop", "limit", limit)
-        self.euler = integrator == "euler"
+        self.euler = integrator == "euler" and system.period is None
+        self.holding = Holding("ClosedLoop", system, self.cost, self.dt, self.substeps)
 
     def init(self, x0: Tensor) -> LoopState:
         """The state at time 0 of the rows x0 (B, n)."""
@@ -70,6 +77,8 @@ class ClosedLoop(nn.Module):
     def forward(self, state: LoopState, uniform: Tensor) -> tuple[LoopState, Tensor]:
         """The state after dt seconds, and the control held until then, (B, m)."""
         u, carried = self.controller.step(state.x, state.carried, uniform, self.dt)
+        if self.cost.bounds is not None:  # an actuator that is asked for more gives its bound
+            u = self.cost.bounds.clip(u)
         x, spent = self._advance(state.x, u)
         good = torch.isfinite(spent) & (x.square().sum(-1) <= self.limit**2)
         for part in (u, *carried):
@@ -78,26 +87,16 @@ class ClosedLoop(nn.Module):
         kept = ControllerState(
             *(_where(alive, new, old) for new, old in zip(carried, state.carried, strict=True))
         )
+        if self.cost.discount:
+            spent = spent * torch.exp(-self.cost.discount * self.dt * state.lived)
         cost = state.cost + torch.where(alive, spent, 0.0)
         return LoopState(_where(alive, x, state.x), cost, alive, state.lived + alive, kept), u
 
     def _advance(self, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
         """The state after dt with u held, and the cost until then."""
-        h = self.dt
-        paid = self.cost.input_rate(u)
-        k1 = self.system.rate(x, u)
-        c1 = self.cost.state_rate(x)
         if self.euler:
-            return x + h * k1, h * (c1 + paid)
-        x2 = x + 0.5 * h * k1
-        k2 = self.system.rate(x2, u)
-        x3 = x + 0.5 * h * k2
-        k3 = self.system.rate(x3, u)
-        x4 = x + h * k3
-        k4 = self.system.rate(x4, u)
-        middle = self.cost.state_rate(x2) + self.cost.state_rate(x3)
-        spent = h * (paid + (c1 + 2 * middle + self.cost.state_rate(x4)) / 6)
-        return x + (h / 6) * (k1 + 2 * (k2 + k3) + k4), spent
+            return x + self.dt * self.system.motion(x, u), self.dt * self.cost.rate(x, u)
+        return self.holding(x, u)
 
 
 def _where(alive: Tensor, new: Tensor, old: Tensor) -> Tensor:

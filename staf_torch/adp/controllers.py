@@ -11,8 +11,8 @@ from torch import Tensor, nn
 
 from ..numerics.checks import real
 from ..numerics.linalg import riccati
-from ..systems import ControlAffineSystem
-from .cost import BoundedInputCost, Cost, matvec, quadratic
+from ..systems import Plant
+from .cost import Cost, matvec, quadratic
 from .sampling import held_riccati
 
 Policy = Callable[[Tensor], Tensor]
@@ -22,7 +22,15 @@ Value = Callable[[Tensor], Tensor]
 
 
 class ControllerState(NamedTuple):
-    """What a controller carries from step to step. Feedback laws leave all of it empty."""
+    """What a controller carries from step to step. Feedback laws leave all of it empty.
+
+    Example:
+        >>> rest = adp.Feedback(lambda x: -x[..., :1]).init(torch.ones(3, 2))
+        >>> rest.critic.shape, rest.gain.shape  # nothing is carried
+        (torch.Size([3, 0]), torch.Size([3, 0, 0]))
+
+        Shown by `staf experiment=adp`.
+    """
 
     critic: Tensor  # Wc, (B, M)
     actor: Tensor  # Wa, (B, M)
@@ -32,6 +40,18 @@ class ControllerState(NamedTuple):
 
 class Controller(nn.Module, abc.ABC):
     """u and what the controller carries on, from the state and what it carried until then.
+
+    Example:
+        >>> class Rest(adp.Controller):
+        ...     def init(self, x0):
+        ...         none = x0.new_zeros(len(x0), 0)
+        ...         return adp.ControllerState(none, none, x0.new_zeros(len(x0), 0, 0), none)
+        ...     def step(self, x, carried, uniform, dt):
+        ...         return x.new_zeros(len(x), 1), carried
+        >>> Rest().step(torch.ones(3, 2), Rest().init(torch.ones(3, 2)), None, 0.01)[0].shape
+        torch.Size([3, 1])
+
+        Shown by `staf experiment=adp_comparison`.
 
     Attributes:
         draws: uniform random points of [-1, 1]^n that a step needs, a row.
@@ -74,6 +94,16 @@ class Controller(nn.Module, abc.ABC):
 class Feedback(Controller):
     """u = policy(x), which carries nothing.
 
+    Example:
+        >>> plant = systems.TwoState()
+        >>> cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
+        >>> policy = adp.Feedback(lambda x: -3.0 * x[..., 1:])
+        >>> x0 = torch.tensor([[0.5, 0.5]]).double()
+        >>> bool(adp.simulate(policy, plant, cost, x0, dt=0.01, steps=100).diverged.any())
+        False
+
+        Shown by `staf experiment=adp adp/policy=lqr`.
+
     Args:
         policy: (..., n) -> (..., m).
         value: of the policy or of its design, (..., n) -> (...), for the record.
@@ -103,63 +133,61 @@ class Feedback(Controller):
 
 
 class LQR(nn.Module):
-    """u = -K x with K = R^-1 B'P and P from the Riccati equation of the linearisation at 0.
+    """u = u_s - K (x - x_s) with K = R^-1 B'P and P from the Riccati equation of the linearisation at the
+    set-point x_s of the cost, where u_s holds the plant; angles are differences in [-pi, pi].
 
-    With a `BoundedInputCost` it is u = -bound tanh(K x / bound). A control that is held for long needs other
-    gains: with a ``period`` P and K are those of the linear plant whose control is held for that time.
+    With bounds u is clipped to them, with a `BoundedInputCost` smoothly. A control that is held for long
+    needs other gains: with a ``period`` P and K are those of the linear plant whose control is held.
+
+    Example:
+        >>> plant = systems.TwoState()
+        >>> cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
+        >>> lqr = adp.LQR(plant, cost)
+        >>> lqr(torch.tensor([[0.0, 1.0]]).double()).round(decimals=3)  # u = -K x, here -3 x2
+        tensor([[-3.]], dtype=torch.float64)
+
+        Shown by `staf experiment=adp adp/policy=lqr`.
 
     Args:
         system: the plant.
         cost: the cost rate.
-        period: s, positive, for which the control will be held; None for one that follows the state.
+        period: s, positive, for which the control will be held; None for one that follows the state, or of a
+            plant in discrete time for its step.
 
     Attributes:
-        p: P, (n, n): x'Px is the value of the linear plant.
+        cost: the cost, measured from the set-point of this plant.
+        p: P, (n, n): e'Pe is the value of the linear plant.
         k: K, (m, n).
 
     Raises:
-        ValueError: if the plant does not rest at 0, or its linearisation cannot be stabilised.
+        ValueError: if the plant does not rest at the set-point, its linearisation cannot be stabilised, or
+            the cost does not see a mode that does not decay.
     """
 
-    def __init__(self, system: ControlAffineSystem, cost: Cost, period: float | None = None) -> None:
+    def __init__(self, system: Plant, cost: Cost, period: float | None = None) -> None:
         super().__init__()
-        check_equilibrium(system)
-        a, b = system.linearisation()
-        name = type(system).__name__
-        if period is None:
-            p = riccati(a, b, cost.q, cost.r, name=name)
+        self.cost = cost.around(system)
+        self.period = system.period if period is None else period
+        if self.period is None:
+            a, b = system.linearisation(self.cost.target, self.cost.target_input)
+            name = type(system).__name__
+            rest = 0.5 * cost.discount * torch.eye(len(a), dtype=a.dtype)
+            p = riccati(a - rest, b, self.cost.state_curvature(), cost.r, name=name)
             k = cost.r_inverse @ b.to(p).mT @ p
         else:
-            p, k = held_riccati(a, b, cost, period, name=name)
-        self.period = period
+            p, k = held_riccati(system, self.cost, self.period)
         self.register_buffer("p", p)
         self.register_buffer("k", k)
         self.p: Tensor
         self.k: Tensor
-        self.bound = cost.bound if isinstance(cost, BoundedInputCost) else None
 
     def forward(self, x: Tensor) -> Tensor:
         """u: (..., n) -> (..., m)."""
-        u = -matvec(self.k, x)
-        return u if self.bound is None else self.bound * (u / self.bound).tanh()
+        return self.cost.saturate(self.cost.input_of(-matvec(self.k, self.cost.deviation(x))))
 
     def value(self, x: Tensor) -> Tensor:
-        """x'Px: (..., n) -> (...)."""
-        return quadratic(self.p, x)
-
-
-def check_equilibrium(system: ControlAffineSystem) -> None:
-    """Refuse a plant with f(0) != 0.
-
-    Raises:
-        ValueError: if f(0) is not 0, with its value.
-    """
-    at = system.drift(system.equilibrium())
-    if not bool((at.abs() <= 1e-9).all()):
-        raise ValueError(
-            f"`{type(system).__name__}.drift` must be 0 at the origin, the state to regulate to; "
-            f"got {at.tolist()}. Measure states and inputs from the equilibrium."
-        )
+        """e'Pe: (..., n) -> (...)."""
+        return quadratic(self.p, self.cost.deviation(x))
 
 
 class Supervised(Controller):
@@ -171,6 +199,17 @@ class Supervised(Controller):
     the weights are: V_P' <= -x'Qx - (1 - 2 trust) u_LQR'R u_LQR. It bounds a control that is too weak as
     well as one that is too strong for its time step. The controller learns on as if its own control had
     been applied: the laws ask the model, not the plant.
+
+    Example:
+        >>> plant = systems.TwoState()
+        >>> cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
+        >>> wild = adp.Feedback(lambda x: 10 * x[..., 1:])
+        >>> safe = adp.Supervised(wild, adp.LQR(plant, cost), cost, trust=0.5)
+        >>> x = torch.tensor([[0.0, 1.0]]).double()
+        >>> safe.restrain(x, torch.tensor([[10.0]]).double()).round(decimals=3)  # half of the LQR's
+        tensor([[-1.5000]], dtype=torch.float64)
+
+        Shown by `staf experiment=adp adp.trust=0.5`.
 
     Args:
         controller: the controller to supervise.
@@ -186,7 +225,8 @@ class Supervised(Controller):
         super().__init__()
         if not 0 < real("Supervised", "trust", trust) <= 1:
             raise ValueError(f"`Supervised(trust=...)` must be in (0, 1]; got {trust!r}.")
-        self.controller, self.lqr, self.cost, self.trust = controller, lqr, cost, trust
+        self.controller, self.lqr, self.trust = controller, lqr, trust
+        self.cost = lqr.cost if isinstance(lqr, LQR) else cost
         self.draws, self.period = controller.draws, controller.period
 
     @property
@@ -206,7 +246,7 @@ class Supervised(Controller):
         """The control to apply in place of u: (..., n), (..., m) -> (..., m)."""
         base = self.lqr(x)
         apart = u - base
-        allowed = self.trust * quadratic(self.cost.r, base).sqrt()
+        allowed = self.trust * quadratic(self.cost.r, self.cost.effort(base)).sqrt()
         wanted = quadratic(self.cost.r, apart).sqrt()
         share = torch.where(wanted > allowed, allowed / wanted, 1.0)
         restrained: Tensor = base + share.unsqueeze(-1) * apart

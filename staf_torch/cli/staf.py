@@ -5,8 +5,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import sys
+from collections.abc import Callable
 
 from ..sweeps import callbacks
 from ..sweeps.batching import USER_ERRORS, sentence
@@ -14,8 +16,10 @@ from ..sweeps.hydra_compat import broken_sweep, find_launcher, full_errors, prog
 from ..sweeps.hydra_compat import config_directory as config_directory
 from ..sweeps.job import Refused, execute
 from ..sweeps.resume import command_line
-from . import doctor
+from ..sweeps.signals import name_and_code, stopped_by_signals
+from . import doctor, reference, schema
 
+_WRITERS = {"schema": schema.main, "docs": reference.main}
 find_launcher()
 _staf = program(execute)
 
@@ -23,15 +27,17 @@ _staf = program(execute)
 def main() -> None:
     """Run the command line. What a user got wrong ends as one sentence and the exit code 1.
 
-    `staf doctor` and `staf --version` are no runs, and Hydra is not asked.
+    `staf doctor`, `staf schema`, `staf docs` and `staf --version` are no runs, and Hydra is not asked.
     """
     if sys.argv[1:] == ["--version"]:
         sys.exit(print(doctor.version()))
     if sys.argv[1:] == ["doctor"]:
         sys.exit(doctor.main())
+    if sys.argv[1:2] and sys.argv[1] in _WRITERS:
+        sys.exit(_written(_WRITERS[sys.argv[1]], sys.argv[2:]))
     sys.path.insert(0, os.getcwd())  # so that `target.path=my_module.my_function` finds the user's file
     typed = sys.argv
-    with full_errors() as wants_trace:
+    with full_errors() as wants_trace, stopped_by_signals():
         try:
             sys.argv = [typed[0], *command_line(typed[1:])]
             _staf()
@@ -44,10 +50,21 @@ def main() -> None:
             if sweep is not None:
                 callbacks.close(sweep)
             if isinstance(error, KeyboardInterrupt):
-                sys.stderr.write(callbacks.farewell(sweep) + "\n")
-                sys.exit(130)  # as shells have it
+                said, code = name_and_code(error)
+                with contextlib.suppress(OSError):  # the terminal may be gone
+                    sys.stderr.write(callbacks.farewell(sweep, said) + "\n")
+                sys.exit(code)
             if wants_trace or not isinstance(error, USER_ERRORS):
                 raise
             sys.exit(f"staf: {sentence(error)}")
         finally:
             sys.argv = typed
+
+
+def _written(write: Callable[[list[str]], str], words: list[str]) -> str | None:
+    """Print what a command that is no run returns; return what to say where it cannot."""
+    try:
+        sys.stdout.write(write(words) + "\n")
+    except ValueError as error:
+        return f"staf: {error}"
+    return None

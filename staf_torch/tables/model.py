@@ -9,11 +9,13 @@ import importlib
 import io
 import itertools
 import math
+import re
 from collections.abc import Mapping, Sequence
 from json import dumps
 from typing import Any
 
 from ..results.reader import Value
+from ..results.untrusted import visible
 from .columns import Column, Number, PrintedColumn, Row, Style, printed, show, significant
 
 _SPECIAL = {
@@ -39,11 +41,21 @@ _SPECIAL = {
     "*": "{*}",
     "±": r"\ensuremath{\pm}",
 }
+_LINK = re.compile(r"\]\s*[(\[:]")
+_BLOCK = re.compile(r"^(?:#{1,6} |> ?|[-+=~]{3,}|[-+] )")  # of Markdown, at the begin of a line
 
 
 @dataclasses.dataclass(frozen=True)
 class Table:
-    """Rows of values under columns, and how people see them."""
+    """Rows of values under columns, and how people see them.
+
+    Example:
+        >>> done = sweep("centers.radius=0.1,0.2", "duration=0.1", "settle_time=0", "figures=false")
+        >>> print(done.table(metrics=("ball_error",)).csv().splitlines()[0])
+        centers.radius,ball_error,status,directory
+
+        Shown by `staf-table runs`.
+    """
 
     columns: tuple[Column, ...]
     rows: tuple[Row, ...]
@@ -91,14 +103,14 @@ class Table:
     def csv(self) -> str:
         """Return the table as CSV: `float` of a cell gives the number back to the last bit.
 
-        Lists are JSON, and what is missing is an empty cell.
+        Lists are JSON, and what is missing is an empty cell. An apostrophe goes before a text that
+        a spreadsheet would take for a formula.
         """
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
-        writer.writerow(self.names)
+        writer.writerow(map(_csv_cell, self.names))
         for row in self.rows:
-            cells = [row.cells.get(name) for name in self.names]
-            writer.writerow([dumps(cell) if isinstance(cell, list | bool) else cell for cell in cells])
+            writer.writerow([_csv_cell(row.cells.get(name)) for name in self.names])
         return text.getvalue()
 
     def _shown(self, column: PrintedColumn, row: int) -> str:
@@ -109,17 +121,42 @@ class Table:
         return f"**{text}**" if row in column.best else text
 
 
+def _csv_cell(value: Value) -> Value:
+    if isinstance(value, list | bool):
+        return dumps(value)
+    formula = isinstance(value, str) and value.startswith(("=", "+", "-", "@", "\t", "\r", "|", "%"))
+    return f"'{value}" if formula else value
+
+
 def _escaped(text: str) -> str:
-    """On one line, without what would end the cell, begin a tag, or stay open; code in `backquotes` stays."""
-    code = "`" in text and text.count("`") % 2 == 0
-    special = "|<" if code else "\\|<`*" if text.count("*") > 1 else "\\|<`"
-    return "".join(f"\\{c}" if c in special else c for c in " ".join(text.split()))
+    """On one line, without what would end the cell, begin a tag, a link or an image, or stay open.
+
+    Code in `single backquotes` stays.
+    """
+    text = " ".join(visible(text).split())
+    parts = text.split("`")
+    code = len(parts) % 2 == 1 and "``" not in text  # closed, and no other number of backquotes opens it
+    stars = "*" if text.count("*") > 1 else ""
+    links = "[]" if _LINK.search(text) else ""
+    outside = f"\\|<{stars}{links}"
+    found = [
+        "".join(f"\\{c}" if c in ("|" if inside else outside) else c for c in part)
+        for inside, part in ((bool(code and n % 2), part) for n, part in enumerate(parts))
+    ]
+    return _BLOCK.sub(r"\\\g<0>", ("`" if code else "\\`").join(found))
 
 
 def latex_text(table: Table) -> str:
     r"""Return a `tabular`; the document needs `\usepackage{booktabs}`, and `textcomp` before LaTeX of 2020.
 
     Why runs have no result stands below it as comments.
+
+    Example:
+        >>> done = sweep("centers.radius=0.1,0.2", "duration=0.1", "settle_time=0", "figures=false")
+        >>> latex_text(done.table(metrics=("ball_error",))).count("tabular")
+        2
+
+        Shown by `staf-table runs --format tex`.
     """
     columns, digits = table.printed(), table.style.digits
     align = "".join("r" if column.numeric else "l" for column in columns)
@@ -127,7 +164,7 @@ def latex_text(table: Table) -> str:
     rows = range(len(table.rows))
     lines += [" & ".join(_cell(column, row, digits) for column in columns) + r" \\" for row in rows]
     lines += [r"\bottomrule", r"\end{tabular}"]
-    lines += ["% " + " ".join(note.split()) for note in table.notes]
+    lines += ["% " + " ".join(visible(note).split()) for note in table.notes]
     return "\n".join(lines) + "\n"
 
 
@@ -173,13 +210,20 @@ def _power(text: str) -> str:
 
 def escape(text: str) -> str:
     """Return what makes LaTeX print a text as it is, on one line."""
-    return "".join(_SPECIAL.get(character, character) for character in " ".join(text.split()))
+    return "".join(_SPECIAL.get(character, character) for character in " ".join(visible(text).split()))
 
 
 def json_text(table: Table) -> str:
     """``{"columns": [...], "rows": [{"ball_error": null, "reasons": {"ball_error": "..."}}], "notes": []}``.
 
     NaN and infinity, which JSON does not have, are null with the reason.
+
+    Example:
+        >>> done = sweep("centers.radius=0.1,0.2", "duration=0.1", "settle_time=0", "figures=false")
+        >>> json_text(done.table(metrics=("ball_error",))).count("directory")
+        3
+
+        Shown by `staf-table runs --format json`.
     """
     content = {
         "columns": list(table.names),
@@ -197,6 +241,13 @@ def _json_row(row: Row) -> dict[str, Any]:
 
 def parquet_bytes(table: Table) -> bytes:
     """Return the table as a Parquet file; a column of several types becomes one of texts, a list JSON.
+
+    Example:
+        >>> done = sweep("centers.radius=0.1,0.2", "duration=0.1", "settle_time=0", "figures=false")
+        >>> parquet_bytes(done.table(metrics=("ball_error",)))[:4]  # doctest: +SKIP
+        b'PAR1'
+
+        Shown by `staf-table runs --format parquet --output table.parquet`.
 
     Raises:
         ValueError: without pandas and pyarrow.
@@ -235,7 +286,15 @@ def require(package: str, what: str) -> Any:
 
 
 def html_text(table: Table) -> str:
-    """Return the table as an HTML element, with the best numbers bold and a line for each note."""
+    """Return the table as an HTML element, with the best numbers bold and a line for each note.
+
+    Example:
+        >>> done = sweep("centers.radius=0.1,0.2", "duration=0.1", "settle_time=0", "figures=false")
+        >>> html_text(done.table(metrics=("ball_error",))).startswith("<table")
+        True
+
+        Shown by `staf experiment=ablation`.
+    """
     columns = table.printed()
     heads = "".join(
         f"<th>{html.escape(f'{c.over}, {c.heading}' if c.over else c.heading)}</th>" for c in columns
