@@ -64,6 +64,7 @@ class Captured:
     def __init__(self) -> None:
         self._stated: dict[int, Any] = {}  # storages, kept: an address is used once
         self._derived: dict[int, Any] = {}
+        self._found: dict[int, Any] = {}
         self._places: dict[tuple[int, str], dict[int, int]] = {}
         self._operations: list[tuple[Any, Sequence[Any], dict[str, Any], Any]] = []
         self._reads: list[tuple[Tensor, np.ndarray[Any, Any]]] = []
@@ -80,6 +81,13 @@ class Captured:
         if address in self._stated:
             return True
         return address not in self._derived and not tensor.is_floating_point()
+
+    def from_outside(self, tensor: Tensor) -> bool:
+        """Whether a tensor was there before."""
+        if not _in_memory(tensor):
+            return False
+        address = tensor.untyped_storage().data_ptr()
+        return address not in self._stated and address not in self._derived
 
     def ran(self, function: Any, args: Sequence[Any], kwargs: dict[str, Any], out: Any) -> None:
         """Note an operation on tensors of which no row has its own."""
@@ -124,7 +132,7 @@ class Captured:
             at += (np.arange(size) * stride).reshape([-1] + [1] * (tensor.dim() - axis - 1))
         start = int(tensor.storage_offset())
         places = self._places.setdefault((tensor.untyped_storage().data_ptr(), kind), {})
-        self._derived.setdefault(tensor.untyped_storage().data_ptr(), tensor.untyped_storage())
+        self._found.setdefault(tensor.untyped_storage().data_ptr(), tensor.untyped_storage())
         flat, fresh = at.reshape(-1).tolist(), []
         for index, place in enumerate(flat):
             if start + place not in places:

@@ -242,7 +242,8 @@ class Tracer(TorchDispatchMode):
     ) -> Any:
         kwargs = kwargs or {}
         tensors = _tensors((args, kwargs))
-        if self._learning and any(t.requires_grad and not self.traced(t) for t in tensors):
+        wanted = [t for t in tensors if self._learning and t.requires_grad and not self.traced(t)]
+        if any(self.captured.from_outside(tensor) for tensor in wanted):
             raise NotLoweredError("a derivative with respect to a constant of the program may be wanted")
         name = func._schema.name.removeprefix("aten::")
         if name in _BLANK or not any(self.traced(tensor) for tensor in tensors):
