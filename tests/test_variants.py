@@ -6,7 +6,6 @@ import inspect
 import itertools
 from types import ModuleType
 
-import pytest
 import torch
 from helpers import basis_of
 from variants import (
@@ -26,7 +25,6 @@ from variants import (
 from staf_torch import adp, centers, kernels, optim, predictors, systems, targets
 from staf_torch.adp import ActorCriticLaw
 from staf_torch.experiments.laws import cases
-from staf_torch.numerics.checks import scalar_hyperparameters
 from staf_torch.systems import Units
 
 MADE = {
@@ -84,23 +82,6 @@ def test_a_plant_declares_units_for_each_coordinate_or_for_all(name: str) -> Non
     assert isinstance(plant.units, Units)
     assert len(plant.units.state.split(", ")) in (1, plant.dim)
     assert plant.spread > 0
-
-
-@pytest.mark.parametrize(
-    ("holder", "numbers"),
-    [
-        (KERNELS["rational_quadratic"].make(), {"alpha": 1.7, "length_scale": 0.9}),
-        (KERNELS["exponential"].make(), {}),
-        (RADII["shrinking_with_gain"][0](), {"radius": 0.3, "offset": 0.05, "gain": 2.0}),
-        (LAWS["heavy ball, stated"], {"step": 1.0, "momentum": 0.9}),
-        (LAWS["steepest descent"], {}),
-    ],
-    ids=lambda value: type(value).__name__,
-)
-def test_numbers_in_which_a_batch_may_differ_have_the_names_of_the_settings(
-    holder: object, numbers: dict[str, float]
-) -> None:
-    assert scalar_hyperparameters(holder) == numbers
 
 
 @over(KERNELS)

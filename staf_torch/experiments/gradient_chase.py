@@ -90,10 +90,7 @@ class GradientChase(BatchedExperiment[ChaseSolution]):
     batchable = frozenset(
         {
             *("seed", "initial_state", "spread", "trajectories", "dt", "duration", "settle_time"),
-            *("centers.radius", "centers.shrink.offset", "centers.shrink.gain"),
-            *("kernel.width", "kernel.length_scale", "kernel.alpha", "kernel.bias"),
-            *("target.matrix", "target.frequency", "target.phase"),
-            *("optimizer.step", "optimizer.momentum"),
+            *("centers.radius", "centers.shrink.*", "kernel.*", "target.*", "optimizer.*"),
         }
     )
 
@@ -150,7 +147,10 @@ class GradientChase(BatchedExperiment[ChaseSolution]):
         return _finish(out, solution, cfg)
 
     def shape(self, settings: Mapping[str, object]) -> object:
-        """Return the number of steps."""
+        """Return the numbers of steps and of iterations a step."""
+        return [self._steps(settings), settings.get("optimizer.inner_steps")]
+
+    def _steps(self, settings: Mapping[str, object]) -> int | str:
         dt, duration = settings["dt"], settings["duration"]
         if not isinstance(dt, int | float) or not isinstance(duration, int | float) or dt <= 0:
             return "none"
@@ -159,7 +159,7 @@ class GradientChase(BatchedExperiment[ChaseSolution]):
 
     def size(self, settings: Mapping[str, object]) -> int:
         """Return about how many bytes the history and the drawn trajectory take."""
-        rows, times = settings.get("trajectories"), self.shape(settings)
+        rows, times = settings.get("trajectories"), self._steps(settings)
         count = settings.get("centers.count")
         start = settings.get("initial_state")
         if not isinstance(rows, int) or not isinstance(times, int):

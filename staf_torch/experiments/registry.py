@@ -83,6 +83,13 @@ class Solution(Protocol):
 S = TypeVar("S", bound=Solution)
 
 
+def _form(value: object) -> object:
+    """Return the word "number" for a number, lists entry by entry, anything else itself in a list."""
+    if isinstance(value, list):
+        return [_form(entry) for entry in value]
+    return "number" if isinstance(value, int | float) and not isinstance(value, bool) else [value]
+
+
 class BatchedExperiment(ABC, Generic[S]):
     """An experiment that solves many configurations as one tensor batch and writes each by itself.
 
@@ -91,7 +98,9 @@ class BatchedExperiment(ABC, Generic[S]):
     """
 
     animates: ClassVar[bool] = False  # whether the setting `animation` has a meaning
-    batchable: ClassVar[frozenset[str]]  # settings, dotted, whose numbers may differ within a batch
+    batchable: ClassVar[frozenset[str]]
+    """Settings, dotted, whose numbers may differ within a batch; ``kernel.*``: all that a kernel has, also
+    one of a user's own."""
 
     @abstractmethod
     def __call__(self, cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics:
@@ -108,6 +117,11 @@ class BatchedExperiment(ABC, Generic[S]):
     @abstractmethod
     def write(self, cfg: DictConfig, directory: Path, solution: S) -> Metrics:
         """Fill the run directory with a solution; `metrics.json` comes last."""
+
+    def shared(self, name: str, value: object) -> object:
+        """Return what a batch shares of a setting: nothing of a batchable number, else all (JSON)."""
+        groups = {f"{name[:i]}.*" for i, letter in enumerate(name) if letter == "."}
+        return value if self.batchable.isdisjoint({name, *groups}) else _form(value)
 
     def shape(self, settings: Mapping[str, object]) -> object:
         """Return what follows from batchable settings and must be equal in a batch all the same (JSON)."""

@@ -146,20 +146,6 @@ def hold(module: nn.Module, name: str, value: Tensor) -> None:
         module.register_buffer(name, value)
 
 
-def scalar_hyperparameters(holder: object) -> dict[str, float]:
-    """Return the numbers in which objects of one tensor batch may differ, by argument of their constructor.
-
-    Args:
-        holder: a kernel, radius, target or plant, whose fixed scalars are buffers; or an update law, whose
-            numbers are attributes. An attribute ``step_size`` is the argument ``step``, as in every law.
-    """
-    if isinstance(holder, nn.Module):
-        scalars = {n: t for n, t in holder._buffers.items() if t is not None and t.dim() == 0}
-        return {name: float(t) for name, t in scalars.items() if t.is_floating_point()}
-    numbers = {name: value for name, value in vars(holder).items() if isinstance(value, float)}
-    return {"step" if name == "step_size" else name: value for name, value in numbers.items()}
-
-
 def shown(module: nn.Module) -> str:
     """The module's own tensors for its repr: numbers by value, others by shape."""
     own = [(n, t) for n, t in (*module._parameters.items(), *module._buffers.items()) if t is not None]

@@ -8,7 +8,7 @@ import logging
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from hydra.errors import HydraException, MissingConfigException
 from omegaconf import DictConfig
@@ -176,20 +176,12 @@ def _group_and_size(cfg: DictConfig, index: int) -> tuple[str, int]:
     try:
         study, settings = experiment(cfg.task), records.flat(cfg)
         if isinstance(study, BatchedExperiment):
-            names = study.batchable
-            static = [[name, _form(value) if name in names else value] for name, value in settings.items()]
+            static = [[name, study.shared(name, value)] for name, value in settings.items()]
             key = json.dumps([study.shape(settings), *static])
             size = study.size(settings)
     except _UNREADABLE:
         pass
     return key, size
-
-
-def _form(value: Any) -> Any:
-    """Return what a batch shares of a batchable value: nothing of a number, the form of a list, a word."""
-    if isinstance(value, list):
-        return [_form(entry) for entry in value]
-    return "number" if isinstance(value, int | float) and not isinstance(value, bool) else [value]
 
 
 def sentence(error: BaseException) -> str:
