@@ -23,7 +23,7 @@ from ..experiments.registry import experiment
 from ..numerics.checks import choice, integer
 from ..results.progress import SHOWN, Progress
 from .batching import Batch, Deferred, Done, Failed, Outcome, Written, batches, solve
-from .hydra_compat import env_override, trusted
+from .hydra_compat import env_override, trusted, trusted_packages
 
 _log = logging.getLogger(__name__)
 EXECUTORS = ("inline", "process", "submitit", "ray")
@@ -297,9 +297,9 @@ def compute(
 # In a worker process
 
 
-def pack(batch: Batch) -> tuple[bytes, list[str]]:
+def pack(batch: Batch) -> tuple[bytes, list[str], list[str]]:
     """Return the arguments of `solve_elsewhere`."""
-    return pickle.dumps(batch), list(sys.path)
+    return pickle.dumps(batch), list(sys.path), trusted_packages()
 
 
 def unpack(pickled: bytes) -> Done:
@@ -308,16 +308,17 @@ def unpack(pickled: bytes) -> Done:
     return done
 
 
-def solve_elsewhere(pickled: bytes, path: Sequence[str]) -> bytes:
+def solve_elsewhere(pickled: bytes, path: Sequence[str], packages: Sequence[str] = ()) -> bytes:
     """Compute a tensor batch in a process that has only just begun, and return the pickled `Done`.
 
     Args:
         pickled: a `Batch`.
         path: `sys.path` of the command, which may lead to a user's own modules.
+        packages: those whose objects the command's settings may name.
     """
     sys.path[:] = [*path, *(entry for entry in sys.path if entry not in path)]
     start = time.monotonic()
-    with trusted():
+    with trusted(packages):
         batch: Batch = pickle.loads(pickled)
         outcomes = solve(batch.settings, SHOWN)
         for i, (outcome, cfg) in enumerate(zip(outcomes, batch.settings, strict=True)):
