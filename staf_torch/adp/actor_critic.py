@@ -5,12 +5,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ..numerics.checks import positive, trailing, vector
+from ..numerics.checks import fail, positive, trailing, vector
 from ..systems import ControlAffineSystem
 from .bases import ValueBasis
 from .bellman import BellmanTerms, bellman_terms
 from .controllers import Controller, ControllerState
-from .cost import QuadraticCost
+from .cost import Cost
 from .extrapolation import Extrapolation
 from .laws import ActorCriticLaw, Information, Weights
 
@@ -24,7 +24,7 @@ class ActorCritic(Controller):
     Args:
         basis: of V^.
         model: what the controller believes the plant to be.
-        cost: x'Qx + u'Ru.
+        cost: the cost rate, with or without bounds; the actor's force is that of the bounded input.
         extrapolation: the points.
         law: `Information` by default.
         critic: Wc(0): a number for all, M numbers, or a tensor (M,) or (B, M), a row a trajectory.
@@ -41,7 +41,7 @@ class ActorCritic(Controller):
         self,
         basis: ValueBasis,
         model: ControlAffineSystem,
-        cost: QuadraticCost,
+        cost: Cost,
         extrapolation: Extrapolation,
         law: ActorCriticLaw | None = None,
         *,
@@ -50,15 +50,15 @@ class ActorCritic(Controller):
         gain: float | Tensor = 250.0,
     ) -> None:
         super().__init__()
-        if not isinstance(cost, QuadraticCost):
-            raise ValueError(
-                "`ActorCritic(cost=...)` must be a QuadraticCost: the laws are derived for it; "
-                f"got {type(cost).__name__}."
-            )
         if model.dim != basis.dim:
             raise ValueError(
                 f"`ActorCritic(basis=...)` has {basis.dim} states, but the plant has {model.dim}."
             )
+        cost = cost.around(model)
+        if cost.target is not None or cost.discount:
+            what = "discount" if cost.discount else "target"
+            rule = f"must have no {what}: the laws regulate to the origin without a discount"
+            raise fail("ActorCritic", "cost", rule, getattr(cost, what))
         self.basis, self.model, self.cost, self.extrapolation = basis, model, cost, extrapolation
         self.law = Information() if law is None else law
         self.draws = extrapolation.draws

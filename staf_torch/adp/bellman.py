@@ -51,7 +51,7 @@ class BellmanTerms(NamedTuple):
     control: Tensor  # u = policy(Ds'Wa), (..., P, m)
     regressor: Tensor  # w = Ds (f + g u), (..., P, M)
     rate: Tensor  # r = x'Qx + U(u), (..., P)
-    push: Tensor  # G Wa = Ds g R^-1 g' Ds' Wa, (..., P, M)
+    push: Tensor  # G Wa = Ds g R^-1 g' Ds' Wa = -2 Ds g u, with bounds that of the u they leave, (..., P, M)
 
 
 def bellman_terms(
@@ -62,7 +62,7 @@ def bellman_terms(
     Args:
         basis: of the value function.
         system: the model.
-        cost: the cost rate, quadratic.
+        cost: the cost rate.
         points: y, (..., P, n).
         at: the states whose centers the points use, (..., P, n).
         actor: Wa, (..., M).
@@ -73,7 +73,8 @@ def bellman_terms(
     u = cost.policy(g, value_gradient)
     driven = matvec(g, u)
     regressor = matvec(gradient, system.drift(points) + driven)
-    return BellmanTerms(u, regressor, cost.rate(points, u), -2 * matvec(gradient, driven))
+    pushed = matvec(g, cost.effort(u))
+    return BellmanTerms(u, regressor, cost.rate(points, u), -2 * matvec(gradient, pushed))
 
 
 def bellman_error(terms: BellmanTerms, critic: Tensor) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Hashable
 from typing import NamedTuple
 
@@ -30,7 +31,8 @@ class LoopState(NamedTuple):
 
 
 class ClosedLoop(nn.Module):
-    """One step of controller and plant: the control is computed at the state, then held for dt.
+    """One step of controller and plant: the control is computed at the state, clipped to the bounds of the
+    cost or the plant, and held for dt.
 
     Args:
         controller: the controller.
@@ -56,7 +58,7 @@ class ClosedLoop(nn.Module):
     ) -> None:
         super().__init__()
         choice("ClosedLoop", "integrator", integrator, ("runge_kutta", "euler"))
-        self.controller, self.system, self.cost = controller, system, cost
+        self.controller, self.system, self.cost = controller, system, cost.around(system)
         self.dt = positive_real("ClosedLoop", "dt", dt)
         self.limit = positive_real("ClosedLoop", "limit", limit)
         self.euler = integrator == "euler"
@@ -70,6 +72,8 @@ class ClosedLoop(nn.Module):
     def forward(self, state: LoopState, uniform: Tensor) -> tuple[LoopState, Tensor]:
         """The state after dt seconds, and the control held until then, (B, m)."""
         u, carried = self.controller.step(state.x, state.carried, uniform, self.dt)
+        if self.cost.bounds is not None:  # an actuator that is asked for more gives its bound
+            u = self.cost.bounds.clip(u)
         x, spent = self._advance(state.x, u)
         good = torch.isfinite(spent) & (x.square().sum(-1) <= self.limit**2)
         for part in (u, *carried):
@@ -78,6 +82,8 @@ class ClosedLoop(nn.Module):
         kept = ControllerState(
             *(_where(alive, new, old) for new, old in zip(carried, state.carried, strict=True))
         )
+        if self.cost.discount:
+            spent = spent * torch.exp(-self.cost.discount * self.dt * state.lived)
         cost = state.cost + torch.where(alive, spent, 0.0)
         return LoopState(_where(alive, x, state.x), cost, alive, state.lived + alive, kept), u
 
@@ -85,6 +91,7 @@ class ClosedLoop(nn.Module):
         """The state after dt with u held, and the cost until then."""
         h = self.dt
         paid = self.cost.input_rate(u)
+        half = math.exp(-0.5 * self.cost.discount * h)  # what the middle of the step counts; its end, squared
         k1 = self.system.rate(x, u)
         c1 = self.cost.state_rate(x)
         if self.euler:
@@ -96,7 +103,9 @@ class ClosedLoop(nn.Module):
         x4 = x + h * k3
         k4 = self.system.rate(x4, u)
         middle = self.cost.state_rate(x2) + self.cost.state_rate(x3)
-        spent = h * (paid + (c1 + 2 * middle + self.cost.state_rate(x4)) / 6)
+        if self.cost.discount:
+            paid = paid * (1 + 4 * half + half**2) / 6
+        spent = h * (paid + (c1 + 2 * half * middle + half**2 * self.cost.state_rate(x4)) / 6)
         return x + (h / 6) * (k1 + 2 * (k2 + k3) + k4), spent
 
 

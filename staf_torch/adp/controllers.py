@@ -11,8 +11,8 @@ from torch import Tensor, nn
 
 from ..numerics.checks import real
 from ..numerics.linalg import riccati
-from ..systems import ControlAffineSystem
-from .cost import BoundedInputCost, Cost, matvec, quadratic
+from ..systems import ControlAffineSystem, Linearisation
+from .cost import Cost, matvec, quadratic
 from .sampling import held_riccati
 
 Policy = Callable[[Tensor], Tensor]
@@ -103,10 +103,11 @@ class Feedback(Controller):
 
 
 class LQR(nn.Module):
-    """u = -K x with K = R^-1 B'P and P from the Riccati equation of the linearisation at 0.
+    """u = u_s - K (x - x_s) with K = R^-1 B'P and P from the Riccati equation of the linearisation at the
+    set-point x_s of the cost, where u_s holds the plant; angles are differences in [-pi, pi].
 
-    With a `BoundedInputCost` it is u = -bound tanh(K x / bound). A control that is held for long needs other
-    gains: with a ``period`` P and K are those of the linear plant whose control is held for that time.
+    With bounds u is clipped to them, with a `BoundedInputCost` smoothly. A control that is held for long
+    needs other gains: with a ``period`` P and K are those of the linear plant whose control is held.
 
     Args:
         system: the plant.
@@ -114,52 +115,44 @@ class LQR(nn.Module):
         period: s, positive, for which the control will be held; None for one that follows the state.
 
     Attributes:
-        p: P, (n, n): x'Px is the value of the linear plant.
+        cost: the cost, measured from the set-point of this plant.
+        p: P, (n, n): e'Pe is the value of the linear plant.
         k: K, (m, n).
 
     Raises:
-        ValueError: if the plant does not rest at 0, or its linearisation cannot be stabilised.
+        ValueError: if the plant does not rest at the set-point, its linearisation cannot be stabilised, or
+            the cost does not see a mode that does not decay.
     """
 
     def __init__(self, system: ControlAffineSystem, cost: Cost, period: float | None = None) -> None:
         super().__init__()
-        check_equilibrium(system)
-        a, b = system.linearisation()
+        self.cost = cost.around(system)
+        a, b = linearised(system, self.cost)
         name = type(system).__name__
         if period is None:
-            p = riccati(a, b, cost.q, cost.r, name=name)
+            rest = 0.5 * cost.discount * torch.eye(len(a), dtype=a.dtype)
+            p = riccati(a - rest, b, self.cost.state_curvature(), cost.r, name=name)
             k = cost.r_inverse @ b.to(p).mT @ p
         else:
-            p, k = held_riccati(a, b, cost, period, name=name)
+            p, k = held_riccati(a, b, self.cost, period, name=name)
         self.period = period
         self.register_buffer("p", p)
         self.register_buffer("k", k)
         self.p: Tensor
         self.k: Tensor
-        self.bound = cost.bound if isinstance(cost, BoundedInputCost) else None
 
     def forward(self, x: Tensor) -> Tensor:
         """u: (..., n) -> (..., m)."""
-        u = -matvec(self.k, x)
-        return u if self.bound is None else self.bound * (u / self.bound).tanh()
+        return self.cost.saturate(self.cost.input_of(-matvec(self.k, self.cost.deviation(x))))
 
     def value(self, x: Tensor) -> Tensor:
-        """x'Px: (..., n) -> (...)."""
-        return quadratic(self.p, x)
+        """e'Pe: (..., n) -> (...)."""
+        return quadratic(self.p, self.cost.deviation(x))
 
 
-def check_equilibrium(system: ControlAffineSystem) -> None:
-    """Refuse a plant with f(0) != 0.
-
-    Raises:
-        ValueError: if f(0) is not 0, with its value.
-    """
-    at = system.drift(system.equilibrium())
-    if not bool((at.abs() <= 1e-9).all()):
-        raise ValueError(
-            f"`{type(system).__name__}.drift` must be 0 at the origin, the state to regulate to; "
-            f"got {at.tolist()}. Measure states and inputs from the equilibrium."
-        )
+def linearised(system: ControlAffineSystem, cost: Cost) -> Linearisation:
+    """The plant's linearisation at the set-point of a cost that is `Cost.around` it."""
+    return system.linearisation(cost.target, cost.target_input)
 
 
 class Supervised(Controller):
@@ -186,7 +179,8 @@ class Supervised(Controller):
         super().__init__()
         if not 0 < real("Supervised", "trust", trust) <= 1:
             raise ValueError(f"`Supervised(trust=...)` must be in (0, 1]; got {trust!r}.")
-        self.controller, self.lqr, self.cost, self.trust = controller, lqr, cost, trust
+        self.controller, self.lqr, self.trust = controller, lqr, trust
+        self.cost = lqr.cost if isinstance(lqr, LQR) else cost
         self.draws, self.period = controller.draws, controller.period
 
     @property
@@ -206,7 +200,7 @@ class Supervised(Controller):
         """The control to apply in place of u: (..., n), (..., m) -> (..., m)."""
         base = self.lqr(x)
         apart = u - base
-        allowed = self.trust * quadratic(self.cost.r, base).sqrt()
+        allowed = self.trust * quadratic(self.cost.r, self.cost.effort(base)).sqrt()
         wanted = quadratic(self.cost.r, apart).sqrt()
         share = torch.where(wanted > allowed, allowed / wanted, 1.0)
         restrained: Tensor = base + share.unsqueeze(-1) * apart

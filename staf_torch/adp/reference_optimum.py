@@ -88,7 +88,7 @@ def optima(problem: AdpProblem, x: Tensor) -> Optima | None:
 
 
 def _formula(problem: AdpProblem, x: Tensor) -> Tensor | None:
-    if not isinstance(problem.cost, QuadraticCost):
+    if not isinstance(problem.cost, QuadraticCost) or not problem.cost.around(problem.system).plain:
         return None
     return problem.system.optimal_value(x, problem.cost.q, problem.cost.r)
 

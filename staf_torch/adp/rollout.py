@@ -64,7 +64,7 @@ class RolloutPolicy(nn.Module):
         super().__init__()
         if model.dim != basis.dim:
             raise fail("RolloutPolicy", "basis", f"must have the plant's {model.dim} states", basis.dim)
-        self.basis, self.model, self.cost, self.terminal = basis, model, cost, terminal
+        self.basis, self.model, self.cost, self.terminal = basis, model, cost.around(model), terminal
         self.horizon = positive_real("RolloutPolicy", "horizon", horizon)
         self.steps = integer("RolloutPolicy", "steps", steps, least=1)
         self.depth = integer("RolloutPolicy", "depth", depth, least=1)

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ..numerics.checks import positive_real
-from ..numerics.linalg import riccati
+from ..numerics.linalg import riccati, unstabilisable_mode
 from ..systems import ControlAffineSystem
 from .cost import Cost
 
@@ -27,7 +27,7 @@ class Hold(NamedTuple):
     paid: Tensor  # W, (n + m, n + m)
 
 
-def exact_hold(f: Tensor, g: Tensor, q: Tensor, r: Tensor, period: float) -> Hold:
+def exact_hold(f: Tensor, g: Tensor, q: Tensor, r: Tensor, period: float, *, discount: float = 0.0) -> Hold:
     """Return x' = F x + G u and the integral of x'Qx + u'Ru over one period with u held.
 
     The exponential of a short step is doubled: e^(M 2h) = (e^(M h))^2, W(2h) = W(h) + e^(M h)' W(h) e^(M h).
@@ -38,6 +38,7 @@ def exact_hold(f: Tensor, g: Tensor, q: Tensor, r: Tensor, period: float) -> Hol
         q: Q, (n, n).
         r: R, (m, m).
         period: dt, s, positive.
+        discount: rho, 1/s: A and B are then those of exp(-rho t / 2) (x, u), and what is paid is discounted.
 
     Raises:
         ValueError: if the period is not positive.
@@ -48,6 +49,7 @@ def exact_hold(f: Tensor, g: Tensor, q: Tensor, r: Tensor, period: float) -> Hol
     n, m = g.shape
     whole = torch.zeros(n + m, n + m, dtype=torch.float64)
     whole[:n, :n], whole[:n, n:] = f, g
+    whole = whole - 0.5 * discount * torch.eye(n + m, dtype=torch.float64)
     length = float(torch.linalg.matrix_norm(whole, 1)) * period
     doublings = max(0, 2 + math.ceil(math.log2(max(length, 1e-9))))
     h = period / 2**doublings
@@ -75,21 +77,26 @@ def held_riccati(f: Tensor, g: Tensor, cost: Cost, period: float, *, name: str) 
     Raises:
         ValueError: if the plant cannot be stabilised, at all or with this period, or SciPy is missing.
     """
-    riccati(f, g, cost.q, cost.r, name=name)  # says why there is none
+    q = cost.state_curvature()
+    rest = 0.5 * cost.discount * torch.eye(len(f), dtype=f.dtype)
+    riccati(f - rest, g, q, cost.r, name=name)  # says why there is none
     from scipy.linalg import (  # here: half a second that no other import need pay
         LinAlgError,
         solve_discrete_are,
     )
 
-    hold, n = exact_hold(f, g, cost.q, cost.r, period), len(f)
+    hold, n = exact_hold(f, g, q, cost.r, period, discount=cost.discount), len(f)
     q, s, r = hold.paid[:n, :n], hold.paid[:n, n:], hold.paid[n:, n:]
+    fault = (
+        f"The linearisation of {name}, held for {period:g} s, is not stabilisable: a mode repeats itself "
+        "within a period where the control cannot see it. Choose another period."
+    )
+    if unstabilisable_mode(hold.a, hold.b, discrete=True) is not None:
+        raise ValueError(fault)
     try:
         solved = solve_discrete_are(*(t.numpy() for t in (hold.a, hold.b, q, r)), s=s.numpy())
     except LinAlgError as error:
-        raise ValueError(
-            f"The linearisation of {name}, held for {period:g} s, is not stabilisable: a mode repeats itself "
-            "within a period where the control cannot see it. Choose another period."
-        ) from error
+        raise ValueError(fault) from error
     p = 0.5 * torch.from_numpy(solved + solved.T)
     k = torch.linalg.solve(r + hold.b.mT @ p @ hold.b, hold.b.mT @ p @ hold.a + s.mT)
     return p, k

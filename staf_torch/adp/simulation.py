@@ -12,7 +12,7 @@ from ..lanes import Program
 from ..numerics.checks import choice, fail, integer, trailing
 from ..systems import ControlAffineSystem
 from .closed_loop import ClosedLoop, program, record
-from .controllers import Controller, check_equilibrium
+from .controllers import Controller
 from .cost import Cost
 
 _DRAWN_AHEAD = 1024  # steps whose random numbers are drawn at once
@@ -94,7 +94,7 @@ def simulate(
     Raises:
         ValueError: if an argument breaks its rule, the plant does not rest at 0 or returns another shape.
     """
-    _check(system, cost, x0)
+    cost = _check(system, cost, x0)
     integer("simulate", "steps", steps, least=1)
     integer("simulate", "every", every, least=1)
     if steps % every:
@@ -160,13 +160,14 @@ def _uniform(x0: Tensor, count: int, draws: int, generators: Sequence[torch.Gene
     return drawn.mul_(2).sub_(1).to(x0)
 
 
-def _check(system: ControlAffineSystem, cost: Cost, x0: Tensor) -> None:
+def _check(system: ControlAffineSystem, cost: Cost, x0: Tensor) -> Cost:
+    """Return the cost around the plant, once all shapes are right."""
     trailing("simulate", "x0", x0, dims=2, last=system.dim)
     if x0.dim() != 2 or x0.shape[0] == 0:
         raise ValueError(f"`simulate(x0=...)` must have the shape (B, n); got {tuple(x0.shape)}.")
-    name, size, inputs = type(system).__name__, x0.shape[1], cost.r.shape[0]
-    if cost.q.shape[0] != size:
-        raise fail("simulate", "cost", f"must be for the plant's {size} states", cost.q.shape[0])
+    name, size, inputs = type(system).__name__, x0.shape[1], cost.inputs
+    if cost.dim != size:
+        raise fail("simulate", "cost", f"must be for the plant's {size} states", cost.dim)
     for method, shape in (("drift", x0.shape), ("effectiveness", (*x0.shape, inputs))):
         returned = getattr(system, method)(x0)
         if not isinstance(returned, Tensor) or returned.shape != shape:
@@ -175,4 +176,4 @@ def _check(system: ControlAffineSystem, cost: Cost, x0: Tensor) -> None:
                 f"`{name}.{method}` must map {tuple(x0.shape)} to {tuple(shape)} "
                 f"(the cost is for {inputs} inputs); got {got}."
             )
-    check_equilibrium(system)
+    return cost.around(system)

@@ -91,7 +91,7 @@ def export_learning_c(controller: Controller, x0: Tensor, path: Path, *, dt: flo
 def _write(path: Path, program: Program, carry: Tree, row: Tree, outputs: Sequence[str], note: str) -> Source:
     try:
         text = program.c_source("staf", carry, (), row, outputs=outputs, note=note)
-        graph, _, following, ends = trace(program.step, Given.of(carry, (), row, 1)).program
+        graph, _, following, ends = trace(program.step, Given.of(carry, (), row, 1), folded=True).program
     except NotLoweredError as error:
         raise ValueError(f"This has no C here, export it as ONNX, pt2 or aoti: {error}") from error
     if graph.single and WIDE in graph.type:

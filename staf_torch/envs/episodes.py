@@ -16,9 +16,10 @@ from .. import systems
 from ..adp import Controller, ControllerState, Cost, Feedback, QuadraticCost
 from ..adp.closed_loop import ClosedLoop, LoopState
 from ..numerics.checks import choice, fail, positive_real
-from ..systems import ControlAffineSystem
+from ..systems import Bounds, ControlAffineSystem, Plant
 
-Plant = str | type[ControlAffineSystem] | ControlAffineSystem
+NamedPlant = str | type[ControlAffineSystem] | ControlAffineSystem
+_ACTION = 20.0  # the largest action where neither plant nor cost states bounds
 Numbers = np.ndarray[Any, np.dtype[np.float64]]
 NAMES = tuple(
     name
@@ -28,7 +29,7 @@ NAMES = tuple(
 """The plants of `systems` with inputs and a number of states, by the name of their class."""
 
 
-def make_plant(plant: Plant) -> ControlAffineSystem:
+def make_plant(plant: NamedPlant) -> ControlAffineSystem:
     """Return the plant given, or one of the class, the name in `systems` or the dotted path given."""
     made: object = plant
     if isinstance(plant, str) and "." in plant:
@@ -51,15 +52,23 @@ def make_cost(plant: ControlAffineSystem, cost: Cost | None) -> Cost:
     return QuadraticCost(1.0, 1.0, plant.dim, plant.inputs) if cost is None else cost
 
 
-def make_spaces(plant: ControlAffineSystem, limit: float, bound: float) -> tuple[spaces.Box, spaces.Box]:
-    """Observations: the state, each coordinate within the limit. Actions: each input within the bound."""
+def make_bounds(plant: Plant, cost: Cost, bound: float | None) -> Bounds:
+    """The bounds of the actions: the one given, else those of the cost or the plant, else 20."""
+    if bound is not None:
+        positive_real("PlantEnv", "bound", bound)
+        return Bounds(-bound, bound, plant.inputs)
+    known = cost.around(plant).bounds
+    return Bounds(-_ACTION, _ACTION, plant.inputs) if known is None else known
+
+
+def make_spaces(plant: Plant, limit: float, bounds: Bounds) -> tuple[spaces.Box, spaces.Box]:
+    """Observations: the state, each coordinate within the limit. Actions: the inputs within their bounds."""
     assert plant.dim is not None
-    positive_real("PlantEnv", "bound", bound)
     seen = spaces.Box(-limit, limit, (plant.dim,), np.float64)
-    return seen, spaces.Box(-bound, bound, (plant.inputs,), np.float64)
+    return seen, spaces.Box(bounds.low.numpy(), bounds.high.numpy(), (plant.inputs,), np.float64)
 
 
-def to_control(action: Numbers | Tensor, shape: tuple[int, ...], bound: float) -> Tensor:
+def to_control(action: Numbers | Tensor, shape: tuple[int, ...], bounds: Bounds) -> Tensor:
     """An action of NumPy or torch as float64, in the action space.
 
     Raises:
@@ -68,8 +77,11 @@ def to_control(action: Numbers | Tensor, shape: tuple[int, ...], bound: float) -
     u = torch.as_tensor(action).detach().to("cpu", torch.float64)
     if u.shape != shape:
         raise fail("step", "action", f"must have the shape {shape}", tuple(u.shape))
-    if not bool((u.abs() <= bound).all()):
-        rule = f"must lie in [-{bound:g}, {bound:g}] (make the environment with a larger `bound`, or clip)"
+    if not bool(bounds.contain(u).all()):
+        box = ", ".join(
+            f"[{a:g}, {b:g}]" for a, b in zip(bounds.low.tolist(), bounds.high.tolist(), strict=True)
+        )
+        rule = f"must lie in {box} (make the environment with a larger `bound`, or clip)"
         raise fail("step", "action", rule, u)
     return u
 
@@ -150,7 +162,7 @@ class Episodes:
         self.loop = ClosedLoop(_Held(), system, cost, dt=dt, limit=limit)
         self.steps = math.ceil(horizon / self.loop.dt - 1e-9)
         self.penalty = positive_real("Episodes", "penalty", penalty)
-        self.state = cost.q.new_zeros(rows, cost.q.shape[0])
+        self.state = cost.q.new_zeros(rows, cost.dim)
         self.age = torch.zeros(rows, dtype=torch.int64)
 
     def begin(self, rows: Tensor, x0: Tensor) -> None:
@@ -164,7 +176,7 @@ class Episodes:
         Raises:
             ValueError: if u has another shape.
         """
-        wanted = (len(self.state), self.loop.cost.r.shape[0])
+        wanted = (len(self.state), self.loop.cost.inputs)
         if u.shape != wanted:
             raise fail("Episodes.step", "u", f"must have the shape {wanted}", tuple(u.shape))
         alive = torch.ones_like(self.age, dtype=torch.bool)

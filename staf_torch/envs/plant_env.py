@@ -14,7 +14,18 @@ from torch import Tensor
 from ..adp import Cost
 from ..numerics.checks import integer, positive_real
 from ..systems import ControlAffineSystem
-from .episodes import NAMES, Episodes, Numbers, Plant, make_cost, make_plant, make_spaces, start, to_control
+from .episodes import (
+    NAMES,
+    Episodes,
+    NamedPlant,
+    Numbers,
+    make_bounds,
+    make_cost,
+    make_plant,
+    make_spaces,
+    start,
+    to_control,
+)
 
 Flags = np.ndarray[Any, np.dtype[np.bool_]]
 
@@ -34,7 +45,8 @@ class PlantEnv(gymnasium.Env):
         horizon: s; the episode is truncated there.
         spread: initial states are uniform in [-spread, spread]^n, by default the plant's own;
             `reset(options={"state": x})` sets one.
-        bound: largest |u_i|; an action beyond it is refused.
+        bound: largest |u_i|; an action beyond it is refused. None for the bounds of the cost or the plant, or
+            20 where there are none.
         limit: an episode whose |x| would exceed it terminates.
         penalty: cost of that.
 
@@ -46,23 +58,24 @@ class PlantEnv(gymnasium.Env):
 
     def __init__(
         self,
-        plant: Plant = "TwoState",
+        plant: NamedPlant = "TwoState",
         cost: Cost | None = None,
         *,
         dt: float = 0.01,
         horizon: float = 10.0,
         spread: float | None = None,
-        bound: float = 20.0,
+        bound: float | None = None,
         limit: float = 100.0,
         penalty: float = 1e4,
     ) -> None:
         self.plant = make_plant(plant)
         self.cost = make_cost(self.plant, cost)
-        self.observation_space, self.action_space = make_spaces(self.plant, limit, bound)
+        self.bounds = make_bounds(self.plant, self.cost, bound)
+        self.observation_space, self.action_space = make_spaces(self.plant, limit, self.bounds)
         self.episodes = Episodes(
             self.plant, self.cost, 1, dt=dt, horizon=horizon, limit=limit, penalty=penalty
         )
-        self.bound, self.spread = bound, _spread("PlantEnv", self.plant, spread)
+        self.spread = _spread("PlantEnv", self.plant, spread)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -79,7 +92,7 @@ class PlantEnv(gymnasium.Env):
         Raises:
             ValueError: if the action is not in the action space.
         """
-        u = to_control(action, (self.plant.inputs,), self.bound)
+        u = to_control(action, (self.plant.inputs,), self.bounds)
         reward, terminated, truncated = self.episodes.step(u.unsqueeze(0))
         return self._observation(), float(reward), bool(terminated), bool(truncated), {}
 
@@ -110,14 +123,14 @@ class PlantVectorEnv(VectorEnv):
 
     def __init__(
         self,
-        plant: Plant = "TwoState",
+        plant: NamedPlant = "TwoState",
         cost: Cost | None = None,
         *,
         num_envs: int = 1,
         dt: float = 0.01,
         horizon: float = 10.0,
         spread: float | None = None,
-        bound: float = 20.0,
+        bound: float | None = None,
         limit: float = 100.0,
         penalty: float = 1e4,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
@@ -127,13 +140,14 @@ class PlantVectorEnv(VectorEnv):
         self.metadata = {**type(self).metadata, "autoreset_mode": self.mode}
         self.plant = make_plant(plant)
         self.cost = make_cost(self.plant, cost)
-        self.single_observation_space, self.single_action_space = make_spaces(self.plant, limit, bound)
+        self.bounds = make_bounds(self.plant, self.cost, bound)
+        self.single_observation_space, self.single_action_space = make_spaces(self.plant, limit, self.bounds)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.episodes = Episodes(
             self.plant, self.cost, num_envs, dt=dt, horizon=horizon, limit=limit, penalty=penalty
         )
-        self.bound, self.spread = bound, _spread("PlantVectorEnv", self.plant, spread)
+        self.spread = _spread("PlantVectorEnv", self.plant, spread)
         self._generators: list[np.random.Generator] = []
         self._over = torch.zeros(num_envs, dtype=torch.bool)
 
@@ -156,7 +170,7 @@ class PlantVectorEnv(VectorEnv):
         Raises:
             ValueError: if an action is not in the action space.
         """
-        u = to_control(actions, (self.num_envs, self.plant.inputs), self.bound)
+        u = to_control(actions, (self.num_envs, self.plant.inputs), self.bounds)
         anew = self._over if self.mode is AutoresetMode.NEXT_STEP else torch.zeros_like(self._over)
         reward, terminated, truncated = self.episodes.step(u)
         if bool(anew.any()):

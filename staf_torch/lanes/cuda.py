@@ -70,7 +70,7 @@ class Kernel:
         compile: Compiler = device_compiler,
     ) -> None:
         given = Given.of(carry, now, row, steps)
-        self._traced, self._real, self._key = trace(program.step, given), given.real, given.key()
+        self._traced, self._real, self._key = trace(program.step, given, folded=True), given.real, given.key()
         shared = [
             f"{kind}{k}"
             for kind, leaves in (("row", given.row), ("now", given.now))

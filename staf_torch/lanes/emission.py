@@ -6,9 +6,12 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import torch
+from torch import Tensor
+
 from .graph import FLAG, REAL, ROW, STEP, WHOLE, Graph
 from .schedule import Schedule
-from .statements import Layout, Writer
+from .statements import FIXED, Layout, Writer
 
 _FEW = 400  # nodes of a program of which two vectors fit the registers and caches side by side
 _INFIX = {"add": "+", "sub": "-", "mul": "*", "div": "/", "lt": "<", "le": "<=", "eq": "==", "ne": "!="}
@@ -21,6 +24,15 @@ class Text(NamedTuple):
 
     source: str
     table: list[float]
+    parameters: list[tuple[int, int]]  # places in the table, and the parameters of the graph that stand there
+
+    def numbers(self, parameters: Tensor, real: torch.dtype) -> Tensor:
+        """The table with these parameters, float64, in the program's dtype."""
+        table = torch.tensor(self.table or [0.0], dtype=torch.float64)
+        if self.parameters:
+            places, numbers = zip(*self.parameters, strict=True)
+            table[list(places)] = parameters[list(numbers)]
+        return table.to(real)
 
 
 def emit(
@@ -48,13 +60,14 @@ def _copies(graph: Graph, schedule: Schedule) -> int:
 
 
 def _fixed(graph: Graph, operands: Sequence[int]) -> bool:
-    return any(graph.op[n] == "pack" and graph.op[graph.args[n][0]] == "const" for n in operands)
+    return any(graph.op[n] == "pack" and graph.op[graph.args[n][0]] in FIXED for n in operands)
 
 
 class _Writer(Writer):
     def __init__(self, graph: Graph, schedule: Schedule, layout: Layout, copies: int) -> None:
         super().__init__(graph, schedule, layout, {REAL: "V", WHOLE: "V", FLAG: "M"}, copies)
         self.table: list[float] = []
+        self.parameters: list[tuple[int, int]] = []
 
     def write(self, following: Sequence[int], outputs: Sequence[int]) -> Text:
         rows, fixed, stored = sum(self.layout.rows), 0, dict[int, int]()
@@ -84,7 +97,7 @@ class _Writer(Writer):
             f"constexpr int {', '.join(f'{k} = {v}' for k, v in counts.items())};",
         ]
         source = [*head, '#include "_driver.hpp"', *prepare, *advance]
-        return Text("\n".join(source) + "\n", self.table)
+        return Text("\n".join(source) + "\n", self.table, self.parameters)
 
     def _prepare(self, stored: dict[int, int]) -> None:
         self._lines.append("static void prepare(const Frame &f, int b) {")
@@ -163,6 +176,8 @@ class _Writer(Writer):
         return f"number({text})" if self.graph.type[node] == FLAG else text
 
     def _literal(self, node: int) -> str:
+        if self.graph.op[node] == "param":
+            return self._typed(node, f"splat(c[{self._entry(node)}])")
         value = self.graph.value(node)
         if isinstance(value, bool):
             return f"all_of({str(value).lower()})"
@@ -173,15 +188,25 @@ class _Writer(Writer):
             return f"splat(REAL({'-' if value < 0 else ''}__builtin_inf()))"
         if abs(value) <= 1024 and value * 64 == int(value * 64):
             return f"splat(REAL({value!r}))"
-        key = ("const", node)
-        if key not in self._index:
-            self._index[key] = len(self.table)
-            self.table.append(value)
-        return f"splat(c[{self._index[key]}])"
+        return f"splat(c[{self._entry(node)}])"
 
     def _table(self, pack: int, at: str) -> str:
         key = ("pack", pack)
         if key not in self._index:
             self._index[key] = len(self.table)
-            self.table += [float(self.graph.value(a) or 0.0) for a in self.graph.args[pack]]
+            for node in self.graph.args[pack]:
+                self._enter(node)
         return self._typed(pack, f"splat(c[{self._index[key]} + {at}])")
+
+    def _entry(self, node: int) -> int:
+        """The place of a number in the table."""
+        key = ("entry", node)
+        if key not in self._index:
+            self._index[key] = len(self.table)
+            self._enter(node)
+        return self._index[key]
+
+    def _enter(self, node: int) -> None:
+        if self.graph.op[node] == "param":
+            self.parameters.append((len(self.table), self.graph.aux[node]))
+        self.table.append(float(self.graph.value(node) or 0.0))

@@ -119,6 +119,10 @@ class Graph:
             "const", (), type, (number, math.copysign(1.0, number)) if number == number else "nan"
         )
 
+    def parameter(self, number: int, type: str) -> int:
+        """The node of a number that only the table of a program knows, so that no text depends on it."""
+        return self.add("param", (), type, number)
+
     def value(self, node: int) -> float | bool | None:
         """The number of a constant, else None."""
         if self.op[node] != "const":

@@ -176,10 +176,11 @@ def _sign(t: Tracer, out: Tensor, a: Tensor) -> Ids:
 def _pow(t: Tracer, out: Tensor, a: Any, power: Any) -> Ids:
     kind = t.kind(out.dtype)
     base = t.nodes(a, kind)
-    exponents = power.tolist() if isinstance(power, Tensor) and not t.traced(power) else power
+    stated = isinstance(power, Tensor) and not t.traced(power) and t.stated(power)
+    exponents = power.tolist() if stated else power
     if isinstance(exponents, int | float):
         return _power(t, kind, base, exponents)
-    if isinstance(power, Tensor) and not t.traced(power) and power.dim() > 0:
+    if stated and power.dim() > 0:
         flat = np.broadcast_to(base, out.shape).reshape(-1)
         each = power.expand(out.shape).reshape(-1).tolist()
         return np.array([_power(t, kind, np.asarray(n), e) for n, e in zip(flat, each, strict=True)]).reshape(
@@ -478,7 +479,9 @@ def _moved(t: Tracer, func: Any, out: Any, args: Sequence[Any], kwargs: dict[str
     at = 2 if name in ("gather", "scatter") else 1 if name.startswith("index") else None
     if name == "index_put" and (kwargs.get("accumulate") or (len(args) > 3 and args[3])):
         raise NotLoweredError(f"`{func}` has no scalar form here")
-    if at is not None and any(isinstance(i, Tensor) and t.traced(i) for i in _listed(args[at])):
+    if at is not None and any(
+        isinstance(i, Tensor) and (t.traced(i) or not t.stated(i)) for i in _listed(args[at])
+    ):
         return _indexed(t, name, out, *args, **kwargs)
     kind = t.kind(out.dtype)
     zero = t.graph.constant(0.0, kind)
@@ -510,18 +513,22 @@ def _listed(value: Any) -> Sequence[Any]:
 def _indexed(
     t: Tracer, name: str, out: Tensor, a: Tensor, dim: Any, index: Any = None, *rest: Any, **_: Any
 ) -> Ids:
-    """gather and scatter at an index that a row computes."""
+    """gather, scatter and selection at an index that a row computes, or that numbers of the table do."""
+    kind = t.kind(out.dtype)
+    if name == "index" and sum(i is not None for i in dim) == 1:
+        axis = next(k for k, i in enumerate(dim) if i is not None)
+        name, dim, index = "index_select", axis, dim[axis]
+    if name == "index_select" and index.dtype != torch.bool:
+        entries = np.moveaxis(t.nodes(a, kind), dim, -1)
+        chosen = _chosen(t, entries[(..., *[None] * index.dim(), slice(None))], t.nodes(index, WHOLE))
+        return np.moveaxis(chosen, range(a.dim() - 1, chosen.ndim), range(dim, dim + index.dim()))
     if name not in ("gather", "scatter"):
         raise NotLoweredError(f"`aten.{name}` at an index that the row computes has no scalar form here")
-    kind = t.kind(out.dtype)
     x = np.moveaxis(t.nodes(a, kind), dim, -1)
     at = np.moveaxis(t.nodes(index, WHOLE), dim, -1)
     if name == "gather":
         x = x[tuple(slice(s) for s in at.shape[:-1])]
-        found: Ids = np.broadcast_to(x[..., :1], at.shape)
-        for k in range(1, x.shape[-1]):
-            found = t.map("where", t.map("eq", at, t.nodes(k, WHOLE)), x[..., k : k + 1], found)
-        return np.moveaxis(found, -1, dim)
+        return np.moveaxis(_chosen(t, x[..., None, :], at), -1, dim)
     source = t.nodes(rest[0], kind)
     source = np.broadcast_to(source, at.shape) if source.ndim == 0 else np.moveaxis(source, dim, -1)
     out_nodes = x.copy()
@@ -531,3 +538,11 @@ def _indexed(
             here = t.map("eq", at[..., s], t.nodes(k, WHOLE))
             part[..., k] = t.map("where", here, source[..., s], part[..., k])
     return np.moveaxis(out_nodes, -1, dim)
+
+
+def _chosen(t: Tracer, x: Ids, at: Ids) -> Ids:
+    """Entry ``at`` (...) of the last dimension of arrays (..., K) that broadcast."""
+    found: Ids = np.broadcast_arrays(x[..., 0], at)[0]
+    for k in range(1, x.shape[-1]):
+        found = t.map("where", t.map("eq", at, t.nodes(k, WHOLE)), x[..., k], found)
+    return found

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from . import compiler
+from .captured import Recipe
 from .combinators import Tree, tracing
-from .emission import emit
+from .emission import Text, emit
 from .graph import NOW, STEP, Graph
 from .lowering import lower
 from .plan import Compiled, Plan, form, ordinary
@@ -57,8 +58,24 @@ class Program:
 
     def __init__(self, step: Step, *, name: str = "program", compile: bool = True, copies: int = 0) -> None:
         self.step, self.name, self.compile, self.copies = step, name, compile, copies
-        self._compiled: dict[Hashable, Compiled | None] = {}
+        self._compiled: dict[Hashable, _Built | None] = {}
         self._prepared: dict[Hashable, Prepared] = {}
+        self._model: tuple[Program, Mapping[int, Tensor]] | None = None
+
+    def with_others(self, step: Step, others: Sequence[tuple[Tensor, Tensor]]) -> Program:
+        """Return the program of a step that differs in captured tensors alone: nothing is traced again.
+
+        What torch made of the captured tensors is made again from the others; the text is the same. Where
+        the step came upon a floating-point tensor that is not named here, or read a number that is now
+        another, the new step is traced after all.
+
+        Args:
+            step: as the step of this program, with the other tensors.
+            others: pairs of a tensor that this step captured and what the new one has in its place.
+        """
+        program = Program(step, name=self.name, compile=self.compile, copies=self.copies)
+        program._model = self, {id(old): new for old, new in others}
+        return program
 
     def __call__(
         self, carry: Tree, now: Tree = (), row: Tree = (), *, steps: int | None = None, every: int = 1
@@ -154,7 +171,7 @@ class Program:
             ValueError: if a name is not one of C, or is there twice.
         """
         given = Given.of(carry, now, row, 1)
-        traced = trace(self.step, given)
+        traced = trace(self.step, given, folded=True)
         kinds = {"row": given.structures["row"], "now": given.structures["now"]}
         kinds |= {"carry": given.structures["carry"], "out": traced.structure}
         found = [labels(structure, kind) for kind, structure in kinds.items()]
@@ -169,10 +186,23 @@ class Program:
             return None
         key = given.key()
         if key not in self._compiled:
-            self._compiled[key] = self._build(given)
-        return self._compiled[key]
+            self._compiled[key] = self._again(key) or self._build(given)
+        built = self._compiled[key]
+        return None if built is None else built.compiled
 
-    def _build(self, given: Given) -> Compiled | None:
+    def _again(self, key: Hashable) -> _Built | None:
+        """The program of the model with a table of other numbers, None where that cannot be."""
+        if self._model is None:
+            return None
+        model, others = self._model
+        built = model._compiled.get(key)
+        numbers = None if built is None else built.recipe.again(others)
+        if built is None or numbers is None:
+            return None
+        compiled = built.compiled._replace(table=built.text.numbers(numbers, built.compiled.real))
+        return built._replace(compiled=compiled)
+
+    def _build(self, given: Given) -> _Built | None:
         real = given.real
         try:
             try:
@@ -193,9 +223,16 @@ class Program:
                 _said.add(told)
                 _log.warning("%s runs in plain torch, slower: %s", self.name, reason)
             return None
-        table = torch.tensor(text.table or [0.0], dtype=real)
+        table = text.numbers(traced.recipe.values, real)
         shapes = tuple((leaf.shape[1:], leaf.dtype) for leaf in given.carry)
-        return Compiled(call, table, real, shapes, traced.outputs, traced.structure)
+        compiled = Compiled(call, table, real, shapes, traced.outputs, traced.structure)
+        return _Built(compiled, text, traced.recipe)
+
+
+class _Built(NamedTuple):
+    compiled: Compiled
+    text: Text
+    recipe: Recipe
 
 
 class Prepared:
@@ -301,21 +338,23 @@ class Traced(NamedTuple):
     program: tuple[Graph, Layout, list[int], list[int]]
     outputs: tuple[tuple[torch.Size, torch.dtype], ...]
     structure: Any
+    recipe: Recipe
 
 
-def trace(step: Step, given: Given, *, widened: bool = False) -> Traced:
+def trace(step: Step, given: Given, *, widened: bool = False, folded: bool = False) -> Traced:
     """Write down what a step does with a single row.
 
     Args:
         step: of the program.
         given: inputs.
         widened: whether the numbers of a float32 program are carried in double.
+        folded: whether the numbers of captured tensors become part of the text.
 
     Raises:
         NotLoweredError: if an operation has no scalar form.
     """
     graph = Graph(given.real == torch.float32 and not widened)
-    tracer = Tracer(graph, lower, torch.is_grad_enabled(), widened)
+    tracer = Tracer(graph, lower, torch.is_grad_enabled(), widened, folded)
 
     def inputs(op: str, leaves: Sequence[Any], depth: int, times: int) -> list[Tensor]:
         traced = []
@@ -349,7 +388,7 @@ def trace(step: Step, given: Given, *, widened: bool = False) -> Traced:
             [leaf.numel() for leaf in leaves],
         )
     shapes = tuple((leaf.shape[1:], leaf.dtype) for leaf in leaves)
-    return Traced((graph, layout, following, outputs), shapes, shape)
+    return Traced((graph, layout, following, outputs), shapes, shape, tracer.captured.recipe())
 
 
 def _entries(leaf: Any, skip: int) -> int:

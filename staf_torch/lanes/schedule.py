@@ -56,7 +56,7 @@ class Schedule:
                 read.update(self._ends(number))
         arrays = {graph.args[n][0] for n in read if graph.op[n] == "elem"}
         kept = (node for node in sorted((read | arrays) & self.live) if graph.depth[node] == ROW)
-        return [node for node in kept if graph.op[node] not in ("const", "row", "elem", "loop")]
+        return [node for node in kept if graph.op[node] not in ("const", "param", "row", "elem", "loop")]
 
     def _once(self, node: int) -> bool:
         """Whether a node is found before the steps, be it inside a loop."""

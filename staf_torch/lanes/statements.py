@@ -13,8 +13,10 @@ from .graph import Graph
 from .schedule import Schedule
 from .tracer import NotLoweredError
 
-_INPUTS = ("const", "elem", "result", "collect", "carry", "state", "row", "now")
+_INPUTS = ("const", "param", "elem", "result", "collect", "carry", "state", "row", "now")
 _ARRAYS = ("pack", "map", "dot", "collect")
+FIXED = ("const", "param")
+"""Nodes that are the same for all rows and times."""
 
 
 class Layout(NamedTuple):
@@ -267,7 +269,7 @@ class Writer(abc.ABC):
 
     def _ref(self, node: int, j: int) -> str:
         graph, op, copy = self.graph, self.graph.op[node], self._copy(j)
-        if op == "const":
+        if op in ("const", "param"):
             return self._literal(node)
         if op == "elem":
             return self._read(graph.args[node][0], str(graph.aux[node]), j)
@@ -289,7 +291,7 @@ class Writer(abc.ABC):
     def _read(self, array: int, at: str, j: int) -> str:
         """Entry ``at`` of an array."""
         graph = self.graph
-        if graph.op[array] == "pack" and all(graph.op[a] == "const" for a in graph.args[array]):
+        if graph.op[array] == "pack" and all(graph.op[a] in FIXED for a in graph.args[array]):
             return self._table(array, at)
         if array in self._stored:
             return self._typed(array, self._buffer("row", self._stored[array], j, at))
@@ -309,7 +311,7 @@ class Writer(abc.ABC):
             return None
         args = graph.args[pack]
         op = graph.op[args[0]]
-        if op == "const" and all(graph.op[a] == "const" for a in args):
+        if op in FIXED and all(graph.op[a] in FIXED for a in args):
             return "table", 0
         if op not in ("row", "now") or any(graph.op[a] != op for a in args):
             return None

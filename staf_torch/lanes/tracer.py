@@ -11,8 +11,10 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes
 
+from .captured import Captured
+from .captured import tensors as _tensors
 from .graph import FLAG, REAL, ROW, WHOLE, WIDE, Graph, Ids
 
 _OWN = (str(Path(__file__).parent), str(Path(torch.__file__).parent))
@@ -45,13 +47,21 @@ class Tracer(TorchDispatchMode):
         graph: written.
         lower: the nodes of what an operation returns, `lowering.lower`.
         learning: whether somebody may want a derivative with respect to a constant.
+        widened: whether the numbers of a float32 program are carried in double.
+        folded: whether the numbers of captured tensors become part of the text.
     """
 
     def __init__(
-        self, graph: Graph, lower: Callable[..., Any], learning: bool = False, widened: bool = False
+        self,
+        graph: Graph,
+        lower: Callable[..., Any],
+        learning: bool = False,
+        widened: bool = False,
+        folded: bool = False,
     ) -> None:
         super().__init__()  # type: ignore[no-untyped-call]
         self.graph, self._lower, self._learning, self._widened = graph, lower, learning, widened
+        self.captured, self._folded = Captured(), folded
         self.inside = 0  # loops around what is traced now
         self._storages: dict[int, tuple[Any, Ids]] = {}  # keeps the storages: an address is used once
 
@@ -101,8 +111,12 @@ class Tracer(TorchDispatchMode):
             own = self.kind(value.dtype)
             if self.traced(value):
                 found = self._view(self._storages[value.untyped_storage().data_ptr()][1], value)
-            else:
+            elif self.stated(value):
                 found = self._constants(value, own)
+            else:
+                direct = kind is not None and (own == FLAG or {own, kind} <= {REAL, WIDE})
+                own = kind if direct and kind is not None else own
+                found = self._parameters(value, own)
         else:
             own = FLAG if isinstance(value, bool) else (kind or REAL)
             found = np.array(self.graph.constant(value, own), dtype=np.int64)
@@ -198,8 +212,16 @@ class Tracer(TorchDispatchMode):
         new = [self.graph.add("elem", (array,), kind, k) for k in range(count)]
         return np.array(new, dtype=np.int64)
 
+    def stated(self, tensor: Tensor) -> bool:
+        """Whether the numbers of a tensor that no row has its own of may shape the text."""
+        return self._folded or self.captured.stated(tensor)
+
+    def _parameters(self, tensor: Tensor, kind: str) -> Ids:
+        return self.captured.numbers(tensor, kind, lambda number: self.graph.parameter(number, kind))
+
     def _constants(self, tensor: Tensor, kind: str) -> Ids:
-        numbers = tensor.detach().reshape(-1).tolist()
+        with _disable_current_modes():
+            numbers = tensor.detach().reshape(-1).tolist()
         return np.array([self.graph.constant(n, kind) for n in numbers], dtype=np.int64).reshape(tensor.shape)
 
     def _view(self, held: Ids, tensor: Tensor) -> Ids:
@@ -210,11 +232,13 @@ class Tracer(TorchDispatchMode):
         self, func: Any, types: Any, args: Sequence[Any] = (), kwargs: dict[str, Any] | None = None
     ) -> Any:
         kwargs = kwargs or {}
-        tensors = [a for a in _leaves((args, kwargs)) if isinstance(a, Tensor)]
+        tensors = _tensors((args, kwargs))
         if self._learning and any(t.requires_grad and not self.traced(t) for t in tensors):
             raise NotLoweredError("a derivative with respect to a constant of the program may be wanted")
         if not any(self.traced(tensor) for tensor in tensors):
-            return func(*args, **kwargs)
+            out = func(*args, **kwargs)
+            self.captured.ran(func, args, kwargs, out)
+            return out
         name = func._schema.name.removeprefix("aten::")
         if name in _READS:
             raise NotLoweredError(f"`{func}` reads a value of a row")
@@ -223,7 +247,7 @@ class Tracer(TorchDispatchMode):
         if any(argument.alias_info and argument.alias_info.is_write for argument in func._schema.arguments):
             raise NotLoweredError(f"`{func}` writes to an argument")
         out = func(*args, **kwargs)
-        results = [o for o in _leaves(out) if isinstance(o, Tensor)]
+        results = _tensors(out)
         if all(self.traced(result) or not result.numel() for result in results):
             return out  # views
         nodes = self._lower(self, func, name, out, args, kwargs)
@@ -237,7 +261,7 @@ class Tracer(TorchDispatchMode):
         if not self.traced(target):  # a tensor of constants that a row's numbers go into
             storage = target.untyped_storage()
             whole = torch.as_strided(target, (storage.nbytes() // target.element_size(),), (1,), 0)
-            self.attach(whole, self._constants(whole, self.kind(target.dtype)))
+            self.attach(whole, self.nodes(whole))
         nodes = self._lower(self, func, name, target, args, kwargs)
         held = self._storages[target.untyped_storage().data_ptr()][1]
         self._view(held, target)[...] = nodes
@@ -246,11 +270,3 @@ class Tracer(TorchDispatchMode):
 
 # Set here and not in the class, where torch would wrap the method and import its compiler, three seconds.
 Tracer.__torch_dispatch__ = Tracer._dispatch  # type: ignore[assignment]
-
-
-def _leaves(value: Any) -> list[Any]:
-    if isinstance(value, list | tuple):
-        return [leaf for part in value for leaf in _leaves(part)]
-    if isinstance(value, dict):
-        return [leaf for part in value.values() for leaf in _leaves(part)]
-    return [value]

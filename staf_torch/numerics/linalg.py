@@ -109,22 +109,68 @@ def positive_definite(call: str, name: str, matrix: Tensor, size: int) -> Tensor
     return matrix.to(torch.float64)
 
 
-def unstabilisable_mode(a: Tensor, b: Tensor) -> complex | None:
-    """An eigenvalue of A with Re >= 0 that no input reaches (Hautus), None if there is none.
+def positive_semidefinite(call: str, name: str, matrix: Tensor, size: int) -> Tensor:
+    """A symmetric positive semidefinite (size, size) float64 matrix, to 1e-12 of its largest eigenvalue.
+
+    Raises:
+        ValueError: if it is anything else.
+    """
+    if matrix.shape != (size, size):
+        raise fail(call, name, f"must be ({size}, {size})", matrix)
+    if not bool(torch.isfinite(matrix).all()):
+        raise fail(call, name, "must be finite", matrix)
+    if not torch.allclose(matrix, matrix.mT, rtol=1e-12, atol=0.0):
+        raise fail(call, name, "must be symmetric", matrix)
+    values = torch.linalg.eigvalsh(matrix)
+    if float(values[0]) < -1e-12 * float(values.abs().max()):
+        raise fail(call, name, "must be positive semidefinite", matrix)
+    return matrix.to(torch.float64)
+
+
+def unstabilisable_mode(a: Tensor, b: Tensor, discrete: bool = False) -> complex | None:
+    """An eigenvalue of A with Re >= 0, or |.| >= 1, that no input reaches (Hautus), None if there is none.
 
     Args:
         a: (n, n).
         b: (n, m).
+        discrete: whether A and B are those of x+ = A x + B u.
     """
     size = a.shape[0]
     scale = max(1.0, float(a.abs().max()))
     for eigenvalue in torch.linalg.eigvals(a).tolist():
-        if eigenvalue.real < -1e-9 * scale:
+        if abs(eigenvalue) < 1 - 1e-9 if discrete else eigenvalue.real < -1e-9 * scale:
             continue
         pencil = torch.cat((a - eigenvalue * torch.eye(size, dtype=torch.complex128), b + 0j), dim=1)
         if float(torch.linalg.svdvals(pencil)[size - 1]) < 1e-9 * scale:
             return complex(eigenvalue)
     return None
+
+
+def check_modes(a: Tensor, b: Tensor, q: Tensor, *, name: str, discrete: bool = False) -> None:
+    """Refuse a linear plant with a mode that does not decay and that no input reaches or no cost sees.
+
+    Args:
+        a: (n, n), of x' = A x + B u in 1/s, or of x+ = A x + B u.
+        b: (n, m).
+        q: Q, (n, n).
+        name: of the plant, for the message.
+        discrete: whether it is x+.
+
+    Raises:
+        ValueError: if there is one; the message names its eigenvalue.
+    """
+    unit = "a step" if discrete else "1/s"
+    for matrix, other, fault in (
+        (a, b, "not stabilisable: no input reaches"),
+        (a.mT, q / q.abs().max() if bool((q != 0).any()) else q, "not detectable: the cost Q does not see"),
+    ):
+        mode = unstabilisable_mode(matrix, other, discrete)
+        if mode is not None:
+            shown = f"{mode.real:.6g}" if abs(mode.imag) < 1e-12 else f"{mode.real:.6g}{mode.imag:+.6g}j"
+            raise ValueError(
+                f"The linearisation of {name} at its equilibrium is {fault} "
+                f"its mode with the eigenvalue {shown} {unit}."
+            )
 
 
 def riccati(a: Tensor, b: Tensor, q: Tensor, r: Tensor, *, name: str = "the system") -> Tensor:
@@ -133,7 +179,7 @@ def riccati(a: Tensor, b: Tensor, q: Tensor, r: Tensor, *, name: str = "the syst
     Args:
         a: A, (n, n), in 1/s.
         b: B, (n, m).
-        q: Q, (n, n), positive definite.
+        q: Q, (n, n), positive semidefinite.
         r: R, (m, m), positive definite.
         name: of the plant, for the message.
 
@@ -141,18 +187,12 @@ def riccati(a: Tensor, b: Tensor, q: Tensor, r: Tensor, *, name: str = "the syst
         (n, n), float64, symmetric.
 
     Raises:
-        ValueError: if Q or R is not positive definite, or (A, B) is not stabilisable; the message
-            names the eigenvalue that no input reaches.
+        ValueError: if Q is not positive semidefinite or R not positive definite, (A, B) is not stabilisable
+            or (A, Q) not detectable; the message names the eigenvalue that no input reaches or no cost sees.
     """
-    positive_definite("riccati", "q", q, a.shape[0])
+    positive_semidefinite("riccati", "q", q, a.shape[0])
     positive_definite("riccati", "r", r, b.shape[1])
-    mode = unstabilisable_mode(a.double(), b.double())
-    if mode is not None:
-        shown = f"{mode.real:.6g}" if abs(mode.imag) < 1e-12 else f"{mode.real:.6g}{mode.imag:+.6g}j"
-        raise ValueError(
-            f"The linearisation of {name} at its equilibrium is not stabilisable: no input reaches "
-            f"its mode with the eigenvalue {shown} 1/s."
-        )
+    check_modes(a.double(), b.double(), q.double(), name=name)
     try:
         from scipy.linalg import solve_continuous_are  # here: half a second that no other import need pay
     except ImportError as error:

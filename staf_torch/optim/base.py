@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+from typing import Any, Self
 
 import torch
 from torch import Tensor
@@ -26,6 +27,19 @@ class UpdateLaw(abc.ABC):
 
     needs: frozenset[str] = frozenset()
     step_size: float | None = None
+
+    @classmethod
+    def from_settings(cls, *, inner_steps: int | None = None, **arguments: Any) -> Self:
+        """Return the law of a node of settings that also says how many iterations a chase takes.
+
+        The group `optimizer` of `staf` is such a node: ``inner_steps`` is an argument of `chase`, not of the
+        law, which is made of the other arguments.
+
+        Args:
+            inner_steps: not used here.
+            arguments: those of the constructor.
+        """
+        return cls(**arguments)
 
     def init(self, weights: Tensor) -> LawState:
         """The state before the first iteration, for weights (..., M)."""

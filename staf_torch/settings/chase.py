@@ -8,7 +8,7 @@ import json
 import math
 import re
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -35,6 +35,7 @@ from ..optim import UpdateLaw
 from ..results.metric_info import OWN
 from ..systems import ControlAffineSystem, trajectory
 
+_CENTERS = "staf_torch.settings.chase.centers_of"
 DTYPES = {"float64": torch.float64, "float32": torch.float32}
 
 
@@ -224,32 +225,71 @@ def make_centers(cfg: DictConfig, dim: int) -> StateFollowingCenters:
     Raises:
         ValueError: if the layout does not exist in that dimension, or has another number of centers.
     """
-    count, layout = cfg.count, cfg.layout
+    settings = plain(cfg)
+    if settings.pop("_target_", _CENTERS) == _CENTERS:  # run directories of version 0.1 have none
+        return centers_of(**settings, dim=dim)
+    made = make(cfg)
+    if not isinstance(made, StateFollowingCenters):
+        raise fail(COMMAND_LINE, "centers", "must be StateFollowingCenters", made)
+    return made
+
+
+def centers_of(
+    layout: str,
+    count: int | None = None,
+    radius: float = 0.1,
+    shrink: Mapping[str, Any] | None = None,
+    *,
+    dim: int | None = None,
+    directions: Sequence[Sequence[float]] | None = None,
+) -> StateFollowingCenters:
+    """Return the centers of a node of settings, such as those of the group `centers`.
+
+    Example:
+        >>> from staf_torch.settings.chase import centers_of
+        >>> centers_of("ball", 10, 0.2, dim=3).directions.shape
+        torch.Size([10, 3])
+
+    Args:
+        layout: rings, polygon, simplex, cross_polytope, ball or directions.
+        count: M; None where the layout and the dimension say it.
+        radius: of the ball.
+        shrink: None, or ``offset`` and ``gain`` of `StateRadius`; a null offset means a constant radius.
+        dim: n; None where the layout says it, as rings, polygon and directions do.
+        directions: of the layout of that name, (M, n) in the closed unit ball.
+
+    Raises:
+        ValueError: if the layout does not exist in that dimension, has another number of centers, or does
+            not say the dimension.
+    """
     planar: dict[str, Callable[[int], Tensor]] = {"rings": rings, "polygon": polygon}
-    fixed: dict[str, Callable[[int], Tensor]] = {
-        "simplex": simplex,
-        "cross_polytope": cross_polytope,
-    }
+    fixed: dict[str, Callable[[int], Tensor]] = {"simplex": simplex, "cross_polytope": cross_polytope}
     choice(COMMAND_LINE, "centers.layout", layout, (*planar, *fixed, "ball", "directions"))
     if layout in planar:
-        if dim != 2:
+        if dim not in (None, 2):
             raise ValueError(
                 f"`centers={layout}` lies in the plane, but the system has {dim} states: "
                 "use simplex, cross_polytope or ball."
             )
-        directions = planar[layout](count)
-    elif layout in fixed:
-        directions = fixed[layout](dim)
-        if count is not None and count != len(directions):
-            integer(COMMAND_LINE, "centers.count", count, least=1)
-            rule = f"must be {len(directions)} (or null) for {layout} with {dim} states"
-            raise fail(COMMAND_LINE, "centers.count", rule, count)
+        points = planar[layout](count)  # type: ignore[arg-type]  # which refuses None
     elif layout == "directions":
-        rows = [vector(COMMAND_LINE, "centers.directions", row, dim) for row in plain(cfg.directions)]
-        directions = torch.tensor(rows, dtype=torch.float64)
+        if isinstance(directions, str) or not directions:  # "???" where nothing was given
+            raise fail(COMMAND_LINE, "centers.directions", "must be a list of points", directions)
+        rows = [vector(COMMAND_LINE, "centers.directions", row, dim) for row in directions]
+        points = torch.tensor(rows, dtype=torch.float64)
+    elif dim is None:
+        raise fail("centers", "dim", f"must be given for the layout {layout}: instantiate(..., dim=n)", dim)
+    elif layout in fixed:
+        points = fixed[layout](dim)
+        if count is not None and count != len(points):
+            integer(COMMAND_LINE, "centers.count", count, least=1)
+            rule = f"must be {len(points)} (or null) for {layout} with {dim} states"
+            raise fail(COMMAND_LINE, "centers.count", rule, count)
     else:
-        directions = ball(count, dim)
-    return StateFollowingCenters(directions, make_radius(cfg.radius, cfg.shrink.offset, cfg.shrink.gain))
+        points = ball(count, dim)  # type: ignore[arg-type]
+    shrinking = dict(shrink or {})
+    size = make_radius(radius, shrinking.get("offset"), shrinking.get("gain", 1.0))
+    return StateFollowingCenters(points, size)
 
 
 def make_radius(radius: float, offset: float | None, gain: float) -> float | Radius:

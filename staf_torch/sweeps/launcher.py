@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 from omegaconf import DictConfig
 from tqdm.auto import tqdm
 
-from ..numerics.checks import integer
+from ..numerics.checks import choice, integer
 from ..results import run_record as records
 from ..results.progress import Progress
 from .batching import Outcome, reason
@@ -26,6 +26,11 @@ from .job import PRINTS, execute, objective, silence_terminal
 
 _log = logging.getLogger(__name__)
 
+_FOREIGN = ("run", "warn", "refuse")
+_NOT_BATCHED = (
+    "the jobs of this program cannot share tensor batches, which only the experiments of `staf` can; "
+    "they run one by one. hydra/launcher=joblib runs them side by side"
+)
 _BAR_EVERY, _LINE_EVERY = 0.2, 10.0  # s
 
 
@@ -128,6 +133,9 @@ class Launch:
         self._directory = Path(str(launcher.config.hydra.sweep.dir))
         if launcher.batch is not None:
             integer("hydra.launcher", "batch", launcher.batch, least=1)
+        choice("hydra.launcher", "foreign", launcher.foreign, _FOREIGN)
+        if self._task is not execute and launcher.foreign == "refuse":
+            raise ValueError(f"`hydra.launcher.foreign=refuse`: {_NOT_BATCHED}")
 
     def run(self, job_overrides: Sequence[Sequence[str]], first: int) -> list[JobReturn]:
         """Run the jobs, numbered from ``first``, and return Hydra's records of them, in order."""
@@ -185,7 +193,9 @@ class Launch:
         self, jobs: list[Job], finished: set[int], progress: SweepProgress
     ) -> Generator[tuple[Job, Callable[[DictConfig], Any]], None, None]:
         """Yield every job that is not finished with the task that ends it, as the tensor batches end."""
-        if self._task is not execute:  # another program's task: nothing to batch
+        if self._task is not execute:
+            if self._launcher.foreign == "warn":
+                _log.warning("%s (hydra.launcher.foreign=run says nothing)", _NOT_BATCHED)
             yield from ((job, self._task) for job in jobs)
             return
         if len(finished) == len(jobs):

@@ -2,7 +2,9 @@
 
 from .base import ControlAffineSystem as ControlAffineSystem
 from .base import Linearisation as Linearisation
+from .base import Plant as Plant
 from .base import Units as Units
+from .bounds import Bounds as Bounds
 from .integrators import runge_kutta_step as runge_kutta_step
 from .integrators import simulate as simulate
 from .integrators import trajectory as trajectory

@@ -8,6 +8,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from ..numerics.angles import wrap
+from .bounds import Bounds
+
 
 class Linearisation(NamedTuple):
     """x' = A x + B u near the equilibrium 0."""
@@ -23,23 +26,81 @@ class Units(NamedTuple):
     input: str = "1"
 
 
-class ControlAffineSystem(nn.Module, abc.ABC):
-    """x' = f(x) + g(x) u, batched. A plant of your own is a subclass with `drift` and, where it has
-    inputs, `effectiveness`; its trajectories then come from a fourth-order Runge-Kutta method.
+class Plant(nn.Module, abc.ABC):
+    """A plant with inputs, batched: what the ones in continuous and in discrete time have in common.
 
     Attributes:
         dim: n, the number of states; None where the plant takes any.
         inputs: m, the number of inputs.
         units: of states and inputs, for the sheet of `staf-export`.
         spread: episodes of `envs` begin uniformly in [-spread, spread]^n unless told otherwise.
-
-    The equilibrium is the origin without control: states and inputs are measured from there.
+        periodic: coordinates that are angles in rad: x and x + 2 pi are the same state there. Costs, the LQR,
+            metrics and plots take their differences in [-pi, pi].
+        bounds: of the inputs; None for none. A cost that states no bounds of its own takes these.
+        period: time that a control is held at least, s: the step of a plant in discrete time, else None.
     """
 
     dim: int | None = None
     inputs: int = 0
     units: Units = Units()
     spread: float = 1.0
+    periodic: tuple[int, ...] = ()
+    bounds: Bounds | None = None
+    period: float | None = None
+
+    def equilibrium(self) -> Tensor:
+        """The state at which the plant rests under `resting_input`, (n,): zeros unless it says else."""
+        return torch.zeros(self._size(), dtype=torch.float64)
+
+    def resting_input(self) -> Tensor:
+        """The input that holds the plant at its equilibrium, (m,): zeros unless it says else."""
+        return torch.zeros(self.inputs, dtype=torch.float64)
+
+    @abc.abstractmethod
+    def motion(self, x: Tensor, u: Tensor) -> Tensor:
+        """x' in continuous time, x+ - x in discrete time: (..., n), (..., m) -> (..., n)."""
+
+    def linearisation(self, x: Tensor | None = None, u: Tensor | None = None) -> Linearisation:
+        """A and B near a state and an input at rest, by default the equilibrium.
+
+        Args:
+            x: (n,).
+            u: (m,).
+
+        Raises:
+            ValueError: if ``dim`` is None.
+        """
+        raise NotImplementedError
+
+    def difference(self, x: Tensor, y: Tensor) -> Tensor:
+        """x - y, of the periodic coordinates in [-pi, pi]: (..., n), (..., n) -> (..., n)."""
+        return wrap(x - y, self.periodic)
+
+    def optimal_value(self, x: Tensor, state_cost: Tensor, input_cost: Tensor) -> Tensor | None:
+        """V*(x) for the cost x'Qx + u'Ru, where it is known.
+
+        Args:
+            x: (..., n).
+            state_cost: Q, (n, n).
+            input_cost: R, (m, m).
+
+        Returns:
+            (...), or None where it is not known.
+        """
+        return None
+
+    def _size(self) -> int:
+        if self.dim is None:
+            raise ValueError(f"`{type(self).__name__}.dim` must be the number of states; got None.")
+        return self.dim
+
+
+class ControlAffineSystem(Plant):
+    """x' = f(x) + g(x) u, batched. A plant of your own is a subclass with `drift` and, where it has
+    inputs, `effectiveness`; its trajectories then come from a fourth-order Runge-Kutta method.
+
+    It is regulated to the origin without control unless `equilibrium` and `resting_input` say else.
+    """
 
     @abc.abstractmethod
     def drift(self, x: Tensor) -> Tensor:
@@ -70,34 +131,16 @@ class ControlAffineSystem(nn.Module, abc.ABC):
         """f without the terms that have no derivative at 0; what `linearisation` differentiates."""
         return self.drift(x)
 
-    def equilibrium(self) -> Tensor:
-        """The state at which the plant rests without control: (n,), zeros."""
-        return torch.zeros(self._size(), dtype=torch.float64)
+    def motion(self, x: Tensor, u: Tensor) -> Tensor:
+        return self.rate(x, u)
 
-    def linearisation(self) -> Linearisation:
-        """A = df/dx and B = g at the equilibrium, by automatic differentiation.
-
-        Raises:
-            ValueError: if ``dim`` is None.
-        """
-        at = self.equilibrium()
+    def linearisation(self, x: Tensor | None = None, u: Tensor | None = None) -> Linearisation:
+        """A = d(f + g u)/dx and B = g at rest, by automatic differentiation."""
+        at = self.equilibrium() if x is None else x
+        resting = self.resting_input() if u is None else u
         matrix = torch.func.jacrev(self.smooth_drift)(at)
-        return Linearisation(matrix.detach(), self.effectiveness(at).detach())
-
-    def optimal_value(self, x: Tensor, state_cost: Tensor, input_cost: Tensor) -> Tensor | None:
-        """V*(x) for the cost x'Qx + u'Ru, where it is known.
-
-        Args:
-            x: (..., n).
-            state_cost: Q, (n, n).
-            input_cost: R, (m, m).
-
-        Returns:
-            (...), or None where it is not known.
-        """
-        return None
-
-    def _size(self) -> int:
-        if self.dim is None:
-            raise ValueError(f"`{type(self).__name__}.dim` must be the number of states; got None.")
-        return self.dim
+        g = self.effectiveness(at).detach()
+        if bool((resting != 0).any()):
+            pushed = torch.func.jacrev(self.effectiveness)(at)  # (n, m, n)
+            matrix = matrix + (pushed * resting.to(at)[:, None]).sum(-2)
+        return Linearisation(matrix.detach(), g)

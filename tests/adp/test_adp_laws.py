@@ -237,9 +237,9 @@ def test_three_states_cost_in_their_first_second_what_the_reference_run_does() -
         ),
         (
             lambda: adp.ActorCritic(
-                staf_basis(), PLANT, adp.BoundedInputCost(1.0, 1.0, 2, 1, bound=1.0), adp.RandomPoints(1, BOX)
+                staf_basis(), PLANT, adp.QuadraticCost(1.0, 1.0, 2, 1, discount=0.1), adp.RandomPoints(1, BOX)
             ),
-            r"`ActorCritic\(cost=...\)` must be a QuadraticCost",
+            r"`ActorCritic\(cost=...\)` must have no discount",
         ),
     ],
 )

@@ -6,7 +6,6 @@ from hydra.utils import instantiate
 from torch import nn
 
 from staf_torch import StaF, StaFBasis
-from staf_torch.settings.chase import make_centers
 
 
 class Critic(nn.Module):
@@ -21,7 +20,7 @@ class Critic(nn.Module):
 @hydra.main(version_base="1.3", config_path=".", config_name="own_app")
 def main(cfg):
     torch.manual_seed(cfg.seed)
-    basis = StaFBasis(instantiate(cfg.kernel), make_centers(cfg.centers, dim=2))
+    basis = StaFBasis(instantiate(cfg.kernel), instantiate(cfg.centers))
     target, critic = instantiate(cfg.target), Critic(basis)
     optimizer = torch.optim.Adam(critic.parameters(), lr=cfg.rate)
     for _ in range(cfg.steps):

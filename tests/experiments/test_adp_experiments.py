@@ -118,7 +118,7 @@ def test_tracking_writes_its_run_directory(tmp_path: Path) -> None:
         (["adp.law=newton"], r"`adp\(law=...\)` must be one of"),
         (["adp.basis=fourier"], r"`adp\(basis=...\)` must be one of"),
         (["adp.extrapolation=grid"], r"`adp\(extrapolation=...\)` must be one of"),
-        (["adp.cost.state=[[1,0],[0,-1]]"], r"`QuadraticCost\(state=...\)` must be positive definite"),
+        (["adp.cost.state=[[1,0],[0,-1]]"], r"`QuadraticCost\(state=...\)` must be positive semidefinite"),
         (["adp.cost.control=0"], r"`QuadraticCost\(control=...\)` must be positive"),
         (["system=oscillator"], r"`adp\(system=...\)` must be a plant with inputs; got 'Oscillator'"),
         (["adp/cost=bounded_input"], r"`ActorCritic\(cost=...\)` must be a QuadraticCost"),

@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 import importlib.resources
+import importlib.util
+import itertools
+import json
 import os
 import re
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from command_line import ROOT
 from hydra import compose, initialize
 from hydra.utils import instantiate
+from omegaconf import DictConfig
 
-from staf_torch import Kernel, systems
-from staf_torch.settings.chase import make_centers
+from staf_torch import Kernel, StateFollowingCenters, optim, systems
+from staf_torch.settings.chase import centers_of
 
 APP = ROOT / "tests" / "examples" / "own_app.py"
 
@@ -25,34 +30,109 @@ def test_the_settings_are_a_package() -> None:
     assert {"__init__.py", "config.yaml", "kernel", "centers"} <= names
 
 
-@pytest.mark.parametrize("launcher", ["basic", "batched"])
-def test_an_application_of_ones_own_sweeps_our_groups_without_a_warning(
-    launcher: str, tmp_path: Path
-) -> None:
-    path = os.pathsep.join([str(ROOT), str(ROOT / "staf_torch" / "plugins")])
-    line = [sys.executable, "-W", "error", str(APP), "-m", f"hydra/launcher={launcher}", "steps=60"]
+@pytest.fixture(scope="module")
+def sweeps(tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, str]]:
+    """What the application said under each launcher; all in one process, where every warning is an error."""
+    place = tmp_path_factory.mktemp("own_app")
+    common = ["kernel=gaussian,matern", "centers.count=3,6", "steps=20"]
+    launchers = [["basic"], ["batched"], ["batched", "hydra.launcher.foreign=refuse"]]
+    if importlib.util.find_spec("hydra_plugins.hydra_joblib_launcher") is not None:
+        launchers.append(["joblib", "hydra.launcher.n_jobs=1"])
+    lines = [["-m", f"hydra/launcher={name}", *more, *common] for name, *more in launchers]
+    lines.append(["-m", "hydra/launcher=batched", "hydra.launcher.foreign=run", "steps=1"])
+    path = os.pathsep.join([str(ROOT), str(ROOT / "staf_torch" / "plugins"), *_extras()])
+    program = [sys.executable, "-W", "error", str(Path(__file__).with_name("own_app_sweeps.py")), str(APP)]
     ended = subprocess.run(
-        [*line, "kernel=gaussian,matern", "centers.count=3,6"],
-        cwd=tmp_path,
+        [*program, json.dumps(lines)],
+        cwd=place,
         env=os.environ | {"PYTHONPATH": path},
         capture_output=True,
         text=True,
         check=False,
     )
-    assert ended.returncode == 0, ended.stderr
-    assert "not available" not in ended.stdout + ended.stderr
-    losses = [float(found) for found in re.findall(r"loss=(\S+)", ended.stdout)]
+    assert ended.returncode == 0, ended.stdout + ended.stderr
+    said = json.loads((place / "said.json").read_text())
+    return [{"line": " ".join(line), **text} for line, text in zip(lines, said, strict=True)]
+
+
+def _extras() -> list[str]:
+    """Folders of this process's path that hold extras, such as joblib."""
+    return [entry for entry in os.environ.get("PYTHONPATH", "").split(os.pathsep) if entry]
+
+
+@pytest.mark.parametrize("launcher", ["basic", "batched", "joblib"])
+def test_an_application_of_ones_own_sweeps_our_groups_without_a_warning(
+    launcher: str, sweeps: list[dict[str, str]]
+) -> None:
+    found = [each for each in sweeps if f"hydra/launcher={launcher} " in each["line"]]
+    if not found:
+        pytest.skip("hydra-joblib-launcher (extra `joblib`) is not installed")
+    said = found[0]
+    assert said["error"] == ""
+    assert "not available" not in said["out"]
+    losses = [float(loss) for loss in re.findall(r"loss=(\S+)", said["out"])]
     assert len(losses) == 4
     assert max(losses) < 1
+    reference = re.findall(r"loss=(\S+)", sweeps[0]["out"])
+    assert re.findall(r"loss=(\S+)", said["out"]) == reference
 
 
-def test_groups_instantiate_on_their_own() -> None:
+def test_our_launcher_says_that_it_cannot_batch_another_program(sweeps: list[dict[str, str]]) -> None:
+    _, told, refused, *_, quiet = sweeps
+    words = "jobs of this program cannot share tensor batches"
+    assert told["out"].count(words) == 1
+    assert refused["error"] == "1"  # Hydra's exit code
+    assert f"`hydra.launcher.foreign=refuse`: the {words}" in refused["out"]
+    assert "loss=" not in refused["out"]
+    assert quiet["error"] == ""
+    assert words not in quiet["out"]
+
+
+OPTIONS = sorted(
+    f"{group}={path.stem}"
+    for group in ("kernel", "centers", "optimizer", "system", "target")
+    for path in (ROOT / "conf" / group).glob("*.yaml")
+)
+OPEN = {  # options that ask for something, and what an application would give
+    "centers=directions": ["centers.directions=[[0.0,0.0],[0.6,0.8]]"],
+    "kernel=custom": ["kernel.path=staf_torch.GaussianKernel"],
+    "system=custom": ["system.path=staf_torch.systems.Pendulum"],
+    "target=custom": ["target.path=staf_torch.targets.Paper"],
+}
+TYPES = {
+    "kernel": Kernel,
+    "centers": StateFollowingCenters,
+    "optimizer": optim.UpdateLaw,
+    "system": systems.ControlAffineSystem,
+    "target": Callable,
+}
+
+
+@pytest.fixture(scope="module")
+def nodes() -> dict[str, DictConfig]:
+    """Every option, composed by an application that has nothing but our search path."""
+    search, found = "hydra.searchpath=[pkg://staf_torch.conf]", {}
+    by_group = [[option for option in OPTIONS if option.startswith(f"{group}=")] for group in TYPES]
     with initialize(version_base="1.3", config_path=None):
-        search = "hydra.searchpath=[pkg://staf_torch.conf]"
-        cfg = compose(
-            overrides=[search, "+kernel=matern", "+system=pendulum", "+target=paper", "+centers=rings"]
-        )
-    assert isinstance(instantiate(cfg.kernel), Kernel)
-    assert isinstance(instantiate(cfg.system), systems.Pendulum)
-    assert callable(instantiate(cfg.target))
-    assert make_centers(cfg.centers, dim=2).count == 3
+        for together in itertools.zip_longest(*by_group):  # one of each group: a few compositions do for all
+            chosen = [option for option in together if option is not None]
+            more = [line for option in chosen for line in OPEN.get(option, [])]
+            cfg = compose(overrides=[search, *(f"+{option}" for option in chosen), *more])
+            found |= {option: cfg[option.partition("=")[0]] for option in chosen}
+    return found
+
+
+@pytest.mark.parametrize("option", OPTIONS)
+def test_an_option_of_a_group_instantiates_on_its_own(option: str, nodes: dict[str, DictConfig]) -> None:
+    group, node = option.partition("=")[0], nodes[option]
+    more = {"dim": 3} if option in ("centers=ball", "centers=simplex", "centers=cross_polytope") else {}
+    assert isinstance(instantiate(node, **more), TYPES[group])
+
+
+def test_a_layout_without_a_dimension_asks_for_it() -> None:
+    with pytest.raises(ValueError, match=r"`centers\(dim=...\)` must be given for the layout simplex"):
+        centers_of("simplex")
+    with pytest.raises(
+        ValueError, match=r"`staf centers.directions=...` must be a list of points; got '\?\?\?'"
+    ):
+        centers_of("directions", directions="???")

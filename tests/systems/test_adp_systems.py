@@ -105,7 +105,7 @@ def test_uncontrollable_stable_mode_is_no_obstacle() -> None:
     ("q", "rule"),
     [
         (-1.0, "must be positive"),
-        ([[1.0, 0.0], [0.0, -1.0]], "must be positive definite"),
+        ([[1.0, 0.0], [0.0, -1.0]], "must be positive (semi)?definite"),
         ([[1.0, 0.5], [0.0, 1.0]], "must be symmetric"),
         (torch.eye(3, dtype=torch.float64), r"must be \(2, 2\)"),
         ([[1.0, float("nan")], [0.0, 1.0]], "must be finite"),

@@ -11,7 +11,7 @@ from torch import Tensor
 from ...numerics.checks import fail, integer, positive_real, trailing
 from ...systems import ControlAffineSystem
 from ..controllers import LQR, Policy, Value
-from ..cost import Cost
+from ..cost import BoundedInputCost, Cost
 from .newton import Plan, Solution, choose, follow, minimise, replay
 from .stage import Stage
 
@@ -79,6 +79,9 @@ class DirectShooting:
         tolerance: float = 1e-12,
         iterations: int = 50,
     ) -> None:
+        cost = cost.around(system)
+        if cost.bounds is not None and not isinstance(cost, BoundedInputCost):
+            raise fail("DirectShooting", "cost", "must have smooth bounds (`BoundedInputCost`)", cost.bounds)
         self.stage = Stage(system, cost)
         rates = (1.0, 1.0)
         if base is None or terminal is None or horizon is None or intervals is None:

@@ -22,6 +22,7 @@ class BatchedLauncherConf:
     executor: str = "inline"  # where tensor batches are computed: inline, process, submitit or ray
     workers: int | None = None  # batches at once; null: one a core, or as many as the cluster takes
     batch: int | None = None  # jobs in a tensor batch at most; null: as many as memory allows
+    foreign: str = "warn"  # jobs of another program, which cannot be batched: run, warn and run, or refuse
     submitit: dict[str, Any] = field(default_factory=dict)  # arguments of submitit's executor
     ray: dict[str, Any] = field(default_factory=dict)  # arguments of ray.init
 
@@ -35,7 +36,7 @@ class BatchedLauncher(launcher.Launcher):
     """Groups jobs that may share a tensor batch, solves the batches, replays every job as Hydra's own.
 
     Args:
-        executor, workers, batch, submitit, ray: as in `BatchedLauncherConf`.
+        executor, workers, batch, foreign, submitit, ray: as in `BatchedLauncherConf`.
     """
 
     def __init__(
@@ -43,10 +44,11 @@ class BatchedLauncher(launcher.Launcher):
         executor: str = "inline",
         workers: int | None = None,
         batch: int | None = None,
+        foreign: str = "warn",
         submitit: dict[str, Any] | None = None,
         ray: dict[str, Any] | None = None,
     ) -> None:
-        self.executor, self.workers, self.batch = executor, workers, batch
+        self.executor, self.workers, self.batch, self.foreign = executor, workers, batch, foreign
         self.arguments = {"submitit": submitit or {}, "ray": ray or {}}
         self.hydra_context: HydraContext | None = None
         self.task_function: TaskFunction | None = None

@@ -1,0 +1,198 @@
+"""Tensors that a step finds outside: numbers of a table, of which the text of a program knows nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils._python_dispatch import _disable_current_modes
+
+_LIKE = (
+    "zeros_like",
+    "ones_like",
+    "full_like",
+    "empty_like",
+    "rand_like",
+    "_new_zeros_with_same_feature_meta",
+)
+_NEW = ("new_zeros", "new_ones", "new_full", "new_empty", "new_empty_strided")
+_OF_NO_VALUES = frozenset((*_LIKE, *_NEW, "lift_fresh", "lift_fresh_copy"))
+"""Operations whose result does not depend on the numbers of their arguments."""
+
+
+class Recipe(NamedTuple):
+    """How the numbers of a table follow from the tensors that a step found outside."""
+
+    values: Tensor  # the numbers as they were, float64
+    operations: list[
+        tuple[Any, Sequence[Any], dict[str, Any], Any]
+    ]  # function, arguments, and what it returned
+    reads: list[tuple[Tensor, np.ndarray[Any, Any]]]  # a tensor, and which places of its memory
+    found: list[Tensor]  # floating-point tensors that were there before
+    checks: list[tuple[Tensor, Any]]  # numbers that the step itself read, and so depends on
+
+    def again(self, others: Mapping[int, Tensor]) -> Tensor | None:
+        """The numbers with other tensors in place of those found; None where the program would be another.
+
+        Args:
+            others: by the identity of the tensor that each replaces: all that are floating-point.
+        """
+        if any(id(tensor) not in others for tensor in self.found):
+            return None
+        known = dict(others)
+        with torch.no_grad():
+            for function, args, kwargs, out in self.operations:
+                result = function(*_swapped(args, known), **_swapped(kwargs, known))
+                for old, new in zip(tensors(out), tensors(result), strict=True):
+                    known[id(old)] = new
+            if any(not _same(known.get(id(tensor), tensor), value) for tensor, value in self.checks):
+                return None
+            return _joined([_read(known.get(id(tensor), tensor), at) for tensor, at in self.reads])
+
+
+class Captured:
+    """Tells numbers that were captured from those that the code of a step states itself.
+
+    What a step makes without a tensor from outside (`torch.eye(3)`, `torch.tensor(0.5)`) is part of its text,
+    and so is the structure that integers and flags from outside hold, as indices and masks do. Floating-point
+    tensors from outside, and all that follows from them, are numbers of the table.
+    """
+
+    def __init__(self) -> None:
+        self._stated: dict[int, Any] = {}  # storages, kept: an address is used once
+        self._derived: dict[int, Any] = {}
+        self._places: dict[tuple[int, str], dict[int, int]] = {}
+        self._operations: list[tuple[Any, Sequence[Any], dict[str, Any], Any]] = []
+        self._reads: list[tuple[Tensor, np.ndarray[Any, Any]]] = []
+        self._values: list[Tensor] = []  # read at once: memory may be written to later
+        self._checks: list[tuple[Tensor, Any]] = []
+        self._repeats = True
+        self.count = 0
+
+    def stated(self, tensor: Tensor) -> bool:
+        """Whether the numbers of a tensor are part of the text."""
+        if tensor.numel() == 0 or tensor._is_zerotensor():
+            return True
+        address = tensor.untyped_storage().data_ptr()
+        if address in self._stated:
+            return True
+        return address not in self._derived and not tensor.is_floating_point()
+
+    def ran(self, function: Any, args: Sequence[Any], kwargs: dict[str, Any], out: Any) -> None:
+        """Note an operation on tensors of which no row has its own."""
+        name = function._schema.name.removeprefix("aten::")
+        given = [t for t in tensors((args, kwargs)) if t.numel()]
+        stated = name in _OF_NO_VALUES or all(self.stated(t) for t in given)
+        if not stated:
+            if name == "_local_scalar_dense":
+                self._checks.append((given[0], out))
+            elif not tensors(out):  # read in a way that cannot be checked
+                self._repeats = False
+            self._operations.append((function, args, kwargs, out))
+        if function._schema.is_mutable:
+            for tensor in given:
+                self._forget(tensor)
+            self._repeats = self._repeats and stated
+        for tensor in tensors(out):
+            if tensor.numel() and not tensor._is_zerotensor():
+                storage = tensor.untyped_storage()
+                known = storage.data_ptr() in self._stated or storage.data_ptr() in self._derived
+                if not stated:
+                    self._stated.pop(storage.data_ptr(), None)
+                    self._derived[storage.data_ptr()] = storage
+                elif not known and not any(
+                    storage.data_ptr() == t.untyped_storage().data_ptr() for t in given
+                ):
+                    self._stated[storage.data_ptr()] = storage
+
+    def numbers(self, tensor: Tensor, kind: str, new: Callable[[int], int]) -> np.ndarray[Any, Any]:
+        """The nodes of a tensor's entries, one for every place in memory.
+
+        Args:
+            tensor: captured.
+            kind: of the nodes.
+            new: makes a node of the number of a parameter.
+        """
+        strides = tensor.stride()
+        at = np.full(tensor.shape, 0, dtype=np.int64)
+        for axis, (size, stride) in enumerate(zip(tensor.shape, strides, strict=True)):
+            at += (np.arange(size) * stride).reshape([-1] + [1] * (tensor.dim() - axis - 1))
+        start = int(tensor.storage_offset())
+        places = self._places.setdefault((tensor.untyped_storage().data_ptr(), kind), {})
+        self._derived.setdefault(tensor.untyped_storage().data_ptr(), tensor.untyped_storage())
+        flat, fresh = at.reshape(-1).tolist(), []
+        for index, place in enumerate(flat):
+            if start + place not in places:
+                places[start + place] = new(self.count)
+                self.count += 1
+                fresh.append(index)
+        if fresh:
+            self._reads.append((tensor, np.array(fresh)))
+            self._values.append(_read(tensor, self._reads[-1][1]))
+        nodes = np.array([places[start + place] for place in flat], dtype=np.int64)
+        return nodes.reshape(tensor.shape)
+
+    def recipe(self) -> Recipe:
+        """How the table came about: no operation that it does not need."""
+        wanted = {id(t) for t, _ in self._reads} | {id(t) for t, _ in self._checks}
+        operations, made = [], set[int]()
+        for operation in reversed(self._operations):
+            out = tensors(operation[3])
+            if any(id(t) in wanted for t in out):
+                operations.append(operation)
+                wanted.update(id(t) for t in tensors(operation[1:3]))
+                made.update(id(t) for t in out)
+        operations.reverse()
+        kept = [t for t, _ in self._reads] + [t for o in operations for t in tensors(o[1:3])]
+        kept += [t for t, _ in self._checks]
+        found = {id(t): t for t in kept if id(t) not in made and not self._made_inside(t)}
+        numbers = [t for t in found.values() if t.is_floating_point()]
+        if not self._repeats:  # memory was written to: once more would write twice
+            numbers.append(torch.empty(0))
+        return Recipe(_joined(self._values), operations, self._reads, numbers, self._checks)
+
+    def _made_inside(self, tensor: Tensor) -> bool:
+        return tensor.numel() == 0 or tensor.untyped_storage().data_ptr() in self._stated
+
+    def _forget(self, tensor: Tensor) -> None:
+        """New numbers stand in this memory."""
+        address = tensor.untyped_storage().data_ptr()
+        for key in [key for key in self._places if key[0] == address]:
+            del self._places[key]
+
+
+def tensors(value: Any) -> list[Tensor]:
+    """The tensors in nested lists, tuples and dictionaries."""
+    if isinstance(value, Tensor):
+        return [value]
+    if isinstance(value, list | tuple):
+        return [tensor for part in value for tensor in tensors(part)]
+    if isinstance(value, dict):
+        return [tensor for part in value.values() for tensor in tensors(part)]
+    return []
+
+
+def _read(tensor: Tensor, at: np.ndarray[Any, Any]) -> Tensor:
+    with _disable_current_modes():  # the tracer itself among them
+        return tensor.detach().double().reshape(-1)[at]
+
+
+def _joined(parts: Sequence[Tensor]) -> Tensor:
+    return torch.cat(list(parts)) if parts else torch.zeros(0, dtype=torch.float64)
+
+
+def _swapped(value: Any, known: Mapping[int, Tensor]) -> Any:
+    if isinstance(value, Tensor):
+        return known.get(id(value), value)
+    if isinstance(value, list | tuple):
+        return type(value)(_swapped(part, known) for part in value)
+    if isinstance(value, dict):
+        return {name: _swapped(part, known) for name, part in value.items()}
+    return value
+
+
+def _same(tensor: Tensor, value: Any) -> bool:
+    return tensor.numel() == 1 and bool(tensor.item() == value)

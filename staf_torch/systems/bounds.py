@@ -1,0 +1,88 @@
+"""What the inputs of a plant may be."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from ..numerics.checks import fail
+
+Limit = float | Sequence[float] | Tensor | None
+
+
+class Bounds(nn.Module):
+    """The box low <= u <= high, in the units of the inputs.
+
+    Example:
+        >>> bounds = systems.Bounds([0.0, -1.0], [20.0, 1.0], inputs=2)
+        >>> bounds.clip(torch.tensor([-3.0, 0.5], dtype=torch.float64))
+        tensor([0.0000, 0.5000], dtype=torch.float64)
+
+    Args:
+        low: a number for all inputs, or one an input; None or -inf for none.
+        high: likewise; None or inf for none.
+        inputs: m.
+
+    Raises:
+        ValueError: if a bound has another length or is NaN, or one is not below the other.
+    """
+
+    def __init__(self, low: Limit, high: Limit, inputs: int) -> None:
+        super().__init__()
+        self.register_buffer("low", _limit("low", low, -math.inf, inputs))
+        self.register_buffer("high", _limit("high", high, math.inf, inputs))
+        self.low: Tensor
+        self.high: Tensor
+        if not bool((self.low < self.high).all()):
+            raise fail("Bounds", "low", f"must be below high, {self.high.tolist()}", self.low.tolist())
+
+    @property
+    def present(self) -> bool:
+        """Whether any input is bounded."""
+        return bool(torch.isfinite(self.low).any() or torch.isfinite(self.high).any())
+
+    def clip(self, u: Tensor) -> Tensor:
+        """The nearest admissible input: (..., m) -> (..., m)."""
+        return torch.minimum(torch.maximum(u, self.low.to(u)), self.high.to(u))
+
+    def contain(self, u: Tensor) -> Tensor:
+        """Whether u is admissible: (..., m) -> (...) bool."""
+        return ((u >= self.low.to(u)) & (u <= self.high.to(u))).all(-1)
+
+    def inward(self, u: Tensor, slope: Tensor) -> Tensor:
+        """The projected gradient at an admissible u: the slope, 0 where it points out of the box at a bound.
+
+        Args:
+            u: (..., m).
+            slope: derivative of a cost in u, (..., m).
+        """
+        at_low, at_high = u <= self.low.to(u), u >= self.high.to(u)
+        return torch.where((at_low & (slope > 0)) | (at_high & (slope < 0)), 0.0, slope)
+
+    def measured_from(self, u: Tensor) -> Bounds:
+        """The box of u' - u for every admissible u': the bounds of a deviation from u (m,)."""
+        return Bounds(self.low - u, self.high - u, len(self.low))
+
+    def extra_repr(self) -> str:
+        return f"low={self.low.tolist()}, high={self.high.tolist()}"
+
+
+def _limit(name: str, given: Limit, none: float, inputs: int) -> Tensor:
+    if given is None:
+        given = none
+    if isinstance(given, bool) or not isinstance(given, int | float | Sequence | Tensor):
+        raise fail("Bounds", name, "must be a number or one an input", given)
+    try:
+        limit = torch.as_tensor(given, dtype=torch.float64).detach().clone()
+    except (TypeError, ValueError) as error:
+        raise fail("Bounds", name, "must be a number or one an input", given) from error
+    if limit.dim() == 0:
+        limit = limit.repeat(inputs)
+    if limit.shape != (inputs,):
+        raise fail("Bounds", name, f"must be a number or one for each of the {inputs} inputs", given)
+    if bool(torch.isnan(limit).any()) or bool((limit == -none).any()):
+        raise fail("Bounds", name, f"must be finite or {none}", given)
+    return limit

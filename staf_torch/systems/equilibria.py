@@ -1,0 +1,113 @@
+"""Where a plant rests: the input that holds it at a state, and the nearest equilibrium to a guess."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ..numerics.differences import central_slopes
+from .base import Plant
+
+_REST = 1e-6  # of the fastest rate of the linearisation, below which a plant counts as resting
+_STEPS = 50
+
+
+def check_rest(plant: Plant, x: Tensor, u: Tensor) -> None:
+    """Refuse a state and an input at which the plant moves.
+
+    Args:
+        plant: the plant.
+        x: (n,).
+        u: (m,).
+
+    Raises:
+        ValueError: if the motion exceeds 1e-6 of the plant's rates there, with its value.
+    """
+    moves = _motion(plant, x, u)
+    if bool((moves.abs() <= _REST * _scale(plant, x, u)).all()):
+        return
+    name = type(plant).__name__
+    if not bool((x != 0).any() or (u != 0).any()) and hasattr(plant, "drift"):
+        raise ValueError(
+            f"`{name}.drift` must be 0 at the origin, the state to regulate to; got {moves.tolist()}. "
+            "Say where the plant rests by `equilibrium` and `resting_input`, or by a set-point of the cost."
+        )
+    raise ValueError(
+        f"{name} does not rest at the state {x.tolist()} under the input {u.tolist()}: it moves by "
+        f"{moves.tolist()}. Choose a set-point at which an admissible input holds it."
+    )
+
+
+def resting_input_at(plant: Plant, x: Tensor, guess: Tensor | None = None) -> Tensor:
+    """The input that comes nearest to holding the plant at x (n,), by Gauss-Newton steps: (m,).
+
+    Args:
+        plant: the plant.
+        x: (n,).
+        guess: (m,); by default the resting input of the plant.
+    """
+    u = plant.resting_input() if guess is None else guess
+    for _ in range(_STEPS):
+        slopes = central_slopes(lambda v: _motions(plant, x.expand(len(v), -1), v), u)
+        step = torch.linalg.lstsq(slopes, -_motion(plant, x, u).unsqueeze(-1), driver="gelsd").solution[:, 0]
+        u = u + step
+        if not bool(torch.isfinite(u).all()) or float(step.norm()) <= 1e-14 * (1 + float(u.norm())):
+            break
+    return u
+
+
+def find_equilibrium(plant: Plant, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+    """A state and an input at which the plant rests, near a guess.
+
+    The input alone moves first, as far as that serves; then state and input together, by the smallest
+    Gauss-Newton steps, so that a plant with many equilibria keeps to the one nearby.
+
+    Args:
+        plant: the plant.
+        x: the guess of the state, (n,).
+        u: the guess of the input, (m,).
+
+    Raises:
+        ValueError: if there is none near the guess; the message says which coordinate keeps moving.
+    """
+    held = resting_input_at(plant, x, u)
+    if bool(torch.isfinite(held).all()) and _rests(plant, x, held):
+        return x, held
+    z, size = torch.cat((x, u)), len(x)
+    for _ in range(_STEPS):
+        slopes = central_slopes(lambda v: _motions(plant, v[:, :size], v[:, size:]), z)
+        moves = _motion(plant, z[:size], z[size:])
+        step = torch.linalg.lstsq(slopes, -moves.unsqueeze(-1), driver="gelsd").solution[:, 0]
+        z = z + step
+        if not bool(torch.isfinite(z).all()) or float(step.norm()) <= 1e-14 * (1 + float(z.norm())):
+            break
+    if bool(torch.isfinite(z).all()) and _rests(plant, z[:size], z[size:]):
+        return z[:size], z[size:]
+    moves = _motion(plant, x, u)
+    worst = int(moves.abs().argmax())
+    raise ValueError(
+        f"{type(plant).__name__} has no equilibrium near the guess, the state {x.tolist()} and the input "
+        f"{u.tolist()}: state {worst} keeps moving, by {float(moves[worst]):.6g}. Give a better "
+        "`equilibrium=(state, input)`."
+    )
+
+
+def _rests(plant: Plant, x: Tensor, u: Tensor) -> bool:
+    moves = _motion(plant, x, u)
+    return bool((moves.abs() <= _REST * _scale(plant, x, u)).all())
+
+
+def _scale(plant: Plant, x: Tensor, u: Tensor) -> float:
+    """What a unit of state or input changes in the motion at most, at least 1e-3."""
+    size, z = len(x), torch.cat((x, u))
+    slopes = central_slopes(lambda v: _motions(plant, v[:, :size], v[:, size:]), z)
+    return max(float(slopes.abs().max()), 1e-3)
+
+
+def _motions(plant: Plant, x: Tensor, u: Tensor) -> Tensor:
+    with torch.no_grad():
+        return plant.motion(x, u)
+
+
+def _motion(plant: Plant, x: Tensor, u: Tensor) -> Tensor:
+    return _motions(plant, x.unsqueeze(0), u.unsqueeze(0))[0]
