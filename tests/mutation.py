@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import hashlib
 import json
 import os
 import random
@@ -23,7 +24,7 @@ import sys
 import tempfile
 import time
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import NamedTuple
@@ -65,7 +66,7 @@ def main() -> int:
         _export(commit, tree)
         found = list(_all_mutants(tree, options.package, options.file))
         chosen = random.Random(options.seed).sample(found, min(options.sample, len(found)))
-        known = _map(commit, tree)
+        known = _map(commit, tree, options.tests)
         print(f"{len(found)} mutants, {len(chosen)} of them by seed {options.seed}", flush=True)
         verdicts = []
         with ThreadPoolExecutor(options.jobs) as pool:
@@ -82,6 +83,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--package", nargs="*", default=[], help="rooms of staf_torch; all by default")
     parser.add_argument("--file", nargs="*", default=[], help="files, staf_torch/...; all by default")
     parser.add_argument("--commit", default="HEAD")
+    parser.add_argument("--tests", nargs="*", default=["tests"], help="that are asked; all by default")
     parser.add_argument("--jobs", type=int, default=1)
     return parser.parse_args()
 
@@ -109,12 +111,13 @@ def _all_mutants(tree: Path, packages: Iterable[str], files: Iterable[str]) -> I
 # Which tests execute a line
 
 
-def _map(commit: str, tree: Path) -> Map:
-    data, times = CACHE / f"{commit}.coverage", CACHE / f"{commit}.json"
+def _map(commit: str, tree: Path, tests: Sequence[str]) -> Map:
+    key = hashlib.sha256(" ".join(sorted(tests)).encode()).hexdigest()[:8]
+    data, times = CACHE / f"{commit}-{key}.coverage", CACHE / f"{commit}-{key}.json"
     if not times.exists():
         print("measuring which test executes which line; this runs the suite once", flush=True)
         CACHE.mkdir(parents=True, exist_ok=True)
-        _measure(tree, data, times)
+        _measure(tree, tests, data, times)
     seconds = {name: float(spent) for name, spent in json.loads(times.read_text()).items()}
     lines: dict[str, dict[int, set[str]]] = defaultdict(lambda: defaultdict(set))
     with contextlib.closing(sqlite3.connect(data)) as base:
@@ -138,7 +141,7 @@ def _numbers(bits: bytes) -> Iterator[int]:
                 yield 8 * index + bit
 
 
-def _measure(tree: Path, data: Path, times: Path) -> None:
+def _measure(tree: Path, tests: Sequence[str], data: Path, times: Path) -> None:
     settings = tree / "mutation.coveragerc"
     settings.write_text(f"[run]\nsource = staf_torch\nrelative_files = true\ndata_file = {data}.part\n")
     shown = tree / "durations.txt"
@@ -154,7 +157,7 @@ def _measure(tree: Path, data: Path, times: Path) -> None:
             "--cov-report=",
         ),
         *(f"--cov-config={settings}", "--cov-context=test", "--durations=0", "--durations-min=0.001"),
-        *(f"--ignore={place}" for place in OUTSIDE),
+        *("-n", "2", "--dist", "worksteal", *(f"--ignore={place}" for place in OUTSIDE), *tests),
     ]
     with shown.open("w") as file:
         ended = subprocess.run(line, cwd=tree, env=_environment(tree), stdout=file, check=False)

@@ -175,6 +175,7 @@ MODULES: dict[str, Case] = {
     "ThreeState": Case(lambda s: systems.ThreeState(), flows, carried=False),
     "TwoState": Case(lambda s: systems.TwoState(), flows, carried=False),
     "VanDerPol": Case(systems.VanDerPol, flows, carried=False),
+    "Bounds": Case(lambda s: systems.Bounds([-s, -1.0], [s, 1.0], 2), lambda module, x: module.clip(3 * x)),
     "Paper": Case(lambda s: targets.Paper(), carried=False),
     "Quadratic": Case(targets.Quadratic),
     "Cosine": Case(lambda s: targets.Cosine([s, 2 * s], 0.3)),
