@@ -135,7 +135,6 @@ CALLS: dict[str, Callable[..., Any]] = {
     "LeadingCoordinates": lambda **given: LeadingCoordinates(GRID, **given),
     "ClosedLoop": loop,
     "Supervised": lambda **given: adp.Supervised(adp.Feedback(LQR, LQR.value), LQR, COST, **given),
-    "BoundedInputCost": lambda **given: adp.BoundedInputCost(1.0, 1.0, 2, 1, **given),
     "RandomPoints": lambda **given: adp.RandomPoints(**{"count": 1, "half_width": 1.0, **given}),
     "QuadraturePoints": lambda **given: adp.QuadraturePoints(
         **{"order": 1, "dim": 1, "half_width": 1.0, **given}
@@ -209,7 +208,12 @@ ABSENT |= {
     ("DirectShooting", "horizon"),
     ("StaF", "out_features"),
 }
-ABSENT |= {("DirectShooting", "intervals"), ("simulate", "seed"), ("trajectory", "chunk")}
+ABSENT |= {
+    ("PlantEnv", "bound"),
+    ("DirectShooting", "intervals"),
+    ("simulate", "seed"),
+    ("trajectory", "chunk"),
+}
 """Arguments for which None has a meaning of its own."""
 RULES = sorted({str(rule): rule for rule in rules() if rule.call not in OTHERS}.values())
 

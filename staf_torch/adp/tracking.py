@@ -108,9 +108,8 @@ def tracking_cost(error: Matrix, control: Matrix) -> QuadraticCost:
     Raises:
         ValueError: if Q or R is not symmetric positive definite.
     """
-    cost = QuadraticCost(error, control, 2, 1)
-    cost.q = torch.block_diag(cost.q, torch.zeros_like(cost.q))
-    return cost
+    paid = QuadraticCost(error, control, 2, 1)
+    return QuadraticCost(torch.block_diag(paid.q, torch.zeros_like(paid.q)), paid.r, 4, 1)
 
 
 def desired_trajectory(time: Tensor) -> Tensor:
