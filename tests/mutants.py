@@ -35,7 +35,7 @@ _WORDS = ("stacklevel", "maxsplit")  # arguments that only say something
 
 
 class Mutant(NamedTuple):
-    """A changed file."""
+    """One change of a file."""
 
     file: str
     line: int
@@ -43,19 +43,25 @@ class Mutant(NamedTuple):
     was: str  # source of the part that changes
     now: str
     context: str  # the whole line, stripped: what names the mutant where line numbers move
-    text: str  # the changed file
+    begin: int  # in bytes
+    end: int
 
     @property
     def key(self) -> tuple[str, str, str, str]:
         """What names the mutant in any version that has the same line."""
         return self.file, self.context, self.was, self.now
 
+    def applied(self, source: str) -> str:
+        """The changed file."""
+        raw = source.encode()
+        return (raw[: self.begin] + self.now.encode() + raw[self.end :]).decode()
+
 
 def mutants_of(file: str, source: str) -> Iterator[Mutant]:
     """Every mutant of a file, in the order of its lines."""
     tree = ast.parse(source)
     skipped = set(_skipped(tree))
-    raw = source.encode()
+    raw, lines = source.encode(), source.splitlines()
     starts = [0]
     for line in raw.splitlines(keepends=True):
         starts.append(starts[-1] + len(line))
@@ -68,13 +74,8 @@ def mutants_of(file: str, source: str) -> Iterator[Mutant]:
             was = raw[begin:end].decode()
             if now == was:
                 continue
-            changed = (raw[:begin] + now.encode() + raw[end:]).decode()
-            try:
-                ast.parse(changed)
-            except SyntaxError:
-                continue
-            line = source.splitlines()[place.lineno - 1].strip()
-            yield Mutant(file, place.lineno, place.end_lineno, was, now, line, changed)
+            line = lines[place.lineno - 1].strip()
+            yield Mutant(file, place.lineno, place.end_lineno, was, now, line, begin, end)
 
 
 def _skipped(tree: ast.AST) -> Iterator[int]:

@@ -211,7 +211,8 @@ def _judge(mutant: Mutant, tree: Path, known: Map) -> Verdict:
     with tempfile.TemporaryDirectory(prefix="staf-mutant-") as folder:
         copy = Path(folder) / "tree"
         shutil.copytree(tree, copy, ignore=shutil.ignore_patterns(".assets", "__pycache__"))
-        (copy / mutant.file).write_text(mutant.text, encoding="utf-8")
+        changed = mutant.applied((tree / mutant.file).read_text(encoding="utf-8"))
+        (copy / mutant.file).write_text(changed, encoding="utf-8")
         line = [*(sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "--tb=no"), *tests]
         running = subprocess.Popen(
             line,
