@@ -23,6 +23,7 @@ from .cost import QuadraticCost as QuadraticCost
 from .extrapolation import Extrapolation as Extrapolation
 from .extrapolation import QuadraturePoints as QuadraturePoints
 from .extrapolation import RandomPoints as RandomPoints
+from .global_value import GlobalValue as GlobalValue
 from .identification import ConcurrentLearning as ConcurrentLearning
 from .identification import Identified as Identified
 from .identification import IdentifyingTracker as IdentifyingTracker
@@ -32,7 +33,9 @@ from .laws import Gains as Gains
 from .laws import Information as Information
 from .laws import Published as Published
 from .laws import Weights as Weights
+from .memory_growth import learn_global_value as learn_global_value
 from .rollout import RolloutPolicy as RolloutPolicy
+from .sampled_problem import SampledProblem as SampledProblem
 from .sampling import HeldStability as HeldStability
 from .sampling import held_stability as held_stability
 from .shooting import DirectShooting as DirectShooting
@@ -42,6 +45,8 @@ from .simulation import simulate as simulate
 from .tracking import TwoStateTracking as TwoStateTracking
 from .tracking import desired_trajectory as desired_trajectory
 from .tracking import tracking_cost as tracking_cost
+from .trajectory_optimisation import BoxDDP as BoxDDP
+from .trajectory_optimisation import Trajectories as Trajectories
 
 
 def __getattr__(name: str) -> type:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Hashable
 from typing import NamedTuple
 
@@ -11,10 +10,11 @@ from torch import Tensor, nn
 
 from ..lanes import Program
 from ..lanes.content import content
-from ..numerics.checks import choice, positive_real
-from ..systems import ControlAffineSystem
+from ..numerics.checks import choice, integer, positive_real
+from ..systems import Plant
 from .controllers import Controller, ControllerState
 from .cost import Cost
+from .holding import Holding
 
 _KEPT = 16
 _kept: dict[Hashable, Program] = {}
@@ -39,7 +39,9 @@ class ClosedLoop(nn.Module):
         system: the plant.
         cost: the cost rate.
         dt: s.
-        integrator: of the plant over a step, ``runge_kutta`` (fourth order) or ``euler`` (as published).
+        integrator: of the plant over a step, ``runge_kutta`` (fourth order) or ``euler`` (as published). A
+            plant in discrete time takes its own steps.
+        substeps: Runge-Kutta steps while the control is held, at least 1.
         limit: a row whose state exceeds it in norm has diverged.
 
     Raises:
@@ -49,19 +51,22 @@ class ClosedLoop(nn.Module):
     def __init__(
         self,
         controller: Controller,
-        system: ControlAffineSystem,
+        system: Plant,
         cost: Cost,
         *,
         dt: float,
         integrator: str = "runge_kutta",
+        substeps: int = 1,
         limit: float = 1e6,
     ) -> None:
         super().__init__()
         choice("ClosedLoop", "integrator", integrator, ("runge_kutta", "euler"))
         self.controller, self.system, self.cost = controller, system, cost.around(system)
         self.dt = positive_real("ClosedLoop", "dt", dt)
+        self.substeps = integer("ClosedLoop", "substeps", substeps, least=1)
         self.limit = positive_real("ClosedLoop", "limit", limit)
-        self.euler = integrator == "euler"
+        self.euler = integrator == "euler" and system.period is None
+        self.holding = Holding("ClosedLoop", system, self.cost, self.dt, self.substeps)
 
     def init(self, x0: Tensor) -> LoopState:
         """The state at time 0 of the rows x0 (B, n)."""
@@ -89,24 +94,9 @@ class ClosedLoop(nn.Module):
 
     def _advance(self, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
         """The state after dt with u held, and the cost until then."""
-        h = self.dt
-        paid = self.cost.input_rate(u)
-        half = math.exp(-0.5 * self.cost.discount * h)  # what the middle of the step counts; its end, squared
-        k1 = self.system.rate(x, u)
-        c1 = self.cost.state_rate(x)
         if self.euler:
-            return x + h * k1, h * (c1 + paid)
-        x2 = x + 0.5 * h * k1
-        k2 = self.system.rate(x2, u)
-        x3 = x + 0.5 * h * k2
-        k3 = self.system.rate(x3, u)
-        x4 = x + h * k3
-        k4 = self.system.rate(x4, u)
-        middle = self.cost.state_rate(x2) + self.cost.state_rate(x3)
-        if self.cost.discount:
-            paid = paid * (1 + 4 * half + half**2) / 6
-        spent = h * (paid + (c1 + 2 * half * middle + half**2 * self.cost.state_rate(x4)) / 6)
-        return x + (h / 6) * (k1 + 2 * (k2 + k3) + k4), spent
+            return x + self.dt * self.system.motion(x, u), self.dt * self.cost.rate(x, u)
+        return self.holding(x, u)
 
 
 def _where(alive: Tensor, new: Tensor, old: Tensor) -> Tensor:

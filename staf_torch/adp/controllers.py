@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from ..numerics.checks import real
 from ..numerics.linalg import riccati
-from ..systems import ControlAffineSystem, Linearisation
+from ..systems import Plant
 from .cost import Cost, matvec, quadratic
 from .sampling import held_riccati
 
@@ -112,7 +112,8 @@ class LQR(nn.Module):
     Args:
         system: the plant.
         cost: the cost rate.
-        period: s, positive, for which the control will be held; None for one that follows the state.
+        period: s, positive, for which the control will be held; None for one that follows the state, or of a
+            plant in discrete time for its step.
 
     Attributes:
         cost: the cost, measured from the set-point of this plant.
@@ -124,18 +125,18 @@ class LQR(nn.Module):
             the cost does not see a mode that does not decay.
     """
 
-    def __init__(self, system: ControlAffineSystem, cost: Cost, period: float | None = None) -> None:
+    def __init__(self, system: Plant, cost: Cost, period: float | None = None) -> None:
         super().__init__()
         self.cost = cost.around(system)
-        a, b = linearised(system, self.cost)
-        name = type(system).__name__
-        if period is None:
+        self.period = system.period if period is None else period
+        if self.period is None:
+            a, b = system.linearisation(self.cost.target, self.cost.target_input)
+            name = type(system).__name__
             rest = 0.5 * cost.discount * torch.eye(len(a), dtype=a.dtype)
             p = riccati(a - rest, b, self.cost.state_curvature(), cost.r, name=name)
             k = cost.r_inverse @ b.to(p).mT @ p
         else:
-            p, k = held_riccati(a, b, self.cost, period, name=name)
-        self.period = period
+            p, k = held_riccati(system, self.cost, self.period)
         self.register_buffer("p", p)
         self.register_buffer("k", k)
         self.p: Tensor
@@ -148,11 +149,6 @@ class LQR(nn.Module):
     def value(self, x: Tensor) -> Tensor:
         """e'Pe: (..., n) -> (...)."""
         return quadratic(self.p, self.cost.deviation(x))
-
-
-def linearised(system: ControlAffineSystem, cost: Cost) -> Linearisation:
-    """The plant's linearisation at the set-point of a cost that is `Cost.around` it."""
-    return system.linearisation(cost.target, cost.target_input)
 
 
 class Supervised(Controller):

@@ -41,7 +41,7 @@ def compare(problem: AdpProblem, result: LoopResult) -> Reference:
     """A closed loop against the optimum, at all recorded times where a formula knows it, else at some."""
     start = result.state[:, 0]
     batch, times = result.state.shape[:2]
-    formula = _formula(problem, start) is not None
+    formula = known_value(problem, start) is not None
     at = torch.arange(times) if formula else _chosen(times, problem.optimum.states // batch)
     found = optima(problem, result.state[:, at])
     if found is None:
@@ -57,9 +57,9 @@ def compare(problem: AdpProblem, result: LoopResult) -> Reference:
 
 def optima(problem: AdpProblem, x: Tensor) -> Optima | None:
     """V* and u* at the states x (..., n); None where neither formula nor shooting finds them."""
-    known = _formula(problem, x)
+    known = known_value(problem, x)
     if known is not None:
-        gradient = value_gradient(lambda y: _formula(problem, y), x)  # type: ignore[arg-type, return-value]
+        gradient = value_gradient(lambda y: known_value(problem, y), x)  # type: ignore[arg-type, return-value]
         return Optima(known, problem.cost.policy(problem.system.effectiveness(x), gradient))
     if not problem.optimum.shooting:
         return None
@@ -87,7 +87,8 @@ def optima(problem: AdpProblem, x: Tensor) -> Optima | None:
     return Optima(found.value.reshape(x.shape[:-1]).to(x), found.control.reshape(*x.shape[:-1], -1).to(x))
 
 
-def _formula(problem: AdpProblem, x: Tensor) -> Tensor | None:
+def known_value(problem: AdpProblem, x: Tensor) -> Tensor | None:
+    """V*(x) by a formula, (..., n) -> (...); None where the plant knows none for the cost."""
     if not isinstance(problem.cost, QuadraticCost) or not problem.cost.around(problem.system).plain:
         return None
     return problem.system.optimal_value(x, problem.cost.q, problem.cost.r)

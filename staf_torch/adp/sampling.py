@@ -6,15 +6,18 @@ import math
 from collections.abc import Callable
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from ..numerics.checks import positive_real
-from ..numerics.linalg import riccati, unstabilisable_mode
-from ..systems import ControlAffineSystem
+from ..numerics.checks import fail, positive_real
+from ..numerics.differences import STEP, central_slopes
+from ..numerics.linalg import check_modes, solver, unstabilisable_mode
+from ..systems import Plant
 from .cost import Cost
 
 _PROBE = 1e-5  # of a state around 0, in its own units, at which the policy is asked for its slope
+_STEPS = 1000  # periods of a plant in discrete time that are tried at most
 _PERIODS = 100  # tried from a hundredth to a hundred times the time constant of the fastest mode
 _REACH = (0.01, 100.0)
 
@@ -64,38 +67,85 @@ def exact_hold(f: Tensor, g: Tensor, q: Tensor, r: Tensor, period: float, *, dis
     return Hold(flow[:n, :n], flow[:n, n:], 0.5 * (paid + paid.mT))
 
 
-def held_riccati(f: Tensor, g: Tensor, cost: Cost, period: float, *, name: str) -> tuple[Tensor, Tensor]:
-    """Return P and K of the best control that is held: u = -K x, of the value x'Px.
-
-    Args:
-        f: F, (n, n), in 1/s.
-        g: G, (n, m).
-        cost: the cost rate.
-        period: dt, s.
-        name: of the plant, for the message.
+def periods(call: str, plant: Plant, dt: float) -> int:
+    """How many steps of a plant in discrete time make ``dt`` seconds.
 
     Raises:
-        ValueError: if the plant cannot be stabilised, at all or with this period, or SciPy is missing.
+        ValueError: if it is not a whole number, at least 1.
     """
-    q = cost.state_curvature()
-    rest = 0.5 * cost.discount * torch.eye(len(f), dtype=f.dtype)
-    riccati(f - rest, g, q, cost.r, name=name)  # says why there is none
-    from scipy.linalg import (  # here: half a second that no other import need pay
-        LinAlgError,
-        solve_discrete_are,
-    )
+    assert plant.period is not None
+    count = round(dt / plant.period)
+    if count < 1 or abs(count * plant.period - dt) > 1e-9 * dt:
+        rule = f"must be a multiple of the plant's period of {plant.period:g} s"
+        raise fail(call, "dt", rule, dt)
+    return count
 
-    hold, n = exact_hold(f, g, q, cost.r, period, discount=cost.discount), len(f)
-    q, s, r = hold.paid[:n, :n], hold.paid[:n, n:], hold.paid[n:, n:]
+
+def linear_hold(plant: Plant, cost: Cost, period: float) -> Hold:
+    """The linearised plant at the set-point over ``period`` seconds with u held, and what it pays.
+
+    With a discount rho A and B are those of exp(-rho t / 2) (x, u).
+
+    Args:
+        plant: in continuous or in discrete time.
+        cost: around the plant.
+        period: s; of a plant in discrete time a multiple of its own.
+
+    Raises:
+        ValueError: if the period breaks its rule.
+    """
+    f, g = (t.double() for t in plant.linearisation(cost.target, cost.target_input))
+    q = cost.state_curvature()
+    if plant.period is None:
+        return exact_hold(f, g, q, cost.r, period, discount=cost.discount)
+    share = math.exp(-0.5 * cost.discount * plant.period)
+    z = torch.zeros(len(f) + g.shape[1], len(f) + g.shape[1], dtype=torch.float64)
+    z[: len(f), : len(f)], z[: len(f), len(f) :], z[len(f) :, len(f) :] = f, g, torch.eye(g.shape[1])
+    flow, paid = torch.eye(len(z), dtype=torch.float64), torch.zeros_like(z)
+    rate = plant.period * torch.block_diag(q.double(), cost.r.double())
+    for _ in range(periods("linear_hold", plant, period)):
+        paid = paid + flow.mT @ rate @ flow
+        flow = share * z @ flow
+    return Hold(flow[: len(f), : len(f)], flow[: len(f), len(f) :], paid)
+
+
+def held_riccati(plant: Plant, cost: Cost, period: float) -> tuple[Tensor, Tensor]:
+    """Return P and K of the best control of the linearised plant that is held: -K e, of the value e'Pe.
+
+    Args:
+        plant: in continuous or in discrete time.
+        cost: around the plant.
+        period: dt, s.
+
+    Raises:
+        ValueError: if the plant cannot be stabilised, at all or with this period, the cost does not see a
+            mode that does not decay, or SciPy is missing.
+    """
+    name = type(plant).__name__
+    hold = linear_hold(plant, cost, period)
+    n = len(hold.a)
+    f, g = plant.linearisation(cost.target, cost.target_input)
+    rest = math.exp(-0.5 * cost.discount * plant.period) if plant.period is not None else 1.0
+    if plant.period is None:
+        f = f - 0.5 * cost.discount * torch.eye(n, dtype=f.dtype)
+    check_modes(
+        rest * f.double(),
+        rest * g.double(),
+        cost.state_curvature().double(),
+        name=name,
+        discrete=plant.period is not None,
+    )
     fault = (
         f"The linearisation of {name}, held for {period:g} s, is not stabilisable: a mode repeats itself "
         "within a period where the control cannot see it. Choose another period."
     )
     if unstabilisable_mode(hold.a, hold.b, discrete=True) is not None:
         raise ValueError(fault)
+    dare = solver("solve_discrete_are")
+    q, s, r = hold.paid[:n, :n], hold.paid[:n, n:], hold.paid[n:, n:]
     try:
-        solved = solve_discrete_are(*(t.numpy() for t in (hold.a, hold.b, q, r)), s=s.numpy())
-    except LinAlgError as error:
+        solved = dare(*(t.numpy() for t in (hold.a, hold.b, q, r)), s=s.numpy())
+    except np.linalg.LinAlgError as error:
         raise ValueError(fault) from error
     p = 0.5 * torch.from_numpy(solved + solved.T)
     k = torch.linalg.solve(r + hold.b.mT @ p @ hold.b, hold.b.mT @ p @ hold.a + s.mT)
@@ -105,17 +155,18 @@ def held_riccati(f: Tensor, g: Tensor, cost: Cost, period: float, *, name: str) 
 class HeldStability(NamedTuple):
     """The stability of a linearised loop whose control is held."""
 
-    spectral_radius: float  # of one period: below 1 the origin is asymptotically stable
-    largest_period: float | None  # s, up to which every period is stable; None: unstable without holding too,
-    # inf: stable up to 100 time constants of the fastest mode
+    spectral_radius: float  # of one period: below 1 the set-point is asymptotically stable
+    largest_period: float | None  # s, up to which every period is stable; None: unstable at every period, or
+    # not known because something has no finite slope;
+    # inf: stable up to 100 time constants of the fastest mode, or 1000 steps of a plant in discrete time
 
 
 def held_stability(
-    policy: Callable[[Tensor], Tensor], system: ControlAffineSystem, period: float
+    policy: Callable[[Tensor], Tensor], system: Plant, period: float, *, at: Tensor | None = None
 ) -> HeldStability:
-    """Return how stable the origin is when ``policy`` is held for ``period`` seconds.
+    """Return how stable a set-point is when ``policy`` is held for ``period`` seconds.
 
-    The plant is linearised by its own derivative, the policy by central differences at 0.
+    The plant is linearised there under the control that the policy gives, the policy by central differences.
 
     Example:
         >>> plant = systems.Pendulum()
@@ -124,32 +175,56 @@ def held_stability(
         True
 
     Args:
-        policy: u from x, (..., n) -> (..., m), with u(0) = 0.
-        system: the plant.
-        period: s, positive.
+        policy: u from x, (..., n) -> (..., m).
+        system: the plant, in continuous or in discrete time.
+        period: s, positive; of a plant in discrete time a multiple of its own.
+        at: the set-point, (n,); the plant's equilibrium by default.
 
     Raises:
-        ValueError: if the period is not positive.
+        ValueError: if the period breaks its rule.
     """
-    f, g = (t.double() for t in system.linearisation())
-    probes = _PROBE * torch.eye(len(f), dtype=torch.float64)
+    at = system.equilibrium() if at is None else at
     with torch.no_grad():
-        slope = (policy(probes) - policy(-probes)).double().mT / (2 * _PROBE)  # du/dx, (m, n)
+        slope = central_slopes(
+            lambda x: policy(x).double().expand(len(x), -1), at.double(), torch.full_like(at, _PROBE / STEP)
+        )
+        held = policy(at.unsqueeze(0))[0].double()
+    f, g = (t.double() for t in system.linearisation(at, held))
+    if not bool(torch.isfinite(torch.cat((f, g, slope.mT), dim=-1)).all()):
+        return HeldStability(math.nan, None)
 
     def radius(dt: float) -> float:
-        hold = exact_hold(f, g, 0 * f, torch.zeros(g.shape[1], g.shape[1]), dt)
-        return float(torch.linalg.eigvals(hold.a + hold.b @ slope).abs().max())
+        a, b = _held(system, f, g, dt)
+        return float(torch.linalg.eigvals(a + b @ slope).abs().max())
 
+    now = radius(period)
+    if system.period is not None:
+        stable = [radius(k * system.period) < 1 for k in range(1, _STEPS + 1)] if now >= 1 else [True]
+        if all(stable):
+            return HeldStability(now, math.inf)
+        first = stable.index(False)
+        return HeldStability(now, first * system.period if first else None)
     modes = torch.linalg.eigvals(f + g @ slope)
     if float(modes.real.max()) >= 0:
-        return HeldStability(radius(period), None)
-    first, last = (math.log10(reach / float(modes.abs().max())) for reach in _REACH)
-    tried = torch.logspace(first, last, _PERIODS, dtype=torch.float64).tolist()
+        return HeldStability(now, None)
+    first_tried, last = (math.log10(reach / float(modes.abs().max())) for reach in _REACH)
+    tried = torch.logspace(first_tried, last, _PERIODS, dtype=torch.float64).tolist()
     count = next((k for k, dt in enumerate(tried) if radius(dt) >= 1), None)
     if count is None:
-        return HeldStability(radius(period), math.inf)
-    stable, unstable = tried[count - 1] if count else 0.0, tried[count]
-    while unstable - stable > 1e-6 * unstable:
-        middle = 0.5 * (stable + unstable)
-        stable, unstable = (middle, unstable) if radius(middle) < 1 else (stable, middle)
-    return HeldStability(radius(period), stable)
+        return HeldStability(now, math.inf)
+    low, high = tried[count - 1] if count else 0.0, tried[count]
+    while high - low > 1e-6 * high:
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if radius(middle) < 1 else (low, middle)
+    return HeldStability(now, low)
+
+
+def _held(plant: Plant, f: Tensor, g: Tensor, dt: float) -> tuple[Tensor, Tensor]:
+    """A and B of the linearised plant over dt seconds with u held."""
+    if plant.period is None:
+        hold = exact_hold(f, g, 0 * f, torch.zeros(g.shape[1], g.shape[1]), dt)
+        return hold.a, hold.b
+    a, b = torch.eye(len(f), dtype=f.dtype), torch.zeros_like(g)
+    for _ in range(periods("held_stability", plant, dt)):
+        a, b = f @ a, f @ b + g
+    return a, b

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import logging
 from collections.abc import Callable, Sequence
 
 import torch
@@ -10,13 +11,16 @@ from torch import Tensor
 
 from ..lanes import Program
 from ..numerics.checks import choice, fail, integer, trailing
-from ..systems import ControlAffineSystem
+from ..systems import ControlAffineSystem, Plant
 from .closed_loop import ClosedLoop, program, record
-from .controllers import Controller
+from .controllers import Controller, Feedback, Policy
 from .cost import Cost
+from .sampling import held_stability
 
+_log = logging.getLogger(__name__)
 _DRAWN_AHEAD = 1024  # steps whose random numbers are drawn at once
 _NUMBERS = 1 << 24  # at most, of all rows together
+_DT = 0.001  # s, where neither controller nor plant has a period
 _PAYS = 3000  # steps of a small batch in plain torch (some 1 ms each) that take as long as to compile
 
 
@@ -50,15 +54,16 @@ class LoopResult:
 
 def simulate(
     controller: Controller,
-    system: ControlAffineSystem,
+    system: Plant,
     cost: Cost,
     x0: Tensor,
     *,
-    dt: float = 0.001,
+    dt: float | None = None,
     steps: int,
     every: int = 1,
     seed: int | Sequence[int] = 0,
     integrator: str = "runge_kutta",
+    substeps: int = 1,
     limit: float = 1e6,
     compile: bool | str = "auto",
     progress: Callable[[int], None] | None = None,
@@ -80,11 +85,12 @@ def simulate(
         system: the plant.
         cost: the cost rate that is integrated along.
         x0: (B, n).
-        dt: s; the control is held that long.
+        dt: s; the control is held that long. By default the period of the controller or of the plant, where
+            one has any, else 1 ms. A period at which the linearised loop is unstable is a warning in the log.
         steps: at least 1.
         every: steps from one recorded time to the next; divides ``steps``.
         seed: of the first row, the next row having the next; or one a row.
-        integrator: as in `ClosedLoop`.
+        integrator: as in `ClosedLoop`, and so is ``substeps``.
         limit: as in `ClosedLoop`.
         compile: whether the loop is compiled by `lanes`: True, False, or ``auto`` (where the run is long
             enough to pay for it). What cannot be compiled runs in plain torch, which is the definition,
@@ -101,10 +107,29 @@ def simulate(
         raise fail("simulate", "every", f"must divide the {steps} steps", every)
     choice("simulate", "compile", compile, (True, False, "auto"))
     worth = steps * (1 + len(x0) / 200) >= _PAYS if compile == "auto" else bool(compile)
-    loop = ClosedLoop(controller, system, cost, dt=dt, integrator=integrator, limit=limit)
+    if dt is None:
+        dt = controller.period or system.period or _DT
+    loop = ClosedLoop(controller, system, cost, dt=dt, integrator=integrator, substeps=substeps, limit=limit)
     loop.to(x0.device)
+    if isinstance(controller, Feedback) and x0.device.type == "cpu":
+        warn_if_unstable(controller.policy, system, cost, dt)
+    worth = worth and system.traceable
     with torch.no_grad():
         return _run(loop, program(loop, worth), x0, steps, every, _seeds(seed, len(x0)), progress)
+
+
+def warn_if_unstable(policy: Policy, system: Plant, cost: Cost, dt: float) -> None:
+    """Say in the log that the linearised loop of a policy held for dt is not stable, and which period is."""
+    stability = held_stability(policy, system, dt, at=cost.target)
+    if not stability.spectral_radius >= 1:
+        return
+    most = stability.largest_period
+    remedy = "at no period" if most is None else f"up to {most:.4g} s"
+    _log.warning(
+        "the control is held for dt = %.4g s, at which the linearised loop has the spectral radius %.4g: it "
+        "is unstable; it is stable %s. `LQR(plant, cost, period=dt)` is made to be held.",
+        *(dt, stability.spectral_radius, remedy),
+    )
 
 
 def _run(
@@ -160,7 +185,7 @@ def _uniform(x0: Tensor, count: int, draws: int, generators: Sequence[torch.Gene
     return drawn.mul_(2).sub_(1).to(x0)
 
 
-def _check(system: ControlAffineSystem, cost: Cost, x0: Tensor) -> Cost:
+def _check(system: Plant, cost: Cost, x0: Tensor) -> Cost:
     """Return the cost around the plant, once all shapes are right."""
     trailing("simulate", "x0", x0, dims=2, last=system.dim)
     if x0.dim() != 2 or x0.shape[0] == 0:
@@ -168,7 +193,8 @@ def _check(system: ControlAffineSystem, cost: Cost, x0: Tensor) -> Cost:
     name, size, inputs = type(system).__name__, x0.shape[1], cost.inputs
     if cost.dim != size:
         raise fail("simulate", "cost", f"must be for the plant's {size} states", cost.dim)
-    for method, shape in (("drift", x0.shape), ("effectiveness", (*x0.shape, inputs))):
+    affine = isinstance(system, ControlAffineSystem)
+    for method, shape in () if not affine else (("drift", x0.shape), ("effectiveness", (*x0.shape, inputs))):
         returned = getattr(system, method)(x0)
         if not isinstance(returned, Tensor) or returned.shape != shape:
             got = tuple(returned.shape) if isinstance(returned, Tensor) else returned

@@ -108,8 +108,8 @@ def tracking_cost(error: Matrix, control: Matrix) -> QuadraticCost:
     Raises:
         ValueError: if Q or R is not symmetric positive definite.
     """
-    paid = QuadraticCost(error, control, 2, 1)
-    return QuadraticCost(torch.block_diag(paid.q, torch.zeros_like(paid.q)), paid.r, 4, 1)
+    q = QuadraticCost(error, control, 2, 1).q
+    return QuadraticCost(torch.block_diag(q, torch.zeros_like(q)), control, 4, 1)
 
 
 def desired_trajectory(time: Tensor) -> Tensor:

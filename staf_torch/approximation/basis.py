@@ -130,10 +130,14 @@ class StaFBasis(ConventionModule):
 
         exp(y'c) then changes by more than e over the ball, with the state and not with V.
         """
+        return self.warn_reach(self.largest_reach(x), stacklevel + 1)
+
+    def largest_reach(self, x: Tensor) -> float:
+        """The largest finite |x| nu(x) over the states (..., n); 0 for a kernel that does not mind."""
         if self.kernel.log_gain(x) is None:
-            return False
+            return 0.0
         reach = (x.norm(dim=-1) * self.centers.radius(x)).detach()
-        return self.warn_reach(float(torch.where(torch.isfinite(reach), reach, 0.0).max()), stacklevel + 1)
+        return float(torch.where(torch.isfinite(reach), reach, 0.0).max())
 
     def warn_reach(self, worst: float, stacklevel: int = 2) -> bool:
         """`check_reach` where the largest |x| nu(x) is known."""

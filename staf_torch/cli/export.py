@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import dataclasses
 import json
 import logging
+import math
 import sys
-import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from hydra.errors import InstantiationException
-from hydra.utils import get_object
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from torch import Tensor, nn
@@ -27,13 +27,23 @@ from ..deploy.sheet import Port
 from ..experiments.adp import learner
 from ..numerics.checks import choice, fail, integer
 from ..results import run_record as records
-from ..results.files import write_text
+from ..results.archive import Archive
+from ..results.files import HISTORY, write_text
+from ..results.settings_file import read_settings
+from ..results.untrusted import UnreadableError, visible
 from ..settings.adp import adp_problem
 from ..settings.chase import DTYPES, chase_problem
+from ..settings.trust import checked, limited
 from ..systems import Units
 
-_CUSTOM = "staf_torch.settings.chase.load"
 _POINTS = 1000
+_READ = ("state", "weights", "estimate", "actor_weights", "control")  # of the history
+_MOST_NUMBERS = 2**25  # of one trajectory
+_UNBUILDABLE = (
+    *(OmegaConfBaseException, InstantiationException, KeyError, IndexError, AttributeError, TypeError),
+    *(AssertionError, RuntimeError),
+)
+"""What settings of another version, or of nobody's, raise while they are built."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,75 +74,68 @@ def deployable(run: Path, row: int = 0, *, trust: bool = False) -> Deployable:
             code, or was written by a version whose numbers this one does not reproduce.
     """
     cfg = _settings(run, trust)
-    history = _history(run)
     tasks = {"gradient_chase": _approximation, "adp": _controller}
     if cfg.get("task") not in tasks:
         listed = " or ".join(tasks)
         raise fail("staf-export", "RUN", f"must be a run of {listed}", cfg.get("task"))
     integer("staf-export", "row", row, least=0)
-    if row >= len(history["state"]):
-        raise fail("staf-export", "row", f"must be below the run's {len(history['state'])} trajectories", row)
-    written_by = (records.read(run / records.RUN) or {}).get("version")
-    precise = cfg.dtype == "float64"
-    cfg.dtype, cfg.device = "float64", "cpu"
+    history = _history(run, row)
+    record = records.read(run / records.RUN) or {}
+    written_by = str(record["version"]) if record.get("version") is not None else None
     try:
-        return dataclasses.replace(tasks[cfg.task](cfg, history, row, precise), written_by=written_by)
-    except (OmegaConfBaseException, InstantiationException, KeyError, AssertionError) as error:
+        precise = cfg.dtype == "float64"
+        cfg.dtype, cfg.device = "float64", "cpu"
+        with contextlib.nullcontext() if trust else limited(f"What {run} describes"):
+            return dataclasses.replace(tasks[cfg.task](cfg, history, precise), written_by=written_by)
+    except _UNBUILDABLE as error:
         raise ValueError(
             f"{run} was written by staf_torch {written_by or '(another version)'}, whose settings "
-            f"staf_torch {__version__} does not understand ({str(error).splitlines()[0]}): run it anew, "
+            f"staf_torch {__version__} does not understand ({_first_line(error)}): run it anew, "
             "or export it with that version."
         ) from error
+
+
+def _first_line(error: Exception) -> str:
+    return next(iter(str(error).splitlines()), type(error).__name__)
 
 
 def _settings(run: Path, trust: bool) -> DictConfig:
     path = run / ".hydra" / "config.yaml"
     if not path.is_file():
         raise fail("staf-export", "RUN", "must be a run directory, with .hydra/config.yaml", str(run))
-    cfg = OmegaConf.load(path)
+    try:
+        cfg = (
+            OmegaConf.load(path) if trust else OmegaConf.create(checked(read_settings(path, run), str(path)))
+        )
+    except UnreadableError as error:
+        raise ValueError(f"{run} has settings that are not read without --trust: {error}.") from error
     if not isinstance(cfg, DictConfig):
         raise fail("staf-export", "RUN", "must hold settings in .hydra/config.yaml", str(run))
-    for target in _targets(OmegaConf.to_container(cfg)):
-        if not trust and (target == _CUSTOM or not _ours(target)):
-            raise ValueError(
-                f"The settings of {run} run code of your own ({target}): add --trust if you know them."
-            )
     OmegaConf.set_struct(cfg, True)  # a setting that is missing is an error, not None
     return cfg
 
 
-def _ours(target: object) -> bool:
-    """Whether a dotted path of the settings leads to the library, and not through it to something else."""
-    if not str(target).startswith("staf_torch."):
-        return False
-    try:
-        return str(getattr(get_object(str(target)), "__module__", "")).startswith("staf_torch.")
-    except (ImportError, AttributeError, ValueError):
-        return True  # a name that this version does not have: building it says so
-
-
-def _targets(node: Any) -> Iterator[Any]:
-    if isinstance(node, dict):
-        if node.get("_target_") is not None:
-            yield node["_target_"]
-        for value in node.values():
-            yield from _targets(value)
-    elif isinstance(node, list):
-        for value in node:
-            yield from _targets(value)
-
-
-def _history(run: Path) -> dict[str, np.ndarray]:
-    path = run / "history.npz"
-    if not path.is_file():
+def _history(run: Path, row: int) -> dict[str, np.ndarray]:
+    """Return the arrays of a history, (T, ...) of one trajectory where they have trajectories."""
+    path = run / HISTORY
+    if not path.exists():
         raise ValueError(
             f"{run} has no history.npz, which holds the weights: run with history=false, or not ended."
         )
     try:
-        with np.load(path, allow_pickle=False) as arrays:
-            return {name: arrays[name] for name in arrays.files}
-    except (ValueError, zipfile.BadZipFile) as error:
-        raise ValueError(f"{path} cannot be read: {error}") from error
+        archive = Archive(path, run)
+        names = [name for name in _READ if name in archive.names]
+        if "state" not in names:
+            raise UnreadableError(f"{path} has no states")
+        batch = archive.shape("state")[:1]
+        if batch and row >= batch[0]:
+            raise fail("staf-export", "row", f"must be below the run's {batch[0]} trajectories", row)
+        for name in names:
+            if math.prod(archive.shape(name)[1:]) > _MOST_NUMBERS or len(archive.shape(name)) < 2:
+                raise UnreadableError(f"{path} has {archive.shape(name)} numbers of {name}")
+        return {name: archive.read(name, row) for name in names}
+    except (UnreadableError, IndexError) as error:
+        raise ValueError(str(error)) from error
 
 
 def _reproduced(name: str, found: Tensor, recorded: np.ndarray, precise: bool) -> None:
@@ -150,17 +153,17 @@ def _reproduced(name: str, found: Tensor, recorded: np.ndarray, precise: bool) -
         )
 
 
-def _approximation(cfg: DictConfig, history: dict[str, np.ndarray], row: int, precise: bool) -> Deployable:
+def _approximation(cfg: DictConfig, history: dict[str, np.ndarray], precise: bool) -> Deployable:
     problem = chase_problem(cfg)
-    x = torch.from_numpy(history["state"][row, -1].astype(np.float64))
-    weights = torch.from_numpy(history["weights"][row, -1].astype(np.float64))
+    x = torch.from_numpy(history["state"][-1].astype(np.float64))
+    weights = torch.from_numpy(history["weights"][-1].astype(np.float64))
     if not bool(torch.isfinite(weights).all()):
         raise fail("staf-export", "row", "must be a trajectory whose weights can be represented", "NaN")
     staf = StaF(problem.basis)
     with torch.no_grad():
         staf.state.copy_(x)
         staf.coefficients.copy_(problem.basis.local(x).coefficients(weights))
-    _reproduced("estimate", staf(x.unsqueeze(0)).detach(), history["estimate"][row, -1:], precise)
+    _reproduced("estimate", staf(x.unsqueeze(0)).detach(), history["estimate"][-1:], precise)
     radius = float(problem.basis.centers.radius(x))
     generator = torch.Generator().manual_seed(0)
     inside = torch.randn(_POINTS, len(x), dtype=torch.float64, generator=generator)
@@ -183,13 +186,13 @@ def _approximation(cfg: DictConfig, history: dict[str, np.ndarray], row: int, pr
     )
 
 
-def _controller(cfg: DictConfig, history: dict[str, np.ndarray], row: int, precise: bool) -> Deployable:
+def _controller(cfg: DictConfig, history: dict[str, np.ndarray], precise: bool) -> Deployable:
     problem = adp_problem(cfg)
-    states = torch.from_numpy(history["state"][row].astype(np.float64))
-    weights = torch.from_numpy(history["actor_weights"][row].astype(np.float64))
+    states = torch.from_numpy(history["state"].astype(np.float64))
+    weights = torch.from_numpy(history["actor_weights"].astype(np.float64))
     learns = learner(problem.controller) is not None
     last = policy_of(problem.controller, weights[-2] if learns else None)
-    _reproduced("control", last(states[-2:-1])[0], history["control"][row, -2], precise)
+    _reproduced("control", last(states[-2:-1])[0], history["control"][-2], precise)
     low, high = states.amin(0), states.amax(0)
     generator = torch.Generator().manual_seed(0)
     points = low + (high - low) * torch.rand(_POINTS, len(low), dtype=torch.float64, generator=generator)
@@ -257,6 +260,8 @@ def export(
     found = deployable(run, row, trust=trust)
     path = run / "export" / f"{found.kind}{ENDINGS[to]}" if output is None else output
     path.parent.mkdir(parents=True, exist_ok=True)
+    if path.is_symlink() or (output is None and path.parent.is_symlink()):
+        raise ValueError(f"{path} is a link, or in a folder that is one: it is not written through.")
     module = found.module(DTYPES[dtype])
     origin: dict[str, object] = {"run": str(run), "row": row}
     if to == "c":
@@ -387,5 +392,5 @@ def main(arguments: list[str] | None = None) -> None:
     try:
         page = export(**vars(given))
     except (ValueError, OSError) as error:
-        sys.exit(f"staf-export: {error}")
+        sys.exit(f"staf-export: {visible(str(error))}")
     sys.stdout.write(sheet.markdown(page))

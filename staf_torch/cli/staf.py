@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import sys
 
@@ -22,7 +23,8 @@ from ..sweeps.hydra_compat import (
 from ..sweeps.hydra_compat import config_directory as config_directory
 from ..sweeps.job import Refused, execute
 from ..sweeps.resume import command_line
-from . import doctor
+from ..sweeps.signals import name_and_code, stopped_by_signals
+from . import doctor, schema
 
 find_launcher()
 _staf = program(execute)
@@ -31,15 +33,17 @@ _staf = program(execute)
 def main() -> None:
     """Run the command line. What a user got wrong ends as one sentence and the exit code 1.
 
-    `staf doctor` and `staf --version` are no runs, and Hydra is not asked.
+    `staf doctor`, `staf schema` and `staf --version` are no runs, and Hydra is not asked.
     """
     if sys.argv[1:] == ["--version"]:
         sys.exit(print(doctor.version()))
     if sys.argv[1:] == ["doctor"]:
         sys.exit(doctor.main())
+    if sys.argv[1:2] == ["schema"]:
+        sys.exit(_schema(sys.argv[2:]))
     sys.path.insert(0, os.getcwd())  # so that `target.path=my_module.my_function` finds the user's file
     typed = sys.argv
-    with full_errors() as wants_trace:
+    with full_errors() as wants_trace, stopped_by_signals():
         try:
             argv = command_line(typed[1:])
             sys.argv = [typed[0], *with_mode(argv)]
@@ -54,10 +58,21 @@ def main() -> None:
             if sweep is not None:
                 callbacks.close(sweep)
             if isinstance(error, KeyboardInterrupt):
-                sys.stderr.write(callbacks.farewell(sweep) + "\n")
-                sys.exit(130)  # as shells have it
+                said, code = name_and_code(error)
+                with contextlib.suppress(OSError):  # the terminal may be gone
+                    sys.stderr.write(callbacks.farewell(sweep, said) + "\n")
+                sys.exit(code)
             if wants_trace or not isinstance(error, USER_ERRORS):
                 raise
             sys.exit(f"staf: {sentence(error)}")
         finally:
             sys.argv = typed
+
+
+def _schema(words: list[str]) -> str | None:
+    """Print the JSON schema of the settings; return what to say where there is no such group."""
+    try:
+        sys.stdout.write(schema.main(words) + "\n")
+    except ValueError as error:
+        return f"staf: {error}"
+    return None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import logging
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
@@ -13,20 +14,33 @@ import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
-from ..adp import ActorCritic, Controller, Gains, LoopResult, Supervised, simulate
+from ..adp import (
+    ActorCritic,
+    Controller,
+    ControllerState,
+    Gains,
+    LoopResult,
+    Supervised,
+    held_stability,
+    simulate,
+)
 from ..adp.problem import AdpProblem
 from ..adp.reference_optimum import Reference, compare
+from ..figures.animation import animate
 from ..figures.closed_loop import AdpHistory, draw_adp
 from ..figures.style import images
 from ..metrics.closed_loop import adp_metrics
+from ..numerics.angles import wrap
 from ..results.progress import SHOWN, Progress
 from ..results.run_directory import RunDirectory
 from ..settings.adp import adp_problem
 from ..settings.chase import make_metrics
 from ..tables.columns import significant
 from .registry import BatchedExperiment, Metrics
+from .scenes import animation_kind, loop_scene
 
 _log = logging.getLogger(__name__)
+_LINEARISED = 8  # rows of a learning controller whose loop is linearised
 _NAMED = 20  # diverged trajectories that the log lists by number
 
 
@@ -40,11 +54,13 @@ class LoopSolution:
     dt: float  # s
     steps: int
     metrics: Metrics  # what `metrics.json` will hold
+    periodic: tuple[int, ...] = ()  # coordinates that are angles
 
 
 class ClosedLoop(BatchedExperiment[LoopSolution]):
     """Optimal regulation; initial states, seeds, initial weights and gains share a tensor batch."""
 
+    animates = True
     batchable = frozenset(
         {"seed", "initial_state", "spread", "adp.critic", "adp.actor", "adp.gain", "adp.policy.gain"}
         | {
@@ -56,7 +72,7 @@ class ClosedLoop(BatchedExperiment[LoopSolution]):
 
     def __call__(self, cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics:
         """Run what the settings describe and fill the run directory; `metrics.json` comes last."""
-        problem = adp_problem(cfg)
+        problem = _problem(cfg)
         return self.write(cfg, directory, _solved(cfg, problem, solve(problem, progress)))
 
     def solve(self, cfgs: Sequence[DictConfig], progress: Progress) -> list[LoopSolution | Exception]:
@@ -78,8 +94,11 @@ class ClosedLoop(BatchedExperiment[LoopSolution]):
         if cfg.history:
             write_history(out, solution.result)
         name_the_diverged(solution.result)
+        kind = animation_kind(cfg)
+        if kind is not None:
+            out.figure("closed_loop", animate(loop_scene(adp_problem(cfg), solution.result), kind))
         if cfg.figures:
-            out.figure(cfg.task, images(draw_adp(_drawn(solution.result, solution.optimum))))
+            out.figure(cfg.task, images(draw_adp(_drawn(solution))))
         _summarise(solution)
         return out.metrics(solution.metrics)
 
@@ -91,9 +110,15 @@ class ClosedLoop(BatchedExperiment[LoopSolution]):
         return int(8 * 40 * min(rows * duration / dt, 2e5))  # type: ignore[operator]
 
 
+def _problem(cfg: DictConfig) -> AdpProblem:
+    problem = adp_problem(cfg)
+    animation_kind(cfg, problem.system.dim)
+    return problem
+
+
 def _prepared(cfg: DictConfig) -> AdpProblem | Exception:
     try:
-        return adp_problem(cfg)
+        return _problem(cfg)
     except Exception as error:  # of this member alone
         return error
 
@@ -105,11 +130,40 @@ def _solved(cfg: DictConfig, problem: AdpProblem, result: LoopResult) -> LoopSol
         optimal_cost=optimum.cost,
         control_error=optimum.control_error,
         value_error=optimum.value_error,
+        final=problem.cost.around(problem.system).deviation(result.state[:, -1]),
     )
+    metrics["held_spectral_radius"] = held_radius(problem, result)
     own = make_metrics(cfg.get("metric"))
     metrics |= {metric.name: metric.worst(result, problem) for metric in own}
     method = f"{type(problem.system).__name__} with {problem.controller.label}"
-    return LoopSolution(result, optimum, method, problem.dt, problem.steps, metrics)
+    periodic = problem.system.periodic
+    return LoopSolution(result, optimum, method, problem.dt, problem.steps, metrics, periodic)
+
+
+def held_radius(problem: AdpProblem, result: LoopResult) -> float | None:
+    """The spectral radius of the linearised loop over one dt with the control held, with the weights of the
+    end; of a controller with weights the largest of the first rows. None where something has no slope."""
+    rows = range(min(_LINEARISED, len(result.state)) if result.actor_weights.shape[-1] else 1)
+    at = problem.cost.around(problem.system).target
+    radii = [
+        held_stability(_frozen(problem, result, row), problem.system, problem.dt, at=at).spectral_radius
+        for row in rows
+    ]
+    return max(radii) if all(map(math.isfinite, radii)) else None
+
+
+def _frozen(problem: AdpProblem, result: LoopResult, row: int) -> Callable[[Tensor], Tensor]:
+    """u(x) of the controller with what it had learned at the end of a row."""
+
+    def policy(x: Tensor) -> Tensor:
+        parts = (result.critic_weights, result.actor_weights, result.identifier)
+        critic, actor, known = (part[row, -1].expand(len(x), -1) for part in parts)
+        gain = torch.eye(critic.shape[-1], dtype=x.dtype).expand(len(x), -1, -1)
+        drawn = x.new_zeros(len(x), problem.controller.draws, x.shape[-1])
+        carried = ControllerState(critic, actor, gain, known)
+        return problem.controller.step(x, carried, drawn, problem.dt)[0]
+
+    return policy
 
 
 def solve(problem: AdpProblem, progress: Progress = SHOWN) -> LoopResult:
@@ -217,19 +271,20 @@ def _summarise(solved: LoopSolution) -> None:
     )
     _log.info("  cost %s, optimal %s, ratio %s", *map(show, ("cost", "optimal_cost", "cost_ratio")))
     _log.info("  second half: |u - u*| <= %s, |V - V^| <= %s", *map(show, ("control_error", "value_error")))
-    names = ("final_state_norm", "regulated_fraction", "diverged_fraction")
-    _log.info("  final |x| %s, regulated %s, diverged %s", *map(show, names))
+    names = ("final_state_norm", "regulated_fraction", "diverged_fraction", "held_spectral_radius")
+    _log.info("  final |x| %s, regulated %s, diverged %s, held spectral radius %s", *map(show, names))
 
 
-def _drawn(result: LoopResult, optimum: Reference) -> AdpHistory:
-    """The first trajectory."""
+def _drawn(solution: LoopSolution) -> AdpHistory:
+    """The first trajectory, its angles in [-pi, pi]."""
+    result, optimum = solution.result, solution.optimum
 
     def first(rows: Tensor | None) -> np.ndarray | None:
         return None if rows is None else rows[0].cpu().numpy()
 
     return AdpHistory(
         time=result.time.numpy(),
-        state=result.state[0].cpu().numpy(),
+        state=wrap(result.state[0], solution.periodic).cpu().numpy(),
         control=result.control[0].cpu().numpy(),
         actor_weights=result.actor_weights[0].cpu().numpy(),
         critic_weights=result.critic_weights[0].cpu().numpy(),

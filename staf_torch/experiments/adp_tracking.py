@@ -27,6 +27,7 @@ from ..adp import (
     simulate,
     tracking_cost,
 )
+from ..figures.animation import animate
 from ..figures.closed_loop import TrackingHistory, draw_tracking
 from ..figures.style import images
 from ..metrics.closed_loop import tracking_metrics
@@ -38,6 +39,7 @@ from ..settings.chase import initial_states, placement, plain
 from ..systems import TwoState
 from ..tables.columns import significant
 from .adp import write_history
+from .scenes import animation_kind, tracking_scene
 
 _log = logging.getLogger(__name__)
 _PARAMETERS = 6
@@ -55,7 +57,8 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> dict[st
     dt = positive_real("staf", "dt", cfg.dt)
     steps = max(1, round(positive_real("staf", "duration", cfg.duration) / dt))
     results = {}
-    for name, controller in _controllers(cfg, plant, cost).items():
+    controllers = _controllers(cfg, plant, cost)
+    for name, controller in controllers.items():
         results[name] = simulate(
             controller.to(device),
             plant,
@@ -83,9 +86,15 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> dict[st
     assert parameters is not None
     if cfg.history:
         write_history(out, identified, parameters=parameters)
+    kind = animation_kind(cfg)
+    if kind is not None:
+        out.figure("tracking", animate(tracking_scene(controllers["identified"], identified), kind))
     if cfg.figures:
         out.figure("adp_tracking", images(draw_tracking(_drawn(results, parameters, plant.theta))))
     return out.metrics(metrics)
+
+
+run.animates = True  # type: ignore[attr-defined]
 
 
 def _optimal_cost(plant: TwoStateTracking, cost: QuadraticCost, x0: Tensor) -> Tensor | None:

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..approximation.basis import REACH
+from ..approximation.basis import REACH, StaFBasis
 from ..engine import ChaseResult, chase_pieces, chunk_length
 from ..metrics.chase import ChaseMetrics, Member
 from ..settings.chase import ChaseProblem
@@ -21,6 +21,7 @@ Sink = Callable[[Mapping[str, np.ndarray]], None]
 
 HISTORY = ("state", "value", "estimate", "weights", "ideal_weights", "excess")
 _DRAWN = (*HISTORY, "ideal_estimate")
+_ROWS = 4096  # that go through time together where nobody keeps a history: memory does not grow with rows
 _DRAWN_TIMES = 4000  # more could not be told apart in print
 
 
@@ -82,30 +83,78 @@ def _run(members: Sequence[_Member], advance: Callable[[int], None] | None, *, a
         members=[Member(m.rows, m.problem.dt, m.problem.settle_time) for m in members],
         own=first.metrics,
     )
-    chunk = chunk_length(len(starts), first.basis, starts.element_size())
+    told = _Told(advance, len(starts), times, len(members))
+    # What a history holds of a time, it holds of all rows.
+    together = len(starts) if any(member.keeps for member in members) else _ROWS
+    blocks = starts.split(together)
+    chunk = chunk_length(min(together, len(starts)), first.basis, starts.element_size())
     # Some twenty pieces of a long run, so that progress is seen; the results do not depend on it.
     chunk = max(1, min(chunk, max(64, -(-times // 20))))
-    chased = chase_pieces(
-        trajectory(first.system, starts, dt=first.dt, steps=first.steps, chunk=chunk),
-        first.basis,
-        first.target,
-        first.law,
-        inner_steps=first.inner_steps,
-        predictor=first.predictor,
-        certificate=first.certificate,
-    )
+    reach = _Reach(first.basis) if len(blocks) > 1 else None
+    done = 0
     with torch.no_grad(), warnings.catch_warnings():
-        if not alone:
+        if reach is not None or not alone:
             warnings.filterwarnings("ignore", message=REACH)
-        for result in chased:
-            metrics.add(result)
-            start = 0
-            for member in members:
-                member.take(result, slice(start, start + member.rows), alone=alone)
-                start += member.rows
-            if advance is not None:
-                advance(result.state.shape[1] * len(members))
+        for block in blocks:
+            if done:
+                metrics.next_rows()
+            chased = chase_pieces(
+                trajectory(first.system, block, dt=first.dt, steps=first.steps, chunk=chunk),
+                first.basis,
+                first.target,
+                first.law,
+                inner_steps=first.inner_steps,
+                predictor=first.predictor,
+                certificate=first.certificate,
+            )
+            for result in chased:
+                metrics.add(result)
+                if reach is not None:
+                    reach.see(result.state)
+                _distribute(result, done, members, alone=alone)
+                told.more(result.state.shape[0] * result.state.shape[1])
+            done += len(block)
+    if reach is not None and alone:
+        reach.warn()
     return [member.outcome(found) for member, found in zip(members, metrics.summaries(), strict=True)]
+
+
+def _distribute(result: ChaseResult, first: int, members: Sequence[_Member], *, alone: bool) -> None:
+    """Give every member what a piece has of its rows; the piece begins at row ``first`` of the batch."""
+    start, count = 0, result.state.shape[0]
+    for member in members:
+        low, high = max(start - first, 0), min(start + member.rows - first, count)
+        if low < high:
+            member.take(result, slice(low, high), first + low - start, alone=alone)
+        start += member.rows
+
+
+class _Told:
+    """Turns rows and times that are done into times of whole problems, for a display of progress."""
+
+    def __init__(self, advance: Callable[[int], None] | None, rows: int, times: int, problems: int) -> None:
+        self._advance, self._all, self._shown = advance, rows * times, times * problems
+        self._done = self._told = 0
+
+    def more(self, count: int) -> None:
+        self._done += count
+        new = self._done * self._shown // self._all - self._told
+        self._told += new
+        if self._advance is not None and new:
+            self._advance(new)
+
+
+class _Reach:
+    """The largest |x| nu(x) of a run in blocks of rows, for one warning at its end."""
+
+    def __init__(self, basis: StaFBasis) -> None:
+        self._basis, self._worst = basis, 0.0
+
+    def see(self, states: Tensor) -> None:
+        self._worst = max(self._worst, self._basis.largest_reach(states))
+
+    def warn(self) -> None:
+        self._basis.warn_reach(self._worst, stacklevel=3)
 
 
 class _Member:
@@ -118,12 +167,18 @@ class _Member:
         self._warnings: list[str] = []
         self._diverged_at = torch.full((self.rows,), -1)
 
-    def take(self, result: ChaseResult, rows: slice, *, alone: bool) -> None:
-        if self._thinned is not None:
+    @property
+    def keeps(self) -> bool:
+        """Whether somebody wants the history."""
+        return self._sink is not None
+
+    def take(self, result: ChaseResult, rows: slice, place: int, *, alone: bool) -> None:
+        """Take in ``rows`` of a piece of time, which are this problem's from ``place`` on."""
+        if self._thinned is not None and place == 0:
             self._thinned.add(result, rows.start)
         if self._sink is not None:
             self._sink({name: getattr(result, name)[rows].cpu().numpy() for name in HISTORY})
-        self._diverged_at = result.diverged_at[rows]
+        self._diverged_at[place : place + rows.stop - rows.start] = result.diverged_at[rows].cpu()
         if not alone and not self._warnings:
             with warnings.catch_warnings(record=True) as given:
                 warnings.simplefilter("always")
@@ -135,7 +190,7 @@ class _Member:
         if self._thinned is not None:
             time = np.arange(self.problem.steps + 1) * self.problem.dt
             drawn = self._thinned.arrays() | {"time": time[:: self._thinned.stride]}
-        return Outcome(metrics, drawn, self._diverged_at.cpu().clone(), tuple(self._warnings))
+        return Outcome(metrics, drawn, self._diverged_at, tuple(self._warnings))
 
 
 class _Thinned:

@@ -11,22 +11,21 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-import torch
 from omegaconf import DictConfig
 
-from ..figures.animation import ChaseScene, animate_chase
+from ..figures.animation import animate
 from ..figures.chase import ChaseHistory, draw_chase
 from ..figures.style import images
-from ..numerics.checks import COMMAND_LINE, fail, flag
+from ..numerics.checks import COMMAND_LINE, flag
 from ..results.progress import SHOWN, Progress
 from ..results.run_directory import HistoryWriter, RunDirectory
 from ..settings.chase import ChaseProblem, Parts, chase_problem
 from ..tables.columns import significant
 from .chase_batch import Outcome, simulate
 from .registry import BatchedExperiment, Metrics
+from .scenes import animation_kind, chase_scene
 
 _log = logging.getLogger(__name__)
-_FRAMES = 60  # of an animation: six seconds
 _NAMED = 20  # diverged trajectories that the log lists by number
 
 
@@ -87,6 +86,7 @@ def solve(
 class GradientChase(BatchedExperiment[ChaseSolution]):
     """The chase of the ideal weights; initial states and scalar hyperparameters share a tensor batch."""
 
+    animates = True
     batchable = frozenset(
         {
             *("seed", "initial_state", "spread", "trajectories", "dt", "duration", "settle_time"),
@@ -103,7 +103,7 @@ class GradientChase(BatchedExperiment[ChaseSolution]):
         The history goes to disk as it arises, where `solve` keeps it in memory for `write`.
         """
         problem = chase_problem(cfg)
-        figures, history = _wanted(cfg)
+        figures, history = _wanted(cfg, problem)
         batch, times = problem.initial_states.shape[0], problem.steps + 1
         out = RunDirectory(directory)
         with contextlib.ExitStack() as stack:
@@ -112,7 +112,7 @@ class GradientChase(BatchedExperiment[ChaseSolution]):
                 writer = stack.enter_context(out.history(batch, times))
             advance = stack.enter_context(progress.over(times, "times"))
             sink = None if writer is None else writer.add
-            (outcome,) = simulate([problem], [sink], [figures or _animated(cfg, problem)], advance)
+            (outcome,) = simulate([problem], [sink], [figures], advance)
             if writer is not None:
                 writer.close(time=_times(Title.of(problem)))
         return _finish(out, ChaseSolution(Title.of(problem), outcome, problem.initial_states.tolist()), cfg)
@@ -191,8 +191,7 @@ def _prepared(cfg: DictConfig, parts: Parts) -> _Ready | Exception:
     try:
         with _recorded(said):
             problem = chase_problem(cfg, parts)
-            figures, history = _wanted(cfg)
-            figures = figures or _animated(cfg, problem)
+            figures, history = _wanted(cfg, problem)
     except Exception as error:  # of this member alone
         return error
     memory = _Memory(len(problem.initial_states), problem.steps + 1) if history else None
@@ -225,64 +224,20 @@ class _Memory:
         self._done += length
 
 
-def _wanted(cfg: DictConfig) -> tuple[bool, bool]:
-    return flag(COMMAND_LINE, "figures", cfg.figures), flag(COMMAND_LINE, "history", cfg.history)
-
-
-def _animated(cfg: DictConfig, problem: ChaseProblem) -> bool:
-    """Whether an animation is wanted.
-
-    Raises:
-        ValueError: if it is, and the state has not two coordinates.
-    """
-    wanted = flag(COMMAND_LINE, "animation", cfg.get("animation", False))
-    if wanted and problem.basis.dim != 2:
-        raise fail(
-            COMMAND_LINE, "animation", f"needs a state in the plane, not in R^{problem.basis.dim}", True
-        )
-    return wanted
-
-
-def _scene(problem: ChaseProblem, drawn: Mapping[str, np.ndarray]) -> ChaseScene:
-    """What moves: the first trajectory at sixty times."""
-    at = np.unique(np.linspace(0, len(drawn["time"]) - 1, _FRAMES).round().astype(int))
-    like = problem.initial_states
-    x = torch.as_tensor(drawn["state"][at]).to(like)
-    weights, ideal = drawn["weights"][at], drawn["ideal_weights"][at]
-    way = torch.as_tensor(np.gradient(drawn["state"], axis=0)[at]).to(like)
-    way = way / way.norm(dim=-1, keepdim=True).clamp_min(torch.finfo(like.dtype).tiny)
-    along = torch.linspace(-1, 1, 41).to(like)
-    radius = problem.basis.centers.radius(x).expand(len(at))
-    points = x[:, None] + (radius[:, None] * along)[..., None] * way[:, None]  # (F, S, 2)
-    reach = float(x.abs().max() + 1.4 * radius.max())
-    line = torch.linspace(-reach, reach, 81).to(like)
-    plane = torch.stack(torch.meshgrid(line, line, indexing="xy"), dim=-1)
-    with torch.no_grad():
-        estimate = (problem.basis(points, x) * torch.as_tensor(weights).to(like)[:, None]).sum(-1)
-        arrays = [problem.basis.centers(x), radius, along, problem.target(points), estimate]
-        centers, size, places, value, guess = (array.cpu().numpy() for array in arrays)
-        level = problem.target(plane.reshape(-1, 2)).reshape(81, 81).cpu().numpy()
-    ticks = line.cpu().numpy()
-    return ChaseScene(
-        time=drawn["time"][at],
-        state=drawn["state"][at],
-        centers=centers,
-        radius=size,
-        weights=weights,
-        ideal_weights=ideal,
-        along=places,
-        value=value,
-        estimate=guess,
-        grid=(ticks, ticks, level),
-    )
+def _wanted(cfg: DictConfig, problem: ChaseProblem) -> tuple[bool, bool]:
+    """Return whether the first trajectory is drawn, at rest or in motion, and whether there is a history."""
+    drawn = flag(COMMAND_LINE, "figures", cfg.figures)
+    moving = animation_kind(cfg, problem.basis.dim) is not None
+    return drawn or moving, flag(COMMAND_LINE, "history", cfg.history)
 
 
 def _finish(out: RunDirectory, solved: ChaseSolution, cfg: DictConfig) -> dict[str, float | None]:
     """What follows the history: the log, the figure, the animation, the metrics."""
     outcome = solved.outcome
     _name_the_diverged(solved)
-    if cfg.get("animation", False):
-        out.figure("chase", {"gif": animate_chase(_scene(chase_problem(cfg), outcome.drawn))})
+    kind = animation_kind(cfg)
+    if kind is not None:
+        out.figure("chase", animate(chase_scene(chase_problem(cfg), outcome.drawn), kind))
     if cfg.figures:
         out.figure("gradient_chase", images(draw_chase(ChaseHistory(**outcome.drawn))))
     _summarise(solved.title, outcome.metrics)

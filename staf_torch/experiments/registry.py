@@ -90,6 +90,7 @@ class BatchedExperiment(ABC, Generic[S]):
     equal. What a member gets must not depend on the others.
     """
 
+    animates: ClassVar[bool] = False  # whether the setting `animation` has a meaning
     batchable: ClassVar[frozenset[str]]  # settings, dotted, whose numbers may differ within a batch
 
     @abstractmethod
@@ -154,3 +155,15 @@ def experiment(task: object) -> Experiment | BatchedExperiment[Solution]:
     if not callable(made):
         raise fail(COMMAND_LINE, "task", "must be an experiment, which can be called", task)
     return made
+
+
+def check_animation(cfg: DictConfig) -> None:
+    """Refuse the setting `animation` where the experiment has nothing that moves.
+
+    Raises:
+        ValueError: if the experiment has no attribute ``animates`` that is true.
+    """
+    wanted = cfg.get("animation", False)
+    if wanted is not False and not getattr(experiment(cfg.task), "animates", False):
+        rule = f"must be false for the task {cfg.task}, which has no animation"
+        raise fail(COMMAND_LINE, "animation", rule, wanted)

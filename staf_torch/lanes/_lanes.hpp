@@ -40,8 +40,20 @@ INLINE V real(VB x) { return (V)x; }
 INLINE V sign_of(V x) { return real(bits(x) & bits(splat(-REAL(0)))); }
 INLINE V abs(V x) { return real(bits(x) & ~bits(splat(-REAL(0)))); }
 INLINE V with_sign(V x, V s) { return real(bits(x) | bits(sign_of(s))); }
+
+// A NaN on either side is the result. The processor's own returns b where one is NaN or both are equal.
+#if defined(__AVX512F__) && !defined(__clang__)
+#if LANES_SINGLE
+INLINE V max(V a, V b) { return a != a ? a : (V)__builtin_ia32_maxps512_mask(a, b, a, -1, 4); }
+INLINE V min(V a, V b) { return a != a ? a : (V)__builtin_ia32_minps512_mask(a, b, a, -1, 4); }
+#else
+INLINE V max(V a, V b) { return a != a ? a : (V)__builtin_ia32_maxpd512_mask(a, b, a, -1, 4); }
+INLINE V min(V a, V b) { return a != a ? a : (V)__builtin_ia32_minpd512_mask(a, b, a, -1, 4); }
+#endif
+#else
 INLINE V max(V a, V b) { return ((a > b) | (a != a)) ? a : b; }
 INLINE V min(V a, V b) { return ((a < b) | (a != a)) ? a : b; }
+#endif
 
 #define EACH_LANE(call)                                     \
     REAL lane[W];                                           \

@@ -54,12 +54,23 @@ def _say(name: str, reason: str) -> None:
         _log.warning("the %s of a chase runs in plain torch, slower: nothing compiled (%s)", name, reason)
 
 
+@functools.cache
+def compiler() -> str:
+    """Return the first line of what the compiler says of its version; empty where there is none."""
+    program = _program()
+    return "" if program is None else _run([program, "--version"]).partition("\n")[0]
+
+
+def _program() -> str | None:
+    return next(filter(None, map(shutil.which, (os.environ.get("CXX", ""), *_COMPILERS))), None)
+
+
 def _library(source: Path, definitions: tuple[str, ...]) -> Path:
     """The path of the shared object, built if it is not in the cache."""
-    compiler = next(filter(None, map(shutil.which, (os.environ.get("CXX", ""), *_COMPILERS))), None)
-    if compiler is None:
+    program = _program()
+    if program is None:
         raise FileNotFoundError(f"none of {', '.join(_COMPILERS)} is on the path")
-    command = [compiler, *_FLAGS, f"-I{_FOLDER}", *(f"-D{each}" for each in definitions), str(source)]
+    command = [program, *_FLAGS, f"-I{_FOLDER}", *(f"-D{each}" for each in definitions), str(source)]
     path = _cache() / f"{source.stem.removeprefix('_')}-{_key(command)}.so"
     if not path.exists():
         # Under a name of its own first: another process may be building the same.

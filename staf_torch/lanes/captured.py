@@ -104,7 +104,9 @@ class Captured:
                     self._stated.pop(storage.data_ptr(), None)
                     self._derived[storage.data_ptr()] = storage
                 elif not known and not any(
-                    storage.data_ptr() == t.untyped_storage().data_ptr() for t in given
+                    storage.data_ptr() == t.untyped_storage().data_ptr()
+                    for t in given
+                    if not t._is_zerotensor()
                 ):
                     self._stated[storage.data_ptr()] = storage
 

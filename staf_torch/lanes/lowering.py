@@ -323,6 +323,10 @@ def _rows(array: Ids, dims: Any, keepdim: bool) -> tuple[Ids, Callable[[Ids], Id
 
 
 def _chain(t: Tracer, op: str, flat: Ids) -> Ids:
+    if op != "mul":  # in pairs, the order being free: g++ takes minutes over a long chain of choices
+        while flat.shape[-1] > 1:
+            odd = flat[..., flat.shape[-1] // 2 * 2 :]
+            flat = np.concatenate((t.map(op, flat[..., 0:-1:2], flat[..., 1::2]), odd), axis=-1)
     out: Ids = flat[..., 0]
     for k in range(1, flat.shape[-1]):
         out = t.map(op, out, flat[..., k])

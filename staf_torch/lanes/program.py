@@ -12,6 +12,7 @@ from torch import Tensor
 from . import compiler
 from .captured import Recipe
 from .combinators import Tree, tracing
+from .eliminations import WithoutVectors
 from .emission import Text, emit
 from .graph import NOW, STEP, Graph
 from .lowering import lower
@@ -369,7 +370,7 @@ def trace(step: Step, given: Given, *, widened: bool = False, folded: bool = Fal
         row = given.tree("row", inputs("row", given.row, 0, 0))
         now = given.tree("now", inputs("now", given.now, NOW, 1))
         carry = inputs("state", given.carry, STEP, 0)
-        with tracer, tracing(tracer):
+        with tracer, tracing(tracer), WithoutVectors(tracer.traced):
             after, out = step(given.tree("carry", carry), now, row)
         ends, structure = flatten(after)
         if structure != given.structures["carry"] or [(e.shape, e.dtype) for e in ends] != [

@@ -198,9 +198,12 @@ class Tracer(TorchDispatchMode):
             array = graph.args[first]
             if all(graph.op[n] == "elem" and graph.args[n] == array for n in nodes):
                 return array[0], np.array([graph.aux[n] for n in nodes], dtype=np.int64)
-        few, places = np.unique(flat, return_inverse=True)
-        if 4 * len(few) <= len(nodes):  # a tensor that was broadcast
-            return self.pack(few, kind), places.reshape(-1)
+        place: dict[
+            int, int
+        ] = {}  # in the order of first use: a broadcast tensor is then read at even strides
+        places = [place.setdefault(n, len(place)) for n in nodes]
+        if 4 * len(place) <= len(nodes):  # a tensor that was broadcast
+            return self.pack(np.array(list(place), dtype=np.int64), kind), np.array(places, dtype=np.int64)
         return self.pack(flat, kind), np.arange(len(nodes))
 
     def pack(self, flat: Ids, kind: str) -> int:
@@ -221,7 +224,10 @@ class Tracer(TorchDispatchMode):
 
     def _constants(self, tensor: Tensor, kind: str) -> Ids:
         with _disable_current_modes():
-            numbers = tensor.detach().reshape(-1).tolist()
+            # The tangent of a constant in forward mode is a zero without memory.
+            numbers = (
+                [0.0] * tensor.numel() if tensor._is_zerotensor() else tensor.detach().reshape(-1).tolist()
+            )
         return np.array([self.graph.constant(n, kind) for n in numbers], dtype=np.int64).reshape(tensor.shape)
 
     def _view(self, held: Ids, tensor: Tensor) -> Ids:

@@ -1,55 +1,117 @@
-"""How far a local approximation is from V on its ball, and the error that the ideal weights leave there."""
+"""How far a local approximation is from V around a state, and how near the ideal weights come."""
 
 from __future__ import annotations
+
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from ..approximation.basis import StaFBasis, Target
 from ..centers import probe_points
+from ..lanes import Program, reduce
 from ..local_basis import NewtonSpace, evaluate_scaled, scale
+from ..numerics.linalg import condition_number
 
 PROBES = 97  # points of the ball to take a supremum over; in the plane 64 of them on its edge
-_BLOCK = 2**18  # numbers in a temporary, so that it stays in cache
+_BLOCK = 2**18  # numbers in a temporary of plain torch, so that it stays in cache
+_PAYS = 30_000  # states in plain torch (some 30 us each) that take as long as to compile
 
 
-def ball_error(basis: StaFBasis, target: Target, x: Tensor, coefficients: Tensor) -> Tensor:
-    """sup |V - V^| over a fixed set of points of the closed ball of radius nu(x) around x.
+class StateErrors(NamedTuple):
+    """What is found at states (..., T, n)."""
+
+    ball_error: Tensor  # (..., T) sup |V - V^| over the closed ball of radius nu(x)
+    ball_floor_error: Tensor  # (..., T) that supremum with the ideal weights, in the local basis
+    gradient_error: Tensor  # (..., T) |grad V - grad V^| at the state, the centers frozen
+    condition_number: Tensor  # (..., T) kappa(K(c(x)))
+    native_square: Tensor  # (..., T) w'V(c), the square of the native norm of V^ with the ideal weights w
+
+
+class StateErrorPass:
+    """Finds `StateErrors` in one pass over states; consecutive pieces share what is set up once.
+
+    Suprema are over fixed points of the ball. The floor is the best that kernel, radius and layout allow,
+    without the rounding of large weights. Plain torch is the definition; once so many states have been asked
+    for that it pays, a program of `lanes` keeps a state in every lane and V at a point serves all.
 
     Args:
-        x: states, (..., T, n).
-        coefficients: b of `ChaseResult.coefficients`, (..., T, M).
+        basis: of V^.
+        target: V.
+        points: of the ball, at least 2.
+        compile: whether to compile: ``auto`` for where it pays.
 
-    Returns:
-        (..., T).
+    Attributes:
+        compiled: whether the last call used the compiled program.
     """
-    probes = probe_points(PROBES, basis.dim).to(x)
-    times = max(1, _BLOCK // (PROBES * max(1, x.numel() // x.shape[-2])))
-    blocks = zip(x.split(times, dim=-2), coefficients.split(times, dim=-2), strict=True)
-    return torch.cat([_ball_error(basis, target, probes, *block) for block in blocks], dim=-1)
 
+    def __init__(
+        self, basis: StaFBasis, target: Target, points: int = PROBES, *, compile: bool | str = "auto"
+    ) -> None:
+        self._basis, self._target, self._points, self._compile = basis, target, points, compile
+        self._fixed: _Fixed | None = None
+        self._seen, self.compiled = 0, False
+        self._program = Program(lambda _, __, row: ((), self._at(*row)), name="the errors on a ball")
 
-def _ball_error(basis: StaFBasis, target: Target, probes: Tensor, x: Tensor, b: Tensor) -> Tensor:
-    nu, offsets = basis.centers.radius(x)[..., None, None], basis.centers.offsets(x)
-    worst = x.new_zeros(x.shape[:-1])
-    for some in probes.split(64):
-        z = nu * some
-        estimate = evaluate_scaled(basis.kernel, offsets, x, z, b)
-        error = (target(x.unsqueeze(-2) + z) - estimate).abs().amax(-1)
-        worst = torch.maximum(worst, error)
-    return worst
+    def __call__(self, x: Tensor, coefficients: Tensor, ideal: Tensor) -> StateErrors:
+        """The errors at the states.
 
+        Args:
+            x: (..., T, n); after the first call states of the same rows.
+            coefficients: b of `ChaseResult.coefficients`, (..., T, M).
+            ideal: the paper's w with the ideal weights, (..., T, M).
+        """
+        if self._fixed is None:
+            self._fixed = _Fixed.of(self._basis, x, self._points)
+        self._seen += x.numel() // x.shape[-1]
+        if self._compile is True or (self._compile == "auto" and self._seen >= _PAYS):
+            row = tuple(part.reshape(-1, part.shape[-1]) for part in (x, coefficients, ideal))
+            self.compiled = self._program.compiles((), (), row, steps=1)
+            if self.compiled:
+                found: tuple[Tensor, ...] = self._program((), (), row, steps=1)[1]
+                return StateErrors(*(part.reshape(x.shape[:-1]) for part in found))
+        width = self._points * self._basis.count
+        times = max(1, _BLOCK // (width * max(1, x.numel() // x.shape[-1] // x.shape[-2])))
+        blocks = zip(*(part.split(times, dim=-2) for part in (x, coefficients, ideal)), strict=True)
+        columns = zip(*(self._at(*block) for block in blocks), strict=True)
+        return StateErrors(*(torch.cat(column, dim=-1) for column in columns))
 
-def gradient_error(basis: StaFBasis, target: Target, x: Tensor, coefficients: Tensor) -> Tensor:
-    """|grad V - grad V^| at the state, with the centers frozen: (..., n), (..., M) -> (...)."""
-    offsets = basis.centers.offsets(x)
+    def _at(self, x: Tensor, coefficients: Tensor, ideal: Tensor) -> StateErrors:
+        """The definition, in which no state sees another: (..., n), (..., M), (..., M)."""
+        basis, target, fixed = self._basis, self._target, self._fixed
+        assert fixed is not None
+        nu, offsets = basis.centers.radius(x)[..., None, None], basis.centers.offsets(x)
+        values, space = basis.values(x, target), basis.local(x)
+        fitted = space.fit(values)
 
-    def estimate(z: Tensor) -> Tensor:
-        return evaluate_scaled(basis.kernel, offsets, x, z.unsqueeze(-2), coefficients)
+        def errors(at: tuple[Tensor, Tensor | None, Tensor | None]) -> Tensor:
+            probes, core, cardinal = at
+            z = nu * probes
+            value, gain = target(x.unsqueeze(-2) + z), scale(basis.kernel, x, z)
+            core = basis.kernel.core(x, z, offsets) if core is None else core
+            estimate = (core * coefficients.unsqueeze(-2)).sum(-1) * gain
+            if cardinal is None:
+                ideal = space.evaluate(z, fitted)
+            else:
+                ideal = (cardinal * fitted.unsqueeze(-2)).sum(-1) * gain
+            return torch.stack(((value - estimate).abs(), (value - ideal).abs()), dim=-1)
 
-    approximate, exact = _gradient(estimate, torch.zeros_like(x)), _gradient(target, x.detach())
-    error: Tensor = (exact - approximate).norm(dim=-1)
-    return error
+        worst = reduce(errors, fixed.over(x), "max", dim=x.dim() - 1)
+        kappa = condition_number(basis.gram_structure(x).scaled())
+        return StateErrors(
+            ball_error=worst[..., 0],
+            ball_floor_error=worst[..., 1],
+            gradient_error=self._gradient_error(x, offsets, coefficients),
+            condition_number=kappa.expand(x.shape[:-1]),
+            native_square=(ideal * values).sum(-1),
+        )
+
+    def _gradient_error(self, x: Tensor, offsets: Tensor, coefficients: Tensor) -> Tensor:
+        def estimate(z: Tensor) -> Tensor:
+            return evaluate_scaled(self._basis.kernel, offsets, x, z.unsqueeze(-2), coefficients)
+
+        approximate, exact = _gradient(estimate, torch.zeros_like(x)), _gradient(self._target, x.detach())
+        return (exact - approximate).square().sum(-1).sqrt()
 
 
 def _gradient(function: Target, at: Tensor) -> Tensor:
@@ -63,59 +125,37 @@ def _gradient(function: Target, at: Tensor) -> Tensor:
     return gradient
 
 
-class BallFloor:
-    """max over the closed ball of radius nu(x) of |V - V^| with the ideal weights, in the local basis.
+class _Fixed(NamedTuple):
+    """What all states share at the points of the ball; None where it depends on the state."""
 
-    The best that kernel, radius and layout allow, without the rounding of large weights. Called with
-    consecutive pieces of the same rows; what they share is set up once.
+    probes: Tensor  # (P, n) in units of the radius
+    core: Tensor | None  # k0(z, d), (P, M), or (..., 1, P, M) where each row has its own
+    cardinal: Tensor | None  # psi(z), likewise: one product then evaluates the ideal weights of all states
 
-    Args:
-        basis: of V^.
-        target: V.
-        points: of the ball over which the maximum is taken, at least 2.
-    """
+    @classmethod
+    def of(cls, basis: StaFBasis, x: Tensor, points: int) -> _Fixed:
+        """For states (..., T, n) and what follows them in the same rows."""
+        probes = probe_points(points, basis.dim).to(x)
+        origin = torch.zeros_like(x[..., :1, :]).expand(*x.shape[:-2], 2, -1)
+        offsets, core = basis.centers.offsets(origin), basis.gram_structure(origin).core
+        if any(part.dim() > 2 and part.shape[-3] > 1 for part in (offsets, core)):
+            return cls(probes, None, None)
+        origin = origin[..., :1, :] if offsets.dim() > 2 or core.dim() > 2 else origin.new_zeros(basis.dim)
+        space, z = basis.local(origin), basis.centers.radius(origin)[..., None, None] * probes
+        # A Newton space has none: its coefficients are nodal values, and cardinal functions, one by one,
+        # lose the digits that a smooth V keeps.
+        cardinal = None
+        if not isinstance(space, NewtonSpace):
+            ones = torch.eye(basis.count, dtype=x.dtype, device=x.device)
+            gain = scale(basis.kernel, origin, z)
+            functions = [space.evaluate(z, one.expand(*origin.shape[:-1], -1)) / gain for one in ones]
+            cardinal = torch.stack(functions, dim=-1)
+        return cls(probes, basis.kernel.core(origin, z, basis.centers.offsets(origin)), cardinal)
 
-    def __init__(self, basis: StaFBasis, target: Target, points: int) -> None:
-        self._basis, self._target, self._points = basis, target, points
-        self._begun = False
-        self._shared: Tensor | None = None
+    def over(self, x: Tensor) -> Any:
+        """With as many dimensions as points at the states x."""
 
-    def __call__(self, x: Tensor) -> Tensor:
-        """At the states (..., T, n): (..., T)."""
-        basis, probes = self._basis, probe_points(self._points, self._basis.dim).to(x)
-        if not self._begun:
-            self._begun, self._shared = True, _shared_functions(basis, x, probes)
-        row = self._points * (1 if self._shared is not None else basis.count)  # numbers in a temporary
-        times = max(1, _BLOCK // (row * max(1, x.numel() // x.shape[-1] // x.shape[-2])))
-        blocks = x.split(times, dim=-2)
-        return torch.cat([_floor(basis, self._target, probes, self._shared, some) for some in blocks], dim=-1)
+        def along(part: Tensor | None) -> Tensor | None:
+            return None if part is None else part[(None,) * (x.dim() + 1 - part.dim())]
 
-
-def _shared_functions(basis: StaFBasis, x: Tensor, probes: Tensor) -> Tensor | None:
-    """psi at the probes of the ball where radius and core do not depend on the state, else None: (M, P), or
-    (..., M, P) where each row has its own. One product then evaluates all states of a row.
-
-    None for a Newton space too: its coefficients are nodal values, and cardinal functions, one by one, lose
-    the digits that a smooth V keeps.
-    """
-    if isinstance(basis.local(x[..., :1, :]), NewtonSpace):
-        return None
-    origin = torch.zeros_like(x[..., :1, :]).expand(*x.shape[:-2], 2, -1)
-    offsets, core = basis.centers.offsets(origin), basis.gram_structure(origin).core
-    if any(part.dim() > 2 and part.shape[-3] > 1 for part in (offsets, core)):
-        return None
-    origin = origin[..., :1, :] if offsets.dim() > 2 or core.dim() > 2 else origin.new_zeros(1, basis.dim)
-    space, z = basis.local(origin), basis.centers.radius(origin)[..., None, None] * probes
-    ones = torch.eye(basis.count, dtype=x.dtype, device=x.device)
-    gain = scale(basis.kernel, origin, z)
-    values = [space.evaluate(z, one.expand(*origin.shape[:-1], -1)) / gain for one in ones]
-    return torch.stack(values, dim=-2).squeeze(-3)
-
-
-def _floor(basis: StaFBasis, target: Target, probes: Tensor, shared: Tensor | None, x: Tensor) -> Tensor:
-    z = basis.centers.radius(x)[..., None, None] * probes
-    space = basis.local(x)
-    fitted = space.fit(basis.values(x, target))
-    estimate = space.evaluate(z, fitted) if shared is None else fitted @ shared * scale(basis.kernel, x, z)
-    worst: Tensor = (target(x.unsqueeze(-2) + z) - estimate).abs().amax(-1)
-    return worst
+        return tuple(map(along, self))

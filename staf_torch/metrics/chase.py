@@ -11,10 +11,9 @@ from torch import Tensor
 
 from ..approximation.basis import StaFBasis, Target
 from ..engine import ChaseResult
-from ..numerics.linalg import condition_number
 from ..optim import UpdateLaw
 from . import Metric
-from .ball_error import PROBES, BallFloor, ball_error, gradient_error
+from .ball_error import StateErrorPass
 
 
 class Member(NamedTuple):
@@ -87,119 +86,143 @@ class ChaseMetrics:
         self._whole = Member(0, dt, settle_time)
         self._members = members
         self._own = tuple(own)
-        firsts = [member.first for member in members or (self._whole,)]
-        # Where the first window begins, and the last.
-        self._first, self._last_first = min(firsts), max(firsts)
-        self._time = 0
-        self._worst: dict[str, Tensor] = {}  # name -> (B,)
-        self._early: list[Tensor] = []  # excess before the window, -inf in it, (B, C) a piece
-        self._violations: Tensor | None = None  # (B,) int64
-        self._uncertified: Tensor | None = None  # (B,) int64, of the certificate
-        self._diverged = torch.zeros(0, dtype=torch.bool)
-        self._floor = BallFloor(basis, target, PROBES)
+        self._errors = StateErrorPass(basis, target)
+        self._rows = _Rows(0)
+        self._done: list[_Rows] = []  # rows before those that are taken in now
+
+    def next_rows(self) -> None:
+        """Say that the next pieces begin at time 0 again, with further rows of the batch."""
+        self._done.append(self._rows.finished())
+        self._rows = _Rows(self._rows.first + len(self._rows.diverged))
 
     def add(self, result: ChaseResult) -> None:
         """Take in the next piece of time."""
-        length = result.state.shape[1]
-        skip = min(max(self._first - self._time, 0), length)
-        early = min(max(self._last_first - self._time, 0), length)
-        settled = self._settled(result.state)  # (B, C) or (1, C)
-        self._time += length
-        self._diverged = result.diverged
+        rows = self._rows
+        batch, length, _ = result.state.shape
+        firsts = self._firsts(rows.first, batch)  # of the window, of each row
+        early, skip = (min(max(int(k) - rows.time, 0), length) for k in (firsts.max(), firsts.min()))
+        index = torch.arange(rows.time, rows.time + length)
+        settled = (index >= firsts.unsqueeze(-1)).to(result.state.device)  # (B, C)
+        rows.time += length
+        rows.diverged = result.diverged
         if early > 0:
-            self._early.append(torch.where(settled[:, :early], -torch.inf, result.excess[:, :early]))
+            rows.early.append(torch.where(settled[:, :early], -torch.inf, result.excess[:, :early]))
         if skip == length:
             return
         at = slice(skip, None)
         settled = settled[:, at]
         x, excess, before = result.state[:, at], result.excess[:, at], result.excess_before[:, at]
-        value, coefficients = result.value[:, at], result.coefficients[:, at]
-        gram = self._basis.gram_structure(x).scaled()
-        kappa = condition_number(gram).expand(value.shape)
-        self._keep_worst(
+        value = result.value[:, at]
+        errors = self._errors(x, result.coefficients[:, at], result.ideal_weights[:, at])
+        rows.keep_worst(
             settled,
             ultimate_error=(value - result.estimate[:, at]).abs(),
             ultimate_error_before=(value - result.estimate_before[:, at]).abs(),
             floor_error=(value - result.ideal_estimate[:, at]).abs(),
             ultimate_excess=excess,
             ultimate_excess_before=before,
-            ball_error=ball_error(self._basis, self._target, x, coefficients),
-            ball_floor_error=self._floor(x),
+            ball_error=errors.ball_error,
+            ball_floor_error=errors.ball_floor_error,
             rounding_floor=torch.finfo(value.dtype).eps * value.abs(),
-            gradient_error=gradient_error(self._basis, self._target, x, coefficients),
-            condition_number=kappa,
+            gradient_error=errors.gradient_error,
+            condition_number=errors.condition_number,
             **{metric.name: self._badness(metric, result)[:, at] for metric in self._own},
         )
-        rate = self._law.contraction(kappa)
+        rate = self._law.contraction(errors.condition_number)
         if rate is None:
             return
-        native = (result.ideal_weights[:, at] * self._basis.values(x, self._target)).sum(-1)
-        rounding = 1e3 * torch.finfo(x.dtype).eps * native.abs()
+        rounding = 1e3 * torch.finfo(x.dtype).eps * errors.native_square.abs()
         broken = excess > rate**self._inner_steps * before * (1 + 1e-9) + rounding
-        self._violations = _more(self._violations, broken & settled)
+        rows.violations = _more(rows.violations, broken & settled)
         if result.certificate is not None:
-            self._uncertified = _more(self._uncertified, result.certificate.violated[:, at] & settled)
+            rows.uncertified = _more(rows.uncertified, result.certificate.violated[:, at] & settled)
 
     def summary(self) -> dict[str, float | None]:
         """Name to number over all rows; None where there is nothing to report."""
-        return self._summary(self._whole, slice(None))
+        return self._summary(self._whole, slice(None), self._gathered())
 
     def summaries(self) -> list[dict[str, float | None]]:
         """Name to number over the rows of each member, in the order of the members."""
         assert self._members is not None
-        summaries, start = [], 0
+        summaries, start, found = [], 0, self._gathered()
         for member in self._members:
-            summaries.append(self._summary(member, slice(start, start + member.rows)))
+            summaries.append(self._summary(member, slice(start, start + member.rows), found))
             start += member.rows
         return summaries
 
     def _badness(self, metric: Metric, result: ChaseResult) -> Tensor:
         return metric.badness(result, Chased(self._basis, self._target, self._law))
 
-    def _settled(self, states: Tensor) -> Tensor:
-        """Which of the next times are in the window of a row: (B, C), or (1, C) for all rows."""
-        members = self._members or (self._whole,)
-        firsts = torch.tensor([m.first for m in members], device=states.device)
-        if self._first != self._last_first:
-            rows = torch.tensor([m.rows for m in members], device=states.device)
-            firsts = firsts.repeat_interleave(rows)
-        else:
-            firsts = firsts[:1]
-        index = torch.arange(self._time, self._time + states.shape[1], device=states.device)
-        return index >= firsts.unsqueeze(-1)
+    def _firsts(self, start: int, batch: int) -> Tensor:
+        """The index of the first settled time of each of the rows from ``start`` on: (B,)."""
+        if self._members is None:
+            return torch.full((batch,), self._whole.first)
+        firsts = torch.tensor([member.first for member in self._members])
+        return firsts.repeat_interleave(torch.tensor([member.rows for member in self._members]))[
+            start : start + batch
+        ]
 
-    def _keep_worst(self, settled: Tensor, **quantities: Tensor) -> None:
-        for name, quantity in quantities.items():
-            worst = torch.where(settled, quantity, -torch.inf).amax(dim=1)
-            self._worst[name] = torch.maximum(self._worst[name], worst) if name in self._worst else worst
+    def _gathered(self) -> _Rows:
+        """All rows as one."""
+        parts = [*self._done, self._rows.finished()]
+        whole = _Rows(0)
+        whole.time, whole.diverged = parts[-1].time, torch.cat([part.diverged for part in parts])
+        whole.worst = {name: torch.cat([p.worst[name] for p in parts]) for name in parts[0].worst}
+        for name in ("last_above", "violations", "uncertified"):
+            counts = [getattr(part, name) for part in parts]
+            setattr(whole, name, None if counts[0] is None else torch.cat(counts))
+        return whole
 
-    def _summary(self, member: Member, rows: slice) -> dict[str, float | None]:
-        kept = ~self._diverged[rows]
+    def _summary(self, member: Member, rows: slice, found: _Rows) -> dict[str, float | None]:
+        kept = ~found.diverged[rows]
         metrics: dict[str, float | None] = dict.fromkeys((*_WORST, *(metric.name for metric in self._own)))
-        any_time = self._time > member.first and bool(kept.any())
+        any_time = found.time > member.first and bool(kept.any())
         if any_time:
-            metrics |= {name: float(worst[rows][kept].max()) for name, worst in self._worst.items()}
+            metrics |= {name: float(worst[rows][kept].max()) for name, worst in found.worst.items()}
         for metric in self._own:
             worst = metrics[metric.name]
             metrics[metric.name] = None if worst is None else metric.from_badness(worst)
-        metrics["settling_time"] = self._settling_time(member, rows, kept) if any_time else None
-        metrics["contraction_violations"] = _count(self._violations, rows, kept) if any_time else None
-        if self._uncertified is not None and self._time > member.first:
-            metrics["certificate_violations"] = _count(self._uncertified, rows, kept)
-        metrics["diverged_fraction"] = float(self._diverged[rows].double().mean())
+        metrics["settling_time"] = None
+        if any_time:
+            last = 0.0 if member.first <= 0 else _largest(found.last_above, rows, kept)
+            metrics["settling_time"] = last * member.dt
+        metrics["contraction_violations"] = _count(found.violations, rows, kept) if any_time else None
+        if found.uncertified is not None and found.time > member.first:
+            metrics["certificate_violations"] = _count(found.uncertified, rows, kept)
+        metrics["diverged_fraction"] = float(found.diverged[rows].double().mean())
         return {
             name: number if number is not None and math.isfinite(number) else None
             for name, number in metrics.items()
         }
 
-    def _settling_time(self, member: Member, rows: slice, kept: Tensor) -> float:
-        if member.first <= 0:
-            return 0.0
-        self._early = [torch.cat(self._early, dim=1)]
-        above = self._early[0][rows] > self._worst["ultimate_excess"][rows, None]
-        index = torch.arange(1, above.shape[1] + 1, device=above.device)
-        last = torch.where(above, index, 0).amax(dim=1)
-        return float(last[kept].max()) * member.dt
+
+class _Rows:
+    """What is gathered of some rows that go through time together."""
+
+    def __init__(self, first: int) -> None:
+        self.first = first  # index of the first of them in the batch
+        self.time = 0
+        self.worst: dict[str, Tensor] = {}  # name -> (B,)
+        self.early: list[Tensor] = []  # excess before the window, -inf in it, (B, C) a piece
+        self.last_above: Tensor | None = None  # (B,) times until the excess stays below that of the window
+        self.violations: Tensor | None = None  # (B,) int64
+        self.uncertified: Tensor | None = None  # (B,) int64, of the certificate
+        self.diverged = torch.zeros(0, dtype=torch.bool)
+
+    def keep_worst(self, settled: Tensor, **quantities: Tensor) -> None:
+        for name, quantity in quantities.items():
+            worst = torch.where(settled, quantity, -torch.inf).amax(dim=1)
+            self.worst[name] = torch.maximum(self.worst[name], worst) if name in self.worst else worst
+
+    def finished(self) -> _Rows:
+        """The same with numbers alone: the history of the excess has been read."""
+        if self.early and self.worst:
+            early = torch.cat(self.early, dim=1)
+            index = torch.arange(1, early.shape[1] + 1, device=early.device)
+            above = early > self.worst["ultimate_excess"].unsqueeze(-1)
+            self.last_above = torch.where(above, index, 0).amax(dim=1)
+        self.early = []
+        return self
 
 
 def _more(count: Tensor | None, happened: Tensor) -> Tensor:
@@ -210,6 +233,10 @@ def _more(count: Tensor | None, happened: Tensor) -> Tensor:
 
 def _count(violations: Tensor | None, rows: slice, kept: Tensor) -> float | None:
     return None if violations is None or not bool(kept.any()) else float(violations[rows][kept].sum())
+
+
+def _largest(numbers: Tensor | None, rows: slice, kept: Tensor) -> float:
+    return 0.0 if numbers is None else float(numbers[rows][kept].max())
 
 
 _WORST = (

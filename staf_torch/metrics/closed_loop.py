@@ -17,6 +17,7 @@ def adp_metrics(
     optimal_cost: Tensor | None,
     control_error: Tensor | None,
     value_error: Tensor | None,
+    final: Tensor | None = None,
 ) -> dict[str, float | None]:
     """The metrics of a closed loop; None where there is nothing to report.
 
@@ -25,18 +26,19 @@ def adp_metrics(
         optimal_cost: V*(x(0)), (B,); NaN where it was not found.
         control_error: |u - u*| at the recorded times, (B, T); NaN where it was not computed.
         value_error: |V - V^| at the recorded times, (B, T); NaN where it was not computed.
+        final: e at the end, (B, n), the state measured from a set-point; the state itself by default.
 
     Returns:
         ``cost``, ``optimal_cost``: medians over the trajectories that did not diverge (of one: itself).
         ``cost_ratio``, ``cost_ratio_mean``, ``cost_ratio_max``: cost / V*(x(0)), median, mean and largest,
         over those whose V*(x(0)) is known and positive.
-        ``final_state_norm``: the largest |x| at the end.
+        ``final_state_norm``: the largest |e| at the end.
         ``control_error``, ``value_error``: the largest over the second half of the time.
-        ``regulated_fraction``: |x| < 1e-3 at the end and not diverged, of all.
+        ``regulated_fraction``: |e| < 1e-3 at the end and not diverged, of all.
         ``diverged_fraction``: of all.
     """
     kept = ~result.diverged
-    norm = result.state[:, -1].norm(dim=-1)
+    norm = (result.state[:, -1] if final is None else final).norm(dim=-1)
     metrics: dict[str, float | None] = {
         "cost": _median(result.cost[kept]),
         "optimal_cost": None if optimal_cost is None else _median(optimal_cost[kept & ~optimal_cost.isnan()]),
@@ -46,7 +48,7 @@ def adp_metrics(
         "final_state_norm": _worst(norm[kept]),
         "control_error": _worst_known(control_error, kept),
         "value_error": _worst_known(value_error, kept),
-        "regulated_fraction": float(regulated(result).double().mean()),
+        "regulated_fraction": float(((norm < _REGULATED) & kept).double().mean()),
         "diverged_fraction": float(result.diverged.double().mean()),
     }
     if optimal_cost is not None:

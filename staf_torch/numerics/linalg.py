@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -173,6 +173,23 @@ def check_modes(a: Tensor, b: Tensor, q: Tensor, *, name: str, discrete: bool = 
             )
 
 
+def solver(name: str) -> Callable[..., Any]:
+    """A function of scipy.linalg, imported where it is needed: half a second that no other import need pay.
+
+    Raises:
+        ValueError: if SciPy is missing.
+    """
+    try:
+        import scipy.linalg
+    except ImportError as error:
+        raise ValueError(
+            "The Riccati equation of the LQR needs SciPy, which is not installed: "
+            "pip install 'staf_torch[adp]'."
+        ) from error
+    found: Callable[..., Any] = getattr(scipy.linalg, name)
+    return found
+
+
 def riccati(a: Tensor, b: Tensor, q: Tensor, r: Tensor, *, name: str = "the system") -> Tensor:
     """P >= 0 with A'P + PA - P B R^-1 B'P + Q = 0: the optimal value x'Px of the linear plant.
 
@@ -193,15 +210,7 @@ def riccati(a: Tensor, b: Tensor, q: Tensor, r: Tensor, *, name: str = "the syst
     positive_semidefinite("riccati", "q", q, a.shape[0])
     positive_definite("riccati", "r", r, b.shape[1])
     check_modes(a.double(), b.double(), q.double(), name=name)
-    try:
-        from scipy.linalg import solve_continuous_are  # here: half a second that no other import need pay
-    except ImportError as error:
-        raise ValueError(
-            "The Riccati equation of the LQR needs SciPy, which is not installed: "
-            "pip install 'staf_torch[adp]'."
-        ) from error
-
-    solution = solve_continuous_are(*(m.double().cpu().numpy() for m in (a, b, q, r)))
+    solution = solver("solve_continuous_are")(*(m.double().cpu().numpy() for m in (a, b, q, r)))
     p = torch.from_numpy(solution)
     return 0.5 * (p + p.mT)
 

@@ -1,6 +1,6 @@
-"""The files of run and sweep directories: their names, how they are written and how they are read.
+"""The files of run and sweep directories: their names, and how they are written: complete or not at all.
 
-Files appear complete or not at all. Everything that reads a folder of results opens its files here.
+They are read by `untrusted`.
 """
 
 from __future__ import annotations
@@ -23,10 +23,6 @@ Value = str | float | int | bool | list[Any] | None
 _WORDS: Mapping[str, Value] = {"null": None, "none": None, "true": True, "false": False}
 
 
-class UnreadableError(Exception):
-    """A directory or file that cannot be read; the message says why."""
-
-
 def write_text(path: Path, text: str) -> None:
     """Write a file under another name, flush it to disk, then rename it into place."""
     write_bytes(path, text.encode())
@@ -36,7 +32,9 @@ def write_bytes(path: Path, content: bytes) -> None:
     """Write bytes as `write_text` writes a text."""
     partial = path.with_name(f".{path.name}.partial")
     try:
-        with partial.open("wb") as file:
+        partial.unlink(missing_ok=True)  # of a run that was killed; and a link there would be written through
+        flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW
+        with os.fdopen(os.open(partial, flags, 0o666), "wb") as file:
             file.write(content)
             file.flush()
             os.fsync(file.fileno())
@@ -52,35 +50,6 @@ def write_metrics(path: Path, metrics: Mapping[str, float | int | None]) -> None
         ValueError: for a number that is not finite, which JSON does not have.
     """
     write_text(path, json.dumps(metrics, indent=2, allow_nan=False) + "\n")
-
-
-def read_text(path: Path) -> str:
-    """Return the text of a file.
-
-    Raises:
-        UnreadableError: if there is none.
-    """
-    try:
-        return path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise UnreadableError(f"{path.name} cannot be read: {error.strerror}") from error
-    except ValueError as error:
-        raise UnreadableError(f"{path.name} is not text: {error}") from error
-
-
-def read_object(path: Path) -> dict[str, Any]:
-    """Return the JSON object in a file.
-
-    Raises:
-        UnreadableError: if there is none.
-    """
-    try:
-        found = json.loads(read_text(path))
-    except ValueError as error:
-        raise UnreadableError(f"{path.name} is not JSON: {error}") from error
-    if not isinstance(found, dict):
-        raise UnreadableError(f"{path.name} holds no object")
-    return found
 
 
 def flatten(settings: Mapping[Any, Any], prefix: str = "") -> dict[str, Any]:

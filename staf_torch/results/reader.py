@@ -6,15 +6,18 @@ A run may go on, be killed or be damaged; it has a row with the reason. Nothing 
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
 import os
 import re
+from collections import ChainMap
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from .._version import __version__
 from ..numerics import fail
+from .build import damage, damaged, short
 from .files import (
     COMPLETED,
     FAILED,
@@ -26,118 +29,26 @@ from .files import (
     RUNNING,
     SWEEP,
     UNFINISHED,
-    UnreadableError,
     flatten,
     parse_overrides,
-    read_object,
-    read_text,
 )
 from .files import Value as Value
-from .metric_info import HEADLINES, OWN, MetricInfo, read_infos
+from .metric_info import read_infos
+from .run import ABOUT as ABOUT
+from .run import Collection as Collection
+from .run import Run as Run
+from .run import Skipped as Skipped
+from .run import identity as identity
+from .run import layers
+from .settings_file import read_settings
+from .untrusted import UnreadableError, parse_object, read_lines, read_object, too_deep, visible
 
-ABOUT = ("task", "status", "reason", "seconds", "version", "directory", "member")
-"""What can be a column of a table beside settings and metrics."""
 _OVERRIDES = "overrides.yaml"
-_SHOWN = 1  # headlines in the short form of a run
 _LISTED = 8  # jobs that have not started, by their numbers
-
-
-@dataclasses.dataclass(frozen=True, repr=False)
-class Run:
-    """A run, or a member of a run of many: what it was, how it ended, what it measured."""
-
-    directory: Path
-    overrides: Mapping[str, Value]  # key -> value, as typed
-    settings: Mapping[str, Value]  # all of them, with dotted keys; the option of a group under its name
-    metrics: Mapping[str, float | None]  # None: nothing to report, or not finite
-    status: str
-    reason: str | None = None  # why there is no result, or something else that a reader should know
-    member: int | None = None  # its number among the members of a run of many
-    version: str | None = None  # of the staf_torch that wrote it
-    task: str | None = None
-    seconds: float | None = None
-    declared: Mapping[str, MetricInfo] = dataclasses.field(default_factory=dict)  # of the user's own metrics
-    lost: Mapping[str, str] = dataclasses.field(default_factory=dict)  # metric -> what stood there instead
-
-    def __repr__(self) -> str:
-        """`<Run completed: kernel=gaussian, ball_error=0.0762>`: overrides and the first headlines."""
-        typed = " ".join(f"{key}={value}" for key, value in self.overrides.items()) or "no overrides"
-        shown = [name for name in HEADLINES if self.metrics.get(name) is not None][:_SHOWN]
-        return f"<Run {self.status}: {', '.join([typed, *(f'{n}={self.metrics[n]:.3g}' for n in shown)])}>"
-
-    def setting(self, key: str) -> Value:
-        """Return the setting of that key, as composed where that is known, else as typed."""
-        return self.settings[key] if key in self.settings else self.overrides.get(key)
-
-    def value(self, key: str) -> Value:
-        """Return anything about the run that has a name: a metric, one of `ABOUT`, or a setting."""
-        if key in self.metrics:
-            return self.metrics[key]
-        if key in ABOUT:
-            found = getattr(self, key)
-            return str(found) if isinstance(found, Path) else found
-        return self.setting(key)
-
-    def absence(self, metric: str) -> str:
-        """Say why there is no number under that metric."""
-        if metric in self.lost:
-            return f"was {self.lost[metric]}, which is not a number"
-        if self.reason is not None:
-            return self.reason
-        if metric in self.metrics:
-            return "not finite, or nothing to report"
-        return "this run has no such metric"
-
-
-@dataclasses.dataclass(frozen=True)
-class Skipped:
-    """Something without a row, or with a row that is not as it should be."""
-
-    path: Path
-    reason: str
-
-
-@dataclasses.dataclass(frozen=True)
-class Collection:
-    """The runs that `collect` found."""
-
-    rows: tuple[Run, ...]  # in the order of the sweep
-    skipped: tuple[Skipped, ...]  # what has no row, and why
-    remarks: tuple[str, ...] = ()  # what a reader of the rows should know
-
-    @property
-    def metrics(self) -> tuple[str, ...]:
-        """The names of all metrics, in the order in which runs wrote them."""
-        return tuple(dict.fromkeys(name for run in self.rows for name in run.metrics))
-
-    @property
-    def infos(self) -> dict[str, MetricInfo]:
-        """What is declared of each metric: by the library, or by the runs for metrics of the user's own."""
-        known = {info.name: info for info in OWN}
-        for run in self.rows:
-            known |= run.declared
-        return {name: known.get(name, MetricInfo(name)) for name in self.metrics}
-
-    @property
-    def keys(self) -> tuple[str, ...]:
-        """The names of everything but metrics that can be a column."""
-        named = (key for run in self.rows for key in (*run.overrides, *run.settings))
-        return (*dict.fromkeys(named), *ABOUT)
-
-    @property
-    def swept(self) -> tuple[str, ...]:
-        """The overridden settings that differ between runs; of a single run, those that were overridden."""
-        overridden = dict.fromkeys(key for run in self.rows for key in run.overrides)
-        if len(self.rows) == 1:
-            return tuple(overridden)
-        return tuple(key for key in overridden if len({identity(run.setting(key)) for run in self.rows}) > 1)
-
-
-def identity(value: Value) -> str:
-    """Return equal texts for values that are the same in a table: 1 and 1.0 are, 1 and "1" are not."""
-    if isinstance(value, int | float) and not isinstance(value, bool):
-        return repr(float(value))
-    return f"{type(value).__name__} {value!r}"
+_COLUMNS = 5000  # names of settings and metrics of all runs together
+_SHOWN = 3  # values of a setting that a remark names
+_DEEPEST = 16  # levels of folders
+_MOST_JOBS = 2**24  # bytes of `sweep.json`
 
 
 def collect(path: str | Path | Sequence[str | Path]) -> Collection:
@@ -157,63 +68,100 @@ def collect(path: str | Path | Sequence[str | Path]) -> Collection:
     rows: list[Run] = []
     skipped: list[Skipped] = []
     others: list[Path] = []
+    names: set[str] = set()  # of all columns
     for start in paths:
         if not start.is_dir():
             raise fail("collect", "path", "must be a directory that exists", str(start))
-        for directory in _directories(start):
+        for directory in _directories(start, skipped):
             if not _is_run(directory):
                 others.append(directory)
                 continue
             try:
-                rows += read_run(directory)
+                found = read_run(directory)
+                names |= _further_names(names, found)
+                rows += found
             except UnreadableError as error:
                 skipped.append(Skipped(directory, str(error)))
+            except Exception as error:  # one bad run never costs the others
+                skipped.append(Skipped(directory, f"cannot be read ({type(error).__name__}: {error})"))
     for directory in others:
         skipped += _not_started(directory, rows)
+    skipped = [Skipped(one.path, visible(one.reason)) for one in skipped]
     if not rows and not skipped:
         raise fail("collect", "path", "must hold a run or a sweep of runs", [str(p) for p in paths])
-    return Collection(tuple(rows), tuple(skipped), tuple(_versions(rows)))
+    collection = Collection(tuple(rows), tuple(skipped))
+    return dataclasses.replace(collection, remarks=(*_versions(rows), *_mixed(collection)))
 
 
-def _directories(start: Path) -> Iterator[Path]:
-    """The folders at and under a path, numbers in their names in order; none below a run directory."""
-    yield start
-    if _is_run(start):
-        return
-    with os.scandir(start) as entries:
-        names = [entry.name for entry in entries if entry.is_dir(follow_symlinks=False)]
-    for name in sorted(names, key=_natural):
-        if not name.startswith(".") and name != FIGURES:
-            yield from _directories(start / name)
+def _further_names(known: set[str], runs: Sequence[Run]) -> set[str]:
+    """Return the names of columns that these runs bring.
+
+    Raises:
+        UnreadableError: where there would be more than any table has: memory is rows times columns.
+    """
+    shared = {id(part): part for run in runs for part in layers(run.settings)}
+    parts = [*shared.values(), *(part for run in runs for part in (run.metrics, run.overrides))]
+    further = {name for part in parts for name in part if name not in known}
+    if further and len(known) + len(further) > _COLUMNS:
+        raise UnreadableError(f"brings settings and metrics of {len(further)} more names")
+    return further
+
+
+def _directories(start: Path, skipped: list[Skipped]) -> Iterator[Path]:
+    """The folders at and under a path, numbers in their names in order; none below a run directory.
+
+    Those that cannot be looked at are added to ``skipped``.
+    """
+    waiting = [(start, 0)]
+    while waiting:
+        folder, depth = waiting.pop()
+        yield folder
+        try:
+            if _is_run(folder):
+                continue
+            with os.scandir(folder) as entries:
+                names = [entry.name for entry in entries if entry.is_dir(follow_symlinks=False)]
+        except OSError as error:
+            skipped.append(Skipped(folder, f"cannot be listed: {error.strerror}"))
+            continue
+        inner = [name for name in sorted(names, key=_natural) if not name.startswith(".") and name != FIGURES]
+        if depth == _DEEPEST and inner:
+            skipped.append(Skipped(folder, f"has folders {_DEEPEST} levels down, which are not looked at"))
+            continue
+        waiting += [(folder / name, depth + 1) for name in reversed(inner)]
 
 
 def _is_run(directory: Path) -> bool:
     files = (RUN, MEMBERS, METRICS, f"{HYDRA}/{_OVERRIDES}")
-    return any((directory / name).exists() for name in files)
+    return any(os.path.lexists(directory / name) for name in files)
 
 
 def _natural(name: str) -> list[tuple[bool, int, str]]:
-    parts = re.split(r"(\d+)", name)
-    return [(part.isdigit(), int(part) if part.isdigit() else 0, part) for part in parts]
+    parts = re.split(r"([0-9]{1,18})", name)
+    return [(bool(n % 2), int(part) if n % 2 else 0, part) for n, part in enumerate(parts)]
 
 
 def _not_started(directory: Path, rows: Sequence[Run]) -> Iterator[Skipped]:
     """The jobs that a sweep has announced and of which there is no run."""
-    if not (directory / SWEEP).exists():
+    if not os.path.lexists(directory / SWEEP):
         return
     try:
-        jobs = read_object(directory / SWEEP).get("jobs")
+        jobs = read_object(directory / SWEEP, _MOST_JOBS).get("jobs")
     except UnreadableError as error:
         yield Skipped(directory, str(error))
         return
     if not isinstance(jobs, list) or not all(isinstance(job, dict) for job in jobs):
         yield Skipped(directory, f"{SWEEP} has no list of jobs")
         return
-    begun = [dict(run.overrides) for run in rows if directory in run.directory.parents]
-    waiting = [job.get("num") for job in jobs if parse_overrides(job.get("overrides") or ()) not in begun]
+    begun = {_identity(run.overrides) for run in rows if directory in run.directory.parents}
+    waiting = [job.get("num") for job in jobs if _identity(parse_overrides(_lines(job))) not in begun]
     if waiting:
         listed = ", ".join(map(str, waiting[:_LISTED])) + (", ..." if len(waiting) > _LISTED else "")
         yield Skipped(directory, f"{len(waiting)} of {len(jobs)} jobs have not started: {listed}")
+
+
+def _identity(overrides: Mapping[str, Value]) -> tuple[tuple[str, str], ...]:
+    return tuple(sorted((key, identity(value)) for key, value in overrides.items()))
 
 
 def _versions(rows: Sequence[Run]) -> Iterator[str]:
@@ -227,19 +175,35 @@ def _versions(rows: Sequence[Run]) -> Iterator[str]:
         )
 
 
+def _mixed(found: Collection) -> Iterator[str]:
+    """One remark for each setting that differs although nobody swept it, and for different builds."""
+    for key in found.unswept:
+        values: dict[str, list[Run]] = {}
+        for run in found.rows:
+            value = run.value(key)
+            values.setdefault(value if isinstance(value, str) else json.dumps(value), []).append(run)
+        counts = [f"{value} in {len(runs)} (as {runs[0].directory})" for value, runs in values.items()]
+        more = f" and {len(counts) - _SHOWN} others" if len(counts) > _SHOWN else ""
+        yield f"`{key}` differs between runs although nobody swept it: {', '.join(counts[:_SHOWN])}{more}"
+
+
 def read_run(directory: Path) -> list[Run]:
     """Return the runs of a run directory: one, or one a member.
 
     Raises:
         UnreadableError: if not even the settings can be read.
     """
-    if not (directory / RUN).exists():
+    if not os.path.lexists(directory / RUN):
         return [_without_record(directory, None)]
     try:
-        run = _of_record(directory, read_object(directory / RUN))
+        record = read_object(directory / RUN)
+        run = _of_record(directory, record)
     except UnreadableError as error:
         return [_without_record(directory, str(error))]
-    return _members(run) if (directory / MEMBERS).exists() else [run]
+    wrong = damaged(directory, record, thorough=False)
+    if wrong is not None:
+        return [dataclasses.replace(run, status=UNFINISHED, reason=wrong, metrics={})]
+    return _members(run) if os.path.lexists(directory / MEMBERS) else [run]
 
 
 def read_record(directory: Path) -> Run:
@@ -253,7 +217,10 @@ def read_record(directory: Path) -> Run:
 
 def _of_record(directory: Path, record: Mapping[str, Any]) -> Run:
     status, reason = _status(record)
-    metrics, lost, unread = _measured(directory) if status == COMPLETED else ({}, {}, None)
+    metrics, lost, unread = _measured(directory, record) if status == COMPLETED else ({}, {}, None)
+    made_by = record.get("build")
+    if unread is not None:
+        status = UNFINISHED
     return Run(
         directory=directory,
         overrides=parse_overrides(_lines(record)),
@@ -266,6 +233,7 @@ def _of_record(directory: Path, record: Mapping[str, Any]) -> Run:
         seconds=_number(record.get("seconds")),
         declared=read_infos(record.get("metrics")),
         lost=lost,
+        build=short(made_by) if isinstance(made_by, dict) else None,
     )
 
 
@@ -283,26 +251,47 @@ def _status(record: Mapping[str, Any]) -> tuple[str, str | None]:
 
 def _members(run: Run) -> list[Run]:
     """One a member; its overrides come on top of the run's."""
-    listed = read_object(run.directory / MEMBERS).get("members")
-    if not isinstance(listed, list) or not all(isinstance(member, dict) for member in listed):
-        raise UnreadableError(f"{MEMBERS} has no list of members")
-    return [_member(run, number, member) for number, member in enumerate(listed)]
+    shared = {key: value for key, value in run.settings.items() if not _of_axis(key)}
+    typed = {key: value for key, value in run.overrides.items() if not _of_axis(key)}
+    base = dataclasses.replace(run, settings=shared, overrides=typed, seconds=None)
+    return [_member(base, number, member) for number, member in enumerate(read_members(run.directory))]
+
+
+def read_members(directory: Path) -> Iterator[Mapping[str, Any]]:
+    """Yield the rows of `members.json`, one after the other: one line each, as the library writes them.
+
+    Raises:
+        UnreadableError: if it has another form, and is too large to be read as a whole.
+    """
+    lines = read_lines(directory / MEMBERS)
+    if not re.fullmatch(rb'\{"version": "[^"]*", "members": \[\n', next(lines, b"")):
+        listed = read_object(directory / MEMBERS, _MOST_JOBS).get("members")
+        if not isinstance(listed, list) or not all(isinstance(member, dict) for member in listed):
+            raise UnreadableError(f"{MEMBERS} has no list of members")
+        yield from listed
+        return
+    for line in lines:
+        if line == b"]}\n":
+            return
+        yield parse_object(line.removesuffix(b"\n").removesuffix(b","), MEMBERS)
+    raise UnreadableError(f"{MEMBERS} ends before its last row")
 
 
 def _member(run: Run, number: int, member: Mapping[str, Any]) -> Run:
     status, reason = _status(member)
     own = parse_overrides(_lines(member))
-    metrics, lost = _metrics(member.get("metrics") or {}) if status == COMPLETED else ({}, {})
-    stated = _settings(member) or {**run.settings, **own}
+    metrics, lost = _metrics(member.get("metrics")) if status == COMPLETED else ({}, {})
+    stated = _settings(member)
+    place = member.get("num")
     return dataclasses.replace(
         run,
-        overrides={key: value for key, value in run.overrides.items() if not _of_axis(key)} | own,
-        settings={key: value for key, value in stated.items() if not _of_axis(key)},
+        overrides={**run.overrides, **own},
+        settings={key: value for key, value in stated.items() if not _of_axis(key)}
+        or ChainMap(own, run.settings),  # type: ignore[arg-type]
         metrics=metrics,
         status=status,
         reason=reason,
-        member=int(_number(member.get("num")) or number),
-        seconds=None,
+        member=place if isinstance(place, int) and not isinstance(place, bool) else number,
         lost=lost,
     )
 
@@ -318,7 +307,7 @@ def _without_record(directory: Path, why: str | None) -> Run:
         overrides, settings = _of_hydra(directory / HYDRA)
     except UnreadableError as error:
         raise UnreadableError("; ".join(filter(None, (why, str(error))))) from error
-    metrics, lost, unread = _measured(directory)
+    metrics, lost, unread = _measured(directory, {})
     if unread is not None and not (directory / METRICS).exists():
         unread = f"has no {METRICS}: it goes on, failed or was killed"
     reason = "; ".join(filter(None, (why, unread))) or None
@@ -328,17 +317,11 @@ def _without_record(directory: Path, why: str | None) -> Run:
 
 
 def _of_hydra(folder: Path) -> tuple[dict[str, Value], dict[str, Value]]:
-    import yaml  # Hydra brings it; only runs without `run.json` need it
-
-    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-
     def load(name: str) -> Any:
         try:
-            return yaml.load(read_text(folder / name), loader)
+            return read_settings(folder / name, folder.parent).tree
         except UnreadableError as error:
             raise UnreadableError(f"{HYDRA}/{error}") from error
-        except yaml.YAMLError as error:
-            raise UnreadableError(f"{HYDRA}/{name} is not YAML: {error}") from error
 
     lines = load(_OVERRIDES)
     if not isinstance(lines, list):
@@ -346,25 +329,32 @@ def _of_hydra(folder: Path) -> tuple[dict[str, Value], dict[str, Value]]:
     try:
         composed, choices = load("config.yaml"), load("hydra.yaml")["hydra"]["runtime"]["choices"]
         options = {group: option for group, option in choices.items() if not group.startswith("hydra/")}
-        settings = flatten(composed) | options
+        settings = _settings({"settings": flatten(composed) | options})
     except (UnreadableError, KeyError, TypeError, AttributeError):
         settings = {}  # the overrides tell runs apart without them
     return parse_overrides(str(line) for line in lines), settings
 
 
-def _measured(directory: Path) -> tuple[dict[str, float | None], dict[str, str], str | None]:
-    """`_metrics` of a run, and why they cannot be read."""
+def _measured(
+    directory: Path, record: Mapping[str, Any]
+) -> tuple[dict[str, float | None], dict[str, str], str | None]:
+    """`_metrics` of a run, and why they cannot be read or believed."""
+    files = found if isinstance(found := record.get("files"), dict) else {}
+    numbers = {name: about for name, about in files.items() if name in (METRICS, MEMBERS)}
+    wrong = damage(directory, numbers, thorough=True)
+    if wrong is not None:
+        return {}, {}, wrong
     try:
         return *_metrics(read_object(directory / METRICS)), None
     except UnreadableError as error:
         return {}, {}, str(error)
 
 
-def _metrics(found: Mapping[str, Any]) -> tuple[dict[str, float | None], dict[str, str]]:
+def _metrics(found: object) -> tuple[dict[str, float | None], dict[str, str]]:
     """The numbers, and what stood in the place of one; nested or other values are no metrics."""
     metrics: dict[str, float | None] = {}
     lost: dict[str, str] = {}
-    for name, value in found.items():
+    for name, value in found.items() if isinstance(found, dict) else ():
         if value is None or (isinstance(value, int) and not isinstance(value, bool)):
             metrics[name] = value
         elif isinstance(value, float):
@@ -375,11 +365,21 @@ def _metrics(found: Mapping[str, Any]) -> tuple[dict[str, float | None], dict[st
 
 
 def _lines(record: Mapping[str, Any]) -> list[str]:
-    return list(map(str, lines)) if isinstance(lines := record.get("overrides"), list) else []
+    lines = record.get("overrides")
+    return [line for line in lines if isinstance(line, str)] if isinstance(lines, list) else []
 
 
 def _settings(record: Mapping[str, Any]) -> dict[str, Value]:
-    return dict(found) if isinstance(found := record.get("settings"), dict) else {}
+    found = record.get("settings")
+    return {key: _setting(key, value) for key, value in found.items()} if isinstance(found, dict) else {}
+
+
+def _setting(key: str, value: Any) -> Value:
+    if isinstance(value, float) and not math.isfinite(value):
+        return repr(value)
+    if too_deep(value):
+        raise UnreadableError(f"the setting {key} is nested too deep")
+    return json.dumps(value) if isinstance(value, dict) else value
 
 
 def _text(value: object) -> str | None:
@@ -387,4 +387,5 @@ def _text(value: object) -> str | None:
 
 
 def _number(value: object) -> float | None:
-    return value if isinstance(value, int | float) and not isinstance(value, bool) else None
+    number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    return value if number else None  # type: ignore[return-value]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
 import tempfile
@@ -13,6 +14,7 @@ from typing import Protocol
 
 import numpy as np
 
+from .archive import Archive
 from .files import FIGURES, HISTORY, METRICS, write_bytes, write_metrics, write_text
 
 
@@ -73,6 +75,8 @@ class RunDirectory:
         """Write the images of a figure, by their endings (`staf_torch.figures.style.images`)."""
         folder = self._place(FIGURES)
         folder.mkdir(exist_ok=True)
+        if folder.is_symlink():
+            raise OSError(errno.ELOOP, "it is a link, which is not written through", str(folder))
         for ending, content in images.items():
             write_bytes(folder / f"{name}.{ending}", content)
 
@@ -99,34 +103,32 @@ class History(Mapping[str, np.ndarray]):
 
     Args:
         path: of the archive.
+
+    Raises:
+        UnreadableError: if there is none that can be read.
     """
 
     def __init__(self, path: Path) -> None:
-        self._path = path
+        self._archive = Archive(path)
         self._read: dict[str, np.ndarray] = {}
-        with zipfile.ZipFile(path) as archive:
-            self._names = [name.removesuffix(".npy") for name in archive.namelist()]
 
     def __getitem__(self, name: str) -> np.ndarray:
         """Return an array."""
-        if name not in self._names:
-            raise KeyError(f"{name!r} is not in {self._path}; there are {', '.join(self._names)}")
         if name not in self._read:
-            with np.load(self._path) as archive:
-                self._read[name] = archive[name]
+            self._read[name] = self._archive.read(name)
         return self._read[name]
 
     def __iter__(self) -> Iterator[str]:
         """Yield the names."""
-        return iter(self._names)
+        return iter(self._archive.names)
 
     def __len__(self) -> int:
         """Return the number of arrays."""
-        return len(self._names)
+        return len(self._archive.names)
 
     def __repr__(self) -> str:
         """Return the names."""
-        return f"<History {', '.join(self._names)}>"
+        return f"<History {', '.join(self._archive.names)}>"
 
 
 class HistoryWriter:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import re
 import time
 from collections.abc import Mapping, Sequence
@@ -13,11 +14,15 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from .._version import __version__
-from .files import COMPLETED, METRICS, UnreadableError, flatten, plain, read_object, write_text
+from .build import build, checksums, damaged, differences, record_checksum
+from .files import COMPLETED, METRICS, flatten, plain, write_text
 from .files import RUN as RUN
 from .files import SWEEP as SWEEP
 from .metric_info import MetricInfo
+from .untrusted import UnreadableError, read_object
 
+_log = logging.getLogger(__name__)
+_TOLD = 4  # differences that a message names
 SETTINGS = "sweep"
 """The group of settings that are about the sweep and not about its jobs."""
 
@@ -29,15 +34,20 @@ class RunRecord:
         cfg: all settings but Hydra's.
         choices: the option chosen of each group of settings.
         overrides: as typed.
+        compiler: that makes machine code of the run, in its own words.
     """
 
-    def __init__(self, cfg: DictConfig, choices: Mapping[str, str | None], overrides: Sequence[str]) -> None:
+    def __init__(
+        self, cfg: DictConfig, choices: Mapping[str, str | None], overrides: Sequence[str], compiler: str = ""
+    ) -> None:
         self._start = time.monotonic()
+        settings = flat(cfg) | {g: c for g, c in choices.items() if not g.startswith("hydra/")}
         self._about = {
             "version": __version__,
             "task": cfg.get("task"),
             "overrides": own(overrides),
-            "settings": flat(cfg) | {g: c for g, c in choices.items() if not g.startswith("hydra/")},
+            "settings": settings,
+            "build": build(settings, compiler),
         }
 
     def declare(self, metrics: Sequence[MetricInfo]) -> None:
@@ -53,7 +63,52 @@ class RunRecord:
         """Write the record with a status: running, completed or failed."""
         spent = round(time.monotonic() - self._start, 3)
         record = {**self._about, "status": status, "reason": reason, "seconds": spent}
+        if status == COMPLETED:
+            record["files"] = checksums(directory, frozenset({RUN}))
+        record["checksum"] = record_checksum(record)
         write_text(directory / RUN, json.dumps(record, indent=1, allow_nan=False) + "\n")
+
+    def finished(self, directory: Path, *, anyway: bool = False) -> dict[str, float | None] | None:
+        """Return the metrics of this very run where it was completed before, else None.
+
+        A run whose files are damaged is none that was completed; a warning names the file.
+
+        Args:
+            directory: of the run.
+            anyway: whether a run of other settings, source, modules, torch or compiler counts as well.
+
+        Raises:
+            ValueError: if the directory holds a run that was made otherwise; the message says what differs.
+        """
+        record = read(directory / RUN)
+        if record is None or record.get("status") != COMPLETED:
+            return None
+        if record.get("overrides") != self._about["overrides"]:
+            lines = record.get("overrides")
+            typed = " ".join(map(str, lines)) if isinstance(lines, list) else lines
+            raise ValueError(
+                f"{directory} holds the run {typed!r}, where this sweep has "
+                f"{' '.join(self._about['overrides'])!r}."
+            )
+        wrong = damaged(directory, record, thorough=True)
+        if wrong is not None:
+            _log.warning("%s: %s; it is run again", directory, wrong)
+            return None
+        if not anyway:
+            self._compare(directory, record)
+        return read(directory / METRICS)
+
+    def _compare(self, directory: Path, record: Mapping[str, Any]) -> None:
+        told = list(differences(record, self._about))
+        if record.get("version") != __version__:
+            told.insert(0, f"it was written by staf_torch {record.get('version')}, and this is {__version__}")
+        if told:
+            more = f"; and {len(told) - _TOLD} more" if len(told) > _TOLD else ""
+            raise ValueError(
+                f"{directory} was not made as it would be now: {'; '.join(told[:_TOLD])}{more}. Numbers may "
+                "differ: run the sweep anew, or keep what is there by `sweep.resume_anyway=true`; tables "
+                "tell the two apart."
+            )
 
 
 def own(overrides: Sequence[str]) -> list[str]:
@@ -80,31 +135,14 @@ def read(path: Path) -> dict[str, Any] | None:
         return None
 
 
-def metrics_of(directory: Path, overrides: Sequence[str]) -> dict[str, float | None] | None:
-    """Return the metrics of a run that was completed by this version with these overrides, else None.
-
-    Raises:
-        ValueError: if the directory holds a run of other settings or of another version.
-    """
-    record = read(directory / RUN)
-    if record is None:
-        return None
-    if record.get("version") != __version__:
-        raise ValueError(
-            f"{directory} was written by staf_torch {record.get('version')}, and this is {__version__}: "
-            "their numbers may differ. Run the sweep anew, or with that version."
-        )
-    if record.get("overrides") != own(overrides):
-        raise ValueError(
-            f"{directory} holds the run {' '.join(record.get('overrides', []))!r}, "
-            f"where this sweep has {' '.join(own(overrides))!r}."
-        )
-    return read(directory / METRICS) if record.get("status") == COMPLETED else None
-
-
 def resumed(cfg: DictConfig) -> bool:
     """Return whether the sweep of these settings takes up an earlier one."""
     return OmegaConf.select(cfg, f"{SETTINGS}.resume") is not None
+
+
+def resumed_anyway(cfg: DictConfig) -> bool:
+    """Return whether runs count that were made by other settings or another source than those of today."""
+    return OmegaConf.select(cfg, f"{SETTINGS}.resume_anyway") is True
 
 
 def without_hydra(config: DictConfig) -> DictConfig:

@@ -315,9 +315,8 @@ def initial_states(cfg: DictConfig, dim: int) -> Tensor:
     batch = integer(COMMAND_LINE, "trajectories", cfg.trajectories, least=1)
     spread = positive_real(COMMAND_LINE, "spread", cfg.spread)
     generator = torch.Generator().manual_seed(integer(COMMAND_LINE, "seed", cfg.seed, least=0))
-    rows = [torch.rand(dim, dtype=torch.float64, generator=generator) for _ in range(batch - 1)]
-    around = [first + spread * (2 * row - 1) for row in rows]
-    return torch.stack([first, *around])
+    rows = torch.rand(batch - 1, dim, dtype=torch.float64, generator=generator)
+    return torch.cat((first.unsqueeze(0), first + spread * (2 * rows - 1)))
 
 
 class LocalProblem(NamedTuple):

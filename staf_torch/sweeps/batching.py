@@ -17,6 +17,7 @@ from omegaconf.errors import OmegaConfBaseException
 from ..experiments.registry import BatchedExperiment, Experiment, Metrics, Solution, experiment
 from ..results import run_record as records
 from ..results.progress import SHOWN, Progress
+from .workers import LostError
 
 _log = logging.getLogger(__name__)
 _KEPT_BYTES = 2**28
@@ -25,8 +26,8 @@ _CHUNK = 128
 """Members of a chunk: more gain nothing, and what is done is written that much later."""
 _UNREADABLE = (ValueError, TypeError, KeyError, AttributeError, OmegaConfBaseException)
 """What broken settings raise while they are grouped. The job itself says later what is wrong with it."""
-USER_ERRORS = (ValueError, HydraException, OmegaConfBaseException, OSError)
-"""What a setting or the disk can bring about; anything else is a defect and keeps its trace."""
+USER_ERRORS = (ValueError, HydraException, OmegaConfBaseException, OSError, LostError)
+"""What a setting, the disk or the machine can bring about; anything else is a defect and keeps its trace."""
 
 
 @dataclasses.dataclass(frozen=True)

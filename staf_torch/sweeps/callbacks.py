@@ -20,6 +20,9 @@ from ..numerics import COMMAND_LINE, fail
 from ..results import run_record as records
 from ..results.files import COMPLETED, PAGE
 from ..results.reader import Run, collect
+from ..results.untrusted import links_in, visible
+from . import lock
+from .batching import sentence
 from .hydra_compat import BrokenSweep
 from .job import PRINTS
 from .report import write_report
@@ -86,11 +89,38 @@ class SweepDirectory(Callback):
     """Takes a directory for a sweep that begins and notes there what was typed."""
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
-        """Make the directory and `sweep.json`; a sweep that is resumed has both."""
-        if not records.resumed(config):
+        """Make the directory, lock it, and write `sweep.json`; a sweep that is resumed has both.
+
+        Raises:
+            SystemExit: if the directory cannot be written, or belongs to another sweep: Hydra turns other
+                exceptions of callbacks into warnings.
+        """
+        try:
+            if records.resumed(config):
+                lock.hold(_directory(config))
+                _refuse_links(_directory(config))
+                return
             claim(config)
             typed = config.hydra.overrides
             records.begin_sweep(_directory(config), list(typed.task), list(typed.hydra))
+        except (ValueError, OSError) as error:
+            lock.give_back(_directory(config))
+            raise SystemExit(f"staf: {sentence(error)}") from error
+
+    def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
+        """Give the directory back: the report has been written."""
+        lock.give_back(_directory(config))
+
+    def on_run_start(self, config: DictConfig, **_: Any) -> None:
+        """Refuse a run directory in which something leads elsewhere.
+
+        Raises:
+            SystemExit: with what leads elsewhere.
+        """
+        try:
+            _refuse_links(Path(str(config.hydra.run.dir)))
+        except ValueError as error:
+            raise SystemExit(f"staf: {error}") from error
 
 
 class SweepReport(Callback):
@@ -111,12 +141,15 @@ class SweepReport(Callback):
             return
         try:
             text = write_report(directory, figures=figures is not False)
+        except OSError as error:  # a full disk, a directory that has gone
+            raise SystemExit(f"staf: no report of the sweep: {sentence(error)}") from error
         except Exception as error:
             _log.warning("no report of the sweep: %s", error)
             return
         if PRINTS.get():
-            sys.stdout.write(f"\n{text}\n  report: {directory / PAGE}\n")
-            sys.stdout.flush()
+            with contextlib.suppress(OSError):  # the terminal may be gone
+                sys.stdout.write(f"\n{text}\n  report: {directory / PAGE}\n")
+                sys.stdout.flush()
 
 
 class TrackRuns(Callback):
@@ -165,13 +198,26 @@ def tracker(config: DictConfig) -> Tracker | None:
 
 
 def claim(config: DictConfig) -> None:
-    """Make the sweep's directory; where another sweep has it, take the next name: `<name>-2`, ...
+    """Make the sweep's directory and lock it; where another sweep has it, take the next name: `<name>-2`, ...
 
-    A directory that was asked for on the command line is used as it is.
+    A directory that was asked for on the command line is taken, or refused.
+
+    Raises:
+        ValueError: if a directory that was asked for holds a sweep, belongs to one that goes on, or leads
+            elsewhere.
+        OSError: if it cannot be made.
     """
     wanted = str(config.hydra.sweep.dir)
     if any(line.startswith("hydra.sweep.dir=") for line in config.hydra.overrides.hydra):
-        Path(wanted).mkdir(parents=True, exist_ok=True)
+        place = Path(wanted)
+        place.mkdir(parents=True, exist_ok=True)
+        lock.hold(place)
+        if (place / records.SWEEP).exists() or next(place.glob(f"*/{records.RUN}"), None) is not None:
+            raise ValueError(
+                f"{wanted} holds a sweep already, and a table of both would mix them. Resume that one with "
+                f"`staf -m sweep.resume={wanted}`, or choose another `hydra.sweep.dir`."
+            )
+        _refuse_links(place)
         return
     directory, attempt = Path(wanted), 1
     while True:
@@ -182,32 +228,51 @@ def claim(config: DictConfig) -> None:
             directory = Path(f"{wanted}-{attempt}")
         else:
             break
+    lock.hold(directory)
     if attempt > 1:  # also for the jobs, whose settings are composed anew
         config.hydra.sweep.dir = str(directory)
         config.hydra.overrides.hydra.append(f"hydra.sweep.dir={records.quoted(str(directory))}")
 
 
+def _refuse_links(directory: Path) -> None:
+    """Raise ValueError where something in a directory leads elsewhere: nothing is written through it."""
+    found = [path for path in links_in(directory) if ".submitit" not in path.parts]
+    if found:
+        more = f" and {len(found) - 1} more" if len(found) > 1 else ""
+        raise ValueError(
+            f"{visible(str(found[0]))}{more} is a link, a pipe or the like, which no run writes: what goes "
+            "there would end elsewhere. Remove it, or choose another directory."
+        )
+
+
 def close(sweep: BrokenSweep) -> None:
     """End a sweep that an exception broke: with its report, or without a trace where no job has begun."""
     directory = _directory(sweep.config)
+    own = lock.held(directory)
+    if own is None:  # another sweep's, which refused us
+        return
+    if own.lost():
+        lock.give_back(directory)
+        return
     if any(directory.glob(f"**/{records.RUN}")):
         sweep.end()
         return
     for name in (records.SWEEP, "multirun.yaml"):
         (directory / name).unlink(missing_ok=True)
     shutil.rmtree(directory / ".submitit", ignore_errors=True)
+    lock.give_back(directory)
     with contextlib.suppress(OSError):  # not empty: it was there before
         directory.rmdir()
 
 
-def farewell(sweep: BrokenSweep | None) -> str:
-    """Return what to say after Ctrl-C."""
+def farewell(sweep: BrokenSweep | None, said: str) -> str:
+    """Return what to say after Ctrl-C or another signal; ``said`` is which."""
     runs = [] if sweep is None else list(_directory(sweep.config).glob(f"*/{records.RUN}"))
     if sweep is None or not runs:
-        return "staf: interrupted"
+        return f"staf: {said}"
     complete = sum((records.read(path) or {}).get("status") == COMPLETED for path in runs)
     place = os.path.relpath(_directory(sweep.config))
-    return f"staf: interrupted; {complete} jobs are complete. Resume with:\n  staf -m sweep.resume={place}"
+    return f"staf: {said}; {complete} jobs are complete. Resume with:\n  staf -m sweep.resume={place}"
 
 
 def _directory(config: DictConfig) -> Path:

@@ -5,15 +5,12 @@ from __future__ import annotations
 import abc
 import contextlib
 import logging
-import multiprocessing
 import os
 import pickle
-import signal
 import sys
 import time
 import warnings
 from collections.abc import Callable, Collection, Generator, Iterator, Mapping, Sequence
-from concurrent import futures
 from pathlib import Path
 from typing import Any
 
@@ -24,12 +21,12 @@ from ..numerics.checks import choice, integer
 from ..results.progress import SHOWN, Progress
 from .batching import Batch, Deferred, Done, Failed, Outcome, Written, batches, solve
 from .hydra_compat import env_override, trusted, trusted_packages
+from .workers import LostError, Worker, ready
 
 _log = logging.getLogger(__name__)
 EXECUTORS = ("inline", "process", "submitit", "ray")
 _EXTRAS = {"submitit": "slurm", "ray": "ray"}
 _POLL_LOCAL, _POLL = 0.2, 10.0  # s
-_NO_INTERRUPT = (signal.SIGINT, signal.SIG_IGN)  # of a worker: the parent ends it
 
 
 def executor(name: object, workers: int | None, arguments: Mapping[str, Any], directory: Path) -> Executor:
@@ -103,21 +100,48 @@ class Executor(abc.ABC):
         """Return what a batch left that has ended. Raises where the worker itself was lost."""
 
     def map(self, batches: Sequence[Batch], progress: Progress) -> Iterator[tuple[int, Done]]:
-        """Yield the number of a batch and what it left, as they end. A lost worker fails its batch alone."""
+        """Yield the number of a batch and what it left, as they end.
+
+        A batch whose worker was lost is tried once more, and then fails alone.
+        """
         running: dict[int, Any] = {}
         waiting = list(range(len(batches)))[::-1]
+        lost: dict[int, str] = {}
         while waiting or running:
             while waiting and len(running) < self.workers:
                 number = waiting.pop()
-                running[number] = self.submit(batches[number], progress)
-            for number in self.wait(running):
+                try:
+                    running[number] = self.submit(batches[number], progress)
+                except Exception as error:
+                    yield number, _failed(batches[number], f"no worker could begin ({_words(error)})")
+            for number in self.wait(running) if running else ():
                 handle = running.pop(number)
                 try:
                     done = self.result(handle)
                 except Exception as error:
-                    lost = RuntimeError(f"the worker was lost ({type(error).__name__}: {error})")
-                    done = Done([Failed(lost)] * len(batches[number].settings), 0.0)
+                    if number not in lost and not isinstance(error, GivenUpError):
+                        lost[number] = _words(error)
+                        _log.warning("a worker was lost: %s; its batch is tried once more", lost[number])
+                        waiting.append(number)
+                        continue
+                    said = "the worker was lost twice" if number in lost else "the worker was lost"
+                    done = _failed(batches[number], f"{said} ({_words(error)})")
                 yield number, done
+
+
+class GivenUpError(Exception):
+    """A worker that was ended by somebody who does not want it tried again."""
+
+
+def _failed(batch: Batch, why: str) -> Done:
+    return Done([Failed(LostError(why))] * len(batch.settings), 0.0)
+
+
+def _words(error: Exception) -> str:
+    """One line of at most 200 characters."""
+    said = " ".join(str(error).split())
+    said = said if isinstance(error, LostError | GivenUpError) else f"{type(error).__name__}: {said}"
+    return said if len(said) <= 200 else f"{said[:197]}..."
 
 
 class Inline(Executor):
@@ -142,31 +166,36 @@ class Inline(Executor):
 
 
 class Process(Executor):
-    """Fresh processes of this machine, which share the cores between them."""
+    """Fresh processes of this machine, which share the cores between them and end with this one."""
 
     def __init__(self, workers: int | None = None) -> None:
         super().__init__(workers)
-        fresh = multiprocessing.get_context("spawn")  # torch's threads do not survive a fork
-        self._pool = futures.ProcessPoolExecutor(self.workers, fresh, signal.signal, _NO_INTERRUPT)
+        self._idle: list[Worker] = []
+        self._all: list[Worker] = []
 
     def close(self, *, failed: bool) -> None:
-        workers = list((getattr(self._pool, "_processes", None) or {}).values())
-        self._pool.shutdown(wait=not failed, cancel_futures=True)
-        if failed:
-            for process in workers:
-                process.terminate()
+        for worker in self._all:
+            worker.end()
+        self._all, self._idle = [], []
 
-    def submit(self, batch: Batch, progress: Progress) -> futures.Future[bytes]:
-        threads = max(1, (os.cpu_count() or 1) // self.workers)
-        with env_override({"OMP_NUM_THREADS": str(threads)}):  # a worker begins on a submission
-            return self._pool.submit(solve_elsewhere, *pack(batch))
+    def submit(self, batch: Batch, progress: Progress) -> Worker:
+        self._idle = [worker for worker in self._idle if worker.alive()]
+        if not self._idle:
+            threads = max(1, (os.cpu_count() or 1) // self.workers)
+            with env_override({"OMP_NUM_THREADS": str(threads)}):
+                self._all.append(Worker(solve_elsewhere))
+                self._idle.append(self._all[-1])
+        worker = self._idle.pop()
+        worker.begin(*pack(batch))
+        return worker
 
-    def wait(self, handles: dict[int, futures.Future[bytes]]) -> list[int]:
-        futures.wait(handles.values(), return_when=futures.FIRST_COMPLETED)
-        return [number for number, future in handles.items() if future.done()]
+    def wait(self, handles: dict[int, Worker]) -> list[int]:
+        return ready(handles)
 
-    def result(self, handle: futures.Future[bytes]) -> Done:
-        return unpack(handle.result())
+    def result(self, handle: Worker) -> Done:
+        done = unpack(handle.result())
+        self._idle.append(handle)
+        return done
 
 
 class Submitit(Executor):

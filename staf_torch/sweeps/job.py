@@ -17,7 +17,8 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from ..experiments.registry import Metrics
+from ..experiments.registry import Metrics, check_animation
+from ..lanes.build import compiler
 from ..numerics.checks import choice
 from ..results import run_record as records
 from ..results.progress import SHOWN, Progress
@@ -63,7 +64,8 @@ def execute(
     search = tuple(line for line in node.overrides.hydra if line.startswith("hydra.searchpath"))
     origin = Origin(list(node.overrides.task), node.runtime.choices, node.job.config_name, search)
     if records.resumed(cfg):
-        finished = records.metrics_of(directory, origin.overrides)
+        record = records.RunRecord(cfg, origin.choices, origin.overrides, compiler())
+        finished = record.finished(directory, anyway=records.resumed_anyway(cfg))
         if finished is not None:
             _log.info("completed before: %s", os.path.relpath(directory))
             return objective(cfg, finished)
@@ -102,8 +104,9 @@ def run(
     Raises:
         Exception: that of the experiment; the record has its reason.
     """
-    record = records.RunRecord(cfg, origin.choices, origin.overrides)
+    record = records.RunRecord(cfg, origin.choices, origin.overrides, compiler())
     with _recorded(record, directory, seconds):
+        check_animation(cfg)
         record.declare([metric.info for metric in make_metrics(cfg.get("metric"))])
         if cfg.get("members") is not None:
             base = [*origin.search, *origin.overrides]

@@ -9,16 +9,19 @@ import gc
 import logging
 import sys
 import time
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from omegaconf import DictConfig
 from tqdm.auto import tqdm
 
+from ..lanes.build import compiler
 from ..numerics.checks import choice, integer
 from ..results import run_record as records
+from ..results.files import METRICS
 from ..results.progress import Progress
+from . import lock
 from .batching import Outcome, reason
 from .executors import compute, executor
 from .hydra_compat import JobReturn, JobStatus, SweepContext, without_hydra_overrides
@@ -151,6 +154,7 @@ class Launch:
             try:
                 with contextlib.closing(self._computed(jobs, set(returns), progress)) as computed:
                     for job, task in computed:
+                        self._still_there(len(returns), len(jobs))
                         ended = self._replay(job, task)
                         failure = ended._return_value if ended.status == JobStatus.FAILED else None
                         progress.ended(job.name, None if failure is None else reason(failure))
@@ -158,6 +162,7 @@ class Launch:
             finally:
                 progress.close()
                 self._sweep_logging()
+        self._refuse_lost(jobs, returns)
         failed = sum(ended.status == JobStatus.FAILED for ended in returns.values())
         _log.info("%d of %d jobs completed, %d failed", len(jobs) - failed, len(jobs), failed)
         return [returns[num] for num in numbered]
@@ -165,6 +170,26 @@ class Launch:
     def _replay(self, job: Job, task: Callable[[DictConfig], Any]) -> JobReturn:
         """Run a job whose outcome is known as Hydra runs one."""
         return self._context.run_job(task, job.config, job.settings)
+
+    def _still_there(self, done: int, jobs: int) -> None:
+        """Raise OSError if the directory of the sweep was taken away: nobody wants it made anew."""
+        own = lock.held(self._directory)
+        if own is not None and own.lost():
+            raise ValueError(
+                f"{self._directory} was removed or replaced while its sweep went on: stopped when {done} of "
+                f"{jobs} jobs were done, and those are lost."
+            )
+
+    def _refuse_lost(self, jobs: Sequence[Job], returns: Mapping[int, JobReturn]) -> None:
+        """Turn jobs whose results have gone since they ended into failed ones."""
+        self._still_there(len(returns), len(jobs))
+        for job in jobs:
+            ended = returns[job.num]
+            complete = self._task is execute and ended.status == JobStatus.COMPLETED
+            if complete and not (job.directory / METRICS).exists():
+                error = ValueError(f"the results of {job.name} are not in {job.directory} any more")
+                sys.stderr.write(f"{job.name} failed: {error}\n")
+                ended.status, ended.return_value = JobStatus.FAILED, error
 
     def _sweep_logging(self) -> None:
         """Send the log to the sweep's own handlers, of which the terminal is none where Python asks."""
@@ -181,8 +206,11 @@ class Launch:
         found: dict[int, JobReturn] = {}
         if not records.resumed(self._context.master):
             return found
+        anyway = records.resumed_anyway(self._context.master)
         for job in jobs:
-            metrics = records.metrics_of(job.directory, job.overrides)
+            choices = job.config.hydra.runtime.choices
+            record = records.RunRecord(job.settings, choices, job.overrides, compiler())
+            metrics = record.finished(job.directory, anyway=anyway)
             if metrics is not None:
                 ended = JobReturn(overrides=job.overrides, status=JobStatus.COMPLETED)
                 ended.return_value = objective(self._context.master, metrics)

@@ -3,62 +3,120 @@
 from __future__ import annotations
 
 import os
+import re
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 from .. import __version__
 from ..results import run_record as records
+from ..results.untrusted import visible
 from .hydra_compat import overrides_in
 
 _RESUME = "sweep.resume="
-_NOT_TAKEN_OVER = ("hydra.mode", "hydra.sweep.dir", "sweep.resume")
+_ANYWAY = "sweep.resume_anyway=true"
+_YES = "--yes"
+_NOT_TAKEN_OVER = ("hydra.mode", "hydra.sweep.dir", "sweep.resume", "sweep.resume_anyway")
+_HARMLESS = re.compile(
+    r"hydra/launcher=(batched|basic|joblib)|hydra/sweeper=(basic|optuna)|hydra\.mode=\w+|hydra\.verbose=\w+"
+    r"|hydra\.launcher\.(executor|workers|batch|n_jobs)=\w+"
+    r"|hydra\.launcher\.submitit\.(timeout_min|mem_gb|nodes|cpus_per_task|gpus_per_node|cluster)=\w+"
+    r"|\+*hydra\.launcher\.submitit\.slurm_(partition|account|qos|time|array_parallelism)=[\w-]+"
+    r"|hydra\.launcher\.ray\.num_cpus=\d+|hydra\.sweeper\.(n_trials|n_jobs|sampler\.seed)=\d+"
+    r"|hydra\.sweeper\.direction=\w+|hydra\.sweep\.dir=.*|hydra\.run\.dir=.*"
+)
+"""Hydra's lines that can only say where and how often jobs run."""
+_MAY_RUN = re.compile(r"_[a-z]+_\b|\$\{|\\|\bpath\b|\btask\b|\btracker\b|hydra|@|=.*(/|\.\.)")
+"""What a line about the jobs needs in order to name code, another file or the environment."""
 
 
 def command_line(argv: Sequence[str]) -> list[str]:
     """Return the arguments with those of the sweep that `sweep.resume` names, if it names one.
 
+    Lines of the sweep that may run code of somebody else are shown, and need a yes at the terminal, `--yes`,
+    or to be repeated on the command line.
+
     Raises:
-        ValueError: if no sweep is there, or it is one of other settings or of another version.
+        ValueError: if no sweep is there, one of other settings or of another version is, or nobody said yes.
     """
     given = overrides_in(argv)
     resumed = [line.removeprefix(_RESUME) for line in given if line.startswith(_RESUME)]
     if not resumed or resumed[-1] == "null":
         return list(argv)
     directory = Path(resumed[-1].strip("'\""))
-    typed, hydra = recorded(directory)
+    typed, hydra = recorded(directory, anyway=_ANYWAY in given)
     own = [line for line in given if not _is_hydra(line) and line in records.own([line])]
     if own and sorted(own) != sorted(typed):
         raise ValueError(_difference(directory, own, typed))
     about_sweep = [line for line in given if line not in records.own([line]) and not line.startswith(_RESUME)]
+    hydra = _merged(hydra, [*about_sweep, *filter(_is_hydra, given)])
+    foreign = [line for line in (*typed, *hydra) if line not in given and may_run_code(line)]
+    if foreign and _YES not in argv:
+        _confirm(directory, foreign)
     place = records.quoted(os.path.normpath(directory))
-    flags = [word for word in argv if word not in given]
+    flags = [word for word in argv if word not in given and word != _YES]
     return [
         *(flags if {"-m", "--multirun"} & set(flags) else [*flags, "--multirun"]),
         *typed,
-        *_merged(hydra, [*about_sweep, *filter(_is_hydra, given)]),
+        *hydra,
+        *filter(_ANYWAY.__eq__, given),
         f"hydra.sweep.dir={place}",
         f"{_RESUME}{place}",
     ]
 
 
-def recorded(directory: Path) -> tuple[list[str], list[str]]:
+def may_run_code(line: str) -> bool:
+    """Return whether a line that somebody else has written may lead to code, files or variables of theirs."""
+    if _is_hydra(line):
+        return _HARMLESS.fullmatch(line) is None
+    return _MAY_RUN.search(line) is not None
+
+
+def _confirm(directory: Path, foreign: Sequence[str]) -> None:
+    """Ask at the terminal.
+
+    Raises:
+        ValueError: if there is no terminal, or the answer is not yes.
+    """
+    shown = "".join(f"\n  {visible(line)}" for line in foreign)
+    if sys.stdin is not None and sys.stdin.isatty() and sys.stderr.isatty():
+        sys.stderr.write(f"staf: {directory} was started with lines that may run code:{shown}\n")
+        sys.stderr.write("Run them? [y/N] ")
+        sys.stderr.flush()
+        if sys.stdin.readline().strip().lower() in ("y", "yes"):
+            return
+    raise ValueError(
+        f"{directory} was started with lines that may run code of whoever started it:{shown}\n"
+        f"If you know them, repeat them, or add {_YES}."
+    )
+
+
+def recorded(directory: Path, *, anyway: bool = False) -> tuple[list[str], list[str]]:
     """Return the overrides of a sweep as they were typed: the jobs' own, and Hydra's.
+
+    Args:
+        directory: of the sweep.
+        anyway: whether one of another version will do.
 
     Raises:
         ValueError: if no sweep of this version is there.
     """
     record = records.read(directory / records.SWEEP)
-    if record is None or "overrides" not in record:
+    if record is None or not _texts(record.get("overrides")) or not _texts(record.get("hydra")):
         raise ValueError(
             f"`staf sweep.resume=...` must be the directory of a sweep, with its {records.SWEEP}; "
             f"got {str(directory)!r}."
         )
-    if record.get("version") != __version__:
+    if record.get("version") != __version__ and not anyway:
         raise ValueError(
             f"`staf sweep.resume=...` must be a sweep of this version ({__version__}), or its rows would not "
             f"be comparable; {directory} was written by {record.get('version')}."
         )
     return record["overrides"], record["hydra"]
+
+
+def _texts(value: object) -> bool:
+    return isinstance(value, list) and all(isinstance(line, str) for line in value)
 
 
 def _is_hydra(line: str) -> bool:

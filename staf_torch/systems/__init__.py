@@ -5,6 +5,7 @@ from .base import Linearisation as Linearisation
 from .base import Plant as Plant
 from .base import Units as Units
 from .bounds import Bounds as Bounds
+from .cart_pole import CartPole as CartPole
 from .integrators import runge_kutta_step as runge_kutta_step
 from .integrators import simulate as simulate
 from .integrators import trajectory as trajectory
@@ -14,4 +15,6 @@ from .pendulum import Pendulum as Pendulum
 from .planar_quadrotor import PlanarQuadrotor as PlanarQuadrotor
 from .three_state import ThreeState as ThreeState
 from .two_state import TwoState as TwoState
+from .user_plants import RatePlant as RatePlant
+from .user_plants import StepPlant as StepPlant
 from .van_der_pol import VanDerPol as VanDerPol

@@ -48,6 +48,11 @@ class Plant(nn.Module, abc.ABC):
     bounds: Bounds | None = None
     period: float | None = None
 
+    @property
+    def traceable(self) -> bool:
+        """Whether the plant is torch all through, so that it can be differentiated and compiled."""
+        return True
+
     def equilibrium(self) -> Tensor:
         """The state at which the plant rests under `resting_input`, (n,): zeros unless it says else."""
         return torch.zeros(self._size(), dtype=torch.float64)

@@ -6,14 +6,14 @@ import math
 from collections.abc import Sequence
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from ..numerics.checks import fail
 
 Limit = float | Sequence[float] | Tensor | None
 
 
-class Bounds(nn.Module):
+class Bounds:
     """The box low <= u <= high, in the units of the inputs.
 
     Example:
@@ -31,11 +31,9 @@ class Bounds(nn.Module):
     """
 
     def __init__(self, low: Limit, high: Limit, inputs: int) -> None:
-        super().__init__()
-        self.register_buffer("low", _limit("low", low, -math.inf, inputs))
-        self.register_buffer("high", _limit("high", high, math.inf, inputs))
-        self.low: Tensor
-        self.high: Tensor
+        # Not a module: a class of plants may have its bounds as a class attribute.
+        self.low = _limit("low", low, -math.inf, inputs)  # (m,)
+        self.high = _limit("high", high, math.inf, inputs)  # (m,)
         if not bool((self.low < self.high).all()):
             raise fail("Bounds", "low", f"must be below high, {self.high.tolist()}", self.low.tolist())
 
@@ -66,8 +64,8 @@ class Bounds(nn.Module):
         """The box of u' - u for every admissible u': the bounds of a deviation from u (m,)."""
         return Bounds(self.low - u, self.high - u, len(self.low))
 
-    def extra_repr(self) -> str:
-        return f"low={self.low.tolist()}, high={self.high.tolist()}"
+    def __repr__(self) -> str:
+        return f"Bounds(low={self.low.tolist()}, high={self.high.tolist()})"
 
 
 def _limit(name: str, given: Limit, none: float, inputs: int) -> Tensor:

@@ -139,7 +139,24 @@ def tabulate(found: Collection, layout: Layout | None = None) -> Table:
     else:
         table = _one_a_run(found, metrics)
     rows = _sorted(table, layout.sort)
-    return dataclasses.replace(table, rows=tuple(rows), style=layout.style)
+    notes = (*table.notes, *_without_effect(found))
+    return dataclasses.replace(table, rows=tuple(rows), notes=notes, style=layout.style)
+
+
+def _without_effect(found: Collection) -> Iterator[str]:
+    """One note for each swept setting that changed no metric, all others being equal."""
+    runs = [(run, frozenset(run.metrics.items())) for run in found.rows if run.metrics]
+    values = {key: [identity(run.value(key)) for run, _ in runs] for key in found.swept}
+    for key in found.swept:
+        groups: dict[tuple[str, ...], tuple[set[str], set[frozenset[tuple[str, float | None]]]]] = {}
+        others = [values[other] for other in found.swept if other != key]
+        for value, (_, metrics), *rest in zip(values[key], runs, *others, strict=True):
+            here, there = groups.setdefault(tuple(rest), (set(), set()))
+            here.add(value)
+            there.add(metrics)
+        compared = [group for group in groups.values() if len(group[0]) > 1]
+        if compared and all(len(metrics) == 1 for _, metrics in compared):
+            yield f"`{key}` was swept and changed no metric in any row."
 
 
 def _check(found: Collection, layout: Layout) -> None:
@@ -185,7 +202,9 @@ def _one_a_run(found: Collection, metrics: Sequence[str]) -> Table:
 
 
 def _grouped(found: Collection, layout: Layout, metrics: Sequence[str]) -> Table:
+    # Runs of different settings or builds never share a row, whatever was asked for.
     keys = layout.rows or tuple(key for key in found.swept if key not in (*layout.columns, _SEED))
+    keys += tuple(key for key in found.unswept if key not in (*keys, *layout.columns))
     groups = _groups(found.rows, keys)
     places = {place(run, layout.columns): [run.value(key) for key in layout.columns] for run in found.rows}
     spread = sorted(places, key=lambda at: [rank(value) for value in places[at]])
@@ -231,10 +250,13 @@ def as_text(value: Value) -> str:
 def _row(runs: Sequence[Run], keys: Sequence[str], spread: Sequence[str], columns: Sequence[Column]) -> Row:
     cells: dict[str, Value] = {key: runs[0].value(key) for key in keys}
     reasons: dict[str, str] = {}
+    places: dict[str, list[Run]] = {}
+    for run in runs:
+        places.setdefault(place(run, spread), []).append(run)
     for column in columns:
         if column.metric is None or column.statistic is None:
             continue
-        here = [run for run in runs if place(run, spread) == column.at]
+        here = places.get(column.at, [])
         numbers = [n for run in here if (n := run.metrics.get(column.metric)) is not None]
         if column.statistic in ("n", "failed"):
             cells[column.name] = len(numbers) if column.statistic == "n" else len(here) - len(numbers)

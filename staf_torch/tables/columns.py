@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from json import dumps
@@ -64,7 +65,7 @@ class PrintedColumn:
     cells: tuple[Number | str | None, ...]
     best: frozenset[int] = frozenset()  # rows
 
-    @property
+    @functools.cached_property
     def numeric(self) -> bool:
         """Whether no cell is a text."""
         return not any(isinstance(cell, str) for cell in self.cells)
@@ -108,8 +109,11 @@ def _aggregated(columns: Sequence[Column], rows: Sequence[Row], style: Style) ->
     """One column for each metric, place and statistic; the spread joins the mean."""
     runs = [row.cells[column.name] for row in rows for column in columns if column.statistic == "n"]
     single = all(count in (0, 1) for count in runs)
-    for metric, at in dict.fromkeys((c.metric, c.at) for c in columns if c.metric is not None):
-        here = {c.statistic: c for c in columns if (c.metric, c.at) == (metric, at)}
+    places: dict[tuple[str, str], dict[str | None, Column]] = {}
+    for column in columns:
+        if column.metric is not None:
+            places.setdefault((column.metric, column.at), {})[column.statistic] = column
+    for (metric, at), here in places.items():
         spread = next((here[name] for name in _SPREADS if name in here and "mean" in here), None)
         shown = [c for name, c in here.items() if name not in _COUNTS and c is not spread]
         for column in shown:

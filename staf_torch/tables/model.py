@@ -9,11 +9,13 @@ import importlib
 import io
 import itertools
 import math
+import re
 from collections.abc import Mapping, Sequence
 from json import dumps
 from typing import Any
 
 from ..results.reader import Value
+from ..results.untrusted import visible
 from .columns import Column, Number, PrintedColumn, Row, Style, printed, show, significant
 
 _SPECIAL = {
@@ -39,6 +41,8 @@ _SPECIAL = {
     "*": "{*}",
     "±": r"\ensuremath{\pm}",
 }
+_LINK = re.compile(r"\]\s*[(\[:]")
+_BLOCK = re.compile(r"^(?:#{1,6} |> ?|[-+=~]{3,}|[-+] )")  # of Markdown, at the begin of a line
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,14 +95,14 @@ class Table:
     def csv(self) -> str:
         """Return the table as CSV: `float` of a cell gives the number back to the last bit.
 
-        Lists are JSON, and what is missing is an empty cell.
+        Lists are JSON, and what is missing is an empty cell. An apostrophe goes before a text that
+        a spreadsheet would take for a formula.
         """
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
-        writer.writerow(self.names)
+        writer.writerow(map(_csv_cell, self.names))
         for row in self.rows:
-            cells = [row.cells.get(name) for name in self.names]
-            writer.writerow([dumps(cell) if isinstance(cell, list | bool) else cell for cell in cells])
+            writer.writerow([_csv_cell(row.cells.get(name)) for name in self.names])
         return text.getvalue()
 
     def _shown(self, column: PrintedColumn, row: int) -> str:
@@ -109,11 +113,29 @@ class Table:
         return f"**{text}**" if row in column.best else text
 
 
+def _csv_cell(value: Value) -> Value:
+    if isinstance(value, list | bool):
+        return dumps(value)
+    formula = isinstance(value, str) and value.startswith(("=", "+", "-", "@", "\t", "\r", "|", "%"))
+    return f"'{value}" if formula else value
+
+
 def _escaped(text: str) -> str:
-    """On one line, without what would end the cell, begin a tag, or stay open; code in `backquotes` stays."""
-    code = "`" in text and text.count("`") % 2 == 0
-    special = "|<" if code else "\\|<`*" if text.count("*") > 1 else "\\|<`"
-    return "".join(f"\\{c}" if c in special else c for c in " ".join(text.split()))
+    """On one line, without what would end the cell, begin a tag, a link or an image, or stay open.
+
+    Code in `single backquotes` stays.
+    """
+    text = " ".join(visible(text).split())
+    parts = text.split("`")
+    code = len(parts) % 2 == 1 and "``" not in text  # closed, and no other number of backquotes opens it
+    stars = "*" if text.count("*") > 1 else ""
+    links = "[]" if _LINK.search(text) else ""
+    outside = f"\\|<{stars}{links}"
+    found = [
+        "".join(f"\\{c}" if c in ("|" if inside else outside) else c for c in part)
+        for inside, part in ((bool(code and n % 2), part) for n, part in enumerate(parts))
+    ]
+    return _BLOCK.sub(r"\\\g<0>", ("`" if code else "\\`").join(found))
 
 
 def latex_text(table: Table) -> str:
@@ -127,7 +149,7 @@ def latex_text(table: Table) -> str:
     rows = range(len(table.rows))
     lines += [" & ".join(_cell(column, row, digits) for column in columns) + r" \\" for row in rows]
     lines += [r"\bottomrule", r"\end{tabular}"]
-    lines += ["% " + " ".join(note.split()) for note in table.notes]
+    lines += ["% " + " ".join(visible(note).split()) for note in table.notes]
     return "\n".join(lines) + "\n"
 
 
@@ -173,7 +195,7 @@ def _power(text: str) -> str:
 
 def escape(text: str) -> str:
     """Return what makes LaTeX print a text as it is, on one line."""
-    return "".join(_SPECIAL.get(character, character) for character in " ".join(text.split()))
+    return "".join(_SPECIAL.get(character, character) for character in " ".join(visible(text).split()))
 
 
 def json_text(table: Table) -> str:

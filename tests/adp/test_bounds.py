@@ -70,6 +70,7 @@ def test_bounds_of_the_plant_serve_where_the_cost_states_none() -> None:
     plant = Two()
     plant.bounds = systems.Bounds(-1.0, [0.5, 2.0], 2)
     free, own = adp.QuadraticCost(1.0, 1.0, 2, 2), adp.QuadraticCost(1.0, 1.0, 2, 2, low=-3.0, high=3.0)
+    assert isinstance(plant.bounds, systems.Bounds)
     assert adp.LQR(plant, free).cost.bounds is plant.bounds
     assert adp.LQR(plant, own).cost.bounds is own.bounds
     assert free.bounds is None

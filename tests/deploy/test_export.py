@@ -106,13 +106,13 @@ def test_foreign_code_in_the_settings_is_not_run(target: str, chase: Path) -> No
     cfg = OmegaConf.load(chase / ".hydra" / "config.yaml")
     cfg.target = {"_target_": target, "path": "os.getcwd"}
     OmegaConf.save(cfg, chase / ".hydra" / "config.yaml")
-    with pytest.raises(ValueError, match=r"run code of your own .*: add --trust"):
+    with pytest.raises(ValueError, match=r"which may run code of somebody else: add --trust"):
         export(chase, "pt2")
 
 
 def test_pickled_history_is_refused(chase: Path) -> None:
     np.savez(chase / "history.npz", state=np.array([{"a": 1}], dtype=object))
-    with pytest.raises(ValueError, match="cannot be read: Object arrays cannot be loaded"):
+    with pytest.raises(ValueError, match="cannot be read: state holds no numbers"):
         export(chase, "pt2")
 
 

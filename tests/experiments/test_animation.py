@@ -1,26 +1,71 @@
-"""`staf animation=true`: the chase as a GIF."""
+"""`staf animation=...`: the first trajectory in motion, as a GIF or as a page."""
 
 from __future__ import annotations
 
+import base64
+import io
+import json
+import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 from PIL import Image
 
 import staf_torch
 
-SHORT = ("duration=0.05", "settle_time=0", "figures=false", "history=false", "animation=true")
+BARE = ("figures=false", "history=false")
+SHORT = ("duration=0.02", "settle_time=0", *BARE)
+LINE = ("system=linear", "system.matrix=[[-1.0]]")
+SPACE = ("target=quadratic", "system=three_state", "initial_state=[1.0,0.0,0.0]", "centers=simplex")
 
 
-def test_an_animation_is_a_gif_with_a_frame_a_time(tmp_path: Path) -> None:
-    found = staf_torch.run(*SHORT, directory=tmp_path / "run")
-    with Image.open(found.directory / "figures" / "chase.gif") as picture:
-        assert picture.n_frames == 6
+def drawn(directory: Path, *settings: str) -> Path:
+    """The one file that an animated run left in its figures."""
+    (path,) = (staf_torch.run(*settings, directory=directory).directory / "figures").iterdir()
+    return path
+
+
+@pytest.mark.parametrize("settings", [(), SPACE], ids=["plane", "space"])
+def test_an_animation_has_a_frame_a_time_and_what_moves_moves(
+    settings: tuple[str, ...], tmp_path: Path
+) -> None:
+    path = drawn(tmp_path / "run", *SHORT, *settings, "animation=true")
+    assert path.name == "chase.gif"
+    with Image.open(path) as picture:
+        assert picture.n_frames == 3
         assert picture.size[0] > 500
-    assert [path.name for path in (found.directory / "figures").iterdir()] == ["chase.gif"]
+        first = np.asarray(picture.convert("RGB"))
+        picture.seek(2)
+        last = np.asarray(picture.convert("RGB"))
+    assert 20 < (first != last).any(-1).sum() < 0.2 * first[..., 0].size
 
 
-def test_a_state_outside_the_plane_is_refused(tmp_path: Path) -> None:
-    space = ("system=three_state", "initial_state=[1.0,0.0,0.0]", "centers=simplex")
-    with pytest.raises(ValueError, match=r"`staf animation=...` needs a state in the plane, not in R\^3"):
-        staf_torch.run(*SHORT, *space, directory=tmp_path / "run")
+def test_a_page_holds_its_frames_and_asks_no_server(tmp_path: Path) -> None:
+    text = drawn(tmp_path / "run", *SHORT, "animation=html").read_text()
+    assert "http" not in text
+    frames = json.loads(re.search(r"const pictures = (.*);", text)[1])
+    assert len(frames) == 3
+    whole, *changes = (Image.open(io.BytesIO(base64.b64decode(frame))).convert("RGBA") for frame in frames)
+    assert whole.getextrema()[3][0] >= 254  # opaque, but for the palette's rounding
+    assert all(picture.getextrema()[3] == (0, 255) for picture in changes)  # mostly transparent
+    assert max(map(len, frames[1:])) < 0.3 * len(frames[0])
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ((*SHORT, "animation=mp4"), r"`staf animation=...` must be one of True, False, 'gif', 'html'"),
+        (
+            ("experiment=laws", "animation=true"),
+            r"`staf animation=...` must be false for the task laws, which has no animation; got True",
+        ),
+        (
+            (*SHORT, "animation=true", "initial_state=[1.0]", "centers=simplex", *LINE),
+            r"`staf animation=...` needs a state of two coordinates or more; got 1",
+        ),
+    ],
+)
+def test_what_cannot_be_animated_is_refused(settings: tuple[str, ...], words: str, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=words):
+        staf_torch.run(*settings, directory=tmp_path / "run")

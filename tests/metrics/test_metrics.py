@@ -16,8 +16,8 @@ from staf_torch import systems
 from staf_torch.approximation.conditioning import sup_error
 from staf_torch.engine import ChaseResult, chase_pieces
 from staf_torch.metrics import ball_error as ball_errors
-from staf_torch.metrics.ball_error import ball_error, gradient_error
-from staf_torch.metrics.chase import ChaseMetrics
+from staf_torch.metrics.ball_error import StateErrorPass
+from staf_torch.metrics.chase import ChaseMetrics, Member
 from staf_torch.numerics.linalg import condition_number
 from staf_torch.optim import SteepestDescent
 from staf_torch.targets import Paper
@@ -37,6 +37,7 @@ KEYS = {
     "contraction_violations",
     "diverged_fraction",
 }
+MOVING = ("exponential", "matern52")  # a graded and a Newton space, at a moving radius
 DT = 0.05
 STARTS = tensor([[1.0, 0.0], [0.3, 0.9], [-1.2, 0.4]])
 
@@ -157,7 +158,7 @@ def test_ball_error_is_close_to_a_dense_supremum(radius: object, dim: int) -> No
         return (y.sum(-1) + 0.3).exp()
 
     coefficients = in_kernels(basis, x, target)
-    found = ball_error(basis, target, x, coefficients)
+    found = StateErrorPass(basis, target)(x, coefficients, coefficients).ball_error
     inside = torch.randn(20_000, dim).double()
     inside /= inside.norm(dim=-1, keepdim=True).clamp(min=1.0)
     inside[::2] /= inside[::2].norm(dim=-1, keepdim=True)
@@ -168,17 +169,48 @@ def test_ball_error_is_close_to_a_dense_supremum(radius: object, dim: int) -> No
     assert (found >= dense * 0.7).all()
 
 
-@pytest.mark.parametrize("radius", [0.1, st.StateRadius(0.2, 0.1)])
-@over(KERNELS)
-def test_ball_floor_is_that_of_the_local_basis_in_pieces_of_any_size(
+@pytest.mark.parametrize(
+    ("name", "radius"),
+    [*((name, 0.2) for name in KERNELS), *((name, st.StateRadius(0.2, 0.1)) for name in MOVING)],
+)
+def test_errors_around_states_in_pieces_of_any_size_and_compiled(
     name: str, radius: object, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    basis, x = basis_of(name, 6, radius), uniform(4, 9, 2)
-    expected = sup_error(basis, x, Paper(), 97)
-    floor = ball_errors.BallFloor(basis, Paper(), 97)
-    torch.testing.assert_close(floor(x), expected, rtol=1e-9, atol=1e-12)
+    basis, x = basis_of(name, 3, radius), uniform(4, 9, 2)
+    coefficients = (1 + 0.1 * uniform(4, 9, 3)) * in_kernels(basis, x, Paper())
+    ideal = basis.ideal_weights(x, Paper())
+    found = StateErrorPass(basis, Paper(), compile=False)(x, coefficients, ideal)
+    torch.testing.assert_close(
+        found.ball_floor_error, sup_error(basis, x, Paper(), 97), rtol=1e-9, atol=1e-12
+    )
+    kappa = condition_number(basis.gram_structure(x).scaled()).expand(4, 9)
+    torch.testing.assert_close(found.condition_number, kappa, rtol=0.0, atol=0.0)
+    compiled = StateErrorPass(basis, Paper(), compile=True)
+    parts = compiled(x, coefficients, ideal)
+    assert compiled.compiled
     monkeypatch.setattr(ball_errors, "_BLOCK", 1)
-    torch.testing.assert_close(floor(x), expected, rtol=1e-9, atol=1e-12)
+    single = StateErrorPass(basis, Paper(), compile=False)(x, coefficients, ideal)
+    for errors in (parts, single):
+        for label, got, wanted in zip(found._fields, errors, found, strict=True):
+            # Eigenvalues are exact to eps of the largest: the smallest to eps kappa of itself.
+            bound = 1e-14 * float(kappa.max()) if label == "condition_number" else 1e-9
+            torch.testing.assert_close(got, wanted, rtol=bound, atol=1e-11, msg=label)
+
+
+def test_a_state_that_is_not_finite_spoils_no_other_in_the_compiled_pass() -> None:
+    basis, x = basis_of("exponential", 3), uniform(1, 20, 2)
+    coefficients = in_kernels(basis, x, Paper())
+    errors = StateErrorPass(basis, Paper(), compile=True)
+    clean = errors(x, coefficients, coefficients)
+    x[0, 3], coefficients[0, 4] = torch.nan, torch.inf
+    dirty = errors(x, coefficients, coefficients)
+    assert errors.compiled
+    rest = [k for k in range(20) if k not in (3, 4)]
+    for one, other in zip(clean, dirty, strict=True):
+        assert torch.equal(one[:, rest], other[:, rest])
+        assert torch.isfinite(other[:, rest]).all()
+    assert not torch.isfinite(dirty.ball_error[0, 3:5]).any()
+    assert dirty.condition_number[0, 3].isnan()
 
 
 @over(KERNELS)
@@ -188,16 +220,31 @@ def test_gradient_error_is_that_of_the_partial_gradient(name: str) -> None:
     staf = st.StaF(basis, (4,)).fit_(x, Paper())
     exact = torch.func.grad(lambda at: Paper()(at).sum())(x)
     expected = (staf.gradient(x.unsqueeze(-2)).squeeze(-2) - exact).norm(dim=-1)
-    torch.testing.assert_close(
-        gradient_error(basis, Paper(), x, coefficients), expected, rtol=1e-7, atol=1e-8
-    )
+    found = StateErrorPass(basis, Paper())(x, coefficients, coefficients).gradient_error
+    torch.testing.assert_close(found, expected, rtol=1e-7, atol=1e-8)
+
+
+def test_blocks_of_rows_give_the_metrics_of_the_whole_batch() -> None:
+    basis, law = basis_of("exponential", 3), SteepestDescent()
+    at = states()
+    at[1, 60:] = torch.nan
+    members = [Member(1, DT, 1.0), Member(2, DT, 2.0)]
+    whole = ChaseMetrics(basis, Paper(), law, inner_steps=10, members=members)
+    whole.add(st.chase(at, basis, Paper(), law, inner_steps=10))
+    blocks = ChaseMetrics(basis, Paper(), law, inner_steps=10, members=members)
+    for k in range(3):
+        if k:
+            blocks.next_rows()
+        for result in chase_pieces(at[k : k + 1].split(41, dim=1), basis, Paper(), law, inner_steps=10):
+            blocks.add(result)
+    for one, other in zip(whole.summaries(), blocks.summaries(), strict=True):
+        assert one == pytest.approx(other, rel=1e-12)
+    assert any(found["settling_time"] for found in whole.summaries())
+    assert whole.summaries()[1]["diverged_fraction"] == 0.5
 
 
 def test_window_of_the_paper_starts_at_its_settling_time() -> None:
     """5.0 / 0.05 is 100.00000000000001 in floating point on some steps: the first time must not move."""
     for dt in (0.05, 0.01, 0.001, 0.1, 0.3):
-        metrics = ChaseMetrics(
-            basis_of("gaussian", 3), Paper(), SteepestDescent(), inner_steps=1, dt=dt, settle_time=30 * dt
-        )
-        assert metrics._first == 30
+        assert Member(1, dt, 30 * dt).first == 30
         assert math.ceil(30 * dt / dt - 1e-9) == 30

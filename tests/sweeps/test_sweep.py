@@ -216,8 +216,9 @@ def test_a_resumed_sweep_keeps_hydras_settings_but_those_that_change(tmp_path: P
 def test_a_directory_with_another_run_in_it_is_named(tmp_path: Path) -> None:
     about = {"version": records.__version__, "overrides": ["seed=1"], "status": "completed"}
     (tmp_path / "run.json").write_text(json.dumps(about))
+    run = records.RunRecord(OmegaConf.create({"seed": 2}), {}, ["seed=2", "sweep.resume=here"])
     with pytest.raises(ValueError, match="holds the run 'seed=1', where this sweep has 'seed=2'"):
-        records.metrics_of(tmp_path, ["seed=2", "sweep.resume=here"])
+        run.finished(tmp_path)
 
 
 def test_an_unknown_swept_key_starts_nothing(place: Path) -> None:

@@ -100,7 +100,7 @@ def test_a_lost_worker_fails_its_batch_alone() -> None:
     assert found[0].outcomes == [Written({}, [(0, "0")])]
     assert found[2].outcomes == [Written({}, [(0, "2")])]
     assert [words(outcome) for outcome in found[1].outcomes] == [
-        "the worker was lost (OSError: no more memory)"
+        "the worker was lost twice (OSError: no more memory)"
     ] * 2
 
 

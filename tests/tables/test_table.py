@@ -214,7 +214,8 @@ def test_latex_has_booktabs_two_lines_of_headings_and_powers_of_ten(found: Colle
     assert len(body) == 4
     assert all(line.endswith(r" \\") and line.count(" & ") == 6 for line in body)
     assert r"\boldmath\textbf{$0.00064 \pm 1.5 \times 10^{-5}$}" in body[0]
-    assert lines[-1].startswith("% 12 of 36 failed")
+    assert lines[-2].startswith("% 12 of 36 failed")
+    assert lines[-1] == "% `kernel` was swept and changed no metric in any row."
 
 
 def test_a_setting_with_anything_in_it_stays_in_its_cell(tmp_path: Path) -> None:

@@ -1,0 +1,300 @@
+"""A value and a policy for a whole box of states: a memory of local models along optimal trajectories."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from ..lanes import Program, scan
+from ..numerics.checks import fail, integer, positive_real, trailing, vector
+from .sampled_problem import SampledProblem
+from .trajectory_optimisation import Reference, Trajectories
+
+_TOGETHER = 4096  # candidates rolled out at once
+_REACH = 0.3  # of the region: a rollout that ends further from what it follows has lost it
+_ARRIVED = 0.01  # share of a trajectory's cost that may be the terminal value: else it did not reach the goal
+
+
+class Choice(NamedTuple):
+    """What the memory knows at states x."""
+
+    control: Tensor  # u, (B, m)
+    value: Tensor  # cost of the best candidate, (B,)
+    entry: Tensor  # its row in the memory, (B,) int64
+    covered: Tensor  # whether it ends near what it follows, (B,) bool
+
+
+class GlobalValue(nn.Module):
+    """V(x) = min_j [cost of following trajectory j from its state nearest to x, for ``lookahead`` steps,
+    + V_j at the end],  V_j(y) = v_j + g_j'd + d'H_j d / 2,  d = y - x_j.
+
+    The memory keeps a model at every state of a library of optimal trajectories: value v, gradient g,
+    curvature H, control and feedback. At a state x the nearest of them are candidates, and so is the linear
+    feedback of the goal. Each is followed from x itself by its own time-varying feedback, within the bounds,
+    and pays what the plant then costs; the model where it ends adds the rest. The control is the first one of
+    the best candidate. Nothing is optimised at run time. A candidate that ends further than 0.3 of the region
+    from what it follows is worth the largest remembered value more.
+
+    Distances are in units of the region, periodic coordinates the shorter way around.
+
+    Example:
+        >>> memory = adp.learn_global_value(problem, region=[math.pi, 8.0], steps=150)
+        >>> memory(x)  # u, (B, m)
+        >>> memory.value(x), memory.bellman_residual(x)
+
+    Args:
+        problem: plant, cost and bounds in steps.
+        library: trajectories with their models, as `BoxDDP.solve` returns them. Those that do not arrive at
+            the goal are left out.
+        region: half the width of the box of states, (n,), positive.
+        candidates: followed from every state, at least 1.
+        lookahead: steps, at least 1.
+        spacing: least distance between two models of one trajectory that are searched, positive.
+
+    Raises:
+        ValueError: if an argument breaks its rule, or no trajectory arrives.
+
+    Source: Atkeson, "Using local trajectory optimizers to speed up global optimization in dynamic
+    programming", NIPS 6 (1993), for libraries of trajectories with local models; the memory as the paper's
+    conclusion names it. `staf_torch.online.ExperienceMemory` blends models; here a minimum is wanted, as
+    two ways around an obstacle of the value must not be averaged.
+    """
+
+    def __init__(
+        self,
+        problem: SampledProblem,
+        library: Trajectories,
+        region: Sequence[float] | Tensor,
+        *,
+        candidates: int = 48,
+        lookahead: int = 60,
+        spacing: float = 0.02,
+    ) -> None:
+        super().__init__()
+        self.problem, self.library = problem, library
+        width = region.tolist() if isinstance(region, Tensor) else list(region)
+        if min(vector("GlobalValue", "region", width, problem.dim)) <= 0:
+            raise fail("GlobalValue", "region", "must be positive", width)
+        self.lookahead = integer("GlobalValue", "lookahead", lookahead, least=1)
+        self.spacing = positive_real("GlobalValue", "spacing", spacing)
+        self.register_buffer("region", torch.tensor(width, dtype=torch.float64))
+        self.region: Tensor
+        arrives = library.value[:, -1] <= _ARRIVED * library.cost + 1e-9
+        self.arrives = arrives & torch.isfinite(library.cost)
+        if not bool(self.arrives.any()):
+            raise fail("GlobalValue", "library", "must have a trajectory that arrives at the goal", None)
+        self.length = library.control.shape[1] + lookahead + 1  # rows of a trajectory in the tables
+        self.register_buffer("plans", self._plans())  # (state, control, feedback), (N length, n + m + m n)
+        self.register_buffer("models", self._models())  # (state, v, g, H), (N length, n + 1 + n + n n)
+        self.plans: Tensor
+        self.models: Tensor
+        entries = self._searched()
+        self.register_buffer("entries", entries)  # rows that are searched, (J,)
+        self.entries: Tensor
+        self.candidates = min(integer("GlobalValue", "candidates", candidates, least=1), len(entries))
+        self._ready()
+
+    def _ready(self) -> None:
+        """Make what is not a tensor: the search tree, and the compiled rollouts."""
+        from scipy.spatial import cKDTree  # a third of a second that no other import need pay
+
+        n, h = self.problem.dim, self.lookahead
+        box = [
+            2 * torch.pi / float(w) if i in self.problem.periodic else 0.0 for i, w in enumerate(self.region)
+        ]
+        self._box, self._width = np.array(box), self.region.numpy()
+        self._goal = self.problem.goal.numpy()
+        self._rows = self.entries.numpy()
+        self._tree = cKDTree(self._scaled(self.plans[self.entries, :n].numpy()), boxsize=self._box)
+        self._windows = self.plans.unfold(0, h, 1).mT  # (N length - h + 1, h, w), a view
+        # Where every trajectory rests at the goal, under the linear feedback.
+        self._resting = int(self.arrives.nonzero()[0]) * self.length + self.length - h - 1
+        self._worst = float(self.models[self.entries, n].max())
+        self._judge = Program(
+            lambda carry, now, row: (carry, self._judged(*row)), name="a global value", copies=1
+        )
+
+    def __getstate__(self) -> dict[str, Any]:
+        dropped = dict.fromkeys(("_tree", "_windows", "_judge"))
+        return {**vars(self), **dropped}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__(state)  # type: ignore[no-untyped-call]
+        self._ready()
+
+    def forward(self, x: Tensor) -> Tensor:
+        """u: (..., n) -> (..., m)."""
+        rows = x if x.dim() == 2 else x.reshape(-1, x.shape[-1])
+        if len(rows) == 1:
+            cost, control, _ = self._followed(rows.expand(self.candidates + 1, -1), self.nearest(rows)[0])
+            u = control[int(cost.numpy().argmin())]
+        else:
+            u = self.choose(rows).control
+        return u if x.dim() == 2 else u.reshape(*x.shape[:-1], u.shape[-1])
+
+    def value(self, x: Tensor) -> Tensor:
+        """V(x): (..., n) -> (...)."""
+        trailing("GlobalValue.value", "x", x, 1, self.problem.dim)
+        return self.choose(x.reshape(-1, x.shape[-1])).value.reshape(x.shape[:-1])
+
+    def gradient(self, x: Tensor) -> Tensor:
+        """g_j + H_j d of the model that the best candidate starts at: (..., n) -> (..., n)."""
+        rows, n = x.reshape(-1, x.shape[-1]), self.problem.dim
+        entry = self.choose(rows).entry
+        model = self.models[entry]
+        d = self.problem.offset(rows, self.plans[entry, :n])
+        _, _, gradient, curvature = model.split((n, 1, n, n * n), dim=-1)
+        slope = gradient + (curvature.unflatten(-1, (n, n)) * d.unsqueeze(-2)).sum(-1)
+        found: Tensor = slope.reshape(x.shape)
+        return found
+
+    def bellman_residual(self, x: Tensor) -> Tensor:
+        """(min_u [l(x, u) + V(F(x, u))] - V(x)) / V(x) over the policy's u and the corners of the bounds.
+
+        Near 0 where the memory knows the optimum; negative where one step of dynamic programming would
+        improve V, and so V is too high at x or too low after it.
+
+        Args:
+            x: (B, n), not the goal.
+        """
+        found = self.choose(x)
+        best = torch.full_like(found.value, torch.inf)
+        for u in (found.control, *self.problem.levels().unsqueeze(1)):
+            after, paid = self.problem.advance(x, u.expand(len(x), -1))
+            best = torch.minimum(best, paid + self.value(after))
+        return (best - found.value) / found.value
+
+    def choose(self, x: Tensor, without: Tensor | None = None) -> Choice:
+        """The best candidate at every state.
+
+        Args:
+            x: (B, n).
+            without: index of a trajectory whose models are no candidates, (B,) int64.
+        """
+        entries = self.nearest(x, without)
+        with torch.no_grad():
+            cost, control, covered = self.follow(x, entries)
+        value, at = cost.min(1, keepdim=True)
+        u = control.gather(1, at.unsqueeze(-1).expand(-1, -1, control.shape[-1])).squeeze(1)
+        return Choice(u, value.squeeze(1), entries.gather(1, at).squeeze(1), covered.gather(1, at).squeeze(1))
+
+    def nearest(self, x: Tensor, without: Tensor | None = None) -> Tensor:
+        """Rows of the memory nearest to x (B, n), and last the resting one: (B, K + 1) int64."""
+        count = self.candidates if without is None else min(4 * self.candidates, len(self._rows))
+        at = self._tree.query(self._scaled(x.numpy()), count)[1].reshape(len(x), -1)
+        rows = self._rows[at]
+        if without is not None:
+            own = rows // self.length == without.numpy()[:, None]
+            rows = np.take_along_axis(rows, own.argsort(axis=1, kind="stable"), axis=1)[:, : self.candidates]
+        whole = np.empty((len(rows), rows.shape[1] + 1), dtype=np.int64)
+        whole[:, :-1], whole[:, -1] = rows, self._resting
+        return torch.from_numpy(whole)
+
+    def follow(self, x: Tensor, entries: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Cost (B, K), first control (B, K, m) and arrival (B, K) of candidates (B, K) at x (B, n)."""
+        step = max(1, _TOGETHER // (count := entries.shape[1]))
+        parts = [
+            self._followed(rows.repeat_interleave(count, 0), which.reshape(-1))
+            for rows, which in zip(x.split(step), entries.split(step), strict=True)
+        ]
+        cost, control, covered = (torch.cat(part) for part in zip(*parts, strict=True))
+        shape = entries.shape
+        return cost.view(shape), control.view(*shape, -1), covered.view(shape)
+
+    def _followed(self, x: Tensor, entries: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Cost (C, 1), first control (C, 1, m) and arrival (C, 1) of one candidate a row: (C, n), (C,)."""
+        ends = self.models.index_select(0, entries + self.lookahead)
+        found: tuple[Tensor, Tensor, Tensor]
+        _, found = self._judge((), (), (x, self._windows.index_select(0, entries), ends), steps=1)
+        return found
+
+    def replay(self, x: Tensor, entries: Tensor, steps: int) -> tuple[Tensor, Reference]:
+        """The stored control (B, T, m) to follow from x (B, n), and what it is a feedback around.
+
+        Args:
+            x: (B, n); the reference is turned by whole periods to where x is.
+            entries: rows of the memory, (B,).
+            steps: T.
+        """
+        n, m = self.problem.dim, self.problem.inputs
+        time = entries % self.length
+        ahead = (time.unsqueeze(1) + torch.arange(steps)).clamp(max=self.length - 1)
+        plan = self.plans[(entries - time).unsqueeze(1) + ahead]
+        shift = x - self.problem.offset(x, plan[:, 0, :n]) - plan[:, 0, :n]
+        state, control, feedback = plan.split((n, m, m * n), dim=-1)
+        return control, Reference(state + shift.unsqueeze(1), feedback.unflatten(-1, (m, n)))
+
+    def _judged(self, x: Tensor, window: Tensor, end: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Follow plans: (B, n), (B, H, n + m + m n), (B, n + 1 + n + n n)."""
+        n, m = self.problem.dim, self.problem.inputs
+
+        def control(x: Tensor, plan: Tensor) -> Tensor:
+            state, u, feedback = plan.split((n, m, m * n), dim=-1)
+            return self.problem.admissible(
+                u + (feedback.unflatten(-1, (m, n)) * (x - state).unsqueeze(-2)).sum(-1)
+            )
+
+        def step(now: tuple[Tensor, Tensor], plan: Tensor) -> tuple[tuple[Tensor, Tensor], tuple[()]]:
+            after, paid = self.problem.advance(now[0], control(now[0], plan))
+            return (after, now[1] + paid), ()
+
+        first = window[:, 0]
+        x = first[:, :n] + self.problem.offset(x, first[:, :n])
+        (last, paid), _ = scan(step, (x, torch.zeros_like(x[:, 0])), window)
+        state, value, gradient, curvature = end.split((n, 1, n, n * n), dim=-1)
+        d = last - state
+        bent = (curvature.unflatten(-1, (n, n)) * d.unsqueeze(-2)).sum(-1)
+        rest = value.squeeze(-1) + ((gradient + 0.5 * bent) * d).sum(-1)
+        far = (d / self.region).square().sum(-1)
+        covered = (far < _REACH**2) & torch.isfinite(paid)
+        lost = paid + value.squeeze(-1) + self._worst * (1 + far)
+        cost = torch.where(covered, paid + rest, lost)
+        return torch.where(torch.isfinite(cost), cost, torch.inf), control(x, first), covered
+
+    def _scaled(self, x: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+        """Coordinates of the search, (B, n): in units of the region, periodic ones in one period."""
+        scaled: np.ndarray[Any, Any] = (x - self._goal) / self._width
+        for i in self.problem.periodic:
+            part = scaled[:, i] % self._box[i]
+            scaled[:, i] = np.where(part < self._box[i], part, 0.0)  # rounding may bring a whole period
+        return scaled
+
+    def _plans(self) -> Tensor:
+        """What is followed: the library, and then the goal under its linear feedback."""
+        library, problem = self.library, self.problem
+        count, m = len(library.state), problem.inputs
+        hold = torch.cat(
+            (self._goals(), problem.rest.expand(count, m), (-problem.k).reshape(1, -1).expand(count, -1)), -1
+        )
+        parts = library.state[:, :-1], library.control, library.feedback.flatten(2)
+        whole = torch.cat((torch.cat(parts, dim=-1), hold.unsqueeze(1).expand(-1, self.lookahead + 1, -1)), 1)
+        return whole.flatten(0, 1)
+
+    def _models(self) -> Tensor:
+        """What is left to pay: along the library, and then at the goal."""
+        library, count, n = self.library, len(self.library.state), self.problem.dim
+        parts = library.state, library.value.unsqueeze(-1), library.gradient, library.curvature.flatten(2)
+        linear = torch.cat((torch.zeros(1 + n, dtype=torch.float64), 2 * self.problem.p.flatten()))
+        ends = torch.cat((self._goals(), linear.expand(count, -1)), dim=-1).unsqueeze(1)
+        ends = ends.expand(-1, self.lookahead + 1, -1)
+        return torch.cat((torch.cat(parts, dim=-1)[:, :-1], ends), dim=1).flatten(0, 1)
+
+    def _goals(self) -> Tensor:
+        """The goal nearest to the end of each trajectory, (N, n)."""
+        last = self.library.state[:, -1]
+        return last - self.problem.offset(last, self.problem.goal)
+
+    def _searched(self) -> Tensor:
+        """Rows that are candidates: those of trajectories that arrive, ``spacing`` apart along each."""
+        state = self.library.state[:, :-1]
+        last, keep = state[:, 0], [self.arrives]
+        for now in state.unbind(1)[1:]:
+            far = (self.problem.offset(now, last) / self.region).square().sum(-1) >= self.spacing**2
+            last = torch.where(far.unsqueeze(-1), now, last)
+            keep.append(far & self.arrives)
+        which, time = torch.stack(keep, dim=1).nonzero(as_tuple=True)
+        return which * self.length + time

@@ -1,0 +1,247 @@
+"""Optimal control in steps: a plant whose control is held for a period, its cost and its bounds."""
+
+from __future__ import annotations
+
+import functools
+import warnings
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from ..lanes import scan
+from ..numerics.angles import wrap
+from ..numerics.checks import fail, integer, positive_real, trailing
+from ..systems import Bounds, Plant
+from ..systems.bounds import Limit
+from .cost import Cost
+
+Step = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
+"""(x (B, n), u (B, m)) -> (x+ (B, n), cost of the step (B,))."""
+_RESTS = 1e-6  # of the scale of the state: how far the goal may move in a step
+
+
+class SampledProblem(nn.Module):
+    """min sum_k l(x_k, u_k) over low <= u_k <= high, with x_{k+1} = F(x_k, u_k).
+
+    Args:
+        step: maps x (B, n) and u (B, m), held for one period, to x+ (B, n) and the cost l (B,). No row sees
+            another. It is differentiated twice by `torch.func` and compiled by `lanes`.
+        dim: n.
+        inputs: m.
+        low: of u, as in `systems.Bounds`; None for none.
+        high: likewise.
+        periodic: the coordinates that are angles, in rad.
+        goal: state at which the plant rests at no cost, (n,); the origin by default.
+        rest: control that keeps it there, (m,); 0 by default.
+
+    Attributes:
+        p: P of the value d'Pd of the best linear feedback near the goal, (n, n), d = x - goal.
+        k: K of its control rest - K d, (m, n).
+
+    Raises:
+        ValueError: if an argument breaks its rule, ``step`` returns other shapes, the goal is not at rest at
+            no cost, or the linearisation there cannot be stabilised.
+    """
+
+    def __init__(
+        self,
+        step: Step,
+        *,
+        dim: int,
+        inputs: int,
+        low: Limit = None,
+        high: Limit = None,
+        periodic: Sequence[int] = (),
+        goal: Tensor | None = None,
+        rest: Tensor | None = None,
+    ) -> None:
+        super().__init__()
+        self.step = step
+        self.dim = integer("SampledProblem", "dim", dim, least=1)
+        self.inputs = integer("SampledProblem", "inputs", inputs, least=1)
+        zeros = torch.zeros(self.dim, dtype=torch.float64)
+        none = torch.zeros(self.inputs, dtype=torch.float64)
+        self.bounds = Bounds(low, high, self.inputs)
+        self.register_buffer("goal", zeros if goal is None else goal.double())
+        self.register_buffer("rest", none if rest is None else rest.double())
+        self.goal: Tensor
+        self.rest: Tensor
+        if not bool(((self.bounds.low < self.rest) & (self.rest < self.bounds.high)).all()):
+            rule = f"must lie between the bounds, {self.bounds.low.tolist()} and {self.bounds.high.tolist()}"
+            raise fail("SampledProblem", "rest", rule, self.rest.tolist())
+        if not set(periodic) <= set(range(-self.dim, self.dim)):
+            raise fail("SampledProblem", "periodic", f"must be coordinates of {self.dim}", list(periodic))
+        self.periodic = tuple(sorted({index % self.dim for index in periodic}))
+        self._check()
+        p, k = self._regulator()
+        self.register_buffer("p", p)
+        self.register_buffer("k", k)
+        self.p: Tensor
+        self.k: Tensor
+
+    @classmethod
+    def of(
+        cls, plant: Plant, cost: Cost, *, dt: float | None = None, low: Limit = None, high: Limit = None
+    ) -> SampledProblem:
+        """A plant and a cost rate, with the control held for dt.
+
+        A plant in continuous time takes one Runge-Kutta step of fourth order, and its cost with it;
+        one in discrete time pays its period times the cost rate.
+
+        Args:
+            plant: the plant.
+            cost: the cost rate, without a discount.
+            dt: s, positive; None for the period of a plant in discrete time.
+            low: of the inputs; None for those of the cost, or else of the plant.
+            high: likewise.
+
+        Raises:
+            ValueError: if an argument breaks its rule, or as in `SampledProblem`.
+        """
+        cost = cost.bounded(low, high).around(plant)
+        if cost.discount:
+            raise fail("SampledProblem.of", "cost", "must have no discount", cost.discount)
+        if plant.period is None:
+            h = positive_real("SampledProblem.of", "dt", dt)
+        elif dt is not None and dt != plant.period:
+            raise fail("SampledProblem.of", "dt", f"must be the plant's period, {plant.period} s", dt)
+
+        def held(x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+            k1, c1 = plant.motion(x, u), cost.rate(x, u)
+            x2 = x + 0.5 * h * k1
+            k2, c2 = plant.motion(x2, u), cost.rate(x2, u)
+            x3 = x + 0.5 * h * k2
+            k3, c3 = plant.motion(x3, u), cost.rate(x3, u)
+            x4 = x + h * k3
+            k4, c4 = plant.motion(x4, u), cost.rate(x4, u)
+            return x + (h / 6) * (k1 + 2 * (k2 + k3) + k4), (h / 6) * (c1 + 2 * (c2 + c3) + c4)
+
+        def stepped(x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+            assert plant.period is not None
+            return x + plant.motion(x, u), plant.period * cost.rate(x, u)
+
+        box = cost.bounds
+        return cls(
+            held if plant.period is None else stepped,
+            dim=cost.dim,
+            inputs=cost.inputs,
+            low=None if box is None else box.low,
+            high=None if box is None else box.high,
+            periodic=plant.periodic,
+            goal=cost.target,
+            rest=cost.target_input,
+        )
+
+    def advance(self, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+        """x+ and the cost of the step: (..., n), (..., m) -> (..., n), (...)."""
+        after, paid = self.step(x.reshape(-1, self.dim), u.reshape(-1, self.inputs))
+        return after.reshape(x.shape), paid.reshape(x.shape[:-1])
+
+    def offset(self, x: Tensor, center: Tensor) -> Tensor:
+        """x - center by the shorter way around: (..., n), (..., n) -> (..., n)."""
+        return wrap(x - center, self.periodic)
+
+    def terminal(self, x: Tensor) -> Tensor:
+        """d'Pd, the value of the linear feedback, d = x - goal: (..., n) -> (...)."""
+        d = self.offset(x, self.goal)
+        return ((d.unsqueeze(-2) * self.p).sum(-1) * d).sum(-1)
+
+    def linear_feedback(self, x: Tensor) -> Tensor:
+        """rest - K d within the bounds: (..., n) -> (..., m)."""
+        d = self.offset(x, self.goal)
+        return self.admissible(self.rest - (d.unsqueeze(-2) * self.k).sum(-1))
+
+    def admissible(self, u: Tensor) -> Tensor:
+        """The nearest control within the bounds: (..., m) -> (..., m)."""
+        return self.bounds.clip(u)
+
+    def levels(self) -> Tensor:
+        """Every combination of lower bound, rest and upper bound, where there are bounds: (L, m)."""
+        columns = [
+            torch.stack([each for each in (low, rest, high) if bool(torch.isfinite(each))])
+            for low, rest, high in zip(self.bounds.low, self.rest, self.bounds.high, strict=True)
+        ]
+        return torch.cartesian_prod(*columns).reshape(-1, self.inputs)
+
+    def derivatives(self, x: Tensor, u: Tensor) -> Derivatives:
+        """First and second derivatives of F and l with respect to z = (x, u): (B, n), (B, m).
+
+        Along pairs of coordinates, one after the other: a compiler gets the text of one pair.
+        """
+        _use_forward_mode()
+        z, n = torch.cat((x, u), dim=-1), self.dim
+
+        def both(z: Tensor) -> Tensor:
+            after, paid = self.step(z[:, :n], z[:, n:])
+            return torch.cat((after, paid.unsqueeze(-1)), dim=-1)
+
+        def along(carry: tuple[()], pair: tuple[Tensor, Tensor]) -> tuple[tuple[()], tuple[Tensor, Tensor]]:
+            one, other = (direction.expand_as(z) for direction in pair)
+            found = torch.func.jvp(lambda y: torch.func.jvp(both, (y,), (one,))[1], (z,), (other,))
+            return carry, (found[0], found[1])
+
+        unit = torch.eye(z.shape[-1], dtype=z.dtype)
+        rows, columns = torch.tril_indices(len(unit), len(unit)).unbind(0)
+        _, (slope, bend) = scan(along, (), (unit[rows], unit[columns]), dim=0)  # (pairs, B, n + 1)
+        first = slope[rows == columns].movedim(0, -1)
+        place = torch.zeros(len(unit), len(unit), dtype=torch.int64)
+        place[rows, columns] = place[columns, rows] = torch.arange(len(rows))
+        second = bend[place.flatten()].movedim(0, -1).unflatten(-1, place.shape)
+        return Derivatives(first[:, :n], second[:, :n], first[:, n], second[:, n])
+
+    def _check(self) -> None:
+        x, u = self.goal.expand(2, -1), self.rest.expand(2, -1)
+        trailing("SampledProblem", "goal", self.goal, 1, self.dim)
+        after, paid = self.step(x, u)
+        if after.shape != x.shape or paid.shape != x.shape[:1]:
+            raise ValueError(
+                f"`SampledProblem(step=...)` must map x {tuple(x.shape)} and u {tuple(u.shape)} to x+ "
+                f"{tuple(x.shape)} and costs {tuple(x.shape[:1])}; got {tuple(after.shape)} and "
+                f"{tuple(paid.shape)}."
+            )
+        moved = float(self.offset(after, x).abs().max())
+        if moved > _RESTS * (1 + float(x.abs().max())) or abs(float(paid[0])) > _RESTS:
+            raise ValueError(
+                f"`SampledProblem(goal=...)` must be a state of rest at no cost; within one step it moves by "
+                f"{moved:.3g} and costs {float(paid[0]):.3g}."
+            )
+
+    def _regulator(self) -> tuple[Tensor, Tensor]:
+        """P and K of the linear-quadratic problem at the goal."""
+        from scipy.linalg import (
+            LinAlgError,
+            solve_discrete_are,
+        )  # half a second that no other import need pay
+
+        at = self.derivatives(self.goal.unsqueeze(0), self.rest.unsqueeze(0))
+        n = self.dim
+        a, b, w = at.first[0, :, :n], at.first[0, :, n:], 0.5 * at.cost_second[0]
+        q, s, r = w[:n, :n], w[:n, n:], w[n:, n:]
+        try:
+            solved = solve_discrete_are(*(t.numpy() for t in (a, b, q, r)), s=s.numpy())
+        except (LinAlgError, ValueError) as error:
+            raise ValueError(
+                "`SampledProblem(step=...)` has no linear-quadratic regulator at the goal: its linearisation "
+                f"cannot be stabilised, or its cost is not convex there ({error})."
+            ) from error
+        p = 0.5 * torch.from_numpy(solved + solved.T)
+        return p, torch.linalg.solve(r + b.mT @ p @ b, b.mT @ p @ a + s.mT)
+
+
+@functools.cache
+def _use_forward_mode() -> None:
+    """Let torch load what its forward mode needs, without its warning about its own `torch.jit.script`."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)
+        torch.func.jvp(torch.sin, (torch.zeros(1),), (torch.ones(1),))
+
+
+class Derivatives(NamedTuple):
+    """Of x+ = F(z) and of the cost l(z) with respect to z = (x, u)."""
+
+    first: Tensor  # dF/dz, (B, n, n + m)
+    second: Tensor  # d2F/dz2, (B, n, n + m, n + m)
+    cost_first: Tensor  # (B, n + m)
+    cost_second: Tensor  # (B, n + m, n + m)

@@ -1,0 +1,359 @@
+"""Box-constrained differential dynamic programming: optimal trajectories of many initial states at once."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..lanes import Program
+from ..numerics.box import box_minimum
+from ..numerics.checks import integer, positive_real, trailing
+from .sampled_problem import Derivatives, SampledProblem
+
+_LENGTHS = (1.0, 0.5, 0.2, 0.07, 0.02)  # shares of a step that are tried side by side
+_EASIER, _HARDER = 0.4, 8.0  # what success and failure do to the regularisation of a row
+_LEAST, _FIRST, _TRUSTED, _MOST = (
+    1e-9,
+    1e-3,
+    1.0,
+    1e9,
+)  # regularisation, in units of the cost's curvature in u
+_NUMBERS = 2**25  # second derivatives that are held at once
+
+
+class Trajectories(NamedTuple):
+    """Trajectories and the local models of the value along them: V(x) ~ V + g'd + d'Hd/2, d = x - x_k."""
+
+    state: Tensor  # (B, T + 1, n), not wrapped
+    control: Tensor  # (B, T, m)
+    feedback: Tensor  # du/dx, (B, T, m, n); 0 where a bound holds
+    value: Tensor  # cost from x_k on, (B, T + 1)
+    gradient: Tensor  # g, (B, T + 1, n)
+    curvature: Tensor  # H, (B, T + 1, n, n)
+    converged: Tensor  # (B,) bool: no step of the search promises or brings a relative gain of tolerance
+
+    @property
+    def cost(self) -> Tensor:
+        """(B,)."""
+        return self.value[:, 0]
+
+    def rows(self, index: Tensor) -> Trajectories:
+        """Some of the rows."""
+        return Trajectories(*(part[index] for part in self))
+
+
+class BoxDDP:
+    """min sum_{k<T} l(x_k, u_k) + V_T(x_T) over bounded controls, from every state of a batch.
+
+    Backward in time, the quadratic model of l + V(F) around the trajectory is minimised over the box of
+    controls, which gives a change of the control and a feedback (0 at a bound); forward, five lengths of the
+    change are tried, each with the feedback, and a row takes the best that lowers its cost. A row that finds
+    none is regularised more, and changes between the full second derivatives and those of Gauss and Newton.
+
+    The minimum is a local one. No row sees another.
+
+    Example:
+        >>> found = adp.BoxDDP(problem, steps=100).solve(x0)
+        >>> found.cost, found.state, found.control  # (B,), (B, 101, n), (B, 100, m)
+
+    Args:
+        problem: plant, cost and bounds in steps.
+        steps: T.
+        iterations: at most.
+        tolerance: relative change of the cost at which a row has converged, positive.
+        compile: whether `lanes` compiles the passes: some seconds of a C++ compiler for a plant that is new
+            to its cache, and a hundred times faster then.
+
+    Raises:
+        ValueError: if an argument breaks its rule.
+
+    Source: Tassa, Mansard, Todorov, "Control-limited differential dynamic programming", ICRA (2014).
+    """
+
+    def __init__(
+        self,
+        problem: SampledProblem,
+        *,
+        steps: int,
+        iterations: int = 60,
+        tolerance: float = 1e-7,
+        compile: bool = True,
+    ) -> None:
+        self.problem = problem
+        self.steps = integer("BoxDDP", "steps", steps, least=1)
+        self.iterations = integer("BoxDDP", "iterations", iterations, least=1)
+        self.tolerance = positive_real("BoxDDP", "tolerance", tolerance)
+        self._expand = Program(
+            lambda carry, now, row: (carry, tuple(problem.derivatives(*row))),
+            name="derivatives of a step",
+            compile=compile,
+        )
+        self._back = Program(self._backward, name="a backward pass", compile=compile)
+        self._forth = Program(self._forward, name="a forward pass", compile=compile)
+
+    def solve(
+        self, x0: Tensor, control: Tensor | None = None, reference: Reference | None = None
+    ) -> Trajectories:
+        """The trajectories from x0 that the search reaches from a first control.
+
+        Args:
+            x0: (B, n).
+            control: (B, T, m), used as it is, or around ``reference``; None for the goal's linear feedback.
+            reference: states and feedback that the first control goes with; none for open loop.
+
+        Raises:
+            ValueError: if a shape is wrong.
+        """
+        n, m = self.problem.dim, self.problem.inputs
+        trailing("BoxDDP.solve", "x0", x0, 2, n)
+        expected = (len(x0), self.steps, m)
+        if control is None:
+            goal = x0 - self.problem.offset(x0, self.problem.goal)
+            gains = (-self.problem.k).expand(*expected, n)
+            reference = Reference(goal.unsqueeze(1).expand(-1, self.steps, -1), gains)
+            control = self.problem.rest.expand(expected)
+        if control.shape != expected:
+            raise ValueError(
+                f"`BoxDDP.solve(control=...)` must have the shape {expected}; got {tuple(control.shape)}."
+            )
+        if reference is None:
+            still = x0.unsqueeze(1).expand(-1, self.steps, -1)
+            reference = Reference(still, x0.new_zeros(*expected, n))
+        together = max(1, _NUMBERS // (self.steps * (n + 1) * (n + m) ** 2))
+        with torch.no_grad():
+            pieces = (part.split(together) for part in (x0, self.problem.admissible(control), *reference))
+            parts = [self._solve(x, u, Reference(*around)) for x, u, *around in zip(*pieces, strict=True)]
+        return Trajectories(*(torch.cat(column) for column in zip(*parts, strict=True)))
+
+    def _solve(self, x0: Tensor, control: Tensor, reference: Reference) -> Trajectories:
+        whole = self.follow(x0, control, *reference)
+        mu, full = torch.full_like(whole.cost, _FIRST), torch.ones_like(whole.cost)
+        converged = torch.zeros(len(x0), dtype=torch.bool)
+        active = torch.isfinite(whole.cost).nonzero().squeeze(1)
+        now, known = whole.rows(active), None
+        for _ in range(self.iterations):
+            if not len(active):
+                break
+            known = self._derivatives(now) if known is None else known
+            found = self._search(now, known, mu[active], full[active])
+            better = found.cost < now.cost
+            gain = (now.cost - found.cost) / now.cost.abs().clamp(min=1e-300)
+            now = _chosen(better, found.plan, now)
+            for part, current in zip(whole, now, strict=True):
+                part[active] = current
+            small = found.promised.abs() <= self.tolerance * now.cost.abs()
+            done = (better & (gain <= self.tolerance)) | (found.definite & small)
+            done = done & (mu[active] <= _TRUSTED)
+            converged[active] = done
+            easier = (mu[active] * _EASIER).clamp(min=_LEAST)
+            mu[active] = torch.where(better, easier, mu[active] * _HARDER)
+            full[active] = torch.where(better, full[active], 1 - full[active])
+            on = ~done & (mu[active] <= _MOST)
+            kept = active[on]
+            known = Derivatives(*(part[on] for part in known))
+            fresh = better[on]
+            now = now.rows(on)
+            if bool(fresh.any()):  # saves work: rows that did not move keep their derivatives
+                new = self._derivatives(now.rows(fresh))
+                for old, fresher in zip(known, new, strict=True):
+                    old[fresh] = fresher
+            active = kept
+        return self._models(whole, converged)
+
+    def follow(self, x0: Tensor, control: Tensor, state: Tensor, feedback: Tensor) -> Plan:
+        """Roll out u = control + feedback (x - state) within the bounds.
+
+        Args:
+            x0: (B, n).
+            control: (B, T, m).
+            state: (B, T, n).
+            feedback: (B, T, m, n).
+        """
+        none = torch.zeros_like(control)
+        return self._rollouts(x0, state, control, none, feedback, x0.new_ones(1))
+
+    def _rollouts(
+        self, x0: Tensor, state: Tensor, control: Tensor, change: Tensor, feedback: Tensor, lengths: Tensor
+    ) -> Plan:
+        shares = lengths.expand(len(x0), -1).contiguous()
+        start = x0.unsqueeze(1).expand(-1, len(lengths), -1).contiguous()
+        end, (x, u, paid) = self._forth(start, (state, control, change, feedback), shares)
+        last = self.problem.terminal(end)  # (B, L)
+        cost = paid.sum(1) + last
+        cost = torch.where(torch.isfinite(cost), cost, torch.inf)
+        best, at = cost.min(1)
+        pick = at[:, None, None, None]
+        states = torch.cat((x, end.unsqueeze(1)), dim=1)
+        return Plan(
+            states.gather(2, pick.expand(-1, self.steps + 1, 1, x.shape[-1])).squeeze(2),
+            u.gather(2, pick.expand(-1, self.steps, 1, u.shape[-1])).squeeze(2),
+            best,
+            torch.cat((paid, last.unsqueeze(1)), dim=1)
+            .gather(2, at[:, None, None].expand(-1, self.steps + 1, 1))
+            .squeeze(2),
+        )
+
+    def _forward(
+        self, x: Tensor, now: tuple[Tensor, ...], lengths: Tensor
+    ) -> tuple[Tensor, tuple[Tensor, ...]]:
+        """One step of all lengths: x (B, L, n), (B, n), (B, m), (B, m), (B, m, n), (B, L)."""
+        state, control, change, feedback = now
+        apart = x - state.unsqueeze(1)
+        u = control.unsqueeze(1) + lengths.unsqueeze(-1) * change.unsqueeze(1)
+        u = u + (feedback.unsqueeze(1) * apart.unsqueeze(-2)).sum(-1)
+        u = self.problem.admissible(u)
+        after, paid = self.problem.advance(x, u)
+        return after, (x, u, paid)
+
+    def _derivatives(self, plan: Plan) -> Derivatives:
+        """Along the trajectories: (B, T, ...)."""
+        x, u = plan.state[:, :-1].flatten(0, 1), plan.control.flatten(0, 1)
+        _, found = self._expand((), (), (x, u), steps=1)
+        shape = plan.control.shape[:2]
+        return Derivatives(*(part[:, 0].unflatten(0, shape) for part in found))
+
+    def _search(self, plan: Plan, known: Derivatives, mu: Tensor, full: Tensor) -> Found:
+        """A backward pass and the best of the five lengths forward."""
+        end, (change, feedback, _, _) = self._backwards(plan, known, mu, full)
+        definite = end.definite > 0
+        lengths = plan.cost.new_tensor(_LENGTHS)
+        tried = self._rollouts(plan.state[:, 0], plan.state[:, :-1], plan.control, change, feedback, lengths)
+        cost = torch.where(definite, tried.cost, torch.inf)
+        return Found(tried, cost, end.promised, definite)
+
+    def _backwards(
+        self, plan: Plan, known: Derivatives, mu: Tensor, full: Tensor
+    ) -> tuple[Model, tuple[Tensor, ...]]:
+        d = self.problem.offset(plan.state[:, -1], self.problem.goal)
+        p = self.problem.p
+        last = Model(
+            2 * (d.unsqueeze(-2) * p).sum(-1),
+            (2 * p).expand(len(d), -1, -1).contiguous(),
+            torch.zeros_like(mu),
+            torch.ones_like(mu),
+        )
+        reverse = tuple(part.flip(1) for part in (*known, plan.control))
+        end, out = self._back(last, reverse, (mu, full))
+        return end, tuple(part.flip(1) for part in out)
+
+    def _backward(
+        self, after: Model, now: tuple[Tensor, ...], row: tuple[Tensor, Tensor]
+    ) -> tuple[Model, tuple[Tensor, ...]]:
+        """One step of the recursion, backward in time."""
+        (first, second, cost_first, cost_second, control), (mu, full) = now, row
+        n = self.problem.dim
+        pulled = (after.curvature.unsqueeze(-1) * first.unsqueeze(-3)).sum(-2)  # H F_z, (B, n, n + m)
+        q1 = cost_first + (after.gradient.unsqueeze(-1) * first).sum(-2)
+        bent = (after.gradient[..., None, None] * second).sum(-3)
+        q2 = cost_second + (first.unsqueeze(-1) * pulled.unsqueeze(-2)).sum(-3) + full[:, None, None] * bent
+        qx, qu, qxx, qux, quu = q1[:, :n], q1[:, n:], q2[:, :n, :n], q2[:, n:, :n], q2[:, n:, n:]
+        unit = torch.eye(quu.shape[-1], dtype=quu.dtype)
+        scale = cost_second[:, n:, n:].diagonal(dim1=-2, dim2=-1).abs().mean(-1)
+        firm = quu + (mu * scale)[:, None, None] * unit
+        low, high = self.problem.bounds.low - control, self.problem.bounds.high - control
+        change = box_minimum(firm, qu, low, high)
+        feedback = slopes_of_minimum(firm, qux, (change > low) & (change < high))
+        moved = (quu * change.unsqueeze(-2)).sum(-1)  # Q_uu k
+        rest = quu.unsqueeze(-1) * feedback.unsqueeze(-3)
+        turned = rest.sum(-2)  # Q_uu K, (B, m, n)
+        gradient = qx + (feedback * (moved + qu).unsqueeze(-1)).sum(-2) + (qux * change.unsqueeze(-1)).sum(-2)
+        cross = (feedback.unsqueeze(-1) * qux.unsqueeze(-2)).sum(-3)
+        curvature = qxx + (feedback.unsqueeze(-1) * turned.unsqueeze(-2)).sum(-3) + cross + cross.mT
+        curvature = 0.5 * (curvature + curvature.mT)
+        promised = after.promised + (qu * change).sum(-1) + 0.5 * (moved * change).sum(-1)
+        model = Model(gradient, curvature, promised, after.definite * _definite(firm))
+        return model, (change, feedback, gradient, curvature)
+
+    def _models(self, plan: Plan, converged: Tensor) -> Trajectories:
+        """The local models along finished trajectories, with as little regularisation as they bear."""
+        known = self._derivatives(plan)
+        small = torch.full_like(plan.cost, _LEAST)
+        end, out = self._backwards(plan, known, small, torch.ones_like(small))
+        _, gauss = self._backwards(plan, known, small, torch.zeros_like(small))
+        fine = (end.definite > 0) & torch.isfinite(end.curvature).flatten(1).all(-1)
+        _, feedback, gradient, curvature = (
+            torch.where(fine[(..., *([None] * (a.dim() - 1)))], a, b) for a, b in zip(out, gauss, strict=True)
+        )
+        d = self.problem.offset(plan.state[:, -1], self.problem.goal)
+        last = 2 * (d.unsqueeze(-2) * self.problem.p).sum(-1)
+        hessian = (2 * self.problem.p).expand(len(d), 1, -1, -1)
+        return Trajectories(
+            plan.state,
+            plan.control,
+            feedback,
+            plan.paid.flip(1).cumsum(1).flip(1),
+            torch.cat((gradient, last.unsqueeze(1)), dim=1),
+            torch.cat((curvature, hessian), dim=1),
+            converged & torch.isfinite(plan.cost),
+        )
+
+
+class Reference(NamedTuple):
+    """What a control is a feedback around."""
+
+    state: Tensor  # (B, T, n)
+    feedback: Tensor  # (B, T, m, n)
+
+
+class Plan(NamedTuple):
+    """Trajectories without their models."""
+
+    state: Tensor  # (B, T + 1, n)
+    control: Tensor  # (B, T, m)
+    cost: Tensor  # (B,)
+    paid: Tensor  # of every step, and at last the terminal value, (B, T + 1)
+
+    def rows(self, index: Tensor) -> Plan:
+        """Some of the rows."""
+        return Plan(*(part[index] for part in self))
+
+
+class Found(NamedTuple):
+    """What one iteration found."""
+
+    plan: Plan
+    cost: Tensor  # (B,); inf where the model was not definite
+    promised: Tensor  # change of the cost by the model, (B,), negative
+    definite: Tensor  # (B,) bool
+
+
+class Model(NamedTuple):
+    """Local model of the value at one time, and what the recursion adds up."""
+
+    gradient: Tensor  # (B, n)
+    curvature: Tensor  # (B, n, n)
+    promised: Tensor  # (B,)
+    definite: Tensor  # (B,) 1 or 0
+
+
+def slopes_of_minimum(hessian: Tensor, cross: Tensor, free: Tensor) -> Tensor:
+    """du/dx of the minimum of u'Hu/2 + (s + C x)'u over a box: (B, m, n), 0 for inputs at a bound.
+
+    Args:
+        hessian: H, (B, m, m).
+        cross: C, (B, m, n).
+        free: whether an input lies between its bounds, (B, m) bool.
+    """
+    share = free.to(hessian)
+    masked = hessian * share.unsqueeze(-1) * share.unsqueeze(-2) + torch.diag_embed(1 - share)
+    inverse = 1 / masked if masked.shape[-1] == 1 else torch.linalg.inv(masked)
+    turn: Tensor = -(inverse.unsqueeze(-1) * (share.unsqueeze(-1) * cross).unsqueeze(-3)).sum(-2)
+    return turn
+
+
+def _definite(a: Tensor) -> Tensor:
+    """1 where all pivots of (B, m, m) are positive, else 0."""
+    fine = torch.ones_like(a[..., 0, 0])
+    for _ in range(a.shape[-1]):
+        pivot = a[..., 0, 0]
+        fine = fine * (pivot > 0)
+        a = a[..., 1:, 1:] - a[..., 1:, :1] * a[..., :1, 1:] / pivot[..., None, None]
+    return fine
+
+
+def _chosen(better: Tensor, new: Plan, old: Plan) -> Plan:
+    return Plan(
+        *(torch.where(better[(..., *([None] * (a.dim() - 1)))], a, b) for a, b in zip(new, old, strict=True))
+    )

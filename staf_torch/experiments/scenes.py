@@ -1,0 +1,204 @@
+"""What moves in an animation: the scenes of a gradient chase and of closed loops."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+import torch
+from omegaconf import DictConfig
+from torch import Tensor
+
+from ..adp import (
+    ActorCritic,
+    Controller,
+    Feedback,
+    IdentifyingTracker,
+    LeadingCoordinates,
+    LoopResult,
+    StaFValueBasis,
+    Supervised,
+)
+from ..adp.problem import AdpProblem
+from ..adp.reference_optimum import known_value
+from ..approximation.basis import StaFBasis
+from ..figures.animation import FRAMES, KINDS, Curves, Scene
+from ..numerics.checks import COMMAND_LINE, choice, fail
+from ..settings.chase import ChaseProblem
+
+_GRID, _ACROSS = 81, 41
+Value = Callable[[Tensor], Tensor]
+
+
+def animation_kind(cfg: DictConfig, dim: int | None = None) -> str | None:
+    """Return what the setting `animation` asks for, gif or html; None for no animation.
+
+    Args:
+        cfg: the settings.
+        dim: n, where it is known: at least 2.
+
+    Raises:
+        ValueError: for anything else, or a state that is a number.
+    """
+    wanted = cfg.get("animation", False)
+    if wanted is False:
+        return None
+    kind = "gif" if wanted is True else str(choice(COMMAND_LINE, "animation", wanted, (True, False, *KINDS)))
+    if dim is not None and dim < 2:
+        raise fail(COMMAND_LINE, "animation", "needs a state of two coordinates or more", dim)
+    return kind
+
+
+def chase_scene(problem: ChaseProblem, drawn: Mapping[str, np.ndarray]) -> Scene:
+    """Return the first trajectory of a chase, thinned, as `Outcome.drawn` has it."""
+    at = np.unique(np.linspace(0, len(drawn["time"]) - 1, FRAMES).round().astype(int))
+    like = problem.initial_states
+    x, weights = (torch.as_tensor(drawn[name][at]).to(like) for name in ("state", "weights"))
+    radius = problem.basis.centers.radius(x).expand(len(at))
+    along, points = _across(torch.as_tensor(drawn["state"]).to(like), at, radius)
+    with torch.no_grad():
+        estimate = (problem.basis(points, x) * weights[:, None]).sum(-1)
+        centers = problem.basis.centers(x)[..., :2]
+        value = problem.target(points)
+        plane = x.shape[-1] == 2
+        grid = _levels(problem.target, float(x.abs().max() + 1.4 * radius.max()), like) if plane else None
+    return Scene(
+        title="level lines of $V$; the centers move with the state"
+        if plane
+        else "the centers move with the state",
+        time=drawn["time"][at],
+        state=_array(x[:, :2]),
+        centers=_array(centers),
+        radius=_array(radius),
+        curves=Curves("weights, and the ideal ones (dotted)", _array(weights), drawn["ideal_weights"][at]),
+        along=_array(along),
+        value=_array(value),
+        estimate=_array(estimate),
+        grid=grid,
+    )
+
+
+def loop_scene(problem: AdpProblem, result: LoopResult) -> Scene:
+    """Return the first trajectory of a closed loop: V is the optimal value, where a formula knows it."""
+    known = known_value(problem, problem.initial_states) is not None
+    optimum: Value | None = (lambda x: _known(problem, x)) if known else None
+    # The state is fast at first and then rests: half of the frames are of the first quarter of the time.
+    at = np.unique((np.linspace(0, 1, FRAMES) ** 2 * _moves_until(result.state[0])).round().astype(int))
+    return _scene(problem.controller, result, at, optimum)
+
+
+def tracking_scene(controller: Controller, result: LoopResult) -> Scene:
+    """Return the first trajectory of a tracking loop with the states (e, xd), in the plane of x = e + xd."""
+    at = np.unique(np.linspace(0, len(result.time) - 1, FRAMES).round().astype(int))
+    scene = _scene(controller, result, at, None)
+    followed = _array(result.state[0, at, 2:4])
+    return scene._replace(
+        title="the state, the desired one (dotted), and the centers",
+        state=scene.state + followed,
+        centers=scene.centers + followed[:, None],
+        followed=followed,
+    )
+
+
+def _moves_until(path: Tensor) -> int:
+    """Return the index of the last time at which a state (T, n) is further than a hundredth of its way."""
+    far = path.norm(dim=-1)
+    return max(1, int((far > 0.01 * far.max()).nonzero().max()))
+
+
+def _scene(controller: Controller, result: LoopResult, at: np.ndarray, optimum: Value | None) -> Scene:
+    path = result.state[0]
+    x, critic = path[at], result.critic_weights[0, at]
+    basis = _moving(controller)
+    with torch.no_grad():
+        if basis is None:
+            radius = (0.1 * path.norm(dim=-1).max()).expand(len(at))
+            centers = x.new_zeros(len(at), 0, 2)
+        else:
+            radius = basis.centers.radius(x[:, : basis.dim]).expand(len(at))
+            centers = basis.centers(x[:, : basis.dim])[..., :2]
+        along, points = _across(path, at, radius)
+        estimate = _estimate(controller, points, x, critic)
+        plane = optimum is not None and x.shape[-1] == 2
+        reach = float(x.abs().max() + 1.4 * radius.max())
+        return Scene(
+            title=("level lines of $V^*$" if plane else "the state")
+            + ("" if basis is None else " and the centers"),
+            time=result.time.numpy()[at],
+            state=_array(x[:, :2]),
+            centers=_array(centers),
+            radius=_array(radius),
+            curves=_curves(result, at),
+            along=_array(along),
+            value=None if optimum is None else _array(optimum(points)),
+            estimate=None if estimate is None else _array(estimate),
+            grid=_levels(optimum, reach, x) if plane and optimum is not None else None,
+            relative=True,
+        )
+
+
+def _curves(result: LoopResult, at: np.ndarray) -> Curves:
+    """Return the critic's weights, or the control of a policy that has none.
+
+    Ideal weights are not shown: the critic learns from the Bellman error, and where the ball shrinks with the
+    state K^-1 V(c) grows beyond all bounds.
+    """
+    critic = result.critic_weights[0, at]
+    if critic.shape[-1] == 0:
+        return Curves("control", _array(result.control[0, at]), None)
+    return Curves("weights of the critic", _array(critic), None)
+
+
+def _inner(controller: Controller) -> Controller:
+    """Return what a supervisor or an identifying tracker holds."""
+    if isinstance(controller, Supervised):
+        return controller.controller
+    return controller.learner if isinstance(controller, IdentifyingTracker) else controller
+
+
+def _moving(controller: Controller) -> StaFBasis | None:
+    """Return kernel and centers of what follows the state in a controller."""
+    inner = _inner(controller)
+    if isinstance(inner, Feedback):
+        basis = getattr(inner.policy, "basis", None)
+    elif isinstance(inner, ActorCritic):
+        value = inner.basis.basis if isinstance(inner.basis, LeadingCoordinates) else inner.basis
+        basis = value.basis if isinstance(value, StaFValueBasis) else None
+    else:
+        basis = None
+    return basis if isinstance(basis, StaFBasis) else None
+
+
+def _estimate(controller: Controller, points: Tensor, x: Tensor, critic: Tensor) -> Tensor | None:
+    """Return V^(y; x) at points y (F, S, n) around the states x (F, n)."""
+    inner = _inner(controller)
+    if isinstance(inner, ActorCritic):
+        around = x.unsqueeze(-2).expand(points.shape)
+        estimate: Tensor = (inner.basis(points, around) * critic.unsqueeze(-2)).sum(-1)
+        return estimate
+    return inner.value(points, inner.init(points[:, 0]))
+
+
+def _known(problem: AdpProblem, x: Tensor) -> Tensor:
+    value = known_value(problem, x)
+    assert value is not None
+    return value
+
+
+def _across(path: Tensor, at: np.ndarray, radius: Tensor) -> tuple[Tensor, Tensor]:
+    """Return places from -1 to 1 (S,), and the points there (F, S, n): along the way through each ball."""
+    way = torch.gradient(path, dim=0)[0][at]
+    way = way / way.norm(dim=-1, keepdim=True).clamp_min(torch.finfo(path.dtype).tiny)
+    along = torch.linspace(-1, 1, _ACROSS).to(path)
+    return along, path[at][:, None] + (radius[:, None] * along)[..., None] * way[:, None]
+
+
+def _levels(value: Value, reach: float, like: Tensor) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    line = torch.linspace(-reach, reach, _GRID).to(like)
+    plane = torch.stack(torch.meshgrid(line, line, indexing="xy"), dim=-1)
+    level = value(plane.reshape(-1, 2)).reshape(_GRID, _GRID)
+    return _array(line), _array(line), _array(level)
+
+
+def _array(values: Tensor) -> np.ndarray:
+    return values.detach().cpu().numpy()

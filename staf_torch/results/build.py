@@ -1,0 +1,249 @@
+"""What made the numbers of a run: settings, source, the user's own modules, torch and the compiler.
+
+Two runs of one sweep may stand in one table only where these agree. Nothing here imports torch, and no module
+is imported to be looked at.
+"""
+
+from __future__ import annotations
+
+import ast
+import functools
+import hashlib
+import importlib.metadata
+import json
+import os
+import sys
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from .._version import __version__
+from .files import RUN
+from .untrusted import UnreadableError, all_visible, open_regular
+
+_PACKAGE = Path(__file__).resolve().parent.parent
+_LOADER = "staf_torch.settings.chase.load"
+_MOST_MODULES = 200
+_CHUNK = 2**20
+_ABSENT = "nothing"
+
+
+def digest(path: Path, *, root: Path | None = None) -> str:
+    """Return the SHA-256 of a regular file, which may be of any size.
+
+    Raises:
+        UnreadableError: if there is none; arguments as of `open_regular`.
+    """
+    found = hashlib.sha256()
+    with open_regular(path, root=root) as file:
+        while piece := file.read(_CHUNK):
+            found.update(piece)
+    return found.hexdigest()
+
+
+@functools.cache
+def source() -> str:
+    """Return a hash of the package's own files, installed or in a checkout: 12 hexadecimal digits."""
+    found = hashlib.sha256()
+    for path in sorted(_PACKAGE.rglob("*")):
+        if path.suffix in (".py", ".hpp", ".cpp", ".html") and path.is_file():
+            found.update(f"{path.relative_to(_PACKAGE)} {path.stat().st_size}\0".encode())
+            found.update(path.read_bytes())
+    return found.hexdigest()[:12]
+
+
+def build(settings: Mapping[str, Any], compiler: str) -> dict[str, Any]:
+    """Return what a run is made by, besides its settings, as `run.json` has it.
+
+    Args:
+        settings: all of the run, by dotted keys.
+        compiler: that makes machine code of the chase, in its own words.
+    """
+    try:
+        torch = importlib.metadata.version("torch")
+    except importlib.metadata.PackageNotFoundError:
+        torch = "of unknown version"
+    return {
+        "version": __version__,
+        "source": source(),
+        "torch": torch,
+        "compiler": compiler,
+        "modules": modules(settings),
+    }
+
+
+def modules(settings: Mapping[str, Any]) -> dict[str, str]:
+    """Return a hash of every module of the user's own that settings name, and of those that it imports."""
+    found: dict[str, str] = {}
+    for path in _named(settings):
+        parts = path.split(".")
+        for length in range(len(parts) - 1, 0, -1):
+            place = _locate(tuple(parts[:length]), tuple(sys.path), os.getcwd())
+            if place is not None:
+                _collect(".".join(parts[:length]), *place, found)
+                break
+    return dict(sorted(found.items()))
+
+
+def differences(then: Mapping[str, Any], now: Mapping[str, Any]) -> Iterator[str]:
+    """Yield one phrase for each setting, or other entry of a record, that is not what it was.
+
+    Args:
+        then: the record of a run: `settings` and `build`, where it has them.
+        now: the same of a run of today.
+    """
+    was, will = _plain(then.get("settings")), _plain(now.get("settings"))
+    if was:
+        for key in sorted({*was, *will}):
+            if was.get(key, _ABSENT) != will.get(key, _ABSENT):
+                yield f"{key} was {_shown(was.get(key, _ABSENT))} and is now {_shown(will.get(key, _ABSENT))}"
+    was, will = _plain(then.get("build")), _plain(now.get("build"))
+    for key in ("source", "torch", "compiler") if was else ():
+        if was.get(key) != will.get(key):
+            what = "the source of staf_torch" if key == "source" else key
+            yield f"{what} was {_shown(was.get(key))} and is now {_shown(will.get(key))}"
+    was, will = _plain(was.get("modules")), _plain(will.get("modules"))
+    for name in sorted({*was, *will}):
+        if was.get(name) != will.get(name):
+            yield f"the module {name} has changed"
+
+
+def short(build: Mapping[str, Any]) -> str:
+    """Return a build as a table names it: `0.1.0 source 3f2a91b0c4d5 torch 2.13.0 other 4a5b6c`."""
+    text = f"{build.get('version')} source {build.get('source')} torch {build.get('torch')}"
+    rest = json.dumps([build.get("compiler"), build.get("modules")], sort_keys=True)
+    return f"{text} other {hashlib.sha256(rest.encode()).hexdigest()[:6]}"
+
+
+def _plain(value: Any) -> dict[str, Any]:
+    """As it is in a file."""
+    return json.loads(json.dumps(value)) if isinstance(value, dict) else {}
+
+
+def _shown(value: Any) -> str:
+    text = value if isinstance(value, str) else json.dumps(value)
+    return text if len(text) <= 80 else f"{text[:77]}..."
+
+
+def _named(settings: Mapping[str, Any]) -> Iterator[str]:
+    """The dotted paths outside the package that settings name."""
+    for key, value in settings.items():
+        group, _, last = key.rpartition(".")
+        loaded = last == "path" and settings.get(f"{group}._target_") == _LOADER
+        names = last == "_target_" or loaded or key == "task"
+        if names and isinstance(value, str) and "." in value and not value.startswith("staf_torch."):
+            yield value
+
+
+@functools.lru_cache(1000)
+def _locate(parts: tuple[str, ...], path: tuple[str, ...], here: str) -> tuple[Path, Path] | None:
+    """The file of a module, and the entry of Python's path that leads there."""
+    for entry in path:
+        base = Path(here, entry)
+        for file in (base.joinpath(*parts).with_suffix(".py"), base.joinpath(*parts, "__init__.py")):
+            if file.is_file():
+                return file, base
+    return None
+
+
+def _collect(name: str, file: Path, base: Path, found: dict[str, str]) -> None:
+    """Add a module, and what it imports from the same folder; of an installed one, from its package."""
+    if name in found or len(found) >= _MOST_MODULES:
+        return
+    stamp = file.stat()
+    found[name], imported = _module(file, stamp.st_mtime_ns, stamp.st_size)
+    installed = base.name in ("site-packages", "dist-packages")
+    for other in imported:
+        absolute = _absolute(name, other, file.name == "__init__.py")
+        if installed and absolute.partition(".")[0] != name.partition(".")[0]:
+            continue
+        parts = absolute.split(".")
+        for length in range(len(parts), 0, -1):
+            place = _locate(tuple(parts[:length]), (str(base),), os.getcwd())
+            if place is not None:
+                _collect(".".join(parts[:length]), *place, found)
+                break
+
+
+def _absolute(name: str, other: str, package: bool) -> str:
+    """`..b.c` as it is meant in the module ``name``."""
+    level = len(other) - len(other.lstrip("."))
+    if not level:
+        return other
+    parts = name.split(".")
+    kept = parts[: len(parts) - level + package]
+    return ".".join([*kept, *filter(None, [other[level:]])])
+
+
+@functools.lru_cache(1000)
+def _module(file: Path, modified: int, size: int) -> tuple[str, tuple[str, ...]]:
+    """The hash of a file of that time and size, and the names in its imports."""
+    content = file.read_bytes()
+    names: list[str] = []
+    try:
+        for node in ast.walk(ast.parse(content)):
+            if isinstance(node, ast.Import):
+                names += [alias.name for alias in node.names]
+            elif isinstance(node, ast.ImportFrom):
+                stem = "." * node.level + (node.module or "")
+                dot = "" if stem.endswith(".") or not stem else "."
+                names += [f"{stem}{dot}{alias.name}" for alias in node.names]
+    except (SyntaxError, ValueError, RecursionError):
+        pass
+    return hashlib.sha256(content).hexdigest()[:12], tuple(names)
+
+
+def record_checksum(record: Mapping[str, Any]) -> str:
+    """Return the SHA-256 of a record without its own checksum."""
+    rest = {key: value for key, value in record.items() if key != "checksum"}
+    return hashlib.sha256(json.dumps(all_visible(rest), sort_keys=True).encode()).hexdigest()
+
+
+def damaged(directory: Path, record: Mapping[str, Any], *, thorough: bool) -> str | None:
+    """Return what is wrong with a run's record or files, None: nothing; ``thorough`` as of `damage`.
+
+    Records of versions that wrote no checksums pass.
+    """
+    if "checksum" in record and record["checksum"] != record_checksum(record):
+        return f"{RUN} is damaged: its checksum is another one"
+    files = record.get("files")
+    return damage(directory, files, thorough=thorough) if isinstance(files, dict) else None
+
+
+def damage(directory: Path, recorded: Mapping[str, Any], *, thorough: bool) -> str | None:
+    """Return what is wrong with the files of a run; None: they are as they were written.
+
+    Args:
+        directory: of the run.
+        recorded: name of a file to its size and SHA-256.
+        thorough: whether to read them; else only their sizes are looked at, and whether they are there only
+            where they hold numbers.
+    """
+    for name, about in recorded.items():
+        if not (isinstance(about, list) and len(about) == 2) or Path(name).is_absolute() or ".." in name:
+            return f"{name} has no checksum"
+        path = directory / name
+        try:
+            size = path.lstat().st_size
+            if size != about[0]:
+                return f"{name} is damaged: it has {size} bytes in place of {about[0]}"
+            if thorough and digest(path, root=directory) != about[1]:
+                return f"{name} is damaged: its checksum is another one"
+        except UnreadableError as error:
+            return str(error)
+        except OSError:
+            if thorough and path.suffix in (".json", ".npz", ".csv"):
+                return f"{name} is missing"
+    return None
+
+
+def checksums(directory: Path, but: frozenset[str]) -> dict[str, list[Any]]:
+    """Return size and SHA-256 of every result file in and under a run directory, by their names there."""
+    found: dict[str, list[Any]] = {}
+    for path in sorted(directory.rglob("*")):
+        name = path.relative_to(directory).as_posix()
+        if path.is_symlink() or not path.is_file() or path.name in but or path.suffix == ".log":
+            continue
+        if not any(part.startswith(".") for part in Path(name).parts):
+            found[name] = [path.stat().st_size, digest(path)]
+    return found

@@ -1,0 +1,176 @@
+"""A run as it is read back, and a collection of runs: plain values, whoever wrote them."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections import ChainMap
+from collections.abc import Collection as Collection_
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+from .files import Value
+from .metric_info import HEADLINES, OWN, MetricInfo
+from .untrusted import visible
+
+ABOUT = ("task", "status", "reason", "seconds", "version", "build", "directory", "member")
+"""What can be a column of a table beside settings and metrics."""
+_SHOWN = 1  # headlines in the short form of a run
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class Run:
+    """A run, or a member of a run of many: what it was, how it ended, what it measured."""
+
+    directory: Path
+    overrides: Mapping[str, Value]  # key -> value, as typed
+    settings: Mapping[str, Value]  # all of them, with dotted keys; the option of a group under its name
+    metrics: Mapping[str, float | None]  # None: nothing to report, or not finite
+    status: str
+    reason: str | None = None  # why there is no result, or something else that a reader should know
+    member: int | None = None  # its number among the members of a run of many
+    version: str | None = None  # of the staf_torch that wrote it
+    task: str | None = None
+    seconds: float | None = None
+    declared: Mapping[str, MetricInfo] = dataclasses.field(default_factory=dict)  # of the user's own metrics
+    lost: Mapping[str, str] = dataclasses.field(default_factory=dict)  # metric -> what stood there instead
+    build: str | None = (
+        None  # what made the numbers besides the settings: source, torch, compiler, own modules
+    )
+
+    def __repr__(self) -> str:
+        """`<Run completed: kernel=gaussian, ball_error=0.0762>`: overrides and the first headlines."""
+        typed = " ".join(f"{key}={value}" for key, value in self.overrides.items()) or "no overrides"
+        shown = [name for name in HEADLINES if self.metrics.get(name) is not None][:_SHOWN]
+        return f"<Run {self.status}: {', '.join([typed, *(f'{n}={self.metrics[n]:.3g}' for n in shown)])}>"
+
+    def setting(self, key: str) -> Value:
+        """Return the setting of that key, as composed where that is known, else as typed."""
+        return self.settings[key] if key in self.settings else self.overrides.get(key)
+
+    def value(self, key: str) -> Value:
+        """Return anything about the run that has a name: a metric, one of `ABOUT`, or a setting."""
+        if key in self.metrics:
+            return self.metrics[key]
+        if key in ABOUT:
+            found = getattr(self, key)
+            return visible(str(found)) if isinstance(found, Path) else found
+        return self.setting(key)
+
+    def absence(self, metric: str) -> str:
+        """Say why there is no number under that metric."""
+        if metric in self.lost:
+            return f"was {self.lost[metric]}, which is not a number"
+        if self.reason is not None:
+            return self.reason
+        if metric in self.metrics:
+            return "not finite, or nothing to report"
+        return "this run has no such metric"
+
+
+@dataclasses.dataclass(frozen=True)
+class Skipped:
+    """Something without a row, or with a row that is not as it should be."""
+
+    path: Path
+    reason: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Collection:
+    """The runs that `collect` found."""
+
+    rows: tuple[Run, ...]  # in the order of the sweep
+    skipped: tuple[Skipped, ...]  # what has no row, and why
+    remarks: tuple[str, ...] = ()  # what a reader of the rows should know
+
+    @functools.cached_property
+    def metrics(self) -> tuple[str, ...]:
+        """The names of all metrics, in the order in which runs wrote them."""
+        return tuple(dict.fromkeys(name for run in self.rows for name in run.metrics))
+
+    @functools.cached_property
+    def infos(self) -> dict[str, MetricInfo]:
+        """What is declared of each metric: by the library, or by the runs for metrics of the user's own."""
+        known = {info.name: info for info in OWN}
+        for declared in {id(run.declared): run.declared for run in self.rows}.values():
+            known |= declared
+        return {name: known.get(name, MetricInfo(name)) for name in self.metrics}
+
+    @functools.cached_property
+    def keys(self) -> tuple[str, ...]:
+        """The names of everything but metrics that can be a column."""
+        named = dict.fromkeys(key for run in self.rows for key in run.overrides)
+        for settings in self._settings:
+            named |= dict.fromkeys(settings)
+        return (*named, *ABOUT)
+
+    @functools.cached_property
+    def swept(self) -> tuple[str, ...]:
+        """The overridden settings that differ between runs; of a single run, those that were overridden."""
+        overridden = dict.fromkeys(key for run in self.rows for key in run.overrides)
+        if len(self.rows) == 1:
+            return tuple(overridden)
+        found = [key for key in overridden if len({identity(run.setting(key)) for run in self.rows}) > 1]
+        return (*found, *self.unswept)
+
+    @functools.cached_property
+    def unswept(self) -> tuple[str, ...]:
+        """Settings that differ between runs although nobody overrode them, and `build` where that differs.
+
+        Somebody edited a file between two of the runs. What an interpolation takes from an override is none.
+        """
+        overridden = dict.fromkeys(key for run in self.rows for key in run.overrides)
+        words = [key for key in overridden if any(isinstance(run.setting(key), str) for run in self.rows)]
+        first: dict[tuple[str, ...], Run] = {}
+        seen: set[int] = set()
+        found: dict[str, None] = {}
+        for run in self.rows:
+            base = layers(run.settings)[-1]
+            if id(base) in seen or not base:  # members share theirs
+                continue
+            seen.add(id(base))
+            other = first.setdefault(tuple(identity(run.setting(key)) for key in words), run)
+            if other is not run:
+                found |= dict.fromkeys(_differ(run, other))
+        builds = {run.build for run in self.rows}
+        return (*(key for key in found if not _explained(key, overridden)), *["build"] * (len(builds) > 1))
+
+    @functools.cached_property
+    def _settings(self) -> list[Mapping[str, Value]]:
+        """The settings of all runs, those that members share once."""
+        return list({id(part): part for run in self.rows for part in layers(run.settings)}.values())
+
+
+def _differ(run: Run, other: Run) -> Iterator[str]:
+    """The settings in which two runs differ, where neither takes its value from an override of its own."""
+    one, two = layers(run.settings)[-1], layers(other.settings)[-1]
+    for key in {**one, **two}:
+        if one.get(key) != two.get(key):
+            entries = [
+                value if isinstance(value, list) else [value] for value in (one.get(key), two.get(key))
+            ]
+            if len(entries[0]) != len(entries[1]):
+                yield key
+                continue
+            pairs = zip(*entries, strict=True)
+            typed = [list(each.overrides.values()) for each in (run, other)]
+            if any(a != b and a not in typed[0] and b not in typed[1] for a, b in pairs):
+                yield key
+
+
+def _explained(key: str, overridden: Collection_[str]) -> bool:
+    """Whether a key is overridden, or is above or below one that is."""
+    return any(key == o or key.startswith((f"{o}.", f"{o}/")) or o.startswith(f"{key}.") for o in overridden)
+
+
+def layers(settings: Mapping[str, Value]) -> Sequence[Mapping[str, Value]]:
+    """Return the settings of a member apart from those of its run, which all members share."""
+    return settings.maps if isinstance(settings, ChainMap) else [settings]
+
+
+def identity(value: Value) -> str:
+    """Return equal texts for values that are the same in a table: 1 and 1.0 are, 1 and "1" are not."""
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        return repr(float(value))
+    return f"{type(value).__name__} {value!r}"

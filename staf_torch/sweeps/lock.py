@@ -1,0 +1,142 @@
+"""A directory belongs to one sweep at a time: a lock that says whose, and ends with its owner."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import json
+import os
+import socket
+import threading
+import time
+from pathlib import Path
+
+from ..results.untrusted import UnreadableError, read_object
+
+NAME = ".lock"
+_BEAT, _STALE = 30.0, 300.0  # s: how often the owner touches the file, and when another host counts it dead
+
+
+class TakenError(ValueError):
+    """Another sweep has the directory; the message says whose it is."""
+
+
+class DirectoryLock:
+    """The lock of a sweep's directory, held until `release`, or until this process ends, however it ends.
+
+    On one machine the kernel knows whether the owner lives. Between machines that share the disk without
+    sharing locks, the owner touches the file every half a minute.
+
+    Args:
+        directory: of the sweep; it exists.
+
+    Raises:
+        TakenError: if another sweep has it.
+        OSError: if the directory cannot be written.
+    """
+
+    def __init__(self, directory: Path) -> None:
+        self._path = directory / NAME
+        self._directory = directory.absolute()
+        self._file = self._taken()
+        self._inode = os.stat(self._directory)
+        self._ended = threading.Event()
+        threading.Thread(target=self._beat, daemon=True).start()
+
+    def lost(self) -> bool:
+        """Return whether the directory was removed or replaced since it was taken."""
+        try:
+            now = os.stat(self._directory)
+        except OSError:
+            return True
+        return (now.st_dev, now.st_ino) != (self._inode.st_dev, self._inode.st_ino)
+
+    def release(self) -> None:
+        """Give the directory back."""
+        if self._ended.is_set():
+            return
+        self._ended.set()
+        with contextlib.suppress(OSError):
+            self._path.unlink()
+        os.close(self._file)
+
+    def _taken(self) -> int:
+        while True:
+            flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC | os.O_NONBLOCK
+            file = os.open(self._path, flags, 0o644)
+            try:
+                self._hold(file)
+                if os.fstat(file).st_ino == os.stat(self._path, follow_symlinks=False).st_ino:
+                    return file
+            except FileNotFoundError:
+                pass  # its owner has just given it back: once more
+            except BaseException:
+                os.close(file)
+                raise
+            os.close(file)
+
+    def _hold(self, file: int) -> None:
+        """Lock an open file and write our name into it."""
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            if error.errno in (errno.EWOULDBLOCK, errno.EACCES):
+                raise self._refused() from error
+            if error.errno not in (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS):
+                raise
+        host = self._owner().get("host")
+        # Where locks are not shared between machines, ours says nothing about an owner elsewhere.
+        if host not in (None, socket.gethostname()) and time.time() - os.fstat(file).st_mtime < _STALE:
+            raise self._refused()
+        about = {
+            "host": socket.gethostname(),
+            "pid": os.getpid(),
+            "since": time.strftime("%Y-%m-%d %H:%M:%S"),
+        }
+        os.ftruncate(file, 0)
+        os.pwrite(file, json.dumps(about).encode(), 0)
+
+    def _owner(self) -> dict[str, object]:
+        try:
+            return read_object(self._path)
+        except UnreadableError:
+            return {}
+
+    def _refused(self) -> TakenError:
+        owner = self._owner()
+        return TakenError(
+            f"{self._path.parent} belongs to a sweep that goes on: process {owner.get('pid', '?')} on "
+            f"{owner.get('host', '?')}, since {owner.get('since', '?')}. Wait for its end, or choose another "
+            "`hydra.sweep.dir`."
+        )
+
+    def _beat(self) -> None:
+        while not self._ended.wait(_BEAT):
+            with contextlib.suppress(OSError):
+                os.utime(self._file)
+
+
+_held: dict[str, DirectoryLock] = {}
+"""The locks of this process, by the absolute paths of the directories."""
+
+
+def hold(directory: Path) -> DirectoryLock:
+    """Take the lock of a directory for this process; arguments and errors as of `DirectoryLock`."""
+    key = os.path.abspath(directory)
+    if key in _held:
+        raise TakenError(f"{directory} belongs to a sweep that goes on in this process.")
+    _held[key] = DirectoryLock(directory)
+    return _held[key]
+
+
+def held(directory: Path) -> DirectoryLock | None:
+    """Return the lock of a directory where this process has it."""
+    return _held.get(os.path.abspath(directory))
+
+
+def give_back(directory: Path) -> None:
+    """Release the lock of a directory where this process has it."""
+    lock = _held.pop(os.path.abspath(directory), None)
+    if lock is not None:
+        lock.release()

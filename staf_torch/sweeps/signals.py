@@ -1,0 +1,56 @@
+"""SIGTERM and SIGHUP end a program as Ctrl-C does: with its report and the line that resumes."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import threading
+from collections.abc import Iterator
+from types import FrameType
+
+_NUMBERS = (signal.SIGTERM, signal.SIGHUP)
+
+
+class Stopped(KeyboardInterrupt):
+    """A signal that asks the program to end; nothing that only handles errors catches it.
+
+    Args:
+        number: of the signal.
+    """
+
+    def __init__(self, number: int) -> None:
+        super().__init__(number)
+        self.number = number
+
+
+@contextlib.contextmanager
+def stopped_by_signals() -> Iterator[None]:
+    """Raise `Stopped` where one of the signals arrives, once; `nohup` and other threads are left alone."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    taken = [number for number in _NUMBERS if signal.getsignal(number) == signal.SIG_DFL]
+    parent = threading.get_native_id()
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        if threading.get_native_id() != parent:  # a child of a fork, which has its own end
+            signal.signal(number, signal.SIG_DFL)
+            signal.raise_signal(number)
+        for each in taken:  # what follows, the report, takes a second or two; SIGKILL remains
+            signal.signal(each, signal.SIG_IGN)
+        raise Stopped(number)
+
+    for number in taken:
+        signal.signal(number, stop)
+    try:
+        yield
+    finally:
+        for number in taken:
+            signal.signal(number, signal.SIG_DFL)
+
+
+def name_and_code(error: KeyboardInterrupt) -> tuple[str, int]:
+    """Return what ended the program, and its exit code as shells have it."""
+    number = error.number if isinstance(error, Stopped) else int(signal.SIGINT)
+    said = "interrupted" if number == signal.SIGINT else f"ended by {signal.Signals(number).name}"
+    return said, 128 + number

@@ -1,0 +1,121 @@
+"""A function of state and input that a user brings, in torch or in NumPy, and its derivatives."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..numerics.differences import central_slopes
+from .base import Linearisation
+
+Motion = Callable[..., Any]
+"""(x (B, n), u (B, m)) -> (B, n), of torch tensors or of NumPy arrays."""
+_PROBES = 3  # rows that the function is tried with
+_KINK = 0.05  # of the largest slope, by which the slopes of two step sizes may differ
+
+
+class BlackBox:
+    """A batched function of x and u, called with what it understands.
+
+    It is tried once: with torch tensors that want derivatives, else with NumPy arrays. Only the first kind is
+    differentiated by autograd and compiled; the slopes of the other come from central differences.
+
+    Args:
+        call: name of the constructor and the argument, for messages: ``StepPlant(step=...)``.
+        function: (B, n), (B, m) -> (B, n).
+        x: a state to try it near, (n,).
+        u: an input to try it near, (m,).
+
+    Attributes:
+        torch: whether the function is torch all the way through.
+
+    Raises:
+        ValueError: if it raises, returns another shape or something not finite, or ignores u.
+    """
+
+    def __init__(self, call: str, function: Motion, x: Tensor, u: Tensor) -> None:
+        if not callable(function):
+            raise ValueError(f"`{call}` must be a function of x (B, n) and u (B, m); got {function!r}.")
+        self._call, self._function = call, function
+        self.torch = self._traces(x, u)
+        self._try(x, u)
+
+    def __call__(self, x: Tensor, u: Tensor) -> Tensor:
+        """(..., n), (..., m) -> (..., n)."""
+        lead = torch.broadcast_shapes(x.shape[:-1], u.shape[:-1])
+        rows = x.expand(*lead, -1).reshape(-1, x.shape[-1]), u.expand(*lead, -1).reshape(-1, u.shape[-1])
+        after = self._function(*rows) if self.torch else self._numpy(*rows)
+        moved: Tensor = after.reshape(*lead, x.shape[-1])
+        return moved
+
+    def linearisation(self, x: Tensor, u: Tensor) -> Linearisation:
+        """d/dx and d/du at one point (n,), (m,).
+
+        Raises:
+            ValueError: if the function has a kink there: slopes of two step sizes differ by more than 5 %.
+        """
+        size, at = len(x), torch.cat((x, u))
+
+        def whole(z: Tensor) -> Tensor:
+            return self(z[..., :size], z[..., size:])
+
+        if self.torch:
+            slopes: Tensor = torch.func.jacrev(lambda z: whole(z.unsqueeze(0))[0])(at).detach()
+        else:
+            slopes = central_slopes(whole, at)
+            wider = central_slopes(whole, at, 100 * at.abs().clamp(min=1.0))
+            off = (slopes - wider).abs().max() / slopes.abs().max().clamp(min=1e-12)
+            if not bool(off <= _KINK):
+                raise ValueError(
+                    f"`{self._call}` is not smooth at the state {x.tolist()} and the input {u.tolist()}: its "
+                    f"slopes over {6e-6:g} and {6e-4:g} differ by {float(off):.2g} of the largest. Linearise "
+                    "it elsewhere (`equilibrium`), or smooth what switches there."
+                )
+        return Linearisation(slopes[:, :size], slopes[:, size:])
+
+    def _traces(self, x: Tensor, u: Tensor) -> bool:
+        """Whether the function maps tensors to a tensor with a derivative, batched by `torch.func` too."""
+        z = torch.cat((x, u)).expand(_PROBES, -1).clone().requires_grad_()
+        try:
+            with torch.enable_grad():
+                after = self._function(z[:, : len(x)], z[:, len(x) :])
+            return isinstance(after, Tensor) and after.requires_grad
+        except Exception:  # it is tried again with NumPy, whose complaint is the one to show
+            return False
+
+    def _numpy(self, x: Tensor, u: Tensor) -> Tensor:
+        after = self._function(x.detach().cpu().numpy(), u.detach().cpu().numpy())
+        return torch.as_tensor(np.asarray(after, dtype=np.float64)).to(x)
+
+    def _try(self, x: Tensor, u: Tensor) -> None:
+        generator = torch.Generator().manual_seed(0)
+        away = 0.1 * torch.randn(_PROBES, len(x) + 2 * len(u), dtype=torch.float64, generator=generator)
+        states, inputs = x + away[:, : len(x)], u + away[:, len(x) : len(x) + len(u)]
+        shape = (tuple(states.shape), tuple(inputs.shape))
+        try:
+            with torch.no_grad():
+                both = states.repeat(2, 1), torch.cat((inputs, inputs + away[:, -len(u) :]))
+                after = self._function(*both) if self.torch else self._numpy(*both)
+        except Exception as error:
+            said = str(error).splitlines()[0] if str(error) else ""
+            raise ValueError(
+                f"`{self._call}` raised {type(error).__name__} ({said}) at x and u of the shapes "
+                f"{shape[0]} and {shape[1]}, as torch tensors and as NumPy arrays. It must map rows to rows."
+            ) from error
+        if not isinstance(after, Tensor) or after.shape != both[0].shape:
+            got = tuple(after.shape) if isinstance(after, Tensor) else type(after).__name__
+            raise ValueError(
+                f"`{self._call}` must map x and u of the shapes {tuple(both[0].shape)} and "
+                f"{tuple(both[1].shape)} to {tuple(both[0].shape)}; got {got}."
+            )
+        if not bool(torch.isfinite(after).all()):
+            raise ValueError(f"`{self._call}` returned values that are not finite near x = {x.tolist()}.")
+        first, second = after.chunk(2)
+        if torch.equal(first, second):
+            raise ValueError(
+                f"`{self._call}` ignores u: another input changes nothing near x = {x.tolist()}."
+            )

@@ -1,0 +1,182 @@
+"""Plants that a user brings as one function: of the next state, or of the rate."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from ..numerics.checks import fail, integer, positive_real, vector
+from .base import Linearisation, Plant
+from .black_box import BlackBox, Motion
+from .bounds import Bounds, Limit
+from .equilibria import find_equilibrium
+
+Guess = Sequence[float] | Tensor | tuple[Sequence[float] | Tensor, Sequence[float] | Tensor] | None
+
+
+class FunctionPlant(Plant):
+    """What `StepPlant` and `RatePlant` have in common: the function, where it rests, its linearisation."""
+
+    def __init__(
+        self,
+        argument: str,
+        function: Motion,
+        *,
+        dim: int,
+        inputs: int,
+        periodic: Sequence[int],
+        equilibrium: Guess,
+        low: Limit,
+        high: Limit,
+    ) -> None:
+        super().__init__()
+        name = type(self).__name__
+        self.dim = integer(name, "dim", dim, least=1)
+        self.inputs = integer(name, "inputs", inputs, least=1)
+        if not set(periodic) <= set(range(-dim, dim)):
+            raise fail(name, "periodic", f"must be coordinates of {dim}", list(periodic))
+        self.periodic = tuple(sorted({index % dim for index in periodic}))
+        bounds = Bounds(low, high, inputs)
+        self.bounds = bounds if bounds.present else None
+        x, u = _guess(name, equilibrium, dim, inputs)
+        self.function = BlackBox(f"{name}({argument}=...)", function, x, u)
+        self._rest = x, u
+        self._rest = find_equilibrium(self, x, u)
+
+    @property
+    def traceable(self) -> bool:
+        return self.function.torch
+
+    def equilibrium(self) -> Tensor:
+        return self._rest[0]
+
+    def resting_input(self) -> Tensor:
+        return self._rest[1]
+
+    def linearisation(self, x: Tensor | None = None, u: Tensor | None = None) -> Linearisation:
+        at = self._rest[0] if x is None else x
+        return self.function.linearisation(at, self._rest[1] if u is None else u)
+
+
+class StepPlant(FunctionPlant):
+    """x+ = step(x, u): a plant in discrete time, or a simulator whose inside nobody knows.
+
+    Example:
+        >>> def step(x, u):  # NumPy or torch: rows (B, 2) and (B, 1) to (B, 2)
+        ...     return np.stack((x[:, 0] + 0.1 * x[:, 1], x[:, 1] + 0.1 * u[:, 0]), axis=1)
+        >>> plant = systems.StepPlant(step, dim=2, inputs=1, dt=0.1)
+
+    A step is one call, for all rows. Where the function is torch all through, loops with it are compiled and
+    it is differentiated by autograd; else its slopes are central differences, all probes in one call.
+
+    Args:
+        step: (B, n), (B, m) -> (B, n), of torch tensors or NumPy arrays.
+        dim: n.
+        inputs: m.
+        dt: s, the time of a step: the control is held as long, and a step pays dt times the cost rate.
+        periodic: coordinates that are angles in rad.
+        equilibrium: a guess of the state at rest, or of state and input; zeros by default. The nearest rest
+            is searched: by the input alone, then by both.
+        low: of the inputs, as in `Bounds`.
+        high: likewise.
+
+    Raises:
+        ValueError: if an argument breaks its rule, the function raises, returns other shapes or ignores u, or
+            the plant does not rest near the guess.
+    """
+
+    def __init__(
+        self,
+        step: Motion,
+        *,
+        dim: int,
+        inputs: int,
+        dt: float,
+        periodic: Sequence[int] = (),
+        equilibrium: Guess = None,
+        low: Limit = None,
+        high: Limit = None,
+    ) -> None:
+        self_period = positive_real("StepPlant", "dt", dt)
+        super().__init__(
+            "step",
+            step,
+            dim=dim,
+            inputs=inputs,
+            periodic=periodic,
+            equilibrium=equilibrium,
+            low=low,
+            high=high,
+        )
+        self.period = self_period
+
+    def step(self, x: Tensor, u: Tensor) -> Tensor:
+        """x+: (..., n), (..., m) -> (..., n)."""
+        return self.function(x, u)
+
+    def motion(self, x: Tensor, u: Tensor) -> Tensor:
+        """x+ - x, angles in [-pi, pi]."""
+        return self.difference(self.step(x, u), x)
+
+
+class RatePlant(FunctionPlant):
+    """x' = rate(x, u), not affine in u.
+
+    Example:
+        >>> plant = systems.RatePlant(lambda x, u: -x + u.sin(), dim=1, inputs=1)
+
+    Args:
+        rate: (B, n), (B, m) -> (B, n), of torch tensors or NumPy arrays, in units of the state a second.
+        dim, inputs, periodic, equilibrium, low, high: as in `StepPlant`.
+
+    Raises:
+        ValueError: as in `StepPlant`.
+    """
+
+    def __init__(
+        self,
+        rate: Motion,
+        *,
+        dim: int,
+        inputs: int,
+        periodic: Sequence[int] = (),
+        equilibrium: Guess = None,
+        low: Limit = None,
+        high: Limit = None,
+    ) -> None:
+        super().__init__(
+            "rate",
+            rate,
+            dim=dim,
+            inputs=inputs,
+            periodic=periodic,
+            equilibrium=equilibrium,
+            low=low,
+            high=high,
+        )
+
+    def rate(self, x: Tensor, u: Tensor) -> Tensor:
+        """x': (..., n), (..., m) -> (..., n)."""
+        return self.function(x, u)
+
+    def motion(self, x: Tensor, u: Tensor) -> Tensor:
+        return self.rate(x, u)
+
+
+def _guess(call: str, given: Guess, dim: int, inputs: int) -> tuple[Tensor, Tensor]:
+    x, u = torch.zeros(dim, dtype=torch.float64), torch.zeros(inputs, dtype=torch.float64)
+    if given is None:
+        return x, u
+    pair = isinstance(given, tuple) and len(given) == 2 and isinstance(given[0], Sequence | Tensor)
+    state, held = given if pair else (given, u)
+    sizes = (("equilibrium", state, dim), ("equilibrium", held, inputs))
+    points = []
+    for name, value, size in sizes:
+        numbers = value.tolist() if isinstance(value, Tensor) else value
+        numbers = vector(call, name, numbers)
+        if len(numbers) != size:
+            raise fail(call, name, f"must be {dim} numbers, or those and {inputs} of the input", given)
+        points.append(torch.tensor(numbers, dtype=torch.float64))
+    return points[0], points[1]

@@ -1,0 +1,107 @@
+"""The memory of local models: near the optimum of the pendulum's swing-up, and what it says about itself."""
+
+from __future__ import annotations
+
+import pickle
+
+import pytest
+import torch
+from helpers_swingup import REGION, double_integrator, pendulum
+from torch import Tensor
+
+from staf_torch import adp
+
+# Gymnasium's Pendulum-v1, reset with the seeds 0 to 7, and what a controller from dynamic programming on a
+# grid of 640 x 641 states and 33 controls pays from there in 200 steps.
+RESETS = torch.tensor(
+    [
+        [0.860556, -0.460427],
+        [0.074277, 0.900927],
+        [-1.497835, -0.403018],
+        [-2.603443, -0.526379],
+        [2.783804, 0.022655],
+        [1.91639, 0.615882],
+        [0.239794, -0.313458],
+        [0.785998, 0.794428],
+    ],
+    dtype=torch.float64,
+)
+GRID = torch.tensor([121.64, 0.37, 115.87, 217.06, 226.77, 113.93, 0.42, 121.54], dtype=torch.float64)
+
+
+@pytest.fixture(scope="module")
+def memory() -> adp.GlobalValue:
+    return adp.learn_global_value(pendulum(), REGION, steps=120, trajectories=60, rounds=1, states=60)
+
+
+def swing(policy: adp.GlobalValue, x: Tensor) -> tuple[Tensor, Tensor]:
+    """The cost of 200 steps, and the last state."""
+    spent = torch.zeros_like(x[:, 0])
+    for _ in range(200):
+        x, paid = policy.problem.advance(x, policy(x))
+        spent = spent + paid
+    return spent, x
+
+
+def test_swing_up_costs_what_dynamic_programming_costs(memory: adp.GlobalValue) -> None:
+    spent, last = swing(memory, RESETS)
+    assert float(spent.mean() / GRID.mean()) < 1.01
+    assert float(memory.problem.terminal(last).max()) < 1e-3
+
+
+def test_value_is_the_cost_that_its_policy_pays(memory: adp.GlobalValue) -> None:
+    spent, _ = swing(memory, RESETS)
+    found = memory.choose(RESETS)
+    assert bool(found.covered.all())
+    assert float((found.value / spent).log().abs().median()) < 1e-3
+    torch.testing.assert_close(memory.value(RESETS), found.value)
+
+
+def test_bellman_residual_is_small_where_the_memory_knows_the_optimum(memory: adp.GlobalValue) -> None:
+    assert float(memory.bellman_residual(RESETS).abs().median()) < 1e-3
+
+
+def test_gradient_is_the_slope_of_the_value(memory: adp.GlobalValue) -> None:
+    library = memory.library.rows(memory.library.converged & memory.arrives)
+    x, h = library.state[library.cost.argsort()[[10, 30]], 3], 1e-5
+    for i, e in enumerate(h * torch.eye(2, dtype=torch.float64)):
+        rise = (memory.value(x + e) - memory.value(x - e)) / (2 * h)
+        torch.testing.assert_close(memory.gradient(x)[:, i], rise, rtol=1e-2, atol=1e-2)
+
+
+def test_one_state_gets_the_control_of_a_batch(memory: adp.GlobalValue) -> None:
+    batch = memory(RESETS)
+    single = torch.cat([memory(x.unsqueeze(0)) for x in RESETS])
+    torch.testing.assert_close(single, batch, rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(memory(RESETS.view(2, 4, 2)), batch.view(2, 4, 1), rtol=1e-12, atol=1e-12)
+
+
+def test_a_whole_turn_changes_nothing(memory: adp.GlobalValue) -> None:
+    turned = RESETS + torch.tensor([2 * torch.pi, 0.0], dtype=torch.float64)
+    torch.testing.assert_close(memory(turned), memory(RESETS), rtol=1e-6, atol=1e-6)
+
+
+def test_control_at_rest_on_top_is_the_regulator(memory: adp.GlobalValue) -> None:
+    x = torch.tensor([[0.01, -0.02]], dtype=torch.float64)
+    torch.testing.assert_close(memory(x), memory.problem.linear_feedback(x), rtol=1e-2, atol=1e-3)
+
+
+def test_memory_survives_a_pickle_and_keeps_to_the_bounds(memory: adp.GlobalValue) -> None:
+    problem = double_integrator(-1.0, 1.0)
+    grown = adp.learn_global_value(problem, [3.0, 3.0], steps=60, trajectories=6, rounds=0, candidates=4)
+    # A problem made by a function inside a function does not pickle: the module's own does.
+    copied = pickle.loads(pickle.dumps(grown.library))
+    again = adp.GlobalValue(problem, copied, [3.0, 3.0], candidates=4)
+    x = torch.tensor([[2.0, 1.0], [-0.1, 0.0]], dtype=torch.float64)
+    assert torch.equal(again(x), grown(x))
+    assert bool(problem.bounds.contain(grown(x)).all())
+
+
+def test_bad_input_is_named(memory: adp.GlobalValue) -> None:
+    with pytest.raises(ValueError, match=r"region=....` must be positive"):
+        adp.GlobalValue(memory.problem, memory.library, [1.0, 0.0])
+    never = memory.library._replace(value=torch.full_like(memory.library.value, torch.inf))
+    with pytest.raises(ValueError, match="must have a trajectory that arrives"):
+        adp.GlobalValue(memory.problem, never, REGION)
+    with pytest.raises(ValueError, match=r"trajectories=....` must be at least 2"):
+        adp.learn_global_value(memory.problem, REGION, steps=10, trajectories=1)

@@ -1,0 +1,149 @@
+"""Box-constrained DDP: the linear plant exactly, bounds by their conditions, models by differences."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import pytest
+import torch
+from helpers_swingup import cost_of, double_integrator, pendulum
+from torch import Tensor
+
+from staf_torch import adp, systems
+
+X0 = torch.tensor([[5.0, 0.0], [-1.0, 2.0]], dtype=torch.float64)
+BOUNDED = double_integrator(-1.0, 1.0)
+
+
+def still(rows: int, steps: int, inputs: int = 1) -> Tensor:
+    return torch.zeros(rows, steps, inputs, dtype=torch.float64)
+
+
+def two_inputs(low: Tensor | None = None, high: Tensor | None = None) -> adp.SampledProblem:
+    """A point mass in the plane with drag, whose two coupled inputs have bounds of their own."""
+    mixed = torch.tensor([[1.0, 0.4], [0.0, 1.0]], dtype=torch.float64)
+
+    def step(x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+        speed = x[..., 2:]
+        pushed = (mixed * u.unsqueeze(-2)).sum(-1)
+        after = speed + 0.1 * (pushed - 0.1 * speed * speed.square().sum(-1, keepdim=True))
+        paid = 0.1 * (x.square().sum(-1) + 0.5 * u.square().sum(-1))
+        return torch.cat((x[..., :2] + 0.1 * speed, after), dim=-1), paid
+
+    return adp.SampledProblem(step, dim=4, inputs=2, low=low, high=high)
+
+
+def test_linear_plant_without_bounds_gives_the_regulator_everywhere() -> None:
+    problem = double_integrator()
+    found = adp.BoxDDP(problem, steps=30, compile=False).solve(X0, still(2, 30))
+    states = found.state[:, :-1]
+    torch.testing.assert_close(found.cost, problem.terminal(X0), rtol=1e-10, atol=0)
+    torch.testing.assert_close(found.gradient[:, 0], 2 * X0 @ problem.p, rtol=1e-8, atol=1e-8)
+    torch.testing.assert_close(found.curvature[0, 7], 2 * problem.p, rtol=1e-8, atol=1e-8)
+    torch.testing.assert_close(found.feedback[1, 3], -problem.k, rtol=1e-7, atol=1e-8)
+    torch.testing.assert_close(found.control, -states @ problem.k.mT, rtol=1e-7, atol=1e-8)
+    assert bool(found.converged.all())
+
+
+@pytest.mark.parametrize(
+    ("make", "x0"),
+    [
+        (lambda: BOUNDED, X0),
+        (
+            lambda: two_inputs(torch.tensor([-0.2, -1.0]), torch.tensor([0.7, torch.inf])),
+            torch.tensor([[2.0, -1.0, 0.5, 1.0], [-3.0, 1.0, 0.0, 0.0]], dtype=torch.float64),
+        ),
+    ],
+    ids=["double integrator", "two inputs"],
+)
+def test_bounded_control_satisfies_the_optimality_conditions(
+    make: Callable[[], adp.SampledProblem], x0: Tensor
+) -> None:
+    problem = make()
+    search = adp.BoxDDP(problem, steps=15, tolerance=1e-11, compile=False)
+    found = search.solve(x0, still(2, 15, problem.inputs))
+    assert bool(found.converged.all())
+    control = found.control.clone().requires_grad_()
+    cost = cost_of(problem, x0, control)
+    torch.testing.assert_close(cost.detach(), found.cost, rtol=1e-12, atol=0)
+    (slope,) = torch.autograd.grad(cost.sum(), control)
+    projected = problem.bounds.inward(found.control, slope)
+    assert float(projected.abs().max()) < 1e-5 * float(found.cost.max())
+    assert bool(problem.bounds.contain(found.control).all())
+    assert bool(((found.control == problem.bounds.low) | (found.control == problem.bounds.high)).any())
+
+
+def test_models_are_the_derivatives_of_the_optimal_cost() -> None:
+    problem = pendulum()
+    search = adp.BoxDDP(problem, steps=30, tolerance=1e-13, compile=False)
+    center, h = torch.tensor([0.08, -0.15], dtype=torch.float64), 1e-3
+    x0 = center + h * torch.tensor([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]], dtype=torch.float64)
+    found = search.solve(x0)
+    assert bool(found.converged.all())
+    middle, right, left, up, down = found.cost
+    gradient = torch.stack((right - left, up - down)) / (2 * h)
+    torch.testing.assert_close(found.gradient[0, 0], gradient, rtol=1e-4, atol=1e-4)
+    bent = torch.stack((right + left - 2 * middle, up + down - 2 * middle)) / h**2
+    torch.testing.assert_close(found.curvature[0, 0].diagonal(), bent, rtol=1e-2, atol=1e-3)
+
+
+def test_rows_do_not_see_each_other() -> None:
+    search = adp.BoxDDP(BOUNDED, steps=12, compile=False)
+    both = search.solve(X0, still(2, 12))
+    alone = search.solve(X0[1:], still(1, 12))
+    torch.testing.assert_close(both.rows(torch.tensor([1])).state, alone.state, rtol=1e-12, atol=1e-12)
+
+
+def test_compiled_passes_find_what_plain_torch_finds() -> None:
+    plain = adp.BoxDDP(BOUNDED, steps=12, compile=False).solve(X0, still(2, 12))
+    fast = adp.BoxDDP(BOUNDED, steps=12).solve(X0, still(2, 12))
+    torch.testing.assert_close(fast.state, plain.state, rtol=1e-8, atol=1e-8)
+    torch.testing.assert_close(fast.curvature, plain.curvature, rtol=1e-6, atol=1e-8)
+
+
+def test_row_that_cannot_be_followed_has_no_cost_and_did_not_converge() -> None:
+    x0 = torch.tensor([[torch.nan, 0.0], [1.0, 0.0]], dtype=torch.float64)
+    found = adp.BoxDDP(BOUNDED, steps=10, compile=False).solve(x0, still(2, 10))
+    assert found.converged.tolist() == [False, True]
+    assert not math.isfinite(float(found.cost[0]))
+
+
+def test_problem_of_a_plant_and_a_cost_pays_what_the_simulation_pays() -> None:
+    plant = systems.Pendulum()
+    cost = adp.QuadraticCost(1.0, 0.1, dim=2, inputs=1, low=-3.0, high=5.0)
+    problem = adp.SampledProblem.of(plant, cost, dt=0.05)
+    x = torch.tensor([[0.3, -0.2]], dtype=torch.float64)
+    run = adp.simulate(adp.Feedback(problem.linear_feedback), plant, cost, x, dt=0.05, steps=20)
+    spent = torch.zeros(1, dtype=torch.float64)
+    for _ in range(20):
+        x, paid = problem.advance(x, problem.linear_feedback(x))
+        spent = spent + paid
+    torch.testing.assert_close(run.cost, spent, rtol=1e-12, atol=0)
+    torch.testing.assert_close(run.state[:, -1], x, rtol=1e-12, atol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: adp.SampledProblem(lambda x, u: (x, u), dim=2, inputs=1), "must map x .2, 2. and u"),
+        (
+            lambda: adp.SampledProblem(lambda x, u: (x + 1, u[:, 0]), dim=2, inputs=1),
+            "must be a state of rest at no cost; within one step it moves by 1",
+        ),
+        (
+            lambda: adp.SampledProblem(lambda x, u: (2 * x, u[:, 0] ** 2 + x[:, 0] ** 2), dim=1, inputs=1),
+            "cannot be stabilised",
+        ),
+        (lambda: double_integrator(0.0, 1.0), "rest=....` must lie between the bounds"),
+        (lambda: adp.BoxDDP(BOUNDED, steps=0), "must be at least 1"),
+        (lambda: adp.BoxDDP(BOUNDED, steps=5).solve(X0, still(2, 6)), r"must have the shape \(2, 5, 1\)"),
+        (
+            lambda: adp.SampledProblem.of(systems.Pendulum(), adp.QuadraticCost(1.0, 1.0, 2, 1)),
+            "dt=....` must be a number",
+        ),
+    ],
+)
+def test_bad_input_is_named(call: Callable[[], object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        call()

@@ -1,0 +1,173 @@
+"""Plants that a user brings: a step or a rate, in NumPy or torch, with angles and a rest of their own."""
+
+from __future__ import annotations
+
+import logging
+import math
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from staf_torch import adp, systems
+
+PERIOD = 0.05
+
+
+def turn(x: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """A step of Gymnasium's Pendulum-v1, its bounds inside."""
+    angle, rate = x[:, 0], x[:, 1]
+    rate = np.clip(rate + (15.0 * np.sin(angle) + 3.0 * np.clip(u[:, 0], -2.0, 2.0)) * PERIOD, -8.0, 8.0)
+    return np.stack((angle + rate * PERIOD, rate), axis=1)
+
+
+def turn_torch(x: Tensor, u: Tensor) -> Tensor:
+    angle, rate = x[:, 0], x[:, 1]
+    rate = (rate + (15.0 * angle.sin() + 3.0 * u[:, 0].clamp(-2.0, 2.0)) * PERIOD).clamp(-8.0, 8.0)
+    return torch.stack((angle + rate * PERIOD, rate), dim=1)
+
+
+def fly(x: Tensor, u: Tensor) -> Tensor:
+    """A planar quadrotor by the thrusts of its two rotors."""
+    lift, lean = (u[:, 0] + u[:, 1]) / 0.027, 0.0397 * (u[:, 1] - u[:, 0]) / (1.4e-5 * math.sqrt(2))
+    speeds = (x[:, 2].sin() * lift, x[:, 2].cos() * lift - 9.81, lean)
+    return torch.cat((x[:, 3:], torch.stack(speeds, dim=1)), dim=1)
+
+
+def pendulum(function: object = turn, **more: object) -> systems.StepPlant:
+    given = {"dim": 2, "inputs": 1, "dt": PERIOD, "periodic": [0], "low": -2.0, "high": 2.0} | more
+    return systems.StepPlant(function, **given)
+
+
+COST = adp.QuadraticCost([[20.0, 0.0], [0.0, 2.0]], 0.02, dim=2, inputs=1)
+X0 = torch.tensor([[0.1, 0.0], [2 * math.pi - 0.1, 0.0], [-0.15, 0.4]], dtype=torch.float64)
+
+
+@torch.no_grad()
+def test_black_box_is_regulated_like_the_same_plant_in_torch() -> None:
+    runs = []
+    for function in (turn, turn_torch):
+        plant = pendulum(function)
+        assert plant.traceable is (function is turn_torch)
+        lqr = adp.LQR(plant, COST)
+        assert lqr.period == PERIOD
+        runs.append(adp.simulate(adp.Feedback(lqr), plant, COST, X0, steps=100, compile=False))
+    torch.testing.assert_close(runs[0].cost, runs[1].cost, rtol=1e-9, atol=0)
+    # The second state is the mirror of the first, a turn further on: it comes to rest there.
+    torch.testing.assert_close(runs[0].cost[1], runs[0].cost[0])
+    goal = torch.tensor([[0.0, 0.0], [2 * math.pi, 0.0], [0.0, 0.0]], dtype=torch.float64)
+    torch.testing.assert_close(runs[0].state[:, -1], goal, rtol=0, atol=1e-6)
+
+
+def test_lqr_of_a_step_plant_is_that_of_the_held_plant_in_continuous_time() -> None:
+    linear = systems.Linear([[0.0, 1.0], [20.0, 0.0]], [[0.0], [1.0]])
+    hold = torch.linalg.matrix_exp(
+        0.1 * torch.tensor([[0.0, 1.0, 0.0], [20.0, 0.0, 1.0], [0.0, 0.0, 0.0]]).double()
+    )
+    plant = systems.StepPlant(
+        lambda x, u: x @ hold[:2, :2].numpy().T + u @ hold[:2, 2:].numpy().T, dim=2, inputs=1, dt=0.1
+    )
+    sampled = adp.LQR(plant, COST)
+    held = adp.held_stability(sampled, plant, 0.1).spectral_radius
+    assert held == pytest.approx(adp.held_stability(sampled, linear, 0.1).spectral_radius, rel=1e-6)
+    x0 = torch.tensor([[0.1, -0.2]], dtype=torch.float64)
+    run = adp.simulate(adp.Feedback(sampled), plant, COST, x0, steps=200)
+    assert float(run.cost) == pytest.approx(float(sampled.value(x0)), rel=1e-8)
+    slow = adp.LQR(plant, COST, period=0.3)
+    assert adp.held_stability(slow, plant, 0.3).spectral_radius < 1
+    with pytest.raises(ValueError, match=r"must be a multiple of the plant's period of 0.1 s; got 0.25"):
+        adp.LQR(plant, COST, period=0.25)
+
+
+@torch.no_grad()
+def test_quadrotor_by_its_rotors_hovers_and_flies_to_a_set_point_within_its_bounds() -> None:
+    plant = systems.RatePlant(fly, dim=6, inputs=2, periodic=[2], low=0.0, high=0.3)
+    hover = torch.full((2,), 0.027 * 9.81 / 2, dtype=torch.float64)
+    torch.testing.assert_close(plant.resting_input(), hover, rtol=1e-9, atol=0)
+    cost = adp.QuadraticCost(1.0, 0.1, dim=6, inputs=2, target=[0.3, 0.2, 0.0, 0.0, 0.0, 0.0])
+    lqr = adp.LQR(plant, cost, period=0.02)
+    start = torch.zeros(1, 6, dtype=torch.float64)
+    run = adp.simulate(adp.Feedback(lqr), plant, cost, start, steps=500)
+    assert isinstance(plant.bounds, systems.Bounds)
+    assert lqr.cost.bounds is plant.bounds
+    assert plant.bounds.contain(run.control[:, :-1]).all()
+    torch.testing.assert_close(run.state[0, -1], lqr.cost.target, rtol=0, atol=1e-3)
+    assert float(run.cost) >= float(lqr.value(start)) * 0.99
+
+
+def test_rest_is_searched_from_the_guess() -> None:
+    def hang(x: np.ndarray, u: np.ndarray) -> np.ndarray:
+        return np.stack((x[:, 1], -9.81 * np.sin(x[:, 0]) + 1e-5 + u[:, 0]), axis=1)
+
+    held = systems.RatePlant(hang, dim=2, inputs=1, equilibrium=[math.pi - 0.2, 0.0])
+    assert float(held.resting_input()) == pytest.approx(9.81 * math.sin(0.2) - 1e-5, rel=1e-6)
+
+    def free(x: np.ndarray, u: np.ndarray) -> np.ndarray:
+        return np.stack((x[:, 1] + 0 * u[:, 0], -9.81 * np.sin(x[:, 0]) + u[:, 0] * x[:, 1]), axis=1)
+
+    top = systems.RatePlant(free, dim=2, inputs=1, equilibrium=([math.pi - 0.2, 0.0], [0.0]))
+    torch.testing.assert_close(
+        top.equilibrium(), torch.tensor([math.pi, 0.0], dtype=torch.float64), rtol=0, atol=1e-9
+    )
+
+
+@torch.no_grad()
+def test_costs_with_outputs_discount_and_blind_directions() -> None:
+    linear = systems.Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
+    x0 = torch.tensor([[1.0, -0.5]], dtype=torch.float64)
+    seen = adp.QuadraticCost([[1.0]], 1.0, dim=2, inputs=1, output=lambda x: x[..., :1])
+    blind = adp.QuadraticCost([[1.0, 0.0], [0.0, 0.0]], 1.0, dim=2, inputs=1)
+    torch.testing.assert_close(adp.LQR(linear, seen).p, adp.LQR(linear, blind).p)
+    for cost in (seen, blind, adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1, discount=0.7)):
+        for period in (None, 0.2):
+            lqr = adp.LQR(linear, cost, period=period)
+            dt = period or 0.01
+            run = adp.simulate(
+                adp.Feedback(lqr), linear, cost, x0, dt=dt, steps=round(30 / dt), every=10, substeps=4
+            )
+            assert float(run.cost) == pytest.approx(float(lqr.value(x0)), rel=2e-4)
+    unseen = adp.QuadraticCost([[0.0, 0.0], [0.0, 1.0]], 1.0, dim=2, inputs=1)
+    with pytest.raises(ValueError, match=r"not detectable: the cost Q does not see its mode .* 0 1/s"):
+        adp.LQR(linear, unseen)
+
+
+def test_loop_that_is_held_too_long_is_said_to_be_unstable(caplog: pytest.LogCaptureFixture) -> None:
+    falling = systems.Linear([[0.0, 1.0], [20.0, 0.0]], [[0.0], [1.0]])
+    lqr, x0 = adp.LQR(falling, COST), torch.ones(1, 2, dtype=torch.float64)
+    with caplog.at_level(logging.WARNING):
+        adp.simulate(adp.Feedback(lqr), falling, COST, x0, dt=0.3, steps=2)
+    stability = adp.held_stability(lqr, falling, 0.3)
+    assert (
+        f"dt = 0.3 s, at which the linearised loop has the spectral radius {stability[0]:.4g}" in caplog.text
+    )
+    assert f"it is stable up to {stability.largest_period:.4g} s" in caplog.text
+    caplog.clear()
+    adp.simulate(adp.Feedback(lqr), falling, COST, x0, dt=0.01, steps=2)
+    adp.simulate(adp.Feedback(adp.LQR(falling, COST, period=0.3)), falling, COST, x0, steps=2)
+    assert caplog.text == ""
+
+
+@pytest.mark.parametrize(
+    ("function", "message"),
+    [
+        (lambda x, u: x, r"`StepPlant\(step=...\)` ignores u"),
+        (lambda x, u: x[:, 0] + u[:, 0], r"must map x and u of the shapes \(6, 2\) and \(6, 1\) to \(6, 2\)"),
+        (lambda x, u: 1 / 0, r"`StepPlant\(step=...\)` raised ZeroDivisionError \(division by zero\)"),
+        (lambda x, u: np.nan * (x + u), r"returned values that are not finite near x"),
+        (lambda x, u: x + 1.0 + 0.01 * np.sin(u), r"no equilibrium near the guess.*state 0 keeps moving"),
+        (3.0, r"must be a function of x \(B, n\) and u \(B, m\); got 3.0"),
+    ],
+)
+def test_bad_steps_are_refused_with_a_sentence(function: object, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        pendulum(function)
+
+
+def test_kinks_and_lost_modes_are_named() -> None:
+    kinked = pendulum(lambda x, u: x + 0.1 * np.abs(x[:, ::-1] + u - 1e-4) - 1e-5)
+    with pytest.raises(ValueError, match=r"`StepPlant\(step=...\)` is not smooth at the state"):
+        adp.LQR(kinked, COST)
+    lost = pendulum(lambda x, u: np.stack((1.5 * x[:, 0], 0.5 * x[:, 1] + u[:, 0]), axis=1))
+    with pytest.raises(ValueError, match=r"StepPlant .* not stabilisable.* eigenvalue 1.5 a step"):
+        adp.LQR(lost, COST)

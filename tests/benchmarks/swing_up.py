@@ -1,0 +1,189 @@
+"""Swing-ups by a memory of local models, measured in full: cost over the optimum, and what it takes.
+
+    python tests/benchmarks/swing_up.py pendulum [--seeds 5] [--json FILE]
+    python tests/benchmarks/swing_up.py cartpole [--ipopt 100] [--json FILE]     # --ipopt: needs casadi
+
+pendulum: Gymnasium's own Pendulum-v1, reset with the seeds 0 to 99, 200 steps, for several seeds of the
+memory; beside it dynamic programming on a grid of the same steps (20 minutes; --grid 0: none). cartpole: 100
+states of a box, 10 N, held for 20 ms. Not collected by pytest.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import math
+import statistics
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from helpers_swingup import CART_REGION, REGION, cart_pole, pendulum, step
+
+from staf_torch import adp
+
+_GRID, _CONTROLS, _EPISODE = 640, 33, 200
+
+
+def main() -> None:
+    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("plant", choices=("pendulum", "cartpole"))
+    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--grid", type=int, default=_GRID, help="0: no dynamic programming")
+    parser.add_argument("--ipopt", type=int, default=0, help="states from which IPOPT solves too")
+    parser.add_argument("--json", type=Path)
+    settings = parser.parse_args()
+    torch.set_num_threads(1)
+    found = swing_pendulum(settings) if settings.plant == "pendulum" else swing_cart(settings)
+    text = json.dumps(found, indent=2)
+    print(text)
+    if settings.json is not None:
+        settings.json.write_text(text)
+
+
+def swing_pendulum(settings: argparse.Namespace) -> dict[str, Any]:
+    import gymnasium
+
+    resets = []
+    for seed in range(100):
+        env = gymnasium.make("Pendulum-v1")
+        env.reset(seed=seed)
+        resets.append(np.asarray(env.unwrapped.state))
+    x0 = torch.tensor(np.array(resets), dtype=torch.float64)
+    grid = dynamic_programming(x0, settings.grid) if settings.grid else None
+    runs = []
+    for seed in range(settings.seeds):
+        began = time.process_time()
+        memory = adp.learn_global_value(pendulum(), REGION, steps=150, seed=seed)
+        offline = time.process_time() - began
+        returns, times = episodes(memory)
+        cost = -torch.tensor(returns, dtype=torch.float64)
+        run = {
+            "seed": seed,
+            "offline_cpu_s": offline,
+            "models": len(memory.entries),
+            "mean_cost_50": float(cost[:50].mean()),
+            "mean_cost_100": float(cost.mean()),
+            "us_a_control_median": statistics.median(times),
+            "us_a_control_p99": float(np.quantile(times, 0.99)),
+        }
+        if grid is not None:
+            run |= {
+                "over_grid_50": float(cost[:50].mean() / grid[:50].mean()),
+                "over_grid_100": float(cost.mean() / grid.mean()),
+                "worst_excess": float((cost - grid).max()),
+            }
+        runs.append(run)
+        print(run, flush=True)
+    names = [name for name in runs[0] if name != "seed"]
+    return {"runs": runs, "median": {name: statistics.median(run[name] for run in runs) for name in names}}
+
+
+def episodes(memory: adp.GlobalValue) -> tuple[list[float], list[float]]:
+    """Returns of the real environment from 100 resets, and microseconds of every control."""
+    import gymnasium
+
+    returns, times = [], []
+    env = gymnasium.make("Pendulum-v1")
+    for seed in range(100):
+        env.reset(seed=seed)
+        total, over = 0.0, False
+        while not over:
+            x = torch.from_numpy(np.asarray(env.unwrapped.state, dtype=np.float64)).unsqueeze(0)
+            began = time.perf_counter()
+            u = memory(x)
+            times.append(1e6 * (time.perf_counter() - began))
+            _, reward, terminated, truncated, _ = env.step(u[0].numpy())
+            total, over = total + float(reward), terminated or truncated
+        returns.append(total)
+    return returns, times
+
+
+def dynamic_programming(x0: Tensor, count: int) -> Tensor:
+    """Cost of 200 steps from x0 (B, 2) under the greedy control of values on a grid, interpolated: (B,)."""
+    angles = -math.pi + 2 * math.pi * torch.arange(count, dtype=torch.float64) / count
+    rates = torch.linspace(-8, 8, count + 1, dtype=torch.float64)
+    states = torch.cartesian_prod(angles, rates)
+    controls = torch.linspace(-2, 2, _CONTROLS, dtype=torch.float64)
+
+    def place(x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        a = (x[..., 0] + math.pi) / (2 * math.pi) * count
+        b = (x[..., 1] + 8) / 16 * count
+        i, k = a.floor(), b.floor().clamp(0, count - 1)
+        low = (i.long() % count) * (count + 1) + k.long()
+        high = ((i.long() + 1) % count) * (count + 1) + k.long()
+        return low.int(), high.int(), (a - i).float(), (b - k).float()
+
+    def at(value: Tensor, where: tuple[Tensor, ...]) -> Tensor:
+        low, high, fa, fb = where
+        low, high = low.long(), high.long()
+        near = (1 - fb) * value[low] + fb * value[low + 1]
+        return (1 - fa) * near + fa * ((1 - fb) * value[high] + fb * value[high + 1])
+
+    moves = []
+    for u in controls:
+        after, paid = step(states, u.expand(len(states), 1))
+        moves.append((place(after), paid))
+    values = [torch.zeros(len(states), dtype=torch.float64)]
+    for _ in range(_EPISODE):
+        best = torch.full_like(values[-1], torch.inf)
+        for where, paid in moves:
+            best = torch.minimum(best, paid + at(values[-1], where))
+        values.append(best)
+    fine = torch.linspace(-2, 2, 401, dtype=torch.float64)
+    x, spent = x0, torch.zeros(len(x0), dtype=torch.float64)
+    for left in range(_EPISODE - 1, -1, -1):
+        pairs = x.unsqueeze(1).expand(-1, len(fine), -1), fine.expand(len(x), -1).unsqueeze(-1)
+        after, paid = step(*pairs)
+        u = fine[(paid + at(values[left], place(after))).argmin(1)].unsqueeze(-1)
+        x, paid = step(x, u)
+        spent = spent + paid
+    return spent
+
+
+def swing_cart(settings: argparse.Namespace) -> dict[str, Any]:
+    problem = cart_pole()
+    width = torch.tensor(CART_REGION, dtype=torch.float64)
+    began = time.process_time()
+    memory = adp.learn_global_value(problem, CART_REGION, steps=200, rounds=6, candidates=64, lookahead=120)
+    offline = time.process_time() - began
+    generator = torch.Generator().manual_seed(99)
+    x0 = width * (2 * torch.rand(100, 4, generator=generator, dtype=torch.float64) - 1)
+    x, spent, controls = x0, torch.zeros(100, dtype=torch.float64), []
+    for _ in range(300):
+        controls.append(memory(x))
+        x, paid = problem.advance(x, controls[-1])
+        spent = spent + paid
+    refined = adp.BoxDDP(problem, steps=300).solve(x0, torch.stack(controls, dim=1)).cost
+    found = {
+        "offline_cpu_s": offline,
+        "models": len(memory.entries),
+        "up": float((problem.terminal(x) < 1e-3).double().mean()),
+        **ratios("over_refined", spent / refined),
+    }
+    if settings.ipopt:
+        from rival_ipopt import solve_cart_pole
+
+        best = torch.stack([solve_cart_pole(each, memory) for each in x0[: settings.ipopt]])
+        found |= ratios("over_ipopt", spent[: settings.ipopt] / best)
+    return found
+
+
+def ratios(name: str, ratio: Tensor) -> dict[str, float]:
+    return {
+        f"{name}_mean": float(ratio.mean()),
+        f"{name}_median": float(ratio.median()),
+        f"{name}_max": float(ratio.max()),
+    }
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,115 @@
+"""`staf schema`: every file that ships is valid by it, what a user mistypes is not."""
+
+from __future__ import annotations
+
+import copy
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from command_line import ROOT
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+from staf_torch.cli import schema
+from staf_torch.cli.staf import main
+
+CONF = ROOT / "conf"
+FILES = sorted(path for path in CONF.rglob("*.yaml") if path.relative_to(CONF).parts[0] != "hydra")
+
+
+@pytest.fixture(scope="module")
+def whole() -> dict[str, Any]:
+    return schema.schema()
+
+
+def faults(whole: dict[str, Any], group: str, settings: Any) -> list[str]:
+    """What is wrong with the settings of a file in the folder ``group`` of `conf/`."""
+    jsonschema = pytest.importorskip("jsonschema")
+    node = whole
+    if group not in (".", "experiment"):
+        node = {"$ref": f"#/$defs/{group.replace('/', '.')}", "$defs": whole["$defs"]}
+    return [error.message for error in jsonschema.Draft202012Validator(node).iter_errors(settings)]
+
+
+def test_it_is_a_schema(whole: dict[str, Any]) -> None:
+    pytest.importorskip("jsonschema").Draft202012Validator.check_schema(whole)
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.relative_to(CONF).as_posix())
+def test_a_file_that_ships_is_valid_and_with_a_wrong_key_it_is_not(path: Path, whole: dict[str, Any]) -> None:
+    group = path.relative_to(CONF).parent.as_posix()
+    settings = OmegaConf.to_container(OmegaConf.load(path))
+    assert faults(whole, group, settings) == []
+    wrong = copy.deepcopy(settings)
+    wrong["raduis"] = 0.1
+    assert faults(whole, group, wrong)
+
+
+def test_settings_of_a_run_are_valid(whole: dict[str, Any]) -> None:
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        for options in (["experiment=adp"], ["kernel=matern", "optimizer=exact", "members=['seed=0,1']"]):
+            assert faults(whole, ".", OmegaConf.to_container(compose("config", options))) == []
+
+
+@pytest.mark.parametrize(
+    ("group", "settings"),
+    [
+        ("kernel", {"_target_": "staf_torch.GaussianKernel", "length_scale": 1.0}),
+        ("kernel", {"_target_": "staf_torch.GaussianKernel", "width": "wide"}),
+        ("kernel", {"_target_": "staf_torch.GausianKernel"}),
+        ("centers", {"radius": 0.1, "shrink": {"ofset": 0.0}}),
+        ("optimizer", {"_target_": "staf_torch.optim.HeavyBall.from_settings", "inner_steps": 1.5}),
+        ("adp", {"gains": {"critc": 0.1}}),
+        ("adp/law", {"_target_": "staf_torch.adp.Frozen", "gians": None}),
+        (".", {"dtype": "float16"}),
+        (".", {"task": "gradient_chasing"}),
+        (".", {"kernel": {"widht": 1.0}}),
+        (".", {"adp": {"rollout": {"horizont": 1.0}}}),
+        ("experiment", {"laws": {"worc": 11}}),
+    ],
+)
+def test_what_is_mistyped_is_not_valid(group: str, settings: Any, whole: dict[str, Any]) -> None:
+    assert faults(whole, group, settings)
+
+
+@pytest.mark.parametrize(
+    ("group", "settings"),
+    [
+        ("kernel", {"_target_": "cauchy.Cauchy", "width": 0.7}),
+        ("kernel", {"width": 2}),
+        ("target", {"_target_": "valley.Valley", "depth": [1, 2]}),
+        ("centers", {"radius": "${spread}", "count": 6}),
+        ("experiment", {"task": "closeness.closeness", "defaults": [{"override /kernel": "matern"}]}),
+        (".", {"animation": "html", "adp": {"q": [[1.0, 0.0], [0.0, 2.0]]}}),
+    ],
+)
+def test_what_a_user_may_write_is_valid(group: str, settings: Any, whole: dict[str, Any]) -> None:
+    assert faults(whole, group, settings) == []
+
+
+def test_comments_of_the_files_are_shown_by_the_editor(whole: dict[str, Any]) -> None:
+    assert whole["properties"]["spread"] != {}
+    assert whole["properties"]["settle_time"]["description"] == "s: metrics are taken from here on"
+    assert whole["$defs"]["adp"]["properties"]["gain"]["description"] == "Gam(0) = gain I"
+    launcher = whole["properties"]["hydra"]["properties"]["launcher"]["properties"]
+    assert launcher["batch"]["description"].startswith("jobs in a tensor batch at most")
+
+
+def test_the_command_prints_the_schema_of_a_group(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["staf", "schema", "adp/law"])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code is None
+    printed = json.loads(capsys.readouterr().out)
+    assert printed["$ref"] == "#/$defs/adp.law"
+    assert printed["$ref"].rpartition("/")[2] in printed["$defs"]
+    monkeypatch.setattr(sys, "argv", ["staf", "schema", "kernels"])
+    with pytest.raises(
+        SystemExit, match=r"`staf schema\(group=...\)` must be one of 'experiment', 'adp/basis', "
+    ):
+        main()

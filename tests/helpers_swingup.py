@@ -1,0 +1,76 @@
+"""Gymnasium's Pendulum-v1 as a problem in steps: what the tests of swing-ups share."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from staf_torch import adp, systems
+
+
+def step(x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+    """The environment's own step: semi-implicit, the new rate moves the angle; minus the reward."""
+    angle, rate = x.unbind(-1)
+    torque = u[..., 0]
+    wrapped = angle - 2 * math.pi * torch.round(angle / (2 * math.pi))
+    paid = wrapped.square() + 0.1 * rate.square() + 0.001 * torque.square()
+    after = (rate + 0.05 * (15 * angle.sin() + 3 * torque)).clamp(-8, 8)
+    return torch.stack((angle + 0.05 * after, after), dim=-1), paid
+
+
+def pendulum() -> adp.SampledProblem:
+    return adp.SampledProblem(step, dim=2, inputs=1, low=-2.0, high=2.0, periodic=[0])
+
+
+REGION = [math.pi, 8.0]
+
+
+def double_integrator(low: float | None = None, high: float | None = None) -> adp.SampledProblem:
+    """A mass that is pushed, in steps of 0.1 s, for x'x + u'u a second."""
+
+    def step(x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+        place, speed = x.unbind(-1)
+        paid = 0.1 * (x.square().sum(-1) + u.square().sum(-1))
+        return torch.stack((place + 0.1 * speed, speed + 0.1 * u[..., 0]), dim=-1), paid
+
+    return adp.SampledProblem(step, dim=2, inputs=1, low=low, high=high)
+
+
+def cost_of(problem: adp.SampledProblem, x: Tensor, control: Tensor) -> Tensor:
+    """What controls (B, T, m) cost from x (B, n), the terminal value with it: (B,)."""
+    spent = torch.zeros_like(x[:, 0])
+    for u in control.unbind(1):
+        x, paid = problem.advance(x, u)
+        spent = spent + paid
+    return spent + problem.terminal(x)
+
+
+CART_REGION = [1.0, math.pi, 1.0, 2.0]
+
+
+class CartPole(systems.ControlAffineSystem):
+    """(place, angle from upright, and their rates); 1 kg, a pole of 0.1 kg and half a metre to its middle."""
+
+    dim, inputs, periodic = 4, 1, (1,)
+
+    def rate(self, x: Tensor, u: Tensor) -> Tensor:
+        _, angle, speed, turn = x.unbind(-1)
+        sine, cosine = angle.sin(), angle.cos()
+        pushed = (u[..., 0] + 0.05 * turn.square() * sine) / 1.1
+        bent = (9.8 * sine - cosine * pushed) / (0.5 * (4 / 3 - 0.1 * cosine.square() / 1.1))
+        return torch.stack((speed, turn, pushed - 0.05 * bent * cosine / 1.1, bent), dim=-1)
+
+    def drift(self, x: Tensor) -> Tensor:
+        return self.rate(x, torch.zeros_like(x[..., :1]))
+
+    def effectiveness(self, x: Tensor) -> Tensor:
+        return (self.rate(x, torch.ones_like(x[..., :1])) - self.drift(x)).unsqueeze(-1)
+
+
+def cart_pole(force: float = 10.0) -> adp.SampledProblem:
+    """Its swing-up by a bounded force that is held for 20 ms."""
+    weights = torch.diag(torch.tensor([1.0, 1.0, 0.1, 0.1], dtype=torch.float64))
+    cost = adp.QuadraticCost(weights, 0.01, dim=4, inputs=1, low=-force, high=force)
+    return adp.SampledProblem.of(CartPole(), cost, dt=0.02)

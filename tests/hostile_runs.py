@@ -1,0 +1,306 @@
+"""Folders of runs that somebody made to do harm: each function spoils one run directory of a sweep."""
+
+from __future__ import annotations
+
+import json
+import os
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from staf_torch import __version__
+
+RECORD = {
+    "version": __version__,
+    "task": "gradient_chase",
+    "status": "completed",
+    "reason": None,
+    "overrides": ["seed=7"],
+    "settings": {"seed": 7, "kernel": "gaussian"},
+    "seconds": 0.5,
+}
+ESCAPE = "\x1b]0;owned\x07\x1b[31m"
+DEEP = "[" * 100_000 + "]" * 100_000
+
+
+def spoiled(**changes: Any) -> Callable[[Path], None]:
+    """A run of which some entries of the record are others; `metrics_json` is the text of `metrics.json`."""
+
+    def write(run: Path) -> None:
+        metrics = changes.get("metrics_json", '{"ball_error": 0.5}')
+        record = {**RECORD, **{key: value for key, value in changes.items() if key != "metrics_json"}}
+        (run / "run.json").write_text(json.dumps(record))
+        (run / "metrics.json").write_text(metrics)
+
+    return write
+
+
+def text(name: str, content: str | bytes) -> Callable[[Path], None]:
+    """A run of which one file has that content."""
+
+    def write(run: Path) -> None:
+        spoiled()(run)
+        (run / name).parent.mkdir(exist_ok=True)
+        (run / name).write_bytes(content.encode() if isinstance(content, str) else content)
+
+    return write
+
+
+def link(name: str, target: str) -> Callable[[Path], None]:
+    """A run of which one file is a link."""
+
+    def write(run: Path) -> None:
+        spoiled()(run)
+        (run / name).unlink(missing_ok=True)
+        (run / name).symlink_to(target)
+
+    return write
+
+
+def pipe(run: Path) -> None:
+    """A pipe that nobody writes to, in place of the metrics."""
+    spoiled()(run)
+    (run / "metrics.json").unlink()
+    os.mkfifo(run / "metrics.json")
+
+
+def old(
+    config: str, overrides: str = "- seed=7\n", choices: str = "{kernel: gaussian}"
+) -> Callable[[Path], None]:
+    """A run without `run.json`, of which Hydra's own files tell."""
+
+    def write(run: Path) -> None:
+        (run / ".hydra").mkdir()
+        (run / ".hydra" / "config.yaml").write_text(config)
+        (run / ".hydra" / "overrides.yaml").write_text(overrides)
+        (run / ".hydra" / "hydra.yaml").write_text(f"hydra:\n  runtime:\n    choices: {choices}\n")
+        (run / "metrics.json").write_text('{"ball_error": 0.5}')
+
+    return write
+
+
+def members(content: str) -> Callable[[Path], None]:
+    """A run of many members."""
+    return text("members.json", content)
+
+
+BOMB = "a0: &a0 [x, x, x, x, x, x, x, x, x, x]\n" + "".join(
+    f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 10)}]\n" for n in range(1, 9)
+)
+TABLES: dict[str, Callable[[Path], None]] = {
+    "deep metrics": text("metrics.json", f'{{"ball_error": {DEEP}}}'),
+    "deep record": text("run.json", DEEP),
+    "deep settings": spoiled(settings={"seed": json.loads("[" * 90 + "]" * 90)}),
+    "a huge integer": text("metrics.json", f'{{"ball_error": 1{"0" * 400}}}'),
+    "an integer of too many digits": text("metrics.json", f'{{"ball_error": 1{"0" * 6000}}}'),
+    "a huge integer in the settings": text(
+        "run.json", json.dumps(RECORD).replace('"seed": 7', f'"seed": 1{"0" * 400}')
+    ),
+    "infinity": text("metrics.json", '{"ball_error": 1e999}'),
+    "metrics that are a list": text("metrics.json", "[1, 2]"),
+    "metrics of lists": text("metrics.json", '{"ball_error": [1, 2], "gradient_error": {"a": 1}}'),
+    "declared metrics that are a list": spoiled(metrics=["ball_error"]),
+    "settings that are a list": spoiled(settings=["seed"]),
+    "overrides that are numbers": spoiled(overrides=[1, None, {"a": 2}]),
+    "overrides that are a text": spoiled(overrides="seed=1"),
+    "a status that is a list": spoiled(status=["completed"]),
+    "a version that is an object": spoiled(version={"a": 1}),
+    "seconds of infinity": text("run.json", json.dumps(RECORD).replace("0.5", "1e999")),
+    "lone surrogates": spoiled(
+        reason="\ud800 lone", overrides=["seed=\udfff"], settings={"\ud800": "\udc00"}
+    ),
+    "bytes that are no text": text("run.json", b"\xff\xfe{}"),
+    "an empty record": text("run.json", ""),
+    "a null character": text("run.json", b"\x00" * 4096),
+    "too many names": text("metrics.json", json.dumps({f"m{n}": n for n in range(50_000)})),
+    "too many bytes": text("metrics.json", '{"ball_error": 0.5' + " " * (5 * 2**20) + "}"),
+    "too many lists": text("metrics.json", '{"a": [' + "[]," * 1_200_000 + "[]]}"),
+    "a pipe": pipe,
+    "a link to a device": link("metrics.json", "/dev/zero"),
+    "a link to a secret": link("metrics.json", "../../secret.json"),
+    "a link that leads to itself": link("run.json", "run.json"),
+    "a folder in place of a file": lambda run: (run / "run.json").mkdir(),
+    "a YAML bomb": old(BOMB),
+    "recursive YAML": old("a: &a [*a]\n"),
+    "recursive overrides": old("a: 1\n", "&a [*a]\n"),
+    "deep YAML": old("a: " + "[" * 3000 + "]" * 3000),
+    "YAML with a Python object": old("a: !!python/object/apply:os.system ['touch ../../owned']\n"),
+    "YAML with choices that are a list": old("a: 1\n", choices="[1, 2]"),
+    "members with num 1e999": members(
+        '{"version": "1", "members": [\n'
+        '{"num": 1e999, "overrides": ["seed=1"], "status": "completed", "metrics": {}}\n]}\n'
+    ),
+    "members whose metrics are a list": members(
+        '{"members": [{"num": 0, "overrides": ["seed=1"], "status": "completed", "metrics": [1]}]}'
+    ),
+    "members that are cut off": members(
+        '{"version": "1", "members": [\n{"num": 0, "status": "completed"},\n'
+    ),
+    "members on one endless line": members('{"version": "1", "members": [\n' + "[" * (2**20 + 10)),
+    "escapes for the terminal": spoiled(
+        reason=ESCAPE, version=ESCAPE, task=ESCAPE, overrides=[f"seed={ESCAPE}"]
+    ),
+    "escapes in names": text("metrics.json", json.dumps({ESCAPE: 1.0})),
+}
+"""What `staf-table` must survive: other runs keep their rows, and nothing leaks, hangs or fills memory."""
+
+CELLS = {
+    "formula": "=cmd|' /C calc'!A0",
+    "plus": "+1+cmd",
+    "at": "@SUM(A1)",
+    "tag": "<script>alert(1)</script>",
+    "escaped tag": r"`a\<img src=x onerror=alert(1)>`\<img src=x>",
+    "image": "![x](http://evil.example/pixel.png)",
+    "reference": "[x]: http://evil.example/ 'y'",
+    "code": "``<img src=http://evil.example/x>``",
+    "backquotes": "` `` <b> `` `",
+    "input": r"\input{/etc/passwd}",
+    "bar": "a|b|c",
+    "direction": "abc\u202egnp.exe",
+    "terminal": ESCAPE,
+}
+"""Texts of settings that must arrive as texts in every format."""
+
+
+def setting(lines: str, without: str = "kernel") -> Callable[[Path], None]:
+    """A run whose settings have other lines for a group; `OWNED` and `EVIL` are files beside the run."""
+
+    def write(run: Path) -> None:
+        path = run / ".hydra" / "config.yaml"
+        kept, inside = [], False
+        for line in path.read_text().splitlines():
+            inside = line.startswith(f"{without}:") or (inside and line.startswith((" ", "-")))
+            kept += [] if inside else [line]
+        told = lines.replace("OWNED", str(run.parent / "owned")).replace("EVIL", str(run.parent / "evil.pt"))
+        path.write_text("\n".join([*kept, told]) + "\n")
+
+    return write
+
+
+def arrays(**changes: Any) -> Callable[[Path], None]:
+    """A run of which some arrays of the history are others."""
+
+    def write(run: Path) -> None:
+        with np.load(run / "history.npz") as found:
+            whole = {name: found[name] for name in found.files}
+        save = np.savez_compressed if changes.pop("compressed", False) else np.savez
+        save(run / "history.npz", **{**whole, **changes})
+
+    return write
+
+
+def lying(run: Path) -> None:
+    """A history whose header promises more numbers than there are."""
+    path = run / "history.npz"
+    content = path.read_bytes()
+    begin = content.index(b"'shape': (")
+    end = content.index(b")", begin)
+    much = b"'shape': (2, 9999999"
+    path.write_bytes(content[:begin] + much.ljust(end - begin) + content[end:])
+
+
+def crowded(run: Path) -> None:
+    """A history of very many arrays."""
+    with zipfile.ZipFile(run / "history.npz", "w") as archive:
+        for number in range(3000):
+            archive.writestr(f"{number:060d}.npy", b"")
+
+
+def replaced(name: str, content: bytes) -> Callable[[Path], None]:
+    def write(run: Path) -> None:
+        (run / name).write_bytes(content)
+
+    return write
+
+
+def history_pipe(run: Path) -> None:
+    (run / "history.npz").unlink()
+    os.mkfifo(run / "history.npz")
+
+
+def history_link(run: Path) -> None:
+    (run / "history.npz").rename(run.parent / "elsewhere.npz")
+    (run / "history.npz").symlink_to(run.parent / "elsewhere.npz")
+
+
+def hydra_link(run: Path) -> None:
+    (run / ".hydra").rename(run.parent / "hydra")
+    (run / ".hydra").symlink_to(run.parent / "hydra")
+
+
+DOUBLING = "r0: {a: 1}\n" + "".join(
+    f"r{n}: {{a: '${{r{n - 1}}}', b: '${{r{n - 1}}}'}}\n" for n in range(1, 40)
+)
+CALL = "_target_: torch.load, f: EVIL, weights_only: false"
+EXPORTS: dict[str, Callable[[Path], None]] = {
+    "a target": setting(f"kernel: {{{CALL}}}"),
+    "a target in the decoded text of another key": setting(
+        f"k: '{{{CALL}}}'\nkernel: ${{oc.create:${{oc.decode:${{k}}}}}}"
+    ),
+    "a target made of parts": setting(
+        "x: load\nkernel: {_target_: 'torch.${x}', f: EVIL, weights_only: false}"
+    ),
+    "a target behind the library's name": setting(
+        "x: module.torch.load\nkernel: {_target_: 'staf_torch.${x}', f: EVIL, weights_only: false}"
+    ),
+    "a target through the library": setting(
+        "kernel: {_target_: staf_torch.approximation.staf.torch.load, f: EVIL, weights_only: false}"
+    ),
+    "a target by reference": setting(
+        "x: torch.load\nkernel: {_target_: '${x}', f: EVIL, weights_only: false}"
+    ),
+    "a target from the environment": setting("kernel: {_target_: '${oc.env:HOME}'}"),
+    "a target from a dictionary": setting("x: {y: torch.load}\nkernel: {_target_: '${oc.dict.values:x}'}"),
+    "a function of ours that writes": setting(
+        "kernel: {_target_: staf_torch.cli.table.main, _args_: [[., --output, OWNED]]}"
+    ),
+    "a function of ours that writes, by keyword": setting(
+        "kernel: {_target_: staf_torch.results.files.write_text, path: OWNED, text: x}"
+    ),
+    "a function of ours that runs": setting(
+        "kernel: {_target_: staf_torch.run, _args_: [duration=0.1, 'hydra.run.dir=OWNED']}"
+    ),
+    "a module of ours that is a program": setting("kernel: {_target_: staf_torch.__main__.main}"),
+    "a loader of ours": setting("kernel: {_target_: staf_torch.settings.chase.load, path: os.getcwd}"),
+    "a loader of ours under its old name": setting(
+        "kernel: {_target_: staf_torch.experiments.build.load, path: os.getcwd}"
+    ),
+    "a target in an argument": setting(
+        f"kernel: {{_target_: staf_torch.AnchoredKernel, kernel: {{{CALL}}}}}"
+    ),
+    "a target in a list": setting(
+        f"kernel: {{_target_: staf_torch.GaussianKernel, width: [1.0, [{{{CALL}}}]]}}"
+    ),
+    "a metric": setting(f"metric: {{{CALL}}}", "metric"),
+    "a target that is a list": setting("kernel: {_target_: [torch.load], f: EVIL}"),
+    "positional arguments": setting("kernel: {_target_: staf_torch.GaussianKernel, _args_: [1.0]}"),
+    "a text with an escaped interpolation": setting("kernel: {_target_: '\\${oc.env:HOME}'}"),
+    "a task of somebody else": setting("task: os.abort", "task"),
+    "a YAML bomb": setting(BOMB),
+    "references that double": setting(DOUBLING),
+    "references in a circle": setting("kernel: '${x}'\nx: '${kernel}'"),
+    "deep settings": setting("kernel: " + "{a: " * 200 + "1" + "}" * 200),
+    "a Python object": setting("kernel: !!python/object/apply:os.system ['touch OWNED']"),
+    "a billion centers": setting(
+        "centers: {layout: ball, count: 1000000000, radius: 0.1, shrink: {}}", "centers"
+    ),
+    "a billion trajectories": setting("trajectories: 1000000000", "trajectories"),
+    "a state of many coordinates": setting(f"initial_state: {[1.0] * 5000}", "initial_state"),
+    "very many steps": setting("dt: 1.0e-300", "dt"),
+    "a kernel of high degree": setting("kernel: {_target_: staf_torch.PolynomialKernel, degree: 100000000}"),
+    "a compressed history": arrays(compressed=True, state=np.zeros((2, 11, 10**5))),
+    "a pickled history": arrays(weights=np.array([[{}] * 11] * 2, dtype=object)),
+    "a history of other sizes": arrays(weights=np.zeros((2, 11, 5))),
+    "a history of no sizes": arrays(state=np.array(1.0)),
+    "an empty history": arrays(state=np.zeros((2, 0, 2))),
+    "a history that lies": lying,
+    "a history of many arrays": crowded,
+    "a history that is text": replaced("history.npz", b"PK\x05\x06"),
+    "a history that is a pipe": history_pipe,
+    "a history behind a link": history_link,
+    "settings behind a link": hydra_link,
+}
+"""What `staf-export` must refuse without `--trust`, in a sentence."""

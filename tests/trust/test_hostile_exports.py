@@ -1,0 +1,115 @@
+"""`staf-export` of runs that somebody made to do harm: nothing of theirs runs, and a sentence says why."""
+
+from __future__ import annotations
+
+import pickle
+import resource
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from hostile_runs import EXPORTS
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+from staf_torch.cli.export import deployable, export
+from staf_torch.cli.staf import config_directory
+from staf_torch.experiments.registry import experiment
+from staf_torch.settings.trust import constructors, limited
+
+
+class Evil:
+    """Leaves a file when it is unpickled."""
+
+    def __init__(self, victim: Path) -> None:
+        self.victim = victim
+
+    def __reduce__(self) -> Any:
+        return Path.touch, (self.victim,)
+
+
+@pytest.fixture(scope="module")
+def chase(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    run = tmp_path_factory.mktemp("runs") / "chase"
+    with initialize_config_dir(config_directory(), version_base="1.3"):
+        cfg = compose("config", ["centers.count=6", "duration=0.1", "trajectories=2", "figures=false"])
+    (run / ".hydra").mkdir(parents=True)
+    OmegaConf.save(cfg, run / ".hydra" / "config.yaml")
+    experiment(cfg.task)(cfg, run)
+    return run
+
+
+@pytest.fixture
+def run(chase: Path, tmp_path: Path) -> Path:
+    torch.save(Evil(tmp_path / "owned"), tmp_path / "evil.pt", pickle_module=pickle)
+    return Path(shutil.copytree(chase, tmp_path / "run"))
+
+
+@pytest.mark.parametrize("name", EXPORTS)
+def test_a_hostile_run_is_refused_in_a_sentence(name: str, run: Path, tmp_path: Path) -> None:
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    EXPORTS[name](run)
+    with pytest.raises(ValueError, match=r"\w") as refused:
+        deployable(run)
+    assert not (tmp_path / "owned").exists()
+    assert "Error" not in str(refused.value).partition("(")[0]
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 500 * 1024
+
+
+def test_the_file_that_would_be_unpickled_does_harm(run: Path, tmp_path: Path) -> None:
+    torch.load(tmp_path / "evil.pt", weights_only=False)
+    assert (tmp_path / "owned").exists()
+
+
+def test_the_refusal_shows_the_line_that_asks_for_trust(run: Path) -> None:
+    EXPORTS["a target behind the library's name"](run)
+    with pytest.raises(
+        ValueError, match=r"config\.yaml:\d+: kernel: \{_target_: 'staf_torch\.\$\{x\}'.*\n.*--trust"
+    ):
+        deployable(run)
+
+
+def test_trust_lifts_every_limit(run: Path, tmp_path: Path) -> None:
+    EXPORTS["a target in the decoded text of another key"](run)
+    with pytest.raises(ValueError, match=r"\w"):
+        deployable(run, trust=True)  # runs, and finds no kernel
+    assert (tmp_path / "owned").exists()
+
+
+@pytest.mark.parametrize("linked", ["export", "export/approximator.pt2"])
+def test_nothing_is_written_through_a_link(linked: str, run: Path, tmp_path: Path) -> None:
+    victim = tmp_path / "victim"
+    victim.mkdir()
+    (run / linked).parent.mkdir(exist_ok=True)
+    (run / linked).symlink_to(victim if linked == "export" else victim / "file")
+    with pytest.raises(ValueError, match="is a link"):
+        export(run, "pt2")
+    assert list(victim.iterdir()) == []
+
+
+def test_every_part_of_the_settings_may_be_built_without_trust() -> None:
+    targets = {
+        line.partition("_target_:")[2].split("#")[0].strip()
+        for path in Path(config_directory()).rglob("*.yaml")
+        for line in path.read_text().splitlines()
+        if "_target_:" in line
+    }
+    foreign = {
+        name for name in targets if "callbacks" in name or name in ("null", "staf_torch.settings.chase.load")
+    }
+    assert targets - foreign - constructors() == set()
+    assert len(targets - foreign) > 30
+
+
+def test_building_takes_no_more_memory_than_its_limit() -> None:
+    with pytest.raises(ValueError, match="takes more memory to build"), limited("this"):
+        torch.zeros(2**27, dtype=torch.float64)
+    assert torch.zeros(2**26, dtype=torch.float64).numel()
+
+
+def test_building_takes_no_more_time_than_its_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("staf_torch.settings.trust._SECONDS", 0.05)
+    with pytest.raises(ValueError, match=r"takes more than 0\.05 s"), limited("this"):
+        all(n == 0 for n in iter(int, 1))  # zeros without end

@@ -1,0 +1,259 @@
+"""A sweep that is taken up again: nothing that its folder says runs unasked, and no two settings mix."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import socket
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import one
+
+from staf_torch.results import build
+from staf_torch.results.reader import collect, read_run
+from staf_torch.results.run_directory import History
+from staf_torch.sweeps import lock
+from staf_torch.sweeps.resume import command_line, may_run_code
+from staf_torch.tables import Layout, tabulate
+
+SHORT = ["duration=0.05", "settle_time=0", "figures=false", "trajectories=2"]
+OWN = [
+    "-m",
+    "--config-dir",
+    "conf",
+    "experiment=mine",
+    "target=custom",
+    "target.path=bowls.bowl",
+    "seed=0,1,2",
+]
+BOWL = "from bowl_helper import SCALE\n\ndef bowl(x):\n    return SCALE * x.square().sum(-1)\n"
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with settings and modules of one's own, and a sweep over them of three jobs."""
+    place = tmp_path_factory.mktemp("own")
+    (place / "conf" / "experiment").mkdir(parents=True)
+    (place / "conf" / "experiment" / "mine.yaml").write_text(
+        "# @package _global_\ntask: gradient_chase\nspread: 0.5\n"
+    )
+    (place / "bowls.py").write_text(BOWL)
+    (place / "bowl_helper.py").write_text("SCALE = 1.0\n")
+    code, _, err = one(str(place), [*OWN, *SHORT, "hydra.sweep.dir=sweep"])
+    assert code == 0, err
+    return place
+
+
+@pytest.fixture
+def place(whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A copy of it, in which the last job is missing."""
+    copy = Path(shutil.copytree(whole, tmp_path / "own", ignore=shutil.ignore_patterns("__pycache__")))
+    shutil.rmtree(copy / "sweep" / "2")
+    monkeypatch.chdir(tmp_path)  # comes back here from wherever the command goes
+    for name in ("bowls", "bowl_helper"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    return copy
+
+
+def resume(place: Path, *more: str) -> tuple[int, str, str]:
+    return one(str(place), ["-m", "--config-dir", "conf", "sweep.resume=sweep", "--yes", *more])
+
+
+def edit(path: str, before: str, after: str) -> Callable[[Path], None]:
+    def change(place: Path) -> None:
+        text = (place / path).read_text()
+        assert before in text
+        (place / path).write_text(text.replace(before, after))
+
+    return change
+
+
+EDITS: dict[str, tuple[Callable[[Path], None], str]] = {
+    "a setting": (edit("conf/experiment/mine.yaml", "0.5", "2.5"), "spread was 0.5 and is now 2.5"),
+    "a further setting": (
+        edit("conf/experiment/mine.yaml", "spread", "seed: 0\ndt: 0.025\nspread"),
+        "dt was 0.01",
+    ),
+    "a module": (edit("bowls.py", "SCALE *", "2 * SCALE *"), "the module bowls has changed"),
+    "a module of a module": (edit("bowl_helper.py", "1.0", "3.0"), "the module bowl_helper has changed"),
+}
+
+
+@pytest.mark.parametrize("name", EDITS)
+def test_an_edit_between_start_and_resume_is_told(name: str, place: Path) -> None:
+    change, said = EDITS[name]
+    change(place)
+    code, _, err = resume(place)
+    assert code == 1
+    assert said in err
+    assert "sweep.resume_anyway=true" in err
+    assert not (place / "sweep" / "2").exists()
+
+
+def test_another_source_or_torch_is_told(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(build, "source", lambda: "0" * 12)
+    code, _, err = resume(place)
+    assert code == 1
+    assert "the source of staf_torch was" in err
+
+
+def test_what_is_mixed_all_the_same_stands_apart(place: Path) -> None:
+    EDITS["a setting"][0](place)
+    code, _, err = resume(place, "sweep.resume_anyway=true")
+    assert code == 0, err
+    found = collect(place / "sweep")
+    assert found.unswept == ("spread",)
+    assert any("`spread` differs between runs although nobody swept it: 0.5 in 2" in r for r in found.remarks)
+    table = tabulate(found, Layout(rows=("target.path",), aggregates=("mean",), metrics=("ball_error",)))
+    assert [(row.cells["spread"], row.cells["ball_error.n"]) for row in table.rows] == [(0.5, 2), (2.5, 1)]
+
+
+def test_an_untouched_sweep_is_resumed_to_the_last_bit(place: Path, whole: Path) -> None:
+    code, _, err = resume(place)
+    assert code == 0, err
+    assert [run.metrics for run in collect(place / "sweep").rows] == [
+        run.metrics for run in collect(whole / "sweep").rows
+    ]
+
+
+def flip(path: Path) -> None:
+    """One digit of a number becomes another."""
+    text = path.read_text()
+    at = next(n for n in range(len(text) // 2, len(text)) if text[n].isdigit())
+    path.write_text(text[:at] + str((int(text[at]) + 1) % 10) + text[at + 1 :])
+
+
+def cut(path: Path) -> None:
+    content = path.read_bytes()
+    path.write_bytes(content[: len(content) // 2])
+
+
+@pytest.mark.parametrize(
+    ("file", "spoil"), [("metrics.json", flip), ("history.npz", cut), ("run.json", flip)]
+)
+def test_a_damaged_file_is_named_and_made_again(
+    file: str, spoil: Callable[[Path], None], place: Path, whole: Path
+) -> None:
+    spoil(place / "sweep" / "1" / file)
+    (bad,) = (run for run in collect(place / "sweep").rows if run.directory.name == "1")
+    assert bad.metrics == {}
+    assert f"{file} is damaged" in str(bad.reason)
+    code, out, err = resume(place)
+    assert code == 0, err
+    assert f"{file} is damaged" in out + err
+    again, before = (read_run(folder / "sweep" / "1")[0] for folder in (place, whole))
+    assert again.metrics == before.metrics
+    histories = [History(run.directory / "history.npz") for run in (again, before)]
+    for key in histories[1]:
+        np.testing.assert_array_equal(histories[0][key], histories[1][key])
+
+
+FOREIGN = [
+    "hydra.callbacks.mine._target_=evil.Callback",
+    "+hydra.callbacks.x={_target_: os.system}",
+    "hydra.launcher.submitit.slurm_setup=['touch owned']",
+    "hydra.job.env_set.LD_PRELOAD=evil.so",
+    "hydra.searchpath=[file:///tmp/evil]",
+    "hydra/job_logging=../../evil",
+    "hydra.launcher.ray.address=evil:1",
+    "hydra.sweep.subdir=../../x",
+    "hydra.launcher.executor=${oc.env:HOME}",
+    "hydra/launcher=evil",
+    "task=os.abort",
+    "task=str(os.abort)",
+    "kernel=custom kernel.path=evil.Kernel",
+    "kernel={_target_: torch.load, f: evil.pt}",
+    "+target.x=${oc.env:SECRET}",
+    "kernel=../../../tmp/evil",
+    "kernel=/tmp/evil",
+    "tracker=custom",
+    "members=['kernel.path=evil.x']",
+    "+kernel@hydra.callbacks.x=evil",
+]
+HARMLESS = ["kernel=gaussian,matern", "centers.radius=0.1,0.2", "adp/policy=lqr", "seed=range(5)", "+new=1"]
+HARMLESS += ["members=['seed=range(9)']", "initial_state=[1.0,0.0]", "hydra.launcher.executor=process"]
+HARMLESS += [
+    "hydra/sweeper=optuna",
+    "hydra.launcher.submitit.timeout_min=10",
+    "centers.radius=interval(0.1,0.2)",
+]
+
+
+@pytest.mark.parametrize("line", FOREIGN)
+def test_a_line_of_somebody_else_is_shown_and_not_run(line: str, tmp_path: Path) -> None:
+    jobs = [] if line.lstrip("+").startswith("hydra") else line.split(" ", line.count("custom "))
+    hydra = [] if jobs else [line]
+    record = {"version": build.__version__, "overrides": ["seed=0", *jobs], "hydra": hydra, "jobs": []}
+    (tmp_path / "sweep.json").write_text(json.dumps(record))
+    with pytest.raises(ValueError, match="may run code of whoever started it") as refused:
+        command_line(["-m", f"sweep.resume={tmp_path}"])
+    assert line.split()[-1] in str(refused.value)
+    assert {*jobs, *hydra} <= set(command_line(["-m", f"sweep.resume={tmp_path}", "--yes"]))
+    assert command_line(["-m", f"sweep.resume={tmp_path}", "seed=0", *jobs, *hydra])  # repeated: known
+
+
+@pytest.mark.parametrize("line", HARMLESS)
+def test_a_plain_line_is_taken_over_without_a_question(line: str) -> None:
+    assert not may_run_code(line)
+
+
+def test_a_directory_that_holds_a_sweep_is_refused(place: Path) -> None:
+    code, _, err = one(str(place), ["-m", "seed=0,1", *SHORT, "hydra.sweep.dir=sweep"])
+    assert code == 1
+    assert "sweep holds a sweep already" in err
+    assert "sweep.resume=sweep" in err
+
+
+def test_a_directory_belongs_to_one_sweep_at_a_time(place: Path) -> None:
+    waiting = "import sys; from pathlib import Path; from staf_torch.sweeps.lock import hold;"
+    waiting += "hold(Path(sys.argv[1])); print('held', flush=True); sys.stdin.read()"
+    line = [sys.executable, "-c", waiting, str(place / "sweep")]
+    with subprocess.Popen(line, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as other:
+        assert other.stdout is not None
+        assert other.stdout.readline() == "held\n"
+        code, _, err = resume(place)
+        assert code == 1
+        assert f"belongs to a sweep that goes on: process {other.pid} on {socket.gethostname()}" in err
+        other.kill()
+    assert resume(place)[0] == 0  # who was killed holds nothing
+
+
+def test_a_lock_of_another_machine_holds_while_it_is_touched(tmp_path: Path) -> None:
+    (tmp_path / lock.NAME).write_text(json.dumps({"host": "elsewhere", "pid": 1, "since": "today"}))
+    with pytest.raises(lock.TakenError, match="process 1 on elsewhere, since today"):
+        lock.DirectoryLock(tmp_path)
+    os.utime(tmp_path / lock.NAME, (0, 0))
+    lock.DirectoryLock(tmp_path).release()
+    assert not (tmp_path / lock.NAME).exists()
+
+
+@pytest.mark.parametrize(
+    "name", [".table.md.partial", "1/.run.json.partial", "1/staf.log", "2", "figures", ".lock", "1/.hydra"]
+)
+def test_a_planted_link_is_not_written_through(name: str, place: Path, tmp_path: Path) -> None:
+    victim = tmp_path / "victim"
+    folder = name in ("2", "figures", "1/.hydra")
+    victim.mkdir() if folder else victim.write_text("mine")
+    planted = place / "sweep" / name
+    shutil.rmtree(planted) if planted.is_dir() else planted.unlink(missing_ok=True)
+    planted.symlink_to(victim)
+    code, _, err = resume(place)
+    assert code == 1
+    assert "link" in err
+    assert list(victim.iterdir()) == [] if folder else victim.read_text() == "mine"
+
+
+def test_a_run_writes_through_no_planted_link(place: Path, tmp_path: Path) -> None:
+    (tmp_path / "victim").write_text("mine")
+    (place / "run").mkdir()
+    (place / "run" / "staf.log").symlink_to(tmp_path / "victim")
+    code, _, err = one(str(place), [*SHORT, "hydra.run.dir=run"])
+    assert code == 1
+    assert "staf.log is a link" in err
+    assert (tmp_path / "victim").read_text() == "mine"

@@ -1,0 +1,72 @@
+"""A sweep that a signal ends: with its report and the line that resumes, and to the same table in the end."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+from command_line import environment
+
+SIGNALLED = """
+import os, random, signal, sys, time
+import staf_torch.cli.staf as app
+import staf_torch.experiments.gradient_chase  # so that the children share it
+import torch._dynamo
+
+GRID = ["centers.count=3,4,6", "centers.radius=0.1,0.2", "hydra.launcher.batch=1"]
+GRID += ["duration=0.05", "settle_time=0", "figures=false", "history=false"]
+
+def start(place, *argv):
+    child = os.fork()
+    if child == 0:
+        sys.stdout = sys.stderr = open(f"{place}.log", "a")
+        sys.argv = ["staf", "-m", *argv]
+        code = 0
+        try:
+            app.main()
+        except SystemExit as end:
+            code = end.code if isinstance(end.code, int) else int(end.code is not None)
+            sys.stderr.write(f"{end.code}\\n")
+        sys.stderr.flush()
+        os._exit(code)
+    return child
+
+def ended(child):
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+
+codes = {"whole": ended(start("whole", *GRID, "hydra.sweep.dir=whole"))}
+chance = random.Random(3)
+for number in (signal.SIGTERM, signal.SIGHUP, signal.SIGINT):
+    place = number.name
+    child = start(place, *GRID, f"hydra.sweep.dir={place}")
+    jobs = chance.randint(1, 4)
+    while not os.path.exists(f"{place}/{jobs}/run.json"):
+        time.sleep(0.0005)
+    os.kill(child, number)
+    codes[place] = ended(child)
+    codes[f"{place} again"] = ended(start(f"{place}2", f"sweep.resume={place}"))
+import json
+print(json.dumps(codes))
+"""
+
+
+def test_signals_end_a_sweep_with_its_report_and_the_line_that_resumes(tmp_path: Path) -> None:
+    line = [sys.executable, "-c", SIGNALLED]
+    run = subprocess.run(line, cwd=tmp_path, env=environment(), capture_output=True, text=True, check=False)
+    assert run.returncode == 0, run.stderr
+    codes = json.loads(run.stdout)
+    assert codes["whole"] == 1  # two jobs have a count that there is not
+    for name, code, said in (
+        ("SIGTERM", 143, "ended by SIGTERM"),
+        ("SIGHUP", 129, "ended by SIGHUP"),
+        ("SIGINT", 130, "interrupted"),
+    ):
+        log = (tmp_path / f"{name}.log").read_text()
+        assert codes[name] == code, log
+        assert f"staf: {said}; " in log
+        assert f"staf -m sweep.resume={name}" in log
+        assert "report: " in log
+        assert codes[f"{name} again"] == 1
+        assert (tmp_path / name / "table.csv").read_text() == (tmp_path / "whole" / "table.csv").read_text()

@@ -1,0 +1,36 @@
+"""What workers of the tests do: importable, because a fresh process looks for it by name."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from pathlib import Path
+
+
+def work(what: str, note: str) -> bytes:
+    """Note the process, then do as told."""
+    Path(note).write_text(str(os.getpid()))
+    if what == "die":
+        os.kill(os.getpid(), signal.SIGKILL)
+    if what == "exit":
+        os._exit(3)
+    if what == "raise":
+        raise OSError("no more memory")
+    if what == "sleep":
+        time.sleep(600)
+    return what.encode()
+
+
+if __name__ == "__main__":  # a parent of two workers, which are at work when it says so
+    import sys
+
+    from staf_torch.sweeps.workers import Worker
+
+    workers = [Worker(work) for _ in range(2)]
+    for number, worker in enumerate(workers):
+        worker.begin("sleep", sys.argv[1] + str(number))
+    while not all(os.path.exists(sys.argv[1] + str(n)) for n in range(2)):
+        time.sleep(0.01)
+    print("at work", flush=True)
+    time.sleep(600)
