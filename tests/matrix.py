@@ -3,8 +3,8 @@
     python tests/matrix.py [--quick] [--only lowest newest] [--place FOLDER]
 
 Environments are built once below FOLDER (`~/.cache/staf_torch-matrix` by default, some gigabytes each: torch
-from the index brings CUDA) and used again. Each runs the whole suite, with `--quick` the tests that versions and
-means touch. What cannot be built here is said, with pip's last line. The last table is in `tests/README.md`.
+from the index brings CUDA) and used again. Each runs the whole suite, with `--quick` the tests that versions
+and means touch. What cannot be built here is said, with pip's last line. The last table: `tests/README.md`.
 """
 
 from __future__ import annotations

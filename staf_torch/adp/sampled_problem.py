@@ -234,7 +234,7 @@ class SampledProblem(nn.Module):
 def _use_forward_mode() -> None:
     """Let torch load what its forward mode needs, without its warning about its own `torch.jit.script`."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)
+        warnings.filterwarnings("ignore", message=".*torch.jit.script")
         torch.func.jvp(torch.sin, (torch.zeros(1),), (torch.ones(1),))
 
 

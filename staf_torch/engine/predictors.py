@@ -178,9 +178,9 @@ def gram_rates(basis: StaFBasis, target: Target, x: Tensor, dx: Tensor) -> GramR
 
 
 def along(function: Callable[[Tensor], Any], x: Tensor, dx: Tensor) -> tuple[Any, Any]:
-    """f(x) and its derivative along dx, in forward mode: torch.func.jvp without the warning that torch 2.13
+    """f(x) and its derivative along dx, in forward mode: torch.func.jvp without the warning that torch
     gives itself on first use, which would end a program in which warnings are errors."""
     with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message=".*torch.jit.script", category=DeprecationWarning)
+        warnings.filterwarnings("ignore", message=".*torch.jit.script")
         primal, tangent = torch.func.jvp(function, (x,), (dx,))[:2]
     return primal, tangent
