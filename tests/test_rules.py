@@ -39,6 +39,12 @@ OTHERS = {
     "StaF.gradient": "in tests/approximation/test_module.py",
     "StaF.hessian": "in tests/approximation/test_hessian.py",
     "ChaseOptimizer": "in tests/optim/test_torch_optimizer.py",
+    "BoxDDP": "in tests/adp/test_trajectory_optimisation.py",
+    "SampledProblem": "in tests/adp/test_trajectory_optimisation.py",
+    "SampledProblem.of": "in tests/adp/test_trajectory_optimisation.py",
+    "GlobalValue": "in tests/adp/test_global_value.py",
+    "learn_global_value": "in tests/adp/test_global_value.py",
+    "StepPlant": "in tests/adp/test_user_plants.py",
 }
 """Calls whose rules are held elsewhere."""
 
@@ -178,6 +184,7 @@ CALLS: dict[str, Callable[..., Any]] = {
     "Pendulum": systems.Pendulum,
     "PlanarQuadrotor": systems.PlanarQuadrotor,
     "VanDerPol": systems.VanDerPol,
+    "CartPole": systems.CartPole,
     "ultimate_bound": bound("ultimate_bound"),
     "step_for_bound": bound("step_for_bound"),
     "steps_for_bound": bound("steps_for_bound"),

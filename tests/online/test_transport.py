@@ -21,7 +21,7 @@ KERNELS = {
 @over(KERNELS, "kernel")
 @pytest.mark.parametrize("forgetting", [1.0, 0.9])
 def test_a_moving_filter_is_the_dense_recursion(kernel: str, forgetting: float) -> None:
-    """u <- T u, D <- T D T', then D <- lambda D and the Kalman update with P = I - D, one matrix at a time."""
+    """u <- T u, D <- T D T', then D <- lambda D and the Kalman update with P = I - D, in matrices."""
     functions = LocalFunctions.of(KERNELS[kernel], 0.4 * st.rings(3))
     ratio, steps = 1e-2, 6
     filter_ = LocalFilter(functions, tensor([ratio]), tensor([forgetting]), slack=0.0)
