@@ -190,7 +190,7 @@ MODULES: dict[str, Case] = {
     "FoldedRollout": Case(lambda s: FoldedRollout(rollout(s))),
 }
 OTHERS = {"_Held", "ConventionModule", "FunctionPlant", "StepPlant", "RatePlant", "Barrier"}
-OTHERS |= {"SampledProblem", "GlobalValue", "SafetyFilter"}
+OTHERS |= {"SampledProblem", "GlobalValue", "SafetyFilter", "PlanReplay"}
 """What wraps a function of the user's own, or takes minutes to make: tested in its room."""
 
 
