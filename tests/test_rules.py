@@ -217,6 +217,7 @@ ABSENT |= {
 }
 ABSENT |= {
     ("PlantEnv", "bound"),
+    ("DirectShooting", "iterations"),
     ("DirectShooting", "intervals"),
     ("simulate", "seed"),
     ("trajectory", "chunk"),
