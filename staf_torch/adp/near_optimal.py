@@ -149,6 +149,7 @@ def near_optimal(
     fastest time constant.
 
     Example:
+        >>> import numpy as np
         >>> def step(x, u):  # a simulator in NumPy: rows (B, 2) and (B, 1)
         ...     return x + 0.1 * np.stack((x[:, 1], np.sin(x[:, 0]) + u[:, 0]), axis=1)
         >>> plant = systems.StepPlant(step, dim=2, inputs=1, dt=0.1, periodic=[0])
