@@ -34,6 +34,7 @@ from .laws import Information as Information
 from .laws import Published as Published
 from .laws import Weights as Weights
 from .memory_growth import learn_global_value as learn_global_value
+from .receding_horizon import RecedingHorizon as RecedingHorizon
 from .rollout import RolloutPolicy as RolloutPolicy
 from .sampled_problem import SampledProblem as SampledProblem
 from .sampling import HeldStability as HeldStability
