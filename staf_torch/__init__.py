@@ -1,5 +1,12 @@
 """State Following (StaF) kernel approximation as a batched PyTorch engine.
 
+The sentence of the library, and where each of its words is: state (`staf_torch.systems`), centers
+(`staf_torch.centers`), Gram matrix (`staf_torch.kernels`), target values (`staf_torch.targets`), weights
+(`staf_torch.optim`, `staf_torch.engine`), estimate (`StaF`, `StaFBasis`), metrics (`staf_torch.metrics`),
+table (`staf_torch.tables`). Closed loops are in `staf_torch.adp`, streams in `staf_torch.online`, devices in
+`staf_torch.deploy`, environments in `staf_torch.envs`, the theorems in `staf_torch.theory`, the compiler in
+`staf_torch.lanes`, experiments from Python in `staf_torch.sweeps.python_api`.
+
 Every name below is imported when it is first used (PEP 562): `staf-table` needs none of them, and no torch.
 """
 

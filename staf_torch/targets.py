@@ -10,12 +10,20 @@ from torch import Tensor, nn
 
 from .numerics.checks import fail, number, real, vector
 
+__all__ = ["Cosine", "Formula", "Paper", "Quadratic"]
+
 
 class Formula(NamedTuple):
     """V once more, for the compiled chase: what a target's `formula(dim)` returns beside its `forward`.
 
     A module with this method, of the library or of yours, is evaluated within the fused recursion and not
     by torch, several times faster; None stands for a dimension that it has no formula for.
+
+    Example:
+        >>> targets.Formula("x[0] * x[0]").expression
+        'x[0] * x[0]'
+
+        Shown by `tests/benchmarks/README.md`.
     """
 
     expression: str  # in C++: coordinates x[0].. and parameters p[0].., with + - * /, exp, tanh and cos
@@ -26,6 +34,12 @@ class Paper(nn.Module):
     """V(x) = x1^2 + 5 x2^2 + tanh(x1 x2), n = 2.
 
     It is not in the exponential kernel's space: its native norm there is infinite.
+
+    Example:
+        >>> targets.Paper()(torch.tensor([1.0, 0.0]).double())
+        tensor(1., dtype=torch.float64)
+
+        Shown by `staf target=paper`.
 
     Source: Rosenfeld et al., section 7.
     """
@@ -42,6 +56,12 @@ class Paper(nn.Module):
 
 class Quadratic(nn.Module):
     """V(x) = x'Px.
+
+    Example:
+        >>> targets.Quadratic(2.0)(torch.tensor([1.0, 2.0]).double())
+        tensor(10., dtype=torch.float64)
+
+        Shown by `staf target=quadratic`.
 
     Args:
         matrix: P, (n, n), symmetric; a number p stands for p I in any dimension.
@@ -78,6 +98,12 @@ class Quadratic(nn.Module):
 
 class Cosine(nn.Module):
     """V(x) = cos(a'x + phase).
+
+    Example:
+        >>> targets.Cosine(frequency=2.0)(torch.tensor([0.0, 0.0]).double())
+        tensor(1., dtype=torch.float64)
+
+        Shown by `staf target=cosine`.
 
     Args:
         frequency: a, rad per unit of the state: n numbers, or one for every coordinate.

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import ast
+import importlib
 import inspect
+import re
+import shlex
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from command_line import ROOT
+from public_names import PACKAGES, public
 
 PACKAGE = ROOT / "staf_torch"
+TOP = re.findall(r"^(\w+):", (ROOT / "conf" / "config.yaml").read_text(encoding="utf-8"), re.MULTILINE)
 DOCUMENTED = {"hydra.core.hydra_config", "hydra.core.config_store"}  # of `hydra.core`, what Hydra documents
 MODULES = {
     ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path
@@ -141,3 +146,45 @@ def test_the_engine_is_six_frames_from_the_command(tmp_path: Path, monkeypatch: 
     (way,) = ways
     assert len(way) <= 6
     assert len({Path(name).name for name in way}) <= 5
+
+
+@pytest.mark.parametrize("package", [name for name in PACKAGES if name != "targets"])
+def test_all_lists_what_a_package_hands_on(package: str) -> None:
+    module = importlib.import_module(f"staf_torch.{package}")
+    tree = ast.parse(Path(str(module.__file__)).read_text(encoding="utf-8"))
+    handed = {
+        alias.asname
+        for node in tree.body
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+        if alias.asname == alias.name and not inspect.ismodule(getattr(module, alias.name))
+    }
+    defined = {
+        node.name
+        for node in tree.body
+        if isinstance(node, ast.ClassDef | ast.FunctionDef) and not node.name.startswith("_")
+    }
+    assert handed | defined <= set(module.__all__)
+    assert all(hasattr(module, name) for name in module.__all__)
+
+
+def test_every_public_name_has_an_example_and_says_where_it_is_shown() -> None:
+    for name, (thing, _) in public().items():
+        text = thing.__doc__ or ""
+        assert ">>> " in text, f"the docstring of {name} needs an example"
+        check_shown(name, text)
+
+
+def check_shown(name: str, text: str) -> None:
+    """What "Shown by" names must exist: a configuration, a command, or a file."""
+    shown = re.findall(r"Shown by `([^`]+)`", " ".join(text.split()))
+    assert shown, f"the docstring of {name} needs a line: Shown by `staf experiment=...`."
+    for place in shown:
+        program, *words = shlex.split(place)
+        if program == "staf":
+            groups = [word.split("=") for word in words if (ROOT / "conf" / word.partition("=")[0]).is_dir()]
+            assert groups or all("." in word or word.split("=")[0] in TOP for word in words), place
+            for group, option in groups:
+                assert (ROOT / "conf" / group / f"{option}.yaml").is_file(), place
+        elif program not in ("staf-table", "staf-export"):
+            assert (ROOT / place).is_file(), place

@@ -21,6 +21,18 @@ class ActorCritic(Controller):
     """u = -1/2 R^-1 g' Ds' Wa, with Wc and Wa moved by a law on the Bellman error at the state and at
     extrapolated points.
 
+    Example:
+        >>> plant = systems.TwoState()
+        >>> cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
+        >>> centers = StateFollowingCenters(rings(3), StateRadius(0.7, offset=1e-5))
+        >>> basis = adp.StaFValueBasis(StaFBasis(AnchoredKernel(ExponentialKernel()), centers))
+        >>> learner = adp.ActorCritic(basis, plant, cost, adp.RandomPoints(1, half_width=0.5))
+        >>> x0 = torch.tensor([[-1.0, 1.0]]).double()
+        >>> adp.simulate(learner, plant, cost, x0, dt=0.01, steps=20).critic_weights.shape  # (B, T, M)
+        torch.Size([1, 21, 3])
+
+        Shown by `staf experiment=adp`.
+
     Args:
         basis: of V^.
         model: what the controller believes the plant to be.

@@ -17,6 +17,13 @@ from ..numerics.checks import choice, flag, integer, positive_real
 class ValueBasis(nn.Module, abc.ABC):
     """V^(y) = W's(y; x): M functions, whose centers may stand around a state x.
 
+    Example:
+        >>> x = torch.tensor([1.0, 2.0]).double()
+        >>> adp.QuadraticBasis(2).value(torch.tensor([1.0, 0.0, 1.0]).double(), x)  # W's(x)
+        tensor(5., dtype=torch.float64)
+
+        Shown by `staf experiment=adp_comparison`.
+
     Attributes:
         count: M.
         dim: n.
@@ -62,6 +69,15 @@ class StaFValueBasis(ValueBasis):
         partial = e^{y'c_i} c_i,   total = e^{y'c_i} (c_i + y + grad nu(x) u_i'y);
 
     every other kernel is differentiated automatically.
+
+    Example:
+        >>> centers = StateFollowingCenters(rings(3), StateRadius(0.7, offset=1e-5))
+        >>> basis = adp.StaFValueBasis(StaFBasis(AnchoredKernel(ExponentialKernel()), centers))
+        >>> x = torch.tensor([1.0, 0.5]).double()
+        >>> basis(x, x).shape, basis.gradient(x, x).shape
+        (torch.Size([3]), torch.Size([3, 2]))
+
+        Shown by `staf experiment=adp adp/basis=staf`.
 
     Args:
         basis: kernel and centers.
@@ -133,6 +149,12 @@ def _slope(radius: StateRadius, x: Tensor) -> Tensor:
 class QuadraticBasis(ValueBasis):
     """s_k(y) = y_i y_j for i <= j: n (n + 1) / 2 functions without centers.
 
+    Example:
+        >>> adp.QuadraticBasis(2)(torch.tensor([2.0, 3.0]).double(), torch.zeros(2).double())
+        tensor([4., 6., 9.], dtype=torch.float64)
+
+        Shown by `staf experiment=adp adp/basis=quadratic`.
+
     Args:
         dim: n, at least 1.
 
@@ -166,6 +188,13 @@ class RBFGridBasis(ValueBasis):
     V^ and its gradient vanish at 0 whatever the weights are, as those of V* do. Without the last term
     (``flat=False``) the control does not vanish at 0, and the state settles beside the origin. The centers
     stand on a regular grid over the box [-half_width, half_width]^n.
+
+    Example:
+        >>> basis = adp.RBFGridBasis(2, points=3)
+        >>> basis.count, float(basis(torch.zeros(2).double(), torch.zeros(2).double()).abs().max())
+        (9, 0.0)
+
+        Shown by `staf experiment=adp adp/basis=rbf_grid`.
 
     Args:
         dim: n.
@@ -222,6 +251,13 @@ class LeadingCoordinates(ValueBasis):
 
     In tracking the value must vanish wherever the error does, whatever the desired state is; a basis of the
     error alone does, and its weights follow the desired state in time.
+
+    Example:
+        >>> basis = adp.LeadingCoordinates(adp.QuadraticBasis(2), dim=4)  # of the first two
+        >>> basis(torch.ones(4).double(), torch.ones(4).double())
+        tensor([1., 1., 1.], dtype=torch.float64)
+
+        Shown by `staf experiment=adp_tracking`.
 
     Args:
         basis: of the first k coordinates.

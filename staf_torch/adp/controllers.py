@@ -22,7 +22,15 @@ Value = Callable[[Tensor], Tensor]
 
 
 class ControllerState(NamedTuple):
-    """What a controller carries from step to step. Feedback laws leave all of it empty."""
+    """What a controller carries from step to step. Feedback laws leave all of it empty.
+
+    Example:
+        >>> rest = adp.Feedback(lambda x: -x[..., :1]).init(torch.ones(3, 2))
+        >>> rest.critic.shape, rest.gain.shape  # nothing is carried
+        (torch.Size([3, 0]), torch.Size([3, 0, 0]))
+
+        Shown by `staf experiment=adp`.
+    """
 
     critic: Tensor  # Wc, (B, M)
     actor: Tensor  # Wa, (B, M)
@@ -32,6 +40,18 @@ class ControllerState(NamedTuple):
 
 class Controller(nn.Module, abc.ABC):
     """u and what the controller carries on, from the state and what it carried until then.
+
+    Example:
+        >>> class Rest(adp.Controller):
+        ...     def init(self, x0):
+        ...         none = x0.new_zeros(len(x0), 0)
+        ...         return adp.ControllerState(none, none, x0.new_zeros(len(x0), 0, 0), none)
+        ...     def step(self, x, carried, uniform, dt):
+        ...         return x.new_zeros(len(x), 1), carried
+        >>> Rest().step(torch.ones(3, 2), Rest().init(torch.ones(3, 2)), None, 0.01)[0].shape
+        torch.Size([3, 1])
+
+        Shown by `staf experiment=adp_comparison`.
 
     Attributes:
         draws: uniform random points of [-1, 1]^n that a step needs, a row.
@@ -74,6 +94,16 @@ class Controller(nn.Module, abc.ABC):
 class Feedback(Controller):
     """u = policy(x), which carries nothing.
 
+    Example:
+        >>> plant = systems.TwoState()
+        >>> cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
+        >>> policy = adp.Feedback(lambda x: -3.0 * x[..., 1:])
+        >>> x0 = torch.tensor([[0.5, 0.5]]).double()
+        >>> bool(adp.simulate(policy, plant, cost, x0, dt=0.01, steps=100).diverged.any())
+        False
+
+        Shown by `staf experiment=adp adp/policy=lqr`.
+
     Args:
         policy: (..., n) -> (..., m).
         value: of the policy or of its design, (..., n) -> (...), for the record.
@@ -108,6 +138,15 @@ class LQR(nn.Module):
 
     With bounds u is clipped to them, with a `BoundedInputCost` smoothly. A control that is held for long
     needs other gains: with a ``period`` P and K are those of the linear plant whose control is held.
+
+    Example:
+        >>> plant = systems.TwoState()
+        >>> cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
+        >>> lqr = adp.LQR(plant, cost)
+        >>> lqr(torch.tensor([[0.0, 1.0]]).double()).round(decimals=3)  # u = -K x, here -3 x2
+        tensor([[-3.]], dtype=torch.float64)
+
+        Shown by `staf experiment=adp adp/policy=lqr`.
 
     Args:
         system: the plant.
@@ -160,6 +199,17 @@ class Supervised(Controller):
     the weights are: V_P' <= -x'Qx - (1 - 2 trust) u_LQR'R u_LQR. It bounds a control that is too weak as
     well as one that is too strong for its time step. The controller learns on as if its own control had
     been applied: the laws ask the model, not the plant.
+
+    Example:
+        >>> plant = systems.TwoState()
+        >>> cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
+        >>> wild = adp.Feedback(lambda x: 10 * x[..., 1:])
+        >>> safe = adp.Supervised(wild, adp.LQR(plant, cost), cost, trust=0.5)
+        >>> x = torch.tensor([[0.0, 1.0]]).double()
+        >>> safe.restrain(x, torch.tensor([[10.0]]).double()).round(decimals=3)  # half of the LQR's
+        tensor([[-1.5000]], dtype=torch.float64)
+
+        Shown by `staf experiment=adp adp.trust=0.5`.
 
     Args:
         controller: the controller to supervise.

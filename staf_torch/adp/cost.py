@@ -29,6 +29,12 @@ class Cost(nn.Module, abc.ABC):
     """The cost rate e'Qe + U(u) of an infinite horizon, with U convex and 0 at the input that holds the plant
     at the set-point. e is the state measured from there, angles in [-pi, pi], or an output of it.
 
+    Example:
+        >>> isinstance(adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1), adp.Cost)
+        True
+
+        Shown by `staf experiment=adp`.
+
     Args:
         state: Q, (n, n), positive semidefinite; a number q stands for q I once the sizes are known.
         control: R, (m, m), positive definite; a number likewise.
@@ -193,6 +199,13 @@ class QuadraticCost(Cost):
     Example:
         >>> cost = adp.QuadraticCost(1.0, 0.1, dim=6, inputs=2, low=[-9.81, -1.0], high=[9.81, 1.0])
 
+    Example:
+        >>> cost = adp.QuadraticCost(2.0, 0.5, dim=2, inputs=1)  # Q = 2 I, R = 0.5
+        >>> float(cost.rate(torch.tensor([1.0, 1.0]).double(), torch.tensor([2.0]).double()))
+        6.0
+
+        Shown by `staf experiment=adp adp/cost=quadratic`.
+
     Args: see `Cost`.
 
     Raises:
@@ -231,6 +244,13 @@ class BoundedInputCost(Cost):
         U(u) = 2 sum_i R_ii b_i int_0^{u_i} artanh(w / b_i) dw,
 
     with b_i the bound on the side of v_i. U is u'Ru for small u and finite at the bound.
+
+    Example:
+        >>> cost = adp.BoundedInputCost(1.0, 1.0, dim=2, inputs=1, bound=1.0)
+        >>> float(cost.rate(torch.tensor([1.0, 0.0]).double(), torch.tensor([0.0]).double()))
+        1.0
+
+        Shown by `staf experiment=adp adp/cost=bounded_input adp/policy=rollout`.
 
     Args:
         bound: of every |u_i|, a positive number or one an input, in the units of u; None where ``low`` and

@@ -19,6 +19,12 @@ class Extrapolation(nn.Module, abc.ABC):
     Around the ``origin`` they are y_i = b z_i, wherever the state is. That is what a global basis needs: its
     weights hold everywhere, and points around the state alone let it forget the rest, so that it stalls.
 
+    Example:
+        >>> isinstance(adp.RandomPoints(1, half_width=0.5), adp.Extrapolation), adp.RandomPoints(3, 0.5).draws
+        (True, 3)
+
+        Shown by `staf experiment=adp`.
+
     Args:
         half_width: b(x), a positive number or a `Radius`, in the units of the state.
         centers: ``moving`` (each point carries its own centers, the published laws) or ``fixed`` (the
@@ -61,6 +67,14 @@ class Extrapolation(nn.Module, abc.ABC):
 class RandomPoints(Extrapolation):
     """N points a step, independent and uniform in the box (the published laws have N = 1).
 
+    Example:
+        >>> points = adp.RandomPoints(2, half_width=0.5)
+        >>> points(torch.zeros(1, 2).double(), torch.ones(1, 2, 2).double())  # uniform numbers in, points out
+        tensor([[[0.5000, 0.5000],
+                 [0.5000, 0.5000]]], dtype=torch.float64)
+
+        Shown by `staf experiment=adp adp/extrapolation=random`.
+
     Args:
         count: N, at least 1.
         half_width: as in `Extrapolation`.
@@ -84,6 +98,13 @@ class RandomPoints(Extrapolation):
 
 class QuadraturePoints(Extrapolation):
     """The mean over the box itself, by an order^n Gauss-Legendre rule: nothing random is left.
+
+    Example:
+        >>> points = adp.QuadraturePoints(3, dim=2, half_width=0.5)
+        >>> points(torch.zeros(1, 2).double(), torch.zeros(1, 0, 2).double()).shape  # 3 a coordinate
+        torch.Size([1, 9, 2])
+
+        Shown by `staf experiment=adp adp/extrapolation=quadrature`.
 
     Args:
         order: points a coordinate, at least 1.

@@ -42,9 +42,17 @@ class GlobalValue(nn.Module):
     Distances are in units of the region, periodic coordinates the shorter way around.
 
     Example:
-        >>> memory = adp.learn_global_value(problem, region=[math.pi, 8.0], steps=150)
-        >>> memory(x)  # u, (B, m)
-        >>> memory.value(x), memory.bellman_residual(x)
+        >>> def step(x, u):  # a cart without friction, for 0.1 s
+        ...     after = torch.stack((x[:, 0] + 0.1 * x[:, 1], x[:, 1] + 0.1 * u[:, 0]), dim=-1)
+        ...     return after, 0.1 * (x.square().sum(-1) + u.square().sum(-1))
+        >>> problem = adp.SampledProblem(step, dim=2, inputs=1, low=-1.0, high=1.0)
+        >>> x0 = torch.tensor([[1.0, 0.0], [-1.0, 0.0]]).double()
+        >>> library = adp.BoxDDP(problem, steps=80, compile=False).solve(x0)
+        >>> memory = adp.GlobalValue(problem, library, region=[1.5, 1.0])
+        >>> memory(torch.tensor([[0.9, 0.0]]).double()).shape  # u, (B, m)
+        torch.Size([1, 1])
+
+        Shown by `staf_torch/adp/README.md`.
 
     Args:
         problem: plant, cost and bounds in steps.

@@ -14,7 +14,14 @@ from .tracking import TwoStateTracking, feedforward, parametric_drift, regressor
 
 
 class Identified(NamedTuple):
-    """The state of an identifier, a row a trajectory."""
+    """The state of an identifier, a row a trajectory.
+
+    Example:
+        >>> adp.ConcurrentLearning(3, 2).init(torch.zeros(1, 3, 2)).rates.shape  # the history stack
+        torch.Size([1, 10, 2])
+
+        Shown by `staf experiment=adp_tracking`.
+    """
 
     theta: Tensor  # estimate, (..., p, n)
     regressors: Tensor  # s_j of the history stack, (..., N, p); zero rows are empty
@@ -28,6 +35,14 @@ class ConcurrentLearning:
     sum_j s_j s_j' has full rank. It is kept by singular-value maximisation: empty places are filled with
     pairs that differ enough from the last; after that a new pair takes the place with which the least
     eigenvalue of sum_j s_j s_j' grows most, if it grows.
+
+    Example:
+        >>> learning = adp.ConcurrentLearning(parameters=3, outputs=2, size=10)
+        >>> known = learning.init(torch.zeros(1, 3, 2).double())
+        >>> known.theta.shape, known.regressors.shape
+        (torch.Size([1, 3, 2]), torch.Size([1, 10, 3]))
+
+        Shown by `staf experiment=adp_tracking`.
 
     Args:
         parameters: p, rows of theta.
@@ -115,6 +130,18 @@ class IdentifyingTracker(Controller):
     The plant takes mu measured from the ud of the true theta, so this returns mu + ud(theta^) - ud(theta):
     the control u that reaches the plant knows theta^ alone, and the cost counts what it deviates from the
     true feedforward. The plant's rate x' is measured without noise.
+
+    Example:
+        >>> plant, cost = adp.TwoStateTracking(), adp.tracking_cost(10.0, 1.0)
+        >>> basis = adp.LeadingCoordinates(adp.QuadraticBasis(2), dim=4)
+        >>> learner = adp.ActorCritic(basis, plant, cost, adp.RandomPoints(1, half_width=0.3))
+        >>> unknown = torch.zeros(3, 2).double()
+        >>> tracker = adp.IdentifyingTracker(learner, plant, adp.ConcurrentLearning(3, 2), unknown)
+        >>> x0 = torch.tensor([[-0.1, 0.1, 0.0, 1.0]]).double()  # e and xd
+        >>> adp.simulate(tracker, plant, cost, x0, dt=0.005, steps=10).identifier.shape[:2]
+        torch.Size([1, 11])
+
+        Shown by `staf experiment=adp_tracking`.
 
     Args:
         learner: the actor-critic.

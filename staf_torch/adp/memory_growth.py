@@ -59,6 +59,17 @@ def learn_global_value(
 
     Every round says in the log what share of the fresh states was known to 1 %.
 
+    Example:
+        >>> def step(x, u):  # a cart without friction, for 0.1 s
+        ...     after = torch.stack((x[:, 0] + 0.1 * x[:, 1], x[:, 1] + 0.1 * u[:, 0]), dim=-1)
+        ...     return after, 0.1 * (x.square().sum(-1) + u.square().sum(-1))
+        >>> problem = adp.SampledProblem(step, dim=2, inputs=1, low=-1.0, high=1.0)
+        >>> memory = adp.learn_global_value(problem, [1.5, 1.0], steps=80)  # doctest: +SKIP
+        >>> memory(torch.tensor([[0.9, 0.0]]).double()).shape  # doctest: +SKIP
+        torch.Size([1, 1])
+
+        Shown by `staf_torch/adp/README.md`.
+
     Args:
         problem: plant, cost and bounds in steps.
         region: half the width of the box of states, (n,).

@@ -25,6 +25,16 @@ _RESTS = 1e-6  # of the scale of the state: how far the goal may move in a step
 class SampledProblem(nn.Module):
     """min sum_k l(x_k, u_k) over low <= u_k <= high, with x_{k+1} = F(x_k, u_k).
 
+    Example:
+        >>> def step(x, u):  # a cart without friction, for 0.1 s
+        ...     after = torch.stack((x[:, 0] + 0.1 * x[:, 1], x[:, 1] + 0.1 * u[:, 0]), dim=-1)
+        ...     return after, 0.1 * (x.square().sum(-1) + u.square().sum(-1))
+        >>> problem = adp.SampledProblem(step, dim=2, inputs=1, low=-1.0, high=1.0)
+        >>> problem.k.shape
+        torch.Size([1, 2])
+
+        Shown by `staf_torch/adp/README.md`.
+
     Args:
         step: maps x (B, n) and u (B, m), held for one period, to x+ (B, n) and the cost l (B,). No row sees
             another. It is differentiated twice by `torch.func` and compiled by `lanes`.

@@ -153,7 +153,14 @@ def held_riccati(plant: Plant, cost: Cost, period: float) -> tuple[Tensor, Tenso
 
 
 class HeldStability(NamedTuple):
-    """The stability of a linearised loop whose control is held."""
+    """The stability of a linearised loop whose control is held.
+
+    Example:
+        >>> adp.HeldStability(spectral_radius=0.97, largest_period=None).spectral_radius < 1
+        True
+
+        Shown by `staf experiment=adp adp/policy=lqr`.
+    """
 
     spectral_radius: float  # of one period: below 1 the set-point is asymptotically stable
     largest_period: float | None  # s, up to which every period is stable; None: unstable at every period, or
@@ -173,6 +180,8 @@ def held_stability(
         >>> lqr = adp.LQR(plant, adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1))
         >>> adp.held_stability(lqr, plant, 0.01).spectral_radius < 1
         True
+
+        Shown by `staf experiment=adp adp/policy=lqr`.
 
     Args:
         policy: u from x, (..., n) -> (..., m).

@@ -30,6 +30,17 @@ class LoopResult:
 
     A row whose plant, control or weights became non-finite, or whose state left the ``limit``, is frozen at
     its last good values from there on: `frozen_at` says when, and it counts as diverged.
+
+    Example:
+        >>> plant = systems.TwoState()
+        >>> cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
+        >>> x0 = torch.tensor([[0.5, 0.5]]).double()
+        >>> lqr = adp.Feedback(adp.LQR(plant, cost))
+        >>> result = adp.simulate(lqr, plant, cost, x0, dt=0.01, steps=50, every=10)
+        >>> result.state.shape, bool(result.diverged.any()), bool(result.cost > 0)
+        (torch.Size([1, 6, 2]), False, True)
+
+        Shown by `staf experiment=adp`.
     """
 
     time: Tensor  # (T,) seconds
@@ -77,8 +88,10 @@ def simulate(
         >>> cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
         >>> lqr = adp.Feedback(adp.LQR(plant, cost))
         >>> x0 = torch.tensor([[-1.0, 1.0]], dtype=torch.float64)
-        >>> adp.simulate(lqr, plant, cost, x0, dt=0.01, steps=1000).cost.shape
+        >>> adp.simulate(lqr, plant, cost, x0, dt=0.01, steps=100).cost.shape
         torch.Size([1])
+
+        Shown by `staf experiment=adp`.
 
     Args:
         controller: the controller.

@@ -24,6 +24,13 @@ class TwoStateTracking(ControlAffineSystem):
     The input is mu = u - ud, which vanishes where e does: the origin of e is an equilibrium for every xd, of
     the cost e'Qe + mu'R mu (`tracking_cost`).
 
+    Example:
+        >>> plant = adp.TwoStateTracking()
+        >>> plant.dim, plant.theta.shape
+        (4, torch.Size([3, 2]))
+
+        Shown by `staf experiment=adp_tracking`.
+
     Args:
         theta: parameters of the drift and of ud, (3, 2) or (..., 3, 2), one a row of states; the true ones by
             default, an estimate for a model.
@@ -101,6 +108,12 @@ def feedforward(desired: Tensor, theta: Tensor) -> Tensor:
 def tracking_cost(error: Matrix, control: Matrix) -> QuadraticCost:
     """e'Qe + mu'R mu in the state (e, xd): nothing is paid for xd itself.
 
+    Example:
+        >>> adp.tracking_cost(10.0, 1.0).q.diagonal()  # of the error alone
+        tensor([10., 10.,  0.,  0.], dtype=torch.float64)
+
+        Shown by `staf experiment=adp_tracking`.
+
     Args:
         error: Q, (2, 2) or a number.
         control: R, (1, 1) or a number.
@@ -113,5 +126,12 @@ def tracking_cost(error: Matrix, control: Matrix) -> QuadraticCost:
 
 
 def desired_trajectory(time: Tensor) -> Tensor:
-    """xd(t) = (sin t, cos t + sin t): (T,) -> (T, 2)."""
+    """xd(t) = (sin t, cos t + sin t): (T,) -> (T, 2).
+
+    Example:
+        >>> adp.desired_trajectory(torch.zeros(1).double())
+        tensor([[0., 1.]], dtype=torch.float64)
+
+        Shown by `staf experiment=adp_tracking`.
+    """
     return torch.stack((time.sin(), time.cos() + time.sin()), dim=-1)

@@ -59,8 +59,10 @@ class StaFBasis(ConventionModule):
         >>> basis.ideal_weights(x, targets.Paper()).shape
         torch.Size([3])
 
+        Shown by `staf experiment=gradient_chase`.
+
     Hyperparameters that kernel, centers and radius were given as `nn.Parameter` are learned, others fixed.
-    The buffer `convention` says in a state_dict what coefficients beside it mean: `check_convention`.
+    A buffer named convention says in a state_dict what coefficients beside it mean.
 
     Args:
         kernel: the kernel k.

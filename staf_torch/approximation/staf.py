@@ -31,6 +31,8 @@ class StaF(nn.Module):
         >>> staf.fit_(x, targets.Paper())(x.unsqueeze(-2)).shape
         torch.Size([2, 1])
 
+        Shown by `staf experiment=ablation`.
+
     Args:
         basis: kernel and centers.
         batch_shape: leading dimensions (...), independent approximations side by side.

@@ -10,3 +10,16 @@ from .state_following import ConstantRadius as ConstantRadius
 from .state_following import Radius as Radius
 from .state_following import StateFollowingCenters as StateFollowingCenters
 from .state_following import StateRadius as StateRadius
+
+__all__ = [
+    "ConstantRadius",
+    "Radius",
+    "StateFollowingCenters",
+    "StateRadius",
+    "ball",
+    "cross_polytope",
+    "polygon",
+    "probe_points",
+    "rings",
+    "simplex",
+]

@@ -34,6 +34,12 @@ def _circle(count: int) -> Tensor:
 def rings(count: int) -> Tensor:
     """Concentric rings in the plane, unisolvent for polynomials of degree k, count = C(k+2, 2).
 
+    Example:
+        >>> rings(6).norm(dim=-1)
+        tensor([1.0000, 1.0000, 1.0000, 1.0000, 1.0000, 0.0000], dtype=torch.float64)
+
+        Shown by `staf centers=rings centers.count=6`.
+
     Args:
         count: 3, 6, 10, 15, 21 or 28.
 
@@ -54,6 +60,15 @@ def polygon(count: int) -> Tensor:
 
     Its points lie on a conic, so five or more of them are no better than second order: a warning
     says so.
+
+    Example:
+        >>> polygon(4).round(decimals=3)
+        tensor([[ 0.,  1.],
+                [ 1.,  0.],
+                [ 0., -1.],
+                [-1., -0.]], dtype=torch.float64)
+
+        Shown by `staf centers=polygon centers.count=5`.
 
     Args:
         count: at least 1; one point is (0, 1).
@@ -80,6 +95,12 @@ def polygon(count: int) -> Tensor:
 def simplex(dim: int) -> Tensor:
     """The corners of a regular simplex on the unit sphere: dim + 1 points, u_i'u_j = -1/dim.
 
+    Example:
+        >>> simplex(2).shape, bool(simplex(3).sum(0).abs().max() < 1e-12)
+        (torch.Size([3, 2]), True)
+
+        Shown by `staf centers=simplex`.
+
     Args:
         dim: n, at least 1.
 
@@ -104,6 +125,15 @@ def simplex(dim: int) -> Tensor:
 def cross_polytope(dim: int) -> Tensor:
     """The corners of the cross-polytope, +e_1, -e_1, +e_2, ...: 2 dim points.
 
+    Example:
+        >>> cross_polytope(2)
+        tensor([[ 1.,  0.],
+                [-1., -0.],
+                [ 0.,  1.],
+                [-0., -1.]], dtype=torch.float64)
+
+        Shown by `staf centers=cross_polytope`.
+
     Args:
         dim: n, at least 1.
 
@@ -124,6 +154,13 @@ def ball(count: int, dim: int) -> Tensor:
     Unisolvent for polynomials of degree <= k whenever count = C(dim + k, k). Deterministic: the points
     are chosen among a fixed low-discrepancy cloud by row pivoting of a polynomial Vandermonde matrix,
     then exchanged one by one as long as that increases its determinant.
+
+    Example:
+        >>> directions = ball(10, dim=3)
+        >>> directions.shape, bool((directions.norm(dim=-1) <= 1 + 1e-12).all())
+        (torch.Size([10, 3]), True)
+
+        Shown by `staf experiment=layouts`.
 
     Args:
         count: M, at least 1; one point is the origin.
@@ -161,6 +198,13 @@ def probe_points(count: int, dim: int) -> Tensor:
     Errors of an interpolant are largest near the boundary. On a line the points are equidistant; in the
     plane two thirds of them are on the unit circle and the rest on two inner ones; in space half of them
     are on the sphere. Deterministic.
+
+    Example:
+        >>> points = probe_points(100, dim=2)
+        >>> points.shape, bool((points.norm(dim=-1) <= 1 + 1e-12).all())
+        (torch.Size([100, 2]), True)
+
+        Shown by `staf experiment=ablation`.
     """
     integer("probe_points", "count", count, least=2)
     if dim == 1:

@@ -11,7 +11,14 @@ from ..numerics.checks import fail, hold, non_negative, positive, shown, trailin
 
 
 class Radius(nn.Module, abc.ABC):
-    """nu(x) >= 0, the radius of the ball of centers at the state x."""
+    """nu(x) >= 0, the radius of the ball of centers at the state x.
+
+    Example:
+        >>> isinstance(StateRadius(0.7, offset=0.01), Radius), StateRadius(0.7, offset=0.01).constant
+        (True, False)
+
+        Shown by `staf centers.shrink.offset=0.01`.
+    """
 
     constant: bool = False
 
@@ -29,6 +36,12 @@ class Radius(nn.Module, abc.ABC):
 
 class ConstantRadius(Radius):
     """nu(x) = radius.
+
+    Example:
+        >>> ConstantRadius(0.1)(torch.zeros(4, 2).double())
+        tensor(0.1000, dtype=torch.float64)
+
+        Shown by `staf centers.radius=0.2`.
 
     Args:
         radius: positive, in the units of the state.
@@ -53,6 +66,12 @@ class ConstantRadius(Radius):
 
 class StateRadius(Radius):
     """nu(x) = radius (x'x + offset) / (1 + gain x'x): centers that close in on the origin.
+
+    Example:
+        >>> StateRadius(0.7, offset=0.01)(torch.tensor([[0.0, 0.0], [1.0, 1.0]]).double())
+        tensor([0.0070, 0.4690], dtype=torch.float64)
+
+        Shown by `staf centers.shrink.offset=0.01`.
 
     Args:
         radius: positive; the radius far from the origin is radius / gain.
@@ -92,6 +111,8 @@ class StateFollowingCenters(nn.Module):
         >>> centers = StateFollowingCenters(rings(6), radius=0.1)
         >>> centers(torch.tensor([1.0, 0.0], dtype=torch.float64)).shape
         torch.Size([6, 2])
+
+        Shown by `staf experiment=gradient_chase`.
 
     Args:
         directions: u, (M, n), distinct, |u_i| <= 1; learned where it is an `nn.Parameter`.

@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
+from collections.abc import Callable
 
 from ..sweeps import callbacks
 from ..sweeps.batching import USER_ERRORS, sentence
@@ -16,8 +17,9 @@ from ..sweeps.hydra_compat import config_directory as config_directory
 from ..sweeps.job import Refused, execute
 from ..sweeps.resume import command_line
 from ..sweeps.signals import name_and_code, stopped_by_signals
-from . import doctor, schema
+from . import doctor, reference, schema
 
+_WRITERS = {"schema": schema.main, "docs": reference.main}
 find_launcher()
 _staf = program(execute)
 
@@ -25,14 +27,14 @@ _staf = program(execute)
 def main() -> None:
     """Run the command line. What a user got wrong ends as one sentence and the exit code 1.
 
-    `staf doctor`, `staf schema` and `staf --version` are no runs, and Hydra is not asked.
+    `staf doctor`, `staf schema`, `staf docs` and `staf --version` are no runs, and Hydra is not asked.
     """
     if sys.argv[1:] == ["--version"]:
         sys.exit(print(doctor.version()))
     if sys.argv[1:] == ["doctor"]:
         sys.exit(doctor.main())
-    if sys.argv[1:2] == ["schema"]:
-        sys.exit(_schema(sys.argv[2:]))
+    if sys.argv[1:2] and sys.argv[1] in _WRITERS:
+        sys.exit(_written(_WRITERS[sys.argv[1]], sys.argv[2:]))
     sys.path.insert(0, os.getcwd())  # so that `target.path=my_module.my_function` finds the user's file
     typed = sys.argv
     with full_errors() as wants_trace, stopped_by_signals():
@@ -59,10 +61,10 @@ def main() -> None:
             sys.argv = typed
 
 
-def _schema(words: list[str]) -> str | None:
-    """Print the JSON schema of the settings; return what to say where there is no such group."""
+def _written(write: Callable[[list[str]], str], words: list[str]) -> str | None:
+    """Print what a command that is no run returns; return what to say where it cannot."""
     try:
-        sys.stdout.write(schema.main(words) + "\n")
+        sys.stdout.write(write(words) + "\n")
     except ValueError as error:
         return f"staf: {error}"
     return None

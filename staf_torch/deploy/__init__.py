@@ -15,3 +15,20 @@ from .formats import export_onnx as export_onnx
 from .formats import export_package as export_package
 from .formats import export_program as export_program
 from .formats import load_program as load_program
+
+__all__ = [
+    "ActorPolicy",
+    "FoldedRollout",
+    "LocalApproximator",
+    "RidgeApproximator",
+    "SupervisedPolicy",
+    "approximator",
+    "export_c",
+    "export_learning_c",
+    "export_onnx",
+    "export_package",
+    "export_program",
+    "load_program",
+    "policy_of",
+    "trace",
+]

@@ -37,6 +37,16 @@ class RidgeApproximator(nn.Module):
     its digits. The series ends where its next term is below the rounding of ``dtype`` at ``reach`` radii;
     farther out the result is NaN, not a truncated series.
 
+    Example:
+        >>> basis = StaFBasis(ExponentialKernel(), StateFollowingCenters(rings(3), radius=0.1))
+        >>> x = torch.tensor([1.0, 0.5]).double()
+        >>> staf = StaF(basis).fit_(x, targets.Paper())
+        >>> small = deploy.RidgeApproximator(staf)
+        >>> bool((small(x[None])[0] - staf(x[None])).abs().max() < 1e-9)
+        True
+
+        Shown by `staf-export RUN --to c`.
+
     Args:
         staf: fitted, of one state, with an `ExponentialKernel` or a `GaussianKernel` of one width.
         dtype: of the arithmetic.
@@ -104,6 +114,16 @@ class LocalApproximator(nn.Module):
     local basis. The arithmetic is in float64 whatever comes in and goes out: a sum of kernels loses most
     digits of float32 to cancellation.
 
+    Example:
+        >>> basis = StaFBasis(GaussianKernel(), StateFollowingCenters(rings(6), radius=0.1))
+        >>> x = torch.tensor([1.0, 0.5]).double()
+        >>> staf = StaF(basis).fit_(x, targets.Paper())
+        >>> small = deploy.LocalApproximator(staf)
+        >>> bool((small(x[None])[0] - staf(x[None])).abs().max() < 1e-9)
+        True
+
+        Shown by `staf-export RUN --to c`.
+
     Args:
         staf: fitted, of one state.
         dtype: of what comes in and goes out.
@@ -150,6 +170,8 @@ def approximator(staf: StaF, dtype: torch.dtype = torch.float64, reach: float = 
         >>> value, gradient = deploy.approximator(StaF(basis).fit_(x, targets.Paper()))(x[None])
         >>> value.shape, gradient.shape
         (torch.Size([1]), torch.Size([1, 2]))
+
+        Shown by `staf-export RUN --to c`.
 
     Args:
         staf: fitted, of one state.

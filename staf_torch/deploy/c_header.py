@@ -41,6 +41,16 @@ def export_c(
 ) -> Source:
     """Write a module at one row as ``static inline void staf(const T state[n], T value[...], ...)``.
 
+    Example:
+        >>> plant = systems.TwoState()
+        >>> cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
+        >>> policy = deploy.policy_of(adp.LQR(plant, cost))
+        >>> source = deploy.export_c(policy, torch.zeros(1, 2).double(), Path("policy.h"), ["control"])
+        >>> "control" in Path("policy.h").read_text()
+        True
+
+        Shown by `staf-export RUN --to c`.
+
     Args:
         module: (1, n) -> a tensor or a tuple of tensors (1, ...).
         example: an input (1, n); float64 makes T double, float32 float.
@@ -63,6 +73,18 @@ def export_learning_c(controller: Controller, x0: Tensor, path: Path, *, dt: flo
 
     which returns the control to hold for ``dt`` seconds and moves the weights. ``uniform`` are random numbers
     of [-1, 1] that the caller draws; the argument is missing where the controller needs none.
+
+    Example:
+        >>> plant = systems.TwoState()
+        >>> cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
+        >>> points = adp.RandomPoints(1, half_width=0.5)
+        >>> learner = adp.ActorCritic(adp.QuadraticBasis(2), plant, cost, points)
+        >>> x0 = torch.tensor([[-1.0, 1.0]]).double()
+        >>> source = deploy.export_learning_c(learner, x0, Path("learner.h"), dt=0.01)
+        >>> Path("learner.h").exists()
+        True
+
+        Shown by `staf-export RUN --to c`.
 
     Args:
         controller: of `adp`.

@@ -14,6 +14,17 @@ from ..numerics.checks import fail, trailing
 class ActorPolicy(nn.Module):
     """u = -1/2 R^-1 g' Ds(x; x)' Wa: the actor without the learning.
 
+    Example:
+        >>> plant = systems.TwoState()
+        >>> cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
+        >>> points = adp.RandomPoints(1, half_width=0.5)
+        >>> learner = adp.ActorCritic(adp.QuadraticBasis(2), plant, cost, points)
+        >>> policy = deploy.ActorPolicy(learner, torch.tensor([0.5, 0.0, 1.0]).double())  # of V*: u* = -h x2
+        >>> policy(torch.tensor([[0.0, 1.0]]).double())
+        tensor([[-3.]], dtype=torch.float64)
+
+        Shown by `staf-export RUN --to c`.
+
     Args:
         learner: basis, plant and cost; copied.
         weights: Wa, (M,).
@@ -43,6 +54,16 @@ class ActorPolicy(nn.Module):
 class SupervisedPolicy(nn.Module):
     """A policy drawn towards the LQR as `Supervised` does it.
 
+    Example:
+        >>> plant = systems.TwoState()
+        >>> cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
+        >>> lqr = adp.LQR(plant, cost)
+        >>> guarded = deploy.SupervisedPolicy(lqr, adp.Supervised(adp.Feedback(lqr), lqr, cost))
+        >>> guarded(torch.tensor([[0.0, 1.0]]).double()).round(decimals=3)
+        tensor([[-3.]], dtype=torch.float64)
+
+        Shown by `staf-export RUN --to c`.
+
     Args:
         policy: (..., n) -> (..., m).
         supervisor: whose rule it is; copied.
@@ -66,6 +87,16 @@ class FoldedRollout(nn.Module):
         (v, g) = H (e^{-x'd_i} V_i),   grad V^(x) = g + x v;
 
     for a translation-invariant kernel grad V^(x) = g, without the factor. Nothing is factored at run time.
+
+    Example:
+        >>> plant = systems.TwoState()
+        >>> cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
+        >>> rollout = adp.RolloutPolicy.of_lqr(plant, cost)
+        >>> x = torch.tensor([[1.0, 0.5]]).double()
+        >>> bool((deploy.FoldedRollout(rollout)(x) - rollout.control(x)).abs().max() < 1e-6)
+        True
+
+        Shown by `staf-export RUN --to c`.
 
     Args:
         policy: the policy; a copy is kept.
@@ -127,6 +158,8 @@ def policy_of(
         >>> cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
         >>> deploy.policy_of(adp.LQR(plant, cost))(torch.ones(1, 2, dtype=torch.float64)).shape
         torch.Size([1, 1])
+
+        Shown by `staf-export RUN --to c`.
 
     Args:
         controller: `Feedback`, `ActorCritic`, `Supervised`, `LQR`, `RolloutPolicy`, or any module

@@ -54,6 +54,15 @@ def need_compiler() -> None:
 def export_onnx(program: ExportedProgram, path: Path, inputs: list[str], outputs: list[str]) -> None:
     """Write a program of `trace` as an ONNX model.
 
+    Example:
+        >>> plant = systems.TwoState()
+        >>> cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
+        >>> policy = deploy.policy_of(adp.LQR(plant, cost))
+        >>> program = deploy.trace(policy, torch.zeros(1, 2).double())
+        >>> deploy.export_onnx(program, Path("policy.onnx"), ["state"], ["control"])  # doctest: +SKIP
+
+        Shown by `staf-export RUN --to onnx`.
+
     Args:
         program: the program.
         path: of the file.
@@ -74,13 +83,36 @@ def export_onnx(program: ExportedProgram, path: Path, inputs: list[str], outputs
 
 
 def export_program(program: ExportedProgram, path: Path, note: Mapping[str, object]) -> None:
-    """Write a program of `trace` with a note of what it is; `load_program` reads both."""
+    """Write a program of `trace` with a note of what it is; `load_program` reads both.
+
+    Example:
+        >>> plant = systems.TwoState()
+        >>> cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
+        >>> policy = deploy.policy_of(adp.LQR(plant, cost))
+        >>> program = deploy.trace(policy, torch.zeros(1, 2).double())
+        >>> deploy.export_program(program, Path("policy.pt2"), {"plant": "two states"})
+        >>> deploy.load_program("policy.pt2")[1]
+        {'format': 1, 'plant': 'two states'}
+
+        Shown by `staf-export RUN --to pt2`.
+    """
     text = json.dumps({"format": FORMAT, **note}, indent=2)
     torch.export.save(program, path, extra_files={_NOTE: text})
 
 
 def load_program(path: str | Path) -> tuple[ExportedProgram, dict[str, object]]:
     """A program that `export_program` wrote, and its note.
+
+    Example:
+        >>> plant = systems.TwoState()
+        >>> cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
+        >>> policy = deploy.policy_of(adp.LQR(plant, cost))
+        >>> program = deploy.trace(policy, torch.zeros(1, 2).double())
+        >>> deploy.export_program(program, Path("policy.pt2"), {"plant": "two states"})
+        >>> deploy.load_program("policy.pt2")[1]
+        {'format': 1, 'plant': 'two states'}
+
+        Shown by `staf-export RUN --to pt2`.
 
     Raises:
         ValueError: if the file is not one of ours, or of a later format.
@@ -106,6 +138,15 @@ def load_program(path: str | Path) -> tuple[ExportedProgram, dict[str, object]]:
 
 def export_package(program: ExportedProgram, path: Path) -> None:
     """Compile a program of `trace` into an AOTInductor package, for one thread.
+
+    Example:
+        >>> plant = systems.TwoState()
+        >>> cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
+        >>> policy = deploy.policy_of(adp.LQR(plant, cost))
+        >>> program = deploy.trace(policy, torch.zeros(1, 2).double())
+        >>> deploy.export_package(program, Path("policy_compiled.pt2"))  # doctest: +SKIP
+
+        Shown by `staf-export RUN --to pt2`.
 
     Raises:
         ValueError: if there is no C++ compiler.

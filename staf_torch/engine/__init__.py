@@ -13,3 +13,18 @@ from .predictors import along as along
 from .predictors import gram_rates as gram_rates
 from .result import ChaseResult as ChaseResult
 from .result import ChaseWeights as ChaseWeights
+
+__all__ = [
+    "Certificate",
+    "ChaseResult",
+    "ChaseWeights",
+    "Predictor",
+    "Secant",
+    "Tangent",
+    "along",
+    "chase",
+    "chase_pieces",
+    "chase_weights",
+    "chunk_length",
+    "gram_rates",
+]

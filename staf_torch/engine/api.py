@@ -58,6 +58,8 @@ def chase(
         >>> chase(states, basis, targets.Paper(), optim.SteepestDescent()).weights.shape
         torch.Size([1, 101, 3])
 
+        Shown by `staf experiment=gradient_chase`.
+
     Args:
         states: x, (B, T, n).
         basis: kernel and centers.
@@ -91,7 +93,17 @@ def chase_pieces(
     weights: Tensor | None = None,
     certificate: bool = False,
 ) -> Iterator[ChaseResult]:
-    """Yield the results of `chase` over consecutive chunks of time (B, C, n), one a chunk."""
+    """Yield the results of `chase` over consecutive chunks of time (B, C, n), one a chunk.
+
+    Example:
+        >>> pieces = torch.ones(1, 20, 2).double().split(8, dim=1)
+        >>> basis = StaFBasis(GaussianKernel(), StateFollowingCenters(rings(3), radius=0.1))
+        >>> chased = chase_pieces(pieces, basis, targets.Paper(), optim.SteepestDescent())
+        >>> [piece.state.shape[1] for piece in chased]
+        [8, 8, 4]
+
+        Shown by `staf trajectories=100`.
+    """
     problem = Problem("chase", basis, target, law, inner_steps, predictor, certificate)
     yield from _chase(problem, pieces, weights)
 
@@ -114,8 +126,14 @@ def chase_weights(
     with some times of all rows at once; `torch.compile` makes it one pass.
 
     Example:
-        >>> pieces = systems.trajectory(systems.Oscillator(), x0, dt=0.01, steps=10**6, chunk=100)
-        >>> last = chase_weights(pieces, basis, targets.Paper(), optim.SteepestDescent(), history=False)
+        >>> x0 = torch.tensor([[1.0, 0.0]], dtype=torch.float64)
+        >>> pieces = systems.trajectory(systems.Oscillator(), x0, dt=0.01, steps=300, chunk=100)
+        >>> basis = StaFBasis(ExponentialKernel(), StateFollowingCenters(rings(3), radius=0.1))
+        >>> law = optim.SteepestDescent()
+        >>> chase_weights(pieces, basis, targets.Paper(), law, history=False).weights.shape  # the last ones
+        torch.Size([1, 1, 3])
+
+        Shown by `tests/benchmarks/README.md`.
 
     Args:
         states: x, (B, T, n), or consecutive pieces (B, C, n) of it.
@@ -228,7 +246,15 @@ class _WeightRun:
 
 
 def chunk_length(batch: int, basis: StaFBasis, itemsize: int) -> int:
-    """Return the times a chunk, so that `chase_pieces` works in some 64 MiB at any horizon."""
+    """Return the times a chunk, so that `chase_pieces` works in some 64 MiB at any horizon.
+
+    Example:
+        >>> basis = StaFBasis(GaussianKernel(), StateFollowingCenters(rings(3), radius=0.1))
+        >>> chunk_length(1, basis, itemsize=8) > chunk_length(1000, basis, itemsize=8) > 0
+        True
+
+        Shown by `staf trajectories=100`.
+    """
     numbers = 4 * basis.count**2 + (basis.count + 2) * (basis.dim + 8)
     return max(1, _WORKING_BYTES // (batch * numbers * itemsize))
 

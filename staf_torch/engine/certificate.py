@@ -29,6 +29,16 @@ class Certificate(NamedTuple):
     growth_k is 1 + O(dt) and drift_k at most dt max |w'|: this is the bound of MATH.md with the factor that
     it leaves out. At the first time growth is 1 and drift is sqrt(e) before the correction. NaN where the law
     has no known rate, K is numerically singular, or the trajectory has diverged.
+
+    Example:
+        >>> x0 = torch.tensor([[1.0, 0.0]]).double()
+        >>> states = systems.simulate(systems.Oscillator(), x0, dt=0.01, steps=50)
+        >>> basis = StaFBasis(GaussianKernel(), StateFollowingCenters(rings(3), radius=0.1))
+        >>> result = chase(states, basis, targets.Paper(), optim.SteepestDescent(), certificate=True)
+        >>> bool(result.certificate.violated.any())
+        False
+
+        Shown by `staf certificate=true`.
     """
 
     rate: Tensor  # (B, T) delta_k^its, the factor in the excess that the law promises for the correction

@@ -23,6 +23,12 @@ class Predictor(abc.ABC):
     Like a law it is pure and holds hyperparameters only. The weights of a chase at x_k are e^{g(x_k)} times
     the paper's, with g the kernel's `log_gain`.
 
+    Example:
+        >>> issubclass(predictors.Tangent, predictors.Predictor), predictors.Secant().products(6)
+        (True, 0)
+
+        Shown by `staf experiment=laws`.
+
     Attributes:
         guarded: whether a prediction is dropped, row by row, where it is worse at its arrival than the
             weights held, F(predicted) > F(held). It costs two products with K a time.
@@ -56,7 +62,7 @@ class Predictor(abc.ABC):
         """The weights to start from at an arrival.
 
         Args:
-            inputs: what `prepare` returned for this arrival.
+            inputs: what `Predictor.prepare` returned for this arrival.
             weights: as corrected at the time before, (B, M).
             previous: as corrected at the time before that, (B, M); at the start, the same as weights;
                 both in units of the state that they leave.
@@ -74,6 +80,19 @@ class Secant(Predictor):
     are not the ideal ones. In directions that the law hardly corrects they run away: six centers under ten
     line searches at dt = 0.02 reach thousands of times F(0). The guard keeps them bounded; with three
     centers it gains a factor 9 under ten line searches and loses a factor 6 under one.
+
+    Example:
+        >>> x0 = torch.tensor([[1.0, 0.0]]).double()
+        >>> states = systems.simulate(systems.Oscillator(), x0, dt=0.01, steps=50)
+        >>> basis = StaFBasis(GaussianKernel(), StateFollowingCenters(rings(3), radius=0.1))
+        >>> plain, guessed = (
+        ...     chase(states, basis, targets.Paper(), optim.SteepestDescent(), predictor=p).excess[0, -1]
+        ...     for p in (None, predictors.Secant())
+        ... )
+        >>> bool(guessed < plain)
+        True
+
+        Shown by `staf predictor=secant`.
 
     Args:
         guarded: whether to drop, row by row, a prediction that is worse than the weights held.
@@ -104,6 +123,19 @@ class Tangent(Predictor):
     Under one iteration of steepest descent the first order is chaotic: perturbations of 1e-14 of the
     initial weights change its ultimate excess between 5e-5 and 1.7e-4 in the paper's simulation. The second
     leaves 1e-11 there.
+
+    Example:
+        >>> x0 = torch.tensor([[1.0, 0.0]]).double()
+        >>> states = systems.simulate(systems.Oscillator(), x0, dt=0.01, steps=50)
+        >>> basis = StaFBasis(GaussianKernel(), StateFollowingCenters(rings(3), radius=0.1))
+        >>> plain, guessed = (
+        ...     chase(states, basis, targets.Paper(), optim.SteepestDescent(), predictor=p).excess[0, -1]
+        ...     for p in (None, predictors.Tangent())
+        ... )
+        >>> bool(guessed < plain)
+        True
+
+        Shown by `staf predictor=tangent`.
 
     Args:
         order: 1 or 2.
@@ -162,6 +194,15 @@ class GramRates(NamedTuple):
 def gram_rates(basis: StaFBasis, target: Target, x: Tensor, dx: Tensor) -> GramRates:
     """Return V(c), e^{-g} K(c) and their derivatives along dx, by one forward-mode product.
 
+    Example:
+        >>> basis = StaFBasis(GaussianKernel(), StateFollowingCenters(rings(3), radius=0.1))
+        >>> x = torch.tensor([[1.0, 0.5]]).double()
+        >>> rates = gram_rates(basis, targets.Paper(), x, torch.tensor([[0.1, 0.0]]).double())
+        >>> type(rates).__name__
+        'GramRates'
+
+        Shown by `staf predictor=tangent`.
+
     Args:
         basis: kernel and centers.
         target: V.
@@ -179,7 +220,16 @@ def gram_rates(basis: StaFBasis, target: Target, x: Tensor, dx: Tensor) -> GramR
 
 def along(function: Callable[[Tensor], Any], x: Tensor, dx: Tensor) -> tuple[Any, Any]:
     """f(x) and its derivative along dx, in forward mode: torch.func.jvp without the warning that torch 2.13
-    gives itself on first use, which would end a program in which warnings are errors."""
+    gives itself on first use, which would end a program in which warnings are errors.
+
+    Example:
+        >>> x, dx = torch.tensor([1.0, 2.0]), torch.tensor([0.1, 0.0])
+        >>> value, rate = along(lambda x: x.square().sum(-1), x, dx)
+        >>> float(value), round(float(rate), 6)
+        (5.0, 0.2)
+
+        Shown by `staf predictor=tangent`.
+    """
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*torch.jit.script", category=DeprecationWarning)
         primal, tangent = torch.func.jvp(function, (x,), (dx,))[:2]

@@ -18,6 +18,16 @@ class ChaseResult:
 
     From the time at which a trajectory diverged its weights stay what they last were, and all that
     follows from them is NaN.
+
+    Example:
+        >>> x0 = torch.tensor([[1.0, 0.0]]).double()
+        >>> states = systems.simulate(systems.Oscillator(), x0, dt=0.01, steps=50)
+        >>> basis = StaFBasis(GaussianKernel(), StateFollowingCenters(rings(3), radius=0.1))
+        >>> result = chase(states, basis, targets.Paper(), optim.Exact())
+        >>> result.weights.shape, bool(result.excess.max() < 1e-9)
+        (torch.Size([1, 51, 3]), True)
+
+        Shown by `staf experiment=gradient_chase`.
     """
 
     state: Tensor  # (B, T, n) as given
@@ -41,7 +51,17 @@ class ChaseResult:
 
 @dataclasses.dataclass(frozen=True)
 class ChaseWeights:
-    """The weights of a gradient chase alone."""
+    """The weights of a gradient chase alone.
+
+    Example:
+        >>> states = torch.ones(1, 20, 2).double()
+        >>> basis = StaFBasis(GaussianKernel(), StateFollowingCenters(rings(3), radius=0.1))
+        >>> law = optim.SteepestDescent()
+        >>> chase_weights(states, basis, targets.Paper(), law, history=False).weights.shape
+        torch.Size([1, 1, 3])
+
+        Shown by `tests/benchmarks/README.md`.
+    """
 
     weights: Tensor  # (B, T, M) the paper's w, corrected; (B, 1, M) at the last time for record="last"
     diverged_at: Tensor  # (B,) int64 index of the first time that is not finite, -1 if none

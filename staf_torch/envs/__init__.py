@@ -13,4 +13,6 @@ from .plant_env import PlantEnv as PlantEnv
 from .plant_env import PlantVectorEnv as PlantVectorEnv
 from .plant_env import register_plants
 
+__all__ = ["OWN_PLANT", "PLANTS", "Agent", "Episodes", "PlantEnv", "PlantVectorEnv", "register_plants"]
+
 register_plants()

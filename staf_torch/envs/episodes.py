@@ -129,6 +129,14 @@ class Episodes:
 
     The steps are those of `adp.simulate`, so that the rewards of an episode add up to minus its cost.
 
+    Example:
+        >>> plant, cost = systems.TwoState(), adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
+        >>> episodes = envs.Episodes(plant, cost, 3, dt=0.01, horizon=1.0, limit=100.0, penalty=1e4)
+        >>> type(episodes).__name__
+        'Episodes'
+
+        Shown by `staf_torch/envs/README.md`.
+
     Args:
         system: the plant, with inputs.
         cost: the cost rate.
@@ -201,11 +209,14 @@ class Agent:
     A learning controller learns on from step to step, row by row; `begin` makes it forget.
 
     Example:
+        >>> import gymnasium
         >>> env = gymnasium.make("staf_torch/TwoState-v0")
         >>> agent = envs.Agent(adp.LQR(env.unwrapped.plant, env.unwrapped.cost))
         >>> observation, _ = env.reset(seed=0)
         >>> agent(observation).shape
         (1,)
+
+        Shown by `staf_torch/envs/README.md`.
 
     Args:
         controller: a `Controller`, or a policy (..., n) -> (..., m).

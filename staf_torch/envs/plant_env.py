@@ -35,8 +35,13 @@ class PlantEnv(gymnasium.Env):
     -int (x'Qx + u'Ru) dt over that time.
 
     Example:
+        >>> import gymnasium
         >>> env = gymnasium.make("staf_torch/TwoState-v0")
         >>> observation, _ = env.reset(seed=0)
+        >>> observation.shape
+        (2,)
+
+        Shown by `staf_torch/envs/README.md`.
 
     Args:
         plant: the name of a plant of `systems`, a class of your own or its dotted path, or a plant.
@@ -105,8 +110,13 @@ class PlantVectorEnv(VectorEnv):
     """`PlantEnv` in B rows that never touch each other: row b is the single environment seeded seed + b.
 
     Example:
-        >>> envs = gymnasium.make_vec("staf_torch/TwoState-v0", num_envs=1000)
-        >>> observations, _ = envs.reset(seed=0)
+        >>> import gymnasium
+        >>> plants = gymnasium.make_vec("staf_torch/TwoState-v0", num_envs=1000)
+        >>> observations, _ = plants.reset(seed=0)
+        >>> observations.shape
+        (1000, 2)
+
+        Shown by `staf_torch/envs/README.md`.
 
     Args:
         plant, cost, dt, horizon, spread, bound, limit, penalty: as in `PlantEnv`.
@@ -213,7 +223,16 @@ OWN_PLANT = "staf_torch/Plant-v0"
 
 
 def register_plants() -> None:
-    """Register every plant with Gymnasium, once."""
+    """Register every plant with Gymnasium, once.
+
+    Example:
+        >>> import gymnasium
+        >>> envs.register_plants()  # done by `import staf_torch.envs` already; twice does no harm
+        >>> any(name.startswith("staf") for name in gymnasium.registry)
+        True
+
+        Shown by `staf_torch/envs/README.md`.
+    """
     for name, plant in (*PLANTS.items(), (OWN_PLANT, None)):
         if name not in gymnasium.registry:
             gymnasium.register(

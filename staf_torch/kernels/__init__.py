@@ -9,3 +9,15 @@ from .matern import MaternKernel as MaternKernel
 from .polynomial import PolynomialKernel as PolynomialKernel
 from .radial import RadialKernel as RadialKernel
 from .rational_quadratic import RationalQuadraticKernel as RationalQuadraticKernel
+
+__all__ = [
+    "AnchoredKernel",
+    "ExponentialKernel",
+    "GaussianKernel",
+    "InverseMultiquadricKernel",
+    "Kernel",
+    "MaternKernel",
+    "PolynomialKernel",
+    "RadialKernel",
+    "RationalQuadraticKernel",
+]

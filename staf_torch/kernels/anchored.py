@@ -15,6 +15,13 @@ class AnchoredKernel(Kernel):
     basis of the paper's optimal regulation example, so that V^(0) = 0. A center at the origin spans
     nothing.
 
+    Example:
+        >>> k = AnchoredKernel(ExponentialKernel())
+        >>> k(torch.tensor([[1.0, 0.0]]).double(), torch.tensor([[1.0, 1.0], [0.0, 0.0]]).double())
+        tensor([[1.7183, 0.0000]], dtype=torch.float64)
+
+        Shown by `staf experiment=adp`.
+
     Args:
         kernel: the kernel k, with k(0, 0) > 0.
 

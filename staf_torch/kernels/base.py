@@ -23,6 +23,15 @@ class Kernel(nn.Module, abc.ABC):
     say nothing of the sort: g = s = 0 and k0(z, d) = k(x + z, x + d).
 
     A hyperparameter that is given as an `nn.Parameter` is learned, a number or another tensor is fixed.
+
+    Example:
+        >>> class Cauchy(Kernel):
+        ...     def forward(self, x1, x2):  # (..., P, n), (..., M, n) -> (..., P, M)
+        ...         return 1 / (1 + (x1.unsqueeze(-2) - x2.unsqueeze(-3)).square().sum(-1))
+        >>> Cauchy()(torch.zeros(1, 2), torch.tensor([[1.0, 0.0], [0.0, 0.0]]))
+        tensor([[0.5000, 1.0000]])
+
+        Shown by `staf kernel=custom kernel.path=staf_torch.MaternKernel`.
     """
 
     state_free: bool = False

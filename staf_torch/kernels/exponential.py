@@ -14,6 +14,13 @@ class ExponentialKernel(Kernel):
     Near a state it factors as exp((x+z)'(x+d)) = e^{|x|^2} e^{x'z} e^{z'd} e^{x'd}, so constant
     offsets have one Gram core for all states. The naive form overflows at |x| = 26.7 in float64.
 
+    Example:
+        >>> k = ExponentialKernel()
+        >>> k(torch.tensor([[1.0, 0.0]]).double(), torch.tensor([[1.0, 1.0], [0.0, 0.0]]).double())
+        tensor([[2.7183, 1.0000]], dtype=torch.float64)
+
+        Shown by `staf kernel=exponential`.
+
     Source: Rosenfeld, Kamalapurkar and Dixon, "State Following (StaF) Kernel Functions for Function
     Approximation", section 2.
     """

@@ -16,6 +16,13 @@ class GaussianKernel(Kernel):
     k = e^{-|z|^2 / 2 width^2} e^{z'd / width^2} e^{-|d|^2 / 2 width^2}: the core is the exponential
     kernel's at the rate 1 / width^2.
 
+    Example:
+        >>> k = GaussianKernel(width=0.5)
+        >>> k(torch.tensor([[1.0, 0.0]]).double(), torch.tensor([[1.0, 1.0], [0.0, 0.0]]).double())
+        tensor([[0.1353, 0.1353]], dtype=torch.float64)
+
+        Shown by `staf kernel=gaussian`.
+
     Args:
         width: positive, in the units of the state; a tensor of shape (...) gives one a batch entry.
 

@@ -24,6 +24,13 @@ class MaternKernel(RadialKernel):
     k(., c) is in C^{2 smoothness - 1}: at y = c the kernel of smoothness 1/2 has no gradient (zero is
     returned, the mean of its directional derivatives) and no Hessian.
 
+    Example:
+        >>> k = MaternKernel(smoothness=1.5)
+        >>> k(torch.tensor([[1.0, 0.0]]).double(), torch.tensor([[1.0, 1.0], [0.0, 0.0]]).double())
+        tensor([[0.4834, 0.4834]], dtype=torch.float64)
+
+        Shown by `staf kernel=matern`.
+
     Args:
         smoothness: 0.5, 1.5 or 2.5.
         length_scale: positive, in the units of the state.

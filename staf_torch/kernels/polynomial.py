@@ -16,6 +16,13 @@ class PolynomialKernel(Kernel):
     Its space is finite: all polynomials of degree <= ``degree`` in n variables, of dimension
     C(n + degree, degree); with ``bias`` zero the homogeneous ones alone, C(n + degree - 1, degree).
 
+    Example:
+        >>> k = PolynomialKernel(degree=2)
+        >>> k(torch.tensor([[1.0, 0.0]]).double(), torch.tensor([[1.0, 1.0], [0.0, 0.0]]).double())
+        tensor([[4., 1.]], dtype=torch.float64)
+
+        Shown by `staf kernel=polynomial`.
+
     Args:
         degree: at least 1.
         bias: not negative.

@@ -15,6 +15,12 @@ class RadialKernel(Kernel):
     """k(y, c) = phi(|y - c|^2 / length_scale^2); a subclass gives the profile phi, phi(0) = 1.
 
     Near a state the kernel is a function of z - d alone, so its core is itself.
+
+    Example:
+        >>> issubclass(MaternKernel, RadialKernel), issubclass(ExponentialKernel, RadialKernel)
+        (True, False)
+
+        Shown by `staf kernel=inverse_multiquadric`.
     """
 
     state_free = True

@@ -14,6 +14,13 @@ class RationalQuadraticKernel(RadialKernel):
 
     A scale mixture of Gaussian kernels; alpha -> infinity is the Gaussian of that width.
 
+    Example:
+        >>> k = RationalQuadraticKernel(alpha=2.0)
+        >>> k(torch.tensor([[1.0, 0.0]]).double(), torch.tensor([[1.0, 1.0], [0.0, 0.0]]).double())
+        tensor([[0.6400, 0.6400]], dtype=torch.float64)
+
+        Shown by `staf kernel=rational_quadratic`.
+
     Args:
         alpha: positive shape parameter.
         length_scale: positive, in the units of the state.

@@ -7,3 +7,5 @@ from .combinators import repeat as repeat
 from .combinators import scan as scan
 from .program import Program as Program
 from .tree import Shared as Shared
+
+__all__ = ["Program", "Shared", "each", "reduce", "repeat", "scan"]

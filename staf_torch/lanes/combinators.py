@@ -22,6 +22,12 @@ _active = threading.local()
 def repeat(count: int, body: Callable[[Tree], Tree], carry: Tree) -> Tree:
     """body(...body(body(carry))), ``count`` times.
 
+    Example:
+        >>> repeat(3, lambda x: 2 * x, torch.ones(1))
+        tensor([8.])
+
+        Shown by `staf experiment=adp adp/policy=rollout`.
+
     Args:
         count: of passes, at least 0.
         body: maps the carry to the next one of the same shapes and dtypes.
@@ -38,6 +44,13 @@ def scan(
     body: Callable[[Tree, Tree], tuple[Tree, Tree]], carry: Tree, inputs: Tree, *, dim: int = 1
 ) -> tuple[Tree, Tree]:
     """carry, out_k = body(carry, input_k) for k = 0, 1, ...; the last carry and all outputs.
+
+    Example:
+        >>> total, partial = scan(lambda s, x: (s + x, s + x), torch.zeros(1), torch.arange(1.0, 4.0)[None])
+        >>> total, partial
+        (tensor([6.]), tensor([[1., 3., 6.]]))
+
+        Shown by `staf experiment=adp`.
 
     Args:
         body: maps a carry and the inputs of one k to the next carry and the outputs of this k.
@@ -74,6 +87,12 @@ def reduce(
     Plain torch calls ``body`` once with all points; a compiled program has them one after the other and
     keeps none of the values.
 
+    Example:
+        >>> reduce(lambda x: x.square(), torch.arange(3.0)[None], "sum")
+        tensor([5.])
+
+        Shown by `staf experiment=adp`.
+
     Args:
         body: a tree of tensors (..., P, ...) to (..., P, ...), P in the place ``dim``; no point sees another.
         points: such a tree.
@@ -103,6 +122,12 @@ def each(body: Callable[[Tensor], Tensor], points: Tensor, *, dim: int = 1, toge
 
     Plain torch calls ``body`` once with all points; a compiled program goes through them, some at a time, so
     that its text is short.
+
+    Example:
+        >>> each(lambda x: x.square(), torch.arange(3.0)[None])
+        tensor([[0., 1., 4.]])
+
+        Shown by `staf experiment=adp adp/policy=rollout`.
 
     Args:
         body: of which no point sees another.

@@ -42,6 +42,8 @@ class Program:
         >>> history.shape
         torch.Size([5, 100])
 
+        Shown by `staf_torch/lanes/README.md`.
+
     The definition is plain torch: ``step`` with all rows, time after time. The compiled program runs ``step``
     once with a single row, (1, ...), writes down what it does as a scalar program and computes that with a
     row in every vector lane. Where that cannot be done, one line of the log says why and the definition runs;

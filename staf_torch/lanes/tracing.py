@@ -22,6 +22,16 @@ def trace(module: nn.Module, example: Tensor, *, batch: int | None = None) -> Ex
 
     Derivatives inside the module become ordinary operations.
 
+    Example:
+        >>> plant = systems.TwoState()
+        >>> cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
+        >>> policy = deploy.policy_of(adp.LQR(plant, cost))
+        >>> program = deploy.trace(policy, torch.zeros(1, 2).double())
+        >>> program.module()(torch.tensor([[0.0, 1.0]]).double()).shape
+        torch.Size([1, 1])
+
+        Shown by `staf-export RUN --to pt2`.
+
     Args:
         module: (B, n) -> a tensor or a tuple of tensors.
         example: an input, (B, n) with any B; its values do not matter, its dtype does.

@@ -53,6 +53,12 @@ _LEAF, _EMPTY = ("leaf", None), (tuple, ())
 class Shared:
     """A tensor without the dimension of rows: one for all rows.
 
+    Example:
+        >>> Shared(torch.ones(2)).tensor
+        tensor([1., 1.])
+
+        Shown by `staf experiment=adp`.
+
     Args:
         tensor: (...), or (T, ...) among the inputs of every time.
     """

@@ -11,12 +11,24 @@ from torch import Tensor
 
 from ..results.metric_info import MetricInfo
 
+__all__ = ["Metric", "MetricInfo"]
+
 
 class Metric(abc.ABC):
     """A number at every time of every trajectory; a run reports the worst of them.
 
     A gradient chase reports the worst over the times t >= settle_time, a closed loop over all recorded times;
     both over the trajectories that did not diverge.
+
+    Example:
+        >>> class Digits(Metric):
+        ...     name, unit, larger_is_better = "digits", "digits", True
+        ...     def __call__(self, result, problem):  # -> (B, T)
+        ...         return -((result.value - result.estimate).abs() / (1 + result.value.abs())).log10()
+        >>> Digits().info
+        MetricInfo(name='digits', unit='digits', larger_is_better=True, headline=True)
+
+        Shown by `staf metric=custom metric.path=mine.Digits`.
 
     Attributes:
         name: in `metrics.json` and in tables.

@@ -2,3 +2,5 @@
 
 from .regressor import StaFRegressor as StaFRegressor
 from .river_adapter import RiverRegressor as RiverRegressor
+
+__all__ = ["RiverRegressor", "StaFRegressor"]

@@ -33,10 +33,14 @@ class ExperienceMemory(nn.Module):
     empty and add their models one after the other.
 
     Example:
+        >>> basis = StaFBasis(GaussianKernel(), StateFollowingCenters(rings(6), radius=0.2))
+        >>> x = torch.tensor([1.0, 0.5]).double()
         >>> memory = ExperienceMemory(basis, capacity=64)
-        >>> memory.add(x, basis.local(x).fit(basis.values(x, targets.Paper())))
+        >>> written = memory.add(x, basis.local(x).fit(basis.values(x, targets.Paper())))
         >>> memory.query(x.unsqueeze(-2)).shape
         torch.Size([1])
+
+        Shown by `staf experiment=memory`.
 
     Args:
         basis: kernel and centers; models are coefficients in ``basis.local(x)``.

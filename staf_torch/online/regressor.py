@@ -50,6 +50,8 @@ class StaFRegressor(ScikitEstimator):
         >>> model.predict(x).shape
         torch.Size([])
 
+        Shown by `tests/examples/notebooks/stream.py`.
+
     Args:
         kernel: a `Kernel`, or the name of one in `KERNELS`.
         radius: of the centers around the latest x, positive, in the units of x; about the distance over

@@ -24,6 +24,8 @@ class RiverRegressor:
         >>> model.predict_one({"a": 1.0, "b": 2.0})
         3.0
 
+        Shown by `staf_torch/online/README.md`.
+
     Args:
         model: of one stream, with arguments of your choice.
     """

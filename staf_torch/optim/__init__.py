@@ -12,3 +12,18 @@ from .preconditioned_descent import PreconditionedDescent as PreconditionedDesce
 from .recursive_least_squares import RecursiveLeastSquares as RecursiveLeastSquares
 from .steepest_descent import SteepestDescent as SteepestDescent
 from .torch_optimizer import ChaseOptimizer as ChaseOptimizer
+
+__all__ = [
+    "BarzilaiBorwein",
+    "ChaseOptimizer",
+    "ConjugateGradient",
+    "Exact",
+    "FixedStep",
+    "HeavyBall",
+    "Nesterov",
+    "NormalisedLMS",
+    "PreconditionedDescent",
+    "RecursiveLeastSquares",
+    "SteepestDescent",
+    "UpdateLaw",
+]

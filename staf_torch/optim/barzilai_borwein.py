@@ -18,6 +18,15 @@ class BarzilaiBorwein(UpdateLaw):
     when that objective began. So the excess after a time step never exceeds the excess before it. The
     plain method converges R-linearly; no rate an iteration is known.
 
+    Example:
+        >>> basis = StaFBasis(GaussianKernel(), StateFollowingCenters(rings(3), radius=0.5))
+        >>> states = torch.tensor([[[1.0, 0.5]]]).double().expand(1, 20, 2)  # at rest: (B, T, n)
+        >>> excess = chase(states, basis, targets.Paper(), optim.BarzilaiBorwein(), inner_steps=2).excess[0]
+        >>> bool(excess[-1] < 1e-3 * excess[0])
+        True
+
+        Shown by `staf optimizer=barzilai_borwein`.
+
     Source: Barzilai and Borwein, "Two-point step size gradient methods", IMA J. Numer. Anal. 8 (1988);
     Raydan, "On the Barzilai and Borwein choice of steplength", IMA J. Numer. Anal. 13 (1993).
     """

@@ -19,6 +19,15 @@ class UpdateLaw(abc.ABC):
 
     A law object holds hyperparameters only. Rows never touch each other.
 
+    Example:
+        >>> class Halfway(optim.UpdateLaw):
+        ...     def step(self, objective, weights, state):
+        ...         return weights + 0.1 * objective.descent(weights), state
+        >>> Halfway().title, Halfway().products(6, iterations=10)
+        ('halfway', 11)
+
+        Shown by `staf experiment=laws`.
+
     Attributes:
         needs: the fields of `Precomputed` that the law will ask for at every time; a chase computes them in
             bulk. Without them an `Objective` computes what it is asked for on the spot.

@@ -18,6 +18,15 @@ class ConjugateGradient(UpdateLaw):
     iteration gains at least what steepest descent would. The line search uses the gradient itself, not
     its recursion, so that iterations beyond M never raise F.
 
+    Example:
+        >>> basis = StaFBasis(GaussianKernel(), StateFollowingCenters(rings(3), radius=0.5))
+        >>> states = torch.tensor([[[1.0, 0.5]]]).double().expand(1, 20, 2)  # at rest: (B, T, n)
+        >>> excess = chase(states, basis, targets.Paper(), optim.ConjugateGradient(), inner_steps=1).excess[0]
+        >>> bool(excess[-1] < 1e-3 * excess[0])
+        True
+
+        Shown by `staf optimizer=conjugate_gradient`.
+
     Source: Hestenes and Stiefel, "Methods of conjugate gradients for solving linear systems" (1952).
     """
 

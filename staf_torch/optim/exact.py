@@ -16,6 +16,15 @@ class Exact(UpdateLaw):
     alone costs more digits than the solve. The paper's own premise, an iteration in place of a solve,
     saves nothing for the few centers of a StaF basis; this law is the yardstick for the others.
 
+    Example:
+        >>> basis = StaFBasis(GaussianKernel(), StateFollowingCenters(rings(3), radius=0.5))
+        >>> states = torch.tensor([[[1.0, 0.5]]]).double()  # (B, T, n)
+        >>> result = chase(states, basis, targets.Paper(), optim.Exact(), inner_steps=1)
+        >>> bool(result.excess.max() < 1e-9)
+        True
+
+        Shown by `staf optimizer=exact`.
+
     Source: Rosenfeld et al., the normal equations of section 6.
     """
 

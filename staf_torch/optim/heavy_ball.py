@@ -15,10 +15,20 @@ class HeavyBall(UpdateLaw):
 
     By default the optimal pair for the spectrum at hand, s = 4 / (1 + q)^2 and
     beta = ((1 - q) / (1 + q))^2 with q = kappa^-1/2, whose excess shrinks by beta an iteration in the
-    limit, though not in every single one: there is no `contraction`. That s is above the 2 at which
+    limit, though not in every single one: there is no
+    `UpdateLaw.contraction`. That s is above the 2 at which
     descent without momentum diverges, so a velocity reset at every time step blows up, and none is
     offered. In rows that nevertheless came to be worse than zero weights, F(a) > F(0), the exact line
     search replaces the step and the velocity is dropped; so F stays bounded.
+
+    Example:
+        >>> basis = StaFBasis(GaussianKernel(), StateFollowingCenters(rings(3), radius=0.5))
+        >>> states = torch.tensor([[[1.0, 0.5]]]).double().expand(1, 20, 2)  # at rest: (B, T, n)
+        >>> excess = chase(states, basis, targets.Paper(), optim.HeavyBall(), inner_steps=2).excess[0]
+        >>> bool(excess[-1] < 0.1 * excess[0])
+        True
+
+        Shown by `staf optimizer=heavy_ball`.
 
     Args:
         step: s, in units of 1 / L, 0 < s < 2 (1 + momentum); None for the optimal pair.

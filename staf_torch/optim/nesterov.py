@@ -17,8 +17,17 @@ class Nesterov(UpdateLaw):
 
     By default beta = (1 - q) / (1 + q) with q = kappa^-1/2 of the spectrum at hand; with s = 1 the excess
     then shrinks by 1 - q an iteration up to a constant, though not in every single one: there is no
-    `contraction`. In rows whose y is worse than zero weights, F(y) > F(0), the velocity is dropped:
+    `UpdateLaw.contraction`. In rows whose y is worse than zero weights, F(y) > F(0), the velocity is dropped:
     what is left is a plain gradient step, which lowers F.
+
+    Example:
+        >>> basis = StaFBasis(GaussianKernel(), StateFollowingCenters(rings(3), radius=0.5))
+        >>> states = torch.tensor([[[1.0, 0.5]]]).double().expand(1, 20, 2)  # at rest: (B, T, n)
+        >>> excess = chase(states, basis, targets.Paper(), optim.Nesterov(), inner_steps=2).excess[0]
+        >>> bool(excess[-1] < 0.5 * excess[0])
+        True
+
+        Shown by `staf optimizer=nesterov`.
 
     Args:
         step: s, in units of 1 / L, 0 < s <= 1.

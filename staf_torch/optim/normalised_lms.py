@@ -18,6 +18,15 @@ class NormalisedLMS(UpdateLaw):
     One sample a time step says nothing about the gradient of V; along a trajectory that does not excite
     all M directions, the error at the state is small and the error on the ball is not.
 
+    Example:
+        >>> basis = StaFBasis(GaussianKernel(), StateFollowingCenters(rings(3), radius=0.5))
+        >>> states = torch.tensor([[[1.0, 0.5]]]).double()  # (B, T, n)
+        >>> result = chase(states, basis, targets.Paper(), optim.NormalisedLMS(), inner_steps=1)
+        >>> bool((result.value - result.estimate).abs().max() < 1e-9)  # V at the state itself
+        True
+
+        Shown by `staf optimizer=normalised_lms`.
+
     Args:
         step: s, 0 < s < 2.
 

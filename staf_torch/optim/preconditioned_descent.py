@@ -19,6 +19,15 @@ class PreconditionedDescent(UpdateLaw):
     ``jacobi``: P = diag(K)^-1, free of charge, and of little use here: in the flat limit the diagonal of K
     is nearly constant. The excess shrinks by ((kappa - 1) / (kappa + 1))^2 with kappa of P K.
 
+    Example:
+        >>> basis = StaFBasis(GaussianKernel(), StateFollowingCenters(rings(3), radius=0.5))
+        >>> states = torch.tensor([[[1.0, 0.5]]]).double()  # (B, T, n)
+        >>> result = chase(states, basis, targets.Paper(), optim.PreconditionedDescent(), inner_steps=1)
+        >>> bool(result.excess.max() < 1e-9)  # radial kernels: the core is K
+        True
+
+        Shown by `staf optimizer=preconditioned_descent`.
+
     Args:
         preconditioner: ``core`` or ``jacobi``.
 

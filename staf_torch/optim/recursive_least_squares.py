@@ -20,6 +20,15 @@ class RecursiveLeastSquares(UpdateLaw):
     so leave it at one. Q, R and the prior are in the weights of the chase, in units of e^{-g(x)} (the
     kernel's `log_gain`): e^{|x|^2} times the paper's for the exponential kernel.
 
+    Example:
+        >>> basis = StaFBasis(GaussianKernel(), StateFollowingCenters(rings(3), radius=0.5))
+        >>> states = torch.tensor([[[1.0, 0.5]]]).double()  # (B, T, n)
+        >>> result = chase(states, basis, targets.Paper(), optim.RecursiveLeastSquares(), inner_steps=1)
+        >>> bool(result.excess.max() < 0.1 * result.excess_before.max())
+        True
+
+        Shown by `staf optimizer=recursive_least_squares`.
+
     Args:
         process_noise: Q, variance by which a weight drifts in a time step; 0 never forgets.
         measurement_noise: R, positive, variance of a sample of V.

@@ -15,6 +15,15 @@ class SteepestDescent(UpdateLaw):
     Each iteration multiplies the excess by at most ((kappa - 1) / (kappa + 1))^2 (Kantorovich). At the
     ideal weights, where lambda is 0/0, the step is zero.
 
+    Example:
+        >>> basis = StaFBasis(GaussianKernel(), StateFollowingCenters(rings(3), radius=0.5))
+        >>> states = torch.tensor([[[1.0, 0.5]]]).double().expand(1, 20, 2)  # at rest: (B, T, n)
+        >>> excess = chase(states, basis, targets.Paper(), optim.SteepestDescent(), inner_steps=2).excess[0]
+        >>> bool(excess[-1] < 0.5 * excess[0])
+        True
+
+        Shown by `staf optimizer=steepest_descent`.
+
     Source: Rosenfeld et al., eq. (6) and (7).
     """
 

@@ -27,7 +27,11 @@ class ChaseOptimizer(Optimizer):
     Example:
         >>> weights = torch.zeros(5, 3, dtype=torch.float64, requires_grad=True)
         >>> optimizer = optim.ChaseOptimizer([weights], optim.ConjugateGradient(), inner_steps=3)
-        >>> loss = optimizer.step(lambda: (weights @ factor - samples).square().sum(-1))
+        >>> factor, samples = torch.eye(3, 8).double(), torch.ones(5, 8).double()
+        >>> optimizer.step(lambda: (weights @ factor - samples).square().sum(-1)).shape  # the loss
+        torch.Size([5])
+
+        Shown by `tests/examples/two_optimizers.py`.
 
     Parameter groups have ``inner_steps``, and ``lr`` where the law has a `step_size`, which it then sets:
     learning-rate schedulers work on these laws. A rate of zero leaves the parameters alone.

@@ -7,7 +7,14 @@ from typing import Any, NamedTuple
 
 
 class MetricInfo(NamedTuple):
-    """A metric, as tables know it."""
+    """A metric, as tables know it.
+
+    Example:
+        >>> MetricInfo("digits", unit="digits", larger_is_better=True).unit
+        'digits'
+
+        Shown by `staf-table runs --sort ball_error`.
+    """
 
     name: str
     unit: str = ""  # empty: that of V, or of what it is made of

@@ -55,8 +55,14 @@ def collect(path: str | Path | Sequence[str | Path]) -> Collection:
     """Read every run directory at or under a path: also those of a sweep that goes on, or was killed.
 
     Example:
-        >>> for run in collect("runs/2026-11-21_18-40-59-589684_sweep").rows:
-        ...     print(run.overrides, run.status, run.metrics.get("ball_error"))
+        >>> lines = ("centers.radius=0.1,0.2", "duration=0.1", "settle_time=0", "figures=false")
+        >>> done = sweep(*lines, directory="runs/radii")
+        >>> for run in collect("runs/radii").rows:
+        ...     print(run.overrides["centers.radius"], run.status)
+        0.1 completed
+        0.2 completed
+
+        Shown by `staf-table runs`.
 
     Args:
         path: a run directory, a sweep's directory, a folder of such, or several of them.

@@ -20,7 +20,15 @@ _SHOWN = 1  # headlines in the short form of a run
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class Run:
-    """A run, or a member of a run of many: what it was, how it ended, what it measured."""
+    """A run, or a member of a run of many: what it was, how it ended, what it measured.
+
+    Example:
+        >>> done = sweep("centers.radius=0.1,0.2", "duration=0.1", "settle_time=0", "figures=false")
+        >>> done[0].status, done[0].setting("centers.radius")
+        ('completed', 0.1)
+
+        Shown by `staf-table runs`.
+    """
 
     directory: Path
     overrides: Mapping[str, Value]  # key -> value, as typed
@@ -40,7 +48,8 @@ class Run:
 
     def __repr__(self) -> str:
         """`<Run completed: kernel=gaussian, ball_error=0.0762>`: overrides and the first headlines."""
-        typed = " ".join(f"{key}={value}" for key, value in self.overrides.items()) or "no overrides"
+        words = (f"{key}={_typed(value)}" for key, value in self.overrides.items())
+        typed = " ".join(words) or "no overrides"
         shown = [name for name in HEADLINES if self.metrics.get(name) is not None][:_SHOWN]
         return f"<Run {self.status}: {', '.join([typed, *(f'{n}={self.metrics[n]:.3g}' for n in shown)])}>"
 
@@ -78,7 +87,16 @@ class Skipped:
 
 @dataclasses.dataclass(frozen=True)
 class Collection:
-    """The runs that `collect` found."""
+    """The runs that `collect` found.
+
+    Example:
+        >>> done = sweep("centers.radius=0.1,0.2", "duration=0.1", "settle_time=0", "figures=false")
+        >>> found = collect([run.directory for run in done])
+        >>> len(found.rows), found.skipped
+        (2, ())
+
+        Shown by `staf-table runs`.
+    """
 
     rows: tuple[Run, ...]  # in the order of the sweep
     skipped: tuple[Skipped, ...]  # what has no row, and why
@@ -174,3 +192,8 @@ def identity(value: Value) -> str:
     if isinstance(value, int | float) and not isinstance(value, bool):
         return repr(float(value))
     return f"{type(value).__name__} {value!r}"
+
+
+def _typed(value: Value) -> str:
+    """Return a value as the command line has it: false, not False."""
+    return str(value).lower() if isinstance(value, bool) else "null" if value is None else str(value)

@@ -36,8 +36,10 @@ def run(*overrides: str, directory: str | Path | None = None) -> Run:
     environment is left changed, so that this may be called anywhere, in another Hydra application too.
 
     Example:
-        >>> run("kernel=gaussian", "centers.radius=0.2", "duration=6.0", directory="runs/gaussian")
-        <Run completed: kernel=gaussian centers.radius=0.2 duration=6.0, ball_error=0.221>
+        >>> run("kernel=gaussian", "duration=6.0", "figures=false", directory="runs/gaussian")
+        <Run completed: kernel=gaussian duration=6.0 figures=false, ball_error=...>
+
+        Shown by `tests/examples/notebooks/chasing.py`.
 
     Args:
         overrides: as on the command line, without the shell's quotes: `"initial_state=[1.0,0.0]"`.
@@ -73,8 +75,12 @@ def sweep(*overrides: str, directory: str | Path | None = None) -> Runs:
 
     Example:
         >>> runs = sweep("kernel=gaussian,matern", "centers.radius=0.1,0.2", "duration=6.0", "figures=false")
-        >>> runs.pivot("kernel", "centers.radius", "ball_error").shape
-        (2, 2)
+        >>> runs
+        <Runs 4 completed, over kernel, centers.radius>
+        >>> runs.best("ball_error").setting("centers.radius")
+        0.1
+
+        Shown by `tests/examples/notebooks/sweep_and_table.py`.
 
     Args:
         overrides: as on the command line, without the shell's quotes.
@@ -102,6 +108,8 @@ def read_runs(path: str | Path | Sequence[str | Path]) -> Runs:
         <Runs 2 completed, over centers.radius>
         >>> read_runs("runs/radii")
         <Runs 2 completed, over centers.radius>
+
+        Shown by `tests/examples/notebooks/sweep_and_table.py`.
 
     Raises:
         ValueError: if a path does not exist or no run is found.

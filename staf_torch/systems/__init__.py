@@ -18,3 +18,24 @@ from .two_state import TwoState as TwoState
 from .user_plants import RatePlant as RatePlant
 from .user_plants import StepPlant as StepPlant
 from .van_der_pol import VanDerPol as VanDerPol
+
+__all__ = [
+    "Bounds",
+    "CartPole",
+    "ControlAffineSystem",
+    "Linear",
+    "Linearisation",
+    "Oscillator",
+    "Pendulum",
+    "PlanarQuadrotor",
+    "Plant",
+    "RatePlant",
+    "StepPlant",
+    "ThreeState",
+    "TwoState",
+    "Units",
+    "VanDerPol",
+    "runge_kutta_step",
+    "simulate",
+    "trajectory",
+]

@@ -13,14 +13,29 @@ from .bounds import Bounds
 
 
 class Linearisation(NamedTuple):
-    """x' = A x + B u near the equilibrium 0."""
+    """x' = A x + B u near the equilibrium 0.
+
+    Example:
+        >>> systems.Pendulum(damping=0.0, gravity=1.0).linearisation().matrix
+        tensor([[0., 1.],
+                [1., 0.]], dtype=torch.float64)
+
+        Shown by `staf experiment=adp adp/policy=lqr`.
+    """
 
     matrix: Tensor  # A, (n, n), 1/s
     input_matrix: Tensor  # B, (n, m)
 
 
 class Units(NamedTuple):
-    """Units of a plant's quantities, entry by entry where they differ: ``rad, rad/s``."""
+    """Units of a plant's quantities, entry by entry where they differ: ``rad, rad/s``.
+
+    Example:
+        >>> systems.Units("rad, rad/s", "N m")
+        Units(state='rad, rad/s', input='N m')
+
+        Shown by `staf-export RUN --to c`.
+    """
 
     state: str = "1"
     input: str = "1"
@@ -28,6 +43,12 @@ class Units(NamedTuple):
 
 class Plant(nn.Module, abc.ABC):
     """A plant with inputs, batched: what the ones in continuous and in discrete time have in common.
+
+    Example:
+        >>> isinstance(systems.Pendulum(), systems.Plant), systems.Pendulum().dim
+        (True, 2)
+
+        Shown by `staf system=pendulum`.
 
     Attributes:
         dim: n, the number of states; None where the plant takes any.
@@ -104,7 +125,20 @@ class ControlAffineSystem(Plant):
     """x' = f(x) + g(x) u, batched. A plant of your own is a subclass with `drift` and, where it has
     inputs, `effectiveness`; its trajectories then come from a fourth-order Runge-Kutta method.
 
-    It is regulated to the origin without control unless `equilibrium` and `resting_input` say else.
+    It is regulated to the origin without control unless `Plant.equilibrium` and `Plant.resting_input` say
+    else.
+
+    Example:
+        >>> class Trolley(systems.ControlAffineSystem):
+        ...     dim, inputs = 2, 1
+        ...     def drift(self, x):
+        ...         return torch.stack((x[..., 1], -0.2 * x[..., 1]), dim=-1)
+        ...     def effectiveness(self, x):
+        ...         return torch.tensor([[0.0], [1.0]]).to(x).expand(*x.shape[:-1], 2, 1)
+        >>> Trolley().rate(torch.tensor([0.0, 1.0]), torch.tensor([0.5]))
+        tensor([1.0000, 0.3000])
+
+        Shown by `tests/examples/notebooks/own_plant.py`.
     """
 
     @abc.abstractmethod
@@ -133,7 +167,7 @@ class ControlAffineSystem(Plant):
         return None
 
     def smooth_drift(self, x: Tensor) -> Tensor:
-        """f without the terms that have no derivative at 0; what `linearisation` differentiates."""
+        """f without the terms that have no derivative at 0; what `Plant.linearisation` differentiates."""
         return self.drift(x)
 
     def motion(self, x: Tensor, u: Tensor) -> Tensor:

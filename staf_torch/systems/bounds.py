@@ -21,6 +21,8 @@ class Bounds:
         >>> bounds.clip(torch.tensor([-3.0, 0.5], dtype=torch.float64))
         tensor([0.0000, 0.5000], dtype=torch.float64)
 
+        Shown by `staf experiment=adp adp/cost=bounded_input adp/policy=rollout`.
+
     Args:
         low: a number for all inputs, or one an input; None or -inf for none.
         high: likewise; None or inf for none.

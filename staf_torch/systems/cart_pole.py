@@ -17,6 +17,12 @@ class CartPole(ControlAffineSystem):
 
     with m the mass of the pole and M that of cart and pole together.
 
+    Example:
+        >>> systems.CartPole().drift(torch.tensor([0.0, 0.0, 1.0, 0.0]).double())
+        tensor([1., 0., 0., 0.], dtype=torch.float64)
+
+        Shown by `staf experiment=adp system=cart_pole initial_state=[0.0,0.1,0.0,0.0]`.
+
     Args:
         cart: kg, positive.
         pole: kg, positive.

@@ -15,6 +15,13 @@ from .base import ControlAffineSystem
 class Linear(ControlAffineSystem):
     """x' = A x + B u; without control the flow is e^{At} x(0).
 
+    Example:
+        >>> plant = systems.Linear([[0.0, 1.0], [-1.0, -0.1]])
+        >>> plant.drift(torch.tensor([1.0, 0.0]).double())
+        tensor([ 0., -1.], dtype=torch.float64)
+
+        Shown by `staf system=linear`.
+
     Args:
         matrix: A, (n, n), in 1/s.
         input_matrix: B, (n, m); None for a plant without inputs.

@@ -13,6 +13,13 @@ class Oscillator(ControlAffineSystem):
     """x' = frequency (x2, -x1): circles, with the exact flow
     x(t) = (cos(wt) x1 + sin(wt) x2, -sin(wt) x1 + cos(wt) x2).
 
+    Example:
+        >>> plant = systems.Oscillator(frequency=2.0)
+        >>> plant.drift(torch.tensor([1.0, 0.0]).double())
+        tensor([ 0., -2.], dtype=torch.float64)
+
+        Shown by `staf system=oscillator`.
+
     Args:
         frequency: w, positive, rad/s.
 

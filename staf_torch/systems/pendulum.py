@@ -14,6 +14,13 @@ class Pendulum(ControlAffineSystem):
 
     theta = 0 is upright, so the open loop is unstable at the equilibrium.
 
+    Example:
+        >>> plant = systems.Pendulum()
+        >>> plant.drift(torch.tensor([0.0, 1.0]).double())
+        tensor([ 1.0000, -0.1000], dtype=torch.float64)
+
+        Shown by `staf system=pendulum`.
+
     Args:
         mass: kg, positive.
         length: m, positive.

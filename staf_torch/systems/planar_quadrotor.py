@@ -17,6 +17,13 @@ class PlanarQuadrotor(ControlAffineSystem):
 
     The input is measured from the hover thrust mass * gravity, so that f(0) = 0.
 
+    Example:
+        >>> plant = systems.PlanarQuadrotor()
+        >>> plant.drift(torch.tensor([0.0, 0.0, 0.0, 1.0, 0.0, 0.0]).double())
+        tensor([1., 0., 0., -0., 0., 0.], dtype=torch.float64)
+
+        Shown by `staf experiment=adp system=planar_quadrotor adp/policy=rollout`.
+
     Args:
         mass: kg, positive.
         inertia: kg m^2, positive.

@@ -13,6 +13,13 @@ class ThreeState(ControlAffineSystem):
 
     The root has no derivative at 0, so the linearisation leaves it out.
 
+    Example:
+        >>> plant = systems.ThreeState()
+        >>> plant.drift(torch.tensor([1.0, 0.0, 0.0]).double())
+        tensor([0., 0., 1.], dtype=torch.float64)
+
+        Shown by `staf experiment=adp_three_state`.
+
     Source: MATH.md section 4, after Kamalapurkar, Rosenfeld and Dixon.
     """
 

@@ -14,6 +14,13 @@ class TwoState(ControlAffineSystem):
     For the cost x'x + u^2 the optimal value is known, V*(x) = x1^2/2 + x2^2, and so is the optimal
     control u* = -h x2. The open loop is unstable.
 
+    Example:
+        >>> plant = systems.TwoState()
+        >>> plant.drift(torch.tensor([1.0, 0.0]).double())
+        tensor([-1.0000, -0.5000], dtype=torch.float64)
+
+        Shown by `staf experiment=adp`.
+
     Args:
         as_printed: the drift of the paper's appendix, which lost a "1 -": x2' = -x1/2 - x2/2 h^2 + h u.
             It is stable without control, and V* above does not solve its HJB equation.

@@ -64,9 +64,12 @@ class StepPlant(FunctionPlant):
     """x+ = step(x, u): a plant in discrete time, or a simulator whose inside nobody knows.
 
     Example:
+        >>> import numpy as np
         >>> def step(x, u):  # NumPy or torch: rows (B, 2) and (B, 1) to (B, 2)
         ...     return np.stack((x[:, 0] + 0.1 * x[:, 1], x[:, 1] + 0.1 * u[:, 0]), axis=1)
         >>> plant = systems.StepPlant(step, dim=2, inputs=1, dt=0.1)
+
+        Shown by `staf_torch/adp/README.md`.
 
     A step is one call, for all rows. Where the function is torch all through, loops with it are compiled and
     it is differentiated by autograd; else its slopes are central differences, all probes in one call.
@@ -126,6 +129,8 @@ class RatePlant(FunctionPlant):
 
     Example:
         >>> plant = systems.RatePlant(lambda x, u: -x + u.sin(), dim=1, inputs=1)
+
+        Shown by `staf_torch/adp/README.md`.
 
     Args:
         rate: (B, n), (B, m) -> (B, n), of torch tensors or NumPy arrays, in units of the state a second.

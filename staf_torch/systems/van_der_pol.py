@@ -12,6 +12,13 @@ from .base import ControlAffineSystem
 class VanDerPol(ControlAffineSystem):
     """x1' = x2,  x2' = damping (1 - x1^2) x2 - x1 + u.
 
+    Example:
+        >>> plant = systems.VanDerPol()
+        >>> plant.drift(torch.tensor([1.0, 0.0]).double())
+        tensor([ 0., -1.], dtype=torch.float64)
+
+        Shown by `staf system=van_der_pol`.
+
     Args:
         damping: mu; for mu > 0 the origin is unstable inside a stable limit cycle.
 

@@ -11,3 +11,17 @@ from .model import html_text as html_text
 from .model import json_text as json_text
 from .model import latex_text as latex_text
 from .model import parquet_bytes as parquet_bytes
+
+__all__ = [
+    "Collection",
+    "Layout",
+    "Run",
+    "Style",
+    "Table",
+    "collect",
+    "html_text",
+    "json_text",
+    "latex_text",
+    "parquet_bytes",
+    "tabulate",
+]

@@ -106,6 +106,12 @@ def _expansion(freedom: int) -> float:
 class Layout:
     """What a table shall show; the options of `staf-table`.
 
+    Example:
+        >>> Layout(rows=("kernel",), metrics=("ball_error",), sort=("ball_error:desc",)).rows
+        ('kernel',)
+
+        Shown by `staf-table runs --rows kernel --metric ball_error`.
+
     Args:
         rows: settings that tell rows apart; empty: all that were swept (without the seed where aggregated).
         columns: settings over whose values a metric is spread.
@@ -127,6 +133,14 @@ class Layout:
 
 def tabulate(found: Collection, layout: Layout | None = None) -> Table:
     """Return the table of some runs.
+
+    Example:
+        >>> done = sweep("centers.radius=0.1,0.2", "duration=0.1", "settle_time=0", "figures=false")
+        >>> table = tabulate(collect(done[0].directory.parent), Layout(metrics=("ball_error",)))
+        >>> [column.name for column in table.columns][:2]
+        ['centers.radius', 'ball_error']
+
+        Shown by `staf-table runs`.
 
     Raises:
         ValueError: for a metric, setting or aggregate that there is not; the message lists those that exist.

@@ -39,6 +39,12 @@ class Row:
 class Style:
     """How numbers are shown.
 
+    Example:
+        >>> Style(digits=2, bold=True)
+        Style(digits=2, bold=True)
+
+        Shown by `staf-table runs --best bold --digits 2`.
+
     Args:
         digits: significant ones.
         bold: the best number of each column is bold.

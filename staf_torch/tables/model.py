@@ -47,7 +47,15 @@ _BLOCK = re.compile(r"^(?:#{1,6} |> ?|[-+=~]{3,}|[-+] )")  # of Markdown, at the
 
 @dataclasses.dataclass(frozen=True)
 class Table:
-    """Rows of values under columns, and how people see them."""
+    """Rows of values under columns, and how people see them.
+
+    Example:
+        >>> done = sweep("centers.radius=0.1,0.2", "duration=0.1", "settle_time=0", "figures=false")
+        >>> print(done.table(metrics=("ball_error",)).csv().splitlines()[0])
+        centers.radius,ball_error,status,directory
+
+        Shown by `staf-table runs`.
+    """
 
     columns: tuple[Column, ...]
     rows: tuple[Row, ...]
@@ -142,6 +150,13 @@ def latex_text(table: Table) -> str:
     r"""Return a `tabular`; the document needs `\usepackage{booktabs}`, and `textcomp` before LaTeX of 2020.
 
     Why runs have no result stands below it as comments.
+
+    Example:
+        >>> done = sweep("centers.radius=0.1,0.2", "duration=0.1", "settle_time=0", "figures=false")
+        >>> latex_text(done.table(metrics=("ball_error",))).count("tabular")
+        2
+
+        Shown by `staf-table runs --format tex`.
     """
     columns, digits = table.printed(), table.style.digits
     align = "".join("r" if column.numeric else "l" for column in columns)
@@ -202,6 +217,13 @@ def json_text(table: Table) -> str:
     """``{"columns": [...], "rows": [{"ball_error": null, "reasons": {"ball_error": "..."}}], "notes": []}``.
 
     NaN and infinity, which JSON does not have, are null with the reason.
+
+    Example:
+        >>> done = sweep("centers.radius=0.1,0.2", "duration=0.1", "settle_time=0", "figures=false")
+        >>> json_text(done.table(metrics=("ball_error",))).count("directory")
+        3
+
+        Shown by `staf-table runs --format json`.
     """
     content = {
         "columns": list(table.names),
@@ -219,6 +241,13 @@ def _json_row(row: Row) -> dict[str, Any]:
 
 def parquet_bytes(table: Table) -> bytes:
     """Return the table as a Parquet file; a column of several types becomes one of texts, a list JSON.
+
+    Example:
+        >>> done = sweep("centers.radius=0.1,0.2", "duration=0.1", "settle_time=0", "figures=false")
+        >>> parquet_bytes(done.table(metrics=("ball_error",)))[:4]  # doctest: +SKIP
+        b'PAR1'
+
+        Shown by `staf-table runs --format parquet --output table.parquet`.
 
     Raises:
         ValueError: without pandas and pyarrow.
@@ -257,7 +286,15 @@ def require(package: str, what: str) -> Any:
 
 
 def html_text(table: Table) -> str:
-    """Return the table as an HTML element, with the best numbers bold and a line for each note."""
+    """Return the table as an HTML element, with the best numbers bold and a line for each note.
+
+    Example:
+        >>> done = sweep("centers.radius=0.1,0.2", "duration=0.1", "settle_time=0", "figures=false")
+        >>> html_text(done.table(metrics=("ball_error",))).startswith("<table")
+        True
+
+        Shown by `staf experiment=ablation`.
+    """
     columns = table.printed()
     heads = "".join(
         f"<th>{html.escape(f'{c.over}, {c.heading}' if c.over else c.heading)}</th>" for c in columns

@@ -29,6 +29,13 @@ class Construction:
     x + l/m, |l|/m <= degree/m < radius. It is evaluated in this product form only. The binomial sum over
     the centers, as printed, needs weights of the size m^degree and loses every digit.
 
+    Example:
+        >>> found = theory.one_polynomial_bound(targets.Paper(), theory.disc(), 0.1, 0.1)
+        >>> found.error <= 0.1, found.m
+        (True, 11)
+
+        Shown by `staf experiment=exponential_bound`.
+
     Source: Rosenfeld et al., section 4, proof of the theorem on the exponential kernel.
     """
 
@@ -211,7 +218,15 @@ class DomainProblem(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class ExponentialBound:
-    """What `exponential_bound` returns."""
+    """What `exponential_bound` returns.
+
+    Example:
+        >>> found = theory.exponential_bound(targets.Paper(), theory.disc(), 0.1, 0.1)
+        >>> found.one_polynomial.error <= 0.1, found.N >= 1
+        (True, True)
+
+        Shown by `staf experiment=exponential_bound`.
+    """
 
     N: int  # degree of the polynomials that approximate V
     S: int  # degree of the polynomials that approximate e^{-x'y}
@@ -257,6 +272,8 @@ def exponential_bound(
         >>> bound.N, bound.S, bound.count, bound.one_polynomial_count
         (3, 2, 21, 10)
 
+        Shown by `staf experiment=exponential_bound`.
+
     Args:
         target: V, points (..., n) to values (...).
         domain: states that cover D, (D, n); see `disc`. What is found holds at these states. The target
@@ -299,6 +316,8 @@ def one_polynomial_bound(
     Example:
         >>> one_polynomial_bound(targets.Paper(), disc(1.0), radius=0.1, epsilon=1e-3).count
         10
+
+        Shown by `staf experiment=exponential_bound`.
 
     Args:
         target: V, points (..., n) to values (...).

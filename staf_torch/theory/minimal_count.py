@@ -27,7 +27,16 @@ _MOST_CENTERS = 500
 
 @dataclasses.dataclass(frozen=True)
 class MinimalCount:
-    """What `minimal_count` returns, over L layouts and the states (...) of a trajectory."""
+    """What `minimal_count` returns, over L layouts and the states (...) of a trajectory.
+
+    Example:
+        >>> x = torch.tensor([[1.0, 0.5]]).double()
+        >>> found = theory.minimal_count(targets.Paper(), ExponentialKernel(), x, 0.1, 1e-2)
+        >>> found.count, found.pointwise
+        (6, tensor([6]))
+
+        Shown by `staf experiment=feasibility`.
+    """
 
     count: int  # the smallest M that does for all states
     pointwise: Tensor  # (...) int64, the smallest M that does for each state
@@ -40,6 +49,12 @@ def standard_layouts(dim: int) -> list[Tensor]:
 
     In the plane one and two points, then `rings` with 3 to 28; in other dimensions `ball` with
     C(n + k, n) points, k = 0, 1, ..., up to 500 of them and k = 6.
+
+    Example:
+        >>> [len(directions) for directions in theory.standard_layouts(2)][:4]
+        [1, 2, 3, 6]
+
+        Shown by `staf experiment=feasibility`.
     """
     if dim == 2:
         return [polygon(1), polygon(2), *(rings(count) for count in (3, 6, 10, 15, 21, 28))]
@@ -60,9 +75,12 @@ def minimal_count(
     V^ has the ideal weights. The layouts are tried from the fewest centers on; the first that does gives M.
 
     Example:
-        >>> states = systems.simulate(systems.Oscillator(), torch.tensor([[1.0, 0.0]]).double(), 0.05, 125)
+        >>> x0 = torch.tensor([[1.0, 0.0]]).double()
+        >>> states = systems.simulate(systems.Oscillator(), x0, dt=0.5, steps=12)
         >>> minimal_count(targets.Paper(), ExponentialKernel(), states, radius=0.1, epsilon=1e-2).count
         6
+
+        Shown by `staf experiment=feasibility`.
 
     Args:
         target: V, points (..., n) to values (...).
@@ -112,6 +130,15 @@ def layout_errors(
 
     The supremum is the largest value on a grid of the ball (769 points in the plane, denser towards its
     surface), improved by a search from its largest points.
+
+    Example:
+        >>> x = torch.tensor([[1.0, 0.5]]).double()
+        >>> layouts = [rings(3), rings(6)]
+        >>> few, more = theory.layout_errors(targets.Paper(), ExponentialKernel(), x, 0.1, layouts).flatten()
+        >>> bool(more < few)
+        True
+
+        Shown by `staf experiment=layouts`.
 
     Args:
         target: V, points (..., n) to values (...).
@@ -175,6 +202,14 @@ def power_function(basis: StaFBasis, x: Tensor, z: Tensor, *, relative: bool = F
     r^(k+1) and the formula cancels to nothing: the difference is taken on paper. For other kernels by a
     pivoted Cholesky factor; below sqrt(M eps k(y,y)) it is then rounding, and what rounds below zero is
     zero.
+
+    Example:
+        >>> basis = StaFBasis(GaussianKernel(), StateFollowingCenters(rings(3), radius=0.1))
+        >>> x = torch.tensor([[1.0, 0.5]]).double()
+        >>> bool(theory.power_function(basis, x, 0.1 * rings(3)).max() < 1e-6)  # 0 at the centers
+        True
+
+        Shown by `staf experiment=feasibility`.
 
     Args:
         basis: kernel and centers.

@@ -19,7 +19,18 @@ _STARTS, _ASCENTS = 8, 60
 
 
 class DriftConstants(NamedTuple):
-    """The worst over a set of states, in the norm |v|^2 = v'K(c(x))v of each."""
+    """The worst over a set of states, in the norm |v|^2 = v'K(c(x))v of each.
+
+    Example:
+        >>> basis = StaFBasis(GaussianKernel(), StateFollowingCenters(rings(3), radius=0.1))
+        >>> plant = systems.Oscillator()
+        >>> states = systems.simulate(plant, torch.tensor([[1.0, 0.0]]).double(), dt=0.5, steps=12)[0]
+        >>> constants = theory.drift_constants(basis, targets.Paper(), states, plant.drift(states))
+        >>> constants.condition_number > 1, constants.speed > 0
+        (True, True)
+
+        Shown by `staf experiment=laws`.
+    """
 
     condition_number: float  # kappa = max lambda_max(K) / lambda_min(K)
     speed: float  # W = max |w'|, of the ideal weights, a second
@@ -27,7 +38,14 @@ class DriftConstants(NamedTuple):
 
 
 class UltimateBound(NamedTuple):
-    """limsup of the excess F(a_k) - F(w_k); inf where nothing is promised."""
+    """limsup of the excess F(a_k) - F(w_k); inf where nothing is promised.
+
+    Example:
+        >>> theory.UltimateBound(before=0.35, after=0.2).after
+        0.2
+
+        Shown by `staf experiment=laws`.
+    """
 
     before: float  # as brought to x_k
     after: float  # as corrected at x_k
@@ -37,6 +55,16 @@ def drift_constants(basis: StaFBasis, target: Target, states: Tensor, velocities
     """The constants of `ultimate_bound` over given states.
 
     They hold for trajectories that stay among these states; sample the region, or a trajectory, densely.
+
+    Example:
+        >>> basis = StaFBasis(GaussianKernel(), StateFollowingCenters(rings(3), radius=0.1))
+        >>> plant = systems.Oscillator()
+        >>> states = systems.simulate(plant, torch.tensor([[1.0, 0.0]]).double(), dt=0.5, steps=12)[0]
+        >>> constants = theory.drift_constants(basis, targets.Paper(), states, plant.drift(states))
+        >>> constants.growth >= 0
+        True
+
+        Shown by `staf experiment=laws`.
 
     Args:
         basis: kernel and centers.
@@ -89,6 +117,17 @@ def ultimate_bound(
 
     and q times that after it: the excess is O(dt^2), where the theorem of the paper gives O(dt).
 
+    Example:
+        >>> basis = StaFBasis(GaussianKernel(), StateFollowingCenters(rings(3), radius=0.1))
+        >>> plant = systems.Oscillator()
+        >>> states = systems.simulate(plant, torch.tensor([[1.0, 0.0]]).double(), dt=0.5, steps=12)[0]
+        >>> constants = theory.drift_constants(basis, targets.Paper(), states, plant.drift(states))
+        >>> bound = theory.ultimate_bound(constants, optim.SteepestDescent(), dt=1e-6, inner_steps=10)
+        >>> bound.after < bound.before
+        True
+
+        Shown by `staf experiment=laws`.
+
     Args:
         constants: of the region or trajectory, `drift_constants`.
         law: an update law with a known `contraction`.
@@ -117,6 +156,17 @@ def step_for_bound(
 ) -> float:
     """The largest dt (s) whose `ultimate_bound` is at most ``excess``, after the correction or before it.
 
+    Example:
+        >>> basis = StaFBasis(GaussianKernel(), StateFollowingCenters(rings(3), radius=0.1))
+        >>> plant = systems.Oscillator()
+        >>> states = systems.simulate(plant, torch.tensor([[1.0, 0.0]]).double(), dt=0.5, steps=12)[0]
+        >>> constants = theory.drift_constants(basis, targets.Paper(), states, plant.drift(states))
+        >>> dt = theory.step_for_bound(constants, optim.SteepestDescent(), excess=0.35, inner_steps=10)
+        >>> 0 < dt < 1
+        True
+
+        Shown by `staf experiment=laws`.
+
     Raises:
         ValueError: if the law has no known rate, or a number breaks its rule.
     """
@@ -135,6 +185,16 @@ def steps_for_bound(
     constants: DriftConstants, law: UpdateLaw, *, excess: float, dt: float, before: bool = False
 ) -> int | None:
     """The fewest iterations a step whose `ultimate_bound` is at most ``excess``; None where none are enough.
+
+    Example:
+        >>> basis = StaFBasis(GaussianKernel(), StateFollowingCenters(rings(3), radius=0.1))
+        >>> plant = systems.Oscillator()
+        >>> states = systems.simulate(plant, torch.tensor([[1.0, 0.0]]).double(), dt=0.5, steps=12)[0]
+        >>> constants = theory.drift_constants(basis, targets.Paper(), states, plant.drift(states))
+        >>> theory.steps_for_bound(constants, optim.SteepestDescent(), excess=0.35, dt=1e-6) >= 1
+        True
+
+        Shown by `staf experiment=laws`.
 
     Raises:
         ValueError: if the law has no known rate, or a number breaks its rule.
@@ -179,7 +239,18 @@ def _gain(basis: StaFBasis, x: Tensor, velocity: Tensor) -> tuple[Tensor, Tensor
 
 
 class PaperStep(NamedTuple):
-    """The constants of the gradient chase theorem over given states, and the step that they allow."""
+    """The constants of the gradient chase theorem over given states, and the step that they allow.
+
+    Example:
+        >>> basis = StaFBasis(GaussianKernel(), StateFollowingCenters(rings(3), radius=0.1))
+        >>> plant = systems.Oscillator()
+        >>> states = systems.simulate(plant, torch.tensor([[1.0, 0.0]]).double(), dt=0.5, steps=12)[0]
+        >>> found = theory.paper_step(basis, targets.Paper(), states, plant.drift(states), excess=0.35)
+        >>> 0 < found.contraction < 1, found.radius > 0
+        (True, True)
+
+        Shown by `staf experiment=laws`.
+    """
 
     dt: float  # s
     contraction: float  # delta, of one iteration
@@ -205,6 +276,16 @@ def paper_step(
     |c'| <= R_0 + R_3 lacks the sqrt(M) of M centers that move at once. For the paper's simulation and an
     excess of 0.35, which it reaches with dt = 1e-2 s, this step is 5.2e-7 s. R_1 is found by ascent
     from a few starts: a maximum that it misses would make the step smaller still.
+
+    Example:
+        >>> basis = StaFBasis(GaussianKernel(), StateFollowingCenters(rings(3), radius=0.1))
+        >>> plant = systems.Oscillator()
+        >>> states = systems.simulate(plant, torch.tensor([[1.0, 0.0]]).double(), dt=0.5, steps=12)[0]
+        >>> found = theory.paper_step(basis, targets.Paper(), states, plant.drift(states), excess=0.35)
+        >>> 0 < found.dt < 1  # s
+        True
+
+        Shown by `staf experiment=laws`.
 
     Args:
         basis: kernel and centers.

@@ -102,6 +102,8 @@ def disc(
         >>> disc(1.0).shape
         torch.Size([97, 2])
 
+        Shown by `staf experiment=exponential_bound`.
+
     Args:
         radius: of the domain, positive, in the units of the state.
         dim: n; 2 is a disc.

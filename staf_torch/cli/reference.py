@@ -1,0 +1,38 @@
+"""`staf docs [FOLDER]`: the reference pages, made of the docstrings by pdoc (extra `docs`)."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+
+MODULES = (
+    *("staf_torch", "staf_torch.sweeps.python_api", "staf_torch.sweeps.runs"),
+    *("staf_torch.approximation.conditioning", "staf_torch.approximation.sensitivity"),
+    *("staf_torch.centers", "staf_torch.deploy", "staf_torch.engine", "staf_torch.envs"),
+    *("staf_torch.kernels", "staf_torch.lanes", "staf_torch.metrics", "staf_torch.online"),
+    "staf_torch.tables",
+)
+"""What has a page; `staf_torch` brings the modules of its `__all__`: adp, optim, systems, targets, theory."""
+
+
+def main(words: Sequence[str]) -> str:
+    """Write the pages into a folder, `site` where none is named; return where they begin.
+
+    Raises:
+        ValueError: without pdoc, or for more than one folder.
+    """
+    if len(words) > 1:
+        raise ValueError(f"`staf docs` takes one folder; got {' '.join(words)!r}.")
+    if importlib.util.find_spec("pdoc") is None:
+        raise ValueError("`staf docs` needs pdoc: install the extra, pip install 'staf_torch[docs]'.")
+    folder = Path(words[0] if words else "site")
+    pdoc = importlib.import_module("pdoc")
+    pdoc.render.configure(docformat="google", footer_text="staf_torch")
+    with warnings.catch_warnings():
+        # Those of a NamedTuple, or of a dataclass's ancestor, are evaluated where our names are not known:
+        warnings.filterwarnings("ignore", "Error parsing type annotation")  # the text is then shown as it is
+        pdoc.pdoc(*MODULES, output_directory=folder)
+    return f"reference pages: {folder / 'index.html'}"

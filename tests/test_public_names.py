@@ -1,0 +1,29 @@
+"""The examples in the docstrings of public names do what they say; `test_structure.py` asks each for one.
+
+They begin where a reader does: after `import torch`, `from pathlib import Path`, `from staf_torch import *`,
+and the names of the package that the name itself is in.
+"""
+
+from __future__ import annotations
+
+import doctest
+import inspect
+from pathlib import Path
+
+import pytest
+from public_names import public
+
+PUBLIC = public()
+
+
+@pytest.mark.parametrize("name", PUBLIC)
+def test_the_example_of_a_name_does_what_it_says(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    thing, names = PUBLIC[name]
+    text = inspect.cleandoc(thing.__doc__ or "")
+    test = doctest.DocTestParser().get_doctest(text, dict(names), name, None, None)
+    said: list[str] = []
+    doctest.DocTestRunner(verbose=False, optionflags=doctest.ELLIPSIS).run(test, out=said.append)
+    assert said == [], "".join(said)
