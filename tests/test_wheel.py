@@ -47,24 +47,43 @@ def test_wheel_holds_the_package_its_settings_and_nothing_else(wheel: Path) -> N
     assert any(name.endswith("LICENSE") for name in names)
 
 
-def test_wheel_runs_in_a_clean_environment_from_any_directory(wheel: Path, tmp_path: Path) -> None:
-    home = tmp_path / "venv"
-    _run(sys.executable, "-m", "venv", home, cwd=tmp_path)
-    python = home / "bin" / "python"
-    site = Path(
-        _run(python, "-c", "import sysconfig; print(sysconfig.get_path('purelib'))", cwd=tmp_path).strip()
-    )
+@pytest.fixture(scope="module")
+def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A virtual environment that has what we depend on, and not this package."""
+    place = tmp_path_factory.mktemp("home")
+    _run(sys.executable, "-m", "venv", place / "venv", cwd=place)
+    asked = "import sysconfig; print(sysconfig.get_path('purelib'))"
+    site = Path(_run(place / "venv" / "bin" / "python", "-c", asked, cwd=place).strip())
     # A path in a .pth file brings the packages there, but not their own .pth files: an editable install
     # of this checkout in the present environment stays out of sight.
     (site / "dependencies.pth").write_text(sysconfig.get_path("purelib") + "\n")
-    _run(python, "-m", "pip", "install", "--quiet", "--no-deps", "--no-index", wheel, cwd=tmp_path)
-    work = tmp_path / "elsewhere"
-    work.mkdir()
-    where = _run(python, "-c", "import staf_torch; print(staf_torch.__file__)", cwd=work).strip()
-    assert Path(where).resolve().is_relative_to(home.resolve())
-    said = _run(home / "bin" / "staf", "duration=0.1", "settle_time=0", "figures=false", cwd=work)
+    return place / "venv"
+
+
+def _install(home: Path, *what: str | Path) -> None:
+    line = [home / "bin" / "python", "-m", "pip", "install", "--quiet", "--no-deps", "--no-index"]
+    _run(*line, "--no-build-isolation", *what, cwd=home)
+
+
+def _sweep_own_app(home: Path, work: Path) -> None:
+    """Sweep somebody's application over our groups by our launcher; every warning is an error."""
+    for path in (ROOT / "tests" / "examples").glob("own_app.*"):
+        (work / path.name).write_bytes(path.read_bytes())
+    line = ["-m", "kernel=gaussian,matern", "steps=2", "hydra/launcher=batched"]
+    said = _run(home / "bin" / "python", "-W", "error", "own_app.py", *line, cwd=work)
+    assert said.count("loss=") == 2
+    assert "not available" not in said
+
+
+def test_wheel_runs_in_a_clean_environment_from_any_directory(
+    wheel: Path, home: Path, tmp_path: Path
+) -> None:
+    _install(home, wheel)
+    where = _run(home / "bin" / "python", "-c", "import staf_torch; print(staf_torch.__file__)", cwd=tmp_path)
+    assert Path(where.strip()).resolve().is_relative_to(home.resolve())
+    said = _run(home / "bin" / "staf", "duration=0.1", "settle_time=0", "figures=false", cwd=tmp_path)
     assert "Gradient chase" in said
-    (run,) = (work / "runs").iterdir()
+    (run,) = (tmp_path / "runs").iterdir()
     assert {path.name for path in run.iterdir()} == {
         ".hydra",
         "run.json",
@@ -73,5 +92,13 @@ def test_wheel_runs_in_a_clean_environment_from_any_directory(wheel: Path, tmp_p
         "history.npz",
     }
     assert json.loads((run / "metrics.json").read_text())["diverged_fraction"] == 0
-    table = _run(home / "bin" / "staf-table", "runs", "--format", "csv", cwd=work)
+    table = _run(home / "bin" / "staf-table", "runs", "--format", "csv", cwd=tmp_path)
     assert "ball_error" in table.splitlines()[0]
+    _sweep_own_app(home, tmp_path)
+
+
+def test_editable_install_serves_another_application_as_a_wheel_does(home: Path, tmp_path: Path) -> None:
+    _install(home, "--force-reinstall", "-e", ROOT)
+    where = _run(home / "bin" / "python", "-c", "import staf_torch; print(staf_torch.__file__)", cwd=tmp_path)
+    assert Path(where.strip()).resolve().is_relative_to(ROOT.resolve())
+    _sweep_own_app(home, tmp_path)

@@ -41,6 +41,7 @@ from .sampling import HeldStability as HeldStability
 from .sampling import held_stability as held_stability
 from .shooting import DirectShooting as DirectShooting
 from .shooting import Optimum as Optimum
+from .shooting import PlanReplay as PlanReplay
 from .simulation import LoopResult as LoopResult
 from .simulation import simulate as simulate
 from .tracking import TwoStateTracking as TwoStateTracking
@@ -72,6 +73,7 @@ __all__ = [
     "LeadingCoordinates",
     "LoopResult",
     "Optimum",
+    "PlanReplay",
     "Published",
     "QuadraticBasis",
     "QuadraticCost",

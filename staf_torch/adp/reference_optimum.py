@@ -74,9 +74,12 @@ def optima(problem: AdpProblem, x: Tensor) -> Optima | None:
     except (ValueError, RuntimeError) as error:  # the closed loop was run: it is worth keeping
         _log.warning("the optimum is not known: %s", str(error).splitlines()[0])
         return None
-    lost = int((~found.converged).sum())
+    lost = int(found.value.isnan().sum())
+    local = int((~found.converged & ~found.value.isnan()).sum())
     if lost:
         _log.warning("direct shooting found no optimum from %d of %d states", lost, len(found.value))
+    if local:
+        _log.warning("V* of %d of %d states may be a local minimum only", local, len(found.value))
     mesh, horizon = (
         float(error.nan_to_num(posinf=torch.inf).max()) for error in (found.mesh_error, found.horizon_error)
     )

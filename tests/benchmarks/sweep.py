@@ -1,6 +1,6 @@
-"""A hundred jobs by the batched launcher and by Hydra's basic one, and a thousand members in one job.
+"""A hundred jobs by `staf -m`, `staf_torch.sweep` and Hydra's basic launcher; a thousand members in one job.
 
-`python tests/benchmarks/sweep.py [--json FILE] [--only batched,basic,members]`, with nothing else running.
+With nothing else running: `python tests/benchmarks/sweep.py [--json FILE] [--only batched,python,memory]`.
 """
 
 from __future__ import annotations
@@ -19,10 +19,24 @@ ROOT = Path(__file__).resolve().parents[2]
 LENGTH = ["duration=5", "settle_time=1", "figures=false"]  # 500 steps
 RADII, COUNTS = "centers.radius=0.05,0.1,0.15,0.2,0.3", "centers.count=3,6,10,15"
 JOBS = ["-m", RADII, COUNTS, "seed=range(5)", "trajectories=2", *LENGTH]
+STAF = ["-m", "staf_torch"]
+PYTHON = f"import staf_torch; assert len(staf_torch.sweep(*{JOBS[1:]!r}, directory='sweep')) == 100"
+MEMORY = f"""
+import gc, pathlib, sys, staf_torch
+sizes = []
+for i in range(10):
+    staf_torch.sweep(*{JOBS[1:]!r}, directory=f"sweep{{i}}")
+    gc.collect()
+    pages = int(pathlib.Path("/proc/self/statm").read_text().split()[1])
+    sizes.append(round(pages * 4096 / 2**20, 1))
+print("memory after each of ten sweeps of 100 runs in one process, MiB:", sizes, file=sys.stderr)
+"""
 COMMANDS = {
-    "batched": [*JOBS, "hydra.sweep.dir=sweep"],
-    "basic": [*JOBS, "hydra.sweep.dir=sweep", "hydra/launcher=basic"],
-    "members": [f"members=['{RADII}','{COUNTS}','seed=range(50)']", "trajectories=2", *LENGTH],
+    "batched": [*STAF, *JOBS, "hydra.sweep.dir=sweep"],
+    "python": ["-c", PYTHON],
+    "memory": ["-c", MEMORY],
+    "basic": [*STAF, *JOBS, "hydra.sweep.dir=sweep", "hydra/launcher=basic"],
+    "members": [*STAF, f"members=['{RADII}','{COUNTS}','seed=range(50)']", "trajectories=2", *LENGTH],
 }
 
 
@@ -31,7 +45,7 @@ def measured(argv: list[str]) -> dict[str, float]:
     path = os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
     with tempfile.TemporaryDirectory() as folder:
         before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
-        line = [sys.executable, "-m", "staf_torch", *argv]
+        line = [sys.executable, *argv]
         subprocess.run(
             line, cwd=folder, env={**os.environ, "PYTHONPATH": path}, check=True, stdout=subprocess.DEVNULL
         )
@@ -50,6 +64,9 @@ def main() -> None:
     for name in chosen.only.split(","):
         found[name] = measured(COMMANDS[name])
         print(f"{name:8s} {found[name]['wall']:7.2f} s wall {found[name]['cpu']:7.2f} s CPU", flush=True)
+    if {"batched", "python"} <= set(found):
+        found["python_ratio"] = round(found["python"]["cpu"] / found["batched"]["cpu"], 3)
+        print(f"staf_torch.sweep takes {found['python_ratio']} of the CPU seconds of staf -m")
     if {"batched", "basic"} <= set(found):
         found["cpu_ratio"] = round(found["batched"]["cpu"] / found["basic"]["cpu"], 3)
         print(f"the batched launcher takes {found['cpu_ratio']} of the basic one's CPU seconds")

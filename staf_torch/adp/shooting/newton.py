@@ -33,38 +33,83 @@ class Direction(NamedTuple):
     gradient: Tensor  # of the cost in x(0), after the step, (B, n)
     decrement: Tensor  # how much the quadratic model falls, (B,)
     definite: Tensor  # (B,) bool: the quadratic model had a minimum
+    costates: Tensor  # grad V along the plan, (B, N + 1, n)
 
 
-def direction(expansion: Expansion, end: Tensor, end_curvature: Tensor) -> Direction:
+def direction(
+    expansion: Expansion, end: Tensor, end_curvature: Tensor, room: tuple[Tensor, Tensor] | None = None
+) -> Direction:
     """The minimiser of the quadratic model, backwards in time.
 
     Args:
         expansion: of the current plan.
         end: dV_T/dx at its last state, (B, n).
         end_curvature: the second derivative there, (B, n, n).
+        room: how far v may fall and rise, (B, N, 2m) each; None where it is not bounded. A control at a bound
+            that the model pushes outward stays there, and gets no feedback.
     """
     slope, gradient, curvature = expansion
     size = end.shape[-1]
     s, S = end, end_curvature
     decrement, definite = torch.zeros_like(end[:, 0]), torch.ones_like(end[:, 0], dtype=torch.bool)
-    offsets, feedbacks = [], []
+    offsets, feedbacks, costates = [], [], [end]
     for k in range(slope.shape[1] - 1, -1, -1):
         J = slope[:, k]
         q = gradient[:, k] + (J * s.unsqueeze(-1)).sum(-2)
         Q = curvature[:, k] + J.mT @ S @ J
-        factor, info = torch.linalg.cholesky_ex(Q[:, size:, size:])
-        definite = definite & (info == 0)
-        right = torch.cat((q[:, size:, None], Q[:, size:, :size]), dim=-1)
-        solved = -torch.cholesky_solve(right, factor)
-        offset, feedback = solved[..., 0], solved[..., 1:]
-        s = q[:, :size] + (Q[:, size:, :size] * offset.unsqueeze(-1)).sum(-2)
-        S = Q[:, :size, :size] + Q[:, :size, size:] @ feedback
+        if room is None:
+            offset, feedback, good = _free_step(q, Q, size)
+            fall = -0.5 * (q[:, size:] * offset).sum(-1)
+        else:
+            offset, feedback, good = _boxed_step(q, Q, size, room[0][:, k], room[1][:, k])
+            pushed = (Q[:, size:, size:] @ offset.unsqueeze(-1)).squeeze(-1)
+            fall = -((q[:, size:] + 0.5 * pushed) * offset).sum(-1)
+        definite = definite & good
+        if room is None:
+            s = q[:, :size] + (Q[:, size:, :size] * offset.unsqueeze(-1)).sum(-2)
+            S = Q[:, :size, :size] + Q[:, :size, size:] @ feedback
+        else:  # at a bound the offset is not the model's minimum: all terms count
+            pulled = q[:, size:] + (Q[:, size:, size:] @ offset.unsqueeze(-1)).squeeze(-1)
+            s = q[:, :size] + (Q[:, size:, :size] * offset.unsqueeze(-1)).sum(-2)
+            s = s + (feedback * pulled.unsqueeze(-1)).sum(-2)
+            cross = Q[:, :size, size:] @ feedback
+            S = Q[:, :size, :size] + cross + cross.mT + feedback.mT @ Q[:, size:, size:] @ feedback
         S = 0.5 * (S + S.mT)
-        decrement = decrement - 0.5 * (q[:, size:] * offset).sum(-1)
+        decrement = decrement + fall
         offsets.append(offset)
         feedbacks.append(feedback)
+        costates.append(s)
     offset, feedback = torch.stack(offsets[::-1], dim=1), torch.stack(feedbacks[::-1], dim=1)
-    return Direction(offset, feedback, s, decrement, definite)
+    return Direction(offset, feedback, s, decrement, definite, torch.stack(costates[::-1], dim=1))
+
+
+def _free_step(q: Tensor, Q: Tensor, size: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Offset, feedback and definiteness of the model of one interval, (B, 2m), (B, 2m, n), (B,)."""
+    factor, info = torch.linalg.cholesky_ex(Q[:, size:, size:])
+    right = torch.cat((q[:, size:, None], Q[:, size:, :size]), dim=-1)
+    solved = -torch.cholesky_solve(right, factor)
+    return solved[..., 0], solved[..., 1:], info == 0
+
+
+def _boxed_step(q: Tensor, Q: Tensor, size: int, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """`_free_step` within a box, by projected Newton steps: what leaves it is fixed at its bound, and freed
+    where the model pulls it back."""
+    slope, curvature = q[:, size:], Q[:, size:, size:]
+    offset, held = torch.zeros_like(slope), None
+    for _ in range(2 * slope.shape[-1]):
+        pull = slope + (curvature @ offset.unsqueeze(-1)).squeeze(-1)
+        fixed = ((offset <= low) & (pull > 0)) | ((offset >= high) & (pull < 0))
+        if held is not None and torch.equal(fixed, held):  # costs time alone: every further pass is this one
+            break
+        held, free = fixed, (~fixed).to(q)
+        both = free.unsqueeze(-1) * free.unsqueeze(-2)
+        factor, info = torch.linalg.cholesky_ex(both * curvature + torch.diag_embed(1 - free))
+        right = torch.cat(((free * pull).unsqueeze(-1), free.unsqueeze(-1) * Q[:, size:, :size]), dim=-1)
+        solved = -torch.cholesky_solve(right, factor)
+        offset = torch.minimum(torch.maximum(offset + solved[..., 0], low), high)
+    bent = (offset <= low) | (offset >= high)
+    feedback = torch.where(bent.unsqueeze(-1), 0.0, solved[..., 1:])
+    return offset, feedback, info == 0
 
 
 def convexified(expansion: Expansion) -> Expansion:
@@ -84,7 +129,7 @@ def replay(
     states, controls = [x], []
     for k, h in enumerate(lengths.unbind()):
         apart = (x - plan.state[:, k]).unsqueeze(-2)
-        v = plan.control[:, k] + offset[..., k, :] + (feedback[:, k] * apart).sum(-1)
+        v = stage.admitted(plan.control[:, k] + offset[..., k, :] + (feedback[:, k] * apart).sum(-1))
         x, c = stage.advance(x, v, h)
         spent = spent + c
         states.append(x)
@@ -128,7 +173,6 @@ class Problem(Protocol):
     """What the iteration needs to know; `DirectShooting` has it."""
 
     stage: Stage
-    base: Callable[[Tensor], Tensor]
     terminal: Callable[[Tensor], Tensor]
     tolerance: float
     iterations: int
@@ -141,23 +185,32 @@ class Solution(NamedTuple):
     feedback: Tensor  # of the last expansion, (B, N, 2m, n)
     gradient: Tensor  # of the cost in x(0), (B, n)
     converged: Tensor  # (B,) bool
+    costates: Tensor  # grad V along the plan, (B, N + 1, n)
+    promise: Tensor  # relative improvement that the last model promises, (B,)
     iterations: Tensor  # (B,)
 
 
-def follow(problem: Problem, x0: Tensor, lengths: Tensor) -> Plan:
-    """The base policy's trajectories on a mesh: (B, n), (N,)."""
+def follow(problem: Problem, control: Callable[[Tensor, float], Tensor], x0: Tensor, lengths: Tensor) -> Plan:
+    """The trajectories under a control u(x, t) on a mesh: (B, n), (N,)."""
     stage = problem.stage
-    x, spent, states, controls = x0, torch.zeros_like(x0[:, 0]), [x0], []
+    x, spent, states, controls, now = x0, torch.zeros_like(x0[:, 0]), [x0], [], 0.0
     for h in lengths.unbind():
-        ahead = closed_stage(stage, problem.base, x, h)
-        v = torch.cat([stage.cost.unsaturated(problem.base(at)) for at in (x, ahead)], dim=-1)
-        x, c = stage.advance(x, v, h)
-        spent = spent + c
+        end = now + float(h)
+        ahead = closed_stage(stage, _at(control, now), x, h)
+        v = [stage.cost.unsaturated(control(at, t)) for at, t in ((x, now), (ahead, end - 1e-9 * float(h)))]
+        both = stage.admitted(torch.cat(v, dim=-1))
+        x, c = stage.advance(x, both, h)
+        spent, now = spent + c, end
         states.append(x)
-        controls.append(v)
+        controls.append(both)
     cost = spent + problem.terminal(x)
     cost = torch.where(torch.isfinite(cost), cost, torch.inf)
     return Plan(torch.stack(states, dim=1), torch.stack(controls, dim=1), cost)
+
+
+def _at(control: Callable[[Tensor, float], Tensor], t: float) -> Callable[[Tensor], Tensor]:
+    """The control of one time as a policy."""
+    return lambda x: control(x, t)
 
 
 def minimise(problem: Problem, plan: Plan, lengths: Tensor) -> Solution:
@@ -180,7 +233,8 @@ def minimise(problem: Problem, plan: Plan, lengths: Tensor) -> Solution:
         stuck = stuck | (moving & ~lower & ~done & rough)
         step, rough = _step(problem, plan, lengths, moving & ~lower)  # convexified where it did not pay
         kept = choose(done | stuck, kept, step)
-    return Solution(plan, kept.feedback, kept.gradient, done, count)
+    promise = torch.where(kept.definite, kept.decrement / plan.cost, torch.inf)
+    return Solution(plan, kept.feedback, kept.gradient, done, kept.costates, promise, count)
 
 
 def _step(problem: Problem, plan: Plan, lengths: Tensor, rough: Tensor) -> tuple[Direction, Tensor]:
@@ -189,10 +243,11 @@ def _step(problem: Problem, plan: Plan, lengths: Tensor, rough: Tensor) -> tuple
     batch, intervals = plan.control.shape[:2]
     spread = lengths.expand(batch, intervals)
     expansion = problem.stage.expand(plan.state[:, :-1], plan.control, spread, slope)
-    step = direction(expansion, slope, curvature)
+    room = problem.stage.room(plan.control)
+    step = direction(expansion, slope, curvature, room)
     rough = rough | ~step.definite
     if bool(rough.any()):  # costs time alone
-        step = choose(~rough, step, direction(convexified(expansion), slope, curvature))
+        step = choose(~rough, step, direction(convexified(expansion), slope, curvature, room))
     return step, rough
 
 

@@ -8,8 +8,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ...systems import ControlAffineSystem, runge_kutta_step
-from ..cost import Cost
+from ...numerics.linalg import row_jacobian
+from ...systems import ControlAffineSystem, Plant, runge_kutta_step
+from ..cost import BoundedInputCost, Cost
 
 
 class Expansion(NamedTuple):
@@ -22,21 +23,62 @@ class Expansion(NamedTuple):
 
 class Stage:
     """x+ = F(x, v) and the cost l(x, v) of an interval on which the input runs linearly from v's first half
-    to its second, by one Runge-Kutta step; a bounded input is the saturated v.
+    to its second, by one Runge-Kutta step. A smoothly bounded input is the saturated v; a hard bound is one
+    of v itself.
 
     Args:
         system: the plant.
         cost: the cost rate.
     """
 
-    def __init__(self, system: ControlAffineSystem, cost: Cost) -> None:
+    def __init__(self, system: Plant, cost: Cost) -> None:
         self.system, self.cost = system, cost
+        hard = cost.bounds is not None and not isinstance(cost, BoundedInputCost)
+        self.box: tuple[Tensor, Tensor] | None = None
+        if hard and cost.bounds is not None:
+            self.box = (cost.bounds.low.repeat(2), cost.bounds.high.repeat(2))
+
+    def admitted(self, v: Tensor) -> Tensor:
+        """v with hard bounds kept: (..., 2m) -> (..., 2m)."""
+        if self.box is None:
+            return v
+        return torch.minimum(torch.maximum(v, self.box[0].to(v)), self.box[1].to(v))
+
+    def room(self, v: Tensor) -> tuple[Tensor, Tensor] | None:
+        """How far v may fall and rise, (..., 2m) each; None without hard bounds."""
+        return None if self.box is None else (self.box[0].to(v) - v, self.box[1].to(v) - v)
+
+    def gap(self, x: Tensor, v: Tensor, costate: Tensor) -> Tensor:
+        """How much the Hamiltonian r + p'f of a control exceeds its minimum over the admissible ones.
+
+        It is measured in u, so that a saturated control that should be another is seen, which the slope in v
+        is not. Of a plant that is not affine in u it is measured along the slope there.
+
+        Args:
+            x: (..., n).
+            v: half of a control, (..., m).
+            costate: p, (..., n).
+        """
+        u = self.input(v)
+        with torch.no_grad():
+            if isinstance(self.system, ControlAffineSystem):
+                g = self.system.effectiveness(x)
+            else:
+                g = _input_slope(self.system, x, u)
+            best = self.cost.policy(g, costate)
+            pull = (g * costate.unsqueeze(-1)).sum(-2)
+            now, least = (self.cost.input_rate(w) + (pull * w).sum(-1) for w in (u, best))
+        return (now - least).clamp(min=0.0)
+
+    def input(self, v: Tensor) -> Tensor:
+        """u of a half of v, (..., m); a smooth bound saturates it, a hard one it keeps already."""
+        return v if self.box is not None else self.cost.saturate(v)
 
     def advance(self, x: Tensor, v: Tensor, h: Tensor) -> tuple[Tensor, Tensor]:
         """(..., n), (..., 2m), lengths h (...) in s: x+ (..., n), the cost (...)."""
         first, last = v.chunk(2, dim=-1)
         middle = 0.5 * (first + last)
-        u1, u2, u4 = (self.cost.saturate(u) for u in (first, middle, last))
+        u1, u2, u4 = (self.input(u) for u in (first, middle, last))
         step = h.unsqueeze(-1)
         k1, c1 = self._field(x, u1)
         k2, c2 = self._field(x + 0.5 * step * k1, u2)
@@ -62,7 +104,13 @@ class Stage:
         return Expansion(slope, gradient, 0.5 * (curvature + curvature.mT))
 
     def _field(self, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
-        return self.system.rate(x, u), self.cost.rate(x, u)
+        return self.system.motion(x, u), self.cost.rate(x, u)
+
+
+def _input_slope(system: Plant, x: Tensor, u: Tensor) -> Tensor:
+    """df/du, (..., n, m)."""
+    with torch.enable_grad():
+        return row_jacobian(lambda w: system.motion(x.detach(), w), u.detach())[1].detach()
 
 
 def adjoint(slope: Tensor, gradient: Tensor, end: Tensor) -> Tensor:
@@ -81,4 +129,4 @@ def _gradient(values: Tensor, z: Tensor) -> Tensor:
 
 def closed_stage(stage: Stage, policy: Callable[[Tensor], Tensor], x: Tensor, h: Tensor) -> Tensor:
     """x+ under a policy that sees the state all the time, by one Runge-Kutta step: (B, n), () -> (B, n)."""
-    return runge_kutta_step(lambda at: stage.system.rate(at, policy(at)), x, float(h))
+    return runge_kutta_step(lambda at: stage.system.motion(at, policy(at)), x, float(h))

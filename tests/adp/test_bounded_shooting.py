@@ -1,0 +1,81 @@
+"""Direct shooting with hard bounds, from several starts, and what it says where it is not sure."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from staf_torch import adp, systems
+
+DOUBLE = systems.Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
+COST = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
+
+
+@pytest.fixture(scope="module")
+def convex() -> adp.Optimum:
+    start = torch.tensor([[5.0, 0.0], [0.5, 0.0], [-5.0, 0.0]], dtype=torch.float64)
+    return adp.DirectShooting(DOUBLE, COST, low=-1.0, high=1.0).solve(start)
+
+
+def test_double_integrator_with_a_hard_bound_is_solved(convex: adp.Optimum) -> None:
+    # 53.1619: IPOPT on 400 intervals over 20 s of a control that is linear on each (Runge-Kutta).
+    assert convex.converged.all()
+    assert float(convex.value[0]) == pytest.approx(53.162, rel=1e-4)
+    torch.testing.assert_close(convex.value[2], convex.value[0], rtol=1e-9, atol=0)
+    assert (convex.plan.abs() <= 1.0).all()
+    assert float(convex.plan[0].min()) == -1.0
+    assert float(convex.optimality.max()) < 1e-4
+    free = adp.DirectShooting(DOUBLE, COST).solve(torch.tensor([[0.5, 0.0]], dtype=torch.float64))
+    torch.testing.assert_close(convex.value[1], free.value[0], rtol=1e-5, atol=0)
+    assert repr(convex).startswith("Optimum(3 states, value ")
+    assert len(repr(convex)) < 120
+
+
+@torch.no_grad()
+def test_plan_is_replayed_at_its_cost(convex: adp.Optimum) -> None:
+    dt = 0.01
+    run = adp.simulate(
+        convex.replay(),
+        DOUBLE,
+        COST,
+        convex.state[:, 0],
+        dt=dt,
+        steps=round(float(convex.time[-1]) / dt),
+        compile=False,
+        every=2,
+    )
+    torch.testing.assert_close(run.cost, convex.value, rtol=3e-3, atol=0)
+    assert (run.state[:, -1].norm(dim=-1) < 1e-2).all()
+
+
+def test_saturated_swing_up_is_not_passed_off_as_an_optimum() -> None:
+    hanging = torch.tensor([[0.0, math.pi, 0.0, 0.0]], dtype=torch.float64)
+    cost = adp.BoundedInputCost(1.0, 0.1, dim=4, inputs=1, bound=10.0)
+    shooting = adp.DirectShooting(systems.CartPole(), cost, horizon=3.0, intervals=20, starts=1, iterations=6)
+    best = shooting.solve(hanging)
+    assert not best.converged.any()
+    assert best.reason[0]
+    assert best.reason[0] in repr(best)
+
+
+def test_row_without_a_finite_start_says_so() -> None:
+    class Exploding(systems.Linear):
+        def drift(self, x: torch.Tensor) -> torch.Tensor:
+            return super().drift(x) + torch.where(x[..., :1] > 2.0, math.inf, 0.0)
+
+    plant = Exploding([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
+    best = adp.DirectShooting(plant, COST, intervals=20).solve(torch.tensor([[3.0, 0.0]]).double())
+    assert best.reason == (
+        "the cost is not finite from here under any start: give a `base` that does not diverge",
+    )
+
+
+def test_what_cannot_be_shot_is_refused_by_name() -> None:
+    step = systems.StepPlant(lambda x, u: 0.5 * x + u, dim=1, inputs=1, dt=0.1)
+    with pytest.raises(ValueError, match=r"`DirectShooting\(system=...\)` must be in continuous time"):
+        adp.DirectShooting(step, adp.QuadraticCost(1.0, 1.0, dim=1, inputs=1))
+    discounted = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1, discount=0.1)
+    with pytest.raises(ValueError, match=r"`DirectShooting\(cost=...\)` must have no discount"):
+        adp.DirectShooting(DOUBLE, discounted)
