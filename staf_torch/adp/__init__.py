@@ -80,6 +80,7 @@ __all__ = [
     "QuadraturePoints",
     "RBFGridBasis",
     "RandomPoints",
+    "RecedingHorizon",
     "RolloutPolicy",
     "SampledProblem",
     "StaFValueBasis",
