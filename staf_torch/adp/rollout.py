@@ -12,11 +12,13 @@ from ..approximation.basis import StaFBasis
 from ..centers import Radius, StateFollowingCenters, ball, cross_polytope, rings
 from ..kernels import ExponentialKernel
 from ..lanes import each, repeat, scan
-from ..lanes.function import RowFunction
+from ..lanes.function import RowFunction, Rows
 from ..numerics.checks import fail, integer, positive_real
 from ..systems import ControlAffineSystem
 from .controllers import LQR, Policy, Value
 from .cost import Cost
+
+_NAME = "a rollout policy"
 
 
 class RolloutPolicy(nn.Module):
@@ -81,7 +83,7 @@ class RolloutPolicy(nn.Module):
         self.steps = integer("RolloutPolicy", "steps", steps, least=1)
         self.depth = integer("RolloutPolicy", "depth", depth, least=1)
         self.period = None if period is None else positive_real("RolloutPolicy", "period", period)
-        self._compiled = RowFunction(self.control, self, "a rollout policy")
+        self._compiled = RowFunction(self.control, self, _NAME, lambda: _TwoPrograms(self))
         self.base: Policy = base
         if depth > 1:
             settings = {"horizon": horizon, "steps": steps, "depth": depth - 1}
@@ -135,7 +137,7 @@ class RolloutPolicy(nn.Module):
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)  # type: ignore[no-untyped-call]
-        self._compiled = RowFunction(self.control, self, "a rollout policy")
+        self._compiled = RowFunction(self.control, self, _NAME, lambda: _TwoPrograms(self))
 
     def control(self, x: Tensor) -> Tensor:
         """`forward` in plain torch: (..., n) -> (..., m)."""
@@ -143,8 +145,12 @@ class RolloutPolicy(nn.Module):
 
     def gradient(self, x: Tensor) -> Tensor:
         """grad V^ at x, the centers frozen: (..., n) -> (..., n)."""
+        return self.gradient_of(x, self.rollout(self.basis.centers(x)))
+
+    def gradient_of(self, x: Tensor, values: Tensor) -> Tensor:
+        """`gradient` from what the rollouts cost, (..., n), (..., M) -> (..., n)."""
         space = self.basis.local(x)
-        coefficients = space.fit(self.rollout(self.basis.centers(x)))
+        coefficients = space.fit(values)
         rise: Tensor = torch.func.grad(lambda z: space.evaluate(z.unsqueeze(-2), coefficients).sum())(
             torch.zeros_like(x)
         )
@@ -186,6 +192,35 @@ class RolloutPolicy(nn.Module):
     def _field(self, x: Tensor) -> tuple[Tensor, Tensor]:
         u = self.base(x)
         return self.model.rate(x, u), self.cost.rate(x, u)
+
+
+class _TwoPrograms:
+    """`RolloutPolicy.control`, a center in every lane, then a state in every lane: (B, n) -> (B, 1, m)."""
+
+    def __init__(self, policy: RolloutPolicy) -> None:
+        centers = policy.basis.centers
+        self._directions = centers.directions.detach()
+        self._roll = Rows(lambda x, u: policy.rollout(x + centers.radius(x)[..., None] * u), _NAME)
+        self._improve = Rows(
+            lambda x, values: policy.cost.policy(
+                policy.model.effectiveness(x), policy.gradient_of(x, values)
+            ),
+            _NAME,
+        )
+
+    @property
+    def compiled(self) -> bool:
+        return self._roll.compiled and self._improve.compiled
+
+    def __call__(self, x: Tensor) -> Tensor:
+        (batch, dim), u = x.shape, self._directions.to(x)
+        count = len(u)
+        if batch == 1:
+            at = x.expand(count, dim)
+        else:
+            at = x.unsqueeze(1).expand(batch, count, dim).reshape(-1, dim)
+            u = u.expand(batch, count, dim).reshape(-1, dim)
+        return self._improve(x, self._roll(at, u).view(batch, count))
 
 
 def _ball(count: int | None, dim: int) -> Tensor:

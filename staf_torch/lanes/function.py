@@ -4,15 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from itertools import chain
-from typing import Any
+from operator import is_
+from typing import Any, Protocol
 
 from torch import Tensor, nn
 
 from .combinators import tracing_now
-from .plan import ordinary
+from .plan import Plan, ordinary
 from .program import Program
 
 _PAYS = 100  # calls of a small batch in plain torch (some 10 ms each) that take as long as to compile
+_KEPT = 64  # shapes of calls that are remembered
+
+
+class Served(Protocol):
+    """A function of rows, (B, n) -> (B, 1, m), that knows whether it is compiled."""
+
+    @property
+    def compiled(self) -> bool: ...
+
+    def __call__(self, x: Tensor, /) -> Tensor: ...
 
 
 class RowFunction:
@@ -26,14 +37,21 @@ class RowFunction:
         function: plain torch, of one row or many.
         module: that holds all that ``function`` reads.
         name: in the log.
+        compile: makes what serves (B, n) -> (B, 1, m) in its place; one program of ``function`` by default.
     """
 
-    def __init__(self, function: Callable[[Tensor], Tensor], module: nn.Module, name: str) -> None:
+    def __init__(
+        self,
+        function: Callable[[Tensor], Tensor],
+        module: nn.Module,
+        name: str,
+        compile: Callable[[], Served] | None = None,
+    ) -> None:
         self._function, self._module, self._name = function, module, name
+        self._compile = self._one_program if compile is None else compile
         self._asked = 0.0
-        self._program: Program | None = None
+        self._served: Served | None = None
         self._seen: list[Any] = []
-        self._signature: list[int] = []
         self._settings: list[dict[str, Any]] = []
         self._tensors: list[Tensor] = []
         self._versions: list[int] = []
@@ -42,21 +60,31 @@ class RowFunction:
         """y: (..., n) -> (..., m)."""
         if not ordinary((x,)) or x.numel() == 0 or tracing_now():
             return self._function(x)
-        flat = x if x.dim() == 2 else x.reshape(-1, x.shape[-1])
+        dims = x.dim()
+        flat = x if dims == 2 else x.unsqueeze(0) if dims == 1 else x.reshape(-1, x.shape[-1])
         if self._asked < _PAYS:
             self._asked += 1 + len(flat) / 200
             return self._function(x)
-        if self._program is None or self._changed():
+        if self._served is None or self._changed():
             self._remember()
-            self._program = Program(
-                lambda carry, now, row: (carry, self._function(row)), name=self._name, copies=1
-            )
-        y: Tensor = self._program((), (), flat, steps=1)[1][:, 0]
-        return y if x.dim() == 2 else y.reshape(*x.shape[:-1], y.shape[-1])
+            self._served = self._compile()
+        y = self._served(flat)
+        return y.view(-1) if dims == 1 else y.reshape(*x.shape[:-1], y.shape[-1])
+
+    @property
+    def compiled(self) -> bool:
+        """Whether a compiled program has served a call."""
+        return self._served is not None and self._served.compiled
+
+    def _one_program(self) -> Served:
+        return Rows(self._function, self._name)
 
     def _changed(self) -> bool:
-        now = list(map(id, chain.from_iterable(map(dict.values, self._settings))))
-        return not self._settings or now != self._signature or self._versions != self._version_list()
+        settings = self._settings
+        if not settings or sum(map(len, settings)) != len(self._seen):
+            return True
+        now = chain.from_iterable(map(dict.values, settings))
+        return not all(map(is_, now, self._seen)) or self._versions != self._version_list()
 
     def _version_list(self) -> list[int]:
         return [tensor._version for tensor in self._tensors]
@@ -70,6 +98,38 @@ class RowFunction:
         ]
         self._settings = [*near, *(part for part in parts if part)]
         self._seen = list(chain.from_iterable(map(dict.values, self._settings)))  # no address is used twice
-        self._signature = list(map(id, self._seen))
         self._tensors = [part for part in self._seen if isinstance(part, Tensor)]
         self._versions = self._version_list()
+
+
+class Rows:
+    """y = function(a, b, ...), (B, ...) to (B, ...), where nobody traces or differentiates.
+
+    Args:
+        function: plain torch, in which no row sees another.
+        name: in the log.
+    """
+
+    def __init__(self, function: Callable[..., Tensor], name: str) -> None:
+        self._program = Program(lambda carry, _, row: (carry, function(*row)), name=name, copies=1)
+        self._plans: dict[Any, Plan] = {}
+
+    @property
+    def compiled(self) -> bool:
+        """Whether a compiled program has served a call."""
+        return bool(self._plans)
+
+    def __call__(self, *given: Tensor) -> Tensor:
+        """Return y with a dimension of one time after the rows, (B, 1, ...)."""
+        # Shapes alone: the caller has looked at the rest.
+        key = tuple([(x.shape, x.stride(), x.dtype) for x in given])
+        plan = self._plans.get(key)
+        if plan is not None:
+            return plan(given)[0]
+        prepared = self._program.prepare((), (), given, steps=1)
+        found: Tensor = prepared((), (), given)[1]
+        if prepared.plan is not None:
+            if len(self._plans) >= _KEPT:
+                self._plans.clear()
+            self._plans[key] = prepared.plan
+        return found

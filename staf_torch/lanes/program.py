@@ -242,6 +242,9 @@ class Prepared:
     """A call of a program for inputs of fixed shapes, strides and dtypes; `Program.prepare` makes one.
 
     Called as the program is, without ``steps`` and ``every``. Inputs of other forms go to the program.
+
+    Attributes:
+        plan: of the compiled call, once there was one; None before, and where the definition runs.
     """
 
     def __init__(self, program: Program, given: Given, every: int) -> None:
@@ -249,7 +252,7 @@ class Prepared:
         leaves, self._structure = flatten(given.trees())
         self._forms = tuple(map(form, leaves))
         self._carries, self._carry = len(given.carry), given.structures["carry"]
-        self._plan: Plan | None = None
+        self.plan: Plan | None = None
         self._refused = given.rows == 0 or given.times == 0
 
     def __call__(self, carry: Tree, now: Tree = (), row: Tree = ()) -> tuple[Tree, Tree]:
@@ -268,16 +271,16 @@ class Prepared:
         """
         if self._refused or not ordinary(leaves):
             return self._program.definition(carry, now, row, steps=self._steps, every=self._every)
-        if self._plan is None:
+        if self.plan is None:
             given = Given.of(carry, now, row, self._steps)
             compiled = self._program.find(given)
             if compiled is None:
                 self._refused = True
                 return self.run(leaves, carry, now, row)
             times = [False] * len(given.row) + [True] * len(given.now) + [False] * len(given.carry)
-            self._plan = Plan(compiled, leaves, times, rows=given.rows, steps=given.times, every=self._every)
-        rooms = iter(self._plan(leaves))
-        return unflatten(self._carry, rooms), unflatten(self._plan.structure, rooms)
+            self.plan = Plan(compiled, leaves, times, rows=given.rows, steps=given.times, every=self._every)
+        rooms = iter(self.plan(leaves))
+        return unflatten(self._carry, rooms), unflatten(self.plan.structure, rooms)
 
 
 class Given(NamedTuple):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import dataclasses
 import html
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, overload
 
@@ -82,8 +82,10 @@ class Run(reader.Run):
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
-class Runs(Sequence[Run]):
+class Runs:
     """The runs of a sweep, in order.
+
+    No `Sequence` by name: polars would take one for rows, and not ask for the Arrow stream.
 
     Example:
         >>> found = sweep("kernel=gaussian,matern", "centers.radius=0.1,0.2", "duration=6.0", "figures=false")
@@ -107,6 +109,10 @@ class Runs(Sequence[Run]):
         if isinstance(index, slice):
             return self._with(self.found.rows[index])
         return Run.of(self.found.rows[index], self.draw)
+
+    def __iter__(self) -> Iterator[Run]:
+        """Yield the runs."""
+        return (self[i] for i in range(len(self)))
 
     def __len__(self) -> int:
         """Return the number of runs."""

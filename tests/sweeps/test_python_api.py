@@ -191,6 +191,8 @@ def test_a_data_frame_over_kernel_radius_and_count_in_three_lines() -> None:
     assert list(whole["ball_error"]) == [run.metrics["ball_error"] for run in runs]
     pytest.importorskip("pyarrow")
     assert runs.__arrow_c_stream__() is not None
+    polars = pytest.importorskip("polars")
+    assert polars.DataFrame(runs)["ball_error"].to_list() == list(whole["ball_error"])
 
 
 def test_a_pivot_has_no_number_where_a_run_has_none() -> None:
