@@ -51,8 +51,7 @@ def learn_global_value(
 ) -> GlobalValue:
     """Fill a memory with optimal trajectories until it knows the box goal +- region.
 
-    1. Trajectories from uniform states, optimised from the goal's linear feedback, from no control and from
-       two random ones.
+    1. Trajectories from uniform states, optimised from no control and from two random ones.
     2. A sweep: each is optimised again from the plans that the memory finds for it in the others, followed
        by their feedback, also after holding a corner of the bounds for a while; the better one is kept.
     3. Rounds: at fresh states the memory's own cost is compared with what such a sweep finds, and where the
@@ -144,20 +143,18 @@ def best_from(memory: GlobalValue, search: BoxDDP, x: Tensor, own: Tensor | None
 
 
 def _first(search: BoxDDP, x: Tensor, generator: torch.Generator) -> Trajectories:
-    """Optimised from the goal's linear feedback, the control at rest, and two that jump between the bounds."""
+    """Optimised from the control at rest, and from two that jump between the bounds."""
     problem, steps = search.problem, search.steps
     levels, shape = problem.levels(), (2 * len(x), -(-steps // _HELD))
     random = levels[torch.randint(len(levels), shape, generator=generator)].repeat_interleave(_HELD, 1)
     still = problem.rest.expand(len(x), steps, -1)
-    tried = search.solve(x), search.solve(x.repeat(3, 1), torch.cat((still, random[:, :steps])))
-    found = Trajectories(*(torch.cat(parts) for parts in zip(*tried, strict=True)))
-    best = found.cost.unflatten(0, (4, -1)).argmin(0)
+    found = search.solve(x.repeat(3, 1), torch.cat((still, random[:, :steps])))
+    best = found.cost.unflatten(0, (3, -1)).argmin(0)
     return found.rows(best * len(x) + torch.arange(len(x)))
 
 
 def _guesses(memory: GlobalValue, steps: int, x: Tensor, own: Tensor | None) -> Guesses:
-    """The cheapest plans, `_BEST` a state, followed at once or after a control was held for a while; and the
-    linear feedback of the goal, which reaches minima that no plan nearby knows."""
+    """The cheapest plans, `_BEST` a state: followed at once, or after a control was held for a while."""
     problem = memory.problem
     entries = memory.nearest(x, own)
     cost, _, _ = memory.follow(x, entries)
@@ -175,8 +172,7 @@ def _guesses(memory: GlobalValue, steps: int, x: Tensor, own: Tensor | None) -> 
                 paid = paid + now
             then = memory.choose(after, own)
             plans.append((paid + then.value, length, u, then.entry, after))
-    plans.append((torch.full_like(x[:, 0], -torch.inf), 0, problem.rest, entries[:, -1], x))
-    chosen = torch.stack([plan[0] for plan in plans], dim=1).topk(count + 1, 1, largest=False).indices
+    chosen = torch.stack([plan[0] for plan in plans], dim=1).topk(count, 1, largest=False).indices
     parts = []
     for k, (_, length, u, entry, after) in enumerate(plans):
         rows = (chosen == k).any(1).nonzero().squeeze(1)
