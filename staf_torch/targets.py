@@ -3,31 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from .numerics.checks import fail, number, real, vector
 
-__all__ = ["Cosine", "Formula", "Paper", "Quadratic"]
-
-
-class Formula(NamedTuple):
-    """V once more, for the compiled chase: what a target's `formula(dim)` returns beside its `forward`.
-
-    A module with this method, of the library or of yours, is evaluated within the fused recursion and not
-    by torch, several times faster; None stands for a dimension that it has no formula for.
-
-    Example:
-        >>> targets.Formula("x[0] * x[0]").expression
-        'x[0] * x[0]'
-
-        Shown by `tests/benchmarks/README.md`.
-    """
-
-    expression: str  # in C++: coordinates x[0].. and parameters p[0].., with + - * /, exp, tanh and cos
-    parameters: tuple[float, ...] = ()
+__all__ = ["Cosine", "Paper", "Quadratic"]
 
 
 class Paper(nn.Module):
@@ -47,11 +29,6 @@ class Paper(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         x1, x2 = x.unbind(-1)
         return x1.square() + 5 * x2.square() + (x1 * x2).tanh()
-
-    def formula(self, dim: int) -> Formula | None:
-        if dim != 2:
-            return None
-        return Formula("x[0] * x[0] + 5 * (x[1] * x[1]) + tanh(x[0] * x[1])")
 
 
 class Quadratic(nn.Module):
@@ -86,15 +63,6 @@ class Quadratic(nn.Module):
             return self.matrix.to(x) * x.square().sum(-1)
         return ((x @ self.matrix.to(x)) * x).sum(-1)
 
-    def formula(self, dim: int) -> Formula | None:
-        matrix, axes = self.matrix.flatten().tolist(), range(dim)
-        if self.matrix.dim() == 0:
-            return Formula("p[0] * (" + " + ".join(f"x[{i}] * x[{i}]" for i in axes) + ")", tuple(matrix))
-        if self.matrix.shape[0] != dim:
-            return None
-        rows = [" + ".join(f"p[{i * dim + j}] * x[{j}]" for j in axes) for i in axes]
-        return Formula(" + ".join(f"x[{i}] * ({row})" for i, row in enumerate(rows)), tuple(matrix))
-
 
 class Cosine(nn.Module):
     """V(x) = cos(a'x + phase).
@@ -121,16 +89,13 @@ class Cosine(nn.Module):
             a = torch.tensor(real("Cosine", "frequency", frequency), dtype=torch.float64)
         self.register_buffer("frequency", a)
         self.frequency: Tensor
-        self.phase = real("Cosine", "phase", phase)
+        # A tensor, so that a compiled program serves every phase; frequency alone is in a state_dict.
+        number = torch.tensor(real("Cosine", "phase", phase), dtype=torch.float64)
+        self.register_buffer("phase", number, persistent=False)
+        self.phase: Tensor
 
     def forward(self, x: Tensor) -> Tensor:
-        return ((x * self.frequency.to(x)).sum(-1) + self.phase).cos()
-
-    def formula(self, dim: int) -> Formula | None:
-        if self.frequency.dim() > 0 and self.frequency.shape[0] != dim:
-            return None
-        phase = " + ".join(f"p[{i}] * x[{i}]" for i in range(dim))
-        return Formula(f"cos({phase} + p[{dim}])", (*self.frequency.expand(dim).tolist(), self.phase))
+        return ((x * self.frequency.to(x)).sum(-1) + self.phase.to(x)).cos()
 
 
 def _square(rows: Sequence[Sequence[float]]) -> Tensor:

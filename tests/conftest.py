@@ -24,6 +24,13 @@ def _same_random_numbers_in_every_order() -> None:
 
 
 @pytest.fixture(autouse=True)
+def _chases_run_by_their_definition(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """But where a test is marked `compiled`: every chase of its own kind is a program to compile."""
+    if request.node.get_closest_marker("compiled") is None:
+        monkeypatch.setattr("staf_torch.engine.row_program._SHORTEST", 10**9)
+
+
+@pytest.fixture(autouse=True)
 def _no_trace_of_hydra(monkeypatch: pytest.MonkeyPatch) -> None:
     """`main` sets this variable for Hydra; no test may see it from another one."""
     monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)

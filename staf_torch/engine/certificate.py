@@ -10,7 +10,7 @@ from torch import Tensor
 from ..numerics.linalg import condition_number
 from ..optim.objective import NativeError
 from .problem import Problem
-from .recursion import Inputs, Link, Recursion
+from .recursion import Corrected, Link
 
 _ROUNDING = 1e3  # multiples of eps w'Kw by which a computed excess may miss
 
@@ -49,60 +49,67 @@ class Certificate(NamedTuple):
 
 
 def certify(
-    problem: Problem, inputs: Inputs, run: Recursion, ideal: Tensor, last: Link | None
+    problem: Problem, gram: Tensor, run: Corrected, ideal: Tensor, last: Link
 ) -> tuple[Certificate, Link]:
-    """Return the certificate of one chunk of time, and the link to the next.
+    """Return the certificate of some times, and what the times after them need to know.
 
     Args:
         problem: law and iterations.
-        inputs: e^{-g} K, V(c) and g, (B, C, ...).
-        run: weights before and after the correction, (B, C, M), in units of e^{-g}.
-        ideal: ideal weights, (B, C, M), in units of e^{-g}.
-        last: of the chunk before, None at the start.
+        gram: e^{-g} K, (..., M, M).
+        run: V(c), g and the weights before and after the correction, (..., M), in units of e^{-g}.
+        ideal: ideal weights, (..., M), in units of e^{-g}.
+        last: of the time before each, (..., M); `first_link` at the start.
     """
-    objective, log_gain = NativeError(inputs.gram, inputs.values), inputs.log_gain
-    before, after = run.before, run.after
-    gram, error = objective.gram, after - ideal
-    if last is None:
-        last = Link(gram[:, 0], log_gain[:, 0], torch.zeros_like(error[:, 0]))
-    grams = torch.cat((last.gram[:, None], gram), dim=1)
-    gains = torch.cat((last.log_gain[:, None], log_gain), dim=1)
-    errors = torch.cat((last.error[:, None], error), dim=1)
-    change = gains[:, 1:] - gains[:, :-1]
-    held = errors[:, :-1] * change.exp()[..., None]
-
-    def norm(vector: Tensor, at: Tensor, gain: Tensor) -> Tensor:
-        square = torch.linalg.vecdot(vector, NativeError(at, vector).curvature(vector))
-        length: Tensor = (square.clamp(min=0) * (-gain).exp()).sqrt()  # negative by rounding alone
-        return length
-
+    objective = NativeError(gram, run.values)
+    error = run.after - ideal
+    change = run.log_gain - last.log_gain
+    held = last.error * change.exp().unsqueeze(-1)
     rate = problem.law.contraction(condition_number(gram))
     rate = (
-        torch.full_like(log_gain, torch.nan)
+        torch.full_like(run.log_gain, torch.nan)
         if rate is None
-        else rate.expand(log_gain.shape) ** problem.inner_steps
+        else rate.expand(run.log_gain.shape) ** problem.inner_steps
     )
-    growth = _growth(grams) * (change / 2).exp()
-    drift = norm(before - ideal - held, gram, log_gain)
-    bound = rate.sqrt() * (growth * norm(errors, grams, gains)[:, :-1] + drift)
-    native = torch.linalg.vecdot(ideal, objective.values).abs()
-    excess, inverse_gain = objective.excess(after, ideal), (-log_gain).exp()
+    growth = _growth(last.gram, gram) * (change / 2).exp()
+    drift = _norm(run.before - ideal - held, gram, run.log_gain)
+    bound = rate.sqrt() * (growth * _norm(last.error, last.gram, last.log_gain) + drift)
+    native = torch.linalg.vecdot(ideal, run.values).abs()
+    excess, inverse_gain = objective.excess(run.after, ideal), (-run.log_gain).exp()
     rounding = _ROUNDING * torch.finfo(gram.dtype).eps * native
     violated = excess * inverse_gain > bound.square() * (1 + 1e-9) + rounding * inverse_gain
-    link = Link(gram[:, -1], log_gain[:, -1], error[:, -1])
-    return Certificate(rate, growth, drift, bound, violated), link
+    return Certificate(rate, growth, drift, bound, violated), Link(gram, run.log_gain, error)
 
 
-def _growth(grams: Tensor) -> Tensor:
-    """sqrt(lambda_max(K_{k-1}^-1 K_k)) of consecutive matrices: (B, 1 + C, M, M) -> (B, C).
+def first_link(gram: Tensor, log_gain: Tensor, error: Tensor) -> Link:
+    """Return what stands for the time before the first: its own matrix, and no error."""
+    return Link(gram, log_gain, torch.zeros_like(error))
 
-    As the largest singular value of L_{k-1}^-1 L_k: forming the product would square the condition.
+
+def before_each(link: Link, chunk: Link) -> Link:
+    """Return the links of the times before those of a chunk: (B, ...), (B, C, ...) -> (B, C, ...)."""
+    pairs = zip(link, chunk, strict=True)
+    return Link(*(torch.cat((last.unsqueeze(1), each[:, :-1]), dim=1) for last, each in pairs))
+
+
+def _norm(vector: Tensor, gram: Tensor, log_gain: Tensor) -> Tensor:
+    square = torch.linalg.vecdot(vector, NativeError(gram, vector).curvature(vector))
+    length: Tensor = (square.clamp(min=0) * (-log_gain).exp()).sqrt()  # negative by rounding alone
+    return length
+
+
+def _growth(before: Tensor, now: Tensor) -> Tensor:
+    """sqrt(lambda_max(K_{k-1}^-1 K_k)): (..., M, M), (..., M, M) -> (...).
+
+    By A = L_{k-1}^-1 L_k: forming K_{k-1}^-1 K_k would square the condition. The largest eigenvalue of A A'
+    is as accurate as the largest singular value of A.
     """
-    factor, failed = torch.linalg.cholesky_ex(grams)
-    fine = (failed == 0) & torch.isfinite(factor).all(-1).all(-1)
-    fine = fine[:, 1:] & fine[:, :-1]
-    identity = torch.eye(grams.shape[-1], dtype=grams.dtype, device=grams.device)
-    here = torch.where(fine[..., None, None], factor[:, 1:], identity)
-    there = torch.where(fine[..., None, None], factor[:, :-1], identity)
+    (there, failed), (here, failed_too) = torch.linalg.cholesky_ex(before), torch.linalg.cholesky_ex(now)
+    fine = (failed == 0) & (failed_too == 0)
+    for factor in (there, here):
+        fine = fine & torch.isfinite(factor).all(-1).all(-1)
+    identity = torch.eye(now.shape[-1], dtype=now.dtype, device=now.device)
+    here = torch.where(fine[..., None, None], here, identity)
+    there = torch.where(fine[..., None, None], there, identity)
     ratio = torch.linalg.solve_triangular(there, here, upper=False)
-    return torch.where(fine, torch.linalg.svdvals(ratio)[..., 0], torch.nan)
+    largest = torch.linalg.eigvalsh(ratio @ ratio.mT)[..., -1]
+    return torch.where(fine, largest.sqrt(), torch.nan)

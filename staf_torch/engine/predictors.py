@@ -45,7 +45,9 @@ class Predictor(abc.ABC):
         """The predictor as in a sentence, from the name of its class."""
         return type(self).__name__.lower()
 
-    def prepare(self, basis: StaFBasis, target: Target, states: Tensor, start: int) -> PredictorInputs:
+    def prepare(
+        self, basis: StaFBasis, target: Target, states: Tensor, start: int | Tensor
+    ) -> PredictorInputs:
         """What `predict` needs at the C arrivals of a chunk of time, in bulk.
 
         Args:
@@ -53,7 +55,7 @@ class Predictor(abc.ABC):
             target: V.
             states: the two before the chunk, then the chunk, (B, 2 + C, n); what lies before the first
                 time of all repeats it.
-            start: the index of the first arrival.
+            start: the index of the first arrival; (B,) within a row program, where it is not known before.
         """
         return ()
 
@@ -157,13 +159,16 @@ class Tangent(Predictor):
     def title(self) -> str:
         return f"tangent order {self.order}"
 
-    def prepare(self, basis: StaFBasis, target: Target, states: Tensor, start: int) -> PredictorInputs:
+    def prepare(
+        self, basis: StaFBasis, target: Target, states: Tensor, start: int | Tensor
+    ) -> PredictorInputs:
         before, x, after = states[:, :-2], states[:, 1:-1], states[:, 2:]
         if self.order == 2:
             advance, relax = _tangent(basis, target, (x + after) / 2, after - x)
             return advance - _apply(relax, advance) / 2, relax - relax @ relax / 2
-        first = torch.arange(start, start + x.shape[1], device=x.device) == 1
-        return _tangent(basis, target, x, torch.where(first[:, None], after - x, (after - before) / 2))
+        start = start if isinstance(start, int) else start.unsqueeze(-1)
+        first = (torch.arange(x.shape[1], device=x.device) + start) == 1
+        return _tangent(basis, target, x, torch.where(first.unsqueeze(-1), after - x, (after - before) / 2))
 
     def predict(self, inputs: PredictorInputs, weights: Tensor, previous: Tensor, unit: Tensor) -> Tensor:
         advance, relax = inputs
@@ -174,8 +179,8 @@ def _tangent(basis: StaFBasis, target: Target, x: Tensor, dx: Tensor) -> tuple[T
     """K^-1 dV(c) and K^-1 dK at the states x along dx, with e^{-g} K for K: (B, C, M), (B, C, M, M)."""
     rates = gram_rates(basis, target, x, dx)
     space = basis.local(x)
-    columns = [space.scaled_weights(space.fit(column)) for column in rates.gram_rate.unbind(-1)]
-    return space.scaled_weights(space.fit(rates.values_rate)), torch.stack(columns, dim=-1)
+    columns = space.scaled_weights(space.fit(rates.gram_rate.movedim(-1, 0)))  # (M, ..., M), each a fit
+    return space.scaled_weights(space.fit(rates.values_rate)), columns.movedim(0, -1)
 
 
 def _apply(matrix: Tensor, vector: Tensor) -> Tensor:

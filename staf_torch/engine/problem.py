@@ -8,9 +8,12 @@ import torch
 from torch import Tensor
 
 from ..approximation.basis import StaFBasis, Target
-from ..numerics.checks import fail, integer, trailing
+from ..lanes import each
+from ..numerics.checks import fail, integer, sampled, trailing
 from ..optim.base import UpdateLaw
 from .predictors import Predictor
+
+_TOGETHER = 10  # centers at which V is written out one by one
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,6 +55,17 @@ class Problem:
             raise ValueError(
                 f"`{self.call}(states=...)` must have the shape (B, T, n); got {tuple(states.shape)}."
             )
+
+    def values(self, x: Tensor) -> Tensor:
+        """Return V(c(x)) at the states x (..., n): (..., M)."""
+        basis, target = self.basis, self.target
+        if basis.count <= _TOGETHER:
+            return basis.values(x, target)
+        # Many centers: a compiled program goes through them some at a time, and its text is short.
+        centers = basis.centers(x)
+        return each(
+            lambda at: sampled(target, target(at), at), centers, dim=x.dim() - 1, together=_TOGETHER // 2
+        )
 
     def first_weights(self, states: Tensor, weights: Tensor | None) -> Tensor:
         """Return e^g w before the first correction, (B, M), in units of the first state.

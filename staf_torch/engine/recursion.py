@@ -1,23 +1,29 @@
 """The sequential part of a gradient chase as a row program, in plain torch: the definition.
 
 Inputs per time are in `Inputs`, the state is `Carry`, one step is `predict` of the predictor, then `begin`
-and ``inner_steps`` times `step` of the law. All are pure functions of rows; `compiled` computes the same.
+and ``inner_steps`` iterations of the law. All are pure functions of rows; `row_program` computes the same.
 """
 
 from __future__ import annotations
 
-from collections.abc import Set
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from ..approximation.basis import GramStructure, StaFBasis
-from ..local_basis import LocalSpace
+from ..approximation.basis import GramStructure
 from ..optim.base import LawState
-from ..optim.objective import NativeError, Precomputed, extremes
+from ..optim.objective import NativeError, Objective, Precomputed
 from .predictors import PredictorInputs
 from .problem import Problem
+
+
+class Moment(NamedTuple):
+    """What the recursion reads at one time beside the objective."""
+
+    log_gain: Tensor  # g(x), (B,)
+    usable: Tensor  # (B,) bool: whether V(c) and K are finite
+    prediction: PredictorInputs = ()  # what the predictor prepared, (B, ...)
 
 
 class Inputs(NamedTuple):
@@ -26,6 +32,7 @@ class Inputs(NamedTuple):
     gram: Tensor  # e^{-g} K(c(x_k)), (B, C, M, M)
     values: Tensor  # V(c(x_k)), (B, C, M)
     log_gain: Tensor  # g(x_k), (B, C)
+    usable: Tensor  # (B, C) bool
     precomputed: Precomputed = Precomputed()  # what the law needs to know of the objectives, (B, C, ...)
     prediction: PredictorInputs = ()  # what the predictor prepared, (B, C, ...)
 
@@ -33,15 +40,24 @@ class Inputs(NamedTuple):
     def of(cls, structure: GramStructure, values: Tensor) -> Inputs:
         """Return the matrices of a Gram structure (B, C), every time its own, with V(c) (B, C, M)."""
         gram, gain = structure.scaled().expand(*values.shape, values.shape[-1]), structure.log_gain
-        return cls(gram, values, values.new_zeros(values.shape[:2]) if gain is None else gain)
+        usable = torch.isfinite(values).all(-1) & torch.isfinite(gram).all(-1).all(-1)
+        return cls(gram, values, values.new_zeros(values.shape[:-1]) if gain is None else gain, usable)
+
+    def objective(self, k: int) -> NativeError:
+        """Return F at time k of the chunk."""
+        return NativeError(self.gram[:, k], self.values[:, k], self.precomputed.at(k))
+
+    def at(self, k: int) -> Moment:
+        """Return what else is known of time k of the chunk."""
+        return Moment(self.log_gain[:, k], self.usable[:, k], tuple(part[:, k] for part in self.prediction))
 
 
 class Link(NamedTuple):
-    """The last time of a chunk, which the certificate of the next one continues from."""
+    """What the certificate must know of the time before."""
 
-    gram: Tensor  # (B, M, M) e^{-g} K
-    log_gain: Tensor  # (B,) g
-    error: Tensor  # (B, M) a - w after the correction, in units of e^{-g}
+    gram: Tensor  # (..., M, M) e^{-g} K
+    log_gain: Tensor  # (...) g
+    error: Tensor  # (..., M) a - w after the correction, in units of e^{-g}
 
 
 class Carry(NamedTuple):
@@ -50,11 +66,20 @@ class Carry(NamedTuple):
     weights: Tensor  # (B, M)
     law_state: LawState
     log_gain: Tensor  # (B,) g(x) of the last time
-    time: int  # index of the next time
+    time: int | Tensor  # index of the next time; (B,) within a row program
     diverged_at: Tensor  # (B,) int64, -1 while finite
     previous: Tensor | None = None  # (B, M) corrected weights of the time before the last; None: no predictor
     states: Tensor | None = None  # (B, 2, n) the last two states; None: no predictor
     link: Link | None = None  # None: no certificate, or the start
+
+
+class Corrected(NamedTuple):
+    """The weights of some times, in units of e^{-log_gain} of each, and what they were corrected for."""
+
+    before: Tensor  # (..., M) as brought to x_k
+    after: Tensor  # (..., M) as corrected at x_k
+    values: Tensor  # V(c(x_k)), (..., M)
+    log_gain: Tensor  # g(x_k), (...)
 
 
 class Recursion(NamedTuple):
@@ -85,45 +110,63 @@ def recursion(problem: Problem, inputs: Inputs, carry: Carry) -> Recursion:
         inputs: of the times of this chunk.
         carry: from the chunk before.
     """
-    law, predictor = problem.law, problem.predictor
-    gram, values, log_gain = inputs[:3]
-    weights, state, last_gain, first, diverged_at, previous = carry[:6]
-    usable = torch.isfinite(values).all(-1) & torch.isfinite(gram).all(-1).all(-1)
     before, after = [], []
-    for k in range(values.shape[1]):
-        unit = (log_gain[:, k] - last_gain).exp().unsqueeze(-1)
-        brought, brought_state = weights * unit, law.rescale(state, unit)
-        objective = NativeError(gram[:, k], values[:, k], inputs.precomputed.at(k))
-        if predictor is not None and first + k > 0:
-            assert previous is not None
-            predicted = predictor.predict(
-                tuple(part[:, k] for part in inputs.prediction), weights, previous, unit
-            )
-            brought = _better(objective, predicted, brought) if predictor.guarded else predicted
-        new, new_state = brought, law.begin(objective, brought, brought_state)
-        for _ in range(problem.inner_steps):
-            new, new_state = law.step(objective, new, new_state)
-        # A row that is not finite stays behind, as it was; the rows beside it never see it.
-        finite = torch.isfinite(new).all(-1) & torch.isfinite(brought).all(-1)
-        fine = usable[:, k] & finite & (diverged_at < 0)
-        diverged_at = torch.where(fine | (diverged_at >= 0), diverged_at, first + k)
-        keep = fine.unsqueeze(-1)
-        before.append(torch.where(keep, brought, weights))
-        if previous is not None:
-            previous = torch.where(keep, (weights if first + k > 0 else new) * unit, previous)
-        weights = torch.where(keep, new, weights)
-        after.append(weights)
-        state = tuple(
-            torch.where(fine.view(-1, *[1] * (part.dim() - 1)), part, old)
-            for part, old in zip(new_state, state, strict=True)
-        )
-        last_gain = torch.where(fine, log_gain[:, k], last_gain)
-    time = first + values.shape[1]
-    carry = Carry(weights, state, last_gain, time, diverged_at, previous, carry.states, carry.link)
+    for k in range(inputs.values.shape[1]):
+        held, carry = correct(problem, inputs.objective(k), inputs.at(k), carry)
+        before.append(held)
+        after.append(carry.weights)
     return Recursion(torch.stack(before, dim=1), torch.stack(after, dim=1), carry)
 
 
-def _better(objective: NativeError, predicted: Tensor, held: Tensor) -> Tensor:
+def correct(problem: Problem, objective: Objective, at: Moment, carry: Carry) -> tuple[Tensor, Carry]:
+    """Return the weights as brought to one time, (B, M), and the carry after their correction there.
+
+    Args:
+        problem: law, iterations and predictor.
+        objective: F at that time.
+        at: what else is known of that time.
+        carry: from the time before.
+    """
+    law, weights, previous, time = problem.law, carry.weights, carry.previous, carry.time
+    unit = (at.log_gain - carry.log_gain).exp().unsqueeze(-1)
+    brought, state = weights * unit, law.rescale(carry.law_state, unit)
+    new = brought
+    if problem.predictor is not None and previous is not None:
+        new = problem.predictor.predict(at.prediction, weights, previous, unit)
+        new = _better(objective, new, brought) if problem.predictor.guarded else new
+        new = brought = _chosen(time, new, brought)
+    new_state = law.begin(objective, brought, state)
+    new, new_state = law.iterate(objective, new, new_state, problem.inner_steps)
+    # A row that is not finite stays behind, as it was; the rows beside it never see it.
+    finite = all_finite(new) & all_finite(brought)
+    fine = at.usable & finite & (carry.diverged_at < 0)
+    keep = fine.unsqueeze(-1)
+    if previous is not None:
+        previous = torch.where(keep, _chosen(time, weights, new) * unit, previous)
+    states = zip(new_state, carry.law_state, strict=True)
+    return torch.where(keep, brought, weights), carry._replace(
+        weights=torch.where(keep, new, weights),
+        law_state=tuple(torch.where(fine.view(-1, *[1] * (n.dim() - 1)), n, old) for n, old in states),
+        log_gain=torch.where(fine, at.log_gain, carry.log_gain),
+        time=time + 1,
+        diverged_at=torch.where(fine | (carry.diverged_at >= 0), carry.diverged_at, time),
+        previous=previous,
+    )
+
+
+def all_finite(vector: Tensor) -> Tensor:
+    """Return whether all entries are finite: (..., M) -> (...). 0 x is 0 then, and NaN else."""
+    return (vector * 0).sum(-1) == 0
+
+
+def _chosen(time: int | Tensor, later: Tensor, first: Tensor) -> Tensor:
+    """Return one (B, M) at the first time of all and the other from then on."""
+    if isinstance(time, int):
+        return later if time > 0 else first
+    return torch.where((time > 0).unsqueeze(-1), later, first)
+
+
+def _better(objective: Objective, predicted: Tensor, held: Tensor) -> Tensor:
     """Return the prediction, or the weights held in the rows where F(predicted) > F(held): (B, M).
 
     Their difference from the two slopes, exact for a quadratic: F itself would lose the digits of a
@@ -134,61 +177,24 @@ def _better(objective: NativeError, predicted: Tensor, held: Tensor) -> Tensor:
     return torch.where(worse.unsqueeze(-1), held, predicted)
 
 
-def precompute(
-    needs: Set[str], space: LocalSpace, gram: Tensor, ideal: Tensor, row: Tensor, sampled: Tensor
-) -> Precomputed:
-    """Return the fields of `Precomputed` that a law names in its `needs`, the others None.
-
-    Args:
-        needs: names of fields.
-        space: the local space at the states (B, C).
-        gram: e^{-g} K, (B, C, M, M).
-        ideal: its ideal weights, (B, C, M).
-        row: e^{-g} k(x, c_i), (B, C, M) or (M,) for all states.
-        sampled: V(x), (B, C).
-    """
-    if not needs:
-        return Precomputed()
-    return Precomputed(
-        extremes=extremes(gram) if "extremes" in needs else None,
-        ideal=ideal if "ideal" in needs else None,
-        inverse=_inverse(space, gram) if "inverse" in needs else None,
-        row=row.expand(ideal.shape) if "row" in needs else None,
-        sampled=sampled if "sampled" in needs else None,
-    )
-
-
-def state_row(basis: StaFBasis, x: Tensor, space: LocalSpace) -> Tensor:
-    """Return k0(0, d_i) at the states x (..., n), (..., M): e^{-g} k(x, c_i) but for the scale S."""
-    return basis.kernel.core(x, x.new_zeros(1, basis.dim), space.offsets).squeeze(-2)
-
-
-def _inverse(space: LocalSpace, gram: Tensor) -> Tensor:
-    """Return (e^{-g} K)^-1, (..., M, M): each column a fit to a unit vector of values."""
-    units = torch.eye(gram.shape[-1], dtype=gram.dtype, device=gram.device)
-    columns = [space.scaled_weights(space.fit(unit.expand(gram.shape[:-1]))) for unit in units]
-    return torch.stack(columns, dim=-1)
-
-
 def last_weights(carry: Carry) -> Tensor:
     """Return the paper's w where the recursion stands, (B, M)."""
     return carry.weights * (-carry.log_gain).exp().unsqueeze(-1)
 
 
-def paper_units(structure: GramStructure, carry: Carry, times: int) -> Tensor:
-    """Return e^{-g} of the last `times` times, (B, C, 1): a row that diverged keeps the last that it had.
+def kept_gain(log_gain: Tensor, carry: Carry) -> Tensor:
+    """Return g in whose units the weights of the last times stand, (B, C): of a row that diverged, its last.
 
     Args:
-        carry: after the chunk.
+        log_gain: of these times, (B, C).
+        carry: after them.
     """
-    gain = carry.log_gain.unsqueeze(-1)
-    if structure.log_gain is not None:
-        gain = torch.where(lost(carry, times), gain, structure.log_gain)
-    return (-gain).exp().unsqueeze(-1)
+    return torch.where(lost(carry, log_gain.shape[1]), carry.log_gain.unsqueeze(-1), log_gain)
 
 
 def lost(carry: Carry, times: int) -> Tensor:
     """Return which of the last `times` times a row did not reach, (B, C) bool."""
+    assert isinstance(carry.time, int)
     index = torch.arange(carry.time - times, carry.time, device=carry.diverged_at.device)
     end = carry.diverged_at.unsqueeze(-1)
     return (end >= 0) & (index >= end)

@@ -1,5 +1,6 @@
 // Tiles of rows through pieces of time. What a program must define before: the numbers of entries ROWS, NOWS,
-// CARRIES, FIXED, the slots SLOTS_*, COPIES of a vector that advance together, and `prepare` and `advance`.
+// AHEAD, CARRIES, FIXED, the slots SLOTS_*, COPIES of a vector that advance together, and `prepare`, `ahead`
+// and `advance`.
 
 #pragma once
 
@@ -14,7 +15,7 @@ struct Call {
 };
 
 constexpr int lanes = COPIES * W, tile_rows = TILE > lanes ? TILE : lanes, room = tile_rows + lanes;
-constexpr int now_bytes = 1 << 15, most_times = 256, most_kept = 1 << 22;
+constexpr int now_bytes = 1 << 15, most_times = 256, least_times = 8, most_kept = 1 << 22;
 
 struct Frame {
     REAL *fixed, *carry, *now;
@@ -25,6 +26,7 @@ struct Frame {
     int64_t first, time, every;
 };
 static void prepare(const Frame &f, int b);
+static void ahead(const Frame &f);
 static void advance(const Frame &f, int b, int rows);
 
 // One number a row; beyond the rows they come again.
@@ -75,11 +77,12 @@ struct Work {
     int64_t tile, next;
 
     void run() {
-        int most = now_bytes / int(sizeof(REAL)) / (tile * (NOWS > 0 ? NOWS : 1));
+        int most = now_bytes / int(sizeof(REAL)) / (tile * (NOWS + AHEAD > 0 ? NOWS + AHEAD : 1));
         most = most < 1 ? 1 : most < most_times ? most : most_times;
+        most = AHEAD > 0 && most < least_times ? least_times : most;
         most = most < call.times ? most : int(call.times);
         const int span = most * int(tile) + lanes;
-        const int64_t numbers = int64_t(ROWS + FIXED + CARRIES) * room + int64_t(NOWS) * span;
+        const int64_t numbers = int64_t(ROWS + FIXED + CARRIES) * room + int64_t(NOWS + AHEAD) * span;
         const Slot *now = call.slots + SLOTS_ROW, *carry = now + SLOTS_NOW, *out = carry + SLOTS_CARRY;
         REAL *const *now_data = data + SLOTS_ROW, *const *carry_data = now_data + SLOTS_NOW;
         REAL *const *out_data = carry_data + SLOTS_CARRY;
@@ -91,10 +94,11 @@ struct Work {
             f.first = first, f.rows = int(call.rows - first < tile ? call.rows - first : tile);
             gather(call.slots, data, SLOTS_ROW, first, f.rows, f.fixed);
             gather(carry, carry_data, SLOTS_CARRY, first, f.rows, f.carry);
-            for (int b = 0; b < f.rows; b += lanes) prepare(f, b);
+            for (int b = 0; b < (f.rows + lanes - 1) / lanes * lanes; b += W) prepare(f, b);
             for (f.time = 0; f.time < call.times; f.time += most) {
                 f.times = int(call.times - f.time < most ? call.times - f.time : most);
                 gather_times(now, now_data, SLOTS_NOW, f, f.now);
+                ahead(f);
                 for (int b = 0; b < f.rows; b += lanes) advance(f, b, f.rows - b < lanes ? f.rows - b : lanes);
             }
             const REAL *from = f.carry;

@@ -64,6 +64,7 @@ class Captured:
     def __init__(self) -> None:
         self._stated: dict[int, Any] = {}  # storages, kept: an address is used once
         self._derived: dict[int, Any] = {}
+        self._found: dict[int, Any] = {}
         self._places: dict[tuple[int, str], dict[int, int]] = {}
         self._operations: list[tuple[Any, Sequence[Any], dict[str, Any], Any]] = []
         self._reads: list[tuple[Tensor, np.ndarray[Any, Any]]] = []
@@ -74,17 +75,24 @@ class Captured:
 
     def stated(self, tensor: Tensor) -> bool:
         """Whether the numbers of a tensor are part of the text."""
-        if tensor.numel() == 0 or tensor._is_zerotensor():
+        if not _in_memory(tensor):
             return True
         address = tensor.untyped_storage().data_ptr()
         if address in self._stated:
             return True
         return address not in self._derived and not tensor.is_floating_point()
 
+    def from_outside(self, tensor: Tensor) -> bool:
+        """Whether a tensor was there before."""
+        if not _in_memory(tensor):
+            return False
+        address = tensor.untyped_storage().data_ptr()
+        return address not in self._stated and address not in self._derived
+
     def ran(self, function: Any, args: Sequence[Any], kwargs: dict[str, Any], out: Any) -> None:
         """Note an operation on tensors of which no row has its own."""
         name = function._schema.name.removeprefix("aten::")
-        given = [t for t in tensors((args, kwargs)) if t.numel()]
+        given = [t for t in tensors((args, kwargs)) if _in_memory(t)]
         stated = name in _OF_NO_VALUES or all(self.stated(t) for t in given)
         if not stated:
             if name == "_local_scalar_dense":
@@ -97,7 +105,7 @@ class Captured:
                 self._forget(tensor)
             self._repeats = self._repeats and stated
         for tensor in tensors(out):
-            if tensor.numel() and not tensor._is_zerotensor():
+            if _in_memory(tensor):
                 storage = tensor.untyped_storage()
                 known = storage.data_ptr() in self._stated or storage.data_ptr() in self._derived
                 if not stated:
@@ -124,7 +132,7 @@ class Captured:
             at += (np.arange(size) * stride).reshape([-1] + [1] * (tensor.dim() - axis - 1))
         start = int(tensor.storage_offset())
         places = self._places.setdefault((tensor.untyped_storage().data_ptr(), kind), {})
-        self._derived.setdefault(tensor.untyped_storage().data_ptr(), tensor.untyped_storage())
+        self._found.setdefault(tensor.untyped_storage().data_ptr(), tensor.untyped_storage())
         flat, fresh = at.reshape(-1).tolist(), []
         for index, place in enumerate(flat):
             if start + place not in places:
@@ -157,7 +165,7 @@ class Captured:
         return Recipe(_joined(self._values), operations, self._reads, numbers, self._checks)
 
     def _made_inside(self, tensor: Tensor) -> bool:
-        return tensor.numel() == 0 or tensor.untyped_storage().data_ptr() in self._stated
+        return not _in_memory(tensor) or tensor.untyped_storage().data_ptr() in self._stated
 
     def _forget(self, tensor: Tensor) -> None:
         """New numbers stand in this memory."""
@@ -184,6 +192,10 @@ def _read(tensor: Tensor, at: np.ndarray[Any, Any]) -> Tensor:
 
 def _joined(parts: Sequence[Tensor]) -> Tensor:
     return torch.cat(list(parts)) if parts else torch.zeros(0, dtype=torch.float64)
+
+
+def _in_memory(tensor: Tensor) -> bool:
+    return tensor.numel() > 0 and not tensor._is_zerotensor()  # forward mode has zeros without memory
 
 
 def _swapped(value: Any, known: Mapping[int, Tensor]) -> Any:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from .graph import STEP, Ids, Loop
-from .tracer import NotLoweredError, Tracer
+from .tracer import LARGE, NotLoweredError, Tracer
 from .tree import flatten, unflatten
 
 Tree = Any
@@ -217,15 +217,13 @@ def _loop(
     now = [_fed(tracer, leaf, dim, number, loop) for leaf in fed]
     inner = []
     for leaf in given:
-        initial = tracer.nodes(leaf).reshape(-1).tolist()
+        large = leaf.numel() > LARGE
+        entries = _whole(tracer, leaf) if large else tracer.nodes(leaf).reshape(-1).tolist()
         start = len(loop.initial)
-        loop.initial += initial
-        kind = tracer.kind(leaf.dtype)
-        nodes = [graph.add("carry", (), kind, (number, start + k), loop.depth) for k in range(len(initial))]
-        loop.carry += nodes
-        inner.append(
-            tracer.attach(leaf.detach().clone(), np.array(nodes, dtype=np.int64).reshape(leaf.shape))
-        )
+        loop.initial += entries
+        new = _numbers(tracer, "carry", (), (number, start), leaf, loop.depth)
+        loop.carry += [graph.args[new[0]][0]] if large else new
+        inner.append(tracer.attach(leaf.detach().clone(), np.array(new, dtype=np.int64).reshape(leaf.shape)))
     after, outputs = body(unflatten(structure, iter(inner)), unflatten(feed, iter(now)))
     tracer.inside -= 1
     ends, end_structure = flatten(after)
@@ -235,20 +233,50 @@ def _loop(
         raise NotLoweredError(
             "the body of a loop returns a carry of other shapes or dtypes than it was given"
         )
-    loop.following = [node for end in ends for node in tracer.nodes(end).reshape(-1).tolist()]
+    for end in ends:
+        large = end.numel() > LARGE
+        loop.following += _whole(tracer, end) if large else tracer.nodes(end).reshape(-1).tolist()
     out_leaves, out_structure = flatten(outputs)
     loop.collected = [tracer.nodes(leaf).reshape(-1).tolist() for leaf in out_leaves]
     _place(tracer, loop, number)
     results, done = [], 0
     for leaf in given:
-        kind, size = tracer.kind(leaf.dtype), leaf.numel()
-        nodes = [graph.add("result", (loop.node,), kind, (number, done + k)) for k in range(size)]
-        done += size
+        nodes = _numbers(tracer, "result", (loop.node,), (number, done), leaf)
+        done += 1 if leaf.numel() > LARGE else leaf.numel()
         results.append(
             tracer.attach(leaf.detach().clone(), np.array(nodes, dtype=np.int64).reshape(leaf.shape))
         )
     stacked = [_collected(tracer, leaf, dim, loop, number, k) for k, leaf in enumerate(out_leaves)]
     return unflatten(structure, iter(results)), unflatten(out_structure, iter(stacked))
+
+
+def _numbers(
+    tracer: Tracer,
+    op: str,
+    args: tuple[int, ...],
+    first: tuple[int, int],
+    leaf: Tensor,
+    depth: int | None = None,
+) -> list[int]:
+    """New nodes of what passes through a loop: one a number, or the entries of one array of many."""
+    graph, kind, size, (number, start) = tracer.graph, tracer.kind(leaf.dtype), leaf.numel(), first
+    if size > LARGE:
+        array = graph.add(f"{op}s", args, kind, (number, start, size), depth)
+        entries: list[int] = tracer.entries(array, kind, size).tolist()
+        return entries
+    return [graph.add(op, args, kind, (number, start + k), depth) for k in range(size)]
+
+
+def _whole(tracer: Tracer, leaf: Tensor) -> list[int]:
+    """An array that holds the entries of a tensor in their order, and nothing else."""
+    flat, kind = tracer.nodes(leaf).reshape(-1), tracer.kind(leaf.dtype)
+    array, places = tracer.array(flat, kind)
+    graph = tracer.graph
+    fits = graph.op[array] not in ("carrys", "results") and places.tolist() == list(range(len(flat)))
+    if fits and len(flat) == graph.size(array):
+        return [array]
+    chosen = tuple(places.tolist())
+    return [graph.add("map", (array,), kind, ("copy", (len(flat),), chosen))]
 
 
 def _fed(tracer: Tracer, leaf: Tensor, dim: int, number: int, loop: Loop) -> Tensor:

@@ -127,16 +127,26 @@ def eigen(gram: Tensor, UPLO: str = "L", compute_v: bool = True) -> tuple[Tensor
     units = torch.eye(size, dtype=gram.dtype, device=gram.device).expand_as(gram)
     passes = (size - 1) * (4 + count.bit_length())
     matrix, vectors = repeat(passes, rotate, (gram.clone(), units.clone()))
-    values = list(matrix.diagonal(dim1=-2, dim2=-1)[..., :count].unbind(-1))
-    columns = list(vectors[..., :count, :count].unbind(-2))
-    for end in range(count - 1, 0, -1):
-        for k in range(end):
-            wrong = values[k] > values[k + 1]
-            values[k], values[k + 1] = torch.minimum(*values[k : k + 2]), torch.maximum(*values[k : k + 2])
-            low, high = columns[k : k + 2]
-            swap = wrong.unsqueeze(-1)
-            columns[k : k + 2] = torch.where(swap, high, low), torch.where(swap, low, high)
-    return torch.stack(values, dim=-1), torch.stack(columns, dim=-1)
+    values = matrix.diagonal(dim1=-2, dim2=-1)[..., :count].clone()
+    columns = vectors[..., :count, :count].clone()  # row k is the eigenvector of value k
+    # Neighbours change places, the even pairs and the odd ones in turn, as often as there are values.
+    values, columns = repeat((count + 1) // 2, _exchange, (values, columns))
+    return values, columns.mT
+
+
+def _exchange(carry: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+    values, rows = carry
+    for start in (0, 1):
+        end = start + (values.shape[-1] - start) // 2 * 2
+        if end > start:
+            a, b = values[..., start:end:2], values[..., start + 1 : end : 2]
+            p, q = rows[..., start:end:2, :], rows[..., start + 1 : end : 2, :]
+            wrong = (a > b).unsqueeze(-1)
+            pairs = torch.stack((torch.minimum(a, b), torch.maximum(a, b)), dim=-1).flatten(-2)
+            moved = torch.stack((torch.where(wrong, q, p), torch.where(wrong, p, q)), dim=-2).flatten(-3, -2)
+            values = torch.cat((values[..., :start], pairs, values[..., end:]), dim=-1)
+            rows = torch.cat((rows[..., :start, :], moved, rows[..., end:, :]), dim=-2)
+    return values, rows
 
 
 def eigenvalues(gram: Tensor) -> Tensor:
@@ -201,9 +211,10 @@ def _tridiagonal(gram: Tensor) -> tuple[list[Tensor], list[Tensor]]:
 
 def _turn(matrix: Tensor, cosine: Tensor, sine: Tensor) -> Tensor:
     """Rotate the rows 2 k and 2 k + 1: (..., M, M), (..., M / 2)."""
-    p, q = matrix[..., 0::2, :], matrix[..., 1::2, :]
-    c, s = cosine.unsqueeze(-1), sine.unsqueeze(-1)
-    return torch.stack((c * p - s * q, s * p + c * q), dim=-2).flatten(-3, -2)
+    partner = [k ^ 1 for k in range(matrix.shape[-2])]
+    c = torch.stack((cosine, cosine), dim=-1).flatten(-2).unsqueeze(-1)
+    s = torch.stack((-sine, sine), dim=-1).flatten(-2).unsqueeze(-1)
+    return c * matrix + s * matrix[..., partner, :]
 
 
 class WithoutVectors(TorchFunctionMode):

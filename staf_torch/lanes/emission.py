@@ -9,14 +9,18 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from .graph import FLAG, REAL, ROW, STEP, WHOLE, Graph
+from .graph import FLAG, NOW, REAL, ROW, STEP, WHOLE, Graph
 from .schedule import Schedule
-from .statements import FIXED, Layout, Writer
+from .statements import Layout, Writer
 
 _FEW = 400  # nodes of a program of which two vectors fit the registers and caches side by side
+_COSTLY, _MEMORY = 20, 4  # operations that a function takes, and that a number written and read is worth
+_FUNCTIONS = frozenset(
+    ("exp", "expm1", "log", "log1p", "sin", "cos", "tan", "tanh", "atan2", "pow", "sqrt", "div")
+)
 _INFIX = {"add": "+", "sub": "-", "mul": "*", "div": "/", "lt": "<", "le": "<=", "eq": "==", "ne": "!="}
 _INFIX |= {"and": "&", "or": "|", "xor": "^"}
-_PREFIX = {"neg": "-", "not": "~", "cast": ""}
+_PREFIX = {"neg": "-", "not": "~", "cast": "", "copy": ""}
 
 
 class Text(NamedTuple):
@@ -47,20 +51,23 @@ def emit(
         outputs: nodes of what a step puts out.
         copies: vectors that advance side by side; 0 for as many as suit many rows.
     """
-    schedule = Schedule(graph, following, outputs)
-    writer = _Writer(graph, schedule, layout, copies or _copies(graph, schedule))
+    schedule = Schedule(graph, following, outputs, ahead=True)
+    if not _worth(graph, schedule):
+        schedule = Schedule(graph, following, outputs)
+    writer = _Writer(graph, schedule, layout, copies or _copies(schedule))
     return writer.write(following, outputs)
 
 
-def _copies(graph: Graph, schedule: Schedule) -> int:
+def _worth(graph: Graph, schedule: Schedule) -> bool:
+    """Whether to find ahead what times alone decide: it goes through memory."""
+    work = sum(_COSTLY if graph.op[n] in _FUNCTIONS else 1 for n in schedule.ahead if graph.op[n] != "now")
+    return work > _MEMORY * len(schedule.cut_ahead())
+
+
+def _copies(schedule: Schedule) -> int:
     """How many vectors advance side by side, so that the processor always has something to do."""
-    if any(graph.op[n] == "dot" and _fixed(graph, graph.args[n]) for n in schedule.live):
-        return 4  # every number of the matrix is read once for all of them
-    return 2 if len(schedule.live) < _FEW else 1
-
-
-def _fixed(graph: Graph, operands: Sequence[int]) -> bool:
-    return any(graph.op[n] == "pack" and graph.op[graph.args[n][0]] in FIXED for n in operands)
+    steps = schedule.live - schedule.ahead
+    return 2 if len(steps) < _FEW or any(schedule.shares_a_matrix(node) for node in steps) else 1
 
 
 class _Writer(Writer):
@@ -70,19 +77,20 @@ class _Writer(Writer):
         self.parameters: list[tuple[int, int]] = []
 
     def write(self, following: Sequence[int], outputs: Sequence[int]) -> Text:
-        rows, fixed, stored = sum(self.layout.rows), 0, dict[int, int]()
-        for node in self.schedule.cut():
-            if self._in_place(node) is not None:
-                continue
-            stored[node] = rows + fixed
-            fixed += self._size(node)
+        rows = sum(self.layout.rows)
+        stored, fixed = self._places("row", self.schedule.cut(), rows)
+        copies, self.copies = self.copies, 1
         prepare = self._function(lambda: self._prepare(stored))
         self._stored = stored
+        found, numbers = self._places("ahead", self.schedule.cut_ahead(), sum(self.layout.nows))
+        ahead = self._function(lambda: self._ahead(found))
+        self._stored, self.copies = stored | found, copies
         advance = self._function(lambda: self._advance(following, outputs))
         counts = {
             "ROWS": rows,
             "FIXED": fixed,
             "NOWS": sum(self.layout.nows),
+            "AHEAD": numbers,
             "CARRIES": sum(self.layout.carries),
             "SLOTS_ROW": len(self.layout.rows),
             "SLOTS_NOW": len(self.layout.nows),
@@ -96,21 +104,48 @@ class _Writer(Writer):
             '#include "_lanes.hpp"',
             f"constexpr int {', '.join(f'{k} = {v}' for k, v in counts.items())};",
         ]
-        source = [*head, '#include "_driver.hpp"', *prepare, *advance]
+        source = [*head, '#include "_driver.hpp"', *prepare, *ahead, *advance]
         return Text("\n".join(source) + "\n", self.table, self.parameters)
 
-    def _prepare(self, stored: dict[int, int]) -> None:
+    def _places(
+        self, buffer: str, nodes: Sequence[int], start: int
+    ) -> tuple[dict[int, tuple[str, int]], int]:
+        """Where nodes are kept in a buffer, and how many numbers they take."""
+        places, taken = dict[int, tuple[str, int]](), 0
+        for node in nodes:
+            if self._in_place(node) is None:
+                places[node] = buffer, start + taken
+                taken += self.graph.size(node)
+        return places, taken
+
+    def _ahead(self, stored: dict[int, tuple[str, int]]) -> None:
+        self._lines.append("static void ahead(const Frame &f) {")
+        self._line("const REAL *const c = f.c, *const fixed = f.fixed;")
+        self._line("(void)c, (void)fixed;")
+        self._line(f"for (int n = 0; n < {'f.times * f.rows' if stored else '0'}; n += W) {{")
+        self._level += 1
+        self._line("const REAL *const now = f.now + n;")
+        self._line("(void)now;")
+        self._block(self.schedule.block(NOW))
+        self._keep(stored, "f.now + n", "f.span")
+        self._level -= 1
+        self._line("}")
+        self._lines.append("}")
+
+    def _keep(self, stored: dict[int, tuple[str, int]], start: str, stride: str) -> None:
+        for node, (_, place) in stored.items():
+            for k in range(self.graph.size(node)):
+                for j in range(self.copies):
+                    value = self._read(node, str(k), j) if self._is_array(node) else self._ref(node, j)
+                    number = self._number(node, value)
+                    self._line(f"store({start} + {place + k} * {stride} + {j} * W, {number});")
+
+    def _prepare(self, stored: dict[int, tuple[str, int]]) -> None:
         self._lines.append("static void prepare(const Frame &f, int b) {")
         self._line("const REAL *const c = f.c, *const fixed = f.fixed + b;")
         self._line("(void)c, (void)fixed;")
         self._block(self.schedule.block(ROW))
-        for node, place in stored.items():
-            for k in range(self._size(node)):
-                for j in range(self.copies):
-                    value = self._read(node, str(k), j) if self._is_array(node) else self._ref(node, j)
-                    self._line(
-                        f"store(f.fixed + b + {place + k} * room + {j} * W, {self._number(node, value)});"
-                    )
+        self._keep(stored, "f.fixed + b", "room")
         self._lines.append("}")
 
     def _advance(self, following: Sequence[int], outputs: Sequence[int]) -> None:

@@ -15,6 +15,9 @@ Ids = np.ndarray[Any, np.dtype[np.int64]]
 REAL, WIDE, FLAG, WHOLE = "real", "wide", "flag", "whole"
 """Types of a node: the program's float, float64 within a program of float32, bool, integer."""
 
+FIXED = ("const", "param")
+"""Operations of nodes that are the same for all rows and times."""
+
 ROW, NOW, STEP = 0, 1, 2
 """Depths: what a row has once, what a time brings whatever the carry is, what depends on the carry.
 Loops inside a step are deeper."""
@@ -118,6 +121,15 @@ class Graph:
         return self.add(
             "const", (), type, (number, math.copysign(1.0, number)) if number == number else "nan"
         )
+
+    def size(self, node: int) -> int:
+        """The entries of an array, 1 for a number."""
+        op, aux = self.op[node], self.aux[node]
+        if op == "map":
+            return math.prod(aux[1])
+        if op in ("collect", "carrys", "results"):
+            return int(aux[2])
+        return int(aux if op == "pack" else aux[0]) if op in ("pack", "dot") else 1
 
     def parameter(self, number: int, type: str) -> int:
         """The node of a number that only the table of a program knows, so that no text depends on it."""

@@ -19,11 +19,12 @@ from .lowering import lower
 from .plan import Compiled, Plan, form, ordinary
 from .scalar_text import Names, c_text
 from .statements import Layout
-from .tracer import NotLoweredError, Tracer
+from .tracer import NoReading, NotLoweredError, Tracer
 from .tree import Shared, flatten, labels, plain, unflatten
 
 _log = logging.getLogger(__name__)
 _said: set[tuple[str, str]] = set()  # what has been logged
+_FEW = 8  # rows that one vector holds
 _PREPARED = 64  # calls of other shapes that a program remembers
 Step = Callable[[Tree, Tree, Tree], tuple[Tree, Tree]]
 
@@ -56,7 +57,7 @@ class Program:
         step: maps (carry, now, row), trees of tensors (B, ...), to the next carry and the outputs (B, ...).
         name: in the log.
         compile: whether to compile at all.
-        copies: vectors of rows that advance side by side: 1 where there will be few rows, 0 by the program.
+        copies: vectors of rows that advance side by side; 0 by the number of rows and the program.
     """
 
     def __init__(self, step: Step, *, name: str = "program", compile: bool = True, copies: int = 0) -> None:
@@ -187,9 +188,10 @@ class Program:
         """The compiled program for such inputs, None where there is none."""
         if not self.compile or not given.ordinary():
             return None
-        key = given.key()
+        copies = self.copies or int(given.rows <= _FEW)
+        key = given.key(), copies
         if key not in self._compiled:
-            self._compiled[key] = self._again(key) or self._build(given)
+            self._compiled[key] = self._again(key) or self._build(given, copies)
         built = self._compiled[key]
         return None if built is None else built.compiled
 
@@ -205,19 +207,19 @@ class Program:
         compiled = built.compiled._replace(table=built.text.numbers(numbers, built.compiled.real))
         return built._replace(compiled=compiled)
 
-    def _build(self, given: Given) -> _Built | None:
+    def _build(self, given: Given, copies: int) -> _Built | None:
         real = given.real
         try:
             try:
                 traced = trace(self.step, given)
-                text = emit(*traced.program, self.copies)
+                text = emit(*traced.program, copies)
             except NotLoweredError:
                 if real == torch.float64:
                     raise
                 # float64 within a program of float32: all of it in double, rounded where it ends.
                 real = torch.float64
                 traced = trace(self.step, given, widened=True)
-                text = emit(*traced.program, self.copies)
+                text = emit(*traced.program, copies)
             call = compiler.function(text.source)
         except (NotLoweredError, OSError) as error:
             reason = " ".join(str(error).split())[:400]
@@ -375,7 +377,7 @@ def trace(step: Step, given: Given, *, widened: bool = False, folded: bool = Fal
         row = given.tree("row", inputs("row", given.row, 0, 0))
         now = given.tree("now", inputs("now", given.now, NOW, 1))
         carry = inputs("state", given.carry, STEP, 0)
-        with tracer, tracing(tracer), WithoutVectors(tracer.traced):
+        with tracer, tracing(tracer), NoReading(tracer), WithoutVectors(tracer.traced):
             after, out = step(given.tree("carry", carry), now, row)
         ends, structure = flatten(after)
         if structure != given.structures["carry"] or [(e.shape, e.dtype) for e in ends] != [

@@ -14,7 +14,7 @@ from .statements import Layout, Writer
 
 _INFIX = {"add": "+", "sub": "-", "mul": "*", "div": "/", "lt": "<", "le": "<=", "eq": "==", "ne": "!="}
 _INFIX |= {"and": "&&", "or": "||", "xor": "!="}
-_PREFIX = {"neg": "-", "not": "!"}
+_PREFIX = {"neg": "-", "not": "!", "copy": ""}
 _NAMES = {"abs": "fabs", "round": "rint"}
 
 

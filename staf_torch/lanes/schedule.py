@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 
-from .graph import NOW, REAL, ROW, STEP, Graph
+from .graph import FIXED, NOW, REAL, ROW, STEP, Graph
 
 
 class Schedule:
@@ -15,15 +15,20 @@ class Schedule:
         graph: the nodes.
         following: the carry after a step.
         outputs: what a step puts out.
+        ahead: whether what times alone decide is found before the steps.
 
     Attributes:
         carries: the numbers of every loop's carry that something needs.
         live: the nodes that something needs.
         uses: how often a node is used.
+        ahead: the nodes that times alone decide, whatever the row and its carry: found for all times and rows
+            of a tile before the steps, their lanes being times and rows alike.
         fused: sums and differences with one product in them: the place (0 or 1) of the product.
     """
 
-    def __init__(self, graph: Graph, following: Sequence[int], outputs: Sequence[int]) -> None:
+    def __init__(
+        self, graph: Graph, following: Sequence[int], outputs: Sequence[int], *, ahead: bool = False
+    ) -> None:
         self._graph = graph
         self.carries: dict[int, set[int]] = {}
         self.uses: Counter[int] = Counter()
@@ -33,6 +38,7 @@ class Schedule:
         self._roots = [*following, *outputs]
         self._mark(self._roots)
         self._count(following, outputs)
+        self.ahead = self._find_ahead() if ahead else set()
         self.fused = self._fuse()
         absorbed = {graph.args[node][place] for node, place in self.fused.items()}
         self._blocks = self._divide(absorbed)
@@ -57,6 +63,37 @@ class Schedule:
         arrays = {graph.args[n][0] for n in read if graph.op[n] == "elem"}
         kept = (node for node in sorted((read | arrays) & self.live) if graph.depth[node] == ROW)
         return [node for node in kept if graph.op[node] not in ("const", "param", "row", "elem", "loop")]
+
+    def cut_ahead(self) -> list[int]:
+        """What times alone decide and the steps read."""
+        graph, read = self._graph, set(self._roots)
+        for node in self.live - self.ahead:
+            if graph.depth[node] != ROW:
+                read.update(self._arguments(node))
+        for number, loop in enumerate(graph.loops):
+            if loop.node in self.live and loop.node not in self.ahead and graph.depth[loop.node] != ROW:
+                read.update(self._ends(number))
+        arrays = {graph.args[n][0] for n in read if graph.op[n] == "elem"}
+        kept = (node for node in sorted((read | arrays) & self.ahead) if graph.depth[node] == NOW)
+        return [node for node in kept if graph.op[node] not in ("now", "elem", "loop")]
+
+    def _find_ahead(self) -> set[int]:
+        """Nodes without a row's own numbers in them: those of times, and the bodies of loops over these."""
+        graph, own = self._graph, set[int]()  # nodes with numbers of a row
+        for node in sorted(self.live):
+            if graph.op[node] in ("row", "state") or any(a in own for a in graph.args[node]):
+                own.add(node)
+        found = {n for n in self.live - own if graph.depth[n] == NOW}
+        for number, loop in enumerate(graph.loops):
+            if loop.node in found:
+                found |= self._body(number)
+        return found
+
+    def shares_a_matrix(self, node: int) -> bool:
+        """Whether a node is a product with a matrix that all rows share: each number is then read for all."""
+        graph = self._graph
+        packs = [a for a in graph.args[node] if graph.op[a] == "pack"] if graph.op[node] == "dot" else []
+        return any(graph.op[graph.args[pack][0]] in FIXED for pack in packs)
 
     def _once(self, node: int) -> bool:
         """Whether a node is found before the steps, be it inside a loop."""
@@ -86,8 +123,8 @@ class Schedule:
                 continue
             self.live.add(node)
             waiting += self._arguments(node)
-            if graph.op[node] in ("carry", "result"):
-                number, k = graph.aux[node]
+            if graph.op[node] in ("carry", "result", "carrys", "results"):
+                number, k = graph.aux[node][:2]
                 if k not in self.carries.setdefault(number, set()):
                     self.carries[number].add(k)
                     loop = graph.loops[number]
@@ -113,31 +150,35 @@ class Schedule:
             for place in (1, 0):
                 arg = graph.args[node][place]
                 alone = self.uses[arg] == 1 and graph.depth[arg] == graph.depth[node]
+                alone = alone and (arg in self.ahead) == (node in self.ahead)
                 if graph.op[arg] == "mul" and alone:
                     fused[node] = place
                     break
         return fused
 
+    def _body(self, number: int) -> set[int]:
+        """The nodes of a loop's passes, those of loops inside included."""
+        graph, loop = self._graph, self._graph.loops[number]
+        # A number that a pass leaves unread, and replaces, belongs to the loop all the same.
+        waiting = [*self._ends(number), *(loop.carry[k] for k in self.carries.get(number, ()))]
+        seen: set[int] = set()
+        while waiting:
+            node = waiting.pop()
+            if node in seen or graph.depth[node] < loop.depth:
+                continue
+            seen.add(node)
+            waiting += self._ends(graph.aux[node]) if graph.op[node] == "loop" else graph.args[node]
+        return seen
+
     def _divide(self, absorbed: set[int]) -> dict[tuple[int, int], list[int]]:
         graph = self._graph
         owner = self._owner
         for number, loop in enumerate(graph.loops):
-            # A number that a pass leaves unread, and replaces, belongs to the loop all the same.
-            waiting, seen = (
-                [*self._ends(number), *(loop.carry[k] for k in self.carries.get(number, ()))],
-                set(),
-            )
-            while waiting:
-                node = waiting.pop()
-                if node in seen or graph.depth[node] < loop.depth:
-                    continue
-                seen.add(node)
-                waiting += self._ends(graph.aux[node]) if graph.op[node] == "loop" else graph.args[node]
-                if graph.depth[node] == loop.depth:
-                    owner[node] = number
+            owner.update({node: number for node in self._body(number) if graph.depth[node] == loop.depth})
         blocks: dict[tuple[int, int], list[int]] = {}
         for node in sorted(self.live - absorbed):
             depth = graph.depth[node]
-            place = (owner[node], depth) if depth > STEP else (-1, STEP if depth == NOW else depth)
+            outside = STEP if depth == NOW and node not in self.ahead else depth
+            place = (owner[node], depth) if depth > STEP else (-1, outside)
             blocks.setdefault(place, []).append(node)
         return blocks

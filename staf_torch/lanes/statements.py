@@ -9,14 +9,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .graph import Graph
+from .graph import FIXED, Graph
 from .schedule import Schedule
 from .tracer import NotLoweredError
 
-_INPUTS = ("const", "param", "elem", "result", "collect", "carry", "state", "row", "now")
-_ARRAYS = ("pack", "map", "dot", "collect")
-FIXED = ("const", "param")
-"""Nodes that are the same for all rows and times."""
+_INPUTS = ("const", "param", "elem", "result", "results", "collect", "carry", "carrys", "state", "row", "now")
+_ARRAYS = ("pack", "map", "dot", "collect", "carrys", "results")
 
 
 class Layout(NamedTuple):
@@ -48,7 +46,7 @@ class Writer(abc.ABC):
         self._lines: list[str] = []
         self._arrays: set[str] = set()  # of constants, written already
         self._level = 1
-        self._stored: dict[int, int] = {}  # what the steps read from memory instead
+        self._stored: dict[int, tuple[str, int]] = {}  # what is read from a buffer instead, and its place
         self._starts = {
             "row": np.cumsum([0, *layout.rows]).tolist(),
             "now": np.cumsum([0, *layout.nows]).tolist(),
@@ -126,6 +124,12 @@ class Writer(abc.ABC):
 
     def _loop(self, number: int) -> None:
         loop, live = self.graph.loops[number], sorted(self.schedule.carries.get(number, ()))
+        arrays = [k for k in live if self._is_array(loop.carry[k])]
+        live = [k for k in live if k not in arrays]
+        for k in arrays:
+            size = self.graph.size(loop.carry[k]) * self.copies
+            self._line(f"{self._type(loop.carry[k])} l{number}_{k}[{size}];")
+            self._copy_array(f"l{number}_{k}", loop.initial[k])
         for k in live:
             kind = self._type(loop.carry[k])
             for j in range(self.copies):
@@ -143,8 +147,17 @@ class Writer(abc.ABC):
                     place = f"(i{number} * {size} + {e}) * {self.copies} + {j}"
                     self._line(f"y{number}_{k}[{place}] = {self._ref(node, j)};")
         self._assign([(f"l{number}_{k}", loop.following[k]) for k in live])
+        for k in arrays:
+            if loop.following[k] != loop.carry[k]:
+                self._copy_array(f"l{number}_{k}", loop.following[k])
         self._level -= 1
         self._line("}")
+
+    def _copy_array(self, name: str, array: int) -> None:
+        size = self.graph.size(array)
+        for j in range(self.copies):
+            target = self._sum(["p"], [self.copies], j)
+            self._line(f"for (int p = 0; p < {size}; ++p) {name}[{target}] = {self._read(array, 'p', j)};")
 
     def _pack(self, node: int) -> None:
         if self._in_place(node) is not None:
@@ -184,7 +197,8 @@ class Writer(abc.ABC):
         kind = self._type(node)
         self._declare(node)
         indices = [self._affine(place, [outs, count]) for place in places]
-        panel = min(outs, 4 if self.copies > 1 else 8)
+        widths = range(4, 1 + (6 if self.copies > 1 else 8))
+        panel = min(outs, min(reversed(widths), key=lambda width: -(-outs // width) * width))
         full = outs // panel
         for start, rows, passes in ((0, panel, full), (full * panel, outs % panel, 1)):
             if rows == 0 or passes == 0:
@@ -223,7 +237,7 @@ class Writer(abc.ABC):
         return values[0], values[1], f"{values[0]} * {values[1]}"
 
     def _declare(self, node: int) -> None:
-        self._line(f"{self._type(node)} a{node}[{self._size(node) * self.copies}];")
+        self._line(f"{self._type(node)} a{node}[{self.graph.size(node) * self.copies}];")
 
     def _affine(self, place: Any, sizes: Sequence[int]) -> tuple[list[int], int] | None:
         """Strides and start of places in an array, None where they are irregular."""
@@ -281,11 +295,11 @@ class Writer(abc.ABC):
             return f"s{self._starts[op][slot] + k}{copy}"
         if op in ("carry", "result"):
             if op == "result" and node in self._stored:
-                return self._typed(node, self._buffer("row", self._stored[node], j))
+                return self._typed(node, self._buffer(*self._stored[node], j))
             number, k = graph.aux[node]
             return f"l{number}_{k}{copy}"
         if node in self._stored:
-            return self._typed(node, self._buffer("row", self._stored[node], j))
+            return self._typed(node, self._buffer(*self._stored[node], j))
         return f"t{node}{copy}"
 
     def _read(self, array: int, at: str, j: int) -> str:
@@ -294,14 +308,14 @@ class Writer(abc.ABC):
         if graph.op[array] == "pack" and all(graph.op[a] in FIXED for a in graph.args[array]):
             return self._table(array, at)
         if array in self._stored:
-            return self._typed(array, self._buffer("row", self._stored[array], j, at))
+            return self._typed(array, self._buffer(*self._stored[array], j, at))
         place = self._in_place(array)
         if place is not None:
             return self._typed(array, self._buffer(*place, j, at))
         name = f"a{array}"
-        if graph.op[array] == "collect":
+        if graph.op[array] in ("collect", "carrys", "results"):
             number, k, _ = graph.aux[array]
-            name = f"y{number}_{k}"
+            name = f"{'y' if graph.op[array] == 'collect' else 'l'}{number}_{k}"
         return f"{name}[{at}]" if self.copies == 1 else f"{name}[({at}) * {self.copies} + {j}]"
 
     def _in_place(self, pack: int) -> tuple[str, int] | None:
@@ -318,16 +332,6 @@ class Writer(abc.ABC):
         places = [self._starts[op][graph.aux[a][0]] + graph.aux[a][1] for a in args]
         first = places[0]
         return (op, first) if places == list(range(first, first + len(places))) else None
-
-    def _size(self, node: int) -> int:
-        graph, op = self.graph, self.graph.op[node]
-        if op == "pack":
-            return int(graph.aux[node])
-        if op == "map":
-            return math.prod(graph.aux[node][1])
-        if op == "collect":
-            return int(graph.aux[node][2])
-        return int(graph.aux[node][0]) if op == "dot" else 1
 
     def _is_array(self, node: int) -> bool:
         return self.graph.op[node] in _ARRAYS

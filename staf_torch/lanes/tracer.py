@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes
 
 from .captured import Captured
@@ -20,6 +21,8 @@ from .graph import FLAG, REAL, ROW, WHOLE, WIDE, Graph, Ids
 _OWN = (str(Path(__file__).parent), str(Path(torch.__file__).parent))
 LARGE = 64  # entries above which an operation on a tensor stays a loop over an array in memory
 _READS = ("_local_scalar_dense", "equal", "is_nonzero", "nonzero", "allclose", "masked_select")
+
+_BLANK = ("zeros_like", "ones_like", "full_like", "new_zeros", "new_ones", "new_full")  # whatever the values
 
 
 class NotLoweredError(Exception):
@@ -239,13 +242,14 @@ class Tracer(TorchDispatchMode):
     ) -> Any:
         kwargs = kwargs or {}
         tensors = _tensors((args, kwargs))
-        if self._learning and any(t.requires_grad and not self.traced(t) for t in tensors):
+        wanted = [t for t in tensors if self._learning and t.requires_grad and not self.traced(t)]
+        if any(self.captured.from_outside(tensor) for tensor in wanted):
             raise NotLoweredError("a derivative with respect to a constant of the program may be wanted")
-        if not any(self.traced(tensor) for tensor in tensors):
+        name = func._schema.name.removeprefix("aten::")
+        if name in _BLANK or not any(self.traced(tensor) for tensor in tensors):
             out = func(*args, **kwargs)
             self.captured.ran(func, args, kwargs, out)
             return out
-        name = func._schema.name.removeprefix("aten::")
         if name in _READS:
             raise NotLoweredError(f"`{func}` reads a value of a row")
         if name.endswith("_") and not name.endswith("__"):
@@ -272,6 +276,25 @@ class Tracer(TorchDispatchMode):
         held = self._storages[target.untyped_storage().data_ptr()][1]
         self._view(held, target)[...] = nodes
         return target
+
+
+class NoReading(TorchFunctionMode):
+    """Refuses what takes the numbers of a row out of torch, where nobody sees what becomes of them."""
+
+    def __init__(self, tracer: Tracer) -> None:
+        super().__init__()
+        self._tracer = tracer
+
+    def __torch_function__(
+        self, func: Any, types: Any, args: Sequence[Any] = (), kwargs: dict[str, Any] | None = None
+    ) -> Any:
+        name = getattr(func, "__name__", "")
+        if name in _LEAVES_TORCH and isinstance(args[0], Tensor) and self._tracer.traced(args[0]):
+            raise NotLoweredError(f"`Tensor.{name}` takes numbers of a row out of torch")
+        return func(*args, **(kwargs or {}))
+
+
+_LEAVES_TORCH = ("numpy", "__array__", "tolist", "__dlpack__")
 
 
 # Set here and not in the class, where torch would wrap the method and import its compiler, three seconds.

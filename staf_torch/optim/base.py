@@ -8,6 +8,7 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
+from ..lanes import repeat
 from .objective import Objective
 
 LawState = tuple[Tensor, ...]
@@ -61,6 +62,20 @@ class UpdateLaw(abc.ABC):
     @abc.abstractmethod
     def step(self, objective: Objective, weights: Tensor, state: LawState) -> tuple[Tensor, LawState]:
         """One iteration: the new weights (..., M) and the new state."""
+
+    def iterate(
+        self, objective: Objective, weights: Tensor, state: LawState, count: int
+    ) -> tuple[Tensor, LawState]:
+        """``count`` iterations: `step` again and again, but for rounding.
+
+        A law whose step finds anew what it could carry along, a residual say, may do so here.
+        """
+
+        def once(carry: tuple[Tensor, LawState]) -> tuple[Tensor, LawState]:
+            return self.step(objective, *carry)
+
+        moved: tuple[Tensor, LawState] = repeat(count, once, (weights, state))
+        return moved
 
     def rescale(self, state: LawState, factor: Tensor) -> LawState:
         """The state when the unit of the weights changes, a -> factor a, K -> K / factor: (..., 1).

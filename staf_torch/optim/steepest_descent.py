@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from ..lanes import repeat
 from .base import LawState, UpdateLaw
 from .objective import Objective
 
@@ -34,6 +35,25 @@ class SteepestDescent(UpdateLaw):
         usable = curvature > 0
         length = torch.where(usable, slope / (2 * torch.where(usable, curvature, 1.0)), 0.0)
         return weights + length.unsqueeze(-1) * g, state
+
+    def iterate(
+        self, objective: Objective, weights: Tensor, state: LawState, count: int
+    ) -> tuple[Tensor, LawState]:
+        """``count`` iterations with the residual carried along, g <- g - 2 lambda K g: one product each."""
+
+        def once(carry: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+            weights, g = carry
+            curved = objective.curvature(g)
+            slope, curvature = torch.linalg.vecdot(g, g), torch.linalg.vecdot(g, curved)
+            usable = curvature > 0
+            twice = torch.where(usable, slope / torch.where(usable, curvature, 1.0), 0.0).unsqueeze(-1)
+            return weights + (twice / 2) * g, g - twice * curved
+
+        if type(self).step is not SteepestDescent.step:  # a law of its own
+            return super().iterate(objective, weights, state, count)
+        if count:
+            weights, _ = repeat(count, once, (weights, objective.descent(weights)))
+        return weights, state
 
     def contraction(self, condition_number: Tensor) -> Tensor:
         return ((condition_number - 1) / (condition_number + 1)).square()

@@ -35,7 +35,7 @@ INNER_STEPS = 10
 RADIUS = 0.1
 STEPS = {3: 1e6, 6: 1e6, 15: 5e5}  # centers: trajectory-steps a measurement
 COMPILED_TIMES = 200  # torch.compile of one step pays its overhead a time: more would only take longer
-OURS = {"staf_torch": "formula", "V in Python": "Python", "V compiled": "torch.compile"}
+OURS = {"staf_torch": "the library's V", "V in Python": "Python", "V compiled": "torch.compile"}
 NAMED = ("JAX jit(vmap(scan))", "JAX components, unrolled")  # the two programs that issue 4 names
 Program = tuple[Callable[[], Any], int]  # what to call, times
 
@@ -163,7 +163,9 @@ def main() -> None:
     parser.add_argument("--no-scaling", action="store_true", help="leave out memory and linearity")
     options = parser.parse_args()
     print(f"{machine()}\nMillions of trajectory-steps a second, {INNER_STEPS} iterations each.")
-    print("staf_torch with V as a formula | in Python | by torch.compile; the best JAX that we could write;")
+    print(
+        "staf_torch with V of the library | in Python | by torch.compile; the best JAX that we could write;"
+    )
     print("the better of jit(vmap(scan)) and components with the inner loop unrolled; the other peers\n")
     print("| M | dtype | B | staf_torch | V in Python | V compiled | best JAX | which | ratio "
           "| named JAX | ratio | numba loops | numba blocks | torch.compile |")  # fmt: skip

@@ -6,7 +6,7 @@ import threading
 
 import pytest
 import torch
-from helpers_fused import BASES, LAW, circles
+from helpers_chase import BASES, LAW, circles
 from torch import Tensor
 
 from staf_torch import chase, chase_weights, engine, optim, targets
@@ -62,15 +62,11 @@ def test_chase_weights_refuses_no_piece_at_all() -> None:
         chase_weights([], BASES["exponential"], targets.Paper(), LAW)
 
 
-def test_chase_weights_refuses_a_predictor() -> None:
-    with pytest.raises(ValueError, match=r"`chase_weights\(predictor=\.\.\.\)` must be None"):
-        chase_weights(
-            circles(2, 3),
-            BASES["exponential"],
-            targets.Paper(),
-            LAW,
-            predictor=engine.predictors.Secant(),
-        )
+def test_chase_weights_takes_a_predictor() -> None:
+    states, basis, predictor = circles(4, 6), BASES["gaussian"], engine.predictors.Tangent()
+    want = chase(states, basis, targets.Paper(), LAW, inner_steps=1, predictor=predictor).weights
+    got = chase_weights(states, basis, targets.Paper(), LAW, inner_steps=1, predictor=predictor).weights
+    torch.testing.assert_close(got, want, rtol=0, atol=1e-10 * float(want.abs().max()))
 
 
 @pytest.mark.parametrize("name", BASES)

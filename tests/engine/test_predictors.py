@@ -67,6 +67,7 @@ REFERENCE = [
 ]
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize(("law", "steps", "predictor", "error", "ball", "gradient", "before"), REFERENCE)
 def test_the_variants_reach_their_reference_numbers(
     law: str, steps: int, predictor: str, error: float, ball: float, gradient: float, before: float

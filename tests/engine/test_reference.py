@@ -16,6 +16,8 @@ from staf_torch.numerics.linalg import condition_number
 from staf_torch.optim import SteepestDescent
 from staf_torch.targets import Paper
 
+pytestmark = pytest.mark.compiled
+
 END = 5 + 2 * math.pi
 BASIS = st.StaFBasis(st.ExponentialKernel(), st.StateFollowingCenters(st.rings(3), radius=0.1))
 

@@ -10,26 +10,29 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers_fused import BASES, LAW, circles, compiled_module
+from helpers_chase import BASES, LAW, circles
 
 from staf_torch import chase, chase_weights, targets
+from staf_torch.engine import row_program
+from staf_torch.lanes import compiler, program
 
 
+@pytest.mark.compiled
 def test_without_a_compiler_the_reference_runs_and_the_log_says_so_once(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    states, basis = circles(4, 5), BASES["exponential"]
+    states, basis = circles(4, 20), BASES["exponential, moving radius"]
     want = chase_weights(states, basis, targets.Paper(), LAW).weights
-    compiled_module.compiled.cache_clear()
-    compiled_module._said.clear()
-    monkeypatch.setattr(compiled_module.shutil, "which", lambda _: None)
-    try:
-        with caplog.at_level(logging.INFO):
-            got = chase_weights(states, basis, targets.Paper(), LAW).weights
-            chase(states.float(), basis, targets.Paper(), LAW)
-    finally:
-        compiled_module.compiled.cache_clear()
-        compiled_module._said.clear()
+    for module, name, empty in (
+        (row_program, "_kept", {}),
+        (compiler, "_loaded", {}),
+        (program, "_said", set()),
+    ):
+        monkeypatch.setattr(module, name, empty)
+    monkeypatch.setattr(compiler.shutil, "which", lambda _: None)
+    with caplog.at_level(logging.INFO):
+        got = chase_weights(states, basis, targets.Paper(), LAW).weights
+        chase(states.float(), basis, targets.Paper(), LAW)
     torch.testing.assert_close(got, want, rtol=0, atol=1e-8 * float(want.abs().max()))
     assert len([r for r in caplog.records if r.name.startswith("staf_torch")]) == 1
 
@@ -49,7 +52,8 @@ tempfile.tempdir = __import__("os").environ.get("TMPDIR")
 basis = st.StaFBasis(st.ExponentialKernel(), st.StateFollowingCenters(st.rings(3), 0.1))
 for dtype in (torch.float64, torch.float32):
     for run in (st.chase, st.chase_weights):
-        weights = run(torch.ones(2, 3, 2, dtype=dtype), basis, st.targets.Paper(), st.optim.SteepestDescent())
+        states = torch.ones(2, 17, 2, dtype=dtype)
+        weights = run(states, basis, st.targets.Paper(), st.optim.SteepestDescent())
         assert weights.weights.isfinite().all()
 """
     unset = ("CXX", "XDG_CACHE_HOME")

@@ -1,0 +1,212 @@
+"""One time of a chase as a step of a row program: what `recursion.py` defines, compiled by `lanes`.
+
+Everything is evaluated in the step from the state x_k alone: kernel, V at the centers, local space,
+predictor, law and results. No matrix and no value at a center ever reaches memory.
+"""
+
+from __future__ import annotations
+
+import copy
+import functools
+from collections.abc import Hashable
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from ..approximation.basis import GramStructure, Target
+from ..lanes import Program
+from ..lanes.content import skeleton
+from ..lanes.plan import ordinary
+from ..optim.base import UpdateLaw
+from ..optim.objective import NativeError, Objective, Precomputed, ScaledError
+from .certificate import Certificate, certify, first_link
+from .problem import Problem
+from .quantities import Known, Numbers, know, numbers, precompute, unless
+from .recursion import Carry, Corrected, Link, Moment, all_finite, correct
+
+_SHORTEST = 16  # times of a chase that is worth a program, which takes some tenths of a second to trace
+_UNROLLED = 8  # centers up to which the Gram matrix is formed; above it stays in its factors
+_KEPT = 64
+_kept: dict[Hashable, tuple[Program, list[Tensor], list[int]]] = {}
+
+
+class RowCarry(NamedTuple):
+    """What passes from one time to the next."""
+
+    chase: Carry
+    reach: Tensor  # (B,) the largest |x| nu(x) so far, which the kernel may warn of
+
+
+class Outputs(NamedTuple):
+    """What is recorded of a time; None where nobody asks for it."""
+
+    weights: Tensor | None = None  # the paper's w, (B, M)
+    numbers: Numbers | None = None
+    certificate: Certificate | None = None
+
+
+class Step:
+    """The step of a chase: (carry, x_k) to the carry and `Outputs`.
+
+    Args:
+        problem: what is chased.
+        everything: whether all results are wanted, or the weights alone.
+    """
+
+    def __init__(self, problem: Problem, everything: bool) -> None:
+        self.problem, self.everything = problem, everything
+
+    def __call__(self, carry: RowCarry, x: Tensor, row: object) -> tuple[RowCarry, Outputs]:
+        problem, last = self.problem, carry.chase
+        known = know(problem, x, local=self.everything or bool(problem.law.needs))
+        structure = known.structure
+        gram = _symmetric(structure.scaled()).expand(*x.shape[:-1], problem.basis.count, problem.basis.count)
+        found = precompute(problem, known, gram)
+        prediction: tuple[Tensor, ...] = ()
+        states = last.states
+        if problem.predictor is not None and states is not None:
+            around = torch.cat((states, x.unsqueeze(1)), dim=1)
+            prepared = problem.predictor.prepare(problem.basis, problem.target, around, last.time)
+            prediction, states = tuple(part.squeeze(1) for part in prepared), around[:, 1:]
+        at = Moment(known.log_gain, _usable(structure, gram, known.values), prediction)
+        objective = _objective(structure, gram, known.values, found)
+        before, now = correct(problem, objective, at, last)
+        now = now._replace(states=states)
+        reach = (
+            torch.maximum(carry.reach, self._reach(x))
+            if known.structure.log_gain is not None
+            else carry.reach
+        )
+        if not self.everything:
+            return RowCarry(now, reach), Outputs(weights=now.weights * (-now.log_gain).exp().unsqueeze(-1))
+        lost = now.diverged_at >= 0
+        run = Corrected(before, now.weights, known.values, known.log_gain)
+        outputs = Outputs(numbers=numbers(known, run, now.log_gain, lost, objective.curvature))
+        if problem.certificate:
+            vouched, link = self._certified(known, gram, run, last)
+            outputs = outputs._replace(certificate=Certificate(*(unless(lost, term) for term in vouched)))
+            now = now._replace(link=link)
+        return RowCarry(now, reach), outputs
+
+    def _certified(self, known: Known, gram: Tensor, run: Corrected, last: Carry) -> tuple[Certificate, Link]:
+        assert known.local is not None
+        assert last.link is not None
+        assert isinstance(last.time, Tensor)
+        ideal, begins = known.local.ideal, last.time == 0
+        first = first_link(gram, run.log_gain, ideal)
+        pairs = zip(first, last.link, strict=True)
+        before = (torch.where(begins.view(-1, *[1] * (new.dim() - 1)), new, old) for new, old in pairs)
+        return certify(self.problem, gram, run, ideal, Link(*before))
+
+    def _reach(self, x: Tensor) -> Tensor:
+        reach = x.square().sum(-1).sqrt() * self.problem.basis.centers.radius(x)
+        return torch.where(torch.isfinite(reach), reach, 0.0)
+
+
+def first_carry(problem: Problem, carry: Carry) -> RowCarry:
+    """Return what a program starts from.
+
+    Args:
+        problem: what is chased.
+        carry: of `recursion.start`.
+    """
+    weights = carry.weights
+    zero, count = torch.zeros_like(carry.log_gain), weights.shape[-1]
+    link = None
+    if problem.certificate:
+        link = Link(weights.new_zeros(*weights.shape, count), zero, torch.zeros_like(weights))
+    return RowCarry(carry._replace(time=torch.zeros_like(carry.diverged_at), link=link), zero)
+
+
+def program(problem: Problem, states: Tensor, carry: RowCarry, *, everything: bool) -> Program | None:
+    """Return the program of a chase, None where the definition serves.
+
+    Programs are kept: one that differs from another in tensors and gains alone takes over its text, and
+    nothing is traced or compiled.
+
+    Args:
+        problem: what is chased.
+        states: the first chunk, (B, C, n).
+        carry: what it starts from.
+        everything: whether all results are wanted, or the weights alone.
+    """
+    if states.shape[1] < _SHORTEST or not ordinary((states, carry.chase.weights)):
+        return None
+    problem = _numbers_as_tensors(problem)
+    found = skeleton(problem.basis, problem.target, problem.law, problem.predictor)
+    if found is None:
+        made = Program(Step(problem, everything), name="a chase")
+    else:
+        structure, tensors = found
+        if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors):
+            return None
+        made = _of(problem, everything, structure, tensors)
+    return made if made.compiles(carry, states) else None
+
+
+def _of(problem: Problem, everything: bool, structure: Hashable, tensors: list[Tensor]) -> Program:
+    key = structure, problem.inner_steps, problem.certificate, everything
+    versions = [tensor._version for tensor in tensors]
+    held = _kept.pop(key, None)
+    if held is None:
+        held = Program(Step(problem, everything), name="a chase"), tensors, versions
+    elif any(a is not b for a, b in zip(held[1], tensors, strict=True)) or held[2] != versions:
+        pairs = list(zip(held[1], tensors, strict=True))
+        _kept[key] = held  # the model of all others
+        return held[0].with_others(Step(problem, everything), pairs)
+    _kept[key] = held
+    while len(_kept) > _KEPT:
+        del _kept[next(iter(_kept))]
+    return held[0]
+
+
+def _numbers_as_tensors(problem: Problem) -> Problem:
+    """Return the problem with the gains of the library's laws as tensors, which no text knows."""
+    law, target = problem.law, problem.target
+    if type(law).__module__.startswith(UpdateLaw.__module__.rpartition(".")[0]):
+        law = copy.copy(law)
+        for name, value in vars(law).items():
+            if isinstance(value, float):
+                setattr(law, name, _number(value))
+    return _with(problem, law, _plain(target))
+
+
+@functools.lru_cache(maxsize=4096)
+def _number(value: float) -> Tensor:
+    return torch.tensor(value, dtype=torch.float64)
+
+
+def _plain(target: Target) -> Target:
+    """Return a target without `torch.compile`, which has nothing to gain here."""
+    plain: Any = getattr(target, "_orig_mod", None) if isinstance(target, nn.Module) else None
+    plain = plain if plain is not None else getattr(target, "_torchdynamo_orig_callable", None)
+    return target if plain is None else plain
+
+
+def _with(problem: Problem, law: UpdateLaw, target: Target) -> Problem:
+    return Problem(
+        problem.call, problem.basis, target, law, problem.inner_steps, problem.predictor, problem.certificate
+    )
+
+
+def _symmetric(gram: Tensor) -> Tensor:
+    """Return K with its lower triangle in the place of the upper one: half the numbers."""
+    lower = torch.ones(gram.shape[-2:], dtype=torch.bool, device=gram.device).tril()
+    return torch.where(lower, gram, gram.mT)
+
+
+def _usable(structure: GramStructure, gram: Tensor, values: Tensor) -> Tensor:
+    """Return whether V(c) and K are finite, (B,); K = S K0 S is where its largest entries are."""
+    if structure.core.dim() > 2:
+        return all_finite(values) & all_finite(gram.flatten(-2))
+    largest = structure.core.abs().amax()
+    if structure.scale is not None:
+        largest = largest * structure.scale.amax(-1).square()
+    return all_finite(values) & (largest < torch.inf)
+
+
+def _objective(structure: GramStructure, gram: Tensor, values: Tensor, found: Precomputed) -> Objective:
+    if structure.core.dim() == 2 and values.shape[-1] > _UNROLLED:
+        return ScaledError(_symmetric(structure.core), structure.scale, values, gram, found)
+    return NativeError(gram, values, found)

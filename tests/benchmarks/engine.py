@@ -1,0 +1,156 @@
+"""The compiled chase under every law beside JAX and numba: `python tests/benchmarks/engine.py [--quick]`.
+
+States given, ten iterations, the weights of every time returned; exponential kernel, the paper's V, rings.
+The rounds of all programs of a row alternate; a speed is the best of the rounds, in CPU seconds of this
+process, so that other programs on the machine matter little. The benchmark refuses a chase that was not
+compiled. Peers that are not installed are skipped by name (extra `bench`). Writes
+runs/benchmarks/engine.json.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import resource
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+ROOT = Path(__file__).parents[2]
+sys.path[:0] = [str(ROOT), str(Path(__file__).parent)]
+
+import peer_laws  # noqa: E402
+
+import staf_torch as st  # noqa: E402
+from staf_torch.engine import predictors  # noqa: E402
+
+STEPS = 10
+RADIUS = {3: 0.3, 6: 0.5, 15: 0.8}
+WORK = {1: 4000, 1000: 100, 100_000: 16}  # rows: times
+OTHERS: dict[str, st.optim.UpdateLaw] = {
+    "BarzilaiBorwein": st.optim.BarzilaiBorwein(),
+    "FixedStep": st.optim.FixedStep(),
+    "FixedStep, absolute": st.optim.FixedStep(0.05, relative=False),
+    "NormalisedLMS": st.optim.NormalisedLMS(),
+    "PreconditionedDescent": st.optim.PreconditionedDescent(),
+    "PreconditionedDescent, jacobi": st.optim.PreconditionedDescent("jacobi"),
+    "RecursiveLeastSquares": st.optim.RecursiveLeastSquares(),
+}
+
+PREDICTED = {"tangent + 1": predictors.Tangent(), "secant + 1": predictors.Secant()}
+
+
+class Refuse(logging.Handler):
+    """A speed of a program that fell back to plain torch is none."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        raise RuntimeError(record.getMessage())
+
+
+def states(batch: int, times: int, dtype: torch.dtype) -> torch.Tensor:
+    """Circles of radii 0.5 to 1.5, (B, T, 2) contiguous."""
+    angle, radius = torch.linspace(0, 6, batch), torch.linspace(0.5, 1.5, batch)
+    x0 = torch.stack((radius * angle.cos(), radius * angle.sin()), dim=-1).double()
+    return st.systems.simulate(st.systems.Oscillator(), x0, dt=0.01, steps=times - 1).to(dtype).contiguous()
+
+
+def plain_value(x: torch.Tensor) -> torch.Tensor:
+    """The paper's V as a user writes it."""
+    return x[..., 0] ** 2 + 5 * x[..., 1] ** 2 + torch.tanh(x[..., 0] * x[..., 1])
+
+
+def measured(programs: dict[str, Callable[[], Any]], steps: int, rounds: int) -> dict[str, float]:
+    """Million trajectory-steps a CPU second of every program; says how long a compiler took."""
+    best: dict[str, float] = {}
+    for name, program in programs.items():
+        before = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
+        program()
+        built = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime - before
+        if built > 0.05:
+            print(f"      {name}: compiled in {built:.1f} CPU s", flush=True)
+    for _ in range(rounds):
+        for name, program in programs.items():
+            start = time.process_time()
+            program()
+            best[name] = min(best.get(name, np.inf), time.process_time() - start)
+    return {name: steps / seconds / 1e6 for name, seconds in best.items()}
+
+
+def peers(law: str, basis: st.StaFBasis, x: torch.Tensor) -> dict[str, Callable[[], Any]]:
+    offsets = (basis.centers.directions * basis.centers.radius(x[0, 0])).double().numpy()
+    found: dict[str, Callable[[], Any]] = {}
+    array = x.numpy()
+    try:
+        import jax
+
+        for name, (program, last) in peer_laws.jax_programs(law, offsets, STEPS).items():
+            given = jax.device_put(np.ascontiguousarray(array.transpose(1, 2, 0)) if last else array)
+            found[f"JAX {name}"] = lambda program=program, given=given: program(given).block_until_ready()
+    except ImportError:
+        print("      JAX is not installed")
+    if len(x) == 1:
+        try:
+            program = peer_laws.numba_program(law, offsets, STEPS)
+            found["numba"] = lambda: program(array)
+        except ImportError:
+            print("      numba is not installed")
+    return found
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="float64, fewer rounds, M = 3 and 6")
+    parser.add_argument("--only", default="", help="laws whose names contain this")
+    parser.add_argument("--rows", type=int, choices=WORK, help="this many rows alone")
+    options = parser.parse_args()
+    logging.getLogger("staf_torch").addHandler(Refuse())
+    torch.set_num_threads(1)
+    rows: list[dict[str, Any]] = []
+    for count in (3, 6) if options.quick else (3, 6, 15):
+        basis = st.StaFBasis(st.ExponentialKernel(), st.StateFollowingCenters(st.rings(count), RADIUS[count]))
+        for dtype in (torch.float64,) if options.quick else (torch.float64, torch.float32):
+            for batch, times in WORK.items():
+                if options.rows in (None, batch):
+                    x, names = states(batch, times, dtype), (*peer_laws.LAWS, *OTHERS, *PREDICTED)
+                    found = [row(n, basis, x, 2 if options.quick else 4) for n in names if options.only in n]
+                    rows += found
+    out = ROOT / "runs" / "benchmarks" / "engine.json"
+    out.parent.mkdir(parents=True, exist_ok=True)
+    out.write_text(json.dumps(rows, indent=1))
+
+
+def row(name: str, basis: st.StaFBasis, x: torch.Tensor, rounds: int) -> dict[str, Any]:
+    """Measure one law at one size."""
+    predictor: st.engine.Predictor | None = None
+    steps, (batch, times, _) = STEPS, x.shape
+    if name in PREDICTED:
+        predictor, steps = PREDICTED[name], 1
+        law: st.optim.UpdateLaw = st.optim.SteepestDescent()
+    else:
+        law = OTHERS[name] if name in OTHERS else getattr(st.optim, name)()
+
+    def ours(call: Callable[..., Any], value: Any) -> Callable[[], Any]:
+        return lambda: call(x, basis, value, law, inner_steps=steps, predictor=predictor)
+
+    paper = st.targets.Paper()
+    programs = {"ours": ours(st.chase_weights, paper)}
+    if name == "SteepestDescent":
+        programs |= {"everything": ours(st.chase, paper), "a callable": ours(st.chase_weights, plain_value)}
+    if name in peer_laws.LAWS:
+        programs |= peers(name, basis, x)
+    found = measured(programs, batch * times, rounds)
+    best = max((v for n, v in found.items() if n.startswith("JAX")), default=np.nan)
+    text = ", ".join(f"{n} {v:.3g}" for n, v in found.items())
+    size = f"M={basis.count} {str(x.dtype)[6:]} B={batch}"
+    print(f"{size:24s} {name:30s} {text}; over JAX {found['ours'] / best:.2f}", flush=True)
+    return {"law": name, "M": basis.count, "dtype": str(x.dtype)[6:], "B": batch, **found}
+
+
+if __name__ == "__main__":
+    main()
