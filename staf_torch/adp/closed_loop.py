@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable
+import contextlib
+import copy
+from collections.abc import Hashable, Iterator
 from typing import NamedTuple
 
 import torch
@@ -15,6 +17,7 @@ from ..systems import Plant
 from .controllers import Controller, ControllerState
 from .cost import Cost
 from .holding import Holding
+from .laws import ActorCriticLaw
 
 _KEPT = 16
 _kept: dict[Hashable, Program] = {}
@@ -116,7 +119,9 @@ def program(loop: ClosedLoop, compile: bool) -> Program:
     key = content(loop) if compile else None
     found = _kept.pop(key, None)
     if found is None:
-        found = Program(lambda state, uniform, _: recorded(loop, state, uniform), name="the closed loop")
+        found = Program(
+            lambda state, uniform, gains: recorded(loop, state, uniform, gains), name="the closed loop"
+        )
         found.compile = compile
     if key is not None:
         _kept[key] = found
@@ -125,9 +130,45 @@ def program(loop: ClosedLoop, compile: bool) -> Program:
     return found
 
 
-def recorded(loop: ClosedLoop, state: LoopState, uniform: Tensor) -> tuple[LoopState, tuple[Tensor, ...]]:
-    """Return the state after one step, and what is recorded of the time before it."""
-    after, u = loop(state, uniform)
+def row_gains(loop: ClosedLoop) -> dict[str, Tensor]:
+    """Return the gains (B, 1) of which every row has its own: inputs of `program`, by their names."""
+    gains = [law.gains for law in _laws(loop)]
+    return {name: value for each in gains for name, value in vars(each).items() if isinstance(value, Tensor)}
+
+
+def _laws(loop: ClosedLoop) -> list[ActorCriticLaw]:
+    laws = (getattr(module, "law", None) for module in loop.controller.modules())
+    return [law for law in laws if isinstance(law, ActorCriticLaw)]
+
+
+@contextlib.contextmanager
+def _with_gains(loop: ClosedLoop, given: dict[str, Tensor]) -> Iterator[None]:
+    """Context: the law has these gains, those of the one row that is traced among them."""
+    laws = _laws(loop) if given else []
+    before = [law.gains for law in laws]
+    try:
+        for law, gains in zip(laws, before, strict=True):
+            law.gains = copy.copy(gains)
+            vars(law.gains).update(given)  # without the checks, which would read a traced number
+        yield
+    finally:
+        for law, gains in zip(laws, before, strict=True):
+            law.gains = gains
+
+
+def recorded(
+    loop: ClosedLoop, state: LoopState, uniform: Tensor, gains: dict[str, Tensor]
+) -> tuple[LoopState, tuple[Tensor, ...]]:
+    """Return the state after one step, and what is recorded of the time before it.
+
+    Args:
+        loop: one step.
+        state: before the step.
+        uniform: its random numbers, (B, draws, n).
+        gains: of `row_gains`.
+    """
+    with _with_gains(loop, gains):
+        after, u = loop(state, uniform)
     return after, record(state, torch.where(after.alive.unsqueeze(-1), u, torch.nan))
 
 

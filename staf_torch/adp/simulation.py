@@ -12,7 +12,7 @@ from torch import Tensor
 from ..lanes import Program
 from ..numerics.checks import choice, fail, integer, trailing
 from ..systems import ControlAffineSystem, Plant
-from .closed_loop import ClosedLoop, program, record
+from .closed_loop import ClosedLoop, program, record, row_gains
 from .controllers import Controller, Feedback, Policy
 from .cost import Cost
 from .sampling import held_stability
@@ -156,7 +156,7 @@ def _run(
 ) -> LoopResult:
     state = loop.init(x0)
     pieces: list[tuple[Tensor, ...]] = []
-    draws, done = loop.controller.draws, 0
+    draws, done, gains = loop.controller.draws, 0, row_gains(loop)
     generators = [torch.Generator().manual_seed(seed) for seed in (seeds if draws else ())]
     ahead = max(1, min(_DRAWN_AHEAD, _NUMBERS // (x0.numel() * max(draws, 1))))
     while done < steps:
@@ -164,7 +164,7 @@ def _run(
         count = ahead // every * every if every <= ahead else min(ahead, every - done % every)
         count = min(count, steps - done)
         uniform = _uniform(x0, count, draws, generators)
-        state, out = steps_of(state, uniform, every=min(every, count))
+        state, out = steps_of(state, uniform, gains, every=min(every, count))
         if done % every == 0:
             pieces.append(out)
         done += count

@@ -23,7 +23,7 @@ from staf_torch import (
     ball,
     systems,
 )
-from staf_torch.adp.closed_loop import ClosedLoop, LoopState, program
+from staf_torch.adp.closed_loop import ClosedLoop, LoopState, program, row_gains
 from staf_torch.lanes import compiler
 
 CLOSE = 1e-11  # of a number's size, after a few steps from equal states
@@ -193,6 +193,43 @@ def test_what_cannot_be_compiled_runs_in_plain_torch_with_one_line(
     (line,) = [record.getMessage() for record in caplog.records]
     assert line.startswith("the closed loop runs in plain torch, slower:")
     assert reason in line
+
+
+def test_rows_with_gains_of_their_own_are_compiled_and_are_those_rows_alone() -> None:
+    x0, critic = uniform(3, 1.0), torch.tensor([[0.1], [0.2], [0.4]], dtype=torch.float64)
+
+    def run(gain: float | Tensor, rows: slice, compile: bool) -> adp.LoopResult:
+        law = adp.Information(adp.Gains(critic=gain))
+        controller = adp.ActorCritic(adp.QuadraticBasis(2), PLANT, COST, adp.RandomPoints(1, 1.0), law)
+        settings = {"dt": 1e-3, "steps": 20, "seed": range(3)[rows], "compile": compile}
+        return adp.simulate(controller, PLANT, COST, x0[rows], **settings)
+
+    whole = run(critic, slice(0, 3), True)
+    torch.testing.assert_close(
+        whole.actor_weights, run(critic, slice(0, 3), False).actor_weights, rtol=CLOSE, atol=CLOSE
+    )
+    for k in range(3):
+        alone = run(float(critic[k]), slice(k, k + 1), True)
+        torch.testing.assert_close(whole.state[k : k + 1], alone.state, rtol=CLOSE, atol=CLOSE)
+    law = adp.Information(adp.Gains(critic=critic))
+    controller = adp.ActorCritic(adp.QuadraticBasis(2), PLANT, COST, adp.RandomPoints(1, 1.0), law)
+    loop = ClosedLoop(controller, PLANT, COST, dt=1e-3)
+    draws = x0.new_zeros(3, 2, loop.controller.draws, 2)
+    assert program(loop, True).compiles(loop.init(x0), draws, row_gains(loop))
+
+
+def test_a_sweep_over_gains_needs_no_other_program() -> None:
+    basis, x0 = adp.QuadraticBasis(2), uniform(1, 1.0)
+
+    def text(critic: float, beta: float) -> str:
+        law = adp.Information(adp.Gains(critic=critic, forgetting=beta))
+        loop = ClosedLoop(
+            adp.ActorCritic(basis, PLANT, COST, adp.RandomPoints(1, 1.0), law), PLANT, COST, dt=1e-3
+        )
+        given = loop.init(x0), x0.new_zeros(1, 2, 1, 2)
+        return program(loop, True).text(*given)
+
+    assert text(0.3, 0.003) == text(0.7, 0.009)
 
 
 def test_a_rollout_policy_that_is_asked_often_compiles_itself_and_sees_what_changes() -> None:
