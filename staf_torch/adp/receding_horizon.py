@@ -22,8 +22,18 @@ class RecedingHorizon(Controller):
     drifts to where the models err (1.02 to 1.12 of the optimum on the pendulum, against 1.00).
 
     Example:
-        >>> mpc = adp.RecedingHorizon(problem, steps=30, memory=memory)
-        >>> adp.simulate(mpc, plant, cost, x0, dt=0.05, steps=100, compile=False)
+        >>> def step(x, u):  # a cart without friction, for 0.1 s
+        ...     after = torch.stack((x[:, 0] + 0.1 * x[:, 1], x[:, 1] + 0.1 * u[:, 0]), dim=-1)
+        ...     return after, 0.1 * (x.square().sum(-1) + u.square().sum(-1))
+        >>> problem = adp.SampledProblem(step, dim=2, inputs=1, low=-1.0, high=1.0)
+        >>> mpc = adp.RecedingHorizon(problem, steps=5, compile=False)
+        >>> x = torch.tensor([[0.5, 0.0]]).double()
+        >>> plan = mpc.init(x)
+        >>> u, plan = mpc.step(x, plan, uniform=x, dt=0.1)  # again and again; no random points are used
+        >>> u.shape
+        torch.Size([1, 1])
+
+        Shown by `staf_torch/adp/README.md`.
 
     Args:
         problem: plant, cost and bounds in steps; its period is that of the loop.

@@ -110,6 +110,11 @@ class SampledProblem(nn.Module):
         Raises:
             ValueError: if an argument breaks its rule, or as in `SampledProblem`.
         """
+        if not plant.traceable:
+            rule = (
+                "must be written in torch all through: trajectories are optimised by its second derivatives"
+            )
+            raise fail("SampledProblem.of", "plant", rule, plant)
         cost = cost.bounded(low, high).around(plant)
         if cost.discount:
             raise fail("SampledProblem.of", "cost", "must have no discount", cost.discount)
