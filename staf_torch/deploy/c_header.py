@@ -18,8 +18,9 @@ from torch import Tensor, nn
 from ..adp import Controller
 from ..lanes import Program
 from ..lanes.combinators import Tree
+from ..lanes.given import Given
 from ..lanes.graph import WIDE, Graph
-from ..lanes.program import Given, trace
+from ..lanes.program import trace
 from ..lanes.schedule import Schedule
 from ..lanes.tracer import NotLoweredError
 from .formats import Run, as_tuple

@@ -28,7 +28,19 @@ from .recursion import Carry, Corrected, Link, Moment, all_finite, correct
 _SHORTEST = 16  # times of a chase that is worth a program, which takes some tenths of a second to trace
 _UNROLLED = 8  # centers up to which the Gram matrix is formed; above it stays in its factors
 _KEPT = 64
-_kept: dict[Hashable, tuple[Program, list[Tensor], list[int]]] = {}
+
+
+class _Kept(NamedTuple):
+    """A program that was traced, and the last one that followed from it."""
+
+    model: Program
+    found: list[Tensor]  # by the model
+    last: Program
+    tensors: list[Tensor]  # of the last
+    versions: list[int]
+
+
+_kept: dict[Hashable, _Kept] = {}
 
 
 class RowCarry(NamedTuple):
@@ -150,15 +162,16 @@ def _of(problem: Problem, everything: bool, structure: Hashable, tensors: list[T
     versions = [tensor._version for tensor in tensors]
     held = _kept.pop(key, None)
     if held is None:
-        held = Program(Step(problem, everything), name="a chase"), tensors, versions
-    elif any(a is not b for a, b in zip(held[1], tensors, strict=True)) or held[2] != versions:
-        pairs = list(zip(held[1], tensors, strict=True))
-        _kept[key] = held  # the model of all others
-        return held[0].with_others(Step(problem, everything), pairs)
+        new = Program(Step(problem, everything), name="a chase")
+        held = _Kept(new, tensors, new, tensors, versions)
+    elif held.versions != versions or any(a is not b for a, b in zip(held.tensors, tensors, strict=True)):
+        pairs = list(zip(held.found, tensors, strict=True))
+        new = held.model.with_others(Step(problem, everything), pairs)
+        held = held._replace(last=new, tensors=tensors, versions=versions)
     _kept[key] = held
     while len(_kept) > _KEPT:
         del _kept[next(iter(_kept))]
-    return held[0]
+    return held.last
 
 
 def _numbers_as_tensors(problem: Problem) -> Problem:

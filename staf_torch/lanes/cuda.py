@@ -12,7 +12,8 @@ import torch
 from torch import Tensor
 
 from .combinators import Tree
-from .program import Given, Program, trace
+from .given import Given
+from .program import Program, trace
 from .scalar_text import cuda_text
 from .tree import Shared, flatten, plain, unflatten
 

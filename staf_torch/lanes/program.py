@@ -14,6 +14,7 @@ from .captured import Recipe
 from .combinators import Tree, tracing
 from .eliminations import WithoutVectors
 from .emission import Text, emit
+from .given import Given
 from .graph import NOW, STEP, Graph
 from .lowering import lower
 from .plan import Compiled, Plan, form, ordinary
@@ -25,6 +26,7 @@ from .tree import Shared, flatten, labels, plain, unflatten
 _log = logging.getLogger(__name__)
 _said: set[tuple[str, str]] = set()  # what has been logged
 _FEW = 8  # rows that one vector holds
+_LONGEST = 12_000  # lines that a compiler is asked to take
 _PREPARED = 64  # calls of other shapes that a program remembers
 Step = Callable[[Tree, Tree, Tree], tuple[Tree, Tree]]
 
@@ -220,6 +222,8 @@ class Program:
                 real = torch.float64
                 traced = trace(self.step, given, widened=True)
                 text = emit(*traced.program, copies)
+            if (lines := text.source.count("\n")) > _LONGEST:
+                raise NotLoweredError(f"the program is {lines} lines long, which take a compiler minutes")
             call = compiler.function(text.source)
         except (NotLoweredError, OSError) as error:
             reason = " ".join(str(error).split())[:400]
@@ -283,61 +287,6 @@ class Prepared:
             self.plan = Plan(compiled, leaves, times, rows=given.rows, steps=given.times, every=self._every)
         rooms = iter(self.plan(leaves))
         return unflatten(self._carry, rooms), unflatten(self.plan.structure, rooms)
-
-
-class Given(NamedTuple):
-    """The inputs of a call as lists."""
-
-    carry: list[Tensor]
-    now: list[Any]
-    row: list[Any]
-    structures: dict[str, Any]
-    rows: int
-    times: int
-
-    @classmethod
-    def of(cls, carry: Tree, now: Tree, row: Tree, steps: int | None) -> Given:
-        leaves, structures = {}, {}
-        for name, tree in (("carry", carry), ("now", now), ("row", row)):
-            leaves[name], structures[name] = flatten(tree)
-        own = [leaf for name in ("carry", "now", "row") for leaf in leaves[name] if isinstance(leaf, Tensor)]
-        if not own:
-            raise ValueError(
-                "`Program(...)` must be given at least one tensor with a dimension of rows; got none."
-            )
-        if leaves["now"]:
-            first = leaves["now"][0]
-            steps = len(first.tensor) if isinstance(first, Shared) else first.shape[1]
-        if steps is None:
-            raise ValueError("`Program(steps=...)` must be given where no input has times; got None.")
-        return cls(**leaves, structures=structures, rows=own[0].shape[0], times=steps)
-
-    @property
-    def real(self) -> torch.dtype:
-        floats = [plain(leaf).dtype for leaf in (*self.carry, *self.now, *self.row)]
-        return torch.float64 if torch.float64 in floats or torch.float32 not in floats else torch.float32
-
-    def trees(self) -> Tree:
-        """The trees (row, now, carry)."""
-        return tuple(self.tree(name, getattr(self, name)) for name in ("row", "now", "carry"))
-
-    def tree(self, name: str, leaves: Sequence[Any]) -> Tree:
-        return unflatten(self.structures[name], iter(leaves))
-
-    def key(self) -> Hashable:
-        parts: list[Hashable] = [(leaf.shape[1:], leaf.dtype) for leaf in self.carry]
-        for skip, leaves in ((2, self.now), (1, self.row)):
-            for leaf in leaves:
-                shared = isinstance(leaf, Shared)
-                tensor = plain(leaf)
-                parts.append((tensor.shape[skip - shared :], tensor.dtype, shared))
-        return tuple(parts), tuple(self.structures.values())
-
-    def ordinary(self) -> bool:
-        """Whether all tensors are ordinary ones on the CPU of which nobody wants a derivative."""
-        if self.rows == 0 or self.times == 0:
-            return False
-        return ordinary((*self.carry, *self.now, *self.row))
 
 
 class Traced(NamedTuple):

@@ -50,7 +50,9 @@ class Archive:
                 with zipfile.ZipFile(file) as archive:
                     entries = archive.infolist()
                 self._stored = dict(self._entry(file, each) for each in entries)
-        except (ValueError, zipfile.BadZipFile, struct.error, NotImplementedError, SyntaxError) as error:
+        except UnreadableError:
+            raise
+        except Exception as error:  # zipfile and numpy raise a dozen kinds over bytes that nobody meant
             raise self._bad(str(error)) from error
 
     @property

@@ -59,17 +59,21 @@ def build(settings: Mapping[str, Any], compiler: str) -> dict[str, Any]:
         settings: all of the run, by dotted keys.
         compiler: that makes machine code of the chase, in its own words.
     """
-    try:
-        torch = importlib.metadata.version("torch")
-    except importlib.metadata.PackageNotFoundError:
-        torch = "of unknown version"
     return {
         "version": __version__,
         "source": source(),
-        "torch": torch,
+        "torch": _torch(),
         "compiler": compiler,
         "modules": modules(settings),
     }
+
+
+@functools.cache
+def _torch() -> str:
+    try:
+        return importlib.metadata.version("torch")
+    except importlib.metadata.PackageNotFoundError:
+        return "of unknown version"
 
 
 def modules(settings: Mapping[str, Any]) -> dict[str, str]:

@@ -30,7 +30,7 @@ def write_text(path: Path, text: str) -> None:
 
 def write_bytes(path: Path, content: bytes) -> None:
     """Write bytes as `write_text` writes a text."""
-    partial = path.with_name(f".{path.name}.partial")
+    partial = path.with_name(partial_name(path.name))
     try:
         partial.unlink(missing_ok=True)  # of a run that was killed; and a link there would be written through
         flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW
@@ -41,6 +41,11 @@ def write_bytes(path: Path, content: bytes) -> None:
         os.replace(partial, path)
     finally:
         partial.unlink(missing_ok=True)
+
+
+def partial_name(name: str) -> str:
+    """Return the name of a file until it is complete."""
+    return f".{name}.partial"
 
 
 def write_metrics(path: Path, metrics: Mapping[str, float | int | None]) -> None:

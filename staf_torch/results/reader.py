@@ -15,7 +15,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from .._version import __version__
 from ..numerics import fail
 from .build import damage, damaged, short
 from .files import (
@@ -31,9 +30,11 @@ from .files import (
     UNFINISHED,
     flatten,
     parse_overrides,
+    partial_name,
 )
 from .files import Value as Value
 from .metric_info import read_infos
+from .remarks import mixed, versions
 from .run import ABOUT as ABOUT
 from .run import Collection as Collection
 from .run import Run as Run
@@ -46,7 +47,6 @@ from .untrusted import UnreadableError, parse_object, read_lines, read_object, t
 _OVERRIDES = "overrides.yaml"
 _LISTED = 8  # jobs that have not started, by their numbers
 _COLUMNS = 5000  # names of settings and metrics of all runs together
-_SHOWN = 3  # values of a setting that a remark names
 _DEEPEST = 16  # levels of folders
 _MOST_JOBS = 2**24  # bytes of `sweep.json`
 
@@ -96,7 +96,7 @@ def collect(path: str | Path | Sequence[str | Path]) -> Collection:
     if not rows and not skipped:
         raise fail("collect", "path", "must hold a run or a sweep of runs", [str(p) for p in paths])
     collection = Collection(tuple(rows), tuple(skipped))
-    return dataclasses.replace(collection, remarks=(*_versions(rows), *_mixed(collection)))
+    return dataclasses.replace(collection, remarks=(*versions(rows), *mixed(collection)))
 
 
 def _further_names(known: set[str], runs: Sequence[Run]) -> set[str]:
@@ -170,29 +170,6 @@ def _identity(overrides: Mapping[str, Value]) -> tuple[tuple[str, str], ...]:
     return tuple(sorted((key, identity(value)) for key, value in overrides.items()))
 
 
-def _versions(rows: Sequence[Run]) -> Iterator[str]:
-    """One remark for each other version of which there are runs."""
-    others = dict.fromkeys(run.version for run in rows if run.version not in (None, __version__))
-    for version in others:
-        those = [run for run in rows if run.version == version]
-        yield (
-            f"{len(those)} of {len(rows)} runs were written by staf_torch {version}, and this is "
-            f"{__version__}: their numbers may mean something else (the first is {those[0].directory})"
-        )
-
-
-def _mixed(found: Collection) -> Iterator[str]:
-    """One remark for each setting that differs although nobody swept it, and for different builds."""
-    for key in found.unswept:
-        values: dict[str, list[Run]] = {}
-        for run in found.rows:
-            value = run.value(key)
-            values.setdefault(value if isinstance(value, str) else json.dumps(value), []).append(run)
-        counts = [f"{value} in {len(runs)} (as {runs[0].directory})" for value, runs in values.items()]
-        more = f" and {len(counts) - _SHOWN} others" if len(counts) > _SHOWN else ""
-        yield f"`{key}` differs between runs although nobody swept it: {', '.join(counts[:_SHOWN])}{more}"
-
-
 def read_run(directory: Path) -> list[Run]:
     """Return the runs of a run directory: one, or one a member.
 
@@ -209,7 +186,10 @@ def read_run(directory: Path) -> list[Run]:
     wrong = damaged(directory, record, thorough=False)
     if wrong is not None:
         return [dataclasses.replace(run, status=UNFINISHED, reason=wrong, metrics={})]
-    return _members(run) if os.path.lexists(directory / MEMBERS) else [run]
+    if os.path.lexists(directory / MEMBERS):
+        return _members(run, MEMBERS)
+    begun = run.status != COMPLETED and os.path.lexists(directory / partial_name(MEMBERS))
+    return [*_members(run, partial_name(MEMBERS)), run] if begun else [run]
 
 
 def read_record(directory: Path) -> Run:
@@ -255,21 +235,26 @@ def _status(record: Mapping[str, Any]) -> tuple[str, str | None]:
     return COMPLETED, reason
 
 
-def _members(run: Run) -> list[Run]:
-    """One a member; its overrides come on top of the run's."""
+def _members(run: Run, name: str) -> list[Run]:
+    """One a member in a file of that name; its overrides come on top of the run's."""
     shared = {key: value for key, value in run.settings.items() if not _of_axis(key)}
     typed = {key: value for key, value in run.overrides.items() if not _of_axis(key)}
     base = dataclasses.replace(run, settings=shared, overrides=typed, seconds=None)
-    return [_member(base, number, member) for number, member in enumerate(read_members(run.directory))]
+    return [_member(base, number, member) for number, member in enumerate(read_members(run.directory, name))]
 
 
-def read_members(directory: Path) -> Iterator[Mapping[str, Any]]:
+def read_members(directory: Path, name: str = MEMBERS) -> Iterator[Mapping[str, Any]]:
     """Yield the rows of `members.json`, one after the other: one line each, as the library writes them.
+
+    In a file that is not complete, which has another ``name``, the last line may be cut off.
 
     Raises:
         UnreadableError: if it has another form, and is too large to be read as a whole.
     """
-    lines = read_lines(directory / MEMBERS)
+    lines = read_lines(directory / name)
+    if name != MEMBERS:
+        yield from (parse_object(line[:-2], name) for line in lines if line.endswith(b"},\n"))
+        return
     if not re.fullmatch(rb'\{"version": "[^"]*", "members": \[\n', next(lines, b"")):
         listed = read_object(directory / MEMBERS, _MOST_JOBS).get("members")
         if not isinstance(listed, list) or not all(isinstance(member, dict) for member in listed):

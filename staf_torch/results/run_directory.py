@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 import shutil
 import tempfile
 import zipfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Protocol
@@ -15,7 +16,7 @@ from typing import Protocol
 import numpy as np
 
 from .archive import Archive
-from .files import FIGURES, HISTORY, METRICS, write_bytes, write_metrics, write_text
+from .files import FIGURES, HISTORY, METRICS, partial_name, write_bytes, write_metrics, write_text
 
 
 class Printable(Protocol):
@@ -53,6 +54,26 @@ class RunDirectory:
     def text(self, name: str, text: str) -> None:
         """Write a text file."""
         write_text(self._place(name), text)
+
+    @contextlib.contextmanager
+    def lines(self, name: str) -> Iterator[Callable[[str], None]]:
+        """Yield a function that appends to a text file, which gets its name when it is complete.
+
+        Until then the text is in a file of `partial_name`, also where the run is killed.
+        """
+        path = self._place(name)
+        partial = path.with_name(partial_name(name))
+        partial.unlink(missing_ok=True)
+        flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW
+        with os.fdopen(os.open(partial, flags, 0o666), "w", encoding="utf-8") as file:
+
+            def write(text: str) -> None:
+                file.write(text)
+                file.flush()
+                os.fsync(file.fileno())
+
+            yield write
+        os.replace(partial, path)
 
     def table(self, name: str, table: Printable, *, shown: Printable | Sequence[Printable] = ()) -> str:
         """Write a table as CSV with every digit and as Markdown.

@@ -88,40 +88,49 @@ class Done(NamedTuple):
 
 def groups(cfgs: Sequence[DictConfig]) -> list[list[int]]:
     """Return the indices of the configurations that may share one tensor batch, in order of appearance."""
-    found: dict[str, list[int]] = {}
-    for index, cfg in enumerate(cfgs):
-        found.setdefault(_group(cfg, index), []).append(index)
-    return list(found.values())
-
-
-def chunks(cfgs: Sequence[DictConfig], indices: Sequence[int]) -> list[list[int]]:
-    """Return the indices of a group in pieces that fit into memory together."""
-    parts: list[list[int]] = []
-    total = 0
-    for index in indices:
-        bytes_ = _size(cfgs[index])
-        if not parts or len(parts[-1]) >= _CHUNK or total + bytes_ > _KEPT_BYTES:
-            parts.append([])
-            total = 0
-        parts[-1].append(index)
-        total += bytes_
-    return parts
+    found, _ = _grouped(cfgs)
+    return found
 
 
 def batches(cfgs: Sequence[DictConfig], *, least: int = 1, most: int | None = None) -> list[list[int]]:
-    """Return the indices of every tensor batch, in order.
+    """Return the indices of every tensor batch, in order; what a batch keeps fits into memory together.
 
     Args:
-        cfgs: the settings of all jobs.
+        cfgs: the settings of all jobs, each of which is asked for once.
         least: so many batches at least, where that can be, to keep that many workers busy.
         most: jobs of a batch at most; None for as many as memory allows.
     """
-    grouped, found = groups(cfgs), []
+    grouped, sizes = _grouped(cfgs)
+    found = []
     for group in grouped:
         length = min(most or len(group), -(-len(group) * len(grouped) // least))
-        for chunk in chunks(cfgs, group):
+        for chunk in _chunks(sizes, group):
             found += [chunk[i : i + length] for i in range(0, len(chunk), length)]
     return sorted(found)
+
+
+def _grouped(cfgs: Sequence[DictConfig]) -> tuple[list[list[int]], list[int]]:
+    """The groups, and how many bytes each configuration keeps until it is written."""
+    found: dict[str, list[int]] = {}
+    sizes = []
+    for index in range(len(cfgs)):
+        key, size = _group_and_size(cfgs[index], index)
+        found.setdefault(key, []).append(index)
+        sizes.append(size)
+    return list(found.values()), sizes
+
+
+def _chunks(sizes: Sequence[int], indices: Sequence[int]) -> list[list[int]]:
+    """The indices of a group in pieces that fit into memory together."""
+    parts: list[list[int]] = []
+    total = 0
+    for index in indices:
+        if not parts or len(parts[-1]) >= _CHUNK or total + sizes[index] > _KEPT_BYTES:
+            parts.append([])
+            total = 0
+        parts[-1].append(index)
+        total += sizes[index]
+    return parts
 
 
 def solve(cfgs: Sequence[DictConfig], progress: Progress) -> list[Outcome]:
@@ -161,17 +170,19 @@ def completion(cfg: DictConfig, outcome: Outcome) -> Experiment:
             return outcome.replay
 
 
-def _group(cfg: DictConfig, index: int) -> str:
-    """Return a text that is equal for the members of a group."""
+def _group_and_size(cfg: DictConfig, index: int) -> tuple[str, int]:
+    """A text that is equal for the members of a group, and the bytes that the solution keeps."""
+    key, size = json.dumps(index), 0
     try:
         study, settings = experiment(cfg.task), records.flat(cfg)
         if isinstance(study, BatchedExperiment):
             names = study.batchable
             static = [[name, _form(value) if name in names else value] for name, value in settings.items()]
-            return json.dumps([study.shape(settings), *static])
+            key = json.dumps([study.shape(settings), *static])
+            size = study.size(settings)
     except _UNREADABLE:
         pass
-    return json.dumps(index)
+    return key, size
 
 
 def _form(value: Any) -> Any:
@@ -179,14 +190,6 @@ def _form(value: Any) -> Any:
     if isinstance(value, list):
         return [_form(entry) for entry in value]
     return "number" if isinstance(value, int | float) and not isinstance(value, bool) else [value]
-
-
-def _size(cfg: DictConfig) -> int:
-    try:
-        study = experiment(cfg.task)
-        return study.size(records.flat(cfg)) if isinstance(study, BatchedExperiment) else 0
-    except _UNREADABLE:
-        return 0
 
 
 def sentence(error: BaseException) -> str:

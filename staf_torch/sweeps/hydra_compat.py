@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, cast
 
 import hydra
+import yaml
 from hydra._internal import config_loader_impl
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
@@ -40,11 +41,13 @@ from hydra.core.utils import env_override as env_override
 from hydra.errors import ConfigCompositionException
 from hydra.types import HydraContext, RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
+from omegaconf._utils import get_omega_conf_dumper
 from omegaconf.errors import OmegaConfBaseException
 
 from ..settings import config_directory as config_directory
 
 _PACKAGE = Path(__file__).resolve().parent.parent
+_KEPT_JOBS = 64
 _TRUSTED = ("staf_torch.*",)
 _HAS_WHITELIST = "execution_whitelist" in inspect.signature(hydra.main).parameters
 """Hydra 1.4: only trusted targets are instantiated. That version also ends sweeps that failed by itself."""
@@ -235,10 +238,10 @@ def _yaml(node: DictConfig, parent: str | None = None) -> str:
 
 @functools.lru_cache(1000)
 def _yaml_part(key: str, part: str, parent: str | None) -> str:
-    node = {key: json.loads(part)}
-    if parent is None:
-        return OmegaConf.to_yaml(OmegaConf.create(node))
-    return OmegaConf.to_yaml(OmegaConf.create({parent: node})).partition("\n")[2]
+    node = {key: json.loads(part)} if parent is None else {parent: {key: json.loads(part)}}
+    dumper, as_hydra = get_omega_conf_dumper(), {"allow_unicode": True, "sort_keys": False}
+    text: str = yaml.dump(node, Dumper=dumper, default_flow_style=False, **as_hydra)
+    return text if parent is None else text.partition("\n")[2]
 
 
 def without_hydra_overrides(overrides: Sequence[str]) -> list[str]:
@@ -386,11 +389,12 @@ class ComposeOnce:
             composed = self._compose([*master_config.hydra.overrides.hydra, *key])
             # Times and the like are those at which the sweep began.
             OmegaConf.copy_cache(from_config=master_config, to_config=composed)
+            if len(self._kept) >= _KEPT_JOBS:  # half a megabyte each
+                self._kept.clear()
             self._kept[key] = composed
         return self._kept[key]
 
     def take(self, master_config: DictConfig, sweep_overrides: Sequence[str]) -> DictConfig:
         """Return the configuration of a job and forget it: the caller may change it."""
-        composed = self.load_sweep_config(master_config, sweep_overrides)
-        del self._kept[tuple(sweep_overrides)]
-        return composed
+        self.load_sweep_config(master_config, sweep_overrides)
+        return self._kept.pop(tuple(sweep_overrides))

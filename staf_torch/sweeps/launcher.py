@@ -11,7 +11,7 @@ import sys
 import time
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar, overload
 
 from omegaconf import DictConfig
 from tqdm.auto import tqdm
@@ -34,6 +34,8 @@ _NOT_BATCHED = (
     "the jobs of this program cannot share tensor batches, which only the experiments of `staf` can; "
     "they run one by one. hydra/launcher=joblib runs them side by side"
 )
+T = TypeVar("T")
+_KEPT_JOBS = 128  # as many as a batch has
 _BAR_EVERY, _LINE_EVERY = 0.2, 10.0  # s
 
 
@@ -114,12 +116,80 @@ class Job(NamedTuple):
     @property
     def name(self) -> str:
         """`job 3 (kernel=gaussian seed=1)`."""
-        return f"job {self.num} ({' '.join(records.own(without_hydra_overrides(self.overrides)))})"
+        return job_name(self.num, self.overrides)
 
     @property
     def directory(self) -> Path:
         """The run directory."""
         return Path(str(self.config.hydra.sweep.dir)) / str(self.config.hydra.sweep.subdir)
+
+
+def job_name(num: int, overrides: Sequence[str]) -> str:
+    """Return `job 3 (kernel=gaussian seed=1)`."""
+    return f"job {num} ({' '.join(records.own(without_hydra_overrides(overrides)))})"
+
+
+class _Jobs(Sequence[Job]):
+    """The jobs of a sweep, composed when they are asked for: settings take half a megabyte a job.
+
+    Args:
+        numbered: number of a job to its overrides, in order.
+        make: composes a job.
+    """
+
+    def __init__(self, numbered: Mapping[int, list[str]], make: Callable[[int, list[str]], Job]) -> None:
+        self._numbered, self._make = numbered, make
+        self._order = list(numbered)
+        self._kept: dict[int, Job] = {}  # the latest ones
+
+    def __len__(self) -> int:
+        return len(self._order)
+
+    @overload
+    def __getitem__(self, index: int) -> Job: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> list[Job]: ...
+
+    def __getitem__(self, index: int | slice) -> Job | list[Job]:
+        if isinstance(index, slice):
+            return [self[i] for i in range(*index.indices(len(self)))]
+        num = self._order[index]
+        if num not in self._kept:
+            while len(self._kept) >= _KEPT_JOBS:
+                del self._kept[next(iter(self._kept))]
+            self._kept[num] = self._make(num, self._numbered[num])
+        return self._kept[num]
+
+    @property
+    def numbers(self) -> list[int]:
+        """The numbers of the jobs, in order."""
+        return self._order
+
+    def forget(self, job: Job) -> None:
+        """Drop a job that has ended; its settings are its own from `__getitem__` on."""
+        self._kept.pop(job.num, None)
+
+
+class _Each(Sequence[T]):
+    """A function of every job, called when it is asked for."""
+
+    def __init__(self, jobs: _Jobs, function: Callable[[Job], T]) -> None:
+        self._jobs, self._function = jobs, function
+
+    def __len__(self) -> int:
+        return len(self._jobs)
+
+    @overload
+    def __getitem__(self, index: int) -> T: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> list[T]: ...
+
+    def __getitem__(self, index: int | slice) -> T | list[T]:
+        if isinstance(index, slice):
+            return [self._function(job) for job in self._jobs[index]]
+        return self._function(self._jobs[index])
 
 
 class Launch:
@@ -134,6 +204,7 @@ class Launch:
         self._context = SweepContext(launcher.hydra_context, launcher.config)
         self._task: Callable[[DictConfig], Any] = launcher.task_function
         self._directory = Path(str(launcher.config.hydra.sweep.dir))
+        self._directories: dict[int, Path] = {}  # of the jobs that ran
         if launcher.batch is not None:
             integer("hydra.launcher", "batch", launcher.batch, least=1)
         choice("hydra.launcher", "foreign", launcher.foreign, _FOREIGN)
@@ -148,7 +219,7 @@ class Launch:
             self._directory.mkdir(parents=True, exist_ok=True)
             numbered = {first + i: list(overrides) for i, overrides in enumerate(job_overrides)}
             records.list_jobs(self._directory, numbered)
-            jobs = [self._job(num, overrides) for num, overrides in numbered.items()]
+            jobs = _Jobs(numbered, self._job)
             returns = self._finished(jobs)
             progress = SweepProgress(len(jobs), len(returns))
             try:
@@ -156,20 +227,24 @@ class Launch:
                     for job, task in computed:
                         self._still_there(len(returns), len(jobs))
                         ended = self._replay(job, task)
+                        jobs.forget(job)
                         failure = ended._return_value if ended.status == JobStatus.FAILED else None
                         progress.ended(job.name, None if failure is None else reason(failure))
                         returns[job.num] = ended
             finally:
                 progress.close()
                 self._sweep_logging()
-        self._refuse_lost(jobs, returns)
+        self._refuse_lost(numbered, returns)
         failed = sum(ended.status == JobStatus.FAILED for ended in returns.values())
         _log.info("%d of %d jobs completed, %d failed", len(jobs) - failed, len(jobs), failed)
         return [returns[num] for num in numbered]
 
     def _replay(self, job: Job, task: Callable[[DictConfig], Any]) -> JobReturn:
-        """Run a job whose outcome is known as Hydra runs one."""
-        return self._context.run_job(task, job.config, job.settings)
+        """Run a job whose outcome is known as Hydra runs one, and keep no settings of it."""
+        ended = self._context.run_job(task, job.config, job.settings)
+        ended.cfg = ended.hydra_cfg = None
+        self._directories[job.num] = job.directory
+        return ended
 
     def _still_there(self, done: int, jobs: int) -> None:
         """Raise OSError if the directory of the sweep was taken away: nobody wants it made anew."""
@@ -180,15 +255,16 @@ class Launch:
                 f"{jobs} jobs were done, and those are lost."
             )
 
-    def _refuse_lost(self, jobs: Sequence[Job], returns: Mapping[int, JobReturn]) -> None:
+    def _refuse_lost(self, numbered: Mapping[int, list[str]], returns: Mapping[int, JobReturn]) -> None:
         """Turn jobs whose results have gone since they ended into failed ones."""
-        self._still_there(len(returns), len(jobs))
-        for job in jobs:
-            ended = returns[job.num]
+        self._still_there(len(returns), len(numbered))
+        for num, directory in self._directories.items():
+            ended = returns[num]
             complete = self._task is execute and ended.status == JobStatus.COMPLETED
-            if complete and not (job.directory / METRICS).exists():
-                error = ValueError(f"the results of {job.name} are not in {job.directory} any more")
-                sys.stderr.write(f"{job.name} failed: {error}\n")
+            if complete and not (directory / METRICS).exists():
+                name = job_name(num, numbered[num])
+                error = ValueError(f"the results of {name} are not in {directory} any more")
+                sys.stderr.write(f"{name} failed: {error}\n")
                 ended.status, ended.return_value = JobStatus.FAILED, error
 
     def _sweep_logging(self) -> None:
@@ -201,7 +277,7 @@ class Launch:
         config = self._context.job_config(num, overrides)
         return Job(num, overrides, config, records.without_hydra(config))
 
-    def _finished(self, jobs: list[Job]) -> dict[int, JobReturn]:
+    def _finished(self, jobs: _Jobs) -> dict[int, JobReturn]:
         """Return the jobs that an earlier start of this sweep completed."""
         found: dict[int, JobReturn] = {}
         if not records.resumed(self._context.master):
@@ -218,7 +294,7 @@ class Launch:
         return found
 
     def _computed(
-        self, jobs: list[Job], finished: set[int], progress: SweepProgress
+        self, jobs: _Jobs, finished: set[int], progress: SweepProgress
     ) -> Generator[tuple[Job, Callable[[DictConfig], Any]], None, None]:
         """Yield every job that is not finished with the task that ends it, as the tensor batches end."""
         if self._task is not execute:
@@ -231,10 +307,10 @@ class Launch:
         about = self._launcher
         with executor(about.executor, about.workers, about.arguments, self._directory) as workers:
             outcomes = compute(
-                [job.settings for job in jobs],
-                [job.directory for job in jobs],
+                _Each(jobs, lambda job: job.settings),
+                _Each(jobs, lambda job: job.directory),
                 workers,
-                finished={i for i, job in enumerate(jobs) if job.num in finished},
+                finished={i for i, num in enumerate(jobs.numbers) if num in finished},
                 most=about.batch,
                 tell=progress.computed,
             )
@@ -249,7 +325,7 @@ def _seldom_collecting() -> Iterator[None]:
     all of them for cycles after every few, a fifth of the time of a sweep."""
     before = gc.get_threshold()
     gc.freeze()  # the half a million objects of torch are here to stay
-    gc.set_threshold(200_000, 50, 50)
+    gc.set_threshold(100_000, 10, 10)
     try:
         yield
     finally:

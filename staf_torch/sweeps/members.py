@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import logging
 import statistics
+from array import array
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,7 @@ from .executors import Inline, compute
 from .hydra_compat import Composer, ConfigLoader, config_loader, parse_override, product
 
 _log = logging.getLogger(__name__)
+_PIECE = 1024  # members that are composed and written together: memory does not grow with their number
 _LISTED = 20  # members that the log shows one by one
 _SHOWN = ("ultimate_error", "floor_error", "ball_error", "ultimate_excess", "diverged_fraction")
 
@@ -54,24 +56,23 @@ def run(
     loader = config_loader()
     jobs = member_overrides(cfg.members, loader)
     composer = Composer(loader, config_name, hydra_node=False)
-    cfgs = [composer([*base, *job, "figures=false", f"history={str(keep).lower()}"]) for job in jobs]
-    places = [directory / "members" / str(number) for number in range(len(cfgs))]
-    rows: list[dict[str, Any]] = [{} for _ in cfgs]
-    with progress.over(len(cfgs), "members") as advance:
-        for index, outcome, _ in compute(cfgs, places, Inline(), tell=lambda jobs: None):
-            row = {"num": index, "overrides": jobs[index]}
-            rows[index] = row | _result(cfgs[index], outcome, places[index], keep, progress)
-            advance(1)
-    out = RunDirectory(directory)
-    lines = ",\n".join(json.dumps(row, allow_nan=False) for row in rows)  # one member a line
-    out.text(MEMBERS, f'{{"version": {json.dumps(__version__)}, "members": [\n{lines}\n]}}\n')
-    _report(rows)
-    counts: Metrics = {
-        "members": len(rows),
-        "failed": sum(row["status"] == "failed" for row in rows),
-        "diverged": sum(bool(row["metrics"].get("diverged_fraction")) for row in rows),
-    }
-    return out.metrics(counts)
+    out, tally = RunDirectory(directory), _Tally()
+    with progress.over(len(jobs), "members") as advance, out.lines(MEMBERS) as write:
+        write(f'{{"version": {json.dumps(__version__)}, "members": [\n')
+        for begin in range(0, len(jobs), _PIECE):
+            part = jobs[begin : begin + _PIECE]
+            cfgs = [composer([*base, *job, "figures=false", f"history={str(keep).lower()}"]) for job in part]
+            places = [directory / "members" / str(begin + index) for index in range(len(part))]
+            rows: list[dict[str, Any]] = [{} for _ in part]
+            for index, outcome, _ in compute(cfgs, places, Inline(), tell=lambda jobs: None):
+                row = {"num": begin + index, "overrides": part[index]}
+                rows[index] = row | _result(cfgs[index], outcome, places[index], keep, progress)
+                advance(1)
+            tally.add(rows)
+            lines = ",\n".join(json.dumps(row, allow_nan=False) for row in rows)  # one member a line
+            write(lines + (",\n" if begin + _PIECE < len(jobs) else "\n]}\n"))
+    tally.report()
+    return out.metrics(tally.counts())
 
 
 def member_overrides(setting: Any, loader: ConfigLoader) -> list[list[str]]:
@@ -113,22 +114,48 @@ def _result(
     return {"status": "completed", "reason": None, "metrics": metrics}
 
 
-def _report(rows: Sequence[dict[str, Any]]) -> None:
-    """Log a short table: the members themselves where they are few, else the spread of each metric."""
-    for row in [row for row in rows if row["status"] == "failed"][:_LISTED]:
-        _log.error("member %d (%s): %s", row["num"], " ".join(row["overrides"]), row["reason"])
-    if len(rows) <= _LISTED:
-        shown = [name for name in _SHOWN if any(name in row["metrics"] for row in rows)]
-        cells: list[dict[str, Value]] = [
-            {"member": " ".join(row["overrides"]), **row["metrics"]} for row in rows
-        ]
-        names: tuple[str, ...] = ("member", *shown)
-    else:
-        cells, names = [], ("metric", "least", "median", "most", "members")
-        for name in dict.fromkeys(name for row in rows for name in row["metrics"]):
-            found = [row["metrics"][name] for row in rows if row["metrics"].get(name) is not None]
-            if found:
-                numbers = (name, min(found), statistics.median(found), max(found), len(found))
-                cells.append(dict(zip(names, numbers, strict=True)))
-    for line in Table.of(cells, {name: name for name in names}).markdown().splitlines():
-        _log.info("%s", line)
+class _Tally:
+    """What the log says of all members in the end, and their counts; many rows are not kept."""
+
+    def __init__(self) -> None:
+        self._count = self._failed = self._diverged = 0
+        self._rows: list[dict[str, Any]] = []  # while they are few
+        self._bad: list[dict[str, Any]] = []
+        self._numbers: dict[str, array[float]] = {}
+
+    def add(self, rows: Sequence[dict[str, Any]]) -> None:
+        """Count further rows."""
+        for row in rows:
+            self._count += 1
+            self._diverged += bool(row["metrics"].get("diverged_fraction"))
+            if row["status"] == "failed":
+                self._failed += 1
+                self._bad += [row] * (len(self._bad) < _LISTED)
+            self._rows += [row] * (len(self._rows) <= _LISTED)
+            for name, value in row["metrics"].items():
+                numbers = self._numbers.setdefault(name, array("d"))
+                if value is not None:
+                    numbers.append(value)
+
+    def counts(self) -> Metrics:
+        """What `metrics.json` holds."""
+        return {"members": self._count, "failed": self._failed, "diverged": self._diverged}
+
+    def report(self) -> None:
+        """Log a short table: the members themselves where they are few, else the spread of each metric."""
+        for row in self._bad:
+            _log.error("member %d (%s): %s", row["num"], " ".join(row["overrides"]), row["reason"])
+        if self._count <= _LISTED:
+            shown = [name for name in _SHOWN if any(name in row["metrics"] for row in self._rows)]
+            cells: list[dict[str, Value]] = [
+                {"member": " ".join(row["overrides"]), **row["metrics"]} for row in self._rows
+            ]
+            names: tuple[str, ...] = ("member", *shown)
+        else:
+            cells, names = [], ("metric", "least", "median", "most", "members")
+            for name, found in self._numbers.items():
+                if found:
+                    numbers = (name, min(found), statistics.median(found), max(found), len(found))
+                    cells.append(dict(zip(names, numbers, strict=True)))
+        for line in Table.of(cells, {name: name for name in names}).markdown().splitlines():
+            _log.info("%s", line)

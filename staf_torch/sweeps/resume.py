@@ -20,9 +20,9 @@ _NOT_TAKEN_OVER = ("hydra.mode", "hydra.sweep.dir", "sweep.resume", "sweep.resum
 _HARMLESS = re.compile(
     r"hydra/launcher=(batched|basic|joblib)|hydra/sweeper=(basic|optuna)|hydra\.mode=\w+|hydra\.verbose=\w+"
     r"|hydra\.launcher\.(executor|workers|batch|n_jobs)=\w+"
-    r"|hydra\.launcher\.submitit\.(timeout_min|mem_gb|nodes|cpus_per_task|gpus_per_node|cluster)=\w+"
+    r"|\+*hydra\.launcher\.submitit\.(timeout_min|mem_gb|nodes|cpus_per_task|gpus_per_node|cluster)=\w+"
     r"|\+*hydra\.launcher\.submitit\.slurm_(partition|account|qos|time|array_parallelism)=[\w-]+"
-    r"|hydra\.launcher\.ray\.num_cpus=\d+|hydra\.sweeper\.(n_trials|n_jobs|sampler\.seed)=\d+"
+    r"|\+*hydra\.launcher\.ray\.num_cpus=\d+|hydra\.sweeper\.(n_trials|n_jobs|sampler\.seed)=\d+"
     r"|hydra\.sweeper\.direction=\w+|hydra\.sweep\.dir=.*|hydra\.run\.dir=.*"
 )
 """Hydra's lines that can only say where and how often jobs run."""

@@ -229,8 +229,8 @@ def test_writing_what_was_solved_leaves_what_a_run_leaves(tmp_path: Path) -> Non
 def test_chunks_hold_what_memory_allows_in_order(monkeypatch: pytest.MonkeyPatch) -> None:
     cfgs = compose(["history=true"], ["seed=range(6)"])
     group = list(range(6))
-    assert batching.chunks(cfgs, group) == [group]
+    assert batching.batches(cfgs) == [group]
     monkeypatch.setattr(batching, "_CHUNK", 4)
-    assert batching.chunks(cfgs, group) == [group[:4], group[4:]]
+    assert batching.batches(cfgs) == [group[:4], group[4:]]
     monkeypatch.setattr(batching, "_KEPT_BYTES", 1)
-    assert batching.chunks(cfgs, group) == [[index] for index in group]
+    assert batching.batches(cfgs) == [[index] for index in group]

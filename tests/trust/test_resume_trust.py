@@ -180,7 +180,7 @@ HARMLESS = ["kernel=gaussian,matern", "centers.radius=0.1,0.2", "adp/policy=lqr"
 HARMLESS += ["members=['seed=range(9)']", "initial_state=[1.0,0.0]", "hydra.launcher.executor=process"]
 HARMLESS += [
     "hydra/sweeper=optuna",
-    "hydra.launcher.submitit.timeout_min=10",
+    "+hydra.launcher.submitit.timeout_min=10",
     "centers.radius=interval(0.1,0.2)",
 ]
 

@@ -1,0 +1,78 @@
+"""The jobs of a sweep as tensor batches, and what becomes of each as the batches end."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Collection, Generator, Sequence
+from pathlib import Path
+from typing import overload
+
+from omegaconf import DictConfig
+
+from ...results.progress import Progress
+from ..batching import Batch, Outcome, batches
+from .base import Executor
+
+_log = logging.getLogger(__name__)
+
+
+class _Batches(Sequence[Batch]):
+    """Batches whose settings are looked up when a batch begins."""
+
+    def __init__(
+        self, planned: Sequence[list[int]], settings: Sequence[DictConfig], directories: Sequence[Path]
+    ) -> None:
+        self._planned, self._settings, self._directories = planned, settings, directories
+
+    def __len__(self) -> int:
+        return len(self._planned)
+
+    @overload
+    def __getitem__(self, index: int) -> Batch: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> list[Batch]: ...
+
+    def __getitem__(self, index: int | slice) -> Batch | list[Batch]:
+        if isinstance(index, slice):
+            return [self[i] for i in range(*index.indices(len(self)))]
+        jobs = self._planned[index]
+        return Batch([self._settings[i] for i in jobs], [str(self._directories[i]) for i in jobs])
+
+
+def compute(
+    settings: Sequence[DictConfig],
+    directories: Sequence[Path],
+    workers: Executor,
+    *,
+    finished: Collection[int] = frozenset(),
+    most: int | None = None,
+    tell: Callable[[float], None],
+) -> Generator[tuple[int, Outcome, float], None, None]:
+    """Yield index, outcome and seconds of every job that is not finished, as the tensor batches end.
+
+    A batch of which some jobs are finished is computed as a whole: rounding depends on the others in it, and
+    a sweep that was interrupted ends with the very numbers that it would have had.
+
+    Args:
+        settings: of every job.
+        directories: of every run.
+        workers: compute the batches.
+        finished: indices of jobs that need no outcome.
+        most: jobs of a batch at most.
+        tell: is told how many jobs are computed, with fractions while this process computes a batch.
+    """
+    done = 0
+    planned = batches(settings, least=workers.pieces, most=most)
+    planned = [batch for batch in planned if not set(finished).issuperset(batch)]
+    _log.info("%d jobs in %d tensor batches", len(settings), len(planned))
+    given = _Batches(planned, settings, directories)
+    wanted = [[i for i in batch if i not in finished] for batch in planned]
+    left = [len(batch) for batch in wanted]
+    listening = Progress(lambda share: tell(done + share * next(filter(None, left), 0)))
+    for number, (outcomes, seconds) in workers.map(given, listening):
+        done, left[number] = done + left[number], 0
+        tell(done)
+        found = dict(zip(planned[number], outcomes, strict=True))
+        for index in wanted[number]:
+            yield index, found[index], seconds / len(outcomes)

@@ -1,0 +1,177 @@
+"""Tensor batches as jobs of SLURM, with or without its accounting, or of this machine, by submitit."""
+
+from __future__ import annotations
+
+import logging
+import os
+import socket
+import subprocess
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from ...results.progress import Progress
+from ..batching import Batch, Done
+from ..lock import NAME
+from ..workers import LostError, beginning, end_with, end_with_file
+from .base import Executor, GivenUpError
+from .remote import pack, solve_elsewhere, unpack
+
+_log = logging.getLogger(__name__)
+_LOOK, _ASK = 0.5, 10.0  # s between two looks for results, and two questions to SLURM
+_GRACE = 20.0  # s that a result may take from another machine to here
+_GOES_ON = {
+    *("PENDING", "RUNNING", "SUSPENDED", "COMPLETING", "CONFIGURING", "RESIZING", "STOPPED", "SIGNALING"),
+    *("REQUEUED", "REQUEUE_FED", "REQUEUE_HOLD", "SPECIAL_EXIT", "STAGE_OUT", "POWER_UP_NODE"),
+}
+_FINAL = {  # states that nobody should try again, and what they mean
+    "CANCELLED": "was cancelled",
+    "TIMEOUT": "ran into its time limit: give it more by hydra.launcher.submitit.timeout_min",
+    "DEADLINE": "did not end before its deadline",
+    "OUT_OF_MEMORY": "had too little memory: give it more by hydra.launcher.submitit.mem_gb",
+}
+
+
+class Task:
+    """What a job computes. SLURM puts it into the queue again where a job runs out of time or is preempted.
+
+    Args:
+        parent: host, process and beginning of the command, which a job on the same machine ends with; None:
+            the job ends when the lock of the sweep is not touched any more.
+        lock: file that the command touches.
+    """
+
+    def __init__(self, parent: tuple[str, int, str] | None, lock: Path) -> None:
+        self._parent, self._lock = parent, lock
+
+    def __call__(self, pickled: bytes, path: Sequence[str]) -> bytes:
+        """Return what `solve_elsewhere` returns."""
+        if self._parent is not None and self._parent[0] == socket.gethostname():
+            end_with(self._parent[1], self._parent[2])
+        elif self._parent is None and self._lock.exists():
+            end_with_file(self._lock)
+        return solve_elsewhere(pickled, path)
+
+    def checkpoint(self, *arguments: Any) -> Any:
+        """Begin the batch anew: its rounding depends on all of its jobs. Other batches keep theirs."""
+        from submitit.helpers import DelayedSubmission
+
+        return DelayedSubmission(self, *arguments)
+
+
+class Submitit(Executor):
+    """One job of a SLURM cluster, or of this machine, a tensor batch.
+
+    Args:
+        workers: jobs at once; None for one a core on this machine, and any number on a cluster.
+        directory: of the sweep.
+        arguments: of `submitit.AutoExecutor.update_parameters`; also `cluster`, which is `slurm` where
+            there is one, else `local`, `folder` of submitit's files, and `slurm_max_num_timeout`, how often
+            a job that runs out of time begins anew.
+    """
+
+    def __init__(self, workers: int | None, directory: Path, arguments: Mapping[str, Any]) -> None:
+        super().__init__(workers)
+        import submitit
+
+        parameters = dict(arguments)
+        place = parameters.pop("cluster", None)
+        folder = self._folder(parameters.pop("folder", None), directory)
+        starts = "slurm_max_num_timeout"  # an argument of the constructor
+        again = {starts: parameters.pop(starts)} if starts in parameters else {}
+        self._executor = submitit.AutoExecutor(folder=folder, cluster=place, **again)
+        self._executor.update_parameters(**{"name": "staf", "timeout_min": 24 * 60, **parameters})
+        self._local = self._executor.cluster in ("local", "debug")
+        parent = (socket.gethostname(), os.getpid(), beginning(os.getpid())) if self._local else None
+        self._task = Task(parent, (directory / NAME).absolute())
+        self._running: dict[str, Any] = {}
+        self._states: dict[str, str] = {}
+        self._asked_at = 0.0
+        self._ended_at: dict[str, float] = {}  # when a job was first seen to have ended without a result
+
+    @staticmethod
+    def _folder(wanted: str | None, directory: Path) -> Path:
+        """Make a fresh folder.
+
+        SLURM before 23.02 makes none for its logs; and what an earlier start, or a stranger, left under the
+        number of a job would be taken for its result.
+        """
+        above = directory / ".submitit" if wanted is None else Path(str(wanted).partition("%")[0])
+        above.mkdir(parents=True, exist_ok=True)
+        return Path(tempfile.mkdtemp(dir=above))
+
+    @property
+    def workers(self) -> int:
+        return super().workers if self._asked or self._local else 10**6
+
+    @property
+    def pieces(self) -> int:
+        return self.workers if self._asked or self._local else 1
+
+    def close(self, *, failed: bool) -> None:
+        for job in self._running.values():
+            job.cancel(check=False)
+        self._running = {}
+
+    def submit(self, batch: Batch, progress: Progress) -> Any:
+        job = self._executor.submit(self._task, *pack(batch))
+        self._running[job.job_id] = job
+        return job
+
+    def wait(self, handles: dict[int, Any]) -> list[int]:
+        while True:
+            ended = [number for number, job in handles.items() if self._has_ended(job)]
+            if ended:
+                return ended
+            time.sleep(_LOOK)
+
+    def result(self, handle: Any) -> Done:
+        self._running.pop(handle.job_id, None)
+        log = handle.paths.stderr
+        if not handle.paths.result_pickle.exists():
+            state = "gone" if self._local else self._states.get(handle.job_id, "gone")
+            how = _FINAL.get(state, f"ended without a result ({state})")
+            why = f"{self._name(handle)} {how}; its log: {log}"
+            raise GivenUpError(why) if state in _FINAL else LostError(why)
+        try:
+            return unpack(handle.result())
+        except Exception as error:
+            said = next((line for line in reversed(str(error).splitlines()) if line.strip()), "")
+            why = f"{self._name(handle)} {said.strip()}; its log: {log}"
+            raise GivenUpError(why) if "timed-out" in said else LostError(why) from error
+
+    def _name(self, job: Any) -> str:
+        return f"{'the process' if self._local else 'SLURM job'} {job.job_id}"
+
+    def _has_ended(self, job: Any) -> bool:
+        """Whether a job left a result, or will leave none."""
+        if job.paths.result_pickle.exists():
+            return True
+        if self._local:
+            return bool(job.done())
+        self._ask()
+        if self._states.get(job.job_id, "gone") in _GOES_ON:
+            self._ended_at.pop(job.job_id, None)
+            return False
+        return time.monotonic() - self._ended_at.setdefault(job.job_id, time.monotonic()) > _GRACE
+
+    def _ask(self) -> None:
+        """Ask the controller for the states of all jobs, now and then: accounting is not needed for that."""
+        if time.monotonic() - self._asked_at < _ASK:
+            return
+        self._asked_at = time.monotonic()
+        line = ["squeue", "--noheader", "--me", "--states=all", "--format=%i %T"]
+        try:
+            found = subprocess.run(line, capture_output=True, text=True, timeout=60, check=True).stdout
+        except (OSError, subprocess.SubprocessError) as error:
+            _log.warning("SLURM does not answer (%s); asked again in %.0f s", error, _ASK)
+            self._states = {job: self._states.get(job, "PENDING") for job in self._running}
+            return
+        now = dict(line.split() for line in found.splitlines() if len(line.split()) == 2)
+        # The controller forgets what ended; what was known then stays known.
+        final = {job: state for job, state in self._states.items() if state not in _GOES_ON}
+        self._states = {**final, **now}
+        for job in self._running:
+            self._states.setdefault(job, "gone")
