@@ -36,6 +36,7 @@ from .laws import Weights as Weights
 from .memory_growth import learn_global_value as learn_global_value
 from .near_optimal import NearOptimal as NearOptimal
 from .near_optimal import near_optimal as near_optimal
+from .receding_horizon import RecedingHorizon as RecedingHorizon
 from .rollout import RolloutPolicy as RolloutPolicy
 from .sampled_problem import SampledProblem as SampledProblem
 from .sampled_rollout import SampledRollout as SampledRollout
@@ -83,6 +84,7 @@ __all__ = [
     "QuadraturePoints",
     "RBFGridBasis",
     "RandomPoints",
+    "RecedingHorizon",
     "RolloutPolicy",
     "SampledProblem",
     "SampledRollout",
