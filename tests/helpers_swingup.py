@@ -26,6 +26,23 @@ def pendulum() -> adp.SampledProblem:
 
 REGION = [math.pi, 8.0]
 
+# Gymnasium's Pendulum-v1, reset with the seeds 0 to 7, and what a controller from dynamic programming on a
+# grid of 640 x 641 states and 33 controls pays from there in 200 steps.
+RESETS = torch.tensor(
+    [
+        [0.860556, -0.460427],
+        [0.074277, 0.900927],
+        [-1.497835, -0.403018],
+        [-2.603443, -0.526379],
+        [2.783804, 0.022655],
+        [1.91639, 0.615882],
+        [0.239794, -0.313458],
+        [0.785998, 0.794428],
+    ],
+    dtype=torch.float64,
+)
+GRID = torch.tensor([121.64, 0.37, 115.87, 217.06, 226.77, 113.93, 0.42, 121.54], dtype=torch.float64)
+
 
 def double_integrator(low: float | None = None, high: float | None = None) -> adp.SampledProblem:
     """A mass that is pushed, in steps of 0.1 s, for x'x + u'u a second."""

@@ -34,8 +34,12 @@ from .laws import Information as Information
 from .laws import Published as Published
 from .laws import Weights as Weights
 from .memory_growth import learn_global_value as learn_global_value
+from .near_optimal import NearOptimal as NearOptimal
+from .near_optimal import near_optimal as near_optimal
+from .receding_horizon import RecedingHorizon as RecedingHorizon
 from .rollout import RolloutPolicy as RolloutPolicy
 from .sampled_problem import SampledProblem as SampledProblem
+from .sampled_rollout import SampledRollout as SampledRollout
 from .sampling import HeldStability as HeldStability
 from .sampling import held_stability as held_stability
 from .shooting import DirectShooting as DirectShooting
@@ -71,6 +75,7 @@ __all__ = [
     "Information",
     "LeadingCoordinates",
     "LoopResult",
+    "NearOptimal",
     "Optimum",
     "PlanReplay",
     "Published",
@@ -79,8 +84,10 @@ __all__ = [
     "QuadraturePoints",
     "RBFGridBasis",
     "RandomPoints",
+    "RecedingHorizon",
     "RolloutPolicy",
     "SampledProblem",
+    "SampledRollout",
     "StaFValueBasis",
     "Supervised",
     "Trajectories",
@@ -93,6 +100,7 @@ __all__ = [
     "held_stability",
     "hjb_residual",
     "learn_global_value",
+    "near_optimal",
     "simulate",
     "tracking_cost",
     "value_gradient",

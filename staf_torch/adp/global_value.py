@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from ..lanes import Program, scan
 from ..numerics.checks import fail, integer, positive_real, trailing, vector
 from .sampled_problem import SampledProblem
-from .trajectory_optimisation import Reference, Trajectories
+from .trajectory_optimisation import LocalModel, Reference, Trajectories
 
 _TOGETHER = 4096  # candidates rolled out at once
 _REACH = 0.3  # of the region: a rollout that ends further from what it follows has lost it
@@ -151,14 +151,14 @@ class GlobalValue(nn.Module):
 
     def gradient(self, x: Tensor) -> Tensor:
         """g_j + H_j d of the model that the best candidate starts at: (..., n) -> (..., n)."""
-        rows, n = x.reshape(-1, x.shape[-1]), self.problem.dim
-        entry = self.choose(rows).entry
-        model = self.models[entry]
-        d = self.problem.offset(rows, self.plans[entry, :n])
-        _, _, gradient, curvature = model.split((n, 1, n, n * n), dim=-1)
-        slope = gradient + (curvature.unflatten(-1, (n, n)) * d.unsqueeze(-2)).sum(-1)
-        found: Tensor = slope.reshape(x.shape)
-        return found
+        rows = x.reshape(-1, x.shape[-1])
+        return self.model(rows).slope(self.problem, rows).reshape(x.shape)
+
+    def model(self, x: Tensor) -> LocalModel:
+        """The remembered model that the best candidate starts from, at every state: (B, n)."""
+        entry, n = self.choose(x).entry, self.problem.dim
+        state, value, gradient, curvature = self.models[entry].split((n, 1, n, n * n), dim=-1)
+        return LocalModel(state, value.squeeze(-1), gradient, curvature.unflatten(-1, (n, n)))
 
     def bellman_residual(self, x: Tensor) -> Tensor:
         """(min_u [l(x, u) + V(F(x, u))] - V(x)) / V(x) over the policy's u and the corners of the bounds.

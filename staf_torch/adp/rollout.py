@@ -122,7 +122,7 @@ class RolloutPolicy(nn.Module):
             ValueError: if an argument breaks its rule, or the plant has no LQR.
         """
         lqr = LQR(system, cost)
-        directions = _ball(centers, lqr.k.shape[-1])
+        directions = ball_directions(centers, lqr.k.shape[-1])
         basis = StaFBasis(ExponentialKernel(), StateFollowingCenters(directions, radius))
         return cls(
             basis, system, cost, lqr, lqr.value, horizon=horizon, steps=steps, depth=depth, period=period
@@ -223,7 +223,7 @@ class _TwoPrograms:
         return self._improve(x, self._roll(at, u).view(batch, count))
 
 
-def _ball(count: int | None, dim: int) -> Tensor:
+def ball_directions(count: int | None, dim: int) -> Tensor:
     """Directions whose fit has an unbiased gradient at 0: all that quadratics need, or a symmetric cross."""
     if count is None and dim > 3:
         corners = cross_polytope(dim)

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from ..lanes import scan
+from ..lanes import each
 from ..numerics.angles import wrap
 from ..numerics.checks import fail, integer, positive_real, trailing
 from ..systems import Bounds, Plant
@@ -110,6 +110,11 @@ class SampledProblem(nn.Module):
         Raises:
             ValueError: if an argument breaks its rule, or as in `SampledProblem`.
         """
+        if not plant.traceable:
+            rule = (
+                "must be written in torch all through: trajectories are optimised by its second derivatives"
+            )
+            raise fail("SampledProblem.of", "plant", rule, plant)
         cost = cost.bounded(low, high).around(plant)
         if cost.discount:
             raise fail("SampledProblem.of", "cost", "must have no discount", cost.discount)
@@ -178,27 +183,29 @@ class SampledProblem(nn.Module):
     def derivatives(self, x: Tensor, u: Tensor) -> Derivatives:
         """First and second derivatives of F and l with respect to z = (x, u): (B, n), (B, m).
 
-        Along pairs of coordinates, one after the other: a compiler gets the text of one pair.
+        Along pairs of coordinates: a compiled program goes through them, and its text is that of one.
         """
         _use_forward_mode()
         z, n = torch.cat((x, u), dim=-1), self.dim
 
         def both(z: Tensor) -> Tensor:
-            after, paid = self.step(z[:, :n], z[:, n:])
+            after, paid = self.advance(z[..., :n], z[..., n:])
             return torch.cat((after, paid.unsqueeze(-1)), dim=-1)
 
-        def along(carry: tuple[()], pair: tuple[Tensor, Tensor]) -> tuple[tuple[()], tuple[Tensor, Tensor]]:
-            one, other = (direction.expand_as(z) for direction in pair)
-            found = torch.func.jvp(lambda y: torch.func.jvp(both, (y,), (one,))[1], (z,), (other,))
-            return carry, (found[0], found[1])
+        def along(pairs: Tensor) -> Tensor:
+            one, other = (direction.clone() for direction in pairs.chunk(2, dim=-1))
+            at = z.unsqueeze(1).expand_as(one).clone()
+            found = torch.func.jvp(lambda y: torch.func.jvp(both, (y,), (one,))[1], (at,), (other,))
+            return torch.cat((found[0], found[1]), dim=-1)
 
         unit = torch.eye(z.shape[-1], dtype=z.dtype)
         rows, columns = torch.tril_indices(len(unit), len(unit)).unbind(0)
-        _, (slope, bend) = scan(along, (), (unit[rows], unit[columns]), dim=0)  # (pairs, B, n + 1)
-        first = slope[rows == columns].movedim(0, -1)
+        pairs = torch.cat((unit[rows], unit[columns]), dim=-1).expand(len(z), -1, -1)
+        slope, bend = each(along, pairs, together=1).split(n + 1, dim=-1)  # (B, pairs, n + 1)
+        first = slope[:, rows == columns].mT
         place = torch.zeros(len(unit), len(unit), dtype=torch.int64)
         place[rows, columns] = place[columns, rows] = torch.arange(len(rows))
-        second = bend[place.flatten()].movedim(0, -1).unflatten(-1, place.shape)
+        second = bend[:, place.flatten()].mT.unflatten(-1, place.shape)
         return Derivatives(first[:, :n], second[:, :n], first[:, n], second[:, n])
 
     def _check(self) -> None:
@@ -244,7 +251,7 @@ class SampledProblem(nn.Module):
 def _use_forward_mode() -> None:
     """Let torch load what its forward mode needs, without its warning about its own `torch.jit.script`."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)
+        warnings.filterwarnings("ignore", message=".*torch.jit.script")
         torch.func.jvp(torch.sin, (torch.zeros(1),), (torch.ones(1),))
 
 

@@ -113,7 +113,11 @@ class BoxDDP:
         self._forth = Program(self._forward, name="a forward pass", compile=compile)
 
     def solve(
-        self, x0: Tensor, control: Tensor | None = None, reference: Reference | None = None
+        self,
+        x0: Tensor,
+        control: Tensor | None = None,
+        reference: Reference | None = None,
+        terminal: LocalModel | None = None,
     ) -> Trajectories:
         """The trajectories from x0 that the search reaches from a first control.
 
@@ -121,6 +125,7 @@ class BoxDDP:
             x0: (B, n).
             control: (B, T, m), used as it is, or around ``reference``; None for the goal's linear feedback.
             reference: states and feedback that the first control goes with; none for open loop.
+            terminal: V_T, a model a row; None for the value of the goal's linear feedback.
 
         Raises:
             ValueError: if a shape is wrong.
@@ -140,23 +145,30 @@ class BoxDDP:
         if reference is None:
             still = x0.unsqueeze(1).expand(-1, self.steps, -1)
             reference = Reference(still, x0.new_zeros(*expected, n))
+        if terminal is None:
+            none, bent = torch.zeros_like(x0), (2 * self.problem.p).expand(len(x0), n, n)
+            terminal = LocalModel(self.problem.goal.expand_as(x0), none[:, 0], none, bent)
         together = max(1, _NUMBERS // (self.steps * (n + 1) * (n + m) ** 2))
         with torch.no_grad():
-            pieces = (part.split(together) for part in (x0, self.problem.admissible(control), *reference))
-            parts = [self._solve(x, u, Reference(*around)) for x, u, *around in zip(*pieces, strict=True)]
+            whole = x0, self.problem.admissible(control), *reference, *terminal
+            parts = [
+                self._solve(x, u, Reference(*around[:2]), LocalModel(*around[2:]))
+                for x, u, *around in zip(*(part.split(together) for part in whole), strict=True)
+            ]
         return Trajectories(*(torch.cat(column) for column in zip(*parts, strict=True)))
 
-    def _solve(self, x0: Tensor, control: Tensor, reference: Reference) -> Trajectories:
-        whole = self.follow(x0, control, *reference)
+    def _solve(self, x0: Tensor, control: Tensor, reference: Reference, terminal: LocalModel) -> Trajectories:
+        none, lengths = torch.zeros_like(control), x0.new_ones(1)
+        whole = self._rollouts(x0, reference.state, control, none, reference.feedback, lengths, terminal)
         mu, full = torch.full_like(whole.cost, _FIRST), torch.ones_like(whole.cost)
         converged = torch.zeros(len(x0), dtype=torch.bool)
         active = torch.isfinite(whole.cost).nonzero().squeeze(1)
-        now, known = whole.rows(active), None
+        now, known, ends = whole.rows(active), None, terminal.rows(active)
         for _ in range(self.iterations):
             if not len(active):
                 break
             known = self._derivatives(now) if known is None else known
-            found = self._search(now, known, mu[active], full[active])
+            found = self._search(now, known, mu[active], full[active], ends)
             better = found.cost < now.cost
             gain = (now.cost - found.cost) / now.cost.abs().clamp(min=1e-300)
             now = _chosen(better, found.plan, now)
@@ -173,33 +185,29 @@ class BoxDDP:
             kept = active[on]
             known = Derivatives(*(part[on] for part in known))
             fresh = better[on]
-            now = now.rows(on)
+            now, ends = now.rows(on), ends.rows(on)
             if bool(fresh.any()):  # saves work: rows that did not move keep their derivatives
                 new = self._derivatives(now.rows(fresh))
                 for old, fresher in zip(known, new, strict=True):
                     old[fresh] = fresher
             active = kept
-        return self._models(whole, converged)
-
-    def follow(self, x0: Tensor, control: Tensor, state: Tensor, feedback: Tensor) -> Plan:
-        """Roll out u = control + feedback (x - state) within the bounds.
-
-        Args:
-            x0: (B, n).
-            control: (B, T, m).
-            state: (B, T, n).
-            feedback: (B, T, m, n).
-        """
-        none = torch.zeros_like(control)
-        return self._rollouts(x0, state, control, none, feedback, x0.new_ones(1))
+        return self._models(whole, converged, terminal)
 
     def _rollouts(
-        self, x0: Tensor, state: Tensor, control: Tensor, change: Tensor, feedback: Tensor, lengths: Tensor
+        self,
+        x0: Tensor,
+        state: Tensor,
+        control: Tensor,
+        change: Tensor,
+        feedback: Tensor,
+        lengths: Tensor,
+        terminal: LocalModel,
     ) -> Plan:
+        """The best of u = control + length change + feedback (x - state) within the bounds."""
         shares = lengths.expand(len(x0), -1).contiguous()
         start = x0.unsqueeze(1).expand(-1, len(lengths), -1).contiguous()
         end, (x, u, paid) = self._forth(start, (state, control, change, feedback), shares)
-        last = self.problem.terminal(end)  # (B, L)
+        last = terminal.at(self.problem, end)  # (B, L)
         cost = paid.sum(1) + last
         cost = torch.where(torch.isfinite(cost), cost, torch.inf)
         best, at = cost.min(1)
@@ -233,26 +241,23 @@ class BoxDDP:
         shape = plan.control.shape[:2]
         return Derivatives(*(part[:, 0].unflatten(0, shape) for part in found))
 
-    def _search(self, plan: Plan, known: Derivatives, mu: Tensor, full: Tensor) -> Found:
+    def _search(
+        self, plan: Plan, known: Derivatives, mu: Tensor, full: Tensor, terminal: LocalModel
+    ) -> Found:
         """A backward pass and the best of the five lengths forward."""
-        end, (change, feedback, _, _) = self._backwards(plan, known, mu, full)
+        end, (change, feedback, _, _) = self._backwards(plan, known, mu, full, terminal)
         definite = end.definite > 0
         lengths = plan.cost.new_tensor(_LENGTHS)
-        tried = self._rollouts(plan.state[:, 0], plan.state[:, :-1], plan.control, change, feedback, lengths)
+        x, u = plan.state, plan.control
+        tried = self._rollouts(x[:, 0], x[:, :-1], u, change, feedback, lengths, terminal)
         cost = torch.where(definite, tried.cost, torch.inf)
         return Found(tried, cost, end.promised, definite)
 
     def _backwards(
-        self, plan: Plan, known: Derivatives, mu: Tensor, full: Tensor
+        self, plan: Plan, known: Derivatives, mu: Tensor, full: Tensor, terminal: LocalModel
     ) -> tuple[Model, tuple[Tensor, ...]]:
-        d = self.problem.offset(plan.state[:, -1], self.problem.goal)
-        p = self.problem.p
-        last = Model(
-            2 * (d.unsqueeze(-2) * p).sum(-1),
-            (2 * p).expand(len(d), -1, -1).contiguous(),
-            torch.zeros_like(mu),
-            torch.ones_like(mu),
-        )
+        slope, bent = terminal.slope(self.problem, plan.state[:, -1]), terminal.curvature.contiguous()
+        last = Model(slope, bent, torch.zeros_like(mu), torch.ones_like(mu))
         reverse = tuple(part.flip(1) for part in (*known, plan.control))
         end, out = self._back(last, reverse, (mu, full))
         return end, tuple(part.flip(1) for part in out)
@@ -285,26 +290,24 @@ class BoxDDP:
         model = Model(gradient, curvature, promised, after.definite * _definite(firm))
         return model, (change, feedback, gradient, curvature)
 
-    def _models(self, plan: Plan, converged: Tensor) -> Trajectories:
+    def _models(self, plan: Plan, converged: Tensor, terminal: LocalModel) -> Trajectories:
         """The local models along finished trajectories, with as little regularisation as they bear."""
         known = self._derivatives(plan)
         small = torch.full_like(plan.cost, _LEAST)
-        end, out = self._backwards(plan, known, small, torch.ones_like(small))
-        _, gauss = self._backwards(plan, known, small, torch.zeros_like(small))
+        end, out = self._backwards(plan, known, small, torch.ones_like(small), terminal)
+        _, gauss = self._backwards(plan, known, small, torch.zeros_like(small), terminal)
         fine = (end.definite > 0) & torch.isfinite(end.curvature).flatten(1).all(-1)
         _, feedback, gradient, curvature = (
             torch.where(fine[(..., *([None] * (a.dim() - 1)))], a, b) for a, b in zip(out, gauss, strict=True)
         )
-        d = self.problem.offset(plan.state[:, -1], self.problem.goal)
-        last = 2 * (d.unsqueeze(-2) * self.problem.p).sum(-1)
-        hessian = (2 * self.problem.p).expand(len(d), 1, -1, -1)
+        last = terminal.slope(self.problem, plan.state[:, -1])
         return Trajectories(
             plan.state,
             plan.control,
             feedback,
             plan.paid.flip(1).cumsum(1).flip(1),
             torch.cat((gradient, last.unsqueeze(1)), dim=1),
-            torch.cat((curvature, hessian), dim=1),
+            torch.cat((curvature, terminal.curvature.unsqueeze(1)), dim=1),
             converged & torch.isfinite(plan.cost),
         )
 
@@ -314,6 +317,30 @@ class Reference(NamedTuple):
 
     state: Tensor  # (B, T, n)
     feedback: Tensor  # (B, T, m, n)
+
+
+class LocalModel(NamedTuple):
+    """V(x) ~ v + g'd + d'Hd/2 with d = x - state by the shorter way around, a row each."""
+
+    state: Tensor  # (B, n)
+    value: Tensor  # v, (B,)
+    gradient: Tensor  # g, (B, n)
+    curvature: Tensor  # H, (B, n, n)
+
+    def rows(self, index: Tensor) -> LocalModel:
+        """Some of the rows."""
+        return LocalModel(*(part[index] for part in self))
+
+    def at(self, problem: SampledProblem, x: Tensor) -> Tensor:
+        """V at L states a row: (B, L, n) -> (B, L)."""
+        d = problem.offset(x, self.state.unsqueeze(1))
+        bent = (self.curvature.unsqueeze(1) * d.unsqueeze(-2)).sum(-1)
+        return self.value.unsqueeze(1) + ((self.gradient.unsqueeze(1) + 0.5 * bent) * d).sum(-1)
+
+    def slope(self, problem: SampledProblem, x: Tensor) -> Tensor:
+        """Its gradient at a state a row: (B, n) -> (B, n)."""
+        d = problem.offset(x, self.state)
+        return self.gradient + (self.curvature * d.unsqueeze(-2)).sum(-1)
 
 
 class Plan(NamedTuple):

@@ -12,7 +12,15 @@ from collections.abc import Callable
 
 from ..sweeps import callbacks
 from ..sweeps.batching import USER_ERRORS, sentence
-from ..sweeps.hydra_compat import broken_sweep, find_launcher, full_errors, program
+from ..sweeps.hydra_compat import (
+    broken_sweep,
+    find_launcher,
+    full_errors,
+    named_packages,
+    program,
+    trusted,
+    with_mode,
+)
 from ..sweeps.hydra_compat import config_directory as config_directory
 from ..sweeps.job import Refused, execute
 from ..sweeps.resume import command_line
@@ -39,8 +47,10 @@ def main() -> None:
     typed = sys.argv
     with full_errors() as wants_trace, stopped_by_signals():
         try:
-            sys.argv = [typed[0], *command_line(typed[1:])]
-            _staf()
+            argv = command_line(typed[1:])
+            sys.argv = [typed[0], *with_mode(argv)]
+            with trusted(named_packages(argv)):
+                _staf()
         except Refused as refused:
             if wants_trace and refused.__cause__ is not None:
                 raise refused.__cause__ from None

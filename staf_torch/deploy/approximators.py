@@ -142,9 +142,9 @@ class LocalApproximator(nn.Module):
         own = copy.deepcopy(staf).double()
         self.dtype = dtype
         self.radius = float(own.basis.centers.radius(own.state).detach())
-        self.register_buffer("state", own.state.detach())
-        self.state: Tensor
-        # Not a submodule: what the local basis is made of is constant here.
+        # Neither buffers nor a submodule: all of this is constant, and a state dict or `.float()` that
+        # changed a part of it would make another function of the whole.
+        self.state = own.state.detach()
         self._space = own.basis.local(self.state)
         self._coefficients = own.coefficients.detach()
 

@@ -119,7 +119,9 @@ def load_program(path: str | Path) -> tuple[ExportedProgram, dict[str, object]]:
     """
     note = {_NOTE: ""}
     try:
-        program = torch.export.load(path, extra_files=note)
+        with warnings.catch_warnings():  # torch 2.9 warns of a file that it then refuses
+            warnings.simplefilter("ignore")
+            program = torch.export.load(path, extra_files=note)
     except Exception as error:  # torch raises errors of all sorts for what is no archive
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise fail(

@@ -224,7 +224,7 @@ def gram_rates(basis: StaFBasis, target: Target, x: Tensor, dx: Tensor) -> GramR
 
 
 def along(function: Callable[[Tensor], Any], x: Tensor, dx: Tensor) -> tuple[Any, Any]:
-    """f(x) and its derivative along dx, in forward mode: torch.func.jvp without the warning that torch 2.13
+    """f(x) and its derivative along dx, in forward mode: torch.func.jvp without the warning that torch
     gives itself on first use, which would end a program in which warnings are errors.
 
     Example:
@@ -236,6 +236,6 @@ def along(function: Callable[[Tensor], Any], x: Tensor, dx: Tensor) -> tuple[Any
         Shown by `staf predictor=tangent`.
     """
     with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message=".*torch.jit.script", category=DeprecationWarning)
+        warnings.filterwarnings("ignore", message=".*torch.jit.script")
         primal, tangent = torch.func.jvp(function, (x,), (dx,))[:2]
     return primal, tangent

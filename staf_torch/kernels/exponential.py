@@ -37,6 +37,9 @@ class ExponentialKernel(Kernel):
     def core(self, x: Tensor, z: Tensor, d: Tensor) -> Tensor:
         return inner(z, d).exp()
 
+    def core_gradient(self, x: Tensor, z: Tensor, d: Tensor, b: Tensor) -> Tensor:
+        return (inner(z, d).exp() * b.unsqueeze(-2)) @ d
+
     def log_gain(self, x: Tensor) -> Tensor:
         return x.square().sum(-1)
 

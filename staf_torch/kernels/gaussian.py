@@ -52,6 +52,9 @@ class GaussianKernel(Kernel):
     def core(self, x: Tensor, z: Tensor, d: Tensor) -> Tensor:
         return (inner(z, d) * per_entry(self.exponent_rate(), 2)).exp()
 
+    def core_gradient(self, x: Tensor, z: Tensor, d: Tensor, b: Tensor) -> Tensor:
+        return (self.core(x, z, d) * b.unsqueeze(-2)) @ d * per_entry(self.exponent_rate(), 2)
+
     def log_scale(self, x: Tensor, z: Tensor) -> Tensor:
         return z.square().sum(-1) * (-0.5 * per_entry(self.exponent_rate(), 1))
 

@@ -6,6 +6,7 @@ import dataclasses
 import importlib
 import json
 import math
+import re
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -166,8 +167,20 @@ def plain(value: Any) -> Any:
 
 
 def make(cfg: DictConfig) -> Any:
-    """Build the object that a group of settings names by ``_target_``."""
-    return instantiate(cfg, _convert_="all")
+    """Build the object that a group of settings names by ``_target_``.
+
+    Raises:
+        ValueError: if its constructor has no such argument, or needs one that is not there.
+    """
+    try:
+        return instantiate(cfg, _convert_="all")
+    except Exception as error:
+        cause = error if isinstance(error, TypeError) else error.__cause__  # Hydra 1.3 wraps, 1.4 does not
+        if isinstance(cause, TypeError) and re.search(
+            r"unexpected keyword argument|missing \d+ req", str(cause)
+        ):
+            raise ValueError(f"`{cfg._target_}` cannot be built from these settings: {cause}.") from error
+        raise
 
 
 def make_metrics(cfg: DictConfig | None) -> tuple[Metric, ...]:

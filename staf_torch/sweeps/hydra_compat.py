@@ -9,9 +9,10 @@ import inspect
 import json
 import os
 import pickle
+import re
 import sys
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
@@ -49,6 +50,7 @@ from ..settings import config_directory as config_directory
 _PACKAGE = Path(__file__).resolve().parent.parent
 _KEPT_JOBS = 64
 _TRUSTED = ("staf_torch.*",)
+_NAMES = re.compile(r"(?:_target_|\bpath)['\"]?\s*[=:]\s*['\"]?([A-Za-z_]\w*\.[\w.]*\w)")
 _HAS_WHITELIST = "execution_whitelist" in inspect.signature(hydra.main).parameters
 """Hydra 1.4: only trusted targets are instantiated. That version also ends sweeps that failed by itself."""
 
@@ -91,14 +93,60 @@ def overrides_in(argv: Sequence[str]) -> list[str]:
 
 
 @contextlib.contextmanager
-def trusted() -> Iterator[None]:
-    """Let a worker process instantiate what `program` may: Hydra 1.4 trusts nothing elsewhere."""
+def trusted(packages: Iterable[str] = ()) -> Iterator[None]:
+    """Let settings name objects of this package and of ``packages``: Hydra 1.4 trusts nothing by itself."""
     with contextlib.ExitStack() as stack:
         if _HAS_WHITELIST:
             from hydra._internal.execution_policy import execution_whitelist
 
-            stack.enter_context(execution_whitelist(_TRUSTED))
+            stack.enter_context(execution_whitelist((*_TRUSTED, *(f"{name}.*" for name in packages))))
         yield
+
+
+def trusted_packages() -> list[str]:
+    """Return the packages that settings may name at present, beside this one; workers get them."""
+    if not _HAS_WHITELIST:
+        return []
+    from hydra._internal.execution_policy import _get_active_execution_whitelist as active
+
+    return [pattern.removesuffix(".*") for pattern in active() or () if pattern not in _TRUSTED]
+
+
+def named_packages(argv: Sequence[str]) -> list[str]:
+    """Return the packages of the objects that a command line names: who types a name trusts what is there.
+
+    Objects are named by keys `_target_` and `path`, in overrides and in the files below `--config-dir`.
+    """
+    if not _HAS_WHITELIST:
+        return []
+    named = re.findall(_NAMES, "\n".join(overrides_in(argv)))
+    for folder in _config_folders(argv):
+        for file in Path(folder).rglob("*.yaml"):
+            named += re.findall(_NAMES, file.read_text(encoding="utf-8", errors="replace"))
+    return sorted({name.partition(".")[0] for name in named})
+
+
+def with_mode(argv: Sequence[str]) -> list[str]:
+    """Return the arguments, and the `hydra.mode` that the file of `experiment=...` sets, for Hydra 1.4.
+
+    That version takes the mode from the command line or from the primary file alone.
+    """
+    given = overrides_in(argv)
+    chosen = [line.partition("=")[2] for line in given if line.startswith("experiment=")]
+    stated = any(line.startswith("hydra.mode=") for line in given) or {"-m", "--multirun"} & set(argv)
+    if not _HAS_WHITELIST or stated or not chosen:
+        return list(argv)
+    for folder in (*_config_folders(argv), config_directory()):
+        file = Path(folder, "experiment", f"{chosen[-1]}.yaml")
+        if file.is_file():
+            mode = OmegaConf.select(OmegaConf.load(file), "hydra.mode")
+            return [*argv, f"hydra.mode={mode}"] if mode is not None else list(argv)
+    return list(argv)
+
+
+def _config_folders(argv: Sequence[str]) -> list[str]:
+    """Return the directory of `--config-dir`, as a list of one or none."""
+    return list(filter(None, [get_args_parser().parse_known_args(list(argv))[0].config_dir]))
 
 
 @contextlib.contextmanager

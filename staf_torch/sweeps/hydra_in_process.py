@@ -27,7 +27,7 @@ from hydra.version import VersionBase
 from omegaconf import DictConfig
 from omegaconf.basecontainer import BaseContainer
 
-from .hydra_compat import config_directory, find_launcher, trusted
+from .hydra_compat import config_directory, find_launcher, named_packages, trusted, with_mode
 
 _OF_AN_APPLICATION: tuple[type, ...] = (GlobalHydra, HydraConfig, JobRuntime, VersionBase)
 """Hydra's singletons that belong to the application that runs; plugins and the store are everyone's."""
@@ -41,7 +41,7 @@ class Application(NamedTuple):
 
     def is_sweep(self, overrides: Sequence[str]) -> bool:
         """Return whether the settings themselves ask for a sweep, as those of `experiment=ablation` do."""
-        return bool(self.hydra.get_mode("config", list(overrides)) == RunMode.MULTIRUN)
+        return bool(self.hydra.get_mode("config", with_mode(overrides)) == RunMode.MULTIRUN)
 
     def run(self, task: Callable[[DictConfig], Any], overrides: Sequence[str]) -> Path:
         """Run one job and return its directory.
@@ -49,7 +49,8 @@ class Application(NamedTuple):
         Raises:
             BaseException: that of Hydra or of the task.
         """
-        ended = self.hydra.run("config", task, [*overrides, "hydra.mode=RUN"])
+        with trusted(named_packages(overrides)):
+            ended = self.hydra.run("config", task, [*overrides, "hydra.mode=RUN"])
         config: Any = ended.hydra_cfg
         return Path(config.hydra.runtime.output_dir)
 
@@ -59,7 +60,8 @@ class Application(NamedTuple):
         Raises:
             BaseException: that of Hydra, or of the first job that failed, after all jobs have ended.
         """
-        self.hydra.multirun("config", task, [*overrides, "hydra.mode=MULTIRUN"])
+        with trusted(named_packages(overrides)):
+            self.hydra.multirun("config", task, [*overrides, "hydra.mode=MULTIRUN"])
         return Path(self.seen[-1].hydra.sweep.dir).absolute()
 
 

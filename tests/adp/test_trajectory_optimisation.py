@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
+import numpy as np
 import pytest
 import torch
 from helpers_swingup import cost_of, double_integrator, pendulum
@@ -123,6 +124,24 @@ def test_problem_of_a_plant_and_a_cost_pays_what_the_simulation_pays() -> None:
     torch.testing.assert_close(run.state[:, -1], x, rtol=1e-12, atol=1e-14)
 
 
+def pushed(x: Tensor, u: Tensor) -> Tensor:
+    return torch.stack((x[:, 0] + 0.1 * x[:, 1], x[:, 1] + 0.1 * u[:, 0]), dim=-1)
+
+
+def test_plant_in_steps_pays_its_period_times_the_rate() -> None:
+    plant = systems.StepPlant(pushed, dim=2, inputs=1, dt=0.1, low=-1.0, high=1.0)
+    problem = adp.SampledProblem.of(plant, adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1))
+    u = torch.tensor([[0.5], [-1.0]], dtype=torch.float64)
+    for mine, known in zip(problem.advance(X0, u), BOUNDED.advance(X0, u), strict=True):
+        torch.testing.assert_close(mine, known)
+    torch.testing.assert_close(problem.p, BOUNDED.p)
+    assert problem.bounds.high.tolist() == [1.0]
+
+
+def numpy_plant() -> systems.StepPlant:
+    return systems.StepPlant(lambda x, u: x + 0.1 * np.tanh(np.asarray(u)), dim=1, inputs=1, dt=0.1)
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [
@@ -138,6 +157,10 @@ def test_problem_of_a_plant_and_a_cost_pays_what_the_simulation_pays() -> None:
         (lambda: double_integrator(0.0, 1.0), "rest=....` must lie between the bounds"),
         (lambda: adp.BoxDDP(BOUNDED, steps=0), "must be at least 1"),
         (lambda: adp.BoxDDP(BOUNDED, steps=5).solve(X0, still(2, 6)), r"must have the shape \(2, 5, 1\)"),
+        (
+            lambda: adp.SampledProblem.of(numpy_plant(), adp.QuadraticCost(1.0, 1.0, 1, 1)),
+            "must be written in torch all through",
+        ),
         (
             lambda: adp.SampledProblem.of(systems.Pendulum(), adp.QuadraticCost(1.0, 1.0, 2, 1)),
             "dt=....` must be a number",

@@ -34,9 +34,13 @@ KEYS = {
     "products_per_second",
 }
 SHORT = ["duration=0.05", "settle_time=0", "figures=false"]
-NEEDS = {  # what some options cannot do without
+NEEDS = {  # what some options cannot do without, or that makes them small
     "centers=directions": ["centers.directions=[[0,1],[1,0],[-1,0]]"],
     "system=planar_quadrotor": ["centers=simplex", "target=quadratic", "initial_state=[0.1,0,0,0,0,0]"],
+    "experiment=exponential_bound": ["exponential_bound.radii=[0.1]", "exponential_bound.states=9"],
+    "experiment=flat_limit": ["flat_limit.counts=[3]", "flat_limit.radii.smallest=1e-3"],
+    "experiment=adp_comparison": ["trajectories=3", "adp.order=2"],
+    "experiment=layouts": ["layouts.states=4", "layouts.radii=[0.1,0.2]"],
     "system=three_state": ["centers=simplex", "target=quadratic", "initial_state=[0.1,0,0]"],
 }
 CUSTOM = {

@@ -212,8 +212,8 @@ def test_bad_settings_are_named(override: str, message: str, tmp_path: Path) -> 
 
 def noisy_laps(laps: int, scale: float, visits: int = 64) -> float:
     """Error of a memory that met every place so often, each model with noise of its own."""
-    basis, x = basis_of("gaussian", radius=0.1), circle(30)
-    memory = st.ExperienceMemory(basis, 40, visits=visits)
+    basis, x = basis_of("gaussian", radius=0.1), circle(30)[:8]
+    memory = st.ExperienceMemory(basis, 12, visits=visits)
     draw = torch.Generator().manual_seed(0)
     for _ in range(laps):
         for state in x:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 from collections.abc import Callable, Collection, Generator, Sequence
 from pathlib import Path
 from typing import overload
@@ -37,7 +38,8 @@ class _Batches(Sequence[Batch]):
         if isinstance(index, slice):
             return [self[i] for i in range(*index.indices(len(self)))]
         jobs = self._planned[index]
-        return Batch([self._settings[i] for i in jobs], [str(self._directories[i]) for i in jobs])
+        places = [os.path.abspath(self._directories[i]) for i in jobs]  # a worker may have another folder
+        return Batch([self._settings[i] for i in jobs], places)
 
 
 def compute(

@@ -16,12 +16,12 @@ from omegaconf import DictConfig
 from ...experiments.registry import experiment
 from ...results.progress import SHOWN
 from ..batching import Batch, Deferred, Done, Failed, Outcome, Written, solve
-from ..hydra_compat import trusted
+from ..hydra_compat import trusted, trusted_packages
 
 
-def pack(batch: Batch) -> tuple[bytes, list[str]]:
+def pack(batch: Batch) -> tuple[bytes, list[str], list[str]]:
     """Return the arguments of `solve_elsewhere`."""
-    return pickle.dumps(batch), list(sys.path)
+    return pickle.dumps(batch), list(sys.path), trusted_packages()
 
 
 def unpack(pickled: bytes) -> Done:
@@ -30,16 +30,17 @@ def unpack(pickled: bytes) -> Done:
     return done
 
 
-def solve_elsewhere(pickled: bytes, path: Sequence[str]) -> bytes:
+def solve_elsewhere(pickled: bytes, path: Sequence[str], packages: Sequence[str] = ()) -> bytes:
     """Compute a tensor batch in a process that has only just begun, and return the pickled `Done`.
 
     Args:
         pickled: a `Batch`.
         path: `sys.path` of the command, which may lead to a user's own modules.
+        packages: those whose objects the command's settings may name.
     """
     sys.path[:] = [*path, *(entry for entry in sys.path if entry not in path)]
     start = time.monotonic()
-    with trusted():
+    with trusted(packages):
         batch: Batch = pickle.loads(pickled)
         outcomes = solve(batch.settings, SHOWN)
         for i, (outcome, cfg) in enumerate(zip(outcomes, batch.settings, strict=True)):

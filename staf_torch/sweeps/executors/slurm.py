@@ -46,13 +46,13 @@ class Task:
     def __init__(self, parent: tuple[str, int, str] | None, lock: Path) -> None:
         self._parent, self._lock = parent, lock
 
-    def __call__(self, pickled: bytes, path: Sequence[str]) -> bytes:
+    def __call__(self, pickled: bytes, path: Sequence[str], packages: Sequence[str] = ()) -> bytes:
         """Return what `solve_elsewhere` returns."""
         if self._parent is not None and self._parent[0] == socket.gethostname():
             end_with(self._parent[1], self._parent[2])
         elif self._parent is None and self._lock.exists():
             end_with_file(self._lock)
-        return solve_elsewhere(pickled, path)
+        return solve_elsewhere(pickled, path, packages)
 
     def checkpoint(self, *arguments: Any) -> Any:
         """Begin the batch anew: its rounding depends on all of its jobs. Other batches keep theirs."""

@@ -1,0 +1,206 @@
+"""One call for a user: from a plant and a cost to a policy, and what is known of it."""
+
+from __future__ import annotations
+
+import math
+import time
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..approximation.basis import StaFBasis
+from ..centers import StateFollowingCenters
+from ..kernels import ExponentialKernel
+from ..numerics.checks import positive_real
+from ..systems import Plant
+from ..systems.bounds import Limit
+from .controllers import LQR, Feedback
+from .cost import Cost
+from .rollout import ball_directions
+from .sampled_rollout import SampledRollout
+from .sampling import held_stability
+from .shooting import DirectShooting
+from .simulation import simulate
+
+_DECAY = 3.0  # time constants of the slowest mode of the LQR in the horizon
+_STEPS = (12, 60)  # periods in the horizon, at least and at most
+_RESOLVED = 0.2  # length of an integration step in time constants of the plant's fastest mode
+_SETTLED = 9.2  # time constants for which the loops of a report run: the slowest mode falls to 1e-4
+_REGULATED = 1e-2  # share of the distance from the set-point that is left
+
+
+class NearOptimal(SampledRollout):
+    """`SampledRollout` of an LQR as `near_optimal` makes it, with a report.
+
+    Example:
+        >>> plant = systems.Pendulum()
+        >>> policy = adp.near_optimal(plant, adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1), dt=0.05)
+        >>> policy.report(states=4, optimum=False)["spectral_radius"] < 1
+        True
+
+        Shown by `staf_torch/adp/README.md`.
+    """
+
+    lqr: LQR
+    radius: float
+    substeps: int
+
+    @torch.no_grad()
+    def report(
+        self, *, states: int = 20, spread: float | None = None, optimum: bool = True, seed: int = 0
+    ) -> dict[str, Any]:
+        """What was chosen, and how good it is from states drawn uniformly around the set-point.
+
+        Args:
+            states: how many.
+            spread: half the width of their box, in units of the state; the plant's ``spread`` by default.
+            optimum: whether to compare with direct shooting, where the plant allows it: that takes the time.
+            seed: of the states.
+
+        Returns:
+            ``dt``, ``base``, ``centers``, ``radius``, ``horizon`` in s, ``substeps``; ``spectral_radius`` and
+            ``largest_period`` of the held linearised loop; ``spread``; ``regulated``, the share of the
+            states that end within 1 % of where they began; ``over_base_median`` and ``over_base_max``, the
+            cost over the LQR's in the states that both regulate; ``over_optimum_median`` and
+            ``over_optimum_max`` likewise (the optimum is not held: part of it is the price of holding), None
+            where it is not known; ``good_spread``, the largest of 1/4, 1/2, 1, 2, 4 times the spread at which
+            all are regulated, 0 if none; ``microseconds`` a call with one row, the median.
+        """
+        width = positive_real("report", "spread", self.plant.spread if spread is None else spread)
+        x0 = self._drawn(states, width, seed)
+        stability = held_stability(self.control, self.plant, self.period, at=self.cost.target)
+        ours, fine = self._run(Feedback(self), x0)
+        base, also = self._run(Feedback(self.lqr), x0)
+        both = fine & also
+        over_base = (ours / base)[both]
+        over_optimum = self._over_optimum(x0, ours, fine) if optimum else ours[:0]
+        good = [
+            share * width
+            for share in (0.25, 0.5, 1.0, 2.0, 4.0)
+            if bool(self._run(Feedback(self), self._drawn(states, share * width, seed + 1))[1].all())
+        ]
+        return {
+            "dt": self.period,
+            "base": type(self.lqr).__name__,
+            "centers": self.basis.count,
+            "radius": self.radius,
+            "horizon": self.steps * self.period,
+            "substeps": self.substeps,
+            "spectral_radius": stability.spectral_radius,
+            "largest_period": stability.largest_period,
+            "spread": width,
+            "regulated": float(fine.double().mean()),
+            "over_base_median": _median(over_base),
+            "over_base_max": float(over_base.max()) if len(over_base) else None,
+            "over_optimum_median": _median(over_optimum),
+            "over_optimum_max": float(over_optimum.max()) if len(over_optimum) else None,
+            "good_spread": max(good, default=0.0),
+            "microseconds": self._microseconds(x0[:1]),
+        }
+
+    def _drawn(self, states: int, width: float, seed: int) -> Tensor:
+        generator = torch.Generator().manual_seed(seed)
+        away = width * (2 * torch.rand(states, self.cost.dim, dtype=torch.float64, generator=generator) - 1)
+        return away if self.cost.target is None else away + self.cost.target
+
+    def _run(self, controller: Feedback, x0: Tensor) -> tuple[Tensor, Tensor]:
+        """Cost until the slowest mode has decayed, and which rows were regulated."""
+        periods = math.ceil(_SETTLED / _slowest(self.lqr, self.plant) / self.period)
+        run = simulate(
+            controller, self.plant, self.cost, x0, dt=self.period, steps=periods, substeps=self.substeps
+        )
+        left = self.cost.deviation(run.state[:, -1]).norm(dim=-1)
+        began = self.cost.deviation(x0).norm(dim=-1)
+        return run.cost, (left <= _REGULATED * began) & ~run.diverged
+
+    def _over_optimum(self, x0: Tensor, cost: Tensor, fine: Tensor) -> Tensor:
+        if self.plant.period is not None or not self.plant.traceable or self.cost.discount:
+            return cost[:0]
+        best = DirectShooting(self.plant, self.cost).solve(x0)
+        return (cost / best.value)[fine & torch.isfinite(best.value)]
+
+    def _microseconds(self, x: Tensor) -> float:
+        for _ in range(200):
+            self(x)
+        taken = []
+        for _ in range(200):
+            start = time.perf_counter_ns()
+            self(x)
+            taken.append((time.perf_counter_ns() - start) / 1000)
+        return sorted(taken)[100]
+
+
+def near_optimal(
+    plant: Plant,
+    cost: Cost,
+    *,
+    dt: float | None = None,
+    low: Limit = None,
+    high: Limit = None,
+    radius: float = 0.1,
+    horizon: float | None = None,
+) -> NearOptimal:
+    """A policy for a plant, held for dt, that costs no more than its LQR.
+
+    The rules: the base is the LQR made for dt; the horizon is three time constants of its slowest mode, 12 to
+    60 periods; the centers are as many as quadratics need, from four states on the cross-polytope and its
+    middle, in a ball of ``radius``; a plant in continuous time is integrated in steps of a fifth of its
+    fastest time constant.
+
+    Example:
+        >>> import numpy as np
+        >>> def step(x, u):  # a simulator in NumPy: rows (B, 2) and (B, 1)
+        ...     return x + 0.1 * np.stack((x[:, 1], np.sin(x[:, 0]) + u[:, 0]), axis=1)
+        >>> plant = systems.StepPlant(step, dim=2, inputs=1, dt=0.1, periodic=[0])
+        >>> policy = adp.near_optimal(plant, adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1), low=-2.0, high=2.0)
+        >>> policy(torch.tensor([[0.3, 0.0]], dtype=torch.float64)).shape
+        torch.Size([1, 1])
+
+        Shown by `staf_torch/adp/README.md`.
+
+    Args:
+        plant: in continuous or in discrete time.
+        cost: the cost rate.
+        dt: s, for which a control is held; by default the period of a plant in discrete time.
+        low: of the inputs, as in `systems.Bounds`; by default those of the cost, or else of the plant.
+        high: likewise.
+        radius: of the ball of centers, in units of the state: measure states so that 1 is a large one.
+        horizon: s; None for the rule above.
+
+    Raises:
+        ValueError: if an argument breaks its rule, or the plant has no LQR; the message says why.
+    """
+    held = plant.period if dt is None else dt
+    period = positive_real("near_optimal", "dt", held)
+    placed = cost.bounded(low, high).around(plant)
+    lqr = LQR(plant, placed, period=period)
+    seconds = (
+        _DECAY / _slowest(lqr, plant)
+        if horizon is None
+        else positive_real("near_optimal", "horizon", horizon)
+    )
+    steps = round(seconds / period)
+    if horizon is None:
+        steps = min(max(steps, _STEPS[0]), _STEPS[1])
+    substeps = 1
+    if plant.period is None:
+        a, _ = plant.linearisation(placed.target, placed.target_input)
+        substeps = max(1, math.ceil(period * float(torch.linalg.eigvals(a).abs().max()) / _RESOLVED))
+    basis = StaFBasis(ExponentialKernel(), StateFollowingCenters(ball_directions(None, placed.dim), radius))
+    policy = NearOptimal(
+        basis, plant, placed, lqr, lqr.value, lqr.p, period=period, steps=steps, substeps=substeps
+    )
+    policy.lqr, policy.radius, policy.substeps = lqr, radius, substeps
+    return policy
+
+
+def _slowest(lqr: LQR, plant: Plant) -> float:
+    """The decay of the slowest mode of the held LQR's loop, 1/s."""
+    assert lqr.period is not None
+    radius = held_stability(lqr, plant, lqr.period, at=lqr.cost.target).spectral_radius
+    return -math.log(max(min(radius, 1 - 1e-9), 1e-9)) / lqr.period
+
+
+def _median(values: Tensor) -> float | None:
+    return float(values.median()) if len(values) else None

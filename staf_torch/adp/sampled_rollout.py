@@ -1,0 +1,191 @@
+"""A policy that is held for a period and improved by rollouts, never by its word alone."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from ..approximation.basis import StaFBasis
+from ..lanes import each, repeat
+from ..lanes.function import RowFunction
+from ..numerics.box import LARGEST, box_minimum
+from ..numerics.checks import fail, integer, positive_real
+from ..systems import Bounds, Plant
+from .controllers import Policy, Value
+from .cost import Cost, matvec
+from .holding import Holding
+
+_SHARES = (1.0, 0.3)  # of the Newton step, that are tried
+_PROBE = 1e-3  # of the range of an input, or of 1, by which it is moved to find slopes
+_SHORTER = 0.75  # of the horizon, at which the promise of a control must hold as well
+_MARGIN = 1e-9  # relative, by which a control must be better than the base's
+
+
+class Promise(NamedTuple):
+    """What rollouts of the base say."""
+
+    whole: Tensor  # cost over the horizon and V_T at its end, (...)
+    part: Tensor  # likewise over three quarters of it
+    free: Tensor  # (...) bool: no bound holds the base's control at the end, so that V_T can be believed
+
+
+class SampledRollout(nn.Module):
+    """u(x) = the best of u_b and u_b + s d, s in {1, 0.3}, by what a simulation of each costs:
+
+        Q(x, u) = cost of holding u for one period + sum of the base's costs over the horizon + V_T,
+        d = argmin over the box of (r_u + B'grad V^)'d + d'(R + B'P B) d,
+
+    where u_b is the base policy's control, B = dx+/du, and V^ interpolates, at M centers around the state
+    after one period, the cost of the base from there. The fit proposes; the comparison on rollouts of the
+    same length decides, state by state: a control that does not promise less than the base's, both over the
+    horizon and over three quarters of it (where V_T is wrong the two disagree), is not applied, nor is one
+    after which the base still ends at a bound. Slopes in u are central differences, so that a simulator in
+    NumPy will do.
+
+    Example:
+        >>> plant = systems.Pendulum()
+        >>> policy = adp.near_optimal(plant, adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1), dt=0.05)
+        >>> policy(torch.tensor([0.4, 0.0], dtype=torch.float64)).shape
+        torch.Size([1])
+
+        Shown by `staf_torch/adp/README.md`.
+
+    Args:
+        basis: kernel and centers.
+        plant: in continuous or in discrete time, of at most 4 inputs.
+        cost: the cost rate.
+        base: the base policy, (..., n) -> (..., m).
+        terminal: V_T, (..., n) -> (...): the value of the base at the end of a rollout.
+        metric: P, (n, n), positive semidefinite, of the step's length: that of the LQR.
+        period: s, for which a control is held.
+        steps: periods in the horizon, at least 4.
+        substeps: integration steps a period of a plant in continuous time.
+
+    Raises:
+        ValueError: if an argument breaks its rule.
+
+    Source: Bertsekas, "Rollout, Policy Iteration, and Distributed Reinforcement Learning" (2020), ch. 2: a
+    rollout that keeps the base's control among its choices does not cost more than the base.
+    """
+
+    def __init__(
+        self,
+        basis: StaFBasis,
+        plant: Plant,
+        cost: Cost,
+        base: Policy,
+        terminal: Value,
+        metric: Tensor,
+        *,
+        period: float,
+        steps: int = 20,
+        substeps: int = 1,
+    ) -> None:
+        super().__init__()
+        cost = cost.around(plant)
+        if cost.dim != basis.dim:
+            raise fail("SampledRollout", "basis", f"must have the plant's {cost.dim} states", basis.dim)
+        if cost.inputs > LARGEST:
+            raise fail("SampledRollout", "plant", f"must have at most {LARGEST} inputs", cost.inputs)
+        self.basis, self.plant, self.cost, self.base, self.terminal = basis, plant, cost, base, terminal
+        self.period = positive_real("SampledRollout", "period", period)
+        self.steps = integer("SampledRollout", "steps", steps, least=4)
+        self.holding = Holding("SampledRollout", plant, cost, self.period, substeps)
+        self.register_buffer("metric", metric.double())
+        self.metric: Tensor
+        self.bounds = Bounds(None, None, cost.inputs) if cost.bounds is None else cost.bounds
+        span = self.bounds.high - self.bounds.low
+        self.register_buffer("probe", _PROBE * torch.where(torch.isfinite(span), span, 1.0))  # (m,)
+        self.probe: Tensor
+        self._compiled = self._compile()
+
+    def forward(self, x: Tensor) -> Tensor:
+        """u: (..., n) -> (..., m)."""
+        return self._compiled(x) if self._compiled is not None else self.control(x)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "_compiled": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__(state)  # type: ignore[no-untyped-call]
+        self._compiled = self._compile()
+
+    def control(self, x: Tensor) -> Tensor:
+        """`forward` in plain torch: (..., n) -> (..., m)."""
+        base = self.bounds.clip(self.base(x))
+        step = self.proposal(x, base)
+        tried = torch.stack([base, *(self.bounds.clip(base + share * step) for share in _SHARES)], dim=-2)
+        after, paid = self.holding(x.unsqueeze(-2).expand(*tried.shape[:-1], x.shape[-1]), tried)
+        promise, discount = self.rollout(after), self._discount()
+        whole, part = paid + discount * promise.whole, paid + discount * promise.part  # (..., 3)
+        least = whole[..., :1] - _MARGIN * whole[..., :1].abs()
+        better = promise.free & (whole < least) & (part < part[..., :1])
+        u, best = base, whole[..., 0]
+        for k in range(1, tried.shape[-2]):
+            lower = better[..., k] & (whole[..., k] < best)
+            u = torch.where(lower.unsqueeze(-1), tried[..., k, :], u)
+            best = torch.where(lower, whole[..., k], best)
+        return u
+
+    def proposal(self, x: Tensor, base: Tensor) -> Tensor:
+        """The Newton step d from the base's control, by the fit: (..., n), (..., m) -> (..., m)."""
+        after, _ = self.holding(x, base)
+        probes = torch.diag(self.probe).to(x)
+        around = torch.cat((base.unsqueeze(-2) + probes, base.unsqueeze(-2) - probes), dim=-2)  # (..., 2m, m)
+        moved, paid = self.holding(x.unsqueeze(-2).expand(*around.shape[:-1], x.shape[-1]), around)
+        size, width = base.shape[-1], 2 * self.probe.to(x)
+        slopes = (moved[..., :size, :] - moved[..., size:, :]) / width.unsqueeze(-1)  # B', (..., m, n)
+        rise = (paid[..., :size] - paid[..., size:]) / width
+        pull = rise + self._discount() * matvec(slopes, self.gradient(after))
+        weighted = (slopes.unsqueeze(-2) * self.metric.to(x)).sum(-1)  # B'P, (..., m, n)
+        bent = (weighted.unsqueeze(-2) * slopes.unsqueeze(-3)).sum(-1)  # B'P B, (..., m, m)
+        curvature = 2 * (self.period * self.cost.r.to(x) + bent)
+        low, high = self.bounds.low.to(x) - base, self.bounds.high.to(x) - base
+        return box_minimum(curvature, pull, low, high)
+
+    def gradient(self, x: Tensor) -> Tensor:
+        """grad V^ at x, of the base's cost fitted at the centers around it: (..., n) -> (..., n)."""
+        space = self.basis.local(x)
+        coefficients = space.fit(self.rollout(self.basis.centers(x)).whole)
+        rise: Tensor = torch.func.grad(lambda z: space.evaluate(z.unsqueeze(-2), coefficients).sum())(
+            torch.zeros_like(x)
+        )
+        return rise
+
+    def rollout(self, x: Tensor) -> Promise:
+        """What the base costs from x on: (..., n)."""
+        first = max(1, round(_SHORTER * self.steps))
+        discount = self._discount()
+
+        def step(now: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+            at, spent, share = now
+            after, paid = self.holding(at, self.bounds.clip(self.base(at)))
+            return after, spent + share * paid, discount * share
+
+        def whole(x: Tensor) -> Tensor:
+            none = torch.zeros_like(x[..., 0])
+            at, spent, share = repeat(first, step, (x, none, none + 1.0))
+            part = spent + share * self.terminal(at)
+            at, spent, share = repeat(self.steps - first, step, (at, spent, share))
+            u = self.base(at)
+            free = ((u > self.bounds.low.to(x)) & (u < self.bounds.high.to(x))).all(-1)
+            return torch.stack((spent + share * self.terminal(at), part, free.to(x)), dim=-1)
+
+        found: Tensor = each(whole, x, dim=x.dim() - 2) if x.dim() > 1 else whole(x)
+        return Promise(found[..., 0], found[..., 1], found[..., 2] > 0)
+
+    def value(self, x: Tensor) -> Tensor:
+        """What the chosen control promises: (..., n) -> (...)."""
+        after, paid = self.holding(x, self.control(x))
+        return paid + self._discount() * self.rollout(after).whole
+
+    def _discount(self) -> float:
+        return math.exp(-self.cost.discount * self.period)
+
+    def _compile(self) -> RowFunction | None:
+        if not self.plant.traceable:
+            return None
+        return RowFunction(self.control, self, "a sampled rollout")

@@ -1,0 +1,96 @@
+"""One call for a plant of a user: a held policy, improved where rollouts say so, never worse."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from staf_torch import adp, deploy, systems
+from staf_torch.deploy.c_header import runner_c
+
+
+def turn(x: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """A step of Gymnasium's Pendulum-v1, as a simulator."""
+    rate = np.clip(x[:, 1] + 0.05 * (15.0 * np.sin(x[:, 0]) + 3.0 * u[:, 0]), -8.0, 8.0)
+    return np.stack((x[:, 0] + 0.05 * rate, rate), axis=1)
+
+
+def drawn(dim: int, width: float, rows: int) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(3)
+    return width * (2 * torch.rand(rows, dim, dtype=torch.float64, generator=generator) - 1)
+
+
+COST = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
+SIMULATOR = systems.StepPlant(turn, dim=2, inputs=1, dt=0.05, periodic=[0], low=-2.0, high=2.0)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize(
+    ("plant", "cost", "dt", "width", "gain"),
+    [
+        (systems.TwoState(), COST, 0.1, 2.0, 0.95),
+        (SIMULATOR, adp.QuadraticCost([[20.0, 0.0], [0.0, 2.0]], 0.02, dim=2, inputs=1), None, 0.6, 1.0),
+    ],
+    ids=["two states", "simulator"],
+)
+def test_improved_policy_is_never_worse_than_its_base(
+    plant: systems.Plant, cost: adp.Cost, dt: float | None, width: float, gain: float
+) -> None:
+    policy = adp.near_optimal(plant, cost, dt=dt, horizon=0.8)
+    x0 = drawn(cost.dim, width, 24)
+    steps = round(4.0 / policy.period)
+    base, ours = (
+        adp.simulate(adp.Feedback(u), plant, cost, x0, dt=policy.period, steps=steps)
+        for u in (policy.lqr, policy)
+    )
+    ratio = ours.cost / base.cost
+    assert float(ratio.max()) <= 1.01
+    assert float(ratio.mean()) < gain
+    bounds = policy.cost.bounds
+    assert bounds is None or bool(bounds.contain(ours.control[:, :-1]).all())
+
+
+@torch.no_grad()
+def test_where_a_bound_holds_the_base_at_the_end_its_own_control_is_kept() -> None:
+    cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1, low=-2.0, high=2.0)
+    policy = adp.near_optimal(systems.Pendulum(), cost, dt=0.05, horizon=0.3)
+    lost = torch.tensor([[1.2, 1.0], [0.01, 0.0]], dtype=torch.float64)  # it falls; it stands
+    promise = policy.rollout(lost)
+    assert promise.free.tolist() == [False, True]
+    assert torch.equal(policy(lost)[0], policy.lqr(lost)[0])
+
+
+@torch.no_grad()
+def test_report_says_what_was_chosen_and_how_good_it_is() -> None:
+    policy = adp.near_optimal(systems.TwoState(), COST, dt=0.1, horizon=0.8)
+    report = policy.report(states=3, spread=0.5)
+    assert report["dt"] == 0.1
+    assert report["centers"] == 6
+    assert report["spectral_radius"] < 1 < report["largest_period"] / 0.1
+    assert report["regulated"] == 1.0
+    assert 1.0 - 1e-3 <= report["over_optimum_median"] < 1.05
+    assert report["over_base_max"] <= 1.01
+    assert report["good_spread"] >= 0.5
+    assert report["microseconds"] > 0
+
+
+@torch.no_grad()
+def test_exported_policy_is_the_policy(tmp_path: Path) -> None:
+    cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1, low=-2.0, high=1.5)
+    policy = deploy.policy_of(adp.near_optimal(systems.Pendulum(), cost, dt=0.05, horizon=0.4))
+    x = drawn(2, 0.5, 40)
+    deploy.export_c(policy, x[:1], tmp_path / "staf.h", ["u"])
+    (u,) = runner_c(tmp_path / "staf.h", [1], torch.float64)(x)
+    torch.testing.assert_close(u, policy(x), rtol=1e-9, atol=1e-9)
+
+
+def test_bad_arguments_are_refused_by_name() -> None:
+    with pytest.raises(ValueError, match=r"`near_optimal\(dt=...\)` must be a number; got None"):
+        adp.near_optimal(systems.Pendulum(), COST)
+    with pytest.raises(ValueError, match=r"`near_optimal\(horizon=...\)` must be positive"):
+        adp.near_optimal(systems.Pendulum(), COST, dt=0.1, horizon=-1.0)
+    with pytest.raises(ValueError, match=r"`SampledRollout\(steps=...\)` must be at least 4"):
+        adp.near_optimal(systems.Pendulum(), COST, dt=0.1, horizon=0.2)

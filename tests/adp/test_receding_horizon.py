@@ -1,0 +1,62 @@
+"""Receding-horizon control: exact on linear plants, within bounds, and as good as the memory at its end."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from helpers_swingup import GRID, RESETS, cost_of, double_integrator, pendulum
+from torch import Tensor
+
+from staf_torch import adp, systems
+
+NONE = torch.empty(0, dtype=torch.float64)
+
+
+def drive(mpc: adp.RecedingHorizon, x: Tensor, steps: int) -> tuple[Tensor, Tensor]:
+    """Controls (B, T, m) and the last state."""
+    carried, controls = mpc.init(x), []
+    for _ in range(steps):
+        u, carried = mpc.step(x, carried, NONE, 0.0)
+        x, _ = mpc.problem.advance(x, u)
+        controls.append(u)
+    return torch.stack(controls, dim=1), x
+
+
+def test_linear_plant_gets_the_regulator_at_every_horizon() -> None:
+    problem = double_integrator()
+    x = torch.tensor([[1.0, -0.5]], dtype=torch.float64)
+    controls, _ = drive(adp.RecedingHorizon(problem, steps=3, compile=False), x, 5)
+    torch.testing.assert_close(controls[:, 0], problem.linear_feedback(x), rtol=1e-8, atol=1e-10)
+    torch.testing.assert_close(cost_of(problem, x, controls), problem.terminal(x), rtol=1e-8, atol=1e-10)
+
+
+def test_bounds_hold_and_the_state_comes_to_rest() -> None:
+    problem = double_integrator(-1.0, 1.0)
+    x = torch.tensor([[3.0, 0.0], [-1.0, 2.0]], dtype=torch.float64)
+    controls, last = drive(adp.RecedingHorizon(problem, steps=25), x, 60)
+    assert bool(problem.bounds.contain(controls).all())
+    assert float(controls.abs().max()) == 1.0
+    assert float(last.abs().max()) < 0.1
+
+
+def test_short_plan_that_ends_in_the_memory_swings_up(memory: adp.GlobalValue) -> None:
+    mpc = adp.RecedingHorizon(memory.problem, steps=20, memory=memory)
+    controls, last = drive(mpc, RESETS, 120)
+    assert float(memory.problem.terminal(last).max()) < 1e-2
+    assert float(cost_of(memory.problem, RESETS, controls).mean() / GRID.mean()) < 1.01
+
+
+def test_simulation_drives_it_as_a_controller() -> None:
+    plant = systems.Pendulum()
+    cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1, low=-4.0, high=4.0)
+    problem = adp.SampledProblem.of(plant, cost, dt=0.1)
+    mpc = adp.RecedingHorizon(problem, steps=10, iterations=2)
+    x0 = torch.tensor([[0.3, 0.0], [-0.2, 0.1]], dtype=torch.float64)
+    run = adp.simulate(mpc, plant, cost, x0, dt=0.1, steps=12, compile=False)
+    best = adp.BoxDDP(problem, steps=12).solve(x0)
+    torch.testing.assert_close(run.cost, best.cost - problem.terminal(best.state[:, -1]), rtol=1e-3, atol=0)
+
+
+def test_memory_of_another_problem_is_refused(memory: adp.GlobalValue) -> None:
+    with pytest.raises(ValueError, match="must be of the same problem"):
+        adp.RecedingHorizon(pendulum(), steps=5, memory=memory)

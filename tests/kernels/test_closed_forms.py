@@ -1,0 +1,65 @@
+"""What a kernel says in closed form is what autograd finds."""
+
+from __future__ import annotations
+
+import torch
+from helpers import uniform
+from variants import KERNELS, over
+
+import staf_torch as st
+
+BASES = {
+    "rational_quadratic": st.RationalQuadraticKernel(1.3, 0.9),
+    "inverse": st.InverseMultiquadricKernel(0.7),
+}
+BASES |= {"polynomial": st.PolynomialKernel(3, 0.7), "matern": st.MaternKernel(1.5, 0.9)}
+
+
+def by_autograd(kernel: st.Kernel, y: torch.Tensor, c: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+    y = y.clone().requires_grad_()
+    (slope,) = torch.autograd.grad((kernel(y, c) @ b.unsqueeze(-1)).sum(), y)
+    return slope
+
+
+@over(KERNELS)
+def test_the_gradient_in_closed_form_is_that_of_autograd(name: str) -> None:
+    kernel = KERNELS[name].make()
+    y, c, b = uniform(2, 5, 2, seed=1), uniform(2, 4, 2, seed=2), uniform(2, 4, seed=3)
+    found = kernel.gradient(y, c, b)
+    if found is None:
+        assert type(kernel).gradient is st.Kernel.gradient  # a user's kernel says nothing
+    else:
+        torch.testing.assert_close(found, by_autograd(kernel, y, c, b), rtol=1e-11, atol=1e-12)
+
+
+@over(KERNELS)
+def test_the_gradient_of_the_core_is_that_of_autograd(name: str) -> None:
+    kernel, x = KERNELS[name].make(), uniform(2, 2, seed=4)
+    z, d, b = 0.3 * uniform(2, 5, 2, seed=1), 0.3 * uniform(2, 4, 2, seed=2), uniform(2, 4, seed=3)
+    found = kernel.core_gradient(x, z, d, b)
+    if found is None:
+        return
+    z = z.requires_grad_()
+    (slope,) = torch.autograd.grad((kernel.core(x, z, d) @ b.unsqueeze(-1)).sum(), z)
+    torch.testing.assert_close(found, slope, rtol=1e-11, atol=1e-12)
+
+
+@over(BASES, "base")
+def test_the_gradient_of_an_anchored_kernel_follows_from_that_of_its_kernel(base: str) -> None:
+    kernel = st.AnchoredKernel(BASES[base])
+    y, c, b = uniform(2, 5, 2, seed=1), uniform(2, 4, 2, seed=2), uniform(2, 4, seed=3)
+    found = kernel.gradient(y, c, b)
+    assert found is not None
+    torch.testing.assert_close(found, by_autograd(kernel, y, c, b), rtol=1e-10, atol=1e-11)
+
+
+@over(KERNELS)
+def test_the_gradient_of_the_scale_is_that_of_autograd(name: str) -> None:
+    kernel, x, z = KERNELS[name].make(), uniform(2, 2, seed=4), 0.3 * uniform(2, 5, 2, seed=1)
+    scale = kernel.log_scale(x, z)
+    found = kernel.log_scale_gradient(x, z)
+    assert (scale is None) == (found is None)
+    if found is not None:
+        z = z.requires_grad_()
+        (slope,) = torch.autograd.grad(kernel.log_scale(x, z).sum(), z)
+        torch.testing.assert_close(found.expand(z.shape), slope, rtol=1e-12, atol=1e-12)

@@ -1,0 +1,215 @@
+"""Run the suite in environments of other versions and of other means.
+
+    python tests/matrix.py [--quick] [--only lowest newest] [--place FOLDER]
+
+Environments are built once below FOLDER (`~/.cache/staf_torch-matrix` by default, some gigabytes each: torch
+from the index brings CUDA) and used again. Each runs the whole suite, with `--quick` the tests that versions
+and means touch. What cannot be built here is said, with pip's last line. The last table: `tests/README.md`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import pwd
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+ROOT = Path(__file__).resolve().parent.parent
+TOOLS = (
+    "pytest>=8",
+    "pytest-xdist>=3.6",
+    "pytest-cov>=7",
+    "hypothesis>=6.100",
+    "mpmath>=1.3",
+    "hatchling>=1.25",
+)
+EXTRAS = ("scipy>=1.11", "gymnasium>=1.1", "gmpy2>=2.1")
+LOWEST = (
+    "torch==2.6.0",
+    "numpy==1.26.0",
+    "hydra-core==1.3.8",
+    "matplotlib==3.8.0",
+    "jinja2==3.1.0",
+    "tqdm==4.66.0",
+)
+CORE = ("torch", "numpy", "matplotlib", "jinja2", "tqdm")
+QUICK = (
+    "tests/kernels",
+    "tests/figures",
+    "tests/settings",
+    "tests/test_modules.py",
+    "tests/test_variants.py",
+    "tests/cli/test_cli_errors.py",
+    "tests/lanes/test_program.py",
+    "tests/engine/test_guards.py",
+    "tests/approximation/test_layers_compiled.py",
+    "tests/deploy/test_deploy.py",
+)
+
+
+class Environment(NamedTuple):
+    """What the suite runs in."""
+
+    about: str
+    python: str | None = None  # its version; None for the interpreter that runs this, with what it has
+    packages: Sequence[str] = ()
+    compiler: bool = True
+    privileged: bool = True
+
+
+ENVIRONMENTS = {
+    "lowest": Environment("lowest declared versions", "3.11", (*LOWEST, *TOOLS, *EXTRAS)),
+    "python312": Environment(
+        "Python 3.12", "3.12", ("torch==2.9.1", "hydra-core<1.4", *CORE[1:], *TOOLS, *EXTRAS)
+    ),
+    "newest": Environment(
+        "newest of everything, Hydra 1.4 candidate",
+        "3.13",
+        (*CORE, "hydra-core==1.4.0rc3", *TOOLS, *EXTRAS, "onnx", "onnxscript", "onnxruntime"),
+    ),
+    "no_extras": Environment("no extras", "3.11", ("torch==2.13.0", *CORE[1:], "hydra-core<1.4", *TOOLS)),
+    "no_compiler": Environment("no C or C++ compiler on the path", compiler=False),
+    "unprivileged": Environment("another user, home read-only", privileged=False),
+}
+
+
+class Outcome(NamedTuple):
+    """What a run of the suite said."""
+
+    versions: str
+    said: str
+    failed: Sequence[str]
+    seconds: float
+
+
+def main() -> int:
+    """Run the command line; the exit code is 1 where an environment is not green."""
+    options = _options()
+    place = Path(options.place)
+    place.mkdir(parents=True, exist_ok=True)
+    outcomes: dict[str, Outcome | str] = {}
+    for name in options.only or ENVIRONMENTS:
+        environment = ENVIRONMENTS[name]
+        try:
+            python = _interpreter(name, environment, place)
+        except OSError as error:
+            outcomes[name] = f"not to be had here: {error}"
+        else:
+            outcomes[name] = _run(environment, python, QUICK if options.quick else ["tests"])
+        print(_row(name, outcomes[name]), flush=True)
+    print(f"\n| environment | versions | {time.strftime('%Y-%m-%d')}{', quick' if options.quick else ''} |")
+    print("|---|---|---|")
+    for name, outcome in outcomes.items():
+        print(_row(name, outcome))
+    return int(any(isinstance(outcome, str) or outcome.failed for outcome in outcomes.values()))
+
+
+def _options() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--quick", action="store_true", help="a subset of the suite")
+    parser.add_argument("--only", nargs="*", choices=[*ENVIRONMENTS], help="environments; all by default")
+    parser.add_argument("--place", default=str(Path.home() / ".cache" / "staf_torch-matrix"))
+    return parser.parse_args()
+
+
+def _interpreter(name: str, environment: Environment, place: Path) -> Path:
+    """The environment's interpreter; its packages are installed where that has not been done.
+
+    Raises:
+        OSError: if there is no such Python, or pip does not find the packages.
+    """
+    if environment.python is None:
+        return Path(sys.executable)
+    folder, done = place / name, place / name / "installed.txt"
+    wanted = "\n".join(environment.packages)
+    if not done.exists() or done.read_text() != wanted:
+        subprocess.run([str(_python(environment.python)), "-m", "venv", "--clear", str(folder)], check=True)
+        line = [str(folder / "bin" / "pip"), "install", "-q", *environment.packages]
+        ended = subprocess.run(line, capture_output=True, text=True, check=False)
+        if ended.returncode != 0:
+            raise OSError((ended.stderr.strip() or "pip failed").splitlines()[-1])
+        done.write_text(wanted)
+    return folder / "bin" / "python"
+
+
+def _python(version: str) -> Path:
+    found = shutil.which(f"python{version}")
+    kept = sorted((Path.home() / ".pyenv" / "versions").glob(f"{version}.*/bin/python"))
+    if found is None and not kept:
+        raise OSError(f"no Python {version}")
+    return kept[-1] if kept else Path(str(found))
+
+
+def _run(environment: Environment, python: Path, tests: Sequence[str]) -> Outcome:
+    with (
+        tempfile.TemporaryDirectory(prefix="staf-matrix-") as scratch,
+        _home(environment, Path(scratch)) as home,
+    ):
+        settings = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", **home}
+        line = [str(python), "-m", "pytest", "-q", "-p", "no:cacheprovider", "--tb=short", *tests]
+        user = None if environment.privileged else "nobody"
+        begun = time.monotonic()
+        ended = subprocess.run(
+            line, cwd=ROOT, env=settings, capture_output=True, text=True, check=False, user=user
+        )
+    failed = re.findall(r"^(?:FAILED|ERROR) (\S+)", ended.stdout, re.MULTILINE)
+    said = (ended.stdout.strip() or ended.stderr.strip() or "nothing").splitlines()[-1]
+    if ended.returncode != 0:
+        sys.stderr.write(ended.stdout[-20000:] + ended.stderr[-3000:])
+        failed = failed or ["pytest itself"]
+    return Outcome(_versions(python), said.strip("= "), failed, time.monotonic() - begun)
+
+
+@contextmanager
+def _home(environment: Environment, scratch: Path) -> Iterator[dict[str, str]]:
+    """Variables of the environment: where programs are found, where a user may write."""
+    changed: dict[str, str] = {}
+    if not environment.compiler:
+        programs = scratch / "bin"
+        programs.mkdir()
+        for name in ("sh", "bash", "env", "git", "ls", "cat", "uname", "rm", "mkdir"):
+            found = shutil.which(name)
+            if found:
+                (programs / name).symlink_to(found)
+        changed |= {"PATH": str(programs), "CXX": "", "CC": "", "XDG_CACHE_HOME": str(scratch / "cache")}
+    if not environment.privileged:
+        home, temporary = scratch / "home", scratch / "tmp"
+        home.mkdir(mode=0o555)
+        temporary.mkdir()
+        scratch.chmod(0o755)
+        os.chown(temporary, pwd.getpwnam("nobody").pw_uid, -1)
+        unset = ("XDG_CACHE_HOME", "MPLCONFIGDIR")
+        changed |= {"HOME": str(home), "TMPDIR": str(temporary), **dict.fromkeys(unset, "")}
+    yield changed
+
+
+def _versions(python: Path) -> str:
+    program = (
+        "import platform; from importlib.metadata import version as v\n"
+        "print('Python', platform.python_version(), *(f'{n} {v(n)}' for n in "
+        "('torch', 'numpy', 'hydra-core', 'matplotlib')), sep=', ')"
+    )
+    return subprocess.run(
+        [str(python), "-c", program], capture_output=True, text=True, check=True
+    ).stdout.strip()
+
+
+def _row(name: str, outcome: Outcome | str) -> str:
+    about = ENVIRONMENTS[name].about
+    if isinstance(outcome, str):
+        return f"| {about} | - | {outcome} |"
+    failing = f"; failing: {', '.join(outcome.failed[:5])}" if outcome.failed else ""
+    return f"| {about} | {outcome.versions} | {outcome.said}{failing} |"
+
+
+if __name__ == "__main__":
+    sys.exit(main())
