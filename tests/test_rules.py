@@ -45,6 +45,7 @@ OTHERS = {
     "GlobalValue": "in tests/adp/test_global_value.py",
     "learn_global_value": "in tests/adp/test_global_value.py",
     "StepPlant": "in tests/adp/test_user_plants.py",
+    "RecedingHorizon": "in tests of its own",
     "report": "in tests of its own",
     "near_optimal": "in tests of its own",
     "SampledRollout": "in tests of its own",
