@@ -164,6 +164,7 @@ PLANTS: dict[str, Callable[[], systems.ControlAffineSystem]] = {
     "pendulum": systems.Pendulum,
     "van_der_pol": systems.VanDerPol,
     "planar_quadrotor": systems.PlanarQuadrotor,
+    "cart_pole": systems.CartPole,
     "linear": lambda: systems.Linear([[0.0, 1.0], [2.0, -1.0]], [[0.0], [1.0]]),
     "linear_of_two_inputs": lambda: systems.Linear(
         [[0.1, 1.0, 0.0], [0.0, 0.2, 1.0], [0.3, 0.0, -1.0]], [[0.0, 1.0], [1.0, 0.0], [0.0, 2.0]]

@@ -57,11 +57,17 @@ def run(
     jobs = member_overrides(cfg.members, loader)
     composer = Composer(loader, config_name, hydra_node=False)
     out, tally = RunDirectory(directory), _Tally()
+
+    def composed(begin: int) -> list[DictConfig]:
+        fixed = ("figures=false", f"history={str(keep).lower()}")
+        return [composer([*base, *job, *fixed]) for job in jobs[begin : begin + _PIECE]]
+
+    cfgs = composed(0)  # before anything is written: most wrong names are refused here
     with progress.over(len(jobs), "members") as advance, out.lines(MEMBERS) as write:
         write(f'{{"version": {json.dumps(__version__)}, "members": [\n')
         for begin in range(0, len(jobs), _PIECE):
             part = jobs[begin : begin + _PIECE]
-            cfgs = [composer([*base, *job, "figures=false", f"history={str(keep).lower()}"]) for job in part]
+            cfgs = composed(begin) if begin else cfgs
             places = [directory / "members" / str(begin + index) for index in range(len(part))]
             rows: list[dict[str, Any]] = [{} for _ in part]
             for index, outcome, _ in compute(cfgs, places, Inline(), tell=lambda jobs: None):
