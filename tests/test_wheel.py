@@ -39,9 +39,9 @@ def test_wheel_holds_the_package_its_settings_and_nothing_else(wheel: Path) -> N
     packages = {"staf_torch", "hydra_plugins"}  # Hydra 1.3 looks into the second
     assert {name.partition("/")[0] for name in names} == packages | {"staf_torch-0.1.0.dist-info"}
     assert {name for name in names if name.startswith("hydra_plugins")} == {"hydra_plugins/staf_batched.py"}
-    sources = {
-        f"staf_torch/{p.relative_to(ROOT / 'staf_torch')}" for p in (ROOT / "staf_torch").rglob("*.py")
-    }
+    files = [p.relative_to(ROOT / "staf_torch") for p in (ROOT / "staf_torch").rglob("*.py")]
+    sources = {f"staf_torch/{p}" for p in files if p.parts[0] != "plugins"}
+    assert not any(name.startswith("staf_torch/plugins") for name in names)  # one copy of each file
     settings = {f"staf_torch/{p.relative_to(ROOT)}" for p in (ROOT / "conf").rglob("*.yaml")}
     assert sources | settings | {"staf_torch/py.typed"} <= names
     assert any(name.endswith("LICENSE") for name in names)

@@ -75,7 +75,7 @@ def find_launcher() -> None:
     another day. A wheel has one at the top level, for programs that do not import this module.
     """
     folder = _PACKAGE / "plugins"
-    if str(folder) in sys.path:
+    if str(folder) in sys.path or not folder.is_dir():
         return
     try:
         installed = importlib.util.find_spec("hydra_plugins.staf_batched") is not None
