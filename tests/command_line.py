@@ -120,6 +120,10 @@ def one(folder: str, argv: list[str]) -> tuple[int, str, str]:
             traceback.print_exc(file=err)
             code = 99
     logging.shutdown()
+    root = logging.getLogger()
+    for handler in root.handlers[:]:  # of the run: the next message would open its file again
+        if isinstance(handler, logging.FileHandler) and handler.baseFilename.endswith("staf.log"):
+            root.removeHandler(handler)
     sys.path[:] = path
     sys.modules.pop("plants", None)
     return code, out.getvalue(), err.getvalue()

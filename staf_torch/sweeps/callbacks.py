@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import importlib.util
 import logging
 import os
@@ -236,6 +237,9 @@ def claim(config: DictConfig) -> None:
 
 def _refuse_links(directory: Path) -> None:
     """Raise ValueError where something in a directory leads elsewhere: nothing is written through it."""
+    blocking = next((p for p in (directory, *directory.parents) if p.exists() and not p.is_dir()), None)
+    if blocking is not None:
+        raise NotADirectoryError(errno.ENOTDIR, "Not a directory", str(blocking))
     found = [path for path in links_in(directory) if ".submitit" not in path.parts]
     if found:
         more = f" and {len(found) - 1} more" if len(found) > 1 else ""

@@ -27,7 +27,7 @@ from staf_torch import (
 )
 from staf_torch.engine import chase_pieces
 from staf_torch.engine.result import concatenate
-from staf_torch.metrics.ball_error import ball_error, gradient_error
+from staf_torch.metrics.ball_error import StateErrorPass
 
 
 @functools.cache
@@ -43,11 +43,12 @@ def settled(law: str, steps: int, predictor: str = "none", dt: float = 0.01) -> 
         predictor=PREDICTORS[predictor],
     )
     at = slice(math.ceil(5 / dt - 1e-9), None)
-    x, coefficients = result.state[:, at], result.coefficients[:, at]
+    parts = (result.state, result.coefficients, result.ideal_weights)
+    errors = StateErrorPass(basis(), TARGET)(*(part[:, at] for part in parts))
     return {
         "error": float((result.value - result.estimate)[:, at].abs().max()),
-        "ball": float(ball_error(basis(), TARGET, x, coefficients).max()),
-        "gradient": float(gradient_error(basis(), TARGET, x, coefficients).max()),
+        "ball": float(errors.ball_error.max()),
+        "gradient": float(errors.gradient_error.max()),
         "before": float(result.excess_before[:, at].max()),
         "after": float(result.excess[:, at].max()),
     }

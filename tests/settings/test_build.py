@@ -47,6 +47,7 @@ def problem(line: str) -> ChaseProblem:
 
 NEEDS = {  # what some options cannot do without
     "centers=directions": "centers.directions=[[0,1],[1,0],[-1,0]]",
+    "system=cart_pole": "centers=simplex initial_state=[0,0,0,0]",
     "system=planar_quadrotor": "centers=simplex initial_state=[0,0,0,0,0,0]",
     "system=three_state": "centers=simplex initial_state=[0,0,0]",
 }

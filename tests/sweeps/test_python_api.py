@@ -53,6 +53,7 @@ def _untouched() -> Iterator[None]:
     assert state() == before
 
 
+@pytest.mark.compiled  # as the command in a process of its own
 @pytest.mark.usefixtures("_untouched")
 def test_a_run_leaves_what_the_command_leaves(capsys: pytest.CaptureFixture[str]) -> None:
     found = staf_torch.run(*SHORT, "centers.radius=0.2", directory="one")
@@ -76,6 +77,7 @@ def test_a_run_leaves_what_the_command_leaves(capsys: pytest.CaptureFixture[str]
     assert "<th>ball_error</th>" in found._repr_html_()
 
 
+@pytest.mark.compiled
 @pytest.mark.usefixtures("_untouched")
 def test_a_sweep_is_that_of_the_command_and_shows_nothing(capsys: pytest.CaptureFixture[str]) -> None:
     lines = ("kernel=gaussian,matern", "centers.radius=0.2,0.1", *BARE)
