@@ -21,6 +21,7 @@ from ..engine import chase
 from ..kernels import ExponentialKernel
 from ..lanes.build import _COMPILERS, _cache
 from ..optim import SteepestDescent
+from ..results.build import source
 from ..systems import Oscillator, simulate
 from ..targets import Paper
 
@@ -31,8 +32,8 @@ _TOLERANCE = 1e-6  # relative
 
 
 def version() -> str:
-    """Return what `staf --version` prints."""
-    return f"staf_torch {__version__}"
+    """Return what `staf --version` prints: the version and, as `run.json` has it, a hash of the source."""
+    return f"staf_torch {__version__} (source {source()})"
 
 
 def main() -> int:

@@ -46,6 +46,8 @@ def source() -> str:
     """Return a hash of the package's own files, installed or in a checkout: 12 hexadecimal digits."""
     found = hashlib.sha256()
     for path in sorted(_PACKAGE.rglob("*")):
+        if "plugins" in path.relative_to(_PACKAGE).parts:  # a wheel has them elsewhere
+            continue
         if path.suffix in (".py", ".hpp", ".cpp", ".html") and path.is_file():
             found.update(f"{path.relative_to(_PACKAGE)} {path.stat().st_size}\0".encode())
             found.update(path.read_bytes())

@@ -58,6 +58,27 @@ def test_compiled_gradients_reach_the_parameters() -> None:
         torch.testing.assert_close(p.grad, expected[key], rtol=1e-9, atol=1e-9, msg=key)
 
 
+@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")  # inductor warns itself
+def test_inductor_differentiates_learned_hyperparameters_of_the_newton_basis() -> None:
+    """Three centers, all learned: inductor was wrong where it fused the Gram matrix with its factor."""
+    kernel = st.AnchoredKernel(st.GaussianKernel(nn.Parameter(torch.tensor(0.8, dtype=torch.float64))))
+    radius = nn.Parameter(torch.tensor(0.3, dtype=torch.float64))
+    basis = st.StaFBasis(kernels[name](), st.StateFollowingCenters(nn.Parameter(0.95 * st.rings(3)), radius))
+    x, points = torch.tensor([0.5, -0.4], dtype=torch.float64), 0.05 * uniform(5, 2)
+
+    def value() -> Tensor:
+        local = basis.local(x)
+        return local.evaluate(points, local.fit(basis.values(x, Paper()))).square().sum()
+
+    learned = list(basis.parameters())
+    assert len(learned) == 3
+    expected = torch.autograd.grad(value(), learned)
+    torch._dynamo.reset()
+    found = torch.autograd.grad(torch.compile(value)(), learned)
+    for ours, theirs in zip(found, expected, strict=True):
+        torch.testing.assert_close(ours, theirs, rtol=1e-9, atol=1e-9)
+
+
 def test_compiled_layers_see_swapped_directions() -> None:
     staf = fixed("exponential", 0.4, (), None)
     y = staf.state + uniform(3, 2, low=-0.2, high=0.2)

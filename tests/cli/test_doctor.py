@@ -13,6 +13,7 @@ from sweep_runs import write_run, write_sweep
 from staf_torch import __version__
 from staf_torch.cli import doctor, table
 from staf_torch.cli.staf import main
+from staf_torch.results.build import source
 
 
 def test_version_is_told_without_a_run(
@@ -23,7 +24,7 @@ def test_version_is_told_without_a_run(
     with pytest.raises(SystemExit) as ended:
         main()
     assert not ended.value.code
-    assert capsys.readouterr().out == f"staf_torch {__version__}\n"
+    assert capsys.readouterr().out == f"staf_torch {__version__} (source {source()})\n"
     assert not list(tmp_path.iterdir())
 
 
