@@ -63,7 +63,7 @@ def test_inductor_differentiates_learned_hyperparameters_of_the_newton_basis() -
     """Three centers, all learned: inductor was wrong where it fused the Gram matrix with its factor."""
     kernel = st.AnchoredKernel(st.GaussianKernel(nn.Parameter(torch.tensor(0.8, dtype=torch.float64))))
     radius = nn.Parameter(torch.tensor(0.3, dtype=torch.float64))
-    basis = st.StaFBasis(kernels[name](), st.StateFollowingCenters(nn.Parameter(0.95 * st.rings(3)), radius))
+    basis = st.StaFBasis(kernel, st.StateFollowingCenters(nn.Parameter(0.95 * st.rings(3)), radius))
     x, points = torch.tensor([0.5, -0.4], dtype=torch.float64), 0.05 * uniform(5, 2)
 
     def value() -> Tensor:
