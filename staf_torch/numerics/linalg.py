@@ -98,18 +98,22 @@ def condition_number(gram: Tensor) -> Tensor:
     return torch.where(finite, ratio, torch.nan)
 
 
-def positive_definite(call: str, name: str, matrix: Tensor, size: int) -> Tensor:
-    """A symmetric positive definite (size, size) float64 matrix.
-
-    Raises:
-        ValueError: if it is anything else.
-    """
+def _symmetric(call: str, name: str, matrix: Tensor, size: int) -> None:
     if matrix.shape != (size, size):
         raise fail(call, name, f"must be ({size}, {size})", matrix)
     if not bool(torch.isfinite(matrix).all()):
         raise fail(call, name, "must be finite", matrix)
     if not torch.allclose(matrix, matrix.mT, rtol=1e-12, atol=0.0):
         raise fail(call, name, "must be symmetric", matrix)
+
+
+def positive_definite(call: str, name: str, matrix: Tensor, size: int) -> Tensor:
+    """A symmetric positive definite (size, size) float64 matrix.
+
+    Raises:
+        ValueError: if it is anything else.
+    """
+    _symmetric(call, name, matrix, size)
     if float(torch.linalg.eigvalsh(matrix)[0]) <= 0:
         raise fail(call, name, "must be positive definite", matrix)
     return matrix.to(torch.float64)
@@ -121,12 +125,7 @@ def positive_semidefinite(call: str, name: str, matrix: Tensor, size: int) -> Te
     Raises:
         ValueError: if it is anything else.
     """
-    if matrix.shape != (size, size):
-        raise fail(call, name, f"must be ({size}, {size})", matrix)
-    if not bool(torch.isfinite(matrix).all()):
-        raise fail(call, name, "must be finite", matrix)
-    if not torch.allclose(matrix, matrix.mT, rtol=1e-12, atol=0.0):
-        raise fail(call, name, "must be symmetric", matrix)
+    _symmetric(call, name, matrix, size)
     values = torch.linalg.eigvalsh(matrix)
     if float(values[0]) < -1e-12 * float(values.abs().max()):
         raise fail(call, name, "must be positive semidefinite", matrix)
