@@ -191,7 +191,7 @@ MODULES: dict[str, Case] = {
 }
 OTHERS = {"_Held", "ConventionModule", "FunctionPlant", "StepPlant", "RatePlant", "Barrier"}
 OTHERS |= {"SampledProblem", "GlobalValue", "SafetyFilter", "PlanReplay"}
-OTHERS |= {"RecedingHorizon"}
+OTHERS |= {"RecedingHorizon", "MujocoPlant", "EnvironmentPlant"}
 OTHERS |= {"NearOptimal", "SampledRollout"}
 """What wraps a function of the user's own, or takes minutes to make: tested in its room."""
 

@@ -86,6 +86,7 @@ class Plant(nn.Module, abc.ABC):
     def motion(self, x: Tensor, u: Tensor) -> Tensor:
         """x' in continuous time, x+ - x in discrete time: (..., n), (..., m) -> (..., n)."""
 
+    @abc.abstractmethod
     def linearisation(self, x: Tensor | None = None, u: Tensor | None = None) -> Linearisation:
         """A and B near a state and an input at rest, by default the equilibrium.
 
@@ -96,7 +97,6 @@ class Plant(nn.Module, abc.ABC):
         Raises:
             ValueError: if ``dim`` is None.
         """
-        raise NotImplementedError
 
     def difference(self, x: Tensor, y: Tensor) -> Tensor:
         """x - y, of the periodic coordinates in [-pi, pi]: (..., n), (..., n) -> (..., n)."""
