@@ -192,7 +192,7 @@ MODULES: dict[str, Case] = {
     "SupervisedPolicy": Case(lambda s: SupervisedPolicy(lqr(s), adp.Supervised(learner(1.0), lqr(), cost()))),
     "FoldedRollout": Case(lambda s: FoldedRollout(rollout(s))),
 }
-OTHERS = {"_Held", "ConventionModule", "FunctionPlant", "StepPlant", "RatePlant", "Barrier"}
+OTHERS = {"_Held", "ConventionModule", "FunctionPlant", "StepPlant", "RatePlant"}
 OTHERS |= {"SampledProblem", "GlobalValue", "SafetyFilter", "PlanReplay"}
 OTHERS |= {"RecedingHorizon"}
 OTHERS |= {"NearOptimal", "SampledRollout"}

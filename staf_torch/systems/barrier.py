@@ -35,11 +35,11 @@ class Barrier(ControlAffineSystem):
 
     Example:
         >>> plant = systems.Barrier(systems.Pendulum(), low=[-1.0, None], high=[2.0, None])
-        >>> s = plant.transform(torch.tensor([2.0 - 1e-6, 3.0]).double())
+        >>> s = plant.transform(torch.tensor([2.0 - 1e-6, 3.0], dtype=torch.float64))
         >>> s.round(decimals=4), plant.margin(s)
-        (tensor([13.8155,  3.0000], dtype=torch.float64), tensor(1.0000e-06, dtype=torch.float64))
+        (tensor([15.6073,  3.0000], dtype=torch.float64), tensor(1.0000e-06, dtype=torch.float64))
 
-        Shown by `staf experiment=safe_box`.
+        Shown by `staf_torch/adp/README.md`.
 
     Args:
         plant: with `dim`, in continuous time and affine in the control.

@@ -21,10 +21,10 @@ class TwoLinkRobot(ControlAffineSystem):
     Example:
         >>> plant = systems.TwoLinkRobot()
         >>> plant.effectiveness(torch.zeros(4).double())[2:].round(decimals=3)  # M^-1
-        tensor([[ 0.3470, -0.7750],
-                [-0.7750,  6.8330]], dtype=torch.float64)
+        tensor([[ 0.3360, -0.7500],
+                [-0.7500,  6.7790]], dtype=torch.float64)
 
-        Shown by `staf experiment=safe_box system=two_link_robot`.
+        Shown by `staf system=two_link_robot`.
 
     Args:
         inertia: (p1, p2, p3), kg m^2, with p2 (p1 - p2) > p3^2, so that M is positive definite.
