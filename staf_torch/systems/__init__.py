@@ -1,5 +1,6 @@
 """Plants, one a file, and their trajectories."""
 
+from .barrier import Barrier as Barrier
 from .base import ControlAffineSystem as ControlAffineSystem
 from .base import Linearisation as Linearisation
 from .base import Plant as Plant
@@ -15,12 +16,15 @@ from .oscillator import Oscillator as Oscillator
 from .pendulum import Pendulum as Pendulum
 from .planar_quadrotor import PlanarQuadrotor as PlanarQuadrotor
 from .three_state import ThreeState as ThreeState
+from .two_link_robot import TwoLinkRobot as TwoLinkRobot
 from .two_state import TwoState as TwoState
+from .two_state_chain import TwoStateChain as TwoStateChain
 from .user_plants import RatePlant as RatePlant
 from .user_plants import StepPlant as StepPlant
 from .van_der_pol import VanDerPol as VanDerPol
 
 __all__ = [
+    "Barrier",
     "Bounds",
     "CartPole",
     "ControlAffineSystem",
@@ -34,7 +38,9 @@ __all__ = [
     "RatePlant",
     "StepPlant",
     "ThreeState",
+    "TwoLinkRobot",
     "TwoState",
+    "TwoStateChain",
     "Units",
     "VanDerPol",
     "runge_kutta_step",
