@@ -78,6 +78,10 @@ class RolloutPolicy(nn.Module):
         period: float | None = None,
     ) -> None:
         super().__init__()
+        if not isinstance(model, ControlAffineSystem):
+            raise fail(
+                "RolloutPolicy", "model", "must be a ControlAffineSystem; `near_optimal` takes others", model
+            )
         if model.dim != basis.dim:
             raise fail("RolloutPolicy", "basis", f"must have the plant's {model.dim} states", basis.dim)
         self.basis, self.model, self.cost, self.terminal = basis, model, cost.around(model), terminal
