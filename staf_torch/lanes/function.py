@@ -62,7 +62,7 @@ class RowFunction:
             return self._function(x)
         dims = x.dim()
         flat = x if dims == 2 else x.unsqueeze(0) if dims == 1 else x.reshape(-1, x.shape[-1])
-        if self._asked < _PAYS:
+        if self._asked + len(flat) / 200 < _PAYS:  # a large batch pays for itself
             self._asked += 1 + len(flat) / 200
             return self._function(x)
         if self._served is None or self._changed():
