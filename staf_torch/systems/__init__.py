@@ -11,6 +11,7 @@ from .integrators import runge_kutta_step as runge_kutta_step
 from .integrators import simulate as simulate
 from .integrators import trajectory as trajectory
 from .linear import Linear as Linear
+from .mujoco_plant import MujocoPlant as MujocoPlant
 from .oscillator import Oscillator as Oscillator
 from .pendulum import Pendulum as Pendulum
 from .planar_quadrotor import PlanarQuadrotor as PlanarQuadrotor
@@ -29,6 +30,7 @@ __all__ = [
     "ControlAffineSystem",
     "Linear",
     "Linearisation",
+    "MujocoPlant",
     "Oscillator",
     "Pendulum",
     "PlanarQuadrotor",

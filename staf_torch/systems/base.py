@@ -94,6 +94,7 @@ class Plant(nn.Module, abc.ABC):
         """The state that is a ``step`` of the velocity further on: (..., n), (..., n) -> (..., n)."""
         return x + step
 
+    @abc.abstractmethod
     def linearisation(self, x: Tensor | None = None, u: Tensor | None = None) -> Linearisation:
         """A and B near a state and an input at rest, by default the equilibrium.
 
@@ -104,7 +105,6 @@ class Plant(nn.Module, abc.ABC):
         Raises:
             ValueError: if ``dim`` is None.
         """
-        raise NotImplementedError
 
     def difference(self, x: Tensor, y: Tensor) -> Tensor:
         """x - y, of the periodic coordinates in [-pi, pi]: (..., n), (..., n) -> (..., n)."""
