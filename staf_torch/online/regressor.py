@@ -33,7 +33,7 @@ class StaFRegressor(StreamEstimator):
     streams.
 
     With ``memory``, the accurate mode (`Bank`): so many samples are kept, the centers are taken from them
-    where the state comes back, and local Gaussian processes, filters and a linear model are mixed by how
+    where the state comes back, and local Gaussian processes, filters, quadratic models are mixed by how
     well they predict. Nothing needs to be tuned; about a tenth of a millisecond a sample. The filter's
     arguments, from ``kernel`` to ``robust``, are not used then.
 
