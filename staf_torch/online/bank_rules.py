@@ -66,6 +66,7 @@ class Rules(NamedTuple):
     floor: float = 1e-3  # of the variance, in running squared errors
     margin: float = 0.1  # how far beyond the range of y a member may go
     far: float = 1e3  # spreads from the center beyond which a sample is not believed
+    doubtful: float = 8.0  # deviations beyond which a sample waits for another one such to be learned
     outlying: float = 30.0  # median deviations beyond which a value has no say in the units
     learned_at: tuple[int, ...] = (2, 5, 10, 20, 40)  # samples after which the units are learned
     forgetting: tuple[float, ...] = (0.9, 0.95, 0.97, 0.98, 0.99, 0.995, 0.999, 1.0)  # of the filters
@@ -98,7 +99,7 @@ class Rules(NamedTuple):
         found += [*self.forgetting, self.carried_ratio, self.carried_slack**2]
         found += [*self.quadratic_forgetting, *self.quadratic_prior, self.pace, self.correction_prior]
         found += [self.correction_forgetting, self.correction_most, self.correction_discount]
-        return [*found, self.correction_share, self.least, self.doubt]
+        return [*found, self.correction_share, self.least, self.doubt, self.doubtful]
 
 
 def layout(shape: BankShape) -> list[tuple[str, tuple[int, ...]]]:
@@ -111,6 +112,9 @@ def layout(shape: BankShape) -> list[tuple[str, tuple[int, ...]]]:
         ("last_y", (k,)),
         ("asked", (n,)),
         ("answered", ()),
+        *((name, ()) for name in ("waiting", "trust", "waiting_time", "waiting_lapse")),
+        ("waiting_x", (n,)),  # a sample that nobody expected, until the next one tells
+        ("waiting_y", (k,)),
         ("center", (n + k,)),
         ("spread", (n + k,)),
         ("covariance", (n + 1, n + 1)),
