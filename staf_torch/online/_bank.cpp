@@ -331,28 +331,37 @@ static void keep(const Rules &r, Stream &s, const double *x, const double *y, do
                 }
 }
 
-static void accept(const Rules &r, Stream &s, const double *x, const double *y, double time, double lapse) {
+static void notice(Stream &s, const double *y) {
     for (int o = 0; o < K; ++o) {
         s.low[o] = std::min(s.low[o], y[o]), s.high[o] = std::max(s.high[o], y[o]);
         s.last_y[o] = y[o];
     }
+}
+
+static void accept(const Rules &r, Stream &s, const double *x, const double *y, double time, double lapse) {
     s.clock += 1, s.learned += 1;
     keep(r, s, x, y, time);
     if (std::find(r.rescaled, r.rescaled + 6, s.clock) != r.rescaled + 6) rescale(r, s);
     else carry(r, s, x, y, lapse);
 }
 
-// Whether a sample that nobody expected waits: it is learned if the next one is alike, else it was an outlier.
+// Whether a sample that nobody expected waits: it is learned as it is if the next one is alike, else within limits.
 static bool waits(const Rules &r, Stream &s, const double *x, const double *y, const double *told, double lapse) {
     bool doubtful = false;
     for (int o = 0; o < K; ++o) {
         const double error = in_units(r, s, o, y[o]) - s.mean[o];
         doubtful |= told[o] == told[o] && square(error) > square(r.doubtful) * std::max(s.variance[o], s.pace[o]);
     }
-    if (doubtful && s.clock >= 40 && s.trust == 0) {
+    if (doubtful && s.clock >= r.settled && s.trust == 0) {
         if (s.waiting == 0) {
             std::copy(x, x + n, s.waiting_x);
             std::copy(y, y + K, s.waiting_y);
+            for (int o = 0; o < K; ++o) {
+                const double most = r.doubtful * std::sqrt(std::max(s.variance[o], s.pace[o]));
+                const double limited = std::min(std::max(in_units(r, s, o, y[o]), s.mean[o] - most), s.mean[o] + most);
+                s.limited_y[o] = limited * scale_of(r, s, n + o) + shift_of(r, s, n + o);
+            }
+            notice(s, y);
             s.waiting = 1, s.waiting_time = s.time, s.waiting_lapse = lapse;
             return true;
         }
@@ -360,7 +369,10 @@ static bool waits(const Rules &r, Stream &s, const double *x, const double *y, c
         accept(r, s, s.waiting_x, s.waiting_y, s.waiting_time, s.waiting_lapse);
         return false;
     }
-    s.skipped += s.waiting, s.waiting = 0;
+    if (s.waiting) {
+        s.waiting = 0;
+        accept(r, s, s.waiting_x, s.limited_y, s.waiting_time, s.waiting_lapse);
+    }
     s.trust = std::max(s.trust - 1, 0.);
     return false;
 }
@@ -398,6 +410,7 @@ static void learn(const Rules &r, Stream &s, const double *given, const double *
             if (told[o] == told[o]) judge_members(r, s, o, in_units(r, s, o, y[o]));
     }
     if (s.far > 0) return;
+    notice(s, y);
     accept(r, s, x, y, s.time, lapse);
 }
 

@@ -255,17 +255,22 @@ class BankDefinition:
         if s.number("far") > 0:
             s["skipped"].add_(1)
             return
+        self._notice(s, y)
         self._accept(s, x, y, s.number("time"), lapse)
 
     def _waits(self, s: Views, x: Tensor, y: Tensor, seen: Tensor, lapse: float) -> bool:
-        """Whether a sample that nobody expected waits: it is learned if the next one is alike, or forgotten."""
+        """Whether a sample that nobody expected waits: if the next one is alike, it is learned as it is."""
         center, spread = (part[self.shape.dim :] for part in self._units(s))
-        most = self.rules.doubtful**2 * torch.maximum(s["variance"], s["pace"])
-        doubtful = bool((seen & (((y - center) / spread - s["mean"]).square() > most)).any())
-        if doubtful and s.number("clock") >= 40 and s.number("trust") == 0:
+        most = self.rules.doubtful * torch.maximum(s["variance"], s["pace"]).sqrt()
+        away = (y - center) / spread - s["mean"]
+        doubtful = bool((seen & (away.abs() > most)).any())
+        if doubtful and s.number("clock") >= self.rules.settled and s.number("trust") == 0:
             if s.number("waiting") == 0:
+                away = torch.minimum(torch.maximum(away, -most), most)
+                s["limited_y"].copy_((s["mean"] + away) * spread + center)
                 for name, value in (("x", x), ("y", y), ("time", s["time"]), ("lapse", torch.tensor(lapse))):
                     s[f"waiting_{name}"].copy_(value)
+                self._notice(s, y)
                 s["waiting"].fill_(1.0)
                 return True
             s["waiting"].zero_()
@@ -273,15 +278,19 @@ class BankDefinition:
             when = s.number("waiting_time"), s.number("waiting_lapse")
             self._accept(s, s["waiting_x"].clone(), s["waiting_y"].clone(), *when)
             return False
-        s["skipped"].add_(s["waiting"])
-        s["waiting"].zero_()
+        if s.number("waiting") == 1:
+            s["waiting"].zero_()
+            when = s.number("waiting_time"), s.number("waiting_lapse")
+            self._accept(s, s["waiting_x"].clone(), s["limited_y"].clone(), *when)
         s["trust"].sub_(1.0).clamp_(min=0.0)
         return False
 
-    def _accept(self, s: Views, x: Tensor, y: Tensor, time: float, lapse: float) -> None:
+    def _notice(self, s: Views, y: Tensor) -> None:
         torch.minimum(s["low"], y, out=s["low"])
         torch.maximum(s["high"], y, out=s["high"])
         s["last_y"].copy_(y)
+
+    def _accept(self, s: Views, x: Tensor, y: Tensor, time: float, lapse: float) -> None:
         s["clock"].add_(1)
         s["learned"].add_(1)
         self._keep(s, x, y, time)
