@@ -193,6 +193,7 @@ OTHERS = {"_Held", "ConventionModule", "FunctionPlant", "StepPlant", "RatePlant"
 OTHERS |= {"SampledProblem", "GlobalValue", "SafetyFilter", "PlanReplay"}
 OTHERS |= {"RecedingHorizon"}
 OTHERS |= {"NearOptimal", "SampledRollout"}
+OTHERS |= {"ParametricPlant", "ChangingPlant", "AdaptiveLQR", "ConcurrentTracker", "Measured", "_Informed"}
 """What wraps a function of the user's own, or takes minutes to make: tested in its room."""
 
 
