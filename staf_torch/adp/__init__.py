@@ -59,6 +59,8 @@ from .near_optimal import NearOptimal as NearOptimal
 from .near_optimal import near_optimal as near_optimal
 from .receding_horizon import RecedingHorizon as RecedingHorizon
 from .rollout import RolloutPolicy as RolloutPolicy
+from .safety_filter import Filtered as Filtered
+from .safety_filter import SafetyFilter as SafetyFilter
 from .sampled_problem import SampledProblem as SampledProblem
 from .sampled_rollout import SampledRollout as SampledRollout
 from .sampling import HeldStability as HeldStability
@@ -95,6 +97,7 @@ __all__ = [
     "Estimate",
     "Extrapolation",
     "Feedback",
+    "Filtered",
     "Frozen",
     "Gains",
     "GlobalValue",
@@ -121,6 +124,7 @@ __all__ = [
     "RandomPoints",
     "RecedingHorizon",
     "RolloutPolicy",
+    "SafetyFilter",
     "SampledProblem",
     "SampledRollout",
     "SlopeWindow",

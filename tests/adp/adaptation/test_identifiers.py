@@ -199,6 +199,12 @@ def test_forgetting_never_opens_the_covariance_beyond_its_first_size() -> None:
             "affine",
         ),
         (lambda: adp.ParametricPlant(lambda x, u: u, dim=1, inputs=1, theta=[1.0]), "regressor"),
+        (lambda: adp.ParametricPlant(lambda x, u: u, dim=1, inputs=-1, theta=[1.0]), "inputs"),
+        (lambda: adp.ConcurrentTracker(MODEL, tuple, length=0.1, feedback=1.0, gain=-1.0), "gain"),
+        (
+            lambda: adp.ConcurrentTracker(MODEL, tuple, length=0.1, feedback=1.0, gain=1.0, source="x"),
+            "source",
+        ),
         (lambda: adp.Measured(adp.Feedback(lambda x: x), noise=-1.0, dim=2), "noise"),
     ],
 )
