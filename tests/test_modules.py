@@ -174,6 +174,9 @@ MODULES: dict[str, Case] = {
     "PlanarQuadrotor": Case(lambda s: systems.PlanarQuadrotor(mass=s), flows, carried=False),
     "ThreeState": Case(lambda s: systems.ThreeState(), flows, carried=False),
     "TwoState": Case(lambda s: systems.TwoState(), flows, carried=False),
+    "TwoStateChain": Case(lambda s: systems.TwoStateChain([1.0, s, -0.5, 0.5]), flows),
+    "TwoLinkRobot": Case(lambda s: systems.TwoLinkRobot(friction=[s, 1.0, 1.0, 1.0]), flows),
+    "Barrier": Case(lambda s: systems.Barrier(systems.TwoState(), -s, [s, None]), flows),
     "CartPole": Case(lambda s: systems.CartPole(cart=s), flows, carried=False),
     "VanDerPol": Case(systems.VanDerPol, flows, carried=False),
     "Paper": Case(lambda s: targets.Paper(), carried=False),
@@ -189,9 +192,9 @@ MODULES: dict[str, Case] = {
     "SupervisedPolicy": Case(lambda s: SupervisedPolicy(lqr(s), adp.Supervised(learner(1.0), lqr(), cost()))),
     "FoldedRollout": Case(lambda s: FoldedRollout(rollout(s))),
 }
-OTHERS = {"_Held", "ConventionModule", "FunctionPlant", "StepPlant", "RatePlant", "Barrier"}
-OTHERS |= {"SampledProblem", "GlobalValue", "SafetyFilter", "PlanReplay"}
-OTHERS |= {"RecedingHorizon"}
+OTHERS = {"_Held", "ConventionModule", "FunctionPlant", "StepPlant", "RatePlant"}
+OTHERS |= {"SampledProblem", "GlobalValue", "SafetyFilter", "FilteredPolicy", "PlanReplay"}
+OTHERS |= {"RecedingHorizon", "MujocoPlant", "EnvironmentPlant"}
 OTHERS |= {"NearOptimal", "SampledRollout"}
 """What wraps a function of the user's own, or takes minutes to make: tested in its room."""
 

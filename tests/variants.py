@@ -165,6 +165,9 @@ PLANTS: dict[str, Callable[[], systems.ControlAffineSystem]] = {
     "van_der_pol": systems.VanDerPol,
     "planar_quadrotor": systems.PlanarQuadrotor,
     "cart_pole": systems.CartPole,
+    "two_state_chain": systems.TwoStateChain,
+    "two_link_robot": systems.TwoLinkRobot,
+    "barrier": lambda: systems.Barrier(systems.TwoStateChain(), [-7.0, None], [5.0, 7.0]),
     "linear": lambda: systems.Linear([[0.0, 1.0], [2.0, -1.0]], [[0.0], [1.0]]),
     "linear_of_two_inputs": lambda: systems.Linear(
         [[0.1, 1.0, 0.0], [0.0, 0.2, 1.0], [0.3, 0.0, -1.0]], [[0.0, 1.0], [1.0, 0.0], [0.0, 2.0]]

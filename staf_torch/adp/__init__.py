@@ -38,6 +38,8 @@ from .near_optimal import NearOptimal as NearOptimal
 from .near_optimal import near_optimal as near_optimal
 from .receding_horizon import RecedingHorizon as RecedingHorizon
 from .rollout import RolloutPolicy as RolloutPolicy
+from .safety_filter import Filtered as Filtered
+from .safety_filter import SafetyFilter as SafetyFilter
 from .sampled_problem import SampledProblem as SampledProblem
 from .sampled_rollout import SampledRollout as SampledRollout
 from .sampling import HeldStability as HeldStability
@@ -66,6 +68,7 @@ __all__ = [
     "DirectShooting",
     "Extrapolation",
     "Feedback",
+    "Filtered",
     "Frozen",
     "Gains",
     "GlobalValue",
@@ -86,6 +89,7 @@ __all__ = [
     "RandomPoints",
     "RecedingHorizon",
     "RolloutPolicy",
+    "SafetyFilter",
     "SampledProblem",
     "SampledRollout",
     "StaFValueBasis",

@@ -62,6 +62,10 @@ class ActorCritic(Controller):
         gain: float | Tensor = 250.0,
     ) -> None:
         super().__init__()
+        if not isinstance(model, ControlAffineSystem):
+            raise fail(
+                "ActorCritic", "model", "must be a ControlAffineSystem; `near_optimal` takes others", model
+            )
         if model.dim != basis.dim:
             raise ValueError(
                 f"`ActorCritic(basis=...)` has {basis.dim} states, but the plant has {model.dim}."

@@ -4,23 +4,23 @@ from __future__ import annotations
 
 import contextlib
 import copy
-from collections.abc import Hashable, Iterator
+import functools
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from ..lanes import Program
-from ..lanes.content import content
+from ..lanes.kept import Kept, number
 from ..numerics.checks import choice, integer, positive_real
 from ..systems import Plant
 from .controllers import Controller, ControllerState
 from .cost import Cost
 from .holding import Holding
-from .laws import ActorCriticLaw
+from .laws import ActorCriticLaw, Gains
 
-_KEPT = 16
-_kept: dict[Hashable, Program] = {}
+_kept = Kept("the closed loop", 16)
 
 
 class LoopState(NamedTuple):
@@ -109,25 +109,32 @@ def _where(alive: Tensor, new: Tensor, old: Tensor) -> Tensor:
 def program(loop: ClosedLoop, compile: bool) -> Program:
     """Return ``loop`` over many steps: it records the state before every step, and the control.
 
-    The last few programs are kept with what they were made of: a loop of the same numbers, settings and
-    classes is not traced again.
+    Compiled loops that differ in gains and tensors alone share one text: `lanes.kept`.
 
     Args:
         loop: one step.
         compile: whether to compile it at all; what cannot be compiled runs in plain torch.
     """
-    key = content(loop) if compile else None
-    found = _kept.pop(key, None)
-    if found is None:
-        found = Program(
-            lambda state, uniform, gains: recorded(loop, state, uniform, gains), name="the closed loop"
-        )
-        found.compile = compile
-    if key is not None:
-        _kept[key] = found
-        while len(_kept) > _KEPT:
-            del _kept[next(iter(_kept))]
-    return found
+    if not compile:
+        return Program(functools.partial(recorded, loop), name="the closed loop", compile=False)
+    numbers = [_numbers(law.gains) for law in _laws(loop)]
+
+    def step(
+        state: LoopState, uniform: Tensor, gains: dict[str, Tensor]
+    ) -> tuple[LoopState, tuple[Tensor, ...]]:
+        with _with_gains(loop, numbers):
+            return recorded(loop, state, uniform, gains)
+
+    inputs = dict.fromkeys(row_gains(loop))  # whatever their numbers are here
+    with _with_gains(loop, [{**own, **inputs} for own in numbers]):
+        found = _kept.of(step, loop)
+    return Program(step, name="the closed loop") if found is None else found
+
+
+def _numbers(gains: Gains) -> dict[str, Tensor]:
+    """Return the gains that are floats as tensors, which no text knows."""
+    given = vars(gains).items()
+    return {name: number(name, v) for name, v in given if not isinstance(v, Tensor)}
 
 
 def row_gains(loop: ClosedLoop) -> dict[str, Tensor]:
@@ -142,14 +149,14 @@ def _laws(loop: ClosedLoop) -> list[ActorCriticLaw]:
 
 
 @contextlib.contextmanager
-def _with_gains(loop: ClosedLoop, given: dict[str, Tensor]) -> Iterator[None]:
-    """Context: the law has these gains, those of the one row that is traced among them."""
-    laws = _laws(loop) if given else []
+def _with_gains(loop: ClosedLoop, given: Sequence[Mapping[str, Tensor | None]]) -> Iterator[None]:
+    """Context: each law has these gains, those of the one row that is traced among them."""
+    laws = _laws(loop)
     before = [law.gains for law in laws]
     try:
-        for law, gains in zip(laws, before, strict=True):
+        for law, gains, others in zip(laws, before, given, strict=True):
             law.gains = copy.copy(gains)
-            vars(law.gains).update(given)  # without the checks, which would read a traced number
+            vars(law.gains).update(others)  # without the checks, which would read a traced number
         yield
     finally:
         for law, gains in zip(laws, before, strict=True):
@@ -167,7 +174,7 @@ def recorded(
         uniform: its random numbers, (B, draws, n).
         gains: of `row_gains`.
     """
-    with _with_gains(loop, gains):
+    with _with_gains(loop, [gains] * len(_laws(loop))) if gains else contextlib.nullcontext():
         after, u = loop(state, uniform)
     return after, record(state, torch.where(after.alive.unsqueeze(-1), u, torch.nan))
 

@@ -174,8 +174,9 @@ class Cost(nn.Module, abc.ABC):
         """A free input that `saturate` maps to u, or near to it at the edge: (..., m) -> (..., m)."""
         return u
 
+    @abc.abstractmethod
     def _prepare(self) -> None:
-        """Compute what depends on the bounds and the set-point."""
+        """Check and compute what depends on the bounds and the set-point: when made, and around a plant."""
 
     def effort(self, u: Tensor) -> Tensor:
         """u - target_input: (..., m) -> (..., m)."""

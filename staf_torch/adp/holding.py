@@ -56,16 +56,16 @@ def runge_kutta_held(plant: Plant, cost: Cost, x: Tensor, u: Tensor, h: float) -
     """x+ and the discounted cost of one Runge-Kutta step with u held."""
     paid = cost.input_rate(u)
     half = math.exp(-0.5 * cost.discount * h)  # what the middle of the step counts; its end, squared
-    k1 = plant.motion(x, u)
+    k1 = plant.velocity(x, u)
     c1 = cost.state_rate(x)
-    x2 = x + 0.5 * h * k1
-    k2 = plant.motion(x2, u)
-    x3 = x + 0.5 * h * k2
-    k3 = plant.motion(x3, u)
-    x4 = x + h * k3
-    k4 = plant.motion(x4, u)
+    x2 = plant.displaced(x, 0.5 * h * k1)
+    k2 = plant.velocity(x2, u)
+    x3 = plant.displaced(x, 0.5 * h * k2)
+    k3 = plant.velocity(x3, u)
+    x4 = plant.displaced(x, h * k3)
+    k4 = plant.velocity(x4, u)
     middle = cost.state_rate(x2) + cost.state_rate(x3)
     if cost.discount:
         paid = paid * (1 + 4 * half + half**2) / 6
     spent = h * (paid + (c1 + 2 * half * middle + half**2 * cost.state_rate(x4)) / 6)
-    return x + (h / 6) * (k1 + 2 * (k2 + k3) + k4), spent
+    return plant.displaced(x, (h / 6) * (k1 + 2 * (k2 + k3) + k4)), spent

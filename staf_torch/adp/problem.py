@@ -6,7 +6,7 @@ import dataclasses
 
 from torch import Tensor
 
-from ..systems import ControlAffineSystem
+from ..systems import Plant
 from .controllers import Controller
 from .cost import Cost
 
@@ -25,7 +25,7 @@ class OptimumSettings:
 class AdpProblem:
     """A closed loop, checked."""
 
-    system: ControlAffineSystem
+    system: Plant
     cost: Cost
     controller: Controller
     initial_states: Tensor  # (B, n)

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from ..systems import ControlAffineSystem
 from . import ControllerState, DirectShooting, LoopResult, QuadraticCost, value_gradient
 from .problem import AdpProblem
 
@@ -57,10 +58,10 @@ def compare(problem: AdpProblem, result: LoopResult) -> Reference:
 
 def optima(problem: AdpProblem, x: Tensor) -> Optima | None:
     """V* and u* at the states x (..., n); None where neither formula nor shooting finds them."""
-    known = known_value(problem, x)
-    if known is not None:
+    known, system = known_value(problem, x), problem.system
+    if known is not None and isinstance(system, ControlAffineSystem):
         gradient = value_gradient(lambda y: known_value(problem, y), x)  # type: ignore[arg-type, return-value]
-        return Optima(known, problem.cost.policy(problem.system.effectiveness(x), gradient))
+        return Optima(known, problem.cost.policy(system.effectiveness(x), gradient))
     if not problem.optimum.shooting:
         return None
     try:

@@ -13,12 +13,14 @@ from ..centers import Radius, StateFollowingCenters, ball, cross_polytope, rings
 from ..kernels import ExponentialKernel
 from ..lanes import each, repeat, scan
 from ..lanes.function import RowFunction, Rows
+from ..lanes.plan import Plan
 from ..numerics.checks import fail, integer, positive_real
 from ..systems import ControlAffineSystem
 from .controllers import LQR, Policy, Value
 from .cost import Cost
 
 _NAME = "a rollout policy"
+_KEPT = 64  # forms of one state that are remembered
 
 
 class RolloutPolicy(nn.Module):
@@ -76,6 +78,10 @@ class RolloutPolicy(nn.Module):
         period: float | None = None,
     ) -> None:
         super().__init__()
+        if not isinstance(model, ControlAffineSystem):
+            raise fail(
+                "RolloutPolicy", "model", "must be a ControlAffineSystem; `near_optimal` takes others", model
+            )
         if model.dim != basis.dim:
             raise fail("RolloutPolicy", "basis", f"must have the plant's {model.dim} states", basis.dim)
         self.basis, self.model, self.cost, self.terminal = basis, model, cost.around(model), terminal
@@ -195,32 +201,49 @@ class RolloutPolicy(nn.Module):
 
 
 class _TwoPrograms:
-    """`RolloutPolicy.control`, a center in every lane, then a state in every lane: (B, n) -> (B, 1, m)."""
+    """`RolloutPolicy.control`, a center in every lane, then a state in every lane: (..., n) -> (B, 1, m)."""
 
     def __init__(self, policy: RolloutPolicy) -> None:
         centers = policy.basis.centers
         self._directions = centers.directions.detach()
-        self._roll = Rows(lambda x, u: policy.rollout(x + centers.radius(x)[..., None] * u), _NAME)
+        self._roll = Rows(
+            lambda x, u: policy.rollout(x + centers.radius(x)[..., None] * u), _NAME, policy, "rollout"
+        )
         self._improve = Rows(
             lambda x, values: policy.cost.policy(
                 policy.model.effectiveness(x), policy.gradient_of(x, values)
             ),
             _NAME,
+            policy,
+            "improvement",
         )
+
+        self._one: dict[Any, tuple[Tensor, Plan, Plan]] = {}  # calls with one state
 
     @property
     def compiled(self) -> bool:
-        return self._roll.compiled and self._improve.compiled
+        return bool(self._one) or (self._roll.compiled and self._improve.compiled)
 
     def __call__(self, x: Tensor) -> Tensor:
-        (batch, dim), u = x.shape, self._directions.to(x)
+        key = x.shape, x.stride(), x.dtype
+        one = self._one.get(key)
+        if one is not None:  # the plans read where the numbers are, and not in which shape
+            u, roll, improve = one
+            return improve((x, roll((x, u))[0]))[0]
+        rows = x if x.dim() == 2 else x.unsqueeze(0)
+        (batch, dim), u = rows.shape, self._directions.to(x)
         count = len(u)
-        if batch == 1:
-            at = x.expand(count, dim)
-        else:
-            at = x.unsqueeze(1).expand(batch, count, dim).reshape(-1, dim)
+        if batch > 1:
+            at = rows.unsqueeze(1).expand(batch, count, dim).reshape(-1, dim)
             u = u.expand(batch, count, dim).reshape(-1, dim)
-        return self._improve(x, self._roll(at, u).view(batch, count))
+            return self._improve(rows, self._roll(at, u).view(batch, count))
+        first, values = self._roll.planned(rows.expand(count, dim), u)
+        second, found = self._improve.planned(rows, values.view(1, count))
+        if first is not None and second is not None and first.direct and second.direct:
+            if len(self._one) >= _KEPT:
+                self._one.clear()
+            self._one[key] = u, first, second
+        return found
 
 
 def ball_directions(count: int | None, dim: int) -> Tensor:

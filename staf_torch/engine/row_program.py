@@ -7,8 +7,6 @@ predictor, law and results. No matrix and no value at a center ever reaches memo
 from __future__ import annotations
 
 import copy
-import functools
-from collections.abc import Hashable
 from typing import Any, NamedTuple
 
 import torch
@@ -16,7 +14,7 @@ from torch import Tensor, nn
 
 from ..approximation.basis import GramStructure, Target
 from ..lanes import Program
-from ..lanes.content import skeleton
+from ..lanes.kept import Kept, number
 from ..lanes.plan import ordinary
 from ..optim.base import UpdateLaw
 from ..optim.objective import NativeError, Objective, Precomputed, ScaledError
@@ -27,20 +25,9 @@ from .recursion import Carry, Corrected, Link, Moment, all_finite, correct
 
 _SHORTEST = 16  # times of a chase that is worth a program, which takes some tenths of a second to trace
 _UNROLLED = 8  # centers up to which the Gram matrix is formed; above it stays in its factors
-_KEPT = 64
 
 
-class _Kept(NamedTuple):
-    """A program that was traced, and the last one that followed from it."""
-
-    model: Program
-    found: list[Tensor]  # by the model
-    last: Program
-    tensors: list[Tensor]  # of the last
-    versions: list[int]
-
-
-_kept: dict[Hashable, _Kept] = {}
+_kept = Kept("a chase")
 
 
 class RowCarry(NamedTuple):
@@ -134,8 +121,7 @@ def first_carry(problem: Problem, carry: Carry) -> RowCarry:
 def program(problem: Problem, states: Tensor, carry: RowCarry, *, everything: bool) -> Program | None:
     """Return the program of a chase, None where the definition serves.
 
-    Programs are kept: one that differs from another in tensors and gains alone takes over its text, and
-    nothing is traced or compiled.
+    One that differs from another in tensors and gains alone takes over its text: `lanes.kept`.
 
     Args:
         problem: what is chased.
@@ -146,32 +132,10 @@ def program(problem: Problem, states: Tensor, carry: RowCarry, *, everything: bo
     if states.shape[1] < _SHORTEST or not ordinary((states, carry.chase.weights)):
         return None
     problem = _numbers_as_tensors(problem)
-    found = skeleton(problem.basis, problem.target, problem.law, problem.predictor)
-    if found is None:
-        made = Program(Step(problem, everything), name="a chase")
-    else:
-        structure, tensors = found
-        if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors):
-            return None
-        made = _of(problem, everything, structure, tensors)
-    return made if made.compiles(carry, states) else None
-
-
-def _of(problem: Problem, everything: bool, structure: Hashable, tensors: list[Tensor]) -> Program:
-    key = structure, problem.inner_steps, problem.certificate, everything
-    versions = [tensor._version for tensor in tensors]
-    held = _kept.pop(key, None)
-    if held is None:
-        new = Program(Step(problem, everything), name="a chase")
-        held = _Kept(new, tensors, new, tensors, versions)
-    elif held.versions != versions or any(a is not b for a, b in zip(held.tensors, tensors, strict=True)):
-        pairs = list(zip(held.found, tensors, strict=True))
-        new = held.model.with_others(Step(problem, everything), pairs)
-        held = held._replace(last=new, tensors=tensors, versions=versions)
-    _kept[key] = held
-    while len(_kept) > _KEPT:
-        del _kept[next(iter(_kept))]
-    return held.last
+    parts = problem.basis, problem.target, problem.law, problem.predictor
+    settings = problem.inner_steps, problem.certificate, everything
+    made = _kept.of(Step(problem, everything), *parts, settings)
+    return made if made is not None and made.compiles(carry, states) else None
 
 
 def _numbers_as_tensors(problem: Problem) -> Problem:
@@ -181,13 +145,8 @@ def _numbers_as_tensors(problem: Problem) -> Problem:
         law = copy.copy(law)
         for name, value in vars(law).items():
             if isinstance(value, float):
-                setattr(law, name, _number(value))
+                setattr(law, name, number(name, value))
     return _with(problem, law, _plain(target))
-
-
-@functools.lru_cache(maxsize=4096)
-def _number(value: float) -> Tensor:
-    return torch.tensor(value, dtype=torch.float64)
 
 
 def _plain(target: Target) -> Target:

@@ -5,6 +5,8 @@ from importlib.util import find_spec as _find_spec
 if _find_spec("gymnasium") is None:
     raise ImportError("staf_torch.envs needs Gymnasium: pip install 'staf_torch[gym]'.")
 
+from .classic_control import classic_control as classic_control
+from .environment_plant import EnvironmentPlant as EnvironmentPlant
 from .episodes import Agent as Agent
 from .episodes import Episodes as Episodes
 from .plant_env import OWN_PLANT as OWN_PLANT
@@ -13,6 +15,16 @@ from .plant_env import PlantEnv as PlantEnv
 from .plant_env import PlantVectorEnv as PlantVectorEnv
 from .plant_env import register_plants
 
-__all__ = ["OWN_PLANT", "PLANTS", "Agent", "Episodes", "PlantEnv", "PlantVectorEnv", "register_plants"]
+__all__ = [
+    "OWN_PLANT",
+    "PLANTS",
+    "Agent",
+    "EnvironmentPlant",
+    "Episodes",
+    "PlantEnv",
+    "PlantVectorEnv",
+    "classic_control",
+    "register_plants",
+]
 
 register_plants()

@@ -223,11 +223,24 @@ class Agent:
         dt: s, between two actions.
         seed: of the random numbers that the controller draws; row b draws from seed + b, as in
             `adp.simulate`.
+        state: the plant's state from an observation, (..., k) -> (..., n) of NumPy arrays, where an
+            environment shows another thing: the sine and cosine of an angle, say.
+        action: the action from a control, (..., m) of NumPy, where an environment wants another thing: the
+            number of one of its actions, say.
     """
 
-    def __init__(self, controller: Controller | Policy, *, dt: float = 0.01, seed: int = 0) -> None:
+    def __init__(
+        self,
+        controller: Controller | Policy,
+        *,
+        dt: float = 0.01,
+        seed: int = 0,
+        state: Callable[[Numbers], Numbers] | None = None,
+        action: Callable[[Numbers], Any] | None = None,
+    ) -> None:
         self.controller = controller if isinstance(controller, Controller) else Feedback(controller)
         self.dt, self.seed = positive_real("Agent", "dt", dt), seed
+        self.state, self.action = state, action
         self._carried: ControllerState | None = None
         self._generators: list[torch.Generator] = []
 
@@ -235,17 +248,19 @@ class Agent:
         """Forget what was learned, and begin the sequence of random numbers anew."""
         self._carried = None
 
-    def __call__(self, observation: Numbers | Tensor) -> Numbers:
-        """u: (n,) -> (m,), or (B, n) -> (B, m) with the same B until the next `begin`."""
-        seen = torch.as_tensor(observation).to("cpu", torch.float64)
+    def __call__(self, observation: Numbers | Tensor) -> Any:
+        """u, or the action that stands for it: (n,) -> (m,), or (B, n) -> (B, m) with the same B until the
+        next `begin`."""
+        shown = observation if self.state is None else self.state(np.asarray(observation))
+        seen = torch.as_tensor(shown).to("cpu", torch.float64)
         x = seen.reshape(-1, seen.shape[-1])
         with torch.no_grad():
             if self._carried is None:
                 self._carried = self.controller.init(x)
                 self._generators = [torch.Generator().manual_seed(self.seed + row) for row in range(len(x))]
             u, self._carried = self.controller.step(x, self._carried, self._uniform(x), self.dt)
-        action: Numbers = u.reshape(*seen.shape[:-1], -1).numpy()
-        return action
+        control: Numbers = u.reshape(*seen.shape[:-1], -1).numpy()
+        return control if self.action is None else self.action(control)
 
     def _uniform(self, x: Tensor) -> Tensor:
         draws = self.controller.draws

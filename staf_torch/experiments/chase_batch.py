@@ -12,6 +12,7 @@ from torch import Tensor
 
 from ..approximation.basis import REACH, StaFBasis
 from ..engine import ChaseResult, chase_pieces, chunk_length
+from ..metrics.ball_error import StateErrorPass
 from ..metrics.chase import ChaseMetrics, Member
 from ..settings.chase import ChaseProblem
 from ..systems import trajectory
@@ -40,6 +41,7 @@ def simulate(
     sinks: Sequence[Sink | None],
     drawn: Sequence[bool],
     advance: Callable[[int], None] | None = None,
+    errors: StateErrorPass | None = None,
 ) -> list[Outcome]:
     """Run problems in pieces of time; those that share basis, target, law and dt run as one batch.
 
@@ -52,6 +54,7 @@ def simulate(
         sinks: where the history of each goes, None where nobody wants it.
         drawn: whether the outcome of each has what its figure needs.
         advance: is told how many more times are done, those of every problem.
+        errors: of their metrics, where all have the same basis, target and initial states.
 
     Returns:
         In the order of the problems.
@@ -64,11 +67,17 @@ def simulate(
     found: dict[int, Outcome] = {}
     for indices in alike.values():
         members = [_Member(problems[i], sinks[i], drawn[i]) for i in indices]
-        found |= zip(indices, _run(members, advance, alone=len(problems) == 1), strict=True)
+        found |= zip(indices, _run(members, advance, errors, alone=len(problems) == 1), strict=True)
     return [found[i] for i in range(len(problems))]
 
 
-def _run(members: Sequence[_Member], advance: Callable[[int], None] | None, *, alone: bool) -> list[Outcome]:
+def _run(
+    members: Sequence[_Member],
+    advance: Callable[[int], None] | None,
+    errors: StateErrorPass | None,
+    *,
+    alone: bool,
+) -> list[Outcome]:
     """Run problems that differ in initial states and settle_time alone as one batch.
 
     Unless one problem is ``alone``, each member keeps the warnings about its own rows.
@@ -82,6 +91,7 @@ def _run(members: Sequence[_Member], advance: Callable[[int], None] | None, *, a
         inner_steps=first.inner_steps,
         members=[Member(m.rows, m.problem.dt, m.problem.settle_time) for m in members],
         own=first.metrics,
+        errors=errors,
     )
     told = _Told(advance, len(starts), times, len(members))
     # What a history holds of a time, it holds of all rows.

@@ -16,6 +16,7 @@ from omegaconf import DictConfig
 from ..figures.animation import animate
 from ..figures.chase import ChaseHistory, draw_chase
 from ..figures.style import images
+from ..metrics.ball_error import StateErrorPass
 from ..numerics.checks import COMMAND_LINE, flag
 from ..results.progress import SHOWN, Progress
 from ..results.run_directory import HistoryWriter, RunDirectory
@@ -77,9 +78,10 @@ def solve(
     advance: Callable[[int], None] | None = None,
     *,
     drawn: bool = True,
+    errors: StateErrorPass | None = None,
 ) -> Outcome:
-    """Run the simulation itself, in pieces of time."""
-    (outcome,) = simulate([problem], [None if writer is None else writer.add], [drawn], advance)
+    """Run the simulation itself, in pieces of time; ``errors`` as in `simulate`."""
+    (outcome,) = simulate([problem], [None if writer is None else writer.add], [drawn], advance, errors)
     return outcome
 
 

@@ -17,6 +17,7 @@ from .. import optim, theory
 from ..engine.predictors import Predictor, Secant, Tangent
 from ..figures.chase import ConvergenceCurve, draw_convergence
 from ..figures.style import images
+from ..metrics.ball_error import StateErrorPass
 from ..numerics.checks import fail, integer, positive_real, vector
 from ..optim import UpdateLaw
 from ..results.progress import SHOWN, Progress
@@ -141,8 +142,12 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> dict[st
     work = integer("laws", "work", cfg.laws.work, least=2)
     excess = positive_real("laws", "excess", cfg.laws.excess)
     steps = _steps(cfg, problem)
-    rows = table(problem, cases(work, problem.basis.count), progress)
-    swept = sweep(problem, curves(work, problem.basis.count), steps, progress)
+    compared, drawn = cases(work, problem.basis.count), curves(work, problem.basis.count)
+    chases = len(compared) + len(drawn) * sum(problem.dt / dt for dt in steps)  # of as many times each
+    expected = int(chases * problem.steps) * len(problem.initial_states)
+    errors = StateErrorPass(problem.basis, problem.target, expected=expected)  # of the same states always
+    rows = table(problem, compared, errors, progress)
+    swept = sweep(problem, drawn, steps, errors, progress)
     promised = promises(problem, excess)
     out = RunDirectory(directory)
     every = Table.of([{name: value for name, value in row.items() if name != "key"} for row in rows])
@@ -162,7 +167,7 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> dict[st
 
 
 def table(
-    problem: ChaseProblem, compared: list[Case], progress: Progress = SHOWN
+    problem: ChaseProblem, compared: list[Case], errors: StateErrorPass, progress: Progress = SHOWN
 ) -> list[dict[str, str | float | None]]:
     """One row a case: what it is, what it costs, and the metrics of its gradient chase."""
     rows: list[dict[str, str | float | None]] = []
@@ -174,13 +179,17 @@ def table(
             "predictor": case.predicted,
             "products": case.products / problem.dt,
         }
-        about.update(solve(_with(problem, case)).metrics)
+        about.update(solve(_with(problem, case), errors=errors).metrics)
         rows.append(about)
     return rows
 
 
 def sweep(
-    problem: ChaseProblem, drawn: list[Case], steps: list[float], progress: Progress = SHOWN
+    problem: ChaseProblem,
+    drawn: list[Case],
+    steps: list[float],
+    errors: StateErrorPass,
+    progress: Progress = SHOWN,
 ) -> list[Curve]:
     """Each case over the same horizon at every step."""
     duration = problem.dt * problem.steps
@@ -188,7 +197,7 @@ def sweep(
     found = []
     for case in progress.each(drawn, "laws over all dt"):
         excess = [
-            solve(dataclasses.replace(_with(problem, case), dt=dt, steps=count)).metrics[
+            solve(dataclasses.replace(_with(problem, case), dt=dt, steps=count), errors=errors).metrics[
                 "ultimate_excess_before"
             ]
             for dt, count in zip(steps, counts, strict=True)

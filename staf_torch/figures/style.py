@@ -67,6 +67,7 @@ def page(width: float, height: float) -> Iterator[Figure]:
         figure = Figure(figsize=(width, height), layout="constrained")
         yield figure
         figure.draw_without_rendering()
+        figure.set_layout_engine("none")  # laid out once: each file would be laid out anew, alike
 
 
 @contextlib.contextmanager

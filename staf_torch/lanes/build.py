@@ -21,6 +21,7 @@ _FOLDER = Path(__file__).parent
 _FLAGS = ("-O3", "-march=native", "-std=c++17", "-shared", "-fPIC", "-pthread")
 _COMPILERS = ("g++", "c++", "clang++")
 _SECONDS = 120
+_DIGEST = 32  # bytes at the end of a library in the cache
 _one_at_a_time = threading.Lock()  # threads of a chase ask for the same at the same time
 _said: set[str] = set()  # what has been logged
 
@@ -72,13 +73,29 @@ def _library(source: Path, definitions: tuple[str, ...]) -> Path:
         raise FileNotFoundError(f"none of {', '.join(_COMPILERS)} is on the path")
     command = [program, *_FLAGS, f"-I{_FOLDER}", *(f"-D{each}" for each in definitions), str(source)]
     path = _cache() / f"{source.stem.removeprefix('_')}-{_key(command)}.so"
-    if not path.exists():
+    if not is_whole(path):
         # Under a name of its own first: another process may be building the same.
         with tempfile.TemporaryDirectory(dir=path.parent) as scratch:
             built = Path(scratch) / path.name
             _run([*command, "-o", str(built)])
+            seal(built)
             os.replace(built, path)
     return path
+
+
+def seal(library: Path) -> None:
+    """Append the digest of a library that was built, which a loader of shared objects does not look at."""
+    with library.open("ab") as file:
+        file.write(hashlib.sha256(library.read_bytes()).digest())
+
+
+def is_whole(library: Path) -> bool:
+    """Whether a library is there and ends with its own digest: half of one would crash the process."""
+    try:
+        content = library.read_bytes()
+    except OSError:
+        return False
+    return content[-_DIGEST:] == hashlib.sha256(content[:-_DIGEST]).digest()
 
 
 def _key(command: list[str]) -> str:

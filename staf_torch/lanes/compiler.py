@@ -12,13 +12,12 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 
-from .build import _COMPILERS, _cache, _processor, _run
+from .build import _COMPILERS, _cache, _processor, _run, is_whole, seal
 
 _FOLDER = Path(__file__).parent
 _HEADERS = ("_lanes.hpp", "_lanes_functions.hpp", "_driver.hpp")
 _FLAGS: tuple[str, ...] = ("-O2", "-march=native", "-std=c++17", "-shared", "-fPIC", "-w")
 _FLAGS += ("-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math", "-fno-signaling-nans")
-_DIGEST = 32
 _one_at_a_time = threading.Lock()
 _loaded: dict[str, Callable[..., None]] = {}
 
@@ -41,21 +40,12 @@ def function(source: str) -> Callable[..., None]:
 
 def _open(source: str) -> Callable[..., None]:
     path = _cache() / f"lanes-{_key(source)}.so"
-    if not _whole(path):
+    if not is_whole(path):
         _build(source, path)
     call: Callable[..., None] = ctypes.CDLL(str(path)).lanes_run
     call.restype = None  # type: ignore[attr-defined]
     call.argtypes = (ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64)  # type: ignore[attr-defined]
     return call
-
-
-def _whole(path: Path) -> bool:
-    """Whether a library is there and ends with its own digest: half of one would crash the process."""
-    try:
-        content = path.read_bytes()
-    except OSError:
-        return False
-    return content[-_DIGEST:] == hashlib.sha256(content[:-_DIGEST]).digest()
 
 
 def _build(source: str, path: Path) -> None:
@@ -64,8 +54,7 @@ def _build(source: str, path: Path) -> None:
         text, built = Path(scratch) / "program.cpp", Path(scratch) / path.name
         text.write_text(source, encoding="utf-8")
         _run([_compiler(), *_FLAGS, "-I", str(_FOLDER), str(text), "-o", str(built)])
-        with built.open("ab") as file:
-            file.write(hashlib.sha256(built.read_bytes()).digest())
+        seal(built)
         os.replace(built, path)
 
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import copyreg
 import io
 import pickle
+import sys
 from collections.abc import Hashable
-from types import FunctionType
+from types import BuiltinFunctionType, FunctionType
 from typing import Any
 
 from torch import Tensor, nn
@@ -49,6 +50,31 @@ def skeleton(*objects: Any) -> tuple[Hashable, list[Tensor]] | None:
     return (text.getvalue(), tuple(writer.kept)), writer.tensors
 
 
+def signature(key: Any) -> bytes | None:
+    """Return a key of `skeleton` as bytes that mean the same in every process.
+
+    None where it names a class or function of which another process may have another version: all but this
+    library, torch and Python's own.
+
+    Args:
+        key: of `skeleton`.
+    """
+    text, kept = key
+    names = list[str]()
+    for value in kept:
+        module, name = getattr(value, "__module__", None) or "", value.__qualname__
+        found: Any = sys.modules.get(module)
+        for part in name.split("."):
+            found = getattr(found, part, None)
+        if found is not value or module.partition(".")[0] not in _VERSIONED:
+            return None
+        names.append(f"{module}.{name}")
+    return b"\0".join((text, *(name.encode() for name in names)))
+
+
+_VERSIONED = frozenset((__name__.partition(".")[0], "torch", "numpy", *sys.stdlib_module_names)) - {
+    "__main__"
+}
 _PLAIN = frozenset((str, int, float, bool, bytes, tuple, list, dict, set, type(None)))
 
 
@@ -61,7 +87,7 @@ class _Writer(pickle.Pickler):
         if not isinstance(value, nn.Module):
             return NotImplemented
         # The keys of hooks count all hooks of the process, and those of state_dicts change no result.
-        state = {name: part for name, part in vars(value).items() if "state_dict" not in name}
+        state = {name: part for name, part in value.__getstate__().items() if "state_dict" not in name}
         hooks = {
             name: tuple(part.values()) for name, part in state.items() if name.endswith("_hooks") and part
         }
@@ -72,7 +98,7 @@ class _Writer(pickle.Pickler):
             return None
         if isinstance(value, FunctionType) and value.__closure__:
             raise pickle.PicklingError("a closure")
-        if isinstance(value, type | FunctionType):
+        if isinstance(value, type | FunctionType | BuiltinFunctionType):
             self.kept.append(value)
             return len(self.kept)
         if isinstance(value, Tensor):

@@ -3,22 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from itertools import chain
-from operator import is_
 from typing import Any, Protocol
 
 from torch import Tensor, nn
 
-from .combinators import tracing_now
+from .combinators import Tree, tracing_now
+from .kept import Kept
 from .plan import Plan, ordinary
 from .program import Program
 
 _PAYS = 100  # calls of a small batch in plain torch (some 10 ms each) that take as long as to compile
 _KEPT = 64  # shapes of calls that are remembered
+_OF_EVERY_MODULE = frozenset(vars(nn.Module())) - {"training"}  # containers, looked into elsewhere, and hooks
+_kept: dict[str, Kept] = {}  # by the name of the functions
 
 
 class Served(Protocol):
-    """A function of rows, (B, n) -> (B, 1, m), that knows whether it is compiled."""
+    """A function of rows, (n,) or (B, n) -> (B, 1, m), that knows whether it is compiled."""
 
     @property
     def compiled(self) -> bool: ...
@@ -51,8 +52,9 @@ class RowFunction:
         self._compile = self._one_program if compile is None else compile
         self._asked = 0.0
         self._served: Served | None = None
-        self._seen: list[Any] = []
+        self._seen: list[tuple[dict[str, Any], str, Any]] = []
         self._settings: list[dict[str, Any]] = []
+        self._sizes: list[int] = []
         self._tensors: list[Tensor] = []
         self._versions: list[int] = []
 
@@ -60,15 +62,15 @@ class RowFunction:
         """y: (..., n) -> (..., m)."""
         if not ordinary((x,)) or x.numel() == 0 or tracing_now():
             return self._function(x)
-        dims = x.dim()
-        flat = x if dims == 2 else x.unsqueeze(0) if dims == 1 else x.reshape(-1, x.shape[-1])
-        if self._asked < _PAYS:
-            self._asked += 1 + len(flat) / 200
+        rows = x.numel() / x.shape[-1]
+        if self._asked + rows / 200 < _PAYS:  # a large batch pays for itself
+            self._asked += 1 + rows / 200
             return self._function(x)
         if self._served is None or self._changed():
             self._remember()
             self._served = self._compile()
-        y = self._served(flat)
+        dims = x.dim()
+        y = self._served(x if dims <= 2 else x.reshape(-1, x.shape[-1]))
         return y.view(-1) if dims == 1 else y.reshape(*x.shape[:-1], y.shape[-1])
 
     @property
@@ -77,14 +79,15 @@ class RowFunction:
         return self._served is not None and self._served.compiled
 
     def _one_program(self) -> Served:
-        return Rows(self._function, self._name)
+        return Rows(self._function, self._name, self._function, self._module)
 
     def _changed(self) -> bool:
-        settings = self._settings
-        if not settings or sum(map(len, settings)) != len(self._seen):
+        if [*map(len, self._settings)] != self._sizes:
             return True
-        now = chain.from_iterable(map(dict.values, settings))
-        return not all(map(is_, now, self._seen)) or self._versions != self._version_list()
+        for part, name, value in self._seen:
+            if part.get(name) is not value:
+                return True
+        return self._versions != self._version_list()
 
     def _version_list(self) -> list[int]:
         return [tensor._version for tensor in self._tensors]
@@ -97,8 +100,10 @@ class RowFunction:
             for part in (module._buffers, module._parameters, module._modules)
         ]
         self._settings = [*near, *(part for part in parts if part)]
-        self._seen = list(chain.from_iterable(map(dict.values, self._settings)))  # no address is used twice
-        self._tensors = [part for part in self._seen if isinstance(part, Tensor)]
+        self._sizes = [*map(len, self._settings)]
+        named = ((part, name) for part in self._settings for name in part if name not in _OF_EVERY_MODULE)
+        self._seen = [(part, name, part[name]) for part, name in named]  # kept: no address is used twice
+        self._tensors = [value for _, _, value in self._seen if isinstance(value, Tensor)]
         self._versions = self._version_list()
 
 
@@ -108,10 +113,15 @@ class Rows:
     Args:
         function: plain torch, in which no row sees another.
         name: in the log.
+        parts: all that ``function`` reads, for `lanes.kept`; none where nothing is to be kept.
     """
 
-    def __init__(self, function: Callable[..., Tensor], name: str) -> None:
-        self._program = Program(lambda carry, _, row: (carry, function(*row)), name=name, copies=1)
+    def __init__(self, function: Callable[..., Tensor], name: str, *parts: Any) -> None:
+        def step(carry: Tree, _: Tree, row: Tree) -> tuple[Tree, Tree]:
+            return carry, function(*row)
+
+        found = _kept.setdefault(name, Kept(name)).of(step, *parts, copies=1) if parts else None
+        self._program = Program(step, name=name, copies=1) if found is None else found
         self._plans: dict[Any, Plan] = {}
 
     @property
@@ -120,16 +130,22 @@ class Rows:
         return bool(self._plans)
 
     def __call__(self, *given: Tensor) -> Tensor:
-        """Return y with a dimension of one time after the rows, (B, 1, ...)."""
+        """Return y with a dimension of one time after the rows, (B, 1, ...); (n,) is one row."""
         # Shapes alone: the caller has looked at the rest.
         key = tuple([(x.shape, x.stride(), x.dtype) for x in given])
         plan = self._plans.get(key)
         if plan is not None:
             return plan(given)[0]
-        prepared = self._program.prepare((), (), given, steps=1)
-        found: Tensor = prepared((), (), given)[1]
-        if prepared.plan is not None:
+        rows = [x.unsqueeze(0) if x.dim() == 1 else x for x in given]
+        plan, found = self.planned(*rows)
+        if plan is not None:
             if len(self._plans) >= _KEPT:
                 self._plans.clear()
-            self._plans[key] = prepared.plan
+            self._plans[key] = plan
         return found
+
+    def planned(self, *given: Tensor) -> tuple[Plan | None, Tensor]:
+        """Return the plan of calls with such inputs, (B, ...), None where the definition runs; and y."""
+        prepared = self._program.prepare((), (), tuple(given), steps=1)
+        found: Tensor = prepared((), (), tuple(given))[1]
+        return prepared.plan, found

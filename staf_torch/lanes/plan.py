@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 import functools
 import itertools
-from array import array
+import struct
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -82,6 +82,7 @@ class Plan:
 
     Attributes:
         structure: of the outputs.
+        direct: whether a call reads nothing of its inputs but their addresses.
     """
 
     def __init__(
@@ -100,6 +101,7 @@ class Plan:
         slots = [
             self._input(k, leaf, timed) for k, (leaf, timed) in enumerate(zip(leaves, times, strict=True))
         ]
+        self.direct = not self._copied and not any(type(leaf) is Shared for leaf in leaves)
         recorded = -(-steps // every)
         ends = [((rows, *s), (1, *_inner(s, rows)), s.numel(), 0) for s, _ in compiled.carry]
         histories = [
@@ -116,6 +118,7 @@ class Plan:
         for k, (shape, _) in enumerate(self._rooms):
             if torch.Size(shape).numel() * self._like.element_size() >= LARGE:
                 self._large.append(k)
+        self._packed = struct.Struct(f"{len(slots)}q").pack
         self._slots = (_Slot * max(len(slots), 1))(*slots)
         self._call = _Call(rows, steps, every, compiled.table.data_ptr(), ctypes.addressof(self._slots))
         self._call.parallel = _parallel()
@@ -139,19 +142,23 @@ class Plan:
         Args:
             leaves: inputs of the forms that the examples had.
         """
-        given = [leaf.tensor if type(leaf) is Shared else leaf for leaf in leaves]
-        real = self._compiled.real
-        for k in self._copied:
-            given[k] = given[k].to(real).contiguous()
+        given, real = leaves, self._compiled.real
+        if not self.direct:
+            given = [leaf.tensor if type(leaf) is Shared else leaf for leaf in leaves]
+            for k in self._copied:
+                given[k] = given[k].to(real).contiguous()
         rooms = [torch.empty_strided(shape, strides, dtype=real) for shape, strides in self._rooms]
         for k in self._large:
             shape, strides = self._rooms[k]
             rooms[k] = fresh(self._like, torch.Size(shape).numel()).as_strided(shape, strides)
-        addresses = array("q", [tensor.data_ptr() for tensor in (*given, *rooms)])
-        self._compiled.call(self._reference, addresses.buffer_info()[0], torch.get_num_threads())
+        addresses = self._packed(*map(_address, given), *map(_address, rooms))
+        self._compiled.call(self._reference, addresses, torch.get_num_threads())
         for k, dtype in self._dtypes:
             rooms[k] = rooms[k].to(dtype)
         return rooms
+
+
+_address = Tensor.data_ptr
 
 
 def _inner(shape: Sequence[int], unit: int) -> tuple[int, ...]:

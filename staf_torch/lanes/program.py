@@ -9,17 +9,19 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from . import compiler
+from . import compiler, trace_cache
 from .captured import Recipe
 from .combinators import Tree, tracing
+from .content import signature, skeleton
 from .eliminations import WithoutVectors
-from .emission import Text, emit
+from .emission import emit
 from .given import Given
 from .graph import NOW, STEP, Graph
 from .lowering import lower
 from .plan import Compiled, Plan, form, ordinary
 from .scalar_text import Names, c_text
 from .statements import Layout
+from .trace_cache import Trace
 from .tracer import NoReading, NotLoweredError, Tracer
 from .tree import Shared, flatten, labels, plain, unflatten
 
@@ -67,6 +69,16 @@ class Program:
         self._compiled: dict[Hashable, _Built | None] = {}
         self._prepared: dict[Hashable, Prepared] = {}
         self._model: tuple[Program, Mapping[int, Tensor]] | None = None
+        self._described: tuple[bytes, Sequence[Tensor]] | None = None
+
+    def described(self, by: bytes | None, tensors: Sequence[Tensor]) -> None:
+        """Let traces go through the user's cache.
+
+        Args:
+            by: tells steps apart, in any process, that differ in more than tensors; None where nothing does.
+            tensors: all floating-point tensors that the step reads.
+        """
+        self._described = None if by is None else (by, tensors)
 
     def with_others(self, step: Step, others: Sequence[tuple[Tensor, Tensor]]) -> Program:
         """Return the program of a step that differs in captured tensors alone: nothing is traced again.
@@ -203,28 +215,18 @@ class Program:
             return None
         model, others = self._model
         built = model._compiled.get(key)
-        numbers = None if built is None else built.recipe.again(others)
+        numbers = None if built is None else built.trace.recipe.again(others)
         if built is None or numbers is None:
             return None
-        compiled = built.compiled._replace(table=built.text.numbers(numbers, built.compiled.real))
+        compiled = built.compiled._replace(table=built.trace.text.numbers(numbers, built.compiled.real))
         return built._replace(compiled=compiled)
 
     def _build(self, given: Given, copies: int) -> _Built | None:
-        real = given.real
         try:
-            try:
-                traced = trace(self.step, given)
-                text = emit(*traced.program, copies)
-            except NotLoweredError:
-                if real == torch.float64:
-                    raise
-                # float64 within a program of float32: all of it in double, rounded where it ends.
-                real = torch.float64
-                traced = trace(self.step, given, widened=True)
-                text = emit(*traced.program, copies)
-            if (lines := text.source.count("\n")) > _LONGEST:
+            made = self._known(given, copies)
+            if (lines := made.text.source.count("\n")) > _LONGEST:
                 raise NotLoweredError(f"the program is {lines} lines long, which take a compiler minutes")
-            call = compiler.function(text.source)
+            call = compiler.function(made.text.source)
         except (NotLoweredError, OSError) as error:
             reason = " ".join(str(error).split())[:400]
             told = self.name, "no build" if isinstance(error, OSError) else reason
@@ -232,16 +234,43 @@ class Program:
                 _said.add(told)
                 _log.warning("%s runs in plain torch, slower: %s", self.name, reason)
             return None
-        table = text.numbers(traced.recipe.values, real)
+        table = made.text.numbers(made.recipe.values, made.real)
         shapes = tuple((leaf.shape[1:], leaf.dtype) for leaf in given.carry)
-        compiled = Compiled(call, table, real, shapes, traced.outputs, traced.structure)
-        return _Built(compiled, text, traced.recipe)
+        return _Built(Compiled(call, table, made.real, shapes, made.outputs, made.structure), made)
+
+    def _known(self, given: Given, copies: int) -> Trace:
+        """What the step does with a single row, from the cache where it has been written down before."""
+        inputs = None if self._described is None else skeleton(given.key())
+        shapes = None if inputs is None else signature(inputs[0])
+        if self._described is None or shapes is None:
+            return _written(self.step, given, copies)
+        step, tensors = self._described
+        path = trace_cache.place(step, shapes, copies)
+        found = trace_cache.load(path, tensors)
+        if found is None:
+            found = _written(self.step, given, copies)
+            trace_cache.save(path, found, tensors)
+        return found
+
+
+def _written(step: Step, given: Given, copies: int) -> Trace:
+    real = given.real
+    try:
+        traced = trace(step, given)
+        text = emit(*traced.program, copies)
+    except NotLoweredError:
+        if real == torch.float64:
+            raise
+        # float64 within a program of float32: all of it in double, rounded where it ends.
+        real = torch.float64
+        traced = trace(step, given, widened=True)
+        text = emit(*traced.program, copies)
+    return Trace(text, traced.recipe, real, traced.outputs, traced.structure)
 
 
 class _Built(NamedTuple):
     compiled: Compiled
-    text: Text
-    recipe: Recipe
+    trace: Trace
 
 
 class Prepared:

@@ -10,12 +10,14 @@ from torch import Tensor
 from ..approximation.basis import StaFBasis, Target
 from ..centers import probe_points
 from ..lanes import Program, reduce
+from ..lanes.kept import Kept
 from ..local_basis import NewtonSpace, evaluate_scaled, scale
 from ..numerics.linalg import condition_number
 
 PROBES = 97  # points of the ball to take a supremum over; in the plane 64 of them on its edge
 _BLOCK = 2**18  # numbers in a temporary of plain torch, so that it stays in cache
 _PAYS = 30_000  # states in plain torch (some 30 us each) that take as long as to compile
+_kept = Kept("the errors on a ball")
 
 
 class StateErrors(NamedTuple):
@@ -40,18 +42,25 @@ class StateErrorPass:
         target: V.
         points: of the ball, at least 2.
         compile: whether to compile: ``auto`` for where it pays.
+        expected: states that will be asked for, where that is known: they then pay from the first on.
 
     Attributes:
         compiled: whether the last call used the compiled program.
     """
 
     def __init__(
-        self, basis: StaFBasis, target: Target, points: int = PROBES, *, compile: bool | str = "auto"
+        self,
+        basis: StaFBasis,
+        target: Target,
+        points: int = PROBES,
+        *,
+        compile: bool | str = "auto",
+        expected: int = 0,
     ) -> None:
         self._basis, self._target, self._points, self._compile = basis, target, points, compile
         self._fixed: _Fixed | None = None
-        self._seen, self.compiled = 0, False
-        self._program = Program(lambda _, __, row: ((), self._at(*row)), name="the errors on a ball")
+        self._seen, self.compiled = expected, False
+        self._program: Program | None = None
 
     def __call__(self, x: Tensor, coefficients: Tensor, ideal: Tensor) -> StateErrors:
         """The errors at the states.
@@ -66,8 +75,12 @@ class StateErrorPass:
         self._seen += x.numel() // x.shape[-1]
         if self._compile is True or (self._compile == "auto" and self._seen >= _PAYS):
             row = tuple(part.reshape(-1, part.shape[-1]) for part in (x, coefficients, ideal))
-            self.compiled = self._program.compiles((), (), row, steps=1)
+            if self._program is None:
+                parts = self._basis, self._target, self._fixed
+                self._program = _kept.of(lambda _, __, row: ((), self._at(*row)), *parts)
+            self.compiled = self._program is not None and self._program.compiles((), (), row, steps=1)
             if self.compiled:
+                assert self._program is not None
                 found: tuple[Tensor, ...] = self._program((), (), row, steps=1)[1]
                 return StateErrors(*(part.reshape(x.shape[:-1]) for part in found))
         width = self._points * self._basis.count

@@ -67,6 +67,7 @@ class ChaseMetrics:
         members: where the batch holds several problems: `summaries` then has one dictionary a member, and dt
             and settle_time are theirs.
         own: metrics of the user's own, reported beside these under their names.
+        errors: finds the errors on a ball, where several chases along the same states share one.
     """
 
     def __init__(
@@ -80,13 +81,14 @@ class ChaseMetrics:
         settle_time: float = 0.0,
         members: Sequence[Member] | None = None,
         own: Sequence[Metric] = (),
+        errors: StateErrorPass | None = None,
     ) -> None:
         self._basis, self._target, self._law = basis, target, law
         self._inner_steps = inner_steps
         self._whole = Member(0, dt, settle_time)
         self._members = members
         self._own = tuple(own)
-        self._errors = StateErrorPass(basis, target)
+        self._errors = StateErrorPass(basis, target) if errors is None else errors
         self._rows = _Rows(0)
         self._done: list[_Rows] = []  # rows before those that are taken in now
 

@@ -1,41 +1,9 @@
 // A call of `Bank` on many streams, one after the other: what bank.py defines. The members of the bank are
 // the lanes. DIM, COUNT, OUTPUTS, CAPACITY, NEIGHBOURS are given on the command line of the compiler.
 
-#include "_filter.hpp"
+#include "_mixture.hpp"
 
-#include <algorithm>
 #include <cstring>
-
-constexpr int C = CAPACITY, near = NEIGHBOURS, sides = 2, groups = 3, locals = groups * lanes, carried = lanes;
-constexpr int members = locals + carried + 2, clocks = 3;  // the linear model and the last value beside them
-constexpr int unknowns = n + 1;
-
-struct Rules {  // see bank.py
-    double rates[sides * 3 + 2];       // of the exponents: nearest by width, latest by width, the two fades
-    double noise[locals];              // variances, in units of a member's amplitude
-    double width[locals], fade[locals];  // which of the eight exponentials a member takes; fade -1 for none
-    double discounts[clocks], discount, share, drop, heavy, likelihood;
-    double members_rate, error_rate, linear_forgetting, linear_prior, recent, floor, margin, far, outlying;
-    double rescaled[6], scaling, carried_forgetting[carried], carried_ratio, carried_slack2;
-    Functions functions;
-};
-
-struct Local {  // a coordinate or an output
-    double shift, scale;
-};
-
-struct Stream {  // the row of a stream in the table of bank.py
-    double clock, count, far, skipped, learned, time;
-    double last_x[n], last_y[K], asked[n], answered;
-    double center[n + K], spread[n + K];
-    double covariance[unknowns][unknowns], linear[K][unknowns];
-    double filters[sizeof(Filter) / sizeof(double)];
-    double weights[K][clocks][members], clock_weights[K][clocks], excess[K][members];
-    double error[K], low[K], high[K], calibration[K];
-    double means[K][members], variances[K][members], mixed[K][clocks], mixed_variance[K][clocks];
-    double mean[K], variance[K];
-    double x[C][n], y[C][K], when[C], order[C], gap[C];
-};
 
 struct Call {
     int64_t streams, mode;  // 1 to predict, 2 to learn
@@ -46,7 +14,6 @@ struct Call {
     const Rules *rules;
 };
 
-static double square(double a) { return a * a; }
 static double shift_of(const Rules &r, const Stream &s, int i) { return r.scaling ? s.center[i] : 0; }
 static double scale_of(const Rules &r, const Stream &s, int i) { return r.scaling ? s.spread[i] : 1; }
 
@@ -72,9 +39,16 @@ static Law law_of(const Rules &r) {
     return law;
 }
 
+INLINE V row(const double *from) {
+    V found;
+    std::memcpy(&found, from, sizeof found);
+    return found;
+}
+
 static void restart_linear(const Rules &r, Stream &s) {
     std::memset(s.covariance, 0, sizeof s.covariance + sizeof s.linear + sizeof s.filters);
     for (int i = 0; i < unknowns; ++i) s.covariance[i][i] = r.linear_prior;
+    s.quadratics.restart(row(r.quadratic_prior), Mask{} == Mask{});
     Filter f{};
     for (int i = 0; i < n; ++i) f.anchor[i] = f.last[i] = all(NAN);
     std::memcpy(s.filters, &f, sizeof f);
@@ -90,11 +64,15 @@ static void clear(const Rules &r, Stream &s) {
     std::fill(s.order, s.order + C, -1);
     std::fill(s.gap, s.gap + C, infinity);
     std::fill(&s.excess[0][0], &s.excess[0][0] + K * members, 1);
-    for (int o = 0; o < K; ++o) s.error[o] = s.calibration[o] = 1, s.low[o] = infinity, s.high[o] = -infinity;
+    std::fill(&s.quadratic_error[0][0], &s.quadratic_error[0][0] + K * lanes, 1);
+    for (int o = 0; o < K; ++o) {
+        s.error[o] = s.pace[o] = s.calibration[o] = 1, s.low[o] = infinity, s.high[o] = -infinity;
+        for (int g = 0; g < groups_of_members; ++g) s.correction_covariance[o][g][g] = r.correction_prior;
+    }
     restart_linear(r, s);
 }
 
-// The carried models learn (x, y), the linear one and the filters.
+// The carried models learn (x, y): the linear one, the quadratics and the filters.
 static void carry(const Rules &r, Stream &s, const double *x, const double *y, double lapse) {
     double u[unknowns] = {1}, v[K], gain[unknowns], spread = 1, most = 0;
     scaled(r, s, x, u + 1);
@@ -117,6 +95,12 @@ static void carry(const Rules &r, Stream &s, const double *x, const double *y, d
     if (most < 100 * r.linear_prior)  // what no sample says anything about would wind up
         for (auto &row : s.covariance)
             for (double &entry : row) entry /= faded;
+    double phi[features];
+    quadratic_features(u + 1, phi);
+    V share = row(r.quadratic_forgetting);
+    if (lapse != 1)
+        for (int l = 0; l < lanes; ++l) share[l] = std::pow(share[l], lapse);
+    s.quadratics.learn(phi, v, share, row(r.quadratic_prior));
     Filter f = filters_of(s);
     const Law law = law_of(r);
     V at[n], value[K], z[n];
@@ -286,12 +270,19 @@ static void ask(const Rules &r, Stream &s, const double *x) {
     for (int i = 0; i < unknowns; ++i)
         for (int j = 0; j < unknowns; ++j) spread += u[i] * s.covariance[i][j] * u[j];
     local_processes(r, s, x, u + 1, line);
-    V at[n], mean[K], variance[K];
+    V at[n], mean[K], variance[K], bent[K];
+    double phi[features];
+    quadratic_features(u + 1, phi);
+    const V bent_spread = s.quadratics.predict(phi, bent);
     for (int i = 0; i < n; ++i) at[i] = all(u[i + 1]);
     predict(r.functions, law_of(r), filters_of(s), at, mean, variance);
     for (int o = 0; o < K; ++o) {
         double *means = s.means[o], *variances = s.variances[o];
         for (int l = 0; l < carried; ++l) means[locals + l] = mean[o][l], variances[locals + l] = variance[o][l];
+        for (int l = 0; l < lanes; ++l) {
+            means[locals + carried + l] = bent[o][l];
+            variances[locals + carried + l] = bent_spread[l] * s.quadratic_error[o][l];
+        }
         means[members - 2] = line[o], variances[members - 2] = spread;
         means[members - 1] = in_units(r, s, o, s.last_y[o]), variances[members - 1] = 1;
         const double low = in_units(r, s, o, s.low[o]), high = in_units(r, s, o, s.high[o]);
@@ -301,68 +292,10 @@ static void ask(const Rules &r, Stream &s, const double *x) {
             means[i] = std::min(std::max(means[i], low - wide), high + wide);
             if (!(variances[i] < 1e300)) variances[i] = 1e300;
         }
-        double whole = 0, first = 0, second = 0, top = -infinity;
-        for (int c = 0; c < clocks; ++c) top = std::max(top, s.clock_weights[o][c]);
-        for (int c = 0; c < clocks; ++c) {
-            const double *logs = s.weights[o][c], most = *std::max_element(logs, logs + members);
-            double total = 0, middle = 0, around = 0, weights[members];
-            for (int i = 0; i < members; ++i) {
-                weights[i] = std::exp(logs[i] - most);
-                if (weights[i] < r.drop) weights[i] = 0;
-                total += weights[i], middle += weights[i] * means[i];
-            }
-            middle /= total;
-            for (int i = 0; i < members; ++i)
-                around += weights[i] * (variances[i] * s.excess[o][i] + square(means[i] - middle));
-            s.mixed[o][c] = middle, s.mixed_variance[o][c] = around / total;
-            const double weight = std::exp(s.clock_weights[o][c] - top);
-            whole += weight, first += weight * middle;
-        }
-        first /= whole;
-        for (int c = 0; c < clocks; ++c)
-            second += std::exp(s.clock_weights[o][c] - top) / whole *
-                      (s.mixed_variance[o][c] + square(s.mixed[o][c] - first));
-        s.mean[o] = first, s.variance[o] = std::max(second, r.floor * s.error[o]) * s.calibration[o];
+        mix(r, s, o, low - wide, high + wide);
     }
     std::copy(x, x + n, s.asked);
     s.answered = 1;
-}
-
-static double score(const Rules &r, double error, double variance, double common) {
-    auto student = [&](double v) {
-        return -.5 * (r.heavy + 1) * std::log1p(error * error / (r.heavy * v));
-    };
-    variance = std::max(variance, 1e-30), common = std::max(common, 1e-30);
-    return r.likelihood * (student(variance) - .5 * std::log(variance)) + (1 - r.likelihood) * student(common);
-}
-static void reweigh(const Rules &r, double *logs, const double *scores, int count, double discount) {
-    double top = -infinity, total = 0;
-    for (int i = 0; i < count; ++i) logs[i] = discount * logs[i] + scores[i], top = std::max(top, logs[i]);
-    for (int i = 0; i < count; ++i) total += std::exp(logs[i] - top);
-    for (int i = 0; i < count; ++i)
-        logs[i] = std::log((1 - r.share) * std::exp(logs[i] - top) / total + r.share / count);
-}
-
-// The members are judged by their prediction of y.
-static void judge_members(const Rules &r, Stream &s, int o, double y) {
-    const double value = in_units(r, s, o, y), t = s.clock, error = value - s.mean[o];
-    double z2 = error * error / std::max(s.variance[o] / s.calibration[o], 1e-300);
-    s.calibration[o] += std::max(r.error_rate, 1 / (t + 5)) * (std::min(z2, surprise * s.calibration[o]) - s.calibration[o]);
-    s.calibration[o] = std::min(std::max(s.calibration[o], 1e-6), 1e2);
-    s.error[o] += std::max(r.error_rate, 1 / (t + 1)) * (std::min(error * error, surprise * s.error[o]) - s.error[o]);
-    double scores[members], over[clocks];
-    for (int i = 0; i < members; ++i) {
-        const double e = value - s.means[o][i], v = s.variances[o][i], ratio = e * e / std::max(v, 1e-30);
-        double &excess = s.excess[o][i];
-        scores[i] = score(r, e, v * excess, s.error[o]);
-        excess += std::max(r.members_rate, 1 / (t + 3)) * (std::min(ratio, surprise * excess) - excess);
-        excess = std::min(std::max(excess, 1e-4), 1e8);
-    }
-    for (int c = 0; c < clocks; ++c) {
-        over[c] = score(r, value - s.mixed[o][c], s.mixed_variance[o][c], s.error[o]);
-        reweigh(r, s.weights[o][c], scores, members, r.discounts[c]);
-    }
-    reweigh(r, s.clock_weights[o], over, clocks, r.discount);
 }
 
 // Keep (x, y). A full store gives up the older of the closest pair of those that are not recent.
@@ -426,7 +359,7 @@ static void learn(const Rules &r, Stream &s, const double *given, const double *
     } else if (s.far > 0) s.skipped += 1;
     else if (known)
         for (int o = 0; o < K; ++o)
-            if (told[o] == told[o]) judge_members(r, s, o, y[o]);
+            if (told[o] == told[o]) judge_members(r, s, o, in_units(r, s, o, y[o]));
     if (s.far > 0) return;
     for (int o = 0; o < K; ++o) {
         s.low[o] = std::min(s.low[o], y[o]), s.high[o] = std::max(s.high[o], y[o]);

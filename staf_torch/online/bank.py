@@ -19,7 +19,7 @@ from .bank_rules import CARRIED_RADIUS, CARRIED_WIDTH, BankShape, Rules, size
 from .compiled_filter import FunctionPointers
 from .local_functions import LocalFunctions
 
-_NUMBERS = 114  # in `Rules`
+_NUMBERS = len(Rules.of(1, True).numbers())
 
 
 class _Rules(ctypes.Structure):
@@ -43,12 +43,13 @@ class Bank:
     older of the closest pair of those that are not recent. At x a linear model (recursive least squares)
     predicts, and 24 Gaussian processes on k samples correct what it leaves: the k nearest, without and
     with two rates of fading by age, and the k latest, each with three widths and two noises, amplitudes
-    y'K^-1 y / k. Beside them stand eight filters (`LocalFilter`, M = n + 1), that linear model and the
-    last value.
+    y'K^-1 y / k. Beside them stand eight filters (`LocalFilter`, M = n + 1), eight models quadratic in x
+    (recursive least squares, five rates of forgetting), that linear model and the last value.
 
     Every member's variance is scaled by its running squared error. The members are mixed by discounted
     scores, part Student-t likelihood with the member's variance, part with the common running error, at
-    three rates of discount; the three mixtures are mixed alike. The mixture's variance follows its running
+    three rates of discount, and the less the less certain they are; the three mixtures are mixed alike, and
+    corrected by least squares on what groups of members say. The mixture's variance follows its running
     squared error.
 
     Args:

@@ -6,15 +6,16 @@ Streams are taken one by one, so that none can touch another; the members of the
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
-from .bank_rules import BankShape, Rules, layout
+from .bank_rules import GROUPS, BankShape, Rules, layout
 from .filter_streams import units_of
-from .kalman_filter import STREAK, SURPRISE, LocalFilter, StreamState
+from .kalman_filter import STREAK, LocalFilter, StreamState
 from .local_functions import LocalFunctions
+from .mixture_definition import judge, mix
+from .quadratic_models import QuadraticModels, quadratic_features
 
 _RESET = ("skipped", "learned")  # what a stream that begins anew keeps
 
@@ -40,6 +41,8 @@ class BankDefinition:
         self.shape, self.rules, self.functions = shape, rules, functions
         ratio = torch.full((len(rules.forgetting),), rules.carried_ratio, dtype=torch.float64)
         forgetting = torch.tensor(rules.forgetting, dtype=torch.float64)
+        self.share = torch.tensor(rules.quadratic_forgetting, dtype=torch.float64)
+        self.prior = torch.tensor(rules.quadratic_prior, dtype=torch.float64)
         self.filter = LocalFilter(functions, ratio, forgetting, rules.carried_slack)
 
     def each(self, table: Tensor) -> list[Views]:
@@ -58,8 +61,9 @@ class BankDefinition:
                 part.zero_()
         s["last_x"].fill_(torch.nan)
         s["asked"].fill_(torch.nan)
-        for name in ("spread", "excess", "error", "calibration"):
+        for name in ("spread", "excess", "error", "pace", "calibration", "quadratic_error"):
             s[name].fill_(1.0)
+        s["correction_covariance"].copy_(self.rules.correction_prior * torch.eye(GROUPS, dtype=torch.float64))
         s["order"].fill_(-1.0)
         s["gap"].fill_(torch.inf)
         s["low"].fill_(torch.inf)
@@ -71,6 +75,7 @@ class BankDefinition:
         s["linear"].zero_()
         s["filters"].zero_()
         s["filters"][: 2 * self.shape.dim].fill_(torch.nan)
+        QuadraticModels(s["factor"], s["quadratic"]).restart(self.prior)
 
     def _units(self, s: Views) -> tuple[Tensor, Tensor]:
         if self.rules.scaling:
@@ -105,26 +110,18 @@ class BankDefinition:
         carried = self.filter.predict(self._filters(s), u[1:].expand(len(r.forgetting), -1))
         last = ((s["last_y"] - center[n:]) / spread[n:])[:, None]
         common = (1 + (u * (s["covariance"] * u).sum(-1)).sum()).expand_as(last)
-        means = torch.cat((process[0], carried[0].mT, line[:, None], last), 1)
-        variances = torch.cat((process[1], carried[1].mT, common, torch.ones_like(last)), 1)
+        features = quadratic_features(u[1:], self.shape.features)
+        bent, wide_of = QuadraticModels(s["factor"], s["quadratic"]).predict(features)
+        means = torch.cat((process[0], carried[0].mT, bent, line[:, None], last), 1)
+        own = (process[1], carried[1].mT, wide_of * s["quadratic_error"])
+        variances = torch.cat((*own, common, torch.ones_like(last)), 1)
         low, high = ((s[name] - center[n:]) / spread[n:] for name in ("low", "high"))
         wide = r.margin * (high - low)
         means = torch.where(torch.isfinite(means), means, last)
         means = torch.maximum(torch.minimum(means, (high + wide)[:, None]), (low - wide)[:, None])
         s["means"].copy_(means)
         s["variances"].copy_(torch.where(variances < 1e300, variances, 1e300))
-        weights = (s["weights"] - s["weights"].amax(-1, keepdim=True)).exp()
-        weights = torch.where(weights < r.drop, 0.0, weights)
-        weights = weights / weights.sum(-1, keepdim=True)  # (K, clocks, members)
-        middle = (weights * means[:, None]).sum(-1)
-        own = (s["variances"] * s["excess"])[:, None] + (means[:, None] - middle[..., None]).square()
-        s["mixed"].copy_(middle)
-        s["mixed_variance"].copy_((weights * own).sum(-1))
-        clocks = s["clock_weights"].softmax(-1)
-        mean = (clocks * middle).sum(-1)
-        variance = (clocks * (s["mixed_variance"] + (middle - mean[:, None]).square())).sum(-1)
-        s["mean"].copy_(mean)
-        s["variance"].copy_(torch.maximum(variance, r.floor * s["error"]) * s["calibration"])
+        mix(r, s, low - wide, high + wide)
         s["asked"].copy_(x)
         s["answered"].fill_(1.0)
 
@@ -156,7 +153,7 @@ class BankDefinition:
         return _processes(torch.stack(kernels), noise, rest, line)
 
     def _carry(self, s: Views, x: Tensor, y: Tensor, lapse: float) -> None:
-        """The linear model and the filters learn (x, y)."""
+        """The linear model, the quadratics and the filters learn (x, y)."""
         r, n = self.rules, self.shape.dim
         center, spread = self._units(s)
         u = torch.cat((torch.ones(1, dtype=torch.float64), (x - center[:n]) / spread[:n]))
@@ -167,6 +164,8 @@ class BankDefinition:
         s["covariance"].sub_(gain[:, None] * gain / total)
         if float(s["covariance"].diagonal().max()) < 100 * r.linear_prior:
             s["covariance"].div_(r.linear_forgetting**lapse)
+        features = quadratic_features(u[1:], self.shape.features)
+        QuadraticModels(s["factor"], s["quadratic"]).learn(features, v, self.share**lapse, self.prior)
         state, lanes = self._filters(s), len(r.forgetting)
         lapses = torch.full((lanes,), lapse, dtype=torch.float64)
         self.filter.learn(state, u[1:].expand(lanes, -1), v.expand(lanes, -1), lapses)
@@ -196,31 +195,6 @@ class BankDefinition:
             return True
         near = (both - s["center"]).abs() < self.rules.far * s["spread"]
         return s.number("clock") >= 40 and not bool(near.all())
-
-    def _judge(self, s: Views, value: Tensor, told: Tensor) -> None:
-        """The members are judged by their prediction of value (K,), where it was told."""
-        r, t = self.rules, s.number("clock")
-        error = value - s["mean"]
-        z2 = error.square() / (s["variance"] / s["calibration"]).clamp(min=1e-300)
-        before, floor = s["calibration"].clone(), max(r.error_rate, 1 / (t + 5))
-        found = before + floor * (torch.minimum(z2, SURPRISE * before) - before)
-        s["calibration"].copy_(torch.where(told, found.clamp(1e-6, 1e2), before))
-        old, rate = s["error"].clone(), max(r.error_rate, 1 / (t + 1))
-        s["error"].copy_(
-            torch.where(told, old + rate * (torch.minimum(error.square(), SURPRISE * old) - old), old)
-        )
-        away, v = value[:, None] - s["means"], s["variances"]
-        score = _scores(r, away, v * s["excess"], s["error"][:, None])
-        over = _scores(r, value[:, None] - s["mixed"], s["mixed_variance"], s["error"][:, None])
-        usual, pace = s["excess"].clone(), max(r.members_rate, 1 / (t + 3))
-        ratio = torch.minimum(away.square() / v.clamp(min=1e-30), SURPRISE * usual)
-        excess = (usual + pace * (ratio - usual)).clamp(1e-4, 1e8)
-        discounts = torch.tensor(r.discounts, dtype=torch.float64)[:, None]
-        weights = _reweighed(r, discounts * s["weights"] + score[:, None])
-        clocks = _reweighed(r, r.discount * s["clock_weights"] + over)
-        s["excess"].copy_(torch.where(told[:, None], excess, usual))
-        s["weights"].copy_(torch.where(told[:, None, None], weights, s["weights"]))
-        s["clock_weights"].copy_(torch.where(told[:, None], clocks, s["clock_weights"]))
 
     def _keep(self, s: Views, x: Tensor, y: Tensor) -> None:
         """Keep (x, y). A full store gives up the older of the closest pair of those that are not recent."""
@@ -275,7 +249,7 @@ class BankDefinition:
             s["time"].copy_(time)
             s["far"].fill_(float(STREAK) if self._beyond(s, x, y) else 0.0)
         elif known and s.number("far") == 0:
-            self._judge(s, (y - center) / spread, seen)
+            judge(self.rules, s, (y - center) / spread, seen, s.number("clock"))
         if s.number("far") > 0:
             s["skipped"].add_(1)
             return
@@ -315,17 +289,3 @@ def _processes(kernels: Tensor, noise: Tensor, rest: Tensor, line: Tensor) -> tu
     amplitude = amplitude / count
     variance = torch.maximum(amplitude * (1 + noise - seen)[:, None], amplitude * noise[:, None])
     return (line + mean).mT, variance.mT
-
-
-def _scores(r: Rules, error: Tensor, variance: Tensor, common: Tensor) -> Tensor:
-    """Part Student-t likelihood with a member's variance, part with the common squared error."""
-    variance, common = variance.clamp(min=1e-30), common.clamp(min=1e-30)
-    student: Callable[[Tensor], Tensor] = lambda v: (  # noqa: E731
-        -0.5 * (r.heavy + 1) * (error.square() / (r.heavy * v)).log1p()
-    )
-    return r.likelihood * (student(variance) - 0.5 * variance.log()) + (1 - r.likelihood) * student(common)
-
-
-def _reweighed(r: Rules, logs: Tensor) -> Tensor:
-    """Logarithms of the normalised weights, a share of them equal."""
-    return ((1 - r.share) * logs.softmax(-1) + r.share / logs.shape[-1]).log()

@@ -5,11 +5,27 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-LOCAL, CARRIED = 24, 8
-MEMBERS = LOCAL + CARRIED + 2  # local processes and filters; the linear model and the last value
+LOCAL, CARRIED, QUADRATIC = 24, 8, 8
+MEMBERS = LOCAL + CARRIED + QUADRATIC + 2  # local processes, filters, quadratics; linear model, last value
 CLOCKS = 3
+GROUPS = 10  # of members whose predictions correct the mixture: see `group`
+MOST_FEATURES = 120  # of a quadratic model: beyond, squares without products, or the coordinates alone
 RECENT = 64  # samples that are always kept
 CARRIED_WIDTH, CARRIED_RADIUS = 8.0, 0.1  # of the filters: in sqrt(n), in widths
+
+
+def group(member: int) -> int:
+    """The group of a member: local processes alike but for fading, latest ones, filters, linear, quadratics.
+
+    -1 for the last value, which has no say in the correction.
+    """
+    if member < 18:
+        return member % 6
+    if member < LOCAL:
+        return 6
+    if member < LOCAL + CARRIED:
+        return 7
+    return {MEMBERS - 2: 8, MEMBERS - 1: -1}.get(member, 9)
 
 
 class BankShape(NamedTuple):
@@ -19,6 +35,12 @@ class BankShape(NamedTuple):
     outputs: int  # K
     capacity: int  # C, samples kept
     neighbours: int  # k, samples of a local process
+
+    @property
+    def features(self) -> int:
+        """Coefficients of a quadratic model."""
+        n = self.dim
+        return next((d for d in ((n + 1) * (n + 2) // 2, 2 * n + 1) if d <= MOST_FEATURES), n + 1)
 
 
 class Rules(NamedTuple):
@@ -31,7 +53,8 @@ class Rules(NamedTuple):
     noise: tuple[float, ...] = (0.09, 1e-8, 9e-4, 1e-12, 0.09, 1e-8) * 4  # a local process each
     discounts: tuple[float, ...] = (0.9, 0.97, 0.995)  # of the scores in the three mixtures
     discount: float = 0.98  # of the scores of the mixtures
-    share: float = 0.01  # of the weights that is equal
+    share: float = 0.001  # of the weights that is equal
+    doubt: float = 0.25  # a weight falls with this power of a variance that is larger than usual
     drop: float = 0.02  # members below this part of the largest weight are left out
     heavy: float = 8.0  # degrees of freedom
     likelihood: float = 0.6  # its part of a score
@@ -47,6 +70,15 @@ class Rules(NamedTuple):
     learned_at: tuple[int, ...] = (2, 5, 10, 20, 40)  # samples after which the units are learned
     forgetting: tuple[float, ...] = (0.9, 0.95, 0.97, 0.98, 0.99, 0.995, 0.999, 1.0)  # of the filters
     carried_ratio: float = 1e-6  # variance of their noise
+    quadratic_forgetting: tuple[float, ...] = (0.9999, 0.9999, 0.9999, 0.9999, 0.998, 0.99, 0.99, 0.97)
+    quadratic_prior: tuple[float, ...] = (1e8, 1e4, 1e2, 1.0, 1e4, 1e4, 10.0, 1e2)  # of their coefficients
+    pace: float = 0.1  # of the error that the correction and the quadratics are measured by
+    correction_prior: float = 0.1  # variance of the correction's coefficients
+    correction_forgetting: float = 0.999
+    correction_most: float = 4.0  # running errors that a group may be away from the mixture
+    correction_discount: float = 0.99  # of the scores of the mixture with and without it
+    correction_share: float = 0.01  # of their weights that is equal
+    least: float = 1e-16  # of a member's running scale
 
     @classmethod
     def of(cls, dim: int, scaling: bool) -> Rules:
@@ -63,12 +95,15 @@ class Rules(NamedTuple):
         found += [*self.discounts, self.discount, self.share, self.drop, self.heavy, self.likelihood]
         found += [self.members_rate, self.error_rate, self.linear_forgetting, self.linear_prior, self.recent]
         found += [self.floor, self.margin, self.far, self.outlying, *self.learned_at, -1, float(self.scaling)]
-        return [*found, *self.forgetting, self.carried_ratio, self.carried_slack**2]
+        found += [*self.forgetting, self.carried_ratio, self.carried_slack**2]
+        found += [*self.quadratic_forgetting, *self.quadratic_prior, self.pace, self.correction_prior]
+        found += [self.correction_forgetting, self.correction_most, self.correction_discount]
+        return [*found, self.correction_share, self.least, self.doubt]
 
 
 def layout(shape: BankShape) -> list[tuple[str, tuple[int, ...]]]:
     """Names and shapes of a stream's numbers, in the order of `Stream` in _bank.cpp."""
-    n, k, c, _ = shape
+    n, k, c, d = shape.dim, shape.outputs, shape.capacity, shape.features
     filters = 2 * n + k * (n + 1) + (n + 1) ** 2 + k + 2
     return [
         *((name, ()) for name in ("clock", "count", "far", "skipped", "learned", "time")),
@@ -81,14 +116,26 @@ def layout(shape: BankShape) -> list[tuple[str, tuple[int, ...]]]:
         ("covariance", (n + 1, n + 1)),
         ("linear", (k, n + 1)),
         ("filters", (filters, CARRIED)),  # the rows of a `StreamState`, and the samples since it began
+        (
+            "factor",
+            (d * (d + 1) // 2, QUADRATIC),
+        ),  # of the quadratics' covariances U D U': columns of U, D last
+        ("quadratic", (k, d, QUADRATIC)),  # coefficients
+        ("quadratic_error", (k, QUADRATIC)),
         ("weights", (k, CLOCKS, MEMBERS)),  # logarithms
         ("clock_weights", (k, CLOCKS)),
         ("excess", (k, MEMBERS)),
-        *((name, (k,)) for name in ("error", "low", "high", "calibration")),
+        ("usual", (k, MEMBERS)),  # running logarithms of the members' variances
+        *((name, (k,)) for name in ("error", "pace", "low", "high", "calibration")),
+        ("correction_covariance", (k, GROUPS, GROUPS)),
+        ("correction", (k, GROUPS)),  # coefficients
+        ("away", (k, GROUPS)),  # of the groups from the mixture, in running errors
+        ("corrected", (k, 2)),  # logarithms of the weights of the mixture without and with it
         ("means", (k, MEMBERS)),
         ("variances", (k, MEMBERS)),
         ("mixed", (k, CLOCKS)),
         ("mixed_variance", (k, CLOCKS)),
+        *((name, (k,)) for name in ("blend", "stacked")),  # the mixture without and with the correction
         ("mean", (k,)),
         ("variance", (k,)),
         ("x", (c, n)),

@@ -59,7 +59,7 @@ def filter_streams(model: Any, sizes: Sizes, like: Tensor, scaling: bool) -> tup
     streams, dim, outputs = sizes
     dtype = like.dtype
     toward = directions(model, dim)
-    found: Tuning | None = getattr(model, "_tuning", None)
+    found: Tuning | None = model._tuning
     if found is not None and found.center.shape == (streams, dim + outputs):
         robust = math.inf if model.robust is None else positive_real(_NAME, "robust", model.robust)
         return tuned_streams(found, toward, dtype, robust, float(model.follow)), found.radius[0] * toward

@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -17,15 +16,14 @@ from .filter_arguments import KERNELS as KERNELS
 from .filter_arguments import Sizes, directions, filter_streams
 from .filter_streams import FilterStreams
 from .samples import lapses, like_given, pair, tensor_of
-from .scikit import ScikitEstimator, not_fitted
-from .smoothing import smooth
+from .smoothing import smooth_record
+from .stream_estimator import StreamEstimator
 from .tuning import tuning
 
 _NAME = "StaFRegressor"
-_ABOUT = ("n_features_in_", "n_streams_", "n_outputs_")
 
 
-class StaFRegressor(ScikitEstimator):
+class StaFRegressor(StreamEstimator):
     """Online regression on streams whose inputs move: constant memory and constant time a sample.
 
     Without ``memory``, the filter: y_k = V_k(x_k) + e_k by a Kalman filter of V's values at M centers around
@@ -35,7 +33,7 @@ class StaFRegressor(ScikitEstimator):
     streams.
 
     With ``memory``, the accurate mode (`Bank`): so many samples are kept, the centers are taken from them
-    where the state comes back, and local Gaussian processes, filters and a linear model are mixed by how
+    where the state comes back, and local Gaussian processes, filters, quadratic models are mixed by how
     well they predict. Nothing needs to be tuned; about a tenth of a millisecond a sample. The filter's
     arguments, from ``kernel`` to ``robust``, are not used then.
 
@@ -83,14 +81,7 @@ class StaFRegressor(ScikitEstimator):
     process given its values at inducing points, Snelson and Ghahramani (2006).
     """
 
-    n_features_in_: int
-    n_streams_: int | None
-    n_outputs_: int | None
     centers_offsets_: Tensor
-    _streams_: Bank | FilterStreams
-    _shape_: tuple[int, ...]
-    _targets_: tuple[int, ...]
-    _dtype_: torch.dtype
 
     def __init__(
         self,
@@ -120,38 +111,6 @@ class StaFRegressor(ScikitEstimator):
         self.scaling = scaling
         self.memory = memory
         self.neighbours = neighbours
-
-    def reset(self, streams: Any = None) -> StaFRegressor:
-        """Forget everything, dimension and streams included; or what these streams learned."""
-        if streams is not None:
-            self._fitted("reset")._streams_.clear(self._numbers("reset", streams))
-            return self
-        for name in [name for name in vars(self) if name.endswith("_")]:
-            delattr(self, name)
-        return self
-
-    def add(self, streams: int = 1) -> StaFRegressor:
-        """Begin further streams, numbered behind the others."""
-        if self._fitted("add").n_streams_ is None:
-            raise ValueError(f"`{_NAME}.add` needs streams side by side, x (S, n); this is a single one.")
-        self._streams_.add(integer(f"{_NAME}.add", "streams", streams, least=1))
-        return self._resized()
-
-    def drop(self, streams: Any) -> StaFRegressor:
-        """Give up the streams with these numbers; the others close ranks."""
-        gone = self._numbers("drop", streams)
-        stays = torch.ones(self._fitted("drop").n_streams_ or 1, dtype=torch.bool)
-        stays[gone] = False
-        if self.n_streams_ is None or not bool(stays.any()):
-            raise fail(f"{_NAME}.drop", "streams", "must leave a stream", streams)
-        self._streams_.keep(stays.nonzero().squeeze(-1))
-        return self._resized()
-
-    def _resized(self) -> StaFRegressor:
-        self.n_streams_ = self._streams_.count
-        self._shape_ = (self._streams_.count, *self._shape_[1:])
-        self._targets_ = (self._streams_.count, *self._targets_[1:])
-        return self
 
     def fit(self, x: Any, y: Any, time: Any = None) -> StaFRegressor:
         """Start afresh and learn from samples in the order of time.
@@ -214,20 +173,11 @@ class StaFRegressor(ScikitEstimator):
         twin._prepare(states[0], values[0])
         streams = twin._streams_
         assert isinstance(streams, FilterStreams)
-        rows = (len(states), twin._streams_.count, -1)
+        rows = (len(states), streams.count, -1)
         whole = torch.ones(rows[:2], dtype=torch.float64) if steps is None else steps.expand(rows[:2])
-        points, targets = states.double().reshape(rows), values.double().reshape(rows)
-        n = points.shape[-1]
-        center, spread = streams.units_for(torch.cat((points, targets), -1))
-        found, variance = smooth(
-            streams.definition,
-            streams.state,
-            (points - center[:, :n]) / spread[:, :n],
-            (targets - center[:, n:]) / spread[:, n:],
-            whole,
+        mean, std = smooth_record(
+            streams, states.double().reshape(rows), values.double().reshape(rows), whole
         )
-        deviation = variance.clamp(min=0.0).sqrt() * streams.definition.base**0.5
-        mean, std = found * spread[:, n:] + center[:, n:], deviation * spread[:, n:]
         return like_given(y, mean.reshape(values.shape)), like_given(y, std.reshape(values.shape))
 
     def partial_fit(self, x: Any, y: Any, lapse: Any = None) -> StaFRegressor:
@@ -306,17 +256,6 @@ class StaFRegressor(ScikitEstimator):
         mean = like_given(x, joined(0))
         return (mean, like_given(x, joined(1).sqrt())) if return_std else mean
 
-    @property
-    def n_samples_seen_(self) -> Tensor:
-        return self._counted(self._streams_.learned)
-
-    @property
-    def n_skipped_(self) -> Tensor:
-        return self._counted(self._streams_.skipped)
-
-    def _counted(self, count: Tensor) -> Tensor:
-        return count.squeeze(0) if self.n_streams_ is None else count
-
     def _is_plain(self, value: Any, target: bool = False) -> bool:
         """Whether compiled code can read a sample in place."""
         return (
@@ -328,41 +267,6 @@ class StaFRegressor(ScikitEstimator):
             and not value.requires_grad
             and value.is_contiguous()
         )
-
-    def _is_fitted(self) -> bool:
-        return "_streams_" in self.__dict__
-
-    def _fitted(self, call: str) -> StaFRegressor:
-        if not self._is_fitted():
-            raise not_fitted(f"`{_NAME}.{call}` needs a first sample: call `fit` or `partial_fit`.")
-        return self
-
-    def state_dict(self) -> dict[str, Any]:
-        """All that was learned, as tensors, numbers and strings, which ``weights_only=True`` loads."""
-        about = {name: getattr(self._fitted("state_dict"), name) for name in _ABOUT}
-        return about | {"dtype": str(self._dtype_)} | self._streams_.state_dict()
-
-    def load_state_dict(self, state: dict[str, Any]) -> StaFRegressor:
-        """Go on from a `state_dict` of a regressor with the same arguments, bit for bit."""
-        dtype = getattr(torch, state["dtype"].removeprefix("torch."))
-        streams, outputs = state["n_streams_"], state["n_outputs_"]
-        leading = () if streams is None else (streams,)
-        x = torch.zeros(*leading, state["n_features_in_"], dtype=dtype)
-        self.reset()
-        self._prepare(x, torch.zeros((*leading, *(() if outputs is None else (outputs,))), dtype=dtype))
-        self._streams_.load_state_dict(state)
-        return self
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {k: v for k, v in vars(self).items() if k in self._parameters()} | (
-            {"learned": self.state_dict()} if self._is_fitted() else {}
-        )
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        learned = state.pop("learned", None)
-        vars(self).update(state)
-        if learned is not None:
-            self.load_state_dict(learned)
 
     def _prepare(self, x: Tensor, y: Tensor) -> None:
         """Infer the sizes from the first sample and check the arguments."""
@@ -398,14 +302,3 @@ class StaFRegressor(ScikitEstimator):
                 f"X has {x.shape[-1]} features, but {_NAME} is expecting {self.n_features_in_} features "
                 "as input."
             )
-
-    def _numbers(self, call: str, streams: Any) -> Tensor:
-        """Numbers of streams, (R,) int64."""
-        found = torch.as_tensor(np.asarray(streams)).reshape(-1)
-        most = self._fitted(call)._streams_.count
-        if found.is_floating_point() or not bool(((found >= 0) & (found < most)).all()):
-            raise fail(
-                f"{_NAME}.{call}", "streams", f"must be numbers of streams from 0 to {most - 1}", streams
-            )
-        rows: Tensor = found.long().unique()
-        return rows

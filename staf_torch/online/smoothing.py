@@ -5,7 +5,33 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from .filter_streams import FilterStreams
 from .kalman_filter import LocalFilter, StreamState
+
+
+def smooth_record(streams: FilterStreams, x: Tensor, y: Tensor, lapse: Tensor) -> tuple[Tensor, Tensor]:
+    """`smooth` in the units of the streams, which are updated to the end.
+
+    Args:
+        streams: that have seen nothing yet.
+        x: (T, S, n), float64.
+        y: (T, S, K).
+        lapse: (T, S).
+
+    Returns:
+        Mean and standard deviation (T, S, K) of V, without noise, in the units of y.
+    """
+    n = x.shape[-1]
+    center, spread = streams.units_for(torch.cat((x, y), -1))
+    mean, variance = smooth(
+        streams.definition,
+        streams.state,
+        (x - center[:, :n]) / spread[:, :n],
+        (y - center[:, n:]) / spread[:, n:],
+        lapse,
+    )
+    deviation = variance.clamp(min=0.0).sqrt() * streams.definition.base**0.5
+    return mean * spread[:, n:] + center[:, n:], deviation * spread[:, n:]
 
 
 def smooth(

@@ -26,7 +26,7 @@ from ..adp import (
 from ..adp.problem import AdpProblem, OptimumSettings
 from ..approximation.basis import StaFBasis
 from ..numerics.checks import choice, fail, flag, integer, positive_real
-from ..systems import ControlAffineSystem
+from ..systems import ControlAffineSystem, Plant
 from . import config_directory
 from .chase import initial_states, make, make_centers, placement, plain
 
@@ -98,28 +98,30 @@ def build(cfg: DictConfig, group: str, kind: type, **known: Callable[[], Any]) -
     return made
 
 
-def plant(cfg: DictConfig) -> ControlAffineSystem:
+def plant(cfg: DictConfig) -> Plant:
     """Build the plant, which must have inputs."""
     system = make(cfg.system)
-    if not isinstance(system, ControlAffineSystem) or system.dim is None:
-        raise fail("adp", "system", "must be a ControlAffineSystem with `dim`", system)
+    if not isinstance(system, Plant) or system.dim is None:
+        raise fail("adp", "system", "must be a `systems.Plant` with `dim`", system)
     if _inputs(system) == 0:
         raise fail("adp", "system", "must be a plant with inputs", type(system).__name__)
     return system
 
 
-def _inputs(system: ControlAffineSystem) -> int:
-    """Return m."""
+def _inputs(system: Plant) -> int:
+    """Return m, which a class that states none shows in its effectiveness."""
+    if not isinstance(system, ControlAffineSystem):
+        return system.inputs
     return system.effectiveness(torch.zeros(1, system.dim or 0, dtype=torch.float64)).shape[-1]
 
 
-def make_cost(cfg: DictConfig, system: ControlAffineSystem) -> Cost:
+def make_cost(cfg: DictConfig, system: Plant) -> Cost:
     """Build the cost rate of the group `adp/cost` in the plant's sizes."""
     cost: Cost = build(cfg, "cost", Cost, dim=lambda: system.dim, inputs=lambda: _inputs(system))
     return cost
 
 
-def controller(cfg: DictConfig, system: ControlAffineSystem, cost: Cost) -> Controller:
+def controller(cfg: DictConfig, system: Plant, cost: Cost) -> Controller:
     """Build the controller of the group `adp/policy`; a callable from x to u becomes a `Feedback`."""
     assert system.dim is not None
     basis = functools.cache(functools.partial(value_basis, cfg, system.dim))
@@ -133,6 +135,7 @@ def controller(cfg: DictConfig, system: ControlAffineSystem, cost: Cost) -> Cont
         Callable,  # type: ignore[arg-type]
         system=lambda: system,
         model=lambda: system,
+        plant=lambda: system,
         cost=lambda: cost,
         dim=lambda: system.dim,
         inputs=lambda: _inputs(system),

@@ -1,5 +1,6 @@
 """Plants, one a file, and their trajectories."""
 
+from .barrier import Barrier as Barrier
 from .base import ControlAffineSystem as ControlAffineSystem
 from .base import Linearisation as Linearisation
 from .base import Plant as Plant
@@ -10,21 +11,26 @@ from .integrators import runge_kutta_step as runge_kutta_step
 from .integrators import simulate as simulate
 from .integrators import trajectory as trajectory
 from .linear import Linear as Linear
+from .mujoco_plant import MujocoPlant as MujocoPlant
 from .oscillator import Oscillator as Oscillator
 from .pendulum import Pendulum as Pendulum
 from .planar_quadrotor import PlanarQuadrotor as PlanarQuadrotor
 from .three_state import ThreeState as ThreeState
+from .two_link_robot import TwoLinkRobot as TwoLinkRobot
 from .two_state import TwoState as TwoState
+from .two_state_chain import TwoStateChain as TwoStateChain
 from .user_plants import RatePlant as RatePlant
 from .user_plants import StepPlant as StepPlant
 from .van_der_pol import VanDerPol as VanDerPol
 
 __all__ = [
+    "Barrier",
     "Bounds",
     "CartPole",
     "ControlAffineSystem",
     "Linear",
     "Linearisation",
+    "MujocoPlant",
     "Oscillator",
     "Pendulum",
     "PlanarQuadrotor",
@@ -32,7 +38,9 @@ __all__ = [
     "RatePlant",
     "StepPlant",
     "ThreeState",
+    "TwoLinkRobot",
     "TwoState",
+    "TwoStateChain",
     "Units",
     "VanDerPol",
     "runge_kutta_step",

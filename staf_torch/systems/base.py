@@ -86,6 +86,15 @@ class Plant(nn.Module, abc.ABC):
     def motion(self, x: Tensor, u: Tensor) -> Tensor:
         """x' in continuous time, x+ - x in discrete time: (..., n), (..., m) -> (..., n)."""
 
+    def velocity(self, x: Tensor, u: Tensor) -> Tensor:
+        """What a closed loop integrates and hands to `displaced`: the motion, unless a plant knows better."""
+        return self.motion(x, u)
+
+    def displaced(self, x: Tensor, step: Tensor) -> Tensor:
+        """The state that is a ``step`` of the velocity further on: (..., n), (..., n) -> (..., n)."""
+        return x + step
+
+    @abc.abstractmethod
     def linearisation(self, x: Tensor | None = None, u: Tensor | None = None) -> Linearisation:
         """A and B near a state and an input at rest, by default the equilibrium.
 
@@ -96,7 +105,6 @@ class Plant(nn.Module, abc.ABC):
         Raises:
             ValueError: if ``dim`` is None.
         """
-        raise NotImplementedError
 
     def difference(self, x: Tensor, y: Tensor) -> Tensor:
         """x - y, of the periodic coordinates in [-pi, pi]: (..., n), (..., n) -> (..., n)."""

@@ -14,6 +14,8 @@ from .base import Linearisation
 
 Motion = Callable[..., Any]
 """(x (B, n), u (B, m)) -> (B, n), of torch tensors or of NumPy arrays."""
+Slopes = Callable[[Any, Any], tuple[Any, Any]]
+"""(x (n,), u (m,)) -> the derivatives with respect to x, (n, n), and u, (n, m), of NumPy arrays."""
 _PROBES = 3  # rows that the function is tried with
 _KINK = 0.05  # of the largest slope, by which the slopes of two step sizes may differ
 
@@ -29,6 +31,7 @@ class BlackBox:
         function: (B, n), (B, m) -> (B, n).
         x: a state to try it near, (n,).
         u: an input to try it near, (m,).
+        slopes: its derivatives, where they are known.
 
     Attributes:
         torch: whether the function is torch all the way through.
@@ -37,16 +40,20 @@ class BlackBox:
         ValueError: if it raises, returns another shape or something not finite, or ignores u.
     """
 
-    def __init__(self, call: str, function: Motion, x: Tensor, u: Tensor) -> None:
+    def __init__(
+        self, call: str, function: Motion, x: Tensor, u: Tensor, slopes: Slopes | None = None
+    ) -> None:
         if not callable(function):
             raise ValueError(f"`{call}` must be a function of x (B, n) and u (B, m); got {function!r}.")
-        self._call, self._function = call, function
+        self._call, self._function, self._slopes = call, function, slopes
         self.torch = self._traces(x, u)
         self._try(x, u)
 
     def __call__(self, x: Tensor, u: Tensor) -> Tensor:
         """(..., n), (..., m) -> (..., n)."""
-        lead = torch.broadcast_shapes(x.shape[:-1], u.shape[:-1])
+        lead = x.shape[:-1]
+        if u.shape[:-1] != lead:
+            lead = torch.broadcast_shapes(lead, u.shape[:-1])
         rows = x.expand(*lead, -1).reshape(-1, x.shape[-1]), u.expand(*lead, -1).reshape(-1, u.shape[-1])
         after = self._function(*rows) if self.torch else self._numpy(*rows)
         moved: Tensor = after.reshape(*lead, x.shape[-1])
@@ -56,8 +63,11 @@ class BlackBox:
         """d/dx and d/du at one point (n,), (m,).
 
         Raises:
-            ValueError: if the function has a kink there: slopes of two step sizes differ by more than 5 %.
+            ValueError: if the function has a kink there: slopes of two step sizes differ by more than 5 %; or
+                if known slopes have another shape or are not finite.
         """
+        if self._slopes is not None:
+            return self._known(self._slopes, x, u)
         size, at = len(x), torch.cat((x, u))
 
         def whole(z: Tensor) -> Tensor:
@@ -76,6 +86,19 @@ class BlackBox:
                     "it elsewhere (`equilibrium`), or smooth what switches there."
                 )
         return Linearisation(slopes[:, :size], slopes[:, size:])
+
+    def _known(self, slopes: Slopes, x: Tensor, u: Tensor) -> Linearisation:
+        found = slopes(x.detach().cpu().numpy(), u.detach().cpu().numpy())
+        a, b = (torch.as_tensor(np.asarray(part, dtype=np.float64)) for part in found)
+        if a.shape != (len(x), len(x)) or b.shape != (len(x), len(u)):
+            shapes = tuple(a.shape), tuple(b.shape)
+            raise ValueError(
+                f"the `slopes` of `{self._call}` must have the shapes {(len(x), len(x))} and "
+                f"{(len(x), len(u))}; got {shapes[0]} and {shapes[1]}."
+            )
+        if not bool(torch.isfinite(torch.cat((a, b), dim=1)).all()):
+            raise ValueError(f"the `slopes` of `{self._call}` are not finite at the state {x.tolist()}.")
+        return Linearisation(a, b)
 
     def _traces(self, x: Tensor, u: Tensor) -> bool:
         """Whether the function maps tensors to a tensor with a derivative, batched by `torch.func` too."""

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ..numerics.checks import fail, integer, positive_real, vector
 from .base import Linearisation, Plant
-from .black_box import BlackBox, Motion
+from .black_box import BlackBox, Motion, Slopes
 from .bounds import Bounds, Limit
 from .equilibria import find_equilibrium
 
@@ -30,6 +30,7 @@ class FunctionPlant(Plant):
         equilibrium: Guess,
         low: Limit,
         high: Limit,
+        slopes: Slopes | None,
     ) -> None:
         super().__init__()
         name = type(self).__name__
@@ -41,7 +42,7 @@ class FunctionPlant(Plant):
         bounds = Bounds(low, high, inputs)
         self.bounds = bounds if bounds.present else None
         x, u = _guess(name, equilibrium, dim, inputs)
-        self.function = BlackBox(f"{name}({argument}=...)", function, x, u)
+        self.function = BlackBox(f"{name}({argument}=...)", function, x, u, slopes)
         self._rest = x, u
         self._rest = find_equilibrium(self, x, u)
 
@@ -84,6 +85,8 @@ class StepPlant(FunctionPlant):
             is searched: by the input alone, then by both.
         low: of the inputs, as in `Bounds`.
         high: likewise.
+        slopes: dx+/dx (n, n) and dx+/du (n, m) at a state (n,) and an input (m,), where a simulator knows
+            them: NumPy arrays of NumPy arrays.
 
     Raises:
         ValueError: if an argument breaks its rule, the function raises, returns other shapes or ignores u, or
@@ -101,8 +104,9 @@ class StepPlant(FunctionPlant):
         equilibrium: Guess = None,
         low: Limit = None,
         high: Limit = None,
+        slopes: Slopes | None = None,
     ) -> None:
-        self_period = positive_real("StepPlant", "dt", dt)
+        period = positive_real("StepPlant", "dt", dt)
         super().__init__(
             "step",
             step,
@@ -112,8 +116,9 @@ class StepPlant(FunctionPlant):
             equilibrium=equilibrium,
             low=low,
             high=high,
+            slopes=slopes,
         )
-        self.period = self_period
+        self.period = period
 
     def step(self, x: Tensor, u: Tensor) -> Tensor:
         """x+: (..., n), (..., m) -> (..., n)."""
@@ -135,6 +140,7 @@ class RatePlant(FunctionPlant):
     Args:
         rate: (B, n), (B, m) -> (B, n), of torch tensors or NumPy arrays, in units of the state a second.
         dim, inputs, periodic, equilibrium, low, high: as in `StepPlant`.
+        slopes: likewise, of the rate.
 
     Raises:
         ValueError: as in `StepPlant`.
@@ -150,6 +156,7 @@ class RatePlant(FunctionPlant):
         equilibrium: Guess = None,
         low: Limit = None,
         high: Limit = None,
+        slopes: Slopes | None = None,
     ) -> None:
         super().__init__(
             "rate",
@@ -160,6 +167,7 @@ class RatePlant(FunctionPlant):
             equilibrium=equilibrium,
             low=low,
             high=high,
+            slopes=slopes,
         )
 
     def rate(self, x: Tensor, u: Tensor) -> Tensor:

@@ -25,6 +25,7 @@ from staf_torch import (
 )
 from staf_torch.adp.closed_loop import ClosedLoop, LoopState, program, row_gains
 from staf_torch.lanes import compiler
+from staf_torch.lanes import program as programs
 
 CLOSE = 1e-11  # of a number's size, after a few steps from equal states
 
@@ -159,13 +160,22 @@ def test_a_compiled_run_is_that_of_the_definition() -> None:
         torch.testing.assert_close(got, want, rtol=1e-9, atol=1e-12, equal_nan=True)
 
 
-def test_a_loop_whose_numbers_changed_is_another_program() -> None:
-    loop = start("information", 1)[0]
+def test_loops_that_differ_in_gains_and_tensors_share_one_text(monkeypatch: pytest.MonkeyPatch) -> None:
+    loop, state, draws = start("information", 5)
     first = program(loop, True)
+    assert first.compiles(state, draws)
     assert program(loop, True) is first
-    assert program(copy.deepcopy(loop), True) is first
-    loop.controller.critic.mul_(2.0)
-    assert program(loop, True) is not first
+    monkeypatch.setattr(programs, "trace", None)
+    monkeypatch.setattr(compiler, "_build", None)
+    for gain in (0.5, 1.0, 2.0, 0.3):  # 1 and powers of two, which a text may spell out
+        other = copy.deepcopy(loop)
+        other.controller.law.gains = adp.Gains(critic_extrapolated=gain, actor=gain)
+        other.controller.basis.basis.centers.directions.mul_(gain)
+        steps = program(other, True)
+        assert steps is not first
+        assert steps.compiles(state, draws)
+        for got, want in zip(steps(state, draws)[1], steps.definition(state, draws)[1], strict=True):
+            torch.testing.assert_close(got, want, rtol=1e-9, atol=1e-12, equal_nan=True)
 
 
 class Branching(systems.TwoState):

@@ -41,6 +41,12 @@ NEEDS = {  # what some options cannot do without, or that makes them small
     "experiment=exponential_bound": ["exponential_bound.radii=[0.1]", "exponential_bound.states=9"],
     "experiment=flat_limit": ["flat_limit.counts=[3]", "flat_limit.radii.smallest=1e-3"],
     "experiment=adp_comparison": ["trajectories=3", "adp.order=2"],
+    "experiment=rivals": [
+        "rivals.plants=[double_integrator]",
+        "rivals.methods=[discrete LQR,MPPI]",
+        "rivals.states=1",
+        "rivals.calls=2",
+    ],
     "experiment=layouts": ["layouts.states=4", "layouts.radii=[0.1,0.2]"],
     "system=three_state": ["centers=simplex", "target=quadratic", "initial_state=[0.1,0,0]"],
 }
@@ -63,7 +69,7 @@ def _options() -> dict[str, list[str]]:
         more += NEEDS.get(f"{group}={option}", [])
         if option == "ablation":
             lines[f"{group}={option}"] = [f"{group}={option}", *ABLATION]
-        elif group != "adp":  # a group of the experiments of that name, which have tests of their own
+        elif group != "adp" and option != "mujoco":  # closed loops, which have tests of their own
             lines[f"{group}={option}"] = [f"{group}={option}", *more, *SHORT]
     return lines
 

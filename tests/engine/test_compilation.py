@@ -24,7 +24,7 @@ def test_without_a_compiler_the_reference_runs_and_the_log_says_so_once(
     states, basis = circles(4, 20), BASES["exponential, moving radius"]
     want = chase_weights(states, basis, targets.Paper(), LAW).weights
     for module, name, empty in (
-        (row_program, "_kept", {}),
+        (row_program._kept, "_models", {}),
         (compiler, "_loaded", {}),
         (program, "_said", set()),
     ):

@@ -160,3 +160,18 @@ def test_a_class_and_a_yaml_of_ones_own_make_a_variant(own: Path) -> None:
 def test_an_object_of_another_kind_is_refused_by_name(own: Path) -> None:
     with pytest.raises(ValueError, match=r"`adp\(basis=...\)` must be a ValueBasis; got Pump"):
         problem(f"hydra.searchpath=[file://{own}]", "adp/basis=pumped")
+
+
+def test_model_of_mujoco_is_a_plant_of_closed_loops(tmp_path: Path) -> None:
+    pytest.importorskip("mujoco", reason="needs the extra mujoco")
+    path = tmp_path / "cart.xml"
+    path.write_text(
+        '<mujoco><worldbody><body><joint name="j" type="slide" axis="1 0 0"/><geom size="0.1"/></body>'
+        '</worldbody><actuator><motor joint="j"/></actuator></mujoco>'
+    )
+    model = ("system=mujoco", f"system.model={path}", "system.dt=0.02", "initial_state=[0.1,0.0]", "dt=0.02")
+    built = problem(*model, "adp/policy=lqr")
+    assert (built.dt, built.system.period) == (0.02, 0.02)
+    assert float(control(built)) < 0
+    with pytest.raises(ValueError, match=r"`ActorCritic\(model=...\)` must be a ControlAffineSystem"):
+        problem(*model)

@@ -20,7 +20,8 @@ OPTIONS = [
     f"{group}={path.stem}"
     for group in GROUPS
     for path in sorted((Path(config_directory()) / group).glob("*.yaml"))
-    if path.stem != "custom"
+    if path.stem
+    not in ("custom", "mujoco")  # of the user's own; the second in tests/settings/test_adp_groups.py
 ]
 
 

@@ -1,0 +1,245 @@
+"""The methods that are compared: each from a plant and a cost to controls, as a user would write it."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import inspect
+import math
+from collections.abc import Callable
+from importlib import metadata
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from .. import adp
+from ..adp import SampledProblem
+from .rival_plants import Case
+
+Steer = Callable[[Tensor], Tensor]
+"""u (B, m) from x (B, n), called once a period: it may remember its last plan."""
+Begin = Callable[[Tensor], Steer]
+"""Steering from the initial states (B, n)."""
+_SAMPLES = 500  # control sequences of MPPI
+_TEMPERATURE = 0.01  # of MPPI, times the LQR's value at the initial states
+_NOISE = 0.25  # its standard deviation, of the range of an input: as large as served on two plants
+
+
+class UnsuitableError(Exception):
+    """A method is not made for a plant; the message says why."""
+
+
+def lqr(case: Case) -> Begin:
+    """Gains in continuous time, held for the period."""
+    if case.discrete:
+        raise UnsuitableError("needs a plant in continuous time")
+    policy = adp.LQR(case.plant(), case.cost())
+    return lambda x0: policy
+
+
+def discrete_lqr(case: Case) -> Begin:
+    """The gains that are made for the period."""
+    policy = adp.LQR(case.plant(), case.cost(), period=case.dt)
+    return lambda x0: policy
+
+
+def near_optimal(case: Case) -> Begin:
+    """The discrete LQR improved by rollouts."""
+    policy = adp.near_optimal(case.plant(), case.cost(), dt=case.dt)
+    return lambda x0: policy
+
+
+def global_value(case: Case) -> Begin:
+    """A memory of optimal trajectories."""
+    if not case.swing:
+        raise UnsuitableError("the LQR reaches the goal")
+    deep = {"rounds": 6, "candidates": 64, "lookahead": 120} if case.dim > 2 else {}
+    width = [math.pi, 8.0] if case.dim == 2 else list(case.box)
+    memory = adp.learn_global_value(case.problem(), width, steps=min(200, case.steps - 50), **deep)
+    return lambda x0: memory
+
+
+def box_ddp(case: Case) -> Begin:
+    """Receding horizon by box-DDP, three iterations a period."""
+    mpc = adp.RecedingHorizon(case.problem(), steps=case.horizon)
+
+    def begin(x0: Tensor) -> Steer:
+        state = mpc.init(x0)
+
+        def steer(x: Tensor) -> Tensor:
+            nonlocal state
+            u, state = mpc.step(x, state, x, case.dt)
+            return u
+
+        return steer
+
+    return begin
+
+
+def ipopt(case: Case) -> Begin:
+    """Receding horizon by CasADi and IPOPT: multiple shooting, begun from the last plan."""
+    import casadi
+
+    n, m, steps = case.dim, case.inputs, case.horizon
+    solve = ipopt_program(casadi, case, case.problem(), steps)
+
+    def begin(x0: Tensor) -> Steer:
+        plans = [np.concatenate([np.tile(x, steps + 1), np.zeros(m * steps)]) for x in x0.numpy()]
+
+        def steer(x: Tensor) -> Tensor:
+            control = []
+            for row, at in enumerate(x.numpy()):
+                plan = np.array(solve(x0=plans[row], p=at)["x"]).ravel()
+                if not np.isfinite(plan).all():
+                    plan = plans[row]
+                states, inputs = plan[: n * (steps + 1)], plan[n * (steps + 1) :]
+                control.append(inputs[:m])
+                ahead = np.concatenate([states[n:], states[-n:]]), np.concatenate([inputs[m:], inputs[-m:]])
+                plans[row] = np.concatenate(ahead)
+            return torch.from_numpy(np.array(control))
+
+        return steer
+
+    return begin
+
+
+def mppi(case: Case) -> Begin:
+    """Model-predictive path integrals: 500 sampled sequences a period."""
+    from pytorch_mppi import MPPI_Batched
+
+    problem = case.problem()
+    low, high = problem.bounds.low, problem.bounds.high
+
+    def paid(x: Tensor, u: Tensor, t: int) -> Tensor:
+        # It asks for the cost after the step. The last state pays the LQR's value as well.
+        cost = problem.advance(x, u)[1]
+        return cost + problem.terminal(x) if t == case.horizon - 1 else cost
+
+    def begin(x0: Tensor) -> Steer:
+        controller = MPPI_Batched(
+            lambda x, u, t: problem.advance(x, u)[0],
+            paid,
+            case.dim,
+            torch.diag((_NOISE * (high - low)) ** 2),
+            len(x0),
+            num_samples=_SAMPLES,
+            horizon=case.horizon,
+            lambda_=_TEMPERATURE * float(problem.terminal(x0).mean()),
+            u_min=low,
+            u_max=high,
+            step_dependent_dynamics=True,
+        )
+        controller.U = torch.zeros_like(controller.U)  # it would begin from noise
+        return controller.command  # type: ignore[no-any-return]
+
+    return begin
+
+
+def ipopt_program(casadi: Any, case: Case, problem: SampledProblem, steps: int) -> Any:
+    """IPOPT on min sum l(x, u) + V_T over (states, controls): called with a guess x0 and the state p."""
+    n, m = case.dim, case.inputs
+    x, u = casadi.MX.sym("x", n), casadi.MX.sym("u", m)
+    weights, goal = case.weights, case.goal().tolist()
+
+    def deviation(x: Any) -> Any:
+        away = [x[i] - goal[i] for i in range(n)]
+        turns = {i: casadi.floor(away[i] / (2 * math.pi) + 0.5) for i in case.periodic}
+        return [part - 2 * math.pi * turns[i] if i in turns else part for i, part in enumerate(away)]
+
+    def paid(x: Any) -> Any:
+        state = sum(q * e**2 for q, e in zip(weights[0], deviation(x), strict=True))
+        return state + sum(r * u[j] ** 2 for j, r in enumerate(weights[1]))
+
+    def motion(x: Any) -> Any:
+        parts = case.equations(casadi, [x[i] for i in range(n)], [u[j] for j in range(m)])
+        return casadi.vertcat(*parts)
+
+    h = case.dt
+    if case.discrete:
+        after, spent = motion(x), h * paid(x)
+    else:
+        at = [x]
+        k = [motion(x)]
+        for share in (0.5, 0.5, 1.0):
+            at.append(x + share * h * k[-1])
+            k.append(motion(at[-1]))
+        costs = [paid(each) for each in at]
+        after = x + h / 6 * (k[0] + 2 * (k[1] + k[2]) + k[3])
+        spent = h / 6 * (costs[0] + 2 * (costs[1] + costs[2]) + costs[3])
+    step = casadi.Function("step", [x, u], [after, spent])
+    states, controls = casadi.MX.sym("X", n, steps + 1), casadi.MX.sym("U", m, steps)
+    start = casadi.MX.sym("p", n)
+    moved, costs = step.map(steps)(states[:, :-1], controls)
+    last = casadi.vertcat(*deviation(states[:, -1]))
+    total = casadi.sum2(costs) + casadi.bilin(problem.p.numpy(), last, last)
+    program = {
+        "x": casadi.vertcat(casadi.vec(states), casadi.vec(controls)),
+        "p": start,
+        "f": total,
+        "g": casadi.vertcat(states[:, 0] - start, casadi.vec(states[:, 1:] - moved)),
+    }
+    quiet = {"ipopt.print_level": 0, "ipopt.sb": "yes", "print_time": False, "ipopt.max_iter": 300}
+    warm = {"ipopt.warm_start_init_point": "yes", "ipopt.mu_init": 1e-3}
+    options = quiet | (warm if steps < case.steps else {}) | {"error_on_fail": False}
+    solver = casadi.nlpsol("mpc", "ipopt", program, options)
+    free, none = np.full(n * (steps + 1), np.inf), dict.fromkeys(("lbg", "ubg"), 0.0)
+    low = np.concatenate([-free, np.tile(case.low, steps)])
+    high = np.concatenate([free, np.tile(case.high, steps)])
+    return lambda x0, p: {**solver(x0=x0, p=p, lbx=low, ubx=high, **none), **solver.stats()}
+
+
+@dataclasses.dataclass(frozen=True)
+class Method:
+    """A row of the table."""
+
+    name: str
+    prepare: Callable[[Case], Begin]
+    packages: tuple[str, ...] = ()  # that it needs beside torch, by their distributions
+    helpers: tuple[Callable[..., Any], ...] = ()  # that a user would write as well
+
+    @property
+    def lines(self) -> int:
+        """Lines of code from a plant and a cost to controls, without blank lines and comments."""
+        return sum(map(_lines, (self.prepare, *self.helpers)))
+
+    @property
+    def missing(self) -> str | None:
+        """The first package that is not installed."""
+        for name in self.packages:
+            try:
+                metadata.distribution(name)
+            except metadata.PackageNotFoundError:
+                return name
+        return None
+
+    @property
+    def megabytes(self) -> float:
+        """What the packages take on disk, beside torch and NumPy."""
+        return sum(_size(name) for name in self.packages) / 2**20
+
+
+METHODS = {
+    method.name: method
+    for method in (
+        Method("LQR", lqr, ("scipy",)),
+        Method("discrete LQR", discrete_lqr, ("scipy",)),
+        Method("near_optimal", near_optimal, ("scipy",)),
+        Method("GlobalValue", global_value, ("scipy",)),
+        Method("box-DDP", box_ddp, ("scipy",)),
+        Method("IPOPT", ipopt, ("casadi",), (ipopt_program,)),
+        Method("MPPI", mppi, ("pytorch-mppi",)),
+    )
+}
+
+
+def _lines(function: Callable[..., Any]) -> int:
+    code = [line.strip() for line in inspect.getsourcelines(function)[0]]
+    return sum(bool(line) and not line.startswith(("#", '"""')) for line in code)
+
+
+@functools.cache
+def _size(name: str) -> int:
+    files = metadata.distribution(name).files or []
+    return sum(path.stat().st_size for file in files if (path := file.locate()).is_file())  # type: ignore[attr-defined]

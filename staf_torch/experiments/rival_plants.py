@@ -1,0 +1,188 @@
+"""The plants on which methods are compared: one text of the equations for torch and for CasADi."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..adp import QuadraticCost, SampledProblem
+from ..systems import Plant, RatePlant, StepPlant
+
+Equations = Callable[[Any, Sequence[Any], Sequence[Any]], Sequence[Any]]
+"""(a module with sin, cos, fmin, fmax, coordinates of x, those of u) -> those of x' or x+."""
+
+
+class TorchMath:
+    """The functions that equations use, under CasADi's names."""
+
+    sin, cos = staticmethod(torch.sin), staticmethod(torch.cos)
+
+    @staticmethod
+    def fmin(x: Tensor, limit: float) -> Tensor:
+        return x.clamp(max=limit)
+
+    @staticmethod
+    def fmax(x: Tensor, limit: float) -> Tensor:
+        return x.clamp(min=limit)
+
+
+@dataclasses.dataclass(frozen=True)
+class Case:
+    """A plant, its cost and its box of initial states.
+
+    Attributes:
+        equations: of x', or of x+ where ``discrete``.
+        dt: s, for which a control is held.
+        steps: of an episode.
+        weights: diagonal of Q, and of R.
+        low: of the inputs; ``high`` likewise.
+        box: half the width of the box of initial states around ``target``.
+        target: the set-point.
+        periodic: coordinates that are angles.
+        swing: whether the goal must be reached from far away, by a `GlobalValue`.
+        horizon: periods that planning methods look ahead.
+    """
+
+    name: str
+    equations: Equations
+    dt: float
+    steps: int
+    weights: tuple[tuple[float, ...], tuple[float, ...]]
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+    box: tuple[float, ...]
+    target: tuple[float, ...] | None = None
+    periodic: tuple[int, ...] = ()
+    discrete: bool = False
+    swing: bool = False
+    horizon: int = 50
+
+    @property
+    def dim(self) -> int:
+        return len(self.box)
+
+    @property
+    def inputs(self) -> int:
+        return len(self.low)
+
+    def goal(self) -> Tensor:
+        """The set-point, (n,)."""
+        return torch.tensor(self.target or [0.0] * self.dim, dtype=torch.float64)
+
+    def plant(self) -> Plant:
+        def function(x: Tensor, u: Tensor) -> Tensor:
+            return torch.stack(tuple(self.equations(TorchMath, x.unbind(-1), u.unbind(-1))), dim=-1)
+
+        given: dict[str, Any] = {
+            "dim": self.dim,
+            "inputs": self.inputs,
+            "periodic": self.periodic,
+            "low": self.low,
+            "high": self.high,
+            "equilibrium": self.goal(),
+        }
+        return StepPlant(function, dt=self.dt, **given) if self.discrete else RatePlant(function, **given)
+
+    def cost(self) -> QuadraticCost:
+        q, r = (torch.diag(torch.tensor(part, dtype=torch.float64)) for part in self.weights)
+        return QuadraticCost(q, r, self.dim, self.inputs, target=self.target)
+
+    def problem(self) -> SampledProblem:
+        return SampledProblem.of(self.plant(), self.cost(), dt=self.dt)
+
+    def states(self, count: int, seed: int) -> Tensor:
+        """Initial states, uniform in the box: (count, n)."""
+        generator = torch.Generator().manual_seed(seed)
+        uniform = torch.rand(count, self.dim, generator=generator, dtype=torch.float64)
+        return self.goal() + torch.tensor(self.box, dtype=torch.float64) * (2 * uniform - 1)
+
+
+def mass(m: Any, x: Sequence[Any], u: Sequence[Any]) -> Sequence[Any]:
+    """A double integrator."""
+    return x[1], u[0] + 0 * x[0]
+
+
+def pendulum(m: Any, x: Sequence[Any], u: Sequence[Any]) -> Sequence[Any]:
+    """x+ of Gymnasium's Pendulum-v1."""
+    rate = m.fmax(m.fmin(x[1] + 0.05 * (15.0 * m.sin(x[0]) + 3.0 * u[0]), 8.0), -8.0)
+    return x[0] + 0.05 * rate, rate
+
+
+def cart_pole(m: Any, x: Sequence[Any], u: Sequence[Any]) -> Sequence[Any]:
+    """(place, angle, their rates): 1 kg, a pole of 0.1 kg, half a metre to its middle, the factor 4/3."""
+    sine, cosine = m.sin(x[1]), m.cos(x[1])
+    shift = (u[0] + 0.05 * x[3] * x[3] * sine) / 1.1
+    bend = (9.8 * sine - cosine * shift) / (0.5 * (4 / 3 - 0.1 * cosine * cosine / 1.1))
+    return x[2], x[3], shift - 0.05 * bend * cosine / 1.1, bend
+
+
+def quadrotor(m: Any, x: Sequence[Any], u: Sequence[Any]) -> Sequence[Any]:
+    """(y, z, angle, their rates) under (thrust above hover, torque): 1 kg, 0.1 kg m^2."""
+    lift = 9.81 + u[0]
+    return x[3], x[4], x[5], -lift * m.sin(x[2]), lift * m.cos(x[2]) - 9.81, u[1] / 0.1
+
+
+_CART = ((1.0, 1.0, 0.1, 0.1), (0.01,))
+CASES = {
+    case.name: case
+    for case in (
+        Case("double_integrator", mass, 0.1, 150, ((1.0, 1.0), (1.0,)), (-1.0,), (1.0,), (5.0, 1.0)),
+        Case(
+            "pendulum",
+            pendulum,
+            0.05,
+            200,
+            ((20.0, 2.0), (0.02,)),
+            (-2.0,),
+            (2.0,),
+            (math.pi, 1.0),
+            periodic=(0,),
+            discrete=True,
+            swing=True,
+        ),
+        Case("cart_pole_10N", cart_pole, 0.02, 250, _CART, (-10.0,), (10.0,), (0.3,) * 4, periodic=(1,)),
+        Case("cart_pole_5N", cart_pole, 0.02, 250, _CART, (-5.0,), (5.0,), (0.3,) * 4, periodic=(1,)),
+        Case(
+            "cart_pole_to_1m",
+            cart_pole,
+            1 / 15,
+            90,
+            ((5.0, 5.0, 0.1, 0.1), (0.1,)),
+            (-10.0,),
+            (10.0,),
+            (1.0, 0.2, 0.2, 0.2),
+            target=(1.0, 0.0, 0.0, 0.0),
+            periodic=(1,),
+            horizon=20,
+        ),
+        Case(
+            "quadrotor",
+            quadrotor,
+            0.02,
+            200,
+            ((1.0,) * 6, (1.0, 1.0)),
+            (-9.81, -1.0),
+            (9.81, 1.0),
+            (0.4,) * 6,
+            periodic=(2,),
+        ),
+        Case(
+            "cart_pole_swing_up",
+            cart_pole,
+            0.02,
+            300,
+            _CART,
+            (-10.0,),
+            (10.0,),
+            (1.0, math.pi, 1.0, 2.0),
+            periodic=(1,),
+            swing=True,
+            horizon=120,
+        ),
+    )
+}

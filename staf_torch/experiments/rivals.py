@@ -1,0 +1,209 @@
+"""Our methods and those of others on the same plants, states and costs; losses are printed as they are."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from omegaconf import DictConfig
+from torch import Tensor
+
+from ..adp import BoxDDP, SampledProblem
+from ..figures.rivals import draw_rivals
+from ..figures.style import images
+from ..numerics.checks import choice, integer
+from ..results.progress import SHOWN, Progress
+from ..results.run_directory import RunDirectory
+from ..settings.chase import plain
+from ..tables import Style, Table
+from ..tables.columns import significant
+from .registry import Metrics, finite
+from .rival_methods import METHODS, Begin, Method, UnsuitableError, ipopt_program
+from .rival_plants import CASES, Case
+
+_log = logging.getLogger(__name__)
+_REGULATED = 1e-3  # share of the cost that may be left at the end of an episode
+_ROUNDED = 1e-6  # of the range of an input, beyond which it violates its bound: solvers round
+_COLUMNS = {
+    "plant": "plant",
+    "method": "method",
+    "ratio_median": "cost over best: median",
+    "ratio_max": "max",
+    "regulated": "regulated",
+    "violations": "violations",
+    "us_median": "us a control: median",
+    "us_p99": "p99",
+    "offline": "s before",
+    "megabytes": "MB",
+    "lines": "lines",
+    "note": "note",
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Episode:
+    """What a method did from every initial state."""
+
+    cost: Tensor  # with the LQR's value at the end, (B,); inf where a number is not finite
+    control: Tensor  # (B, T, m)
+    state: Tensor  # (B, T + 1, n)
+    left: Tensor  # LQR's value at the end, (B,)
+    outside: float  # share of the controls beyond the bounds
+    offline: float  # CPU s before the first control
+
+
+def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics:
+    """Run every method on every plant and fill the run directory; `metrics.json` comes last."""
+    settings = cfg.rivals
+    cases = [CASES[str(choice("rivals", "plants", name, tuple(CASES)))] for name in plain(settings.plants)]
+    chosen = [
+        METHODS[str(choice("rivals", "methods", name, tuple(METHODS)))] for name in plain(settings.methods)
+    ]
+    states = integer("rivals", "states", settings.states, least=1)
+    calls = integer("rivals", "calls", settings.calls, least=1)
+    seed = integer("staf", "seed", cfg.seed, least=0)
+    rows: list[dict[str, Any]] = []
+    with progress.over(len(cases), "plants") as advance:
+        for case in cases:
+            rows += compare(case, chosen, case.states(states, seed), calls)
+            advance(1)
+    out = RunDirectory(directory)
+    out.table("rivals", dataclasses.replace(Table.of(rows, _COLUMNS), style=Style(digits=4)))
+    if cfg.figures:
+        out.figure("rivals", images(draw_rivals(rows)))
+    measured = ("ratio_median", "ratio_max", "regulated", "violations")
+    return out.metrics(
+        {
+            f"{row['plant']}_{_key(row['method'])}_{name}": finite(row[name])
+            for row in rows
+            for name in measured
+        }
+    )
+
+
+def compare(case: Case, methods: list[Method], x0: Tensor, calls: int) -> list[dict[str, Any]]:
+    """The rows of one plant."""
+    problem = case.problem()
+    episodes: dict[str, Episode] = {}
+    times: dict[str, list[float]] = {}
+    notes: dict[str, str] = {}
+    for method in methods:
+        if method.missing is not None:
+            notes[method.name] = f"{method.missing} is not installed"
+            continue
+        began = time.process_time()
+        try:
+            begin = method.prepare(case)
+        except UnsuitableError as why:
+            notes[method.name] = str(why)
+            continue
+        offline = time.process_time() - began
+        episodes[method.name] = play(problem, begin, x0, case.steps, offline)
+        times[method.name] = timed(problem, begin, x0[:1], calls)
+        _log.info(
+            "%s, %s: mean cost %s",
+            case.name,
+            method.name,
+            significant(float(episodes[method.name].cost.mean()), 5),
+        )
+    best = best_known(case, problem, x0, list(episodes.values()))
+    rows = []
+    for method in methods:
+        row: dict[str, Any] = {"plant": case.name, "method": method.name, "note": notes.get(method.name)}
+        row |= {"lines": method.lines, "megabytes": None if method.missing else method.megabytes}
+        row |= dict.fromkeys(
+            ("ratio_median", "ratio_max", "regulated", "violations", "us_median", "us_p99", "offline")
+        )
+        if method.name in episodes:
+            row |= _measured(episodes[method.name], times[method.name], best)
+        rows.append(row)
+    return rows
+
+
+@torch.no_grad()
+def play(problem: SampledProblem, begin: Begin, x0: Tensor, steps: int, offline: float = 0.0) -> Episode:
+    """Steer from x0 for a number of periods; what is applied is within the bounds."""
+    steer, x = begin(x0), x0
+    spent, outside = torch.zeros_like(x0[:, 0]), 0.0
+    controls, states = [], [x0]
+    slack = _ROUNDED * (problem.bounds.high - problem.bounds.low)
+    for _ in range(steps):
+        wanted = steer(x)
+        u = problem.admissible(wanted)
+        outside += float(((wanted - u).abs() > slack).any(-1).double().mean()) / steps
+        x, paid = problem.advance(x, u)
+        spent = spent + paid
+        controls.append(u)
+        states.append(x)
+    left = problem.terminal(x)
+    cost = torch.where(torch.isfinite(spent + left), spent + left, torch.inf)
+    return Episode(cost, torch.stack(controls, 1), torch.stack(states, 1), left, outside, offline)
+
+
+@torch.no_grad()
+def timed(problem: SampledProblem, begin: Begin, x: Tensor, calls: int) -> list[float]:
+    """CPU microseconds of every control of one state, along its trajectory, the first ones left out."""
+    steer, taken = begin(x), []
+    for _ in range(calls):
+        start = time.process_time()
+        u = steer(x)
+        taken.append(1e6 * (time.process_time() - start))
+        x, _ = problem.advance(x, problem.admissible(u))
+    return taken[len(taken) // 10 :]
+
+
+def best_known(case: Case, problem: SampledProblem, x0: Tensor, episodes: list[Episode]) -> Tensor:
+    """The lowest cost over the episode that anything reached: a method, box-DDP from where it went, and where
+    CasADi is installed IPOPT from the best of these: (B,)."""
+    search = BoxDDP(problem, steps=case.steps, iterations=100)
+    found = search.solve(x0)
+    best, control, state = found.cost, found.control, found.state
+    for episode in episodes:
+        fine = torch.isfinite(episode.cost) & (episode.cost < 1e3 * best)
+        if not bool(fine.any()):
+            continue
+        refined = search.solve(x0[fine], episode.control[fine])
+        lower = refined.cost < best[fine]
+        rows = fine.nonzero().squeeze(1)[lower]
+        best = best.index_copy(0, rows, refined.cost[lower])
+        control = control.index_copy(0, rows, refined.control[lower])
+        state = state.index_copy(0, rows, refined.state[lower])
+        best = torch.minimum(best, episode.cost)
+    if METHODS["IPOPT"].missing is None:
+        best = torch.minimum(best, _by_ipopt(case, problem, x0, control, state))
+    return best
+
+
+def _by_ipopt(case: Case, problem: SampledProblem, x0: Tensor, control: Tensor, state: Tensor) -> Tensor:
+    import casadi
+
+    solve = ipopt_program(casadi, case, problem, case.steps)
+    found = []
+    for row in range(len(x0)):
+        guess = np.concatenate([state[row].numpy().ravel(), control[row].numpy().ravel()])
+        solved = solve(x0=guess, p=x0[row].numpy())
+        found.append(float(solved["f"]) if solved["success"] else np.inf)
+    return torch.tensor(found, dtype=torch.float64)
+
+
+def _measured(episode: Episode, times: list[float], best: Tensor) -> dict[str, Any]:
+    up = episode.left <= _REGULATED * best
+    ratio = (episode.cost / best)[up]
+    return {
+        "ratio_median": float(ratio.median()) if len(ratio) else None,
+        "ratio_max": float(ratio.max()) if len(ratio) else None,
+        "regulated": float(up.double().mean()),
+        "violations": episode.outside,
+        "us_median": float(np.median(times)),
+        "us_p99": float(np.quantile(times, 0.99)),
+        "offline": episode.offline,
+    }
+
+
+def _key(method: str) -> str:
+    return method.lower().replace(" ", "_").replace("-", "_")

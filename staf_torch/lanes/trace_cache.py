@@ -1,0 +1,138 @@
+"""Traces in the user's cache: what another process wrote down of a step is not traced again."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import io
+import os
+import pickle
+import platform
+import tempfile
+import zlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from .build import _cache
+from .captured import Recipe
+from .captured import tensors as tensors_of
+from .emission import Text
+
+_PACKAGE = Path(__file__).parent.parent
+_DIGEST = 32
+_DAMAGED = (OSError, pickle.UnpicklingError, AttributeError, EOFError, ImportError, IndexError, ValueError)
+
+
+class Trace(NamedTuple):
+    """What is left of a step once it has been written down."""
+
+    text: Text
+    recipe: Recipe
+    real: torch.dtype
+    outputs: tuple[tuple[torch.Size, torch.dtype], ...]
+    structure: Any
+
+
+def place(*described: object) -> Path:
+    """Return the file of a trace.
+
+    Args:
+        described: all that it depends on beside this package, torch and Python: bytes, numbers, strings.
+    """
+    around = _package(), torch.__version__, platform.python_version(), str(torch.get_default_dtype())
+    digest = hashlib.sha256(repr((*around, *described)).encode()).hexdigest()
+    return _cache() / f"trace-{digest[:24]}"
+
+
+def load(path: Path, tensors: Sequence[Tensor]) -> Trace | None:
+    """Return a trace with the numbers that follow from other tensors; None where there is none.
+
+    Args:
+        path: of `place`.
+        tensors: what the step reads, in the order in which `save` was given them.
+    """
+    try:
+        content = path.read_bytes()
+        if content[-_DIGEST:] != hashlib.sha256(content[:-_DIGEST]).digest():
+            return None
+        found = Trace(*_Reader(io.BytesIO(zlib.decompress(content[:-_DIGEST])), tensors).load())
+    except _DAMAGED:
+        return None
+    numbers = found.recipe.again({id(tensor): tensor for tensor in tensors})
+    return None if numbers is None else found._replace(recipe=found.recipe._replace(values=numbers))
+
+
+def save(path: Path, trace: Trace, tensors: Sequence[Tensor]) -> None:
+    """Write a trace, unless its numbers follow from more than these tensors.
+
+    Args:
+        path: of `place`.
+        trace: of a step.
+        tensors: what the step reads.
+    """
+    places = {id(tensor): k for k, tensor in enumerate(tensors)}
+    if any(id(tensor) not in places for tensor in trace.recipe.found):
+        return
+    file = io.BytesIO()
+    try:
+        numberless = trace.recipe._replace(values=torch.empty(0))
+        _Writer(file, places, numberless).dump(tuple(trace._replace(recipe=numberless)))
+        content = zlib.compress(file.getvalue(), level=1)  # 100 kilobytes to 15
+        # Under a name of its own first: another process may be writing the same.
+        with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as scratch:
+            scratch.write(content + hashlib.sha256(content).digest())
+        os.replace(scratch.name, path)
+    except (OSError, pickle.PicklingError, TypeError, AttributeError):
+        return  # it is traced again another time
+
+
+@functools.cache
+def _package() -> str:
+    """A digest of the source of this package."""
+    digest = hashlib.sha256()
+    for path in sorted(_PACKAGE.rglob("*.py")):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+class _Writer(pickle.Pickler):
+    """Writes tensors of the step as their numbers, those that follow from them by the order they came in."""
+
+    def __init__(self, file: io.BytesIO, places: dict[int, int], recipe: Recipe) -> None:
+        super().__init__(file, protocol=5)
+        self._places = places
+        made = [tensor for operation in recipe.operations for tensor in tensors_of(operation[3])]
+        self._made = {id(tensor): k for k, tensor in enumerate(made)}
+
+    def persistent_id(self, value: Any) -> Any:
+        if isinstance(value, torch._ops.OpOverload):
+            return "operation", value._schema.name, value._overloadname
+        if not isinstance(value, Tensor):
+            return None
+        if id(value) in self._places:
+            return "given", self._places[id(value)]
+        if id(value) in self._made:
+            return "made", self._made[id(value)]
+        return "value", value.detach().numpy().copy()
+
+
+class _Reader(pickle.Unpickler):
+    def __init__(self, file: io.BytesIO, tensors: Sequence[Tensor]) -> None:
+        super().__init__(file)
+        self._given, self._made = tensors, dict[int, Tensor]()
+
+    def persistent_load(self, name: Any) -> Any:
+        kind, value = name[0], name[1]
+        if kind == "operation":
+            namespace, _, operation = value.partition("::")
+            packet = getattr(getattr(torch.ops, namespace), operation)
+            return getattr(packet, name[2] or "default")
+        if kind == "given":
+            return self._given[value]
+        if kind == "made":  # stands for what the operation will make: its identity alone matters
+            return self._made.setdefault(value, torch.empty(0))
+        return torch.from_numpy(value)

@@ -1,0 +1,141 @@
+// How the members of a bank are mixed and judged: what mixture_definition.py defines.
+
+#pragma once
+
+#include "_bank.hpp"
+
+#include <algorithm>
+
+static double square(double a) { return a * a; }
+
+// The group of a member: see bank_rules.py.
+constexpr int group_of(int i) {
+    return i < 18                     ? i % 6
+           : i < locals               ? 6
+           : i < locals + carried     ? 7
+           : i < members - 2          ? 9
+           : i == members - 2         ? 8
+                                      : -1;
+}
+
+// The mixture of what the members say of an output, its correction, and its variance; within low and high.
+static void mix(const Rules &r, Stream &s, int o, double low, double high) {
+    const double *means = s.means[o], *variances = s.variances[o];
+    double whole = 0, first = 0, second = 0, top = -infinity;
+    for (int c = 0; c < clocks; ++c) top = std::max(top, s.clock_weights[o][c]);
+    double doubts[members];
+    for (int i = 0; i < members; ++i)
+        doubts[i] = r.doubt * std::max(std::log(std::max(variances[i], least)) - s.usual[o][i], 0.);
+    double total[groups_of_members]{}, sum[groups_of_members]{}, highest[groups_of_members];
+    std::fill(highest, highest + groups_of_members, -infinity);
+    for (int i = 0; i < members - 1; ++i)
+        highest[group_of(i)] = std::max(highest[group_of(i)], s.weights[o][clocks - 1][i] - doubts[i]);
+    for (int c = 0; c < clocks; ++c) {
+        double all_of = 0, middle = 0, around = 0, most = -infinity, weights[members];
+        for (int i = 0; i < members; ++i) weights[i] = s.weights[o][c][i] - doubts[i], most = std::max(most, weights[i]);
+        for (int i = 0; i < members; ++i) {
+            weights[i] = std::exp(weights[i] - most);
+            if (weights[i] < r.drop) weights[i] = 0;
+            all_of += weights[i], middle += weights[i] * means[i];
+        }
+        middle /= all_of;
+        for (int i = 0; i < members; ++i)
+            around += weights[i] * (variances[i] * s.excess[o][i] + square(means[i] - middle));
+        s.mixed[o][c] = middle, s.mixed_variance[o][c] = around / all_of;
+        const double weight = std::exp(s.clock_weights[o][c] - top);
+        whole += weight, first += weight * middle;
+    }
+    first /= whole;
+    for (int c = 0; c < clocks; ++c)
+        second += std::exp(s.clock_weights[o][c] - top) / whole *
+                  (s.mixed_variance[o][c] + square(s.mixed[o][c] - first));
+    for (int i = 0; i < members - 1; ++i) {
+        const int g = group_of(i);
+        const double weight = std::exp(s.weights[o][clocks - 1][i] - doubts[i] - highest[g]);
+        total[g] += weight, sum[g] += weight * means[i];
+    }
+    const double unit = std::sqrt(std::max(s.pace[o], least)), most = r.correction_most;
+    double stacked = 0;
+    for (int g = 0; g < groups_of_members; ++g) {
+        s.away[o][g] = std::min(std::max((sum[g] / total[g] - first) / unit, -most), most);
+        stacked += s.correction[o][g] * s.away[o][g];
+    }
+    stacked = std::max(std::min(first + unit * stacked, high), low);
+    s.blend[o] = first, s.stacked[o] = stacked;
+    const double share = 1 / (1 + std::exp(s.corrected[o][0] - s.corrected[o][1]));
+    s.mean[o] = (1 - share) * first + share * stacked;
+    second += square(s.mean[o] - first);
+    s.variance[o] = std::max(second, r.floor * s.pace[o]) * s.calibration[o];
+}
+
+static double student(const Rules &r, double error, double variance) {
+    return -.5 * (r.heavy + 1) * std::log1p(error * error / (r.heavy * variance));
+}
+static double score(const Rules &r, double error, double variance, double common) {
+    variance = std::max(variance, least), common = std::max(common, least);
+    return r.likelihood * (student(r, error, variance) - .5 * std::log(variance)) +
+           (1 - r.likelihood) * student(r, error, common);
+}
+static void reweigh(double *logs, const double *scores, int count, double discount, double share) {
+    double top = -infinity, total = 0;
+    for (int i = 0; i < count; ++i) logs[i] = discount * logs[i] + scores[i], top = std::max(top, logs[i]);
+    for (int i = 0; i < count; ++i) total += std::exp(logs[i] - top);
+    for (int i = 0; i < count; ++i) logs[i] = std::log((1 - share) * std::exp(logs[i] - top) / total + share / count);
+}
+
+// Least squares of the mixture's error on the groups' distance from it, both in running errors.
+static void learn_correction(const Rules &r, Stream &s, int o, double blended) {
+    constexpr int G = groups_of_members;
+    auto &covariance = s.correction_covariance[o];
+    const double most = r.correction_most, *away = s.away[o];
+    double error = blended / std::sqrt(std::max(s.pace[o], least)), gain[G], total = r.correction_forgetting, widest = 0;
+    error = std::min(std::max(error, -most), most);
+    for (int g = 0; g < G; ++g) {
+        gain[g] = 0;
+        for (int h = 0; h < G; ++h) gain[g] += covariance[g][h] * away[h];
+        total += away[g] * gain[g], error -= s.correction[o][g] * away[g];
+    }
+    for (int g = 0; g < G; ++g) {
+        s.correction[o][g] += gain[g] * error / total;
+        for (int h = 0; h < G; ++h) covariance[g][h] -= gain[g] * gain[h] / total;
+        widest = std::max(widest, covariance[g][g]);
+    }
+    if (widest < r.correction_prior)
+        for (auto &row : covariance)
+            for (double &entry : row) entry /= r.correction_forgetting;
+}
+
+// The members and their mixtures are judged by their prediction of an output, in units.
+static void judge_members(const Rules &r, Stream &s, int o, double value) {
+    const double t = s.clock, error = value - s.mean[o], blended = value - s.blend[o];
+    learn_correction(r, s, o, blended);
+    const double z2 = error * error / std::max(s.variance[o] / s.calibration[o], 1e-300);
+    s.calibration[o] += std::max(r.error_rate, 1 / (t + 5)) * (std::min(z2, surprise * s.calibration[o]) - s.calibration[o]);
+    s.calibration[o] = std::min(std::max(s.calibration[o], 1e-6), 1e2);
+    auto follow = [&](double &running, double rate) {
+        running += std::max(rate, 1 / (t + 1)) * (std::min(blended * blended, surprise * running) - running);
+    };
+    follow(s.error[o], r.error_rate);
+    follow(s.pace[o], r.pace);
+    const double unit = std::max(s.pace[o], least);
+    const double both[2] = {student(r, blended, unit), student(r, value - s.stacked[o], unit)};
+    reweigh(s.corrected[o], both, 2, r.correction_discount, r.correction_share);
+    double scores[members], over[clocks];
+    for (int i = 0; i < members; ++i) {
+        const double e = value - s.means[o][i], v = s.variances[o][i], ratio = e * e / std::max(v, least);
+        double &excess = s.excess[o][i], &usual = s.usual[o][i];
+        usual += std::max(r.members_rate, 1 / (t + 1)) * (std::log(std::max(v, least)) - usual);
+        scores[i] = score(r, e, v * excess, s.error[o]);
+        excess += std::max(r.members_rate, 1 / (t + 3)) * (std::min(ratio, surprise * excess) - excess);
+        excess = std::min(std::max(excess, r.least), 1e8);
+        const int l = i - locals - carried;
+        if (l < 0 || l >= lanes) continue;
+        double &size = s.quadratic_error[o][l];
+        size = std::max(size * (1 + std::max(r.pace, 1 / (t + 2)) * (std::min(ratio, surprise) - 1)), 1e-26);
+    }
+    for (int c = 0; c < clocks; ++c) {
+        over[c] = score(r, value - s.mixed[o][c], s.mixed_variance[o][c], s.error[o]);
+        reweigh(s.weights[o][c], scores, members, r.discounts[c], r.share);
+    }
+    reweigh(s.clock_weights[o], over, clocks, r.discount, r.share);
+}

@@ -1,0 +1,129 @@
+"""How the members of a bank are mixed and judged, in plain torch: the definition."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from .bank_rules import GROUPS, MEMBERS, QUADRATIC, Rules, group
+from .kalman_filter import SURPRISE
+
+_LEAST = 1e-30  # of a variance
+_GROUP = torch.tensor([group(member) for member in range(MEMBERS)])
+
+
+def mix(r: Rules, s: dict[str, Tensor], low: Tensor, high: Tensor) -> None:
+    """The mixture of what the members say, its correction by groups of them, and its variance.
+
+    A member that is less certain than it usually is has less weight. Three mixtures by scores that fade at
+    three rates are mixed by their own scores. To that is added
+    sum_g beta_g (m_g - mixture), m_g the mean of a group by the scores that fade most slowly, beta by least
+    squares; with or without it, as either predicts.
+
+    Args:
+        r: the constants.
+        s: parts of a stream; ``means`` and ``variances`` are what the members say.
+        low: of the range in which a prediction must be, (K,).
+        high: (K,).
+    """
+    means = s["means"]
+    surplus = (s["variances"].clamp(min=_LEAST).log() - s["usual"]).clamp(min=0.0)
+    logs = s["weights"] - r.doubt * surplus[:, None]
+    weights = (logs - logs.amax(-1, keepdim=True)).exp()
+    weights = torch.where(weights < r.drop, 0.0, weights)
+    weights = weights / weights.sum(-1, keepdim=True)  # (K, clocks, members)
+    middle = (weights * means[:, None]).sum(-1)
+    own = (s["variances"] * s["excess"])[:, None] + (means[:, None] - middle[..., None]).square()
+    s["mixed"].copy_(middle)
+    s["mixed_variance"].copy_((weights * own).sum(-1))
+    clocks = s["clock_weights"].softmax(-1)
+    blend = (clocks * middle).sum(-1)
+    variance = (clocks * (s["mixed_variance"] + (middle - blend[:, None]).square())).sum(-1)
+    unit = s["pace"].clamp(min=_LEAST).sqrt()
+    for g in range(GROUPS):
+        inside = torch.eq(_GROUP, g)
+        share = logs[:, -1, inside].softmax(-1)
+        s["away"][:, g] = ((share * means[:, inside]).sum(-1) - blend) / unit
+    s["away"].clamp_(-r.correction_most, r.correction_most)
+    stacked = blend + unit * (s["correction"] * s["away"]).sum(-1)
+    s["blend"].copy_(blend)
+    s["stacked"].copy_(torch.maximum(torch.minimum(stacked, high), low))
+    s["mean"].copy_((s["corrected"].softmax(-1) * torch.stack((blend, s["stacked"]), -1)).sum(-1))
+    variance = variance + (s["mean"] - blend).square()
+    s["variance"].copy_(torch.maximum(variance, r.floor * s["pace"]) * s["calibration"])
+
+
+def judge(r: Rules, s: dict[str, Tensor], value: Tensor, told: Tensor, t: float) -> None:
+    """The members and their mixtures are judged by their prediction of value (K,), where it was told.
+
+    Args:
+        r: the constants.
+        s: parts of a stream.
+        value: (K,).
+        told: (K,) bool.
+        t: samples learned so far.
+    """
+    error, blended = value - s["mean"], value - s["blend"]
+    _learn_correction(r, s, blended, told)
+    z2 = error.square() / (s["variance"] / s["calibration"]).clamp(min=1e-300)
+    before, floor = s["calibration"].clone(), max(r.error_rate, 1 / (t + 5))
+    found = before + floor * (torch.minimum(z2, SURPRISE * before) - before)
+    s["calibration"].copy_(torch.where(told, found.clamp(1e-6, 1e2), before))
+    for name, rate in (("error", r.error_rate), ("pace", r.pace)):
+        old = s[name].clone()
+        change = max(rate, 1 / (t + 1)) * (torch.minimum(blended.square(), SURPRISE * old) - old)
+        s[name].copy_(torch.where(told, old + change, old))
+    pace = s["pace"].clamp(min=_LEAST)[:, None]
+    both = torch.stack((blended, value - s["stacked"]), -1)
+    corrected = r.correction_discount * s["corrected"] + _student(r, both, pace)
+    away, v = value[:, None] - s["means"], s["variances"]
+    score = _scores(r, away, v * s["excess"], s["error"][:, None])
+    over = _scores(r, value[:, None] - s["mixed"], s["mixed_variance"], s["error"][:, None])
+    usual, rate = s["excess"].clone(), max(r.members_rate, 1 / (t + 3))
+    ratio = away.square() / v.clamp(min=_LEAST)
+    excess = (usual + rate * (torch.minimum(ratio, SURPRISE * usual) - usual)).clamp(r.least, 1e8)
+    logs, before = v.clamp(min=_LEAST).log(), s["usual"].clone()
+    usual_log = before + max(r.members_rate, 1 / (t + 1)) * (logs - before)
+    size, of = s["quadratic_error"].clone(), slice(MEMBERS - 2 - QUADRATIC, MEMBERS - 2)
+    factor = 1 + max(r.pace, 1 / (t + 2)) * (ratio[:, of].clamp(max=SURPRISE) - 1)
+    discounts = torch.tensor(r.discounts, dtype=torch.float64)[:, None]
+    weights = _reweighed(r.share, discounts * s["weights"] + score[:, None])
+    clocks = _reweighed(r.share, r.discount * s["clock_weights"] + over)
+    mark = told[:, None]
+    s["quadratic_error"].copy_(torch.where(mark, (size * factor).clamp(min=1e-26), size))
+    s["usual"].copy_(torch.where(mark, usual_log, before))
+    s["excess"].copy_(torch.where(mark, excess, usual))
+    s["weights"].copy_(torch.where(mark[..., None], weights, s["weights"]))
+    s["clock_weights"].copy_(torch.where(mark, clocks, s["clock_weights"]))
+    s["corrected"].copy_(torch.where(mark, _reweighed(r.correction_share, corrected), s["corrected"]))
+
+
+def _learn_correction(r: Rules, s: dict[str, Tensor], blended: Tensor, told: Tensor) -> None:
+    """Least squares of the mixture's error on the groups' distance from it, both in running errors."""
+    most = r.correction_most
+    unit = s["pace"].clamp(min=_LEAST).sqrt()
+    for o in told.nonzero().flatten().tolist():
+        away, covariance = s["away"][o], s["correction_covariance"][o]
+        target = (blended[o] / unit[o]).clamp(-most, most)
+        gain = covariance @ away
+        total = r.correction_forgetting + away @ gain
+        s["correction"][o] += gain * ((target - s["correction"][o] @ away) / total)
+        covariance -= gain[:, None] * gain / total
+        if float(covariance.diagonal().max()) < r.correction_prior:
+            covariance /= r.correction_forgetting
+
+
+def _student(r: Rules, error: Tensor, variance: Tensor) -> Tensor:
+    return -0.5 * (r.heavy + 1) * (error.square() / (r.heavy * variance)).log1p()
+
+
+def _scores(r: Rules, error: Tensor, variance: Tensor, common: Tensor) -> Tensor:
+    """Part Student-t likelihood with a member's variance, part with the common squared error."""
+    variance, common = variance.clamp(min=_LEAST), common.clamp(min=_LEAST)
+    own = _student(r, error, variance) - 0.5 * variance.log()
+    return r.likelihood * own + (1 - r.likelihood) * _student(r, error, common)
+
+
+def _reweighed(share: float, logs: Tensor) -> Tensor:
+    """Logarithms of the normalised weights, a share of them equal."""
+    return ((1 - share) * logs.softmax(-1) + share / logs.shape[-1]).log()

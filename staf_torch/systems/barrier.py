@@ -1,0 +1,233 @@
+"""A plant in coordinates in which a box of states is the whole space."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from ..numerics.angles import wrap
+from ..numerics.checks import fail
+from .base import ControlAffineSystem, Linearisation
+
+Wall = float | Sequence[float | None] | Tensor | None
+_NAMED = 20  # rows that an error lists
+
+
+class Barrier(ControlAffineSystem):
+    """The same plant in s, with every bounded coordinate of the state measured by
+
+        s = ln( (x - low) (high - c) / ((high - x) (c - low)) ),  ds/dx = 1/(x - low) + 1/(high - x),
+
+    so that s runs from -inf to inf while x runs from one wall to the other, and s = 0 where the plant rests,
+    at x = c. A policy, cost or learner of s then knows no constraint. With one wall the other factor is left
+    out; a coordinate without walls is s = x - c.
+
+    Next to a wall x has few digits of its distance, s has all of them: `walls` and `margin` read them from s,
+    and a closed loop moves the distances, so that a step is as accurate there as anywhere and as little stiff
+    as the plant is. A held control that carries the plant through a wall makes s NaN: `adp.simulate` freezes
+    that row and counts it as diverged. No control keeps every state inside: whoever heads for a wall needs
+    room to brake.
+
+    A cost of x is one with an output: ``QuadraticCost(..., output=barrier.inverse)``.
+
+    Example:
+        >>> plant = systems.Barrier(systems.Pendulum(), low=[-1.0, None], high=[2.0, None])
+        >>> s = plant.transform(torch.tensor([2.0 - 1e-6, 3.0], dtype=torch.float64))
+        >>> s.round(decimals=4), plant.margin(s)
+        (tensor([15.6073,  3.0000], dtype=torch.float64), tensor(1.0000e-06, dtype=torch.float64))
+
+        Shown by `staf_torch/adp/README.md`.
+
+    Args:
+        plant: with `dim`, in continuous time and affine in the control.
+        low: of the states, one number or one a coordinate, in their units; None or -inf for no wall.
+        high: likewise; None or inf for none.
+
+    Raises:
+        ValueError: if the plant is of another kind, a wall has another length or is NaN, or the plant's
+            equilibrium is not strictly between the walls.
+
+    Source: Mahmud et al., Front. Robot. AI 8 (2021), eq. (2), around 0; here around the equilibrium.
+    """
+
+    def __init__(self, plant: ControlAffineSystem, low: Wall, high: Wall) -> None:
+        if not isinstance(plant, ControlAffineSystem) or plant.dim is None:
+            raise fail("Barrier", "plant", "must be a ControlAffineSystem with `dim`", plant)
+        super().__init__()
+        center = plant.equilibrium().double()
+        lows, highs = (
+            _walls("low", low, -math.inf, plant.dim),
+            _walls("high", high, math.inf, plant.dim),
+        )
+        for name, wall, wrong in (("low", lows, lows >= center), ("high", highs, highs <= center)):
+            if bool(wrong.any()):
+                side = "below" if name == "low" else "above"
+                rule = f"must be {side} the equilibrium {center.tolist()} in every coordinate"
+                raise fail("Barrier", name, rule, wall.tolist())
+        self.plant = plant
+        self.dim, self.inputs, self.bounds = plant.dim, plant.inputs, plant.bounds
+        free = (torch.isinf(lows) & torch.isinf(highs)).tolist()
+        self.periodic = tuple(k for k in plant.periodic if free[k % plant.dim])
+        self._turning = tuple(k for k in plant.periodic if not free[k % plant.dim])
+        below, above = 1 / (center - lows), 1 / (highs - center)  # 0 for a wall that is not there
+        unbounded = (below == 0) & (above == 0)
+        buffers = {
+            "low": lows,
+            "high": highs,
+            "center": center,
+            "below": torch.where(unbounded, 0.5, below),  # any number: what it makes is not used
+            "above": torch.where(unbounded, 0.5, above),
+            "free": unbounded,
+            "floor": torch.where(torch.isinf(lows), center - 1, lows),
+            "ceiling": torch.where(torch.isinf(highs), center + 1, highs),
+            "walled": torch.stack((torch.isfinite(lows), torch.isfinite(highs))),
+        }
+        for name, buffer in buffers.items():
+            self.register_buffer(name, buffer)
+        self.low: Tensor  # (n,)
+        self.high: Tensor
+        self.center: Tensor
+        self.below: Tensor  # 1/(c - low)
+        self.above: Tensor  # 1/(high - c)
+        self.free: Tensor  # (n,) bool: no wall at all
+        self.floor: Tensor  # low, or a number in its place
+        self.ceiling: Tensor
+        self.walled: Tensor  # (2, n) bool: has a low wall, a high wall
+
+    @property
+    def traceable(self) -> bool:
+        return self.plant.traceable
+
+    def resting_input(self) -> Tensor:
+        return self.plant.resting_input()
+
+    def transform(self, x: Tensor) -> Tensor:
+        """s from x: (..., n) -> (..., n).
+
+        Raises:
+            ValueError: if a state is not strictly inside the box; the message names its row.
+        """
+        low, high, center = self.low.to(x), self.high.to(x), self.center.to(x)
+        if self._turning:
+            x = center + wrap(x - center, self._turning)
+        outside = ~((x > low) & (x < high)).all(-1)
+        if bool(outside.any()):
+            rows = outside.flatten().nonzero().flatten().tolist()
+            named = ", ".join(map(str, rows[:_NAMED])) + (" and more" if len(rows) > _NAMED else "")
+            first = x.reshape(-1, x.shape[-1])[rows[0]].tolist()
+            raise ValueError(
+                f"`Barrier.transform(x=...)` must lie strictly between the walls {low.tolist()} and "
+                f"{high.tolist()}; not so row {named}, of which the first is {first}."
+            )
+        down = torch.where(self.walled[0], (x - self.floor.to(x)) * self.below.to(x), 1.0)
+        up = torch.where(self.walled[1], (self.ceiling.to(x) - x) * self.above.to(x), 1.0)
+        return self._coordinate(x - center, down, up)
+
+    def inverse(self, s: Tensor) -> Tensor:
+        """x from s: (..., n) -> (..., n), in the box up to rounding: 1e-17 beside a wall x is the wall."""
+        apart, down, up = self._shares(s)
+        # From the wall where that is near, from the middle where s is small: no digit is lost in either.
+        x = torch.where((up < 0.5) & self.walled[1], self._from_high(s, up), self.center.to(s) + apart)
+        return torch.where((down < 0.5) & self.walled[0], self._from_low(s, down), x)
+
+    def walls(self, s: Tensor) -> tuple[Tensor, Tensor]:
+        """x - low and high - x with all digits, inf where there is no wall: (..., n) -> two (..., n)."""
+        _, down, up = self._shares(s)
+        to_low, to_high = down * (self.center - self.floor).to(s), up * (self.ceiling - self.center).to(s)
+        return (
+            torch.where(self.walled[0], to_low, torch.inf),
+            torch.where(self.walled[1], to_high, torch.inf),
+        )
+
+    def margin(self, s: Tensor) -> Tensor:
+        """The distance to the nearest wall, in the units of its coordinate: (..., n) -> (...)."""
+        return torch.minimum(*self.walls(s)).amin(-1)
+
+    def stretch(self, s: Tensor) -> Tensor:
+        """ds/dx of every coordinate: (..., n) -> (..., n)."""
+        below, above = self.below.to(s), self.above.to(s)
+        left = s < 0
+        small = torch.where(left, s, -s).exp()
+        whole = torch.where(left, below + above * small, above + below * small)
+        return torch.where(self.free, 1.0, whole.square() / ((below + above) * small))
+
+    def drift(self, s: Tensor) -> Tensor:
+        return self.stretch(s) * self.plant.drift(self.inverse(s))
+
+    def smooth_drift(self, s: Tensor) -> Tensor:
+        return self.stretch(s) * self.plant.smooth_drift(self.inverse(s))
+
+    def effectiveness(self, s: Tensor) -> Tensor:
+        return self.stretch(s).unsqueeze(-1) * self.plant.effectiveness(self.inverse(s))
+
+    def velocity(self, s: Tensor, u: Tensor) -> Tensor:
+        """x' of the plant itself: (..., n), (..., m) -> (..., n)."""
+        return self.plant.motion(self.inverse(s), u)
+
+    def displaced(self, s: Tensor, step: Tensor) -> Tensor:
+        """s of the state whose x is ``step`` further on, NaN beyond a wall: (..., n) twice -> (..., n)."""
+        apart, down, up = self._shares(s)
+        down = torch.where(self.walled[0], down + step * self.below.to(s), 1.0)
+        up = torch.where(self.walled[1], up - step * self.above.to(s), 1.0)
+        return self._coordinate(apart + step, down, up)
+
+    def linearisation(self, x: Tensor | None = None, u: Tensor | None = None) -> Linearisation:
+        """D A D^-1 and D B with D = ds/dx, near a state of rest s and an input."""
+        s = self.equilibrium() if x is None else x
+        found = self.plant.linearisation(self.inverse(s), u)
+        scale = self.stretch(s).to(found.matrix)
+        return Linearisation(
+            scale.unsqueeze(-1) * found.matrix / scale, scale.unsqueeze(-1) * found.input_matrix
+        )
+
+    def extra_repr(self) -> str:
+        return f"low={self.low.tolist()}, high={self.high.tolist()}"
+
+    def _from_low(self, s: Tensor, down: Tensor) -> Tensor:
+        return self.floor.to(s) + down * (self.center - self.floor).to(s)
+
+    def _from_high(self, s: Tensor, up: Tensor) -> Tensor:
+        return self.ceiling.to(s) - up * (self.ceiling - self.center).to(s)
+
+    def _shares(self, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """x - c, (x - low)/(c - low) and (high - x)/(high - c), the last two 1 where there is no wall."""
+        below, above = self.below.to(s), self.above.to(s)
+        left = s < 0
+        small = torch.where(left, s, -s)  # -|s|, but with a slope at 0
+        share = small.exp()
+        whole = torch.where(left, below + above * share, above + below * share)
+        far = (below + above) / whole
+        near = far * share
+        apart = torch.where(left, small.expm1(), -small.expm1()) / whole
+        down, up = torch.where(left, near, far), torch.where(left, far, near)
+        return torch.where(self.free, s, apart), down, up
+
+    def _coordinate(self, apart: Tensor, down: Tensor, up: Tensor) -> Tensor:
+        """s by log1p of what the nearer wall's share is short of the other, which loses no digit."""
+        left = apart < 0
+        excess = (
+            torch.where(left, -apart, apart)
+            * (self.below + self.above).to(apart)
+            / torch.where(left, down, up)
+        )
+        s = excess.log1p()
+        s = torch.where(left, -s, s)
+        # The far wall has no part in s, but a step may lead through it.
+        return torch.where(self.free, apart, torch.where((down > 0) & (up > 0), s, torch.nan))
+
+
+def _walls(name: str, given: Wall, none: float, size: int) -> Tensor:
+    """One wall a coordinate, (n,) float64."""
+    numbers = given.tolist() if isinstance(given, Tensor) else given
+    listed = [numbers] * size if numbers is None or isinstance(numbers, int | float) else numbers
+    if isinstance(listed, str) or not isinstance(listed, Sequence) or len(listed) != size:
+        raise fail("Barrier", name, f"must be a number or one for each of the {size} states", given)
+    walls = [none if one is None else one for one in listed]
+    if not all(isinstance(one, int | float) and not isinstance(one, bool) for one in walls):
+        raise fail("Barrier", name, "must be numbers or None", given)
+    if any(math.isnan(one) or one == -none for one in walls):
+        raise fail("Barrier", name, f"must be finite or {none}", given)
+    return torch.tensor(walls, dtype=torch.float64)

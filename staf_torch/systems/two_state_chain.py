@@ -1,0 +1,57 @@
+"""The two-state example of the barrier transformation, with the four parameters of its drift."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from ..numerics.checks import vector
+from .base import ControlAffineSystem
+
+
+class TwoStateChain(ControlAffineSystem):
+    """x1' = a x2,  x2' = b x1 + c x2 + d x2 h^2 + h u,  with h = cos(2 x1) + 2 and theta = (a, b, c, d).
+
+    Example:
+        >>> plant = systems.TwoStateChain()
+        >>> plant.drift(torch.tensor([0.0, 1.0]).double())  # h = 3
+        tensor([1., 4.], dtype=torch.float64)
+
+        Shown by `staf system=two_state_chain`.
+
+    Args:
+        theta: the parameters (a, b, c, d), in 1/s.
+
+    Raises:
+        ValueError: if theta is not four finite numbers.
+
+    Source: Mahmud et al., Front. Robot. AI 8 (2021), first example.
+    """
+
+    dim = 2
+    inputs = 1
+
+    def __init__(self, theta: Sequence[float] = (1.0, -1.0, -0.5, 0.5)) -> None:
+        super().__init__()
+        given = theta.tolist() if isinstance(theta, Tensor) else list(theta)
+        numbers = vector("TwoStateChain", "theta", given, 4)
+        self.register_buffer("theta", torch.tensor(numbers, dtype=torch.float64))
+        self.theta: Tensor
+
+    def drift(self, x: Tensor) -> Tensor:
+        a, b, c, d = self.theta.to(x).unbind(-1)
+        x1, x2 = x.unbind(-1)
+        return torch.stack((a * x2, b * x1 + c * x2 + d * x2 * _gain(x1).square()), dim=-1)
+
+    def effectiveness(self, x: Tensor) -> Tensor:
+        gain = _gain(x[..., 0])
+        return torch.stack((torch.zeros_like(gain), gain), dim=-1).unsqueeze(-1)
+
+    def extra_repr(self) -> str:
+        return f"theta={self.theta.tolist()}"
+
+
+def _gain(x1: Tensor) -> Tensor:
+    return (2 * x1).cos() + 2

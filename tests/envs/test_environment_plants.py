@@ -1,0 +1,126 @@
+"""Gymnasium's environments as plants, and policies that drive environments through their observations."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from staf_torch import adp, systems
+
+gymnasium = pytest.importorskip("gymnasium", reason="needs the extra gym")
+
+from staf_torch import envs  # noqa: E402
+
+# (environment, initial states, an action of the environment from a control of the plant, tolerance)
+CASES = {
+    "Pendulum-v1": ([[3.0, 7.9], [0.1, -0.3]], lambda u: u, 1e-12),
+    "CartPole-v1": ([[0.1, -0.2, 0.05, 0.3], [0.0, 0.5, -0.02, -0.6]], lambda u: int(u[0] > 0), 1e-12),
+    "Acrobot-v1": ([[0.4, -0.7, 3.0, -2.0], [3.0, 0.2, 12.5, 28.0]], lambda u: int(u[0]) + 1, 1e-10),
+    # Its state is kept in float32.
+    "MountainCarContinuous-v0": ([[-1.19, -0.05], [0.3, 0.02]], lambda u: u, 1e-6),
+}
+
+
+@pytest.mark.parametrize("name", list(CASES))
+def test_classic_control_in_torch_follows_the_real_environment(name: str) -> None:
+    starts, act, tolerance = CASES[name]
+    plant, env = envs.classic_control(name), gymnasium.make(name).unwrapped
+    levels = [plant.bounds.low, plant.bounds.high]
+    for start in starts:
+        env.reset(seed=0)
+        env.state = np.array(start)
+        x = torch.tensor([start], dtype=torch.float64)
+        for k in range(8):
+            u = levels[(k // 3) % 2]
+            env.step(act(u.numpy()))
+            x = plant.step(x, u.unsqueeze(0))
+            apart = plant.difference(x[0], torch.from_numpy(np.array(env.state, dtype=np.float64)))
+            assert float(apart.abs().max()) < tolerance
+
+
+def test_every_classic_plant_has_a_regulator() -> None:
+    for name in CASES:
+        plant = envs.classic_control(name)
+        lqr = adp.LQR(plant, adp.QuadraticCost(1.0, 1.0, dim=plant.dim, inputs=1))
+        assert adp.held_stability(lqr, plant, plant.period, at=plant.equilibrium()).spectral_radius < 1
+
+
+def test_environment_that_can_be_set_to_a_state_is_the_same_plant_as_its_port() -> None:
+    cost = adp.QuadraticCost(1.0, 0.1, dim=2, inputs=1)
+    ported, real = envs.classic_control("Pendulum-v1"), envs.EnvironmentPlant("Pendulum-v1", periodic=[0])
+    assert (real.period, real.periodic, real.traceable) == (0.05, (0,), False)
+    torch.testing.assert_close(adp.LQR(real, cost).k, adp.LQR(ported, cost).k, rtol=1e-6, atol=0)
+    x0 = torch.tensor([[0.2, 0.1], [-0.3, 0.0]], dtype=torch.float64)
+    runs = [
+        adp.simulate(adp.Feedback(adp.LQR(ported, cost)), plant, cost, x0, steps=20, compile=False)
+        for plant in (ported, real)
+    ]
+    torch.testing.assert_close(runs[0].cost, runs[1].cost, rtol=1e-12, atol=0)
+
+
+def test_policy_swings_through_observations_and_actions_of_another_kind() -> None:
+    plant = envs.classic_control("CartPole-v1")
+    lqr = adp.LQR(plant, adp.QuadraticCost(1.0, 0.01, dim=4, inputs=1))
+    agent = envs.Agent(lqr, dt=0.02, action=lambda u: int(u[0] > 0))
+    env = gymnasium.make("CartPole-v1")
+    seen, _ = env.reset(seed=0)
+    total, over = 0.0, False
+    while not over:
+        seen, reward, terminated, truncated, _ = env.step(agent(seen))
+        total, over = total + reward, terminated or truncated
+    assert total == 500
+
+    turning = envs.classic_control("Pendulum-v1")
+    held = adp.LQR(turning, adp.QuadraticCost(1.0, 0.01, dim=2, inputs=1))
+    agent = envs.Agent(
+        held, state=lambda seen: np.stack((np.arctan2(seen[..., 1], seen[..., 0]), seen[..., 2]), axis=-1)
+    )
+    angle = np.array([[0.1, 0.2], [-0.1, 0.0]])
+    shown = np.stack((np.cos(angle[:, 0]), np.sin(angle[:, 0]), angle[:, 1]), axis=-1)
+    np.testing.assert_allclose(agent(shown), held(torch.from_numpy(angle)).numpy(), rtol=1e-12)
+
+
+class Falling(gymnasium.Env):
+    """An environment that hides its state in an attribute of its own."""
+
+    action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float64)
+    observation_space = gymnasium.spaces.Box(-9.0, 9.0, (1,), np.float64)
+    height = 0.0
+
+    def reset(self, *, seed=None, options=None):  # type: ignore[no-untyped-def]
+        return np.zeros(1), {}
+
+    def step(self, action):  # type: ignore[no-untyped-def]
+        self.height = 1.1 * self.height + 0.1 * float(action[0])
+        return np.array([self.height]), 0.0, False, False, {}
+
+
+def test_environment_of_your_own_says_how_its_state_is_read_and_written() -> None:
+    plant = envs.EnvironmentPlant(
+        Falling(),
+        read=lambda env: np.array([env.height]),
+        write=lambda env, x: setattr(env, "height", float(x[0])),
+        dt=0.1,
+    )
+    assert plant.linearisation().matrix.item() == pytest.approx(1.1)
+    assert isinstance(plant.bounds, systems.Bounds)
+    with pytest.raises(ValueError, match=r"`EnvironmentPlant\(read=...\)` and write must be given"):
+        envs.EnvironmentPlant(Falling(), dt=0.1)
+    with pytest.raises(ValueError, match=r"`EnvironmentPlant\(dt=...\)` must be given"):
+        envs.EnvironmentPlant("MountainCarContinuous-v0")
+    with pytest.raises(ValueError, match=r"must have actions that are a vector of numbers.*Discrete"):
+        envs.EnvironmentPlant("CartPole-v1")
+    with pytest.raises(ValueError, match=r"`classic_control\(name=...\)` must be one of"):
+        envs.classic_control("Ant-v5")
+
+
+def test_angle_of_the_pendulum_is_the_same_a_turn_further_on() -> None:
+    plant = envs.classic_control("Pendulum-v1")
+    x = torch.tensor([[0.3, 0.1]], dtype=torch.float64)
+    turned = x + torch.tensor([2 * math.pi, 0.0], dtype=torch.float64)
+    u = torch.tensor([[0.5]], dtype=torch.float64)
+    apart = plant.difference(plant.step(turned, u), plant.step(x, u))
+    torch.testing.assert_close(apart, torch.zeros_like(x), rtol=0, atol=1e-12)

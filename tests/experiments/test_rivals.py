@@ -1,0 +1,84 @@
+"""Methods beside those of others: the table is what the numbers say."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from torch import Tensor
+
+from staf_torch.cli.staf import config_directory
+from staf_torch.experiments import rivals
+from staf_torch.experiments.rival_methods import METHODS, Method, ipopt_program
+from staf_torch.experiments.rival_plants import CASES
+
+SHORT = dataclasses.replace(CASES["double_integrator"], steps=60, horizon=20)
+
+
+def idle(case):  # type: ignore[no-untyped-def]
+    """No control at all."""
+    return lambda x0: lambda x: torch.zeros(len(x), case.inputs, dtype=x.dtype)
+
+
+def shouting(case):  # type: ignore[no-untyped-def]
+    """More than the bounds allow."""
+    return lambda x0: lambda x: torch.full((len(x), case.inputs), 3.0, dtype=x.dtype)
+
+
+def test_rows_say_what_was_lost_violated_and_not_tried() -> None:
+    methods = [
+        METHODS["discrete LQR"],
+        METHODS["GlobalValue"],
+        Method("idle", idle),
+        Method("shouting", shouting),
+        Method("absent", idle, ("no-such-package",)),
+    ]
+    x0 = torch.tensor([[0.5, 0.0], [4.0, 1.0]], dtype=torch.float64)
+    best, unsuited, lost, loud, absent = rivals.compare(SHORT, methods, x0, calls=3)
+    assert (best["regulated"], best["violations"]) == (1, 0)
+    assert 1 - 1e-9 <= best["ratio_median"] <= best["ratio_max"] < 1.1
+    assert (unsuited["ratio_median"], unsuited["note"]) == (None, "the LQR reaches the goal")
+    assert (lost["regulated"], lost["ratio_median"]) == (0, None)
+    assert loud["violations"] == pytest.approx(1)
+    assert absent["note"] == "no-such-package is not installed"
+    assert (absent["regulated"], absent["megabytes"]) == (None, None)
+    assert (lost["lines"], best["us_median"] > 0) == (2, True)
+
+
+@pytest.mark.parametrize("name", list(CASES))
+def test_every_plant_rests_at_its_goal_and_begins_in_its_box(name: str) -> None:
+    case = CASES[name]
+    plant, x = case.plant(), case.states(20, seed=1)
+    rest = plant.motion(case.goal().unsqueeze(0), torch.zeros(1, case.inputs, dtype=torch.float64))
+    torch.testing.assert_close(rest, torch.zeros_like(rest), rtol=0, atol=1e-12)
+    assert ((x - case.goal()).abs() <= torch.tensor(case.box, dtype=torch.float64)).all()
+
+
+@pytest.mark.parametrize("name", ["cart_pole_to_1m", "pendulum"])
+def test_equations_mean_the_same_to_casadi(name: str) -> None:
+    casadi = pytest.importorskip("casadi", reason="needs the extra rivals")
+    case = dataclasses.replace(CASES[name], steps=3)
+    problem, x0 = case.problem(), CASES[name].states(1, seed=0)
+    solved = ipopt_program(casadi, case, problem, 3)(
+        x0=np.zeros(case.dim * 4 + case.inputs * 3), p=x0[0].numpy()
+    )
+    assert solved["success"]
+    plan = torch.from_numpy(np.array(solved["x"]).ravel())
+    states, control = plan[: case.dim * 4].reshape(4, -1), plan[case.dim * 4 :].reshape(3, 1, -1)
+    x, spent = x0, torch.zeros(1, dtype=torch.float64)
+    for u, after in zip(control, states[1:], strict=True):
+        x, paid = problem.advance(x, u)
+        spent = spent + paid
+        torch.testing.assert_close(x[0], after, rtol=0, atol=1e-6)
+    cost: Tensor = spent + problem.terminal(x)
+    assert float(cost) == pytest.approx(float(solved["f"]), rel=1e-6)
+
+
+def test_unknown_plants_and_methods_are_refused_by_name(tmp_path) -> None:  # type: ignore[no-untyped-def]
+    with initialize_config_dir(config_directory(), version_base="1.3"):
+        cfg = compose("config", ["experiment=rivals", "rivals.plants=[rocket]"])
+    with pytest.raises(ValueError, match=r"`rivals\(plants=...\)` must be one of .*; got 'rocket'"):
+        rivals.run(cfg, tmp_path)

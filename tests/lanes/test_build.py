@@ -1,0 +1,35 @@
+"""C++ files of the package in the user's cache."""
+
+from __future__ import annotations
+
+import ctypes
+from pathlib import Path
+
+import pytest
+
+from staf_torch.lanes import build
+
+needs_compiler = pytest.mark.skipif(not build.compiler(), reason="needs a C++ compiler")
+
+
+@needs_compiler
+@pytest.mark.parametrize("damage", ["half", "nothing left", "a byte changed", "no digest"])
+def test_damaged_library_in_the_cache_is_built_anew(
+    damage: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    source = tmp_path / "_seven.cpp"
+    source.write_text('extern "C" int staf_seven() { return 7; }\n', encoding="utf-8")
+    path = build._library(source, ())
+    content = path.read_bytes()
+    other = bytes([content[100] ^ 1])
+    damaged = {
+        "half": content[: len(content) // 2],
+        "nothing left": b"",
+        "a byte changed": content[:100] + other + content[101:],
+        "no digest": content[:-32],
+    }[damage]
+    path.write_bytes(damaged)
+    assert build._library(source, ()) == path
+    assert path.read_bytes() == content
+    assert ctypes.CDLL(str(path)).staf_seven() == 7

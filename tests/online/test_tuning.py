@@ -1,0 +1,82 @@
+"""Hyperparameters from a stretch, against those that it was drawn with."""
+
+from __future__ import annotations
+
+import pickle
+
+import pytest
+import torch
+from torch import Tensor
+
+import staf_torch as st
+
+
+def drawn(width: Tensor, noise: float, steps: int = 220, seed: int = 0) -> tuple[Tensor, Tensor]:
+    """A path (T, 2) and a sample (T,) of the Gaussian process with these widths along it, with noise."""
+    draw = torch.Generator().manual_seed(seed)
+    time = 0.12 * torch.arange(steps, dtype=torch.float64)
+    x = torch.stack((time.sin() + 0.4 * (2.3 * time).cos(), (1.37 * time).cos()), -1)
+    apart = ((x[:, None] - x[None]) / width).square().sum(-1)
+    gram = (-0.5 * apart).exp() + 1e-9 * torch.eye(steps, dtype=torch.float64)
+    clean = torch.linalg.cholesky(gram) @ torch.randn(steps, generator=draw, dtype=torch.float64)
+    return x, clean + noise * torch.randn(steps, generator=draw, dtype=torch.float64)
+
+
+def errors(model: st.StaFRegressor, x: Tensor, y: Tensor) -> float:
+    found = []
+    for k in range(len(x)):
+        if k > 20:
+            found.append(model.predict(x[k]) - y[k])
+        model.partial_fit(x[k], y[k])
+    return float(torch.stack(found).square().mean().sqrt())
+
+
+def test_tuned_regressor_predicts_as_one_that_knows_what_the_stream_was_drawn_with() -> None:
+    """The width itself need not be found: on a slow path many predict alike."""
+    x, y = drawn(torch.tensor([0.7, 0.7]).double(), 0.1, steps=300)
+    tuned = st.StaFRegressor().tune(x[:150], y[:150])
+    knowing = st.StaFRegressor(st.GaussianKernel(0.7), 0.35, noise=0.1, forgetting=1.0)
+    wrong = st.StaFRegressor(st.GaussianKernel(0.1), 0.05, noise=0.1, forgetting=1.0)
+    found = [errors(model, x[150:], y[150:]) for model in (tuned, knowing, wrong)]
+    assert found[0] < 1.07 * found[1]
+    assert found[0] < 0.8 * found[2]
+
+
+def test_each_coordinate_and_each_stream_has_its_own_width() -> None:
+    along = [drawn(torch.tensor(w).double(), 0.05) for w in ([0.5, 50.0], [50.0, 0.5])]
+    x, y = (torch.stack([pair[k] for pair in along], 1) for k in range(2))
+    found = st.StaFRegressor().tune(x, y)._tuning
+    assert found is not None
+    assert float(found.spread[0, 1]) > 1.5 * float(found.spread[0, 0])
+    assert float(found.spread[1, 0]) > 1.5 * float(found.spread[1, 1])
+
+
+def test_streams_that_drift_forget_and_others_do_not() -> None:
+    x, y = drawn(torch.tensor([0.7, 0.7]).double(), 0.05)
+    drift = y + (0.15 * torch.arange(len(y), dtype=torch.float64)).sin() * x[:, 0]
+    found = st.StaFRegressor().tune(x[:, None].expand(-1, 2, -1), torch.stack((y, drift), 1))._tuning
+    assert found is not None
+    assert float(found.forgetting[0]) > float(found.forgetting[1])
+
+
+def test_tuning_knows_no_units_and_is_saved_with_what_was_learned() -> None:
+    plain, told = drawn(torch.tensor([0.4, 0.4]).double(), 0.05, steps=120)
+    x, y = 300 * plain + 1e4, 1e-3 * told - 5
+    tuned = st.StaFRegressor().tune(x[:80], y[:80])
+    standard = st.StaFRegressor().tune(plain[:80], told[:80])
+    found, expected = errors(tuned, x[80:], y[80:]), 1e-3 * errors(standard, plain[80:], told[80:])
+    assert abs(found / expected - 1) < 1e-6
+    point = x[7] + 1
+    again = pickle.loads(pickle.dumps(tuned))
+    assert torch.equal(again.predict(point), tuned.predict(point))
+    other = st.StaFRegressor().load_state_dict(tuned.state_dict())
+    assert torch.equal(
+        other.partial_fit(x[3], y[3]).predict(point), tuned.partial_fit(x[3], y[3]).predict(point)
+    )
+
+
+def test_there_is_nothing_to_tune_in_the_accurate_mode() -> None:
+    x, y = drawn(torch.tensor([0.7, 0.7]).double(), 0.1, steps=30)
+    assert st.StaFRegressor(memory=128).tune(x, y)._tuning is None
+    with pytest.raises(ValueError, match=r"tune.*must have the shape"):
+        st.StaFRegressor().tune(x[:, 0], y)

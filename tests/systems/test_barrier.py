@@ -1,0 +1,267 @@
+"""A box of states as the whole space: digits beside the wall, the wrapped plant, the published cases."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import pytest
+import torch
+from torch import Tensor
+
+from staf_torch import adp, systems
+
+LOW, HIGH = [-7.0, -5.0], [5.0, 7.0]
+
+
+def drawn(*shape: int, seed: int = 0) -> Tensor:
+    return torch.rand(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+
+
+def numbers(values: object) -> Tensor:
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def chain() -> systems.Barrier:
+    return systems.Barrier(systems.TwoStateChain(), LOW, HIGH)
+
+
+class Offset(systems.ControlAffineSystem):
+    """Two coordinates that rest at (1, -2) under the input 3; the first is an angle."""
+
+    dim, inputs, periodic = 2, 1, (0,)
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.bounds = systems.Bounds(-9.0, 9.0, 1)
+
+    def equilibrium(self) -> Tensor:
+        return numbers([1.0, -2.0])
+
+    def resting_input(self) -> Tensor:
+        return numbers([3.0])
+
+    def drift(self, x: Tensor) -> Tensor:
+        return torch.stack((x[..., 1] + 2, (x[..., 0] - 1).sin() - 3 * (1 + (x[..., 1] + 2) / 2)), dim=-1)
+
+    def effectiveness(self, x: Tensor) -> Tensor:
+        return torch.stack((0 * x[..., 0], 1 + (x[..., 1] + 2) / 2), dim=-1).unsqueeze(-1)
+
+
+def exact(x: float, low: float, high: float, center: float) -> float:
+    """The published formula in rational numbers and one logarithm of many digits."""
+    from decimal import Decimal, localcontext
+
+    with localcontext() as context:
+        context.prec = 60
+        a, b, c, y = (Decimal(v) for v in (low, high, center, x))
+        return float(((y - a) * (b - c) / ((b - y) * (c - a))).ln())
+
+
+@pytest.mark.parametrize("gap", [1.0, 1e-3, 1e-6, 1e-12])
+def test_s_has_all_digits_next_to_a_wall_and_next_to_the_middle(gap: float) -> None:
+    plant = chain()
+    for x in ([-7 + gap, 7 - gap], [5 - gap, -5 + gap], [gap, -gap]):
+        s = plant.transform(numbers(x))
+        for k in range(2):
+            assert float(s[k]) == pytest.approx(exact(x[k], LOW[k], HIGH[k], 0.0), rel=4e-16 * 4)
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_there_and_back_in_random_boxes(dtype: torch.dtype) -> None:
+    eps = torch.finfo(dtype).eps
+    for seed in range(20):
+        walls = 10 ** (3 * drawn(2, 3, seed=seed) - 1)
+        plant = systems.Barrier(systems.Linear(-torch.eye(3), torch.eye(3)), -walls[0], walls[1])
+        share = torch.cat((drawn(200, 3, seed=seed), 10 ** (-5 * drawn(200, 3, seed=seed + 50))))
+        x = (plant.low + (plant.high - plant.low) * share).to(dtype)
+        x = x[((x > plant.low.to(dtype)) & (x < plant.high.to(dtype))).all(-1)]
+        s = plant.transform(x)
+        assert s.dtype == dtype
+        assert (plant.inverse(s) - x).abs().max() <= 20 * eps * walls.max()
+        far = 60 * (2 * drawn(400, 3, seed=seed) - 1).to(dtype) / (1 if dtype == torch.float64 else 2)
+        low, high = plant.walls(far)
+        assert bool((low > 0).all() and (high > 0).all())
+        again = plant.displaced(far, torch.zeros_like(far))
+        assert ((again - far).abs() / (1 + far.abs())).max() <= 8 * eps
+
+
+def test_one_wall_and_none_are_limits_of_two() -> None:
+    linear = systems.Linear(-torch.eye(3), torch.eye(3))
+    open_ended = systems.Barrier(linear, [-2.0, None, None], [None, 3.0, None])
+    walled = systems.Barrier(linear, [-2.0, -1e12, -1e12], [1e12, 3.0, 1e12])
+    x = numbers([[-1.9, 2.9, 40.0], [50.0, -60.0, -0.1], [0.0, 0.0, 0.0]])
+    s = open_ended.transform(x)
+    torch.testing.assert_close(s[:, :2], walled.transform(x)[:, :2], rtol=1e-9, atol=1e-9)
+    assert torch.equal(s[:, 2], x[:, 2])
+    torch.testing.assert_close(open_ended.inverse(s), x, rtol=1e-14, atol=1e-14)
+    low, high = open_ended.walls(s)
+    assert bool(torch.isinf(low[:, 1:]).all() and torch.isinf(high[:, [0, 2]]).all())
+    torch.testing.assert_close(open_ended.margin(s), numbers([0.1, 52.0, 2.0]))
+
+
+def test_the_wrapped_plant_moves_as_the_plant_does() -> None:
+    plant = chain()
+    x = plant.low + (plant.high - plant.low) * (0.05 + 0.9 * drawn(50, 2))
+    u, s = drawn(50, 1, seed=1), plant.transform(x)
+    stretch = torch.func.grad(lambda y: plant.inverse(y).sum())(s)  # dx/ds
+    torch.testing.assert_close(plant.stretch(s), 1 / stretch, rtol=1e-12, atol=0)
+    inner = plant.plant.rate(x, u)
+    torch.testing.assert_close(plant.rate(s, u), inner / stretch, rtol=1e-11, atol=1e-11)
+    torch.testing.assert_close(plant.velocity(s, u), inner, rtol=1e-12, atol=1e-12)
+
+
+def test_what_a_plant_declares_is_carried_through() -> None:
+    plant = systems.Barrier(Offset(), [0.0, None], [2.5, None])
+    assert (plant.dim, plant.inputs) == (2, 1)
+    assert plant.bounds is not None
+    assert plant.periodic == ()  # the angle has walls: s of it does not repeat
+    assert systems.Barrier(Offset(), [None, -3.0], [None, -1.0]).periodic == (0,)
+    assert torch.equal(plant.transform(numbers([1.0, -2.0])), torch.zeros(2).double())
+    around = plant.transform(numbers([0.5 + 2 * math.pi, -2.0]))
+    torch.testing.assert_close(around, plant.transform(numbers([0.5, -2.0])), rtol=1e-14, atol=0)
+    found = plant.linearisation()
+    by_hand = torch.func.jacrev(lambda s: plant.rate(s, plant.resting_input()))(plant.equilibrium())
+    torch.testing.assert_close(found.matrix, by_hand, rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(found.input_matrix, plant.effectiveness(plant.equilibrium()))
+
+
+def test_a_cost_of_x_is_a_cost_with_an_output() -> None:
+    plant = chain()
+    of_x = adp.QuadraticCost(2.0, 1.0, dim=2, inputs=1, output=plant.inverse)
+    s = plant.transform(numbers([[-6.0, 6.0]]))
+    assert float(of_x.state_rate(s)) == pytest.approx(2 * 72.0, rel=1e-12)
+    k = adp.LQR(plant, of_x).k
+    inner = adp.LQR(plant.plant, adp.QuadraticCost(2.0, 1.0, dim=2, inputs=1)).k
+    torch.testing.assert_close(k * plant.stretch(plant.equilibrium()), inner, rtol=1e-9, atol=1e-9)
+
+
+def followed(
+    plant: systems.Barrier, cost: adp.Cost, s0: Tensor, dt: float, steps: int
+) -> tuple[Tensor, float]:
+    """The end and the cost under the LQR in s, its control following s: Runge-Kutta in s, as published."""
+    lqr = adp.LQR(plant, cost)
+
+    def field(z: Tensor) -> Tensor:
+        s = z[:-1]
+        u = lqr(s)
+        return torch.cat((plant.rate(s, u), cost.rate(s, u)[None]))
+
+    z = torch.cat((s0, s0.new_zeros(1)))
+    for _ in range(steps):
+        z = systems.runge_kutta_step(field, z, dt)
+    return z[:-1], float(z[-1])
+
+
+def test_published_two_states_under_the_lqr_in_s() -> None:
+    plant, cost = chain(), adp.QuadraticCost(10.0, 0.1, dim=2, inputs=1)
+    s0 = plant.transform(numbers([-6.5, 6.5]))
+    assert s0.tolist() == pytest.approx([-3.472, 3.472], abs=5e-4)
+    assert float(adp.LQR(plant, cost)(s0)) == pytest.approx(-22.0, abs=1e-3)  # the largest on the way
+    first, paid = followed(plant, cost, s0, 0.004, 50)
+    assert paid + followed(plant, cost, first, 0.025, 260)[1] == pytest.approx(70.782, abs=1e-3)
+
+
+def robot_rate(x: Sequence[float], u: Sequence[float]) -> list[float]:
+    """x' of the robot by scalars."""
+    p1, p2, p3 = 3.473, 0.196, 0.242
+    _, q2, w1, w2 = x
+    c, s = math.cos(q2), math.sin(q2)
+    left = [
+        u[0] + p3 * s * w2 * w1 + p3 * s * (w1 + w2) * w2 - 5.3 * w1 - 8.45 * math.tanh(w1),
+        u[1] - p3 * s * w1 * w1 - 1.1 * w2 - 2.35 * math.tanh(w2),
+    ]
+    one, cross = p1 + 2 * p3 * c, p2 + p3 * c
+    det = one * p2 - cross * cross
+    return [w1, w2, (p2 * left[0] - cross * left[1]) / det, (one * left[1] - cross * left[0]) / det]
+
+
+def test_published_robot_under_the_lqr_in_s() -> None:
+    """K is the library's; the loop is in x, by scalars."""
+    low, high = [-7.0, -7.0, -5.0, -5.0], [5.0, 5.0, 7.0, 7.0]
+    plant = systems.Barrier(systems.TwoLinkRobot(), low, high)
+    gains = adp.LQR(plant, adp.QuadraticCost(1.0, 1.0, dim=4, inputs=2)).k.tolist()
+
+    def field(z: list[float]) -> list[float]:
+        x = z[:4]
+        s = [math.log(b * (a - y) / (a * (b - y))) for y, a, b in zip(x, low, high, strict=True)]
+        u = [-math.fsum(k * e for k, e in zip(row, s, strict=True)) for row in gains]
+        return [*robot_rate(x, u), math.fsum(e * e for e in (*s, *u))]
+
+    z, h = [-5.0, -5.0, 5.0, 5.0, 0.0], 0.01
+    for _ in range(6000):
+        k1 = field(z)
+        k2 = field([y + 0.5 * h * k for y, k in zip(z, k1, strict=True)])
+        k3 = field([y + 0.5 * h * k for y, k in zip(z, k2, strict=True)])
+        k4 = field([y + h * k for y, k in zip(z, k3, strict=True)])
+        z = [y + h / 6 * (a + 2 * b + 2 * c + d) for y, a, b, c, d in zip(z, k1, k2, k3, k4, strict=True)]
+    assert z[4] == pytest.approx(63.12, abs=0.005)
+    assert float(plant.transform(numbers(z[:4]))[0]) == pytest.approx(-0.215, abs=5e-4)
+
+
+def test_a_held_control_moves_s_as_runge_kutta_in_s_does() -> None:
+    plant, cost = chain(), adp.QuadraticCost(10.0, 0.1, dim=2, inputs=1)
+    s0 = plant.transform(numbers([[-6.5, 6.5], [1.0, 2.0]]))
+    lqr = adp.LQR(plant, cost)
+    run = adp.simulate(adp.Feedback(lqr), plant, cost, s0, dt=2e-4, steps=1)
+    torch.testing.assert_close(
+        run.state[:, 1],
+        systems.runge_kutta_step(lambda s: plant.rate(s, lqr(s0)), s0, 2e-4),
+        rtol=1e-10,
+        atol=0,
+    )
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_a_millionth_from_the_wall_nobody_who_can_brake_leaves(dtype: torch.dtype) -> None:
+    """Speed has a wall of its own; where x1 is, there is room to brake or it moves inward."""
+    plant, cost = chain(), adp.QuadraticCost(10.0, 0.1, dim=2, inputs=1)
+    x = torch.stack((-6.0 + 9.0 * drawn(300), numbers([7 - 1e-6, -5 + 1e-6] * 150)), dim=-1)
+    inward = numbers([[5 - 1e-6, -3.0], [-7 + 1e-6, 5.0], [5 - 1e-6, -1e-3]])
+    s0 = plant.transform(torch.cat((x, inward))).to(dtype)
+    assert float(plant.margin(s0).max()) == pytest.approx(1e-6, rel=1e-5)
+    run = adp.simulate(adp.Feedback(adp.LQR(plant, cost)), plant, cost, s0, dt=1e-3, steps=80, every=10)
+    assert not bool(run.diverged.any())
+    assert float(plant.margin(run.state).min()) > 0.99e-6
+
+
+def test_who_cannot_brake_is_counted_and_stays_inside_until_then() -> None:
+    plant, cost = chain(), adp.QuadraticCost(10.0, 0.1, dim=2, inputs=1)
+    s0 = plant.transform(numbers([[5 - 1e-6, 5.0], [0.0, 0.0]]))
+    run = adp.simulate(adp.Feedback(adp.LQR(plant, cost)), plant, cost, s0, dt=1e-3, steps=20)
+    assert run.diverged.tolist() == [True, False]
+    assert bool((plant.margin(run.state) > 0).all())
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "message"),
+    [
+        ([0.0, -5.0], 5.0, r"`Barrier\(low=...\)` must be below the equilibrium \[0.0, 0.0\]"),
+        (-5.0, [5.0, -1.0], r"`Barrier\(high=...\)` must be above the equilibrium"),
+        ([-5.0], 5.0, r"one for each of the 2 states; got \[-5.0\]"),
+        (-5.0, math.nan, "must be finite or inf; got nan"),
+        (["a", 0], 5.0, "must be numbers or None"),
+    ],
+)
+def test_boxes_that_do_not_contain_the_equilibrium_are_refused(
+    low: object, high: object, message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        systems.Barrier(systems.TwoStateChain(), low, high)  # type: ignore[arg-type]
+
+
+def test_starts_outside_are_refused_by_their_row() -> None:
+    x = torch.zeros(4, 2, dtype=torch.float64)
+    x[2, 1], x[3, 0] = 7.0, torch.nan
+    with pytest.raises(ValueError, match=r"not so row 2, 3, of which the first is \[0.0, 7.0\]"):
+        chain().transform(x)
+    with pytest.raises(ValueError, match="must be a ControlAffineSystem"):
+        systems.Barrier(systems.RatePlant(lambda x, u: u - x, dim=1, inputs=1), -1.0, 1.0)  # type: ignore[arg-type]
+
+
+def test_a_robot_is_that_of_scalars_and_one_that_no_mass_matrix_has_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"`TwoLinkRobot\(inertia=...\)` must be positive"):
+        systems.TwoLinkRobot(inertia=[0.3, 0.196, 0.242])
+    robot, x, u = systems.TwoLinkRobot(), 2 * drawn(20, 4) - 1, drawn(20, 2)
+    expected = numbers([robot_rate(*row) for row in zip(x.tolist(), u.tolist(), strict=True)])
+    torch.testing.assert_close(robot.rate(x, u), expected, rtol=1e-12, atol=1e-12)
