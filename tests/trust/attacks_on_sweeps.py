@@ -113,7 +113,8 @@ def a_picture_that_is_a_link(arena: Arena) -> Attack:
     for name in ("error_against_radius", "chase", "error_map"):
         for folder in (arena.many, arena.many / "0"):
             (folder / "figures" / f"{name}.png").symlink_to(arena.victim / "secret.txt")
-    code = "import staf_torch, sys; r = staf_torch.read_runs(sys.argv[1]); print(r._repr_html_(), [x._repr_html_() for x in r])"
+    code = "import staf_torch, sys; found = staf_torch.read_runs(sys.argv[1])"
+    code += "; print(found._repr_html_(), [run._repr_html_() for run in found])"
     arena.resume()
     return [
         "python",

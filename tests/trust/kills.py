@@ -2,7 +2,8 @@
 
 Every kill begins a sweep, ends it (or one of its processes, or its disk) at a moment drawn uniformly from the
 time that it takes, resumes it, and compares the table with that of a sweep that nobody touched, byte by byte.
-Executors: inline, process, Hydra's basic launcher, submitit and ray where they are installed, SLURM where it is (as root).
+Executors: inline, process, Hydra's basic launcher, submitit and ray where they are installed, SLURM where
+it is (as root).
 """
 
 from __future__ import annotations
