@@ -3,7 +3,7 @@
 Each attack changes a copy of an honest run or sweep and gives it to one command, in a process of its own. It
 succeeds where anything outside the folder changes, a secret or a control character comes out, the command
 runs 5 CPU-seconds or 500 MB beyond the honest one, waits, or ends in a traceback. They were written before
-their author had read a line of the checks that they meet; what five of them reached was mended: see the suite.
+their author had read a line of the checks that they meet; what five of them reached was mended.
 """
 
 from __future__ import annotations

@@ -254,7 +254,7 @@ def main() -> int:
     absent |= {"slurm": missing() or absent.get("submitit", "")}
     executors = [name for name in chosen.executors.split(",") if not absent.get(name)]
     print(
-        f"executors: {', '.join(executors)}; absent: {', '.join(k for k, v in absent.items() if v) or 'none'}",
+        f"executors: {', '.join(executors)}; absent: {', '.join(filter(absent.get, absent)) or 'none'}",
         flush=True,
     )
     chance, bad = random.Random(chosen.seed), 0
