@@ -70,7 +70,7 @@ class LeastSquares:
         alarm: float | None = None,
     ) -> None:
         first = vector("LeastSquares", "theta", theta)
-        several = [deviation] * len(first) if isinstance(deviation, int | float) else list(deviation)
+        several = list(deviation) if isinstance(deviation, Sequence) else [deviation] * len(first)
         if len(several) != len(first):
             raise fail("LeastSquares", "deviation", f"must be one number or {len(first)}", deviation)
         sizes = [positive_real("LeastSquares", "deviation", value) for value in several]
