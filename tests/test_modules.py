@@ -196,7 +196,15 @@ OTHERS = {"_Held", "ConventionModule", "FunctionPlant", "StepPlant", "RatePlant"
 OTHERS |= {"SampledProblem", "GlobalValue", "SafetyFilter", "FilteredPolicy", "PlanReplay"}
 OTHERS |= {"RecedingHorizon", "MujocoPlant", "EnvironmentPlant"}
 OTHERS |= {"NearOptimal", "SampledRollout"}
-OTHERS |= {"ParametricPlant", "ChangingPlant", "AdaptiveLQR", "ConcurrentTracker", "Measured", "_Informed"}
+OTHERS |= {
+    "ParametricPlant",
+    "ChangingPlant",
+    "AdaptiveLQR",
+    "ConcurrentTracker",
+    "Measured",
+    "Observed",
+    "_Informed",
+}
 """What wraps a function of the user's own, or takes minutes to make: tested in its room."""
 
 

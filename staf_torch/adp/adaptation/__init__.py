@@ -5,6 +5,11 @@ from .adaptive_lqr import AdaptiveLQR as AdaptiveLQR
 from .history_stack import ConcurrentGradient as ConcurrentGradient
 from .history_stack import HistoryStack as HistoryStack
 from .history_stack import Stack as Stack
+from .kalman import Belief as Belief
+from .kalman import ExtendedKalman as ExtendedKalman
+from .kalman import KalmanFilter as KalmanFilter
+from .kalman import Observed as Observed
+from .kalman import UnscentedKalman as UnscentedKalman
 from .least_squares import Estimate as Estimate
 from .least_squares import LeastSquares as LeastSquares
 from .measured import ChangingPlant as ChangingPlant
