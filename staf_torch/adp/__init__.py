@@ -20,6 +20,7 @@ from .controllers import Supervised as Supervised
 from .cost import BoundedInputCost as BoundedInputCost
 from .cost import Cost as Cost
 from .cost import QuadraticCost as QuadraticCost
+from .energy_shaping import EnergyShaping as EnergyShaping
 from .extrapolation import Extrapolation as Extrapolation
 from .extrapolation import QuadraturePoints as QuadraturePoints
 from .extrapolation import RandomPoints as RandomPoints
@@ -64,6 +65,7 @@ __all__ = [
     "ControllerState",
     "Cost",
     "DirectShooting",
+    "EnergyShaping",
     "Extrapolation",
     "Feedback",
     "Frozen",

@@ -27,9 +27,9 @@ PLANTS = {
     "Pendulum": (systems.Pendulum, (1.0, 1.0), None, 0.05, 1.5, 200),
     "VanDerPol": (systems.VanDerPol, (1.0, 1.0), None, 0.05, 1.5, 200),
     "ThreeState": (systems.ThreeState, (10.0, 1.0), None, 0.02, 0.5, 1000),
-    "CartPole": (systems.CartPole, (1.0, 1.0), 5.0, 0.02, 0.3, 400),
+    "CartPole": (systems.CartPole, (1.0, 1.0), 5.0, 0.02, 0.3, 800),
     "PlanarQuadrotor": (systems.PlanarQuadrotor, (1.0, 1.0), None, 0.02, 0.4, 400),
-    "Pendulum-v1": (CASES["pendulum"].plant, (1.0, 0.001), None, 0.05, 1.0, 200),
+    "Pendulum-v1": (CASES["pendulum"].plant, ([[20.0, 0.0], [0.0, 2.0]], 0.02), None, 0.05, 1.0, 200),
 }
 
 
