@@ -193,9 +193,10 @@ MODULES: dict[str, Case] = {
     "FoldedRollout": Case(lambda s: FoldedRollout(rollout(s))),
 }
 OTHERS = {"_Held", "ConventionModule", "FunctionPlant", "StepPlant", "RatePlant"}
-OTHERS |= {"SampledProblem", "GlobalValue", "SafetyFilter", "PlanReplay"}
+OTHERS |= {"SampledProblem", "GlobalValue", "SafetyFilter", "FilteredPolicy", "PlanReplay"}
 OTHERS |= {"RecedingHorizon", "MujocoPlant", "EnvironmentPlant", "EnergyShaping"}
 OTHERS |= {"NearOptimal", "SampledRollout"}
+OTHERS |= {"ParametricPlant", "ChangingPlant", "AdaptiveLQR", "ConcurrentTracker", "Measured", "_Informed"}
 """What wraps a function of the user's own, or takes minutes to make: tested in its room."""
 
 

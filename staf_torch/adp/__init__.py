@@ -3,6 +3,27 @@
 import warnings
 
 from .actor_critic import ActorCritic as ActorCritic
+from .adaptation import Adaptation as Adaptation
+from .adaptation import AdaptiveLQR as AdaptiveLQR
+from .adaptation import ChangingPlant as ChangingPlant
+from .adaptation import ConcurrentGradient as ConcurrentGradient
+from .adaptation import ConcurrentTracker as ConcurrentTracker
+from .adaptation import Doubling as Doubling
+from .adaptation import Equation as Equation
+from .adaptation import Estimate as Estimate
+from .adaptation import HistoryStack as HistoryStack
+from .adaptation import IntegralWindows as IntegralWindows
+from .adaptation import LeastSquares as LeastSquares
+from .adaptation import LinearFamily as LinearFamily
+from .adaptation import Measured as Measured
+from .adaptation import ParametricPlant as ParametricPlant
+from .adaptation import SlopeWindow as SlopeWindow
+from .adaptation import SlopeWindows as SlopeWindows
+from .adaptation import Stack as Stack
+from .adaptation import Tracking as Tracking
+from .adaptation import Window as Window
+from .adaptation import measured_rate as measured_rate
+from .adaptation import riccati_rows as riccati_rows
 from .bases import LeadingCoordinates as LeadingCoordinates
 from .bases import QuadraticBasis as QuadraticBasis
 from .bases import RBFGridBasis as RBFGridBasis
@@ -39,6 +60,8 @@ from .near_optimal import NearOptimal as NearOptimal
 from .near_optimal import near_optimal as near_optimal
 from .receding_horizon import RecedingHorizon as RecedingHorizon
 from .rollout import RolloutPolicy as RolloutPolicy
+from .safety_filter import Filtered as Filtered
+from .safety_filter import SafetyFilter as SafetyFilter
 from .sampled_problem import SampledProblem as SampledProblem
 from .sampled_rollout import SampledRollout as SampledRollout
 from .sampling import HeldStability as HeldStability
@@ -58,27 +81,42 @@ __all__ = [
     "LQR",
     "ActorCritic",
     "ActorCriticLaw",
+    "Adaptation",
+    "AdaptiveLQR",
     "BoundedInputCost",
     "BoxDDP",
+    "ChangingPlant",
+    "ConcurrentGradient",
     "ConcurrentLearning",
+    "ConcurrentTracker",
     "Controller",
     "ControllerState",
     "Cost",
     "DirectShooting",
+    "Doubling",
     "EnergyShaping",
+    "Equation",
+    "Estimate",
     "Extrapolation",
     "Feedback",
+    "Filtered",
     "Frozen",
     "Gains",
     "GlobalValue",
     "HeldStability",
+    "HistoryStack",
     "Identified",
     "IdentifyingTracker",
     "Information",
+    "IntegralWindows",
     "LeadingCoordinates",
+    "LeastSquares",
+    "LinearFamily",
     "LoopResult",
+    "Measured",
     "NearOptimal",
     "Optimum",
+    "ParametricPlant",
     "PlanReplay",
     "Published",
     "QuadraticBasis",
@@ -88,21 +126,29 @@ __all__ = [
     "RandomPoints",
     "RecedingHorizon",
     "RolloutPolicy",
+    "SafetyFilter",
     "SampledProblem",
     "SampledRollout",
+    "SlopeWindow",
+    "SlopeWindows",
     "StaFValueBasis",
+    "Stack",
     "Supervised",
+    "Tracking",
     "Trajectories",
     "TwoStateTracking",
     "ValueBasis",
     "Weights",
+    "Window",
     "bellman_error",
     "bellman_terms",
     "desired_trajectory",
     "held_stability",
     "hjb_residual",
     "learn_global_value",
+    "measured_rate",
     "near_optimal",
+    "riccati_rows",
     "simulate",
     "tracking_cost",
     "value_gradient",

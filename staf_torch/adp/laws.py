@@ -10,6 +10,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from ..lanes import eliminations
+from ..lanes.combinators import tracing_now
 from ..numerics.checks import fail, number, positive_real
 from .bellman import BellmanTerms, bellman_error
 from .cost import matvec
@@ -284,9 +286,12 @@ def solve_definite(matrix: Tensor, right: Tensor) -> Tensor:
 
     Gauss-Jordan elimination without pivoting, which is stable for a positive definite matrix, as operations
     over the whole batch: a library call a row would take most of a step's time. A row whose matrix is not
-    finite comes out non-finite, and the loop's monitor catches it.
+    finite comes out non-finite, and the loop's monitor catches it. Where a program is traced, one half of the
+    matrix decides.
     """
     size = right.shape[-1]
+    if tracing_now():
+        return eliminations.solve_definite(matrix, right)
     if size > _UNROLLED:
         solution: Tensor = torch.linalg.solve_ex(matrix, right.unsqueeze(-1))[0].squeeze(-1)
         return solution

@@ -8,6 +8,7 @@ from .approximators import approximator as approximator
 from .c_header import export_c as export_c
 from .c_header import export_learning_c as export_learning_c
 from .controllers import ActorPolicy as ActorPolicy
+from .controllers import FilteredPolicy as FilteredPolicy
 from .controllers import FoldedRollout as FoldedRollout
 from .controllers import SupervisedPolicy as SupervisedPolicy
 from .controllers import policy_of as policy_of
@@ -18,6 +19,7 @@ from .formats import load_program as load_program
 
 __all__ = [
     "ActorPolicy",
+    "FilteredPolicy",
     "FoldedRollout",
     "LocalApproximator",
     "RidgeApproximator",

@@ -7,7 +7,7 @@ import copy
 import torch
 from torch import Tensor, nn
 
-from ..adp import ActorCritic, Controller, Feedback, RolloutPolicy, Supervised
+from ..adp import ActorCritic, Controller, Feedback, RolloutPolicy, SafetyFilter, Supervised
 from ..numerics.checks import fail, trailing
 
 
@@ -77,6 +77,36 @@ class SupervisedPolicy(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """u: (..., n) -> (..., m)."""
         return self.supervisor.restrain(x, self.policy(x))
+
+
+class FilteredPolicy(nn.Module):
+    """A policy behind a `SafetyFilter`. Where a constraint depends on the time, t is the last entry of x.
+
+    Example:
+        >>> plant = systems.Linear([[0.0]], [[1.0]])
+        >>> cost = adp.QuadraticCost(1.0, 1.0, dim=1, inputs=1)
+        >>> wall = adp.SafetyFilter(adp.LQR(plant, cost), plant, lambda x, t: x[:, 0] - 0.1 * t, dt=0.01)
+        >>> deploy.policy_of(wall)(torch.tensor([[0.2, 2.0]]).double()).round(decimals=3)  # the wall, at 0.2
+        tensor([[0.1000]], dtype=torch.float64)
+
+        Shown by `staf-export RUN --to c`.
+
+    Args:
+        policy: (..., n) -> (..., m).
+        filter: whose rule it is; copied.
+    """
+
+    def __init__(self, policy: nn.Module, filter: SafetyFilter) -> None:
+        super().__init__()
+        self.policy = policy
+        self.filter = copy.deepcopy(filter)
+        self.filter.controller = Feedback(policy)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """u: (..., n), or (..., n + 1) with the time, -> (..., m)."""
+        moving = self.filter.moving
+        u: Tensor = self.filter(x[..., :-1], x[..., -1]) if moving else self.filter(x)
+        return u
 
 
 class FoldedRollout(nn.Module):
@@ -162,8 +192,8 @@ def policy_of(
         Shown by `staf-export RUN --to c`.
 
     Args:
-        controller: `Feedback`, `ActorCritic`, `Supervised`, `LQR`, `RolloutPolicy`, or any module
-            (..., n) -> (..., m).
+        controller: `Feedback`, `ActorCritic`, `Supervised`, `SafetyFilter`, `LQR`, `RolloutPolicy`, or any
+            module (..., n) -> (..., m).
         weights: Wa of an actor-critic, (M,); its initial ones by default.
         dtype: of the arithmetic.
 
@@ -176,6 +206,8 @@ def policy_of(
 def _policy_of(controller: Controller | nn.Module, weights: Tensor | None) -> nn.Module:
     if isinstance(controller, Supervised):
         return SupervisedPolicy(_policy_of(controller.controller, weights), controller)
+    if isinstance(controller, SafetyFilter):
+        return FilteredPolicy(_policy_of(controller.controller, weights), controller)
     if isinstance(controller, ActorCritic):
         chosen = controller.actor if weights is None else weights
         return ActorPolicy(controller, chosen)

@@ -62,8 +62,9 @@ class RowFunction:
         """y: (..., n) -> (..., m)."""
         if not ordinary((x,)) or x.numel() == 0 or tracing_now():
             return self._function(x)
-        if self._asked < _PAYS:
-            self._asked += 1 + x.numel() / x.shape[-1] / 200
+        rows = x.numel() / x.shape[-1]
+        if self._asked + rows / 200 < _PAYS:  # a large batch pays for itself
+            self._asked += 1 + rows / 200
             return self._function(x)
         if self._served is None or self._changed():
             self._remember()

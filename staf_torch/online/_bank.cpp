@@ -116,11 +116,11 @@ static void carry(const Rules &r, Stream &s, const double *x, const double *y, d
         for (int o = 0; o < K; ++o)
             for (int i = 0; i < M; ++i)
                 f.mean[o][i] = verdict.moves ? (verdict.afresh ? V{} : moved.mean[o][i]) : f.mean[o][i];
-        for (int i = 0; i < M; ++i)
-            for (int j = 0; j < M; ++j)
-                f.learned[i][j] = verdict.moves ? (verdict.afresh ? V{} : moved.learned[i][j]) : f.learned[i][j];
+        for (int i = 0; i < M * (M + 1) / 2; ++i)
+            f.learned[i] = verdict.moves ? (verdict.afresh ? V{} : moved.learned[i]) : f.learned[i];
     }
-    update(r.functions, law, f, z, value, seen, all(lapse), verdict.fine);
+    auto get = [&](int i) { return f.learned[i]; };
+    update(r.functions, law, f, get, [&](int i, V value) { f.learned[i] = value; }, z, value, seen, all(lapse), verdict.fine);
     std::memcpy(s.filters, &f, sizeof f);
 }
 
@@ -275,7 +275,8 @@ static void ask(const Rules &r, Stream &s, const double *x) {
     quadratic_features(u + 1, phi);
     const V bent_spread = s.quadratics.predict(phi, bent);
     for (int i = 0; i < n; ++i) at[i] = all(u[i + 1]);
-    predict(r.functions, law_of(r), filters_of(s), at, mean, variance);
+    const Filter f = filters_of(s);
+    predict(r.functions, law_of(r), f, [&](int i) { return f.learned[i]; }, at, mean, variance);
     for (int o = 0; o < K; ++o) {
         double *means = s.means[o], *variances = s.variances[o];
         for (int l = 0; l < carried; ++l) means[locals + l] = mean[o][l], variances[locals + l] = variance[o][l];

@@ -4,7 +4,7 @@
 
 struct Call {
     int64_t streams, stride, mode;  // 1 to predict, 2 to learn
-    REAL *table;                    // see StreamState, a row every stride
+    REAL *table;                    // see StreamState: blocks of the rows of `lanes` streams
     int64_t *counts;                // (4, stride)
     const REAL *x, *y;              // (streams, n), (streams, K)
     const double *lapse;            // (streams), or null for ones
@@ -14,41 +14,51 @@ struct Call {
     double slack2, robust, base, tiny, most, limit;
 };
 constexpr int tile = 64;  // streams that are worked on together stay in the cache
-constexpr int row_mean = 2 * n, row_learned = row_mean + K * M, row_errors = row_learned + M * M;
+constexpr int row_mean = 2 * n, row_learned = row_mean + K * M, row_errors = row_learned + M * (M + 1) / 2;
+constexpr int rows_of_all = row_errors + K + 1;
 
 typedef REAL Stored __attribute__((vector_size(lanes * sizeof(REAL))));
-INLINE V load(const REAL *from, int count) {
-    Stored found{};
-    if (count == lanes) __builtin_memcpy(&found, from, sizeof found);
-    else __builtin_memcpy(&found, from, count * sizeof(REAL));
+INLINE REAL *block_of(const Call &call, int64_t first) { return call.table + first * rows_of_all; }
+INLINE V load(const REAL *from) {
+    Stored found;
+    __builtin_memcpy(&found, from, sizeof found);
     return __builtin_convertvector(found, V);
 }
-INLINE void save(REAL *to, V value, int count) {
+INLINE void save(REAL *to, V value) {
     const Stored found = __builtin_convertvector(value, Stored);
-    if (count == lanes) __builtin_memcpy(to, &found, sizeof found);
-    else __builtin_memcpy(to, &found, count * sizeof(REAL));
+    __builtin_memcpy(to, &found, sizeof found);
 }
-INLINE V column(const REAL *from, int step, int count) {
+// As many numbers as there are streams, `step` apart: whole registers where that is possible.
+template <typename From> INLINE V column(const From *from, int step, int count) {
     V found{};
-    for (int l = 0; l < count; ++l) found[l] = from[int64_t(l) * step];
+    if (count == lanes && step == 1) {
+        typedef From Whole __attribute__((vector_size(lanes * sizeof(From))));
+        Whole whole;
+        __builtin_memcpy(&whole, from, sizeof whole);
+        return __builtin_convertvector(whole, V);
+    }
+    for (int l = 0; l < count; ++l) found[l] = double(from[int64_t(l) * step]);
     return found;
 }
+INLINE int64_t *counts_of(const Call &call, int which, int64_t first) { return call.counts + which * call.stride + first; }
 INLINE V count_of(const Call &call, int which, int64_t first, int count) {
-    V found{};
-    for (int l = 0; l < count; ++l) found[l] = double(call.counts[which * call.stride + first + l]);
+    return column(counts_of(call, which, first), 1, count);
+}
+INLINE void save_count(int64_t *to, Mask value, int count) { __builtin_memcpy(to, &value, count * sizeof *to); }
+INLINE Mask saved_count(const int64_t *from, int count) {
+    Mask found{};
+    __builtin_memcpy(&found, from, count * sizeof *from);
     return found;
 }
-INLINE void read(const Call &call, int64_t first, int count, Filter &s, bool whole) {
-    const REAL *at = call.table + first;
+// All but D, which is read where it is used.
+INLINE void read(const Call &call, int64_t first, int count, Filter &s) {
+    const REAL *at = block_of(call, first);
     int row = 0;
-    auto next = [&] { return load(at + (row++) * call.stride, count); };
+    auto next = [&] { return load(at + (row++) * lanes); };
     for (int i = 0; i < n; ++i) s.anchor[i] = next();
     for (int i = 0; i < n; ++i) s.last[i] = next();
     for (int o = 0; o < K; ++o)
         for (int i = 0; i < M; ++i) s.mean[o][i] = next();
-    if (whole)
-        for (int i = 0; i < M; ++i)
-            for (int j = 0; j < M; ++j) s.learned[i][j] = next();
     row = row_errors;
     for (int o = 0; o < K; ++o) s.errors[o] = next();
     s.largest = next();
@@ -56,19 +66,20 @@ INLINE void read(const Call &call, int64_t first, int count, Filter &s, bool who
 }
 
 INLINE Law law_of(const Call &call, int64_t first, int count) {
-    Law law{all(1), all(1), all(call.slack2), all(call.robust), all(call.base), call.tiny, call.most, call.limit};
-    for (int l = 0; l < count; ++l) law.ratio[l] = call.ratio[first + l], law.forgetting[l] = call.forgetting[first + l];
-    return law;
+    const V ratio = column(call.ratio + first, 1, count), forgetting = column(call.forgetting + first, 1, count);
+    return {ratio, forgetting, all(call.slack2), all(call.robust), all(call.base), call.tiny, call.most, call.limit};
 }
 
 static void tell(const Call &call) {
     for (int64_t first = 0; first < call.streams; first += lanes) {
         const int count = call.streams - first < lanes ? int(call.streams - first) : lanes;
-        Filter s{};
-        read(call, first, count, s, true);
+        Filter s;
+        read(call, first, count, s);
+        const REAL *learned = block_of(call, first) + row_learned * lanes;
         V x[n], mean[K], variance[K];
         for (int i = 0; i < n; ++i) x[i] = column(call.x + first * n + i, n, count);
-        predict(call.functions, law_of(call, first, count), s, x, mean, variance);
+        auto get = [&](int i) { return load(learned + i * lanes); };
+        predict(call.functions, law_of(call, first, count), s, get, x, mean, variance);
         for (int o = 0; o < K; ++o)
             for (int l = 0; l < count; ++l) {
                 call.mean[(first + l) * K + o] = REAL(mean[o][l]);
@@ -79,23 +90,25 @@ static void tell(const Call &call) {
 
 // Streams that move: gathered from anywhere in the tile, so that no others pay.
 static void move(const Call &call, const int64_t *rows, int count, const V *h, const Mask afresh) {
-    V mean[K][M], learned[M][M], *flat = &learned[0][0];
-    auto at = [&](int row, int l) -> REAL & { return call.table[row * call.stride + rows[l]]; };
+    V mean[K][M], learned[M * (M + 1) / 2];
+    REAL *place[lanes];
+    for (int l = 0; l < count; ++l) place[l] = block_of(call, rows[l] / lanes * lanes) + rows[l] % lanes;
+    auto at = [&](int row, int l) -> REAL & { return place[l][row * lanes]; };
     for (int o = 0; o < K; ++o)
         for (int i = 0; i < M; ++i) {
             mean[o][i] = V{};
             for (int l = 0; l < count; ++l) mean[o][i][l] = at(row_mean + o * M + i, l);
         }
-    for (int i = 0; i < M * M; ++i) {
-        flat[i] = V{};
-        for (int l = 0; l < count; ++l) flat[i][l] = at(row_learned + i, l);
+    for (int i = 0; i < row_errors - row_learned; ++i) {
+        learned[i] = V{};
+        for (int l = 0; l < count; ++l) learned[i][l] = at(row_learned + i, l);
     }
     transfer(call.functions, h, mean, learned);
     for (int o = 0; o < K; ++o)
         for (int i = 0; i < M; ++i)
             for (int l = 0; l < count; ++l) at(row_mean + o * M + i, l) = afresh[l] ? REAL(0) : REAL(mean[o][i][l]);
-    for (int i = 0; i < M * M; ++i)
-        for (int l = 0; l < count; ++l) at(row_learned + i, l) = afresh[l] ? REAL(0) : REAL(flat[i][l]);
+    for (int i = 0; i < row_errors - row_learned; ++i)
+        for (int l = 0; l < count; ++l) at(row_learned + i, l) = afresh[l] ? REAL(0) : REAL(learned[i][l]);
     for (int i = 0; i < n; ++i)
         for (int l = 0; l < count; ++l) at(i, l) = at(n + i, l);  // the anchor goes to x
 }
@@ -113,13 +126,14 @@ static void learn(const Call &call) {
             Filter s;
             V x[n], y[K];
             Mask seen[K];
-            read(call, first, count, s, false);
+            read(call, first, count, s);
             for (int i = 0; i < n; ++i) x[i] = column(call.x + first * n + i, n, count);
             for (int o = 0; o < K; ++o) y[o] = column(call.y + first * K + o, K, count);
             Verdict &v = verdicts[(first - begin) / lanes];
             v = judge(law_of(call, first, count), s, x, y, seen, count_of(call, 2, first, count));
-            for (int i = 0; i < n; ++i) save(call.table + (n + i) * call.stride + first, s.last[i], count);
-            for (int o = 0; o < K; ++o) save(call.table + (row_errors + o) * call.stride + first, s.errors[o], count);
+            REAL *block = block_of(call, first);
+            for (int i = 0; i < n; ++i) save(block + (n + i) * lanes, s.last[i]);
+            for (int o = 0; o < K; ++o) save(block + (row_errors + o) * lanes, s.errors[o]);
             if (!any(v.moves)) continue;
             for (int l = 0; l < count; ++l)
                 if (v.moves[l]) {
@@ -128,7 +142,7 @@ static void learn(const Call &call) {
                     afresh[moving] = v.afresh[l];
                     if (v.afresh[l]) {
                         call.counts[3 * call.stride + first + l] = 0;
-                        call.table[(row_errors + K) * call.stride + first + l] = 0;
+                        block[(row_errors + K) * lanes + l] = 0;
                     }
                     if (++moving == lanes) move(call, rows, moving, h, afresh), moving = 0;
                 }
@@ -138,7 +152,7 @@ static void learn(const Call &call) {
             const int count = end - first < lanes ? int(end - first) : lanes;
             const Verdict &v = verdicts[(first - begin) / lanes];
             Filter s;
-            read(call, first, count, s, true);
+            read(call, first, count, s);
             V y[K], z[n], lapse = all(1);
             Mask seen[K];
             for (int i = 0; i < n; ++i) z[i] = v.moves ? V{} : v.z[i];
@@ -149,21 +163,22 @@ static void learn(const Call &call) {
             }
             if (call.lapse)
                 for (int l = 0; l < count; ++l) lapse[l] = call.lapse[first + l];
-            const Mask good = update(call.functions, law_of(call, first, count), s, z, y, seen, lapse, v.fine);
-            auto put = [&](int row, V value) { save(call.table + row * call.stride + first, value, count); };
+            REAL *block = block_of(call, first), *learned = block + row_learned * lanes;
+            auto put = [&](int row, V value) { save(block + row * lanes, value); };
+            const Mask good = update(
+                call.functions, law_of(call, first, count), s, [&](int i) { return load(learned + i * lanes); },
+                [&](int i, V value) { save(learned + i * lanes, value); }, z, y, seen, lapse, v.fine);
             for (int o = 0; o < K; ++o) {
                 put(row_errors + o, s.errors[o]);
                 for (int i = 0; i < M; ++i) put(row_mean + o * M + i, s.mean[o][i]);
             }
-            for (int i = 0; i < M; ++i)
-                for (int j = 0; j < M; ++j) put(row_learned + i * M + j, s.learned[i][j]);
             put(row_errors + K, s.largest);
-            for (int l = 0; l < count; ++l) {
-                int64_t *at = call.counts + first + l;
-                at[0] += good[l] != 0, at[call.stride] += good[l] == 0;
-                at[2 * call.stride] = v.afresh[l] && good[l] ? 0 : int64_t(v.streak[l]);
-                at[3 * call.stride] = int64_t(s.since[l]);
-            }
+            int64_t *at = counts_of(call, 0, first), *skipped = counts_of(call, 1, first);
+            save_count(at, saved_count(at, count) - good, count);
+            save_count(skipped, saved_count(skipped, count) - ~good, count);
+            const V streak = v.afresh & good ? V{} : v.streak;
+            save_count(counts_of(call, 2, first), __builtin_convertvector(streak, Mask), count);
+            save_count(counts_of(call, 3, first), __builtin_convertvector(s.since, Mask), count);
         }
     }
 }

@@ -51,7 +51,7 @@ struct Functions {  // of local_functions.py, in float64
 };
 
 struct Filter {  // of lanes streams
-    V anchor[n], last[n], mean[K][M], learned[M][M], errors[K], largest, since;
+    V anchor[n], last[n], mean[K][M], learned[M * (M + 1) / 2], errors[K], largest, since;  // D's lower triangle
 };
 
 struct Law {
@@ -75,9 +75,24 @@ INLINE void functions_at(const Functions &f, const V *z, V *psi) {
     }
 }
 
+// c(k, l) <- sum_j a(j, k) b(j, l) in blocks that stay in registers; for l <= k alone where that is enough.
+template <bool lower, typename A, typename B, typename Put> INLINE void product(A a, B b, Put put) {
+    constexpr int side = M % 4 == 0 ? 4 : M % 3 == 0 ? 3 : M % 2 == 0 ? 2 : 1;
+    for (int k = 0; k < M; k += side)
+        for (int l = 0; l < (lower ? k + side : M); l += side) {
+            V sum[side][side]{};
+            for (int j = 0; j < M; ++j)
+                for (int p = 0; p < side; ++p)
+                    for (int q = 0; q < side; ++q) sum[p][q] += a(j, k + p) * b(j, l + q);
+            for (int p = 0; p < side; ++p)
+                for (int q = 0; q < side; ++q)
+                    if (!lower || l + q <= k + p) put(k + p, l + q, sum[p][q]);
+        }
+}
+
 // u <- T u and D <- T D T' for a step h, and nothing where the step is too far for the kernel.
-static void transfer(const Functions &f, const V *h, V mean[K][M], V learned[M][M]) {
-    V square{}, before[M], after[M], T[M][M], half[M][M];
+static void transfer(const Functions &f, const V *h, V mean[K][M], V *learned) {
+    V square{}, before[M], after[M], T[M][M], half[M][M], whole[M][M];
     for (int i = 0; i < n; ++i) square += (h[i] / f.reach) * (h[i] / f.reach);
     const Mask near = square <= 1e16;
     V step[n];
@@ -90,38 +105,24 @@ static void transfer(const Functions &f, const V *h, V mean[K][M], V learned[M][
         before[j] = exponential(f.rate * along - shift);
         after[j] = exponential(minimum(shift - f.rate * along - lost, all(700)));
     }
-    for (int i = 0; i < M; ++i)
-        for (int l = 0; l < M; ++l) {
-            V sum{};
-            for (int j = 0; j < M; ++j) sum += before[j] * (f.gram[i * M + j] * f.newton[j * M + l]);
-            half[i][l] = sum * after[i];
-        }
-    for (int k = 0; k < M; ++k)
-        for (int l = 0; l < M; ++l) {
-            V sum{};
-            for (int i = 0; i < M; ++i) sum += f.newton[i * M + k] * half[i][l];
-            T[k][l] = near ? sum : V{};
-        }
+    for (int j = 0; j < M; ++j)
+        for (int l = 0; l < M; ++l) whole[j][l] = before[j] * f.newton[j * M + l];
+    product<false>([&](int j, int i) { return f.gram[j * M + i]; }, [&](int j, int l) { return whole[j][l]; },
+                   [&](int i, int l, V sum) { half[i][l] = sum * after[i]; });
+    product<false>([&](int i, int k) { return f.newton[i * M + k]; }, [&](int i, int l) { return half[i][l]; },
+                   [&](int k, int l, V sum) { T[l][k] = near ? sum : V{}; });  // the transpose, to be read along rows
     for (int o = 0; o < K; ++o) {
-        V moved[M];
-        for (int k = 0; k < M; ++k) {
-            moved[k] = V{};
-            for (int l = 0; l < M; ++l) moved[k] += T[k][l] * mean[o][l];
-        }
+        V moved[M]{};
+        for (int l = 0; l < M; ++l)
+            for (int k = 0; k < M; ++k) moved[k] += T[l][k] * mean[o][l];
         for (int k = 0; k < M; ++k) mean[o][k] = moved[k];
     }
-    for (int k = 0; k < M; ++k)
-        for (int l = 0; l < M; ++l) {
-            V sum{};
-            for (int j = 0; j < M; ++j) sum += T[k][j] * learned[j][l];
-            half[k][l] = sum;
-        }
-    for (int k = 0; k < M; ++k)
-        for (int l = 0; l <= k; ++l) {
-            V sum{};
-            for (int j = 0; j < M; ++j) sum += half[k][j] * T[l][j];
-            learned[k][l] = learned[l][k] = sum;
-        }
+    for (int i = 0; i < M; ++i)
+        for (int j = 0; j <= i; ++j) whole[i][j] = whole[j][i] = learned[i * (i + 1) / 2 + j];
+    product<false>([&](int j, int k) { return T[j][k]; }, [&](int j, int l) { return whole[j][l]; },
+                   [&](int k, int l, V sum) { half[l][k] = sum; });
+    product<true>([&](int j, int k) { return half[j][k]; }, [&](int j, int l) { return T[j][l]; },
+                  [&](int k, int l, V sum) { learned[k * (k + 1) / 2 + l] = sum; });
 }
 
 INLINE V running_scale(const Law &law, V errors, V since) {
@@ -135,16 +136,18 @@ INLINE Mask is_fresh(const Filter &s) {
     return sum != sum;
 }
 
-// Mean and variance of the next y at x.
-static void predict(const Functions &f, const Law &law, const Filter &s, const V *x, V mean[K], V variance[K]) {
+// Mean and variance of the next y at x. D's lower triangle is asked for by its numbers.
+template <typename Get>
+INLINE void predict(const Functions &f, const Law &law, const Filter &s, Get learned, const V *x, V mean[K],
+                    V variance[K]) {
     V z[n], psi[M];
     for (int i = 0; i < n; ++i) z[i] = (x[i] != x[i] ? s.last[i] : x[i]) - s.anchor[i];
     functions_at(f, z, psi);
     V prior = all(1);
-    for (int i = 0; i < M; ++i) {
+    for (int i = 0, at = 0; i < M; ++i) {
         V sum{};
-        for (int j = 0; j < M; ++j) sum += s.learned[i][j] * psi[j];
-        prior -= psi[i] * sum;
+        for (int j = 0; j < i; ++j) sum += learned(at++) * psi[j];
+        prior -= psi[i] * (sum + sum + learned(at++) * psi[i]);
     }
     const Mask fresh = is_fresh(s);
     for (int o = 0; o < K; ++o) {
@@ -191,17 +194,24 @@ INLINE Verdict judge(const Law &law, Filter &s, V *x, V *y, Mask *seen, V streak
 }
 
 // The Kalman update at z from the anchor, where the result is finite: these lanes are returned.
-INLINE Mask update(const Functions &f, const Law &law, Filter &s, const V *z, const V *y, const Mask *seen, V lapse,
-                   Mask fine) {
-    V psi[M], known[M], gain[M], change[K], spread = 1. + law.ratio, share, total{}, peak{};
+template <typename Get, typename Put>
+INLINE Mask update(const Functions &f, const Law &law, Filter &s, Get learned, Put put, const V *z, const V *y,
+                   const Mask *seen, V lapse, Mask fine) {
+    V psi[M], known[M]{}, gain[M], change[K], spread = 1. + law.ratio, share, total{}, peak{};
     functions_at(f, z, psi);
     share = lapse == 1. ? law.forgetting : V{};
     if (any(lapse != 1.))
         for (int l = 0; l < lanes; ++l) share[l] = lapse[l] == 1. ? share[l] : std::pow(law.forgetting[l], lapse[l]);
-    for (int i = 0; i < M; ++i) {
+    for (int i = 0, at = 0; i < M; ++i) {
         V sum{};
-        for (int j = 0; j < M; ++j) sum += s.learned[i][j] * psi[j];
-        known[i] = sum * share;
+        for (int j = 0; j < i; ++j) {
+            const V entry = learned(at++);
+            sum += entry * psi[j], known[j] += entry * psi[i];
+        }
+        known[i] = sum + learned(at++) * psi[i];
+    }
+    for (int i = 0; i < M; ++i) {
+        known[i] *= share;
         spread -= psi[i] * known[i];
         gain[i] = psi[i] - known[i];
         total += gain[i] * 0.;  // not a number where one of them is not finite
@@ -231,10 +241,12 @@ INLINE Mask update(const Functions &f, const Law &law, Filter &s, const V *z, co
         s.errors[o] = good ? errors[o] : s.errors[o];
         for (int i = 0; i < M; ++i) s.mean[o][i] = good ? s.mean[o][i] + gain[i] * change[o] : s.mean[o][i];
     }
-    for (int i = 0; i < M; ++i)
-        for (int j = 0; j <= i; ++j) {
-            const V next = s.learned[i][j] * share + gain[i] * (gain[j] * inverse);
-            s.learned[i][j] = s.learned[j][i] = good ? next : s.learned[i][j];
+    for (int i = 0, at = 0; i < M; ++i) {
+        const V part = gain[i] * inverse;
+        for (int j = 0; j <= i; ++j, ++at) {
+            const V old = learned(at), next = old * share + part * gain[j];
+            put(at, good ? next : old);
         }
+    }
     return good;
 }

@@ -87,7 +87,7 @@ class BankDefinition:
         state = StreamState.empty(
             s["x"], len(self.rules.forgetting), self.shape.dim, self.shape.dim + 1, len(s["error"])
         )
-        state.table.copy_(s["filters"][:-1])
+        state.put(s["filters"][:-1])
         state.counts[3].copy_(s["filters"][-1])
         return state
 

@@ -104,7 +104,7 @@ class Rules(NamedTuple):
 def layout(shape: BankShape) -> list[tuple[str, tuple[int, ...]]]:
     """Names and shapes of a stream's numbers, in the order of `Stream` in _bank.cpp."""
     n, k, c, d = shape.dim, shape.outputs, shape.capacity, shape.features
-    filters = 2 * n + k * (n + 1) + (n + 1) ** 2 + k + 2
+    filters = 2 * n + k * (n + 1) + (n + 1) * (n + 2) // 2 + k + 2
     return [
         *((name, ()) for name in ("clock", "count", "far", "skipped", "learned", "time")),
         ("last_x", (n,)),

@@ -68,16 +68,16 @@ class CompiledFilter:
 
     def __init__(self, definition: LocalFilter, state: StreamState, call: Callable[..., None]) -> None:
         pointers, self._held = FunctionPointers.of(definition.functions)
-        self._held += [state.table, state.counts, definition.ratio, definition.forgetting]
-        streams = state.table.shape[1]
+        self._held += [state.blocks, state.counts, definition.ratio, definition.forgetting]
+        streams = state.streams
         self._call = _Call(streams=streams, stride=streams, functions=pointers)
-        self._call.table, self._call.counts = state.table.data_ptr(), state.counts.data_ptr()
+        self._call.table, self._call.counts = state.blocks.data_ptr(), state.counts.data_ptr()
         self._call.ratio, self._call.forgetting = (
             definition.ratio.data_ptr(),
             definition.forgetting.data_ptr(),
         )
         self._call.slack2, self._call.robust = definition.slack**2, definition.robust
-        numbers = torch.finfo(state.table.dtype)
+        numbers = torch.finfo(state.dtype)
         self._call.base, self._call.tiny, self._call.most = definition.base, numbers.eps**0.5, numbers.max
         self._call.limit = numbers.max**0.75
         self._run, self._pointer = call, ctypes.byref(self._call)
@@ -86,9 +86,9 @@ class CompiledFilter:
     @classmethod
     def build(cls, definition: LocalFilter, state: StreamState) -> CompiledFilter | LocalFilter:
         """The compiled filter, or the definition where there is none."""
-        functions, real = definition.functions, _REALS.get(state.table.dtype)
+        functions, real = definition.functions, _REALS.get(state.dtype)
         plain = functions.rate is not None and functions.shared is not None and functions.stationary
-        if not plain or real is None or state.count > _MOST or state.table.device.type != "cpu":
+        if not plain or real is None or state.count > _MOST or state.blocks.device.type != "cpu":
             return definition
         sizes = f"DIM={state.dim}", f"COUNT={state.count}", f"OUTPUTS={state.outputs}"
         call = compiled(Path(__file__).with_name("_filter.cpp"), *sizes, f"REAL={real}")

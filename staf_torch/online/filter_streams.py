@@ -28,9 +28,9 @@ class FilterStreams:
         self, definition: LocalFilter, state: StreamState, scaling: bool, units: Tensor | None = None
     ) -> None:
         self.scaling = scaling
-        self.dtype = state.table.dtype
-        size, wide = state.table.shape[1], state.dim + state.outputs
-        like = state.table.new_zeros(0, dtype=torch.float64)
+        self.dtype = state.dtype
+        size, wide = state.streams, state.dim + state.outputs
+        like = state.blocks.new_zeros(0, dtype=torch.float64)
         self.units = torch.cat((like.new_zeros(size, wide), like.new_ones(size, wide)), 1)  # centers, spreads
         self.first = like.new_zeros(size, LEARNED_AT[-1] if scaling else 0, wide + 1)  # samples and lapses
         self.clock = torch.zeros(size, dtype=torch.int64)
@@ -42,7 +42,7 @@ class FilterStreams:
     def _hold(self, definition: LocalFilter, state: StreamState) -> None:
         """Filter these streams from now on."""
         self.definition, self.state = definition, state
-        self.count = state.table.shape[1]
+        self.count = state.streams
         self._filter = CompiledFilter.build(definition, state)
         self.compiled = isinstance(self._filter, CompiledFilter) and not self.scaling
         self._center, self._spread = self.units.to(self.dtype).split(state.dim + state.outputs, dim=1)
@@ -95,7 +95,7 @@ class FilterStreams:
         self.units[row] = torch.cat((center, spread))
         self._center, self._spread = self.units.to(self.dtype).split(wide, dim=1)
         u = ((samples[:, :wide] - center) / spread).to(self.dtype)
-        alone = StreamState.empty(self.state.table, 1, n, self.state.count, self.state.outputs)
+        alone = StreamState.empty(self.state.blocks, 1, n, self.state.count, self.state.outputs)
         law = self.definition.with_law(
             self.definition.ratio[row, None], self.definition.forgetting[row, None]
         )
@@ -105,7 +105,9 @@ class FilterStreams:
                 alone, u[k : k + 1, :n].contiguous(), u[k : k + 1, n:].contiguous(), samples[k, -1:].clone()
             )
         counts = self.state.counts[:2, row].clone()
-        self.state.table[:, row] = alone.table[:, 0]
+        table = self.state.table
+        table[:, row] = alone.table[:, 0]
+        self.state.put(table)
         self.state.counts[:, row] = alone.counts[:, 0]
         self.state.counts[0, row] = torch.maximum(counts[0] + 1, alone.counts[0, 0])
         self.state.counts[1, row] = counts[1]
@@ -120,8 +122,10 @@ class FilterStreams:
 
     def clear(self, rows: Tensor) -> None:
         """Let the streams with these numbers begin anew."""
-        fresh = StreamState.empty(self.state.table, len(rows), *self.state.sizes)
-        self.state.table[:, rows], self.state.counts[:, rows] = fresh.table, fresh.counts
+        fresh = StreamState.empty(self.state.blocks, len(rows), *self.state.sizes)
+        table = self.state.table
+        table[:, rows], self.state.counts[:, rows] = fresh.table, fresh.counts
+        self.state.put(table)
         self.clock[rows] = 0
         wide = self.units.shape[1] // 2
         self.units[rows, :wide], self.units[rows, wide:] = 0.0, 1.0
@@ -129,9 +133,9 @@ class FilterStreams:
 
     def add(self, streams: int) -> None:
         """Begin further streams, behind the others."""
-        fresh = StreamState.empty(self.state.table, streams, *self.state.sizes)
-        self.state.table = torch.cat((self.state.table, fresh.table), 1).contiguous()
-        self.state.counts = torch.cat((self.state.counts, fresh.counts), 1).contiguous()
+        fresh = StreamState.empty(self.state.blocks, streams, *self.state.sizes)
+        table = torch.cat((self.state.table, fresh.table), 1)
+        state = self.state.with_table(table, torch.cat((self.state.counts, fresh.counts), 1))
         wide = self.units.shape[1] // 2
         new = torch.cat((self.units.new_zeros(streams, wide), self.units.new_ones(streams, wide)), 1)
         self.units = torch.cat((self.units, new))
@@ -142,15 +146,14 @@ class FilterStreams:
             torch.cat((a, b.expand(streams)))
             for a, b in zip((old.ratio, old.forgetting), self._law, strict=True)
         )
-        self._hold(old.with_law(ratio, forgetting), self.state)
+        self._hold(old.with_law(ratio, forgetting), state)
 
     def keep(self, rows: Tensor) -> None:
         """Go on with the streams with these numbers alone."""
-        self.state.table = self.state.table[:, rows].contiguous()
-        self.state.counts = self.state.counts[:, rows].contiguous()
+        state = self.state.with_table(self.state.table[:, rows], self.state.counts[:, rows])
         self.units, self.first, self.clock = self.units[rows], self.first[rows], self.clock[rows]
         old = self.definition
-        self._hold(old.with_law(old.ratio[rows], old.forgetting[rows]), self.state)
+        self._hold(old.with_law(old.ratio[rows], old.forgetting[rows]), state)
 
     def state_dict(self) -> dict[str, Any]:
         """Copies of all tensors that learning changes."""
@@ -165,9 +168,9 @@ class FilterStreams:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take over what `state_dict` has."""
-        self.state.table, self.state.counts = state["table"].clone(), state["counts"].clone()
+        kept = self.state.with_table(state["table"], state["counts"].clone())
         self.units, self.clock, self.first = (state[name].clone() for name in ("units", "clock", "first"))
-        self._hold(self.definition.with_law(state["ratio"].clone(), state["forgetting"].clone()), self.state)
+        self._hold(self.definition.with_law(state["ratio"].clone(), state["forgetting"].clone()), kept)
 
 
 def units_of(samples: Tensor) -> tuple[Tensor, Tensor]:

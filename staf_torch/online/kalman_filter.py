@@ -12,6 +12,7 @@ from torch import Tensor
 from .local_functions import LocalFunctions
 
 SURPRISE = 25.0  # standardised squared errors count at most so many times their running mean
+LANES = 8  # streams whose numbers stand together: the double precision numbers of a vector register
 STREAK = 8  # samples in a row that are out of all proportion before a stream starts afresh
 
 
@@ -20,11 +21,12 @@ class StreamState:
     """What is kept of every stream, in place; streams are the last dimension.
 
     u is the mean of the weights, I - D their covariance: D, 0 <= D <= I, is what has been learned. The rows
-    of the table: the anchor, x as last measured, u output by output, D row by row, and for every output the
-    running mean of its squared standardised errors; then the largest |y| learned.
+    of the table: the anchor, x as last measured, u output by output, D's lower triangle row by row, and for
+    every output the running mean of its squared standardised errors; then the largest |y| learned. In memory
+    the numbers of `LANES` streams stand together, so that machine code reads them one after the other.
     """
 
-    table: Tensor  # (2 n + K M + M M + K + 1, S)
+    blocks: Tensor  # (ceil(S / LANES), 2 n + K M + M (M + 1) / 2 + K + 1, LANES)
     counts: Tensor  # learned, skipped, out of proportion in a row, learned since it began: (4, S) int64
     dim: int  # n
     count: int  # M
@@ -33,11 +35,34 @@ class StreamState:
     @classmethod
     def empty(cls, like: Tensor, streams: int, dim: int, count: int, outputs: int) -> StreamState:
         """Nothing learned, at NaN: a stream's first sample puts it somewhere."""
-        rows = 2 * dim + outputs * count + count * count + outputs + 1
+        rows = 2 * dim + outputs * count + count * (count + 1) // 2 + outputs + 1
         table = like.new_zeros(rows, streams)
         table[: 2 * dim] = torch.nan
         counts = torch.zeros(4, streams, dtype=torch.int64, device=like.device)
-        return cls(table, counts, dim, count, outputs)
+        return cls(_blocks(table), counts, dim, count, outputs)
+
+    def with_table(self, table: Tensor, counts: Tensor) -> StreamState:
+        """Other streams of these sizes."""
+        return dataclasses.replace(self, blocks=_blocks(table), counts=counts.contiguous())
+
+    @property
+    def streams(self) -> int:
+        """S."""
+        return self.counts.shape[1]
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Of the table."""
+        return self.blocks.dtype
+
+    @property
+    def table(self) -> Tensor:
+        """A copy of the table, (rows, S)."""
+        return self.blocks.transpose(0, 1).flatten(1)[:, : self.streams]
+
+    def put(self, table: Tensor) -> None:
+        """Take these numbers, (rows, S)."""
+        self.blocks.copy_(_blocks(table.to(self.blocks)))
 
     @property
     def sizes(self) -> tuple[int, int, int]:
@@ -45,10 +70,19 @@ class StreamState:
         return self.dim, self.count, self.outputs
 
     def parts(self, table: Tensor) -> Parts:
-        """Views of the rows of a table (..., S)."""
+        """The rows of a table (..., S) by name: views, but for D."""
         n, m, k = self.dim, self.count, self.outputs
-        anchor, last, mean, learned, errors, largest = table.split([n, n, k * m, m * m, k, 1])
-        return Parts(anchor, last, mean.unflatten(0, (k, m)), learned.unflatten(0, (m, m)), errors, largest)
+        anchor, last, mean, lower, errors, largest = table.split([n, n, k * m, m * (m + 1) // 2, k, 1])
+        row, column = torch.tril_indices(m, m, device=table.device)
+        learned = table.new_empty(m, m, *table.shape[1:])
+        learned[row, column] = learned[column, row] = lower
+        return Parts(anchor, last, mean.unflatten(0, (k, m)), learned, errors, largest)
+
+    def whole(self, parts: Parts) -> Tensor:
+        """The table with these rows."""
+        row, column = torch.tril_indices(self.count, self.count, device=parts.learned.device)
+        lower = parts._replace(learned=parts.learned[row, column])
+        return torch.cat([part.reshape(-1, part.shape[-1]) for part in lower])
 
     @property
     def anchor(self) -> Tensor:
@@ -139,7 +173,7 @@ class LocalFilter:
         fresh = torch.isnan(old.anchor).any(0)  # nothing is known before the first sample
         mean, variance = torch.where(fresh, 0.0, mean), variance * scale
         variance = torch.where(fresh, (1 + self.ratio) * self.base, variance)
-        return mean.mT.to(state.table), variance.mT.to(state.table)
+        return mean.mT.to(state.blocks), variance.mT.to(state.blocks)
 
     def learn(self, state: StreamState, x: Tensor, y: Tensor, lapse: Tensor | None = None) -> None:
         """Learn one sample a stream, in place, computed in float64.
@@ -160,7 +194,7 @@ class LocalFilter:
         seen = ~torch.isnan(y)
         y = torch.where(seen, y.double(), 0.0)
         size, largest = y.abs().amax(0), old.largest[0]
-        tiny = torch.finfo(state.table.dtype).eps ** 0.5
+        tiny = torch.finfo(state.dtype).eps ** 0.5
         sound = measured & seen.any(0) & torch.isfinite(x).all(0) & torch.isfinite(y).all(0)
         huge = (since > 0) & (largest > 0) & (size * tiny > largest)
         small = (size > 0) & (size < largest * tiny)
@@ -189,13 +223,10 @@ class LocalFilter:
             old.errors * start,
             torch.where(afresh, none, largest)[None],
         )
-        most = torch.finfo(state.table.dtype).max
+        most = torch.finfo(state.dtype).max
         found, good = self._update(moved, since, _Sample(z, y, seen, lapse, fine, most))
-        rows = [
-            torch.where(good, new, old_).reshape(-1, x.shape[1])
-            for new, old_ in zip(found, moved, strict=True)
-        ]
-        state.table.copy_(torch.cat(rows))
+        kept = [torch.where(good, new, old_) for new, old_ in zip(found, moved, strict=True)]
+        state.put(state.whole(Parts(*kept)))
         streak = torch.where(afresh & good, 0, streak)
         state.counts.copy_(torch.stack((samples + good, skipped + ~good, streak, since + good)))
 
@@ -231,6 +262,14 @@ class LocalFilter:
         """Running residual variance in units of the predicted: the prior's at first, then what errors say."""
         trust = samples.clamp(max=20) / 20.0
         return (errors * trust + self.base * (1 - trust)).clamp(min=1e-6 * self.base)
+
+
+def _blocks(table: Tensor) -> Tensor:
+    """(rows, S) -> (ceil(S / LANES), rows, LANES), zeros behind the last stream."""
+    short = -table.shape[1] % LANES
+    padded = torch.nn.functional.pad(table, (0, short))
+    blocks: Tensor = padded.unflatten(1, (-1, LANES)).transpose(0, 1).contiguous()
+    return blocks
 
 
 def _apply(matrix: Tensor, vector: Tensor) -> Tensor:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import pytest
 import torch
+from torch import Tensor
 
 from staf_torch import lanes
-from staf_torch.lanes.eliminations import eigenvalues
+from staf_torch.lanes.eliminations import eigenvalues, solve, solve_definite
 
 
 def matrices(size: int, dtype: torch.dtype = torch.float64) -> torch.Tensor:
@@ -28,6 +29,45 @@ def test_eigenvalues_are_those_of_lapack_to_rounding_of_the_largest(size: int, d
     wanted = torch.linalg.eigvalsh(given.double())
     error = (eigenvalues(given).double() - wanted).abs().amax(-1)
     assert (error <= 16 * torch.finfo(dtype).eps * wanted.abs().amax(-1)).all()
+
+
+@pytest.mark.parametrize("size", [1, 2, 5, 13])
+def test_a_definite_system_is_solved_to_the_rounding_of_its_condition(size: int) -> None:
+    torch.manual_seed(size)
+    some, right = torch.randn(9, size, size).double(), torch.randn(9, size).double()
+    gram = some @ some.mT + 0.1 * torch.eye(size)
+    error = solve_definite(gram, right) - torch.linalg.solve(gram, right)
+    assert (error.norm(dim=-1) <= 1e-13 * torch.linalg.cond(gram) * right.norm(dim=-1)).all()
+    gram[..., 0, 1:] = torch.nan  # above the diagonal nothing is read
+    assert solve_definite(gram, right).isfinite().all()
+
+
+@pytest.mark.parametrize(("size", "left"), [(3, False), (9, True)])
+def test_a_program_solves_with_pivots(size: int, left: bool) -> None:
+    torch.manual_seed(size)
+    matrix, right = torch.randn(9, size, size).double(), torch.randn(9, size, size).double()
+    matrix[:, 0, 0] = 0  # the first pivot is another
+    matrix[3], matrix[4, 0] = 0, torch.nan
+
+    def step(_: object, __: object, row: tuple[Tensor, Tensor]) -> tuple[tuple[()], Tensor]:
+        return (), torch.linalg.solve_ex(*row, left=left)[0]
+
+    program, given = lanes.Program(step), (matrix, right)
+    assert program.compiles((), (), given, steps=1)
+    found, wanted = (
+        program((), (), given, steps=1)[1][:, 0],
+        program.definition((), (), given, steps=1)[1][:, 0],
+    )
+    fine = [k for k in range(9) if k not in (3, 4)]
+    assert not found[[3, 4]].isfinite().any()
+    torch.testing.assert_close(found[fine], wanted[fine], rtol=1e-10, atol=1e-10)
+
+
+def test_the_place_of_a_pivot_that_is_zero_is_said_and_a_vector_is_a_vector() -> None:
+    matrix, right = torch.eye(3).double().repeat(2, 1, 1), torch.arange(6.0).double().view(2, 3)
+    matrix[1, 1:] = 0
+    assert solve(matrix, right.unsqueeze(-1))[3].tolist() == [0, 2]
+    assert torch.equal(solve(matrix[:1], right[0])[0], right[:1])
 
 
 def test_eigenvalues_of_a_row_that_is_not_finite_are_nan() -> None:

@@ -30,13 +30,13 @@ def definition_of(bank: Bank) -> Bank:
 @needs_compiler
 @pytest.mark.parametrize("outputs", [1, 2])
 def test_compiled_bank_is_what_the_definition_says(outputs: int) -> None:
-    shape = BankShape(2, outputs, 130, 12)
+    shape = BankShape(2, outputs, 80, 10)
     fast, slow = Bank(shape, 2, True), definition_of(Bank(shape, 2, True))
-    x, y = streams(190, 2, outputs)
+    x, y = streams(125, 2, outputs)
     x[50, 0, 1], y[60, 1, 0], x[70, 1, 0] = torch.nan, torch.nan, torch.inf
     y[80, 0], x[90, 1] = 1e300, 1e12
-    x[150:, 1] += 1e9  # gone for good: it starts afresh
-    for k in range(190):
+    x[105:, 1] += 1e9  # gone for good: it starts afresh
+    for k in range(125):
         lapse = None if k % 3 else torch.tensor([0.5, 2.0], dtype=torch.float64)
         if k % 5:
             for found, expected in zip(fast.predict(x[k]), slow.predict(x[k]), strict=True):

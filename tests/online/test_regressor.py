@@ -85,8 +85,9 @@ def test_around_one_anchor_the_filter_is_gaussian_process_regression(kernel: str
     state = StreamState.empty(torch.zeros(0).double(), 1, 2, 6, 1)
     filter_ = LocalFilter(frame, tensor([ratio]), tensor([1.0]), slack=1.0)
     filter_.learn(state, SEVERAL[:, :1].mT, tensor([[0.0]]))  # the first sample says where the centers are
-    state.parts(state.table).mean.zero_()
-    state.parts(state.table).learned.zero_()
+    parts = state.parts(state.table)
+    nothing = parts._replace(mean=torch.zeros_like(parts.mean), learned=torch.zeros_like(parts.learned))
+    state.put(state.whole(nothing))
     for k in range(20):
         filter_.learn(state, (SEVERAL[:, :1] + z[:, k : k + 1]).mT, y[k : k + 1, None])
     x = SEVERAL[:, :1].expand(2, 20)
