@@ -196,6 +196,7 @@ OTHERS = {"_Held", "ConventionModule", "FunctionPlant", "StepPlant", "RatePlant"
 OTHERS |= {"SampledProblem", "GlobalValue", "SafetyFilter", "FilteredPolicy", "PlanReplay"}
 OTHERS |= {"RecedingHorizon", "MujocoPlant", "EnvironmentPlant"}
 OTHERS |= {"NearOptimal", "SampledRollout"}
+OTHERS |= {"ParametricPlant", "ChangingPlant", "AdaptiveLQR", "ConcurrentTracker", "Measured", "_Informed"}
 """What wraps a function of the user's own, or takes minutes to make: tested in its room."""
 
 

@@ -3,6 +3,27 @@
 import warnings
 
 from .actor_critic import ActorCritic as ActorCritic
+from .adaptation import Adaptation as Adaptation
+from .adaptation import AdaptiveLQR as AdaptiveLQR
+from .adaptation import ChangingPlant as ChangingPlant
+from .adaptation import ConcurrentGradient as ConcurrentGradient
+from .adaptation import ConcurrentTracker as ConcurrentTracker
+from .adaptation import Doubling as Doubling
+from .adaptation import Equation as Equation
+from .adaptation import Estimate as Estimate
+from .adaptation import HistoryStack as HistoryStack
+from .adaptation import IntegralWindows as IntegralWindows
+from .adaptation import LeastSquares as LeastSquares
+from .adaptation import LinearFamily as LinearFamily
+from .adaptation import Measured as Measured
+from .adaptation import ParametricPlant as ParametricPlant
+from .adaptation import SlopeWindow as SlopeWindow
+from .adaptation import SlopeWindows as SlopeWindows
+from .adaptation import Stack as Stack
+from .adaptation import Tracking as Tracking
+from .adaptation import Window as Window
+from .adaptation import measured_rate as measured_rate
+from .adaptation import riccati_rows as riccati_rows
 from .bases import LeadingCoordinates as LeadingCoordinates
 from .bases import QuadraticBasis as QuadraticBasis
 from .bases import RBFGridBasis as RBFGridBasis
@@ -59,13 +80,21 @@ __all__ = [
     "LQR",
     "ActorCritic",
     "ActorCriticLaw",
+    "Adaptation",
+    "AdaptiveLQR",
     "BoundedInputCost",
     "BoxDDP",
+    "ChangingPlant",
+    "ConcurrentGradient",
     "ConcurrentLearning",
+    "ConcurrentTracker",
     "Controller",
     "ControllerState",
     "Cost",
     "DirectShooting",
+    "Doubling",
+    "Equation",
+    "Estimate",
     "Extrapolation",
     "Feedback",
     "Filtered",
@@ -73,13 +102,19 @@ __all__ = [
     "Gains",
     "GlobalValue",
     "HeldStability",
+    "HistoryStack",
     "Identified",
     "IdentifyingTracker",
     "Information",
+    "IntegralWindows",
     "LeadingCoordinates",
+    "LeastSquares",
+    "LinearFamily",
     "LoopResult",
+    "Measured",
     "NearOptimal",
     "Optimum",
+    "ParametricPlant",
     "PlanReplay",
     "Published",
     "QuadraticBasis",
@@ -92,19 +127,26 @@ __all__ = [
     "SafetyFilter",
     "SampledProblem",
     "SampledRollout",
+    "SlopeWindow",
+    "SlopeWindows",
     "StaFValueBasis",
+    "Stack",
     "Supervised",
+    "Tracking",
     "Trajectories",
     "TwoStateTracking",
     "ValueBasis",
     "Weights",
+    "Window",
     "bellman_error",
     "bellman_terms",
     "desired_trajectory",
     "held_stability",
     "hjb_residual",
     "learn_global_value",
+    "measured_rate",
     "near_optimal",
+    "riccati_rows",
     "simulate",
     "tracking_cost",
     "value_gradient",
