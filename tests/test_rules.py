@@ -51,6 +51,7 @@ OTHERS = {
     "StepPlant": "in tests/adp/test_user_plants.py",
     "MujocoPlant": "in tests/systems/test_mujoco_plant.py",
     "RecedingHorizon": "in tests of its own",
+    "EnergyShaping": "in tests/adp/test_energy_shaping.py",
     "report": "in tests of its own",
     "near_optimal": "in tests of its own",
     "SampledRollout": "in tests of its own",

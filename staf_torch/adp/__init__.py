@@ -41,6 +41,7 @@ from .controllers import Supervised as Supervised
 from .cost import BoundedInputCost as BoundedInputCost
 from .cost import Cost as Cost
 from .cost import QuadraticCost as QuadraticCost
+from .energy_shaping import EnergyShaping as EnergyShaping
 from .extrapolation import Extrapolation as Extrapolation
 from .extrapolation import QuadraturePoints as QuadraturePoints
 from .extrapolation import RandomPoints as RandomPoints
@@ -93,6 +94,7 @@ __all__ = [
     "Cost",
     "DirectShooting",
     "Doubling",
+    "EnergyShaping",
     "Equation",
     "Estimate",
     "Extrapolation",
