@@ -10,6 +10,7 @@ import os
 import sys
 from collections.abc import Callable
 
+from ..settings import config_directory as config_directory
 from ..sweeps import callbacks
 from ..sweeps.batching import USER_ERRORS, sentence
 from ..sweeps.hydra_compat import (
@@ -21,7 +22,6 @@ from ..sweeps.hydra_compat import (
     trusted,
     with_mode,
 )
-from ..sweeps.hydra_compat import config_directory as config_directory
 from ..sweeps.job import Refused, execute
 from ..sweeps.resume import command_line
 from ..sweeps.signals import name_and_code, stopped_by_signals

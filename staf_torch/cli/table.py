@@ -11,6 +11,7 @@ from pathlib import Path
 
 from ..results.files import RUNNING, UNFINISHED, write_bytes
 from ..results.reader import Collection, collect
+from ..results.untrusted import visible
 from ..tables import Layout, Style, Table, json_text, latex_text, parquet_bytes, tabulate
 from ..tables.aggregate import AGGREGATES
 
@@ -56,7 +57,7 @@ def _once(options: argparse.Namespace) -> int:
     try:
         found = collect(options.path)
         for skipped in found.skipped:
-            print(f"skipped {skipped.path}: {skipped.reason}", file=sys.stderr)
+            print(f"skipped {visible(str(skipped.path))}: {skipped.reason}", file=sys.stderr)
         for remark in found.remarks:
             print(f"note: {remark}", file=sys.stderr)
         content = _rendered(found, options)

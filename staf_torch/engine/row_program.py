@@ -131,10 +131,13 @@ def program(problem: Problem, states: Tensor, carry: RowCarry, *, everything: bo
     """
     if states.shape[1] < _SHORTEST or not ordinary((states, carry.chase.weights)):
         return None
-    problem = _numbers_as_tensors(problem)
-    parts = problem.basis, problem.target, problem.law, problem.predictor
     settings = problem.inner_steps, problem.certificate, everything
-    made = _kept.of(Step(problem, everything), *parts, settings)
+    owners = problem.basis, problem.target, problem.law, problem.predictor, *settings
+    made = _kept.unchanged(*owners)
+    if made is None:
+        problem = _numbers_as_tensors(problem)
+        parts = problem.basis, problem.target, problem.law, problem.predictor
+        made = _kept.of(Step(problem, everything), *parts, settings, owners=owners)
     return made if made is not None and made.compiles(carry, states) else None
 
 

@@ -144,6 +144,9 @@ EXPERIMENTS: Mapping[str, str] = {
     "adp_comparison": "adp_comparison.run",
     "adp_initial_weights": "adp_comparison.initial_weights",
     "adp_tracking": "adp_tracking.run",
+    "faults": "faults.run",
+    "icl": "icl.run",
+    "safe_box": "safe_box.run",
     "rivals": "rivals.run",
 }
 """Name in `task` -> path within this package. They are imported when they are asked for."""

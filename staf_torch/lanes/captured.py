@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -71,6 +71,8 @@ class Captured:
         self._values: list[Tensor] = []  # read at once: memory may be written to later
         self._checks: list[tuple[Tensor, Any]] = []
         self._repeats = True
+        self._results: dict[Hashable, int] = {}  # operations that ran, and the storage of what they returned
+        self._same: dict[int, int] = {}  # storages, and earlier ones that hold the same numbers
         self.count = 0
 
     def stated(self, tensor: Tensor) -> bool:
@@ -111,6 +113,8 @@ class Captured:
                 if not stated:
                     self._stated.pop(storage.data_ptr(), None)
                     self._derived[storage.data_ptr()] = storage
+                    if not known and not function._schema.is_mutable:
+                        self._recognise(storage.data_ptr(), function, args, kwargs)
                 elif not known and not any(
                     storage.data_ptr() == t.untyped_storage().data_ptr()
                     for t in given
@@ -131,7 +135,7 @@ class Captured:
         for axis, (size, stride) in enumerate(zip(tensor.shape, strides, strict=True)):
             at += (np.arange(size) * stride).reshape([-1] + [1] * (tensor.dim() - axis - 1))
         start = int(tensor.storage_offset())
-        places = self._places.setdefault((tensor.untyped_storage().data_ptr(), kind), {})
+        places = self._places.setdefault((self._first(tensor), kind), {})
         self._found.setdefault(tensor.untyped_storage().data_ptr(), tensor.untyped_storage())
         flat, fresh = at.reshape(-1).tolist(), []
         for index, place in enumerate(flat):
@@ -172,6 +176,37 @@ class Captured:
         address = tensor.untyped_storage().data_ptr()
         for key in [key for key in self._places if key[0] == address]:
             del self._places[key]
+        self._results = {key: result for key, result in self._results.items() if result != address}
+        self._same = {new: old for new, old in self._same.items() if address not in (new, old)}
+
+    def _first(self, tensor: Tensor) -> int:
+        """The storage of a tensor, or the earlier one that holds the same numbers."""
+        address = tensor.untyped_storage().data_ptr()
+        return self._same.get(address, address)
+
+    def _recognise(self, address: int, function: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> None:
+        """Let what an operation returned be what it returned before, of the same arguments.
+
+        Two of a kernel's methods that both scale the offsets of the centers then read the same numbers of
+        the table, and what follows from them in a row is computed once.
+        """
+        key = function, self._description(args), self._description(tuple(kwargs.items()))
+        try:
+            first = self._results.setdefault(key, address)
+        except TypeError:  # an argument that cannot be compared
+            return
+        if first != address:
+            self._same[address] = first
+
+    def _description(self, value: Any) -> Hashable:
+        if isinstance(value, Tensor):
+            if not _in_memory(value):
+                return id(value)
+            form = value.storage_offset(), value.stride(), value.shape, value.dtype
+            return (self._first(value), value._version, *form)
+        if isinstance(value, list | tuple):
+            return tuple(map(self._description, value))
+        return type(value), value  # 1, 1.0 and True are equal
 
 
 def tensors(value: Any) -> list[Tensor]:

@@ -7,29 +7,12 @@ import io
 import pickle
 import sys
 from collections.abc import Hashable
-from types import BuiltinFunctionType, FunctionType
+from operator import is_
+from types import BuiltinFunctionType, FunctionType, MethodType
 from typing import Any
 
+import torch
 from torch import Tensor, nn
-
-
-def content(*objects: Any) -> Hashable | None:
-    """Return a key of all numbers and settings inside of objects; None where one of them holds a closure.
-
-    Classes and functions are told apart by identity, so that one that is defined anew is another. What a
-    function closed over, nobody sees from here.
-
-    Args:
-        objects: modules, tensors, anything that can be pickled.
-    """
-    text = io.BytesIO()
-    writer = _Writer(text)
-    try:
-        for each in objects:
-            writer.dump(each)
-    except (pickle.PicklingError, TypeError, AttributeError):
-        return None
-    return text.getvalue(), tuple(writer.kept)
 
 
 def skeleton(*objects: Any) -> tuple[Hashable, list[Tensor]] | None:
@@ -40,14 +23,8 @@ def skeleton(*objects: Any) -> tuple[Hashable, list[Tensor]] | None:
     Args:
         objects: modules, tensors, anything that can be pickled.
     """
-    text = io.BytesIO()
-    writer = _Skeleton(text)
-    try:
-        for each in objects:
-            writer.dump(each)
-    except (pickle.PicklingError, TypeError, AttributeError):
-        return None
-    return (text.getvalue(), tuple(writer.kept)), writer.tensors
+    writer = _written(objects)
+    return None if writer is None else ((writer.file.getvalue(), tuple(writer.kept)), writer.tensors)
 
 
 def signature(key: Any) -> bytes | None:
@@ -75,13 +52,73 @@ def signature(key: Any) -> bytes | None:
 _VERSIONED = frozenset((__name__.partition(".")[0], "torch", "numpy", *sys.stdlib_module_names)) - {
     "__main__"
 }
-_PLAIN = frozenset((str, int, float, bool, bytes, tuple, list, dict, set, type(None)))
+
+
+class Watch:
+    """Says whether objects are as they were: nothing inside of them has been put in the place of another.
+
+    Args:
+        objects: as of `skeleton`.
+
+    Attributes:
+        tensors: inside of them.
+        blind: whether something inside cannot be watched.
+    """
+
+    def __init__(self, *objects: Any) -> None:
+        writer = _written(objects)
+        self.blind = writer is None or writer.blind
+        if writer is None:
+            return
+        self.tensors = [*writer.tensors, *writer.others]
+        self._versions = [tensor._version for tensor in self.tensors]
+        self._dicts = [(part, list(part.values())) for part in writer.dicts]
+        self._lists = [(part, list(part)) for part in writer.lists]
+        self._sets = [(part, set(part)) for part in writer.sets]
+
+    def unchanged(self) -> bool:
+        """Return whether nothing has changed since."""
+        if self.blind:
+            return False
+        for part, values in self._dicts:
+            if len(part) != len(values) or not all(map(is_, part.values(), values)):
+                return False
+        for row, values in self._lists:
+            if len(row) != len(values) or not all(map(is_, row, values)):
+                return False
+        if any(now != then for now, then in self._sets):
+            return False
+        return [tensor._version for tensor in self.tensors] == self._versions
+
+
+def _written(objects: tuple[Any, ...]) -> _Writer | None:
+    writer = _Writer(io.BytesIO())
+    try:
+        for each in objects:
+            writer.dump(each)
+    except (pickle.PicklingError, TypeError, AttributeError):
+        return None
+    return writer
+
+
+_ATOMS = frozenset((str, int, float, bool, bytes, tuple, type(None)))  # and what an address alone tells apart
+_FIXED = (tuple, type, FunctionType, BuiltinFunctionType, MethodType, torch.dtype, torch.device, frozenset)
 
 
 class _Writer(pickle.Pickler):
+    """Writes everything but floating-point tensors, and notes what may change later."""
+
     def __init__(self, file: io.BytesIO) -> None:
         super().__init__(file)
+        self.file = file
         self.kept: list[object] = []  # part of the key: an address is used once
+        self.tensors: list[Tensor] = []
+        self.others: list[Tensor] = []  # whose numbers are part of the key
+        self.dicts: list[dict[Any, Any]] = []
+        self.lists: list[list[Any]] = []
+        self.sets: list[set[Any]] = []
+        self.blind = False
+        self._places: dict[int, int] = {}
 
     def reducer_override(self, value: Any) -> Any:
         if not isinstance(value, nn.Module):
@@ -94,32 +131,40 @@ class _Writer(pickle.Pickler):
         return copyreg.__newobj__, (type(value),), state | hooks  # type: ignore[attr-defined]
 
     def persistent_id(self, value: Any) -> Any:
-        if type(value) in _PLAIN:  # most of all: asked for every object
+        if type(value) in _ATOMS:  # most of all: asked for every object
             return None
+        if isinstance(value, Tensor):
+            return self._tensor(value)
         if isinstance(value, FunctionType) and value.__closure__:
             raise pickle.PicklingError("a closure")
         if isinstance(value, type | FunctionType | BuiltinFunctionType):
             self.kept.append(value)
             return len(self.kept)
-        if isinstance(value, Tensor):
-            plain = value.detach().cpu()
-            return str(value.dtype), str(value.device), tuple(value.shape), plain.numpy().tobytes()
+        self._note(value)
         return None
 
-
-class _Skeleton(_Writer):
-    def __init__(self, file: io.BytesIO) -> None:
-        super().__init__(file)
-        self.tensors: list[Tensor] = []
-        self._places: dict[int, int] = {}
-
-    def persistent_id(self, value: Any) -> Any:
-        if type(value) in _PLAIN:
-            return None
-        if not isinstance(value, Tensor) or not value.is_floating_point():
-            return super().persistent_id(value)
+    def _tensor(self, value: Tensor) -> Any:
+        if not value.is_floating_point():
+            self.others.append(value)
+            plain = value.detach().cpu()
+            return str(value.dtype), str(value.device), tuple(value.shape), plain.numpy().tobytes()
         if id(value) not in self._places:
             self._places[id(value)] = len(self.tensors)
             self.tensors.append(value)
         place = self._places[id(value)]
         return place, str(value.dtype), str(value.device), tuple(value.shape), value.stride()
+
+    def _note(self, value: Any) -> None:
+        known = True
+        if isinstance(value, dict):
+            self.dicts.append(value)
+        elif isinstance(value, list):
+            self.lists.append(value)
+        elif isinstance(value, set):
+            self.sets.append(value)
+        else:
+            known = isinstance(value, _FIXED)
+        if hasattr(value, "__dict__"):
+            self.dicts.append(vars(value))
+        elif not known:
+            self.blind = True

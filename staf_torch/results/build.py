@@ -91,6 +91,40 @@ def modules(settings: Mapping[str, Any]) -> dict[str, str]:
     return dict(sorted(found.items()))
 
 
+def imported(own: Mapping[str, str]) -> dict[str, str]:
+    """Return a hash of every further module of this process that lies where the user's own modules lie.
+
+    Among them are those that the user's code imports by names that it makes, which nobody finds by reading.
+
+    Args:
+        own: what `modules` found.
+    """
+    places = (_locate(tuple(name.split(".")), tuple(sys.path), os.getcwd()) for name in own)
+    bases = tuple(f"{base}{os.sep}" for _, base in filter(None, places) if not _installed(base))
+    standard = os.path.dirname(os.__file__)  # may lie below a working directory
+    found: dict[str, str | None] = {}
+    for name, module in sorted(sys.modules.items()) if bases else ():
+        file = getattr(module, "__dict__", {}).get("__file__")
+        if name in own or name.partition(".")[0] in (_PACKAGE.name, "__main__") or not isinstance(file, str):
+            continue
+        if file.startswith(bases) and not file.startswith(standard):
+            found[name] = None if any(map(_installed, Path(file).parents)) else _hash(name)
+    return {name: known for name, known in found.items() if known is not None}
+
+
+def _installed(folder: Path) -> bool:
+    return folder.name in ("site-packages", "dist-packages")
+
+
+def _hash(name: str) -> str | None:
+    """The hash of a module's file as it is now, None: there is none."""
+    place = _locate(tuple(name.split(".")), tuple(sys.path), os.getcwd())
+    if place is None or not place[0].is_file():
+        return None
+    stamp = place[0].stat()
+    return _module(place[0], stamp.st_mtime_ns, stamp.st_size)[0]
+
+
 def differences(then: Mapping[str, Any], now: Mapping[str, Any]) -> Iterator[str]:
     """Yield one phrase for each setting, or other entry of a record, that is not what it was.
 
@@ -108,9 +142,13 @@ def differences(then: Mapping[str, Any], now: Mapping[str, Any]) -> Iterator[str
         if was.get(key) != will.get(key):
             what = "the source of staf_torch" if key == "source" else key
             yield f"{what} was {_shown(was.get(key))} and is now {_shown(will.get(key))}"
+    others = _plain(was.get("imported"))
     was, will = _plain(was.get("modules")), _plain(will.get("modules"))
     for name in sorted({*was, *will}):
         if was.get(name) != will.get(name):
+            yield f"the module {name} has changed"
+    for name in sorted({*others} - {*was, *will}):
+        if others[name] != _hash(name):
             yield f"the module {name} has changed"
 
 
@@ -158,7 +196,7 @@ def _collect(name: str, file: Path, base: Path, found: dict[str, str]) -> None:
         return
     stamp = file.stat()
     found[name], imported = _module(file, stamp.st_mtime_ns, stamp.st_size)
-    installed = base.name in ("site-packages", "dist-packages")
+    installed = _installed(base)
     for other in imported:
         absolute = _absolute(name, other, file.name == "__init__.py")
         if installed and absolute.partition(".")[0] != name.partition(".")[0]:

@@ -96,7 +96,8 @@ def collect(path: str | Path | Sequence[str | Path]) -> Collection:
     if not rows and not skipped:
         raise fail("collect", "path", "must hold a run or a sweep of runs", [str(p) for p in paths])
     collection = Collection(tuple(rows), tuple(skipped))
-    return dataclasses.replace(collection, remarks=(*versions(rows), *mixed(collection)))
+    remarks = tuple(map(visible, (*versions(rows), *mixed(collection))))
+    return dataclasses.replace(collection, remarks=remarks)
 
 
 def _further_names(known: set[str], runs: Sequence[Run]) -> set[str]:

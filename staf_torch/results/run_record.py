@@ -14,7 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from .._version import __version__
-from .build import build, checksums, damaged, differences, record_checksum
+from .build import build, checksums, damaged, differences, imported, record_checksum
 from .files import COMPLETED, METRICS, flatten, plain, write_text
 from .files import RUN as RUN
 from .files import SWEEP as SWEEP
@@ -64,6 +64,9 @@ class RunRecord:
         spent = round(time.monotonic() - self._start, 3)
         record = {**self._about, "status": status, "reason": reason, "seconds": spent}
         if status == COMPLETED:
+            made_by = self._about["build"]
+            further = imported(made_by["modules"])  # as the run has ended: it imported them on its way
+            record["build"] = {**made_by, "imported": further} if further else made_by
             record["files"] = checksums(directory, frozenset({RUN}))
         record["checksum"] = record_checksum(record)
         write_text(directory / RUN, json.dumps(record, indent=1, allow_nan=False) + "\n")
@@ -143,11 +146,6 @@ def resumed(cfg: DictConfig) -> bool:
 def resumed_anyway(cfg: DictConfig) -> bool:
     """Return whether runs count that were made by other settings or another source than those of today."""
     return OmegaConf.select(cfg, f"{SETTINGS}.resume_anyway") is True
-
-
-def without_hydra(config: DictConfig) -> DictConfig:
-    """Return a copy of the settings as a task sees them."""
-    return OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
 
 
 def begin_sweep(directory: Path, overrides: Sequence[str], hydra: Sequence[str]) -> None:

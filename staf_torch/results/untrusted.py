@@ -162,10 +162,10 @@ def too_deep(value: Any, left: int = _DEEPEST) -> bool:
 
 
 def links_in(directory: Path) -> list[Path]:
-    """Return what in and under a folder is neither a regular file nor a folder, such as links and pipes.
+    """Return what in and under a folder is neither a regular file of one name nor a folder, such as links.
 
-    Nothing of ours writes one, and who writes to a file behind a link writes elsewhere. A folder that cannot
-    be listed counts too.
+    Nothing of ours writes one, and who writes to a file behind a link, or to one that has another name
+    elsewhere (a hard link), writes elsewhere. A folder that cannot be listed counts too.
     """
     found, folders = [], [directory]
     while folders:
@@ -175,13 +175,20 @@ def links_in(directory: Path) -> list[Path]:
                 for entry in entries:
                     if entry.is_dir(follow_symlinks=False):
                         folders.append(Path(entry.path))
-                    elif not entry.is_file(follow_symlinks=False):
+                    elif not _plain_file(entry):
                         found.append(Path(entry.path))
         except FileNotFoundError:
             continue
         except OSError:
             found.append(folder)
     return found
+
+
+def _plain_file(entry: os.DirEntry[str]) -> bool:
+    try:
+        return entry.is_file(follow_symlinks=False) and entry.stat(follow_symlinks=False).st_nlink < 2
+    except FileNotFoundError:  # it has gone since it was listed
+        return True
 
 
 def _decoded(content: bytes, name: str) -> str:

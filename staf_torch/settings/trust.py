@@ -7,6 +7,7 @@ that is loaded are resolved here first, by references alone, and only then looke
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import functools
 import inspect
 import math
@@ -14,6 +15,7 @@ import re
 import resource
 import signal
 import threading
+import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import FrameType
@@ -42,6 +44,7 @@ _MOST_STEPS = 1e7  # of a trajectory
 _SIZE = 1000  # of any other whole number: counts of centers, orders, degrees, points
 _MOST_ENTRIES = 1000  # of a list
 _MEMORY, _SECONDS = 256 * 2**20, 4.0  # of building, beyond what the process had
+_LOOK = 0.05  # s between two looks at the time of another thread
 _SPECIAL = {"_target_", "_partial_", "_convert_", "_recursive_"}
 
 
@@ -173,26 +176,22 @@ def _leaves(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
 def limited(what: str) -> Iterator[None]:
     """Let what is built here take a quarter of a gigabyte and four seconds of CPU time at most.
 
-    Sizes multiply in more ways than `checked` knows. Outside the main thread the time is not limited, and
-    memory is on Linux alone.
+    Sizes multiply in more ways than `checked` knows. Memory is limited on Linux alone, and time while Python
+    code runs: a single call of a library in C ends first.
 
     Raises:
         ValueError: where that is exceeded.
     """
-
-    def stop(number: int, frame: FrameType | None) -> None:
-        raise ValueError(f"{what} takes more than {_SECONDS:g} s to build: add --trust to wait.")
-
     soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
     most = _data_bytes() + _MEMORY
     main = threading.current_thread() is threading.main_thread()
-    before = signal.signal(signal.SIGPROF, stop) if main else None
     try:
         if most > _MEMORY:
             resource.setrlimit(resource.RLIMIT_DATA, (most if hard < 0 else min(most, hard), hard))
-        if main:
-            signal.setitimer(signal.ITIMER_PROF, _SECONDS)
-        yield
+        with _stopped_by_signal() if main else _stopped_by_thread():
+            yield
+    except _TooLongError as error:
+        raise ValueError(f"{what} takes more than {_SECONDS:g} s to build: add --trust to wait.") from error
     except (MemoryError, RuntimeError) as error:
         if isinstance(error, MemoryError) or "memory" in str(error):
             raise ValueError(
@@ -200,10 +199,51 @@ def limited(what: str) -> Iterator[None]:
             ) from error
         raise
     finally:
-        if main:
-            signal.setitimer(signal.ITIMER_PROF, 0)
-            signal.signal(signal.SIGPROF, before)
         resource.setrlimit(resource.RLIMIT_DATA, (soft, hard))
+
+
+class _TooLongError(Exception):
+    """The time is over."""
+
+
+@contextlib.contextmanager
+def _stopped_by_signal() -> Iterator[None]:
+    """Raise `_TooLongError` in the main thread when the process has used its time."""
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        raise _TooLongError
+
+    before = signal.signal(signal.SIGPROF, stop)
+    try:
+        signal.setitimer(signal.ITIMER_PROF, _SECONDS)
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_PROF, 0)
+        signal.signal(signal.SIGPROF, before)
+
+
+@contextlib.contextmanager
+def _stopped_by_thread() -> Iterator[None]:
+    """Raise `_TooLongError` in a thread that is not the main one and gets no signals; a third one watches."""
+    watched = threading.get_ident()
+    clock = time.pthread_getcpuclockid(watched)
+    until = time.clock_gettime(clock) + _SECONDS
+    ended, lock = threading.Event(), threading.Lock()
+
+    def watch() -> None:
+        while not ended.wait(_LOOK):
+            with lock:
+                if not ended.is_set() and time.clock_gettime(clock) > until:
+                    raised = ctypes.py_object(_TooLongError)
+                    ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(watched), raised)
+                    return
+
+    threading.Thread(target=watch, daemon=True).start()
+    try:
+        yield
+    finally:
+        with lock:  # from here on nothing is raised that has not been
+            ended.set()
 
 
 def _data_bytes() -> int:

@@ -244,8 +244,9 @@ def _refuse_links(directory: Path) -> None:
     if found:
         more = f" and {len(found) - 1} more" if len(found) > 1 else ""
         raise ValueError(
-            f"{visible(str(found[0]))}{more} is a link, a pipe or the like, which no run writes: what goes "
-            "there would end elsewhere. Remove it, or choose another directory."
+            f"{visible(str(found[0]))}{more} is a link (or has another name, as hard links have), a pipe or "
+            "the like, which no run writes: what goes there would end elsewhere. Remove it, or choose "
+            "another directory."
         )
 
 

@@ -110,18 +110,12 @@ class Job(NamedTuple):
 
     num: int
     overrides: list[str]
-    config: DictConfig  # with Hydra's node
-    settings: DictConfig  # without
+    settings: DictConfig  # as the task sees them, without Hydra's node
 
     @property
     def name(self) -> str:
         """`job 3 (kernel=gaussian seed=1)`."""
         return job_name(self.num, self.overrides)
-
-    @property
-    def directory(self) -> Path:
-        """The run directory."""
-        return Path(str(self.config.hydra.sweep.dir)) / str(self.config.hydra.sweep.subdir)
 
 
 def job_name(num: int, overrides: Sequence[str]) -> str:
@@ -130,7 +124,7 @@ def job_name(num: int, overrides: Sequence[str]) -> str:
 
 
 class _Jobs(Sequence[Job]):
-    """The jobs of a sweep, composed when they are asked for: settings take half a megabyte a job.
+    """The jobs of a sweep, composed when they are asked for: many settings take much memory.
 
     Args:
         numbered: number of a job to its overrides, in order.
@@ -204,6 +198,7 @@ class Launch:
         self._context = SweepContext(launcher.hydra_context, launcher.config)
         self._task: Callable[[DictConfig], Any] = launcher.task_function
         self._directory = Path(str(launcher.config.hydra.sweep.dir))
+        self._numbered = self._context.numbered
         self._directories: dict[int, Path] = {}  # of the jobs that ran
         if launcher.batch is not None:
             integer("hydra.launcher", "batch", launcher.batch, least=1)
@@ -231,6 +226,8 @@ class Launch:
                         failure = ended._return_value if ended.status == JobStatus.FAILED else None
                         progress.ended(job.name, None if failure is None else reason(failure))
                         returns[job.num] = ended
+                        if len(returns) % _KEPT_JOBS == 0:
+                            gc.collect()  # settings refer to their parents, and go no other way
             finally:
                 progress.close()
                 self._sweep_logging()
@@ -241,9 +238,10 @@ class Launch:
 
     def _replay(self, job: Job, task: Callable[[DictConfig], Any]) -> JobReturn:
         """Run a job whose outcome is known as Hydra runs one, and keep no settings of it."""
-        ended = self._context.run_job(task, job.config, job.settings)
+        config = self._context.job_config(job.num, job.overrides)
+        ended = self._context.run_job(task, config, job.settings)
         ended.cfg = ended.hydra_cfg = None
-        self._directories[job.num] = job.directory
+        self._directories[job.num] = _place(config)
         return ended
 
     def _still_there(self, done: int, jobs: int) -> None:
@@ -274,8 +272,13 @@ class Launch:
             silence_terminal()
 
     def _job(self, num: int, overrides: list[str]) -> Job:
-        config = self._context.job_config(num, overrides)
-        return Job(num, overrides, config, records.without_hydra(config))
+        return Job(num, overrides, self._context.settings(overrides))
+
+    def _place_of(self, job: Job) -> Path:
+        """Return the run directory of a job."""
+        if self._numbered and not any(line.lstrip("+~").startswith("hydra") for line in job.overrides):
+            return self._directory / str(job.num)
+        return _place(self._context.job_config(job.num, job.overrides))
 
     def _finished(self, jobs: _Jobs) -> dict[int, JobReturn]:
         """Return the jobs that an earlier start of this sweep completed."""
@@ -284,9 +287,9 @@ class Launch:
             return found
         anyway = records.resumed_anyway(self._context.master)
         for job in jobs:
-            choices = job.config.hydra.runtime.choices
-            record = records.RunRecord(job.settings, choices, job.overrides, compiler())
-            metrics = record.finished(job.directory, anyway=anyway)
+            config = self._context.job_config(job.num, job.overrides)
+            record = records.RunRecord(job.settings, config.hydra.runtime.choices, job.overrides, compiler())
+            metrics = record.finished(_place(config), anyway=anyway)
             if metrics is not None:
                 ended = JobReturn(overrides=job.overrides, status=JobStatus.COMPLETED)
                 ended.return_value = objective(self._context.master, metrics)
@@ -308,7 +311,7 @@ class Launch:
         with executor(about.executor, about.workers, about.arguments, self._directory) as workers:
             outcomes = compute(
                 _Each(jobs, lambda job: job.settings),
-                _Each(jobs, lambda job: job.directory),
+                _Each(jobs, self._place_of),
                 workers,
                 finished={i for i, num in enumerate(jobs.numbers) if num in finished},
                 most=about.batch,
@@ -325,12 +328,17 @@ def _seldom_collecting() -> Iterator[None]:
     all of them for cycles after every few, a fifth of the time of a sweep."""
     before = gc.get_threshold()
     gc.freeze()  # the half a million objects of torch are here to stay
-    gc.set_threshold(100_000, 10, 10)
+    gc.set_threshold(20_000, 5, 5)
     try:
         yield
     finally:
         gc.set_threshold(*before)
         gc.unfreeze()
+
+
+def _place(config: DictConfig) -> Path:
+    """Return the run directory of a job whose configuration has Hydra's node."""
+    return Path(str(config.hydra.sweep.dir), str(config.hydra.sweep.subdir))
 
 
 def _off_the_terminal(outcome: Outcome, seconds: float, progress: Progress) -> Callable[[DictConfig], Any]:

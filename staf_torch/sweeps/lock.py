@@ -66,6 +66,8 @@ class DirectoryLock:
             flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC | os.O_NONBLOCK
             file = os.open(self._path, flags, 0o644)
             try:
+                if os.fstat(file).st_nlink > 1:  # what we write there would be in the other file too
+                    raise OSError(errno.EMLINK, "it is a hard link", str(self._path))
                 self._hold(file)
                 if os.fstat(file).st_ino == os.stat(self._path, follow_symlinks=False).st_ino:
                     return file

@@ -20,7 +20,7 @@ from ..results.reader import collect, read_record
 from . import callbacks
 from .batching import sentence
 from .hydra_compat import broken_sweep, overrides_in
-from .hydra_in_process import application
+from .hydra_compat.in_process import application
 from .job import PRINTS, Refused, execute, silence_terminal
 from .resume import command_line
 from .runs import Run, Runs

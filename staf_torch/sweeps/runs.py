@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import contextlib
 import dataclasses
 import html
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -14,6 +15,7 @@ from ..results import reader
 from ..results.files import FIGURES, HISTORY, parse_overrides
 from ..results.reader import Collection, Value, identity
 from ..results.run_directory import History
+from ..results.untrusted import UnreadableError, read_bytes
 from ..tables import Layout, Style, Table, html_text, tabulate
 from ..tables.columns import significant
 from ..tables.model import data_frame, require
@@ -24,6 +26,7 @@ if TYPE_CHECKING:
     DataFrame = Any
 
 Draw = Callable[["Run"], Mapping[str, "Figure"]]
+_MOST_PICTURE = 2**25  # bytes
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -68,17 +71,22 @@ class Run(reader.Run):
         return dict(self.draw(self))
 
     def _repr_html_(self) -> str:
-        pictures = sorted((self.directory / FIGURES).glob("*.png"))
         shown = "".join(
-            f'<img style="max-width:100%" alt="{html.escape(p.stem)}" '
-            f'src="data:image/png;base64,{base64.b64encode(p.read_bytes()).decode()}">'
-            for p in pictures
+            f'<img style="max-width:100%" alt="{html.escape(name)}" '
+            f'src="data:image/png;base64,{base64.b64encode(picture).decode()}">'
+            for name, picture in self._pictures()
         )
         rows = "".join(
             f"<tr><th>{html.escape(name)}</th><td>{html.escape(significant(value, 4))}</td></tr>"
             for name, value in self.metrics.items()
         )
         return f"<p><code>{html.escape(repr(self))}</code></p>{shown}<table>{rows}</table>"
+
+    def _pictures(self) -> Iterator[tuple[str, bytes]]:
+        """Yield name and content of every picture in this folder; a link may lead to anything."""
+        for path in sorted((self.directory / FIGURES).glob("*.png")):
+            with contextlib.suppress(UnreadableError):
+                yield path.stem, read_bytes(path, _MOST_PICTURE, root=self.directory)
 
 
 @dataclasses.dataclass(frozen=True, repr=False)

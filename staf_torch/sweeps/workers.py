@@ -34,7 +34,7 @@ class Worker:
     def __init__(self, work: Callable[..., bytes]) -> None:
         context = multiprocessing.get_context("spawn")  # torch's threads do not survive a fork
         self._ours, theirs = context.Pipe()
-        self._process = context.Process(target=_serve, args=(work, theirs), daemon=True)
+        self._process = context.Process(target=_serve, args=(work, theirs, os.getpid()), daemon=True)
         self._process.start()
         theirs.close()
 
@@ -85,11 +85,11 @@ def _end_of(code: int | None) -> str:
     return f"it ended with exit code {code}"
 
 
-def _serve(work: Callable[..., bytes], theirs: multiprocessing.connection.Connection) -> None:
-    """Compute what comes through the pipe until it closes, in the process of a `Worker`."""
+def _serve(work: Callable[..., bytes], theirs: multiprocessing.connection.Connection, parent: int) -> None:
+    """Compute what comes through the pipe until it closes, in the process of a `Worker` of that parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends us
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    end_with(os.getppid(), parent=True)
+    end_with(parent, parent=True)  # which may have ended while this process began
     while True:
         try:
             arguments = theirs.recv()

@@ -39,7 +39,7 @@ class Barrier(ControlAffineSystem):
         >>> s.round(decimals=4), plant.margin(s)
         (tensor([15.6073,  3.0000], dtype=torch.float64), tensor(1.0000e-06, dtype=torch.float64))
 
-        Shown by `staf_torch/adp/README.md`.
+        Shown by `staf experiment=safe_box`.
 
     Args:
         plant: with `dim`, in continuous time and affine in the control.
@@ -122,6 +122,13 @@ class Barrier(ControlAffineSystem):
                 f"`Barrier.transform(x=...)` must lie strictly between the walls {low.tolist()} and "
                 f"{high.tolist()}; not so row {named}, of which the first is {first}."
             )
+        return self.coordinates(x)
+
+    def coordinates(self, x: Tensor) -> Tensor:
+        """`transform` without its check, NaN outside the box, for compiled loops: (..., n) -> (..., n)."""
+        center = self.center.to(x)
+        if self._turning:
+            x = center + wrap(x - center, self._turning)
         down = torch.where(self.walled[0], (x - self.floor.to(x)) * self.below.to(x), 1.0)
         up = torch.where(self.walled[1], (self.ceiling.to(x) - x) * self.above.to(x), 1.0)
         return self._coordinate(x - center, down, up)

@@ -19,7 +19,7 @@ class TwoStateChain(ControlAffineSystem):
         >>> plant.drift(torch.tensor([0.0, 1.0]).double())  # h = 3
         tensor([1., 4.], dtype=torch.float64)
 
-        Shown by `staf system=two_state_chain`.
+        Shown by `staf experiment=safe_box`.
 
     Args:
         theta: the parameters (a, b, c, d), in 1/s.

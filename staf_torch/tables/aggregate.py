@@ -13,6 +13,7 @@ from ..numerics import TABLE_COMMAND, fail
 from ..results.files import COMPLETED
 from ..results.metric_info import OWN
 from ..results.reader import Collection, Run, Value, identity
+from ..results.untrusted import visible
 from .columns import Column, Row, Style
 from .model import Table
 
@@ -304,7 +305,7 @@ def _notes(runs: Sequence[Run]) -> Iterator[str]:
         if run.reason is not None:
             reasons.setdefault((run.status, run.reason), []).append(run)
     for (status, reason), those in reasons.items():
-        shown = ", ".join(str(run.directory) for run in those[:_NAMED])
+        shown = ", ".join(visible(str(run.directory)) for run in those[:_NAMED])
         more = f" and {len(those) - _NAMED} more" if len(those) > _NAMED else ""
         yield f"{len(those)} of {len(runs)} {status}: {reason} (in {shown}{more})"
 

@@ -42,6 +42,9 @@ _SPECIAL = {
     "±": r"\ensuremath{\pm}",
 }
 _LINK = re.compile(r"\]\s*[(\[:]")
+_FORMULA = re.compile(
+    "\\s*[=+\\-@|%\uff1d\uff0b\uff0d\uff20]|[\\t\\r]"
+)  # what a spreadsheet computes, wide letters too
 _BLOCK = re.compile(r"^(?:#{1,6} |> ?|[-+=~]{3,}|[-+] )")  # of Markdown, at the begin of a line
 
 
@@ -124,8 +127,7 @@ class Table:
 def _csv_cell(value: Value) -> Value:
     if isinstance(value, list | bool):
         return dumps(value)
-    formula = isinstance(value, str) and value.startswith(("=", "+", "-", "@", "\t", "\r", "|", "%"))
-    return f"'{value}" if formula else value
+    return f"'{value}" if isinstance(value, str) and _FORMULA.match(value) else value
 
 
 def _escaped(text: str) -> str:

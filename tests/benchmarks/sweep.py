@@ -1,6 +1,7 @@
 """A hundred jobs by `staf -m`, `staf_torch.sweep` and Hydra's basic launcher; a thousand members in one job.
 
-With nothing else running: `python tests/benchmarks/sweep.py [--json FILE] [--only batched,python,memory]`.
+With nothing else running: `python tests/benchmarks/sweep.py [--json FILE] [--only batched,python]`. What
+many jobs and members cost beside their numbers (40 steps each): `--only jobs2000,members20000,members100000`.
 """
 
 from __future__ import annotations
@@ -8,17 +9,18 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import resource
 import subprocess
 import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
 LENGTH = ["duration=5", "settle_time=1", "figures=false"]  # 500 steps
 RADII, COUNTS = "centers.radius=0.05,0.1,0.15,0.2,0.3", "centers.count=3,6,10,15"
 JOBS = ["-m", RADII, COUNTS, "seed=range(5)", "trajectories=2", *LENGTH]
+SHORT = ["trajectories=2", "duration=0.4", "settle_time=0.2", "figures=false", "history=false"]
 STAF = ["-m", "staf_torch"]
 PYTHON = f"import staf_torch; assert len(staf_torch.sweep(*{JOBS[1:]!r}, directory='sweep')) == 100"
 MEMORY = f"""
@@ -36,34 +38,40 @@ COMMANDS = {
     "python": ["-c", PYTHON],
     "memory": ["-c", MEMORY],
     "basic": [*STAF, *JOBS, "hydra.sweep.dir=sweep", "hydra/launcher=basic"],
+    "jobs2000": [*STAF, "-m", RADII, COUNTS, "seed=range(100)", *SHORT, "hydra.sweep.dir=sweep"],
+    "members20000": [*STAF, f"members=['{RADII}','{COUNTS}','seed=range(1000)']", *SHORT],
+    "members100000": [*STAF, f"members=['{RADII}','{COUNTS}','seed=range(5000)']", *SHORT],
     "members": [*STAF, f"members=['{RADII}','{COUNTS}','seed=range(50)']", "trajectories=2", *LENGTH],
 }
 
 
 def measured(argv: list[str]) -> dict[str, float]:
-    """Wall and CPU seconds of a command, all its processes together."""
+    """Wall and CPU seconds of a command with all its processes, and the most memory of its first one, MiB."""
     path = os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
     with tempfile.TemporaryDirectory() as folder:
-        before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
-        line = [sys.executable, *argv]
-        subprocess.run(
-            line, cwd=folder, env={**os.environ, "PYTHONPATH": path}, check=True, stdout=subprocess.DEVNULL
-        )
-        wall, after = time.perf_counter() - start, resource.getrusage(resource.RUSAGE_CHILDREN)
-    cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    return {"wall": round(wall, 2), "cpu": round(cpu, 2)}
+        start = time.perf_counter()
+        line, environment = [sys.executable, *argv], {**os.environ, "PYTHONPATH": path}
+        process = subprocess.Popen(line, cwd=folder, env=environment, stdout=subprocess.DEVNULL)
+        _, status, used = os.wait4(process.pid, 0)
+        wall = time.perf_counter() - start
+        process.returncode = os.waitstatus_to_exitcode(status)
+        if process.returncode:
+            raise subprocess.CalledProcessError(process.returncode, line)
+    cpu = used.ru_utime + used.ru_stime
+    return {"wall": round(wall, 2), "cpu": round(cpu, 2), "memory": round(used.ru_maxrss / 1024)}
 
 
 def main() -> None:
     """Measure, print, and write where asked."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--json", type=Path)
-    parser.add_argument("--only", default=",".join(COMMANDS))
+    parser.add_argument("--only", default=",".join(name for name in COMMANDS if not name[-1].isdigit()))
     chosen = parser.parse_args()
-    found: dict[str, dict[str, float] | float] = {}
+    found: dict[str, Any] = {}
     for name in chosen.only.split(","):
         found[name] = measured(COMMANDS[name])
-        print(f"{name:8s} {found[name]['wall']:7.2f} s wall {found[name]['cpu']:7.2f} s CPU", flush=True)
+        text = "{wall:7.2f} s wall {cpu:7.2f} s CPU {memory:5.0f} MiB".format(**found[name])
+        print(f"{name:14s} {text}", flush=True)
     if {"batched", "python"} <= set(found):
         found["python_ratio"] = round(found["python"]["cpu"] / found["batched"]["cpu"], 3)
         print(f"staf_torch.sweep takes {found['python_ratio']} of the CPU seconds of staf -m")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 import torch
 from torch import Tensor
@@ -107,3 +109,22 @@ def test_what_a_step_writes_into_its_own_memory_is_followed() -> None:
     first(x, steps=1)
     again = first.with_others(step_of(torch.tensor(3.0)), [])
     torch.testing.assert_close(again(x, steps=1), again.definition(x, steps=1))
+
+
+def test_what_is_computed_twice_of_captured_numbers_is_read_once_unless_it_was_written_to() -> None:
+    a, x = NUMBERS[0].double(), torch.rand(4, 3, dtype=torch.float64)
+
+    def twice(x: Tensor, now: Any, row: Any) -> tuple[Tensor, Any]:
+        return (x * (2 * a).sum()).exp() + (x * (2 * a).sum()).exp(), ()
+
+    def written(x: Tensor, now: Any, row: Any) -> tuple[Tensor, Any]:
+        first, second = 2 * a, 2 * a
+        second += 1
+        return (x * first.sum()).exp() + (x * second.sum()).exp() + (x * (2 * a).sum()).exp(), ()
+
+    for step, exponentials in ((twice, 3), (written, 6)):  # three entries of x
+        program = lanes.Program(step, copies=1)
+        assert program.text(x, steps=1).count("= exp(") == exponentials
+        assert program.compiles(x, steps=1)
+        found, wanted = program(x, steps=1)[0], program.definition(x, steps=1)[0]
+        torch.testing.assert_close(found, wanted, rtol=1e-12, atol=0)

@@ -122,3 +122,40 @@ def test_a_tensor_that_nobody_named_keeps_the_trace_out_of_the_cache(cache: Path
 def test_where_a_derivative_may_be_wanted_there_is_no_program(cache: Path) -> None:
     module = layer(0).requires_grad_(True)
     assert Kept("a test").of(lambda x, _, __: (module(x), x), module) is None
+
+
+CHANGES: dict[str, Any] = {
+    "nothing": lambda m: None,
+    "a tensor in place": lambda m: m[0].bias.add_(1),
+    "another tensor": lambda m: setattr(m[0], "bias", nn.Parameter(m[0].bias.clone(), requires_grad=False)),
+    "another part": lambda m: m.__setitem__(1, nn.Sigmoid()),
+    "an attribute": lambda m: setattr(m[1], "mine", 3.0),
+    "an entry of a list": lambda m: m.notes.append(1),
+    "a hook": lambda m: m[0].register_forward_hook(lambda *_: None),
+    "a derivative": lambda m: m.requires_grad_(True),
+}
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_the_same_objects_are_read_again_once_something_inside_has_changed(change: str, cache: Path) -> None:
+    kept, module = Kept("a test"), layer(0)
+    module.notes = []  # type: ignore[assignment]
+    for _ in range(2):  # the second call is the first from which a watch pays
+        assert kept.unchanged(module, 3) is None
+        program = kept.of(lambda x, _, __: (module(x), x), module, owners=(module, 3))
+    assert kept.unchanged(module, 3) is program
+    assert kept.unchanged(module, 4) is None
+    CHANGES[change](module)
+    assert (kept.unchanged(module, 3) is program) == (change == "nothing")
+
+
+class Slots:
+    __slots__ = ("number",)
+
+
+def test_what_cannot_be_watched_is_read_every_time(cache: Path) -> None:
+    kept, part = Kept("a test"), Slots()
+    part.number = 1.0
+    for _ in range(3):
+        kept.of(lambda x, _, __: (x * part.number, x), part, owners=(part,))
+        assert kept.unchanged(part) is None

@@ -50,8 +50,8 @@ def test_a_configuration_is_the_one_that_hydra_composes(job: list[str]) -> None:
 def test_only_the_choices_of_groups_are_composed(monkeypatch: pytest.MonkeyPatch) -> None:
     composer = Composer(config_loader(), hydra_node=False)
     loaded: list[object] = []
-    load = composer._load
-    monkeypatch.setattr(composer, "_load", lambda lines: loaded.append(lines) or load(lines))
+    load = composer.anew
+    monkeypatch.setattr(composer, "anew", lambda lines: loaded.append(lines) or load(lines))
     found = [composer([f"kernel={k}", f"seed={s}"]) for k in ("gaussian", "matern") for s in range(3)]
     assert loaded == [("kernel=gaussian",), ("kernel=matern",)]
     assert [cfg.seed for cfg in found] == [0, 1, 2, 0, 1, 2]

@@ -5,6 +5,8 @@ from __future__ import annotations
 import pickle
 import resource
 import shutil
+import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +16,8 @@ from hostile_runs import EXPORTS
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from staf_torch.cli.export import deployable, export
+from staf_torch.cli.deployable import deployable
+from staf_torch.cli.export import export
 from staf_torch.cli.staf import config_directory
 from staf_torch.experiments.registry import experiment
 from staf_torch.settings.trust import constructors, limited
@@ -113,3 +116,20 @@ def test_building_takes_no_more_time_than_its_limit(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr("staf_torch.settings.trust._SECONDS", 0.05)
     with pytest.raises(ValueError, match=r"takes more than 0\.05 s"), limited("this"):
         all(n == 0 for n in iter(int, 1))  # zeros without end
+
+
+def test_building_in_a_thread_takes_no_more_time_than_its_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("staf_torch.settings.trust._SECONDS", 0.05)
+
+    def build() -> str:
+        with limited("this"):
+            time.sleep(0.2)  # waiting is no building
+        try:
+            with limited("this"):
+                all(n == 0 for n in iter(int, 1))
+        except ValueError as error:
+            return str(error)
+        return "built"
+
+    with ThreadPoolExecutor(1) as pool:
+        assert "takes more than 0.05 s" in pool.submit(build).result(60)

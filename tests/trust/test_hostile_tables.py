@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import csv
 import io
 import json
@@ -15,6 +16,7 @@ from command_line import environment
 from hostile_runs import CELLS, TABLES
 from sweep_runs import write_run
 
+from staf_torch import read_runs
 from staf_torch.cli.table import main
 from staf_torch.results.reader import collect
 from staf_torch.tables import html_text, latex_text, tabulate
@@ -141,3 +143,33 @@ def test_the_command_writes_a_table_through_no_link(tmp_path: Path) -> None:
     assert main([str(tmp_path), "--output", str(tmp_path / "table.md")]) == 0
     assert victim.read_text() == "mine"
     assert "0.125" in (tmp_path / "table.md").read_text()
+
+
+def test_no_name_of_a_folder_reaches_the_terminal_as_it_is(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for number, name in enumerate(("0", "\x1b[2J\u202e", "\x1b]0;x\x07")):
+        write_run(tmp_path / name, {"seed": number}, {"ball_error": 0.1 * number}, version=f"0.0.{number}")
+    (tmp_path / "\x1b]0;x\x07" / "run.json").write_text("{")
+    for line in ([], ["--rows", "seed"], ["--format", "csv"]):
+        assert main([str(tmp_path), *line]) == 0
+        said = "".join(capsys.readouterr())
+        assert not set(said) & {"\x1b", "\x07", "\u202e"}
+
+
+def test_no_space_hides_a_formula_from_the_table_and_none_is_computed(tmp_path: Path) -> None:
+    for number, value in enumerate((" =1+1", "\uff1d1+1", "\t@x", "plain")):
+        write_run(tmp_path / str(number), {"kernel": value}, {"ball_error": 0.1})
+    rows = csv.DictReader(io.StringIO(tabulate(collect(tmp_path)).csv()))
+    assert [row["kernel"][0] for row in rows] == ["'", "'", "'", "p"]
+
+
+def test_a_notebook_shows_no_picture_from_behind_a_link(tmp_path: Path) -> None:
+    run = write_run(tmp_path / "0", {"seed": 1}, {"ball_error": 0.1})
+    (run / "figures").mkdir()
+    (tmp_path / "secret").write_bytes(b"secret")
+    (run / "figures" / "a.png").symlink_to(tmp_path / "secret")
+    (run / "figures" / "b.png").write_bytes(b"picture")
+    shown = read_runs(run)[0]._repr_html_()
+    assert base64.b64encode(b"picture").decode() in shown
+    assert base64.b64encode(b"secret").decode() not in shown

@@ -32,7 +32,15 @@ OWN = [
     "target.path=bowls.bowl",
     "seed=0,1,2",
 ]
-BOWL = "from bowl_helper import SCALE\n\ndef bowl(x):\n    return SCALE * x.square().sum(-1)\n"
+BOWL = """
+import importlib
+from bowl_helper import SCALE
+
+FURTHER = importlib.import_module("_".join(["bowl", "extra"])).SCALE
+
+def bowl(x):
+    return SCALE * FURTHER * x.square().sum(-1)
+"""
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +52,8 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "# @package _global_\ntask: gradient_chase\nspread: 0.5\n"
     )
     (place / "bowls.py").write_text(BOWL)
-    (place / "bowl_helper.py").write_text("SCALE = 1.0\n")
+    for name in ("bowl_helper", "bowl_extra"):
+        (place / f"{name}.py").write_text("SCALE = 1.0\n")
     code, _, err = one(str(place), [*OWN, *SHORT, "hydra.sweep.dir=sweep"])
     assert code == 0, err
     return place
@@ -56,7 +65,7 @@ def place(whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     copy = Path(shutil.copytree(whole, tmp_path / "own", ignore=shutil.ignore_patterns("__pycache__")))
     shutil.rmtree(copy / "sweep" / "2")
     monkeypatch.chdir(tmp_path)  # comes back here from wherever the command goes
-    for name in ("bowls", "bowl_helper"):
+    for name in ("bowls", "bowl_helper", "bowl_extra"):
         monkeypatch.delitem(sys.modules, name, raising=False)
     return copy
 
@@ -81,6 +90,7 @@ EDITS: dict[str, tuple[Callable[[Path], None], str]] = {
         "dt was 0.01",
     ),
     "a module": (edit("bowls.py", "SCALE *", "2 * SCALE *"), "the module bowls has changed"),
+    "a module of a made-up name": (edit("bowl_extra.py", "1.0", "3.0"), "the module bowl_extra has changed"),
     "a module of a module": (edit("bowl_helper.py", "1.0", "3.0"), "the module bowl_helper has changed"),
 }
 
@@ -247,6 +257,19 @@ def test_a_planted_link_is_not_written_through(name: str, place: Path, tmp_path:
     assert code == 1
     assert "link" in err
     assert list(victim.iterdir()) == [] if folder else victim.read_text() == "mine"
+
+
+@pytest.mark.parametrize("name", ["table.md", "1/staf.log", ".lock", "multirun.yaml"])
+def test_a_second_name_of_a_file_elsewhere_is_not_written_through(
+    name: str, place: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "victim").write_text("mine")
+    (place / "sweep" / name).unlink(missing_ok=True)
+    (place / "sweep" / name).hardlink_to(tmp_path / "victim")
+    code, _, err = resume(place)
+    assert code == 1
+    assert "hard link" in err
+    assert (tmp_path / "victim").read_text() == "mine"
 
 
 def test_a_run_writes_through_no_planted_link(place: Path, tmp_path: Path) -> None:

@@ -1,7 +1,4 @@
-"""Hydra called from Python: an application in a process that may be a notebook or another application.
-
-Beside `hydra_compat` the only module that depends on the inside of Hydra.
-"""
+"""Hydra called from Python: an application in a process that may be a notebook or another application."""
 
 from __future__ import annotations
 
@@ -27,7 +24,8 @@ from hydra.version import VersionBase
 from omegaconf import DictConfig
 from omegaconf.basecontainer import BaseContainer
 
-from .hydra_compat import config_directory, find_launcher, named_packages, trusted, with_mode
+from ...settings import config_directory
+from .program import find_launcher, named_packages, trusted, with_mode
 
 _OF_AN_APPLICATION: tuple[type, ...] = (GlobalHydra, HydraConfig, JobRuntime, VersionBase)
 """Hydra's singletons that belong to the application that runs; plugins and the store are everyone's."""

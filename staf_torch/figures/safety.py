@@ -1,0 +1,65 @@
+"""Figures of constrained closed loops: the plane with the sets that must not be left or entered, and h(t)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from .style import WIDTH, colour, curves, dash, legend_above, letter, page
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
+class BoxHistory(NamedTuple):
+    """One start under several methods, in a box."""
+
+    time: np.ndarray  # (T,) seconds
+    paths: Mapping[str, np.ndarray]  # method -> x, (T, n)
+    margins: Mapping[str, np.ndarray]  # method -> distance to the nearest wall, (T,)
+    costs: Mapping[str, np.ndarray]  # method -> cost so far, (T,)
+    barrier_state: np.ndarray  # s of the first method, (T, n)
+    low: np.ndarray  # (n,) -inf for none
+    high: np.ndarray  # (n,)
+
+
+def draw_box(history: BoxHistory) -> Figure:
+    """The first two coordinates with their walls, the distance to the nearest wall, s and the cost."""
+    with page(WIDTH, 4.6) as figure:
+        plane, margin, barrier, cost = figure.subplots(2, 2).flat
+        for i, (name, path) in enumerate(history.paths.items()):
+            plane.plot(path[:, 0], path[:, 1], dash(i), color=colour(i), label=name)
+            margin.plot(history.time, history.margins[name], dash(i), color=colour(i))
+            cost.plot(history.time, history.costs[name], dash(i), color=colour(i), label=name)
+        walls(plane, history.low[:2], history.high[:2])
+        plane.set(xlabel="$x_1$", ylabel="$x_2$")
+        legend_above(plane, 3)
+        margin.set_ylabel("distance to the nearest wall")
+        margin.set_ylim(bottom=0)
+        curves(barrier, history.time, history.barrier_state, "$s_{%d}$")
+        barrier.set_ylabel("barrier coordinates")
+        legend_above(barrier, history.barrier_state.shape[1])
+        cost.set_ylabel("cost of $s$ so far")
+        cost.set_ylim(bottom=0)
+        for axes in (margin, barrier, cost):
+            axes.set(xlabel="time (s)", xlim=(history.time[0], history.time[-1]))
+        letter((plane, margin, barrier, cost))
+    return figure
+
+
+def walls(axes: Axes, low: np.ndarray, high: np.ndarray) -> None:
+    """Draw the walls of two coordinates, and shade what lies beyond."""
+    for k, ends in enumerate((axes.get_xlim(), axes.get_ylim())):
+        reach = 0.06 * (ends[1] - ends[0])
+        for wall, sign in ((low[k], -1), (high[k], 1)):
+            if np.isfinite(wall):
+                beyond = sorted((wall, wall + sign * reach))
+                if k == 0:
+                    axes.axvline(wall, color="0.2", linewidth=0.8)
+                    axes.axvspan(beyond[0], beyond[1], color="0.85", linewidth=0)
+                else:
+                    axes.axhline(wall, color="0.2", linewidth=0.8)
+                    axes.axhspan(beyond[0], beyond[1], color="0.85", linewidth=0)

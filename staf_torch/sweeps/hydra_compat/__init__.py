@@ -1,0 +1,24 @@
+"""What depends on the inside of Hydra 1.3 and 1.4; no module outside this folder does."""
+
+from hydra.core.config_loader import ConfigLoader as ConfigLoader
+from hydra.core.utils import JobReturn as JobReturn
+from hydra.core.utils import JobStatus as JobStatus
+from hydra.core.utils import env_override as env_override
+
+from .composing import Composer as Composer
+from .composing import JobLoader as JobLoader
+from .composing import config_loader as config_loader
+from .composing import parse_override as parse_override
+from .composing import product as product
+from .jobs import SweepContext as SweepContext
+from .jobs import without_hydra_overrides as without_hydra_overrides
+from .program import BrokenSweep as BrokenSweep
+from .program import broken_sweep as broken_sweep
+from .program import find_launcher as find_launcher
+from .program import full_errors as full_errors
+from .program import named_packages as named_packages
+from .program import overrides_in as overrides_in
+from .program import program as program
+from .program import trusted as trusted
+from .program import trusted_packages as trusted_packages
+from .program import with_mode as with_mode

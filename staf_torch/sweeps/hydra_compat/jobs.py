@@ -1,0 +1,165 @@
+"""One job of a sweep, as Hydra's launchers run it."""
+
+from __future__ import annotations
+
+import functools
+import json
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple, cast
+
+import yaml
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.utils import (
+    JobReturn,
+    JobRuntime,
+    JobStatus,
+    _flush_loggers,
+    configure_log,
+    env_override,
+    filter_overrides,
+    run_job,
+    setup_globals,
+)
+from hydra.types import HydraContext
+from omegaconf import DictConfig, OmegaConf, open_dict, read_write
+from omegaconf._utils import OmegaConfDumper, get_omega_conf_dumper
+
+from .composing import JobLoader
+from .program import HAS_WHITELIST
+
+
+class SweepContext(NamedTuple):
+    """What Hydra hands to a launcher."""
+
+    hydra: HydraContext
+    master: DictConfig  # settings of the sweep
+
+    def start(self) -> None:
+        """Register Hydra's resolvers and send the log to the sweep's own handlers."""
+        setup_globals()
+        self.sweep_logging()
+
+    def sweep_logging(self) -> None:
+        """Send the log to the sweep's own handlers: what follows belongs to no job's log."""
+        trust: dict[str, Any] = {}
+        if HAS_WHITELIST:
+            trust = {"execution_whitelist": cast(Any, self.hydra).execution_whitelist}
+        configure_log(self.master.hydra.hydra_logging, self.master.hydra.verbose, **trust)
+
+    def settings(self, overrides: Sequence[str]) -> DictConfig:
+        """Return the settings of a job as its task sees them; they are the caller's own."""
+        return self._loader.load_sweep_config(self.master, overrides)
+
+    def job_config(self, num: int, overrides: Sequence[str]) -> DictConfig:
+        """Return the configuration of job ``num`` with Hydra's node; it is the caller's own."""
+        config = self._loader.whole(self.master, overrides)
+        with open_dict(config):
+            config.hydra.job.id = str(num)
+            config.hydra.job.num = num
+        return config
+
+    @property
+    def numbered(self) -> bool:
+        """Whether the directories of jobs are their numbers, as they are where nobody says otherwise."""
+        node: Any = OmegaConf.to_container(self.master.hydra.sweep)
+        return bool(node["subdir"] == "${hydra.job.num}")
+
+    @property
+    def _loader(self) -> JobLoader:
+        loader = self.hydra.config_loader
+        assert isinstance(loader, JobLoader)
+        return loader
+
+    def run_job(
+        self, task: Callable[[DictConfig], Any], config: DictConfig, settings: DictConfig
+    ) -> JobReturn:
+        """Run one job as every launcher does: directory, `.hydra/`, log, callbacks and status.
+
+        Args:
+            task: is called with ``settings``.
+            config: of the job, with Hydra's node.
+            settings: of the job, without.
+        """
+        if not HAS_WHITELIST and not config.hydra.job.chdir:
+            return _run_job(self.hydra.callbacks, task, config, settings)
+        return run_job(
+            hydra_context=self.hydra,
+            task_function=task,
+            config=config,
+            job_dir_key="hydra.sweep.dir",
+            job_subdir_key="hydra.sweep.subdir",
+        )
+
+
+def _run_job(
+    callbacks: Any, task: Callable[[DictConfig], Any], config: DictConfig, settings: DictConfig
+) -> JobReturn:
+    """Run one job as `run_job` of Hydra 1.3 does, without its five copies of the settings."""
+    active, before = HydraConfig.instance(), HydraConfig.instance().cfg
+    OmegaConf.set_readonly(config.hydra, True)
+    active.cfg = cast(Any, config)
+    try:
+        directory = Path(str(config.hydra.sweep.dir), str(config.hydra.sweep.subdir)).absolute()
+        with read_write(config.hydra.runtime), open_dict(config.hydra.runtime):
+            config.hydra.runtime.output_dir = os.path.normpath(directory)
+        ret = JobReturn(
+            overrides=[str(line) for line in config.hydra.overrides.task],
+            cfg=settings,
+            hydra_cfg=config,
+            working_dir=os.getcwd(),
+            task_name=JobRuntime.instance().get("name"),
+        )
+        directory.mkdir(parents=True, exist_ok=True)
+        configure_log(config.hydra.job_logging, config.hydra.verbose)
+        if config.hydra.output_subdir is not None:
+            folder = directory / config.hydra.output_subdir
+            folder.mkdir(exist_ok=True)
+            (folder / "config.yaml").write_text(_yaml(settings), encoding="utf-8")
+            (folder / "hydra.yaml").write_text(_yaml(config.hydra, "hydra"), encoding="utf-8")
+            overrides = OmegaConf.to_yaml(config.hydra.overrides.task)
+            (folder / "overrides.yaml").write_text(overrides, encoding="utf-8")
+        with env_override(config.hydra.job.env_set):
+            callbacks.on_job_start(config=config, task_function=task)
+            try:
+                ret.return_value = task(settings)
+                ret.status = JobStatus.COMPLETED
+            except Exception as error:
+                ret.return_value, ret.status = error, JobStatus.FAILED
+        _flush_loggers()
+        callbacks.on_job_end(config=config, job_return=ret)
+        return ret
+    finally:
+        active.cfg = before
+
+
+def _yaml(node: DictConfig, parent: str | None = None) -> str:
+    """Return `OmegaConf.to_yaml(node)`, or of ``{parent: node}``; equal parts of many nodes are made once."""
+    parts: Any = OmegaConf.to_container(node, enum_to_str=True)
+    text = [] if parent is None else [f"{parent}:\n"]
+    return "".join(text + [_yaml_part(key, json.dumps(part), parent) for key, part in parts.items()])
+
+
+@functools.lru_cache(1000)
+def _yaml_part(key: str, part: str, parent: str | None) -> str:
+    node = {key: json.loads(part)} if parent is None else {parent: {key: json.loads(part)}}
+    as_hydra = {"allow_unicode": True, "sort_keys": False}
+    text: str = yaml.dump(node, Dumper=_dumper(), default_flow_style=False, **as_hydra)
+    return text if parent is None else text.partition("\n")[2]
+
+
+@functools.cache
+def _dumper() -> Any:
+    """Return OmegaConf's dumper of texts, over the emitter in C where there is one: a tenth of the time."""
+    base = getattr(yaml, "CDumper", None)
+    if base is None:
+        return get_omega_conf_dumper()
+    kind = type("_Dumper", (base,), {})
+    kind.add_representer(str, OmegaConfDumper.str_representer)  # type: ignore[attr-defined]
+    return kind
+
+
+def without_hydra_overrides(overrides: Sequence[str]) -> list[str]:
+    """Return the overrides that are not about Hydra's own node."""
+    return list(filter_overrides(overrides))

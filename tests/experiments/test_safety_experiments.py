@@ -1,0 +1,42 @@
+"""The experiments with constraints end to end, short."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hydra import compose, initialize_config_dir
+
+from staf_torch.cli.staf import config_directory
+from staf_torch.experiments import safe_box
+
+
+def settings(*overrides: str):  # type: ignore[no-untyped-def]
+    with initialize_config_dir(config_directory(), version_base="1.3"):
+        return compose("config", list(overrides))
+
+
+SHORT = ("duration=0.04", "dt=0.01", "trajectories=2", "adp.optimum.shooting=false", "adp.compile=false")
+
+
+def test_the_box_has_a_row_a_method_and_keeps_what_starts_inside(tmp_path: Path) -> None:
+    cfg = settings("experiment=safe_box", *SHORT, "safe_box.states=4", "safe_box.decay=20")
+    metrics = safe_box.run(cfg, tmp_path)
+    assert json.loads((tmp_path / "metrics.json").read_text()) == metrics
+    assert metrics["constraint_violations"] == 0
+    assert metrics["minimum_margin"] > 0.05
+    assert metrics["optimal_cost"] is None
+    assert metrics["lqr_of_x_filtered_cost"] == metrics["lqr_of_x_cost"]  # bit for bit: no wall is near
+    assert len((tmp_path / "safe_box.csv").read_text().splitlines()) == 4
+    assert (tmp_path / "figures" / "safe_box.png").stat().st_size > 5000
+    with np.load(tmp_path / "history.npz") as history:
+        assert history["state"].shape == history["barrier_state"].shape == (2, 5, 2)
+        assert float(history["margin"].min()) == pytest.approx(metrics["minimum_margin"])
+
+
+def test_a_start_outside_the_box_is_refused_by_its_row(tmp_path: Path) -> None:
+    cfg = settings("experiment=safe_box", *SHORT, "safe_box.low=[-6,-5]")
+    with pytest.raises(ValueError, match=r"must lie strictly between the walls .* not so row 0"):
+        safe_box.run(cfg, tmp_path)

@@ -1,0 +1,219 @@
+"""Files that `staf-table` and the page of a sweep are to show."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import re
+import socket
+from pathlib import Path
+from typing import Any
+
+from arena import Arena, Attack, attack, says
+
+
+@attack
+def controls_beyond_escape(arena: Arena) -> Attack:
+    def change(found: dict[str, Any]) -> None:
+        found["overrides"].append("kernel=\x9b2Jx\u202egnp\u2066\x07\x7f")
+        found["status"], found["reason"] = "failed", "\x9d52;c;ZWNobyBoaQ==\x9c \x1bP+q\x1b\\ \x0b\x0c\x08"
+
+    arena.json("0/run.json", change)
+    arena.json("1/metrics.json", lambda found: found.__setitem__("\u202e\x1b]0;x\x07ball", 1.0))
+    return arena.table()
+
+
+@attack
+def controls_in_the_name_of_a_job(arena: Arena) -> Attack:
+    (arena.many / "0").rename(arena.many / "\x1b[2J\r\n\u202e0")
+    (arena.many / "1" / "run.json").write_text("{")
+    (arena.many / "1").rename(arena.many / "\x1b]0;x\x07")
+    return ["staf-table", str(arena.hostile)], None
+
+
+@attack
+def formulas_of_every_kind(arena: Arena) -> Attack:
+    values = (
+        "@SUM(1+9)",
+        "+1+cmd|' /C calc'!A0",
+        "-2+3+cmd|'!A0",
+        "\t=cmd|'!A0",
+        "\r=1+1",
+        "\uff1d1+1",
+        " =1+1",
+    )
+    for job in range(3):
+        arena.json(
+            f"{job}/run.json", lambda found, job=job: found["overrides"].append(f"kernel={values[job]}")
+        )
+        arena.json(f"{job}/metrics.json", lambda found, job=job: found.__setitem__(values[job + 3], 1.0))
+    arena.json("2/run.json", lambda found: found.update(status="failed", reason=values[6]))
+
+    def check(arena: Arena, result: Any) -> str | None:
+        import csv
+
+        rows = list(csv.reader(io.StringIO(result.text, newline="")))
+        bad = [c for row in rows for c in row if re.match(r"\s*[=@\t\r\uff1d]|[+-].*[a-z|(]", c, re.S)]
+        return f"cells that a spreadsheet computes: {bad}" if bad else None
+
+    return arena.table("--format", "csv")[0], check
+
+
+@attack
+def tex_in_caret_notation(arena: Arena) -> Attack:
+    values = (r"^^5cinput{/etc/passwd}", r"\write18{touch x}", "%\n\\input{/etc/passwd}")
+    for job in range(3):
+        arena.json(
+            f"{job}/run.json", lambda found, job=job: found["overrides"].append(f"kernel={values[job]}")
+        )
+    arena.json("0/run.json", lambda found: found.update(status="failed", reason="x\n\\input{/etc/passwd}"))
+
+    def check(arena: Arena, result: Any) -> str | None:
+        lines = [line.split("%")[0].replace(r"\textbackslash", "") for line in result.text.splitlines()]
+        bad = [line for line in lines if "^^" in line or r"\input" in line or r"\write" in line]
+        return f"TeX would run {bad}" if bad else None
+
+    return arena.table("--format", "tex", "--rows", "kernel")[0], check
+
+
+@attack
+def links_and_scripts_in_markdown(arena: Arena) -> Attack:
+    values = ("[x](javascript:alert(1))", "![x](http://h.example/p.png)", "<img src=x onerror=alert(1)>")
+    for job in range(3):
+        arena.json(
+            f"{job}/run.json", lambda found, job=job: found["overrides"].append(f"kernel={values[job]}")
+        )
+    arena.json("0/metrics.json", lambda found: found.__setitem__("a|b\n\n<script>alert(1)</script>\n", 1.0))
+    arena.json(
+        "1/run.json",
+        lambda found: found.update(status="failed", reason="http://h.example/?q [y]: http://h.example/"),
+    )
+
+    def check(arena: Arena, result: Any) -> str | None:
+        bad = re.findall(r"(?<!\\)<(?:img|script)|(?<!\\)\]\(|(?<!\\)!\[", result.text)
+        return f"Markdown lets through {bad}" if bad else None
+
+    return arena.table("--rows", "kernel", "--metric", "ball_error")[0], check
+
+
+@attack
+def a_page_of_the_sweep(arena: Arena) -> Attack:
+    evil = "</script></style><script>alert(1)</script><img src=x onerror=alert(1)>\"'><svg/onload=alert(1)>"
+    arena.json(
+        "0/run.json",
+        lambda found: (
+            found["overrides"].append(f"kernel={evil}"),
+            found.update(status="failed", reason=evil),
+        ),
+    )
+    arena.json("1/metrics.json", lambda found: found.__setitem__(evil, 1.0))
+    (arena.many / "multirun.yaml").write_text(f"x: '{evil}'\n")
+
+    def check(arena: Arena, result: Any) -> str | None:
+        page = (arena.many / "report.html").read_text()
+        bad = re.findall(r"<script>alert|<img src=x|<svg/onload", page)
+        return f"report.html has {bad}" if bad else None
+
+    return arena.resume("--yes")[0], check
+
+
+@attack
+def a_loop_of_links(arena: Arena) -> Attack:
+    for job in range(3):
+        (arena.many / str(job) / "again").symlink_to(arena.hostile)
+        (arena.many / str(job) / "root").symlink_to("/")
+    return ["staf-table", str(arena.hostile)], None
+
+
+@attack
+def files_that_are_no_files(arena: Arena) -> Attack:
+    os.mkfifo(arena.many / ".lock")
+    (arena.many / "0" / "metrics.json").unlink()
+    server = socket.socket(socket.AF_UNIX)
+    here = os.getcwd()
+    os.chdir(arena.many / "0")  # a socket's path may have 107 bytes
+    server.bind("metrics.json")
+    os.chdir(here)
+    server.close()
+    (arena.many / "1" / "run.json").unlink()
+    (arena.many / "1" / "run.json").symlink_to("/dev/stdin")
+    (arena.many / "2" / "metrics.json").unlink()
+    os.mkfifo(arena.many / "2" / "metrics.json")
+    (arena.many / "sweep.json").unlink()
+    (arena.many / "sweep.json").mkdir()
+    return arena.table()
+
+
+@attack
+def a_record_of_three_hundred_megabytes(arena: Arena) -> Attack:
+    for name in ("0/run.json", "1/metrics.json", "sweep.json"):
+        with (arena.many / name).open("r+b") as file:
+            file.truncate(300 * 2**20)
+    return arena.table()
+
+
+@attack
+def three_hundred_thousand_metrics(arena: Arena) -> Attack:
+    for job in range(3):
+        many = {f"metric_{job}_{k}": k for k in range(100_000)}
+        arena.json(f"{job}/metrics.json", lambda found, many=many: found.update(many))
+    return arena.table()
+
+
+@attack
+def twenty_thousand_folders(arena: Arena) -> Attack:
+    for job in range(3, 20_003):
+        (arena.many / str(job)).mkdir()
+    return arena.table()
+
+
+@attack
+def folders_a_thousand_deep(arena: Arena) -> Attack:
+    here, start = os.open(arena.many / "0", os.O_RDONLY), os.getcwd()
+    os.fchdir(here)
+    for _ in range(1500):
+        os.mkdir("d")
+        os.chdir("d")
+    Path("run.json").write_text("{}")
+    os.chdir(start)
+    os.close(here)
+    return ["staf-table", str(arena.hostile)], None
+
+
+@attack
+def members_of_every_type(arena: Arena) -> Attack:
+    rows = [
+        1,
+        None,
+        [],
+        {},
+        {"overrides": {"a": 1}},
+        {"overrides": [1, None], "metrics": [1]},
+        {"status": ["completed"]},
+    ]
+    rows += [
+        {
+            "number": "x",
+            "overrides": ["seed=1"],
+            "status": "completed",
+            "reason": {},
+            "metrics": {"ball_error": {"a": []}},
+        }
+    ]
+    rows += [
+        {"number": 10**400, "overrides": "seed=1", "metrics": {"ball_error": 10**400, "b": "1e5", "c": True}}
+    ]
+    (arena.many / "0" / "members.json").write_text(json.dumps(rows))
+    (arena.many / "1" / "members.json").write_text('{"members": ' + json.dumps(rows) + "}")
+    return arena.table()[0], says("0.3")
+
+
+@attack
+def numbers_of_every_type_for_jobs(arena: Arena) -> Attack:
+    jobs = [
+        {"num": n, "overrides": ["centers.radius=0.1"]}
+        for n in ("../../victim", -1, 1e300, [], {}, None, "0\n1", True)
+    ]
+    arena.json("sweep.json", lambda found: found.update(jobs=jobs))
+    return arena.table()
