@@ -194,6 +194,7 @@ MODULES: dict[str, Case] = {
 }
 OTHERS = {"_Held", "ConventionModule", "FunctionPlant", "StepPlant", "RatePlant"}
 OTHERS |= {"SampledProblem", "GlobalValue", "SafetyFilter", "FilteredPolicy", "PlanReplay"}
+OTHERS |= {"AmongDiscs"}  # of an experiment
 OTHERS |= {"RecedingHorizon", "MujocoPlant", "EnvironmentPlant"}
 OTHERS |= {"NearOptimal", "SampledRollout"}
 """What wraps a function of the user's own, or takes minutes to make: tested in its room."""

@@ -40,7 +40,7 @@ class Filtered(NamedTuple):
         >>> found.control.round(decimals=2), found.margin
         (tensor([[0.9900]], dtype=torch.float64), tensor([[0.5000]], dtype=torch.float64))
 
-        Shown by `staf_torch/adp/README.md`.
+        Shown by `staf experiment=avoidance`.
     """
 
     control: Tensor  # (..., m)
@@ -85,7 +85,7 @@ class SafetyFilter(Controller):
         >>> wall.report(run)["constraint_violations"], wall.report(run)["infeasible"]
         (0, [])
 
-        Shown by `staf_torch/adp/README.md`.
+        Shown by `staf experiment=avoidance`.
 
     Args:
         policy: u from x, (..., n) -> (..., m), or a controller, also one that learns.

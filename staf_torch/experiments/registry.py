@@ -145,6 +145,7 @@ EXPERIMENTS: Mapping[str, str] = {
     "adp_initial_weights": "adp_comparison.initial_weights",
     "adp_tracking": "adp_tracking.run",
     "safe_box": "safe_box.run",
+    "avoidance": "avoidance.run",
     "rivals": "rivals.run",
 }
 """Name in `task` -> path within this package. They are imported when they are asked for."""
