@@ -194,8 +194,17 @@ MODULES: dict[str, Case] = {
 }
 OTHERS = {"_Held", "ConventionModule", "FunctionPlant", "StepPlant", "RatePlant"}
 OTHERS |= {"SampledProblem", "GlobalValue", "SafetyFilter", "FilteredPolicy", "PlanReplay"}
-OTHERS |= {"RecedingHorizon", "MujocoPlant", "EnvironmentPlant"}
+OTHERS |= {"RecedingHorizon", "MujocoPlant", "EnvironmentPlant", "EnergyShaping"}
 OTHERS |= {"NearOptimal", "SampledRollout"}
+OTHERS |= {
+    "ParametricPlant",
+    "ChangingPlant",
+    "AdaptiveLQR",
+    "ConcurrentTracker",
+    "Measured",
+    "Observed",
+    "_Informed",
+}
 """What wraps a function of the user's own, or takes minutes to make: tested in its room."""
 
 

@@ -33,6 +33,9 @@ ELSEWHERE = {
     "cli",
 }  # rules of the command line: tests/cli/test_cli_errors.py
 OTHERS = {
+    "ParametricPlant": "in tests/adp/adaptation/test_identifiers.py",
+    "ConcurrentTracker": "in tests/adp/adaptation/test_identifiers.py",
+    "Observed": "in tests/adp/adaptation/test_kalman.py",
     "trace": "takes an exported program",
     "Cosine": "numbers and lists alike, in tests/test_targets.py",
     "paper_step": "of the theorem, in tests/theory/test_errata.py",
@@ -49,6 +52,7 @@ OTHERS = {
     "StepPlant": "in tests/adp/test_user_plants.py",
     "MujocoPlant": "in tests/systems/test_mujoco_plant.py",
     "RecedingHorizon": "in tests of its own",
+    "EnergyShaping": "in tests/adp/test_energy_shaping.py",
     "report": "in tests of its own",
     "near_optimal": "in tests of its own",
     "SampledRollout": "in tests of its own",
@@ -100,6 +104,8 @@ X = torch.tensor([[0.5, -0.4]], dtype=torch.float64)
 EYE = torch.eye(2, dtype=torch.float64)
 CONSTANTS = theory.DriftConstants(condition_number=10.0, speed=1.0, growth=0.1)
 GRID = adp.RBFGridBasis(2, 2)
+ACTUATORS = adp.ParametricPlant.of_effectiveness(PLANT)
+WINDOWS, ESTIMATE = adp.IntegralWindows(ACTUATORS, 0.1), adp.LeastSquares([1.0], 0.5)
 
 
 def bound(name: str) -> Callable[..., Any]:
@@ -197,6 +203,12 @@ CALLS: dict[str, Callable[..., Any]] = {
     "step_for_bound": bound("step_for_bound"),
     "steps_for_bound": bound("steps_for_bound"),
     "disc": theory.disc,
+    "IntegralWindows": lambda **given: adp.IntegralWindows(ACTUATORS, **{"length": 0.1, **given}),
+    "SlopeWindows": lambda **given: adp.SlopeWindows(ACTUATORS, **given),
+    "HistoryStack": lambda **given: adp.HistoryStack(**{"rows": 1, "parameters": 1, **given}),
+    "LeastSquares": lambda **given: adp.LeastSquares([1.0], **{"deviation": 1.0, **given}),
+    "AdaptiveLQR": lambda **given: adp.AdaptiveLQR(ACTUATORS, COST, WINDOWS, ESTIMATE, **given),
+    "riccati_rows": lambda **given: adp.riccati_rows(-EYE, EYE, EYE, EYE, **given),
 }
 """How to call, with arguments that are right beside the one in question."""
 
@@ -224,6 +236,9 @@ ABSENT |= {
     ("StaF", "out_features"),
 }
 ABSENT |= {
+    ("IntegralWindows", "first"),
+    ("LeastSquares", "alarm"),
+    ("AdaptiveLQR", "a_step"),
     ("PlantEnv", "bound"),
     ("DirectShooting", "iterations"),
     ("DirectShooting", "intervals"),

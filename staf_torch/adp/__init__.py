@@ -3,6 +3,32 @@
 import warnings
 
 from .actor_critic import ActorCritic as ActorCritic
+from .adaptation import Adaptation as Adaptation
+from .adaptation import AdaptiveLQR as AdaptiveLQR
+from .adaptation import Belief as Belief
+from .adaptation import ChangingPlant as ChangingPlant
+from .adaptation import ConcurrentGradient as ConcurrentGradient
+from .adaptation import ConcurrentTracker as ConcurrentTracker
+from .adaptation import Doubling as Doubling
+from .adaptation import Equation as Equation
+from .adaptation import Estimate as Estimate
+from .adaptation import ExtendedKalman as ExtendedKalman
+from .adaptation import HistoryStack as HistoryStack
+from .adaptation import IntegralWindows as IntegralWindows
+from .adaptation import KalmanFilter as KalmanFilter
+from .adaptation import LeastSquares as LeastSquares
+from .adaptation import LinearFamily as LinearFamily
+from .adaptation import Measured as Measured
+from .adaptation import Observed as Observed
+from .adaptation import ParametricPlant as ParametricPlant
+from .adaptation import SlopeWindow as SlopeWindow
+from .adaptation import SlopeWindows as SlopeWindows
+from .adaptation import Stack as Stack
+from .adaptation import Tracking as Tracking
+from .adaptation import UnscentedKalman as UnscentedKalman
+from .adaptation import Window as Window
+from .adaptation import measured_rate as measured_rate
+from .adaptation import riccati_rows as riccati_rows
 from .bases import LeadingCoordinates as LeadingCoordinates
 from .bases import QuadraticBasis as QuadraticBasis
 from .bases import RBFGridBasis as RBFGridBasis
@@ -20,6 +46,7 @@ from .controllers import Supervised as Supervised
 from .cost import BoundedInputCost as BoundedInputCost
 from .cost import Cost as Cost
 from .cost import QuadraticCost as QuadraticCost
+from .energy_shaping import EnergyShaping as EnergyShaping
 from .extrapolation import Extrapolation as Extrapolation
 from .extrapolation import QuadraturePoints as QuadraturePoints
 from .extrapolation import RandomPoints as RandomPoints
@@ -59,13 +86,24 @@ __all__ = [
     "LQR",
     "ActorCritic",
     "ActorCriticLaw",
+    "Adaptation",
+    "AdaptiveLQR",
+    "Belief",
     "BoundedInputCost",
     "BoxDDP",
+    "ChangingPlant",
+    "ConcurrentGradient",
     "ConcurrentLearning",
+    "ConcurrentTracker",
     "Controller",
     "ControllerState",
     "Cost",
     "DirectShooting",
+    "Doubling",
+    "EnergyShaping",
+    "Equation",
+    "Estimate",
+    "ExtendedKalman",
     "Extrapolation",
     "Feedback",
     "Filtered",
@@ -73,13 +111,21 @@ __all__ = [
     "Gains",
     "GlobalValue",
     "HeldStability",
+    "HistoryStack",
     "Identified",
     "IdentifyingTracker",
     "Information",
+    "IntegralWindows",
+    "KalmanFilter",
     "LeadingCoordinates",
+    "LeastSquares",
+    "LinearFamily",
     "LoopResult",
+    "Measured",
     "NearOptimal",
+    "Observed",
     "Optimum",
+    "ParametricPlant",
     "PlanReplay",
     "Published",
     "QuadraticBasis",
@@ -92,19 +138,27 @@ __all__ = [
     "SafetyFilter",
     "SampledProblem",
     "SampledRollout",
+    "SlopeWindow",
+    "SlopeWindows",
     "StaFValueBasis",
+    "Stack",
     "Supervised",
+    "Tracking",
     "Trajectories",
     "TwoStateTracking",
+    "UnscentedKalman",
     "ValueBasis",
     "Weights",
+    "Window",
     "bellman_error",
     "bellman_terms",
     "desired_trajectory",
     "held_stability",
     "hjb_residual",
     "learn_global_value",
+    "measured_rate",
     "near_optimal",
+    "riccati_rows",
     "simulate",
     "tracking_cost",
     "value_gradient",

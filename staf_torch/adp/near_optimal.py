@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import time
 from typing import Any
@@ -23,6 +24,7 @@ from .sampling import held_stability
 from .shooting import DirectShooting
 from .simulation import simulate
 
+_log = logging.getLogger(__name__)
 _DECAY = 3.0  # time constants of the slowest mode of the LQR in the horizon
 _STEPS = (12, 60)  # periods in the horizon, at least and at most
 _RESOLVED = 0.2  # length of an integration step in time constants of the plant's fastest mode
@@ -146,7 +148,7 @@ def near_optimal(
     The rules: the base is the LQR made for dt; the horizon is three time constants of its slowest mode, 12 to
     60 periods; the centers are as many as quadratics need, from four states on the cross-polytope and its
     middle, in a ball of ``radius``; a plant in continuous time is integrated in steps of a fifth of its
-    fastest time constant.
+    fastest time constant. A simulator so slow that a control takes longer than dt is a warning in the log.
 
     Example:
         >>> import numpy as np
@@ -192,7 +194,27 @@ def near_optimal(
         basis, plant, placed, lqr, lqr.value, lqr.p, period=period, steps=steps, substeps=substeps
     )
     policy.lqr, policy.radius, policy.substeps = lqr, radius, substeps
+    if not plant.traceable:
+        _warn_if_slow(policy)
     return policy
+
+
+def _warn_if_slow(policy: NearOptimal) -> None:
+    """One line in the log where a simulator cannot be asked in time."""
+    x = policy.plant.equilibrium().unsqueeze(0)
+    began = time.perf_counter()
+    with torch.no_grad():
+        policy(x)
+    taken = time.perf_counter() - began
+    if taken > policy.period:
+        _log.warning(
+            "a control of `near_optimal` takes about %.3g s with this %s, longer than the %.3g s for which "
+            "it is held: it cannot run beside the plant. Shorten `horizon` (%d periods now), or use the LQR.",
+            taken,
+            type(policy.plant).__name__,
+            policy.period,
+            policy.steps,
+        )
 
 
 def _slowest(lqr: LQR, plant: Plant) -> float:

@@ -144,6 +144,8 @@ EXPERIMENTS: Mapping[str, str] = {
     "adp_comparison": "adp_comparison.run",
     "adp_initial_weights": "adp_comparison.initial_weights",
     "adp_tracking": "adp_tracking.run",
+    "faults": "faults.run",
+    "icl": "icl.run",
     "safe_box": "safe_box.run",
     "rivals": "rivals.run",
 }

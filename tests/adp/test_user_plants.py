@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import time
 
 import numpy as np
 import pytest
@@ -171,3 +172,14 @@ def test_kinks_and_lost_modes_are_named() -> None:
     lost = pendulum(lambda x, u: np.stack((1.5 * x[:, 0], 0.5 * x[:, 1] + u[:, 0]), axis=1))
     with pytest.raises(ValueError, match=r"StepPlant .* not stabilisable.* eigenvalue 1.5 a step"):
         adp.LQR(lost, COST)
+
+
+def test_simulator_that_is_too_slow_for_its_period_is_said_to_be(caplog: pytest.LogCaptureFixture) -> None:
+    def slow(x: np.ndarray, u: np.ndarray) -> np.ndarray:
+        time.sleep(0.002)
+        return turn(x, u)
+
+    with caplog.at_level(logging.WARNING):
+        adp.near_optimal(pendulum(slow, dt=0.01), COST, horizon=0.1)
+    assert "longer than the 0.01 s for which it is held" in caplog.text
+    assert "Shorten `horizon` (10 periods now)" in caplog.text

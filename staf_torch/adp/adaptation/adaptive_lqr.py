@@ -1,0 +1,250 @@
+"""The certainty-equivalent policy: identified while it runs, redesigned on the fly, robust while in doubt."""
+
+from __future__ import annotations
+
+import copy
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ...numerics.checks import fail, integer, non_negative, positive_real, real
+from ..controllers import LQR, Controller, ControllerState, Policy
+from ..cost import Cost, matvec, quadratic
+from ..rollout import RolloutPolicy
+from .carried import pack, unpack
+from .least_squares import Estimate, LeastSquares
+from .parametric import ParametricPlant
+from .redesign import Doubling, control_rate, doubling_start, doubling_step, product, riccati_residual
+from .windows import IntegralWindows, Window
+
+_SOLVED = 1e-2  # residual of the Riccati equation, for the model of the moment, of a design that is used
+
+
+class Adaptation(NamedTuple):
+    """What an adaptive controller knows and does, a row a trajectory.
+
+    Example:
+        >>> plant = adp.ParametricPlant.of_effectiveness(systems.Pendulum())
+        >>> cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
+        >>> law = adp.LeastSquares([1.0], deviation=0.5)
+        >>> control = adp.AdaptiveLQR(plant, cost, adp.IntegralWindows(plant, 0.02), law)
+        >>> x0 = torch.tensor([[0.5, 0.0]]).double()
+        >>> run = adp.simulate(control, plant, cost, x0, dt=0.01, steps=40)
+        >>> now = control.adaptation(run.identifier)
+        >>> now.estimate.theta[0, -1].round(decimals=3), now.certain[0, [0, -1]]
+        (tensor([1.], dtype=torch.float64), tensor([0., 1.], dtype=torch.float64))
+
+        Shown by `staf experiment=faults`.
+    """
+
+    estimate: Estimate
+    certain: Tensor  # (...) 1 where the redesigned policy has the control, 0 where the robust one has it
+    alarmed_at: Tensor  # (...) s, when the plant was last found to be another one; -1: never
+    time: Tensor  # (...) s
+    window: Window
+    doubling: Doubling
+    stage: Tensor  # (...) doublings done of the design that is under way
+    p: Tensor  # (..., n, n) of the design that is used
+
+
+class AdaptiveLQR(Controller):
+    """u = -K(theta^) e with K = R^-1 B'P and P from the Riccati equation of the model of the moment, where
+    that model is certain enough; the control of a robust policy where it is not:
+
+        certain:  c^2 sum_ij C_ij tr(W^-1 M_i W^-1 M_j) < 1,   W = Q + K'RK,   M_i = P (A_i - B_i K) + (..)',
+
+    with C the covariance of theta^ and A_i, B_i the slopes of A and B in theta_i. Then e'Pe falls along the
+    linearised loop for every theta within c standard deviations. Each row has its own model, gain and doubt.
+
+    The Riccati equation is solved by structured doubling, ``doublings`` steps a design and ``a_step`` of them
+    a control, so that a design is some controls old. With a ``rollout`` the LQR of the moment is its base and
+    the model of the moment its model.
+
+    Example:
+        >>> def regressor(x, u):  # damping and inertia of an inverted pendulum
+        ...     zero = torch.zeros_like(u)
+        ...     return torch.stack((torch.cat((zero, -x[..., 1:]), -1), torch.cat((zero, u), -1)), dim=-1)
+        >>> def known(x, u):
+        ...     return torch.stack((x[..., 1], 9.81 * x[..., 0].sin()), dim=-1)
+        >>> plant = adp.ParametricPlant(regressor, known, dim=2, inputs=1, theta=[0.1, 1.0])
+        >>> cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
+        >>> law = adp.LeastSquares([0.3, 0.6], deviation=[0.3, 0.5])
+        >>> control = adp.AdaptiveLQR(plant, cost, adp.IntegralWindows(plant, 0.05), law)
+        >>> run = adp.simulate(control, plant, cost, torch.tensor([[0.5, 0.0]]).double(), dt=0.01, steps=300)
+        >>> control.adaptation(run.identifier).estimate.theta[0, -1].round(decimals=2)
+        tensor([0.1000, 1.0000], dtype=torch.float64)
+
+        Shown by `staf experiment=faults`.
+
+    Args:
+        model: the plant; its theta is not used.
+        cost: the cost rate, without discount.
+        windows: of the integrals.
+        law: of theta, with the first estimate.
+        robust: the policy in doubt; None for the LQR of the first estimate.
+        confidence: c, positive.
+        probe: amplitude of a square wave that is added to every input while the model is uncertain, in its
+            units, not negative: under a linear feedback alone not all parameters can be told apart.
+        doublings: of a design, at least 1.
+        a_step: doublings a control; None for all of them at once.
+        rollout: improves the LQR of the moment; its own model and base are not used.
+
+    Raises:
+        ValueError: if an argument breaks its rule, or the plant rests at the set-point for some theta only.
+    """
+
+    def __init__(
+        self,
+        model: ParametricPlant,
+        cost: Cost,
+        windows: IntegralWindows,
+        law: LeastSquares,
+        *,
+        robust: Policy | None = None,
+        confidence: float = 3.0,
+        probe: float = 0.0,
+        doublings: int = 14,
+        a_step: int | None = None,
+        rollout: RolloutPolicy | None = None,
+    ) -> None:
+        super().__init__()
+        self.model, self.cost = model, cost.around(model)
+        if cost.discount:
+            raise fail("AdaptiveLQR", "cost", "must have no discount", cost.discount)
+        p = model.parameters_count
+        if len(law.first) != p:
+            raise fail("AdaptiveLQR", "law", f"must have the model's {p} parameters", len(law.first))
+        self.windows, self.law, self.rollout = windows, law, rollout
+        self.confidence = positive_real("AdaptiveLQR", "confidence", confidence)
+        non_negative("AdaptiveLQR", "probe", probe)
+        self.probe = real("AdaptiveLQR", "probe", probe)
+        self.doublings = integer("AdaptiveLQR", "doublings", doublings, least=1)
+        self.a_step = self.doublings if a_step is None else integer("AdaptiveLQR", "a_step", a_step, least=1)
+        if self.doublings % self.a_step:
+            raise fail("AdaptiveLQR", "a_step", f"must divide the {doublings} doublings", a_step)
+        self.family = model.family(self.cost.target, self.cost.target_input)
+        self.curvature = self.cost.state_curvature()
+        self.robust: Policy = LQR(model.believing(law.first), cost) if robust is None else robust
+        self.theta: Tensor | None = None
+        self._like = self._start(torch.zeros(1, int(model.dim or 0), dtype=torch.float64), None)
+
+    def starting_from(self, theta: Tensor) -> AdaptiveLQR:
+        """A copy whose rows have first estimates of their own, (B, p)."""
+        other = copy.copy(self)
+        other.theta = theta
+        return other
+
+    def init(self, x0: Tensor) -> ControllerState:
+        none = x0.new_zeros(len(x0), 0)
+        start = pack(self._start(x0, self.theta), 1)
+        return ControllerState(none, none, x0.new_zeros(len(x0), 0, 0), start)
+
+    def adaptation(self, identifier: Tensor) -> Adaptation:
+        """What the rows of `LoopResult.identifier` say, (..., K)."""
+        found: Adaptation = unpack(self._like, identifier, 1)
+        return found
+
+    def step(
+        self, x: Tensor, carried: ControllerState, uniform: Tensor, dt: float
+    ) -> tuple[Tensor, ControllerState]:
+        now = self.adaptation(carried.identifier)
+        window, equation = self.windows.step(now.window, x, dt)
+        estimate = self.law.step(now.estimate, equation, dt)
+        a, b = self.family.at(estimate.theta)
+        doubling, stage, p = self._designed(now, a, b)
+        k = product(product(self.cost.r_inverse.to(b), b.mT), p)
+        solved = riccati_residual(p, a, control_rate(b, self.cost.r_inverse), self.curvature) < _SOLVED
+        certain = solved & (self._doubt(estimate.covariance, p, k) < 1)
+        u = self._control(x, estimate.theta, p, k)
+        doubtful = self.robust(x)
+        if self.probe:
+            doubtful = doubtful + self._probing(now.time)
+        u = torch.where(certain.unsqueeze(-1), u, doubtful)
+        if self.cost.bounds is not None:  # what the actuator will give, which the window must know
+            u = self.cost.bounds.clip(u)
+        alarmed = estimate.resets > now.estimate.resets
+        after = Adaptation(
+            estimate,
+            certain.to(x),
+            torch.where(alarmed, now.time, now.alarmed_at),
+            now.time + dt,
+            self.windows.holding(window, u),
+            doubling,
+            stage,
+            p,
+        )
+        return u, carried._replace(identifier=pack(after, x.dim() - 1))
+
+    def _start(self, x: Tensor, theta: Tensor | None) -> Adaptation:
+        estimate = self.law.init(x, theta)
+        square = x.new_zeros(len(x), x.shape[-1], x.shape[-1])
+        zero = x.new_zeros(len(x))
+        empty = Doubling(square, square.clone(), square.clone())
+        return Adaptation(
+            estimate,
+            zero,
+            zero - 1,
+            zero.clone(),
+            self.windows.init(x),
+            empty,
+            zero.clone(),
+            square.clone(),
+        )
+
+    def _designed(self, now: Adaptation, a: Tensor, b: Tensor) -> tuple[Doubling, Tensor, Tensor]:
+        """The design under way, how far it is, and P of the last one that was finished."""
+        begins = now.stage == 0
+        first = doubling_start(a, control_rate(b, self.cost.r_inverse), self.curvature)
+        pair = Doubling(
+            *(
+                torch.where(begins[..., None, None], new, old)
+                for new, old in zip(first, now.doubling, strict=True)
+            )
+        )
+        for _ in range(self.a_step):
+            pair = doubling_step(pair)
+        stage = now.stage + self.a_step
+        done = stage >= self.doublings
+        sound = done & torch.isfinite(pair.h).all(-1).all(-1)
+        p = torch.where(sound[..., None, None], pair.h, now.p)
+        # A design that went wrong must not end the row: its pair starts from zero.
+        pair = Doubling(
+            *(torch.where(torch.isfinite(part) & ~done[..., None, None], part, 0.0) for part in pair)
+        )
+        return pair, torch.where(done, 0.0, stage), p
+
+    def _doubt(self, covariance: Tensor, p: Tensor, k: Tensor) -> Tensor:
+        """c^2 sum_ij C_ij tr(W^-1 M_i W^-1 M_j): (...)."""
+        r = self.cost.r.to(p)
+        weight = torch.linalg.inv_ex(self.curvature.to(p) + product(product(k.mT, r), k))[0]
+        slopes = self.family.a_slopes.to(p) - product(self.family.b_slopes.to(p), k.unsqueeze(-3))
+        pushed = product(p.unsqueeze(-3), slopes)
+        turned = product(weight.unsqueeze(-3), pushed + pushed.mT)  # (..., p, n, n)
+        paired = (turned.unsqueeze(-3) * turned.mT.unsqueeze(-4)).sum((-2, -1))
+        doubt = self.confidence**2 * (covariance * paired).sum((-2, -1))
+        return torch.where(torch.isfinite(doubt), doubt, torch.inf)
+
+    def _control(self, x: Tensor, theta: Tensor, p: Tensor, k: Tensor) -> Tensor:
+        """The certainty-equivalent control."""
+        if self.rollout is None:
+            return self._linear(x, k)
+        policy = copy.copy(self.rollout)
+        policy._modules = dict(policy._modules)
+        for name in ("model", "base", "terminal"):  # modules there, functions here
+            policy._modules.pop(name, None)
+        policy.model = self.model.believing(theta.unsqueeze(-2))  # one a row, for all its centers
+        many_k, many_p = k.unsqueeze(-3), p.unsqueeze(-3)
+        policy.base = lambda x: self._linear(x, many_k)
+        policy.terminal = lambda x: quadratic(many_p, self.cost.deviation(x))
+        values = policy.rollout(policy.basis.centers(x))
+        return self.cost.policy(self.model.believing(theta).effectiveness(x), policy.gradient_of(x, values))
+
+    def _linear(self, x: Tensor, k: Tensor) -> Tensor:
+        return self.cost.saturate(self.cost.input_of(-matvec(k, self.cost.deviation(x))))
+
+    def _probing(self, time: Tensor) -> Tensor:
+        """Square waves, every input's of another period: (..., m)."""
+        length = self.windows.length
+        turns = [time * (3.141592653589793 / (length * (2 + j))) for j in range(self.model.inputs)]
+        return self.probe * torch.stack([(turn + 0.1).sin().sign() for turn in turns], dim=-1)

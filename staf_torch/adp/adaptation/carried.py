@@ -1,0 +1,61 @@
+"""Named tuples of tensors as one flat row, which is what a controller carries."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+Tree = Any
+"""A tensor, or a named tuple of trees."""
+
+
+def pack(tree: Tree, lead: int) -> Tensor:
+    """All tensors of a tree behind each other: (..., *shape) each -> (..., K).
+
+    Args:
+        tree: of tensors with the same leading dimensions.
+        lead: how many dimensions lead.
+    """
+    return torch.cat(
+        [leaf.flatten(lead) if leaf.dim() > lead else leaf[..., None] for leaf in leaves(tree)], -1
+    )
+
+
+def unpack(like: Tree, flat: Tensor, lead: int) -> Tree:
+    """The tree that was packed: (..., K) -> tensors (..., *shape).
+
+    Args:
+        like: a tree of the same shapes, with any leading dimensions.
+        flat: (..., K).
+        lead: how many dimensions lead in ``like``.
+    """
+    shapes = [leaf.shape[lead:] for leaf in leaves(like)]
+    pieces = flat.split([math.prod(shape) for shape in shapes], dim=-1)
+    found = [piece.reshape(*flat.shape[:-1], *shape) for piece, shape in zip(pieces, shapes, strict=True)]
+    return _rebuilt(like, iter(found))
+
+
+def leaves(tree: Tree) -> list[Tensor]:
+    """The tensors of a tree, in order."""
+    return [tree] if isinstance(tree, Tensor) else [leaf for part in tree for leaf in leaves(part)]
+
+
+def _rebuilt(like: Tree, found: Any) -> Tree:
+    if isinstance(like, Tensor):
+        return next(found)
+    return type(like)(*(_rebuilt(part, found) for part in like))
+
+
+def empty_row(x: Tensor, size: int) -> Tensor:
+    """Room for nothing, or zeros: (B, size)."""
+    return x.new_zeros(len(x), size)
+
+
+def rows_of(value: float | Sequence[float] | Tensor, x: Tensor) -> Tensor:
+    """One number a row, from a number or one each: (B,)."""
+    given = torch.as_tensor(value, dtype=x.dtype, device=x.device)
+    return given.expand(len(x)).clone()

@@ -1,0 +1,127 @@
+"""Parameters by recursive least squares: with forgetting, a covariance, and a test of what is new."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ...numerics.checks import fail, non_negative, positive_real, real, vector
+from .windows import Equation
+
+
+class Estimate(NamedTuple):
+    """theta^ with its covariance, a row a trajectory.
+
+    Example:
+        >>> adp.LeastSquares([0.0, 0.0], deviation=5.0).init(torch.zeros(3, 2)).covariance.shape
+        torch.Size([3, 2, 2])
+
+        Shown by `staf experiment=faults`.
+    """
+
+    theta: Tensor  # (..., p)
+    covariance: Tensor  # (..., p, p)
+    surprise: Tensor  # (...) largest innovation of the last equation, in its standard deviations
+    resets: Tensor  # (...) how often the covariance was opened again
+
+
+class LeastSquares:
+    """theta^ of the equations S theta = z + noise by recursive least squares, one row of S after the other:
+
+        k = P s / (s'P s + r),   theta^ += k (z - s'theta^),   P -= k s'P,
+
+    with the noise's variance r of the equation and ``floor``^2 more. Between equations P grows at the rate
+    ``forgetting``, up to its first trace. Where an innovation exceeds ``alarm`` standard deviations the plant
+    is another one: P opens to its first size again, and the old data are forgotten at once.
+
+    Example:
+        >>> law = adp.LeastSquares([0.0, 0.0], deviation=10.0, floor=1e-6)
+        >>> now = law.init(torch.zeros(1, 2).double())
+        >>> s = torch.tensor([[[1.0, 2.0], [1.0, -1.0]]]).double()
+        >>> z = s @ torch.tensor([3.0, 4.0]).double()
+        >>> equation = adp.Equation(s, z, torch.zeros(1), torch.tensor([True]))
+        >>> law.step(now, equation, 0.01).theta.round(decimals=6)
+        tensor([[3., 4.]], dtype=torch.float64)
+
+        Shown by `staf experiment=faults`.
+
+    Args:
+        theta: first estimate, p numbers.
+        deviation: standard deviation of the first estimate, positive, one number or p.
+        floor: standard deviation of an error of z beside the noise, positive: that of the integrals, of what
+            the model leaves out.
+        forgetting: 1/s, not negative.
+        alarm: positive; None for no test.
+
+    Raises:
+        ValueError: if an argument breaks its rule.
+    """
+
+    def __init__(
+        self,
+        theta: Sequence[float],
+        deviation: float | Sequence[float],
+        *,
+        floor: float = 1e-6,
+        forgetting: float = 0.0,
+        alarm: float | None = None,
+    ) -> None:
+        first = vector("LeastSquares", "theta", theta)
+        several = list(deviation) if isinstance(deviation, Sequence) else [deviation] * len(first)
+        if len(several) != len(first):
+            raise fail("LeastSquares", "deviation", f"must be one number or {len(first)}", deviation)
+        sizes = [positive_real("LeastSquares", "deviation", value) for value in several]
+        self.first = torch.tensor(first, dtype=torch.float64)
+        self.prior = torch.diag(torch.tensor(sizes, dtype=torch.float64).square())
+        self.floor = positive_real("LeastSquares", "floor", floor)
+        non_negative("LeastSquares", "forgetting", forgetting)
+        self.forgetting = real("LeastSquares", "forgetting", forgetting)
+        self.alarm = None if alarm is None else positive_real("LeastSquares", "alarm", alarm)
+
+    def init(self, x: Tensor, theta: Tensor | None = None) -> Estimate:
+        """The first estimate, a row each of (..., n).
+
+        Args:
+            x: for the shape alone.
+            theta: (..., p), of every row; the common one by default.
+        """
+        lead, p = x.shape[:-1], len(self.first)
+        start = self.first.to(x).expand(*lead, p).clone() if theta is None else theta.to(x)
+        zero = x.new_zeros(lead)
+        return Estimate(start, self.prior.to(x).expand(*lead, p, p).clone(), zero, zero.clone())
+
+    def step(self, state: Estimate, equation: Equation, dt: float) -> Estimate:
+        """The estimate with an equation, where it is ready.
+
+        Args:
+            state: before it.
+            equation: S theta = z.
+            dt: s since the step before.
+        """
+        theta, p, ready = state.theta, state.covariance, equation.ready
+        prior = self.prior.to(theta)
+        if self.forgetting:
+            grown = p * (1 + self.forgetting * dt)
+            room = grown.diagonal(dim1=-2, dim2=-1).sum(-1) <= prior.diagonal().sum()
+            p = torch.where(room[..., None, None], grown, p)
+        noise = equation.variance + self.floor**2
+        surprise, resets = state.surprise, state.resets
+        if self.alarm is not None:
+            seen = (equation.s.unsqueeze(-2) * p.unsqueeze(-3)).sum(-1)  # S P, (..., n, p)
+            spread = (seen * equation.s).sum(-1) + noise.unsqueeze(-1)
+            left = equation.z - (equation.s * theta.unsqueeze(-2)).sum(-1)
+            sigmas = (left.square() / spread).amax(-1).sqrt()
+            alarmed = ready & (sigmas > self.alarm)
+            p = torch.where(alarmed[..., None, None], prior, p)
+            surprise = torch.where(ready, sigmas, surprise)
+            resets = resets + alarmed.to(resets)
+        for row in range(equation.s.shape[-2]):
+            s, z = equation.s[..., row, :], equation.z[..., row]
+            ps = (p * s.unsqueeze(-2)).sum(-1)
+            gain = torch.where(ready, 1 / ((ps * s).sum(-1) + noise), 0.0)
+            theta = theta + (gain * (z - (s * theta).sum(-1))).unsqueeze(-1) * ps
+            p = p - gain[..., None, None] * ps.unsqueeze(-1) * ps.unsqueeze(-2)
+        return Estimate(theta, p, surprise, resets)

@@ -1,0 +1,145 @@
+"""Adaptive tracking where the input pushes every state: the law of the papers on concurrent learning."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ...numerics.checks import choice, fail
+from ..controllers import Controller, ControllerState
+from .carried import pack, unpack
+from .history_stack import ConcurrentGradient, HistoryStack, Stack
+from .parametric import ParametricPlant
+from .windows import IntegralWindows, SlopeWindow, SlopeWindows, Window
+
+Reference = Callable[[Tensor], tuple[Tensor, Tensor]]
+"""xd and its rate from the state, (..., N) -> (..., m) and (..., m)."""
+Gain = float | Sequence[float] | Tensor
+
+
+class Tracking(NamedTuple):
+    """What a `ConcurrentTracker` carries, a row a trajectory.
+
+    Example:
+        >>> adp.Tracking._fields[:4]
+        ('theta', 'feedback', 'gain', 'rate')
+
+        Shown by `staf experiment=icl`.
+    """
+
+    theta: Tensor  # (..., p)
+    feedback: Tensor  # (...) K
+    gain: Tensor  # (...) k_CL
+    rate: Tensor  # (...) Gam
+    window: Window | SlopeWindow
+    stack: Stack
+
+
+class ConcurrentTracker(Controller):
+    """Follow xd with a plant whose first m states are pushed by the m inputs, x' = Y(z) theta + u:
+
+        u = xd' - Y theta^ - K (x - xd),
+        theta^' = Gam (Y'(x - xd) + k_CL sum_j S_j' (z_j - S_j theta^)),
+
+    with equations S theta = z from windows of measured states, of which a `HistoryStack` keeps the best.
+    Each row may have gains of its own.
+
+    Example:
+        >>> def regressor(z, u):  # x' = theta sin x + u
+        ...     return z.sin().unsqueeze(-1)
+        >>> plant = adp.ParametricPlant(regressor, lambda z, u: u, dim=1, inputs=1, theta=[2.0])
+        >>> def rest(z):
+        ...     return torch.ones_like(z), torch.zeros_like(z)  # xd = 1
+        >>> tracker = adp.ConcurrentTracker(plant, rest, length=0.05, feedback=2.0, gain=2000.0, size=5)
+        >>> cost = adp.QuadraticCost(1.0, 1.0, dim=1, inputs=1)
+        >>> x0 = torch.tensor([[-1.0]]).double()
+        >>> run = adp.simulate(tracker, plant, cost, x0, dt=0.01, steps=400)
+        >>> run.state[0, -1].round(decimals=2)
+        tensor([1.], dtype=torch.float64)
+        >>> tracker.tracking(run.identifier).theta[0, -1].round(decimals=2)
+        tensor([2.], dtype=torch.float64)
+
+        Shown by `staf experiment=icl`.
+
+    Args:
+        plant: its theta is not used.
+        reference: xd and xd' from the state.
+        length: of the windows, s, a number or one a row; so are the gains.
+        feedback: K, 1/s.
+        gain: k_CL.
+        rate: Gam.
+        source: of the equations: ``integral``, or ``slope``, x' from the difference over the window.
+        size: N of the stack.
+        first: theta^(0), p numbers; None for zeros.
+
+    Raises:
+        ValueError: if an argument breaks its rule.
+
+    Source: Parikh, Kamalapurkar and Dixon, IJACSP 33 (2019); the implicit step of theta^ is our own.
+    """
+
+    def __init__(
+        self,
+        plant: ParametricPlant,
+        reference: Reference,
+        *,
+        length: Gain,
+        feedback: Gain,
+        gain: Gain,
+        rate: Gain = 1.0,
+        source: str = "integral",
+        size: int = 20,
+        first: Sequence[float] | None = None,
+    ) -> None:
+        super().__init__()
+        choice("ConcurrentTracker", "source", source, ("integral", "slope"))
+        self.gains = []
+        for name, value in (("feedback", feedback), ("gain", gain), ("rate", rate), ("length", length)):
+            given = torch.as_tensor(value, dtype=torch.float64)
+            if given.dim() > 1 or not bool((given > 0).all()):
+                raise fail("ConcurrentTracker", name, "must be positive, a number or one a row", value)
+            self.gains.append(given)
+        self.plant, self.reference = plant, reference
+        longest = float(self.gains[3].max())
+        made = IntegralWindows if source == "integral" else SlopeWindows
+        self.windows: IntegralWindows | SlopeWindows = made(plant, longest)
+        p = plant.parameters_count
+        self.stack = HistoryStack(len(plant.rows), p, size)
+        self.first = torch.zeros(p).double() if first is None else torch.tensor(first, dtype=torch.float64)
+        self._like = self._start(
+            torch.zeros(1, plant._size(), dtype=torch.float64), [g.max() for g in self.gains]
+        )
+
+    def init(self, x0: Tensor) -> ControllerState:
+        none = x0.new_zeros(len(x0), 0)
+        start = pack(self._start(x0, self.gains), 1)
+        return ControllerState(none, none, x0.new_zeros(len(x0), 0, 0), start)
+
+    def tracking(self, identifier: Tensor) -> Tracking:
+        """What the rows of `LoopResult.identifier` say, (..., K)."""
+        found: Tracking = unpack(self._like, identifier, 1)
+        return found
+
+    def step(
+        self, x: Tensor, carried: ControllerState, uniform: Tensor, dt: float
+    ) -> tuple[Tensor, ControllerState]:
+        now, m = self.tracking(carried.identifier), self.plant.inputs
+        window, equation = self.windows.step(now.window, x, dt)  # type: ignore[arg-type]
+        stack = self.stack.step(now.stack, equation)
+        wanted, wanted_rate = self.reference(x)
+        error = x[..., :m] - wanted
+        y = self.plant.regressor(x, torch.zeros_like(error))[..., :m, :]
+        push = (y * error.unsqueeze(-1)).sum(-2)
+        theta = ConcurrentGradient(now.gain, now.rate).step(now.theta, stack.gram, stack.moment, dt, push)
+        u = wanted_rate - (y * theta.unsqueeze(-2)).sum(-1) - now.feedback.unsqueeze(-1) * error
+        window = self.windows.holding(window, u)  # type: ignore[arg-type]
+        after = now._replace(theta=theta, window=window, stack=stack)
+        return u, carried._replace(identifier=pack(after, x.dim() - 1))
+
+    def _start(self, x: Tensor, gains: Sequence[Tensor]) -> Tracking:
+        feedback, gain, rate, length = (g.to(x).expand(len(x)).clone() for g in gains)
+        theta = self.first.to(x).expand(len(x), -1).clone()
+        return Tracking(theta, feedback, gain, rate, self.windows.init(x, length), self.stack.init(x))

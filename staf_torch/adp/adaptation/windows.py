@@ -1,0 +1,276 @@
+"""Equations for the parameters from measured states alone: integrals over windows of time."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ...numerics.checks import choice, fail, non_negative, positive_real, real
+from .parametric import ParametricPlant
+
+
+class Equation(NamedTuple):
+    """S theta = z up to noise, a row a trajectory.
+
+    Example:
+        >>> adp.Equation(torch.ones(1, 2, 3), torch.ones(1, 2), torch.ones(1), torch.tensor([True])).z.shape
+        torch.Size([1, 2])
+
+        Shown by `staf experiment=icl`.
+    """
+
+    s: Tensor  # (..., r, p), a row each of the model's ``rows``
+    z: Tensor  # (..., r)
+    variance: Tensor  # (...) of the noise of every entry of z
+    ready: Tensor  # (...) bool: whether there is one at this time
+
+
+class Window(NamedTuple):
+    """What is integrated of the window so far.
+
+    Example:
+        >>> windows = adp.IntegralWindows(adp.ParametricPlant.of_effectiveness(systems.Pendulum()), 0.1)
+        >>> windows.init(torch.zeros(5, 2)).s.shape
+        torch.Size([5, 2, 1])
+
+        Shown by `staf experiment=icl`.
+    """
+
+    x: Tensor  # (..., n) the state that was measured last
+    u: Tensor  # (..., m) the input held since
+    s: Tensor  # (..., r, p)
+    z: Tensor  # (..., r)
+    elapsed: Tensor  # (...) s; -1 before the first measurement
+    length: Tensor  # (...) s of this window
+    longest: Tensor  # (...) s
+
+
+class IntegralWindows:
+    """Equations S theta = z from states alone, one a window of time, where x' is not measured:
+
+        S = sum_k phi_k int_k Y dt,   z = sum_k phi_k (x_k+1 - x_k - int_k h dt),
+
+    over the steps k of the window, the integrals by the trapezoidal rule with the input held. With phi = 1
+    (``box``) that is integral concurrent learning. With phi = sin^2(pi t / T) (``smooth``) the noise of a
+    measurement counts as the slope of phi and not as 1: of white noise of the states a window keeps
+    pi^2 dt / (4 T) of the variance of a box.
+
+    Example:
+        >>> plant = adp.ParametricPlant.of_effectiveness(systems.Pendulum())
+        >>> windows = adp.IntegralWindows(plant, length=0.02)
+        >>> now, x, u = windows.init(torch.zeros(1, 2).double()), torch.zeros(1, 2).double(), torch.ones(1, 1)
+        >>> for _ in range(3):
+        ...     now, equation = windows.step(now, x, 0.01)
+        ...     now = windows.holding(now, u.double())
+        ...     x = systems.runge_kutta_step(lambda x: plant.motion(x, u.double()), x, 0.01)
+        >>> equation.ready, (equation.z / equation.s[..., 0])[..., 1].round(decimals=3)
+        (tensor([True]), tensor([1.], dtype=torch.float64))
+
+        Shown by `staf experiment=icl`.
+
+    Args:
+        model: the plant, whose theta is not used.
+        length: T, s, positive.
+        shape: ``box`` or ``smooth``.
+        first: s, the length of the first window; every other one is twice as long, up to T. None for T. Short
+            windows know something soon, long ones are worth more against noise.
+        noise: standard deviation of the noise of a measured state, in its units, not negative.
+
+    Raises:
+        ValueError: if an argument breaks its rule.
+
+    Source: Parikh, Kamalapurkar and Dixon, "Integral concurrent learning", IJACSP 33 (2019), for the box.
+    """
+
+    def __init__(
+        self,
+        model: ParametricPlant,
+        length: float,
+        *,
+        shape: str = "box",
+        first: float | None = None,
+        noise: float = 0.0,
+    ) -> None:
+        self.model = model
+        self.length = positive_real("IntegralWindows", "length", length)
+        self.first = self.length if first is None else positive_real("IntegralWindows", "first", first)
+        if self.first > self.length:
+            raise fail("IntegralWindows", "first", f"must be at most the length of {length:g} s", first)
+        choice("IntegralWindows", "shape", shape, ("box", "smooth"))
+        self.smooth = shape == "smooth"
+        non_negative("IntegralWindows", "noise", noise)
+        self.noise = real("IntegralWindows", "noise", noise)
+
+    def init(self, x: Tensor, length: Tensor | None = None) -> Window:
+        """Nothing measured yet, a row each of the states (..., n).
+
+        Args:
+            x: for the shape alone.
+            length: (...), of every row; the common one by default.
+        """
+        lead, count = x.shape[:-1], len(self.model.rows)
+        return Window(
+            torch.zeros_like(x),
+            x.new_zeros(*lead, self.model.inputs),
+            x.new_zeros(*lead, count, self.model.parameters_count),
+            x.new_zeros(*lead, count),
+            x.new_full(lead, -1.0),
+            x.new_full(lead, self.first) if length is None else length.to(x),
+            x.new_full(lead, self.length) if length is None else length.to(x),
+        )
+
+    def step(self, state: Window, x: Tensor, dt: float) -> tuple[Window, Equation]:
+        """The window with the state measured now, and the equation where it is complete.
+
+        Args:
+            state: until the measurement before.
+            x: (..., n), measured now.
+            dt: s since the measurement before.
+        """
+        begun = state.elapsed >= 0
+        share = self._weight(state, dt) if self.smooth else torch.ones_like(state.elapsed)
+        share = torch.where(begun, share, 0.0)
+        model, rows, half = self.model, self.model.rows, 0.5 * dt * share
+        s = model.regressor(state.x, state.u) + model.regressor(x, state.u)
+        moved = model.difference(x, state.x)
+        h = model.rest_of(state.x, state.u) + model.rest_of(x, state.u)
+        whole_s = state.s + half[..., None, None] * s[..., rows, :]
+        whole_z = state.z + (share.unsqueeze(-1) * moved - half.unsqueeze(-1) * h)[..., rows]
+        elapsed = torch.where(begun, state.elapsed + dt, 0.0)
+        ready = elapsed > state.length - 0.5 * dt
+        kept = (~ready).to(x)
+        after = Window(
+            x,
+            state.u,
+            kept[..., None, None] * whole_s,
+            kept.unsqueeze(-1) * whole_z,
+            kept * elapsed,
+            torch.where(ready, torch.minimum(2 * state.length, state.longest), state.length),
+            state.longest,
+        )
+        return after, Equation(whole_s, whole_z, self._variance(state, dt), ready)
+
+    def holding(self, state: Window, u: Tensor) -> Window:
+        """The window with the input that is held from now on, (..., m)."""
+        return state._replace(u=u)
+
+    def _weight(self, state: Window, dt: float) -> Tensor:
+        """phi in the middle of the step."""
+        return (math.pi * (state.elapsed + 0.5 * dt) / state.length).sin().square()
+
+    def _variance(self, state: Window, dt: float) -> Tensor:
+        """Of the noise of z: sum (phi_k - phi_k-1)^2 of the noise's."""
+        share = 0.5 * math.pi**2 * dt / state.length if self.smooth else torch.full_like(state.length, 2.0)
+        return self.noise**2 * share
+
+
+class SlopeWindow(NamedTuple):
+    """What `SlopeWindows` remembers of the window so far.
+
+    Example:
+        >>> adp.SlopeWindow._fields[:2]
+        ('x', 'u')
+
+        Shown by `staf experiment=icl`.
+    """
+
+    x: Tensor  # (..., n) at the window's beginning
+    u: Tensor  # (..., m) held since the last measurement
+    s: Tensor  # (..., r, p) Y in its middle
+    h: Tensor  # (..., r) h there
+    elapsed: Tensor  # (...) s; -1 before the first measurement
+    length: Tensor  # (...) s
+
+
+class SlopeWindows:
+    """Equations Y theta = x' - h in the middle of a window, with x' from the difference over the window.
+
+    This is concurrent learning with a differentiated state, the rival of `IntegralWindows`: the same two
+    states make z, but Y is that of one noisy state and not the mean over the window.
+
+    Example:
+        >>> plant = adp.ParametricPlant.of_effectiveness(systems.Pendulum())
+        >>> adp.SlopeWindows(plant, 0.02).init(torch.zeros(5, 2)).s.shape
+        torch.Size([5, 2, 1])
+
+        Shown by `staf experiment=icl`.
+
+    Args:
+        model: the plant, whose theta is not used.
+        length: s, positive.
+
+    Raises:
+        ValueError: if the length is not positive.
+    """
+
+    def __init__(self, model: ParametricPlant, length: float) -> None:
+        self.model = model
+        self.length = positive_real("SlopeWindows", "length", length)
+
+    def init(self, x: Tensor, length: Tensor | None = None) -> SlopeWindow:
+        """As `IntegralWindows.init`."""
+        lead, count = x.shape[:-1], len(self.model.rows)
+        return SlopeWindow(
+            torch.zeros_like(x),
+            x.new_zeros(*lead, self.model.inputs),
+            x.new_zeros(*lead, count, self.model.parameters_count),
+            x.new_zeros(*lead, count),
+            x.new_full(lead, -1.0),
+            x.new_full(lead, self.length) if length is None else length.to(x),
+        )
+
+    def step(self, state: SlopeWindow, x: Tensor, dt: float) -> tuple[SlopeWindow, Equation]:
+        """As `IntegralWindows.step`."""
+        begun = state.elapsed >= 0
+        elapsed = torch.where(begun, state.elapsed + dt, 0.0)
+        half = 0.5 * state.length
+        middle = begun & (elapsed > half - 0.5 * dt) & (elapsed <= half + 0.5 * dt)
+        rows = self.model.rows
+        s = torch.where(middle[..., None, None], self.model.regressor(x, state.u)[..., rows, :], state.s)
+        h = torch.where(middle.unsqueeze(-1), self.model.rest_of(x, state.u)[..., rows], state.h)
+        ready = begun & (elapsed > state.length - 0.5 * dt)
+        slope = self.model.difference(x, state.x)[..., rows] / elapsed.clamp(min=dt).unsqueeze(-1)
+        begins = ~begun | ready
+        after = SlopeWindow(
+            torch.where(begins.unsqueeze(-1), x, state.x),
+            state.u,
+            s,
+            h,
+            torch.where(begins, 0.0, elapsed),
+            state.length,
+        )
+        return after, Equation(s, slope - h, torch.zeros_like(elapsed), ready)
+
+    def holding(self, state: SlopeWindow, u: Tensor) -> SlopeWindow:
+        """As `IntegralWindows.holding`."""
+        return state._replace(u=u)
+
+
+def measured_rate(model: ParametricPlant, x: Tensor, u: Tensor, rate: Tensor, noise: float) -> Equation:
+    """Return the equation Y(x, u) theta = x' - h(x, u) of a measured rate.
+
+    Example:
+        >>> plant = adp.ParametricPlant.of_effectiveness(systems.Pendulum())
+        >>> x, u = torch.zeros(1, 2).double(), torch.ones(1, 1).double()
+        >>> adp.measured_rate(plant, x, u, plant.motion(x, u), 0.0).z
+        tensor([[0., 1.]], dtype=torch.float64)
+
+        Shown by `staf experiment=icl`.
+
+    Args:
+        model: the plant.
+        x: (..., n).
+        u: (..., m), held when x' was measured.
+        rate: x', (..., n).
+        noise: standard deviation of the measured x'.
+    """
+    lead = torch.zeros_like(x[..., 0])
+    return Equation(
+        model.regressor(x, u)[..., model.rows, :],
+        (rate - model.rest_of(x, u))[..., model.rows],
+        lead + noise**2,
+        torch.ones_like(lead).bool(),
+    )

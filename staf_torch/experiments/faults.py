@@ -1,0 +1,295 @@
+"""Plants that are not what the design was made for: failed actuators, half an actuator, a wrong mass."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from omegaconf import DictConfig
+from torch import Tensor
+
+from ..adp import (
+    LQR,
+    AdaptiveLQR,
+    BoundedInputCost,
+    ChangingPlant,
+    Controller,
+    Cost,
+    DirectShooting,
+    Feedback,
+    IntegralWindows,
+    LeastSquares,
+    LoopResult,
+    Measured,
+    ParametricPlant,
+    QuadraticCost,
+    simulate,
+)
+from ..figures.adaptation import FaultPicture, draw_faults
+from ..figures.style import images
+from ..numerics.checks import COMMAND_LINE, choice, flag, integer, positive_real
+from ..results.progress import SHOWN, Progress
+from ..results.run_directory import RunDirectory
+from ..settings.chase import plain
+from ..tables import Style, Table
+from .registry import Metrics, finite
+
+_log = logging.getLogger(__name__)
+_COLUMNS = {
+    "case": "case",
+    "method": "method",
+    "cost_median": "cost, median",
+    "cost_max": "largest",
+    "ratio_median": "over the optimum, median",
+    "ratio_max": "largest",
+    "regulated": "regulated",
+    "found_median": "found after (s), median",
+    "parameter_error": "largest error of a parameter",
+}
+_RECORDED = 0.01  # s between recorded times, about
+_SETTLED = 1.0  # s at the end in which a regulated state stays near the origin
+
+
+class Case(NamedTuple):
+    """One plant, what happens to it, and the policy that learns it."""
+
+    model: ParametricPlant
+    cost: Cost
+    x0: Tensor  # (B, n)
+    before: Tensor  # (B, p)
+    after: Tensor  # (B, p)
+    at: Tensor  # (B,) s
+    dt: float  # s
+    noise: float  # standard deviation of a measured state
+    near: float  # norm below which the state is regulated
+    adaptive: AdaptiveLQR
+    optimum: Callable[[], Tensor | None]  # the least cost from x0 of who knows it all, (B,)
+
+
+def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics:
+    """Run every case with three policies and fill the run directory; `metrics.json` comes last."""
+    figures = flag(COMMAND_LINE, "figures", cfg.figures)
+    rows = integer(COMMAND_LINE, "trajectories", cfg.trajectories, least=1)
+    duration = positive_real(COMMAND_LINE, "duration", cfg.duration)
+    generator = torch.Generator().manual_seed(integer(COMMAND_LINE, "seed", cfg.seed, least=0))
+    table: list[dict[str, Any]] = []
+    pictures: dict[str, FaultPicture] = {}
+    metrics: Metrics = {}
+    for name in plain(cfg.faults.cases):
+        choice(COMMAND_LINE, "faults.cases", name, tuple(CASES))
+        case = CASES[name](rows, generator)
+        results = {
+            method: _simulated(case, control, duration) for method, control in _controllers(case).items()
+        }
+        best = case.optimum()
+        for method, result in results.items():
+            measured = _measured(case, method, result, best)
+            table.append({"case": name.replace("_", " "), "method": method} | measured)
+            key = f"{name}_{method.replace(' ', '_')}_"
+            metrics |= {key + what: finite(value) for what, value in measured.items() if value is not None}
+            _log.info(
+                "%-12s %-8s cost %.5g, largest %.5g, regulated %.4g",
+                *(name, method, measured["cost_median"], measured["cost_max"], measured["regulated"]),
+            )
+        pictures[name.replace("_", " ")] = _picture(case, results)
+    out = RunDirectory(directory)
+    out.table("faults", dataclasses.replace(Table.of(table, _COLUMNS), style=Style(digits=5)))
+    if figures:
+        out.figure("faults", images(draw_faults(pictures)))
+    return out.metrics(metrics)
+
+
+def short_period(rows: int, generator: torch.Generator) -> Case:
+    """The F/A-18's short period with effectiveness (.7, 0): drift and effectiveness unknown, the drift's
+    first estimate uniform in [-5, 5].
+
+    Source: Deptula, Bell, Zegers, Licitra and Dixon, Automatica 116 (2020), 108922.
+    """
+    drift = torch.tensor([-1.175, 0.9871, -8.458, -0.8776], dtype=torch.float64)
+    pushed = torch.tensor([[-0.194, -0.03593], [-19.29, -3.803]], dtype=torch.float64)
+
+    def regressor(x: Tensor, u: Tensor) -> Tensor:
+        none = torch.zeros_like(x)
+        effect = pushed.to(x) * u.unsqueeze(-2)
+        first, second = torch.cat((x, none), -1), torch.cat((none, x), -1)
+        return torch.cat((torch.stack((first, second), dim=-2), effect), dim=-1)
+
+    true = torch.cat((drift, torch.tensor([0.7, 0.0], dtype=torch.float64)))
+    model = ParametricPlant(regressor, dim=2, inputs=2, theta=true)
+    cost = BoundedInputCost(0.25, 5.0, dim=2, inputs=2, bound=2.0)
+    x0 = torch.tensor([[25.0, -10.0]], dtype=torch.float64).repeat(rows, 1)
+    first = torch.ones(rows, 6, dtype=torch.float64)
+    first[:, :4] = 10 * torch.rand(rows, 4, generator=generator, dtype=torch.float64) - 5
+    law = LeastSquares([0.0] * 4 + [1.0] * 2, deviation=[10.0] * 4 + [1.0] * 2, floor=1e-5)
+    # The plant is stable: where nothing is known, nothing is done but to probe.
+    adaptive = AdaptiveLQR(
+        *(model, cost, IntegralWindows(model, 0.002), law),
+        robust=torch.zeros_like,
+        probe=1.0,
+    ).starting_from(first)
+    known = true.expand(rows, 6)
+    return Case(
+        *(model, cost, x0, known, known, torch.zeros(rows), 0.001, 0.0, 1e-2, adaptive),
+        lambda: DirectShooting(model, cost).solve(x0[:1]).value.expand(rows),
+    )
+
+
+def unstable(rows: int, generator: torch.Generator) -> Case:
+    """x1'' = 25 x1 + u1 + u2/10, controlled every 20 ms, of whose first actuator half is lost on the way to
+    the origin, between 0.1 and 0.5 s. An LQR that is made to be held for that long does not stand it."""
+
+    def regressor(x: Tensor, u: Tensor) -> Tensor:
+        effect = u * torch.tensor([1.0, 0.1]).to(u)
+        return torch.stack((torch.zeros_like(effect), effect), dim=-2)
+
+    def known(x: Tensor, u: Tensor) -> Tensor:
+        return torch.stack((x[..., 1], 25 * x[..., 0]), dim=-1)
+
+    model = ParametricPlant(regressor, known, dim=2, inputs=2, theta=[1.0, 1.0], rows=[1])
+    cost = QuadraticCost(1.0, 1.0, dim=2, inputs=2)
+    x0 = 2 * torch.rand(rows, 2, generator=generator, dtype=torch.float64) - 1
+    at = 0.1 + 0.4 * torch.rand(rows, generator=generator, dtype=torch.float64)
+    law = LeastSquares([1.0, 1.0], deviation=[0.3, 0.05], floor=1e-3, forgetting=0.2, alarm=5.0)
+    windows = IntegralWindows(model, 0.06, noise=0.002)
+    before = torch.ones(rows, 2, dtype=torch.float64)
+    return Case(
+        *(model, cost, x0, before, before * torch.tensor([0.5, 1.0]).to(before), at, 0.02, 0.002, 0.05),
+        AdaptiveLQR(model, cost, windows, law, a_step=14),
+        lambda: None,
+    )
+
+
+def mass(rows: int, generator: torch.Generator) -> Case:
+    """An inverted pendulum with half or twice the mass of the design, states measured with noise of 0.01."""
+
+    def regressor(x: Tensor, u: Tensor) -> Tensor:
+        return torch.cat((torch.zeros_like(u), u - 0.1 * x[..., 1:]), dim=-1).unsqueeze(-1)
+
+    def known(x: Tensor, u: Tensor) -> Tensor:
+        return torch.stack((x[..., 1], 9.81 * x[..., 0].sin()), dim=-1)
+
+    model = ParametricPlant(regressor, known, dim=2, inputs=1, theta=[1.0], rows=[1])
+    cost = QuadraticCost(1.0, 1.0, dim=2, inputs=1)
+    drawn = torch.rand(rows, 2, generator=generator, dtype=torch.float64)
+    side = torch.where(torch.rand(rows, generator=generator) < 0.5, -1.0, 1.0)
+    x0 = torch.stack((side * (0.5 + drawn[:, 0]), 2 * drawn[:, 1] - 1), dim=-1)
+    true = torch.where(torch.arange(rows) % 2 == 0, 2.0, 0.5).double().unsqueeze(-1)  # 1 / mass
+    law = LeastSquares([1.0], deviation=1.0, floor=1e-4)
+    windows = IntegralWindows(model, 0.3, shape="smooth", first=0.01, noise=0.01)
+    # Between the masses that are possible: too much push is dearer than too little, for so short a time.
+    robust = LQR(model.believing(torch.tensor([4 / 3], dtype=torch.float64)), cost)
+    adaptive = AdaptiveLQR(model, cost, windows, law, robust=robust, confidence=2.0, a_step=7)
+
+    def optimum() -> Tensor:
+        best = torch.full((rows,), torch.nan, dtype=torch.float64)
+        for inverse in true.unique():
+            same = true[:, 0] == inverse
+            shooting = DirectShooting(model.believing(inverse.unsqueeze(0)), cost)
+            best[same] = shooting.solve(x0[same]).value
+        return best
+
+    return Case(*(model, cost, x0, true, true, torch.zeros(rows), 0.001, 0.01, 0.05, adaptive), optimum)
+
+
+CASES: dict[str, Callable[[int, torch.Generator], Case]] = {
+    "short_period": short_period,
+    "unstable": unstable,
+    "mass": mass,
+}
+
+
+class _Informed(torch.nn.Module):
+    """u = -K e with the gain of every row's own plant, as it is in the end."""
+
+    def __init__(self, case: Case) -> None:
+        super().__init__()
+        self.own = case.after.unique(dim=0)
+        self.laws = [LQR(case.model.believing(theta), case.cost, period=case.dt) for theta in self.own]
+        self.count = case.model.parameters_count
+
+    def forward(self, z: Tensor) -> Tensor:
+        u: Tensor
+        n = z.shape[-1] - self.count
+        x, theta = z[..., :n], z[..., n:]
+        u = self.laws[0](x)
+        for law, own in zip(self.laws[1:], self.own[1:], strict=True):
+            u = torch.where((theta == own.to(theta)).all(-1, keepdim=True), law(x), u)
+        return u
+
+
+def _controllers(case: Case) -> dict[str, Controller]:
+    """What the state and noise are measured for, by name: the last parameters are seen by who knows them."""
+    n, p = case.model._size(), case.model.parameters_count
+    design = LQR(case.model.believing(_design(case)), case.cost, period=case.dt)
+    later = [*range(n), *range(n + p, n + 2 * p)]
+    return {
+        "ignorant LQR": Measured(Feedback(design), noise=case.noise, dim=n),
+        "informed LQR": Measured(
+            Feedback(_Informed(case)),
+            noise=[case.noise] * n + [0.0] * p,
+            dim=n + p,
+            output=lambda z: z[..., later],
+        ),
+        "adaptive": Measured(case.adaptive, noise=case.noise, dim=n),
+    }
+
+
+def _design(case: Case) -> Tensor:
+    """The parameters that an ignorant design believes: healthy actuators, the nominal mass."""
+    theta = case.adaptive.law.first.clone()
+    if case.model.parameters_count == 6:  # the drift is known to it, the fault is not
+        theta[:4] = case.before[0, :4]
+    return theta
+
+
+def _simulated(case: Case, controller: Controller, duration: float) -> LoopResult:
+    plant = ChangingPlant(case.model)
+    z0 = plant.start(case.x0, case.before, case.after, case.at)
+    every = max(1, round(_RECORDED / case.dt))
+    steps = every * max(1, round(duration / case.dt / every))
+    return simulate(controller, plant, plant.cost(case.cost), z0, dt=case.dt, steps=steps, every=every)
+
+
+def _measured(case: Case, method: str, result: LoopResult, best: Tensor | None) -> dict[str, float | None]:
+    n = case.model._size()
+    late = result.time >= result.time[-1] - _SETTLED
+    regulated = (result.state[:, late, :n].norm(dim=-1) < case.near).all(-1) & ~result.diverged
+    ratio = None if best is None else torch.where(result.diverged, torch.inf, result.cost / best)
+    row: dict[str, float | None] = {
+        "cost_median": float(result.cost.median()),
+        "cost_max": float(result.cost.max()),
+        "ratio_median": None if ratio is None else float(ratio.median()),
+        "ratio_max": None if ratio is None else float(ratio.max()),
+        "regulated": float(regulated.double().mean()),
+        "found_median": None,
+        "parameter_error": None,
+    }
+    if method == "adaptive":
+        now = case.adaptive.adaptation(result.identifier)
+        if case.adaptive.law.alarm is None:  # found: the model is certain enough for the first time
+            found = (now.certain.cumsum(1) == 0).sum(1) * (result.time[1] - result.time[0])
+        else:
+            alarmed = now.alarmed_at[:, -1]
+            found = torch.where(alarmed < 0, torch.inf, alarmed - case.at.to(alarmed))
+        row["found_median"] = float(found.median())
+        error = (now.estimate.theta[:, -1] - case.after).abs() / case.after.abs().clamp(min=1.0)
+        row["parameter_error"] = float(error.max())
+    return row
+
+
+def _picture(case: Case, results: dict[str, LoopResult]) -> FaultPicture:
+    n, adaptive = case.model._size(), results["adaptive"]
+    now = case.adaptive.adaptation(adaptive.identifier)
+    time = adaptive.time.numpy()
+    truth = torch.where((adaptive.time < case.at[0])[:, None], case.before[0], case.after[0])
+    return FaultPicture(
+        time=time,
+        norms={name: result.state[0, :, :n].norm(dim=-1).numpy() for name, result in results.items()},
+        parameters=now.estimate.theta[0].numpy(),
+        truth=truth.numpy(),
+        certain=now.certain[0].numpy() > 0,
+    )

@@ -1,0 +1,170 @@
+"""Integral concurrent learning beside concurrent learning of a differentiated state, over random gains."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+from pathlib import Path
+from typing import Any
+
+import torch
+from omegaconf import DictConfig
+from torch import Tensor
+
+from ..adp import ConcurrentTracker, LoopResult, Measured, ParametricPlant, QuadraticCost, simulate
+from ..figures.adaptation import GainSets, draw_gain_sets
+from ..figures.style import images
+from ..numerics.checks import COMMAND_LINE, fail, flag, integer, positive_real, real, vector
+from ..results.progress import SHOWN, Progress
+from ..results.run_directory import RunDirectory
+from ..settings.chase import plain
+from ..tables import Style, Table
+from .registry import Metrics, finite
+
+_log = logging.getLogger(__name__)
+SOURCES = {"integral": "integral", "slope": "derivative"}
+_TRUE = (5.0, 10.0, 15.0, 20.0)
+_RECORDED = 0.1  # s between recorded times at most, about: of each all stacks are kept
+_COLUMNS = {
+    "method": "concurrent learning",
+    "diverged": "diverged",
+    "error_median": "RMS of e, median",
+    "error_best": "best",
+    "error_worst": "worst",
+    "parameter_error_median": "RMS of the theta error, median",
+    "parameter_error_best": "best",
+    "parameter_error_worst": "worst",
+}
+
+
+def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics:
+    """Run both sources with the same gains and noise and fill the run directory, `metrics.json` last."""
+    figures = flag(COMMAND_LINE, "figures", cfg.figures)
+    dt = positive_real(COMMAND_LINE, "dt", cfg.dt)
+    duration = positive_real(COMMAND_LINE, "duration", cfg.duration)
+    every = max(1, round(min(_RECORDED, duration / 20) / dt))
+    steps = every * max(1, round(duration / dt / every))
+    noise = real(COMMAND_LINE, "icl.noise", cfg.icl.noise)
+    gains = _gains(cfg)
+    plant, cost = published(), QuadraticCost(1.0, 1.0, 5, 2, output=lambda z: z[..., :2] - reference(z)[0])
+    rows = len(gains["rate"])
+    start = [*vector(COMMAND_LINE, "initial_state", plain(cfg.initial_state), 2), 1.0, 0.0, 1.0]
+    x0 = torch.tensor([start], dtype=torch.float64).repeat(rows, 1)
+    errors, thetas, diverged = {}, {}, {}
+    time = torch.zeros(0)
+    for source, name in SOURCES.items():
+        tracker = ConcurrentTracker(
+            plant,
+            reference,
+            source=source,
+            size=integer(COMMAND_LINE, "icl.size", cfg.icl.size, 1),
+            feedback=gains["feedback"],
+            gain=gains["gain"],
+            rate=gains["rate"],
+            length=gains["length"],
+        )
+        seen = Measured(tracker, noise=[noise, noise, 0.0, 0.0, 0.0], dim=5)
+        result = simulate(
+            seen,
+            plant,
+            cost,
+            x0,
+            dt=dt,
+            steps=steps,
+            every=every,
+            seed=integer(COMMAND_LINE, "seed", cfg.seed, least=0),
+        )
+        time, errors[name], diverged[name] = result.time, _tracking_error(result), int(result.diverged.sum())
+        thetas[name] = tracker.tracking(result.identifier).theta.clone()  # without the stacks beside it
+    late = time >= positive_real(COMMAND_LINE, "settle_time", cfg.settle_time)
+    if not bool(late.any()):
+        raise fail(COMMAND_LINE, "settle_time", "must be before the end", cfg.settle_time)
+    rms = {name: _rms(error[:, late]) for name, error in errors.items()}
+    rms_theta = {name: _rms(theta[:, late] - plant.theta) for name, theta in thetas.items()}
+    table: list[dict[str, Any]] = []
+    metrics: Metrics = {}
+    for name in errors:
+        measured = {"diverged": float(diverged[name])}
+        for what, values in (("error", rms[name]), ("parameter_error", rms_theta[name])):
+            parts = {"median": values.median(), "best": values.min(), "worst": values.max()}
+            measured |= {f"{what}_{key}": float(value) for key, value in parts.items()}
+        table.append({"method": name} | measured)
+        metrics |= {f"{name}_{key}": finite(value) for key, value in measured.items()}
+        _log.info(
+            "%-10s RMS of e %.4g, of theta %.4g (medians)", name, rms[name].median(), rms_theta[name].median()
+        )
+    for what, found in (("error", rms), ("parameter_error", rms_theta)):
+        better = (found["integral"] < found["derivative"]).double().mean()
+        metrics[f"integral_better_{what}"] = float(better)
+    out = RunDirectory(directory)
+    out.table("icl", dataclasses.replace(Table.of(table, _COLUMNS), style=Style(digits=4)))
+    if figures:
+        shown = int(rms_theta["integral"].argmin())
+        picture = GainSets(
+            time=time.numpy(),
+            parameters=thetas["integral"][shown].numpy(),
+            truth=plant.theta.numpy(),
+            error={name: values.numpy() for name, values in rms.items()},
+            parameter_error={name: values.numpy() for name, values in rms_theta.items()},
+            followed={name: error[shown].norm(dim=-1).numpy() for name, error in errors.items()},
+        )
+        out.figure("icl", images(draw_gain_sets(picture)))
+    return out.metrics(metrics)
+
+
+def published() -> ParametricPlant:
+    """x' = Y(x, t) theta + u of the paper, in the state (x1, x2, e^(-t/10), sin t, cos t)."""
+
+    def regressor(z: Tensor, u: Tensor) -> Tensor:
+        x1, x2, _, sine, _ = z.unbind(-1)
+        none = torch.zeros_like(x1)
+        first = torch.stack((x1.square(), x2.sin(), none, none), dim=-1)
+        second = torch.stack((none, x2 * sine, x1, x1 * x2), dim=-1)
+        return torch.stack((first, second, *(torch.zeros_like(first),) * 3), dim=-2)
+
+    def known(z: Tensor, u: Tensor) -> Tensor:
+        _, _, decay, sine, cosine = z.unbind(-1)
+        return torch.cat((u, torch.stack((-0.1 * decay, cosine, -sine), dim=-1)), dim=-1)
+
+    return ParametricPlant(regressor, known, dim=5, inputs=2, theta=_TRUE, rows=[0, 1])
+
+
+def reference(z: Tensor) -> tuple[Tensor, Tensor]:
+    """xd = 10 (1 - e^(-t/10)) (sin 2t, 0.4 cos 3t) and its rate: (..., 5) -> (..., 2), (..., 2).
+
+    The published code has a factor of 30 in the rate where the derivative has 10.
+    """
+    _, _, decay, s, c = z.unbind(-1)
+    sine, cosine = 2 * s * c, c * c - s * s  # of 2t
+    sine3, cosine3 = 3 * s - 4 * s**3, 4 * c**3 - 3 * c
+    wide, growth = 10 * (1 - decay), decay
+    wanted = torch.stack((wide * sine, 0.4 * wide * cosine3), dim=-1)
+    first = growth * sine + 2 * wide * cosine
+    second = 0.4 * (growth * cosine3 - 3 * wide * sine3)
+    return wanted, torch.stack((first, second), dim=-1)
+
+
+def _gains(cfg: DictConfig) -> dict[str, Tensor]:
+    """Gains of every row, uniform in their ranges."""
+    rows = integer(COMMAND_LINE, "trajectories", cfg.trajectories, least=1)
+    generator = torch.Generator().manual_seed(integer(COMMAND_LINE, "seed", cfg.seed, least=0))
+    drawn = torch.rand(rows, 4, generator=generator, dtype=torch.float64)
+    found = {}
+    for k, name in enumerate(("feedback", "gain", "rate", "length")):
+        low, high = vector(COMMAND_LINE, f"icl.{name}", plain(cfg.icl[name]), 2)
+        if not 0 < low <= high:
+            raise fail(
+                COMMAND_LINE, f"icl.{name}", "must be two positive numbers, the smaller first", [low, high]
+            )
+        found[name] = low + (high - low) * drawn[:, k]
+    return found
+
+
+def _tracking_error(result: LoopResult) -> Tensor:
+    """x - xd, (B, T, 2)."""
+    return result.state[..., :2] - reference(result.state)[0]
+
+
+def _rms(values: Tensor) -> Tensor:
+    """Root of the mean square of the norms: (B, T, k) -> (B,)."""
+    return values.square().sum(-1).mean(1).sqrt()

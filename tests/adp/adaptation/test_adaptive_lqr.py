@@ -1,0 +1,158 @@
+"""The policy that is redesigned while it runs: its Riccati equations, its doubt, its loops."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from helpers import tensor, uniform
+from helpers_adaptation import COST, PENDULUM, TRUE
+
+from staf_torch import adp, systems
+from staf_torch.adp.closed_loop import ClosedLoop, program
+from staf_torch.numerics.linalg import riccati
+
+WINDOWS = adp.IntegralWindows(PENDULUM, 0.1, shape="smooth", first=0.02, noise=0.01)
+LAW = adp.LeastSquares([0.2, 0.7], deviation=[0.2, 0.6], floor=1e-4, forgetting=0.1, alarm=8.0)
+CHANGING = adp.ChangingPlant(PENDULUM)
+
+
+def adaptive(**settings: object) -> adp.AdaptiveLQR:
+    return adp.AdaptiveLQR(PENDULUM, COST, WINDOWS, LAW, **settings)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("n", "m"), [(1, 1), (2, 1), (4, 2)])
+def test_riccati_equations_of_rows_are_solved_as_one_by_one(n: int, m: int) -> None:
+    a, b = 10 ** uniform(20, 1, 1, seed=1) * uniform(20, n, n, seed=2), uniform(20, n, m, seed=3)
+    q, r = torch.diag(1 + torch.arange(n).double()), 0.5 * torch.eye(m).double()
+    rows = adp.riccati_rows(a, b, q, torch.linalg.inv(r))
+    for row in range(20):
+        wanted = riccati(a[row], b[row], q, r)
+        torch.testing.assert_close(rows[row], wanted, rtol=1e-9, atol=1e-9 * float(wanted.abs().max()))
+        assert torch.equal(
+            adp.riccati_rows(a[row : row + 1], b[row : row + 1], q, torch.linalg.inv(r))[0], rows[row]
+        )
+
+
+def test_where_the_policy_is_certain_every_theta_within_the_deviations_is_stabilised() -> None:
+    control, family = adaptive(confidence=2.0), PENDULUM.family()
+    theta = tensor([[0.3, 0.9]])
+    a, b = family.at(theta)
+    p = adp.riccati_rows(a, b, COST.q, COST.r_inverse)
+    k = b.mT @ p
+    shape = tensor([[1.0, 0.3], [0.3, 0.5]])
+    # The largest covariance of this shape of which the policy is still certain.
+    scale = float(control._doubt(shape[None], p, k))
+    covariance = shape / scale * (1 - 1e-9)
+    assert float(control._doubt(covariance[None], p, k)) < 1
+    directions = uniform(2000, 2, seed=4)
+    edge = 2.0 * directions / directions.norm(dim=-1, keepdim=True) @ torch.linalg.cholesky(covariance).mT
+    closed_a, closed_b = family.at(theta + edge)
+    closed = closed_a - closed_b @ k
+    falls = p @ closed + (p @ closed).mT
+    assert float(torch.linalg.eigvalsh(falls)[:, -1].max()) < 0
+    assert float(edge.norm(dim=-1).max()) > 0.1  # that is not because nothing is allowed
+
+
+def test_a_plant_of_unknown_parameters_is_learned_and_the_robust_policy_has_it_until_then() -> None:
+    robust = adp.LQR(PENDULUM, COST)
+    law = adp.LeastSquares([0.2, 0.7], deviation=[0.2, 0.6], floor=1e-4)
+    windows = adp.IntegralWindows(PENDULUM, 0.05)
+    control = adp.AdaptiveLQR(
+        PENDULUM, COST, windows, law, robust=lambda x: robust(x) + 0.25, doublings=12, a_step=3
+    )
+    true = tensor([[0.05, 0.5], [0.2, 2.0], [0.1, 1.0]])
+    z0 = CHANGING.start(tensor([[0.5, 0.0], [-0.5, 0.3], [0.2, -1.0]]), true)
+    run = adp.simulate(
+        adp.Measured(control, noise=0.0, dim=2),
+        CHANGING,
+        CHANGING.cost(COST),
+        z0,
+        dt=0.005,
+        steps=150,
+        compile=False,
+    )
+    now = control.adaptation(run.identifier)
+    torch.testing.assert_close(now.estimate.theta[:, -1], true, rtol=2e-2, atol=2e-2)
+    x, u, certain = run.state[:, :-1, :2], run.control[:, :-1], now.certain[:, 1:-1].bool()
+    assert not certain[:, 0].any()
+    assert certain[:, -1].all()
+    doubtful = ~certain
+    torch.testing.assert_close(u[:, :-1][doubtful], (robust(x) + 0.25)[:, :-1][doubtful])
+    gain = [adp.LQR(PENDULUM.believing(row), COST).k for row in now.estimate.theta[:, -1]]
+    last = -(torch.stack(gain) @ x[:, -1].unsqueeze(-1)).squeeze(-1)
+    torch.testing.assert_close(u[:, -1], last, rtol=1e-3, atol=1e-6)
+
+
+def test_a_change_is_found_when_it_happens() -> None:
+    law = adp.LeastSquares([0.1, 1.0], deviation=[0.2, 0.6], floor=1e-4, alarm=8.0)
+    windows = adp.IntegralWindows(PENDULUM, 0.02)
+    control = adp.AdaptiveLQR(PENDULUM, COST, windows, law, doublings=12, a_step=2)
+    z0 = CHANGING.start(tensor([[1.0, 0.0], [1.0, 0.0]]), TRUE, tensor([[0.1, 0.6], [0.1, 1.0]]), at=0.5)
+    run = adp.simulate(
+        adp.Measured(control, noise=0.0, dim=2),
+        CHANGING,
+        CHANGING.cost(COST),
+        z0,
+        dt=0.005,
+        steps=160,
+        compile=False,
+    )
+    alarmed = control.adaptation(run.identifier).alarmed_at[:, -1]
+    assert 0.5 <= float(alarmed[0]) <= 0.54
+    assert float(alarmed[1]) == -1
+
+
+def test_a_design_that_cannot_be_made_leaves_the_robust_policy_and_not_a_dead_row() -> None:
+    law = adp.LeastSquares([0.1, 0.0], deviation=1.0)  # an input without effect
+    control = adp.AdaptiveLQR(PENDULUM, COST, WINDOWS, law, robust=lambda x: 0 * x[..., :1], a_step=7)
+    run = adp.simulate(control, PENDULUM, COST, tensor([[0.1, 0.0]]), dt=0.01, steps=60, compile=False)
+    assert not run.diverged.any()
+    assert not control.adaptation(run.identifier).certain.any()
+
+
+@pytest.mark.parametrize("case", ["linear", "rollout"])
+def test_compiled_steps_are_those_of_the_definition(case: str) -> None:
+    more = {
+        "linear": {"a_step": 2, "probe": 1.0},
+        "rollout": {"a_step": 1, "rollout": adp.RolloutPolicy.of_lqr(PENDULUM, COST, steps=2)},
+    }[case]
+    controller = adp.Measured(adaptive(**more), noise=0.01, dim=2)
+    loop = ClosedLoop(controller, CHANGING, CHANGING.cost(COST), dt=0.005)
+    z0 = CHANGING.start(uniform(9, 2, seed=1), (1.5 + uniform(9, 2, seed=2)) * TRUE)
+    steps, draws = program(loop, True), uniform(9, 25, controller.draws, CHANGING.dim, seed=3)
+    state = loop.init(z0)
+    assert steps.compiles(state, draws)
+    got, want = steps(state, draws)[0], steps.definition(state, draws)[0]
+    for one, other in zip((*got[:4], *got.carried), (*want[:4], *want.carried), strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-9, atol=1e-9)
+    part = steps(loop.init(z0[:3]), draws[:3])[0]  # rows do not know of each other
+    assert torch.equal(part.carried.identifier, got.carried.identifier[:3])
+
+
+def test_noise_has_the_deviations_that_are_asked_for() -> None:
+    seen: list[torch.Tensor] = []
+
+    def policy(x: torch.Tensor) -> torch.Tensor:
+        seen.append(x)
+        return 0 * x[..., :1]
+
+    measured = adp.Measured(
+        adp.Feedback(policy), noise=[0.5, 0.0, 2.0], dim=3, output=lambda x: x[..., [0, 1, 0]]
+    )
+    x, draws = torch.ones(20000, 2).double(), uniform(20000, measured.draws, 3, seed=1)
+    measured.step(x, measured.init(x), draws, 0.1)
+    (y,) = seen
+    torch.testing.assert_close(y.mean(0), tensor([1.0, 1.0, 1.0]), rtol=0, atol=0.05)
+    torch.testing.assert_close(y.std(0), tensor([0.5, 0.0, 2.0]), rtol=0.03, atol=0)
+    assert abs(float(torch.corrcoef(y[:, [0, 2]].mT)[0, 1])) < 0.03
+
+
+def test_a_changing_plant_has_the_parameters_of_its_row_and_time() -> None:
+    z0 = CHANGING.start(uniform(2, 2), tensor([[0.1, 1.0], [0.2, 2.0]]), [0.3, 3.0], at=tensor([0.25, 9.0]))
+    u = torch.ones(2, 1).double()
+    torch.testing.assert_close(CHANGING.rate(z0, u)[:, :2], PENDULUM.believing(z0[:, 2:4]).rate(z0[:, :2], u))
+    z = z0
+    for _ in range(26):
+        z = systems.runge_kutta_step(lambda z: CHANGING.motion(z, u), z, 0.01)
+    torch.testing.assert_close(CHANGING.theta(z), tensor([[0.3, 3.0], [0.2, 2.0]]))
+    torch.testing.assert_close(CHANGING.drift(z0) + CHANGING.effectiveness(z0)[..., 0], CHANGING.rate(z0, u))

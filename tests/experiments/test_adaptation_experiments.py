@@ -1,0 +1,52 @@
+"""The experiments on learning while running, short."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+
+from staf_torch.cli.staf import config_directory
+from staf_torch.experiments import faults, icl
+
+
+def settings(*overrides: str):  # type: ignore[no-untyped-def]
+    with initialize_config_dir(config_directory(), version_base="1.3"):
+        return compose("config", list(overrides))
+
+
+def test_faults_leave_a_row_a_case_and_method(tmp_path: Path) -> None:
+    cfg = settings("experiment=faults", "trajectories=2", "duration=0.03", "faults.cases=[mass,short_period]")
+    metrics = faults.run(cfg, tmp_path)
+    assert json.loads((tmp_path / "metrics.json").read_text()) == metrics
+    lines = (tmp_path / "faults.md").read_text().splitlines()
+    assert len(lines) == 2 + 6
+    # Before anything is known the adaptive policy is not the informed one; the optimum is below all.
+    assert metrics["mass_adaptive_cost_median"] != metrics["mass_informed_LQR_cost_median"]
+    assert metrics["short_period_adaptive_parameter_error"] < 1e-4  # found within 30 ms
+    assert (tmp_path / "figures" / "faults.png").stat().st_size > 10_000
+
+
+def test_integral_and_derivative_see_the_same_plant_and_gains(tmp_path: Path) -> None:
+    short = ("trajectories=3", "dt=0.005", "duration=0.3", "settle_time=0.1", "icl.length=[0.02,0.04]")
+    metrics = icl.run(settings("experiment=icl", "figures=false", *short), tmp_path)
+    assert json.loads((tmp_path / "metrics.json").read_text()) == metrics
+    assert metrics["integral_diverged"] == metrics["derivative_diverged"] == 0
+    assert metrics["integral_error_median"] != metrics["derivative_error_median"]
+    with pytest.raises(ValueError, match="settle_time"):
+        icl.run(settings("experiment=icl", *short, "settle_time=1.0"), tmp_path)
+
+
+def test_the_published_reference_has_the_rate_that_is_stated() -> None:
+    time = torch.tensor([0.0, 0.7, 12.3], dtype=torch.float64, requires_grad=True)
+    z = torch.stack((time * 0, time * 0, (-0.1 * time).exp(), time.sin(), time.cos()), dim=-1)
+    wanted, rate = icl.reference(z)
+    stated = 10 * (1 - (-0.1 * time).exp())
+    torch.testing.assert_close(wanted[:, 0], stated * (2 * time).sin())
+    torch.testing.assert_close(wanted[:, 1], stated * 0.4 * (3 * time).cos())
+    for k in range(2):
+        (slope,) = torch.autograd.grad(wanted[:, k].sum(), time, retain_graph=True)
+        torch.testing.assert_close(rate[:, k], slope)
