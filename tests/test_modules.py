@@ -202,6 +202,7 @@ OTHERS |= {
     "AdaptiveLQR",
     "ConcurrentTracker",
     "Measured",
+    "RobustFilter",
     "Observed",
     "_Informed",
 }
