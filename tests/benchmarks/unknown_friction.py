@@ -2,8 +2,9 @@
 
     python tests/benchmarks/unknown_friction.py [rows]
 
-A double integrator in the plane with unknown friction among two discs, and a pendulum whose gravity and friction
-are unknown and whose angle must stay below pi/4, though its policy wants it to go beyond. Source of the numbers: AdaptiveCBFToolbox.jl (ACC 2022).
+A double integrator in the plane with unknown friction among two discs, and a pendulum whose gravity and
+friction are unknown and whose angle must stay below pi/4, though its policy wants it to go beyond. Source of
+the numbers: AdaptiveCBFToolbox.jl (ACC 2022).
 """
 
 from __future__ import annotations
