@@ -114,8 +114,8 @@ def main(rows: int) -> None:
                 shortfall = float(now.slack.max())
                 error = float((now.estimate.theta - given[:, n:]).abs().max())
             print(
-                f"| {example.__name__} | {name} | {h.min():.3g} | {int((h < 0).sum())} of {rows} | {shortfall:.2g} "
-                f"| {error:.2g} | {spent:.1f} |"
+                f"| {example.__name__} | {name} | {h.min():.3g} | {int((h < 0).sum())} of {rows} "
+                f"| {shortfall:.2g} | {error:.2g} | {spent:.1f} |"
             )
 
 
