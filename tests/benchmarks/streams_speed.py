@@ -1,8 +1,8 @@
 """Processor time of streams, one thread: `python tests/benchmarks/streams_speed.py`.
 
 The filter on ten thousand streams, of which about a seventh (M = 6) and a quarter (M = 28) move their centers
-at a step; one stream, a sample a call from Python, filter and bank; and the filter of M = 6 once more as a row
-program of `staf_torch.lanes`, all steps in one call, against which the hand-written C++ must defend itself.
+at a step; one stream, a sample a call from Python, filter and bank; and the filter of M = 6 as a row program
+of `staf_torch.lanes`, all steps in one call, against which the hand-written C++ must defend itself.
 """
 
 from __future__ import annotations
