@@ -15,11 +15,11 @@ class PolicyIteration(ActorCriticLaw):
         Wc' = -(damping I + A)^-1 sum_j a_j w_j delta_j / rho_j / settling,   A = sum_j a_j w_j w_j' / rho_j,
         Wa' = -ea1 (Wa - Wc) - ea2 Wa,
 
-    both implicit over a step. That is policy iteration (Howard; for the Hamilton-Jacobi-Bellman equation
-    Kleinman, Saridis and Lee), a step of it a time step, around the state alone. Unlike `Information` it has no
-    least-squares gain that remembers other states, which a basis that follows the state makes stale, and no
-    actor force of the Lyapunov proof, which outweighs the critic where basis functions are steep. It has no
-    proof either, and failed on plants whose drift is unstable (Van der Pol, pendulum: adp/README.md).
+    both implicit over a step. That is policy iteration, a step of it a time step, around the state alone.
+    Unlike `Information` it has no least-squares gain that remembers other states, which a basis that follows
+    the state makes stale, and no actor force of the Lyapunov proof, which outweighs the critic where basis
+    functions are steep. It has no proof either, and failed on plants whose drift is unstable (Van der Pol,
+    pendulum: adp/README.md).
 
     The points must determine the weights: M of them at least. The default gains are other than the published.
 
