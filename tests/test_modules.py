@@ -203,6 +203,7 @@ OTHERS |= {
     "AdaptiveLQR",
     "ConcurrentTracker",
     "Measured",
+    "RobustFilter",
     "Observed",
     "_Informed",
 }
