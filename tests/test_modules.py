@@ -211,6 +211,7 @@ OTHERS |= {
     "AdaptiveLQR",
     "ConcurrentTracker",
     "Measured",
+    "RobustFilter",
     "Observed",
     "_Informed",
 }

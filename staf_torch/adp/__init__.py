@@ -13,6 +13,7 @@ from .adaptation import Doubling as Doubling
 from .adaptation import Equation as Equation
 from .adaptation import Estimate as Estimate
 from .adaptation import ExtendedKalman as ExtendedKalman
+from .adaptation import Guarded as Guarded
 from .adaptation import HistoryStack as HistoryStack
 from .adaptation import IntegralWindows as IntegralWindows
 from .adaptation import KalmanFilter as KalmanFilter
@@ -21,6 +22,7 @@ from .adaptation import LinearFamily as LinearFamily
 from .adaptation import Measured as Measured
 from .adaptation import Observed as Observed
 from .adaptation import ParametricPlant as ParametricPlant
+from .adaptation import RobustFilter as RobustFilter
 from .adaptation import SlopeWindow as SlopeWindow
 from .adaptation import SlopeWindows as SlopeWindows
 from .adaptation import Stack as Stack
@@ -115,6 +117,7 @@ __all__ = [
     "Frozen",
     "Gains",
     "GlobalValue",
+    "Guarded",
     "HeldStability",
     "HistoryStack",
     "Identified",
@@ -139,6 +142,7 @@ __all__ = [
     "RBFGridBasis",
     "RandomPoints",
     "RecedingHorizon",
+    "RobustFilter",
     "RolloutPolicy",
     "SafetyFilter",
     "SampledProblem",
