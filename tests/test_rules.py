@@ -35,6 +35,8 @@ ELSEWHERE = {
 OTHERS = {
     "ParametricPlant": "in tests/adp/adaptation/test_identifiers.py",
     "ConcurrentTracker": "in tests/adp/adaptation/test_identifiers.py",
+    "RobustFilter": "in tests/adp/adaptation/test_robust_filter.py",
+    "Observed": "in tests/adp/adaptation/test_kalman.py",
     "trace": "takes an exported program",
     "Cosine": "numbers and lists alike, in tests/test_targets.py",
     "paper_step": "of the theorem, in tests/theory/test_errata.py",
@@ -191,6 +193,7 @@ CALLS: dict[str, Callable[..., Any]] = {
     "HeavyBall": lambda **given: optim.HeavyBall(**{"step": 0.5, "momentum": 0.5, **given}),
     "Nesterov": lambda **given: optim.Nesterov(**{"step": 0.5, "momentum": 0.5, **given}),
     "NormalisedLMS": optim.NormalisedLMS,
+    "PolicyIteration": adp.PolicyIteration,
     "PreconditionedDescent": optim.PreconditionedDescent,
     "trajectory": trajectories,
     "Oscillator": systems.Oscillator,

@@ -163,7 +163,7 @@ def _run(
         # A piece ends at a recorded time, or there is none inside.
         count = ahead // every * every if every <= ahead else min(ahead, every - done % every)
         count = min(count, steps - done)
-        uniform = _uniform(x0, count, draws, generators)
+        uniform = uniform_numbers(x0, count, draws, generators)
         state, out = steps_of(state, uniform, gains, every=min(every, count))
         if done % every == 0:
             pieces.append(out)
@@ -189,7 +189,7 @@ def _seeds(seed: int | Sequence[int], batch: int) -> Sequence[int]:
     return range(first, first + batch)
 
 
-def _uniform(x0: Tensor, count: int, draws: int, generators: Sequence[torch.Generator]) -> Tensor:
+def uniform_numbers(x0: Tensor, count: int, draws: int, generators: Sequence[torch.Generator]) -> Tensor:
     """The next ``count`` steps' uniform numbers of [-1, 1], (B, count, draws, n), one generator a row."""
     rows, dim = x0.shape
     drawn = torch.empty(rows, count, draws, dim, dtype=torch.float64)

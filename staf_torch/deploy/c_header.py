@@ -8,7 +8,7 @@ import os
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -24,6 +24,7 @@ from ..lanes.program import trace
 from ..lanes.schedule import Schedule
 from ..lanes.tracer import NotLoweredError
 from .formats import Run, as_tuple
+from .sheet import Work
 
 _CHEAP = set("add sub mul div lt le eq ne and or xor neg abs min max not where sqrt".split())  # noqa: SIM905
 _FREE = set("const elem result collect carry state row now load pack cast loop".split())  # noqa: SIM905
@@ -35,6 +36,16 @@ class Source(NamedTuple):
     constants: int  # numbers in it
     flops: int
     functions: int  # calls of exp and the like
+
+    def work(self, entries: int, dtype: torch.dtype) -> Work:
+        """The same as `staf-export` says it.
+
+        Args:
+            entries: of all inputs and outputs.
+            dtype: of the arithmetic.
+        """
+        size = dtype.itemsize
+        return Work(self.constants, self.flops, self.functions, self.constants * size, entries * size)
 
 
 def export_c(
@@ -155,16 +166,10 @@ def runner_c(path: Path, sizes: Sequence[int | None], dtype: torch.dtype) -> Run
     Raises:
         ValueError: if there is no C compiler.
     """
-    kind = "float" if dtype == torch.float32 else "double"
+    kind = _c_type(dtype)
     names = ", ".join(f"o{k}" for k in range(len(sizes)))
     declared = ", ".join(f"{kind} *o{k}" for k in range(len(sizes)))
-    source = f'#include "{path.resolve()}"\n'
-    source += f"void call(const {kind} *state, {declared}) {{ staf(state, {names}); }}\n"
-    with tempfile.TemporaryDirectory() as folder:
-        (Path(folder) / "call.c").write_text(source, encoding="utf-8")
-        line = [need_c_compiler(), "-O2", "-shared", "-fPIC", "-x", "c", "call.c", "-o", "call.so", "-lm"]
-        subprocess.run(line, cwd=folder, check=True, capture_output=True)
-        call = ctypes.CDLL(str(Path(folder) / "call.so")).call
+    call = _built(path, f"void call(const {kind} *state, {declared}) {{ staf(state, {names}); }}")
 
     def run(x: Tensor) -> tuple[Tensor, ...]:
         outs = tuple(torch.empty(len(x), *([] if size is None else [size]), dtype=dtype) for size in sizes)
@@ -173,6 +178,52 @@ def runner_c(path: Path, sizes: Sequence[int | None], dtype: torch.dtype) -> Run
         return outs
 
     return run
+
+
+def runner_learning_c(
+    path: Path, draws: int, inputs: int, dtype: torch.dtype
+) -> Callable[[Tensor, Tensor], Tensor]:
+    """The header of a controller that learns, compiled with -O2: it starts anew and follows given states.
+
+    Args:
+        path: of the header.
+        draws: of the controller.
+        inputs: of the plant, m.
+        dtype: as in `export_learning_c`.
+
+    Returns:
+        A function of states (K, n) and random numbers (K, draws, n) that returns the controls (K, m).
+
+    Raises:
+        ValueError: if there is no C compiler.
+    """
+    kind = _c_type(dtype)
+    step = f"staf(&s, x + k * n, {f'z + k * n * {draws}, ' if draws else ''}u + k * {inputs})"
+    loop = f"staf_state s; staf_start(&s); for (long k = 0; k < steps; ++k) {step}; (void)z;"
+    given = f"const {kind} *x, const {kind} *z, {kind} *u, long steps, long n"
+    call = _built(path, f"void call({given}) {{ {loop} }}")
+
+    def run(states: Tensor, uniform: Tensor) -> Tensor:
+        x, z, u = states.contiguous(), uniform.contiguous(), states.new_empty(len(states), inputs)
+        call(*(ctypes.c_void_p(t.data_ptr()) for t in (x, z, u)), *map(ctypes.c_long, x.shape))
+        return u
+
+    return run
+
+
+def _c_type(dtype: torch.dtype) -> str:
+    return "float" if dtype == torch.float32 else "double"
+
+
+def _built(path: Path, function: str) -> Callable[..., object]:
+    """Compile a header and a function ``call`` that calls what is in it."""
+    with tempfile.TemporaryDirectory() as folder:
+        source = f'#include "{path.resolve()}"\n{function}\n'
+        (Path(folder) / "call.c").write_text(source, encoding="utf-8")
+        line = [need_c_compiler(), "-O2", "-shared", "-fPIC", "-x", "c", "call.c", "-o", "call.so", "-lm"]
+        subprocess.run(line, cwd=folder, check=True, capture_output=True)
+        call: Callable[..., object] = ctypes.CDLL(str(Path(folder) / "call.so")).call
+        return call
 
 
 def need_c_compiler() -> str:

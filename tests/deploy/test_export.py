@@ -13,10 +13,14 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from staf_torch import deploy
-from staf_torch.cli.export import deployable, export, main
+from staf_torch.cli.deployable import deployable
+from staf_torch.cli.export import export, export_learning, main
 from staf_torch.cli.staf import config_directory
 from staf_torch.experiments.registry import experiment
 
+needs_cc = pytest.mark.skipif(
+    not any(map(shutil.which, ("cc", "gcc", "g++", "clang"))), reason="no C compiler"
+)
 RUNS = {
     "chase": ["centers.count=6", "duration=0.1", "trajectories=2"],
     "actor": ["experiment=adp", "duration=0.1", "dt=0.005", "trajectories=2", "adp.trust=0.5"],
@@ -41,6 +45,22 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def chase(runs: Path, tmp_path: Path) -> Path:
     """A copy of the chase that a test may spoil."""
     return Path(shutil.copytree(runs / "chase", tmp_path / "chase"))
+
+
+@needs_cc
+def test_a_learner_as_c_follows_its_run_and_what_does_not_learn_is_refused(
+    runs: Path, tmp_path: Path
+) -> None:
+    page = export_learning(runs / "actor", output=tmp_path / "learner.h", row=1, calls=20)
+    assert page["equality"]["u"] < 1e-12
+    assert [port["name"] for port in page["inputs"]] == ["x", "uniform"]
+    text = (tmp_path / "learner.h").read_text()
+    assert "staf_start(staf_state *" in text
+    assert (tmp_path / "learner.h.md").exists()
+    with pytest.raises(ValueError, match=r"`staf-export\(learning=...\)` must be left away"):
+        export_learning(runs / "lqr", calls=20)
+    with pytest.raises(SystemExit, match="must go with --to c"):
+        main([str(runs / "actor"), "--to", "pt2", "--learning"])
 
 
 @pytest.mark.parametrize(("name", "row"), [("chase", 1), ("actor", 1), ("lqr", 0)])

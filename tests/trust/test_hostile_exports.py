@@ -16,7 +16,8 @@ from hostile_runs import EXPORTS
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from staf_torch.cli.export import deployable, export
+from staf_torch.cli.deployable import deployable
+from staf_torch.cli.export import export
 from staf_torch.cli.staf import config_directory
 from staf_torch.experiments.registry import experiment
 from staf_torch.settings.trust import constructors, limited

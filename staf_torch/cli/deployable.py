@@ -1,0 +1,290 @@
+"""What a run holds that a device can compute: read, built anew, and compared with what was recorded."""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import dataclasses
+import math
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+
+import numpy as np
+import torch
+from hydra.errors import InstantiationException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from torch import Tensor, nn
+
+from .. import __version__
+from ..adp import Controller, simulate
+from ..adp.simulation import uniform_numbers
+from ..approximation.staf import StaF
+from ..deploy import approximator, policy_of
+from ..deploy.sheet import Port
+from ..experiments.adp import learner
+from ..numerics.checks import fail, integer
+from ..results import run_record as records
+from ..results.archive import Archive
+from ..results.files import HISTORY
+from ..results.settings_file import read_settings
+from ..results.untrusted import UnreadableError
+from ..settings.adp import adp_problem
+from ..settings.chase import chase_problem
+from ..settings.trust import checked, limited
+from ..systems import Units
+
+_POINTS = 1000
+_FOLLOWED = 500  # steps of a run that a learning controller is compared over
+_READ = ("state", "weights", "estimate", "actor_weights", "control")  # of the history
+_MOST_NUMBERS = 2**25  # of one trajectory
+_UNBUILDABLE = (
+    *(OmegaConfBaseException, InstantiationException, KeyError, IndexError, AttributeError, TypeError),
+    *(AssertionError, RuntimeError),
+)
+"""What settings of another version, or of nobody's, raise while they are built."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Deployable:
+    """What is exported of a run."""
+
+    kind: str  # approximator, controller
+    what: str  # one sentence
+    module: Callable[[torch.dtype], nn.Module]
+    points: Tensor  # (P, n) of the region, float64
+    input: Port
+    outputs: tuple[Port, ...]
+    written_by: str | None  # the version that made the run, where it says
+
+
+def deployable(run: Path, row: int = 0, *, trust: bool = False) -> Deployable:
+    """What a device needs of one trajectory of a run: its controller, or its approximation at the last time.
+
+    The objects are built anew from the run's settings, and must reproduce what the run recorded.
+
+    Args:
+        run: the directory.
+        row: the trajectory.
+        trust: whether code of your own that the settings name may be imported.
+
+    Raises:
+        ValueError: if the directory is no run, lacks its history, holds another experiment, names foreign
+            code, or was written by a version whose numbers this one does not reproduce.
+    """
+    tasks = {"gradient_chase": _approximation, "adp": _controller}
+    with _opened(run, row, tasks, trust) as (cfg, history, precise, written_by):
+        return dataclasses.replace(tasks[cfg.task](cfg, history, precise), written_by=written_by)
+
+
+@dataclasses.dataclass(frozen=True)
+class Learner:
+    """A controller that goes on learning, and the first steps of its run."""
+
+    what: str  # one sentence
+    controller: Controller
+    dt: float  # s
+    states: Tensor  # (K, n), float64
+    uniform: Tensor  # (K, draws, n) random numbers of [-1, 1]
+    inputs: tuple[Port, ...]
+    outputs: tuple[Port, ...]
+    written_by: str | None
+
+    def copied(self, dtype: torch.dtype) -> Controller:
+        """Return the controller in a dtype."""
+        return copy.deepcopy(self.controller).to(dtype)
+
+
+def learning(run: Path, row: int = 0, *, trust: bool = False) -> Learner:
+    """The controller of one trajectory as it was at time 0, that learns as it did in the run.
+
+    Args:
+        run, row, trust: as in `deployable`.
+
+    Raises:
+        ValueError: as `deployable`, or if nothing in the run's controller learns.
+    """
+    with _opened(run, row, {"adp": _learner}, trust) as (cfg, history, precise, written_by):
+        return dataclasses.replace(_learner(cfg, history, precise, row), written_by=written_by)
+
+
+@contextlib.contextmanager
+def _opened(
+    run: Path, row: int, tasks: Mapping[str, object], trust: bool
+) -> Iterator[tuple[DictConfig, dict[str, np.ndarray], bool, str | None]]:
+    """Context: settings in float64, history of one trajectory, whether it is as precise, and who wrote it."""
+    cfg = _settings(run, trust)
+    if cfg.get("task") not in tasks:
+        raise fail("staf-export", "RUN", f"must be a run of {' or '.join(tasks)}", cfg.get("task"))
+    integer("staf-export", "row", row, least=0)
+    history = _history(run, row)
+    record = records.read(run / records.RUN) or {}
+    written_by = str(record["version"]) if record.get("version") is not None else None
+    try:
+        precise = cfg.dtype == "float64"
+        cfg.dtype, cfg.device = "float64", "cpu"
+        with contextlib.nullcontext() if trust else limited(f"What {run} describes"):
+            yield cfg, history, precise, written_by
+    except _UNBUILDABLE as error:
+        raise ValueError(
+            f"{run} was written by staf_torch {written_by or '(another version)'}, whose settings "
+            f"staf_torch {__version__} does not understand ({_first_line(error)}): run it anew, "
+            "or export it with that version."
+        ) from error
+
+
+def _first_line(error: Exception) -> str:
+    return next(iter(str(error).splitlines()), type(error).__name__)
+
+
+def _settings(run: Path, trust: bool) -> DictConfig:
+    path = run / ".hydra" / "config.yaml"
+    if not path.is_file():
+        raise fail("staf-export", "RUN", "must be a run directory, with .hydra/config.yaml", str(run))
+    try:
+        cfg = (
+            OmegaConf.load(path) if trust else OmegaConf.create(checked(read_settings(path, run), str(path)))
+        )
+    except UnreadableError as error:
+        raise ValueError(f"{run} has settings that are not read without --trust: {error}.") from error
+    if not isinstance(cfg, DictConfig):
+        raise fail("staf-export", "RUN", "must hold settings in .hydra/config.yaml", str(run))
+    OmegaConf.set_struct(cfg, True)  # a setting that is missing is an error, not None
+    return cfg
+
+
+def _history(run: Path, row: int) -> dict[str, np.ndarray]:
+    """Return the arrays of a history, (T, ...) of one trajectory where they have trajectories."""
+    path = run / HISTORY
+    if not path.exists():
+        raise ValueError(
+            f"{run} has no history.npz, which holds the weights: run with history=false, or not ended."
+        )
+    try:
+        archive = Archive(path, run)
+        names = [name for name in _READ if name in archive.names]
+        if "state" not in names:
+            raise UnreadableError(f"{path} has no states")
+        batch = archive.shape("state")[:1]
+        if batch and row >= batch[0]:
+            raise fail("staf-export", "row", f"must be below the run's {batch[0]} trajectories", row)
+        for name in names:
+            if math.prod(archive.shape(name)[1:]) > _MOST_NUMBERS or len(archive.shape(name)) < 2:
+                raise UnreadableError(f"{path} has {archive.shape(name)} numbers of {name}")
+        return {name: archive.read(name, row) for name in names}
+    except (UnreadableError, IndexError) as error:
+        raise ValueError(str(error)) from error
+
+
+def _reproduced(name: str, found: Tensor, recorded: np.ndarray, precise: bool) -> None:
+    """Whatever wrote the run: what is built from it must give the recorded numbers."""
+    wanted = torch.from_numpy(np.asarray(recorded, dtype=np.float64))
+    if not bool(torch.isfinite(wanted).all()):
+        raise fail(
+            "staf-export", "row", "must be a trajectory that did not diverge", f"a recorded {name} of NaN"
+        )
+    worst = float((found - wanted).abs().max() / wanted.abs().max().clamp(min=1e-3))
+    if not worst <= (1e-8 if precise else 1e-3):
+        raise ValueError(
+            f"The recorded {name} of this run cannot be reproduced: built from its settings it differs by "
+            f"{worst:.3g}. Another version of staf_torch wrote it, or a file was changed: run it anew."
+        )
+
+
+def _approximation(cfg: DictConfig, history: dict[str, np.ndarray], precise: bool) -> Deployable:
+    problem = chase_problem(cfg)
+    x = torch.from_numpy(history["state"][-1].astype(np.float64))
+    weights = torch.from_numpy(history["weights"][-1].astype(np.float64))
+    if not bool(torch.isfinite(weights).all()):
+        raise fail("staf-export", "row", "must be a trajectory whose weights can be represented", "NaN")
+    staf = StaF(problem.basis)
+    with torch.no_grad():
+        staf.state.copy_(x)
+        staf.coefficients.copy_(problem.basis.local(x).coefficients(weights))
+    _reproduced("estimate", staf(x.unsqueeze(0)).detach(), history["estimate"][-1:], precise)
+    radius = float(problem.basis.centers.radius(x))
+    generator = torch.Generator().manual_seed(0)
+    inside = torch.randn(_POINTS, len(x), dtype=torch.float64, generator=generator)
+    shrink = torch.rand(_POINTS, 1, dtype=torch.float64, generator=generator) ** (1 / len(x))
+    points = x + radius * shrink * inside / inside.norm(dim=-1, keepdim=True)
+    unit = getattr(problem.system, "units", Units())
+    where = ", ".join(f"{v:.6g}" for v in x.tolist())
+    return Deployable(
+        "approximator",
+        f"V^ and its gradient around the state of the last time, {problem.basis.count} centers of "
+        f"{type(problem.basis.kernel).__name__}; the gradient is the partial one, centers frozen.",
+        lambda dtype: approximator(staf, dtype),
+        points,
+        Port("state", len(x), unit.state, f"the ball of radius {radius:.6g} around ({where})"),
+        (
+            Port("value", None, "that of V", "V^; NaN far outside the region, where it has no digits left"),
+            Port("gradient", len(x), "that of V per state", "grad V^"),
+        ),
+        None,
+    )
+
+
+def _controller(cfg: DictConfig, history: dict[str, np.ndarray], precise: bool) -> Deployable:
+    problem = adp_problem(cfg)
+    states = torch.from_numpy(history["state"].astype(np.float64))
+    weights = torch.from_numpy(history["actor_weights"].astype(np.float64))
+    learns = learner(problem.controller) is not None
+    last = policy_of(problem.controller, weights[-2] if learns else None)
+    _reproduced("control", last(states[-2:-1])[0], history["control"][-2], precise)
+    low, high = states.amin(0), states.amax(0)
+    generator = torch.Generator().manual_seed(0)
+    points = low + (high - low) * torch.rand(_POINTS, len(low), dtype=torch.float64, generator=generator)
+    unit = problem.system.units
+    box = " x ".join(f"[{a:.4g}, {b:.4g}]" for a, b in zip(low.tolist(), high.tolist(), strict=True))
+    learned = f", {weights.shape[-1]} actor weights as they were at the end" if learns else ""
+    return Deployable(
+        "controller",
+        f"The control u(x) of {type(problem.system).__name__} by {problem.controller.label}{learned}.",
+        lambda dtype: policy_of(problem.controller, weights[-1] if learns else None, dtype),
+        points,
+        Port("state", len(low), unit.state, f"visited: {box}"),
+        (Port("control", history["control"].shape[-1], unit.input, f"to be held for {problem.dt:g} s"),),
+        None,
+    )
+
+
+def _learner(cfg: DictConfig, history: dict[str, np.ndarray], precise: bool, row: int) -> Learner:
+    problem = adp_problem(cfg)
+    if learner(problem.controller) is None:
+        what = type(problem.controller).__name__
+        raise fail("staf-export", "learning", "must be left away where nothing learns", what)
+    x0, seed = problem.initial_states[row : row + 1], problem.seed + row
+    steps = max(problem.every, min(problem.steps, _FOLLOWED) // problem.every * problem.every)
+    found = simulate(
+        problem.controller,
+        problem.system,
+        problem.cost,
+        x0,
+        dt=problem.dt,
+        steps=steps,
+        seed=seed,
+        integrator=problem.integrator,
+        compile=False,
+    )
+    times = slice(0, steps, problem.every)
+    recorded = history["control"][: steps // problem.every]
+    _reproduced("control", found.control[0, times], recorded, precise)
+    generators = [torch.Generator().manual_seed(seed)] if problem.controller.draws else []
+    uniform = uniform_numbers(x0, steps, problem.controller.draws, generators)[0]
+    unit, size = problem.system.units, x0.shape[-1]
+    inputs = [Port("x", size, unit.state, "as the weights have learned it")]
+    if problem.controller.draws:
+        numbers = problem.controller.draws * size
+        inputs.append(Port("uniform", numbers, "1", "random numbers of [-1, 1], new in every step"))
+    return Learner(
+        f"One step of {problem.controller.label} on {type(problem.system).__name__}, from the weights of "
+        f"time 0: the control to hold for {problem.dt:g} s, before any bounds of the actuator, and new "
+        "weights.",
+        problem.controller,
+        problem.dt,
+        found.state[0, :steps],
+        uniform,
+        tuple(inputs),
+        (Port("u", found.control.shape[-1], unit.input, f"to be held for {problem.dt:g} s"),),
+        None,
+    )
