@@ -194,9 +194,19 @@ MODULES: dict[str, Case] = {
 }
 OTHERS = {"_Held", "ConventionModule", "FunctionPlant", "StepPlant", "RatePlant"}
 OTHERS |= {"SampledProblem", "GlobalValue", "SafetyFilter", "FilteredPolicy", "PlanReplay"}
+OTHERS |= {"AmongDiscs"}  # of an experiment
 OTHERS |= {"RecedingHorizon", "MujocoPlant", "EnvironmentPlant", "EnergyShaping"}
 OTHERS |= {"NearOptimal", "SampledRollout"}
-OTHERS |= {"ParametricPlant", "ChangingPlant", "AdaptiveLQR", "ConcurrentTracker", "Measured", "_Informed"}
+OTHERS |= {
+    "ParametricPlant",
+    "ChangingPlant",
+    "AdaptiveLQR",
+    "ConcurrentTracker",
+    "Measured",
+    "RobustFilter",
+    "Observed",
+    "_Informed",
+}
 """What wraps a function of the user's own, or takes minutes to make: tested in its room."""
 
 

@@ -35,6 +35,8 @@ ELSEWHERE = {
 OTHERS = {
     "ParametricPlant": "in tests/adp/adaptation/test_identifiers.py",
     "ConcurrentTracker": "in tests/adp/adaptation/test_identifiers.py",
+    "RobustFilter": "in tests/adp/adaptation/test_robust_filter.py",
+    "Observed": "in tests/adp/adaptation/test_kalman.py",
     "trace": "takes an exported program",
     "Cosine": "numbers and lists alike, in tests/test_targets.py",
     "paper_step": "of the theorem, in tests/theory/test_errata.py",

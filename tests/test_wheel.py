@@ -47,6 +47,19 @@ def test_wheel_holds_the_package_its_settings_and_nothing_else(wheel: Path) -> N
     assert any(name.endswith("LICENSE") for name in names)
 
 
+def test_an_index_can_show_the_description_and_the_version_is_one(wheel: Path) -> None:
+    with zipfile.ZipFile(wheel) as archive:
+        (name,) = (name for name in archive.namelist() if name.endswith("METADATA"))
+        about, _, description = archive.read(name).decode().partition("\n\n")
+    assert "Description-Content-Type: text/markdown" in about
+    assert "StaFBasis" in description
+    assert "](" not in description  # pictures and links of the README lead nowhere there
+    exec(description.split("```python")[1].split("```")[0])
+    (version,) = (line.split()[1] for line in about.splitlines() if line.startswith("Version:"))
+    assert f"\nversion: {version}\n" in (ROOT / "CITATION.cff").read_text()
+    assert f"version = {{{version}}}" in (ROOT / "README.md").read_text()
+
+
 @pytest.fixture(scope="module")
 def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A virtual environment that has what we depend on, and not this package."""

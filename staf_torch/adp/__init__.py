@@ -5,22 +5,29 @@ import warnings
 from .actor_critic import ActorCritic as ActorCritic
 from .adaptation import Adaptation as Adaptation
 from .adaptation import AdaptiveLQR as AdaptiveLQR
+from .adaptation import Belief as Belief
 from .adaptation import ChangingPlant as ChangingPlant
 from .adaptation import ConcurrentGradient as ConcurrentGradient
 from .adaptation import ConcurrentTracker as ConcurrentTracker
 from .adaptation import Doubling as Doubling
 from .adaptation import Equation as Equation
 from .adaptation import Estimate as Estimate
+from .adaptation import ExtendedKalman as ExtendedKalman
+from .adaptation import Guarded as Guarded
 from .adaptation import HistoryStack as HistoryStack
 from .adaptation import IntegralWindows as IntegralWindows
+from .adaptation import KalmanFilter as KalmanFilter
 from .adaptation import LeastSquares as LeastSquares
 from .adaptation import LinearFamily as LinearFamily
 from .adaptation import Measured as Measured
+from .adaptation import Observed as Observed
 from .adaptation import ParametricPlant as ParametricPlant
+from .adaptation import RobustFilter as RobustFilter
 from .adaptation import SlopeWindow as SlopeWindow
 from .adaptation import SlopeWindows as SlopeWindows
 from .adaptation import Stack as Stack
 from .adaptation import Tracking as Tracking
+from .adaptation import UnscentedKalman as UnscentedKalman
 from .adaptation import Window as Window
 from .adaptation import measured_rate as measured_rate
 from .adaptation import riccati_rows as riccati_rows
@@ -83,6 +90,7 @@ __all__ = [
     "ActorCriticLaw",
     "Adaptation",
     "AdaptiveLQR",
+    "Belief",
     "BoundedInputCost",
     "BoxDDP",
     "ChangingPlant",
@@ -97,24 +105,28 @@ __all__ = [
     "EnergyShaping",
     "Equation",
     "Estimate",
+    "ExtendedKalman",
     "Extrapolation",
     "Feedback",
     "Filtered",
     "Frozen",
     "Gains",
     "GlobalValue",
+    "Guarded",
     "HeldStability",
     "HistoryStack",
     "Identified",
     "IdentifyingTracker",
     "Information",
     "IntegralWindows",
+    "KalmanFilter",
     "LeadingCoordinates",
     "LeastSquares",
     "LinearFamily",
     "LoopResult",
     "Measured",
     "NearOptimal",
+    "Observed",
     "Optimum",
     "ParametricPlant",
     "PlanReplay",
@@ -125,6 +137,7 @@ __all__ = [
     "RBFGridBasis",
     "RandomPoints",
     "RecedingHorizon",
+    "RobustFilter",
     "RolloutPolicy",
     "SafetyFilter",
     "SampledProblem",
@@ -137,6 +150,7 @@ __all__ = [
     "Tracking",
     "Trajectories",
     "TwoStateTracking",
+    "UnscentedKalman",
     "ValueBasis",
     "Weights",
     "Window",

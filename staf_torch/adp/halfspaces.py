@@ -130,7 +130,7 @@ def _best_case(wanted: Tensor, unit: Tensor, far: Tensor, low: Tensor, high: Ten
         return torch.cat(found, dim=-1)
 
     shape = (*wanted.shape[:-1], *table.shape)
-    found = each(case, table.to(wanted).expand(shape), dim=wanted.dim() - 1)
+    found = each(case, table.to(wanted).expand(shape), dim=wanted.dim() - 1, together=1)
     firm, error, soft, soft_error = found.split((size, 1, size, 1), dim=-1)
     scale = 1 + wanted.abs().amax(-1, keepdim=True) + far.abs().amax(-1, keepdim=True)
     met, left = _first_least(firm, error.squeeze(-1))

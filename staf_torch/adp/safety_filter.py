@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from ..lanes import repeat
 from ..lanes.function import RowFunction
 from ..numerics.checks import fail, non_negative, positive, positive_real, trailing
 from ..systems import Bounds, Plant, StepPlant
@@ -39,12 +40,22 @@ class Filtered(NamedTuple):
         >>> found.control.round(decimals=2), found.margin
         (tensor([[0.9900]], dtype=torch.float64), tensor([[0.5000]], dtype=torch.float64))
 
-        Shown by `staf_torch/adp/README.md`.
+        Shown by `staf experiment=avoidance`.
     """
 
     control: Tensor  # (..., m)
     margin: Tensor  # h of every constraint now, (..., k)
     slack: Tensor  # (...) how much further u would have to reach, in its (weighted) units; 0: all is met
+
+
+class Pass(NamedTuple):
+    """What one linearisation hands to the next."""
+
+    u: Tensor  # (B, m)
+    slack: Tensor  # (B,)
+    margin: Tensor  # h, (B, k)
+    met: Tensor  # (B,) 1 where the wanted control satisfies everything, else 0
+    first: Tensor  # (B,) 1 before the first pass, then 0
 
 
 class SafetyFilter(Controller):
@@ -74,7 +85,7 @@ class SafetyFilter(Controller):
         >>> wall.report(run)["constraint_violations"], wall.report(run)["infeasible"]
         (0, [])
 
-        Shown by `staf_torch/adp/README.md`.
+        Shown by `staf experiment=avoidance`.
 
     Args:
         policy: u from x, (..., n) -> (..., m), or a controller, also one that learns.
@@ -259,19 +270,21 @@ class SafetyFilter(Controller):
         at = torch.where(
             ((wanted >= self.bounds.low.to(x)) & (wanted <= self.bounds.high.to(x))), wanted, first * unit
         )
-        u, margin = at, None
-        met = slack = None
-        for _ in range(_PASSES):
-            normal, least, now = self.inequalities(x, u, t)
-            if met is None:
-                met, margin = (((normal * u.unsqueeze(-2)).sum(-1)) >= least).all(-1), now
+
+        def linearise(now: Pass) -> Pass:
+            normal, least, margin = self.inequalities(x, now.u, t)
             found = nearest_admissible(first, normal * unit, least, low, high, self.table)
-            u, slack = found.point * unit, found.shortfall
-        assert met is not None
-        assert margin is not None
-        assert slack is not None
-        u = torch.where(met.unsqueeze(-1), at, u)
-        slack = torch.where(met, 0.0, slack)
+            fine = ((normal * now.u.unsqueeze(-2)).sum(-1) >= least).all(-1)
+            met = torch.where(now.first > 0, fine.to(x), now.met)
+            return Pass(found.point * unit, found.shortfall, margin, met, torch.zeros_like(now.first))
+
+        none = torch.zeros_like(t)
+        start = Pass(
+            at, none, none.unsqueeze(-1).expand(-1, len(self.constraints)).contiguous(), none, none + 1
+        )
+        u, slack, margin, met, _ = repeat(_PASSES, linearise, start)
+        u = torch.where(met.unsqueeze(-1) > 0, at, u)
+        slack = torch.where(met > 0, 0.0, slack)
         return torch.cat((u, margin, slack.unsqueeze(-1)), dim=-1).reshape(*z.shape[:-1], -1)
 
     def _inequality(self, k: int, x: Tensor, u: Tensor, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -147,6 +147,7 @@ EXPERIMENTS: Mapping[str, str] = {
     "faults": "faults.run",
     "icl": "icl.run",
     "safe_box": "safe_box.run",
+    "avoidance": "avoidance.run",
     "rivals": "rivals.run",
 }
 """Name in `task` -> path within this package. They are imported when they are asked for."""

@@ -49,6 +49,7 @@ class Scene(NamedTuple):
     estimate: np.ndarray | None  # (F, S) V^ there
     grid: tuple[np.ndarray, np.ndarray, np.ndarray] | None  # x1 (G,), x2 (G,) and V (G, G), rows along x2
     followed: np.ndarray | None = None  # (F, 2) the state that is to be tracked
+    discs: np.ndarray | None = None  # (F, K, 3) centers and radii of sets that must not be entered
     relative: bool = False  # V is an optimal value; V and V^ as shares of its largest in a ball that shrinks
 
 
@@ -120,6 +121,7 @@ class _Stage:
             [["plane", "across"], ["plane", "curves"]], width_ratios=[1.15, 1.0]
         ).values()
         self._draw_plane(self._plane)
+        across.set_visible(scene.value is not None or scene.estimate is not None)
         self._draw_across(across)
         self._draw_curves(curves)
 
@@ -136,6 +138,9 @@ class _Stage:
         if scene.followed is not None:
             axes.plot(*scene.followed.T, ":", color="0.2", linewidth=0.8)
             (self._goal,) = axes.plot([], [], "x", color="0.2", markersize=5)
+        self._discs = [Circle((0, 0), 1.0, facecolor="0.8", edgecolor="0.4") for _ in self._at(0)]
+        for disc in self._discs:
+            axes.add_patch(disc)
         self._ball = Circle((0, 0), 1.0, facecolor=colour(4), alpha=0.35, edgecolor=colour(0))
         axes.add_patch(self._ball)
         (self._centers,) = axes.plot([], [], "o", color=colour(0), markersize=3)
@@ -145,6 +150,10 @@ class _Stage:
             reach = float(scene.radius.max())
             axes.set_xlim(*_limits(seen[:, 0], reach))
             axes.set_ylim(*_limits(seen[:, 1], reach))
+
+    def _at(self, frame: int) -> np.ndarray:
+        """Centers and radii of the discs, (K, 3)."""
+        return np.zeros((0, 3)) if self._scene.discs is None else self._scene.discs[frame]
 
     def _draw_across(self, axes: Axes) -> None:
         scene = self._scene
@@ -180,6 +189,8 @@ class _Stage:
         """Put everything where it is at that frame."""
         scene = self._scene
         self._path.set_data(scene.state[: frame + 1, 0], scene.state[: frame + 1, 1])
+        for disc, (x, y, radius) in zip(self._discs, self._at(frame), strict=True):
+            disc.set(center=(x, y), radius=radius)
         self._ball.set(center=tuple(scene.state[frame]), radius=float(scene.radius[frame]))
         self._centers.set_data(scene.centers[frame, :, 0], scene.centers[frame, :, 1])
         self._state.set_data(scene.state[frame, :1], scene.state[frame, 1:])

@@ -56,13 +56,15 @@ class Bank:
         shape: sizes.
         streams: S.
         scaling: whether the units of x and y are learned, from the first 2, 5, 10, 20 and 40 samples.
+        doubtful: standard deviations beyond which a sample waits for the next one. If that is as far off,
+            both are learned, else the first with an error of so many deviations.
     """
 
-    def __init__(self, shape: BankShape, streams: int, scaling: bool) -> None:
+    def __init__(self, shape: BankShape, streams: int, scaling: bool, doubtful: float = math.inf) -> None:
         self.shape, self.scaling, self.dtype = shape, scaling, torch.float64
         width = CARRIED_WIDTH * math.sqrt(shape.dim)
         functions = LocalFunctions.of(GaussianKernel(width), CARRIED_RADIUS * width * simplex(shape.dim))
-        rules = Rules.of(shape.dim, scaling)
+        rules = Rules.of(shape.dim, scaling, doubtful)
         pointers, self._held = FunctionPointers.of(functions)
         self._rules = _Rules((ctypes.c_double * _NUMBERS)(*rules.numbers()), pointers)
         self._call, self._run = _Call(), _built(shape)

@@ -10,7 +10,7 @@ import pytest
 from hydra import compose, initialize_config_dir
 
 from staf_torch.cli.staf import config_directory
-from staf_torch.experiments import safe_box
+from staf_torch.experiments import avoidance, safe_box
 
 
 def settings(*overrides: str):  # type: ignore[no-untyped-def]
@@ -18,7 +18,7 @@ def settings(*overrides: str):  # type: ignore[no-untyped-def]
         return compose("config", list(overrides))
 
 
-SHORT = ("duration=0.04", "dt=0.01", "trajectories=2", "adp.optimum.shooting=false", "adp.compile=false")
+SHORT = ("duration=0.02", "dt=0.01", "trajectories=2", "adp.optimum.shooting=false", "adp.compile=false")
 
 
 def test_the_box_has_a_row_a_method_and_keeps_what_starts_inside(tmp_path: Path) -> None:
@@ -32,7 +32,7 @@ def test_the_box_has_a_row_a_method_and_keeps_what_starts_inside(tmp_path: Path)
     assert len((tmp_path / "safe_box.csv").read_text().splitlines()) == 4
     assert (tmp_path / "figures" / "safe_box.png").stat().st_size > 5000
     with np.load(tmp_path / "history.npz") as history:
-        assert history["state"].shape == history["barrier_state"].shape == (2, 5, 2)
+        assert history["state"].shape == history["barrier_state"].shape == (2, 3, 2)
         assert float(history["margin"].min()) == pytest.approx(metrics["minimum_margin"])
 
 
@@ -40,3 +40,36 @@ def test_a_start_outside_the_box_is_refused_by_its_row(tmp_path: Path) -> None:
     cfg = settings("experiment=safe_box", *SHORT, "safe_box.low=[-6,-5]")
     with pytest.raises(ValueError, match=r"must lie strictly between the walls .* not so row 0"):
         safe_box.run(cfg, tmp_path)
+
+
+def test_among_discs_the_filter_has_a_row_beside_the_lqr_and_a_film(tmp_path: Path) -> None:
+    short = (
+        "duration=0.5",
+        "dt=0.1",
+        "trajectories=3",
+        "adp.compile=false",
+        "animation=gif",
+        "avoidance.discs=2",
+    )
+    cfg = settings("experiment=avoidance", *short)
+    metrics = avoidance.run(cfg, tmp_path)
+    assert json.loads((tmp_path / "metrics.json").read_text()) == metrics
+    assert metrics["constraint_violations"] == metrics["lqr_constraint_violations"] == 0
+    assert metrics["cost"] >= 0.99 * metrics["lqr_cost"]
+    assert len((tmp_path / "avoidance.csv").read_text().splitlines()) == 3
+    for name in ("avoidance.png", "avoidance.gif"):
+        assert (tmp_path / "figures" / name).stat().st_size > 5000
+    with np.load(tmp_path / "history.npz") as history:
+        assert history["state"].shape == (3, 6, 12)
+        assert float(history["distance"].min()) == pytest.approx(metrics["minimum_margin"])
+
+
+def test_scenarios_begin_clear_of_the_discs_and_are_the_same_again() -> None:
+    cfg = settings("experiment=avoidance", "trajectories=50")
+    x0 = avoidance.scenarios(cfg)
+    assert x0.shape == (50, 16)
+    assert float(avoidance.distance(x0, 0.4).min()) > 0.6
+    assert float(x0[:, 6:8].abs().max()) <= 0.3
+    assert x0.equal(avoidance.scenarios(cfg))
+    with pytest.raises(ValueError, match="must leave room for a start"):
+        avoidance.scenarios(settings("experiment=avoidance", "avoidance.radius=9", "trajectories=1"))

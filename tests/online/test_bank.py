@@ -31,10 +31,11 @@ def definition_of(bank: Bank) -> Bank:
 @pytest.mark.parametrize("outputs", [1, 2])
 def test_compiled_bank_is_what_the_definition_says(outputs: int) -> None:
     shape = BankShape(2, outputs, 80, 10)
-    fast, slow = Bank(shape, 2, True), definition_of(Bank(shape, 2, True))
+    fast, slow = Bank(shape, 2, True, 8.0), definition_of(Bank(shape, 2, True, 8.0))
     x, y = streams(125, 2, outputs)
     x[50, 0, 1], y[60, 1, 0], x[70, 1, 0] = torch.nan, torch.nan, torch.inf
     y[80, 0], x[90, 1] = 1e300, 1e12
+    y[85, 0], y[95:97, 0] = 30.0, -20.0  # an outlier, and two that are learned
     x[105:, 1] += 1e9  # gone for good: it starts afresh
     for k in range(125):
         lapse = None if k % 3 else torch.tensor([0.5, 2.0], dtype=torch.float64)

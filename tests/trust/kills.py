@@ -51,6 +51,7 @@ EXECUTORS = {
         "hydra.launcher.batch=8",
     ],
 }
+TRACE = 99  # exit code of a command that ends in a traceback
 WAIT, STAY = 240.0, 30.0  # s that a sweep may take, and its processes to end after it: they may be importing
 
 
@@ -68,7 +69,7 @@ class Sweep:
         self.pid = os.fork()
         if self.pid:
             return
-        code = 99
+        code = TRACE
         try:
             os.chdir(place)
             os.environ.update(environment)
@@ -135,10 +136,11 @@ def to_worker(sweep: Sweep, chance: random.Random) -> str:
 
 def full_disk(sweep: Sweep, chance: random.Random) -> str:
     """Fill the small disk of the sweep, for the rest of its time."""
-    with (sweep.place / "ballast").open("wb") as ballast, contextlib.suppress(OSError):
-        while True:
-            ballast.write(bytes(4096))
-            ballast.flush()
+    ballast = os.open(sweep.place / "ballast", os.O_WRONLY | os.O_CREAT)
+    with contextlib.suppress(OSError):
+        while os.write(ballast, bytes(4096)):
+            pass
+    os.close(ballast)
     return "a full disk"
 
 
@@ -223,7 +225,7 @@ def one(
         table = place / "sweep" / "table.csv"
         same = again == 0 and table.exists() and table.read_bytes() == whole[0]
         log = (place / "log").read_text(errors="replace").splitlines()[-15:]
-        trouble = [] if same else log
+        trouble = [] if same and code != TRACE else log
         trouble += [f"{stayed} processes stayed"] * bool(stayed)
     shutil.rmtree(place, ignore_errors=True)
     verdict = "same" if same and not trouble else "ANOTHER"

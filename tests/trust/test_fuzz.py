@@ -1,14 +1,19 @@
 """Every reader of a folder of results, over files that nobody meant.
 
-Ten thousand cases of each: `STAF_FUZZ=10000 pytest tests/trust/test_fuzz.py`.
+Ten thousand cases: `STAF_FUZZ=1500 pytest tests/trust/test_fuzz.py` (so many for each of seven readers). No
+case may take five seconds, start a process, import a module from where the files are, or write elsewhere.
 """
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 import os
+import signal
+import sys
 import tempfile
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +48,65 @@ VALUE = st.recursive(
 OBJECT = st.dictionaries(
     st.sampled_from([*RECORD, "metrics", "files", "build", "checksum", "jobs"]) | TEXT, VALUE
 )
+
+
+SECONDS = 5.0
+FORBIDDEN = ("os.system", "os.exec", "os.posix_spawn", "subprocess.Popen", "socket.connect", "ctypes.dlopen")
+WATCHED: list[str] = []  # folders of the cases that are running
+
+
+SEEN: list[str] = []  # what they did that no reader does; a reader may swallow an exception
+
+
+def _watch(event: str, arguments: tuple[Any, ...]) -> None:
+    if not WATCHED:
+        return
+    writes = event == "open" and isinstance(arguments[0], str) and "w" in str(arguments[1])
+    elsewhere = writes and not arguments[0].startswith(WATCHED[-1])
+    foreign = event == "import" and str(arguments[1]).startswith(WATCHED[-1])
+    if event in FORBIDDEN or elsewhere or foreign:
+        SEEN.append(f"{event} {arguments}")
+        raise RuntimeError(SEEN[-1])
+
+
+sys.addaudithook(_watch)
+
+
+@contextlib.contextmanager
+def case() -> Iterator[str]:
+    """A folder for one case; what is done in there is watched, and has five seconds."""
+
+    def late(*_: object) -> None:
+        SEEN.append(f"more than {SECONDS} s")
+        raise RuntimeError(SEEN[-1])
+
+    with tempfile.TemporaryDirectory() as folder:
+        before = signal.signal(signal.SIGALRM, late)
+        signal.setitimer(signal.ITIMER_REAL, SECONDS)
+        WATCHED.append(folder)
+        try:
+            yield folder
+        finally:
+            WATCHED.pop()
+            signal.setitimer(signal.ITIMER_REAL, 0)
+            signal.signal(signal.SIGALRM, before)
+            seen, SEEN[:] = list(SEEN), []
+        assert not seen, seen
+
+
+def wait() -> None:
+    signal.setitimer(signal.ITIMER_REAL, 0.01)
+    signal.pause()
+
+
+@pytest.mark.parametrize(("act", "said"), [(lambda: os.system("true"), "os.system"), (wait, "more than")])
+def test_a_case_that_runs_something_or_hangs_fails(act: Callable[[], Any], said: str) -> None:
+    def swallowed() -> None:
+        with case(), contextlib.suppress(RuntimeError):
+            act()
+
+    with pytest.raises(AssertionError, match=said):
+        swallowed()
 
 
 def changed(content: bytes) -> st.SearchStrategy[bytes]:
@@ -88,7 +152,7 @@ def test_no_record_costs_the_other_runs_their_rows(name: str) -> None:
     @fuzz
     @given(FILES[name])
     def check(content: bytes) -> None:
-        with tempfile.TemporaryDirectory() as folder:
+        with case() as folder:
             write_run(Path(folder) / "0", {"seed": 1}, {"ball_error": 0.125})
             run = write_run(Path(folder) / "1", {"seed": 2}, {"ball_error": 0.25})
             (run / name).write_bytes(content)
@@ -119,7 +183,7 @@ def test_settings_are_read_or_refused() -> None:
     @fuzz
     @given(changed(CONFIG) | values | st.binary(max_size=60))
     def check(content: bytes) -> None:
-        with tempfile.TemporaryDirectory() as folder:
+        with case() as folder:
             (Path(folder) / "config.yaml").write_bytes(content)
             try:
                 tree = checked(read_settings(Path(folder) / "config.yaml", Path(folder)), "config.yaml")
@@ -152,7 +216,7 @@ def test_an_archive_is_read_or_refused() -> None:
     @fuzz
     @given(changed(archive()) | st.binary(max_size=100))
     def check(content: bytes) -> None:
-        with tempfile.TemporaryDirectory() as folder:
+        with case() as folder:
             (Path(folder) / "history.npz").write_bytes(content)
             read(Path(folder) / "history.npz")
 
@@ -166,7 +230,7 @@ def test_a_sweep_is_resumed_or_refused() -> None:
         | changed(b'{"version": "0.1.0", "overrides": ["seed=1"], "hydra": [], "jobs": []}')
     )
     def check(content: bytes) -> None:
-        with tempfile.TemporaryDirectory() as folder:
+        with case() as folder:
             (Path(folder) / "sweep.json").write_bytes(content)
             try:
                 command_line(["-m", f"sweep.resume={folder}"])

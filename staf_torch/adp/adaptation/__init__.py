@@ -5,6 +5,11 @@ from .adaptive_lqr import AdaptiveLQR as AdaptiveLQR
 from .history_stack import ConcurrentGradient as ConcurrentGradient
 from .history_stack import HistoryStack as HistoryStack
 from .history_stack import Stack as Stack
+from .kalman import Belief as Belief
+from .kalman import ExtendedKalman as ExtendedKalman
+from .kalman import KalmanFilter as KalmanFilter
+from .kalman import Observed as Observed
+from .kalman import UnscentedKalman as UnscentedKalman
 from .least_squares import Estimate as Estimate
 from .least_squares import LeastSquares as LeastSquares
 from .measured import ChangingPlant as ChangingPlant
@@ -13,6 +18,8 @@ from .parametric import LinearFamily as LinearFamily
 from .parametric import ParametricPlant as ParametricPlant
 from .redesign import Doubling as Doubling
 from .redesign import riccati_rows as riccati_rows
+from .robust_filter import Guarded as Guarded
+from .robust_filter import RobustFilter as RobustFilter
 from .tracker import ConcurrentTracker as ConcurrentTracker
 from .tracker import Tracking as Tracking
 from .windows import Equation as Equation

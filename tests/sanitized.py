@@ -1,0 +1,187 @@
+"""The native code under AddressSanitizer and UBSan: `python tests/sanitized.py [--calls 10000] [--seed 0]`.
+
+Row programs, chases and filters of streams are built with both sanitizers and called with shapes, layouts and
+dtypes drawn at random: 0 and 1 rows and times, strided, transposed, expanded and misaligned tensors, and
+inputs that must be refused. A bad read, a bad write or undefined behaviour ends the process; what is returned
+is compared with plain torch. In the end a read outside is made on purpose, which has to be found.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ctypes
+import os
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+FLAGS = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-fno-omit-frame-pointer", "-O1")
+SECONDS = 60  # of a call
+ROWS, TIMES = (0, 1, 1, 2, 3, 7, 8, 9, 16, 17, 33), (0, 1, 1, 2, 3, 5)
+
+
+def missing() -> str | None:
+    """Why nothing can be sanitized here; None: it can."""
+    try:
+        found = subprocess.run(
+            ["g++", "-print-file-name=libasan.so"], capture_output=True, text=True, check=True
+        )
+    except (OSError, subprocess.CalledProcessError) as error:
+        return f"there is no g++ ({error})"
+    return None if os.path.isabs(found.stdout.strip()) else "g++ has no libasan"
+
+
+def run(calls: int, seed: int, cache: Path) -> str:
+    """Return what a process under the sanitizers said of so many calls, or what they found.
+
+    Raises:
+        AssertionError: if the read outside was not found that the process ends with.
+    """
+    library = subprocess.run(
+        ["g++", "-print-file-name=libasan.so"], capture_output=True, text=True, check=True
+    )
+    environment = {
+        **os.environ,
+        "LD_PRELOAD": library.stdout.strip(),
+        "ASAN_OPTIONS": "detect_leaks=0:exitcode=66",
+        "UBSAN_OPTIONS": "print_stacktrace=1:halt_on_error=1",
+        "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]),
+        "XDG_CACHE_HOME": str(cache),
+        "OMP_NUM_THREADS": "1",
+    }
+    line = [sys.executable, __file__, "--inside", "--calls", str(calls), "--seed", str(seed)]
+    ended = subprocess.run(line, env=environment, capture_output=True, text=True, check=False)
+    if "none bad" not in ended.stdout:
+        return f"exit {ended.returncode}: {ended.stdout}{ended.stderr[-5000:]}"
+    assert ended.returncode == 66, ended.stderr
+    assert "heap-buffer-overflow" in ended.stderr
+    return ended.stdout.strip()
+
+
+def inside(calls: int, seed: int) -> None:
+    """Call native code so often, in a process that has the sanitizers loaded."""
+    import torch
+
+    from staf_torch import GaussianKernel, StaFBasis, StateFollowingCenters, chase, lanes, optim, rings
+    from staf_torch.lanes import build, compiler
+    from staf_torch.online import StaFRegressor
+
+    build._FLAGS += FLAGS
+    compiler._FLAGS += FLAGS
+    chance = random.Random(seed)
+    torch.manual_seed(seed)
+
+    def laid_out(shape: tuple[int, ...], dtype: torch.dtype) -> torch.Tensor:
+        """Numbers of that shape in some layout: in one piece, misaligned, strided, transposed or expanded."""
+        kind = chance.choice(["whole", "misaligned", "strided", "transposed", "expanded"])
+        found = torch.rand(shape, dtype=torch.float64).to(dtype)
+        if kind == "misaligned":
+            place = torch.empty(found.numel() + 1, dtype=dtype)[1:].view(shape)
+        elif kind == "strided":
+            place = torch.empty((*shape[:-1], 2 * shape[-1] + 1), dtype=dtype)[..., 1 : 1 + 2 * shape[-1] : 2]
+        elif kind == "transposed" and len(shape) > 1:
+            place = torch.empty((shape[1], shape[0], *shape[2:]), dtype=dtype).transpose(0, 1)
+        elif kind == "expanded" and shape[0]:
+            return found[:1].expand(shape)
+        else:
+            return found
+        return place.copy_(found)
+
+    def step(carry: tuple, now: tuple, row: tuple) -> tuple:
+        (x,), (u,), (gain,) = carry, now, row
+        x = torch.where(x > 0.5, x.sin(), x.exp()) * gain.unsqueeze(-1) + u.clamp(max=0.7)
+        return (x,), (x, x.square().sum(-1), (x - u).abs().amax(-1))
+
+    program = lanes.Program(step, name="sanitized")
+
+    def a_program() -> None:
+        rows, times, dtype = (
+            chance.choice(ROWS),
+            chance.choice(TIMES),
+            chance.choice([torch.float64, torch.float32]),
+        )
+        carry = (laid_out((rows, 3), dtype),)
+        now = (laid_out((rows, times, 3), dtype),)
+        given = carry, now, (laid_out((rows,), dtype),)
+        every = chance.choice([1, 1, 2, 3])
+        try:
+            found, expected = (run(*given, every=every) for run in (program, program.definition))
+        except (ValueError, RuntimeError):
+            assert rows == 0 or times == 0
+            return
+        close = 1e-12 if dtype == torch.float64 else 1e-5
+        for one, other in zip((*found[0], *found[1]), (*expected[0], *expected[1]), strict=True):
+            torch.testing.assert_close(one, other, rtol=close, atol=close)
+
+    bases = {
+        dtype: StaFBasis(GaussianKernel(), StateFollowingCenters(rings(3).to(dtype), 0.3)).to(dtype)
+        for dtype in (torch.float64, torch.float32)
+    }
+
+    def a_chase() -> None:
+        rows, times, dtype = chance.choice(ROWS), chance.choice(TIMES), chance.choice(list(bases))
+        wrong = chance.random() < 0.3
+        shape = (rows, times, chance.choice([1, 3]) if wrong else 2)
+        states = laid_out(shape, torch.float32 if wrong and dtype == torch.float64 else dtype)
+        law = chance.choice([optim.SteepestDescent(), optim.Nesterov()])
+        try:
+            found = chase(states, bases[dtype], lambda x: x.square().sum(-1), law, inner_steps=2)
+        except (ValueError, RuntimeError, TypeError):
+            assert wrong or rows == 0 or times == 0
+            return
+        assert found.weights.shape == (rows, times, 3)
+        assert found.weights.isfinite().all()
+
+    def a_filter() -> None:
+        times, streams = chance.choice((1, 2, 3, 5, 17)), chance.choice((0, 1, 1, 2, 3, 9))
+        shape = (times, streams, 2) if streams else (times, 2)
+        wrong = chance.random() < 0.2
+        x = laid_out(shape, chance.choice([torch.float64, torch.float32]))
+        y = laid_out((*shape[:-1][: 1 if wrong else None],), x.dtype)
+        try:
+            model = StaFRegressor().fit(x, y)
+            predicted = model.predict(x[-1])
+        except (ValueError, RuntimeError, TypeError):
+            return
+        assert torch.as_tensor(predicted).shape[: len(shape) - 2] == shape[1:-1]
+
+    kinds = {"programs": a_program, "chases": a_chase, "filters": a_filter}
+    counts = dict.fromkeys(kinds, 0)
+    for _ in range(calls):
+        name = chance.choices(list(kinds), weights=(6, 2, 2))[0]
+        signal.alarm(SECONDS)  # which ends the process: a call that hangs listens to nothing else
+        kinds[name]()
+        signal.alarm(0)
+        counts[name] += 1
+    built = list(Path(os.environ["XDG_CACHE_HOME"], "staf_torch").rglob("*.so"))
+    assert len(built) >= min(4, calls), built
+    assert all(b"__asan_report_load" in library.read_bytes() for library in built)
+    print(f"{calls} calls of {len(built)} libraries under the sanitizers, none bad: {counts}", flush=True)
+    outside = torch.empty(3, dtype=torch.float64)
+    ctypes.string_at(outside.data_ptr(), 256)  # must be found, or all of this has shown nothing
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--calls", type=int, default=10_000)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--inside", action="store_true", help=argparse.SUPPRESS)
+    chosen = parser.parse_args()
+    if chosen.inside:
+        inside(chosen.calls, chosen.seed)
+        return 0
+    if why := missing():
+        print(why)
+        return 0
+    with tempfile.TemporaryDirectory() as cache:
+        said = run(chosen.calls, chosen.seed, Path(cache))
+    print(said)
+    return int("none bad" not in said)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
