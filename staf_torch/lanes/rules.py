@@ -16,7 +16,7 @@ RULES: dict[str, Rule] = {}
 
 
 def rule(*names: str) -> Callable[[Rule], Rule]:
-    """Decorator: a function of (tracer, what torch returned, arguments...) is the rule of these operations."""
+    """Decorator: a function of (tracer, what torch returned, arguments) is the rule of these operations."""
 
     def register(rule: Rule) -> Rule:
         RULES.update(dict.fromkeys(names, rule))
