@@ -195,6 +195,7 @@ CALLS: dict[str, Callable[..., Any]] = {
     "HeavyBall": lambda **given: optim.HeavyBall(**{"step": 0.5, "momentum": 0.5, **given}),
     "Nesterov": lambda **given: optim.Nesterov(**{"step": 0.5, "momentum": 0.5, **given}),
     "NormalisedLMS": optim.NormalisedLMS,
+    "PolicyIteration": adp.PolicyIteration,
     "PreconditionedDescent": optim.PreconditionedDescent,
     "trajectory": trajectories,
     "Oscillator": systems.Oscillator,

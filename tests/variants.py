@@ -248,6 +248,7 @@ ACTOR_CRITIC_LAWS: dict[str, Callable[[], adp.ActorCriticLaw]] = {
     "information": adp.Information,
     "published": adp.Published,
     "frozen": adp.Frozen,
+    "policy_iteration": adp.PolicyIteration,
 }
 
 

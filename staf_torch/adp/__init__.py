@@ -68,6 +68,7 @@ from .laws import Weights as Weights
 from .memory_growth import learn_global_value as learn_global_value
 from .near_optimal import NearOptimal as NearOptimal
 from .near_optimal import near_optimal as near_optimal
+from .policy_iteration import PolicyIteration as PolicyIteration
 from .receding_horizon import RecedingHorizon as RecedingHorizon
 from .rollout import RolloutPolicy as RolloutPolicy
 from .safety_filter import Filtered as Filtered
@@ -135,6 +136,7 @@ __all__ = [
     "Optimum",
     "ParametricPlant",
     "PlanReplay",
+    "PolicyIteration",
     "Published",
     "QuadraticBasis",
     "QuadraticCost",
