@@ -14,7 +14,7 @@ from torch import Tensor
 from ..adp import ConcurrentTracker, LoopResult, Measured, ParametricPlant, QuadraticCost, simulate
 from ..figures.adaptation import GainSets, draw_gain_sets
 from ..figures.style import images
-from ..numerics.checks import COMMAND_LINE, fail, flag, integer, positive_real, real, vector
+from ..numerics.checks import COMMAND_LINE, fail, flag, integer, non_negative, positive_real, real, vector
 from ..results.progress import SHOWN, Progress
 from ..results.run_directory import RunDirectory
 from ..settings.chase import plain
@@ -76,7 +76,7 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
         )
         time, errors[name], diverged[name] = result.time, _tracking_error(result), int(result.diverged.sum())
         thetas[name] = tracker.tracking(result.identifier).theta.clone()  # without the stacks beside it
-    late = time >= positive_real(COMMAND_LINE, "settle_time", cfg.settle_time)
+    late = time >= non_negative(COMMAND_LINE, "settle_time", cfg.settle_time)
     if not bool(late.any()):
         raise fail(COMMAND_LINE, "settle_time", "must be before the end", cfg.settle_time)
     rms = {name: _rms(error[:, late]) for name, error in errors.items()}

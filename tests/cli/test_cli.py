@@ -47,7 +47,12 @@ NEEDS = {  # what some options cannot do without, or that makes them small
         "rivals.states=1",
         "rivals.calls=2",
     ],
+    "experiment=icl": ["trajectories=2"],
+    "experiment=faults": ["faults.cases=[unstable]"],
+    "experiment=safe_box": ["trajectories=2", "safe_box.states=20", "safe_box.filter=false"],
+    "experiment=avoidance": ["trajectories=3"],
     "experiment=layouts": ["layouts.states=4", "layouts.radii=[0.1,0.2]"],
+    "system=two_link_robot": ["centers=simplex", "target=quadratic", "initial_state=[0.1,0,0,0]"],
     "system=three_state": ["centers=simplex", "target=quadratic", "initial_state=[0.1,0,0]"],
 }
 CUSTOM = {

@@ -50,6 +50,7 @@ NEEDS = {  # what some options cannot do without
     "centers=directions": "centers.directions=[[0,1],[1,0],[-1,0]]",
     "system=cart_pole": "centers=simplex initial_state=[0,0,0,0]",
     "system=planar_quadrotor": "centers=simplex initial_state=[0,0,0,0,0,0]",
+    "system=two_link_robot": "centers=simplex initial_state=[0,0,0,0]",
     "system=three_state": "centers=simplex initial_state=[0,0,0]",
 }
 
