@@ -49,7 +49,12 @@ NEEDS = {  # what some options cannot do without, or that makes them small
     ],
     "experiment=icl": ["trajectories=2"],
     "experiment=faults": ["faults.cases=[unstable]"],
-    "experiment=safe_box": ["trajectories=2", "safe_box.states=20", "safe_box.filter=false"],
+    "experiment=safe_box": [
+        "trajectories=2",
+        "safe_box.states=20",
+        "safe_box.filter=false",
+        "adp.optimum.shooting=false",
+    ],
     "experiment=avoidance": ["trajectories=3"],
     "experiment=layouts": ["layouts.states=4", "layouts.radii=[0.1,0.2]"],
     "system=two_link_robot": ["centers=simplex", "target=quadratic", "initial_state=[0.1,0,0,0]"],
