@@ -31,6 +31,9 @@ from .adaptation import UnscentedKalman as UnscentedKalman
 from .adaptation import Window as Window
 from .adaptation import measured_rate as measured_rate
 from .adaptation import riccati_rows as riccati_rows
+from .avoidance import AvoidanceCost as AvoidanceCost
+from .avoidance import AvoidancePlans as AvoidancePlans
+from .avoidance import plan_around as plan_around
 from .bases import LeadingCoordinates as LeadingCoordinates
 from .bases import QuadraticBasis as QuadraticBasis
 from .bases import RBFGridBasis as RBFGridBasis
@@ -65,6 +68,7 @@ from .laws import Weights as Weights
 from .memory_growth import learn_global_value as learn_global_value
 from .near_optimal import NearOptimal as NearOptimal
 from .near_optimal import near_optimal as near_optimal
+from .policy_iteration import PolicyIteration as PolicyIteration
 from .receding_horizon import RecedingHorizon as RecedingHorizon
 from .rollout import RolloutPolicy as RolloutPolicy
 from .safety_filter import Filtered as Filtered
@@ -90,6 +94,8 @@ __all__ = [
     "ActorCriticLaw",
     "Adaptation",
     "AdaptiveLQR",
+    "AvoidanceCost",
+    "AvoidancePlans",
     "Belief",
     "BoundedInputCost",
     "BoxDDP",
@@ -130,6 +136,7 @@ __all__ = [
     "Optimum",
     "ParametricPlant",
     "PlanReplay",
+    "PolicyIteration",
     "Published",
     "QuadraticBasis",
     "QuadraticCost",
@@ -162,6 +169,7 @@ __all__ = [
     "learn_global_value",
     "measured_rate",
     "near_optimal",
+    "plan_around",
     "riccati_rows",
     "simulate",
     "tracking_cost",
