@@ -13,6 +13,7 @@ from .adaptation import Doubling as Doubling
 from .adaptation import Equation as Equation
 from .adaptation import Estimate as Estimate
 from .adaptation import ExtendedKalman as ExtendedKalman
+from .adaptation import Guarded as Guarded
 from .adaptation import HistoryStack as HistoryStack
 from .adaptation import IntegralWindows as IntegralWindows
 from .adaptation import KalmanFilter as KalmanFilter
@@ -21,6 +22,7 @@ from .adaptation import LinearFamily as LinearFamily
 from .adaptation import Measured as Measured
 from .adaptation import Observed as Observed
 from .adaptation import ParametricPlant as ParametricPlant
+from .adaptation import RobustFilter as RobustFilter
 from .adaptation import SlopeWindow as SlopeWindow
 from .adaptation import SlopeWindows as SlopeWindows
 from .adaptation import Stack as Stack
@@ -29,6 +31,9 @@ from .adaptation import UnscentedKalman as UnscentedKalman
 from .adaptation import Window as Window
 from .adaptation import measured_rate as measured_rate
 from .adaptation import riccati_rows as riccati_rows
+from .avoidance import AvoidanceCost as AvoidanceCost
+from .avoidance import AvoidancePlans as AvoidancePlans
+from .avoidance import plan_around as plan_around
 from .bases import LeadingCoordinates as LeadingCoordinates
 from .bases import QuadraticBasis as QuadraticBasis
 from .bases import RBFGridBasis as RBFGridBasis
@@ -63,6 +68,7 @@ from .laws import Weights as Weights
 from .memory_growth import learn_global_value as learn_global_value
 from .near_optimal import NearOptimal as NearOptimal
 from .near_optimal import near_optimal as near_optimal
+from .policy_iteration import PolicyIteration as PolicyIteration
 from .receding_horizon import RecedingHorizon as RecedingHorizon
 from .rollout import RolloutPolicy as RolloutPolicy
 from .safety_filter import Filtered as Filtered
@@ -88,6 +94,8 @@ __all__ = [
     "ActorCriticLaw",
     "Adaptation",
     "AdaptiveLQR",
+    "AvoidanceCost",
+    "AvoidancePlans",
     "Belief",
     "BoundedInputCost",
     "BoxDDP",
@@ -110,6 +118,7 @@ __all__ = [
     "Frozen",
     "Gains",
     "GlobalValue",
+    "Guarded",
     "HeldStability",
     "HistoryStack",
     "Identified",
@@ -127,6 +136,7 @@ __all__ = [
     "Optimum",
     "ParametricPlant",
     "PlanReplay",
+    "PolicyIteration",
     "Published",
     "QuadraticBasis",
     "QuadraticCost",
@@ -134,6 +144,7 @@ __all__ = [
     "RBFGridBasis",
     "RandomPoints",
     "RecedingHorizon",
+    "RobustFilter",
     "RolloutPolicy",
     "SafetyFilter",
     "SampledProblem",
@@ -158,6 +169,7 @@ __all__ = [
     "learn_global_value",
     "measured_rate",
     "near_optimal",
+    "plan_around",
     "riccati_rows",
     "simulate",
     "tracking_cost",

@@ -300,7 +300,7 @@ static void ask(const Rules &r, Stream &s, const double *x) {
 }
 
 // Keep (x, y). A full store gives up the older of the closest pair of those that are not recent.
-static void keep(const Rules &r, Stream &s, const double *x, const double *y) {
+static void keep(const Rules &r, Stream &s, const double *x, const double *y, double time) {
     const double old = s.clock - r.recent;
     int slot = int(s.count), count = slot;
     if (count < C) {
@@ -321,7 +321,7 @@ static void keep(const Rules &r, Stream &s, const double *x, const double *y) {
     }
     std::copy(x, x + n, s.x[slot]);
     std::copy(y, y + K, s.y[slot]);
-    s.when[slot] = s.time, s.order[slot] = s.clock, s.gap[slot] = infinity;
+    s.when[slot] = time, s.order[slot] = s.clock, s.gap[slot] = infinity;
     for (int i = 0; i < count; ++i)
         if (s.order[i] == old + 1)  // it is recent no more from the next sample on
             for (int j = 0; j < count; ++j)
@@ -329,6 +329,52 @@ static void keep(const Rules &r, Stream &s, const double *x, const double *y) {
                     const double d = apart(r, s, s.x[i], s.x[j]);
                     s.gap[i] = std::min(s.gap[i], d), s.gap[j] = std::min(s.gap[j], d);
                 }
+}
+
+static void notice(Stream &s, const double *y) {
+    for (int o = 0; o < K; ++o) {
+        s.low[o] = std::min(s.low[o], y[o]), s.high[o] = std::max(s.high[o], y[o]);
+        s.last_y[o] = y[o];
+    }
+}
+
+static void accept(const Rules &r, Stream &s, const double *x, const double *y, double time, double lapse) {
+    s.clock += 1, s.learned += 1;
+    keep(r, s, x, y, time);
+    if (std::find(r.rescaled, r.rescaled + 6, s.clock) != r.rescaled + 6) rescale(r, s);
+    else carry(r, s, x, y, lapse);
+}
+
+// Whether a sample that nobody expected waits: it is learned as it is if the next one is alike, else within limits.
+static bool waits(const Rules &r, Stream &s, const double *x, const double *y, const double *told, double lapse) {
+    bool doubtful = false;
+    for (int o = 0; o < K; ++o) {
+        const double error = in_units(r, s, o, y[o]) - s.mean[o];
+        doubtful |= told[o] == told[o] && square(error) > square(r.doubtful) * std::max(s.variance[o], s.pace[o]);
+    }
+    if (doubtful && s.clock >= r.settled && s.trust == 0) {
+        if (s.waiting == 0) {
+            std::copy(x, x + n, s.waiting_x);
+            std::copy(y, y + K, s.waiting_y);
+            for (int o = 0; o < K; ++o) {
+                const double most = r.doubtful * std::sqrt(std::max(s.variance[o], s.pace[o]));
+                const double limited = std::min(std::max(in_units(r, s, o, y[o]), s.mean[o] - most), s.mean[o] + most);
+                s.limited_y[o] = limited * scale_of(r, s, n + o) + shift_of(r, s, n + o);
+            }
+            notice(s, y);
+            s.waiting = 1, s.waiting_time = s.time, s.waiting_lapse = lapse;
+            return true;
+        }
+        s.waiting = 0, s.trust = streak_limit;
+        accept(r, s, s.waiting_x, s.waiting_y, s.waiting_time, s.waiting_lapse);
+        return false;
+    }
+    if (s.waiting) {
+        s.waiting = 0;
+        accept(r, s, s.waiting_x, s.limited_y, s.waiting_time, s.waiting_lapse);
+    }
+    s.trust = std::max(s.trust - 1, 0.);
+    return false;
 }
 
 static void learn(const Rules &r, Stream &s, const double *given, const double *told, double lapse) {
@@ -358,21 +404,14 @@ static void learn(const Rules &r, Stream &s, const double *given, const double *
         if (beyond(r, s, x, y)) s.skipped += 1;
         else s.far = 0;
     } else if (s.far > 0) s.skipped += 1;
-    else if (known)
+    else if (known) {
+        if (waits(r, s, x, y, told, lapse)) return;
         for (int o = 0; o < K; ++o)
             if (told[o] == told[o]) judge_members(r, s, o, in_units(r, s, o, y[o]));
+    }
     if (s.far > 0) return;
-    for (int o = 0; o < K; ++o) {
-        s.low[o] = std::min(s.low[o], y[o]), s.high[o] = std::max(s.high[o], y[o]);
-        s.last_y[o] = y[o];
-    }
-    s.clock += 1, s.learned += 1;
-    keep(r, s, x, y);
-    if (std::find(r.rescaled, r.rescaled + 6, s.clock) != r.rescaled + 6) {
-        rescale(r, s);
-        return;
-    }
-    carry(r, s, x, y, lapse);
+    notice(s, y);
+    accept(r, s, x, y, s.time, lapse);
 }
 
 static void tell(const Rules &r, Stream &s, const double *given, double *mean, double *variance) {

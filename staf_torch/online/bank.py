@@ -17,6 +17,7 @@ from ..lanes.build import compiled
 from .bank_definition import BankDefinition
 from .bank_rules import CARRIED_RADIUS, CARRIED_WIDTH, BankShape, Rules, size
 from .compiled_filter import FunctionPointers
+from .filter_streams import refuse_other
 from .local_functions import LocalFunctions
 
 _NUMBERS = len(Rules.of(1, True).numbers())
@@ -56,13 +57,15 @@ class Bank:
         shape: sizes.
         streams: S.
         scaling: whether the units of x and y are learned, from the first 2, 5, 10, 20 and 40 samples.
+        doubtful: standard deviations beyond which a sample waits for the next one. If that is as far off,
+            both are learned, else the first with an error of so many deviations.
     """
 
-    def __init__(self, shape: BankShape, streams: int, scaling: bool) -> None:
+    def __init__(self, shape: BankShape, streams: int, scaling: bool, doubtful: float = math.inf) -> None:
         self.shape, self.scaling, self.dtype = shape, scaling, torch.float64
         width = CARRIED_WIDTH * math.sqrt(shape.dim)
         functions = LocalFunctions.of(GaussianKernel(width), CARRIED_RADIUS * width * simplex(shape.dim))
-        rules = Rules.of(shape.dim, scaling)
+        rules = Rules.of(shape.dim, scaling, doubtful)
         pointers, self._held = FunctionPointers.of(functions)
         self._rules = _Rules((ctypes.c_double * _NUMBERS)(*rules.numbers()), pointers)
         self._call, self._run = _Call(), _built(shape)
@@ -109,6 +112,7 @@ class Bank:
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Take over what `state_dict` has."""
+        refuse_other(state["table"].shape[1], size(self.shape))
         self.replace(state["table"].clone())
 
     @property

@@ -196,7 +196,7 @@ class BankDefinition:
         near = (both - s["center"]).abs() < self.rules.far * s["spread"]
         return s.number("clock") >= 40 and not bool(near.all())
 
-    def _keep(self, s: Views, x: Tensor, y: Tensor) -> None:
+    def _keep(self, s: Views, x: Tensor, y: Tensor, time: float) -> None:
         """Keep (x, y). A full store gives up the older of the closest pair of those that are not recent."""
         old, count = s.number("clock") - self.rules.recent, int(s.number("count"))
         order, gap = s["order"], s["gap"]
@@ -214,7 +214,7 @@ class BankDefinition:
                 rest = others.clone()
                 rest[i] = False
                 gap[i] = torch.where(rest, self._apart(s, s["x"], s["x"][i]), torch.inf).min()
-        s["x"][slot], s["y"][slot], s["when"][slot] = x, y, s["time"]
+        s["x"][slot], s["y"][slot], s["when"][slot] = x, y, time
         order[slot], gap[slot] = s["clock"], torch.inf
         for i in (order == old + 1).nonzero().flatten().tolist():
             distance = torch.where(
@@ -249,16 +249,51 @@ class BankDefinition:
             s["time"].copy_(time)
             s["far"].fill_(float(STREAK) if self._beyond(s, x, y) else 0.0)
         elif known and s.number("far") == 0:
+            if self._waits(s, x, y, seen, lapse):
+                return
             judge(self.rules, s, (y - center) / spread, seen, s.number("clock"))
         if s.number("far") > 0:
             s["skipped"].add_(1)
             return
+        self._notice(s, y)
+        self._accept(s, x, y, s.number("time"), lapse)
+
+    def _waits(self, s: Views, x: Tensor, y: Tensor, seen: Tensor, lapse: float) -> bool:
+        """Whether a sample that nobody expected waits: if the next one is alike, it is learned as it is."""
+        center, spread = (part[self.shape.dim :] for part in self._units(s))
+        most = self.rules.doubtful * torch.maximum(s["variance"], s["pace"]).sqrt()
+        away = (y - center) / spread - s["mean"]
+        doubtful = bool((seen & (away.abs() > most)).any())
+        if doubtful and s.number("clock") >= self.rules.settled and s.number("trust") == 0:
+            if s.number("waiting") == 0:
+                away = torch.minimum(torch.maximum(away, -most), most)
+                s["limited_y"].copy_((s["mean"] + away) * spread + center)
+                for name, value in (("x", x), ("y", y), ("time", s["time"]), ("lapse", torch.tensor(lapse))):
+                    s[f"waiting_{name}"].copy_(value)
+                self._notice(s, y)
+                s["waiting"].fill_(1.0)
+                return True
+            s["waiting"].zero_()
+            s["trust"].fill_(float(STREAK))
+            when = s.number("waiting_time"), s.number("waiting_lapse")
+            self._accept(s, s["waiting_x"].clone(), s["waiting_y"].clone(), *when)
+            return False
+        if s.number("waiting") == 1:
+            s["waiting"].zero_()
+            when = s.number("waiting_time"), s.number("waiting_lapse")
+            self._accept(s, s["waiting_x"].clone(), s["limited_y"].clone(), *when)
+        s["trust"].sub_(1.0).clamp_(min=0.0)
+        return False
+
+    def _notice(self, s: Views, y: Tensor) -> None:
         torch.minimum(s["low"], y, out=s["low"])
         torch.maximum(s["high"], y, out=s["high"])
         s["last_y"].copy_(y)
+
+    def _accept(self, s: Views, x: Tensor, y: Tensor, time: float, lapse: float) -> None:
         s["clock"].add_(1)
         s["learned"].add_(1)
-        self._keep(s, x, y)
+        self._keep(s, x, y, time)
         if s.number("clock") in self.rules.learned_at:
             self._rescale(s)
         else:

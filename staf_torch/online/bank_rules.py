@@ -66,6 +66,8 @@ class Rules(NamedTuple):
     floor: float = 1e-3  # of the variance, in running squared errors
     margin: float = 0.1  # how far beyond the range of y a member may go
     far: float = 1e3  # spreads from the center beyond which a sample is not believed
+    doubtful: float = math.inf  # deviations beyond which a sample waits for another one such to be believed
+    settled: float = 10.0  # samples before which none waits
     outlying: float = 30.0  # median deviations beyond which a value has no say in the units
     learned_at: tuple[int, ...] = (2, 5, 10, 20, 40)  # samples after which the units are learned
     forgetting: tuple[float, ...] = (0.9, 0.95, 0.97, 0.98, 0.99, 0.995, 0.999, 1.0)  # of the filters
@@ -81,10 +83,11 @@ class Rules(NamedTuple):
     least: float = 1e-16  # of a member's running scale
 
     @classmethod
-    def of(cls, dim: int, scaling: bool) -> Rules:
+    def of(cls, dim: int, scaling: bool, doubtful: float = math.inf) -> Rules:
         """The rules for inputs (n,); widths in units of sqrt(n)."""
         rates = tuple(1 / (2 * width**2 * dim) for width in (0.5, 1.5, 15.0))
-        return cls(rates, scaling, CARRIED_RADIUS * CARRIED_WIDTH * math.sqrt(dim))
+        slack = CARRIED_RADIUS * CARRIED_WIDTH * math.sqrt(dim)
+        return cls(rates, scaling, slack, doubtful=doubtful)
 
     def numbers(self) -> list[float]:
         """In the order of `Rules` in _bank.cpp."""
@@ -98,7 +101,7 @@ class Rules(NamedTuple):
         found += [*self.forgetting, self.carried_ratio, self.carried_slack**2]
         found += [*self.quadratic_forgetting, *self.quadratic_prior, self.pace, self.correction_prior]
         found += [self.correction_forgetting, self.correction_most, self.correction_discount]
-        return [*found, self.correction_share, self.least, self.doubt]
+        return [*found, self.correction_share, self.least, self.doubt, self.doubtful, self.settled]
 
 
 def layout(shape: BankShape) -> list[tuple[str, tuple[int, ...]]]:
@@ -111,6 +114,10 @@ def layout(shape: BankShape) -> list[tuple[str, tuple[int, ...]]]:
         ("last_y", (k,)),
         ("asked", (n,)),
         ("answered", ()),
+        *((name, ()) for name in ("waiting", "trust", "waiting_time", "waiting_lapse")),
+        ("waiting_x", (n,)),  # a sample that nobody expected, until the next one tells
+        ("waiting_y", (k,)),
+        ("limited_y", (k,)),  # what is learned of it if it was alone
         ("center", (n + k,)),
         ("spread", (n + k,)),
         ("covariance", (n + 1, n + 1)),

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import copy
+import math
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from ..kernels import Kernel
-from ..numerics.checks import fail, flag, integer
+from ..numerics.checks import fail, flag, integer, positive_real
 from .bank import Bank
 from .bank_rules import RECENT, BankShape
 from .filter_arguments import KERNELS as KERNELS
@@ -35,7 +36,7 @@ class StaFRegressor(StreamEstimator):
     With ``memory``, the accurate mode (`Bank`): so many samples are kept, the centers are taken from them
     where the state comes back, and local Gaussian processes, filters, quadratic models are mixed by how
     well they predict. Nothing needs to be tuned; about a tenth of a millisecond a sample. The filter's
-    arguments, from ``kernel`` to ``robust``, are not used then.
+    arguments, from ``kernel`` to ``follow``, are not used then.
 
     No stream influences another. A coordinate of x that is NaN was not measured and is held; a target that is
     NaN is not learned. Any finite number is survived: a stream that jumps starts afresh there.
@@ -63,7 +64,8 @@ class StaFRegressor(StreamEstimator):
         forgetting: in (0, 1]: the share of what was learned that is still believed one unit of time later.
         follow: the centers stay until x has moved by follow * radius, not negative: by default until it
             leaves their ball.
-        robust: standard deviations beyond which an error counts no more than there (Huber); None for any.
+        robust: standard deviations beyond which an error counts no more than there (Huber); None for any. In
+            the accurate mode a sample beyond waits for the next, and counts in full if that is as far off.
         scaling: whether x and y are brought to mean 0 and variance 1, learned from the first 40 samples; None
             does so in the accurate mode. Then radius, noise and amplitude are in these units.
         memory: samples kept, at least 128, for the accurate mode; None for the filter alone.
@@ -278,7 +280,8 @@ class StaFRegressor(StreamEstimator):
             memory = integer(_NAME, "memory", self.memory, least=2 * RECENT)
             neighbours = integer(_NAME, "neighbours", self.neighbours, least=8)
             shape = BankShape(dim, outputs, memory, min(neighbours, memory))
-            self._streams_ = Bank(shape, count, scaling is not False)
+            robust = math.inf if self.robust is None else positive_real(_NAME, "robust", self.robust)
+            self._streams_ = Bank(shape, count, scaling is not False, robust)
         else:
             like = torch.zeros(0, dtype=dtype, device=x.device)
             self._streams_, self.centers_offsets_ = filter_streams(

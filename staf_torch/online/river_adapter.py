@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import math
+import sys
 from collections.abc import Mapping
 from typing import Any
 
@@ -15,8 +17,8 @@ class RiverRegressor:
     """`learn_one` and `predict_one` around a `StaFRegressor`, for river's pipelines and metrics.
 
     Features are taken by the names of the first sample, in its order; one that is missing later was not
-    measured. Nothing of river is imported: where it is installed, its `compose.Pipeline` takes this as a
-    regressor.
+    measured. Nothing of river is imported: where it is, its `compose.Pipeline` and its metrics take this
+    as a regressor.
 
     Example:
         >>> model = RiverRegressor(StaFRegressor(memory=500))
@@ -33,8 +35,16 @@ class RiverRegressor:
     _supervised = True
 
     def __init__(self, model: StaFRegressor | None = None) -> None:
+        river = sys.modules.get("river.base")
+        if river is not None:
+            river.Regressor.register(type(self))  # for metrics, which ask what they are given
         self.model = StaFRegressor(memory=500) if model is None else model
         self.features: tuple[Any, ...] = ()
+
+    def clone(self, new_params: Mapping[str, Any] | None = None, **kwargs: Any) -> RiverRegressor:
+        """An adapter of the same settings that has learned nothing."""
+        settings = {"model": copy.copy(self.model).reset()} | dict(new_params or {})
+        return RiverRegressor(**settings)
 
     def learn_one(self, x: Mapping[Any, float], y: float, **kwargs: Any) -> RiverRegressor:
         """Learn one sample."""

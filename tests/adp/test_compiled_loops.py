@@ -85,6 +85,7 @@ CASES: dict[str, Callable[[], tuple[adp.Controller, systems.ControlAffineSystem,
     "information, bounded": lambda: learned(adp.Information(bound=2.0)),
     "published": lambda: learned(adp.Published()),
     "frozen": lambda: learned(adp.Frozen()),
+    "policy iteration": lambda: learned(adp.PolicyIteration(), adp.QuadraturePoints(2, 2, BOX)),
     "three fixed points": lambda: learned(adp.Information(), adp.RandomPoints(3, BOX, "fixed")),
     "partial gradient, quadrature": lambda: of_basis(staf_basis("partial"), adp.QuadraturePoints(2, 2, BOX)),
     "a kernel without closed form": lambda: of_basis(

@@ -31,10 +31,11 @@ def definition_of(bank: Bank) -> Bank:
 @pytest.mark.parametrize("outputs", [1, 2])
 def test_compiled_bank_is_what_the_definition_says(outputs: int) -> None:
     shape = BankShape(2, outputs, 80, 10)
-    fast, slow = Bank(shape, 2, True), definition_of(Bank(shape, 2, True))
+    fast, slow = Bank(shape, 2, True, 8.0), definition_of(Bank(shape, 2, True, 8.0))
     x, y = streams(125, 2, outputs)
     x[50, 0, 1], y[60, 1, 0], x[70, 1, 0] = torch.nan, torch.nan, torch.inf
     y[80, 0], x[90, 1] = 1e300, 1e12
+    y[85, 0], y[95:97, 0] = 30.0, -20.0  # an outlier, and two that are learned
     x[105:, 1] += 1e9  # gone for good: it starts afresh
     for k in range(125):
         lapse = None if k % 3 else torch.tensor([0.5, 2.0], dtype=torch.float64)
@@ -103,6 +104,15 @@ def test_saved_state_goes_on_bit_for_bit(memory: int | None, tmp_path: object) -
         whole.partial_fit(x[k], y[k])
         again.partial_fit(x[k], y[k])
     assert torch.equal(whole.predict(x[0]), again.predict(x[0]))
+
+
+@pytest.mark.parametrize("memory", [None, 128])
+def test_state_of_other_sizes_is_refused(memory: int | None) -> None:
+    x, y = streams(5, 2)
+    state = st.StaFRegressor(memory=memory, neighbours=8).fit(x, y[..., 0]).state_dict()
+    other = st.StaFRegressor(count=10, memory=memory and 200, neighbours=8)
+    with pytest.raises(ValueError, match=r"load_state_dict.*numbers a stream"):
+        other.load_state_dict(state)
 
 
 @pytest.mark.parametrize("memory", [None, 128])

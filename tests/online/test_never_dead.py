@@ -113,12 +113,23 @@ def test_coordinate_that_was_not_measured_is_held_and_a_target_is_not_learned(me
     assert error_after(model, x, y) < 0.2
 
 
-def test_outliers_count_less_where_asked() -> None:
+@pytest.mark.parametrize("memory", [None, 128])
+def test_outliers_count_less_where_asked(memory: int | None) -> None:
     x, y = path(400)
     draw = torch.Generator().manual_seed(0)
     noisy = y + 0.05 * torch.randn(400, generator=draw, dtype=torch.float64)
     noisy[20::25] += 20.0
-    plain = st.StaFRegressor(radius=0.4, noise=0.05).fit(x, noisy)
-    robust = st.StaFRegressor(radius=0.4, noise=0.05, robust=2.0).fit(x, noisy)
-    late = [float((m.predict(x[-4:]) - y[-4:]).abs().max()) for m in (plain, robust)]
+    kept = {"radius": 0.4, "noise": 0.05, "memory": memory, "neighbours": 8}
+    models = [st.StaFRegressor(robust=robust, **kept) for robust in (None, 4.0)]
+    errors = [error_after(model.fit(x[:1], noisy[:1]), x[1:], noisy[1:]) for model in models]
+    late = [float((model.predict(x[-4:]) - y[-4:]).abs().max()) for model in models]
     assert late[1] < 0.5 * late[0]
+    assert errors[1] < 1.05 * errors[0]  # outliers themselves included
+
+
+def test_change_that_stays_is_learned_at_once_by_a_robust_bank() -> None:
+    x, y = path(300)
+    changed = torch.where(torch.arange(300) < 150, y, y + 30)
+    model = st.StaFRegressor(memory=128, neighbours=8, robust=5.0).fit(x[:180], changed[:180])
+    assert int(model.n_samples_seen_) == 180
+    assert abs(float(model.predict(x[180]) - changed[180])) < 1.0

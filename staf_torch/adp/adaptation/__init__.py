@@ -18,6 +18,8 @@ from .parametric import LinearFamily as LinearFamily
 from .parametric import ParametricPlant as ParametricPlant
 from .redesign import Doubling as Doubling
 from .redesign import riccati_rows as riccati_rows
+from .robust_filter import Guarded as Guarded
+from .robust_filter import RobustFilter as RobustFilter
 from .tracker import ConcurrentTracker as ConcurrentTracker
 from .tracker import Tracking as Tracking
 from .windows import Equation as Equation

@@ -1,0 +1,200 @@
+"""A safety filter for a plant whose parameters are not known: safe for all that they may still be."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ...numerics.checks import fail, positive_real, vector
+from ..controllers import Controller, ControllerState
+from ..halfspaces import nearest_admissible
+from ..safety_filter import Constraint, SafetyFilter
+from .carried import leaves, pack, unpack
+from .least_squares import Estimate, LeastSquares
+from .measured import ChangingPlant
+from .parametric import ParametricPlant
+from .windows import IntegralWindows, Window
+
+_PASSES = 2  # linearisations of the conditions in u
+
+
+class Guarded(NamedTuple):
+    """What a `RobustFilter` carries, a row a trajectory.
+
+    Example:
+        >>> adp.Guarded._fields
+        ('estimate', 'window', 'time', 'least', 'slack', 'acted')
+
+        Shown by `tests/benchmarks/unknown_friction.py`.
+    """
+
+    estimate: Estimate
+    window: Window
+    time: Tensor  # (...) s
+    least: Tensor  # (...) smallest h so far
+    slack: Tensor  # (...) largest shortfall of a condition so far
+    acted: Tensor  # (...) steps in which the control was another than the wanted one
+
+
+class RobustFilter(Controller):
+    """The control nearest to the wanted one that keeps h(x, t) >= 0 for every theta that is still possible:
+
+        max(low, theta^ - c s) <= theta <= min(high, theta^ + c s),
+
+    with s the standard deviations of the estimate and ``low``, ``high`` what was known before. The condition
+    of `SafetyFilter` is asked at the corners of that box and the largest demand counts; it is affine in theta
+    up to the length of a hold where inputs act in a known way. As the estimate sharpens, the filter lets go.
+
+    Example:
+        >>> def regressor(x, u):  # a trolley with unknown friction
+        ...     return torch.stack((torch.zeros_like(x[..., :1]), -x[..., 1:]), dim=-2)
+        >>> def known(x, u):
+        ...     return torch.cat((x[..., 1:], u), dim=-1)
+        >>> plant = adp.ParametricPlant(regressor, known, dim=2, inputs=1, theta=[0.5], rows=[1])
+        >>> def wall(x, t):
+        ...     return x[:, 0] + 0.1
+        >>> wanted = adp.Feedback(adp.LQR(plant, adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)))
+        >>> windows, law = adp.IntegralWindows(plant, 0.1), adp.LeastSquares([1.5], deviation=1.0)
+        >>> box = {"theta_low": [0.0], "theta_high": [3.0]}
+        >>> safe = adp.RobustFilter(wanted, plant, wall, windows, law, dt=0.02, **box)
+        >>> cost, x0 = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1), torch.tensor([[1.0, -2.0]]).double()
+        >>> run = adp.simulate(safe, plant, cost, x0, steps=100)
+        >>> now = safe.guarded(run.identifier)
+        >>> bool(now.least[0, -1] > 0), now.estimate.theta[0, -1].round(decimals=2)
+        (True, tensor([0.5000], dtype=torch.float64))
+
+        Shown by `tests/benchmarks/unknown_friction.py`.
+
+    Args:
+        controller: of the wanted control.
+        plant: its theta is not used.
+        constraints: h(x, t), as in `SafetyFilter`.
+        windows: of the integrals.
+        law: of theta.
+        dt: s, for which a control is held.
+        theta_low: p numbers, below which no parameter is.
+        theta_high: likewise.
+        confidence: c, positive.
+        decay: as in `SafetyFilter`, and so are ``degree`` and ``margin``.
+
+    Raises:
+        ValueError: if an argument breaks its rule.
+    """
+
+    def __init__(
+        self,
+        controller: Controller,
+        plant: ParametricPlant,
+        constraints: Constraint | Sequence[Constraint],
+        windows: IntegralWindows,
+        law: LeastSquares,
+        *,
+        dt: float,
+        theta_low: Sequence[float],
+        theta_high: Sequence[float],
+        confidence: float = 4.0,
+        decay: float | Sequence[float] = 2.0,
+        degree: int | Sequence[int] = 2,
+        margin: float | Sequence[float] = 0.0,
+    ) -> None:
+        super().__init__()
+        p, n = plant.parameters_count, plant._size()
+        self.low = torch.tensor(vector("RobustFilter", "theta_low", theta_low), dtype=torch.float64)
+        self.high = torch.tensor(vector("RobustFilter", "theta_high", theta_high), dtype=torch.float64)
+        if self.low.shape != (p,) or self.high.shape != (p,) or not bool((self.low <= self.high).all()):
+            rule = f"must be {p} numbers, none above that of theta_high"
+            raise fail("RobustFilter", "theta_low", rule, theta_low)
+        self.confidence = positive_real("RobustFilter", "confidence", confidence)
+        self.controller, self.plant, self.windows, self.law = controller, plant, windows, law
+        several = [constraints] if callable(constraints) else list(constraints)
+        self.filter = SafetyFilter(
+            lambda z: z[..., : plant.inputs] * 0,  # only its conditions are asked
+            ChangingPlant(plant),
+            [_of_leading(h, n) for h in several],
+            dt=dt,
+            decay=decay,
+            degree=degree,
+            margin=margin,
+        )
+        self.period, self.draws = dt, controller.draws
+        self._like = self._start(torch.zeros(1, n, dtype=torch.float64))
+        self._size = sum(leaf[0].numel() for leaf in leaves(self._like))
+
+    def init(self, x0: Tensor) -> ControllerState:
+        inner = self.controller.init(x0)
+        return inner._replace(identifier=torch.cat((pack(self._start(x0), 1), inner.identifier), dim=-1))
+
+    def guarded(self, identifier: Tensor) -> Guarded:
+        """What the rows of `LoopResult.identifier` say, (..., K)."""
+        found: Guarded = unpack(self._like, identifier[..., : self._size], 1)
+        return found
+
+    def step(
+        self, x: Tensor, carried: ControllerState, uniform: Tensor, dt: float
+    ) -> tuple[Tensor, ControllerState]:
+        now, rest = self.guarded(carried.identifier), carried.identifier[..., self._size :]
+        wanted, after = self.controller.step(x, carried._replace(identifier=rest), uniform, dt)
+        window, equation = self.windows.step(now.window, x, dt)
+        estimate = self.law.step(now.estimate, equation, dt)
+        u, h, slack = self._restrained(x, wanted, now.time, estimate)
+        if self.plant.bounds is not None:
+            u = self.plant.bounds.clip(u)
+        acted = (u != wanted).any(-1).to(x)
+        kept = Guarded(
+            estimate,
+            self.windows.holding(window, u),
+            now.time + dt,
+            torch.minimum(now.least, h),
+            torch.maximum(now.slack, slack),
+            now.acted + acted,
+        )
+        packed = torch.cat((pack(kept, x.dim() - 1), after.identifier), dim=-1)
+        return u, after._replace(identifier=packed)
+
+    def _restrained(
+        self, x: Tensor, wanted: Tensor, time: Tensor, estimate: Estimate
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """u, the least h and the shortfall."""
+        filter = self.filter
+        spread = self.confidence * estimate.covariance.diagonal(dim1=-2, dim2=-1).sqrt()
+        low = torch.maximum(self.low.to(x), estimate.theta - spread)
+        high = torch.minimum(self.high.to(x), estimate.theta + spread)
+        corners = [
+            torch.stack([(low, high)[side][..., k] for k, side in enumerate(sides)], dim=-1)
+            for sides in itertools.product((0, 1), repeat=low.shape[-1])
+        ]
+        clock = torch.full_like(x[..., :1], 2.0)  # the plant of the filter has not changed yet
+        states = [torch.cat((x, theta, theta, clock), dim=-1) for theta in corners]
+        unit, bounds = filter.unit.to(x), filter.bounds
+        least_u, most_u = bounds.low.to(x) / unit, bounds.high.to(x) / unit
+        u, met, slack, margin = wanted, None, torch.zeros_like(time), torch.zeros_like(time)
+        for _ in range(_PASSES):
+            found = [filter.inequalities(z, u, time) for z in states]
+            normal = sum(part[0] for part in found) / len(found)
+            # The demand of every corner, taken over to the mean normal at this u.
+            demands = [part[1] + ((normal - part[0]) * u.unsqueeze(-2)).sum(-1) for part in found]
+            demand = torch.stack(demands, dim=-1).amax(-1)
+            if met is None:
+                met = ((normal * u.unsqueeze(-2)).sum(-1) >= demand).all(-1)
+                margin = found[0][2].amin(-1)
+            nearest = nearest_admissible(wanted / unit, normal * unit, demand, least_u, most_u, filter.table)
+            u, slack = nearest.point * unit, nearest.shortfall
+        assert met is not None
+        return torch.where(met.unsqueeze(-1), wanted, u), margin, torch.where(met, 0.0, slack)
+
+    def _start(self, x: Tensor) -> Guarded:
+        zero = x.new_zeros(len(x))
+        estimate, window = self.law.init(x), self.windows.init(x)
+        return Guarded(estimate, window, zero, torch.full_like(zero, _FAR), zero.clone(), zero.clone())
+
+
+_FAR = 1e300  # h before anything was seen: finite, as what is carried must be
+
+
+def _of_leading(h: Constraint, count: int) -> Callable[[Tensor, Tensor], Tensor]:
+    """h of the first states alone."""
+    return lambda z, t: h(z[:, :count], t)

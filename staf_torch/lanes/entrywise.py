@@ -1,0 +1,250 @@
+"""Operations entry by entry: arithmetic, functions, comparisons, choices, copies."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from .graph import FLAG, REAL, Ids
+from .rules import RULES, common, numbers, rule
+from .tracer import NotLoweredError, Tracer
+
+_LARGEST_POWER = 64
+
+
+def _entrywise(name: str, op: str | None = None) -> None:
+    def rule(t: Tracer, out: Tensor, *args: Any) -> Ids:
+        return t.map(op or name, *numbers(t, t.kind(out.dtype), *args))
+
+    RULES[name] = rule
+
+
+for _name in ("neg", "abs", "sqrt", "exp", "expm1", "log", "log1p", "sin", "cos", "tan", "tanh", "atan2"):
+    _entrywise(_name)
+for _name in (
+    "asin",
+    "acos",
+    "atan",
+    "sinh",
+    "cosh",
+    "log2",
+    "log10",
+    "exp2",
+    "erf",
+    "floor",
+    "ceil",
+    "trunc",
+):
+    _entrywise(_name)
+for _name, _op in (("maximum", "max"), ("minimum", "min"), ("mul", "mul")):
+    _entrywise(_name, _op)
+
+
+@rule("add", "sub", "rsub")
+def _sum_of_two(t: Tracer, out: Tensor, a: Any, b: Any, alpha: Any = 1, _name: str = "add") -> Ids:
+    kind = t.kind(out.dtype)
+    left, right = numbers(t, kind, a, b)
+    if alpha != 1:
+        right = t.map("mul", right, t.nodes(alpha, kind))
+    return t.map(_name, left, right)
+
+
+RULES["sub"] = functools.partial(_sum_of_two, _name="sub")
+RULES["rsub"] = lambda t, out, a, b, alpha=1: _sum_of_two(t, out, b, _times(t, out, a, alpha), _name="sub")
+
+
+def _times(t: Tracer, out: Tensor, a: Tensor, alpha: Any) -> Tensor:
+    if alpha != 1:
+        raise NotLoweredError("`aten.rsub` with alpha has no scalar form here")
+    return a
+
+
+@rule("div")
+def _div(t: Tracer, out: Tensor, a: Any, b: Any, rounding_mode: str | None = None) -> Ids:
+    kind = t.kind(out.dtype) if out.dtype.is_floating_point else REAL
+    quotient = t.map("div", *numbers(t, kind, a, b))
+    if rounding_mode is not None:
+        quotient = t.map(rounding_mode, quotient)
+    return t.cast(quotient, t.kind(out.dtype))
+
+
+@rule("reciprocal")
+def _reciprocal(t: Tracer, out: Tensor, a: Tensor) -> Ids:
+    kind = t.kind(out.dtype)
+    return t.map("div", t.nodes(1.0, kind), t.nodes(a, kind))
+
+
+@rule("rsqrt")
+def _rsqrt(t: Tracer, out: Tensor, a: Tensor) -> Ids:
+    return t.map("div", t.nodes(1.0, t.kind(out.dtype)), t.map("sqrt", t.nodes(a, t.kind(out.dtype))))
+
+
+@rule("sigmoid")
+def _sigmoid(t: Tracer, out: Tensor, a: Tensor) -> Ids:
+    kind = t.kind(out.dtype)
+    one = t.nodes(1.0, kind)
+    return t.map("div", one, t.map("add", one, t.map("exp", t.map("neg", t.nodes(a, kind)))))
+
+
+@rule("round")
+def _round(t: Tracer, out: Tensor, a: Tensor, decimals: int = 0) -> Ids:
+    if decimals:
+        raise NotLoweredError("`aten.round` to decimals has no scalar form here")
+    return t.map("round", t.nodes(a))
+
+
+@rule("frac")
+def _frac(t: Tracer, out: Tensor, a: Tensor) -> Ids:
+    return t.map("sub", t.nodes(a), t.map("trunc", t.nodes(a)))
+
+
+@rule("remainder", "fmod")
+def _remainder(t: Tracer, out: Tensor, a: Any, b: Any) -> Ids:
+    raise NotLoweredError("a remainder has no scalar form here")
+
+
+@rule("sign", "sgn")
+def _sign(t: Tracer, out: Tensor, a: Tensor) -> Ids:
+    x, kind = t.nodes(a), t.kind(a.dtype)
+    zero = t.nodes(0.0, kind)
+    up, down = (t.cast(flag, kind) for flag in (t.map("lt", zero, x), t.map("lt", x, zero)))
+    return t.map("sub", up, down)
+
+
+@rule("pow")
+def _pow(t: Tracer, out: Tensor, a: Any, power: Any) -> Ids:
+    kind = t.kind(out.dtype)
+    base = t.nodes(a, kind)
+    stated = isinstance(power, Tensor) and not t.traced(power) and t.stated(power)
+    exponents = power.tolist() if stated else power
+    if isinstance(exponents, int | float):
+        return _power(t, kind, base, exponents)
+    if stated and power.dim() > 0:
+        flat = np.broadcast_to(base, out.shape).reshape(-1)
+        each = power.expand(out.shape).reshape(-1).tolist()
+        return np.array([_power(t, kind, np.asarray(n), e) for n, e in zip(flat, each, strict=True)]).reshape(
+            out.shape
+        )
+    return t.map("pow", base, t.nodes(power, kind))
+
+
+def _power(t: Tracer, kind: str, base: Ids, exponent: float) -> Ids:
+    if exponent == 0.5:
+        return t.map("sqrt", base)
+    if exponent != int(exponent) or abs(exponent) > _LARGEST_POWER:
+        return t.map("pow", base, t.nodes(float(exponent), kind))
+    if exponent < 0:
+        return t.map("div", t.nodes(1.0, kind), _power(t, kind, base, -exponent))
+    if exponent == 0:
+        return np.broadcast_to(t.nodes(1.0, kind), np.shape(base))
+    half = _power(t, kind, base, int(exponent) // 2) if exponent > 1 else None
+    square = None if half is None else t.map("mul", half, half)
+    return base if square is None else t.map("mul", square, base) if exponent % 2 else square
+
+
+@rule("clamp")
+def _clamp(t: Tracer, out: Tensor, a: Tensor, low: Any = None, high: Any = None) -> Ids:
+    kind = t.kind(out.dtype)
+    x = t.nodes(a, kind)
+    x = x if low is None else t.map("max", x, t.nodes(low, kind))
+    return x if high is None else t.map("min", x, t.nodes(high, kind))
+
+
+RULES["clamp_min"] = lambda t, out, a, low: _clamp(t, out, a, low)
+RULES["clamp_max"] = lambda t, out, a, high: _clamp(t, out, a, None, high)
+
+
+@rule("addcmul")
+def _addcmul(t: Tracer, out: Tensor, a: Tensor, b: Tensor, c: Tensor, value: float = 1) -> Ids:
+    x, y, z, factor = numbers(t, t.kind(out.dtype), a, b, c, value)
+    return t.map("add", x, t.map("mul", factor, t.map("mul", y, z)))
+
+
+@rule("addcdiv")
+def _addcdiv(t: Tracer, out: Tensor, a: Tensor, b: Tensor, c: Tensor, value: float = 1) -> Ids:
+    x, y, z, factor = numbers(t, t.kind(out.dtype), a, b, c, value)
+    return t.map("add", x, t.map("mul", factor, t.map("div", y, z)))
+
+
+@rule("lerp")
+def _lerp(t: Tracer, out: Tensor, a: Tensor, b: Tensor, weight: Any) -> Ids:
+    x, y, w = numbers(t, t.kind(out.dtype), a, b, weight)
+    return t.map("add", x, t.map("mul", w, t.map("sub", y, x)))
+
+
+def _comparison(name: str, op: str, swapped: bool) -> None:
+    def rule(t: Tracer, out: Tensor, a: Any, b: Any) -> Ids:
+        kind = common(t, a, b)
+        left, right = numbers(t, REAL if kind == FLAG else kind, a, b)
+        return t.map(op, right, left) if swapped else t.map(op, left, right)
+
+    RULES[name] = rule
+
+
+for _name, _op, _swap in (("lt", "lt", False), ("gt", "lt", True), ("le", "le", False), ("ge", "le", True)):
+    _comparison(_name, _op, _swap)
+for _name in ("eq", "ne"):
+    _comparison(_name, _name, False)
+
+
+def _logic(op: str, *names: str) -> None:
+    def rule(t: Tracer, out: Tensor, *args: Any) -> Ids:
+        if out.dtype != torch.bool:
+            raise NotLoweredError("logic on the bits of integers has no scalar form here")
+        return t.map(op, *numbers(t, FLAG, *args))
+
+    RULES.update(dict.fromkeys(names, rule))
+
+
+_logic("and", "logical_and", "bitwise_and", "__and__")
+_logic("or", "logical_or", "bitwise_or", "__or__")
+_logic("xor", "logical_xor", "bitwise_xor", "__xor__")
+_logic("not", "logical_not", "bitwise_not")
+_multiply = RULES["mul"]
+RULES["mul"] = lambda t, out, a, b: (
+    t.map("and", *numbers(t, FLAG, a, b)) if out.dtype == torch.bool else _multiply(t, out, a, b)
+)
+
+
+@rule("isnan")
+def _isnan(t: Tracer, out: Tensor, a: Tensor) -> Ids:
+    return t.map("ne", t.nodes(a), t.nodes(a))
+
+
+@rule("where")
+def _where(t: Tracer, out: Tensor, chosen: Tensor, a: Any, b: Any) -> Ids:
+    kind = t.kind(out.dtype)
+    return t.map("where", t.nodes(chosen, FLAG), t.nodes(a, kind), t.nodes(b, kind))
+
+
+@rule("masked_fill")
+def _masked_fill(t: Tracer, out: Tensor, a: Tensor, mask: Tensor, value: Any) -> Ids:
+    kind = t.kind(out.dtype)
+    return t.map("where", t.nodes(mask, FLAG), t.nodes(value, kind), t.nodes(a, kind))
+
+
+@rule("_to_copy", "clone", "copy", "lift_fresh_copy", "contiguous", "detach_copy")
+def _copied(t: Tracer, out: Tensor, a: Any, *source: Any, **_: Any) -> Ids:
+    given = source[0] if source and isinstance(source[0], Tensor) else a
+    return np.broadcast_to(t.nodes(given, t.kind(out.dtype)), out.shape)
+
+
+@rule("zeros_like", "new_zeros", "zero", "_new_zeros_with_same_feature_meta")
+def zeros(t: Tracer, out: Tensor, *_: Any, **__: Any) -> Ids:
+    """The nodes of as many zeros as torch returned."""
+    return np.full(out.shape, t.graph.constant(0.0, t.kind(out.dtype)), dtype=np.int64)
+
+
+@rule("ones_like", "new_ones")
+def _ones(t: Tracer, out: Tensor, *_: Any, **__: Any) -> Ids:
+    return np.full(out.shape, t.graph.constant(1.0, t.kind(out.dtype)), dtype=np.int64)
+
+
+@rule("full_like", "new_full", "fill", "empty_like", "new_empty", "new_empty_strided")
+def _full(t: Tracer, out: Tensor, *args: Any, **_: Any) -> Ids:
+    value = args[-1] if len(args) > 1 and not isinstance(args[-1], list | tuple) else 0.0
+    return np.broadcast_to(t.nodes(value, t.kind(out.dtype)), out.shape)

@@ -1,0 +1,121 @@
+"""Operations that move entries: torch itself moves the numbers of nodes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from .graph import WHOLE, Ids
+from .tracer import NotLoweredError, Tracer
+
+MOVEMENTS = frozenset(
+    (
+        "cat",
+        "stack",
+        "index",
+        "index_select",
+        "gather",
+        "flip",
+        "roll",
+        "repeat",
+        "select_scatter",
+        "slice_scatter",
+        "index_put",
+        "scatter",
+        "constant_pad_nd",
+        "diag_embed",
+        "tril",
+        "triu",
+        "_unsafe_view",
+        "view_copy",
+        "expand_copy",
+        "unfold_copy",
+        "diagonal_scatter",
+        "as_strided_scatter",
+        "select_backward",
+        "slice_backward",
+        "diagonal_backward",
+        "index_copy",
+        "take",
+        "take_along_dim",
+    )
+)
+
+
+def moved(t: Tracer, func: Any, out: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> Any:
+    """The nodes of what an operation of `MOVEMENTS` returns; arguments as of `lowering.lower`."""
+    name = func._schema.name.removeprefix("aten::")
+    at = 2 if name in ("gather", "scatter") else 1 if name.startswith("index") else None
+    if name == "index_put" and (kwargs.get("accumulate") or (len(args) > 3 and args[3])):
+        raise NotLoweredError(f"`{func}` has no scalar form here")
+    if at is not None and any(
+        isinstance(i, Tensor) and (t.traced(i) or not t.stated(i)) for i in _listed(args[at])
+    ):
+        return _indexed(t, name, out, *args, **kwargs)
+    kind = t.kind(out.dtype)
+    zero = t.graph.constant(0.0, kind)
+
+    def numbers(value: Any, fixed: bool) -> Any:
+        if isinstance(value, list | tuple):
+            return type(value)(numbers(part, fixed) for part in value)
+        if isinstance(value, Tensor) and not fixed:
+            nodes = t.nodes(value, kind) - zero  # what torch fills with 0 is then the node of 0
+            return torch.from_numpy(np.ascontiguousarray(nodes))
+        return value
+
+    values = [numbers(a, position == at) for position, a in enumerate(args)]
+    fill = 4 if name == "scatter" else 2 if name == "constant_pad_nd" else 3
+    if (
+        name in ("scatter", "constant_pad_nd")
+        and len(args) > fill - 1
+        and not isinstance(args[-1], Tensor | list)
+    ):
+        values[-1] = t.graph.constant(args[-1], kind) - zero
+    result = func(*values, **{k: numbers(v, False) for k, v in kwargs.items()})
+    return result.numpy() + zero
+
+
+def _listed(value: Any) -> Sequence[Any]:
+    return value if isinstance(value, list | tuple) else [value]
+
+
+def _indexed(
+    t: Tracer, name: str, out: Tensor, a: Tensor, dim: Any, index: Any = None, *rest: Any, **_: Any
+) -> Ids:
+    """gather, scatter and selection at an index that a row computes, or that numbers of the table do."""
+    kind = t.kind(out.dtype)
+    if name == "index" and sum(i is not None for i in dim) == 1:
+        axis = next(k for k, i in enumerate(dim) if i is not None)
+        name, dim, index = "index_select", axis, dim[axis]
+    if name == "index_select" and index.dtype != torch.bool:
+        entries = np.moveaxis(t.nodes(a, kind), dim, -1)
+        chosen = _chosen(t, entries[(..., *[None] * index.dim(), slice(None))], t.nodes(index, WHOLE))
+        return np.moveaxis(chosen, range(a.dim() - 1, chosen.ndim), range(dim, dim + index.dim()))
+    if name not in ("gather", "scatter"):
+        raise NotLoweredError(f"`aten.{name}` at an index that the row computes has no scalar form here")
+    x = np.moveaxis(t.nodes(a, kind), dim, -1)
+    at = np.moveaxis(t.nodes(index, WHOLE), dim, -1)
+    if name == "gather":
+        x = x[tuple(slice(s) for s in at.shape[:-1])]
+        return np.moveaxis(_chosen(t, x[..., None, :], at), -1, dim)
+    source = t.nodes(rest[0], kind)
+    source = np.broadcast_to(source, at.shape) if source.ndim == 0 else np.moveaxis(source, dim, -1)
+    out_nodes = x.copy()
+    part = out_nodes[tuple(slice(s) for s in at.shape[:-1])]
+    for s in range(at.shape[-1]):
+        for k in range(x.shape[-1]):
+            here = t.map("eq", at[..., s], t.nodes(k, WHOLE))
+            part[..., k] = t.map("where", here, source[..., s], part[..., k])
+    return np.moveaxis(out_nodes, -1, dim)
+
+
+def _chosen(t: Tracer, x: Ids, at: Ids) -> Ids:
+    """Entry ``at`` (...) of the last dimension of arrays (..., K) that broadcast."""
+    found: Ids = np.broadcast_arrays(x[..., 0], at)[0]
+    for k in range(1, x.shape[-1]):
+        found = t.map("where", t.map("eq", at, t.nodes(k, WHOLE)), x[..., k], found)
+    return found

@@ -1,0 +1,139 @@
+"""Processor time of streams, one thread: `python tests/benchmarks/streams_speed.py`.
+
+The filter on ten thousand streams, of which about a seventh (M = 6) and a quarter (M = 28) move their centers
+at a step; one stream, a sample a call from Python, filter and bank; and the filter of M = 6 as a row program
+of `staf_torch.lanes`, all steps in one call, against which the hand-written C++ must defend itself.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+sys.path[:0] = [str(Path(__file__).parents[2])]
+
+import staf_torch as st  # noqa: E402
+from staf_torch import lanes  # noqa: E402
+from staf_torch.online.local_functions import LocalFunctions  # noqa: E402
+
+NOISE, FORGETTING = 0.05, 0.999
+
+
+def path(streams: int, dim: int, steps: int, dtype: torch.dtype) -> list[tuple[Tensor, Tensor]]:
+    phase = 6.28 * torch.rand(streams, dim, generator=torch.Generator().manual_seed(0))
+    rates = torch.linspace(1, 1.7, dim)
+    found = [(0.05 * k * rates + phase).sin().to(dtype) for k in range(steps)]
+    return [(x, x.sum(-1)) for x in found]
+
+
+def regressor(dim: int, count: int) -> st.StaFRegressor:
+    return st.StaFRegressor(st.GaussianKernel(0.9 * dim**0.5), 0.4, count, noise=NOISE, forgetting=FORGETTING)
+
+
+def many(dim: int, count: int, dtype: torch.dtype, streams: int = 10_000, steps: int = 20) -> str:
+    model, samples = regressor(dim, count), path(streams, dim, steps + 20, dtype)
+    spent: list[list[float]] = [[], []]
+    for k, (x, y) in enumerate(samples):
+        start = time.process_time()
+        if k >= 20:
+            model.predict(x)
+            spent[0].append(time.process_time() - start)
+            start = time.process_time()
+        model.partial_fit(x, y)
+        if k >= 20:
+            spent[1].append(time.process_time() - start)
+    predict, learn = (1e6 * sorted(part)[len(part) // 2] / streams for part in spent)
+    name = str(dtype).removeprefix("torch.")
+    return (
+        f"{streams} streams, n = {dim}, M = {count}, {name}: predict {predict:.3f} us, learn {learn:.3f} us"
+    )
+
+
+def single(model: st.StaFRegressor, dim: int, calls: int = 2000) -> str:
+    samples = [(x[0].contiguous(), y[0]) for x, y in path(1, dim, calls + 1100, torch.float64)]
+    for x, y in samples[:1100]:
+        model.partial_fit(x, y)
+    start = time.process_time()
+    for x, y in samples[1100:]:
+        model.predict(x)
+        model.partial_fit(x, y)
+    return f"{1e6 * (time.process_time() - start) / calls:.1f} us to predict and learn"
+
+
+def row_program(dim: int, count: int) -> lanes.Program:
+    """The filter's step as torch code of one row: centers that follow, prediction, Kalman update."""
+    functions = LocalFunctions.of(st.GaussianKernel(0.9 * dim**0.5), 0.4 * st.rings(count))
+    d, newton, q = functions.offsets, functions.shared, functions.rate
+    assert newton is not None
+    assert q is not None
+    gram = functions.kernel.core(torch.zeros_like(d[0]), d, d)
+    squares, reach = d.square().sum(-1), float(d.square().sum(-1).amax().sqrt())
+    eye = torch.eye(count, dtype=torch.float64)
+
+    def step(
+        carry: tuple[Tensor, ...], now: tuple[Tensor, ...], row: object
+    ) -> tuple[tuple[Tensor, ...], Tensor]:
+        anchor, mean, learned = carry
+        x, y = now
+        z = x - anchor
+        moves = (z.square().sum(-1) > 0.16).unsqueeze(-1)
+        h = torch.where(moves, z, 0.0)
+        along, square = q * (h @ d.mT), h.square().sum(-1, keepdim=True)
+        shift = q * (square + 1e-300).sqrt() * reach
+        before, after = (along - shift).exp(), (shift - along - q * square / 2).exp()
+        half = after.unsqueeze(-1) * (gram @ (before.unsqueeze(-1) * newton))
+        transfer = torch.where(moves.unsqueeze(-1), newton.mT @ half, eye)
+        mean = (transfer @ mean.unsqueeze(-1)).squeeze(-1)
+        learned = transfer @ learned @ transfer.mT
+        z = torch.where(moves, 0.0, z)
+        psi = (q / 2 * (squares - (z.unsqueeze(-2) - d).square().sum(-1))).exp() @ newton
+        predicted = (psi * mean).sum(-1)
+        known = FORGETTING * (learned @ psi.unsqueeze(-1)).squeeze(-1)
+        spread = (1 + NOISE**2 - (psi * known).sum(-1)).unsqueeze(-1)
+        gain = psi - known
+        mean = mean + gain * ((y - predicted).unsqueeze(-1) / spread)
+        learned = FORGETTING * learned + gain.unsqueeze(-1) * (gain / spread).unsqueeze(-2)
+        return (torch.where(moves, x, anchor), mean, learned), predicted
+
+    return lanes.Program(step)
+
+
+def as_row_program(dim: int, count: int, streams: int = 10_000, steps: int = 20) -> str:
+    samples = path(streams, dim, steps, torch.float64)
+    x, y = (torch.stack([pair[k] for pair in samples], 1) for k in range(2))
+    start = x[:, 0].clone(), x.new_zeros(streams, count), x.new_zeros(streams, count, count)
+    program = row_program(dim, count)
+    _, found = program(start, (x, y))
+    model, errors = regressor(dim, count), []
+    for k, (point, value) in enumerate(samples):
+        if k:
+            errors.append((model.predict(point) - found[:, k]).abs().max())
+        model.partial_fit(point, value)
+    spent = []
+    for _ in range(5):
+        begin = time.process_time()
+        program(start, (x, y))
+        spent.append(time.process_time() - begin)
+    each = 1e6 * sorted(spent)[2] / streams / steps
+    return f"{each:.3f} us to predict and learn, {float(max(errors)):.1e} from the regressor"
+
+
+def main() -> None:
+    torch.set_num_threads(1)
+    for dtype in (torch.float32, torch.float64):
+        print(many(2, 6, dtype))
+    print(many(6, 28, torch.float32))
+    print(f"one stream, n = 2, M = 6: {single(regressor(2, 6), 2)}")
+    print(f"one stream, n = 6, M = 28: {single(regressor(6, 28), 6)}")
+    for neighbours in (32, 48):
+        model = st.StaFRegressor(memory=1000, neighbours=neighbours)
+        print(f"one stream, bank of {neighbours} neighbours, n = 4: {single(model, 4)}")
+    print(f"M = 6 as a row program, float64: {as_row_program(2, 6)}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,77 @@
+"""scikit-learn's and river's tools around the regressor, where these are installed."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+import staf_torch as st
+from staf_torch.online import RiverRegressor
+
+EXPECTED = {
+    "check_fit2d_predict1d": "a single point (n,) is a prediction of one stream",
+    "check_supervised_y_no_nan": "a target that is not finite is skipped and counted",
+    "check_fit_score_takes_y": "partial_fit of (T, n) means T streams, fit one stream in time",
+}
+
+
+def series(steps: int) -> tuple[np.ndarray, np.ndarray]:
+    time = 0.15 * np.arange(steps)
+    x = np.stack((np.sin(time), 3 + 2 * np.cos(1.3 * time)), 1)
+    return x, np.sin(2 * x[:, 0]) + 0.5 * x[:, 1]
+
+
+@pytest.mark.filterwarnings("ignore:Estimator StaFRegressor does not inherit", "ignore:Skipping check")
+def test_check_estimator_passes_but_for_what_the_manual_names() -> None:
+    checks = pytest.importorskip("sklearn.utils.estimator_checks")
+    model = st.StaFRegressor(memory=128, neighbours=8)
+    found = checks.check_estimator(model, expected_failed_checks=EXPECTED, on_fail=None)
+    assert {check["check_name"] for check in found if check["status"] == "xfail"} == set(EXPECTED)
+    assert [check["check_name"] for check in found if check["status"] == "failed"] == []
+
+
+def test_pipelines_searches_and_several_targets_work() -> None:
+    pytest.importorskip("sklearn")
+    from sklearn.base import clone
+    from sklearn.model_selection import GridSearchCV, TimeSeriesSplit, cross_val_score
+    from sklearn.multioutput import MultiOutputRegressor
+    from sklearn.pipeline import make_pipeline
+    from sklearn.preprocessing import StandardScaler
+
+    x, y = series(120)
+    pipe = make_pipeline(StandardScaler(), st.StaFRegressor(st.GaussianKernel(1.0), noise=0.05))
+    settings = {"stafregressor__kernel__width": [0.05, 1.0], "stafregressor__radius": [0.4]}
+    search = GridSearchCV(pipe, settings, cv=TimeSeriesSplit(3)).fit(x, y)
+    assert search.best_params_["stafregressor__kernel__width"] == 1.0
+    assert search.best_estimator_.score(x[-5:], y[-5:]) > 0.9
+    assert np.isfinite(cross_val_score(clone(pipe), x, y, cv=TimeSeriesSplit(3))).all()
+    several = MultiOutputRegressor(st.StaFRegressor(scaling=True)).fit(x, np.stack((y, -y), 1))
+    found = several.predict(x[-1:])
+    np.testing.assert_allclose(found[:, 0], -found[:, 1], atol=1e-9)
+
+
+def test_river_adapter_takes_features_by_name() -> None:
+    x, y = series(150)
+    errors = []
+    model = RiverRegressor(st.StaFRegressor(memory=128, neighbours=8))
+    assert model.predict_one({"a": 1.0, "b": 2.0}) == 0.0
+    for k, (row, value) in enumerate(zip(x.tolist(), y.tolist(), strict=True)):
+        sample = {"a": row[0], "b": row[1]} if k % 2 else {"b": row[1], "a": row[0]}
+        errors.append(model.predict_one(sample) - value)
+        model.learn_one(sample, value)
+    assert math.isfinite(model.predict_one({"b": 3.0}))  # one that is missing was not measured
+    assert np.sqrt(np.mean(np.square(errors[75:]))) < 0.05 * y.std()
+
+
+def test_river_pipelines_take_the_adapter() -> None:
+    compose = pytest.importorskip("river.compose")
+    from river import evaluate, metrics, preprocessing
+
+    x, y = series(100)
+    samples = [({"a": a, "b": b}, value) for (a, b), value in zip(x.tolist(), y.tolist(), strict=True)]
+    model = compose.Pipeline(
+        preprocessing.StandardScaler(), RiverRegressor(st.StaFRegressor(memory=128, neighbours=8))
+    )
+    assert evaluate.progressive_val_score(samples, model, metrics.MAE()).get() < 0.3 * y.std()
