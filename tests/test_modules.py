@@ -52,6 +52,11 @@ def rates(module: Any, x: Tensor) -> Tensor:
     return torch.stack([module.rate(x, u), module.state_rate(x), module.input_rate(u)])
 
 
+def near(x: Tensor) -> Tensor:
+    """h of a half-plane that the states of `X` are near to."""
+    return x[..., 0] + 0.5
+
+
 def control(module: Any, x: Tensor) -> Tensor:
     uniform = 0.5 * x.new_ones(len(x), max(1, module.draws), x.shape[-1])
     u, carried = module.step(x, module.init(x), uniform, 0.01)
@@ -154,6 +159,9 @@ MODULES: dict[str, Case] = {
         lambda module, x: module(torch.cat([x, x], -1)[..., :3], torch.cat([x, x], -1)[..., :3]),
     ),
     "QuadraticCost": Case(cost, rates),
+    "AvoidanceCost": Case(
+        lambda s: adp.AvoidanceCost(s, 1.0, 2, 1, obstacles=near, reach=1.0, weight=s), rates
+    ),
     "BoundedInputCost": Case(lambda s: adp.BoundedInputCost(s, 1.0, 2, 1, bound=2.0), rates),
     "RandomPoints": Case(lambda s: adp.RandomPoints(2, st.StateRadius(s, 0.1)), points),
     "QuadraturePoints": Case(quadrature, lambda module, x: module(x, x.new_zeros(len(x), 0, 2)).flatten(1)),

@@ -48,6 +48,8 @@ OTHERS = {
     "SampledProblem.of": "in tests/adp/test_trajectory_optimisation.py",
     "GlobalValue": "in tests/adp/test_global_value.py",
     "learn_global_value": "in tests/adp/test_global_value.py",
+    "AvoidanceCost": "in tests/adp/test_avoidance.py",
+    "plan_around": "in tests/adp/test_avoidance.py",
     "SafetyFilter": "in tests/adp/test_safety_filter.py",
     "TwoLinkRobot": "numbers within a list, in tests/systems/test_barrier.py",
     "StepPlant": "in tests/adp/test_user_plants.py",

@@ -228,6 +228,9 @@ PAPER_LAW = "steepest descent"
 
 
 COSTS: dict[str, Callable[[], adp.Cost]] = {
+    "avoidance": lambda: adp.AvoidanceCost(
+        1.0, 1.0, 2, 1, obstacles=lambda x: (x[..., 0] - 3).square() + x[..., 1].square() - 0.25, reach=0.5
+    ),
     "quadratic": lambda: adp.QuadraticCost(1.0, 1.0, 2, 1),
     "bounded_input": lambda: adp.BoundedInputCost(1.0, 0.1, 2, 1, bound=8.0),
 }

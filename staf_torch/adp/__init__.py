@@ -31,6 +31,9 @@ from .adaptation import UnscentedKalman as UnscentedKalman
 from .adaptation import Window as Window
 from .adaptation import measured_rate as measured_rate
 from .adaptation import riccati_rows as riccati_rows
+from .avoidance import AvoidanceCost as AvoidanceCost
+from .avoidance import AvoidancePlans as AvoidancePlans
+from .avoidance import plan_around as plan_around
 from .bases import LeadingCoordinates as LeadingCoordinates
 from .bases import QuadraticBasis as QuadraticBasis
 from .bases import RBFGridBasis as RBFGridBasis
@@ -91,6 +94,8 @@ __all__ = [
     "ActorCriticLaw",
     "Adaptation",
     "AdaptiveLQR",
+    "AvoidanceCost",
+    "AvoidancePlans",
     "Belief",
     "BoundedInputCost",
     "BoxDDP",
@@ -164,6 +169,7 @@ __all__ = [
     "learn_global_value",
     "measured_rate",
     "near_optimal",
+    "plan_around",
     "riccati_rows",
     "simulate",
     "tracking_cost",

@@ -179,10 +179,10 @@ def mass(rows: int, generator: torch.Generator) -> Case:
     x0 = torch.stack((side * (0.5 + drawn[:, 0]), 2 * drawn[:, 1] - 1), dim=-1)
     true = torch.where(torch.arange(rows) % 2 == 0, 2.0, 0.5).double().unsqueeze(-1)  # 1 / mass
     law = LeastSquares([1.0], deviation=1.0, floor=1e-4)
-    windows = IntegralWindows(model, 0.3, shape="smooth", first=0.01, noise=0.01)
+    windows = IntegralWindows(model, 0.3, shape="smooth", first=0.013, noise=0.01)
     # Between the masses that are possible: too much push is dearer than too little, for so short a time.
-    robust = LQR(model.believing(torch.tensor([4 / 3], dtype=torch.float64)), cost)
-    adaptive = AdaptiveLQR(model, cost, windows, law, robust=robust, confidence=2.0, a_step=7)
+    robust = LQR(model.believing(torch.tensor([1.15], dtype=torch.float64)), cost)
+    adaptive = AdaptiveLQR(model, cost, windows, law, robust=robust, confidence=2.0)
 
     def optimum() -> Tensor:
         best = torch.full((rows,), torch.nan, dtype=torch.float64)

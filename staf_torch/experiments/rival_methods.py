@@ -22,7 +22,7 @@ Steer = Callable[[Tensor], Tensor]
 """u (B, m) from x (B, n), called once a period: it may remember its last plan."""
 Begin = Callable[[Tensor], Steer]
 """Steering from the initial states (B, n)."""
-_SAMPLES = 500  # control sequences of MPPI
+_SAMPLES = 200  # control sequences of MPPI
 _TEMPERATURE = 0.01  # of MPPI, times the LQR's value at the initial states
 _NOISE = 0.25  # its standard deviation, of the range of an input: as large as served on two plants
 
@@ -106,7 +106,7 @@ def ipopt(case: Case) -> Begin:
 
 
 def mppi(case: Case) -> Begin:
-    """Model-predictive path integrals: 500 sampled sequences a period."""
+    """Model-predictive path integrals: 200 sampled sequences a period."""
     from pytorch_mppi import MPPI_Batched
 
     problem = case.problem()

@@ -58,7 +58,8 @@ class Episode:
 
 
 def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics:
-    """Run every method on every plant and fill the run directory; `metrics.json` comes last."""
+    """Run every method on every plant and fill the run directory, the table after every plant; `metrics.json`
+    comes last."""
     settings = cfg.rivals
     cases = [CASES[str(choice("rivals", "plants", name, tuple(CASES)))] for name in plain(settings.plants)]
     chosen = [
@@ -68,12 +69,12 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
     calls = integer("rivals", "calls", settings.calls, least=1)
     seed = integer("staf", "seed", cfg.seed, least=0)
     rows: list[dict[str, Any]] = []
+    out = RunDirectory(directory)
     with progress.over(len(cases), "plants") as advance:
         for case in cases:
             rows += compare(case, chosen, case.states(states, seed), calls)
+            out.table("rivals", dataclasses.replace(Table.of(rows, _COLUMNS), style=Style(digits=5)))
             advance(1)
-    out = RunDirectory(directory)
-    out.table("rivals", dataclasses.replace(Table.of(rows, _COLUMNS), style=Style(digits=4)))
     if cfg.figures:
         out.figure("rivals", images(draw_rivals(rows)))
     measured = ("ratio_median", "ratio_max", "regulated", "violations")

@@ -17,6 +17,7 @@ from ..lanes.build import compiled
 from .bank_definition import BankDefinition
 from .bank_rules import CARRIED_RADIUS, CARRIED_WIDTH, BankShape, Rules, size
 from .compiled_filter import FunctionPointers
+from .filter_streams import refuse_other
 from .local_functions import LocalFunctions
 
 _NUMBERS = len(Rules.of(1, True).numbers())
@@ -111,6 +112,7 @@ class Bank:
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Take over what `state_dict` has."""
+        refuse_other(state["table"].shape[1], size(self.shape))
         self.replace(state["table"].clone())
 
     @property

@@ -168,9 +168,17 @@ class FilterStreams:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take over what `state_dict` has."""
+        refuse_other(state["table"].shape[0], self.state.blocks.shape[1])
         kept = self.state.with_table(state["table"], state["counts"].clone())
         self.units, self.clock, self.first = (state[name].clone() for name in ("units", "clock", "first"))
         self._hold(self.definition.with_law(state["ratio"].clone(), state["forgetting"].clone()), kept)
+
+
+def refuse_other(given: int, expected: int) -> None:
+    """Raise where a saved table has another number of numbers a stream."""
+    if given != expected:
+        told = f"must have {expected} numbers a stream, as this version and these arguments have; got {given}"
+        raise ValueError(f"`StaFRegressor.load_state_dict(state=...)` {told}.")
 
 
 def units_of(samples: Tensor) -> tuple[Tensor, Tensor]:

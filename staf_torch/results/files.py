@@ -109,5 +109,5 @@ def _parsed(word: str) -> Value:
             listed = json.loads(word)
         except ValueError:
             return word
-        return listed if isinstance(listed, list) else word
+        return plain(listed) if isinstance(listed, list) else word
     return word

@@ -31,6 +31,7 @@ from .files import (
     flatten,
     parse_overrides,
     partial_name,
+    plain,
 )
 from .files import Value as Value
 from .metric_info import read_infos
@@ -371,7 +372,7 @@ def _setting(key: str, value: Any) -> Value:
         return repr(value)
     if too_deep(value):
         raise UnreadableError(f"the setting {key} is nested too deep")
-    return json.dumps(value) if isinstance(value, dict) else value
+    return json.dumps(value) if isinstance(value, dict) else plain(value)
 
 
 def _text(value: object) -> str | None:

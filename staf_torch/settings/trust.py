@@ -134,6 +134,8 @@ class _Resolved:
             raise self._refuse(key, "grows without end when its references are followed")
         prefix = f"{key}." if key else ""
         if isinstance(value, dict):
+            if any("$" in str(name) for name in value):
+                raise self._refuse(key, "has an interpolation for a name")
             return {name: self._of(inner, f"{prefix}{name}", depth + 1) for name, inner in value.items()}
         if isinstance(value, list):
             return [self._of(inner, f"{prefix}{n}", depth + 1) for n, inner in enumerate(value)]

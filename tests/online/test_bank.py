@@ -107,6 +107,15 @@ def test_saved_state_goes_on_bit_for_bit(memory: int | None, tmp_path: object) -
 
 
 @pytest.mark.parametrize("memory", [None, 128])
+def test_state_of_other_sizes_is_refused(memory: int | None) -> None:
+    x, y = streams(5, 2)
+    state = st.StaFRegressor(memory=memory, neighbours=8).fit(x, y[..., 0]).state_dict()
+    other = st.StaFRegressor(count=10, memory=memory and 200, neighbours=8)
+    with pytest.raises(ValueError, match=r"load_state_dict.*numbers a stream"):
+        other.load_state_dict(state)
+
+
+@pytest.mark.parametrize("memory", [None, 128])
 def test_streams_come_and_go_without_touching_the_others(memory: int | None) -> None:
     x, y = streams(140, 4)
     model = st.StaFRegressor(memory=memory, neighbours=8)

@@ -73,7 +73,7 @@ def another_number(path: Path, chance: random.Random, pattern: str = r"\d+\.\d+"
     """Change one number of a file; return what stood before it."""
     text = path.read_text()
     hit = chance.choice(list(re.finditer(pattern, text)))
-    changed = str(round(float(hit[0]) * chance.uniform(1.1, 3), 4))
+    changed = str(round((float(hit[0]) + 0.01) * chance.uniform(1.1, 3), 4))  # also where it is zero
     path.write_text(text[: hit.start()] + changed + text[hit.end() :])
     return text[: hit.start()].splitlines()[-1]
 

@@ -50,7 +50,7 @@ OBJECT = st.dictionaries(
 )
 
 
-SECONDS = 5.0
+SECONDS, WAIT = 5.0, 60.0  # s of computing, and of waiting, that a case may take
 FORBIDDEN = ("os.system", "os.exec", "os.posix_spawn", "subprocess.Popen", "socket.connect", "ctypes.dlopen")
 WATCHED: list[str] = []  # folders of the cases that are running
 
@@ -74,22 +74,25 @@ sys.addaudithook(_watch)
 
 @contextlib.contextmanager
 def case() -> Iterator[str]:
-    """A folder for one case; what is done in there is watched, and has five seconds."""
+    """A folder for one case; what is done in there is watched, and has five seconds of CPU time."""
 
     def late(*_: object) -> None:
-        SEEN.append(f"more than {SECONDS} s")
+        SEEN.append(f"more than {SECONDS} s of computing, or {WAIT} s")
         raise RuntimeError(SEEN[-1])
 
     with tempfile.TemporaryDirectory() as folder:
-        before = signal.signal(signal.SIGALRM, late)
-        signal.setitimer(signal.ITIMER_REAL, SECONDS)
+        before = {number: signal.signal(number, late) for number in (signal.SIGALRM, signal.SIGPROF)}
+        signal.setitimer(signal.ITIMER_PROF, SECONDS)
+        signal.setitimer(signal.ITIMER_REAL, WAIT)
         WATCHED.append(folder)
         try:
             yield folder
         finally:
             WATCHED.pop()
+            signal.setitimer(signal.ITIMER_PROF, 0)
             signal.setitimer(signal.ITIMER_REAL, 0)
-            signal.signal(signal.SIGALRM, before)
+            for number, handler in before.items():
+                signal.signal(number, handler)
             seen, SEEN[:] = list(SEEN), []
         assert not seen, seen
 

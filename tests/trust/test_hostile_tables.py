@@ -19,7 +19,7 @@ from sweep_runs import write_run
 from staf_torch import read_runs
 from staf_torch.cli.table import main
 from staf_torch.results.reader import collect
-from staf_torch.tables import html_text, latex_text, tabulate
+from staf_torch.tables import html_text, json_text, latex_text, tabulate
 
 MEMORY = 500 * 2**20
 LIMITED = """
@@ -173,3 +173,10 @@ def test_a_notebook_shows_no_picture_from_behind_a_link(tmp_path: Path) -> None:
     shown = read_runs(run)[0]._repr_html_()
     assert base64.b64encode(b"picture").decode() in shown
     assert base64.b64encode(b"secret").decode() not in shown
+
+
+@pytest.mark.parametrize("setting", [[1e999], [1.0, [-1e999]], "[1e999]"])
+def test_a_number_in_a_list_that_is_none_costs_no_table(setting: object, tmp_path: Path) -> None:
+    for number, value in enumerate(([1.0], setting)):
+        write_run(tmp_path / str(number), {"initial_state": value}, {"ball_error": 0.125})
+    assert json_text(tabulate(collect(tmp_path))).count("0.125") == 2
