@@ -52,8 +52,9 @@ INLINE void gather_times(const Slot *slot, REAL *const *data, int slots, const F
                     for (int t = 0; t < f.times; ++t) to[t * f.rows + r] = from[r * slot->row + t * slot->time];
         }
 }
+extern "C" void *aligned_alloc(__SIZE_TYPE__, __SIZE_TYPE__);  // of the C library: clang has no builtin of it
 INLINE REAL *allocate(int64_t numbers) {
-    return static_cast<REAL *>(__builtin_aligned_alloc(64, (numbers * sizeof(REAL) + 127) / 64 * 64));
+    return static_cast<REAL *>(aligned_alloc(64, (numbers * sizeof(REAL) + 127) / 64 * 64));
 }
 
 // A thread's memory stays with it from call to call: fresh pages cost more than a short program.
