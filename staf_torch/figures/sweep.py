@@ -114,14 +114,22 @@ def heat_maps(found: Collection) -> list[HeatMap]:
 
 
 def cost_against_accuracy(found: Collection) -> list[Panel]:
-    """Return panels of the error against products with K a second, a line a law and predictor."""
+    """Return panels of the error against the work, a line a law and predictor; of one law a line a radius.
+
+    The work is that of products with K a second: where M was swept their M^2 multiplications, else their
+    number.
+    """
     runs = [run for run in _usable(found, METRIC) if run.metrics.get(COST) is not None]
-    if len({run.metrics[COST] for run in runs}) < 2:
+    by_count = _several(runs, COUNT)
+    if len({_work(run, by_count) for run in runs}) < 2:
         return []
+    of_radius = _several(runs, RADIUS) and len({_law(run) for run in runs}) == 1
+    named = _radius if of_radius else _law
+    inside = (*_OF_COST, RADIUS) if of_radius else _OF_COST
     panels = []
-    for title, group in _panels(found, runs, _OF_COST):
-        lines = _split(group, lambda run: f"{run.setting('optimizer')}|{run.setting('predictor')}")
-        curves = [Curve(_law(line[0]), _costs(line)) for _, line in lines]
+    for title, group in _panels(found, runs, inside):
+        order = (lambda run: run.setting(RADIUS)) if of_radius else _law
+        curves = [Curve(named(line[0]), _costs(line, by_count)) for _, line in _split(group, order)]
         panels.append(Panel(title, tuple(curves)))
     return panels
 
@@ -129,6 +137,17 @@ def cost_against_accuracy(found: Collection) -> list[Panel]:
 def _law(run: Run) -> str:
     law, predictor = (str(run.setting(key)).replace("_", " ") for key in ("optimizer", "predictor"))
     return law if predictor in ("none", "None") else f"{law}, {predictor} predictor"
+
+
+def _radius(run: Run) -> str:
+    return f"$r$ = {run.setting(RADIUS):g}"
+
+
+def _work(run: Run, by_count: bool) -> float:
+    """Products with K a second, or the multiplications in them."""
+    products, count = run.metrics[COST], run.setting(COUNT)
+    assert products is not None
+    return products * count**2 if by_count and isinstance(count, int) else products
 
 
 def _usable(found: Collection, metric: str) -> list[Run]:
@@ -181,12 +200,15 @@ def _points(runs: Sequence[Run], key: str, metric: str) -> tuple[Point, ...]:
     return tuple(_point(x, errors) for x, errors in sorted(at.items()))
 
 
-def _costs(runs: Sequence[Run]) -> tuple[Point, ...]:
+def _costs(runs: Sequence[Run], by_count: bool) -> tuple[Point, ...]:
     points = []
     for _, group in _split(runs, lambda run: _agreeing(run, _OF_COST[:-1])):
-        cost = group[0].metrics[COST]
-        assert cost is not None
-        points.append(_point(cost, [error for run in group if (error := run.metrics[METRIC]) is not None]))
+        points.append(
+            _point(
+                _work(group[0], by_count),
+                [error for run in group if (error := run.metrics[METRIC]) is not None],
+            )
+        )
     return tuple(sorted(points))
 
 
@@ -224,13 +246,18 @@ def draw_error_against_radius(panels: Sequence[Panel], rounding: float | None) -
     return figure
 
 
-def draw_cost_against_accuracy(panels: Sequence[Panel]) -> Figure:
-    """Both axes logarithmic; a line a law and predictor with its 95 % band over the seeds."""
+def draw_cost_against_accuracy(panels: Sequence[Panel], work: str = "products") -> Figure:
+    """Both axes logarithmic; a line a law and predictor, or a radius, with its 95 % band over the seeds.
+
+    Args:
+        panels: of `cost_against_accuracy`.
+        work: what the work is counted in.
+    """
     with page(*_size(len(panels))) as figure:
         grid = subplots(figure, len(panels), min(len(panels), _COLUMNS), sharey=True)
         for axes, shown in zip(grid, panels, strict=True):
             _lines(axes, shown)
-            axes.set_xlabel("products with $K$ a second of trajectory")
+        figure.supxlabel(f"{work} with $K$ a second of trajectory", size="medium")  # too long for a panel
         _finish(figure, grid, panels)
     return figure
 
@@ -350,7 +377,8 @@ def map_figure(found: Collection) -> Figure | None:
 def cost_figure(found: Collection) -> Figure | None:
     """Draw `cost_against_accuracy` of a sweep; None where nothing that costs was swept."""
     panels = cost_against_accuracy(found)
-    return draw_cost_against_accuracy(panels) if panels else None
+    work = "multiplications" if _several(found.rows, COUNT) else "products"
+    return draw_cost_against_accuracy(panels, work) if panels else None
 
 
 SWEEP_FIGURES: dict[str, tuple[str, Callable[[Collection], Figure | None]]] = {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from pathlib import Path
 
@@ -133,6 +134,16 @@ def test_figures_are_only_those_that_the_swept_settings_allow(tmp_path: Path) ->
     assert curve.label == "steepest descent"
     assert [(point.x, point.middle) for point in curve.points] == [(200.0, 1.0), (1100.0, 0.1)]
     assert set(draw_sweep(found, RunDirectory(tmp_path))) == {"Cost against accuracy"}
+
+
+def test_of_one_law_the_cost_is_that_of_the_centers_and_a_line_is_a_radius(tmp_path: Path) -> None:
+    for num, (count, radius) in enumerate(itertools.product((3, 6), (0.1, 0.2))):
+        metrics = {"ball_error": radius**2 / count, "products_per_second": 10.0}
+        write_run(tmp_path / str(num), {"centers.count": count, "centers.radius": radius}, metrics)
+    (panel,) = series.cost_against_accuracy(collect(tmp_path))
+    assert [curve.label for curve in panel.curves] == ["$r$ = 0.1", "$r$ = 0.2"]
+    points = [(point.x, point.middle) for point in panel.curves[1].points]
+    assert points == [(90.0, pytest.approx(0.04 / 3)), (360.0, pytest.approx(0.04 / 6))]
 
 
 def test_more_panels_than_can_be_read_are_refused(tmp_path: Path) -> None:
