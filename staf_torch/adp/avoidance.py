@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -160,6 +161,9 @@ def plan_around(
         ValueError: if an argument breaks its rule.
     """
     integer("plan_around", "steps", steps, least=4)
+    if not shrink:
+        raise fail("plan_around", "shrink", "must have at least one share", shrink)
+    cost = copy.deepcopy(cost)  # its weight is going to change
     first = float(cost.weight)
     free = QuadraticCost(cost.q, cost.r, cost.dim, cost.inputs)
     problem = SampledProblem.of(plant, cost, dt=dt)
@@ -177,8 +181,6 @@ def plan_around(
         search = BoxDDP(problem, steps=steps, iterations=iterations, compile=compile)
         found = search.solve(rows, control, around)
         control, around = found.control, Reference(found.state[:, :-1], found.feedback)
-    cost.weight.fill_(first)
-    cost.edge.fill_(_EDGE)
     assert found is not None
     bare = SampledProblem.of(plant, free, dt=dt, low=problem.bounds.low, high=problem.bounds.high)
     _, paid = bare.advance(found.state[:, :-1], found.control)

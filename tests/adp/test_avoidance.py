@@ -78,3 +78,5 @@ def test_what_breaks_a_rule_is_refused(given: dict[str, object], message: str) -
         adp.plan_around(LINE, cost_of(), tensor([[3.0, 0.0]]), dt=0.1, steps=3)
     with pytest.raises(ValueError, match=r"`plan_around\(shrink=...\)` must be positive; got 0"):
         adp.plan_around(LINE, cost_of(), tensor([[3.0, 0.0]]), dt=0.1, steps=4, shrink=(0.0,), compile=False)
+    with pytest.raises(ValueError, match=r"`plan_around\(shrink=...\)` must have at least one share"):
+        adp.plan_around(LINE, cost_of(), tensor([[3.0, 0.0]]), dt=0.1, steps=4, shrink=())
