@@ -62,7 +62,7 @@ class ChaseSolution:
 
     title: Title
     outcome: Outcome
-    starts: list[list[float]]  # initial states, (B, n)
+    starts: np.ndarray  # initial states, (B, n)
     history: dict[str, np.ndarray] | None = None  # name -> (B, T, ...)
     warnings: tuple[str, ...] = ()
 
@@ -114,7 +114,9 @@ class GradientChase(BatchedExperiment[ChaseSolution]):
             (outcome,) = simulate([problem], [sink], [figures], advance)
             if writer is not None:
                 writer.close(time=_times(Title.of(problem)))
-        return _finish(out, ChaseSolution(Title.of(problem), outcome, problem.initial_states.tolist()), cfg)
+        return _finish(
+            out, ChaseSolution(Title.of(problem), outcome, problem.initial_states.cpu().numpy()), cfg
+        )
 
     def solve(self, cfgs: Sequence[DictConfig], progress: Progress) -> list[ChaseSolution | Exception]:
         """Solve several configurations of one group as one tensor batch."""
@@ -184,7 +186,7 @@ class _Ready:
         """With what the whole batch was warned of."""
         told = dict.fromkeys([*self.warnings, *common, *outcome.warnings])
         history = None if self.memory is None else self.memory.arrays
-        starts = self.problem.initial_states.tolist()
+        starts = self.problem.initial_states.cpu().numpy()
         return ChaseSolution(Title.of(self.problem), outcome, starts, history, tuple(told))
 
 
@@ -256,7 +258,7 @@ def _name_the_diverged(solved: ChaseSolution) -> None:
         _log.warning(
             "trajectory %d from %s diverged at t = %.6g s; its weights are frozen from there on",
             row,
-            solved.starts[row],
+            solved.starts[row].tolist(),
             float(solved.outcome.diverged_at[row]) * solved.title.dt,
         )
     if len(rows) > _NAMED:
