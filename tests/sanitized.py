@@ -158,7 +158,7 @@ def inside(calls: int, seed: int) -> None:
         signal.alarm(0)
         counts[name] += 1
     built = list(Path(os.environ["XDG_CACHE_HOME"], "staf_torch").rglob("*.so"))
-    assert len(built) >= min(4, calls), built
+    assert len(built) >= min(3, calls), built
     assert all(b"__asan_report_load" in library.read_bytes() for library in built)
     print(f"{calls} calls of {len(built)} libraries under the sanitizers, none bad: {counts}", flush=True)
     outside = torch.empty(3, dtype=torch.float64)

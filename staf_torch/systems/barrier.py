@@ -42,7 +42,7 @@ class Barrier(ControlAffineSystem):
         Shown by `staf experiment=safe_box`.
 
     Args:
-        plant: with `dim`, in continuous time and affine in the control.
+        plant: that says its dim, in continuous time and affine in the control.
         low: of the states, one number or one a coordinate, in their units; None or -inf for no wall.
         high: likewise; None or inf for none.
 
