@@ -21,7 +21,7 @@ from ..numerics.checks import choice, integer
 from ..results import run_record as records
 from ..results.files import METRICS
 from ..results.progress import Progress
-from . import lock
+from . import lock, signals
 from .batching import Outcome, reason
 from .executors import compute, executor
 from .hydra_compat import JobReturn, JobStatus, SweepContext, without_hydra_overrides
@@ -220,6 +220,7 @@ class Launch:
             try:
                 with contextlib.closing(self._computed(jobs, set(returns), progress)) as computed:
                     for job, task in computed:
+                        signals.check()
                         self._still_there(len(returns), len(jobs))
                         ended = self._replay(job, task)
                         jobs.forget(job)

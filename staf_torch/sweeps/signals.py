@@ -1,4 +1,8 @@
-"""SIGTERM and SIGHUP end a program as Ctrl-C does: with its report and the line that resumes."""
+"""SIGTERM and SIGHUP end a program as Ctrl-C does: with its report and the line that resumes.
+
+Python raises what a signal asks for between any two instructions, also inside of a finaliser or of a callback
+of the garbage collector, where it is printed and lost. Whoever loops over jobs therefore asks again: `check`.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +12,9 @@ import threading
 from collections.abc import Iterator
 from types import FrameType
 
-_NUMBERS = (signal.SIGTERM, signal.SIGHUP)
+_NUMBERS = (signal.SIGTERM, signal.SIGHUP, signal.SIGINT)
+_USUAL = (signal.SIG_DFL, signal.default_int_handler)
+_arrived: list[int] = []  # since `stopped_by_signals` began
 
 
 class Stopped(KeyboardInterrupt):
@@ -29,15 +35,17 @@ def stopped_by_signals() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    taken = [number for number in _NUMBERS if signal.getsignal(number) == signal.SIG_DFL]
+    before = {number: signal.getsignal(number) for number in _NUMBERS}
+    taken = {number: handler for number, handler in before.items() if handler in _USUAL}
     parent = threading.get_native_id()
 
     def stop(number: int, frame: FrameType | None) -> None:
         if threading.get_native_id() != parent:  # a child of a fork, which has its own end
             signal.signal(number, signal.SIG_DFL)
             signal.raise_signal(number)
-        for each in taken:  # what follows, the report, takes a second or two; SIGKILL remains
-            signal.signal(each, signal.SIG_IGN)
+        for each in taken:  # what follows, the report, takes a second or two; Ctrl-C and SIGKILL remain
+            signal.signal(each, signal.default_int_handler if each == signal.SIGINT else signal.SIG_IGN)
+        _arrived.append(number)
         raise Stopped(number)
 
     for number in taken:
@@ -45,8 +53,15 @@ def stopped_by_signals() -> Iterator[None]:
     try:
         yield
     finally:
-        for number in taken:
-            signal.signal(number, signal.SIG_DFL)
+        _arrived.clear()
+        for number, handler in taken.items():
+            signal.signal(number, handler)
+
+
+def check() -> None:
+    """Raise `Stopped` if a signal has arrived and what it raised was lost."""
+    if _arrived:
+        raise Stopped(_arrived[0])
 
 
 def name_and_code(error: KeyboardInterrupt) -> tuple[str, int]:

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import json
+import signal
 import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 from command_line import environment
+
+from staf_torch.sweeps import signals
 
 SIGNALLED = """
 import os, random, signal, sys, time
@@ -70,3 +74,20 @@ def test_signals_end_a_sweep_with_its_report_and_the_line_that_resumes(tmp_path:
         assert "report: " in log
         assert codes[f"{name} again"] == 1
         assert (tmp_path / name / "table.csv").read_text() == (tmp_path / "whole" / "table.csv").read_text()
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_within_a_finaliser_is_not_lost(number: signal.Signals) -> None:
+    class Dying:
+        def __del__(self) -> None:
+            signal.raise_signal(number)
+
+    with signals.stopped_by_signals():
+        signals.check()
+        Dying()  # Python prints what is raised there, and goes on
+        with pytest.raises(signals.Stopped) as stopped:
+            signals.check()
+    assert stopped.value.number == number
+    signals.check()
+    assert signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler)
