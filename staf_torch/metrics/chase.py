@@ -90,11 +90,14 @@ class ChaseMetrics:
         self._own = tuple(own)
         self._errors = StateErrorPass(basis, target) if errors is None else errors
         self._rows = _Rows(0)
-        self._done: list[_Rows] = []  # rows before those that are taken in now
+        self._kept: _Rows | None = None  # of all rows, those before the ones that are taken in now filled in
 
     def next_rows(self) -> None:
         """Say that the next pieces begin at time 0 again, with further rows of the batch."""
-        self._done.append(self._rows.finished())
+        assert self._members is not None
+        if self._kept is None:
+            self._kept = _Rows(0)
+        self._kept.fill(self._rows.finished(), sum(member.rows for member in self._members))
         self._rows = _Rows(self._rows.first + len(self._rows.diverged))
 
     def add(self, result: ChaseResult) -> None:
@@ -159,21 +162,17 @@ class ChaseMetrics:
         """The index of the first settled time of each of the rows from ``start`` on: (B,)."""
         if self._members is None:
             return torch.full((batch,), self._whole.first)
-        firsts = torch.tensor([member.first for member in self._members])
-        return firsts.repeat_interleave(torch.tensor([member.rows for member in self._members]))[
-            start : start + batch
-        ]
+        ends = torch.tensor([member.rows for member in self._members]).cumsum(0)
+        of_row = torch.searchsorted(ends, torch.arange(start, start + batch), right=True)
+        return torch.tensor([member.first for member in self._members])[of_row]
 
     def _gathered(self) -> _Rows:
         """All rows as one."""
-        parts = [*self._done, self._rows.finished()]
-        whole = _Rows(0)
-        whole.time, whole.diverged = parts[-1].time, torch.cat([part.diverged for part in parts])
-        whole.worst = {name: torch.cat([p.worst[name] for p in parts]) for name in parts[0].worst}
-        for name in ("last_above", "violations", "uncertified"):
-            counts = [getattr(part, name) for part in parts]
-            setattr(whole, name, None if counts[0] is None else torch.cat(counts))
-        return whole
+        last = self._rows.finished()
+        if self._kept is None:
+            return last
+        self._kept.fill(last, len(self._kept.diverged))
+        return self._kept
 
     def _summary(self, member: Member, rows: slice, found: _Rows) -> dict[str, float | None]:
         kept = ~found.diverged[rows]
@@ -225,6 +224,26 @@ class _Rows:
             self.last_above = torch.where(above, index, 0).amax(dim=1)
         self.early = []
         return self
+
+    def fill(self, part: _Rows, total: int) -> None:
+        """Take over the numbers of some finished rows of ``total``.
+
+        Into tensors for all of them: many small ones that stay would leave holes in memory between them.
+        """
+        rows = slice(part.first, part.first + len(part.diverged))
+        self.time = part.time
+        for name, worst in part.worst.items():
+            if name not in self.worst:
+                self.worst[name] = worst.new_full((total,), -torch.inf)
+            self.worst[name][rows] = worst
+        for name in ("last_above", "violations", "uncertified", "diverged"):
+            found, whole = getattr(part, name), getattr(self, name)
+            if found is None:
+                continue
+            if whole is None or len(whole) < total:
+                whole = found.new_zeros(total)
+                setattr(self, name, whole)
+            whole[rows] = found
 
 
 def _more(count: Tensor | None, happened: Tensor) -> Tensor:
