@@ -175,3 +175,28 @@ def test_a_killed_job_keeps_the_members_that_it_finished(runs: Path) -> None:
     whole, left = collect(runs / "whole").rows, collect(runs / "killed").rows
     assert [run.metrics for run in left[:6]] == [run.metrics for run in whole[:6]]
     assert [run.status for run in left] == ["completed"] * 6 + ["failed"]
+
+
+def test_a_sweep_of_such_jobs_goes_on_within_the_job(
+    tmp_path: Path, computed: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(members, "_PIECE", 2)
+    monkeypatch.chdir(tmp_path)
+    lines = ["-m", "members=['seed=range(3)']", "kernel=gaussian,matern", *SHORT]
+    with monkeypatch.context() as patch:
+        compute = members.compute  # type: ignore[attr-defined]
+
+        def killed(cfgs: Any, places: Any, *rest: Any, **more: Any) -> Any:
+            if places[0].parts[-3:] == ("1", "members", "2"):
+                raise KeyboardInterrupt
+            return compute(cfgs, places, *rest, **more)
+
+        patch.setattr(members, "compute", killed)
+        assert one(str(tmp_path), [*lines, "hydra.sweep.dir=killed"])[0] == 130
+    assert computed == [0, 1, 2, 0, 1]
+    assert one(str(tmp_path), ["-m", "sweep.resume=killed"])[0] == 0
+    assert computed == [0, 1, 2, 0, 1, 2]
+    assert one(str(tmp_path), [*lines, "hydra.sweep.dir=whole"])[0] == 0
+    for job in ("0", "1"):
+        rows = [(tmp_path / each / job / "members.json").read_bytes() for each in ("killed", "whole")]
+        assert rows[0] == rows[1]
