@@ -43,6 +43,20 @@ def write_bytes(path: Path, content: bytes) -> None:
         partial.unlink(missing_ok=True)
 
 
+def open_after(path: Path, keep: int) -> int:
+    """Return the descriptor of a file to write to after its first ``keep`` bytes; the rest of it is cut off.
+
+    With none to keep it is a new file. A link is not followed.
+    """
+    if keep:
+        file = os.open(path, os.O_WRONLY | os.O_NOFOLLOW)
+        os.ftruncate(file, keep)
+        os.lseek(file, keep, os.SEEK_SET)
+        return file
+    path.unlink(missing_ok=True)
+    return os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o666)
+
+
 def partial_name(name: str) -> str:
     """Return the name of a file until it is complete."""
     return f".{name}.partial"

@@ -16,7 +16,7 @@ from typing import Protocol
 import numpy as np
 
 from .archive import Archive
-from .files import FIGURES, HISTORY, METRICS, partial_name, write_bytes, write_metrics, write_text
+from .files import FIGURES, HISTORY, METRICS, open_after, partial_name, write_bytes, write_metrics, write_text
 
 
 class Printable(Protocol):
@@ -56,16 +56,15 @@ class RunDirectory:
         write_text(self._place(name), text)
 
     @contextlib.contextmanager
-    def lines(self, name: str) -> Iterator[Callable[[str], None]]:
+    def lines(self, name: str, *, keep: int = 0) -> Iterator[Callable[[str], None]]:
         """Yield a function that appends to a text file, which gets its name when it is complete.
 
-        Until then the text is in a file of `partial_name`, also where the run is killed.
+        Until then the text is in a file of `partial_name`, also where the run is killed; so many bytes of an
+        earlier one are kept.
         """
         path = self._place(name)
         partial = path.with_name(partial_name(name))
-        partial.unlink(missing_ok=True)
-        flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW
-        with os.fdopen(os.open(partial, flags, 0o666), "w", encoding="utf-8") as file:
+        with os.fdopen(open_after(partial, keep), "w", encoding="utf-8") as file:
 
             def write(text: str) -> None:
                 file.write(text)

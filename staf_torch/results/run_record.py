@@ -8,7 +8,7 @@ import re
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -49,6 +49,11 @@ class RunRecord:
             "settings": settings,
             "build": build(settings, compiler),
         }
+
+    @property
+    def made_by(self) -> str:
+        """Hash of settings, overrides, source, modules, torch and compiler."""
+        return record_checksum({key: value for key, value in self._about.items() if key != "metrics"})
 
     def declare(self, metrics: Sequence[MetricInfo]) -> None:
         """Add metrics of the user's own, so that a table knows them without their code."""
@@ -102,16 +107,34 @@ class RunRecord:
         return read(directory / METRICS)
 
     def _compare(self, directory: Path, record: Mapping[str, Any]) -> None:
-        told = list(differences(record, self._about))
-        if record.get("version") != __version__:
-            told.insert(0, f"it was written by staf_torch {record.get('version')}, and this is {__version__}")
+        told = self._differences(record)
         if told:
-            more = f"; and {len(told) - _TOLD} more" if len(told) > _TOLD else ""
             raise ValueError(
-                f"{directory} was not made as it would be now: {'; '.join(told[:_TOLD])}{more}. Numbers may "
+                f"{directory} was not made as it would be now: {told}. Numbers may "
                 "differ: run the sweep anew, or keep what is there by `sweep.resume_anyway=true`; tables "
                 "tell the two apart."
             )
+
+    def refuse_rows(self, directory: Path) -> NoReturn:
+        """Refuse to go on with rows of members that something else made.
+
+        Raises:
+            ValueError: with what differs.
+        """
+        told = self._differences(read(directory / RUN) or {}) or "its overrides were others"
+        raise ValueError(
+            f"{directory} has rows of members that were not made as they would be now: {told}. One table of "
+            "both would mix them: run the job in another directory, or begin it anew by "
+            "`sweep.resume_anyway=true`."
+        )
+
+    def _differences(self, record: Mapping[str, Any]) -> str:
+        """Return what differs between an earlier record and this one, the first few."""
+        told = list(differences(record, self._about))
+        if record.get("version") != __version__:
+            told.insert(0, f"it was written by staf_torch {record.get('version')}, and this is {__version__}")
+        more = f"; and {len(told) - _TOLD} more" if len(told) > _TOLD else ""
+        return "; ".join(told[:_TOLD]) + more
 
 
 def own(overrides: Sequence[str]) -> list[str]:

@@ -21,9 +21,10 @@ from ..experiments.registry import Metrics, check_animation
 from ..lanes.build import compiler
 from ..numerics.checks import choice
 from ..results import run_record as records
+from ..results.files import MEMBERS, METRICS, partial_name
 from ..results.progress import SHOWN, Progress
 from ..settings.chase import make_metrics
-from . import members
+from . import lock, members
 from .batching import DEFERRED, USER_ERRORS, Outcome, completion, reason, sentence
 
 _log = logging.getLogger(__name__)
@@ -105,12 +106,16 @@ def run(
         Exception: that of the experiment; the record has its reason.
     """
     record = records.RunRecord(cfg, origin.choices, origin.overrides, compiler())
-    with _recorded(record, directory, seconds):
+    with contextlib.ExitStack() as stack:
+        start = None
+        if cfg.get("members") is not None:  # before the record of the earlier start is overwritten
+            start = stack.enter_context(members.start_of(cfg, directory, record))
+        stack.enter_context(_recorded(record, directory, seconds))
         check_animation(cfg)
         record.declare([metric.info for metric in make_metrics(cfg.get("metric"))])
-        if cfg.get("members") is not None:
+        if start is not None:
             base = [*origin.search, *origin.overrides]
-            return members.run(cfg, directory, base, origin.config_name, progress)
+            return members.run(cfg, directory, base, origin.config_name, start, progress)
         return completion(cfg, outcome)(cfg, directory, progress)
 
 
@@ -136,7 +141,9 @@ def _log_warning(message: Warning | str, *_: Any, **__: Any) -> None:
 
 def _take_back(directory: Path) -> None:
     """Remove what this run has written, and nothing else: the directory may be the user's own."""
-    if (directory / "metrics.json").exists():
+    # Results, the members so far, a directory that another process holds: those stay.
+    others = (METRICS, partial_name(MEMBERS), lock.NAME)
+    if any((directory / name).exists() for name in others):
         return
     shutil.rmtree(directory / ".hydra", ignore_errors=True)
     for name in (records.RUN, "staf.log"):

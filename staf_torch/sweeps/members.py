@@ -6,28 +6,29 @@ row each in `members.json`, the row that the same job of a sweep leaves in its o
 
 from __future__ import annotations
 
-import json
+import contextlib
 import logging
 import statistics
 from array import array
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 
-from .. import __version__
 from ..experiments.registry import Metrics
 from ..numerics.checks import COMMAND_LINE, fail, flag
-from ..results.files import MEMBERS
+from ..results import run_record as records
 from ..results.progress import Progress
 from ..results.reader import Value
 from ..results.run_directory import RunDirectory
 from ..tables import Table
+from . import lock
 from .batching import Computed, Failed, Outcome, completion, reason
 from .executors import Inline, compute
 from .hydra_compat import Composer, ConfigLoader, config_loader, parse_override, product
+from .member_rows import FOLDER, Left, left, made_by, rows_left, writer
 
 _log = logging.getLogger(__name__)
 _PIECE = 1024  # members that are composed and written together: memory does not grow with their number
@@ -35,8 +36,20 @@ _LISTED = 20  # members that the log shows one by one
 _SHOWN = ("ultimate_error", "floor_error", "ball_error", "ultimate_excess", "diverged_fraction")
 
 
+class Start(NamedTuple):
+    """What a job of members begins with."""
+
+    run: str  # hash of what makes the run
+    left: Left  # rows of an earlier start
+
+
 def run(
-    cfg: DictConfig, directory: Path, overrides: Sequence[str], config_name: str | None, progress: Progress
+    cfg: DictConfig,
+    directory: Path,
+    overrides: Sequence[str],
+    config_name: str | None,
+    start: Start,
+    progress: Progress,
 ) -> Metrics:
     """Run all members and write `members.json` and `metrics.json`: how many there are, failed and diverged.
 
@@ -45,40 +58,93 @@ def run(
         directory: the run directory.
         overrides: that led to ``cfg``.
         config_name: of the primary configuration that led to ``cfg``.
+        start: what makes the run, and the rows that an earlier start of it has left.
         progress: shows how many members are done.
 
     Raises:
         ValueError, hydra.errors.HydraException: if `members` is no list of overrides, or names what is not
-            there. What is wrong with one member alone fails it alone.
+            there, or a row that is left had other settings. What is wrong with one member alone fails it
+            alone.
     """
     base = [line for line in overrides if line.lstrip("+~").partition("=")[0] != "members"]
     keep = flag(COMMAND_LINE, "history", cfg.history) and "history=true" in base
     loader = config_loader()
     jobs = member_overrides(cfg.members, loader)
     composer = Composer(loader, config_name, hydra_node=False)
-    out, tally = RunDirectory(directory), _Tally()
+    out, tally, before = RunDirectory(directory), _Tally(), start.left
+    done = len(before.made)
 
     def composed(begin: int) -> list[DictConfig]:
         fixed = ("figures=false", f"history={str(keep).lower()}")
         return [composer([*base, *job, *fixed]) for job in jobs[begin : begin + _PIECE]]
 
     cfgs = composed(0)  # before anything is written: most wrong names are refused here
-    with progress.over(len(jobs), "members") as advance, out.lines(MEMBERS) as write:
-        write(f'{{"version": {json.dumps(__version__)}, "members": [\n')
-        for begin in range(0, len(jobs), _PIECE):
+    for begin in range(0, done, _PIECE):
+        made = [made_by(one) for one in (composed(begin) if begin else cfgs)]
+        _refuse_others(jobs, begin, made, before.made[begin : begin + _PIECE])
+    for row in rows_left(directory, done) if done else ():
+        tally.add([row])
+    if done:
+        _log.info("%d of %d members were completed before", done, len(jobs))
+    with (
+        progress.over(len(jobs), "members") as advance,
+        writer(directory, start.run, len(jobs), before) as write,
+    ):
+        advance(done)
+        for begin in range(done // _PIECE * _PIECE, len(jobs), _PIECE):
             part = jobs[begin : begin + _PIECE]
             cfgs = composed(begin) if begin else cfgs
-            places = [directory / "members" / str(begin + index) for index in range(len(part))]
+            places = [directory / FOLDER / str(begin + index) for index in range(len(part))]
             rows: list[dict[str, Any]] = [{} for _ in part]
-            for index, outcome, _ in compute(cfgs, places, Inline(), tell=lambda jobs: None):
+            completed = range(max(0, min(done - begin, len(part))))
+            for index, outcome, _ in compute(
+                cfgs, places, Inline(), finished=completed, tell=lambda jobs: None
+            ):
                 row = {"num": begin + index, "overrides": part[index]}
                 rows[index] = row | _result(cfgs[index], outcome, places[index], keep, progress)
                 advance(1)
-            tally.add(rows)
-            lines = ",\n".join(json.dumps(row, allow_nan=False) for row in rows)  # one member a line
-            write(lines + (",\n" if begin + _PIECE < len(jobs) else "\n]}\n"))
+            tally.add(rows[len(completed) :])
+            write(rows[len(completed) :], [made_by(one) for one in cfgs[len(completed) :]])
     tally.report()
     return out.metrics(tally.counts())
+
+
+@contextlib.contextmanager
+def start_of(cfg: DictConfig, directory: Path, record: records.RunRecord) -> Iterator[Start]:
+    """Hold the directory of a job of members, and yield what an earlier start has left where that is resumed.
+
+    Args:
+        cfg: the settings; `members` is not null.
+        directory: of the run.
+        record: of the run that begins.
+
+    Raises:
+        ValueError: if another process has the directory, or the rows that are left were made otherwise.
+    """
+    lock.hold(directory)
+    try:
+        found: Left | None = Left([])
+        if records.resumed(cfg):
+            found = left(directory, record.made_by)
+        if found is None and not records.resumed_anyway(cfg):
+            record.refuse_rows(directory)
+        if found is None:
+            _log.warning("the members that %s has were made otherwise: all run again", directory)
+        yield Start(record.made_by, found or Left([]))
+    finally:
+        lock.give_back(directory)
+
+
+def _refuse_others(
+    jobs: Sequence[Sequence[str]], first: int, now: Sequence[str], then: Sequence[str]
+) -> None:
+    """Raise ValueError if a member that is left was made by other settings than it would be now."""
+    for index, (is_now, was) in enumerate(zip(now, then, strict=False)):
+        if is_now != was:
+            raise ValueError(
+                f"member {first + index} ({' '.join(jobs[first + index])}) was not made as it would be now: "
+                "its settings or the modules that they name have changed. Run the job in another directory."
+            )
 
 
 def member_overrides(setting: Any, loader: ConfigLoader) -> list[list[str]]:

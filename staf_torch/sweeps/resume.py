@@ -1,4 +1,4 @@
-"""`staf -m sweep.resume=runs/<sweep>`: the command line of a sweep that is taken up again."""
+"""`sweep.resume=...`: the command line of a sweep, or of one run of many members, that is taken up again."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from .hydra_compat import overrides_in
 _RESUME = "sweep.resume="
 _ANYWAY = "sweep.resume_anyway=true"
 _YES = "--yes"
-_NOT_TAKEN_OVER = ("hydra.mode", "hydra.sweep.dir", "sweep.resume", "sweep.resume_anyway")
+_NOT_TAKEN_OVER = ("hydra.mode", "hydra.run.dir", "hydra.sweep.dir", "sweep.resume", "sweep.resume_anyway")
 _HARMLESS = re.compile(
     r"hydra/launcher=(batched|basic|joblib)|hydra/sweeper=(basic|optuna)|hydra\.mode=\w+|hydra\.verbose=\w+"
     r"|hydra\.launcher\.(executor|workers|batch|n_jobs)=\w+"
@@ -44,7 +44,10 @@ def command_line(argv: Sequence[str]) -> list[str]:
     if not resumed or resumed[-1] == "null":
         return list(argv)
     directory = Path(resumed[-1].strip("'\""))
-    typed, hydra = recorded(directory, anyway=_ANYWAY in given)
+    single = is_run_of_members(directory)
+    if single and {"-m", "--multirun"} & set(argv):
+        raise ValueError(f"{directory} is one run, of many members: resume it without -m.")
+    typed, hydra = (_of_run(directory), []) if single else recorded(directory, anyway=_ANYWAY in given)
     own = [line for line in given if not _is_hydra(line) and line in records.own([line])]
     if own and sorted(own) != sorted(typed):
         raise ValueError(_difference(directory, own, typed))
@@ -56,11 +59,11 @@ def command_line(argv: Sequence[str]) -> list[str]:
     place = records.quoted(os.path.normpath(directory))
     flags = [word for word in argv if word not in given and word != _YES]
     return [
-        *(flags if {"-m", "--multirun"} & set(flags) else [*flags, "--multirun"]),
+        *(flags if single or {"-m", "--multirun"} & set(flags) else [*flags, "--multirun"]),
         *typed,
         *hydra,
         *filter(_ANYWAY.__eq__, given),
-        f"hydra.sweep.dir={place}",
+        f"hydra.{'run' if single else 'sweep'}.dir={place}",
         f"{_RESUME}{place}",
     ]
 
@@ -70,6 +73,24 @@ def may_run_code(line: str) -> bool:
     if _is_hydra(line):
         return _HARMLESS.fullmatch(line) is None
     return _MAY_RUN.search(line) is not None
+
+
+def is_run_of_members(directory: Path) -> bool:
+    """Return whether a directory is that of one run of `members=`, and not that of a sweep."""
+    settings = (records.read(directory / records.RUN) or {}).get("settings")
+    return (
+        not (directory / records.SWEEP).exists()
+        and isinstance(settings, dict)
+        and settings.get("members") is not None
+    )
+
+
+def _of_run(directory: Path) -> list[str]:
+    """Return the overrides of a run as they were typed; Hydra's own are not recorded."""
+    lines = (records.read(directory / records.RUN) or {}).get("overrides")
+    if not isinstance(lines, list) or not _texts(lines):
+        raise ValueError(f"`staf sweep.resume={directory}`: its {records.RUN} has no overrides.")
+    return lines
 
 
 def _confirm(directory: Path, foreign: Sequence[str]) -> None:
