@@ -14,7 +14,7 @@ SHORT = ("duration=0.05", "figures=false")
 BAD: dict[str, tuple[str, tuple[str, ...]]] = {
     "unknown kernel": (
         "kernel=nope",
-        ("there is no `kernel/nope`; there are anchored, custom, exponential, ",),
+        ("there is no `kernel/nope`; there are anchored, anchored_gaussian, custom, exponential, ",),
     ),
     "launcher of an extra": (
         "hydra/launcher=nope",

@@ -192,7 +192,8 @@ def test_a_sweep_of_such_jobs_goes_on_within_the_job(
             return compute(cfgs, places, *rest, **more)
 
         patch.setattr(members, "compute", killed)
-        assert one(str(tmp_path), [*lines, "hydra.sweep.dir=killed"])[0] == 130
+        code, _, err = one(str(tmp_path), [*lines, "hydra.sweep.dir=killed"])
+        assert code == 130, err
     assert computed == [0, 1, 2, 0, 1]
     assert one(str(tmp_path), ["-m", "sweep.resume=killed"])[0] == 0
     assert computed == [0, 1, 2, 0, 1, 2]

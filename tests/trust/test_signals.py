@@ -25,6 +25,9 @@ GRID += ["duration=0.05", "settle_time=0", "figures=false", "history=false"]
 def start(place, *argv):
     child = os.fork()
     if child == 0:
+        for number in (signal.SIGTERM, signal.SIGHUP):
+            signal.signal(number, signal.SIG_DFL)
+        signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
         sys.stdout = sys.stderr = open(f"{place}.log", "a")
         sys.argv = ["staf", "-m", *argv]
         code = 0
@@ -83,6 +86,8 @@ def test_a_signal_within_a_finaliser_is_not_lost(number: signal.Signals) -> None
         def __del__(self) -> None:
             signal.raise_signal(number)
 
+    usual = signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL
+    before = signal.signal(number, usual)  # a shell's background jobs ignore some
     with signals.stopped_by_signals():
         signals.check()
         Dying()  # Python prints what is raised there, and goes on
@@ -90,4 +95,5 @@ def test_a_signal_within_a_finaliser_is_not_lost(number: signal.Signals) -> None
             signals.check()
     assert stopped.value.number == number
     signals.check()
-    assert signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler)
+    assert signal.getsignal(number) == usual
+    signal.signal(number, before)
