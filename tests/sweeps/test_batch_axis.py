@@ -15,6 +15,7 @@ from staf_torch.results.progress import Progress
 from staf_torch.sweeps import members
 from staf_torch.sweeps.batching import sentence
 from staf_torch.sweeps.hydra_compat import Composer, config_loader
+from staf_torch.sweeps.member_rows import Left
 
 SHORT = ["dt=0.05", "duration=1.0", "settle_time=0.5", "figures=false"]
 
@@ -22,7 +23,8 @@ SHORT = ["dt=0.05", "duration=1.0", "settle_time=0.5", "figures=false"]
 def run(directory: Path, lines: object, *base: str) -> tuple[Metrics, list[dict[str, Any]]]:
     (cfg,) = compose([*SHORT, *base], [[]])
     cfg.members = lines
-    metrics = members.run(cfg, directory, [*SHORT, *base], "config", Progress())
+    start = members.Start("", Left([]))
+    metrics = members.run(cfg, directory, [*SHORT, *base], "config", start, Progress())
     record = json.loads((directory / "members.json").read_text())
     assert json.loads((directory / "metrics.json").read_text()) == metrics
     return metrics, record["members"]
