@@ -264,6 +264,7 @@ EXPORTS: dict[str, Callable[[Path], None]] = {
         "kernel: {_target_: staf_torch.run, _args_: [duration=0.1, 'hydra.run.dir=OWNED']}"
     ),
     "a module of ours that is a program": setting("kernel: {_target_: staf_torch.__main__.main}"),
+    "a file for a parser of C": setting("system: {_target_: staf_torch.systems.MujocoPlant, model: EVIL}"),
     "a loader of ours": setting("kernel: {_target_: staf_torch.settings.chase.load, path: os.getcwd}"),
     "a loader of ours under its old name": setting(
         "kernel: {_target_: staf_torch.experiments.build.load, path: os.getcwd}"

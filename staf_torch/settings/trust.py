@@ -33,7 +33,11 @@ from ..systems import ControlAffineSystem
 from . import config_directory
 
 _TARGET = re.compile(r"_target_: *(staf_torch\.[\w.]+)")
-_NOT_PARTS = ("staf_torch.settings.chase.load", "staf_torch.sweeps.")  # imports what it is told; end of runs
+_NOT_PARTS = (
+    "staf_torch.settings.chase.load",  # imports what it is told
+    "staf_torch.systems.MujocoPlant",  # reads any file, by a parser that no limit here can stop
+    "staf_torch.sweeps.",  # end of runs
+)
 _REFERENCE = re.compile(r"\$\{([A-Za-z_][\w.]*)\}")
 _MOST_NODES, _MOST_TEXT, _DEEPEST = 20_000, 1000, 30
 _SIZES: Mapping[str, float] = {
