@@ -70,17 +70,17 @@ def run(
     keep = flag(COMMAND_LINE, "history", cfg.history) and "history=true" in base
     loader = config_loader()
     jobs = member_overrides(cfg.members, loader)
-    composer = Composer(loader, config_name, hydra_node=False)
+    fixed = ("figures=false", f"history={str(keep).lower()}")
+    composer = Composer(loader, config_name, hydra_node=False, always=[*base, *fixed])
     out, tally, before = RunDirectory(directory), _Tally(), start.left
     done = len(before.made)
 
     def composed(begin: int) -> list[DictConfig]:
-        fixed = ("figures=false", f"history={str(keep).lower()}")
         return [composer([*base, *job, *fixed]) for job in jobs[begin : begin + _PIECE]]
 
     cfgs = composed(0)  # before anything is written: most wrong names are refused here
     for begin in range(0, done, _PIECE):
-        made = [made_by(one) for one in (composed(begin) if begin else cfgs)]
+        made = [made_by(records.flat(one)) for one in (composed(begin) if begin else cfgs)]
         _refuse_others(jobs, begin, made, before.made[begin : begin + _PIECE])
     for row in rows_left(directory, done) if done else ():
         tally.add([row])
@@ -97,14 +97,15 @@ def run(
             places = [directory / FOLDER / str(begin + index) for index in range(len(part))]
             rows: list[dict[str, Any]] = [{} for _ in part]
             completed = range(max(0, min(done - begin, len(part))))
+            flat = [records.flat(one) for one in cfgs]
             for index, outcome, _ in compute(
-                cfgs, places, Inline(), finished=completed, tell=lambda jobs: None
+                cfgs, places, Inline(), finished=completed, most=_PIECE, flat=flat, tell=lambda jobs: None
             ):
                 row = {"num": begin + index, "overrides": part[index]}
                 rows[index] = row | _result(cfgs[index], outcome, places[index], keep, progress)
                 advance(1)
             tally.add(rows[len(completed) :])
-            write(rows[len(completed) :], [made_by(one) for one in cfgs[len(completed) :]])
+            write(rows[len(completed) :], [made_by(one) for one in flat[len(completed) :]])
     tally.report()
     return out.metrics(tally.counts())
 
