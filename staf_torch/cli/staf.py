@@ -9,11 +9,13 @@ import contextlib
 import os
 import sys
 from collections.abc import Callable
+from typing import NoReturn
 
 from ..settings import config_directory as config_directory
 from ..sweeps import callbacks
 from ..sweeps.batching import USER_ERRORS, sentence
 from ..sweeps.hydra_compat import (
+    BrokenSweep,
     broken_sweep,
     find_launcher,
     full_errors,
@@ -45,30 +47,43 @@ def main() -> None:
         sys.exit(_written(_WRITERS[sys.argv[1]], sys.argv[2:]))
     sys.path.insert(0, os.getcwd())  # so that `target.path=my_module.my_function` finds the user's file
     typed = sys.argv
-    with full_errors() as wants_trace, stopped_by_signals():
-        try:
-            argv = command_line(typed[1:])
-            sys.argv = [typed[0], *with_mode(argv)]
-            with trusted(named_packages(argv)):
-                _staf()
-        except Refused as refused:
-            if wants_trace and refused.__cause__ is not None:
-                raise refused.__cause__ from None
+    try:
+        with full_errors() as wants_trace, stopped_by_signals():
+            _run(typed, wants_trace)
+    except KeyboardInterrupt as error:  # between two lines of ours: no sweep had begun, or it has ended
+        _end_by_signal(None, error)
+    finally:
+        sys.argv = typed
+
+
+def _run(typed: list[str], wants_trace: bool) -> None:
+    """Run a command line through Hydra and turn what ends it into a sentence and an exit code."""
+    try:
+        argv = command_line(typed[1:])
+        sys.argv = [typed[0], *with_mode(argv)]
+        with trusted(named_packages(argv)):
+            _staf()
+    except Refused as refused:
+        if wants_trace and refused.__cause__ is not None:
+            raise refused.__cause__ from None
+        raise
+    except (Exception, KeyboardInterrupt) as error:
+        sweep = broken_sweep(error)
+        if sweep is not None:
+            callbacks.close(sweep)
+        if isinstance(error, KeyboardInterrupt):
+            _end_by_signal(sweep, error)
+        if wants_trace or not isinstance(error, USER_ERRORS):
             raise
-        except (Exception, KeyboardInterrupt) as error:
-            sweep = broken_sweep(error)
-            if sweep is not None:
-                callbacks.close(sweep)
-            if isinstance(error, KeyboardInterrupt):
-                said, code = name_and_code(error)
-                with contextlib.suppress(OSError):  # the terminal may be gone
-                    sys.stderr.write(callbacks.farewell(sweep, said) + "\n")
-                sys.exit(code)
-            if wants_trace or not isinstance(error, USER_ERRORS):
-                raise
-            sys.exit(f"staf: {sentence(error)}")
-        finally:
-            sys.argv = typed
+        sys.exit(f"staf: {sentence(error)}")
+
+
+def _end_by_signal(sweep: BrokenSweep | None, error: KeyboardInterrupt) -> NoReturn:
+    """Say which signal ended the program and how to resume, and exit with the code that shells expect."""
+    said, code = name_and_code(error)
+    with contextlib.suppress(OSError):  # the terminal may be gone
+        sys.stderr.write(callbacks.farewell(sweep, error, said) + "\n")
+    sys.exit(code)
 
 
 def _written(write: Callable[[list[str]], str], words: list[str]) -> str | None:

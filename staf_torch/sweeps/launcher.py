@@ -43,6 +43,7 @@ _NOT_BATCHED = (
 )
 T = TypeVar("T")
 _KEPT_JOBS = 128  # as many as a batch has
+_COLLECTED = 64  # jobs after which their settings are collected
 _BAR_EVERY, _LINE_EVERY = 0.2, 10.0  # s
 
 
@@ -239,7 +240,7 @@ class Launch:
                         failure = ended._return_value if ended.status == JobStatus.FAILED else None
                         progress.ended(job.name, None if failure is None else reason(failure))
                         returns[job.num] = ended
-                        if len(returns) % _KEPT_JOBS == 0:
+                        if len(returns) % _COLLECTED == 0:
                             gc.collect()  # settings refer to their parents, and go no other way
             finally:
                 progress.close()

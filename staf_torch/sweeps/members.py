@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import os
 import statistics
 from array import array
 from collections.abc import Iterator, Sequence
@@ -87,6 +88,7 @@ def run(
     if done:
         _log.info("%d of %d members were completed before", done, len(jobs))
     with (
+        _saying_how_to_resume(directory, tally, len(jobs)),
         progress.over(len(jobs), "members") as advance,
         writer(directory, start.run, len(jobs), before) as write,
     ):
@@ -104,8 +106,8 @@ def run(
                 row = {"num": begin + index, "overrides": part[index]}
                 rows[index] = row | _result(cfgs[index], outcome, places[index], keep, progress)
                 advance(1)
-            tally.add(rows[len(completed) :])
             write(rows[len(completed) :], [made_by(one) for one in flat[len(completed) :]])
+            tally.add(rows[len(completed) :])
     tally.report()
     return out.metrics(tally.counts())
 
@@ -122,7 +124,7 @@ def start_of(cfg: DictConfig, directory: Path, record: records.RunRecord) -> Ite
     Raises:
         ValueError: if another process has the directory, or the rows that are left were made otherwise.
     """
-    lock.hold(directory)
+    lock.hold(directory, "run")
     try:
         found: Left | None = Left([])
         if records.resumed(cfg):
@@ -134,6 +136,17 @@ def start_of(cfg: DictConfig, directory: Path, record: records.RunRecord) -> Ite
         yield Start(record.made_by, found or Left([]))
     finally:
         lock.give_back(directory)
+
+
+@contextlib.contextmanager
+def _saying_how_to_resume(directory: Path, tally: _Tally, total: int) -> Iterator[None]:
+    """Add to a Ctrl-C, or another signal, how many members are complete and the line that resumes."""
+    try:
+        yield
+    except KeyboardInterrupt as error:
+        done, place = tally.counts()["members"], os.path.relpath(directory)
+        error.add_note(f"{done} of {total} members are complete. Resume with:\n  staf sweep.resume={place}")
+        raise
 
 
 def _refuse_others(
