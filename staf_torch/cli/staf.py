@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import NoReturn
 
 from ..settings import config_directory as config_directory
@@ -47,35 +47,36 @@ def main() -> None:
         sys.exit(_written(_WRITERS[sys.argv[1]], sys.argv[2:]))
     sys.path.insert(0, os.getcwd())  # so that `target.path=my_module.my_function` finds the user's file
     typed = sys.argv
-    try:
-        with full_errors() as wants_trace, stopped_by_signals():
-            _run(typed, wants_trace)
-    except KeyboardInterrupt as error:  # between two lines of ours: no sweep had begun, or it has ended
-        _end_by_signal(None, error)
-    finally:
-        sys.argv = typed
-
-
-def _run(typed: list[str], wants_trace: bool) -> None:
-    """Run a command line through Hydra and turn what ends it into a sentence and an exit code."""
-    try:
-        argv = command_line(typed[1:])
-        sys.argv = [typed[0], *with_mode(argv)]
-        with trusted(named_packages(argv)):
-            _staf()
-    except Refused as refused:
-        if wants_trace and refused.__cause__ is not None:
-            raise refused.__cause__ from None
-        raise
-    except (Exception, KeyboardInterrupt) as error:
-        sweep = broken_sweep(error)
-        if sweep is not None:
-            callbacks.close(sweep)
-        if isinstance(error, KeyboardInterrupt):
-            _end_by_signal(sweep, error)
-        if wants_trace or not isinstance(error, USER_ERRORS):
+    with _told_between_lines(), full_errors() as wants_trace, stopped_by_signals():
+        try:
+            argv = command_line(typed[1:])
+            sys.argv = [typed[0], *with_mode(argv)]
+            with trusted(named_packages(argv)):
+                _staf()
+        except Refused as refused:
+            if wants_trace and refused.__cause__ is not None:
+                raise refused.__cause__ from None
             raise
-        sys.exit(f"staf: {sentence(error)}")
+        except (Exception, KeyboardInterrupt) as error:
+            sweep = broken_sweep(error)
+            if sweep is not None:
+                callbacks.close(sweep)
+            if isinstance(error, KeyboardInterrupt):
+                _end_by_signal(sweep, error)
+            if wants_trace or not isinstance(error, USER_ERRORS):
+                raise
+            sys.exit(f"staf: {sentence(error)}")
+        finally:
+            sys.argv = typed
+
+
+@contextlib.contextmanager
+def _told_between_lines() -> Iterator[None]:
+    """End in a sentence also where a signal comes before the program has begun, or after it has ended."""
+    try:
+        yield
+    except KeyboardInterrupt as error:
+        _end_by_signal(None, error)
 
 
 def _end_by_signal(sweep: BrokenSweep | None, error: KeyboardInterrupt) -> NoReturn:

@@ -54,7 +54,7 @@ EXECUTORS = {
     ],
 }
 TRACE = 99  # exit code of a command that ends in a traceback
-WAIT, STAY = 240.0, 30.0  # s that a sweep may take, and its processes to end after it: they may be importing
+WAIT, STAY = 240.0, 120.0  # s that a sweep may take, and its processes to end after it: they may be importing
 
 
 class Sweep:
@@ -79,6 +79,7 @@ class Sweep:
             for stream in (1, 2):
                 os.dup2(log, stream)
             os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
+            signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
             sys.argv = ["staf", "-m", *line]
             staf.main()
             code = 0
