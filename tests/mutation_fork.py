@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import contextlib
 import os
+import resource
 import shutil
 import signal
 import sys
@@ -16,10 +17,11 @@ from typing import NamedTuple
 import pytest
 from mutants import Mutant
 from mutants_accepted import ACCEPTED
-from mutation_map import Map, tests_near
+from mutation_map import Map, places, tests_near
 
 SECONDS = 45.0  # of tests that a mutant is given, by what they took with the right code
 TESTS = 150  # at most
+PATIENCE = 10  # seconds by the clock for one of the processor, on a machine that is shared
 
 
 class Verdict(NamedTuple):
@@ -50,11 +52,11 @@ def begin(tree: Path, known: Map, compiled: Path, until: float) -> None:
     _place, _map, _until = tree.parent / f"tree-{os.getpid()}", known, until
     shutil.copytree(tree, _place, ignore=shutil.ignore_patterns(".assets"))
     programs = tree.parent / f"cache-{os.getpid()}"
-    if compiled.exists():
-        shutil.copytree(compiled, programs / "staf_torch")
+    (programs / "staf_torch").mkdir(parents=True)
+    for library in compiled.glob("*.so"):
+        shutil.copy2(library, programs / "staf_torch")
     os.environ |= {"PYTHONPATH": str(_place), "XDG_CACHE_HOME": str(programs)}
-    os.environ |= {"PYTHONDONTWRITEBYTECODE": "1", "OMP_NUM_THREADS": "1", "MPLBACKEND": "agg"}
-    sys.dont_write_bytecode = True
+    os.environ |= {"OMP_NUM_THREADS": "1", "MPLBACKEND": "agg"}
 
 
 def judge(mutant: Mutant) -> Verdict | None:
@@ -71,7 +73,7 @@ def judge(mutant: Mutant) -> Verdict | None:
     begun = time.monotonic()
     path.write_text(mutant.applied(source), encoding="utf-8")
     try:
-        said, by = _run_in_fork(tests, 60 + 6 * sum(_map.seconds.get(test, 0.0) for test in tests))
+        said, by = _run_in_fork(tests, 20 + 3 * sum(_map.seconds.get(test, 0.0) for test in tests))
     finally:
         path.write_text(source, encoding="utf-8")
     return Verdict(mutant, said, len(tests), time.monotonic() - begun, by)
@@ -79,9 +81,8 @@ def judge(mutant: Mutant) -> Verdict | None:
 
 def _tests_for(mutant: Mutant, source: str) -> list[str]:
     """Those that execute the lines, the folder's own first and the short ones first, within the time."""
-    hits, _ = tests_near(_map, mutant.file, mutant.line, mutant.last_line, _around(mutant, source))
-    room = mutant.file.split("/")[1].removesuffix(".py")
-    near = {test: 0 if test.startswith((f"tests/{room}/", f"tests/test_{room}")) else 1 for test in hits}
+    hits = tests_near(_map, mutant.file, mutant.line, mutant.last_line, _around(mutant, source))
+    near = {test: 0 if test.startswith(places(mutant.file)) else 1 for test in hits}
     chosen: list[str] = []
     total = 0.0
     for test in sorted(hits, key=lambda test: (near[test], _map.seconds.get(test, 0.0), test)):
@@ -123,23 +124,16 @@ class _Chosen:
 
 
 def _run_in_fork(tests: Sequence[str], limit: float) -> tuple[str, str]:
-    """Run tests in a child; what they said, and the one that failed."""
+    """Run tests in a child for so many seconds of the processor; what they said, and the one that failed."""
     heard, told = os.pipe()
     child = os.fork()
     if child == 0:
-        os.setsid()
-        silent = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(silent, 1)
-        os.dup2(silent, 2)
-        os.chdir(_place)
-        sys.path[:0] = [str(_place)]
-        chosen = _Chosen(tests)
-        files = sorted({test.partition("::")[0] for test in tests})
-        code: int = pytest.main(["-x", "-q", "-p", "no:cacheprovider", "--tb=no", *files], plugins=[chosen])
-        os.write(told, f"{int(code)} {chosen.failed}".encode())
-        os._exit(0)
+        try:
+            os.write(told, _tested(tests, int(limit)).encode())
+        finally:
+            os._exit(0)
     os.close(told)
-    end = time.monotonic() + limit
+    end = time.monotonic() + PATIENCE * limit
     while os.waitpid(child, os.WNOHANG)[0] == 0:
         if time.monotonic() > end:
             os.kill(child, signal.SIGKILL)
@@ -150,8 +144,22 @@ def _run_in_fork(tests: Sequence[str], limit: float) -> tuple[str, str]:
     words = os.read(heard, 4096).decode().split(" ", 1)
     os.close(heard)
     if words == [""]:
-        return "killed", "by the clock" if time.monotonic() > end else "by the end of the process"
+        return "killed", "by the clock, or the process ended"
     return ("survived" if words[0] in ("0", "5") else "killed"), words[1]
+
+
+def _tested(tests: Sequence[str], limit: int) -> str:
+    os.setsid()
+    resource.setrlimit(resource.RLIMIT_CPU, (limit, limit + 1))
+    silent = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(silent, 1)
+    os.dup2(silent, 2)
+    os.chdir(_place)
+    sys.path[:0] = [str(_place)]
+    chosen = _Chosen(tests)
+    files = sorted({test.partition("::")[0] for test in tests})
+    line = ["-x", "-q", "-p", "no:cacheprovider", "--tb=no", *files]
+    return f"{int(pytest.main(line, plugins=[chosen]))} {chosen.failed}"
 
 
 def _end_group(child: int) -> None:

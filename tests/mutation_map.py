@@ -39,7 +39,7 @@ class Map(NamedTuple):
     """What each test executes."""
 
     lines: dict[str, dict[int, set[str]]]  # file -> line -> tests
-    seconds: dict[str, float]  # of a test, the fixtures that it shares left out
+    seconds: dict[str, float]  # of the processor, for a test and the fixtures that were made for it
 
 
 class Recorder:
@@ -48,7 +48,6 @@ class Recorder:
     def __init__(self, folder: Path) -> None:
         """Write below a folder, under names of this process, test after test."""
         self.seen = folder / f"seen-{os.getpid()}.jsonl"
-        self.spent = 0.0
         self.places: list[str] = [""]
         import coverage
 
@@ -74,14 +73,14 @@ class Recorder:
         """A test is a context."""
         shared = item._fixtureinfo.name2fixturedefs.values()  # type: ignore[attr-defined]
         names = [_name(each[-1]) for each in shared if each[-1].scope != "function"]
-        self.spent = 0.0
+        begun = _processor_seconds()
         self.enter(item.nodeid)
         try:
             return (yield)
         finally:
             self.leave()
             with self.seen.open("a") as file:
-                print(json.dumps([item.nodeid, names, self.spent]), file=file)
+                print(json.dumps([item.nodeid, names, _processor_seconds() - begun]), file=file)
 
     @pytest.hookimpl(wrapper=True)
     def pytest_fixture_setup(self, fixturedef: Any) -> Iterator[None]:
@@ -94,10 +93,6 @@ class Recorder:
         finally:
             self.leave()
 
-    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        """Note how long a test took."""
-        self.spent += report.duration
-
     def pytest_sessionfinish(self) -> None:
         """Write what was seen."""
         self.measuring.stop()
@@ -108,6 +103,11 @@ def pytest_configure(config: pytest.Config) -> None:
     """Where this is named as a plugin: measure, but not in the process that only hands tests out."""
     if hasattr(config, "workerinput") or not config.getoption("numprocesses", None):
         config.pluginmanager.register(Recorder(Path(os.environ["STAF_MUTATION_FOLDER"])))
+
+
+def _processor_seconds() -> float:
+    """Of this process and those that it has waited for: no other program on the machine counts."""
+    return sum(os.times()[:4])
 
 
 def _name(fixture: Any) -> str:
@@ -224,7 +224,7 @@ def tests_near(
     """Tests that execute some lines.
 
     Where none does, because the lines run at import: those of the lines' own function or class, or else of
-    the file.
+    the file, or else of the folder.
 
     Args:
         known: the map.
@@ -234,7 +234,7 @@ def tests_near(
         inside: first and last line of the function or class around.
 
     Returns:
-        The tests, and whether they execute the lines themselves.
+        The tests; none where the folder has none.
     """
     there = known.lines.get(file, {})
     order = sorted(there)
@@ -242,5 +242,11 @@ def tests_near(
         span = order[bisect.bisect_left(order, begin) : bisect.bisect_right(order, end)]
         hits = set().union(*(there[number] for number in span)) if span else set()
         if hits:
-            return hits, (begin, end) == (first, last)
-    return set(), False
+            return hits
+    return {test for test in known.seconds if test.startswith(places(file))}
+
+
+def places(file: str) -> tuple[str, ...]:
+    """Where the tests of a file's own folder are."""
+    room = file.split("/")[1].removesuffix(".py")
+    return f"tests/{room}/", f"tests/test_{room}"
