@@ -36,7 +36,7 @@ PRELOADED = ("torch", "torch._dynamo", "numpy", "scipy.linalg", "matplotlib.pypl
 
 
 def main() -> int:
-    """Run the command line; the exit code is 1 where a mutant that is not accepted survives."""
+    """Run the command line; the exit code is 1 where too few of them are killed."""
     options = _options()
     begun = time.monotonic()
     with tempfile.TemporaryDirectory(prefix="staf-mutation-") as scratch:
@@ -49,14 +49,15 @@ def main() -> int:
         print(f"{len(found)} mutants, {len(chosen)} of them by seed {options.seed}", flush=True)
         _prepare(tree)
         verdicts = []
-        arguments = tree, known, CACHE.parent / "staf_torch", begun + 60 * options.minutes
+        until = begun + 60 * options.minutes
+        arguments = tree, known, CACHE.parent / "staf_torch", options.seconds, until
         with multiprocessing.get_context("fork").Pool(options.jobs, begin, arguments) as pool:
             for verdict in pool.imap_unordered(judge, chosen):
                 if verdict is not None:
                     verdicts.append(verdict)
                     _tell(verdict)
     print(f"{time.monotonic() - begun:.0f} s; no time for {len(chosen) - len(verdicts)} of the sample")
-    return _report(verdicts)
+    return int(_report(verdicts) < options.least)
 
 
 def _options() -> argparse.Namespace:
@@ -67,6 +68,8 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--file", nargs="*", default=[], help="files, staf_torch/...; all by default")
     parser.add_argument("--commit", default="HEAD")
     parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--seconds", type=float, default=45, help="of tests that a mutant is given")
+    parser.add_argument("--least", type=float, default=95, help="score in percent that is asked for")
     parser.add_argument("--minutes", type=float, default=600, help="after which no mutant is begun")
     return parser.parse_args()
 
@@ -147,7 +150,8 @@ def _tell(verdict: Verdict) -> None:
     )
 
 
-def _report(verdicts: list[Verdict]) -> int:
+def _report(verdicts: list[Verdict]) -> float:
+    """Print a row a room; the score of all in percent, without the accepted ones."""
     rooms: dict[str, Counter[str]] = defaultdict(Counter)
     for verdict in verdicts:
         rooms[verdict.mutant.file.split("/")[1]][verdict.said] += 1
@@ -158,7 +162,8 @@ def _report(verdicts: list[Verdict]) -> int:
         score = f"{100 * count['killed'] / counted:.0f} %" if counted else "-"
         row = f"{count['killed']:7} {count['survived']:9} {count['unreached']:10} {count['accepted']:9}"
         print(f"{room:16} {row} {score:>6}")
-    return int(rooms["all"]["survived"] + rooms["all"]["unreached"] > 0)
+    counted = sum(rooms["all"][said] for said in ("killed", "survived", "unreached"))
+    return 100 * rooms["all"]["killed"] / max(counted, 1)
 
 
 if __name__ == "__main__":

@@ -19,8 +19,7 @@ from mutants import Mutant
 from mutants_accepted import ACCEPTED
 from mutation_map import Map, places, tests_near
 
-SECONDS = 45.0  # of tests that a mutant is given, by what they took with the right code
-TESTS = 150  # at most
+OVERHEAD = 0.1  # seconds that a test costs beside what was measured
 PATIENCE = 10  # seconds by the clock for one of the processor, on a machine that is shared
 
 
@@ -36,20 +35,22 @@ class Verdict(NamedTuple):
 
 _place = Path()
 _map = Map({}, {})
+_seconds = 0.0
 _until = 0.0
 
 
-def begin(tree: Path, known: Map, compiled: Path, until: float) -> None:
+def begin(tree: Path, known: Map, compiled: Path, seconds: float, until: float) -> None:
     """Make a copy of a tree, which this process alone changes.
 
     Args:
         tree: the right one.
         known: which test executes which line.
         compiled: folder of the programs that are compiled already; what a mutant compiles goes elsewhere.
+        seconds: of tests that a mutant is given, by what they took with the right code.
         until: reading of `time.monotonic` after which no mutant is begun.
     """
-    global _place, _map, _until
-    _place, _map, _until = tree.parent / f"tree-{os.getpid()}", known, until
+    global _place, _map, _seconds, _until
+    _place, _map, _seconds, _until = tree.parent / f"tree-{os.getpid()}", known, seconds, until
     shutil.copytree(tree, _place, ignore=shutil.ignore_patterns(".assets"))
     programs = tree.parent / f"cache-{os.getpid()}"
     (programs / "staf_torch").mkdir(parents=True)
@@ -86,8 +87,8 @@ def _tests_for(mutant: Mutant, source: str) -> list[str]:
     chosen: list[str] = []
     total = 0.0
     for test in sorted(hits, key=lambda test: (near[test], _map.seconds.get(test, 0.0), test)):
-        total += _map.seconds.get(test, 0.0)
-        if chosen and (total > SECONDS or len(chosen) == TESTS):
+        total += _map.seconds.get(test, 0.0) + OVERHEAD
+        if chosen and total > _seconds:
             break
         chosen.append(test)
     return chosen
