@@ -2,10 +2,10 @@
 
     python tests/matrix.py [--quick] [--only lowest newest] [--tests tests/kernels] [--jobs 2] [--order SEED]
 
-Environments are built once below `--place` (`~/.cache/staf_torch-matrix` by default, some gigabytes each), and
+Environments are built once below `--place` (`~/.cache/staf_torch-matrix` by default, some gigabytes each) and
 used again: torch from the index brings CUDA. Each runs the whole suite, with `--quick` the tests that versions
-and means touch, in an order by chance where a seed is given. What cannot be built here is said, with pip's
-last line. The last table: `tests/README.md`.
+and means touch, in an order by chance where a seed is given. What cannot be built here is said, with the last
+line of pip. The last table: `tests/README.md`.
 """
 
 from __future__ import annotations
