@@ -3,9 +3,9 @@
     python tests/matrix.py [--quick] [--only lowest newest] [--tests tests/kernels] [--jobs 2] [--order SEED]
 
 Environments are built once below `--place` (`~/.cache/staf_torch-matrix` by default, some gigabytes each) and
-used again: torch from the index brings CUDA. Each runs the whole suite, with `--quick` the tests that versions
-and means touch, in an order by chance where a seed is given. What cannot be built here is said, with the last
-line of pip. The last table: `tests/README.md`.
+used again: torch from the index brings CUDA. Each runs the whole suite, with `--quick` the tests that touch
+versions and means, in an order by chance where a seed is given. What cannot be built here is said, with the
+last line of pip. The last table: `tests/README.md`.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ QUICK = (
     "tests/test_variants.py",
     "tests/cli/test_cli_errors.py",
     "tests/lanes/test_program.py",
-    "tests/engine/test_guards.py",
+    "tests/engine/test_chase.py",
     "tests/approximation/test_layers_compiled.py",
     "tests/deploy/test_deploy.py",
 )
