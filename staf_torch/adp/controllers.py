@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import pad
 
 from ..numerics.checks import real
 from ..numerics.linalg import riccati
@@ -134,7 +135,8 @@ class Feedback(Controller):
 
 class LQR(nn.Module):
     """u = u_s - K (x - x_s) with K = R^-1 B'P and P from the Riccati equation of the linearisation at the
-    set-point x_s of the cost, where u_s holds the plant; angles are differences in [-pi, pi].
+    set-point x_s of the cost, where u_s holds the plant; angles are differences in [-pi, pi]. Of a
+    `TrackingCost` P and K are those of the plant's equilibrium, and x_s moves along the path.
 
     With bounds u is clipped to them, with a `BoundedInputCost` smoothly. A control that is held for long
     needs other gains: with a ``period`` P and K are those of the linear plant whose control is held.
@@ -168,14 +170,17 @@ class LQR(nn.Module):
         super().__init__()
         self.cost = cost.around(system)
         self.period = system.period if period is None else period
+        system, still = self.cost.regulated(system)
         if self.period is None:
-            a, b = system.linearisation(self.cost.target, self.cost.target_input)
+            a, b = system.linearisation(still.target, still.target_input)
             name = type(system).__name__
             rest = 0.5 * cost.discount * torch.eye(len(a), dtype=a.dtype)
-            p = riccati(a - rest, b, self.cost.state_curvature(), cost.r, name=name)
+            p = riccati(a - rest, b, still.state_curvature(), cost.r, name=name)
             k = cost.r_inverse @ b.to(p).mT @ p
         else:
-            p, k = held_riccati(system, self.cost, self.period)
+            p, k = held_riccati(system, still, self.period)
+        clock = self.cost.dim - len(p)
+        p, k = pad(p, (0, clock, 0, clock)), pad(k, (0, clock))
         self.register_buffer("p", p)
         self.register_buffer("k", k)
         self.p: Tensor
