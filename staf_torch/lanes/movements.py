@@ -48,7 +48,7 @@ MOVEMENTS = frozenset(
 
 def moved(t: Tracer, func: Any, out: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> Any:
     """The nodes of what an operation of `MOVEMENTS` returns; arguments as of `lowering.lower`."""
-    name = func._schema.name.removeprefix("aten::")
+    name = func._schema.name.removeprefix("aten::").removesuffix("_")
     named = [argument.name for argument in func._schema.arguments]
     at = next((k for k, argument in enumerate(named) if argument in ("index", "indices")), None)
     if name == "index_put" and (kwargs.get("accumulate") or (len(args) > 3 and args[3])):
@@ -117,6 +117,10 @@ def _indexed(
 ) -> Ids:
     """gather, scatter and selection at an index that a row computes, or that numbers of the table do."""
     kind = t.kind(out.dtype)
+    if name == "index_put" and len(dim) == 1 and dim[0].dtype == torch.bool and index.numel() == 1:
+        chosen = t.nodes(dim[0])  # y[y > 1] = 1
+        chosen = chosen.reshape(*chosen.shape, *[1] * (a.dim() - chosen.ndim))
+        return t.map("where", chosen, t.nodes(index, kind).reshape(()), t.nodes(a, kind))
     if name == "index" and sum(i is not None for i in dim) == 1:
         axis = next(k for k, i in enumerate(dim) if i is not None)
         name, dim, index = "index_select", axis, dim[axis]

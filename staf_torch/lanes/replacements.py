@@ -142,6 +142,16 @@ def searchsorted(
     return passed.to(torch.int32 if out_int32 else torch.int64).sum(-1)
 
 
+def fmin(a: Tensor, b: Tensor) -> Tensor:
+    """The smaller of two; what is a number where the other is NaN."""
+    return torch.where(a.isnan(), b, torch.where(b.isnan(), a, torch.minimum(a, b)))
+
+
+def fmax(a: Tensor, b: Tensor) -> Tensor:
+    """The larger of two; what is a number where the other is NaN."""
+    return torch.where(a.isnan(), b, torch.where(b.isnan(), a, torch.maximum(a, b)))
+
+
 def angle(x: Tensor) -> Tensor:
     """The angle of real numbers: 0, or pi where negative."""
     return torch.where(x < 0, torch.pi, x * 0)
@@ -160,4 +170,6 @@ REPLACEMENTS: dict[str, Callable[..., Any]] = {
     "prims::var": _variance,
     "searchsorted": searchsorted,
     "angle": angle,
+    "fmin": fmin,
+    "fmax": fmax,
 }

@@ -38,6 +38,13 @@ def lookup(x: Tensor) -> Tensor:
     return (at - 1) + (x - low) / (high - low)
 
 
+def masked(x: Tensor) -> Tensor:
+    y = x.clone()
+    y[y > 0.5] = 0.25
+    y[y[:, 0] < 0] = torch.tensor(-1.0, dtype=x.dtype)
+    return y
+
+
 OPERATIONS: dict[str, Callable[[Tensor], Tensor]] = {
     "remainder": wrapped,
     "remainder by a row": lambda x: torch.remainder(x * 30, x.flip(-1)),
@@ -77,6 +84,8 @@ OPERATIONS: dict[str, Callable[[Tensor], Tensor]] = {
     "index_fill": lambda x: x.index_fill(-1, LIST, 0.25),
     "index_add": lambda x: x.index_add(-1, LIST, x[:, 1:], alpha=2.0),
     "squeezed in place": lambda x: x.clone().unsqueeze_(-1).squeeze_(-1),
+    "chosen by a mask": masked,
+    "fmin": lambda x: torch.fmin(x, torch.fmax(x.flip(-1), torch.tensor(0.1))),
     "slope of a list": slope(lambda x: x[:, [1, 0, 1, 1]].cumprod(-1)),
     "slope of a product": slope(lambda x: x.prod(-1)),
     "slope of a sort": slope(lambda x: x.sort(-1)[0] * torch.arange(SIZE)),
