@@ -176,10 +176,36 @@ WITH_FAR(tan, with_zero(turned(r, rest, n) / turned(r, rest, n + 1), x))
         EACH_LANE(single ? __builtin_##name##f(lane[l]) : __builtin_##name(lane[l]))                        \
     }
 LIBM(asin) LIBM(acos) LIBM(atan) LIBM(sinh) LIBM(cosh) LIBM(log2) LIBM(log10) LIBM(exp2) LIBM(erf)
+LIBM(asinh) LIBM(acosh) LIBM(atanh) LIBM(erfc) LIBM(lgamma)
 #define LIBM_TWO(name)                                                                                      \
     static __attribute__((noinline)) V name(V x, V y) {                                                     \
         REAL other[W];                                                                                      \
         store(other, y);                                                                                    \
         EACH_LANE(single ? __builtin_##name##f(lane[l], other[l]) : __builtin_##name(lane[l], other[l]))    \
     }
-LIBM_TWO(atan2) LIBM_TWO(pow)
+LIBM_TWO(atan2) LIBM_TWO(pow) LIBM_TWO(hypot)
+INLINE V copysign(V size, V sign) { return with_sign(abs(size), sign); }
+
+// x - q y with q = x / y towards 0. The quotient as it is rounded may be one off, also across a whole number; the
+// rest is exact with one rounding, and so is the step back. Large quotients go to the library's own function.
+#if defined(__AVX512F__) || defined(__FMA__) || defined(__ARM_FEATURE_FMA)
+static __attribute__((noinline)) V far_fmod(V x, V y, V found, M distant) {
+    const V chosen = number(distant);
+    REAL a[W], b[W], out[W], other[W];
+    store(a, x), store(b, y), store(out, found), store(other, chosen);
+    for (int l = 0; l < W; ++l)
+        if (other[l] != 0) out[l] = single ? __builtin_fmodf(a[l], b[l]) : __builtin_fmod(a[l], b[l]);
+    return load(out);
+}
+INLINE V fmod(V x, V y) {
+    const V size = abs(x), unit = abs(y), whole = floor(size / unit);
+    const M near = (whole < F::whole) & (unit < REAL(__builtin_inf()));
+    V rest = fma(-whole, unit, size);
+    rest = rest < 0 ? rest + unit : rest;
+    rest = rest >= unit ? rest - unit : rest;
+    const V found = with_sign(abs(rest), x);
+    return __builtin_expect(any(~near), 0) ? far_fmod(x, y, found, ~near) : found;
+}
+#else
+LIBM_TWO(fmod)
+#endif
