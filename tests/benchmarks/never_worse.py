@@ -3,7 +3,8 @@
     python tests/benchmarks/never_worse.py [--states 300] [--only TwoState,Pendulum] [--json FILE]
 
 A row a plant: the cost of `adp.near_optimal(plan=False)` over that of its LQR where both regulate, and how
-many states each regulates. Ends with an error where a state costs more than 1.01 of the base's. Not collected by pytest.
+many states each regulates. Ends with an error where a state costs more than 1.01 of the base's. Not collected
+by pytest.
 """
 
 from __future__ import annotations
