@@ -57,10 +57,11 @@ class ChaseProblem:
     metrics: tuple[Metric, ...] = ()  # of the user's own
 
 
-def load(path: str, arguments: dict[str, Any] | None = None) -> Any:
+def load(path: str, arguments: dict[str, Any] | None = None, *, inner_steps: int | None = None) -> Any:
     """Return the object at a dotted path, for classes and functions outside the package.
 
-    A class is called with ``arguments``; anything else is returned as it is.
+    A class is called with ``arguments``; anything else is returned as it is. ``inner_steps`` is not used
+    here: it stands beside an update law in the settings and belongs to the chase.
 
     Raises:
         ValueError: if nothing is there, or arguments are given to something that is not a class.
