@@ -6,7 +6,8 @@ import copyreg
 import io
 import pickle
 import sys
-from collections.abc import Hashable
+from collections.abc import Hashable, Iterable, Mapping
+from itertools import chain
 from operator import is_
 from types import BuiltinFunctionType, FunctionType, MethodType
 from typing import Any
@@ -72,23 +73,39 @@ class Watch:
             return
         self.tensors = [*writer.tensors, *writer.others]
         self._versions = [tensor._version for tensor in self.tensors]
-        self._dicts = [(part, list(part.values())) for part in writer.dicts]
-        self._lists = [(part, list(part)) for part in writer.lists]
+        self._dicts, self._lists = writer.dicts, writer.lists
         self._sets = [(part, set(part)) for part in writer.sets]
+        self._code = _inside(writer.kept)
+        self._lengths, self._inside = self._look()
 
     def unchanged(self) -> bool:
         """Return whether nothing has changed since."""
         if self.blind:
             return False
-        for part, values in self._dicts:
-            if len(part) != len(values) or not all(map(is_, part.values(), values)):
-                return False
-        for row, values in self._lists:
-            if len(row) != len(values) or not all(map(is_, row, values)):
-                return False
+        lengths, inside = self._look()  # all at once: a hundred containers in ten microseconds
+        if lengths != self._lengths or not all(map(is_, inside, self._inside)):
+            return False
         if any(now != then for now, then in self._sets):
             return False
         return [tensor._version for tensor in self.tensors] == self._versions
+
+    def _look(self) -> tuple[list[int], list[Any]]:
+        """The lengths of all containers, and what is in them."""
+        maps = [*self._dicts, *self._code]  # a method may be replaced
+        inside = [value for part in maps for value in part.values()]
+        inside += chain.from_iterable(self._lists)
+        return [*map(len, maps), *map(len, self._lists)], inside
+
+
+def code(key: Any) -> list[Mapping[str, Any]]:
+    """Return what is in the classes that a key of `skeleton` names, and in their bases: methods above all."""
+    _, kept = key
+    return _inside(kept)
+
+
+def _inside(kept: Iterable[object]) -> list[Mapping[str, Any]]:
+    named = [each for each in dict.fromkeys(kept) if isinstance(each, type)]
+    return [vars(kind) for each in named for kind in each.__mro__ if kind is not object]
 
 
 def _written(objects: tuple[Any, ...]) -> _Writer | None:
