@@ -15,7 +15,7 @@ from ..centers import simplex
 from ..kernels import GaussianKernel
 from ..lanes.build import compiled
 from .bank_definition import BankDefinition
-from .bank_rules import CARRIED_RADIUS, CARRIED_WIDTH, BankShape, Rules, size
+from .bank_rules import CARRIED_RADIUS, CARRIED_WIDTH, TRACKED, BankShape, Rules, size
 from .compiled_filter import FunctionPointers
 from .filter_streams import refuse_other
 from .local_functions import LocalFunctions
@@ -154,5 +154,5 @@ class Bank:
 @functools.cache
 def _built(shape: BankShape) -> Callable[..., None] | None:
     sizes = f"DIM={shape.dim}", f"COUNT={shape.dim + 1}", f"OUTPUTS={shape.outputs}"
-    kept = f"CAPACITY={shape.capacity}", f"NEIGHBOURS={shape.neighbours}"
+    kept = f"CAPACITY={shape.capacity}", f"NEIGHBOURS={shape.neighbours}", f"TRACKED={TRACKED}"
     return compiled(Path(__file__).with_name("_bank.cpp"), *sizes, *kept)
