@@ -293,8 +293,9 @@ static void ask(const Rules &r, Stream &s, const double *x) {
             variances[locals + carried + lanes + l] = tracked_spread[l];
         }
         means[members - 2] = line[o], variances[members - 2] = spread;
-        means[members - 1] = in_units(r, s, o, s.last_y[o]), variances[members - 1] = 1;
-        const double low = in_units(r, s, o, s.low[o]), high = in_units(r, s, o, s.high[o]);
+        const double last = s.waiting ? s.waiting_y[o] : s.last_y[o];
+        means[members - 1] = in_units(r, s, o, last), variances[members - 1] = 1;
+        const double low = in_units(r, s, o, std::min(s.low[o], last)), high = in_units(r, s, o, std::max(s.high[o], last));
         const double wide = r.margin * (high - low);
         for (int i = 0; i < members; ++i) {
             if (!(means[i] - means[i] == 0)) means[i] = means[members - 1];  // x itself may not be finite
@@ -353,34 +354,30 @@ static void accept(const Rules &r, Stream &s, const double *x, const double *y, 
     else carry(r, s, x, y, lapse);
 }
 
-// Whether a sample that nobody expected waits: it is learned as it is if the next one is alike, else within limits.
-static bool waits(const Rules &r, Stream &s, const double *x, const double *y, const double *told, double lapse) {
+// Whether a sample that nobody expected waits: it is learned if the next one is as far off, else skipped.
+static bool waits(const Rules &r, Stream &s, const double *x, const double *y, const double *told, double &lapse) {
     bool doubtful = false;
     for (int o = 0; o < K; ++o) {
-        const double error = in_units(r, s, o, y[o]) - s.mean[o];
-        doubtful |= told[o] == told[o] && square(error) > square(r.doubtful) * std::max(s.variance[o], s.pace[o]);
+        const double error = std::fabs(in_units(r, s, o, y[o]) - s.mean[o]);
+        const double most = error > r.outside ? r.doubtful_outside : r.doubtful;
+        doubtful |= told[o] == told[o] && square(error) > square(most) * std::max(s.variance[o], s.pace[o]);
     }
-    if (doubtful && s.clock >= r.settled && s.trust == 0) {
-        if (s.waiting == 0) {
+    const bool waiting = s.waiting, rare = s.doubted < r.rare;
+    s.doubted += r.doubted_rate * (doubtful - s.doubted);
+    if (doubtful && rare && s.clock >= r.settled && s.trust == 0) {
+        s.waiting = !waiting;
+        if (!waiting) {
             std::copy(x, x + n, s.waiting_x);
             std::copy(y, y + K, s.waiting_y);
-            for (int o = 0; o < K; ++o) {
-                const double most = r.doubtful * std::sqrt(std::max(s.variance[o], s.pace[o]));
-                const double limited = std::min(std::max(in_units(r, s, o, y[o]), s.mean[o] - most), s.mean[o] + most);
-                s.limited_y[o] = limited * scale_of(r, s, n + o) + shift_of(r, s, n + o);
-            }
-            notice(s, y);
-            s.waiting = 1, s.waiting_time = s.time, s.waiting_lapse = lapse;
+            s.waiting_time = s.time, s.waiting_lapse = lapse;
             return true;
         }
-        s.waiting = 0, s.trust = streak_limit;
+        s.trust = streak_limit;
+        notice(s, s.waiting_y);
         accept(r, s, s.waiting_x, s.waiting_y, s.waiting_time, s.waiting_lapse);
         return false;
     }
-    if (s.waiting) {
-        s.waiting = 0;
-        accept(r, s, s.waiting_x, s.limited_y, s.waiting_time, s.waiting_lapse);
-    }
+    if (waiting) s.waiting = 0, s.skipped += 1, lapse += s.waiting_lapse;
     s.trust = std::max(s.trust - 1, 0.);
     return false;
 }

@@ -17,8 +17,9 @@ struct Rules {  // see bank.py
     double members_rate, error_rate, linear_forgetting, linear_prior, recent, floor, margin, far, outlying;
     double rescaled[9], scaling, carried_forgetting[carried], carried_ratio, carried_slack2;
     double quadratic_forgetting[lanes], quadratic_prior[lanes], pace, correction_prior, correction_forgetting;
-    double correction_most, correction_discount, correction_share, least, doubt, doubtful, settled;
-    double squares_discount, squares_rate, squares_share, own_rate, best_rate, largest;
+    double correction_most, correction_discount, correction_share, least, doubt;
+    double doubtful, doubtful_outside, outside, rare, doubted_rate, settled;
+    double squares_discount, squares_rate, squares_share, own_rate, best_rate, largest, uncalibrated;
     TrackerRules trackers;
     Functions functions;
 };
@@ -26,7 +27,7 @@ struct Rules {  // see bank.py
 struct Stream {  // the row of a stream in the table of bank.py
     double clock, count, far, skipped, learned, time;
     double last_x[n], last_y[K], asked[n], answered;
-    double waiting, trust, waiting_time, waiting_lapse, waiting_x[n], waiting_y[K], limited_y[K];
+    double waiting, trust, doubted, waiting_time, waiting_lapse, waiting_x[n], waiting_y[K];
     double center[n + K], spread[n + K];
     double covariance[unknowns][unknowns], linear[K][unknowns];
     double filters[sizeof(Filter) / sizeof(double)];

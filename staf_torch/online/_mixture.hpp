@@ -123,7 +123,8 @@ static void judge_members(const Rules &r, Stream &s, int o, double value) {
     const double t = s.clock, error = value - s.mean[o], blended = value - s.blend[o][0];
     learn_correction(r, s, o, blended);
     const double z2 = error * error / std::max(s.variance[o] / s.calibration[o], 1e-300);
-    s.calibration[o] += std::max(r.error_rate, 1 / (t + 5)) * (std::min(z2, surprise * s.calibration[o]) - s.calibration[o]);
+    const double surprised = std::min(z2, surprise * s.calibration[o]) - s.calibration[o], since = t - r.uncalibrated;
+    if (since > 0) s.calibration[o] += std::max(r.error_rate, 1 / (since + 5)) * surprised;
     s.calibration[o] = std::min(std::max(s.calibration[o], 1e-6), 1e2);
     auto follow = [&](double &running, double found, double rate, double most) {
         running += std::max(rate, 1 / (t + 1)) * (std::min(found, most * running) - running);

@@ -62,10 +62,15 @@ class Rules(NamedTuple):
     linear_forgetting: float = 0.999
     linear_prior: float = 100.0  # variance of the coefficients
     recent: float = RECENT
-    floor: float = 1e-3  # of the variance, in running squared errors
+    floor: float = 0.05  # of the variance, in running squared errors
+    uncalibrated: float = 3.0  # samples before the errors have a say in the size of the variance
     margin: float = 0.1  # how far beyond the range of y a member may go
     far: float = 1e3  # spreads from the center beyond which a sample is not believed
-    doubtful: float = math.inf  # deviations beyond which a sample waits for another one such to be believed
+    doubtful: float = 30.0  # deviations beyond which a sample waits for another one such to be believed
+    doubtful_outside: float = 8.0  # the same for an error of more than ``outside`` spreads of y
+    outside: float = 12.0
+    rare: float = 0.05  # share of samples that are doubted: beyond, none waits
+    doubted_rate: float = 0.01  # of this running share
     settled: float = 10.0  # samples before which none waits
     outlying: float = 30.0  # median deviations beyond which a value has no say in the units
     learned_at: tuple[int, ...] = (2, 5, 10, 20, 40, 80, 160, 320)  # samples after which units are learned: all are kept
@@ -94,12 +99,13 @@ class Rules(NamedTuple):
     least: float = 1e-16  # of a member's running scale
 
     @classmethod
-    def of(cls, dim: int, scaling: bool, doubtful: float = math.inf) -> Rules:
+    def of(cls, dim: int, scaling: bool, doubtful: float | None = None) -> Rules:
         """The rules for inputs (n,); widths in units of sqrt(n)."""
         rates = tuple(1 / (2 * width**2 * dim) for width in (0.5, 1.5, 15.0))
         slack = CARRIED_RADIUS * CARRIED_WIDTH * math.sqrt(dim)
         tracker_rates = tuple(1 / (2 * width**2 * dim) for width in cls._field_defaults["tracker_width"])
-        return cls(rates, scaling, slack, doubtful=doubtful, tracker_rate=tracker_rates)
+        found = cls(rates, scaling, slack, tracker_rate=tracker_rates)
+        return found if doubtful is None else found._replace(doubtful=doubtful, doubtful_outside=doubtful)
 
     def numbers(self) -> list[float]:
         """In the order of `Rules` in _bank.cpp."""
@@ -113,9 +119,10 @@ class Rules(NamedTuple):
         found += [*self.forgetting, self.carried_ratio, self.carried_slack**2]
         found += [*self.quadratic_forgetting, *self.quadratic_prior, self.pace, self.correction_prior]
         found += [self.correction_forgetting, self.correction_most, self.correction_discount]
-        found += [self.correction_share, self.least, self.doubt, self.doubtful, self.settled]
+        found += [self.correction_share, self.least, self.doubt, self.doubtful, self.doubtful_outside]
+        found += [self.outside, self.rare, self.doubted_rate, self.settled]
         found += [self.squares_discount, self.squares_rate, self.squares_share, self.own_rate]
-        found += [self.best_rate, self.largest, *self.tracker_rate, *self.tracker_noise]
+        found += [self.best_rate, self.largest, self.uncalibrated, *self.tracker_rate, *self.tracker_noise]
         return [*found, *self.tracker_forgetting, self.tracker_jitter, self.tracker_wrong]
 
 
@@ -129,10 +136,9 @@ def layout(shape: BankShape) -> list[tuple[str, tuple[int, ...]]]:
         ("last_y", (k,)),
         ("asked", (n,)),
         ("answered", ()),
-        *((name, ()) for name in ("waiting", "trust", "waiting_time", "waiting_lapse")),
+        *((name, ()) for name in ("waiting", "trust", "doubted", "waiting_time", "waiting_lapse")),
         ("waiting_x", (n,)),  # a sample that nobody expected, until the next one tells
         ("waiting_y", (k,)),
-        ("limited_y", (k,)),  # what is learned of it if it was alone
         ("center", (n + k,)),
         ("spread", (n + k,)),
         ("covariance", (n + 1, n + 1)),

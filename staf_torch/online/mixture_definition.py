@@ -69,8 +69,9 @@ def judge(r: Rules, s: dict[str, Tensor], value: Tensor, told: Tensor, t: float)
     error, blended = value - s["mean"], value - s["blend"][:, 0]
     _learn_correction(r, s, blended, told)
     z2 = error.square() / (s["variance"] / s["calibration"]).clamp(min=1e-300)
-    before, floor = s["calibration"].clone(), max(r.error_rate, 1 / (t + 5))
-    found = before + floor * (torch.minimum(z2, SURPRISE * before) - before)
+    before, since = s["calibration"].clone(), t - r.uncalibrated
+    rate = max(r.error_rate, 1 / (since + 5)) if since > 0 else 0.0
+    found = before + rate * (torch.minimum(z2, SURPRISE * before) - before)
     s["calibration"].copy_(torch.where(told, found.clamp(1e-6, 1e2), before))
     of_blends = (value[:, None] - s["blend"]).square()
     scores = _student(r, of_blends.sqrt(), s["own"].clamp(min=_LEAST)[:, None])

@@ -10,6 +10,7 @@ regression", IEEE Trans. Neural Netw. Learn. Syst. 23 (2012), in the numbers of 
 
 from __future__ import annotations
 
+import functools
 from typing import NamedTuple
 
 import torch
@@ -65,7 +66,7 @@ class TrackerModels(NamedTuple):
             novel[lane] = False
         self.counts[0].copy_(torch.where(novel, self.counts[1], self.counts[0]))
         self.weights.copy_(weights)
-        first, second = torch.tril_indices(len(k), len(k))
+        first, second = _below(len(k))
         self.known.copy_(known[first, second])
         self.inverse.copy_(inverse[first, second])
         broken |= self._drifted(inverse, size, rate, jitter, wrong)
@@ -74,27 +75,30 @@ class TrackerModels(NamedTuple):
 
     def _drifted(self, inverse: Tensor, size: int, rate: Tensor, jitter: float, wrong: float) -> Tensor:
         """Whether the inverse times a column of the kernels is wrong, at one place a sample: (L,)."""
-        found = torch.zeros_like(rate, dtype=torch.bool)
-        for lane in range(len(rate)):
-            i = int(self.counts[2, lane])
-            i = i if i < size else 0
-            self.counts[2, lane] = i + 1
-            apart = (self.points[..., lane] - self.points[i, :, lane]).square().sum(-1)
-            column = (-rate[lane] * apart).exp()
-            column[i] += jitter
-            total = (inverse[i, :, lane] * column).sum()
-            found[lane] = bool(inverse[i, i, lane] != 0) and not bool((total - 1).abs() < wrong)
-        return found
+        lanes = torch.arange(len(rate))
+        at = torch.where(self.counts[2] < size, self.counts[2], 0.0).long()
+        self.counts[2] = at + 1
+        apart = (self.points.permute(2, 0, 1) - self.points[at, :, lanes][:, None]).square().sum(-1)
+        column = (-rate[:, None] * apart).exp()
+        column[lanes, at] += jitter
+        rows = inverse.permute(2, 0, 1)[lanes, at]  # (L, D)
+        right = ((rows * column).sum(-1) - 1).abs() < wrong
+        return torch.ne(rows[lanes, at], 0) & ~right
 
     def _kernels(self, x: Tensor, rate: Tensor) -> Tensor:
         """The kernels between the samples and x, (D, L)."""
         return (-rate * (self.points - x[:, None]).square().sum(1)).exp()
 
 
+@functools.cache
+def _below(size: int) -> Tensor:
+    return torch.tril_indices(size, size)
+
+
 def _whole(lower: Tensor) -> Tensor:
     """The symmetric matrices (D, D, L) of lower triangles by rows."""
     size = int((2 * len(lower)) ** 0.5)
-    first, second = torch.tril_indices(size, size)
+    first, second = _below(size)
     found = lower.new_zeros(size, size, lower.shape[-1])
     found[first, second] = lower
     found[second, first] = lower
