@@ -73,7 +73,16 @@ class Rules(NamedTuple):
     doubted_rate: float = 0.01  # of this running share
     settled: float = 10.0  # samples before which none waits
     outlying: float = 30.0  # median deviations beyond which a value has no say in the units
-    learned_at: tuple[int, ...] = (2, 5, 10, 20, 40, 80, 160, 320)  # samples after which units are learned: all are kept
+    learned_at: tuple[int, ...] = (
+        2,
+        5,
+        10,
+        20,
+        40,
+        80,
+        160,
+        320,
+    )  # samples after which units are learned: all are kept
     forgetting: tuple[float, ...] = (0.9, 0.95, 0.97, 0.98, 0.99, 0.995, 0.999, 1.0)  # of the filters
     carried_ratio: float = 1e-6  # variance of their noise
     quadratic_forgetting: tuple[float, ...] = (0.9999, 0.9999, 0.9999, 0.9999, 0.998, 0.99, 0.99, 0.97)

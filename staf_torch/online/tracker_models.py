@@ -33,7 +33,14 @@ class TrackerModels(NamedTuple):
         return (self.weights * k).sum(1), spread.clamp(min=0.0) + noise
 
     def learn(
-        self, x: Tensor, values: Tensor, rate: Tensor, noise: Tensor, share: Tensor, jitter: float, wrong: float
+        self,
+        x: Tensor,
+        values: Tensor,
+        rate: Tensor,
+        noise: Tensor,
+        share: Tensor,
+        jitter: float,
+        wrong: float,
     ) -> None:
         """Learn values (K,) at x (n,); share (L,) of what was known is still believed.
 

@@ -47,7 +47,9 @@ def test_full_process_keeps_its_size_and_what_matters() -> None:
     (x, y), models = samples(150), empty(24, outputs=2)
     learn(models, x, y)
     assert models.counts[1].max() <= 23
-    errors = torch.stack([models.predict(p, RATE, NOISE, JITTER)[0][:, 0] - v for p, v in zip(x, y, strict=True)])
+    errors = torch.stack(
+        [models.predict(p, RATE, NOISE, JITTER)[0][:, 0] - v for p, v in zip(x, y, strict=True)]
+    )
     assert errors.square().mean().sqrt() < 0.6 * y.std()
     inverse = torch.zeros(24, 24, dtype=torch.float64)
     first, second = torch.tril_indices(24, 24)
@@ -56,7 +58,9 @@ def test_full_process_keeps_its_size_and_what_matters() -> None:
     points = models.points[kept][..., 1]
     gram = (-RATE[1] * torch.cdist(points, points).square()).exp()
     identity = torch.eye(len(points), dtype=torch.float64)
-    torch.testing.assert_close(inverse[kept][:, kept] @ (gram + JITTER * identity), identity, rtol=0, atol=1e-6)
+    torch.testing.assert_close(
+        inverse[kept][:, kept] @ (gram + JITTER * identity), identity, rtol=0, atol=1e-6
+    )
 
 
 def test_sample_that_is_known_takes_no_place_and_still_teaches() -> None:
