@@ -58,8 +58,8 @@ class Bank:
         shape: sizes.
         streams: S.
         scaling: whether the units of x and y are learned, from the first 2, 5, 10, 20 and 40 samples.
-        doubtful: standard deviations beyond which a sample waits for the next one: if that is as far off, both
-            are learned, else the first is skipped. By default 30, and 8 for an error of more than 12
+        doubtful: standard deviations beyond which a sample waits for the next one: if that is as far off,
+            both are learned, else the first is skipped. By default 30, and 8 for an error of more than 12
             spreads of y. Where more than one in twenty is doubted, none waits.
     """
 

@@ -16,7 +16,7 @@ CARRIED_WIDTH, CARRIED_RADIUS = 8.0, 0.1  # of the filters: in sqrt(n), in width
 
 
 def group(member: int) -> int:
-    """The group of a member: local processes alike but for fading, latest, filters, quadratics, trackers, linear.
+    """Local processes alike but for fading, latest, filters, quadratics, trackers, linear: a member's group.
 
     -1 for the last value, which has no say in the correction.
     """

@@ -1,11 +1,12 @@
 """Gaussian processes on a few samples of the whole past, which fade, side by side: the definition.
 
-The mean of a process with the samples z at x is k' w, its variance 1 + jitter - k' B k, where k = k(z, x); the
-inverse Q of the kernels K between the samples tells whether a new one is known already. Processes are the last
-dimension; each has its own samples.
+The mean of a process with the samples z at x is k' w, its variance 1 + jitter - k' B k, where k = k(z, x);
+the inverse Q of the kernels K between the samples tells whether a new one is known already. Processes are the
+last dimension; each has its own samples.
 
-Source: Van Vaerenbergh, Lazaro-Gredilla and Santamaria, "Kernel recursive least-squares tracker for time-varying
-regression", IEEE Trans. Neural Netw. Learn. Syst. 23 (2012), in the numbers of Csato and Opper (2002).
+Source: Van Vaerenbergh, Lazaro-Gredilla and Santamaria, "Kernel recursive least-squares tracker for
+time-varying regression", IEEE Trans. Neural Netw. Learn. Syst. 23 (2012), in the numbers of Csato and Opper,
+"Sparse on-line Gaussian processes", Neural Computation 14 (2002).
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ class TrackerModels(NamedTuple):
         """Learn values (K,) at x (n,); share (L,) of what was known is still believed.
 
         A sample that the others span within 10 jitter leaves its mark on them alone. A full process gives up
-        the one without which its means change least. Where rounding has added up to ``wrong``, it begins anew.
+        the one without which its means change least. Where rounding has added up to ``wrong`` it begins anew.
         """
         k, known, inverse = self._kernels(x, rate), _whole(self.known), _whole(self.inverse)
         size = min(int(self.counts[1].max()) + 1, len(k))  # places in use, and one

@@ -1,13 +1,12 @@
-"""Public streams, every peer tuned: `python tests/benchmarks/streams.py [--earlier | --held-out] [--cache FILE]`.
+"""Public streams, peers tuned: `python tests/benchmarks/streams.py [--earlier|--held-out] [--cache FILE]`.
 
 One protocol: inputs and target standardised by the first fifth for the peers; every setting of a peer's grid
 runs over the first fifth, the one with the smallest error on its last two thirds then runs over the whole
 stream, predicting each sample before it learns it, and is scored on the other four fifths (root mean square).
 `StaFRegressor(memory=1000)` has one default for all, and raw units. Before the table kafbox's Lorenz is
 reproduced (embedding 6, ALD-KRLS, -40.17 dB after 1000 samples). `--cache` keeps the peers' results, which
-take a quarter of an hour. `--earlier` and `--held-out` take the streams of streams_held_out.py, `--sets` some by
-name.
-Peers that are not installed are named and skipped: `pip install -e '.[bench]'`.
+take a quarter of an hour. `--earlier` and `--held-out` take the streams of streams_held_out.py, `--sets` some
+by name. Peers that are not installed are named and skipped: `pip install -e '.[bench]'`.
 """
 
 from __future__ import annotations
