@@ -18,9 +18,14 @@ struct Trackers {
 
     static int triangle(int i, int j) { return i > j ? i * (i + 1) / 2 + j : j * (j + 1) / 2 + i; }
 
+    static void clear(Row *from, int count, Mask where) {
+        for (int i = 0; i < count; ++i) from[i] = where ? V{} : V(from[i]);
+    }
     void restart(Mask where) {
-        Row *entry = points[0];
-        for (size_t i = 0; i < sizeof(Trackers) / sizeof(Row); ++i) entry[i] = where ? V{} : V(entry[i]);
+        for (int i = 0; i < D; ++i) clear(points[i], n, where);
+        for (int o = 0; o < K; ++o) clear(weights[o], D, where);
+        clear(known, entries, where), clear(inverse, entries, where);
+        clear(&vacant, 1, where), clear(&count, 1, where), clear(&turn, 1, where);
     }
 
     int used() const {
