@@ -183,7 +183,7 @@ class BoxFilter(nn.Module):
                 dim=-1,
             )
 
-        value, pull = torch.func.vjp(conditions, u)
+        value, pull = torch.func.vjp(conditions, u)  # type: ignore[misc]
         # Reverse mode: forward mode in plain torch takes a hundred times as long, for its own reasons.
         normal = torch.stack(
             [pull(one.expand_as(value))[0] for one in torch.eye(len(self.walls)).to(u)], dim=1
@@ -263,7 +263,8 @@ def _degrees(box: Barrier) -> list[int]:
 
         def pushed(u: Tensor) -> Tensor:
             slope = torch.func.grad(speed)(x, u)
-            return (slope * plant.motion(x, u)).sum()
+            rate: Tensor = (slope * plant.motion(x, u)).sum()
+            return rate
 
         effects = torch.func.grad(speed, argnums=1)(x, rest), torch.func.grad(pushed)(rest)
         found.append(next((n for n, one in enumerate(effects, 1) if bool((one.abs() > _NOTHING).any())), 0))

@@ -112,7 +112,7 @@ class ClosedLoop(nn.Module):
         return self.holding(x, u)
 
     def _renewed(self, x: Tensor) -> Tensor:
-        u = self.controller.policy(x)  # type: ignore[union-attr, operator]
+        u = self.controller.policy(x)  # type: ignore[operator]
         return u if self.cost.bounds is None else self.cost.bounds.clip(u)
 
 

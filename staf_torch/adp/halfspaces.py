@@ -124,8 +124,8 @@ def _in_plane(wanted: Tensor, unit: Tensor, far: Tensor, low: Tensor, high: Tens
     corners = torch.stack((one * d - other * c, other * a - one * b), dim=-1) / (a * d - b * c).unsqueeze(-1)
     points = torch.cat((feet, corners), dim=-2)  # (..., P, 2)
     rounded = torch.full((len(pairs) + total, total), _ROUNDED, dtype=wanted.dtype, device=wanted.device)
-    for row, edges in enumerate([(k,) for k in range(total)] + pairs):
-        rounded[row, list(edges)] = _OWN
+    for row, edges in enumerate([[k] for k in range(total)] + [list(pair) for pair in pairs]):
+        rounded[row, edges] = _OWN
     scale = 1 + wanted.abs().amax(-1, keepdim=True) + far.abs().amax(-1, keepdim=True) + points.abs().amax(-1)
     short = aims.unsqueeze(-2) - (lines.unsqueeze(-3) * points.unsqueeze(-2)).sum(-1)
     fits = (short <= rounded * torch.finfo(wanted.dtype).eps * scale.unsqueeze(-1)).all(-1)

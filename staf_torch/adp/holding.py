@@ -93,11 +93,12 @@ def runge_kutta_held(
 ) -> tuple[Tensor, Tensor]:
     """x+ and the discounted cost of one Runge-Kutta step with u held, of one length, s, or one a row."""
     paid = cost.input_rate(u)
-    # half: what the middle of the step counts; its end, squared
+    h: float | Tensor = length
+    half: float | Tensor  # what the middle of the step counts; its end, squared
     if isinstance(length, Tensor):
         half, h = torch.exp(-0.5 * cost.discount * length), length.unsqueeze(-1)
     else:
-        half, h = math.exp(-0.5 * cost.discount * length), length
+        half = math.exp(-0.5 * cost.discount * length)
     k1 = plant.velocity(x, u)
     c1 = cost.state_rate(x)
     x2 = plant.displaced(x, 0.5 * h * k1)

@@ -47,7 +47,6 @@ _COLUMNS = {
     "left_near_fraction": "left, of starts beside a wall",
     "largest_control": "largest |u|",
 }
-_SUBSTEPS = 16  # of the filters in barrier coordinates: each no longer than half the time to the next wall
 _NAMED = 20  # starts that the log lists
 
 
@@ -71,9 +70,9 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
     cost = make_cost(cfg, system).to(device)
     box = Barrier(system, plain(cfg.safe_box.low), plain(cfg.safe_box.high)).to(device)
     x0 = initial_states(cfg, system.dim).to(device=device, dtype=torch.float64)
-    best = None
-    if flag("adp", "optimum.shooting", cfg.adp.optimum.shooting):
-        best = _optimum(box, cost, box.transform(x0[:1]))
+    s0 = box.transform(x0)
+    wanted = flag("adp", "optimum.shooting", cfg.adp.optimum.shooting)
+    best = _optimum(box, cost, s0[:1]) if wanted else None
     others = {"left": _anywhere(cfg, box), "left_near": _beside_walls(cfg, box)}
     dt = positive_real(COMMAND_LINE, "dt", cfg.dt)
     steps = max(1, round(positive_real(COMMAND_LINE, "duration", cfg.duration) / dt))
@@ -111,14 +110,15 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
 def methods(cfg: DictConfig, box: Barrier, cost: Cost) -> dict[str, Method]:
     """The LQR in both coordinates, by itself and behind the filters."""
     system, size, dt = box.plant, box.dim or 0, float(cfg.dt)
+    substeps = integer("safe_box", "substeps", cfg.safe_box.substeps, least=1)
     of_s = LQR(box, cost)
     paid = QuadraticCost(cost.q, cost.r, size, cost.inputs, output=lambda x: box.coordinates(x))
     lqr = LQR(system, QuadraticCost(cost.q, cost.r, size, cost.inputs))
     found = {"LQR of s": Method(Feedback(of_s), box, cost)}
     if flag("safe_box", "filter", cfg.safe_box.filter):
         held, renewed = (BoxFilter(of_s, box, dt=dt, renewed=renewed) for renewed in (False, True))
-        found["LQR of s, filtered"] = Method(Feedback(held), box, cost, _SUBSTEPS)
-        found["LQR of s, filtered, renewed"] = Method(Feedback(renewed), box, cost, _SUBSTEPS, renew=True)
+        found["LQR of s, filtered"] = Method(Feedback(held), box, cost, substeps)
+        found["LQR of s, filtered, renewed"] = Method(Feedback(renewed), box, cost, substeps, renew=True)
         walls = [_within(box, k) for k in range(size) if bool(box.walled[:, k].any())]
         guard = SafetyFilter(lqr, system, walls, dt=dt, decay=float(cfg.safe_box.decay))
         found["LQR of x, filtered"] = Method(guard, system, paid)

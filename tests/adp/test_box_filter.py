@@ -53,12 +53,12 @@ def test_what_can_be_kept_stays_inside_and_the_rest_is_named(dtype: torch.dtype)
     x = beside_the_walls(40)
     s0 = BOX.transform(x).to(dtype)
     guard = adp.BoxFilter(OF_S, BOX, dt=DT)
-    run = adp.simulate(adp.Feedback(guard), BOX, COST, s0, steps=4, substeps=16, compile=False)
+    run = adp.simulate(adp.Feedback(guard), BOX, COST, s0, steps=2, substeps=16, compile=False)
     kept = can_be_kept(x)
     assert 10 < int(kept.sum()) < 30
     assert torch.equal(guard.share(s0) < 1, kept)
     assert torch.equal(~run.diverged, kept)
-    bare = adp.simulate(adp.Feedback(OF_S), BOX, COST, s0, dt=DT, steps=4, substeps=16, compile=False)
+    bare = adp.simulate(adp.Feedback(OF_S), BOX, COST, s0, dt=DT, steps=2, substeps=16, compile=False)
     assert int(bare.diverged.sum()) > int(run.diverged.sum())
 
 
@@ -67,7 +67,7 @@ def test_a_control_that_is_renewed_in_time_keeps_every_start() -> None:
     guard = adp.BoxFilter(OF_S, BOX, dt=DT, renewed=True)
     assert float(guard.hold(s0).min()) < 1e-6
     assert float(guard.hold(BOX.transform(tensor([0.0, 1.0])))) == DT
-    settings = {"steps": 1, "substeps": 8, "renew": True, "compile": False}
+    settings = {"steps": 1, "substeps": 6, "renew": True, "compile": False}
     run = adp.simulate(adp.Feedback(guard), BOX, COST, s0, **settings)  # type: ignore[arg-type]
     assert not bool(run.diverged.any())
 
@@ -101,9 +101,9 @@ def test_a_robot_with_two_inputs_and_walls_for_all_of_its_states() -> None:
     x = tensor([[4.997, -6.997, 4.0, -4.0], [-5.0, -5.0, 5.0, 5.0]])
     s0 = box.transform(x)
     assert torch.equal(guard(s0)[1], lqr(s0)[1])
-    run = adp.simulate(adp.Feedback(guard), box, cost, s0, steps=3, substeps=4, compile=False)
+    run = adp.simulate(adp.Feedback(guard), box, cost, s0, steps=1, substeps=4, compile=False)
     assert not bool(run.diverged.any())
-    bare = adp.simulate(adp.Feedback(lqr), box, cost, s0, dt=DT, steps=3, substeps=4, compile=False)
+    bare = adp.simulate(adp.Feedback(lqr), box, cost, s0, dt=DT, steps=1, substeps=4, compile=False)
     assert bare.diverged.tolist() == [True, False]
 
 
