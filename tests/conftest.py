@@ -8,7 +8,7 @@ import os
 # between threads cost tenfold. Before torch is imported, and inherited by the commands that tests run.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-import os
+import random
 
 import hypothesis
 import pytest
@@ -16,6 +16,20 @@ import torch
 
 hypothesis.settings.register_profile("suite", max_examples=25, deadline=None, derandomize=True)
 hypothesis.settings.load_profile("suite")
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """An order of the tests by chance: folders, files and the tests of a file."""
+    parser.addoption("--order", type=int, default=None, metavar="SEED", help="shuffle the tests by a seed")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Shuffle, but leave files in one piece: what the tests of a file share is made once."""
+    seed = config.getoption("--order")
+    if seed is not None:
+        rank = {path: random.Random(f"{seed} {path}").random() for path in {item.path for item in items}}
+        own = {item.nodeid: random.Random(f"{seed} {item.nodeid}").random() for item in items}
+        items.sort(key=lambda item: (rank[item.path], own[item.nodeid]))
 
 
 @pytest.fixture(autouse=True)

@@ -1,10 +1,11 @@
 """Run the suite in environments of other versions and of other means.
 
-    python tests/matrix.py [--quick] [--only lowest newest] [--place FOLDER]
+    python tests/matrix.py [--quick] [--only lowest newest] [--tests tests/kernels] [--jobs 2] [--order SEED]
 
-Environments are built once below FOLDER (`~/.cache/staf_torch-matrix` by default, some gigabytes each: torch
-from the index brings CUDA) and used again. Each runs the whole suite, with `--quick` the tests that versions
-and means touch. What cannot be built here is said, with pip's last line. The last table: `tests/README.md`.
+Environments are built once below `--place` (`~/.cache/staf_torch-matrix` by default, some gigabytes each) and
+used again: torch from the index brings CUDA. Each runs the whole suite, with `--quick` the tests that touch
+versions and means, in an order by chance where a seed is given. What cannot be built here is said, with the
+last line of pip. The last table: `tests/README.md`.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ QUICK = (
     "tests/test_variants.py",
     "tests/cli/test_cli_errors.py",
     "tests/lanes/test_program.py",
-    "tests/engine/test_guards.py",
+    "tests/engine/test_chase.py",
     "tests/approximation/test_layers_compiled.py",
     "tests/deploy/test_deploy.py",
 )
@@ -104,7 +105,10 @@ def main() -> int:
         except OSError as error:
             outcomes[name] = f"not to be had here: {error}"
         else:
-            outcomes[name] = _run(environment, python, QUICK if options.quick else ["tests"])
+            tests = QUICK if options.quick else options.tests
+            more = ["-n", str(options.jobs), "--dist", "worksteal"] if options.jobs > 1 else []
+            more += [] if options.order is None else ["--order", str(options.order)]
+            outcomes[name] = _run(environment, python, [*more, *tests])
         print(_row(name, outcomes[name]), flush=True)
     print(f"\n| environment | versions | {time.strftime('%Y-%m-%d')}{', quick' if options.quick else ''} |")
     print("|---|---|---|")
@@ -116,6 +120,9 @@ def main() -> int:
 def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="a subset of the suite")
+    parser.add_argument("--tests", nargs="*", default=["tests"], help="that are run; all by default")
+    parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--order", type=int, default=None, help="seed of an order by chance")
     parser.add_argument("--only", nargs="*", choices=[*ENVIRONMENTS], help="environments; all by default")
     parser.add_argument("--place", default=str(Path.home() / ".cache" / "staf_torch-matrix"))
     return parser.parse_args()
@@ -149,13 +156,13 @@ def _python(version: str) -> Path:
     return kept[-1] if kept else Path(str(found))
 
 
-def _run(environment: Environment, python: Path, tests: Sequence[str]) -> Outcome:
+def _run(environment: Environment, python: Path, arguments: Sequence[str]) -> Outcome:
     with (
         tempfile.TemporaryDirectory(prefix="staf-matrix-") as scratch,
         _home(environment, Path(scratch)) as home,
     ):
         settings = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", **home}
-        line = [str(python), "-m", "pytest", "-q", "-p", "no:cacheprovider", "--tb=short", *tests]
+        line = [str(python), "-m", "pytest", "-q", "-p", "no:cacheprovider", "--tb=short", *arguments]
         user = None if environment.privileged else "nobody"
         begun = time.monotonic()
         ended = subprocess.run(

@@ -1,9 +1,12 @@
-"""The native code under AddressSanitizer and UBSan: `python tests/sanitized.py [--calls 10000] [--seed 0]`.
+"""The native code under AddressSanitizer and UBSan.
 
-Row programs, chases and filters of streams are built with both sanitizers and called with shapes, layouts and
-dtypes drawn at random: 0 and 1 rows and times, strided, transposed, expanded and misaligned tensors, and
-inputs that must be refused. A bad read, a bad write or undefined behaviour ends the process; what is returned
-is compared with plain torch. In the end a read outside is made on purpose, which has to be found.
+    python tests/sanitized.py [--calls 10000] [--seed 0] [--compiler clang++]
+
+Row programs, chases, filters of streams and banks of local models are built with both sanitizers and called
+with shapes, layouts and dtypes drawn at random: 0 and 1 rows and times, strided, transposed, expanded and
+misaligned tensors, and inputs that must be refused. A bad read, a bad write or undefined behaviour ends the
+process; what is returned is compared with plain torch. In the end a read outside is made on purpose, which
+has to be found.
 """
 
 from __future__ import annotations
@@ -20,37 +23,40 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 FLAGS = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-fno-omit-frame-pointer", "-O1")
-SECONDS = 60  # of a call
+SECONDS = 60  # of the processor, for a call; ten times as many by the clock
 ROWS, TIMES = (0, 1, 1, 2, 3, 7, 8, 9, 16, 17, 33), (0, 1, 1, 2, 3, 5)
 
 
-def missing() -> str | None:
+def missing(compiler: str = "g++") -> str | None:
     """Why nothing can be sanitized here; None: it can."""
     try:
-        found = subprocess.run(
-            ["g++", "-print-file-name=libasan.so"], capture_output=True, text=True, check=True
-        )
+        found = _runtime(compiler)
     except (OSError, subprocess.CalledProcessError) as error:
-        return f"there is no g++ ({error})"
-    return None if os.path.isabs(found.stdout.strip()) else "g++ has no libasan"
+        return f"there is no {compiler} ({error})"
+    return None if found.is_absolute() and found.exists() else f"{compiler} has no runtime of the sanitizers"
 
 
-def run(calls: int, seed: int, cache: Path) -> str:
+def _runtime(compiler: str) -> Path:
+    """The shared library of the sanitizers."""
+    name = "libclang_rt.asan-x86_64.so" if "clang" in compiler else "libasan.so"
+    said = subprocess.run([compiler, f"-print-file-name={name}"], capture_output=True, text=True, check=True)
+    return Path(said.stdout.strip())
+
+
+def run(calls: int, seed: int, cache: Path, compiler: str = "g++") -> str:
     """Return what a process under the sanitizers said of so many calls, or what they found.
 
     Raises:
         AssertionError: if the read outside was not found that the process ends with.
     """
-    library = subprocess.run(
-        ["g++", "-print-file-name=libasan.so"], capture_output=True, text=True, check=True
-    )
     environment = {
         **os.environ,
-        "LD_PRELOAD": library.stdout.strip(),
+        "LD_PRELOAD": str(_runtime(compiler)),
         "ASAN_OPTIONS": "detect_leaks=0:exitcode=66",
         "UBSAN_OPTIONS": "print_stacktrace=1:halt_on_error=1",
         "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]),
         "XDG_CACHE_HOME": str(cache),
+        "CXX": compiler,
         "OMP_NUM_THREADS": "1",
     }
     line = [sys.executable, __file__, "--inside", "--calls", str(calls), "--seed", str(seed)]
@@ -69,9 +75,12 @@ def inside(calls: int, seed: int) -> None:
     from staf_torch import GaussianKernel, StaFBasis, StateFollowingCenters, chase, lanes, optim, rings
     from staf_torch.lanes import build, compiler
     from staf_torch.online import StaFRegressor
+    from staf_torch.online.bank import Bank
+    from staf_torch.online.bank_rules import BankShape
 
-    build._FLAGS += FLAGS
-    compiler._FLAGS += FLAGS
+    more = (*FLAGS, "-shared-libasan") if "clang" in os.environ["CXX"] else FLAGS
+    build._FLAGS += more
+    compiler._FLAGS += more
     chance = random.Random(seed)
     torch.manual_seed(seed)
 
@@ -149,16 +158,42 @@ def inside(calls: int, seed: int) -> None:
             return
         assert torch.as_tensor(predicted).shape[: len(shape) - 2] == shape[1:-1]
 
-    kinds = {"programs": a_program, "chases": a_chase, "filters": a_filter}
+    def a_bank() -> None:
+        """Some samples for some streams, of which some go on; compiled code against the definition."""
+        streams, steps = chance.choice((0, 1, 1, 2, 3)), chance.choice((0, 1, 2, 12))
+        shape = BankShape(dim=2, outputs=1, capacity=9, neighbours=3)
+        bank, plain = Bank(shape, streams, chance.random() < 0.5), None
+        if chance.random() < 0.1:
+            plain = Bank(shape, streams, bank.scaling)
+            plain._run = None
+        for at in range(steps):
+            x = torch.rand(bank.count, 2, dtype=torch.float64) * chance.choice([1e-300, 1.0, 1e150])
+            y = torch.rand(bank.count, 1, dtype=torch.float64) * chance.choice([1.0, 1.0, float("inf")])
+            lapse = chance.choice([None, torch.rand(bank.count, dtype=torch.float64)])
+            bank.learn(x, y, lapse)
+            found = bank.predict(x)
+            if plain is not None and bank.count:
+                plain.learn(x, y, lapse)
+                for one, other in zip(found, plain.predict(x), strict=True):
+                    torch.testing.assert_close(one, other, rtol=1e-6, atol=1e-6, equal_nan=True)
+            if plain is None and at == 5:
+                bank.keep(torch.arange(bank.count)[1:])
+                bank.add(2)
+
+    kinds = {"programs": a_program, "chases": a_chase, "filters": a_filter, "banks": a_bank}
     counts = dict.fromkeys(kinds, 0)
-    for _ in range(calls):
-        name = chance.choices(list(kinds), weights=(6, 2, 2))[0]
-        signal.alarm(SECONDS)  # which ends the process: a call that hangs listens to nothing else
+    for at in range(calls):
+        name = chance.choices(list(kinds), weights=(6, 2, 2, 1))[0] if at >= len(kinds) else list(kinds)[at]
+        # Both signals end the process: a call that hangs listens to nothing else.
+        signal.setitimer(signal.ITIMER_PROF, SECONDS)
+        signal.alarm(10 * SECONDS)
         kinds[name]()
+        signal.setitimer(signal.ITIMER_PROF, 0)
         signal.alarm(0)
         counts[name] += 1
     built = list(Path(os.environ["XDG_CACHE_HOME"], "staf_torch").rglob("*.so"))
-    assert len(built) >= min(3, calls), built
+    names = {library.name.rpartition("-")[0] for library in built}
+    assert names >= {"bank", "filter", "lanes"}, names
     assert all(b"__asan_report_load" in library.read_bytes() for library in built)
     print(f"{calls} calls of {len(built)} libraries under the sanitizers, none bad: {counts}", flush=True)
     outside = torch.empty(3, dtype=torch.float64)
@@ -169,16 +204,17 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--calls", type=int, default=10_000)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--compiler", default="g++")
     parser.add_argument("--inside", action="store_true", help=argparse.SUPPRESS)
     chosen = parser.parse_args()
     if chosen.inside:
         inside(chosen.calls, chosen.seed)
         return 0
-    if why := missing():
+    if why := missing(chosen.compiler):
         print(why)
         return 0
     with tempfile.TemporaryDirectory() as cache:
-        said = run(chosen.calls, chosen.seed, Path(cache))
+        said = run(chosen.calls, chosen.seed, Path(cache), chosen.compiler)
     print(said)
     return int("none bad" not in said)
 

@@ -134,6 +134,10 @@ def tracked(module: Any, x: Tensor) -> Tensor:
     return torch.cat([u, after.identifier], -1)
 
 
+def onwards(t: Tensor) -> Tensor:
+    return t.unsqueeze(-1)
+
+
 def quadrature(s: float) -> nn.Module:
     return adp.QuadraturePoints(2, 2, s)
 
@@ -162,6 +166,7 @@ MODULES: dict[str, Case] = {
     "AvoidanceCost": Case(
         lambda s: adp.AvoidanceCost(s, 1.0, 2, 1, obstacles=near, reach=1.0, weight=s), rates
     ),
+    "TrackingCost": Case(lambda s: adp.TrackingCost(s, 1.0, 1, 1, path=onwards), rates),
     "BoundedInputCost": Case(lambda s: adp.BoundedInputCost(s, 1.0, 2, 1, bound=2.0), rates),
     "RandomPoints": Case(lambda s: adp.RandomPoints(2, st.StateRadius(s, 0.1)), points),
     "QuadraturePoints": Case(quadrature, lambda module, x: module(x, x.new_zeros(len(x), 0, 2)).flatten(1)),
@@ -185,6 +190,10 @@ MODULES: dict[str, Case] = {
     "TwoStateChain": Case(lambda s: systems.TwoStateChain([1.0, s, -0.5, 0.5]), flows),
     "TwoLinkRobot": Case(lambda s: systems.TwoLinkRobot(friction=[s, 1.0, 1.0, 1.0]), flows),
     "Barrier": Case(lambda s: systems.Barrier(systems.TwoState(), -s, [s, None]), flows),
+    "Clocked": Case(
+        lambda s: systems.Clocked(systems.Linear([[-2 * s]], [[s]])),
+        lambda module, x: module.motion(x, x[..., :1]),
+    ),
     "CartPole": Case(lambda s: systems.CartPole(cart=s), flows, carried=False),
     "VanDerPol": Case(systems.VanDerPol, flows, carried=False),
     "Paper": Case(lambda s: targets.Paper(), carried=False),

@@ -232,6 +232,7 @@ COSTS: dict[str, Callable[[], adp.Cost]] = {
         1.0, 1.0, 2, 1, obstacles=lambda x: (x[..., 0] - 3).square() + x[..., 1].square() - 0.25, reach=0.5
     ),
     "quadratic": lambda: adp.QuadraticCost(1.0, 1.0, 2, 1),
+    "tracking": lambda: adp.TrackingCost(1.0, 1.0, 2, 1, path=lambda t: torch.stack((t, t), dim=-1)),
     "bounded_input": lambda: adp.BoundedInputCost(1.0, 0.1, 2, 1, bound=8.0),
 }
 VALUE_BASES: dict[str, Callable[[], adp.ValueBasis]] = {

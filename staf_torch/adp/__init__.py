@@ -69,6 +69,8 @@ from .laws import Weights as Weights
 from .memory_growth import learn_global_value as learn_global_value
 from .near_optimal import NearOptimal as NearOptimal
 from .near_optimal import near_optimal as near_optimal
+from .path_cost import TrackingCost as TrackingCost
+from .plans import Trajectories as Trajectories
 from .policy_iteration import PolicyIteration as PolicyIteration
 from .receding_horizon import RecedingHorizon as RecedingHorizon
 from .rollout import RolloutPolicy as RolloutPolicy
@@ -87,7 +89,6 @@ from .tracking import TwoStateTracking as TwoStateTracking
 from .tracking import desired_trajectory as desired_trajectory
 from .tracking import tracking_cost as tracking_cost
 from .trajectory_optimisation import BoxDDP as BoxDDP
-from .trajectory_optimisation import Trajectories as Trajectories
 
 __all__ = [
     "LQR",
@@ -157,6 +158,7 @@ __all__ = [
     "Stack",
     "Supervised",
     "Tracking",
+    "TrackingCost",
     "Trajectories",
     "TwoStateTracking",
     "UnscentedKalman",

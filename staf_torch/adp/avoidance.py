@@ -13,8 +13,9 @@ from torch import Tensor
 from ..numerics.checks import choice, fail, integer, positive_real
 from ..systems import Plant
 from .cost import Matrix, QuadraticCost
+from .plans import Reference, Trajectories
 from .sampled_problem import SampledProblem
-from .trajectory_optimisation import BoxDDP, Reference, Trajectories
+from .trajectory_optimisation import BoxDDP
 
 Obstacle = Callable[[Tensor], Tensor]
 """h(x), at least 0 outside: (..., n) -> (...)."""

@@ -13,9 +13,10 @@ from torch import Tensor, nn
 
 from ..lanes import Program
 from ..lanes.kept import Kept, number
+from ..lanes.tree import flatten, unflatten
 from ..numerics.checks import choice, fail, integer, positive_real
 from ..systems import Plant
-from .controllers import Controller, ControllerState, Feedback
+from .controllers import Carried, Controller, ControllerState, Feedback
 from .cost import Cost
 from .holding import Holding
 from .laws import ActorCriticLaw, Gains
@@ -30,7 +31,7 @@ class LoopState(NamedTuple):
     cost: Tensor  # (B,) the integral of the cost rate so far
     alive: Tensor  # (B,) bool; a row that became non-finite keeps its last finite values
     lived: Tensor  # (B,) steps taken alive
-    carried: ControllerState
+    carried: Carried
 
 
 class ClosedLoop(nn.Module):
@@ -83,21 +84,40 @@ class ClosedLoop(nn.Module):
         """The state at time 0 of the rows x0 (B, n)."""
         alive = torch.isfinite(x0).all(-1)
         zeros = x0.new_zeros(x0.shape[0])
-        return LoopState(x0, zeros, alive, zeros.clone(), self.controller.init(x0))
+        carried = self.controller.init(x0)
+        for part in flatten(carried)[0]:
+            if part.shape[:1] != x0.shape[:1]:
+                raise ValueError(
+                    f"`{type(self.controller).__name__}.init` must return tensors (B, ...), here with "
+                    f"B = {x0.shape[0]}; got one of {tuple(part.shape)}."
+                )
+        return LoopState(x0, zeros, alive, zeros.clone(), carried)
 
     def forward(self, state: LoopState, uniform: Tensor) -> tuple[LoopState, Tensor]:
         """The state after dt seconds, and the control held until then, (B, m)."""
         u, carried = self.controller.step(state.x, state.carried, uniform, self.dt)
+        wanted = (len(state.x), self.system.inputs)
+        if u.shape != wanted:
+            raise ValueError(
+                f"`{type(self.controller).__name__}.step` must return a control (B, m), here {wanted}; "
+                f"got {tuple(u.shape)}."
+            )
         if self.cost.bounds is not None:  # an actuator that is asked for more gives its bound
             u = self.cost.bounds.clip(u)
         x, spent = self._advance(state.x, u)
         good = torch.isfinite(spent) & (x.square().sum(-1) <= self.limit**2)
-        for part in (u, *carried):
-            good = good & torch.isfinite(part).flatten(1).all(-1)
+        parts, before = flatten(carried), flatten(state.carried)
+        shapes, given = ([tuple(part.shape) for part in each[0]] for each in (parts, before))
+        if parts[1] != before[1] or shapes != given:
+            raise ValueError(
+                f"`{type(self.controller).__name__}.step` must carry on what it got, tensors of the shapes "
+                f"{given}; got {shapes}."
+            )
+        for part in (u, *parts[0]):
+            good = good & torch.isfinite(part).reshape(len(part), -1).all(-1)
         alive = state.alive & good
-        kept = ControllerState(
-            *(_where(alive, new, old) for new, old in zip(carried, state.carried, strict=True))
-        )
+        pairs = zip(parts[0], before[0], strict=True)
+        kept = unflatten(parts[1], (_where(alive, new, old) for new, old in pairs))
         if self.cost.discount:
             spent = spent * torch.exp(-self.cost.discount * self.dt * state.lived)
         cost = state.cost + torch.where(alive, spent, 0.0)
@@ -194,6 +214,9 @@ def recorded(
 
 
 def record(state: LoopState, u: Tensor) -> tuple[Tensor, ...]:
-    """Return x, u, Wa, Wc, the cost and the identifier."""
+    """Return x, u, Wa, Wc, the cost and the identifier; nothing of what a controller names otherwise."""
     carried = state.carried
+    if not isinstance(carried, ControllerState):
+        none = state.x.new_zeros(len(state.x), 0)
+        return state.x, u, none, none, state.cost, none
     return state.x, u, carried.actor, carried.critic, state.cost, carried.identifier

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import pad
 
 from ..numerics.checks import real
 from ..numerics.linalg import riccati
@@ -38,18 +39,24 @@ class ControllerState(NamedTuple):
     identifier: Tensor  # what an identifier of the plant remembers, (B, K)
 
 
+Carried = ControllerState | Any
+"""What a controller carries from step to step: a `ControllerState`, or a tensor (B, ...) of its own, or
+tuples, dictionaries and named tuples of such, which are not recorded."""
+
+
 class Controller(nn.Module, abc.ABC):
     """u and what the controller carries on, from the state and what it carried until then.
 
     Example:
-        >>> class Rest(adp.Controller):
+        >>> class Integral(adp.Controller):  # carries the integral of x_1, (B,)
         ...     def init(self, x0):
-        ...         none = x0.new_zeros(len(x0), 0)
-        ...         return adp.ControllerState(none, none, x0.new_zeros(len(x0), 0, 0), none)
+        ...         return torch.zeros_like(x0[:, 0])
         ...     def step(self, x, carried, uniform, dt):
-        ...         return x.new_zeros(len(x), 1), carried
-        >>> Rest().step(torch.ones(3, 2), Rest().init(torch.ones(3, 2)), None, 0.01)[0].shape
-        torch.Size([3, 1])
+        ...         carried = carried + dt * x[:, 0]
+        ...         return -(x.sum(-1) + 0.5 * carried).unsqueeze(-1), carried
+        >>> cost, x0 = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1), torch.ones(3, 2).double()
+        >>> adp.simulate(Integral(), systems.TwoState(), cost, x0, dt=0.01, steps=10).diverged
+        tensor([False, False, False])
 
         Shown by `staf experiment=adp_comparison`.
 
@@ -67,13 +74,11 @@ class Controller(nn.Module, abc.ABC):
         return type(self).__name__
 
     @abc.abstractmethod
-    def init(self, x0: Tensor) -> ControllerState:
+    def init(self, x0: Tensor) -> Carried:
         """What is carried into the first step, a row each of the states x0 (B, n)."""
 
     @abc.abstractmethod
-    def step(
-        self, x: Tensor, carried: ControllerState, uniform: Tensor, dt: float
-    ) -> tuple[Tensor, ControllerState]:
+    def step(self, x: Tensor, carried: Carried, uniform: Tensor, dt: float) -> tuple[Tensor, Carried]:
         """The control to hold for ``dt`` seconds, and what is carried on after them.
 
         Args:
@@ -86,7 +91,7 @@ class Controller(nn.Module, abc.ABC):
             u (B, m), and what the next step gets as ``carried``.
         """
 
-    def value(self, x: Tensor, carried: ControllerState) -> Tensor | None:
+    def value(self, x: Tensor, carried: Carried) -> Tensor | None:
         """V^(x) where the controller has an idea of it: (..., n) -> (...)."""
         return None
 
@@ -134,7 +139,8 @@ class Feedback(Controller):
 
 class LQR(nn.Module):
     """u = u_s - K (x - x_s) with K = R^-1 B'P and P from the Riccati equation of the linearisation at the
-    set-point x_s of the cost, where u_s holds the plant; angles are differences in [-pi, pi].
+    set-point x_s of the cost, where u_s holds the plant; angles are differences in [-pi, pi]. Of a
+    `TrackingCost` P and K are those of the plant's equilibrium, and x_s moves along the path.
 
     With bounds u is clipped to them, with a `BoundedInputCost` smoothly. A control that is held for long
     needs other gains: with a ``period`` P and K are those of the linear plant whose control is held.
@@ -168,14 +174,17 @@ class LQR(nn.Module):
         super().__init__()
         self.cost = cost.around(system)
         self.period = system.period if period is None else period
+        system, still = self.cost.regulated(system)
         if self.period is None:
-            a, b = system.linearisation(self.cost.target, self.cost.target_input)
+            a, b = system.linearisation(still.target, still.target_input)
             name = type(system).__name__
             rest = 0.5 * cost.discount * torch.eye(len(a), dtype=a.dtype)
-            p = riccati(a - rest, b, self.cost.state_curvature(), cost.r, name=name)
+            p = riccati(a - rest, b, still.state_curvature(), cost.r, name=name)
             k = cost.r_inverse @ b.to(p).mT @ p
         else:
-            p, k = held_riccati(system, self.cost, self.period)
+            p, k = held_riccati(system, still, self.period)
+        clock = self.cost.dim - len(p)
+        p, k = pad(p, (0, clock, 0, clock)), pad(k, (0, clock))
         self.register_buffer("p", p)
         self.register_buffer("k", k)
         self.p: Tensor

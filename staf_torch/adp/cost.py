@@ -129,6 +129,14 @@ class Cost(nn.Module, abc.ABC):
         other._prepare()
         return other
 
+    def set_point(self) -> Tensor | None:
+        """The state that the LQR is a feedback around, (n,); None for the origin."""
+        return self.target
+
+    def regulated(self, plant: Plant) -> tuple[Plant, Cost]:
+        """The plant and the cost, around it, whose LQR is that of this cost: themselves."""
+        return plant, self
+
     @property
     def plain(self) -> bool:
         """Whether this is x'Qx + U(u) at the origin: no set-point, output, bounds or discount."""

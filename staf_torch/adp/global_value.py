@@ -11,8 +11,8 @@ from torch import Tensor, nn
 
 from ..lanes import Program, scan
 from ..numerics.checks import fail, integer, positive_real, trailing, vector
+from .plans import LocalModel, Reference, Trajectories
 from .sampled_problem import SampledProblem
-from .trajectory_optimisation import LocalModel, Reference, Trajectories
 
 _TOGETHER = 4096  # candidates rolled out at once
 _REACH = 0.3  # of the region: a rollout that ends further from what it follows has lost it
@@ -83,6 +83,8 @@ class GlobalValue(nn.Module):
         spacing: float = 0.02,
     ) -> None:
         super().__init__()
+        if problem.path is not None:
+            raise fail("GlobalValue", "problem", "must have a goal that stays where it is", problem.path)
         self.problem, self.library = problem, library
         width = region.tolist() if isinstance(region, Tensor) else list(region)
         if min(vector("GlobalValue", "region", width, problem.dim)) <= 0:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ..lanes import repeat
 from ..numerics.checks import positive_real
-from ..systems import Plant, StepPlant
+from ..systems import Clocked, Plant, StepPlant
 from .cost import Cost
 from .sampling import periods
 
@@ -83,7 +83,8 @@ class Holding:
         return x, spent
 
     def _step(self, x: Tensor, u: Tensor, h: float) -> tuple[Tensor, Tensor]:
-        if isinstance(self.plant, StepPlant):
+        if self.plant.period is not None:
+            assert isinstance(self.plant, StepPlant | Clocked)
             return self.plant.step(x, u), h * self.cost.rate(x, u)
         return runge_kutta_held(self.plant, self.cost, x, u, h)
 

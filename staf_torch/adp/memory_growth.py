@@ -11,8 +11,9 @@ from torch import Tensor
 
 from ..numerics.checks import integer
 from .global_value import GlobalValue
+from .plans import Reference, Trajectories
 from .sampled_problem import SampledProblem
-from .trajectory_optimisation import BoxDDP, Reference, Trajectories
+from .trajectory_optimisation import BoxDDP
 
 _log = logging.getLogger(__name__)
 _HELD = 10  # steps for which a random first control is held

@@ -13,8 +13,8 @@ from torch import Tensor
 from ..approximation.basis import StaFBasis
 from ..centers import StateFollowingCenters
 from ..kernels import ExponentialKernel
-from ..numerics.checks import positive_real
-from ..systems import Plant
+from ..numerics.checks import fail, positive_real
+from ..systems import Clocked, Plant
 from ..systems.bounds import Limit
 from .controllers import LQR, Feedback
 from .cost import Cost
@@ -175,6 +175,9 @@ def near_optimal(
     """
     held = plant.period if dt is None else dt
     period = positive_real("near_optimal", "dt", held)
+    if isinstance(plant, Clocked):
+        rule = "must have no clock: a path is followed by `RecedingHorizon` or `LQR`"
+        raise fail("near_optimal", "plant", rule, plant)
     placed = cost.bounded(low, high).around(plant)
     lqr = LQR(plant, placed, period=period)
     seconds = (

@@ -8,8 +8,9 @@ from torch import Tensor
 from ..numerics.checks import fail, integer
 from .controllers import Controller, ControllerState
 from .global_value import GlobalValue
+from .plans import LocalModel, Reference, Trajectories
 from .sampled_problem import SampledProblem
-from .trajectory_optimisation import BoxDDP, LocalModel, Reference, Trajectories
+from .trajectory_optimisation import BoxDDP
 
 
 class RecedingHorizon(Controller):
@@ -38,7 +39,9 @@ class RecedingHorizon(Controller):
     Args:
         problem: plant, cost and bounds in steps; its period is that of the loop.
         steps: T.
-        iterations: of a period; the first plan takes as many as it needs, up to 60.
+        iterations: of a period; the first plan takes as many as it needs, up to 60. 0: the first plan alone
+            is followed, with its feedback and then with that of the goal, in some 50 us a control; let
+            ``steps`` be the whole episode then.
         memory: for V_T and the plan to begin from; None for the linear feedback and the last plan.
         compile: as in `BoxDDP`.
 
@@ -63,28 +66,33 @@ class RecedingHorizon(Controller):
         if memory is not None and memory.problem is not problem:
             raise fail("RecedingHorizon", "memory", "must be of the same problem", memory.problem)
         self.steps = integer("RecedingHorizon", "steps", steps, least=1)
+        integer("RecedingHorizon", "iterations", iterations, least=0 if memory is None else 1)
         self._first = BoxDDP(problem, steps=steps, compile=compile)
-        self._search = BoxDDP(problem, steps=steps, iterations=iterations, compile=compile)
+        self._search: BoxDDP | None = None
+        if iterations:
+            self._search = BoxDDP(problem, steps=steps, iterations=iterations, compile=compile)
 
     def init(self, x0: Tensor) -> ControllerState:
         """The first plan, from the states x0 (B, n)."""
         control, reference = (None, None) if self.memory is None else self._remembered(x0)
         found = self._first.solve(x0, control, reference, self._terminal(x0, control, reference))
-        return self._carried(found)
+        return _carrying(_rows(found), 0)
 
     def step(
         self, x: Tensor, carried: ControllerState, uniform: Tensor, dt: float
     ) -> tuple[Tensor, ControllerState]:
         """The first control of the improved plan (B, m), and the plan a step further on."""
+        if self._search is None:
+            return self._followed(x, carried.identifier)
         if self.memory is not None:
             control, reference = self._remembered(x)
         else:
             n, m = self.problem.dim, self.problem.inputs
-            plan = carried.identifier.unflatten(-1, (self.steps, n + m + m * n))
+            plan = carried.identifier[:, 1:].unflatten(-1, (self.steps, n + m + m * n))
             state, control, feedback = plan.split((n, m, m * n), dim=-1)
             reference = Reference(state, feedback.unflatten(-1, (m, n)))
         found = self._search.solve(x, control, reference, self._terminal(x, control, reference))
-        return found.control[:, 0], self._carried(found)
+        return found.control[:, 0], self._ahead(_rows(found), self.problem.goals(found.state[:, -1], 0)[:, 0])
 
     def _remembered(self, x: Tensor) -> tuple[Tensor, Reference]:
         assert self.memory is not None
@@ -100,15 +108,33 @@ class RecedingHorizon(Controller):
             x, _ = self.problem.advance(x, u)
         return self.memory.model(x)
 
-    def _carried(self, found: Trajectories) -> ControllerState:
-        """The plan from the next step on, and at its end the linear feedback of the goal."""
-        last = found.state[:, -1]
-        goal = last - self.problem.offset(last, self.problem.goal)
-        count, m = len(last), self.problem.inputs
+    def _followed(self, x: Tensor, plan: Tensor) -> tuple[Tensor, ControllerState]:
+        """The control of a plan that is not improved, (B, 1 + T w), and the plan with one step more done."""
+        n, m = self.problem.dim, self.problem.inputs
+        done, width = int(plan[0, 0]), n + m + m * n  # all rows began together
+        carried = _carrying(plan[:, 1:], done + 1)
+        if done >= self.steps:
+            return self.problem.linear_feedback(x), carried
+        at = plan[:, 1 + done * width : 1 + (done + 1) * width]
+        state, control, feedback = at.split((n, m, m * n), dim=-1)
+        away = (x - state).unsqueeze(-2)
+        u = control + (feedback.unflatten(-1, (m, n)) * away).sum(-1)
+        return self.problem.admissible(u), carried
+
+    def _ahead(self, plan: Tensor, goal: Tensor) -> ControllerState:
+        """The plan (B, T, w) from the next step on, and at its end the linear feedback of a goal (B, n)."""
+        count, m = len(goal), self.problem.inputs
         hold = goal, self.problem.rest.expand(count, m), (-self.problem.k).flatten().expand(count, -1)
-        ahead = torch.cat(
-            (found.state[:, 1:-1], found.control[:, 1:], found.feedback[:, 1:].flatten(2)), dim=-1
-        )
-        plan = torch.cat((ahead, torch.cat(hold, dim=-1).unsqueeze(1)), dim=1)
-        empty = last.new_zeros(count, 0)
-        return ControllerState(empty, empty, last.new_zeros(count, 0, 0), plan.flatten(1))
+        return _carrying(torch.cat((plan[:, 1:], torch.cat(hold, dim=-1).unsqueeze(1)), dim=1), 0)
+
+
+def _rows(found: Trajectories) -> Tensor:
+    """State, control and feedback of every step: (B, T, n + m + m n)."""
+    return torch.cat((found.state[:, :-1], found.control, found.feedback.flatten(2)), dim=-1)
+
+
+def _carrying(plan: Tensor, done: int) -> ControllerState:
+    """A plan (B, T, w) and how many of its steps are done."""
+    empty = plan.new_zeros(len(plan), 0)
+    known = torch.cat((plan.new_full((len(plan), 1), done), plan.flatten(1)), dim=1)
+    return ControllerState(empty, empty, plan.new_zeros(len(plan), 0, 0), known)

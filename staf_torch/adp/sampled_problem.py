@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import pad
 
 from ..lanes import each
 from ..numerics.angles import wrap
@@ -16,6 +17,7 @@ from ..numerics.checks import fail, integer, positive_real, trailing
 from ..systems import Bounds, Plant
 from ..systems.bounds import Limit
 from .cost import Cost
+from .path_cost import Path, TrackingCost
 
 Step = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 """(x (B, n), u (B, m)) -> (x+ (B, n), cost of the step (B,))."""
@@ -45,6 +47,8 @@ class SampledProblem(nn.Module):
         periodic: the coordinates that are angles, in rad.
         goal: state at which the plant rests at no cost, (n,); the origin by default.
         rest: control that keeps it there, (m,); 0 by default.
+        path: x_d from t, (...) -> (..., n - 1), for a problem whose last coordinate is the time: the goal
+            moves along it. The linear feedback is that of ``goal``, where the plant rests, carried along.
 
     Attributes:
         p: P of the value d'Pd of the best linear feedback near the goal, (n, n), d = x - goal.
@@ -66,9 +70,11 @@ class SampledProblem(nn.Module):
         periodic: Sequence[int] = (),
         goal: Tensor | None = None,
         rest: Tensor | None = None,
+        path: Path | None = None,
     ) -> None:
         super().__init__()
         self.step = step
+        self.path: Path | None = path
         self.dim = integer("SampledProblem", "dim", dim, least=1)
         self.inputs = integer("SampledProblem", "inputs", inputs, least=1)
         zeros = torch.zeros(self.dim, dtype=torch.float64)
@@ -84,6 +90,7 @@ class SampledProblem(nn.Module):
         if not set(periodic) <= set(range(-self.dim, self.dim)):
             raise fail("SampledProblem", "periodic", f"must be coordinates of {self.dim}", list(periodic))
         self.periodic = tuple(sorted({index % self.dim for index in periodic}))
+        self.tick = 0.0  # s of a step, where the last coordinate is the time
         self._check()
         p, k = self._regulator()
         self.register_buffer("p", p)
@@ -145,8 +152,9 @@ class SampledProblem(nn.Module):
             low=None if box is None else box.low,
             high=None if box is None else box.high,
             periodic=plant.periodic,
-            goal=cost.target,
+            goal=plant.equilibrium() if isinstance(cost, TrackingCost) else cost.target,
             rest=cost.target_input,
+            path=cost.path if isinstance(cost, TrackingCost) else None,
         )
 
     def advance(self, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
@@ -158,14 +166,29 @@ class SampledProblem(nn.Module):
         """x - center by the shorter way around: (..., n), (..., n) -> (..., n)."""
         return wrap(x - center, self.periodic)
 
+    def goals(self, x: Tensor, steps: int) -> Tensor:
+        """The goal after each of so many steps, 0 of them first, angles near those of x: (B, n) ->
+        (B, steps + 1, n)."""
+        if self.path is None:
+            return (x - self.offset(x, self.goal)).unsqueeze(1).expand(-1, steps + 1, -1)
+        time = x[:, -1:] + self.tick * torch.arange(steps + 1, dtype=x.dtype)
+        goal = torch.cat((self.path(time), time.unsqueeze(-1)), dim=-1)
+        return x.unsqueeze(1) - self.offset(x.unsqueeze(1), goal)
+
+    def away(self, x: Tensor) -> Tensor:
+        """x - goal by the shorter way around: (..., n) -> (..., n)."""
+        if self.path is None:
+            return self.offset(x, self.goal)
+        return self.offset(x, torch.cat((self.path(x[..., -1]), x[..., -1:]), dim=-1))
+
     def terminal(self, x: Tensor) -> Tensor:
         """d'Pd, the value of the linear feedback, d = x - goal: (..., n) -> (...)."""
-        d = self.offset(x, self.goal)
+        d = self.away(x)
         return ((d.unsqueeze(-2) * self.p).sum(-1) * d).sum(-1)
 
     def linear_feedback(self, x: Tensor) -> Tensor:
         """rest - K d within the bounds: (..., n) -> (..., m)."""
-        d = self.offset(x, self.goal)
+        d = self.away(x)
         return self.admissible(self.rest - (d.unsqueeze(-2) * self.k).sum(-1))
 
     def admissible(self, u: Tensor) -> Tensor:
@@ -218,6 +241,11 @@ class SampledProblem(nn.Module):
                 f"{tuple(x.shape)} and costs {tuple(x.shape[:1])}; got {tuple(after.shape)} and "
                 f"{tuple(paid.shape)}."
             )
+        if self.path is not None:
+            self.tick = float(after[0, -1] - x[0, -1])
+            if not self.tick > 0:
+                raise fail("SampledProblem", "step", "must move the time, the last coordinate", self.tick)
+            return
         moved = float(self.offset(after, x).abs().max())
         if moved > _RESTS * (1 + float(x.abs().max())) or abs(float(paid[0])) > _RESTS:
             raise ValueError(
@@ -233,9 +261,9 @@ class SampledProblem(nn.Module):
         )  # half a second that no other import need pay
 
         at = self.derivatives(self.goal.unsqueeze(0), self.rest.unsqueeze(0))
-        n = self.dim
-        a, b, w = at.first[0, :, :n], at.first[0, :, n:], 0.5 * at.cost_second[0]
-        q, s, r = w[:n, :n], w[:n, n:], w[n:, n:]
+        m, n = self.inputs, self.dim - (self.path is not None)
+        a, b, w = at.first[0, :n, :n], at.first[0, :n, -m:], 0.5 * at.cost_second[0]
+        q, s, r = w[:n, :n], w[:n, -m:], w[-m:, -m:]
         try:
             solved = solve_discrete_are(*(t.numpy() for t in (a, b, q, r)), s=s.numpy())
         except (LinAlgError, ValueError) as error:
@@ -244,7 +272,9 @@ class SampledProblem(nn.Module):
                 f"cannot be stabilised, or its cost is not convex there ({error})."
             ) from error
         p = 0.5 * torch.from_numpy(solved + solved.T)
-        return p, torch.linalg.solve(r + b.mT @ p @ b, b.mT @ p @ a + s.mT)
+        k = torch.linalg.solve(r + b.mT @ p @ b, b.mT @ p @ a + s.mT)
+        clock = self.dim - n
+        return pad(p, (0, clock, 0, clock)), pad(k, (0, clock))
 
 
 @functools.cache

@@ -13,7 +13,7 @@ from torch import Tensor
 from ..numerics.checks import fail, positive_real
 from ..numerics.differences import STEP, central_slopes
 from ..numerics.linalg import check_modes, solver, unstabilisable_mode
-from ..systems import Plant
+from ..systems import Clocked, Plant
 from .cost import Cost
 
 _PROBE = 1e-5  # of a state around 0, in its own units, at which the policy is asked for its slope
@@ -187,11 +187,19 @@ def held_stability(
         policy: u from x, (..., n) -> (..., m).
         system: the plant, in continuous or in discrete time.
         period: s, positive; of a plant in discrete time a multiple of its own.
-        at: the set-point, (n,); the plant's equilibrium by default.
+        at: the set-point, (n,); the plant's equilibrium by default. For a `systems.Clocked` plant the state
+            of the path at t = 0, without the time.
 
     Raises:
-        ValueError: if the period breaks its rule.
+        ValueError: if the period breaks its rule, or the plant is clocked and ``at`` is missing.
     """
+    if isinstance(system, Clocked):  # whose clock would count as a mode that never decays
+        if at is None:
+            raise fail(
+                "held_stability", "at", "must be a state of the path at t = 0, for a clocked plant", at
+            )
+        clocked = system
+        return held_stability(lambda x: policy(clocked.at(x)), system.plant, period, at=at)
     at = system.equilibrium() if at is None else at
     with torch.no_grad():
         slope = central_slopes(

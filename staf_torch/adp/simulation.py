@@ -135,7 +135,7 @@ def simulate(
 
 def warn_if_unstable(policy: Policy, system: Plant, cost: Cost, dt: float) -> None:
     """Say in the log that the linearised loop of a policy held for dt is not stable, and which period is."""
-    stability = held_stability(policy, system, dt, at=cost.target)
+    stability = held_stability(policy, system, dt, at=cost.set_point())
     if not stability.spectral_radius >= 1:
         return
     most = stability.largest_period

@@ -10,6 +10,7 @@ from torch import Tensor
 from ..lanes import Program
 from ..numerics.box import box_minimum
 from ..numerics.checks import integer, positive_real, trailing
+from .plans import LocalModel, Plan, Reference, Trajectories
 from .sampled_problem import Derivatives, SampledProblem
 
 _LENGTHS = (1.0, 0.5, 0.2, 0.07, 0.02)  # shares of a step that are tried side by side
@@ -21,39 +22,6 @@ _LEAST, _FIRST, _TRUSTED, _MOST = (
     1e9,
 )  # regularisation, in units of the cost's curvature in u
 _NUMBERS = 2**25  # second derivatives that are held at once
-
-
-class Trajectories(NamedTuple):
-    """Trajectories and the local models of the value along them: V(x) ~ V + g'd + d'Hd/2, d = x - x_k.
-
-    Example:
-        >>> def step(x, u):  # a cart without friction, for 0.1 s
-        ...     after = torch.stack((x[:, 0] + 0.1 * x[:, 1], x[:, 1] + 0.1 * u[:, 0]), dim=-1)
-        ...     return after, 0.1 * (x.square().sum(-1) + u.square().sum(-1))
-        >>> problem = adp.SampledProblem(step, dim=2, inputs=1, low=-1.0, high=1.0)
-        >>> found = adp.BoxDDP(problem, steps=20, compile=False).solve(torch.tensor([[1.0, 0.0]]).double())
-        >>> found.state.shape, found.feedback.shape
-        (torch.Size([1, 21, 2]), torch.Size([1, 20, 1, 2]))
-
-        Shown by `staf_torch/adp/README.md`.
-    """
-
-    state: Tensor  # (B, T + 1, n), not wrapped
-    control: Tensor  # (B, T, m)
-    feedback: Tensor  # du/dx, (B, T, m, n); 0 where a bound holds
-    value: Tensor  # cost from x_k on, (B, T + 1)
-    gradient: Tensor  # g, (B, T + 1, n)
-    curvature: Tensor  # H, (B, T + 1, n, n)
-    converged: Tensor  # (B,) bool: no step of the search promises or brings a relative gain of tolerance
-
-    @property
-    def cost(self) -> Tensor:
-        """(B,)."""
-        return self.value[:, 0]
-
-    def rows(self, index: Tensor) -> Trajectories:
-        """Some of the rows."""
-        return Trajectories(*(part[index] for part in self))
 
 
 class BoxDDP:
@@ -134,9 +102,8 @@ class BoxDDP:
         trailing("BoxDDP.solve", "x0", x0, 2, n)
         expected = (len(x0), self.steps, m)
         if control is None:
-            goal = x0 - self.problem.offset(x0, self.problem.goal)
             gains = (-self.problem.k).expand(*expected, n)
-            reference = Reference(goal.unsqueeze(1).expand(-1, self.steps, -1), gains)
+            reference = Reference(self.problem.goals(x0, self.steps)[:, :-1], gains)
             control = self.problem.rest.expand(expected)
         if control.shape != expected:
             raise ValueError(
@@ -147,7 +114,10 @@ class BoxDDP:
             reference = Reference(still, x0.new_zeros(*expected, n))
         if terminal is None:
             none, bent = torch.zeros_like(x0), (2 * self.problem.p).expand(len(x0), n, n)
-            terminal = LocalModel(self.problem.goal.expand_as(x0), none[:, 0], none, bent)
+            goal = self.problem.goal.expand_as(x0)
+            if self.problem.path is not None:
+                goal = self.problem.goals(x0, self.steps)[:, -1]
+            terminal = LocalModel(goal, none[:, 0], none, bent)
         together = max(1, _NUMBERS // (self.steps * (n + 1) * (n + m) ** 2))
         with torch.no_grad():
             whole = x0, self.problem.admissible(control), *reference, *terminal
@@ -310,50 +280,6 @@ class BoxDDP:
             torch.cat((curvature, terminal.curvature.unsqueeze(1)), dim=1),
             converged & torch.isfinite(plan.cost),
         )
-
-
-class Reference(NamedTuple):
-    """What a control is a feedback around."""
-
-    state: Tensor  # (B, T, n)
-    feedback: Tensor  # (B, T, m, n)
-
-
-class LocalModel(NamedTuple):
-    """V(x) ~ v + g'd + d'Hd/2 with d = x - state by the shorter way around, a row each."""
-
-    state: Tensor  # (B, n)
-    value: Tensor  # v, (B,)
-    gradient: Tensor  # g, (B, n)
-    curvature: Tensor  # H, (B, n, n)
-
-    def rows(self, index: Tensor) -> LocalModel:
-        """Some of the rows."""
-        return LocalModel(*(part[index] for part in self))
-
-    def at(self, problem: SampledProblem, x: Tensor) -> Tensor:
-        """V at L states a row: (B, L, n) -> (B, L)."""
-        d = problem.offset(x, self.state.unsqueeze(1))
-        bent = (self.curvature.unsqueeze(1) * d.unsqueeze(-2)).sum(-1)
-        return self.value.unsqueeze(1) + ((self.gradient.unsqueeze(1) + 0.5 * bent) * d).sum(-1)
-
-    def slope(self, problem: SampledProblem, x: Tensor) -> Tensor:
-        """Its gradient at a state a row: (B, n) -> (B, n)."""
-        d = problem.offset(x, self.state)
-        return self.gradient + (self.curvature * d.unsqueeze(-2)).sum(-1)
-
-
-class Plan(NamedTuple):
-    """Trajectories without their models."""
-
-    state: Tensor  # (B, T + 1, n)
-    control: Tensor  # (B, T, m)
-    cost: Tensor  # (B,)
-    paid: Tensor  # of every step, and at last the terminal value, (B, T + 1)
-
-    def rows(self, index: Tensor) -> Plan:
-        """Some of the rows."""
-        return Plan(*(part[index] for part in self))
 
 
 class Found(NamedTuple):

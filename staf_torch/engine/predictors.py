@@ -234,8 +234,18 @@ def along(function: Callable[[Tensor], Any], x: Tensor, dx: Tensor) -> tuple[Any
         (5.0, 0.2)
 
         Shown by `staf predictor=tangent`.
+
+    Raises:
+        NotImplementedError: if an operation of the function has no derivative in forward mode.
     """
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*torch.jit.script")
-        primal, tangent = torch.func.jvp(function, (x,), (dx,))[:2]
+        try:
+            primal, tangent = torch.func.jvp(function, (x,), (dx,))[:2]
+        except NotImplementedError as error:
+            said = str(error).partition("\n")[0]
+            raise NotImplementedError(
+                "A `Tangent` predictor needs derivatives of V and of the kernel in forward mode; torch says: "
+                + said
+            ) from None
     return primal, tangent

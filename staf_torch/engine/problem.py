@@ -10,7 +10,7 @@ from torch import Tensor
 from ..approximation.basis import StaFBasis, Target
 from ..lanes import each
 from ..numerics.checks import fail, integer, sampled, trailing
-from ..optim.base import UpdateLaw
+from ..optim.base import LawState, UpdateLaw
 from .predictors import Predictor
 
 _TOGETHER = 10  # centers at which V is written out one by one
@@ -66,6 +66,47 @@ class Problem:
         return each(
             lambda at: sampled(target, target(at), at), centers, dim=x.dim() - 1, together=_TOGETHER // 2
         )
+
+    def first_state(self, weights: Tensor) -> LawState:
+        """Return what the law carries into the first iteration, for weights (B, M).
+
+        Raises:
+            TypeError: if `init` of the law returns no tuple of tensors.
+            ValueError: if one of them does not begin with B, the rows.
+        """
+        state, name = self.law.init(weights), f"{type(self.law).__name__}.init"
+        if not isinstance(state, tuple) or not all(isinstance(part, Tensor) for part in state):
+            raise TypeError(f"`{name}` must return a tuple of tensors; got {state!r}.")
+        for k, part in enumerate(state):
+            if part.shape[:1] != weights.shape[:1]:
+                raise ValueError(
+                    f"`{name}` must return tensors of the shapes (B,), (B, M) or (B, M, M), here with B = "
+                    f"{weights.shape[0]}; number {k} is {tuple(part.shape)}."
+                )
+        return state
+
+    def check_step(self, weights: Tensor, state: LawState, before: LawState) -> None:
+        """Refuse what the law made of weights (B, M) if it is not shaped like what it was given.
+
+        Args:
+            weights: the new ones, and their shape is that of the centers.
+            state: the new one.
+            before: what the law was given.
+
+        Raises:
+            ValueError: naming the law and the part.
+        """
+        name = f"{type(self.law).__name__}.step"
+        if weights.shape[-1:] != (self.basis.count,) or weights.dim() != 2:
+            raise ValueError(
+                f"`{name}` must return weights of the shape (B, {self.basis.count}); "
+                f"got {tuple(weights.shape)}."
+            )
+        shapes, given = ([tuple(part.shape) for part in parts] for parts in (state, before))
+        if shapes != given:
+            raise ValueError(
+                f"`{name}` must return a state of the shapes that it got, {given}; got {shapes}."
+            )
 
     def first_weights(self, states: Tensor, weights: Tensor | None) -> Tensor:
         """Return e^g w before the first correction, (B, M), in units of the first state.

@@ -96,7 +96,7 @@ def start(problem: Problem, states: Tensor, weights: Tensor | None) -> Carry:
     gain = problem.basis.kernel.log_gain(states[:, 0])
     zero = states.new_zeros(states.shape[0])
     never = torch.full(zero.shape, -1, dtype=torch.int64, device=states.device)
-    carry = Carry(first, problem.law.init(first), zero if gain is None else gain, 0, never)
+    carry = Carry(first, problem.first_state(first), zero if gain is None else gain, 0, never)
     if problem.predictor is None:
         return carry
     return carry._replace(previous=carry.weights, states=states[:, [0, 0]])
@@ -137,6 +137,7 @@ def correct(problem: Problem, objective: Objective, at: Moment, carry: Carry) ->
         new = brought = _chosen(time, new, brought)
     new_state = law.begin(objective, brought, state)
     new, new_state = law.iterate(objective, new, new_state, problem.inner_steps)
+    problem.check_step(new, new_state, carry.law_state)
     # A row that is not finite stays behind, as it was; the rows beside it never see it.
     finite = all_finite(new) & all_finite(brought)
     fine = at.usable & finite & (carry.diverged_at < 0)

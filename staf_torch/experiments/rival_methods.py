@@ -47,6 +47,8 @@ def discrete_lqr(case: Case) -> Begin:
 
 def near_optimal(case: Case) -> Begin:
     """The discrete LQR improved by rollouts."""
+    if case.path is not None:
+        raise UnsuitableError("follows no path")
     policy = adp.near_optimal(case.plant(), case.cost(), dt=case.dt)
     return lambda x0: policy
 
@@ -63,7 +65,16 @@ def global_value(case: Case) -> Begin:
 
 def box_ddp(case: Case) -> Begin:
     """Receding horizon by box-DDP, three iterations a period."""
-    mpc = adp.RecedingHorizon(case.problem(), steps=case.horizon)
+    return steered(case, adp.RecedingHorizon(case.problem(), steps=case.horizon))
+
+
+def plan(case: Case) -> Begin:
+    """One plan of the whole episode by box-DDP, followed with its feedback."""
+    return steered(case, adp.RecedingHorizon(case.problem(), steps=case.steps, iterations=0))
+
+
+def steered(case: Case, mpc: adp.Controller) -> Begin:
+    """A controller that carries a state, as a function of x."""
 
     def begin(x0: Tensor) -> Steer:
         state = mpc.init(x0)
@@ -86,18 +97,22 @@ def ipopt(case: Case) -> Begin:
     solve = ipopt_program(casadi, case, case.problem(), steps)
 
     def begin(x0: Tensor) -> Steer:
-        plans = [np.concatenate([np.tile(x, steps + 1), np.zeros(m * steps)]) for x in x0.numpy()]
+        rest = np.tile(case.rest or [0.0] * m, steps)
+        plans = [np.concatenate([np.tile(x, steps + 1), rest]) for x in x0[:, :n].numpy()]
+        time = 0.0
 
         def steer(x: Tensor) -> Tensor:
+            nonlocal time
             control = []
-            for row, at in enumerate(x.numpy()):
-                plan = np.array(solve(x0=plans[row], p=at)["x"]).ravel()
+            for row, at in enumerate(x[:, :n].numpy()):
+                plan = np.array(solve(x0=plans[row], p=np.append(at, time))["x"]).ravel()
                 if not np.isfinite(plan).all():
                     plan = plans[row]
                 states, inputs = plan[: n * (steps + 1)], plan[n * (steps + 1) :]
                 control.append(inputs[:m])
                 ahead = np.concatenate([states[n:], states[-n:]]), np.concatenate([inputs[m:], inputs[-m:]])
                 plans[row] = np.concatenate(ahead)
+            time += case.dt
             return torch.from_numpy(np.array(control))
 
         return steer
@@ -121,7 +136,7 @@ def mppi(case: Case) -> Begin:
         controller = MPPI_Batched(
             lambda x, u, t: problem.advance(x, u)[0],
             paid,
-            case.dim,
+            problem.dim,
             torch.diag((_NOISE * (high - low)) ** 2),
             len(x0),
             num_samples=_SAMPLES,
@@ -138,19 +153,20 @@ def mppi(case: Case) -> Begin:
 
 
 def ipopt_program(casadi: Any, case: Case, problem: SampledProblem, steps: int) -> Any:
-    """IPOPT on min sum l(x, u) + V_T over (states, controls): called with a guess x0 and the state p."""
+    """IPOPT on min sum l(x, u) + V_T over (states, controls): called with a guess x0 and p = (x, t)."""
     n, m = case.dim, case.inputs
-    x, u = casadi.MX.sym("x", n), casadi.MX.sym("u", m)
-    weights, goal = case.weights, case.goal().tolist()
+    x, u, t = casadi.MX.sym("x", n), casadi.MX.sym("u", m), casadi.MX.sym("t")
+    weights, rest = case.weights, case.rest or [0.0] * m
 
-    def deviation(x: Any) -> Any:
+    def deviation(x: Any, t: Any) -> Any:
+        goal = case.goal().tolist() if case.path is None else case.path(casadi, t)
         away = [x[i] - goal[i] for i in range(n)]
         turns = {i: casadi.floor(away[i] / (2 * math.pi) + 0.5) for i in case.periodic}
         return [part - 2 * math.pi * turns[i] if i in turns else part for i, part in enumerate(away)]
 
-    def paid(x: Any) -> Any:
-        state = sum(q * e**2 for q, e in zip(weights[0], deviation(x), strict=True))
-        return state + sum(r * u[j] ** 2 for j, r in enumerate(weights[1]))
+    def paid(x: Any, t: Any) -> Any:
+        state = sum(q * e**2 for q, e in zip(weights[0], deviation(x, t), strict=True))
+        return state + sum(r * (u[j] - rest[j]) ** 2 for j, r in enumerate(weights[1]))
 
     def motion(x: Any) -> Any:
         parts = case.equations(casadi, [x[i] for i in range(n)], [u[j] for j in range(m)])
@@ -158,27 +174,28 @@ def ipopt_program(casadi: Any, case: Case, problem: SampledProblem, steps: int) 
 
     h = case.dt
     if case.discrete:
-        after, spent = motion(x), h * paid(x)
+        after, spent = motion(x), h * paid(x, t)
     else:
         at = [x]
         k = [motion(x)]
         for share in (0.5, 0.5, 1.0):
             at.append(x + share * h * k[-1])
             k.append(motion(at[-1]))
-        costs = [paid(each) for each in at]
+        costs = [paid(each, t + s * h) for each, s in zip(at, (0.0, 0.5, 0.5, 1.0), strict=True)]
         after = x + h / 6 * (k[0] + 2 * (k[1] + k[2]) + k[3])
         spent = h / 6 * (costs[0] + 2 * (costs[1] + costs[2]) + costs[3])
-    step = casadi.Function("step", [x, u], [after, spent])
+    step = casadi.Function("step", [x, u, t], [after, spent])
     states, controls = casadi.MX.sym("X", n, steps + 1), casadi.MX.sym("U", m, steps)
-    start = casadi.MX.sym("p", n)
-    moved, costs = step.map(steps)(states[:, :-1], controls)
-    last = casadi.vertcat(*deviation(states[:, -1]))
-    total = casadi.sum2(costs) + casadi.bilin(problem.p.numpy(), last, last)
+    start = casadi.MX.sym("p", n + 1)
+    times = start[n] + h * casadi.DM(range(steps)).T
+    moved, costs = step.map(steps)(states[:, :-1], controls, times)
+    last = casadi.vertcat(*deviation(states[:, -1], start[n] + h * steps))
+    total = casadi.sum2(costs) + casadi.bilin(problem.p[:n, :n].numpy(), last, last)
     program = {
         "x": casadi.vertcat(casadi.vec(states), casadi.vec(controls)),
         "p": start,
         "f": total,
-        "g": casadi.vertcat(states[:, 0] - start, casadi.vec(states[:, 1:] - moved)),
+        "g": casadi.vertcat(states[:, 0] - start[:n], casadi.vec(states[:, 1:] - moved)),
     }
     quiet = {"ipopt.print_level": 0, "ipopt.sb": "yes", "print_time": False, "ipopt.max_iter": 300}
     warm = {"ipopt.warm_start_init_point": "yes", "ipopt.mu_init": 1e-3}
@@ -227,7 +244,8 @@ METHODS = {
         Method("discrete LQR", discrete_lqr, ("scipy",)),
         Method("near_optimal", near_optimal, ("scipy",)),
         Method("GlobalValue", global_value, ("scipy",)),
-        Method("box-DDP", box_ddp, ("scipy",)),
+        Method("box-DDP", box_ddp, ("scipy",), (steered,)),
+        Method("plan followed", plan, ("scipy",), (steered,)),
         Method("IPOPT", ipopt, ("casadi",), (ipopt_program,)),
         Method("MPPI", mppi, ("pytorch-mppi",)),
     )

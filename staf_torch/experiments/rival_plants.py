@@ -10,8 +10,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..adp import QuadraticCost, SampledProblem
-from ..systems import Plant, RatePlant, StepPlant
+from ..adp import QuadraticCost, SampledProblem, TrackingCost
+from ..systems import Clocked, Plant, RatePlant, StepPlant
 
 Equations = Callable[[Any, Sequence[Any], Sequence[Any]], Sequence[Any]]
 """(a module with sin, cos, fmin, fmax, coordinates of x, those of u) -> those of x' or x+."""
@@ -46,6 +46,10 @@ class Case:
         periodic: coordinates that are angles.
         swing: whether the goal must be reached from far away, by a `GlobalValue`.
         horizon: periods that planning methods look ahead.
+        path: coordinates of the state to follow from (module, t), of a plant in continuous time; None for the
+            set-point. ``box`` is then around it at t = 0.
+        rest: the input that holds the plant; 0 by default.
+        left: share of the cost that may be left at the end of an episode that counts as regulated.
     """
 
     name: str
@@ -61,6 +65,9 @@ class Case:
     discrete: bool = False
     swing: bool = False
     horizon: int = 50
+    path: Callable[[Any, Any], Sequence[Any]] | None = None
+    rest: tuple[float, ...] | None = None
+    left: float = 1e-3
 
     @property
     def dim(self) -> int:
@@ -71,8 +78,15 @@ class Case:
         return len(self.low)
 
     def goal(self) -> Tensor:
-        """The set-point, (n,)."""
+        """The set-point, or the path at t = 0, (n,)."""
+        if self.path is not None:
+            return self.way(torch.zeros((), dtype=torch.float64))
         return torch.tensor(self.target or [0.0] * self.dim, dtype=torch.float64)
+
+    def way(self, time: Tensor) -> Tensor:
+        """The path: (...) -> (..., n)."""
+        assert self.path is not None
+        return torch.stack(tuple(self.path(TorchMath, time)), dim=-1)
 
     def plant(self) -> Plant:
         def function(x: Tensor, u: Tensor) -> Tensor:
@@ -84,22 +98,28 @@ class Case:
             "periodic": self.periodic,
             "low": self.low,
             "high": self.high,
-            "equilibrium": self.goal(),
+            "equilibrium": self.goal() if self.rest is None else ([0.0] * self.dim, list(self.rest)),
         }
-        return StepPlant(function, dt=self.dt, **given) if self.discrete else RatePlant(function, **given)
+        if self.discrete:
+            return StepPlant(function, dt=self.dt, **given)
+        plant = RatePlant(function, **given)
+        return plant if self.path is None else Clocked(plant)
 
     def cost(self) -> QuadraticCost:
         q, r = (torch.diag(torch.tensor(part, dtype=torch.float64)) for part in self.weights)
+        if self.path is not None:
+            return TrackingCost(q, r, self.dim, self.inputs, path=self.way)
         return QuadraticCost(q, r, self.dim, self.inputs, target=self.target)
 
     def problem(self) -> SampledProblem:
         return SampledProblem.of(self.plant(), self.cost(), dt=self.dt)
 
     def states(self, count: int, seed: int) -> Tensor:
-        """Initial states, uniform in the box: (count, n)."""
+        """Initial states, uniform in the box, with the time where there is a path: (count, n or n + 1)."""
         generator = torch.Generator().manual_seed(seed)
         uniform = torch.rand(count, self.dim, generator=generator, dtype=torch.float64)
-        return self.goal() + torch.tensor(self.box, dtype=torch.float64) * (2 * uniform - 1)
+        x = self.goal() + torch.tensor(self.box, dtype=torch.float64) * (2 * uniform - 1)
+        return x if self.path is None else torch.cat((x, torch.zeros_like(x[:, :1])), dim=-1)
 
 
 def mass(m: Any, x: Sequence[Any], u: Sequence[Any]) -> Sequence[Any]:
@@ -125,6 +145,21 @@ def quadrotor(m: Any, x: Sequence[Any], u: Sequence[Any]) -> Sequence[Any]:
     """(y, z, angle, their rates) under (thrust above hover, torque): 1 kg, 0.1 kg m^2."""
     lift = 9.81 + u[0]
     return x[3], x[4], x[5], -lift * m.sin(x[2]), lift * m.cos(x[2]) - 9.81, u[1] / 0.1
+
+
+def small_quadrotor(m: Any, x: Sequence[Any], u: Sequence[Any]) -> Sequence[Any]:
+    """(x, x', z, z', theta, theta') under two thrusts, safe-control-gym's: 27 g, the arms 39.7 mm."""
+    lift = (u[0] + u[1]) / 0.027
+    turn = 0.0397 * (u[1] - u[0]) / (1.4e-5 * math.sqrt(2))
+    return x[1], m.sin(x[4]) * lift, x[3], m.cos(x[4]) * lift - 9.81, x[5], turn
+
+
+def figure_eight(m: Any, t: Any) -> Sequence[Any]:
+    """A lemniscate of 0.75 m around (0, 1 m) in 6 s, without the angle that it takes."""
+    turn = 2 * math.pi / 6
+    sine, cosine = m.sin(turn * t), m.cos(turn * t)
+    across, up = 0.75 * turn * cosine, 0.75 * turn * (cosine * cosine - sine * sine)
+    return 0.75 * sine, across, 0.75 * sine * cosine + 1.0, up, 0 * t, 0 * t
 
 
 _CART = ((1.0, 1.0, 0.1, 0.1), (0.01,))
@@ -170,6 +205,21 @@ CASES = {
             (9.81, 1.0),
             (0.4,) * 6,
             periodic=(2,),
+        ),
+        Case(
+            "figure_eight",
+            small_quadrotor,
+            0.02,
+            300,
+            ((5.0, 0.1, 5.0, 0.1, 0.1, 0.1), (0.1, 0.1)),
+            (0.0563, 0.0563),  # two rotors each at their least and most: 3.16e-10 (0.2685 PWM + 4070.3)^2 N
+            (0.2967, 0.2967),
+            (0.05,) * 6,
+            periodic=(4,),
+            horizon=20,
+            path=figure_eight,
+            rest=(0.5 * 0.027 * 9.81,) * 2,
+            left=0.2,
         ),
         Case(
             "cart_pole_swing_up",

@@ -27,7 +27,6 @@ from .rival_methods import METHODS, Begin, Method, UnsuitableError, ipopt_progra
 from .rival_plants import CASES, Case
 
 _log = logging.getLogger(__name__)
-_REGULATED = 1e-3  # share of the cost that may be left at the end of an episode
 _ROUNDED = 1e-6  # of the range of an input, beyond which it violates its bound: solvers round
 _COLUMNS = {
     "plant": "plant",
@@ -100,6 +99,7 @@ def compare(case: Case, methods: list[Method], x0: Tensor, calls: int) -> list[d
         began = time.process_time()
         try:
             begin = method.prepare(case)
+            begin(x0[:1])  # a plan of the whole episode is made here
         except UnsuitableError as why:
             notes[method.name] = str(why)
             continue
@@ -121,7 +121,7 @@ def compare(case: Case, methods: list[Method], x0: Tensor, calls: int) -> list[d
             ("ratio_median", "ratio_max", "regulated", "violations", "us_median", "us_p99", "offline")
         )
         if method.name in episodes:
-            row |= _measured(episodes[method.name], times[method.name], best)
+            row |= _measured(episodes[method.name], times[method.name], best, case.left)
         rows.append(row)
     return rows
 
@@ -186,14 +186,14 @@ def _by_ipopt(case: Case, problem: SampledProblem, x0: Tensor, control: Tensor, 
     solve = ipopt_program(casadi, case, problem, case.steps)
     found = []
     for row in range(len(x0)):
-        guess = np.concatenate([state[row].numpy().ravel(), control[row].numpy().ravel()])
-        solved = solve(x0=guess, p=x0[row].numpy())
+        guess = np.concatenate([state[row, :, : case.dim].numpy().ravel(), control[row].numpy().ravel()])
+        solved = solve(x0=guess, p=np.append(x0[row, : case.dim].numpy(), 0.0))
         found.append(float(solved["f"]) if solved["success"] else np.inf)
     return torch.tensor(found, dtype=torch.float64)
 
 
-def _measured(episode: Episode, times: list[float], best: Tensor) -> dict[str, Any]:
-    up = episode.left <= _REGULATED * best
+def _measured(episode: Episode, times: list[float], best: Tensor, share: float) -> dict[str, Any]:
+    up = episode.left <= share * best
     ratio = (episode.cost / best)[up]
     return {
         "ratio_median": float(ratio.median()) if len(ratio) else None,

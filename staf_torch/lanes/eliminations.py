@@ -157,7 +157,7 @@ def orthogonal(matrix: Tensor, mode: str = "reduced") -> tuple[Tensor, Tensor]:
 def eigen(gram: Tensor, UPLO: str = "L", compute_v: bool = True) -> tuple[Tensor, Tensor]:
     """The eigenvalues of symmetric matrices, ascending, and eigenvectors in columns, by Jacobi's rotations.
 
-    Torch asks for vectors also where a caller wants none; see `WithoutVectors`.
+    Torch asks for vectors also where a caller wants none; see `InPlainTorch`.
 
     One pass rotates the pairs (0, 1), (2, 3), ... at once and then moves all indices but the first one
     place on, so that after size - 1 passes every pair has met: Brent and Luk (1985).
@@ -277,10 +277,54 @@ def _turn(matrix: Tensor, cosine: Tensor, sine: Tensor) -> Tensor:
     return c * matrix + s * matrix[..., partner, :]
 
 
-class WithoutVectors(TorchFunctionMode):
-    """Context: `torch.linalg.eigvalsh` of a traced matrix is `eigenvalues`.
+def _signs_and_pivots(matrix: Tensor) -> tuple[Tensor, Tensor]:
+    """The sign of the permutation, (...), and the pivots, (..., M), of an elimination with row exchanges."""
+    rest, pivots = matrix, []
+    sign = torch.ones_like(matrix[..., 0, 0])
+    while rest.shape[-1]:
+        best = rest[..., 0, :]
+        others = []
+        for i in range(1, rest.shape[-1]):
+            row = rest[..., i, :]
+            larger = row[..., :1].abs() > best[..., :1].abs()
+            sign = torch.where(larger.squeeze(-1), -sign, sign)
+            best, row = torch.where(larger, row, best), torch.where(larger, best, row)
+            others.append(row)
+        pivot = best[..., 0]
+        pivots.append(pivot)
+        below = best[..., 1:] / torch.where(pivot == 0, 1.0, pivot).unsqueeze(-1)
+        cleared = [row[..., 1:] - row[..., :1] * below for row in others]
+        rest = torch.stack(cleared, dim=-2) if cleared else rest[..., :0, :0]
+    return sign, torch.stack(pivots, dim=-1)
 
-    Below, where operations are traced, `eigvalsh` looks like `eigh`, which takes many times as long.
+
+def determinant(matrix: Tensor) -> Tensor:
+    """det A: (..., M, M) -> (...)."""
+    sign, pivots = _signs_and_pivots(matrix)
+    return sign * pivots.prod(-1)
+
+
+def log_determinant(matrix: Tensor) -> tuple[Tensor, Tensor]:
+    """The sign of det A and log |det A|: (..., M, M) -> (...), (...)."""
+    sign, pivots = _signs_and_pivots(matrix)
+    return sign * pivots.sign().prod(-1), pivots.abs().log().sum(-1)
+
+
+def _logdet(matrix: Tensor) -> Tensor:
+    sign, size = log_determinant(matrix)
+    return torch.where(sign < 0, torch.nan, size)
+
+
+def _one_hot(index: Tensor, num_classes: int = -1) -> Tensor:
+    if num_classes < 1:  # torch would read the largest index
+        return torch.nn.functional.one_hot(index, num_classes)
+    return (index.unsqueeze(-1) == torch.arange(num_classes, device=index.device)).to(torch.int64)
+
+
+class InPlainTorch(TorchFunctionMode):
+    """Context: a few functions of a traced tensor are plain torch operations, where one cannot see any more
+    below, where operations are traced, what was asked for: `eigvalsh` looks like `eigh`, which takes many
+    times as long; the slope of a determinant reads the factors that torch keeps; `one_hot` reads its input.
 
     Args:
         traced: whether a tensor depends on an input of the program.
@@ -293,12 +337,26 @@ class WithoutVectors(TorchFunctionMode):
     def __torch_function__(
         self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
     ) -> Any:
-        if func is torch.linalg.eigvalsh and len(args) == 1 and not kwargs:
-            (gram,) = args
-            if not torch._C._functorch.is_functorch_wrapped_tensor(gram) and self._traced(gram):
-                return eigenvalues(gram)
-        return func(*args, **(kwargs or {}))
+        kwargs = kwargs or {}
+        plain = _PLAIN.get(func)
+        if plain is not None and args and isinstance(args[0], Tensor):
+            wrapped = torch._C._functorch.is_functorch_wrapped_tensor(args[0])
+            if plain is eigenvalues:  # a bisection has no derivative worth the name
+                chosen = not wrapped and len(args) == 1 and not kwargs and self._traced(args[0])
+            else:
+                chosen = wrapped or self._traced(args[0])
+            if chosen:
+                return plain(*args, **kwargs)
+        return func(*args, **kwargs)
 
+
+_PLAIN: dict[Any, Callable[..., Any]] = {
+    torch.linalg.eigvalsh: eigenvalues,
+    torch.nn.functional.one_hot: _one_hot,
+    **dict.fromkeys((torch.linalg.det, torch.det, Tensor.det), determinant),
+    **dict.fromkeys((torch.linalg.slogdet, torch.slogdet, Tensor.slogdet), log_determinant),
+    **dict.fromkeys((torch.logdet, Tensor.logdet), _logdet),
+}
 
 FACTORISATIONS: dict[str, Callable[..., Any]] = {
     "linalg_cholesky_ex": cholesky,

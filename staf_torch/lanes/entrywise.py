@@ -31,10 +31,17 @@ for _name in (
     "atan",
     "sinh",
     "cosh",
+    "asinh",
+    "acosh",
+    "atanh",
     "log2",
     "log10",
     "exp2",
     "erf",
+    "erfc",
+    "lgamma",
+    "hypot",
+    "copysign",
     "floor",
     "ceil",
     "trunc",
@@ -92,9 +99,11 @@ def _sigmoid(t: Tracer, out: Tensor, a: Tensor) -> Ids:
 
 @rule("round")
 def _round(t: Tracer, out: Tensor, a: Tensor, decimals: int = 0) -> Ids:
-    if decimals:
-        raise NotLoweredError("`aten.round` to decimals has no scalar form here")
-    return t.map("round", t.nodes(a))
+    if not decimals:
+        return t.map("round", t.nodes(a))
+    unit = t.nodes(10.0 ** abs(decimals), t.kind(out.dtype))
+    up, down = ("mul", "div") if decimals > 0 else ("div", "mul")
+    return t.map(down, t.map("round", t.map(up, t.nodes(a), unit)), unit)
 
 
 @rule("frac")
@@ -102,9 +111,23 @@ def _frac(t: Tracer, out: Tensor, a: Tensor) -> Ids:
     return t.map("sub", t.nodes(a), t.map("trunc", t.nodes(a)))
 
 
-@rule("remainder", "fmod")
+@rule("fmod")
+def _fmod(t: Tracer, out: Tensor, a: Any, b: Any) -> Ids:
+    return t.cast(t.map("fmod", *numbers(t, _divided(t, out), a, b)), t.kind(out.dtype))
+
+
+@rule("remainder")
 def _remainder(t: Tracer, out: Tensor, a: Any, b: Any) -> Ids:
-    raise NotLoweredError("a remainder has no scalar form here")
+    kind = _divided(t, out)
+    x, y = numbers(t, kind, a, b)
+    rest, zero = t.map("fmod", x, y), t.nodes(0.0, kind)
+    unlike = t.map("xor", t.map("lt", rest, zero), t.map("lt", y, zero))
+    moved = t.map("and", t.map("ne", rest, zero), unlike)  # the rest has the sign of the divisor
+    return t.cast(t.map("where", moved, t.map("add", rest, y), rest), t.kind(out.dtype))
+
+
+def _divided(t: Tracer, out: Tensor) -> str:
+    return t.kind(out.dtype) if out.dtype.is_floating_point else REAL
 
 
 @rule("sign", "sgn")

@@ -10,9 +10,12 @@ from torch._decomp import decomposition_table
 
 from . import entrywise, reductions  # noqa: F401  their rules
 from .eliminations import FACTORISATIONS
-from .movements import MOVEMENTS, moved
+from .movements import MOVEMENTS, moved, scatter_add
+from .replacements import REPLACEMENTS
 from .rules import RULES
 from .tracer import NotLoweredError, Tracer
+
+RULES["scatter_add"] = scatter_add
 
 
 def lower(t: Tracer, func: Any, name: str, out: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> Any:
@@ -28,12 +31,14 @@ def lower(t: Tracer, func: Any, name: str, out: Any, args: Sequence[Any], kwargs
     Raises:
         NotLoweredError: if there is no rule.
     """
-    rule = RULES.get(name)
+    # What torch's own decompositions end in takes the arguments of the operation of the same name.
+    plain = name if name in REPLACEMENTS else name.removeprefix("prims::")
+    rule = RULES.get(plain)
     if rule is not None:
         return rule(t, out, *args, **kwargs)
     if name in MOVEMENTS:
         return moved(t, func, out, args, kwargs)
-    decomposition = FACTORISATIONS.get(name) or decomposition_table.get(func)
+    decomposition = FACTORISATIONS.get(name) or REPLACEMENTS.get(name) or decomposition_table.get(func)
     if decomposition is None and func._can_decompose():  # of several operations, also in torch
         decomposition = func.decompose
     if decomposition is None:

@@ -48,10 +48,11 @@ MOVEMENTS = frozenset(
 
 def moved(t: Tracer, func: Any, out: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> Any:
     """The nodes of what an operation of `MOVEMENTS` returns; arguments as of `lowering.lower`."""
-    name = func._schema.name.removeprefix("aten::")
-    at = 2 if name in ("gather", "scatter") else 1 if name.startswith("index") else None
+    name = func._schema.name.removeprefix("aten::").removesuffix("_")
+    named = [argument.name for argument in func._schema.arguments]
+    at = next((k for k, argument in enumerate(named) if argument in ("index", "indices")), None)
     if name == "index_put" and (kwargs.get("accumulate") or (len(args) > 3 and args[3])):
-        raise NotLoweredError(f"`{func}` has no scalar form here")
+        return _accumulated(t, out, *args[:3])
     if at is not None and any(
         isinstance(i, Tensor) and (t.traced(i) or not t.stated(i)) for i in _listed(args[at])
     ):
@@ -79,6 +80,34 @@ def moved(t: Tracer, func: Any, out: Any, args: Sequence[Any], kwargs: dict[str,
     return result.numpy() + zero
 
 
+def scatter_add(t: Tracer, out: Tensor, a: Tensor, dim: int, index: Tensor, source: Tensor) -> Ids:
+    """Entries added at places along a dimension, also at such as the row computes: the slope of `gather`."""
+    kind = t.kind(out.dtype)
+    total = np.moveaxis(t.nodes(a, kind), dim, -1).copy()
+    at = np.moveaxis(t.nodes(index, WHOLE), dim, -1)
+    added = np.moveaxis(t.nodes(source, kind), dim, -1)
+    inner = tuple(slice(size) for size in at.shape[:-1])
+    part, added, nothing = total[inner], added[inner], t.nodes(0.0, kind)
+    for s in range(at.shape[-1]):
+        for k in range(total.shape[-1]):
+            here = t.map("eq", at[..., s], t.nodes(k, WHOLE))
+            part[..., k] = t.map("add", part[..., k], t.map("where", here, added[..., s], nothing))
+    return np.moveaxis(total, -1, dim)
+
+
+def _accumulated(t: Tracer, out: Tensor, a: Tensor, index: Sequence[Tensor | None], source: Tensor) -> Ids:
+    """Entries added at an index that no row computes: the slope of an entry that was read twice, say."""
+    if any(isinstance(i, Tensor) and (t.traced(i) or not t.stated(i)) for i in index):
+        raise NotLoweredError("`aten.index_put` at an index that the row computes has no scalar form here")
+    kind = t.kind(out.dtype)
+    places = torch.arange(a.numel()).reshape(a.shape)[tuple(slice(None) if i is None else i for i in index)]
+    nodes = np.broadcast_to(t.nodes(a, kind), a.shape).reshape(-1).copy()
+    added = np.broadcast_to(t.nodes(source, kind), tuple(places.shape)).reshape(-1)
+    for place, node in zip(places.reshape(-1).tolist(), added, strict=True):
+        nodes[place] = t.map("add", np.asarray(nodes[place]), np.asarray(node))
+    return nodes.reshape(a.shape)
+
+
 def _listed(value: Any) -> Sequence[Any]:
     return value if isinstance(value, list | tuple) else [value]
 
@@ -88,6 +117,10 @@ def _indexed(
 ) -> Ids:
     """gather, scatter and selection at an index that a row computes, or that numbers of the table do."""
     kind = t.kind(out.dtype)
+    if name == "index_put" and len(dim) == 1 and dim[0].dtype == torch.bool and index.numel() == 1:
+        chosen = t.nodes(dim[0])  # y[y > 1] = 1
+        chosen = chosen.reshape(*chosen.shape, *[1] * (a.dim() - chosen.ndim))
+        return t.map("where", chosen, t.nodes(index, kind).reshape(()), t.nodes(a, kind))
     if name == "index" and sum(i is not None for i in dim) == 1:
         axis = next(k for k, i in enumerate(dim) if i is not None)
         name, dim, index = "index_select", axis, dim[axis]

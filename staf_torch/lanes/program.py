@@ -13,7 +13,7 @@ from . import compiler, trace_cache
 from .captured import Recipe
 from .combinators import Tree, tracing
 from .content import signature, skeleton
-from .eliminations import WithoutVectors
+from .eliminations import InPlainTorch
 from .emission import emit
 from .given import Given
 from .graph import NOW, STEP, Graph
@@ -355,8 +355,15 @@ def trace(step: Step, given: Given, *, widened: bool = False, folded: bool = Fal
         row = given.tree("row", inputs("row", given.row, 0, 0))
         now = given.tree("now", inputs("now", given.now, NOW, 1))
         carry = inputs("state", given.carry, STEP, 0)
-        with tracer, tracing(tracer), NoReading(tracer), WithoutVectors(tracer.traced):
-            after, out = step(given.tree("carry", carry), now, row)
+        with tracer, tracing(tracer), NoReading(tracer), InPlainTorch(tracer.traced):
+            try:
+                after, out = step(given.tree("carry", carry), now, row)
+            except NotLoweredError:
+                raise
+            except (
+                Exception
+            ) as error:  # of the step itself, which the definition raises again, or of the tracer
+                raise NotLoweredError(f"{type(error).__name__}: {error}") from error
         ends, structure = flatten(after)
         if structure != given.structures["carry"] or [(e.shape, e.dtype) for e in ends] != [
             (c.shape, c.dtype) for c in carry

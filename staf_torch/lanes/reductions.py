@@ -113,12 +113,38 @@ def _norm(
     t: Tracer, out: Tensor, a: Tensor, order: float = 2, dims: Any = None, keepdim: bool = False, **_: Any
 ) -> Ids:
     flat, shaped = _rows(t.nodes(a, t.kind(out.dtype)), dims, keepdim)
+    return shaped(_length(t, flat, order))
+
+
+def _length(t: Tracer, flat: Ids, order: float) -> Ids:
+    """The norm over the last dimension."""
     if order == 2:
-        return shaped(t.map("sqrt", t.total(t.map("mul", flat, flat))))
-    size = t.map("abs", flat)
+        return t.map("sqrt", t.total(t.map("mul", flat, flat)))
     if order in (1, math.inf):
-        return shaped(t.total(size) if order == 1 else _chain(t, "max", size))
+        size = t.map("abs", flat)
+        return t.total(size) if order == 1 else _chain(t, "max", size)
     raise NotLoweredError(f"a norm of order {order} has no scalar form here")
+
+
+@rule("_cdist_forward")
+def _distances(t: Tracer, out: Tensor, a: Tensor, b: Tensor, order: float, mode: int | None) -> Ids:
+    x, y = numbers(t, t.kind(out.dtype), a, b)
+    return _length(t, t.map("sub", x[..., :, None, :], y[..., None, :, :]), order)
+
+
+@rule("_cdist_backward")
+def _slope_of_distances(
+    t: Tracer, out: Tensor, slope: Tensor, a: Tensor, b: Tensor, order: float, distances: Tensor
+) -> Ids:
+    if order != 2:
+        raise NotLoweredError(f"the slope of distances of order {order} has no scalar form here")
+    kind = t.kind(out.dtype)
+    g, x, y, r = numbers(t, kind, slope, a, b, distances)
+    nothing, one = t.nodes(0.0, kind), t.nodes(1.0, kind)
+    apart = t.map("ne", r, nothing)  # torch: no slope where two points meet
+    share = t.map("where", apart, t.map("div", g, t.map("where", apart, r, one)), nothing)
+    away = t.map("sub", x[..., :, None, :], y[..., None, :, :])
+    return t.total(np.moveaxis(t.map("mul", share[..., None], away), -2, -1))
 
 
 # Products.

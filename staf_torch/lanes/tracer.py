@@ -22,6 +22,7 @@ _OWN = (str(Path(__file__).parent), str(Path(torch.__file__).parent))
 LARGE = 64  # entries above which an operation on a tensor stays a loop over an array in memory
 _READS = ("_local_scalar_dense", "equal", "is_nonzero", "nonzero", "allclose", "masked_select")
 
+_RESHAPED = ("squeeze_", "unsqueeze_", "transpose_", "t_", "as_strided_")  # the same memory seen otherwise
 _BLANK = ("zeros_like", "ones_like", "full_like", "new_zeros", "new_ones", "new_full")  # whatever the values
 
 
@@ -111,8 +112,10 @@ class Tracer(TorchDispatchMode):
     def nodes(self, value: Any, kind: str | None = None) -> Ids:
         """The nodes of a tensor's or number's entries, as one type."""
         if isinstance(value, Tensor):
-            own = self.kind(value.dtype)
-            if self.traced(value):
+            traced = self.traced(value)
+            # A constant of float32, `torch.eye(3)` say, is a number of a float64 program as well.
+            own = REAL if value.dtype == torch.float32 and not traced else self.kind(value.dtype)
+            if traced:
                 found = self._view(self._storages[value.untyped_storage().data_ptr()][1], value)
             elif self.stated(value):
                 found = self._constants(value, own)
@@ -252,6 +255,8 @@ class Tracer(TorchDispatchMode):
             return out
         if name in _READS:
             raise NotLoweredError(f"`{func}` reads a value of a row")
+        if name in _RESHAPED:
+            return func(*args, **kwargs)
         if name.endswith("_") and not name.endswith("__"):
             return self._in_place(func, name.removesuffix("_"), args, kwargs)
         if any(argument.alias_info and argument.alias_info.is_write for argument in func._schema.arguments):

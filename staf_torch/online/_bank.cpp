@@ -39,6 +39,17 @@ static Law law_of(const Rules &r) {
     return law;
 }
 
+// Lane which[l] of a, or of b from `lanes` on.
+INLINE V picked(V a, V b, Mask which) {
+#ifdef __clang__  // which has no builtin of it for lanes that are not constants
+    V found;
+    for (int l = 0; l < lanes; ++l) found[l] = which[l] < lanes ? a[which[l]] : b[which[l] - lanes];
+    return found;
+#else
+    return __builtin_shuffle(a, b, which);
+#endif
+}
+
 INLINE V row(const double *from) {
     V found;
     std::memcpy(&found, from, sizeof found);
@@ -224,7 +235,7 @@ static void local_processes(const Rules &r, Stream &s, const double *x, const do
             const double age = std::fabs(when[i] - when[j]);
             const V e = exponential(exponents * V{nearest, nearest, nearest, latest, latest, latest, age, age});
             for (int g = 0; g < groups; ++g)
-                gram[g][i][j] = __builtin_shuffle(e, width[g]) * __builtin_shuffle(e, all(1), fade[g]);
+                gram[g][i][j] = picked(e, e, width[g]) * picked(e, all(1), fade[g]);
         }
     for (int g = 0; g < groups; ++g) {
         auto &a = gram[g];

@@ -19,8 +19,8 @@ struct Quadratics {
     void restart(V prior, Mask where) {
         for (int j = 0; j < features; ++j)
             for (int i = 0; i <= j; ++i) column(j)[i] = where ? (i < j ? V{} : prior) : V(column(j)[i]);
-        for (auto &output : coefficients)
-            for (Row &entry : output) entry = where ? V{} : V(entry);
+        for (int o = 0; o < K; ++o)  // by index: a reference to a row of them would promise 64 bytes of alignment
+            for (int j = 0; j < features; ++j) coefficients[o][j] = where ? V{} : V(coefficients[o][j]);
     }
 
     // U' phi

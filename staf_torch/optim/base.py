@@ -80,9 +80,17 @@ class UpdateLaw(abc.ABC):
     def rescale(self, state: LawState, factor: Tensor) -> LawState:
         """The state when the unit of the weights changes, a -> factor a, K -> K / factor: (..., 1).
 
-        The default scales everything, as is right for velocities.
+        The default scales vectors (..., M), as is right for velocities, and matrices (..., M, M), as is right
+        for K^-1; numbers (...), a count or a flag say, stay. A law that carries others, gradients say, which
+        the unit leaves alone, says so here.
         """
-        return tuple(part * factor for part in state)
+        extra = factor.dim() - 1
+        return tuple(
+            part
+            if part.dim() == extra
+            else part * factor.view(*factor.shape, *[1] * (part.dim() - extra - 1))
+            for part in state
+        )
 
     def contraction(self, condition_number: Tensor) -> Tensor | None:
         """A bound on excess after / excess before of one iteration, from kappa(K); None: not known."""

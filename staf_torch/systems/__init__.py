@@ -7,6 +7,7 @@ from .base import Plant as Plant
 from .base import Units as Units
 from .bounds import Bounds as Bounds
 from .cart_pole import CartPole as CartPole
+from .clocked import Clocked as Clocked
 from .integrators import runge_kutta_step as runge_kutta_step
 from .integrators import simulate as simulate
 from .integrators import trajectory as trajectory
@@ -27,6 +28,7 @@ __all__ = [
     "Barrier",
     "Bounds",
     "CartPole",
+    "Clocked",
     "ControlAffineSystem",
     "Linear",
     "Linearisation",

@@ -38,7 +38,11 @@ NEEDS = {  # what some options cannot do without, or that makes them small
     "centers=directions": ["centers.directions=[[0,1],[1,0],[-1,0]]"],
     "system=cart_pole": ["centers=simplex", "target=quadratic", "initial_state=[0.1,0,0,0]"],
     "system=planar_quadrotor": ["centers=simplex", "target=quadratic", "initial_state=[0.1,0,0,0,0,0]"],
-    "experiment=exponential_bound": ["exponential_bound.radii=[0.1]", "exponential_bound.states=9"],
+    "experiment=exponential_bound": [
+        "exponential_bound.radii=[0.1]",
+        "exponential_bound.states=5",
+        "exponential_bound.epsilons=[0.1]",
+    ],
     "experiment=flat_limit": ["flat_limit.counts=[3]", "flat_limit.radii.smallest=1e-3"],
     "experiment=adp_comparison": ["trajectories=3", "adp.order=2"],
     "experiment=rivals": [
@@ -63,6 +67,8 @@ NEEDS = {  # what some options cannot do without, or that makes them small
 CUSTOM = {
     "kernel": "plants.Cauchy",
     "metric": "plants.Largest",
+    "optimizer": "plants.Shrinking",
+    "predictor": "plants.Still",
     "system": "plants.Escape",
     "target": "plants.bowl",
     "tracker": "plants.Lines",

@@ -2,11 +2,36 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from helpers import uniform
 from variants import KERNELS, over
 
 import staf_torch as st
+
+ONE_AN_ENTRY: dict[str, Callable[[torch.Tensor], st.Kernel]] = {
+    "gaussian": lambda width: st.GaussianKernel(width),
+    "matern12": lambda length: st.MaternKernel(0.5, length),
+    "matern32": lambda length: st.MaternKernel(1.5, length),
+    "matern52": lambda length: st.MaternKernel(2.5, length),
+    "inverse": lambda length: st.InverseMultiquadricKernel(length),
+    "rational_quadratic": lambda length: st.RationalQuadraticKernel(1.3, length),
+    "rational_quadratic_alpha": lambda alpha: st.RationalQuadraticKernel(alpha, 0.9),
+    "polynomial": lambda bias: st.PolynomialKernel(3, bias),
+}
+QUESTIONS: dict[str, Callable[..., torch.Tensor | None]] = {
+    "value": lambda k, x, z, d, b: k(z, d),
+    "gradient": lambda k, x, z, d, b: k.gradient(z, d, b),
+    "core": lambda k, x, z, d, b: k.core(x, z, d),
+    "core_gradient": lambda k, x, z, d, b: k.core_gradient(x, z, d, b),
+    "log_gain": lambda k, x, z, d, b: k.log_gain(x),
+    "log_scale": lambda k, x, z, d, b: k.log_scale(x, z),
+    "log_scale_gradient": lambda k, x, z, d, b: k.log_scale_gradient(x, z),
+    "anchored": lambda k, x, z, d, b: st.AnchoredKernel(k)(z, d),
+    "anchored_gradient": lambda k, x, z, d, b: st.AnchoredKernel(k).gradient(z, d, b),
+    "shift": lambda k, x, z, d, b: (k.follow(z, d[..., :1, :].expand_as(z)) or (None,))[0],
+}
 
 BASES = {
     "rational_quadratic": st.RationalQuadraticKernel(1.3, 0.9),
@@ -63,3 +88,24 @@ def test_the_gradient_of_the_scale_is_that_of_autograd(name: str) -> None:
         z = z.requires_grad_()
         (slope,) = torch.autograd.grad(kernel.log_scale(x, z).sum(), z)
         torch.testing.assert_close(found.expand(z.shape), slope, rtol=1e-12, atol=1e-12)
+
+
+@over(ONE_AN_ENTRY)
+@over(QUESTIONS, "question")
+def test_hyperparameters_of_an_entry_each_are_kernels_one_by_one(question: str, name: str) -> None:
+    """Sizes of batch, points, centers and states all differ, so that none can stand in for another."""
+    make, ask = ONE_AN_ENTRY[name], QUESTIONS[question]
+    many = torch.tensor([0.6, 0.9, 1.7], dtype=torch.float64)
+    x, z, d, b = (
+        uniform(3, 2, seed=1),
+        uniform(3, 5, 2, seed=2),
+        uniform(3, 4, 2, seed=3),
+        uniform(3, 4, seed=4),
+    )
+    found = ask(make(many), x, z, d, b)
+    alone = [ask(make(each), *given) for each, *given in zip(many, x, z, d, b, strict=True)]
+    if found is None:
+        assert all(each is None for each in alone)
+    else:
+        shape = (3, *alone[0].shape)
+        torch.testing.assert_close(found.expand(shape), torch.stack(alone), rtol=1e-13, atol=1e-14)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Callable
+
 import pytest
 import torch
 from torch import Tensor
@@ -40,6 +43,36 @@ def test_a_definite_system_is_solved_to_the_rounding_of_its_condition(size: int)
     assert (error.norm(dim=-1) <= 1e-13 * torch.linalg.cond(gram) * right.norm(dim=-1)).all()
     gram[..., 0, 1:] = torch.nan  # above the diagonal nothing is read
     assert solve_definite(gram, right).isfinite().all()
+
+
+DEFINITE: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
+    "factor": lambda gram, b: torch.linalg.cholesky_ex(gram)[0],
+    "upper factor": lambda gram, b: torch.linalg.cholesky_ex(gram, upper=True)[0],
+    "from a lower factor": lambda gram, b: torch.cholesky_solve(b, gram),
+    "from an upper factor": lambda gram, b: torch.cholesky_solve(b, gram, upper=True),
+    "inverse": lambda gram, b: torch.linalg.inv_ex(gram - gram.new_tensor(4.0).expand(gram.shape))[0],
+}
+for _upper, _left, _unit in itertools.product([True, False], repeat=3):
+    DEFINITE[f"triangle {_upper} {_left} {_unit}"] = lambda gram, b, upper=_upper, left=_left, unit=_unit: (
+        torch.linalg.solve_triangular(gram, b if left else b.mT, upper=upper, left=left, unitriangular=unit)
+    )
+
+
+@pytest.mark.parametrize("name", DEFINITE)
+def test_a_program_factors_and_solves_as_torch_does(name: str) -> None:
+    """Matrices with other numbers above the diagonal than below, where only one of both is read."""
+    torch.manual_seed(1)
+    some, right = torch.randn(5, 4, 4).double(), torch.randn(5, 4, 2).double()
+    gram = some if "triangle" in name or "from" in name else some @ some.mT + torch.eye(4)
+    gram = gram + 5 * torch.eye(4) if gram is some else gram
+
+    def step(_: object, __: object, row: tuple[Tensor, Tensor]) -> tuple[tuple[()], Tensor]:
+        return (), DEFINITE[name](*row)
+
+    program = lanes.Program(step)
+    assert program.compiles((), (), (gram, right), steps=1)
+    found, wanted = (run((), (), (gram, right), steps=1)[1] for run in (program, program.definition))
+    torch.testing.assert_close(found, wanted, rtol=1e-10, atol=1e-10)
 
 
 @pytest.mark.parametrize(("size", "left"), [(3, False), (9, True)])

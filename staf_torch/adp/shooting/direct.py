@@ -9,10 +9,11 @@ import torch
 from torch import Tensor
 
 from ...numerics.checks import fail, integer, positive_real, trailing
-from ...systems import ControlAffineSystem, Linear, Plant
+from ...systems import Clocked, ControlAffineSystem, Linear, Plant
 from ...systems.bounds import Limit
 from ..controllers import LQR, Policy, Value
 from ..cost import Cost
+from .mesh import graded, halved, split
 from .newton import Plan, Solution, choose, follow, minimise, replay
 from .optimum import Optimum
 from .stage import Stage
@@ -22,7 +23,6 @@ _DECAY = 9.2  # time constants of the slowest mode in the horizon: it falls to 1
 _RESOLVED = 0.5  # mean interval in time constants of the fastest mode
 _LEAST = 80  # intervals
 _MOST = 120  # intervals that are chosen at most where inputs are bounded
-_GRADING = 6.0  # ratio of the last interval to the first
 _ROWS = 256  # states solved from at once: a graph of second derivatives is kept for each
 _GAP = 1e-3  # share of the value by which a stationary control may miss the minimum of the Hamiltonian
 _SAME = 1e-4  # relative, of the values of two starts that found the same
@@ -106,6 +106,9 @@ class DirectShooting:
         if system.period is not None or not system.traceable:
             rule = "must be in continuous time and in torch: it is differentiated twice"
             raise fail("DirectShooting", "system", rule, type(system).__name__)
+        if isinstance(system, Clocked):
+            rule = "must have no clock: a path is followed by `BoxDDP`"
+            raise fail("DirectShooting", "system", rule, system)
         cost = cost.bounded(low, high).around(system)
         if cost.discount:
             raise fail("DirectShooting", "cost", "must have no discount", cost.discount)
@@ -369,37 +372,3 @@ def _rates(system: Plant, lqr: LQR) -> tuple[float, float]:
     a, b = system.linearisation(lqr.cost.target, lqr.cost.target_input)
     modes = torch.linalg.eigvals(a.to(lqr.p) - b.to(lqr.p) @ lqr.k)
     return float(-modes.real.max()), float(modes.abs().max())
-
-
-def graded(horizon: float, intervals: int) -> Tensor:
-    """Times of a mesh whose intervals grow in geometric progression: (N + 1,) from 0 to the horizon."""
-    power = math.log(_GRADING) * torch.arange(intervals + 1, dtype=torch.float64) / max(1, intervals - 1)
-    return horizon * power.expm1() / power[-1].expm1()
-
-
-def halved(time: Tensor) -> Tensor:
-    """The same times and those half-way: (N + 1,) -> (2N + 1,)."""
-    middle = 0.5 * (time[1:] + time[:-1])
-    return torch.cat((time[:1], torch.stack((middle, time[1:]), dim=-1).flatten()))
-
-
-def split(stage: Stage, plan: Plan, feedback: Tensor, lengths: Tensor) -> tuple[Plan, Tensor]:
-    """The same control on half intervals, and a feedback around it.
-
-    Args:
-        stage: of the problem.
-        plan: on N intervals.
-        feedback: around it, (B, N, 2m, n).
-        lengths: of the N intervals, (N,).
-
-    Returns:
-        A plan on 2N intervals (of the old cost) and its feedback (B, 2N, 2m, n).
-    """
-    first, last = plan.control.chunk(2, dim=-1)
-    middle = 0.5 * (first + last)
-    early, late = torch.cat((first, middle), dim=-1), torch.cat((middle, last), dim=-1)
-    between, _ = stage.advance(plan.state[:, :-1], early, 0.5 * lengths.expand(plan.control.shape[:2]))
-    state = torch.stack((plan.state[:, :-1], between), dim=2).flatten(1, 2)
-    state = torch.cat((state, plan.state[:, -1:]), dim=1)
-    control = torch.stack((early, late), dim=2).flatten(1, 2)
-    return Plan(state, control, plan.cost), feedback.repeat_interleave(2, dim=1)

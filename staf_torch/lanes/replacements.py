@@ -1,0 +1,175 @@
+"""Operations in terms of simpler torch operations that have a scalar form: order, running products, counts.
+
+What `lower` finds here it traces in place of the operation of torch. Sizes are those
+of a state or of a handful of centers, and order is found by comparing every pair.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from .tracer import NotLoweredError
+
+
+def sort(
+    x: Tensor, dim: int = -1, descending: bool = False, *, stable: bool | None = True
+) -> tuple[Tensor, Tensor]:
+    """The entries in their order and their places, NaN above all; equal entries stay in their order."""
+    if x.dim() == 0:
+        return x.clone(), torch.zeros_like(x, dtype=torch.int64)
+    moved = x.movedim(dim, -1)
+    one, other = moved.unsqueeze(-1), moved.unsqueeze(-2)  # other stands before one
+    low, high = (one, other) if descending else (other, one)
+    before = (low < high) | (low == low) & (high != high)
+    after = (high < low) | (high == high) & (low != low)
+    earlier = torch.ones(x.shape[dim], x.shape[dim], dtype=torch.bool, device=x.device).tril(-1)
+    rank = (before | ~after & earlier).to(torch.int64).sum(-1)
+    place = torch.arange(x.shape[dim], device=x.device)
+    places = ((rank.unsqueeze(-2) == place.unsqueeze(-1)).to(torch.int64) * place).sum(-1)
+    return moved.gather(-1, places).movedim(-1, dim), places.movedim(-1, dim).clone()
+
+
+def stable_sort(
+    x: Tensor, *, stable: bool | None = True, dim: int = -1, descending: bool = False
+) -> tuple[Tensor, Tensor]:
+    """`sort` as the overload `sort.stable` calls it."""
+    return sort(x, dim, descending)
+
+
+def topk(
+    x: Tensor, k: int, dim: int = -1, largest: bool = True, sorted: bool = True
+) -> tuple[Tensor, Tensor]:
+    """The k largest or smallest entries and their places."""
+    values, places = sort(x, dim, descending=largest)
+    return values.narrow(dim, 0, k).clone(), places.narrow(dim, 0, k).clone()
+
+
+def kthvalue(x: Tensor, k: int, dim: int = -1, keepdim: bool = False) -> tuple[Tensor, Tensor]:
+    """The k-th smallest entry, k from 1, and its place."""
+    found = [part.narrow(dim, k - 1, 1) for part in sort(x, dim)]
+    values, places = (part.clone() if keepdim else part.squeeze(dim).clone() for part in found)
+    return values, places
+
+
+def median_along(x: Tensor, dim: int, keepdim: bool = False) -> tuple[Tensor, Tensor]:
+    """The lower median and its place; NaN where there is one."""
+    values, places = sort(x, dim)
+    count = x.shape[dim]
+    lost = values.narrow(dim, count - 1, 1).isnan()
+    found = [
+        torch.where(lost, part.narrow(dim, count - 1, 1), part.narrow(dim, (count - 1) // 2, 1))
+        for part in (values, places)
+    ]
+    value, place = found if keepdim else (part.squeeze(dim) for part in found)
+    return value, place
+
+
+def median(x: Tensor, dim: int | None = None, keepdim: bool = False) -> Any:
+    """The lower median of all entries, or along a dimension with its place."""
+    return median_along(x.reshape(-1), 0)[0] if dim is None else median_along(x, dim, keepdim)
+
+
+def _running(x: Tensor, dim: int, beats: Callable[[Tensor, Tensor], Tensor]) -> tuple[Tensor, Tensor]:
+    parts = x.unbind(dim)
+    best, place = parts[0], torch.zeros_like(parts[0], dtype=torch.int64)
+    values, places = [best], [place]
+    for k, part in enumerate(parts[1:], start=1):
+        taken = beats(part, best) | (part != part)
+        best, place = torch.where(taken, part, best), torch.where(taken, k, place)
+        values.append(best)
+        places.append(place)
+    return torch.stack(values, dim), torch.stack(places, dim)
+
+
+def cummax(x: Tensor, dim: int) -> tuple[Tensor, Tensor]:
+    """The largest entry so far and its place."""
+    return _running(x, dim, torch.ge)
+
+
+def cummin(x: Tensor, dim: int) -> tuple[Tensor, Tensor]:
+    """The smallest entry so far and its place."""
+    return _running(x, dim, torch.le)
+
+
+def cumprod(x: Tensor, dim: int, *, dtype: torch.dtype | None = None) -> Tensor:
+    """The products of the entries so far."""
+    parts = list((x if dtype is None else x.to(dtype)).unbind(dim))
+    for k in range(1, len(parts)):
+        parts[k] = parts[k - 1] * parts[k]
+    return torch.stack(parts, dim)
+
+
+def _product(x: Tensor, dims: Sequence[int] | None, *, output_dtype: torch.dtype | None = None) -> Tensor:
+    axes = range(x.dim()) if dims is None else [d % x.dim() for d in dims]
+    x = x if output_dtype is None else x.to(output_dtype)
+    for dim in sorted(axes, reverse=True):
+        x = x.prod(dim)
+    return x
+
+
+def _sum(x: Tensor, dims: Sequence[int] | None, *, output_dtype: torch.dtype | None = None) -> Tensor:
+    return x.sum(list(range(x.dim()) if dims is None else dims), dtype=output_dtype)
+
+
+def _variance(
+    x: Tensor, dims: Sequence[int] | None, correction: float = 1, *, output_dtype: torch.dtype | None = None
+) -> Tensor:
+    axes = list(range(x.dim()) if dims is None else dims)
+    count = torch.Size(x.shape[d] for d in axes).numel()
+    square = (x - x.mean(axes, keepdim=True)).square().sum(axes)
+    return square / max(0.0, count - correction)
+
+
+def searchsorted(
+    boundaries: Tensor,
+    x: Tensor | float,
+    *,
+    out_int32: bool = False,
+    right: bool = False,
+    side: str | None = None,
+    sorter: Tensor | None = None,
+) -> Tensor:
+    """How many boundaries stand before x; NaN is above all."""
+    if not isinstance(x, Tensor) or sorter is not None:
+        raise NotLoweredError("`searchsorted` of a number or with a sorter has no scalar form here")
+    at = x.unsqueeze(-1)
+    edges = boundaries if boundaries.dim() == 1 else boundaries.unsqueeze(-2)
+    passed = ~(edges > at) if right or side == "right" else ~(edges >= at)
+    return passed.to(torch.int32 if out_int32 else torch.int64).sum(-1)
+
+
+def fmin(a: Tensor, b: Tensor) -> Tensor:
+    """The smaller of two; what is a number where the other is NaN."""
+    return torch.where(a.isnan(), b, torch.where(b.isnan(), a, torch.minimum(a, b)))
+
+
+def fmax(a: Tensor, b: Tensor) -> Tensor:
+    """The larger of two; what is a number where the other is NaN."""
+    return torch.where(a.isnan(), b, torch.where(b.isnan(), a, torch.maximum(a, b)))
+
+
+def angle(x: Tensor) -> Tensor:
+    """The angle of real numbers: 0, or pi where negative."""
+    return torch.where(x < 0, torch.pi, x * 0)
+
+
+REPLACEMENTS: dict[str, Callable[..., Any]] = {
+    "sort": sort,
+    "topk": topk,
+    "kthvalue": kthvalue,
+    "median": median,
+    "cummax": cummax,
+    "cummin": cummin,
+    "cumprod": cumprod,
+    "prims::prod": _product,
+    "prims::sum": _sum,
+    "prims::var": _variance,
+    "searchsorted": searchsorted,
+    "angle": angle,
+    "fmin": fmin,
+    "fmax": fmax,
+}

@@ -1,0 +1,84 @@
+"""A controller of a user's own carries what it likes: numbers, flags, counts, in any container, compiled."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from staf_torch import adp, systems
+
+PLANT = systems.TwoState()
+COST = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
+
+
+class Hysteresis(adp.Controller):
+    """A relay with a dead zone beside a feedback; it counts its switches."""
+
+    def init(self, x0: Tensor) -> Any:
+        mode = torch.zeros_like(x0[:, 0])
+        return {"mode": mode, "switches": mode.long(), "past": (x0, mode > 0)}
+
+    def step(self, x: Tensor, carried: Any, uniform: Tensor, dt: float) -> tuple[Tensor, Any]:
+        mode = torch.where(x[:, 0] > 0.2, 1.0, torch.where(x[:, 0] < -0.2, -1.0, carried["mode"]))
+        changed = mode != carried["mode"]
+        u = -(0.3 * mode + x.sum(-1) + 0.1 * (x - carried["past"][0]).sum(-1))
+        kept = {"mode": mode, "switches": carried["switches"] + changed.long(), "past": (x, changed)}
+        return u.unsqueeze(-1), kept
+
+
+@pytest.mark.compiled
+def test_a_state_of_ones_own_is_carried_row_by_row(caplog: pytest.LogCaptureFixture) -> None:
+    x0 = torch.randn(9, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    x0[4] = torch.nan
+    runs = [
+        adp.simulate(Hysteresis(), PLANT, COST, x0, dt=0.02, steps=200, compile=compile)
+        for compile in (True, False)
+    ]
+    assert not caplog.text
+    torch.testing.assert_close(runs[0].state, runs[1].state, rtol=1e-10, atol=1e-10, equal_nan=True)
+    assert runs[0].diverged.tolist() == [row == 4 for row in range(9)]
+    assert runs[0].critic_weights.shape == (9, 201, 0)
+    alone = adp.simulate(Hysteresis(), PLANT, COST, x0[2:3], dt=0.02, steps=200, compile=True)
+    assert torch.equal(alone.state[0], runs[0].state[2])
+
+
+class Broken(Hysteresis):
+    def __init__(self, initial: Any, after: Any) -> None:
+        super().__init__()
+        self.initial, self.after = initial, after
+
+    def init(self, x0: Tensor) -> Any:
+        return self.initial
+
+    def step(self, x: Tensor, carried: Any, uniform: Tensor, dt: float) -> tuple[Tensor, Any]:
+        return -x[:, :1], self.after
+
+
+@pytest.mark.parametrize(
+    ("initial", "after", "message"),
+    [
+        (torch.tensor(0.0), None, r"`Broken.init` must return tensors \(B, ...\), .* B = 3; got .* \(\)"),
+        (torch.zeros(3), torch.zeros(3, 1), r"`Broken.step` must carry on .* \[\(3,\)\]; got \[\(3, 1\)\]"),
+        (torch.zeros(3), (torch.zeros(3),), r"`Broken.step` must carry on what it got"),
+    ],
+)  # fmt: skip
+def test_what_is_carried_keeps_its_form(initial: Any, after: Any, message: str) -> None:
+    x0 = torch.ones(3, 2, dtype=torch.float64)
+    with pytest.raises(ValueError, match=message):
+        adp.simulate(Broken(initial, after), PLANT, COST, x0, dt=0.1, steps=2)
+
+
+@pytest.mark.parametrize("shape", [(3,), (3, 2), (1,)])
+def test_a_control_of_another_shape_is_refused(shape: tuple[int, ...]) -> None:
+    class Odd(adp.Controller):
+        def init(self, x0: Tensor) -> Any:
+            return ()
+
+        def step(self, x: Tensor, carried: Any, uniform: Tensor, dt: float) -> tuple[Tensor, Any]:
+            return torch.zeros(shape, dtype=x.dtype), carried
+
+    with pytest.raises(ValueError, match=r"\(3, 1\)"):
+        adp.simulate(Odd(), PLANT, COST, torch.ones(3, 2, dtype=torch.float64), dt=0.1, steps=2)

@@ -1,0 +1,194 @@
+"""Operations that people write in plants, laws and values, compiled, are those of torch; derivatives too."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from staf_torch import lanes
+
+SIZE = 3
+LIST = torch.tensor([2, 0])
+EDGES = (-0.8, -0.1, 0.4, 1.1)
+
+
+def slope(function: Callable[[Tensor], Tensor]) -> Callable[[Tensor], Tensor]:
+    return torch.func.grad(lambda x: function(x).sin().sum())
+
+
+def matrix(x: Tensor) -> Tensor:
+    return torch.eye(SIZE) * 2 + x.unsqueeze(-1) * x.unsqueeze(-2).flip(-1)
+
+
+def wrapped(x: Tensor) -> Tensor:
+    """An angle between -pi and pi."""
+    return torch.remainder(5 * x + torch.pi, 2 * torch.pi) - torch.pi
+
+
+def lookup(x: Tensor) -> Tensor:
+    """A table interpolated linearly."""
+    edges = torch.tensor(EDGES, dtype=x.dtype)
+    at = torch.searchsorted(edges, x.contiguous()).clamp(1, len(EDGES) - 1)
+    low, high = edges[at - 1], edges[at]
+    return (at - 1) + (x - low) / (high - low)
+
+
+def masked(x: Tensor) -> Tensor:
+    y = x.clone()
+    y[y > 0.5] = 0.25
+    y[y[:, 0] < 0] = torch.tensor(-1.0, dtype=x.dtype)
+    return y
+
+
+OPERATIONS: dict[str, Callable[[Tensor], Tensor]] = {
+    "remainder": wrapped,
+    "remainder by a row": lambda x: torch.remainder(x * 30, x.flip(-1)),
+    "fmod": lambda x: torch.fmod(x * 40, -0.3),
+    "floor division": lambda x: (x * 9) // 0.7,
+    "hypot": lambda x: torch.hypot(x, x.roll(1, -1)),
+    "asinh": torch.asinh,
+    "acosh": lambda x: torch.acosh(1 + x.abs()),
+    "atanh": lambda x: torch.atanh(x / (1 + x.abs())),
+    "erfc": torch.erfc,
+    "lgamma": lambda x: torch.lgamma(x.abs() + 0.1),
+    "copysign": lambda x: torch.copysign(x, -x.flip(-1)),
+    "angle": torch.angle,
+    "round to decimals": lambda x: torch.round(x, decimals=2),
+    "sort": lambda x: x.sort(-1)[0],
+    "argsort": lambda x: x.argsort(-1).to(x),
+    "sort descending": lambda x: x.sort(-1, descending=True)[0],
+    "top": lambda x: x.topk(2, -1)[0],
+    "median": lambda x: x.median(-1, keepdim=True)[0],
+    "second smallest": lambda x: x.kthvalue(2, -1, keepdim=True)[0],
+    "quantile": lambda x: x.nan_to_num(0.0, 1.0, -1.0).quantile(0.3, -1, keepdim=True),
+    "cummax": lambda x: x.cummax(-1)[0],
+    "cummin": lambda x: x.cummin(-1)[0],
+    "cumprod": lambda x: x.cumprod(-1),
+    "std": lambda x: x.std(-1, keepdim=True),
+    "layer norm": lambda x: functional.layer_norm(x, (SIZE,)),
+    "cross": lambda x: torch.linalg.cross(x, x.flip(-1)),
+    "det": lambda x: torch.linalg.det(matrix(x)).unsqueeze(-1),
+    "slogdet": lambda x: torch.stack(tuple(torch.linalg.slogdet(matrix(x))), dim=-1),
+    "logdet": lambda x: torch.logdet(matrix(x)).unsqueeze(-1),
+    "lookup table": lookup,
+    "one hot": lambda x: functional.one_hot(x.argmax(-1), SIZE).to(x),
+    "distances": lambda x: torch.cdist(x.unsqueeze(-2), x.flip(-1).unsqueeze(-2)).squeeze(-1),
+    "constant of float32": lambda x: x + torch.eye(SIZE)[1],
+    "index_select": lambda x: x.index_select(-1, LIST),
+    "index_copy": lambda x: x.index_copy(-1, LIST, x[:, 1:]),
+    "index_fill": lambda x: x.index_fill(-1, LIST, 0.25),
+    "index_add": lambda x: x.index_add(-1, LIST, x[:, 1:], alpha=2.0),
+    "squeezed in place": lambda x: x.clone().unsqueeze_(-1).squeeze_(-1),
+    "chosen by a mask": masked,
+    "fmin": lambda x: torch.fmin(x, torch.fmax(x.flip(-1), torch.tensor(0.1))),
+    "slope of a list": slope(lambda x: x[:, [1, 0, 1, 1]].cumprod(-1)),
+    "slope of a product": slope(lambda x: x.prod(-1)),
+    "slope of a sort": slope(lambda x: x.sort(-1)[0] * torch.arange(SIZE)),
+    "slope of gather": slope(lambda x: x.gather(-1, x.argsort(-1)[:, :2]).prod(-1)),
+    "slope of det": slope(lambda x: torch.linalg.det(matrix(x))),
+    "slope of a remainder": slope(lambda x: wrapped(x).square()),
+    "slope of distances": slope(lambda x: torch.cdist(x.unsqueeze(-1), x.flip(-1).unsqueeze(-1))),
+    "slope of a table": slope(lookup),
+}  # fmt: skip
+
+
+ORDERED = (
+    "sort",
+    "argsort",
+    "sort descending",
+    "top",
+    "median",
+    "second smallest",
+    "cummax",
+    "cummin",
+    "copysign",
+)
+
+
+def both(operations: dict[str, Callable[[Tensor], Tensor]]) -> Callable[[Tensor], list[dict[str, Tensor]]]:
+    """A function of x (B, n): the operations of every row, compiled, and by torch."""
+
+    def step(carry: Tensor, now: Tensor, row: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        return carry, {name: operation(row) for name, operation in operations.items()}
+
+    program = lanes.Program(step)
+
+    def run(x: Tensor) -> list[dict[str, Tensor]]:
+        assert program.compiles(x, x.unsqueeze(1), x)
+        return [call(x, x.unsqueeze(1), x)[1] for call in (program, program.definition)]
+
+    return run
+
+
+def drawn(dtype: torch.dtype) -> Tensor:
+    return torch.randn(41, SIZE, dtype=torch.float64, generator=torch.Generator().manual_seed(3)).to(dtype)
+
+
+def close(found: Tensor, wanted: Tensor, name: str) -> None:
+    bound = 2**9 * torch.finfo(wanted.dtype).eps
+    torch.testing.assert_close(
+        found, wanted, rtol=bound, atol=bound, equal_nan=True, msg=lambda said: f"{name}: {said}"
+    )
+
+
+@pytest.mark.compiled
+def test_compiled_operations_are_those_of_torch() -> None:
+    run, x = both(OPERATIONS), drawn(torch.float64)
+    found, wanted = run(x)
+    for name in OPERATIONS:
+        close(found[name], wanted[name], name)
+
+
+@pytest.mark.compiled
+def test_order_is_that_of_torch_for_what_is_no_number() -> None:
+    run, x = both({name: OPERATIONS[name] for name in ORDERED}), drawn(torch.float64)
+    x[::2, 0] = torch.tensor([0.0, -0.0, torch.inf, -torch.inf, torch.nan, 5e-324, 1e30]).double().repeat(3)
+    x[::3, 1] = x[::3, 0]
+    found, wanted = run(x)
+    for name in ORDERED:
+        close(found[name], wanted[name], name)
+
+
+@pytest.mark.compiled
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_remainders_are_exact_whatever_the_quotient(dtype: torch.dtype) -> None:
+    """Beside NumPy: `torch.fmod` itself errs by a divisor where that is nearly subnormal (2.13, x86)."""
+    run = both(
+        {
+            "fmod": lambda x: torch.fmod(x[:, :1], x[:, 1:2]),
+            "remainder": lambda x: torch.remainder(x[:, :1], x[:, 1:2]),
+        }
+    )
+    info = torch.finfo(dtype)
+    for scale in (info.tiny, 1.0, 1e3, 2 / info.eps, 1e30):
+        x = drawn(dtype)
+        x[:20, 0] *= scale
+        x[20:, 1] *= scale
+        x[:4, 1] = torch.tensor([0.0, torch.inf, torch.nan, 1.0])
+        x[4, 0] = 3 * x[4, 1]
+        found = run(x)[0]
+        with np.errstate(invalid="ignore"):
+            for name, exact in (("fmod", np.fmod), ("remainder", np.remainder)):
+                wanted = torch.from_numpy(exact(x[:, 0].numpy(), x[:, 1].numpy()))
+                torch.testing.assert_close(
+                    found[name][:, 0, 0], wanted, rtol=0, atol=0, equal_nan=True, msg=name
+                )
+
+
+def test_an_error_of_the_tracer_leaves_the_definition(caplog: pytest.LogCaptureFixture) -> None:
+    class Odd:
+        def __call__(self, x: Tensor) -> Tensor:
+            if torch.utils._python_dispatch._get_current_dispatch_mode() is not None:
+                raise KeyError("lost while tracing")
+            return 2 * x
+
+    odd = Odd()
+    program = lanes.Program(lambda carry, now, row: (carry, odd(row)))
+    x = torch.randn(5, 2, dtype=torch.float64)
+    assert torch.equal(program(x, x.unsqueeze(1), x)[1][:, 0], 2 * x)
+    assert "KeyError" in caplog.text
