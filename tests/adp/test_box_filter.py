@@ -128,6 +128,9 @@ def test_copies_and_pickles_are_the_same_filter() -> None:
 def test_what_breaks_a_rule_is_refused() -> None:
     with pytest.raises(ValueError, match=r"`BoxFilter\(box=...\)` must be a systems.Barrier"):
         adp.BoxFilter(OF_S, CHAIN, dt=DT)  # type: ignore[arg-type]
+    for wrong in (0.0, -1.0):
+        with pytest.raises(ValueError, match=r"`BoxFilter\(dt=...\)` must be positive"):
+            adp.BoxFilter(OF_S, BOX, dt=wrong)
     with pytest.raises(ValueError, match=r"`BoxFilter\(box=...\)` must have a wall"):
         adp.BoxFilter(OF_S, systems.Barrier(CHAIN, None, None), dt=DT)
     three = systems.Linear([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0] * 3], [[0.0], [0.0], [1.0]])
