@@ -102,7 +102,7 @@ def run(
             completed = range(max(0, min(done - begin, len(part))))
             flat = [records.flat(one) for one in cfgs]
             for index, outcome, _ in compute(
-                cfgs, places, Inline(), finished=completed, most=_PIECE, flat=flat, tell=lambda jobs: None
+                cfgs, places, Inline(), finished=completed, flat=flat, tell=lambda jobs: None
             ):
                 row = {"num": begin + index, "overrides": part[index]}
                 rows[index] = row | _result(cfgs[index], outcome, places[index], keep, progress)
