@@ -50,6 +50,7 @@ OTHERS = {
     "learn_global_value": "in tests/adp/test_global_value.py",
     "AvoidanceCost": "in tests/adp/test_avoidance.py",
     "plan_around": "in tests/adp/test_avoidance.py",
+    "BoxFilter": "in tests/adp/test_box_filter.py",
     "SafetyFilter": "in tests/adp/test_safety_filter.py",
     "TwoLinkRobot": "numbers within a list, in tests/systems/test_barrier.py",
     "StepPlant": "in tests/adp/test_user_plants.py",
@@ -58,6 +59,7 @@ OTHERS = {
     "EnergyShaping": "in tests/adp/test_energy_shaping.py",
     "report": "in tests of its own",
     "near_optimal": "in tests of its own",
+    "PathIntegral": "in tests/adp/test_path_integral.py",
     "SampledRollout": "in tests of its own",
 }
 """Calls whose rules are held elsewhere."""

@@ -43,6 +43,7 @@ from .bellman import bellman_error as bellman_error
 from .bellman import bellman_terms as bellman_terms
 from .bellman import hjb_residual as hjb_residual
 from .bellman import value_gradient as value_gradient
+from .box_filter import BoxFilter as BoxFilter
 from .controllers import LQR as LQR
 from .controllers import Controller as Controller
 from .controllers import ControllerState as ControllerState
@@ -69,6 +70,7 @@ from .memory_growth import learn_global_value as learn_global_value
 from .near_optimal import NearOptimal as NearOptimal
 from .near_optimal import near_optimal as near_optimal
 from .path_cost import TrackingCost as TrackingCost
+from .path_integral import PathIntegral as PathIntegral
 from .plans import Trajectories as Trajectories
 from .policy_iteration import PolicyIteration as PolicyIteration
 from .receding_horizon import RecedingHorizon as RecedingHorizon
@@ -100,6 +102,7 @@ __all__ = [
     "Belief",
     "BoundedInputCost",
     "BoxDDP",
+    "BoxFilter",
     "ChangingPlant",
     "ConcurrentGradient",
     "ConcurrentLearning",
@@ -136,6 +139,7 @@ __all__ = [
     "Observed",
     "Optimum",
     "ParametricPlant",
+    "PathIntegral",
     "PlanReplay",
     "PolicyIteration",
     "Published",
