@@ -119,7 +119,7 @@ def peers(law: str, basis: st.StaFBasis, x: torch.Tensor) -> dict[str, Callable[
 
 
 def arithmetic_alone(basis: st.StaFBasis, x: torch.Tensor) -> Callable[[], Any]:
-    """What the JAX program of `Exact` computes, as a row program: K^-1 = S^-1 K0^-1 S^-1 and no row looked after.
+    """What JAX computes for `Exact`, as a row program: S^-1 K0^-1 S^-1 V, no row looked after.
 
     What a chase takes beyond it is the price of digits kept, of rows that diverge and of warnings.
     """
