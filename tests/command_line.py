@@ -22,7 +22,9 @@ PLANTS = '''
 import torch
 from torch import nn
 from staf_torch import Kernel
+from staf_torch.engine.predictors import Predictor
 from staf_torch.metrics import Metric
+from staf_torch.optim import UpdateLaw
 from staf_torch.sweeps.callbacks import Tracker
 
 class Escape(nn.Module):
@@ -40,6 +42,21 @@ class Cauchy(Kernel):
         self.width = width
     def forward(self, x1, x2):
         return 1 / (1 + (x1.unsqueeze(-2) - x2.unsqueeze(-3)).square().sum(-1) / self.width ** 2)
+
+class Shrinking(UpdateLaw):
+    """A user's law: descent at a step that shrinks from iteration to iteration, a number a row."""
+    def __init__(self, rate=0.5):
+        self.rate = rate
+    def init(self, weights):
+        return (torch.full_like(weights[..., 0], self.rate),)
+    def step(self, objective, weights, state):
+        length = state[0] / objective.gram.square().sum((-1, -2)).sqrt()
+        return weights + length.unsqueeze(-1) * objective.descent(weights), (0.99 * state[0],)
+
+class Still(Predictor):
+    """A user's predictor: the paper's weights stay."""
+    def predict(self, inputs, weights, previous, unit):
+        return unit * weights
 
 class Largest(Metric):
     """A user's metric: the norm of the state."""

@@ -8,12 +8,14 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from typing import NoReturn
 
 from ..settings import config_directory as config_directory
 from ..sweeps import callbacks
 from ..sweeps.batching import USER_ERRORS, sentence
 from ..sweeps.hydra_compat import (
+    BrokenSweep,
     broken_sweep,
     find_launcher,
     full_errors,
@@ -45,7 +47,7 @@ def main() -> None:
         sys.exit(_written(_WRITERS[sys.argv[1]], sys.argv[2:]))
     sys.path.insert(0, os.getcwd())  # so that `target.path=my_module.my_function` finds the user's file
     typed = sys.argv
-    with full_errors() as wants_trace, stopped_by_signals():
+    with _told_between_lines(), full_errors() as wants_trace, stopped_by_signals():
         try:
             argv = command_line(typed[1:])
             sys.argv = [typed[0], *with_mode(argv)]
@@ -60,15 +62,29 @@ def main() -> None:
             if sweep is not None:
                 callbacks.close(sweep)
             if isinstance(error, KeyboardInterrupt):
-                said, code = name_and_code(error)
-                with contextlib.suppress(OSError):  # the terminal may be gone
-                    sys.stderr.write(callbacks.farewell(sweep, said) + "\n")
-                sys.exit(code)
+                _end_by_signal(sweep, error)
             if wants_trace or not isinstance(error, USER_ERRORS):
                 raise
             sys.exit(f"staf: {sentence(error)}")
         finally:
             sys.argv = typed
+
+
+@contextlib.contextmanager
+def _told_between_lines() -> Iterator[None]:
+    """End in a sentence also where a signal comes before the program has begun, or after it has ended."""
+    try:
+        yield
+    except KeyboardInterrupt as error:
+        _end_by_signal(None, error)
+
+
+def _end_by_signal(sweep: BrokenSweep | None, error: KeyboardInterrupt) -> NoReturn:
+    """Say which signal ended the program and how to resume, and exit with the code that shells expect."""
+    said, code = name_and_code(error)
+    with contextlib.suppress(OSError):  # the terminal may be gone
+        sys.stderr.write(callbacks.farewell(sweep, error, said) + "\n")
+    sys.exit(code)
 
 
 def _written(write: Callable[[list[str]], str], words: list[str]) -> str | None:

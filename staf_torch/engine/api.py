@@ -176,10 +176,8 @@ class _Run:
     def __init__(self, problem: Problem, states: Tensor, weights: Tensor | None, *, everything: bool) -> None:
         self._problem, self._warned, self._reach = problem, False, 0.0
         self.carry = start(problem, states, weights)
-        first = row_program.first_carry(problem, self.carry)
-        self._program = row_program.program(problem, states, first, everything=everything)
-        if self._program is not None:
-            self.carry = first.chase._replace(time=0)
+        self._first = row_program.first_carry(problem, self.carry)
+        self._program = row_program.program(problem, states, self._first, everything=everything)
 
     def chunks(self, states: Tensor) -> tuple[Tensor, ...]:
         """Return the states (B, T, n) in chunks of time that fit into memory."""
@@ -217,8 +215,8 @@ class _Run:
         run, inputs = self._corrected(known)
         gone = lost(run.carry, states.shape[1])
         at = Corrected(run.before, run.after, known.values, known.log_gain)
-        kept = kept_gain(known.log_gain, run.carry)
-        result = numbers(known, at, kept, gone).result(states, run.carry.diverged_at)
+        unit = (-kept_gain(known.log_gain, run.carry)).exp()
+        result = numbers(known, at, unit, gone).result(states, run.carry.diverged_at)
         if not problem.certificate:
             return result
         assert known.local is not None
@@ -248,17 +246,21 @@ class _Run:
         """Run the program over a chunk; within it times count from 0, or from 2 where others were before."""
         carry, start = self.carry, self.carry.time
         assert isinstance(start, int)
-        begins = min(start, 2)
-        given = row_program.RowCarry(
-            carry._replace(
-                time=torch.full_like(carry.diverged_at, begins), diverged_at=carry.diverged_at.clamp(max=0)
-            ),
-            torch.zeros_like(carry.log_gain),
-        )
-        after, outputs = program(given, states, every=every)
-        now, old = after.chase, carry.diverged_at
-        fresh = torch.where(now.diverged_at >= 0, now.diverged_at + (start - begins), -1)
-        self.carry = now._replace(time=start + states.shape[1], diverged_at=torch.where(old >= 0, old, fresh))
+        if start == 0:
+            after, outputs = program(self._first, states, every=every)
+            diverged_at = after.chase.diverged_at
+        else:
+            begins, old = min(start, 2), carry.diverged_at
+            given = row_program.RowCarry(
+                carry._replace(time=torch.full_like(old, begins), diverged_at=old.clamp(max=0)),
+                torch.zeros_like(carry.log_gain),
+                (-carry.log_gain).exp(),
+            )
+            after, outputs = program(given, states, every=every)
+            found_at = after.chase.diverged_at
+            fresh = torch.where(found_at >= 0, found_at + (start - begins), -1)
+            diverged_at = torch.where(old >= 0, old, fresh)
+        self.carry = after.chase._replace(time=start + states.shape[1], diverged_at=diverged_at)
         if not self._warned:
             self._warned = self._problem.basis.warn_reach(float(after.reach.max()), stacklevel=5)
         found: row_program.Outputs = outputs

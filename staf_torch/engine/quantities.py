@@ -116,7 +116,7 @@ class Numbers(NamedTuple):
 def numbers(
     known: Known,
     run: Corrected,
-    kept_gain: Tensor,
+    unit: Tensor,
     lost: Tensor,
     product: Callable[[Tensor], Tensor] | None = None,
 ) -> Numbers:
@@ -125,7 +125,7 @@ def numbers(
     Args:
         known: at the states x (..., n), with the local space.
         run: weights before and after the correction.
-        kept_gain: g in whose units e^{-g} the weights stand, (...): a row that diverged keeps its last.
+        unit: e^{-g} in whose units the weights stand, (...): a row that diverged keeps its last.
         lost: whether the row has diverged, (...) bool.
         product: e^{-g} K v, where somebody has it; else the Gram matrix stays in its factors.
     """
@@ -149,7 +149,7 @@ def numbers(
 
     origin = known.state.new_zeros(1, known.state.shape[-1])
     return Numbers(
-        weights=_paper_weights(run.after, (-kept_gain).exp().unsqueeze(-1)),
+        weights=_paper_weights(run.after, unit.unsqueeze(-1)),
         ideal_weights=reached(_paper_weights(ideal, inverse_gain.unsqueeze(-1))),
         coefficients=reached(scale * run.after),
         value=reached(value),

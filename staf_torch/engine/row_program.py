@@ -35,6 +35,7 @@ class RowCarry(NamedTuple):
 
     chase: Carry
     reach: Tensor  # (B,) the largest |x| nu(x) so far, which the kernel may warn of
+    unit: Tensor  # (B,) e^{-log_gain} of the chase
 
 
 class Outputs(NamedTuple):
@@ -60,6 +61,8 @@ class Step:
         problem, last = self.problem, carry.chase
         known = know(problem, x, local=self.everything or bool(problem.law.needs))
         structure = known.structure
+        if structure.log_gain is None:  # it never changes: a compiler is told what it is
+            last = last._replace(log_gain=known.log_gain)
         gram = _symmetric(structure.scaled()).expand(*x.shape[:-1], problem.basis.count, problem.basis.count)
         found = precompute(problem, known, gram)
         prediction: tuple[Tensor, ...] = ()
@@ -77,16 +80,21 @@ class Step:
             if known.structure.log_gain is not None
             else carry.reach
         )
-        if not self.everything:
-            return RowCarry(now, reach), Outputs(weights=now.weights * (-now.log_gain).exp().unsqueeze(-1))
         lost = now.diverged_at >= 0
+        # Not of now.log_gain: what follows from x_k alone is found for many times at once.
+        unit = torch.where(lost, carry.unit, (-known.log_gain).exp())
+        kept = RowCarry(now, reach, unit)
+        if structure.log_gain is None:
+            kept = RowCarry(now._replace(log_gain=carry.chase.log_gain), reach, carry.unit)
+        if not self.everything:
+            return kept, Outputs(weights=now.weights * unit.unsqueeze(-1))
         run = Corrected(before, now.weights, known.values, known.log_gain)
-        outputs = Outputs(numbers=numbers(known, run, now.log_gain, lost, objective.curvature))
+        outputs = Outputs(numbers=numbers(known, run, unit, lost, objective.curvature))
         if problem.certificate:
             vouched, link = self._certified(known, gram, run, last)
             outputs = outputs._replace(certificate=Certificate(*(unless(lost, term) for term in vouched)))
-            now = now._replace(link=link)
-        return RowCarry(now, reach), outputs
+            kept = kept._replace(chase=kept.chase._replace(link=link))
+        return kept, outputs
 
     def _certified(self, known: Known, gram: Tensor, run: Corrected, last: Carry) -> tuple[Certificate, Link]:
         assert known.local is not None
@@ -115,7 +123,9 @@ def first_carry(problem: Problem, carry: Carry) -> RowCarry:
     link = None
     if problem.certificate:
         link = Link(weights.new_zeros(*weights.shape, count), zero, torch.zeros_like(weights))
-    return RowCarry(carry._replace(time=torch.zeros_like(carry.diverged_at), link=link), zero)
+    return RowCarry(
+        carry._replace(time=torch.zeros_like(carry.diverged_at), link=link), zero, (-carry.log_gain).exp()
+    )
 
 
 def program(problem: Problem, states: Tensor, carry: RowCarry, *, everything: bool) -> Program | None:

@@ -39,18 +39,69 @@ INLINE void gather(const Slot *slot, REAL *const *data, int slots, int64_t first
             for (int r = rows; r < whole; ++r) to[r] = to[r - rows];
         }
 }
+#if defined(__GNUC__) && !defined(__clang__)
+#define TRANSPOSES 1
+// W vectors of W numbers change rows and columns: blocks of W / 2 places, of W / 4, ... of 1.
+template <int...> struct Places {};
+template <int S, int... L> INLINE void exchange(V &a, V &b, Places<L...>) {
+    const VB low = {(L & S ? W + L - S : L)...}, high = {(L & S ? W + L : L + S)...};
+    const V first = __builtin_shuffle(a, b, low);
+    b = __builtin_shuffle(a, b, high), a = first;
+}
+template <int S> INLINE void transpose(V *v) {
+    if constexpr (S > 0) {
+        UNROLLED for (int i = 0; i < W; ++i)
+            if (!(i & S)) exchange<S>(v[i], v[i + S], Places<__integer_pack(W)...>());
+        transpose<S / 2>(v);
+    }
+}
+#else
+#define TRANSPOSES 0
+#endif
+
+// Of every row one number after the other, of f.times times and `entries` entries: vectors of rows.
+INLINE int transposed(const REAL *from, int64_t row, int entries, const Frame &f, REAL *to) {
+#if TRANSPOSES
+    const int numbers = f.times * entries, whole = numbers / W * W;
+    for (int r = 0; r + W <= f.rows; r += W)
+        for (int first = 0, t = 0, e = 0; first < whole; first += W) {
+            V v[W];
+            UNROLLED for (int k = 0; k < W; ++k) {
+                v[k] = load(from + (r + k) * row + first);
+                __builtin_prefetch(from + (r + k) * row + first + numbers);  // of the next piece of time
+            }
+            transpose<W / 2>(v);
+            UNROLLED for (int k = 0; k < W; ++k) {
+                store(to + int64_t(e) * f.span + t * f.rows + r, v[k]);
+                if (++e == entries) e = 0, ++t;
+            }
+        }
+    return whole;
+#else
+    return 0;
+#endif
+}
 INLINE void gather_times(const Slot *slot, REAL *const *data, int slots, const Frame &f, REAL *to) {
-    for (int s = 0; s < slots; ++s, ++slot)
-        for (int64_t e = 0; e < slot->entries; ++e, to += f.span) {
-            const REAL *from = data[s] + f.first * slot->row + f.time * slot->time + e * slot->entry;
-            for (int r = 0; r < lanes; ++r) to[f.times * f.rows + r] = from[0];
+    for (int s = 0; s < slots; to += slot->entries * f.span, ++s, ++slot) {
+        const REAL *const from = data[s] + f.first * slot->row + f.time * slot->time;
+        const int entries = int(slot->entries);
+        const bool dense = slot->time == entries && (slot->entry == 1 || entries == 1) && slot->row > 1;
+        const int done = dense && f.rows >= W ? transposed(from, slot->row, entries, f, to) : 0;
+        const int there = done ? f.rows / W * W : 0;  // rows of which `done` numbers are there
+        for (int e = 0; e < entries; ++e) {
+            const REAL *const at = from + e * slot->entry;
+            REAL *const column = to + int64_t(e) * f.span;
+            for (int r = 0; r < lanes; ++r) column[f.times * f.rows + r] = at[0];
             if (slot->row == 1)
                 for (int t = 0; t < f.times; ++t)
-                    for (int r = 0; r < f.rows; ++r) to[t * f.rows + r] = from[t * slot->time + r];
+                    for (int r = 0; r < f.rows; ++r) column[t * f.rows + r] = at[t * slot->time + r];
             else
-                for (int r = 0; r < f.rows; ++r)
-                    for (int t = 0; t < f.times; ++t) to[t * f.rows + r] = from[r * slot->row + t * slot->time];
+                for (int r = 0; r < f.rows; ++r) {
+                    const int first = r < there ? (done - e + entries - 1) / entries : 0;
+                    for (int t = first; t < f.times; ++t) column[t * f.rows + r] = at[r * slot->row + t * slot->time];
+                }
         }
+    }
 }
 extern "C" void *aligned_alloc(__SIZE_TYPE__, __SIZE_TYPE__);  // of the C library: clang has no builtin of it
 INLINE REAL *allocate(int64_t numbers) {
@@ -114,15 +165,26 @@ struct Work {
     static void task(void *data) { static_cast<Work *>(data)->run(); }
 };
 
-// Entry e of output s at time t: rows b.. of the tile.
-INLINE void put(const Frame &f, int s, int64_t e, int t, int b, int rows, V x) {
-    const Slot &slot = f.outputs[s];
-    REAL *to = f.data[s] + f.first + b + (f.time + t) / f.every * slot.time + e * slot.entry;
-    if (rows >= W) return store(to, x);
-    REAL lane[W];
-    store(lane, x);
-    for (int l = 0; l < rows; ++l) to[l] = lane[l];
-}
+// Counts the times from one that is recorded to the next, and writes to the place of the latest.
+struct Recorder {
+    const Frame &f;
+    int64_t left, place;  // times to go, and recorded ones
+    INLINE_METHOD Recorder(const Frame &f) : f(f), place((f.time + f.every - 1) / f.every) {
+        left = place * f.every - f.time, --place;
+    }
+    INLINE_METHOD bool due() {
+        if (left--) return false;
+        left = f.every - 1, ++place;
+        return true;
+    }
+    // Entry e of output s: rows b.. of the tile.
+    INLINE_METHOD void put(int s, int64_t e, int b, int rows, V x) const {
+        const Slot &slot = f.outputs[s];
+        REAL *to = f.data[s] + f.first + b + place * slot.time + e * slot.entry;
+        if (rows >= W) return store(to, x);
+        if (rows > 0) store_first(to, x, rows);
+    }
+};
 
 extern "C" void lanes_run(const Call *call, REAL *const *data, int64_t most_threads) {
     const int64_t even = (call->rows + most_threads - 1) / most_threads;

@@ -12,7 +12,13 @@
 #else
 #define LANES_BYTES 16
 #endif
-#define INLINE static inline __attribute__((always_inline))
+#define INLINE_METHOD inline __attribute__((always_inline))
+#define INLINE static INLINE_METHOD
+#if defined(__AVX512F__) && !defined(__clang__)
+#define LANES_512 1
+#else
+#define LANES_512 0
+#endif
 
 typedef REAL V __attribute__((vector_size(LANES_BYTES)));
 typedef decltype(V{} < V{}) M;  // lanes of 0 or -1
@@ -31,6 +37,17 @@ INLINE V load(const REAL *from) {
     return x;
 }
 INLINE void store(REAL *to, V x) { __builtin_memcpy(to, &x, sizeof x); }
+INLINE void store_first(REAL *to, V x, int count) {  // fewer than W numbers
+#if LANES_512 && LANES_SINGLE
+    __builtin_ia32_storeups512_mask(to, x, (1 << count) - 1);
+#elif LANES_512
+    __builtin_ia32_storeupd512_mask(to, x, (1 << count) - 1);
+#else
+    REAL lane[W];
+    store(lane, x);
+    for (int l = 0; l < count; ++l) to[l] = lane[l];
+#endif
+}
 INLINE M load_flag(const REAL *from) { return load(from) != V{}; }
 INLINE V where(M m, V a, V b) { return m ? a : b; }
 INLINE M where(M m, M a, M b) { return (m & a) | (~m & b); }
@@ -41,18 +58,35 @@ INLINE V sign_of(V x) { return real(bits(x) & bits(splat(-REAL(0)))); }
 INLINE V abs(V x) { return real(bits(x) & ~bits(splat(-REAL(0)))); }
 INLINE V with_sign(V x, V s) { return real(bits(x) | bits(sign_of(s))); }
 
-// A NaN on either side is the result. The processor's own returns b where one is NaN or both are equal.
-#if defined(__AVX512F__) && !defined(__clang__)
-#if LANES_SINGLE
-INLINE V max(V a, V b) { return a != a ? a : (V)__builtin_ia32_maxps512_mask(a, b, a, -1, 4); }
-INLINE V min(V a, V b) { return a != a ? a : (V)__builtin_ia32_minps512_mask(a, b, a, -1, 4); }
+INLINE bool any(M m) {
+#if LANES_512 && LANES_SINGLE
+    return __builtin_ia32_ptestmd512((VB)m, (VB)m, -1) != 0;
+#elif LANES_512
+    typedef long long Longs __attribute__((vector_size(64)));
+    return __builtin_ia32_ptestmq512((Longs)m, (Longs)m, -1) != 0;
 #else
-INLINE V max(V a, V b) { return a != a ? a : (V)__builtin_ia32_maxpd512_mask(a, b, a, -1, 4); }
-INLINE V min(V a, V b) { return a != a ? a : (V)__builtin_ia32_minpd512_mask(a, b, a, -1, 4); }
+    const M none = M{} != M{};
+    return __builtin_memcmp(&m, &none, sizeof m) != 0;
 #endif
+}
+
+// A NaN on either side is the result. The processor's own returns b where one is NaN or both are equal; that of
+// `least` and `greatest` keeps a NaN of x.
+#if LANES_512
+#if LANES_SINGLE
+#define PROCESSORS(name, a, b) (V)__builtin_ia32_##name##ps512_mask(a, b, a, -1, 4)
+#else
+#define PROCESSORS(name, a, b) (V)__builtin_ia32_##name##pd512_mask(a, b, a, -1, 4)
+#endif
+INLINE V max(V a, V b) { return a != a ? a : PROCESSORS(max, a, b); }
+INLINE V min(V a, V b) { return a != a ? a : PROCESSORS(min, a, b); }
+INLINE V greatest(V x, REAL bound) { return PROCESSORS(max, splat(bound), x); }
+INLINE V least(V x, REAL bound) { return PROCESSORS(min, splat(bound), x); }
 #else
 INLINE V max(V a, V b) { return ((a > b) | (a != a)) ? a : b; }
 INLINE V min(V a, V b) { return ((a < b) | (a != a)) ? a : b; }
+INLINE V greatest(V x, REAL bound) { return x < bound ? splat(bound) : x; }
+INLINE V least(V x, REAL bound) { return x > bound ? splat(bound) : x; }
 #endif
 
 #define EACH_LANE(call)                                     \
@@ -63,7 +97,7 @@ INLINE V min(V a, V b) { return ((a < b) | (a != a)) ? a : b; }
     return x;
 
 // One rounding where the processor has it.
-#if defined(__AVX512F__) && !defined(__clang__)
+#if LANES_512
 INLINE V fma(V a, V b, V c) {
 #if LANES_SINGLE
     return (V)__builtin_ia32_vfmaddps512_mask(a, b, c, -1, 4);

@@ -9,7 +9,7 @@ template <> struct Format<false> {
     static constexpr int digits = 52, bias = 1023, exp_terms = 13, log_terms = 11, sine_terms = 8, cosine_terms = 8;
     static constexpr double magic = 0x1.8p52, whole = 0x1p51, tiny = 0x1p-1022;
     static constexpr double log2_high = 0x1.62e42feep-1, log2_low = 0x1.a39ef35793c76p-33;
-    static constexpr double low = -750, high = 710, flat = 20, minus_one = -40;
+    static constexpr double most = 750, high = 710, flat = 20, minus_one = -40;
     static constexpr double quarter[] = {0x1.921fb5444p+0, 0x1.68c234c4cp-39, 0x1.98a2e037p-77, 0x1.cd129024e088ap-115};
     static constexpr double far = 0x1p16;  // beyond it the quarter turns need more digits than these
     static constexpr int64_t root_half = 0x3fe6a09e667f3bcd;
@@ -18,7 +18,7 @@ template <> struct Format<true> {
     static constexpr int digits = 23, bias = 127, exp_terms = 7, log_terms = 5, sine_terms = 4, cosine_terms = 5;
     static constexpr float magic = 0x1.8p23f, whole = 0x1p22f, tiny = 0x1p-126f;
     static constexpr float log2_high = 0x1.62e4p-1f, log2_low = 0x1.7f7d1cp-20f;
-    static constexpr float low = -110, high = 89, flat = 10, minus_one = -18;
+    static constexpr float most = 110, high = 89, flat = 10, minus_one = -18;
     static constexpr float quarter[] = {0x1.92p+0f, 0x1.fb4p-12f, 0x1.444p-24f, 0x1.68c234p-39f};
     static constexpr float far = 0x1p12f;
     static constexpr int32_t root_half = 0x3f3504f3;
@@ -45,8 +45,30 @@ constexpr REAL over_factorial[] = {
 #define UNROLLED _Pragma("GCC unroll 16")
 INLINE V power_of_two(VB n) { return real((n + F::bias) << F::digits); }
 
-// x = n log(2) + r, |r| <= log(2) / 2: n as bits, and e^r - 1.
-INLINE V reduced_exponential(V x, VB &n) {
+// x 2^n, rounded once: 2^n alone need not be a normal number. n as bits, and as the number `whole`.
+INLINE V times_power(V x, VB n, V whole) {
+#if LANES_512
+    (void)n;
+#if LANES_SINGLE
+    return (V)__builtin_ia32_scalefps512_mask(x, whole, x, -1, 4);
+#else
+    return (V)__builtin_ia32_scalefpd512_mask(x, whole, x, -1, 4);
+#endif
+#else
+    (void)whole;
+    const VB half = n >> 1;
+    return x * power_of_two(half) * power_of_two(n - half);
+#endif
+}
+
+// x = n log(2) + r, |r| <= log(2) / 2: n as bits and as a number, and e^r - 1 = r + r^2 (even + r odd) by its parts.
+struct Reduced {
+    VB n;
+    V whole, r, square, even, odd;
+    INLINE_METHOD V rest() const { return fma(square, fma(r, odd, even), r); }
+    INLINE_METHOD V rest_of_minus() const { return fma(square, fma(-r, odd, even), -r); }
+};
+INLINE Reduced reduced_exponential(V x) {
     const V rounded = fma(x, splat(REAL(1.4426950408889634)), splat(F::magic)), whole = rounded - F::magic;
     const V r = fma(-whole, splat(F::log2_low), fma(-whole, splat(F::log2_high), x)), square = r * r;
     constexpr int top = F::exp_terms;
@@ -55,30 +77,29 @@ INLINE V reduced_exponential(V x, VB &n) {
         odd = fma(odd, square, splat(over_factorial[k]));
         if (k > 2) even = fma(even, square, splat(over_factorial[k - 1]));
     }
-    n = bits(rounded) - bits(splat(F::magic));
-    return fma(square, fma(r, odd, even), r);
+    return {bits(rounded) - bits(splat(F::magic)), whole, r, square, even, odd};
 }
-INLINE V clamped(V x, REAL low, REAL high) {
-    const V above = x < low ? splat(low) : x;  // NaN stays
-    return above > high ? splat(high) : above;
-}
+INLINE V clamped(V x, REAL low, REAL high) { return least(greatest(x, low), high); }
 INLINE V exp(V x) {
-    VB n;
-    const V power = 1 + reduced_exponential(clamped(x, F::low, F::high), n);
-    const VB half = n >> 1;
-    return power * power_of_two(half) * power_of_two(n - half);  // 2^n alone need not be a normal number
+    const Reduced parts = reduced_exponential(clamped(x, -F::most, F::most));
+    return times_power(1 + parts.rest(), parts.n, parts.whole);
+}
+// exp(-x), bit by bit: beside an exp(x) it costs next to nothing, for the compiler finds their parts once.
+INLINE V exp_of_minus(V x) {
+    const Reduced parts = reduced_exponential(clamped(x, -F::most, F::most));
+    return times_power(1 + parts.rest_of_minus(), -parts.n, -parts.whole);
 }
 INLINE V expm1(V x) {
-    VB n;
-    const V rest = reduced_exponential(clamped(x, F::minus_one, F::high), n), half = power_of_two(n - 1);
+    const Reduced parts = reduced_exponential(clamped(x, F::minus_one, F::high));
+    const V rest = parts.rest(), half = power_of_two(parts.n - 1);
     const V found = 2 * fma(half, rest, half - REAL(0.5));
-    return with_sign(abs(n == 0 ? rest : found), x);  // half of the smallest number is none
+    return with_sign(abs(parts.n == 0 ? rest : found), x);  // half of the smallest number is none
 }
 // e / (e + 2) with e = e^{2|x|} - 1, which loses no digit of a small x.
 INLINE V tanh(V x) {
-    VB n;
-    const V at = clamped(abs(x), 0, F::flat), rest = reduced_exponential(2 * at, n), power = power_of_two(n);
-    const V e = fma(power, rest, power - 1);
+    const V at = least(abs(x), F::flat);
+    const Reduced parts = reduced_exponential(2 * at);
+    const V power = power_of_two(parts.n), e = fma(power, parts.rest(), power - 1);
     return with_sign(e / (e + 2), x);
 }
 
@@ -140,10 +161,6 @@ INLINE V cosine_of(V r, V rest) {
     V sum = splat(over_factorial[2 * F::cosine_terms] * (F::cosine_terms % 2 ? -1 : 1));
     UNROLLED for (int k = F::cosine_terms - 1; k > 1; --k) sum = fma(sum, z, splat(over_factorial[2 * k] * (k % 2 ? -1 : 1)));
     return near + (((1 - near) - half) + fma(z * z, sum, -r * rest));
-}
-INLINE bool any(M m) {
-    const M none = M{} != M{};
-    return __builtin_memcmp(&m, &none, sizeof m) != 0;
 }
 // A lane with a large argument goes to the library's own function, which knows pi to a thousand digits.
 #define WITH_FAR(name, near)                                                                                \

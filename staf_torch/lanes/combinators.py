@@ -242,6 +242,9 @@ def _loop(
     results, done = [], 0
     for leaf in given:
         nodes = _numbers(tracer, "result", (loop.node,), (number, done), leaf)
+        if leaf.numel() <= LARGE:  # what a pass finds without the carry of another, all passes find alike
+            ends = loop.following[done : done + len(nodes)]
+            nodes = [e if graph.depth[e] < loop.depth else n for e, n in zip(ends, nodes, strict=True)]
         done += 1 if leaf.numel() > LARGE else leaf.numel()
         results.append(
             tracer.attach(leaf.detach().clone(), np.array(nodes, dtype=np.int64).reshape(leaf.shape))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -158,11 +159,12 @@ class _Writer(Writer):
                 self._line(
                     f"{self._type(node)} s{k}{self._copy(j)} = {read}(f.carry + b + {k} * room + {j} * W);"
                 )
+        self._line("Recorder recorder(f);")
         self._line("for (int t = 0; t < f.times; ++t) {")
         self._level += 1
         self._line("const REAL *const now = f.now + t * f.rows + b;")
         self._line("(void)now;")
-        self._block(self.schedule.block(STEP))
+        self._steps(following)
         self._outputs(outputs)
         self._assign([(f"s{k}", node) for k, node in enumerate(following)])
         self._level -= 1
@@ -173,10 +175,51 @@ class _Writer(Writer):
                 self._line(f"store(f.carry + b + {k} * room + {j} * W, {self._number(node, value)});")
         self._lines.append("}")
 
+    def _steps(self, following: Sequence[int]) -> None:
+        """Write a step for a processor that is to expect that no row stays behind.
+
+        A mask that decides of half the carry or more whether it goes on or stays as it was becomes a branch:
+        where it holds in all lanes, the next step need not wait for it.
+        """
+        nodes = self.schedule.block(STEP)
+        mask, held = self._choices(following)
+        kept, waiting, last = [node for node in nodes if node in held], set(held), list[int]()
+        for node in nodes:
+            if node not in held and not waiting.isdisjoint(self._read_by(node)):
+                waiting.add(node)
+                last.append(node)
+        if not kept or any(not waiting.isdisjoint(self._read_by(node)) for node in kept):
+            return self._block(nodes)
+        self._block([node for node in nodes if node not in waiting])
+        pairs = [(node, j) for j in range(self.copies) for node in kept]
+        for node, j in pairs:
+            going_on = self._ref(self.graph.args[node][1], j)
+            self._line(f"{self._type(node)} t{node}{self._copy(j)} = {going_on};")
+        stays = " | ".join(f"~{self._ref(mask, j)}" for j in range(self.copies))
+        self._line(f"if (__builtin_expect(any({stays}), 0)) {{")
+        for node, j in pairs:
+            self._line(f"    t{node}{self._copy(j)} = {self._expression(node, j)};")
+        self._line("}")
+        self._block(last)
+
+    def _choices(self, following: Sequence[int]) -> tuple[int, set[int]]:
+        """The mask that lets most of the carry go on, and all choices of it between that and staying."""
+        graph, masks = self.graph, Counter[int]()
+        choices = [n for n in self.schedule.block(STEP) if graph.op[n] == "where"]
+        choices = [n for n in choices if graph.op[graph.args[n][2]] == "state"]
+        masks.update(graph.args[n][0] for n in choices if n in following)
+        mask, count = masks.most_common(1)[0] if masks else (-1, 0)
+        return mask, {n for n in choices if graph.args[n][0] == mask and 2 * count >= len(following)}
+
+    def _read_by(self, node: int) -> set[int]:
+        """The nodes that the statement of a node reads."""
+        args, place = self.graph.args[node], self.schedule.fused.get(node)
+        return set(args) if place is None else {*args, *self.graph.args[args[place]]}
+
     def _outputs(self, outputs: Sequence[int]) -> None:
         if not outputs:
             return
-        self._line("if ((f.time + t) % f.every == 0) {")
+        self._line("if (recorder.due()) {")
         self._level += 1
         done = 0
         for slot, size in enumerate(self.layout.outputs):
@@ -184,7 +227,7 @@ class _Writer(Writer):
                 node = outputs[done + e]
                 for j in range(self.copies):
                     value = self._number(node, self._ref(node, j))
-                    self._line(f"put(f, {slot}, {e}, t, b + {j} * W, rows - {j} * W, {value});")
+                    self._line(f"recorder.put({slot}, {e}, b + {j} * W, rows - {j} * W, {value});")
             done += size
         self._level -= 1
         self._line("}")
@@ -195,6 +238,13 @@ class _Writer(Writer):
         if op in _PREFIX:
             return f"{_PREFIX[op]}{values[0]}"
         return f"{op}({', '.join(values)})"
+
+    def _expression(self, node: int, j: int) -> str:
+        """An exponential of -x as one of x: the compiler finds once what it has in common with e^x."""
+        graph = self.graph
+        if graph.op[node] == "exp" and graph.op[graph.args[node][0]] == "neg":
+            return f"exp_of_minus({self._ref(graph.args[graph.args[node][0]][0], j)})"
+        return super()._expression(node, j)
 
     def _fma(self, a: str, b: str, c: str) -> str:
         return f"fma({a}, {b}, {c})"

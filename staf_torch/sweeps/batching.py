@@ -6,9 +6,9 @@ import dataclasses
 import json
 import logging
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from hydra.errors import HydraException, MissingConfigException
 from omegaconf import DictConfig
@@ -23,7 +23,7 @@ _log = logging.getLogger(__name__)
 _KEPT_BYTES = 2**28
 """What the members of a chunk may keep until they are written."""
 _CHUNK = 128
-"""Members of a chunk: more gain nothing, and what is done is written that much later."""
+"""Members of a chunk where nobody says otherwise: what is done is written that much later."""
 _UNREADABLE = (ValueError, TypeError, KeyError, AttributeError, OmegaConfBaseException)
 """What broken settings raise while they are grouped. The job itself says later what is wrong with it."""
 USER_ERRORS = (ValueError, HydraException, OmegaConfBaseException, OSError, LostError)
@@ -68,6 +68,8 @@ class Failed:
     error: Exception
 
 
+Flat = Mapping[str, Any]
+"""Settings by dotted keys."""
 Outcome = Computed | Written | Deferred | Failed
 DEFERRED = Deferred()
 
@@ -86,46 +88,54 @@ class Done(NamedTuple):
     seconds: float
 
 
-def groups(cfgs: Sequence[DictConfig]) -> list[list[int]]:
-    """Return the indices of the configurations that may share one tensor batch, in order of appearance."""
-    found, _ = _grouped(cfgs)
+def flat_or_none(cfg: DictConfig) -> Flat | None:
+    """Return the settings of a job by dotted keys; None where they are broken, which the job says itself."""
+    try:
+        return records.flat(cfg)
+    except _UNREADABLE:
+        return None
+
+
+def groups(settings: Sequence[Flat | None]) -> list[list[int]]:
+    """Return the indices of the jobs that may share one tensor batch, in order of appearance."""
+    found, _ = _grouped(settings)
     return found
 
 
-def batches(cfgs: Sequence[DictConfig], *, least: int = 1, most: int | None = None) -> list[list[int]]:
+def batches(settings: Sequence[Flat | None], *, least: int = 1, most: int | None = None) -> list[list[int]]:
     """Return the indices of every tensor batch, in order; what a batch keeps fits into memory together.
 
     Args:
-        cfgs: the settings of all jobs, each of which is asked for once.
+        settings: of all jobs, as `flat_or_none` has them, each of which is asked for once.
         least: so many batches at least, where that can be, to keep that many workers busy.
-        most: jobs of a batch at most; None for as many as memory allows.
+        most: jobs of a batch at most; None for as many as memory allows, 128 at most.
     """
-    grouped, sizes = _grouped(cfgs)
+    grouped, sizes = _grouped(settings)
     found = []
     for group in grouped:
         length = min(most or len(group), -(-len(group) * len(grouped) // least))
-        for chunk in _chunks(sizes, group):
+        for chunk in _chunks(sizes, group, most or _CHUNK):
             found += [chunk[i : i + length] for i in range(0, len(chunk), length)]
     return sorted(found)
 
 
-def _grouped(cfgs: Sequence[DictConfig]) -> tuple[list[list[int]], list[int]]:
-    """The groups, and how many bytes each configuration keeps until it is written."""
+def _grouped(settings: Sequence[Flat | None]) -> tuple[list[list[int]], list[int]]:
+    """The groups, and how many bytes each job keeps until it is written."""
     found: dict[str, list[int]] = {}
     sizes = []
-    for index in range(len(cfgs)):
-        key, size = _group_and_size(cfgs[index], index)
+    for index in range(len(settings)):
+        key, size = _group_and_size(settings[index], index)
         found.setdefault(key, []).append(index)
         sizes.append(size)
     return list(found.values()), sizes
 
 
-def _chunks(sizes: Sequence[int], indices: Sequence[int]) -> list[list[int]]:
-    """The indices of a group in pieces that fit into memory together."""
+def _chunks(sizes: Sequence[int], indices: Sequence[int], most: int) -> list[list[int]]:
+    """The indices of a group in pieces of ``most`` at most that fit into memory together."""
     parts: list[list[int]] = []
     total = 0
     for index in indices:
-        if not parts or len(parts[-1]) >= _CHUNK or total + sizes[index] > _KEPT_BYTES:
+        if not parts or len(parts[-1]) >= most or total + sizes[index] > _KEPT_BYTES:
             parts.append([])
             total = 0
         parts[-1].append(index)
@@ -170,11 +180,13 @@ def completion(cfg: DictConfig, outcome: Outcome) -> Experiment:
             return outcome.replay
 
 
-def _group_and_size(cfg: DictConfig, index: int) -> tuple[str, int]:
+def _group_and_size(settings: Flat | None, index: int) -> tuple[str, int]:
     """A text that is equal for the members of a group, and the bytes that the solution keeps."""
     key, size = json.dumps(index), 0
+    if settings is None:
+        return key, size
     try:
-        study, settings = experiment(cfg.task), records.flat(cfg)
+        study = experiment(settings["task"])
         if isinstance(study, BatchedExperiment):
             static = [[name, study.shared(name, value)] for name, value in settings.items()]
             key = json.dumps([study.shape(settings), *static])

@@ -270,10 +270,18 @@ def close(sweep: BrokenSweep) -> None:
         directory.rmdir()
 
 
-def farewell(sweep: BrokenSweep | None, said: str) -> str:
-    """Return what to say after Ctrl-C or another signal; ``said`` is which."""
-    runs = [] if sweep is None else list(_directory(sweep.config).glob(f"*/{records.RUN}"))
-    if sweep is None or not runs:
+def farewell(sweep: BrokenSweep | None, error: KeyboardInterrupt, said: str) -> str:
+    """Return what to say after Ctrl-C or another signal.
+
+    Args:
+        sweep: that was broken; None: a single run, or nothing had begun.
+        error: that broke it, with what a run has noted there.
+        said: which signal it was.
+    """
+    if sweep is None:
+        return "; ".join([f"staf: {said}", *getattr(error, "__notes__", ())])
+    runs = list(_directory(sweep.config).glob(f"*/{records.RUN}"))
+    if not runs:
         return f"staf: {said}"
     complete = sum((records.read(path) or {}).get("status") == COMPLETED for path in runs)
     place = os.path.relpath(_directory(sweep.config))

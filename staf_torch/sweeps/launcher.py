@@ -22,9 +22,16 @@ from ..results import run_record as records
 from ..results.files import METRICS
 from ..results.progress import Progress
 from . import lock, signals
-from .batching import Outcome, reason
+from .batching import Flat, Outcome, flat_or_none, reason
 from .executors import compute, executor
-from .hydra_compat import JobReturn, JobStatus, SweepContext, without_hydra_overrides
+from .hydra_compat import (
+    JobReturn,
+    JobStatus,
+    SweepContext,
+    directory_of,
+    interpolations_parsed_once,
+    without_hydra_overrides,
+)
 from .job import PRINTS, execute, objective, silence_terminal
 
 _log = logging.getLogger(__name__)
@@ -36,6 +43,7 @@ _NOT_BATCHED = (
 )
 T = TypeVar("T")
 _KEPT_JOBS = 128  # as many as a batch has
+_COLLECTED = 64  # jobs after which their settings are collected
 _BAR_EVERY, _LINE_EVERY = 0.2, 10.0  # s
 
 
@@ -160,19 +168,23 @@ class _Jobs(Sequence[Job]):
         """The numbers of the jobs, in order."""
         return self._order
 
+    def overrides(self, index: int) -> list[str]:
+        """Return the overrides of a job, which is not composed."""
+        return self._numbered[self._order[index]]
+
     def forget(self, job: Job) -> None:
         """Drop a job that has ended; its settings are its own from `__getitem__` on."""
         self._kept.pop(job.num, None)
 
 
 class _Each(Sequence[T]):
-    """A function of every job, called when it is asked for."""
+    """A function of every index, called when the entry is asked for."""
 
-    def __init__(self, jobs: _Jobs, function: Callable[[Job], T]) -> None:
-        self._jobs, self._function = jobs, function
+    def __init__(self, count: int, function: Callable[[int], T]) -> None:
+        self._indices, self._function = range(count), function
 
     def __len__(self) -> int:
-        return len(self._jobs)
+        return len(self._indices)
 
     @overload
     def __getitem__(self, index: int) -> T: ...
@@ -182,8 +194,8 @@ class _Each(Sequence[T]):
 
     def __getitem__(self, index: int | slice) -> T | list[T]:
         if isinstance(index, slice):
-            return [self._function(job) for job in self._jobs[index]]
-        return self._function(self._jobs[index])
+            return [self._function(i) for i in self._indices[index]]
+        return self._function(self._indices[index])
 
 
 class Launch:
@@ -208,14 +220,15 @@ class Launch:
 
     def run(self, job_overrides: Sequence[Sequence[str]], first: int) -> list[JobReturn]:
         """Run the jobs, numbered from ``first``, and return Hydra's records of them, in order."""
-        with _seldom_collecting():
+        with _seldom_collecting(), interpolations_parsed_once():
             self._context.start()
-            self._sweep_logging()
+            if not PRINTS.get():
+                silence_terminal()
             self._directory.mkdir(parents=True, exist_ok=True)
             numbered = {first + i: list(overrides) for i, overrides in enumerate(job_overrides)}
             records.list_jobs(self._directory, numbered)
             jobs = _Jobs(numbered, self._job)
-            returns = self._finished(jobs)
+            returns = self._finished(numbered)
             progress = SweepProgress(len(jobs), len(returns))
             try:
                 with contextlib.closing(self._computed(jobs, set(returns), progress)) as computed:
@@ -227,11 +240,10 @@ class Launch:
                         failure = ended._return_value if ended.status == JobStatus.FAILED else None
                         progress.ended(job.name, None if failure is None else reason(failure))
                         returns[job.num] = ended
-                        if len(returns) % _KEPT_JOBS == 0:
+                        if len(returns) % _COLLECTED == 0:
                             gc.collect()  # settings refer to their parents, and go no other way
             finally:
                 progress.close()
-                self._sweep_logging()
         self._refuse_lost(numbered, returns)
         failed = sum(ended.status == JobStatus.FAILED for ended in returns.values())
         _log.info("%d of %d jobs completed, %d failed", len(jobs) - failed, len(jobs), failed)
@@ -239,10 +251,10 @@ class Launch:
 
     def _replay(self, job: Job, task: Callable[[DictConfig], Any]) -> JobReturn:
         """Run a job whose outcome is known as Hydra runs one, and keep no settings of it."""
-        config = self._context.job_config(job.num, job.overrides)
-        ended = self._context.run_job(task, config, job.settings)
+        config = self._context.job_config(job.num, job.overrides, reuse=self._context.own_callbacks)
+        self._directories[job.num] = directory_of(config)
+        ended = self._context.run_job(task, config, job.settings, job.overrides)
         ended.cfg = ended.hydra_cfg = None
-        self._directories[job.num] = _place(config)
         return ended
 
     def _still_there(self, done: int, jobs: int) -> None:
@@ -266,35 +278,34 @@ class Launch:
                 sys.stderr.write(f"{name} failed: {error}\n")
                 ended.status, ended.return_value = JobStatus.FAILED, error
 
-    def _sweep_logging(self) -> None:
-        """Send the log to the sweep's own handlers, of which the terminal is none where Python asks."""
-        self._context.sweep_logging()
-        if not PRINTS.get():
-            silence_terminal()
-
     def _job(self, num: int, overrides: list[str]) -> Job:
         return Job(num, overrides, self._context.settings(overrides))
+
+    def _flat(self, overrides: Sequence[str]) -> Flat | None:
+        """Return the settings of a job by dotted keys."""
+        return flat_or_none(self._context.settings(overrides, reuse=True))
 
     def _place_of(self, job: Job) -> Path:
         """Return the run directory of a job."""
         if self._numbered and not any(line.lstrip("+~").startswith("hydra") for line in job.overrides):
             return self._directory / str(job.num)
-        return _place(self._context.job_config(job.num, job.overrides))
+        return directory_of(self._context.job_config(job.num, job.overrides, reuse=True))
 
-    def _finished(self, jobs: _Jobs) -> dict[int, JobReturn]:
+    def _finished(self, numbered: Mapping[int, list[str]]) -> dict[int, JobReturn]:
         """Return the jobs that an earlier start of this sweep completed."""
         found: dict[int, JobReturn] = {}
         if not records.resumed(self._context.master):
             return found
         anyway = records.resumed_anyway(self._context.master)
-        for job in jobs:
-            config = self._context.job_config(job.num, job.overrides)
-            record = records.RunRecord(job.settings, config.hydra.runtime.choices, job.overrides, compiler())
-            metrics = record.finished(_place(config), anyway=anyway)
+        for num, overrides in numbered.items():
+            settings = self._context.settings(overrides, reuse=True)
+            config = self._context.job_config(num, overrides, reuse=True)
+            record = records.RunRecord(settings, config.hydra.runtime.choices, overrides, compiler())
+            metrics = record.finished(directory_of(config), anyway=anyway)
             if metrics is not None:
-                ended = JobReturn(overrides=job.overrides, status=JobStatus.COMPLETED)
+                ended = JobReturn(overrides=overrides, status=JobStatus.COMPLETED)
                 ended.return_value = objective(self._context.master, metrics)
-                found[job.num] = ended
+                found[num] = ended
         return found
 
     def _computed(
@@ -311,16 +322,16 @@ class Launch:
         about = self._launcher
         with executor(about.executor, about.workers, about.arguments, self._directory) as workers:
             outcomes = compute(
-                _Each(jobs, lambda job: job.settings),
-                _Each(jobs, self._place_of),
+                _Each(len(jobs), lambda index: jobs[index].settings),
+                _Each(len(jobs), lambda index: self._place_of(jobs[index])),
                 workers,
+                flat=_Each(len(jobs), lambda index: self._flat(jobs.overrides(index))),
                 finished={i for i, num in enumerate(jobs.numbers) if num in finished},
                 most=about.batch,
                 tell=progress.computed,
             )
             for index, outcome, seconds in outcomes:
                 yield jobs[index], _off_the_terminal(outcome, seconds, Progress(progress.running))
-                self._sweep_logging()
 
 
 @contextlib.contextmanager
@@ -335,11 +346,6 @@ def _seldom_collecting() -> Iterator[None]:
     finally:
         gc.set_threshold(*before)
         gc.unfreeze()
-
-
-def _place(config: DictConfig) -> Path:
-    """Return the run directory of a job whose configuration has Hydra's node."""
-    return Path(str(config.hydra.sweep.dir), str(config.hydra.sweep.subdir))
 
 
 def _off_the_terminal(outcome: Outcome, seconds: float, progress: Progress) -> Callable[[DictConfig], Any]:

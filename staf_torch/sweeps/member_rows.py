@@ -16,10 +16,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from omegaconf import DictConfig
-
 from .. import __version__
-from ..results import run_record as records
 from ..results.build import checksums, damage, modules
 from ..results.files import MEMBERS, open_after, partial_name
 from ..results.run_directory import RunDirectory
@@ -43,9 +40,8 @@ class Left(NamedTuple):
 Write = Callable[[Sequence[dict[str, Any]], Sequence[str]], None]
 
 
-def made_by(cfg: DictConfig) -> str:
-    """Return a hash of all settings of a member and of the user's own modules that they name."""
-    settings = records.flat(cfg)
+def made_by(settings: Mapping[str, Any]) -> str:
+    """Return a hash of the settings of a member, by dotted keys, and of the user's modules that they name."""
     text = json.dumps([settings, modules(settings)], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:_DIGITS]
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import os
 import statistics
 from array import array
 from collections.abc import Iterator, Sequence
@@ -70,23 +71,24 @@ def run(
     keep = flag(COMMAND_LINE, "history", cfg.history) and "history=true" in base
     loader = config_loader()
     jobs = member_overrides(cfg.members, loader)
-    composer = Composer(loader, config_name, hydra_node=False)
+    fixed = ("figures=false", f"history={str(keep).lower()}")
+    composer = Composer(loader, config_name, hydra_node=False, always=[*base, *fixed])
     out, tally, before = RunDirectory(directory), _Tally(), start.left
     done = len(before.made)
 
     def composed(begin: int) -> list[DictConfig]:
-        fixed = ("figures=false", f"history={str(keep).lower()}")
         return [composer([*base, *job, *fixed]) for job in jobs[begin : begin + _PIECE]]
 
     cfgs = composed(0)  # before anything is written: most wrong names are refused here
     for begin in range(0, done, _PIECE):
-        made = [made_by(one) for one in (composed(begin) if begin else cfgs)]
+        made = [made_by(records.flat(one)) for one in (composed(begin) if begin else cfgs)]
         _refuse_others(jobs, begin, made, before.made[begin : begin + _PIECE])
     for row in rows_left(directory, done) if done else ():
         tally.add([row])
     if done:
         _log.info("%d of %d members were completed before", done, len(jobs))
     with (
+        _saying_how_to_resume(directory, tally, len(jobs)),
         progress.over(len(jobs), "members") as advance,
         writer(directory, start.run, len(jobs), before) as write,
     ):
@@ -97,14 +99,15 @@ def run(
             places = [directory / FOLDER / str(begin + index) for index in range(len(part))]
             rows: list[dict[str, Any]] = [{} for _ in part]
             completed = range(max(0, min(done - begin, len(part))))
+            flat = [records.flat(one) for one in cfgs]
             for index, outcome, _ in compute(
-                cfgs, places, Inline(), finished=completed, tell=lambda jobs: None
+                cfgs, places, Inline(), finished=completed, most=_PIECE, flat=flat, tell=lambda jobs: None
             ):
                 row = {"num": begin + index, "overrides": part[index]}
                 rows[index] = row | _result(cfgs[index], outcome, places[index], keep, progress)
                 advance(1)
+            write(rows[len(completed) :], [made_by(one) for one in flat[len(completed) :]])
             tally.add(rows[len(completed) :])
-            write(rows[len(completed) :], [made_by(one) for one in cfgs[len(completed) :]])
     tally.report()
     return out.metrics(tally.counts())
 
@@ -121,7 +124,7 @@ def start_of(cfg: DictConfig, directory: Path, record: records.RunRecord) -> Ite
     Raises:
         ValueError: if another process has the directory, or the rows that are left were made otherwise.
     """
-    lock.hold(directory)
+    lock.hold(directory, "run")
     try:
         found: Left | None = Left([])
         if records.resumed(cfg):
@@ -133,6 +136,17 @@ def start_of(cfg: DictConfig, directory: Path, record: records.RunRecord) -> Ite
         yield Start(record.made_by, found or Left([]))
     finally:
         lock.give_back(directory)
+
+
+@contextlib.contextmanager
+def _saying_how_to_resume(directory: Path, tally: _Tally, total: int) -> Iterator[None]:
+    """Add to a Ctrl-C, or another signal, how many members are complete and the line that resumes."""
+    try:
+        yield
+    except KeyboardInterrupt as error:
+        done, place = tally.counts()["members"], os.path.relpath(directory)
+        error.add_note(f"{done} of {total} members are complete. Resume with:\n  staf sweep.resume={place}")
+        raise
 
 
 def _refuse_others(

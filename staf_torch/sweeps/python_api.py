@@ -148,7 +148,7 @@ def _ended_early(error: BaseException) -> Path:
     if broken is not None:
         callbacks.close(broken)
     if isinstance(error, KeyboardInterrupt):
-        raise KeyboardInterrupt(callbacks.farewell(broken, "interrupted")) from None
+        raise KeyboardInterrupt(callbacks.farewell(broken, error, "interrupted")) from None
     if broken is not None and isinstance(error, Exception):
         directory = Path(str(broken.config.hydra.sweep.dir)).absolute()
         begun = any(directory.glob(f"**/{RUN}"))

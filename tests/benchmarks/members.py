@@ -11,7 +11,7 @@ import sys
 import time
 
 from staf_torch.results.progress import SHOWN
-from staf_torch.sweeps.batching import batches, solve
+from staf_torch.sweeps.batching import batches, flat_or_none, solve
 from staf_torch.sweeps.hydra_compat import Composer, config_loader
 
 ALONE = 3
@@ -27,7 +27,7 @@ def main(kernel: str = "gaussian", count: str = "25") -> None:
     composed = time.perf_counter()
     solve(cfgs[:1], SHOWN)
     warm = time.perf_counter()
-    for batch_ in batches(cfgs):
+    for batch_ in batches([flat_or_none(cfg) for cfg in cfgs]):
         solve([cfgs[i] for i in batch_], SHOWN)
     batch = time.perf_counter()
     for cfg in cfgs[:ALONE]:

@@ -67,6 +67,8 @@ NEEDS = {  # what some options cannot do without, or that makes them small
 CUSTOM = {
     "kernel": "plants.Cauchy",
     "metric": "plants.Largest",
+    "optimizer": "plants.Shrinking",
+    "predictor": "plants.Still",
     "system": "plants.Escape",
     "target": "plants.bowl",
     "tracker": "plants.Lines",

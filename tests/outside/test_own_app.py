@@ -97,6 +97,7 @@ OPTIONS = sorted(
 OPEN = {  # options that ask for something, and what an application would give
     "centers=directions": ["centers.directions=[[0.0,0.0],[0.6,0.8]]"],
     "kernel=custom": ["kernel.path=staf_torch.GaussianKernel"],
+    "optimizer=custom": ["optimizer.path=staf_torch.optim.HeavyBall"],
     "system=custom": ["system.path=staf_torch.systems.Pendulum"],
     "target=custom": ["target.path=staf_torch.targets.Paper"],
 }

@@ -11,7 +11,7 @@ from hydra.types import RunMode
 from omegaconf import OmegaConf
 
 from staf_torch.results.run_record import flat
-from staf_torch.sweeps.hydra_compat import Composer, config_loader
+from staf_torch.sweeps.hydra_compat import Composer, config_loader, interpolations_parsed_once
 
 JOBS = [
     [],
@@ -45,6 +45,56 @@ def test_a_configuration_is_the_one_that_hydra_composes(job: list[str]) -> None:
         assert found.hydra.runtime._metadata.flags == expected.hydra.runtime._metadata.flags
     first.seed = 99
     assert again.seed == expected.seed
+
+
+SAME_KEYS = [
+    ["kernel=matern", "kernel.length_scale=0.5", "seed=3", "initial_state=[1,2]"],
+    ["kernel=matern", "kernel.length_scale=0.7", "seed=3", "initial_state=[3]"],
+    ["kernel=matern", "kernel.length_scale=0.7", "seed=null", "initial_state=none"],
+    ["kernel=gaussian", "kernel.width=0.7", "seed=3", "initial_state=[1,2]"],
+    ["kernel=gaussian", "kernel.width=0.8", "seed=3", "initial_state=[1,2]"],
+    ["seed=3", "++seed=4", "spread=2"],
+    ["seed=4", "++seed=5", "spread=2"],
+    ["centers.shrink={offset: 1}", "seed=1"],
+    ["centers.shrink={gain: 2}", "seed=1"],
+    ["spread=${centers.radius}", "centers.radius=0.1"],
+    ["spread=${seed}", "centers.radius=0.1"],
+    ["centers.shrink=null", "seed=1"],
+    ["centers.shrink=3", "seed=1"],
+    ["centers.shrink.offset=3", "seed=1"],
+]
+
+
+@pytest.mark.parametrize("hydra_node", [True, False])
+def test_an_object_that_is_used_again_holds_nothing_of_the_call_before(hydra_node: bool) -> None:
+    loader = config_loader()
+    always = ["dt=0.02", "seed=3", "trajectories=2"]
+    composer = Composer(loader, hydra_node=hydra_node, always=always)
+    objects = set()
+    with interpolations_parsed_once():
+        for job in SAME_KEYS:
+            line = ["dt=0.02", "trajectories=2", *job]
+            expected = OmegaConf.to_container(Composer(loader, hydra_node=hydra_node).anew(line))
+            found = composer.reused(line)
+            objects.add(id(found))
+            assert pickle.dumps(OmegaConf.to_container(found)) == pickle.dumps(expected), job
+            assert pickle.dumps(OmegaConf.to_container(composer(line))) == pickle.dumps(expected), job
+            OmegaConf.set_readonly(found.hydra if hydra_node else found, hydra_node)
+    assert len(objects) < len(SAME_KEYS)
+
+
+def test_an_override_that_fails_leaves_nothing_in_an_object_that_is_used_again() -> None:
+    composer = Composer(config_loader(), hydra_node=False)
+    assert composer.reused(["seed=3", "spread=1"]).seed == 3
+    for _ in range(2):
+        with pytest.raises(HydraException):
+            composer.reused(["seed=4", "spraed=1"])
+    again = composer.reused(["seed=5", "spread=1"])
+    assert (again.seed, again.spread) == (5, 1)
+    assert (
+        composer.reused(["spread=2"]).seed
+        == config_loader().load_configuration("config", [], RunMode.RUN).seed
+    )
 
 
 def test_only_the_choices_of_groups_are_composed(monkeypatch: pytest.MonkeyPatch) -> None:

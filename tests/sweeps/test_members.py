@@ -35,6 +35,14 @@ def solve(cfgs: Sequence[DictConfig]) -> list[Outcome]:
     return batching.solve(cfgs, SHOWN)
 
 
+def flat(cfgs: Sequence[DictConfig]) -> list[batching.Flat | None]:
+    return [batching.flat_or_none(cfg) for cfg in cfgs]
+
+
+def groups(cfgs: Sequence[DictConfig]) -> list[list[int]]:
+    return batching.groups(flat(cfgs))
+
+
 def solutions(cfgs: Sequence[DictConfig]) -> list[ChaseSolution]:
     found = [outcome.solution for outcome in solve(cfgs) if isinstance(outcome, Computed)]
     assert len(found) == len(cfgs)
@@ -82,7 +90,7 @@ BATCHES = {
 def test_a_member_gets_what_it_gets_alone(name: str) -> None:
     base, lines = BATCHES[name]
     cfgs = compose(base, [*STARTS, *lines])
-    (group,) = batching.groups(cfgs)
+    (group,) = groups(cfgs)
     assert group == list(range(len(cfgs)))
     together = GradientChase().solve(cfgs, SHOWN)  # raises where `batching.solve` would run each alone
     iterated = name not in ("exact", "tangent")  # those weights come from a factor of K
@@ -118,7 +126,7 @@ LOOPS = {
 def test_a_closed_loop_in_a_batch_is_the_one_alone(name: str) -> None:
     base, lines = LOOPS[name]
     cfgs = compose(["experiment=adp", *CLOSED, *base], lines)
-    (group,) = batching.groups(cfgs)
+    (group,) = groups(cfgs)
     assert group == list(range(len(cfgs)))
     together = ClosedLoop().solve(cfgs, SHOWN)
     digits = 1e-9 if name != "single precision" else 1e-3
@@ -138,23 +146,23 @@ def test_a_closed_loop_in_a_batch_is_the_one_alone(name: str) -> None:
 
 def test_only_what_may_differ_within_a_batch_shares_a_group() -> None:
     cfgs = compose([], ["kernel=gaussian,matern", "centers.count=3,6", "centers.radius=0.1,0.2"])
-    assert batching.groups(cfgs) == [[0, 1], [2, 3], [4, 5], [6, 7]]
+    assert groups(cfgs) == [[0, 1], [2, 3], [4, 5], [6, 7]]
     cfgs = compose(["kernel=matern"], ["kernel.smoothness=0.5,1.5", "kernel.length_scale=1,2", "seed=1,2"])
-    assert batching.groups(cfgs) == [list(range(8))]  # every number of a kernel, also of a user's own
+    assert groups(cfgs) == [list(range(8))]  # every number of a kernel, also of a user's own
     cfgs = compose([], ["centers.shrink.offset=null,0.1,0.2", "optimizer.inner_steps=1,2"])
-    assert batching.groups(cfgs) == [[0], [1], [2, 4], [3, 5]]
+    assert groups(cfgs) == [[0], [1], [2, 4], [3, 5]]
 
 
 def test_steps_of_time_share_a_group_where_their_number_is_the_same() -> None:
     cfgs = compose([], ["dt=0.05,0.04,0.1"])
-    assert batching.groups(cfgs) == [[0], [1], [2]]
+    assert groups(cfgs) == [[0], [1], [2]]
     cfgs = compose([], ["dt=0.05,0.1", "duration=1.0,2.0"])
-    assert batching.groups(cfgs) == [[0, 3], [1], [2]]
+    assert groups(cfgs) == [[0, 3], [1], [2]]
 
 
 def test_experiments_without_batches_stay_alone() -> None:
     cfgs = compose(["experiment=feasibility"], ["seed=1,2"])
-    assert batching.groups(cfgs) == [[0], [1]]
+    assert groups(cfgs) == [[0], [1]]
     assert solve(cfgs[:1]) == [DEFERRED]
 
 
@@ -163,7 +171,7 @@ def test_a_member_that_is_refused_fails_alone_with_its_own_sentence() -> None:
     found = solve([cfgs[0], cfgs[1], cfgs[2]])
     assert [type(one) for one in found] == [Computed, Failed, Computed]
     assert words(found[1]) == "`ConstantRadius(radius=...)` must be positive; got -1."
-    assert batching.groups(cfgs) == [[0, 1, 2], [3]]
+    assert groups(cfgs) == [[0, 1, 2], [3]]
     assert "must be a number; got 'oops'" in words(solve([cfgs[3]])[0])
 
 
@@ -194,7 +202,7 @@ def test_a_member_that_diverges_leaves_the_others_as_they_are() -> None:
 
 def test_a_layout_that_cannot_have_the_count_fails_alone() -> None:
     cfgs = compose([], ["centers.count=3,7"])
-    assert batching.groups(cfgs) == [[0], [1]]
+    assert groups(cfgs) == [[0], [1]]
     assert "must be one of" in words(solve([cfgs[1]])[0])
 
 
@@ -229,8 +237,8 @@ def test_writing_what_was_solved_leaves_what_a_run_leaves(tmp_path: Path) -> Non
 def test_chunks_hold_what_memory_allows_in_order(monkeypatch: pytest.MonkeyPatch) -> None:
     cfgs = compose(["history=true"], ["seed=range(6)"])
     group = list(range(6))
-    assert batching.batches(cfgs) == [group]
+    assert batching.batches(flat(cfgs)) == [group]
     monkeypatch.setattr(batching, "_CHUNK", 4)
-    assert batching.batches(cfgs) == [group[:4], group[4:]]
+    assert batching.batches(flat(cfgs)) == [group[:4], group[4:]]
     monkeypatch.setattr(batching, "_KEPT_BYTES", 1)
-    assert batching.batches(cfgs) == [[index] for index in group]
+    assert batching.batches(flat(cfgs)) == [[index] for index in group]

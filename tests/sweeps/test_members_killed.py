@@ -40,7 +40,9 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
             return compute(cfgs, places, *rest, **more)
 
         patch.setattr(members, "compute", killed)
-        assert one(str(place), [*OWN, *GRID, "history=true", "hydra.run.dir=killed"])[0] == 130
+        code, _, err = one(str(place), [*OWN, *GRID, "history=true", "hydra.run.dir=killed"])
+        assert code == 130
+        (place / "said").write_text(err)
     return place
 
 
@@ -69,6 +71,11 @@ def computed(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 def resume(place: Path, *more: str) -> tuple[int, str, str]:
     return one(str(place), [*OWN, "sweep.resume=killed", *more])
+
+
+def test_ctrl_c_says_how_many_members_are_complete_and_how_to_resume(runs: Path) -> None:
+    said = "staf: interrupted; 6 of 9 members are complete. Resume with:\n  staf sweep.resume=killed\n"
+    assert (runs / "said").read_text().endswith(said)
 
 
 def cut_in_a_row(killed: Path) -> None:

@@ -1,9 +1,9 @@
 """Sweeps killed at random moments, and taken up again: `python tests/trust/kills.py [--kills 50]`.
 
-Every kill begins a sweep, ends it (or one of its processes, or its disk) at a moment drawn uniformly from the
-time that it takes, resumes it, and compares the table with that of a sweep that nobody touched, byte by byte.
-Executors: inline, process, Hydra's basic launcher, submitit and ray where they are installed, SLURM where
-it is (as root).
+Every kill begins a sweep, ends it (or one of its processes, its jobs, its node, its disk) at a moment drawn
+uniformly from the time that it takes, resumes it, and compares the table with that of a sweep that nobody
+touched, byte by byte. Executors: inline, process, Hydra's basic launcher, submitit and ray where they are
+installed, SLURM where it is (as root). What befell how many is printed in the end.
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Callable, Iterator
+from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -28,6 +29,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 os.environ["OMP_NUM_THREADS"] = "1"  # torch's threads do not survive a fork
 
 import torch._dynamo  # noqa: E402, F401
+from harms import Harm, deck, full_disk  # noqa: E402
 from slurm_node import SlurmNode, missing  # noqa: E402
 
 import staf_torch.experiments.gradient_chase  # noqa: E402, F401
@@ -52,7 +54,7 @@ EXECUTORS = {
     ],
 }
 TRACE = 99  # exit code of a command that ends in a traceback
-WAIT, STAY = 240.0, 30.0  # s that a sweep may take, and its processes to end after it: they may be importing
+WAIT, STAY = 240.0, 120.0  # s that a sweep may take, and its processes to end after it: they may be importing
 
 
 class Sweep:
@@ -77,6 +79,7 @@ class Sweep:
             for stream in (1, 2):
                 os.dup2(log, stream)
             os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
+            signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
             sys.argv = ["staf", "-m", *line]
             staf.main()
             code = 0
@@ -107,80 +110,6 @@ class Sweep:
         return self._code
 
 
-def children(pid: int) -> list[int]:
-    """The processes below one, deepest last."""
-    found: list[int] = []
-    for stat in Path("/proc").glob("[0-9]*/stat"):
-        with contextlib.suppress(OSError):
-            fields = stat.read_text().rpartition(")")[2].split()
-            if int(fields[1]) == pid and fields[0] not in "ZX":
-                child = int(stat.parent.name)
-                found += [child, *children(child)]
-    return found
-
-
-def to_parent(number: signal.Signals) -> Callable[[Sweep, random.Random], str]:
-    def kill(sweep: Sweep, chance: random.Random) -> str:
-        os.kill(sweep.pid, number)
-        return f"{number.name} to the command"
-
-    return kill
-
-
-def to_worker(sweep: Sweep, chance: random.Random) -> str:
-    """SIGKILL to one of the processes that the command has started; to itself where there is none."""
-    below = children(sweep.pid)
-    os.kill(chance.choice(below or [sweep.pid]), signal.SIGKILL)
-    return "SIGKILL to a worker" if below else "SIGKILL to the command"
-
-
-def full_disk(sweep: Sweep, chance: random.Random) -> str:
-    """Fill the small disk of the sweep, for the rest of its time."""
-    ballast = os.open(sweep.place / "ballast", os.O_WRONLY | os.O_CREAT)
-    with contextlib.suppress(OSError):
-        while os.write(ballast, bytes(4096)):
-            pass
-    os.close(ballast)
-    return "a full disk"
-
-
-def slurm_harm(node: SlurmNode) -> Callable[[Sweep, random.Random], str]:
-    def harm(sweep: Sweep, chance: random.Random) -> str:
-        what = chance.choice(["scancel", "requeue", "node", "daemon"])
-        jobs = node.run("squeue", "-h", "-o", "%i").stdout.split()
-        if what == "scancel":
-            node.run("scancel", *jobs)
-        elif what == "requeue":  # as preemption does it
-            node.run("scontrol", "requeue", ",".join(jobs))
-        elif what == "node":
-            host = node.run("sinfo", "-h", "-o", "%n").stdout.split()[0]
-            node.run("scontrol", "update", f"NodeName={host}", "State=DOWN", "Reason=test")
-            time.sleep(1)
-            node.run("scontrol", "update", f"NodeName={host}", "State=RESUME")
-        else:
-            node.stop("slurmd")
-            time.sleep(1)
-            node.start("slurmd", "-D", "-N", node.run("sinfo", "-h", "-o", "%n").stdout.split()[0])
-        return f"SLURM: {what} of {len(jobs)} jobs"
-
-    return harm
-
-
-def kinds(executor: str, node: SlurmNode | None) -> list[Callable[[Sweep, random.Random], str]]:
-    """What can befall a sweep with that executor."""
-    found = [
-        to_parent(number)
-        for number in (signal.SIGKILL, signal.SIGKILL, signal.SIGTERM, signal.SIGHUP, signal.SIGINT)
-    ]
-    if executor in ("process", "submitit", "ray"):
-        found += [to_worker] * 4
-    if executor == "inline" and os.geteuid() == 0:
-        found += [full_disk] * 2
-    if node is not None:
-        found += [slurm_harm(node)] * 6
-    return found
-
-
 @contextlib.contextmanager
 def small_disk(place: Path) -> Iterator[None]:
     """Mount a disk of a few megabytes at a folder."""
@@ -195,13 +124,12 @@ def small_disk(place: Path) -> Iterator[None]:
 def one(
     base: Path,
     executor: str,
+    harm: Harm,
     environment: dict[str, str],
     chance: random.Random,
     whole: tuple[bytes, float],
-    node: SlurmNode | None,
 ) -> str:
     """One kill; return what happened, beginning with `same` where the table came out the same."""
-    harm = chance.choice(kinds(executor, node))
     place = base / f"{executor}{chance.randrange(10**9)}"
     apart = executor in ("slurm", "ray")  # their processes are their own daemons' to end
     with small_disk(place) if harm is full_disk else contextlib.nullcontext(place.mkdir()):
@@ -210,7 +138,8 @@ def one(
         sweep = Sweep(place, line, environment)
         while not (place / "sweep" / "sweep.json").exists() and not sweep.over():
             time.sleep(0.005)
-        moment = chance.uniform(0, max(0.1, whole[1] - (time.monotonic() - begin)))
+        left = max(0.1, whole[1] - (time.monotonic() - begin))
+        moment = chance.uniform(0, left / 4 if executor == "slurm" else left)  # SLURM's jobs are waited for
         time.sleep(moment)
         said = "it was over before" if sweep.over() else harm(sweep, chance)
         code = sweep.end()
@@ -249,6 +178,9 @@ def main() -> int:
     parser.add_argument(
         "--executors", default=",".join(EXECUTORS), help="one after the other, of " + ", ".join(EXECUTORS)
     )
+    parser.add_argument(
+        "--kinds", help="of kills, such as SIGHUP,scancel,node_loss; all, each as often, else"
+    )
     chosen = parser.parse_args()
     path = os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
     environment = {"PYTHONPATH": path}
@@ -276,13 +208,20 @@ def main() -> int:
             code = Sweep(place, [*GRID, *EXECUTORS[executor], "hydra.sweep.dir=sweep"], own).end()
             assert code == 0, (place / "log").read_text()
             wholes[executor] = (place / "sweep" / "table.csv").read_bytes(), time.monotonic() - begin
+        wanted = chosen.kinds.split(",") if chosen.kinds else None
+        cards = [card for card in deck(executors, node) if wanted is None or card[1] in wanted]
+        counts: Counter[str] = Counter()
         for number in range(chosen.kills):
-            executor = executors[number % len(executors)]
-            slurm = node if executor == "slurm" else None
-            own = {**environment, **(slurm.environment if slurm is not None else {})}
-            said = one(base, executor, own, chance, wholes[executor], slurm)
+            if number % len(cards) == 0:
+                chance.shuffle(cards)
+            executor, name, harm = cards[number % len(cards)]
+            own = {**environment, **(node.environment if node is not None and executor == "slurm" else {})}
+            said = one(base, executor, harm, own, chance, wholes[executor])
+            counts[f"{name} ({executor})"] += "over before" not in said and "no job was" not in said
             bad += not said.startswith("same")
             print(f"{number + 1}: {said}", flush=True)
+    for name, count in sorted(counts.items()):
+        print(f"{count:4d} {name}")
     print(f"{chosen.kills - bad} of {chosen.kills} resumed to the same table")
     return bool(bad)
 

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from command_line import environment
 
+from staf_torch.cli import staf
 from staf_torch.sweeps import signals
 
 SIGNALLED = """
@@ -97,3 +100,23 @@ def test_a_signal_within_a_finaliser_is_not_lost(number: signal.Signals) -> None
     signals.check()
     assert signal.getsignal(number) == usual
     signal.signal(number, before)
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_before_the_first_line_of_the_program_ends_in_a_sentence(
+    number: signal.Signals, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    @contextlib.contextmanager
+    def struck() -> Iterator[None]:
+        with signals.stopped_by_signals():
+            signal.raise_signal(number)
+            yield
+
+    before = signal.signal(number, signal.SIG_DFL)  # a shell's background jobs ignore some
+    monkeypatch.setattr(staf, "stopped_by_signals", struck)
+    monkeypatch.setattr(sys, "argv", ["staf", "figures=false"])
+    with pytest.raises(SystemExit) as ended:
+        staf.main()
+    signal.signal(number, before)
+    assert ended.value.code == 128 + number
+    assert capsys.readouterr().err == f"staf: ended by {number.name}\n"

@@ -11,7 +11,7 @@ from typing import overload
 from omegaconf import DictConfig
 
 from ...results.progress import Progress
-from ..batching import Batch, Outcome, batches
+from ..batching import Batch, Flat, Outcome, batches, flat_or_none
 from .base import Executor
 
 _log = logging.getLogger(__name__)
@@ -49,6 +49,7 @@ def compute(
     *,
     finished: Collection[int] = frozenset(),
     most: int | None = None,
+    flat: Sequence[Flat | None] | None = None,
     tell: Callable[[float], None],
 ) -> Generator[tuple[int, Outcome, float], None, None]:
     """Yield index, outcome and seconds of every job that is not finished, as the tensor batches end.
@@ -62,10 +63,12 @@ def compute(
         workers: compute the batches.
         finished: indices of jobs that need no outcome.
         most: jobs of a batch at most.
+        flat: what `flat_or_none` makes of the settings of every job, where somebody has that already.
         tell: is told how many jobs are computed, with fractions while this process computes a batch.
     """
     done = 0
-    planned = batches(settings, least=workers.pieces, most=most)
+    flat = [flat_or_none(settings[i]) for i in range(len(settings))] if flat is None else flat
+    planned = batches(flat, least=workers.pieces, most=most)
     planned = [batch for batch in planned if not set(finished).issuperset(batch)]
     _log.info("%d jobs in %d tensor batches", len(settings), len(planned))
     given = _Batches(planned, settings, directories)

@@ -8,9 +8,11 @@ from hydra.core.utils import env_override as env_override
 from .composing import Composer as Composer
 from .composing import JobLoader as JobLoader
 from .composing import config_loader as config_loader
+from .composing import interpolations_parsed_once as interpolations_parsed_once
 from .composing import parse_override as parse_override
 from .composing import product as product
 from .jobs import SweepContext as SweepContext
+from .jobs import directory_of as directory_of
 from .jobs import without_hydra_overrides as without_hydra_overrides
 from .program import BrokenSweep as BrokenSweep
 from .program import broken_sweep as broken_sweep

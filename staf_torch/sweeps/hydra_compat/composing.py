@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
+import functools
 import pickle
-from collections.abc import Sequence
-from typing import Any, cast
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple, cast
 
+import omegaconf.base
 from hydra._internal import config_loader_impl
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
@@ -13,7 +16,7 @@ from hydra._internal.utils import create_config_search_path
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Override
+from hydra.core.override_parser.types import Override, OverrideType
 from hydra.core.plugins import Plugins
 from hydra.errors import ConfigCompositionException
 from hydra.types import HydraContext, RunMode
@@ -47,6 +50,24 @@ def product(overrides: Sequence[Override]) -> list[list[str]]:
     return [list(job) for job in jobs]
 
 
+@contextlib.contextmanager
+def interpolations_parsed_once() -> Iterator[None]:
+    """Keep the parse trees of interpolations, which OmegaConf makes anew for every value that it looks up.
+
+    Such as `${hydra.job.num}`: a millisecond each time, in a sweep a few times a job.
+    """
+    module: Any = omegaconf.base
+    parse = getattr(module, "parse", None)
+    if parse is None:
+        yield
+        return
+    module.parse = functools.lru_cache(1000)(parse)
+    try:
+        yield
+    finally:
+        module.parse = parse
+
+
 class Composer:
     """``loader.load_configuration(config_name, overrides, RunMode.RUN)``, fast where it is called often.
 
@@ -58,16 +79,24 @@ class Composer:
         loader: Hydra's, of the program.
         config_name: of the primary configuration.
         hydra_node: False for the configuration as a task sees it, which is the larger part of the time.
+        always: overrides that all calls share; their values are applied once.
     """
 
     def __init__(
-        self, loader: ConfigLoader, config_name: str | None = "config", *, hydra_node: bool = True
+        self,
+        loader: ConfigLoader,
+        config_name: str | None = "config",
+        *,
+        hydra_node: bool = True,
+        always: Collection[str] = (),
     ) -> None:
         self._loader, self._name, self._hydra_node = loader, config_name, hydra_node
         self._parser = OverridesParser.create()
         self._parsed: dict[str, Override] = {}
-        self._chosen: dict[tuple[str, ...], bytes] = {}  # pickled: copied a fifth as fast otherwise
+        self._always = frozenset(always)
+        self._chosen: dict[tuple[Any, ...], bytes] = {}  # pickled: copied a fifth as fast otherwise
         self._groups: dict[str, bool] = {}
+        self._reused: _Reused | None = None
         self._apply = getattr(ConfigLoaderImpl, "_apply_overrides_to_config", None)
         self._repository = getattr(loader, "repository", None)
 
@@ -78,19 +107,57 @@ class Composer:
             hydra.errors.HydraException, ValueError: what Hydra itself raises.
         """
         parsed = [self._parse(line) for line in overrides]
-        chosen = tuple(line for line, one in zip(overrides, parsed, strict=True) if self._chooses(one))
-        if self._apply is None or any("searchpath" in line for line in chosen):
+        chosen = self.choices(overrides)
+        if chosen is None:
             return self.anew(overrides)
-        if chosen not in self._chosen:
-            self._chosen[chosen] = pickle.dumps(self.anew(chosen))
-        composed: DictConfig = pickle.loads(self._chosen[chosen])
+        values = [one for one in parsed if not self._chooses(one)]
+        first: list[Override] = []
+        if self._always and _independent({one.key_or_group: one for one in values}):
+            first = [one for one in values if one.input_line in self._always]
+        key = (chosen, *(one.input_line for one in first))
+        if key not in self._chosen:
+            made = self.anew(chosen)
+            self._set(made, first, parsed)
+            self._chosen[key] = pickle.dumps(made)
+        composed: DictConfig = pickle.loads(self._chosen[key])
+        self._set(composed, [one for one in values if one not in first], parsed)
+        return composed
+
+    def reused(self, overrides: Sequence[str]) -> DictConfig:
+        """Return the configuration of these overrides in an object that the next call of this may change.
+
+        Where the values of the same keys alone are others than in the call before, those are set: a third of
+        the time of a new object. Errors as of a call.
+        """
+        parsed, chosen = [self._parse(line) for line in overrides], self.choices(overrides)
+        values = {one.key_or_group: one for one in parsed if not self._chooses(one)}
+        before, self._reused = self._reused, None  # an error leaves some of the values
+        if chosen is None or not _independent(values):
+            return self(overrides)
+        if before is not None and before.chosen == chosen and list(before.values) == list(values):
+            composed = before.composed
+            further = [one for key, one in values.items() if one is not before.values[key]]
+            self._set(composed, further, parsed)
+        else:
+            composed = self(overrides)
+        self._reused = _Reused(chosen, values, composed)
+        return composed
+
+    def choices(self, overrides: Sequence[str]) -> tuple[str, ...] | None:
+        """Return the overrides that decide what is composed; None where Hydra must compose it itself."""
+        chosen = tuple(line for line in overrides if self._chooses(self._parse(line)))
+        return None if self._apply is None or any("searchpath" in line for line in chosen) else chosen
+
+    def _set(self, composed: DictConfig, values: Sequence[Override], parsed: Sequence[Override]) -> None:
+        """Set values in a configuration, and note in Hydra's node all overrides that led to it."""
+        assert self._apply is not None
         try:
-            self._apply([one for one in parsed if not self._chooses(one)], composed)
+            self._apply(values, composed)
         except OmegaConfBaseException as error:
             raise ConfigCompositionException() from error
         if self._hydra_node:
-            _note_overrides(composed, parsed)
-        return composed
+            with read_write(composed.hydra):  # a job may have run with it
+                _note_overrides(composed, parsed)
 
     def anew(self, overrides: Sequence[str]) -> DictConfig:
         """Return the configuration as Hydra itself composes it; arguments and errors as of a call."""
@@ -118,11 +185,40 @@ class Composer:
         return self._groups[key] and not isinstance(override.value(), dict)
 
 
+class _Reused(NamedTuple):
+    """The configuration that `Composer.reused` returned last."""
+
+    chosen: tuple[str, ...]
+    values: dict[str, Override]  # by their keys
+    composed: DictConfig
+
+
+def _independent(values: Mapping[str, Override]) -> bool:
+    """Return whether each override sets a number, a text or a list at a key of its own, with none above it.
+
+    Then one of them may be set anew, and what it was leaves nothing.
+    """
+    for key, one in values.items():
+        above = {key[:i] for i, letter in enumerate(key) if letter == "."}
+        value = one.value()
+        if one.type != OverrideType.CHANGE or not above.isdisjoint(values):
+            return False
+        if isinstance(value, dict) or "${" in str(value):
+            return False
+    return True
+
+
 def _note_overrides(composed: DictConfig, parsed: Sequence[Override]) -> None:
     """Write into Hydra's node what Hydra notes there of the overrides."""
     app = [one for one in parsed if not one.is_hydra_override()]
     node: Any = composed.hydra
-    node.overrides.task = [one.input_line for one in app]
+    lines: list[Any] = [one.input_line for one in app]
+    noted: Any = OmegaConf.to_container(node.overrides.task)  # as written: an interpolation is a text here
+    if len(noted) == len(lines):
+        for index in (i for i, line in enumerate(lines) if line != noted[i]):
+            node.overrides.task[index] = lines[index]
+    else:
+        node.overrides.task = lines
     directory_name = getattr(config_loader_impl, "get_overrides_dirname", None)  # Hydra 1.3; then a resolver
     if directory_name is not None:
         style = node.job.config.override_dirname
@@ -135,7 +231,7 @@ class JobLoader:
     """Hydra's loader for a sweep whose launcher is ours: jobs are composed as `Composer` does it.
 
     Sweepers compose each job as a test and throw the result away: they get the settings without Hydra's node,
-    a third of the work. Our launcher takes that node from `whole`.
+    in an object that is used again. Our launcher takes that node from `whole`.
 
     Args:
         loader: Hydra's own, asked for all else.
@@ -144,9 +240,10 @@ class JobLoader:
 
     def __init__(self, loader: ConfigLoader, master: DictConfig) -> None:
         self._loader = loader
-        self._composers = {
-            node: Composer(loader, master.hydra.job.config_name, hydra_node=node) for node in (True, False)
-        }
+        name = master.hydra.job.config_name
+        self._settings = Composer(loader, name, hydra_node=False)
+        self._whole = Composer(loader, name)
+        self.hydra_yaml: dict[tuple[str, ...], dict[str, str]] = {}  # parts of `hydra.yaml`, by `choices`
         self._unseen = bool(master.hydra.searchpath)  # groups that a `Composer` cannot see
 
     @classmethod
@@ -159,17 +256,35 @@ class JobLoader:
         return getattr(self._loader, name)
 
     def load_sweep_config(self, master_config: DictConfig, sweep_overrides: Sequence[str]) -> DictConfig:
+        """Return the settings of a job without Hydra's node, in an object that the next call may change."""
+        return self._composed(self._settings, master_config, sweep_overrides, reuse=True)
+
+    def settings(self, master: DictConfig, overrides: Sequence[str]) -> DictConfig:
         """Return the settings of a job as its task sees them, without Hydra's node."""
-        return self._composed(master_config, sweep_overrides, hydra_node=False)
+        return self._composed(self._settings, master, overrides, reuse=False)
 
-    def whole(self, master_config: DictConfig, sweep_overrides: Sequence[str]) -> DictConfig:
-        """Return the configuration of a job with Hydra's node."""
-        return self._composed(master_config, sweep_overrides, hydra_node=True)
+    def whole(self, master: DictConfig, overrides: Sequence[str], *, reuse: bool) -> DictConfig:
+        """Return the configuration of a job with Hydra's node.
 
-    def _composed(self, master: DictConfig, overrides: Sequence[str], *, hydra_node: bool) -> DictConfig:
-        composer = self._composers[hydra_node]
+        Args:
+            master: settings of the sweep.
+            overrides: of the job.
+            reuse: whether the next call may change the object.
+        """
+        return self._composed(self._whole, master, overrides, reuse=reuse)
+
+    def choices(self, master: DictConfig, overrides: Sequence[str]) -> tuple[str, ...] | None:
+        """Return the lines that decide what Hydra's node holds, beside what is noted of the job itself."""
+        return None if self._unseen else self._whole.choices([*master.hydra.overrides.hydra, *overrides])
+
+    def _composed(
+        self, composer: Composer, master: DictConfig, overrides: Sequence[str], *, reuse: bool
+    ) -> DictConfig:
         lines = [*master.hydra.overrides.hydra, *overrides]
-        composed = composer.anew(lines) if self._unseen else composer(lines)
+        if self._unseen:
+            composed = composer.anew(lines)
+        else:
+            composed = composer.reused(lines) if reuse else composer(lines)
         # Times and the like are those at which the sweep began.
         OmegaConf.copy_cache(from_config=master, to_config=composed)
         return composed

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import importlib
-import logging
 import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -25,6 +24,7 @@ from omegaconf import DictConfig
 from omegaconf.basecontainer import BaseContainer
 
 from ...settings import config_directory
+from .log_handlers import handlers_aside
 from .program import find_launcher, named_packages, trusted, with_mode
 
 _OF_AN_APPLICATION: tuple[type, ...] = (GlobalHydra, HydraConfig, JobRuntime, VersionBase)
@@ -67,7 +67,7 @@ class Application(NamedTuple):
 def application() -> Iterator[Application]:
     """Yield the application; what the process had of Hydra, logging and import path comes back in the end."""
     with contextlib.ExitStack() as stack:
-        for guard in (_import_path, _environment, _singletons, _logging):
+        for guard in (_import_path, _environment, _singletons, handlers_aside):
             stack.enter_context(guard())
         find_launcher()
         _register_launcher()
@@ -129,23 +129,3 @@ def _singletons() -> Iterator[None]:
         instances.update(aside)
         BaseContainer._resolvers.clear()
         BaseContainer._resolvers.update(resolvers)
-
-
-@contextlib.contextmanager
-def _logging() -> Iterator[None]:
-    """Hide the handlers of the process from `logging.config`, which closes all that it knows of."""
-    root = logging.getLogger()
-    handlers, level, known = root.handlers[:], root.level, logging._handlerList[:]  # type: ignore[attr-defined]
-    named = dict(logging._handlers)  # type: ignore[attr-defined]
-    logging._handlerList.clear()  # type: ignore[attr-defined]
-    logging._handlers.clear()  # type: ignore[attr-defined]
-    root.handlers[:] = []
-    try:
-        yield
-    finally:
-        for handler in root.handlers:
-            handler.close()
-        root.handlers[:] = handlers
-        root.setLevel(level)
-        logging._handlerList[:0] = known  # type: ignore[attr-defined]
-        logging._handlers.update(named)  # type: ignore[attr-defined]

@@ -1,0 +1,94 @@
+"""Inputs on their way into lanes, rows that stay behind, and what is found once for all passes."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from staf_torch import lanes
+
+Pair = tuple[Tensor, Tensor]
+
+
+def same_bits(a: Tensor, b: Tensor) -> bool:
+    kind = torch.int64 if a.dtype == torch.float64 else torch.int32
+    return torch.equal(a.contiguous().view(kind), b.contiguous().view(kind))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_every_number_of_an_input_reaches_its_row_and_time(dtype: torch.dtype) -> None:
+    def step(carry: Tensor, now: tuple[Tensor, ...], row: object) -> tuple[Tensor, tuple[Tensor, ...]]:
+        return carry, now
+
+    program = lanes.Program(step)
+    for rows in (1, 9, 65):
+        for times in (1, 20, 70):
+            given = [torch.rand(rows, times, *shape, dtype=dtype) for shape in ((), (1,), (2,), (3,), (2, 5))]
+            given.append(torch.rand(rows, times, 4, dtype=dtype)[..., ::2])  # neither dense nor alone
+            given.append(torch.rand(times, 3, rows, dtype=dtype).movedim(-1, 0))  # rows last
+            carry = torch.zeros(rows, dtype=dtype)
+            assert program.compiles(carry, tuple(given))
+            _, out = program(carry, tuple(given))
+            assert all(same_bits(a, b) for a, b in zip(out, given, strict=True))
+
+
+def held(carry: tuple[Tensor, Tensor, Tensor], now: Tensor, row: object) -> tuple[object, Tensor]:
+    """A row of which a number is not finite stays behind, as the rows of a chase do."""
+    x, gain, lost_at = carry
+    new = x * (now - gain).exp()
+    fine = torch.isfinite(new) & (lost_at < 0)
+    lost_at = torch.where(fine | (lost_at >= 0), lost_at, now)
+    x, gain = torch.where(fine, new, x), torch.where(fine, now, gain)
+    return (x, gain, lost_at), x * gain - now
+
+
+@pytest.mark.parametrize("rows", [1, 5, 40])
+def test_rows_that_stay_behind_keep_their_numbers_and_no_other_row_sees_them(rows: int) -> None:
+    torch.manual_seed(0)
+    now = torch.rand(rows, 50).double()
+    now[::3, 20] = torch.nan
+    carry = torch.ones(rows).double(), torch.zeros(rows).double(), -torch.ones(rows).double()
+    program = lanes.Program(held)
+    assert "__builtin_expect(any(" in program.text(carry, now)
+    (x, gain, lost_at), out = program(carry, now)
+    (wanted, wanted_gain, wanted_lost), history = program.definition(carry, now)
+    torch.testing.assert_close(x, wanted, rtol=1e-13, atol=0)
+    torch.testing.assert_close(out, history, rtol=1e-12, atol=1e-15, equal_nan=True)
+    torch.testing.assert_close(lost_at, wanted_lost, equal_nan=True, rtol=0, atol=0)
+    assert torch.equal(gain, wanted_gain)
+    for row in range(rows):
+        alone = tuple(part[row : row + 1] for part in carry)
+        found = program(alone, now[row : row + 1])[1]
+        assert same_bits(found.nan_to_num(), out[row : row + 1].nan_to_num())
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_exponential_of_minus_x_has_the_bits_of_its_own(dtype: torch.dtype) -> None:
+    def step(carry: tuple[()], now: tuple[()], row: Pair) -> tuple[tuple[()], Tensor]:
+        x, minus = row
+        return carry, torch.stack((x.exp(), (-x).exp(), minus.exp()), dim=-1)
+
+    x = torch.cat((torch.linspace(-760, 760, 4001), torch.linspace(-1, 1, 999), torch.tensor([0.0, -0.0])))
+    x = torch.cat((x, torch.tensor([torch.inf, -torch.inf, torch.nan, 1e-310]))).to(dtype)
+    up, down, wanted = lanes.Program(step)((), (), (x, -x), steps=1)[1].unbind(-1)
+    there = ~torch.isnan(x)  # NaN has a sign, which nobody asks for
+    assert same_bits(down.squeeze()[there], wanted.squeeze()[there])
+    bound = 4 * torch.finfo(dtype).eps
+    torch.testing.assert_close(up.squeeze(), x.exp(), rtol=bound, atol=0, equal_nan=True)
+
+
+def test_what_all_passes_of_a_loop_find_alike_is_found_once() -> None:
+    def step(carry: Pair, now: Tensor, row: object) -> tuple[Pair, Tensor]:
+        def body(at: Pair) -> Pair:
+            return 2 * now, at[0] + at[1]
+
+        carry = lanes.repeat(3, body, carry)
+        return carry, carry[1]
+
+    carry, now = (torch.ones(3).double(), torch.rand(3).double()), torch.rand(3, 4).double()
+    program = lanes.Program(step)
+    end, out = program(carry, now)
+    wanted, history = program.definition(carry, now)
+    assert torch.equal(out, history)
+    assert torch.equal(end[0], wanted[0])

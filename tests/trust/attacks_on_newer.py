@@ -1,0 +1,108 @@
+"""What came last: plants of other libraries, slopes, kept traces, jobs of many members that go on."""
+
+from __future__ import annotations
+
+import json
+import os
+import pickle
+from pathlib import Path
+
+from arena import Arena, Attack, Call, attack
+
+
+@attack
+def an_environment_whose_id_names_a_module(arena: Arena) -> Attack:
+    arena.module(arena.cwd)
+    arena.module(arena.one)
+    return arena.set("system", {"_target_": "staf_torch.envs.EnvironmentPlant", "env": "evil_mod:Evil-v0"})
+
+
+@attack
+def an_environment_made_by_the_loader(arena: Arena) -> Attack:
+    arena.module(arena.cwd)
+    loader = {"_target_": "staf_torch.settings.chase.load", "path": "gymnasium.make"}
+    return arena.set("target", loader | {"arguments": {"id": "evil_mod:Evil-v0"}})
+
+
+@attack
+def a_secret_as_a_model_of_mujoco(arena: Arena) -> Attack:
+    model = str(arena.victim / "secret.txt")
+    return arena.set("system", {"_target_": "staf_torch.systems.MujocoPlant", "model": model})
+
+
+@attack
+def a_device_as_a_model_of_mujoco(arena: Arena) -> Attack:
+    return arena.set("system", {"_target_": "staf_torch.systems.MujocoPlant", "model": "/dev/zero"})
+
+
+@attack
+def slopes_that_are_a_call(arena: Arena) -> Attack:
+    call = {"_target_": "os.system", "command": arena.touch}
+    plant = {"_target_": "staf_torch.systems.StepPlant", "dim": 2, "inputs": 1, "dt": 0.1}
+    return arena.set("system", plant | {"step": call, "slopes": call})
+
+
+@attack
+def a_plant_within_a_barrier(arena: Arena) -> Attack:
+    (arena.one / "evil.pt").write_bytes(pickle.dumps(Call("os.system", arena.touch)))
+    inner = {"_target_": "torch.load", "f": str(arena.one / "evil.pt"), "weights_only": False}
+    box = {"_target_": "staf_torch.systems.Barrier", "low": [-1, -1], "high": [1, 1]}
+    return arena.set("system", box | {"plant": inner})
+
+
+@attack
+def traces_kept_where_the_runs_are(arena: Arena) -> Attack:
+    """A cache of traces, which are pickles, that the environment of the jobs leads to."""
+    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    evil = pickle.dumps(Call("os.system", arena.touch))
+    for path in (home / "staf_torch").rglob("*"):
+        copy = arena.many / "cache" / path.relative_to(home)
+        if path.is_file() and path.suffix != ".so":
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            copy.write_bytes(evil)
+    arena.line(f"hydra.job.env_set.XDG_CACHE_HOME={arena.many}/cache")
+    return arena.line("hydra.launcher.executor=process")
+
+
+def killed_members(arena: Arena, members: list[str]) -> Attack:
+    """Make the one run a job of many members that was killed, and take it up again."""
+    path = arena.one / "run.json"
+    found = json.loads(path.read_text())
+    found["settings"]["members"] = members
+    found["overrides"].append(f"members={json.dumps(members)}")
+    path.write_text(json.dumps(found | {"status": "running"}))
+    (arena.one / "metrics.json").unlink()
+    return ["staf", f"sweep.resume={arena.one}"], None
+
+
+@attack
+def members_that_are_written_through_a_link(arena: Arena) -> Attack:
+    for name in (".members.json.partial", ".members.json.sums", "members.json"):
+        (arena.one / name).symlink_to(arena.victim / "note.txt")
+    return killed_members(arena, ["seed=0,1"])
+
+
+@attack
+def checksums_of_members_that_are_a_pipe(arena: Arena) -> Attack:
+    os.mkfifo(arena.one / ".members.json.sums")
+    (arena.one / ".members.json.partial").write_text('{"version": "0.1.0", "members": [\n')
+    return killed_members(arena, ["seed=0,1"])
+
+
+@attack
+def a_folder_of_members_that_leads_elsewhere(arena: Arena) -> Attack:
+    (arena.one / "members").symlink_to(arena.victim, target_is_directory=True)
+    command, _ = killed_members(arena, ["seed=0,1"])
+    return [*command, "--yes"], None
+
+
+@attack
+def a_billion_members(arena: Arena) -> Attack:
+    return killed_members(arena, ["seed=range(1000000000)"])
+
+
+@attack
+def members_of_members(arena: Arena) -> Attack:
+    lines = ["members=['seed=0,1']", "hydra.run.dir=" + str(arena.victim), "task=evil_mod.V"]
+    arena.module(arena.cwd)
+    return killed_members(arena, lines)
