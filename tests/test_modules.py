@@ -212,7 +212,7 @@ MODULES: dict[str, Case] = {
 OTHERS = {"_Held", "ConventionModule", "FunctionPlant", "StepPlant", "RatePlant"}
 OTHERS |= {"SampledProblem", "GlobalValue", "SafetyFilter", "FilteredPolicy", "PlanReplay"}
 OTHERS |= {"AmongDiscs"}  # of an experiment
-OTHERS |= {"RecedingHorizon", "MujocoPlant", "EnvironmentPlant", "EnergyShaping"}
+OTHERS |= {"RecedingHorizon", "PathIntegral", "MujocoPlant", "EnvironmentPlant", "EnergyShaping"}
 OTHERS |= {"NearOptimal", "SampledRollout"}
 OTHERS |= {
     "ParametricPlant",

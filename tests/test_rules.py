@@ -58,6 +58,7 @@ OTHERS = {
     "EnergyShaping": "in tests/adp/test_energy_shaping.py",
     "report": "in tests of its own",
     "near_optimal": "in tests of its own",
+    "PathIntegral": "in tests/adp/test_path_integral.py",
     "SampledRollout": "in tests of its own",
 }
 """Calls whose rules are held elsewhere."""

@@ -69,6 +69,7 @@ from .memory_growth import learn_global_value as learn_global_value
 from .near_optimal import NearOptimal as NearOptimal
 from .near_optimal import near_optimal as near_optimal
 from .path_cost import TrackingCost as TrackingCost
+from .path_integral import PathIntegral as PathIntegral
 from .plans import Trajectories as Trajectories
 from .policy_iteration import PolicyIteration as PolicyIteration
 from .receding_horizon import RecedingHorizon as RecedingHorizon
@@ -136,6 +137,7 @@ __all__ = [
     "Observed",
     "Optimum",
     "ParametricPlant",
+    "PathIntegral",
     "PlanReplay",
     "PolicyIteration",
     "Published",

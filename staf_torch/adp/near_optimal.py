@@ -13,12 +13,14 @@ from torch import Tensor
 from ..approximation.basis import StaFBasis
 from ..centers import StateFollowingCenters
 from ..kernels import ExponentialKernel
-from ..numerics.checks import fail, positive_real
+from ..numerics.checks import fail, flag, positive_real
 from ..systems import Clocked, Plant
 from ..systems.bounds import Limit
+from .bounded_plans import BoundedPlans
 from .controllers import LQR, Feedback
 from .cost import Cost
 from .rollout import ball_directions
+from .sampled_problem import SampledProblem
 from .sampled_rollout import SampledRollout
 from .sampling import held_stability
 from .shooting import DirectShooting
@@ -47,6 +49,33 @@ class NearOptimal(SampledRollout):
     lqr: LQR
     radius: float
     substeps: int
+    planner: BoundedPlans | None = None
+
+    def forward(self, x: Tensor) -> Tensor:
+        """u: (..., n) -> (..., m)."""
+        u = super().forward(x)
+        if self.planner is None:
+            return u
+        rows, controls = x.reshape(-1, x.shape[-1]), u.reshape(-1, u.shape[-1])
+        strained = self.planner.strained(rows)
+        if not bool(strained.any()):  # saves work: a plan takes milliseconds
+            return u
+        planned = self.planner(rows[strained])
+        return controls.index_copy(0, strained.nonzero().squeeze(1), planned).view(u.shape)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**super().__getstate__(), "planner": self.planner is not None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__(state)
+        self.planner = self.plans() if state["planner"] else None
+
+    def plans(self) -> BoundedPlans | None:
+        """What controls where the LQR would meet a bound; None without bounds or a plant in torch."""
+        limited = self.cost.bounds is not None and not self.cost.discount
+        if not limited or not self.plant.traceable or self.plant.period not in (None, self.period):
+            return None
+        return BoundedPlans(SampledProblem.of(self.plant, self.cost, dt=self.period), self.steps)
 
     @torch.no_grad()
     def report(
@@ -142,13 +171,18 @@ def near_optimal(
     high: Limit = None,
     radius: float = 0.1,
     horizon: float | None = None,
+    plan: bool = True,
 ) -> NearOptimal:
     """A policy for a plant, held for dt, that costs no more than its LQR.
 
     The rules: the base is the LQR made for dt; the horizon is three time constants of its slowest mode, 12 to
     60 periods; the centers are as many as quadratics need, from four states on the cross-polytope and its
     middle, in a ball of ``radius``; a plant in continuous time is integrated in steps of a fifth of its
-    fastest time constant. A simulator so slow that a control takes longer than dt is a warning in the log.
+    fastest time constant. Where inputs have bounds and the LQR, followed from a state over the horizon,
+    meets one, the control is the first one of a plan over that horizon, the best that `BoxDDP` finds from the
+    LQR and from holding a bound for a while: rollouts of an LQR do not know what to do before a bound. That
+    takes tens of milliseconds, and a plant in torch, held for one period of its own, without a discount.
+    A simulator so slow that a control takes longer than dt is a warning in the log.
 
     Example:
         >>> import numpy as np
@@ -169,6 +203,8 @@ def near_optimal(
         high: likewise.
         radius: of the ball of centers, in units of the state: measure states so that 1 is a large one.
         horizon: s; None for the rule above.
+        plan: whether to plan where the LQR would meet a bound. What plans is not exported to C, and loops
+            with it are not compiled.
 
     Raises:
         ValueError: if an argument breaks its rule, or the plant has no LQR; the message says why.
@@ -197,6 +233,8 @@ def near_optimal(
         basis, plant, placed, lqr, lqr.value, lqr.p, period=period, steps=steps, substeps=substeps
     )
     policy.lqr, policy.radius, policy.substeps = lqr, radius, substeps
+    if flag("near_optimal", "plan", plan):
+        policy.planner = policy.plans()
     if not plant.traceable:
         _warn_if_slow(policy)
     return policy

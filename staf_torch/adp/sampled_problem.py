@@ -188,8 +188,11 @@ class SampledProblem(nn.Module):
 
     def linear_feedback(self, x: Tensor) -> Tensor:
         """rest - K d within the bounds: (..., n) -> (..., m)."""
-        d = self.away(x)
-        return self.admissible(self.rest - (d.unsqueeze(-2) * self.k).sum(-1))
+        return self.admissible(self.rest - (self.away(x).unsqueeze(-2) * self.k).sum(-1))
+
+    def steered(self, x: Tensor, change: Tensor) -> Tensor:
+        """The linear feedback and a change of it, within the bounds: (..., n), (..., m) -> (..., m)."""
+        return self.admissible(self.linear_feedback(x) + change)
 
     def admissible(self, u: Tensor) -> Tensor:
         """The nearest control within the bounds: (..., m) -> (..., m)."""

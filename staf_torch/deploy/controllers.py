@@ -7,7 +7,7 @@ import copy
 import torch
 from torch import Tensor, nn
 
-from ..adp import ActorCritic, Controller, Feedback, RolloutPolicy, SafetyFilter, Supervised
+from ..adp import ActorCritic, Controller, Feedback, NearOptimal, RolloutPolicy, SafetyFilter, Supervised
 from ..numerics.checks import fail, trailing
 
 
@@ -217,6 +217,9 @@ def _policy_of(controller: Controller | nn.Module, weights: Tensor | None) -> nn
         controller = controller.policy  # type: ignore[assignment]
     if isinstance(controller, RolloutPolicy) and foldable(controller):
         return FoldedRollout(controller)
+    if isinstance(controller, NearOptimal) and controller.planner is not None:
+        rule = "must not plan on the way: `near_optimal(..., plan=False)`"
+        raise fail("policy_of", "controller", rule, "a policy that plans where a bound is met")
     if isinstance(controller, Controller) or not isinstance(controller, nn.Module):
         raise fail("policy_of", "controller", "must be a feedback law without memory or an actor", controller)
     return copy.deepcopy(controller)

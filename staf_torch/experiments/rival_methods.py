@@ -73,15 +73,22 @@ def plan(case: Case) -> Begin:
     return steered(case, adp.RecedingHorizon(case.problem(), steps=case.steps, iterations=0))
 
 
+def path_integral(case: Case) -> Begin:
+    """Our own sampling, around the feedback."""
+    return steered(case, adp.PathIntegral(case.problem(), steps=case.horizon, samples=_SAMPLES))
+
+
 def steered(case: Case, mpc: adp.Controller) -> Begin:
     """A controller that carries a state, as a function of x."""
 
     def begin(x0: Tensor) -> Steer:
-        state = mpc.init(x0)
+        state, drawn = mpc.init(x0), torch.Generator().manual_seed(0)
 
         def steer(x: Tensor) -> Tensor:
             nonlocal state
-            u, state = mpc.step(x, state, x, case.dt)
+            shape = (*x.shape[:1], mpc.draws, x.shape[1])
+            uniform = 2 * torch.rand(shape, generator=drawn, dtype=x.dtype) - 1
+            u, state = mpc.step(x, state, uniform, case.dt)
             return u
 
         return steer
@@ -245,6 +252,7 @@ METHODS = {
         Method("near_optimal", near_optimal, ("scipy",)),
         Method("GlobalValue", global_value, ("scipy",)),
         Method("box-DDP", box_ddp, ("scipy",), (steered,)),
+        Method("PathIntegral", path_integral, ("scipy",), (steered,)),
         Method("plan followed", plan, ("scipy",), (steered,)),
         Method("IPOPT", ipopt, ("casadi",), (ipopt_program,)),
         Method("MPPI", mppi, ("pytorch-mppi",)),

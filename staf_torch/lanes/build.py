@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import contextlib
 import ctypes
 import functools
 import hashlib
@@ -13,6 +14,7 @@ import shutil
 import subprocess
 import tempfile
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -21,6 +23,10 @@ _FOLDER = Path(__file__).parent
 _FLAGS = ("-O3", "-march=native", "-std=c++17", "-shared", "-fPIC", "-pthread")
 _COMPILERS = ("g++", "c++", "clang++")
 _SECONDS = 120
+_SCRATCH = tempfile.gettempprefix()  # of names under which a file is written at first
+_DAY = 86_400.0
+_LONGEST_UNUSED = 60 * _DAY
+_MOST_BYTES = 2**30  # a trace is some 15 kilobytes, a library 30
 _DIGEST = 32  # bytes at the end of a library in the cache
 _one_at_a_time = threading.Lock()  # threads of a chase ask for the same at the same time
 _said: set[str] = set()  # what has been logged
@@ -53,6 +59,40 @@ def _say(name: str, reason: str) -> None:
         _said.add(name)
     if first:
         _log.warning("the %s of a chase runs in plain torch, slower: nothing compiled (%s)", name, reason)
+
+
+def used(path: Path) -> None:
+    """Note that a file of the cache is in use now, which `prune` goes by."""
+    with contextlib.suppress(OSError):  # there is none, or it belongs to somebody else
+        os.utime(path)
+
+
+def prune(folder: Path, *, now: float | None = None) -> None:
+    """Delete files of the cache that nobody has used for long, and the oldest while there are too many bytes.
+
+    What was used within a day stays in any case: another process may be about to load it. A library that a
+    process has loaded stays with that process. Names that this library did not give are left alone.
+
+    Args:
+        folder: of the cache.
+        now: in seconds; the present by default.
+    """
+    now = time.time() if now is None else now
+    found = list[tuple[float, int, Path]]()
+    for path in folder.iterdir():
+        with contextlib.suppress(OSError):  # deleted by another process
+            state = path.stat()
+            if path.suffix == ".so" or path.name.startswith(("trace-", _SCRATCH)):
+                found.append((state.st_mtime, state.st_size, path))
+    kept = sum(size for _, size, _ in found)
+    for last_use, size, path in sorted(found):
+        unused, left_over = now - last_use, path.name.startswith(_SCRATCH)  # by a process that was killed
+        if unused > _LONGEST_UNUSED or (unused > _DAY and (left_over or kept > _MOST_BYTES)):
+            kept -= size
+            if path.is_dir():
+                shutil.rmtree(path, ignore_errors=True)
+            else:
+                path.unlink(missing_ok=True)
 
 
 @functools.cache
@@ -92,6 +132,7 @@ def seal(library: Path) -> None:
 def is_whole(library: Path) -> bool:
     """Whether a library is there and ends with its own digest: half of one would crash the process."""
     try:
+        used(library)
         content = library.read_bytes()
     except OSError:
         return False
@@ -126,12 +167,22 @@ def _cache() -> Path:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if os.access(folder, os.W_OK):
+            _pruned(folder)
             return folder
     except OSError:
         pass
     folder = Path(tempfile.mkdtemp(prefix="staf_torch-"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     return folder
+
+
+@functools.cache
+def _pruned(folder: Path) -> None:
+    """Prune a cache once in a process."""
+    try:
+        prune(folder)
+    except OSError as error:
+        _log.debug("the cache %s was not pruned: %s", folder, error)
 
 
 def _run(command: list[str]) -> str:

@@ -6,7 +6,7 @@ import copyreg
 import io
 import pickle
 import sys
-from collections.abc import Hashable
+from collections.abc import Hashable, Iterable, Mapping
 from itertools import chain
 from operator import is_
 from types import BuiltinFunctionType, FunctionType, MethodType
@@ -74,8 +74,9 @@ class Watch:
         self.tensors = [*writer.tensors, *writer.others]
         self._versions = [tensor._version for tensor in self.tensors]
         self._dicts, self._lists = writer.dicts, writer.lists
-        self._lengths, self._inside = self._look()
         self._sets = [(part, set(part)) for part in writer.sets]
+        self._code = _inside(writer.kept)
+        self._lengths, self._inside = self._look()
 
     def unchanged(self) -> bool:
         """Return whether nothing has changed since."""
@@ -90,9 +91,21 @@ class Watch:
 
     def _look(self) -> tuple[list[int], list[Any]]:
         """The lengths of all containers, and what is in them."""
-        values = chain.from_iterable(map(dict.values, self._dicts))
-        inside = [*values, *chain.from_iterable(self._lists)]
-        return [*map(len, self._dicts), *map(len, self._lists)], inside
+        maps = [*self._dicts, *self._code]  # a method may be replaced
+        inside = [value for part in maps for value in part.values()]
+        inside += chain.from_iterable(self._lists)
+        return [*map(len, maps), *map(len, self._lists)], inside
+
+
+def code(key: Any) -> list[Mapping[str, Any]]:
+    """Return what is in the classes that a key of `skeleton` names, and in their bases: methods above all."""
+    _, kept = key
+    return _inside(kept)
+
+
+def _inside(kept: Iterable[object]) -> list[Mapping[str, Any]]:
+    named = [each for each in dict.fromkeys(kept) if isinstance(each, type)]
+    return [vars(kind) for each in named for kind in each.__mro__ if kind is not object]
 
 
 def _written(objects: tuple[Any, ...]) -> _Writer | None:

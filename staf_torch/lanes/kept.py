@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Hashable
+from operator import is_
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from .content import Watch, signature, skeleton
+from .content import Watch, code, signature, skeleton
 from .program import Program, Step
 
 
@@ -31,6 +32,7 @@ class _Model(NamedTuple):
     tensors: list[Tensor]  # of the last
     versions: list[int]
     signature: bytes | None
+    code: list[Any]  # what is in the classes of the step's objects
 
 
 class Kept:
@@ -79,14 +81,17 @@ class Kept:
         if found is None:
             return Program(step, name=self._name, copies=copies)
         key, tensors = found
+        inside = [value for part in code(key) for value in part.values()]
         if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors):
             return None
         versions = [tensor._version for tensor in tensors]
         held = self._models.pop(key, None)
+        if held is not None and not (len(held.code) == len(inside) and all(map(is_, held.code, inside))):
+            held = None  # a method was replaced
         if held is None:
             new, told = Program(step, name=self._name, copies=copies), signature(key)
             new.described(told, tensors)
-            held = _Model(new, tensors, new, tensors, versions, told)
+            held = _Model(new, tensors, new, tensors, versions, told, inside)
         elif held.versions != versions or any(a is not b for a, b in zip(held.tensors, tensors, strict=True)):
             new = held.traced.with_others(step, list(zip(held.found, tensors, strict=True)))
             new.described(held.signature, tensors)

@@ -18,6 +18,7 @@ from .emission import emit
 from .given import Given
 from .graph import NOW, STEP, Graph
 from .lowering import lower
+from .patches import unpatched
 from .plan import Compiled, Plan, form, ordinary
 from .scalar_text import Names, c_text
 from .statements import Layout
@@ -242,7 +243,7 @@ class Program:
         """What the step does with a single row, from the cache where it has been written down before."""
         inputs = None if self._described is None else skeleton(given.key())
         shapes = None if inputs is None else signature(inputs[0])
-        if self._described is None or shapes is None:
+        if self._described is None or shapes is None or not unpatched():
             return _written(self.step, given, copies)
         step, tensors = self._described
         path = trace_cache.place(step, shapes, copies)

@@ -8,6 +8,7 @@ import io
 import os
 import pickle
 import platform
+import sys
 import tempfile
 import zlib
 from collections.abc import Sequence
@@ -17,14 +18,30 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from .build import _cache
+from .build import _cache, used
 from .captured import Recipe
 from .captured import tensors as tensors_of
 from .emission import Text
 
 _PACKAGE = Path(__file__).parent.parent
 _DIGEST = 32
-_DAMAGED = (OSError, pickle.UnpicklingError, AttributeError, EOFError, ImportError, IndexError, ValueError)
+_ALLOWED = frozenset(
+    (
+        ("torch", "Size"),
+        ("torch", "device"),
+        ("builtins", "slice"),
+        ("builtins", "tuple"),
+        ("builtins", "complex"),
+        ("numpy", "dtype"),
+        ("numpy", "ndarray"),
+        ("numpy.core.multiarray", "_reconstruct"),
+        ("numpy._core.multiarray", "_reconstruct"),
+        ("numpy.core.numeric", "_frombuffer"),
+        ("numpy._core.numeric", "_frombuffer"),
+    )
+)
+_NAMESPACES = ("aten", "prims")
+_DAMAGED = (OSError, pickle.UnpicklingError, AttributeError, EOFError, IndexError, ValueError, zlib.error)
 
 
 class Trace(NamedTuple):
@@ -57,6 +74,7 @@ def load(path: Path, tensors: Sequence[Tensor]) -> Trace | None:
     """
     try:
         content = path.read_bytes()
+        used(path)
         if content[-_DIGEST:] != hashlib.sha256(content[:-_DIGEST]).digest():
             return None
         found = Trace(*_Reader(io.BytesIO(zlib.decompress(content[:-_DIGEST])), tensors).load())
@@ -121,14 +139,32 @@ class _Writer(pickle.Pickler):
 
 
 class _Reader(pickle.Unpickler):
+    """Reads what `_Writer` writes, and refuses every other class or function: a file is no program."""
+
     def __init__(self, file: io.BytesIO, tensors: Sequence[Tensor]) -> None:
         super().__init__(file)
         self._given, self._made = tensors, dict[int, Tensor]()
+
+    def find_class(self, module: str, name: str) -> Any:
+        if (module, name) in _ALLOWED:
+            return super().find_class(module, name)
+        there: Any = sys.modules.get(module)  # nothing is imported here
+        for part in name.split("."):
+            there = getattr(there, part, None)
+        if module in ("torch", "torch._utils") and isinstance(
+            there, torch.dtype | torch.memory_format | torch.layout
+        ):
+            return there
+        if module.partition(".")[0] == _PACKAGE.name and isinstance(there, type) and issubclass(there, tuple):
+            return there  # named tuples, which structures of outputs are
+        raise pickle.UnpicklingError(f"{module}.{name} does not belong into a trace")
 
     def persistent_load(self, name: Any) -> Any:
         kind, value = name[0], name[1]
         if kind == "operation":
             namespace, _, operation = value.partition("::")
+            if namespace not in _NAMESPACES:
+                raise pickle.UnpicklingError(f"operations of {namespace} do not belong into a trace")
             packet = getattr(getattr(torch.ops, namespace), operation)
             return getattr(packet, name[2] or "default")
         if kind == "given":

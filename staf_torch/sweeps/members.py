@@ -28,11 +28,12 @@ from ..tables import Table
 from . import lock
 from .batching import Computed, Failed, Outcome, completion, reason
 from .executors import Inline, compute
-from .hydra_compat import Composer, ConfigLoader, config_loader, parse_override, product
+from .hydra_compat import Composer, ConfigLoader, Product, config_loader, parse_override, sweep_size
 from .member_rows import FOLDER, Left, left, made_by, rows_left, writer
 
 _log = logging.getLogger(__name__)
 _PIECE = 1024  # members that are composed and written together: memory does not grow with their number
+MOST_JOBS = 10**6  # of a sweep, or members of a job: their lists are memory
 _LISTED = 20  # members that the log shows one by one
 _SHOWN = ("ultimate_error", "floor_error", "ball_error", "ultimate_excess", "diverged_fraction")
 
@@ -161,11 +162,11 @@ def _refuse_others(
             )
 
 
-def member_overrides(setting: Any, loader: ConfigLoader) -> list[list[str]]:
+def member_overrides(setting: Any, loader: ConfigLoader) -> Sequence[list[str]]:
     """Return the overrides of every member, in the order of Hydra's own sweeper.
 
     Raises:
-        ValueError: if the setting is not a list of overrides in Hydra's grammar.
+        ValueError: if the setting is not a list of overrides in Hydra's grammar, or they make too many.
     """
     lines = OmegaConf.to_container(setting) if OmegaConf.is_config(setting) else setting
     lines = [lines] if isinstance(lines, str) else lines
@@ -181,7 +182,9 @@ def member_overrides(setting: Any, loader: ConfigLoader) -> list[list[str]]:
         overrides.append(override)
         if override.is_hydra_override() or override.key_or_group == "members":
             raise fail(COMMAND_LINE, "members", "must be about the experiment alone", line)
-    return product(overrides)
+    if sweep_size(overrides) > MOST_JOBS:
+        raise fail(COMMAND_LINE, "members", f"must be {MOST_JOBS} at most, in several jobs if need be", lines)
+    return Product(overrides)
 
 
 def _result(

@@ -8,10 +8,13 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from hydra.errors import HydraException
+
 from .. import __version__
 from ..results import run_record as records
 from ..results.untrusted import visible
-from .hydra_compat import overrides_in
+from .hydra_compat import overrides_in, parse_override, sweep_size
+from .members import MOST_JOBS
 
 _RESUME = "sweep.resume="
 _ANYWAY = "sweep.resume_anyway=true"
@@ -48,6 +51,7 @@ def command_line(argv: Sequence[str]) -> list[str]:
     if single and {"-m", "--multirun"} & set(argv):
         raise ValueError(f"{directory} is one run, of many members: resume it without -m.")
     typed, hydra = (_of_run(directory), []) if single else recorded(directory, anyway=_ANYWAY in given)
+    _check_size(directory, typed)
     own = [line for line in given if not _is_hydra(line) and line in records.own([line])]
     if own and sorted(own) != sorted(typed):
         raise ValueError(_difference(directory, own, typed))
@@ -66,6 +70,16 @@ def command_line(argv: Sequence[str]) -> list[str]:
         f"hydra.{'run' if single else 'sweep'}.dir={place}",
         f"{_RESUME}{place}",
     ]
+
+
+def _check_size(directory: Path, typed: Sequence[str]) -> None:
+    """Raise ValueError for a sweep of more jobs than memory has room for, before anybody lists them."""
+    try:
+        size = sweep_size([parse_override(line) for line in typed])
+    except HydraException:  # whoever composes the jobs says so
+        return
+    if size > MOST_JOBS:
+        raise ValueError(f"{directory} has a sweep of {size:g} jobs, and {MOST_JOBS} are the most.")
 
 
 def may_run_code(line: str) -> bool:

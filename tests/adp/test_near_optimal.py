@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from pathlib import Path
 
 import numpy as np
@@ -80,7 +81,9 @@ def test_report_says_what_was_chosen_and_how_good_it_is() -> None:
 @torch.no_grad()
 def test_exported_policy_is_the_policy(tmp_path: Path) -> None:
     cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1, low=-2.0, high=1.5)
-    policy = deploy.policy_of(adp.near_optimal(systems.Pendulum(), cost, dt=0.05, horizon=0.4))
+    with pytest.raises(ValueError, match=r"`policy_of\(controller=...\)` must not plan on the way"):
+        deploy.policy_of(adp.near_optimal(systems.Pendulum(), cost, dt=0.05, horizon=0.4))
+    policy = deploy.policy_of(adp.near_optimal(systems.Pendulum(), cost, dt=0.05, horizon=0.4, plan=False))
     x = drawn(2, 0.5, 40)
     deploy.export_c(policy, x[:1], tmp_path / "staf.h", ["u"])
     (u,) = runner_c(tmp_path / "staf.h", [1], torch.float64)(x)
@@ -94,3 +97,21 @@ def test_bad_arguments_are_refused_by_name() -> None:
         adp.near_optimal(systems.Pendulum(), COST, dt=0.1, horizon=-1.0)
     with pytest.raises(ValueError, match=r"`SampledRollout\(steps=...\)` must be at least 4"):
         adp.near_optimal(systems.Pendulum(), COST, dt=0.1, horizon=0.2)
+
+
+def test_plan_takes_over_where_the_lqr_would_meet_a_bound() -> None:
+    """A mass at 5 m with |u| <= 1: the LQR's rollouts overshoot; the plan is the optimum of its horizon."""
+    plant = systems.Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
+    policy = adp.near_optimal(plant, COST, dt=0.25, low=-1.0, high=1.0)
+    x = torch.tensor([[3.0, 1.0], [0.05, 0.0], [-3.0, -1.0]], dtype=torch.float64)
+    assert policy.planner is not None
+    assert policy.planner.strained(x).tolist() == [True, False, True]
+    u = policy(x)
+    best = adp.BoxDDP(policy.planner.problem, steps=policy.steps).solve(x[::2])
+    torch.testing.assert_close(u[::2], best.control[:, 0], rtol=0, atol=1e-3)
+    torch.testing.assert_close(u[0], -u[2])
+    torch.testing.assert_close(u[1], policy.control(x[1]), rtol=0, atol=1e-9)
+    assert torch.equal(policy(x[1]), u[1])
+    again = pickle.loads(pickle.dumps(policy))
+    torch.testing.assert_close(again(x), u)
+    assert adp.near_optimal(plant, COST, dt=0.25).planner is None

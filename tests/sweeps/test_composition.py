@@ -6,12 +6,20 @@ import pickle
 
 import pytest
 from composing import compose
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import OmegaConf
 
 from staf_torch.results.run_record import flat
-from staf_torch.sweeps.hydra_compat import Composer, config_loader, interpolations_parsed_once
+from staf_torch.sweeps.hydra_compat import (
+    Composer,
+    Product,
+    config_loader,
+    interpolations_parsed_once,
+    parse_override,
+    sweep_size,
+)
 
 JOBS = [
     [],
@@ -130,3 +138,29 @@ def test_settings_are_flat_and_resolved() -> None:
     assert settings["centers.shrink.offset"] is None
     assert settings["initial_state"] == [1.0, 0.0]
     assert not any(name.startswith("hydra") for name in settings)
+
+
+def test_the_jobs_of_a_product_are_those_of_hydras_sweeper() -> None:
+    lines = [
+        "a=1,2,3",
+        "b=range(0,1,0.25)",
+        "c=7",
+        "a=4,5",
+        "d=choice(x,y)",
+        "e=range(5,0,-2)",
+        "f=[1],[2,3]",
+    ]
+    overrides = [parse_override(line) for line in lines]
+    (expected,) = BasicSweeper.split_arguments(overrides, None)
+    found = Product(overrides)
+    assert list(found) == expected
+    assert found[3:-5:7] == expected[3:-5:7]
+    assert found[-1] == expected[-1]
+    assert sweep_size(overrides) == 3 * len(found)  # `a` comes twice
+
+
+@pytest.mark.parametrize(
+    "line", ["seed=range(1000000000)", "seed=shuffle(range(0,1e12))", "seed=range(1,2,0)"]
+)
+def test_a_range_of_a_billion_numbers_is_counted_and_not_written_out(line: str) -> None:
+    assert sweep_size([parse_override(line)]) >= 1e9

@@ -80,6 +80,7 @@ class Sweep:
                 os.dup2(log, stream)
             os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
             signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
+            signal.signal(signal.SIGTERM, signal.SIG_DFL)
             sys.argv = ["staf", "-m", *line]
             staf.main()
             code = 0
@@ -182,6 +183,7 @@ def main() -> int:
         "--kinds", help="of kills, such as SIGHUP,scancel,node_loss; all, each as often, else"
     )
     chosen = parser.parse_args()
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit("ended by SIGTERM"))  # and the daemons of SLURM with us
     path = os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
     environment = {"PYTHONPATH": path}
     absent = {name: name for name in ("ray", "submitit") if importlib.util.find_spec(name) is None}

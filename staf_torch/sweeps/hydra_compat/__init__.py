@@ -10,10 +10,11 @@ from .composing import JobLoader as JobLoader
 from .composing import config_loader as config_loader
 from .composing import interpolations_parsed_once as interpolations_parsed_once
 from .composing import parse_override as parse_override
-from .composing import product as product
 from .jobs import SweepContext as SweepContext
 from .jobs import directory_of as directory_of
 from .jobs import without_hydra_overrides as without_hydra_overrides
+from .products import Product as Product
+from .products import sweep_size as sweep_size
 from .program import BrokenSweep as BrokenSweep
 from .program import broken_sweep as broken_sweep
 from .program import find_launcher as find_launcher

@@ -11,7 +11,6 @@ from typing import Any, NamedTuple, cast
 import omegaconf.base
 from hydra._internal import config_loader_impl
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
-from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra._internal.utils import create_config_search_path
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.global_hydra import GlobalHydra
@@ -42,12 +41,6 @@ def parse_override(line: str, loader: ConfigLoader | None = None) -> Override:
     """
     (parsed,) = OverridesParser.create(config_loader=loader).parse_overrides([line])
     return parsed
-
-
-def product(overrides: Sequence[Override]) -> list[list[str]]:
-    """Return the overrides of every job of a sweep, in the order of Hydra's own sweeper."""
-    (jobs,) = BasicSweeper.split_arguments(list(overrides), None)
-    return [list(job) for job in jobs]
 
 
 @contextlib.contextmanager

@@ -1,0 +1,60 @@
+"""The jobs of a sweep from its overrides: how many they are, and each when it is asked for."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import overload
+
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+from hydra.core.override_parser.types import Override, RangeSweep
+
+
+def sweep_size(overrides: Sequence[Override]) -> float:
+    """Return how many jobs these overrides make; a range of a billion numbers is not written out for it."""
+    return math.prod(_length(one) for one in overrides if one.is_sweep_override())
+
+
+def _length(override: Override) -> float:
+    value = override._value
+    if not isinstance(value, RangeSweep):
+        return sum(1 for _ in override.sweep_string_iterator()) if override.is_discrete_sweep() else 1
+    start, stop, step = (float(number or 0) for number in (value.start, value.stop, value.step))
+    steps = (stop - start) / step if step else math.inf
+    return max(0, math.ceil(steps)) if math.isfinite(steps) else math.inf
+
+
+class Product(Sequence[list[str]]):
+    """The overrides of every job of a sweep, in the order of Hydra's own sweeper; each made when asked for.
+
+    Args:
+        overrides: with sweeps among them.
+    """
+
+    def __init__(self, overrides: Sequence[Override]) -> None:
+        self._lists: dict[str, list[str]] = {}  # a key that comes twice has its first place and last values
+        for one in overrides:
+            (listed,) = BasicSweeper.split_arguments([one], None)
+            self._lists[one.get_key_element()] = [line for (line,) in listed]
+        self._numbers = range(math.prod(map(len, self._lists.values())))
+
+    def __len__(self) -> int:
+        return len(self._numbers)
+
+    @overload
+    def __getitem__(self, index: int) -> list[str]: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> list[list[str]]: ...
+
+    def __getitem__(self, index: int | slice) -> list[str] | list[list[str]]:
+        if isinstance(index, slice):
+            return [self._job(number) for number in self._numbers[index]]
+        return self._job(self._numbers[index])
+
+    def _job(self, number: int) -> list[str]:
+        lines = []
+        for values in reversed(self._lists.values()):
+            number, place = divmod(number, len(values))
+            lines.append(values[place])
+        return lines[::-1]

@@ -1,0 +1,131 @@
+"""What the user's cache must not do: bring back code that was replaced, run what a file says, grow."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import io
+import os
+import pickle
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from staf_torch import kernels
+from staf_torch.lanes import build, patches, trace_cache
+from staf_torch.lanes.kept import Kept
+from staf_torch.lanes.program import Program
+
+X = torch.linspace(-1, 1, 10, dtype=torch.float64).view(5, 2)
+
+
+def of(kept: Kept, kernel: nn.Module) -> Program:
+    def step(x: Tensor, now: Any, row: Any) -> tuple[Tensor, Tensor]:
+        x = 0.5 * x + 0.1 * kernel(x.unsqueeze(-2), torch.ones(1, 2).double()).squeeze(-2)
+        return x, x.sum(-1)
+
+    found = kept.of(step, kernel, owners=(kernel,))
+    assert found is not None
+    return found
+
+
+@pytest.fixture
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty cache for traces; what is compiled stays where it is."""
+    monkeypatch.setattr("staf_torch.lanes.trace_cache._cache", lambda: tmp_path)
+    return tmp_path
+
+
+def twice(self: nn.Module, x1: Tensor, x2: Tensor) -> Tensor:
+    return 2 * (x1 @ x2.mT)
+
+
+@pytest.mark.parametrize("same_process", [True, False])
+def test_a_method_that_was_replaced_meets_no_old_trace(
+    same_process: bool, cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kernel, kept = kernels.ExponentialKernel(), Kept("a test")
+    for _ in range(3):  # from the second on a watch says whether something has changed
+        before = of(kept, kernel)(X, steps=1)[1]
+    assert len(list(cache.iterdir())) == 1
+    assert kept.unchanged(kernel) is not None
+    monkeypatch.setattr(kernels.ExponentialKernel, "forward", twice)
+    assert not patches.unpatched()
+    assert kept.unchanged(kernel) is None
+    program = of(kept if same_process else Kept("a test"), kernel)
+    found = program(X, steps=1)[1]
+    torch.testing.assert_close(found, program.definition(X, steps=1)[1])
+    assert not torch.allclose(found, before)
+    assert len(list(cache.iterdir())) == 1  # nor is it written for others
+
+
+@pytest.mark.parametrize(
+    "put",
+    [
+        lambda patch: patch.setattr("staf_torch.numerics.linalg.pivoted_cholesky", twice),
+        lambda patch: patch.setattr(kernels.ExponentialKernel, "forward", staticmethod(twice)),
+        lambda patch: patch.setattr(kernels.ExponentialKernel, "state_free", property(twice)),
+        lambda patch: patch.setattr(kernels.ExponentialKernel, "forward", kernels.GaussianKernel.forward),
+    ],
+)
+def test_foreign_functions_are_seen_and_the_librarys_own_are_not(
+    put: Callable[[pytest.MonkeyPatch], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert patches.unpatched()
+    put(monkeypatch)
+    assert not patches.unpatched()
+    monkeypatch.undo()
+    assert patches.unpatched()
+
+
+def test_no_module_of_the_package_looks_patched() -> None:
+    for name in ("adp", "envs", "experiments", "metrics", "online", "theory"):
+        importlib.import_module(f"staf_torch.{name}")
+    patched = [] if patches.unpatched() else [name for name, (_, own) in patches._seen.items() if not own]
+    assert not patched
+
+
+class Harm:
+    def __reduce__(self) -> Any:
+        return os.system, ("exit 0",)
+
+
+@pytest.mark.parametrize("content", [Harm(), Path("x"), os.getcwd])
+def test_a_file_that_names_other_code_is_no_trace(content: object, cache: Path) -> None:
+    path = cache / "trace-0"
+    packed = zlib.compress(pickle.dumps((content,)))
+    path.write_bytes(packed + hashlib.sha256(packed).digest())
+    with pytest.raises(pickle.UnpicklingError, match="does not belong into a trace"):
+        trace_cache._Reader(io.BytesIO(pickle.dumps((content,))), ()).load()
+    assert trace_cache.load(path, ()) is None
+
+
+def test_the_cache_forgets_what_nobody_has_used_and_nothing_of_today(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    day, now = build._DAY, 1e9
+    ages = {"lanes-new.so": 0.5, "trace-old": 61, "lanes-old.so": 70, "lanes-mid.so": 20, "trace-mid": 10}
+    ages |= {"tmpabc": 2, "tmpnow": 0.01, "notes.txt": 400}
+    for name, days in ages.items():
+        (tmp_path / name).write_bytes(b"0" * 100)
+        os.utime(tmp_path / name, (now - days * day,) * 2)
+    (tmp_path / "tmpdir").mkdir()
+    os.utime(tmp_path / "tmpdir", (now - 3 * day,) * 2)
+
+    def left() -> set[str]:
+        build.prune(tmp_path, now=now)
+        return {path.name for path in tmp_path.iterdir()}
+
+    kept = {"lanes-new.so", "lanes-mid.so", "trace-mid", "tmpnow", "notes.txt"}
+    assert left() == kept
+    monkeypatch.setattr(build, "_MOST_BYTES", 300)
+    assert left() == kept - {"lanes-mid.so"}
+    monkeypatch.setattr(build, "_MOST_BYTES", 0)
+    assert left() == {"lanes-new.so", "tmpnow", "notes.txt"}
+    build.used(tmp_path / "lanes-new.so")
+    assert (tmp_path / "lanes-new.so").stat().st_mtime > now
