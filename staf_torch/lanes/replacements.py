@@ -33,13 +33,6 @@ def sort(
     return moved.gather(-1, places).movedim(-1, dim), places.movedim(-1, dim).clone()
 
 
-def stable_sort(
-    x: Tensor, *, stable: bool | None = True, dim: int = -1, descending: bool = False
-) -> tuple[Tensor, Tensor]:
-    """`sort` as the overload `sort.stable` calls it."""
-    return sort(x, dim, descending)
-
-
 def topk(
     x: Tensor, k: int, dim: int = -1, largest: bool = True, sorted: bool = True
 ) -> tuple[Tensor, Tensor]:

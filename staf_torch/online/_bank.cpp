@@ -58,6 +58,7 @@ INLINE V row(const double *from) {
 
 static void restart_linear(const Rules &r, Stream &s) {
     std::memset(s.covariance, 0, sizeof s.covariance + sizeof s.linear + sizeof s.filters);
+    s.trackers.restart(Mask{} == Mask{});
     for (int i = 0; i < unknowns; ++i) s.covariance[i][i] = r.linear_prior;
     s.quadratics.restart(row(r.quadratic_prior), Mask{} == Mask{});
     Filter f{};
@@ -77,13 +78,13 @@ static void clear(const Rules &r, Stream &s) {
     std::fill(&s.excess[0][0], &s.excess[0][0] + K * members, 1);
     std::fill(&s.quadratic_error[0][0], &s.quadratic_error[0][0] + K * lanes, 1);
     for (int o = 0; o < K; ++o) {
-        s.error[o] = s.pace[o] = s.calibration[o] = 1, s.low[o] = infinity, s.high[o] = -infinity;
+        s.error[o] = s.pace[o] = s.own[o] = s.best[o] = s.calibration[o] = 1, s.low[o] = infinity, s.high[o] = -infinity;
         for (int g = 0; g < groups_of_members; ++g) s.correction_covariance[o][g][g] = r.correction_prior;
     }
     restart_linear(r, s);
 }
 
-// The carried models learn (x, y): the linear one, the quadratics and the filters.
+// The carried models learn (x, y): the linear one, the quadratics, the trackers and the filters.
 static void carry(const Rules &r, Stream &s, const double *x, const double *y, double lapse) {
     double u[unknowns] = {1}, v[K], gain[unknowns], spread = 1, most = 0;
     scaled(r, s, x, u + 1);
@@ -108,16 +109,19 @@ static void carry(const Rules &r, Stream &s, const double *x, const double *y, d
             for (double &entry : row) entry /= faded;
     double phi[features];
     quadratic_features(u + 1, phi);
-    V share = row(r.quadratic_forgetting);
-    if (lapse != 1)
-        for (int l = 0; l < lanes; ++l) share[l] = std::pow(share[l], lapse);
-    s.quadratics.learn(phi, v, share, row(r.quadratic_prior));
+    auto after = [&](V share) {
+        if (lapse != 1)
+            for (int l = 0; l < lanes; ++l) share[l] = std::pow(share[l], lapse);
+        return share;
+    };
+    s.quadratics.learn(phi, v, after(row(r.quadratic_forgetting)), row(r.quadratic_prior));
     Filter f = filters_of(s);
     const Law law = law_of(r);
     V at[n], value[K], z[n];
     Mask seen[K];
     for (int i = 0; i < n; ++i) at[i] = all(u[i + 1]);
     for (int o = 0; o < K; ++o) value[o] = all(v[o]);
+    s.trackers.learn(r.trackers, at, value, after(r.trackers.forgetting));
     const Verdict verdict = judge(law, f, at, value, seen, V{});
     for (int i = 0; i < n; ++i) z[i] = verdict.moves ? V{} : verdict.z[i];
     if (any(verdict.moves)) {
@@ -281,11 +285,13 @@ static void ask(const Rules &r, Stream &s, const double *x) {
     for (int i = 0; i < unknowns; ++i)
         for (int j = 0; j < unknowns; ++j) spread += u[i] * s.covariance[i][j] * u[j];
     local_processes(r, s, x, u + 1, line);
-    V at[n], mean[K], variance[K], bent[K];
+    V at[n], mean[K], variance[K], bent[K], tracked[K];
     double phi[features];
     quadratic_features(u + 1, phi);
     const V bent_spread = s.quadratics.predict(phi, bent);
     for (int i = 0; i < n; ++i) at[i] = all(u[i + 1]);
+    const V tracked_spread = s.trackers.predict(r.trackers, at, tracked);
+    const V unknown = minimum(tracked_spread - r.trackers.noise, all(1));
     const Filter f = filters_of(s);
     predict(r.functions, law_of(r), f, [&](int i) { return f.learned[i]; }, at, mean, variance);
     for (int o = 0; o < K; ++o) {
@@ -294,10 +300,13 @@ static void ask(const Rules &r, Stream &s, const double *x) {
         for (int l = 0; l < lanes; ++l) {
             means[locals + carried + l] = bent[o][l];
             variances[locals + carried + l] = bent_spread[l] * s.quadratic_error[o][l];
+            means[locals + carried + lanes + l] = tracked[o][l] + square(unknown[l]) * line[o];
+            variances[locals + carried + lanes + l] = tracked_spread[l];
         }
         means[members - 2] = line[o], variances[members - 2] = spread;
-        means[members - 1] = in_units(r, s, o, s.last_y[o]), variances[members - 1] = 1;
-        const double low = in_units(r, s, o, s.low[o]), high = in_units(r, s, o, s.high[o]);
+        const double last = s.waiting ? s.waiting_y[o] : s.last_y[o];
+        means[members - 1] = in_units(r, s, o, last), variances[members - 1] = 1;
+        const double low = in_units(r, s, o, std::min(s.low[o], last)), high = in_units(r, s, o, std::max(s.high[o], last));
         const double wide = r.margin * (high - low);
         for (int i = 0; i < members; ++i) {
             if (!(means[i] - means[i] == 0)) means[i] = means[members - 1];  // x itself may not be finite
@@ -352,38 +361,34 @@ static void notice(Stream &s, const double *y) {
 static void accept(const Rules &r, Stream &s, const double *x, const double *y, double time, double lapse) {
     s.clock += 1, s.learned += 1;
     keep(r, s, x, y, time);
-    if (std::find(r.rescaled, r.rescaled + 6, s.clock) != r.rescaled + 6) rescale(r, s);
+    if (std::find(r.rescaled, r.rescaled + 9, s.clock) != r.rescaled + 9 && s.clock <= C) rescale(r, s);
     else carry(r, s, x, y, lapse);
 }
 
-// Whether a sample that nobody expected waits: it is learned as it is if the next one is alike, else within limits.
-static bool waits(const Rules &r, Stream &s, const double *x, const double *y, const double *told, double lapse) {
+// Whether a sample that nobody expected waits: it is learned if the next one is as far off, else skipped.
+static bool waits(const Rules &r, Stream &s, const double *x, const double *y, const double *told, double &lapse) {
     bool doubtful = false;
     for (int o = 0; o < K; ++o) {
-        const double error = in_units(r, s, o, y[o]) - s.mean[o];
-        doubtful |= told[o] == told[o] && square(error) > square(r.doubtful) * std::max(s.variance[o], s.pace[o]);
+        const double error = std::fabs(in_units(r, s, o, y[o]) - s.mean[o]);
+        const double most = error > r.outside ? r.doubtful_outside : r.doubtful;
+        doubtful |= told[o] == told[o] && square(error) > square(most) * std::max(s.variance[o], s.pace[o]);
     }
-    if (doubtful && s.clock >= r.settled && s.trust == 0) {
-        if (s.waiting == 0) {
+    const bool waiting = s.waiting, rare = s.doubted < r.rare;
+    s.doubted += r.doubted_rate * (doubtful - s.doubted);
+    if (doubtful && rare && s.clock >= r.settled && s.trust == 0) {
+        s.waiting = !waiting;
+        if (!waiting) {
             std::copy(x, x + n, s.waiting_x);
             std::copy(y, y + K, s.waiting_y);
-            for (int o = 0; o < K; ++o) {
-                const double most = r.doubtful * std::sqrt(std::max(s.variance[o], s.pace[o]));
-                const double limited = std::min(std::max(in_units(r, s, o, y[o]), s.mean[o] - most), s.mean[o] + most);
-                s.limited_y[o] = limited * scale_of(r, s, n + o) + shift_of(r, s, n + o);
-            }
-            notice(s, y);
-            s.waiting = 1, s.waiting_time = s.time, s.waiting_lapse = lapse;
+            s.waiting_time = s.time, s.waiting_lapse = lapse;
             return true;
         }
-        s.waiting = 0, s.trust = streak_limit;
+        s.trust = streak_limit;
+        notice(s, s.waiting_y);
         accept(r, s, s.waiting_x, s.waiting_y, s.waiting_time, s.waiting_lapse);
         return false;
     }
-    if (s.waiting) {
-        s.waiting = 0;
-        accept(r, s, s.waiting_x, s.limited_y, s.waiting_time, s.waiting_lapse);
-    }
+    if (waiting) s.waiting = 0, s.skipped += 1, lapse += s.waiting_lapse;
     s.trust = std::max(s.trust - 1, 0.);
     return false;
 }

@@ -9,6 +9,9 @@
 #include <cmath>
 #include <cstdint>
 #include <limits>
+#ifdef __AVX512F__
+#include <immintrin.h>
+#endif
 
 #define INLINE static inline __attribute__((always_inline))
 typedef double V __attribute__((vector_size(64)));
@@ -22,8 +25,12 @@ INLINE V maximum(V a, V b) { return a > b ? a : b; }
 INLINE V minimum(V a, V b) { return a < b ? a : b; }
 INLINE V absolute(V a) { return a < 0 ? -a : a; }
 INLINE V root(V a) {
+#ifdef __AVX512F__  // the loop is scalar, as std::sqrt may set errno
+    return (V)_mm512_sqrt_pd((__m512d)a);
+#else
     for (int l = 0; l < lanes; ++l) a[l] = std::sqrt(a[l]);
     return a;
+#endif
 }
 INLINE Mask finite(V a) { return a - a == V{}; }
 INLINE bool any(Mask m) {
@@ -223,8 +230,10 @@ INLINE Mask update(const Functions &f, const Law &law, Filter &s, Get learned, P
         for (int i = 0; i < M; ++i) error -= psi[i] * s.mean[o][i];
         const V square = minimum(error * error / spread, all(law.most));
         const V limited = minimum(square, all(law.limit));
-        const V kept = minimum(law.robust * root(running_scale(law, s.errors[o], s.since) / square), all(1));
-        change[o] = seen[o] ? (law.robust < infinity ? kept : all(1)) * error / spread : V{};
+        V kept = all(1);
+        if (any(law.robust < infinity))  // a fifth of the time of a small filter
+            kept = minimum(law.robust * root(running_scale(law, s.errors[o], s.since) / square), all(1));
+        change[o] = seen[o] ? kept * error / spread : V{};
         const V counted = s.since < streak_limit ? limited : minimum(limited, surprise * s.errors[o]);
         errors[o] = seen[o] ? s.errors[o] + rate * (counted - s.errors[o]) : s.errors[o];
         size = maximum(size, absolute(y[o]));

@@ -13,8 +13,9 @@ constexpr int group_of(int i) {
     return i < 18                     ? i % 6
            : i < locals               ? 6
            : i < locals + carried     ? 7
+           : i < members - 2 - lanes  ? 8
            : i < members - 2          ? 9
-           : i == members - 2         ? 8
+           : i == members - 2         ? 10
                                       : -1;
 }
 
@@ -61,9 +62,21 @@ static void mix(const Rules &r, Stream &s, int o, double low, double high) {
         stacked += s.correction[o][g] * s.away[o][g];
     }
     stacked = std::max(std::min(first + unit * stacked, high), low);
-    s.blend[o] = first, s.stacked[o] = stacked;
-    const double share = 1 / (1 + std::exp(s.corrected[o][0] - s.corrected[o][1]));
-    s.mean[o] = (1 - share) * first + share * stacked;
+    double logs[members], peak = -infinity, whole_of = 0, squared = 0;
+    for (int i = 0; i < members; ++i) logs[i] = s.squares[o][i] - doubts[i], peak = std::max(peak, logs[i]);
+    for (int i = 0; i < members; ++i) {
+        const double weight = std::exp(logs[i] - peak);
+        whole_of += weight, squared += weight * means[i];
+    }
+    double *blend = s.blend[o], best = -infinity, parts = 0;
+    blend[0] = first, blend[1] = stacked, blend[2] = squared / whole_of;
+    for (double log : s.corrected[o]) best = std::max(best, log);
+    s.mean[o] = 0;
+    for (int b = 0; b < blends; ++b) {
+        const double share = std::exp(s.corrected[o][b] - best);
+        if (share >= r.drop) parts += share, s.mean[o] += share * blend[b];
+    }
+    s.mean[o] /= parts;
     second += square(s.mean[o] - first);
     s.variance[o] = std::max(second, r.floor * s.pace[o]) * s.calibration[o];
 }
@@ -107,20 +120,28 @@ static void learn_correction(const Rules &r, Stream &s, int o, double blended) {
 
 // The members and their mixtures are judged by their prediction of an output, in units.
 static void judge_members(const Rules &r, Stream &s, int o, double value) {
-    const double t = s.clock, error = value - s.mean[o], blended = value - s.blend[o];
+    const double t = s.clock, error = value - s.mean[o], blended = value - s.blend[o][0];
     learn_correction(r, s, o, blended);
     const double z2 = error * error / std::max(s.variance[o] / s.calibration[o], 1e-300);
-    s.calibration[o] += std::max(r.error_rate, 1 / (t + 5)) * (std::min(z2, surprise * s.calibration[o]) - s.calibration[o]);
+    const double surprised = std::min(z2, surprise * s.calibration[o]) - s.calibration[o], since = t - r.uncalibrated;
+    if (since > 0) s.calibration[o] += std::max(r.error_rate, 1 / (since + 5)) * surprised;
     s.calibration[o] = std::min(std::max(s.calibration[o], 1e-6), 1e2);
-    auto follow = [&](double &running, double rate) {
-        running += std::max(rate, 1 / (t + 1)) * (std::min(blended * blended, surprise * running) - running);
+    auto follow = [&](double &running, double found, double rate, double most) {
+        running += std::max(rate, 1 / (t + 1)) * (std::min(found, most * running) - running);
     };
-    follow(s.error[o], r.error_rate);
-    follow(s.pace[o], r.pace);
-    const double unit = std::max(s.pace[o], least);
-    const double both[2] = {student(r, blended, unit), student(r, value - s.stacked[o], unit)};
-    reweigh(s.corrected[o], both, 2, r.correction_discount, r.correction_share);
-    double scores[members], over[clocks];
+    double scores[members], over[clocks], of_blends[blends], least_square = infinity;
+    for (int b = 0; b < blends; ++b) {
+        const double e = value - s.blend[o][b];
+        of_blends[b] = student(r, e, std::max(s.own[o], least)), least_square = std::min(least_square, e * e);
+    }
+    reweigh(s.corrected[o], of_blends, blends, r.correction_discount, r.correction_share);
+    for (int i = 0; i < members; ++i)
+        scores[i] = -r.squares_rate * std::min(square(value - s.means[o][i]) / std::max(s.best[o], least), 1e9);
+    reweigh(s.squares[o], scores, members, r.squares_discount, r.squares_share);
+    follow(s.error[o], blended * blended, r.error_rate, surprise);
+    follow(s.pace[o], blended * blended, r.pace, surprise);
+    follow(s.own[o], error * error, r.own_rate, r.largest);
+    follow(s.best[o], least_square, r.best_rate, r.largest);
     for (int i = 0; i < members; ++i) {
         const double e = value - s.means[o][i], v = s.variances[o][i], ratio = e * e / std::max(v, least);
         double &excess = s.excess[o][i], &usual = s.usual[o][i];

@@ -15,7 +15,7 @@ from ..centers import simplex
 from ..kernels import GaussianKernel
 from ..lanes.build import compiled
 from .bank_definition import BankDefinition
-from .bank_rules import CARRIED_RADIUS, CARRIED_WIDTH, BankShape, Rules, size
+from .bank_rules import CARRIED_RADIUS, CARRIED_WIDTH, TRACKED, BankShape, Rules, size
 from .compiled_filter import FunctionPointers
 from .filter_streams import refuse_other
 from .local_functions import LocalFunctions
@@ -45,23 +45,25 @@ class Bank:
     predicts, and 24 Gaussian processes on k samples correct what it leaves: the k nearest, without and
     with two rates of fading by age, and the k latest, each with three widths and two noises, amplitudes
     y'K^-1 y / k. Beside them stand eight filters (`LocalFilter`, M = n + 1), eight models quadratic in x
-    (recursive least squares, five rates of forgetting), that linear model and the last value.
+    (recursive least squares, five rates of forgetting), eight Gaussian processes on at most 63 samples of the
+    whole past that fade (`TrackerModels`), that linear model and the last value.
 
     Every member's variance is scaled by its running squared error. The members are mixed by discounted
     scores, part Student-t likelihood with the member's variance, part with the common running error, at
-    three rates of discount, and the less the less certain they are; the three mixtures are mixed alike, and
-    corrected by least squares on what groups of members say. The mixture's variance follows its running
-    squared error.
+    three rates of discount, and the less the less certain they are; the three mixtures are mixed alike. With
+    what least squares on groups of members adds to that, and a mixture by squared errors over a long time,
+    they make the mean. Its variance follows its running squared error.
 
     Args:
         shape: sizes.
         streams: S.
         scaling: whether the units of x and y are learned, from the first 2, 5, 10, 20 and 40 samples.
-        doubtful: standard deviations beyond which a sample waits for the next one. If that is as far off,
-            both are learned, else the first with an error of so many deviations.
+        doubtful: standard deviations beyond which a sample waits for the next one: if that is as far off,
+            both are learned, else the first is skipped. By default 30, and 8 for an error of more than 12
+            spreads of y. Where more than one in twenty is doubted, none waits.
     """
 
-    def __init__(self, shape: BankShape, streams: int, scaling: bool, doubtful: float = math.inf) -> None:
+    def __init__(self, shape: BankShape, streams: int, scaling: bool, doubtful: float | None = None) -> None:
         self.shape, self.scaling, self.dtype = shape, scaling, torch.float64
         width = CARRIED_WIDTH * math.sqrt(shape.dim)
         functions = LocalFunctions.of(GaussianKernel(width), CARRIED_RADIUS * width * simplex(shape.dim))
@@ -154,5 +156,5 @@ class Bank:
 @functools.cache
 def _built(shape: BankShape) -> Callable[..., None] | None:
     sizes = f"DIM={shape.dim}", f"COUNT={shape.dim + 1}", f"OUTPUTS={shape.outputs}"
-    kept = f"CAPACITY={shape.capacity}", f"NEIGHBOURS={shape.neighbours}"
+    kept = f"CAPACITY={shape.capacity}", f"NEIGHBOURS={shape.neighbours}", f"TRACKED={TRACKED}"
     return compiled(Path(__file__).with_name("_bank.cpp"), *sizes, *kept)

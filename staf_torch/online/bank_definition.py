@@ -16,6 +16,7 @@ from .kalman_filter import STREAK, LocalFilter, StreamState
 from .local_functions import LocalFunctions
 from .mixture_definition import judge, mix
 from .quadratic_models import QuadraticModels, quadratic_features
+from .tracker_models import TrackerModels
 
 _RESET = ("skipped", "learned")  # what a stream that begins anew keeps
 
@@ -43,6 +44,8 @@ class BankDefinition:
         forgetting = torch.tensor(rules.forgetting, dtype=torch.float64)
         self.share = torch.tensor(rules.quadratic_forgetting, dtype=torch.float64)
         self.prior = torch.tensor(rules.quadratic_prior, dtype=torch.float64)
+        rows = rules.tracker_rate, rules.tracker_noise, rules.tracker_forgetting
+        self.tracker_rate, self.tracker_noise, self.tracker_share = torch.tensor(rows, dtype=torch.float64)
         self.filter = LocalFilter(functions, ratio, forgetting, rules.carried_slack)
 
     def each(self, table: Tensor) -> list[Views]:
@@ -61,7 +64,7 @@ class BankDefinition:
                 part.zero_()
         s["last_x"].fill_(torch.nan)
         s["asked"].fill_(torch.nan)
-        for name in ("spread", "excess", "error", "pace", "calibration", "quadratic_error"):
+        for name in ("spread", "excess", "error", "pace", "own", "best", "calibration", "quadratic_error"):
             s[name].fill_(1.0)
         s["correction_covariance"].copy_(self.rules.correction_prior * torch.eye(GROUPS, dtype=torch.float64))
         s["order"].fill_(-1.0)
@@ -76,6 +79,8 @@ class BankDefinition:
         s["filters"].zero_()
         s["filters"][: 2 * self.shape.dim].fill_(torch.nan)
         QuadraticModels(s["factor"], s["quadratic"]).restart(self.prior)
+        for part in _trackers(s):
+            part.zero_()
 
     def _units(self, s: Views) -> tuple[Tensor, Tensor]:
         if self.rules.scaling:
@@ -108,14 +113,21 @@ class BankDefinition:
         line = (s["linear"] * u).sum(-1)
         process = self._local_processes(s, x, u[1:], line)
         carried = self.filter.predict(self._filters(s), u[1:].expand(len(r.forgetting), -1))
-        last = ((s["last_y"] - center[n:]) / spread[n:])[:, None]
+        latest = s["waiting_y" if s.number("waiting") == 1 else "last_y"]
+        last = ((latest - center[n:]) / spread[n:])[:, None]
         common = (1 + (u * (s["covariance"] * u).sum(-1)).sum()).expand_as(last)
         features = quadratic_features(u[1:], self.shape.features)
         bent, wide_of = QuadraticModels(s["factor"], s["quadratic"]).predict(features)
-        means = torch.cat((process[0], carried[0].mT, bent, line[:, None], last), 1)
-        own = (process[1], carried[1].mT, wide_of * s["quadratic_error"])
+        jitter = r.tracker_jitter
+        tracked, tracked_spread = _trackers(s).predict(u[1:], self.tracker_rate, self.tracker_noise, jitter)
+        # where a tracker knows nothing it says what the linear model says
+        unknown = (tracked_spread - self.tracker_noise).clamp(max=1.0)
+        tracked = tracked + unknown.square() * line[:, None]
+        means = torch.cat((process[0], carried[0].mT, bent, tracked, line[:, None], last), 1)
+        own = (process[1], carried[1].mT, wide_of * s["quadratic_error"], tracked_spread.expand_as(tracked))
         variances = torch.cat((*own, common, torch.ones_like(last)), 1)
-        low, high = ((s[name] - center[n:]) / spread[n:] for name in ("low", "high"))
+        ends = torch.minimum(s["low"], latest), torch.maximum(s["high"], latest)
+        low, high = ((end - center[n:]) / spread[n:] for end in ends)
         wide = r.margin * (high - low)
         means = torch.where(torch.isfinite(means), means, last)
         means = torch.maximum(torch.minimum(means, (high + wide)[:, None]), (low - wide)[:, None])
@@ -153,7 +165,7 @@ class BankDefinition:
         return _processes(torch.stack(kernels), noise, rest, line)
 
     def _carry(self, s: Views, x: Tensor, y: Tensor, lapse: float) -> None:
-        """The linear model, the quadratics and the filters learn (x, y)."""
+        """The linear model, the quadratics, the trackers and the filters learn (x, y)."""
         r, n = self.rules, self.shape.dim
         center, spread = self._units(s)
         u = torch.cat((torch.ones(1, dtype=torch.float64), (x - center[:n]) / spread[:n]))
@@ -166,6 +178,8 @@ class BankDefinition:
             s["covariance"].div_(r.linear_forgetting**lapse)
         features = quadratic_features(u[1:], self.shape.features)
         QuadraticModels(s["factor"], s["quadratic"]).learn(features, v, self.share**lapse, self.prior)
+        rules = self.tracker_rate, self.tracker_noise, self.tracker_share**lapse
+        _trackers(s).learn(u[1:], v, *rules, r.tracker_jitter, r.tracker_wrong)
         state, lanes = self._filters(s), len(r.forgetting)
         lapses = torch.full((lanes,), lapse, dtype=torch.float64)
         self.filter.learn(state, u[1:].expand(lanes, -1), v.expand(lanes, -1), lapses)
@@ -249,8 +263,10 @@ class BankDefinition:
             s["time"].copy_(time)
             s["far"].fill_(float(STREAK) if self._beyond(s, x, y) else 0.0)
         elif known and s.number("far") == 0:
-            if self._waits(s, x, y, seen, lapse):
+            since = self._waits(s, x, y, seen, lapse)
+            if since is None:
                 return
+            lapse = since
             judge(self.rules, s, (y - center) / spread, seen, s.number("clock"))
         if s.number("far") > 0:
             s["skipped"].add_(1)
@@ -258,32 +274,35 @@ class BankDefinition:
         self._notice(s, y)
         self._accept(s, x, y, s.number("time"), lapse)
 
-    def _waits(self, s: Views, x: Tensor, y: Tensor, seen: Tensor, lapse: float) -> bool:
-        """Whether a sample that nobody expected waits: if the next one is alike, it is learned as it is."""
+    def _waits(self, s: Views, x: Tensor, y: Tensor, seen: Tensor, lapse: float) -> float | None:
+        """Time since the last sample that was learned, or None where this one waits.
+
+        A sample that nobody expected does; it is learned if the next is as far off, else skipped.
+        """
         center, spread = (part[self.shape.dim :] for part in self._units(s))
-        most = self.rules.doubtful * torch.maximum(s["variance"], s["pace"]).sqrt()
-        away = (y - center) / spread - s["mean"]
-        doubtful = bool((seen & (away.abs() > most)).any())
-        if doubtful and s.number("clock") >= self.rules.settled and s.number("trust") == 0:
-            if s.number("waiting") == 0:
-                away = torch.minimum(torch.maximum(away, -most), most)
-                s["limited_y"].copy_((s["mean"] + away) * spread + center)
+        r = self.rules
+        away = ((y - center) / spread - s["mean"]).abs()
+        most = torch.where(away > r.outside, r.doubtful_outside, r.doubtful).to(away)
+        doubtful = bool((seen & (away > most * torch.maximum(s["variance"], s["pace"]).sqrt())).any())
+        waiting, rare = s.number("waiting") == 1, s.number("doubted") < r.rare
+        s["waiting"].zero_()
+        s["doubted"].add_(r.doubted_rate * (float(doubtful) - s["doubted"]))
+        if doubtful and rare and s.number("clock") >= r.settled and s.number("trust") == 0:
+            if not waiting:
                 for name, value in (("x", x), ("y", y), ("time", s["time"]), ("lapse", torch.tensor(lapse))):
                     s[f"waiting_{name}"].copy_(value)
-                self._notice(s, y)
                 s["waiting"].fill_(1.0)
-                return True
-            s["waiting"].zero_()
+                return None
             s["trust"].fill_(float(STREAK))
+            self._notice(s, s["waiting_y"])
             when = s.number("waiting_time"), s.number("waiting_lapse")
             self._accept(s, s["waiting_x"].clone(), s["waiting_y"].clone(), *when)
-            return False
-        if s.number("waiting") == 1:
-            s["waiting"].zero_()
-            when = s.number("waiting_time"), s.number("waiting_lapse")
-            self._accept(s, s["waiting_x"].clone(), s["limited_y"].clone(), *when)
+            return lapse
         s["trust"].sub_(1.0).clamp_(min=0.0)
-        return False
+        if not waiting:
+            return lapse
+        s["skipped"].add_(1)
+        return s.number("waiting_lapse") + lapse
 
     def _notice(self, s: Views, y: Tensor) -> None:
         torch.minimum(s["low"], y, out=s["low"])
@@ -294,10 +313,15 @@ class BankDefinition:
         s["clock"].add_(1)
         s["learned"].add_(1)
         self._keep(s, x, y, time)
-        if s.number("clock") in self.rules.learned_at:
+        if s.number("clock") in self.rules.learned_at and s.number("clock") <= self.shape.capacity:
             self._rescale(s)
         else:
             self._carry(s, x, y, lapse)
+
+
+def _trackers(s: Views) -> TrackerModels:
+    parts = ("tracked", "tracker_weights", "tracker_known", "tracker_inverse", "tracker_counts")
+    return TrackerModels(*(s[name] for name in parts))
 
 
 def _processes(kernels: Tensor, noise: Tensor, rest: Tensor, line: Tensor) -> tuple[Tensor, Tensor]:

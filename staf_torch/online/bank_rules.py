@@ -5,27 +5,26 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-LOCAL, CARRIED, QUADRATIC = 24, 8, 8
-MEMBERS = LOCAL + CARRIED + QUADRATIC + 2  # local processes, filters, quadratics; linear model, last value
-CLOCKS = 3
-GROUPS = 10  # of members whose predictions correct the mixture: see `group`
+LOCAL, CARRIED, QUADRATIC, TRACKERS = 24, 8, 8, 8
+MEMBERS = LOCAL + CARRIED + QUADRATIC + TRACKERS + 2  # ... and the linear model, the last value
+CLOCKS, BLENDS = 3, 3
+GROUPS = 11  # of members whose predictions correct the mixture: see `group`
 MOST_FEATURES = 120  # of a quadratic model: beyond, squares without products, or the coordinates alone
+TRACKED = 64  # places for the samples of a tracker
 RECENT = 64  # samples that are always kept
 CARRIED_WIDTH, CARRIED_RADIUS = 8.0, 0.1  # of the filters: in sqrt(n), in widths
 
 
 def group(member: int) -> int:
-    """The group of a member: local processes alike but for fading, latest ones, filters, linear, quadratics.
+    """Local processes alike but for fading, latest, filters, quadratics, trackers, linear: a member's group.
 
     -1 for the last value, which has no say in the correction.
     """
     if member < 18:
         return member % 6
-    if member < LOCAL:
-        return 6
-    if member < LOCAL + CARRIED:
-        return 7
-    return {MEMBERS - 2: 8, MEMBERS - 1: -1}.get(member, 9)
+    if member >= MEMBERS - 2:
+        return 10 if member == MEMBERS - 2 else -1
+    return 6 + (member - 18) // 6 if member < LOCAL else 7 + (member - LOCAL) // 8
 
 
 class BankShape(NamedTuple):
@@ -63,13 +62,27 @@ class Rules(NamedTuple):
     linear_forgetting: float = 0.999
     linear_prior: float = 100.0  # variance of the coefficients
     recent: float = RECENT
-    floor: float = 1e-3  # of the variance, in running squared errors
+    floor: float = 0.05  # of the variance, in running squared errors
+    uncalibrated: float = 3.0  # samples before the errors have a say in the size of the variance
     margin: float = 0.1  # how far beyond the range of y a member may go
     far: float = 1e3  # spreads from the center beyond which a sample is not believed
-    doubtful: float = math.inf  # deviations beyond which a sample waits for another one such to be believed
+    doubtful: float = 30.0  # deviations beyond which a sample waits for another one such to be believed
+    doubtful_outside: float = 8.0  # the same for an error of more than ``outside`` spreads of y
+    outside: float = 12.0
+    rare: float = 0.05  # share of samples that are doubted: beyond, none waits
+    doubted_rate: float = 0.01  # of this running share
     settled: float = 10.0  # samples before which none waits
     outlying: float = 30.0  # median deviations beyond which a value has no say in the units
-    learned_at: tuple[int, ...] = (2, 5, 10, 20, 40)  # samples after which the units are learned
+    learned_at: tuple[int, ...] = (
+        2,
+        5,
+        10,
+        20,
+        40,
+        80,
+        160,
+        320,
+    )  # samples after which units are learned: all are kept
     forgetting: tuple[float, ...] = (0.9, 0.95, 0.97, 0.98, 0.99, 0.995, 0.999, 1.0)  # of the filters
     carried_ratio: float = 1e-6  # variance of their noise
     quadratic_forgetting: tuple[float, ...] = (0.9999, 0.9999, 0.9999, 0.9999, 0.998, 0.99, 0.99, 0.97)
@@ -78,16 +91,30 @@ class Rules(NamedTuple):
     correction_prior: float = 0.1  # variance of the correction's coefficients
     correction_forgetting: float = 0.999
     correction_most: float = 4.0  # running errors that a group may be away from the mixture
-    correction_discount: float = 0.99  # of the scores of the mixture with and without it
+    correction_discount: float = 0.995  # of the scores of the mixture, the corrected one, that by squares
     correction_share: float = 0.01  # of their weights that is equal
+    squares_discount: float = 0.999  # of the members' squared errors in the mixture by squares
+    squares_rate: float = 0.1  # of their running mean that a squared error counts
+    squares_share: float = 0.001
+    own_rate: float = 0.05  # of the running squared error of the prediction
+    best_rate: float = 0.005  # of the least one of the three mixtures
+    largest: float = 400.0  # running squares that a square counts at most there
+    tracker_width: tuple[float, ...] = (0.5, 2.0, 2.0, 4.0, 1.0, 8.0, 4.0, 1.0)  # in sqrt(n)
+    tracker_noise: tuple[float, ...] = (0.1, 1e-4, 1e-2, 0.1, 1e-4, 1e-4, 1e-4, 1e-2)  # variances
+    tracker_forgetting: tuple[float, ...] = (1.0, 1.0, 1.0, 1.0, 0.999, 0.999, 0.99, 0.99)
+    tracker_rate: tuple[float, ...] = ()  # 1 / (2 width^2)
+    tracker_jitter: float = 1e-6
+    tracker_wrong: float = 0.1  # of an entry of 1, that rounding may add up to
     least: float = 1e-16  # of a member's running scale
 
     @classmethod
-    def of(cls, dim: int, scaling: bool, doubtful: float = math.inf) -> Rules:
+    def of(cls, dim: int, scaling: bool, doubtful: float | None = None) -> Rules:
         """The rules for inputs (n,); widths in units of sqrt(n)."""
         rates = tuple(1 / (2 * width**2 * dim) for width in (0.5, 1.5, 15.0))
         slack = CARRIED_RADIUS * CARRIED_WIDTH * math.sqrt(dim)
-        return cls(rates, scaling, slack, doubtful=doubtful)
+        tracker_rates = tuple(1 / (2 * width**2 * dim) for width in cls._field_defaults["tracker_width"])
+        found = cls(rates, scaling, slack, tracker_rate=tracker_rates)
+        return found if doubtful is None else found._replace(doubtful=doubtful, doubtful_outside=doubtful)
 
     def numbers(self) -> list[float]:
         """In the order of `Rules` in _bank.cpp."""
@@ -101,7 +128,11 @@ class Rules(NamedTuple):
         found += [*self.forgetting, self.carried_ratio, self.carried_slack**2]
         found += [*self.quadratic_forgetting, *self.quadratic_prior, self.pace, self.correction_prior]
         found += [self.correction_forgetting, self.correction_most, self.correction_discount]
-        return [*found, self.correction_share, self.least, self.doubt, self.doubtful, self.settled]
+        found += [self.correction_share, self.least, self.doubt, self.doubtful, self.doubtful_outside]
+        found += [self.outside, self.rare, self.doubted_rate, self.settled]
+        found += [self.squares_discount, self.squares_rate, self.squares_share, self.own_rate]
+        found += [self.best_rate, self.largest, self.uncalibrated, *self.tracker_rate, *self.tracker_noise]
+        return [*found, *self.tracker_forgetting, self.tracker_jitter, self.tracker_wrong]
 
 
 def layout(shape: BankShape) -> list[tuple[str, tuple[int, ...]]]:
@@ -114,10 +145,9 @@ def layout(shape: BankShape) -> list[tuple[str, tuple[int, ...]]]:
         ("last_y", (k,)),
         ("asked", (n,)),
         ("answered", ()),
-        *((name, ()) for name in ("waiting", "trust", "waiting_time", "waiting_lapse")),
+        *((name, ()) for name in ("waiting", "trust", "doubted", "waiting_time", "waiting_lapse")),
         ("waiting_x", (n,)),  # a sample that nobody expected, until the next one tells
         ("waiting_y", (k,)),
-        ("limited_y", (k,)),  # what is learned of it if it was alone
         ("center", (n + k,)),
         ("spread", (n + k,)),
         ("covariance", (n + 1, n + 1)),
@@ -129,20 +159,25 @@ def layout(shape: BankShape) -> list[tuple[str, tuple[int, ...]]]:
         ),  # of the quadratics' covariances U D U': columns of U, D last
         ("quadratic", (k, d, QUADRATIC)),  # coefficients
         ("quadratic_error", (k, QUADRATIC)),
+        ("tracked", (TRACKED, n, TRACKERS)),  # the parts of `TrackerModels`
+        ("tracker_weights", (k, TRACKED, TRACKERS)),
+        *((f"tracker_{name}", (TRACKED * (TRACKED + 1) // 2, TRACKERS)) for name in ("known", "inverse")),
+        ("tracker_counts", (3, TRACKERS)),
         ("weights", (k, CLOCKS, MEMBERS)),  # logarithms
         ("clock_weights", (k, CLOCKS)),
         ("excess", (k, MEMBERS)),
         ("usual", (k, MEMBERS)),  # running logarithms of the members' variances
-        *((name, (k,)) for name in ("error", "pace", "low", "high", "calibration")),
+        ("squares", (k, MEMBERS)),  # logarithms of the weights by squared errors
+        *((name, (k,)) for name in ("error", "pace", "own", "best", "low", "high", "calibration")),
         ("correction_covariance", (k, GROUPS, GROUPS)),
         ("correction", (k, GROUPS)),  # coefficients
         ("away", (k, GROUPS)),  # of the groups from the mixture, in running errors
-        ("corrected", (k, 2)),  # logarithms of the weights of the mixture without and with it
+        ("corrected", (k, BLENDS)),  # logarithms of the weights of the three mixtures
         ("means", (k, MEMBERS)),
         ("variances", (k, MEMBERS)),
         ("mixed", (k, CLOCKS)),
         ("mixed_variance", (k, CLOCKS)),
-        *((name, (k,)) for name in ("blend", "stacked")),  # the mixture without and with the correction
+        ("blend", (k, BLENDS)),  # the mixture, the corrected one, that by squares
         ("mean", (k,)),
         ("variance", (k,)),
         ("x", (c, n)),

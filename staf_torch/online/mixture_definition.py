@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from .bank_rules import GROUPS, MEMBERS, QUADRATIC, Rules, group
+from .bank_rules import CARRIED, GROUPS, LOCAL, MEMBERS, QUADRATIC, Rules, group
 from .kalman_filter import SURPRISE
 
 _LEAST = 1e-30  # of a variance
@@ -13,12 +13,13 @@ _GROUP = torch.tensor([group(member) for member in range(MEMBERS)])
 
 
 def mix(r: Rules, s: dict[str, Tensor], low: Tensor, high: Tensor) -> None:
-    """The mixture of what the members say, its correction by groups of them, and its variance.
+    """The mixture of what the members say, and its variance: a mixture of three.
 
-    A member that is less certain than it usually is has less weight. Three mixtures by scores that fade at
-    three rates are mixed by their own scores. To that is added
-    sum_g beta_g (m_g - mixture), m_g the mean of a group by the scores that fade most slowly, beta by least
-    squares; with or without it, as either predicts.
+    A member that is less certain than it usually is has less weight. First, three mixtures by scores that
+    fade at three rates are mixed by their own scores. Second, to that is added
+    sum_g beta_g (m_g - first), m_g the mean of a group by the scores that fade most slowly, beta by least
+    squares. Third, the members by their squared errors over a long time, which rare large errors decide. The
+    three are weighed by how they predict, and one far behind the best has no weight.
 
     Args:
         r: the constants.
@@ -46,9 +47,11 @@ def mix(r: Rules, s: dict[str, Tensor], low: Tensor, high: Tensor) -> None:
         s["away"][:, g] = ((share * means[:, inside]).sum(-1) - blend) / unit
     s["away"].clamp_(-r.correction_most, r.correction_most)
     stacked = blend + unit * (s["correction"] * s["away"]).sum(-1)
-    s["blend"].copy_(blend)
-    s["stacked"].copy_(torch.maximum(torch.minimum(stacked, high), low))
-    s["mean"].copy_((s["corrected"].softmax(-1) * torch.stack((blend, s["stacked"]), -1)).sum(-1))
+    squared = ((s["squares"] - r.doubt * surplus).softmax(-1) * means).sum(-1)
+    s["blend"].copy_(torch.stack((blend, torch.maximum(torch.minimum(stacked, high), low), squared), -1))
+    parts = (s["corrected"] - s["corrected"].amax(-1, keepdim=True)).exp()
+    parts = torch.where(parts < r.drop, 0.0, parts)
+    s["mean"].copy_((parts * s["blend"]).sum(-1) / parts.sum(-1))
     variance = variance + (s["mean"] - blend).square()
     s["variance"].copy_(torch.maximum(variance, r.floor * s["pace"]) * s["calibration"])
 
@@ -63,19 +66,27 @@ def judge(r: Rules, s: dict[str, Tensor], value: Tensor, told: Tensor, t: float)
         told: (K,) bool.
         t: samples learned so far.
     """
-    error, blended = value - s["mean"], value - s["blend"]
+    error, blended = value - s["mean"], value - s["blend"][:, 0]
     _learn_correction(r, s, blended, told)
     z2 = error.square() / (s["variance"] / s["calibration"]).clamp(min=1e-300)
-    before, floor = s["calibration"].clone(), max(r.error_rate, 1 / (t + 5))
-    found = before + floor * (torch.minimum(z2, SURPRISE * before) - before)
+    before, since = s["calibration"].clone(), t - r.uncalibrated
+    rate = max(r.error_rate, 1 / (since + 5)) if since > 0 else 0.0
+    found = before + rate * (torch.minimum(z2, SURPRISE * before) - before)
     s["calibration"].copy_(torch.where(told, found.clamp(1e-6, 1e2), before))
-    for name, rate in (("error", r.error_rate), ("pace", r.pace)):
+    of_blends = (value[:, None] - s["blend"]).square()
+    scores = _student(r, of_blends.sqrt(), s["own"].clamp(min=_LEAST)[:, None])
+    corrected = _reweighed(r.correction_share, r.correction_discount * s["corrected"] + scores)
+    costs = ((value[:, None] - s["means"]).square() / s["best"].clamp(min=_LEAST)[:, None]).clamp(max=1e9)
+    squares = _reweighed(r.squares_share, r.squares_discount * s["squares"] - r.squares_rate * costs)
+    for name, found, rate, most in (
+        ("error", blended.square(), r.error_rate, SURPRISE),
+        ("pace", blended.square(), r.pace, SURPRISE),
+        ("own", error.square(), r.own_rate, r.largest),
+        ("best", of_blends.amin(-1), r.best_rate, r.largest),
+    ):
         old = s[name].clone()
-        change = max(rate, 1 / (t + 1)) * (torch.minimum(blended.square(), SURPRISE * old) - old)
+        change = max(rate, 1 / (t + 1)) * (torch.minimum(found, most * old) - old)
         s[name].copy_(torch.where(told, old + change, old))
-    pace = s["pace"].clamp(min=_LEAST)[:, None]
-    both = torch.stack((blended, value - s["stacked"]), -1)
-    corrected = r.correction_discount * s["corrected"] + _student(r, both, pace)
     away, v = value[:, None] - s["means"], s["variances"]
     score = _scores(r, away, v * s["excess"], s["error"][:, None])
     over = _scores(r, value[:, None] - s["mixed"], s["mixed_variance"], s["error"][:, None])
@@ -84,7 +95,7 @@ def judge(r: Rules, s: dict[str, Tensor], value: Tensor, told: Tensor, t: float)
     excess = (usual + rate * (torch.minimum(ratio, SURPRISE * usual) - usual)).clamp(r.least, 1e8)
     logs, before = v.clamp(min=_LEAST).log(), s["usual"].clone()
     usual_log = before + max(r.members_rate, 1 / (t + 1)) * (logs - before)
-    size, of = s["quadratic_error"].clone(), slice(MEMBERS - 2 - QUADRATIC, MEMBERS - 2)
+    size, of = s["quadratic_error"].clone(), slice(LOCAL + CARRIED, LOCAL + CARRIED + QUADRATIC)
     factor = 1 + max(r.pace, 1 / (t + 2)) * (ratio[:, of].clamp(max=SURPRISE) - 1)
     discounts = torch.tensor(r.discounts, dtype=torch.float64)[:, None]
     weights = _reweighed(r.share, discounts * s["weights"] + score[:, None])
@@ -95,7 +106,8 @@ def judge(r: Rules, s: dict[str, Tensor], value: Tensor, told: Tensor, t: float)
     s["excess"].copy_(torch.where(mark, excess, usual))
     s["weights"].copy_(torch.where(mark[..., None], weights, s["weights"]))
     s["clock_weights"].copy_(torch.where(mark, clocks, s["clock_weights"]))
-    s["corrected"].copy_(torch.where(mark, _reweighed(r.correction_share, corrected), s["corrected"]))
+    s["corrected"].copy_(torch.where(mark, corrected, s["corrected"]))
+    s["squares"].copy_(torch.where(mark, squares, s["squares"]))
 
 
 def _learn_correction(r: Rules, s: dict[str, Tensor], blended: Tensor, told: Tensor) -> None:

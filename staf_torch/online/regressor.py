@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import math
 from typing import Any
 
 import torch
@@ -65,7 +64,8 @@ class StaFRegressor(StreamEstimator):
         follow: the centers stay until x has moved by follow * radius, not negative: by default until it
             leaves their ball.
         robust: standard deviations beyond which an error counts no more than there (Huber); None for any. In
-            the accurate mode a sample beyond waits for the next, and counts in full if that is as far off.
+            the accurate mode a sample beyond waits for the next: both are learned if that is as far off, else
+            the first is skipped; None takes 30, and 8 for an error of more than 12 spreads of y.
         scaling: whether x and y are brought to mean 0 and variance 1, learned from the first 40 samples; None
             does so in the accurate mode. Then radius, noise and amplitude are in these units.
         memory: samples kept, at least 128, for the accurate mode; None for the filter alone.
@@ -280,7 +280,7 @@ class StaFRegressor(StreamEstimator):
             memory = integer(_NAME, "memory", self.memory, least=2 * RECENT)
             neighbours = integer(_NAME, "neighbours", self.neighbours, least=8)
             shape = BankShape(dim, outputs, memory, min(neighbours, memory))
-            robust = math.inf if self.robust is None else positive_real(_NAME, "robust", self.robust)
+            robust = None if self.robust is None else positive_real(_NAME, "robust", self.robust)
             self._streams_ = Bank(shape, count, scaling is not False, robust)
         else:
             like = torch.zeros(0, dtype=dtype, device=x.device)

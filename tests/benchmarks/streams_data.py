@@ -92,9 +92,12 @@ def channel_switch(count: int = 1500, switch: int = 500) -> Series:
     return Series(x, (y + 0.1 * y.std() * draw.standard_normal(count))[:, None])
 
 
-def arm(count: int) -> Series:
-    """Torques of both joints of a planar arm from angles, rates and accelerations; smooth random motion."""
-    draw = np.random.default_rng(3)
+def arm(count: int, seed: int = 3, second: float = 1.0) -> Series:
+    """Torques of both joints of a planar arm from angles, rates and accelerations; smooth random motion.
+
+    Links of length 1, masses 1 and ``second`` at their ends, friction that nearly is of Coulomb's kind.
+    """
+    draw = np.random.default_rng(seed)
     time = 0.02 * np.arange(count)
     frequency, phase = draw.uniform(0.2, 1.2, (2, 6)), draw.uniform(0, 2 * np.pi, (2, 6))
     wave = 2 * np.pi * frequency[..., None] * time + phase[..., None]
@@ -104,10 +107,11 @@ def arm(count: int) -> Series:
     a = -0.5 * (rate**2 * np.sin(wave)).sum(1)
     c2, s2 = np.cos(q[1]), np.sin(q[1])
     gravity = 9.81 * np.cos(q[0] + q[1])
-    first = (3 + 2 * c2) * a[0] + (1 + c2) * a[1] - s2 * (2 * v[0] * v[1] + v[1] ** 2)
-    first += 2 * 9.81 * np.cos(q[0]) + gravity + 2 * np.tanh(5 * v[0])
-    second = (1 + c2) * a[0] + a[1] + s2 * v[0] ** 2 + gravity + np.tanh(5 * v[1])
-    y = np.stack((first, second), 1) / 20
+    shoulder = 2 * (1 + c2) * a[0] + (1 + c2) * a[1] - s2 * (2 * v[0] * v[1] + v[1] ** 2)
+    shoulder += 9.81 * np.cos(q[0]) + gravity
+    shoulder = second * shoulder + a[0] + 9.81 * np.cos(q[0]) + 2 * np.tanh(5 * v[0])
+    elbow = second * ((1 + c2) * a[0] + a[1] + s2 * v[0] ** 2 + gravity) + np.tanh(5 * v[1])
+    y = np.stack((shoulder, elbow), 1) / 20
     return Series(np.concatenate((q, v, a)).T, y + 0.05 * draw.standard_normal(y.shape))
 
 

@@ -60,7 +60,7 @@ OPERATIONS: dict[str, Callable[[Tensor], Tensor]] = {
     "angle": torch.angle,
     "round to decimals": lambda x: torch.round(x, decimals=2),
     "sort": lambda x: x.sort(-1)[0],
-    "argsort": lambda x: x.argsort(-1).to(x),
+    "argsort": lambda x: x.argsort(dim=-1, stable=True).to(x),
     "sort descending": lambda x: x.sort(-1, descending=True)[0],
     "top": lambda x: x.topk(2, -1)[0],
     "median": lambda x: x.median(-1, keepdim=True)[0],

@@ -113,18 +113,28 @@ def test_coordinate_that_was_not_measured_is_held_and_a_target_is_not_learned(me
     assert error_after(model, x, y) < 0.2
 
 
-@pytest.mark.parametrize("memory", [None, 128])
-def test_outliers_count_less_where_asked(memory: int | None) -> None:
-    x, y = path(400)
+@pytest.mark.parametrize(("memory", "robusts"), [(None, (None, 4.0)), (128, (1e30, None))])
+def test_outliers_count_less_in_the_bank_and_where_asked(
+    memory: int | None, robusts: tuple[float | None, float | None]
+) -> None:
+    x, y = path(300)
     draw = torch.Generator().manual_seed(0)
-    noisy = y + 0.05 * torch.randn(400, generator=draw, dtype=torch.float64)
+    noisy = y + 0.05 * torch.randn(300, generator=draw, dtype=torch.float64)
     noisy[20::25] += 20.0
     kept = {"radius": 0.4, "noise": 0.05, "memory": memory, "neighbours": 8}
-    models = [st.StaFRegressor(robust=robust, **kept) for robust in (None, 4.0)]
+    models = [st.StaFRegressor(robust=robust, **kept) for robust in robusts]
     errors = [error_after(model.fit(x[:1], noisy[:1]), x[1:], noisy[1:]) for model in models]
     late = [float((model.predict(x[-4:]) - y[-4:]).abs().max()) for model in models]
     assert late[1] < 0.5 * late[0]
     assert errors[1] < 1.05 * errors[0]  # outliers themselves included
+    assert memory is None or int(models[1].n_skipped_) == len(noisy[20::25])
+
+
+def test_spikes_that_are_not_rare_are_learned() -> None:
+    x = torch.arange(300, dtype=torch.float64)[:, None] % 8
+    y = torch.where(x[:, 0] == 3, 50.0, 0.0)
+    model = st.StaFRegressor(memory=128, neighbours=8).fit(x, y)
+    assert abs(float(model.predict(x[3])) - 50) < 1.0
 
 
 def test_change_that_stays_is_learned_at_once_by_a_robust_bank() -> None:
