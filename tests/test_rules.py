@@ -50,6 +50,7 @@ OTHERS = {
     "learn_global_value": "in tests/adp/test_global_value.py",
     "AvoidanceCost": "in tests/adp/test_avoidance.py",
     "plan_around": "in tests/adp/test_avoidance.py",
+    "BoxFilter": "in tests/adp/test_box_filter.py",
     "SafetyFilter": "in tests/adp/test_safety_filter.py",
     "TwoLinkRobot": "numbers within a list, in tests/systems/test_barrier.py",
     "StepPlant": "in tests/adp/test_user_plants.py",

@@ -43,6 +43,7 @@ from .bellman import bellman_error as bellman_error
 from .bellman import bellman_terms as bellman_terms
 from .bellman import hjb_residual as hjb_residual
 from .bellman import value_gradient as value_gradient
+from .box_filter import BoxFilter as BoxFilter
 from .controllers import LQR as LQR
 from .controllers import Controller as Controller
 from .controllers import ControllerState as ControllerState
@@ -101,6 +102,7 @@ __all__ = [
     "Belief",
     "BoundedInputCost",
     "BoxDDP",
+    "BoxFilter",
     "ChangingPlant",
     "ConcurrentGradient",
     "ConcurrentLearning",

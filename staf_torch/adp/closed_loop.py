@@ -14,9 +14,9 @@ from torch import Tensor, nn
 from ..lanes import Program
 from ..lanes.kept import Kept, number
 from ..lanes.tree import flatten, unflatten
-from ..numerics.checks import choice, integer, positive_real
+from ..numerics.checks import choice, fail, integer, positive_real
 from ..systems import Plant
-from .controllers import Carried, Controller, ControllerState
+from .controllers import Carried, Controller, ControllerState, Feedback
 from .cost import Cost
 from .holding import Holding
 from .laws import ActorCriticLaw, Gains
@@ -45,7 +45,10 @@ class ClosedLoop(nn.Module):
         dt: s.
         integrator: of the plant over a step, ``runge_kutta`` (fourth order) or ``euler`` (as published). A
             plant in discrete time takes its own steps.
-        substeps: Runge-Kutta steps while the control is held, at least 1.
+        substeps: Runge-Kutta steps while the control is held, at least 1; of a plant with a
+            `Plant.step_limit` each row has lengths of its own.
+        renew: whether the control follows the state at every substep, in place of being held for dt. Of
+            feedback laws alone.
         limit: a row whose state exceeds it in norm has diverged.
 
     Raises:
@@ -61,6 +64,7 @@ class ClosedLoop(nn.Module):
         dt: float,
         integrator: str = "runge_kutta",
         substeps: int = 1,
+        renew: bool = False,
         limit: float = 1e6,
     ) -> None:
         super().__init__()
@@ -69,6 +73,10 @@ class ClosedLoop(nn.Module):
         self.dt = positive_real("ClosedLoop", "dt", dt)
         self.substeps = integer("ClosedLoop", "substeps", substeps, least=1)
         self.limit = positive_real("ClosedLoop", "limit", limit)
+        if renew and (not isinstance(controller, Feedback) or system.period is not None):
+            rule = "needs a feedback law and a plant in continuous time"
+            raise fail("ClosedLoop", "renew", rule, controller.label)
+        self.renew = renew
         self.euler = integrator == "euler" and system.period is None
         self.holding = Holding("ClosedLoop", system, self.cost, self.dt, self.substeps)
 
@@ -119,7 +127,13 @@ class ClosedLoop(nn.Module):
         """The state after dt with u held, and the cost until then."""
         if self.euler:
             return x + self.dt * self.system.motion(x, u), self.dt * self.cost.rate(x, u)
+        if self.renew and isinstance(self.controller, Feedback):
+            return self.holding(x, u, self._renewed)
         return self.holding(x, u)
+
+    def _renewed(self, x: Tensor) -> Tensor:
+        u = self.controller.policy(x)  # type: ignore[operator]
+        return u if self.cost.bounds is None else self.cost.bounds.clip(u)
 
 
 def _where(alive: Tensor, new: Tensor, old: Tensor) -> Tensor:

@@ -16,6 +16,8 @@ _FIRM, _SOFT = (
     1e-14,
     1e-10,
 )  # shortfall of a unit normal's inequality a unit of its multiplier, where it holds
+_ROUNDED, _OWN = 64, 2**20  # roundings by which a point may miss an inequality, and one on whose edge it is
+_GIVE = 1e-9  # of the squares of u - wanted, beside those of what is missing
 _MET = 1e-9  # error of a case, in units of u, below which it is the solution
 
 
@@ -63,9 +65,11 @@ def nearest_admissible(
     """argmin |u - wanted|^2 over low <= u <= high with a_i'u >= c_i, i = 1..k.
 
     Where no u satisfies all, the bounds hold and the squares of (c_i - a_i'u) / |a_i| have the least sum; for
-    one unknown, the largest of them is least. One unknown is an interval. For more the stationary points of
-    all cases are compared: with multipliers l >= 0 the solution is u = clip(wanted + A'l), and the case that
-    satisfies all of these conditions best is it. A ``wanted`` that is admissible is returned as it is.
+    one unknown, the largest of them is least. One unknown is an interval. For two the solution is on one of
+    the edges or where two of them meet: the nearest of these points that satisfies all. For more the
+    stationary points of all cases are compared: with multipliers l >= 0 the solution is
+    u = clip(wanted + A'l), and the case that satisfies all of these conditions best is it. A ``wanted`` that
+    is admissible is returned as it is.
 
     Args:
         wanted: (..., m).
@@ -81,8 +85,12 @@ def nearest_admissible(
     length = normals.square().sum(-1).sqrt()
     length = torch.where(length > 0, length, 1.0)
     unit, far = normals / length.unsqueeze(-1), least / length
-    point = _interval(wanted, unit, far, low, high)
-    if wanted.shape[-1] > 1:
+    size = wanted.shape[-1]
+    if size == 1:
+        point = _interval(wanted, unit, far, low, high)
+    elif size == 2:
+        point = _in_plane(wanted, unit, far, low, high)
+    else:
         point = _best_case(wanted, unit, far, low, high, table)
     fits = ((wanted >= low) & (wanted <= high)).all(-1) & ((unit * wanted.unsqueeze(-2)).sum(-1) >= far).all(
         -1
@@ -100,6 +108,65 @@ def _interval(wanted: Tensor, unit: Tensor, far: Tensor, low: Tensor, high: Tens
     inside = torch.minimum(torch.maximum(wanted, bottom), top)
     met = torch.where(bottom > top, 0.5 * (bottom + top), inside)
     return torch.minimum(torch.maximum(met, low), high)
+
+
+def _in_plane(wanted: Tensor, unit: Tensor, far: Tensor, low: Tensor, high: Tensor) -> Tensor:
+    """Two unknowns: the nearest corner or foot that satisfies all, else least squares of what is missing."""
+    sides = torch.cat((torch.eye(2), -torch.eye(2))).to(wanted)
+    lines = torch.cat((unit, sides.expand(*unit.shape[:-2], -1, -1)), dim=-2)
+    aims = torch.cat((far, torch.cat((low, -high)).to(far).expand(*far.shape[:-1], -1)), dim=-1)
+    total = aims.shape[-1]  # -inf of a bound that is not there: what lies on its edge fits nowhere
+    feet = wanted.unsqueeze(-2) + (aims - (lines * wanted.unsqueeze(-2)).sum(-1)).unsqueeze(-1) * lines
+    pairs = list(itertools.combinations(range(total), 2))
+    first, second = [i for i, _ in pairs], [j for _, j in pairs]
+    (a, c), (b, d) = (lines[..., k, :].unbind(-1) for k in (first, second))
+    one, other = aims[..., first], aims[..., second]
+    corners = torch.stack((one * d - other * c, other * a - one * b), dim=-1) / (a * d - b * c).unsqueeze(-1)
+    points = torch.cat((feet, corners), dim=-2)  # (..., P, 2)
+    rounded = torch.full((len(pairs) + total, total), _ROUNDED, dtype=wanted.dtype, device=wanted.device)
+    for row, edges in enumerate([[k] for k in range(total)] + [list(pair) for pair in pairs]):
+        rounded[row, edges] = _OWN
+    scale = 1 + wanted.abs().amax(-1, keepdim=True) + far.abs().amax(-1, keepdim=True) + points.abs().amax(-1)
+    short = aims.unsqueeze(-2) - (lines.unsqueeze(-3) * points.unsqueeze(-2)).sum(-1)
+    fits = (short <= rounded * torch.finfo(wanted.dtype).eps * scale.unsqueeze(-1)).all(-1)
+    apart = torch.where(fits, (points - wanted.unsqueeze(-2)).square().sum(-1), torch.inf)
+    nearest, found = _first_least(points, apart)
+    nearest = torch.minimum(torch.maximum(nearest, low), high)
+    return torch.where(found < torch.inf, nearest, _least_squares(wanted, unit, far, low, high))
+
+
+def _least_squares(wanted: Tensor, unit: Tensor, far: Tensor, low: Tensor, high: Tensor) -> Tensor:
+    """Two unknowns in a box: the least sum of squares of what is missing, and of these the nearest."""
+    count = far.shape[-1]
+    start = torch.minimum(torch.maximum(wanted, low), high)
+
+    def subset(chosen: Tensor) -> Tensor:
+        """The minima for a set of inequalities, on the plane and its edges: (..., S, k) -> (..., S, 15)."""
+        a, b = (chosen * unit[..., k].unsqueeze(-2) for k in (0, 1))
+        aims, give = chosen * far.unsqueeze(-2), _GIVE
+        aa, ab, bb = ((p * q).sum(-1) for p, q in ((a, a), (a, b), (b, b)))
+        ra, rb = ((p * aims).sum(-1) for p in (a, b))
+        ra, rb = ra + give * start[..., :1], rb + give * start[..., 1:]
+        aa, bb = aa + give, bb + give
+        turn = aa * bb - ab * ab
+        candidates = [((ra * bb - rb * ab) / turn, (rb * aa - ra * ab) / turn)]
+        for end in (low, high):
+            there = torch.where(torch.isfinite(end), end, start)
+            x, y = (there[..., k : k + 1].expand_as(ra) for k in (0, 1))
+            candidates += [(x, (rb - ab * x) / bb), ((ra - ab * y) / aa, y)]
+        found = []
+        for pair in candidates:
+            u = torch.minimum(torch.maximum(torch.stack(pair, dim=-1), low), high)
+            missing = far.unsqueeze(-2) - (unit.unsqueeze(-3) * u.unsqueeze(-2)).sum(-1)
+            paid = torch.where(missing > 0, missing, 0.0).square().sum(-1)
+            found += [u, (paid + give * (u - start.unsqueeze(-2)).square().sum(-1)).unsqueeze(-1)]
+        return torch.cat(found, dim=-1)
+
+    subsets = torch.tensor(list(itertools.product((0.0, 1.0), repeat=count))[1:]).to(wanted)
+    shape = (*wanted.shape[:-1], *subsets.shape)
+    found = each(subset, subsets.expand(shape), dim=wanted.dim() - 1, together=1).unflatten(-1, (5, 3))
+    found = found.flatten(-3, -2)
+    return _first_least(found[..., :2], found[..., 2])[0]
 
 
 def _best_case(wanted: Tensor, unit: Tensor, far: Tensor, low: Tensor, high: Tensor, table: Tensor) -> Tensor:

@@ -75,6 +75,7 @@ def simulate(
     seed: int | Sequence[int] = 0,
     integrator: str = "runge_kutta",
     substeps: int = 1,
+    renew: bool = False,
     limit: float = 1e6,
     compile: bool | str = "auto",
     progress: Callable[[int], None] | None = None,
@@ -103,7 +104,7 @@ def simulate(
         steps: at least 1.
         every: steps from one recorded time to the next; divides ``steps``.
         seed: of the first row, the next row having the next; or one a row.
-        integrator: as in `ClosedLoop`, and so is ``substeps``.
+        integrator: as in `ClosedLoop`, and so are ``substeps`` and ``renew``.
         limit: as in `ClosedLoop`.
         compile: whether the loop is compiled by `lanes`: True, False, or ``auto`` (where the run is long
             enough to pay for it). What cannot be compiled runs in plain torch, which is the definition,
@@ -122,7 +123,8 @@ def simulate(
     worth = steps * (1 + len(x0) / 200) >= _PAYS if compile == "auto" else bool(compile)
     if dt is None:
         dt = controller.period or system.period or _DT
-    loop = ClosedLoop(controller, system, cost, dt=dt, integrator=integrator, substeps=substeps, limit=limit)
+    more = {"integrator": integrator, "substeps": substeps, "renew": renew, "limit": limit}
+    loop = ClosedLoop(controller, system, cost, dt=dt, **more)  # type: ignore[arg-type]
     loop.to(x0.device)
     if isinstance(controller, Feedback) and x0.device.type == "cpu":
         warn_if_unstable(controller.policy, system, cost, dt)

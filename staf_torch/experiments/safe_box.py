@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 import torch
 from omegaconf import DictConfig
@@ -13,6 +13,7 @@ from torch import Tensor
 
 from ..adp import (
     LQR,
+    BoxFilter,
     Controller,
     Cost,
     DirectShooting,
@@ -32,8 +33,7 @@ from ..results.run_directory import RunDirectory
 from ..settings.adp import make_cost, plant, updated
 from ..settings.chase import initial_states, placement, plain
 from ..systems import Barrier, ControlAffineSystem, Plant
-from ..tables import Table
-from ..tables.columns import significant
+from .comparison import Comparison
 from .registry import Metrics, finite
 
 _log = logging.getLogger(__name__)
@@ -44,8 +44,20 @@ _COLUMNS = {
     "minimum_margin": "least margin",
     "constraint_violations": "rows that left",
     "left_fraction": "left, of all starts in the box",
+    "left_near_fraction": "left, of starts beside a wall",
     "largest_control": "largest |u|",
 }
+_NAMED = 20  # starts that the log lists
+
+
+class Method(NamedTuple):
+    """What is compared: a controller, the coordinates it runs in, and how."""
+
+    controller: Controller
+    plant: Plant
+    cost: Cost
+    substeps: int = 1
+    renew: bool = False
 
 
 def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics:
@@ -56,52 +68,31 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
     if not isinstance(system, ControlAffineSystem) or system.dim is None:
         raise fail(COMMAND_LINE, "system", "must be a ControlAffineSystem", system)
     cost = make_cost(cfg, system).to(device)
-    chosen = cfg.safe_box
-    box = Barrier(system, plain(chosen.low), plain(chosen.high)).to(device)
-    x0 = initial_states(cfg, system.dim).to(device=device, dtype=dtype)
+    box = Barrier(system, plain(cfg.safe_box.low), plain(cfg.safe_box.high)).to(device)
+    x0 = initial_states(cfg, system.dim).to(device=device, dtype=torch.float64)
     s0 = box.transform(x0)
-    dt = positive_real(COMMAND_LINE, "dt", cfg.dt)
-    steps = max(1, round(positive_real(COMMAND_LINE, "duration", cfg.duration) / dt))
-    every = next(k for k in range(max(1, steps // 2000), steps + 1) if steps % k == 0)
-    filtered = flag("safe_box", "filter", chosen.filter)
-    methods: dict[str, tuple[Controller, Plant, Cost]] = {"LQR of s": (Feedback(LQR(box, cost)), box, cost)}
-    of_s = QuadraticCost(cost.q, cost.r, system.dim, cost.inputs, output=lambda x: box.coordinates(x)).to(
-        device
-    )
-    lqr = LQR(system, QuadraticCost(cost.q, cost.r, system.dim, cost.inputs)).to(device)
-    if filtered:
-        walls = [k for k in range(system.dim) if bool(box.walled[:, k].any())]
-        guard = SafetyFilter(lqr, system, [_within(box, k) for k in walls], dt=dt, decay=float(chosen.decay))
-        methods["LQR of x, filtered"] = guard, system, of_s
-    methods["LQR of x"] = Feedback(lqr), system, of_s
-    anywhere = _anywhere(cfg, box).to(x0)
-    results: dict[str, LoopResult] = {}
-    left: dict[str, float] = {}
-    for name, method in methods.items():
-        moved = method[1]
-        starts, others = (box.transform(x) if moved is box else x for x in (x0, anywhere))
-        results[name] = _simulated(cfg, method, starts, steps, every)
-        tried = _simulated(cfg, method, others, steps, every)
-        left[name] = constraint_metrics(tried, _margin(box, moved, tried))["constraint_violations"] or 0.0
     wanted = flag("adp", "optimum.shooting", cfg.adp.optimum.shooting)
     best = _optimum(box, cost, s0[:1]) if wanted else None
-    rows: list[dict[str, Any]] = []
+    others = {"left": _anywhere(cfg, box), "left_near": _beside_walls(cfg, box)}
+    dt = positive_real(COMMAND_LINE, "dt", cfg.dt)
+    steps = max(1, round(positive_real(COMMAND_LINE, "duration", cfg.duration) / dt))
+    followed = max(1, round(positive_real("safe_box", "followed", cfg.safe_box.followed) / dt))
+    every = next(k for k in range(max(1, steps // 2000), steps + 1) if steps % k == 0)
+    comparison = Comparison(_COLUMNS, ("cost", "minimum_margin", "constraint_violations"), _log)
+    results: dict[str, LoopResult] = {}
     margins: dict[str, Tensor] = {}
-    metrics: Metrics = {"optimal_cost": best}
-    for name, result in results.items():
-        inside = name == "LQR of s"
-        margins[name] = _margin(box, methods[name][1], result)
-        measured = constraint_metrics(result, margins[name])
-        paid = None if bool(result.diverged[0]) else finite(result.cost[0])
-        measured["cost"] = paid
-        measured["cost_ratio"] = None if best is None or paid is None else paid / best
-        measured["left_fraction"] = left[name] / len(anywhere)
-        measured["largest_control"] = finite(result.control[0, :-1].abs().max())
-        rows.append({"method": name} | measured)
-        prefix = "_".join(name.lower().replace(",", "").split())
-        metrics |= measured if inside else {f"{prefix}_{key}": value for key, value in measured.items()}
-        shown = [significant(measured[key], 5) for key in ("cost", "minimum_margin", "constraint_violations")]
-        _log.info("%-20s cost of s %s, least margin %s, rows that left %s", name, *shown)
+    for name, method in methods(cfg, box, cost).items():
+        results[name] = _simulated(cfg, method, box, x0.to(dtype), steps, every)
+        margins[name] = _margin(box, method.plant, results[name])
+        measured = _measured(results[name], margins[name], best)
+        for what, starts in others.items():
+            tried = _simulated(
+                cfg, method, box, starts.to(dtype), followed, 1 if method.plant is system else followed
+            )
+            left = constraint_metrics(tried, _margin(box, method.plant, tried))["constraint_violations"]
+            measured[f"{what}_fraction"] = (left or 0.0) / len(starts)
+        comparison.add("" if name == "LQR of s" else _prefix(name), measured, method=name)
+    metrics = {"optimal_cost": best} | comparison.metrics | _unavoidable(cfg, box, others)
     out = RunDirectory(directory)
     if cfg.history:
         first = results["LQR of s"]
@@ -110,26 +101,80 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
         with out.history(*first.state.shape[:2]) as writer:
             writer.add({name: array.cpu().numpy() for name, array in arrays.items()})
             writer.close(time=first.time.numpy())
-    out.table("safe_box", Table.of(rows, _COLUMNS))
+    comparison.write(out, "safe_box")
     if cfg.figures:
         out.figure("safe_box", images(draw_box(_drawn(box, results, margins))))
     return out.metrics(metrics)
 
 
+def methods(cfg: DictConfig, box: Barrier, cost: Cost) -> dict[str, Method]:
+    """The LQR in both coordinates, by itself and behind the filters."""
+    system, size, dt = box.plant, box.dim or 0, float(cfg.dt)
+    substeps = integer("safe_box", "substeps", cfg.safe_box.substeps, least=1)
+    of_s = LQR(box, cost)
+    paid = QuadraticCost(cost.q, cost.r, size, cost.inputs, output=lambda x: box.coordinates(x))
+    lqr = LQR(system, QuadraticCost(cost.q, cost.r, size, cost.inputs))
+    found = {"LQR of s": Method(Feedback(of_s), box, cost)}
+    if flag("safe_box", "filter", cfg.safe_box.filter):
+        held, renewed = (BoxFilter(of_s, box, dt=dt, renewed=renewed) for renewed in (False, True))
+        found["LQR of s, filtered"] = Method(Feedback(held), box, cost, substeps)
+        found["LQR of s, filtered, renewed"] = Method(Feedback(renewed), box, cost, substeps, renew=True)
+        walls = [_within(box, k) for k in range(size) if bool(box.walled[:, k].any())]
+        guard = SafetyFilter(lqr, system, walls, dt=dt, decay=float(cfg.safe_box.decay))
+        found["LQR of x, filtered"] = Method(guard, system, paid)
+    found["LQR of x"] = Method(Feedback(lqr), system, paid)
+    for method in found.values():
+        method.controller.to(box.low.device)
+        method.cost.to(box.low.device)
+    return found
+
+
 def _simulated(
-    cfg: DictConfig, method: tuple[Controller, Plant, Cost], x0: Tensor, steps: int, every: int
+    cfg: DictConfig, method: Method, box: Barrier, x0: Tensor, steps: int, every: int
 ) -> LoopResult:
-    """Run one method; every ``every``-th step is recorded."""
-    controller, system, cost = method
-    seed = integer(COMMAND_LINE, "seed", cfg.seed, least=0)
+    """Run one method from states x of the box; every ``every``-th step is recorded."""
+    if method.plant is box:
+        x0 = box.transform(x0.double()).to(x0)
     return simulate(
-        *(controller, system, cost, x0),
+        *(method.controller, method.plant, method.cost, x0),
         dt=float(cfg.dt),
         steps=steps,
         every=every,
-        seed=seed,
+        seed=integer(COMMAND_LINE, "seed", cfg.seed, least=0),
+        substeps=method.substeps,
+        renew=method.renew,
         compile=cfg.adp.compile,
     )
+
+
+def _measured(result: LoopResult, margin: Tensor, best: float | None) -> dict[str, float | None]:
+    measured = constraint_metrics(result, margin)
+    paid = None if bool(result.diverged[0]) else finite(result.cost[0])
+    measured["cost"] = paid
+    measured["cost_ratio"] = None if best is None or paid is None else paid / best
+    measured["largest_control"] = finite(result.control[0, :-1].abs().max())
+    return measured
+
+
+def _unavoidable(cfg: DictConfig, box: Barrier, starts: dict[str, Tensor]) -> Metrics:
+    """The starts that no control held for dt keeps inside: their shares, and their numbers in the log."""
+    guard = BoxFilter(lambda s: s.new_zeros(*s.shape[:-1], box.inputs), box, dt=float(cfg.dt))
+    found: Metrics = {}
+    for what, x in starts.items():
+        rows = (guard.share(box.transform(x)) >= 1).nonzero().flatten().tolist()
+        found[f"{what}_unavoidable_fraction"] = len(rows) / len(x)
+        if rows:
+            named = ", ".join(map(str, rows[:_NAMED])) + (" and more" if len(rows) > _NAMED else "")
+            where = "beside a wall" if what == "left_near" else "in the box"
+            _log.info(
+                "%d of %d starts %s cannot be kept inside by any control held for %g s: number %s",
+                *(len(rows), len(x), where, float(cfg.dt), named),
+            )
+    return found
+
+
+def _prefix(name: str) -> str:
+    return "_".join(name.lower().replace(",", "").split()) + "_"
 
 
 def _anywhere(cfg: DictConfig, box: Barrier) -> Tensor:
@@ -138,6 +183,19 @@ def _anywhere(cfg: DictConfig, box: Barrier) -> Tensor:
     generator = torch.Generator().manual_seed(integer(COMMAND_LINE, "seed", cfg.seed, least=0))
     share = torch.rand(count, box.dim or 0, dtype=torch.float64, generator=generator)
     return (box.floor + (box.ceiling - box.floor) * share).clamp(box.low + 1e-9, box.high - 1e-9)
+
+
+def _beside_walls(cfg: DictConfig, box: Barrier) -> Tensor:
+    """States of `_anywhere`, each moved to ``safe_box.near`` from one of the walls: (B, n)."""
+    near = positive_real("safe_box", "near", cfg.safe_box.near)
+    x = _anywhere(cfg, box)
+    generator = torch.Generator().manual_seed(integer(COMMAND_LINE, "seed", cfg.seed, least=0))
+    walls = [(k, side) for k in range(box.dim or 0) for side in (0, 1) if bool(box.walled[side, k])]
+    chosen = torch.randint(len(walls), (len(x),), generator=generator)
+    for number, (k, side) in enumerate(walls):
+        beside = box.high[k] - near if side else box.low[k] + near
+        x[:, k] = torch.where(chosen.to(x.device) == number, beside, x[:, k])
+    return x
 
 
 def _margin(box: Barrier, system: Plant, result: LoopResult) -> Tensor:

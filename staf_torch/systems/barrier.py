@@ -181,6 +181,14 @@ class Barrier(ControlAffineSystem):
         up = torch.where(self.walled[1], up - step * self.above.to(s), 1.0)
         return self._coordinate(apart + step, down, up)
 
+    def step_limit(self, s: Tensor, u: Tensor) -> Tensor:
+        """Half the time in which the nearest wall would be reached at the speed of now, inf where none is
+        ahead: (..., n), (..., m) -> (...). No stage of a Runge-Kutta step is then beyond a wall."""
+        rate = self.velocity(s, u)
+        (down, up), none = self.walls(s), torch.full_like(s, torch.inf)
+        low, high = torch.where(rate < 0, -down / rate, none), torch.where(rate > 0, up / rate, none)
+        return 0.5 * torch.minimum(low, high).amin(-1)
+
     def linearisation(self, x: Tensor | None = None, u: Tensor | None = None) -> Linearisation:
         """D A D^-1 and D B with D = ds/dx, near a state of rest s and an input."""
         s = self.equilibrium() if x is None else x

@@ -94,6 +94,11 @@ class Plant(nn.Module, abc.ABC):
         """The state that is a ``step`` of the velocity further on: (..., n), (..., n) -> (..., n)."""
         return x + step
 
+    def step_limit(self, x: Tensor, u: Tensor) -> Tensor | None:
+        """The longest integration step at a state, s, for substeps of a row's own lengths:
+        (..., n), (..., m) -> (...). None, unless a plant knows better: any length will do."""
+        return None
+
     @abc.abstractmethod
     def linearisation(self, x: Tensor | None = None, u: Tensor | None = None) -> Linearisation:
         """A and B near a state and an input at rest, by default the equilibrium.

@@ -18,18 +18,24 @@ def settings(*overrides: str):  # type: ignore[no-untyped-def]
         return compose("config", list(overrides))
 
 
+FEW = ("safe_box.states=4", "safe_box.decay=20", "safe_box.followed=0.01", "safe_box.substeps=4")
 SHORT = ("duration=0.02", "dt=0.01", "trajectories=2", "adp.optimum.shooting=false", "adp.compile=false")
 
 
 def test_the_box_has_a_row_a_method_and_keeps_what_starts_inside(tmp_path: Path) -> None:
-    cfg = settings("experiment=safe_box", *SHORT, "safe_box.states=4", "safe_box.decay=20")
+    cfg = settings("experiment=safe_box", *SHORT, *FEW)
     metrics = safe_box.run(cfg, tmp_path)
     assert json.loads((tmp_path / "metrics.json").read_text()) == metrics
     assert metrics["constraint_violations"] == 0
     assert metrics["minimum_margin"] > 0.05
     assert metrics["optimal_cost"] is None
+    assert metrics["lqr_of_s_filtered_cost"] == pytest.approx(metrics["cost"], rel=1e-3)
+    assert metrics["lqr_of_s_filtered_left_near_fraction"] == metrics["left_near_unavoidable_fraction"]
+    assert (
+        metrics["lqr_of_s_filtered_renewed_left_near_fraction"] == metrics["left_unavoidable_fraction"] == 0
+    )
     assert metrics["lqr_of_x_filtered_cost"] == metrics["lqr_of_x_cost"]  # bit for bit: no wall is near
-    assert len((tmp_path / "safe_box.csv").read_text().splitlines()) == 4
+    assert len((tmp_path / "safe_box.csv").read_text().splitlines()) == 6
     assert (tmp_path / "figures" / "safe_box.png").stat().st_size > 5000
     with np.load(tmp_path / "history.npz") as history:
         assert history["state"].shape == history["barrier_state"].shape == (2, 3, 2)
@@ -37,7 +43,7 @@ def test_the_box_has_a_row_a_method_and_keeps_what_starts_inside(tmp_path: Path)
 
 
 def test_a_start_outside_the_box_is_refused_by_its_row(tmp_path: Path) -> None:
-    cfg = settings("experiment=safe_box", *SHORT, "safe_box.low=[-6,-5]")
+    cfg = settings("experiment=safe_box", *SHORT, *FEW, "safe_box.low=[-6,-5]")
     with pytest.raises(ValueError, match=r"must lie strictly between the walls .* not so row 0"):
         safe_box.run(cfg, tmp_path)
 
