@@ -68,10 +68,17 @@ def full_disk(sweep: Victim, chance: random.Random) -> str:
 
 
 def to_raylet(sweep: Victim, chance: random.Random) -> str:
-    """SIGKILL to the daemon of a node of Ray; to the command where there is none yet."""
-    found = [pid for pid in children(sweep.pid) if "raylet/raylet" in command_of(pid)]
-    os.kill(found[0] if found else sweep.pid, signal.SIGKILL)
-    return "SIGKILL to the raylet" if found else "SIGKILL to the command, which had no raylet yet"
+    """SIGKILL to the daemon of a node of Ray, as soon as there is one, or up to five seconds later."""
+    until = time.monotonic() + JOBS
+    while time.monotonic() < until and not sweep.over():
+        found = [pid for pid in children(sweep.pid) if "raylet/raylet" in command_of(pid)]
+        if found:
+            time.sleep(chance.uniform(0, 5))
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(found[0], signal.SIGKILL)
+                return "SIGKILL to the raylet"
+        time.sleep(0.05)
+    return "no job was running"
 
 
 def command_of(pid: int) -> str:

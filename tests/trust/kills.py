@@ -29,7 +29,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 os.environ["OMP_NUM_THREADS"] = "1"  # torch's threads do not survive a fork
 
 import torch._dynamo  # noqa: E402, F401
-from harms import Harm, deck, full_disk  # noqa: E402
+from harms import Harm, deck, full_disk, to_raylet  # noqa: E402
 from slurm_node import SlurmNode, missing  # noqa: E402
 
 import staf_torch.experiments.gradient_chase  # noqa: E402, F401
@@ -140,7 +140,8 @@ def one(
         while not (place / "sweep" / "sweep.json").exists() and not sweep.over():
             time.sleep(0.005)
         left = max(0.1, whole[1] - (time.monotonic() - begin))
-        moment = chance.uniform(0, left / 4 if executor == "slurm" else left)  # SLURM's jobs are waited for
+        waits = executor == "slurm" or harm is to_raylet  # for what they harm
+        moment = chance.uniform(0, left / 4 if waits else left)
         time.sleep(moment)
         said = "it was over before" if sweep.over() else harm(sweep, chance)
         code = sweep.end()
