@@ -8,6 +8,7 @@ from torch import Tensor
 from ..numerics.checks import fail, integer
 from .controllers import Controller, ControllerState
 from .global_value import GlobalValue
+from .memory_growth import best_from
 from .plans import LocalModel, Reference, Trajectories
 from .sampled_problem import SampledProblem
 from .trajectory_optimisation import BoxDDP
@@ -41,7 +42,8 @@ class RecedingHorizon(Controller):
         steps: T.
         iterations: of a period; the first plan takes as many as it needs, up to 60. 0: the first plan alone
             is followed, with its feedback and then with that of the goal, in some 50 us a control; let
-            ``steps`` be the whole episode then.
+            ``steps`` be the whole episode then. With a memory that plan is the best that `BoxDDP` reaches
+            from several of the memory's, also after holding a bound for a while.
         memory: for V_T and the plan to begin from; None for the linear feedback and the last plan.
         compile: as in `BoxDDP`.
 
@@ -66,7 +68,7 @@ class RecedingHorizon(Controller):
         if memory is not None and memory.problem is not problem:
             raise fail("RecedingHorizon", "memory", "must be of the same problem", memory.problem)
         self.steps = integer("RecedingHorizon", "steps", steps, least=1)
-        integer("RecedingHorizon", "iterations", iterations, least=0 if memory is None else 1)
+        integer("RecedingHorizon", "iterations", iterations, least=0)
         self._first = BoxDDP(problem, steps=steps, compile=compile)
         self._search: BoxDDP | None = None
         if iterations:
@@ -74,6 +76,8 @@ class RecedingHorizon(Controller):
 
     def init(self, x0: Tensor) -> ControllerState:
         """The first plan, from the states x0 (B, n)."""
+        if self._search is None and self.memory is not None:
+            return _carrying(_rows(best_from(self.memory, self._first, x0)), 0)
         control, reference = (None, None) if self.memory is None else self._remembered(x0)
         found = self._first.solve(x0, control, reference, self._terminal(x0, control, reference))
         return _carrying(_rows(found), 0)

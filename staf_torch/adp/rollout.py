@@ -182,8 +182,8 @@ class RolloutPolicy(nn.Module):
                 carry: tuple[Tensor, Tensor, Tensor], at: tuple[Tensor, Tensor]
             ) -> tuple[tuple[Tensor, Tensor, Tensor], tuple[()]]:
                 slope, end, spent = carry
-                slope, rate = self._field(start + at[0] * slope)
-                return (slope, end + at[1] * slope, spent + at[1] * rate), ()
+                slope, rate = self._field(self.model.displaced(start, at[0] * slope))
+                return (slope, self.model.displaced(end, at[1] * slope), spent + at[1] * rate), ()
 
             (_, end, spent), _ = scan(stage, (torch.zeros_like(start), *now), (asked, shares), dim=0)
             return end, spent
@@ -197,7 +197,7 @@ class RolloutPolicy(nn.Module):
 
     def _field(self, x: Tensor) -> tuple[Tensor, Tensor]:
         u = self.base(x)
-        return self.model.rate(x, u), self.cost.rate(x, u)
+        return self.model.velocity(x, u), self.cost.rate(x, u)
 
 
 class _TwoPrograms:

@@ -17,6 +17,7 @@ from ..systems import Clocked, Plant
 from .cost import Cost
 
 _PROBE = 1e-5  # of a state around 0, in its own units, at which the policy is asked for its slope
+_REACHED, _GROWS = 1e-12, 1e-6  # relative, of a state that inputs reach and of a mode that grows
 _STEPS = 1000  # periods of a plant in discrete time that are tried at most
 _PERIODS = 100  # tried from a hundredth to a hundred times the time constant of the fastest mode
 _REACH = (0.01, 100.0)
@@ -174,6 +175,8 @@ def held_stability(
     """Return how stable a set-point is when ``policy`` is held for ``period`` seconds.
 
     The plant is linearised there under the control that the policy gives, the policy by central differences.
+    Modes that no control moves and that do not grow by themselves, such as others' motion that is part of the
+    state, are left out.
 
     Example:
         >>> plant = systems.Pendulum()
@@ -209,6 +212,8 @@ def held_stability(
     f, g = (t.double() for t in system.linearisation(at, held))
     if not bool(torch.isfinite(torch.cat((f, g, slope.mT), dim=-1)).all()):
         return HeldStability(math.nan, None)
+    basis = _moved(f, g, discrete=system.period is not None)
+    f, g, slope = basis.mT @ f @ basis, basis.mT @ g, slope @ basis
 
     def radius(dt: float) -> float:
         a, b = _held(system, f, g, dt)
@@ -234,6 +239,22 @@ def held_stability(
         middle = 0.5 * (low + high)
         low, high = (middle, high) if radius(middle) < 1 else (low, middle)
     return HeldStability(now, low)
+
+
+def _moved(f: Tensor, g: Tensor, *, discrete: bool) -> Tensor:
+    """An orthonormal basis, (n, c), of the states that inputs reach; of all where another mode grows."""
+    size, scale = len(f), float(f.norm()) + 1.0
+    columns = [g / (float(g.norm()) + torch.finfo(g.dtype).tiny)]
+    for _ in range(size - 1):
+        columns.append(f @ columns[-1] / scale)
+    left, sizes, _ = torch.linalg.svd(torch.cat(columns, dim=-1))
+    count = int((sizes > _REACHED * sizes.amax()).sum())
+    rest = left[:, count:]
+    if count in (0, size):
+        return torch.eye(size, dtype=f.dtype)
+    modes = torch.linalg.eigvals(rest.mT @ f @ rest)
+    grows = modes.abs().max() > 1 + _GROWS if discrete else modes.real.max() > _GROWS * scale
+    return torch.eye(size, dtype=f.dtype) if bool(grows) else left[:, :count]
 
 
 def _held(plant: Plant, f: Tensor, g: Tensor, dt: float) -> tuple[Tensor, Tensor]:

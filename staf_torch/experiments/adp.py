@@ -18,6 +18,7 @@ from ..adp import (
     ActorCritic,
     Controller,
     ControllerState,
+    Cost,
     Gains,
     LoopResult,
     Supervised,
@@ -41,6 +42,7 @@ from .scenes import animation_kind, loop_scene
 
 _log = logging.getLogger(__name__)
 _LINEARISED = 8  # rows of a learning controller whose loop is linearised
+_SETTLING = 0.25  # share of the first cost rate of a state, below which it is on its way
 _NAMED = 20  # diverged trajectories that the log lists by number
 
 
@@ -133,6 +135,7 @@ def _solved(cfg: DictConfig, problem: AdpProblem, result: LoopResult) -> LoopSol
         final=problem.cost.around(problem.system).deviation(result.state[:, -1]),
     )
     metrics["held_spectral_radius"] = held_radius(problem, result)
+    count_the_restless(problem.cost.around(problem.system), result)
     own = make_metrics(cfg.get("metric"))
     metrics |= {metric.name: metric.worst(result, problem) for metric in own}
     method = f"{type(problem.system).__name__} with {problem.controller.label}"
@@ -254,6 +257,21 @@ def name_the_diverged(result: LoopResult) -> None:
         _log.warning("trajectory %d from %s diverged at t = %.6g s", row, start, float(result.frozen_at[row]))
     if len(rows) > _NAMED:
         _log.warning("and %d more trajectories diverged", len(rows) - _NAMED)
+
+
+def count_the_restless(cost: Cost, result: LoopResult) -> None:
+    """Warn where the state's cost rate in the last quarter of the run never fell to a quarter of what it was
+    at first, with the number of such trajectories."""
+    rate = cost.state_rate(result.state)  # (B, T)
+    late = rate[:, -max(1, rate.shape[1] // 4) :].amin(1)
+    moving = (rate[:, 0] > 0) & (late > _SETTLING * rate[:, 0])
+    restless = int((moving & ~result.diverged).sum())
+    if restless:
+        _log.warning(
+            "%d of %d trajectories are not regulated: in the last quarter of the %.4g s their state never "
+            "paid less than a quarter of its first cost rate",
+            *(restless, len(rate), float(result.time[-1])),
+        )
 
 
 def _summarise(solved: LoopSolution) -> None:

@@ -148,3 +148,13 @@ def test_bad_arguments_are_refused_by_name() -> None:
     ):
         with pytest.raises(ValueError, match=message):
             rollout(**settings)
+
+
+def test_in_barrier_coordinates_rollouts_move_the_distances_to_the_walls() -> None:
+    """Steps of 50 ms in s itself overflow from the published start, and left no control at all."""
+    box = systems.Barrier(systems.TwoStateChain(), [-7.0, -5.0], [5.0, 7.0])
+    cost = adp.QuadraticCost(10.0, 0.1, dim=2, inputs=1)
+    s0 = box.transform(torch.tensor([[-6.5, 6.5]], dtype=torch.float64))
+    coarse, fine = (adp.RolloutPolicy.of_lqr(box, cost, steps=steps).rollout(s0) for steps in (10, 200))
+    torch.testing.assert_close(coarse, fine, rtol=0.05, atol=0)
+    assert float(fine) == pytest.approx(70.78, rel=0.05)  # of the LQR of s, here 0.5 s of it and its value

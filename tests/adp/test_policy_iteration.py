@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from helpers_adp import uniform
+from helpers_adp import COST, PLANT, uniform
 
 from staf_torch import (
     AnchoredKernel,
@@ -17,9 +17,6 @@ from staf_torch import (
     systems,
 )
 from staf_torch.adp.laws import ActorCriticLaw, BellmanSums, Weights
-
-PLANT = systems.TwoState()
-COST = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
 
 
 def learner(plant: systems.ControlAffineSystem, critic: list[float], law: ActorCriticLaw) -> adp.ActorCritic:

@@ -46,6 +46,15 @@ def test_short_plan_that_ends_in_the_memory_swings_up(memory: adp.GlobalValue) -
     assert float(cost_of(memory.problem, RESETS, controls).mean() / GRID.mean()) < 1.01
 
 
+def test_one_plan_of_the_memory_is_followed_up(memory: adp.GlobalValue) -> None:
+    mpc = adp.RecedingHorizon(memory.problem, steps=120, iterations=0, memory=memory)
+    controls, last = drive(mpc, RESETS, 120)
+    assert float(memory.problem.terminal(last).max()) < 1e-2
+    cost = cost_of(memory.problem, RESETS, controls)
+    assert bool((cost <= memory.value(RESETS) * (1 + 1e-3)).all())
+    assert float(cost.mean() / GRID.mean()) < 1.01
+
+
 def test_simulation_drives_it_as_a_controller() -> None:
     plant = systems.Pendulum()
     cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1, low=-4.0, high=4.0)

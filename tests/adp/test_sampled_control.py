@@ -94,3 +94,19 @@ def test_bad_periods_are_refused_by_name() -> None:
     turning = systems.Linear([[0.0, 1.0], [-1.0, 0.0]], [[0.0], [1.0]])
     with pytest.raises(ValueError, match=r"held for 3\.14159 s, is not stabilisable"):
         adp.LQR(turning, COST, period=math.pi)
+
+
+def test_others_that_move_by_themselves_do_not_make_a_loop_unstable() -> None:
+    """A mass, and beside it a disc that moves at its own speed: only a mode that grows is told."""
+    for growth, stable in ((0.0, True), (0.5, False)):
+        f = torch.zeros(4, 4).double()
+        f[0, 1] = f[2, 3] = 1.0
+        f[3, 3] = growth
+        both = systems.Linear(f.tolist(), [[0.0], [1.0], [0.0], [0.0]])
+        found = adp.held_stability(lambda x: -x[..., :1] - 2 * x[..., 1:2], both, 0.1)
+        assert (found.spectral_radius < 1) == stable
+        alone = systems.Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
+        mass = adp.held_stability(lambda x: -x[..., :1] - 2 * x[..., 1:2], alone, 0.1)
+        if stable:
+            assert found.spectral_radius == pytest.approx(mass.spectral_radius, abs=1e-9)
+            assert found.largest_period == pytest.approx(mass.largest_period, rel=1e-4)

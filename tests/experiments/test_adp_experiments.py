@@ -7,9 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from hydra import compose, initialize_config_dir
 from PIL import Image
 
+from staf_torch import adp, systems
 from staf_torch.cli.staf import config_directory
 from staf_torch.experiments import adp as adp_experiment
 from staf_torch.experiments import adp_comparison, adp_tracking
@@ -143,3 +145,14 @@ def test_bad_setting_is_refused_by_name(overrides: list[str], message: str, tmp_
     with pytest.raises(ValueError, match=message):
         adp_experiment.ClosedLoop()(settings("experiment=adp", *overrides), tmp_path)
     assert not list(tmp_path.iterdir())
+
+
+def test_trajectories_that_do_not_come_to_rest_are_counted(caplog: pytest.LogCaptureFixture) -> None:
+    plant, cost = systems.VanDerPol(), adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
+    x0 = torch.tensor([[2.0, 0.0], [0.0, -1.5], [0.0, 0.0]], dtype=torch.float64)
+    idle = adp.Feedback(lambda x: torch.zeros_like(x[..., :1]))
+    for policy in (idle, adp.Feedback(adp.LQR(plant, cost))):
+        run = adp.simulate(policy, plant, cost, x0, dt=0.1, steps=80, compile=False)
+        adp_experiment.count_the_restless(cost, run)
+    (said,) = [record.getMessage() for record in caplog.records if "not regulated" in record.getMessage()]
+    assert said.startswith("2 of 3 trajectories are not regulated: in the last quarter of the 8 s")
