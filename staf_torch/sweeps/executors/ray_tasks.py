@@ -7,6 +7,7 @@ from typing import Any
 
 from ...results.progress import Progress
 from ..batching import Batch, Done
+from ..workers import LostError
 from .base import Executor
 from .remote import pack, solve_elsewhere, unpack
 
@@ -26,7 +27,11 @@ class Ray(Executor):
         self._ray: Any = ray
         self._ours = not ray.is_initialized()
         if self._ours:
-            ray.init(**{"log_to_driver": False, "include_dashboard": False, **arguments})
+            try:
+                ray.init(**{"log_to_driver": False, "include_dashboard": False, **arguments})
+            except Exception as error:  # Ray raises plain ones where a daemon of its ends as it begins
+                said = " ".join(str(error).split())
+                raise LostError(f"Ray could not begin ({type(error).__name__}: {said})") from error
         self._solve = ray.remote(max_retries=0)(solve_elsewhere)  # `map` tries once more
 
     @property
