@@ -7,6 +7,9 @@ from collections.abc import Sequence
 from omegaconf import DictConfig
 
 from staf_torch.sweeps.hydra_compat import Composer, config_loader
+from staf_torch.sweeps.hydra_compat.program import HAS_WHITELIST
+
+HYDRA: dict[str, str] = {} if HAS_WHITELIST else {"version_base": "1.3"}  # 1.4 deprecates the argument
 
 
 def compose(base: Sequence[str], jobs: Sequence[Sequence[str]]) -> list[DictConfig]:

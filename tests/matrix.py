@@ -2,10 +2,10 @@
 
     python tests/matrix.py [--quick] [--only lowest newest] [--tests tests/kernels] [--jobs 2] [--order SEED]
 
-Environments are built once below `--place` (`~/.cache/staf_torch-matrix` by default, some gigabytes each) and
-used again: torch from the index brings CUDA. Each runs the whole suite, with `--quick` the tests that touch
-versions and means, in an order by chance where a seed is given. What cannot be built here is said, with the
-last line of pip. The last table: `tests/README.md`.
+The committed tree counts, not the working one. Environments are built once below `--place` (by default
+`~/.cache/staf_torch-matrix`, some gigabytes each) and used again: torch from the index brings CUDA. Each runs
+the whole suite, with `--quick` the tests that touch versions and means, in an order by chance where a seed is
+given. What cannot be built here is said, with the last line of pip. The last table: `tests/README.md`.
 """
 
 from __future__ import annotations
@@ -98,6 +98,10 @@ def main() -> int:
     place = Path(options.place)
     place.mkdir(parents=True, exist_ok=True)
     outcomes: dict[str, Outcome | str] = {}
+    tree = Path(tempfile.mkdtemp(prefix="staf-matrix-tree-"))  # a copy: nobody edits it while tests run
+    tree.chmod(0o755)
+    archive = subprocess.run(["git", "archive", "HEAD"], cwd=ROOT, capture_output=True, check=True)
+    subprocess.run(["tar", "-x", "-C", str(tree)], input=archive.stdout, check=True)
     for name in options.only or ENVIRONMENTS:
         environment = ENVIRONMENTS[name]
         try:
@@ -108,8 +112,9 @@ def main() -> int:
             tests = QUICK if options.quick else options.tests
             more = ["-n", str(options.jobs), "--dist", "worksteal"] if options.jobs > 1 else []
             more += [] if options.order is None else ["--order", str(options.order)]
-            outcomes[name] = _run(environment, python, [*more, *tests])
+            outcomes[name] = _run(environment, python, tree, [*more, *tests])
         print(_row(name, outcomes[name]), flush=True)
+    shutil.rmtree(tree, ignore_errors=True)
     print(f"\n| environment | versions | {time.strftime('%Y-%m-%d')}{', quick' if options.quick else ''} |")
     print("|---|---|---|")
     for name, outcome in outcomes.items():
@@ -156,17 +161,17 @@ def _python(version: str) -> Path:
     return kept[-1] if kept else Path(str(found))
 
 
-def _run(environment: Environment, python: Path, arguments: Sequence[str]) -> Outcome:
+def _run(environment: Environment, python: Path, tree: Path, arguments: Sequence[str]) -> Outcome:
     with (
         tempfile.TemporaryDirectory(prefix="staf-matrix-") as scratch,
         _home(environment, Path(scratch)) as home,
     ):
-        settings = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", **home}
+        settings = {**os.environ, "PYTHONPATH": str(tree), "OMP_NUM_THREADS": "1", **home}
         line = [str(python), "-m", "pytest", "-q", "-p", "no:cacheprovider", "--tb=short", *arguments]
         user = None if environment.privileged else "nobody"
         begun = time.monotonic()
         ended = subprocess.run(
-            line, cwd=ROOT, env=settings, capture_output=True, text=True, check=False, user=user
+            line, cwd=tree, env=settings, capture_output=True, text=True, check=False, user=user
         )
     failed = re.findall(r"^(?:FAILED|ERROR) (\S+)", ended.stdout, re.MULTILINE)
     said = (ended.stdout.strip() or ended.stderr.strip() or "nothing").splitlines()[-1]

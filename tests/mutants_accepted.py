@@ -12,4 +12,50 @@ ACCEPTED: dict[tuple[str, str, str, str], str] = {
         "10_000",
         "10001",
     ): _SPEED,
+    ("staf_torch/systems/barrier.py", "left = s < 0", "s < 0", "(s <= 0)"): (
+        "both branches are the same function at 0, value and slope"
+    ),
+    (
+        "staf_torch/adp/shooting/newton.py",
+        "_SHORTER = (0.5, 0.25, 0.1, 0.03, 0.01)  # shares of the Newton step, where the whole one does not "
+        "pay",
+        "0.03",
+        "0.06",
+    ): "another share of a step that is tried: the search ends at the same optimum",
+    (
+        "staf_torch/systems/barrier.py",
+        "scale.unsqueeze(-1) * found.matrix / scale, scale.unsqueeze(-1) * found.input_matrix",
+        "-1",
+        "(1)",
+    ): "of one state: the scale has one dimension",
+    (
+        "staf_torch/adp/rollout.py",
+        "if first is not None and second is not None and first.direct and second.direct:",
+        "first is not None",
+        "(first is None)",
+    ): _SPEED,
+    (
+        "staf_torch/results/archive.py",
+        "_DIRECTORY = 2**16  # bytes of the list of arrays at most",
+        "16",
+        "17",
+    ): "a limit against hostile files: no file of ours comes near",
+    (
+        "staf_torch/online/local_functions.py",
+        "units = torch.eye(gram.shape[-1], dtype=gram.dtype, device=gram.device)",
+        "torch.eye(gram.shape[-1], dtype=gram.dtype, device=gram.device)",
+        "torch.eye(gram.shape[-1], dtype=gram.dtype)",
+    ): "of another device than the processor, which machines that run the tests lack",
+    (
+        "staf_torch/online/local_functions.py",
+        "zero = offsets.new_zeros(offsets.shape[-1])",
+        "1",
+        "2",
+    ): "a state that is not read: the kernel does not depend on it",
+    (
+        "staf_torch/adp/laws.py",
+        "first, rest = here * masses.new_ones(1), there * masses",
+        "here * masses.new_ones(1)",
+        "(here / masses.new_ones(1))",
+    ): "over ones as times ones",
 }

@@ -17,6 +17,7 @@ import multiprocessing
 import os
 import py_compile
 import random
+import re
 import subprocess
 import sys
 import tempfile
@@ -44,7 +45,9 @@ def main() -> int:
         commit = _git("rev-parse", options.commit).strip()
         _export(commit, tree)
         found = list(_all_mutants(tree, options.package, options.file))
-        chosen = random.Random(options.seed).sample(found, min(options.sample, len(found)))
+        chosen = random.Random(options.seed).sample(found, min(options.sample, len(found)))[options.skip :]
+        if options.again:
+            chosen = list(_survivors(options.again.read_text(), found))
         known = _known(commit, tree, options.jobs)
         print(f"{len(found)} mutants, {len(chosen)} of them by seed {options.seed}", flush=True)
         _prepare(tree)
@@ -64,6 +67,8 @@ def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--sample", type=int, default=100)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--skip", type=int, default=0, help="so many of the sample: they were tried before")
+    parser.add_argument("--again", type=Path, help="output of a run: what survived in it, and nothing else")
     parser.add_argument("--package", nargs="*", default=[], help="rooms of staf_torch; all by default")
     parser.add_argument("--file", nargs="*", default=[], help="files, staf_torch/...; all by default")
     parser.add_argument("--commit", default="HEAD")
@@ -92,6 +97,14 @@ def _all_mutants(tree: Path, packages: Iterable[str], files: Iterable[str]) -> I
         if (packages and name.split("/")[1] not in packages) or (files and name not in files):
             continue
         yield from mutants_of(name, path.read_text(encoding="utf-8"))
+
+
+def _survivors(output: str, found: Sequence[Mutant]) -> Iterator[Mutant]:
+    """Mutants that an output names as not killed, in a version whose lines may have moved."""
+    pattern = r"^(?:survived|unreached) +(\S+):(\d+): ('.*'|\".*\") -> ('.*'|\".*\")  \[\d+ tests"
+    for file, line, was, now in re.findall(pattern, output, re.MULTILINE):
+        alike = [m for m in found if (m.file, repr(m.was), repr(m.now)) == (file, was, now)]
+        yield from sorted(alike, key=lambda m: abs(m.line - int(line)))[:1]
 
 
 def _texts(tree: Path) -> dict[str, str]:

@@ -74,7 +74,7 @@ def judge(mutant: Mutant) -> Verdict | None:
     begun = time.monotonic()
     path.write_text(mutant.applied(source), encoding="utf-8")
     try:
-        said, by = _run_in_fork(tests, 20 + 3 * sum(_map.seconds.get(test, 0.0) for test in tests))
+        said, by = _run_in_fork(tests, 60 + 5 * sum(_map.seconds.get(test, 0.0) for test in tests))
     finally:
         path.write_text(source, encoding="utf-8")
     return Verdict(mutant, said, len(tests), time.monotonic() - begun, by)
@@ -94,16 +94,15 @@ def _tests_for(mutant: Mutant, source: str) -> list[str]:
     return chosen
 
 
-def _around(mutant: Mutant, source: str) -> tuple[int, int]:
-    """First and last line of the innermost function or class around."""
+def _around(mutant: Mutant, source: str) -> tuple[int, int, bool]:
+    """First and last line of the innermost function, class or file around; whether it runs at import."""
     kinds = ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef
-    spans = [
-        (each.lineno, each.end_lineno or each.lineno)
-        for each in ast.walk(ast.parse(source))
-        if isinstance(each, kinds)
-    ]
-    inside = [span for span in spans if span[0] <= mutant.line <= span[1]]
-    return min(inside, key=lambda span: span[1] - span[0], default=(mutant.line, mutant.last_line))
+    inside: tuple[int, int, bool] = (1, 10**9, True)
+    for each in ast.walk(ast.parse(source)):  # outer ones come first
+        if isinstance(each, kinds) and each.lineno <= mutant.line <= (each.end_lineno or each.lineno):
+            early = isinstance(each, ast.ClassDef) or mutant.line < each.body[0].lineno
+            inside = each.lineno, each.end_lineno or each.lineno, early
+    return inside
 
 
 class _Chosen:

@@ -218,30 +218,28 @@ def as_map(found: dict[str, Any]) -> Map:
     return Map(lines, found["seconds"])
 
 
-def tests_near(
-    known: Map, file: str, first: int, last: int, inside: tuple[int, int]
-) -> tuple[set[str], bool]:
+def tests_near(known: Map, file: str, first: int, last: int, around: tuple[int, int, bool]) -> set[str]:
     """Tests that execute some lines.
 
-    Where none does, because the lines run at import: those of the lines' own function or class, or else of
-    the file, or else of the folder.
+    Where that happens at import, or not at all: those of the function or class around, or else of the file,
+    or else of the folder.
 
     Args:
         known: the map.
         file: whose lines are meant.
         first: one of them.
         last: one of them.
-        inside: first and last line of the function or class around.
+        around: first and last line of the function, class or file around; whether the lines run at import.
 
     Returns:
         The tests; none where the folder has none.
     """
     there = known.lines.get(file, {})
     order = sorted(there)
-    for begin, end in ((first, last), inside, (0, 10**9)):
+    for begin, end in ((first, last), around[:2], (0, 10**9)):
         span = order[bisect.bisect_left(order, begin) : bisect.bisect_right(order, end)]
         hits = set().union(*(there[number] for number in span)) if span else set()
-        if hits:
+        if hits and not (around[2] and (begin, end) == (first, last)):
             return hits
     return {test for test in known.seconds if test.startswith(places(file))}
 

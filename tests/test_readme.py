@@ -11,6 +11,7 @@ from pathlib import Path
 import hydra
 import pytest
 from command_line import ROOT
+from composing import HYDRA
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
@@ -211,7 +212,7 @@ def test_the_front_page_has_a_table_of_commands() -> None:
     ids=lambda command: command.replace("::", ":"),
 )
 def test_settings_of_a_command_compose(command: str) -> None:
-    with hydra.initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+    with hydra.initialize_config_dir(str(ROOT / "conf"), **HYDRA):
         for job in jobs(overrides(command)):
             settings = hydra.compose("config", job)
             assert OmegaConf.select(settings, "task"), STAF[command]

@@ -66,8 +66,9 @@ class StaFRegressor(StreamEstimator):
         robust: standard deviations beyond which an error counts no more than there (Huber); None for any. In
             the accurate mode a sample beyond waits for the next: both are learned if that is as far off, else
             the first is skipped; None takes 30, and 8 for an error of more than 12 spreads of y.
-        scaling: whether x and y are brought to mean 0 and variance 1, learned from the first 40 samples; None
-            does so in the accurate mode. Then radius, noise and amplitude are in these units.
+        scaling: whether x and y are brought to mean 0 and variance 1, learned from the first 40 samples, in
+            the accurate mode again from 80, 160 and 320; None does so in that mode alone. Then radius,
+            noise and amplitude are in these units.
         memory: samples kept, at least 128, for the accurate mode; None for the filter alone.
         neighbours: of them that make a local process, at least 8.
 

@@ -44,7 +44,7 @@ def held(x: Tensor, u: Tensor, pieces: int = 200) -> tuple[Tensor, Tensor]:
 
 def can_be_kept(x: Tensor) -> Tensor:
     """Whether the hardest pull that leaves x2 inside keeps x1 inside: (B, 2) -> (B,) bool."""
-    outward = torch.sign(x[:, 1])
+    outward = torch.sign(x[:, 0] - 0.5 * (LOW[0] + HIGH[0]))  # the nearer wall of x1
     soft, hard = torch.zeros(len(x)).double(), torch.full((len(x),), 5e4).double()
     for _ in range(30):
         middle = 0.5 * (soft + hard)

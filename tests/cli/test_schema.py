@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 from command_line import ROOT
+from composing import HYDRA
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
@@ -49,7 +50,7 @@ def test_a_file_that_ships_is_valid_and_with_a_wrong_key_it_is_not(path: Path, w
 
 
 def test_settings_of_a_run_are_valid(whole: dict[str, Any]) -> None:
-    with initialize_config_dir(str(CONF), version_base="1.3"):
+    with initialize_config_dir(str(CONF), **HYDRA):
         for options in (["experiment=adp"], ["kernel=matern", "optimizer=exact", "members=['seed=0,1']"]):
             assert faults(whole, ".", OmegaConf.to_container(compose("config", options))) == []
 

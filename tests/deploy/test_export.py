@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from composing import HYDRA
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
@@ -33,7 +34,7 @@ RUNS = {
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("runs")
     for name, overrides in RUNS.items():
-        with initialize_config_dir(config_directory(), version_base="1.3"):
+        with initialize_config_dir(config_directory(), **HYDRA):
             cfg = compose("config", ["figures=false", *overrides])
         (folder / name / ".hydra").mkdir(parents=True)
         OmegaConf.save(cfg, folder / name / ".hydra" / "config.yaml")

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from composing import HYDRA
 from hydra import compose, initialize_config_dir
 from PIL import Image
 
@@ -21,7 +22,7 @@ TRACKED = ("duration=0.1", "dt=0.01", "animation=gif")
 
 
 def settings(*overrides: str):  # type: ignore[no-untyped-def]
-    with initialize_config_dir(config_directory(), version_base="1.3"):
+    with initialize_config_dir(config_directory(), **HYDRA):
         return compose("config", list(overrides))
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 import mpmath as mp
 import pytest
 import torch
+from composing import HYDRA
 from helpers import tensor, uniform
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
@@ -25,7 +26,7 @@ from staf_torch.figures.theory import ErrorPanel, draw_errors
 
 
 def settings(*overrides: str) -> DictConfig:
-    with initialize_config_dir(version_base="1.3", config_dir=config_directory()):
+    with initialize_config_dir(config_directory(), **HYDRA):
         return compose("config", overrides=["experiment=flat_limit", *overrides])
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from composing import HYDRA
 from hydra import compose, initialize_config_dir
 from hydra.errors import HydraException
 from omegaconf import DictConfig
@@ -23,7 +24,7 @@ from staf_torch.settings.chase import chase_problem
 
 
 def settings(*overrides: str) -> DictConfig:
-    with initialize_config_dir(version_base="1.3", config_dir=config_directory()):
+    with initialize_config_dir(config_directory(), **HYDRA):
         return compose("config", list(overrides))
 
 

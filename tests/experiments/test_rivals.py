@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
+from composing import HYDRA
 from hydra import compose, initialize_config_dir
 from torch import Tensor
 
@@ -79,7 +80,7 @@ def test_equations_mean_the_same_to_casadi(name: str) -> None:
 
 
 def test_unknown_plants_and_methods_are_refused_by_name(tmp_path) -> None:  # type: ignore[no-untyped-def]
-    with initialize_config_dir(config_directory(), version_base="1.3"):
+    with initialize_config_dir(config_directory(), **HYDRA):
         cfg = compose("config", ["experiment=rivals", "rivals.plants=[rocket]"])
     with pytest.raises(ValueError, match=r"`rivals\(plants=...\)` must be one of .*; got 'rocket'"):
         rivals.run(cfg, tmp_path)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from composing import HYDRA
 from hydra import compose, initialize_config_dir
 
 from staf_torch.cli.staf import config_directory
@@ -14,7 +15,7 @@ from staf_torch.experiments import avoidance, safe_box
 
 
 def settings(*overrides: str):  # type: ignore[no-untyped-def]
-    with initialize_config_dir(config_directory(), version_base="1.3"):
+    with initialize_config_dir(config_directory(), **HYDRA):
         return compose("config", list(overrides))
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import hydra
 import pytest
+from composing import HYDRA
 from omegaconf import DictConfig
 
 from staf_torch.cli.staf import config_directory
@@ -23,7 +24,7 @@ SMALL = {
 
 
 def settings(name: str, *overrides: str) -> DictConfig:
-    with hydra.initialize_config_dir(config_directory(), version_base="1.3"):
+    with hydra.initialize_config_dir(config_directory(), **HYDRA):
         return hydra.compose("config", [f"experiment={name}", *SMALL[name], *overrides])
 
 

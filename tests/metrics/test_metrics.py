@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 from collections.abc import Callable
@@ -92,6 +93,17 @@ def test_settling_time_is_the_last_time_above_the_settled_excess() -> None:
     last = max(int(row.nonzero().max()) for row in above if row.any())
     assert found["settling_time"] == pytest.approx((last + 1) * DT)
     assert gather(states(), settle_time=0.0)[0]["settling_time"] == 0.0
+
+
+@pytest.mark.parametrize(("time", "counted"), [(39, False), (40, True)])
+def test_the_window_begins_at_the_first_time_that_is_settled(time: int, counted: bool) -> None:
+    basis, law = basis_of("exponential", 3), SteepestDescent()
+    metrics = ChaseMetrics(basis, Paper(), law, inner_steps=10, dt=DT, settle_time=40 * DT)
+    result = st.chase(states(), basis, Paper(), law, inner_steps=10)
+    excess = result.excess.clone()
+    excess[1, time] = 7.0
+    metrics.add(dataclasses.replace(result, excess=excess))
+    assert (metrics.summary()["ultimate_excess"] == 7.0) == counted
 
 
 def test_a_window_after_the_end_has_nothing_to_report() -> None:

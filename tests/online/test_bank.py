@@ -134,3 +134,13 @@ def test_streams_come_and_go_without_touching_the_others(memory: int | None) -> 
     found = model.predict(x[0, [1, 2, 3, 0]])
     assert torch.equal(found[1], alone.predict(x[0, 2]))
     assert torch.equal(found[0], fresh.predict(x[0, 1]))
+
+
+def test_a_bank_counts_what_it_learned_and_what_it_skipped() -> None:
+    bank = Bank(BankShape(2, 1, 80, 10), 2, True)
+    for at in range(5):
+        y = torch.ones(2, 1, dtype=torch.float64)
+        y[1] = torch.inf if at == 3 else at
+        bank.learn(torch.full((2, 2), float(at), dtype=torch.float64), y)
+    assert bank.learned.tolist() == [5, 4]
+    assert bank.skipped.tolist() == [0, 1]

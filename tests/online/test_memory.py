@@ -10,6 +10,7 @@ from pathlib import Path
 import hydra
 import pytest
 import torch
+from composing import HYDRA
 from helpers import basis_of, tensor, uniform
 from omegaconf import DictConfig
 from torch import Tensor
@@ -167,7 +168,7 @@ def test_bad_arguments_are_named() -> None:
 
 def settings(*overrides: str) -> DictConfig:
     small = ["memory.states=40", "memory.revisits=8", "memory.steps=40", "settle_time=2", "duration=5.2"]
-    with hydra.initialize_config_dir(config_directory(), version_base="1.3"):
+    with hydra.initialize_config_dir(config_directory(), **HYDRA):
         return hydra.compose("config", ["experiment=memory", *small, *overrides])
 
 

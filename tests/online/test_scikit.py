@@ -23,6 +23,15 @@ def series(steps: int) -> tuple[np.ndarray, np.ndarray]:
     return x, np.sin(2 * x[:, 0]) + 0.5 * x[:, 1]
 
 
+def test_an_argument_of_the_kernel_is_set_by_its_name_and_others_are_refused() -> None:
+    model = st.StaFRegressor(st.GaussianKernel(0.5)).set_params(kernel__width=0.8)
+    assert isinstance(model.kernel, st.GaussianKernel)
+    assert float(model.kernel.width) == 0.8
+    for name in ("kernel__length_scale", "memory__width", "centres"):
+        with pytest.raises(ValueError, match=name):
+            model.set_params(**{name: 1.0})
+
+
 @pytest.mark.filterwarnings("ignore:Estimator StaFRegressor does not inherit", "ignore:Skipping check")
 def test_check_estimator_passes_but_for_what_the_manual_names() -> None:
     checks = pytest.importorskip("sklearn.utils.estimator_checks")

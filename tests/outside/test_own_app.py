@@ -15,6 +15,7 @@ from pathlib import Path
 
 import pytest
 from command_line import ROOT
+from composing import HYDRA
 from hydra import compose, initialize
 from hydra.utils import instantiate
 from omegaconf import DictConfig
@@ -115,7 +116,7 @@ def nodes() -> dict[str, DictConfig]:
     """Every option, composed by an application that has nothing but our search path."""
     search, found = "hydra.searchpath=[pkg://staf_torch.conf]", {}
     by_group = [[option for option in OPTIONS if option.startswith(f"{group}=")] for group in TYPES]
-    with initialize(version_base="1.3", config_path=None):
+    with initialize(config_path=None, **HYDRA):
         for together in itertools.zip_longest(*by_group):  # one of each group: a few compositions do for all
             chosen = [option for option in together if option is not None]
             more = [line for option in chosen for line in OPEN.get(option, [])]

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from composing import HYDRA
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
 
@@ -23,7 +24,7 @@ OPTIONS = [
 
 
 def settings(*overrides: str) -> DictConfig:
-    with initialize_config_dir(config_directory(), version_base="1.3"):
+    with initialize_config_dir(config_directory(), **HYDRA):
         return compose("config", ["experiment=adp", *overrides])
 
 

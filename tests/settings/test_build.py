@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from composing import HYDRA
 from hydra import compose, initialize_config_dir
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
@@ -27,7 +28,7 @@ OPTIONS = [
 
 @functools.cache
 def composed(*choices: str) -> DictConfig:
-    with initialize_config_dir(version_base="1.3", config_dir=config_directory()):
+    with initialize_config_dir(config_directory(), **HYDRA):
         return compose("config", overrides=list(choices))
 
 

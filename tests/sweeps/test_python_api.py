@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import torch
 from command_line import ROOT
+from composing import HYDRA
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from matplotlib.figure import Figure
@@ -159,7 +160,7 @@ def test_ctrl_c_leaves_a_sweep_that_can_be_resumed_and_a_process_as_it_was() -> 
 
 
 def test_runs_inside_another_hydra_application_and_leaves_it_alone() -> None:
-    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+    with initialize_config_dir(str(ROOT / "conf"), **HYDRA):
         before = GlobalHydra.instance()
         found = staf_torch.run(*BARE)
         assert GlobalHydra.instance() is before

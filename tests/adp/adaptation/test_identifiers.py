@@ -174,6 +174,19 @@ def test_an_alarm_opens_the_covariance_of_the_row_that_changed_alone() -> None:
     torch.testing.assert_close(now.theta, second, rtol=0, atol=1e-4)
 
 
+def test_least_squares_take_any_dimensions_of_rows() -> None:
+    """The alarm goes off in some of them, forgetting is on, and no two sizes are the same."""
+    law = adp.LeastSquares([0.0] * 4, deviation=0.1, forgetting=0.5, alarm=3.0)
+    given, now = equations(5, 6, uniform(6, 4, seed=5)), law.init(uniform(6, 2))
+    many = law.init(uniform(3, 2, 2))
+    for equation in given:
+        now = law.step(now, equation, 0.1)
+        many = law.step(many, adp.Equation(*(part.unflatten(0, (3, 2)) for part in equation)), 0.1)
+    assert 0 < float(now.resets.min()) < float(now.resets.max())
+    for flat, deep in zip(now, many, strict=True):
+        assert torch.equal(flat, deep.flatten(0, 1))
+
+
 def test_forgetting_never_opens_the_covariance_beyond_its_first_size() -> None:
     law = adp.LeastSquares([0.0, 0.0], deviation=2.0, forgetting=3.0)
     now = law.init(torch.zeros(1, 2).double())
