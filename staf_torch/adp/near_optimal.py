@@ -171,17 +171,19 @@ def near_optimal(
     high: Limit = None,
     radius: float = 0.1,
     horizon: float | None = None,
-    plan: bool = True,
+    plan: bool = False,
 ) -> NearOptimal:
     """A policy for a plant, held for dt, that costs no more than its LQR.
 
     The rules: the base is the LQR made for dt; the horizon is three time constants of its slowest mode, 12 to
     60 periods; the centers are as many as quadratics need, from four states on the cross-polytope and its
     middle, in a ball of ``radius``; a plant in continuous time is integrated in steps of a fifth of its
-    fastest time constant. Where inputs have bounds and the LQR, followed from a state over the horizon,
-    meets one, the control is the first one of a plan over that horizon, the best that `BoxDDP` finds from the
-    LQR and from holding a bound for a while: rollouts of an LQR do not know what to do before a bound. That
-    takes tens of milliseconds, and a plant in torch, held for one period of its own, without a discount.
+    fastest time constant. Rollouts of an LQR do not know what to do before a bound of the inputs. With
+    ``plan``, where the LQR, followed from a state over the horizon, meets one, the control is the first one
+    of a plan over that horizon, the best that `BoxDDP` finds from the LQR and from holding a bound for a
+    while. That takes tens of milliseconds a control, and a plant in torch, held for one period of its own,
+    without a discount. It regulates more states and is no bound on the cost: every control is planned anew,
+    and two ways around that cost nearly the same may take turns. `RecedingHorizon` carries its plan.
     A simulator so slow that a control takes longer than dt is a warning in the log.
 
     Example:
@@ -203,7 +205,7 @@ def near_optimal(
         high: likewise.
         radius: of the ball of centers, in units of the state: measure states so that 1 is a large one.
         horizon: s; None for the rule above.
-        plan: whether to plan where the LQR would meet a bound. What plans is not exported to C, and loops
+        plan: whether to plan where the LQR would meet a bound. Such a policy is not exported to C, and loops
             with it are not compiled.
 
     Raises:

@@ -82,8 +82,8 @@ def test_report_says_what_was_chosen_and_how_good_it_is() -> None:
 def test_exported_policy_is_the_policy(tmp_path: Path) -> None:
     cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1, low=-2.0, high=1.5)
     with pytest.raises(ValueError, match=r"`policy_of\(controller=...\)` must not plan on the way"):
-        deploy.policy_of(adp.near_optimal(systems.Pendulum(), cost, dt=0.05, horizon=0.4))
-    policy = deploy.policy_of(adp.near_optimal(systems.Pendulum(), cost, dt=0.05, horizon=0.4, plan=False))
+        deploy.policy_of(adp.near_optimal(systems.Pendulum(), cost, dt=0.05, horizon=0.4, plan=True))
+    policy = deploy.policy_of(adp.near_optimal(systems.Pendulum(), cost, dt=0.05, horizon=0.4))
     x = drawn(2, 0.5, 40)
     deploy.export_c(policy, x[:1], tmp_path / "staf.h", ["u"])
     (u,) = runner_c(tmp_path / "staf.h", [1], torch.float64)(x)
@@ -102,7 +102,7 @@ def test_bad_arguments_are_refused_by_name() -> None:
 def test_plan_takes_over_where_the_lqr_would_meet_a_bound() -> None:
     """A mass at 5 m with |u| <= 1: the LQR's rollouts overshoot; the plan is the optimum of its horizon."""
     plant = systems.Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
-    policy = adp.near_optimal(plant, COST, dt=0.25, low=-1.0, high=1.0)
+    policy = adp.near_optimal(plant, COST, dt=0.25, low=-1.0, high=1.0, plan=True)
     x = torch.tensor([[3.0, 1.0], [0.05, 0.0], [-3.0, -1.0]], dtype=torch.float64)
     assert policy.planner is not None
     assert policy.planner.strained(x).tolist() == [True, False, True]
@@ -114,4 +114,5 @@ def test_plan_takes_over_where_the_lqr_would_meet_a_bound() -> None:
     assert torch.equal(policy(x[1]), u[1])
     again = pickle.loads(pickle.dumps(policy))
     torch.testing.assert_close(again(x), u)
-    assert adp.near_optimal(plant, COST, dt=0.25).planner is None
+    assert adp.near_optimal(plant, COST, dt=0.25, plan=True).planner is None
+    assert adp.near_optimal(plant, COST, dt=0.25, low=-1.0, high=1.0).planner is None

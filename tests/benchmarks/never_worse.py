@@ -2,7 +2,7 @@
 
     python tests/benchmarks/never_worse.py [--states 300] [--only TwoState,Pendulum] [--json FILE]
 
-A row a plant: the cost of `adp.near_optimal(plan=False)` over that of its LQR where both regulate, and how
+A row a plant: the cost of `adp.near_optimal` over that of its LQR where both regulate, and how
 many states each regulates. Ends with an error where a state costs more than 1.01 of the base's. Not collected
 by pytest.
 """
@@ -41,7 +41,7 @@ def measure(name: str, count: int) -> dict[str, float | int]:
     plant = make()
     cost = adp.QuadraticCost(q, r, plant.dim, plant.inputs)
     limits = {} if bound is None else {"low": -bound, "high": bound}
-    policy = adp.near_optimal(plant, cost, dt=dt, plan=False, **limits)
+    policy = adp.near_optimal(plant, cost, dt=dt, **limits)
     generator = torch.Generator().manual_seed(12345)
     x0 = width * (2 * torch.rand(count, plant.dim, generator=generator, dtype=torch.float64) - 1)
     runs = [
