@@ -177,6 +177,7 @@ class _Run:
         self._problem, self._warned, self._reach = problem, False, 0.0
         self.carry = start(problem, states, weights)
         self._first = row_program.first_carry(problem, self.carry)
+        self._unit = self._first.unit  # of the last chunk, bit by bit: a row that diverged stays as it was
         self._program = row_program.program(problem, states, self._first, everything=everything)
 
     def chunks(self, states: Tensor) -> tuple[Tensor, ...]:
@@ -254,13 +255,14 @@ class _Run:
             given = row_program.RowCarry(
                 carry._replace(time=torch.full_like(old, begins), diverged_at=old.clamp(max=0)),
                 torch.zeros_like(carry.log_gain),
-                (-carry.log_gain).exp(),
+                self._unit,
             )
             after, outputs = program(given, states, every=every)
             found_at = after.chase.diverged_at
             fresh = torch.where(found_at >= 0, found_at + (start - begins), -1)
             diverged_at = torch.where(old >= 0, old, fresh)
         self.carry = after.chase._replace(time=start + states.shape[1], diverged_at=diverged_at)
+        self._unit = after.unit
         if not self._warned:
             self._warned = self._problem.basis.warn_reach(float(after.reach.max()), stacklevel=5)
         found: row_program.Outputs = outputs

@@ -81,7 +81,8 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
     comparison = Comparison(_COLUMNS, ("cost", "minimum_margin", "constraint_violations"), _log)
     results: dict[str, LoopResult] = {}
     margins: dict[str, Tensor] = {}
-    for name, method in methods(cfg, box, cost).items():
+    compared = methods(cfg, box, cost)
+    for name, method in compared.items():
         results[name] = _simulated(cfg, method, box, x0.to(dtype), steps, every)
         margins[name] = _margin(box, method.plant, results[name])
         measured = _measured(results[name], margins[name], best)
@@ -103,7 +104,7 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
             writer.close(time=first.time.numpy())
     comparison.write(out, "safe_box")
     if cfg.figures:
-        out.figure("safe_box", images(draw_box(_drawn(box, results, margins))))
+        out.figure("safe_box", images(draw_box(_drawn(box, compared, results, margins))))
     return out.metrics(metrics)
 
 
@@ -219,12 +220,14 @@ def _optimum(box: Barrier, cost: Cost, s0: Tensor) -> float | None:
     return finite(found.value[0])
 
 
-def _drawn(box: Barrier, results: dict[str, LoopResult], margins: dict[str, Tensor]) -> BoxHistory:
+def _drawn(
+    box: Barrier, compared: dict[str, Method], results: dict[str, LoopResult], margins: dict[str, Tensor]
+) -> BoxHistory:
     """The first trajectory of every method."""
     of_s = results["LQR of s"]
     paths = {
-        name: (box.inverse(result.state[0]) if result is of_s else result.state[0]).cpu().numpy()
-        for name, result in results.items()
+        name: (box.inverse(r.state[0]) if compared[name].plant is box else r.state[0]).cpu().numpy()
+        for name, r in results.items()
     }
     return BoxHistory(
         time=of_s.time.numpy(),

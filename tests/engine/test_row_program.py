@@ -149,13 +149,14 @@ def test_rows_have_the_bits_that_they_have_in_any_batch_and_beside_any_row() -> 
 
 def test_chunks_of_time_continue_to_the_bit_and_remember_who_diverged() -> None:
     states = circles(9, 60)
-    states[4, 45:] = torch.nan
+    states[4, 45:] = states[2, 25:] = states[7, 19:] = torch.nan
     options = {"basis": BASES["exponential"], "target": Paper(), "law": LAW}
     whole = chase_weights(states, **options)
     parts = chase_weights(states.split(20, dim=1), **options)
     assert torch.equal(parts.weights, whole.weights)
     assert torch.equal(parts.diverged_at, whole.diverged_at)
-    assert whole.diverged_at[4] == 45
+    assert whole.diverged_at[[4, 2, 7]].tolist() == [45, 25, 19]
+    assert torch.equal(parts.weights[7, 19:], whole.weights[7, 18].expand(41, -1))
     last = chase_weights(states.split(20, dim=1), **options, history=False)
     torch.testing.assert_close(last.weights[:, 0], whole.weights[:, -1], rtol=1e-14, atol=0)
 
