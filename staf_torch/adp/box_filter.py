@@ -19,7 +19,7 @@ _LEFT, _LEAST = (
     1e-3,
 )  # share of a distance that a hold leaves, and at least: where no control leaves half
 _MET = 1e-4  # of u, by which a condition may be missed where it counts as met: less than `_LEAST` leaves
-_PASSES = 3  # linearisations of the held plant; it is nearly affine in u, so that three are exact to 1e-6
+_PASSES = 5  # linearisations of the held plant: three are exact to 1e-6 from braking on, not from 0
 _PROBES = 32  # states at which the effect of the inputs is looked for
 _NOTHING = 1e-9  # slope below which there is none
 
@@ -50,6 +50,9 @@ class BoxFilter(nn.Module):
     bounds that is a matter of ``dt`` alone: with ``renewed=True`` a control is held for half the time to the
     next wall, if that is less, and stops the coordinate by then. `simulate(..., substeps=16, renew=True)`
     renews it like that within ``dt``: as close to a control in continuous time as the state asks for.
+
+    One hold is looked ahead. A policy that brakes by itself, the LQR of s, is kept wherever a control exists;
+    one that never does, u = 0, comes to corners where the walls of two coordinates contradict each other.
 
     Example:
         >>> box = systems.Barrier(systems.TwoStateChain(), low=[-7.0, -5.0], high=[5.0, 7.0])

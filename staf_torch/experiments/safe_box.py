@@ -93,7 +93,7 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
             left = constraint_metrics(tried, _margin(box, method.plant, tried))["constraint_violations"]
             measured[f"{what}_fraction"] = (left or 0.0) / len(starts)
         comparison.add("" if name == "LQR of s" else _prefix(name), measured, method=name)
-    metrics = {"optimal_cost": best} | comparison.metrics | _unavoidable(cfg, box, others)
+    metrics = {"optimal_cost": best} | comparison.metrics | _unavoidable(cfg, box, cost, others)
     out = RunDirectory(directory)
     if cfg.history:
         first = results["LQR of s"]
@@ -157,9 +157,9 @@ def _measured(result: LoopResult, margin: Tensor, best: float | None) -> dict[st
     return measured
 
 
-def _unavoidable(cfg: DictConfig, box: Barrier, starts: dict[str, Tensor]) -> Metrics:
+def _unavoidable(cfg: DictConfig, box: Barrier, cost: Cost, starts: dict[str, Tensor]) -> Metrics:
     """The starts that no control held for dt keeps inside: their shares, and their numbers in the log."""
-    guard = BoxFilter(lambda s: s.new_zeros(*s.shape[:-1], box.inputs), box, dt=float(cfg.dt))
+    guard = BoxFilter(LQR(box, cost), box, dt=float(cfg.dt))
     found: Metrics = {}
     for what, x in starts.items():
         rows = (guard.share(box.transform(x)) >= 1).nonzero().flatten().tolist()

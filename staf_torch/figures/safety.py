@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from .style import WIDTH, colour, curves, dash, legend_above, letter, page
+from .style import WIDTH, colour, curves, dash, legend_above, legend_of_all, letter, page
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -36,7 +36,7 @@ def draw_box(history: BoxHistory) -> Figure:
             cost.plot(history.time, history.costs[name], dash(i), color=colour(i), label=name)
         walls(plane, history.low[:2], history.high[:2])
         plane.set(xlabel="$x_1$", ylabel="$x_2$")
-        legend_above(plane, 3)
+        legend_of_all(figure, plane, 3)
         margin.set_ylabel("distance to the nearest wall")
         margin.set_ylim(bottom=0)
         curves(barrier, history.time, history.barrier_state, "$s_{%d}$")

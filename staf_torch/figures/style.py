@@ -137,6 +137,13 @@ def legend_above(axes: Axes, columns: int) -> None:
     axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=min(columns, 5), borderaxespad=0.2)
 
 
+def legend_of_all(figure: Figure, axes: Axes, most: int) -> None:
+    """Put one legend above all panels, with the lines of one of them, ``most`` in a row."""
+    handles, labels = axes.get_legend_handles_labels()
+    columns = min(len(labels), most)
+    figure.legend(handles, labels, loc="outside upper center", ncols=columns, handlelength=3.2)
+
+
 def positive(values: np.ndarray) -> np.ndarray:
     """Leave a gap at zeros, which cannot stand on a logarithmic axis."""
     return np.where(values > 0, values, np.nan)

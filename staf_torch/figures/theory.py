@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from .style import WIDTH, colour, dash, letter, marker, page, positive, subplots, ticks
+from .style import WIDTH, colour, dash, legend_of_all, letter, marker, page, positive, subplots, ticks
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -79,7 +79,7 @@ def draw_exponential_bound(found: Mapping[tuple[float, float], Mapping[str, floa
             axes.set_xlabel(r"largest error $\epsilon$")
             axes.tick_params(labelbottom=True)
         _plain_ticks(grid[0], found)
-        _legend_of(figure, grid[0], 6)
+        legend_of_all(figure, grid[0], 6)
     return figure
 
 
@@ -102,13 +102,6 @@ def _bounds(axes: Axes, rows: Mapping[float, Mapping[str, float | None]]) -> Non
     axes.set_xlim(max(epsilon) * 1.5, min(epsilon) / 1.5)  # what is asked grows to the right
 
 
-def _legend_of(figure: Figure, axes: Axes, most: int) -> None:
-    """One legend above all panels, with the lines of one of them."""
-    handles, labels = axes.get_legend_handles_labels()
-    columns = min(len(labels), most)
-    figure.legend(handles, labels, loc="outside upper center", ncols=columns, handlelength=3.2)
-
-
 def draw_feasibility(found: Feasibility) -> Figure:
     """M that is needed along the trajectory at one radius, and for all of it against the radius."""
     with page(WIDTH, 3.2) as figure:
@@ -128,7 +121,7 @@ def draw_feasibility(found: Feasibility) -> Figure:
         ticks(right, "x", found.radii)
         right.set_xlabel("radius $r$ of the ball")
         letter((left, right), f"at each state, $r = {found.radius:g}$", "along the whole trajectory")
-        _legend_of(figure, right, 6)
+        legend_of_all(figure, right, 6)
     return figure
 
 
