@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -48,14 +47,3 @@ def _rebuilt(like: Tree, found: Any) -> Tree:
     if isinstance(like, Tensor):
         return next(found)
     return type(like)(*(_rebuilt(part, found) for part in like))
-
-
-def empty_row(x: Tensor, size: int) -> Tensor:
-    """Room for nothing, or zeros: (B, size)."""
-    return x.new_zeros(len(x), size)
-
-
-def rows_of(value: float | Sequence[float] | Tensor, x: Tensor) -> Tensor:
-    """One number a row, from a number or one each: (B,)."""
-    given = torch.as_tensor(value, dtype=x.dtype, device=x.device)
-    return given.expand(len(x)).clone()

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ...numerics.checks import fail, integer, number
-from ...systems import Bounds, ControlAffineSystem, Plant
+from ...systems import Bounds, ControlAffineSystem
 
 Regressor = Callable[[Tensor, Tensor], Tensor]
 """Y from x and u: (..., n), (..., m) -> (..., n, p)."""
@@ -192,14 +192,3 @@ class ParametricPlant(ControlAffineSystem):
             raise fail(
                 "ParametricPlant", "rows", "must have all states whose regressor does not vanish", self.rows
             )
-
-
-def parametric(call: str, name: str, plant: Plant) -> ParametricPlant:
-    """The plant, if it is linear in its parameters.
-
-    Raises:
-        ValueError: if it is another one.
-    """
-    if not isinstance(plant, ParametricPlant):
-        raise fail(call, name, "must be a ParametricPlant", type(plant).__name__)
-    return plant
