@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from ..lanes import Program
 from ..lanes.kept import Kept, number
 from ..lanes.tree import flatten, unflatten
-from ..numerics.checks import choice, fail, integer, positive_real
+from ..numerics.checks import choice, fail, flag, integer, positive_real
 from ..systems import Plant
 from .controllers import Carried, Controller, ControllerState, Feedback
 from .cost import Cost
@@ -73,10 +73,10 @@ class ClosedLoop(nn.Module):
         self.dt = positive_real("ClosedLoop", "dt", dt)
         self.substeps = integer("ClosedLoop", "substeps", substeps, least=1)
         self.limit = positive_real("ClosedLoop", "limit", limit)
-        if renew and (not isinstance(controller, Feedback) or system.period is not None):
+        self.renew = flag("ClosedLoop", "renew", renew)
+        if self.renew and (not isinstance(controller, Feedback) or system.period is not None):
             rule = "needs a feedback law and a plant in continuous time"
             raise fail("ClosedLoop", "renew", rule, controller.label)
-        self.renew = renew
         self.euler = integrator == "euler" and system.period is None
         self.holding = Holding("ClosedLoop", system, self.cost, self.dt, self.substeps)
 

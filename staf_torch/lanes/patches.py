@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import sys
 import threading
 from collections.abc import Iterator
@@ -18,7 +19,7 @@ _KEEPING = frozenset(
     f"lanes.{name}" for name in ("build", "compiler", "program", "trace_cache")
 )  # know no step
 _OTHERS = frozenset(("torch", "numpy", "scipy", "gymnasium", "mujoco", "hydra", "omegaconf", "matplotlib"))
-_OTHERS |= sys.stdlib_module_names - {"__main__"}
+_OTHERS |= sys.stdlib_module_names - {"__main__", "unittest"}
 _seen: dict[
     str, tuple[list[Any], bool]
 ] = {}  # what was in a module and its classes, and whether it was its own
@@ -78,8 +79,14 @@ def _functions(value: Any) -> Iterator[FunctionType]:
     else:
         parts = (getattr(value, "__func__", value),)  # of a static or class method
     for part in parts:
+        while isinstance(part, functools.partial):
+            part = part.func
         if isinstance(part, FunctionType):
             yield part
+        elif not isinstance(part, type) and callable(part):
+            called = type(part).__call__
+            if isinstance(called, FunctionType):
+                yield called  # an object in the place of a function, a mock say
         inner = (
             None if isinstance(part, type) else getattr(part, "__wrapped__", None)
         )  # of a cache, a decorator

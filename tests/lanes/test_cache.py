@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import importlib
 import io
@@ -11,6 +12,7 @@ import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import pytest
 import torch
@@ -64,6 +66,11 @@ def test_a_method_that_was_replaced_meets_no_old_trace(
     assert len(list(cache.iterdir())) == 1  # nor is it written for others
 
 
+class Called:
+    def __call__(self, *given: Any) -> Any:
+        return given
+
+
 @pytest.mark.parametrize(
     "put",
     [
@@ -71,6 +78,9 @@ def test_a_method_that_was_replaced_meets_no_old_trace(
         lambda patch: patch.setattr(kernels.ExponentialKernel, "forward", staticmethod(twice)),
         lambda patch: patch.setattr(kernels.ExponentialKernel, "state_free", property(twice)),
         lambda patch: patch.setattr(kernels.ExponentialKernel, "forward", kernels.GaussianKernel.forward),
+        lambda patch: patch.setattr(kernels.ExponentialKernel, "forward", functools.partial(twice, None)),
+        lambda patch: patch.setattr("staf_torch.numerics.linalg.pivoted_cholesky", mock.MagicMock()),
+        lambda patch: patch.setattr("staf_torch.numerics.linalg.pivoted_cholesky", Called()),
     ],
 )
 def test_foreign_functions_are_seen_and_the_librarys_own_are_not(
