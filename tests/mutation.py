@@ -3,9 +3,9 @@
     python tests/mutation.py [--sample 100] [--seed 0] [--package kernels optim] [--jobs 2] [--minutes 30]
 
 A mutant runs the tests that execute its line, those of the same folder first and the short ones first,
-until one fails (`mutation_fork.py`). Which tests execute which line is measured once (`mutation_map.py`) and
-kept in the user's cache. The committed tree counts, not the working one. Mutants in `mutants_accepted.py`
-change nothing that can be seen.
+until one fails (`mutation_judge.py`). Which tests execute which line is measured once a file of tests
+(`mutation_map.py`) and kept in the user's cache. The committed tree counts, not the working one. Mutants in
+`mutants_accepted.py` change nothing that can be seen.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ import time
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 from mutants import Mutant, mutants_of
-from mutation_fork import Verdict, begin, judge
-from mutation_map import Map, as_map, measure, moved
+from mutation_fork import begin
+from mutation_judge import Verdict, begin_judging, fail_anyway, judge
+from mutation_map import kept_at, known, measure, test_files
 
 ROOT = Path(__file__).resolve().parent.parent
 CACHE = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "staf_torch-mutation"
@@ -40,25 +40,30 @@ def main() -> int:
     """Run the command line; the exit code is 1 where too few of them are killed."""
     options = _options()
     begun = time.monotonic()
+    until = begun + 60 * options.minutes
+    compiled = CACHE.parent / "staf_torch"
     with tempfile.TemporaryDirectory(prefix="staf-mutation-") as scratch:
         tree = Path(scratch) / "tree"
-        commit = _git("rev-parse", options.commit).strip()
-        _export(commit, tree)
+        _export(_git("rev-parse", options.commit).strip(), tree)
+        _prepare(tree)
+        _measure_the_new(tree, compiled, options.jobs, until)
         found = list(_all_mutants(tree, options.package, options.file))
         chosen = random.Random(options.seed).sample(found, min(options.sample, len(found)))[options.skip :]
         if options.again:
             chosen = list(_survivors(options.again.read_text(), found))
-        known = _known(commit, tree, options.jobs)
         print(f"{len(found)} mutants, {len(chosen)} of them by seed {options.seed}", flush=True)
-        _prepare(tree)
         verdicts = []
-        until = begun + 60 * options.minutes
-        arguments = tree, known, CACHE.parent / "staf_torch", options.seconds, until
-        with multiprocessing.get_context("fork").Pool(options.jobs, begin, arguments) as pool:
-            for verdict in pool.imap_unordered(judge, chosen):
+        arguments = tree, compiled, known(CACHE / "map", tree), options.seconds, until
+        with multiprocessing.get_context("fork").Pool(options.jobs, begin_judging, arguments) as pool:
+            for verdict in pool.imap(judge, chosen):
                 if verdict is not None:
                     verdicts.append(verdict)
                     _tell(verdict)
+            witnesses = sorted({verdict.by for verdict in verdicts if "::" in verdict.by})
+            liars = set(pool.apply(fail_anyway, [witnesses]))
+    for liar in sorted(liars):
+        print(f"no witness, fails with the right code: {liar}")
+    verdicts = [each._replace(said="survived") if each.by in liars else each for each in verdicts]
     print(f"{time.monotonic() - begun:.0f} s; no time for {len(chosen) - len(verdicts)} of the sample")
     return int(_report(verdicts) < options.least)
 
@@ -107,40 +112,22 @@ def _survivors(output: str, found: Sequence[Mutant]) -> Iterator[Mutant]:
         yield from sorted(alike, key=lambda m: abs(m.line - int(line)))[:1]
 
 
-def _texts(tree: Path) -> dict[str, str]:
-    paths = sorted((tree / "staf_torch").rglob("*.py"))
-    return {str(path.relative_to(tree)): path.read_text(encoding="utf-8") for path in paths}
-
-
-def _known(commit: str, tree: Path, jobs: int) -> Map:
-    """The map of a commit: the kept one, or that of the latest ancestor with what changed measured again."""
-    kept = CACHE / f"{commit}.json"
-    if kept.exists():
-        return as_map(json.loads(kept.read_text())["found"])
-    CACHE.mkdir(parents=True, exist_ok=True)
-    older = next((c for c in _git("rev-list", commit).split() if (CACHE / f"{c}.json").exists()), None)
-    if older is None:
-        print("measuring which test executes which line: runs the suite once", flush=True)
-        found = _measured(tree, ["tests"], jobs)
-    else:
-        before = json.loads((CACHE / f"{older}.json").read_text())
-        found = moved(before["found"], before["texts"], _texts(tree))
-        changed = _git("diff", "--name-only", older, commit, "--", "tests").split()
-        files = [each for each in changed if Path(each).name.startswith("test_") and (tree / each).exists()]
-        print(f"map of {older[:8]}; measuring {len(files)} files of tests again", flush=True)
-        for kind in ("lines", "tests", "seconds"):
-            found[kind] = {
-                n: value for n, value in found[kind].items() if n.partition("::")[0] not in changed
-            }
-        for kind, values in (_measured(tree, files, jobs) if files else {}).items():
-            found[kind] |= values
-    kept.write_text(json.dumps({"found": found, "texts": _texts(tree)}))
-    return as_map(found)
-
-
-def _measured(tree: Path, tests: Sequence[str], jobs: int) -> dict[str, Any]:
-    with tempfile.TemporaryDirectory(prefix="staf-mutation-map-") as folder:
-        return measure(tree, tests, Path(folder), jobs)
+def _measure_the_new(tree: Path, compiled: Path, jobs: int, until: float) -> None:
+    """Measure which lines are executed by the files of tests that changed since the map was made."""
+    store = CACHE / "map"
+    store.mkdir(parents=True, exist_ok=True)
+    new = [each for each in test_files(tree) if not kept_at(store, tree, each).exists()]
+    if not new:
+        return
+    print(f"measuring which lines {len(new)} files of tests execute", flush=True)
+    with multiprocessing.get_context("fork").Pool(jobs, begin, (tree, compiled)) as pool:
+        for name, found in pool.imap_unordered(measure, new):
+            if found is not None:
+                kept_at(store, tree, name).write_text(json.dumps(found))
+                print(f"{sum(found['seconds'].values()):6.1f} s {len(found['seconds']):4} {name}", flush=True)
+            if time.monotonic() > until:
+                pool.terminate()
+                raise SystemExit("no time left; what was measured is kept")
 
 
 def _prepare(tree: Path) -> None:
