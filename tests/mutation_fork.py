@@ -1,4 +1,4 @@
-"""Tests of a tree of files in a fork of a process that has torch: for `mutation_map.py` and `mutation_judge.py`."""
+"""Tests of a tree in a fork of a process that has torch: for `mutation_map.py` and `mutation_judge.py`."""
 
 from __future__ import annotations
 
