@@ -15,6 +15,7 @@ from mutation_fork import begin, in_fork, place
 from mutation_map import Map, places, tests_near
 
 OVERHEAD = 0.1  # seconds that a test costs beside what was measured
+UNKNOWN = 5.0  # seconds that a file of tests is taken for
 FIRST = 4.0  # seconds of tests that are tried before files of more tests are read
 
 
@@ -74,14 +75,16 @@ def judge(mutant: Mutant) -> Verdict | None:
 
 def fail_anyway(tests: Sequence[str]) -> list[str]:
     """Those of some tests that fail in this process with the right code: they are no witnesses."""
+    if not tests:
+        return []
     chosen = Chosen(tests)
-    in_fork(chosen.files, chosen, 60 + 5 * sum(_map.seconds.get(test, 0.0) for test in tests), stop=False)
+    in_fork(chosen.files, chosen, 60 + 5 * sum(_cost(test) for test in tests), stop=False)
     return chosen.read()
 
 
 def _run(tests: Sequence[str]) -> tuple[str, str]:
     chosen = Chosen(tests)
-    limit = 60 + 5 * sum(_map.seconds.get(test, 0.0) for test in tests)
+    limit = 60 + 5 * sum(_cost(test) for test in tests)
     code = in_fork(chosen.files, chosen, limit, stop=True)
     if code is None:
         return "killed", "by the clock, or the process ended"
@@ -92,9 +95,17 @@ def _groups(tests: Sequence[str]) -> list[list[str]]:
     """What is short first; the rest only where that says nothing, since reading its files takes a while."""
     total, first = 0.0, 0
     while first < len(tests) and (first == 0 or total < FIRST):
-        total += _map.seconds.get(tests[first], 0.0) + OVERHEAD
+        total += _cost(tests[first]) + OVERHEAD
         first += 1
     return [each for each in (list(tests[:first]), list(tests[first:])) if each]
+
+
+def _cost(test: str) -> float:
+    return _map.seconds.get(test, 0.0 if "::" in test else UNKNOWN)
+
+
+def _file(test: str) -> str:
+    return test.partition("::")[0]
 
 
 def _tests_for(mutant: Mutant, source: str) -> list[str]:
@@ -103,8 +114,8 @@ def _tests_for(mutant: Mutant, source: str) -> list[str]:
     near = {test: 0 if test.startswith(places(mutant.file)) else 1 for test in hits}
     chosen: list[str] = []
     total = 0.0
-    for test in sorted(hits, key=lambda test: (near[test], _map.seconds.get(test, 0.0), test)):
-        total += _map.seconds.get(test, 0.0) + OVERHEAD
+    for test in sorted(hits, key=lambda test: (near[test], _cost(test), test)):
+        total += _cost(test) + OVERHEAD
         if chosen and total > _seconds:
             break
         chosen.append(test)
@@ -128,14 +139,15 @@ class Chosen:
     def __init__(self, tests: Sequence[str]) -> None:
         """Tests are named as pytest does, files before their tests."""
         self.rank = {test: at for at, test in enumerate(tests)}
-        self.files = sorted({test.partition("::")[0] for test in tests})
+        self.files = sorted({_file(test) for test in tests})
         self.said = place().parent / f"failed-{place().name}.txt"
         self.said.write_text("")
 
     def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
         """Keep the chosen ones."""
-        items[:] = [item for item in items if item.nodeid in self.rank]
-        items.sort(key=lambda item: self.rank[item.nodeid])
+        at = {id(item): self.rank.get(item.nodeid, self.rank.get(_file(item.nodeid))) for item in items}
+        items[:] = [item for item in items if at[id(item)] is not None]
+        items.sort(key=lambda item: at[id(item)])
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
         """Write down a test that fails."""

@@ -48,6 +48,7 @@ class Map(NamedTuple):
 
     lines: Mapping[str, Mapping[int, set[str]]]  # file -> line -> tests
     seconds: Mapping[str, float]  # of the processor, for a test and the fixtures that were made for it
+    unmeasured: tuple[str, ...] = ()  # files of tests
 
 
 # Measured
@@ -203,10 +204,12 @@ def known(store: Path, tree: Path) -> Map:
     """The map of a tree, of what is kept for its files of tests."""
     lines: dict[str, dict[int, set[str]]] = defaultdict(lambda: defaultdict(set))
     seconds: dict[str, float] = {}
+    unmeasured = []
     now = {str(path.relative_to(tree)): hash_of(path) for path in (tree / "staf_torch").rglob("*.py")}
     for test_file in test_files(tree):
         kept = kept_at(store, tree, test_file)
         if not kept.exists():
+            unmeasured.append(test_file)
             continue
         found = json.loads(kept.read_text())
         places = {
@@ -218,7 +221,7 @@ def known(store: Path, tree: Path) -> Map:
                 for number in numbers if file in places else ():
                     if number in places[file]:
                         lines[file][places[file][number]].update(users)
-    return Map(lines, seconds)
+    return Map(lines, seconds, tuple(unmeasured))
 
 
 def _users(tests: Mapping[str, Iterable[str]]) -> dict[str, list[str]]:
@@ -259,7 +262,7 @@ def tests_near(known: Map, file: str, first: int, last: int, around: tuple[int, 
     """Tests that execute some lines.
 
     Where that happens at import, or not at all: those of the function or class around, or else of the file,
-    or else of the folder.
+    or else of the folder. Files of the folder that were not measured count as a test each.
 
     Args:
         known: the map.
@@ -272,13 +275,14 @@ def tests_near(known: Map, file: str, first: int, last: int, around: tuple[int, 
         The tests; none where the folder has none.
     """
     there = known.lines.get(file, {})
+    whole = {test for test in known.unmeasured if test.startswith(places(file))}
     order = sorted(there)
     for begin, end in ((first, last), around[:2], (0, 10**9)):
         span = order[bisect.bisect_left(order, begin) : bisect.bisect_right(order, end)]
         hits = set().union(*(there[number] for number in span)) if span else set()
         if hits and not (around[2] and (begin, end) == (first, last)):
-            return hits
-    return {test for test in known.seconds if test.startswith(places(file))}
+            return hits | whole
+    return {test for test in known.seconds if test.startswith(places(file))} | whole
 
 
 def places(file: str) -> tuple[str, ...]:
