@@ -9,6 +9,7 @@ from torch import Tensor
 import staf_torch as st
 from staf_torch.online.bank import Bank
 from staf_torch.online.bank_rules import BankShape
+from staf_torch.online.quadratic_models import QuadraticModels
 
 COMPILED = Bank(BankShape(2, 1, 128, 8), 1, True).compiled
 needs_compiler = pytest.mark.skipif(not COMPILED, reason="needs a C++ compiler")
@@ -190,3 +191,38 @@ def test_a_bank_counts_what_it_learned_and_what_it_skipped() -> None:
         bank.learn(torch.full((2, 2), float(at), dtype=torch.float64), y)
     assert bank.learned.tolist() == [5, 4]
     assert bank.skipped.tolist() == [0, 1]
+
+
+@pytest.mark.parametrize("kind", ["definition", pytest.param("compiled", marks=needs_compiler)])
+@pytest.mark.parametrize("given", [(0.5, torch.inf), (torch.nan, torch.nan), (0.5, 0.5)])
+@pytest.mark.parametrize("told", [(1.0, 1.0), (1.0, -torch.inf), (torch.nan, torch.nan), (torch.nan, 1.0)])
+def test_a_sample_with_nothing_to_learn_is_skipped_and_does_no_harm(
+    kind: str, given: tuple[float, float], told: tuple[float, float]
+) -> None:
+    """An input that is infinite or was not measured at all, a target that is infinite or not there."""
+    bank = Bank(BankShape(2, 2, 80, 10), 1, True)
+    bank = bank if kind == "compiled" else definition_of(bank)
+    x, y = streams(4, 1, outputs=2)
+    for state, value in zip(x, y, strict=True):
+        bank.learn(state, value)
+    bank.learn(torch.tensor([given]).double(), torch.tensor([told]).double())
+    sound = given == (0.5, 0.5) and told[1] == 1.0
+    assert bank.learned.tolist() == [5 if sound else 4]
+    assert bank.skipped.tolist() == [0 if sound else 1]
+    assert all(torch.isfinite(part).all() for part in bank.predict(x[1]))
+
+
+def test_models_that_overflow_begin_anew_and_the_others_go_on() -> None:
+    """Two rates of forgetting: one model is broken by hand, as features that overflow would."""
+    prior = torch.tensor([2.0, 3.0], dtype=torch.float64)
+    features, values = torch.tensor([1.0, -0.5, 2.0]).double(), torch.tensor([0.7]).double()
+    models = QuadraticModels(torch.empty(6, 2).double(), torch.empty(1, 3, 2).double())
+    models.restart(prior)
+    fresh = [part.clone() for part in models]
+    models.learn(features, values, torch.tensor([1.0, 0.9]).double(), prior)
+    other = [part[..., 0].clone() for part in models]
+    models.coefficients[0, 0, 1] = torch.inf
+    models.learn(0 * features, values, torch.tensor([1.0, 0.9]).double(), prior)
+    for part, new, kept in zip(models, fresh, other, strict=True):
+        torch.testing.assert_close(part[..., 1], new[..., 1], rtol=0, atol=0)
+        torch.testing.assert_close(part[..., 0], kept, rtol=0, atol=0)
