@@ -48,7 +48,7 @@ _COLUMNS = {
     "ratio_max": "largest",
     "regulated": "regulated",
     "found_median": "found after (s), median",
-    "parameter_error": "largest error of a parameter",
+    "parameter_error": "largest error of a parameter, over max(1, abs theta)",
 }
 _RECORDED = 0.01  # s between recorded times, about
 _SETTLED = 1.0  # s at the end in which a regulated state stays near the origin

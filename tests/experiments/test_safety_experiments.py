@@ -7,9 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from composing import settings
 
 from staf_torch.experiments import avoidance, safe_box
+from staf_torch.experiments.vehicles import vehicle
 
 FEW = ("safe_box.states=4", "safe_box.decay=20", "safe_box.followed=0.01", "safe_box.substeps=4")
 SHORT = ("duration=0.02", "dt=0.01", "trajectories=2", "adp.optimum.shooting=false", "adp.compile=false")
@@ -61,6 +63,23 @@ def test_among_discs_the_filter_has_a_row_beside_the_lqr_and_a_film(tmp_path: Pa
     with np.load(tmp_path / "history.npz") as history:
         assert history["state"].shape == (3, 6, 12)
         assert float(history["distance"].min()) == pytest.approx(metrics["minimum_margin"])
+
+
+def test_a_unicycle_keeps_off_the_discs_that_its_policy_drives_into(tmp_path: Path) -> None:
+    short = ("duration=6", "dt=0.1", "trajectories=6", "figures=false", "history=false", "adp.compile=false")
+    cfg = settings("experiment=avoidance", "avoidance.vehicle=unicycle", "avoidance.discs=2", *short)
+    metrics = avoidance.run(cfg, tmp_path)
+    assert metrics["constraint_violations"] == 0 < metrics["lookahead_constraint_violations"]
+    assert metrics["minimum_margin"] > 0 > metrics["lookahead_minimum_margin"]
+    with pytest.raises(ValueError, match="vehicle"):
+        avoidance.run(settings("experiment=avoidance", "avoidance.vehicle=tram"), tmp_path)
+
+
+def test_the_point_ahead_of_a_unicycle_goes_straight_to_the_origin() -> None:
+    one = vehicle(settings("experiment=avoidance", "avoidance.vehicle=unicycle"), 0.02)
+    x = torch.tensor([[1.0, -2.0, 0.7], [0.1, 0.3, -2.0]], dtype=torch.float64)
+    moved = x + 1e-6 * one.rate(x, one.policy(x))
+    torch.testing.assert_close((one.point(moved) - one.point(x)) / 1e-6, -one.point(x), rtol=1e-5, atol=1e-5)
 
 
 def test_scenarios_begin_clear_of_the_discs_and_are_the_same_again() -> None:
