@@ -24,11 +24,20 @@ from ..results import run_record as records
 from ..results.progress import Progress
 from ..results.reader import Value
 from ..results.run_directory import RunDirectory
+from ..settings.plain import ManySettings
 from ..tables import Table
 from . import lock
 from .batching import Computed, Failed, Outcome, completion, reason
 from .executors import Inline, compute
-from .hydra_compat import Composer, ConfigLoader, Product, config_loader, parse_override, sweep_size
+from .hydra_compat import (
+    Composer,
+    ConfigLoader,
+    PlainComposer,
+    Product,
+    config_loader,
+    parse_override,
+    sweep_size,
+)
 from .member_rows import FOLDER, Left, left, made_by, rows_left, writer
 
 _log = logging.getLogger(__name__)
@@ -73,16 +82,16 @@ def run(
     loader = config_loader()
     jobs = member_overrides(cfg.members, loader)
     fixed = ("figures=false", f"history={str(keep).lower()}")
-    composer = Composer(loader, config_name, hydra_node=False, always=[*base, *fixed])
+    composer = PlainComposer(Composer(loader, config_name, hydra_node=False, always=[*base, *fixed]))
     out, tally, before = RunDirectory(directory), _Tally(), start.left
     done = len(before.made)
 
-    def composed(begin: int) -> list[DictConfig]:
-        return [composer([*base, *job, *fixed]) for job in jobs[begin : begin + _PIECE]]
+    def composed(begin: int) -> ManySettings:
+        return composer([[*base, *job, *fixed] for job in jobs[begin : begin + _PIECE]])
 
     cfgs = composed(0)  # before anything is written: most wrong names are refused here
     for begin in range(0, done, _PIECE):
-        made = [made_by(records.flat(one)) for one in (composed(begin) if begin else cfgs)]
+        made = [made_by(one) for one in (composed(begin) if begin else cfgs).flat]
         _refuse_others(jobs, begin, made, before.made[begin : begin + _PIECE])
     for row in rows_left(directory, done) if done else ():
         tally.add([row])
@@ -100,14 +109,13 @@ def run(
             places = [directory / FOLDER / str(begin + index) for index in range(len(part))]
             rows: list[dict[str, Any]] = [{} for _ in part]
             completed = range(max(0, min(done - begin, len(part))))
-            flat = [records.flat(one) for one in cfgs]
             for index, outcome, _ in compute(
-                cfgs, places, Inline(), finished=completed, flat=flat, tell=lambda jobs: None
+                cfgs, places, Inline(), finished=completed, flat=cfgs.flat, tell=lambda jobs: None
             ):
                 row = {"num": begin + index, "overrides": part[index]}
-                rows[index] = row | _result(cfgs[index], outcome, places[index], keep, progress)
+                rows[index] = row | _result(cfgs, index, outcome, places[index], keep, progress)
                 advance(1)
-            write(rows[len(completed) :], [made_by(one) for one in flat[len(completed) :]])
+            write(rows[len(completed) :], [made_by(one) for one in cfgs.flat[len(completed) :]])
             tally.add(rows[len(completed) :])
     tally.report()
     return out.metrics(tally.counts())
@@ -188,7 +196,7 @@ def member_overrides(setting: Any, loader: ConfigLoader) -> Sequence[list[str]]:
 
 
 def _result(
-    cfg: DictConfig, outcome: Outcome, directory: Path, keep: bool, progress: Progress
+    cfgs: ManySettings, index: int, outcome: Outcome, directory: Path, keep: bool, progress: Progress
 ) -> dict[str, Any]:
     """Return what a row says of the end of a member; its files are written where they are kept."""
     try:
@@ -197,7 +205,7 @@ def _result(
         else:
             if not isinstance(outcome, Failed):
                 directory.mkdir(parents=True, exist_ok=True)
-            metrics = completion(cfg, outcome)(cfg, directory, progress)
+            metrics = completion(cfgs[index], outcome)(cfgs[index], directory, progress)
     except Exception as error:
         return {"status": "failed", "reason": reason(error), "metrics": {}}
     return {"status": "completed", "reason": None, "metrics": metrics}
