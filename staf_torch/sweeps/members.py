@@ -9,12 +9,13 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
-import statistics
+import tempfile
 from array import array
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import IO, Any, NamedTuple
 
+import numpy as np
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 
@@ -83,7 +84,7 @@ def run(
     jobs = member_overrides(cfg.members, loader)
     fixed = ("figures=false", f"history={str(keep).lower()}")
     composer = PlainComposer(Composer(loader, config_name, hydra_node=False, always=[*base, *fixed]))
-    out, tally, before = RunDirectory(directory), _Tally(), start.left
+    out, before = RunDirectory(directory), start.left
     done = len(before.made)
 
     def composed(begin: int) -> ManySettings:
@@ -93,32 +94,33 @@ def run(
     for begin in range(0, done, _PIECE):
         made = [made_by(one) for one in (composed(begin) if begin else cfgs).flat]
         _refuse_others(jobs, begin, made, before.made[begin : begin + _PIECE])
-    for row in rows_left(directory, done) if done else ():
-        tally.add([row])
-    if done:
-        _log.info("%d of %d members were completed before", done, len(jobs))
-    with (
-        _saying_how_to_resume(directory, tally, len(jobs)),
-        progress.over(len(jobs), "members") as advance,
-        writer(directory, start.run, len(jobs), before) as write,
-    ):
-        advance(done)
-        for begin in range(done // _PIECE * _PIECE, len(jobs), _PIECE):
-            part = jobs[begin : begin + _PIECE]
-            cfgs = composed(begin) if begin else cfgs
-            places = [directory / FOLDER / str(begin + index) for index in range(len(part))]
-            rows: list[dict[str, Any]] = [{} for _ in part]
-            completed = range(max(0, min(done - begin, len(part))))
-            for index, outcome, _ in compute(
-                cfgs, places, Inline(), finished=completed, flat=cfgs.flat, tell=lambda jobs: None
-            ):
-                row = {"num": begin + index, "overrides": part[index]}
-                rows[index] = row | _result(cfgs, index, outcome, places[index], keep, progress)
-                advance(1)
-            write(rows[len(completed) :], [made_by(one) for one in cfgs.flat[len(completed) :]])
-            tally.add(rows[len(completed) :])
-    tally.report()
-    return out.metrics(tally.counts())
+    with contextlib.closing(_Tally(directory)) as tally:
+        for row in rows_left(directory, done) if done else ():
+            tally.add([row])
+        if done:
+            _log.info("%d of %d members were completed before", done, len(jobs))
+        with (
+            _saying_how_to_resume(directory, tally, len(jobs)),
+            progress.over(len(jobs), "members") as advance,
+            writer(directory, start.run, len(jobs), before) as write,
+        ):
+            advance(done)
+            for begin in range(done // _PIECE * _PIECE, len(jobs), _PIECE):
+                part = jobs[begin : begin + _PIECE]
+                cfgs = composed(begin) if begin else cfgs
+                places = [directory / FOLDER / str(begin + index) for index in range(len(part))]
+                rows: list[dict[str, Any]] = [{} for _ in part]
+                completed = range(max(0, min(done - begin, len(part))))
+                for index, outcome, _ in compute(
+                    cfgs, places, Inline(), finished=completed, flat=cfgs.flat, tell=lambda jobs: None
+                ):
+                    row = {"num": begin + index, "overrides": part[index]}
+                    rows[index] = row | _result(cfgs, index, outcome, places[index], keep, progress)
+                    advance(1)
+                write(rows[len(completed) :], [made_by(one) for one in cfgs.flat[len(completed) :]])
+                tally.add(rows[len(completed) :])
+        tally.report()
+        return out.metrics(tally.counts())
 
 
 @contextlib.contextmanager
@@ -212,13 +214,21 @@ def _result(
 
 
 class _Tally:
-    """What the log says of all members in the end, and their counts; many rows are not kept."""
+    """What the log says of all members in the end, and their counts.
 
-    def __init__(self) -> None:
+    Many rows are not kept, and the numbers of a metric lie in a file without a name: memory does not grow
+    with the members.
+
+    Args:
+        directory: of the run.
+    """
+
+    def __init__(self, directory: Path) -> None:
+        self._directory, self._files = directory, contextlib.ExitStack()
         self._count = self._failed = self._diverged = 0
         self._rows: list[dict[str, Any]] = []  # while they are few
         self._bad: list[dict[str, Any]] = []
-        self._numbers: dict[str, array[float]] = {}
+        self._numbers: dict[str, IO[bytes]] = {}
 
     def add(self, rows: Sequence[dict[str, Any]]) -> None:
         """Count further rows."""
@@ -229,10 +239,15 @@ class _Tally:
                 self._failed += 1
                 self._bad += [row] * (len(self._bad) < _LISTED)
             self._rows += [row] * (len(self._rows) <= _LISTED)
-            for name, value in row["metrics"].items():
-                numbers = self._numbers.setdefault(name, array("d"))
-                if value is not None:
-                    numbers.append(value)
+        for name in dict.fromkeys(name for row in rows for name in row["metrics"]):
+            if name not in self._numbers:
+                self._numbers[name] = self._files.enter_context(tempfile.TemporaryFile(dir=self._directory))
+            values = (row["metrics"].get(name) for row in rows)
+            array("d", (value for value in values if value is not None)).tofile(self._numbers[name])
+
+    def close(self) -> None:
+        """Give the files back."""
+        self._files.close()
 
     def counts(self) -> Metrics:
         """What `metrics.json` holds."""
@@ -250,9 +265,11 @@ class _Tally:
             names: tuple[str, ...] = ("member", *shown)
         else:
             cells, names = [], ("metric", "least", "median", "most", "members")
-            for name, found in self._numbers.items():
-                if found:
-                    numbers = (name, min(found), statistics.median(found), max(found), len(found))
+            for name, file in self._numbers.items():
+                file.seek(0)
+                if len(found := np.fromfile(file)):
+                    least, median, most = (float(of(found)) for of in (np.min, np.median, np.max))
+                    numbers = (name, least, median, most, len(found))
                     cells.append(dict(zip(names, numbers, strict=True)))
         for line in Table.of(cells, {name: name for name in names}).markdown().splitlines():
             _log.info("%s", line)
