@@ -241,7 +241,8 @@ class _Tally:
             self._rows += [row] * (len(self._rows) <= _LISTED)
         for name in dict.fromkeys(name for row in rows for name in row["metrics"]):
             if name not in self._numbers:
-                self._numbers[name] = self._files.enter_context(tempfile.TemporaryFile(dir=self._directory))
+                made = tempfile.TemporaryFile(dir=self._directory)  # noqa: SIM115  # closed with the others
+                self._numbers[name] = self._files.enter_context(made)
             values = (row["metrics"].get(name) for row in rows)
             array("d", (value for value in values if value is not None)).tofile(self._numbers[name])
 
