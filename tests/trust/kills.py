@@ -132,7 +132,7 @@ def one(
     whole: tuple[bytes, float],
     share: float,
 ) -> str:
-    """One kill in the first ``share`` of a sweep; say what happened, beginning with `same` for the same table."""
+    """One kill in the first ``share`` of a sweep; say what happened, first `same` for the same table."""
     place = base / f"{executor}{chance.randrange(10**9)}"
     apart = executor in ("slurm", "ray")  # their processes are their own daemons' to end
     with small_disk(place) if harm is full_disk else contextlib.nullcontext(place.mkdir()):
