@@ -34,6 +34,12 @@ from mutation_notes import Notes
 ROOT = Path(__file__).resolve().parent.parent
 CACHE = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "staf_torch-mutation"
 PRELOADED = ("torch", "torch._dynamo", "numpy", "scipy.linalg", "matplotlib.pyplot", "omegaconf")
+PRELOADED += (
+    "hypothesis.extra.numpy",
+    "hypothesis.strategies",
+    "hydra._internal.hydra",
+    "hydra.core.plugins",
+)
 
 
 def main() -> int:
@@ -130,7 +136,8 @@ def _measure_the_new(tree: Path, compiled: Path, jobs: int, until: float) -> Non
 def _prepare(tree: Path) -> None:
     """Compile by content: a file that changes within a second is seen to change. Import what is slow."""
     mode = py_compile.PycInvalidationMode.CHECKED_HASH
-    compileall.compile_dir(tree / "staf_torch", quiet=1, invalidation_mode=mode)
+    for folder in ("staf_torch", "tests"):
+        compileall.compile_dir(tree / folder, quiet=1, invalidation_mode=mode)
     for name in PRELOADED:
         __import__(name)
 
