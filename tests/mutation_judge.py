@@ -29,7 +29,7 @@ class Verdict(NamedTuple):
     by: str = ""  # the test that failed
 
 
-_map = Map({}, {})
+_map = Map({}, {}, {})
 _seconds = 0.0
 _until = 0.0
 
@@ -78,13 +78,13 @@ def fail_anyway(tests: Sequence[str]) -> list[str]:
     if not tests:
         return []
     chosen = Chosen(tests)
-    in_fork(chosen.files, chosen, 60 + 5 * sum(_cost(test) for test in tests), stop=False)
+    in_fork(chosen.files, chosen, 60 + 5 * _cost(tests), stop=False)
     return chosen.read()
 
 
 def _run(tests: Sequence[str]) -> tuple[str, str]:
     chosen = Chosen(tests)
-    limit = 60 + 5 * sum(_cost(test) for test in tests)
+    limit = 60 + 5 * _cost(tests)
     code = in_fork(chosen.files, chosen, limit, stop=True)
     if code is None:
         return "killed", "by the clock, or the process ended"
@@ -93,33 +93,31 @@ def _run(tests: Sequence[str]) -> tuple[str, str]:
 
 def _groups(tests: Sequence[str]) -> list[list[str]]:
     """What is short first; the rest only where that says nothing, since reading its files takes a while."""
-    total, first = 0.0, 0
-    while first < len(tests) and (first == 0 or total < FIRST):
-        total += _cost(tests[first]) + OVERHEAD
-        first += 1
+    first = max(1, sum(_cost(tests[: at + 1]) < FIRST for at in range(len(tests))))
     return [each for each in (list(tests[:first]), list(tests[first:])) if each]
-
-
-def _cost(test: str) -> float:
-    return _map.seconds.get(test, 0.0 if "::" in test else UNKNOWN)
-
-
-def _file(test: str) -> str:
-    return test.partition("::")[0]
 
 
 def _tests_for(mutant: Mutant, source: str) -> list[str]:
     """Those that execute the lines, the folder's own first and the short ones first, within the time."""
     hits = tests_near(_map, mutant.file, mutant.line, mutant.last_line, _around(mutant, source))
     near = {test: 0 if test.startswith(places(mutant.file)) else 1 for test in hits}
+    order = sorted(hits, key=lambda test: (near[test], _cost([test]), test))
     chosen: list[str] = []
-    total = 0.0
-    for test in sorted(hits, key=lambda test: (near[test], _cost(test), test)):
-        total += _cost(test) + OVERHEAD
-        if chosen and total > _seconds:
-            break
-        chosen.append(test)
-    return chosen
+    for test in order:
+        if _cost([*chosen, test]) <= _seconds:
+            chosen.append(test)
+    return chosen or sorted(hits, key=lambda test: (_cost([test]), test))[:1]
+
+
+def _cost(tests: Sequence[str]) -> float:
+    """Seconds of tests with the fixtures that they share."""
+    shared = {each for test in tests for each in _map.fixtures.get(test, ())}
+    own = sum(_map.seconds.get(test, UNKNOWN) for test in tests)
+    return own + sum(_map.seconds[each] for each in shared) + OVERHEAD * len(tests)
+
+
+def _file(test: str) -> str:
+    return test.partition("::")[0]
 
 
 def _around(mutant: Mutant, source: str) -> tuple[int, int, bool]:
