@@ -23,7 +23,9 @@ class Verdict(NamedTuple):
     """What the tests said to a mutant."""
 
     mutant: Mutant
-    said: str  # killed, survived, accepted, or unreached: no test executes the file
+    said: (
+        str  # killed, survived, accepted, unreached: no test executes the file, or too dear: all take longer
+    )
     tests: int = 0
     seconds: float = 0.0
     by: str = ""  # the test that failed
@@ -59,7 +61,7 @@ def judge(mutant: Mutant) -> Verdict | None:
     source = path.read_text(encoding="utf-8")
     tests = _tests_for(mutant, source)
     if not tests:
-        return Verdict(mutant, "unreached")
+        return Verdict(mutant, "unreached" if not _hits(mutant, source) else "too dear")
     begun = time.monotonic()
     path.write_text(mutant.applied(source), encoding="utf-8")
     said, by = "survived", ""
@@ -99,14 +101,18 @@ def _groups(tests: Sequence[str]) -> list[list[str]]:
 
 def _tests_for(mutant: Mutant, source: str) -> list[str]:
     """Those that execute the lines, the folder's own first and the short ones first, within the time."""
-    hits = tests_near(_map, mutant.file, mutant.line, mutant.last_line, _around(mutant, source))
+    hits = _hits(mutant, source)
     near = {test: 0 if test.startswith(places(mutant.file)) else 1 for test in hits}
     order = sorted(hits, key=lambda test: (near[test], _cost([test]), test))
     chosen: list[str] = []
     for test in order:
         if _cost([*chosen, test]) <= _seconds:
             chosen.append(test)
-    return chosen or sorted(hits, key=lambda test: (_cost([test]), test))[:1]
+    return chosen
+
+
+def _hits(mutant: Mutant, source: str) -> set[str]:
+    return tests_near(_map, mutant.file, mutant.line, mutant.last_line, _around(mutant, source))
 
 
 def _cost(tests: Sequence[str]) -> float:
