@@ -58,4 +58,25 @@ ACCEPTED: dict[tuple[str, str, str, str], str] = {
         "here * masses.new_ones(1)",
         "(here / masses.new_ones(1))",
     ): "over ones as times ones",
+    (
+        "staf_torch/theory/ultimate_bound.py",
+        "count = math.ceil(math.log(q) / math.log(one) - 1e-12)",
+        "1e-12",
+        "2e-12",
+    ): "room for the rounding of a quotient of logarithms, some 1e-16 of it",
+    (
+        "staf_torch/lanes/emission.py",
+        "mask, count = masks.most_common(1)[0] if masks else (-1, 0)",
+        "1",
+        "2",
+    ): "the first of the two most common is the most common; -2 names no node, as -1 does not",
+    ("staf_torch/adp/memory_growth.py", "22,", "22", "23"): (
+        "another time that a guess holds a corner of the bounds: the best of many guesses is kept"
+    ),
+    (
+        "staf_torch/lanes/plan.py",
+        "ends = [((rows, *s), (1, *_inner(s, rows)), s.numel(), 0) for s, _ in compiled.carry]",
+        "0",
+        "1",
+    ): "stride from time to time of what has one time: never read",
 }

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 from pathlib import Path
 
 import pytest
 
-from staf_torch.results.untrusted import links_in, too_deep
+from staf_torch.results.build import digest
+from staf_torch.results.untrusted import UnreadableError, links_in, open_regular, too_deep
 
 
 def test_links_of_every_kind_are_found_and_files_and_folders_are_none(tmp_path: Path) -> None:
@@ -39,3 +41,15 @@ def nested(depth: int) -> object:
 def test_depth_is_that_of_the_deepest_branch(most: int) -> None:
     for depth in range(7):
         assert too_deep(nested(depth), most) == (depth > most)
+
+
+def test_what_lies_behind_a_linked_folder_is_not_read(tmp_path: Path) -> None:
+    (tmp_path / "run" / "deep").mkdir(parents=True)
+    (tmp_path / "run" / "deep" / "a").write_bytes(b"content")
+    (tmp_path / "run" / "linked").symlink_to(tmp_path / "run" / "deep")
+    inside, behind = tmp_path / "run" / "deep" / "a", tmp_path / "run" / "linked" / "a"
+    assert digest(inside, root=tmp_path / "run") == hashlib.sha256(b"content").hexdigest()
+    assert digest(behind) == digest(inside)  # without a folder to keep to, the user's own links count
+    for read in (digest, open_regular):
+        with pytest.raises(UnreadableError):
+            read(behind, root=tmp_path / "run")
