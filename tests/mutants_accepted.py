@@ -79,4 +79,10 @@ ACCEPTED: dict[tuple[str, str, str, str], str] = {
         "0",
         "1",
     ): "stride from time to time of what has one time: never read",
+    (
+        "staf_torch/adp/safety_filter.py",
+        "time = torch.as_tensor(0.0 if t is None else t).to(x).expand(x.shape[:-1])",
+        "0.0",
+        "1.0",
+    ): "a time on which no constraint depends: else it must be given",
 }

@@ -71,6 +71,18 @@ def test_a_plan_that_is_followed_from_a_whole_turn_away_is_the_same_plan_there(
     assert bool(((here[1].state[:, 0] - RESETS)[:, 0].abs() <= torch.pi).all())
 
 
+def test_candidates_lie_apart_along_a_trajectory_and_leave_no_gap(memory: adp.GlobalValue) -> None:
+    state, searched = memory.library.state[:, :-1], set(memory.entries.tolist())
+    for row in range(len(state)):
+        begin = row * memory.length
+        assert (begin in searched) == bool(memory.arrives[row])
+        last = state[row, 0]
+        for k in range(1, state.shape[1] if memory.arrives[row] else 0):
+            gap = float((memory.problem.offset(state[row, k], last) / memory.region).norm())
+            assert (begin + k in searched) == (gap >= memory.spacing) or abs(gap - memory.spacing) < 1e-9
+            last = state[row, k] if begin + k in searched else last
+
+
 def test_control_at_rest_on_top_is_the_regulator(memory: adp.GlobalValue) -> None:
     x = torch.tensor([[0.01, -0.02]], dtype=torch.float64)
     torch.testing.assert_close(memory(x), memory.problem.linear_feedback(x), rtol=1e-2, atol=1e-3)

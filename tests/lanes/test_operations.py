@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from staf_torch import lanes
+from staf_torch.lanes.replacements import REPLACEMENTS
 
 SIZE = 3
 LIST = torch.tensor([2, 0])
@@ -239,3 +240,20 @@ def test_an_error_of_the_tracer_leaves_the_definition(caplog: pytest.LogCaptureF
     x = torch.randn(5, 2, dtype=torch.float64)
     assert torch.equal(program(x, x.unsqueeze(1), x)[1][:, 0], 2 * x)
     assert "KeyError" in caplog.text
+
+
+@pytest.mark.parametrize("dims", [None, (0,), (2,), (-1,), (0, 1), (0, 2), (0, 1, 2)])
+def test_reductions_over_any_dimensions_are_those_of_numpy(dims: tuple[int, ...] | None) -> None:
+    x = torch.randn(2, 3, 4, dtype=torch.float64)
+    wanted = {
+        "prims::sum": np.sum(x.numpy(), axis=dims),
+        "prims::prod": np.prod(x.numpy(), axis=dims),
+        "prims::var": np.var(x.numpy(), axis=dims, ddof=1),
+    }
+    for name, value in wanted.items():
+        found = REPLACEMENTS[name](x, dims)
+        torch.testing.assert_close(found, torch.as_tensor(value), msg=name)
+    for name in ("prims::sum", "prims::prod"):
+        assert REPLACEMENTS[name](x.float(), dims, output_dtype=torch.float64).dtype == torch.float64
+    plain = REPLACEMENTS["prims::var"](x, dims, 0.0)
+    torch.testing.assert_close(plain, torch.as_tensor(np.var(x.numpy(), axis=dims)))
