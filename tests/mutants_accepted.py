@@ -1,9 +1,48 @@
-"""Mutants that change nothing that anybody could see: (file, line, what changes, into what) -> why."""
+"""Mutants that change nothing that anybody could see: kinds of them, and each by its name."""
 
 from __future__ import annotations
 
+import re
+
+from mutants import Mutant
+
+_DEVICE = "of another device than the processor, which machines that run the tests lack"
+_LOOKS = "how a line of a figure is drawn, not where"
+_STYLE = (
+    "marker",
+    "markersize",
+    "alpha",
+    "linewidth",
+    "zorder",
+    "fontsize",
+    "handlelength",
+    "frameon",
+    "rotation",
+)
 _SPEED = "decides which of two ways that find the same is taken: the threshold is of speed alone"
 
+
+def accepted(mutant: Mutant) -> str | None:
+    """Why a mutant changes nothing that anybody could see; None where it does."""
+    if _without(mutant, "device"):
+        return _DEVICE
+    if mutant.room == "figures" and any(_without(mutant, name) for name in _STYLE):
+        return _LOOKS
+    return ACCEPTED.get(mutant.key)
+
+
+def _without(mutant: Mutant, name: str) -> bool:
+    """Whether all that a mutant changes is that a call lacks an argument of that name."""
+    fewer = re.sub(rf",?\s*\b{name}=[^,()]*(\([^()]*\))?[^,()]*(?=[,)])", "", mutant.was, count=1)
+    return fewer != mutant.was and _plain(fewer) == _plain(mutant.now)
+
+
+def _plain(text: str) -> str:
+    """Without blanks, kinds of quotes and a last comma."""
+    return re.sub(r",(?=\))", "", re.sub(r"\s", "", text)).replace('"', "'")
+
+
+# (file, line, what changes, into what) -> why
 ACCEPTED: dict[tuple[str, str, str, str], str] = {
     (
         "staf_torch/systems/integrators.py",
@@ -40,12 +79,6 @@ ACCEPTED: dict[tuple[str, str, str, str], str] = {
         "16",
         "17",
     ): "a limit against hostile files: no file of ours comes near",
-    (
-        "staf_torch/online/local_functions.py",
-        "units = torch.eye(gram.shape[-1], dtype=gram.dtype, device=gram.device)",
-        "torch.eye(gram.shape[-1], dtype=gram.dtype, device=gram.device)",
-        "torch.eye(gram.shape[-1], dtype=gram.dtype)",
-    ): "of another device than the processor, which machines that run the tests lack",
     (
         "staf_torch/online/local_functions.py",
         "zero = offsets.new_zeros(offsets.shape[-1])",
@@ -85,4 +118,10 @@ ACCEPTED: dict[tuple[str, str, str, str], str] = {
         "0.0",
         "1.0",
     ): "a time on which no constraint depends: else it must be given",
+    (
+        "staf_torch/adp/memory_growth.py",
+        "search = BoxDDP(problem, steps=steps, iterations=40, tolerance=1e-5)",
+        "40",
+        "41",
+    ): "the limit of a search that mostly ends before",
 }

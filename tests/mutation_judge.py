@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import pytest
 from mutants import Mutant
-from mutants_accepted import ACCEPTED
+from mutants_accepted import accepted
 from mutation_fork import begin, in_fork, place
 from mutation_map import Map, places, tests_near
 
@@ -53,7 +53,7 @@ def begin_judging(tree: Path, compiled: Path, known: Map, seconds: float, until:
 
 def judge(mutant: Mutant) -> Verdict | None:
     """Try a mutant; None where there is no time left."""
-    if mutant.key in ACCEPTED:
+    if accepted(mutant):
         return Verdict(mutant, "accepted")
     if time.monotonic() > _until:
         return None
