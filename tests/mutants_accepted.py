@@ -124,4 +124,10 @@ ACCEPTED: dict[tuple[str, str, str, str], str] = {
         "40",
         "41",
     ): "the limit of a search that mostly ends before",
+    (
+        "staf_torch/lanes/captured.py",
+        "nodes = np.array([places[start + place] for place in flat], dtype=np.int64)",
+        "np.array([places[start + place] for place in flat], dtype=np.int64)",
+        "np.array([places[start + place] for place in flat])",
+    ): "whole numbers become int64 by themselves, but for NumPy 1 on Windows",
 }
