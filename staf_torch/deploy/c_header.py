@@ -289,9 +289,13 @@ def _c_type(dtype: torch.dtype) -> str:
 
 
 def _built(path: Path, function: str, head: str = "") -> Callable[..., object]:
-    """Compile a header and a function ``call`` that calls what is in it."""
+    """Compile a header and a function ``call`` that calls what is in it.
+
+    The header is copied: the name of the folder that it lies in, which may be somebody else's, is no C.
+    """
     with tempfile.TemporaryDirectory() as folder:
-        source = f'{head}#include "{path.resolve()}"\n{function}\n'
+        shutil.copyfile(path, Path(folder) / "exported.h")
+        source = f'{head}#include "exported.h"\n{function}\n'
         (Path(folder) / "call.c").write_text(source, encoding="utf-8")
         line = [need_c_compiler(), "-O2", "-shared", "-fPIC", "-x", "c", "call.c", "-o", "call.so", "-lm"]
         subprocess.run(line, cwd=folder, check=True, capture_output=True)

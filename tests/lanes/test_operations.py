@@ -14,6 +14,7 @@ from staf_torch import lanes
 
 SIZE = 3
 LIST = torch.tensor([2, 0])
+COMPARISONS = (torch.lt, torch.le, torch.gt, torch.ge, torch.eq, torch.ne)
 EDGES = (-0.8, -0.1, 0.4, 1.1)
 
 
@@ -36,6 +37,13 @@ def lookup(x: Tensor) -> Tensor:
     at = torch.searchsorted(edges, x.contiguous()).clamp(1, len(EDGES) - 1)
     low, high = edges[at - 1], edges[at]
     return (at - 1) + (x - low) / (high - low)
+
+
+def compared(x: Tensor) -> Tensor:
+    """Of numbers that are often equal."""
+    a = (2 * x).round()
+    found = [compare(a, other) for compare in COMPARISONS for other in (a.flip(-1), 1.0)]
+    return torch.cat(found, dim=-1).to(x)
 
 
 def masked(x: Tensor) -> Tensor:
@@ -87,6 +95,7 @@ OPERATIONS: dict[str, Callable[[Tensor], Tensor]] = {
     "squeezed in place": lambda x: x.clone().unsqueeze_(-1).squeeze_(-1),
     "chosen by a mask": masked,
     "fmin": lambda x: torch.fmin(x, torch.fmax(x.flip(-1), torch.tensor(0.1))),
+    "compared": compared,
     "slope of a list": slope(lambda x: x[:, [1, 0, 1, 1]].cumprod(-1)),
     "slope of a product": slope(lambda x: x.prod(-1)),
     "slope of a sort": slope(lambda x: x.sort(-1)[0] * torch.arange(SIZE)),

@@ -242,3 +242,9 @@ def test_chunks_hold_what_memory_allows_in_order(monkeypatch: pytest.MonkeyPatch
     assert batching.batches(flat(cfgs)) == [group[:4], group[4:]]
     monkeypatch.setattr(batching, "_KEPT_BYTES", 1)
     assert batching.batches(flat(cfgs)) == [[index] for index in group]
+
+
+def test_members_are_counted_before_they_are_listed() -> None:
+    with pytest.raises(ValueError, match="must be 1000000 at most"):
+        member_overrides(["seed=range(1000)", "spread=range(1,2000)"], config_loader())
+    assert len(member_overrides(["seed=range(1000)", "spread=range(1,1001)"], config_loader())) == 10**6

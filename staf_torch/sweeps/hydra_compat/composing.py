@@ -38,8 +38,12 @@ def parse_override(line: str, loader: ConfigLoader | None = None) -> Override:
 
     Raises:
         hydra.errors.HydraException: if the grammar has no such line.
+        ValueError: if its brackets are nested too deep.
     """
-    (parsed,) = OverridesParser.create(config_loader=loader).parse_overrides([line])
+    try:
+        (parsed,) = OverridesParser.create(config_loader=loader).parse_overrides([line])
+    except RecursionError as error:
+        raise ValueError(f"{line[:40]}... is nested too deep.") from error
     return parsed
 
 
