@@ -7,16 +7,9 @@ from pathlib import Path
 
 import pytest
 import torch
-from composing import HYDRA
-from hydra import compose, initialize_config_dir
+from composing import settings
 
-from staf_torch.cli.staf import config_directory
 from staf_torch.experiments import faults, icl
-
-
-def settings(*overrides: str):  # type: ignore[no-untyped-def]
-    with initialize_config_dir(config_directory(), **HYDRA):
-        return compose("config", list(overrides))
 
 
 def test_faults_leave_a_row_a_case_and_method(tmp_path: Path) -> None:

@@ -8,22 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from composing import HYDRA
-from hydra import compose, initialize_config_dir
+from composing import settings
 from PIL import Image
 
 from staf_torch import adp, systems
-from staf_torch.cli.staf import config_directory
 from staf_torch.experiments import adp as adp_experiment
 from staf_torch.experiments import adp_comparison, adp_tracking
 
 SHORT = ["duration=0.1", "dt=0.005"]
 TRACKED = ("duration=0.1", "dt=0.01", "animation=gif")
-
-
-def settings(*overrides: str):  # type: ignore[no-untyped-def]
-    with initialize_config_dir(config_directory(), **HYDRA):
-        return compose("config", list(overrides))
 
 
 def moves(path: Path) -> None:

@@ -12,9 +12,8 @@ from typing import Any
 
 import pytest
 import torch
-from composing import HYDRA
+from composing import settings
 from hostile_runs import EXPORTS
-from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from staf_torch.cli.deployable import deployable
@@ -38,8 +37,7 @@ class Evil:
 @pytest.fixture(scope="module")
 def chase(tmp_path_factory: pytest.TempPathFactory) -> Path:
     run = tmp_path_factory.mktemp("runs") / "chase"
-    with initialize_config_dir(config_directory(), **HYDRA):
-        cfg = compose("config", ["centers.count=6", "duration=0.1", "trajectories=2", "figures=false"])
+    cfg = settings("centers.count=6", "duration=0.1", "trajectories=2", "figures=false")
     (run / ".hydra").mkdir(parents=True)
     OmegaConf.save(cfg, run / ".hydra" / "config.yaml")
     experiment(cfg.task)(cfg, run)
