@@ -64,6 +64,7 @@ OPERATIONS: dict[str, Callable[[Tensor], Tensor]] = {
     "acosh": lambda x: torch.acosh(1 + x.abs()),
     "atanh": lambda x: torch.atanh(x / (1 + x.abs())),
     "erfc": torch.erfc,
+    "erfinv": lambda x: torch.erfinv(x / (1 + x.abs())),
     "lgamma": lambda x: torch.lgamma(x.abs() + 0.1),
     "copysign": lambda x: torch.copysign(x, -x.flip(-1)),
     "angle": torch.angle,
