@@ -130,4 +130,10 @@ ACCEPTED: dict[tuple[str, str, str, str], str] = {
         "np.array([places[start + place] for place in flat], dtype=np.int64)",
         "np.array([places[start + place] for place in flat])",
     ): "whole numbers become int64 by themselves, but for NumPy 1 on Windows",
+    (
+        "staf_torch/online/tuning.py",
+        "ROUNDS = (0.6, 0.3)  # spread of the logarithms of the candidates around the best so far",
+        "0.3",
+        "0.6",
+    ): "another spread of the candidates of a random search: the best of all is kept",
 }
