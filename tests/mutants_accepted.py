@@ -136,4 +136,10 @@ ACCEPTED: dict[tuple[str, str, str, str], str] = {
         "0.3",
         "0.6",
     ): "another spread of the candidates of a random search: the best of all is kept",
+    (
+        "staf_torch/online/experience_memory.py",
+        "still = (x - self.origin).square().sum(-1) < limit.square()",
+        "(x - self.origin).square().sum(-1) < limit.square()",
+        "((x - self.origin).square().sum(-1) <= limit.square())",
+    ): "a state to the last bit at the edge between two ways to remember it",
 }

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from staf_torch import lanes
-from staf_torch.lanes.eliminations import eigenvalues, orthogonal, solve, solve_definite
+from staf_torch.lanes.eliminations import eigen, eigenvalues, orthogonal, solve, solve_definite
 
 
 def matrices(size: int, dtype: torch.dtype = torch.float64) -> torch.Tensor:
@@ -128,3 +128,14 @@ def test_reflections_give_orthogonal_columns_and_a_triangle(size: int, lead: tup
     torch.testing.assert_close(q @ r, matrix, rtol=0, atol=1e-13)
     torch.testing.assert_close(q.mT @ q, torch.eye(size).double().expand_as(q), rtol=0, atol=1e-13)
     assert torch.equal(r, r.triu())
+
+
+@pytest.mark.parametrize("size", [1, 2, 3, 6])
+def test_rotations_give_eigenvalues_in_their_order_with_their_vectors(size: int) -> None:
+    torch.manual_seed(size)
+    some = torch.randn(2, 3, size, size, dtype=torch.float64)
+    gram = some + some.mT
+    found, vectors = eigen(gram)
+    torch.testing.assert_close(found, torch.linalg.eigvalsh(gram), rtol=0, atol=1e-12)
+    torch.testing.assert_close(vectors * found.unsqueeze(-2) @ vectors.mT, gram, rtol=0, atol=1e-12)
+    torch.testing.assert_close(vectors.mT @ vectors, torch.eye(size).double().expand_as(gram))
