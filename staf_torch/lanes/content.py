@@ -91,10 +91,12 @@ class Watch:
 
     def _look(self) -> tuple[list[int], list[Any]]:
         """The lengths of all containers, and what is in them."""
-        parts = [part.values() for part in self._dicts]
+        parts: list[Iterable[Any]] = [part.values() for part in self._dicts]
         parts += [part.values() for part in self._code]  # a method may be replaced
         parts += self._lists
-        return [*map(len, parts)], [*chain.from_iterable(parts)]
+        return [*map(len, self._dicts), *map(len, self._code), *map(len, self._lists)], [
+            *chain.from_iterable(parts)
+        ]
 
 
 def code(key: Any) -> list[Mapping[str, Any]]:
