@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 
 from omegaconf import DictConfig
@@ -12,7 +13,16 @@ from staf_torch.sweeps.hydra_compat.program import HAS_WHITELIST
 HYDRA: dict[str, str] = {} if HAS_WHITELIST else {"version_base": "1.3"}  # 1.4 deprecates the argument
 
 
+@functools.cache
+def _composer() -> Composer:
+    return Composer(config_loader(), hydra_node=False)
+
+
+def settings(*overrides: str) -> DictConfig:
+    """The settings of a command line without Hydra's node, a cached composition for each choice of groups."""
+    return _composer()(overrides)
+
+
 def compose(base: Sequence[str], jobs: Sequence[Sequence[str]]) -> list[DictConfig]:
     """The settings of ``[*base, *job]`` for every job, without Hydra's node."""
-    composer = Composer(config_loader(), hydra_node=False)
-    return [composer((*base, *job)) for job in jobs]
+    return [settings(*base, *job) for job in jobs]

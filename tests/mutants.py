@@ -47,6 +47,11 @@ class Mutant(NamedTuple):
     end: int
 
     @property
+    def room(self) -> str:
+        """The package, or the file beside the packages, that has the line."""
+        return room_of(self.file)
+
+    @property
     def key(self) -> tuple[str, str, str, str]:
         """What names the mutant in any version that has the same line."""
         return self.file, self.context, self.was, self.now
@@ -55,6 +60,11 @@ class Mutant(NamedTuple):
         """The changed file."""
         raw = source.encode()
         return (raw[: self.begin] + self.now.encode() + raw[self.end :]).decode()
+
+
+def room_of(file: str) -> str:
+    """The package below staf_torch that a file is in, or itself."""
+    return file.split("/")[1]
 
 
 def mutants_of(file: str, source: str) -> Iterator[Mutant]:

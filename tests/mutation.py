@@ -3,9 +3,9 @@
     python tests/mutation.py [--sample 100] [--seed 0] [--package kernels optim] [--jobs 2] [--minutes 30]
 
 A mutant runs the tests that execute its line, those of the same folder first and the short ones first,
-until one fails (`mutation_fork.py`). Which tests execute which line is measured once (`mutation_map.py`) and
-kept in the user's cache. The committed tree counts, not the working one. Mutants in `mutants_accepted.py`
-change nothing that can be seen.
+until one fails (`mutation_judge.py`). Which tests execute which line is measured once a file of tests
+(`mutation_map.py`) and kept in the user's cache. The committed tree counts, not the working one. Mutants in
+`mutants_accepted.py` change nothing that can be seen.
 """
 
 from __future__ import annotations
@@ -17,49 +17,62 @@ import multiprocessing
 import os
 import py_compile
 import random
-import re
 import subprocess
 import sys
 import tempfile
 import time
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any
 
-from mutants import Mutant, mutants_of
-from mutation_fork import Verdict, begin, judge
-from mutation_map import Map, as_map, measure, moved
+from mutants import Mutant, mutants_of, room_of
+from mutation_fork import begin
+from mutation_judge import Verdict, begin_judging, fail_anyway, judge
+from mutation_map import kept_at, known, measure, test_files
+from mutation_notes import Notes
 
 ROOT = Path(__file__).resolve().parent.parent
 CACHE = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "staf_torch-mutation"
 PRELOADED = ("torch", "torch._dynamo", "numpy", "scipy.linalg", "matplotlib.pyplot", "omegaconf")
+PRELOADED += (
+    "hypothesis.extra.numpy",
+    "hypothesis.strategies",
+    "hydra._internal.hydra",
+    "hydra.core.plugins",
+)
 
 
 def main() -> int:
     """Run the command line; the exit code is 1 where too few of them are killed."""
     options = _options()
     begun = time.monotonic()
+    until = begun + 60 * options.minutes
+    compiled = CACHE.parent / "staf_torch"
     with tempfile.TemporaryDirectory(prefix="staf-mutation-") as scratch:
         tree = Path(scratch) / "tree"
-        commit = _git("rev-parse", options.commit).strip()
-        _export(commit, tree)
-        found = list(_all_mutants(tree, options.package, options.file))
-        chosen = random.Random(options.seed).sample(found, min(options.sample, len(found)))[options.skip :]
-        if options.again:
-            chosen = list(_survivors(options.again.read_text(), found))
-        known = _known(commit, tree, options.jobs)
-        print(f"{len(found)} mutants, {len(chosen)} of them by seed {options.seed}", flush=True)
+        _export(_git("rev-parse", options.commit).strip(), tree)
         _prepare(tree)
-        verdicts = []
-        until = begun + 60 * options.minutes
-        arguments = tree, known, CACHE.parent / "staf_torch", options.seconds, until
-        with multiprocessing.get_context("fork").Pool(options.jobs, begin, arguments) as pool:
-            for verdict in pool.imap_unordered(judge, chosen):
+        _measure_the_new(tree, compiled, options.jobs, begun + 60 * options.mapping)
+        found = list(_all_mutants(tree, options.package, options.file))
+        drawn = random.Random(options.seed).sample(found, min(options.sample, len(found)))
+        notes = Notes(options.into, found, drawn)
+        left = notes.left(again=options.again, without=options.without)
+        print(f"{len(found)} mutants, {len(notes.sample)} of them drawn, {len(left)} to try", flush=True)
+        arguments = tree, compiled, known(CACHE / "map", tree), options.seconds, until
+        with multiprocessing.get_context("fork").Pool(options.jobs, begin_judging, arguments) as pool:
+            tried = []
+            for (at, _), verdict in zip(left, pool.imap(judge, [each for _, each in left]), strict=True):
                 if verdict is not None:
-                    verdicts.append(verdict)
                     _tell(verdict)
-    print(f"{time.monotonic() - begun:.0f} s; no time for {len(chosen) - len(verdicts)} of the sample")
+                    notes.add(at, verdict)
+                    tried.append((at, verdict))
+            liars = pool.apply(fail_anyway, [sorted({each.by for _, each in tried if "::" in each.by})])
+    for at, verdict in tried:
+        if verdict.by in liars:
+            print(f"no witness, fails with the right code: {verdict.by}")
+            notes.add(at, verdict._replace(said="survived"))
+    verdicts = notes.verdicts()
+    print(f"{time.monotonic() - begun:.0f} s; tried, in its order: {len(verdicts)} of {len(notes.sample)}")
     return int(_report(verdicts) < options.least)
 
 
@@ -67,15 +80,17 @@ def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--sample", type=int, default=100)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--skip", type=int, default=0, help="so many of the sample: they were tried before")
-    parser.add_argument("--again", type=Path, help="output of a run: what survived in it, and nothing else")
-    parser.add_argument("--package", nargs="*", default=[], help="rooms of staf_torch; all by default")
-    parser.add_argument("--file", nargs="*", default=[], help="files, staf_torch/...; all by default")
+    parser.add_argument("--package", nargs="*", default=[], help="to draw from; all of staf_torch by default")
+    parser.add_argument("--file", nargs="*", default=[], help="to draw from, staf_torch/...; all by default")
+    parser.add_argument("--into", type=Path, help="file of the sample and its verdicts, where a run goes on")
+    parser.add_argument("--again", action="store_true", help="try what survived once more")
+    parser.add_argument("--without", nargs="*", default=[], help="packages that are left for another run")
     parser.add_argument("--commit", default="HEAD")
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--seconds", type=float, default=45, help="of tests that a mutant is given")
     parser.add_argument("--least", type=float, default=95, help="score in percent that is asked for")
     parser.add_argument("--minutes", type=float, default=600, help="after which no mutant is begun")
+    parser.add_argument("--mapping", type=float, default=600, help="minutes of these for the map")
     return parser.parse_args()
 
 
@@ -94,59 +109,35 @@ def _export(commit: str, tree: Path) -> None:
 def _all_mutants(tree: Path, packages: Iterable[str], files: Iterable[str]) -> Iterator[Mutant]:
     for path in sorted((tree / "staf_torch").rglob("*.py")):
         name = str(path.relative_to(tree))
-        if (packages and name.split("/")[1] not in packages) or (files and name not in files):
+        if (packages and room_of(name) not in packages) or (files and name not in files):
             continue
         yield from mutants_of(name, path.read_text(encoding="utf-8"))
 
 
-def _survivors(output: str, found: Sequence[Mutant]) -> Iterator[Mutant]:
-    """Mutants that an output names as not killed, in a version whose lines may have moved."""
-    pattern = r"^(?:survived|unreached) +(\S+):(\d+): ('.*'|\".*\") -> ('.*'|\".*\")  \[\d+ tests"
-    for file, line, was, now in re.findall(pattern, output, re.MULTILINE):
-        alike = [m for m in found if (m.file, repr(m.was), repr(m.now)) == (file, was, now)]
-        yield from sorted(alike, key=lambda m: abs(m.line - int(line)))[:1]
-
-
-def _texts(tree: Path) -> dict[str, str]:
-    paths = sorted((tree / "staf_torch").rglob("*.py"))
-    return {str(path.relative_to(tree)): path.read_text(encoding="utf-8") for path in paths}
-
-
-def _known(commit: str, tree: Path, jobs: int) -> Map:
-    """The map of a commit: the kept one, or that of the latest ancestor with what changed measured again."""
-    kept = CACHE / f"{commit}.json"
-    if kept.exists():
-        return as_map(json.loads(kept.read_text())["found"])
-    CACHE.mkdir(parents=True, exist_ok=True)
-    older = next((c for c in _git("rev-list", commit).split() if (CACHE / f"{c}.json").exists()), None)
-    if older is None:
-        print("measuring which test executes which line: runs the suite once", flush=True)
-        found = _measured(tree, ["tests"], jobs)
-    else:
-        before = json.loads((CACHE / f"{older}.json").read_text())
-        found = moved(before["found"], before["texts"], _texts(tree))
-        changed = _git("diff", "--name-only", older, commit, "--", "tests").split()
-        files = [each for each in changed if Path(each).name.startswith("test_") and (tree / each).exists()]
-        print(f"map of {older[:8]}; measuring {len(files)} files of tests again", flush=True)
-        for kind in ("lines", "tests", "seconds"):
-            found[kind] = {
-                n: value for n, value in found[kind].items() if n.partition("::")[0] not in changed
-            }
-        for kind, values in (_measured(tree, files, jobs) if files else {}).items():
-            found[kind] |= values
-    kept.write_text(json.dumps({"found": found, "texts": _texts(tree)}))
-    return as_map(found)
-
-
-def _measured(tree: Path, tests: Sequence[str], jobs: int) -> dict[str, Any]:
-    with tempfile.TemporaryDirectory(prefix="staf-mutation-map-") as folder:
-        return measure(tree, tests, Path(folder), jobs)
+def _measure_the_new(tree: Path, compiled: Path, jobs: int, until: float) -> None:
+    """Measure which lines are executed by the files of tests that changed since the map was made."""
+    store = CACHE / "map"
+    store.mkdir(parents=True, exist_ok=True)
+    new = [each for each in test_files(tree) if not kept_at(store, tree, each).exists()]
+    if not new or time.monotonic() >= until:
+        return
+    print(f"measuring which lines {len(new)} files of tests execute", flush=True)
+    with multiprocessing.get_context("fork").Pool(jobs, begin, (tree, compiled)) as pool:
+        for name, found in pool.imap_unordered(measure, new):
+            if found is not None:
+                kept_at(store, tree, name).write_text(json.dumps(found))
+                print(f"{sum(found['seconds'].values()):6.1f} s {len(found['seconds']):4} {name}", flush=True)
+            if time.monotonic() > until:
+                pool.terminate()
+                print("no time to measure the others: whole files of them run, of the mutant's own folder")
+                break
 
 
 def _prepare(tree: Path) -> None:
     """Compile by content: a file that changes within a second is seen to change. Import what is slow."""
     mode = py_compile.PycInvalidationMode.CHECKED_HASH
-    compileall.compile_dir(tree / "staf_torch", quiet=1, invalidation_mode=mode)
+    for folder in ("staf_torch", "tests"):
+        compileall.compile_dir(tree / folder, quiet=1, invalidation_mode=mode)
     for name in PRELOADED:
         __import__(name)
 
@@ -167,16 +158,15 @@ def _report(verdicts: list[Verdict]) -> float:
     """Print a row a room; the score of all in percent, without the accepted ones."""
     rooms: dict[str, Counter[str]] = defaultdict(Counter)
     for verdict in verdicts:
-        rooms[verdict.mutant.file.split("/")[1]][verdict.said] += 1
+        rooms[verdict.mutant.room][verdict.said] += 1
         rooms["all"][verdict.said] += 1
-    print(f"\n{'room':16} {'killed':>7} {'survived':>9} {'unreached':>10} {'accepted':>9} {'score':>6}")
+    kinds = ("killed", "survived", "too dear", "unreached", "accepted")
+    print(f"\n{'room':16} " + " ".join(f"{kind:>9}" for kind in kinds) + "  score")
     for room, count in sorted(rooms.items(), key=lambda item: (item[0] == "all", item[0])):
-        counted = count["killed"] + count["survived"] + count["unreached"]
+        counted = count.total() - count["accepted"]
         score = f"{100 * count['killed'] / counted:.0f} %" if counted else "-"
-        row = f"{count['killed']:7} {count['survived']:9} {count['unreached']:10} {count['accepted']:9}"
-        print(f"{room:16} {row} {score:>6}")
-    counted = sum(rooms["all"][said] for said in ("killed", "survived", "unreached"))
-    return 100 * rooms["all"]["killed"] / max(counted, 1)
+        print(f"{room:16} " + " ".join(f"{count[kind]:9}" for kind in kinds) + f"  {score:>5}")
+    return 100 * rooms["all"]["killed"] / max(rooms["all"].total() - rooms["all"]["accepted"], 1)
 
 
 if __name__ == "__main__":

@@ -1,8 +1,9 @@
 """Which tests execute which line, in the processes that they start as well: for `mutation.py`.
 
-The suite runs once under coverage, with a context a test and one a shared fixture: whoever uses a fixture
-counts as executing its lines. A map is kept with its commit. For a later commit lines are matched with those
-of the map, and only test files that changed are measured again.
+Every file of tests runs once under coverage, in a fork of its own, with a context a test and one a shared
+fixture: whoever uses a fixture counts as executing its lines. What a file of tests executes is kept under
+the hash of its text, with the hashes of the package's files. For another version of the package lines are
+matched with those of the map; only files of tests that changed are measured again.
 """
 
 from __future__ import annotations
@@ -10,17 +11,23 @@ from __future__ import annotations
 import bisect
 import contextlib
 import difflib
+import hashlib
 import json
 import os
+import shutil
 import sqlite3
+import statistics
 import subprocess
-import sys
+import tempfile
 from collections import defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import coverage
 import pytest
+from mutation_fork import in_fork, place
 
 _SETTINGS = """
 [run]
@@ -31,78 +38,89 @@ data_file = {data}
 context = ${{STAF_MUTATION_CONTEXT-}}
 disable_warnings = no-data-collected,module-not-imported,module-not-measured,couldnt-parse
 """
-_OUTSIDE = ("tests/outside", "tests/cluster", "tests/test_wheel.py", "tests/test_structure.py")
-"""These install things or read files, and execute no line here."""
+_OUTSIDE = ("tests/outside/", "tests/cluster/", "tests/benchmarks/", "tests/examples/", "tests/test_wheel.py")
+_OUTSIDE += ("tests/test_structure.py", "tests/test_sanitized.py")
+"""These install and build things or read files, and execute no line here."""
+_LONGEST = 900.0  # seconds of the processor for one file of tests
 
 
 class Map(NamedTuple):
     """What each test executes."""
 
-    lines: dict[str, dict[int, set[str]]]  # file -> line -> tests
-    seconds: dict[str, float]  # of the processor, for a test and the fixtures that were made for it
+    lines: Mapping[str, Mapping[int, set[str]]]  # file -> line -> tests
+    seconds: Mapping[str, float]  # of the processor, for a test or a fixture that tests share
+    fixtures: Mapping[str, Sequence[str]]  # that a test shares
+    unmeasured: tuple[str, ...] = ()  # files of tests
+
+
+# Measured
 
 
 class Recorder:
     """The plugin of pytest that measures."""
 
     def __init__(self, folder: Path) -> None:
-        """Write below a folder, under names of this process, test after test."""
-        self.seen = folder / f"seen-{os.getpid()}.jsonl"
-        self.places: list[str] = [""]
-        import coverage
+        """Write below a folder."""
+        self.seen = folder / "seen.jsonl"
+        self.seen.write_text("")
+        self.settings = folder / "settings.ini"
+        self.settings.write_text(_SETTINGS.format(data=folder / "data"))
+        self.contexts: list[str] = [""]
+        self.measuring: coverage.Coverage | None = None
+        self.failed = False
 
-        self.measuring = coverage.Coverage(config_file=str(folder / "settings.ini"), context=None)
+    def pytest_sessionstart(self) -> None:
+        """Start, in the process that runs the tests; those that it starts inherit what to do."""
+        os.environ["COVERAGE_PROCESS_START"] = str(self.settings)
+        self.measuring = coverage.Coverage(config_file=str(self.settings), context=None)
         self.measuring.start()
-
-    def enter(self, context: str) -> None:
-        """Count lines for a context, until `leave`."""
-        self.places.append(context)
-        self._switch()
-
-    def leave(self) -> None:
-        """Count lines for the context before."""
-        self.places.pop()
         self._switch()
 
     def _switch(self) -> None:
-        os.environ["STAF_MUTATION_CONTEXT"] = self.places[-1]  # processes that start inherit it
-        self.measuring.switch_context(self.places[-1])
+        os.environ["STAF_MUTATION_CONTEXT"] = self.contexts[-1]
+        if self.measuring is not None:
+            self.measuring.switch_context(self.contexts[-1])
+
+    @contextlib.contextmanager
+    def _counting_for(self, context: str) -> Iterator[None]:
+        self.contexts.append(context)
+        self._switch()
+        try:
+            yield
+        finally:
+            self.contexts.pop()
+            self._switch()
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_protocol(self, item: pytest.Item) -> Iterator[None]:
-        """A test is a context."""
+        """A test is a context; one that fails with the right code is no witness against a mutant."""
         shared = item._fixtureinfo.name2fixturedefs.values()  # type: ignore[attr-defined]
         names = [_name(each[-1]) for each in shared if each[-1].scope != "function"]
-        begun = _processor_seconds()
-        self.enter(item.nodeid)
-        try:
-            return (yield)
-        finally:
-            self.leave()
+        begun, self.failed = _processor_seconds(), False
+        with self._counting_for(item.nodeid):
+            outcome = yield
+        if not self.failed:
             with self.seen.open("a") as file:
                 print(json.dumps([item.nodeid, names, _processor_seconds() - begun]), file=file)
+        return outcome
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        """Notice a failure."""
+        self.failed = self.failed or report.failed
 
     @pytest.hookimpl(wrapper=True)
     def pytest_fixture_setup(self, fixturedef: Any) -> Iterator[None]:
         """A fixture that several tests share is a context of its own."""
         if fixturedef.scope == "function":
             return (yield)
-        self.enter(_name(fixturedef))
-        try:
+        with self._counting_for(_name(fixturedef)):
             return (yield)
-        finally:
-            self.leave()
 
     def pytest_sessionfinish(self) -> None:
         """Write what was seen."""
-        self.measuring.stop()
-        self.measuring.save()
-
-
-def pytest_configure(config: pytest.Config) -> None:
-    """Where this is named as a plugin: measure, but not in the process that only hands tests out."""
-    if hasattr(config, "workerinput") or not config.getoption("numprocesses", None):
-        config.pluginmanager.register(Recorder(Path(os.environ["STAF_MUTATION_FOLDER"])))
+        if self.measuring is not None:
+            self.measuring.stop()
+            self.measuring.save()
 
 
 def _processor_seconds() -> float:
@@ -114,41 +132,29 @@ def _name(fixture: Any) -> str:
     return f"fixture {fixture.baseid} {fixture.argname}"
 
 
-def measure(tree: Path, tests: Iterable[str], folder: Path, jobs: int) -> dict[str, Any]:
-    """Run tests of a tree once.
+def measure(test_file: str) -> tuple[str, dict[str, Any] | None]:
+    """Run a file of tests once, in the copy of this process.
 
     Returns:
-        Lines of every test and fixture, the fixtures of every test, and the seconds that it took, for json.
+        The file, and for json: lines of every test and fixture, fixtures and seconds of every test, hashes
+        of the package's files. None where the run was ended.
     """
-    (folder / "settings.ini").write_text(_SETTINGS.format(data=folder / "data"))
-    line = [
-        *(sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "mutation_map", "--tb=no")
-    ]
-    line += [*(f"--ignore={place}" for place in _OUTSIDE), *tests]
-    line += ["-n", str(jobs), "--dist", "worksteal"] if jobs > 1 else []
-    settings = {
-        "PYTHONPATH": os.pathsep.join((str(tree), str(Path(__file__).parent))),
-        "COVERAGE_PROCESS_START": str(folder / "settings.ini"),
-        "STAF_MUTATION_FOLDER": str(folder),
-        "STAF_MUTATION_CONTEXT": "",
-    }
-    with (folder / "said.txt").open("w") as said:
-        ended = subprocess.run(
-            line, cwd=tree, env={**os.environ, **settings}, stdout=said, stderr=said, check=False
-        )
-    text = (folder / "said.txt").read_text()
-    print("\n".join(text.strip().splitlines()[-6:]), flush=True)
-    if ended.returncode not in (0, 1):
-        raise SystemExit(f"the tests did not run: exit code {ended.returncode}")
-    return read(folder)
+    folder = Path(tempfile.mkdtemp(dir=place().parent, prefix="map-"))
+    try:
+        if in_fork([test_file], Recorder(folder), _LONGEST, stop=False) is None:
+            return test_file, None
+        found = _read(folder)
+    finally:
+        shutil.rmtree(folder)
+    executed = {file for files in found["lines"].values() for file in files}
+    found["package"] = {file: hash_of(place() / file) for file in sorted(executed)}
+    return test_file, found
 
 
-def read(folder: Path) -> dict[str, Any]:
-    """What tests have written so far, also where they were ended in between; see `measure`."""
+def _read(folder: Path) -> dict[str, Any]:
     found: dict[str, Any] = {"lines": {}, "tests": {}, "seconds": {}}
-    for path in folder.glob("seen-*.jsonl"):
-        for test, fixtures, spent in map(json.loads, path.read_text().splitlines()):
-            found["tests"][test], found["seconds"][test] = fixtures, spent
+    for test, fixtures, spent in map(json.loads, (folder / "seen.jsonl").read_text().splitlines()):
+        found["tests"][test], found["seconds"][test] = fixtures, spent
     lines: dict[str, dict[str, set[int]]] = defaultdict(lambda: defaultdict(set))
     for path in folder.glob("data.*"):
         for file, context, numbers in _rows(path):
@@ -176,53 +182,103 @@ def _rows(data: Path) -> Iterator[tuple[str, str, list[int]]]:
                 yield path[path.rindex("staf_torch/") :], name, numbers
 
 
-def moved(found: dict[str, Any], old: dict[str, str], new: dict[str, str]) -> dict[str, Any]:
-    """Match the lines of a map with those of another version.
+# Kept
 
-    Args:
-        found: what `measure` returned.
-        old: the text of every file that it was measured with.
-        new: that of every file now.
-    """
-    places = {file: _matching(old.get(file, ""), text) for file, text in new.items()}
-    lines = {}
-    for context, files in found["lines"].items():
-        lines[context] = {
-            file: [places[file][number] for number in numbers if number in places[file]]
-            for file, numbers in files.items()
-            if file in places
+
+def test_files(tree: Path) -> list[str]:
+    """Files of tests that can tell a mutant."""
+    names = (str(path.relative_to(tree)) for path in sorted((tree / "tests").rglob("test_*.py")))
+    return [name for name in names if not name.startswith(_OUTSIDE)]
+
+
+def kept_at(store: Path, tree: Path, test_file: str) -> Path:
+    """Where the map of a file of tests is kept, in the version that a tree has."""
+    return store / f"{test_file.replace('/', '+')}@{hash_of(tree / test_file)[:16]}.json"
+
+
+def hash_of(path: Path) -> str:
+    """The name that git gives to the text of a file."""
+    raw = path.read_bytes()
+    return hashlib.sha1(b"blob %d\0" % len(raw) + raw).hexdigest()
+
+
+def known(store: Path, tree: Path) -> Map:
+    """The map of a tree, of what is kept for its files of tests."""
+    lines: dict[str, dict[int, set[str]]] = defaultdict(lambda: defaultdict(set))
+    seconds: dict[str, float] = {}
+    fixtures: dict[str, list[str]] = {}
+    unmeasured = []
+    now = {str(path.relative_to(tree)): hash_of(path) for path in (tree / "staf_torch").rglob("*.py")}
+    for test_file in test_files(tree):
+        kept = kept_at(store, tree, test_file)
+        if not kept.exists():
+            unmeasured.append(test_file)
+            continue
+        found = json.loads(kept.read_text())
+        places = {
+            file: _matching(before, now[file]) for file, before in found["package"].items() if file in now
         }
-    return {**found, "lines": lines}
+        seconds |= _apart(found["tests"], found["seconds"])
+        fixtures |= found["tests"]
+        for context, users in _users(found["tests"]).items():
+            for file, numbers in found["lines"].get(context, {}).items():
+                for number in numbers if file in places else ():
+                    if number in places[file]:
+                        lines[file][places[file][number]].update(users)
+    return Map(lines, seconds, fixtures, tuple(unmeasured))
 
 
+def _apart(tests: Mapping[str, Sequence[str]], seconds: Mapping[str, float]) -> dict[str, float]:
+    """Seconds of tests and of fixtures: what its first user takes beyond the others is a fixture's."""
+    found = dict(seconds)
+    for test, fixtures in tests.items():  # in the order that they ran
+        new = set(fixtures) - set(found)
+        others = [seconds[each] for each, used in tests.items() if each != test and new & set(used)]
+        beyond = max(seconds[test] - statistics.median(others), 0.0) if others else 0.0
+        found |= dict.fromkeys(new, beyond / max(len(new), 1))
+        found[test] = seconds[test] - beyond
+    return found
+
+
+def _users(tests: Mapping[str, Iterable[str]]) -> dict[str, list[str]]:
+    """Tests of every context: themselves, and what uses a fixture."""
+    users: dict[str, list[str]] = defaultdict(list)
+    for test, fixtures in tests.items():
+        for context in (test, *fixtures):
+            users[context].append(test)
+    return users
+
+
+@cache
 def _matching(old: str, new: str) -> dict[int, int]:
-    before, after = old.splitlines(), new.splitlines()
-    if before == after:
-        return {number: number for number in range(1, len(before) + 1)}
-    blocks = difflib.SequenceMatcher(None, before, after, autojunk=False).get_matching_blocks()
+    """Lines of one text, by its hash, in another; none of a text that git no longer has."""
+    before = _text(old)
+    if before is None or old == new:
+        return {number: number for number in range(1, len(before or ()) + 1)}
+    blocks = difflib.SequenceMatcher(None, before, _text(new) or [], autojunk=False).get_matching_blocks()
     return {one + at + 1: two + at + 1 for one, two, size in blocks for at in range(size)}
 
 
-def as_map(found: dict[str, Any]) -> Map:
-    """Give every test the lines of the fixtures that it shares."""
-    users: dict[str, list[str]] = defaultdict(list)
-    for test, fixtures in found["tests"].items():
-        users[test].append(test)
-        for fixture in fixtures:
-            users[fixture].append(test)
-    lines: dict[str, dict[int, set[str]]] = defaultdict(lambda: defaultdict(set))
-    for context, files in found["lines"].items():
-        for file, numbers in files.items():
-            for number in numbers:
-                lines[file][number].update(users.get(context, ()))
-    return Map(lines, found["seconds"])
+@cache
+def _text(blob: str) -> list[str] | None:
+    found = subprocess.run(
+        ["git", "cat-file", "blob", blob],
+        cwd=Path(__file__).parent,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    return found.stdout.splitlines() if found.returncode == 0 else None
+
+
+# Asked
 
 
 def tests_near(known: Map, file: str, first: int, last: int, around: tuple[int, int, bool]) -> set[str]:
     """Tests that execute some lines.
 
     Where that happens at import, or not at all: those of the function or class around, or else of the file,
-    or else of the folder.
+    or else of the folder. Files of the folder that were not measured count as a test each.
 
     Args:
         known: the map.
@@ -235,13 +291,14 @@ def tests_near(known: Map, file: str, first: int, last: int, around: tuple[int, 
         The tests; none where the folder has none.
     """
     there = known.lines.get(file, {})
+    whole = {test for test in known.unmeasured if test.startswith(places(file))}
     order = sorted(there)
     for begin, end in ((first, last), around[:2], (0, 10**9)):
         span = order[bisect.bisect_left(order, begin) : bisect.bisect_right(order, end)]
         hits = set().union(*(there[number] for number in span)) if span else set()
         if hits and not (around[2] and (begin, end) == (first, last)):
-            return hits
-    return {test for test in known.seconds if test.startswith(places(file))}
+            return hits | whole
+    return {test for test in known.fixtures if test.startswith(places(file))} | whole
 
 
 def places(file: str) -> tuple[str, ...]:

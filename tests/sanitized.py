@@ -86,7 +86,7 @@ def inside(calls: int, seed: int, chosen: Sequence[str]) -> None:
     from staf_torch.lanes import build, compiler
     from staf_torch.online import StaFRegressor
     from staf_torch.online.bank import Bank
-    from staf_torch.online.bank_rules import BankShape
+    from staf_torch.online.bank_rules import RECENT, BankShape, Rules
 
     more = (*FLAGS, "-shared-libasan") if "clang" in os.environ["CXX"] else FLAGS
     build._FLAGS += more
@@ -170,8 +170,12 @@ def inside(calls: int, seed: int, chosen: Sequence[str]) -> None:
 
     def a_bank() -> None:
         """Some samples for some streams, of which some go on; compiled code against the definition."""
-        streams, steps = chance.choice((0, 1, 1, 2, 3)), chance.choice((0, 1, 2, 12))
-        shape = BankShape(dim=2, outputs=1, capacity=9, neighbours=3)
+        streams, steps = chance.choice((0, 1, 1, 2, 3)), chance.choice((0, 1, 2, 12, 70))
+        shape = BankShape(dim=2, outputs=1, capacity=RECENT, neighbours=3)
+        # A Gram matrix of k + 1 points has at most this condition, by which rounding may grow.
+        rounding = (
+            (shape.neighbours + 1) / min(Rules._field_defaults["noise"]) * torch.finfo(torch.float64).eps
+        )
         bank, plain = Bank(shape, streams, chance.random() < 0.5), None
         if chance.random() < 0.1:
             plain = Bank(shape, streams, bank.scaling)
@@ -183,10 +187,12 @@ def inside(calls: int, seed: int, chosen: Sequence[str]) -> None:
             lapse = chance.choice([None, torch.rand(bank.count, dtype=torch.float64)])
             bank.learn(x, y, lapse)
             found = bank.predict(x)
-            if plain is not None and bank.count:
+            if plain is not None and bank.count and at < 12:
                 plain.learn(x, y, lapse)
                 for one, other in zip(found, plain.predict(x), strict=True):
-                    torch.testing.assert_close(one, other, rtol=1e-3, atol=1e-3, equal_nan=True)
+                    torch.testing.assert_close(one, other, rtol=rounding, atol=rounding, equal_nan=True)
+            if plain is not None:
+                plain.table.copy_(bank.table)  # a step from equal states: rounding does not add up
             if plain is None and at == 5:
                 bank.keep(torch.arange(bank.count)[1:])
                 bank.add(2)

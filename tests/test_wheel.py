@@ -64,7 +64,7 @@ def test_an_index_can_show_the_description_and_the_version_is_one(wheel: Path) -
 def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A virtual environment that has what we depend on, and not this package."""
     place = tmp_path_factory.mktemp("home")
-    _run(sys.executable, "-m", "venv", place / "venv", cwd=place)
+    _run(sys.executable, "-m", "venv", "--without-pip", place / "venv", cwd=place)
     asked = "import sysconfig; print(sysconfig.get_path('purelib'))"
     site = Path(_run(place / "venv" / "bin" / "python", "-c", asked, cwd=place).strip())
     # A path in a .pth file brings the packages there, but not their own .pth files: an editable install
@@ -76,6 +76,12 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def _install(home: Path, *what: str | Path) -> None:
     line = [home / "bin" / "python", "-m", "pip", "install", "--quiet", "--no-deps", "--no-index"]
     _run(*line, "--no-build-isolation", *what, cwd=home)
+
+
+def _imported(home: Path, cwd: Path) -> Path:
+    """Where the environment finds the package, without the seconds of its import."""
+    asked = "import importlib.util; print(importlib.util.find_spec('staf_torch').origin)"
+    return Path(_run(home / "bin" / "python", "-c", asked, cwd=cwd).strip()).resolve()
 
 
 def _sweep_own_app(home: Path, work: Path) -> None:
@@ -92,8 +98,7 @@ def test_wheel_runs_in_a_clean_environment_from_any_directory(
     wheel: Path, home: Path, tmp_path: Path
 ) -> None:
     _install(home, wheel)
-    where = _run(home / "bin" / "python", "-c", "import staf_torch; print(staf_torch.__file__)", cwd=tmp_path)
-    assert Path(where.strip()).resolve().is_relative_to(home.resolve())
+    assert _imported(home, tmp_path).is_relative_to(home.resolve())
     said = _run(home / "bin" / "staf", "duration=0.1", "settle_time=0", "figures=false", cwd=tmp_path)
     assert "Gradient chase" in said
     (run,) = (tmp_path / "runs").iterdir()
@@ -112,6 +117,5 @@ def test_wheel_runs_in_a_clean_environment_from_any_directory(
 
 def test_editable_install_serves_another_application_as_a_wheel_does(home: Path, tmp_path: Path) -> None:
     _install(home, "--force-reinstall", "-e", ROOT)
-    where = _run(home / "bin" / "python", "-c", "import staf_torch; print(staf_torch.__file__)", cwd=tmp_path)
-    assert Path(where.strip()).resolve().is_relative_to(ROOT.resolve())
+    assert _imported(home, tmp_path).is_relative_to(ROOT.resolve())
     _sweep_own_app(home, tmp_path)

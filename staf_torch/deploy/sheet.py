@@ -14,6 +14,8 @@ import torch
 from torch import Tensor
 from torch.export import ExportedProgram
 
+from ..results.untrusted import visible
+
 CALLS = 10_000
 _WARM = 500
 
@@ -175,8 +177,8 @@ def markdown(sheet: Mapping[str, Any]) -> str:
         "",
         sheet["what"],
         "",
-        f"From `{sheet['run']}`, trajectory {sheet['row']}, by staf_torch {sheet['version']} and torch "
-        f"{sheet['torch']}. Batch B: {sheet['batch']}.",
+        f"From `{_named(sheet['run'])}`, trajectory {sheet['row']}, by staf_torch {sheet['version']} and "
+        f"torch {sheet['torch']}. Batch B: {sheet['batch']}.",
         "",
         "| | name | shape | dtype | unit | region |",
         "|---|---|---|---|---|---|",
@@ -200,6 +202,11 @@ def markdown(sheet: Mapping[str, Any]) -> str:
         "Errors are the largest difference over the largest value, at 1000 random points of the region.",
     ]
     return "\n".join(lines) + "\n"
+
+
+def _named(path: str) -> str:
+    """A path as it stands between backquotes: on one line, and with nothing that a terminal obeys."""
+    return visible(path).replace("\n", "\\n").replace("`", "'")
 
 
 def _shape(size: int | None) -> str:

@@ -331,6 +331,7 @@ static void keep(const Rules &r, Stream &s, const double *x, const double *y, do
             if (s.order[j] <= old && (slot < 0 || s.gap[j] < s.gap[slot] ||
                                       (s.gap[j] == s.gap[slot] && s.order[j] < s.order[slot])))
                 slot = j;
+        slot = std::max(slot, 0);  // of a loaded table, in which every sample may call itself recent
         for (int i = 0; i < C; ++i) {
             if (i == slot || s.order[i] > old || apart(r, s, s.x[i], s.x[slot]) != s.gap[i]) continue;
             s.gap[i] = infinity;

@@ -15,7 +15,16 @@ from ..centers import simplex
 from ..kernels import GaussianKernel
 from ..lanes.build import compiled
 from .bank_definition import BankDefinition
-from .bank_rules import CARRIED_RADIUS, CARRIED_WIDTH, TRACKED, BankShape, Rules, size
+from .bank_rules import (
+    CARRIED_RADIUS,
+    CARRIED_WIDTH,
+    RECENT,
+    TRACKED,
+    BankShape,
+    Rules,
+    refuse_unwritten,
+    size,
+)
 from .compiled_filter import FunctionPointers
 from .filter_streams import refuse_other
 from .local_functions import LocalFunctions
@@ -64,6 +73,7 @@ class Bank:
     """
 
     def __init__(self, shape: BankShape, streams: int, scaling: bool, doubtful: float | None = None) -> None:
+        assert shape.capacity >= RECENT  # a full store gives up a sample that is not recent
         self.shape, self.scaling, self.dtype = shape, scaling, torch.float64
         width = CARRIED_WIDTH * math.sqrt(shape.dim)
         functions = LocalFunctions.of(GaussianKernel(width), CARRIED_RADIUS * width * simplex(shape.dim))
@@ -113,9 +123,16 @@ class Bank:
         return {"table": self.table.clone()}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Take over what `state_dict` has."""
-        refuse_other(state["table"].shape[1], size(self.shape))
-        self.replace(state["table"].clone())
+        """Take over what `state_dict` of as many streams has.
+
+        Raises:
+            ValueError: if the table has another shape, dtype or device, or numbers that no bank has written:
+                compiled code goes by them.
+        """
+        table = state["table"]
+        refuse_other(state, {"table": self.table}, size(self.shape), table.shape[-1])
+        refuse_unwritten(self.shape, table)
+        self.replace(table.clone())
 
     @property
     def learned(self) -> Tensor:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+from torch import Tensor
+
 LOCAL, CARRIED, QUADRATIC, TRACKERS = 24, 8, 8, 8
 MEMBERS = LOCAL + CARRIED + QUADRATIC + TRACKERS + 2  # ... and the linear model, the last value
 CLOCKS, BLENDS = 3, 3
@@ -189,3 +191,25 @@ def layout(shape: BankShape) -> list[tuple[str, tuple[int, ...]]]:
 def size(shape: BankShape) -> int:
     """Numbers a stream."""
     return sum(math.prod(dims) for _, dims in layout(shape))
+
+
+def refuse_unwritten(shape: BankShape, table: Tensor) -> None:
+    """Refuse a saved table (S, size) with numbers that no bank writes and that compiled code goes by.
+
+    Raises:
+        ValueError: where a number of samples or a place is out of range, or a sample is not finite.
+    """
+    sizes = [math.prod(dims) for _, dims in layout(shape)]
+    parts = dict(zip((name for name, _ in layout(shape)), table.split(sizes, dim=1), strict=True))
+    turns = parts["tracker_counts"][:, -TRACKERS:]
+    rules = {
+        f"a number of samples from 0 to {shape.capacity}": (parts["count"] >= 0)
+        & (parts["count"] <= shape.capacity),
+        f"a place from 0 to {TRACKED}": (turns >= 0) & (turns <= TRACKED),
+        "samples that are finite": (parts["x"].isfinite().all(1) & parts["y"].isfinite().all(1))[:, None],
+    }
+    for rule, holds in rules.items():
+        if not bool(holds.all()):
+            raise ValueError(
+                f"`StaFRegressor.load_state_dict(state=...)` must have {rule}; 'table' has another."
+            )

@@ -157,6 +157,10 @@ class FilterStreams:
 
     def state_dict(self) -> dict[str, Any]:
         """Copies of all tensors that learning changes."""
+        return {name: tensor.clone() for name, tensor in self._learned().items()}
+
+    def _learned(self) -> dict[str, Tensor]:
+        """All tensors that learning changes."""
         kept = {
             "table": self.state.table,
             "counts": self.state.counts,
@@ -164,21 +168,38 @@ class FilterStreams:
             "clock": self.clock,
         }
         law = {"first": self.first, "ratio": self.definition.ratio, "forgetting": self.definition.forgetting}
-        return {name: tensor.clone() for name, tensor in (kept | law).items()}
+        return kept | law
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take over what `state_dict` has."""
-        refuse_other(state["table"].shape[0], self.state.blocks.shape[1])
+        """Take over what `state_dict` of as many streams has.
+
+        Raises:
+            ValueError: if a tensor has another shape, dtype or device, since compiled code goes by these.
+        """
+        refuse_other(state, self._learned(), self.state.blocks.shape[1], state["table"].shape[0])
         kept = self.state.with_table(state["table"], state["counts"].clone())
         self.units, self.clock, self.first = (state[name].clone() for name in ("units", "clock", "first"))
         self._hold(self.definition.with_law(state["ratio"].clone(), state["forgetting"].clone()), kept)
 
 
-def refuse_other(given: int, expected: int) -> None:
-    """Raise where a saved table has another number of numbers a stream."""
+def refuse_other(state: dict[str, Any], own: dict[str, Tensor], expected: int, given: int) -> None:
+    """Raise where a saved state has other tensors than a new one.
+
+    Args:
+        state: that was saved.
+        own: tensors of the new one, by name.
+        expected: numbers a stream of the new one.
+        given: numbers a stream of the saved table.
+    """
+    name = "`StaFRegressor.load_state_dict(state=...)`"
     if given != expected:
         told = f"must have {expected} numbers a stream, as this version and these arguments have; got {given}"
-        raise ValueError(f"`StaFRegressor.load_state_dict(state=...)` {told}.")
+        raise ValueError(f"{name} {told}.")
+    for key, tensor in own.items():
+        found = state[key]
+        if (found.shape, found.dtype, found.device) != (tensor.shape, tensor.dtype, tensor.device):
+            told = f"must have {key!r} of shape {tuple(tensor.shape)}, {tensor.dtype} on {tensor.device}"
+            raise ValueError(f"{name} {told}; got {tuple(found.shape)}, {found.dtype} on {found.device}.")
 
 
 def units_of(samples: Tensor) -> tuple[Tensor, Tensor]:

@@ -23,6 +23,7 @@ from .untrusted import UnreadableError, read_object
 
 _log = logging.getLogger(__name__)
 _TOLD = 4  # differences that a message names
+_SHOWN, _LINE = 80, 1000  # characters of a version, and of a command line, that a message repeats
 SETTINGS = "sweep"
 """The group of settings that are about the sweep and not about its jobs."""
 
@@ -93,7 +94,8 @@ class RunRecord:
             return None
         if record.get("overrides") != self._about["overrides"]:
             lines = record.get("overrides")
-            typed = " ".join(map(str, lines)) if isinstance(lines, list) else lines
+            typed = " ".join(map(str, lines)) if isinstance(lines, list) else str(lines)
+            typed = typed if len(typed) <= _LINE else f"{typed[: _LINE - 3]}..."
             raise ValueError(
                 f"{directory} holds the run {typed!r}, where this sweep has "
                 f"{' '.join(self._about['overrides'])!r}."
@@ -132,7 +134,8 @@ class RunRecord:
         """Return what differs between an earlier record and this one, the first few."""
         told = list(differences(record, self._about))
         if record.get("version") != __version__:
-            told.insert(0, f"it was written by staf_torch {record.get('version')}, and this is {__version__}")
+            then = str(record.get("version"))[:_SHOWN]
+            told.insert(0, f"it was written by staf_torch {then}, and this is {__version__}")
         more = f"; and {len(told) - _TOLD} more" if len(told) > _TOLD else ""
         return "; ".join(told[:_TOLD]) + more
 

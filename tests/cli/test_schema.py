@@ -8,10 +8,9 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import composing
 import pytest
 from command_line import ROOT
-from composing import HYDRA
-from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from staf_torch.cli import schema
@@ -50,9 +49,8 @@ def test_a_file_that_ships_is_valid_and_with_a_wrong_key_it_is_not(path: Path, w
 
 
 def test_settings_of_a_run_are_valid(whole: dict[str, Any]) -> None:
-    with initialize_config_dir(str(CONF), **HYDRA):
-        for options in (["experiment=adp"], ["kernel=matern", "optimizer=exact", "members=['seed=0,1']"]):
-            assert faults(whole, ".", OmegaConf.to_container(compose("config", options))) == []
+    for options in (["experiment=adp"], ["kernel=matern", "optimizer=exact", "members=['seed=0,1']"]):
+        assert faults(whole, ".", OmegaConf.to_container(composing.settings(*options))) == []
 
 
 @pytest.mark.parametrize(

@@ -9,14 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from composing import HYDRA
-from hydra import compose, initialize_config_dir
+from composing import settings
 from omegaconf import OmegaConf
 
 from staf_torch import deploy
 from staf_torch.cli.deployable import deployable
 from staf_torch.cli.export import export, export_learning, main
-from staf_torch.cli.staf import config_directory
 from staf_torch.experiments.registry import experiment
 
 needs_cc = pytest.mark.skipif(
@@ -34,8 +32,7 @@ RUNS = {
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("runs")
     for name, overrides in RUNS.items():
-        with initialize_config_dir(config_directory(), **HYDRA):
-            cfg = compose("config", ["figures=false", *overrides])
+        cfg = settings("figures=false", *overrides)
         (folder / name / ".hydra").mkdir(parents=True)
         OmegaConf.save(cfg, folder / name / ".hydra" / "config.yaml")
         experiment(cfg.task)(cfg, folder / name)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import os
 import subprocess
@@ -42,33 +43,45 @@ FAULTS = {
     "failing build": {"CXX": "/bin/false"},
     "nowhere to write": {"HOME": "/proc", "TMPDIR": "/proc"},
 }
+FAULTY = """
+import json, os, sys, tempfile, torch, staf_torch as st
 
-
-@pytest.mark.parametrize("fault", FAULTS)
-def test_no_fault_of_a_build_is_more_than_one_line_of_the_log(fault: str, tmp_path: Path) -> None:
-    program = """
-import sys, tempfile, torch, staf_torch as st
-tempfile.tempdir = __import__("os").environ.get("TMPDIR")
-basis = st.StaFBasis(st.ExponentialKernel(), st.StateFollowingCenters(st.rings(3), 0.1))
-for dtype in (torch.float64, torch.float32):
-    for run in (st.chase, st.chase_weights):
-        states = torch.ones(2, 17, 2, dtype=dtype)
-        weights = run(states, basis, st.targets.Paper(), st.optim.SteepestDescent())
-        assert weights.weights.isfinite().all()
+faults, place = json.loads(sys.argv[1]), sys.argv[2]
+for name, changed in faults.items():  # each in a fork, so that torch is imported once
+    child = os.fork()
+    if child:
+        print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+        continue
+    said = os.open(f"{place}/{name}", os.O_CREAT | os.O_WRONLY)
+    os.dup2(said, 1)
+    os.dup2(said, 2)
+    if "HOME" not in changed:
+        os.environ["XDG_CACHE_HOME"] = f"{place}/cache of {name}"
+    os.environ.update(changed)
+    tempfile.tempdir = os.environ.get("TMPDIR")
+    basis = st.StaFBasis(st.ExponentialKernel(), st.StateFollowingCenters(st.rings(3), 0.1))
+    for dtype in (torch.float64, torch.float32):
+        for run in (st.chase, st.chase_weights):
+            states = torch.ones(2, 17, 2, dtype=dtype)
+            weights = run(states, basis, st.targets.Paper(), st.optim.SteepestDescent())
+            assert weights.weights.isfinite().all()
+    sys.stdout.flush()
+    os._exit(0)
 """
+
+
+def test_no_fault_of_a_build_is_more_than_one_line_of_the_log(tmp_path: Path) -> None:
     unset = ("CXX", "XDG_CACHE_HOME")
-    environment = {name: value for name, value in os.environ.items() if name not in unset}
-    if "HOME" not in FAULTS[fault]:
-        environment["XDG_CACHE_HOME"] = str(tmp_path)
-    done = subprocess.run(
-        [sys.executable, "-W", "error", "-c", program],
-        env=environment | FAULTS[fault],
+    ended = subprocess.run(
+        [sys.executable, "-u", "-W", "error", "-c", FAULTY, json.dumps(FAULTS), str(tmp_path)],
+        env={name: value for name, value in os.environ.items() if name not in unset},
         cwd=Path(__file__).parents[2],
         capture_output=True,
         text=True,
         check=False,
     )
-    assert done.returncode == 0, done.stderr
-    assert done.stdout == ""
-    assert len(done.stderr.splitlines()) == 1
-    assert "runs in plain torch" in done.stderr
+    said = {fault: (tmp_path / fault).read_text() for fault in FAULTS}
+    assert ended.stdout.split() == ["0"] * len(FAULTS), (said, ended.stderr)
+    for fault, text in said.items():
+        assert len(text.splitlines()) == 1, (fault, text)
+        assert "runs in plain torch" in text

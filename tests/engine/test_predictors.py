@@ -117,9 +117,8 @@ def test_one_line_search_behind_a_tangent_is_enough() -> None:
 def test_the_excess_falls_with_the_order_of_the_predictor(
     law: str, predictor: str, least: float, most: float
 ) -> None:
-    steps = (0.04, 0.02, 0.01)
-    excess = [settled(law, 1, predictor, dt)["before"] for dt in steps]
-    slope = math.log(excess[0] / excess[-1]) / math.log(steps[0] / steps[-1])
+    slow, fast = (settled(law, 1, predictor, dt)["before"] for dt in (0.04, 0.02))
+    slope = math.log2(slow / fast)
     assert least < slope < most
 
 
@@ -268,7 +267,7 @@ def test_gradients_pass_through_a_chase(law: str, predictor: str) -> None:
 
     matrix = torch.tensor([[0.3, 0.1], [0.0, 0.5]], dtype=torch.float64)
     arguments = x.clone().requires_grad_(), matrix.requires_grad_()
-    assert torch.autograd.gradcheck(final, arguments, atol=1e-4, rtol=1e-4)
+    assert torch.autograd.gradcheck(final, arguments, atol=1e-4, rtol=1e-4, fast_mode=True)
 
 
 def test_what_is_no_predictor_is_refused() -> None:

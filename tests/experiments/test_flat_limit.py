@@ -9,25 +9,22 @@ import math
 from decimal import Decimal
 from pathlib import Path
 
+import composing
 import mpmath as mp
 import pytest
 import torch
-from composing import HYDRA
 from helpers import tensor, uniform
-from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 from truth import Truth, paper
 
 import staf_torch as st
-from staf_torch.cli.staf import config_directory
 from staf_torch.experiments import flat_limit
 from staf_torch.figures.style import images
 from staf_torch.figures.theory import ErrorPanel, draw_errors
 
 
 def settings(*overrides: str) -> DictConfig:
-    with initialize_config_dir(config_directory(), **HYDRA):
-        return compose("config", overrides=["experiment=flat_limit", *overrides])
+    return composing.settings("experiment=flat_limit", *overrides)
 
 
 @pytest.mark.parametrize("count", [1, 3, 6, 15])

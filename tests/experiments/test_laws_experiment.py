@@ -10,10 +10,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from composing import HYDRA
-from hydra import compose, initialize_config_dir
+from composing import settings
 from hydra.errors import HydraException
-from omegaconf import DictConfig
 from variants import LAWS
 
 from staf_torch import optim, predictors
@@ -21,11 +19,6 @@ from staf_torch.cli.staf import config_directory
 from staf_torch.experiments import gradient_chase, laws
 from staf_torch.experiments.laws import cases
 from staf_torch.settings.chase import chase_problem
-
-
-def settings(*overrides: str) -> DictConfig:
-    with initialize_config_dir(config_directory(), **HYDRA):
-        return compose("config", list(overrides))
 
 
 def options(group: str) -> list[str]:

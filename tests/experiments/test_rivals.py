@@ -7,11 +7,9 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
-from composing import HYDRA
-from hydra import compose, initialize_config_dir
+from composing import settings
 from torch import Tensor
 
-from staf_torch.cli.staf import config_directory
 from staf_torch.experiments import rivals
 from staf_torch.experiments.rival_methods import METHODS, Method, ipopt_program
 from staf_torch.experiments.rival_plants import CASES
@@ -80,7 +78,6 @@ def test_equations_mean_the_same_to_casadi(name: str) -> None:
 
 
 def test_unknown_plants_and_methods_are_refused_by_name(tmp_path) -> None:  # type: ignore[no-untyped-def]
-    with initialize_config_dir(config_directory(), **HYDRA):
-        cfg = compose("config", ["experiment=rivals", "rivals.plants=[rocket]"])
+    cfg = settings("experiment=rivals", "rivals.plants=[rocket]")
     with pytest.raises(ValueError, match=r"`rivals\(plants=...\)` must be one of .*; got 'rocket'"):
         rivals.run(cfg, tmp_path)

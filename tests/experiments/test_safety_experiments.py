@@ -7,17 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from composing import HYDRA
-from hydra import compose, initialize_config_dir
+from composing import settings
 
-from staf_torch.cli.staf import config_directory
 from staf_torch.experiments import avoidance, safe_box
-
-
-def settings(*overrides: str):  # type: ignore[no-untyped-def]
-    with initialize_config_dir(config_directory(), **HYDRA):
-        return compose("config", list(overrides))
-
 
 FEW = ("safe_box.states=4", "safe_box.decay=20", "safe_box.followed=0.01", "safe_box.substeps=4")
 SHORT = ("duration=0.02", "dt=0.01", "trajectories=2", "adp.optimum.shooting=false", "adp.compile=false")

@@ -6,12 +6,10 @@ import csv
 import json
 from pathlib import Path
 
-import hydra
+import composing
 import pytest
-from composing import HYDRA
 from omegaconf import DictConfig
 
-from staf_torch.cli.staf import config_directory
 from staf_torch.experiments import exponential_bound, feasibility, layouts
 from staf_torch.experiments.registry import EXPERIMENTS
 
@@ -24,8 +22,7 @@ SMALL = {
 
 
 def settings(name: str, *overrides: str) -> DictConfig:
-    with hydra.initialize_config_dir(config_directory(), **HYDRA):
-        return hydra.compose("config", [f"experiment={name}", *SMALL[name], *overrides])
+    return composing.settings(f"experiment={name}", *SMALL[name], *overrides)
 
 
 def run(name: str, directory: Path, *overrides: str) -> dict[str, float | None]:

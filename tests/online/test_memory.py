@@ -7,16 +7,14 @@ import json
 import math
 from pathlib import Path
 
-import hydra
+import composing
 import pytest
 import torch
-from composing import HYDRA
 from helpers import basis_of, tensor, uniform
 from omegaconf import DictConfig
 from torch import Tensor
 
 import staf_torch as st
-from staf_torch.cli.staf import config_directory
 from staf_torch.experiments import memory as experiment
 from staf_torch.experiments.registry import EXPERIMENTS
 
@@ -168,8 +166,7 @@ def test_bad_arguments_are_named() -> None:
 
 def settings(*overrides: str) -> DictConfig:
     small = ["memory.states=40", "memory.revisits=8", "memory.steps=40", "settle_time=2", "duration=5.2"]
-    with hydra.initialize_config_dir(config_directory(), **HYDRA):
-        return hydra.compose("config", ["experiment=memory", *small, *overrides])
+    return composing.settings("experiment=memory", *small, *overrides)
 
 
 def test_revisited_region_settles_in_one_step_from_the_memory(tmp_path: Path) -> None:

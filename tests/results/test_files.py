@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from staf_torch.results import files
-from staf_torch.results.files import flatten, write_metrics, write_text
+from staf_torch.results.files import flatten, open_after, write_metrics, write_text
 
 
 def test_metrics_read_back_as_written(tmp_path: Path) -> None:
@@ -64,3 +64,26 @@ def test_a_failed_write_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.
 def test_nested_settings_have_dotted_keys_and_what_is_empty_stays() -> None:
     nested = {"a": {"b": {"c": 1}, "d": [2]}, "e": {}, "f": None}
     assert flatten(nested) == {"a.b.c": 1, "a.d": [2], "e": {}, "f": None}
+
+
+@pytest.mark.parametrize("keep", [0, 3])
+def test_a_file_is_taken_up_behind_what_is_kept(tmp_path: Path, keep: int) -> None:
+    path = tmp_path / "rows.csv"
+    path.write_text("abcdef")
+    with os.fdopen(open_after(path, keep), "w") as file:
+        file.write("xy")
+    assert path.read_text() == "abcdef"[:keep] + "xy"
+
+
+@pytest.mark.parametrize("keep", [0, 3])
+def test_what_is_taken_up_is_no_link_to_another_file(tmp_path: Path, keep: int) -> None:
+    own, path = tmp_path / "own.txt", tmp_path / "rows.csv"
+    own.write_text("abcdef")
+    path.symlink_to(own)
+    if keep:
+        with pytest.raises(OSError, match=r"rows\.csv"):
+            open_after(path, keep)
+    else:
+        os.close(open_after(path, keep))
+        assert not path.is_symlink()
+    assert own.read_text() == "abcdef"

@@ -9,7 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as some
 
+from staf_torch.results.archive import Archive
 from staf_torch.results.run_directory import HistoryWriter
+from staf_torch.results.untrusted import UnreadableError
 
 
 def arrays(batch: int, times: int, dtype: str = "float64") -> dict[str, np.ndarray]:
@@ -91,3 +93,23 @@ def test_an_incomplete_archive_is_refused(tmp_path: Path) -> None:
 def test_a_directory_that_does_not_exist_is_an_os_error(tmp_path: Path) -> None:
     with pytest.raises(OSError, match="nowhere"):
         HistoryWriter(tmp_path / "nowhere" / "history.npz", 1, 1)
+
+
+def test_an_archive_that_must_be_unpacked_is_refused_whatever_it_holds(tmp_path: Path) -> None:
+    """Also an array that deflates to more bytes than it has: nothing is unpacked, ever."""
+    for name, array in arrays(1, 5).items():
+        np.savez_compressed(tmp_path / "history.npz", **{name: array})
+        with pytest.raises(UnreadableError, match=f"{name} is compressed"):
+            Archive(tmp_path / "history.npz")
+
+
+@pytest.mark.parametrize("order", ["C", "F"])
+def test_a_row_is_read_alone_as_with_the_others(tmp_path: Path, order: str) -> None:
+    expected = {name: np.asarray(array, order=order) for name, array in arrays(3, 5).items()}
+    np.savez(tmp_path / "history.npz", **expected)
+    archive = Archive(tmp_path / "history.npz")
+    for name, array in expected.items():
+        assert archive.shape(name) == array.shape
+        np.testing.assert_array_equal(archive.read(name), array)
+        for row in range(3):
+            np.testing.assert_array_equal(archive.read(name, row), array[row])

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import composing
 import pytest
 import torch
-from composing import HYDRA
-from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
 
 from staf_torch import adp
@@ -24,8 +23,7 @@ OPTIONS = [
 
 
 def settings(*overrides: str) -> DictConfig:
-    with initialize_config_dir(config_directory(), **HYDRA):
-        return compose("config", ["experiment=adp", *overrides])
+    return composing.settings("experiment=adp", *overrides)
 
 
 def problem(*overrides: str) -> AdpProblem:

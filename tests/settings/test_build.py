@@ -5,10 +5,9 @@ from __future__ import annotations
 import functools
 from pathlib import Path
 
+import composing
 import pytest
 import torch
-from composing import HYDRA
-from hydra import compose, initialize_config_dir
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
@@ -28,8 +27,7 @@ OPTIONS = [
 
 @functools.cache
 def composed(*choices: str) -> DictConfig:
-    with initialize_config_dir(config_directory(), **HYDRA):
-        return compose("config", overrides=list(choices))
+    return composing.settings(*choices)
 
 
 def settings(line: str) -> DictConfig:

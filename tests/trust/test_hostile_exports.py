@@ -12,14 +12,14 @@ from typing import Any
 
 import pytest
 import torch
-from composing import HYDRA
+from composing import settings
 from hostile_runs import EXPORTS
-from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from staf_torch.cli.deployable import deployable
 from staf_torch.cli.export import export
 from staf_torch.cli.staf import config_directory
+from staf_torch.deploy import sheet
 from staf_torch.experiments.registry import experiment
 from staf_torch.settings.trust import constructors, limited
 
@@ -37,8 +37,7 @@ class Evil:
 @pytest.fixture(scope="module")
 def chase(tmp_path_factory: pytest.TempPathFactory) -> Path:
     run = tmp_path_factory.mktemp("runs") / "chase"
-    with initialize_config_dir(config_directory(), **HYDRA):
-        cfg = compose("config", ["centers.count=6", "duration=0.1", "trajectories=2", "figures=false"])
+    cfg = settings("centers.count=6", "duration=0.1", "trajectories=2", "figures=false")
     (run / ".hydra").mkdir(parents=True)
     OmegaConf.save(cfg, run / ".hydra" / "config.yaml")
     experiment(cfg.task)(cfg, run)
@@ -91,6 +90,19 @@ def test_nothing_is_written_through_a_link(linked: str, run: Path, tmp_path: Pat
     with pytest.raises(ValueError, match="is a link"):
         export(run, "pt2")
     assert list(victim.iterdir()) == []
+
+
+def test_the_name_of_a_folder_is_neither_c_nor_told_to_the_terminal(run: Path, tmp_path: Path) -> None:
+    evil = "__attribute__((constructor)) static void evil(void)"
+    (tmp_path / "x").write_text(
+        f'int system(const char *); {evil} {{ system("touch {tmp_path}/owned"); }}\nvoid staf() {{}}\n'
+    )
+    moved = tmp_path / 'x"\n#pragma \x1b[2J'
+    run.rename(moved)
+    page = sheet.markdown(export(moved, "c", calls=10))
+    assert not (tmp_path / "owned").exists()
+    assert "\x1b" not in page
+    assert "pragma" in page
 
 
 def test_every_part_of_the_settings_may_be_built_without_trust() -> None:

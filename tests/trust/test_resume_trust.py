@@ -20,8 +20,6 @@ from staf_torch.results import build
 from staf_torch.results.reader import collect, read_run
 from staf_torch.results.run_directory import History
 from staf_torch.sweeps import lock
-from staf_torch.sweeps.hydra_compat import config_loader
-from staf_torch.sweeps.members import member_overrides
 from staf_torch.sweeps.resume import command_line, may_run_code
 from staf_torch.tables import Layout, tabulate
 
@@ -237,14 +235,19 @@ def test_a_directory_belongs_to_one_sweep_at_a_time(place: Path) -> None:
     assert resume(place)[0] == 0  # who was killed holds nothing
 
 
-def test_a_sweep_of_a_billion_jobs_is_refused_before_anybody_lists_them(tmp_path: Path) -> None:
-    record = {"version": __version__, "overrides": ["seed=range(1000000000)"], "hydra": []}
+LONG = {
+    "seed=range(1000000000)": r"a sweep of 1e\+09 jobs, and 1000000 are the most",
+    f"+note=[{'1,' * 9999}1]": "lines of 20007 characters, and 10000 are the most",
+    f"+note={'[' * 4000}{']' * 4000}": "is nested too deep",
+}
+
+
+@pytest.mark.parametrize("line", LONG, ids=("jobs", "characters", "depth"))
+def test_a_line_that_would_take_for_ever_is_refused_before_it_is_read(line: str, tmp_path: Path) -> None:
+    record = {"version": __version__, "overrides": [line], "hydra": []}
     (tmp_path / "sweep.json").write_text(json.dumps(record))
-    with pytest.raises(ValueError, match=r"a sweep of 1e\+09 jobs, and 1000000 are the most"):
+    with pytest.raises(ValueError, match=LONG[line]):
         command_line(["-m", f"sweep.resume={tmp_path}"])
-    with pytest.raises(ValueError, match="must be 1000000 at most"):
-        member_overrides(["seed=range(1000)", "spread=range(1,2000)"], config_loader())
-    assert len(member_overrides(["seed=range(1000)", "spread=range(1,1001)"], config_loader())) == 10**6
 
 
 def test_a_lock_of_another_machine_holds_while_it_is_touched(tmp_path: Path) -> None:

@@ -1,0 +1,171 @@
+"""Whether tests notice a mutant: for `mutation.py`."""
+
+from __future__ import annotations
+
+import ast
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+from mutants import Mutant
+from mutants_accepted import accepted
+from mutation_fork import begin, in_fork, place
+from mutation_map import Map, places, tests_near
+
+OVERHEAD = 0.1  # seconds that a test costs beside what was measured
+UNKNOWN = 5.0  # seconds that a file of tests is taken for
+FIRST = 4.0  # seconds of tests that are tried before files of more tests are read
+
+
+class Verdict(NamedTuple):
+    """What the tests said to a mutant."""
+
+    mutant: Mutant
+    said: (
+        str  # killed, survived, accepted, unreached: no test executes the file, or too dear: all take longer
+    )
+    tests: int = 0
+    seconds: float = 0.0
+    by: str = ""  # the test that failed
+
+
+_map = Map({}, {}, {})
+_seconds = 0.0
+_until = 0.0
+
+
+def begin_judging(tree: Path, compiled: Path, known: Map, seconds: float, until: float) -> None:
+    """Prepare a process: see `mutation_fork.begin`.
+
+    Args:
+        tree: the right one.
+        compiled: folder of the programs that are compiled already.
+        known: which test executes which line.
+        seconds: of tests that a mutant is given, by what they took with the right code.
+        until: reading of `time.monotonic` after which no mutant is begun.
+    """
+    global _map, _seconds, _until
+    begin(tree, compiled)
+    _map, _seconds, _until = known, seconds, until
+
+
+def judge(mutant: Mutant) -> Verdict | None:
+    """Try a mutant; None where there is no time left."""
+    if accepted(mutant):
+        return Verdict(mutant, "accepted")
+    if time.monotonic() > _until:
+        return None
+    path = place() / mutant.file
+    source = path.read_text(encoding="utf-8")
+    tests = _tests_for(mutant, source)
+    if not tests:
+        return Verdict(mutant, "unreached" if not _hits(mutant, source) else "too dear")
+    begun = time.monotonic()
+    path.write_text(mutant.applied(source), encoding="utf-8")
+    said, by = "survived", ""
+    try:
+        for group in _groups(tests):
+            said, by = _run(group)
+            if said == "killed":
+                break
+    finally:
+        path.write_text(source, encoding="utf-8")
+    return Verdict(mutant, said, len(tests), time.monotonic() - begun, by)
+
+
+def fail_anyway(tests: Sequence[str]) -> list[str]:
+    """Those of some tests that fail in this process with the right code: they are no witnesses."""
+    if not tests:
+        return []
+    chosen = Chosen(tests)
+    in_fork(chosen.files, chosen, 60 + 5 * _cost(tests), stop=False)
+    return chosen.read()
+
+
+def _run(tests: Sequence[str]) -> tuple[str, str]:
+    chosen = Chosen(tests)
+    limit = 60 + 5 * _cost(tests)
+    code = in_fork(chosen.files, chosen, limit, stop=True)
+    if code is None:
+        return "killed", "by the clock, or the process ended"
+    return ("survived" if code in (0, 5) else "killed"), next(iter(chosen.read()), "")
+
+
+def _groups(tests: Sequence[str]) -> list[list[str]]:
+    """What is short first; the rest only where that says nothing, since reading its files takes a while."""
+    first = max(1, sum(_cost(tests[: at + 1]) < FIRST for at in range(len(tests))))
+    return [each for each in (list(tests[:first]), list(tests[first:])) if each]
+
+
+def _tests_for(mutant: Mutant, source: str) -> list[str]:
+    """Those that execute the lines, the folder's own first and the short ones first, within the time."""
+    hits = _hits(mutant, source)
+    near = {test: 0 if test.startswith(places(mutant.file)) else 1 for test in hits}
+    order = sorted(hits, key=lambda test: (near[test], _cost([test]), test))
+    chosen: list[str] = []
+    for test in order:
+        if _cost([*chosen, test]) <= _seconds:
+            chosen.append(test)
+    return chosen
+
+
+def _hits(mutant: Mutant, source: str) -> set[str]:
+    return tests_near(_map, mutant.file, mutant.line, mutant.last_line, _around(mutant, source))
+
+
+def _cost(tests: Sequence[str]) -> float:
+    """Seconds of tests with the fixtures that they share."""
+    shared = {each for test in tests for each in _map.fixtures.get(test, ())}
+    own = sum(_map.seconds.get(test, UNKNOWN) for test in tests)
+    return own + sum(_map.seconds[each] for each in shared) + OVERHEAD * len(tests)
+
+
+def _file(test: str) -> str:
+    return test.partition("::")[0]
+
+
+def _around(mutant: Mutant, source: str) -> tuple[int, int, bool]:
+    """First and last line of the innermost function, class or file around; whether it runs at import."""
+    kinds = ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef
+    inside: tuple[int, int, bool] = (1, 10**9, True)
+    for each in ast.walk(ast.parse(source)):  # outer ones come first
+        if isinstance(each, kinds) and each.lineno <= mutant.line <= (each.end_lineno or each.lineno):
+            early = isinstance(each, ast.ClassDef) or mutant.line < each.body[0].lineno
+            inside = each.lineno, each.end_lineno or each.lineno, early
+    return inside
+
+
+class Chosen:
+    """The plugin of pytest that runs some tests in some order, and writes down which of them fail."""
+
+    def __init__(self, tests: Sequence[str]) -> None:
+        """Tests are named as pytest does, files before their tests."""
+        self.rank = {test: at for at, test in enumerate(tests)}
+        self.files = sorted({_file(test) for test in tests})
+        self.said = place().parent / f"failed-{place().name}.txt"
+        self.said.write_text("")
+
+    def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
+        """Keep the chosen ones."""
+        at = {id(item): self.rank.get(item.nodeid, self.rank.get(_file(item.nodeid))) for item in items}
+        items[:] = [item for item in items if at[id(item)] is not None]
+        items.sort(key=lambda item: at[id(item)])
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        """Write down a test that fails."""
+        self._note(report)
+
+    def pytest_collectreport(self, report: pytest.CollectReport) -> None:
+        """Write down a file that cannot be read."""
+        self._note(report)
+
+    def _note(self, report: pytest.TestReport | pytest.CollectReport) -> None:
+        if report.failed:
+            with self.said.open("a") as file:
+                print(report.nodeid, file=file)
+
+    def read(self) -> list[str]:
+        """What has failed, in the parent."""
+        return list(dict.fromkeys(self.said.read_text().splitlines()))
