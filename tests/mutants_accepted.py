@@ -142,4 +142,16 @@ ACCEPTED: dict[tuple[str, str, str, str], str] = {
         "(x - self.origin).square().sum(-1) < limit.square()",
         "((x - self.origin).square().sum(-1) <= limit.square())",
     ): "a state to the last bit at the edge between two ways to remember it",
+    (
+        "staf_torch/lanes/combinators.py",
+        "if count > 1 and (tracer := _tracer(carry)) is not None:",
+        "1",
+        "2",
+    ): "whether a loop of two passes is written out or not",
+    (
+        "staf_torch/sweeps/launcher.py",
+        "self._bar = tqdm(total=total, bar_format=layout, leave=False, disable=None, file=sys.stderr)",
+        "tqdm(total=total, bar_format=layout, leave=False, disable=None, file=sys.stderr)",
+        "tqdm(total=total, bar_format=layout, disable=None, file=sys.stderr)",
+    ): "whether the bar of progress stays on a terminal behind the last job",
 }
