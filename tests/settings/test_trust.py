@@ -12,7 +12,6 @@ import yaml
 from staf_torch.results.settings_file import read_settings
 from staf_torch.settings import trust
 
-
 LIMITS = [(name, most) for name, most in trust._SIZES.items() if math.isfinite(most)]
 
 
