@@ -35,7 +35,7 @@ def moves(path: Path) -> None:
         ["experiment=adp", "adp/law=published", "dt=0.001"],
         ["experiment=adp", "adp.gradient=partial", "adp.extrapolated_centers=fixed"],
         ["experiment=adp", "adp/extrapolation=quadrature", "adp.order=3", "adp.trust=0.5", "animation=gif"],
-        ["experiment=adp", "adp/policy=rollout", "adp.rollout.depth=1", "animation=gif"],
+        ["experiment=adp", "adp/policy=rollout", "adp.rollout.depth=1"],
         ["experiment=adp", "adp/policy=lqr", "system=pendulum"],
         ["experiment=adp", "adp/policy=none", "trajectories=3"],
         ["experiment=adp", "system=two_state_as_printed", "adp.optimum.shooting=false"],

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from staf_torch import lanes
-from staf_torch.lanes.eliminations import eigenvalues, solve, solve_definite
+from staf_torch.lanes.eliminations import eigenvalues, inverse, solve, solve_definite, triangular
 
 
 def matrices(size: int, dtype: torch.dtype = torch.float64) -> torch.Tensor:
@@ -73,6 +73,38 @@ def test_a_program_factors_and_solves_as_torch_does(name: str) -> None:
     assert program.compiles((), (), (gram, right), steps=1)
     found, wanted = (run((), (), (gram, right), steps=1)[1] for run in (program, program.definition))
     torch.testing.assert_close(found, wanted, rtol=1e-10, atol=1e-10)
+
+
+def test_matrices_of_many_entries_are_factored_a_row_a_pass() -> None:
+    """Loops in the program, and also a row whose pivot is not positive."""
+    torch.manual_seed(2)
+    some, right = torch.randn(5, 9, 9).double(), torch.randn(5, 9, 2).double()
+    definite = some @ some.mT + torch.eye(9)
+    definite[3] -= 4 * torch.eye(9)
+
+    def step(_: object, __: object, row: tuple[Tensor, ...]) -> tuple[tuple[()], tuple[Tensor, ...]]:
+        gram, near, b = row
+        above = torch.linalg.solve_triangular(near.mT, b, upper=True, unitriangular=True)
+        return (), (*torch.linalg.cholesky_ex(gram), torch.cholesky_solve(b, near), above)
+
+    program, given = lanes.Program(step), (definite, some + 5 * torch.eye(9), right)
+    assert program.compiles((), (), given, steps=1)
+    found, wanted = (run((), (), given, steps=1)[1] for run in (program, program.definition))
+    assert torch.equal(found[1], wanted[1])
+    assert wanted[1][3] > 0
+    for one, other in zip(found, wanted, strict=True):
+        torch.testing.assert_close(one[[0, 1, 2, 4]], other[[0, 1, 2, 4]], rtol=1e-9, atol=1e-9)
+
+
+def test_triangles_and_inverses_of_many_entries_are_those_of_torch() -> None:
+    torch.manual_seed(3)
+    matrix, right = torch.randn(5, 9, 9).double() + 5 * torch.eye(9), torch.randn(5, 9, 2).double()
+    torch.testing.assert_close(inverse(matrix)[0], torch.linalg.inv(matrix), rtol=1e-10, atol=1e-12)
+    for upper, left, unit in itertools.product([True, False], repeat=3):
+        b = right if left else right.mT
+        wanted = torch.linalg.solve_triangular(matrix, b, upper=upper, left=left, unitriangular=unit)
+        found = triangular(matrix, b, upper=upper, left=left, unitriangular=unit)
+        torch.testing.assert_close(found, wanted, rtol=1e-10, atol=1e-12)
 
 
 @pytest.mark.parametrize(("size", "left"), [(3, False), (9, True)])
