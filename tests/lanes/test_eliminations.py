@@ -10,7 +10,15 @@ import torch
 from torch import Tensor
 
 from staf_torch import lanes
-from staf_torch.lanes.eliminations import eigenvalues, inverse, solve, solve_definite, triangular
+from staf_torch.lanes.eliminations import (
+    eigen,
+    eigenvalues,
+    inverse,
+    orthogonal,
+    solve,
+    solve_definite,
+    triangular,
+)
 
 
 def matrices(size: int, dtype: torch.dtype = torch.float64) -> torch.Tensor:
@@ -149,3 +157,25 @@ def test_a_program_asks_for_eigenvalues_without_vectors() -> None:
     found, wanted = program((), (), given, steps=1)[1][:, 0], torch.linalg.eigvalsh(given)
     assert ((found - wanted).abs().amax(-1) <= 16 * 2.3e-16 * wanted.abs().amax(-1)).all()
     assert torch.equal(found[1], eigenvalues(given[1]))  # LAPACK has another last bit
+
+
+@pytest.mark.parametrize("lead", [(), (4,), (2, 3)])
+@pytest.mark.parametrize("size", [1, 2, 5])
+def test_reflections_give_orthogonal_columns_and_a_triangle(size: int, lead: tuple[int, ...]) -> None:
+    matrix = torch.randn(*lead, size, size, dtype=torch.float64)
+    matrix[..., 0] = 0 if size == 5 else matrix[..., 0]  # a column that no reflection need move
+    q, r = orthogonal(matrix)
+    torch.testing.assert_close(q @ r, matrix, rtol=0, atol=1e-13)
+    torch.testing.assert_close(q.mT @ q, torch.eye(size).double().expand_as(q), rtol=0, atol=1e-13)
+    assert torch.equal(r, r.triu())
+
+
+@pytest.mark.parametrize("size", [1, 2, 3, 6])
+def test_rotations_give_eigenvalues_in_their_order_with_their_vectors(size: int) -> None:
+    torch.manual_seed(size)
+    some = torch.randn(2, 3, size, size, dtype=torch.float64)
+    gram = some + some.mT
+    found, vectors = eigen(gram)
+    torch.testing.assert_close(found, torch.linalg.eigvalsh(gram), rtol=0, atol=1e-12)
+    torch.testing.assert_close(vectors * found.unsqueeze(-2) @ vectors.mT, gram, rtol=0, atol=1e-12)
+    torch.testing.assert_close(vectors.mT @ vectors, torch.eye(size).double().expand_as(gram))
