@@ -9,13 +9,13 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ..lanes import Program, scan
+from ..lanes import Program
 from ..numerics.checks import fail, integer, positive_real, trailing, vector
+from .following import follow_plan
 from .plans import LocalModel, Reference, Trajectories
 from .sampled_problem import SampledProblem
 
 _TOGETHER = 4096  # candidates rolled out at once
-_REACH = 0.3  # of the region: a rollout that ends further from what it follows has lost it
 _ARRIVED = 0.01  # share of a trajectory's cost that may be the terminal value: else it did not reach the goal
 
 
@@ -122,8 +122,8 @@ class GlobalValue(nn.Module):
         self._tree = cKDTree(self._scaled(self.plans[self.entries, :n].numpy()), boxsize=self._box)
         self._windows = self.plans.unfold(0, h, 1).mT  # (N length - h + 1, h, w), a view
         # Where every trajectory rests at the goal, under the linear feedback.
-        self._resting = int(self.arrives.nonzero()[0]) * self.length + self.length - h - 1
-        self._worst = float(self.models[self.entries, n].max())
+        self.resting = int(self.arrives.nonzero()[0]) * self.length + self.length - h - 1
+        self.worst = float(self.models[self.entries, n].max())
         self._judge = Program(
             lambda carry, now, row: (carry, self._judged(*row)), name="a global value", copies=1
         )
@@ -201,7 +201,7 @@ class GlobalValue(nn.Module):
             own = rows // self.length == without.numpy()[:, None]
             rows = np.take_along_axis(rows, own.argsort(axis=1, kind="stable"), axis=1)[:, : self.candidates]
         whole = np.empty((len(rows), rows.shape[1] + 1), dtype=np.int64)
-        whole[:, :-1], whole[:, -1] = rows, self._resting
+        whole[:, :-1], whole[:, -1] = rows, self.resting
         return torch.from_numpy(whole)
 
     def follow(self, x: Tensor, entries: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -239,31 +239,7 @@ class GlobalValue(nn.Module):
         return control, Reference(state + shift.unsqueeze(1), feedback.unflatten(-1, (m, n)))
 
     def _judged(self, x: Tensor, window: Tensor, end: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Follow plans: (B, n), (B, H, n + m + m n), (B, n + 1 + n + n n)."""
-        n, m = self.problem.dim, self.problem.inputs
-
-        def control(x: Tensor, plan: Tensor) -> Tensor:
-            state, u, feedback = plan.split((n, m, m * n), dim=-1)
-            return self.problem.admissible(
-                u + (feedback.unflatten(-1, (m, n)) * (x - state).unsqueeze(-2)).sum(-1)
-            )
-
-        def step(now: tuple[Tensor, Tensor], plan: Tensor) -> tuple[tuple[Tensor, Tensor], tuple[()]]:
-            after, paid = self.problem.advance(now[0], control(now[0], plan))
-            return (after, now[1] + paid), ()
-
-        first = window[:, 0]
-        x = first[:, :n] + self.problem.offset(x, first[:, :n])
-        (last, paid), _ = scan(step, (x, torch.zeros_like(x[:, 0])), window)
-        state, value, gradient, curvature = end.split((n, 1, n, n * n), dim=-1)
-        d = last - state
-        bent = (curvature.unflatten(-1, (n, n)) * d.unsqueeze(-2)).sum(-1)
-        rest = value.squeeze(-1) + ((gradient + 0.5 * bent) * d).sum(-1)
-        far = (d / self.region).square().sum(-1)
-        covered = (far < _REACH**2) & torch.isfinite(paid)
-        lost = paid + value.squeeze(-1) + self._worst * (1 + far)
-        cost = torch.where(covered, paid + rest, lost)
-        return torch.where(torch.isfinite(cost), cost, torch.inf), control(x, first), covered
+        return follow_plan(self.problem, self.region, self.worst, x, window, end)
 
     def _scaled(self, x: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
         """Coordinates of the search, (B, n): in units of the region, periodic ones in one period."""

@@ -8,7 +8,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ..lanes import Program
+from ..lanes import Program, each, scan
+from ..lanes.combinators import tracing_now
 from ..numerics.checks import fail, integer, positive_real, vector
 from .controllers import Controller, ControllerState
 from .sampled_problem import SampledProblem
@@ -98,7 +99,9 @@ class PathIntegral(Controller):
         self.register_buffer("scales", scales)  # (S,)
         self.scales: Tensor
         self.draws = -(-self.samples * self.knots * m // n)
-        self._roll = Program(self._rolled, name="sampled plans", compile=compile)
+        self._roll = Program(
+            lambda carry, now, row: (carry, self._paid(*row)), name="sampled plans", compile=compile
+        )
 
     def init(self, x0: Tensor) -> ControllerState:
         """No change of the feedback."""
@@ -125,7 +128,7 @@ class PathIntegral(Controller):
         weight = torch.where(fine, (-sharp).exp(), 0.0)
         blended = (weight[..., None, None] * torch.where(fine[..., None, None], tried, 0.0)).sum(1)
         blended = blended / weight.sum(1)[:, None, None]
-        chosen = tried[torch.arange(count), at[:, 0]]
+        chosen = tried.gather(1, at[..., None, None].expand(-1, -1, self.steps, m)).squeeze(1)
         better = self.costs(x, blended.unsqueeze(1))[:, 0] < least[:, 0]
         plan = torch.where(better[:, None, None], blended, chosen)
         ahead = torch.cat((plan[:, 1:], torch.zeros_like(plan[:, :1])), dim=1)
@@ -133,18 +136,25 @@ class PathIntegral(Controller):
 
     def costs(self, x: Tensor, change: Tensor) -> Tensor:
         """What changes of the feedback cost, inf where that is not finite: (B, n), (B, S, T, m) -> (B, S)."""
-        shape = change.shape[:2]
-        start = x.unsqueeze(1).expand(*shape, -1).flatten(0, 1).contiguous()
-        (last, paid), _ = self._roll((start, torch.zeros_like(start[:, 0])), (change.flatten(0, 1),), ())
-        cost = paid + self.problem.terminal(last)
-        return torch.where(torch.isfinite(cost), cost, torch.inf).view(shape)
+        if tracing_now():
+            cost = each(lambda some: self._paid(x, some.squeeze(1)).unsqueeze(1), change, together=1)
+        else:
+            shape = change.shape[:2]
+            start = x.unsqueeze(1).expand(*shape, -1).flatten(0, 1).contiguous()
+            _, cost = self._roll((), (), (start, change.flatten(0, 1)), steps=1)
+            cost = cost.view(shape)
+        return torch.where(torch.isfinite(cost), cost, torch.inf)
 
-    def _rolled(
-        self, carry: tuple[Tensor, Tensor], now: tuple[Tensor], row: tuple[()]
-    ) -> tuple[tuple[Tensor, Tensor], tuple[()]]:
-        x, paid = carry
-        after, cost = self.problem.advance(x, self.problem.steered(x, now[0]))
-        return (after, paid + cost), ()
+    def _paid(self, x: Tensor, change: Tensor) -> Tensor:
+        """What a change of the feedback costs, a row each: (R, n), (R, T, m) -> (R,)."""
+
+        def step(now: tuple[Tensor, Tensor], change: Tensor) -> tuple[tuple[Tensor, Tensor], tuple[()]]:
+            after, cost = self.problem.advance(now[0], self.problem.steered(now[0], change))
+            return (after, now[1] + cost), ()
+
+        (last, paid), _ = scan(step, (x, torch.zeros_like(x[:, 0])), change)
+        whole: Tensor = paid + self.problem.terminal(last)
+        return whole
 
 
 def _hats(steps: int, knots: int) -> Tensor:

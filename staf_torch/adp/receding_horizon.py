@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from ..lanes.combinators import tracing_now
 from ..numerics.checks import fail, integer
 from .controllers import Controller, ControllerState
 from .global_value import GlobalValue
@@ -68,7 +69,7 @@ class RecedingHorizon(Controller):
         if memory is not None and memory.problem is not problem:
             raise fail("RecedingHorizon", "memory", "must be of the same problem", memory.problem)
         self.steps = integer("RecedingHorizon", "steps", steps, least=1)
-        integer("RecedingHorizon", "iterations", iterations, least=0)
+        self.iterations = integer("RecedingHorizon", "iterations", iterations, least=0)
         self._first = BoxDDP(problem, steps=steps, compile=compile)
         self._search: BoxDDP | None = None
         if iterations:
@@ -77,10 +78,10 @@ class RecedingHorizon(Controller):
     def init(self, x0: Tensor) -> ControllerState:
         """The first plan, from the states x0 (B, n)."""
         if self._search is None and self.memory is not None:
-            return _carrying(_rows(best_from(self.memory, self._first, x0)), 0)
+            return _carrying(_rows(best_from(self.memory, self._first, x0)))
         control, reference = (None, None) if self.memory is None else self._remembered(x0)
         found = self._first.solve(x0, control, reference, self._terminal(x0, control, reference))
-        return _carrying(_rows(found), 0)
+        return _carrying(_rows(found))
 
     def step(
         self, x: Tensor, carried: ControllerState, uniform: Tensor, dt: float
@@ -115,21 +116,29 @@ class RecedingHorizon(Controller):
     def _followed(self, x: Tensor, plan: Tensor) -> tuple[Tensor, ControllerState]:
         """The control of a plan that is not improved, (B, 1 + T w), and the plan with one step more done."""
         n, m = self.problem.dim, self.problem.inputs
-        done, width = int(plan[0, 0]), n + m + m * n  # all rows began together
-        carried = _carrying(plan[:, 1:], done + 1)
-        if done >= self.steps:
+        width, last = n + m + m * n, self.steps - 1
+        carried = _carrying(plan[:, 1:], plan[:, :1] + 1)
+        if tracing_now():  # a program cannot ask for a number: it looks up the row of the plan
+            done, steps = plan[:, :1], plan[:, 1:].unflatten(-1, (self.steps, width))
+            now = steps.gather(1, done.clamp(max=last).long().unsqueeze(-1).expand(-1, -1, width)).squeeze(1)
+            return torch.where(done > last, self.problem.linear_feedback(x), self._around(x, now)), carried
+        begun = int(plan[0, 0])  # all rows began together
+        if begun > last:
             return self.problem.linear_feedback(x), carried
-        at = plan[:, 1 + done * width : 1 + (done + 1) * width]
-        state, control, feedback = at.split((n, m, m * n), dim=-1)
+        return self._around(x, plan[:, 1 + begun * width : 1 + (begun + 1) * width]), carried
+
+    def _around(self, x: Tensor, plan: Tensor) -> Tensor:
+        """The control of one step of a plan (B, w) at x (B, n)."""
+        n, m = self.problem.dim, self.problem.inputs
+        state, control, feedback = plan.split((n, m, m * n), dim=-1)
         away = (x - state).unsqueeze(-2)
-        u = control + (feedback.unflatten(-1, (m, n)) * away).sum(-1)
-        return self.problem.admissible(u), carried
+        return self.problem.admissible(control + (feedback.unflatten(-1, (m, n)) * away).sum(-1))
 
     def _ahead(self, plan: Tensor, goal: Tensor) -> ControllerState:
         """The plan (B, T, w) from the next step on, and at its end the linear feedback of a goal (B, n)."""
         count, m = len(goal), self.problem.inputs
         hold = goal, self.problem.rest.expand(count, m), (-self.problem.k).flatten().expand(count, -1)
-        return _carrying(torch.cat((plan[:, 1:], torch.cat(hold, dim=-1).unsqueeze(1)), dim=1), 0)
+        return _carrying(torch.cat((plan[:, 1:], torch.cat(hold, dim=-1).unsqueeze(1)), dim=1))
 
 
 def _rows(found: Trajectories) -> Tensor:
@@ -137,8 +146,8 @@ def _rows(found: Trajectories) -> Tensor:
     return torch.cat((found.state[:, :-1], found.control, found.feedback.flatten(2)), dim=-1)
 
 
-def _carrying(plan: Tensor, done: int) -> ControllerState:
-    """A plan (B, T, w) and how many of its steps are done."""
+def _carrying(plan: Tensor, done: Tensor | None = None) -> ControllerState:
+    """A plan (B, T, w) and how many of its steps are done, (B, 1); none by default."""
     empty = plan.new_zeros(len(plan), 0)
-    known = torch.cat((plan.new_full((len(plan), 1), done), plan.flatten(1)), dim=1)
+    known = torch.cat((plan.new_zeros(len(plan), 1) if done is None else done, plan.flatten(1)), dim=1)
     return ControllerState(empty, empty, plan.new_zeros(len(plan), 0, 0), known)

@@ -10,12 +10,12 @@ from torch import Tensor, nn
 
 from ..approximation.basis import StaFBasis
 from ..centers import Radius, StateFollowingCenters, ball, cross_polytope, rings
-from ..kernels import ExponentialKernel
+from ..kernels import ExponentialKernel, GaussianKernel, Kernel
 from ..lanes import each, repeat, scan
 from ..lanes.function import RowFunction, Rows
 from ..lanes.plan import Plan
 from ..numerics.checks import fail, integer, positive_real
-from ..systems import ControlAffineSystem
+from ..systems import Barrier, ControlAffineSystem
 from .controllers import LQR, Policy, Value
 from .cost import Cost
 
@@ -107,8 +107,9 @@ class RolloutPolicy(nn.Module):
         steps: int = 10,
         depth: int = 1,
         period: float | None = None,
+        kernel: Kernel | None = None,
     ) -> RolloutPolicy:
-        """Improve the LQR of the plant, with centers of the exponential kernel in a ball around the state.
+        """Improve the LQR of the plant, with centers of a kernel in a ball around the state.
 
         Example:
             >>> plant = systems.Pendulum()
@@ -123,13 +124,17 @@ class RolloutPolicy(nn.Module):
                 cross-polytope and its middle.
             radius: of the ball, a positive number or a `Radius`, in the units of the state.
             horizon: as in `RolloutPolicy`, and so are ``steps``, ``depth`` and ``period``.
+            kernel: None for the exponential one; of a `Barrier` for the Gaussian of width 1, because beside a
+                wall its coordinates are far from 0, where the exponential kernel errs.
 
         Raises:
             ValueError: if an argument breaks its rule, or the plant has no LQR.
         """
         lqr = LQR(system, cost)
         directions = ball_directions(centers, lqr.k.shape[-1])
-        basis = StaFBasis(ExponentialKernel(), StateFollowingCenters(directions, radius))
+        if kernel is None:
+            kernel = GaussianKernel() if isinstance(system, Barrier) else ExponentialKernel()
+        basis = StaFBasis(kernel, StateFollowingCenters(directions, radius))
         return cls(
             basis, system, cost, lqr, lqr.value, horizon=horizon, steps=steps, depth=depth, period=period
         )

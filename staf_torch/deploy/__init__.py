@@ -7,6 +7,7 @@ from .approximators import RidgeApproximator as RidgeApproximator
 from .approximators import approximator as approximator
 from .c_header import export_c as export_c
 from .c_header import export_learning_c as export_learning_c
+from .c_header import time_c as time_c
 from .controllers import ActorPolicy as ActorPolicy
 from .controllers import FilteredPolicy as FilteredPolicy
 from .controllers import FoldedRollout as FoldedRollout
@@ -16,12 +17,14 @@ from .formats import export_onnx as export_onnx
 from .formats import export_package as export_package
 from .formats import export_program as export_program
 from .formats import load_program as load_program
+from .remembered import RememberedPolicy as RememberedPolicy
 
 __all__ = [
     "ActorPolicy",
     "FilteredPolicy",
     "FoldedRollout",
     "LocalApproximator",
+    "RememberedPolicy",
     "RidgeApproximator",
     "SupervisedPolicy",
     "approximator",
@@ -32,5 +35,6 @@ __all__ = [
     "export_program",
     "load_program",
     "policy_of",
+    "time_c",
     "trace",
 ]

@@ -23,8 +23,10 @@ from ..lanes.graph import WIDE, Graph
 from ..lanes.program import trace
 from ..lanes.schedule import Schedule
 from ..lanes.tracer import NotLoweredError
+from .controllers import check_bounded
 from .formats import Run, as_tuple
-from .sheet import Work
+from .remembered import RememberedPolicy
+from .sheet import Latency, Work
 
 _CHEAP = set("add sub mul div lt le eq ne and or xor neg abs min max not where sqrt".split())  # noqa: SIM905
 _FREE = set("const elem result collect carry state row now load pack cast loop".split())  # noqa: SIM905
@@ -74,6 +76,8 @@ def export_c(
         ValueError: if an operation of the module has no C here.
     """
 
+    if isinstance(module, RememberedPolicy):
+        return _write_remembered(path, module, example[:1], outputs, note)
     program = Program(lambda carry, now, row: (carry, as_tuple(module(row["state"]))), name="the header")
     return _write(path, program, (), {"state": example[:1]}, outputs, note)
 
@@ -106,8 +110,9 @@ def export_learning_c(controller: Controller, x0: Tensor, path: Path, *, dt: flo
         note: lines for the comment at its head.
 
     Raises:
-        ValueError: if an operation of the controller has no C here.
+        ValueError: if the controller optimises on the way, or an operation of it has no C here.
     """
+    check_bounded("export_learning_c", controller)
     first = controller.init(x0[:1])
     carry = {key: part for key, part in first._asdict().items() if part.numel()}
     inputs = {"x": x0[:1]}
@@ -123,17 +128,43 @@ def export_learning_c(controller: Controller, x0: Tensor, path: Path, *, dt: flo
 
 
 def _write(path: Path, program: Program, carry: Tree, row: Tree, outputs: Sequence[str], note: str) -> Source:
+    source = _counted(program, carry, row)
+    text = program.c_source("staf", carry, (), row, outputs=outputs, note=_said(note, source, "takes"))
+    path.write_text(text, encoding="utf-8")
+    return source
+
+
+def _write_remembered(
+    path: Path, module: RememberedPolicy, x: Tensor, outputs: Sequence[str], note: str
+) -> Source:
+    program, row, names = module.program(), module.row(x), ["cost", "control"]
+    one = _counted(program, (), row)
+    plans, (searched, n) = module.candidates + 1, module.searched.shape
+    compared = searched * (5 * n + 1)
+    tables = sum(getattr(module, name).numel() for name in ("plans", "models", "searched"))
+    whole = Source(tables + one.constants, plans * one.flops + compared, plans * one.functions)
+    follow = program.c_source("staf_follow", (), (), row, outputs=names)
+    said = _said(note, whole, f"compares {searched} states and takes at most")
+    path.write_text(module.c_text(follow, outputs, said), encoding="utf-8")
+    return whole
+
+
+def _counted(program: Program, carry: Tree, row: Tree) -> Source:
     try:
-        text = program.c_source("staf", carry, (), row, outputs=outputs, note=note)
         graph, _, following, ends = trace(program.step, Given.of(carry, (), row, 1), folded=True).program
     except NotLoweredError as error:
         raise ValueError(f"This has no C here, export it as ONNX, pt2 or aoti: {error}") from error
     if graph.single and WIDE in graph.type:
         raise ValueError("This needs float64 inside, or float32 loses its digits: use --dtype float64.")
-    path.write_text(text, encoding="utf-8")
     schedule = Schedule(graph, following, ends)
     constants = sum(graph.op[node] == "const" for node in schedule.live)
     return Source(constants, *_cost(graph, schedule))
+
+
+def _said(note: str, source: Source, takes: str) -> str:
+    """The note and what a call costs: loops have fixed lengths, and both sides of a choice are computed."""
+    most = f"A call {takes} {source.flops} additions and the like,"
+    return f"{note}\n{most}\n{source.functions} calls of exp and the like, whatever the state is.".lstrip()
 
 
 def _cost(graph: Graph, schedule: Schedule) -> tuple[int, int]:
@@ -180,6 +211,48 @@ def runner_c(path: Path, sizes: Sequence[int | None], dtype: torch.dtype) -> Run
     return run
 
 
+def time_c(path: Path, states: Tensor, outputs: Sequence[int]) -> Latency:
+    """Time every call of a header of `export_c`, compiled with -O2, inside C: median, 99 % and worst.
+
+    It is CPU time of the thread, without what other programs take, and with some tenths of a microsecond
+    that asking for it takes. All calls do the same work: the worst is the time to plan with on such a core.
+
+    Example:
+        >>> plant = systems.TwoState()
+        >>> cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
+        >>> x = torch.rand(1000, 2, dtype=torch.float64)
+        >>> policy = deploy.policy_of(adp.LQR(plant, cost))
+        >>> source = deploy.export_c(policy, x, Path("policy.h"), ["control"])
+        >>> deploy.time_c(Path("policy.h"), x, [1]).worst_us > 0
+        True
+
+        Shown by `staf_torch/deploy/README.md`.
+
+    Args:
+        path: of the header.
+        states: of the calls, (C, n), in the dtype of the header.
+        outputs: entries of every output.
+
+    Raises:
+        ValueError: if there is no C compiler.
+    """
+    kind = _c_type(states.dtype)
+    declared = " ".join(f"{kind} o{k}[{size}];" for k, size in enumerate(outputs))
+    names = ", ".join(f"o{k}" for k in range(len(outputs)))
+    used = " ".join(f"seen += o{k}[0];" for k in range(len(outputs)))
+    now = "clock_gettime(CLOCK_THREAD_CPUTIME_ID, &%s);"
+    loop = (
+        f"for (long r = 0; r < rows; ++r) {{ {now % 'a'} staf(x + r * n, {names}); {now % 'b'} {used} "
+        "us[r] = 1e6 * (double)(b.tv_sec - a.tv_sec) + 1e-3 * (double)(b.tv_nsec - a.tv_nsec); }"
+    )
+    body = f"struct timespec a, b; volatile double seen = 0; {declared} {loop}"
+    given = f"const {kind} *x, double *us, long rows, long n"
+    call = _built(path, f"void call({given}) {{ {body} }}", "#include <time.h>\n")
+    x, taken = states.contiguous(), torch.empty(len(states), dtype=torch.float64)
+    call(*(ctypes.c_void_p(t.data_ptr()) for t in (x, taken)), *map(ctypes.c_long, x.shape))
+    return Latency(len(x), float(taken.median()), float(taken.quantile(0.99)), float(taken.max()))
+
+
 def runner_learning_c(
     path: Path, draws: int, inputs: int, dtype: torch.dtype
 ) -> Callable[[Tensor, Tensor], Tensor]:
@@ -215,14 +288,14 @@ def _c_type(dtype: torch.dtype) -> str:
     return "float" if dtype == torch.float32 else "double"
 
 
-def _built(path: Path, function: str) -> Callable[..., object]:
+def _built(path: Path, function: str, head: str = "") -> Callable[..., object]:
     """Compile a header and a function ``call`` that calls what is in it.
 
     The header is copied: the name of the folder that it lies in, which may be somebody else's, is no C.
     """
     with tempfile.TemporaryDirectory() as folder:
         shutil.copyfile(path, Path(folder) / "exported.h")
-        source = f'#include "exported.h"\n{function}\n'
+        source = f'{head}#include "exported.h"\n{function}\n'
         (Path(folder) / "call.c").write_text(source, encoding="utf-8")
         line = [need_c_compiler(), "-O2", "-shared", "-fPIC", "-x", "c", "call.c", "-o", "call.so", "-lm"]
         subprocess.run(line, cwd=folder, check=True, capture_output=True)

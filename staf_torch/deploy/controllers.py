@@ -7,8 +7,21 @@ import copy
 import torch
 from torch import Tensor, nn
 
-from ..adp import ActorCritic, Controller, Feedback, NearOptimal, RolloutPolicy, SafetyFilter, Supervised
+from ..adp import (
+    ActorCritic,
+    Controller,
+    Feedback,
+    GlobalValue,
+    NearOptimal,
+    PathIntegral,
+    PlanReplay,
+    RecedingHorizon,
+    RolloutPolicy,
+    SafetyFilter,
+    Supervised,
+)
 from ..numerics.checks import fail, trailing
+from .remembered import RememberedPolicy
 
 
 class ActorPolicy(nn.Module):
@@ -192,13 +205,13 @@ def policy_of(
         Shown by `staf-export RUN --to c`.
 
     Args:
-        controller: `Feedback`, `ActorCritic`, `Supervised`, `SafetyFilter`, `LQR`, `RolloutPolicy`, or any
-            module (..., n) -> (..., m).
+        controller: `Feedback`, `ActorCritic`, `Supervised`, `SafetyFilter`, `LQR`, `RolloutPolicy`,
+            `GlobalValue`, or any module (..., n) -> (..., m).
         weights: Wa of an actor-critic, (M,); its initial ones by default.
         dtype: of the arithmetic.
 
     Raises:
-        ValueError: if the controller is none of these.
+        ValueError: if the controller is none of these, plans on the way, or carries a state.
     """
     return _policy_of(controller, weights).to(dtype).eval().requires_grad_(False)
 
@@ -220,6 +233,29 @@ def _policy_of(controller: Controller | nn.Module, weights: Tensor | None) -> nn
     if isinstance(controller, NearOptimal) and controller.planner is not None:
         rule = "must not plan on the way: `near_optimal(..., plan=False)`"
         raise fail("policy_of", "controller", rule, "a policy that plans where a bound is met")
+    if isinstance(controller, GlobalValue):
+        return RememberedPolicy(controller)
+    if isinstance(controller, RecedingHorizon | PathIntegral | PlanReplay):
+        check_bounded("policy_of", controller)
+        rule = "carries its plan from control to control: `deploy.export_learning_c` writes it with its state"
+        raise fail("policy_of", "controller", rule, type(controller).__name__)
     if isinstance(controller, Controller) or not isinstance(controller, nn.Module):
         raise fail("policy_of", "controller", "must be a feedback law without memory or an actor", controller)
     return copy.deepcopy(controller)
+
+
+def check_bounded(call: str, controller: Controller) -> None:
+    """Refuse what no device can run in a time that is known before.
+
+    Raises:
+        ValueError: that says why.
+    """
+    if isinstance(controller, RecedingHorizon) and controller.iterations:
+        rule = (
+            "must not optimise on the way, as a search ends when it has converged, after a time that nobody "
+            "can state: `RecedingHorizon(..., iterations=0)` follows one plan"
+        )
+        raise fail(call, "controller", rule, f"iterations={controller.iterations}")
+    if isinstance(controller, PlanReplay):
+        rule = "must be a feedback: a plan of direct shooting knows no state; `RecedingHorizon` follows one"
+        raise fail(call, "controller", rule, "PlanReplay")

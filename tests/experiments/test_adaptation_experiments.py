@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 
 import pytest
 import torch
 from composing import settings
+from omegaconf import OmegaConf
 
 from staf_torch.experiments import faults, icl
 
@@ -44,3 +46,31 @@ def test_the_published_reference_has_the_rate_that_is_stated() -> None:
     for k in range(2):
         (slope,) = torch.autograd.grad(wanted[:, k].sum(), time, retain_graph=True)
         torch.testing.assert_close(rate[:, k], slope)
+
+
+def test_gains_are_drawn_for_every_row_within_their_ranges() -> None:
+    cfg = settings("experiment=icl", "icl.gain=[0.5,0.5]", "icl.rate=[1,2]")
+    for rows in (1, 3):
+        cfg.trajectories = rows
+        gains = icl._gains(cfg)
+        assert gains["gain"].tolist() == [0.5] * rows
+        assert bool(((gains["rate"] >= 1) & (gains["rate"] <= 2)).all())
+    for name, wrong in (("trajectories", 0), ("icl.rate", [2, 1]), ("icl.rate", [0, 1])):
+        bad = cfg.copy()
+        OmegaConf.update(bad, name, wrong)
+        with pytest.raises(ValueError, match=name):
+            icl._gains(bad)
+
+
+def test_the_plant_is_the_published_one() -> None:
+    x1, x2, time = 0.3, -1.2, 0.7
+    decay, sine, cosine = math.exp(-0.1 * time), math.sin(time), math.cos(time)
+    z, u = torch.tensor([[x1, x2, decay, sine, cosine]]).double(), torch.tensor([[0.4, -0.9]]).double()
+    wanted = [
+        5 * x1**2 + 10 * math.sin(x2) + 0.4,
+        10 * x2 * sine + 15 * x1 + 20 * x1 * x2 - 0.9,
+        -0.1 * decay,
+        cosine,
+        -sine,
+    ]
+    torch.testing.assert_close(icl.published().velocity(z, u), torch.tensor([wanted]).double())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import composing
@@ -9,10 +10,11 @@ import pytest
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from staf_torch import adp
+from staf_torch import adp, systems
 from staf_torch.adp.problem import AdpProblem
 from staf_torch.cli.staf import config_directory
-from staf_torch.settings.adp import adp_problem
+from staf_torch.settings.adp import adp_problem, make_cost, updated
+from staf_torch.sweeps.hydra_compat.program import trusted
 
 GROUPS = ("policy", "law", "basis", "extrapolation", "cost")
 OPTIONS = [
@@ -97,7 +99,7 @@ def test_settings_that_the_last_version_wrote_build_what_they_did() -> None:
 
 MODULE = '''
 import torch
-from staf_torch import adp
+from staf_torch import adp, systems
 
 class Pump(torch.nn.Module):
     """A policy of x alone, which asks for the plant by name."""
@@ -127,7 +129,7 @@ def down(x):
 
 
 @pytest.fixture
-def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """A user's folder: a module, and an option of each group in YAML, found through Hydra's search path."""
     (tmp_path / "my_control.py").write_text(MODULE)
     monkeypatch.syspath_prepend(str(tmp_path))
@@ -141,7 +143,8 @@ def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         path = tmp_path / "settings" / "adp" / f"{name}.yaml"
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text + "\n")
-    return tmp_path / "settings"
+    with trusted(["my_control"]):
+        yield tmp_path / "settings"
 
 
 def test_a_class_and_a_yaml_of_ones_own_make_a_variant(own: Path) -> None:
@@ -174,3 +177,10 @@ def test_model_of_mujoco_is_a_plant_of_closed_loops(tmp_path: Path) -> None:
     assert float(control(built)) < 0
     with pytest.raises(ValueError, match=r"`ActorCritic\(model=...\)` must be a ControlAffineSystem"):
         problem(*model)
+
+
+def test_a_cost_has_the_sizes_of_any_kind_of_plant() -> None:
+    step = systems.StepPlant(lambda x, u: 0.9 * x + u.sum(-1, keepdim=True), dim=3, inputs=2, dt=0.1)
+    for plant, dim, inputs in ((step, 3, 2), (systems.ThreeState(), 3, 2), (systems.TwoState(), 2, 1)):
+        cost = make_cost(updated(settings()), plant)
+        assert (cost.dim, cost.inputs) == (dim, inputs)

@@ -1,0 +1,190 @@
+"""A memory of plans as a device reads it: tables, a search through all of them, and rollouts in loops."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from ..adp import GlobalValue
+from ..adp.following import follow_plan
+from ..lanes import Program
+
+
+class RememberedPolicy(nn.Module):
+    """u of a `GlobalValue`: the first control of the cheapest of the K remembered plans nearest to x and of
+    the goal's feedback, each followed from x. All J states that are searched are compared with x, one after
+    the other, so that a call takes the same work at every state.
+
+    Example:
+        >>> def step(x, u):  # a cart without friction, for 0.1 s
+        ...     after = torch.stack((x[:, 0] + 0.1 * x[:, 1], x[:, 1] + 0.1 * u[:, 0]), dim=-1)
+        ...     return after, 0.1 * (x.square().sum(-1) + u.square().sum(-1))
+        >>> problem = adp.SampledProblem(step, dim=2, inputs=1, low=-1.0, high=1.0)
+        >>> library = adp.BoxDDP(problem, steps=80, compile=False).solve(torch.tensor([[1.0, 0.0]]).double())
+        >>> memory = adp.GlobalValue(problem, library, region=[1.5, 1.0], candidates=4, lookahead=10)
+        >>> x = torch.tensor([[0.9, 0.0]]).double()
+        >>> bool((deploy.RememberedPolicy(memory)(x) - memory(x)).abs().max() < 1e-12)
+        True
+
+        Shown by `staf_torch/deploy/README.md`.
+
+    Args:
+        memory: of which the tables are copied that a control needs.
+
+    Attributes:
+        plans: state, control and feedback of every step and at last of the goal, (P, n + m + m n).
+        models: state, value, gradient and curvature where candidates end, (E, n + 1 + n + n n).
+        searched: the states that are searched, in units of the region, (J, n).
+        first: the row of ``plans`` of every candidate, (J + 1,); the last one is the goal's feedback.
+        last: the row of the end of its trajectory, (J + 1,).
+        end: the row of ``models``, (J + 1,).
+    """
+
+    def __init__(self, memory: GlobalValue) -> None:
+        super().__init__()
+        problem, length = memory.problem, memory.length
+        self.problem = copy.deepcopy(problem)
+        self.candidates, self.lookahead, self.worst = memory.candidates, memory.lookahead, memory.worst
+        steps = length - self.lookahead - 1  # of a trajectory; all later rows are the goal
+        rows = torch.cat((memory.entries, torch.tensor([memory.resting])))
+        which, time = rows // length, rows % length
+        used, place = which.unique(return_inverse=True)
+        kept = used.unsqueeze(1) * length + torch.arange(steps + 1)
+        ends = which * length + (time + self.lookahead).clamp(max=steps)
+        models, end = ends.unique(return_inverse=True)
+        period = torch.zeros(problem.dim, dtype=torch.float64)
+        period[list(problem.periodic)] = 2 * torch.pi / memory.region[list(problem.periodic)]
+        tables = {
+            "region": memory.region.clone(),
+            "period": period,  # of a coordinate in units of the region, (n,); 0: it has none
+            "plans": memory.plans[kept.flatten()],
+            "models": memory.models[models],
+        }
+        for name, table in tables.items():
+            self.register_buffer(name, table)
+        integers = {"first": place * (steps + 1) + time, "last": place * (steps + 1) + steps, "end": end}
+        for name, table in integers.items():
+            self.register_buffer(name, table)
+        self.region: Tensor
+        self.period: Tensor
+        self.plans: Tensor
+        self.models: Tensor
+        self.first: Tensor
+        self.last: Tensor
+        self.end: Tensor
+        self.register_buffer("searched", self._scaled(self.plans[self.first[:-1], : problem.dim]))
+        self.searched: Tensor
+
+    def forward(self, x: Tensor) -> Tensor:
+        """u: (B, n) -> (B, m)."""
+        count = self.candidates + 1
+        apart = (self._scaled(x).unsqueeze(1) - self.searched).abs()  # (B, J, n)
+        around = torch.where(self.period > 0, (self.period - apart).abs(), apart)
+        near = torch.minimum(apart, around).square().sum(-1).topk(self.candidates, largest=False).indices
+        at = torch.cat((near, torch.full_like(near[:, :1], len(self.searched))), dim=1).flatten()
+        ahead = self.first[at].unsqueeze(1) + torch.arange(self.lookahead)
+        window = self.plans[torch.minimum(ahead, self.last[at].unsqueeze(1))]
+        rows = x.unsqueeze(1).expand(-1, count, -1).flatten(0, 1)
+        cost, control, _ = self.follow(rows, window, self.models[self.end[at]])
+        best = cost.unflatten(0, (-1, count)).argmin(1, keepdim=True)
+        u = control.unflatten(0, (-1, count)).gather(1, best.unsqueeze(-1).expand(-1, -1, control.shape[-1]))
+        chosen: Tensor = u.squeeze(1)
+        return chosen
+
+    def follow(self, x: Tensor, window: Tensor, end: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """As `follow_plan`."""
+        return follow_plan(self.problem, self.region, self.worst, x, window, end)
+
+    def program(self) -> Program:
+        """One candidate from one state, (1, n), as a row program."""
+        return Program(
+            lambda carry, now, row: (carry, self.follow(row["x"], row["window"], row["end"])[:2]),
+            name="a plan that is followed",
+        )
+
+    def row(self, x: Tensor) -> dict[str, Tensor]:
+        """What `program` reads, of the first candidate, for a state (1, n)."""
+        window = self.plans[self.first[:1].expand(self.lookahead)].unsqueeze(0)
+        return {"x": x, "window": window, "end": self.models[:1]}
+
+    def c_text(self, follow: str, outputs: Sequence[str], note: str) -> str:
+        """The header: tables, the text ``follow`` of `program` as ``staf_follow``, and the search."""
+        real = "float" if self.plans.dtype == torch.float32 else "double"
+        n, m = self.problem.dim, self.problem.inputs
+        floats = ("plans", "models", "searched", "region", "period")
+        tables = [_table(real, f"staf_{name}", getattr(self, name), real == "float") for name in floats]
+        whole = ("first", "last", "end")
+        tables += [_table("int", f"staf_{name}", getattr(self, name), False) for name in whole]
+        sizes = {
+            **{"REAL": real, "N": n, "M": m, "WIDTH": self.plans.shape[1], "MODEL": self.models.shape[1]},
+            **{"J": len(self.searched), "K": self.candidates, "H": self.lookahead},
+            **{"ABS": "fabs", "FLOOR": "floor", "CONTROL": outputs[0]},
+            "GOAL": ", ".join(repr(float(g)) for g in self.problem.goal),
+        }
+        if real == "float":
+            sizes |= {"ABS": "fabsf", "FLOOR": "floorf"}
+        text = _SEARCH
+        for name, value in sizes.items():
+            text = text.replace(f"@{name}@", str(value))
+        lines = ["/*", *(f" * {line}".rstrip() for line in note.replace("*/", "* /").splitlines()), " */"]
+        head = ["#ifndef STAF_H", "#define STAF_H", "", follow.strip(), ""]
+        return "\n".join([*(lines if note else []), *head, *tables, text, "#endif"]) + "\n"
+
+    def _scaled(self, x: Tensor) -> Tensor:
+        """Coordinates of the search, in units of the region, periodic ones in one period: (B, n)."""
+        scaled = (x - self.problem.goal) / self.region
+        turns = torch.where(self.period > 0, (scaled / self.period).floor(), 0.0)
+        return scaled - torch.where(self.period > 0, turns * self.period, 0.0)
+
+
+def _table(kind: str, name: str, table: Tensor, single: bool) -> str:
+    digits = (f"{x:.9g}" if single else repr(x) for x in table.flatten().tolist())
+    return f"static const {kind} {name}[{table.numel()}] = {{\n{_broken(list(digits))}\n}};\n"
+
+
+def _broken(numbers: list[str]) -> str:
+    """Numbers of C, eight a line."""
+    return ",\n".join(", ".join(numbers[k : k + 8]) for k in range(0, len(numbers), 8))
+
+
+_SEARCH = """static inline void staf(const @REAL@ state[@N@], @REAL@ @CONTROL@[@M@])
+{
+    static const @REAL@ goal[@N@] = { @GOAL@ };
+    @REAL@ at[@N@], far[@K@], least = (@REAL@)INFINITY;
+    int near[@K@ + 1];
+    for (int i = 0; i < @N@; ++i) {
+        at[i] = (state[i] - goal[i]) / staf_region[i];
+        if (staf_period[i] > 0) at[i] -= @FLOOR@(at[i] / staf_period[i]) * staf_period[i];
+    }
+    for (int k = 0; k < @K@; ++k) far[k] = (@REAL@)INFINITY, near[k] = k;
+    near[@K@] = @J@; /* the goal's own feedback */
+    for (int j = 0; j < @J@; ++j) { /* the @K@ nearest, the nearest first */
+        @REAL@ square = 0;
+        for (int i = 0; i < @N@; ++i) {
+            @REAL@ apart = @ABS@(at[i] - staf_searched[j * @N@ + i]);
+            const @REAL@ around = @ABS@(staf_period[i] - apart);
+            if (staf_period[i] > 0 && around < apart) apart = around;
+            square += apart * apart;
+        }
+        if (!(square < far[@K@ - 1])) continue;
+        int k = @K@ - 1;
+        for (; k > 0 && square < far[k - 1]; --k) far[k] = far[k - 1], near[k] = near[k - 1];
+        far[k] = square, near[k] = j;
+    }
+    for (int k = 0; k <= @K@; ++k) {
+        @REAL@ window[@H@ * @WIDTH@], cost[1], control[@M@];
+        const int j = near[k];
+        for (int t = 0; t < @H@; ++t) {
+            const int row = staf_first[j] + t < staf_last[j] ? staf_first[j] + t : staf_last[j];
+            for (int i = 0; i < @WIDTH@; ++i) window[t * @WIDTH@ + i] = staf_plans[row * @WIDTH@ + i];
+        }
+        staf_follow(state, window, staf_models + staf_end[j] * @MODEL@, cost, control);
+        if (k > 0 && !(cost[0] < least)) continue;
+        least = cost[0];
+        for (int i = 0; i < @M@; ++i) @CONTROL@[i] = control[i];
+    }
+}
+"""

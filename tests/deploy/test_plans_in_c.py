@@ -1,0 +1,143 @@
+"""Policies that follow plans, as files: a memory, carried and sampled plans; and what is refused."""
+
+from __future__ import annotations
+
+import math
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+from helpers_swingup import double_integrator, pendulum
+from torch import Tensor
+
+from staf_torch import adp, deploy, systems
+from staf_torch.deploy.c_header import runner_c, runner_learning_c
+
+needs_cc = pytest.mark.skipif(
+    not any(shutil.which(name) for name in ("cc", "gcc", "g++", "clang")), reason="needs a C compiler"
+)
+
+
+@pytest.fixture(scope="module")
+def memory() -> adp.GlobalValue:
+    """Of a pendulum near the top, where the angle may pass a whole turn."""
+    problem, turn = pendulum(), 2 * math.pi
+    x = torch.tensor([[0.3, 0.0], [-0.2, 0.1], [turn - 0.2, 0.3], [-turn + 0.2, -0.5]], dtype=torch.float64)
+    states, controls = [x], []
+    for _ in range(60):  # the linear feedback, instead of a search that takes seconds
+        controls.append(problem.linear_feedback(states[-1]))
+        states.append(problem.advance(states[-1], controls[-1])[0])
+    state, control = torch.stack(states, dim=1), torch.stack(controls, dim=1)
+    gains, bent = (-problem.k).expand(4, 60, 1, 2), (2 * problem.p).expand(4, 61, 2, 2)
+    slope = (bent * problem.away(state).unsqueeze(-2)).sum(-1)
+    fine = torch.ones(4, dtype=torch.bool)
+    library = adp.Trajectories(state, control, gains, problem.terminal(state), slope, bent, fine)
+    return adp.GlobalValue(problem, library, [math.pi, 8.0], candidates=12, lookahead=6)
+
+
+def states(count: int) -> Tensor:
+    """Upright give or take a little, some a turn away, and a quarter of them anywhere."""
+    generator = torch.Generator().manual_seed(0)
+    uniform = 2 * torch.rand(count, 2, dtype=torch.float64, generator=generator) - 1
+    turns = torch.randint(-1, 2, (count,), generator=generator)
+    x = torch.tensor([0.3, 0.5], dtype=torch.float64) * uniform
+    x[::4] *= 20
+    return torch.stack((x[:, 0] + 2 * math.pi * turns, x[:, 1]), dim=1)
+
+
+@needs_cc
+def test_memory_in_c_has_the_control_of_the_library_and_says_what_a_call_takes(
+    memory: adp.GlobalValue, tmp_path: Path
+) -> None:
+    x, path = states(200), tmp_path / "memory.h"
+    policy = deploy.policy_of(memory)
+    source = deploy.export_c(policy, x, path, ["u"])
+    (u,) = runner_c(path, [1], torch.float64)(x)
+    torch.testing.assert_close(u, memory(x), rtol=0, atol=1e-12)
+    torch.testing.assert_close(policy(x), memory(x), rtol=0, atol=1e-12)
+    assert 0.1 < float((u.abs() < 2).double().mean()) < 1  # not a bound everywhere
+    one = source.functions / (memory.candidates + 1)
+    assert one == int(one) >= memory.lookahead  # a sine a step
+    said = f"compares {len(memory.entries)} states and takes at most {source.flops} additions"
+    assert said in path.read_text()
+    timed = deploy.time_c(path, x, [1])
+    assert timed.calls == 200
+    assert 0 < timed.median_us <= timed.p99_us <= timed.worst_us
+
+
+@needs_cc
+def test_memory_in_float_chooses_nearly_the_same_control(memory: adp.GlobalValue, tmp_path: Path) -> None:
+    x, path = states(200).float(), tmp_path / "memory.h"
+    deploy.export_c(deploy.policy_of(memory, dtype=torch.float32), x, path, ["u"])
+    (u,) = runner_c(path, [1], torch.float32)(x)
+    assert float((u.double() - memory(x.double())).abs().median()) < 1e-4
+
+
+def test_traced_memory_has_the_control_of_the_library_at_every_batch(memory: adp.GlobalValue) -> None:
+    x = states(20)
+    short = adp.GlobalValue(memory.problem, memory.library, memory.region, candidates=3, lookahead=2)
+    program = deploy.trace(deploy.policy_of(short), x).module()  # what ONNX, pt2 and aoti are written from
+    for rows in (x, x[:1]):
+        torch.testing.assert_close(program(rows), short(rows), rtol=0, atol=1e-12)
+
+
+@needs_cc
+@pytest.mark.parametrize("kind", ["followed", "sampled"])
+def test_plan_that_is_carried_is_a_structure_in_c(kind: str, tmp_path: Path) -> None:
+    problem = double_integrator(-1.0, 1.0)
+    controller: adp.Controller = (
+        adp.RecedingHorizon(problem, steps=12, iterations=0, compile=False)
+        if kind == "followed"
+        else adp.PathIntegral(problem, steps=6, samples=4, knots=3, compile=False)
+    )
+    x0 = torch.tensor([[2.0, 0.5]], dtype=torch.float64)
+    path = tmp_path / "plan.h"
+    deploy.export_learning_c(controller, x0, path, dt=0.1)
+    generator = torch.Generator().manual_seed(0)
+    x = x0 * torch.linspace(1, 0.1, 20, dtype=torch.float64).unsqueeze(1)  # 8 steps beyond the plan
+    uniform = 2 * torch.rand(20, controller.draws, 2, dtype=torch.float64, generator=generator) - 1
+    carried, wanted = controller.init(x0), []
+    for at, numbers in zip(x.split(1), uniform.split(1), strict=True):
+        u, carried = controller.step(at, carried, numbers, 0.1)
+        wanted.append(u)
+    found = runner_learning_c(path, controller.draws, 1, torch.float64)(x, uniform)
+    torch.testing.assert_close(found, torch.cat(wanted), rtol=0, atol=1e-9)
+    assert bool((found.abs() < 1).any())
+    with pytest.raises(ValueError, match="carries its plan from control to control"):
+        deploy.policy_of(controller)
+
+
+@needs_cc
+@pytest.mark.parametrize("kind", ["energy", "near_optimal"])
+def test_feedback_of_a_plant_with_bounds_in_c(kind: str, tmp_path: Path) -> None:
+    plant, cost = systems.Pendulum(), adp.QuadraticCost(1.0, 1.0, 2, 1, low=-3.0, high=3.0)
+    policy = (
+        adp.EnergyShaping(
+            plant, cost, lambda x: 0.5 * x[..., 1] ** 2 + 9.81 * x[..., 0].cos(), gain=0.1, capture=1.0
+        )
+        if kind == "energy"
+        else adp.near_optimal(plant, cost, dt=0.05, horizon=0.2)
+    )
+    x, path = 0.2 * states(30), tmp_path / "policy.h"
+    module = deploy.policy_of(policy)
+    deploy.export_c(module, x, path, ["u"])
+    (u,) = runner_c(path, [1], torch.float64)(x)
+    torch.testing.assert_close(u, policy(x), rtol=0, atol=1e-9)
+    assert bool((u.abs() < 3).any())
+
+
+def test_what_searches_on_the_way_is_refused_with_its_reason(tmp_path: Path) -> None:
+    problem, plant = double_integrator(-1.0, 1.0), systems.TwoState()
+    mpc = adp.RecedingHorizon(problem, steps=5, compile=False)
+    x = torch.zeros(1, 2, dtype=torch.float64)
+    for write in (
+        lambda: deploy.policy_of(mpc),
+        lambda: deploy.export_learning_c(mpc, x, tmp_path / "a.h", dt=0.1),
+    ):
+        with pytest.raises(ValueError, match="a search ends when it has converged"):
+            write()
+    plan = adp.DirectShooting(plant, adp.QuadraticCost(1.0, 1.0, 2, 1)).solve(x + 0.1).replay()
+    with pytest.raises(ValueError, match="a plan of direct shooting knows no state"):
+        deploy.policy_of(plan)
+    assert not list(tmp_path.iterdir())
