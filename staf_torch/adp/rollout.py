@@ -130,9 +130,8 @@ class RolloutPolicy(nn.Module):
         lqr = LQR(system, cost)
         directions = ball_directions(centers, lqr.k.shape[-1])
         basis = StaFBasis(ExponentialKernel(), StateFollowingCenters(directions, radius))
-        return cls(
-            basis, system, cost, lqr, lqr.value, horizon=horizon, steps=steps, depth=depth, period=period
-        )
+        end = lqr.value if cost.end is None else lqr.cost.terminal
+        return cls(basis, system, cost, lqr, end, horizon=horizon, steps=steps, depth=depth, period=period)
 
     def forward(self, x: Tensor) -> Tensor:
         """u: (..., n) -> (..., m)."""
