@@ -85,12 +85,12 @@ class Cost(nn.Module, abc.ABC):
         self.target_input = _point(name, "target_input", target_input, inputs)
         non_negative(name, "discount", discount)
         self.discount = real(name, "discount", discount)
-        end = None
-        if terminal is not None:
-            if output is not None or self.discount:
-                raise fail(name, "terminal", "must be None beside an output or a discount", terminal)
-            end = positive_semidefinite(name, "terminal", _square(name, "terminal", terminal, dim), dim)
-        self.register_buffer("end", end)
+        if terminal is not None and (output is not None or self.discount):
+            raise fail(name, "terminal", "must be None beside an output or a discount", terminal)
+        end = None if terminal is None else _square(name, "terminal", terminal, dim)
+        self.register_buffer(
+            "end", None if end is None else positive_semidefinite(name, "terminal", end, dim)
+        )
         self.end: Tensor | None
         self.periodic: tuple[int, ...] = ()
         bounds = Bounds(low, high, inputs)
@@ -221,9 +221,7 @@ class QuadraticCost(Cost):
     The appendix of the paper loses the minus of the policy.
 
     Example:
-        >>> cost = adp.QuadraticCost(1.0, 0.1, dim=6, inputs=2, low=[-9.81, -1.0], high=[9.81, 1.0])
-
-    Example:
+        >>> bounded = adp.QuadraticCost(1.0, 0.1, dim=6, inputs=2, low=[-9.81, -1.0], high=[9.81, 1.0])
         >>> cost = adp.QuadraticCost(2.0, 0.5, dim=2, inputs=1)  # Q = 2 I, R = 0.5
         >>> float(cost.rate(torch.tensor([1.0, 1.0]).double(), torch.tensor([2.0]).double()))
         6.0

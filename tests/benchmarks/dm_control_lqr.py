@@ -4,7 +4,8 @@
 
 `systems.MujocoPlant` of the task's own model, `adp.LQR` of its own cost. A row a task and seed: the largest
 difference of gains and of the value's matrix, over the largest entry, and of the cost of an episode of 20 000
-steps from 20 of the task's initial states over x'Px/2. Ends with an error beyond 1e-6. Not collected by pytest.
+steps from 20 of the task's initial states over x'Px/2. Ends with an error beyond 1e-6. Not collected by
+pytest.
 """
 
 from __future__ import annotations
