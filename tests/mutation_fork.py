@@ -35,7 +35,7 @@ def begin(tree: Path, compiled: Path) -> None:
     for library in compiled.glob("*.so"):
         shutil.copy2(library, programs / "staf_torch")
     os.environ |= {"PYTHONPATH": str(_place), "XDG_CACHE_HOME": str(programs)}
-    os.environ |= {"OMP_NUM_THREADS": "1", "MPLBACKEND": "agg"}
+    os.environ |= {"OMP_NUM_THREADS": "1", "MPLBACKEND": "agg", "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"}
 
 
 def place() -> Path:
@@ -86,5 +86,5 @@ def _tested(files: Sequence[str], plugin: object, limit: int, *, stop: bool) -> 
     os.dup2(silent, 2)
     os.chdir(_place)
     sys.path[:0] = [str(_place)]
-    line = ["-q", "-p", "no:cacheprovider", "--tb=no", *(["-x"] if stop else []), *files]
+    line = ["-q", "-p", "no:cacheprovider", "--assert=plain", "--tb=no", *(["-x"] if stop else []), *files]
     return int(pytest.main(line, plugins=[plugin]))

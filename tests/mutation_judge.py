@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import pytest
 from mutants import Mutant
-from mutants_accepted import ACCEPTED
+from mutants_accepted import accepted
 from mutation_fork import begin, in_fork, place
 from mutation_map import Map, places, tests_near
 
@@ -23,13 +23,15 @@ class Verdict(NamedTuple):
     """What the tests said to a mutant."""
 
     mutant: Mutant
-    said: str  # killed, survived, accepted, or unreached: no test executes the file
+    said: (
+        str  # killed, survived, accepted, unreached: no test executes the file, or too dear: all take longer
+    )
     tests: int = 0
     seconds: float = 0.0
     by: str = ""  # the test that failed
 
 
-_map = Map({}, {})
+_map = Map({}, {}, {})
 _seconds = 0.0
 _until = 0.0
 
@@ -51,7 +53,7 @@ def begin_judging(tree: Path, compiled: Path, known: Map, seconds: float, until:
 
 def judge(mutant: Mutant) -> Verdict | None:
     """Try a mutant; None where there is no time left."""
-    if mutant.key in ACCEPTED:
+    if accepted(mutant):
         return Verdict(mutant, "accepted")
     if time.monotonic() > _until:
         return None
@@ -59,7 +61,7 @@ def judge(mutant: Mutant) -> Verdict | None:
     source = path.read_text(encoding="utf-8")
     tests = _tests_for(mutant, source)
     if not tests:
-        return Verdict(mutant, "unreached")
+        return Verdict(mutant, "unreached" if not _hits(mutant, source) else "too dear")
     begun = time.monotonic()
     path.write_text(mutant.applied(source), encoding="utf-8")
     said, by = "survived", ""
@@ -78,13 +80,13 @@ def fail_anyway(tests: Sequence[str]) -> list[str]:
     if not tests:
         return []
     chosen = Chosen(tests)
-    in_fork(chosen.files, chosen, 60 + 5 * sum(_cost(test) for test in tests), stop=False)
+    in_fork(chosen.files, chosen, 60 + 5 * _cost(tests), stop=False)
     return chosen.read()
 
 
 def _run(tests: Sequence[str]) -> tuple[str, str]:
     chosen = Chosen(tests)
-    limit = 60 + 5 * sum(_cost(test) for test in tests)
+    limit = 60 + 5 * _cost(tests)
     code = in_fork(chosen.files, chosen, limit, stop=True)
     if code is None:
         return "killed", "by the clock, or the process ended"
@@ -93,33 +95,35 @@ def _run(tests: Sequence[str]) -> tuple[str, str]:
 
 def _groups(tests: Sequence[str]) -> list[list[str]]:
     """What is short first; the rest only where that says nothing, since reading its files takes a while."""
-    total, first = 0.0, 0
-    while first < len(tests) and (first == 0 or total < FIRST):
-        total += _cost(tests[first]) + OVERHEAD
-        first += 1
+    first = max(1, sum(_cost(tests[: at + 1]) < FIRST for at in range(len(tests))))
     return [each for each in (list(tests[:first]), list(tests[first:])) if each]
-
-
-def _cost(test: str) -> float:
-    return _map.seconds.get(test, 0.0 if "::" in test else UNKNOWN)
-
-
-def _file(test: str) -> str:
-    return test.partition("::")[0]
 
 
 def _tests_for(mutant: Mutant, source: str) -> list[str]:
     """Those that execute the lines, the folder's own first and the short ones first, within the time."""
-    hits = tests_near(_map, mutant.file, mutant.line, mutant.last_line, _around(mutant, source))
+    hits = _hits(mutant, source)
     near = {test: 0 if test.startswith(places(mutant.file)) else 1 for test in hits}
+    order = sorted(hits, key=lambda test: (near[test], _cost([test]), test))
     chosen: list[str] = []
-    total = 0.0
-    for test in sorted(hits, key=lambda test: (near[test], _cost(test), test)):
-        total += _cost(test) + OVERHEAD
-        if chosen and total > _seconds:
-            break
-        chosen.append(test)
+    for test in order:
+        if _cost([*chosen, test]) <= _seconds:
+            chosen.append(test)
     return chosen
+
+
+def _hits(mutant: Mutant, source: str) -> set[str]:
+    return tests_near(_map, mutant.file, mutant.line, mutant.last_line, _around(mutant, source))
+
+
+def _cost(tests: Sequence[str]) -> float:
+    """Seconds of tests with the fixtures that they share."""
+    shared = {each for test in tests for each in _map.fixtures.get(test, ())}
+    own = sum(_map.seconds.get(test, UNKNOWN) for test in tests)
+    return own + sum(_map.seconds[each] for each in shared) + OVERHEAD * len(tests)
+
+
+def _file(test: str) -> str:
+    return test.partition("::")[0]
 
 
 def _around(mutant: Mutant, source: str) -> tuple[int, int, bool]:

@@ -16,10 +16,11 @@ import json
 import os
 import shutil
 import sqlite3
+import statistics
 import subprocess
 import tempfile
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -47,7 +48,8 @@ class Map(NamedTuple):
     """What each test executes."""
 
     lines: Mapping[str, Mapping[int, set[str]]]  # file -> line -> tests
-    seconds: Mapping[str, float]  # of the processor, for a test and the fixtures that were made for it
+    seconds: Mapping[str, float]  # of the processor, for a test or a fixture that tests share
+    fixtures: Mapping[str, Sequence[str]]  # that a test shares
     unmeasured: tuple[str, ...] = ()  # files of tests
 
 
@@ -204,6 +206,7 @@ def known(store: Path, tree: Path) -> Map:
     """The map of a tree, of what is kept for its files of tests."""
     lines: dict[str, dict[int, set[str]]] = defaultdict(lambda: defaultdict(set))
     seconds: dict[str, float] = {}
+    fixtures: dict[str, list[str]] = {}
     unmeasured = []
     now = {str(path.relative_to(tree)): hash_of(path) for path in (tree / "staf_torch").rglob("*.py")}
     for test_file in test_files(tree):
@@ -215,13 +218,26 @@ def known(store: Path, tree: Path) -> Map:
         places = {
             file: _matching(before, now[file]) for file, before in found["package"].items() if file in now
         }
-        seconds |= found["seconds"]
+        seconds |= _apart(found["tests"], found["seconds"])
+        fixtures |= found["tests"]
         for context, users in _users(found["tests"]).items():
             for file, numbers in found["lines"].get(context, {}).items():
                 for number in numbers if file in places else ():
                     if number in places[file]:
                         lines[file][places[file][number]].update(users)
-    return Map(lines, seconds, tuple(unmeasured))
+    return Map(lines, seconds, fixtures, tuple(unmeasured))
+
+
+def _apart(tests: Mapping[str, Sequence[str]], seconds: Mapping[str, float]) -> dict[str, float]:
+    """Seconds of tests and of fixtures: what its first user takes beyond the others is a fixture's."""
+    found = dict(seconds)
+    for test, fixtures in tests.items():  # in the order that they ran
+        new = set(fixtures) - set(found)
+        others = [seconds[each] for each, used in tests.items() if each != test and new & set(used)]
+        beyond = max(seconds[test] - statistics.median(others), 0.0) if others else 0.0
+        found |= dict.fromkeys(new, beyond / max(len(new), 1))
+        found[test] = seconds[test] - beyond
+    return found
 
 
 def _users(tests: Mapping[str, Iterable[str]]) -> dict[str, list[str]]:
@@ -282,7 +298,7 @@ def tests_near(known: Map, file: str, first: int, last: int, around: tuple[int, 
         hits = set().union(*(there[number] for number in span)) if span else set()
         if hits and not (around[2] and (begin, end) == (first, last)):
             return hits | whole
-    return {test for test in known.seconds if test.startswith(places(file))} | whole
+    return {test for test in known.fixtures if test.startswith(places(file))} | whole
 
 
 def places(file: str) -> tuple[str, ...]:

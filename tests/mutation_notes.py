@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 from mutants import Mutant
-from mutants_accepted import ACCEPTED
+from mutants_accepted import accepted
 from mutation_judge import Verdict
 
 Name = tuple[str, str, str, str, int]
@@ -75,7 +75,7 @@ class Notes:
             len(self.sample),
         )
         found = (each for at, each in sorted(self._verdicts.items()) if at < end)
-        return [each._replace(said="accepted") if each.mutant.key in ACCEPTED else each for each in found]
+        return [each._replace(said="accepted") if accepted(each.mutant) else each for each in found]
 
 
 def _named(found: Iterable[Mutant]) -> Iterator[tuple[Name, Mutant]]:

@@ -23,7 +23,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-FLAGS = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-fno-omit-frame-pointer", "-O1")
+FLAGS = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-fno-omit-frame-pointer")
 SECONDS = 60  # of the processor, for a call; ten times as many by the clock
 LIBRARIES = {
     "programs": "lanes",
@@ -51,7 +51,12 @@ def _runtime(compiler: str) -> Path:
 
 
 def run(
-    calls: int, seed: int, cache: Path, compiler: str = "g++", kinds: Sequence[str] = tuple(LIBRARIES)
+    calls: int,
+    seed: int,
+    cache: Path,
+    compiler: str = "g++",
+    kinds: Sequence[str] = tuple(LIBRARIES),
+    level: str = "-O1",
 ) -> str:
     """Return what a process under the sanitizers said of so many calls, or what they found.
 
@@ -69,7 +74,7 @@ def run(
         "OMP_NUM_THREADS": "1",
     }
     line = [sys.executable, __file__, "--inside", "--calls", str(calls), "--seed", str(seed)]
-    line += ["--kinds", *kinds]
+    line += ["--kinds", *kinds, f"--level={level}"]
     ended = subprocess.run(line, env=environment, capture_output=True, text=True, check=False)
     if "none bad" not in ended.stdout:
         return f"exit {ended.returncode}: {ended.stdout}{ended.stderr[-5000:]}"
@@ -78,7 +83,7 @@ def run(
     return ended.stdout.strip()
 
 
-def inside(calls: int, seed: int, chosen: Sequence[str]) -> None:
+def inside(calls: int, seed: int, chosen: Sequence[str], level: str) -> None:
     """Call native code so often, in a process that has the sanitizers loaded."""
     import torch
 
@@ -88,7 +93,7 @@ def inside(calls: int, seed: int, chosen: Sequence[str]) -> None:
     from staf_torch.online.bank import Bank
     from staf_torch.online.bank_rules import RECENT, BankShape, Rules
 
-    more = (*FLAGS, "-shared-libasan") if "clang" in os.environ["CXX"] else FLAGS
+    more = (*FLAGS, level, *(("-shared-libasan",) if "clang" in os.environ["CXX"] else ()))
     build._FLAGS += more
     compiler._FLAGS += more
     chance = random.Random(seed)
@@ -227,16 +232,17 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--compiler", default="g++")
     parser.add_argument("--kinds", nargs="*", choices=[*LIBRARIES], default=[*LIBRARIES])
+    parser.add_argument("--level", default="-O1", help="of the compiler; -O0 builds in half the time")
     parser.add_argument("--inside", action="store_true", help=argparse.SUPPRESS)
     chosen = parser.parse_args()
     if chosen.inside:
-        inside(chosen.calls, chosen.seed, chosen.kinds)
+        inside(chosen.calls, chosen.seed, chosen.kinds, chosen.level)
         return 0
     if why := missing(chosen.compiler):
         print(why)
         return 0
     with tempfile.TemporaryDirectory() as cache:
-        said = run(chosen.calls, chosen.seed, Path(cache), chosen.compiler, chosen.kinds)
+        said = run(chosen.calls, chosen.seed, Path(cache), chosen.compiler, chosen.kinds, chosen.level)
     print(said)
     return int("none bad" not in said)
 

@@ -14,7 +14,8 @@ from staf_torch import lanes
 
 @pytest.mark.skipif(sanitized.missing() is not None, reason=sanitized.missing() or "")
 def test_no_shape_or_layout_makes_native_code_read_outside(tmp_path: Path) -> None:
-    said = sanitized.run(6, 1, tmp_path, kinds=["programs", "banks"])  # a bank runs what a filter does
+    kinds = ["programs", "banks"]  # a bank runs what a filter does
+    said = sanitized.run(6, 1, tmp_path, kinds=kinds, level="-O0")
     assert said.startswith("6 calls of")
 
 

@@ -21,6 +21,7 @@ from ..numerics.checks import COMMAND_LINE, flag
 from ..results.progress import SHOWN, Progress
 from ..results.run_directory import HistoryWriter, RunDirectory
 from ..settings.chase import ChaseProblem, Parts, chase_problem
+from ..settings.plain import PlainSettings, to_read
 from ..tables.columns import significant
 from .chase_batch import Outcome, simulate
 from .registry import BatchedExperiment, Metrics
@@ -121,7 +122,7 @@ class GradientChase(BatchedExperiment[ChaseSolution]):
     def solve(self, cfgs: Sequence[DictConfig], progress: Progress) -> list[ChaseSolution | Exception]:
         """Solve several configurations of one group as one tensor batch."""
         parts = Parts()
-        prepared = [_prepared(cfg, parts) for cfg in cfgs]
+        prepared = [_prepared(cfg, parts) for cfg in to_read(cfgs)]
         ready = [member for member in prepared if isinstance(member, _Ready)]
         common: list[str] = []
         outcomes: list[Outcome] = []
@@ -190,7 +191,7 @@ class _Ready:
         return ChaseSolution(Title.of(self.problem), outcome, starts, history, tuple(told))
 
 
-def _prepared(cfg: DictConfig, parts: Parts) -> _Ready | Exception:
+def _prepared(cfg: DictConfig | PlainSettings, parts: Parts) -> _Ready | Exception:
     said: list[str] = []
     try:
         with _recorded(said):
@@ -228,7 +229,7 @@ class _Memory:
         self._done += length
 
 
-def _wanted(cfg: DictConfig, problem: ChaseProblem) -> tuple[bool, bool]:
+def _wanted(cfg: DictConfig | PlainSettings, problem: ChaseProblem) -> tuple[bool, bool]:
     """Return whether the first trajectory is drawn, at rest or in motion, and whether there is a history."""
     drawn = flag(COMMAND_LINE, "figures", cfg.figures)
     moving = animation_kind(cfg, problem.basis.dim) is not None

@@ -25,12 +25,13 @@ from ..approximation.basis import StaFBasis
 from ..figures.animation import FRAMES, KINDS, Curves, Scene
 from ..numerics.checks import COMMAND_LINE, choice, fail
 from ..settings.chase import ChaseProblem
+from ..settings.plain import PlainSettings
 
 _GRID, _ACROSS = 81, 41
 Value = Callable[[Tensor], Tensor]
 
 
-def animation_kind(cfg: DictConfig, dim: int | None = None) -> str | None:
+def animation_kind(cfg: DictConfig | PlainSettings, dim: int | None = None) -> str | None:
     """Return what the setting `animation` asks for, gif or html; None for no animation.
 
     Args:

@@ -149,9 +149,9 @@ class Bank:
         shape = len(self.table), self.shape.outputs
         mean, variance = x.new_empty(shape), x.new_empty(shape)
         if self._run is None:
-            streams = self._definition.each(self.table)
-            pairs = [self._definition.predict(s, point) for s, point in zip(streams, x, strict=True)]
-            return torch.stack([pair[0] for pair in pairs]), torch.stack([pair[1] for pair in pairs])
+            for i, stream in enumerate(self._definition.each(self.table)):
+                mean[i], variance[i] = self._definition.predict(stream, x[i])
+            return mean, variance
         call = self._call
         call.mode, call.x, call.mean, call.variance = 1, x.data_ptr(), mean.data_ptr(), variance.data_ptr()
         self._run(ctypes.byref(call))

@@ -34,6 +34,7 @@ from ..numerics.checks import COMMAND_LINE, choice, fail, flag, integer, positiv
 from ..optim import UpdateLaw
 from ..results.metric_info import OWN
 from ..systems import ControlAffineSystem, trajectory
+from .plain import PlainSettings
 
 _CENTERS = "staf_torch.settings.chase.centers_of"
 DTYPES = {"float64": torch.float64, "float32": torch.float32}
@@ -107,10 +108,12 @@ def _key(argument: object) -> object:
     """Return a key that is equal for equal settings; an object that is none is only equal to itself."""
     if OmegaConf.is_config(argument):
         return json.dumps(OmegaConf.to_container(argument, resolve=True), default=repr)
+    if isinstance(argument, PlainSettings):
+        return json.dumps(argument, default=repr)
     return argument if isinstance(argument, int | float | str | None) else id(argument)
 
 
-def chase_problem(cfg: DictConfig, parts: Parts | None = None) -> ChaseProblem:
+def chase_problem(cfg: DictConfig | PlainSettings, parts: Parts | None = None) -> ChaseProblem:
     """Build the gradient chase that the settings describe.
 
     Args:
@@ -169,10 +172,12 @@ def _dimension(system: ControlAffineSystem, initial_state: object) -> int:
 
 def plain(value: Any) -> Any:
     """Return a setting as Python has it: a list or dictionary, resolved, in place of OmegaConf's."""
+    if isinstance(value, PlainSettings):
+        return {key: plain(inner) for key, inner in value.items()}
     return OmegaConf.to_container(value, resolve=True) if OmegaConf.is_config(value) else value
 
 
-def make(cfg: DictConfig) -> Any:
+def make(cfg: DictConfig | PlainSettings) -> Any:
     """Build the object that a group of settings names by ``_target_``.
 
     Raises:
@@ -189,7 +194,7 @@ def make(cfg: DictConfig) -> Any:
         raise
 
 
-def make_metrics(cfg: DictConfig | None) -> tuple[Metric, ...]:
+def make_metrics(cfg: DictConfig | PlainSettings | None) -> tuple[Metric, ...]:
     """Return the metrics of the user's own that the group `metric` names: none, one, or a sequence of them.
 
     Raises:
@@ -225,7 +230,7 @@ def placement(device: object, dtype: object) -> tuple[torch.device, torch.dtype]
     return place, DTYPES[str(dtype)]
 
 
-def make_centers(cfg: DictConfig, dim: int) -> StateFollowingCenters:
+def make_centers(cfg: DictConfig | PlainSettings, dim: int) -> StateFollowingCenters:
     """Build the centers of the group `centers` around states of ``dim`` coordinates.
 
     Raises:
@@ -303,14 +308,14 @@ def make_radius(radius: float, offset: float | None, gain: float) -> float | Rad
     return radius if offset is None else StateRadius(radius, offset, gain)
 
 
-def _law(cfg: DictConfig) -> tuple[UpdateLaw, int]:
+def _law(cfg: DictConfig | PlainSettings) -> tuple[UpdateLaw, int]:
     """Build the update law of the group `optimizer`; return it with the number of inner steps."""
     settings = plain(cfg)
     inner_steps = integer(COMMAND_LINE, "optimizer.inner_steps", settings.pop("inner_steps"), least=1)
     return make(OmegaConf.create(settings)), inner_steps
 
 
-def initial_states(cfg: DictConfig, dim: int) -> Tensor:
+def initial_states(cfg: DictConfig | PlainSettings, dim: int) -> Tensor:
     """Return the stated initial state, then others uniform in a box around it: (B, n) float64.
 
     The generator runs on the CPU in float64, so that one seed means the same states everywhere, and

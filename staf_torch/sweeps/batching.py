@@ -17,6 +17,7 @@ from omegaconf.errors import OmegaConfBaseException
 from ..experiments.registry import BatchedExperiment, Experiment, Metrics, Solution, experiment
 from ..results import run_record as records
 from ..results.progress import SHOWN, Progress
+from ..settings.plain import to_read
 from .workers import LostError
 
 _log = logging.getLogger(__name__)
@@ -77,7 +78,7 @@ DEFERRED = Deferred()
 class Batch(NamedTuple):
     """The jobs of a tensor batch."""
 
-    settings: list[DictConfig]
+    settings: Sequence[DictConfig]
     directories: list[str]  # of the runs
 
 
@@ -149,8 +150,9 @@ def solve(cfgs: Sequence[DictConfig], progress: Progress) -> list[Outcome]:
     Where the batch as a whole raises, its members are tried one by one, so that only the culprit fails.
     """
     try:
-        study = experiment(cfgs[0].task)
-        if not isinstance(study, BatchedExperiment) or any(cfg.get("members") is not None for cfg in cfgs):
+        read = to_read(cfgs)
+        study = experiment(read[0].task)
+        if not isinstance(study, BatchedExperiment) or any(cfg.get("members") is not None for cfg in read):
             return [DEFERRED for _ in cfgs]
         solutions = study.solve(cfgs, progress)
         return [Failed(each) if isinstance(each, Exception) else Computed(each) for each in solutions]

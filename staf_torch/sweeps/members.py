@@ -9,12 +9,13 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
-import statistics
+import tempfile
 from array import array
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import IO, Any, NamedTuple
 
+import numpy as np
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 
@@ -24,11 +25,20 @@ from ..results import run_record as records
 from ..results.progress import Progress
 from ..results.reader import Value
 from ..results.run_directory import RunDirectory
+from ..settings.plain import ManySettings
 from ..tables import Table
 from . import lock
 from .batching import Computed, Failed, Outcome, completion, reason
 from .executors import Inline, compute
-from .hydra_compat import Composer, ConfigLoader, Product, config_loader, parse_override, sweep_size
+from .hydra_compat import (
+    Composer,
+    ConfigLoader,
+    PlainComposer,
+    Product,
+    config_loader,
+    parse_override,
+    sweep_size,
+)
 from .member_rows import FOLDER, Left, left, made_by, rows_left, writer
 
 _log = logging.getLogger(__name__)
@@ -73,44 +83,44 @@ def run(
     loader = config_loader()
     jobs = member_overrides(cfg.members, loader)
     fixed = ("figures=false", f"history={str(keep).lower()}")
-    composer = Composer(loader, config_name, hydra_node=False, always=[*base, *fixed])
-    out, tally, before = RunDirectory(directory), _Tally(), start.left
+    composer = PlainComposer(Composer(loader, config_name, hydra_node=False, always=[*base, *fixed]))
+    out, before = RunDirectory(directory), start.left
     done = len(before.made)
 
-    def composed(begin: int) -> list[DictConfig]:
-        return [composer([*base, *job, *fixed]) for job in jobs[begin : begin + _PIECE]]
+    def composed(begin: int) -> ManySettings:
+        return composer([[*base, *job, *fixed] for job in jobs[begin : begin + _PIECE]])
 
     cfgs = composed(0)  # before anything is written: most wrong names are refused here
     for begin in range(0, done, _PIECE):
-        made = [made_by(records.flat(one)) for one in (composed(begin) if begin else cfgs)]
+        made = [made_by(one) for one in (composed(begin) if begin else cfgs).flat]
         _refuse_others(jobs, begin, made, before.made[begin : begin + _PIECE])
-    for row in rows_left(directory, done) if done else ():
-        tally.add([row])
-    if done:
-        _log.info("%d of %d members were completed before", done, len(jobs))
-    with (
-        _saying_how_to_resume(directory, tally, len(jobs)),
-        progress.over(len(jobs), "members") as advance,
-        writer(directory, start.run, len(jobs), before) as write,
-    ):
-        advance(done)
-        for begin in range(done // _PIECE * _PIECE, len(jobs), _PIECE):
-            part = jobs[begin : begin + _PIECE]
-            cfgs = composed(begin) if begin else cfgs
-            places = [directory / FOLDER / str(begin + index) for index in range(len(part))]
-            rows: list[dict[str, Any]] = [{} for _ in part]
-            completed = range(max(0, min(done - begin, len(part))))
-            flat = [records.flat(one) for one in cfgs]
-            for index, outcome, _ in compute(
-                cfgs, places, Inline(), finished=completed, flat=flat, tell=lambda jobs: None
-            ):
-                row = {"num": begin + index, "overrides": part[index]}
-                rows[index] = row | _result(cfgs[index], outcome, places[index], keep, progress)
-                advance(1)
-            write(rows[len(completed) :], [made_by(one) for one in flat[len(completed) :]])
-            tally.add(rows[len(completed) :])
-    tally.report()
-    return out.metrics(tally.counts())
+    with contextlib.closing(_Tally(directory)) as tally:
+        for row in rows_left(directory, done) if done else ():
+            tally.add([row])
+        if done:
+            _log.info("%d of %d members were completed before", done, len(jobs))
+        with (
+            _saying_how_to_resume(directory, tally, len(jobs)),
+            progress.over(len(jobs), "members") as advance,
+            writer(directory, start.run, len(jobs), before) as write,
+        ):
+            advance(done)
+            for begin in range(done // _PIECE * _PIECE, len(jobs), _PIECE):
+                part = jobs[begin : begin + _PIECE]
+                cfgs = composed(begin) if begin else cfgs
+                places = [directory / FOLDER / str(begin + index) for index in range(len(part))]
+                rows: list[dict[str, Any]] = [{} for _ in part]
+                completed = range(max(0, min(done - begin, len(part))))
+                for index, outcome, _ in compute(
+                    cfgs, places, Inline(), finished=completed, flat=cfgs.flat, tell=lambda jobs: None
+                ):
+                    row = {"num": begin + index, "overrides": part[index]}
+                    rows[index] = row | _result(cfgs, index, outcome, places[index], keep, progress)
+                    advance(1)
+                write(rows[len(completed) :], [made_by(one) for one in cfgs.flat[len(completed) :]])
+                tally.add(rows[len(completed) :])
+        tally.report()
+        return out.metrics(tally.counts())
 
 
 @contextlib.contextmanager
@@ -188,7 +198,7 @@ def member_overrides(setting: Any, loader: ConfigLoader) -> Sequence[list[str]]:
 
 
 def _result(
-    cfg: DictConfig, outcome: Outcome, directory: Path, keep: bool, progress: Progress
+    cfgs: ManySettings, index: int, outcome: Outcome, directory: Path, keep: bool, progress: Progress
 ) -> dict[str, Any]:
     """Return what a row says of the end of a member; its files are written where they are kept."""
     try:
@@ -197,20 +207,28 @@ def _result(
         else:
             if not isinstance(outcome, Failed):
                 directory.mkdir(parents=True, exist_ok=True)
-            metrics = completion(cfg, outcome)(cfg, directory, progress)
+            metrics = completion(cfgs[index], outcome)(cfgs[index], directory, progress)
     except Exception as error:
         return {"status": "failed", "reason": reason(error), "metrics": {}}
     return {"status": "completed", "reason": None, "metrics": metrics}
 
 
 class _Tally:
-    """What the log says of all members in the end, and their counts; many rows are not kept."""
+    """What the log says of all members in the end, and their counts.
 
-    def __init__(self) -> None:
+    Many rows are not kept, and the numbers of a metric lie in a file without a name: memory does not grow
+    with the members.
+
+    Args:
+        directory: of the run.
+    """
+
+    def __init__(self, directory: Path) -> None:
+        self._directory, self._files = directory, contextlib.ExitStack()
         self._count = self._failed = self._diverged = 0
         self._rows: list[dict[str, Any]] = []  # while they are few
         self._bad: list[dict[str, Any]] = []
-        self._numbers: dict[str, array[float]] = {}
+        self._numbers: dict[str, IO[bytes]] = {}
 
     def add(self, rows: Sequence[dict[str, Any]]) -> None:
         """Count further rows."""
@@ -221,10 +239,16 @@ class _Tally:
                 self._failed += 1
                 self._bad += [row] * (len(self._bad) < _LISTED)
             self._rows += [row] * (len(self._rows) <= _LISTED)
-            for name, value in row["metrics"].items():
-                numbers = self._numbers.setdefault(name, array("d"))
-                if value is not None:
-                    numbers.append(value)
+        for name in dict.fromkeys(name for row in rows for name in row["metrics"]):
+            if name not in self._numbers:
+                made = tempfile.TemporaryFile(dir=self._directory)  # noqa: SIM115  # closed with the others
+                self._numbers[name] = self._files.enter_context(made)
+            values = (row["metrics"].get(name) for row in rows)
+            array("d", (value for value in values if value is not None)).tofile(self._numbers[name])
+
+    def close(self) -> None:
+        """Give the files back."""
+        self._files.close()
 
     def counts(self) -> Metrics:
         """What `metrics.json` holds."""
@@ -242,9 +266,11 @@ class _Tally:
             names: tuple[str, ...] = ("member", *shown)
         else:
             cells, names = [], ("metric", "least", "median", "most", "members")
-            for name, found in self._numbers.items():
-                if found:
-                    numbers = (name, min(found), statistics.median(found), max(found), len(found))
+            for name, file in self._numbers.items():
+                file.seek(0)
+                if len(found := np.fromfile(file)):
+                    least, median, most = (float(of(found)) for of in (np.min, np.median, np.max))
+                    numbers = (name, least, median, most, len(found))
                     cells.append(dict(zip(names, numbers, strict=True)))
         for line in Table.of(cells, {name: name for name in names}).markdown().splitlines():
             _log.info("%s", line)

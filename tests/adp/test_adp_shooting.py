@@ -137,3 +137,12 @@ def test_plant_that_cannot_be_stabilised_and_states_of_another_size_are_refused(
         adp.DirectShooting(stuck, COST)
     with pytest.raises(ValueError, match=r"`DirectShooting.solve\(x0=...\)` must have 2 entries"):
         adp.DirectShooting(PLANT, COST).solve(torch.zeros(1, 3, dtype=torch.float64))
+
+
+def test_an_earlier_plan_is_a_start_that_costs_what_it_did() -> None:
+    x = uniform(2, 1.0, seed=5)
+    shooting = adp.DirectShooting(LINEAR, COST, intervals=16)
+    best = shooting.solve(x)
+    start = shooting._warm(best, x, torch.arange(2), best.time)
+    torch.testing.assert_close(start.cost, best.value, rtol=1e-2, atol=0)
+    torch.testing.assert_close(start.state, best.state, rtol=0, atol=0.02)

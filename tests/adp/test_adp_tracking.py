@@ -94,3 +94,19 @@ def test_bad_arguments_are_refused_by_name() -> None:
         adp.LeadingCoordinates(staf_basis(), 1)
     with pytest.raises(ValueError, match=r"`QuadraticCost\(state=...\)` must be positive"):
         adp.tracking_cost(-1.0, 1.0)
+
+
+def test_a_full_stack_takes_a_pair_only_where_the_least_eigenvalue_grows() -> None:
+    """Of vectors along the axes the eigenvalues are exact: along an axis that is known, nothing grows."""
+    learning = adp.ConcurrentLearning(2, 1, size=2)
+    known = learning.init(torch.zeros(1, 2, 1).double())
+    kept = known._replace(regressors=torch.tensor([[[2.0, 0.0], [3.0, 0.0]]]).double())
+    y = torch.ones(1, 1).double()
+    again = learning.remember(kept, torch.tensor([[5.0, 0.0]]).double(), y)
+    assert torch.equal(again.regressors, kept.regressors)
+    other = learning.remember(kept, torch.tensor([[0.0, 1.0]]).double(), y)
+    assert other.regressors.tolist() == [[[2.0, 0.0], [0.0, 1.0]]] or other.regressors.tolist() == [
+        [[0.0, 1.0], [3.0, 0.0]]
+    ]
+    better = learning.remember(other, torch.tensor([[0.0, 2.0]]).double(), y)
+    assert bool((torch.linalg.eigvalsh(better.regressors.mT @ better.regressors)[:, 0] > 1.0).all())

@@ -82,3 +82,9 @@ def test_a_control_of_another_shape_is_refused(shape: tuple[int, ...]) -> None:
 
     with pytest.raises(ValueError, match=r"\(3, 1\)"):
         adp.simulate(Odd(), PLANT, COST, torch.ones(3, 2, dtype=torch.float64), dt=0.1, steps=2)
+
+
+def test_a_feedback_carries_nothing_for_any_number_of_rows() -> None:
+    for rows in (1, 5):
+        for part in adp.Feedback(lambda x: -x).init(torch.zeros(rows, 2)):
+            assert part is None or (len(part) == rows and part.numel() == 0)

@@ -279,3 +279,11 @@ def test_what_breaks_a_rule_is_refused(given: dict[str, object], message: str) -
     usual: dict[str, object] = {"policy": lambda x: x, "plant": LINE, "constraints": wall, "dt": 0.01}
     with pytest.raises(ValueError, match=message):
         adp.SafetyFilter(**{**usual, **given})  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("stated", "most"), [({}, 0.3), ({"low": -0.2, "high": 0.2}, 0.2)])
+def test_bounds_of_the_plant_hold_where_the_filter_states_none(stated: dict[str, float], most: float) -> None:
+    plant = systems.Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
+    plant.bounds = systems.Bounds(-0.3, 0.3, 1)
+    shield = adp.SafetyFilter(lambda x: 5.0 + 0 * x[..., :1], plant, wall, dt=0.01, **stated)
+    assert shield(tensor([[1.0, 0.0]])).tolist() == [[most]]

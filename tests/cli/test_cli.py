@@ -44,6 +44,9 @@ NEEDS = {  # what some options cannot do without, or that makes them small
         "exponential_bound.epsilons=[0.1]",
     ],
     "experiment=flat_limit": ["flat_limit.counts=[3]", "flat_limit.radii.smallest=1e-3"],
+    "experiment=adp": ["adp.optimum.shooting=false"],
+    "experiment=adp_three_state": ["adp.optimum.shooting=false"],
+    "experiment=laws": ["laws.steps=[0.025,0.0125]", "laws.work=2"],
     "experiment=adp_comparison": ["trajectories=3", "adp.order=2"],
     "experiment=rivals": [
         "rivals.plants=[double_integrator]",

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 from composing import settings
+from omegaconf import OmegaConf
 
 from staf_torch.experiments import faults, icl
 
@@ -44,3 +45,17 @@ def test_the_published_reference_has_the_rate_that_is_stated() -> None:
     for k in range(2):
         (slope,) = torch.autograd.grad(wanted[:, k].sum(), time, retain_graph=True)
         torch.testing.assert_close(rate[:, k], slope)
+
+
+def test_gains_are_drawn_for_every_row_within_their_ranges() -> None:
+    cfg = settings("experiment=icl", "icl.gain=[0.5,0.5]", "icl.rate=[1,2]")
+    for rows in (1, 3):
+        cfg.trajectories = rows
+        gains = icl._gains(cfg)
+        assert gains["gain"].tolist() == [0.5] * rows
+        assert bool(((gains["rate"] >= 1) & (gains["rate"] <= 2)).all())
+    for name, wrong in (("trajectories", 0), ("icl.rate", [2, 1]), ("icl.rate", [0, 1])):
+        bad = cfg.copy()
+        OmegaConf.update(bad, name, wrong)
+        with pytest.raises(ValueError, match=name):
+            icl._gains(bad)

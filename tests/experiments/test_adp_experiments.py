@@ -35,7 +35,7 @@ def moves(path: Path) -> None:
         ["experiment=adp", "adp/law=published", "dt=0.001"],
         ["experiment=adp", "adp.gradient=partial", "adp.extrapolated_centers=fixed"],
         ["experiment=adp", "adp/extrapolation=quadrature", "adp.order=3", "adp.trust=0.5", "animation=gif"],
-        ["experiment=adp", "adp/policy=rollout", "adp.rollout.depth=1", "animation=gif"],
+        ["experiment=adp", "adp/policy=rollout", "adp.rollout.depth=1"],
         ["experiment=adp", "adp/policy=lqr", "system=pendulum"],
         ["experiment=adp", "adp/policy=none", "trajectories=3"],
         ["experiment=adp", "system=two_state_as_printed", "adp.optimum.shooting=false"],
@@ -150,3 +150,13 @@ def test_trajectories_that_do_not_come_to_rest_are_counted(caplog: pytest.LogCap
         adp_experiment.count_the_restless(cost, run)
     (said,) = [record.getMessage() for record in caplog.records if "not regulated" in record.getMessage()]
     assert said.startswith("2 of 3 trajectories are not regulated: in the last quarter of the 8 s")
+
+
+@pytest.mark.parametrize("points", ["random", "quadrature"])
+def test_tracking_learns_at_points_of_either_kind(points: str) -> None:
+    cfg = adp_tracking.updated(settings("experiment=adp_tracking", f"adp/extrapolation={points}"))
+    plant, cost = adp.TwoStateTracking(), adp_tracking.tracking_cost(10.0, 1.0)
+    learner = adp_tracking._controllers(cfg, plant, cost)["known"]
+    assert isinstance(learner, adp.ActorCritic)
+    kind = {"random": adp.RandomPoints, "quadrature": adp.QuadraturePoints}[points]
+    assert isinstance(learner.extrapolation, kind)

@@ -92,3 +92,10 @@ def test_what_all_passes_of_a_loop_find_alike_is_found_once() -> None:
     wanted, history = program.definition(carry, now)
     assert torch.equal(out, history)
     assert torch.equal(end[0], wanted[0])
+
+
+def test_costly_functions_of_the_time_alone_are_found_ahead_and_cheap_ones_are_not() -> None:
+    carry, now = torch.ones(3).double(), torch.ones(3, 4).double()
+    for function, ahead in ((lambda t: t + 1, 0), (lambda t: t.exp().sin(), 1)):
+        program = lanes.Program(lambda c, t, row, f=function: (c * f(t), ()))
+        assert f" AHEAD = {ahead}," in program.text(carry, now)

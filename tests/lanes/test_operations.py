@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from staf_torch import lanes
+from staf_torch.lanes.replacements import REPLACEMENTS
 
 SIZE = 3
 LIST = torch.tensor([2, 0])
@@ -190,6 +191,44 @@ def test_remainders_are_exact_whatever_the_quotient(dtype: torch.dtype) -> None:
                 )
 
 
+ZEROS: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
+    "itself": lambda x, y: x,
+    "minus": lambda x, y: -x,
+    "sum": lambda x, y: x + y,
+    "difference": lambda x, y: x - y,
+    "product": lambda x, y: x * y,
+    "square": lambda x, y: x * x,
+    "quotient": lambda x, y: x / (y * y + 1),
+    "least": lambda x, y: torch.minimum(x, y * y + 1),
+    "most": lambda x, y: torch.maximum(x, -y * y - 1),
+    "where it is": lambda x, y: torch.where(y > -9, x, 1.0),
+    "where it is not": lambda x, y: torch.where(y > 9, 1.0, x),
+    "exp": lambda x, y: x.exp() - 1.0,
+    "abs": lambda x, y: x.abs(),
+    "floor": lambda x, y: x.floor(),
+    "sine": lambda x, y: x.sin(),
+    "constant": lambda x, y: torch.where(y > 0, -0.0, 0.0),
+}  # fmt: skip
+
+
+@pytest.mark.compiled
+def test_a_zero_keeps_its_sign_and_loses_it_as_in_torch() -> None:
+    """Terms that add a zero may only go where no sign of a zero depends on them: 1/x tells."""
+
+    def step(carry: Tensor, now: Tensor, row: Tensor) -> tuple[Tensor, Tensor]:
+        x, y = row.unbind(-1)
+        found = [operation(x, y) for operation in ZEROS.values()]
+        return carry, torch.stack(
+            [each for z in found for each in (z + 0.0, 0.0 + z, z - 0.0, z + -0.0, 0.0 - z)]
+        )
+
+    numbers = torch.tensor([0.0, -0.0, 1.0, -1.0], dtype=torch.float64)
+    x = torch.cartesian_prod(numbers, numbers)
+    program = lanes.Program(step)
+    found, wanted = (call(x, x.unsqueeze(1), x)[1] for call in (program, program.definition))
+    torch.testing.assert_close(1 / found, 1 / wanted, rtol=1e-14, atol=0)
+
+
 def test_an_error_of_the_tracer_leaves_the_definition(caplog: pytest.LogCaptureFixture) -> None:
     class Odd:
         def __call__(self, x: Tensor) -> Tensor:
@@ -202,3 +241,20 @@ def test_an_error_of_the_tracer_leaves_the_definition(caplog: pytest.LogCaptureF
     x = torch.randn(5, 2, dtype=torch.float64)
     assert torch.equal(program(x, x.unsqueeze(1), x)[1][:, 0], 2 * x)
     assert "KeyError" in caplog.text
+
+
+@pytest.mark.parametrize("dims", [None, (0,), (2,), (-1,), (0, 1), (0, 2), (0, 1, 2)])
+def test_reductions_over_any_dimensions_are_those_of_numpy(dims: tuple[int, ...] | None) -> None:
+    x = torch.randn(2, 3, 4, dtype=torch.float64)
+    wanted = {
+        "prims::sum": np.sum(x.numpy(), axis=dims),
+        "prims::prod": np.prod(x.numpy(), axis=dims),
+        "prims::var": np.var(x.numpy(), axis=dims, ddof=1),
+    }
+    for name, value in wanted.items():
+        found = REPLACEMENTS[name](x, dims)
+        torch.testing.assert_close(found, torch.as_tensor(value), msg=name)
+    for name in ("prims::sum", "prims::prod"):
+        assert REPLACEMENTS[name](x.float(), dims, output_dtype=torch.float64).dtype == torch.float64
+    plain = REPLACEMENTS["prims::var"](x, dims, 0.0)
+    torch.testing.assert_close(plain, torch.as_tensor(np.var(x.numpy(), axis=dims)))

@@ -183,6 +183,13 @@ def test_streams_come_and_go_without_touching_the_others(memory: int | None) -> 
     assert torch.equal(found[0], fresh.predict(x[0, 1]))
 
 
+def test_no_streams_have_no_predictions() -> None:
+    shape, x = BankShape(2, 1, 128, 8), torch.zeros(0, 2, dtype=torch.float64)
+    for bank in (Bank(shape, 0, True), definition_of(Bank(shape, 0, True))):
+        bank.learn(x, x[:, :1])
+        assert [part.shape for part in bank.predict(x)] == [(0, 1), (0, 1)]
+
+
 def test_a_bank_counts_what_it_learned_and_what_it_skipped() -> None:
     bank = Bank(BankShape(2, 1, 128, 8), 2, True)
     for at in range(5):

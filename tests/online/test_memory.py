@@ -213,11 +213,11 @@ def noisy_laps(laps: int, scale: float, visits: int = 64) -> float:
     basis, x = basis_of("gaussian", radius=0.1), circle(30)[:8]
     memory = st.ExperienceMemory(basis, 12, visits=visits)
     draw = torch.Generator().manual_seed(0)
+    places = [(state, basis.local(state), basis.values(state, V)) for state in x]
     for _ in range(laps):
-        for state in x:
-            values = basis.values(state, V)
+        for state, local, values in places:
             noise = scale * torch.randn(values.shape[-1:], generator=draw, dtype=torch.float64)
-            memory.add(state, basis.local(state).fit(values + noise))
+            memory.add(state, local.fit(values + noise))
     return float((memory.query(x) - V(x)).square().mean().sqrt())
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 from helpers_laws import iterate, quadratic
@@ -265,3 +266,15 @@ def test_a_setting_that_would_diverge_is_refused(make: object) -> None:
     assert callable(make)
     with pytest.raises(ValueError, match=r"`.*`"):
         make()
+
+
+@pytest.mark.parametrize("momentum", [0.0, 0.5, 0.9])
+def test_heavy_ball_takes_the_steps_with_which_it_converges_and_no_others(momentum: float) -> None:
+    def radius(step: float) -> float:  # of the map (a, a before) where the curvature is largest
+        return float(np.abs(np.linalg.eigvals([[1 + momentum - step, -momentum], [1.0, 0.0]])).max())
+
+    most = 2 * (1 + momentum)
+    assert radius(0.99 * most) < 1 < radius(1.01 * most)
+    assert optim.HeavyBall(0.99 * most, momentum).step_size == 0.99 * most
+    with pytest.raises(ValueError, match=r"must be below 2 \(1 \+ momentum\)"):
+        optim.HeavyBall(most, momentum)

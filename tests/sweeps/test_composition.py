@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import pickle
 
 import pytest
@@ -12,8 +13,10 @@ from hydra.types import RunMode
 from omegaconf import OmegaConf
 
 from staf_torch.results.run_record import flat
+from staf_torch.settings.plain import PlainSettings
 from staf_torch.sweeps.hydra_compat import (
     Composer,
+    PlainComposer,
     Product,
     config_loader,
     interpolations_parsed_once,
@@ -164,3 +167,25 @@ def test_the_jobs_of_a_product_are_those_of_hydras_sweeper() -> None:
 )
 def test_a_range_of_a_billion_numbers_is_counted_and_not_written_out(line: str) -> None:
     assert sweep_size([parse_override(line)]) >= 1e9
+
+
+def test_plain_settings_are_those_of_hydra_and_nothing_that_refers_to_another_is_plain() -> None:
+    lines = [
+        ["dt=0.02", "trajectories=2", *job] for job in (*SAME_KEYS, *JOBS[:-2], ["seed=5", "spread=2.0"])
+    ]
+    composer = Composer(config_loader(), hydra_node=False, always=["dt=0.02", "trajectories=2"])
+    many = PlainComposer(composer)(lines)
+    plain = []
+    for line, found, by_key in zip(lines, many.read(), many.flat, strict=True):
+        expected = composer(line)
+        assert json.dumps(by_key) == json.dumps(flat(expected)), line
+        if isinstance(found, PlainSettings):
+            plain.append(line[2:])
+            assert json.dumps(found) == json.dumps(OmegaConf.to_container(expected)), line
+        else:
+            assert found == expected
+    assert [job for job in SAME_KEYS if job not in plain] == [*SAME_KEYS[5:11]]
+    assert many[-1] == composer(lines[-1])
+    assert many.of([2, 0])[1] == composer(lines[0])
+    with pytest.raises(HydraException):
+        PlainComposer(composer)([["seed=1"], ["sead=1"]])

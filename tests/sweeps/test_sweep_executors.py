@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import signal
+import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,7 @@ from staf_torch.results.progress import SHOWN, Progress
 from staf_torch.sweeps import executors
 from staf_torch.sweeps.batching import Batch, Done, Failed, Outcome, Written, completion, solve
 from staf_torch.sweeps.executors import EXECUTORS, Executor, executor
+from staf_torch.sweeps.executors.slurm import Task
 from staf_torch.sweeps.hydra_compat import find_launcher
 from staf_torch.sweeps.launcher import SweepProgress
 
@@ -136,3 +139,33 @@ def test_progress_is_one_line_with_what_failed_and_the_time_left(
     lines = capsys.readouterr().err.splitlines()
     assert lines[-2] == "job 3 (seed=1) failed: it diverged"
     assert lines[-1].startswith("4 of 10 jobs done, 1 failed, ")
+
+
+@pytest.mark.parametrize("lost", [0, 2, 9])
+def test_a_signal_of_slurm_ends_the_job_and_is_no_error_of_its_batch(
+    lost: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls = []
+
+    def requeued(
+        number: int, frame: object
+    ) -> None:  # as submitit's handler: by a command that may be killed
+        calls.append(number)
+        if len(calls) <= lost:
+            raise subprocess.CalledProcessError(-15, "scontrol")
+        raise SystemExit(-1)
+
+    text = (
+        "import os, signal\ndef task(cfg, directory, progress=None): os.kill(os.getpid(), signal.SIGUSR2)\n"
+    )
+    (tmp_path / "out_of_time.py").write_text(text)
+    (cfg,) = compose(SHORT, [["task=out_of_time.task"]])
+    monkeypatch.syspath_prepend(tmp_path)
+    before = signal.signal(signal.SIGUSR2, requeued)
+    try:
+        with pytest.raises(subprocess.CalledProcessError if lost == 9 else SystemExit):
+            Task(None, tmp_path / "lock")(*executors.pack(batch([cfg], tmp_path)))
+        assert signal.getsignal(signal.SIGUSR2) is requeued
+    finally:
+        signal.signal(signal.SIGUSR2, before)
+    assert len(calls) == min(lost, 2) + 1

@@ -53,6 +53,7 @@ EXECUTORS = {
         "hydra.launcher.batch=8",
     ],
 }
+SHARES = (1.0, 0.5, 0.2, 0.05)  # of a sweep's time, one after the other where it was over before the kill
 TRACE = 99  # exit code of a command that ends in a traceback
 WAIT, STAY = 240.0, 120.0  # s that a sweep may take, and its processes to end after it: they may be importing
 
@@ -129,8 +130,9 @@ def one(
     environment: dict[str, str],
     chance: random.Random,
     whole: tuple[bytes, float],
+    share: float,
 ) -> str:
-    """One kill; return what happened, beginning with `same` where the table came out the same."""
+    """One kill in the first ``share`` of a sweep; say what happened, first `same` for the same table."""
     place = base / f"{executor}{chance.randrange(10**9)}"
     apart = executor in ("slurm", "ray")  # their processes are their own daemons' to end
     with small_disk(place) if harm is full_disk else contextlib.nullcontext(place.mkdir()):
@@ -141,7 +143,7 @@ def one(
             time.sleep(0.005)
         left = max(0.1, whole[1] - (time.monotonic() - begin))
         waits = executor == "slurm" or harm is to_raylet  # for what they harm
-        moment = chance.uniform(0, left / 4 if waits else left)
+        moment = share * chance.uniform(0, left / 4 if waits else left)
         time.sleep(moment)
         said = "it was over before" if sweep.over() else harm(sweep, chance)
         code = sweep.end()
@@ -194,7 +196,7 @@ def main() -> int:
         f"executors: {', '.join(executors)}; absent: {', '.join(filter(absent.get, absent)) or 'none'}",
         flush=True,
     )
-    chance, bad = random.Random(chosen.seed), 0
+    chance, bad, missed = random.Random(chosen.seed), 0, 0
     with contextlib.ExitStack() as stack:
         base = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="kills.")))
         base.chmod(0o755)
@@ -219,14 +221,20 @@ def main() -> int:
                 chance.shuffle(cards)
             executor, name, harm = cards[number % len(cards)]
             own = {**environment, **(node.environment if node is not None and executor == "slurm" else {})}
-            said = one(base, executor, harm, own, chance, wholes[executor])
-            counts[f"{name} ({executor})"] += "over before" not in said and "no job was" not in said
+            for share in SHARES:
+                said = one(base, executor, harm, own, chance, wholes[executor], share)
+                hit = "over before" not in said and "no job was" not in said
+                if hit or not said.startswith("same"):
+                    break
+                print(f"{number + 1}: drawn again, earlier: {said}", flush=True)
+            counts[f"{name} ({executor})"] += hit
+            missed += not hit
             bad += not said.startswith("same")
             print(f"{number + 1}: {said}", flush=True)
     for name, count in sorted(counts.items()):
         print(f"{count:4d} {name}")
-    print(f"{chosen.kills - bad} of {chosen.kills} resumed to the same table")
-    return bool(bad)
+    print(f"{chosen.kills - bad} of {chosen.kills} resumed to the same table; {missed} found nothing to kill")
+    return bool(bad + missed)
 
 
 if __name__ == "__main__":

@@ -62,7 +62,7 @@ class RobustFilter(Controller):
         >>> box = {"theta_low": [0.0], "theta_high": [3.0]}
         >>> safe = adp.RobustFilter(wanted, plant, wall, windows, law, dt=0.02, **box)
         >>> cost, x0 = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1), torch.tensor([[1.0, -2.0]]).double()
-        >>> run = adp.simulate(safe, plant, cost, x0, steps=100)
+        >>> run = adp.simulate(safe, plant, cost, x0, steps=40)
         >>> now = safe.guarded(run.identifier)
         >>> bool(now.least[0, -1] > 0), now.estimate.theta[0, -1].round(decimals=2)
         (True, tensor([0.5000], dtype=torch.float64))

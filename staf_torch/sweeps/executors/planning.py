@@ -11,6 +11,7 @@ from typing import overload
 from omegaconf import DictConfig
 
 from ...results.progress import Progress
+from ...settings.plain import ManySettings
 from ..batching import Batch, Flat, Outcome, batches, flat_or_none
 from .base import Executor
 
@@ -39,7 +40,9 @@ class _Batches(Sequence[Batch]):
             return [self[i] for i in range(*index.indices(len(self)))]
         jobs = self._planned[index]
         places = [os.path.abspath(self._directories[i]) for i in jobs]  # a worker may have another folder
-        return Batch([self._settings[i] for i in jobs], places)
+        settings = self._settings
+        some = settings.of(jobs) if isinstance(settings, ManySettings) else [settings[i] for i in jobs]
+        return Batch(some, places)
 
 
 def compute(

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
+import signal
 import socket
 import subprocess
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 from ...results.progress import Progress
@@ -21,6 +24,7 @@ from .remote import pack, solve_elsewhere, unpack
 
 _log = logging.getLogger(__name__)
 _LOOK, _ASK = 0.5, 10.0  # s between two looks for results, and two questions to SLURM
+_REQUEUES = 3  # times that a job asks to be put into the queue again
 _GRACE = 20.0  # s that a result may take from another machine to here
 _GOES_ON = {
     *("PENDING", "RUNNING", "SUSPENDED", "COMPLETING", "CONFIGURING", "RESIZING", "STOPPED", "SIGNALING"),
@@ -52,13 +56,52 @@ class Task:
             end_with(self._parent[1], self._parent[2])
         elif self._parent is None and self._lock.exists():
             end_with_file(self._lock)
-        return solve_elsewhere(pickled, path, packages)
+        with _ended_by_signals():
+            return solve_elsewhere(pickled, path, packages)
 
     def checkpoint(self, *arguments: Any) -> Any:
         """Begin the batch anew: its rounding depends on all of its jobs. Other batches keep theirs."""
         from submitit.helpers import DelayedSubmission
 
         return DelayedSubmission(self, *arguments)
+
+
+class _SignalledError(BaseException):
+    """What a handler of submitit raised: no error of the batch in which it happened to be raised."""
+
+    def __init__(self, error: Exception) -> None:
+        super().__init__(str(error))
+        self.error = error
+
+
+@contextlib.contextmanager
+def _ended_by_signals() -> Iterator[None]:
+    """Let submitit's handlers of a time limit and of preemption end the job, whatever catches errors in it.
+
+    At a time limit SLURM may end the very `scontrol` that puts the job into the queue again: it is started
+    anew.
+    """
+    before = {number: signal.getsignal(number) for number in (signal.SIGUSR1, signal.SIGUSR2)}
+    ours = {number: handler for number, handler in before.items() if callable(handler)}
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        for left in reversed(range(_REQUEUES)):
+            try:
+                ours[signal.Signals(number)](number, frame)
+                return
+            except Exception as error:
+                if not left or not isinstance(error, subprocess.SubprocessError):
+                    raise _SignalledError(error) from error
+
+    try:
+        for number in ours:
+            signal.signal(number, handle)
+        yield
+    except _SignalledError as told:
+        raise told.error from None
+    finally:
+        for number, handler in ours.items():
+            signal.signal(number, handler)
 
 
 class Submitit(Executor):

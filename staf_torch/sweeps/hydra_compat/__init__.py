@@ -13,6 +13,7 @@ from .composing import parse_override as parse_override
 from .jobs import SweepContext as SweepContext
 from .jobs import directory_of as directory_of
 from .jobs import without_hydra_overrides as without_hydra_overrides
+from .plain_composing import PlainComposer as PlainComposer
 from .products import Product as Product
 from .products import sweep_size as sweep_size
 from .program import BrokenSweep as BrokenSweep

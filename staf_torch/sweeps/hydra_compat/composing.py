@@ -65,6 +65,9 @@ def interpolations_parsed_once() -> Iterator[None]:
         module.parse = parse
 
 
+MOST_LINES = 10_000  # that are kept: a million seeds are a million lines
+
+
 class Composer:
     """``loader.load_configuration(config_name, overrides, RunMode.RUN)``, fast where it is called often.
 
@@ -103,13 +106,13 @@ class Composer:
         Raises:
             hydra.errors.HydraException, ValueError: what Hydra itself raises.
         """
-        parsed = [self._parse(line) for line in overrides]
+        parsed = [self.parsed(line) for line in overrides]
         chosen = self.choices(overrides)
         if chosen is None:
             return self.anew(overrides)
-        values = [one for one in parsed if not self._chooses(one)]
+        values = [one for one in parsed if not self.chooses(one)]
         first: list[Override] = []
-        if self._always and _independent({one.key_or_group: one for one in values}):
+        if self._always and independent({one.key_or_group: one for one in values}):
             first = [one for one in values if one.input_line in self._always]
         key = (chosen, *(one.input_line for one in first))
         if key not in self._chosen:
@@ -126,10 +129,10 @@ class Composer:
         Where the values of the same keys alone are others than in the call before, those are set: a third of
         the time of a new object. Errors as of a call.
         """
-        parsed, chosen = [self._parse(line) for line in overrides], self.choices(overrides)
-        values = {one.key_or_group: one for one in parsed if not self._chooses(one)}
+        parsed, chosen = [self.parsed(line) for line in overrides], self.choices(overrides)
+        values = {one.key_or_group: one for one in parsed if not self.chooses(one)}
         before, self._reused = self._reused, None  # an error leaves some of the values
-        if chosen is None or not _independent(values):
+        if chosen is None or not independent(values):
             return self(overrides)
         if before is not None and before.chosen == chosen and list(before.values) == list(values):
             composed = before.composed
@@ -142,7 +145,7 @@ class Composer:
 
     def choices(self, overrides: Sequence[str]) -> tuple[str, ...] | None:
         """Return the overrides that decide what is composed; None where Hydra must compose it itself."""
-        chosen = tuple(line for line in overrides if self._chooses(self._parse(line)))
+        chosen = tuple(line for line in overrides if self.chooses(self.parsed(line)))
         return None if self._apply is None or any("searchpath" in line for line in chosen) else chosen
 
     def _set(self, composed: DictConfig, values: Sequence[Override], parsed: Sequence[Override]) -> None:
@@ -164,15 +167,18 @@ class Composer:
                 del composed["hydra"]
         return composed
 
-    def _parse(self, line: str) -> Override:
+    def parsed(self, line: str) -> Override:
+        """Return an override, parsed and looked at once. Errors as of a call."""
         if line not in self._parsed:
+            if len(self._parsed) >= MOST_LINES:
+                self._parsed.clear()
             (parsed,) = self._parser.parse_overrides([line])
             if parsed.is_sweep_override():
                 self.anew([line])  # refused there, in Hydra's words
             self._parsed[line] = parsed
         return self._parsed[line]
 
-    def _chooses(self, override: Override) -> bool:
+    def chooses(self, override: Override) -> bool:
         """Return whether the override decides what is composed, beyond the value of one key."""
         key = override.key_or_group
         if override.is_hydra_override() or self._repository is None:
@@ -190,7 +196,7 @@ class _Reused(NamedTuple):
     composed: DictConfig
 
 
-def _independent(values: Mapping[str, Override]) -> bool:
+def independent(values: Mapping[str, Override]) -> bool:
     """Return whether each override sets a number, a text or a list at a key of its own, with none above it.
 
     Then one of them may be set anew, and what it was leaves nothing.
