@@ -130,4 +130,28 @@ ACCEPTED: dict[tuple[str, str, str, str], str] = {
         "np.array([places[start + place] for place in flat], dtype=np.int64)",
         "np.array([places[start + place] for place in flat])",
     ): "whole numbers become int64 by themselves, but for NumPy 1 on Windows",
+    (
+        "staf_torch/online/tuning.py",
+        "ROUNDS = (0.6, 0.3)  # spread of the logarithms of the candidates around the best so far",
+        "0.3",
+        "0.6",
+    ): "another spread of the candidates of a random search: the best of all is kept",
+    (
+        "staf_torch/online/experience_memory.py",
+        "still = (x - self.origin).square().sum(-1) < limit.square()",
+        "(x - self.origin).square().sum(-1) < limit.square()",
+        "((x - self.origin).square().sum(-1) <= limit.square())",
+    ): "a state to the last bit at the edge between two ways to remember it",
+    (
+        "staf_torch/lanes/combinators.py",
+        "if count > 1 and (tracer := _tracer(carry)) is not None:",
+        "1",
+        "2",
+    ): "whether a loop of two passes is written out or not",
+    (
+        "staf_torch/sweeps/launcher.py",
+        "self._bar = tqdm(total=total, bar_format=layout, leave=False, disable=None, file=sys.stderr)",
+        "tqdm(total=total, bar_format=layout, leave=False, disable=None, file=sys.stderr)",
+        "tqdm(total=total, bar_format=layout, disable=None, file=sys.stderr)",
+    ): "whether the bar of progress stays on a terminal behind the last job",
 }

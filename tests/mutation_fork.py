@@ -80,6 +80,8 @@ def in_fork(files: Sequence[str], plugin: object, limit: float, *, stop: bool) -
 def _tested(files: Sequence[str], plugin: object, limit: int, *, stop: bool) -> int:
     os.setsid()
     multiprocessing.current_process().daemon = False  # a worker of a pool may start no processes, tests may
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell ignores these in the background
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
     resource.setrlimit(resource.RLIMIT_CPU, (limit, limit + 1))
     silent = os.open(os.devnull, os.O_WRONLY)
     os.dup2(silent, 1)

@@ -91,10 +91,12 @@ class Watch:
 
     def _look(self) -> tuple[list[int], list[Any]]:
         """The lengths of all containers, and what is in them."""
-        maps = [*self._dicts, *self._code]  # a method may be replaced
-        inside = [value for part in maps for value in part.values()]
-        inside += chain.from_iterable(self._lists)
-        return [*map(len, maps), *map(len, self._lists)], inside
+        parts: list[Iterable[Any]] = [part.values() for part in self._dicts]
+        parts += [part.values() for part in self._code]  # a method may be replaced
+        parts += self._lists
+        return [*map(len, self._dicts), *map(len, self._code), *map(len, self._lists)], [
+            *chain.from_iterable(parts)
+        ]
 
 
 def code(key: Any) -> list[Mapping[str, Any]]:
@@ -104,8 +106,8 @@ def code(key: Any) -> list[Mapping[str, Any]]:
 
 
 def _inside(kept: Iterable[object]) -> list[Mapping[str, Any]]:
-    named = [each for each in dict.fromkeys(kept) if isinstance(each, type)]
-    return [vars(kind) for each in named for kind in each.__mro__ if kind is not object]
+    kinds = (kind for each in kept if isinstance(each, type) for kind in each.__mro__)
+    return [vars(kind) for kind in dict.fromkeys(kinds) if kind is not object]
 
 
 def _written(objects: tuple[Any, ...]) -> _Writer | None:

@@ -13,11 +13,21 @@ import torch
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
+from . import rolled_eliminations as rolled
 from .combinators import repeat
+from .tracer import LARGE
+
+
+def _many(matrix: Tensor) -> bool:
+    """Whether a matrix is one that stays in memory."""
+    return matrix.shape[-1] * matrix.shape[-2] > LARGE
 
 
 def cholesky(gram: Tensor, *, upper: bool = False, check_errors: bool = False) -> tuple[Tensor, Tensor]:
     """L with L L' = K, and 0 or, where a pivot is not positive, its place: (...)."""
+    if _many(gram):
+        factor, failed = rolled.cholesky(gram)
+        return factor.mT.clone() if upper else factor, failed
     rest, columns = gram, []
     failed = torch.zeros_like(gram[..., 0, 0], dtype=torch.int32)
     for k in range(gram.shape[-1]):
@@ -37,6 +47,10 @@ def triangular(
     """T^-1 B: (..., M, M), (..., M, P); B T^-1 where not ``left``."""
     if not left:
         return triangular(matrix.mT, right.mT, upper=not upper, unitriangular=unitriangular).mT.clone()
+    if _many(matrix) and matrix.shape[-1] > 1:  # an upper triangle from behind is a lower one
+        flipped = (part.flip(-2) if upper else part for part in (matrix.flip(-1) if upper else matrix, right))
+        solution = rolled.triangular(*flipped, unitriangular=unitriangular)
+        return solution.flip(-2) if upper else solution
     size = matrix.shape[-1]
     found: dict[int, Tensor] = {}
     for i in reversed(range(size)) if upper else range(size):
@@ -57,6 +71,8 @@ def inverse(matrix: Tensor, *, check_errors: bool = False) -> tuple[Tensor, Tens
     """A^-1, by elimination with pivots of the largest size in a column, and 0: (...)."""
     size = matrix.shape[-1]
     identity = torch.eye(size, dtype=matrix.dtype, device=matrix.device).expand_as(matrix)
+    if _many(matrix):
+        return solve(matrix, identity)[0], torch.zeros_like(matrix[..., 0, 0], dtype=torch.int32)
     whole = torch.cat((matrix, identity), dim=-1)
     for k in range(size):
         best, chosen = whole[..., k, :], whole[..., k, k].abs()
@@ -219,7 +235,8 @@ def eigenvalues(gram: Tensor) -> Tensor:
     """
     largest = gram.abs().amax((-2, -1), keepdim=True)
     largest = torch.where(largest > 0, largest, 1.0)  # squares of entries shall neither overflow nor vanish
-    diagonal, squares = _tridiagonal(gram / largest)
+    find = rolled.tridiagonal if _many(gram) else _tridiagonal
+    diagonal, squares = find(gram / largest)
     size, real = len(diagonal), torch.finfo(gram.dtype)
     beside = [square.sqrt() for square in squares]
     zero = torch.zeros_like(diagonal[0])

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import torch
@@ -13,8 +14,10 @@ from torch import Tensor
 from .graph import FLAG, NOW, REAL, ROW, STEP, WHOLE, Graph
 from .schedule import Schedule
 from .statements import Layout, Writer
+from .tracer import LARGE
 
 _FEW = 400  # nodes of a program of which two vectors fit the registers and caches side by side
+_MANY = 1500  # nodes of which even a matrix that the vectors share does not pay for twice the text
 _COSTLY, _MEMORY = 20, 4  # operations that a function takes, and that a number written and read is worth
 _FUNCTIONS = frozenset(
     ("exp", "expm1", "log", "log1p", "sin", "cos", "tan", "tanh", "atan2", "pow", "sqrt", "div")
@@ -68,12 +71,14 @@ def _worth(graph: Graph, schedule: Schedule) -> bool:
 def _copies(schedule: Schedule) -> int:
     """How many vectors advance side by side, so that the processor always has something to do."""
     steps = schedule.live - schedule.ahead
-    return 2 if len(steps) < _FEW or any(schedule.shares_a_matrix(node) for node in steps) else 1
+    shares = len(steps) < _MANY and any(schedule.shares_a_matrix(node) for node in steps)
+    return 2 if len(steps) < _FEW or shares else 1
 
 
 class _Writer(Writer):
     def __init__(self, graph: Graph, schedule: Schedule, layout: Layout, copies: int) -> None:
         super().__init__(graph, schedule, layout, {REAL: "V", WHOLE: "V", FLAG: "M"}, copies)
+        self._in_memory = {slot for slot, size in enumerate(layout.carries) if size > LARGE}
         self.table: list[float] = []
         self.parameters: list[tuple[int, int]] = []
 
@@ -135,11 +140,12 @@ class _Writer(Writer):
 
     def _keep(self, stored: dict[int, tuple[str, int]], start: str, stride: str) -> None:
         for node, (_, place) in stored.items():
-            for k in range(self.graph.size(node)):
-                for j in range(self.copies):
-                    value = self._read(node, str(k), j) if self._is_array(node) else self._ref(node, j)
-                    number = self._number(node, value)
-                    self._line(f"store({start} + {place + k} * {stride} + {j} * W, {number});")
+            for j in range(self.copies):
+                loop, k, value = "", str(place), self._ref(node, j)
+                if self._is_array(node):
+                    loop = f"for (int p = 0; p < {self.graph.size(node)}; ++p) "
+                    k, value = f"({place} + p)", self._read(node, "p", j)
+                self._line(f"{loop}store({start} + {k} * {stride} + {j} * W, {self._number(node, value)});")
 
     def _prepare(self, stored: dict[int, tuple[str, int]]) -> None:
         self._lines.append("static void prepare(const Frame &f, int b) {")
@@ -153,12 +159,14 @@ class _Writer(Writer):
         self._lines.append("static void advance(const Frame &f, int b, int rows) {")
         self._line("const REAL *const c = f.c, *const fixed = f.fixed + b;")
         self._line("(void)c, (void)fixed, (void)rows;")
-        for k, node in enumerate(following):
-            for j in range(self.copies):
-                read = "load_flag" if self.graph.type[node] == FLAG else "load"
-                self._line(
-                    f"{self._type(node)} s{k}{self._copy(j)} = {read}(f.carry + b + {k} * room + {j} * W);"
-                )
+        slots = self._slots(following)
+        for slot, _, nodes in slots:
+            if slot in self._in_memory:
+                self._line(f"{self._type(nodes[0])} S{slot}[{len(nodes) * self.copies}];")
+        for name, loop, place, node, j in self._carried(slots):
+            read = "load_flag" if self.graph.type[node] == FLAG else "load"
+            kind = "" if loop else f"{self._type(node)} "
+            self._line(f"{loop}{kind}{name} = {read}(f.carry + b + {place} * room + {j} * W);")
         self._line("Recorder recorder(f);")
         self._line("for (int t = 0; t < f.times; ++t) {")
         self._level += 1
@@ -166,14 +174,47 @@ class _Writer(Writer):
         self._line("(void)now;")
         self._steps(following)
         self._outputs(outputs)
-        self._assign([(f"s{k}", node) for k, node in enumerate(following)])
+        self._follow(slots)
         self._level -= 1
         self._line("}")
-        for k, node in enumerate(following):
-            for j in range(self.copies):
-                value = f"s{k}{self._copy(j)}"
-                self._line(f"store(f.carry + b + {k} * room + {j} * W, {self._number(node, value)});")
+        for name, loop, place, node, j in self._carried(slots):
+            number = self._number(node, name)
+            self._line(f"{loop}store(f.carry + b + {place} * room + {j} * W, {number});")
         self._lines.append("}")
+
+    def _slots(self, following: Sequence[int]) -> list[tuple[int, int, Sequence[int]]]:
+        """Every slot of the carry, where it starts, and what it becomes."""
+        starts = self._starts["state"]
+        return [(k, a, following[a:b]) for k, (a, b) in enumerate(itertools.pairwise(starts))]
+
+    def _carried(
+        self, slots: Sequence[tuple[int, int, Sequence[int]]]
+    ) -> Iterator[tuple[str, str, str, int, int]]:
+        """The variables of the carry: name, the loop around it, place, a node of its type, copy."""
+        for slot, start, nodes in slots:
+            if slot in self._in_memory:
+                loop = f"for (int p = 0; p < {len(nodes)}; ++p) "
+                for j in range(self.copies):
+                    yield self._state(slot, "p", j), loop, f"({start} + p)", nodes[0], j
+                continue
+            for k, node in enumerate(nodes, start):
+                for j in range(self.copies):
+                    yield f"s{k}{self._copy(j)}", "", str(k), node, j
+
+    def _follow(self, slots: Sequence[tuple[int, int, Sequence[int]]]) -> None:
+        """The carry becomes what follows, all at once: what lies in memory is copied last."""
+        late = list[tuple[int, str, int]]()
+        for slot, _, nodes in slots:
+            own = [("state", (slot, k)) for k in range(len(nodes))]
+            if slot not in self._in_memory or [(self.graph.op[n], self.graph.aux[n]) for n in nodes] == own:
+                continue
+            self._line(f"{self._type(nodes[0])} next{slot}[{len(nodes) * self.copies}];")
+            self._fill(f"next{slot}", nodes)
+            late.append((slot, f"next{slot}", len(nodes) * self.copies))
+        short = [(start, nodes) for slot, start, nodes in slots if slot not in self._in_memory]
+        self._assign([(f"s{k}", node) for start, nodes in short for k, node in enumerate(nodes, start)])
+        for slot, name, size in late:
+            self._line(f"for (int p = 0; p < {size}; ++p) S{slot}[p] = {name}[p];")
 
     def _steps(self, following: Sequence[int]) -> None:
         """Write a step for a processor that is to expect that no row stays behind.

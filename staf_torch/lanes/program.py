@@ -151,6 +151,10 @@ class Program:
 
     def compiles(self, carry: Tree, now: Tree = (), row: Tree = (), *, steps: int | None = None) -> bool:
         """Whether the compiled program serves these inputs."""
+        leaves, structure = flatten((row, now, carry))
+        prepared = self._prepared.get((structure, tuple(map(form, leaves)), steps, 1))
+        if prepared is not None and prepared.plan is not None:  # it has served such ones
+            return ordinary(leaves)
         return self.find(Given.of(carry, now, row, steps)) is not None
 
     def text(self, carry: Tree, now: Tree = (), row: Tree = (), *, steps: int | None = None) -> str:

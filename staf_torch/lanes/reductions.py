@@ -12,7 +12,9 @@ from torch import Tensor
 from .entrywise import zeros
 from .graph import FLAG, WHOLE, Ids
 from .rules import RULES, numbers, rule
-from .tracer import NotLoweredError, Tracer
+from .tracer import LARGE, NotLoweredError, Tracer
+
+_FEW = 8  # numbers that need no loop
 
 
 def _rows(array: Ids, dims: Any, keepdim: bool) -> tuple[Ids, Callable[[Ids], Ids]]:
@@ -30,9 +32,11 @@ def _rows(array: Ids, dims: Any, keepdim: bool) -> tuple[Ids, Callable[[Ids], Id
 
 def _chain(t: Tracer, op: str, flat: Ids) -> Ids:
     if op != "mul":  # in pairs, the order being free: g++ takes minutes over a long chain of choices
+        least = _FEW if flat.size > LARGE else LARGE  # what is in memory stays there until little is left
         while flat.shape[-1] > 1:
             odd = flat[..., flat.shape[-1] // 2 * 2 :]
-            flat = np.concatenate((t.map(op, flat[..., 0:-1:2], flat[..., 1::2]), odd), axis=-1)
+            paired = t.map(op, flat[..., 0:-1:2], flat[..., 1::2], least=least)
+            flat = np.concatenate((paired, odd), axis=-1)
     out: Ids = flat[..., 0]
     for k in range(1, flat.shape[-1]):
         out = t.map(op, out, flat[..., k])

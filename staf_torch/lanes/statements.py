@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .graph import FIXED, Graph
+from .runs import runs
 from .schedule import Schedule
 from .tracer import NotLoweredError
 
@@ -47,6 +48,7 @@ class Writer(abc.ABC):
         self._arrays: set[str] = set()  # of constants, written already
         self._level = 1
         self._stored: dict[int, tuple[str, int]] = {}  # what is read from a buffer instead, and its place
+        self._in_memory: set[int] = set()  # slots of the carry that are arrays
         self._starts = {
             "row": np.cumsum([0, *layout.rows]).tolist(),
             "now": np.cumsum([0, *layout.nows]).tolist(),
@@ -163,9 +165,44 @@ class Writer(abc.ABC):
         if self._in_place(node) is not None:
             return
         self._declare(node)
-        for k, entry in enumerate(self.graph.args[node]):
+        self._fill(f"a{node}", self.graph.args[node])
+
+    def _fill(self, name: str, entries: Sequence[int]) -> None:
+        """Write numbers one after the other into an array, runs of another array's entries by loops."""
+        for run in runs([self._place_in_array(entry) for entry in entries]):
             for j in range(self.copies):
-                self._line(f"a{node}[{k * self.copies + j}] = {self._ref(entry, j)};")
+                if run.step is None:
+                    for k in range(run.begin, run.begin + run.length):
+                        self._line(f"{name}[{k * self.copies + j}] = {self._ref(entries[k], j)};")
+                    continue
+                target = self._sum(["p"], [self.copies], run.begin * self.copies + j)
+                value = self._read_like(entries[run.begin], self._sum(["p"], [run.step], run.first), j)
+                self._line(f"for (int p = 0; p < {run.length}; ++p) {name}[{target}] = {value};")
+
+    def _place_in_array(self, entry: int) -> tuple[Any, int]:
+        """What an entry is read from, equal for entries of one array or buffer, and the place in it."""
+        graph, op = self.graph, self.graph.op[entry]
+        if op == "elem":
+            return graph.args[entry][0], graph.aux[entry]
+        if op in ("row", "now") or (op == "state" and graph.aux[entry][0] in self._in_memory):
+            slot, k = graph.aux[entry]
+            return (op, slot), k
+        return ("same", entry), 0
+
+    def _read_like(self, entry: int, at: str, j: int) -> str:
+        """What stands at another place of what an entry is read from."""
+        graph, op = self.graph, self.graph.op[entry]
+        if op == "elem":
+            return self._read(graph.args[entry][0], at, j)
+        if op == "state" and graph.aux[entry][0] in self._in_memory:
+            return self._state(graph.aux[entry][0], at, j)
+        if op in ("row", "now"):
+            return self._typed(entry, self._buffer(op, self._starts[op][graph.aux[entry][0]], j, at))
+        return self._ref(entry, j)
+
+    def _state(self, slot: int, at: str, j: int) -> str:
+        """Entry ``at`` of a slot of the carry that is an array."""
+        return f"S{slot}[{at}]" if self.copies == 1 else f"S{slot}[({at}) * {self.copies} + {j}]"
 
     def _map(self, node: int) -> None:
         op, shape, *places = self.graph.aux[node]
@@ -292,7 +329,11 @@ class Writer(abc.ABC):
             return self._typed(node, self._buffer(op, self._starts[op][slot] + k, j))
         if op == "state":
             slot, k = graph.aux[node]
-            return f"s{self._starts[op][slot] + k}{copy}"
+            return (
+                self._state(slot, str(k), j)
+                if slot in self._in_memory
+                else f"s{self._starts[op][slot] + k}{copy}"
+            )
         if op in ("carry", "result"):
             if op == "result" and node in self._stored:
                 return self._typed(node, self._buffer(*self._stored[node], j))

@@ -137,11 +137,17 @@ class Tracer(TorchDispatchMode):
         out = [function(*entries) for entries in zip(*flat, strict=True)]
         return np.array(out, dtype=np.int64).reshape(spread[0].shape)
 
-    def map(self, op: str, *arrays: Ids) -> Ids:
-        """An operation of every entry of arrays that broadcast: scalar by scalar, or a loop over many."""
+    def map(self, op: str, *arrays: Ids, least: int = LARGE) -> Ids:
+        """An operation of every entry of arrays that broadcast: scalar by scalar, or a loop over many.
+
+        Args:
+            op: of single numbers.
+            arrays: of nodes.
+            least: entries above which it is a loop.
+        """
         graph = self.graph
         spread = np.broadcast_arrays(*arrays)
-        if spread[0].size > LARGE and not self._folds(spread):
+        if spread[0].size > least and not self._folds(spread):
             operands = [self._operand(part.reshape(-1)) for part in spread]
             type = FLAG if op in ("lt", "le", "eq", "ne") else graph.type[int(spread[-1].flat[0])]
             aux = (op, spread[0].shape, *(places for _, places in operands))

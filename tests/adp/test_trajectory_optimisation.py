@@ -170,3 +170,20 @@ def numpy_plant() -> systems.StepPlant:
 def test_bad_input_is_named(call: Callable[[], object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         call()
+
+
+def test_a_plan_where_the_cost_is_concave_in_the_control_leads_to_a_minimum() -> None:
+    def step(x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+        waved = u.square() + 1 - (3 * u).cos()  # its second derivative is -7 at a third of pi
+        return 0.9 * x + 0.1 * u, 0.1 * (x.square() + waved).sum(-1)
+
+    problem = adp.SampledProblem(step, dim=1, inputs=1)
+    x0 = torch.tensor([[1.0], [0.2]], dtype=torch.float64)
+    start = torch.full((2, 10, 1), 1.0, dtype=torch.float64)
+    found = adp.BoxDDP(problem, steps=10, compile=False).solve(x0, start)
+    assert bool(found.converged.all())
+    control = found.control.clone().requires_grad_()
+    bent = torch.func.hessian(lambda u: cost_of(problem, x0[:1], u[None]).sum())(control[0].detach())
+    assert float(torch.linalg.eigvalsh(bent.reshape(10, 10)).min()) > 0
+    (slope,) = torch.autograd.grad(cost_of(problem, x0, control).sum(), control)
+    assert float(slope.abs().max()) < 1e-4

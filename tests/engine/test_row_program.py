@@ -120,6 +120,22 @@ def test_a_certificate_and_the_weights_alone_are_compiled(definition) -> None:
     )
 
 
+def test_matrices_of_many_centers_are_factored_in_loops(definition) -> None:
+    """A certificate and a Kalman filter of the weights: factors, triangles, eigenvalues, matrices carried."""
+    basis, law = (
+        StaFBasis(GaussianKernel(), StateFollowingCenters(rings(10), 1.0)),
+        optim.RecursiveLeastSquares(),
+    )
+    got = compiled(chase, STATES, basis, Paper(), law, inner_steps=1, certificate=True)
+    want = definition(chase, STATES, basis, Paper(), law, inner_steps=1, certificate=True)
+    assert got.certificate is not None
+    assert want.certificate is not None
+    assert want.certificate.growth.isfinite().all()
+    for a, b in zip(got.certificate, want.certificate, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-7, equal_nan=True)
+    torch.testing.assert_close(got.estimate, want.estimate, rtol=1e-7, atol=1e-8)
+
+
 def test_many_centers_stay_loops_over_arrays(definition) -> None:
     got = compiled(chase_weights, STATES, MANY, Paper(), LAW, inner_steps=1)
     want = definition(chase_weights, STATES, MANY, Paper(), LAW, inner_steps=1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 
 import pytest
@@ -59,3 +60,17 @@ def test_gains_are_drawn_for_every_row_within_their_ranges() -> None:
         OmegaConf.update(bad, name, wrong)
         with pytest.raises(ValueError, match=name):
             icl._gains(bad)
+
+
+def test_the_plant_is_the_published_one() -> None:
+    x1, x2, time = 0.3, -1.2, 0.7
+    decay, sine, cosine = math.exp(-0.1 * time), math.sin(time), math.cos(time)
+    z, u = torch.tensor([[x1, x2, decay, sine, cosine]]).double(), torch.tensor([[0.4, -0.9]]).double()
+    wanted = [
+        5 * x1**2 + 10 * math.sin(x2) + 0.4,
+        10 * x2 * sine + 15 * x1 + 20 * x1 * x2 - 0.9,
+        -0.1 * decay,
+        cosine,
+        -sine,
+    ]
+    torch.testing.assert_close(icl.published().velocity(z, u), torch.tensor([wanted]).double())

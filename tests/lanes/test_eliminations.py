@@ -10,7 +10,15 @@ import torch
 from torch import Tensor
 
 from staf_torch import lanes
-from staf_torch.lanes.eliminations import eigenvalues, solve, solve_definite
+from staf_torch.lanes.eliminations import (
+    eigen,
+    eigenvalues,
+    inverse,
+    orthogonal,
+    solve,
+    solve_definite,
+    triangular,
+)
 
 
 def matrices(size: int, dtype: torch.dtype = torch.float64) -> torch.Tensor:
@@ -75,6 +83,38 @@ def test_a_program_factors_and_solves_as_torch_does(name: str) -> None:
     torch.testing.assert_close(found, wanted, rtol=1e-10, atol=1e-10)
 
 
+def test_matrices_of_many_entries_are_factored_a_row_a_pass() -> None:
+    """Loops in the program, and also a row whose pivot is not positive."""
+    torch.manual_seed(2)
+    some, right = torch.randn(5, 9, 9).double(), torch.randn(5, 9, 2).double()
+    definite = some @ some.mT + torch.eye(9)
+    definite[3] -= 4 * torch.eye(9)
+
+    def step(_: object, __: object, row: tuple[Tensor, ...]) -> tuple[tuple[()], tuple[Tensor, ...]]:
+        gram, near, b = row
+        above = torch.linalg.solve_triangular(near.mT, b, upper=True, unitriangular=True)
+        return (), (*torch.linalg.cholesky_ex(gram), torch.cholesky_solve(b, near), above)
+
+    program, given = lanes.Program(step), (definite, some + 5 * torch.eye(9), right)
+    assert program.compiles((), (), given, steps=1)
+    found, wanted = (run((), (), given, steps=1)[1] for run in (program, program.definition))
+    assert torch.equal(found[1], wanted[1])
+    assert wanted[1][3] > 0
+    for one, other in zip(found, wanted, strict=True):
+        torch.testing.assert_close(one[[0, 1, 2, 4]], other[[0, 1, 2, 4]], rtol=1e-9, atol=1e-9)
+
+
+def test_triangles_and_inverses_of_many_entries_are_those_of_torch() -> None:
+    torch.manual_seed(3)
+    matrix, right = torch.randn(5, 9, 9).double() + 5 * torch.eye(9), torch.randn(5, 9, 2).double()
+    torch.testing.assert_close(inverse(matrix)[0], torch.linalg.inv(matrix), rtol=1e-10, atol=1e-12)
+    for upper, left, unit in itertools.product([True, False], repeat=3):
+        b = right if left else right.mT
+        wanted = torch.linalg.solve_triangular(matrix, b, upper=upper, left=left, unitriangular=unit)
+        found = triangular(matrix, b, upper=upper, left=left, unitriangular=unit)
+        torch.testing.assert_close(found, wanted, rtol=1e-10, atol=1e-12)
+
+
 @pytest.mark.parametrize(("size", "left"), [(3, False), (9, True)])
 def test_a_program_solves_with_pivots(size: int, left: bool) -> None:
     torch.manual_seed(size)
@@ -117,3 +157,25 @@ def test_a_program_asks_for_eigenvalues_without_vectors() -> None:
     found, wanted = program((), (), given, steps=1)[1][:, 0], torch.linalg.eigvalsh(given)
     assert ((found - wanted).abs().amax(-1) <= 16 * 2.3e-16 * wanted.abs().amax(-1)).all()
     assert torch.equal(found[1], eigenvalues(given[1]))  # LAPACK has another last bit
+
+
+@pytest.mark.parametrize("lead", [(), (4,), (2, 3)])
+@pytest.mark.parametrize("size", [1, 2, 5])
+def test_reflections_give_orthogonal_columns_and_a_triangle(size: int, lead: tuple[int, ...]) -> None:
+    matrix = torch.randn(*lead, size, size, dtype=torch.float64)
+    matrix[..., 0] = 0 if size == 5 else matrix[..., 0]  # a column that no reflection need move
+    q, r = orthogonal(matrix)
+    torch.testing.assert_close(q @ r, matrix, rtol=0, atol=1e-13)
+    torch.testing.assert_close(q.mT @ q, torch.eye(size).double().expand_as(q), rtol=0, atol=1e-13)
+    assert torch.equal(r, r.triu())
+
+
+@pytest.mark.parametrize("size", [1, 2, 3, 6])
+def test_rotations_give_eigenvalues_in_their_order_with_their_vectors(size: int) -> None:
+    torch.manual_seed(size)
+    some = torch.randn(2, 3, size, size, dtype=torch.float64)
+    gram = some + some.mT
+    found, vectors = eigen(gram)
+    torch.testing.assert_close(found, torch.linalg.eigvalsh(gram), rtol=0, atol=1e-12)
+    torch.testing.assert_close(vectors * found.unsqueeze(-2) @ vectors.mT, gram, rtol=0, atol=1e-12)
+    torch.testing.assert_close(vectors.mT @ vectors, torch.eye(size).double().expand_as(gram))

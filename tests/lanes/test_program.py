@@ -12,6 +12,7 @@ from torch import Tensor
 
 from staf_torch import lanes, optim, systems
 from staf_torch.lanes import compiler
+from staf_torch.lanes.runs import Run, runs
 from staf_torch.optim.objective import NativeError, Precomputed
 
 EPS = torch.finfo(torch.float64).eps
@@ -293,3 +294,40 @@ def test_float64_inside_a_program_of_float32_is_carried_in_double_throughout() -
     assert end.dtype == history.dtype == torch.float32
     torch.testing.assert_close(history, want, rtol=1e-4, atol=1e-5)
     torch.testing.assert_close(end, want_end, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("rows", [1, 5, 21])
+def test_a_carry_of_many_entries_stays_in_memory(rows: int) -> None:
+    """Matrices that change places, a part of one that moves on, flags, and numbers beside them."""
+    torch.manual_seed(rows)
+    a, b = torch.randn(2, rows, 9, 9).double().unbind()
+
+    def step(carry: Any, u: Tensor, _: object) -> tuple[Any, Any]:
+        one, other, some, last = carry
+        moved = torch.cat((one[:, 1:], 0.5 * one[:, :1] + u[:, None, None]), dim=1)
+        moved = torch.where(some, moved, -moved).roll(1, -1)
+        return (other, moved, other > one, one[:, 3, 4]), (one.sum((-2, -1)), last)
+
+    start = a, b, a > b, a[:, 0, 0]
+    program, u = lanes.Program(step), torch.randn(rows, 6).double()
+    assert program.compiles(start, u)
+    (after, out), (wanted, known) = program(start, u), program.definition(start, u)
+    for found, right in zip((*after, *out), (*wanted, *known), strict=True):
+        torch.testing.assert_close(found, right, rtol=1e-13, atol=1e-13)
+
+
+def test_entries_that_lie_evenly_are_runs() -> None:
+    places = [
+        ("a", 5),
+        ("a", 7),
+        ("a", 9),
+        ("a", 11),
+        ("b", 0),
+        ("a", 12),
+        ("c", 1),
+        ("c", 1),
+        ("c", 1),
+        ("c", 1),
+    ]
+    assert runs(places) == [Run(0, 4, 5, 2), Run(4, 2), Run(6, 4, 1, 0)]
+    assert runs([]) == []

@@ -9,10 +9,10 @@ import pytest
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from staf_torch import adp
+from staf_torch import adp, systems
 from staf_torch.adp.problem import AdpProblem
 from staf_torch.cli.staf import config_directory
-from staf_torch.settings.adp import adp_problem
+from staf_torch.settings.adp import adp_problem, make_cost, updated
 
 GROUPS = ("policy", "law", "basis", "extrapolation", "cost")
 OPTIONS = [
@@ -97,7 +97,7 @@ def test_settings_that_the_last_version_wrote_build_what_they_did() -> None:
 
 MODULE = '''
 import torch
-from staf_torch import adp
+from staf_torch import adp, systems
 
 class Pump(torch.nn.Module):
     """A policy of x alone, which asks for the plant by name."""
@@ -174,3 +174,10 @@ def test_model_of_mujoco_is_a_plant_of_closed_loops(tmp_path: Path) -> None:
     assert float(control(built)) < 0
     with pytest.raises(ValueError, match=r"`ActorCritic\(model=...\)` must be a ControlAffineSystem"):
         problem(*model)
+
+
+def test_a_cost_has_the_sizes_of_any_kind_of_plant() -> None:
+    step = systems.StepPlant(lambda x, u: 0.9 * x + u.sum(-1, keepdim=True), dim=3, inputs=2, dt=0.1)
+    for plant, dim, inputs in ((step, 3, 2), (systems.ThreeState(), 3, 2), (systems.TwoState(), 2, 1)):
+        cost = make_cost(updated(settings()), plant)
+        assert (cost.dim, cost.inputs) == (dim, inputs)

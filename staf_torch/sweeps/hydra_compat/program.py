@@ -108,7 +108,9 @@ def with_mode(argv: Sequence[str]) -> list[str]:
         file = Path(folder, "experiment", f"{chosen[-1]}.yaml")
         if file.is_file():
             mode = OmegaConf.select(OmegaConf.load(file), "hydra.mode")
-            return [*argv, f"hydra.mode={mode}"] if mode is not None else list(argv)
+            behind = argv.index(f"experiment={chosen[-1]}") + 1  # overrides may not be parted by an option
+            added = [] if mode is None else [f"hydra.mode={mode}"]
+            return [*argv[:behind], *added, *argv[behind:]]
     return list(argv)
 
 
