@@ -226,6 +226,7 @@ OTHERS |= {
     "ParametricPlant",
     "ChangingPlant",
     "AdaptiveLQR",
+    "DriftLQR",
     "ConcurrentTracker",
     "Measured",
     "RobustFilter",
