@@ -51,3 +51,8 @@ def test_directions_are_rings_in_the_plane_and_spread_in_a_ball_elsewhere(dim: i
     found = directions(st.StaFRegressor(count=count), dim)
     wanted = st.rings(count) if dim == 2 and count in (3, 6) else st.ball(count, dim)
     assert torch.equal(found, wanted)
+
+
+@pytest.mark.parametrize("dim", [1, 2, 3, 5])
+def test_as_many_directions_as_a_quadratic_function_has_numbers_by_default(dim: int) -> None:
+    assert directions(st.StaFRegressor(), dim).shape == ((dim + 1) * (dim + 2) // 2, dim)
