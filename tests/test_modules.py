@@ -218,6 +218,7 @@ OTHERS |= {
     "ParametricPlant",
     "ChangingPlant",
     "AdaptiveLQR",
+    "DriftLQR",
     "ConcurrentTracker",
     "Measured",
     "RobustFilter",

@@ -10,6 +10,9 @@ from .adaptation import ChangingPlant as ChangingPlant
 from .adaptation import ConcurrentGradient as ConcurrentGradient
 from .adaptation import ConcurrentTracker as ConcurrentTracker
 from .adaptation import Doubling as Doubling
+from .adaptation import DriftAdaptation as DriftAdaptation
+from .adaptation import DriftEstimate as DriftEstimate
+from .adaptation import DriftLQR as DriftLQR
 from .adaptation import Equation as Equation
 from .adaptation import Estimate as Estimate
 from .adaptation import ExtendedKalman as ExtendedKalman
@@ -26,6 +29,7 @@ from .adaptation import RobustFilter as RobustFilter
 from .adaptation import SlopeWindow as SlopeWindow
 from .adaptation import SlopeWindows as SlopeWindows
 from .adaptation import Stack as Stack
+from .adaptation import StreamDrift as StreamDrift
 from .adaptation import Tracking as Tracking
 from .adaptation import UnscentedKalman as UnscentedKalman
 from .adaptation import Window as Window
@@ -112,6 +116,9 @@ __all__ = [
     "Cost",
     "DirectShooting",
     "Doubling",
+    "DriftAdaptation",
+    "DriftEstimate",
+    "DriftLQR",
     "EnergyShaping",
     "Equation",
     "Estimate",
@@ -158,6 +165,7 @@ __all__ = [
     "SlopeWindows",
     "StaFValueBasis",
     "Stack",
+    "StreamDrift",
     "Supervised",
     "Tracking",
     "TrackingCost",

@@ -21,6 +21,7 @@ from ..adp import (
     Cost,
     Gains,
     LoopResult,
+    SafetyFilter,
     Supervised,
     held_stability,
     simulate,
@@ -135,6 +136,10 @@ def _solved(cfg: DictConfig, problem: AdpProblem, result: LoopResult) -> LoopSol
         final=problem.cost.around(problem.system).deviation(result.state[:, -1]),
     )
     metrics["held_spectral_radius"] = held_radius(problem, result)
+    if isinstance(problem.controller, SafetyFilter):
+        report = problem.controller.report(result)
+        metrics |= {f"wall_{name}": report[name] for name in ("minimum_margin", "constraint_violations")}
+        metrics["wall_acted"] = report["acted"]
     count_the_restless(problem.cost.around(problem.system), result)
     own = make_metrics(cfg.get("metric"))
     metrics |= {metric.name: metric.worst(result, problem) for metric in own}
@@ -235,9 +240,10 @@ def _gains(gains: Sequence[Gains], counts: Tensor, like: Tensor) -> Gains:
 
 
 def learner(controller: Controller) -> ActorCritic | None:
-    """Return what learns in a controller, with or without a supervisor; None where nothing does."""
-    inner = controller.controller if isinstance(controller, Supervised) else controller
-    return inner if isinstance(inner, ActorCritic) else None
+    """Return what learns in a controller, behind a supervisor or a filter; None where nothing does."""
+    while isinstance(controller, Supervised | SafetyFilter):
+        controller = controller.controller
+    return controller if isinstance(controller, ActorCritic) else None
 
 
 def write_history(out: RunDirectory, result: LoopResult, **more: Tensor) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 from pathlib import Path
 from typing import NamedTuple
 
@@ -23,7 +22,7 @@ from ..adp import (
     SafetyFilter,
     simulate,
 )
-from ..adp.safety_filter import Constraint
+from ..adp.walls import walls
 from ..figures.safety import BoxHistory, draw_box
 from ..figures.style import images
 from ..metrics.safety import constraint_metrics
@@ -120,8 +119,8 @@ def methods(cfg: DictConfig, box: Barrier, cost: Cost) -> dict[str, Method]:
         held, renewed = (BoxFilter(of_s, box, dt=dt, renewed=renewed) for renewed in (False, True))
         found["LQR of s, filtered"] = Method(Feedback(held), box, cost, substeps)
         found["LQR of s, filtered, renewed"] = Method(Feedback(renewed), box, cost, substeps, renew=True)
-        walls = [_within(box, k) for k in range(size) if bool(box.walled[:, k].any())]
-        guard = SafetyFilter(lqr, system, walls, dt=dt, decay=float(cfg.safe_box.decay))
+        kept = walls(box.low.tolist(), box.high.tolist())
+        guard = SafetyFilter(lqr, system, kept, dt=dt, decay=float(cfg.safe_box.decay))
         found["LQR of x, filtered"] = Method(guard, system, paid)
     found["LQR of x"] = Method(Feedback(lqr), system, paid)
     for method in found.values():
@@ -202,14 +201,6 @@ def _beside_walls(cfg: DictConfig, box: Barrier) -> Tensor:
 def _margin(box: Barrier, system: Plant, result: LoopResult) -> Tensor:
     """The distance to the nearest wall at the recorded times, NaN outside the box: (B, T)."""
     return box.margin(result.state if system is box else box.coordinates(result.state))
-
-
-def _within(box: Barrier, k: int) -> Constraint:
-    """h of a coordinate, in its units: (x - low)(high - x)/(high - low), or the distance to its one wall."""
-    low, high = float(box.low[k]), float(box.high[k])
-    if math.isinf(low) or math.isinf(high):
-        return lambda x, t: high - x[:, k] if math.isinf(low) else x[:, k] - low
-    return lambda x, t: (x[:, k] - low) * (high - x[:, k]) / (high - low)
 
 
 def _optimum(box: Barrier, cost: Cost, s0: Tensor) -> float | None:

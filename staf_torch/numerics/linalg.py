@@ -85,6 +85,14 @@ def pivoted_cholesky(gram: Tensor) -> PivotedCholesky:
     return PivotedCholesky(factor + torch.diag_embed(dropped.to(factor)), order_, rank)
 
 
+def newton_basis(gram: Tensor) -> Tensor:
+    """C = P'L^-T of K0 (..., M, M), with zero columns beyond the rank: (..., M, M)."""
+    factor = pivoted_cholesky(gram)
+    units = torch.eye(gram.shape[-1], dtype=gram.dtype, device=gram.device)
+    columns = [factor.solve_upper(unit.expand(factor.order.shape)) for unit in units]
+    return torch.stack(columns, dim=-1)
+
+
 def condition_number(gram: Tensor) -> Tensor:
     """lambda_max / lambda_min of K (..., M, M) -> (...): inf where not definite, NaN where not finite.
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ..kernels import Kernel
-from ..numerics.linalg import pivoted_cholesky
+from ..numerics.linalg import newton_basis
 
 _JUMP = 4.0  # radii: beyond, a kernel whose scale grows with the state says nothing about the new one
 _FAR = 1e8  # radii: beyond, no kernel does, and the squares of a user's kernel may overflow
@@ -45,7 +45,7 @@ class LocalFunctions(NamedTuple):
         if not kernel.state_free:
             return cls(kernel, offsets, None, None, None)
         gram = kernel.core(zero, offsets, offsets)
-        shared, rate = _newton(gram), kernel.exponent_rate()
+        shared, rate = newton_basis(gram), kernel.exponent_rate()
         pairs = None if rate is None else (gram.unsqueeze(1) * shared.mT).flatten(0, 1)
         return cls(kernel, offsets, shared, rate, pairs)
 
@@ -153,12 +153,4 @@ class LocalFunctions(NamedTuple):
         return None if before is None or after is None else (after - before) / 2
 
     def _newton(self, state: Tensor) -> Tensor:
-        return _newton(self.kernel.core(state, self.offsets, self.offsets))
-
-
-def _newton(gram: Tensor) -> Tensor:
-    """C = P'L^-T of K0 (..., M, M), with zero columns beyond the rank: (..., M, M)."""
-    factor = pivoted_cholesky(gram)
-    units = torch.eye(gram.shape[-1], dtype=gram.dtype, device=gram.device)
-    columns = [factor.solve_upper(unit.expand(factor.order.shape)) for unit in units]
-    return torch.stack(columns, dim=-1)
+        return newton_basis(self.kernel.core(state, self.offsets, self.offsets))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import inspect
+import math
 import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -20,13 +21,16 @@ from ..adp import (
     Cost,
     Extrapolation,
     Feedback,
+    SafetyFilter,
     Supervised,
     ValueBasis,
 )
 from ..adp.problem import AdpProblem, OptimumSettings
+from ..adp.walls import walls
 from ..approximation.basis import StaFBasis
 from ..numerics.checks import choice, fail, flag, integer, positive_real
 from ..systems import ControlAffineSystem, Plant
+from ..systems.barrier import wall_numbers
 from . import config_directory
 from .chase import initial_states, make, make_centers, placement, plain
 
@@ -53,6 +57,7 @@ def adp_problem(cfg: DictConfig) -> AdpProblem:
     cost = make_cost(cfg, system)
     control = controller(cfg, system, cost)
     dt = max(positive_real("staf", "dt", cfg.dt), control.period or 0.0)
+    control = _behind_walls(cfg, system, control, dt)
     duration = positive_real("staf", "duration", cfg.duration)
     steps = round(duration / dt)
     if steps < 1:
@@ -153,6 +158,19 @@ def controller(cfg: DictConfig, system: Plant, cost: Cost) -> Controller:
     return Supervised(policy, LQR(system, cost), cost, cfg.adp.trust)
 
 
+def _behind_walls(cfg: DictConfig, system: Plant, control: Controller, dt: float) -> Controller:
+    """The controller behind a `SafetyFilter` that keeps the box of `adp.walls`; itself without walls."""
+    size = system.dim or 0
+    low, high = (
+        wall_numbers("adp.walls", name, plain(cfg.adp.walls[name]), none, size).tolist()
+        for name, none in (("low", -math.inf), ("high", math.inf))
+    )
+    kept = walls(low, high)
+    if not kept:
+        return control
+    return SafetyFilter(control, system, kept, dt=dt, decay=plain(cfg.adp.walls.decay))
+
+
 def value_basis(cfg: DictConfig, dim: int) -> ValueBasis:
     """Build the basis of the group `adp/basis`; one that asks for ``basis`` gets kernel and centers."""
 
@@ -196,6 +214,7 @@ def updated(cfg: DictConfig) -> DictConfig:
     new = changed(cfg, old)
     said = {f"adp.{group}={name}": f"adp/{group}={name}" for group, name in old.items()}
     with open_dict(new):
+        new.adp.setdefault("walls", {"low": None, "high": None, "decay": 2.0})  # later than 0.2
         for name, target in _TARGETS.items():
             new.adp[name].setdefault("_target_", target)
         cost = new.adp.cost

@@ -80,6 +80,7 @@ class Batch(NamedTuple):
 
     settings: Sequence[DictConfig]
     directories: list[str]  # of the runs
+    whole: Sequence[Experiment | None] = ()  # runs a job of many members in a worker; None for other jobs
 
 
 class Done(NamedTuple):
@@ -189,7 +190,8 @@ def _group_and_size(settings: Flat | None, index: int) -> tuple[str, int]:
         return key, size
     try:
         study = experiment(settings["task"])
-        if isinstance(study, BatchedExperiment):
+        # A job of many members makes batches of its own.
+        if isinstance(study, BatchedExperiment) and settings.get("members") is None:
             static = [[name, study.shared(name, value)] for name, value in settings.items()]
             key = json.dumps([study.shape(settings), *static])
             size = study.size(settings)

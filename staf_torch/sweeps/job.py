@@ -25,7 +25,8 @@ from ..results.files import MEMBERS, METRICS, partial_name
 from ..results.progress import SHOWN, Progress
 from ..settings.chase import make_metrics
 from . import lock, members
-from .batching import DEFERRED, USER_ERRORS, Outcome, completion, reason, sentence
+from .batching import DEFERRED, USER_ERRORS, Deferred, Outcome, completion, reason, sentence
+from .hydra_compat import SearchPaths, searching
 
 _log = logging.getLogger(__name__)
 
@@ -40,6 +41,25 @@ class Origin(NamedTuple):
     choices: Mapping[str, str | None]  # the option chosen of each group of settings
     config_name: str | None = "config"
     search: tuple[str, ...] = ()  # overrides of Hydra's search path
+
+    @classmethod
+    def of(cls, node: Any) -> Origin:
+        """Return where the settings of the job with that node of Hydra's come from."""
+        search = tuple(line for line in node.overrides.hydra if line.startswith("hydra.searchpath"))
+        choices = {str(group): choice for group, choice in node.runtime.choices.items()}
+        return cls(list(node.overrides.task), choices, node.job.config_name, search)
+
+
+class InWorker(NamedTuple):
+    """Runs a job of many members whole in a worker process, where no Hydra is running. It can be pickled."""
+
+    origin: Origin
+    paths: SearchPaths  # of the command, with those of `--config-dir`
+
+    def __call__(self, cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics:
+        """Run the job, from the rows on that an earlier try of it has left; see `run`."""
+        with searching(self.paths):
+            return run(cfg, directory, self.origin, DEFERRED, 0.0, progress, again=True)
 
 
 class Refused(SystemExit):
@@ -62,8 +82,7 @@ def execute(
     """
     node = HydraConfig.get()
     directory = Path(node.runtime.output_dir)
-    search = tuple(line for line in node.overrides.hydra if line.startswith("hydra.searchpath"))
-    origin = Origin(list(node.overrides.task), node.runtime.choices, node.job.config_name, search)
+    origin = Origin.of(node)
     if records.resumed(cfg):
         record = records.RunRecord(cfg, origin.choices, origin.overrides, compiler())
         finished = record.finished(directory, anyway=records.resumed_anyway(cfg))
@@ -91,6 +110,8 @@ def run(
     outcome: Outcome = DEFERRED,
     seconds: float = 0.0,
     progress: Progress = SHOWN,
+    *,
+    again: bool = False,
 ) -> Metrics:
     """Run one job and fill its directory; `run.json` says how it ends.
 
@@ -101,6 +122,7 @@ def run(
         outcome: what was computed for the job already.
         seconds: that were spent on it.
         progress: shows how far long loops are.
+        again: whether rows of members in the directory are those of an earlier try of this very job.
 
     Raises:
         Exception: that of the experiment; the record has its reason.
@@ -108,8 +130,9 @@ def run(
     record = records.RunRecord(cfg, origin.choices, origin.overrides, compiler())
     with contextlib.ExitStack() as stack:
         start = None
-        if cfg.get("members") is not None:  # before the record of the earlier start is overwritten
-            start = stack.enter_context(members.start_of(cfg, directory, record))
+        if cfg.get("members") is not None and isinstance(outcome, Deferred):
+            # before the record of the earlier start is overwritten
+            start = stack.enter_context(members.start_of(cfg, directory, record, again=again))
         stack.enter_context(_recorded(record, directory, seconds))
         check_animation(cfg)
         record.declare([metric.info for metric in make_metrics(cfg.get("metric"))])

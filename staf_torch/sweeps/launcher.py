@@ -30,9 +30,10 @@ from .hydra_compat import (
     SweepContext,
     directory_of,
     interpolations_parsed_once,
+    search_paths,
     without_hydra_overrides,
 )
-from .job import PRINTS, execute, objective, silence_terminal
+from .job import PRINTS, InWorker, Origin, execute, objective, silence_terminal
 
 _log = logging.getLogger(__name__)
 
@@ -281,6 +282,13 @@ class Launch:
     def _job(self, num: int, overrides: list[str]) -> Job:
         return Job(num, overrides, self._context.settings(overrides))
 
+    def _whole(self, job: Job) -> InWorker | None:
+        """Return what runs a job of many members in a worker, None for other jobs."""
+        if job.settings.get("members") is None:
+            return None
+        config = self._context.job_config(job.num, job.overrides, reuse=True)
+        return InWorker(Origin.of(config.hydra), search_paths())
+
     def _flat(self, overrides: Sequence[str]) -> Flat | None:
         """Return the settings of a job by dotted keys."""
         return flat_or_none(self._context.settings(overrides, reuse=True))
@@ -327,6 +335,7 @@ class Launch:
                 workers,
                 flat=_Each(len(jobs), lambda index: self._flat(jobs.overrides(index))),
                 finished={i for i, num in enumerate(jobs.numbers) if num in finished},
+                whole=() if about.executor == "inline" else _Each(len(jobs), lambda i: self._whole(jobs[i])),
                 most=about.batch,
                 tell=progress.computed,
             )

@@ -124,13 +124,16 @@ def run(
 
 
 @contextlib.contextmanager
-def start_of(cfg: DictConfig, directory: Path, record: records.RunRecord) -> Iterator[Start]:
+def start_of(
+    cfg: DictConfig, directory: Path, record: records.RunRecord, *, again: bool = False
+) -> Iterator[Start]:
     """Hold the directory of a job of members, and yield what an earlier start has left where that is resumed.
 
     Args:
         cfg: the settings; `members` is not null.
         directory: of the run.
         record: of the run that begins.
+        again: whether what is there was left by an earlier try of this run.
 
     Raises:
         ValueError: if another process has the directory, or the rows that are left were made otherwise.
@@ -138,7 +141,7 @@ def start_of(cfg: DictConfig, directory: Path, record: records.RunRecord) -> Ite
     lock.hold(directory, "run")
     try:
         found: Left | None = Left([])
-        if records.resumed(cfg):
+        if again or records.resumed(cfg):
             found = left(directory, record.made_by)
         if found is None and not records.resumed_anyway(cfg):
             record.refuse_rows(directory)

@@ -59,8 +59,8 @@ class Barrier(ControlAffineSystem):
         super().__init__()
         center = plant.equilibrium().double()
         lows, highs = (
-            _walls("low", low, -math.inf, plant.dim),
-            _walls("high", high, math.inf, plant.dim),
+            wall_numbers("Barrier", "low", low, -math.inf, plant.dim),
+            wall_numbers("Barrier", "high", high, math.inf, plant.dim),
         )
         for name, wall, wrong in (("low", lows, lows >= center), ("high", highs, highs <= center)):
             if bool(wrong.any()):
@@ -234,15 +234,15 @@ class Barrier(ControlAffineSystem):
         return torch.where(self.free, apart, torch.where((down > 0) & (up > 0), s, torch.nan))
 
 
-def _walls(name: str, given: Wall, none: float, size: int) -> Tensor:
+def wall_numbers(call: str, name: str, given: Wall, none: float, size: int) -> Tensor:
     """One wall a coordinate, (n,) float64."""
     numbers = given.tolist() if isinstance(given, Tensor) else given
     listed = [numbers] * size if numbers is None or isinstance(numbers, int | float) else numbers
     if isinstance(listed, str) or not isinstance(listed, Sequence) or len(listed) != size:
-        raise fail("Barrier", name, f"must be a number or one for each of the {size} states", given)
+        raise fail(call, name, f"must be a number or one for each of the {size} states", given)
     walls = [none if one is None else one for one in listed]
     if not all(isinstance(one, int | float) and not isinstance(one, bool) for one in walls):
-        raise fail("Barrier", name, "must be numbers or None", given)
+        raise fail(call, name, "must be numbers or None", given)
     if any(math.isnan(one) or one == -none for one in walls):
-        raise fail("Barrier", name, f"must be finite or {none}", given)
+        raise fail(call, name, f"must be finite or {none}", given)
     return torch.tensor(walls, dtype=torch.float64)

@@ -15,6 +15,7 @@ from omegaconf import OmegaConf
 from staf_torch import deploy
 from staf_torch.cli.deployable import deployable
 from staf_torch.cli.export import export, export_learning, main
+from staf_torch.deploy.c_header import runner_c
 from staf_torch.experiments.registry import experiment
 
 needs_cc = pytest.mark.skipif(
@@ -24,6 +25,10 @@ RUNS = {
     "chase": ["centers.count=6", "duration=0.1", "trajectories=2"],
     "actor": ["experiment=adp", "duration=0.1", "dt=0.005", "trajectories=2", "adp.trust=0.5"],
     "lqr": ["experiment=adp", "duration=0.1", "dt=0.01", "adp/policy=lqr", "system=pendulum"],
+    "guarded": [
+        *("experiment=adp", "adp/basis=quadratic", "duration=0.1", "dt=0.01", "initial_state=[-1.0,0.0]"),
+        "adp.walls.high=[null,0.05]",
+    ],
     "rollout": ["experiment=adp", "duration=0.1", "dt=0.01", "adp/policy=rollout", "adp.rollout.steps=1"],
 }
 
@@ -83,6 +88,23 @@ def test_exported_program_computes_what_the_run_recorded(
     assert page["inputs"][0]["unit"] == ("rad, rad/s" if name == "lqr" else "1")
     assert json.loads((tmp_path / "it.pt2.json").read_text()) == page
     assert f"| flops | {page['work']['flops']}," in (tmp_path / "it.pt2.md").read_text()
+
+
+@needs_cc
+def test_a_filter_around_a_learned_policy_is_the_same_in_c(runs: Path, tmp_path: Path) -> None:
+    page = export(runs / "guarded", "c", output=tmp_path / "guarded.h", calls=20)
+    assert page["equality"]["control"] < 1e-9
+    guard = deployable(runs / "guarded").module(torch.float64)
+    low, high = torch.tensor([-1.0, -0.5]), torch.tensor([1.0, 0.1])  # beyond the wall, too
+    generator = torch.Generator().manual_seed(0)
+    x = low + (high - low) * torch.rand(500, 2, dtype=torch.float64, generator=generator)
+    (control,) = runner_c(tmp_path / "guarded.h", [1], torch.float64)(x)
+    torch.testing.assert_close(control, guard(x), rtol=0, atol=1e-9)
+    other = (control - guard.policy(x)).abs().amax(-1) > 1e-3
+    assert 0.01 < float(other.double().mean()) < 0.9  # the filter acts, and not everywhere
+    metrics = json.loads((runs / "guarded" / "metrics.json").read_text())
+    assert metrics["wall_constraint_violations"] == 0
+    assert metrics["wall_minimum_margin"] > 0
 
 
 @pytest.mark.parametrize("name", list(RUNS))

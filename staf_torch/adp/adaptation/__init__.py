@@ -2,6 +2,8 @@
 
 from .adaptive_lqr import Adaptation as Adaptation
 from .adaptive_lqr import AdaptiveLQR as AdaptiveLQR
+from .drift_lqr import DriftAdaptation as DriftAdaptation
+from .drift_lqr import DriftLQR as DriftLQR
 from .history_stack import ConcurrentGradient as ConcurrentGradient
 from .history_stack import HistoryStack as HistoryStack
 from .history_stack import Stack as Stack
@@ -20,6 +22,8 @@ from .redesign import Doubling as Doubling
 from .redesign import riccati_rows as riccati_rows
 from .robust_filter import Guarded as Guarded
 from .robust_filter import RobustFilter as RobustFilter
+from .stream_drift import DriftEstimate as DriftEstimate
+from .stream_drift import StreamDrift as StreamDrift
 from .tracker import ConcurrentTracker as ConcurrentTracker
 from .tracker import Tracking as Tracking
 from .windows import Equation as Equation

@@ -15,10 +15,8 @@ from ..rollout import RolloutPolicy
 from .carried import pack, unpack
 from .least_squares import Estimate, LeastSquares
 from .parametric import ParametricPlant
-from .redesign import Doubling, control_rate, doubling_start, doubling_step, product, riccati_residual
+from .redesign import Doubling, Redesign, product
 from .windows import IntegralWindows, Window
-
-_SOLVED = 1e-2  # residual of the Riccati equation, for the model of the moment, of a design that is used
 
 
 class Adaptation(NamedTuple):
@@ -119,12 +117,13 @@ class AdaptiveLQR(Controller):
         self.confidence = positive_real("AdaptiveLQR", "confidence", confidence)
         non_negative("AdaptiveLQR", "probe", probe)
         self.probe = real("AdaptiveLQR", "probe", probe)
-        self.doublings = integer("AdaptiveLQR", "doublings", doublings, least=1)
-        self.a_step = self.doublings if a_step is None else integer("AdaptiveLQR", "a_step", a_step, least=1)
-        if self.doublings % self.a_step:
+        integer("AdaptiveLQR", "doublings", doublings, least=1)
+        each = doublings if a_step is None else integer("AdaptiveLQR", "a_step", a_step, least=1)
+        if doublings % each:
             raise fail("AdaptiveLQR", "a_step", f"must divide the {doublings} doublings", a_step)
         self.family = model.family(self.cost.target, self.cost.target_input)
         self.curvature = self.cost.state_curvature()
+        self.redesign = Redesign(self.curvature, self.cost.r_inverse, doublings, each)
         self.robust: Policy = LQR(model.believing(law.first), cost) if robust is None else robust
         self.theta: Tensor | None = None
         self._like = self._start(torch.zeros(1, int(model.dim or 0), dtype=torch.float64), None)
@@ -152,10 +151,9 @@ class AdaptiveLQR(Controller):
         window, equation = self.windows.step(now.window, x, dt)
         estimate = self.law.step(now.estimate, equation, dt)
         a, b = self.family.at(estimate.theta)
-        doubling, stage, p = self._designed(now, a, b)
+        doubling, stage, p = self.redesign.step(now.doubling, now.stage, now.p, a, b)
         k = product(product(self.cost.r_inverse.to(b), b.mT), p)
-        solved = riccati_residual(p, a, control_rate(b, self.cost.r_inverse), self.curvature) < _SOLVED
-        certain = solved & (self._doubt(estimate.covariance, p, k) < 1)
+        certain = self.redesign.solved(p, a, b) & (self._doubt(estimate.covariance, p, k) < 1)
         u = self._control(x, estimate.theta, p, k)
         doubtful = self.robust(x)
         if self.probe:
@@ -191,28 +189,6 @@ class AdaptiveLQR(Controller):
             zero.clone(),
             square.clone(),
         )
-
-    def _designed(self, now: Adaptation, a: Tensor, b: Tensor) -> tuple[Doubling, Tensor, Tensor]:
-        """The design under way, how far it is, and P of the last one that was finished."""
-        begins = now.stage == 0
-        first = doubling_start(a, control_rate(b, self.cost.r_inverse), self.curvature)
-        pair = Doubling(
-            *(
-                torch.where(begins[..., None, None], new, old)
-                for new, old in zip(first, now.doubling, strict=True)
-            )
-        )
-        for _ in range(self.a_step):
-            pair = doubling_step(pair)
-        stage = now.stage + self.a_step
-        done = stage >= self.doublings
-        sound = done & torch.isfinite(pair.h).all(-1).all(-1)
-        p = torch.where(sound[..., None, None], pair.h, now.p)
-        # A design that went wrong must not end the row: its pair starts from zero.
-        pair = Doubling(
-            *(torch.where(torch.isfinite(part) & ~done[..., None, None], part, 0.0) for part in pair)
-        )
-        return pair, torch.where(done, 0.0, stage), p
 
     def _doubt(self, covariance: Tensor, p: Tensor, k: Tensor) -> Tensor:
         """c^2 sum_ij C_ij tr(W^-1 M_i W^-1 M_j): (...)."""

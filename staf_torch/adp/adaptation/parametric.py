@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ...numerics.checks import fail, integer, number
-from ...systems import Bounds, ControlAffineSystem
+from ...systems import Barrier, Bounds, ControlAffineSystem
 
 Regressor = Callable[[Tensor, Tensor], Tensor]
 """Y from x and u: (..., n), (..., m) -> (..., n, p)."""
@@ -117,6 +117,39 @@ class ParametricPlant(ControlAffineSystem):
             inputs=plant.inputs,
             theta=torch.ones(plant.inputs, dtype=torch.float64),
             periodic=plant.periodic,
+            bounds=plant.bounds,
+        )
+
+    @classmethod
+    def of_barrier(cls, box: Barrier) -> ParametricPlant:
+        """Return the plant of a box in its coordinates s: s' = D(s) (h + Y theta) with D = ds/dx.
+
+        This is the model for a design. The loop runs on the `Barrier`, which keeps its digits beside a wall.
+
+        Example:
+            >>> pendulum = adp.ParametricPlant.of_effectiveness(systems.Pendulum())
+            >>> box = systems.Barrier(pendulum, low=[-1.0, None], high=[2.0, None])
+            >>> model = adp.ParametricPlant.of_barrier(box)
+            >>> bool(torch.equal(model.drift(torch.ones(2).double()), box.drift(torch.ones(2).double())))
+            True
+
+        Args:
+            box: around a `ParametricPlant`.
+
+        Raises:
+            ValueError: if the plant in the box is of another kind.
+        """
+        plant = box.plant
+        if not isinstance(plant, ParametricPlant):
+            raise fail("ParametricPlant.of_barrier", "box", "must be around a ParametricPlant", plant)
+        return cls(
+            lambda s, u: box.stretch(s).unsqueeze(-1) * plant.regressor(box.inverse(s), u),
+            lambda s, u: box.stretch(s) * plant.rest_of(box.inverse(s), u),
+            dim=plant._size(),
+            inputs=plant.inputs,
+            theta=plant.theta,
+            rows=plant.rows,
+            periodic=box.periodic,
             bounds=plant.bounds,
         )
 

@@ -9,6 +9,8 @@ from torch import Tensor
 
 from ...numerics.checks import integer
 
+_SOLVED = 1e-2  # residual of the Riccati equation, for the model of the moment, of a design that is used
+
 
 class Doubling(NamedTuple):
     """The symplectic pair after 2^k steps; h tends to P.
@@ -60,6 +62,52 @@ def riccati_rows(a: Tensor, b: Tensor, q: Tensor, r_inverse: Tensor, *, doubling
     for _ in range(doublings):
         now = doubling_step(now)
     return now.h
+
+
+class Redesign:
+    """Riccati equations of rows solved while a loop runs: some doublings a control, one design after another.
+
+    Args:
+        curvature: Q, (n, n).
+        r_inverse: R^-1, (m, m).
+        doublings: of a design.
+        a_step: of them a control, dividing them.
+    """
+
+    def __init__(self, curvature: Tensor, r_inverse: Tensor, doublings: int, a_step: int) -> None:
+        self.curvature, self.r_inverse = curvature, r_inverse
+        self.doublings, self.a_step = doublings, a_step
+
+    def step(
+        self, pair: Doubling, stage: Tensor, p: Tensor, a: Tensor, b: Tensor
+    ) -> tuple[Doubling, Tensor, Tensor]:
+        """The design under way, how far it is, and P of the last one that was finished.
+
+        Args:
+            pair: of the design under way.
+            stage: doublings done of it, (...); where it is 0 one begins with the model of now.
+            p: P of the one before, (..., n, n).
+            a: A of now, (..., n, n).
+            b: B of now, (..., n, m).
+        """
+        begins = (stage == 0)[..., None, None]
+        first = doubling_start(a, control_rate(b, self.r_inverse), self.curvature)
+        pair = Doubling(*(torch.where(begins, new, old) for new, old in zip(first, pair, strict=True)))
+        for _ in range(self.a_step):
+            pair = doubling_step(pair)
+        stage = stage + self.a_step
+        done = stage >= self.doublings
+        sound = done & torch.isfinite(pair.h).all(-1).all(-1)
+        p = torch.where(sound[..., None, None], pair.h, p)
+        # A design that went wrong must not end the row: its pair starts from zero.
+        pair = Doubling(
+            *(torch.where(torch.isfinite(part) & ~done[..., None, None], part, 0.0) for part in pair)
+        )
+        return pair, torch.where(done, 0.0, stage), p
+
+    def solved(self, p: Tensor, a: Tensor, b: Tensor) -> Tensor:
+        """Whether P is of the model of now, (...) bool: a design may be older, or without a solution."""
+        return riccati_residual(p, a, control_rate(b, self.r_inverse), self.curvature) < _SOLVED
 
 
 def control_rate(b: Tensor, r_inverse: Tensor) -> Tensor:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -78,6 +79,8 @@ class IntegralWindows:
         first: s, the length of the first window; every other one is twice as long, up to T. None for T. Short
             windows know something soon, long ones are worth more against noise.
         noise: standard deviation of the noise of a measured state, in its units, not negative.
+        states: the plant's states from what is measured, (..., n) -> (..., n); None where these are it. With
+            the `inverse` of a `Barrier` equations are of x, as smooth beside a wall as anywhere.
 
     Raises:
         ValueError: if an argument breaks its rule.
@@ -93,8 +96,9 @@ class IntegralWindows:
         shape: str = "box",
         first: float | None = None,
         noise: float = 0.0,
+        states: Callable[[Tensor], Tensor] | None = None,
     ) -> None:
-        self.model = model
+        self.model, self.states = model, states
         self.length = positive_real("IntegralWindows", "length", length)
         self.first = self.length if first is None else positive_real("IntegralWindows", "first", first)
         if self.first > self.length:
@@ -130,6 +134,7 @@ class IntegralWindows:
             x: (..., n), measured now.
             dt: s since the measurement before.
         """
+        x = x if self.states is None else self.states(x)
         begun = state.elapsed >= 0
         share = self._weight(state, dt) if self.smooth else torch.ones_like(state.elapsed)
         share = torch.where(begun, share, 0.0)

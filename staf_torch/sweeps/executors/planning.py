@@ -10,6 +10,7 @@ from typing import overload
 
 from omegaconf import DictConfig
 
+from ...experiments.registry import Experiment
 from ...results.progress import Progress
 from ...settings.plain import ManySettings
 from ..batching import Batch, Flat, Outcome, batches, flat_or_none
@@ -22,9 +23,14 @@ class _Batches(Sequence[Batch]):
     """Batches whose settings are looked up when a batch begins."""
 
     def __init__(
-        self, planned: Sequence[list[int]], settings: Sequence[DictConfig], directories: Sequence[Path]
+        self,
+        planned: Sequence[list[int]],
+        settings: Sequence[DictConfig],
+        directories: Sequence[Path],
+        whole: Sequence[Experiment | None],
     ) -> None:
         self._planned, self._settings, self._directories = planned, settings, directories
+        self._whole = whole
 
     def __len__(self) -> int:
         return len(self._planned)
@@ -42,7 +48,7 @@ class _Batches(Sequence[Batch]):
         places = [os.path.abspath(self._directories[i]) for i in jobs]  # a worker may have another folder
         settings = self._settings
         some = settings.of(jobs) if isinstance(settings, ManySettings) else [settings[i] for i in jobs]
-        return Batch(some, places)
+        return Batch(some, places, [self._whole[i] for i in jobs] if self._whole else ())
 
 
 def compute(
@@ -53,6 +59,7 @@ def compute(
     finished: Collection[int] = frozenset(),
     most: int | None = None,
     flat: Sequence[Flat | None] | None = None,
+    whole: Sequence[Experiment | None] = (),
     tell: Callable[[float], None],
 ) -> Generator[tuple[int, Outcome, float], None, None]:
     """Yield index, outcome and seconds of every job that is not finished, as the tensor batches end.
@@ -67,6 +74,7 @@ def compute(
         finished: indices of jobs that need no outcome.
         most: jobs of a batch at most.
         flat: what `flat_or_none` makes of the settings of every job, where somebody has that already.
+        whole: runs a job of many members in a worker, None for other jobs; empty: no worker runs any.
         tell: is told how many jobs are computed, with fractions while this process computes a batch.
     """
     done = 0
@@ -74,7 +82,7 @@ def compute(
     planned = batches(flat, least=workers.pieces, most=most)
     planned = [batch for batch in planned if not set(finished).issuperset(batch)]
     _log.info("%d jobs in %d tensor batches", len(settings), len(planned))
-    given = _Batches(planned, settings, directories)
+    given = _Batches(planned, settings, directories, whole)
     wanted = [[i for i in batch if i not in finished] for batch in planned]
     left = [len(batch) for batch in wanted]
     listening = Progress(lambda share: tell(done + share * next(filter(None, left), 0)))

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
-from ...experiments.registry import experiment
+from ...experiments.registry import Experiment, experiment
 from ...results.progress import SHOWN
 from ..batching import Batch, Deferred, Done, Failed, Outcome, Written, solve
 from ..hydra_compat import trusted, trusted_packages
@@ -44,19 +44,19 @@ def solve_elsewhere(pickled: bytes, path: Sequence[str], packages: Sequence[str]
         batch: Batch = pickle.loads(pickled)
         outcomes = solve(batch.settings, SHOWN)
         for i, (outcome, cfg) in enumerate(zip(outcomes, batch.settings, strict=True)):
-            # A job with `members` of its own composes them, which takes the program's Hydra.
-            if isinstance(outcome, Deferred) and cfg.get("members") is None:
-                outcomes[i] = _run_whole(cfg, Path(batch.directories[i]))
+            if isinstance(outcome, Deferred):
+                whole = batch.whole[i] if batch.whole else None
+                outcomes[i] = _run_whole(cfg, Path(batch.directories[i]), whole or experiment(cfg.task))
         portable = [_portable(outcome) for outcome in outcomes]
     return pickle.dumps(Done(portable, time.monotonic() - start))
 
 
-def _run_whole(cfg: DictConfig, directory: Path) -> Outcome:
+def _run_whole(cfg: DictConfig, directory: Path, whole: Experiment) -> Outcome:
     """Run an experiment that takes no part in batches, and keep its log for the parent."""
     directory.mkdir(parents=True, exist_ok=True)
     with _kept_log() as lines:
         try:
-            return Written(experiment(cfg.task)(cfg, directory, SHOWN), lines)
+            return Written(whole(cfg, directory, SHOWN), lines)
         except Exception as error:
             return Failed(error)
 

@@ -7,12 +7,15 @@ from hydra.core.utils import env_override as env_override
 
 from .composing import Composer as Composer
 from .composing import JobLoader as JobLoader
-from .composing import config_loader as config_loader
 from .composing import interpolations_parsed_once as interpolations_parsed_once
 from .composing import parse_override as parse_override
 from .jobs import SweepContext as SweepContext
 from .jobs import directory_of as directory_of
 from .jobs import without_hydra_overrides as without_hydra_overrides
+from .loading import SearchPaths as SearchPaths
+from .loading import config_loader as config_loader
+from .loading import search_paths as search_paths
+from .loading import searching as searching
 from .plain_composing import PlainComposer as PlainComposer
 from .products import Product as Product
 from .products import sweep_size as sweep_size

@@ -11,26 +11,13 @@ from typing import Any, NamedTuple, cast
 import omegaconf.base
 from hydra._internal import config_loader_impl
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
-from hydra._internal.utils import create_config_search_path
 from hydra.core.config_loader import ConfigLoader
-from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override, OverrideType
-from hydra.core.plugins import Plugins
 from hydra.errors import ConfigCompositionException
 from hydra.types import HydraContext, RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 from omegaconf.errors import OmegaConfBaseException
-
-from ...settings import config_directory
-
-
-def config_loader() -> ConfigLoader:
-    """Return Hydra's loader: of the running program, else one of `conf/`."""
-    if GlobalHydra.instance().is_initialized():
-        return GlobalHydra.instance().config_loader()
-    Plugins.instance()  # the sources of configurations are plugins
-    return ConfigLoaderImpl(create_config_search_path(config_directory()))
 
 
 def parse_override(line: str, loader: ConfigLoader | None = None) -> Override:

@@ -156,3 +156,34 @@ def test_a_changing_plant_has_the_parameters_of_its_row_and_time() -> None:
         z = systems.runge_kutta_step(lambda z: CHANGING.motion(z, u), z, 0.01)
     torch.testing.assert_close(CHANGING.theta(z), tensor([[0.3, 3.0], [0.2, 2.0]]))
     torch.testing.assert_close(CHANGING.drift(z0) + CHANGING.effectiveness(z0)[..., 0], CHANGING.rate(z0, u))
+
+
+def test_behind_walls_parameters_are_learned_from_the_plant_and_the_design_is_of_the_barrier() -> None:
+    def regressor(x: torch.Tensor, u: torch.Tensor) -> torch.Tensor:
+        x1, x2 = x.unbind(-1)
+        gain, none = (2 * x1).cos() + 2, torch.zeros_like(x1)
+        rows = (x2, none, none, none), (none, x1, x2, x2 * gain.square())
+        return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
+
+    def known(x: torch.Tensor, u: torch.Tensor) -> torch.Tensor:
+        return torch.stack((0 * x[..., 0], ((2 * x[..., 0]).cos() + 2) * u[..., 0]), dim=-1)
+
+    true = [1.0, -1.0, -0.5, 0.5]
+    box = systems.Barrier(
+        adp.ParametricPlant(regressor, known, dim=2, inputs=1, theta=true), (-7, -5), (5, 7)
+    )
+    cost = adp.QuadraticCost(10.0, 0.1, dim=2, inputs=1)
+    law = adp.LeastSquares([0.0] * 4, deviation=5.0, floor=1e-6)
+    windows = adp.IntegralWindows(box.plant, 0.002, states=box.inverse)  # type: ignore[arg-type]
+    model = adp.ParametricPlant.of_barrier(box)
+    control = adp.AdaptiveLQR(model, cost, windows, law, robust=lambda s: -10 * s[..., 1:], doublings=8)
+    s0 = box.transform(tensor([[-6.5, 6.5]]))
+    run = adp.simulate(control, box, cost, s0, dt=0.001, steps=20, compile=False)
+    now = control.adaptation(run.identifier)
+    assert bool(now.certain[0, 6:].all())
+    assert not bool(now.certain[0, 1])
+    torch.testing.assert_close(now.estimate.theta[0, -1], tensor(true), rtol=0, atol=1e-3)
+    lqr = adp.LQR(box, cost)
+    torch.testing.assert_close(run.control[0, 15:20], lqr(run.state[0, 15:20]), rtol=1e-2, atol=1e-2)
+    with pytest.raises(ValueError, match="must be around a ParametricPlant"):
+        adp.ParametricPlant.of_barrier(systems.Barrier(systems.Pendulum(), -1.0, 1.0))

@@ -1,0 +1,244 @@
+"""A drift of which no form is known, learned from measured states by kernels that follow the state."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ...kernels import Kernel
+from ...numerics.checks import fail, non_negative, positive_real, real
+from ...numerics.linalg import newton_basis, row_jacobian
+from ...systems import ControlAffineSystem
+from .parametric import ParametricPlant
+from .redesign import product
+from .windows import Equation, IntegralWindows
+
+_NODES = (0.06943184420297371, 0.33000947820757187, 0.6699905217924281, 0.9305681557970262)
+_WEIGHTS = (0.17392742256872692, 0.32607257743127307, 0.32607257743127307, 0.17392742256872692)
+# Gauss and Legendre's, on [0, 1]: exact for slopes that are polynomials of degree 7 along the way
+
+
+class DriftEstimate(NamedTuple):
+    """What a `StreamDrift` knows, a row a trajectory.
+
+    Example:
+        >>> adp.DriftEstimate._fields
+        ('anchor', 'mean', 'covariance')
+
+        Shown by `tests/benchmarks/unknown_drift.py`.
+    """
+
+    anchor: Tensor  # (..., n) the state that the centers surround
+    mean: Tensor  # (..., r, M n) weights of the rows
+    covariance: Tensor  # (..., M n, M n) of the weights of every row, in units of ``deviation``^2
+
+
+class StreamDrift:
+    """d(x) in x' = h(x) + d(x) + g(x) u as a stream of StaF models, where nothing of d is known but that it
+    vanishes at the plant's equilibrium x_s:
+
+        d_r(x) = sum_j a_rj(x) (x - x_s)_j,  a_rj a Gaussian process of standard deviation ``deviation``.
+
+    Around the state each a_rj is psi(z)'u with the orthonormal functions psi of the kernels at the centers
+    c + d_i, z = x - c, and weights u by a Kalman filter. When the state leaves the ball around c the centers
+    move on: the posterior at the old ones predicts the values at the new ones, and what it cannot say there
+    is uncertain again (as the filter of `StaFRegressor` does it). Equations are integrals over a window of
+    time, from measured states alone.
+
+    With a wide kernel the a_rj are constants, and this is least squares for a linear drift; with a narrow one
+    every place is learned by itself.
+
+    Example:
+        >>> known = systems.Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
+        >>> centers = torch.tensor([[1.0, 0.0], [-0.5, 0.9], [-0.5, -0.9]]).double()
+        >>> kernel = GaussianKernel(2.0)
+        >>> drift = adp.StreamDrift(known, kernel, 0.5 * centers, rows=[1], deviation=2.0, length=0.05)
+        >>> now = drift.init(torch.tensor([[1.0, 0.0]]).double())
+        >>> mean, spread = drift.predict(now, torch.tensor([[1.0, 0.0]]).double())
+        >>> mean, spread.round(decimals=3)  # nothing is known yet
+        (tensor([[0.]], dtype=torch.float64), tensor([[2.]], dtype=torch.float64))
+
+        Shown by `tests/benchmarks/unknown_drift.py`.
+
+    Args:
+        known: h and g, whose equilibrium is x_s; its input there is held.
+        kernel: translation invariant, such as `GaussianKernel`; its width is how far a_rj are alike.
+        offsets: d_i of the M centers from the state, (M, n), in the units of the state.
+        rows: the states whose rates have an unknown part, in order.
+        deviation: of a_rj before anything was seen, positive, 1/s.
+        length: s, of a window.
+        noise: standard deviation of the noise of a measured state, not negative.
+        floor: standard deviation of an error of an equation beside the noise, positive: that of the integral.
+        forgetting: 1/s, not negative: the rate at which what was learned fades towards the prior.
+        smooth: whether windows weigh the integral by sin^2, as in `IntegralWindows`: for noise.
+
+    Raises:
+        ValueError: if an argument breaks its rule.
+
+    Source: the filter as in the class `StaFRegressor`; windows as in `IntegralWindows`.
+    """
+
+    def __init__(
+        self,
+        known: ControlAffineSystem,
+        kernel: Kernel,
+        offsets: Tensor,
+        *,
+        rows: Sequence[int],
+        deviation: float,
+        length: float,
+        noise: float = 0.0,
+        floor: float = 1e-4,
+        forgetting: float = 0.0,
+        smooth: bool = False,
+    ) -> None:
+        if not isinstance(known, ControlAffineSystem) or known.dim is None:
+            raise fail("StreamDrift", "known", "must be a ControlAffineSystem with `dim`", known)
+        if not kernel.state_free or kernel.scale_slope != 0.0:
+            raise fail("StreamDrift", "kernel", "must be translation invariant", kernel)
+        if offsets.dim() != 2 or offsets.shape[1] != known.dim or not bool(torch.isfinite(offsets).all()):
+            rule = f"must be finite numbers (M, {known.dim})"
+            raise fail("StreamDrift", "offsets", rule, tuple(offsets.shape))
+        self.known, self.kernel, self.offsets = known, kernel, offsets.double()
+        self.radius = positive_real("StreamDrift", "offsets", float(self.offsets.norm(dim=-1).max()))
+        self.basis = newton_basis(kernel(self.offsets, self.offsets).detach())
+        self.deviation = positive_real("StreamDrift", "deviation", deviation)
+        self.floor = positive_real("StreamDrift", "floor", floor)
+        non_negative("StreamDrift", "forgetting", forgetting)
+        self.forgetting = real("StreamDrift", "forgetting", forgetting)
+        self.center, self.rest = known.equilibrium(), known.resting_input()
+        self.rows = list(rows)
+        count, dim = self.offsets.shape
+        plant = ParametricPlant(
+            lambda x, u: self._spread_over_rows(x, x),
+            lambda x, u: known.rate(x, u),
+            dim=dim,
+            inputs=known.inputs,
+            theta=[0.0] * (count * dim),
+            rows=self.rows,
+            periodic=known.periodic,
+            bounds=known.bounds,
+        )
+        shape = "smooth" if smooth else "box"
+        self.windows = IntegralWindows(plant, length, shape=shape, noise=noise)
+
+    def init(self, x: Tensor) -> DriftEstimate:
+        """Nothing learned yet, around the states (..., n)."""
+        count = self.offsets.numel()
+        identity = torch.eye(count, dtype=x.dtype, device=x.device).expand(*x.shape[:-1], count, count)
+        return DriftEstimate(
+            x.clone(), x.new_zeros(*x.shape[:-1], len(self.rows), count), identity.contiguous()
+        )
+
+    def window_of(self, estimate: DriftEstimate) -> IntegralWindows:
+        """The windows whose equations are of this estimate's weights."""
+        windows = copy.copy(self.windows)
+        windows.model = copy.copy(windows.model)
+        windows.model.regressor = lambda x, u: self._spread_over_rows(x, estimate.anchor)
+        return windows
+
+    def step(self, estimate: DriftEstimate, equation: Equation, x: Tensor, dt: float) -> DriftEstimate:
+        """The estimate with an equation, where it is ready, and around x where that left the ball.
+
+        Args:
+            estimate: before it.
+            equation: of `window_of` this estimate.
+            x: (..., n), measured at the equation's end.
+            dt: s since the step before.
+        """
+        mean, p, ready = estimate.mean, estimate.covariance, equation.ready
+        scale = self.deviation
+        if self.forgetting:
+            identity = torch.eye(p.shape[-1], dtype=p.dtype, device=p.device)
+            p = identity + (p - identity) / (1 + self.forgetting * dt)
+        s = scale * equation.s[..., 0, :]
+        reach = self.windows.length * scale
+        left = self._rest(x, estimate.anchor) * self._deviation(x).square().sum(-1)
+        noise = equation.variance + self.floor**2 + reach**2 * left
+        ps = (p * s.unsqueeze(-2)).sum(-1)
+        gain = torch.where(ready, 1 / ((ps * s).sum(-1) + noise), 0.0)
+        missing = equation.z - (s.unsqueeze(-2) * mean).sum(-1)  # (..., r)
+        mean = mean + (gain.unsqueeze(-1) * missing).unsqueeze(-1) * ps.unsqueeze(-2)
+        p = p - gain[..., None, None] * ps.unsqueeze(-1) * ps.unsqueeze(-2)
+        return self._moved(DriftEstimate(estimate.anchor, mean, p), x, ready)
+
+    def predict(self, estimate: DriftEstimate, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and standard deviation of d at x, of the rows: (..., n) -> (..., r), (..., r)."""
+        a, covariance = self.slopes(estimate, x)
+        e = self._deviation(x)
+        mean = (a * e.unsqueeze(-2)).sum(-1)
+        variance = (e.unsqueeze(-1) * covariance * e.unsqueeze(-2)).sum((-2, -1))
+        return mean, variance.sqrt().unsqueeze(-1).expand(mean.shape)
+
+    def slopes(self, estimate: DriftEstimate, x: Tensor) -> tuple[Tensor, Tensor]:
+        """a at x, (..., r, n), and the covariance of every row of it, (..., n, n)."""
+        psi = self._functions(x, estimate.anchor)
+        m, n = self.offsets.shape
+        a = (psi[..., None, :, None] * estimate.mean.unflatten(-1, (m, n))).sum(-2)
+        both = psi[..., :, None, None, None] * psi[..., None, None, :, None]  # (..., M, 1, M, 1)
+        p = (both * estimate.covariance.unflatten(-1, (m, n)).unflatten(-3, (m, n))).sum((-4, -2))
+        identity = torch.eye(n, dtype=x.dtype, device=x.device)
+        left = self._rest(x, estimate.anchor)[..., None, None] * identity
+        return self.deviation * a, self.deviation**2 * (p + left)
+
+    def matrix(self, estimate: DriftEstimate, x: Tensor) -> tuple[Tensor, Tensor]:
+        """A(x) with h(x) + d(x) = A(x) (x - x_s), (..., n, n), and the covariance of its unknown rows.
+
+        h counts by the mean of its slope along the way from x_s to x.
+        """
+        e, center = self._deviation(x), self.center.to(x)
+        idle = self.rest.to(x).expand(*x.shape[:-1], -1)
+        a = torch.zeros_like(x).unsqueeze(-1) * e.unsqueeze(-2)
+        for node, weight in zip(_NODES, _WEIGHTS, strict=True):
+            slope = row_jacobian(lambda y: self.known.rate(y, idle), center + node * e)[1]
+            a = a + weight * slope
+        own, covariance = self.slopes(estimate, x)
+        places = torch.eye(len(self.center), dtype=x.dtype, device=x.device)[:, self.rows]
+        return a + product(places, own), covariance
+
+    def _deviation(self, x: Tensor) -> Tensor:
+        return self.known.difference(x, self.center.to(x))
+
+    def _functions(self, x: Tensor, anchor: Tensor) -> Tensor:
+        """psi at x: (..., n), (..., n) -> (..., M)."""
+        z, basis = self.known.difference(x, anchor), self.basis.to(x)
+        near = self.kernel(z.unsqueeze(-2), self.offsets.to(x))  # (..., 1, M)
+        return product(near, basis).squeeze(-2)
+
+    def _rest(self, x: Tensor, anchor: Tensor) -> Tensor:
+        """The share of the prior's variance at x that no weights explain, in [0, 1]: (...)."""
+        left = 1 - self._functions(x, anchor).square().sum(-1)
+        return torch.where(left > 0, left, 0.0)  # at a center it is 0, up to rounding on either side
+
+    def _spread_over_rows(self, x: Tensor, anchor: Tensor) -> Tensor:
+        """psi_i (x - x_s)_j in the rows of `rows`, (..., n, M n)."""
+        features = (self._functions(x, anchor).unsqueeze(-1) * self._deviation(x).unsqueeze(-2)).flatten(-2)
+        places = torch.zeros(x.shape[-1], dtype=x.dtype, device=x.device)
+        places[self.rows] = 1.0
+        return places.unsqueeze(-1) * features.unsqueeze(-2)
+
+    def _moved(self, now: DriftEstimate, x: Tensor, ready: Tensor) -> DriftEstimate:
+        """With the centers around x, where a window ended outside the ball."""
+        step = self.known.difference(x, now.anchor)
+        moves = ready & (step.square().sum(-1) > self.radius**2)
+        step = torch.where(moves.unsqueeze(-1), step, 0.0)
+        m, n = self.offsets.shape
+        offsets, basis = self.offsets.to(x), self.basis.to(x)
+        there = self.kernel(step.unsqueeze(-2) + offsets, offsets)
+        transfer = product(product(basis.mT, there), basis)  # (..., M, M)
+        mean = (transfer[..., None, :, :, None] * now.mean.unflatten(-1, (m, n)).unsqueeze(-3)).sum(-2)
+        known = torch.eye(m * n, dtype=x.dtype, device=x.device) - now.covariance
+        split = known.unflatten(-1, (m, n)).unflatten(-3, (m, n))  # (..., M, n, M, n)
+        half = (transfer[..., :, :, None, None, None] * split.unsqueeze(-5)).sum(-4)
+        whole = (half.unsqueeze(-3) * transfer[..., None, None, :, :, None]).sum(-2)
+        covariance = torch.eye(m * n, dtype=x.dtype, device=x.device) - whole.flatten(-2).flatten(-3, -2)
+        wide = moves.unsqueeze(-1)
+        return DriftEstimate(
+            torch.where(wide, x, now.anchor),
+            torch.where(wide.unsqueeze(-1), mean.flatten(-2), now.mean),
+            torch.where(wide.unsqueeze(-1), covariance, now.covariance),
+        )
