@@ -9,6 +9,8 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import random
+from collections.abc import Iterator
+from pathlib import Path
 
 import hypothesis
 import pytest
@@ -30,6 +32,15 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         rank = {path: random.Random(f"{seed} {path}").random() for path in {item.path for item in items}}
         own = {item.nodeid: random.Random(f"{seed} {item.nodeid}").random() for item in items}
         items.sort(key=lambda item: (rank[item.path], own[item.nodeid]))
+
+
+@pytest.fixture(autouse=True, scope="session")
+def _settings_are_trusted_as_by_the_command() -> Iterator[None]:
+    """Hydra 1.4 builds only what a program trusts: here the package, and what tests define."""
+    from staf_torch.sweeps.hydra_compat.program import trusted
+
+    with trusted(path.stem for path in Path(__file__).parent.rglob("*.py")):
+        yield
 
 
 @pytest.fixture(autouse=True)

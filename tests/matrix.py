@@ -167,7 +167,7 @@ def _run(environment: Environment, python: Path, tree: Path, arguments: Sequence
         _home(environment, Path(scratch)) as home,
     ):
         settings = {**os.environ, "PYTHONPATH": str(tree), "OMP_NUM_THREADS": "1", **home}
-        line = [str(python), "-m", "pytest", "-q", "-p", "no:cacheprovider", "--tb=short", *arguments]
+        line = [str(python), "-m", "pytest", "-p", "no:cacheprovider", "--tb=short", *arguments]
         user = None if environment.privileged else "nobody"
         begun = time.monotonic()
         ended = subprocess.run(

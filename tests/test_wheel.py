@@ -13,6 +13,8 @@ from pathlib import Path
 import pytest
 from command_line import ROOT
 
+from staf_torch import __version__
+
 
 def _run(*line: str | Path, cwd: Path) -> str:
     clean = {
@@ -37,7 +39,7 @@ def test_wheel_holds_the_package_its_settings_and_nothing_else(wheel: Path) -> N
     with zipfile.ZipFile(wheel) as archive:
         names = set(archive.namelist())
     packages = {"staf_torch", "hydra_plugins"}  # Hydra 1.3 looks into the second
-    assert {name.partition("/")[0] for name in names} == packages | {"staf_torch-0.1.0.dist-info"}
+    assert {name.partition("/")[0] for name in names} == packages | {f"staf_torch-{__version__}.dist-info"}
     assert {name for name in names if name.startswith("hydra_plugins")} == {"hydra_plugins/staf_batched.py"}
     files = [p.relative_to(ROOT / "staf_torch") for p in (ROOT / "staf_torch").rglob("*.py")]
     sources = {f"staf_torch/{p}" for p in files if p.parts[0] != "plugins"}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import composing
@@ -13,6 +14,7 @@ from staf_torch import adp, systems
 from staf_torch.adp.problem import AdpProblem
 from staf_torch.cli.staf import config_directory
 from staf_torch.settings.adp import adp_problem, make_cost, updated
+from staf_torch.sweeps.hydra_compat.program import trusted
 
 GROUPS = ("policy", "law", "basis", "extrapolation", "cost")
 OPTIONS = [
@@ -127,7 +129,7 @@ def down(x):
 
 
 @pytest.fixture
-def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """A user's folder: a module, and an option of each group in YAML, found through Hydra's search path."""
     (tmp_path / "my_control.py").write_text(MODULE)
     monkeypatch.syspath_prepend(str(tmp_path))
@@ -141,7 +143,8 @@ def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         path = tmp_path / "settings" / "adp" / f"{name}.yaml"
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text + "\n")
-    return tmp_path / "settings"
+    with trusted(["my_control"]):
+        yield tmp_path / "settings"
 
 
 def test_a_class_and_a_yaml_of_ones_own_make_a_variant(own: Path) -> None:

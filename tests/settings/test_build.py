@@ -14,6 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 from staf_torch import StateRadius
 from staf_torch.cli.staf import config_directory
 from staf_torch.settings.chase import ChaseProblem, chase_problem
+from staf_torch.sweeps.hydra_compat.program import named_packages, trusted
 
 GROUPS = ("kernel", "centers", "target", "system", "optimizer")
 OPTIONS = [
@@ -160,7 +161,8 @@ BAD: dict[str, tuple[str, tuple[str, ...]]] = {
 @pytest.mark.parametrize("name", BAD)
 def test_a_bad_value_is_named(name: str) -> None:
     line, expected = BAD[name]
-    with pytest.raises(Exception) as found:  # noqa: PT011 (Hydra wraps some; the command unwraps them)
+    own = trusted(named_packages(line.split()))  # as of the command
+    with own, pytest.raises(Exception) as found:  # noqa: PT011 (Hydra wraps some; the command unwraps them)
         problem(line)
     messages, error = [], found.value
     while error is not None:
