@@ -153,6 +153,8 @@ def solve(
 
 def orthogonal(matrix: Tensor, mode: str = "reduced") -> tuple[Tensor, Tensor]:
     """Q and R of a square matrix by Householder's reflections."""
+    if _many(matrix):
+        return rolled.orthogonal(matrix)
     size = matrix.shape[-1]
     rest = matrix
     q = torch.eye(size, dtype=matrix.dtype, device=matrix.device).expand_as(matrix)

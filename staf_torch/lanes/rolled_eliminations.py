@@ -54,6 +54,29 @@ def triangular(lower: Tensor, right: Tensor, *, unitriangular: bool) -> Tensor:
     return solution
 
 
+def orthogonal(matrix: Tensor) -> tuple[Tensor, Tensor]:
+    """Q and R of a square matrix by Householder's reflections: (..., M, M), (..., M, M)."""
+    size, place = matrix.shape[-1], _places(matrix)
+
+    def reflect(carry: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+        rest, q, done = carry  # column i of the rest is column done + i, cyclically
+        here, open_ = place == done.unsqueeze(-1), place >= done.unsqueeze(-1)
+        column = torch.where(open_, rest[..., 0], 0.0)
+        length = column.square().sum(-1, keepdim=True).sqrt()
+        head = torch.where(column < 0, column - length, column + length)
+        vector = torch.where(here, head, column)
+        square = vector.square().sum(-1, keepdim=True)
+        scaled = torch.where(square > 0, 2 / torch.where(square > 0, square, 1.0), 0.0) * vector
+        rest = rest - scaled.unsqueeze(-1) * (vector.unsqueeze(-1) * rest).sum(-2, keepdim=True)
+        q = q - (q * vector.unsqueeze(-2)).sum(-1, keepdim=True) * scaled.unsqueeze(-2)
+        return torch.cat((rest[..., 1:], rest[..., :1]), dim=-1), q, done + 1
+
+    identity = torch.eye(size, dtype=matrix.dtype, device=matrix.device).expand_as(matrix)
+    start = matrix.clone(), identity.clone(), torch.zeros_like(matrix[..., 0, 0])
+    rest, q, _ = repeat(size - 1, reflect, start)
+    return q, torch.cat((rest[..., 1:], rest[..., :1]), dim=-1).triu()
+
+
 def tridiagonal(gram: Tensor) -> tuple[list[Tensor], list[Tensor]]:
     """The diagonal of Q'KQ, M of (...), and the squares of the entries beside it, M - 1 of (...)."""
     size = gram.shape[-1]

@@ -107,6 +107,10 @@ def test_matrices_of_many_entries_are_factored_a_row_a_pass() -> None:
 def test_triangles_and_inverses_of_many_entries_are_those_of_torch() -> None:
     torch.manual_seed(3)
     matrix, right = torch.randn(5, 9, 9).double() + 5 * torch.eye(9), torch.randn(5, 9, 2).double()
+    q, r = orthogonal(matrix)
+    torch.testing.assert_close(q @ r, matrix, rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(q @ q.mT, torch.eye(9).double().expand_as(q), rtol=1e-12, atol=1e-12)
+    assert torch.equal(r, r.triu())
     torch.testing.assert_close(inverse(matrix)[0], torch.linalg.inv(matrix), rtol=1e-10, atol=1e-12)
     for upper, left, unit in itertools.product([True, False], repeat=3):
         b = right if left else right.mT
