@@ -154,4 +154,13 @@ ACCEPTED: dict[tuple[str, str, str, str], str] = {
         "tqdm(total=total, bar_format=layout, leave=False, disable=None, file=sys.stderr)",
         "tqdm(total=total, bar_format=layout, disable=None, file=sys.stderr)",
     ): "whether the bar of progress stays on a terminal behind the last job",
+    ("staf_torch/results/progress.py", "_LINE_EVERY = 10.0  # s", "10.0", "20.0"): (
+        "seconds between two lines of a log"
+    ),
+    (
+        "staf_torch/approximation/coefficient_format.py",
+        "return torch.tensor(list(json.dumps(record, sort_keys=True).encode()), dtype=torch.uint8)",
+        "json.dumps(record, sort_keys=True)",
+        "json.dumps(record)",
+    ): "the order of names in a record that is read by name",
 }

@@ -210,7 +210,15 @@ MODULES: dict[str, Case] = {
     "FoldedRollout": Case(lambda s: FoldedRollout(rollout(s))),
 }
 OTHERS = {"_Held", "ConventionModule", "FunctionPlant", "StepPlant", "RatePlant"}
-OTHERS |= {"SampledProblem", "GlobalValue", "BoxFilter", "SafetyFilter", "FilteredPolicy", "PlanReplay"}
+OTHERS |= {
+    "SampledProblem",
+    "GlobalValue",
+    "BoxFilter",
+    "SafetyFilter",
+    "FilteredPolicy",
+    "PlanReplay",
+    "RememberedPolicy",
+}
 OTHERS |= {"AmongDiscs"}  # of an experiment
 OTHERS |= {"RecedingHorizon", "PathIntegral", "MujocoPlant", "EnvironmentPlant", "EnergyShaping"}
 OTHERS |= {"NearOptimal", "SampledRollout"}

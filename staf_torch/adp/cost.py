@@ -46,6 +46,8 @@ class Cost(nn.Module, abc.ABC):
         target_input: the input there, m numbers; None for the one that holds the plant there.
         output: y(x), (..., n) -> (..., p), in place of x: e = y(x) - y(target), and Q is (p, p) or a matrix.
         discount: rho in 1/s: what is paid at t counts exp(-rho t).
+        terminal: S of e'Se, (n, n) or a number, paid where plans, shooting and rollouts end, in place of the
+            LQR's value; None for an endless horizon, which all else is for. Not with an output or a discount.
 
     Raises:
         ValueError: if Q is not positive semidefinite or R not positive definite of its size, or another
@@ -65,6 +67,7 @@ class Cost(nn.Module, abc.ABC):
         target_input: Sequence[float] | Tensor | None = None,
         output: Output | None = None,
         discount: float = 0.0,
+        terminal: Matrix | None = None,
     ) -> None:
         super().__init__()
         name = type(self).__name__
@@ -82,6 +85,13 @@ class Cost(nn.Module, abc.ABC):
         self.target_input = _point(name, "target_input", target_input, inputs)
         non_negative(name, "discount", discount)
         self.discount = real(name, "discount", discount)
+        if terminal is not None and (output is not None or self.discount):
+            raise fail(name, "terminal", "must be None beside an output or a discount", terminal)
+        end = None if terminal is None else _square(name, "terminal", terminal, dim)
+        self.register_buffer(
+            "end", None if end is None else positive_semidefinite(name, "terminal", end, dim)
+        )
+        self.end: Tensor | None
         self.periodic: tuple[int, ...] = ()
         bounds = Bounds(low, high, inputs)
         self.bounds: Bounds | None = bounds if bounds.present else None
@@ -154,6 +164,11 @@ class Cost(nn.Module, abc.ABC):
         target = torch.zeros_like(x) if self.target is None else self.target.to(x).expand_as(x)
         return quadratic(self.q, self.output(x) - self.output(target))
 
+    def terminal(self, x: Tensor) -> Tensor:
+        """e'Se, of a cost with a terminal cost: (..., n) -> (...)."""
+        assert self.end is not None
+        return quadratic(self.end, self.deviation(x))
+
     def state_curvature(self) -> Tensor:
         """Half the second derivative of e'Qe at the set-point, (n, n): Q, or C'QC with C = dy/dx."""
         if self.output is None:
@@ -206,9 +221,7 @@ class QuadraticCost(Cost):
     The appendix of the paper loses the minus of the policy.
 
     Example:
-        >>> cost = adp.QuadraticCost(1.0, 0.1, dim=6, inputs=2, low=[-9.81, -1.0], high=[9.81, 1.0])
-
-    Example:
+        >>> bounded = adp.QuadraticCost(1.0, 0.1, dim=6, inputs=2, low=[-9.81, -1.0], high=[9.81, 1.0])
         >>> cost = adp.QuadraticCost(2.0, 0.5, dim=2, inputs=1)  # Q = 2 I, R = 0.5
         >>> float(cost.rate(torch.tensor([1.0, 1.0]).double(), torch.tensor([2.0]).double()))
         6.0

@@ -85,6 +85,10 @@ class GlobalValue(nn.Module):
         super().__init__()
         if problem.path is not None:
             raise fail("GlobalValue", "problem", "must have a goal that stays where it is", problem.path)
+        if not problem.endless:
+            raise fail(
+                "GlobalValue", "problem", "must have no terminal cost: a memory knows no end", problem.end
+            )
         self.problem, self.library = problem, library
         width = region.tolist() if isinstance(region, Tensor) else list(region)
         if min(vector("GlobalValue", "region", width, problem.dim)) <= 0:

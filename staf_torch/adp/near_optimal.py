@@ -31,6 +31,7 @@ _DECAY = 3.0  # time constants of the slowest mode of the LQR in the horizon
 _STEPS = (12, 60)  # periods in the horizon, at least and at most
 _RESOLVED = 0.2  # length of an integration step in time constants of the plant's fastest mode
 _SETTLED = 9.2  # time constants for which the loops of a report run: the slowest mode falls to 1e-4
+_SHARE = 0.5  # of a period that a control may take without a warning: another half for a slower moment
 _REGULATED = 1e-2  # share of the distance from the set-point that is left
 
 
@@ -184,7 +185,7 @@ def near_optimal(
     while. That takes tens of milliseconds a control, and a plant in torch, held for one period of its own,
     without a discount. It regulates more states and is no bound on the cost: every control is planned anew,
     and two ways around that cost nearly the same may take turns. `RecedingHorizon` carries its plan.
-    A simulator so slow that a control takes longer than dt is a warning in the log.
+    A simulator so slow that a control takes more than half of dt is a warning in the log, with the share.
 
     Example:
         >>> import numpy as np
@@ -216,6 +217,9 @@ def near_optimal(
     if isinstance(plant, Clocked):
         rule = "must have no clock: a path is followed by `RecedingHorizon` or `LQR`"
         raise fail("near_optimal", "plant", rule, plant)
+    if cost.end is not None:
+        rule = "must have no terminal cost, as the policy knows no end: plans do, `RecedingHorizon`"
+        raise fail("near_optimal", "cost", rule, cost.end)
     placed = cost.bounded(low, high).around(plant)
     lqr = LQR(plant, placed, period=period)
     seconds = (
@@ -243,21 +247,27 @@ def near_optimal(
 
 
 def _warn_if_slow(policy: NearOptimal) -> None:
-    """One line in the log where a simulator cannot be asked in time."""
+    """One line in the log where a simulator leaves little of the period to anything else, or nothing."""
     x = policy.plant.equilibrium().unsqueeze(0)
-    began = time.perf_counter()
-    with torch.no_grad():
-        policy(x)
-    taken = time.perf_counter() - began
-    if taken > policy.period:
-        _log.warning(
-            "a control of `near_optimal` takes about %.3g s with this %s, longer than the %.3g s for which "
-            "it is held: it cannot run beside the plant. Shorten `horizon` (%d periods now), or use the LQR.",
-            taken,
-            type(policy.plant).__name__,
-            policy.period,
-            policy.steps,
-        )
+    tries = []
+    for _ in range(2):  # the first call loads what later ones find
+        began = time.perf_counter()
+        with torch.no_grad():
+            policy(x)
+        tries.append(time.perf_counter() - began)
+        if tries[-1] <= _SHARE * policy.period:
+            return
+    taken = min(tries)
+    _log.warning(
+        "a control of `near_optimal` takes about %.3g s with this %s, %.0f %% of the %.3g s for which it is "
+        "held: %s. Shorten `horizon` (%d periods now), or use the LQR.",
+        taken,
+        type(policy.plant).__name__,
+        100 * taken / policy.period,
+        policy.period,
+        "it cannot run beside the plant" if taken > policy.period else "a slower moment and it is late",
+        policy.steps,
+    )
 
 
 def _slowest(lqr: LQR, plant: Plant) -> float:

@@ -135,9 +135,8 @@ class RolloutPolicy(nn.Module):
         if kernel is None:
             kernel = GaussianKernel() if isinstance(system, Barrier) else ExponentialKernel()
         basis = StaFBasis(kernel, StateFollowingCenters(directions, radius))
-        return cls(
-            basis, system, cost, lqr, lqr.value, horizon=horizon, steps=steps, depth=depth, period=period
-        )
+        end = lqr.value if cost.end is None else lqr.cost.terminal
+        return cls(basis, system, cost, lqr, end, horizon=horizon, steps=steps, depth=depth, period=period)
 
     def forward(self, x: Tensor) -> Tensor:
         """u: (..., n) -> (..., m)."""

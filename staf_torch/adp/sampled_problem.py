@@ -14,6 +14,7 @@ from torch.nn.functional import pad
 from ..lanes import each
 from ..numerics.angles import wrap
 from ..numerics.checks import fail, integer, positive_real, trailing
+from ..numerics.linalg import positive_semidefinite
 from ..systems import Bounds, Plant
 from ..systems.bounds import Limit
 from .cost import Cost
@@ -49,6 +50,8 @@ class SampledProblem(nn.Module):
         rest: control that keeps it there, (m,); 0 by default.
         path: x_d from t, (...) -> (..., n - 1), for a problem whose last coordinate is the time: the goal
             moves along it. The linear feedback is that of ``goal``, where the plant rests, carried along.
+        terminal: S of d'Sd, paid where a plan ends, (n, n) positive semidefinite, d = x - goal; None for P
+            below, as the problem goes on without an end.
 
     Attributes:
         p: P of the value d'Pd of the best linear feedback near the goal, (n, n), d = x - goal.
@@ -71,6 +74,7 @@ class SampledProblem(nn.Module):
         goal: Tensor | None = None,
         rest: Tensor | None = None,
         path: Path | None = None,
+        terminal: Tensor | None = None,
     ) -> None:
         super().__init__()
         self.step = step
@@ -97,6 +101,11 @@ class SampledProblem(nn.Module):
         self.register_buffer("k", k)
         self.p: Tensor
         self.k: Tensor
+        self.endless = terminal is None
+        if terminal is not None:
+            terminal = positive_semidefinite("SampledProblem", "terminal", terminal, self.dim)
+        self.register_buffer("end", p if terminal is None else terminal)
+        self.end: Tensor
 
     @classmethod
     def of(
@@ -155,6 +164,7 @@ class SampledProblem(nn.Module):
             goal=plant.equilibrium() if isinstance(cost, TrackingCost) else cost.target,
             rest=cost.target_input,
             path=cost.path if isinstance(cost, TrackingCost) else None,
+            terminal=cost.end,
         )
 
     def advance(self, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
@@ -182,9 +192,9 @@ class SampledProblem(nn.Module):
         return self.offset(x, torch.cat((self.path(x[..., -1]), x[..., -1:]), dim=-1))
 
     def terminal(self, x: Tensor) -> Tensor:
-        """d'Pd, the value of the linear feedback, d = x - goal: (..., n) -> (...)."""
+        """What is paid where a plan ends: d'Pd of the linear feedback, or d'Sd: (..., n) -> (...)."""
         d = self.away(x)
-        return ((d.unsqueeze(-2) * self.p).sum(-1) * d).sum(-1)
+        return ((d.unsqueeze(-2) * self.end).sum(-1) * d).sum(-1)
 
     def linear_feedback(self, x: Tensor) -> Tensor:
         """rest - K d within the bounds: (..., n) -> (..., m)."""

@@ -113,7 +113,7 @@ class BoxDDP:
             still = x0.unsqueeze(1).expand(-1, self.steps, -1)
             reference = Reference(still, x0.new_zeros(*expected, n))
         if terminal is None:
-            none, bent = torch.zeros_like(x0), (2 * self.problem.p).expand(len(x0), n, n)
+            none, bent = torch.zeros_like(x0), (2 * self.problem.end).expand(len(x0), n, n)
             goal = self.problem.goal.expand_as(x0)
             if self.problem.path is not None:
                 goal = self.problem.goals(x0, self.steps)[:, -1]

@@ -166,3 +166,8 @@ def test_bad_bounds_are_refused_by_name() -> None:
     with pytest.raises(ValueError, match="diagonal for more than 4 bounded inputs"):
         adp.QuadraticCost(1.0, torch.eye(5).double() + 0.1, 2, 5, low=-1.0)
     assert COST.bounds is None
+
+
+def test_a_cost_with_bounds_saves_only_what_it_was_given() -> None:
+    cost = adp.BoundedInputCost(1.0, 0.1, dim=2, inputs=1, bound=8.0)
+    assert not [name for name in cost.state_dict() if name.rpartition(".")[2].startswith("_")]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import pickle
 from pathlib import Path
 
@@ -116,3 +117,25 @@ def test_plan_takes_over_where_the_lqr_would_meet_a_bound() -> None:
     torch.testing.assert_close(again(x), u)
     assert adp.near_optimal(plant, COST, dt=0.25, plan=True).planner is None
     assert adp.near_optimal(plant, COST, dt=0.25, low=-1.0, high=1.0).planner is None
+
+
+@torch.no_grad()
+def test_another_control_than_the_bases_promises_less_over_both_horizons() -> None:
+    policy = adp.near_optimal(systems.TwoState(), COST, dt=0.1, horizon=0.8)
+    x, discount = drawn(2, 2.0, 300), math.exp(-COST.discount * 0.1)
+
+    def promised(u: torch.Tensor) -> torch.Tensor:
+        after, paid = policy.holding(x, u)
+        promise = policy.rollout(after)
+        return torch.stack((paid + discount * promise.whole, paid + discount * promise.part))
+
+    base, chosen = policy.lqr(x), policy.control(x)
+    other = (chosen != base).any(-1)
+    gain = promised(base) - promised(chosen)
+    assert float(other.double().mean()) > 0.3
+    assert bool((gain[:, other] > 0).all())
+    step = policy.proposal(x, base)  # where none is chosen, none of those that are tried is better in both
+    for share in (1.0, 0.3):
+        tried = base + share * step
+        better = (promised(base) - promised(tried) > 1e-6 * promised(base)).all(0)
+        assert not bool((better & policy.rollout(policy.holding(x, tried)[0]).free & ~other).any())

@@ -181,5 +181,18 @@ def test_simulator_that_is_too_slow_for_its_period_is_said_to_be(caplog: pytest.
 
     with caplog.at_level(logging.WARNING):
         adp.near_optimal(pendulum(slow, dt=0.01), COST, horizon=0.1)
-    assert "longer than the 0.01 s for which it is held" in caplog.text
+    assert "of the 0.01 s for which it is held: it cannot run beside the plant" in caplog.text
     assert "Shorten `horizon` (10 periods now)" in caplog.text
+
+
+@pytest.mark.parametrize(("seconds", "said"), [(0.04, False), (0.06, True), (0.094, True)])
+def test_share_of_the_period_that_a_control_takes_is_said_from_a_half_on(
+    seconds: float, said: bool, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = iter(range(1000))
+    monkeypatch.setattr(time, "perf_counter", lambda: seconds * next(now))
+    with caplog.at_level(logging.WARNING):
+        adp.near_optimal(pendulum(turn, dt=0.1), COST, horizon=0.4)
+    share = f"{100 * seconds / 0.1:.0f} % of the 0.1 s for which it is held: a slower moment and it is late"
+    assert (share in caplog.text) == said
+    assert bool(caplog.text) == said

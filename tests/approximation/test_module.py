@@ -283,3 +283,13 @@ def test_a_model_without_values_says_how_it_gets_them() -> None:
     empty.to_empty(device="cpu")
     with pytest.raises(ValueError, match=r"built on the meta device must be given its values first"):
         empty(torch.zeros(1, 2, dtype=torch.float64))
+
+
+def test_a_model_that_is_reset_knows_nothing_and_stands_at_zero() -> None:
+    model = st.StaF(st.StaFBasis(st.GaussianKernel(), st.StateFollowingCenters(st.rings(3), radius=0.5)))
+    with torch.no_grad():
+        model.coefficients.fill_(2.0)
+        model.state.fill_(1.0)
+    model.reset_parameters()
+    assert not model.coefficients.any()
+    assert not model.state.any()

@@ -10,7 +10,7 @@ import torch
 from composing import settings
 from torch import Tensor
 
-from staf_torch.experiments import rivals
+from staf_torch.experiments import rival_methods, rivals
 from staf_torch.experiments.rival_methods import METHODS, Method, ipopt_program
 from staf_torch.experiments.rival_plants import CASES
 
@@ -81,3 +81,7 @@ def test_unknown_plants_and_methods_are_refused_by_name(tmp_path) -> None:  # ty
     cfg = settings("experiment=rivals", "rivals.plants=[rocket]")
     with pytest.raises(ValueError, match=r"`rivals\(plants=...\)` must be one of .*; got 'rocket'"):
         rivals.run(cfg, tmp_path)
+
+
+def test_the_size_of_a_package_is_that_of_its_files() -> None:
+    assert rival_methods._size("numpy") > 10 * rival_methods._size("pytest") > 0

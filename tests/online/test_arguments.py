@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import pytest
+import torch
 from helpers import tensor, uniform
 from variants import Cauchy
 
 import staf_torch as st
+from staf_torch.online.filter_arguments import directions
 
 
 @pytest.mark.parametrize(
@@ -42,3 +44,15 @@ def test_bad_samples_are_named() -> None:
         model.predict(uniform(3, 5))
     with pytest.raises(ValueError, match="array of numbers"):
         model.predict("no")
+
+
+@pytest.mark.parametrize(("dim", "count"), [(2, 6), (2, 5), (3, 6)])
+def test_directions_are_rings_in_the_plane_and_spread_in_a_ball_elsewhere(dim: int, count: int) -> None:
+    found = directions(st.StaFRegressor(count=count), dim)
+    wanted = st.rings(count) if dim == 2 and count in (3, 6) else st.ball(count, dim)
+    assert torch.equal(found, wanted)
+
+
+@pytest.mark.parametrize("dim", [1, 2, 3, 5])
+def test_as_many_directions_as_a_quadratic_function_has_numbers_by_default(dim: int) -> None:
+    assert directions(st.StaFRegressor(), dim).shape == ((dim + 1) * (dim + 2) // 2, dim)

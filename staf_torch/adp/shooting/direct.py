@@ -68,7 +68,8 @@ class DirectShooting:
         system: the plant, in continuous time and in torch; its rate must have second derivatives.
         cost: the cost rate, without a discount.
         base: the policy to start from, (..., n) -> (..., m), or several; the LQR by default.
-        terminal: V_T, (..., n) -> (...), with two derivatives; the Riccati value by default.
+        terminal: V_T, (..., n) -> (...), with two derivatives; by default the cost's own terminal
+            cost, or else the Riccati value.
         low: of the inputs, as in `systems.Bounds`; by default those of the cost, or else of the plant.
         high: likewise.
         horizon: T in s; by default so long that the slowest mode of the LQR has fallen to 1e-4, and twice to
@@ -110,6 +111,8 @@ class DirectShooting:
             rule = "must have no clock: a path is followed by `BoxDDP`"
             raise fail("DirectShooting", "system", rule, system)
         cost = cost.bounded(low, high).around(system)
+        if cost.end is not None and horizon is None:
+            raise fail("DirectShooting", "horizon", "must be given beside a terminal cost", None)
         if cost.discount:
             raise fail("DirectShooting", "cost", "must have no discount", cost.discount)
         self.stage = Stage(system, cost)
@@ -125,7 +128,7 @@ class DirectShooting:
         self.bases = given
         if terminal is None:
             assert self.lqr is not None
-            terminal = self.lqr.value
+            terminal = self.lqr.value if cost.end is None else cost.terminal
         self.terminal = terminal
         self.stated = (horizon, intervals)
         chosen = _DECAY / rates[0] if horizon is None else horizon
