@@ -105,7 +105,7 @@ def test_jobs_of_many_members_run_whole_on_slurm_with_the_same_bytes(node: Slurm
     for job in "01":
         rows = (place / "slurm" / job / "members.json").read_bytes()
         assert rows == (place / "inline" / job / "members.json").read_bytes()
-        assert len(json.loads(rows)) == 4
+        assert len(json.loads(rows)["members"]) == 4
 
 
 def test_a_cancelled_job_fails_alone_and_is_told_in_a_line(node: SlurmNode, place: Path) -> None:
