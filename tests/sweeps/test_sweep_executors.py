@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import signal
 import subprocess
+import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -15,9 +17,11 @@ from staf_torch.results.progress import SHOWN, Progress
 from staf_torch.sweeps import executors
 from staf_torch.sweeps.batching import Batch, Done, Failed, Outcome, Written, completion, solve
 from staf_torch.sweeps.executors import EXECUTORS, Executor, executor
-from staf_torch.sweeps.executors.slurm import Task
+from staf_torch.sweeps.executors.base import GivenUpError
+from staf_torch.sweeps.executors.slurm import Submitit, Task
 from staf_torch.sweeps.hydra_compat import find_launcher
 from staf_torch.sweeps.launcher import SweepProgress
+from staf_torch.sweeps.workers import LostError
 
 SHORT = ["duration=0.05", "settle_time=0", "figures=false", "history=false"]
 
@@ -118,8 +122,6 @@ def test_an_executor_that_is_none_is_refused(tmp_path: Path) -> None:
 def test_a_library_that_is_not_installed_is_named_with_its_extra(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import sys
-
     monkeypatch.setitem(sys.modules, name, None)
     with pytest.raises(ValueError, match=rf"executor={name}` needs the extra: pip install 'staf_torch\["):
         executor(name, None, {"submitit": {}, "ray": {}}, tmp_path)
@@ -139,6 +141,38 @@ def test_progress_is_one_line_with_what_failed_and_the_time_left(
     lines = capsys.readouterr().err.splitlines()
     assert lines[-2] == "job 3 (seed=1) failed: it diverged"
     assert lines[-1].startswith("4 of 10 jobs done, 1 failed, ")
+
+
+@pytest.mark.parametrize(
+    ("last", "error", "said"),
+    [
+        (
+            "UncompletedJobError: Job not requeued because: timed-out too many times.",
+            GivenUpError,
+            "time limit",
+        ),
+        ("MemoryError: no more memory", LostError, "SLURM job 8 MemoryError: no more memory; its log: 8.err"),
+    ],
+)
+def test_the_last_line_of_a_trace_says_why_a_job_of_slurm_has_no_result(
+    last: str, error: type[Exception], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class AutoExecutor(SimpleNamespace):
+        cluster = "slurm"
+
+        def update_parameters(self, **parameters: Any) -> None:
+            return None
+
+    def result() -> None:  # as submitit says it
+        frame = "-" * 22
+        trace = f"Traceback (most recent call last):\n  File\n{last}\n"
+        where = "You can check full logs with 'job.stderr(0)' or at paths:\n  - 8.err\n  - 8.out"
+        raise RuntimeError(f"Job (task=0) failed with trace:\n{frame}\n{trace}\n{frame}\n{where}")
+
+    monkeypatch.setitem(sys.modules, "submitit", SimpleNamespace(AutoExecutor=AutoExecutor))
+    paths = SimpleNamespace(stderr="8.err", result_pickle=tmp_path)
+    with pytest.raises(error, match=said):
+        Submitit(None, tmp_path, {}).result(SimpleNamespace(job_id="8", paths=paths, result=result))
 
 
 @pytest.mark.parametrize("lost", [0, 2, 9])

@@ -81,7 +81,8 @@ class Sweep:
                 os.dup2(log, stream)
             os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
             signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
-            signal.signal(signal.SIGTERM, signal.SIG_DFL)
+            for number in (signal.SIGTERM, signal.SIGHUP):  # `nohup python kills.py` ignores SIGHUP
+                signal.signal(number, signal.SIG_DFL)
             sys.argv = ["staf", "-m", *line]
             staf.main()
             code = 0

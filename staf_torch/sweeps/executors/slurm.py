@@ -194,9 +194,10 @@ class Submitit(Executor):
         try:
             return unpack(handle.result())
         except Exception as error:
-            said = next((line for line in reversed(str(error).splitlines()) if line.strip()), "")
-            why = f"{self._name(handle)} {said.strip()}; its log: {log}"
-            raise GivenUpError(why) if "timed-out" in said else LostError(why) from error
+            said = _last_of_trace(str(error))
+            timeout = "timed-out" in said  # submitit's word where a job may not begin anew once more
+            why = f"{self._name(handle)} {_FINAL['TIMEOUT'] if timeout else said}; its log: {log}"
+            raise GivenUpError(why) if timeout else LostError(why) from error
 
     def _name(self, job: Any) -> str:
         return f"{'the process' if self._local else 'SLURM job'} {job.job_id}"
@@ -223,3 +224,9 @@ class Submitit(Executor):
         self._states = {**final, **now}
         for job in self._running:
             self._states.setdefault(job, "gone")
+
+
+def _last_of_trace(said: str) -> str:
+    """Return the last line of a job's traceback, which submitit frames by dashes, with its logs below."""
+    lines = said.partition("You can check full logs")[0].splitlines()
+    return next((line.strip() for line in reversed(lines) if line.strip(" -")), "ended without a word")
