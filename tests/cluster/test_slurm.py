@@ -21,6 +21,8 @@ pytest.importorskip("submitit", reason="the extra `slurm` is not installed")
 pytestmark = pytest.mark.skipif(missing() is not None, reason=missing() or "")
 
 SHORT = ["duration=0.05", "settle_time=0", "figures=false", "history=false"]
+MEMBERS = ["members=['kernel=gaussian,matern','seed=0,1'],['kernel=gaussian,matern','seed=2,3']"]
+MEMBERS += ["trajectories=2", *SHORT]
 SLURM = ["hydra.launcher.executor=submitit", "+hydra.launcher.submitit.cluster=slurm"]
 SLOW = '''
 import time
@@ -94,6 +96,18 @@ def test_a_sweep_on_slurm_ends_with_the_bits_of_one_that_is_not(node: SlurmNode,
     assert len(two) == 4
 
 
+def test_jobs_of_many_members_run_whole_on_slurm_with_the_same_bytes(node: SlurmNode, place: Path) -> None:
+    for name, more in (("inline", []), ("slurm", SLURM)):
+        out, _ = (run := staf(node, place, *MEMBERS, *more, f"hydra.sweep.dir={name}")).communicate(
+            timeout=300
+        )
+        assert run.returncode == 0, out
+    for job in "01":
+        rows = (place / "slurm" / job / "members.json").read_bytes()
+        assert rows == (place / "inline" / job / "members.json").read_bytes()
+        assert len(json.loads(rows)["members"]) == 4
+
+
 def test_a_cancelled_job_fails_alone_and_is_told_in_a_line(node: SlurmNode, place: Path) -> None:
     run = staf(node, place, "task=slow.slow", "seed=3,99", *SHORT, *SLURM, "hydra.sweep.dir=sweep")
     wait_for_the_first(run, place)
@@ -132,3 +146,24 @@ def test_a_sweep_that_is_killed_leaves_no_job_behind(node: SlurmNode, place: Pat
         time.sleep(0.2)
     else:
         raise AssertionError(left)
+
+
+def test_a_sweep_whose_controller_is_gone_ends_by_a_signal(node: SlurmNode, place: Path) -> None:
+    run = staf(node, place, "task=slow.slow", "seed=3,99", *SHORT, *SLURM, "hydra.sweep.dir=sweep")
+    wait_for_the_first(run, place)
+    running(node, 1)
+    node.stop("slurmctld")
+    try:
+        run.terminate()
+        out, _ = run.communicate(timeout=60)
+    finally:
+        node.start("slurmctld", "-D")
+    assert run.returncode == 143, out
+    assert "SLURM did not confirm that it cancels 1 jobs" in out
+    assert "1 jobs are complete. Resume with:" in out
+    for _ in range(300):  # the job ends by itself, and the node is free again
+        left = node.run("squeue", "-h", "-o", "%i %T")
+        if left.returncode == 0 and not left.stdout.strip():
+            return
+        time.sleep(0.2)
+    raise AssertionError(left)

@@ -164,7 +164,7 @@ def test_a_signal_of_slurm_ends_the_job_and_is_no_error_of_its_batch(
     before = signal.signal(signal.SIGUSR2, requeued)
     try:
         with pytest.raises(subprocess.CalledProcessError if lost == 9 else SystemExit):
-            Task(None, tmp_path / "lock")(*executors.pack(batch([cfg], tmp_path)))
+            Task(None, None)(*executors.pack(batch([cfg], tmp_path)))
         assert signal.getsignal(signal.SIGUSR2) is requeued
     finally:
         signal.signal(signal.SIGUSR2, before)

@@ -7,7 +7,7 @@ import os
 import random
 import signal
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Protocol
 
@@ -40,6 +40,37 @@ def children(pid: int) -> list[int]:
                 child = int(stat.parent.name)
                 found += [child, *children(child)]
     return found
+
+
+def working_in(place: Path) -> list[int]:
+    """The processes that have that working directory, or one below it."""
+    found = []
+    for link in Path("/proc").glob("[0-9]*/cwd"):
+        with contextlib.suppress(OSError):
+            if Path(os.readlink(link)).is_relative_to(place):
+                found.append(int(link.parent.name))
+    return found
+
+
+@contextlib.contextmanager
+def ended_with_us(place: Path, patience: float = 15.0) -> Iterator[None]:
+    """Where a signal or an error breaks us off, end the processes that work in a folder.
+
+    Args:
+        place: the folder.
+        patience: s from SIGTERM, with which they end what they began, to SIGKILL.
+    """
+    try:
+        yield
+    except BaseException:
+        for number, seconds in ((signal.SIGTERM, patience), (signal.SIGKILL, 5.0)):
+            for pid in working_in(place):
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(pid, number)
+            until = time.monotonic() + seconds
+            while working_in(place) and time.monotonic() < until:
+                time.sleep(0.05)
+        raise
 
 
 def to_parent(number: signal.Signals) -> Harm:

@@ -29,7 +29,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 os.environ["OMP_NUM_THREADS"] = "1"  # torch's threads do not survive a fork
 
 import torch._dynamo  # noqa: E402, F401
-from harms import Harm, deck, full_disk, to_raylet  # noqa: E402
+from harms import Harm, deck, ended_with_us, full_disk, to_raylet, working_in  # noqa: E402
 from slurm_node import SlurmNode, missing  # noqa: E402
 
 import staf_torch.experiments.gradient_chase  # noqa: E402, F401
@@ -135,7 +135,8 @@ def one(
     """One kill in the first ``share`` of a sweep; say what happened, first `same` for the same table."""
     place = base / f"{executor}{chance.randrange(10**9)}"
     apart = executor in ("slurm", "ray")  # their processes are their own daemons' to end
-    with small_disk(place) if harm is full_disk else contextlib.nullcontext(place.mkdir()):
+    disk = small_disk(place) if harm is full_disk else contextlib.nullcontext(place.mkdir())
+    with disk, ended_with_us(place):
         begin = time.monotonic()
         line = [*GRID, *EXECUTORS[executor], "hydra.sweep.dir=sweep"]
         sweep = Sweep(place, line, environment)
@@ -148,7 +149,7 @@ def one(
         said = "it was over before" if sweep.over() else harm(sweep, chance)
         code = sweep.end()
         until = time.monotonic() + STAY
-        while (stayed := 0 if apart else working_in(place)) and time.monotonic() < until:
+        while (stayed := 0 if apart else len(working_in(place))) and time.monotonic() < until:
             time.sleep(0.1)
         (place / "ballast").unlink(missing_ok=True)
         # Where no job had begun, the sweep has taken its directory back and says nothing of resuming.
@@ -166,15 +167,6 @@ def one(
     return "\n".join([f"{verdict}: {executor}, {said} after {moment:.1f} s, {ended}", *trouble])
 
 
-def working_in(place: Path) -> int:
-    """How many processes have that working directory."""
-    found = 0
-    for link in Path("/proc").glob("[0-9]*/cwd"):
-        with contextlib.suppress(OSError):
-            found += os.readlink(link).startswith(str(place))
-    return found
-
-
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--kills", type=int, default=50)
@@ -186,7 +178,7 @@ def main() -> int:
         "--kinds", help="of kills, such as SIGHUP,scancel,node_loss; all, each as often, else"
     )
     chosen = parser.parse_args()
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit("ended by SIGTERM"))  # and the daemons of SLURM with us
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit("ended by SIGTERM"))  # and what we began with us
     path = os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
     environment = {"PYTHONPATH": path}
     absent = {name: name for name in ("ray", "submitit") if importlib.util.find_spec(name) is None}
@@ -210,7 +202,8 @@ def main() -> int:
             begin = time.monotonic()
             place = base / f"whole_{executor}"
             place.mkdir()
-            code = Sweep(place, [*GRID, *EXECUTORS[executor], "hydra.sweep.dir=sweep"], own).end()
+            with ended_with_us(place):
+                code = Sweep(place, [*GRID, *EXECUTORS[executor], "hydra.sweep.dir=sweep"], own).end()
             assert code == 0, (place / "log").read_text()
             wholes[executor] = (place / "sweep" / "table.csv").read_bytes(), time.monotonic() - begin
         wanted = chosen.kinds.split(",") if chosen.kinds else None

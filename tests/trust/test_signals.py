@@ -16,9 +16,36 @@ from command_line import environment
 from staf_torch.cli import staf
 from staf_torch.sweeps import signals
 
+SUBMITIT = """
+import os, types
+from pathlib import Path
+
+class AutoExecutor:
+    '''As submitit's, on a SLURM that runs the first job and then goes away.'''
+    cluster, count = "slurm", 0
+
+    def __init__(self, folder, cluster):
+        self.folder = Path(folder)
+
+    def update_parameters(self, **parameters):
+        pass
+
+    def submit(self, task, *arguments):
+        self.count += 1
+        paths = types.SimpleNamespace(result_pickle=self.folder / str(self.count), stderr="none")
+        if self.count == 1 and os.fork() == 0:
+            try:
+                (self.folder / "partial").write_bytes(task(*arguments))
+                (self.folder / "partial").rename(paths.result_pickle)
+            finally:
+                os._exit(0)
+        read = paths.result_pickle.read_bytes
+        return types.SimpleNamespace(job_id=str(self.count), paths=paths, result=read)
+"""
 SIGNALLED = """
 import os, random, signal, sys, time
 import staf_torch.cli.staf as app
+import staf_torch.sweeps.executors.controller as controller
 import staf_torch.experiments.gradient_chase  # so that the children share it
 import torch._dynamo
 
@@ -57,12 +84,26 @@ for number in (signal.SIGTERM, signal.SIGHUP, signal.SIGINT):
     os.kill(child, number)
     codes[place] = ended(child)
     codes[f"{place} again"] = ended(start(f"{place}2", f"sweep.resume={place}"))
+
+controller._ASK, controller._END = 0.05, 0.3
+os.environ["PATH"] = os.pathsep.join([os.getcwd(), os.environ["PATH"]])
+slurm = ["hydra.launcher.executor=submitit", "+hydra.launcher.submitit.cluster=slurm"]
+child = start("slurm", *GRID, *slurm, "hydra.sweep.dir=slurm")
+while not os.path.exists("squeue.hangs"):
+    time.sleep(0.0005)
+os.kill(child, signal.SIGTERM)
+codes["slurm"] = ended(child)
+codes["slurm again"] = ended(start("slurm2", "sweep.resume=slurm", "hydra.launcher.executor=inline"))
 import json
 print(json.dumps(codes))
 """
 
 
 def test_signals_end_a_sweep_with_its_report_and_the_line_that_resumes(tmp_path: Path) -> None:
+    (tmp_path / "submitit.py").write_text(SUBMITIT)
+    for name, first in (("squeue", "grep -q completed slurm/0/run.json || exit 1"), ("scancel", "")):
+        (tmp_path / name).write_text(f'#!/bin/sh\n{first}\n: > "$0.hangs"\nexec sleep 30\n')
+        (tmp_path / name).chmod(0o755)
     line = [sys.executable, "-c", SIGNALLED]
     run = subprocess.run(line, cwd=tmp_path, env=environment(), capture_output=True, text=True, check=False)
     assert run.returncode == 0, run.stderr
@@ -72,14 +113,16 @@ def test_signals_end_a_sweep_with_its_report_and_the_line_that_resumes(tmp_path:
         ("SIGTERM", 143, "ended by SIGTERM"),
         ("SIGHUP", 129, "ended by SIGHUP"),
         ("SIGINT", 130, "interrupted"),
+        ("slurm", 143, "ended by SIGTERM; 1 jobs are complete"),  # whose commands hang
     ):
         log = (tmp_path / f"{name}.log").read_text()
         assert codes[name] == code, log
-        assert f"staf: {said}; " in log
+        assert f"staf: {said}" in log
         assert f"staf -m sweep.resume={name}" in log
         assert "report: " in log
         assert codes[f"{name} again"] == 1
         assert (tmp_path / name / "table.csv").read_text() == (tmp_path / "whole" / "table.csv").read_text()
+    assert "cancels 11 jobs (scancel did not end in time)" in (tmp_path / "slurm.log").read_text()
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")

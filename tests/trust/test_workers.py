@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 import worker_tasks
 from command_line import environment
+from harms import ended_with_us, working_in
 
 from staf_torch.sweeps.workers import LostError, Worker, beginning, end_with, ready
 
@@ -94,3 +95,17 @@ def gone(pids: list[int]) -> bool:
             return True
         time.sleep(0.1)
     return False
+
+
+def test_kills_that_are_broken_off_leave_no_process(tmp_path: Path) -> None:
+    """One that begins another and ends by SIGTERM, and one that does not care for it."""
+    deaf = "trap '' TERM; : > deaf; while :; do sleep 0.05; done"
+    script = f'(sleep 60 & : > begun; wait) & sh -c "{deaf}" & wait'
+    with subprocess.Popen(["sh", "-c", script], cwd=tmp_path) as run:
+        while not all((tmp_path / name).exists() for name in ("begun", "deaf")):
+            time.sleep(0.01)
+        assert len(working_in(tmp_path)) >= 4
+        with pytest.raises(SystemExit), ended_with_us(tmp_path, 0.2):
+            raise SystemExit
+        assert not working_in(tmp_path)
+        assert run.wait() != 0

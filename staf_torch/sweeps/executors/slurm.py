@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import logging
 import os
 import signal
 import socket
@@ -20,10 +19,10 @@ from ..batching import Batch, Done
 from ..lock import NAME
 from ..workers import LostError, beginning, end_with, end_with_file
 from .base import Executor, GivenUpError
+from .controller import Controller
 from .remote import pack, solve_elsewhere, unpack
 
-_log = logging.getLogger(__name__)
-_LOOK, _ASK = 0.5, 10.0  # s between two looks for results, and two questions to SLURM
+_LOOK = 0.5  # s between two looks for results
 _REQUEUES = 3  # times that a job asks to be put into the queue again
 _GRACE = 20.0  # s that a result may take from another machine to here
 _GOES_ON = {
@@ -44,18 +43,18 @@ class Task:
     Args:
         parent: host, process and beginning of the command, which a job on the same machine ends with; None:
             the job ends when the lock of the sweep is not touched any more.
-        lock: file that the command touches.
+        lock: file that the command touches; None: there is none.
     """
 
-    def __init__(self, parent: tuple[str, int, str] | None, lock: Path) -> None:
+    def __init__(self, parent: tuple[str, int, str] | None, lock: Path | None) -> None:
         self._parent, self._lock = parent, lock
 
     def __call__(self, pickled: bytes, path: Sequence[str], packages: Sequence[str] = ()) -> bytes:
         """Return what `solve_elsewhere` returns."""
         if self._parent is not None and self._parent[0] == socket.gethostname():
             end_with(self._parent[1], self._parent[2])
-        elif self._parent is None and self._lock.exists():
-            end_with_file(self._lock)
+        elif self._lock is not None and self._lock.parent.exists():  # machines may not share that disk
+            end_with_file(self._lock)  # which has gone where the job was waiting when the command ended
         with _ended_by_signals():
             return solve_elsewhere(pickled, path, packages)
 
@@ -128,10 +127,11 @@ class Submitit(Executor):
         self._executor.update_parameters(**{"name": "staf", "timeout_min": 24 * 60, **parameters})
         self._local = self._executor.cluster in ("local", "debug")
         parent = (socket.gethostname(), os.getpid(), beginning(os.getpid())) if self._local else None
-        self._task = Task(parent, (directory / NAME).absolute())
+        lock = (directory / NAME).absolute()
+        self._task = Task(parent, lock if lock.exists() and not self._local else None)
+        self._controller = Controller()
         self._running: dict[str, Any] = {}
         self._states: dict[str, str] = {}
-        self._asked_at = 0.0
         self._ended_at: dict[str, float] = {}  # when a job was first seen to have ended without a result
 
     @staticmethod
@@ -154,14 +154,27 @@ class Submitit(Executor):
         return self.workers if self._asked or self._local else 1
 
     def close(self, *, failed: bool) -> None:
-        for job in self._running.values():
-            job.cancel(check=False)
+        if self._local:
+            for job in self._running.values():
+                job.cancel(check=False)
+        else:
+            self._controller.cancel(list(self._running))
         self._running = {}
 
     def submit(self, batch: Batch, progress: Progress) -> Any:
-        job = self._executor.submit(self._task, *pack(batch))
-        self._running[job.job_id] = job
-        return job
+        packed = pack(batch)
+        submitted: list[Any] = []
+
+        def begin() -> None:
+            job = self._executor.submit(self._task, *packed)
+            self._running[job.job_id] = job
+            submitted.append(job)
+
+        if self._local:
+            begin()
+        else:
+            self._controller.submit(begin)
+        return submitted[0]
 
     def wait(self, handles: dict[int, Any]) -> list[int]:
         while True:
@@ -194,25 +207,17 @@ class Submitit(Executor):
             return True
         if self._local:
             return bool(job.done())
-        self._ask()
-        if self._states.get(job.job_id, "gone") in _GOES_ON:
+        self._look()
+        if self._states.get(job.job_id, "PENDING") in _GOES_ON:
             self._ended_at.pop(job.job_id, None)
             return False
         return time.monotonic() - self._ended_at.setdefault(job.job_id, time.monotonic()) > _GRACE
 
-    def _ask(self) -> None:
-        """Ask the controller for the states of all jobs, now and then: accounting is not needed for that."""
-        if time.monotonic() - self._asked_at < _ASK:
+    def _look(self) -> None:
+        """Take over what the controller says of the jobs, where it says something."""
+        now = self._controller.states()
+        if now is None:
             return
-        self._asked_at = time.monotonic()
-        line = ["squeue", "--noheader", "--me", "--states=all", "--format=%i %T"]
-        try:
-            found = subprocess.run(line, capture_output=True, text=True, timeout=60, check=True).stdout
-        except (OSError, subprocess.SubprocessError) as error:
-            _log.warning("SLURM does not answer (%s); asked again in %.0f s", error, _ASK)
-            self._states = {job: self._states.get(job, "PENDING") for job in self._running}
-            return
-        now = dict(line.split() for line in found.splitlines() if len(line.split()) == 2)
         # The controller forgets what ended; what was known then stays known.
         final = {job: state for job, state in self._states.items() if state not in _GOES_ON}
         self._states = {**final, **now}
