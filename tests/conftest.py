@@ -15,6 +15,9 @@ from pathlib import Path
 import hypothesis
 import pytest
 import torch
+from absent_extras import pytest_make_collect_report, pytest_runtest_makereport
+
+__all__ = ["pytest_make_collect_report", "pytest_runtest_makereport"]
 
 hypothesis.settings.register_profile("suite", max_examples=25, deadline=None, derandomize=True)
 hypothesis.settings.load_profile("suite")

@@ -110,6 +110,13 @@ EYE = torch.eye(2, dtype=torch.float64)
 CONSTANTS = theory.DriftConstants(condition_number=10.0, speed=1.0, growth=0.1)
 GRID = adp.RBFGridBasis(2, 2)
 ACTUATORS = adp.ParametricPlant.of_effectiveness(PLANT)
+
+
+def stream_drift(**given: Any) -> adp.StreamDrift:
+    usual = {"rows": [1], "deviation": 1.0, "length": 0.1}
+    return adp.StreamDrift(PLANT, st.GaussianKernel(2.0), torch.eye(2).double(), **{**usual, **given})
+
+
 WINDOWS, ESTIMATE = adp.IntegralWindows(ACTUATORS, 0.1), adp.LeastSquares([1.0], 0.5)
 
 
@@ -214,6 +221,8 @@ CALLS: dict[str, Callable[..., Any]] = {
     "HistoryStack": lambda **given: adp.HistoryStack(**{"rows": 1, "parameters": 1, **given}),
     "LeastSquares": lambda **given: adp.LeastSquares([1.0], **{"deviation": 1.0, **given}),
     "AdaptiveLQR": lambda **given: adp.AdaptiveLQR(ACTUATORS, COST, WINDOWS, ESTIMATE, **given),
+    "StreamDrift": lambda **given: stream_drift(**given),
+    "DriftLQR": lambda **given: adp.DriftLQR(stream_drift(), COST, **given),
     "riccati_rows": lambda **given: adp.riccati_rows(-EYE, EYE, EYE, EYE, **given),
 }
 """How to call, with arguments that are right beside the one in question."""
@@ -245,6 +254,7 @@ ABSENT |= {
     ("IntegralWindows", "first"),
     ("LeastSquares", "alarm"),
     ("AdaptiveLQR", "a_step"),
+    ("DriftLQR", "a_step"),
     ("PlantEnv", "bound"),
     ("DirectShooting", "iterations"),
     ("DirectShooting", "intervals"),

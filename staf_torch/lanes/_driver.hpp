@@ -16,6 +16,7 @@ struct Call {
 
 constexpr int lanes = COPIES * W, tile_rows = TILE > lanes ? TILE : lanes, room = tile_rows + lanes;
 constexpr int now_bytes = 1 << 15, most_times = 256, least_times = 8, most_kept = 1 << 22;
+constexpr int64_t most_cached = 1 << 22;  // bytes of an output that the caches may hold until somebody reads it
 
 struct Frame {
     REAL *fixed, *carry, *now;
@@ -23,7 +24,7 @@ struct Frame {
     const Slot *outputs;
     REAL *const *data;  // of the outputs
     int rows, times, span;
-    int64_t first, time, every;
+    int64_t first, time, every, recorded;
 };
 static void prepare(const Frame &f, int b);
 static void ahead(const Frame &f);
@@ -141,7 +142,7 @@ struct Work {
         Frame f;
         f.fixed = memory.of(numbers + lanes), f.carry = f.fixed + (ROWS + FIXED) * room, f.now = f.carry + CARRIES * room;
         f.c = call.table, f.outputs = out + SLOTS_CARRY, f.data = out_data + SLOTS_CARRY;
-        f.every = call.every, f.span = span;
+        f.every = call.every, f.span = span, f.recorded = (call.times + call.every - 1) / call.every;
         for (int64_t first; (first = __atomic_fetch_add(&next, tile, __ATOMIC_RELAXED)) < call.rows;) {
             f.first = first, f.rows = int(call.rows - first < tile ? call.rows - first : tile);
             gather(call.slots, data, SLOTS_ROW, first, f.rows, f.fixed);
@@ -160,6 +161,7 @@ struct Work {
                     for (int r = 0; r < f.rows; ++r) to[r * out[s].row] = from[r];
                 }
         }
+        wait_for_streams();
         memory.give_back();
     }
     static void task(void *data) { static_cast<Work *>(data)->run(); }
@@ -181,6 +183,8 @@ struct Recorder {
     INLINE_METHOD void put(int s, int64_t e, int b, int rows, V x) const {
         const Slot &slot = f.outputs[s];
         REAL *to = f.data[s] + f.first + b + place * slot.time + e * slot.entry;
+        const bool far = slot.time * f.recorded > most_cached / int64_t(sizeof(REAL));
+        if (rows >= W && far && reinterpret_cast<uintptr_t>(to) % sizeof(V) == 0) return stream(to, x);
         if (rows >= W) return store(to, x);
         if (rows > 0) store_first(to, x, rows);
     }

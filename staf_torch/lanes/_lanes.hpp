@@ -37,6 +37,27 @@ INLINE V load(const REAL *from) {
     return x;
 }
 INLINE void store(REAL *to, V x) { __builtin_memcpy(to, &x, sizeof x); }
+// Past the caches, where a line need not be read before it is written; `to` is a multiple of the vector.
+INLINE void stream(REAL *to, V x) {
+#if defined(__clang__)
+    __builtin_nontemporal_store(x, reinterpret_cast<V *>(to));
+#elif LANES_512 && LANES_SINGLE
+    __builtin_ia32_movntps512(to, x);
+#elif LANES_512
+    __builtin_ia32_movntpd512(to, x);
+#elif defined(__AVX__) && LANES_SINGLE
+    __builtin_ia32_movntps256(to, x);
+#elif defined(__AVX__)
+    __builtin_ia32_movntpd256(to, x);
+#else
+    store(to, x);
+#endif
+}
+INLINE void wait_for_streams() {
+#if defined(__AVX__)
+    __builtin_ia32_sfence();
+#endif
+}
 INLINE void store_first(REAL *to, V x, int count) {  // fewer than W numbers
 #if LANES_512 && LANES_SINGLE
     __builtin_ia32_storeups512_mask(to, x, (1 << count) - 1);

@@ -99,3 +99,24 @@ def test_costly_functions_of_the_time_alone_are_found_ahead_and_cheap_ones_are_n
     for function, ahead in ((lambda t: t + 1, 0), (lambda t: t.exp().sin(), 1)):
         program = lanes.Program(lambda c, t, row, f=function: (c * f(t), ()))
         assert f" AHEAD = {ahead}," in program.text(carry, now)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("rows", [1024, 1001])
+def test_a_long_history_that_bypasses_the_caches_is_that_of_its_pieces(rows: int, dtype: torch.dtype) -> None:
+    """Lines that begin where a vector does, and lines that do not."""
+    now = torch.rand(rows, 320, 4, dtype=dtype)
+
+    def step(carry: Tensor, now: Tensor, row: object) -> tuple[Tensor, Tensor]:
+        carry = 0.5 * carry + now
+        return carry, carry
+
+    program, carry = lanes.Program(step), torch.zeros(rows, 4, dtype=dtype)
+    after, whole = program(carry, now)
+    assert whole.numel() * whole.element_size() > 2**22
+    pieces = []
+    for piece in now.split(40, dim=1):
+        carry, found = program(carry, piece)
+        pieces.append(found)
+    assert same_bits(whole, torch.cat(pieces, dim=1))
+    assert same_bits(after, carry)

@@ -98,13 +98,14 @@ class StreamDrift:
     ) -> None:
         if not isinstance(known, ControlAffineSystem) or known.dim is None:
             raise fail("StreamDrift", "known", "must be a ControlAffineSystem with `dim`", known)
-        if not kernel.state_free or kernel.scale_slope != 0.0:
+        if not isinstance(kernel, Kernel) or not kernel.state_free or kernel.scale_slope != 0.0:
             raise fail("StreamDrift", "kernel", "must be translation invariant", kernel)
-        if offsets.dim() != 2 or offsets.shape[1] != known.dim or not bool(torch.isfinite(offsets).all()):
-            rule = f"must be finite numbers (M, {known.dim})"
-            raise fail("StreamDrift", "offsets", rule, tuple(offsets.shape))
+        if not isinstance(offsets, Tensor) or offsets.dim() != 2 or offsets.shape[1] != known.dim:
+            raise fail("StreamDrift", "offsets", f"must be numbers (M, {known.dim})", offsets)
+        if not bool(torch.isfinite(offsets).all()) or not bool(offsets.any()):
+            raise fail("StreamDrift", "offsets", "must be finite, and not all of them 0", offsets)
         self.known, self.kernel, self.offsets = known, kernel, offsets.double()
-        self.radius = positive_real("StreamDrift", "offsets", float(self.offsets.norm(dim=-1).max()))
+        self.radius = float(self.offsets.norm(dim=-1).max())
         self.basis = newton_basis(kernel(self.offsets, self.offsets).detach())
         self.deviation = positive_real("StreamDrift", "deviation", deviation)
         self.floor = positive_real("StreamDrift", "floor", floor)
