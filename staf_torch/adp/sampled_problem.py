@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import pad
@@ -14,7 +15,7 @@ from torch.nn.functional import pad
 from ..lanes import each
 from ..numerics.angles import wrap
 from ..numerics.checks import fail, integer, positive_real, trailing
-from ..numerics.linalg import positive_semidefinite
+from ..numerics.linalg import positive_semidefinite, solver
 from ..systems import Bounds, Plant
 from ..systems.bounds import Limit
 from .cost import Cost
@@ -268,18 +269,14 @@ class SampledProblem(nn.Module):
 
     def _regulator(self) -> tuple[Tensor, Tensor]:
         """P and K of the linear-quadratic problem at the goal."""
-        from scipy.linalg import (
-            LinAlgError,
-            solve_discrete_are,
-        )  # half a second that no other import need pay
-
         at = self.derivatives(self.goal.unsqueeze(0), self.rest.unsqueeze(0))
         m, n = self.inputs, self.dim - (self.path is not None)
         a, b, w = at.first[0, :n, :n], at.first[0, :n, -m:], 0.5 * at.cost_second[0]
         q, s, r = w[:n, :n], w[:n, -m:], w[-m:, -m:]
+        solve = solver("solve_discrete_are")
         try:
-            solved = solve_discrete_are(*(t.numpy() for t in (a, b, q, r)), s=s.numpy())
-        except (LinAlgError, ValueError) as error:
+            solved = solve(*(t.numpy() for t in (a, b, q, r)), s=s.numpy())
+        except (np.linalg.LinAlgError, ValueError) as error:
             raise ValueError(
                 "`SampledProblem(step=...)` has no linear-quadratic regulator at the goal: its linearisation "
                 f"cannot be stabilised, or its cost is not convex there ({error})."
