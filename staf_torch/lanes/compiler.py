@@ -18,7 +18,7 @@ _FOLDER = Path(__file__).parent
 _HEADERS = ("_lanes.hpp", "_lanes_functions.hpp", "_driver.hpp")
 _FLAGS: tuple[str, ...] = ("-O2", "-march=native", "-std=c++17", "-shared", "-fPIC", "-w")
 _FLAGS += ("-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math", "-fno-signaling-nans")
-# A long program takes half the time without what looks at all of its loops and branches together.
+# A long program takes GCC half the time without what looks at all of its loops and branches together.
 _LONG, _FLAGS_OF_LONG = 1500, ("-fira-region=one", "-fno-tree-pre", "-fno-gcse")  # lines
 _one_at_a_time = threading.Lock()
 _loaded: dict[str, Callable[..., None]] = {}
@@ -55,8 +55,11 @@ def _build(source: str, path: Path) -> None:
     with tempfile.TemporaryDirectory(dir=path.parent) as scratch:
         text, built = Path(scratch) / "program.cpp", Path(scratch) / path.name
         text.write_text(source, encoding="utf-8")
-        more = _FLAGS_OF_LONG if source.count("\n") > _LONG else ()
-        _run([_compiler(), *_FLAGS, *more, "-I", str(_FOLDER), str(text), "-o", str(built)])
+        compiler = _compiler()
+        # Clang, which also answers to the name of g++, knows none of these.
+        long = source.count("\n") > _LONG and "clang" not in _version(compiler).lower()
+        more = _FLAGS_OF_LONG if long else ()
+        _run([compiler, *_FLAGS, *more, "-I", str(_FOLDER), str(text), "-o", str(built)])
         seal(built)
         os.replace(built, path)
 
@@ -76,4 +79,9 @@ def _key(source: str) -> str:
 def _surroundings(compiler: str) -> tuple[str, ...]:
     """What the machine code depends on beside the text."""
     headers = (_FOLDER.joinpath(name).read_text(encoding="utf-8") for name in _HEADERS)
-    return (*headers, *_FLAGS, *_FLAGS_OF_LONG, _run([compiler, "--version"]), _processor())
+    return (*headers, *_FLAGS, *_FLAGS_OF_LONG, _version(compiler), _processor())
+
+
+@functools.cache
+def _version(compiler: str) -> str:
+    return _run([compiler, "--version"])

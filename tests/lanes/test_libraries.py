@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import ctypes
+import shutil
 from pathlib import Path
 
 import pytest
+import torch
 
-from staf_torch.lanes import build
+from staf_torch.lanes import Program, build, compiler
 
 needs_compiler = pytest.mark.skipif(not build.compiler(), reason="needs a C++ compiler")
 
@@ -33,3 +35,17 @@ def test_damaged_library_in_the_cache_is_built_anew(
     assert build._library(source, ()) == path
     assert path.read_bytes() == content
     assert ctypes.CDLL(str(path)).staf_seven() == 7
+
+
+@pytest.mark.parametrize("name", ["g++", "clang++"])
+def test_a_long_program_is_built_by_every_compiler(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Options that spare one compiler half of its time are errors to another."""
+    if shutil.which(name) is None:
+        pytest.skip(f"there is no {name} here")
+    monkeypatch.setenv("CXX", name)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    short = Program(lambda x, *_: (x + 1, x)).text(torch.zeros(1), steps=1)
+    compiler.function(short + f"// {name}\n" * (compiler._LONG + 1))
+    assert len(list((tmp_path / "staf_torch").glob("lanes-*.so"))) == 1
