@@ -1,4 +1,4 @@
-"""Whether settings ask for one run or for a sweep (`hydra.mode`), read from one file in place of a composition."""
+"""Whether settings ask for one run or for a sweep (`hydra.mode`), read from one file, not composed."""
 
 from __future__ import annotations
 
