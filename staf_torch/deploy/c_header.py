@@ -20,7 +20,7 @@ from ..lanes import Program
 from ..lanes.combinators import Tree
 from ..lanes.given import Given
 from ..lanes.graph import WIDE, Graph
-from ..lanes.program import trace
+from ..lanes.one_row import trace
 from ..lanes.schedule import Schedule
 from ..lanes.tracer import NotLoweredError
 from .controllers import check_bounded
