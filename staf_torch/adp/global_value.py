@@ -265,7 +265,8 @@ class GlobalValue(nn.Module):
         along, axes = torch.linalg.eigh(self.region.unsqueeze(-1) * curvature * self.region)
         metric = ((axes * along.abs().unsqueeze(-2)) @ axes.mT).mean(0)
         metric = metric + _ROUND * metric.diagonal().mean() * torch.eye(n, dtype=torch.float64)
-        return torch.linalg.cholesky(metric / self.region / self.region.unsqueeze(-1))
+        frame: Tensor = torch.linalg.cholesky(metric / self.region / self.region.unsqueeze(-1))
+        return frame
 
     def _plans(self) -> Tensor:
         """What is followed: the library, and then the goal under its linear feedback."""
