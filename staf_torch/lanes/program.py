@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from . import compiler, trace_cache
+from .alone import doubt, undrawn
 from .combinators import Tree
 from .content import signature, skeleton
 from .emission import emit
@@ -72,6 +73,9 @@ class Program:
         self._model: tuple[Program, Mapping[int, Tensor]] | None = None
         self._described: tuple[bytes, Sequence[Tensor]] | None = None
         self._watch: Watch | None = None  # of what the step of a user reads, once it is compiled
+        self.of_users = isinstance(step, FunctionType) and is_users(step)  # or reads what a user wrote
+        self._asked = 0  # rows with which `doubt` was asked
+        self._refused: str | None = None  # why its rows are not alone
 
     def described(self, by: bytes | None, tensors: Sequence[Tensor]) -> None:
         """Let traces go through the user's cache.
@@ -81,6 +85,7 @@ class Program:
             tensors: all floating-point tensors that the step reads.
         """
         self._described = None if by is None else (by, tensors)
+        self.of_users = by is None
 
     def with_others(self, step: Step, others: Sequence[tuple[Tensor, Tensor]]) -> Program:
         """Return the program of a step that differs in captured tensors alone: nothing is traced again.
@@ -95,6 +100,7 @@ class Program:
         """
         program = Program(step, name=self.name, compile=self.compile, copies=self.copies)
         program._model = self, {id(old): new for old, new in others}
+        program.of_users, program._asked, program._refused = self.of_users, self._asked, self._refused
         return program
 
     def __call__(
@@ -215,14 +221,25 @@ class Program:
         if key not in self._compiled:
             self._compiled[key] = self._again(key) or self._build(given, copies)
         built = self._compiled[key]
-        return None if built is None else built.compiled
+        return None if built is None or not self._alone(given) else built.compiled
+
+    def _alone(self, given: Given) -> bool:
+        """Whether a step of a user may be written down with a single row: asked for one row, and for more."""
+        rows = min(given.rows, 2)
+        if self.of_users and self._asked < rows:
+            self._asked = rows
+            self._refused = self._refused or doubt(self.step, given)
+            if self._refused is not None:
+                _say(self.name, f"its step {self._refused}")
+        return self._refused is None
 
     def _look_around(self) -> None:
         """Forget what was compiled of a step that now reads something else."""
         if self._watch is not None and not self._watch.unchanged():
             self._compiled.clear()
             self._prepared.clear()
-            self._watch = self._model = None
+            self._watch = self._model = self._refused = None
+            self._asked = 0
 
     def _again(self, key: Hashable) -> _Built | None:
         """The program of the model with a table of other numbers, None where that cannot be."""
@@ -241,16 +258,13 @@ class Program:
             watch = Watch(self.step)
             self._watch = None if watch.blind else watch
         try:
-            made = self._known(given, copies)
+            with undrawn():
+                made = self._known(given, copies)
             if (lines := made.text.source.count("\n")) > _LONGEST:
                 raise NotLoweredError(f"the program is {lines} lines long, which take a compiler minutes")
             call = compiler.function(made.text.source)
         except (NotLoweredError, OSError) as error:
-            reason = " ".join(str(error).split())[:400]
-            told = self.name, "no build" if isinstance(error, OSError) else reason
-            if told not in _said:
-                _said.add(told)
-                _log.warning("%s runs in plain torch, slower: %s", self.name, reason)
+            _say(self.name, str(error), "no build" if isinstance(error, OSError) else None)
             return None
         table = made.text.numbers(made.recipe.values, made.real)
         shapes = tuple((leaf.shape[1:], leaf.dtype) for leaf in given.carry)
@@ -269,6 +283,15 @@ class Program:
             found = _written(self.step, given, copies)
             trace_cache.save(path, found, tensors)
         return found
+
+
+def _say(name: str, reason: str, kind: str | None = None) -> None:
+    """Log why a program runs in plain torch, once for a reason or a kind of reasons."""
+    reason = " ".join(reason.split())[:400]
+    told = name, reason if kind is None else kind
+    if told not in _said:
+        _said.add(told)
+        _log.warning("%s runs in plain torch, slower: %s", name, reason)
 
 
 def _written(step: Step, given: Given, copies: int) -> Trace:
