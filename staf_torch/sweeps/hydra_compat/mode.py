@@ -29,7 +29,8 @@ def mode_read_from_its_file() -> Iterator[None]:
     That version composes all settings once to look at this key, and once more to run. In `conf/` files of
     `experiment` alone set the key (a test says so); where the user's settings may do so, Hydra composes.
     """
-    composed: Callable[[Hydra, str | None, list[str]], Any] = Hydra.get_mode
+    application: Any = Hydra
+    composed: Callable[[Hydra, str | None, list[str]], Any] = application.get_mode
 
     def get_mode(self: Hydra, config_name: str | None, overrides: list[str]) -> Any:
         providers = {place.provider for place in self.config_loader.get_search_path().get_path()}
@@ -38,11 +39,11 @@ def mode_read_from_its_file() -> Iterator[None]:
         known, mode = _written(overrides)
         return mode if known else composed(self, config_name, overrides)
 
-    Hydra.get_mode = get_mode
+    application.get_mode = get_mode
     try:
         yield
     finally:
-        Hydra.get_mode = composed
+        application.get_mode = composed
 
 
 def _written(overrides: Sequence[str]) -> tuple[bool, RunMode | None]:
