@@ -21,7 +21,7 @@ from .lowering import lower
 from .patches import unpatched
 from .plan import Compiled, Plan, form, ordinary
 from .scalar_text import Names, c_text
-from .statements import Layout
+from .schedule import Layout
 from .trace_cache import Trace
 from .tracer import NoReading, NotLoweredError, Tracer
 from .tree import Shared, flatten, labels, plain, unflatten
