@@ -126,6 +126,8 @@ def simulate(
     more = {"integrator": integrator, "substeps": substeps, "renew": renew, "limit": limit}
     loop = ClosedLoop(controller, system, cost, dt=dt, **more)  # type: ignore[arg-type]
     loop.to(x0.device)
+    if isinstance(controller, Feedback):
+        controller.check(x0)
     if isinstance(controller, Feedback) and x0.device.type == "cpu":
         warn_if_unstable(controller.policy, system, cost, dt)
     worth = worth and system.traceable
