@@ -20,7 +20,6 @@ from .one_row import Step, trace
 from .patches import unpatched
 from .plan import Compiled, Plan, form, ordinary
 from .scalar_text import Names, c_text
-from .schedule import Layout
 from .surroundings import is_users
 from .trace_cache import Trace
 from .tracer import NotLoweredError
