@@ -19,7 +19,7 @@ struct Rules {  // see bank.py
     double quadratic_forgetting[lanes], quadratic_prior[lanes], pace, correction_prior, correction_forgetting;
     double correction_most, correction_discount, correction_share, least, doubt;
     double doubtful, doubtful_outside, outside, rare, doubted_rate, settled;
-    double squares_discount, squares_rate, squares_share, own_rate, best_rate, largest, uncalibrated;
+    double squares_discount, squares_rate, squares_share, own_rate, best_rate, largest, uncalibrated, searched_at;
     TrackerRules trackers;
     Functions functions;
 };
@@ -34,6 +34,8 @@ struct Stream {  // the row of a stream in the table of bank.py
     Quadratics quadratics;
     double quadratic_error[K][lanes];
     Trackers trackers;
+    Row tracker_rate, tracker_noise, tracker_forgetting;  // in place of those of the rules, once they are learned
+    double metric[n][n];
     double weights[K][clocks][members], clock_weights[K][clocks], excess[K][members], usual[K][members];
     double squares[K][members];
     double error[K], pace[K], own[K], best[K], low[K], high[K], calibration[K];

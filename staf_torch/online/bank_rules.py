@@ -12,7 +12,9 @@ MEMBERS = LOCAL + CARRIED + QUADRATIC + TRACKERS + 2  # ... and the linear model
 CLOCKS, BLENDS = 3, 3
 GROUPS = 11  # of members whose predictions correct the mixture: see `group`
 MOST_FEATURES = 120  # of a quadratic model: beyond, squares without products, or the coordinates alone
-TRACKED = 64  # places for the samples of a tracker
+TRACKED = 96  # places for the samples of a tracker
+SEARCHED = 128  # samples by whose likelihood hyperparameters of trackers are learned
+TURNED, PLAIN, FADING, TURNED_FADING = 0, 1, 4, 5  # these trackers
 RECENT = 64  # samples that are always kept
 CARRIED_WIDTH, CARRIED_RADIUS = 8.0, 0.1  # of the filters: in sqrt(n), in widths
 
@@ -101,6 +103,7 @@ class Rules(NamedTuple):
     own_rate: float = 0.05  # of the running squared error of the prediction
     best_rate: float = 0.005  # of the least one of the three mixtures
     largest: float = 400.0  # running squares that a square counts at most there
+    searched_at: float = 40.0  # samples from which hyperparameters of trackers are learned with the units
     tracker_width: tuple[float, ...] = (0.5, 2.0, 2.0, 4.0, 1.0, 8.0, 4.0, 1.0)  # in sqrt(n)
     tracker_noise: tuple[float, ...] = (0.1, 1e-4, 1e-2, 0.1, 1e-4, 1e-4, 1e-4, 1e-2)  # variances
     tracker_forgetting: tuple[float, ...] = (1.0, 1.0, 1.0, 1.0, 0.999, 0.999, 0.99, 0.99)
@@ -133,7 +136,8 @@ class Rules(NamedTuple):
         found += [self.correction_share, self.least, self.doubt, self.doubtful, self.doubtful_outside]
         found += [self.outside, self.rare, self.doubted_rate, self.settled]
         found += [self.squares_discount, self.squares_rate, self.squares_share, self.own_rate]
-        found += [self.best_rate, self.largest, self.uncalibrated, *self.tracker_rate, *self.tracker_noise]
+        found += [self.best_rate, self.largest, self.uncalibrated, self.searched_at]
+        found += [*self.tracker_rate, *self.tracker_noise]
         return [*found, *self.tracker_forgetting, self.tracker_jitter, self.tracker_wrong]
 
 
@@ -165,6 +169,8 @@ def layout(shape: BankShape) -> list[tuple[str, tuple[int, ...]]]:
         ("tracker_weights", (k, TRACKED, TRACKERS)),
         *((f"tracker_{name}", (TRACKED * (TRACKED + 1) // 2, TRACKERS)) for name in ("known", "inverse")),
         ("tracker_counts", (3, TRACKERS)),
+        *((f"tracker_{name}", (TRACKERS,)) for name in ("rate", "noise", "forgetting")),
+        ("metric", (n, n)),  # A: two trackers see A'x
         ("weights", (k, CLOCKS, MEMBERS)),  # logarithms
         ("clock_weights", (k, CLOCKS)),
         ("excess", (k, MEMBERS)),
