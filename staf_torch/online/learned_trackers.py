@@ -1,7 +1,8 @@
 """Hyperparameters of four trackers by their likelihood on a stretch of samples: the definition.
 
 A process with the kernel exp(-rate |x - z|^2 - fade |t - s|), noise in units of its amplitude, and the
-likeliest amplitude has the log likelihood -K/2 log det G - m/2 sum_o log(y_o' G^-1 y_o), G the kernels with noise.
+likeliest amplitude has the log likelihood -K/2 log det G - m/2 sum_o log(y_o' G^-1 y_o), G the kernels with
+noise.
 The best of a grid is refined. One tracker takes it, one the best that fades, and two the same in coordinates
 A'x in which directions count as the function changes along them: A A' is the mean outer product of the
 process's gradients, plus a tenth of its trace.
