@@ -20,7 +20,7 @@ from ..lanes import Program
 from ..lanes.combinators import Tree
 from ..lanes.given import Given
 from ..lanes.graph import WIDE, Graph
-from ..lanes.program import trace
+from ..lanes.one_row import trace
 from ..lanes.schedule import Schedule
 from ..lanes.tracer import NotLoweredError
 from .controllers import check_bounded
@@ -140,7 +140,7 @@ def _write_remembered(
     program, row, names = module.program(), module.row(x), ["cost", "control"]
     one = _counted(program, (), row)
     plans, (searched, n) = module.candidates + 1, module.searched.shape
-    compared = searched * (5 * n + 1)
+    compared = searched * (3 * n + 1) + n * (2 * n + 4)
     tables = sum(getattr(module, name).numel() for name in ("plans", "models", "searched"))
     whole = Source(tables + one.constants, plans * one.flops + compared, plans * one.functions)
     follow = program.c_source("staf_follow", (), (), row, outputs=names)

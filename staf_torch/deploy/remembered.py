@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Sequence
 
 import torch
@@ -15,7 +16,7 @@ from ..lanes import Program
 
 class RememberedPolicy(nn.Module):
     """u of a `GlobalValue`: the first control of the cheapest of the K remembered plans nearest to x and of
-    the goal's feedback, each followed from x. All J states that are searched are compared with x, one after
+    the goal's feedback, each followed from x. All S states that are searched are compared with x, one after
     the other, so that a call takes the same work at every state.
 
     Example:
@@ -37,7 +38,8 @@ class RememberedPolicy(nn.Module):
     Attributes:
         plans: state, control and feedback of every step and at last of the goal, (P, n + m + m n).
         models: state, value, gradient and curvature where candidates end, (E, n + 1 + n + n n).
-        searched: the states that are searched, in units of the region, (J, n).
+        searched: the J states that are searched, in `GlobalValue.seen`'s coordinates, and their images a turn
+            away where a coordinate is periodic, (S, n).
         first: the row of ``plans`` of every candidate, (J + 1,); the last one is the goal's feedback.
         last: the row of the end of its trajectory, (J + 1,).
         end: the row of ``models``, (J + 1,).
@@ -55,11 +57,10 @@ class RememberedPolicy(nn.Module):
         kept = used.unsqueeze(1) * length + torch.arange(steps + 1)
         ends = which * length + (time + self.lookahead).clamp(max=steps)
         models, end = ends.unique(return_inverse=True)
-        period = torch.zeros(problem.dim, dtype=torch.float64)
-        period[list(problem.periodic)] = 2 * torch.pi / memory.region[list(problem.periodic)]
         tables = {
             "region": memory.region.clone(),
-            "period": period,  # of a coordinate in units of the region, (n,); 0: it has none
+            "frame": memory.frame.clone(),
+            "searched": memory.images(),
             "plans": memory.plans[kept.flatten()],
             "models": memory.models[models],
         }
@@ -69,22 +70,21 @@ class RememberedPolicy(nn.Module):
         for name, table in integers.items():
             self.register_buffer(name, table)
         self.region: Tensor
-        self.period: Tensor
+        self.frame: Tensor
+        self.searched: Tensor
         self.plans: Tensor
         self.models: Tensor
         self.first: Tensor
         self.last: Tensor
         self.end: Tensor
-        self.register_buffer("searched", self._scaled(self.plans[self.first[:-1], : problem.dim]))
-        self.searched: Tensor
 
     def forward(self, x: Tensor) -> Tensor:
         """u: (B, n) -> (B, m)."""
-        count = self.candidates + 1
-        apart = (self._scaled(x).unsqueeze(1) - self.searched).abs()  # (B, J, n)
-        around = torch.where(self.period > 0, (self.period - apart).abs(), apart)
-        near = torch.minimum(apart, around).square().sum(-1).topk(self.candidates, largest=False).indices
-        at = torch.cat((near, torch.full_like(near[:, :1], len(self.searched))), dim=1).flatten()
+        count, states = self.candidates + 1, len(self.first) - 1
+        seen = self.problem.offset(x, self.problem.goal) @ self.frame
+        apart = (seen.unsqueeze(1) - self.searched).square().sum(-1)  # (B, S)
+        near = apart.topk(self.candidates, largest=False).indices % states
+        at = torch.cat((near, torch.full_like(near[:, :1], states)), dim=1).flatten()
         ahead = self.first[at].unsqueeze(1) + torch.arange(self.lookahead)
         window = self.plans[torch.minimum(ahead, self.last[at].unsqueeze(1))]
         rows = x.unsqueeze(1).expand(-1, count, -1).flatten(0, 1)
@@ -114,30 +114,25 @@ class RememberedPolicy(nn.Module):
         """The header: tables, the text ``follow`` of `program` as ``staf_follow``, and the search."""
         real = "float" if self.plans.dtype == torch.float32 else "double"
         n, m = self.problem.dim, self.problem.inputs
-        floats = ("plans", "models", "searched", "region", "period")
+        floats = ("plans", "models", "searched", "frame")
         tables = [_table(real, f"staf_{name}", getattr(self, name), real == "float") for name in floats]
         whole = ("first", "last", "end")
         tables += [_table("int", f"staf_{name}", getattr(self, name), False) for name in whole]
         sizes = {
             **{"REAL": real, "N": n, "M": m, "WIDTH": self.plans.shape[1], "MODEL": self.models.shape[1]},
-            **{"J": len(self.searched), "K": self.candidates, "H": self.lookahead},
-            **{"ABS": "fabs", "FLOOR": "floor", "CONTROL": outputs[0]},
+            **{"S": len(self.searched), "J": len(self.first) - 1, "K": self.candidates, "H": self.lookahead},
+            **{"ROUND": "rint", "CONTROL": outputs[0]},
             "GOAL": ", ".join(repr(float(g)) for g in self.problem.goal),
+            "PERIOD": ", ".join(repr(2 * math.pi) if i in self.problem.periodic else "0" for i in range(n)),
         }
         if real == "float":
-            sizes |= {"ABS": "fabsf", "FLOOR": "floorf"}
+            sizes["ROUND"] = "rintf"
         text = _SEARCH
         for name, value in sizes.items():
             text = text.replace(f"@{name}@", str(value))
         lines = ["/*", *(f" * {line}".rstrip() for line in note.replace("*/", "* /").splitlines()), " */"]
         head = ["#ifndef STAF_H", "#define STAF_H", "", follow.strip(), ""]
         return "\n".join([*(lines if note else []), *head, *tables, text, "#endif"]) + "\n"
-
-    def _scaled(self, x: Tensor) -> Tensor:
-        """Coordinates of the search, in units of the region, periodic ones in one period: (B, n)."""
-        scaled = (x - self.problem.goal) / self.region
-        turns = torch.where(self.period > 0, (scaled / self.period).floor(), 0.0)
-        return scaled - torch.where(self.period > 0, turns * self.period, 0.0)
 
 
 def _table(kind: str, name: str, table: Tensor, single: bool) -> str:
@@ -152,27 +147,26 @@ def _broken(numbers: list[str]) -> str:
 
 _SEARCH = """static inline void staf(const @REAL@ state[@N@], @REAL@ @CONTROL@[@M@])
 {
-    static const @REAL@ goal[@N@] = { @GOAL@ };
-    @REAL@ at[@N@], far[@K@], least = (@REAL@)INFINITY;
+    static const @REAL@ goal[@N@] = { @GOAL@ }, period[@N@] = { @PERIOD@ }; /* 0: no angle */
+    @REAL@ at[@N@] = { 0 }, far[@K@], least = (@REAL@)INFINITY;
     int near[@K@ + 1];
     for (int i = 0; i < @N@; ++i) {
-        at[i] = (state[i] - goal[i]) / staf_region[i];
-        if (staf_period[i] > 0) at[i] -= @FLOOR@(at[i] / staf_period[i]) * staf_period[i];
+        @REAL@ away = state[i] - goal[i];
+        if (period[i] > 0) away -= @ROUND@(away / period[i]) * period[i];
+        for (int k = 0; k < @N@; ++k) at[k] += away * staf_frame[i * @N@ + k];
     }
     for (int k = 0; k < @K@; ++k) far[k] = (@REAL@)INFINITY, near[k] = k;
     near[@K@] = @J@; /* the goal's own feedback */
-    for (int j = 0; j < @J@; ++j) { /* the @K@ nearest, the nearest first */
+    for (int j = 0; j < @S@; ++j) { /* the @K@ nearest, the nearest first */
         @REAL@ square = 0;
         for (int i = 0; i < @N@; ++i) {
-            @REAL@ apart = @ABS@(at[i] - staf_searched[j * @N@ + i]);
-            const @REAL@ around = @ABS@(staf_period[i] - apart);
-            if (staf_period[i] > 0 && around < apart) apart = around;
+            const @REAL@ apart = at[i] - staf_searched[j * @N@ + i];
             square += apart * apart;
         }
         if (!(square < far[@K@ - 1])) continue;
         int k = @K@ - 1;
         for (; k > 0 && square < far[k - 1]; --k) far[k] = far[k - 1], near[k] = near[k - 1];
-        far[k] = square, near[k] = j;
+        far[k] = square, near[k] = j % @J@; /* an image stands for its state */
     }
     for (int k = 0; k <= @K@; ++k) {
         @REAL@ window[@H@ * @WIDTH@], cost[1], control[@M@];

@@ -3,29 +3,33 @@
 from __future__ import annotations
 
 import copyreg
+import hashlib
 import io
 import pickle
 import sys
 from collections.abc import Hashable, Iterable, Mapping
-from itertools import chain
-from operator import is_
-from types import BuiltinFunctionType, FunctionType, MethodType
+from types import BuiltinFunctionType, CellType, CodeType, FunctionType, MethodType, ModuleType
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
+
+from .surroundings import EMPTY, Lookup, Same, content_of, installed, is_users, lookups
 
 
 def skeleton(*objects: Any) -> tuple[Hashable, list[Tensor]] | None:
     """Return a key of the settings inside of objects, and the floating-point tensors that it leaves out.
 
-    They come in an order that equal keys share. None where an object holds a closure.
+    They come in an order that equal keys share. A function of a user counts with all that it reads: what it
+    closes over, its defaults, the globals that it names, and so on through the functions that it calls. None
+    where something cannot be written down (an open file, a lock).
 
     Args:
-        objects: modules, tensors, anything that can be pickled.
+        objects: modules, tensors, functions, anything that can be pickled.
     """
-    writer = _written(objects)
-    return None if writer is None else ((writer.file.getvalue(), tuple(writer.kept)), writer.tensors)
+    writer = written(objects)
+    return None if isinstance(writer, str) else ((writer.file.getvalue(), tuple(writer.kept)), writer.tensors)
 
 
 def signature(key: Any) -> bytes | None:
@@ -40,6 +44,8 @@ def signature(key: Any) -> bytes | None:
     text, kept = key
     names = list[str]()
     for value in kept:
+        if isinstance(value, CodeType | Same):
+            return None
         module, name = getattr(value, "__module__", None) or "", value.__qualname__
         found: Any = sys.modules.get(module)
         for part in name.split("."):
@@ -55,76 +61,47 @@ _VERSIONED = frozenset((__name__.partition(".")[0], "torch", "numpy", *sys.stdli
 }
 
 
-class Watch:
-    """Says whether objects are as they were: nothing inside of them has been put in the place of another.
-
-    Args:
-        objects: as of `skeleton`.
-
-    Attributes:
-        tensors: inside of them.
-        blind: whether something inside cannot be watched.
-    """
-
-    def __init__(self, *objects: Any) -> None:
-        writer = _written(objects)
-        self.blind = writer is None or writer.blind
-        if writer is None:
-            return
-        self.tensors = [*writer.tensors, *writer.others]
-        self._versions = [tensor._version for tensor in self.tensors]
-        self._dicts, self._lists = writer.dicts, writer.lists
-        self._sets = [(part, set(part)) for part in writer.sets]
-        self._code = _inside(writer.kept)
-        self._lengths, self._inside = self._look()
-
-    def unchanged(self) -> bool:
-        """Return whether nothing has changed since."""
-        if self.blind:
-            return False
-        lengths, inside = self._look()  # all at once: a hundred containers in ten microseconds
-        if lengths != self._lengths or not all(map(is_, inside, self._inside)):
-            return False
-        if any(now != then for now, then in self._sets):
-            return False
-        return [tensor._version for tensor in self.tensors] == self._versions
-
-    def _look(self) -> tuple[list[int], list[Any]]:
-        """The lengths of all containers, and what is in them."""
-        parts: list[Iterable[Any]] = [part.values() for part in self._dicts]
-        parts += [part.values() for part in self._code]  # a method may be replaced
-        parts += self._lists
-        return [*map(len, self._dicts), *map(len, self._code), *map(len, self._lists)], [
-            *chain.from_iterable(parts)
-        ]
-
-
 def code(key: Any) -> list[Mapping[str, Any]]:
     """Return what is in the classes that a key of `skeleton` names, and in their bases: methods above all."""
     _, kept = key
-    return _inside(kept)
+    return inside_classes(kept)
 
 
-def _inside(kept: Iterable[object]) -> list[Mapping[str, Any]]:
+def inside_classes(kept: Iterable[object]) -> list[Mapping[str, Any]]:
+    """Return what is in the classes among what was kept, and in their bases.
+
+    Args:
+        kept: of a `Writer`.
+    """
     kinds = (kind for each in kept if isinstance(each, type) for kind in each.__mro__)
     return [vars(kind) for kind in dict.fromkeys(kinds) if kind is not object]
 
 
-def _written(objects: tuple[Any, ...]) -> _Writer | None:
-    writer = _Writer(io.BytesIO())
+def written(objects: tuple[Any, ...]) -> Writer | str:
+    """Return what has read all that objects hold, or why it could not.
+
+    Args:
+        objects: as of `skeleton`.
+    """
+    writer = Writer(io.BytesIO())
     try:
         for each in objects:
             writer.dump(each)
-    except (pickle.PicklingError, TypeError, AttributeError):
-        return None
+        writer.finish()
+    except (pickle.PicklingError, TypeError, AttributeError) as error:
+        return str(error)
     return writer
 
 
 _ATOMS = frozenset((str, int, float, bool, bytes, tuple, type(None)))  # and what an address alone tells apart
-_FIXED = (tuple, type, FunctionType, BuiltinFunctionType, MethodType, torch.dtype, torch.device, frozenset)
+_SMALL = 1 << 14  # bytes of an array that are compared at every call
+_FIXED = (
+    *(tuple, type, frozenset, complex, slice, range, np.generic, np.dtype, torch.dtype, torch.device),
+    *(FunctionType, BuiltinFunctionType, MethodType),
+)
 
 
-class _Writer(pickle.Pickler):
+class Writer(pickle.Pickler):
     """Writes everything but floating-point tensors, and notes what may change later."""
 
     def __init__(self, file: io.BytesIO) -> None:
@@ -136,8 +113,55 @@ class _Writer(pickle.Pickler):
         self.dicts: list[dict[Any, Any]] = []
         self.lists: list[list[Any]] = []
         self.sets: list[set[Any]] = []
-        self.blind = False
+        self.lookups: list[Lookup] = []
+        self.cells: list[CellType] = []
+        self.functions: list[FunctionType] = []
+        self.arrays: list[np.ndarray[Any, Any]] = []
+        self.inside: tuple[int, ...] = (0,) * 6  # how many of `held` lie inside of the objects
+        self.blind, self.blind_around = False, False  # whether something cannot be watched, inside or around
         self._places: dict[int, int] = {}
+        self._waiting: list[FunctionType | type] = []  # whose surroundings are to be written
+        self._met: dict[int, int] = {}  # of a function or class of a user: its place among the kept
+
+    def finish(self) -> None:
+        """Write what the functions and classes of a user read that were come upon, and so on."""
+        self.inside = tuple(map(len, self.held()))
+        inside, self.blind = self.blind, False
+        while self._waiting:
+            met = self._waiting.pop()
+            self.dump(self._class(met) if isinstance(met, type) else self._function(met))
+        self.blind, self.blind_around = inside or self.blind, self.blind
+
+    def held(self) -> tuple[list[Any], ...]:
+        """All that may change later without being another object."""
+        return self.dicts, self.lists, self.sets, self.arrays, self.tensors, self.others
+
+    def _function(self, function: FunctionType) -> tuple[Any, ...]:
+        """What a function reads beside its arguments."""
+        parts: list[Any] = [function.__defaults__, function.__kwdefaults__, vars(function)]
+        for cell in function.__closure__ or ():
+            self.cells.append(cell)
+            content = content_of(cell)
+            if content is EMPTY or (isinstance(content, ModuleType) and is_users(function)):
+                self.kept.append(Same(content))  # and what the function asks a module for, below
+            else:
+                parts.append(content)
+        if not is_users(function):
+            return tuple(parts)
+        for lookup in lookups(function):
+            self.lookups.append(lookup)
+            value = lookup.value
+            parts.append(lookup.name)
+            if lookup.installed or isinstance(value, ModuleType):
+                self.kept.append(Same(value))
+            else:
+                parts.append(value)
+        return tuple(parts)
+
+    def _class(self, kind: type) -> tuple[Any, ...]:
+        """What the classes of a user hold from which one is derived: functions, numbers, containers."""
+        users = [vars(each).items() for each in kind.__mro__ if is_users(each)]
+        return tuple(part for items in users for name, value in items for part in _parts(name, value))
 
     def reducer_override(self, value: Any) -> Any:
         if not isinstance(value, nn.Module):
@@ -154,13 +178,37 @@ class _Writer(pickle.Pickler):
             return None
         if isinstance(value, Tensor):
             return self._tensor(value)
-        if isinstance(value, FunctionType) and value.__closure__:
-            raise pickle.PicklingError("a closure")
+        if isinstance(value, type | FunctionType) and self._reads(value):
+            return self._of_users(value)
         if isinstance(value, type | FunctionType | BuiltinFunctionType):
             self.kept.append(value)
             return len(self.kept)
+        if isinstance(value, ModuleType):
+            if not installed(value.__name__):
+                raise pickle.PicklingError(f"the module {value.__name__}, which may change")
+            self.kept.append(Same(value))
+            return len(self.kept)
+        if isinstance(value, np.ndarray) and not value.dtype.hasobject:
+            return self._array(value)
         self._note(value)
         return None
+
+    @staticmethod
+    def _reads(value: type | FunctionType) -> bool:
+        """Whether more than the address of a function or class decides what it does."""
+        return is_users(value) or (isinstance(value, FunctionType) and value.__closure__ is not None)
+
+    def _of_users(self, value: type | FunctionType) -> int:
+        """Note a function or class once. Of a function the code counts: a lambda is often made anew."""
+        if id(value) not in self._met:
+            if isinstance(value, FunctionType):
+                self.functions.append(value)
+                self.kept.append(value.__code__)
+            else:
+                self.kept.append(value)
+            self._met[id(value)] = len(self.kept)
+            self._waiting.append(value)
+        return self._met[id(value)]
 
     def _tensor(self, value: Tensor) -> Any:
         if not value.is_floating_point():
@@ -172,6 +220,14 @@ class _Writer(pickle.Pickler):
             self.tensors.append(value)
         place = self._places[id(value)]
         return place, str(value.dtype), str(value.device), tuple(value.shape), value.stride()
+
+    def _array(self, value: np.ndarray[Any, Any]) -> Any:
+        """The numbers of an array by their digest: keys stay small."""
+        if value.nbytes <= _SMALL:
+            self.arrays.append(value)
+        else:
+            self.blind = True
+        return str(value.dtype), value.shape, hashlib.blake2b(value.tobytes()).digest()
 
     def _note(self, value: Any) -> None:
         known = True
@@ -187,3 +243,17 @@ class _Writer(pickle.Pickler):
             self.dicts.append(vars(value))
         elif not known:
             self.blind = True
+
+
+_SIMPLE = (int, float, complex, str, bytes, tuple, list, dict, set, frozenset, Tensor)
+
+
+def _parts(name: str, value: Any) -> Iterable[Any]:
+    """What an attribute of a class holds that a step may read: functions, or itself."""
+    if isinstance(value, property):
+        return [part for part in (value.fget, value.fset, value.fdel) if part is not None]
+    value = getattr(value, "__func__", value)  # of a static or class method
+    known = (
+        FunctionType if name.startswith("__") else (FunctionType, *_SIMPLE)
+    )  # not annotations and the like
+    return [value] if isinstance(value, known) else []

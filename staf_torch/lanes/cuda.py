@@ -13,7 +13,8 @@ from torch import Tensor
 
 from .combinators import Tree
 from .given import Given
-from .program import Program, trace
+from .one_row import trace
+from .program import Program
 from .scalar_text import cuda_text
 from .tree import Shared, flatten, plain, unflatten
 

@@ -11,6 +11,7 @@ from .combinators import Tree, tracing_now
 from .kept import Kept
 from .plan import Plan, ordinary
 from .program import Program
+from .watch import Watch
 
 _PAYS = 100  # calls of a small batch in plain torch (some 10 ms each) that take as long as to compile
 _KEPT = 64  # shapes of calls that are remembered
@@ -31,8 +32,8 @@ class RowFunction:
     """y = function(x), (..., n) -> (..., m), each row by itself.
 
     The definition is plain torch. Where the calls so far would have paid for it, and nobody traces or
-    differentiates, a program of `lanes` serves; it is made anew when a tensor of the module, or an attribute
-    of the module or a child, has changed since.
+    differentiates, a program of `lanes` serves; it is made anew when a tensor of the module, an attribute of
+    the module or a child, or what functions of a user in it read (globals, closures) has changed since.
 
     Args:
         function: plain torch, of one row or many.
@@ -57,6 +58,7 @@ class RowFunction:
         self._sizes: list[int] = []
         self._tensors: list[Tensor] = []
         self._versions: list[int] = []
+        self._around: Watch | None = None
 
     def __call__(self, x: Tensor) -> Tensor:
         """y: (..., n) -> (..., m)."""
@@ -87,6 +89,8 @@ class RowFunction:
         for part, name, value in self._seen:
             if part.get(name) is not value:
                 return True
+        if self._around is not None and not self._around.unchanged():
+            return True
         return self._versions != self._version_list()
 
     def _version_list(self) -> list[int]:
@@ -105,6 +109,8 @@ class RowFunction:
         self._seen = [(part, name, part[name]) for part, name in named]  # kept: no address is used twice
         self._tensors = [value for _, _, value in self._seen if isinstance(value, Tensor)]
         self._versions = self._version_list()
+        around = Watch(self._function, self._module, surroundings=True)
+        self._around = None if around.blind else around
 
 
 class Rows:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import logging
 from collections.abc import Hashable
 from operator import is_
 from typing import Any, NamedTuple
@@ -10,8 +11,12 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from .content import Watch, code, signature, skeleton
-from .program import Program, Step
+from .content import code, signature, skeleton, written
+from .one_row import Step
+from .program import Program
+from .watch import Watch
+
+_log = logging.getLogger(__name__)
 
 
 @functools.lru_cache(maxsize=4096)
@@ -48,7 +53,7 @@ class Kept:
     """
 
     def __init__(self, name: str, most: int = 64) -> None:
-        self._name, self._most = name, most
+        self._name, self._most, self._told = name, most, False
         self._models: dict[Hashable, _Model] = {}
         self._latest: dict[Hashable, tuple[Program, Watch | None, tuple[Any, ...]]] = {}
 
@@ -72,14 +77,17 @@ class Kept:
 
         Args:
             step: of a program.
-            parts: all that the step reads: modules, tensors, settings. One that holds a closure is known to
-                be equal to nothing.
+            parts: all that the step reads: modules, tensors, functions, settings. One that cannot be written
+                down is known to be equal to nothing.
             copies: as in `Program`.
             owners: objects and settings that decide what the parts are, for `unchanged`.
         """
         found = skeleton(copies, *parts)
         if found is None:
-            return Program(step, name=self._name, copies=copies)
+            self._say_why(parts)
+            program = Program(step, name=self._name, copies=copies)
+            program.described(None, ())
+            return program
         key, tensors = found
         inside = [value for part in code(key) for value in part.values()]
         if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors):
@@ -107,6 +115,16 @@ class Kept:
             while len(self._latest) > self._most:
                 del self._latest[next(iter(self._latest))]
         return held.last
+
+    def _say_why(self, parts: tuple[Any, ...]) -> None:
+        if not self._told:
+            self._told = True
+            reason = written(parts)
+            _log.warning(
+                "%s is traced again at every call: what it reads cannot be written down: %s",
+                self._name,
+                reason,
+            )
 
 
 def _identities(owners: tuple[Any, ...]) -> Hashable:

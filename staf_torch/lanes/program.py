@@ -3,35 +3,34 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
+from types import FunctionType
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from . import compiler, trace_cache
-from .captured import Recipe
-from .combinators import Tree, tracing
+from .alone import doubt, undrawn
+from .combinators import Tree
 from .content import signature, skeleton
-from .eliminations import InPlainTorch
 from .emission import emit
 from .given import Given
-from .graph import NOW, STEP, Graph
-from .lowering import lower
+from .one_row import Step, trace
 from .patches import unpatched
 from .plan import Compiled, Plan, form, ordinary
 from .scalar_text import Names, c_text
-from .statements import Layout
+from .surroundings import is_users
 from .trace_cache import Trace
-from .tracer import NoReading, NotLoweredError, Tracer
+from .tracer import NotLoweredError
 from .tree import Shared, flatten, labels, plain, unflatten
+from .watch import Watch
 
 _log = logging.getLogger(__name__)
 _said: set[tuple[str, str]] = set()  # what has been logged
 _FEW = 8  # rows that one vector holds
 _LONGEST = 12_000  # lines that a compiler is asked to take
 _PREPARED = 64  # calls of other shapes that a program remembers
-Step = Callable[[Tree, Tree, Tree], tuple[Tree, Tree]]
 
 
 class Program:
@@ -55,8 +54,10 @@ class Program:
     row in every vector lane. Where that cannot be done, one line of the log says why and the definition runs;
     so it does where a derivative is wanted or a tensor is not on the CPU.
 
-    What ``step`` finds elsewhere (attributes, closures) is a constant: make a new program when that changes.
-    Rows never see each other.
+    What a function ``step`` finds elsewhere (globals, closures, tensors and attributes there) may change
+    between calls: the program is then made anew. A constant is what cannot be watched (an object without a
+    ``__dict__``, an array of NumPy beyond 16 kB), and all of it for a call that was prepared. Rows never see
+    each other.
 
     Args:
         step: maps (carry, now, row), trees of tensors (B, ...), to the next carry and the outputs (B, ...).
@@ -71,6 +72,10 @@ class Program:
         self._prepared: dict[Hashable, Prepared] = {}
         self._model: tuple[Program, Mapping[int, Tensor]] | None = None
         self._described: tuple[bytes, Sequence[Tensor]] | None = None
+        self._watch: Watch | None = None  # of what the step of a user reads, once it is compiled
+        self.of_users = isinstance(step, FunctionType) and is_users(step)  # or reads what a user wrote
+        self._asked = 0  # rows with which `doubt` was asked
+        self._refused: str | None = None  # why its rows are not alone
 
     def described(self, by: bytes | None, tensors: Sequence[Tensor]) -> None:
         """Let traces go through the user's cache.
@@ -80,6 +85,7 @@ class Program:
             tensors: all floating-point tensors that the step reads.
         """
         self._described = None if by is None else (by, tensors)
+        self.of_users = by is None
 
     def with_others(self, step: Step, others: Sequence[tuple[Tensor, Tensor]]) -> Program:
         """Return the program of a step that differs in captured tensors alone: nothing is traced again.
@@ -94,6 +100,7 @@ class Program:
         """
         program = Program(step, name=self.name, compile=self.compile, copies=self.copies)
         program._model = self, {id(old): new for old, new in others}
+        program.of_users, program._asked, program._refused = self.of_users, self._asked, self._refused
         return program
 
     def __call__(
@@ -111,6 +118,7 @@ class Program:
         Returns:
             The carry, (B, ...), and the outputs, (B, ceil(T / every), ...).
         """
+        self._look_around()
         leaves, structure = flatten((row, now, carry))
         key = structure, tuple(map(form, leaves)), steps, every
         prepared = self._prepared.get(key)
@@ -151,6 +159,7 @@ class Program:
 
     def compiles(self, carry: Tree, now: Tree = (), row: Tree = (), *, steps: int | None = None) -> bool:
         """Whether the compiled program serves these inputs."""
+        self._look_around()
         leaves, structure = flatten((row, now, carry))
         prepared = self._prepared.get((structure, tuple(map(form, leaves)), steps, 1))
         if prepared is not None and prepared.plan is not None:  # it has served such ones
@@ -212,7 +221,25 @@ class Program:
         if key not in self._compiled:
             self._compiled[key] = self._again(key) or self._build(given, copies)
         built = self._compiled[key]
-        return None if built is None else built.compiled
+        return None if built is None or not self._alone(given) else built.compiled
+
+    def _alone(self, given: Given) -> bool:
+        """Whether a step of a user may be written down with a single row: asked for one row, and for more."""
+        rows = min(given.rows, 2)
+        if self.of_users and self._asked < rows:
+            self._asked = rows
+            self._refused = self._refused or doubt(self.step, given)
+            if self._refused is not None:
+                _say(self.name, f"its step {self._refused}")
+        return self._refused is None
+
+    def _look_around(self) -> None:
+        """Forget what was compiled of a step that now reads something else."""
+        if self._watch is not None and not self._watch.unchanged():
+            self._compiled.clear()
+            self._prepared.clear()
+            self._watch = self._model = self._refused = None
+            self._asked = 0
 
     def _again(self, key: Hashable) -> _Built | None:
         """The program of the model with a table of other numbers, None where that cannot be."""
@@ -227,17 +254,17 @@ class Program:
         return built._replace(compiled=compiled)
 
     def _build(self, given: Given, copies: int) -> _Built | None:
+        if self._watch is None and isinstance(self.step, FunctionType) and is_users(self.step):
+            watch = Watch(self.step)
+            self._watch = None if watch.blind else watch
         try:
-            made = self._known(given, copies)
+            with undrawn():
+                made = self._known(given, copies)
             if (lines := made.text.source.count("\n")) > _LONGEST:
                 raise NotLoweredError(f"the program is {lines} lines long, which take a compiler minutes")
             call = compiler.function(made.text.source)
         except (NotLoweredError, OSError) as error:
-            reason = " ".join(str(error).split())[:400]
-            told = self.name, "no build" if isinstance(error, OSError) else reason
-            if told not in _said:
-                _said.add(told)
-                _log.warning("%s runs in plain torch, slower: %s", self.name, reason)
+            _say(self.name, str(error), "no build" if isinstance(error, OSError) else None)
             return None
         table = made.text.numbers(made.recipe.values, made.real)
         shapes = tuple((leaf.shape[1:], leaf.dtype) for leaf in given.carry)
@@ -256,6 +283,15 @@ class Program:
             found = _written(self.step, given, copies)
             trace_cache.save(path, found, tensors)
         return found
+
+
+def _say(name: str, reason: str, kind: str | None = None) -> None:
+    """Log why a program runs in plain torch, once for a reason or a kind of reasons."""
+    reason = " ".join(reason.split())[:400]
+    told = name, reason if kind is None else kind
+    if told not in _said:
+        _said.add(told)
+        _log.warning("%s runs in plain torch, slower: %s", name, reason)
 
 
 def _written(step: Step, given: Given, copies: int) -> Trace:
@@ -321,74 +357,3 @@ class Prepared:
             self.plan = Plan(compiled, leaves, times, rows=given.rows, steps=given.times, every=self._every)
         rooms = iter(self.plan(leaves))
         return unflatten(self._carry, rooms), unflatten(self.plan.structure, rooms)
-
-
-class Traced(NamedTuple):
-    """A program as every back end takes it, and its outputs for one row."""
-
-    program: tuple[Graph, Layout, list[int], list[int]]
-    outputs: tuple[tuple[torch.Size, torch.dtype], ...]
-    structure: Any
-    recipe: Recipe
-
-
-def trace(step: Step, given: Given, *, widened: bool = False, folded: bool = False) -> Traced:
-    """Write down what a step does with a single row.
-
-    Args:
-        step: of the program.
-        given: inputs.
-        widened: whether the numbers of a float32 program are carried in double.
-        folded: whether the numbers of captured tensors become part of the text.
-
-    Raises:
-        NotLoweredError: if an operation has no scalar form.
-    """
-    graph = Graph(given.real == torch.float32 and not widened)
-    tracer = Tracer(graph, lower, torch.is_grad_enabled(), widened, folded)
-
-    def inputs(op: str, leaves: Sequence[Any], depth: int, times: int) -> list[Tensor]:
-        traced = []
-        for slot, leaf in enumerate(leaves):
-            at = plain(leaf).detach()
-            at = at if isinstance(leaf, Shared) else at[:1]
-            at = at.select(0 if isinstance(leaf, Shared) else 1, 0) if times else at
-            traced.append(tracer.input(at, op, slot, depth))
-        return traced
-
-    with torch.no_grad():
-        row = given.tree("row", inputs("row", given.row, 0, 0))
-        now = given.tree("now", inputs("now", given.now, NOW, 1))
-        carry = inputs("state", given.carry, STEP, 0)
-        with tracer, tracing(tracer), NoReading(tracer), InPlainTorch(tracer.traced):
-            try:
-                after, out = step(given.tree("carry", carry), now, row)
-            except NotLoweredError:
-                raise
-            except (
-                Exception
-            ) as error:  # of the step itself, which the definition raises again, or of the tracer
-                raise NotLoweredError(f"{type(error).__name__}: {error}") from error
-        ends, structure = flatten(after)
-        if structure != given.structures["carry"] or [(e.shape, e.dtype) for e in ends] != [
-            (c.shape, c.dtype) for c in carry
-        ]:
-            raise NotLoweredError("the step returns a carry of other shapes or dtypes than it was given")
-        leaves, shape = flatten(out)
-        if any(leaf.dim() == 0 or leaf.shape[0] != 1 for leaf in leaves):
-            raise NotLoweredError("an output of the step has no dimension of rows")
-        following = [node for end in ends for node in tracer.nodes(end).reshape(-1).tolist()]
-        outputs = [node for leaf in leaves for node in tracer.nodes(leaf).reshape(-1).tolist()]
-        layout = Layout(
-            [_entries(leaf, 1) for leaf in given.row],
-            [_entries(leaf, 2) for leaf in given.now],
-            [_entries(leaf, 1) for leaf in given.carry],
-            [leaf.numel() for leaf in leaves],
-        )
-    shapes = tuple((leaf.shape[1:], leaf.dtype) for leaf in leaves)
-    return Traced((graph, layout, following, outputs), shapes, shape, tracer.captured.recipe())
-
-
-def _entries(leaf: Any, skip: int) -> int:
-    shape = leaf.tensor.shape[skip - 1 :] if isinstance(leaf, Shared) else leaf.shape[skip:]
-    return shape.numel()

@@ -255,6 +255,8 @@ class Tracer(TorchDispatchMode):
         if any(self.captured.from_outside(tensor) for tensor in wanted):
             raise NotLoweredError("a derivative with respect to a constant of the program may be wanted")
         name = func._schema.name.removeprefix("aten::")
+        if torch.Tag.nondeterministic_seeded in func.tags and not _own_generator(args, kwargs):
+            raise NotLoweredError(f"`{func}` draws random numbers")
         if name in _BLANK or not any(self.traced(tensor) for tensor in tensors):
             out = func(*args, **kwargs)
             self.captured.ran(func, args, kwargs, out)
@@ -287,6 +289,11 @@ class Tracer(TorchDispatchMode):
         held = self._storages[target.untyped_storage().data_ptr()][1]
         self._view(held, target)[...] = nodes
         return target
+
+
+def _own_generator(args: Sequence[Any], kwargs: dict[str, Any]) -> bool:
+    """Whether random numbers come from a generator that was given: one seeded in a step repeats itself."""
+    return any(isinstance(value, torch.Generator) for value in (*args, *kwargs.values()))
 
 
 class NoReading(TorchFunctionMode):

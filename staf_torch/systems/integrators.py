@@ -9,10 +9,12 @@ from torch import Tensor
 
 from ..lanes import Program
 from ..lanes.combinators import Tree
+from ..lanes.kept import Kept
 from ..numerics.checks import integer, positive_real, trailing
 from .base import ControlAffineSystem
 
 _PAYS = 10_000  # steps of a small batch in plain torch (some .1 ms each) that take as long as to compile
+_kept = Kept("a trajectory", 16)
 
 
 def runge_kutta_step(field: Callable[[Tensor], Tensor], x: Tensor, dt: float) -> Tensor:
@@ -98,7 +100,8 @@ def _program(system: ControlAffineSystem, dt: float, compile: bool) -> Program:
     def step(x: Tensor, now: Tree, row: Tree) -> tuple[Tensor, Tensor]:
         return runge_kutta_step(lambda at: _drift(system, at), x, dt), x
 
-    return Program(step, name="a trajectory", compile=compile)
+    found = _kept.of(step, system, dt) if compile else None
+    return Program(step, name="a trajectory", compile=compile) if found is None else found
 
 
 def _drift(system: ControlAffineSystem, x: Tensor) -> Tensor:

@@ -83,6 +83,22 @@ def test_candidates_lie_apart_along_a_trajectory_and_leave_no_gap(memory: adp.Gl
             last = state[row, k] if begin + k in searched else last
 
 
+def test_candidates_are_the_nearest_by_the_mean_curvature_the_shorter_way_around(
+    memory: adp.GlobalValue,
+) -> None:
+    curvature = memory.models[memory.entries, 5:].view(-1, 2, 2) * memory.region * memory.region[:, None]
+    size, axes = torch.linalg.eigh(curvature)
+    metric = torch.einsum("bij,bj,bkj->ik", axes, size.abs(), axes) / len(size)
+    metric = metric + 0.01 * metric.trace() / 2 * torch.eye(2, dtype=torch.float64)
+    x = torch.cat((RESETS, torch.tensor([[3.1, 0.5], [-3.1, -0.5]], dtype=torch.float64)))
+    d = memory.problem.offset(x.unsqueeze(1), memory.plans[memory.entries, :2]) / memory.region
+    far, wanted = (d @ metric * d).sum(-1).topk(memory.candidates, 1, largest=False)
+    assert bool((far[:, -1].sqrt() < torch.pi / memory.region[0] * metric[0, 0].sqrt()).all())  # not twice
+    found = memory.nearest(x)
+    assert torch.equal(found[:, :-1].sort().values, memory.entries[wanted].sort().values)
+    assert bool((found[:, -1] == memory.resting).all())
+
+
 def test_control_at_rest_on_top_is_the_regulator(memory: adp.GlobalValue) -> None:
     x = torch.tensor([[0.01, -0.02]], dtype=torch.float64)
     torch.testing.assert_close(memory(x), memory.problem.linear_feedback(x), rtol=1e-2, atol=1e-3)

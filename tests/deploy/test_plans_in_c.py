@@ -59,7 +59,7 @@ def test_memory_in_c_has_the_control_of_the_library_and_says_what_a_call_takes(
     assert 0.1 < float((u.abs() < 2).double().mean()) < 1  # not a bound everywhere
     one = source.functions / (memory.candidates + 1)
     assert one == int(one) >= memory.lookahead  # a sine a step
-    said = f"compares {len(memory.entries)} states and takes at most {source.flops} additions"
+    said = f"compares {2 * len(memory.entries)} states and takes at most {source.flops} additions"
     assert said in path.read_text()
     timed = deploy.time_c(path, x, [1])
     assert timed.calls == 200

@@ -1,0 +1,104 @@
+"""Whether a step does with a row alone what it does with it among others, and does it again."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from .given import Given
+from .tree import Shared, flatten, plain
+
+_CLOSE = 1e-2  # of the largest entry: far above what another order of sums does to an ill-conditioned row
+
+
+def doubt(step: Callable[..., Any], given: Given) -> str | None:
+    """Return why a step must not be written down with a single row, None where it may.
+
+    It is called with one row, again, and with that row beside the one that differs most from it. What draws
+    random numbers, counts its calls, reads a clock or takes a mean over the batch gives itself away.
+
+    Args:
+        step: plain torch, of all rows.
+        given: inputs, of which the first time is taken.
+    """
+    first, other = [0], [_farthest(given)]
+    with undrawn(), torch.no_grad():
+        alone = _called(step, given, first)
+        if not _close(alone, _called(step, given, first), 0.0):  # the same operations in the same order
+            return "gives other numbers when it is called again (random numbers, a counter, a clock?)"
+        if given.rows == 1:
+            return None
+        try:
+            both = _called(step, given, first + other)
+        except Exception as error:  # which plain torch will raise again, for all rows
+            return f"takes one row but not two: {type(error).__name__}: {error}"
+        parts = [leaf[:1] for leaf in both], [leaf[1:] for leaf in both]
+        if not (_close(alone, parts[0], _CLOSE) and _close(_called(step, given, other), parts[1], _CLOSE)):
+            return (
+                "gives a row other numbers beside another row (a mean over the batch, a branch on its size?)"
+            )
+    return None
+
+
+@contextmanager
+def undrawn() -> Iterator[None]:
+    """Put the states of all common random numbers back at the end: to compile draws none."""
+    common = np.random.get_state()  # noqa: NPY002 - a user's code draws from it
+    states = torch.get_rng_state(), common, random.getstate()
+    try:
+        yield
+    finally:
+        torch.set_rng_state(states[0])
+        np.random.set_state(states[1])  # noqa: NPY002
+        random.setstate(states[2])
+
+
+def _farthest(given: Given) -> int:
+    """The row whose inputs differ most from those of the first."""
+    distance = torch.zeros(given.rows, dtype=torch.float64)
+    for leaf in (*given.carry, *given.now, *given.row):
+        if isinstance(leaf, Tensor) and leaf.numel():
+            at = leaf[:, 0] if any(leaf is other for other in given.now) else leaf
+            numbers = at.detach().double().reshape(given.rows, -1).nan_to_num(0.0, 0.0, 0.0)
+            distance += (numbers - numbers[:1]).abs().sum(-1)
+    return int(distance.argmax()) if given.rows > 1 else 0
+
+
+def _called(step: Callable[..., Any], given: Given, rows: Sequence[int]) -> list[Tensor]:
+    """All leaves of what a step makes of some rows at the first time; the inputs are copies."""
+
+    def few(leaf: Any, time: bool) -> Any:
+        if isinstance(leaf, Shared):
+            return (leaf.tensor[0] if time else plain(leaf)).clone()
+        return (leaf[:, 0] if time else leaf)[rows]
+
+    carry, now, row = (
+        given.tree(name, [few(leaf, name == "now") for leaf in getattr(given, name)])
+        for name in ("carry", "now", "row")
+    )
+    return flatten(step(carry, now, row))[0]
+
+
+def _close(found: Sequence[Tensor], other: Sequence[Tensor], tolerance: float) -> bool:
+    if len(found) != len(other):
+        return False
+    return all(_leaves_are_close(*pair, tolerance) for pair in zip(found, other, strict=True))
+
+
+def _leaves_are_close(found: Tensor, other: Tensor, tolerance: float) -> bool:
+    if found.shape != other.shape:
+        return False
+    one, two = found.double(), other.double()
+    finite = torch.isfinite(one)
+    if not torch.equal(finite, torch.isfinite(two)):
+        return False
+    one, two = one[finite], two[finite]
+    return not one.numel() or bool(
+        (one - two).abs().max() <= tolerance * max(one.abs().max(), two.abs().max())
+    )

@@ -1,0 +1,118 @@
+"""A step that is more than a function of its row runs as it was written, and the log says why."""
+
+from __future__ import annotations
+
+import itertools
+import random
+import time
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+import staf_torch as st
+from staf_torch.lanes import Program
+from staf_torch.lanes import program as programs
+
+X = torch.linspace(-1, 1, 10, dtype=torch.float64).view(5, 2)
+COUNT = itertools.count()
+DRAW = np.random.default_rng(0)
+
+
+def mean(x: Tensor) -> Tensor:
+    return x - x.mean(0)
+
+
+def of_the_size(x: Tensor) -> Tensor:
+    return x if len(x) > 1 else 2 * x
+
+
+def of_the_first(x: Tensor) -> Tensor:
+    return x * x[0].sum()
+
+
+def of_the_clock(x: Tensor) -> Tensor:
+    return x * time.perf_counter()
+
+
+OTHERS: dict[str, tuple[Callable[[Tensor], Tensor], str]] = {
+    "torch": (lambda x: x + torch.randn(x.shape), "draws random numbers"),
+    "torch, like": (lambda x: x + torch.rand_like(x), "draws random numbers"),
+    "torch, in place": (lambda x: x + torch.empty_like(x).normal_(), "draws random numbers"),
+    "dropout": (lambda x: torch.nn.functional.dropout(x), "draws random numbers"),
+    "NumPy": (lambda x: x + np.random.randn(), "called again"),  # noqa: NPY002
+    "a generator": (lambda x: x + DRAW.normal(), "called again"),
+    "Python": (lambda x: x + random.random(), "called again"),
+    "a counter": (lambda x: x * (1 + next(COUNT)), "called again"),
+    "a clock": (of_the_clock, "called again"),
+    "a mean over the batch": (mean, "beside another row"),
+    "the size of the batch": (of_the_size, "beside another row"),
+    "the first row": (of_the_first, "beside another row"),
+    "one row alone": (lambda x: x.view(1, 2) * 1.0, "one row but not two"),
+}
+
+
+@pytest.fixture(autouse=True)
+def _nothing_was_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(programs, "_said", set())
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_what_is_no_function_of_a_row_is_not_compiled(name: str, caplog: pytest.LogCaptureFixture) -> None:
+    function, reason = OTHERS[name]
+    program = Program(lambda x, _, __: (x, function(x)))
+    assert not program.compiles(X, steps=3)
+    (line,) = caplog.messages
+    assert reason in line
+
+
+@pytest.mark.parametrize("name", ["torch", "NumPy", "Python", "a generator"])
+def test_noise_is_drawn_at_every_time(name: str) -> None:
+    function, _ = OTHERS[name]
+    _, found = Program(lambda x, _, __: (x, function(x)))(X, steps=50)
+    noise = (found - X[:, None]).flatten(1)
+    assert len(noise.unique()) >= 50
+
+
+def test_to_compile_draws_no_random_number() -> None:
+    torch.manual_seed(3), random.seed(3), np.random.seed(3)  # noqa: NPY002
+    expected = torch.rand(1).item(), random.random(), np.random.rand()  # noqa: NPY002
+    torch.manual_seed(3), random.seed(3), np.random.seed(3)  # noqa: NPY002
+    for name in ("NumPy", "Python", "torch"):
+        assert not Program(lambda x, _, __, name=name: (x, OTHERS[name][0](x))).compiles(X, steps=3)
+    assert (torch.rand(1).item(), random.random(), np.random.rand()) == expected  # noqa: NPY002
+
+
+def test_a_mean_is_seen_once_there_is_more_than_a_row() -> None:
+    program = Program(lambda x, _, __: (x, x - x.mean(0)))
+    assert program.compiles(X[:1], steps=3)  # of a single row it is a function of the row
+    assert not program.compiles(X, steps=3)
+    same = X[:1].expand(3, 2).contiguous()
+    assert Program(lambda x, _, __: (x, x - x.mean(0))).compiles(same, steps=3)  # nothing tells here
+    mixed = torch.cat((same, X[-1:]))
+    assert not Program(lambda x, _, __: (x, x - x.mean(0))).compiles(mixed, steps=3)
+
+
+def test_a_generator_that_a_step_seeds_itself_repeats_its_numbers() -> None:
+    def step(x: Tensor, now: object, row: object) -> tuple[Tensor, Tensor]:
+        return x, x + torch.randn(2, generator=torch.Generator().manual_seed(0), dtype=x.dtype)
+
+    program = Program(step)
+    assert program.compiles(X, steps=2)
+    torch.testing.assert_close(program(X, steps=2)[1], program.definition(X, steps=2)[1])
+
+
+@pytest.mark.compiled
+def test_a_chase_of_noisy_values_has_new_noise_at_every_time(caplog: pytest.LogCaptureFixture) -> None:
+    states = X[None, 2:3].expand(1, 200, 2).contiguous()
+    basis = st.StaFBasis(st.GaussianKernel(), st.StateFollowingCenters(st.rings(3), 0.3))
+
+    def noisy(x: Tensor) -> Tensor:
+        return x.square().sum(-1) + 0.1 * torch.randn(x.shape[:-1], dtype=x.dtype)
+
+    found = st.chase_weights(states, basis, noisy, st.optim.Exact(), inner_steps=1).weights
+    assert len(found[0, :, 0].unique()) == 200
+    (line,) = caplog.messages
+    assert "a chase runs in plain torch, slower" in line
