@@ -219,6 +219,7 @@ static void rescale(const Rules &r, Stream &s) {
     std::fill(s.low, s.low + K, infinity);
     std::fill(s.high, s.high + K, -infinity);
     if (count >= r.searched_at) learn_trackers(r, s);
+    std::memset(s.map, 0, sizeof s.map);
     restart_linear(r, s);
     for (int j = 0; j < count; ++j) {
         if (beyond(r, s, s.x[j], s.y[j])) continue;

@@ -63,7 +63,9 @@ class Bank:
     scores, part Student-t likelihood with the member's variance, part with the common running error, at
     three rates of discount, and the less the less certain they are; the three mixtures are mixed alike. With
     what least squares on groups of members adds to that, and a mixture by squared errors over a long time,
-    they make the mean. Its variance follows its running squared error.
+    they make a mean, and a map of that mean to what usually follows it (33 knots) makes another one, for
+    functions that saturate and targets of few values; the four are weighed by how they predict. The variance
+    follows the running squared error.
 
     Args:
         shape: sizes.

@@ -211,6 +211,7 @@ class BankDefinition:
         s["high"].fill_(-torch.inf)
         if count >= self.rules.searched_at:
             self._learn_trackers(s, count)
+        s["map"].zero_()
         self._restart_linear(s)
         for j in range(count):
             if self._beyond(s, s["x"][j], s["y"][j]):
