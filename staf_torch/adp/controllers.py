@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
+from ..lanes.surroundings import is_users
 from ..numerics.checks import real
 from ..numerics.linalg import riccati
 from ..systems import Plant
@@ -110,8 +111,11 @@ class Feedback(Controller):
         Shown by `staf experiment=adp adp/policy=lqr`.
 
     Args:
-        policy: (..., n) -> (..., m).
+        policy: (..., n) -> (..., m), a function of x alone: what has a memory is a `Controller`.
         value: of the policy or of its design, (..., n) -> (...), for the record.
+
+    Raises:
+        ValueError: of `check`, at the start of a run.
     """
 
     def __init__(self, policy: Policy, value: Value | None = None) -> None:
@@ -133,8 +137,35 @@ class Feedback(Controller):
     ) -> tuple[Tensor, ControllerState]:
         return self.policy(x), carried
 
+    def check(self, x0: Tensor) -> None:
+        """Refuse a policy of a user that has a memory: it would remember every check that asks it, too.
+
+        Args:
+            x0: states at which it is asked, (B, n).
+
+        Raises:
+            ValueError: if a call changes a tensor that the policy holds.
+        """
+        if not is_users(type(self.policy)):
+            return
+        before = _tensors_of(self.policy)
+        with torch.no_grad():
+            self.policy(x0)
+        for name, (tensor, version) in _tensors_of(self.policy).items():
+            if name not in before or tensor is not before[name][0] or version != before[name][1]:
+                raise ValueError(
+                    f"`Feedback(policy=...)` must be a function of the state; a call of {self.label} changed "
+                    f"its `{name}`. What has a memory is a `Controller`: `init` and `step` carry it by rows."
+                )
+
     def value(self, x: Tensor, carried: ControllerState) -> Tensor | None:
         return None if self._value is None else self._value(x)
+
+
+def _tensors_of(policy: Any) -> dict[str, tuple[Tensor, int]]:
+    """The tensors that an object holds itself, and how often each was written to."""
+    held = {**getattr(policy, "__dict__", {}), **getattr(policy, "_buffers", {})}
+    return {name: (x, x._version) for name, x in held.items() if isinstance(x, Tensor)}
 
 
 class LQR(nn.Module):

@@ -32,6 +32,16 @@ def skeleton(*objects: Any) -> tuple[Hashable, list[Tensor]] | None:
     return None if isinstance(writer, str) else ((writer.file.getvalue(), tuple(writer.kept)), writer.tensors)
 
 
+def reads_users_code(*objects: Any) -> bool:
+    """Return whether code of a user is among what objects hold or lead to, or nobody can say.
+
+    Args:
+        objects: as of `skeleton`.
+    """
+    writer = written(objects)
+    return isinstance(writer, str) or writer.of_users
+
+
 def signature(key: Any) -> bytes | None:
     """Return a key of `skeleton` as bytes that mean the same in every process.
 
@@ -116,6 +126,7 @@ class Writer(pickle.Pickler):
         self.lookups: list[Lookup] = []
         self.cells: list[CellType] = []
         self.functions: list[FunctionType] = []
+        self.of_users = False  # whether a function or class of a user was come upon
         self.arrays: list[np.ndarray[Any, Any]] = []
         self.inside: tuple[int, ...] = (0,) * 6  # how many of `held` lie inside of the objects
         self.blind, self.blind_around = False, False  # whether something cannot be watched, inside or around
@@ -206,6 +217,7 @@ class Writer(pickle.Pickler):
                 self.kept.append(value.__code__)
             else:
                 self.kept.append(value)
+            self.of_users = self.of_users or is_users(value)
             self._met[id(value)] = len(self.kept)
             self._waiting.append(value)
         return self._met[id(value)]

@@ -13,7 +13,7 @@ from torch import Tensor
 from . import compiler, trace_cache
 from .alone import doubt, undrawn
 from .combinators import Tree
-from .content import signature, skeleton
+from .content import reads_users_code, signature, skeleton
 from .emission import emit
 from .given import Given
 from .one_row import Step, trace
@@ -73,7 +73,7 @@ class Program:
         self._model: tuple[Program, Mapping[int, Tensor]] | None = None
         self._described: tuple[bytes, Sequence[Tensor]] | None = None
         self._watch: Watch | None = None  # of what the step of a user reads, once it is compiled
-        self.of_users = isinstance(step, FunctionType) and is_users(step)  # or reads what a user wrote
+        self._of_users: bool | None = None  # whether the step is of a user, or reads what a user wrote
         self._asked = 0  # rows with which `doubt` was asked
         self._refused: str | None = None  # why its rows are not alone
 
@@ -85,7 +85,7 @@ class Program:
             tensors: all floating-point tensors that the step reads.
         """
         self._described = None if by is None else (by, tensors)
-        self.of_users = by is None
+        self._of_users = None if by is None else False
 
     def with_others(self, step: Step, others: Sequence[tuple[Tensor, Tensor]]) -> Program:
         """Return the program of a step that differs in captured tensors alone: nothing is traced again.
@@ -100,7 +100,7 @@ class Program:
         """
         program = Program(step, name=self.name, compile=self.compile, copies=self.copies)
         program._model = self, {id(old): new for old, new in others}
-        program.of_users, program._asked, program._refused = self.of_users, self._asked, self._refused
+        program._of_users, program._asked, program._refused = self._of_users, self._asked, self._refused
         return program
 
     def __call__(
@@ -199,10 +199,12 @@ class Program:
             note: lines for the comment at the head.
 
         Raises:
-            NotLoweredError: if an operation has no scalar form.
+            NotLoweredError: if an operation has no scalar form, or the step is more than a function of a row.
             ValueError: if a name is not one of C, or is there twice.
         """
         given = Given.of(carry, now, row, 1)
+        if not self._alone(given):
+            raise NotLoweredError(f"its step {self._refused}")
         traced = trace(self.step, given, folded=True)
         kinds = {"row": given.structures["row"], "now": given.structures["now"]}
         kinds |= {"carry": given.structures["carry"], "out": traced.structure}
@@ -226,9 +228,11 @@ class Program:
     def _alone(self, given: Given) -> bool:
         """Whether a step of a user may be written down with a single row: asked for one row, and for more."""
         rows = min(given.rows, 2)
-        if self.of_users and self._asked < rows:
+        if self._asked < rows and self._of_users is not False:
             self._asked = rows
-            self._refused = self._refused or doubt(self.step, given)
+            self._of_users = reads_users_code(self.step)
+            if self._of_users:
+                self._refused = self._refused or doubt(self.step, given)
             if self._refused is not None:
                 _say(self.name, f"its step {self._refused}")
         return self._refused is None

@@ -15,6 +15,9 @@ from torch import Tensor
 import staf_torch as st
 from staf_torch.lanes import Program
 from staf_torch.lanes import program as programs
+from staf_torch.lanes.content import reads_users_code
+from staf_torch.lanes.function import Rows
+from staf_torch.lanes.tracer import NotLoweredError
 
 X = torch.linspace(-1, 1, 10, dtype=torch.float64).view(5, 2)
 COUNT = itertools.count()
@@ -116,3 +119,24 @@ def test_a_chase_of_noisy_values_has_new_noise_at_every_time(caplog: pytest.LogC
     assert len(found[0, :, 0].unique()) == 200
     (line,) = caplog.messages
     assert "a chase runs in plain torch, slower" in line
+
+
+class Noisy(torch.nn.Module):
+    """Of a user, inside of a step that this library wrote."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        return x + random.random()
+
+
+def test_code_of_a_user_is_found_inside_of_the_librarys(caplog: pytest.LogCaptureFixture) -> None:
+    rows = Rows(Noisy(), "a test")
+    assert len({float(rows(X)[0, 0, 0]) for _ in range(5)}) == 5
+    assert "called again" in caplog.text
+    assert reads_users_code(Noisy().forward)
+    assert not reads_users_code(torch.nn.Linear(2, 2), st.GaussianKernel(), torch.tanh)
+
+
+def test_a_header_of_a_noisy_function_is_refused() -> None:
+    program = Program(lambda carry, now, row: (carry, (Noisy()(row["x"]),)), name="the header")
+    with pytest.raises(NotLoweredError, match="called again"):
+        program.c_source("noisy", row={"x": X[:1]})
