@@ -177,6 +177,6 @@ class Bank:
 @functools.cache
 def _built(shape: BankShape) -> Callable[..., None] | None:
     sizes = f"DIM={shape.dim}", f"COUNT={shape.dim + 1}", f"OUTPUTS={shape.outputs}"
-    kept = f"CAPACITY={shape.capacity}", f"NEIGHBOURS={shape.neighbours}", f"TRACKED={TRACKED}"
-    kept += (f"SEARCHED={SEARCHED}",)
-    return compiled(Path(__file__).with_name("_bank.cpp"), *sizes, *kept)
+    kept = f"CAPACITY={shape.capacity}", f"NEIGHBOURS={shape.neighbours}"
+    trackers = f"TRACKED={TRACKED}", f"SEARCHED={SEARCHED}"
+    return compiled(Path(__file__).with_name("_bank.cpp"), *sizes, *kept, *trackers)

@@ -69,7 +69,8 @@ def likelihoods(s: Stretch, rate: Tensor, noise: Tensor, fade: Tensor) -> Tensor
     factor = torch.linalg.cholesky(gram)
     squares = torch.linalg.solve_triangular(factor, s.y, upper=False).square().sum(1)  # (L, K)
     logs = factor.diagonal(dim1=1, dim2=2).log().sum(1)
-    return -s.y.shape[1] * logs - 0.5 * len(apart) * squares.clamp(min=1e-300).log().sum(1)
+    found: Tensor = -s.y.shape[1] * logs - 0.5 * len(apart) * squares.clamp(min=1e-300).log().sum(1)
+    return found
 
 
 def _better(s: Stretch, rate: Tensor, noise: Tensor, fade: Tensor, best: Choice) -> Choice:
@@ -117,4 +118,5 @@ def sensitivity(s: Stretch, c: Choice) -> Tensor:
     outer = gradients.mT @ gradients
     trace, eye = outer.trace(), torch.eye(n, dtype=kernel.dtype)
     share = outer / trace if float(trace) > 0 else eye / n
-    return torch.linalg.cholesky((share * n + RIDGE * n * eye) / (1 + RIDGE * n))
+    metric: Tensor = torch.linalg.cholesky((share * n + RIDGE * n * eye) / (1 + RIDGE * n))
+    return metric
