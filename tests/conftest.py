@@ -40,7 +40,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 @pytest.hookimpl(wrapper=True)
 def pytest_collection() -> Generator[None, object, object]:
-    """Collect tests without looking for garbage, a quarter of that time: six thousand tests and modules stay."""
+    """Collect tests without looking for garbage, a quarter of that time: all of them stay."""
     gc.disable()
     try:
         return (yield)
