@@ -8,10 +8,9 @@ import shlex
 from collections.abc import Iterator
 from pathlib import Path
 
-import hydra
 import pytest
 from command_line import ROOT
-from composing import HYDRA
+from composing import settings
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
@@ -212,10 +211,8 @@ def test_the_front_page_has_a_table_of_commands() -> None:
     ids=lambda command: command.replace("::", ":"),
 )
 def test_settings_of_a_command_compose(command: str) -> None:
-    with hydra.initialize_config_dir(str(ROOT / "conf"), **HYDRA):
-        for job in jobs(overrides(command)):
-            settings = hydra.compose("config", job)
-            assert OmegaConf.select(settings, "task"), STAF[command]
+    for job in jobs(overrides(command)):
+        assert OmegaConf.select(settings(*job), "task"), STAF[command]
 
 
 def test_options_of_the_other_programs_exist() -> None:

@@ -77,7 +77,7 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def _install(home: Path, *what: str | Path) -> None:
     line = [home / "bin" / "python", "-m", "pip", "install", "--quiet", "--no-deps", "--no-index"]
-    _run(*line, "--no-build-isolation", *what, cwd=home)
+    _run(*line, "--no-compile", "--no-build-isolation", *what, cwd=home)
 
 
 def _imported(home: Path, cwd: Path) -> Path:

@@ -246,10 +246,15 @@ def _summit(first: Tensor, last: Tensor, rise: Tensor, fall: Tensor, length: Ten
     up, down, apart = rise * length, fall * length, last - first
     square, cube = 3 * apart - 2 * up - down, up + down - 2 * apart
     inside = square.square() - 3 * cube * up
-    at = up / (torch.where(inside > 0, inside, 0.0).sqrt() - square)
+    turns = (up > 0) & (inside > 0)
+    below = torch.where(turns, inside, 1.0).sqrt() - square
+    turns = turns & (below > up)  # within the length
+    # Numbers in the place of those that are not used: where the cubic is a line the slope of a root of 0 and
+    # of a division by 0 would make all slopes NaN, and the filter helpless. In float32 lines are common.
+    at = torch.where(turns, up, 0.5) / torch.where(turns, below, 1.0)
     peak = first + at * (up + at * (square + at * cube))
     ends = torch.maximum(first, last)
-    return torch.where((up > 0) & (inside > 0) & (at > 0) & (at < 1) & (peak > ends), peak, ends)
+    return torch.where(turns & (peak > ends), peak, ends)
 
 
 def _degrees(box: Barrier) -> list[int]:

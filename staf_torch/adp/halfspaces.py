@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ..lanes import each
+from ..lanes import each, repeat
 
 MOST_CASES = 1000  # sets of active inequalities and bounds that are compared at most
 _FIRM, _SOFT = (
@@ -127,12 +127,21 @@ def _in_plane(wanted: Tensor, unit: Tensor, far: Tensor, low: Tensor, high: Tens
     for row, edges in enumerate([[k] for k in range(total)] + [list(pair) for pair in pairs]):
         rounded[row, edges] = _OWN
     scale = 1 + wanted.abs().amax(-1, keepdim=True) + far.abs().amax(-1, keepdim=True) + points.abs().amax(-1)
-    short = aims.unsqueeze(-2) - (lines.unsqueeze(-3) * points.unsqueeze(-2)).sum(-1)
+    (a, b), (x, y) = lines.unsqueeze(-3).unbind(-1), points.unsqueeze(-2).unbind(-1)
+    short = aims.unsqueeze(-2) - (a * x + b * y)
     fits = (short <= rounded * torch.finfo(wanted.dtype).eps * scale.unsqueeze(-1)).all(-1)
     apart = torch.where(fits, (points - wanted.unsqueeze(-2)).square().sum(-1), torch.inf)
     nearest, found = _first_least(points, apart)
     nearest = torch.minimum(torch.maximum(nearest, low), high)
-    return torch.where(found < torch.inf, nearest, _least_squares(wanted, unit, far, low, high))
+
+    def compromise(now: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+        _, none, wanted, unit, far = now
+        return _least_squares(wanted, unit, far, low, high), none, wanted, unit, far
+
+    # Few rows have no solution: all that their compromise reads is carried, so that nothing is found ahead.
+    none = ~(found.squeeze(-1) < torch.inf)
+    point: Tensor = repeat(1, compromise, (nearest, none, wanted, unit, far), where=lambda now: now[1])[0]
+    return point
 
 
 def _least_squares(wanted: Tensor, unit: Tensor, far: Tensor, low: Tensor, high: Tensor) -> Tensor:

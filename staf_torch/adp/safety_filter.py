@@ -48,16 +48,6 @@ class Filtered(NamedTuple):
     slack: Tensor  # (...) how much further u would have to reach, in its (weighted) units; 0: all is met
 
 
-class Pass(NamedTuple):
-    """What one linearisation hands to the next."""
-
-    u: Tensor  # (B, m)
-    slack: Tensor  # (B,)
-    margin: Tensor  # h, (B, k)
-    met: Tensor  # (B,) 1 where the wanted control satisfies everything, else 0
-    first: Tensor  # (B,) 1 before the first pass, then 0
-
-
 class SafetyFilter(Controller):
     """The control nearest to what a policy wants that keeps h_i(x, t) >= 0:
 
@@ -252,12 +242,14 @@ class SafetyFilter(Controller):
     def inequalities(self, x: Tensor, u: Tensor, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """a_i, c_i and h_i of the condition a_i'u >= c_i, linearised at u: (B, n), (B, m), (B,) ->
         (B, k, m), (B, k), (B, k)."""
-        parts = [
-            torch.func.vmap(functools.partial(self._inequality, k))(x.unsqueeze(1), u.unsqueeze(1), t)
-            for k in range(len(self.constraints))
-        ]
-        normal, least, margin = (torch.stack(column, dim=1) for column in zip(*parts, strict=True))
+        normal, least, margin = self._every(self._inequality, x, u, t)
         return normal[:, :, 0], least, margin
+
+    def _every(self, of: Callable[..., tuple[Tensor, ...]], x: Tensor, u: Tensor, t: Tensor) -> list[Tensor]:
+        """What a function of (k, x, u, t), one row, says of every constraint: (B, k, ...) each."""
+        rows = [functools.partial(of, k) for k in range(len(self.constraints))]
+        parts = [torch.func.vmap(row)(x.unsqueeze(1), u.unsqueeze(1), t) for row in rows]
+        return [torch.stack(column, dim=1) for column in zip(*parts, strict=True)]
 
     def _definition(self, z: Tensor) -> Tensor:
         """u, margins and slack of rows of (x, u, t): (..., n + m + 1) -> (..., m + k + 1)."""
@@ -271,36 +263,45 @@ class SafetyFilter(Controller):
             ((wanted >= self.bounds.low.to(x)) & (wanted <= self.bounds.high.to(x))), wanted, first * unit
         )
 
-        def linearise(now: Pass) -> Pass:
-            normal, least, margin = self.inequalities(x, now.u, t)
-            found = nearest_admissible(first, normal * unit, least, low, high, self.table)
-            fine = ((normal * now.u.unsqueeze(-2)).sum(-1) >= least).all(-1)
-            met = torch.where(now.first > 0, fine.to(x), now.met)
-            return Pass(found.point * unit, found.shortfall, margin, met, torch.zeros_like(now.first))
+        shortfall, margin = self._every(self._shortfall, x, at, t)
+        met = (shortfall <= 0).all(-1)  # needs neither slopes nor a quadratic program
 
-        none = torch.zeros_like(t)
-        start = Pass(
-            at, none, none.unsqueeze(-1).expand(-1, len(self.constraints)).contiguous(), none, none + 1
-        )
-        u, slack, margin, met, _ = repeat(_PASSES, linearise, start)
-        u = torch.where(met.unsqueeze(-1) > 0, at, u)
-        slack = torch.where(met > 0, 0.0, slack)
+        def linearise(now: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+            normal, least, _ = self.inequalities(x, now[0], t)
+            found = nearest_admissible(first, normal * unit, least, low, high, self.table)
+            return found.point * unit, found.shortfall, now[2]
+
+        start = at, torch.zeros_like(t), ~met
+        u, slack, _ = repeat(_PASSES, linearise, start, where=lambda now: now[2])
         return torch.cat((u, margin, slack.unsqueeze(-1)), dim=-1).reshape(*z.shape[:-1], -1)
+
+    def _shortfall(self, k: int, x: Tensor, u: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
+        """How far phi misses its condition with u held, and h now: (1, n), (1, m), () -> (), ()."""
+        end, middle = self._held(k, x, u, t)
+        return self._required(k, x, t, end, middle) - end, _number(self.constraints[k])(x, t)
 
     def _inequality(self, k: int, x: Tensor, u: Tensor, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Of one constraint and one row: (1, n), (1, m), () -> (1, m), (), ()."""
-        phi, dt = self._level(k), self.hold
 
         def held(u: Tensor) -> tuple[Tensor, Tensor]:
-            middle = self._advance(x, u)
-            return phi(self._advance(middle, u), t + dt), phi(middle, t + 0.5 * dt)
+            return self._held(k, x, u, t)
 
         slope, (end, middle) = torch.func.grad_and_value(held, has_aux=True)(u)
-        now = phi(x, t)
+        required = self._required(k, x, t, end, middle)
+        miss = (required - end + (slope * u).sum()) / self.hold
+        return slope / self.hold, miss, _number(self.constraints[k])(x, t)
+
+    def _held(self, k: int, x: Tensor, u: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
+        """phi at the end of the hold, and in its middle."""
+        phi, middle = self._level(k), self._advance(x, u)
+        return phi(self._advance(middle, u), t + self.hold), phi(middle, t + 0.5 * self.hold)
+
+    def _required(self, k: int, x: Tensor, t: Tensor, end: Tensor, middle: Tensor) -> Tensor:
+        """What phi must be at the end."""
+        now = self._level(k)(x, t)
         dip = 0.5 * (now + end) - middle
         dip = torch.where(dip > 0, dip, 0.0)
-        required = dip + torch.exp(-self.decay[k].to(x) * dt) * (now - dip)
-        return slope / dt, (required - end + (slope * u).sum()) / dt, _number(self.constraints[k])(x, t)
+        return dip + torch.exp(-self.decay[k].to(x) * self.hold) * (now - dip)
 
     def _advance(self, x: Tensor, u: Tensor) -> Tensor:
         """x after half a hold."""

@@ -198,8 +198,8 @@ def uniform_numbers(x0: Tensor, count: int, draws: int, generators: Sequence[tor
     rows, dim = x0.shape
     drawn = torch.empty(rows, count, draws, dim, dtype=torch.float64)
     for row, generator in zip(drawn.unbind(0), generators, strict=False):
-        row.uniform_(generator=generator)
-    return drawn.mul_(2).sub_(1).to(x0)
+        row.uniform_(-1.0, 1.0, generator=generator)
+    return drawn.to(x0)
 
 
 def _check(system: Plant, cost: Cost, x0: Tensor) -> Cost:

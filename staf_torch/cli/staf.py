@@ -19,6 +19,7 @@ from ..sweeps.hydra_compat import (
     broken_sweep,
     find_launcher,
     full_errors,
+    mode_read_from_its_file,
     named_packages,
     program,
     trusted,
@@ -51,7 +52,7 @@ def main() -> None:
         try:
             argv = command_line(typed[1:])
             sys.argv = [typed[0], *with_mode(argv)]
-            with trusted(named_packages(argv)):
+            with trusted(named_packages(argv)), mode_read_from_its_file():
                 _staf()
         except Refused as refused:
             if wants_trace and refused.__cause__ is not None:

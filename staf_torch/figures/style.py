@@ -39,6 +39,8 @@ STYLE: dict[Any, Any] = {  # a two-column paper's figure: small sans-serif type,
     "xtick.direction": "in",
     "ytick.direction": "in",
     "pdf.fonttype": 42,
+    "figure.autolayout": False,  # or a figure of the user's would be laid out once more
+    "figure.constrained_layout.use": False,
 }
 WIDTH = 7.2  # inches: both columns of a paper
 _DPI = 200
@@ -66,8 +68,11 @@ def page(width: float, height: float) -> Iterator[Figure]:
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(width, height), layout="constrained")
         yield figure
-        figure.draw_without_rendering()
-        figure.set_layout_engine("none")  # laid out once: each file would be laid out anew, alike
+        engine = figure.get_layout_engine()
+        assert engine is not None
+        engine.execute(figure)
+        # Laid out once; while a figure has an engine, even an empty one, each file is drawn twice.
+        figure.set_layout_engine(None)
 
 
 @contextlib.contextmanager

@@ -112,7 +112,7 @@ def _library(source: Path, definitions: tuple[str, ...]) -> Path:
     if program is None:
         raise FileNotFoundError(f"none of {', '.join(_COMPILERS)} is on the path")
     command = [program, *_FLAGS, f"-I{_FOLDER}", *(f"-D{each}" for each in definitions), str(source)]
-    path = _cache() / f"{source.stem.removeprefix('_')}-{_key(command)}.so"
+    path = _cache() / f"{source.stem.removeprefix('_')}-{_key(program, source, definitions)}.so"
     if not is_whole(path):
         # Under a name of its own first: another process may be building the same.
         with tempfile.TemporaryDirectory(dir=path.parent) as scratch:
@@ -139,16 +139,17 @@ def is_whole(library: Path) -> bool:
     return content[-_DIGEST:] == hashlib.sha256(content[:-_DIGEST]).digest()
 
 
-def _key(command: list[str]) -> str:
-    """What the machine code depends on: the source, the command, the compiler and the processor."""
-    version = _run([command[0], "--version"])
-    sources = [
-        path.read_text()
-        for path in sorted(
-            (Path(command[-1]), *Path(command[-1]).parent.glob("_*.hpp"), *_FOLDER.glob("_*.hpp"))
-        )
-    ]
-    parts = (*sources, *command, version, platform.platform(), _processor())
+def _key(program: str, source: Path, definitions: tuple[str, ...]) -> str:
+    """What the machine code depends on: sources, flags, definitions, the compiler and the processor.
+
+    Not where the sources lie: two checkouts of one version share what is built.
+    """
+    version = _run([program, "--version"])
+    files = sorted(
+        {source, *source.parent.glob("_*.hpp"), *_FOLDER.glob("_*.hpp")}, key=lambda file: file.name
+    )
+    sources = [file.read_text() for file in files]
+    parts = (*sources, *_FLAGS, *definitions, version, platform.platform(), _processor())
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:16]
 
 

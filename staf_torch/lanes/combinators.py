@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .graph import STEP, Ids, Loop
+from .graph import FLAG, STEP, Ids, Loop
 from .tracer import LARGE, NotLoweredError, Tracer
 from .tree import flatten, unflatten
 
@@ -19,25 +19,50 @@ Tree = Any
 _active = threading.local()
 
 
-def repeat(count: int, body: Callable[[Tree], Tree], carry: Tree) -> Tree:
-    """body(...body(body(carry))), ``count`` times.
+def repeat(
+    count: int,
+    body: Callable[[Tree], Tree],
+    carry: Tree,
+    *,
+    where: Callable[[Tree], Tensor] | None = None,
+) -> Tree:
+    """body(...body(body(carry))), ``count`` times, or as often as a row asks for.
 
     Example:
         >>> repeat(3, lambda x: 2 * x, torch.ones(1))
         tensor([8.])
+        >>> repeat(9, lambda x: 2 * x, torch.tensor([1.0, 3.0, 70.0]), where=lambda x: x < 50)
+        tensor([64., 96., 70.])
 
         Shown by `staf experiment=adp adp/policy=rollout`.
 
     Args:
         count: of passes, at least 0.
         body: maps the carry to the next one of the same shapes and dtypes.
-        carry: a tree of tensors.
+        carry: a tree of tensors; with ``where`` of tensors (B, ...).
+        where: of a carry, (B,) bool: the rows that take the next pass. The others keep what they have, and
+            once no row goes on, no pass is computed. What ``body`` reads from outside of the carry is found
+            before the first pass, whoever takes it.
     """
-    if count > 1 and (tracer := _tracer(carry)) is not None:
-        return _loop(tracer, count, lambda now, _: (body(now), ()), carry, (), 1)[0]
+    if (count > 1 or (where is not None and count)) and (tracer := _tracer(carry)) is not None:
+        return _loop(tracer, count, lambda now, _: (body(now), ()), carry, (), 1, where)[0]
     for _ in range(count):
-        carry = body(carry)
+        if where is None:
+            carry = body(carry)
+            continue
+        going = where(carry)
+        if not (tracing_now() or torch._C._functorch.peek_interpreter_stack()) and not bool(going.any()):
+            break
+        carry = _chosen(going, body(carry), carry)
     return carry
+
+
+def _chosen(going: Tensor, after: Tree, before: Tree) -> Tree:
+    """``after`` in the rows that go on, ``before`` in the others."""
+    (new, structure), old = flatten(after), flatten(before)[0]
+    masks = (going.reshape(going.shape + (1,) * (leaf.dim() - going.dim())) for leaf in new)
+    picked = [torch.where(mask, one, other) for mask, one, other in zip(masks, new, old, strict=True)]
+    return unflatten(structure, iter(picked))
 
 
 def scan(
@@ -205,6 +230,7 @@ def _loop(
     carry: Tree,
     inputs: Tree,
     dim: int,
+    where: Callable[[Tree], Tensor] | None = None,
 ) -> tuple[Tree, Tree]:
     """Trace one pass and write the loop: the trees that come out of it."""
     graph = tracer.graph
@@ -224,7 +250,13 @@ def _loop(
         new = _numbers(tracer, "carry", (), (number, start), leaf, loop.depth)
         loop.carry += [graph.args[new[0]][0]] if large else new
         inner.append(tracer.attach(leaf.detach().clone(), np.array(new, dtype=np.int64).reshape(leaf.shape)))
-    after, outputs = body(unflatten(structure, iter(inner)), unflatten(feed, iter(now)))
+    before = unflatten(structure, iter(inner))
+    going = None if where is None else where(before)
+    if going is not None:
+        loop.going = int(tracer.nodes(going, FLAG).item())
+    after, outputs = body(before, unflatten(feed, iter(now)))
+    if going is not None:
+        after = _chosen(going, after, before)
     tracer.inside -= 1
     ends, end_structure = flatten(after)
     if [(e.shape, e.dtype) for e in ends] != [
@@ -310,7 +342,7 @@ def _collected(tracer: Tracer, leaf: Tensor, dim: int, loop: Loop, number: int, 
 def _place(tracer: Tracer, loop: Loop, number: int) -> None:
     """Where the loop stands: as far outside as what it needs allows."""
     graph = tracer.graph
-    ends = [*loop.following, *(node for part in loop.collected for node in part)]
+    ends = [*loop.following, *(node for part in loop.collected for node in part), *loop.condition]
     free, seen, stack = set(loop.initial), set(), ends
     while stack:
         node = stack.pop()

@@ -98,7 +98,7 @@ def written(objects: tuple[Any, ...]) -> Writer | str:
         for each in objects:
             writer.dump(each)
         writer.finish()
-    except (pickle.PicklingError, TypeError, AttributeError) as error:
+    except (pickle.PicklingError, TypeError, AttributeError, ValueError) as error:
         return str(error)
     return writer
 

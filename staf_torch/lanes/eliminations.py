@@ -340,10 +340,15 @@ def _one_hot(index: Tensor, num_classes: int = -1) -> Tensor:
     return (index.unsqueeze(-1) == torch.arange(num_classes, device=index.device)).to(torch.int64)
 
 
+def _is_finite(x: Tensor) -> Tensor:
+    return x.abs() < math.inf  # one comparison, where torch has two
+
+
 class InPlainTorch(TorchFunctionMode):
     """Context: a few functions of a traced tensor are plain torch operations, where one cannot see any more
     below, where operations are traced, what was asked for: `eigvalsh` looks like `eigh`, which takes many
-    times as long; the slope of a determinant reads the factors that torch keeps; `one_hot` reads its input.
+    times as long; the slope of a determinant reads the factors that torch keeps; `one_hot` reads its input;
+    `isfinite` compares twice.
 
     Args:
         traced: whether a tensor depends on an input of the program.
@@ -372,6 +377,7 @@ class InPlainTorch(TorchFunctionMode):
 _PLAIN: dict[Any, Callable[..., Any]] = {
     torch.linalg.eigvalsh: eigenvalues,
     torch.nn.functional.one_hot: _one_hot,
+    **dict.fromkeys((torch.isfinite, Tensor.isfinite), _is_finite),
     **dict.fromkeys((torch.linalg.det, torch.det, Tensor.det), determinant),
     **dict.fromkeys((torch.linalg.slogdet, torch.slogdet, Tensor.slogdet), log_determinant),
     **dict.fromkeys((torch.logdet, Tensor.logdet), _logdet),

@@ -11,9 +11,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from .fusion import ends_with, taken_over
 from .graph import FLAG, NOW, REAL, ROW, STEP, WHOLE, Graph
-from .schedule import Schedule
-from .statements import Layout, Writer
+from .schedule import Layout, Schedule
+from .statements import Writer
 from .tracer import LARGE
 
 _FEW = 400  # nodes of a program of which two vectors fit the registers and caches side by side
@@ -79,6 +80,8 @@ class _Writer(Writer):
     def __init__(self, graph: Graph, schedule: Schedule, layout: Layout, copies: int) -> None:
         super().__init__(graph, schedule, layout, {REAL: "V", WHOLE: "V", FLAG: "M"}, copies)
         self._in_memory = {slot for slot, size in enumerate(layout.carries) if size > LARGE}
+        self._taken_over = taken_over(graph, schedule)
+        self._ends = dict[int, int]()  # slots that a map makes where they were
         self.table: list[float] = []
         self.parameters: list[tuple[int, int]] = []
 
@@ -162,6 +165,10 @@ class _Writer(Writer):
         slots = self._slots(following)
         for slot, _, nodes in slots:
             if slot in self._in_memory:
+                node = ends_with(self.graph, self.schedule, self._taken_over, slot, nodes)
+                if node is not None:
+                    self._ends[slot] = node
+                    self._taken_over.add(node)
                 self._line(f"{self._type(nodes[0])} S{slot}[{len(nodes) * self.copies}];")
         for name, loop, place, node, j in self._carried(slots):
             read = "load_flag" if self.graph.type[node] == FLAG else "load"
@@ -208,6 +215,8 @@ class _Writer(Writer):
             own = [("state", (slot, k)) for k in range(len(nodes))]
             if slot not in self._in_memory or [(self.graph.op[n], self.graph.aux[n]) for n in nodes] == own:
                 continue
+            if slot in self._ends:
+                continue
             self._line(f"{self._type(nodes[0])} next{slot}[{len(nodes) * self.copies}];")
             self._fill(f"next{slot}", nodes)
             late.append((slot, f"next{slot}", len(nodes) * self.copies))
@@ -215,6 +224,8 @@ class _Writer(Writer):
         self._assign([(f"s{k}", node) for start, nodes in short for k, node in enumerate(nodes, start)])
         for slot, name, size in late:
             self._line(f"for (int p = 0; p < {size}; ++p) S{slot}[p] = {name}[p];")
+        for slot, node in self._ends.items():
+            self._entries(node, f"S{slot}")
 
     def _steps(self, following: Sequence[int]) -> None:
         """Write a step for a processor that is to expect that no row stays behind.
@@ -286,6 +297,9 @@ class _Writer(Writer):
         if graph.op[node] == "exp" and graph.op[graph.args[node][0]] == "neg":
             return f"exp_of_minus({self._ref(graph.args[graph.args[node][0]][0], j)})"
         return super()._expression(node, j)
+
+    def _nobody(self, mask: int) -> str:
+        return f"!any({' | '.join(self._ref(mask, j) for j in range(self.copies))})"
 
     def _fma(self, a: str, b: str, c: str) -> str:
         return f"fma({a}, {b}, {c})"

@@ -121,8 +121,8 @@ class RowFunction:
 def ready(module: nn.Module, x: Tensor) -> bool:
     """Compile now what serves calls like ``module(x)``: no control loop must wait for it at its 100th call.
 
-    Policies of `staf_torch.adp` run in plain torch until their calls would have paid for a compiler. It takes a
-    second to thirty, once; machine code from the user's cache is there in milliseconds.
+    Policies of `staf_torch.adp` run in plain torch until their calls would have paid for a compiler. It takes
+    one second to thirty, once; from the user's cache the machine code is there in milliseconds.
 
     Example:
         >>> plant, cost = systems.TwoState(), adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)

@@ -35,6 +35,12 @@ class Loop:
     initial: list[int] = dataclasses.field(default_factory=list)
     following: list[int] = dataclasses.field(default_factory=list)
     collected: list[list[int]] = dataclasses.field(default_factory=list)  # a pass's entries of every output
+    going: int = -1  # whether the row takes a pass, found at its head; -1 where it takes all
+
+    @property
+    def condition(self) -> list[int]:
+        """``going``, where there is one."""
+        return [self.going] if self.going >= 0 else []
 
 
 _FOLD: dict[str, Callable[..., Any]] = {

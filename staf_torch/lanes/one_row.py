@@ -14,7 +14,7 @@ from .eliminations import InPlainTorch
 from .given import Given
 from .graph import NOW, STEP, Graph
 from .lowering import lower
-from .statements import Layout
+from .schedule import Layout
 from .tracer import NoReading, NotLoweredError, Tracer
 from .tree import Shared, flatten, plain
 

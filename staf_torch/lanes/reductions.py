@@ -31,6 +31,10 @@ def _rows(array: Ids, dims: Any, keepdim: bool) -> tuple[Ids, Callable[[Ids], Id
 
 
 def _chain(t: Tracer, op: str, flat: Ids) -> Ids:
+    if op in ("and", "or"):  # halves, an odd entry in both: every loop goes on in the next one's place
+        while flat.size > LARGE and flat.shape[-1] > 1:
+            half = -(-flat.shape[-1] // 2)
+            flat = t.map(op, flat[..., :half], flat[..., -half:], least=_FEW)
     if op != "mul":  # in pairs, the order being free: g++ takes minutes over a long chain of choices
         least = _FEW if flat.size > LARGE else LARGE  # what is in memory stays there until little is left
         while flat.shape[-1] > 1:

@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from .graph import FLAG, REAL, ROW, STEP, WHOLE, WIDE, Graph
-from .schedule import Schedule
-from .statements import Layout, Writer
+from .schedule import Layout, Schedule
+from .statements import Writer
 
 _INFIX = {"add": "+", "sub": "-", "mul": "*", "div": "/", "lt": "<", "le": "<=", "eq": "==", "ne": "!="}
 _INFIX |= {"and": "&&", "or": "||", "xor": "!="}
@@ -52,6 +52,9 @@ class _ScalarWriter(Writer):
             a, b = values  # NaN wins
             return f"{a} {'<' if op == 'min' else '>'} {b} || {a} != {a} ? {a} : {b}"
         return f"{_NAMES.get(op, op)}{'' if wide else self._suffix}({', '.join(values)})"
+
+    def _nobody(self, mask: int) -> str:
+        return f"!({self._ref(mask, 0)})"
 
     def _fma(self, a: str, b: str, c: str) -> str:
         return f"{a} * {b} - {c[1:]}" if c.startswith("-") else f"{a} * {b} + {c}"

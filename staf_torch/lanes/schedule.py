@@ -4,8 +4,18 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from typing import NamedTuple
 
 from .graph import FIXED, NOW, REAL, ROW, STEP, Graph
+
+
+class Layout(NamedTuple):
+    """How many entries a program reads and writes."""
+
+    rows: Sequence[int]  # of every input that a row has once
+    nows: Sequence[int]  # of every input of a time
+    carries: Sequence[int]
+    outputs: Sequence[int]
 
 
 class Schedule:
@@ -41,6 +51,7 @@ class Schedule:
         self.ahead = self._find_ahead() if ahead else set()
         self.fused = self._fuse()
         absorbed = {graph.args[node][place] for node, place in self.fused.items()}
+        self._where: dict[int, tuple[int, int]] = {}  # the block of a node
         self._blocks = self._divide(absorbed)
 
     def block(self, depth: int) -> list[int]:
@@ -95,6 +106,10 @@ class Schedule:
         packs = [a for a in graph.args[node] if graph.op[a] == "pack"] if graph.op[node] == "dot" else []
         return any(graph.op[graph.args[pack][0]] in FIXED for pack in packs)
 
+    def together(self, one: int, other: int) -> bool:
+        """Whether two nodes stand in the same block: of one loop, or of one depth outside of all."""
+        return self._where[one] == self._where[other]
+
     def _once(self, node: int) -> bool:
         """Whether a node is found before the steps, be it inside a loop."""
         depth = self._graph.depth[node]
@@ -113,7 +128,8 @@ class Schedule:
         """What a loop starts and goes on with, as far as it is needed."""
         here = self._graph.loops[loop]
         ends = [part[k] for k in self.carries.get(loop, ()) for part in (here.initial, here.following)]
-        return ends + [node for k in self.collected(loop) for node in here.collected[k]]
+        ends += [node for k in self.collected(loop) for node in here.collected[k]]
+        return ends + here.condition if ends else []
 
     def _mark(self, stack: Sequence[int]) -> None:
         graph, waiting = self._graph, list(stack)
@@ -128,7 +144,7 @@ class Schedule:
                 if k not in self.carries.setdefault(number, set()):
                     self.carries[number].add(k)
                     loop = graph.loops[number]
-                    waiting += [loop.initial[k], loop.following[k], loop.carry[k]]
+                    waiting += [loop.initial[k], loop.following[k], loop.carry[k], *loop.condition]
             elif graph.op[node] == "collect":
                 number, k, _ = graph.aux[node]
                 self._collected.setdefault(number, set()).add(k)
@@ -180,5 +196,6 @@ class Schedule:
             depth = graph.depth[node]
             outside = STEP if depth == NOW and node not in self.ahead else depth
             place = (owner[node], depth) if depth > STEP else (-1, outside)
+            self._where[node] = place
             blocks.setdefault(place, []).append(node)
         return blocks

@@ -4,27 +4,19 @@ from __future__ import annotations
 
 import abc
 import math
-from collections.abc import Callable, Iterable, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any
 
 import numpy as np
 
+from .fusion import evenly, leaves
 from .graph import FIXED, Graph
 from .runs import runs
-from .schedule import Schedule
+from .schedule import Layout, Schedule
 from .tracer import NotLoweredError
 
 _INPUTS = ("const", "param", "elem", "result", "results", "collect", "carry", "carrys", "state", "row", "now")
 _ARRAYS = ("pack", "map", "dot", "collect", "carrys", "results")
-
-
-class Layout(NamedTuple):
-    """How many entries a program reads and writes."""
-
-    rows: Sequence[int]  # of every input that a row has once
-    nows: Sequence[int]  # of every input of a time
-    carries: Sequence[int]
-    outputs: Sequence[int]
 
 
 class Writer(abc.ABC):
@@ -49,6 +41,7 @@ class Writer(abc.ABC):
         self._level = 1
         self._stored: dict[int, tuple[str, int]] = {}  # what is read from a buffer instead, and its place
         self._in_memory: set[int] = set()  # slots of the carry that are arrays
+        self._taken_over: set[int] = set()  # maps that are computed where they are read
         self._starts = {
             "row": np.cumsum([0, *layout.rows]).tolist(),
             "now": np.cumsum([0, *layout.nows]).tolist(),
@@ -76,6 +69,10 @@ class Writer(abc.ABC):
     @abc.abstractmethod
     def _table(self, pack: int, at: str) -> str:
         """The expression of an entry of an array of constants."""
+
+    @abc.abstractmethod
+    def _nobody(self, mask: int) -> str:
+        """The condition that a mask holds for no row."""
 
     def _typed(self, node: int, text: str) -> str:
         """A number from memory as the node's type."""
@@ -112,7 +109,7 @@ class Writer(abc.ABC):
     def _block(self, nodes: Sequence[int]) -> None:
         for node in nodes:
             op = self.graph.op[node]
-            if op in _INPUTS:
+            if op in _INPUTS or node in self._taken_over:
                 continue
             if op == "loop":
                 self._loop(self.graph.aux[node])
@@ -141,7 +138,11 @@ class Writer(abc.ABC):
             self._line(f"{kind} y{number}_{k}[{size * self.copies}];")
         self._line(f"for (int i{number} = 0; i{number} < {loop.count}; ++i{number}) {{")
         self._level += 1
-        self._block(self.schedule.body(number))
+        body = self.schedule.body(number)
+        if loop.going >= 0:
+            self._block([node for node in body if node <= loop.going])
+            self._line(f"if ({self._nobody(loop.going)}) break;")
+        self._block([node for node in body if node > loop.going])
         for k in sorted(self.schedule.collected(number)):
             size = len(loop.collected[k])
             for e, node in enumerate(loop.collected[k]):
@@ -205,35 +206,51 @@ class Writer(abc.ABC):
         return f"S{slot}[{at}]" if self.copies == 1 else f"S{slot}[({at}) * {self.copies} + {j}]"
 
     def _map(self, node: int) -> None:
-        op, shape, *places = self.graph.aux[node]
         self._declare(node)
-        sizes = [s for s in shape if s > 1]
-        indices = [self._affine(place, sizes) for place in places]
+        self._entries(node, f"a{node}")
+
+    def _entries(self, node: int, name: str) -> None:
+        """Write the entries of a map into an array."""
+        sizes = [s for s in self.graph.aux[node][1] if s > 1]
+        places = [each for _, each in leaves(self.graph, self._taken_over, node)]
+        indices = [evenly(each, sizes) for each in places]
         names = [f"p{d}" for d in range(len(sizes))]
         whole = all(index is not None for index in indices)
         if not whole:
             names, sizes = ["p"], [math.prod(sizes)]
-        for name, size in zip(names, sizes, strict=True):
-            self._line(f"for (int {name} = 0; {name} < {size}; ++{name}) {{")
+        for variable, size in zip(names, sizes, strict=True):
+            self._line(f"for (int {variable} = 0; {variable} < {size}; ++{variable}) {{")
             self._level += 1
         target = self._sum(names, [math.prod(sizes[d + 1 :]) for d in range(len(sizes))], 0)
+        ats = [
+            self._sum(names, *index) if whole and index is not None else self._lookup(each)
+            for each, index in zip(places, indices, strict=True)
+        ]
         for j in range(self.copies):
-            values = []
-            for operand, place, index in zip(self.graph.args[node], places, indices, strict=True):
-                at = self._sum(names, *index) if whole and index is not None else self._lookup(place)
-                values.append(self._ref(operand, j) if place is None else self._read(operand, at, j))
-            result = self._operation(op, values, self.graph.type[node])
-            self._line(f"a{node}[({target}) * {self.copies} + {j}] = {result};")
+            value = self._mapped(node, iter(ats), j)
+            self._line(f"{name}[({target}) * {self.copies} + {j}] = {value};")
         for _ in names:
             self._level -= 1
             self._line("}")
+
+    def _mapped(self, node: int, ats: Iterator[str], j: int) -> str:
+        """The expression of one entry of a map, its `leaves` read at ``ats``."""
+        op, _, *places = self.graph.aux[node]
+        values = []
+        for operand, place in zip(self.graph.args[node], places, strict=True):
+            if operand in self._taken_over:
+                values.append(f"({self._mapped(operand, ats, j)})")
+                continue
+            at = next(ats)
+            values.append(self._ref(operand, j) if place is None else self._read(operand, at, j))
+        return self._operation(op, values, self.graph.type[node])
 
     def _dot(self, node: int) -> None:
         """Sums of products, some rows of them in registers at once."""
         outs, count, *places = self.graph.aux[node]
         kind = self._type(node)
         self._declare(node)
-        indices = [self._affine(place, [outs, count]) for place in places]
+        indices = [evenly(place, [outs, count]) for place in places]
         widths = range(4, 1 + (6 if self.copies > 1 else 8))
         panel = min(outs, min(reversed(widths), key=lambda width: -(-outs // width) * width))
         full = outs // panel
@@ -275,19 +292,6 @@ class Writer(abc.ABC):
 
     def _declare(self, node: int) -> None:
         self._line(f"{self._type(node)} a{node}[{self.graph.size(node) * self.copies}];")
-
-    def _affine(self, place: Any, sizes: Sequence[int]) -> tuple[list[int], int] | None:
-        """Strides and start of places in an array, None where they are irregular."""
-        if place is None:
-            return [0] * len(sizes), 0
-        table = np.array(place).reshape(sizes)
-        start, strides = int(table.flat[0]), []
-        for d in range(len(sizes)):
-            step = np.diff(table, axis=d)
-            if step.size and not (step == step.flat[0]).all():
-                return None
-            strides.append(int(step.flat[0]) if step.size else 0)
-        return strides, start
 
     def _sum(self, names: Sequence[str], strides: Sequence[int], start: int) -> str:
         terms = [n if s == 1 else f"{n} * {s}" for n, s in zip(names, strides, strict=True) if s]
@@ -351,6 +355,9 @@ class Writer(abc.ABC):
         if array in self._stored:
             return self._typed(array, self._buffer(*self._stored[array], j, at))
         place = self._in_place(array)
+        if place is not None and place[0] == "state":
+            slot = graph.aux[graph.args[array][0]][0]
+            return self._state(slot, self._sum([f"({at})"], [1], place[1]), j)
         if place is not None:
             return self._typed(array, self._buffer(*place, j, at))
         name = f"a{array}"
@@ -368,6 +375,11 @@ class Writer(abc.ABC):
         op = graph.op[args[0]]
         if op in FIXED and all(graph.op[a] in FIXED for a in args):
             return "table", 0
+        if op == "state":  # nothing is written there before the end of a step
+            slot, start = graph.aux[args[0]]
+            whole = [("state", (slot, start + k)) for k in range(len(args))]
+            fits = slot in self._in_memory and [(graph.op[a], graph.aux[a]) for a in args] == whole
+            return (op, start) if fits else None
         if op not in ("row", "now") or any(graph.op[a] != op for a in args):
             return None
         places = [self._starts[op][graph.aux[a][0]] + graph.aux[a][1] for a in args]

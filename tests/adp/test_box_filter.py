@@ -75,6 +75,18 @@ def test_a_control_that_is_renewed_in_time_keeps_every_start() -> None:
     assert not bool(run.diverged.any())
 
 
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_a_way_that_is_a_line_has_slopes(dtype: torch.dtype) -> None:
+    # With the control that is wanted x1 goes straight to its wall: in float32 the cubic is a line.
+    s = BOX.transform(tensor([[4.999999, 3.4938383727974553]])).to(dtype)
+    guard = adp.BoxFilter(OF_S, BOX, dt=DT, renewed=True)
+    hold = guard.hold(s)
+    normal, least = guard.inequalities(s, OF_S(s), hold, torch.full_like(hold, 0.5))
+    assert bool(torch.isfinite(normal).all())
+    assert bool(torch.isfinite(least).all())
+    assert float(guard(s)) == pytest.approx(-2.103e7, rel=1e-3)  # v^2/d, by v = 3.49 and d = 5e-7
+
+
 @pytest.mark.compiled
 def test_compiled_it_keeps_the_same_starts() -> None:
     s0 = BOX.transform(beside_the_walls(40))

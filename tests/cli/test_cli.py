@@ -7,13 +7,11 @@ import importlib.util
 import json
 import math
 import statistics
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import Outcome, environment, run_all
+from command_line import Outcome, run_all
 
 from staf_torch.cli.staf import config_directory
 
@@ -342,11 +340,3 @@ def test_help_lists_the_groups_and_the_settings(outcomes: dict[str, Outcome]) ->
     assert outcome.left == set()
     for words in ("State Following", "kernel:", "exponential", "initial_state", "duration"):
         assert words in outcome.out
-
-
-def test_the_package_is_the_command(tmp_path: Path) -> None:
-    line = [sys.executable, "-m", "staf_torch", *SHORT]
-    ended = subprocess.run(line, cwd=tmp_path, env=environment(), capture_output=True, text=True, check=True)
-    assert ended.stderr == ""
-    (run,) = (tmp_path / "runs").iterdir()
-    assert set(metrics(run)) == KEYS

@@ -37,6 +37,25 @@ def test_damaged_library_in_the_cache_is_built_anew(
     assert ctypes.CDLL(str(path)).staf_seven() == 7
 
 
+@needs_compiler
+def test_checkouts_of_one_version_share_what_is_built_and_others_do_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    program = build._program()
+    assert program is not None
+    for place in ("one", "two", "three"):
+        (tmp_path / place).mkdir()
+        (tmp_path / place / "_seven.cpp").write_text('#include "_number.hpp"\n')
+        (tmp_path / place / "_number.hpp").write_text("9" if place == "three" else "7")
+    one, two, three = (tmp_path / place / "_seven.cpp" for place in ("one", "two", "three"))
+    key = build._key(program, one, ("N=3",))
+    assert build._key(program, two, ("N=3",)) == key
+    assert build._key(program, three, ("N=3",)) != key  # a header of it
+    assert build._key(program, one, ("N=4",)) != key
+    monkeypatch.setattr(build, "_FLAGS", (*build._FLAGS, "-O0"))
+    assert build._key(program, one, ("N=3",)) != key
+
+
 @pytest.mark.parametrize("name", ["g++", "clang++"])
 def test_a_long_program_is_built_by_every_compiler(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import math
 import sys
 from collections.abc import Callable
@@ -13,6 +14,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from staf_torch.lanes.content import reads_users_code, skeleton
 from staf_torch.lanes.function import RowFunction
 from staf_torch.lanes.kept import Kept
 from staf_torch.lanes.program import Program
@@ -228,3 +230,9 @@ def test_a_program_of_ones_own_step_reads_again_what_has_changed(notebook: Any) 
         found, expected = program(X, steps=2), program.definition(X, steps=2)
         for one, other in zip(found, expected, strict=True):
             torch.testing.assert_close(one, other)
+
+
+def test_a_pointer_cannot_be_written_down_and_is_a_users() -> None:
+    pointer = ctypes.pointer(ctypes.c_double(1.0))
+    assert skeleton(pointer) is None
+    assert reads_users_code(pointer)

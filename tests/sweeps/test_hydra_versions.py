@@ -6,6 +6,12 @@ import importlib
 from pathlib import Path
 
 import pytest
+from hydra._internal import utils as hydra_utils
+from hydra._internal.hydra import Hydra
+from omegaconf import OmegaConf
+
+from staf_torch.settings import config_directory
+from staf_torch.sweeps.hydra_compat import in_process, mode_read_from_its_file
 
 program = importlib.import_module("staf_torch.sweeps.hydra_compat.program")  # a function has that name too
 
@@ -46,3 +52,44 @@ def test_the_mode_of_an_experiment_is_said_where_only_the_newer_hydra_needs_it(
         assert program.with_mode(line) == line
     last = program.with_mode(["experiment=plain", *swept])  # of two experiments the last one counts
     assert last == ["experiment=plain", *(told if version else swept)]
+
+
+@pytest.mark.skipif(program.HAS_WHITELIST, reason="Hydra 1.4 takes the mode from the command line")
+@pytest.mark.parametrize(
+    ("overrides", "composes"),
+    [
+        ([], False),
+        (["experiment=ablation", "kernel=gaussian"], False),
+        (["experiment=ablation", "experiment=adp"], False),
+        (["experiment=ablation", "hydra.mode=RUN"], True),
+        (["experiment=swept"], True),
+        (["experiment=ablation,adp"], True),
+        (["hydra.searchpath=[pkg://nothing]"], True),
+    ],
+)
+def test_the_mode_that_is_read_from_a_file_is_the_one_that_hydra_composes(
+    overrides: list[str], composes: bool, folder: str
+) -> None:
+    path = hydra_utils.create_config_search_path(config_directory())
+    if overrides == ["experiment=swept"]:  # a folder of the user's, who may set the mode in any file
+        path.prepend("command-line", f"file://{folder}")
+    with in_process._singletons():
+        program_of_hydra = Hydra.create_main_hydra2("staf", path)
+        expected = program_of_hydra.get_mode("config", overrides)
+        asked: list[object] = []
+        compose = program_of_hydra.compose_config
+        program_of_hydra.compose_config = lambda *a, **k: asked.append(a) or compose(*a, **k)
+        with mode_read_from_its_file():
+            assert program_of_hydra.get_mode("config", overrides) == expected
+        assert bool(asked) == composes
+
+
+def test_files_of_experiments_alone_set_the_mode_and_none_includes_another() -> None:
+    for file in Path(config_directory()).rglob("*.yaml"):
+        settings = OmegaConf.load(file)
+        if file.parent.name == "experiment":
+            for entry in settings.get("defaults", []):
+                assert "experiment" not in str(entry), file
+        else:
+            assert OmegaConf.select(settings, "hydra.mode") is None, file
+            assert "mode" not in settings or "hydra" not in file.parts, file

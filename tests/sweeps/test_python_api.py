@@ -60,7 +60,8 @@ def test_a_run_leaves_what_the_command_leaves(capsys: pytest.CaptureFixture[str]
     found = staf_torch.run(*SHORT, "centers.radius=0.2", directory="one")
     assert capsys.readouterr().out == ""
     line = [sys.executable, "-m", "staf_torch", *SHORT, "centers.radius=0.2", "hydra.run.dir=two"]
-    subprocess.run(line, check=True, capture_output=True, env=os.environ | {"PYTHONPATH": str(ROOT)})
+    ended = subprocess.run(line, check=True, capture_output=True, env=os.environ | {"PYTHONPATH": str(ROOT)})
+    assert ended.stderr == b""
     for name in ("metrics.json", ".hydra/config.yaml", "figures/gradient_chase.png"):
         assert Path("one", name).read_bytes() == Path("two", name).read_bytes(), name
     assert {path.name for path in Path("one").iterdir()} == {path.name for path in Path("two").iterdir()}

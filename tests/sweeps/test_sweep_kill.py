@@ -13,7 +13,6 @@ KILLED = """
 import os, random, signal, sys, time
 import staf_torch.cli.staf as app
 import staf_torch.experiments.gradient_chase  # so that the children share it
-import torch._dynamo  # and what torch.func.grad imports
 
 GRID = ["centers.count=3,4,6", "centers.radius=0.1,0.2", "hydra.launcher.batch=2"]
 GRID += ["duration=0.05", "settle_time=0", "figures=false", "history=false"]

@@ -47,9 +47,8 @@ import os, random, signal, sys, time
 import staf_torch.cli.staf as app
 import staf_torch.sweeps.executors.controller as controller
 import staf_torch.experiments.gradient_chase  # so that the children share it
-import torch._dynamo
 
-GRID = ["centers.count=3,4,6", "centers.radius=0.1,0.2", "seed=0,1", "hydra.launcher.batch=1"]
+GRID = ["centers.count=3,4,6", "centers.radius=0.1,0.2", "hydra.launcher.batch=1"]
 GRID += ["duration=0.05", "settle_time=0", "figures=false", "history=false"]
 
 def start(place, *argv):
@@ -78,7 +77,7 @@ chance = random.Random(3)
 for number in (signal.SIGTERM, signal.SIGHUP, signal.SIGINT):
     place = number.name
     child = start(place, *GRID, f"hydra.sweep.dir={place}")
-    jobs = chance.randint(1, 4)
+    jobs = chance.randint(1, 3)
     while not os.path.exists(f"{place}/{jobs}/run.json"):
         time.sleep(0.0005)
     os.kill(child, number)
@@ -108,7 +107,7 @@ def test_signals_end_a_sweep_with_its_report_and_the_line_that_resumes(tmp_path:
     run = subprocess.run(line, cwd=tmp_path, env=environment(), capture_output=True, text=True, check=False)
     assert run.returncode == 0, run.stderr
     codes = json.loads(run.stdout)
-    assert codes["whole"] == 1  # four jobs have a count that there is not
+    assert codes["whole"] == 1  # two jobs have a count that there is not
     for name, code, said in (
         ("SIGTERM", 143, "ended by SIGTERM"),
         ("SIGHUP", 129, "ended by SIGHUP"),
@@ -122,7 +121,7 @@ def test_signals_end_a_sweep_with_its_report_and_the_line_that_resumes(tmp_path:
         assert "report: " in log
         assert codes[f"{name} again"] == 1
         assert (tmp_path / name / "table.csv").read_text() == (tmp_path / "whole" / "table.csv").read_text()
-    assert "cancels 11 jobs (scancel did not end in time)" in (tmp_path / "slurm.log").read_text()
+    assert "cancels 5 jobs (scancel did not end in time)" in (tmp_path / "slurm.log").read_text()
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from ...lanes import repeat
 from ...numerics.checks import integer, non_negative, positive_real, real
 from ..cost import matvec
 from .windows import Equation
@@ -89,6 +90,18 @@ class HistoryStack:
 
     def step(self, state: Stack, equation: Equation) -> Stack:
         """The stack after one more trial, with the equation where it is ready and fits."""
+
+        def busy(now: tuple[Stack, Equation]) -> Tensor:
+            return now[1].ready | (now[0].turn >= 0)
+
+        def trial(now: tuple[Stack, Equation]) -> tuple[Stack, Equation]:
+            return self._trial(*now), now[1]
+
+        # Most of the time there is nothing to try: a compiled program then computes no eigenvalue.
+        after: Stack = repeat(1, trial, (state, equation), where=busy)[0]
+        return after
+
+    def _trial(self, state: Stack, equation: Equation) -> Stack:
         slots, full = torch.arange(self.size, device=state.s.device), state.filled >= self.size
         change = (equation.s - state.tried_s).square().sum((-2, -1))
         new = change > self.novelty**2 * equation.s.square().sum((-2, -1))

@@ -66,6 +66,7 @@ class Composer:
         loader: Hydra's, of the program.
         config_name: of the primary configuration.
         hydra_node: False for the configuration as a task sees it, which is the larger part of the time.
+        whole: a composer of the same configurations with Hydra's node, whose choices are not composed again.
         always: overrides that all calls share; their values are applied once.
     """
 
@@ -76,8 +77,9 @@ class Composer:
         *,
         hydra_node: bool = True,
         always: Collection[str] = (),
+        whole: Composer | None = None,
     ) -> None:
-        self._loader, self._name, self._hydra_node = loader, config_name, hydra_node
+        self._loader, self._name, self._hydra_node, self._whole = loader, config_name, hydra_node, whole
         self._parser = OverridesParser.create()
         self._parsed: dict[str, Override] = {}
         self._always = frozenset(always)
@@ -103,7 +105,7 @@ class Composer:
             first = [one for one in values if one.input_line in self._always]
         key = (chosen, *(one.input_line for one in first))
         if key not in self._chosen:
-            made = self.anew(chosen)
+            made = self.anew(chosen) if self._whole is None else self._without_node(self._whole(chosen))
             self._set(made, first, parsed)
             self._chosen[key] = pickle.dumps(made)
         composed: DictConfig = pickle.loads(self._chosen[key])
@@ -148,7 +150,10 @@ class Composer:
 
     def anew(self, overrides: Sequence[str]) -> DictConfig:
         """Return the configuration as Hydra itself composes it; arguments and errors as of a call."""
-        composed = self._loader.load_configuration(self._name, list(overrides), RunMode.RUN)
+        return self._without_node(self._loader.load_configuration(self._name, list(overrides), RunMode.RUN))
+
+    def _without_node(self, composed: DictConfig) -> DictConfig:
+        """Remove Hydra's node, unless it is wanted."""
         if not self._hydra_node:
             with read_write(composed), open_dict(composed):
                 del composed["hydra"]
@@ -231,8 +236,8 @@ class JobLoader:
     def __init__(self, loader: ConfigLoader, master: DictConfig) -> None:
         self._loader = loader
         name = master.hydra.job.config_name
-        self._settings = Composer(loader, name, hydra_node=False)
         self._whole = Composer(loader, name)
+        self._settings = Composer(loader, name, hydra_node=False, whole=self._whole)
         self.hydra_yaml: dict[tuple[str, ...], dict[str, str]] = {}  # parts of `hydra.yaml`, by `choices`
         self._unseen = bool(master.hydra.searchpath)  # groups that a `Composer` cannot see
 

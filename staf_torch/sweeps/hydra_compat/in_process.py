@@ -25,6 +25,7 @@ from omegaconf.basecontainer import BaseContainer
 
 from ...settings import config_directory
 from .log_handlers import handlers_aside
+from .mode import mode_read_from_its_file
 from .program import find_launcher, named_packages, trusted, with_mode
 
 _OF_AN_APPLICATION: tuple[type, ...] = (GlobalHydra, HydraConfig, JobRuntime, VersionBase)
@@ -39,7 +40,8 @@ class Application(NamedTuple):
 
     def is_sweep(self, overrides: Sequence[str]) -> bool:
         """Return whether the settings themselves ask for a sweep, as those of `experiment=ablation` do."""
-        return bool(self.hydra.get_mode("config", with_mode(overrides)) == RunMode.MULTIRUN)
+        with mode_read_from_its_file():
+            return bool(self.hydra.get_mode("config", with_mode(overrides)) == RunMode.MULTIRUN)
 
     def run(self, task: Callable[[DictConfig], Any], overrides: Sequence[str]) -> Path:
         """Run one job and return its directory.
