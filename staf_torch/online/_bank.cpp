@@ -1,6 +1,7 @@
 // A call of `Bank` on many streams, one after the other: what bank.py defines. The members of the bank are
 // the lanes. DIM, COUNT, OUTPUTS, CAPACITY, NEIGHBOURS are given on the command line of the compiler.
 
+#include "_learned_trackers.hpp"
 #include "_mixture.hpp"
 
 #include <cstring>
@@ -56,6 +57,22 @@ INLINE V row(const double *from) {
     return found;
 }
 
+// The trackers whose hyperparameters are learned.
+constexpr int turned_lane = 0, plain_lane = 1, fading_lane = 4, turned_fading_lane = 5;
+
+INLINE TrackerRules tracker_rules(const Rules &r, const Stream &s) {
+    return {s.tracker_rate, s.tracker_noise, s.tracker_forgetting, r.trackers.jitter, r.trackers.wrong};
+}
+// Where the trackers see u: some in the coordinates of the metric.
+INLINE void tracked_at(const Stream &s, const double *u, V *at) {
+    double turned[n];
+    turn(s.metric, u, turned);
+    for (int i = 0; i < n; ++i) {
+        at[i] = all(u[i]);
+        at[i][turned_lane] = at[i][turned_fading_lane] = turned[i];
+    }
+}
+
 static void restart_linear(const Rules &r, Stream &s) {
     std::memset(s.covariance, 0, sizeof s.covariance + sizeof s.linear + sizeof s.filters);
     s.trackers.restart(Mask{} == Mask{});
@@ -81,6 +98,8 @@ static void clear(const Rules &r, Stream &s) {
         s.error[o] = s.pace[o] = s.own[o] = s.best[o] = s.calibration[o] = 1, s.low[o] = infinity, s.high[o] = -infinity;
         for (int g = 0; g < groups_of_members; ++g) s.correction_covariance[o][g][g] = r.correction_prior;
     }
+    s.tracker_rate = r.trackers.rate, s.tracker_noise = r.trackers.noise, s.tracker_forgetting = r.trackers.forgetting;
+    for (int i = 0; i < n; ++i) s.metric[i][i] = 1;
     restart_linear(r, s);
 }
 
@@ -117,11 +136,12 @@ static void carry(const Rules &r, Stream &s, const double *x, const double *y, d
     s.quadratics.learn(phi, v, after(row(r.quadratic_forgetting)), row(r.quadratic_prior));
     Filter f = filters_of(s);
     const Law law = law_of(r);
-    V at[n], value[K], z[n];
+    V at[n], value[K], z[n], place[n];
     Mask seen[K];
     for (int i = 0; i < n; ++i) at[i] = all(u[i + 1]);
     for (int o = 0; o < K; ++o) value[o] = all(v[o]);
-    s.trackers.learn(r.trackers, at, value, after(r.trackers.forgetting));
+    tracked_at(s, u + 1, place);
+    s.trackers.learn(tracker_rules(r, s), place, value, after(s.tracker_forgetting));
     const Verdict verdict = judge(law, f, at, value, seen, V{});
     for (int i = 0; i < n; ++i) z[i] = verdict.moves ? V{} : verdict.z[i];
     if (any(verdict.moves)) {
@@ -155,6 +175,30 @@ template <typename Value> static double median(int count, Value value) {
     return sorted[(count - 1) / 2];
 }
 
+// Four trackers' hyperparameters, from the latest samples in the store, which has all of them in their order.
+static void learn_trackers(const Rules &r, Stream &s) {
+    static thread_local Stretch stretch;
+    static thread_local Learned found;
+    const int count = int(s.count);
+    stretch.count = 0;
+    int usable[most_searched];
+    for (int j = count; j-- > 0 && stretch.count < most_searched;)
+        if (!beyond(r, s, s.x[j], s.y[j])) usable[stretch.count++] = j;
+    for (int i = 0; i < stretch.count; ++i) {
+        const int j = usable[stretch.count - 1 - i];
+        scaled(r, s, s.x[j], stretch.at[i]);
+        for (int o = 0; o < K; ++o) stretch.y[o][i] = in_units(r, s, o, s.y[j][o]);
+        stretch.when[i] = s.when[j];
+    }
+    learn_hyperparameters(stretch, found);
+    std::memcpy(s.metric, found.metric, sizeof s.metric);
+    auto take = [&](int lane, const Choice &c) {
+        s.tracker_rate[lane] = c.rate, s.tracker_noise[lane] = c.noise, s.tracker_forgetting[lane] = std::exp(-2 * c.fade);
+    };
+    take(turned_lane, found.turned), take(plain_lane, found.plain);
+    take(fading_lane, found.fading), take(turned_fading_lane, found.turned_fading);
+}
+
 // Units from the samples in the store, which has all of them; the carried models learn these again.
 static void rescale(const Rules &r, Stream &s) {
     const int count = int(s.count);
@@ -174,6 +218,8 @@ static void rescale(const Rules &r, Stream &s) {
     }
     std::fill(s.low, s.low + K, infinity);
     std::fill(s.high, s.high + K, -infinity);
+    if (count >= r.searched_at) learn_trackers(r, s);
+    std::memset(s.map, 0, sizeof s.map);
     restart_linear(r, s);
     for (int j = 0; j < count; ++j) {
         if (beyond(r, s, s.x[j], s.y[j])) continue;
@@ -285,13 +331,14 @@ static void ask(const Rules &r, Stream &s, const double *x) {
     for (int i = 0; i < unknowns; ++i)
         for (int j = 0; j < unknowns; ++j) spread += u[i] * s.covariance[i][j] * u[j];
     local_processes(r, s, x, u + 1, line);
-    V at[n], mean[K], variance[K], bent[K], tracked[K];
+    V at[n], place[n], mean[K], variance[K], bent[K], tracked[K];
     double phi[features];
     quadratic_features(u + 1, phi);
     const V bent_spread = s.quadratics.predict(phi, bent);
     for (int i = 0; i < n; ++i) at[i] = all(u[i + 1]);
-    const V tracked_spread = s.trackers.predict(r.trackers, at, tracked);
-    const V unknown = minimum(tracked_spread - r.trackers.noise, all(1));
+    tracked_at(s, u + 1, place);
+    const V tracked_spread = s.trackers.predict(tracker_rules(r, s), place, tracked);
+    const V unknown = minimum(tracked_spread - s.tracker_noise, all(1));
     const Filter f = filters_of(s);
     predict(r.functions, law_of(r), f, [&](int i) { return f.learned[i]; }, at, mean, variance);
     for (int o = 0; o < K; ++o) {

@@ -6,7 +6,7 @@
 
 constexpr int C = CAPACITY, near = NEIGHBOURS, sides = 2, groups = 3, locals = groups * lanes, carried = lanes;
 constexpr int members = locals + carried + 2 * lanes + 2, clocks = 3;  // quadratics, trackers, the linear model, the last value
-constexpr int unknowns = n + 1, groups_of_members = 11, blends = 3;
+constexpr int unknowns = n + 1, groups_of_members = 11, blends = 4, knots = 33;
 constexpr double least = 1e-30;  // of a variance
 
 struct Rules {  // see bank.py
@@ -19,7 +19,8 @@ struct Rules {  // see bank.py
     double quadratic_forgetting[lanes], quadratic_prior[lanes], pace, correction_prior, correction_forgetting;
     double correction_most, correction_discount, correction_share, least, doubt;
     double doubtful, doubtful_outside, outside, rare, doubted_rate, settled;
-    double squares_discount, squares_rate, squares_share, own_rate, best_rate, largest, uncalibrated;
+    double squares_discount, squares_rate, squares_share, own_rate, best_rate, largest, uncalibrated, searched_at;
+    double map_step, map_prior, map_forgetting;
     TrackerRules trackers;
     Functions functions;
 };
@@ -34,12 +35,15 @@ struct Stream {  // the row of a stream in the table of bank.py
     Quadratics quadratics;
     double quadratic_error[K][lanes];
     Trackers trackers;
+    Row tracker_rate, tracker_noise, tracker_forgetting;  // in place of those of the rules, once they are learned
+    double metric[n][n];
     double weights[K][clocks][members], clock_weights[K][clocks], excess[K][members], usual[K][members];
     double squares[K][members];
     double error[K], pace[K], own[K], best[K], low[K], high[K], calibration[K];
     double correction_covariance[K][groups_of_members][groups_of_members], correction[K][groups_of_members];
     double away[K][groups_of_members], corrected[K][blends];
+    double map[K][2][knots];  // corrections, and what is known of them
     double means[K][members], variances[K][members], mixed[K][clocks], mixed_variance[K][clocks];
-    double blend[K][blends], mean[K], variance[K];
+    double blend[K][blends], straight[K], mean[K], variance[K];
     double x[C][n], y[C][K], when[C], order[C], gap[C];
 };

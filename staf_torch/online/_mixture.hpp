@@ -19,6 +19,14 @@ constexpr int group_of(int i) {
                                       : -1;
 }
 
+// Where a mean stands among the knots of the map: the knot below it, and the part of the way to the next.
+static int knot_of(const Rules &r, double mean, double &part) {
+    const double place = std::min(knots - 1., std::max(0., mean / r.map_step + knots / 2));  // 0 for NaN
+    const int knot = std::min(int(place), knots - 2);
+    part = place - knot;
+    return knot;
+}
+
 // The mixture of what the members say of an output, its correction, and its variance; within low and high.
 static void mix(const Rules &r, Stream &s, int o, double low, double high) {
     const double *means = s.means[o], *variances = s.variances[o];
@@ -68,15 +76,23 @@ static void mix(const Rules &r, Stream &s, int o, double low, double high) {
         const double weight = std::exp(logs[i] - peak);
         whole_of += weight, squared += weight * means[i];
     }
-    double *blend = s.blend[o], best = -infinity, parts = 0;
+    double *blend = s.blend[o];
     blend[0] = first, blend[1] = stacked, blend[2] = squared / whole_of;
-    for (double log : s.corrected[o]) best = std::max(best, log);
-    s.mean[o] = 0;
-    for (int b = 0; b < blends; ++b) {
-        const double share = std::exp(s.corrected[o][b] - best);
-        if (share >= r.drop) parts += share, s.mean[o] += share * blend[b];
-    }
-    s.mean[o] /= parts;
+    auto mixed = [&](int count) {
+        double best = -infinity, parts = 0, sum = 0;
+        for (int b = 0; b < count; ++b) best = std::max(best, s.corrected[o][b]);
+        for (int b = 0; b < count; ++b) {
+            const double share = std::exp(s.corrected[o][b] - best);
+            if (share >= r.drop) parts += share, sum += share * blend[b];
+        }
+        return sum / parts;
+    };
+    s.straight[o] = mixed(blends - 1);
+    double part;
+    const int knot = knot_of(r, s.straight[o], part);
+    const double mapped = s.straight[o] + (1 - part) * s.map[o][0][knot] + part * s.map[o][0][knot + 1];
+    blend[blends - 1] = std::max(std::min(mapped, high), low);
+    s.mean[o] = mixed(blends);
     second += square(s.mean[o] - first);
     s.variance[o] = std::max(second, r.floor * s.pace[o]) * s.calibration[o];
 }
@@ -118,10 +134,25 @@ static void learn_correction(const Rules &r, Stream &s, int o, double blended) {
             for (double &entry : row) entry /= r.correction_forgetting;
 }
 
+// The map of the mean learns by least squares, each of two knots as if it stood alone.
+static void learn_map(const Rules &r, Stream &s, int o, double value) {
+    double part;
+    const int knot = knot_of(r, s.straight[o], part);
+    auto &correction = s.map[o][0], &known = s.map[o][1];
+    const double of[] = {1 - part, part};
+    const double error = value - s.straight[o] - of[0] * correction[knot] - of[1] * correction[knot + 1];
+    for (int i = 0; i < 2; ++i) {
+        double &k = known[knot + i];
+        k = k * (1 - (1 - r.map_forgetting) * of[i]) + of[i] * of[i];
+        correction[knot + i] += of[i] * error / (k + r.map_prior);
+    }
+}
+
 // The members and their mixtures are judged by their prediction of an output, in units.
 static void judge_members(const Rules &r, Stream &s, int o, double value) {
     const double t = s.clock, error = value - s.mean[o], blended = value - s.blend[o][0];
     learn_correction(r, s, o, blended);
+    learn_map(r, s, o, value);
     const double z2 = error * error / std::max(s.variance[o] / s.calibration[o], 1e-300);
     const double surprised = std::min(z2, surprise * s.calibration[o]) - s.calibration[o], since = t - r.uncalibrated;
     if (since > 0) s.calibration[o] += std::max(r.error_rate, 1 / (since + 5)) * surprised;

@@ -19,6 +19,7 @@ from .bank_rules import (
     CARRIED_RADIUS,
     CARRIED_WIDTH,
     RECENT,
+    SEARCHED,
     TRACKED,
     BankShape,
     Rules,
@@ -54,14 +55,17 @@ class Bank:
     predicts, and 24 Gaussian processes on k samples correct what it leaves: the k nearest, without and
     with two rates of fading by age, and the k latest, each with three widths and two noises, amplitudes
     y'K^-1 y / k. Beside them stand eight filters (`LocalFilter`, M = n + 1), eight models quadratic in x
-    (recursive least squares, five rates of forgetting), eight Gaussian processes on at most 63 samples of the
-    whole past that fade (`TrackerModels`), that linear model and the last value.
+    (recursive least squares, five rates of forgetting), eight Gaussian processes on at most 95 samples of the
+    whole past that fade (`TrackerModels`; four learn width, noise, rate of fading and a metric, see
+    learned_trackers.py), that linear model and the last value.
 
     Every member's variance is scaled by its running squared error. The members are mixed by discounted
     scores, part Student-t likelihood with the member's variance, part with the common running error, at
     three rates of discount, and the less the less certain they are; the three mixtures are mixed alike. With
     what least squares on groups of members adds to that, and a mixture by squared errors over a long time,
-    they make the mean. Its variance follows its running squared error.
+    they make a mean, and a map of that mean to what usually follows it (33 knots) makes another one, for
+    functions that saturate and targets of few values; the four are weighed by how they predict. The variance
+    follows the running squared error.
 
     Args:
         shape: sizes.
@@ -173,5 +177,6 @@ class Bank:
 @functools.cache
 def _built(shape: BankShape) -> Callable[..., None] | None:
     sizes = f"DIM={shape.dim}", f"COUNT={shape.dim + 1}", f"OUTPUTS={shape.outputs}"
-    kept = f"CAPACITY={shape.capacity}", f"NEIGHBOURS={shape.neighbours}", f"TRACKED={TRACKED}"
-    return compiled(Path(__file__).with_name("_bank.cpp"), *sizes, *kept)
+    kept = f"CAPACITY={shape.capacity}", f"NEIGHBOURS={shape.neighbours}"
+    trackers = f"TRACKED={TRACKED}", f"SEARCHED={SEARCHED}"
+    return compiled(Path(__file__).with_name("_bank.cpp"), *sizes, *kept, *trackers)

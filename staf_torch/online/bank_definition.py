@@ -10,9 +10,21 @@ import math
 import torch
 from torch import Tensor
 
-from .bank_rules import GROUPS, BankShape, Rules, layout
+from .bank_rules import (
+    FADING,
+    GROUPS,
+    PLAIN,
+    SEARCHED,
+    TRACKERS,
+    TURNED,
+    TURNED_FADING,
+    BankShape,
+    Rules,
+    layout,
+)
 from .filter_streams import units_of
 from .kalman_filter import STREAK, LocalFilter, StreamState
+from .learned_trackers import Stretch, learn_hyperparameters
 from .local_functions import LocalFunctions
 from .mixture_definition import judge, mix
 from .quadratic_models import QuadraticModels, quadratic_features
@@ -44,8 +56,6 @@ class BankDefinition:
         forgetting = torch.tensor(rules.forgetting, dtype=torch.float64)
         self.share = torch.tensor(rules.quadratic_forgetting, dtype=torch.float64)
         self.prior = torch.tensor(rules.quadratic_prior, dtype=torch.float64)
-        rows = rules.tracker_rate, rules.tracker_noise, rules.tracker_forgetting
-        self.tracker_rate, self.tracker_noise, self.tracker_share = torch.tensor(rows, dtype=torch.float64)
         self.filter = LocalFilter(functions, ratio, forgetting, rules.carried_slack)
 
     def each(self, table: Tensor) -> list[Views]:
@@ -67,6 +77,9 @@ class BankDefinition:
         for name in ("spread", "excess", "error", "pace", "own", "best", "calibration", "quadratic_error"):
             s[name].fill_(1.0)
         s["correction_covariance"].copy_(self.rules.correction_prior * torch.eye(GROUPS, dtype=torch.float64))
+        for name in ("rate", "noise", "forgetting"):
+            s[f"tracker_{name}"].copy_(torch.tensor(getattr(self.rules, f"tracker_{name}")))
+        s["metric"].copy_(torch.eye(self.shape.dim, dtype=torch.float64))
         s["order"].fill_(-1.0)
         s["gap"].fill_(torch.inf)
         s["low"].fill_(torch.inf)
@@ -119,9 +132,10 @@ class BankDefinition:
         features = quadratic_features(u[1:], self.shape.features)
         bent, wide_of = QuadraticModels(s["factor"], s["quadratic"]).predict(features)
         jitter = r.tracker_jitter
-        tracked, tracked_spread = _trackers(s).predict(u[1:], self.tracker_rate, self.tracker_noise, jitter)
+        rules = s["tracker_rate"], s["tracker_noise"]
+        tracked, tracked_spread = _trackers(s).predict(_tracked_at(s, u[1:]), *rules, jitter)
         # where a tracker knows nothing it says what the linear model says
-        unknown = (tracked_spread - self.tracker_noise).clamp(max=1.0)
+        unknown = (tracked_spread - s["tracker_noise"]).clamp(max=1.0)
         tracked = tracked + unknown.square() * line[:, None]
         means = torch.cat((process[0], carried[0].mT, bent, tracked, line[:, None], last), 1)
         own = (process[1], carried[1].mT, wide_of * s["quadratic_error"], tracked_spread.expand_as(tracked))
@@ -178,8 +192,8 @@ class BankDefinition:
             s["covariance"].div_(r.linear_forgetting**lapse)
         features = quadratic_features(u[1:], self.shape.features)
         QuadraticModels(s["factor"], s["quadratic"]).learn(features, v, self.share**lapse, self.prior)
-        rules = self.tracker_rate, self.tracker_noise, self.tracker_share**lapse
-        _trackers(s).learn(u[1:], v, *rules, r.tracker_jitter, r.tracker_wrong)
+        rules = s["tracker_rate"], s["tracker_noise"], s["tracker_forgetting"] ** lapse
+        _trackers(s).learn(_tracked_at(s, u[1:]), v, *rules, r.tracker_jitter, r.tracker_wrong)
         state, lanes = self._filters(s), len(r.forgetting)
         lapses = torch.full((lanes,), lapse, dtype=torch.float64)
         self.filter.learn(state, u[1:].expand(lanes, -1), v.expand(lanes, -1), lapses)
@@ -195,6 +209,9 @@ class BankDefinition:
         s["spread"].copy_(spread)
         s["low"].fill_(torch.inf)
         s["high"].fill_(-torch.inf)
+        if count >= self.rules.searched_at:
+            self._learn_trackers(s, count)
+        s["map"].zero_()
         self._restart_linear(s)
         for j in range(count):
             if self._beyond(s, s["x"][j], s["y"][j]):
@@ -202,6 +219,22 @@ class BankDefinition:
             torch.minimum(s["low"], s["y"][j], out=s["low"])
             torch.maximum(s["high"], s["y"][j], out=s["high"])
             self._carry(s, s["x"][j], s["y"][j], float(s["when"][j] - s["when"][j - 1]) if j else 1.0)
+
+    def _learn_trackers(self, s: Views, count: int) -> None:
+        """Four trackers' hyperparameters, from the latest samples in the store, which are in their order."""
+        usable = [j for j in range(count) if not self._beyond(s, s["x"][j], s["y"][j])][-SEARCHED:]
+        n, (center, spread) = self.shape.dim, self._units(s)
+        samples = (torch.cat((s["x"], s["y"]), 1)[usable] - center) / spread
+        found = learn_hyperparameters(Stretch(samples[:, :n], samples[:, n:], s["when"][usable]))
+        s["metric"].copy_(found.metric)
+        for lane, choice in (
+            (TURNED, found.turned),
+            (PLAIN, found.plain),
+            (FADING, found.fading),
+            (TURNED_FADING, found.turned_fading),
+        ):
+            s["tracker_rate"][lane], s["tracker_noise"][lane] = choice.rate, choice.noise
+            s["tracker_forgetting"][lane] = math.exp(-2 * choice.fade)
 
     def _beyond(self, s: Views, x: Tensor, y: Tensor) -> bool:
         both = torch.cat((x, y))
@@ -317,6 +350,13 @@ class BankDefinition:
             self._rescale(s)
         else:
             self._carry(s, x, y, lapse)
+
+
+def _tracked_at(s: Views, u: Tensor) -> Tensor:
+    """Where the trackers see u (n,), some of them in the coordinates of the metric: (n, L)."""
+    found = u[:, None].repeat(1, TRACKERS)
+    found[:, [TURNED, TURNED_FADING]] = (s["metric"].mT @ u)[:, None]
+    return found
 
 
 def _trackers(s: Views) -> TrackerModels:

@@ -9,10 +9,13 @@ from torch import Tensor
 
 LOCAL, CARRIED, QUADRATIC, TRACKERS = 24, 8, 8, 8
 MEMBERS = LOCAL + CARRIED + QUADRATIC + TRACKERS + 2  # ... and the linear model, the last value
-CLOCKS, BLENDS = 3, 3
+CLOCKS, BLENDS = 3, 4
+KNOTS = 33  # of the map of the mean
 GROUPS = 11  # of members whose predictions correct the mixture: see `group`
 MOST_FEATURES = 120  # of a quadratic model: beyond, squares without products, or the coordinates alone
-TRACKED = 64  # places for the samples of a tracker
+TRACKED = 96  # places for the samples of a tracker
+SEARCHED = 128  # samples by whose likelihood hyperparameters of trackers are learned
+TURNED, PLAIN, FADING, TURNED_FADING = 0, 1, 4, 5  # these trackers
 RECENT = 64  # samples that are always kept
 CARRIED_WIDTH, CARRIED_RADIUS = 8.0, 0.1  # of the filters: in sqrt(n), in widths
 
@@ -93,14 +96,18 @@ class Rules(NamedTuple):
     correction_prior: float = 0.1  # variance of the correction's coefficients
     correction_forgetting: float = 0.999
     correction_most: float = 4.0  # running errors that a group may be away from the mixture
-    correction_discount: float = 0.995  # of the scores of the mixture, the corrected one, that by squares
+    correction_discount: float = 0.995  # of the scores of the four mixtures
     correction_share: float = 0.01  # of their weights that is equal
     squares_discount: float = 0.999  # of the members' squared errors in the mixture by squares
     squares_rate: float = 0.1  # of their running mean that a squared error counts
     squares_share: float = 0.001
     own_rate: float = 0.05  # of the running squared error of the prediction
-    best_rate: float = 0.005  # of the least one of the three mixtures
+    best_rate: float = 0.005  # of the least one of the four mixtures
     largest: float = 400.0  # running squares that a square counts at most there
+    searched_at: float = 40.0  # samples from which hyperparameters of trackers are learned with the units
+    map_step: float = 0.25  # between knots, in units of y
+    map_prior: float = 10.0  # samples that say that the map is the identity
+    map_forgetting: float = 0.995
     tracker_width: tuple[float, ...] = (0.5, 2.0, 2.0, 4.0, 1.0, 8.0, 4.0, 1.0)  # in sqrt(n)
     tracker_noise: tuple[float, ...] = (0.1, 1e-4, 1e-2, 0.1, 1e-4, 1e-4, 1e-4, 1e-2)  # variances
     tracker_forgetting: tuple[float, ...] = (1.0, 1.0, 1.0, 1.0, 0.999, 0.999, 0.99, 0.99)
@@ -133,7 +140,9 @@ class Rules(NamedTuple):
         found += [self.correction_share, self.least, self.doubt, self.doubtful, self.doubtful_outside]
         found += [self.outside, self.rare, self.doubted_rate, self.settled]
         found += [self.squares_discount, self.squares_rate, self.squares_share, self.own_rate]
-        found += [self.best_rate, self.largest, self.uncalibrated, *self.tracker_rate, *self.tracker_noise]
+        found += [self.best_rate, self.largest, self.uncalibrated, self.searched_at]
+        found += [self.map_step, self.map_prior, self.map_forgetting]
+        found += [*self.tracker_rate, *self.tracker_noise]
         return [*found, *self.tracker_forgetting, self.tracker_jitter, self.tracker_wrong]
 
 
@@ -165,6 +174,8 @@ def layout(shape: BankShape) -> list[tuple[str, tuple[int, ...]]]:
         ("tracker_weights", (k, TRACKED, TRACKERS)),
         *((f"tracker_{name}", (TRACKED * (TRACKED + 1) // 2, TRACKERS)) for name in ("known", "inverse")),
         ("tracker_counts", (3, TRACKERS)),
+        *((f"tracker_{name}", (TRACKERS,)) for name in ("rate", "noise", "forgetting")),
+        ("metric", (n, n)),  # A: two trackers see A'x
         ("weights", (k, CLOCKS, MEMBERS)),  # logarithms
         ("clock_weights", (k, CLOCKS)),
         ("excess", (k, MEMBERS)),
@@ -174,12 +185,14 @@ def layout(shape: BankShape) -> list[tuple[str, tuple[int, ...]]]:
         ("correction_covariance", (k, GROUPS, GROUPS)),
         ("correction", (k, GROUPS)),  # coefficients
         ("away", (k, GROUPS)),  # of the groups from the mixture, in running errors
-        ("corrected", (k, BLENDS)),  # logarithms of the weights of the three mixtures
+        ("corrected", (k, BLENDS)),  # logarithms of the weights of the four mixtures
+        ("map", (k, 2, KNOTS)),  # corrections, and what is known of them
         ("means", (k, MEMBERS)),
         ("variances", (k, MEMBERS)),
         ("mixed", (k, CLOCKS)),
         ("mixed_variance", (k, CLOCKS)),
-        ("blend", (k, BLENDS)),  # the mixture, the corrected one, that by squares
+        ("blend", (k, BLENDS)),  # the mixture, the corrected one, that by squares, what the map makes of them
+        ("straight", (k,)),  # the mean without the map
         ("mean", (k,)),
         ("variance", (k,)),
         ("x", (c, n)),

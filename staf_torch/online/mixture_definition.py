@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from .bank_rules import CARRIED, GROUPS, LOCAL, MEMBERS, QUADRATIC, Rules, group
+from .bank_rules import BLENDS, CARRIED, GROUPS, KNOTS, LOCAL, MEMBERS, QUADRATIC, Rules, group
 from .kalman_filter import SURPRISE
 
 _LEAST = 1e-30  # of a variance
@@ -13,13 +13,15 @@ _GROUP = torch.tensor([group(member) for member in range(MEMBERS)])
 
 
 def mix(r: Rules, s: dict[str, Tensor], low: Tensor, high: Tensor) -> None:
-    """The mixture of what the members say, and its variance: a mixture of three.
+    """The mixture of what the members say, and its variance: a mixture of four.
 
     A member that is less certain than it usually is has less weight. First, three mixtures by scores that
     fade at three rates are mixed by their own scores. Second, to that is added
     sum_g beta_g (m_g - first), m_g the mean of a group by the scores that fade most slowly, beta by least
     squares. Third, the members by their squared errors over a long time, which rare large errors decide. The
-    three are weighed by how they predict, and one far behind the best has no weight.
+    three are weighed by how they predict, and one far behind the best has no weight. Fourth, what usually
+    follows where these three say what they say, which is another value where a function saturates or a target
+    has few values; it is weighed alike.
 
     Args:
         r: the constants.
@@ -48,12 +50,40 @@ def mix(r: Rules, s: dict[str, Tensor], low: Tensor, high: Tensor) -> None:
     s["away"].clamp_(-r.correction_most, r.correction_most)
     stacked = blend + unit * (s["correction"] * s["away"]).sum(-1)
     squared = ((s["squares"] - r.doubt * surplus).softmax(-1) * means).sum(-1)
-    s["blend"].copy_(torch.stack((blend, torch.maximum(torch.minimum(stacked, high), low), squared), -1))
-    parts = (s["corrected"] - s["corrected"].amax(-1, keepdim=True)).exp()
-    parts = torch.where(parts < r.drop, 0.0, parts)
-    s["mean"].copy_((parts * s["blend"]).sum(-1) / parts.sum(-1))
+    straight = torch.stack((blend, torch.maximum(torch.minimum(stacked, high), low), squared), -1)
+    s["straight"].copy_(_weighed(r, s["corrected"][:, : BLENDS - 1], straight))
+    knots, parts = _knots(r, s["straight"])
+    mapped = s["straight"] + (parts * s["map"][:, 0].gather(1, knots)).sum(-1)
+    mapped = torch.maximum(torch.minimum(mapped, high), low)
+    s["blend"].copy_(torch.cat((straight, mapped[:, None]), -1))
+    s["mean"].copy_(_weighed(r, s["corrected"], s["blend"]))
     variance = variance + (s["mean"] - blend).square()
     s["variance"].copy_(torch.maximum(variance, r.floor * s["pace"]) * s["calibration"])
+
+
+def _weighed(r: Rules, logs: Tensor, values: Tensor) -> Tensor:
+    """Means of values (K, B) by the logarithms of weights, of which small ones are dropped: (K,)."""
+    parts = (logs - logs.amax(-1, keepdim=True)).exp()
+    parts = torch.where(parts < r.drop, 0.0, parts)
+    return (parts * values).sum(-1) / parts.sum(-1)
+
+
+def _knots(r: Rules, mean: Tensor) -> tuple[Tensor, Tensor]:
+    """The two knots of the map around a mean (K,), and the parts that they have in it: (K, 2), (K, 2)."""
+    place = (mean / r.map_step + KNOTS // 2).clamp(0, KNOTS - 1)
+    knot = place.long().clamp(max=KNOTS - 2)
+    part = place - knot
+    return torch.stack((knot, knot + 1), -1), torch.stack((1 - part, part), -1)
+
+
+def _learn_map(r: Rules, s: dict[str, Tensor], value: Tensor, told: Tensor) -> None:
+    """The map of the mean learns by least squares, each of two knots as if it stood alone."""
+    knots, parts = _knots(r, s["straight"])
+    for o in told.nonzero().flatten().tolist():
+        at, part, (correction, known) = knots[o], parts[o], s["map"][o]
+        error = value[o] - s["straight"][o] - (part * correction[at]).sum()
+        known[at] = known[at] * (1 - (1 - r.map_forgetting) * part) + part.square()
+        correction[at] += part * error / (known[at] + r.map_prior)
 
 
 def judge(r: Rules, s: dict[str, Tensor], value: Tensor, told: Tensor, t: float) -> None:
@@ -68,6 +98,7 @@ def judge(r: Rules, s: dict[str, Tensor], value: Tensor, told: Tensor, t: float)
     """
     error, blended = value - s["mean"], value - s["blend"][:, 0]
     _learn_correction(r, s, blended, told)
+    _learn_map(r, s, value, told)
     z2 = error.square() / (s["variance"] / s["calibration"]).clamp(min=1e-300)
     before, since = s["calibration"].clone(), t - r.uncalibrated
     rate = max(r.error_rate, 1 / (since + 5)) if since > 0 else 0.0

@@ -28,7 +28,7 @@ class TrackerModels(NamedTuple):
     counts: Tensor  # the place that is free, samples kept, the place that is checked next, (3, L)
 
     def predict(self, x: Tensor, rate: Tensor, noise: Tensor, jitter: float) -> tuple[Tensor, Tensor]:
-        """Means (K, L) and variances of the next value (L,) at x (n,)."""
+        """Means (K, L) and variances of the next value (L,) at x (n, L)."""
         k = self._kernels(x, rate)
         spread = 1 + jitter - (k * _times(_whole(self.known), k)).sum(0)
         return (self.weights * k).sum(1), spread.clamp(min=0.0) + noise
@@ -43,7 +43,7 @@ class TrackerModels(NamedTuple):
         jitter: float,
         wrong: float,
     ) -> None:
-        """Learn values (K,) at x (n,); share (L,) of what was known is still believed.
+        """Learn values (K,) at x (n, L); share (L,) of what was known is still believed.
 
         A sample that the others span within 10 jitter leaves its mark on them alone. A full process gives up
         the one without which its means change least. Where rounding has added up to ``wrong`` it begins anew.
@@ -58,7 +58,7 @@ class TrackerModels(NamedTuple):
         learned = 1 / (spread.clamp(min=0.0) + noise)
         places = torch.arange(len(k))[:, None]
         own = (novel & (self.counts[0] == places)).to(k)
-        self.points.copy_(torch.where(own.bool()[:, None], x[:, None], self.points))
+        self.points.copy_(torch.where(own.bool()[:, None], x, self.points))
         s = torch.where(novel, 0.0, q) - share * b + own
         q = q - own
         fade = share.sqrt()
@@ -95,7 +95,7 @@ class TrackerModels(NamedTuple):
 
     def _kernels(self, x: Tensor, rate: Tensor) -> Tensor:
         """The kernels between the samples and x, (D, L)."""
-        return (-rate * (self.points - x[:, None]).square().sum(1)).exp()
+        return (-rate * (self.points - x).square().sum(1)).exp()
 
 
 @functools.cache

@@ -1,12 +1,13 @@
-"""Public streams, peers tuned: `python tests/benchmarks/streams.py [--earlier|--held-out] [--cache FILE]`.
+"""Public streams, peers tuned: `tests/benchmarks/streams.py [--earlier|--held-out|--latest] [--cache FILE]`.
 
 One protocol: inputs and target standardised by the first fifth for the peers; every setting of a peer's grid
 runs over the first fifth, the one with the smallest error on its last two thirds then runs over the whole
 stream, predicting each sample before it learns it, and is scored on the other four fifths (root mean square).
 `StaFRegressor(memory=1000)` has one default for all, and raw units. Before the table kafbox's Lorenz is
 reproduced (embedding 6, ALD-KRLS, -40.17 dB after 1000 samples). `--cache` keeps the peers' results, which
-take a quarter of an hour. `--earlier` and `--held-out` take the streams of streams_held_out.py, `--sets` some
-by name. Peers that are not installed are named and skipped: `pip install -e '.[bench]'`.
+take a quarter of an hour. `--earlier` and `--held-out` take the streams of streams_held_out.py, `--latest`
+those of streams_latest.py, `--sets` some by name. Peers that are not installed are named and skipped:
+`pip install -e '.[bench]'`.
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ import peer_kernel_filters as kernels  # noqa: E402
 import peer_local_models as local  # noqa: E402
 from streams_data import SETS, Series, lorenz  # noqa: E402
 from streams_held_out import EARLIER, HELD_OUT  # noqa: E402
+from streams_latest import LATEST  # noqa: E402
 
 import staf_torch as st  # noqa: E402
 
@@ -145,7 +147,7 @@ def rows(names: list[str], cache: Path | None, arguments: dict[str, Any]) -> lis
     found = []
     for name in names:
         try:
-            series = (SETS | EARLIER | HELD_OUT)[name]()
+            series = (SETS | EARLIER | HELD_OUT | LATEST)[name]()
         except ImportError as missing:
             print(f"{name} skipped: {missing}", file=sys.stderr)
             continue
@@ -196,8 +198,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--cache", type=Path, help="where the peers' results are kept, JSON")
     parser.add_argument("--sets", nargs="*")
-    parser.add_argument("--earlier", action="store_true", help="the streams that were held out before")
-    parser.add_argument("--held-out", action="store_true", help="the streams that nothing was chosen on")
+    for name, which, told in (
+        ("--earlier", EARLIER, "the streams that were held out before"),
+        ("--held-out", HELD_OUT, "the streams that nothing was chosen on when they were run"),
+        ("--latest", LATEST, "more such, that were fixed later"),
+    ):
+        parser.add_argument(name, action="store_const", dest="which", const=which, default=SETS, help=told)
     parser.add_argument("--memory", type=int, default=1000)
     parser.add_argument("--neighbours", type=int, default=48)
     parser.add_argument("--no-kafbox", action="store_true", help="do not reproduce kafbox's Lorenz first")
@@ -210,8 +216,7 @@ def main() -> None:
     print("| set | StaFRegressor | best peer | ratio | " + " | ".join(COMPARED) + " | z rms | 90 % band |")
     print("|---|---:|---:|---:|" + "---:|" * (len(COMPARED) + 2), flush=True)
     arguments = {"memory": options.memory, "neighbours": options.neighbours}
-    chosen = HELD_OUT if options.held_out else EARLIER if options.earlier else SETS
-    names = options.sets or list(chosen)
+    names = options.sets or list(options.which)
     print("\n" + summary(rows(names, options.cache, arguments)))
 
 

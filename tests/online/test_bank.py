@@ -139,7 +139,7 @@ def test_no_saved_state_leads_compiled_code_outside(memory: int | None) -> None:
         ("count", 129.0, "a number of samples from 0 to 128"),
         ("count", -1.0, "a number of samples"),
         ("count", torch.nan, "a number of samples"),
-        ("tracker_counts", 65.0, "a place from 0 to 64"),
+        ("tracker_counts", 97.0, "a place from 0 to 96"),
         ("tracker_counts", -1.0, "a place"),
         ("x", torch.nan, "samples that are finite"),
         ("y", torch.inf, "samples that are finite"),

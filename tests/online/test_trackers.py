@@ -20,7 +20,9 @@ def empty(places: int, dim: int = 2, outputs: int = 1) -> TrackerModels:
 
 def learn(models: TrackerModels, x: Tensor, y: Tensor, share: float = 1.0) -> None:
     for point, value in zip(x, y, strict=True):
-        models.learn(point, value, RATE, NOISE, torch.full((2,), share, dtype=torch.float64), JITTER, WRONG)
+        models.learn(
+            point[:, None], value, RATE, NOISE, torch.full((2,), share, dtype=torch.float64), JITTER, WRONG
+        )
 
 
 def samples(count: int) -> tuple[Tensor, Tensor]:
@@ -32,7 +34,7 @@ def test_with_room_for_all_samples_it_is_the_gaussian_process() -> None:
     (x, y), models = samples(20), empty(32, outputs=2)
     learn(models, x, y)
     at = torch.tensor([0.3, -0.2], dtype=torch.float64)
-    mean, variance = models.predict(at, RATE, NOISE, JITTER)
+    mean, variance = models.predict(at[:, None], RATE, NOISE, JITTER)
     for lane in range(2):
         gram = (-RATE[lane] * torch.cdist(x, x).square()).exp()
         gram += (JITTER + NOISE[lane]) * torch.eye(20, dtype=torch.float64)
@@ -48,7 +50,7 @@ def test_full_process_keeps_its_size_and_what_matters() -> None:
     learn(models, x, y)
     assert models.counts[1].max() <= 23
     errors = torch.stack(
-        [models.predict(p, RATE, NOISE, JITTER)[0][:, 0] - v for p, v in zip(x, y, strict=True)]
+        [models.predict(p[:, None], RATE, NOISE, JITTER)[0][:, 0] - v for p, v in zip(x, y, strict=True)]
     )
     assert errors.square().mean().sqrt() < 0.6 * y.std()
     inverse = torch.zeros(24, 24, dtype=torch.float64)
@@ -67,7 +69,7 @@ def test_sample_that_is_known_takes_no_place_and_still_teaches() -> None:
     models, x = empty(16), torch.zeros(40, 2, dtype=torch.float64)
     learn(models, x, torch.ones(40, 1, dtype=torch.float64))
     assert models.counts[1].tolist() == [1.0, 1.0]
-    mean, variance = models.predict(x[0], RATE, NOISE, JITTER)
+    mean, variance = models.predict(x[0][:, None], RATE, NOISE, JITTER)
     assert (mean - 1).abs().max() < 0.01
     assert ((variance - NOISE) < NOISE / 30).all()
 
@@ -76,7 +78,7 @@ def test_what_was_learned_fades_to_nothing() -> None:
     (x, y), models = samples(10), empty(16, outputs=2)
     learn(models, x, y)
     learn(models, x[:1] + 100, y[:1], share=1e-12)
-    mean, variance = models.predict(x[3], RATE, NOISE, JITTER)
+    mean, variance = models.predict(x[3][:, None], RATE, NOISE, JITTER)
     assert mean.abs().max() < 1e-5
     torch.testing.assert_close(variance, 1 + JITTER + NOISE)
 
