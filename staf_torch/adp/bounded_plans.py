@@ -7,7 +7,7 @@ from torch import Tensor
 
 from ..lanes import repeat
 from ..lanes.function import RowFunction
-from .plans import Reference
+from .plans import Reference, Trajectories
 from .sampled_problem import SampledProblem
 from .trajectory_optimisation import BoxDDP
 
@@ -35,29 +35,7 @@ class BoundedPlans:
 
     def __call__(self, x: Tensor) -> Tensor:
         """u: (B, n) -> (B, m)."""
-        control, feedback = self._guesses(x)
-        count, b = len(control), len(x)
-        goal = self.problem.goals(x, self.steps)[:, :-1]
-        found = self._search.solve(
-            x.repeat(count, 1),
-            control.repeat_interleave(b, 0),
-            Reference(goal.repeat(count, 1, 1), feedback.repeat_interleave(b, 0)),
-        )
-        cost = torch.where(torch.isfinite(found.cost), found.cost, torch.inf).view(count, b)
-        best = cost.argmin(0) * b + torch.arange(b)
-        return found.control[best, 0]
-
-    def _guesses(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """First controls (G, T, m), and their feedback (G, T, m, n)."""
-        levels = self.problem.levels()
-        corners = levels[(levels != self.problem.rest).all(-1)]
-        lengths = [0, *(length for length in _LENGTHS if length < self.steps)]
-        held = [(length, u) for length in lengths for u in (corners if length else corners[:1])]
-        control = self.problem.rest.repeat(len(held), self.steps, 1)
-        feedback = (-self.problem.k).repeat(len(held), self.steps, 1, 1)
-        for k, (length, u) in enumerate(held):
-            control[k, :length], feedback[k, :length] = u, 0.0
-        return control, feedback
+        return best_held(self._search, x).control[:, 0]
 
     def _strain(self, x: Tensor) -> Tensor:
         low, high = self.problem.bounds.low.to(x), self.problem.bounds.high.to(x)
@@ -71,3 +49,30 @@ class BoundedPlans:
 
         met: Tensor = repeat(self.steps, step, (x, torch.zeros_like(x[..., 0])))[1]
         return met.unsqueeze(-1)
+
+
+def best_held(search: BoxDDP, x: Tensor) -> Trajectories:
+    """The cheapest trajectories from x (B, n) that a search reaches from the linear feedback of the goal, and
+    from each corner of the bounds, held for 2 to 30 periods before it."""
+    control, feedback = _guesses(search.problem, search.steps)
+    count, b = len(control), len(x)
+    goal = search.problem.goals(x, search.steps)[:, :-1]
+    found = search.solve(
+        x.repeat(count, 1),
+        control.repeat_interleave(b, 0),
+        Reference(goal.repeat(count, 1, 1), feedback.repeat_interleave(b, 0)),
+    )
+    cost = torch.where(torch.isfinite(found.cost), found.cost, torch.inf).view(count, b)
+    return found.rows(cost.argmin(0) * b + torch.arange(b))
+
+
+def _guesses(problem: SampledProblem, steps: int) -> tuple[Tensor, Tensor]:
+    """First controls (G, T, m), and their feedback (G, T, m, n); the linear feedback first."""
+    levels = problem.levels()
+    corners = levels[(levels != problem.rest).all(-1)]
+    held = [(length, u) for length in _LENGTHS if length < steps for u in corners]
+    control = problem.rest.repeat(1 + len(held), steps, 1)
+    feedback = (-problem.k).repeat(1 + len(held), steps, 1, 1)
+    for k, (length, u) in enumerate(held, 1):
+        control[k, :length], feedback[k, :length] = u, 0.0
+    return control, feedback

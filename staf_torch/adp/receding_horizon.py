@@ -6,7 +6,8 @@ import torch
 from torch import Tensor
 
 from ..lanes.combinators import tracing_now
-from ..numerics.checks import fail, integer
+from ..numerics.checks import fail, flag, integer
+from .bounded_plans import best_held
 from .controllers import Controller, ControllerState
 from .global_value import GlobalValue
 from .memory_growth import best_from
@@ -46,6 +47,10 @@ class RecedingHorizon(Controller):
             ``steps`` be the whole episode then. With a memory that plan is the best that `BoxDDP` reaches
             from several of the memory's, also after holding a bound for a while.
         memory: for V_T and the plan to begin from; None for the linear feedback and the last plan.
+        held: whether the first plan is the best of several, begun also from holding each corner of the
+            bounds for 2 to 30 periods before the linear feedback, not from this feedback alone: where the
+            bounds are met there are several ways to the goal, and the plan of a period before decides which
+            one is gone. Without a memory, which has its own.
         compile: as in `BoxDDP`.
 
     Raises:
@@ -62,12 +67,16 @@ class RecedingHorizon(Controller):
         steps: int,
         iterations: int = 3,
         memory: GlobalValue | None = None,
+        held: bool = False,
         compile: bool = True,
     ) -> None:
         super().__init__()
         self.problem, self.memory = problem, memory
         if memory is not None and memory.problem is not problem:
             raise fail("RecedingHorizon", "memory", "must be of the same problem", memory.problem)
+        self.held = flag("RecedingHorizon", "held", held)
+        if held and memory is not None:
+            raise fail("RecedingHorizon", "held", "must be False with a memory, which has plans", held)
         self.steps = integer("RecedingHorizon", "steps", steps, least=1)
         self.iterations = integer("RecedingHorizon", "iterations", iterations, least=0)
         self._first = BoxDDP(problem, steps=steps, compile=compile)
@@ -79,6 +88,8 @@ class RecedingHorizon(Controller):
         """The first plan, from the states x0 (B, n)."""
         if self._search is None and self.memory is not None:
             return _carrying(_rows(best_from(self.memory, self._first, x0)))
+        if self.held:
+            return _carrying(_rows(best_held(self._first, x0)))
         control, reference = (None, None) if self.memory is None else self._remembered(x0)
         found = self._first.solve(x0, control, reference, self._terminal(x0, control, reference))
         return _carrying(_rows(found))

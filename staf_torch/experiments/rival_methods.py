@@ -53,6 +53,14 @@ def near_optimal(case: Case) -> Begin:
     return lambda x0: policy
 
 
+def planned(case: Case) -> Begin:
+    """`near_optimal` with a plan that it carries, where bounds bite."""
+    if case.path is not None:
+        raise UnsuitableError("follows no path")
+    policy = adp.near_optimal(case.plant(), case.cost(), dt=case.dt, plan=True)
+    return steered(case, policy.controller())
+
+
 def global_value(case: Case) -> Begin:
     """A memory of optimal trajectories."""
     if not case.swing:
@@ -222,6 +230,7 @@ class Method:
     prepare: Callable[[Case], Begin]
     packages: tuple[str, ...] = ()  # that it needs beside torch, by their distributions
     helpers: tuple[Callable[..., Any], ...] = ()  # that a user would write as well
+    slow: bool = False  # tens of milliseconds a control of one state: fewer states
 
     @property
     def lines(self) -> int:
@@ -250,12 +259,13 @@ METHODS = {
         Method("LQR", lqr, ("scipy",)),
         Method("discrete LQR", discrete_lqr, ("scipy",)),
         Method("near_optimal", near_optimal, ("scipy",)),
+        Method("near_optimal planned", planned, ("scipy",), (steered,)),
         Method("GlobalValue", global_value, ("scipy",)),
         Method("box-DDP", box_ddp, ("scipy",), (steered,)),
         Method("PathIntegral", path_integral, ("scipy",), (steered,)),
         Method("plan followed", plan, ("scipy",), (steered,)),
-        Method("IPOPT", ipopt, ("casadi",), (ipopt_program,)),
-        Method("MPPI", mppi, ("pytorch-mppi",)),
+        Method("IPOPT", ipopt, ("casadi",), (ipopt_program,), slow=True),
+        Method("MPPI", mppi, ("pytorch-mppi",), slow=True),
     )
 }
 

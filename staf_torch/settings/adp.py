@@ -21,6 +21,7 @@ from ..adp import (
     Cost,
     Extrapolation,
     Feedback,
+    NearOptimal,
     SafetyFilter,
     Supervised,
     ValueBasis,
@@ -152,6 +153,8 @@ def controller(cfg: DictConfig, system: Plant, cost: Cost) -> Controller:
         actor=lambda: start(cfg.adp.actor),
     )
     if not isinstance(policy, Controller):
+        if isinstance(policy, NearOptimal) and policy.planner is not None:
+            return policy.controller()
         return Feedback(policy, getattr(policy, "value", None))
     if cfg.adp.trust is None:
         return policy

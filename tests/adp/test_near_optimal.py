@@ -113,6 +113,11 @@ def test_plan_takes_over_where_the_lqr_would_meet_a_bound() -> None:
     torch.testing.assert_close(u[0], -u[2])
     torch.testing.assert_close(u[1], policy.control(x[1]), rtol=0, atol=1e-9)
     assert torch.equal(policy(x[1]), u[1])
+    loop = policy.controller()  # carries its plan
+    run = adp.simulate(loop, plant, policy.cost, x, dt=0.25, steps=60, compile=False)
+    whole = adp.BoxDDP(policy.planner.problem, steps=60).solve(x)
+    torch.testing.assert_close(run.cost, whole.cost, rtol=1e-4, atol=1e-6)
+    assert isinstance(adp.near_optimal(plant, COST, dt=0.25, plan=True).controller(), adp.Feedback)
     again = pickle.loads(pickle.dumps(policy))
     torch.testing.assert_close(again(x), u)
     assert adp.near_optimal(plant, COST, dt=0.25, plan=True).planner is None

@@ -66,6 +66,20 @@ def test_simulation_drives_it_as_a_controller() -> None:
     torch.testing.assert_close(run.cost, best.cost - problem.terminal(best.state[:, -1]), rtol=1e-3, atol=0)
 
 
+def test_first_plan_that_tries_held_bounds_finds_the_cheaper_way(memory: adp.GlobalValue) -> None:
+    x = torch.tensor([[1.1, -2.0], [1.1, 1.0], [0.2, 0.0]], dtype=torch.float64)
+    plain, held = (
+        drive(adp.RecedingHorizon(memory.problem, steps=60, held=held), x, 100) for held in (False, True)
+    )
+    costs = [cost_of(memory.problem, x, controls) for controls, _ in (plain, held)]
+    assert bool((costs[0][:2] > 1.3 * costs[1][:2]).all())
+    torch.testing.assert_close(costs[0][2], costs[1][2])
+    assert bool((costs[1] < 1.01 * memory.value(x))[[0, 2]].all())  # one corner, once: no swing-up
+    assert float(memory.problem.terminal(held[1]).max()) < 1e-2
+    with pytest.raises(ValueError, match="must be False with a memory"):
+        adp.RecedingHorizon(memory.problem, steps=5, memory=memory, held=True)
+
+
 def test_memory_of_another_problem_is_refused(memory: adp.GlobalValue) -> None:
     with pytest.raises(ValueError, match="must be of the same problem"):
         adp.RecedingHorizon(pendulum(), steps=5, memory=memory)

@@ -47,6 +47,22 @@ def test_rows_say_what_was_lost_violated_and_not_tried() -> None:
     assert (lost["lines"], best["us_median"] > 0) == (2, True)
 
 
+def test_slow_methods_run_from_fewer_states_and_say_so() -> None:
+    def timid(case):  # type: ignore[no-untyped-def]
+        """The regulator, and a third of it far out."""
+        steer = rival_methods.discrete_lqr(case)(None)
+        return lambda x0: lambda x: torch.where(x[:, :1].abs() > 1, 0.3, 1.0) * steer(x)
+
+    slow = Method("slow", timid, slow=True)
+    x0 = torch.tensor([[0.5, 0.0], [0.2, 0.1], [1.2, 0.0]], dtype=torch.float64)
+    every, few = rivals.compare(SHORT, [Method("fast", timid), slow], x0, calls=3, slow=1)
+    assert (every["note"], few["note"]) == (None, "from 1 of the 3 states")
+    assert every["ratio_max"] > 1.001  # it has seen the last one
+    assert few["ratio_max"] == pytest.approx(1)
+    (whole,) = rivals.compare(SHORT, [slow], x0, calls=3, slow=3)
+    assert whole["note"] is None
+
+
 @pytest.mark.parametrize("name", list(CASES))
 def test_every_plant_rests_at_its_goal_and_begins_in_its_box(name: str) -> None:
     case = CASES[name]
