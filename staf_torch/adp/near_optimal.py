@@ -13,6 +13,7 @@ from torch import Tensor
 from ..approximation.basis import StaFBasis
 from ..centers import StateFollowingCenters
 from ..kernels import ExponentialKernel
+from ..lanes import ready
 from ..numerics.checks import fail, flag, positive_real
 from ..systems import Clocked, Plant
 from ..systems.bounds import Limit
@@ -105,9 +106,10 @@ class NearOptimal(SampledRollout):
             cost over the LQR's in the states that both regulate; ``over_optimum_median`` and
             ``over_optimum_max`` likewise (the optimum is not held: part of it is the price of holding), None
             where it is not known; ``good_spread``, the largest of 1/4, 1/2, 1, 2, 4 times the spread at which
-            all are regulated, 0 if none; ``microseconds`` a control of one row, the median; ``strained``, the
-            share of the states from which the LQR would meet a bound within the horizon, where the policy
-            is no better than the LQR unless it plans; None without bounds or a plant in torch.
+            all are regulated, else of 1/8 to 1/4096, 0 if none; ``microseconds`` a control of one row, the
+            median; ``strained``, the share of the states from which the LQR would meet a bound within the
+            horizon, where the policy is no better than the LQR unless it plans; None without bounds or a plant
+            in torch.
         """
         width = positive_real("report", "spread", self.plant.spread if spread is None else spread)
         x0 = self._drawn(states, width, seed)
@@ -118,11 +120,6 @@ class NearOptimal(SampledRollout):
         over_base = (ours / base)[both]
         over_optimum = self._over_optimum(x0, ours, fine) if optimum else ours[:0]
         planner = self.plans() if self.planner is None else self.planner
-        good = [
-            share * width
-            for share in (0.25, 0.5, 1.0, 2.0, 4.0)
-            if bool(self._run(self.controller(), self._drawn(states, share * width, seed + 1))[1].all())
-        ]
         return {
             "dt": self.period,
             "base": type(self.lqr).__name__,
@@ -138,7 +135,7 @@ class NearOptimal(SampledRollout):
             "over_base_max": float(over_base.max()) if len(over_base) else None,
             "over_optimum_median": _median(over_optimum),
             "over_optimum_max": float(over_optimum.max()) if len(over_optimum) else None,
-            "good_spread": max(good, default=0.0),
+            "good_spread": self._good(states, width, seed + 1),
             "microseconds": self._microseconds(x0[:1]),
             "strained": None if planner is None else float(planner.strained(x0).double().mean()),
         }
@@ -158,6 +155,17 @@ class NearOptimal(SampledRollout):
         began = self.cost.deviation(x0).norm(dim=-1)
         return run.cost, (left <= _REGULATED * began) & ~run.diverged
 
+    def _good(self, states: int, width: float, seed: int) -> float:
+        """The largest box of a few from which all states are regulated, the largest of smaller ones."""
+
+        def good(share: float) -> bool:
+            return bool(self._run(self.controller(), self._drawn(states, share * width, seed))[1].all())
+
+        found = max(filter(good, (0.25, 0.5, 1.0, 2.0, 4.0)), default=None)
+        if found is None:  # units of which 1 is far: a gap of a centimetre in metres
+            found = next(filter(good, (2.0**-k for k in range(3, 13))), 0.0)
+        return found * width
+
     def _over_optimum(self, x0: Tensor, cost: Tensor, fine: Tensor) -> Tensor:
         if self.plant.period is not None or not self.plant.traceable or self.cost.discount:
             return cost[:0]
@@ -165,6 +173,7 @@ class NearOptimal(SampledRollout):
         return (cost / best.value)[fine & torch.isfinite(best.value)]
 
     def _microseconds(self, x: Tensor) -> float:
+        ready(self, x)
         controller = self.controller()
         carried, none, taken = controller.init(x), x.new_zeros(len(x), 0), []
         for _ in range(400):

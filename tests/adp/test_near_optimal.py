@@ -144,3 +144,22 @@ def test_another_control_than_the_bases_promises_less_over_both_horizons() -> No
         tried = base + share * step
         better = (promised(base) - promised(tried) > 1e-6 * promised(base)).all(0)
         assert not bool((better & policy.rollout(policy.holding(x, tried)[0]).free & ~other).any())
+
+
+class Gap(systems.ControlAffineSystem):
+    """x' = x + 1e4 x^3 + u: some centimetres from rest nothing holds it."""
+
+    dim, inputs = 1, 1
+
+    def drift(self, x: torch.Tensor) -> torch.Tensor:
+        return x + 1e4 * x**3
+
+    def effectiveness(self, x: torch.Tensor) -> torch.Tensor:
+        return torch.ones(1, 1, dtype=x.dtype).expand(*x.shape, 1)
+
+
+def test_report_finds_the_region_of_a_plant_in_small_units() -> None:
+    policy = adp.near_optimal(Gap(), adp.QuadraticCost(1.0, 1.0, dim=1, inputs=1), dt=0.02, horizon=0.2)
+    report = policy.report(states=8, optimum=False)
+    assert report["regulated"] == 0  # in the box of 1
+    assert 1 / 256 <= report["good_spread"] <= 1 / 32
