@@ -114,9 +114,23 @@ class AvoidancePlans(NamedTuple):
         Shown by `staf_torch/adp/README.md`.
     """
 
-    trajectories: Trajectories  # of the last weight, a row a start
+    trajectories: Trajectories  # a row a start
     cost: Tensor  # (B,) of x'Qx + u'Ru alone; inf where every plan touches an obstacle
     margin: Tensor  # (B,) the smallest h at the times of the plan
+
+    def or_cheaper(self, other: AvoidancePlans) -> AvoidancePlans:
+        """The cheaper plan of every row; of two that touch an obstacle the other one."""
+        gain = ~(self.cost < other.cost)
+
+        def chosen(new: Tensor, old: Tensor) -> Tensor:
+            return torch.where(gain.reshape(-1, *[1] * (new.dim() - 1)), new, old)
+
+        parts = zip(other.trajectories, self.trajectories, strict=True)
+        return AvoidancePlans(
+            Trajectories(*(chosen(new, old) for new, old in parts)),
+            chosen(other.cost, self.cost),
+            chosen(other.margin, self.margin),
+        )
 
 
 def plan_around(
@@ -133,8 +147,9 @@ def plan_around(
     """Optimal plans that keep out of the obstacles, by an interior path: `BoxDDP` with weights that shrink.
 
     Each start is tried from the goal's linear feedback with every combination of bounds held for a quarter of
-    the time, so that both ways around an obstacle are among the guesses; the cheapest plan that keeps
-    h >= 0 at all of its times is the result. Nothing is chosen by the start.
+    the time, so that both ways around an obstacle are among the guesses; the cheapest plan of any guess and
+    weight that keeps h >= 0 at all of its times is the result: with a small weight a plan may dip into an
+    obstacle by a hair. Nothing is chosen by the start.
 
     Example:
         >>> plant = systems.Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
@@ -175,18 +190,20 @@ def plan_around(
     control: Tensor = problem.rest + torch.where(pushed[:, None], away.unsqueeze(1), 0.0)
     gains = (-problem.k).expand(len(rows), steps, -1, -1)
     around = Reference(problem.goal.expand(len(rows), steps, -1), gains)
-    found: Trajectories | None = None
+    bare = SampledProblem.of(plant, free, dt=dt, low=problem.bounds.low, high=problem.bounds.high)
+    best: AvoidancePlans | None = None
     for share in shrink:
         cost.weight.fill_(first * positive_real("plan_around", "shrink", share))
         cost.edge.fill_(_EDGE * math.sqrt(share))
         search = BoxDDP(problem, steps=steps, iterations=iterations, compile=compile)
         found = search.solve(rows, control, around)
         control, around = found.control, Reference(found.state[:, :-1], found.feedback)
-    assert found is not None
-    bare = SampledProblem.of(plant, free, dt=dt, low=problem.bounds.low, high=problem.bounds.high)
-    _, paid = bare.advance(found.state[:, :-1], found.control)
-    total = paid.sum(1) + bare.terminal(found.state[:, -1])
-    margin = cost.outside(found.state).amin(-1)
-    total = torch.where((margin >= 0) & torch.isfinite(total), total, torch.inf)
-    best = total.reshape(len(x0), -1).argmin(-1) + torch.arange(len(x0)) * len(ways)
-    return AvoidancePlans(found.rows(best), total[best], margin[best])
+        _, paid = bare.advance(found.state[:, :-1], found.control)
+        total = paid.sum(1) + bare.terminal(found.state[:, -1])
+        margin = cost.outside(found.state).amin(-1)
+        total = torch.where((margin >= 0) & torch.isfinite(total), total, torch.inf)
+        now = AvoidancePlans(found, total, margin)
+        best = now if best is None else best.or_cheaper(now)
+    assert best is not None
+    chosen = best.cost.reshape(len(x0), -1).argmin(-1) + torch.arange(len(x0)) * len(ways)
+    return AvoidancePlans(best.trajectories.rows(chosen), best.cost[chosen], best.margin[chosen])

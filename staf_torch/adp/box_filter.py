@@ -188,9 +188,8 @@ class BoxFilter(nn.Module):
 
         value, pull = torch.func.vjp(conditions, u)  # type: ignore[misc]
         # Reverse mode: forward mode in plain torch takes a hundred times as long, for its own reasons.
-        normal = torch.stack(
-            [pull(one.expand_as(value))[0] for one in torch.eye(len(self.walls)).to(u)], dim=1
-        )
+        walls = torch.eye(len(self.walls)).to(u)
+        normal = torch.func.vmap(lambda one: pull(one.expand_as(value))[0], out_dims=1)(walls)
         return normal, (normal * u.unsqueeze(-2)).sum(-1) - value
 
     def _condition(

@@ -43,7 +43,7 @@ class NearOptimal(SampledRollout):
     Example:
         >>> plant = systems.Pendulum()
         >>> policy = adp.near_optimal(plant, adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1), dt=0.05)
-        >>> policy.report(states=4, optimum=False)["spectral_radius"] < 1
+        >>> policy.report(states=2, optimum=False)["spectral_radius"] < 1
         True
 
         Shown by `staf_torch/adp/README.md`.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import functools
 import hashlib
+import logging
 import os
 import shutil
 import tempfile
@@ -20,6 +21,8 @@ _FLAGS: tuple[str, ...] = ("-O2", "-march=native", "-std=c++17", "-shared", "-fP
 _FLAGS += ("-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math", "-fno-signaling-nans")
 # A long program takes GCC half the time without what looks at all of its loops and branches together.
 _LONG, _FLAGS_OF_LONG = 1500, ("-fira-region=one", "-fno-tree-pre", "-fno-gcse")  # lines
+_SLOW = 6000  # lines from which a user hears of it: some seconds
+_log = logging.getLogger(__name__)
 _one_at_a_time = threading.Lock()
 _loaded: dict[str, Callable[..., None]] = {}
 
@@ -57,7 +60,10 @@ def _build(source: str, path: Path) -> None:
         text.write_text(source, encoding="utf-8")
         compiler = _compiler()
         # Clang, which also answers to the name of g++, knows none of these.
-        long = source.count("\n") > _LONG and "clang" not in _version(compiler).lower()
+        lines = source.count("\n")
+        if lines > _SLOW:
+            _log.warning("a program of %d lines is compiled, once: some %.0f s", lines, lines / 1000)
+        long = lines > _LONG and "clang" not in _version(compiler).lower()
         more = _FLAGS_OF_LONG if long else ()
         _run([compiler, *_FLAGS, *more, "-I", str(_FOLDER), str(text), "-o", str(built)])
         seal(built)

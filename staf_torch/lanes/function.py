@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, Protocol
 
+import torch
 from torch import Tensor, nn
 
 from .combinators import Tree, tracing_now
@@ -80,6 +81,10 @@ class RowFunction:
         """Whether a compiled program has served a call."""
         return self._served is not None and self._served.compiled
 
+    def hasten(self) -> None:
+        """Compile at the next call, whatever it pays."""
+        self._asked = _PAYS
+
     def _one_program(self) -> Served:
         return Rows(self._function, self._name, self._function, self._module)
 
@@ -111,6 +116,38 @@ class RowFunction:
         self._versions = self._version_list()
         around = Watch(self._function, self._module, surroundings=True)
         self._around = None if around.blind else around
+
+
+def ready(module: nn.Module, x: Tensor) -> bool:
+    """Compile now what serves calls like ``module(x)``: no control loop must wait for it at its 100th call.
+
+    Policies of `staf_torch.adp` run in plain torch until their calls would have paid for a compiler. It takes
+    one second to thirty, once; from the user's cache the machine code is there in milliseconds.
+
+    Example:
+        >>> plant, cost = systems.TwoState(), adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
+        >>> policy = adp.RolloutPolicy.of_lqr(plant, cost)
+        >>> lanes.ready(policy, torch.zeros(1, 2).double())  # now, not in the loop
+        True
+
+        Shown by `staf_torch/lanes/README.md`.
+
+    Args:
+        module: a policy, or one that holds policies.
+        x: a state (n,) or states (B, n) as they will come; every shape has a plan of its own.
+
+    Returns:
+        Whether compiled programs serve, all there are. False where there are none, or plain torch serves: the
+        log says why.
+    """
+    found = [
+        part for each in module.modules() for part in vars(each).values() if isinstance(part, RowFunction)
+    ]
+    for function in found:
+        function.hasten()
+    with torch.no_grad():
+        module(x)
+    return bool(found) and all(function.compiled for function in found)
 
 
 class Rows:

@@ -29,7 +29,7 @@ from .watch import Watch
 _log = logging.getLogger(__name__)
 _said: set[tuple[str, str]] = set()  # what has been logged
 _FEW = 8  # rows that one vector holds
-_LONGEST = 12_000  # lines that a compiler is asked to take
+_LONGEST = 20_000  # lines that a compiler is asked to take: half a minute
 _PREPARED = 64  # calls of other shapes that a program remembers
 
 

@@ -8,6 +8,7 @@ from helpers import tensor, uniform
 from torch import Tensor
 
 from staf_torch import adp, systems
+from staf_torch.adp.plans import Trajectories
 
 LINE = systems.Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
 
@@ -60,6 +61,18 @@ def test_plans_touch_what_they_may_and_pay_as_their_weight_vanishes() -> None:
     assert bool((found.margin < 0.03).all())
     assert float(cost.weight) == 1.0
     assert float(found.trajectories.control.abs().max()) <= 1
+
+
+def test_the_cheapest_plan_that_touches_nothing_stands_whatever_its_weight() -> None:
+    def plans(name: float, cost: list[float]) -> adp.AvoidancePlans:
+        rows = torch.full((4,), name, dtype=torch.float64)
+        parts = [rows[:, None, None], rows[:, None, None], rows[:, None], rows[:, None], rows, rows, rows > 0]
+        return adp.AvoidancePlans(Trajectories(*parts), tensor(cost), rows)
+
+    heavy, light = plans(1.0, [1.0, torch.inf, 3.0, torch.inf]), plans(2.0, [2.0, 5.0, torch.inf, torch.inf])
+    found = heavy.or_cheaper(light)
+    assert found.cost.tolist() == [1.0, 5.0, 3.0, torch.inf]
+    assert found.margin.tolist() == found.trajectories.state.flatten().tolist() == [1.0, 2.0, 1.0, 2.0]
 
 
 @pytest.mark.parametrize(

@@ -196,7 +196,7 @@ def test_what_cannot_be_compiled_runs_in_plain_torch_with_one_line(
         plant = systems.TwoState()
         monkeypatch.setattr(compiler, "function", refuse)
     lqr, x0 = adp.Feedback(adp.LQR(PLANT, COST)), uniform(2, 1.0)
-    settings = {"dt": 0.013, "steps": 2000, "every": 1000}
+    settings = {"dt": 0.013, "steps": 200, "every": 100}
     with caplog.at_level(logging.WARNING):
         run = adp.simulate(lqr, plant, COST, x0, compile=True, **settings)
     plain = adp.simulate(lqr, PLANT, COST, x0, compile=False, **settings)

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from staf_torch.lanes import program as programs
+from staf_torch.lanes.function import RowFunction, ready
 from staf_torch.lanes.kept import Kept
 from staf_torch.lanes.program import Program
 
@@ -159,3 +160,19 @@ def test_what_cannot_be_watched_is_read_every_time(cache: Path) -> None:
     for _ in range(3):
         kept.of(lambda x, _, __: (x * part.number, x), part, owners=(part,))
         assert kept.unchanged(part) is None
+
+
+def test_a_policy_is_ready_before_its_loop_begins(caplog: pytest.LogCaptureFixture) -> None:
+    module = layer(0)
+    row = RowFunction(module.forward, module, "a test")
+    holder = nn.Module()
+    holder.row, holder.forward = row, row.__call__
+    assert not row.compiled
+    assert ready(holder, X[0])
+    assert row.compiled
+    torch.testing.assert_close(row(X[0]), module(X[0]), rtol=1e-13, atol=1e-13)
+    assert not ready(nn.Linear(2, 2).double(), X)
+    refused = RowFunction(lambda x: module(x) + torch.randn(x.shape), module, "a noisy test")
+    holder.row, holder.forward = refused, refused.__call__
+    assert not ready(holder, X[0])
+    assert "draws random numbers" in caplog.text

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -151,30 +152,32 @@ def test_each_log_has_its_own_job_alone(batched: tuple[Path, str]) -> None:
 
 
 def test_a_resumed_sweep_runs_what_is_missing_and_ends_with_the_same_bits(
-    place: Path, batched: tuple[Path, str], tmp_path: Path
+    place: Path, batched: tuple[Path, str]
 ) -> None:
-    before = rows(batched[0])
-    first = (batched[0] / "0" / "run.json").stat().st_mtime_ns
-    running = record(batched[0] / "5") | {"status": "running"}
-    (batched[0] / "5" / "run.json").write_text(json.dumps(running))
-    (batched[0] / "4" / "run.json").unlink()
-    code, out, err = one(str(place), ["-m", "sweep.resume=runs/batched"])
+    again = shutil.copytree(batched[0], place / "runs" / "again")  # other tests look at that one
+    before = rows(again)
+    first = (again / "0" / "run.json").stat().st_mtime_ns
+    running = record(again / "5") | {"status": "running"}
+    (again / "5" / "run.json").write_text(json.dumps(running))
+    (again / "4" / "run.json").unlink()
+    code, out, err = one(str(place), ["-m", "sweep.resume=runs/again"])
     assert code == 1  # the failed ones fail again
     assert "4 of 6 jobs completed, 2 failed" in out, err
-    assert rows(batched[0]) == before
-    assert (batched[0] / "0" / "run.json").stat().st_mtime_ns == first
-    assert not list((batched[0] / "0").glob(".*partial"))
+    assert rows(again) == before
+    assert (again / "0" / "run.json").stat().st_mtime_ns == first
+    assert not list((again / "0").glob(".*partial"))
 
 
 def test_other_launchers_resume_too(place: Path, basic: tuple[Path, str]) -> None:
-    before = rows(basic[0])
-    first = (basic[0] / "0" / "run.json").stat().st_mtime_ns
-    (basic[0] / "5" / "run.json").unlink()
-    code, out, _ = one(str(place), ["-m", *GRID, "sweep.resume=runs/basic", "hydra/launcher=basic"])
+    again = shutil.copytree(basic[0], place / "runs" / "basic_again")
+    before = rows(again)
+    first = (again / "0" / "run.json").stat().st_mtime_ns
+    (again / "5" / "run.json").unlink()
+    code, out, _ = one(str(place), ["-m", *GRID, "sweep.resume=runs/basic_again", "hydra/launcher=basic"])
     assert code == 1
-    assert "completed before: runs/basic/0" in out
-    assert rows(basic[0]) == before
-    assert (basic[0] / "0" / "run.json").stat().st_mtime_ns == first
+    assert "completed before: runs/basic_again/0" in out
+    assert rows(again) == before
+    assert (again / "0" / "run.json").stat().st_mtime_ns == first
 
 
 @pytest.mark.parametrize(

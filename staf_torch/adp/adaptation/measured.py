@@ -35,7 +35,7 @@ class Measured(Controller):
         >>> plant, cost = systems.Pendulum(), adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
         >>> seen = adp.Measured(adp.Feedback(adp.LQR(plant, cost)), noise=0.01, dim=2)
         >>> x0 = torch.tensor([[0.3, 0.0]]).double()
-        >>> run = adp.simulate(seen, plant, cost, x0, dt=0.01, steps=300)
+        >>> run = adp.simulate(seen, plant, cost, x0, dt=0.02, steps=150)
         >>> bool(run.state[0, -1].norm() < 0.2), bool(run.state[0, -1].norm() > 1e-6)
         (True, True)
 
