@@ -13,6 +13,9 @@
 #include <immintrin.h>
 #endif
 
+#ifndef REAL
+#define REAL double
+#endif
 #define INLINE static inline __attribute__((always_inline))
 typedef double V __attribute__((vector_size(64)));
 typedef int64_t Mask __attribute__((vector_size(64)));  // lanes of 0 or -1
@@ -39,21 +42,26 @@ INLINE bool any(Mask m) {
     return found != 0;
 }
 
-// e^x to an ulp or two; 0 below -708, e^709 above it.
+// e^x to an ulp or two, where streams are of floats to 3e-10; 0 below -708, e^709 above it.
 INLINE V exponential(V x) {
-    const V at = x > 709. ? all(709.) : x < -708. ? all(-708.) : x, shifted = at * 1.4426950408889634 + 0x1.8p52;
+    const V at = minimum(maximum(x, all(-708)), all(709)), shifted = at * 1.4426950408889634 + 0x1.8p52;
     const V whole = shifted - 0x1.8p52, r = (at - whole * 0x1.62e42feep-1) - whole * 0x1.a39ef35793c76p-33;
     constexpr double over[] = {1. / 6227020800, 1. / 479001600, 1. / 39916800, 1. / 3628800, 1. / 362880,
                                1. / 40320, 1. / 5040, 1. / 720, 1. / 120, 1. / 24, 1. / 6, 1. / 2, 1, 1};
-    V sum = all(over[0]);
-    for (int j = 1; j < 14; ++j) sum = sum * r + over[j];
+    constexpr int first = sizeof(REAL) == sizeof(float) ? 5 : 0;
+    V sum = all(over[first]);
+    for (int j = first + 1; j < 14; ++j) sum = sum * r + over[j];
+#ifdef __AVX512F__
+    const V found = (V)_mm512_scalef_pd((__m512d)sum, (__m512d)whole);
+#else
     const Mask power = ((Mask)shifted - (Mask)all(0x1.8p52) + 1022) << 52;  // 2^709 e^.3 fits in two steps
     const V found = sum * (V)power * 2.;
+#endif
     return x < -708. ? V{} : x != x ? x : found;
 }
 
 struct Functions {  // of local_functions.py, in float64
-    const double *offsets, *squares, *newton, *gram;  // d (M, n), |d|^2 (M), C (M, M), K0 (M, M)
+    const double *offsets, *squares, *newton, *gram;  // d (M, n), |d|^2 (M), C (M, M) upper triangular, K0 (M, M)
     double rate, reach;                               // q; the largest |d|
 };
 
@@ -78,17 +86,19 @@ INLINE void functions_at(const Functions &f, const V *z, V *psi) {
     }
     for (int i = 0; i < M; ++i) {
         psi[i] = V{};
-        for (int j = 0; j < M; ++j) psi[i] += f.newton[j * M + i] * e[j];
+        for (int j = 0; j <= i; ++j) psi[i] += f.newton[j * M + i] * e[j];
     }
 }
 
 // c(k, l) <- sum_j a(j, k) b(j, l) in blocks that stay in registers; for l <= k alone where that is enough.
-template <bool lower, typename A, typename B, typename Put> INLINE void product(A a, B b, Put put) {
+// A factor that is upper triangular has no part in the sum beyond j = k, or l.
+enum Triangular { neither, first, second };
+template <bool lower, Triangular upper, typename A, typename B, typename Put> INLINE void product(A a, B b, Put put) {
     constexpr int side = M % 4 == 0 ? 4 : M % 3 == 0 ? 3 : M % 2 == 0 ? 2 : 1;
     for (int k = 0; k < M; k += side)
         for (int l = 0; l < (lower ? k + side : M); l += side) {
             V sum[side][side]{};
-            for (int j = 0; j < M; ++j)
+            for (int j = 0; j < (upper == first ? k + side : upper == second ? l + side : M); ++j)
                 for (int p = 0; p < side; ++p)
                     for (int q = 0; q < side; ++q) sum[p][q] += a(j, k + p) * b(j, l + q);
             for (int p = 0; p < side; ++p)
@@ -114,9 +124,9 @@ static void transfer(const Functions &f, const V *h, V mean[K][M], V *learned) {
     }
     for (int j = 0; j < M; ++j)
         for (int l = 0; l < M; ++l) whole[j][l] = before[j] * f.newton[j * M + l];
-    product<false>([&](int j, int i) { return f.gram[j * M + i]; }, [&](int j, int l) { return whole[j][l]; },
+    product<false, second>([&](int j, int i) { return f.gram[j * M + i]; }, [&](int j, int l) { return whole[j][l]; },
                    [&](int i, int l, V sum) { half[i][l] = sum * after[i]; });
-    product<false>([&](int i, int k) { return f.newton[i * M + k]; }, [&](int i, int l) { return half[i][l]; },
+    product<false, first>([&](int i, int k) { return f.newton[i * M + k]; }, [&](int i, int l) { return half[i][l]; },
                    [&](int k, int l, V sum) { T[l][k] = near ? sum : V{}; });  // the transpose, to be read along rows
     for (int o = 0; o < K; ++o) {
         V moved[M]{};
@@ -126,9 +136,9 @@ static void transfer(const Functions &f, const V *h, V mean[K][M], V *learned) {
     }
     for (int i = 0; i < M; ++i)
         for (int j = 0; j <= i; ++j) whole[i][j] = whole[j][i] = learned[i * (i + 1) / 2 + j];
-    product<false>([&](int j, int k) { return T[j][k]; }, [&](int j, int l) { return whole[j][l]; },
+    product<false, neither>([&](int j, int k) { return T[j][k]; }, [&](int j, int l) { return whole[j][l]; },
                    [&](int k, int l, V sum) { half[l][k] = sum; });
-    product<true>([&](int j, int k) { return half[j][k]; }, [&](int j, int l) { return T[j][l]; },
+    product<true, neither>([&](int j, int k) { return half[j][k]; }, [&](int j, int l) { return T[j][l]; },
                   [&](int k, int l, V sum) { learned[k * (k + 1) / 2 + l] = sum; });
 }
 

@@ -33,12 +33,16 @@ class FunctionPointers(ctypes.Structure):
     @classmethod
     def of(cls, functions: LocalFunctions) -> tuple[FunctionPointers, list[Tensor]]:
         """The pointers, and the tensors that must live as long."""
-        offsets = functions.offsets.double().contiguous()
-        zero = torch.zeros_like(offsets[0])
-        gram = functions.kernel.core(zero, offsets, offsets).contiguous()
         assert functions.shared is not None
         assert functions.rate is not None
-        held = [offsets, offsets.square().sum(-1), functions.shared.contiguous(), gram]
+        # C = P'L^-T is upper triangular in the order of the pivots, in which compiled code has the centers
+        leading = (functions.shared == 0).long().cumprod(1).sum(1)
+        order = leading.argsort(stable=True)
+        newton, offsets = functions.shared[order].contiguous(), functions.offsets.double()[order].contiguous()
+        assert not newton.tril(-1).any()
+        zero = torch.zeros_like(offsets[0])
+        gram = functions.kernel.core(zero, offsets, offsets).contiguous()
+        held = [offsets, offsets.square().sum(-1), newton, gram]
         reach = math.sqrt(max(float(offsets.square().sum(-1).amax()), 1e-300))
         pointers = [tensor.data_ptr() for tensor in held]
         return cls(*pointers, float(functions.rate), reach), held
