@@ -29,7 +29,8 @@ from .shooting import DirectShooting
 from .simulation import simulate
 
 _log = logging.getLogger(__name__)
-_DECAY = 3.0  # time constants of the slowest mode of the LQR in the horizon
+_DECAY = 2.0  # time constants of the slowest mode of the LQR in the horizon
+_PLANNED = 3.0  # likewise with plans, which need the end to be nearer to the goal
 _STEPS = (12, 60)  # periods in the horizon, at least and at most
 _RESOLVED = 0.2  # length of an integration step in time constants of the plant's fastest mode
 _SETTLED = 9.2  # time constants for which the loops of a report run: the slowest mode falls to 1e-4
@@ -196,16 +197,17 @@ def near_optimal(
 ) -> NearOptimal:
     """A policy for a plant, held for dt, that costs no more than its LQR.
 
-    The rules: the base is the LQR made for dt; the horizon is three time constants of its slowest mode, 12 to
-    60 periods; the centers are as many as quadratics need, from four states on the cross-polytope and its
-    middle, in a ball of ``radius``; a plant in continuous time is integrated in steps of a fifth of its
-    fastest time constant. Rollouts of an LQR do not know what to do before a bound of the inputs. With
-    ``plan`` the policy's ``controller()``, for loops, is a `RecedingHorizon` over that horizon, of which the
-    first plan is the best that `BoxDDP` finds from the LQR and from holding a bound for a while, and that is
-    carried and improved from control to control, in some milliseconds. It takes a plant in torch, held for
-    one period of its own, without a discount. The policy as a function of x makes such a plan anew, in tens
-    of milliseconds, where the LQR, followed from x over the horizon, meets a bound; in a loop two ways around
-    that cost nearly the same would take turns. ``report()`` says how often bounds are met, ``strained``.
+    The rules: the base is the LQR made for dt; the horizon is two time constants of its slowest mode (three
+    with ``plan``), 12 to 60 periods; the centers are as many as quadratics need, from four states on the
+    cross-polytope and its middle, in a ball of ``radius``; a plant in continuous time is integrated in
+    steps of a fifth of its fastest time constant. Rollouts of an LQR do not know what to do before a bound
+    of the inputs. With ``plan`` the policy's ``controller()``, for loops, is a `RecedingHorizon` over that
+    horizon, of which the first plan is the best that `BoxDDP` finds from the LQR and from holding a bound
+    for a while, and that is carried and improved from control to control, in some milliseconds. It takes a
+    plant in torch, held for one period of its own, without a discount. The policy as a function of x makes
+    such a plan anew, in tens of milliseconds, where the LQR, followed from x over the horizon, meets a
+    bound; in a loop two ways around that cost nearly the same would take turns. ``report()`` says how often
+    bounds are met, ``strained``.
     A simulator so slow that a control takes more than half of dt is a warning in the log, with the share.
 
     Example:
@@ -244,7 +246,7 @@ def near_optimal(
     placed = cost.bounded(low, high).around(plant)
     lqr = LQR(plant, placed, period=period)
     seconds = (
-        _DECAY / _slowest(lqr, plant)
+        (_PLANNED if flag("near_optimal", "plan", plan) else _DECAY) / _slowest(lqr, plant)
         if horizon is None
         else positive_real("near_optimal", "horizon", horizon)
     )

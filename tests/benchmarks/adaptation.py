@@ -1,4 +1,4 @@
-"""Time of closed loops that learn while they run: 1000 rows, 10 s at 1 ms, compiled.
+"""Time of closed loops that learn while they run, or move among discs: 1000 rows, 10 s at 1 ms, compiled.
 
     python tests/benchmarks/adaptation.py [rows]
 
@@ -13,7 +13,10 @@ import time
 import torch
 
 from staf_torch import adp
-from staf_torch.experiments import faults, icl
+from staf_torch.experiments import avoidance, faults, icl
+from staf_torch.experiments.vehicles import VEHICLES, vehicle
+from staf_torch.settings.adp import updated
+from staf_torch.sweeps.hydra_compat import Composer, config_loader
 
 STEPS, DT = 10_000, 0.001
 
@@ -32,7 +35,21 @@ def loops(rows: int) -> dict[str, tuple[adp.Controller, object, adp.Cost, torch.
     seen = adp.Measured(tracker, noise=[0.3, 0.3, 0.0, 0.0, 0.0], dim=5)
     x0 = torch.tensor([[1.0, 0.0, 1.0, 0.0, 1.0]], dtype=torch.float64).repeat(rows, 1)
     found["icl"] = seen, plant, cost, x0
-    return found
+    return found | {f"avoidance, {kind}": among_discs(rows, kind) for kind in VEHICLES}
+
+
+def among_discs(rows: int, kind: str) -> tuple[adp.Controller, object, adp.Cost, torch.Tensor]:
+    """A vehicle of `staf experiment=avoidance` behind its filter."""
+    composer = Composer(config_loader(), hydra_node=False)
+    given = ["experiment=avoidance", f"trajectories={rows}", f"avoidance.vehicle={kind}", f"dt={DT}"]
+    cfg = updated(composer(given))
+    own, chosen = vehicle(cfg, DT), cfg.avoidance
+    plant = avoidance.AmongDiscs(own, chosen.discs)
+    discs = [avoidance._apart(own, k, chosen.radius) for k in range(chosen.discs)]
+    bounds = {"low": [-bound for bound in own.bounds], "high": list(own.bounds)}
+    settings = {"dt": DT, "decay": chosen.decay, "margin": chosen.margin, **bounds}
+    guard = adp.SafetyFilter(lambda x: own.policy(x[..., : own.size]), plant, discs, **settings)
+    return guard, plant, avoidance._cost(cfg, own, plant.dim or 0), avoidance.scenarios(cfg)
 
 
 def main(rows: int) -> None:
