@@ -109,8 +109,8 @@ class NearOptimal(SampledRollout):
             where it is not known; ``good_spread``, the largest of 1/4, 1/2, 1, 2, 4 times the spread at which
             all are regulated, else of 1/8 to 1/4096, 0 if none; ``microseconds`` a control of one row, the
             median; ``strained``, the share of the states from which the LQR would meet a bound within the
-            horizon, where the policy is no better than the LQR unless it plans; None without bounds or a plant
-            in torch.
+            horizon, where the policy is no better than the LQR unless it plans; None without bounds or a
+            plant in torch.
         """
         width = positive_real("report", "spread", self.plant.spread if spread is None else spread)
         x0 = self._drawn(states, width, seed)
