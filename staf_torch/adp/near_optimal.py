@@ -157,7 +157,7 @@ class NearOptimal(SampledRollout):
         return run.cost, (left <= _REGULATED * began) & ~run.diverged
 
     def _good(self, states: int, width: float, seed: int) -> float:
-        """The largest box of a few from which all states are regulated, the largest of smaller ones."""
+        """The largest box of a few from which all states are regulated, else of smaller ones."""
 
         def good(share: float) -> bool:
             return bool(self._run(self.controller(), self._drawn(states, share * width, seed))[1].all())

@@ -341,6 +341,8 @@ def _one_hot(index: Tensor, num_classes: int = -1) -> Tensor:
 
 
 def _is_finite(x: Tensor) -> Tensor:
+    if not x.is_floating_point():
+        return torch.ones_like(x, dtype=torch.bool)
     return x.abs() < math.inf  # one comparison, where torch has two
 
 
