@@ -7,6 +7,7 @@ import hashlib
 import io
 import pickle
 import sys
+import warnings
 from collections.abc import Hashable, Iterable, Mapping
 from types import BuiltinFunctionType, CellType, CodeType, FunctionType, MethodType, ModuleType
 from typing import Any
@@ -94,6 +95,12 @@ def written(objects: tuple[Any, ...]) -> Writer | str:
         objects: as of `skeleton`.
     """
     writer = Writer(io.BytesIO())
+    with warnings.catch_warnings():  # that something will not be written down by a later Python
+        warnings.simplefilter("ignore", DeprecationWarning)
+        return _read(writer, objects)
+
+
+def _read(writer: Writer, objects: tuple[Any, ...]) -> Writer | str:
     try:
         for each in objects:
             writer.dump(each)

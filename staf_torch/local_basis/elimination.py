@@ -121,7 +121,8 @@ def functionals_of(points: Tensor, degrees: Degrees) -> Elimination:
     strengths, start = [], 0
     for size in degrees.sizes:
         block = r[..., start : start + size, start : start + size]
-        strengths.append(block.norm(dim=-1))
+        # torch 2.9 keeps the dimension where one number without memory (device meta) is summed up.
+        strengths.append(block.norm(dim=-1) if size > 1 else block.abs().squeeze(-1))
         start += size
     return Elimination(q, torch.cat(strengths, dim=-1), degrees.each)
 
