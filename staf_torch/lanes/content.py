@@ -7,7 +7,6 @@ import hashlib
 import io
 import pickle
 import sys
-import warnings
 from collections.abc import Hashable, Iterable, Mapping
 from types import BuiltinFunctionType, CellType, CodeType, FunctionType, MethodType, ModuleType
 from typing import Any
@@ -95,18 +94,12 @@ def written(objects: tuple[Any, ...]) -> Writer | str:
         objects: as of `skeleton`.
     """
     writer = Writer(io.BytesIO())
-    with warnings.catch_warnings():  # that something will not be written down by a later Python
-        warnings.simplefilter("ignore", DeprecationWarning)
-        return _read(writer, objects)
-
-
-def _read(writer: Writer, objects: tuple[Any, ...]) -> Writer | str:
     try:
         for each in objects:
             writer.dump(each)
         writer.finish()
-    except (pickle.PicklingError, TypeError, AttributeError, ValueError) as error:
-        return str(error)
+    except Exception as error:  # of any object that a function names: a lock, a deep list, a proxy
+        return f"{type(error).__name__}: {error}"
     return writer
 
 
@@ -208,6 +201,8 @@ class Writer(pickle.Pickler):
             return len(self.kept)
         if isinstance(value, np.ndarray) and not value.dtype.hasobject:
             return self._array(value)
+        if type(value).__module__ == "itertools":  # Python 3.12 warns of it, 3.14 refuses
+            raise pickle.PicklingError(f"an iterator, {type(value).__name__}")
         self._note(value)
         return None
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import ctypes
+import itertools
 import math
 import sys
+import threading
 from collections.abc import Callable
 from types import ModuleType
 from typing import Any
@@ -236,3 +238,23 @@ def test_a_pointer_cannot_be_written_down_and_is_a_users() -> None:
     pointer = ctypes.pointer(ctypes.c_double(1.0))
     assert skeleton(pointer) is None
     assert reads_users_code(pointer)
+
+
+class Refusing:
+    def __reduce__(self) -> Any:
+        raise RuntimeError("not this one")
+
+
+def deep() -> list[Any]:
+    inner: list[Any] = []
+    for _ in range(100_000):
+        inner = [inner]
+    return inner
+
+
+@pytest.mark.parametrize("make", [Refusing, deep, itertools.count, threading.Lock])
+def test_whatever_a_function_names_a_call_goes_on(make: Callable[[], Any], notebook: Any) -> None:
+    notebook.step = eval("lambda x, now, row: (x if other is None else 2 * x, x)", vars(notebook))
+    notebook.other = make()
+    torch.testing.assert_close(Program(notebook.step)(X, steps=3)[0], 8 * X)
+    assert of(Kept("a test"), notebook.step) is not None
