@@ -252,7 +252,7 @@ def near_optimal(
     )
     steps = round(seconds / period)
     if horizon is None:
-        steps = min(max(steps, _STEPS[0]), _STEPS[1])
+        steps = min(max(-(-steps // 4) * 4, _STEPS[0]), _STEPS[1])  # quarters: of one loop each
     substeps = 1
     if plant.period is None:
         a, _ = plant.linearisation(placed.target, placed.target_input)
