@@ -14,7 +14,6 @@ from ..systems import Clocked, Plant, StepPlant
 from .cost import Cost
 from .sampling import periods
 
-
 Stage = tuple[Tensor, Tensor, Tensor]
 """The slope of the last stage, the mean of the slopes, and what was paid."""
 
@@ -114,12 +113,11 @@ def runge_kutta_held(
 
 
 def _shares(length: float | Tensor, discount: float, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Of the four stages: how far ahead they ask, (4, ..., 1), what their slopes count, (4, ..., 1), and their
-    costs, (4, ...), in s."""
+    """How far ahead the stages ask, what slopes and what costs count there, s: (4, ..., 1) twice, (4, ...)."""
     if not isinstance(length, Tensor):
-        h, half = length, math.exp(-0.5 * discount * length)
-        table = ((0.0, h / 6, h / 6), (h / 2, h / 3, half * h / 3))
-        table += ((h / 2, h / 3, half * h / 3), (h, h / 6, half**2 * h / 6))
+        h, left = length, math.exp(-0.5 * discount * length)  # what the middle still counts; the end, squared
+        between = (h / 2, h / 3, left * h / 3)
+        table = ((0.0, h / 6, h / 6), between, between, (h, h / 6, left**2 * h / 6))
         asked, counted, worth = like.new_tensor(table).unbind(-1)
         return asked.unsqueeze(-1), counted.unsqueeze(-1), worth
     half = torch.exp(-0.5 * discount * length)
