@@ -118,7 +118,7 @@ def _shares(length: float | Tensor, discount: float, like: Tensor) -> tuple[Tens
         h, left = length, math.exp(-0.5 * discount * length)  # what the middle still counts; the end, squared
         between = (h / 2, h / 3, left * h / 3)
         table = ((0.0, h / 6, h / 6), between, between, (h, h / 6, left**2 * h / 6))
-        asked, counted, worth = like.new_tensor(table).unbind(-1)
+        asked, counted, worth = torch.tensor(table, dtype=like.dtype, device=like.device).unbind(-1)
         return asked.unsqueeze(-1), counted.unsqueeze(-1), worth
     half = torch.exp(-0.5 * discount * length)
     ends, middle = length / 6, length / 3
