@@ -251,8 +251,8 @@ def near_optimal(
         else positive_real("near_optimal", "horizon", horizon)
     )
     steps = round(seconds / period)
-    if horizon is None:
-        steps = min(max(-(-steps // 4) * 4, _STEPS[0]), _STEPS[1])  # quarters: of one loop each
+    if horizon is None:  # four quarters, of which a program has one
+        steps = min(max(-(-steps // 4) * 4, _STEPS[0]), _STEPS[1])
     substeps = 1
     if plant.period is None:
         a, _ = plant.linearisation(placed.target, placed.target_input)
