@@ -83,13 +83,13 @@ def fail_anyway(tests: Sequence[str]) -> list[str]:
     if not tests:
         return []
     chosen = Chosen(tests)
-    in_fork(chosen.files, chosen, 60 + 5 * _cost(tests), stop=False)
+    in_fork(chosen.files, chosen, 30 + 3 * _cost(tests), stop=False)
     return chosen.read()
 
 
 def _run(tests: Sequence[str]) -> tuple[str, str]:
     chosen = Chosen(tests)
-    limit = 60 + 5 * _cost(tests)
+    limit = 30 + 3 * _cost(tests)
     code = in_fork(chosen.files, chosen, limit, stop=True)
     if code is None:
         return "killed", _ENDED
