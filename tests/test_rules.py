@@ -220,6 +220,9 @@ CALLS: dict[str, Callable[..., Any]] = {
     "SlopeWindows": lambda **given: adp.SlopeWindows(ACTUATORS, **given),
     "HistoryStack": lambda **given: adp.HistoryStack(**{"rows": 1, "parameters": 1, **given}),
     "LeastSquares": lambda **given: adp.LeastSquares([1.0], **{"deviation": 1.0, **given}),
+    "AdaptiveActorCritic": lambda **given: adp.AdaptiveActorCritic(
+        LEARNER, ACTUATORS, WINDOWS, ESTIMATE, **given
+    ),
     "AdaptiveLQR": lambda **given: adp.AdaptiveLQR(ACTUATORS, COST, WINDOWS, ESTIMATE, **given),
     "StreamDrift": lambda **given: stream_drift(**given),
     "DriftLQR": lambda **given: adp.DriftLQR(stream_drift(), COST, **given),
