@@ -221,7 +221,11 @@ CALLS: dict[str, Callable[..., Any]] = {
     "HistoryStack": lambda **given: adp.HistoryStack(**{"rows": 1, "parameters": 1, **given}),
     "LeastSquares": lambda **given: adp.LeastSquares([1.0], **{"deviation": 1.0, **given}),
     "AdaptiveActorCritic": lambda **given: adp.AdaptiveActorCritic(
-        LEARNER, ACTUATORS, WINDOWS, ESTIMATE, **given
+        adp.ActorCritic(adp.QuadraticBasis(2), PLANT, COST, adp.RandomPoints(1, 1.0)),
+        ACTUATORS,
+        WINDOWS,
+        ESTIMATE,
+        **given,
     ),
     "AdaptiveLQR": lambda **given: adp.AdaptiveLQR(ACTUATORS, COST, WINDOWS, ESTIMATE, **given),
     "StreamDrift": lambda **given: stream_drift(**given),

@@ -1,13 +1,15 @@
 """`adp.PolicyIteration` on a drift that is identified while it controls: what 200 fresh states cost.
 
-    python tests/benchmarks/identified_policy_iteration.py [--states 200] [--seed 1] [--episodes 20] [--noise 0] [--start 1]
+    python tests/benchmarks/identified_policy_iteration.py [--states 200] [--seed 1] [--episodes 20]
+        [--noise 0] [--start 1]
 
-The two-state plant of the paper, x' = theta's(x) + g(x) u with theta (3, 2) unknown, 0 at first; 10 s at 5 ms from
-uniform states of [-2, 2]^2. Only x is measured; `AdaptiveActorCritic` finds theta by least squares from integrals, and
-the weights rest at those of --start x'x while the Bellman equation is in doubt. Four rows: no learning, these weights
-throughout; the drift known; nothing known at the beginning of each state's first and only episode; and what one learner
-knows after its own episodes, one after the other, from other states. Prints the cost over V* where the state is regulated: |x| < 1e-3 at the end, with noise
-20 standard deviations of it. Not collected by pytest.
+The two-state plant of the paper, x' = theta's(x) + g(x) u with theta (3, 2) unknown, 0 at first; 10 s at 5
+ms from uniform states of [-2, 2]^2. Only x is measured; `AdaptiveActorCritic` finds theta by least squares
+from integrals, and the weights rest at those of --start x'x while the Bellman equation is in doubt. Four
+rows: no learning, these weights throughout; the drift known; nothing known at the beginning of each state's
+first and only episode; and what one learner knows after its own episodes, one after the other, from other
+states. Prints the cost over V* where the state is regulated: |x| < 1e-3 at the end, with noise 20 standard
+deviations of it. Not collected by pytest.
 """
 
 from __future__ import annotations

@@ -60,7 +60,8 @@ def test_weights_wait_in_doubt_and_every_state_is_regulated_near_the_optimum() -
     weights = run.critic_weights[waited]
     assert torch.equal(weights, tensor(FIRST).expand_as(weights))
     first, last = (PLANT.optimal_value(x, COST.q, COST.r) for x in (x0, run.state[:, -1]))
-    assert first is not None and last is not None
+    assert first is not None
+    assert last is not None
     assert float(((run.cost + last) / first).mean()) < 1.04
     assert float((last / first).max()) < 0.1
 
