@@ -198,7 +198,7 @@ def near_optimal(
     """A policy for a plant, held for dt, that costs no more than its LQR.
 
     The rules: the base is the LQR made for dt; the horizon is two time constants of its slowest mode (three
-    with ``plan``), 12 to 60 periods; the centers are as many as quadratics need, from four states on the
+    with ``plan``), 12 to 60 periods, four quarters; the centers are as many as quadratics need, from four states on the
     cross-polytope and its middle, in a ball of ``radius``; a plant in continuous time is integrated in
     steps of a fifth of its fastest time constant. Rollouts of an LQR do not know what to do before a bound
     of the inputs. With ``plan`` the policy's ``controller()``, for loops, is a `RecedingHorizon` over that
