@@ -203,8 +203,7 @@ ACCEPTED: dict[tuple[str, str, str, str], str] = {
     ): "zeros like another column, which has the same shape",
     (
         "staf_torch/deploy/approximators.py",
-        "log_scale = (z * self.state).sum(-1, keepdim=True) if self.rate is None else "
-        "-0.5 * self.rate * square",
+        "sums = torch.addmm(self.constant, torch.cat(powers, dim=-1), self.table)",
         "-1",
         "(1)",
     ): "of (B, n), the one shape that an exported approximator takes",
