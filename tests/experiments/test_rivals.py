@@ -198,3 +198,22 @@ def test_published_numbers_are_of_these_cases(name: str) -> None:
         u = torch.full((1, case.inputs), 0.2, dtype=torch.float64)
         paid = 0.01 * sum(case.weights[0]) + 0.04 * sum(case.weights[1])
         assert float(cost.rate(x, u)) == pytest.approx(paid)
+
+
+@pytest.mark.parametrize("name", list(CASES))
+def test_an_angle_is_a_coordinate_that_may_turn_once_more_and_not_less(name: str) -> None:
+    case = CASES[name]
+    generator = torch.Generator().manual_seed(2)
+    x = torch.rand(5, case.dim, generator=generator, dtype=torch.float64)
+    u = torch.rand(5, case.inputs, generator=generator, dtype=torch.float64)
+
+    def moved(by: Tensor) -> Tensor:
+        """What the equations say there, of x+ less the way that x itself was moved."""
+        found = torch.stack(tuple(case.equations(TorchMath, (x + by).unbind(-1), u.unbind(-1))), -1)
+        return found - by if case.discrete else found
+
+    still = torch.zeros(case.dim, dtype=torch.float64)
+    for k, unit in enumerate(torch.eye(case.dim, dtype=torch.float64)):
+        turn, part = ((moved(way * unit) - moved(still)).abs().max() for way in (2 * math.pi, 1.0))
+        assert (k in case.periodic) == (float(turn) < 1e-9 < float(part)), k
+    assert set(case.periodic) == {k for k in range(case.dim) if k in case.plant().periodic}
