@@ -125,7 +125,7 @@ class Captured:
                     self._stated[storage.data_ptr()] = storage
 
     def _written_here(self, fresh: Sequence[Tensor]) -> None:
-        """What `torch.tensor` of Python's numbers made just now; memory of an array of NumPy is not torch's."""
+        """What `torch.tensor` of Python's numbers made just now, not memory of an array of NumPy."""
         for tensor in fresh:
             storage = tensor.untyped_storage()
             if storage.resizable() and self.from_outside(tensor):
