@@ -122,6 +122,39 @@ def as_row_program(dim: int, count: int, streams: int = 10_000, steps: int = 20)
     return f"{each:.3f} us to predict and learn, {float(max(errors)):.1e} from the regressor"
 
 
+def processes_as_row_program(streams: int, neighbours: int = 32) -> str:
+    """The largest part of the bank, its 24 Gaussian processes of the nearest samples, a stream a lane."""
+    rates = torch.tensor([0.5, 1.0, 2.0]).double().repeat(8)
+    fades = torch.tensor([0.0, 0.01, 0.05, 0.1]).double().repeat_interleave(6)
+    eye = 1e-3 * torch.eye(neighbours, dtype=torch.float64)
+
+    def step(carry: tuple[()], _: tuple[()], row: tuple[Tensor, ...]) -> tuple[tuple[()], Tensor]:
+        points, y, when = row
+        square = (points.unsqueeze(2) - points.unsqueeze(1)).square().sum(-1)
+        age = (when.unsqueeze(2) - when.unsqueeze(1)).abs()
+
+        def process(_: tuple[()], rule: tuple[Tensor, Tensor]) -> tuple[tuple[()], Tensor]:
+            kernel = (-rule[0] * square - rule[1] * age).exp()
+            factor = torch.linalg.cholesky_ex(kernel[:, :-1, :-1] + eye).L
+            sides = torch.stack((y, kernel[:, :-1, -1]), -1)
+            beta, seen = torch.linalg.solve_triangular(factor, sides, upper=False).unbind(-1)
+            return (), torch.stack(((beta * seen).sum(-1), seen.square().sum(-1), beta.square().sum(-1)), -1)
+
+        return carry, lanes.scan(process, (), (rates, fades), dim=0)[1].transpose(0, 1)
+
+    generator = torch.Generator().manual_seed(0)
+    shapes = (neighbours + 1, 4), (neighbours,), (neighbours + 1,)
+    row = tuple(torch.rand(streams, *shape, generator=generator).double() for shape in shapes)
+    program, spent = lanes.Program(step), []
+    if not program.compiles((), (), row, steps=1):
+        return "is not compiled"
+    for _ in range(30):
+        begin = time.process_time()
+        program((), (), row, steps=1)
+        spent.append(time.process_time() - begin)
+    return f"{1e6 * sorted(spent)[15] / streams:.0f} us a stream"
+
+
 def main() -> None:
     torch.set_num_threads(1)
     for dtype in (torch.float32, torch.float64):
@@ -132,6 +165,10 @@ def main() -> None:
     for neighbours in (32, 48):
         model = st.StaFRegressor(memory=1000, neighbours=neighbours)
         print(f"one stream, bank of {neighbours} neighbours, n = 4: {single(model, 4)}")
+    for streams in (1, 8):
+        print(
+            f"its 24 processes alone as a row program, streams {streams}: {processes_as_row_program(streams)}"
+        )
     print(f"M = 6 as a row program, float64: {as_row_program(2, 6)}")
 
 
