@@ -3,11 +3,12 @@
     python tests/benchmarks/shooting.py [--cases CASE,CASE] [--states 4] [--starts 6] [--seed 0] [--json FILE]
 
 Needs casadi. Every plant on which `experiments/rival_plants.py` compares methods, in continuous time, from
-random states of its box, and swing-ups from hanging and from random states; the mesh, the Runge-Kutta steps, the
-controls (linear on an interval) and the terminal cost are those that `DirectShooting` chose. IPOPT starts at its
-plan, at that plan shaken, and from controls that jump between the bounds around the ways to each goal that
-differs by full turns. Prints the value over the least that any of these found. A row that claims to have
-converged and costs more than 1.0001 of that is an error (exit code 1). Not collected by pytest.
+random states of its box, and swing-ups from hanging and from random states; the mesh, the Runge-Kutta
+steps, the controls (linear on an interval) and the terminal cost are those that `DirectShooting` chose.
+IPOPT starts at its plan, at that plan shaken, and from controls that jump between the bounds around the
+ways to each goal that differs by full turns. Prints the value over the least that any of these found. A row
+that claims to have converged and costs more than 1.0001 of that is an error (exit code 1). Not collected by
+pytest.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ import json
 import math
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,6 @@ import torch
 from torch import Tensor
 
 from staf_torch import adp
-from staf_torch.experiments import rival_plants
 from staf_torch.experiments.rival_plants import CASES, Case
 
 _SAME = 1e-4  # relative
@@ -159,7 +159,7 @@ class Peer:
         self, x0: Tensor, found: tuple[Tensor, Tensor] | None, count: int, draw: np.random.Generator
     ) -> list[tuple[np.ndarray, np.ndarray]]:
         """Half of them at and around a plan (T + 1, n), (T, 2 m) where there is one, the others cold."""
-        n, m, steps = self.sizes
+        _, m, steps = self.sizes
         low, high = np.tile(self.case.low, 2), np.tile(self.case.high, 2)
         several = []
         if found is not None:
@@ -235,7 +235,8 @@ def line(row: Row) -> str:
         f"{value / row['ours'] if math.isfinite(row['ours']) else value:.5g}" for value in row["ipopt"]
     )
     said = "converged" if row["converged"] else row["reason"]
-    return f"| {row['case']} | {row['state']} | {row['ours']:.6g} | {row['over']:.6f} | {cold} | {said} | {row['cpu_s']:.1f} |"
+    cells = [row["case"], row["state"], f"{row['ours']:.6g}", f"{row['over']:.6f}", cold, said]
+    return "| " + " | ".join(str(cell) for cell in (*cells, f"{row['cpu_s']:.1f}")) + " |"
 
 
 def main() -> None:

@@ -49,7 +49,8 @@ class DirectShooting:
     slope does not pass. A row whose value is not near its LQR's, or is much less than the base costs, is
     started from more guesses: constant controls at the bounds for a while, none, random splines, each
     followed by the base policies; the cheapest of them that are no mirror images are improved. It has
-    converged if two starts found the same lowest value to 1e-4, else its `reason` says ``local``. A row that is not stationary is NaN, and its `reason` says why.
+    converged if two starts found the same lowest value to 1e-4, else its `reason` says ``local``. A row that
+    is not stationary is NaN, and its `reason` says why.
 
     Every control that is found is admissible, so the value is an upper bound of V*, but for the errors of
     the Runge-Kutta steps and of the horizon, which `Optimum` reports.
