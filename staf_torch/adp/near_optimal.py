@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ..approximation.basis import StaFBasis
-from ..centers import StateFollowingCenters
+from ..centers import StateFollowingCenters, cross_polytope
 from ..kernels import ExponentialKernel
 from ..lanes import ready
 from ..numerics.checks import fail, flag, positive_real
@@ -199,9 +199,10 @@ def near_optimal(
 
     The rules: the base is the LQR made for dt; the horizon is two time constants of its slowest mode (three
     with ``plan``), 12 to 60 periods; the centers are as many as quadratics need, from four states on the
-    cross-polytope and its middle, in a ball of ``radius``; a plant in continuous time is integrated in
-    steps of a fifth of its fastest time constant. Rollouts of an LQR do not know what to do before a bound
-    of the inputs. With ``plan`` the policy's ``controller()``, for loops, is a `RecedingHorizon` over that
+    cross-polytope and its middle, in a ball of ``radius`` (of a simulator, whose time is what a control
+    takes, on the cross-polytope of the inputs alone, as `SampledRollout` says); a plant in continuous time
+    is integrated in steps of a fifth of its fastest time constant. Rollouts of an LQR do not know what to
+    do before a bound of the inputs. With ``plan`` the policy's ``controller()``, for loops, is a `RecedingHorizon` over that
     horizon, of which the first plan is the best that `BoxDDP` finds from the LQR and from holding a bound
     for a while, and that is carried and improved from control to control, in some milliseconds. It takes a
     plant in torch, held for one period of its own, without a discount. The policy as a function of x makes
@@ -257,7 +258,11 @@ def near_optimal(
     if plant.period is None:
         a, _ = plant.linearisation(placed.target, placed.target_input)
         substeps = max(1, math.ceil(period * float(torch.linalg.eigvals(a).abs().max()) / _RESOLVED))
-    basis = StaFBasis(ExponentialKernel(), StateFollowingCenters(ball_directions(None, placed.dim), radius))
+    directions = ball_directions(None, placed.dim)
+    if not plant.traceable and placed.inputs < placed.dim:
+        corners = cross_polytope(placed.inputs)
+        directions = torch.cat((corners, torch.zeros_like(corners[:1])))
+    basis = StaFBasis(ExponentialKernel(), StateFollowingCenters(directions, radius))
     policy = NearOptimal(
         basis, plant, placed, lqr, lqr.value, lqr.p, period=period, steps=steps, substeps=substeps
     )

@@ -20,8 +20,11 @@ def wrap(difference: Tensor, periodic: Sequence[int]) -> Tensor:
     """
     if not periodic:
         return difference
-    size = difference.shape[-1]
+    turn = turns(difference.shape[-1], periodic)
+    return difference - turn.to(difference) * (difference / (2 * math.pi)).round()
+
+
+def turns(size: int, periodic: Sequence[int]) -> Tensor:
+    """2 pi where a coordinate is an angle, else 0: (size,)."""
     angles = {index % size for index in periodic}
-    turn = torch.tensor([2 * math.pi if k in angles else 0.0 for k in range(size)], dtype=torch.float64)
-    turns = (difference / (2 * math.pi)).round()
-    return difference - turn.to(difference) * turns
+    return torch.tensor([2 * math.pi if k in angles else 0.0 for k in range(size)], dtype=torch.float64)
