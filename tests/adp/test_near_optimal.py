@@ -187,9 +187,8 @@ def test_simulator_is_followed_in_numpy_to_the_same_promise(
     for one, other in zip(seen.rollout(x), hidden.rollout(x), strict=True):
         torch.testing.assert_close(one, other, rtol=1e-7, atol=0)  # slopes by differences
     assert torch.equal(hidden.rollout(x[1, 2]).whole, hidden.rollout(x).whole[1, 2])
-    # Along the only input three centers find the slope that six find for all directions.
-    assert (seen.basis.count, hidden.basis.count) == (6, 3)
-    unbounded = x[0] * 0.05 if target is None else x[0] * 0.05 + torch.tensor(target, dtype=torch.float64)
-    steps = [policy.proposal(unbounded, policy.base(unbounded)) for policy in (seen, hidden)]
-    torch.testing.assert_close(*steps, rtol=0, atol=2e-3)
+    assert (seen.basis.count, hidden.basis.count) == (6, 3)  # along the only input three centers will do
+    near = x[0] * 0.05 if target is None else x[0] * 0.05 + torch.tensor(target, dtype=torch.float64)
+    if not smooth:  # the LQR is the optimum, wherever the set-point is
+        assert float(hidden.proposal(near, hidden.base(near)).abs().max()) < 1e-3
     torch.testing.assert_close(pickle.loads(pickle.dumps(hidden))(x), hidden(x), rtol=0, atol=0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from torch import Tensor
 
 from staf_torch.experiments import rival_methods, rivals
 from staf_torch.experiments.rival_methods import METHODS, Method, ipopt_program
-from staf_torch.experiments.rival_plants import CASES
+from staf_torch.experiments.rival_plants import CASES, TorchMath
 
 SHORT = dataclasses.replace(CASES["double_integrator"], steps=60, horizon=20)
 
@@ -71,6 +72,67 @@ def test_every_plant_rests_at_its_goal_and_begins_in_its_box(name: str) -> None:
     torch.testing.assert_close(rest, torch.zeros_like(rest), rtol=0, atol=1e-12)
     assert (x[:, case.dim :] == 0).all()
     assert ((x[:, : case.dim] - case.goal()).abs() <= torch.tensor(case.box, dtype=torch.float64)).all()
+
+
+def energy(name: str, x: Tensor) -> Tensor:
+    """Kinetic and potential energy of a plant, from its masses and lengths alone, in J."""
+    if name == "quadrotor":
+        return 0.5 * x[..., 3:5].square().sum(-1) + 0.5 * 0.1 * x[..., 5] ** 2 + 9.81 * x[..., 1]
+    if name == "figure_eight":
+        return 0.027 * (0.5 * (x[..., 1] ** 2 + x[..., 3] ** 2) + 9.81 * x[..., 2]) + 0.7e-5 * x[..., 5] ** 2
+    swing, sine, cosine = x[..., 3], x[..., 1].sin(), x[..., 1].cos()
+    across, up = x[..., 2] + 0.5 * swing * cosine, -0.5 * swing * sine  # of the middle of the pole
+    turning = 0.5 * (0.1 * 1.0**2 / 12) * swing**2  # of a rod of a metre
+    return 0.5 * x[..., 2] ** 2 + 0.5 * 0.1 * (across**2 + up**2) + turning + 0.1 * 9.8 * 0.5 * cosine
+
+
+@pytest.mark.parametrize("name", ["cart_pole_10N", "quadrotor", "figure_eight"])
+def test_the_energy_of_a_plant_grows_at_the_power_of_its_inputs(name: str) -> None:
+    case = CASES[name]
+    generator = torch.Generator().manual_seed(1)
+    x = torch.rand(50, case.dim, generator=generator, dtype=torch.float64, requires_grad=True)
+    u = torch.rand(50, case.inputs, generator=generator, dtype=torch.float64)
+    (slope,) = torch.autograd.grad(energy(name, x).sum(), x)
+    rate = torch.stack(tuple(case.equations(TorchMath, x.unbind(-1), u.unbind(-1))), -1)
+    along = {
+        "cart_pole_10N": lambda: u[:, 0] * x[:, 2],
+        "quadrotor": lambda: (
+            (9.81 + u[:, 0]) * (x[:, 4] * x[:, 2].cos() - x[:, 3] * x[:, 2].sin()) + u[:, 1] * x[:, 5]
+        ),
+        "figure_eight": lambda: (
+            u.sum(-1) * (x[:, 1] * x[:, 4].sin() + x[:, 3] * x[:, 4].cos())
+            + 0.0397 / math.sqrt(2) * (u[:, 1] - u[:, 0]) * x[:, 5]
+        ),
+    }[name]()
+    torch.testing.assert_close((slope * rate).sum(-1), along, rtol=1e-12, atol=1e-12)
+    still = {"cart_pole_10N": [2, 3], "quadrotor": [3, 4, 5], "figure_eight": [1, 3, 5]}[name]
+    places = [k for k in range(case.dim) if k not in still]
+    assert torch.equal(rate[:, places], x[:, still])
+
+
+def test_the_pendulum_is_that_of_gymnasium() -> None:
+    gymnasium = pytest.importorskip("gymnasium", reason="needs the extra gym")
+    inside = gymnasium.make("Pendulum-v1").unwrapped
+    inside.reset(seed=0)
+    for angle, rate, torque in ((0.3, 0.5, 1.0), (-2.0, 7.9, 2.0), (2.5, -7.9, -2.0)):
+        inside.state = np.array([angle, rate])
+        inside.step(np.array([torque]))
+        found = CASES["pendulum"].equations(TorchMath, torch.tensor([angle, rate]), torch.tensor([torque]))
+        np.testing.assert_allclose(torch.stack(tuple(found)).numpy(), inside.state, rtol=1e-5)
+
+
+def test_the_path_has_the_velocities_that_it_states_and_the_period_that_it_is_called_by() -> None:
+    time = torch.linspace(0, 6, 25, dtype=torch.float64, requires_grad=True)
+    way = CASES["figure_eight"].way(time)
+    for place, velocity in ((0, 1), (2, 3)):
+        (slope,) = torch.autograd.grad(way[:, place].sum(), time, retain_graph=True)
+        torch.testing.assert_close(way[:, velocity], slope, rtol=0, atol=1e-12)
+    torch.testing.assert_close(way[0], way[-1], rtol=0, atol=1e-12)
+    torch.testing.assert_close(way[12, [0, 2]], way[0, [0, 2]], rtol=0, atol=1e-12)  # it meets itself halfway
+    assert not torch.allclose(way[12], way[0])
+    across, up = way[:, 0], way[:, 2] - 1
+    torch.testing.assert_close(across.abs().max(), torch.tensor(0.75, dtype=torch.float64), rtol=1e-2, atol=0)
+    torch.testing.assert_close(across**4, 0.75**2 * (across**2 - up**2), rtol=0, atol=1e-12)  # of Gerono
 
 
 @pytest.mark.parametrize("name", ["cart_pole_to_1m", "pendulum", "figure_eight"])
