@@ -163,3 +163,57 @@ def test_unknown_plants_and_methods_are_refused_by_name(tmp_path) -> None:  # ty
 
 def test_the_size_of_a_package_is_that_of_its_files() -> None:
     assert rival_methods._size("numpy") > 10 * rival_methods._size("pytest") > 0
+
+
+# Period (s), duration (s), diagonals of Q and R, bounds of the inputs, half the box of states, periods ahead.
+TABLE = {
+    "double_integrator": (0.1, 15, (1, 1), (1,), (-1,), (1,), (5, 1), 50),
+    "pendulum": (0.05, 10, (20, 2), (0.02,), (-2,), (2,), (math.pi, 1), 50),
+    "cart_pole_10N": (0.02, 5, (1, 1, 0.1, 0.1), (0.01,), (-10,), (10,), (0.3,) * 4, 50),
+    "cart_pole_5N": (0.02, 5, (1, 1, 0.1, 0.1), (0.01,), (-5,), (5,), (0.3,) * 4, 50),
+    "cart_pole_to_1m": (1 / 15, 6, (5, 5, 0.1, 0.1), (0.1,), (-10,), (10,), (1, 0.2, 0.2, 0.2), 20),
+    "quadrotor": (0.02, 4, (1,) * 6, (1, 1), (-9.81, -1), (9.81, 1), (0.4,) * 6, 50),
+    "figure_eight": (
+        0.02,
+        6,
+        (5, 0.1, 5, 0.1, 0.1, 0.1),
+        (0.1, 0.1),
+        (0.0563,) * 2,
+        (0.2967,) * 2,
+        (0.05,) * 6,
+        20,
+    ),
+    "cart_pole_swing_up": (0.02, 6, (1, 1, 0.1, 0.1), (0.01,), (-10,), (10,), (1, math.pi, 1, 2), 120),
+}
+
+
+@pytest.mark.parametrize("name", list(CASES))
+def test_published_numbers_are_of_these_cases(name: str) -> None:
+    case, cost = CASES[name], CASES[name].cost()
+    found = (case.dt, case.steps * case.dt, *case.weights, case.low, case.high, case.box, case.horizon)
+    for one, two in zip(found, TABLE[name], strict=True):
+        assert one == pytest.approx(two)
+    if case.path is None:
+        x = (case.goal() + 0.1).unsqueeze(0)
+        u = torch.full((1, case.inputs), 0.2, dtype=torch.float64)
+        paid = 0.01 * sum(case.weights[0]) + 0.04 * sum(case.weights[1])
+        assert float(cost.rate(x, u)) == pytest.approx(paid)
+
+
+@pytest.mark.parametrize("name", list(CASES))
+def test_an_angle_is_a_coordinate_that_may_turn_once_more_and_not_less(name: str) -> None:
+    case = CASES[name]
+    generator = torch.Generator().manual_seed(2)
+    x = torch.rand(5, case.dim, generator=generator, dtype=torch.float64)
+    u = torch.rand(5, case.inputs, generator=generator, dtype=torch.float64)
+
+    def moved(by: Tensor) -> Tensor:
+        """What the equations say there, of x+ less the way that x itself was moved."""
+        found = torch.stack(tuple(case.equations(TorchMath, (x + by).unbind(-1), u.unbind(-1))), -1)
+        return found - by if case.discrete else found
+
+    still = torch.zeros(case.dim, dtype=torch.float64)
+    for k, unit in enumerate(torch.eye(case.dim, dtype=torch.float64)):
+        turn, part = ((moved(way * unit) - moved(still)).abs().max() for way in (2 * math.pi, 1.0))
+        assert (k in case.periodic) == (float(turn) < 1e-9 < float(part)), k
+    assert set(case.periodic) == {k for k in range(case.dim) if k in case.plant().periodic}
