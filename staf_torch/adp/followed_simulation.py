@@ -8,7 +8,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..numerics.angles import turns
 from ..systems import Bounds, Plant, StepPlant
 from ..systems.black_box import Numbers
 from .controllers import LQR, Policy
@@ -58,7 +57,7 @@ def _linear(lqr: Policy, bounds: Bounds) -> Callable[[Numbers], Numbers]:
     rest = np.zeros(cost.inputs) if cost.target_input is None else cost.target_input.numpy()
     low, high = bounds.low.numpy(), bounds.high.numpy()
     bounded = bounds.present
-    turn = turns(size, cost.periodic).numpy()
+    turn = np.array([2 * np.pi * (k in cost.periodic) for k in range(size)])
     whole = 2 * np.pi
 
     def feedback(x: Numbers) -> Numbers:

@@ -20,11 +20,13 @@ def wrap(difference: Tensor, periodic: Sequence[int]) -> Tensor:
     """
     if not periodic:
         return difference
-    turn = turns(difference.shape[-1], periodic)
-    return difference - turn.to(difference) * (difference / (2 * math.pi)).round()
-
-
-def turns(size: int, periodic: Sequence[int]) -> Tensor:
-    """2 pi where a coordinate is an angle, else 0: (size,)."""
+    size = difference.shape[-1]
     angles = {index % size for index in periodic}
-    return torch.tensor([2 * math.pi if k in angles else 0.0 for k in range(size)], dtype=torch.float64)
+    if len(angles) == size:
+        return _wrapped(difference)
+    columns = [_wrapped(x) if k in angles else x for k, x in enumerate(difference.unbind(-1))]
+    return torch.stack(columns, dim=-1)
+
+
+def _wrapped(angle: Tensor) -> Tensor:
+    return angle - 2 * math.pi * (angle / (2 * math.pi)).round()
