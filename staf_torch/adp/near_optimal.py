@@ -199,9 +199,9 @@ def near_optimal(
 
     The rules: the base is the LQR made for dt; the horizon is two time constants of its slowest mode (three
     with plans), 12 to 60 periods, four quarters; the centers are as many as quadratics need, from four
-    states on the cross-polytope and its middle, in a ball of ``radius`` (of a simulator, whose time is what a control
-    takes, on the cross-polytope of the inputs alone, as `SampledRollout` says); a plant in continuous time
-    is integrated in steps of a fifth of its fastest time constant.
+    states on the cross-polytope and its middle, in a ball of ``radius`` (of a simulator, whose time is what a
+    control takes, on the cross-polytope of the inputs alone, as `SampledRollout` says); a plant in continuous
+    time is integrated in steps of a fifth of its fastest time constant.
 
     Rollouts of an LQR do not know what to do before a bound of the inputs. With ``plan`` the policy's
     ``controller()``, for loops, is a `RecedingHorizon` over that horizon, of which the first plan is the best

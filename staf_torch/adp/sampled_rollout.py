@@ -199,7 +199,7 @@ class SampledRollout(nn.Module):
         passes = math.gcd(self.steps, rest)  # of a stretch of which both are made: a program has one loop
         discount = self._discount()
         if self._followed is not None:
-            return self._promised(x, first)
+            return self._promised(x, self.steps - rest)
 
         stretches = x.new_zeros(self.steps // passes)
 
