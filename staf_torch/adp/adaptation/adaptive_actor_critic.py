@@ -167,8 +167,8 @@ class AdaptiveActorCritic(Controller):
 
 def _chosen(where: Tensor, one: ControllerState, other: ControllerState) -> ControllerState:
     """The weights of one where it says so, those of the other elsewhere."""
-    parts = (
+    critic, actor, gain = (
         torch.where(where[(..., *[None] * (new.dim() - where.dim()))], new, old)
         for new, old in zip(one[:3], other[:3], strict=True)
     )
-    return ControllerState(*parts, other.identifier)
+    return ControllerState(critic, actor, gain, other.identifier)
