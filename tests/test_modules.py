@@ -225,6 +225,7 @@ OTHERS |= {"NearOptimal", "SampledRollout"}
 OTHERS |= {
     "ParametricPlant",
     "ChangingPlant",
+    "AdaptiveActorCritic",
     "AdaptiveLQR",
     "DriftLQR",
     "ConcurrentTracker",
