@@ -23,7 +23,7 @@ class FilterStreams:
         state: of the streams.
         scaling: whether the units of x and y are learned from the first samples of each stream.
         units: centers and spreads (S, 2 (n + K)) that are known instead, NaN where they are not.
-        stretch: by which learned spreads are multiplied, (n + K,), ones by default.
+        stretch: by which learned spreads are multiplied, (S, n + K), ones by default.
     """
 
     def __init__(
@@ -34,18 +34,18 @@ class FilterStreams:
         units: Tensor | None = None,
         stretch: Tensor | None = None,
     ) -> None:
-        self.scaling, self._stretch = scaling, stretch
+        self.scaling = scaling
         self.dtype = state.dtype
         size, wide = state.streams, state.dim + state.outputs
         like = state.blocks.new_zeros(0, dtype=torch.float64)
         self.units = like.new_zeros(size, 2 * wide)  # centers, spreads
+        self._stretch = self.units.new_ones(size, wide) if stretch is None else stretch.double()
         self._known = torch.full_like(self.units, torch.nan) if units is None else units.double()
         self.first = like.new_zeros(size, LEARNED_AT[-1] if scaling else 0, wide + 1)  # samples and lapses
         self.clock = torch.zeros(
             size, dtype=torch.int64
         )  # of first samples; behind them, of far ones in a row
         self._begin(torch.arange(size))
-        self._law = _typical(definition.ratio), _typical(definition.forgetting)  # of added streams
         self._hold(definition, state)
 
     def _begin(self, rows: Tensor) -> None:
@@ -129,7 +129,7 @@ class FilterStreams:
         wide, n = self.state.dim + self.state.outputs, self.state.dim
         samples = self.first[row, : self.clock[row]]
         center, spread = units_of(samples[:, :wide])
-        spread = spread if self._stretch is None else spread * self._stretch
+        spread = spread * self._stretch[row]
         self.units[row] = torch.cat((center, spread))
         self._center, self._spread = self.units.to(self.dtype).split(wide, dim=1)
         u = ((samples[:, :wide] - center) / spread).to(self.dtype)
@@ -156,8 +156,8 @@ class FilterStreams:
         if not self.scaling or bool((self.clock >= LEARNED_AT[-1]).all()):
             return self.units[:, :wide], self.units[:, wide:]
         found = [units_of(row[torch.isfinite(row).all(1)]) for row in samples.unbind(1)]
-        stretch = 1.0 if self._stretch is None else self._stretch
-        return torch.stack([pair[0] for pair in found]), torch.stack([pair[1] for pair in found]) * stretch
+        spreads = torch.stack([pair[1] for pair in found]) * self._stretch
+        return torch.stack([pair[0] for pair in found]), spreads
 
     def clear(self, rows: Tensor) -> None:
         """Let the streams with these numbers begin anew."""
@@ -177,19 +177,17 @@ class FilterStreams:
         self.units, self._known = torch.cat((self.units, new)), torch.cat((self._known, new))
         self.first = torch.cat((self.first, self.first.new_zeros(streams, *self.first.shape[1:])))
         self.clock = torch.cat((self.clock, self.clock.new_zeros(streams)))
+        self._stretch = torch.cat((self._stretch, _typical(self._stretch).expand(streams, -1)))
         self._begin(torch.arange(self.count, self.count + streams))
         old = self.definition
-        ratio, forgetting = (
-            torch.cat((a, b.expand(streams)))
-            for a, b in zip((old.ratio, old.forgetting), self._law, strict=True)
-        )
+        ratio, forgetting = (torch.cat((a, _typical(a).expand(streams))) for a in (old.ratio, old.forgetting))
         self._hold(old.with_law(ratio, forgetting), state)
 
     def keep(self, rows: Tensor) -> None:
         """Go on with the streams with these numbers alone."""
         state = self.state.with_table(self.state.table[:, rows], self.state.counts[:, rows])
         self.units, self.first, self.clock = self.units[rows], self.first[rows], self.clock[rows]
-        self._known = self._known[rows]
+        self._known, self._stretch = self._known[rows], self._stretch[rows]
         old = self.definition
         self._hold(old.with_law(old.ratio[rows], old.forgetting[rows]), state)
 
@@ -236,7 +234,7 @@ class FilterStreams:
 
 
 def _typical(values: Tensor) -> Tensor:
-    """The lower median of (S,), (1,)."""
+    """The lower median of every column, which streams that are added begin with: (S, ...) -> (1, ...)."""
     return values.median(0).values[None]
 
 

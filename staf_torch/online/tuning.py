@@ -110,7 +110,7 @@ def tuned_streams(
     law = found.ratio.clone(), found.forgetting.clone()
     filter_ = LocalFilter(functions, *law, follow * float(found.radius[0]), robust)
     state = StreamState.empty(torch.zeros(0, dtype=dtype), len(found.ratio), n, len(offsets), outputs)
-    stretch = torch.cat((found.width.median(0).values, found.width.new_ones(outputs)))
+    stretch = torch.cat((found.width, found.width.new_ones(len(found.width), outputs)), 1)
     return FilterStreams(filter_, state, True, torch.cat((found.center, found.spread), 1), stretch)
 
 
