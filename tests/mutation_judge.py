@@ -16,6 +16,7 @@ from mutation_map import Map, places, tests_near
 
 OVERHEAD = 0.1  # seconds that a test costs beside what was measured
 UNKNOWN = 5.0  # seconds that a file of tests is taken for
+_ENDED = "by the clock, or the process ended"
 FIRST = 4.0  # seconds of tests that are tried before files of more tests are read
 
 
@@ -64,7 +65,7 @@ def judge(mutant: Mutant) -> Verdict | None:
         return Verdict(mutant, "unreached" if not _hits(mutant, source) else "too dear")
     begun = time.monotonic()
     path.write_text(mutant.applied(source), encoding="utf-8")
-    said, by = "survived", ""
+    said, by, group = "survived", "", tests
     try:
         for group in _groups(tests):
             said, by = _run(group)
@@ -72,6 +73,8 @@ def judge(mutant: Mutant) -> Verdict | None:
                 break
     finally:
         path.write_text(source, encoding="utf-8")
+    if by == _ENDED and _run(group)[1] == _ENDED:
+        said, by = "too dear", ""  # with the right code as well
     return Verdict(mutant, said, len(tests), time.monotonic() - begun, by)
 
 
@@ -80,16 +83,16 @@ def fail_anyway(tests: Sequence[str]) -> list[str]:
     if not tests:
         return []
     chosen = Chosen(tests)
-    in_fork(chosen.files, chosen, 60 + 5 * _cost(tests), stop=False)
+    in_fork(chosen.files, chosen, 30 + 3 * _cost(tests), stop=False)
     return chosen.read()
 
 
 def _run(tests: Sequence[str]) -> tuple[str, str]:
     chosen = Chosen(tests)
-    limit = 60 + 5 * _cost(tests)
+    limit = 30 + 3 * _cost(tests)
     code = in_fork(chosen.files, chosen, limit, stop=True)
     if code is None:
-        return "killed", "by the clock, or the process ended"
+        return "killed", _ENDED
     return ("survived" if code in (0, 5) else "killed"), next(iter(chosen.read()), "")
 
 

@@ -226,6 +226,7 @@ OTHERS |= {"NearOptimal", "SampledRollout"}
 OTHERS |= {
     "ParametricPlant",
     "ChangingPlant",
+    "AdaptiveActorCritic",
     "AdaptiveLQR",
     "DriftLQR",
     "ConcurrentTracker",

@@ -221,6 +221,13 @@ CALLS: dict[str, Callable[..., Any]] = {
     "SlopeWindows": lambda **given: adp.SlopeWindows(ACTUATORS, **given),
     "HistoryStack": lambda **given: adp.HistoryStack(**{"rows": 1, "parameters": 1, **given}),
     "LeastSquares": lambda **given: adp.LeastSquares([1.0], **{"deviation": 1.0, **given}),
+    "AdaptiveActorCritic": lambda **given: adp.AdaptiveActorCritic(
+        adp.ActorCritic(adp.QuadraticBasis(2), PLANT, COST, adp.RandomPoints(1, 1.0)),
+        ACTUATORS,
+        WINDOWS,
+        ESTIMATE,
+        **given,
+    ),
     "AdaptiveLQR": lambda **given: adp.AdaptiveLQR(ACTUATORS, COST, WINDOWS, ESTIMATE, **given),
     "StreamDrift": lambda **given: stream_drift(**given),
     "DriftLQR": lambda **given: adp.DriftLQR(stream_drift(), COST, **given),

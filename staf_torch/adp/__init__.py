@@ -4,6 +4,7 @@ import warnings
 
 from .actor_critic import ActorCritic as ActorCritic
 from .adaptation import Adaptation as Adaptation
+from .adaptation import AdaptiveActorCritic as AdaptiveActorCritic
 from .adaptation import AdaptiveLQR as AdaptiveLQR
 from .adaptation import Belief as Belief
 from .adaptation import ChangingPlant as ChangingPlant
@@ -20,6 +21,7 @@ from .adaptation import Guarded as Guarded
 from .adaptation import HistoryStack as HistoryStack
 from .adaptation import IntegralWindows as IntegralWindows
 from .adaptation import KalmanFilter as KalmanFilter
+from .adaptation import LearnedModel as LearnedModel
 from .adaptation import LeastSquares as LeastSquares
 from .adaptation import LinearFamily as LinearFamily
 from .adaptation import Measured as Measured
@@ -101,6 +103,7 @@ __all__ = [
     "ActorCritic",
     "ActorCriticLaw",
     "Adaptation",
+    "AdaptiveActorCritic",
     "AdaptiveLQR",
     "AvoidanceCost",
     "AvoidancePlans",
@@ -140,6 +143,7 @@ __all__ = [
     "IntegralWindows",
     "KalmanFilter",
     "LeadingCoordinates",
+    "LearnedModel",
     "LeastSquares",
     "LinearFamily",
     "LoopResult",

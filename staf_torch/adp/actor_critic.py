@@ -105,9 +105,24 @@ class ActorCritic(Controller):
         self, x: Tensor, actor: Tensor, uniform: Tensor, model: ControlAffineSystem | None = None
     ) -> BellmanTerms:
         """The Bellman terms at the state (first) and at the extrapolated points, by ``model`` if given."""
-        points = torch.cat((x.unsqueeze(-2), self.extrapolation(x, uniform)), dim=-2)
-        at = points if self.extrapolation.moving else x.unsqueeze(-2).expand(points.shape)
-        return bellman_terms(self.basis, model or self.model, self.cost, points, at, actor)
+        points = self.points(x, uniform)
+        return bellman_terms(
+            self.basis, model or self.model, self.cost, points, self._followed(x, points), actor
+        )
+
+    def points(self, x: Tensor, uniform: Tensor) -> Tensor:
+        """The state and the extrapolated points, (..., P, n)."""
+        return torch.cat((x.unsqueeze(-2), self.extrapolation(x, uniform)), dim=-2)
+
+    def value_gradient(self, x: Tensor, critic: Tensor, uniform: Tensor) -> Tensor:
+        """grad V^ at these points, (..., P, n)."""
+        points = self.points(x, uniform)
+        gradient = self.basis.gradient(points, self._followed(x, points))  # (..., P, M, n)
+        return (gradient * critic[..., None, :, None]).sum(-2)
+
+    def _followed(self, x: Tensor, points: Tensor) -> Tensor:
+        """The states around which the centers of the points stand, (..., P, n)."""
+        return points if self.extrapolation.moving else x.unsqueeze(-2).expand(points.shape)
 
     def step(
         self, x: Tensor, carried: ControllerState, uniform: Tensor, dt: float
@@ -118,11 +133,14 @@ class ActorCritic(Controller):
         self, model: ControlAffineSystem, x: Tensor, carried: ControllerState, uniform: Tensor, dt: float
     ) -> tuple[Tensor, ControllerState]:
         """`step` with a model of the moment, for instance one that is being identified."""
+        terms = self.terms(x, carried.actor, uniform, model)
+        return terms.control[..., 0, :], self.moved(terms, carried, dt)
+
+    def moved(self, terms: BellmanTerms, carried: ControllerState, dt: float) -> ControllerState:
+        """The weights after ``dt`` seconds with the Bellman terms of now."""
         weights = Weights(carried.critic, carried.actor, carried.gain)
-        terms = self.terms(x, weights.actor, uniform, model)
         sums = self.law.sums(terms, self.extrapolation.weights, weights)
-        critic, actor, gain = self.law.step(sums, weights, dt)
-        return terms.control[..., 0, :], ControllerState(critic, actor, gain, carried.identifier)
+        return ControllerState(*self.law.step(sums, weights, dt), carried.identifier)
 
     def value(self, x: Tensor, carried: ControllerState) -> Tensor | None:
         return self.basis.value(carried.critic, x)

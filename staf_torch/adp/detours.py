@@ -90,28 +90,31 @@ class DetourRollout(Controller):
         stride: int = 1,
     ) -> None:
         super().__init__()
-        name = "DetourRollout"
         if isinstance(plant, StepPlant) or not isinstance(plant, Plant) or not plant.traceable:
-            raise fail(name, "plant", "must be in continuous time and torch all through", plant)
+            raise fail("DetourRollout", "plant", "must be in continuous time and torch all through", plant)
         self.policy, self.plant, self.terminal, self.cost = policy, plant, terminal, cost.around(plant)
         self.constraints = [constraints] if callable(constraints) else list(constraints)
         if not self.constraints or not all(map(callable, self.constraints)):
-            raise fail(name, "constraints", "must be h(x, t) or a list of them", constraints)
+            raise fail("DetourRollout", "constraints", "must be h(x, t) or a list of them", constraints)
         along = torch.as_tensor(axes, dtype=torch.float64)
         fits = along.dim() == 2 and along.shape[1] == cost.dim and 1 <= len(along) <= _AXES
         if not fits or not bool(torch.isfinite(along).all()):
-            raise fail(name, "axes", f"must be 1 to {_AXES} rows of {cost.dim} finite numbers", axes)
-        self.period = self.hold = positive_real(name, "dt", dt)
-        self.stride = integer(name, "stride", stride, least=1)
-        self.steps = integer(name, "steps", steps, least=1)
+            raise fail(
+                "DetourRollout", "axes", f"must be 1 to {_AXES} rows of {cost.dim} finite numbers", axes
+            )
+        self.period = self.hold = positive_real("DetourRollout", "dt", dt)
+        self.stride = integer("DetourRollout", "stride", stride, least=1)
+        self.steps = integer("DetourRollout", "steps", steps, least=1)
         if self.steps % self.stride:
-            raise fail(name, "steps", f"must be a multiple of stride={self.stride}", steps)
-        kept = non_negative(name, "margin", torch.as_tensor(margin, dtype=torch.float64))
+            raise fail("DetourRollout", "steps", f"must be a multiple of stride={self.stride}", steps)
+        kept = non_negative("DetourRollout", "margin", torch.as_tensor(margin, dtype=torch.float64))
         if kept.dim() and kept.shape != (len(self.constraints),):
-            raise fail(name, "margin", f"must be a number or {len(self.constraints)} of them", margin)
-        self.weight = positive_real(name, "weight", weight)
-        large = positive(name, "sizes", torch.as_tensor(list(sizes), dtype=torch.float64))
-        long = [integer(name, "lengths", length, least=1) for length in lengths]
+            raise fail(
+                "DetourRollout", "margin", f"must be a number or {len(self.constraints)} of them", margin
+            )
+        self.weight = positive_real("DetourRollout", "weight", weight)
+        large = positive("DetourRollout", "sizes", torch.as_tensor(list(sizes), dtype=torch.float64))
+        long = [integer("DetourRollout", "lengths", length, least=1) for length in lengths]
         self.register_buffer("axes", along.clone())
         self.register_buffer("margin", kept.expand(len(self.constraints)).clone())
         self.register_buffer("fresh", _detours(len(along), large, long))
@@ -120,7 +123,7 @@ class DetourRollout(Controller):
         self.margin: Tensor
         self.fresh: Tensor  # (P, k + 1), the length last
         self.changes: Tensor  # (C, k + 1)
-        self.holding = Holding(name, plant, self.cost, self.stride * self.hold)
+        self.holding = Holding("DetourRollout", plant, self.cost, self.stride * self.hold)
         self._rows = RowFunction(self._definition, self, "a choice of detours")
 
     def init(self, x0: Tensor) -> ControllerState:

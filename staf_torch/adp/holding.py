@@ -8,11 +8,14 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from ..lanes import repeat
+from ..lanes import repeat, scan
 from ..numerics.checks import positive_real
 from ..systems import Clocked, Plant, StepPlant
 from .cost import Cost
 from .sampling import periods
+
+Stage = tuple[Tensor, Tensor, Tensor]
+"""The slope of the last stage, the mean of the slopes, and what was paid."""
 
 
 class Holding:
@@ -93,23 +96,33 @@ def runge_kutta_held(
     plant: Plant, cost: Cost, x: Tensor, u: Tensor, length: float | Tensor
 ) -> tuple[Tensor, Tensor]:
     """x+ and the discounted cost of one Runge-Kutta step with u held, of one length, s, or one a row."""
-    paid = cost.input_rate(u)
-    h: float | Tensor = length
-    half: float | Tensor  # what the middle of the step counts; its end, squared
-    if isinstance(length, Tensor):
-        half, h = torch.exp(-0.5 * cost.discount * length), length.unsqueeze(-1)
-    else:
-        half = math.exp(-0.5 * cost.discount * length)
-    k1 = plant.velocity(x, u)
-    c1 = cost.state_rate(x)
-    x2 = plant.displaced(x, 0.5 * h * k1)
-    k2 = plant.velocity(x2, u)
-    x3 = plant.displaced(x, 0.5 * h * k2)
-    k3 = plant.velocity(x3, u)
-    x4 = plant.displaced(x, h * k3)
-    k4 = plant.velocity(x4, u)
-    middle = cost.state_rate(x2) + cost.state_rate(x3)
-    if cost.discount:
-        paid = paid * (1 + 4 * half + half**2) / 6
-    spent = length * (paid + (c1 + 2 * half * middle + half**2 * cost.state_rate(x4)) / 6)
-    return plant.displaced(x, (h / 6) * (k1 + 2 * (k2 + k3) + k4)), spent
+    asked, counted, worth = _shares(length, cost.discount, x)
+    rate = cost.input_rate(u)
+
+    def stage(now: Stage, share: tuple[Tensor, Tensor, Tensor]) -> tuple[Stage, tuple[()]]:
+        slope, mean, paid = now
+        ahead, count, value = share
+        at = plant.displaced(x, ahead * slope)
+        slope = plant.velocity(at, u)
+        mean = mean + count * slope
+        return (slope, mean, paid + value * (rate + cost.state_rate(at))), ()
+
+    start = (torch.zeros_like(x), torch.zeros_like(x), torch.zeros_like(rate))
+    (_, mean, paid), _ = scan(stage, start, (asked, counted, worth), dim=0)  # a program has a stage once
+    return plant.displaced(x, mean), paid
+
+
+def _shares(length: float | Tensor, discount: float, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """How far ahead the stages ask, what slopes and costs count there, s: (4, ..., 1) twice, (4, ...)."""
+    if not isinstance(length, Tensor):
+        h, left = length, math.exp(-0.5 * discount * length)  # what the middle still counts; the end, squared
+        between = (h / 2, h / 3, left * h / 3)
+        table = ((0.0, h / 6, h / 6), between, between, (h, h / 6, left**2 * h / 6))
+        asked, counted, worth = torch.tensor(table, dtype=like.dtype, device=like.device).unbind(-1)
+        return asked.unsqueeze(-1), counted.unsqueeze(-1), worth
+    half = torch.exp(-0.5 * discount * length)
+    ends, middle = length / 6, length / 3
+    asked = torch.stack((torch.zeros_like(length), 0.5 * length, 0.5 * length, length))
+    counted = torch.stack((ends, middle, middle, ends))
+    worth = torch.stack((ends, middle * half, middle * half, ends * half.square()))
+    return asked.unsqueeze(-1), counted.unsqueeze(-1), worth

@@ -198,17 +198,17 @@ def near_optimal(
     """A policy for a plant, held for dt, that costs no more than its LQR.
 
     The rules: the base is the LQR made for dt; the horizon is two time constants of its slowest mode (three
-    with ``plan``), 12 to 60 periods; the centers are as many as quadratics need, from four states on the
-    cross-polytope and its middle, in a ball of ``radius``; a plant in continuous time is integrated in
-    steps of a fifth of its fastest time constant. Rollouts of an LQR do not know what to do before a bound
-    of the inputs. With ``plan`` the policy's ``controller()``, for loops, is a `RecedingHorizon` over that
-    horizon, of which the first plan is the best that `BoxDDP` finds from the LQR and from holding a bound
-    for a while, and that is carried and improved from control to control, in some milliseconds. It takes a
-    plant in torch, held for one period of its own, without a discount. The policy as a function of x makes
-    such a plan anew, in tens of milliseconds, where the LQR, followed from x over the horizon, meets a
-    bound; in a loop two ways around that cost nearly the same would take turns. ``report()`` says how often
-    bounds are met, ``strained``.
-    A simulator so slow that a control takes more than half of dt is a warning in the log, with the share.
+    with ``plan``), 12 to 60 periods, four quarters; the centers are as many as quadratics need, from
+    four states on the cross-polytope and its middle, in a ball of ``radius``; a plant in continuous time is
+    integrated in steps of a fifth of its fastest time constant. Rollouts of an LQR do not know what to do
+    before a bound of the inputs. With ``plan`` the policy's ``controller()``, for loops, is a
+    `RecedingHorizon` over that horizon, of which the first plan is the best that `BoxDDP` finds from the
+    LQR and from holding a bound for a while, and that is carried and improved from control to control, in
+    some milliseconds. It takes a plant in torch, held for one period of its own, without a discount. The
+    policy as a function of x makes such a plan anew, in tens of milliseconds, where the LQR, followed
+    from x over the horizon, meets a bound; in a loop two ways around that cost nearly the same would take
+    turns. ``report()`` says how often bounds are met, ``strained``. A simulator so slow that a control
+    takes more than half of dt is a warning in the log, with the share.
 
     Example:
         >>> import numpy as np
@@ -251,8 +251,8 @@ def near_optimal(
         else positive_real("near_optimal", "horizon", horizon)
     )
     steps = round(seconds / period)
-    if horizon is None:
-        steps = min(max(steps, _STEPS[0]), _STEPS[1])
+    if horizon is None:  # four quarters, of which a program has one
+        steps = min(max(-(-steps // 4) * 4, _STEPS[0]), _STEPS[1])
     substeps = 1
     if plant.period is None:
         a, _ = plant.linearisation(placed.target, placed.target_input)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from ..approximation.basis import StaFBasis
-from ..lanes import each, repeat
+from ..lanes import each, repeat, scan
 from ..lanes.function import RowFunction
 from ..numerics.box import LARGEST, box_minimum
 from ..numerics.checks import fail, integer, positive_real
@@ -22,6 +22,10 @@ _SHARES = (1.0, 0.3)  # of the Newton step, that are tried
 _PROBE = 1e-3  # of the range of an input, or of 1, by which it is moved to find slopes
 _SHORTER = 0.75  # of the horizon, at which the promise of a control must hold as well
 _MARGIN = 1e-9  # relative, by which a control must be better than the base's
+
+
+Stretch = tuple[Tensor, Tensor, Tensor]
+"""The state, what was paid, and what a cost still counts."""
 
 
 class Promise(NamedTuple):
@@ -157,22 +161,27 @@ class SampledRollout(nn.Module):
 
     def rollout(self, x: Tensor) -> Promise:
         """What the base costs from x on: (..., n)."""
-        first = max(1, round(_SHORTER * self.steps))
+        rest = max(1, self.steps - round(_SHORTER * self.steps))
+        passes = math.gcd(self.steps, rest)  # of a stretch of which both are made: a program has one loop
         discount = self._discount()
 
-        def step(now: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+        stretches = x.new_zeros(self.steps // passes)
+
+        def step(now: Stretch) -> Stretch:
             at, spent, share = now
             after, paid = self.holding(at, self.bounds.clip(self.base(at)))
             return after, spent + share * paid, discount * share
 
+        def stretch(now: Stretch, _: Tensor) -> tuple[Stretch, Tensor]:
+            at, spent, share = repeat(passes, step, now)
+            return (at, spent, share), spent + share * self.terminal(at)
+
         def whole(x: Tensor) -> Tensor:
             none = torch.zeros_like(x[..., 0])
-            at, spent, share = repeat(first, step, (x, none, none + 1.0))
-            part = spent + share * self.terminal(at)
-            at, spent, share = repeat(self.steps - first, step, (at, spent, share))
+            (at, _, _), promised = scan(stretch, (x, none, none + 1.0), stretches, dim=0)
             u = self.base(at)
             free = ((u > self.bounds.low.to(x)) & (u < self.bounds.high.to(x))).all(-1)
-            return torch.stack((spent + share * self.terminal(at), part, free.to(x)), dim=-1)
+            return torch.stack((promised[-1], promised[-1 - rest // passes], free.to(x)), dim=-1)
 
         found: Tensor = each(whole, x, dim=x.dim() - 2) if x.dim() > 1 else whole(x)
         return Promise(found[..., 0], found[..., 1], found[..., 2] > 0)

@@ -21,7 +21,9 @@ _log = logging.getLogger(__name__)
 _DRAWN_AHEAD = 1024  # steps whose random numbers are drawn at once
 _NUMBERS = 1 << 24  # at most, of all rows together
 _DT = 0.001  # s, where neither controller nor plant has a period
-_PAYS = 3000  # steps of a small batch in plain torch (some 1 ms each) that take as long as to compile
+_PAYS = (
+    3000  # integration steps of a small batch in plain torch (some 1 ms each) that take as long as to compile
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -120,7 +122,8 @@ def simulate(
     if steps % every:
         raise fail("simulate", "every", f"must divide the {steps} steps", every)
     choice("simulate", "compile", compile, (True, False, "auto"))
-    worth = steps * (1 + len(x0) / 200) >= _PAYS if compile == "auto" else bool(compile)
+    integer("simulate", "substeps", substeps, least=1)
+    worth = steps * substeps * (1 + len(x0) / 200) >= _PAYS if compile == "auto" else bool(compile)
     if dt is None:
         dt = controller.period or system.period or _DT
     more = {"integrator": integrator, "substeps": substeps, "renew": renew, "limit": limit}

@@ -37,8 +37,10 @@ class GramStructure(NamedTuple):
 
     def scaled(self) -> Tensor:
         """S K0 S = e^{-gain} K(c(x)): (..., M, M)."""
-        scale = self.scale
-        return self.core if scale is None else scale.unsqueeze(-1) * self.core * scale.unsqueeze(-2)
+        if self.log_scale is None:
+            return self.core
+        scale = self.log_scale.exp()
+        return scale.unsqueeze(-1) * self.core * scale.unsqueeze(-2)
 
     def quadratic(self, v: Tensor) -> Tensor:
         """v'S K0 S v without S K0 S: (..., M) -> (...)."""

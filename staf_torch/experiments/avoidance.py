@@ -168,11 +168,12 @@ def scenarios(cfg: DictConfig) -> Tensor:
             return torch.zeros(2, dtype=torch.float64)
         return 2 * math.pi * torch.rand(1, dtype=torch.float64, generator=generator)
 
+    reach = torch.tensor([_HALF_WIDTH] * 2 + [speed] * 2, dtype=torch.float64)
     found: list[Tensor] = []
     for _ in range(_DRAWS * count):
         angle, numbers = (torch.rand(n, dtype=torch.float64, generator=generator) for n in (1, 4 * discs))
         start = away * torch.cat(((2 * math.pi * angle).cos(), (2 * math.pi * angle).sin()))
-        moving = (2 * numbers - 1).reshape(discs, 4) * torch.tensor([_HALF_WIDTH] * 2 + [speed] * 2)
+        moving = (2 * numbers - 1).reshape(discs, 4) * reach
         if float((moving[:, :2] - start).norm(dim=-1).min()) > clear:
             found.append(torch.cat((start, at_rest(), moving.flatten())))
         if len(found) == count:

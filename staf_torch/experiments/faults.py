@@ -175,7 +175,7 @@ def mass(rows: int, generator: torch.Generator) -> Case:
     model = ParametricPlant(regressor, known, dim=2, inputs=1, theta=[1.0], rows=[1])
     cost = QuadraticCost(1.0, 1.0, dim=2, inputs=1)
     drawn = torch.rand(rows, 2, generator=generator, dtype=torch.float64)
-    side = torch.where(torch.rand(rows, generator=generator) < 0.5, -1.0, 1.0)
+    side = torch.where(torch.rand(rows, dtype=torch.float32, generator=generator) < 0.5, -1.0, 1.0)
     x0 = torch.stack((side * (0.5 + drawn[:, 0]), 2 * drawn[:, 1] - 1), dim=-1)
     true = torch.where(torch.arange(rows) % 2 == 0, 2.0, 0.5).double().unsqueeze(-1)  # 1 / mass
     law = LeastSquares([1.0], deviation=1.0, floor=1e-4)

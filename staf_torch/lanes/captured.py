@@ -95,6 +95,8 @@ class Captured:
         """Note an operation on tensors of which no row has its own."""
         name = function._schema.name.removeprefix("aten::")
         given = [t for t in tensors((args, kwargs)) if _in_memory(t)]
+        if name == "lift_fresh":
+            self._written_here(given)
         stated = name in _OF_NO_VALUES or all(self.stated(t) for t in given)
         if not stated:
             if name == "_local_scalar_dense":
@@ -121,6 +123,13 @@ class Captured:
                     if not t._is_zerotensor()
                 ):
                     self._stated[storage.data_ptr()] = storage
+
+    def _written_here(self, fresh: Sequence[Tensor]) -> None:
+        """What `torch.tensor` of Python's numbers made just now, not memory of an array of NumPy."""
+        for tensor in fresh:
+            storage = tensor.untyped_storage()
+            if storage.resizable() and self.from_outside(tensor):
+                self._stated[storage.data_ptr()] = storage
 
     def numbers(self, tensor: Tensor, kind: str, new: Callable[[int], int]) -> np.ndarray[Any, Any]:
         """The nodes of a tensor's entries, one for every place in memory.

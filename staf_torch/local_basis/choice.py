@@ -72,10 +72,12 @@ class LocalBasis:
         rate = kernel.exponent_rate()
         assert rate is not None
         graded, units, spread = self._of(centers)
+        nu = centers.radius(x)
         return GradedSpace(
             kernel=kernel,
             state=x,
-            nu=centers.radius(x),
+            nu=nu,
+            radius=nu * graded.reach,
             directions=directions.to(x),
             units=units.to(x),
             spread=spread.to(x),
@@ -126,6 +128,6 @@ def choose(kernel: Kernel, directions: Tensor) -> tuple[str, Degrees | None]:
     if highest is not None:
         degrees = degrees_of(directions)
         # A functional of a higher degree than the kernel's sees nothing: a case for the Newton basis.
-        if len(degrees.sizes) <= highest + 1:
+        if len(degrees.sizes()) <= highest + 1:
             return "polynomial", degrees
     return "newton", None

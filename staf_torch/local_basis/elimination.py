@@ -37,12 +37,10 @@ class Degrees(NamedTuple):
         monomials = (tuple(tuple(row) for row in block) for block in record["monomials"])
         return cls(tuple(monomials), float(record["reach"]))
 
-    @property
     def sizes(self) -> tuple[int, ...]:
         """How many functionals each degree has."""
         return tuple(len(block) for block in self.monomials)
 
-    @property
     def each(self) -> tuple[int, ...]:
         """k_j, the degree of every functional: M of them, non-decreasing."""
         return tuple(k for k, block in enumerate(self.monomials) for _ in block)
@@ -119,12 +117,12 @@ def functionals_of(points: Tensor, degrees: Degrees) -> Elimination:
     diagonal = r.diagonal(dim1=-2, dim2=-1)
     q = torch.where(diagonal.unsqueeze(-2) < 0, -q, q)
     strengths, start = [], 0
-    for size in degrees.sizes:
+    for size in degrees.sizes():
         block = r[..., start : start + size, start : start + size]
         # torch 2.9 keeps the dimension where one number without memory (device meta) is summed up.
         strengths.append(block.norm(dim=-1) if size > 1 else block.abs().squeeze(-1))
         start += size
-    return Elimination(q, torch.cat(strengths, dim=-1), degrees.each)
+    return Elimination(q, torch.cat(strengths, dim=-1), degrees.each())
 
 
 def _chosen(points: Tensor, degrees: Degrees) -> Tensor:

@@ -59,11 +59,11 @@ def graded_basis(directions: Tensor, degrees: Degrees | None = None) -> GradedBa
     u = directions.double() / degrees.reach
     found = functionals_of(u, degrees)
     functionals = found.functionals / found.strengths.unsqueeze(-2)
-    known = tuple(range(len(degrees.sizes)))
-    degree = torch.tensor(degrees.each, device=u.device)
+    known = tuple(range(len(degrees.sizes())))
+    degree = torch.tensor(degrees.each(), device=u.device)
     members = degree == torch.tensor(known, device=u.device).unsqueeze(-1)  # (K, M)
     weights = functionals.unsqueeze(-2) * members
-    factorial = torch.tensor([math.factorial(k) for k in degrees.each], dtype=u.dtype, device=u.device)
+    factorial = torch.tensor([math.factorial(k) for k in degrees.each()], dtype=u.dtype, device=u.device)
     return GradedBasis(u, degrees.reach, functionals, weights, known, degree, factorial)
 
 
@@ -120,7 +120,6 @@ class Interpolation(NamedTuple):
         series = torch.einsum("mk,...kij->...mij", transform, _inverse(functionals @ nodal))
         return cls(functionals, series, _chebyshev(2 * wide / upper - 1))
 
-    @property
     def shared(self) -> bool:
         """Whether one matrix serves all states."""
         return self.chebyshev is None and self.inverse.dim() == 2
@@ -128,7 +127,7 @@ class Interpolation(NamedTuple):
     def solve(self, values: Tensor) -> Tensor:
         """Psi^-1 v: (..., M) -> (..., M), computed in float64 whatever the dtype of v."""
         wide = values.double()
-        if self.shared and wide.dim() == 2:  # the same with rows last, which is faster
+        if self.shared() and wide.dim() == 2:  # the same with rows last, which is faster
             return (self.inverse @ (self.functionals @ wide.mT)).mT.to(values.dtype)
         return self._apply_inverse(wide @ self.functionals.mT).to(values.dtype)
 
@@ -169,6 +168,7 @@ class GradedSpace(NamedTuple):
     kernel: Kernel
     state: Tensor  # x, (..., n)
     nu: Tensor  # the radius of the centers, (...) or () for all states
+    radius: Tensor  # nu times the reach, (...) or ()
     directions: Tensor  # u, (M, n), in the dtype of the state and in units of the radius
     units: Tensor  # of `GradedBasis.narrow`, (M, n), in the dtype of the state
     spread: Tensor  # of `GradedBasis.narrow`, (K M, M), in the dtype of the state
@@ -180,14 +180,7 @@ class GradedSpace(NamedTuple):
     @property
     def offsets(self) -> Tensor:
         """d = nu u, (..., M, n), or (M, n) for all states."""
-        return (
-            self.nu[..., None, None] * self.directions
-        )  # as centers.offsets: a compiler then knows them equal
-
-    @property
-    def radius(self) -> Tensor:
-        """nu times the reach, (...) or () for all states."""
-        return self.nu * self.basis.reach
+        return self._offsets()
 
     @property
     def rank(self) -> Tensor:
@@ -200,24 +193,24 @@ class GradedSpace(NamedTuple):
         bound = self.bound() if self.meeting and self.nu.dim() > 0 else None
         if bound is not None:
             bound = self.rate * (bound * self.basis.reach).square()
-        interpolation = Interpolation.of(self.basis, self._r2, bound)
-        offsets = self.offsets
+        interpolation = Interpolation.of(self.basis, self._r2(), bound)
+        offsets = self._offsets()
 
         def solve(values: Tensor, state: Tensor) -> Tensor:
             return interpolation.solve(scale(self.kernel, state, offsets, -1.0) * values)
 
-        if not interpolation.shared or offsets.dim() > 2:
+        if not interpolation.shared() or offsets.dim() > 2:
             return solve(values, self.state)
         return in_blocks(solve, values, self.state)
 
     def evaluate(self, z: Tensor, coefficients: Tensor) -> Tensor:
         """V^(x + z): (..., P, n), (..., M) -> (..., P)."""
-        terms = self._terms(z, self._r2)
+        terms = self._terms(z, self._r2())
         return _sums(terms, self._ridge_weights(coefficients)) * scale(self.kernel, self.state, z)
 
     def evaluate_with_gradient(self, z: Tensor, coefficients: Tensor) -> tuple[Tensor, Tensor]:
         """V^(x + z) and its gradient in z, in closed form: (..., P, n), (..., M) -> (..., P), (..., P, n)."""
-        r2, apart = self._r2, self._ridge_weights(coefficients)
+        r2, apart = self._r2(), self._ridge_weights(coefficients)
         terms = self._terms(z, r2)
         sums = _sums(terms, apart)
         inner = terms[0] * (over_points(r2) * apart[0])
@@ -232,7 +225,7 @@ class GradedSpace(NamedTuple):
         Not finite where r^(-2 k_j) is not.
         """
         b = (coefficients * self._unscale()) @ self.basis.functionals.to(coefficients).mT
-        return b * scale(self.kernel, self.state, self.offsets, -1.0)
+        return b * scale(self.kernel, self.state, self._offsets(), -1.0)
 
     def weights(self, coefficients: Tensor) -> Tensor:
         """The paper's w: (..., M) -> (..., M); NaN in a row where it cannot be represented."""
@@ -240,12 +233,15 @@ class GradedSpace(NamedTuple):
 
     def coefficients(self, weights: Tensor) -> Tensor:
         """beta from the paper's w: (..., M) -> (..., M)."""
-        b = to_scaled(self.kernel, self.state, weights) * scale(self.kernel, self.state, self.offsets)
+        b = to_scaled(self.kernel, self.state, weights) * scale(self.kernel, self.state, self._offsets())
         full = self.basis.functionals  # orthogonal columns
         inverse = full / full.square().sum(0)
         return b @ inverse.to(b) / self._unscale()
 
-    @property
+    def _offsets(self) -> Tensor:
+        # As centers.offsets: a compiler then knows them equal.
+        return self.nu[..., None, None] * self.directions
+
     def _r2(self) -> Tensor:
         """r^2 = q nu^2, (...) or ()."""
         return self.rate.to(self.nu) * self.radius.square()
@@ -271,7 +267,7 @@ class GradedSpace(NamedTuple):
 
     def _unscale(self) -> Tensor:
         """k_j! r^(-2 k_j): (..., M)."""
-        factor: Tensor = self.basis.factorial.to(self.nu) * self._r2.unsqueeze(-1) ** -self.basis.degree
+        factor: Tensor = self.basis.factorial.to(self.nu) * self._r2().unsqueeze(-1) ** -self.basis.degree
         return factor
 
 

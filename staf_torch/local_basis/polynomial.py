@@ -154,7 +154,7 @@ def polynomial_space(
     scaled = torch.where(usable, wide / torch.where(usable, scale, 1.0), directions.double())
     found = functionals_of(scaled, degrees)
     weights = found.functionals / found.strengths.unsqueeze(-2)
-    return PolynomialSpace(kernel, x, offsets, scaled.to(x), size, weights.to(x), degrees.each)
+    return PolynomialSpace(kernel, x, offsets, scaled.to(x), size, weights.to(x), degrees.each())
 
 
 def _square(kernel: PolynomialKernel, x: Tensor) -> Tensor:

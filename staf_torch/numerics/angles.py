@@ -22,6 +22,11 @@ def wrap(difference: Tensor, periodic: Sequence[int]) -> Tensor:
         return difference
     size = difference.shape[-1]
     angles = {index % size for index in periodic}
-    turn = torch.tensor([2 * math.pi if k in angles else 0.0 for k in range(size)], dtype=torch.float64)
-    turns = (difference / (2 * math.pi)).round()
-    return difference - turn.to(difference) * turns
+    if len(angles) == size:
+        return _wrapped(difference)
+    columns = [_wrapped(x) if k in angles else x for k, x in enumerate(difference.unbind(-1))]
+    return torch.stack(columns, dim=-1)
+
+
+def _wrapped(angle: Tensor) -> Tensor:
+    return angle - 2 * math.pi * (angle / (2 * math.pi)).round()

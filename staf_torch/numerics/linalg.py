@@ -23,7 +23,6 @@ class PivotedCholesky(NamedTuple):
     order: Tensor  # (..., M) int64: row k of L belongs to row order[k] of K
     rank: Tensor  # (...) int64: pivots above the tolerance
 
-    @property
     def kept(self) -> Tensor:
         """(..., M) bool in pivoted order: whether the pivot was above the tolerance."""
         size = self.factor.shape[-1]
@@ -34,14 +33,14 @@ class PivotedCholesky(NamedTuple):
         shape = torch.broadcast_tensors(self.order, values)[0].shape
         permuted = values.expand(shape).gather(-1, self.order.expand(shape))
         solved = torch.linalg.solve_triangular(self.factor, permuted.unsqueeze(-1), upper=False)
-        return torch.where(self.kept, solved.squeeze(-1), 0.0)
+        return torch.where(self.kept(), solved.squeeze(-1), 0.0)
 
     def solve_upper(self, coefficients: Tensor) -> Tensor:
         """P' L^-T beta, with beta zero beyond the rank: (..., M) -> (..., M)."""
         solved = torch.linalg.solve_triangular(
-            self.factor.mT, torch.where(self.kept, coefficients, 0.0).unsqueeze(-1), upper=True
+            self.factor.mT, torch.where(self.kept(), coefficients, 0.0).unsqueeze(-1), upper=True
         ).squeeze(-1)
-        solved = torch.where(self.kept, solved, 0.0)
+        solved = torch.where(self.kept(), solved, 0.0)
         order = self.order.expand(solved.shape)
         return torch.zeros_like(solved).scatter(-1, order, solved)
 

@@ -78,7 +78,8 @@ class BankDefinition:
             s[name].fill_(1.0)
         s["correction_covariance"].copy_(self.rules.correction_prior * torch.eye(GROUPS, dtype=torch.float64))
         for name in ("rate", "noise", "forgetting"):
-            s[f"tracker_{name}"].copy_(torch.tensor(getattr(self.rules, f"tracker_{name}")))
+            rule = getattr(self.rules, f"tracker_{name}")
+            s[f"tracker_{name}"].copy_(torch.tensor(rule, dtype=torch.float64))
         s["metric"].copy_(torch.eye(self.shape.dim, dtype=torch.float64))
         s["order"].fill_(-1.0)
         s["gap"].fill_(torch.inf)
@@ -322,8 +323,9 @@ class BankDefinition:
         s["doubted"].add_(r.doubted_rate * (float(doubtful) - s["doubted"]))
         if doubtful and rare and s.number("clock") >= r.settled and s.number("trust") == 0:
             if not waiting:
-                for name, value in (("x", x), ("y", y), ("time", s["time"]), ("lapse", torch.tensor(lapse))):
+                for name, value in (("x", x), ("y", y), ("time", s["time"])):
                     s[f"waiting_{name}"].copy_(value)
+                s["waiting_lapse"].fill_(lapse)
                 s["waiting"].fill_(1.0)
                 return None
             s["trust"].fill_(float(STREAK))

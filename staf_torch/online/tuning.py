@@ -54,8 +54,10 @@ def tuning(x: Tensor, y: Tensor, directions: Tensor) -> Tuning:
     spread = torch.where(spread > 0, spread, 1.0)
     samples = (both - center) / spread
     n, streams = x.shape[-1], x.shape[1]
-    widths = torch.tensor(WIDTHS).double() * math.sqrt(n)
-    rows = torch.cartesian_prod(widths, torch.tensor(NOISES).double(), torch.tensor(FORGETTING).double())
+    widths = torch.tensor(WIDTHS, dtype=torch.float64) * math.sqrt(n)
+    rows = torch.cartesian_prod(
+        widths, *(torch.tensor(each, dtype=torch.float64) for each in (NOISES, FORGETTING))
+    )
     first = _Candidates(*(rows[:, k].expand(streams, -1) for k in range(3)))
     first = first._replace(width=first.width.unsqueeze(-1).expand(-1, -1, n))
     found: list[tuple[Tensor, _Candidates]] = []
@@ -74,7 +76,7 @@ def tuning(x: Tensor, y: Tensor, directions: Tensor) -> Tuning:
         *(_choose(one, b, a).squeeze(1) for a, b in zip(found[0][1], found[1][1], strict=True))
     )
     units = torch.cat((spread[:, :n] * kept.width, spread[:, n:]), 1)
-    radii = torch.tensor(RADII).double()[which]
+    radii = torch.tensor(RADII, dtype=torch.float64)[which]
     return Tuning(
         center, units, kept.noise**2, kept.forgetting, radii, torch.where(one, found[1][0], found[0][0])
     )

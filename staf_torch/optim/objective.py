@@ -136,21 +136,20 @@ class ScaledError(NamedTuple):
 
     def spectrum(self) -> tuple[Tensor, Tensor]:
         """The smallest and the largest eigenvalue of K: (...), (...)."""
-        return self._plain.spectrum()
+        return self._plain().spectrum()
 
     def solve(self, values: Tensor) -> Tensor:
         """K^-1 v: (..., M) -> (..., M)."""
-        return self._plain.solve(values)
+        return self._plain().solve(values)
 
     def minimiser(self) -> Tensor:
         """K^-1 V: (..., M)."""
-        return self._plain.minimiser()
+        return self._plain().minimiser()
 
     def sample(self) -> tuple[Tensor, Tensor]:
         """k(x, c_i) and V(x) at the state."""
-        return self._plain.sample()
+        return self._plain().sample()
 
-    @property
     def _plain(self) -> NativeError:
         return NativeError(self.gram, self.values, self.precomputed)
 

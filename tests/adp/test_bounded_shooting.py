@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from staf_torch import adp, systems
+from staf_torch.adp.shooting import starts
 
 DOUBLE = systems.Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
 COST = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
@@ -79,3 +80,42 @@ def test_what_cannot_be_shot_is_refused_by_name() -> None:
     discounted = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1, discount=0.1)
     with pytest.raises(ValueError, match=r"`DirectShooting\(cost=...\)` must have no discount"):
         adp.DirectShooting(DOUBLE, discounted)
+
+
+@pytest.mark.parametrize("bounded", [True, False])
+def test_guesses_hold_each_input_at_each_end_and_then_wander_between_them(bounded: bool) -> None:
+    limits = {"low": [-1.0, -2.0], "high": [1.5, 3.0]} if bounded else {}
+    cost = adp.QuadraticCost(1.0, 1.0, 2, 2, target_input=[0.5, 0.25], target=[0.0, 0.0], **limits)
+    base = lambda x: 2 * x + torch.tensor([0.5, 0.25]).to(x)  # noqa: E731
+    x0 = torch.tensor([[0.1, -0.2], [-0.3, 0.1]], dtype=torch.float64)
+    found = starts.guesses(cost, base, x0, 10.0, 5, seed=3)
+    low, high = ([-1.0, -2.0], [1.5, 3.0]) if bounded else ([0.5 - 1.8, 0.25 - 1.2], [0.5 + 1.8, 0.25 + 1.2])
+    constant, wandering = found[:-5], found[-5:]
+    assert [each.until for each in constant] == [
+        3.0,
+        *(10 * s for s in (0.02, 0.04, 0.08, 0.14, 0.22, 0.32) for _ in range(4)),
+    ]
+    rest = torch.tensor([0.5, 0.25], dtype=torch.float64)
+    torch.testing.assert_close(constant[0].knots, rest.expand(2, 2))
+    for k, guess in enumerate(constant[1:]):
+        level = rest.clone()
+        level[k % 4 // 2] = (low, high)[k % 2][k % 4 // 2]
+        torch.testing.assert_close(guess.knots, level.expand(2, 2))
+    knots = torch.stack([each.knots for each in wandering])
+    assert knots.shape == (5, 6, 2)
+    ends = torch.tensor([low, high], dtype=torch.float64)
+    assert bool(((knots >= ends[0] - 1e-12) & (knots <= ends[1] + 1e-12)).all())
+    for end in ends:  # a sixth of them, at each
+        assert 0.05 < float((knots - end).abs().lt(1e-12).double().mean()) < 0.4
+    assert all(0 < each.until < 6 for each in wandering)
+    again = starts.guesses(cost, base, x0, 10.0, 5, seed=4)
+    assert not torch.equal(again[-1].knots, found[-1].knots)
+
+
+def test_a_guess_is_followed_along_its_knots_until_the_base_takes_over() -> None:
+    guess = starts.Guess(torch.tensor([[0.0], [1.0], [5.0]], dtype=torch.float64), 2.0)
+    control = starts.guided(guess, lambda x: x.new_full((*x.shape[:-1], 1), 9.0))
+    x = torch.zeros(3, 2, dtype=torch.float64)
+    said = {0.0: 0.0, 0.5: 0.5, 1.0: 1.0, 1.5: 3.0, 1.75: 4.0, 2.0: 9.0, 3.0: 9.0}
+    for time, want in said.items():
+        torch.testing.assert_close(control(x, time), torch.full((3, 1), want, dtype=torch.float64))

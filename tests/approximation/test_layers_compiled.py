@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ast
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 import torch
@@ -123,3 +125,29 @@ def test_export_takes_batches_of_any_size(name: str, strict: bool) -> None:
                 torch.testing.assert_close(found, expected, rtol=1e-12, atol=1e-12)
     if name in ("exponential", "gaussian"):  # nothing that depends on the directions alone is left to do
         assert "qr" not in program.graph_module.code
+
+
+ROOT = Path(st.__file__).parent
+LAYERS = ("approximation", "centers", "kernels", "local_basis", "numerics")
+
+
+@pytest.mark.parametrize("room", LAYERS)
+def test_no_method_of_a_named_tuple_reads_a_property_of_it(room: str) -> None:
+    """Dynamo of torch 2.9 knows fields and methods of a named tuple, and no property."""
+    for path in sorted((ROOT / room).glob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if not isinstance(node, ast.ClassDef) or "NamedTuple" not in map(ast.unparse, node.bases):
+                continue
+            functions = [each for each in node.body if isinstance(each, ast.FunctionDef)]
+            properties = {f.name for f in functions if any(map(is_property, f.decorator_list))}
+            assert properties <= {"offsets", "rank", "scale"}, (
+                path,
+                node.name,
+            )  # not read where one compiles
+            for function in functions:
+                read = {ast.unparse(each) for each in ast.walk(function) if isinstance(each, ast.Attribute)}
+                assert not read & {f"self.{name}" for name in properties}, (path, node.name, function.name)
+
+
+def is_property(decorator: ast.expr) -> bool:
+    return ast.unparse(decorator) == "property"

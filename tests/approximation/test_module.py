@@ -293,3 +293,17 @@ def test_a_model_that_is_reset_knows_nothing_and_stands_at_zero() -> None:
     model.reset_parameters()
     assert not model.coefficients.any()
     assert not model.state.any()
+
+
+def test_a_dtype_and_a_device_that_are_given_are_those_of_all_that_is_held() -> None:
+    staf = st.StaF(basis_of("gaussian"), (2,), dtype=torch.float32, device="meta")
+    for held in (staf.coefficients, staf.state):
+        assert (held.dtype, held.device.type) == (torch.float32, "meta")
+    assert st.StaF(basis_of("gaussian")).coefficients.dtype == torch.float64
+
+
+def test_what_is_reset_is_as_new() -> None:
+    staf = fitted("gaussian", (3,))
+    staf.reset_parameters()
+    for name, held in st.StaF(staf.basis, (3,)).state_dict().items():
+        assert torch.equal(staf.state_dict()[name], held), name

@@ -171,3 +171,20 @@ def test_a_law_without_a_rate_has_no_a_priori_radius() -> None:
     _, constants = circle()
     with pytest.raises(ValueError, match=r"ultimate_bound\(law=\.\.\.\)"):
         theory.ultimate_bound(constants, optim.HeavyBall(), dt=0.01, inner_steps=1)
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1e6])
+def test_rounding_is_no_violation_in_any_unit_of_the_value(unit: float) -> None:
+    where = states(batch=3, steps=1)[:, :1].expand(-1, 40, -1)  # at rest: the bound goes to zero
+    plain, scaled = (
+        chase(
+            *(where, basis(), lambda x, u=u: u * TARGET(x), LAWS["steepest descent"]),
+            inner_steps=100,
+            certificate=True,
+        ).certificate
+        for u in (1.0, unit)
+    )
+    assert plain is not None
+    assert scaled is not None
+    assert not bool(scaled.violated.any())
+    torch.testing.assert_close(scaled.bound[:, 0], unit * plain.bound[:, 0], rtol=1e-4, atol=0)

@@ -14,6 +14,7 @@ import staf_torch as st
 from staf_torch import systems
 from staf_torch.engine import ChaseResult, chase_pieces
 from staf_torch.engine import api as engine
+from staf_torch.engine.result import concatenate
 from staf_torch.numerics.linalg import condition_number
 from staf_torch.optim import SteepestDescent
 from staf_torch.targets import Cosine, Paper
@@ -272,3 +273,30 @@ def test_weights_that_underflow_are_not_a_number_while_the_estimate_is_one() -> 
     torch.testing.assert_close(result.ideal_estimate, result.value, rtol=5e-2, atol=0)
     assert torch.isfinite(result.coefficients).all()
     assert not result.diverged.any()
+
+
+@pytest.mark.parametrize("ends", [(9,), (4, 9), (1, 2, 9)])
+@pytest.mark.parametrize("certificate", [True, False])
+def test_pieces_of_time_are_one_result_again(ends: tuple[int, ...], certificate: bool) -> None:
+    x0 = uniform(2, 2, low=0.3, seed=1)
+    states = systems.simulate(systems.Oscillator(), x0, dt=0.05, steps=8)
+    whole = st.chase(states, basis_of("gaussian"), Paper(), SteepestDescent(), certificate=certificate)
+    spans = [slice(begin, end) for begin, end in zip((0, *ends), ends, strict=False)]
+
+    def cut(thing: object, at: slice) -> object:
+        return thing[:, at] if isinstance(thing, torch.Tensor) and thing.dim() > 1 else thing
+
+    pieces = []
+    for at in spans:
+        fields = {field.name: cut(getattr(whole, field.name), at) for field in dataclasses.fields(whole)}
+        if whole.certificate is not None:
+            fields["certificate"] = type(whole.certificate)(*(cut(each, at) for each in whole.certificate))
+        pieces.append(ChaseResult(**fields))
+    again = concatenate(pieces)
+    for field in dataclasses.fields(whole):
+        one, two = getattr(whole, field.name), getattr(again, field.name)
+        pairs = (
+            zip(one, two, strict=True) if field.name == "certificate" and one is not None else [(one, two)]
+        )
+        for a, b in pairs:
+            assert (a is b is None) or torch.equal(a, b), field.name

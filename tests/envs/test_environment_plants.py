@@ -124,3 +124,29 @@ def test_angle_of_the_pendulum_is_the_same_a_turn_further_on() -> None:
     u = torch.tensor([[0.5]], dtype=torch.float64)
     apart = plant.difference(plant.step(turned, u), plant.step(x, u))
     torch.testing.assert_close(apart, torch.zeros_like(x), rtol=0, atol=1e-12)
+
+
+class Drawn(Falling):
+    """An environment that draws a parameter whenever it begins."""
+
+    def reset(self, *, seed=None, options=None):  # type: ignore[no-untyped-def]
+        gymnasium.Env.reset(self, seed=seed)
+        self.growth = self.np_random.uniform(1.0, 2.0)
+        return np.zeros(1), {}
+
+    def step(self, action):  # type: ignore[no-untyped-def]
+        self.height = self.growth * self.height + 0.1 * float(action[0])
+        return np.array([self.height]), 0.0, False, False, {}
+
+
+def test_a_plant_made_twice_of_an_environment_that_draws_is_the_same_one() -> None:
+    first, second = (
+        envs.EnvironmentPlant(
+            Drawn(),
+            read=lambda env: np.array([env.height]),
+            write=lambda env, x: setattr(env, "height", float(x[0])),
+            dt=0.1,
+        )
+        for _ in range(2)
+    )
+    assert torch.equal(first.linearisation().matrix, second.linearisation().matrix)

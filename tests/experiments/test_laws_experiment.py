@@ -16,7 +16,7 @@ from variants import LAWS
 
 from staf_torch import optim, predictors
 from staf_torch.cli.staf import config_directory
-from staf_torch.experiments import gradient_chase, laws
+from staf_torch.experiments import chase_batch, gradient_chase, laws
 from staf_torch.experiments.laws import cases
 from staf_torch.settings.chase import chase_problem
 
@@ -93,3 +93,16 @@ def test_single_precision_runs_every_law(tmp_path: Path) -> None:
     metrics = laws.run(settings("experiment=laws", "laws.steps=[0.1,0.05]", *short), tmp_path)
     assert all(value == 0 for name, value in metrics.items() if name.endswith("diverged_fraction"))
     assert torch.get_default_dtype() == torch.float32
+
+
+@pytest.mark.parametrize(("rows", "times", "problems"), [(4, 10, 2), (3, 7, 3), (1, 5, 1), (2, 100, 5)])
+def test_progress_is_told_in_times_of_whole_problems_and_ends_with_all(
+    rows: int, times: int, problems: int
+) -> None:
+    told: list[int] = []
+    progress = chase_batch._Told(told.append, rows, times, problems)
+    for done in range(1, rows * times + 1):
+        progress.more(1)
+        assert sum(told) == times * problems * done // (rows * times)
+    assert min(told) > 0
+    chase_batch._Told(None, rows, times, problems).more(1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from torch import Tensor
 
 from staf_torch.experiments import rival_methods, rivals
 from staf_torch.experiments.rival_methods import METHODS, Method, ipopt_program
-from staf_torch.experiments.rival_plants import CASES
+from staf_torch.experiments.rival_plants import CASES, TorchMath
 
 SHORT = dataclasses.replace(CASES["double_integrator"], steps=60, horizon=20)
 
@@ -73,6 +74,67 @@ def test_every_plant_rests_at_its_goal_and_begins_in_its_box(name: str) -> None:
     assert ((x[:, : case.dim] - case.goal()).abs() <= torch.tensor(case.box, dtype=torch.float64)).all()
 
 
+def energy(name: str, x: Tensor) -> Tensor:
+    """Kinetic and potential energy of a plant, from its masses and lengths alone, in J."""
+    if name == "quadrotor":
+        return 0.5 * x[..., 3:5].square().sum(-1) + 0.5 * 0.1 * x[..., 5] ** 2 + 9.81 * x[..., 1]
+    if name == "figure_eight":
+        return 0.027 * (0.5 * (x[..., 1] ** 2 + x[..., 3] ** 2) + 9.81 * x[..., 2]) + 0.7e-5 * x[..., 5] ** 2
+    swing, sine, cosine = x[..., 3], x[..., 1].sin(), x[..., 1].cos()
+    across, up = x[..., 2] + 0.5 * swing * cosine, -0.5 * swing * sine  # of the middle of the pole
+    turning = 0.5 * (0.1 * 1.0**2 / 12) * swing**2  # of a rod of a metre
+    return 0.5 * x[..., 2] ** 2 + 0.5 * 0.1 * (across**2 + up**2) + turning + 0.1 * 9.8 * 0.5 * cosine
+
+
+@pytest.mark.parametrize("name", ["cart_pole_10N", "quadrotor", "figure_eight"])
+def test_the_energy_of_a_plant_grows_at_the_power_of_its_inputs(name: str) -> None:
+    case = CASES[name]
+    generator = torch.Generator().manual_seed(1)
+    x = torch.rand(50, case.dim, generator=generator, dtype=torch.float64, requires_grad=True)
+    u = torch.rand(50, case.inputs, generator=generator, dtype=torch.float64)
+    (slope,) = torch.autograd.grad(energy(name, x).sum(), x)
+    rate = torch.stack(tuple(case.equations(TorchMath, x.unbind(-1), u.unbind(-1))), -1)
+    along = {
+        "cart_pole_10N": lambda: u[:, 0] * x[:, 2],
+        "quadrotor": lambda: (
+            (9.81 + u[:, 0]) * (x[:, 4] * x[:, 2].cos() - x[:, 3] * x[:, 2].sin()) + u[:, 1] * x[:, 5]
+        ),
+        "figure_eight": lambda: (
+            u.sum(-1) * (x[:, 1] * x[:, 4].sin() + x[:, 3] * x[:, 4].cos())
+            + 0.0397 / math.sqrt(2) * (u[:, 1] - u[:, 0]) * x[:, 5]
+        ),
+    }[name]()
+    torch.testing.assert_close((slope * rate).sum(-1), along, rtol=1e-12, atol=1e-12)
+    still = {"cart_pole_10N": [2, 3], "quadrotor": [3, 4, 5], "figure_eight": [1, 3, 5]}[name]
+    places = [k for k in range(case.dim) if k not in still]
+    assert torch.equal(rate[:, places], x[:, still])
+
+
+def test_the_pendulum_is_that_of_gymnasium() -> None:
+    gymnasium = pytest.importorskip("gymnasium", reason="needs the extra gym")
+    inside = gymnasium.make("Pendulum-v1").unwrapped
+    inside.reset(seed=0)
+    for angle, rate, torque in ((0.3, 0.5, 1.0), (-2.0, 7.9, 2.0), (2.5, -7.9, -2.0)):
+        inside.state = np.array([angle, rate])
+        inside.step(np.array([torque]))
+        found = CASES["pendulum"].equations(TorchMath, torch.tensor([angle, rate]), torch.tensor([torque]))
+        np.testing.assert_allclose(torch.stack(tuple(found)).numpy(), inside.state, rtol=1e-5)
+
+
+def test_the_path_has_the_velocities_that_it_states_and_the_period_that_it_is_called_by() -> None:
+    time = torch.linspace(0, 6, 25, dtype=torch.float64, requires_grad=True)
+    way = CASES["figure_eight"].way(time)
+    for place, velocity in ((0, 1), (2, 3)):
+        (slope,) = torch.autograd.grad(way[:, place].sum(), time, retain_graph=True)
+        torch.testing.assert_close(way[:, velocity], slope, rtol=0, atol=1e-12)
+    torch.testing.assert_close(way[0], way[-1], rtol=0, atol=1e-12)
+    torch.testing.assert_close(way[12, [0, 2]], way[0, [0, 2]], rtol=0, atol=1e-12)  # it meets itself halfway
+    assert not torch.allclose(way[12], way[0])
+    across, up = way[:, 0], way[:, 2] - 1
+    torch.testing.assert_close(across.abs().max(), torch.tensor(0.75, dtype=torch.float64), rtol=1e-2, atol=0)
+    torch.testing.assert_close(across**4, 0.75**2 * (across**2 - up**2), rtol=0, atol=1e-12)  # of Gerono
+
+
 @pytest.mark.parametrize("name", ["cart_pole_to_1m", "pendulum", "figure_eight"])
 def test_equations_mean_the_same_to_casadi(name: str) -> None:
     casadi = pytest.importorskip("casadi", reason="needs the extra rivals")
@@ -101,3 +163,57 @@ def test_unknown_plants_and_methods_are_refused_by_name(tmp_path) -> None:  # ty
 
 def test_the_size_of_a_package_is_that_of_its_files() -> None:
     assert rival_methods._size("numpy") > 10 * rival_methods._size("pytest") > 0
+
+
+# Period (s), duration (s), diagonals of Q and R, bounds of the inputs, half the box of states, periods ahead.
+TABLE = {
+    "double_integrator": (0.1, 15, (1, 1), (1,), (-1,), (1,), (5, 1), 50),
+    "pendulum": (0.05, 10, (20, 2), (0.02,), (-2,), (2,), (math.pi, 1), 50),
+    "cart_pole_10N": (0.02, 5, (1, 1, 0.1, 0.1), (0.01,), (-10,), (10,), (0.3,) * 4, 50),
+    "cart_pole_5N": (0.02, 5, (1, 1, 0.1, 0.1), (0.01,), (-5,), (5,), (0.3,) * 4, 50),
+    "cart_pole_to_1m": (1 / 15, 6, (5, 5, 0.1, 0.1), (0.1,), (-10,), (10,), (1, 0.2, 0.2, 0.2), 20),
+    "quadrotor": (0.02, 4, (1,) * 6, (1, 1), (-9.81, -1), (9.81, 1), (0.4,) * 6, 50),
+    "figure_eight": (
+        0.02,
+        6,
+        (5, 0.1, 5, 0.1, 0.1, 0.1),
+        (0.1, 0.1),
+        (0.0563,) * 2,
+        (0.2967,) * 2,
+        (0.05,) * 6,
+        20,
+    ),
+    "cart_pole_swing_up": (0.02, 6, (1, 1, 0.1, 0.1), (0.01,), (-10,), (10,), (1, math.pi, 1, 2), 120),
+}
+
+
+@pytest.mark.parametrize("name", list(CASES))
+def test_published_numbers_are_of_these_cases(name: str) -> None:
+    case, cost = CASES[name], CASES[name].cost()
+    found = (case.dt, case.steps * case.dt, *case.weights, case.low, case.high, case.box, case.horizon)
+    for one, two in zip(found, TABLE[name], strict=True):
+        assert one == pytest.approx(two)
+    if case.path is None:
+        x = (case.goal() + 0.1).unsqueeze(0)
+        u = torch.full((1, case.inputs), 0.2, dtype=torch.float64)
+        paid = 0.01 * sum(case.weights[0]) + 0.04 * sum(case.weights[1])
+        assert float(cost.rate(x, u)) == pytest.approx(paid)
+
+
+@pytest.mark.parametrize("name", list(CASES))
+def test_an_angle_is_a_coordinate_that_may_turn_once_more_and_not_less(name: str) -> None:
+    case = CASES[name]
+    generator = torch.Generator().manual_seed(2)
+    x = torch.rand(5, case.dim, generator=generator, dtype=torch.float64)
+    u = torch.rand(5, case.inputs, generator=generator, dtype=torch.float64)
+
+    def moved(by: Tensor) -> Tensor:
+        """What the equations say there, of x+ less the way that x itself was moved."""
+        found = torch.stack(tuple(case.equations(TorchMath, (x + by).unbind(-1), u.unbind(-1))), -1)
+        return found - by if case.discrete else found
+
+    still = torch.zeros(case.dim, dtype=torch.float64)
+    for k, unit in enumerate(torch.eye(case.dim, dtype=torch.float64)):
+        turn, part = ((moved(way * unit) - moved(still)).abs().max() for way in (2 * math.pi, 1.0))
+        assert (k in case.periodic) == (float(turn) < 1e-9 < float(part)), k
+    assert set(case.periodic) == {k for k in range(case.dim) if k in case.plant().periodic}

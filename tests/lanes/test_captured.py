@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -87,6 +88,29 @@ def test_a_tensor_that_is_not_named_is_not_taken_for_the_old_one() -> None:
     first(x, steps=1)
     again = first.with_others(step_of(three, one), [(one, three)])
     torch.testing.assert_close(again(x, steps=1)[0], 3 * x + 1)
+
+
+@pytest.mark.parametrize("shared", [False, True])
+def test_tables_that_a_step_writes_are_its_text_and_arrays_of_numpy_are_not(shared: bool) -> None:
+    table = np.array([[1.0, 0.3], [0.7, 2.0]])
+
+    def step_of(a: Tensor) -> lanes.program.Step:
+        def step(x: Tensor, now: Tensor, row: Tensor) -> tuple[Tensor, tuple[()]]:
+            rows = torch.as_tensor(table) if shared else torch.tensor(((1.0, 0.3), (0.7, 2.0)))
+            return lanes.scan(lambda c, r: (c * r[0] + a * r[1], ()), x, rows.to(x), dim=0)[0], ()
+
+        return step
+
+    x, one, two = torch.rand(4, dtype=torch.float64), torch.tensor(1.0), torch.tensor(2.0)
+    first = lanes.Program(step_of(one))
+    first(x, steps=1)
+    second = first.with_others(step_of(two), [(one, two)])
+    if shared:
+        table[0, 0] = 5.0
+    expected = second.definition(x, steps=1)
+    traced = second._known
+    second._known = traced if shared else None  # type: ignore[assignment,method-assign]
+    torch.testing.assert_close(second(x, steps=1), expected, rtol=1e-12, atol=1e-12)
 
 
 def test_what_a_step_writes_into_its_own_memory_is_followed() -> None:

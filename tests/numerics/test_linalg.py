@@ -21,7 +21,7 @@ def low_rank(seed: int, *batch: int, size: int, rank: int) -> torch.Tensor:
 def reassembled(gram: torch.Tensor) -> torch.Tensor:
     """L L' with its columns beyond the rank dropped, back in the order of K."""
     factor, order, _ = found = pivoted_cholesky(gram)
-    kept = factor * found.kept.unsqueeze(-2)
+    kept = factor * found.kept().unsqueeze(-2)
     position = order.argsort(-1)
     rows = kept.gather(-2, position.unsqueeze(-1).expand(kept.shape))
     return rows @ rows.mT

@@ -1,5 +1,7 @@
 """Learning while running: what a plant's parameters are, found and used while the plant is controlled."""
 
+from .adaptive_actor_critic import AdaptiveActorCritic as AdaptiveActorCritic
+from .adaptive_actor_critic import LearnedModel as LearnedModel
 from .adaptive_lqr import Adaptation as Adaptation
 from .adaptive_lqr import AdaptiveLQR as AdaptiveLQR
 from .drift_lqr import DriftAdaptation as DriftAdaptation

@@ -53,7 +53,7 @@ def guesses(cost: Cost, base: Policy, x0: Tensor, horizon: float, count: int, se
     generator = torch.Generator().manual_seed(seed)
     for _ in range(count):
         knots = torch.rand(_KNOTS, cost.inputs, dtype=torch.float64, generator=generator)
-        until = float(torch.rand((), generator=generator)) * 0.6 * horizon
+        until = float(torch.rand((), dtype=torch.float32, generator=generator)) * 0.6 * horizon
         found.append(Guess(low + (high - low) * (1.5 * knots - 0.25).clamp(0.0, 1.0), until))
     return found
 

@@ -224,3 +224,10 @@ def test_forgetting_never_opens_the_covariance_beyond_its_first_size() -> None:
 def test_what_breaks_a_rule_is_refused_with_its_name(make, rule: str) -> None:
     with pytest.raises(ValueError, match=rule):
         make()
+
+
+def test_the_variance_of_a_measured_rate_is_that_of_its_noise() -> None:
+    x, u = uniform(4, 2), uniform(4, 1)
+    equation = adp.measured_rate(MODEL, x, u, PENDULUM.motion(x, u), 0.3)
+    torch.testing.assert_close(equation.variance, torch.full_like(equation.variance, 0.09))
+    assert bool(equation.ready.all())

@@ -1,0 +1,577 @@
+"""What a figure draws is what it was given: curves, scales, limits and names, read back from the axes."""
+
+from __future__ import annotations
+
+import io
+import itertools
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from staf_torch.figures import adaptation, chase, closed_loop, rivals, safety, sweep, theory
+from staf_torch.figures.animation import Curves, Scene, _Stage, animate
+from staf_torch.figures.style import colour, positive
+
+T = np.linspace(0.5, 4.5, 9)
+
+
+@pytest.fixture(autouse=True)
+def _not_laid_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where panels lie says nothing of what they hold, and takes nine tenths of the time."""
+    monkeypatch.setattr("matplotlib.layout_engine.ConstrainedLayoutEngine.execute", lambda *_: None)
+
+
+Curve = tuple[str | None, Any, Any]  # name in the legend, x, y
+
+
+def wave(*shape: int, low: float = 0.2) -> np.ndarray:
+    """Positive numbers, no two alike, with the times first."""
+    size = int(np.prod(shape))
+    return low + np.abs(np.sin(1.7 * np.arange(1, size + 1))).reshape(shape)
+
+
+def visible(figure: Figure) -> list[Axes]:
+    return [axes for axes in figure.axes if axes.get_visible()]
+
+
+def lines(axes: Axes) -> list[Curve]:
+    """Name, x and y of every line of a panel."""
+    found = []
+    for line in axes.get_lines():
+        name = str(line.get_label())
+        x, y = (np.asarray(part, dtype=float) for part in line.get_data())
+        found.append((None if name.startswith("_") else name, x, y))
+    return found
+
+
+def holds(axes: Axes, curves: Sequence[Curve], names: tuple[str, str], **more: Any) -> None:
+    """The panel has these curves in this order, these names of its axes, and what else is told."""
+    assert (axes.get_xlabel(), axes.get_ylabel()) == names
+    scales = more.pop("scales", ("linear", "linear"))
+    assert (axes.get_xscale(), axes.get_yscale()) == scales
+    found = lines(axes)
+    assert [curve[0] for curve in found] == [curve[0] for curve in curves]
+    for (_, x, y), (name, want_x, want_y) in zip(found, curves, strict=True):
+        np.testing.assert_allclose(x, want_x, err_msg=str(name))
+        np.testing.assert_allclose(y, want_y, err_msg=str(name))
+    for limit, want in more.items():
+        np.testing.assert_allclose(getattr(axes, f"get_{limit}")(), want)
+    named = [line for line in axes.get_lines() if not str(line.get_label()).startswith("_")]
+    looks = [(line.get_color(), line.get_linestyle(), line.get_marker()) for line in named]
+    assert len(set(looks)) == len(looks)  # no two of one look
+
+
+def legend(thing: Any) -> list[str]:
+    """The entries of a legend of a panel, or of a whole figure."""
+    found = thing.get_legend() if isinstance(thing, Axes) else thing.legends[0]
+    return [text.get_text() for text in found.get_texts()]
+
+
+def span(along: np.ndarray) -> tuple[float, float]:
+    return float(along[0]), float(along[-1])
+
+
+LINEAR_LOG, LOG, LOG_LINEAR = ("linear", "log"), ("log", "log"), ("log", "linear")
+EMPTY = ([], [])
+
+
+@pytest.mark.parametrize("count", [2, 7])
+def test_the_panels_of_a_chase_hold_its_history(count: int) -> None:
+    parts = [wave(9, 2), wave(9), wave(9) + 0.1 * T, wave(9) + 0.01 * T, wave(9, count), wave(9, count) + 1]
+    excess = wave(9)
+    excess[3] = 0.0
+    history = chase.ChaseHistory(T, *parts, excess)
+    state, value, weights, error = visible(chase.draw_chase(history))
+    inside = {"xlim": span(T)}
+    holds(
+        state,
+        [(f"$x_{{{i + 1}}}$", T, history.state[:, i]) for i in range(2)],
+        ("", "state $x$"),
+        **inside,
+    )
+    holds(
+        value,
+        [("$V(x)$", T, history.value), (r"$\hat V(x)$", T, history.estimate)],
+        ("", "value"),
+        **inside,
+    )
+    pairs = [
+        ((f"$a_{{{i + 1}}}$", T, history.weights[:, i]), (None, T, history.ideal_weights[:, i]))
+        for i in range(count)
+    ]
+    holds(
+        weights,
+        [*(curve for pair in pairs for curve in pair), ("ideal", *EMPTY)],
+        ("time (s)", "weights"),
+        **inside,
+    )
+    assert legend(weights) == [*([f"$a_{{{i + 1}}}$" for i in range(count)] if count < 7 else []), "ideal"]
+    drawn = np.where(excess > 0, excess, np.nan)
+    holds(
+        error,
+        [
+            (r"$|V - \hat V|$", T, 0.1 * T),
+            ("ideal weights (floor)", T, 0.01 * T),
+            ("excess $F(a) - F(w)$", T, drawn),
+        ],
+        ("time (s)", "error at $x$; excess"),
+        scales=LINEAR_LOG,
+        **inside,
+    )
+    assert error.get_ylim()[0] > 1e-3
+    deep = chase.draw_chase(history._replace(excess=np.where(excess > 0.5, excess, 1e-12)))
+    top = max(excess.max(), 0.1 * T.max())
+    assert deep.axes[3].get_ylim()[0] == pytest.approx(1e-6 * top)
+
+
+def test_the_curves_of_a_convergence_are_named_with_their_slopes() -> None:
+    step = np.array([0.01, 0.02, 0.05])
+    found = [
+        chase.ConvergenceCurve("a", step, wave(3), 1.97),
+        chase.ConvergenceCurve("b", step, wave(3) + 1, None),
+    ]
+    (axes,) = visible(chase.draw_convergence(found))
+    names = "step $\\Delta t$ (s)", "ultimate excess before the correction"
+    holds(axes, [("a: 2.0", step, wave(3)), ("b: -", step, wave(3) + 1)], names, scales=LOG)
+    assert [label.get_text() for label in axes.get_xticklabels()] == ["0.01", "0.02", "0.05"]
+    assert legend(axes) == ["a: 2.0", "b: -"]
+
+
+@pytest.mark.parametrize("dim", [1, 3])
+def test_a_memory_is_drawn_where_it_is_with_the_balls_of_its_models(dim: int) -> None:
+    errors, excess = {"kept": wave(9), "fresh": wave(9) + 1}, {"zero": wave(4), "stored": wave(4) + 1}
+    picture = chase.MemoryPicture(wave(9, dim), wave(5, dim) + 1, wave(5), T, errors, excess, 0.3)
+    where, region, revisits = visible(chase.draw_memory(picture))
+    second = min(dim, 2) - 1
+    places = picture.stored[:, [0, second]]
+    curves = [
+        ("path", *picture.path[:, [0, second]].T),
+        ("stored model", *places.T),
+        ("ball of its centers", *EMPTY),
+    ]
+    holds(where, curves, ("$x_1$", f"$x_{second + 1}$"))
+    (balls,) = where.collections
+    np.testing.assert_allclose(balls.get_offsets(), places)
+    np.testing.assert_allclose(balls.get_widths(), 2 * picture.radius)
+    np.testing.assert_allclose(balls.get_heights(), 2 * picture.radius)
+    assert where.get_aspect() == 1
+    names = "time at which the ball was visited (s)", r"$\max\,|V - \hat V|$ on the ball"
+    holds(
+        region, [(name, T, values) for name, values in errors.items()], names, scales=LINEAR_LOG, xlim=span(T)
+    )
+    curves = [(name, range(1, 5), values) for name, values in excess.items()]
+    names = "steps after the revisit", "largest excess $F(a) - F(w)$"
+    holds(revisits, [*curves, ("settled chase", [0, 1], [0.3, 0.3])], names, scales=LOG)
+
+
+@pytest.mark.parametrize(("weights", "shooting"), [(3, True), (6, False), (0, False)])
+def test_the_panels_of_a_closed_loop_hold_its_history(weights: int, shooting: bool) -> None:
+    known = wave(9)
+    known[::2] = np.nan
+    known = known if shooting else np.linspace(1, 2, 300)
+    time = T if shooting else np.linspace(0.5, 4.5, 300)
+    size = len(time)
+    history = closed_loop.AdpHistory(
+        *(time, wave(size, 2), wave(size, 1), wave(size, weights), wave(size, weights) + 1, wave(size)),
+        *(known, known + 1, 0.7 if shooting else None),
+    )
+    panels = visible(closed_loop.draw_adp(history))
+    shown: list[tuple[str, str, np.ndarray]] = [("state $x$", "$x_{%d}$", history.state)]
+    if weights:
+        shown.append((r"actor $\hat W_a$", r"$\hat W_{a,%d}$", history.actor_weights))
+        shown.append((r"critic $\hat W_c$", r"$\hat W_{c,%d}$", history.critic_weights))
+    else:
+        shown.append(("control $u$", "$u_{%d}$", history.control))
+    for axes, (name, label, values) in zip(panels, shown, strict=False):
+        curves = [(label % (i + 1), time, column) for i, column in enumerate(values.T)]
+        holds(axes, curves, ("time (s)", name), xlim=span(time))
+        assert legend(axes) == [curve[0] for curve in curves]
+    at = np.isfinite(known)
+    errors = (r"$|u - u^*|$", known), (r"$|V^* - \hat V|$", known + 1)
+    for axes, (name, values) in zip(panels[len(shown) :], errors, strict=False):
+        holds(axes, [(None, time[at], values[at])], ("time (s)", name), scales=LINEAR_LOG, xlim=span(time))
+        assert axes.get_lines()[0].get_marker() == ("." if shooting else "")
+    curves = [("so far", time, history.running_cost)]
+    curves += [("optimal, $V^*(x(0))$", [0, 1], [0.7, 0.7])] if shooting else []
+    holds(panels[-1], curves, ("time (s)", "cost"), xlim=span(time))
+    assert panels[-1].get_ylim()[0] == 0
+    assert [axes.get_title(loc="left") for axes in panels] == [f"({chr(97 + i)})" for i in range(len(panels))]
+
+
+def test_a_comparison_counts_states_up_to_a_multiple_of_the_optimal_cost() -> None:
+    (axes,) = visible(
+        closed_loop.draw_comparison({"a": np.array([3.0, 1.0, np.inf, 1.5]), "b": np.array([2.0])})
+    )
+    curves = [("a", [1e-4, 0.5, 2.0], [0.25, 0.5, 0.75]), ("b", [1.0], [1.0])]
+    names = "excess cost $J/J^* - 1$", "share of initial states regulated"
+    holds(axes, curves, names, scales=LOG_LINEAR, xlim=(1e-4, 1e2), ylim=(0, 1.02))
+    assert {line.get_drawstyle() for line in axes.get_lines()} == {"steps-post"}
+    assert legend(axes) == ["a", "b"]
+
+
+def test_a_tracked_path_is_the_error_and_the_desired_state_together() -> None:
+    errors = {"identified": wave(9), "exact": wave(9) + 1}
+    history = closed_loop.TrackingHistory(T, wave(9, 4), errors, wave(9, 6), wave(6), wave(9, 3))
+    followed, error, parameters, critic = visible(closed_loop.draw_tracking(history))
+    curves: list[Curve] = []
+    for i in range(2):
+        curves.append((f"$x_{i + 1}$", T, history.state[:, i] + history.state[:, 2 + i]))
+        curves.append(("desired" if i else None, T, history.state[:, 2 + i]))
+    holds(followed, curves, ("time (s)", "state"), xlim=span(T))
+    names = "time (s)", "$|x - x_d|$"
+    holds(
+        error, [(name, T, values) for name, values in errors.items()], names, scales=LINEAR_LOG, xlim=span(T)
+    )
+    curves = []
+    for i in range(6):
+        curves += [(None, T, history.parameters[:, i]), (None, [0, 1], [history.truth[i]] * 2)]
+    curves += [(r"$\hat\theta$, one colour an entry", *EMPTY), (r"$\theta$", *EMPTY)]
+    holds(parameters, curves, ("time (s)", "drift parameters"), xlim=span(T))
+    curves = [(rf"$\hat W_{{c,{i + 1}}}$", T, history.critic_weights[:, i]) for i in range(3)]
+    holds(critic, curves, ("time (s)", r"critic $\hat W_c$"), xlim=span(T))
+
+
+def test_a_box_has_its_walls_where_it_has_any() -> None:
+    paths, margins, costs = (
+        {name: wave(9, *size) + k for k, name in enumerate("ab")} for size in ((3,), (), ())
+    )
+    low, high = np.array([-1.0, -np.inf, 0.0]), np.array([np.inf, 4.0, 0.0])
+    history = safety.BoxHistory(T, paths, margins, costs, wave(9, 3), low, high)
+    figure = safety.draw_box(history)
+    plane, margin, barrier, cost = visible(figure)
+    curves: list[Curve] = [(name, path[:, 0], path[:, 1]) for name, path in paths.items()]
+    holds(plane, [*curves, (None, [-1, -1], [0, 1]), (None, [0, 1], [4, 4])], ("$x_1$", "$x_2$"))
+    left, above = (
+        patch.get_window_extent().transformed(plane.transData.inverted()) for patch in plane.patches
+    )
+    assert left.x1 == pytest.approx(-1)
+    assert above.y0 == pytest.approx(4)
+    assert left.x0 < -1
+    assert above.y1 > 4
+    assert legend(figure) == ["a", "b"]
+    names = "time (s)", "distance to the nearest wall"
+    holds(margin, [(None, T, values) for values in margins.values()], names, xlim=span(T))
+    curves = [(f"$s_{{{i + 1}}}$", T, history.barrier_state[:, i]) for i in range(3)]
+    holds(barrier, curves, ("time (s)", "barrier coordinates"), xlim=span(T))
+    names = "time (s)", "cost of $s$ so far"
+    holds(cost, [(name, T, values) for name, values in costs.items()], names, xlim=span(T))
+    assert margin.get_ylim()[0] == cost.get_ylim()[0] == 0
+
+
+def test_discs_are_drawn_at_five_times_of_the_first_half() -> None:
+    paths = {name: wave(9, 2) + k for k, name in enumerate("ab")}
+    distances, costs = ({name: wave(9) + k for k, name in enumerate("ab")} for _ in range(2))
+    nearest = {"a": np.array([0.3, -0.1, 0.2]), "b": np.array([0.5, 0.4])}
+    history = safety.AvoidanceHistory(T, paths, wave(9, 2, 2), 0.4, distances, costs, nearest)
+    plane, apart, share, cost = visible(safety.draw_avoidance(history))
+    shown = [0, 1, 2, 3, 4] if T[4] >= 0.5 * T[-1] > T[3] else []
+    centers = [tuple(center) for at in shown for center in history.discs[at]]
+    np.testing.assert_allclose([disc.center for disc in plane.patches], centers)
+    assert {disc.radius for disc in plane.patches} == {0.4}
+    curves: list[Curve] = []
+    for name, path in paths.items():
+        curves += [(name, *path.T), (None, *path[shown].T)]
+    holds(plane, curves, ("$p_1$ (m)", "$p_2$ (m)"))
+    assert plane.get_aspect() == 1
+    curves = [(name, T, values) for name, values in distances.items()]
+    names = "time (s)", "distance to the nearest disc (m)"
+    holds(apart, [*curves, (None, [0, 1], [0, 0])], names, xlim=span(T))
+    curves = [("a", [-0.1, 0.2, 0.3], [1 / 3, 2 / 3, 1]), ("b", [0.4, 0.5], [0.5, 1]), (None, [0, 0], [0, 1])]
+    names = "least distance on the way (m)", "share of the scenarios"
+    holds(share, curves, names, ylim=(0, 1.02))
+    holds(cost, [(name, T, v) for name, v in costs.items()], ("time (s)", "cost so far"), xlim=span(T))
+    assert cost.get_ylim()[0] == 0
+
+
+def test_a_fault_has_its_norms_above_and_its_parameters_below() -> None:
+    certain = np.arange(9) > 3
+    cases = {
+        name: adaptation.FaultPicture(
+            T, {"a": wave(9) + k, "b": wave(9) + 2}, wave(9, 2), wave(9, 2) + k, certain
+        )
+        for k, name in enumerate(("loss", "gain"))
+    }
+    figure = adaptation.draw_faults(cases)
+    titles = [axes.get_title(loc="left") for axes in figure.axes]
+    assert titles == ["(a) loss", "(b) gain", "(c) ", "(d) "]
+    for k, case in enumerate(cases.values()):
+        above, below = figure.axes[k], figure.axes[2 + k]
+        names = "time (s)", "" if k else "$|x|$"
+        holds(above, [(n, T, v) for n, v in case.norms.items()], names, scales=LINEAR_LOG, xlim=span(T))
+        curves: list[Curve] = []
+        for i in range(2):
+            curves += [(None, T, case.parameters[:, i]), (None, T, case.truth[:, i])]
+        room = 0.3 * max(case.truth.max() - case.truth.min(), 1.0)
+        limits = case.truth.min() - room, case.truth.max() + room
+        names = "time (s)", "" if k else r"$\hat\theta$ and $\theta$ (dotted)"
+        holds(below, curves, names, xlim=(T[0], 2.0), ylim=limits)
+        (shade,) = below.collections
+        x, y = shade.get_paths()[0].vertices.T
+        assert (x.min(), x.max()) == (T[0], T[3])
+        assert (y.min(), y.max()) == limits
+    assert legend(figure.axes[0]) == ["a", "b"]
+
+
+def test_gain_sets_are_sorted_by_their_errors() -> None:
+    two = lambda *shape: {name: wave(*shape) + k for k, name in enumerate(("integral", "derivative"))}  # noqa: E731
+    sets = adaptation.GainSets(T, wave(9, 3), wave(3), two(4), two(5), two(9))
+    theta, followed, error, parameter = visible(adaptation.draw_gain_sets(sets))
+    curves: list[Curve] = []
+    for i in range(3):
+        curves += [(None, T, sets.parameters[:, i]), (None, [0, 1], [sets.truth[i]] * 2)]
+    holds(theta, curves, ("time (s)", r"$\hat\theta$ (integral), $\theta$ dotted"), xlim=span(T))
+    names = "time (s)", "$|x - x_d|$"
+    holds(followed, [(n, T, v) for n, v in sets.followed.items()], names, scales=LINEAR_LOG, xlim=span(T))
+    shown = (
+        (error, sets.error, "RMS of $x - x_d$"),
+        (parameter, sets.parameter_error, r"RMS of $\hat\theta - \theta$"),
+    )
+    for axes, values, label in shown:
+        curves = [(n, np.sort(v), np.arange(1, len(v) + 1) / len(v)) for n, v in values.items()]
+        holds(axes, curves, (label, "share of gain sets"), scales=LOG_LINEAR, ylim=(0, 1.02))
+    assert legend(error) == ["integral", "derivative"]
+
+
+def test_rivals_are_points_hollow_where_they_fail_from_some_states() -> None:
+    rows = [
+        {"plant": plant, "method": method, "us_median": 3.0 * k + 1, "ratio_median": ratio, "regulated": part}
+        for k, (plant, method, ratio, part) in enumerate(
+            [
+                ("cart_pole", "a", 1.5, 1),
+                ("cart_pole", "b", 1.0, 0.5),
+                ("mass", "a", None, 0),
+                ("mass", "b", 1.1, 1),
+            ]
+        )
+    ]
+    figure = rivals.draw_rivals(rows)
+    cart, mass = visible(figure)
+    named = [("a", *EMPTY), ("b", *EMPTY)]
+    names = r"$\mu$s a control", "median excess cost"
+    holds(cart, [(None, [1], [0.5]), (None, [4], [1e-5]), *named], names, scales=LOG)
+    holds(mass, [(None, [10], [0.1])], (names[0], ""), scales=LOG)
+    assert [line.get_fillstyle() for line in cart.get_lines()[:2]] == ["full", "none"]
+    assert [axes.get_title() for axes in (cart, mass)] == ["cart pole", "mass"]
+    assert [line.get_color() for line in mass.get_lines()] == [colour(1)]
+    assert legend(figure) == ["a", "b"]
+    four = [row | {"plant": str(k)} for k, row in enumerate(rows)]
+    grid = rivals.draw_rivals(four).axes
+    assert [axes.get_visible() for axes in grid] == [True] * 4 + [False] * 2
+    assert [axes.get_ylabel() for axes in grid[:4]] == ["median excess cost", "", "", "median excess cost"]
+
+
+def test_bounds_are_drawn_from_the_loose_to_the_strict() -> None:
+    keys = "count", "one_polynomial_count", "measured_count"
+    epsilons, radii = (0.1, 0.01), (0.4, 0.2)
+    found = {
+        (r, e): {key: None if (e, k) == (0.01, 2) else 3.0 * (k + 1) + 10 * r for k, key in enumerate(keys)}
+        for r in radii
+        for e in epsilons
+    }
+    figure = theory.draw_exponential_bound(found)
+    labels = "two polynomials (paper)", "one polynomial", "measured with ideal weights"
+    panels = visible(figure)
+    for n, (axes, r) in enumerate(zip(panels, sorted(radii), strict=True)):
+        curves = [
+            (label, epsilons, [found[r, e][key] or np.nan for e in epsilons])
+            for key, label in zip(keys, labels, strict=True)
+        ]
+        names = r"largest error $\epsilon$", "" if n else "kernels $M$"
+        holds(axes, curves, names, scales=LOG, xlim=(0.15, 0.01 / 1.5))
+        assert axes.get_title() == f"$r = {r:g}$"
+    assert [label.get_text() for label in panels[0].get_yticklabels()] == ["1", "2", "3", "6", "10"]
+    assert [label.get_text() for label in panels[0].get_xticklabels()] == ["$10^{-2}$", "$10^{-1}$"]
+    assert legend(figure) == list(labels)
+
+
+@pytest.mark.parametrize("circle", [True, False])
+def test_feasibility_is_drawn_along_the_arc_or_over_time(circle: bool) -> None:
+    angles = np.linspace(3.0, -1.0, 9)
+    state = np.stack((np.cos(angles), np.sin(angles)), -1) * (2.0 if circle else T[:, None])
+    pointwise, overall = np.array([[3.0] * 8 + [0], [6.0] * 9]), np.array([[3.0, 6], [0, 10]])
+    radii, epsilons = np.array([0.1, 0.5]), np.array([0.1, 0.003])
+    counts = np.array([3, 6, 10])
+    found = theory.Feasibility(T, state, 0.5, radii, epsilons, counts, pointwise, overall)
+    figure = theory.draw_feasibility(found)
+    left, right = visible(figure)
+    labels = "$\\epsilon = 10^{-1}$", "$\\epsilon = 0.003$"
+    place = np.degrees(3.0 - angles) if circle else T
+    names = "angle passed on the circle (degrees)" if circle else "time (s)", "centers $M$"
+    curves = [(label, place, positive(pointwise[i])) for i, label in enumerate(labels)]
+    holds(left, curves, names, scales=LINEAR_LOG, xlim=span(place))
+    curves = [(label, radii, positive(overall[:, i])) for i, label in enumerate(labels)]
+    holds(right, curves, ("radius $r$ of the ball", ""), scales=LOG)
+    assert [label.get_text() for label in left.get_yticklabels()] == ["3", "6", "10"]
+    assert [label.get_text() for label in right.get_xticklabels()] == ["0.1", "0.5"]
+    titles = [axes.get_title(loc="left") for axes in (left, right)]
+    assert titles == ["(a) at each state, $r = 0.5$", "(b) along the whole trajectory"]
+    assert legend(figure) == list(labels)
+
+
+def test_layouts_are_drawn_by_family_and_the_first_four_against_the_radius() -> None:
+    radii = np.array([0.1, 0.2])
+    tried = [
+        ("rings", 3),
+        ("rings", 6),
+        ("rings", 10),
+        ("rings", 15),
+        ("rings", 21),
+        ("polygon", 3),
+        ("simplex", 3),
+    ]
+    found = [
+        theory.LayoutCurve(family, count, 2, 1e-3 * (k + 1), wave(2) + k, None if k else 2.0)
+        for k, (family, count) in enumerate(tried)
+    ]
+    left, right = visible(theory.draw_layouts(found, 0.2, radii))
+    rings = [3, 6, 10, 15, 21], [1e-3, 2e-3, 3e-3, 4e-3, 5e-3]
+    names = "centers $M$", r"$\sup\,|V - \hat V|$ on the ball"
+    holds(left, [("rings", *rings), ("polygon", [3], [6e-3]), ("simplex", [3], [7e-3])], names, scales=LOG)
+    assert [line.get_linestyle() for line in left.get_lines()] == ["-", "None", "None"]
+    curves = [
+        (f"{family}, {count}: {'-' if k else '2.00'}", radii, wave(2) + k)
+        for k, (family, count) in enumerate(tried)
+        if k not in (4, 6)
+    ]
+    holds(right, curves, ("radius $r$ of the ball", ""), scales=LOG)
+    assert [axes.get_title(loc="left") for axes in (left, right)] == ["(a) $r = 0.2$", "(b) slopes in $r$"]
+    assert [label.get_text() for label in left.get_xticklabels()] == ["3", "6", "10", "15", "21"]
+
+
+def test_a_failure_is_a_mark_and_an_exact_result_a_tenth_of_rounding() -> None:
+    radius = [0.1, 0.01, 0.001]
+    errors = {"old": [0.5, np.inf, np.inf], "new": [0.1, 0.0, np.inf]}
+    panels = [theory.ErrorPanel(title, 1e-8, radius, errors) for title in ("float32", "float64")]
+    figure = theory.draw_errors(panels, 1)
+    for n, axes in enumerate(visible(figure)):
+        curves = [
+            ("old", radius, [0.5, np.nan, np.nan]),
+            (None, [0.01, 0.001], [1, 1]),
+            ("new", radius, [0.1, 1e-9, np.nan]),
+            (None, [0.001], [4]),
+            ("fails (in its colour)", *EMPTY),
+            (r"$\varepsilon$ of the dtype", [0, 1], [1e-8, 1e-8]),
+        ]
+        names = "radius $r$", "" if n else r"relative error of $\hat V$"
+        holds(axes, curves, names, scales=LOG, ylim=(5e-10, 12.0))
+        assert axes.get_title(loc="left") == ("(b) float64" if n else "(a) float32")
+    assert legend(figure) == ["old", "new", "fails (in its colour)", r"$\varepsilon$ of the dtype"]
+
+
+def _panels(spread: float) -> list[sweep.Panel]:
+    def points(factor: float) -> tuple[sweep.Point, ...]:
+        return tuple(sweep.Point(x, factor * x, factor * x / spread, factor * x * spread) for x in (0.1, 0.2))
+
+    curves = (sweep.Curve("3 centers", points(1.0), points(0.1)), sweep.Curve("6 centers", points(0.5)))
+    return [sweep.Panel("Gaussian kernel", curves), sweep.Panel("exponential kernel", curves[:1])]
+
+
+@pytest.mark.parametrize(("spread", "rounding"), [(1.5, 1e-3), (1.0, None), (1.05, 1e-13)])
+def test_errors_of_a_sweep_are_drawn_with_their_bands(spread: float, rounding: float | None) -> None:
+    panels, x = _panels(spread), np.array([0.1, 0.2])
+    figure = sweep.draw_error_against_radius(panels, rounding)
+    grid = visible(figure)
+    told = [] if rounding is None else [rf"rounding, $\varepsilon\,\max|V|$ = {rounding:.0e}"]
+    told = [f"{text}, below" if rounding == 1e-13 else text for text in told]
+    level: list[Curve] = [(text, [0, 1], [rounding] * 2) for text in told]
+    three: list[Curve] = [("3 centers", x, x), (None, x, 0.1 * x)]
+    many = [*three, ("6 centers", x, 0.5 * x), ("ideal weights, local basis", *EMPTY), *level]
+    error = r"$\sup\,|V - \hat V|$ on the ball"
+    holds(grid[0], many, ("radius $r$ of the ball", error), scales=LOG)
+    holds(grid[1], [*three, *level], ("radius $r$ of the ball", ""), scales=LOG)
+    assert [axes.get_title(loc="left") for axes in grid] == ["Gaussian kernel", "exponential kernel"]
+    band = grid[0].collections
+    assert len(band) == (2 if spread > 1 else 0)
+    for shade, factor in zip(band, (1.0, 0.5), strict=False):
+        y = shade.get_paths()[0].vertices[:, 1]
+        assert (y.min(), y.max()) == pytest.approx((factor * 0.1 / spread, factor * 0.2 * spread))
+    low = min([0.05 / 3, 0.01 / 4, *([1e-3 / 4] if rounding == 1e-3 else [])])
+    assert grid[0].get_ylim() == pytest.approx((low, 0.6))
+    said = ["3 centers", "6 centers", "ideal weights, local basis", *told]
+    assert legend(figure) == said + (["95 % over seeds"] if spread > 1.2**0.5 else [])
+    costly = sweep.draw_cost_against_accuracy(panels, "multiplications")
+    assert costly.get_supxlabel() == "multiplications with $K$ a second of trajectory"
+    holds(costly.axes[0], many[:3], ("", error), scales=LOG)
+
+
+def test_a_map_shows_the_number_of_every_cell() -> None:
+    shown = sweep.HeatMap("k", (0.1, 0.2, 0.4), (3, 6), ((1e-3, 2.5, None), (1234.0, 0.05, 1e-5)))
+    axes, bar = visible(sweep.draw_heat_maps([shown]))
+    texts = {tuple(text.get_position()): (text.get_text(), text.get_color()) for text in axes.texts}
+    assert {at: text for at, (text, _) in texts.items()} == {
+        (0, 0): "1.0e-3",
+        (1, 0): "2.5",
+        (2, 0): "-",
+        (0, 1): "1.2e3",
+        (1, 1): "0.05",
+        (2, 1): "1.0e-5",
+    }
+    assert [texts[at][1] for at in ((2, 1), (0, 1), (2, 0))] == ["white", "black", "0.3"]
+    (image,) = axes.images
+    np.testing.assert_allclose(image.get_array().filled(np.nan), np.array(shown.errors, dtype=float))
+    assert (image.norm.vmin, image.norm.vmax) == (1e-5, 1234.0)
+    assert [label.get_text() for label in axes.get_xticklabels()] == ["0.1", "0.2", "0.4"]
+    assert [label.get_text() for label in axes.get_yticklabels()] == ["3", "6"]
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("radius $r$ of the ball", "centers $M$")
+    assert bar.get_ylabel() == r"$\sup\,|V - \hat V|$ on the ball"
+    (same, _) = visible(sweep.draw_heat_maps([shown._replace(errors=((2.0,) * 3,) * 2)]))
+    assert (same.images[0].norm.vmin, same.images[0].norm.vmax) == (2.0, 20.0)
+
+
+SCENE = Scene(
+    *("title", T, wave(9, 2), wave(9, 3, 2), wave(9)),
+    Curves("weights", wave(9, 2), wave(9, 2) + 1),
+    *(np.linspace(-1, 1, 5), wave(9, 5), wave(9, 5) + 1, None, wave(9, 2) + 2, wave(9, 2, 3)),
+)
+
+
+@pytest.mark.parametrize("relative", [False, True])
+@pytest.mark.parametrize("frame", [0, 4])
+def test_a_frame_shows_the_way_so_far_and_all_else_as_it_is_then(frame: int, relative: bool) -> None:
+    scene, figure = SCENE._replace(relative=relative), Figure()
+    _Stage(figure, scene).show(frame)
+    plane, across, curves = figure.axes
+    way = slice(0, frame + 1)
+    names = [(None, *part) for part in (scene.state[way].T, scene.followed.T, scene.followed[[frame]].T)]
+    drawn = lines(plane)
+    want = [names[0], names[1], names[2], (None, *scene.centers[frame].T), (None, *scene.state[[frame]].T)]
+    for (_, x, y), (_, want_x, want_y) in zip(drawn, want, strict=True):
+        np.testing.assert_array_equal(x, want_x)
+        np.testing.assert_array_equal(y, want_y)
+    *discs, ball = plane.patches
+    np.testing.assert_allclose([(*disc.center, disc.radius) for disc in discs], scene.discs[frame])
+    np.testing.assert_allclose((*ball.center, ball.radius), (*scene.state[frame], scene.radius[frame]))
+    unit = scene.value[frame].max() if relative else 1.0
+    pair = ("$V^*$" if relative else "$V$", scene.value), (r"$\hat V$", scene.estimate)
+    label = "place in the ball (radii, along the way)", "share of the largest" if relative else ""
+    holds(across, [(n, scene.along, v[frame] / unit) for n, v in pair], label, xlim=(-1, 1))
+    low, high = scene.value.min(), scene.value.max()
+    want_y = (-0.15, 1.15) if relative else (low - 0.08 * (high - low), high + 0.08 * (high - low))
+    assert across.get_ylim() == pytest.approx(want_y)
+    ideal = [(None, T, column) for column in scene.curves.ideal.T]
+    now = [(None, T[way], column[way]) for column in scene.curves.values.T]
+    holds(curves, [*ideal, *now], ("time (s)", ""), xlim=span(T))
+    span_of = scene.curves.values if relative else scene.curves.ideal
+    low, high = span_of.min(), span_of.max()
+    assert curves.get_ylim() == pytest.approx((low - 0.08 * (high - low), high + 0.08 * (high - low)))
+    both = np.concatenate((scene.state, scene.followed))
+    ends = [(part.min() - scene.radius.max(), part.max() + scene.radius.max()) for part in both.T]
+    want_x, want_y = ((low - 0.08 * (high - low), high + 0.08 * (high - low)) for low, high in ends)
+    assert plane.get_xlim() == pytest.approx(want_x)
+    assert plane.get_ylim() == pytest.approx(want_y)
+
+
+def test_every_frame_of_an_animation_is_another_picture() -> None:
+    from PIL import Image, ImageChops, ImageSequence
+
+    still = SCENE._replace(time=T[:3], curves=Curves("weights", wave(3, 2), None))
+    with Image.open(io.BytesIO(animate(still, "gif")["gif"])) as moving:
+        frames = [frame.convert("RGB") for frame in ImageSequence.Iterator(moving)]
+        assert moving.info["duration"] == 100  # ms
+    assert len(frames) == 3
+    for one, two in itertools.pairwise(frames):
+        assert ImageChops.difference(one, two).getbbox() is not None

@@ -1,0 +1,86 @@
+"""What holds for every class and signature of the package, whatever it does.
+
+`mutation.py` runs these for what happens at import, beside the tests that the map finds.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import importlib
+import inspect
+import pkgutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+import staf_torch
+
+ROOT = Path(staf_torch.__file__).parent
+CONF = next(path for path in (ROOT / "conf", ROOT.parent / "conf") if path.is_dir())
+CHANGING = {"Loop": "a loop while it is traced", "StreamState": "a filter's, written in place"}
+OTHERWISE = {
+    ("experiment/adp_policy_iteration.yaml", "width"): "the experiment's own",
+    ("optimizer/jacobi.yaml", "preconditioner"): "the option's name says so",
+    ("system/two_state_as_printed.yaml", "as_printed"): "the option's name says so",
+}
+"""Options of the command line that differ from the constructor's default on purpose."""
+
+
+@functools.cache
+def classes() -> dict[str, type]:
+    """Every class by its place in the package."""
+    found = {}
+    for info in pkgutil.walk_packages(staf_torch.__path__, "staf_torch."):
+        if "plugins" in info.name or "__main__" in info.name or ".conf" in info.name:
+            continue
+        for name, kind in vars(importlib.import_module(info.name)).items():
+            if inspect.isclass(kind) and kind.__module__ == info.name:
+                found[f"{info.name}.{name}"] = kind
+    return found
+
+
+def test_every_dataclass_is_frozen_and_says_which_are_not() -> None:
+    kinds = [kind for kind in classes().values() if dataclasses.is_dataclass(kind)]
+    open_ = {kind.__name__ for kind in kinds if not kind.__dataclass_params__.frozen}  # type: ignore[attr-defined]
+    assert open_ == set(CHANGING)
+    assert len(kinds) > 30
+
+
+def targets() -> Iterator[tuple[str, str, Any, Any]]:
+    """File, key, value and the constructor's default, of every option with a plain value."""
+    for path in sorted(CONF.rglob("*.yaml")):
+        for node in nodes(yaml.safe_load(path.read_text(encoding="utf-8"))):
+            for key, value in node.items():
+                parameter = signature(node["_target_"]).get(key)
+                plain = (
+                    isinstance(value, bool | int | float | str) and "$" not in str(value) and value != "???"
+                )
+                if plain and parameter is not None and parameter.default not in (parameter.empty, None):
+                    yield str(path.relative_to(CONF)), key, value, parameter.default
+
+
+def nodes(node: Any) -> Iterator[dict[str, Any]]:
+    if isinstance(node, dict):
+        if str(node.get("_target_", "")).startswith("staf_torch."):
+            yield node
+        for value in node.values():
+            yield from nodes(value)
+
+
+def signature(target: str) -> dict[str, inspect.Parameter]:
+    """Parameters of what a target makes: of the class, also where a method of it makes one from settings."""
+    thing: Any = staf_torch
+    importlib.import_module("staf_torch.adp")
+    found = [thing := getattr(thing, name) for name in target.split(".")[1:]]
+    kind = next((each for each in found if inspect.isclass(each)), found[-1])
+    return dict(inspect.signature(kind).parameters)
+
+
+def test_an_option_of_the_command_line_is_the_default_of_the_constructor() -> None:
+    found = list(targets())
+    differing = {(file, key): (value, default) for file, key, value, default in found if value != default}
+    assert set(differing) == set(OTHERWISE), differing
+    assert len(found) > 40

@@ -1,0 +1,140 @@
+"""torch's default dtype belongs to the caller: no number of the library depends on it, in no bit."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from composing import settings
+from helpers import basis_of
+from helpers_chase import BASES, LAW, circles
+from test_modules import MODULES, X
+from torch import Tensor, nn
+from variants import COSTS, DESCENDING, KERNELS, LAYOUTS, PLANTS, PREDICTORS, RADII, TARGETS
+
+import staf_torch as st
+from staf_torch import adp, optim, predictors, systems, theory
+from staf_torch.adp.shooting.starts import guesses
+from staf_torch.experiments import avoidance
+from staf_torch.experiments.rival_plants import CASES
+
+
+@contextmanager
+def default(dtype: torch.dtype) -> Iterator[None]:
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(dtype)
+    try:
+        yield
+    finally:
+        torch.set_default_dtype(before)
+
+
+def numbers(thing: Any) -> Iterator[Tensor]:
+    """Every number of a result, with its dtype."""
+    if isinstance(thing, Tensor):
+        yield thing.detach()
+    elif isinstance(thing, np.ndarray):
+        yield torch.from_numpy(thing)
+    elif isinstance(thing, bool | int | float):
+        yield torch.tensor(thing, dtype=torch.float64)
+    elif isinstance(thing, nn.Module):
+        yield from (each.detach() for each in (*thing.parameters(), *thing.buffers()))
+    elif dataclasses.is_dataclass(thing):
+        yield from numbers(vars(thing))
+    elif isinstance(thing, Mapping):
+        yield from numbers(list(thing.values()))
+    elif isinstance(thing, list | tuple):
+        for each in thing:
+            yield from numbers(each)
+
+
+def shooting() -> Any:
+    plant, cost = systems.TwoState(), adp.QuadraticCost(1.0, 1.0, 2, 1, low=-1.0, high=1.0)
+    return [(each.knots, each.until) for each in guesses(cost, adp.LQR(plant, cost), X, 3.0, 4, seed=1)]
+
+
+def chased(
+    law: optim.UpdateLaw, predictor: predictors.Predictor | None = None, basis: str = "gaussian"
+) -> Any:
+    found = st.chase(
+        circles(2, 6), BASES[basis], TARGETS["paper"][0](), law, inner_steps=2, predictor=predictor
+    )
+    return vars(found) if hasattr(found, "__dict__") else tuple(found)
+
+
+def held(name: str) -> Any:
+    plant = PLANTS[name]()
+    x = 0.3 * torch.ones(3, plant.dim, dtype=torch.float64)
+    u = 0.2 * torch.ones(3, plant.inputs, dtype=torch.float64)
+    return plant.motion(x, u), plant.linearisation() if name != "three_state" else ()
+
+
+def learned() -> Any:
+    time = np.arange(80) * 0.1
+    stream = np.stack((np.cos(time), np.sin(time)), -1)
+    model = st.online.StaFRegressor().fit(stream, stream[:, 0] ** 2 + stream[:, 1])
+    return model.predict(stream[-1])
+
+
+def tuned() -> Any:
+    time = np.arange(30) * 0.1
+    stream = np.stack((np.cos(time), np.sin(time)), -1)
+    return tuple(st.StaFRegressor().tune(stream, stream[:, 0] ** 2)._tuning)
+
+
+def rated(name: str) -> Any:
+    cost = COSTS[name]()
+    return cost.rate(X[:, : cost.dim] if cost.dim == 2 else X, X[:, :1])
+
+
+THINGS: dict[str, Callable[[], Any]] = {
+    **{f"module {k}": lambda c=c: (m := c.make(0.9), c.call(m, X)) for k, c in MODULES.items()},
+    **{f"directions {k}": c.make for k, c in LAYOUTS.items() if c.dim < 4},
+    **{
+        f"radius {k}": lambda m=m: st.StateFollowingCenters(st.rings(3), m())(X)
+        for k, (m, _) in RADII.items()
+    },
+    **{f"weights {k}": lambda k=k: basis_of(k).ideal_weights(X, TARGETS["paper"][0]()) for k in KERNELS},
+    **{f"target {k}": lambda m=m: m()(X) for k, (m, _) in TARGETS.items()},
+    **{f"law {k}": lambda law=law: chased(law) for k, law in DESCENDING.items()},
+    **{f"predictor {k}": lambda p=p: chased(LAW, p) for k, p in PREDICTORS.items()},
+    **{f"basis {k}": lambda k=k: chased(LAW, None, k) for k in BASES},
+    **{f"plant {k}": lambda k=k: held(k) for k in PLANTS},
+    **{f"cost {k}": lambda k=k: rated(k) for k in COSTS},
+    **{f"states of {k}": lambda c=c: (c.goal(), c.states(4, 1), c.cost()) for k, c in CASES.items()},
+    "guesses": shooting,
+    "stream": learned,
+    "discs": lambda: avoidance.scenarios(
+        settings("experiment=avoidance", "trajectories=3", "avoidance.speed=0.1")
+    ),
+    "unicycles": lambda: avoidance.scenarios(
+        settings("experiment=avoidance", "trajectories=3", "avoidance.vehicle=unicycle")
+    ),
+    "motion": lambda: systems.simulate(systems.VanDerPol(), X, dt=0.05, steps=5),
+    "minimal count": lambda: theory.minimal_count(
+        TARGETS["paper"][0](), st.ExponentialKernel(), X, radius=0.3, epsilon=1e-2
+    ),
+    "tuned stream": tuned,
+    "sensitivity": lambda: (
+        st.StaF(basis_of("gaussian"), (3,)).fit_(X, TARGETS["paper"][0]()).hessian(X[:, None])
+    ),
+}
+
+
+@pytest.mark.parametrize("name", list(THINGS))
+def test_no_number_depends_on_the_default_dtype(name: str) -> None:
+    torch.manual_seed(0)
+    with default(torch.float32):
+        single = list(numbers(THINGS[name]()))
+    torch.manual_seed(0)
+    with default(torch.float64):
+        double = list(numbers(THINGS[name]()))
+    assert len(single) == len(double) > 0
+    for one, two in zip(single, double, strict=True):
+        assert one.dtype == two.dtype
+        torch.testing.assert_close(one, two, rtol=0, atol=0, equal_nan=True)
