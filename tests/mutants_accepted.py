@@ -9,6 +9,7 @@ from pathlib import Path
 from mutants import Mutant
 
 _DEVICE = "of another device than the processor, which machines that run the tests lack"
+_ENCODING = "of a locale other than UTF-8, which machines that run the tests lack"
 _LOOKS = "how a line of a figure is drawn, not where"
 _STYLE = (
     "marker",
@@ -23,6 +24,7 @@ _STYLE = (
 )
 _SPEED = "decides which of two ways that find the same is taken: the threshold is of speed alone"
 _EDGE = "a number that equals a tolerance (below 1e-3) to the last bit, which none does but by chance"
+_LENGTHS = "an assertion of our own that lengths agree; other assertions are no mutants either"
 _TOLERANCE = 1e-3
 _EDGES = {ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt}
 _ROOT = Path(__file__).resolve().parent.parent
@@ -32,8 +34,12 @@ def accepted(mutant: Mutant) -> str | None:
     """Why a mutant changes nothing that anybody could see; None where it does."""
     if _at_a_tolerance(mutant):
         return _EDGE
+    if _of_lengths(mutant):
+        return _LENGTHS
     if _without(mutant, "device"):
         return _DEVICE
+    if _without(mutant, "encoding"):
+        return _ENCODING
     if mutant.room == "figures" and any(_without(mutant, name) for name in _STYLE):
         return _LOOKS
     return ACCEPTED.get(mutant.key)
@@ -43,6 +49,15 @@ def _without(mutant: Mutant, name: str) -> bool:
     """Whether all that a mutant changes is that a call lacks an argument of that name."""
     fewer = re.sub(rf",?\s*\b{name}=[^,()]*(\([^()]*\))?[^,()]*(?=[,)])", "", mutant.was, count=1)
     return fewer != mutant.was and _plain(fewer) == _plain(mutant.now)
+
+
+def _of_lengths(mutant: Mutant) -> bool:
+    """Whether all that a mutant changes is that `zip` does not see whether lengths agree."""
+    if mutant.was == "True":
+        return (
+            "strict=True" in mutant.context and "zip(" in mutant.context and mutant.context.count("True") == 1
+        )
+    return mutant.was.startswith("zip(") and "strict=True" in mutant.was and _without(mutant, "strict")
 
 
 def _at_a_tolerance(mutant: Mutant) -> bool:

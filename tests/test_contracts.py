@@ -73,7 +73,7 @@ def nodes(node: Any) -> Iterator[dict[str, Any]]:
 def signature(target: str) -> dict[str, inspect.Parameter]:
     """Parameters of what a target makes: of the class, also where a method of it makes one from settings."""
     thing: Any = staf_torch
-    importlib.import_module("staf_torch.adp")
+    classes()  # all packages are attributes then
     found = [thing := getattr(thing, name) for name in target.split(".")[1:]]
     kind = next((each for each in found if inspect.isclass(each)), found[-1])
     return dict(inspect.signature(kind).parameters)

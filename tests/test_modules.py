@@ -215,6 +215,7 @@ OTHERS |= {
     "GlobalValue",
     "BoxFilter",
     "SafetyFilter",
+    "DetourRollout",
     "FilteredPolicy",
     "PlanReplay",
     "RememberedPolicy",

@@ -58,6 +58,7 @@ from .controllers import Supervised as Supervised
 from .cost import BoundedInputCost as BoundedInputCost
 from .cost import Cost as Cost
 from .cost import QuadraticCost as QuadraticCost
+from .detours import DetourRollout as DetourRollout
 from .energy_shaping import EnergyShaping as EnergyShaping
 from .extrapolation import Extrapolation as Extrapolation
 from .extrapolation import QuadraturePoints as QuadraturePoints
@@ -117,6 +118,7 @@ __all__ = [
     "Controller",
     "ControllerState",
     "Cost",
+    "DetourRollout",
     "DirectShooting",
     "Doubling",
     "DriftAdaptation",

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ..approximation.basis import StaFBasis
-from ..centers import StateFollowingCenters
+from ..centers import StateFollowingCenters, cross_polytope
 from ..kernels import ExponentialKernel
 from ..lanes import ready
 from ..numerics.checks import fail, flag, positive_real
@@ -198,17 +198,19 @@ def near_optimal(
     """A policy for a plant, held for dt, that costs no more than its LQR.
 
     The rules: the base is the LQR made for dt; the horizon is two time constants of its slowest mode (three
-    with ``plan``), 12 to 60 periods, four quarters; the centers are as many as quadratics need, from
-    four states on the cross-polytope and its middle, in a ball of ``radius``; a plant in continuous time is
-    integrated in steps of a fifth of its fastest time constant. Rollouts of an LQR do not know what to do
-    before a bound of the inputs. With ``plan`` the policy's ``controller()``, for loops, is a
-    `RecedingHorizon` over that horizon, of which the first plan is the best that `BoxDDP` finds from the
-    LQR and from holding a bound for a while, and that is carried and improved from control to control, in
-    some milliseconds. It takes a plant in torch, held for one period of its own, without a discount. The
-    policy as a function of x makes such a plan anew, in tens of milliseconds, where the LQR, followed
-    from x over the horizon, meets a bound; in a loop two ways around that cost nearly the same would take
-    turns. ``report()`` says how often bounds are met, ``strained``. A simulator so slow that a control
-    takes more than half of dt is a warning in the log, with the share.
+    with plans), 12 to 60 periods, four quarters; the centers are as many as quadratics need, from four
+    states on the cross-polytope and its middle, in a ball of ``radius`` (of a simulator, whose time is what a
+    control takes, on the cross-polytope of the inputs alone, as `SampledRollout` says); a plant in continuous
+    time is integrated in steps of a fifth of its fastest time constant.
+
+    Rollouts of an LQR do not know what to do before a bound of the inputs. With ``plan`` the policy's
+    ``controller()``, for loops, is a `RecedingHorizon` over that horizon, of which the first plan is the best
+    that `BoxDDP` finds from the LQR and from holding a bound for a while, and that is carried and improved
+    from control to control, in some milliseconds. It takes a plant in torch, held for one period of its own,
+    without a discount. The policy as a function of x makes such a plan anew, in tens of milliseconds, where
+    the LQR, followed from x over the horizon, meets a bound; in a loop two ways around that cost nearly the
+    same would take turns. ``report()`` says how often bounds are met, ``strained``.
+    A simulator so slow that a control takes more than half of dt is a warning in the log, with the share.
 
     Example:
         >>> import numpy as np
@@ -257,7 +259,11 @@ def near_optimal(
     if plant.period is None:
         a, _ = plant.linearisation(placed.target, placed.target_input)
         substeps = max(1, math.ceil(period * float(torch.linalg.eigvals(a).abs().max()) / _RESOLVED))
-    basis = StaFBasis(ExponentialKernel(), StateFollowingCenters(ball_directions(None, placed.dim), radius))
+    directions = ball_directions(None, placed.dim)
+    if not plant.traceable and placed.inputs < placed.dim:
+        corners = cross_polytope(placed.inputs)
+        directions = torch.cat((corners, torch.zeros_like(corners[:1])))
+    basis = StaFBasis(ExponentialKernel(), StateFollowingCenters(directions, radius))
     policy = NearOptimal(
         basis, plant, placed, lqr, lqr.value, lqr.p, period=period, steps=steps, substeps=substeps
     )

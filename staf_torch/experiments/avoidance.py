@@ -64,6 +64,9 @@ class AmongDiscs(ControlAffineSystem):
         still = torch.zeros_like(moving)
         return torch.cat((self.vehicle.rate(own, u), torch.cat((moving, still), dim=-1).flatten(-2)), dim=-1)
 
+    def motion(self, x: Tensor, u: Tensor) -> Tensor:
+        return self.rate(x, u)  # the sum f + g u would compute it three times
+
     def drift(self, x: Tensor) -> Tensor:
         return self.rate(x, x.new_zeros(*x.shape[:-1], 2))
 
@@ -86,7 +89,7 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
     vehicle = made(cfg, dt)
     discs = (x0.shape[-1] - vehicle.size) // 4
     system = AmongDiscs(vehicle, discs).to(device)
-    cost = _cost(cfg, vehicle, system.dim or 0)
+    cost = vehicle_cost(cfg, vehicle, system.dim or 0)
 
     def wanted(x: Tensor) -> Tensor:
         u: Tensor = vehicle.policy(x[..., : vehicle.size])
@@ -95,7 +98,7 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
     guard = SafetyFilter(
         wanted,
         system,
-        [_apart(vehicle, k, radius) for k in range(discs)],
+        [apart(vehicle, k, radius) for k in range(discs)],
         dt=dt,
         low=[-bound for bound in vehicle.bounds],
         high=list(vehicle.bounds),
@@ -187,7 +190,7 @@ def distance(state: Tensor, radius: float, size: int = 4) -> Tensor:
     return apart.amin(-1) - radius
 
 
-def _apart(vehicle: Vehicle, k: int, radius: float) -> Constraint:
+def apart(vehicle: Vehicle, k: int, radius: float) -> Constraint:
     """|point - c_k|^2 - (radius + reach)^2: where it holds the vehicle is outside."""
     at, far = vehicle.size + 4 * k, radius + vehicle.reach
     return lambda x, t: (vehicle.point(x[:, : vehicle.size]) - x[:, at : at + 2]).square().sum(-1) - far**2
@@ -201,14 +204,11 @@ def _still(vehicle: Vehicle, x: Tensor) -> Tensor:
     return far
 
 
-def _cost(cfg: DictConfig, vehicle: Vehicle, dim: int) -> QuadraticCost:
+def vehicle_cost(cfg: DictConfig, vehicle: Vehicle, dim: int) -> QuadraticCost:
     """x'Qx and u'Ru of the vehicle, of a unicycle of its point; the discs cost nothing."""
     low, high = [-bound for bound in vehicle.bounds], list(vehicle.bounds)
     if vehicle.size == 4:
-        weights = QuadraticCost(cfg.adp.q, cfg.adp.r, 4, 2)
-        state = torch.zeros(dim, dim, dtype=torch.float64)
-        state[:4, :4] = weights.q
-        return QuadraticCost(state, weights.r, dim, 2, low=low, high=high)
+        return QuadraticCost(cfg.adp.q, cfg.adp.r, dim, 2, low=low, high=high, output=lambda x: x[..., :4])
     home = [-vehicle.reach] + [0.0] * (dim - 1)  # where the point is at the origin
 
     def output(x: Tensor) -> Tensor:

@@ -11,7 +11,7 @@ struct Call {
     double *table;  // of rows that began with zeros and were cleared
 
     const double *x, *y, *lapse;  // (streams, n), (streams, K), (streams)
-    double *mean, *variance;      // (streams, K)
+    double *mean, *deviation;     // (streams, K)
     const Rules *rules;
 };
 
@@ -163,7 +163,8 @@ static bool beyond(const Rules &r, const Stream &s, const double *x, const doubl
     for (int i = 0; i < n + K; ++i) {
         const double value = i < n ? x[i] : y[i - n];
         if (!(std::fabs(value) < 1e150)) return true;
-        if (s.clock >= 40 && !(std::fabs(value - s.center[i]) < r.far * s.spread[i])) return true;
+        const double most = s.clock >= 40 ? r.far : 1e100;  // young units may be tiny: squares must be numbers
+        if (s.clock >= 2 && !(std::fabs(value - s.center[i]) < most * s.spread[i])) return true;
     }
     return false;
 }
@@ -206,15 +207,17 @@ static void rescale(const Rules &r, Stream &s) {
         auto value = [&](int j) { return i < n ? s.x[j][i] : s.y[j][i - n]; };
         double middle = median(count, value);
         const double typical = median(count, [&](int j) { return std::fabs(value(j) - middle); });
-        double mean = 0, sum = 0, inside = 0;
+        double mean = 0, sum = 0, inside = 0, largest = 0;
         auto usual = [&](int j) { return typical == 0 || std::fabs(value(j) - middle) <= r.outlying * typical; };
         for (int j = 0; j < count; ++j)
             if (usual(j)) mean += value(j), inside += 1;
         mean /= inside;
         for (int j = 0; j < count; ++j)
-            if (usual(j)) sum += square(value(j) - mean);
-        const double spread = std::sqrt(sum / inside);
-        s.center[i] = mean, s.spread[i] = spread > 1e-12 * std::fabs(mean) ? spread : 1;
+            if (usual(j)) largest = std::max(largest, std::fabs(value(j) - mean));
+        for (int j = 0; j < count; ++j)  // of the largest, whose square may be no number
+            if (usual(j) && largest > 0) sum += square((value(j) - mean) / largest);
+        const double spread = largest * std::sqrt(sum / inside);
+        s.center[i] = mean, s.spread[i] = spread > std::max(1e-12 * std::fabs(mean), 1e-150) ? spread : 1;
     }
     std::fill(s.low, s.low + K, infinity);
     std::fill(s.high, s.high + K, -infinity);
@@ -449,7 +452,7 @@ static void learn(const Rules &r, Stream &s, const double *given, const double *
     for (int o = 0; o < K; ++o) some |= told[o] == told[o], sound &= !std::isinf(told[o]);
     for (int i = 0; i < n; ++i)
         if (std::isfinite(given[i]) && std::fabs(given[i]) < 1e150) s.last_x[i] = given[i];
-    s.time += lapse;
+    s.time += lapse, s.unlearned += lapse;
     if (!sound || !some || !measured) {
         s.skipped += 1;
         return;
@@ -465,27 +468,29 @@ static void learn(const Rules &r, Stream &s, const double *given, const double *
         clear(r, s);
         std::copy(x, x + n, s.last_x);
         s.time = time;
-        if (beyond(r, s, x, y)) s.skipped += 1;
-        else s.far = 0;
+        s.far = beyond(r, s, x, y) ? streak_limit : 0;
+        s.skipped += s.far > 0;
     } else if (s.far > 0) s.skipped += 1;
     else if (known) {
+        lapse = s.unlearned, s.unlearned = 0;
         if (waits(r, s, x, y, told, lapse)) return;
         for (int o = 0; o < K; ++o)
             if (told[o] == told[o]) judge_members(r, s, o, in_units(r, s, o, y[o]));
     }
     if (s.far > 0) return;
+    s.unlearned = 0;
     notice(s, y);
     accept(r, s, x, y, s.time, lapse);
 }
 
-static void tell(const Rules &r, Stream &s, const double *given, double *mean, double *variance) {
+static void tell(const Rules &r, Stream &s, const double *given, double *mean, double *deviation) {
     double x[n];
     for (int i = 0; i < n; ++i) x[i] = given[i] == given[i] ? given[i] : s.last_x[i];
     if (s.count > 0) ask(r, s, x);
     for (int o = 0; o < K; ++o) {
         const double scale = scale_of(r, s, n + o);
         mean[o] = s.count > 0 ? s.mean[o] * scale + shift_of(r, s, n + o) : 0;
-        variance[o] = s.count > 0 ? s.variance[o] * scale * scale : 1;
+        deviation[o] = s.count > 0 ? std::sqrt(s.variance[o]) * scale : 1;
     }
 }
 
@@ -493,7 +498,7 @@ extern "C" void staf_bank(const Call *call) {
     Stream *streams = reinterpret_cast<Stream *>(call->table);
     for (int64_t i = 0; i < call->streams; ++i) {
         Stream &s = streams[i];
-        if (call->mode & 1) tell(*call->rules, s, call->x + i * n, call->mean + i * K, call->variance + i * K);
+        if (call->mode & 1) tell(*call->rules, s, call->x + i * n, call->mean + i * K, call->deviation + i * K);
         if (call->mode & 2)
             learn(*call->rules, s, call->x + i * n, call->y + i * K, call->lapse ? call->lapse[i] : 1);
     }

@@ -46,4 +46,5 @@ struct Stream {  // the row of a stream in the table of bank.py
     double means[K][members], variances[K][members], mixed[K][clocks], mixed_variance[K][clocks];
     double blend[K][blends], straight[K], mean[K], variance[K];
     double x[C][n], y[C][K], when[C], order[C], gap[C];
+    double unlearned;  // time that has passed in samples that were skipped
 };

@@ -9,7 +9,7 @@ struct Call {
     const REAL *x, *y;              // (streams, n), (streams, K)
     const double *lapse;            // (streams), or null for ones
     const double *ratio, *forgetting;  // (streams)
-    REAL *mean, *variance;          // (streams, K)
+    REAL *mean, *deviation;         // (streams, K)
     Functions functions;
     double slack2, robust, base, tiny, most, limit;
 };
@@ -100,13 +100,13 @@ static void tell(const Call &call) {
         auto get = [&](int i) { return load(learned + i * lanes); };
         predict(call.functions, law_of(call, first, count), s, get, x, mean, variance);
         if (K == 1 && count == lanes) {
-            save(call.mean + first, mean[0]), save(call.variance + first, variance[0]);
+            save(call.mean + first, mean[0]), save(call.deviation + first, root(variance[0]));
             continue;
         }
         for (int o = 0; o < K; ++o)
             for (int l = 0; l < count; ++l) {
                 call.mean[(first + l) * K + o] = REAL(mean[o][l]);
-                call.variance[(first + l) * K + o] = REAL(variance[o][l]);
+                call.deviation[(first + l) * K + o] = REAL(std::sqrt(variance[o][l]));
             }
     }
 }

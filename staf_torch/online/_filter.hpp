@@ -264,7 +264,7 @@ INLINE Mask update(const Functions &f, const Law &law, Filter &s, Get learned, P
         const V part = gain[i] * inverse;
         for (int j = 0; j <= i; ++j, ++at) {
             const V old = learned(at), next = old * share + part * gain[j];
-            put(at, good ? next : old);
+            put(at, good ? next : old * share);  // time passes, whatever becomes of the sample
         }
     }
     return good;

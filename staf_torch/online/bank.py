@@ -43,7 +43,7 @@ class _Call(ctypes.Structure):
     _fields_ = (
         ("streams", ctypes.c_int64),
         ("mode", ctypes.c_int64),
-        *((name, ctypes.c_void_p) for name in ("table", "x", "y", "lapse", "mean", "variance", "rules")),
+        *((name, ctypes.c_void_p) for name in ("table", "x", "y", "lapse", "mean", "deviation", "rules")),
     )
 
 
@@ -133,8 +133,12 @@ class Bank:
             ValueError: if the table has another shape, dtype or device, or numbers that no bank has written:
                 compiled code goes by them.
         """
-        table = state["table"]
-        refuse_other(state, {"table": self.table}, size(self.shape), table.shape[-1])
+        table = state.get("table")
+        if not isinstance(table, Tensor):
+            raise ValueError("`StaFRegressor.load_state_dict(state=...)` must have a tensor 'table'.")
+        if "arguments" not in state and table.shape[-1] == size(self.shape) - 1:  # of an older version
+            table = torch.nn.functional.pad(table, (0, 1))
+        refuse_other({"table": table}, {"table": self.table}, size(self.shape), table.shape[-1])
         refuse_unwritten(self.shape, table)
         self.replace(table.clone())
 
@@ -149,17 +153,17 @@ class Bank:
         return self.table[:, 3].long()
 
     def predict(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and variance of the next y at x (S, n), contiguous float64: (S, K), (S, K)."""
+        """Mean and standard deviation of the next y at x (S, n), contiguous float64: (S, K), (S, K)."""
         shape = len(self.table), self.shape.outputs
-        mean, variance = x.new_empty(shape), x.new_empty(shape)
+        mean, deviation = x.new_empty(shape), x.new_empty(shape)
         if self._run is None:
             for i, stream in enumerate(self._definition.each(self.table)):
-                mean[i], variance[i] = self._definition.predict(stream, x[i])
-            return mean, variance
+                mean[i], deviation[i] = self._definition.predict(stream, x[i])
+            return mean, deviation
         call = self._call
-        call.mode, call.x, call.mean, call.variance = 1, x.data_ptr(), mean.data_ptr(), variance.data_ptr()
+        call.mode, call.x, call.mean, call.deviation = 1, x.data_ptr(), mean.data_ptr(), deviation.data_ptr()
         self._run(ctypes.byref(call))
-        return mean, variance
+        return mean, deviation
 
     def learn(self, x: Tensor, y: Tensor, lapse: Tensor | None = None) -> None:
         """Learn one sample a stream: (S, n), (S, K), contiguous float64; time since the last sample, (S,)."""

@@ -111,13 +111,13 @@ class BankDefinition:
         return state
 
     def predict(self, s: Views, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and variance at x (n,): (K,), (K,)."""
+        """Mean and standard deviation at x (n,): (K,), (K,)."""
         x = torch.where(torch.isnan(x), s["last_x"], x)
         if s.number("count") == 0:
             return torch.zeros_like(s["mean"]), torch.ones_like(s["mean"])
         self._ask(s, x)
         center, spread = (part[self.shape.dim :] for part in self._units(s))
-        return s["mean"] * spread + center, s["variance"] * spread.square()
+        return s["mean"] * spread + center, s["variance"].sqrt() * spread
 
     def _ask(self, s: Views, x: Tensor) -> None:
         """What every member says at x, and their mixture."""
@@ -126,7 +126,7 @@ class BankDefinition:
         u = torch.cat((torch.ones(1, dtype=torch.float64), (x - center[:n]) / spread[:n]))
         line = (s["linear"] * u).sum(-1)
         process = self._local_processes(s, x, u[1:], line)
-        carried = self.filter.predict(self._filters(s), u[1:].expand(len(r.forgetting), -1))
+        carried = self.filter.moments(self._filters(s), u[1:].expand(len(r.forgetting), -1))
         latest = s["waiting_y" if s.number("waiting") == 1 else "last_y"]
         last = ((latest - center[n:]) / spread[n:])[:, None]
         common = (1 + (u * (s["covariance"] * u).sum(-1)).sum()).expand_as(last)
@@ -206,6 +206,7 @@ class BankDefinition:
         count = int(s.number("count"))
         samples = torch.cat((s["x"], s["y"]), 1)[:count]
         center, spread = units_of(samples)
+        spread = torch.where(spread > 1e-150, spread, 1.0)
         s["center"].copy_(center)
         s["spread"].copy_(spread)
         s["low"].fill_(torch.inf)
@@ -241,8 +242,10 @@ class BankDefinition:
         both = torch.cat((x, y))
         if not bool((both.abs() < 1e150).all()):
             return True
-        near = (both - s["center"]).abs() < self.rules.far * s["spread"]
-        return s.number("clock") >= 40 and not bool(near.all())
+        # young units may be tiny: squares must be numbers
+        most = self.rules.far if s.number("clock") >= 40 else 1e100
+        near = (both - s["center"]).abs() < most * s["spread"]
+        return s.number("clock") >= 2 and not bool(near.all())
 
     def _keep(self, s: Views, x: Tensor, y: Tensor, time: float) -> None:
         """Keep (x, y). A full store gives up the older of the closest pair of those that are not recent."""
@@ -275,7 +278,8 @@ class BankDefinition:
         """Learn one sample: (n,), (K,)."""
         x = torch.where(torch.isnan(given), s["last_x"], given)
         s["last_x"].copy_(torch.where(given.abs() < 1e150, given, s["last_x"]))
-        s["time"].add_(lapse)
+        for name in ("time", "unlearned"):
+            s[name].add_(lapse)
         seen = ~torch.isnan(told)
         sound = bool(
             torch.isfinite(x).all() & seen.any() & ~torch.isnan(given).all() & ~torch.isinf(told).any()
@@ -297,6 +301,8 @@ class BankDefinition:
             s["time"].copy_(time)
             s["far"].fill_(float(STREAK) if self._beyond(s, x, y) else 0.0)
         elif known and s.number("far") == 0:
+            lapse = s.number("unlearned")
+            s["unlearned"].zero_()
             since = self._waits(s, x, y, seen, lapse)
             if since is None:
                 return
@@ -305,6 +311,7 @@ class BankDefinition:
         if s.number("far") > 0:
             s["skipped"].add_(1)
             return
+        s["unlearned"].zero_()
         self._notice(s, y)
         self._accept(s, x, y, s.number("time"), lapse)
 

@@ -198,6 +198,7 @@ def layout(shape: BankShape) -> list[tuple[str, tuple[int, ...]]]:
         ("x", (c, n)),
         ("y", (c, k)),
         *((name, (c,)) for name in ("when", "order", "gap")),
+        ("unlearned", ()),  # time that has passed in samples that were skipped
     ]
 
 

@@ -55,7 +55,7 @@ class _Call(ctypes.Structure):
         ("mode", ctypes.c_int64),
         *((name, ctypes.c_void_p) for name in ("table", "counts", "x", "y", "lapse", "ratio", "forgetting")),
         ("mean", ctypes.c_void_p),
-        ("variance", ctypes.c_void_p),
+        ("deviation", ctypes.c_void_p),
         ("functions", FunctionPointers),
         *((name, ctypes.c_double) for name in ("slack2", "robust", "base", "tiny", "most", "limit")),
     )
@@ -99,13 +99,13 @@ class CompiledFilter:
         return definition if call is None else cls(definition, state, call)
 
     def predict(self, state: StreamState, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and variance of the next y at x (S, n), contiguous, in the table's dtype: (S, K) each."""
-        mean, variance = x.new_empty(self._shape), x.new_empty(self._shape)
+        """Mean and standard deviation of the next y at x (S, n), contiguous, of the table's dtype: (S, K)."""
+        mean, deviation = x.new_empty(self._shape), x.new_empty(self._shape)
         call = self._call
         call.mode, call.x = 1, x.data_ptr()
-        call.mean, call.variance = mean.data_ptr(), variance.data_ptr()
+        call.mean, call.deviation = mean.data_ptr(), deviation.data_ptr()
         self._run(self._pointer)
-        return mean, variance
+        return mean, deviation
 
     def learn(self, state: StreamState, x: Tensor, y: Tensor, lapse: Tensor | None = None) -> None:
         """Learn one sample a stream: (S, n), (S, K), contiguous and in the table's dtype; (S,) float64."""

@@ -8,10 +8,11 @@ import torch
 from torch import Tensor
 
 from .compiled_filter import CompiledFilter
-from .kalman_filter import LocalFilter, StreamState
+from .kalman_filter import STREAK, LocalFilter, StreamState
 
 LEARNED_AT = (2, 5, 10, 20, 40)  # samples after which the units are learned
 OUTLYING = 30.0  # median deviations beyond which a value has no say in them
+FAR = 1e3  # spreads from the center where units say nothing: a stream that stays there learns new ones
 
 
 class FilterStreams:
@@ -21,23 +22,40 @@ class FilterStreams:
         definition: the filter; its ratio and forgetting have an entry a stream, or one for all.
         state: of the streams.
         scaling: whether the units of x and y are learned from the first samples of each stream.
-        units: centers and spreads (S, 2 (n + K)) that are known instead.
+        units: centers and spreads (S, 2 (n + K)) that are known instead, NaN where they are not.
+        stretch: by which learned spreads are multiplied, (S, n + K), ones by default.
     """
 
     def __init__(
-        self, definition: LocalFilter, state: StreamState, scaling: bool, units: Tensor | None = None
+        self,
+        definition: LocalFilter,
+        state: StreamState,
+        scaling: bool,
+        units: Tensor | None = None,
+        stretch: Tensor | None = None,
     ) -> None:
         self.scaling = scaling
         self.dtype = state.dtype
         size, wide = state.streams, state.dim + state.outputs
         like = state.blocks.new_zeros(0, dtype=torch.float64)
-        self.units = torch.cat((like.new_zeros(size, wide), like.new_ones(size, wide)), 1)  # centers, spreads
+        self.units = like.new_zeros(size, 2 * wide)  # centers, spreads
+        self._stretch = self.units.new_ones(size, wide) if stretch is None else stretch.double()
+        self._known = torch.full_like(self.units, torch.nan) if units is None else units.double()
         self.first = like.new_zeros(size, LEARNED_AT[-1] if scaling else 0, wide + 1)  # samples and lapses
-        self.clock = torch.zeros(size, dtype=torch.int64)
-        if units is not None:
-            self.units, self.clock = units.double(), self.clock + LEARNED_AT[-1]
-        self._law = (definition.ratio[:1].clone(), definition.forgetting[:1].clone())
+        self.clock = torch.zeros(
+            size, dtype=torch.int64
+        )  # of first samples; behind them, of far ones in a row
+        self._begin(torch.arange(size))
         self._hold(definition, state)
+
+    def _begin(self, rows: Tensor) -> None:
+        """Streams with these numbers know no units but those that they were given."""
+        wide, known = self.units.shape[1] // 2, self._known[rows]
+        given = known.isfinite().all(1)
+        unit = torch.arange(2 * wide) >= wide
+        self.units[rows] = torch.where(given[:, None], known, unit.double())
+        self.clock[rows] = torch.where(given, LEARNED_AT[-1], 0)
+        self.first[rows] = 0.0
 
     def _hold(self, definition: LocalFilter, state: StreamState) -> None:
         """Filter these streams from now on."""
@@ -58,26 +76,29 @@ class FilterStreams:
         return self.state.counts[1]
 
     def predict(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and variance of the next y at x (S, n): (S, K), (S, K)."""
+        """Mean and standard deviation of the next y at x (S, n): (S, K), (S, K)."""
         if not self.scaling:
             return self._filter.predict(self.state, x)
         n = self.state.dim
-        mean, variance = self._filter.predict(self.state, (x - self._center[:, :n]) / self._spread[:, :n])
-        return mean * self._spread[:, n:] + self._center[:, n:], variance * self._spread[:, n:].square()
+        mean, deviation = self._filter.predict(self.state, (x - self._center[:, :n]) / self._spread[:, :n])
+        return mean * self._spread[:, n:] + self._center[:, n:], deviation * self._spread[:, n:]
 
     def learn(self, x: Tensor, y: Tensor, lapse: Tensor | None = None) -> None:
         """Learn one sample a stream: (S, n), (S, K), (S,)."""
         if not self.scaling:
             self._filter.learn(self.state, x, y, lapse)
             return
-        n, young = self.state.dim, self.clock < LEARNED_AT[-1]
+        n = self.state.dim
+        self._leave(x, y)
+        young = self.clock < LEARNED_AT[-1]
         complete = torch.isfinite(x).all(1) & torch.isfinite(y).all(1) & young
         due = torch.zeros_like(complete)
-        if bool(complete.any()):
+        if bool(young.any()):
+            rows = young.nonzero().squeeze(1)
+            lapses = torch.ones_like(rows, dtype=torch.float64) if lapse is None else lapse[rows]
+            self.first[rows, self.clock[rows], -1] += lapses  # since the last complete one
             rows = complete.nonzero().squeeze(1)
-            lapses = torch.ones(self.count, 1) if lapse is None else lapse.unsqueeze(1)
-            sample = torch.cat((x.double(), y.double(), lapses.double()), 1)
-            self.first[rows, self.clock[rows]] = sample[rows]
+            self.first[rows, self.clock[rows], :-1] = torch.cat((x, y), 1)[rows].double()
             self.clock[rows] += 1
             due = complete & torch.isin(self.clock, torch.tensor(LEARNED_AT))
         rest = torch.where(due.unsqueeze(1), torch.nan, (y - self._center[:, n:]) / self._spread[:, n:])
@@ -87,11 +108,28 @@ class FilterStreams:
             for row in due.nonzero().squeeze(1).tolist():
                 self._rescale(row)
 
+    def _leave(self, x: Tensor, y: Tensor) -> None:
+        """Let streams learn new units that have been far from what these were learned from for long."""
+        settled = (self.clock >= LEARNED_AT[-1]) & ~self._known.isfinite().all(1)
+        if not bool(settled.any()):
+            return
+        center, spread = self.units.chunk(2, dim=1)
+        both = torch.cat((x, y), 1).double()
+        far = ((both - center).abs() > FAR * spread).any(1) & torch.isfinite(x).all(1)
+        clock = torch.where(far, self.clock + 1, LEARNED_AT[-1])
+        self.clock = torch.where(settled & ~both.isnan().any(1), clock, self.clock)
+        gone = (self.clock >= LEARNED_AT[-1] + STREAK).nonzero().squeeze(1)
+        if len(gone):
+            counts = self.state.counts[:2, gone].clone()
+            self.clear(gone)
+            self.state.counts[:2, gone] = counts
+
     def _rescale(self, row: int) -> None:
         """Take the units of a stream from its first samples, and learn these again."""
         wide, n = self.state.dim + self.state.outputs, self.state.dim
         samples = self.first[row, : self.clock[row]]
         center, spread = units_of(samples[:, :wide])
+        spread = spread * self._stretch[row]
         self.units[row] = torch.cat((center, spread))
         self._center, self._spread = self.units.to(self.dtype).split(wide, dim=1)
         u = ((samples[:, :wide] - center) / spread).to(self.dtype)
@@ -118,7 +156,8 @@ class FilterStreams:
         if not self.scaling or bool((self.clock >= LEARNED_AT[-1]).all()):
             return self.units[:, :wide], self.units[:, wide:]
         found = [units_of(row[torch.isfinite(row).all(1)]) for row in samples.unbind(1)]
-        return torch.stack([pair[0] for pair in found]), torch.stack([pair[1] for pair in found])
+        spreads = torch.stack([pair[1] for pair in found]) * self._stretch
+        return torch.stack([pair[0] for pair in found]), spreads
 
     def clear(self, rows: Tensor) -> None:
         """Let the streams with these numbers begin anew."""
@@ -126,38 +165,41 @@ class FilterStreams:
         table = self.state.table
         table[:, rows], self.state.counts[:, rows] = fresh.table, fresh.counts
         self.state.put(table)
-        self.clock[rows] = 0
-        wide = self.units.shape[1] // 2
-        self.units[rows, :wide], self.units[rows, wide:] = 0.0, 1.0
-        self._center, self._spread = self.units.to(self.dtype).split(wide, dim=1)
+        self._begin(rows)
+        self._center, self._spread = self.units.to(self.dtype).chunk(2, dim=1)
 
     def add(self, streams: int) -> None:
         """Begin further streams, behind the others."""
         fresh = StreamState.empty(self.state.blocks, streams, *self.state.sizes)
         table = torch.cat((self.state.table, fresh.table), 1)
         state = self.state.with_table(table, torch.cat((self.state.counts, fresh.counts), 1))
-        wide = self.units.shape[1] // 2
-        new = torch.cat((self.units.new_zeros(streams, wide), self.units.new_ones(streams, wide)), 1)
-        self.units = torch.cat((self.units, new))
+        new = self.units.new_full((streams, self.units.shape[1]), torch.nan)
+        self.units, self._known = torch.cat((self.units, new)), torch.cat((self._known, new))
         self.first = torch.cat((self.first, self.first.new_zeros(streams, *self.first.shape[1:])))
         self.clock = torch.cat((self.clock, self.clock.new_zeros(streams)))
+        self._stretch = torch.cat((self._stretch, _typical(self._stretch).expand(streams, -1)))
+        self._begin(torch.arange(self.count, self.count + streams))
         old = self.definition
-        ratio, forgetting = (
-            torch.cat((a, b.expand(streams)))
-            for a, b in zip((old.ratio, old.forgetting), self._law, strict=True)
-        )
+        ratio, forgetting = (torch.cat((a, _typical(a).expand(streams))) for a in (old.ratio, old.forgetting))
         self._hold(old.with_law(ratio, forgetting), state)
 
     def keep(self, rows: Tensor) -> None:
         """Go on with the streams with these numbers alone."""
         state = self.state.with_table(self.state.table[:, rows], self.state.counts[:, rows])
         self.units, self.first, self.clock = self.units[rows], self.first[rows], self.clock[rows]
+        self._known, self._stretch = self._known[rows], self._stretch[rows]
         old = self.definition
         self._hold(old.with_law(old.ratio[rows], old.forgetting[rows]), state)
 
     def state_dict(self) -> dict[str, Any]:
-        """Copies of all tensors that learning changes."""
-        return {name: tensor.clone() for name, tensor in self._learned().items()}
+        """Copies of all tensors that learning changes, and what the local functions are told by."""
+        return {name: tensor.clone() for name, tensor in (self._learned() | self._fixed()).items()}
+
+    def _fixed(self) -> dict[str, Tensor]:
+        """What must not be another one: the centers, and the kernel at them."""
+        functions = self.definition.functions
+        zero, offsets = torch.zeros_like(functions.offsets[0]), functions.offsets
+        return {"offsets": offsets, "gram": functions.kernel.core(zero, offsets, offsets).detach()}
 
     def _learned(self) -> dict[str, Tensor]:
         """All tensors that learning changes."""
@@ -174,12 +216,26 @@ class FilterStreams:
         """Take over what `state_dict` of as many streams has.
 
         Raises:
-            ValueError: if a tensor has another shape, dtype or device, since compiled code goes by these.
+            ValueError: if a tensor has another shape, dtype or device, since compiled code goes by these, or
+                if kernel or centers are others.
         """
+        if not isinstance(state.get("table"), Tensor):
+            raise ValueError("`StaFRegressor.load_state_dict(state=...)` must have a tensor 'table'.")
         refuse_other(state, self._learned(), self.state.blocks.shape[1], state["table"].shape[0])
+        for name, own in self._fixed().items():
+            given = state.get(name, own)  # which older versions did not save
+            like = given.shape == own.shape and given.dtype == own.dtype
+            if not like or not torch.allclose(given, own, rtol=1e-9):
+                told = "must have the kernel, radius and centers of this regressor"
+                raise ValueError(f"`StaFRegressor.load_state_dict(state=...)` {told}; {name!r} differs.")
         kept = self.state.with_table(state["table"], state["counts"].clone())
         self.units, self.clock, self.first = (state[name].clone() for name in ("units", "clock", "first"))
         self._hold(self.definition.with_law(state["ratio"].clone(), state["forgetting"].clone()), kept)
+
+
+def _typical(values: Tensor) -> Tensor:
+    """The lower median of every column, which streams that are added begin with: (S, ...) -> (1, ...)."""
+    return values.median(0).values[None]
 
 
 def refuse_other(state: dict[str, Any], own: dict[str, Tensor], expected: int, given: int) -> None:
@@ -196,7 +252,9 @@ def refuse_other(state: dict[str, Any], own: dict[str, Tensor], expected: int, g
         told = f"must have {expected} numbers a stream, as this version and these arguments have; got {given}"
         raise ValueError(f"{name} {told}.")
     for key, tensor in own.items():
-        found = state[key]
+        found = state.get(key)
+        if not isinstance(found, Tensor):
+            raise ValueError(f"{name} must have a tensor {key!r}; got {found!r}.")
         if (found.shape, found.dtype, found.device) != (tensor.shape, tensor.dtype, tensor.device):
             told = f"must have {key!r} of shape {tuple(tensor.shape)}, {tensor.dtype} on {tensor.device}"
             raise ValueError(f"{name} {told}; got {tuple(found.shape)}, {found.dtype} on {found.device}.")
@@ -209,6 +267,9 @@ def units_of(samples: Tensor) -> tuple[Tensor, Tensor]:
     typical = away.median(0).values
     usual = (typical == 0) | (away <= OUTLYING * typical)
     count = usual.sum(0)
-    mean = torch.where(usual, samples, 0.0).sum(0) / count
-    spread = (torch.where(usual, samples - mean, 0.0).square().sum(0) / count).sqrt()
+    mean = (torch.where(usual, samples, 0.0) / count).sum(0)
+    apart = torch.where(usual, samples - mean, 0.0)
+    largest = apart.abs().amax(0)  # its square may be no number
+    part = torch.where(largest > 0, apart / largest, 0.0)
+    spread = largest * (part.square().sum(0) / count).sqrt()
     return mean, torch.where(spread > 1e-12 * mean.abs(), spread, 1.0)

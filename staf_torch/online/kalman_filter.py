@@ -161,6 +161,11 @@ class LocalFilter:
         return LocalFilter(self.functions, *law, self.slack, self.robust, self.base)
 
     def predict(self, state: StreamState, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and standard deviation of the next y at x (S, n): (S, K), (S, K)."""
+        mean, variance = self.moments(state, x)
+        return mean, variance.sqrt()
+
+    def moments(self, state: StreamState, x: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and variance of the next y at x (S, n): (S, K), (S, K)."""
         old = state.parts(state.table.double())
         x = torch.where(torch.isnan(x.mT), old.last, x.mT.double())
@@ -225,7 +230,8 @@ class LocalFilter:
         )
         most = torch.finfo(state.dtype).max
         found, good = self._update(moved, since, _Sample(z, y, seen, lapse, fine, most))
-        kept = [torch.where(good, new, old_) for new, old_ in zip(found, moved, strict=True)]
+        faded = moved._replace(learned=moved.learned * self.forgetting**lapse)  # time passes in any case
+        kept = [torch.where(good, new, old_) for new, old_ in zip(found, faded, strict=True)]
         state.put(state.whole(Parts(*kept)))
         streak = torch.where(afresh & good, 0, streak)
         state.counts.copy_(torch.stack((samples + good, skipped + ~good, streak, since + good)))

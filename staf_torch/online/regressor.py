@@ -15,7 +15,7 @@ from .bank_rules import RECENT, BankShape
 from .filter_arguments import KERNELS as KERNELS
 from .filter_arguments import Sizes, directions, filter_streams
 from .filter_streams import FilterStreams
-from .samples import lapses, like_given, pair, tensor_of
+from .samples import lapse_of, lapses, like_given, pair, tensor_of
 from .smoothing import smooth_record
 from .stream_estimator import StreamEstimator
 from .tuning import tuning
@@ -189,7 +189,7 @@ class StaFRegressor(StreamEstimator):
         Args:
             x: (n,) for a single stream, (S, n) for S streams side by side; tensors or arrays.
             y: x's shape without n, or with K in place of n for K outputs.
-            lapse: time since the sample before, () or (S,), not negative; 1 by default.
+            lapse: time since the call before, () or (S,), finite, not negative; 1 by default.
 
         Raises:
             ValueError: if a shape is another one than at the first sample, or, at the first sample, an
@@ -199,15 +199,13 @@ class StaFRegressor(StreamEstimator):
             self._streams_.learn(x, y)  # what compiled code reads as it is: nothing to convert or check
             return self
         states, values = pair("partial_fit", x, y, (1, 2))
-        return self._learn(
-            states, values, None if lapse is None else tensor_of(f"{_NAME}.partial_fit", "lapse", lapse)
-        )
+        steps = None if lapse is None else lapse_of(lapse, len(states) if states.dim() == 2 else 1)
+        return self._learn(states, values, steps)
 
     def _learn(self, states: Tensor, values: Tensor, lapse: Tensor | None) -> StaFRegressor:
         if not self._is_fitted():
             self._prepare(states, values)
         streams = self._streams_
-        single = self.n_streams_ is None
         if states.shape != self._shape_ or (values.dim() == states.dim()) != (self.n_outputs_ is not None):
             self._check("partial_fit", states, values)
         rows = states.to(streams.dtype).reshape(streams.count, self.n_features_in_).contiguous()
@@ -215,7 +213,7 @@ class StaFRegressor(StreamEstimator):
         if targets.shape[1] != (self.n_outputs_ or 1):
             self._check("partial_fit", states, values)
         if lapse is not None:
-            lapse = lapse.double().expand(1 if single else streams.count).contiguous()
+            lapse = lapse.expand(streams.count).contiguous()
         streams.learn(rows, targets, lapse)
         return self
 
@@ -235,13 +233,14 @@ class StaFRegressor(StreamEstimator):
             ValueError: before the first sample, or for another number of streams or dimensions.
         """
         if self._is_plain(x):
-            mean, variance = self._streams_.predict(x)
+            mean, deviation = self._streams_.predict(x)
             mean = mean.view(self._targets_)
-            return (mean, variance.view(self._targets_).sqrt()) if return_std else mean
+            return (mean, deviation.view(self._targets_)) if return_std else mean
         points = tensor_of(f"{_NAME}.predict", "x", x)
         own = 1 if self._fitted("predict").n_streams_ is None else 2
         several = points.dim() == own + 1
-        if tuple((points.select(-2, 0) if several and points.shape[-2] else points).shape) != self._shape_:
+        shape_of_one = (*points.shape[:-2], points.shape[-1]) if several else tuple(points.shape)
+        if shape_of_one != self._shape_:
             self._check("predict", points)
         streams = self._streams_
         shape = (streams.count, self.n_features_in_)
@@ -253,11 +252,13 @@ class StaFRegressor(StreamEstimator):
         ending = () if self.n_outputs_ is None else (self.n_outputs_,)
 
         def joined(which: int) -> Tensor:
+            if not found:
+                return points.new_empty(*points.shape[:-1], *ending)
             one = found[0][which] if not several else torch.stack([pair[which] for pair in found], dim=1)
             return one.reshape((*points.shape[:-1], *ending))
 
         mean = like_given(x, joined(0))
-        return (mean, like_given(x, joined(1).sqrt())) if return_std else mean
+        return (mean, like_given(x, joined(1))) if return_std else mean
 
     def _is_plain(self, value: Any, target: bool = False) -> bool:
         """Whether compiled code can read a sample in place."""
@@ -270,6 +271,15 @@ class StaFRegressor(StreamEstimator):
             and not value.requires_grad
             and value.is_contiguous()
         )
+
+    def _decisive(self) -> tuple[str, ...]:
+        """Arguments that what was learned depends on."""
+        if self.memory is not None:
+            return ("memory", "neighbours", "robust", "scaling")
+        if self._tuning is not None:
+            return ("memory", "count", "follow", "robust")
+        known = ("radius", "count", "noise", "amplitude", "forgetting", "follow", "robust", "scaling")
+        return ("memory", *known)
 
     def _prepare(self, x: Tensor, y: Tensor) -> None:
         """Infer the sizes from the first sample and check the arguments."""
@@ -296,8 +306,9 @@ class StaFRegressor(StreamEstimator):
     def _check(self, call: str, x: Tensor, y: Tensor | None = None) -> None:
         """Raise unless the shapes are those of the first sample."""
         outputs = () if self.n_outputs_ is None else (self.n_outputs_,)
-        own = x.select(-2, 0) if call == "predict" and x.dim() == len(self._shape_) + 1 else x
-        if tuple(own.shape) != self._shape_ or (y is not None and y.shape != (*self._shape_[:-1], *outputs)):
+        several = call == "predict" and x.dim() == len(self._shape_) + 1
+        own = (*x.shape[:-2], x.shape[-1]) if several else tuple(x.shape)
+        if own != self._shape_ or (y is not None and y.shape != (*self._shape_[:-1], *outputs)):
             given = f"{tuple(x.shape)}" + ("" if y is None else f" and y's {tuple(y.shape)}")
             raise ValueError(
                 f"`{_NAME}.{call}(x=...)` must have the shape {self._shape_} of the first sample, with "

@@ -57,14 +57,30 @@ def pair(call: str, x: Any, y: Any, dims: tuple[int, int]) -> tuple[Tensor, Tens
 
 
 def lapses(time: Any, states: Tensor) -> Tensor | None:
-    """Time since the sample before, (T, S), 1 at the first; None without times."""
+    """Time since the sample before, (T, S) or (T, 1), 1 at the first; None without times."""
     if time is None:
         return None
     given = tensor_of(f"{_NAME}.fit", "time", time).double()
-    if len(given) != len(states) or not bool((given.diff(dim=0) >= 0).all()):
-        raise fail(f"{_NAME}.fit", "time", "must be increasing, (T,) or (T, S)", time)
-    steps = torch.cat((torch.ones_like(given[:1]), given.diff(dim=0)))
-    return steps.reshape(len(states), -1)
+    steps = given.diff(dim=0)
+    fits = tuple(given.shape) in {(len(states),), tuple(states.shape[:-1])}
+    if not fits or not bool(given.isfinite().all() and (steps >= 0).all() and steps.isfinite().all()):
+        streams = "" if states.dim() == 2 else f" or {tuple(states.shape[:-1])}"
+        raise fail(f"{_NAME}.fit", "time", f"must be finite and increasing, ({len(states)},){streams}", time)
+    return torch.cat((torch.ones_like(given[:1]), steps)).reshape(len(states), -1)
+
+
+def lapse_of(lapse: Any, streams: int) -> Tensor:
+    """Time since the sample before, (S,) float64.
+
+    Raises:
+        ValueError: unless it is one number, or one for each stream, finite and not negative.
+    """
+    given = tensor_of(f"{_NAME}.partial_fit", "lapse", lapse).double()
+    fits = given.dim() <= 1 and given.numel() in (1, streams)
+    if not fits or not bool(((given >= 0) & (given < torch.inf)).all()):
+        told = f"must be finite and not negative, () or ({streams},)"
+        raise fail(f"{_NAME}.partial_fit", "lapse", told, lapse)
+    return given.expand(streams).contiguous()
 
 
 def like_given(x: Any, found: Tensor) -> Any:

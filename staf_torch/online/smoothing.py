@@ -56,13 +56,16 @@ def smooth(
     eye = torch.eye(state.count, dtype=torch.float64)
     means, covariances, expected, predicted, transfers, anchors = [], [], [], [], [], []
     for k in range(len(x)):
-        old = state.parts(state.table.double().clone())
+        before, old = state.counts.clone(), state.parts(state.table.double().clone())
         filter_.learn(state, x[k], y[k], lapse[k])
         new = state.parts(state.table.double().clone())
         known = ~torch.isnan(old.anchor).any(0)
         step = torch.where(known, new.anchor - old.anchor, 0.0)
-        transfer, factor = filter_.functions.transfer(torch.where(known, old.anchor, new.anchor), step)
-        transfer = torch.where(step.abs().sum(0) > 0, transfer, eye.unsqueeze(-1)).permute(2, 0, 1)
+        transfer, factor = filter_.functions.transfer(torch.where(known, old.anchor, 0.0), step)
+        transfer = torch.where(step.abs().sum(0) > 0, transfer, eye.unsqueeze(-1))
+        # a stream that starts afresh says nothing about what was before
+        afresh = (before[3] > 0) & (state.counts[3] == 1) & (state.counts[0] > before[0])
+        transfer = torch.where(afresh, 0.0, transfer).permute(2, 0, 1)
         scaled = transfer if factor is None else transfer * factor[:, None, None]
         learned = old.learned.permute(2, 0, 1)
         share = (filter_.forgetting ** lapse[k])[:, None, None]
@@ -72,7 +75,20 @@ def smooth(
         predicted.append(eye - share * transfer @ learned @ transfer.mT)
         transfers.append(scaled)
         anchors.append(new.anchor)
-    return _backwards(filter_, (means, covariances, expected, predicted, transfers, anchors), x.double())
+    around = list(_held(torch.stack(anchors).mT).mT)  # before the first sample: where that will be
+    return _backwards(
+        filter_, (means, covariances, expected, predicted, transfers, around), _held(x.double())
+    )
+
+
+def _held(x: Tensor) -> Tensor:
+    """What was not measured (T, ...) is as it was before, and before the first time as it will be then."""
+    found = x.clone()
+    for k in range(1, len(x)):
+        found[k] = torch.where(torch.isnan(found[k]), found[k - 1], found[k])
+    for k in reversed(range(len(x) - 1)):
+        found[k] = torch.where(torch.isnan(found[k]), found[k + 1], found[k])
+    return found
 
 
 def _backwards(filter_: LocalFilter, record: tuple[list[Tensor], ...], x: Tensor) -> tuple[Tensor, Tensor]:
@@ -84,7 +100,7 @@ def _backwards(filter_: LocalFilter, record: tuple[list[Tensor], ...], x: Tensor
             gain = torch.linalg.solve(predicted[k + 1], transfers[k + 1] @ covariances[k]).mT
             u = means[k] + gain @ (u - expected[k + 1])
             p = covariances[k] + gain @ (p - predicted[k + 1]) @ gain.mT
-        z = torch.where(torch.isnan(x[k].mT), 0.0, x[k].mT - anchors[k])
+        z = x[k].mT - anchors[k]
         local = filter_.functions.local(anchors[k], z)
         psi = local.psi.mT.unsqueeze(-1)  # (S, M, 1)
         factor = torch.ones_like(z[0]) if local.log_factor is None else local.log_factor.exp()

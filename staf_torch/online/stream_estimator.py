@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+import numbers
 from typing import Any, Self
 
 import numpy as np
@@ -16,6 +17,7 @@ from .scikit import ScikitEstimator, not_fitted
 from .tuning import Tuning
 
 _ABOUT = ("n_features_in_", "n_streams_", "n_outputs_")
+_DTYPES = {str(dtype): dtype for dtype in (torch.float32, torch.float64)}
 
 
 class StreamEstimator(ScikitEstimator, abc.ABC):
@@ -34,6 +36,10 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
     def _prepare(self, x: Tensor, y: Tensor) -> None:
         """Infer the sizes from the first sample, check the arguments and begin the streams."""
 
+    @abc.abstractmethod
+    def _decisive(self) -> tuple[str, ...]:
+        """Arguments that what was learned depends on."""
+
     def reset(self, streams: Any = None) -> Self:
         """Forget everything, dimension and streams included; or what these streams learned."""
         if streams is not None:
@@ -49,7 +55,9 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
             raise ValueError(
                 f"`{self._call('add')}` needs streams side by side, x (S, n); this is a single one."
             )
-        self._streams_.add(integer(self._call("add"), "streams", streams, least=1))
+        count = integer(self._call("add"), "streams", streams, least=1)
+        self._streams_.add(count)
+        self._tuning = None if self._tuning is None else self._tuning.add(count)
         return self._resized()
 
     def drop(self, streams: Any) -> Self:
@@ -59,7 +67,9 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
         stays[gone] = False
         if self.n_streams_ is None or not bool(stays.any()):
             raise fail(self._call("drop"), "streams", "must leave a stream", streams)
-        self._streams_.keep(stays.nonzero().squeeze(-1))
+        rows = stays.nonzero().squeeze(-1)
+        self._streams_.keep(rows)
+        self._tuning = None if self._tuning is None else self._tuning.keep(rows)
         return self._resized()
 
     def _resized(self) -> Self:
@@ -94,23 +104,52 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
     def state_dict(self) -> dict[str, Any]:
         """All that was learned, as tensors, numbers and strings, which ``weights_only=True`` loads."""
         about = {name: getattr(self._fitted("state_dict"), name) for name in _ABOUT}
+        about |= {"dtype": str(self._dtype_), "arguments": self._plain_arguments()}
         tuned = {} if self._tuning is None else {"tuning": self._tuning._asdict()}
-        return about | {"dtype": str(self._dtype_)} | tuned | self._streams_.state_dict()
+        return about | tuned | self._streams_.state_dict()
+
+    def _plain_arguments(self) -> dict[str, Any]:
+        """Decisive arguments that are numbers, flags or None; floats, as a search's may be NumPy's."""
+        found = {name: getattr(self, name) for name in self._decisive()}
+        plain = {k: v for k, v in found.items() if v is None or isinstance(v, numbers.Real | np.bool_)}
+        return {k: v if v is None else float(v) for k, v in plain.items()}
 
     def load_state_dict(self, state: dict[str, Any]) -> Self:
-        """Go on from a `state_dict` of a regressor with the same arguments, bit for bit."""
-        dtype = getattr(torch, state["dtype"].removeprefix("torch."))
-        streams, outputs = state["n_streams_"], state["n_outputs_"]
+        """Go on from a `state_dict` of a regressor with the same arguments, bit for bit.
+
+        Raises:
+            ValueError: for a state with other arguments, or of another version, that cannot be gone on from.
+                What this regressor has learned stays as it is then.
+        """
+        name = self._call("load_state_dict")
+        missing = [key for key in (*_ABOUT, "dtype", "table") if key not in state]
+        if missing or state["dtype"] not in _DTYPES:
+            told = f"it has no {missing}" if missing else f"its dtype is {state['dtype']!r}"
+            raise ValueError(f"`{name}(state=...)` must be what `state_dict` returned; {told}.")
+        streams, outputs, dtype = state["n_streams_"], state["n_outputs_"], _DTYPES[state["dtype"]]
+        twin = type(self)(**self.get_params(deep=False))
+        if "tuning" in state:
+            tuned = state["tuning"]
+            tuned = {"width": torch.ones_like(tuned["center"])[:, : state["n_features_in_"]]} | tuned
+            twin._tuning = Tuning(**tuned)
+        own, given = twin._plain_arguments(), state.get("arguments", {})
+        for key, value in own.items():
+            if key in given and given[key] != value:
+                told = f"must be of a regressor with the same arguments: it has {key}={given[key]}"
+                raise ValueError(f"`{name}(state=...)` {told}, this one {value}.")
         leading = () if streams is None else (streams,)
         x = torch.zeros(*leading, state["n_features_in_"], dtype=dtype)
+        twin._prepare(x, torch.zeros((*leading, *(() if outputs is None else (outputs,))), dtype=dtype))
+        twin._streams_.load_state_dict(state)
         self.reset()
-        self._tuning = Tuning(**state["tuning"]) if "tuning" in state else None
-        self._prepare(x, torch.zeros((*leading, *(() if outputs is None else (outputs,))), dtype=dtype))
-        self._streams_.load_state_dict(state)
+        vars(self).update({k: v for k, v in vars(twin).items() if k.endswith("_") or k == "_tuning"})
+        if "tuning" not in state:
+            self._tuning = None
         return self
 
     def __getstate__(self) -> dict[str, Any]:
-        return {k: v for k, v in vars(self).items() if k in self._parameters()} | (
+        kept = (*self._parameters(), "_tuning")
+        return {k: v for k, v in vars(self).items() if k in kept} | (
             {"learned": self.state_dict()} if self._is_fitted() else {}
         )
 
@@ -124,7 +163,12 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
         """Numbers of streams, (R,) int64."""
         found = torch.as_tensor(np.asarray(streams)).reshape(-1)
         most = self._fitted(call)._streams_.count
-        if found.is_floating_point() or not bool(((found >= 0) & (found < most)).all()):
+        found = found.long() if found.numel() == 0 else found  # an empty list is of floats
+        if (
+            found.is_floating_point()
+            or found.dtype == torch.bool
+            or not bool(((found >= 0) & (found < most)).all())
+        ):
             raise fail(
                 self._call(call), "streams", f"must be numbers of streams from 0 to {most - 1}", streams
             )

@@ -30,6 +30,18 @@ class Tuning(NamedTuple):
     forgetting: Tensor  # (S,)
     radius: Tensor  # (S,) of the centers, in widths
     likelihood: Tensor  # (S,) log of the one-step predictive density, a sample, y in standard deviations
+    width: Tensor  # (S, n) in standard deviations of x
+
+    def keep(self, rows: Tensor) -> Tuning:
+        """Of the streams with these numbers alone; the radius stays the one that serves all."""
+        return Tuning(*(part[rows] for part in self))._replace(radius=self.radius[:1].repeat(len(rows)))
+
+    def add(self, streams: int) -> Tuning:
+        """With streams that nobody has seen: typical ones, whose units are not known."""
+        typical = [part.median(0).values.expand(streams, *part.shape[1:]) for part in self]
+        new = Tuning(*typical)
+        new = new._replace(center=new.center * torch.nan, spread=new.spread * torch.nan)
+        return Tuning(*(torch.cat(pair) for pair in zip(self, new, strict=True)))
 
 
 class _Candidates(NamedTuple):
@@ -78,7 +90,13 @@ def tuning(x: Tensor, y: Tensor, directions: Tensor) -> Tuning:
     units = torch.cat((spread[:, :n] * kept.width, spread[:, n:]), 1)
     radii = torch.tensor(RADII, dtype=torch.float64)[which]
     return Tuning(
-        center, units, kept.noise**2, kept.forgetting, radii, torch.where(one, found[1][0], found[0][0])
+        center,
+        units,
+        kept.noise**2,
+        kept.forgetting,
+        radii,
+        torch.where(one, found[1][0], found[0][0]),
+        kept.width,
     )
 
 
@@ -92,7 +110,8 @@ def tuned_streams(
     law = found.ratio.clone(), found.forgetting.clone()
     filter_ = LocalFilter(functions, *law, follow * float(found.radius[0]), robust)
     state = StreamState.empty(torch.zeros(0, dtype=dtype), len(found.ratio), n, len(offsets), outputs)
-    return FilterStreams(filter_, state, True, torch.cat((found.center, found.spread), 1))
+    stretch = torch.cat((found.width, found.width.new_ones(len(found.width), outputs)), 1)
+    return FilterStreams(filter_, state, True, torch.cat((found.center, found.spread), 1), stretch)
 
 
 def _best(candidates: _Candidates, samples: Tensor, n: int, offsets: Tensor) -> tuple[_Candidates, Tensor]:
@@ -109,8 +128,8 @@ def _best(candidates: _Candidates, samples: Tensor, n: int, offsets: Tensor) -> 
         x = (sample[:, None, :n] / candidates.width).flatten(0, 1).contiguous()
         y = sample[:, None, n:].expand(-1, count, -1).flatten(0, 1).contiguous()
         if k > len(samples) // 3:
-            mean, variance = lanes.predict(x)
-            density = -0.5 * ((y - mean).square() / variance + variance.log())
+            mean, deviation = lanes.predict(x)
+            density = -0.5 * ((y - mean) / deviation).square() - deviation.log()
             score += torch.where(torch.isfinite(density), density, 0.0).sum(-1).unflatten(0, (streams, count))
         lanes.learn(x, y)
     best = score.argmax(1)

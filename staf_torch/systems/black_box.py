@@ -16,6 +16,7 @@ Motion = Callable[..., Any]
 """(x (B, n), u (B, m)) -> (B, n), of torch tensors or of NumPy arrays."""
 Slopes = Callable[[Any, Any], tuple[Any, Any]]
 """(x (n,), u (m,)) -> the derivatives with respect to x, (n, n), and u, (n, m), of NumPy arrays."""
+Numbers = np.ndarray[Any, np.dtype[np.float64]]
 _PROBES = 3  # rows that the function is tried with
 _KINK = 0.05  # of the largest slope, by which the slopes of two step sizes may differ
 
@@ -58,6 +59,30 @@ class BlackBox:
         after = self._function(*rows) if self.torch else self._numpy(*rows)
         moved: Tensor = after.reshape(*lead, x.shape[-1])
         return moved
+
+    def follow(
+        self, x: Numbers, feedback: Callable[[Numbers], Numbers], steps: int
+    ) -> tuple[Numbers, Numbers]:
+        """Every state and control under a feedback, of a function in NumPy that is a step: by the function's
+        own ``follow_feedback``, where it has one, else a call a step.
+
+        Args:
+            x: (B, n).
+            feedback: (B, n) -> (B, m).
+            steps: T.
+
+        Returns:
+            (B, T + 1, n), (B, T, m).
+        """
+        whole = getattr(self._function, "follow_feedback", None)
+        if callable(whole):
+            found: tuple[Numbers, Numbers] = whole(x, feedback, steps)
+            return found
+        states, controls = [x], []
+        for _ in range(steps):
+            controls.append(feedback(states[-1]))
+            states.append(np.asarray(self._function(states[-1], controls[-1]), dtype=np.float64))
+        return np.stack(states, axis=1), np.stack(controls, axis=1)
 
     def linearisation(self, x: Tensor, u: Tensor) -> Linearisation:
         """d/dx and d/du at one point (n,), (m,).

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -11,10 +11,10 @@ import numpy as np
 import torch
 
 from ..numerics.checks import fail, integer, positive_real
+from .black_box import Numbers
 from .bounds import Limit
 from .user_plants import Guess, StepPlant
 
-Numbers = np.ndarray[Any, np.dtype[np.float64]]
 _SLOPE = 1e-6  # by which `mjd_transitionFD` moves states and inputs, as its documentation advises
 
 
@@ -92,6 +92,12 @@ class _Simulation:
 
         self.model, self.frames, self._rollout = model, frames, rollout.rollout
         self.data = [MjData(model) for _ in range(threads)]
+        self._followers: list[
+            tuple[Any, Numbers, Numbers]
+        ] = []  # a simulation a row, its inputs and warm start
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "_followers": []}
 
     def __call__(self, x: Numbers, u: Numbers) -> Numbers:
         """x+: (B, n), (B, m) -> (B, n)."""
@@ -117,6 +123,40 @@ class _Simulation:
         after: Numbers = found[:, -1, 1:].copy()
         after[found[:, -1, 0] <= 1] = np.nan  # a reset begins the clock anew at 0
         return after
+
+    def follow_feedback(
+        self, x: Numbers, feedback: Callable[[Numbers], Numbers], steps: int
+    ) -> tuple[Numbers, Numbers]:
+        """`BlackBox.follow`: a simulation a row that goes on, which no period sets up anew. The same bits."""
+        mujoco, model = _mujoco(), self.model
+        if len(self.data) > 1:  # rows of a period side by side
+            states, controls = [x], []
+            for _ in range(steps):
+                controls.append(feedback(states[-1]))
+                states.append(self(states[-1], controls[-1]))
+            return np.stack(states, axis=1), np.stack(controls, axis=1)
+        kind, rows = int(mujoco.mjtState.mjSTATE_FULLPHYSICS), len(x)
+        while len(self._followers) < rows:
+            data = mujoco.MjData(model)
+            self._followers.append((data, data.ctrl, data.qacc_warmstart))
+        followers = self._followers[:rows]
+        found = np.empty((steps + 1, rows, 1 + x.shape[1]))
+        found[0, :, 0], found[0, :, 1:] = 1.0, x  # the time, 1 s, and then the state
+        applied = np.empty((steps, rows, model.nu))
+        for (data, _, _), began in zip(followers, found[0], strict=True):
+            mujoco.mj_resetData(model, data)
+            mujoco.mj_setState(model, data, began, kind)
+        step, read, frames = mujoco.mj_step, mujoco.mj_getState, self.frames
+        for k in range(steps):
+            applied[k] = feedback(found[k, :, 1:])
+            for (data, control, warm), u, after in zip(followers, applied[k], found[k + 1], strict=True):
+                control[:], warm[:] = u, 0.0
+                step(model, data, frames)
+                read(model, data, after, kind)
+        # A reset begins the clock anew at 0: from there on a row is lost.
+        lost = np.logical_or.accumulate(~(found[1:, :, 0] > found[:-1, :, 0]), axis=0)
+        found[1:][lost] = np.nan
+        return found[:, :, 1:].swapaxes(0, 1), applied.swapaxes(0, 1)
 
     def slopes(self, x: Numbers, u: Numbers) -> tuple[Numbers, Numbers]:
         """dx+/dx and dx+/du at one point (n,), (m,)."""

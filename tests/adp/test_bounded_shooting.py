@@ -9,6 +9,8 @@ import torch
 
 from staf_torch import adp, systems
 from staf_torch.adp.shooting import starts
+from staf_torch.adp.shooting.direct import _cheapest
+from staf_torch.adp.shooting.newton import Plan
 
 DOUBLE = systems.Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
 COST = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
@@ -80,6 +82,17 @@ def test_what_cannot_be_shot_is_refused_by_name() -> None:
     discounted = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1, discount=0.1)
     with pytest.raises(ValueError, match=r"`DirectShooting\(cost=...\)` must have no discount"):
         adp.DirectShooting(DOUBLE, discounted)
+
+
+def test_a_start_and_its_mirror_image_do_not_agree_with_each_other() -> None:
+    def plan(*costs: float) -> Plan:
+        cost = torch.tensor(costs, dtype=torch.float64)
+        return Plan(cost[:, None, None], cost[:, None, None], cost)
+
+    # In the first row the base costs 9 and is found again, and 5 has a mirror image; the second has none.
+    several = [plan(9.0, 8.0), plan(5.0, 4.0), plan(5.0 + 1e-12, 6.0), plan(7.0, math.inf)]
+    costs = torch.stack([each.cost for each in _cheapest(several, 3, torch.tensor([9.0, 9.0]).double())])
+    assert costs.T.tolist() == [[5.0, 7.0, math.inf], [4.0, 6.0, 8.0]]
 
 
 @pytest.mark.parametrize("bounded", [True, False])

@@ -163,3 +163,32 @@ def test_report_finds_the_region_of_a_plant_in_small_units() -> None:
     report = policy.report(states=8, optimum=False)
     assert report["regulated"] == 0  # in the box of 1
     assert 1 / 256 <= report["good_spread"] <= 1 / 32
+
+
+def torch_turn(x: torch.Tensor, u: torch.Tensor) -> torch.Tensor:
+    """`turn` in torch."""
+    rate = (x[:, 1] + 0.05 * (15.0 * x[:, 0].sin() + 3.0 * u[:, 0])).clamp(-8.0, 8.0)
+    return torch.stack((x[:, 0] + 0.05 * rate, rate), dim=1)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("target", [None, (2 * math.pi, 0.0)])
+@pytest.mark.parametrize("smooth", [False, True])
+def test_simulator_is_followed_in_numpy_to_the_same_promise(
+    target: tuple[float, float] | None, smooth: bool
+) -> None:
+    kind = adp.BoundedInputCost if smooth else adp.QuadraticCost
+    cost = kind(1.0, 0.1, dim=2, inputs=1, low=-2.0, high=1.5, target=target, discount=0.1)
+    seen, hidden = (
+        adp.near_optimal(systems.StepPlant(step, dim=2, inputs=1, dt=0.05, periodic=[0]), cost, horizon=0.4)
+        for step in (torch_turn, turn)
+    )
+    x = drawn(2, 1.0, 6).view(2, 3, 2)
+    for one, other in zip(seen.rollout(x), hidden.rollout(x), strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-7, atol=0)  # slopes by differences
+    assert torch.equal(hidden.rollout(x[1, 2]).whole, hidden.rollout(x).whole[1, 2])
+    assert (seen.basis.count, hidden.basis.count) == (6, 3)  # along the only input three centers will do
+    near = x[0] * 0.05 if target is None else x[0] * 0.05 + torch.tensor(target, dtype=torch.float64)
+    if not smooth:  # the LQR is the optimum, wherever the set-point is
+        assert float(hidden.proposal(near, hidden.base(near)).abs().max()) < 1e-3
+    torch.testing.assert_close(pickle.loads(pickle.dumps(hidden))(x), hidden(x), rtol=0, atol=0)

@@ -45,11 +45,11 @@ def among_discs(rows: int, kind: str) -> tuple[adp.Controller, object, adp.Cost,
     cfg = updated(composer(given))
     own, chosen = vehicle(cfg, DT), cfg.avoidance
     plant = avoidance.AmongDiscs(own, chosen.discs)
-    discs = [avoidance._apart(own, k, chosen.radius) for k in range(chosen.discs)]
+    discs = [avoidance.apart(own, k, chosen.radius) for k in range(chosen.discs)]
     bounds = {"low": [-bound for bound in own.bounds], "high": list(own.bounds)}
     settings = {"dt": DT, "decay": chosen.decay, "margin": chosen.margin, **bounds}
     guard = adp.SafetyFilter(lambda x: own.policy(x[..., : own.size]), plant, discs, **settings)
-    return guard, plant, avoidance._cost(cfg, own, plant.dim or 0), avoidance.scenarios(cfg)
+    return guard, plant, avoidance.vehicle_cost(cfg, own, plant.dim or 0), avoidance.scenarios(cfg)
 
 
 def main(rows: int) -> None:

@@ -1,66 +1,76 @@
-"""The safety filter among moving discs beside a model-predictive control that IPOPT solves at every control.
+"""Vehicles among moving discs behind the filter, with detours and without, beside an NMPC by IPOPT.
 
-    python tests/benchmarks/among_discs.py [scenarios]      (needs casadi)
+    python tests/benchmarks/among_discs.py [scenarios] [--rival N] [--vehicle unicycle] [--seed K]
 
-A mass in the plane, |u_i| <= 1 m/s^2, three discs of radius 0.4 m whose velocities both know, the scenarios
-of `staf experiment=avoidance`, 15 s, a control held for 0.1 s; the filter keeps a margin of 1e-3 m^2. The
-rival plans 4 s ahead with the LQR's value at their end, keeps outside of the discs at the times of its plan,
-begins each search with the plan before and, where IPOPT finds none, follows that one. Costs are those of the
-loop, x'x + u'u, from the same integration.
+It needs casadi.
+
+The scenarios of `staf experiment=avoidance`: a mass, |u_i| <= 1 m/s^2, or a unicycle, and three discs of
+radius 0.4 m whose velocities all know; 15 s, a control held for 0.1 s. The rival plans 4 s ahead with the
+value that detours have at their end, keeps the vehicle outside of the discs at the times of its plan, begins
+each search with the plan before and, where IPOPT finds none, follows that one. Costs are those of the loop,
+from the same integration.
 """
 
 from __future__ import annotations
 
+import argparse
 import math
-import sys
 import time
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import casadi
 import numpy as np
 import torch
-from omegaconf import OmegaConf
 from torch import Tensor
 
 from staf_torch import adp, systems
-from staf_torch.adp.safety_filter import Constraint
-from staf_torch.experiments.avoidance import scenarios as drawn
+from staf_torch.experiments import avoidance
+from staf_torch.experiments.vehicles import vehicle
+from staf_torch.settings.adp import updated
+from staf_torch.sweeps.hydra_compat import Composer, config_loader
 
 DT, STEPS, AHEAD, RADIUS, DISCS = 0.1, 150, 40, 0.4, 3
+ALONE = 20  # scenarios whose loops are timed one by one
 _TOUCH = 1e-6  # m: IPOPT keeps its constraints up to its tolerance
 
 
-class Plane(systems.ControlAffineSystem):
-    """The mass and its discs, (p, v, c_1, c_1', ...)."""
+class Model(NamedTuple):
+    """A vehicle in CasADi."""
 
-    dim, inputs = 4 + 4 * DISCS, 2
-
-    def drift(self, x: Tensor) -> Tensor:
-        pairs = x.unflatten(-1, (-1, 2, 2))[..., 1, :]  # speeds
-        return torch.cat((pairs.unsqueeze(-2), torch.zeros_like(pairs).unsqueeze(-2)), dim=-2).flatten(-3)
-
-    def effectiveness(self, x: Tensor) -> Tensor:
-        push = torch.zeros(self.dim, 2, dtype=x.dtype)
-        push[2, 0] = push[3, 1] = 1.0
-        return push.expand(*x.shape[:-1], -1, -1)
+    size: int
+    rate: Callable[[Any, Any], Any]
+    paid: Callable[[Any], Any]  # a second, without the input's part
+    end: Callable[[Any], Any]
 
 
 class Predictive(adp.Controller):
-    """IPOPT at every control, row after row."""
+    """IPOPT at every control, row after row.
 
-    def __init__(self, value: np.ndarray) -> None:
+    Args:
+        model: how the vehicle moves, what a rate of its cost is and what its end costs.
+        bounds: of the two inputs.
+    """
+
+    def __init__(self, model: Model, bounds: tuple[float, float]) -> None:
         super().__init__()
         self.period = DT
-        x0, discs = casadi.SX.sym("x0", 4), casadi.SX.sym("discs", 4 * DISCS)
-        x, u = casadi.SX.sym("x", 4, AHEAD + 1), casadi.SX.sym("u", 2, AHEAD)
+        n = self.size = model.size
+        x0, discs = casadi.SX.sym("x0", n), casadi.SX.sym("discs", 4 * DISCS)
+        x, u = casadi.SX.sym("x", n, AHEAD + 1), casadi.SX.sym("u", 2, AHEAD)
         paid, same, apart = 0, [x[:, 0] - x0], []
         for k in range(AHEAD):
-            p, v, a = x[:2, k], x[2:, k], u[:, k]
-            paid += DT * (casadi.sumsqr(x[:, k]) + casadi.sumsqr(a))
-            same.append(x[:, k + 1] - casadi.vertcat(p + DT * v + 0.5 * DT**2 * a, v + DT * a))
+            now, a = x[:, k], u[:, k]
+            paid += DT * (model.paid(now) + casadi.sumsqr(a))
+            k1 = model.rate(now, a)
+            k2 = model.rate(now + DT / 2 * k1, a)
+            k3 = model.rate(now + DT / 2 * k2, a)
+            k4 = model.rate(now + DT * k3, a)
+            same.append(x[:, k + 1] - now - DT / 6 * (k1 + 2 * k2 + 2 * k3 + k4))
             for i in range(DISCS):
                 center = discs[4 * i : 4 * i + 2] + (k + 1) * DT * discs[4 * i + 2 : 4 * i + 4]
                 apart.append(casadi.sumsqr(x[:2, k + 1] - center))
-        paid += casadi.bilin(casadi.DM(value), x[:, AHEAD], x[:, AHEAD])
+        paid += model.end(x[:, AHEAD])
         problem = {
             "x": casadi.vertcat(casadi.vec(x), casadi.vec(u)),
             "p": casadi.vertcat(x0, discs),
@@ -69,10 +79,11 @@ class Predictive(adp.Controller):
         }
         quiet = {"print_level": 0, "sb": "yes", "warm_start_init_point": "yes", "max_iter": 200}
         self.solver = casadi.nlpsol("nmpc", "ipopt", problem, {"print_time": False, "ipopt": quiet})
-        free = 4 * (AHEAD + 1)
+        free = n * (AHEAD + 1)
+        self.bounds = np.array(bounds)
         self.within = {
-            "lbx": [-math.inf] * free + [-1.0] * (2 * AHEAD),
-            "ubx": [math.inf] * free + [1.0] * (2 * AHEAD),
+            "lbx": [-math.inf] * free + [-bound for bound in bounds] * AHEAD,
+            "ubx": [math.inf] * free + list(bounds) * AHEAD,
             "lbg": [0.0] * free + [RADIUS**2] * (DISCS * AHEAD),
             "ubg": [0.0] * free + [math.inf] * (DISCS * AHEAD),
         }
@@ -86,14 +97,15 @@ class Predictive(adp.Controller):
         return torch.tensor(np.array([self.row(k, row) for k, row in enumerate(x.numpy())])), carried
 
     def row(self, number: int, z: np.ndarray) -> np.ndarray:
-        states = 4 * (AHEAD + 1)
+        n = self.size
+        states = n * (AHEAD + 1)
         guess = self.before.get(number)
         if guess is None:
             guess = np.concatenate(
-                (np.outer(1 - np.arange(AHEAD + 1) / AHEAD, z[:4]).ravel(), np.zeros(2 * AHEAD))
+                (np.outer(1 - np.arange(AHEAD + 1) / AHEAD, z[:n]).ravel(), np.zeros(2 * AHEAD))
             )
         else:  # a step on
-            x, u = guess[:states].reshape(-1, 4), guess[states:].reshape(-1, 2)
+            x, u = guess[:states].reshape(-1, n), guess[states:].reshape(-1, 2)
             guess = np.concatenate((x[1:].ravel(), x[-1], u[1:].ravel(), np.zeros(2)))
         clock = time.process_time()
         found = self.solver(x0=guess, p=z, **self.within)
@@ -103,69 +115,144 @@ class Predictive(adp.Controller):
         else:
             self.failed += 1
         self.before[number] = guess
-        return np.clip(guess[states : states + 2], -1, 1)
+        return np.clip(guess[states : states + 2], -self.bounds, self.bounds)
 
 
-def scenarios(count: int) -> Tensor:
-    """As `staf experiment=avoidance` draws them, seed 0."""
-    chosen = {"discs": DISCS, "radius": RADIUS, "distance": 3.0, "speed": 0.3, "vehicle": "mass"}
-    return drawn(OmegaConf.create({"trajectories": count, "seed": 0, "avoidance": chosen}))
-
-
-def apart(k: int) -> Constraint:
-    return lambda x, t: (x[:, :2] - x[:, 4 + 4 * k : 6 + 4 * k]).square().sum(-1) - RADIUS**2
-
-
-def main(count: int) -> None:
-    torch.set_num_threads(1)
-    x0, plant = scenarios(count), Plane()
-    mass = systems.Linear(
-        *(np.kron(m, np.eye(2)).tolist() for m in ([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]]))
+def mass(value: np.ndarray) -> Model:
+    """The LQR's value at the end."""
+    return Model(
+        4,
+        lambda x, u: casadi.vertcat(x[2:], u),
+        casadi.sumsqr,
+        lambda x: casadi.bilin(casadi.DM(value), x, x),
     )
-    own = adp.QuadraticCost(1.0, 1.0, dim=4, inputs=2, low=-1.0, high=1.0)
-    lqr = adp.LQR(mass, own, period=DT)
-    weights = torch.zeros(plant.dim, plant.dim, dtype=torch.float64)
-    weights[:4, :4] = torch.eye(4)
-    cost = adp.QuadraticCost(weights, 1.0, dim=plant.dim, inputs=2, low=-1.0, high=1.0)
-    rival = Predictive(adp.SampledProblem.of(mass, own, dt=DT).p.numpy())
-    settings = {"dt": DT, "low": -1.0, "high": 1.0, "decay": 3.0, "margin": 1e-3}
-    walls = [apart(k) for k in range(DISCS)]
-    guard = adp.SafetyFilter(lambda x: lqr(x[..., :4]), plant, walls, **settings)  # type: ignore[arg-type]
-    costs = {}
-    for name, controller in (("LQR behind the filter", guard), ("NMPC by IPOPT", rival)):
-        run = adp.simulate(controller, plant, cost, x0, dt=DT, steps=STEPS, compile=False)
-        discs = run.state[..., 4:].unflatten(-1, (-1, 4))[..., :2]
-        gaps = (run.state[..., None, :2] - discs).norm(dim=-1).amin((1, 2)) - RADIUS
-        costs[name] = run.cost
-        deep = int((gaps < -_TOUCH).sum())
-        print(f"{name}: cost {float(run.cost.mean()):.3f}, collisions {deep} of {count}, ", end="")
-        print(f"least distance {float(gaps.min()):.5f} m")
-    clock = time.process_time()
-    for k in range(1000):
-        guard(x0[k % count, None])
-    single = (time.process_time() - clock) / 1000
-    theirs = rival.seconds / rival.asked
-    print(f"a control: the filter {1e6 * single:.0f} us, NMPC {1e6 * theirs:.0f} us", end="")
-    print(f" ({theirs / single:.0f} times), {rival.failed} of {rival.asked} not solved")
-    many = x0.repeat(1000 // count + 1, 1)
-    for _ in range(2):  # the first compiles
-        clock = time.process_time()
-        adp.simulate(guard, plant, cost, many, dt=DT, steps=STEPS, compile=True)
-    spent = (time.process_time() - clock) / (len(many) * STEPS)
-    print(
-        f"{len(many)} rows in one program, plant included: {1e6 * spent:.2f} us ({theirs / spent:.0f} times)"
+
+
+def unicycle(ahead: float) -> Model:
+    """Speed and turning; its point ahead is what costs, at the end as `among` says."""
+
+    def squared(x: Any) -> Any:
+        return casadi.sumsqr(x[:2] + ahead * casadi.vertcat(casadi.cos(x[2]), casadi.sin(x[2])))
+
+    def rate(x: Any, u: Any) -> Any:
+        return casadi.vertcat(u[0] * casadi.cos(x[2]), u[0] * casadi.sin(x[2]), u[1])
+
+    return Model(3, rate, squared, squared)
+
+
+class Loop(NamedTuple):
+    """Vehicles among discs, and the controllers to compare."""
+
+    plant: avoidance.AmongDiscs
+    cost: adp.Cost
+    x0: Tensor
+    ours: dict[str, adp.SafetyFilter]
+    rival: Predictive
+
+
+def among(kind: str, count: int, seed: int) -> Loop:
+    """The scenarios of `staf experiment=avoidance` with a period of 0.1 s."""
+    given = ["experiment=avoidance", f"trajectories={count}", f"avoidance.vehicle={kind}", f"seed={seed}"]
+    cfg = updated(Composer(config_loader(), hydra_node=False)([*given, f"dt={DT}"]))
+    own, x0 = vehicle(cfg, DT), avoidance.scenarios(cfg)
+    plant = avoidance.AmongDiscs(own, DISCS)
+    cost = avoidance.vehicle_cost(cfg, own, int(plant.dim or 0))
+    n, free = own.size, adp.QuadraticCost(1.0, 1.0, dim=4, inputs=2)
+    if kind == "mass":
+        value = adp.SampledProblem.of(systems.Linear(*_plane()), free, dt=DT).p
+        rival = Predictive(mass(value.numpy()), own.bounds)
+
+        def end(x: Tensor) -> Tensor:
+            return ((x[..., None, :n] * value).sum(-1) * x[..., :n]).sum(-1)
+    else:
+        rival = Predictive(unicycle(own.reach), own.bounds)
+
+        def end(x: Tensor) -> Tensor:
+            return own.point(x[..., :n]).square().sum(-1)
+
+    def wanted(x: Tensor) -> Tensor:
+        u: Tensor = own.policy(x[..., :n])
+        return u
+
+    walls = [avoidance.apart(own, k, RADIUS) for k in range(DISCS)]
+    bounds = {"low": [-bound for bound in own.bounds], "high": list(own.bounds)}
+    behind = {"dt": DT, "decay": 3.0, "margin": 1e-3, **bounds}
+    detours = adp.DetourRollout(
+        wanted,
+        plant,
+        cost,
+        walls,
+        axes=torch.eye(2, plant.dim),
+        dt=DT,
+        steps=AHEAD,
+        stride=2,
+        terminal=end,
+        margin=0.04,
     )
-    ratio = costs["LQR behind the filter"] / costs["NMPC by IPOPT"]
-    mine, other = (each.mean() for each in costs.values())
-    parts = {
-        "of the means": mine / other,
-        "median": ratio.median(),
-        "largest": ratio.max(),
-        "least": ratio.min(),
+    ours = {
+        f"{own.label} behind the filter": adp.SafetyFilter(wanted, plant, walls, **behind),  # type: ignore[arg-type]
+        "with detours": adp.SafetyFilter(detours, plant, walls, **behind),  # type: ignore[arg-type]
     }
-    print("cost over NMPC's: " + ", ".join(f"{key} {float(value):.4f}" for key, value in parts.items()))
-    print(f"at most 1.05 of it in {int((ratio <= 1.05).sum())} of {count}")
+    return Loop(plant, cost, x0, ours, rival)
+
+
+def _plane() -> tuple[list[list[float]], list[list[float]]]:
+    """A and B of the mass."""
+    a, b = np.kron([[0.0, 1.0], [0.0, 0.0]], np.eye(2)), np.kron([[0.0], [1.0]], np.eye(2))
+    return a.tolist(), b.tolist()
+
+
+def main(count: int, rivals: int, kind: str, seed: int) -> None:
+    torch.set_num_threads(1)
+    loop = among(kind, count, seed)
+    settings = {"dt": DT, "steps": STEPS}
+    n = loop.rival.size
+    costs: dict[str, Tensor] = {}
+
+    def told(name: str, run: adp.LoopResult) -> None:
+        discs = run.state[..., n:].unflatten(-1, (-1, 4))[..., :2]
+        gaps = (run.state[..., None, :2] - discs).norm(dim=-1).amin((1, 2)) - RADIUS
+        deep = int((gaps < -_TOUCH).sum())
+        costs[name] = run.cost
+        print(f"{name}: cost {float(run.cost.mean()):.3f}, collisions {deep} of {len(gaps)}, ", end="")
+        print(f"least distance {float(gaps.min()):.5f} m", flush=True)
+
+    def seconds(controller: adp.Controller, x0: Tensor) -> float:
+        """A control in a loop in one program, plant included; the second run counts."""
+        for _ in range(2):
+            clock = time.process_time()
+            adp.simulate(controller, loop.plant, loop.cost, x0, compile=True, **settings)  # type: ignore[arg-type]
+        return (time.process_time() - clock) / len(x0) / STEPS
+
+    spent = {}
+    for name, controller in loop.ours.items():
+        told(name, adp.simulate(controller, loop.plant, loop.cost, loop.x0, compile=True, **settings))  # type: ignore[arg-type]
+        alone = [seconds(controller, row[None]) for row in loop.x0[:ALONE]]
+        spent[name] = sum(alone) / len(alone), max(alone), seconds(controller, loop.x0)
+    run = adp.simulate(loop.rival, loop.plant, loop.cost, loop.x0[:rivals], compile=False, **settings)  # type: ignore[arg-type]
+    told("NMPC by IPOPT", run)
+    theirs = loop.rival.seconds / loop.rival.asked
+    print(f"NMPC: {1e6 * theirs:.0f} us a control, {loop.rival.failed} of {loop.rival.asked} not solved")
+    for name, (mean, most, many) in spent.items():
+        print(f"{name}: a control {1e6 * mean:.1f} us alone ({theirs / mean:.0f} times less), ")
+        print(f"  slowest of {ALONE} loops {1e6 * most:.1f}; {1e6 * many:.2f} us a row ({theirs / many:.0f})")
+        mine = costs[name][:rivals]
+        ratio = mine / costs["NMPC by IPOPT"]
+        parts = {
+            "of the means": mine.mean() / costs["NMPC by IPOPT"].mean(),
+            "median": ratio.median(),
+            "largest": ratio.max(),
+            "least": ratio.min(),
+        }
+        print("  over NMPC's cost: " + ", ".join(f"{key} {float(value):.4f}" for key, value in parts.items()))
+        print(f"  at most 1.05 of it in {int((ratio <= 1.05).sum())} of {rivals}", flush=True)
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else 30)
+    parser = argparse.ArgumentParser()
+    parser.add_argument("scenarios", type=int, nargs="?", default=1000)
+    parser.add_argument("--rival", type=int, default=30, help="scenarios that the NMPC drives")
+    parser.add_argument("--vehicle", default="mass", choices=("mass", "unicycle"))
+    parser.add_argument("--seed", type=int, default=0)
+    given = parser.parse_args()
+    main(given.scenarios, min(given.rival, given.scenarios), given.vehicle, given.seed)

@@ -181,8 +181,12 @@ def swing_cart(settings: argparse.Namespace) -> dict[str, Any]:
         if settings.ipopt and k == 0:
             from rival_ipopt import solve_cart_pole
 
-            peer = torch.stack([solve_cart_pole(each, memory) for each in x0[: settings.ipopt]])
-            row |= ratios("over_ipopt", spent[: settings.ipopt] / peer)
+            peer = []
+            for state, cost in zip(x0[: settings.ipopt], spent, strict=False):
+                peer.append(solve_cart_pole(state, memory))
+                ratio = float(cost / peer[-1])
+                print(f"{len(peer)} policy {cost:.5f} IPOPT {peer[-1]:.5f} ratio {ratio:.5f}", flush=True)
+            row |= ratios("over_ipopt", spent[: settings.ipopt] / torch.stack(peer))
         found[f"draw_{seed}"] = row
         print(seed, row, flush=True)
     return found

@@ -275,3 +275,20 @@ def test_what_is_no_predictor_is_refused() -> None:
         chase(states(), basis(), TARGET, optim.Exact(), predictor="tangent")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r"Tangent\(order=\.\.\.\)"):
         predictors.Tangent(3)
+
+
+class Lost(predictors.Predictor):
+    """NaN for the rows whose first weight is negative."""
+
+    def predict(self, inputs: object, weights: Tensor, previous: object, unit: Tensor) -> Tensor:
+        return torch.where(weights[:, :1] < 0, torch.nan, unit * weights)
+
+
+def test_a_row_whose_prediction_is_lost_diverges_though_its_law_forgets_the_start() -> None:
+    where, exact = states(batch=6, steps=4), LAWS["exact"]
+    plain = chase(where, basis(), TARGET, exact)
+    found = chase(where, basis(), TARGET, exact, predictor=Lost())
+    lost = (plain.weights[:, :-1, 0] < 0).any(1)
+    assert 0 < int(lost.sum()) < 6
+    assert torch.equal(found.diverged, lost)
+    assert torch.equal(found.weights[~lost], plain.weights[~lost])

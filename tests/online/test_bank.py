@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 import torch
 from torch import Tensor
@@ -115,9 +117,35 @@ def test_saved_state_goes_on_bit_for_bit(memory: int | None, tmp_path: object) -
 def test_state_of_other_sizes_is_refused(memory: int | None) -> None:
     x, y = streams(5, 2)
     state = st.StaFRegressor(memory=memory, neighbours=8).fit(x, y[..., 0]).state_dict()
-    other = st.StaFRegressor(count=10, memory=memory and 200, neighbours=8)
-    with pytest.raises(ValueError, match=r"load_state_dict.*numbers a stream"):
-        other.load_state_dict(state)
+    other = st.StaFRegressor(count=10, memory=memory and 200, neighbours=8).fit(x, y[..., 0])
+    before = other.predict(x[0])
+    older = {name: value for name, value in state.items() if name != "arguments"}
+    for given, rule in ((state, "same arguments: it has (count|memory)="), (older, "numbers a stream")):
+        with pytest.raises(ValueError, match=rf"load_state_dict.*{rule}"):
+            other.load_state_dict(given)
+    assert torch.equal(other.predict(x[0]), before)  # and leaves what was learned
+
+
+@pytest.mark.parametrize("change", [{"radius": 0.3}, {"kernel": "matern"}, {"noise": 0.3}, {"scaling": True}])
+def test_state_of_another_model_is_refused(change: dict[str, Any]) -> None:
+    x, y = streams(5, 2)
+    state = st.StaFRegressor().fit(x, y[..., 0]).state_dict()
+    with pytest.raises(ValueError, match=r"load_state_dict.*(radius|kernel|noise|scaling)"):
+        st.StaFRegressor(**change).load_state_dict(state)
+    with pytest.raises(ValueError, match=r"load_state_dict.*has no \['n_features_in_'"):
+        st.StaFRegressor().load_state_dict({})
+
+
+def test_a_bank_saved_before_its_last_number_goes_on() -> None:
+    x, y = streams(40, 2)
+    model = st.StaFRegressor(memory=128, neighbours=8).fit(x[:30], y[:30, :, 0])
+    state = {name: value for name, value in model.state_dict().items() if name != "arguments"}
+    state["table"] = state["table"][:, :-1].contiguous()
+    again = st.StaFRegressor(memory=128, neighbours=8).load_state_dict(state)
+    for k in range(30, 40):
+        assert torch.equal(model.predict(x[k]), again.predict(x[k]))
+        model.partial_fit(x[k], y[k, :, 0])
+        again.partial_fit(x[k], y[k, :, 0])
 
 
 @pytest.mark.parametrize("memory", [None, 128])
@@ -170,7 +198,9 @@ def test_streams_come_and_go_without_touching_the_others(memory: int | None) -> 
     for k in range(60):
         model.partial_fit(x[k, :3], y[k, :3, 0])
         alone.partial_fit(x[k, 2], y[k, 2, 0])
-    model.drop([0]).add(2).reset(streams=[0])
+    with pytest.raises(ValueError, match="numbers of streams"):
+        model.drop(torch.tensor([True, False]))  # not a mask
+    model.drop([]).drop([0]).add(2).reset(streams=[0])
     assert model.n_streams_ == 4
     assert model.n_samples_seen_.tolist()[1:] == [60, 0, 0]
     fresh = st.StaFRegressor(memory=memory, neighbours=8)

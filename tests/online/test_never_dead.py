@@ -143,3 +143,45 @@ def test_change_that_stays_is_learned_at_once_by_a_robust_bank() -> None:
     model = st.StaFRegressor(memory=128, neighbours=8, robust=5.0).fit(x[:180], changed[:180])
     assert int(model.n_samples_seen_) == 180
     assert abs(float(model.predict(x[180]) - changed[180])) < 1.0
+
+
+@pytest.mark.parametrize(("of_x", "of_y"), [(1e-300, 1e160), (1e200, 1.0), (1e-300, 1e-300), (1e140, 1e-140)])
+@pytest.mark.parametrize("settings", [{"memory": 128, "neighbours": 8}, {"scaling": True}, {}])
+def test_stream_is_alive_after_many_samples_of_another_magnitude(
+    settings: dict[str, float], of_x: float, of_y: float
+) -> None:
+    x, y = path(60)
+    model = st.StaFRegressor(radius=0.4, noise=0.05, **settings).fit(of_x * x, of_y * y)
+    error_after(model, *path(30))
+    assert error_after(model, x, y) < 0.3
+
+
+@pytest.mark.parametrize(("of_x", "of_y"), [(1e-300, 1e-300), (1e300, 1e160), (1.0, 1e300)])
+def test_units_are_learned_at_any_magnitude(of_x: float, of_y: float) -> None:
+    x, y = path(80)
+    found, expected = (
+        st.StaFRegressor(radius=0.4, noise=0.05, scaling=True)
+        .fit(a * x, b * y)
+        .predict(a * x[:9], return_std=True)
+        for a, b in ((of_x, of_y), (1.0, 1.0))
+    )
+    for one, other in zip(found, expected, strict=True):
+        torch.testing.assert_close(one / of_y, other, rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize("memory", [None, 128])
+def test_time_passes_while_nothing_is_learned(memory: int | None) -> None:
+    x, y = path(60)
+    settings = {"radius": 0.4, "noise": 0.05, "forgetting": 0.9, "memory": memory, "neighbours": 8}
+    waited, told = (st.StaFRegressor(**settings).fit(x, y) for _ in range(2))
+    for _ in range(30):
+        waited.partial_fit(x[-1], torch.tensor(math.nan))
+    waited.partial_fit(x[20], y[20])
+    told.partial_fit(x[20], y[20], lapse=31.0)
+    for one, other in zip(*(m.predict(x[25], return_std=True) for m in (waited, told)), strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-9, atol=1e-9)
+    for wrong in (-1.0, math.nan, math.inf):
+        with pytest.raises(ValueError, match=r"partial_fit\(lapse=.*finite and not negative"):
+            told.partial_fit(x[0], y[0], lapse=wrong)
+        with pytest.raises(ValueError, match=r"fit\(time=.*finite and increasing"):
+            told.fit(x[:3], y[:3], time=torch.tensor([0.0, 1.0, wrong]))

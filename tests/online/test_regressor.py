@@ -145,8 +145,9 @@ def test_samples_that_are_not_finite_are_skipped_and_counted() -> None:
     model = learned(st.StaFRegressor(radius=0.3), bad_x, bad_y)
     assert model.n_skipped_.tolist() == [0, 1, 1, 1]
     assert model.n_samples_seen_.tolist() == [40, 39, 39, 39]
-    kept = [k for k in range(40) if k != 10]
-    alone = learned(st.StaFRegressor(radius=0.3), x[kept, 1], y[kept, 1])
+    alone = learned(st.StaFRegressor(radius=0.3), x[:10, 1], y[:10, 1])
+    alone.partial_fit(x[11, 1], y[11, 1], lapse=2.0)  # time passes while nothing is learned
+    learned(alone, x[12:, 1], y[12:, 1])
     whole = learned(st.StaFRegressor(radius=0.3), x, y)
     found = model.predict(x[-1])
     torch.testing.assert_close(found[1], alone.predict(x[-1, 1]), rtol=1e-10, atol=1e-10)
@@ -195,7 +196,7 @@ def test_skipped_sample_leaves_the_stream_as_it_was() -> None:
     x, y = walks(2, 30)
     model = learned(st.StaFRegressor(radius=0.3), x, y)
     before = copy.deepcopy(model._streams_.state)
-    model.partial_fit(torch.full_like(x[0], torch.nan), y[0])
+    model.partial_fit(torch.full_like(x[0], torch.nan), y[0], lapse=0.0)
     for name in ("anchor", "mean", "learned"):
         assert torch.equal(getattr(before, name), getattr(model._streams_.state, name))
 
@@ -266,3 +267,4 @@ def test_arrays_give_arrays_and_every_point_of_a_stream_can_be_asked_for() -> No
     single = st.StaFRegressor("gaussian", 0.3).fit(x[:, 0], y[:, 0])
     assert single.predict(x[-4:, 0]).shape == (4,)
     assert single.predict(x[-1, 0]).shape == ()
+    assert single.predict(x[:0, 0]).shape == (0,)

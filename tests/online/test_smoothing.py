@@ -24,7 +24,7 @@ def dense(x: Tensor, y: Tensor, follow: float) -> tuple[Tensor, Tensor]:
     The weights around one anchor are N(0, I); around the next they are T u + w, w ~ N(0, I - T T').
     """
     functions = LocalFunctions.of(st.GaussianKernel(0.9), RADIUS * st.rings(3))
-    anchor, moves, psi, rest = x[0], [], [], []
+    anchor, moves, psi, rest = x[~torch.isnan(y)][0], [], [], []
     for point, value in zip(x, y, strict=True):
         move = torch.eye(3, dtype=torch.float64)
         if not torch.isnan(value) and float((point - anchor).norm()) > follow * RADIUS:
@@ -50,10 +50,11 @@ def dense(x: Tensor, y: Tensor, follow: float) -> tuple[Tensor, Tensor]:
     return gain @ y[seen], variance
 
 
+@pytest.mark.parametrize("missing", [[7], [0, 1, 2, 8, 9]])
 @pytest.mark.parametrize("follow", [100.0, 1.0, 0.0])
-def test_smoothing_is_conditioning_on_all_samples(follow: float) -> None:
+def test_smoothing_is_conditioning_on_all_samples(follow: float, missing: list[int]) -> None:
     x, y = path(24), uniform(24, seed=3)
-    y[7] = torch.nan
+    y[missing] = torch.nan
     model = st.StaFRegressor(
         st.GaussianKernel(0.9), RADIUS, 3, noise=NOISE, forgetting=1.0, follow=follow, scaling=False
     )
@@ -79,6 +80,30 @@ def test_smoothing_errs_less_than_filtering_and_leaves_the_regressor_alone() -> 
     errors = [float((found - truth)[late].square().mean().sqrt()) for found in (mean, torch.stack(filtered))]
     assert errors[0] < 0.85 * errors[1]
     assert 0.7 < float(((mean - truth) / std)[late].square().mean().sqrt()) < 1.4
+
+
+def test_coordinates_that_were_not_measured_are_held_and_before_the_first_time_as_then() -> None:
+    x, y = path(40), uniform(40, seed=4)
+    held, holed = x.clone(), x.clone()
+    for k, column in ((0, 0), (1, 1), (20, 0), (21, 0), (30, 1)):
+        holed[k, column] = torch.nan
+        held[k, column] = x[1, 0] if k == 0 else held[k - 1, column]
+    model = st.StaFRegressor(radius=0.4, noise=0.2)
+    found, expected = (
+        model.smooth(holed, y),
+        model.smooth(held, torch.where(torch.arange(40) == 0, torch.nan, y)),
+    )
+    for one, other in zip(found, expected, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-9, atol=1e-9)
+
+
+def test_a_stream_that_started_afresh_says_nothing_about_what_was_before() -> None:
+    x, y = path(60), uniform(60, seed=5)
+    gone = torch.where(torch.arange(60) < 30, y, 1e12 * y)
+    model = st.StaFRegressor(radius=0.4, noise=0.2)
+    whole, part = model.smooth(x, gone), model.smooth(x[:30], y[:30])
+    for one, other in zip(whole, part, strict=True):
+        torch.testing.assert_close(one[:30], other, rtol=1e-9, atol=1e-9)
 
 
 def test_streams_outputs_units_and_times_are_smoothed_as_alone() -> None:

@@ -80,3 +80,24 @@ def test_there_is_nothing_to_tune_in_the_accurate_mode() -> None:
     assert st.StaFRegressor(memory=128).tune(x, y)._tuning is None
     with pytest.raises(ValueError, match=r"tune.*must have the shape"):
         st.StaFRegressor().tune(x[:, 0], y)
+
+
+def test_tuned_streams_keep_their_hyperparameters_when_others_go_and_come() -> None:
+    pairs = [drawn(torch.tensor([0.7, 0.7]).double(), 0.1, steps=60, seed=seed) for seed in range(3)]
+    x, y = (torch.stack([3.0 * pair[k] + 5 for pair in pairs], 1) for k in range(2))
+    tuned = st.StaFRegressor().tune(x, y)
+    again = pickle.loads(pickle.dumps(tuned))  # before the first sample too
+    for model in (tuned, again):
+        model.fit(x, y).drop([0]).add(1).reset(streams=[1])
+    assert torch.equal(tuned.predict(x[3]), again.predict(x[3]))
+    other = st.StaFRegressor().load_state_dict(tuned.state_dict())
+    order = [1, 2, 0]
+    alone = st.StaFRegressor()
+    alone._tuning = None if tuned._tuning is None else tuned._tuning.keep(torch.tensor([1]))
+    for k in range(60):
+        for model in (tuned, other):
+            model.partial_fit(x[k, order], y[k, order])
+        alone.partial_fit(x[k, 2:3], y[k, 2:3])
+    assert torch.equal(tuned.predict(x[9, order]), other.predict(x[9, order]))
+    assert torch.equal(tuned.predict(x[9, order])[1], alone.predict(x[9, 2:3])[0])  # begun anew, still tuned
+    assert float((tuned.predict(x[59, order]) - y[59, order])[2].abs()) < 1.0  # one that nobody tuned

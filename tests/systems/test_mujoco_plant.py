@@ -50,6 +50,23 @@ def test_rows_are_the_simulations_of_mujoco_itself() -> None:
         assert torch.equal(other.step(x, u), after)
 
 
+def test_simulation_that_goes_on_under_a_feedback_has_the_bits_of_single_periods(
+    tmp_path, monkeypatch
+) -> None:  # type: ignore[no-untyped-def]
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes its log into the working directory
+    plant = pole(dt=0.02)
+    x = 0.3 * torch.randn(3, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64).numpy()
+    x[2, 3] = 1e12  # MuJoCo resets this row
+    feedback = lambda x: np.clip(-x[:, :1] - 5 * x[:, 1:2], -1.0, 2.0)  # noqa: E731
+    for simulator in (plant, pole(dt=0.02, threads=2)):
+        states, controls = simulator.function.follow(x, feedback, 5)
+        assert (states.shape, controls.shape) == ((3, 6, 4), (3, 5, 1))
+        for k in range(5):
+            after = plant.step(torch.from_numpy(states[:, k].copy()), torch.from_numpy(controls[:, k].copy()))
+            np.testing.assert_array_equal(after[:2].numpy(), states[:2, k + 1])
+        assert np.isnan(states[2, 1:]).all()
+
+
 def test_slopes_of_mujoco_are_those_of_differences() -> None:
     known, by_differences = pole(dt=0.03), pole("RK4", dt=0.03)
     at = known.linearisation()

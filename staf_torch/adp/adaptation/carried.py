@@ -8,8 +8,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ...lanes.tree import flatten, unflatten
+
 Tree = Any
-"""A tensor, or a named tuple of trees."""
+"""A tensor, or a named tuple of trees, as in `lanes.tree`."""
 
 
 def pack(tree: Tree, lead: int) -> Tensor:
@@ -19,9 +21,8 @@ def pack(tree: Tree, lead: int) -> Tensor:
         tree: of tensors with the same leading dimensions.
         lead: how many dimensions lead.
     """
-    return torch.cat(
-        [leaf.flatten(lead) if leaf.dim() > lead else leaf[..., None] for leaf in leaves(tree)], -1
-    )
+    leaves, _ = flatten(tree)
+    return torch.cat([leaf.flatten(lead) if leaf.dim() > lead else leaf[..., None] for leaf in leaves], -1)
 
 
 def unpack(like: Tree, flat: Tensor, lead: int) -> Tree:
@@ -32,18 +33,8 @@ def unpack(like: Tree, flat: Tensor, lead: int) -> Tree:
         flat: (..., K).
         lead: how many dimensions lead in ``like``.
     """
-    shapes = [leaf.shape[lead:] for leaf in leaves(like)]
+    leaves, structure = flatten(like)
+    shapes = [leaf.shape[lead:] for leaf in leaves]
     pieces = flat.split([math.prod(shape) for shape in shapes], dim=-1)
     found = [piece.reshape(*flat.shape[:-1], *shape) for piece, shape in zip(pieces, shapes, strict=True)]
-    return _rebuilt(like, iter(found))
-
-
-def leaves(tree: Tree) -> list[Tensor]:
-    """The tensors of a tree, in order."""
-    return [tree] if isinstance(tree, Tensor) else [leaf for part in tree for leaf in leaves(part)]
-
-
-def _rebuilt(like: Tree, found: Any) -> Tree:
-    if isinstance(like, Tensor):
-        return next(found)
-    return type(like)(*(_rebuilt(part, found) for part in like))
+    return unflatten(structure, iter(found))

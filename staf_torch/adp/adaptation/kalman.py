@@ -14,7 +14,7 @@ from ...numerics.linalg import row_jacobian
 from ...systems import Plant, runge_kutta_step
 from ..controllers import Controller, ControllerState
 from ..cost import matvec
-from .carried import leaves, pack, unpack
+from .carried import pack, unpack
 from .measured import Output
 from .redesign import product
 
@@ -243,7 +243,7 @@ class Observed(Controller):
         self.guess, self.deviation = guess, torch.tensor(several, dtype=torch.float64)
         self.draws, self.period = controller.draws, controller.period
         self._like = self._start(torch.zeros(1, 1, dtype=torch.float64))
-        self._size = sum(leaf[0].numel() for leaf in leaves(self._like))
+        self._size = pack(self._like, 1).shape[-1]
 
     @property
     def label(self) -> str:

@@ -13,7 +13,7 @@ from ...numerics.checks import fail, positive_real, vector
 from ..controllers import Controller, ControllerState
 from ..halfspaces import nearest_admissible
 from ..safety_filter import Constraint, SafetyFilter
-from .carried import leaves, pack, unpack
+from .carried import pack, unpack
 from .least_squares import Estimate, LeastSquares
 from .measured import ChangingPlant
 from .parametric import ParametricPlant
@@ -122,7 +122,7 @@ class RobustFilter(Controller):
         )
         self.period, self.draws = dt, controller.draws
         self._like = self._start(torch.zeros(1, n, dtype=torch.float64))
-        self._size = sum(leaf[0].numel() for leaf in leaves(self._like))
+        self._size = pack(self._like, 1).shape[-1]
 
     def init(self, x0: Tensor) -> ControllerState:
         inner = self.controller.init(x0)

@@ -26,7 +26,9 @@ _MOST = 120  # intervals that are chosen at most where inputs are bounded
 _ROWS = 256  # states solved from at once: a graph of second derivatives is kept for each
 _GAP = 1e-3  # share of the value by which a stationary control may miss the minimum of the Hamiltonian
 _SAME = 1e-4  # relative, of the values of two starts that found the same
-_NEAR = (0.5, 2.0)  # value over the LQR's, inside which one start is believed
+_NEAR = (0.5, 2.0)  # value over the LQR's, inside which one start is believed,
+_PLAIN = 1.5  # where following the base costs at most so many times what was found from it
+_MIRRORED = 1e-9  # relative difference of cost below which two guesses are one and its mirror image
 _REST = 1e-3  # share of the value that the terminal cost may be, before the horizon grows
 _DOUBLINGS = 3  # of the horizon
 _SPLINES = 8  # random guesses
@@ -44,10 +46,11 @@ class DirectShooting:
 
     A row is stationary when the model promises a relative improvement of less than ``tolerance`` and the
     control minimises the Hamiltonian in u to a share of 1e-3 of the value: a saturated control without a
-    slope does not pass. A row whose value is not near its LQR's is started from more guesses: constant
-    controls at the bounds for a while, none, random splines, each followed by the base policies; the
-    cheapest of them are improved. It has converged if two starts found the same lowest value to 1e-4, else
-    its `reason` says ``local``. A row that is not stationary is NaN, and its `reason` says why.
+    slope does not pass. A row whose value is not near its LQR's, or is much less than the base costs, is
+    started from more guesses: constant controls at the bounds for a while, none, random splines, each
+    followed by the base policies; the cheapest of them that are no mirror images are improved. It has
+    converged if two starts found the same lowest value to 1e-4, else its `reason` says ``local``. A row that
+    is not stationary is NaN, and its `reason` says why.
 
     Every control that is found is admissible, so the value is an upper bound of V*, but for the errors of
     the Runge-Kutta steps and of the horizon, which `Optimum` reports.
@@ -184,14 +187,14 @@ class DirectShooting:
         base = self.bases[0]
         start = follow(self, _always(base), x0, time.diff())
         found = self._improve(start, time, x0, base)
-        hard = ~self._believed(found, x0)
+        hard = ~self._believed(found, x0, start.cost)
         if not bool(hard.any()):  # costs time alone
             return found
         rows = hard.nonzero().flatten()
         plans = self._guessed(x0[rows], time)
         if warm is not None:
             plans.append(self._warm(warm, x0[rows], rows, time))
-        plans = _cheapest(plans, self.starts)
+        plans = _cheapest(plans, self.starts, start.cost[rows])
         # All starts of all rows are one batch: what a step costs hardly depends on its size.
         together = Plan(*(torch.cat(parts) for parts in zip(*plans, strict=True)))
         improved = self._improve(together, time, x0[rows].repeat(len(plans), 1), base)
@@ -199,12 +202,13 @@ class DirectShooting:
         several = [selected(improved, k * len(rows) + places) for k in range(len(plans))]
         return _merged(found, rows, several)
 
-    def _believed(self, found: Optimum, x0: Tensor) -> Tensor:
-        """Rows in which one start is enough: (B,) bool."""
+    def _believed(self, found: Optimum, x0: Tensor, followed: Tensor) -> Tensor:
+        """Rows in which one start is enough, given what following the base costs there: (B,) bool."""
         if self.lqr is None or isinstance(self.stage.system, Linear):
             return found.converged
         ratio = found.value / self.lqr.value(x0)
-        return found.converged & ((x0 == 0).all(-1) | ((ratio > _NEAR[0]) & (ratio < _NEAR[1])))
+        near = (ratio > _NEAR[0]) & (ratio < _NEAR[1]) & (followed <= _PLAIN * found.value)
+        return found.converged & ((x0 == 0).all(-1) | near)
 
     def _guessed(self, x0: Tensor, time: Tensor) -> list[Plan]:
         lengths, horizon = time.diff(), float(time[-1])
@@ -308,10 +312,23 @@ def _why(known: bool, solution: Solution, left: float, row: int) -> str:
     return f"the control misses the minimum of the Hamiltonian by {left:.2g} of the value: it is saturated"
 
 
-def _cheapest(plans: list[Plan], count: int) -> list[Plan]:
-    """The ``count`` cheapest of several plans, row by row."""
-    costs = torch.stack([plan.cost for plan in plans])  # (S, B)
-    order = costs.argsort(dim=0)[: min(count, len(plans))]
+def _cheapest(plans: list[Plan], count: int, used: Tensor) -> list[Plan]:
+    """The ``count`` cheapest of several plans that differ from each other and from one used, row by row.
+
+    Two that cost the same are mirror images, or one and the same: they would find the same, and agree with
+    nobody but themselves. All but the first of them come last, as plans that cost inf.
+
+    Args:
+        plans: of the rows.
+        count: at most.
+        used: cost of the plan that was improved already, (B,).
+    """
+    costs = torch.stack([used, *(plan.cost for plan in plans)])  # (1 + S, B)
+    apart = (costs.unsqueeze(1) - costs).abs() > _MIRRORED * costs
+    same = ~apart & torch.isfinite(costs)
+    earlier = torch.ones_like(same[..., 0]).tril(-1).unsqueeze(-1)  # plan i after plan j
+    costs = torch.where((same & earlier).any(1), torch.inf, costs)[1:]
+    order = costs.argsort(dim=0, stable=True)[: min(count, len(plans))]
     rows = torch.arange(costs.shape[1])
     state, control = (torch.stack([getattr(p, name) for p in plans]) for name in ("state", "control"))
     return [Plan(state[k, rows], control[k, rows], costs[k, rows]) for k in order]
