@@ -5,10 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ..lanes import repeat
 from ..lanes.function import RowFunction
 from .plans import Reference, Trajectories
 from .sampled_problem import SampledProblem
+from .sampled_rollout import SampledRollout
 from .trajectory_optimisation import BoxDDP
 
 _LENGTHS = (2, 4, 7, 12, 20, 30)  # periods for which a corner of the bounds is held before the feedback
@@ -22,33 +22,26 @@ class BoundedPlans:
     Args:
         problem: plant, cost and bounds in steps.
         steps: T.
+        policy: whose base is the linear feedback; a program is kept by what the policy holds, as a problem
+            holds closures, which are not known again.
     """
 
-    def __init__(self, problem: SampledProblem, steps: int) -> None:
+    def __init__(self, problem: SampledProblem, steps: int, policy: SampledRollout) -> None:
         self.problem, self.steps = problem, steps
         self._search = BoxDDP(problem, steps=steps, iterations=_ITERATIONS)
-        self._strained = RowFunction(self._strain, problem, "whether a bound is met")
+        self._strained = RowFunction(policy.meets_bound, policy, "whether a bound is met")
 
     def strained(self, x: Tensor) -> Tensor:
-        """Whether the linear feedback, followed over the horizon, meets a bound: (B, n) -> (B,) bool."""
-        return self._strained(x)[:, 0] > 0
+        """Whether the base, followed over the policy's horizon, meets a bound: (B, n) -> (B,) bool."""
+        return self._strained(x).reshape(-1) > 0
+
+    def hasten(self) -> None:
+        """Compile `strained` at its next call."""
+        self._strained.hasten()
 
     def __call__(self, x: Tensor) -> Tensor:
         """u: (B, n) -> (B, m)."""
         return best_held(self._search, x).control[:, 0]
-
-    def _strain(self, x: Tensor) -> Tensor:
-        low, high = self.problem.bounds.low.to(x), self.problem.bounds.high.to(x)
-
-        def step(now: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
-            at, met = now
-            u = self.problem.linear_feedback(at)
-            after, _ = self.problem.advance(at, u)
-            bound = ((u <= low) | (u >= high)).any(-1)
-            return after, torch.where(bound, 1.0, met)
-
-        met: Tensor = repeat(self.steps, step, (x, torch.zeros_like(x[..., 0])))[1]
-        return met.unsqueeze(-1)
 
 
 def best_held(search: BoxDDP, x: Tensor) -> Trajectories:

@@ -27,6 +27,7 @@ from .sampled_rollout import SampledRollout
 from .sampling import held_stability
 from .shooting import DirectShooting
 from .simulation import simulate
+from .strained_plans import StrainedPlans
 
 _log = logging.getLogger(__name__)
 _DECAY = 2.0  # time constants of the slowest mode of the LQR in the horizon
@@ -68,11 +69,13 @@ class NearOptimal(SampledRollout):
         return controls.index_copy(0, strained.nonzero().squeeze(1), planned).view(u.shape)
 
     def controller(self) -> Controller:
-        """What a loop runs: the policy itself, or with ``plan`` a `RecedingHorizon` over its horizon that
-        carries its plan from control to control, the first one the best of several."""
-        if self.planner is None:
-            return Feedback(self)
-        return RecedingHorizon(self.planner.problem, steps=self.steps, held=True)
+        """What a loop runs: the policy, and where inputs have bounds and the LQR, followed from the state,
+        would meet one, a plan that is carried as long as this lasts. With ``plan`` a `RecedingHorizon` that
+        carries its plan from control to control all the time, the first one the best of several."""
+        if self.planner is not None:
+            return RecedingHorizon(self.planner.problem, steps=self.steps, held=True)
+        planner = self.plans(_PLANNED)
+        return Feedback(self) if planner is None else StrainedPlans(self, planner)
 
     def __getstate__(self) -> dict[str, Any]:
         return {**super().__getstate__(), "planner": self.planner is not None}
@@ -81,12 +84,16 @@ class NearOptimal(SampledRollout):
         super().__setstate__(state)
         self.planner = self.plans() if state["planner"] else None
 
-    def plans(self) -> BoundedPlans | None:
-        """What controls where the LQR would meet a bound; None without bounds or a plant in torch."""
+    def plans(self, constants: float | None = None) -> BoundedPlans | None:
+        """What controls where the LQR would meet a bound; None without bounds or a plant in torch. It looks
+        so many time constants ahead, by default as far as the policy."""
         limited = self.cost.bounds is not None and not self.cost.discount
         if not limited or not self.plant.traceable or self.plant.period not in (None, self.period):
             return None
-        return BoundedPlans(SampledProblem.of(self.plant, self.cost, dt=self.period), self.steps)
+        steps = self.steps
+        if constants is not None:
+            steps = max(steps, _periods(constants / _slowest(self.lqr, self.plant), self.period))
+        return BoundedPlans(SampledProblem.of(self.plant, self.cost, dt=self.period), steps, self)
 
     @torch.no_grad()
     def report(
@@ -109,8 +116,8 @@ class NearOptimal(SampledRollout):
             where it is not known; ``good_spread``, the largest of 1/4, 1/2, 1, 2, 4 times the spread at which
             all are regulated, else of 1/8 to 1/4096, 0 if none; ``microseconds`` a control of one row, the
             median; ``strained``, the share of the states from which the LQR would meet a bound within the
-            horizon, where the policy is no better than the LQR unless it plans; None without bounds or a
-            plant in torch.
+            horizon, where the policy as a function of x is no better than the LQR unless it plans, and its
+            ``controller()`` plans; None without bounds or a plant in torch.
         """
         width = positive_real("report", "spread", self.plant.spread if spread is None else spread)
         x0 = self._drawn(states, width, seed)
@@ -203,13 +210,16 @@ def near_optimal(
     control takes, on the cross-polytope of the inputs alone, as `SampledRollout` says); a plant in continuous
     time is integrated in steps of a fifth of its fastest time constant.
 
-    Rollouts of an LQR do not know what to do before a bound of the inputs. With ``plan`` the policy's
-    ``controller()``, for loops, is a `RecedingHorizon` over that horizon, of which the first plan is the best
-    that `BoxDDP` finds from the LQR and from holding a bound for a while, and that is carried and improved
-    from control to control, in some milliseconds. It takes a plant in torch, held for one period of its own,
-    without a discount. The policy as a function of x makes such a plan anew, in tens of milliseconds, where
-    the LQR, followed from x over the horizon, meets a bound; in a loop two ways around that cost nearly the
-    same would take turns. ``report()`` says how often bounds are met, ``strained``.
+    Rollouts of an LQR do not know what to do before a bound of the inputs. Where the LQR, followed from x
+    over the horizon, meets one (``report()`` says how often, ``strained``), the policy's ``controller()``,
+    for loops, carries a plan by `BoxDDP` over three time constants and improves it from control to control,
+    in some milliseconds, until no bound is met any more. A first state of this kind gets the best plan of
+    those begun from the LQR and from holding a bound for a while: it is made before the loop, by ``init``;
+    a row that comes to a bound later begins from the LQR. After `lanes.ready` of the policy ``init``
+    compiles what plans need. It takes a plant in torch, held for one period of its own, without a discount;
+    else, and without bounds, ``controller()`` is the policy alone. With ``plan`` it is a `RecedingHorizon`,
+    which plans all the time, and the policy as a function of x makes a plan anew, in tens of milliseconds,
+    where a bound is met; in a loop two ways around that cost nearly the same would take turns.
     A simulator so slow that a control takes more than half of dt is a warning in the log, with the share.
 
     Example:
@@ -252,9 +262,7 @@ def near_optimal(
         if horizon is None
         else positive_real("near_optimal", "horizon", horizon)
     )
-    steps = round(seconds / period)
-    if horizon is None:  # four quarters, of which a program has one
-        steps = min(max(-(-steps // 4) * 4, _STEPS[0]), _STEPS[1])
+    steps = _periods(seconds, period) if horizon is None else round(seconds / period)
     substeps = 1
     if plant.period is None:
         a, _ = plant.linearisation(placed.target, placed.target_input)
@@ -273,6 +281,11 @@ def near_optimal(
     if not plant.traceable:
         _warn_if_slow(policy)
     return policy
+
+
+def _periods(seconds: float, period: float) -> int:
+    """In a horizon: four quarters, of which a program has one."""
+    return min(max(-(-round(seconds / period) // 4) * 4, _STEPS[0]), _STEPS[1])
 
 
 def _warn_if_slow(policy: NearOptimal) -> None:

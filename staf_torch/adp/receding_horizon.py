@@ -94,6 +94,12 @@ class RecedingHorizon(Controller):
         found = self._first.solve(x0, control, reference, self._terminal(x0, control, reference))
         return _carrying(_rows(found))
 
+    def idle(self, x0: Tensor) -> ControllerState:
+        """The linear feedback of the goal as a plan, not yet followed from the states x0 (B, n)."""
+        goal, gains = self.problem.goals(x0, self.steps)[:, :-1], (-self.problem.k).flatten()
+        parts = goal, self.problem.rest.expand(*goal.shape[:-1], -1), gains.expand(*goal.shape[:-1], -1)
+        return _carrying(torch.cat(parts, dim=-1))
+
     def step(
         self, x: Tensor, carried: ControllerState, uniform: Tensor, dt: float
     ) -> tuple[Tensor, ControllerState]:

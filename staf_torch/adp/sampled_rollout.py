@@ -124,6 +124,11 @@ class SampledRollout(nn.Module):
         """u: (..., n) -> (..., m)."""
         return self._compiled(x) if self._compiled is not None else self.control(x)
 
+    @property
+    def compiled(self) -> bool:
+        """Whether a compiled program has served a call."""
+        return self._compiled is not None and self._compiled.compiled
+
     def __getstate__(self) -> dict[str, Any]:
         return {**vars(self), "_compiled": None, "_followed": None}
 
@@ -221,6 +226,19 @@ class SampledRollout(nn.Module):
 
         found: Tensor = each(whole, x, dim=x.dim() - 2) if x.dim() > 1 else whole(x)
         return Promise(found[..., 0], found[..., 1], found[..., 2] > 0)
+
+    def meets_bound(self, x: Tensor) -> Tensor:
+        """1 where the base, followed over the horizon, meets a bound, else 0: (..., n) -> (..., 1)."""
+        low, high = self.bounds.low.to(x), self.bounds.high.to(x)
+
+        def step(now: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+            at, met = now
+            u = self.bounds.clip(self.base(at))
+            after, _ = self.holding(at, u)
+            return after, torch.where(((u <= low) | (u >= high)).any(-1), 1.0, met)
+
+        met: Tensor = repeat(self.steps, step, (x, torch.zeros_like(x[..., 0])))[1]
+        return met.unsqueeze(-1)
 
     def _promised(self, x: Tensor, first: int) -> Promise:
         """`rollout` of a simulator: it goes through all periods, and then all of it is paid for at once."""

@@ -125,6 +125,31 @@ def test_plan_takes_over_where_the_lqr_would_meet_a_bound() -> None:
 
 
 @torch.no_grad()
+def test_loop_carries_a_plan_only_where_the_lqr_would_meet_a_bound() -> None:
+    """The same mass without `plan`: from afar the optimum, also where it is only pushed there in the loop."""
+    plant = systems.Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
+    policy = adp.near_optimal(plant, COST, dt=0.25, low=-1.0, high=1.0)
+    loop, planner = policy.controller(), policy.plans()
+    assert planner is not None
+    x = torch.tensor([[3.0, 1.0], [0.05, 0.0], [-3.0, -1.0]], dtype=torch.float64)
+    run, alone = (
+        adp.simulate(loop, plant, policy.cost, rows, dt=0.25, steps=12, compile=False) for rows in (x, x[:1])
+    )
+    assert torch.equal(alone.state[0], run.state[0])
+    assert planner.strained(run.state[0]).tolist() == [True] * 8 + [False] * 5
+    best = adp.BoxDDP(planner.problem, steps=60).solve(x)
+    torch.testing.assert_close(run.control[:, :12], best.control[:, :12], rtol=0, atol=1e-2)
+    near, none = x[1:2], x.new_zeros(1, 0)
+    u, carried = loop.step(near, loop.init(near), none, 0.25)
+    assert torch.equal(u, policy(near))
+    pushed, _ = loop.step(x[:1], carried, none, 0.25)
+    torch.testing.assert_close(pushed, best.control[:1, 0], rtol=0, atol=1e-2)
+    lost, _ = loop.step(near / 0.0, carried, none, 0.25)  # nothing is planned from there
+    assert bool(lost.isnan().all())
+    assert isinstance(adp.near_optimal(plant, COST, dt=0.25).controller(), adp.Feedback)
+
+
+@torch.no_grad()
 def test_another_control_than_the_bases_promises_less_over_both_horizons() -> None:
     policy = adp.near_optimal(systems.TwoState(), COST, dt=0.1, horizon=0.8)
     x, discount = drawn(2, 2.0, 300), math.exp(-COST.discount * 0.1)

@@ -2,9 +2,9 @@
 
     python tests/benchmarks/never_worse.py [--states 300] [--only TwoState,Pendulum] [--json FILE]
 
-A row a plant: the cost of `adp.near_optimal` over that of its LQR where both regulate, and how
-many states each regulates. Ends with an error where a state costs more than 1.01 of the base's. Not collected
-by pytest.
+A row a plant: the cost of `adp.near_optimal(...).controller()` over that of its LQR where both regulate, and
+how many states each regulates. Ends with an error where a state costs more than 1.01 of the base's. Not
+collected by pytest.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def measure(name: str, count: int) -> dict[str, float | int]:
     x0 = width * (2 * torch.rand(count, plant.dim, generator=generator, dtype=torch.float64) - 1)
     runs = [
         adp.simulate(
-            adp.Feedback(one),
+            one,
             plant,
             policy.cost,
             x0,
@@ -55,7 +55,7 @@ def measure(name: str, count: int) -> dict[str, float | int]:
             every=periods,
             substeps=policy.substeps,
         )
-        for one in (policy.lqr, policy)
+        for one in (adp.Feedback(policy.lqr), policy.controller())
     ]
     left = [policy.cost.deviation(run.state[:, -1]).norm(dim=-1) for run in runs]
     base, ours = (

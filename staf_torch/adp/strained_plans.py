@@ -1,0 +1,68 @@
+"""A policy in a loop that plans where its base would meet a bound, and only as long as that lasts."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from .bounded_plans import BoundedPlans
+from .controllers import Controller, ControllerState
+from .receding_horizon import RecedingHorizon
+from .sampled_rollout import SampledRollout
+
+
+class StrainedPlans(Controller):
+    """u = policy(x), but a plan's where the linear feedback of the goal, followed from x, would meet a bound.
+
+    There a row carries a plan from control to control and improves it on the way, until the linear feedback
+    meets no bound any more. That the plan is carried matters: two ways around that cost nearly the same would
+    take turns, were each control decided anew. Where this is so at the beginning, the first plan is the best
+    of several, which `init` finds before the loop; in the loop there is no time for this, and a plan begins
+    from the linear feedback.
+
+    Args:
+        policy: of the other states; its base is the linear feedback.
+        planner: of its plant, cost and bounds; it knows where bounds are met.
+    """
+
+    def __init__(self, policy: SampledRollout, planner: BoundedPlans) -> None:
+        super().__init__()
+        self.policy, self.period = policy, policy.period
+        self._planner = planner
+        self._begun = RecedingHorizon(planner.problem, steps=planner.steps, held=True)
+
+    @property
+    def label(self) -> str:
+        return type(self.policy).__name__
+
+    def init(self, x0: Tensor) -> ControllerState:
+        """The first plans from x0 (B, n), of the rows that need one.
+
+        After `lanes.ready` of the policy, what the loop may need is made and compiled here, too.
+        """
+        carried = self._begun.idle(x0)
+        if self.policy.compiled:
+            self._planner.hasten()
+            self._begun.step(x0, carried, x0, self.policy.period)
+        rows = self._strained(x0).nonzero().squeeze(1)
+        if len(rows):  # saves work: the best of several takes a tenth of a second
+            carried.identifier[rows] = self._begun.init(x0[rows]).identifier
+        return carried
+
+    def step(
+        self, x: Tensor, carried: ControllerState, uniform: Tensor, dt: float
+    ) -> tuple[Tensor, ControllerState]:
+        rows = self._strained(x).nonzero().squeeze(1)
+        # The policy sees all rows, as each number of rows would be a program of its own.
+        u = self.policy(x) if len(rows) < len(x) else x.new_empty(len(x), self.policy.cost.inputs)
+        after = self._begun.idle(x)
+        if len(rows):  # saves work: a plan takes milliseconds
+            plans = carried._replace(**{name: part[rows] for name, part in carried._asdict().items()})
+            planned, ahead = self._begun.step(x[rows], plans, uniform[rows], dt)
+            u = u.index_copy(0, rows, planned)
+            after.identifier[rows] = ahead.identifier
+        return u, after
+
+    def _strained(self, x: Tensor) -> Tensor:
+        """(B, n) -> (B,) bool; a row that has left the finite numbers has nothing to plan."""
+        return self._planner.strained(x) & torch.isfinite(x).all(-1)
