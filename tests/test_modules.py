@@ -222,7 +222,7 @@ OTHERS |= {
 }
 OTHERS |= {"AmongDiscs"}  # of an experiment
 OTHERS |= {"RecedingHorizon", "PathIntegral", "MujocoPlant", "EnvironmentPlant", "EnergyShaping"}
-OTHERS |= {"NearOptimal", "SampledRollout"}
+OTHERS |= {"NearOptimal", "SampledRollout", "StrainedPlans"}
 OTHERS |= {
     "ParametricPlant",
     "ChangingPlant",
