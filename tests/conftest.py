@@ -38,6 +38,15 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         items.sort(key=lambda item: (rank[item.path], own[item.nodeid]))
 
 
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Skip what is about compiled programs where nothing can be compiled."""
+    if item.get_closest_marker("needs_compiler") is not None:
+        from staf_torch.lanes import build
+
+        if not build.compiler():
+            pytest.skip("needs a C++ compiler")
+
+
 @pytest.hookimpl(wrapper=True)
 def pytest_collection() -> Generator[None, object, object]:
     """Collect tests without looking for garbage, a quarter of that time: all of them stay."""

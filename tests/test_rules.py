@@ -37,6 +37,7 @@ OTHERS = {
     "ConcurrentTracker": "in tests/adp/adaptation/test_identifiers.py",
     "RobustFilter": "in tests/adp/adaptation/test_robust_filter.py",
     "Observed": "in tests/adp/adaptation/test_kalman.py",
+    "ConsiderFilter": "in tests/adp/adaptation/test_consider.py",
     "trace": "takes an exported program",
     "Cosine": "numbers and lists alike, in tests/test_targets.py",
     "paper_step": "of the theorem, in tests/theory/test_errata.py",

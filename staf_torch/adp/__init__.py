@@ -10,6 +10,8 @@ from .adaptation import Belief as Belief
 from .adaptation import ChangingPlant as ChangingPlant
 from .adaptation import ConcurrentGradient as ConcurrentGradient
 from .adaptation import ConcurrentTracker as ConcurrentTracker
+from .adaptation import Considered as Considered
+from .adaptation import ConsiderFilter as ConsiderFilter
 from .adaptation import Doubling as Doubling
 from .adaptation import DriftAdaptation as DriftAdaptation
 from .adaptation import DriftEstimate as DriftEstimate
@@ -115,6 +117,8 @@ __all__ = [
     "ConcurrentGradient",
     "ConcurrentLearning",
     "ConcurrentTracker",
+    "ConsiderFilter",
+    "Considered",
     "Controller",
     "ControllerState",
     "Cost",

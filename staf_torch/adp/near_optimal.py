@@ -198,10 +198,10 @@ def near_optimal(
     """A policy for a plant, held for dt, that costs no more than its LQR.
 
     The rules: the base is the LQR made for dt; the horizon is two time constants of its slowest mode (three
-    with plans), 12 to 60 periods, four quarters; the centers are as many as quadratics need, from four
-    states on the cross-polytope and its middle, in a ball of ``radius`` (of a simulator, whose time is what a
-    control takes, on the cross-polytope of the inputs alone, as `SampledRollout` says); a plant in continuous
-    time is integrated in steps of a fifth of its fastest time constant.
+    with plans), 12 to 60 periods, four quarters; 2 m + 1 centers lie along the m inputs, at ``radius``
+    from the state and on it, as `SampledRollout` says (with more inputs than states, around the state as many
+    as quadratics need); a plant in continuous time is integrated in steps of a fifth of its fastest time
+    constant.
 
     Rollouts of an LQR do not know what to do before a bound of the inputs. With ``plan`` the policy's
     ``controller()``, for loops, is a `RecedingHorizon` over that horizon, of which the first plan is the best
@@ -259,10 +259,9 @@ def near_optimal(
     if plant.period is None:
         a, _ = plant.linearisation(placed.target, placed.target_input)
         substeps = max(1, math.ceil(period * float(torch.linalg.eigvals(a).abs().max()) / _RESOLVED))
-    directions = ball_directions(None, placed.dim)
-    if not plant.traceable and placed.inputs < placed.dim:
-        corners = cross_polytope(placed.inputs)
-        directions = torch.cat((corners, torch.zeros_like(corners[:1])))
+    corners = cross_polytope(placed.inputs)
+    along = torch.cat((corners, torch.zeros_like(corners[:1])))
+    directions = along if placed.inputs <= placed.dim else ball_directions(None, placed.dim)
     basis = StaFBasis(ExponentialKernel(), StateFollowingCenters(directions, radius))
     policy = NearOptimal(
         basis, plant, placed, lqr, lqr.value, lqr.p, period=period, steps=steps, substeps=substeps

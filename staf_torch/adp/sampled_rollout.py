@@ -186,7 +186,7 @@ class SampledRollout(nn.Module):
 
     def _promise(self, after: Tensor, known: Promise) -> Promise:
         """What the base promises from (..., 1 + S, n), of which the first may be among the centers."""
-        middle = None if self._followed is None or self.along is None else self.along.middle
+        middle = None if self.along is None else self.along.middle
         if middle is None:
             return self.rollout(after)
         others = self.rollout(after[..., 1:, :])

@@ -19,6 +19,7 @@ from staf_torch.lanes import compiler, program
 
 
 @pytest.mark.compiled
+@pytest.mark.needs_compiler
 def test_without_a_compiler_the_reference_runs_and_the_log_says_so_once(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -19,6 +19,8 @@ from staf_torch.lanes.content import reads_users_code
 from staf_torch.lanes.function import Rows
 from staf_torch.lanes.tracer import NotLoweredError
 
+pytestmark = pytest.mark.needs_compiler
+
 X = torch.linspace(-1, 1, 10, dtype=torch.float64).view(5, 2)
 COUNT = itertools.count()
 DRAW = np.random.default_rng(0)

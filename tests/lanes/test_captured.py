@@ -12,6 +12,8 @@ from torch import Tensor
 from staf_torch import lanes
 from staf_torch.lanes import compiler
 
+pytestmark = pytest.mark.needs_compiler
+
 NUMBERS = (torch.tensor([0.3, -1.7, 0.9]), torch.tensor([1.0, 1.0, 0.0]), torch.tensor([-0.0, 0.5, 1 / 64]))
 
 

@@ -11,6 +11,8 @@ from torch.fx.experimental.proxy_tensor import make_fx
 
 from staf_torch import lanes
 
+pytestmark = pytest.mark.needs_compiler
+
 EPS = torch.finfo(torch.float64).eps
 Pair = tuple[Tensor, Tensor]
 

@@ -8,6 +8,8 @@ from torch import Tensor
 
 from staf_torch import lanes
 
+pytestmark = pytest.mark.needs_compiler
+
 Pair = tuple[Tensor, Tensor]
 
 

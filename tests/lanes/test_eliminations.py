@@ -20,6 +20,8 @@ from staf_torch.lanes.eliminations import (
     triangular,
 )
 
+pytestmark = pytest.mark.needs_compiler
+
 
 def matrices(size: int, dtype: torch.dtype = torch.float64) -> torch.Tensor:
     torch.manual_seed(size)

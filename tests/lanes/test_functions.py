@@ -13,6 +13,8 @@ from torch import Tensor
 
 from staf_torch import lanes
 
+pytestmark = pytest.mark.needs_compiler
+
 BOUNDS: dict[str, tuple[float, float]] = {  # units in the last place, float64 and float32
     "exp": (1.0, 1.0),
     "expm1": (2.0, 2.0),

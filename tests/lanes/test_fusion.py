@@ -11,6 +11,8 @@ from torch import Tensor
 from staf_torch import lanes
 from staf_torch.lanes.fusion import evenly
 
+pytestmark = pytest.mark.needs_compiler
+
 SIZE = 67  # odd, and more entries than stay in registers
 EPS = torch.finfo(torch.float64).eps
 

@@ -14,6 +14,8 @@ from staf_torch.lanes.function import RowFunction, ready
 from staf_torch.lanes.kept import Kept
 from staf_torch.lanes.program import Program
 
+pytestmark = pytest.mark.needs_compiler
+
 X = torch.linspace(-1, 1, 10, dtype=torch.float64).view(5, 2)
 
 

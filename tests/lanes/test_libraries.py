@@ -11,10 +11,8 @@ import torch
 
 from staf_torch.lanes import Program, build, compiler
 
-needs_compiler = pytest.mark.skipif(not build.compiler(), reason="needs a C++ compiler")
 
-
-@needs_compiler
+@pytest.mark.needs_compiler
 @pytest.mark.parametrize("damage", ["half", "nothing left", "a byte changed", "no digest"])
 def test_damaged_library_in_the_cache_is_built_anew(
     damage: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -37,7 +35,7 @@ def test_damaged_library_in_the_cache_is_built_anew(
     assert ctypes.CDLL(str(path)).staf_seven() == 7
 
 
-@needs_compiler
+@pytest.mark.needs_compiler
 def test_checkouts_of_one_version_share_what_is_built_and_others_do_not(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

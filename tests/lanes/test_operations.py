@@ -13,6 +13,8 @@ from torch.nn import functional
 from staf_torch import lanes
 from staf_torch.lanes.replacements import REPLACEMENTS
 
+pytestmark = pytest.mark.needs_compiler
+
 SIZE = 3
 LIST = torch.tensor([2, 0])
 COMPARISONS = (torch.lt, torch.le, torch.gt, torch.ge, torch.eq, torch.ne)

@@ -15,6 +15,8 @@ from staf_torch.lanes import compiler
 from staf_torch.lanes.runs import Run, runs
 from staf_torch.optim.objective import NativeError, Precomputed
 
+pytestmark = pytest.mark.needs_compiler
+
 EPS = torch.finfo(torch.float64).eps
 SPECIAL = torch.tensor([0.0, -0.0, 1.0, -1.0, torch.inf, -torch.inf, torch.nan, 5e-324, -1e-310, 1e300, 0.5])
 

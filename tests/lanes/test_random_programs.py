@@ -13,6 +13,8 @@ from torch import Tensor
 
 from staf_torch import lanes
 
+pytestmark = pytest.mark.needs_compiler
+
 Operation = Callable[..., Tensor]
 ONE: dict[str, Operation] = {
     "neg": torch.neg,

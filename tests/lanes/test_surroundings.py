@@ -23,6 +23,7 @@ from staf_torch.lanes.program import Program
 from staf_torch.lanes.watch import Watch
 from staf_torch.systems import simulate
 
+pytestmark = pytest.mark.needs_compiler
 SOURCE = """
 import math, numpy as np, torch
 gain, unread, notes, table = 2.0, 1.0, [1.0, 2.0], {"gain": 2.0}

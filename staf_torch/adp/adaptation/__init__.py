@@ -4,6 +4,8 @@ from .adaptive_actor_critic import AdaptiveActorCritic as AdaptiveActorCritic
 from .adaptive_actor_critic import LearnedModel as LearnedModel
 from .adaptive_lqr import Adaptation as Adaptation
 from .adaptive_lqr import AdaptiveLQR as AdaptiveLQR
+from .consider import Considered as Considered
+from .consider import ConsiderFilter as ConsiderFilter
 from .drift_lqr import DriftAdaptation as DriftAdaptation
 from .drift_lqr import DriftLQR as DriftLQR
 from .history_stack import ConcurrentGradient as ConcurrentGradient

@@ -13,6 +13,7 @@ from ..controllers import LQR, Controller, ControllerState, Policy
 from ..cost import Cost, matvec, quadratic
 from ..rollout import RolloutPolicy
 from .carried import pack, unpack
+from .consider import Considered, ConsiderFilter
 from .least_squares import Estimate, LeastSquares
 from .parametric import ParametricPlant
 from .redesign import Doubling, Redesign, product
@@ -44,6 +45,7 @@ class Adaptation(NamedTuple):
     doubling: Doubling
     stage: Tensor  # (...) doublings done of the design that is under way
     p: Tensor  # (..., n, n) of the design that is used
+    belief: Considered | None = None  # of the state, where it is filtered
 
 
 class AdaptiveLQR(Controller):
@@ -57,7 +59,8 @@ class AdaptiveLQR(Controller):
 
     The Riccati equation is solved by structured doubling, ``doublings`` steps a design and ``a_step`` of them
     a control, so that a design is some controls old. With a ``rollout`` the LQR of the moment is its base and
-    the model of the moment its model.
+    the model of the moment its model. With a ``filter`` that LQR sees the filter's mean in place of what is
+    measured; the identifier and the robust policy see the measurement.
 
     Example:
         >>> def regressor(x, u):  # damping and inertia of an inverted pendulum
@@ -87,6 +90,7 @@ class AdaptiveLQR(Controller):
         doublings: of a design, at least 1.
         a_step: doublings a control; None for all of them at once.
         rollout: improves the LQR of the moment; its own model and base are not used.
+        filter: of the measured state, for the policy of the model of the moment; None for none.
 
     Raises:
         ValueError: if an argument breaks its rule, or the plant rests at the set-point for some theta only.
@@ -105,6 +109,7 @@ class AdaptiveLQR(Controller):
         doublings: int = 14,
         a_step: int | None = None,
         rollout: RolloutPolicy | None = None,
+        filter: ConsiderFilter | None = None,
     ) -> None:
         super().__init__()
         self.model, self.cost = model, cost.around(model)
@@ -113,7 +118,9 @@ class AdaptiveLQR(Controller):
         p = model.parameters_count
         if len(law.first) != p:
             raise fail("AdaptiveLQR", "law", f"must have the model's {p} parameters", len(law.first))
-        self.windows, self.law, self.rollout = windows, law, rollout
+        if filter is not None and filter.model is not model:
+            raise fail("AdaptiveLQR", "filter", "must be of the same model", filter.model)
+        self.windows, self.law, self.rollout, self.filter = windows, law, rollout, filter
         self.confidence = positive_real("AdaptiveLQR", "confidence", confidence)
         non_negative("AdaptiveLQR", "probe", probe)
         self.probe = real("AdaptiveLQR", "probe", probe)
@@ -154,7 +161,10 @@ class AdaptiveLQR(Controller):
         doubling, stage, p = self.redesign.step(now.doubling, now.stage, now.p, a, b)
         k = product(product(self.cost.r_inverse.to(b), b.mT), p)
         certain = self.redesign.solved(p, a, b) & (self._doubt(estimate.covariance, p, k) < 1)
-        u = self._control(x, estimate.theta, p, k)
+        belief = now.belief
+        if self.filter is not None and belief is not None:
+            belief = self.filter.step(belief, x, now.window.u, estimate, dt)
+        u = self._control(x if belief is None else belief.mean, estimate.theta, p, k)
         doubtful = self.robust(x)
         if self.probe:
             doubtful = doubtful + self._probing(now.time)
@@ -171,6 +181,7 @@ class AdaptiveLQR(Controller):
             doubling,
             stage,
             p,
+            belief,
         )
         return u, carried._replace(identifier=pack(after, x.dim() - 1))
 
@@ -188,6 +199,7 @@ class AdaptiveLQR(Controller):
             empty,
             zero.clone(),
             square.clone(),
+            None if self.filter is None else self.filter.init(x),
         )
 
     def _doubt(self, covariance: Tensor, p: Tensor, k: Tensor) -> Tensor:

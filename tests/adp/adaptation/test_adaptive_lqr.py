@@ -110,11 +110,15 @@ def test_a_design_that_cannot_be_made_leaves_the_robust_policy_and_not_a_dead_ro
     assert not control.adaptation(run.identifier).certain.any()
 
 
-@pytest.mark.parametrize("case", ["linear", "rollout"])
+@pytest.mark.parametrize("case", ["filter", "rollout"])
 def test_compiled_steps_are_those_of_the_definition(case: str) -> None:
     more = {
-        "linear": {"a_step": 2, "probe": 1.0},
         "rollout": {"a_step": 1, "rollout": adp.RolloutPolicy.of_lqr(PENDULUM, COST, steps=2)},
+        "filter": {
+            "a_step": 2,
+            "probe": 1.0,
+            "filter": adp.ConsiderFilter(PENDULUM, noise=0.01, process=0.01),
+        },
     }[case]
     controller = adp.Measured(adaptive(**more), noise=0.01, dim=2)
     loop = ClosedLoop(controller, CHANGING, CHANGING.cost(COST), dt=0.005)

@@ -1,0 +1,140 @@
+"""The state from noisy measurements of all of it, with a model whose parameters are being identified."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ...numerics.checks import fail, non_negative, real
+from ...numerics.linalg import row_jacobian
+from ...systems import runge_kutta_step
+from .least_squares import Estimate
+from .parametric import ParametricPlant
+from .redesign import product
+
+
+class Considered(NamedTuple):
+    """What a `ConsiderFilter` knows: x = mean + e + sensitivity (theta - theta^), with Cov e = covariance.
+
+    Example:
+        >>> adp.Considered._fields
+        ('mean', 'covariance', 'sensitivity', 'theta', 'steps')
+
+        Shown by `staf experiment=faults`.
+    """
+
+    mean: Tensor  # (..., n)
+    covariance: Tensor  # (..., n, n) of what noise and disturbances make
+    sensitivity: Tensor  # (..., n, p)
+    theta: Tensor  # (..., p) that the mean was made with
+    steps: Tensor  # (...) measurements so far
+
+
+class ConsiderFilter:
+    """The Schmidt-Kalman filter of measured states y = x + noise around an estimate theta^ with covariance C:
+
+        x^ += H d theta^,   x^-, F = step of x^ with theta^,   H- = F H + dt Y,   P- = F P F' + Q dt,
+        T = P- + H- C H-',   K = T (T + R)^-1,   x^ = x^- + K (y - x^-),
+        H = (I - K) H-,   P = (I - K) P- (I - K)' + K R K'.
+
+    H says how an error of theta^ shows in x^: while theta is unknown the measurement counts, once it is known
+    the model does, and where theta^ changes x^ follows. theta itself is left to a law as `LeastSquares`.
+
+    Example:
+        >>> plant = adp.ParametricPlant.of_effectiveness(systems.Pendulum())
+        >>> filter = adp.ConsiderFilter(plant, noise=0.01)
+        >>> unknown = adp.LeastSquares([1.0], deviation=0.5).init(torch.zeros(1, 2).double())
+        >>> y, u = torch.tensor([[0.1, 0.0]]).double(), torch.zeros(1, 1).double()
+        >>> now = filter.step(filter.init(y), y, u, unknown, 0.01)
+        >>> torch.equal(now.mean, y)  # the first measurement is all that is known
+        True
+
+        Shown by `staf experiment=faults`.
+
+    Args:
+        model: the plant; its theta is not used.
+        noise: standard deviation of every measured state, positive, one number or n.
+        process: standard deviation of what disturbs each state in a second, one number or n, not negative:
+            the variance grows by its square times the time.
+
+    Raises:
+        ValueError: if an argument breaks its rule.
+
+    Source: Schmidt, "Application of state-space methods to navigation problems", Adv. Control Syst. 3 (1966).
+    """
+
+    def __init__(
+        self,
+        model: ParametricPlant,
+        *,
+        noise: float | Sequence[float],
+        process: float | Sequence[float] = 0.0,
+    ) -> None:
+        n = model._size()
+        found = []
+        for name, given in (("noise", noise), ("process", process)):
+            several = list(given) if isinstance(given, Sequence) else [given] * n
+            if len(several) != n:
+                raise fail("ConsiderFilter", name, f"must be one number or {n}", given)
+            for value in several:
+                non_negative("ConsiderFilter", name, value)
+            found.append(torch.tensor(several, dtype=torch.float64))
+        if not all(real("ConsiderFilter", "noise", float(value)) > 0 for value in found[0]):
+            raise fail("ConsiderFilter", "noise", "must be positive", noise)
+        self.model = model
+        self.noise, self.process = found
+
+    def init(self, x: Tensor) -> Considered:
+        """Before the first measurement.
+
+        Args:
+            x: (..., n), for the shape alone.
+        """
+        lead, n, p = x.shape[:-1], x.shape[-1], self.model.parameters_count
+        return Considered(
+            torch.zeros_like(x),
+            x.new_zeros(*lead, n, n),
+            x.new_zeros(*lead, n, p),
+            x.new_zeros(*lead, p),
+            x.new_zeros(lead),
+        )
+
+    def step(self, state: Considered, y: Tensor, u: Tensor, estimate: Estimate, dt: float) -> Considered:
+        """What is known with the measurement of now.
+
+        Args:
+            state: after the measurement before.
+            y: (..., n), measured now.
+            u: (..., m), held since the measurement before.
+            estimate: of theta, with its covariance.
+            dt: s since then.
+        """
+        theta = estimate.theta
+        believed = self.model.believing(theta)
+        follows = (state.sensitivity * (theta - state.theta).unsqueeze(-2)).sum(-1)
+        mean, slope = row_jacobian(
+            lambda x: runge_kutta_step(lambda x: believed.motion(x, u), x, dt), state.mean + follows
+        )
+        sensitivity = product(slope, state.sensitivity) + dt * self.model.regressor(state.mean + follows, u)
+        own = product(product(slope, state.covariance), slope.mT)
+        own = own + torch.diag(self.process.to(y).square() * dt)
+        shown = product(product(sensitivity, estimate.covariance), sensitivity.mT)
+        r = torch.diag(self.noise.to(y).square())
+        whole = own + shown
+        gain = product(whole, torch.linalg.inv_ex(whole + r)[0])
+        kept = torch.eye(y.shape[-1]).to(y) - gain
+        left = self.model.difference(y, mean)
+        mean = mean + (gain * left.unsqueeze(-2)).sum(-1)
+        own = product(product(kept, own), kept.mT) + product(product(gain, r), gain.mT)
+        first = state.steps == 0
+        wide = first[..., None, None]
+        return Considered(
+            torch.where(first.unsqueeze(-1), y, mean),
+            torch.where(wide, r, own),
+            torch.where(wide, 0.0, product(kept, sensitivity)),
+            theta,
+            state.steps + 1,
+        )
