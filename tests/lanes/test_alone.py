@@ -142,3 +142,14 @@ def test_a_header_of_a_noisy_function_is_refused() -> None:
     program = Program(lambda carry, now, row: (carry, (Noisy()(row["x"]),)), name="the header")
     with pytest.raises(NotLoweredError, match="called again"):
         program.c_source("noisy", row={"x": X[:1]})
+
+
+@pytest.mark.parametrize("mixed", [False, True])
+def test_what_rounding_decides_says_nothing_of_a_row(mixed: bool) -> None:
+    def step(x: Tensor, now: object, row: object) -> tuple[Tensor, tuple[Tensor, Tensor]]:
+        rounded = x.sin() * (1 + 3e-16 * len(x))  # as another order of sums does
+        other = x - x.mean(0) if mixed else x
+        return 0.5 * x, ((1e18 * rounded).remainder(2.0), other)
+
+    x = torch.linspace(0.1, 0.9, 6, dtype=torch.float64)
+    assert Program(step).compiles(x, steps=2) is not mixed
