@@ -152,12 +152,13 @@ class LocalFilter:
         robust: float = math.inf,
         base: float = 1.0,
     ) -> None:
-        self.functions, self.ratio, self.forgetting, self.slack = functions, ratio, forgetting, slack
+        self.functions, self.slack = functions, slack
+        self.ratio, self.forgetting = ratio.contiguous(), forgetting.contiguous()  # compiled code reads them
         self.robust, self.base = robust, base
 
     def with_law(self, ratio: Tensor, forgetting: Tensor) -> LocalFilter:
         """The filter for other streams, with these rho and lambda (S,)."""
-        law = ratio.contiguous(), forgetting.contiguous()
+        law = ratio, forgetting
         return LocalFilter(self.functions, *law, self.slack, self.robust, self.base)
 
     def predict(self, state: StreamState, x: Tensor) -> tuple[Tensor, Tensor]:

@@ -140,7 +140,8 @@ class StaFRegressor(StreamEstimator):
         likelihood: all candidates are streams of one tensor batch. They take the place of ``kernel``,
         ``radius``, ``noise``, ``amplitude``, ``forgetting`` and ``scaling`` wherever as many streams with as
         many outputs are learned; the radius is one for all streams, that of the first. What was learned
-        before is forgotten. The accurate mode has nothing to tune, and is left as it is.
+        before is forgotten. A coordinate that hardly moves in the stretch gets the width of the others;
+        one that covers little of its width is logged. The accurate mode has nothing to tune, and stays.
 
         Args:
             x: (T, n), one stream in time, or (T, S, n), S streams; some hundred samples.

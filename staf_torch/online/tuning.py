@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from typing import NamedTuple
 
@@ -13,12 +14,17 @@ from .filter_streams import FilterStreams
 from .kalman_filter import LocalFilter, StreamState
 from .local_functions import LocalFunctions
 
+_log = logging.getLogger(__name__)
+
 WIDTHS = (0.5, 1.0, 2.0, 4.0, 8.0)  # in standard deviations of x, times sqrt(n)
 NOISES = (1e-3, 1e-2, 0.1, 0.4)  # in standard deviations of y
 FORGETTING = (1.0, 0.999, 0.99, 0.97)
 RADII = (0.25, 0.5)  # in widths
 ROUNDS = (0.6, 0.3)  # spread of the logarithms of the candidates around the best so far
 AROUND = 48  # of these candidates a round
+SHORT = 0.35  # widths / sqrt(n), nearly what all of x covers of the widest: a coordinate with less is logged
+LITTLE = 6.0  # nats, log of the number of candidates: what is worth less may be luck of the best of them
+HARDLY = 0.02  # widths of the other coordinates: one that covers less hardly moves
 
 
 class Tuning(NamedTuple):
@@ -63,7 +69,8 @@ def tuning(x: Tensor, y: Tensor, directions: Tensor) -> Tuning:
     count = seen.sum(0).clamp(min=1)
     center = torch.where(seen, both, 0.0).sum(0) / count
     spread = (torch.where(seen, both - center, 0.0).square().sum(0) / count).sqrt()
-    spread = torch.where(spread > 0, spread, 1.0)
+    moves = spread > 1e-12 * center.abs()
+    spread = torch.where(moves, spread, 1.0)
     samples = (both - center) / spread
     n, streams = x.shape[-1], x.shape[1]
     widths = torch.tensor(WIDTHS, dtype=torch.float64) * math.sqrt(n)
@@ -72,7 +79,7 @@ def tuning(x: Tensor, y: Tensor, directions: Tensor) -> Tuning:
     )
     first = _Candidates(*(rows[:, k].expand(streams, -1) for k in range(3)))
     first = first._replace(width=first.width.unsqueeze(-1).expand(-1, -1, n))
-    found: list[tuple[Tensor, _Candidates]] = []
+    found: list[tuple[Tensor, _Candidates, Tensor]] = []
     for radius in RADII:
         best, score = _best(first, samples, n, radius * directions)
         draw = torch.Generator().manual_seed(0)
@@ -81,13 +88,18 @@ def tuning(x: Tensor, y: Tensor, directions: Tensor) -> Tuning:
             gains = better > score
             best = _Candidates(*(_choose(gains, new, old) for new, old in zip(again, best, strict=True)))
             score = torch.where(gains, better, score)
-        found.append((score, best))
-    which = torch.stack([score for score, _ in found]).argmax(0)
+        found.append((score, best, _unknown(best, score, samples, n, radius * directions)))
+    which = torch.stack([score for score, *_ in found]).argmax(0)
     one = which == 1
     kept = _Candidates(
         *(_choose(one, b, a).squeeze(1) for a, b in zip(found[0][1], found[1][1], strict=True))
     )
-    units = torch.cat((spread[:, :n] * kept.width, spread[:, n:]), 1)
+    unknown = _choose(one, found[1][2], found[0][2])
+    path = torch.where(seen, both, center)[..., :n]
+    extent = path.amax(0) - path.amin(0)
+    width, stretch, wider = _widened(kept.width, spread[:, :n], extent, unknown)
+    _warn(extent / width, width, wider)
+    units = torch.cat((width, spread[:, n:]), 1)
     radii = torch.tensor(RADII, dtype=torch.float64)[which]
     return Tuning(
         center,
@@ -95,8 +107,8 @@ def tuning(x: Tensor, y: Tensor, directions: Tensor) -> Tuning:
         kept.noise**2,
         kept.forgetting,
         radii,
-        torch.where(one, found[1][0], found[0][0]),
-        kept.width,
+        torch.where(one, found[1][0], found[0][0]) / (len(samples) - len(samples) // 3),
+        stretch,
     )
 
 
@@ -114,8 +126,8 @@ def tuned_streams(
     return FilterStreams(filter_, state, True, torch.cat((found.center, found.spread), 1), stretch)
 
 
-def _best(candidates: _Candidates, samples: Tensor, n: int, offsets: Tensor) -> tuple[_Candidates, Tensor]:
-    """The candidate of each stream that predicts the later two thirds best, and how well."""
+def _scores(candidates: _Candidates, samples: Tensor, n: int, offsets: Tensor) -> Tensor:
+    """Log-likelihood of the later two thirds by every candidate, (S, C)."""
     streams, count, _ = candidates.width.shape
     outputs = samples.shape[-1] - n
     functions = LocalFunctions.of(GaussianKernel(1.0), offsets)
@@ -132,17 +144,87 @@ def _best(candidates: _Candidates, samples: Tensor, n: int, offsets: Tensor) -> 
             density = -0.5 * ((y - mean) / deviation).square() - deviation.log()
             score += torch.where(torch.isfinite(density), density, 0.0).sum(-1).unflatten(0, (streams, count))
         lanes.learn(x, y)
+    return score
+
+
+def _best(candidates: _Candidates, samples: Tensor, n: int, offsets: Tensor) -> tuple[_Candidates, Tensor]:
+    """The candidate of each stream that predicts the later two thirds best, (S, 1), and its likelihood."""
+    score = _scores(candidates, samples, n, offsets)
     best = score.argmax(1)
-    rows = torch.arange(streams)
-    scored = score[rows, best] / (len(samples) - len(samples) // 3)
-    return _Candidates(*(part[rows, best, None] for part in candidates)), scored
+    rows = torch.arange(len(best))
+    return _Candidates(*(part[rows, best, None] for part in candidates)), score[rows, best]
+
+
+def _unknown(best: _Candidates, score: Tensor, samples: Tensor, n: int, offsets: Tensor) -> Tensor:
+    """Coordinates whose widths the stretch says nothing about, (S, n): it is as likely without them.
+
+    Coordinates that say the same are needed together, so the least needed ones are left out one after the
+    other, as long as the loss of all stays below `LITTLE`.
+    """
+    alone = torch.eye(n, dtype=torch.bool).expand(len(score), -1, -1)  # candidate c leaves coordinate c out
+    losses = score[:, None] - _scores(_without(best, alone), samples, n, offsets)
+    rank = losses.argsort(1).argsort(1)  # 0 for the least needed
+    first = rank[:, None, :] <= torch.arange(n)[:, None]  # candidate c leaves the c + 1 least needed out
+    together = score[:, None] - _scores(_without(best, first), samples, n, offsets)
+    little = (together < LITTLE).long().cumprod(1)
+    return little.gather(1, rank).bool()
+
+
+def _without(best: _Candidates, left_out: Tensor) -> _Candidates:
+    """The best of each stream once for every choice (S, C, n) of coordinates that it does not see."""
+    count = left_out.shape[1]
+    width = torch.where(left_out, torch.inf, best.width)
+    return _Candidates(width, best.noise.expand(-1, count), best.forgetting.expand(-1, count))
+
+
+def _widened(width: Tensor, spread: Tensor, extent: Tensor, unknown: Tensor) -> tuple[Tensor, ...]:
+    """Widths in the units of x, and in standard deviations: of the others where a coordinate hardly moves.
+
+    Args:
+        width: that were found, (S, n), in standard deviations of x.
+        spread: these standard deviations, (S, n), 1 for a constant.
+        extent: from the least x to the largest, (S, n).
+        unknown: as `_unknown` says, (S, n).
+
+    Returns:
+        Both, (S, n), and which are the geometric mean of the known ones now, (S, n).
+    """
+
+    def others(values: Tensor) -> Tensor:
+        """Geometric mean of the known ones, (S, 1); NaN without any."""
+        return torch.where(unknown, torch.nan, values.log()).nanmean(1, keepdim=True).exp()
+
+    own = spread * width
+    typical = others(own)
+    wider = unknown & (extent < HARDLY * typical)
+    return torch.where(wider, typical, own), torch.where(wider, others(width), width), wider
+
+
+def _warn(covered: Tensor, width: Tensor, wider: Tensor) -> None:
+    """One line in the log if a coordinate covers little of a width: what comes later may be beyond.
+
+    Args:
+        covered: in widths, (S, n).
+        width: (S, n).
+        wider: where the width is that of the other coordinates, (S, n).
+    """
+    n = covered.shape[1]
+    most = SHORT / math.sqrt(n)
+    if bool((covered < most).any()):
+        stream, k = divmod(int(covered.argmin()), n)
+        told = ", which is that of the others: it says nothing of its own" if wider[stream, k] else ""
+        _log.warning(
+            "`StaFRegressor.tune`: coordinate %d of stream %d covers %.2g of a width (%.3g) in this stretch%s"
+            "; %d coordinate(s) in all cover less than %.2g. Tune where they move, if they ever do",
+            *(k, stream, covered[stream, k], width[stream, k], told, int((covered < most).sum()), most),
+        )
 
 
 def _around(best: _Candidates, wide: float, draw: torch.Generator) -> _Candidates:
     """Candidates near the best of each stream: (S, 1, ...) -> (S, AROUND, ...)."""
 
     def factor(like: Tensor) -> Tensor:
-        shape = (len(like), AROUND, *like.shape[2:])
+        shape = (1, AROUND, *like.shape[2:])  # for all streams the same, whoever is beside them
         return (wide * torch.randn(shape, generator=draw, dtype=torch.float64)).exp()
 
     lost = (1 - best.forgetting).clamp(min=1e-4) * factor(best.forgetting)

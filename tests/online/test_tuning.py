@@ -101,3 +101,33 @@ def test_tuned_streams_keep_their_hyperparameters_when_others_go_and_come() -> N
     assert torch.equal(tuned.predict(x[9, order]), other.predict(x[9, order]))
     assert torch.equal(tuned.predict(x[9, order])[1], alone.predict(x[9, 2:3])[0])  # begun anew, still tuned
     assert float((tuned.predict(x[59, order]) - y[59, order])[2].abs()) < 1.0  # one that nobody tuned
+
+
+def test_stretch_in_which_a_coordinate_hardly_moves_says_so_and_nothing_about_its_width(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """The coordinate stands still, or jitters, for 120 samples, and moves after these: 1.2 CPU-s."""
+    path, _ = drawn(torch.tensor([0.9, 0.9]).double(), 0.1, steps=300)
+    later = torch.cat((path[:1, 1].expand(120), path[:180, 1]))
+    draw = torch.Generator().manual_seed(int(torch.randint(2**31, ())))
+    for jitter in (0.0, 1e-3):
+        x = torch.stack((path[:, 0], later), -1)
+        x[:120, 1] += jitter * torch.randn(120, generator=draw, dtype=torch.float64)
+        y = (2 * x).sin().sum(-1) + 0.1 * torch.randn(300, generator=draw, dtype=torch.float64)
+        caplog.clear()
+        tuned = st.StaFRegressor().tune(x[:120], y[:120])
+        knowing = st.StaFRegressor(st.GaussianKernel(0.9), 0.45, noise=0.1)
+        assert len(caplog.records) == 1
+        assert "coordinate 1 of stream 0 covers" in caplog.text
+        assert errors(tuned, x[120:], y[120:]) < 1.6 * errors(knowing, x[120:], y[120:])
+
+
+def test_tuning_of_a_stream_is_the_same_whoever_is_beside() -> None:
+    pairs = [drawn(torch.tensor([0.7, 0.7]).double(), 0.1, steps=60, seed=seed) for seed in range(2)]
+    x, y = (torch.stack([pair[k] for pair in pairs], 1) for k in range(2))
+    together = st.StaFRegressor().tune(x, y)._tuning
+    alone = [st.StaFRegressor().tune(x[:, k], y[:, k])._tuning for k in range(2)]
+    assert together is not None
+    for k, own in enumerate(alone):
+        assert own is not None
+        assert all(torch.equal(a[k], b[0]) for a, b in zip(together, own, strict=True))
