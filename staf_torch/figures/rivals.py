@@ -45,11 +45,12 @@ def draw_rivals(rows: Sequence[Mapping[str, Any]]) -> Figure:
             axes.set_title(plant.replace("_", " "), fontsize="small")
         for axes in list(grid.flat)[len(plants) :]:
             axes.set_visible(False)
-        for axes in grid[-1]:
+        for axes in list(grid.flat)[: len(plants)][-across:]:  # with no panel below
             axes.set_xlabel(r"$\mu$s a control")
+            axes.tick_params(labelbottom=True)
         for axes in grid[:, 0]:
             axes.set_ylabel("median excess cost")
         for index, method in enumerate(methods):
             grid[0, 0].plot([], [], marker(index), color=colour(index), linestyle="none", label=method)
-        figure.legend(loc="outside right center")
+        figure.legend(loc="outside right center", title="hollow: not all regulated", title_fontsize="small")
     return figure
