@@ -184,9 +184,13 @@ class SampledRollout(nn.Module):
         return box_minimum(curvature, pull, low, high), known
 
     def gradient(self, x: Tensor) -> Tensor:
-        """grad V^ at x, of the base's cost fitted at the centers around it, of a basis of the states:
-        (..., n) -> (..., n)."""
-        assert self.along is None
+        """grad V^ at x, of the base's cost fitted at the centers around it: (..., n) -> (..., n).
+
+        Raises:
+            ValueError: if the basis is of the inputs, along which alone V^ is then known.
+        """
+        if self.along is not None:
+            raise fail("SampledRollout", "basis", "must be of the states to know grad V^", self.basis.dim)
         return _rise(self.basis, x, self.rollout(self.basis.centers(x)).whole)
 
     def _promise(self, after: Tensor, known: Promise) -> Promise:
