@@ -13,7 +13,11 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from ..lanes.combinators import scan
 from .checks import fail
+
+_Elimination = tuple[Tensor, Tensor, Tensor, Tensor]
+_IN_REGISTERS = 8  # rows of a matrix that a compiled program writes out entry by entry
 
 
 class PivotedCholesky(NamedTuple):
@@ -60,11 +64,10 @@ def pivoted_cholesky(gram: Tensor) -> PivotedCholesky:
         gram = torch.linalg.solve_triangular(identity, gram, upper=False)
     scale = gram.diagonal(dim1=-2, dim2=-1).amax(-1)
     tolerance = size * torch.finfo(gram.dtype).eps * scale
-    rest = gram
-    open_ = torch.ones(gram.shape[:-1], dtype=torch.bool, device=gram.device)
-    alive = torch.isfinite(gram).all(-1).all(-1)
-    columns, order, rank = [], [], torch.zeros_like(scale, dtype=torch.int64)
-    for _ in range(size):
+    places = torch.arange(size, device=gram.device)
+
+    def eliminate(carry: _Elimination, _: Tensor) -> tuple[_Elimination, tuple[Tensor, Tensor]]:
+        rest, open_, alive, rank = carry
         diagonal = rest.diagonal(dim1=-2, dim2=-1)
         pivot = torch.where(open_, diagonal, -torch.inf).argmax(-1, keepdim=True)  # (..., 1)
         value = diagonal.gather(-1, pivot).squeeze(-1)
@@ -73,15 +76,16 @@ def pivoted_cholesky(gram: Tensor) -> PivotedCholesky:
         root = torch.where(alive, value, 1.0).sqrt().unsqueeze(-1)
         column = torch.where(alive.unsqueeze(-1) & open_, column / root, 0.0)
         rest = rest - column.unsqueeze(-1) * column.unsqueeze(-2)
-        open_ = open_.scatter(-1, pivot, False)
-        columns.append(column)
-        order.append(pivot)
-        rank = rank + alive
-    order_ = torch.cat(order, dim=-1)
-    unpivoted = torch.stack(columns, dim=-1)
-    factor = unpivoted.gather(-2, order_.unsqueeze(-1).expand(unpivoted.shape))
-    dropped = torch.arange(size, device=gram.device) >= rank.unsqueeze(-1)
-    return PivotedCholesky(factor + torch.diag_embed(dropped.to(factor)), order_, rank)
+        return (rest, open_.scatter(-1, pivot, False), alive, rank + alive), (column, pivot.squeeze(-1))
+
+    open_ = torch.ones(gram.shape[:-1], dtype=torch.bool, device=gram.device)
+    alive = torch.isfinite(gram).all(-1).all(-1)
+    start = gram, open_, alive, torch.zeros_like(scale, dtype=torch.int64)
+    (_, _, _, rank), (columns, pivots) = scan(eliminate, start, places, dim=0, unrolled=size <= _IN_REGISTERS)
+    unpivoted, order = columns.movedim(0, -1), pivots.movedim(0, -1)
+    factor = unpivoted.gather(-2, order.unsqueeze(-1).expand(unpivoted.shape))
+    dropped = places >= rank.unsqueeze(-1)
+    return PivotedCholesky(factor + torch.diag_embed(dropped.to(factor)), order, rank)
 
 
 def newton_basis(gram: Tensor) -> Tensor:
