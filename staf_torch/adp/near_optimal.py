@@ -55,6 +55,8 @@ class NearOptimal(SampledRollout):
     radius: float
     substeps: int
     planner: BoundedPlans | None = None
+    _planners: dict[int, BoundedPlans]  # by the number of their periods: each has programs, which take seconds
+    _loops: dict[BoundedPlans, RecedingHorizon]
 
     def forward(self, x: Tensor) -> Tensor:
         """u: (..., n) -> (..., m)."""
@@ -73,12 +75,21 @@ class NearOptimal(SampledRollout):
         would meet one, a plan that is carried as long as this lasts. With ``plan`` a `RecedingHorizon` that
         carries its plan from control to control all the time, the first one the best of several."""
         if self.planner is not None:
-            return RecedingHorizon(self.planner.problem, steps=self.steps, held=True)
+            return self._carried(self.planner)
         planner = self.plans(_PLANNED)
-        return Feedback(self) if planner is None else StrainedPlans(self, planner)
+        return Feedback(self) if planner is None else StrainedPlans(self, planner, self._carried(planner))
+
+    def _carried(self, planner: BoundedPlans) -> RecedingHorizon:
+        """One for all controllers of a planner: it holds programs and nothing of a loop."""
+        known = self._loops.get(planner)
+        if known is None:
+            known = RecedingHorizon(planner.problem, steps=planner.steps, held=True)
+            self._loops[planner] = known
+        return known
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**super().__getstate__(), "planner": self.planner is not None}
+        made = {"planner": self.planner is not None, "_planners": {}, "_loops": {}}
+        return {**super().__getstate__(), **made}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)
@@ -93,7 +104,10 @@ class NearOptimal(SampledRollout):
         steps = self.steps
         if constants is not None:
             steps = max(steps, _periods(constants / _slowest(self.lqr, self.plant), self.period))
-        return BoundedPlans(SampledProblem.of(self.plant, self.cost, dt=self.period), steps, self)
+        if steps not in self._planners:
+            problem = SampledProblem.of(self.plant, self.cost, dt=self.period)
+            self._planners[steps] = BoundedPlans(problem, steps, self)
+        return self._planners[steps]
 
     @torch.no_grad()
     def report(
@@ -275,6 +289,7 @@ def near_optimal(
         basis, plant, placed, lqr, lqr.value, lqr.p, period=period, steps=steps, substeps=substeps
     )
     policy.lqr, policy.radius, policy.substeps = lqr, radius, substeps
+    policy._planners, policy._loops = {}, {}
     if flag("near_optimal", "plan", plan):
         policy.planner = policy.plans()
     if not plant.traceable:

@@ -23,13 +23,13 @@ class StrainedPlans(Controller):
     Args:
         policy: of the other states; its base is the linear feedback.
         planner: of its plant, cost and bounds; it knows where bounds are met.
+        begun: what carries the plans, of the planner's problem.
     """
 
-    def __init__(self, policy: SampledRollout, planner: BoundedPlans) -> None:
+    def __init__(self, policy: SampledRollout, planner: BoundedPlans, begun: RecedingHorizon) -> None:
         super().__init__()
         self.policy, self.period = policy, policy.period
-        self._planner = planner
-        self._begun = RecedingHorizon(planner.problem, steps=planner.steps, held=True)
+        self._planner, self._begun = planner, begun
 
     @property
     def label(self) -> str:
