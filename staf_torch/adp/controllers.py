@@ -71,10 +71,13 @@ class Controller(nn.Module, abc.ABC):
         draws: uniform random points of [-1, 1]^n that a step needs, a row.
         period: least time for which a control is held, s; None where any time will do.
         label: a few words for a log or a sheet.
+        costly: whether a program of a step takes a compiler so long that a loop is compiled where that is
+            asked for alone.
     """
 
     draws: int = 0
     period: float | None = None
+    costly: bool = False
 
     @property
     def label(self) -> str:

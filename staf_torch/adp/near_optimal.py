@@ -258,8 +258,8 @@ def near_optimal(
         high: likewise.
         radius: of the ball of centers, in units of the state: measure states so that 1 is a large one.
         horizon: s; None for the rule above.
-        plan: whether to plan where the LQR would meet a bound. Such a policy is not exported to C, and loops
-            with it are not compiled.
+        plan: whether to plan where the LQR would meet a bound. Such a policy is exported to C as its
+            ``controller()``, and loops with it are compiled where that is asked for.
 
     Raises:
         ValueError: if an argument breaks its rule, or the plant has no LQR; the message says why.

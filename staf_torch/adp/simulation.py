@@ -109,8 +109,8 @@ def simulate(
         integrator: as in `ClosedLoop`, and so are ``substeps`` and ``renew``.
         limit: as in `ClosedLoop`.
         compile: whether the loop is compiled by `lanes`: True, False, or ``auto`` (where the run is long
-            enough to pay for it). What cannot be compiled runs in plain torch, which is the definition,
-            with one line in the log.
+            enough to pay for it, and never with a controller that improves plans: some seconds, once). What
+            cannot be compiled runs in plain torch, which is the definition, with one line in the log.
         progress: called with the number of steps done since its last call.
 
     Raises:
@@ -133,6 +133,8 @@ def simulate(
         controller.check(x0)
     if isinstance(controller, Feedback) and x0.device.type == "cpu":
         warn_if_unstable(controller.policy, system, cost, dt)
+    if compile == "auto" and any(getattr(part, "costly", False) for part in controller.modules()):
+        worth = False
     worth = worth and system.traceable
     with torch.no_grad():
         return _run(loop, program(loop, worth), x0, steps, every, _seeds(seed, len(x0)), progress)

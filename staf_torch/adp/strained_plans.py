@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from ..lanes import repeat
+from ..lanes.combinators import tracing_now
 from .bounded_plans import BoundedPlans
 from .controllers import Controller, ControllerState, carrying
 from .receding_horizon import RecedingHorizon
@@ -43,6 +45,7 @@ class StrainedPlans(Controller):
         carried = self._without(x0)
         if self.policy.compiled:
             self._planner.hasten()
+            self._begun.hasten()
             self._begun.step(x0, self._begun.idle(x0), x0, self.policy.period)
         rows = self._strained(x0).nonzero().squeeze(1)
         if len(rows):  # saves work: the best of several takes a tenth of a second
@@ -52,6 +55,8 @@ class StrainedPlans(Controller):
     def step(
         self, x: Tensor, carried: ControllerState, uniform: Tensor, dt: float
     ) -> tuple[Tensor, ControllerState]:
+        if tracing_now():
+            return self._traced(x, carried, uniform, dt)
         rows = self._strained(x).nonzero().squeeze(1)
         none = carried.identifier[:, 0] < 0
         if not len(rows):  # saves work, as below: a plan takes milliseconds
@@ -65,6 +70,21 @@ class StrainedPlans(Controller):
         after = self._without(x)
         after.identifier[rows] = ahead.identifier
         return u.index_copy(0, rows, planned), after
+
+    def _traced(
+        self, x: Tensor, carried: ControllerState, uniform: Tensor, dt: float
+    ) -> tuple[Tensor, ControllerState]:
+        """`step` for a program, which plans where the row asks for it."""
+        met, known = self._strained(x), carried.identifier
+        plans = torch.where(known[:, :1] < 0, self._begun.idle(x).identifier, known)
+
+        def plan(_: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+            u, after = self._begun.step(x, carried._replace(identifier=plans), uniform, dt)
+            return u, after.identifier
+
+        start = self.policy(x), self._without(x).identifier
+        u, after = repeat(1, plan, start, where=lambda _: met)
+        return u, carrying(after)
 
     def _without(self, x: Tensor) -> ControllerState:
         """No plan in any row: -1 steps of it are done."""

@@ -13,14 +13,10 @@ from ..numerics.checks import integer, positive_real, trailing
 from .plans import LocalModel, Plan, Reference, Trajectories
 from .sampled_problem import Derivatives, SampledProblem
 
-_LENGTHS = (1.0, 0.5, 0.2, 0.07, 0.02)  # shares of a step that are tried side by side
-_EASIER, _HARDER = 0.4, 8.0  # what success and failure do to the regularisation of a row
-_LEAST, _FIRST, _TRUSTED, _MOST = (
-    1e-9,
-    1e-3,
-    1.0,
-    1e9,
-)  # regularisation, in units of the cost's curvature in u
+LENGTHS = (1.0, 0.5, 0.2, 0.07, 0.02)  # shares of a step that are tried side by side
+EASIER, HARDER = 0.4, 8.0  # what success and failure do to the regularisation of a row
+# Of the regularisation, in units of the cost's curvature in u:
+LEAST, FIRST, TRUSTED, MOST = 1e-9, 1e-3, 1.0, 1e9
 _NUMBERS = 2**25  # second derivatives that are held at once
 
 
@@ -77,8 +73,8 @@ class BoxDDP:
             name="derivatives of a step",
             compile=compile,
         )
-        self._back = Program(self._backward, name="a backward pass", compile=compile)
-        self._forth = Program(self._forward, name="a forward pass", compile=compile)
+        self._back = Program(self.backward, name="a backward pass", compile=compile)
+        self._forth = Program(self.forward, name="a forward pass", compile=compile)
 
     def solve(
         self,
@@ -113,11 +109,7 @@ class BoxDDP:
             still = x0.unsqueeze(1).expand(-1, self.steps, -1)
             reference = Reference(still, x0.new_zeros(*expected, n))
         if terminal is None:
-            none, bent = torch.zeros_like(x0), (2 * self.problem.end).expand(len(x0), n, n)
-            goal = self.problem.goal.expand_as(x0)
-            if self.problem.path is not None:
-                goal = self.problem.goals(x0, self.steps)[:, -1]
-            terminal = LocalModel(goal, none[:, 0], none, bent)
+            terminal = self.ends(x0)
         together = max(1, _NUMBERS // (self.steps * (n + 1) * (n + m) ** 2))
         with torch.no_grad():
             whole = x0, self.problem.admissible(control), *reference, *terminal
@@ -127,10 +119,18 @@ class BoxDDP:
             ]
         return Trajectories(*(torch.cat(column) for column in zip(*parts, strict=True)))
 
+    def ends(self, x0: Tensor) -> LocalModel:
+        """V_T of plans from x0 (B, n): the value of the goal's linear feedback, or what the problem pays."""
+        none, bent = torch.zeros_like(x0), (2 * self.problem.end).expand(*x0.shape, x0.shape[-1])
+        goal = self.problem.goal.expand_as(x0)
+        if self.problem.path is not None:
+            goal = self.problem.goals(x0, self.steps)[:, -1]
+        return LocalModel(goal, none[:, 0], none, bent)
+
     def _solve(self, x0: Tensor, control: Tensor, reference: Reference, terminal: LocalModel) -> Trajectories:
         none, lengths = torch.zeros_like(control), x0.new_ones(1)
         whole = self._rollouts(x0, reference.state, control, none, reference.feedback, lengths, terminal)
-        mu, full = torch.full_like(whole.cost, _FIRST), torch.ones_like(whole.cost)
+        mu, full = torch.full_like(whole.cost, FIRST), torch.ones_like(whole.cost)
         converged = torch.zeros(len(x0), dtype=torch.bool)
         active = torch.isfinite(whole.cost).nonzero().squeeze(1)
         now, known, ends = whole.rows(active), None, terminal.rows(active)
@@ -146,12 +146,12 @@ class BoxDDP:
                 part[active] = current
             small = found.promised.abs() <= self.tolerance * now.cost.abs()
             done = (better & (gain <= self.tolerance)) | (found.definite & small)
-            done = done & (mu[active] <= _TRUSTED)
+            done = done & (mu[active] <= TRUSTED)
             converged[active] = done
-            easier = (mu[active] * _EASIER).clamp(min=_LEAST)
-            mu[active] = torch.where(better, easier, mu[active] * _HARDER)
+            easier = (mu[active] * EASIER).clamp(min=LEAST)
+            mu[active] = torch.where(better, easier, mu[active] * HARDER)
             full[active] = torch.where(better, full[active], 1 - full[active])
-            on = ~done & (mu[active] <= _MOST)
+            on = ~done & (mu[active] <= MOST)
             kept = active[on]
             known = Derivatives(*(part[on] for part in known))
             fresh = better[on]
@@ -192,7 +192,7 @@ class BoxDDP:
             .squeeze(2),
         )
 
-    def _forward(
+    def forward(
         self, x: Tensor, now: tuple[Tensor, ...], lengths: Tensor
     ) -> tuple[Tensor, tuple[Tensor, ...]]:
         """One step of all lengths: x (B, L, n), (B, n), (B, m), (B, m), (B, m, n), (B, L)."""
@@ -217,7 +217,7 @@ class BoxDDP:
         """A backward pass and the best of the five lengths forward."""
         end, (change, feedback, _, _) = self._backwards(plan, known, mu, full, terminal)
         definite = end.definite > 0
-        lengths = plan.cost.new_tensor(_LENGTHS)
+        lengths = plan.cost.new_tensor(LENGTHS)
         x, u = plan.state, plan.control
         tried = self._rollouts(x[:, 0], x[:, :-1], u, change, feedback, lengths, terminal)
         cost = torch.where(definite, tried.cost, torch.inf)
@@ -232,7 +232,7 @@ class BoxDDP:
         end, out = self._back(last, reverse, (mu, full))
         return end, tuple(part.flip(1) for part in out)
 
-    def _backward(
+    def backward(
         self, after: Model, now: tuple[Tensor, ...], row: tuple[Tensor, Tensor]
     ) -> tuple[Model, tuple[Tensor, ...]]:
         """One step of the recursion, backward in time."""
@@ -263,7 +263,7 @@ class BoxDDP:
     def _models(self, plan: Plan, converged: Tensor, terminal: LocalModel) -> Trajectories:
         """The local models along finished trajectories, with as little regularisation as they bear."""
         known = self._derivatives(plan)
-        small = torch.full_like(plan.cost, _LEAST)
+        small = torch.full_like(plan.cost, LEAST)
         end, out = self._backwards(plan, known, small, torch.ones_like(small), terminal)
         _, gauss = self._backwards(plan, known, small, torch.zeros_like(small), terminal)
         fine = (end.definite > 0) & torch.isfinite(end.curvature).flatten(1).all(-1)
@@ -280,6 +280,10 @@ class BoxDDP:
             torch.cat((curvature, terminal.curvature.unsqueeze(1)), dim=1),
             converged & torch.isfinite(plan.cost),
         )
+
+
+Known = tuple[Tensor, ...]
+"""The fields of `Derivatives`, (B, T, ...)."""
 
 
 class Found(NamedTuple):

@@ -20,6 +20,7 @@ from ..adp import (
     SafetyFilter,
     Supervised,
 )
+from ..adp.strained_plans import StrainedPlans
 from ..numerics.checks import fail, trailing
 from .remembered import RememberedPolicy
 
@@ -231,11 +232,11 @@ def _policy_of(controller: Controller | nn.Module, weights: Tensor | None) -> nn
     if isinstance(controller, RolloutPolicy) and foldable(controller):
         return FoldedRollout(controller)
     if isinstance(controller, NearOptimal) and controller.planner is not None:
-        rule = "must not plan on the way: `near_optimal(..., plan=False)`"
+        rule = "must not plan anew in every state: `export_learning_c` writes its `controller()`"
         raise fail("policy_of", "controller", rule, "a policy that plans where a bound is met")
     if isinstance(controller, GlobalValue):
         return RememberedPolicy(controller)
-    if isinstance(controller, RecedingHorizon | PathIntegral | PlanReplay):
+    if isinstance(controller, RecedingHorizon | PathIntegral | PlanReplay | StrainedPlans):
         check_bounded("policy_of", controller)
         rule = "carries its plan from control to control: `deploy.export_learning_c` writes it with its state"
         raise fail("policy_of", "controller", rule, type(controller).__name__)
@@ -250,10 +251,10 @@ def check_bounded(call: str, controller: Controller) -> None:
     Raises:
         ValueError: that says why.
     """
-    if isinstance(controller, RecedingHorizon) and controller.iterations:
+    if isinstance(controller, RecedingHorizon) and controller.iterations and controller.memory is not None:
         rule = (
-            "must not optimise on the way, as a search ends when it has converged, after a time that nobody "
-            "can state: `RecedingHorizon(..., iterations=0)` follows one plan"
+            "must not search a memory and then optimise: `GlobalValue` alone is exported, and "
+            "`RecedingHorizon` without `memory` or with `iterations=0`"
         )
         raise fail(call, "controller", rule, f"iterations={controller.iterations}")
     if isinstance(controller, PlanReplay):

@@ -84,7 +84,7 @@ def test_report_says_what_was_chosen_and_how_good_it_is() -> None:
 @torch.no_grad()
 def test_exported_policy_is_the_policy(tmp_path: Path) -> None:
     cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1, low=-2.0, high=1.5)
-    with pytest.raises(ValueError, match=r"`policy_of\(controller=...\)` must not plan on the way"):
+    with pytest.raises(ValueError, match=r"`policy_of\(controller=...\)` must not plan anew in every state"):
         deploy.policy_of(adp.near_optimal(systems.Pendulum(), cost, dt=0.05, horizon=0.4, plan=True))
     policy = deploy.policy_of(adp.near_optimal(systems.Pendulum(), cost, dt=0.05, horizon=0.4))
     x = drawn(2, 0.5, 40)

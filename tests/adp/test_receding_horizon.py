@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import math
+from typing import Any
+
 import pytest
 import torch
 from helpers_swingup import GRID, RESETS, cost_of, double_integrator, pendulum
 from torch import Tensor
 
 from staf_torch import adp, systems
+from staf_torch.adp.plans import Reference
+from staf_torch.adp.traced_search import TracedSearch
 
 NONE = torch.empty(0, dtype=torch.float64)
 
@@ -83,3 +88,41 @@ def test_first_plan_that_tries_held_bounds_finds_the_cheaper_way(memory: adp.Glo
 def test_memory_of_another_problem_is_refused(memory: adp.GlobalValue) -> None:
     with pytest.raises(ValueError, match="must be of the same problem"):
         adp.RecedingHorizon(pendulum(), steps=5, memory=memory)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("iterations", [1, 3, 30])
+def test_search_as_a_program_finds_the_plan_of_the_search(iterations: int) -> None:
+    """Rows that converge, that meet bounds, that begin badly, and one that is no number."""
+    problem = double_integrator(-1.0, 1.0)
+    search = adp.BoxDDP(problem, steps=9, iterations=iterations, compile=False)
+    x = torch.tensor([[0.1, 0.0], [3.0, 1.0], [-2.0, 2.0], [math.nan, 0.0], [0.0, 0.0]], dtype=torch.float64)
+    generator = torch.Generator().manual_seed(iterations)
+    control = 3 * torch.rand(5, 9, 1, dtype=torch.float64, generator=generator) - 1.5
+    around = Reference(torch.zeros(5, 9, 2).double(), -problem.k.expand(5, 9, 1, 2))
+    found = search.solve(x, control, around)
+    state, u, feedback = TracedSearch(search)(x, control, around)
+    fine = torch.isfinite(x).all(-1)
+    for traced, plain in ((state, found.state), (u, found.control), (feedback, found.feedback)):
+        torch.testing.assert_close(traced[fine], plain[fine], rtol=0, atol=1e-7 if iterations > 3 else 1e-12)
+
+
+@torch.no_grad()
+@pytest.mark.needs_compiler
+def test_hastened_control_is_that_of_the_parts(caplog: pytest.LogCaptureFixture) -> None:
+    mpc = adp.RecedingHorizon(double_integrator(-1.0, 1.0), steps=9)
+    x = torch.tensor([[0.1, 0.0], [3.0, 1.0], [-2.0, 2.0]], dtype=torch.float64)
+    plan, none = mpc.init(x), x.new_zeros(3, 0)
+    parts = mpc.step(x + 0.1, plan, none, 0.1)
+    mpc.hasten()
+    whole, alone = (
+        mpc.step(x[rows] + 0.1, rows_of(plan, rows), none[rows], 0.1) for rows in (slice(3), slice(1, 2))
+    )
+    assert not caplog.text
+    torch.testing.assert_close(whole[0], parts[0], rtol=0, atol=1e-12)
+    torch.testing.assert_close(whole[1].identifier, parts[1].identifier, rtol=0, atol=1e-12)
+    assert torch.equal(whole[0][1:2], alone[0])
+
+
+def rows_of(state: Any, rows: slice) -> Any:
+    return state._replace(**{name: part[rows] for name, part in state._asdict().items()})

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -83,14 +84,17 @@ def test_traced_memory_has_the_control_of_the_library_at_every_batch(memory: adp
 
 
 @needs_cc
-@pytest.mark.parametrize("kind", ["followed", "sampled"])
+@pytest.mark.parametrize("kind", ["followed", "sampled", "improved", "where a bound is met"])
 def test_plan_that_is_carried_is_a_structure_in_c(kind: str, tmp_path: Path) -> None:
     problem = double_integrator(-1.0, 1.0)
-    controller: adp.Controller = (
-        adp.RecedingHorizon(problem, steps=12, iterations=0, compile=False)
-        if kind == "followed"
-        else adp.PathIntegral(problem, steps=6, samples=4, knots=3, compile=False)
-    )
+    plant, cost = systems.Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]]), adp.QuadraticCost(1.0, 1.0, 2, 1)
+    make: dict[str, Callable[[], adp.Controller]] = {
+        "followed": lambda: adp.RecedingHorizon(problem, steps=12, iterations=0, compile=False),
+        "sampled": lambda: adp.PathIntegral(problem, steps=6, samples=4, knots=3, compile=False),
+        "improved": lambda: adp.RecedingHorizon(problem, steps=12, iterations=2, compile=False),
+        "where a bound is met": adp.near_optimal(plant, cost, dt=0.1, low=-1.0, high=1.0).controller,
+    }
+    controller = make[kind]()
     x0 = torch.tensor([[2.0, 0.5]], dtype=torch.float64)
     path = tmp_path / "plan.h"
     deploy.export_learning_c(controller, x0, path, dt=0.1)
@@ -127,15 +131,15 @@ def test_feedback_of_a_plant_with_bounds_in_c(kind: str, tmp_path: Path) -> None
     assert bool((u.abs() < 3).any())
 
 
-def test_what_searches_on_the_way_is_refused_with_its_reason(tmp_path: Path) -> None:
-    problem, plant = double_integrator(-1.0, 1.0), systems.TwoState()
-    mpc = adp.RecedingHorizon(problem, steps=5, compile=False)
+def test_what_searches_on_the_way_is_refused_with_its_reason(memory: adp.GlobalValue, tmp_path: Path) -> None:
+    plant = systems.TwoState()
+    mpc = adp.RecedingHorizon(memory.problem, steps=5, memory=memory, compile=False)
     x = torch.zeros(1, 2, dtype=torch.float64)
     for write in (
         lambda: deploy.policy_of(mpc),
         lambda: deploy.export_learning_c(mpc, x, tmp_path / "a.h", dt=0.1),
     ):
-        with pytest.raises(ValueError, match="a search ends when it has converged"):
+        with pytest.raises(ValueError, match="must not search a memory and then optimise"):
             write()
     plan = adp.DirectShooting(plant, adp.QuadraticCost(1.0, 1.0, 2, 1)).solve(x + 0.1).replay()
     with pytest.raises(ValueError, match="a plan of direct shooting knows no state"):
