@@ -26,7 +26,7 @@ class FilterStreams:
         scaling: whether the units of x and y are learned from the first samples of each stream.
         units: centers and spreads (S, 2 (n + K)) that are known instead, NaN where they are not.
         stretch: by which learned spreads are multiplied, (S, n + K), ones by default.
-        may_grow: 1 for coordinates whose units grow with what they are seen to move by, (S, n): all by default
+        may_grow: 1 for coordinates whose units grow with what they are seen to move by, (S, n): by default all
             where units are learned, none where they are known.
     """
 
@@ -168,7 +168,13 @@ class FilterStreams:
         self._relearn(row, samples, added=1)
 
     def _relearn(self, row: int, samples: Tensor, added: int = 0) -> None:
-        """Let a stream forget all but these samples and their lapses, (N, n + K + 1), in its units."""
+        """Let a stream forget all but these samples and their lapses, (N, n + K + 1), in its units.
+
+        Args:
+            row: number of the stream.
+            samples: oldest first.
+            added: 1 where the latest of them has not been counted yet.
+        """
         wide, n = self.state.dim + self.state.outputs, self.state.dim
         self._center, self._spread = self.units.to(self.dtype).split(wide, dim=1)
         center, spread = self.units[row].split(wide)
@@ -178,17 +184,20 @@ class FilterStreams:
             self.definition.ratio[row, None], self.definition.forgetting[row, None]
         )
         filter_ = CompiledFilter.build(law, alone)
+        before = 0
         for k in range(len(u)):
+            before = int(alone.counts[0, 0])
             filter_.learn(
                 alone, u[k : k + 1, :n].contiguous(), u[k : k + 1, n:].contiguous(), samples[k, -1:].clone()
             )
+        latest = int(alone.counts[0, 0]) - before  # 1 if the latest sample was learned
         counts = self.state.counts[:2, row].clone()
         table = self.state.table
         table[:, row] = alone.table[:, 0]
         self.state.put(table)
         self.state.counts[:, row] = alone.counts[:, 0]
-        self.state.counts[0, row] = torch.maximum(counts[0] + added, alone.counts[0, 0])
-        self.state.counts[1, row] = counts[1]
+        self.state.counts[0, row] = torch.maximum(counts[0] + added * latest, alone.counts[0, 0])
+        self.state.counts[1, row] = counts[1] + added * (1 - latest)
 
     def units_for(self, samples: Tensor) -> tuple[Tensor, Tensor]:
         """Centers and spreads (S, n + K) for a whole record (T, S, n + K): from all of it, or as known."""
@@ -307,7 +316,7 @@ def refuse_other(state: dict[str, Any], own: dict[str, Tensor], expected: int, g
 
 
 def units_of(samples: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean and standard deviation of every column of (N, D), outlying values and NaN aside; 0 and 1 of none."""
+    """Mean and standard deviation of every column of (N, D) but for NaN and outlying values; 0, 1 of none."""
     middle = samples.nanmedian(0).values
     away = (samples - middle).abs()
     typical = away.nanmedian(0).values
