@@ -26,8 +26,8 @@ class FilterStreams:
         scaling: whether the units of x and y are learned from the first samples of each stream.
         units: centers and spreads (S, 2 (n + K)) that are known instead, NaN where they are not.
         stretch: by which learned spreads are multiplied, (S, n + K), ones by default.
-        may_grow: 1 for coordinates whose units grow with what they are seen to move by, (S, n): by default all
-            where units are learned, none where they are known.
+        may_grow: 1 for coordinates whose units grow with what they are seen to move by, (S, n); by default
+            all where units are learned, none where they are known.
     """
 
     def __init__(

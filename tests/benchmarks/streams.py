@@ -6,7 +6,8 @@ stream, predicting each sample before it learns it, and is scored on the other f
 `StaFRegressor(memory=1000)` has one default for all, and raw units. Before the table kafbox's Lorenz is
 reproduced (embedding 6, ALD-KRLS, -40.17 dB after 1000 samples). `--cache` keeps the peers' results, which
 take a quarter of an hour. `--earlier` and `--held-out` take the streams of streams_held_out.py, `--latest`
-those of streams_latest.py, `--sets` some by name; `--filter` tunes the filter alone, as peers are. Peers that are not installed are named and skipped:
+those of streams_latest.py, `--sets` some by name; `--filter` tunes the
+filter alone, as peers are. Peers that are not installed are named and skipped:
 `pip install -e '.[bench]'`.
 """
 
