@@ -45,6 +45,12 @@ Carried = ControllerState | Any
 tuples, dictionaries and named tuples of such, which are not recorded."""
 
 
+def carrying(known: Tensor) -> ControllerState:
+    """The state of a controller that carries numbers (B, w) and learns nothing."""
+    empty = known.new_zeros(len(known), 0)
+    return ControllerState(empty, empty, known.new_zeros(len(known), 0, 0), known)
+
+
 class Controller(nn.Module, abc.ABC):
     """u and what the controller carries on, from the state and what it carried until then.
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from ..lanes import Program, each, scan
 from ..lanes.combinators import tracing_now
 from ..numerics.checks import fail, integer, positive_real, vector
-from .controllers import Controller, ControllerState
+from .controllers import Controller, ControllerState, carrying
 from .sampled_problem import SampledProblem
 
 _INSIDE = 1 - 1e-12  # of a uniform number: its normal one is then finite
@@ -105,7 +105,7 @@ class PathIntegral(Controller):
 
     def init(self, x0: Tensor) -> ControllerState:
         """No change of the feedback."""
-        return _carrying(x0.new_zeros(len(x0), self.steps, self.problem.inputs))
+        return carrying(x0.new_zeros(len(x0), self.steps * self.problem.inputs))
 
     def step(
         self, x: Tensor, carried: ControllerState, uniform: Tensor, dt: float
@@ -132,7 +132,7 @@ class PathIntegral(Controller):
         better = self.costs(x, blended.unsqueeze(1))[:, 0] < least[:, 0]
         plan = torch.where(better[:, None, None], blended, chosen)
         ahead = torch.cat((plan[:, 1:], torch.zeros_like(plan[:, :1])), dim=1)
-        return self.problem.steered(x, plan[:, 0]), _carrying(ahead)
+        return self.problem.steered(x, plan[:, 0]), carrying(ahead.flatten(1))
 
     def costs(self, x: Tensor, change: Tensor) -> Tensor:
         """What changes of the feedback cost, inf where that is not finite: (B, n), (B, S, T, m) -> (B, S)."""
@@ -161,8 +161,3 @@ def _hats(steps: int, knots: int) -> Tensor:
     """What each knot counts at each step, linear between the knots: (T, knots)."""
     place = torch.linspace(0, knots - 1, steps, dtype=torch.float64).unsqueeze(1)
     return (1 - (place - torch.arange(knots, dtype=torch.float64)).abs()).clamp(min=0)
-
-
-def _carrying(plan: Tensor) -> ControllerState:
-    empty = plan.new_zeros(len(plan), 0)
-    return ControllerState(empty, empty, plan.new_zeros(len(plan), 0, 0), plan.flatten(1))

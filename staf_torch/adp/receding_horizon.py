@@ -8,7 +8,7 @@ from torch import Tensor
 from ..lanes.combinators import tracing_now
 from ..numerics.checks import fail, flag, integer
 from .bounded_plans import best_held
-from .controllers import Controller, ControllerState
+from .controllers import Controller, ControllerState, carrying
 from .global_value import GlobalValue
 from .memory_growth import best_from
 from .plans import LocalModel, Reference, Trajectories
@@ -83,6 +83,12 @@ class RecedingHorizon(Controller):
         self._search: BoxDDP | None = None
         if iterations:
             self._search = BoxDDP(problem, steps=steps, iterations=iterations, compile=compile)
+
+    @property
+    def width(self) -> int:
+        """Numbers of a plan: T (n + m + m n)."""
+        n, m = self.problem.dim, self.problem.inputs
+        return self.steps * (n + m + m * n)
 
     def init(self, x0: Tensor) -> ControllerState:
         """The first plan, from the states x0 (B, n)."""
@@ -165,6 +171,5 @@ def _rows(found: Trajectories) -> Tensor:
 
 def _carrying(plan: Tensor, done: Tensor | None = None) -> ControllerState:
     """A plan (B, T, w) and how many of its steps are done, (B, 1); none by default."""
-    empty = plan.new_zeros(len(plan), 0)
-    known = torch.cat((plan.new_zeros(len(plan), 1) if done is None else done, plan.flatten(1)), dim=1)
-    return ControllerState(empty, empty, plan.new_zeros(len(plan), 0, 0), known)
+    done = plan.new_zeros(len(plan), 1) if done is None else done
+    return carrying(torch.cat((done, plan.flatten(1)), dim=1))

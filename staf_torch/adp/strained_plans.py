@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from .bounded_plans import BoundedPlans
-from .controllers import Controller, ControllerState
+from .controllers import Controller, ControllerState, carrying
 from .receding_horizon import RecedingHorizon
 from .sampled_rollout import SampledRollout
 
@@ -23,13 +23,13 @@ class StrainedPlans(Controller):
     Args:
         policy: of the other states; its base is the linear feedback.
         planner: of its plant, cost and bounds; it knows where bounds are met.
+        begun: what carries the plans, of the planner's problem.
     """
 
-    def __init__(self, policy: SampledRollout, planner: BoundedPlans) -> None:
+    def __init__(self, policy: SampledRollout, planner: BoundedPlans, begun: RecedingHorizon) -> None:
         super().__init__()
         self.policy, self.period = policy, policy.period
-        self._planner = planner
-        self._begun = RecedingHorizon(planner.problem, steps=planner.steps, held=True)
+        self._planner, self._begun = planner, begun
 
     @property
     def label(self) -> str:
@@ -40,10 +40,10 @@ class StrainedPlans(Controller):
 
         After `lanes.ready` of the policy, what the loop may need is made and compiled here, too.
         """
-        carried = self._begun.idle(x0)
+        carried = self._without(x0)
         if self.policy.compiled:
             self._planner.hasten()
-            self._begun.step(x0, carried, x0, self.policy.period)
+            self._begun.step(x0, self._begun.idle(x0), x0, self.policy.period)
         rows = self._strained(x0).nonzero().squeeze(1)
         if len(rows):  # saves work: the best of several takes a tenth of a second
             carried.identifier[rows] = self._begun.init(x0[rows]).identifier
@@ -53,15 +53,22 @@ class StrainedPlans(Controller):
         self, x: Tensor, carried: ControllerState, uniform: Tensor, dt: float
     ) -> tuple[Tensor, ControllerState]:
         rows = self._strained(x).nonzero().squeeze(1)
+        none = carried.identifier[:, 0] < 0
+        if not len(rows):  # saves work, as below: a plan takes milliseconds
+            return self.policy(x), carried if bool(none.all()) else self._without(x)
         # The policy sees all rows, as each number of rows would be a program of its own.
         u = self.policy(x) if len(rows) < len(x) else x.new_empty(len(x), self.policy.cost.inputs)
-        after = self._begun.idle(x)
-        if len(rows):  # saves work: a plan takes milliseconds
-            plans = carried._replace(**{name: part[rows] for name, part in carried._asdict().items()})
-            planned, ahead = self._begun.step(x[rows], plans, uniform[rows], dt)
-            u = u.index_copy(0, rows, planned)
-            after.identifier[rows] = ahead.identifier
-        return u, after
+        plans, begins = carried.identifier[rows], none[rows].unsqueeze(-1)
+        plans = torch.where(begins, self._begun.idle(x[rows]).identifier, plans)
+        mine = carried._replace(**{name: part[rows] for name, part in carried._asdict().items()})
+        planned, ahead = self._begun.step(x[rows], mine._replace(identifier=plans), uniform[rows], dt)
+        after = self._without(x)
+        after.identifier[rows] = ahead.identifier
+        return u.index_copy(0, rows, planned), after
+
+    def _without(self, x: Tensor) -> ControllerState:
+        """No plan in any row: -1 steps of it are done."""
+        return carrying(x.new_full((len(x), 1 + self._begun.width), -1.0))
 
     def _strained(self, x: Tensor) -> Tensor:
         """(B, n) -> (B,) bool; a row that has left the finite numbers has nothing to plan."""

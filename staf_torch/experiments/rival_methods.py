@@ -46,11 +46,11 @@ def discrete_lqr(case: Case) -> Begin:
 
 
 def near_optimal(case: Case) -> Begin:
-    """The discrete LQR improved by rollouts."""
+    """The discrete LQR improved by rollouts, and by a plan as long as a bound is met."""
     if case.path is not None:
         raise UnsuitableError("follows no path")
     policy = adp.near_optimal(case.plant(), case.cost(), dt=case.dt)
-    return lambda x0: policy
+    return steered(case, policy.controller())
 
 
 def planned(case: Case) -> Begin:
@@ -258,7 +258,7 @@ METHODS = {
     for method in (
         Method("LQR", lqr, ("scipy",)),
         Method("discrete LQR", discrete_lqr, ("scipy",)),
-        Method("near_optimal", near_optimal, ("scipy",)),
+        Method("near_optimal", near_optimal, ("scipy",), (steered,)),
         Method("near_optimal planned", planned, ("scipy",), (steered,)),
         Method("GlobalValue", global_value, ("scipy",)),
         Method("box-DDP", box_ddp, ("scipy",), (steered,)),

@@ -66,7 +66,12 @@ def _chosen(going: Tensor, after: Tree, before: Tree) -> Tree:
 
 
 def scan(
-    body: Callable[[Tree, Tree], tuple[Tree, Tree]], carry: Tree, inputs: Tree, *, dim: int = 1
+    body: Callable[[Tree, Tree], tuple[Tree, Tree]],
+    carry: Tree,
+    inputs: Tree,
+    *,
+    dim: int = 1,
+    unrolled: bool = False,
 ) -> tuple[Tree, Tree]:
     """carry, out_k = body(carry, input_k) for k = 0, 1, ...; the last carry and all outputs.
 
@@ -82,18 +87,24 @@ def scan(
         carry: a tree of tensors.
         inputs: a tree of tensors; entry k along ``dim`` is the input of pass k.
         dim: of inputs and outputs, counted from the front: 1 where the rows come first.
+        unrolled: whether a compiled program writes the passes one after the other: faster where they are few
+            and small, of longer text.
 
     Returns:
         The carry after the last pass, and the outputs stacked along ``dim``.
     """
     leaves, structure = flatten(inputs)
     count = leaves[0].shape[dim]
-    if count > 1 and (tracer := _tracer((carry, inputs))) is not None:
+
+    def at(k: int) -> Tree:
+        return unflatten(structure, iter([leaf.select(dim, k) for leaf in leaves]))
+
+    tracer = None if unrolled or count < 2 else _tracer((carry, inputs))
+    if tracer is not None and not _fixed(tracer, (carry, inputs), lambda: body(carry, at(0))):
         return _loop(tracer, count, body, carry, inputs, dim)
     outputs, shape = [], None
     for k in range(count):
-        now = unflatten(structure, iter([leaf.select(dim, k) for leaf in leaves]))
-        carry, out = body(carry, now)
+        carry, out = body(carry, at(k))
         parts, shape = flatten(out)
         outputs.append(parts)
     stacked = [torch.stack(column, dim=dim) for column in zip(*outputs, strict=True)]
@@ -221,6 +232,13 @@ def _tracer(tree: Tree) -> Tracer | None:
     if tracer is None or torch._C._functorch.peek_interpreter_stack() is not None:
         return None
     return None if any(leaf.requires_grad for leaf in flatten(tree)[0]) else tracer
+
+
+def _fixed(tracer: Tracer, given: Tree, first: Callable[[], Tree]) -> bool:
+    """Whether no row has numbers of its own in what a first pass is given, and makes none."""
+    if any(tracer.traced(leaf) for leaf in flatten(given)[0]):
+        return False
+    return not any(tracer.traced(leaf) for leaf in flatten(first())[0])
 
 
 def _loop(

@@ -9,6 +9,7 @@ import math
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
@@ -126,7 +127,8 @@ def solve(
     columns = right.unsqueeze(-1) if vector else right
     size, width = matrix.shape[-1], columns.shape[-1]
     place = torch.arange(size, dtype=matrix.dtype, device=matrix.device)
-    batch = torch.broadcast_shapes(matrix.shape[:-2], columns.shape[:-2])
+    # Not torch.broadcast_shapes, whose first call imports sympy for half a second.
+    batch = np.broadcast_shapes(matrix.shape[:-2], columns.shape[:-2])
     both = matrix.expand(*batch, size, size), columns.expand(*batch, size, width)
     zero = torch.zeros_like(torch.cat(both, dim=-1)[..., 0])
 

@@ -18,6 +18,7 @@ from .statements import Writer
 from .tracer import LARGE
 
 _FEW = 400  # nodes of a program of which two vectors fit the registers and caches side by side
+_WRITTEN_OUT = 8  # entries of an output that are stored one by one
 _MANY = 1500  # nodes of which even a matrix that the vectors share does not pay for twice the text
 _COSTLY, _MEMORY = 20, 4  # operations that a function takes, and that a number written and read is worth
 _FUNCTIONS = frozenset(
@@ -275,12 +276,29 @@ class _Writer(Writer):
         self._level += 1
         done = 0
         for slot, size in enumerate(self.layout.outputs):
-            for e in range(size):
-                node = outputs[done + e]
-                for j in range(self.copies):
-                    value = self._number(node, self._ref(node, j))
-                    self._line(f"recorder.put({slot}, {e}, b + {j} * W, rows - {j} * W, {value});")
+            entries = outputs[done : done + size]
+            if size > _WRITTEN_OUT:
+                self._put_by_loop(slot, entries)
+            else:
+                for (e, node), j in itertools.product(enumerate(entries), range(self.copies)):
+                    self._line(self._put(slot, str(e), self._number(node, self._ref(node, j)), j))
             done += size
+        self._level -= 1
+        self._line("}")
+
+    def _put(self, slot: int, entry: str, value: str, j: int) -> str:
+        return f"recorder.put({slot}, {entry}, b + {j} * W, rows - {j} * W, {value});"
+
+    def _put_by_loop(self, slot: int, entries: Sequence[int]) -> None:
+        """Outputs of many entries: their stores, written out, can take g++ longer than all the rest."""
+        name, first = f"o{slot}", entries[0]
+        self._line(f"{self._type(first)} {name}[{len(entries) * self.copies}];")
+        self._fill(name, entries)
+        self._line(f"for (int p = 0; p < {len(entries)}; ++p) {{")
+        self._level += 1
+        for j in range(self.copies):
+            place = self._sum(["p"], [self.copies], j)
+            self._line(self._put(slot, "p", self._number(first, f"{name}[{place}]"), j))
         self._level -= 1
         self._line("}")
 

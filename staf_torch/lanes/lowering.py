@@ -12,6 +12,7 @@ from . import entrywise, reductions  # noqa: F401  their rules
 from .eliminations import FACTORISATIONS
 from .movements import MOVEMENTS, moved, scatter_add
 from .replacements import REPLACEMENTS
+from .rolled_choices import CHOICES, many
 from .rules import RULES
 from .tracer import NotLoweredError, Tracer
 
@@ -34,11 +35,18 @@ def lower(t: Tracer, func: Any, name: str, out: Any, args: Sequence[Any], kwargs
     # What torch's own decompositions end in takes the arguments of the operation of the same name.
     plain = name if name in REPLACEMENTS else name.removeprefix("prims::")
     rule = RULES.get(plain)
-    if rule is not None:
+    rolled = (
+        len(args) > 2
+        and "reduce" not in kwargs
+        and many(name, *args[:3])
+        and (t.traced(args[2]) or not t.stated(args[2]))
+    )
+    if rule is not None and not rolled:
         return rule(t, out, *args, **kwargs)
-    if name in MOVEMENTS:
+    if name in MOVEMENTS and not rolled:
         return moved(t, func, out, args, kwargs)
-    decomposition = FACTORISATIONS.get(name) or REPLACEMENTS.get(name) or decomposition_table.get(func)
+    tables: Any = (CHOICES,) if rolled else (FACTORISATIONS, REPLACEMENTS)
+    decomposition = next((table[name] for table in tables if name in table), decomposition_table.get(func))
     if decomposition is None and func._can_decompose():  # of several operations, also in torch
         decomposition = func.decompose
     if decomposition is None:

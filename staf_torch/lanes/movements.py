@@ -65,7 +65,7 @@ def moved(t: Tracer, func: Any, out: Any, args: Sequence[Any], kwargs: dict[str,
             return type(value)(numbers(part, fixed) for part in value)
         if isinstance(value, Tensor) and not fixed:
             nodes = t.nodes(value, kind) - zero  # what torch fills with 0 is then the node of 0
-            return torch.from_numpy(np.ascontiguousarray(nodes))
+            return torch.from_numpy(np.array(nodes))  # `ascontiguousarray` knows none without dimensions
         return value
 
     values = [numbers(a, position == at) for position, a in enumerate(args)]
@@ -113,7 +113,15 @@ def _listed(value: Any) -> Sequence[Any]:
 
 
 def _indexed(
-    t: Tracer, name: str, out: Tensor, a: Tensor, dim: Any, index: Any = None, *rest: Any, **_: Any
+    t: Tracer,
+    name: str,
+    out: Tensor,
+    a: Tensor,
+    dim: Any,
+    index: Any = None,
+    *rest: Any,
+    reduce: str | None = None,
+    **_: Any,
 ) -> Ids:
     """gather, scatter and selection at an index that a row computes, or that numbers of the table do."""
     kind = t.kind(out.dtype)
@@ -135,8 +143,11 @@ def _indexed(
     if name == "gather":
         x = x[tuple(slice(s) for s in at.shape[:-1])]
         return np.moveaxis(_chosen(t, x[..., None, :], at), -1, dim)
+    if reduce is not None:
+        raise NotLoweredError("`scatter` with reduce= has no scalar form here; `scatter_add` has one")
     source = t.nodes(rest[0], kind)
     source = np.broadcast_to(source, at.shape) if source.ndim == 0 else np.moveaxis(source, dim, -1)
+    source = source[tuple(slice(s) for s in at.shape)]
     out_nodes = x.copy()
     part = out_nodes[tuple(slice(s) for s in at.shape[:-1])]
     for s in range(at.shape[-1]):

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ..kernels import Kernel
-from ..numerics.linalg import newton_basis
+from ..lanes.pivoted_cholesky import newton_basis
 
 _JUMP = 4.0  # radii: beyond, a kernel whose scale grows with the state says nothing about the new one
 _FAR = 1e8  # radii: beyond, no kernel does, and the squares of a user's kernel may overflow

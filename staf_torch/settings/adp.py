@@ -153,8 +153,8 @@ def controller(cfg: DictConfig, system: Plant, cost: Cost) -> Controller:
         actor=lambda: start(cfg.adp.actor),
     )
     if not isinstance(policy, Controller):
-        if isinstance(policy, NearOptimal) and policy.planner is not None:
-            return policy.controller()
+        if isinstance(policy, NearOptimal) and not isinstance(loop := policy.controller(), Feedback):
+            return loop
         return Feedback(policy, getattr(policy, "value", None))
     if cfg.adp.trust is None:
         return policy

@@ -52,9 +52,9 @@ class BlackBox:
 
     def __call__(self, x: Tensor, u: Tensor) -> Tensor:
         """(..., n), (..., m) -> (..., n)."""
-        lead = x.shape[:-1]
+        lead: tuple[int, ...] = x.shape[:-1]
         if u.shape[:-1] != lead:
-            lead = torch.broadcast_shapes(lead, u.shape[:-1])
+            lead = np.broadcast_shapes(lead, u.shape[:-1])
         rows = x.expand(*lead, -1).reshape(-1, x.shape[-1]), u.expand(*lead, -1).reshape(-1, u.shape[-1])
         after = self._function(*rows) if self.torch else self._numpy(*rows)
         moved: Tensor = after.reshape(*lead, x.shape[-1])

@@ -220,3 +220,24 @@ def test_simulator_is_followed_in_numpy_to_the_same_promise(
         for policy in (seen, hidden):
             assert float(policy.proposal(near, policy.base(near)).abs().max()) < 1e-3
     torch.testing.assert_close(pickle.loads(pickle.dumps(hidden))(x), hidden(x), rtol=0, atol=0)
+
+
+@torch.no_grad()
+def test_controllers_of_a_policy_share_programs_and_no_plan() -> None:
+    plant = systems.Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
+    policy = adp.near_optimal(plant, COST, dt=0.25, low=-1.0, high=1.0)
+    one, other = policy.controller(), policy.controller()
+    assert one._begun is other._begun
+    far, near = torch.tensor([[3.0, 1.0]]).double(), torch.tensor([[0.05, 0.0]]).double()
+    none = far.new_zeros(1, 0)
+    plan, idle = one.init(far), other.init(near)
+    u, after = one.step(far, plan, none, 0.25)
+    again, same = other.step(near, idle, none, 0.25)
+    assert same is idle  # nothing to carry: nothing is made
+    assert torch.equal(again, policy(near))
+    assert torch.equal(one.step(far, plan, none, 0.25)[0], u)  # nor is a plan changed by those who follow it
+    _, ended = one.step(near, after, none, 0.25)
+    assert bool((ended.identifier[:, 0] < 0).all())
+    copied = pickle.loads(pickle.dumps(policy)).controller()
+    assert copied._begun is not one._begun
+    torch.testing.assert_close(copied.step(far, copied.init(far), none, 0.25)[0], u, rtol=0, atol=1e-6)

@@ -10,6 +10,7 @@ import pytest
 import torch
 from helpers_chase import BASES, LAW, circles
 from torch import Tensor, nn
+from variants import Cauchy
 
 from staf_torch import (
     ExponentialKernel,
@@ -50,6 +51,11 @@ CASES = {
     "jacobi preconditioner": (GAUSS, optim.PreconditionedDescent("jacobi"), predictors.Tangent(2)),
     "recursive least squares": (WELL, optim.RecursiveLeastSquares(), None),
     "ten centers that pivot": (MATERN, LAW, None),
+    "a user's kernel, ten centers": (
+        StaFBasis(Cauchy(), StateFollowingCenters(rings(10), 1.4)),
+        LAW,
+        None,
+    ),
 }
 
 

@@ -74,13 +74,13 @@ class Called:
 @pytest.mark.parametrize(
     "put",
     [
-        lambda patch: patch.setattr("staf_torch.numerics.linalg.pivoted_cholesky", twice),
+        lambda patch: patch.setattr("staf_torch.lanes.pivoted_cholesky.pivoted_cholesky", twice),
         lambda patch: patch.setattr(kernels.ExponentialKernel, "forward", staticmethod(twice)),
         lambda patch: patch.setattr(kernels.ExponentialKernel, "state_free", property(twice)),
         lambda patch: patch.setattr(kernels.ExponentialKernel, "forward", kernels.GaussianKernel.forward),
         lambda patch: patch.setattr(kernels.ExponentialKernel, "forward", functools.partial(twice, None)),
-        lambda patch: patch.setattr("staf_torch.numerics.linalg.pivoted_cholesky", mock.MagicMock()),
-        lambda patch: patch.setattr("staf_torch.numerics.linalg.pivoted_cholesky", Called()),
+        lambda patch: patch.setattr("staf_torch.lanes.pivoted_cholesky.pivoted_cholesky", mock.MagicMock()),
+        lambda patch: patch.setattr("staf_torch.lanes.pivoted_cholesky.pivoted_cholesky", Called()),
     ],
 )
 def test_foreign_functions_are_seen_and_the_librarys_own_are_not(

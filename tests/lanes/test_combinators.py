@@ -97,3 +97,39 @@ def test_a_mask_of_rows_goes_with_matrices_and_flags() -> None:
 def test_c_leaves_a_loop_when_the_row_is_done() -> None:
     source = lanes.Program(step).c_source("grow", *given(1))
     assert "break;" in source
+
+
+@pytest.mark.needs_compiler
+def test_passes_over_numbers_of_no_row_are_numbers_of_the_program(caplog: pytest.LogCaptureFixture) -> None:
+    table = torch.linspace(0.5, 2.0, 12, dtype=torch.float64)
+
+    def products() -> Tensor:  # of numbers without a dimension, as of one matrix for all rows
+        def body(done: Tensor, factor: Tensor) -> tuple[Tensor, Tensor]:
+            return done * factor, torch.stack([done, factor]).sum()
+
+        return lanes.scan(body, torch.ones((), dtype=torch.float64), table, dim=0)[1]
+
+    program = lanes.Program(
+        lambda carry, now, row: (carry + products().sum(), products() * carry.unsqueeze(-1))
+    )
+    start, now = torch.rand(3, dtype=torch.float64), torch.zeros(3, 4, dtype=torch.float64)
+    found, expected = program(start, now, ()), program.definition(start, now, ())
+    assert "plain torch" not in caplog.text
+    for one, other in zip(found, expected, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-15, atol=0)
+    assert "for (int i" not in program.c_source("fixed", start, now, ())
+
+
+@pytest.mark.needs_compiler
+def test_passes_that_meet_a_row_first_in_their_body_are_a_loop() -> None:
+    def step(carry: Tensor, now: Tensor, row: Tensor) -> tuple[Tensor, Tensor]:
+        steps = torch.arange(1.0, 6.0, dtype=torch.float64)
+        total, parts = lanes.scan(
+            lambda s, k: (s + k * row, s * row), torch.zeros(1, dtype=torch.float64), steps, dim=0
+        )
+        return carry + total, parts.movedim(0, -1)
+
+    program = lanes.Program(step)
+    start, now, row = (torch.rand(*shape, dtype=torch.float64) for shape in ((3,), (3, 2), (3,)))
+    for one, other in zip(program(start, now, row), program.definition(start, now, row), strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-15, atol=1e-16)

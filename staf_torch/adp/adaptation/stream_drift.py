@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 
 from ...kernels import Kernel
+from ...lanes.pivoted_cholesky import newton_basis
 from ...numerics.checks import fail, non_negative, positive_real, real
-from ...numerics.linalg import newton_basis, row_jacobian
+from ...numerics.linalg import row_jacobian
 from ...systems import ControlAffineSystem
 from .parametric import ParametricPlant
 from .redesign import product
