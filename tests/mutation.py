@@ -28,7 +28,7 @@ from pathlib import Path
 from mutants import Mutant, mutants_of, room_of
 from mutation_fork import begin
 from mutation_judge import Verdict, begin_judging, fail_anyway, judge
-from mutation_map import kept_at, known, measure, test_files
+from mutation_map import kept_at, known, measure, places, test_files
 from mutation_notes import Notes
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -52,11 +52,12 @@ def main() -> int:
         tree = Path(scratch) / "tree"
         _export(_git("rev-parse", options.commit).strip(), tree)
         _prepare(tree)
-        _measure_the_new(tree, compiled, options.jobs, begun + 60 * options.mapping)
         found = list(_all_mutants(tree, options.package, options.file))
         drawn = random.Random(options.seed).sample(found, min(options.sample, len(found)))
         notes = Notes(options.into, found, drawn)
         left = notes.left(again=options.again, without=options.without)
+        near = tuple({place for _, each in left for place in places(each.file)})
+        _measure_the_new(tree, compiled, options.jobs, begun + 60 * options.mapping, near)
         print(f"{len(found)} mutants, {len(notes.sample)} of them drawn, {len(left)} to try", flush=True)
         arguments = tree, compiled, known(CACHE / "map", tree), options.seconds, until
         with multiprocessing.get_context("fork").Pool(options.jobs, begin_judging, arguments) as pool:
@@ -115,11 +116,15 @@ def _all_mutants(tree: Path, packages: Iterable[str], files: Iterable[str]) -> I
         yield from mutants_of(name, path.read_text(encoding="utf-8"))
 
 
-def _measure_the_new(tree: Path, compiled: Path, jobs: int, until: float) -> None:
-    """Measure which lines are executed by the files of tests that changed since the map was made."""
+def _measure_the_new(tree: Path, compiled: Path, jobs: int, until: float, near: tuple[str, ...]) -> None:
+    """Measure which lines are executed by the files of tests that changed since the map was made.
+
+    Those of the folders in which the mutants are, ``near``, come first: there may be no time for all.
+    """
     store = CACHE / "map"
     store.mkdir(parents=True, exist_ok=True)
     new = [each for each in test_files(tree) if not kept_at(store, tree, each).exists()]
+    new.sort(key=lambda name: not name.startswith(near))
     if not new or time.monotonic() >= until:
         return
     print(f"measuring which lines {len(new)} files of tests execute", flush=True)

@@ -14,6 +14,7 @@ import difflib
 import hashlib
 import json
 import os
+import re
 import shutil
 import sqlite3
 import statistics
@@ -279,7 +280,8 @@ def tests_near(known: Map, file: str, first: int, last: int, around: tuple[int, 
     """Tests that execute some lines.
 
     Where that happens at import, or not at all: those of the function or class around, or else of the file,
-    or else of the folder. Files of the folder that were not measured count as a test each.
+    or else of the folder. Files of tests that were not measured count as a test each, if they are
+    of the folder or import the module.
 
     Args:
         known: the map.
@@ -293,7 +295,7 @@ def tests_near(known: Map, file: str, first: int, last: int, around: tuple[int, 
     """
     there = known.lines.get(file, {})
     near = (*places(file), *((_CONTRACTS,) if around[2] else ()))
-    whole = {test for test in known.unmeasured if test.startswith(near)}
+    whole = {test for test in known.unmeasured if test.startswith(near) or _names(test, file)}
     if around[2]:
         whole |= {test for test in known.fixtures if test.startswith(_CONTRACTS)}
     order = sorted(there)
@@ -303,6 +305,17 @@ def tests_near(known: Map, file: str, first: int, last: int, around: tuple[int, 
         if hits and not (around[2] and (begin, end) == (first, last)):
             return hits | whole
     return {test for test in known.fixtures if test.startswith(places(file))} | whole
+
+
+def _names(test_file: str, file: str) -> bool:
+    """Whether a file of tests imports a module of the package, by its name."""
+    room, *inner = Path(file).with_suffix("").parts[1:]
+    if not inner:
+        return False
+    module = re.escape(inner[-1])
+    dotted = re.escape(".".join((room, *inner[:-1])))
+    text = (place() / test_file).read_text(encoding="utf-8")
+    return re.search(rf"staf_torch\.{dotted}(\.{module}\b| import .*\b{module}\b)", text) is not None
 
 
 def places(file: str) -> tuple[str, ...]:

@@ -220,7 +220,8 @@ def inside(calls: int, seed: int, chosen: Sequence[str], level: str) -> None:
     built = list(Path(os.environ["XDG_CACHE_HOME"], "staf_torch").rglob("*.so"))
     names = {library.name.rpartition("-")[0] for library in built}
     assert names >= {LIBRARIES[kind] for kind in chosen}, names
-    assert all(b"__asan_report_load" in library.read_bytes() for library in built)
+    bare = [str(library) for library in built if b"__asan_report_load" not in library.read_bytes()]
+    assert not bare, bare
     print(f"{calls} calls of {len(built)} libraries under the sanitizers, none bad: {counts}", flush=True)
     outside = torch.empty(3, dtype=torch.float64)
     ctypes.string_at(outside.data_ptr(), 256)  # must be found, or all of this has shown nothing

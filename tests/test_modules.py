@@ -215,6 +215,7 @@ OTHERS |= {
     "GlobalValue",
     "BoxFilter",
     "SafetyFilter",
+    "DetourPlans",
     "DetourRollout",
     "FilteredPolicy",
     "PlanReplay",

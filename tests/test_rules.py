@@ -52,6 +52,7 @@ OTHERS = {
     "AvoidanceCost": "in tests/adp/test_avoidance.py",
     "plan_around": "in tests/adp/test_avoidance.py",
     "BoxFilter": "in tests/adp/test_box_filter.py",
+    "DetourPlans": "in tests/adp/test_detour_plans.py",
     "DetourRollout": "in tests/adp/test_detours.py",
     "SafetyFilter": "in tests/adp/test_safety_filter.py",
     "TwoLinkRobot": "numbers within a list, in tests/systems/test_barrier.py",

@@ -12,7 +12,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from command_line import ROOT
+from command_line import ROOT, one
 from public_names import PACKAGES, public
 
 PACKAGE = ROOT / "staf_torch"
@@ -128,7 +128,6 @@ def test_private_functions_have_seven_parameters_at_most() -> None:
 
 
 def test_the_engine_is_six_frames_from_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from staf_torch.cli.staf import main
     from staf_torch.experiments import chase_batch
 
     ways: list[list[str]] = []
@@ -143,9 +142,9 @@ def test_the_engine_is_six_frames_from_the_command(tmp_path: Path, monkeypatch: 
 
     monkeypatch.setattr(chase_batch, "chase_pieces", counted)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["staf", "duration=0.05", "settle_time=0", "figures=false"])
-    monkeypatch.setattr(sys, "path", list(sys.path))
-    main()
+    monkeypatch.setattr(sys, "argv", list(sys.argv))
+    code, _, err = one(str(tmp_path), ["duration=0.05", "settle_time=0", "figures=false"])
+    assert code == 0, err
     (way,) = ways
     assert len(way) <= 6
     assert len({Path(name).name for name in way}) <= 5

@@ -60,6 +60,7 @@ from .controllers import Supervised as Supervised
 from .cost import BoundedInputCost as BoundedInputCost
 from .cost import Cost as Cost
 from .cost import QuadraticCost as QuadraticCost
+from .detour_plans import DetourPlans as DetourPlans
 from .detours import DetourRollout as DetourRollout
 from .energy_shaping import EnergyShaping as EnergyShaping
 from .extrapolation import Extrapolation as Extrapolation
@@ -122,6 +123,7 @@ __all__ = [
     "Controller",
     "ControllerState",
     "Cost",
+    "DetourPlans",
     "DetourRollout",
     "DirectShooting",
     "Doubling",

@@ -222,7 +222,7 @@ class SampledProblem(nn.Module):
 
         Along pairs of coordinates: a compiled program goes through them, and its text is that of one.
         """
-        _use_forward_mode()
+        use_forward_mode()
         z, n = torch.cat((x, u), dim=-1), self.dim
 
         def both(z: Tensor) -> Tensor:
@@ -288,7 +288,7 @@ class SampledProblem(nn.Module):
 
 
 @functools.cache
-def _use_forward_mode() -> None:
+def use_forward_mode() -> None:
     """Let torch load what its forward mode needs, without its warning about its own `torch.jit.script`."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*torch.jit.script")

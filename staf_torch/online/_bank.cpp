@@ -219,6 +219,8 @@ static void rescale(const Rules &r, Stream &s) {
         const double spread = largest * std::sqrt(sum / inside);
         s.center[i] = mean, s.spread[i] = spread > std::max(1e-12 * std::fabs(mean), 1e-150) ? spread : 1;
     }
+    bool never[K];  // measured so far
+    for (int o = 0; o < K; ++o) never[o] = s.low[o] == infinity;
     std::fill(s.low, s.low + K, infinity);
     std::fill(s.high, s.high + K, -infinity);
     if (count >= r.searched_at) learn_trackers(r, s);
@@ -227,7 +229,7 @@ static void rescale(const Rules &r, Stream &s) {
     for (int j = 0; j < count; ++j) {
         if (beyond(r, s, s.x[j], s.y[j])) continue;
         for (int o = 0; o < K; ++o)
-            s.low[o] = std::min(s.low[o], s.y[j][o]), s.high[o] = std::max(s.high[o], s.y[j][o]);
+            if (!never[o]) s.low[o] = std::min(s.low[o], s.y[j][o]), s.high[o] = std::max(s.high[o], s.y[j][o]);
         carry(r, s, s.x[j], s.y[j], j ? s.when[j] - s.when[j - 1] : 1);
     }
 }
@@ -402,17 +404,21 @@ static void keep(const Rules &r, Stream &s, const double *x, const double *y, do
                 }
 }
 
-static void notice(Stream &s, const double *y) {
+// The range of y, of outputs that are measured now or have been before.
+static void notice(Stream &s, const double *y, const bool *measured) {
     for (int o = 0; o < K; ++o) {
+        if (!(measured && measured[o]) && s.low[o] == infinity) continue;
         s.low[o] = std::min(s.low[o], y[o]), s.high[o] = std::max(s.high[o], y[o]);
         s.last_y[o] = y[o];
     }
 }
 
-static void accept(const Rules &r, Stream &s, const double *x, const double *y, double time, double lapse) {
+static void accept(const Rules &r, Stream &s, const double *x, const double *y, double time, double lapse,
+                   bool anew) {
     s.clock += 1, s.learned += 1;
     keep(r, s, x, y, time);
-    if (std::find(r.rescaled, r.rescaled + 9, s.clock) != r.rescaled + 9 && s.clock <= C) rescale(r, s);
+    anew |= std::find(r.rescaled, r.rescaled + 9, s.clock) != r.rescaled + 9;
+    if (anew && s.clock <= C) rescale(r, s);
     else carry(r, s, x, y, lapse);
 }
 
@@ -435,8 +441,8 @@ static bool waits(const Rules &r, Stream &s, const double *x, const double *y, c
             return true;
         }
         s.trust = streak_limit;
-        notice(s, s.waiting_y);
-        accept(r, s, s.waiting_x, s.waiting_y, s.waiting_time, s.waiting_lapse);
+        notice(s, s.waiting_y, nullptr);
+        accept(r, s, s.waiting_x, s.waiting_y, s.waiting_time, s.waiting_lapse, false);
         return false;
     }
     if (waiting) s.waiting = 0, s.skipped += 1, lapse += s.waiting_lapse;
@@ -445,7 +451,8 @@ static bool waits(const Rules &r, Stream &s, const double *x, const double *y, c
 }
 
 static void learn(const Rules &r, Stream &s, const double *given, const double *told, double lapse) {
-    double x[n], y[K];
+    double x[n], y[K], judged[K];
+    bool first[K], seen[K], anew = false;  // the first value of an output says nothing of predictions
     bool some = false, measured = false, sound = true;
     for (int i = 0; i < n; ++i) x[i] = given[i] == given[i] ? given[i] : s.last_x[i], sound &= std::isfinite(x[i]);
     for (int i = 0; i < n; ++i) measured |= given[i] == given[i];
@@ -459,8 +466,12 @@ static void learn(const Rules &r, Stream &s, const double *given, const double *
     }
     const bool known = s.count > 0;
     if (known && !(s.answered && std::equal(x, x + n, s.asked))) ask(r, s, x);
-    for (int o = 0; o < K; ++o)
-        y[o] = told[o] == told[o] ? told[o] : s.mean[o] * scale_of(r, s, n + o) + shift_of(r, s, n + o);
+    for (int o = 0; o < K; ++o) {
+        seen[o] = told[o] == told[o];
+        first[o] = known && seen[o] && s.low[o] == infinity && std::fabs(told[o]) < 1e150;
+        judged[o] = first[o] ? NAN : told[o];
+        y[o] = seen[o] && !first[o] ? told[o] : s.mean[o] * scale_of(r, s, n + o) + shift_of(r, s, n + o);
+    }
     s.answered = 0;
     s.far = beyond(r, s, x, y) ? s.far + 1 : 0;
     if (s.far >= streak_limit) {  // the stream has gone elsewhere for good
@@ -473,14 +484,19 @@ static void learn(const Rules &r, Stream &s, const double *given, const double *
     } else if (s.far > 0) s.skipped += 1;
     else if (known) {
         lapse = s.unlearned, s.unlearned = 0;
-        if (waits(r, s, x, y, told, lapse)) return;
+        if (waits(r, s, x, y, judged, lapse)) return;
         for (int o = 0; o < K; ++o)
-            if (told[o] == told[o]) judge_members(r, s, o, in_units(r, s, o, y[o]));
+            if (judged[o] == judged[o]) judge_members(r, s, o, in_units(r, s, o, y[o]));
     }
     if (s.far > 0) return;
     s.unlearned = 0;
-    notice(s, y);
-    accept(r, s, x, y, s.time, lapse);
+    for (int o = 0; o < K; ++o)
+        if (first[o]) {  // until now nothing was known of it: it counts as if it had always been so
+            for (int j = 0; j < s.count; ++j) s.y[j][o] = told[o];
+            y[o] = told[o], anew = true;
+        }
+    notice(s, y, seen);
+    accept(r, s, x, y, s.time, lapse, anew);
 }
 
 static void tell(const Rules &r, Stream &s, const double *given, double *mean, double *deviation) {

@@ -209,6 +209,7 @@ class BankDefinition:
         spread = torch.where(spread > 1e-150, spread, 1.0)
         s["center"].copy_(center)
         s["spread"].copy_(spread)
+        never = s["low"] == torch.inf  # measured so far
         s["low"].fill_(torch.inf)
         s["high"].fill_(-torch.inf)
         if count >= self.rules.searched_at:
@@ -218,8 +219,8 @@ class BankDefinition:
         for j in range(count):
             if self._beyond(s, s["x"][j], s["y"][j]):
                 continue
-            torch.minimum(s["low"], s["y"][j], out=s["low"])
-            torch.maximum(s["high"], s["y"][j], out=s["high"])
+            torch.minimum(s["low"], torch.where(never, torch.inf, s["y"][j]), out=s["low"])
+            torch.maximum(s["high"], torch.where(never, -torch.inf, s["y"][j]), out=s["high"])
             self._carry(s, s["x"][j], s["y"][j], float(s["when"][j] - s["when"][j - 1]) if j else 1.0)
 
     def _learn_trackers(self, s: Views, count: int) -> None:
@@ -291,7 +292,10 @@ class BankDefinition:
         if known and not (s.number("answered") and bool((x == s["asked"]).all())):
             self._ask(s, x)
         center, spread = (part[self.shape.dim :] for part in self._units(s))
-        y = torch.where(seen, told, s["mean"] * spread + center)
+        # the first value of an output says nothing of predictions
+        first = seen & (s["low"] == torch.inf) & (told.abs() < 1e150) & known
+        judged = seen & ~first
+        y = torch.where(judged, told, s["mean"] * spread + center)
         s["answered"].zero_()
         s["far"].copy_(s["far"] + 1 if self._beyond(s, x, y) else torch.zeros(()))
         if s.number("far") >= STREAK:  # the stream has gone elsewhere for good
@@ -303,17 +307,20 @@ class BankDefinition:
         elif known and s.number("far") == 0:
             lapse = s.number("unlearned")
             s["unlearned"].zero_()
-            since = self._waits(s, x, y, seen, lapse)
+            since = self._waits(s, x, y, judged, lapse)
             if since is None:
                 return
             lapse = since
-            judge(self.rules, s, (y - center) / spread, seen, s.number("clock"))
+            judge(self.rules, s, (y - center) / spread, judged, s.number("clock"))
         if s.number("far") > 0:
             s["skipped"].add_(1)
             return
         s["unlearned"].zero_()
-        self._notice(s, y)
-        self._accept(s, x, y, s.number("time"), lapse)
+        # until now nothing was known of these: they count as if they had always been so
+        y = torch.where(first, told, y)
+        s["y"][: int(s.number("count"))] = torch.where(first, told, s["y"][: int(s.number("count"))])
+        self._notice(s, y, seen)
+        self._accept(s, x, y, s.number("time"), lapse, anew=bool(first.any()))
 
     def _waits(self, s: Views, x: Tensor, y: Tensor, seen: Tensor, lapse: float) -> float | None:
         """Time since the last sample that was learned, or None where this one waits.
@@ -336,7 +343,7 @@ class BankDefinition:
                 s["waiting"].fill_(1.0)
                 return None
             s["trust"].fill_(float(STREAK))
-            self._notice(s, s["waiting_y"])
+            self._notice(s, s["waiting_y"], torch.zeros_like(seen))
             when = s.number("waiting_time"), s.number("waiting_lapse")
             self._accept(s, s["waiting_x"].clone(), s["waiting_y"].clone(), *when)
             return lapse
@@ -346,16 +353,19 @@ class BankDefinition:
         s["skipped"].add_(1)
         return s.number("waiting_lapse") + lapse
 
-    def _notice(self, s: Views, y: Tensor) -> None:
-        torch.minimum(s["low"], y, out=s["low"])
-        torch.maximum(s["high"], y, out=s["high"])
-        s["last_y"].copy_(y)
+    def _notice(self, s: Views, y: Tensor, measured: Tensor) -> None:
+        """The range of y, of outputs that are measured now or have been before."""
+        known = measured | (s["low"] < torch.inf)
+        torch.minimum(s["low"], torch.where(known, y, torch.inf), out=s["low"])
+        torch.maximum(s["high"], torch.where(known, y, -torch.inf), out=s["high"])
+        s["last_y"].copy_(torch.where(known, y, s["last_y"]))
 
-    def _accept(self, s: Views, x: Tensor, y: Tensor, time: float, lapse: float) -> None:
+    def _accept(self, s: Views, x: Tensor, y: Tensor, time: float, lapse: float, anew: bool = False) -> None:
         s["clock"].add_(1)
         s["learned"].add_(1)
         self._keep(s, x, y, time)
-        if s.number("clock") in self.rules.learned_at and s.number("clock") <= self.shape.capacity:
+        anew = anew or s.number("clock") in self.rules.learned_at
+        if anew and s.number("clock") <= self.shape.capacity:
             self._rescale(s)
         else:
             self._carry(s, x, y, lapse)

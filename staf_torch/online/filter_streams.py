@@ -13,6 +13,8 @@ from .kalman_filter import STREAK, LocalFilter, StreamState
 LEARNED_AT = (2, 5, 10, 20, 40)  # samples after which the units are learned
 OUTLYING = 30.0  # median deviations beyond which a value has no say in them
 FAR = 1e3  # spreads from the center where units say nothing: a stream that stays there learns new ones
+GROWN = 3.0  # times its unit: a coordinate whose latest samples spread so far gets a larger one
+LOOKED_AT = 10  # samples after which that is looked at again
 
 
 class FilterStreams:
@@ -24,6 +26,8 @@ class FilterStreams:
         scaling: whether the units of x and y are learned from the first samples of each stream.
         units: centers and spreads (S, 2 (n + K)) that are known instead, NaN where they are not.
         stretch: by which learned spreads are multiplied, (S, n + K), ones by default.
+        may_grow: 1 for coordinates whose units grow with what they are seen to move by, (S, n); by default
+            all where units are learned, none where they are known.
     """
 
     def __init__(
@@ -33,6 +37,7 @@ class FilterStreams:
         scaling: bool,
         units: Tensor | None = None,
         stretch: Tensor | None = None,
+        may_grow: Tensor | None = None,
     ) -> None:
         self.scaling = scaling
         self.dtype = state.dtype
@@ -42,9 +47,10 @@ class FilterStreams:
         self._stretch = self.units.new_ones(size, wide) if stretch is None else stretch.double()
         self._known = torch.full_like(self.units, torch.nan) if units is None else units.double()
         self.first = like.new_zeros(size, LEARNED_AT[-1] if scaling else 0, wide + 1)  # samples and lapses
-        self.clock = torch.zeros(
-            size, dtype=torch.int64
-        )  # of first samples; behind them, of far ones in a row
+        # Of first samples; behind them, of far ones in a row. Then the place of the oldest of the latest.
+        self.clock, self.turn = (torch.zeros(size, dtype=torch.int64) for _ in range(2))
+        grows = self.units.new_full((size, state.dim), float(units is None))
+        self._may_grow = grows if may_grow is None else may_grow.double()
         self._begin(torch.arange(size))
         self._hold(definition, state)
 
@@ -56,6 +62,8 @@ class FilterStreams:
         self.units[rows] = torch.where(given[:, None], known, unit.double())
         self.clock[rows] = torch.where(given, LEARNED_AT[-1], 0)
         self.first[rows] = 0.0
+        self.first[rows, :, :-1] = torch.nan
+        self.turn[rows] = 0
 
     def _hold(self, definition: LocalFilter, state: StreamState) -> None:
         """Filter these streams from now on."""
@@ -90,23 +98,51 @@ class FilterStreams:
             return
         n = self.state.dim
         self._leave(x, y)
-        young = self.clock < LEARNED_AT[-1]
-        complete = torch.isfinite(x).all(1) & torch.isfinite(y).all(1) & young
-        due = torch.zeros_like(complete)
-        if bool(young.any()):
-            rows = young.nonzero().squeeze(1)
-            lapses = torch.ones_like(rows, dtype=torch.float64) if lapse is None else lapse[rows]
-            self.first[rows, self.clock[rows], -1] += lapses  # since the last complete one
-            rows = complete.nonzero().squeeze(1)
-            self.first[rows, self.clock[rows], :-1] = torch.cat((x, y), 1)[rows].double()
-            self.clock[rows] += 1
-            due = complete & torch.isin(self.clock, torch.tensor(LEARNED_AT))
+        due = self._remember(x, y, lapse)
         rest = torch.where(due.unsqueeze(1), torch.nan, (y - self._center[:, n:]) / self._spread[:, n:])
         self._filter.learn(self.state, (x - self._center[:, :n]) / self._spread[:, :n], rest, lapse)
         if bool(due.any()):
             self.state.counts[1] -= due.long()  # not skipped: it is learned with the others
             for row in due.nonzero().squeeze(1).tolist():
-                self._rescale(row)
+                self._learn_units(row)
+        self._grow()
+
+    def _remember(self, x: Tensor, y: Tensor, lapse: Tensor | None) -> Tensor:
+        """Keep the latest samples of every stream; which streams learn their units from the first, (S,)."""
+        both = torch.cat((x, y), 1).double()
+        n, kept = self.state.dim, LEARNED_AT[-1]
+        seen = ~both.isnan()
+        usable = seen[:, :n].any(1) & seen[:, n:].any(1) & ~both.isinf().any(1)
+        young = self.clock < kept
+        place = torch.where(young, self.clock, self.turn)
+        every = torch.arange(len(place))
+        lapses = torch.ones_like(both[:, 0]) if lapse is None else lapse
+        waited = torch.where(young, self.first[every, place, -1], 0.0)  # since the last usable one
+        self.first[every, place, -1] = waited + lapses
+        rows = usable.nonzero().squeeze(1)
+        self.first[rows, place[rows], :-1] = both[rows]
+        self.turn = torch.where(usable & ~young, (self.turn + 1) % kept, self.turn)
+        self.clock += usable & young
+        return usable & young & torch.isin(self.clock, torch.tensor(LEARNED_AT))
+
+    def _grow(self) -> None:
+        """Give a coordinate that moves by far more than its unit a larger one, and learn the latest again."""
+        n, wide = self.state.dim, self.units.shape[1] // 2
+        looks = (self.clock == LEARNED_AT[-1]) & (self.turn % LOOKED_AT == 0) & self._may_grow.any(1)
+        rows = looks.nonzero().squeeze(1)
+        if not len(rows):
+            return
+        latest = self.first[rows, :, :n]
+        moves = units_of(latest.transpose(0, 1).flatten(1))[1].unflatten(0, (len(rows), n))
+        still = (latest.isnan() | (latest == latest[:, :1])).all(1)  # has the spread 1
+        told = (~latest.isnan()).sum(1) >= LEARNED_AT[-1] // 2
+        moves = torch.where(told & ~still, moves * self._stretch[rows, :n], 0.0)
+        unit = self.units[rows, wide : wide + n]
+        grown = (moves > GROWN * unit) & (self._may_grow[rows] > 0)
+        for i in grown.any(1).nonzero().squeeze(1).tolist():
+            row = int(rows[i])
+            self.units[row, wide : wide + n] = torch.where(grown[i], moves[i], unit[i])
+            self._relearn(row, self.first[row].roll(-int(self.turn[row]), 0))
 
     def _leave(self, x: Tensor, y: Tensor) -> None:
         """Let streams learn new units that have been far from what these were learned from for long."""
@@ -124,38 +160,51 @@ class FilterStreams:
             self.clear(gone)
             self.state.counts[:2, gone] = counts
 
-    def _rescale(self, row: int) -> None:
+    def _learn_units(self, row: int) -> None:
         """Take the units of a stream from its first samples, and learn these again."""
-        wide, n = self.state.dim + self.state.outputs, self.state.dim
         samples = self.first[row, : self.clock[row]]
-        center, spread = units_of(samples[:, :wide])
-        spread = spread * self._stretch[row]
-        self.units[row] = torch.cat((center, spread))
+        center, spread = units_of(samples[:, :-1])
+        self.units[row] = torch.cat((center, spread * self._stretch[row]))
+        self._relearn(row, samples, added=1)
+
+    def _relearn(self, row: int, samples: Tensor, added: int = 0) -> None:
+        """Let a stream forget all but these samples and their lapses, (N, n + K + 1), in its units.
+
+        Args:
+            row: number of the stream.
+            samples: oldest first.
+            added: 1 where the latest of them has not been counted yet.
+        """
+        wide, n = self.state.dim + self.state.outputs, self.state.dim
         self._center, self._spread = self.units.to(self.dtype).split(wide, dim=1)
+        center, spread = self.units[row].split(wide)
         u = ((samples[:, :wide] - center) / spread).to(self.dtype)
         alone = StreamState.empty(self.state.blocks, 1, n, self.state.count, self.state.outputs)
         law = self.definition.with_law(
             self.definition.ratio[row, None], self.definition.forgetting[row, None]
         )
         filter_ = CompiledFilter.build(law, alone)
+        before = 0
         for k in range(len(u)):
+            before = int(alone.counts[0, 0])
             filter_.learn(
                 alone, u[k : k + 1, :n].contiguous(), u[k : k + 1, n:].contiguous(), samples[k, -1:].clone()
             )
+        latest = int(alone.counts[0, 0]) - before  # 1 if the latest sample was learned
         counts = self.state.counts[:2, row].clone()
         table = self.state.table
         table[:, row] = alone.table[:, 0]
         self.state.put(table)
         self.state.counts[:, row] = alone.counts[:, 0]
-        self.state.counts[0, row] = torch.maximum(counts[0] + 1, alone.counts[0, 0])
-        self.state.counts[1, row] = counts[1]
+        self.state.counts[0, row] = torch.maximum(counts[0] + added * latest, alone.counts[0, 0])
+        self.state.counts[1, row] = counts[1] + added * (1 - latest)
 
     def units_for(self, samples: Tensor) -> tuple[Tensor, Tensor]:
         """Centers and spreads (S, n + K) for a whole record (T, S, n + K): from all of it, or as known."""
         wide = self.units.shape[1] // 2
         if not self.scaling or bool((self.clock >= LEARNED_AT[-1]).all()):
             return self.units[:, :wide], self.units[:, wide:]
-        found = [units_of(row[torch.isfinite(row).all(1)]) for row in samples.unbind(1)]
+        found = [units_of(torch.where(row.isfinite(), row, torch.nan)) for row in samples.unbind(1)]
         spreads = torch.stack([pair[1] for pair in found]) * self._stretch
         return torch.stack([pair[0] for pair in found]), spreads
 
@@ -176,7 +225,9 @@ class FilterStreams:
         new = self.units.new_full((streams, self.units.shape[1]), torch.nan)
         self.units, self._known = torch.cat((self.units, new)), torch.cat((self._known, new))
         self.first = torch.cat((self.first, self.first.new_zeros(streams, *self.first.shape[1:])))
-        self.clock = torch.cat((self.clock, self.clock.new_zeros(streams)))
+        self.clock, self.turn = (torch.cat((a, a.new_zeros(streams))) for a in (self.clock, self.turn))
+        grows = _typical(self._may_grow).expand(streams, -1)
+        self._may_grow = torch.cat((self._may_grow, grows))
         self._stretch = torch.cat((self._stretch, _typical(self._stretch).expand(streams, -1)))
         self._begin(torch.arange(self.count, self.count + streams))
         old = self.definition
@@ -188,6 +239,7 @@ class FilterStreams:
         state = self.state.with_table(self.state.table[:, rows], self.state.counts[:, rows])
         self.units, self.first, self.clock = self.units[rows], self.first[rows], self.clock[rows]
         self._known, self._stretch = self._known[rows], self._stretch[rows]
+        self.turn, self._may_grow = self.turn[rows], self._may_grow[rows]
         old = self.definition
         self._hold(old.with_law(old.ratio[rows], old.forgetting[rows]), state)
 
@@ -208,6 +260,7 @@ class FilterStreams:
             "counts": self.state.counts,
             "units": self.units,
             "clock": self.clock,
+            "turn": self.turn,
         }
         law = {"first": self.first, "ratio": self.definition.ratio, "forgetting": self.definition.forgetting}
         return kept | law
@@ -221,6 +274,7 @@ class FilterStreams:
         """
         if not isinstance(state.get("table"), Tensor):
             raise ValueError("`StaFRegressor.load_state_dict(state=...)` must have a tensor 'table'.")
+        state = {"turn": torch.zeros_like(self.turn)} | state  # of older versions
         refuse_other(state, self._learned(), self.state.blocks.shape[1], state["table"].shape[0])
         for name, own in self._fixed().items():
             given = state.get(name, own)  # which older versions did not save
@@ -229,7 +283,8 @@ class FilterStreams:
                 told = "must have the kernel, radius and centers of this regressor"
                 raise ValueError(f"`StaFRegressor.load_state_dict(state=...)` {told}; {name!r} differs.")
         kept = self.state.with_table(state["table"], state["counts"].clone())
-        self.units, self.clock, self.first = (state[name].clone() for name in ("units", "clock", "first"))
+        for name in ("units", "clock", "first", "turn"):
+            setattr(self, name, state[name].clone())
         self._hold(self.definition.with_law(state["ratio"].clone(), state["forgetting"].clone()), kept)
 
 
@@ -261,12 +316,12 @@ def refuse_other(state: dict[str, Any], own: dict[str, Tensor], expected: int, g
 
 
 def units_of(samples: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean and standard deviation of every column of (N, D), outlying values aside."""
-    middle = samples.median(0).values
+    """Mean and standard deviation of every column of (N, D) but for NaN and outlying values; 0, 1 of none."""
+    middle = samples.nanmedian(0).values
     away = (samples - middle).abs()
-    typical = away.median(0).values
-    usual = (typical == 0) | (away <= OUTLYING * typical)
-    count = usual.sum(0)
+    typical = away.nanmedian(0).values
+    usual = ~samples.isnan() & ((typical == 0) | (away <= OUTLYING * typical))
+    count = usual.sum(0).clamp(min=1)
     mean = (torch.where(usual, samples, 0.0) / count).sum(0)
     apart = torch.where(usual, samples - mean, 0.0)
     largest = apart.abs().amax(0)  # its square may be no number

@@ -130,7 +130,8 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
         twin = type(self)(**self.get_params(deep=False))
         if "tuning" in state:
             tuned = state["tuning"]
-            tuned = {"width": torch.ones_like(tuned["center"])[:, : state["n_features_in_"]]} | tuned
+            ones = torch.ones_like(tuned["center"])[:, : state["n_features_in_"]]  # of older versions
+            tuned = {"width": ones, "unknown": torch.zeros_like(ones)} | tuned
             twin._tuning = Tuning(**tuned)
         own, given = twin._plain_arguments(), state.get("arguments", {})
         for key, value in own.items():

@@ -24,6 +24,8 @@ ROUNDS = (0.6, 0.3)  # spread of the logarithms of the candidates around the bes
 AROUND = 48  # of these candidates a round
 SHORT = 0.35  # widths / sqrt(n), nearly what all of x covers of the widest: a coordinate with less is logged
 LITTLE = 6.0  # nats, log of the number of candidates: what is worth less may be luck of the best of them
+FAILS = 0.05  # share of samples that no candidate need explain
+BROAD = 3.0  # standard deviations of y: width of the density that explains these
 HARDLY = 0.02  # widths of the other coordinates: one that covers less hardly moves
 
 
@@ -36,7 +38,8 @@ class Tuning(NamedTuple):
     forgetting: Tensor  # (S,)
     radius: Tensor  # (S,) of the centers, in widths
     likelihood: Tensor  # (S,) log of the one-step predictive density, a sample, y in standard deviations
-    width: Tensor  # (S, n) in standard deviations of x
+    width: Tensor  # (S, n) in standard deviations of x; where these say nothing, that of the others
+    unknown: Tensor  # (S, n) float64, 1 where the stretch says nothing about a width: it may grow
 
     def keep(self, rows: Tensor) -> Tuning:
         """Of the streams with these numbers alone; the radius stays the one that serves all."""
@@ -109,6 +112,7 @@ def tuning(x: Tensor, y: Tensor, directions: Tensor) -> Tuning:
         radii,
         torch.where(one, found[1][0], found[0][0]) / (len(samples) - len(samples) // 3),
         stretch,
+        unknown.double(),
     )
 
 
@@ -123,7 +127,8 @@ def tuned_streams(
     filter_ = LocalFilter(functions, *law, follow * float(found.radius[0]), robust)
     state = StreamState.empty(torch.zeros(0, dtype=dtype), len(found.ratio), n, len(offsets), outputs)
     stretch = torch.cat((found.width, found.width.new_ones(len(found.width), outputs)), 1)
-    return FilterStreams(filter_, state, True, torch.cat((found.center, found.spread), 1), stretch)
+    units = torch.cat((found.center, found.spread), 1)
+    return FilterStreams(filter_, state, True, units, stretch, found.unknown)
 
 
 def _scores(candidates: _Candidates, samples: Tensor, n: int, offsets: Tensor) -> Tensor:
@@ -141,10 +146,24 @@ def _scores(candidates: _Candidates, samples: Tensor, n: int, offsets: Tensor) -
         y = sample[:, None, n:].expand(-1, count, -1).flatten(0, 1).contiguous()
         if k > len(samples) // 3:
             mean, deviation = lanes.predict(x)
-            density = -0.5 * ((y - mean) / deviation).square() - deviation.log()
-            score += torch.where(torch.isfinite(density), density, 0.0).sum(-1).unflatten(0, (streams, count))
+            score += _log_density(y, mean, deviation).sum(-1).unflatten(0, (streams, count))
         lanes.learn(x, y)
     return score
+
+
+def _log_density(y: Tensor, mean: Tensor, deviation: Tensor) -> Tensor:
+    """log((1 - a) N(y; mean, deviation) + a b(y)) but for constants; 0 where y was not measured.
+
+    b is a Student-t density (4 degrees of freedom, 3 standard deviations of y wide), the same for all
+    candidates: a sample of a sensor that fails, which none explains, costs them alike. A density that is no
+    number is a density of 0, and leaves b alone.
+    """
+    z = (y - mean) / deviation
+    own = -0.5 * z.square() - deviation.log()
+    own = torch.where(torch.isfinite(own), own, -torch.inf)
+    broad = -2.5 * ((y / BROAD).square() / 4).log1p() - math.log(BROAD)
+    found = torch.logaddexp(own + math.log1p(-FAILS), broad + math.log(FAILS))
+    return torch.where(torch.isnan(y), 0.0, found)
 
 
 def _best(candidates: _Candidates, samples: Tensor, n: int, offsets: Tensor) -> tuple[_Candidates, Tensor]:
@@ -187,7 +206,8 @@ def _widened(width: Tensor, spread: Tensor, extent: Tensor, unknown: Tensor) -> 
         unknown: as `_unknown` says, (S, n).
 
     Returns:
-        Both, (S, n), and which are the geometric mean of the known ones now, (S, n).
+        The first, (S, n); the second, (S, n), of the others wherever nothing is known; and which of the
+        first are the geometric mean of the known ones now, (S, n).
     """
 
     def others(values: Tensor) -> Tensor:
@@ -197,7 +217,9 @@ def _widened(width: Tensor, spread: Tensor, extent: Tensor, unknown: Tensor) -> 
     own = spread * width
     typical = others(own)
     wider = unknown & (extent < HARDLY * typical)
-    return torch.where(wider, typical, own), torch.where(wider, others(width), width), wider
+    usual = others(width)
+    stretch = torch.where(unknown & usual.isfinite(), usual, width)
+    return torch.where(wider, typical, own), stretch, wider
 
 
 def _warn(covered: Tensor, width: Tensor, wider: Tensor) -> None:

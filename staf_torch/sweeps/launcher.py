@@ -348,13 +348,16 @@ def _seldom_collecting() -> Iterator[None]:
     """Look for garbage seldom: Hydra copies configurations a dozen times a job, and Python would look through
     all of them for cycles after every few, a fifth of the time of a sweep."""
     before = gc.get_threshold()
-    gc.freeze()  # the half a million objects of torch are here to stay
+    ours = gc.get_freeze_count() == 0  # what a program has frozen itself cannot be told apart afterwards
+    if ours:
+        gc.freeze()  # the half a million objects of torch are here to stay
     gc.set_threshold(20_000, 5, 5)
     try:
         yield
     finally:
         gc.set_threshold(*before)
-        gc.unfreeze()
+        if ours:
+            gc.unfreeze()
 
 
 def _off_the_terminal(outcome: Outcome, seconds: float, progress: Progress) -> Callable[[DictConfig], Any]:

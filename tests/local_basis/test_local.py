@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 from helpers import basis_of, tensor, uniform
 from variants import KERNELS, RADII, over
@@ -58,3 +59,21 @@ def test_centers_that_meet_leave_one_of_them() -> None:
 
 def test_one_factor_serves_all_states() -> None:
     assert basis_of("matern32").local(uniform(5, 4, 2)).factor.factor.shape == (6, 6)
+
+
+@pytest.mark.parametrize("kernel", ["exponential", "gaussian"])
+@pytest.mark.parametrize("count", [3, 6])
+@pytest.mark.parametrize("bound", [0.05, 0.4, 1.2, 2.5, 5.0])  # above 1 or so no series serves all states
+def test_a_radius_that_moves_gives_what_the_constant_one_of_its_size_gives(
+    kernel: str, count: int, bound: float
+) -> None:
+    moving = st.StateRadius(bound, 0.05)
+    x = uniform(6, 2, low=-2.0, high=2.0)
+    together = basis_of(kernel, count, moving)
+    space = together.local(x)
+    found = space.fit(together.values(x, Paper()))
+    for row, at in enumerate(x):
+        alone = basis_of(kernel, count, float(moving(at)))
+        expected = alone.local(at).fit(alone.values(at, Paper()))
+        assert found[row].isfinite().all()
+        torch.testing.assert_close(found[row], expected, rtol=1e-7, atol=1e-7)

@@ -263,3 +263,43 @@ def test_models_that_overflow_begin_anew_and_the_others_go_on() -> None:
     for part, new, kept in zip(models, fresh, other, strict=True):
         torch.testing.assert_close(part[..., 1], new[..., 1], rtol=0, atol=0)
         torch.testing.assert_close(part[..., 0], kept, rtol=0, atol=0)
+
+
+def late_output(steps: int, begins: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Two outputs of one stream far from 0; the second as measured, from a sample on, and as it is."""
+    x, y = streams(steps, 1, 2)
+    whole = y + torch.tensor([50.0, -2000.0]).double()
+    told = whole.clone()
+    told[:begins, 0, 1] = torch.nan
+    return x, told, whole
+
+
+@needs_compiler
+@pytest.mark.parametrize("begins", [1, 7])
+def test_output_that_is_measured_later_was_not_0_before(begins: int) -> None:
+    x, told, whole = late_output(120, begins)
+    found = []
+    for y in (told, whole):
+        bank, errors = Bank(BankShape(2, 2, 128, 8), 1, True), []
+        for k in range(120):
+            if k >= begins + 12:
+                errors.append(bank.predict(x[k])[0][0, 1] - whole[k, 0, 1])
+            bank.learn(x[k], y[k])
+        assert float(bank.table[0, 4]) == 120
+        found.append(float(torch.stack(errors).square().mean().sqrt()))
+    assert found[0] < 2.5 * found[1]  # of one that has learned for longer; 4 and more where it was 0
+
+
+@needs_compiler
+def test_compiled_bank_waits_for_an_output_as_the_definition_does() -> None:
+    x, told, _ = late_output(30, 7)
+    fast, slow = Bank(BankShape(2, 2, 128, 8), 1, True), definition_of(Bank(BankShape(2, 2, 128, 8), 1, True))
+    for k in range(30):
+        for found, expected in zip(fast.predict(x[k]), slow.predict(x[k]), strict=True):
+            torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-6)
+        for bank in (fast, slow):
+            bank.learn(x[k], told[k].contiguous())
+        both = [bank._definition.each(bank.table)[0] for bank in (fast, slow)]
+        for part in ("y", "low", "high", "last_y", "center", "spread"):
+            torch.testing.assert_close(both[0][part], both[1][part], rtol=1e-5, atol=1e-6)
+        slow.table.copy_(fast.table)

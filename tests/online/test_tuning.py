@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 import staf_torch as st
+from staf_torch.online.tuning import _log_density
 
 
 def drawn(width: Tensor, noise: float, steps: int = 220, seed: int = 0) -> tuple[Tensor, Tensor]:
@@ -131,3 +132,58 @@ def test_tuning_of_a_stream_is_the_same_whoever_is_beside() -> None:
     for k, own in enumerate(alone):
         assert own is not None
         assert all(torch.equal(a[k], b[0]) for a, b in zip(together, own, strict=True))
+
+
+def test_samples_that_no_candidate_explains_do_not_choose() -> None:
+    """A sensor that fails three times in the stretch: what is tuned there predicts the rest as before."""
+    x, y = drawn(torch.tensor([0.7, 0.7]).double(), 0.1, steps=300, seed=40)
+    broken = y.clone()
+    broken[torch.tensor([70, 71, 110])] += torch.tensor([40.0, -30.0, 40.0]).double()
+    found = [errors(st.StaFRegressor().tune(x[:150], each[:150]), x, y) for each in (y, broken)]
+    assert found[1] < 1.7 * found[0]  # 4.4 to 6.5 with a Gaussian density alone
+
+
+def test_density_of_zero_loses_against_one_that_is_not() -> None:
+    y = torch.tensor([[1.0], [1.0], [torch.nan], [0.5]]).double()
+    mean = torch.tensor([[0.9, 1e200], [1.0, torch.nan], [0.0, 1.0], [0.0, 0.0]]).double()
+    deviation = torch.tensor([[0.1, 1e-150], [0.1, 0.1], [0.1, 0.1], [0.0, 0.1]]).double()
+    found = _log_density(y, mean, deviation)
+    assert torch.isfinite(found).all()  # so that one sample throws no candidate away
+    assert (found[:2, 0] > found[:2, 1]).all()
+    assert found[2].tolist() == [0.0, 0.0]
+
+
+@pytest.mark.parametrize("tunes", [True, False])
+def test_units_grow_with_a_coordinate_that_jittered_while_they_were_learned(tunes: bool) -> None:
+    """Jitter of 3 % for 120 samples, then movement of 1: 8 times the error of one that knows without."""
+    path, _ = drawn(torch.tensor([0.9, 0.9]).double(), 0.1, steps=300)
+    draw = torch.Generator().manual_seed(int(torch.randint(2**31, ())))
+    x = torch.stack((path[:, 0], torch.cat((path[:1, 1].expand(120), path[:180, 1]))), -1)
+    x[:120, 1] += 0.03 * torch.randn(120, generator=draw, dtype=torch.float64)
+    y = (2 * x).sin().sum(-1) + 0.1 * torch.randn(300, generator=draw, dtype=torch.float64)
+    found = st.StaFRegressor().tune(x[:120], y[:120]) if tunes else st.StaFRegressor(scaling=True)
+    knowing = st.StaFRegressor(st.GaussianKernel(0.9), 0.45, noise=0.1)
+    for model in (found, knowing):
+        for k in range(0 if tunes else 120):
+            model.partial_fit(x[k], y[k])
+    assert errors(found, x[120:], y[120:]) < 2.2 * errors(knowing, x[120:], y[120:])
+    again = type(found)(**found.get_params()).load_state_dict(found.state_dict())
+    assert torch.equal(again.predict(x[7]), found.predict(x[7]))
+
+
+def test_units_are_those_of_what_was_measured_of_each_coordinate() -> None:
+    """No sample is complete: coordinates take turns, and the same units come out."""
+    x, y = drawn(torch.tensor([0.7, 0.7]).double(), 0.1, steps=60)
+    x = 1e3 * x + 5e4
+    for k in range(2):
+        x[k::3, k] = torch.nan  # of three samples one is complete
+    model = st.StaFRegressor(scaling=True).fit(x, y)
+    center, spread = model._streams_.units[0].chunk(2)  # type: ignore[union-attr]
+    for k in range(2):
+        seen = x[:40, k][~x[:40, k].isnan()]
+        assert float((center[k] - seen.mean()).abs()) < 1e-9 * float(center[k])
+        assert float((spread[k] / seen.std(correction=0) - 1).abs()) < 1e-9
+    never = st.StaFRegressor(scaling=True).fit(x.where(torch.tensor([True, False]), torch.nan), y)
+    assert (
+        int(never.n_samples_seen_) == 0
+    )  # as without scaling: a coordinate is held, and there is nothing to hold

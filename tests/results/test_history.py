@@ -113,3 +113,27 @@ def test_a_row_is_read_alone_as_with_the_others(tmp_path: Path, order: str) -> N
         np.testing.assert_array_equal(archive.read(name), array)
         for row in range(3):
             np.testing.assert_array_equal(archive.read(name, row), array[row])
+
+
+HIDDEN = {
+    "a comment": lambda whole, said: whole[:-2] + len(said).to_bytes(2, "little") + said,
+    "a comment that is cut off": lambda whole, said: (
+        whole[:-2] + (len(said) + 9).to_bytes(2, "little") + said
+    ),
+    "bytes behind it": lambda whole, said: whole + said,
+    "a comment announced": lambda whole, said: whole[:-2] + b"\1\0",
+}
+
+
+@pytest.mark.parametrize("how", HIDDEN)
+@given(said=some.one_of(some.integers(1, 60).map(bytes), some.binary(min_size=1, max_size=60)))
+def test_an_archive_whose_list_is_not_at_its_very_end_is_refused(
+    tmp_path_factory: pytest.TempPathFactory, how: str, said: bytes
+) -> None:
+    """How long the list is would be read from somewhere else than `zipfile` reads it."""
+    path = tmp_path_factory.mktemp("history") / "history.npz"
+    np.savez(path, **arrays(1, 2))
+    Archive(path)
+    path.write_bytes(HIDDEN[how](path.read_bytes(), said))
+    with pytest.raises(UnreadableError, match="does not end as an archive"):
+        Archive(path)

@@ -46,7 +46,13 @@ def _untouched() -> Iterator[None]:
         return [
             *(environment, sys.path[:], sys.argv[:], os.getcwd(), hydra, root.handlers[:], root.level),
             *(random.getstate(), torch.get_rng_state().tolist(), np.random.get_state()[1].tolist()),  # noqa: NPY002
-            *(torch.get_num_threads(), torch.get_default_dtype(), gc.get_threshold(), sys.stdout, sys.stderr),
+            *(
+                torch.get_num_threads(),
+                torch.get_default_dtype(),
+                gc.get_threshold(),
+                gc.get_freeze_count() > 0,
+            ),
+            *(sys.stdout, sys.stderr),
         ]
 
     before = state()
@@ -222,6 +228,18 @@ def test_own_function_to_figure_in_six_lines_of_a_notebook() -> None:
     found = run("target=custom", "target.path=mine.valley", *SHORT)
     assert found.metrics["ball_error"] < 0.1
     assert isinstance(found.figures()["gradient_chase"], Figure)
+
+
+@pytest.mark.parametrize("frozen", [True, False])
+@pytest.mark.usefixtures("_untouched")
+def test_what_a_program_keeps_from_the_collector_stays_so(frozen: bool) -> None:
+    was = gc.get_freeze_count() > 0  # by conftest.py
+    (gc.freeze if frozen else gc.unfreeze)()
+    try:
+        staf_torch.sweep(*BARE)
+        assert (gc.get_freeze_count() > 0) == frozen
+    finally:
+        (gc.freeze if was else gc.unfreeze)()
 
 
 def test_memory_is_flat_over_sweeps() -> None:

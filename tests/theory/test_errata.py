@@ -200,6 +200,10 @@ def test_drift_of_the_excess_needs_the_gradient_in_the_centers() -> None:
     step = theory.paper_step(staf, target, x, systems.Oscillator().drift(x), excess=0.35)
     assert in_weights.norm() < 1e-9
     assert step.ideal_gradient > 1
+    velocity = 3 * systems.Oscillator().drift(x)
+    again = theory.paper_step(staf, lambda y: 2 * target(y), x, velocity, excess=0.7)
+    assert again.gradient == pytest.approx(4 * step.gradient)  # F is quadratic in the weights, and so in V
+    assert again.dt == pytest.approx(2 * step.dt / (3 * 4))
 
 
 def test_forward_euler_inflates_the_circle_of_the_simulation() -> None:

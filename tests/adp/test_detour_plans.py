@@ -1,0 +1,135 @@
+"""Plans around what moves: every control free, improved as the loop runs."""
+
+from __future__ import annotations
+
+import pickle
+
+import pytest
+import torch
+from torch import Tensor
+
+from staf_torch import adp, systems
+
+PLANE = systems.Linear(torch.eye(4).roll(2, dims=1).triu().tolist(), torch.eye(4)[:, 2:].tolist())
+COST = adp.QuadraticCost(1.0, 1.0, dim=4, inputs=2, low=-1.0, high=1.0)
+LQR = adp.LQR(PLANE, COST, period=0.2)
+BESIDE = torch.tensor([[2.0, 0.1, 0.0, 0.0]], dtype=torch.float64)
+AWAY = torch.tensor([[-1.0, 0.5, 0.2, 0.1], [0.6, -0.4, 0.0, 0.3]], dtype=torch.float64)
+
+
+def disc(x: Tensor, t: Tensor) -> Tensor:
+    """A disc on the way to the origin, that moves."""
+    return (x[:, 0] - 1.0).square() + (x[:, 1] + 0.1 - 0.05 * t).square() - 0.16
+
+
+class Wide(systems.ControlAffineSystem):
+    """A mass in the plane, and a point that moves up at 5 cm/s and asks nobody."""
+
+    dim, inputs = 6, 2
+
+    def drift(self, x: Tensor) -> Tensor:
+        still = torch.zeros_like(x[..., :2])
+        return torch.cat((x[..., 2:4], still, still + 0.05 * x.new_tensor([0.0, 1.0]) * x[..., 4:5]), dim=-1)
+
+    def effectiveness(self, x: Tensor) -> Tensor:
+        return torch.eye(6, dtype=x.dtype)[:, 2:4].expand(*x.shape[:-1], 6, 2)
+
+
+def detours(**given: object) -> adp.DetourRollout:
+    settings = {"axes": torch.eye(2, 4), "dt": 0.2, "steps": 12, "terminal": LQR.value, "margin": 0.02}
+    settings |= {"sizes": [0.6], "lengths": [5]}
+    return adp.DetourRollout(LQR, PLANE, COST, disc, **{**settings, **given})  # type: ignore[arg-type]
+
+
+def test_where_nothing_is_in_its_way_and_no_bound_is_met_the_plan_is_the_lqr() -> None:
+    plans, x = adp.DetourPlans(detours(steps=8), first=2), AWAY
+    u, after = plans.step(x, plans.init(x), x, 0.2)
+    # J counts a period by its beginning, the LQR of 0.2 s by the integral.
+    torch.testing.assert_close(u, LQR(x), rtol=0.3, atol=0.05)
+    ahead = after.identifier[:, :-1].unflatten(-1, (8, 2))
+    torch.testing.assert_close(after.identifier[:, -1], torch.ones(2).double())
+    moved = plans._advance(x, u)
+    torch.testing.assert_close(plans.step(moved, after, x, 0.2)[0], ahead[:, 0], rtol=0.02, atol=0.01)
+
+
+def test_no_change_of_a_plan_lowers_what_it_costs() -> None:
+    plans = adp.DetourPlans(detours(margin=0.0, steps=6), first=6)
+    best = plans.init(BESIDE).identifier[:, :-1]
+    found = plans._improved(BESIDE, best, torch.zeros(1, 1).double(), 1)[-1]
+    others = best + 1e-3 * torch.randn(40, best.shape[1], generator=torch.Generator().manual_seed(1)).double()
+    others = COST.bounds.clip(others.unflatten(-1, (6, 2))).flatten(1)
+    x, still = BESIDE.expand(40, -1), torch.zeros(40, 1).double()
+    tried = plans._run(x, plans._others(x), still, others.unflatten(-1, (6, 2)), lambda y, o, u, k: u)
+    assert bool((tried.total > found).all())
+
+
+@pytest.mark.compiled
+def test_a_plan_leads_around_and_is_compiled_as_it_is_defined(caplog: pytest.LogCaptureFixture) -> None:
+    plans = adp.DetourPlans(detours(steps=6), first=2)
+    guard = adp.SafetyFilter(plans, PLANE, disc, dt=0.2, low=-1.0, high=1.0, decay=3.0)
+    defined = adp.simulate(guard, PLANE, COST, BESIDE, steps=2, compile=False)
+    compiled = adp.simulate(guard, PLANE, COST, BESIDE, steps=40, compile=True)
+    torch.testing.assert_close(compiled.state[:, :3], defined.state, rtol=1e-9, atol=1e-9)
+    assert not caplog.records  # compiled indeed
+    assert guard.report(compiled)["constraint_violations"] == 0
+    assert float(compiled.state[0, -1].norm()) < 0.1
+
+
+def test_states_that_no_input_moves_may_be_left_out_of_a_step() -> None:
+    """A disc whose place is a state, not a function of time: the same plan, of four states or of six."""
+
+    def near(x: Tensor, t: Tensor) -> Tensor:
+        return (x[:, :2] - x[:, 4:]).square().sum(-1) - 0.16
+
+    wide = Wide()
+    cost = adp.QuadraticCost(1.0, 1.0, dim=6, inputs=2, low=-1.0, high=1.0, output=lambda x: x[..., :4])
+    given = {"axes": torch.eye(2, 6), "dt": 0.2, "steps": 4, "sizes": [0.6], "lengths": [3]}
+    ways = adp.DetourRollout(
+        lambda x: LQR(x[..., :4]), wide, cost, near, terminal=lambda x: LQR.value(x[..., :4]), **given
+    )
+    x = torch.tensor([[1.7, 0.1, -0.5, 0.0, 1.0, -0.1]], dtype=torch.float64)
+    one, other = adp.DetourPlans(ways, first=1), adp.DetourPlans(ways, first=1, moved=4)
+    controls = [plans.step(x, plans.init(x), x, 0.2)[0] for plans in (one, other)]
+    torch.testing.assert_close(*controls, rtol=1e-9, atol=1e-9)
+    with pytest.raises(ValueError, match=r"`DetourPlans\(moved=...\)` must count every state"):
+        adp.DetourPlans(ways, moved=3)
+
+
+def test_rows_do_not_see_each_other_and_it_can_be_pickled() -> None:
+    plans = pickle.loads(pickle.dumps(adp.DetourPlans(_picklable(), first=1)))
+    u, after = plans.step(AWAY, plans.init(AWAY), AWAY, 0.2)
+    for k in range(2):
+        one, its = plans.step(AWAY[k : k + 1], plans.init(AWAY[k : k + 1]), AWAY, 0.2)
+        torch.testing.assert_close(one, u[k : k + 1], rtol=1e-10, atol=1e-10)
+        torch.testing.assert_close(its.identifier, after.identifier[k : k + 1], rtol=1e-10, atol=1e-10)
+
+
+def _picklable() -> adp.DetourRollout:
+    return detours(steps=3)
+
+
+@pytest.mark.parametrize(
+    ("given", "rule"),
+    [
+        ({"moved": 5}, r"`DetourPlans\(moved=...\)` must be at most the 4 states"),
+        ({"moved": 0}, r"`DetourPlans\(moved=...\)`"),
+        ({"iterations": 0}, r"`DetourPlans\(iterations=...\)`"),
+        ({"first": 0}, r"`DetourPlans\(first=...\)`"),
+        ({"weight": 0.0}, r"`DetourPlans\(weight=...\)` must be positive"),
+    ],
+)
+def test_arguments_that_break_their_rule_are_named(given: dict[str, object], rule: str) -> None:
+    with pytest.raises(ValueError, match=rule):
+        adp.DetourPlans(detours(), **given)  # type: ignore[arg-type]
+
+
+def test_the_cost_and_the_period_are_checked() -> None:
+    fading = adp.QuadraticCost(1.0, 1.0, dim=4, inputs=2, discount=0.1)
+    ways = adp.DetourRollout(
+        LQR, PLANE, fading, disc, axes=torch.eye(2, 4), dt=0.2, steps=4, terminal=LQR.value
+    )
+    with pytest.raises(ValueError, match="must have a QuadraticCost without discount"):
+        adp.DetourPlans(ways)
+    plans = adp.DetourPlans(detours(steps=4), first=1)
+    with pytest.raises(ValueError, match=r"`DetourPlans\(dt=...\)` must be that of the loop"):
+        plans.step(BESIDE, plans.init(BESIDE), BESIDE, 0.1)

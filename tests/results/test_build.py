@@ -1,0 +1,33 @@
+"""Which files a run's record of modules names."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from staf_torch.results import build
+
+
+@pytest.mark.parametrize("folder", ["mine", "site-packages", "dist-packages"])
+def test_a_module_is_recorded_with_what_it_imports_and_an_installed_one_with_its_package_alone(
+    folder: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    base = tmp_path / folder
+    files = {
+        "plants/__init__.py": "",
+        "plants/own.py": "import other, plants.absent\nfrom . import near\nfrom plants.sub.far import x\n",
+        "plants/near.py": "",
+        "plants/sub/__init__.py": "from .. import own\n",  # in a circle
+        "plants/sub/far.py": "import torch\nx = 1\n",
+        "other.py": "import further\n",
+        "further.py": "",
+    }
+    for name, text in files.items():
+        (base / name).parent.mkdir(parents=True, exist_ok=True)
+        (base / name).write_text(text)
+    monkeypatch.syspath_prepend(str(base))
+    found = build.modules({"target._target_": "plants.own.x"})
+    package = {name for name in found if name.partition(".")[0] == "plants"}
+    assert package >= {"plants.own", "plants.near", "plants.sub.far"}
+    assert set(found) - package == ({"other", "further"} if folder == "mine" else set())
