@@ -72,6 +72,7 @@ class FilterStreams:
         self._filter = CompiledFilter.build(definition, state)
         self.compiled = isinstance(self._filter, CompiledFilter) and not self.scaling
         self._center, self._spread = self.units.to(self.dtype).split(state.dim + state.outputs, dim=1)
+        self._calm = False  # until `_see`
 
     @property
     def learned(self) -> Tensor:
@@ -96,20 +97,49 @@ class FilterStreams:
         if not self.scaling:
             self._filter.learn(self.state, x, y, lapse)
             return
-        n = self.state.dim
-        self._leave(x, y)
-        due = self._remember(x, y, lapse)
-        rest = torch.where(due.unsqueeze(1), torch.nan, (y - self._center[:, n:]) / self._spread[:, n:])
+        n, both = self.state.dim, torch.cat((x, y), 1).double()
+        calm = self._calm and bool(both.isfinite().all()) and not self._far(both)
+        due = None if calm else self._looked_at(x, both, lapse)
+        rest = (y - self._center[:, n:]) / self._spread[:, n:]
+        if due is not None:
+            rest = torch.where(due.unsqueeze(1), torch.nan, rest)
         self._filter.learn(self.state, (x - self._center[:, :n]) / self._spread[:, :n], rest, lapse)
-        if bool(due.any()):
+        if calm:
+            self._keep_all(both, lapse)
+        elif due is not None and bool(due.any()):
             self.state.counts[1] -= due.long()  # not skipped: it is learned with the others
-            for row in due.nonzero().squeeze(1).tolist():
-                self._learn_units(row)
-        self._grow()
+            self._learn_units(due)
+        if not calm or self._even % LOOKED_AT == 0:
+            self._grow()
+            self._see()
 
-    def _remember(self, x: Tensor, y: Tensor, lapse: Tensor | None) -> Tensor:
+    def _see(self) -> None:
+        """Note whether all streams have their units and are at the same place of their latest samples: the
+        next sample then costs a few operations."""
+        self._even = int(self.turn[0])
+        self._calm = bool((self.clock == LEARNED_AT[-1]).all()) and bool((self.turn == self._even).all())
+        self._reach = FAR * self.units.chunk(2, dim=1)[1]
+        self._watched = not bool(self._known.isfinite().all(1).any())
+
+    def _far(self, both: Tensor) -> bool:
+        """Whether a stream is so far from what its units were learned from that these say nothing."""
+        away = (both - self.units[:, : both.shape[1]]).abs()
+        return not self._watched or bool((away > self._reach).any())
+
+    def _keep_all(self, both: Tensor, lapse: Tensor | None) -> None:
+        """`_remember` where no stream is young and all of a sample is measured."""
+        self.first[:, self._even, :-1] = both
+        self.first[:, self._even, -1] = 1.0 if lapse is None else lapse
+        self._even = (self._even + 1) % LEARNED_AT[-1]
+        self.turn.fill_(self._even)
+
+    def _looked_at(self, x: Tensor, both: Tensor, lapse: Tensor | None) -> Tensor:
+        """Which streams are due to learn their units, (S,), with the sample kept."""
+        self._leave(x, both)
+        return self._remember(both, lapse)
+
+    def _remember(self, both: Tensor, lapse: Tensor | None) -> Tensor:
         """Keep the latest samples of every stream; which streams learn their units from the first, (S,)."""
-        both = torch.cat((x, y), 1).double()
         n, kept = self.state.dim, LEARNED_AT[-1]
         seen = ~both.isnan()
         usable = seen[:, :n].any(1) & seen[:, n:].any(1) & ~both.isinf().any(1)
@@ -130,27 +160,33 @@ class FilterStreams:
         n, wide = self.state.dim, self.units.shape[1] // 2
         looks = (self.clock == LEARNED_AT[-1]) & (self.turn % LOOKED_AT == 0) & self._may_grow.any(1)
         rows = looks.nonzero().squeeze(1)
-        if not len(rows):
+        latest, unit = self.first[rows, :, :n], self.units[rows, wide : wide + n]
+        # No spread is larger than half of what lies between the extremes, which are found in no time.
+        lowest, highest = latest.nan_to_num(nan=torch.inf).amin(1), latest.nan_to_num(nan=-torch.inf).amax(1)
+        wide_enough = 0.5 * (highest - lowest) * self._stretch[rows, :n] > GROWN * unit
+        some = wide_enough.any(1)
+        if not bool(some.any()):  # costs time alone
             return
-        latest = self.first[rows, :, :n]
+        rows, latest, unit = rows[some], latest[some], unit[some]
         moves = units_of(latest.transpose(0, 1).flatten(1))[1].unflatten(0, (len(rows), n))
         still = (latest.isnan() | (latest == latest[:, :1])).all(1)  # has the spread 1
         told = (~latest.isnan()).sum(1) >= LEARNED_AT[-1] // 2
         moves = torch.where(told & ~still, moves * self._stretch[rows, :n], 0.0)
-        unit = self.units[rows, wide : wide + n]
         grown = (moves > GROWN * unit) & (self._may_grow[rows] > 0)
-        for i in grown.any(1).nonzero().squeeze(1).tolist():
-            row = int(rows[i])
-            self.units[row, wide : wide + n] = torch.where(grown[i], moves[i], unit[i])
-            self._relearn(row, self.first[row].roll(-int(self.turn[row]), 0))
+        some = grown.any(1)
+        if not bool(some.any()):  # costs time alone
+            return
+        rows = rows[some]
+        self.units[rows, wide : wide + n] = torch.where(grown, moves, unit)[some]
+        order = (self.turn[rows, None] + torch.arange(LEARNED_AT[-1])) % LEARNED_AT[-1]
+        self._relearn(rows, self.first[rows[:, None], order])
 
-    def _leave(self, x: Tensor, y: Tensor) -> None:
+    def _leave(self, x: Tensor, both: Tensor) -> None:
         """Let streams learn new units that have been far from what these were learned from for long."""
         settled = (self.clock >= LEARNED_AT[-1]) & ~self._known.isfinite().all(1)
         if not bool(settled.any()):
             return
         center, spread = self.units.chunk(2, dim=1)
-        both = torch.cat((x, y), 1).double()
         far = ((both - center).abs() > FAR * spread).any(1) & torch.isfinite(x).all(1)
         clock = torch.where(far, self.clock + 1, LEARNED_AT[-1])
         self.clock = torch.where(settled & ~both.isnan().any(1), clock, self.clock)
@@ -160,44 +196,47 @@ class FilterStreams:
             self.clear(gone)
             self.state.counts[:2, gone] = counts
 
-    def _learn_units(self, row: int) -> None:
-        """Take the units of a stream from its first samples, and learn these again."""
-        samples = self.first[row, : self.clock[row]]
-        center, spread = units_of(samples[:, :-1])
-        self.units[row] = torch.cat((center, spread * self._stretch[row]))
-        self._relearn(row, samples, added=1)
+    def _learn_units(self, due: Tensor) -> None:
+        """Take the units of some streams from their first samples, and learn these again."""
+        for count in LEARNED_AT:
+            rows = (due & (self.clock == count)).nonzero().squeeze(1)
+            if len(rows):
+                samples = self.first[rows, :count]
+                center, spread = (
+                    part.unflatten(0, (len(rows), -1))
+                    for part in units_of(samples[..., :-1].transpose(0, 1).flatten(1))
+                )
+                self.units[rows] = torch.cat((center, spread * self._stretch[rows]), 1)
+                self._relearn(rows, samples, added=1)
 
-    def _relearn(self, row: int, samples: Tensor, added: int = 0) -> None:
-        """Let a stream forget all but these samples and their lapses, (N, n + K + 1), in its units.
+    def _relearn(self, rows: Tensor, samples: Tensor, added: int = 0) -> None:
+        """Let streams forget all but these samples and their lapses, (R, N, n + K + 1), in their units.
 
         Args:
-            row: number of the stream.
+            rows: numbers of the streams, (R,).
             samples: oldest first.
             added: 1 where the latest of them has not been counted yet.
         """
         wide, n = self.state.dim + self.state.outputs, self.state.dim
         self._center, self._spread = self.units.to(self.dtype).split(wide, dim=1)
-        center, spread = self.units[row].split(wide)
-        u = ((samples[:, :wide] - center) / spread).to(self.dtype)
-        alone = StreamState.empty(self.state.blocks, 1, n, self.state.count, self.state.outputs)
-        law = self.definition.with_law(
-            self.definition.ratio[row, None], self.definition.forgetting[row, None]
-        )
+        center, spread = self.units[rows].unsqueeze(1).split(wide, dim=-1)
+        u = ((samples[..., :wide] - center) / spread).to(self.dtype)
+        alone = StreamState.empty(self.state.blocks, len(rows), n, self.state.count, self.state.outputs)
+        law = self.definition.with_law(self.definition.ratio[rows], self.definition.forgetting[rows])
         filter_ = CompiledFilter.build(law, alone)
-        before = 0
-        for k in range(len(u)):
-            before = int(alone.counts[0, 0])
-            filter_.learn(
-                alone, u[k : k + 1, :n].contiguous(), u[k : k + 1, n:].contiguous(), samples[k, -1:].clone()
-            )
-        latest = int(alone.counts[0, 0]) - before  # 1 if the latest sample was learned
-        counts = self.state.counts[:2, row].clone()
+        before = alone.counts[0].clone()
+        for k in range(u.shape[1]):
+            before = alone.counts[0].clone()
+            at, lapse = u[:, k], samples[:, k, -1].clone()
+            filter_.learn(alone, at[:, :n].contiguous(), at[:, n:].contiguous(), lapse)
+        latest = alone.counts[0] - before  # 1 if the latest sample was learned
+        counts = self.state.counts[:2, rows].clone()
         table = self.state.table
-        table[:, row] = alone.table[:, 0]
+        table[:, rows] = alone.table
         self.state.put(table)
-        self.state.counts[:, row] = alone.counts[:, 0]
-        self.state.counts[0, row] = torch.maximum(counts[0] + added * latest, alone.counts[0, 0])
-        self.state.counts[1, row] = counts[1] + added * (1 - latest)
+        self.state.counts[:, rows] = alone.counts
+        self.state.counts[0, rows] = torch.maximum(counts[0] + added * latest, alone.counts[0])
+        self.state.counts[1, rows] = counts[1] + added * (1 - latest)
 
     def units_for(self, samples: Tensor) -> tuple[Tensor, Tensor]:
         """Centers and spreads (S, n + K) for a whole record (T, S, n + K): from all of it, or as known."""
@@ -216,6 +255,7 @@ class FilterStreams:
         self.state.put(table)
         self._begin(rows)
         self._center, self._spread = self.units.to(self.dtype).chunk(2, dim=1)
+        self._calm = False
 
     def add(self, streams: int) -> None:
         """Begin further streams, behind the others."""
