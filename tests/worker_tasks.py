@@ -27,6 +27,9 @@ if __name__ == "__main__":  # a parent of two workers, which are at work when it
 
     from staf_torch.sweeps.workers import Worker
 
+    for number in (signal.SIGHUP, signal.SIGTERM):  # which `nohup` lets a whole suite ignore
+        signal.signal(number, signal.SIG_DFL)
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # as a shell's `&` does
     workers = [Worker(work) for _ in range(2)]
     for number, worker in enumerate(workers):
         worker.begin("sleep", sys.argv[1] + str(number))
