@@ -56,9 +56,7 @@ class NearOptimal(SampledRollout):
     radius: float
     substeps: int
     planner: BoundedPlans | None = None
-    _planners: dict[
-        int, BoundedPlans
-    ]  # by the number of their periods: each has programs, which take seconds
+    _planners: dict[Any, BoundedPlans]  # each has programs, which take seconds
     _loops: dict[BoundedPlans, RecedingHorizon]
 
     def forward(self, x: Tensor) -> Tensor:
@@ -107,10 +105,11 @@ class NearOptimal(SampledRollout):
         steps = self.steps
         if constants is not None:
             steps = max(steps, _periods(constants / _slowest(self.lqr, self.plant), self.period))
-        if steps not in self._planners:
+        key = steps, self.plant, self.cost
+        if key not in self._planners:
             problem = SampledProblem.of(self.plant, self.cost, dt=self.period)
-            self._planners[steps] = BoundedPlans(problem, steps, self)
-        return self._planners[steps]
+            self._planners[key] = BoundedPlans(problem, steps, self)
+        return self._planners[key]
 
     @torch.no_grad()
     def report(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 import pickle
 from pathlib import Path
@@ -228,6 +229,9 @@ def test_controllers_of_a_policy_share_programs_and_no_plan() -> None:
     policy = adp.near_optimal(plant, COST, dt=0.25, low=-1.0, high=1.0)
     one, other = policy.controller(), policy.controller()
     assert one._begun is other._begun
+    dearer = copy.copy(policy)
+    dearer.cost = adp.QuadraticCost(1.0, 9.0, dim=2, inputs=1, low=-1.0, high=1.0)
+    assert dearer.controller()._begun is not one._begun  # plans of another cost are others
     far, near = torch.tensor([[3.0, 1.0]]).double(), torch.tensor([[0.05, 0.0]]).double()
     none = far.new_zeros(1, 0)
     plan, idle = one.init(far), other.init(near)
