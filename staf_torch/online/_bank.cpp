@@ -144,7 +144,11 @@ static void carry(const Rules &r, Stream &s, const double *x, const double *y, d
     s.trackers.learn(tracker_rules(r, s), place, value, after(s.tracker_forgetting));
     const Verdict verdict = judge(law, f, at, value, seen, V{});
     for (int i = 0; i < n; ++i) z[i] = verdict.moves ? V{} : verdict.z[i];
+    V before[K];
     if (any(verdict.moves)) {
+        const V known = moments(r.functions, verdict.z, f.mean, [&](int i) { return f.learned[i]; }, before);
+        const V variance = 1. + law.ratio - after(law.forgetting) * known;
+        for (int o = 0; o < K; ++o) before[o] = (value[o] - before[o]) * (value[o] - before[o]) / variance;
         Filter moved = f;
         transfer(r.functions, verdict.z, moved.mean, moved.learned);
         for (int i = 0; i < n; ++i) f.anchor[i] = verdict.moves ? at[i] : f.anchor[i];
@@ -155,7 +159,8 @@ static void carry(const Rules &r, Stream &s, const double *x, const double *y, d
             f.learned[i] = verdict.moves ? (verdict.afresh ? V{} : moved.learned[i]) : f.learned[i];
     }
     auto get = [&](int i) { return f.learned[i]; };
-    update(r.functions, law, f, get, [&](int i, V value) { f.learned[i] = value; }, z, value, seen, all(lapse), verdict.fine);
+    update(r.functions, law, f, get, [&](int i, V value) { f.learned[i] = value; }, z, value, seen, all(lapse), verdict.fine,
+           verdict.moves & ~verdict.afresh, before);
     std::memcpy(s.filters, &f, sizeof f);
 }
 

@@ -63,10 +63,15 @@ INLINE int64_t *counts_of(const Call &call, int which, int64_t first) { return c
 INLINE V count_of(const Call &call, int which, int64_t first, int count) {
     return column(counts_of(call, which, first), 1, count);
 }
-INLINE void save_count(int64_t *to, Mask value, int count) { __builtin_memcpy(to, &value, count * sizeof *to); }
+// Whole registers where there are so many streams: a copy of unknown size is a call.
+INLINE void save_count(int64_t *to, Mask value, int count) {
+    if (count == lanes) __builtin_memcpy(to, &value, sizeof value);
+    else __builtin_memcpy(to, &value, count * sizeof *to);
+}
 INLINE Mask saved_count(const int64_t *from, int count) {
     Mask found{};
-    __builtin_memcpy(&found, from, count * sizeof *from);
+    if (count == lanes) __builtin_memcpy(&found, from, sizeof found);
+    else __builtin_memcpy(&found, from, count * sizeof *from);
     return found;
 }
 // All but D, which is read where it is used.
@@ -111,9 +116,10 @@ static void tell(const Call &call) {
     }
 }
 
-// Streams that move: gathered from anywhere in the tile, so that no others pay.
-static void move(const Call &call, const int64_t *rows, int count, const V *h, const Mask afresh) {
-    V mean[K][M], learned[M * (M + 1) / 2];
+// Streams that move: gathered from anywhere in the tile, so that no others pay. Then `squares` has their squared
+// errors in units of the variance predicted before: (tile / lanes, K).
+static void move(const Call &call, const int64_t *rows, int count, const V *h, const Mask afresh, V *squares) {
+    V mean[K][M], learned[M * (M + 1) / 2], expected[K];
     REAL *place[lanes];
     for (int l = 0; l < count; ++l) place[l] = block_of(call, rows[l] / lanes * lanes) + rows[l] % lanes;
     auto at = [&](int row, int l) -> REAL & { return place[l][row * lanes]; };
@@ -125,6 +131,16 @@ static void move(const Call &call, const int64_t *rows, int count, const V *h, c
     for (int i = 0; i < row_errors - row_learned; ++i) {
         learned[i] = V{};
         for (int l = 0; l < count; ++l) learned[i][l] = at(row_learned + i, l);
+    }
+    V variance = moments(call.functions, h, mean, [&](int i) { return learned[i]; }, expected);
+    for (int l = 0; l < count; ++l) {
+        const double once = call.forgetting[rows[l]], lapse = call.lapse ? call.lapse[rows[l]] : 1;
+        variance[l] = 1 + call.ratio[rows[l]] - (lapse == 1 ? once : std::pow(once, lapse)) * variance[l];
+    }
+    for (int o = 0; o < K; ++o) {
+        for (int l = 0; l < count; ++l) expected[o][l] -= double(call.y[rows[l] * K + o]);
+        const V square = expected[o] * expected[o] / variance;
+        for (int l = 0; l < count; ++l) squares[rows[l] % tile / lanes * K + o][rows[l] % lanes] = square[l];
     }
     transfer(call.functions, h, mean, learned);
     for (int o = 0; o < K; ++o)
@@ -140,6 +156,7 @@ static void learn(const Call &call) {
     for (int64_t begin = 0; begin < call.streams; begin += tile) {
         const int64_t end = begin + tile < call.streams ? begin + tile : call.streams;
         Verdict verdicts[tile / lanes];
+        V squares[tile / lanes * K];
         int64_t rows[lanes];
         V h[n]{};
         Mask afresh{};
@@ -167,10 +184,10 @@ static void learn(const Call &call) {
                         call.counts[3 * call.stride + first + l] = 0;
                         block[(row_errors + K) * lanes + l] = 0;
                     }
-                    if (++moving == lanes) move(call, rows, moving, h, afresh), moving = 0;
+                    if (++moving == lanes) move(call, rows, moving, h, afresh, squares), moving = 0;
                 }
         }
-        if (moving) move(call, rows, moving, h, afresh);
+        if (moving) move(call, rows, moving, h, afresh, squares);
         for (int64_t first = begin; first < end; first += lanes) {
             const int count = end - first < lanes ? int(end - first) : lanes;
             const Verdict &v = verdicts[(first - begin) / lanes];
@@ -190,7 +207,8 @@ static void learn(const Call &call) {
             auto put = [&](int row, V value) { save(block + row * lanes, value); };
             const Mask good = update(
                 call.functions, law_of(call, first, count), s, [&](int i) { return load(learned + i * lanes); },
-                [&](int i, V value) { save(learned + i * lanes, value); }, z, y, seen, lapse, v.fine);
+                [&](int i, V value) { save(learned + i * lanes, value); }, z, y, seen, lapse, v.fine,
+                v.moves & ~v.afresh, squares + (first - begin) / lanes * K);
             for (int o = 0; o < K; ++o) {
                 put(row_errors + o, s.errors[o]);
                 for (int i = 0; i < M; ++i) put(row_mean + o * M + i, s.mean[o][i]);

@@ -21,7 +21,7 @@ typedef double V __attribute__((vector_size(64)));
 typedef int64_t Mask __attribute__((vector_size(64)));  // lanes of 0 or -1
 constexpr int lanes = 8, n = DIM, M = COUNT, K = OUTPUTS;
 constexpr double infinity = std::numeric_limits<double>::infinity();
-constexpr double surprise = 25, streak_limit = 8;
+constexpr double surprise = 25, streak_limit = 8, error_rate = .05;
 
 INLINE V all(double x) { return V{} + x; }
 INLINE V maximum(V a, V b) { return a > b ? a : b; }
@@ -153,25 +153,35 @@ INLINE Mask is_fresh(const Filter &s) {
     return sum != sum;
 }
 
-// Mean and variance of the next y at x. D's lower triangle is asked for by its numbers.
+// V's mean; psi'D psi, by which samples have made its variance less than 1, is returned. D's lower triangle is asked
+// for by numbers.
 template <typename Get>
-INLINE void predict(const Functions &f, const Law &law, const Filter &s, Get learned, const V *x, V mean[K],
-                    V variance[K]) {
-    V z[n], psi[M];
-    for (int i = 0; i < n; ++i) z[i] = (x[i] != x[i] ? s.last[i] : x[i]) - s.anchor[i];
+INLINE V moments(const Functions &f, const V *z, const V known[K][M], Get learned, V mean[K]) {
+    V psi[M], total{};
     functions_at(f, z, psi);
-    V prior = all(1);
     for (int i = 0, at = 0; i < M; ++i) {
         V sum{};
         for (int j = 0; j < i; ++j) sum += learned(at++) * psi[j];
-        prior -= psi[i] * (sum + sum + learned(at++) * psi[i]);
+        total += psi[i] * (sum + sum + learned(at++) * psi[i]);
     }
+    for (int o = 0; o < K; ++o) {
+        mean[o] = V{};
+        for (int i = 0; i < M; ++i) mean[o] += psi[i] * known[o][i];
+    }
+    return total;
+}
+
+// Mean and variance of the next y at x, a unit of time after the latest.
+template <typename Get>
+INLINE void predict(const Functions &f, const Law &law, const Filter &s, Get learned, const V *x, V mean[K],
+                    V variance[K]) {
+    V z[n];
+    for (int i = 0; i < n; ++i) z[i] = (x[i] != x[i] ? s.last[i] : x[i]) - s.anchor[i];
+    const V spread = 1. + law.ratio - law.forgetting * moments(f, z, s.mean, learned, mean);
     const Mask fresh = is_fresh(s);
     for (int o = 0; o < K; ++o) {
-        V sum{};
-        for (int i = 0; i < M; ++i) sum += psi[i] * s.mean[o][i];
-        mean[o] = fresh ? V{} : sum;
-        variance[o] = fresh ? law.base * (1. + law.ratio) : (prior + law.ratio) * running_scale(law, s.errors[o], s.since);
+        mean[o] = fresh ? V{} : mean[o];
+        variance[o] = fresh ? law.base * (1. + law.ratio) : spread * running_scale(law, s.errors[o], s.since);
     }
 }
 
@@ -210,10 +220,11 @@ INLINE Verdict judge(const Law &law, Filter &s, V *x, V *y, Mask *seen, V streak
     return v;
 }
 
-// The Kalman update at z from the anchor, where the result is finite: these lanes are returned.
+// The Kalman update at z from the anchor, where the result is finite: these lanes are returned. Where the centers
+// have moved, `before` has the squared errors in units of the variance that was predicted before they did.
 template <typename Get, typename Put>
 INLINE Mask update(const Functions &f, const Law &law, Filter &s, Get learned, Put put, const V *z, const V *y,
-                   const Mask *seen, V lapse, Mask fine) {
+                   const Mask *seen, V lapse, Mask fine, Mask moved, const V *before) {
     V psi[M], known[M]{}, gain[M], change[K], spread = 1. + law.ratio, share, total{}, peak{};
     functions_at(f, z, psi);
     share = lapse == 1. ? law.forgetting : V{};
@@ -233,17 +244,17 @@ INLINE Mask update(const Functions &f, const Law &law, Filter &s, Get learned, P
         gain[i] = psi[i] - known[i];
         total += gain[i] * 0.;  // not a number where one of them is not finite
     }
-    const V rate = maximum(1. / (s.since + 1.), all(.01));
+    const V rate = maximum(1. / (s.since + 1.), all(error_rate)), inverse = 1. / spread;
     V size = s.largest, errors[K];
     for (int o = 0; o < K; ++o) {
         V error = y[o];
         for (int i = 0; i < M; ++i) error -= psi[i] * s.mean[o][i];
-        const V square = minimum(error * error / spread, all(law.most));
+        const V square = minimum(moved ? before[o] : error * error * inverse, all(law.most));
         const V limited = minimum(square, all(law.limit));
         V kept = all(1);
         if (any(law.robust < infinity))  // a fifth of the time of a small filter
             kept = minimum(law.robust * root(running_scale(law, s.errors[o], s.since) / square), all(1));
-        change[o] = seen[o] ? kept * error / spread : V{};
+        change[o] = seen[o] ? kept * error * inverse : V{};
         const V counted = s.since < streak_limit ? limited : minimum(limited, surprise * s.errors[o]);
         errors[o] = seen[o] ? s.errors[o] + rate * (counted - s.errors[o]) : s.errors[o];
         size = maximum(size, absolute(y[o]));
@@ -253,7 +264,6 @@ INLINE Mask update(const Functions &f, const Law &law, Filter &s, Get learned, P
         }
     }
     const Mask good = fine & (spread > 0.) & (total == 0.) & finite(spread) & (peak <= law.most);
-    const V inverse = 1. / spread;
     s.largest = good ? size : s.largest;
     s.since = good ? s.since + 1. : s.since;
     for (int o = 0; o < K; ++o) {

@@ -13,6 +13,7 @@ from .local_functions import LocalFunctions
 
 SURPRISE = 25.0  # standardised squared errors count at most so many times their running mean
 LANES = 8  # streams whose numbers stand together: the double precision numbers of a vector register
+ERROR_RATE = 0.05  # at which that mean follows: a memory of some twenty samples
 STREAK = 8  # samples in a row that are out of all proportion before a stream starts afresh
 
 
@@ -119,13 +120,17 @@ class _Sample(NamedTuple):
     seen: Tensor  # whether it was, (K, S)
     lapse: Tensor  # (S,)
     fine: Tensor  # whether the stream learns, (S,)
+    moved: Tensor  # whether its centers have moved to x, (S,)
+    before: Tensor  # squared errors in units of the variance predicted before they did, (K, S)
     most: float  # the largest number of the table
 
 
 class LocalFilter:
     """y_k = V_k(x_k) + e_k, e ~ N(0, rho), with V a Gaussian process of unit amplitude around the state.
 
-    A sample: P <- I - lambda D (what was learned fades towards the prior), then the Kalman update. When the
+    A sample: P <- I - lambda D (what was learned fades towards the prior), then the Kalman update; a
+    prediction is of a sample one unit of time after the latest, with lambda D. Variances are multiplied by
+    the running mean of squared errors in units of the variance that was predicted for them. When the
     state has left the anchor the centers move there, u <- T u and D <- T D T', |T| <= 1: D can only shrink,
     so that no covariance winds up in directions that the stream does not visit. K outputs share D.
 
@@ -167,19 +172,24 @@ class LocalFilter:
         return mean, variance.sqrt()
 
     def moments(self, state: StreamState, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and variance of the next y at x (S, n): (S, K), (S, K)."""
+        """Mean and variance of the y at x (S, n) one unit of time later: (S, K), (S, K)."""
         old = state.parts(state.table.double())
         x = torch.where(torch.isnan(x.mT), old.last, x.mT.double())
-        local = self.functions.local(old.anchor, x - old.anchor)
-        prior = self.functions.prior(old.anchor, x - old.anchor)
-        factor: Tensor | float = 1.0 if local.log_factor is None else local.log_factor.exp()
-        mean = (local.psi * old.mean).sum(-2) * factor
-        variance = (prior - _quadratic(old.learned, local.psi)) * factor**2 + self.ratio
+        mean, variance = self._moments(old, x - old.anchor, self.forgetting)
         scale = self._scale(old.errors, state.counts[3])
         fresh = torch.isnan(old.anchor).any(0)  # nothing is known before the first sample
         mean, variance = torch.where(fresh, 0.0, mean), variance * scale
         variance = torch.where(fresh, (1 + self.ratio) * self.base, variance)
         return mean.mT.to(state.blocks), variance.mT.to(state.blocks)
+
+    def _moments(self, old: Parts, z: Tensor, share: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean (K, S) and variance (S,) of the next y at z (n, S) from the anchor, before errors scale it;
+        when it comes, this share of D is left."""
+        local = self.functions.local(old.anchor, z)
+        prior = self.functions.prior(old.anchor, z)
+        factor: Tensor | float = 1.0 if local.log_factor is None else local.log_factor.exp()
+        mean = (local.psi * old.mean).sum(-2) * factor
+        return mean, (prior - share * _quadratic(old.learned, local.psi)) * factor**2 + self.ratio
 
     def learn(self, state: StreamState, x: Tensor, y: Tensor, lapse: Tensor | None = None) -> None:
         """Learn one sample a stream, in place, computed in float64.
@@ -210,6 +220,8 @@ class LocalFilter:
 
         z = torch.where(fine & ~afresh, x - old.anchor, 0.0)
         moves = fine & (afresh | ((z * z).sum(0) > self.slack**2))
+        expected, variance = self._moments(old, z, self.forgetting**lapse)
+        before = (y - expected).square() / variance
         anchor = torch.where(moves, x, old.anchor)
         start = torch.where(afresh, 0.0, 1.0)
         transfer, factor = self.functions.transfer(
@@ -230,7 +242,9 @@ class LocalFilter:
             torch.where(afresh, none, largest)[None],
         )
         most = torch.finfo(state.dtype).max
-        found, good = self._update(moved, since, _Sample(z, y, seen, lapse, fine, most))
+        found, good = self._update(
+            moved, since, _Sample(z, y, seen, lapse, fine, moves & ~afresh, before, most)
+        )
         faded = moved._replace(learned=moved.learned * self.forgetting**lapse)  # time passes in any case
         kept = [torch.where(good, new, old_) for new, old_ in zip(found, faded, strict=True)]
         state.put(state.whole(Parts(*kept)))
@@ -239,7 +253,7 @@ class LocalFilter:
 
     def _update(self, old: Parts, samples: Tensor, sample: _Sample) -> tuple[Parts, Tensor]:
         """The Kalman update at z from the anchor; and the streams whose result is finite."""
-        z, y, seen, lapse, fine, most = sample
+        z, y, seen, lapse, fine, moved, before, most = sample
         local = self.functions.local(old.anchor, z)
         psi, noise = local.psi, self.ratio
         largest = torch.maximum(old.largest, y.abs().amax(0))
@@ -252,14 +266,14 @@ class LocalFilter:
         spread = prior + noise - (psi * known).sum(0)
         error = y - (psi * old.mean).sum(-2)
         gain = psi - known
-        square = (error * error / spread).clamp(max=most)
+        square = torch.where(moved, before, error * error / spread).clamp(max=most)
         limited = square.clamp(max=most**0.75)
         scale = self._scale(old.errors, samples)
         kept = (self.robust * (scale / square).sqrt()).clamp(max=1.0) if math.isfinite(self.robust) else 1.0
         change = torch.where(seen, kept * error / spread, 0.0)
         mean = old.mean + gain * change.unsqueeze(-2)
         learned = old.learned * share + gain.unsqueeze(1) * (gain / spread)
-        rate = (1 / (samples + 1.0)).clamp(min=0.01)
+        rate = (1 / (samples + 1.0)).clamp(min=ERROR_RATE)
         counted = torch.where(samples < STREAK, limited, torch.minimum(limited, SURPRISE * old.errors))
         errors = torch.where(seen, old.errors + rate * (counted - old.errors), old.errors)
         good = fine & (spread > 0) & (mean.abs().amax((0, 1)) <= most) & torch.isfinite(learned.sum((0, 1)))

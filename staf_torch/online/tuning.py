@@ -20,6 +20,11 @@ WIDTHS = (0.5, 1.0, 2.0, 4.0, 8.0)  # in standard deviations of x, times sqrt(n)
 NOISES = (1e-3, 1e-2, 0.1, 0.4)  # in standard deviations of y
 FORGETTING = (1.0, 0.999, 0.99, 0.97)
 RADII = (0.25, 0.5)  # in widths
+DEFAULT = (
+    1.0,
+    1e-2,
+    0.999,
+)  # width, noise, forgetting of a regressor that nobody tuned: among the candidates
 ROUNDS = (0.6, 0.3)  # spread of the logarithms of the candidates around the best so far
 AROUND = 48  # of these candidates a round
 SHORT = 0.35  # widths / sqrt(n), nearly what all of x covers of the widest: a coordinate with less is logged
@@ -80,6 +85,7 @@ def tuning(x: Tensor, y: Tensor, directions: Tensor) -> Tuning:
     rows = torch.cartesian_prod(
         widths, *(torch.tensor(each, dtype=torch.float64) for each in (NOISES, FORGETTING))
     )
+    rows = torch.cat((rows, torch.tensor([DEFAULT], dtype=torch.float64)))
     first = _Candidates(*(rows[:, k].expand(streams, -1) for k in range(3)))
     first = first._replace(width=first.width.unsqueeze(-1).expand(-1, -1, n))
     found: list[tuple[Tensor, _Candidates, Tensor]] = []

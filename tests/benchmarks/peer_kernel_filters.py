@@ -157,5 +157,4 @@ class RandomFeatures:
         total = self.forgetting + phi @ g
         self.weights = self.weights + g * ((y - phi @ self.weights) / total)
         self.p -= np.outer(g, g / total)
-        if self.forgetting < 1:
-            self.p /= self.forgetting
+        self.p = (self.p + self.p.T) / (2 * self.forgetting)  # else it loses its symmetry, as rounding has it

@@ -118,15 +118,24 @@ def test_drifting_functions_are_predicted(kernel: str) -> None:
     assert float(error) < 0.1  # the noise is 0.05
 
 
-def test_standard_deviation_says_how_large_the_errors_are() -> None:
+@pytest.mark.parametrize(
+    ("noise", "forgetting", "follow"),
+    [(0.05, 0.999, 1.0), (0.005, 0.9, 1.0), (0.005, 0.99, 0.0), (0.05, 0.9, 0.0)],
+)
+def test_standard_deviation_says_how_large_the_errors_are(
+    noise: float, forgetting: float, follow: float
+) -> None:
+    """Also where much is forgotten until the next sample, and where the centers move at every sample."""
     x, y = walks(16, 200)
-    model = learned(st.StaFRegressor(st.GaussianKernel(0.9), 0.4, noise=0.05), x[:50], y[:50])
+    kernel = st.GaussianKernel(0.9)
+    model = st.StaFRegressor(kernel, 0.4, noise=noise, forgetting=forgetting, follow=follow)
+    learned(model, x[:50], y[:50])
     scores = []
     for state, value in zip(x[50:], y[50:], strict=True):
         mean, std = model.predict(state, return_std=True)
         scores.append((mean - value).square() / std.square())
         model.partial_fit(state, value)
-    assert 0.7 < float(torch.stack(scores).mean()) < 1.4
+    assert 0.9 < float(torch.stack(scores).mean().sqrt()) < 1.15
 
 
 def test_streams_do_not_touch_each_other() -> None:

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 import staf_torch as st
+from staf_torch.online import tuning
 from staf_torch.online.tuning import _log_density
 
 
@@ -55,9 +56,28 @@ def test_each_coordinate_and_each_stream_has_its_own_width() -> None:
 def test_streams_that_drift_forget_and_others_do_not() -> None:
     x, y = drawn(torch.tensor([0.7, 0.7]).double(), 0.05)
     drift = y + (0.15 * torch.arange(len(y), dtype=torch.float64)).sin() * x[:, 0]
-    found = st.StaFRegressor().tune(x[:, None].expand(-1, 2, -1), torch.stack((y, drift), 1))._tuning
+    tuned = st.StaFRegressor().tune(x[:, None].expand(-1, 2, -1), torch.stack((y, drift), 1))
+    found = tuned._tuning
     assert found is not None
-    assert float(found.forgetting[0]) > float(found.forgetting[1])
+    gains = (1 - found.forgetting) / found.ratio  # what a stream forgets between samples beside their noise
+    assert float(gains[1]) > 3 * float(gains[0])
+    never = st.StaFRegressor(st.GaussianKernel(0.7), 0.35, noise=0.05, forgetting=1.0)
+    assert errors(st.StaFRegressor().tune(x, drift), x, drift) < 0.85 * errors(never, x, drift)
+
+
+def test_settings_of_a_regressor_that_nobody_tuned_are_among_the_candidates(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """So that what is tuned is never less likely on its stretch; here every other candidate is a poor one."""
+    for name, poor in (("WIDTHS", (300.0,)), ("NOISES", (3.0,)), ("FORGETTING", (0.5,)), ("ROUNDS", ())):
+        monkeypatch.setattr(tuning, name, poor)
+    x, y = drawn(torch.tensor([0.7, 0.7]).double(), 0.05, steps=90)
+    found = st.StaFRegressor().tune(x, y)._tuning
+    assert found is not None
+    default = st.StaFRegressor()
+    assert abs(float(found.ratio[0]) - default.noise**2) < 1e-15
+    assert float(found.forgetting[0]) == default.forgetting
+    assert torch.equal(found.width[0], torch.ones(2).double())
 
 
 def test_tuning_knows_no_units_and_is_saved_with_what_was_learned() -> None:
