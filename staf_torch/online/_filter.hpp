@@ -249,7 +249,7 @@ INLINE Mask update(const Functions &f, const Law &law, Filter &s, Get learned, P
     for (int o = 0; o < K; ++o) {
         V error = y[o];
         for (int i = 0; i < M; ++i) error -= psi[i] * s.mean[o][i];
-        const V square = minimum(moved ? before[o] : error * error * inverse, all(law.most));
+        const V square = minimum(moved & finite(before[o]) ? before[o] : error * error * inverse, all(law.most));
         const V limited = minimum(square, all(law.limit));
         V kept = all(1);
         if (any(law.robust < infinity))  // a fifth of the time of a small filter

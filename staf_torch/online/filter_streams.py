@@ -355,6 +355,11 @@ def refuse_other(state: dict[str, Any], own: dict[str, Tensor], expected: int, g
             raise ValueError(f"{name} {told}; got {tuple(found.shape)}, {found.dtype} on {found.device}.")
 
 
+def total(values: Tensor) -> Tensor:
+    """Sum over the first dimension, of which each column's bits do not depend on how many stand beside it."""
+    return values.cumsum(0)[-1]
+
+
 def units_of(samples: Tensor) -> tuple[Tensor, Tensor]:
     """Mean and standard deviation of every column of (N, D) but for NaN and outlying values; 0, 1 of none."""
     middle = samples.nanmedian(0).values
@@ -362,9 +367,9 @@ def units_of(samples: Tensor) -> tuple[Tensor, Tensor]:
     typical = away.nanmedian(0).values
     usual = ~samples.isnan() & ((typical == 0) | (away <= OUTLYING * typical))
     count = usual.sum(0).clamp(min=1)
-    mean = (torch.where(usual, samples, 0.0) / count).sum(0)
+    mean = total(torch.where(usual, samples, 0.0) / count)
     apart = torch.where(usual, samples - mean, 0.0)
     largest = apart.abs().amax(0)  # its square may be no number
     part = torch.where(largest > 0, apart / largest, 0.0)
-    spread = largest * (part.square().sum(0) / count).sqrt()
+    spread = largest * (total(part.square()) / count).sqrt()
     return mean, torch.where(spread > 1e-12 * mean.abs(), spread, 1.0)

@@ -13,7 +13,7 @@ from .local_functions import LocalFunctions
 
 SURPRISE = 25.0  # standardised squared errors count at most so many times their running mean
 LANES = 8  # streams whose numbers stand together: the double precision numbers of a vector register
-ERROR_RATE = 0.05  # at which that mean follows: a memory of some twenty samples
+ERROR_RATE = 0.05  # at which that mean follows: the latest twenty samples or so
 STREAK = 8  # samples in a row that are out of all proportion before a stream starts afresh
 
 
@@ -120,7 +120,7 @@ class _Sample(NamedTuple):
     seen: Tensor  # whether it was, (K, S)
     lapse: Tensor  # (S,)
     fine: Tensor  # whether the stream learns, (S,)
-    moved: Tensor  # whether its centers have moved to x, (S,)
+    moved: Tensor  # whether its centers have moved to x, and what follows is a number, (K, S)
     before: Tensor  # squared errors in units of the variance predicted before they did, (K, S)
     most: float  # the largest number of the table
 
@@ -221,7 +221,8 @@ class LocalFilter:
         z = torch.where(fine & ~afresh, x - old.anchor, 0.0)
         moves = fine & (afresh | ((z * z).sum(0) > self.slack**2))
         expected, variance = self._moments(old, z, self.forgetting**lapse)
-        before = (y - expected).square() / variance
+        before = (y - expected).square() / variance  # no number where a kernel overflows so far away
+        jumped = moves & ~afresh & torch.isfinite(before)
         anchor = torch.where(moves, x, old.anchor)
         start = torch.where(afresh, 0.0, 1.0)
         transfer, factor = self.functions.transfer(
@@ -242,9 +243,7 @@ class LocalFilter:
             torch.where(afresh, none, largest)[None],
         )
         most = torch.finfo(state.dtype).max
-        found, good = self._update(
-            moved, since, _Sample(z, y, seen, lapse, fine, moves & ~afresh, before, most)
-        )
+        found, good = self._update(moved, since, _Sample(z, y, seen, lapse, fine, jumped, before, most))
         faded = moved._replace(learned=moved.learned * self.forgetting**lapse)  # time passes in any case
         kept = [torch.where(good, new, old_) for new, old_ in zip(found, faded, strict=True)]
         state.put(state.whole(Parts(*kept)))

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ..kernels import GaussianKernel
-from .filter_streams import FilterStreams
+from .filter_streams import FilterStreams, total
 from .kalman_filter import LocalFilter, StreamState
 from .local_functions import LocalFunctions
 
@@ -75,8 +75,8 @@ def tuning(x: Tensor, y: Tensor, directions: Tensor) -> Tuning:
     both = torch.cat((x, y), -1).double()
     seen = torch.isfinite(both)
     count = seen.sum(0).clamp(min=1)
-    center = torch.where(seen, both, 0.0).sum(0) / count
-    spread = (torch.where(seen, both - center, 0.0).square().sum(0) / count).sqrt()
+    center = total(torch.where(seen, both, 0.0)) / count
+    spread = (total(torch.where(seen, both - center, 0.0).square()) / count).sqrt()
     moves = spread > 1e-12 * center.abs()
     spread = torch.where(moves, spread, 1.0)
     samples = (both - center) / spread

@@ -43,6 +43,7 @@ def test_filter_recovers_from_a_far_input(kernel: str, far: float, dtype: torch.
     model = st.StaFRegressor(kernel, 0.4, noise=0.05)
     for state, value in zip(bad, y, strict=True):
         model.partial_fit(state, value)
+    assert 0 < float(model.predict(x[-1], return_std=True)[1]) < 1.0
     assert error_after(model, x, y) < 0.3
 
 

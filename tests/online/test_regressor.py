@@ -185,6 +185,16 @@ def test_prediction_before_a_sample_changes_nothing_of_what_is_learned(kernel: s
     )
 
 
+@pytest.mark.parametrize("streams", [3, 7, 9])
+def test_units_have_the_same_bits_beside_streams_that_learn_theirs_later(streams: int) -> None:
+    x, y = walks(streams, 60)
+    late = y.clone()
+    late[3:17, : streams // 2] = torch.nan
+    both = [learned(st.StaFRegressor(scaling=True), x, targets) for targets in (y, late)]
+    for one, other in zip(*(model.predict(x[7], return_std=True) for model in both), strict=True):
+        assert torch.equal(one[streams // 2 :], other[streams // 2 :])
+
+
 def test_what_was_learned_fades_alike_beside_streams_that_skip() -> None:
     """By a number for all while all learn, stream by stream otherwise; the number is renewed now and then."""
     x, y = walks(2, 60)

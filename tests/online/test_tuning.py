@@ -144,12 +144,12 @@ def test_stretch_in_which_a_coordinate_hardly_moves_says_so_and_nothing_about_it
 
 
 def test_tuning_of_a_stream_is_the_same_whoever_is_beside() -> None:
-    pairs = [drawn(torch.tensor([0.7, 0.7]).double(), 0.1, steps=60, seed=seed) for seed in range(2)]
+    pairs = [drawn(torch.tensor([0.7, 0.7]).double(), 0.1, steps=60, seed=seed) for seed in range(7)]
     x, y = (torch.stack([pair[k] for pair in pairs], 1) for k in range(2))
     together = st.StaFRegressor().tune(x, y)._tuning
-    alone = [st.StaFRegressor().tune(x[:, k], y[:, k])._tuning for k in range(2)]
+    alone = {k: st.StaFRegressor().tune(x[:, k], y[:, k])._tuning for k in (1, 6)}
     assert together is not None
-    for k, own in enumerate(alone):
+    for k, own in alone.items():
         assert own is not None
         assert all(torch.equal(a[k], b[0]) for a, b in zip(together, own, strict=True))
 
