@@ -70,6 +70,7 @@ class ActorCritic(Controller):
             raise ValueError(
                 f"`ActorCritic(basis=...)` has {basis.dim} states, but the plant has {model.dim}."
             )
+        _check_points(extrapolation, basis.dim)
         cost = cost.around(model)
         if cost.target is not None or cost.discount:
             what = "discount" if cost.discount else "target"
@@ -152,3 +153,17 @@ def _weights(name: str, value: Initial, count: int) -> Tensor:
     if isinstance(value, int | float):
         value = [value] * count
     return torch.tensor(vector("ActorCritic", name, value, count), dtype=torch.float64)
+
+
+def _check_points(extrapolation: Extrapolation, dim: int) -> None:
+    """Refuse points of another space than the plant's, which would fail within the loop."""
+    x, uniform = (torch.zeros(1, *rows, dim, dtype=torch.float64) for rows in ((), (extrapolation.draws,)))
+    try:
+        shape = tuple(extrapolation(x, uniform).shape)
+    except RuntimeError as error:
+        shape, said = (), f" ({error})"
+    else:
+        said = ""
+    if len(shape) != 3 or (shape[0], shape[2]) != (1, dim):
+        rule = f"must make points (B, N, {dim}) around states (B, {dim}){said}"
+        raise fail("ActorCritic", "extrapolation", rule, shape or extrapolation)

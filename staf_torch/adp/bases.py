@@ -12,6 +12,7 @@ from ..approximation.basis import StaFBasis
 from ..centers import StateRadius
 from ..kernels import AnchoredKernel, ExponentialKernel
 from ..numerics.checks import choice, flag, integer, positive_real
+from ..numerics.forward_mode import jacobian
 
 
 class ValueBasis(nn.Module, abc.ABC):
@@ -129,15 +130,10 @@ class StaFValueBasis(ValueBasis):
         return size * along
 
     def _automatic(self, y: Tensor, x: Tensor) -> Tensor:
-        """One backward pass a basis function: a (..., M, n) Jacobian without a loop over the batch."""
-        if self.mode == "total":
-            # y and x move together: the derivative along y = y0 + h, x = x0 + h.
-            values, pull = torch.func.vjp(lambda h: self(y + h, x + h), torch.zeros_like(y))[:2]
-        else:
-            values, pull = torch.func.vjp(lambda at: self(at, x), y)[:2]
-        selectors = torch.eye(self.count, dtype=values.dtype, device=values.device)
-        rows = [pull(selector.expand(values.shape))[0] for selector in selectors]
-        return torch.stack(rows, dim=-2)
+        if self.mode == "partial":
+            return jacobian(lambda at: self(at, x), y)
+        # y and x move together: the derivative along y = y0 + h, x = x0 + h.
+        return jacobian(lambda h: self(y + h, x + h), torch.zeros_like(y))
 
 
 def _slope(radius: StateRadius, x: Tensor) -> Tensor:

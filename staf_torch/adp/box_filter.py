@@ -159,7 +159,10 @@ class BoxFilter(nn.Module):
             found, met = leaving(left)
             return torch.where(done.unsqueeze(-1) > 0, u, found), torch.maximum(done, met), 0 * left + _LEAST
 
-        u, _, _ = repeat(2, less, (wanted, torch.zeros_like(hold), torch.full_like(hold, _LEFT)))
+        # Most controls ask for no correction: what is looked for costs ten times what finding this out does.
+        half = torch.full_like(hold, _LEFT)
+        fine = (self._conditions(s, wanted, hold, half) >= 0).all(-1).to(hold)
+        u, _, _ = repeat(2, less, (wanted, fine, half), where=lambda now: now[1] == 0)
         return torch.cat((u, self._share(s, u, hold).unsqueeze(-1)), dim=-1).reshape(*z.shape[:-1], -1)
 
     def _share(self, s: Tensor, u: Tensor, hold: Tensor) -> Tensor:
@@ -173,24 +176,20 @@ class BoxFilter(nn.Module):
     def inequalities(self, s: Tensor, u: Tensor, hold: Tensor, left: Tensor) -> tuple[Tensor, Tensor]:
         """a_i and c_i of the conditions a_i'u >= c_i, linearised at u, one a wall: (B, n), (B, m), (B,), (B,)
         -> (B, W, m), (B, W)."""
-        x = self.box.inverse(s)
-        apart = self._apart(s)
-
-        def conditions(u: Tensor) -> Tensor:
-            held = self._held(x, u, hold)
-            return torch.stack(
-                [
-                    self._condition(held, k, side, degree, apart[side][:, k], hold, left)
-                    for (k, side), degree in zip(self.walls, self.degree, strict=True)
-                ],
-                dim=-1,
-            )
-
-        value, pull = torch.func.vjp(conditions, u)  # type: ignore[misc]
+        value, pull = torch.func.vjp(lambda u: self._conditions(s, u, hold, left), u)  # type: ignore[misc]
         # Reverse mode: forward mode in plain torch takes a hundred times as long, for its own reasons.
         walls = torch.eye(len(self.walls)).to(u)
         normal = torch.func.vmap(lambda one: pull(one.expand_as(value))[0], out_dims=1)(walls)
         return normal, (normal * u.unsqueeze(-2)).sum(-1) - value
+
+    def _conditions(self, s: Tensor, u: Tensor, hold: Tensor, left: Tensor) -> Tensor:
+        """What the walls ask for, each met where it is >= 0: (B, W)."""
+        held, apart = self._held(self.box.inverse(s), u, hold), self._apart(s)
+        found = [
+            self._condition(held, k, side, degree, apart[side][:, k], hold, left)
+            for (k, side), degree in zip(self.walls, self.degree, strict=True)
+        ]
+        return torch.stack(found, dim=-1)
 
     def _condition(
         self, held: Held, k: int, side: int, degree: int, apart: Tensor, hold: Tensor, left: Tensor

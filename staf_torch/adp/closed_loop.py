@@ -14,11 +14,11 @@ from torch import Tensor, nn
 from ..lanes import Program
 from ..lanes.kept import Kept, number
 from ..lanes.tree import flatten, unflatten
-from ..numerics.checks import choice, fail, flag, integer, positive_real
+from ..numerics.checks import choice, fail, flag, positive_real
 from ..systems import Plant
 from .controllers import Carried, Controller, ControllerState, Feedback
 from .cost import Cost
-from .holding import Holding
+from .holding import Holding, fewest_and_most
 from .laws import ActorCriticLaw, Gains
 
 _kept = Kept("the closed loop", 16)
@@ -46,7 +46,8 @@ class ClosedLoop(nn.Module):
         integrator: of the plant over a step, ``runge_kutta`` (fourth order) or ``euler`` (as published). A
             plant in discrete time takes its own steps.
         substeps: Runge-Kutta steps while the control is held, at least 1; of a plant with a
-            `Plant.step_limit` each row has lengths of its own.
+            `Plant.step_limit` each row has lengths of its own, and of two numbers, (1, 16), it takes the
+            first where no limit is met, the second at most.
         renew: whether the control follows the state at every substep, in place of being held for dt. Of
             feedback laws alone.
         limit: a row whose state exceeds it in norm has diverged.
@@ -63,7 +64,7 @@ class ClosedLoop(nn.Module):
         *,
         dt: float,
         integrator: str = "runge_kutta",
-        substeps: int = 1,
+        substeps: int | tuple[int, int] = 1,
         renew: bool = False,
         limit: float = 1e6,
     ) -> None:
@@ -71,14 +72,14 @@ class ClosedLoop(nn.Module):
         choice("ClosedLoop", "integrator", integrator, ("runge_kutta", "euler"))
         self.controller, self.system, self.cost = controller, system, cost.around(system)
         self.dt = positive_real("ClosedLoop", "dt", dt)
-        self.substeps = integer("ClosedLoop", "substeps", substeps, least=1)
+        self.substeps = fewest_and_most("ClosedLoop", substeps)[1]
         self.limit = positive_real("ClosedLoop", "limit", limit)
         self.renew = flag("ClosedLoop", "renew", renew)
         if self.renew and (not isinstance(controller, Feedback) or system.period is not None):
             rule = "needs a feedback law and a plant in continuous time"
             raise fail("ClosedLoop", "renew", rule, controller.label)
         self.euler = integrator == "euler" and system.period is None
-        self.holding = Holding("ClosedLoop", system, self.cost, self.dt, self.substeps)
+        self.holding = Holding("ClosedLoop", system, self.cost, self.dt, substeps)
 
     def init(self, x0: Tensor) -> LoopState:
         """The state at time 0 of the rows x0 (B, n)."""

@@ -13,10 +13,10 @@ from ..lanes.function import RowFunction
 from ..numerics.angles import wrap
 from ..numerics.box import LARGEST, box_minimum
 from ..numerics.checks import fail, integer, positive_real
+from ..numerics.forward_mode import use_forward_mode
 from .controllers import Controller, ControllerState
 from .cost import QuadraticCost, matvec
 from .detours import DetourRollout
-from .sampled_problem import use_forward_mode
 from .trajectory_optimisation import slopes_of_minimum
 
 _LENGTHS, _SHARES = (5, 15, 40), (0.3, 1.0)  # periods for which shares of the bounds are held, as starts

@@ -9,10 +9,24 @@ import torch
 from torch import Tensor
 
 from ..lanes import repeat, scan
-from ..numerics.checks import positive_real
+from ..numerics.checks import integer, positive_real
 from ..systems import Clocked, Plant, StepPlant
 from .cost import Cost
 from .sampling import periods
+
+
+def fewest_and_most(call: str, substeps: int | tuple[int, int]) -> tuple[int, int]:
+    """The numbers of integration steps, checked.
+
+    Raises:
+        ValueError: if they are no integers, or the most are fewer than the least.
+    """
+    least, most = (substeps, substeps) if isinstance(substeps, int) else substeps
+    return (
+        integer(call, "substeps", least, least=1),
+        integer(call, "substeps", most, least=least),
+    )
+
 
 Stage = tuple[Tensor, Tensor, Tensor]
 """The slope of the last stage, the mean of the slopes, and what was paid."""
@@ -30,16 +44,21 @@ class Holding:
         cost: the cost rate, around the plant.
         dt: s; of a plant in discrete time a multiple of its period.
         substeps: integration steps, at least 1; not for a plant in discrete time. Where the plant has a
-            `Plant.step_limit` the first of them are no longer than that, and the last takes the rest.
+            `Plant.step_limit` the first of them are no longer than that, and the last takes the rest. Two
+            numbers: of such a plant the least where no limit is met, and the most.
 
     Raises:
         ValueError: if ``dt`` is not positive, or no multiple of the plant's period.
     """
 
-    def __init__(self, call: str, plant: Plant, cost: Cost, dt: float, substeps: int = 1) -> None:
+    def __init__(
+        self, call: str, plant: Plant, cost: Cost, dt: float, substeps: int | tuple[int, int] = 1
+    ) -> None:
         self.plant, self.cost = plant, cost
         self.dt = positive_real(call, "dt", dt)
-        self.steps = substeps if plant.period is None else periods(call, plant, dt)
+        least, most = fewest_and_most(call, substeps)
+        self.least = least
+        self.steps = most if plant.period is None else periods(call, plant, dt)
 
     def __call__(
         self, x: Tensor, u: Tensor, renewed: Callable[[Tensor], Tensor] | None = None
@@ -67,22 +86,27 @@ class Holding:
     ) -> tuple[Tensor, Tensor]:
         """Substeps of a row's own lengths."""
         none = torch.zeros_like(x[..., 0])
+        longest = none + self.dt / self.least
+        equal = self.least == self.steps
 
         def substep(now: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
             x, u, spent, left, count = now
-            length = left / count
+            length = left / count if equal else torch.minimum(left, longest)
             limit = self.plant.step_limit(x, u)
             if limit is not None:
-                length = torch.where((count > 1) & (limit < length), limit, length)
+                length = torch.where(limit < length, limit, length)
+            length = torch.where(count > 1, length, left)
             after, paid = runge_kutta_held(self.plant, self.cost, x, u, length)
             if self.cost.discount:
                 paid = paid * torch.exp(-self.cost.discount * (self.dt - left))
-            return (
-                *(after, u if renewed is None else renewed(after)),
-                *(spent + paid, left - length, count - 1),
-            )
+            return after, u, spent + paid, left - length, count - 1
 
-        x, _, spent, _, _ = repeat(self.steps, substep, (x, u, none, none + self.dt, none + self.steps))
+        def further(now: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+            return substep(now if renewed is None else (now[0], renewed(now[0]), *now[2:]))
+
+        first = substep((x, u, none, none + self.dt, none + self.steps))
+        some = None if equal else (lambda now: now[3] > 0)
+        x, _, spent, _, _ = repeat(self.steps - 1, further, first, where=some)
         return x, spent
 
     def _step(self, x: Tensor, u: Tensor, h: float) -> tuple[Tensor, Tensor]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import functools
-import warnings
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -15,6 +13,7 @@ from torch.nn.functional import pad
 from ..lanes import each
 from ..numerics.angles import wrap
 from ..numerics.checks import fail, integer, positive_real, trailing
+from ..numerics.forward_mode import use_forward_mode
 from ..numerics.linalg import positive_semidefinite, solver
 from ..systems import Bounds, Plant
 from ..systems.bounds import Limit
@@ -285,14 +284,6 @@ class SampledProblem(nn.Module):
         k = torch.linalg.solve(r + b.mT @ p @ b, b.mT @ p @ a + s.mT)
         clock = self.dim - n
         return pad(p, (0, clock, 0, clock)), pad(k, (0, clock))
-
-
-@functools.cache
-def use_forward_mode() -> None:
-    """Let torch load what its forward mode needs, without its warning about its own `torch.jit.script`."""
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message=".*torch.jit.script")
-        torch.func.jvp(torch.sin, (torch.zeros(1),), (torch.ones(1),))
 
 
 class Derivatives(NamedTuple):

@@ -15,6 +15,7 @@ from ..systems import ControlAffineSystem, Plant
 from .closed_loop import ClosedLoop, program, record, row_gains
 from .controllers import Controller, Feedback, Policy
 from .cost import Cost
+from .holding import fewest_and_most
 from .sampling import held_stability
 
 _log = logging.getLogger(__name__)
@@ -76,7 +77,7 @@ def simulate(
     every: int = 1,
     seed: int | Sequence[int] = 0,
     integrator: str = "runge_kutta",
-    substeps: int = 1,
+    substeps: int | tuple[int, int] = 1,
     renew: bool = False,
     limit: float = 1e6,
     compile: bool | str = "auto",
@@ -122,8 +123,8 @@ def simulate(
     if steps % every:
         raise fail("simulate", "every", f"must divide the {steps} steps", every)
     choice("simulate", "compile", compile, (True, False, "auto"))
-    integer("simulate", "substeps", substeps, least=1)
-    worth = steps * substeps * (1 + len(x0) / 200) >= _PAYS if compile == "auto" else bool(compile)
+    most = fewest_and_most("simulate", substeps)[1]
+    worth = steps * most * (1 + len(x0) / 200) >= _PAYS if compile == "auto" else bool(compile)
     if dt is None:
         dt = controller.period or system.period or _DT
     more = {"integrator": integrator, "substeps": substeps, "renew": renew, "limit": limit}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import abc
-import warnings
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -12,6 +11,7 @@ from torch import Tensor
 
 from ..approximation.basis import StaFBasis, Target
 from ..numerics.checks import choice
+from ..numerics.forward_mode import use_forward_mode
 
 PredictorInputs = tuple[Tensor, ...]
 """What a predictor prepares in bulk: tensors (B, C, ...), those of one time (B, ...)."""
@@ -238,14 +238,13 @@ def along(function: Callable[[Tensor], Any], x: Tensor, dx: Tensor) -> tuple[Any
     Raises:
         NotImplementedError: if an operation of the function has no derivative in forward mode.
     """
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message=".*torch.jit.script")
-        try:
-            primal, tangent = torch.func.jvp(function, (x,), (dx,))[:2]
-        except NotImplementedError as error:
-            said = str(error).partition("\n")[0]
-            raise NotImplementedError(
-                "A `Tangent` predictor needs derivatives of V and of the kernel in forward mode; torch says: "
-                + said
-            ) from None
+    use_forward_mode()
+    try:
+        primal, tangent = torch.func.jvp(function, (x,), (dx,))[:2]
+    except NotImplementedError as error:
+        said = str(error).partition("\n")[0]
+        raise NotImplementedError(
+            "A `Tangent` predictor needs derivatives of V and of the kernel in forward mode; torch says: "
+            + said
+        ) from None
     return primal, tangent

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 import logging
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 import torch
 from omegaconf import DictConfig
@@ -18,8 +17,8 @@ from ..numerics.checks import COMMAND_LINE, fail, flag, integer, non_negative, p
 from ..results.progress import SHOWN, Progress
 from ..results.run_directory import RunDirectory
 from ..settings.chase import plain
-from ..tables import Style, Table
-from .registry import Metrics, finite
+from .comparison import Comparison
+from .registry import Metrics
 
 _log = logging.getLogger(__name__)
 SOURCES = {"integral": "integral", "slope": "derivative"}
@@ -37,79 +36,83 @@ _COLUMNS = {
 }
 
 
+class Followed(NamedTuple):
+    """What the rows did with one source of the equations."""
+
+    time: Tensor  # (T,) s
+    error: Tensor  # (B, T, 2) of x
+    theta: Tensor  # (B, T, p)
+    diverged: int
+
+
 def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics:
     """Run both sources with the same gains and noise and fill the run directory, `metrics.json` last."""
     figures = flag(COMMAND_LINE, "figures", cfg.figures)
-    dt = positive_real(COMMAND_LINE, "dt", cfg.dt)
-    duration = positive_real(COMMAND_LINE, "duration", cfg.duration)
-    every = max(1, round(min(_RECORDED, duration / 20) / dt))
-    steps = every * max(1, round(duration / dt / every))
-    noise = real(COMMAND_LINE, "icl.noise", cfg.icl.noise)
-    gains = _gains(cfg)
-    plant, cost = published(), QuadraticCost(1.0, 1.0, 5, 2, output=lambda z: z[..., :2] - reference(z)[0])
-    rows = len(gains["rate"])
-    start = [*vector(COMMAND_LINE, "initial_state", plain(cfg.initial_state), 2), 1.0, 0.0, 1.0]
-    x0 = torch.tensor([start], dtype=torch.float64).repeat(rows, 1)
-    errors, thetas, diverged = {}, {}, {}
-    time = torch.zeros(0)
-    for source, name in SOURCES.items():
-        tracker = ConcurrentTracker(
-            plant,
-            reference,
-            source=source,
-            size=integer(COMMAND_LINE, "icl.size", cfg.icl.size, 1),
-            feedback=gains["feedback"],
-            gain=gains["gain"],
-            rate=gains["rate"],
-            length=gains["length"],
-        )
-        seen = Measured(tracker, noise=[noise, noise, 0.0, 0.0, 0.0], dim=5)
-        result = simulate(
-            seen,
-            plant,
-            cost,
-            x0,
-            dt=dt,
-            steps=steps,
-            every=every,
-            seed=integer(COMMAND_LINE, "seed", cfg.seed, least=0),
-        )
-        time, errors[name], diverged[name] = result.time, _tracking_error(result), int(result.diverged.sum())
-        thetas[name] = tracker.tracking(result.identifier).theta.clone()  # without the stacks beside it
-    late = time >= non_negative(COMMAND_LINE, "settle_time", cfg.settle_time)
+    settle = non_negative(COMMAND_LINE, "settle_time", cfg.settle_time)
+    plant, gains = published(), _gains(cfg)
+    found = {name: _followed(cfg, plant, gains, source) for source, name in SOURCES.items()}
+    time = found["integral"].time
+    late = time >= settle
     if not bool(late.any()):
         raise fail(COMMAND_LINE, "settle_time", "must be before the end", cfg.settle_time)
-    rms = {name: _rms(error[:, late]) for name, error in errors.items()}
-    rms_theta = {name: _rms(theta[:, late] - plant.theta) for name, theta in thetas.items()}
-    table: list[dict[str, Any]] = []
-    metrics: Metrics = {}
-    for name in errors:
-        measured = {"diverged": float(diverged[name])}
+    rms = {name: _rms(each.error[:, late]) for name, each in found.items()}
+    rms_theta = {name: _rms(each.theta[:, late] - plant.theta) for name, each in found.items()}
+    comparison = Comparison(_COLUMNS, ("error_median", "parameter_error_median"), _log)
+    for name, each in found.items():
+        measured = {"diverged": float(each.diverged)}
         for what, values in (("error", rms[name]), ("parameter_error", rms_theta[name])):
             parts = {"median": values.median(), "best": values.min(), "worst": values.max()}
             measured |= {f"{what}_{key}": float(value) for key, value in parts.items()}
-        table.append({"method": name} | measured)
-        metrics |= {f"{name}_{key}": finite(value) for key, value in measured.items()}
-        _log.info(
-            "%-10s RMS of e %.4g, of theta %.4g (medians)", name, rms[name].median(), rms_theta[name].median()
-        )
-    for what, found in (("error", rms), ("parameter_error", rms_theta)):
-        better = (found["integral"] < found["derivative"]).double().mean()
-        metrics[f"integral_better_{what}"] = float(better)
+        comparison.add(f"{name}_", measured, method=name)
+    for what, values_of in (("error", rms), ("parameter_error", rms_theta)):
+        better = (values_of["integral"] < values_of["derivative"]).double().mean()
+        comparison.metrics[f"integral_better_{what}"] = float(better)
     out = RunDirectory(directory)
-    out.table("icl", dataclasses.replace(Table.of(table, _COLUMNS), style=Style(digits=4)))
+    comparison.write(out, "icl", digits=4)
     if figures:
         shown = int(rms_theta["integral"].argmin())
         picture = GainSets(
             time=time.numpy(),
-            parameters=thetas["integral"][shown].numpy(),
+            parameters=found["integral"].theta[shown].numpy(),
             truth=plant.theta.numpy(),
             error={name: values.numpy() for name, values in rms.items()},
             parameter_error={name: values.numpy() for name, values in rms_theta.items()},
-            followed={name: error[shown].norm(dim=-1).numpy() for name, error in errors.items()},
+            followed={name: each.error[shown].norm(dim=-1).numpy() for name, each in found.items()},
         )
         out.figure("icl", images(draw_gain_sets(picture)))
-    return out.metrics(metrics)
+    return out.metrics(comparison.metrics)
+
+
+def _followed(cfg: DictConfig, plant: ParametricPlant, gains: dict[str, Tensor], source: str) -> Followed:
+    """The closed loops of all gains with the equations of one source."""
+    dt = positive_real(COMMAND_LINE, "dt", cfg.dt)
+    duration = positive_real(COMMAND_LINE, "duration", cfg.duration)
+    every = max(1, round(min(_RECORDED, duration / 20) / dt))
+    noise = real(COMMAND_LINE, "icl.noise", cfg.icl.noise)
+    size = integer(COMMAND_LINE, "icl.size", cfg.icl.size, 1)
+    start = [*vector(COMMAND_LINE, "initial_state", plain(cfg.initial_state), 2), 1.0, 0.0, 1.0]
+    tracker = ConcurrentTracker(
+        plant,
+        reference,
+        source=source,
+        size=size,
+        feedback=gains["feedback"],
+        gain=gains["gain"],
+        rate=gains["rate"],
+        length=gains["length"],
+    )
+    result = simulate(
+        Measured(tracker, noise=[noise, noise, 0.0, 0.0, 0.0], dim=5),
+        plant,
+        QuadraticCost(1.0, 1.0, 5, 2, output=lambda z: z[..., :2] - reference(z)[0]),
+        torch.tensor([start], dtype=torch.float64).repeat(len(gains["rate"]), 1),
+        dt=dt,
+        steps=every * max(1, round(duration / dt / every)),
+        every=every,
+        seed=integer(COMMAND_LINE, "seed", cfg.seed, least=0),
+    )
+    theta = tracker.tracking(result.identifier).theta.clone()  # without the stacks beside it
+    return Followed(result.time, _tracking_error(result), theta, int(result.diverged.sum()))
 
 
 def published() -> ParametricPlant:

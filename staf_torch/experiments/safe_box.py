@@ -55,7 +55,7 @@ class Method(NamedTuple):
     controller: Controller
     plant: Plant
     cost: Cost
-    substeps: int = 1
+    substeps: int | tuple[int, int] = 1
     renew: bool = False
 
 
@@ -110,7 +110,7 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
 def methods(cfg: DictConfig, box: Barrier, cost: Cost) -> dict[str, Method]:
     """The LQR in both coordinates, by itself and behind the filters."""
     system, size, dt = box.plant, box.dim or 0, float(cfg.dt)
-    substeps = integer("safe_box", "substeps", cfg.safe_box.substeps, least=1)
+    substeps = 1, integer("safe_box", "substeps", cfg.safe_box.substeps, least=1)
     of_s = LQR(box, cost)
     paid = QuadraticCost(cost.q, cost.r, size, cost.inputs, output=lambda x: box.coordinates(x))
     lqr = LQR(system, QuadraticCost(cost.q, cost.r, size, cost.inputs))

@@ -62,7 +62,7 @@ def _build(source: str, path: Path) -> None:
         # Clang, which also answers to the name of g++, knows none of these.
         lines = source.count("\n")
         if lines > _SLOW:
-            _log.warning("a program of %d lines is compiled, once: some %.0f s", lines, lines / 1000)
+            _log.warning("a program of %d lines is compiled, once: some %.0f s", lines, lines / 1600)
         long = lines > _LONG and "clang" not in _version(compiler).lower()
         more = _FLAGS_OF_LONG if long else ()
         _run([compiler, *_FLAGS, *more, "-I", str(_FOLDER), str(text), "-o", str(built)])

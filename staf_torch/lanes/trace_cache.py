@@ -40,6 +40,7 @@ _ALLOWED = frozenset(
         ("numpy._core.numeric", "_frombuffer"),
     )
 )
+_NAMED = (torch.dtype, torch.memory_format, torch.layout)
 _NAMESPACES = ("aten", "prims")
 _DAMAGED = (OSError, pickle.UnpicklingError, AttributeError, EOFError, IndexError, ValueError, zlib.error)
 
@@ -129,6 +130,10 @@ class _Writer(pickle.Pickler):
     def persistent_id(self, value: Any) -> Any:
         if isinstance(value, torch._ops.OpOverload):
             return "operation", value._schema.name, value._overloadname
+        if isinstance(
+            value, _NAMED
+        ):  # pickle names the first module that has imported torch, perhaps a user's
+            return "named", str(value).removeprefix("torch.")
         if not isinstance(value, Tensor):
             return None
         if id(value) in self._places:
@@ -151,10 +156,6 @@ class _Reader(pickle.Unpickler):
         there: Any = sys.modules.get(module)  # nothing is imported here
         for part in name.split("."):
             there = getattr(there, part, None)
-        if module in ("torch", "torch._utils") and isinstance(
-            there, torch.dtype | torch.memory_format | torch.layout
-        ):
-            return there
         if module.partition(".")[0] == _PACKAGE.name and isinstance(there, type) and issubclass(there, tuple):
             return there  # named tuples, which structures of outputs are
         raise pickle.UnpicklingError(f"{module}.{name} does not belong into a trace")
@@ -167,6 +168,11 @@ class _Reader(pickle.Unpickler):
                 raise pickle.UnpicklingError(f"operations of {namespace} do not belong into a trace")
             packet = getattr(getattr(torch.ops, namespace), operation)
             return getattr(packet, name[2] or "default")
+        if kind == "named":
+            there = getattr(torch, value, None)
+            if not isinstance(there, _NAMED):
+                raise pickle.UnpicklingError(f"torch.{value} does not belong into a trace")
+            return there
         if kind == "given":
             return self._given[value]
         if kind == "made":  # stands for what the operation will make: its identity alone matters

@@ -236,6 +236,10 @@ def test_three_states_cost_in_their_first_second_what_the_reference_run_does() -
             r"`ActorCritic\(basis=...\)` has 3 states, but the plant has 2",
         ),
         (
+            lambda: adp.ActorCritic(staf_basis(), PLANT, COST, adp.QuadraturePoints(2, 3, BOX)),
+            r"`ActorCritic\(extrapolation=...\)` must make points \(B, N, 2\) around states \(B, 2\)",
+        ),
+        (
             lambda: adp.ActorCritic(
                 staf_basis(), PLANT, adp.QuadraticCost(1.0, 1.0, 2, 1, discount=0.1), adp.RandomPoints(1, BOX)
             ),

@@ -75,6 +75,33 @@ def test_a_control_that_is_renewed_in_time_keeps_every_start() -> None:
     assert not bool(run.diverged.any())
 
 
+@pytest.mark.compiled
+def test_substeps_are_few_away_from_walls_and_many_beside_them() -> None:
+    guard = adp.Feedback(adp.BoxFilter(OF_S, BOX, dt=DT, renewed=True))
+    near = BOX.transform(beside_the_walls(12))
+    away = BOX.transform(tensor([[0.0, 1.0], [-3.0, 2.0], [2.0, -1.0]]))
+    settings = {"dt": DT, "steps": 3, "renew": True}
+
+    def run(s0: Tensor, substeps: int | tuple[int, int], compile: bool = False) -> adp.LoopResult:
+        more = settings | {"substeps": substeps, "compile": compile}
+        return adp.simulate(guard, BOX, COST, s0, **more)  # type: ignore[arg-type]
+
+    mixed, compiled = (run(torch.cat((near, away)), (1, 6), compile) for compile in (False, True))
+    assert not bool(mixed.diverged.any())
+    torch.testing.assert_close(compiled.state, mixed.state, rtol=1e-6, atol=1e-9)
+    torch.testing.assert_close(compiled.cost, mixed.cost, rtol=1e-9, atol=1e-12)
+    torch.testing.assert_close(mixed.state[12:], run(away, 1).state, rtol=1e-13, atol=1e-13)
+    torch.testing.assert_close(mixed.cost[12:], run(away, 1).cost, rtol=1e-13, atol=1e-13)
+    # Of as many at least as at most every one is taken, away from walls too.
+    torch.testing.assert_close(run(away, (6, 6)).state, run(away, 6).state, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("wrong", [(4, 2), (0, 2), 0, (1, 2.5)])
+def test_fewer_substeps_at_most_than_at_least_are_refused(wrong: object) -> None:
+    with pytest.raises(ValueError, match=r"`simulate\(substeps=...\)` must be"):
+        adp.simulate(adp.Feedback(OF_S), BOX, COST, tensor([[0.0, 0.0]]), dt=DT, steps=1, substeps=wrong)  # type: ignore[arg-type]
+
+
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 def test_a_way_that_is_a_line_has_slopes(dtype: torch.dtype) -> None:
     # With the control that is wanted x1 goes straight to its wall: in float32 the cubic is a line.

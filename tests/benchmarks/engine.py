@@ -141,11 +141,12 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="float64, fewer rounds, M = 3 and 6")
     parser.add_argument("--only", default="", help="laws whose names contain this")
     parser.add_argument("--rows", type=int, choices=WORK, help="this many rows alone")
+    parser.add_argument("--centers", type=int, nargs="+", choices=RADIUS, help="these M alone")
     options = parser.parse_args()
     logging.getLogger("staf_torch").addHandler(Refuse())
     torch.set_num_threads(1)
     rows: list[dict[str, Any]] = []
-    for count in (3, 6) if options.quick else (3, 6, 15):
+    for count in options.centers or ((3, 6) if options.quick else (3, 6, 15)):
         basis = st.StaFBasis(st.ExponentialKernel(), st.StateFollowingCenters(st.rings(count), RADIUS[count]))
         for dtype in (torch.float64,) if options.quick else (torch.float64, torch.float32):
             for batch, times in WORK.items():

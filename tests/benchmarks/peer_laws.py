@@ -190,4 +190,5 @@ def numba_program(law: str, offsets: np.ndarray, inner_steps: int) -> Program:
         return out
 
     core = np.exp(offsets @ offsets.T)
-    return lambda states: run(states, offsets.astype(states.dtype), core.astype(states.dtype))
+    # numba types scalars as float64, which small loops of one row do not feel: float32 comes and goes.
+    return lambda states: run(states.astype(np.float64), offsets, core).astype(states.dtype)

@@ -1,6 +1,6 @@
 """Who leaves the box of the published two states: the LQR of s, and the LQR behind `adp.BoxFilter`.
 
-    python tests/benchmarks/walls.py [starts]
+    python tests/benchmarks/walls.py [starts] [seed]
 
 As many starts from the whole box, and as many 1e-6 beside one of its walls, followed for 0.1 s with controls
 held for 1 ms, in double and single precision. Whether a start that is lost could have been kept is found
@@ -22,8 +22,8 @@ LOW, HIGH, NEAR, DT = (-7.0, -5.0), (5.0, 7.0), 1e-6, 1e-3
 PLANT = systems.TwoStateChain()
 
 
-def starts(count: int, beside: bool) -> Tensor:
-    generator = torch.Generator().manual_seed(0)
+def starts(count: int, beside: bool, seed: int) -> Tensor:
+    generator = torch.Generator().manual_seed(seed)
     low, high = torch.tensor(LOW).double(), torch.tensor(HIGH).double()
     x = low + (high - low) * torch.rand(count, 2, dtype=torch.float64, generator=generator)
     wall = torch.randint(4, (count,), generator=generator)
@@ -53,7 +53,7 @@ def can_be_kept(x: Tensor) -> Tensor:
     return held(x, -outward * soft)[0]
 
 
-def main(count: int) -> None:
+def main(count: int, seed: int) -> None:
     torch.set_num_threads(1)
     box = systems.Barrier(PLANT, LOW, HIGH)
     cost = adp.QuadraticCost(10.0, 0.1, dim=2, inputs=1)
@@ -62,18 +62,18 @@ def main(count: int) -> None:
     print("| starts | dtype | method | left | of these could have been kept | CPU s |")
     print("|---|---|---|---|---|---|")
     for beside in (False, True):
-        x = starts(count, beside)
+        x = starts(count, beside, seed)
         keeps = can_be_kept(x)
         for dtype in (torch.float64, torch.float32):
             s0 = box.transform(x).to(dtype)
-            for name, policy, renew in (
-                ("LQR of s", lqr, False),
-                ("LQR of s, renewed 16 times a ms", lqr, True),
-                ("filtered", filtered, False),
-                ("filtered, renewed", renewed, True),
+            for name, policy, renew, substeps in (
+                ("LQR of s", lqr, False, 16),
+                ("LQR of s, renewed 16 times a ms", lqr, True, 16),
+                ("filtered", filtered, False, (1, 16)),
+                ("filtered, renewed", renewed, True, (1, 16)),
             ):
                 clock = time.process_time()
-                settings = {"dt": DT, "steps": 100, "every": 100, "substeps": 16, "renew": renew}
+                settings = {"dt": DT, "steps": 100, "every": 100, "substeps": substeps, "renew": renew}
                 run = adp.simulate(adp.Feedback(policy), box, cost, s0, compile=True, **settings)  # type: ignore[arg-type]
                 spent, left = time.process_time() - clock, run.diverged
                 where = "beside a wall" if beside else "in the box"
@@ -83,4 +83,5 @@ def main(count: int) -> None:
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else 10_000)
+    count, seed = [*map(int, sys.argv[1:]), *(10_000, 0)[len(sys.argv) - 1 :]]
+    main(count, seed)

@@ -8,6 +8,7 @@ import importlib
 import io
 import os
 import pickle
+import pickletools
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -17,9 +18,11 @@ from unittest import mock
 import pytest
 import torch
 from torch import Tensor, nn
+from variants import KERNELS, over
 
-from staf_torch import kernels
-from staf_torch.lanes import build, patches, trace_cache
+from staf_torch import StaFBasis, StateFollowingCenters, chase, kernels, optim, rings, targets
+from staf_torch.lanes import build, compiler, patches, trace_cache
+from staf_torch.lanes.captured import Recipe
 from staf_torch.lanes.kept import Kept
 from staf_torch.lanes.program import Program
 
@@ -113,6 +116,36 @@ def test_a_file_that_names_other_code_is_no_trace(content: object, cache: Path) 
     with pytest.raises(pickle.UnpicklingError, match="does not belong into a trace"):
         trace_cache._Reader(io.BytesIO(pickle.dumps((content,))), ()).load()
     assert trace_cache.load(path, ()) is None
+
+
+def test_a_trace_names_no_module_for_what_torch_has_by_name() -> None:
+    """pickle would name the first module that has imported torch: a user's, which no other process knows."""
+    named, file = (torch.contiguous_format, torch.float32, torch.strided), io.BytesIO()
+    trace_cache._Writer(file, {}, Recipe(torch.empty(0), [], [], [], [])).dump(named)
+    codes = {code.name for code, _, _ in pickletools.genops(file.getvalue())}
+    assert not codes & {"GLOBAL", "STACK_GLOBAL", "INST"}
+    assert trace_cache._Reader(io.BytesIO(file.getvalue()), ()).load() == named
+
+
+@pytest.mark.compiled
+@over(KERNELS)
+def test_what_was_traced_of_a_chase_is_there_for_the_next_process(
+    name: str, cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kernel, kept = KERNELS[name].make(), []
+    write = trace_cache.save
+
+    def save(path: Path, trace: trace_cache.Trace, tensors: Any) -> None:
+        write(path, trace, tensors)
+        kept.append(trace_cache.load(path, tensors))
+
+    monkeypatch.setattr(trace_cache, "save", save)
+    monkeypatch.setattr(compiler, "function", mock.Mock(side_effect=OSError("not asked")))
+    basis = StaFBasis(kernel, StateFollowingCenters(rings(3), 0.3))
+    x = 0.01 * torch.arange(48).double().view(1, 24, 2)
+    chase(x, basis, targets.Quadratic(2.0), optim.SteepestDescent(), certificate=True)
+    ours = type(kernel).__module__.startswith("staf_torch")
+    assert [trace is not None for trace in kept] == [True] * ours  # a user's own is traced in every process
 
 
 def test_the_cache_forgets_what_nobody_has_used_and_nothing_of_today(
