@@ -5,7 +5,8 @@
 The committed tree counts, not the working one. Environments are built once below `--place` (by default
 `~/.cache/staf_torch-matrix`, some gigabytes each) and used again: torch from the index brings CUDA. Each runs
 the whole suite, with `--quick` the tests that touch versions and means, in an order by chance where a seed is
-given. What cannot be built here is said, with the last line of pip. The last table: `tests/README.md`.
+given, and writes NAME.log there. What cannot be built here is said, with the last line of pip. The last table:
+`tests/README.md`.
 """
 
 from __future__ import annotations
@@ -112,7 +113,7 @@ def main() -> int:
             tests = QUICK if options.quick else options.tests
             more = ["-n", str(options.jobs), "--dist", "worksteal"] if options.jobs > 1 else []
             more += [] if options.order is None else ["--order", str(options.order)]
-            outcomes[name] = _run(environment, python, tree, [*more, *tests])
+            outcomes[name] = _run(environment, python, tree, [*more, *tests], place / f"{name}.log")
         print(_row(name, outcomes[name]), flush=True)
     shutil.rmtree(tree, ignore_errors=True)
     print(f"\n| environment | versions | {time.strftime('%Y-%m-%d')}{', quick' if options.quick else ''} |")
@@ -161,7 +162,8 @@ def _python(version: str) -> Path:
     return kept[-1] if kept else Path(str(found))
 
 
-def _run(environment: Environment, python: Path, tree: Path, arguments: Sequence[str]) -> Outcome:
+def _run(environment: Environment, python: Path, tree: Path, arguments: Sequence[str], log: Path) -> Outcome:
+
     with (
         tempfile.TemporaryDirectory(prefix="staf-matrix-") as scratch,
         _home(environment, Path(scratch)) as home,
@@ -170,13 +172,15 @@ def _run(environment: Environment, python: Path, tree: Path, arguments: Sequence
         line = [str(python), "-m", "pytest", "-p", "no:cacheprovider", "--tb=short", *arguments]
         user = None if environment.privileged else "nobody"
         begun = time.monotonic()
-        ended = subprocess.run(
-            line, cwd=tree, env=settings, capture_output=True, text=True, check=False, user=user
-        )
-    failed = re.findall(r"^(?:FAILED|ERROR) (\S+)", ended.stdout, re.MULTILINE)
-    said = (ended.stdout.strip() or ended.stderr.strip() or "nothing").splitlines()[-1]
-    if ended.returncode != 0:
-        sys.stderr.write(ended.stdout[-20000:] + ended.stderr[-3000:])
+        with log.open("w") as output:  # to be read while it runs
+            code = subprocess.run(
+                line, cwd=tree, env=settings, stdout=output, stderr=output, check=False, user=user
+            ).returncode
+    told = log.read_text()
+    failed = re.findall(r"^(?:FAILED|ERROR) (\S+)", told, re.MULTILINE)
+    said = (told.strip() or "nothing").splitlines()[-1]
+    if code != 0:
+        sys.stderr.write(told[-20000:])
         failed = failed or ["pytest itself"]
     return Outcome(_versions(python), said.strip("= "), failed, time.monotonic() - begun)
 
