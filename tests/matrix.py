@@ -5,7 +5,7 @@
 The committed tree counts, not the working one. Environments are built once below `--place` (by default
 `~/.cache/staf_torch-matrix`, some gigabytes each) and used again: torch from the index brings CUDA. Each runs
 the whole suite, with `--quick` the tests that touch versions and means, in an order by chance where a seed is
-given, and writes NAME.log there. What cannot be built here is said, with the last line of pip. The last table:
+given, and writes NAME.log there. What cannot be built here is said, with the last line of pip. Last table:
 `tests/README.md`.
 """
 

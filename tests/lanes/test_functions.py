@@ -138,6 +138,9 @@ def test_infinities_nan_zeros_and_subnormal_numbers_come_out_as_in_torch(
 ) -> None:
     x, y = torch.cartesian_prod(*[torch.tensor(SPECIAL, dtype=torch.float64).to(dtype)] * 2).unbind(-1)
     found, wanted = program((), (), (x, y), steps=1)[1], program.definition((), (), (x, y), steps=1)[1]
+    large = x.isfinite() & (x > 1)  # where the log1p of torch 2.6 is infinite at 1.7e308
+    logarithms = torch.tensor([math.log1p(max(v, 0.0)) for v in x.tolist()], dtype=torch.float64)
+    wanted["log1p"] = torch.where(large.unsqueeze(-1), logarithms.to(dtype).unsqueeze(-1), wanted["log1p"])
     for name in wanted:
         bound = 4 * torch.finfo(dtype).eps
         # torch itself flushes some subnormal results; the test above measures those of lanes.
