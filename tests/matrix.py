@@ -35,6 +35,7 @@ TOOLS = (
     "hatchling>=1.25",
 )
 EXTRAS = ("scipy>=1.11", "gymnasium>=1.1", "gmpy2>=2.1")
+COMPILERS = re.compile(r"(^|-)(cc|c\+\+|gcc|g\+\+|clang|clang\+\+|cpp|c89|c99|tcc|nvcc|icx|icpx)(-[\d.]+)?$")
 LOWEST = (
     "torch==2.6.0",
     "numpy==1.26.0",
@@ -192,10 +193,11 @@ def _home(environment: Environment, scratch: Path) -> Iterator[dict[str, str]]:
     if not environment.compiler:
         programs = scratch / "bin"
         programs.mkdir()
-        for name in ("sh", "bash", "env", "git", "ls", "cat", "uname", "rm", "mkdir"):
-            found = shutil.which(name)
-            if found:
-                (programs / name).symlink_to(found)
+        for folder in os.environ["PATH"].split(os.pathsep):
+            for found in Path(folder).glob("*"):
+                place = programs / found.name
+                if found.is_file() and not COMPILERS.search(found.name) and not place.is_symlink():
+                    place.symlink_to(found)
         changed |= {"PATH": str(programs), "CXX": "", "CC": "", "XDG_CACHE_HOME": str(scratch / "cache")}
     if not environment.privileged:
         home, temporary = scratch / "home", scratch / "tmp"

@@ -135,7 +135,8 @@ def test_a_signal_does_not_wait_for_a_submission_that_hangs(
             codes.append(run.wait())
 
     def end() -> None:
-        while not (commands / "pid").exists():
+        late = time.monotonic() + 60
+        while not (commands / "pid").exists() and time.monotonic() < late:
             time.sleep(0.01)
         os.kill(os.getpid(), signal.SIGTERM)
 

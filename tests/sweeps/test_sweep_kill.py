@@ -38,6 +38,7 @@ for attempt in range(2):
     child = start(*GRID, f"hydra.sweep.dir={place}")
     # Anywhere from the first file of the sweep on.
     while not os.path.exists(f"{place}/sweep.json"):
+        assert os.waitpid(child, os.WNOHANG) == (0, 0), "the sweep ended before it began"
         time.sleep(0.001)
     time.sleep(chance.uniform(0, whole))
     os.kill(child, signal.SIGKILL)

@@ -26,7 +26,7 @@ from omegaconf.basecontainer import BaseContainer
 from ...settings import config_directory
 from .log_handlers import handlers_aside
 from .mode import mode_read_from_its_file
-from .program import find_launcher, named_packages, trusted, with_mode
+from .program import HAS_WHITELIST, find_launcher, named_packages, trusted, with_mode
 
 _OF_AN_APPLICATION: tuple[type, ...] = (GlobalHydra, HydraConfig, JobRuntime, VersionBase)
 """Hydra's singletons that belong to the application that runs; plugins and the store are everyone's."""
@@ -73,7 +73,7 @@ def application() -> Iterator[Application]:
             stack.enter_context(guard())
         find_launcher()
         _register_launcher()
-        if hasattr(version, "setbase"):
+        if hasattr(version, "setbase") and not HAS_WHITELIST:  # 1.4 warns of it
             version.setbase("1.3")
         stack.enter_context(trusted())
         hydra = Hydra.create_main_hydra2("staf", create_config_search_path(config_directory()))

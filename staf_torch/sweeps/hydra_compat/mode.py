@@ -29,12 +29,15 @@ def mode_read_from_its_file() -> Iterator[None]:
     That version composes all settings once to look at this key, and once more to run. In `conf/` files of
     `experiment` alone set the key (a test says so); where the user's settings may do so, Hydra composes.
     """
+    if HAS_WHITELIST:  # Hydra 1.4 reads it from there itself
+        yield
+        return
     application: Any = Hydra
     composed: Callable[[Hydra, str | None, list[str]], Any] = application.get_mode
 
     def get_mode(self: Hydra, config_name: str | None, overrides: list[str]) -> Any:
         providers = {place.provider for place in self.config_loader.get_search_path().get_path()}
-        if HAS_WHITELIST or config_name != "config" or not providers <= _OURS:
+        if config_name != "config" or not providers <= _OURS:
             return composed(self, config_name, overrides)
         known, mode = _written(overrides)
         return mode if known else composed(self, config_name, overrides)
