@@ -46,20 +46,22 @@ def test_where_nothing_is_in_its_way_and_no_bound_is_met_the_plan_is_the_lqr() -
     u, after = plans.step(x, plans.init(x), x, 0.2)
     # J counts a period by its beginning, the LQR of 0.2 s by the integral.
     torch.testing.assert_close(u, LQR(x), rtol=0.3, atol=0.05)
-    ahead = after.identifier[:, :-1].unflatten(-1, (8, 2))
+    ahead = after.identifier[:, :-2].unflatten(-1, (8, 2))
     torch.testing.assert_close(after.identifier[:, -1], torch.ones(2).double())
-    moved = plans._advance(x, u)
+    moved = plans._problem._advance(x, u)
     torch.testing.assert_close(plans.step(moved, after, x, 0.2)[0], ahead[:, 0], rtol=0.02, atol=0.01)
 
 
 def test_no_change_of_a_plan_lowers_what_it_costs() -> None:
     plans = adp.DetourPlans(detours(margin=0.0, steps=6), first=6)
-    best = plans.init(BESIDE).identifier[:, :-1]
+    best = plans.init(BESIDE).identifier[:, :-2]
     found = plans._improved(BESIDE, best, torch.zeros(1, 1).double(), 1)[-1]
     others = best + 1e-3 * torch.randn(40, best.shape[1], generator=torch.Generator().manual_seed(1)).double()
     others = COST.bounds.clip(others.unflatten(-1, (6, 2))).flatten(1)
     x, still = BESIDE.expand(40, -1), torch.zeros(40, 1).double()
-    tried = plans._run(x, plans._others(x), still, others.unflatten(-1, (6, 2)), lambda y, o, u, k: u)
+    tried = plans._problem.follow(
+        x, plans._problem.others(x), still, others.unflatten(-1, (6, 2)), lambda y, o, u, k: u
+    )
     assert bool((tried.total > found).all())
 
 

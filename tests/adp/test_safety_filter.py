@@ -266,7 +266,10 @@ def test_a_copy_a_pickle_and_single_precision_are_the_same_filter() -> None:
             {"constraints": lambda x, t: 1 + 0 * x[:, 0]},
             "moves neither first nor second derivative of number 0",
         ),
-        ({"decay": 200.0}, r"must be at most 1/dt = 100; got 200.0"),
+        (
+            {"decay": [200.0], "degree": 2},
+            r"must be at most 1/dt = 100 where the relative degree is two; got",
+        ),
         ({"decay": [1.0, 2.0]}, "must be a number or one for each of the 1 constraints"),
         ({"decay": 0.0}, r"`SafetyFilter\(decay=...\)` must be positive"),
         ({"margin": -1.0}, r"`SafetyFilter\(margin=...\)` must not be negative"),
