@@ -57,7 +57,8 @@ class SafetyFilter(Controller):
         phi = h (relative degree one),  phi = h' + decay h (relative degree two, h' along the plant).
 
     That is the exponential control barrier function of a control that is held: x(t + dt; u) is the plant
-    itself, by Runge-Kutta steps, linearised in u where it was found, until what u must satisfy it satisfies. What phi dips between the samples, which
+    itself, by Runge-Kutta steps, linearised in u where it was found, until what u must satisfy it satisfies.
+    What phi dips between the samples, which
     its value in the middle of the hold shows, is kept as a margin, so that phi and with it h stay
     positive in between too. In the limit of a short hold the condition is phi' >= -decay phi. The quadratic
     program is solved exactly: in closed form for one input, else by comparing all cases.

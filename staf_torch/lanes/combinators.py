@@ -63,7 +63,7 @@ def repeat(
 def few_passes() -> Iterator[None]:
     """Loops in plain torch end after a few passes; a scan repeats the outputs of the last.
 
-    To try what a step does with its rows: a pass is written once, so that a few of them call all that it calls.
+    To try what a step does with its rows: a few passes call all that the loop calls.
     """
     before, _active.few = getattr(_active, "few", False), True
     try:
