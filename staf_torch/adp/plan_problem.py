@@ -15,7 +15,7 @@ from .cost import QuadraticCost, matvec
 from .detours import DetourRollout
 from .trajectory_optimisation import slopes_of_minimum
 
-_TRIES, _SHORTER = 3, 0.3  # lengths of a step that are tried, each this share of the one before
+_TRIES, _SHORTER = 6, 0.3  # lengths of a step that are tried, each this share of the one before
 
 Chosen = Callable[[Tensor, Tensor, Any, Tensor], Tensor]
 """u from the moved states, the others, what the period brings, and the number of periods so far."""
