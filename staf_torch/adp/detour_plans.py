@@ -175,7 +175,7 @@ class DetourPlans(Controller):
         first, end = plan.control[:, 0], problem.whole(plan.states[:, -1], others[:, -1])
         last = problem.clipped(self.detours.policy(end))
         ahead = torch.cat((plan.control[:, 1:], last.unsqueeze(1)), dim=1)
-        left = plan.total - problem.paid(x, first, done[:, 0] * self.hold)
+        left = plan.total - problem.paid(x, first, done[:, 0] * self.hold) + problem.longer(end, last)
         after = torch.cat((first, ahead.flatten(1), left.unsqueeze(-1), done + 1), dim=-1)
         return after.reshape(*z.shape[:-1], -1)
 
@@ -187,12 +187,14 @@ class DetourPlans(Controller):
         carried = problem.follow(y, others, done, given, lambda y, others, u, k: u)
 
         def begin(now: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+            x, k = now[3:]  # in the carry: what a pass reads from outside is computed in any case
             none = x.new_zeros(len(x), self.detours.fresh.shape[1])
-            return *self._followed(y, others, self.detours.cheapest(x, none, done), done), now[-1]
+            tried = self.detours.cheapest(x, none, done)
+            return *self._followed(x[:, : self.moved], others, tried, done), x, k
 
         def attempt(now: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
             best, plan, k = now[:3], now[3:6], now[6]
-            plan = repeat(1, begin, (*plan, k), where=lambda now: now[-1] == 1)[:3]
+            plan = repeat(1, begin, (*plan, x, k), where=lambda now: now[-1] == 1)[:3]
             plan = repeat(self.iterations, problem.improve, (others, done, *plan))[2:5]
             better = plan[2] < torch.where(k == 0, torch.inf, best[2])
             kept = (better[:, None, None], better[:, None, None], better)

@@ -90,6 +90,13 @@ class PlanProblem:
         """A period's part of J: (B, n), (B, m), (B,) -> (B,)."""
         return self.hold * (self.cost.state_rate(x) + self.cost.input_rate(u) + self.penalty(x, t))
 
+    def longer(self, x: Tensor, u: Tensor) -> Tensor:
+        """What a last period with u adds to J where no constraint is met: (B, n), (B, m) -> (B,)."""
+        rates = self.cost.state_rate(x) + self.cost.input_rate(u)
+        value = self.detours.terminal
+        added: Tensor = self.hold * rates + value(self._advance(x, u)) - value(x)
+        return added
+
     def whole(self, y: Tensor, others: Tensor) -> Tensor:
         """The states of both kinds: (B, p), (B, n - p) -> (B, n)."""
         return y if self.moved == self.cost.dim else torch.cat((y, others), dim=-1)
