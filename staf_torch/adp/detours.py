@@ -159,14 +159,14 @@ class DetourRollout(Controller):
 
         def compare(now: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
             x, before, done, _, going = now
-            return x, before, done, self._cheapest(x, before, done), going
+            return x, before, done, self.cheapest(x, before, done), going
 
         chosen = repeat(1, compare, start, where=lambda now: now[4])[3]
-        u = self._control(x, chosen, torch.zeros_like(done[:, 0]))
+        u = self.control_along(x, chosen, torch.zeros_like(done[:, 0]))
         left = torch.where(chosen[:, k:] > 1, chosen[:, k:] - 1, 0.0)
         return torch.cat((u, chosen[:, :k], left, done + 1), dim=-1).reshape(*z.shape[:-1], -1)
 
-    def _cheapest(self, x: Tensor, before: Tensor, done: Tensor) -> Tensor:
+    def cheapest(self, x: Tensor, before: Tensor, done: Tensor) -> Tensor:
         """The detour of the least J: (B, n), (B, k + 1), (B, 1) -> (B, k + 1); the policy alone first."""
         known = before.unsqueeze(1) + self.changes.to(x)
         fresh = self.fresh.to(x).expand(len(x), -1, -1)
@@ -188,7 +188,7 @@ class DetourRollout(Controller):
 
         def step(now: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
             x, k, spent, missing = now
-            after, paid = self.holding(x, self._control(x, tried, k))
+            after, paid = self.holding(x, self.control_along(x, tried, k))
             k = k + self.stride
             short = self._missing(after, (done + k) * self.hold)
             return after, k, spent + paid, missing + step_time * short
@@ -197,7 +197,7 @@ class DetourRollout(Controller):
         x, _, spent, missing = repeat(self.steps // self.stride, step, (x, none, none, none))
         return spent + self.terminal(x), missing
 
-    def _control(self, x: Tensor, tried: Tensor, k: Tensor) -> Tensor:
+    def control_along(self, x: Tensor, tried: Tensor, k: Tensor) -> Tensor:
         """The control k periods on: the policy's own where the detour is over."""
         s = (tried[..., :-1].unsqueeze(-1) * self.axes.to(x)).sum(-2)
         u = self.policy(torch.where((k < tried[..., -1]).unsqueeze(-1), x - s, x))

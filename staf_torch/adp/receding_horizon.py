@@ -91,7 +91,6 @@ class RecedingHorizon(Controller):
             lambda carry, now, row: (carry, self._traced(*row)),
             name="a plan improved",
             compile=compile,
-            probe=lambda carry, now, row: (carry, self._probed(row[0])),
         )
 
     def hasten(self) -> None:
@@ -140,9 +139,6 @@ class RecedingHorizon(Controller):
         control, reference = self._begun(x, carried.identifier)
         found = self._search.solve(x, control, reference, self._terminal(x, control, reference))
         return found.control[:, 0], self._ahead(_rows(found), found.state[:, -1])
-
-    def _probed(self, x: Tensor) -> tuple[Tensor, ...]:
-        return self.problem.advance(x, self.problem.linear_feedback(x))
 
     def _begun(self, x: Tensor, plan: Tensor) -> tuple[Tensor, Reference]:
         """What a search begins from: the memory's plan, or the carried one (B, 1 + T w)."""

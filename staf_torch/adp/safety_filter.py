@@ -24,7 +24,8 @@ Constraint = Callable[[Tensor, Tensor], Tensor]
 Rows = Callable[[Tensor, Tensor], Tensor]
 """A function of one row (1, n) and a time () to a number ()."""
 INFEASIBLE = 1e-6  # slack, in units of the input, from which on a row counts as infeasible
-_PASSES = 2  # linearisations: at the wanted control, then at what the first one found
+_PASSES, _MOST = 2, 8  # linearisations at least, the first at the wanted control; at most, until all is met
+_SOLVED = 1e-6  # of what a wanted control misses, at which it is
 _PROBES, _TIMES = 32, (0.0, 0.1, 1.0, 10.0, 100.0)  # states and times (s) at which constraints are tried
 _NOTHING = 1e-9  # of the slopes that make it, below which the effect of a control counts as none
 _RECORD = 4  # columns that the filter carries: steps, least margin, largest slack, steps with another control
@@ -56,7 +57,8 @@ class SafetyFilter(Controller):
         phi = h (relative degree one),  phi = h' + decay h (relative degree two, h' along the plant).
 
     That is the exponential control barrier function of a control that is held: x(t + dt; u) is the plant
-    itself, by Runge-Kutta steps, linearised in u where it was found. What phi dips between the samples, which
+    itself, by Runge-Kutta steps, linearised in u where it was found, until what u must satisfy it satisfies.
+    What phi dips between the samples, which
     its value in the middle of the hold shows, is kept as a margin, so that phi and with it h stay
     positive in between too. In the limit of a short hold the condition is phi' >= -decay phi. The quadratic
     program is solved exactly: in closed form for one input, else by comparing all cases.
@@ -86,7 +88,7 @@ class SafetyFilter(Controller):
         low: of the inputs, as in `systems.Bounds`; both None for those of the plant.
         high: likewise.
         decay: 1/s, one number or one a constraint: how fast h may fall. Large ones let the policy come nearer
-            to the edge, and need larger controls there. At most 1/dt.
+            to the edge, and need larger controls there. At most 1/dt where the relative degree is two.
         degree: 1 or 2 a constraint, or None: found by trying states around the equilibrium.
         margin: in units of h, one number or one a constraint: h >= margin is kept.
         weight: of the squares of u - policy(x), positive, one an input; all 1 by default.
@@ -128,8 +130,6 @@ class SafetyFilter(Controller):
         self.bounds = plant.bounds if not own.present and plant.bounds is not None else own
         rates = positive("SafetyFilter", "decay", torch.as_tensor(decay, dtype=torch.float64))
         self.register_buffer("decay", _one_each("decay", rates, count))
-        if bool((self.decay * self.hold > 1).any()):
-            raise fail("SafetyFilter", "decay", f"must be at most 1/dt = {1 / self.hold:g}", decay)
         kept = non_negative("SafetyFilter", "margin", torch.as_tensor(margin, dtype=torch.float64))
         self.register_buffer("margin", _one_each("margin", kept, count))
         heavy = torch.ones(plant.inputs) if weight is None else torch.as_tensor(weight)
@@ -144,6 +144,10 @@ class SafetyFilter(Controller):
         self.register_buffer("table", cases(count, low_.tolist(), high_.tolist()))
         self.table: Tensor
         self.degree, self.moving = self._probe(degree)
+        second = torch.tensor(self.degree) == 2
+        if bool((second & (self.decay * self.hold > 1)).any()):
+            rule = f"must be at most 1/dt = {1 / self.hold:g} where the relative degree is two"
+            raise fail("SafetyFilter", "decay", rule, decay)
         self._rows = RowFunction(self._definition, self, "a safety filter")
 
     @property
@@ -264,15 +268,30 @@ class SafetyFilter(Controller):
         )
 
         shortfall, margin = self._every(self._shortfall, x, at, t)
-        met = (shortfall <= 0).all(-1)  # needs neither slopes nor a quadratic program
+        asked = shortfall.amax(-1)
+        met = asked <= 0  # needs neither slopes nor a quadratic program
+        none = torch.zeros_like(t)
 
-        def linearise(now: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-            normal, least, _ = self.inequalities(x, now[0], t)
-            found = nearest_admissible(first, normal * unit, least, low, high, self.table)
-            return found.point * unit, found.shortfall, now[2]
+        def linearise(now: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+            u, best, slack, least, passes, _ = now
+            normal, required, _ = self.inequalities(x, u, t)
+            found = nearest_admissible(first, normal * unit, required, low, high, self.table)
+            u, passes = found.point * unit, passes + 1
+            missing, _ = self._every(self._shortfall, x, u, t)
+            left = missing.amax(-1)
+            unmet = left > _SOLVED * asked
+            # Where a line is a poor likeness: what is still missing, along its slope.
+            length = self.hold * (normal * unit).square().sum(-1).sqrt()
+            short = torch.where((missing > 0) & (length > 0), missing / length, torch.zeros_like(missing))
+            reach = torch.maximum(found.shortfall, torch.where(unmet, short.amax(-1), none))
+            better = (passes <= _PASSES) | (left < least)
+            best = torch.where(better.unsqueeze(-1), u, best)
+            slack, least = torch.where(better, reach, slack), torch.where(better, left, least)
+            again = (passes < _PASSES) | (unmet & (passes < _MOST))
+            return u, best, slack, least, passes, again
 
-        start = at, torch.zeros_like(t), ~met
-        u, slack, _ = repeat(_PASSES, linearise, start, where=lambda now: now[2])
+        start = at, at, none, none, none, ~met
+        _, u, slack, *_ = repeat(_MOST, linearise, start, where=lambda now: now[5])
         return torch.cat((u, margin, slack.unsqueeze(-1)), dim=-1).reshape(*z.shape[:-1], -1)
 
     def _shortfall(self, k: int, x: Tensor, u: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:

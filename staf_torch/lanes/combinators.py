@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any, Literal
 
 import numpy as np
@@ -17,6 +18,7 @@ from .tree import flatten, unflatten
 Tree = Any
 """Nested tuples, lists, dictionaries or named tuples of tensors."""
 _active = threading.local()
+_FEW = 4  # passes of a loop that is only tried
 
 
 def repeat(
@@ -46,7 +48,7 @@ def repeat(
     """
     if (count > 1 or (where is not None and count)) and (tracer := _tracer(carry)) is not None:
         return _loop(tracer, count, lambda now, _: (body(now), ()), carry, (), 1, where)[0]
-    for _ in range(count):
+    for _ in range(_passes(count)):
         if where is None:
             carry = body(carry)
             continue
@@ -55,6 +57,23 @@ def repeat(
             break
         carry = _chosen(going, body(carry), carry)
     return carry
+
+
+@contextmanager
+def few_passes() -> Iterator[None]:
+    """Loops in plain torch end after a few passes; a scan repeats the outputs of the last.
+
+    To try what a step does with its rows: a few passes call all that the loop calls.
+    """
+    before, _active.few = getattr(_active, "few", False), True
+    try:
+        yield
+    finally:
+        _active.few = before
+
+
+def _passes(count: int) -> int:
+    return min(count, _FEW) if getattr(_active, "few", False) else count
 
 
 def _chosen(going: Tensor, after: Tree, before: Tree) -> Tree:
@@ -103,10 +122,11 @@ def scan(
     if tracer is not None and not _fixed(tracer, (carry, inputs), lambda: body(carry, at(0))):
         return _loop(tracer, count, body, carry, inputs, dim)
     outputs, shape = [], None
-    for k in range(count):
+    for k in range(_passes(count)):
         carry, out = body(carry, at(k))
         parts, shape = flatten(out)
         outputs.append(parts)
+    outputs += outputs[-1:] * (count - len(outputs))
     stacked = [torch.stack(column, dim=dim) for column in zip(*outputs, strict=True)]
     return carry, unflatten(shape, iter(stacked))
 

@@ -64,8 +64,6 @@ class Program:
         name: in the log.
         compile: whether to compile at all.
         copies: vectors of rows that advance side by side; 0 by the number of rows and the program.
-        probe: a step that is cheap in plain torch and calls the same functions of a user, asked in place of
-            ``step`` whether it is more than a function of its row; ``step`` by default.
     """
 
     def __init__(
@@ -75,9 +73,7 @@ class Program:
         name: str = "program",
         compile: bool = True,
         copies: int = 0,
-        probe: Step | None = None,
     ) -> None:
-        self._probe = step if probe is None else probe
         self.step, self.name, self.compile, self.copies = step, name, compile, copies
         self._compiled: dict[Hashable, _Built | None] = {}
         self._prepared: dict[Hashable, Prepared] = {}
@@ -243,7 +239,7 @@ class Program:
             self._asked = rows
             self._of_users = reads_users_code(self.step)
             if self._of_users:
-                self._refused = self._refused or doubt(self._probe, given)
+                self._refused = self._refused or doubt(self.step, given)
             if self._refused is not None:
                 _say(self.name, f"its step {self._refused}")
         return self._refused is None

@@ -46,20 +46,22 @@ def test_where_nothing_is_in_its_way_and_no_bound_is_met_the_plan_is_the_lqr() -
     u, after = plans.step(x, plans.init(x), x, 0.2)
     # J counts a period by its beginning, the LQR of 0.2 s by the integral.
     torch.testing.assert_close(u, LQR(x), rtol=0.3, atol=0.05)
-    ahead = after.identifier[:, :-1].unflatten(-1, (8, 2))
+    ahead = after.identifier[:, :-2].unflatten(-1, (8, 2))
     torch.testing.assert_close(after.identifier[:, -1], torch.ones(2).double())
-    moved = plans._advance(x, u)
+    moved = plans._problem._advance(x, u)
     torch.testing.assert_close(plans.step(moved, after, x, 0.2)[0], ahead[:, 0], rtol=0.02, atol=0.01)
 
 
 def test_no_change_of_a_plan_lowers_what_it_costs() -> None:
     plans = adp.DetourPlans(detours(margin=0.0, steps=6), first=6)
-    best = plans.init(BESIDE).identifier[:, :-1]
+    best = plans.init(BESIDE).identifier[:, :-2]
     found = plans._improved(BESIDE, best, torch.zeros(1, 1).double(), 1)[-1]
     others = best + 1e-3 * torch.randn(40, best.shape[1], generator=torch.Generator().manual_seed(1)).double()
     others = COST.bounds.clip(others.unflatten(-1, (6, 2))).flatten(1)
     x, still = BESIDE.expand(40, -1), torch.zeros(40, 1).double()
-    tried = plans._run(x, plans._others(x), still, others.unflatten(-1, (6, 2)), lambda y, o, u, k: u)
+    tried = plans._problem.follow(
+        x, plans._problem.others(x), still, others.unflatten(-1, (6, 2)), lambda y, o, u, k: u
+    )
     assert bool((tried.total > found).all())
 
 
@@ -70,7 +72,7 @@ def test_a_plan_leads_around_and_is_compiled_as_it_is_defined(caplog: pytest.Log
     defined = adp.simulate(guard, PLANE, COST, BESIDE, steps=2, compile=False)
     compiled = adp.simulate(guard, PLANE, COST, BESIDE, steps=40, compile=True)
     torch.testing.assert_close(compiled.state[:, :3], defined.state, rtol=1e-9, atol=1e-9)
-    assert not caplog.records  # compiled indeed
+    assert all("is compiled, once" in record.getMessage() for record in caplog.records)  # and not refused
     assert guard.report(compiled)["constraint_violations"] == 0
     assert float(compiled.state[0, -1].norm()) < 0.1
 
@@ -133,3 +135,46 @@ def test_the_cost_and_the_period_are_checked() -> None:
     plans = adp.DetourPlans(detours(steps=4), first=1)
     with pytest.raises(ValueError, match=r"`DetourPlans\(dt=...\)` must be that of the loop"):
         plans.step(BESIDE, plans.init(BESIDE), BESIDE, 0.1)
+
+
+def test_a_plan_that_costs_more_than_expected_is_left_for_another_way() -> None:
+    """A disc that was not there when the plan was made, and a carried plan that is worth nothing."""
+
+    def appearing(x: Tensor, t: Tensor) -> Tensor:
+        return torch.where(t < 0.1, 10.0, (x[:, 0] - 1.0).square() + (x[:, 1] + 0.1).square() - 0.16)
+
+    ways = adp.DetourRollout(
+        LQR,
+        PLANE,
+        COST,
+        appearing,
+        axes=torch.eye(2, 4),
+        dt=0.2,
+        steps=10,
+        terminal=LQR.value,
+        margin=0.02,
+        sizes=[0.6],
+        lengths=[4],
+    )
+    plans = adp.DetourPlans(ways, first=4)
+    x = BESIDE
+    carried = plans.init(x).identifier
+    idle = torch.zeros(1, 20).double()
+    done = torch.ones(1, 1).double()
+    for control, expected, other in (
+        (idle, 1.0, True),
+        (idle, 1e9, False),
+        (carried[:, :-2], torch.inf, False),
+    ):
+        level = torch.full((1,), expected, dtype=torch.float64)
+        alone = plans._improved(x, control, done, plans.iterations)[-1]
+        found = plans._kept(x, control, level, done)[1].total
+        assert bool(found < alone) is other
+        assert bool(found <= alone)
+    # Where nothing is in its way a plan costs what was expected of it, so that no other is looked for.
+    free = adp.DetourPlans(detours(steps=8), first=2)
+    u, after = free.step(AWAY, free.init(AWAY), AWAY, 0.2)
+    ahead, given = free._problem._advance(AWAY, u), after.identifier[:, :-2].unflatten(-1, (8, 2))
+    others, later = free._problem.others(ahead), after.identifier[:, -1:]
+    total = free._problem.follow(ahead, others, later, given, lambda y, others, u, k: u).total
+    torch.testing.assert_close(total, after.identifier[:, -2], rtol=1e-9, atol=1e-12)

@@ -266,7 +266,10 @@ def test_a_copy_a_pickle_and_single_precision_are_the_same_filter() -> None:
             {"constraints": lambda x, t: 1 + 0 * x[:, 0]},
             "moves neither first nor second derivative of number 0",
         ),
-        ({"decay": 200.0}, r"must be at most 1/dt = 100; got 200.0"),
+        (
+            {"decay": [200.0], "degree": 2},
+            r"must be at most 1/dt = 100 where the relative degree is two; got",
+        ),
         ({"decay": [1.0, 2.0]}, "must be a number or one for each of the 1 constraints"),
         ({"decay": 0.0}, r"`SafetyFilter\(decay=...\)` must be positive"),
         ({"margin": -1.0}, r"`SafetyFilter\(margin=...\)` must not be negative"),
@@ -287,3 +290,54 @@ def test_bounds_of_the_plant_hold_where_the_filter_states_none(stated: dict[str,
     plant.bounds = systems.Bounds(-0.3, 0.3, 1)
     shield = adp.SafetyFilter(lambda x: 5.0 + 0 * x[..., :1], plant, wall, dt=0.01, **stated)
     assert shield(tensor([[1.0, 0.0]])).tolist() == [[most]]
+
+
+class Turning(systems.ControlAffineSystem):
+    """(p, angle)' = (v cos, v sin, w): what v moves changes within a hold as w turns it."""
+
+    dim, inputs = 3, 2
+
+    def drift(self, x: Tensor) -> Tensor:
+        return torch.zeros_like(x)
+
+    def effectiveness(self, x: Tensor) -> Tensor:
+        none, one = torch.zeros_like(x[..., 0]), torch.ones_like(x[..., 0])
+        rows = (x[..., 2].cos(), none), (x[..., 2].sin(), none), (none, one)
+        return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
+
+
+@pytest.mark.parametrize("decay", [9.0, 60.0])
+def test_a_condition_that_bends_is_met_or_the_slack_says_so(decay: float) -> None:
+    """A unicycle turns by half a radian within a hold: no line is like its condition."""
+    shield = adp.SafetyFilter(
+        lambda x: x[..., :2], Turning(), disc, dt=0.1, low=[-1, -5], high=[1, 5], decay=decay, degree=1
+    )
+    x, angle = uniform(4000, 3, low=-1.0, high=1.0, seed=7), uniform(4000, low=0.0, high=6.28, seed=8)
+    x[:, 0], x[:, 1] = (
+        1 + (0.5 + 0.1 * x[:, 0].abs()) * angle.cos(),
+        (0.5 + 0.1 * x[:, 1].abs()) * angle.sin(),
+    )
+    x = torch.cat((x[:, :2], 3.14 * x[:, 2:]), dim=-1)
+    x = x[disc(x, tensor(0.0)) >= 0]
+    wanted = uniform(len(x), 2, low=-1.0, high=1.0, seed=9) * tensor([1.0, 5.0])
+    found = shield.restrain(x, wanted)
+
+    def after(u: Tensor) -> tuple[Tensor, Tensor]:
+        halves = [x]
+        for _ in range(2):
+            halves.append(
+                systems.runge_kutta_step(lambda z: shield.plant.motion(z, u), halves[-1], 0.5 * shield.hold)
+            )
+        now, middle, end = (disc(each, tensor(0.0)) for each in halves)
+        dip = (0.5 * (now + end) - middle).clamp(min=0)
+        return end, dip + math.exp(-decay * shield.hold) * (now - dip)
+
+    end, required = after(wanted)
+    asked = (required - end).clamp(min=0)
+    end, required = after(found.control)
+    missing = (required - end).clamp(min=0)
+    assert int((asked > 0).sum()) > 300
+    met = found.slack < 1e-9
+    assert bool((missing[met] <= 2e-6 * asked[met] + 1e-12).all())
+    assert bool((missing[~met] > 0).all())
+    assert float(met.double().mean()) > 0.9

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 import staf_torch as st
+from staf_torch import lanes
 from staf_torch.lanes import Program
 from staf_torch.lanes import program as programs
 from staf_torch.lanes.content import reads_users_code
@@ -153,3 +154,33 @@ def test_what_rounding_decides_says_nothing_of_a_row(mixed: bool) -> None:
 
     x = torch.linspace(0.1, 0.9, 6, dtype=torch.float64)
     assert Program(step).compiles(x, steps=2) is not mixed
+
+
+def test_loops_are_tried_by_a_few_passes_and_what_they_call_is_still_seen(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """What a user's function does with its rows, every pass does."""
+    calls = []
+
+    def mixed(x: Tensor) -> Tensor:
+        calls.append(len(x))
+        return 0.5 * x + 0.1 * x.mean(0)
+
+    def own(x: Tensor) -> Tensor:
+        calls.append(len(x))
+        return 0.5 * x + 0.1
+
+    rows = torch.linspace(0.0, 1.0, 6, dtype=torch.float64)[:, None]
+    for function in (own, mixed):
+        calls.clear()
+        caplog.clear()
+        program = lanes.Program(
+            lambda carry, now, row, f=function: (lanes.repeat(100, f, carry), ()), name="many"
+        )
+        assert program.compiles(rows, (), (), steps=1) is (function is own)
+        assert len(calls) < 60
+        assert ("beside another row" in caplog.text) is (function is mixed)
+    found = lanes.Program(lambda carry, now, row: (lanes.repeat(100, own, carry), ()))(rows, (), (), steps=1)[
+        0
+    ]
+    torch.testing.assert_close(found, torch.full_like(rows, 0.2))
