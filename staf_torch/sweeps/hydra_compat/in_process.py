@@ -8,13 +8,14 @@ import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 from hydra import version
 from hydra._internal.hydra import Hydra
 from hydra._internal.utils import create_config_search_path
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.plugins import Plugins
 from hydra.core.singleton import Singleton
 from hydra.core.utils import JobRuntime
@@ -40,8 +41,13 @@ class Application(NamedTuple):
 
     def is_sweep(self, overrides: Sequence[str]) -> bool:
         """Return whether the settings themselves ask for a sweep, as those of `experiment=ablation` do."""
+        lines, hydra = with_mode(overrides), cast(Any, self.hydra)
         with mode_read_from_its_file():
-            return bool(self.hydra.get_mode("config", with_mode(overrides)) == RunMode.MULTIRUN)
+            if HAS_WHITELIST:
+                read = hydra.get_mode("config", lines, OverridesParser.create().parse_overrides(lines))
+            else:
+                read = hydra.get_mode("config", lines)
+        return bool(read == RunMode.MULTIRUN)
 
     def run(self, task: Callable[[DictConfig], Any], overrides: Sequence[str]) -> Path:
         """Run one job and return its directory.
