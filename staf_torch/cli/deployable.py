@@ -32,6 +32,7 @@ from ..results.untrusted import UnreadableError
 from ..settings.adp import adp_problem
 from ..settings.chase import chase_problem
 from ..settings.trust import checked, limited
+from ..sweeps.hydra_compat import everything_trusted
 from ..systems import Units
 
 _POINTS = 1000
@@ -123,7 +124,7 @@ def _opened(
     try:
         precise = cfg.dtype == "float64"
         cfg.dtype, cfg.device = "float64", "cpu"
-        with contextlib.nullcontext() if trust else limited(f"What {run} describes"):
+        with everything_trusted() if trust else limited(f"What {run} describes"):
             yield cfg, history, precise, written_by
     except _UNBUILDABLE as error:
         raise ValueError(

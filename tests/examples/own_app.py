@@ -17,7 +17,11 @@ class Critic(nn.Module):
         return self.trend(y).squeeze(-1) + self.rest(y)
 
 
-@hydra.main(version_base="1.3", config_path=".", config_name="own_app")
+# Hydra 1.4 asks for what settings may name, and takes no version.
+OPTIONS = {"version_base": "1.3"} if hydra.__version__ < "1.4" else {"execution_whitelist": ("staf_torch.*",)}
+
+
+@hydra.main(config_path=".", config_name="own_app", **OPTIONS)
 def main(cfg):
     torch.manual_seed(cfg.seed)
     basis = StaFBasis(instantiate(cfg.kernel), instantiate(cfg.centers))

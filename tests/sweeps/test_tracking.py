@@ -71,7 +71,9 @@ def test_an_error_of_a_tracker_is_a_warning(run: Path, caplog: pytest.LogCapture
 
 
 def test_something_that_is_no_tracker_ends_the_program_before_the_run() -> None:
-    with pytest.raises(SystemExit, match=r"`staf tracker=...` must be a staf_torch.sweeps.callbacks.Tracker"):
+    with pytest.raises(
+        SystemExit, match=r"must be a staf_torch.sweeps.callbacks.Tracker|execution whitelist"
+    ):
         TrackRuns().on_run_start(settings("builtins.dict"))
 
 

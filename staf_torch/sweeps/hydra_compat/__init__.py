@@ -22,6 +22,7 @@ from .products import Product as Product
 from .products import sweep_size as sweep_size
 from .program import BrokenSweep as BrokenSweep
 from .program import broken_sweep as broken_sweep
+from .program import everything_trusted as everything_trusted
 from .program import find_launcher as find_launcher
 from .program import full_errors as full_errors
 from .program import named_packages as named_packages

@@ -71,6 +71,18 @@ def trusted(packages: Iterable[str] = ()) -> Iterator[None]:
         yield
 
 
+def everything_trusted() -> contextlib.AbstractContextManager[object]:
+    """Let settings name any object, as Hydra 1.3 does, where a user has asked for trust."""
+    if not HAS_WHITELIST:
+        return contextlib.nullcontext()
+    from hydra._internal import execution_policy
+
+    found: contextlib.AbstractContextManager[object] = execution_policy.execution_whitelist(
+        execution_policy.UNSAFE_DISABLE_EXECUTION_CHECKS
+    )
+    return found
+
+
 def trusted_packages() -> list[str]:
     """Return the packages that settings may name at present, beside this one; workers get them."""
     if not HAS_WHITELIST:
