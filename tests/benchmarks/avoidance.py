@@ -1,6 +1,6 @@
 """`adp.plan_around` beside IPOPT: a double integrator in the plane, |u| <= 1, a disc of radius 0.5 at (1, 0).
 
-    python tests/benchmarks/avoidance.py [starts]      (needs casadi)
+    python tests/benchmarks/avoidance.py [starts] [seed]      (needs casadi)
 
 Starts at rest in [1.7, 3] x [-1.5, 1.5], Q = I, R = I; both hold the control for 0.1 s over 10 s, with one
 Runge-Kutta step each, the LQR's value at the end and the disc at the same times. IPOPT begins on either side.
@@ -58,14 +58,14 @@ def ipopt(x0: np.ndarray, terminal: np.ndarray, sides: tuple[float, ...] = (-1.0
     return best
 
 
-def main(count: int) -> None:
+def main(count: int, seed: int = 0) -> None:
     torch.set_num_threads(1)
     a, b = np.kron([[0.0, 1.0], [0.0, 0.0]], np.eye(2)), np.kron([[0.0], [1.0]], np.eye(2))
     plant = systems.Linear(a.tolist(), b.tolist())
     cost = adp.AvoidanceCost(
         1.0, 1.0, dim=4, inputs=2, obstacles=disc, reach=0.5, weight=1.0, kind="log", low=-1.0, high=1.0
     )
-    generator = torch.Generator().manual_seed(0)
+    generator = torch.Generator().manual_seed(seed)
     place = torch.rand(count, 2, dtype=torch.float64, generator=generator)
     x0 = torch.cat(
         (torch.tensor([1.7, -1.5]) + place * torch.tensor([1.3, 3.0]), torch.zeros(count, 2)), dim=-1
@@ -87,4 +87,4 @@ def main(count: int) -> None:
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else 50)
+    main(*map(int, sys.argv[1:] or [50]))

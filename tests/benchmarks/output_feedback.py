@@ -1,6 +1,6 @@
 """A planar quadrotor whose position alone is measured: 100 starts, two Kalman filters, beside the full state.
 
-python tests/benchmarks/output_feedback.py [rows]
+python tests/benchmarks/output_feedback.py [rows] [seed]
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ def position(x: Tensor) -> Tensor:
     return x[..., :2]
 
 
-def main(rows: int) -> None:
+def main(rows: int, seed: int = 0) -> None:
     plant = systems.PlanarQuadrotor()
     cost = adp.QuadraticCost(1.0, 1.0, dim=6, inputs=2)
     lqr = adp.Feedback(adp.LQR(plant, cost))
-    generator = torch.Generator().manual_seed(0)
+    generator = torch.Generator().manual_seed(seed)
     spread = torch.tensor([1.0, 1.0, 0.3, 0.5, 0.5, 0.3], dtype=torch.float64)
     x0 = spread * (2 * torch.rand(rows, 6, generator=generator, dtype=torch.float64) - 1)
     settings = {"noise": [NOISE, NOISE], "process": 0.01}
@@ -54,4 +54,4 @@ def main(rows: int) -> None:
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else 100)
+    main(*map(int, sys.argv[1:] or [100]))

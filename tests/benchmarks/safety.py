@@ -1,6 +1,6 @@
 """`adp.SafetyFilter` alone: time a row on one core, and the program against a dense solver.
 
-    python tests/benchmarks/safety.py [rows]
+    python tests/benchmarks/safety.py [rows] [seed]
 
 100 000 rows of a double integrator in the plane, two discs (one moves), bounds of 1. The dense solver is
 Lawson and Hanson's least distance programming in SciPy, on the first 2000 rows whose inequalities can be
@@ -55,12 +55,12 @@ def by_osqp(wanted: np.ndarray, rows: np.ndarray, least: np.ndarray) -> np.ndarr
     return np.asarray(found.x) if found.info.status == "solved" else None
 
 
-def main(count: int) -> None:
+def main(count: int, seed: int = 0) -> None:
     torch.set_num_threads(1)
     plant = systems.Linear(*(np.kron(part, np.eye(2)).tolist() for part in INTEGRATOR))
     lqr = adp.LQR(plant, adp.QuadraticCost(1.0, 1.0, dim=4, inputs=2))
     guard = adp.SafetyFilter(lqr, plant, [disc, passing], dt=0.01, low=-1.0, high=1.0)
-    generator = torch.Generator().manual_seed(0)
+    generator = torch.Generator().manual_seed(seed)
     x = 3 * torch.rand(count, 4, dtype=torch.float64, generator=generator) - 1.5
     t = torch.rand(count, dtype=torch.float64, generator=generator)
     u, taken = lqr(x), []
@@ -98,4 +98,4 @@ def main(count: int) -> None:
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else 100_000)
+    main(*map(int, sys.argv[1:] or [100_000]))

@@ -1,6 +1,6 @@
 """Two published examples of safe adaptation, 200 seeds each: friction, and gravity, unknown; h >= 0.
 
-    python tests/benchmarks/unknown_friction.py [rows]
+    python tests/benchmarks/unknown_friction.py [rows] [seed]
 
 A double integrator in the plane with unknown friction among two discs, and a pendulum whose gravity and
 friction are unknown and whose angle must stay below pi/4, though its policy wants it to go beyond. Source of
@@ -93,11 +93,11 @@ def pendulum(rows: int, generator: torch.Generator) -> Example:
     )
 
 
-def main(rows: int) -> None:
+def main(rows: int, seed: int = 0) -> None:
     print("| example | filter | least h | rows with h < 0 | largest shortfall | theta error | CPU s |")
     print("|---|---|---|---|---|---|---|")
     for example in (double_integrator, pendulum):
-        truth, cost, given, controllers, dt, steps = example(rows, torch.Generator().manual_seed(0))
+        truth, cost, given, controllers, dt, steps = example(rows, torch.Generator().manual_seed(seed))
         n = truth.own
         z0 = truth.start(given[:, :n], given[:, n:])
         safe = controllers["adaptive"]
@@ -120,4 +120,4 @@ def main(rows: int) -> None:
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else 200)
+    main(*map(int, sys.argv[1:] or [200]))
