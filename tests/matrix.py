@@ -179,7 +179,8 @@ def _run(environment: Environment, python: Path, tree: Path, arguments: Sequence
             ).returncode
     told = log.read_text()
     failed = re.findall(r"^(?:FAILED|ERROR) (\S+)", told, re.MULTILINE)
-    said = (told.strip() or "nothing").splitlines()[-1]
+    ends = re.findall(r"^=* ?(\d+ \w+.* in [\d.]+s.*?)=*$", told, re.MULTILINE)
+    said = (ends or told.strip().splitlines() or ["nothing"])[-1]
     if code != 0:
         sys.stderr.write(told[-20000:])
         failed = failed or ["pytest itself"]

@@ -19,6 +19,7 @@ def test_no_shape_or_layout_makes_native_code_read_outside() -> None:
     assert said.startswith("6 calls of")
 
 
+@pytest.mark.needs_compiler
 def test_rows_and_times_may_be_more_than_two_to_the_31_numbers_apart() -> None:
     try:
         far = torch.empty(2**31 + 2**20, dtype=torch.float32)  # 9 GB, of which a few pages are touched

@@ -224,7 +224,7 @@ class LocalFilter:
         before = (y - expected).square() / variance  # no number where a kernel overflows so far away
         jumped = moves & ~afresh & torch.isfinite(before)
         anchor = torch.where(moves, x, old.anchor)
-        start = torch.where(afresh, 0.0, 1.0)
+        start = torch.where(afresh, 0.0, 1.0).double()
         transfer, factor = self.functions.transfer(
             torch.where(afresh, x, old.anchor), torch.where(moves, z, 0.0)
         )
@@ -272,7 +272,7 @@ class LocalFilter:
         change = torch.where(seen, kept * error / spread, 0.0)
         mean = old.mean + gain * change.unsqueeze(-2)
         learned = old.learned * share + gain.unsqueeze(1) * (gain / spread)
-        rate = (1 / (samples + 1.0)).clamp(min=ERROR_RATE)
+        rate = (1 / (samples.double() + 1.0)).clamp(min=ERROR_RATE)
         counted = torch.where(samples < STREAK, limited, torch.minimum(limited, SURPRISE * old.errors))
         errors = torch.where(seen, old.errors + rate * (counted - old.errors), old.errors)
         good = fine & (spread > 0) & (mean.abs().amax((0, 1)) <= most) & torch.isfinite(learned.sum((0, 1)))
@@ -280,7 +280,7 @@ class LocalFilter:
 
     def _scale(self, errors: Tensor, samples: Tensor) -> Tensor:
         """Running residual variance in units of the predicted: the prior's at first, then what errors say."""
-        trust = samples.clamp(max=20) / 20.0
+        trust = samples.double().clamp(max=20) / 20.0
         return (errors * trust + self.base * (1 - trust)).clamp(min=1e-6 * self.base)
 
 

@@ -131,6 +131,7 @@ def test_smooth_bounds_of_each_side_are_kept_and_their_cost_is_the_integral() ->
     assert torch.equal(symmetric.saturate(v), adp.BoundedInputCost(1.0, 2.0, 2, 1, bound=3.0).saturate(v))
 
 
+@pytest.mark.needs_compiler
 def test_exported_policy_keeps_asymmetric_bounds(tmp_path: object) -> None:
     from staf_torch.deploy.c_header import runner_c
 

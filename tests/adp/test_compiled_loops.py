@@ -123,6 +123,7 @@ def leaves(state: LoopState) -> list[Tensor]:
     return [*state[:4], *state.carried]
 
 
+@pytest.mark.needs_compiler
 @pytest.mark.parametrize("case", CASES)
 def test_compiled_steps_are_those_of_the_definition(case: str) -> None:
     loop, state, draws = start(case, 65)
@@ -134,6 +135,7 @@ def test_compiled_steps_are_those_of_the_definition(case: str) -> None:
         torch.testing.assert_close(got, want, rtol=CLOSE, atol=CLOSE, equal_nan=True)
 
 
+@pytest.mark.needs_compiler
 @pytest.mark.parametrize("case", ["information", "rollout"])
 def test_a_row_has_the_same_bits_at_every_batch_and_beside_every_neighbour(case: str) -> None:
     loop, state, draws = start(case, 1000)
@@ -161,6 +163,7 @@ def test_a_compiled_run_is_that_of_the_definition() -> None:
         torch.testing.assert_close(got, want, rtol=1e-9, atol=1e-12, equal_nan=True)
 
 
+@pytest.mark.needs_compiler
 def test_loops_that_differ_in_gains_and_tensors_share_one_text(monkeypatch: pytest.MonkeyPatch) -> None:
     loop, state, draws = start("information", 5)
     first = program(loop, True)
@@ -184,6 +187,7 @@ class Branching(systems.TwoState):
         return super().drift(x) * (2.0 if bool(x.sum() > 1e9) else 1.0)
 
 
+@pytest.mark.needs_compiler
 @pytest.mark.parametrize("reason", ["no compiler", "reads a value of a row"])
 def test_what_cannot_be_compiled_runs_in_plain_torch_with_one_line(
     reason: str, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
@@ -206,6 +210,7 @@ def test_what_cannot_be_compiled_runs_in_plain_torch_with_one_line(
     assert reason in line
 
 
+@pytest.mark.needs_compiler
 def test_rows_with_gains_of_their_own_are_compiled_and_are_those_rows_alone() -> None:
     x0, critic = uniform(3, 1.0), torch.tensor([[0.1], [0.2], [0.4]], dtype=torch.float64)
 
@@ -243,6 +248,7 @@ def test_a_sweep_over_gains_needs_no_other_program() -> None:
     assert text(0.3, 0.003) == text(0.7, 0.009)
 
 
+@pytest.mark.needs_compiler
 def test_a_rollout_policy_that_is_asked_often_compiles_itself_and_sees_what_changes() -> None:
     policy = adp.RolloutPolicy.of_lqr(PLANT, COST, steps=4)
     x = uniform(50, 0.5)

@@ -82,6 +82,7 @@ def test_report_says_what_was_chosen_and_how_good_it_is() -> None:
     assert report["microseconds"] > 0
 
 
+@pytest.mark.needs_compiler
 @torch.no_grad()
 def test_exported_policy_is_the_policy(tmp_path: Path) -> None:
     cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1, low=-2.0, high=1.5)

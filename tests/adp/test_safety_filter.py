@@ -232,6 +232,7 @@ def test_weights_say_which_input_shall_move() -> None:
     torch.testing.assert_close(dear, tensor([1.0, -1.0]), rtol=0, atol=1e-5)
 
 
+@pytest.mark.needs_compiler
 def test_in_c_it_is_the_same(tmp_path: Path) -> None:
     guard = adp.SafetyFilter(adp.LQR(PLANE, COST4), PLANE, [passing], dt=0.05, low=-1.0, high=1.0)
     policy = deploy.policy_of(guard)

@@ -59,6 +59,7 @@ def test_compiled_gradients_reach_the_parameters() -> None:
         torch.testing.assert_close(p.grad, expected[key], rtol=1e-9, atol=1e-9, msg=key)
 
 
+@pytest.mark.needs_compiler
 @pytest.mark.skipif(
     torch.__version__.startswith("2.6"), reason="an assertion in inductor's own backward pass"
 )

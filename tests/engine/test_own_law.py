@@ -36,6 +36,7 @@ class Adaptive(UpdateLaw):
         return torch.where(helps.unsqueeze(-1), weights + move, weights), state
 
 
+@pytest.mark.needs_compiler
 @pytest.mark.compiled
 def test_a_law_that_carries_tensors_of_every_kind(caplog: pytest.LogCaptureFixture) -> None:
     found = chase(STATES, BASIS, Paper(), Adaptive(), inner_steps=3)

@@ -169,6 +169,7 @@ def test_rows_have_the_bits_that_they_have_in_any_batch_and_beside_any_row() -> 
         assert torch.equal(result.weights[5, 3:], whole[5, 2].expand(14, -1))
 
 
+@pytest.mark.needs_compiler
 def test_chunks_of_time_continue_to_the_bit_and_remember_who_diverged() -> None:
     states = circles(9, 60)
     states[4, 45:] = states[2, 25:] = states[7, 19:] = torch.nan
@@ -183,6 +184,7 @@ def test_chunks_of_time_continue_to_the_bit_and_remember_who_diverged() -> None:
     torch.testing.assert_close(last.weights[:, 0], whole.weights[:, -1], rtol=1e-14, atol=0)
 
 
+@pytest.mark.needs_compiler
 @pytest.mark.parametrize("law", [LAW, optim.Nesterov(0.7)], ids=["steepest descent", "nesterov"])
 def test_another_radius_width_gain_or_phase_compiles_and_traces_nothing(
     law: optim.UpdateLaw, definition, monkeypatch: pytest.MonkeyPatch

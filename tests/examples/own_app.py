@@ -7,6 +7,8 @@ from torch import nn
 
 from staf_torch import StaF, StaFBasis
 
+OPTIONS = {"version_base": "1.3"} if hydra.__version__ < "1.4" else {"execution_whitelist": ("staf_torch.*",)}
+
 
 class Critic(nn.Module):
     def __init__(self, basis):
@@ -15,10 +17,6 @@ class Critic(nn.Module):
 
     def forward(self, y):
         return self.trend(y).squeeze(-1) + self.rest(y)
-
-
-# Hydra 1.4 asks for what settings may name, and takes no version.
-OPTIONS = {"version_base": "1.3"} if hydra.__version__ < "1.4" else {"execution_whitelist": ("staf_torch.*",)}
 
 
 @hydra.main(config_path=".", config_name="own_app", **OPTIONS)

@@ -181,6 +181,7 @@ def test_ball_error_is_close_to_a_dense_supremum(radius: object, dim: int) -> No
     assert (found >= dense * 0.7).all()
 
 
+@pytest.mark.needs_compiler
 @pytest.mark.parametrize(
     ("name", "radius"),
     [*((name, 0.2) for name in KERNELS), *((name, st.StateRadius(0.2, 0.1)) for name in MOVING)],
@@ -209,6 +210,7 @@ def test_errors_around_states_in_pieces_of_any_size_and_compiled(
             torch.testing.assert_close(got, wanted, rtol=bound, atol=1e-11, msg=label)
 
 
+@pytest.mark.needs_compiler
 def test_a_state_that_is_not_finite_spoils_no_other_in_the_compiled_pass() -> None:
     basis, x = basis_of("exponential", 3), uniform(1, 20, 2)
     coefficients = in_kernels(basis, x, Paper())

@@ -80,6 +80,7 @@ def test_raw_units_predict_as_standard_ones() -> None:
     )  # units count before they are known
 
 
+@pytest.mark.needs_compiler
 def test_streams_have_the_same_bits_alone_and_beside_others() -> None:
     x, y = streams(150, 5)
     y[40, 1], x[60, 3] = torch.nan, 1e250
@@ -190,6 +191,7 @@ def test_a_table_in_which_every_sample_calls_itself_recent_stays_inside() -> Non
     assert stream["order"].tolist() == [1.0, *[2.0] * 127]
 
 
+@pytest.mark.needs_compiler
 @pytest.mark.parametrize("memory", [None, 128])
 def test_streams_come_and_go_without_touching_the_others(memory: int | None) -> None:
     x, y = streams(140, 4)

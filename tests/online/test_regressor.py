@@ -185,6 +185,7 @@ def test_prediction_before_a_sample_changes_nothing_of_what_is_learned(kernel: s
     )
 
 
+@pytest.mark.needs_compiler
 @pytest.mark.parametrize("streams", [3, 7, 9])
 def test_units_have_the_same_bits_beside_streams_that_learn_theirs_later(streams: int) -> None:
     x, y = walks(streams, 60)

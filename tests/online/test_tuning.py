@@ -103,6 +103,7 @@ def test_there_is_nothing_to_tune_in_the_accurate_mode() -> None:
         st.StaFRegressor().tune(x[:, 0], y)
 
 
+@pytest.mark.needs_compiler
 def test_tuned_streams_keep_their_hyperparameters_when_others_go_and_come() -> None:
     pairs = [drawn(torch.tensor([0.7, 0.7]).double(), 0.1, steps=60, seed=seed) for seed in range(3)]
     x, y = (torch.stack([3.0 * pair[k] + 5 for pair in pairs], 1) for k in range(2))

@@ -54,6 +54,7 @@ def test_a_variant_is_one_class_and_one_yaml() -> None:
     assert len(modules) == len(groups)
 
 
+@pytest.mark.needs_compiler
 def test_own_variants_run_and_their_metric_is_declared_in_the_record(place: Path, said: list[str]) -> None:
     metrics = json.loads((place / "runs/own/metrics.json").read_text())
     record = json.loads((place / "runs/own/run.json").read_text())
@@ -68,6 +69,7 @@ def test_own_variants_run_and_their_metric_is_declared_in_the_record(place: Path
     }
 
 
+@pytest.mark.needs_compiler
 def test_a_sweep_over_own_hyperparameters_has_a_row_for_each(place: Path, said: list[str]) -> None:
     runs = collect(place / "runs/sweep").rows
     assert [run.status for run in runs] == ["completed"] * 4
@@ -76,6 +78,7 @@ def test_a_sweep_over_own_hyperparameters_has_a_row_for_each(place: Path, said: 
     assert len({run.metrics["digits"] for run in runs}) == 4
 
 
+@pytest.mark.needs_compiler
 def test_an_own_experiment_is_swept(place: Path, said: list[str]) -> None:
     near, far = (run.metrics["distance"] for run in collect(place / "runs/closeness").rows)
     assert near is not None
@@ -83,6 +86,7 @@ def test_an_own_experiment_is_swept(place: Path, said: list[str]) -> None:
     assert 0 < near < far
 
 
+@pytest.mark.needs_compiler
 def test_a_table_sorts_and_marks_an_own_metric_by_its_declaration(place: Path, said: list[str]) -> None:
     runs = collect(place / "runs/sweep").rows
     best = max(run.metrics["digits"] for run in runs)
@@ -92,11 +96,13 @@ def test_a_table_sorts_and_marks_an_own_metric_by_its_declaration(place: Path, s
     assert shown == sorted(shown, reverse=True)
 
 
+@pytest.mark.needs_compiler
 def test_the_sheet_of_an_own_plant_has_its_units(place: Path, said: list[str]) -> None:
     assert "m, m/s" in said[SHEET]
     assert "| N |" in said[SHEET]
 
 
+@pytest.mark.needs_compiler
 def test_an_own_plant_is_an_environment_by_its_dotted_path(
     place: Path, said: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

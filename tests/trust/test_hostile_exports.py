@@ -96,6 +96,7 @@ def test_nothing_is_written_through_a_link(linked: str, run: Path, tmp_path: Pat
     assert list(victim.iterdir()) == []
 
 
+@pytest.mark.needs_compiler
 def test_the_name_of_a_folder_is_neither_c_nor_told_to_the_terminal(run: Path, tmp_path: Path) -> None:
     evil = "__attribute__((constructor)) static void evil(void)"
     (tmp_path / "x").write_text(

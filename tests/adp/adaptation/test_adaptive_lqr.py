@@ -110,6 +110,7 @@ def test_a_design_that_cannot_be_made_leaves_the_robust_policy_and_not_a_dead_ro
     assert not control.adaptation(run.identifier).certain.any()
 
 
+@pytest.mark.needs_compiler
 @pytest.mark.parametrize("case", ["filter", "rollout"])
 def test_compiled_steps_are_those_of_the_definition(case: str) -> None:
     more = {

@@ -63,6 +63,7 @@ def test_an_unstable_pendulum_is_held_by_its_angle_alone(kind: type[adp.KalmanFi
     torch.testing.assert_close(belief.u[:, 1:, 0], run.control[:, :-1, 0])
 
 
+@pytest.mark.needs_compiler
 @pytest.mark.parametrize("kind", KINDS)
 def test_compiled_filters_are_those_of_the_definition_row_by_row(kind: type[adp.KalmanFilter]) -> None:
     cost = adp.QuadraticCost(1.0, 1.0, dim=3, inputs=1)
