@@ -73,11 +73,13 @@ class Controller(nn.Module, abc.ABC):
         label: a few words for a log or a sheet.
         costly: whether a program of a step takes a compiler so long that a loop is compiled where that is
             asked for alone.
+        work: steps of a feedback law that a control takes, about: such a loop pays for its compiler sooner.
     """
 
     draws: int = 0
     period: float | None = None
     costly: bool = False
+    work: float = 1.0
 
     @property
     def label(self) -> str:

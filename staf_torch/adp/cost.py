@@ -20,7 +20,7 @@ from ..systems.equilibria import check_rest, resting_input_at
 
 _EDGE = 1 - 1e-9  # of the bound, beyond which artanh is that of this share
 
-Matrix = float | Sequence[Sequence[float]] | Tensor
+Matrix = float | Sequence[float] | Sequence[Sequence[float]] | Tensor
 Output = Callable[[Tensor], Tensor]
 """y from x: (..., n) -> (..., p)."""
 
@@ -36,7 +36,7 @@ class Cost(nn.Module, abc.ABC):
         Shown by `staf experiment=adp`.
 
     Args:
-        state: Q, (n, n), positive semidefinite; a number q stands for q I once the sizes are known.
+        state: Q, (n, n), positive semidefinite, or its diagonal (n,); a number q stands for q I.
         control: R, (m, m), positive definite; a number likewise.
         dim: n.
         inputs: m.
@@ -370,8 +370,10 @@ def _pull(effectiveness: Tensor, gradient: Tensor) -> Tensor:
 
 def _square(call: str, name: str, value: Matrix, size: int) -> Tensor:
     if isinstance(value, Tensor):
-        return value.to(torch.float64)
+        return value.to(torch.float64) if value.dim() != 1 else value.to(torch.float64).diag()
     if isinstance(value, Sequence) and not isinstance(value, str):
+        if value and all(isinstance(entry, int | float) for entry in value):
+            return torch.tensor(vector(call, name, value, len(value)), dtype=torch.float64).diag()
         return torch.tensor([vector(call, name, row, len(value)) for row in value], dtype=torch.float64)
     return positive_real(call, name, value) * torch.eye(size, dtype=torch.float64)
 

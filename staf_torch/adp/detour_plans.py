@@ -64,6 +64,8 @@ class DetourPlans(Controller):
     Source: Tassa, Mansard, Todorov, "Control-limited differential dynamic programming", ICRA (2014).
     """
 
+    work = 300.0
+
     def __init__(
         self,
         detours: DetourRollout,

@@ -72,6 +72,8 @@ class DetourRollout(Controller):
     the improvement of a policy by rollouts of few candidates.
     """
 
+    work = 50.0
+
     def __init__(
         self,
         policy: Policy,

@@ -67,7 +67,7 @@ class LoopResult:
 
 
 def simulate(
-    controller: Controller,
+    controller: Controller | Policy,
     system: Plant,
     cost: Cost,
     x0: Tensor,
@@ -98,7 +98,7 @@ def simulate(
         Shown by `staf experiment=adp`.
 
     Args:
-        controller: the controller.
+        controller: the controller, or u from x, (..., n) -> (..., m), as `Feedback` takes it.
         system: the plant.
         cost: the cost rate that is integrated along.
         x0: (B, n).
@@ -117,6 +117,10 @@ def simulate(
     Raises:
         ValueError: if an argument breaks its rule, the plant does not rest at 0 or returns another shape.
     """
+    if not isinstance(controller, Controller):
+        if not callable(controller):
+            raise fail("simulate", "controller", "must be a Controller or a function of x", controller)
+        controller = Feedback(controller)
     cost = _check(system, cost, x0)
     integer("simulate", "steps", steps, least=1)
     integer("simulate", "every", every, least=1)
@@ -124,7 +128,8 @@ def simulate(
         raise fail("simulate", "every", f"must divide the {steps} steps", every)
     choice("simulate", "compile", compile, (True, False, "auto"))
     most = fewest_and_most("simulate", substeps)[1]
-    worth = steps * most * (1 + len(x0) / 200) >= _PAYS if compile == "auto" else bool(compile)
+    work = steps * (most + max(getattr(part, "work", 1.0) for part in controller.modules()) - 1)
+    worth = work * (1 + len(x0) / 200) >= _PAYS if compile == "auto" else bool(compile)
     if dt is None:
         dt = controller.period or system.period or _DT
     more = {"integrator": integrator, "substeps": substeps, "renew": renew, "limit": limit}

@@ -88,3 +88,48 @@ def test_a_feedback_carries_nothing_for_any_number_of_rows() -> None:
     for rows in (1, 5):
         for part in adp.Feedback(lambda x: -x).init(torch.zeros(rows, 2)):
             assert part is None or (len(part) == rows and part.numel() == 0)
+
+
+def test_a_function_of_the_state_is_a_controller_and_anything_else_is_not() -> None:
+    plant, cost = systems.TwoState(), adp.QuadraticCost([1.0, 2.0], [3.0], dim=2, inputs=1)
+    policy = lambda x: -3.0 * x[..., 1:]  # noqa: E731
+    x0 = torch.tensor([[0.5, 0.5], [-0.2, 0.1]]).double()
+    one, other = (adp.simulate(each, plant, cost, x0, steps=20) for each in (policy, adp.Feedback(policy)))
+    assert torch.equal(one.state, other.state)
+    with pytest.raises(
+        ValueError, match=r"`simulate\(controller=...\)` must be a Controller or a function of x"
+    ):
+        adp.simulate(3.0, plant, cost, x0, steps=20)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("state", [[1.0, 2.0], torch.tensor([1.0, 2.0])])
+def test_weights_may_be_given_by_their_diagonal(state: object) -> None:
+    cost = adp.QuadraticCost(state, [3.0], dim=2, inputs=1)  # type: ignore[arg-type]
+    assert cost.q.tolist() == [[1.0, 0.0], [0.0, 2.0]]
+    assert cost.r.tolist() == [[3.0]]
+    with pytest.raises(ValueError, match=r"`QuadraticCost\(state=...\)`"):
+        adp.QuadraticCost([1.0, 2.0, 3.0], [3.0], dim=2, inputs=1)
+
+
+@pytest.mark.compiled
+def test_a_controller_of_much_work_is_compiled_sooner() -> None:
+    calls = []
+
+    class Busy(adp.Controller):
+        def init(self, x0: Tensor) -> Tensor:
+            return torch.zeros_like(x0[:, 0])
+
+        def step(self, x: Tensor, carried: Tensor, uniform: Tensor, dt: float) -> tuple[Tensor, Tensor]:
+            calls.append(len(x))
+            return -x[:, 1:], carried
+
+    plant, cost = systems.TwoState(), adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
+    counts = []
+    for work in (1.0, 1e4):
+        busy = Busy()
+        busy.work = work
+        calls.clear()
+        adp.simulate(busy, plant, cost, torch.ones(2, 2).double(), dt=0.01, steps=200)
+        counts.append(len(calls))
+    assert counts[0] >= 200
+    assert counts[1] < 30
