@@ -111,6 +111,7 @@ def test_weights_may_be_given_by_their_diagonal(state: object) -> None:
         adp.QuadraticCost([1.0, 2.0, 3.0], [3.0], dim=2, inputs=1)
 
 
+@pytest.mark.needs_compiler
 @pytest.mark.compiled
 def test_a_controller_of_much_work_is_compiled_sooner() -> None:
     calls = []

@@ -84,6 +84,7 @@ class Distance(Kernel):
         return (-torch.cdist(x1, x2).square()).exp()
 
 
+@pytest.mark.needs_compiler
 @pytest.mark.compiled
 def test_a_kernel_by_distances_is_compiled_and_its_tangent_refused(caplog: pytest.LogCaptureFixture) -> None:
     basis = StaFBasis(Distance(), StateFollowingCenters(rings(3), 0.6))
