@@ -29,6 +29,7 @@ class Hysteresis(adp.Controller):
         return u.unsqueeze(-1), kept
 
 
+@pytest.mark.needs_compiler
 @pytest.mark.compiled
 def test_a_state_of_ones_own_is_carried_row_by_row(caplog: pytest.LogCaptureFixture) -> None:
     x0 = torch.randn(9, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
