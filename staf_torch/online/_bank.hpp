@@ -17,7 +17,7 @@ struct Rules {  // see bank.py
     double members_rate, error_rate, linear_forgetting, linear_prior, recent, floor, margin, far, outlying;
     double rescaled[9], scaling, carried_forgetting[carried], carried_ratio, carried_slack2;
     double quadratic_forgetting[lanes], quadratic_prior[lanes], pace, correction_prior, correction_forgetting;
-    double correction_most, correction_discount, correction_share, least, doubt;
+    double correction_most, correction_discount, correction_share, least, doubts[clocks], doubt;
     double doubtful, doubtful_outside, outside, rare, doubted_rate, settled;
     double squares_discount, squares_rate, squares_share, own_rate, best_rate, largest, uncalibrated, searched_at;
     double map_step, map_prior, map_forgetting;

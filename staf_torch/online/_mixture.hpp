@@ -32,16 +32,21 @@ static void mix(const Rules &r, Stream &s, int o, double low, double high) {
     const double *means = s.means[o], *variances = s.variances[o];
     double whole = 0, first = 0, second = 0, top = -infinity;
     for (int c = 0; c < clocks; ++c) top = std::max(top, s.clock_weights[o][c]);
-    double doubts[members];
+    double doubts[members], claims[members], behind[members], surest = infinity;  // logarithms of variances
+    for (int i = 0; i < members; ++i) {
+        claims[i] = std::log(std::max(variances[i], least)), behind[i] = claims[i] + std::log(s.excess[o][i]);
+        surest = std::min(surest, behind[i]);
+    }
     for (int i = 0; i < members; ++i)
-        doubts[i] = r.doubt * std::max(std::log(std::max(variances[i], least)) - s.usual[o][i], 0.);
+        doubts[i] = std::max(std::min(claims[i] - s.usual[o][i], behind[i] - surest), 0.);
+    const double slow = r.doubts[clocks - 1];
     double total[groups_of_members]{}, sum[groups_of_members]{}, highest[groups_of_members];
     std::fill(highest, highest + groups_of_members, -infinity);
     for (int i = 0; i < members - 1; ++i)
-        highest[group_of(i)] = std::max(highest[group_of(i)], s.weights[o][clocks - 1][i] - doubts[i]);
+        highest[group_of(i)] = std::max(highest[group_of(i)], s.weights[o][clocks - 1][i] - slow * doubts[i]);
     for (int c = 0; c < clocks; ++c) {
         double all_of = 0, middle = 0, around = 0, most = -infinity, weights[members];
-        for (int i = 0; i < members; ++i) weights[i] = s.weights[o][c][i] - doubts[i], most = std::max(most, weights[i]);
+        for (int i = 0; i < members; ++i) weights[i] = s.weights[o][c][i] - r.doubts[c] * doubts[i], most = std::max(most, weights[i]);
         for (int i = 0; i < members; ++i) {
             weights[i] = std::exp(weights[i] - most);
             if (weights[i] < r.drop) weights[i] = 0;
@@ -60,7 +65,7 @@ static void mix(const Rules &r, Stream &s, int o, double low, double high) {
                   (s.mixed_variance[o][c] + square(s.mixed[o][c] - first));
     for (int i = 0; i < members - 1; ++i) {
         const int g = group_of(i);
-        const double weight = std::exp(s.weights[o][clocks - 1][i] - doubts[i] - highest[g]);
+        const double weight = std::exp(s.weights[o][clocks - 1][i] - slow * doubts[i] - highest[g]);
         total[g] += weight, sum[g] += weight * means[i];
     }
     const double unit = std::sqrt(std::max(s.pace[o], least)), most = r.correction_most;
@@ -71,7 +76,7 @@ static void mix(const Rules &r, Stream &s, int o, double low, double high) {
     }
     stacked = std::max(std::min(first + unit * stacked, high), low);
     double logs[members], peak = -infinity, whole_of = 0, squared = 0;
-    for (int i = 0; i < members; ++i) logs[i] = s.squares[o][i] - doubts[i], peak = std::max(peak, logs[i]);
+    for (int i = 0; i < members; ++i) logs[i] = s.squares[o][i] - r.doubt * doubts[i], peak = std::max(peak, logs[i]);
     for (int i = 0; i < members; ++i) {
         const double weight = std::exp(logs[i] - peak);
         whole_of += weight, squared += weight * means[i];

@@ -58,7 +58,12 @@ class Rules(NamedTuple):
     discounts: tuple[float, ...] = (0.9, 0.97, 0.995)  # of the scores in the three mixtures
     discount: float = 0.98  # of the scores of the mixtures
     share: float = 0.001  # of the weights that is equal
-    doubt: float = 0.25  # a weight falls with this power of a variance that is larger than usual
+    doubts: tuple[float, ...] = (
+        1.0,
+        0.5,
+        0.25,
+    )  # powers of a doubted variance that weights fall with, a mixture each
+    doubt: float = 0.5  # ... by squared errors
     drop: float = 0.02  # members below this part of the largest weight are left out
     heavy: float = 8.0  # degrees of freedom
     likelihood: float = 0.6  # its part of a score
@@ -137,7 +142,14 @@ class Rules(NamedTuple):
         found += [*self.forgetting, self.carried_ratio, self.carried_slack**2]
         found += [*self.quadratic_forgetting, *self.quadratic_prior, self.pace, self.correction_prior]
         found += [self.correction_forgetting, self.correction_most, self.correction_discount]
-        found += [self.correction_share, self.least, self.doubt, self.doubtful, self.doubtful_outside]
+        found += [
+            self.correction_share,
+            self.least,
+            *self.doubts,
+            self.doubt,
+            self.doubtful,
+            self.doubtful_outside,
+        ]
         found += [self.outside, self.rare, self.doubted_rate, self.settled]
         found += [self.squares_discount, self.squares_rate, self.squares_share, self.own_rate]
         found += [self.best_rate, self.largest, self.uncalibrated, self.searched_at]

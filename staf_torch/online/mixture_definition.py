@@ -15,8 +15,9 @@ _GROUP = torch.tensor([group(member) for member in range(MEMBERS)])
 def mix(r: Rules, s: dict[str, Tensor], low: Tensor, high: Tensor) -> None:
     """The mixture of what the members say, and its variance: a mixture of four.
 
-    A member that is less certain than it usually is has less weight. First, three mixtures by scores that
-    fade at three rates are mixed by their own scores. Second, to that is added
+    A member that is less certain than it usually is has less weight, as far as another one is more certain
+    than it. First, three mixtures by scores that fade at three rates are mixed by their own scores; the
+    faster they fade, the more counts how certain a member is. Second, to that is added
     sum_g beta_g (m_g - first), m_g the mean of a group by the scores that fade most slowly, beta by least
     squares. Third, the members by their squared errors over a long time, which rare large errors decide. The
     three are weighed by how they predict, and one far behind the best has no weight. Fourth, what usually
@@ -30,8 +31,10 @@ def mix(r: Rules, s: dict[str, Tensor], low: Tensor, high: Tensor) -> None:
         high: (K,).
     """
     means = s["means"]
-    surplus = (s["variances"].clamp(min=_LEAST).log() - s["usual"]).clamp(min=0.0)
-    logs = s["weights"] - r.doubt * surplus[:, None]
+    claims = s["variances"].clamp(min=_LEAST).log()
+    behind = claims + s["excess"].log()
+    surplus = torch.minimum(claims - s["usual"], behind - behind.amin(-1, keepdim=True)).clamp(min=0.0)
+    logs = s["weights"] - torch.tensor(r.doubts, dtype=torch.float64)[:, None] * surplus[:, None]
     weights = (logs - logs.amax(-1, keepdim=True)).exp()
     weights = torch.where(weights < r.drop, 0.0, weights)
     weights = weights / weights.sum(-1, keepdim=True)  # (K, clocks, members)

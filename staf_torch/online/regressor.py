@@ -100,7 +100,7 @@ class StaFRegressor(StreamEstimator):
         robust: float | None = None,
         scaling: bool | None = None,
         memory: int | None = None,
-        neighbours: int = 48,
+        neighbours: int = 56,
     ) -> None:
         self.kernel = kernel
         self.radius = radius

@@ -209,7 +209,7 @@ def main() -> None:
         parser.add_argument(name, action="store_const", dest="which", const=which, default=SETS, help=told)
     parser.add_argument("--filter", action="store_true", help="tuned on the first fifth, not the bank")
     parser.add_argument("--memory", type=int, default=1000)
-    parser.add_argument("--neighbours", type=int, default=48)
+    parser.add_argument("--neighbours", type=int, default=56)
     parser.add_argument("--no-kafbox", action="store_true", help="do not reproduce kafbox's Lorenz first")
     options = parser.parse_args()
     torch.set_num_threads(1)

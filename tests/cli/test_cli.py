@@ -126,7 +126,7 @@ def outcomes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Outcome]:
 
 
 def run_directory(outcome: Outcome) -> Path:
-    assert outcome.code == 0, outcome
+    assert outcome.code == 0, f"{outcome}"  # in full, for absent_extras.py
     assert "Traceback" not in outcome.err
     assert outcome.left == {"runs"}
     (run,) = (outcome.folder / "runs").iterdir()
