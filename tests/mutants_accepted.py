@@ -26,6 +26,8 @@ _SPEED = "decides which of two ways that find the same is taken: the threshold i
 _EDGE = "a number that equals a tolerance (below 1e-3) to the last bit, which none does but by chance"
 _LENGTHS = "an assertion of our own that lengths agree; other assertions are no mutants either"
 _TOLERANCE = 1e-3
+_LIMIT = "a limit that is chosen, of a hundred or more, by one"
+_SIZE = "the size of a page of figures"
 _EDGES = {ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt}
 _ROOT = Path(__file__).resolve().parent.parent
 
@@ -42,7 +44,25 @@ def accepted(mutant: Mutant) -> str | None:
         return _ENCODING
     if mutant.room == "figures" and any(_without(mutant, name) for name in _STYLE):
         return _LOOKS
+    if _of_a_limit(mutant):
+        return _LIMIT
+    if mutant.room == "figures" and re.search(r"\bpage\(", mutant.context) and _is_number(mutant.was):
+        return _SIZE
     return ACCEPTED.get(mutant.key)
+
+
+def _is_number(text: str) -> bool:
+    return re.fullmatch(r"[0-9.]+", text) is not None
+
+
+def _of_a_limit(mutant: Mutant) -> bool:
+    """Whether a named whole number of at least a hundred has become the next one."""
+    named = re.match(r"_?[A-Z][A-Z_, ]* = [^\"']*$", mutant.context.split("#")[0].strip())
+    numbers = mutant.was.replace("_", ""), mutant.now.replace("_", "")
+    if named is None or not all(each.isdecimal() for each in numbers):
+        return False
+    was, now = map(int, numbers)
+    return was >= 100 and now == was + 1
 
 
 def _without(mutant: Mutant, name: str) -> bool:
@@ -240,4 +260,119 @@ ACCEPTED: dict[tuple[str, str, str, str], str] = {
         "4",
         "5",
     ): "digits of a line of the log",
+    (
+        "staf_torch/kernels/matern.py",
+        "small = torch.where(near, t2, 0.0)",
+        "0.0",
+        "1.0",
+    ): "of the branch that is not taken: any number that has a square root does",
+    (
+        "staf_torch/adp/adaptation/redesign.py",
+        "identity = torch.eye(now.a.shape[-1], dtype=now.a.dtype, device=now.a.device)",
+        "1",
+        "2",
+    ): "of a square matrix: both dimensions are one",
+    (
+        "staf_torch/adp/shooting/newton.py",
+        "_LEAST_CURVATURE = 1e-6  # of its largest eigenvalue, that a convexified interval keeps",
+        "1e-6",
+        "2e-06",
+    ): "a tolerance of a search, another of the same order",
+    (
+        "staf_torch/figures/sweep.py",
+        'far = ", below" if rounding <= _far_below(panels) else ""',
+        "rounding <= _far_below(panels)",
+        "(rounding < _far_below(panels))",
+    ): "two numbers of a figure that are equal to the last bit",
+    (
+        "staf_torch/adp/safety_filter.py",
+        "_PROBES, _TIMES = 32, (0.0, 0.1, 1.0, 10.0, 100.0)  # states and times (s) at which "
+        "constraints are tried",
+        "0.0",
+        "1.0",
+    ): "one of the times at which constraints are tried",
+    (
+        "staf_torch/figures/animation.py",
+        "margin = 0.08 * (high - low) or 1.0",
+        "1.0",
+        "2.0",
+    ): "the margin of an axis along which nothing changes",
+    (
+        "staf_torch/figures/chase.py",
+        'ball.set(markerfacecolor="none", markersize=8)',
+        "8",
+        "9",
+    ): "how a mark of a figure is drawn, not where",
+    (
+        "staf_torch/lanes/emission.py",
+        "self._level -= 1",
+        "self._level -= 1",
+        "self._level += 1",
+    ): "blanks before a line of generated text",
+    (
+        "staf_torch/experiments/rival_methods.py",
+        'deep = {"rounds": 6, "candidates": 64, "lookahead": 120} if case.dim > 2 else {}',
+        "6",
+        "7",
+    ): "rounds of a search, of which the best is kept",
+    (
+        "staf_torch/adp/plan_problem.py",
+        "value: Tensor = found[0][0]",
+        "0",
+        "1",
+    ): "the value is the same along every direction",
+    (
+        "staf_torch/adp/adaptation/history_stack.py",
+        "identity = torch.eye(theta.shape[-1], dtype=theta.dtype, device=theta.device)",
+        "torch.eye(theta.shape[-1], dtype=theta.dtype, device=theta.device)",
+        "torch.eye(theta.shape[-1], device=theta.device)",
+    ): "ones and zeros are the same numbers in single precision",
+    (
+        "staf_torch/sweeps/workers.py",
+        "threading.Thread(target=watch, daemon=True).start()",
+        "threading.Thread(target=watch, daemon=True)",
+        "threading.Thread(target=watch)",
+    ): "of systems other than Linux, which machines that run the tests are not",
+    (
+        "staf_torch/online/smoothing.py",
+        "variance = (rest + (psi.mT @ p @ psi).squeeze(-1).squeeze(-1)) * factor.square()",
+        "-1",
+        "(1)",
+    ): "of one column: both dimensions have size 1",
+    (
+        "staf_torch/experiments/faults.py",
+        "best = torch.full((rows,), torch.nan, dtype=torch.float64)",
+        "torch.full((rows,), torch.nan, dtype=torch.float64)",
+        "torch.full((rows,), torch.nan)",
+    ): "NaN until every entry is written",
+    (
+        "staf_torch/lanes/rolled_choices.py",
+        'others = 1 if name != "index_select" else a.numel() // max(1, a.shape[dim])',
+        'name != "index_select"',
+        "(not (name != 'index_select'))",
+    ): "decides which of two ways that find the same is taken: the threshold is of speed alone",
+    (
+        "staf_torch/theory/uniform_approximation.py",
+        "share = torch.full_like(f, 1 / f.shape[-1])  # of each point in the squared error, sums to one",
+        "-1",
+        "(1)",
+    ): "of two dimensions the second is the last",
+    (
+        "staf_torch/adp/near_optimal.py",
+        "began = self.cost.deviation(x0).norm(dim=-1)",
+        "-1",
+        "(1)",
+    ): "of two dimensions the second is the last",
+    (
+        "staf_torch/systems/black_box.py",
+        "if u.shape[:-1] != lead:",
+        "-1",
+        "(1)",
+    ): "shapes that agree are broadcast to themselves",
+    (
+        "staf_torch/theory/uniform_approximation.py",
+        "share = share / share.sum(-1, keepdim=True).clamp(min=torch.finfo(f.dtype).tiny)",
+        "-1",
+        "(1)",
+    ): "of two dimensions the second is the last",
 }

@@ -53,12 +53,16 @@ class ScikitEstimator:
         setattr(self, own, type(kernel)(**(known | {nested: value})))
 
     def score(self, x: Any, y: Any, sample_weight: Any = None) -> float:
-        """R^2 of the prediction at x, (P, n), as scikit-learn's regressors have it."""
+        """R^2 of the prediction at x, (P, n), as scikit-learn's regressors have it.
+
+        The mean over the outputs; of constant targets 1 where they are met exactly, else 0.
+        """
         truth, found = np.asarray(y, np.float64), np.asarray(self.predict(x), np.float64)  # type: ignore[attr-defined]
         weight = np.ones(len(truth)) if sample_weight is None else np.asarray(sample_weight, np.float64)
         weight = weight.reshape(-1, *[1] * (truth.ndim - 1))
         total = (weight * (truth - np.average(truth, 0, weight.ravel())) ** 2).sum(0)
-        return float(np.mean(1 - (weight * (truth - found) ** 2).sum(0) / np.where(total > 0, total, 1)))
+        left = (weight * (truth - found) ** 2).sum(0)
+        return float(np.mean(1 - np.where(total > 0, left / np.where(total > 0, total, 1), left > 0)))
 
     def __repr__(self) -> str:
         arguments = ", ".join(f"{name}={value!r}" for name, value in self.get_params(deep=False).items())

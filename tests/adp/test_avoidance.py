@@ -93,3 +93,11 @@ def test_what_breaks_a_rule_is_refused(given: dict[str, object], message: str) -
         adp.plan_around(LINE, cost_of(), tensor([[3.0, 0.0]]), dt=0.1, steps=4, shrink=(0.0,), compile=False)
     with pytest.raises(ValueError, match=r"`plan_around\(shrink=...\)` must have at least one share"):
         adp.plan_around(LINE, cost_of(), tensor([[3.0, 0.0]]), dt=0.1, steps=4, shrink=())
+
+
+def test_the_nearest_obstacle_is_found_for_any_leading_dimensions() -> None:
+    cost = adp.AvoidanceCost(
+        1.0, 1.0, dim=2, inputs=2, obstacles=[lambda x: x[..., 0], lambda x: x[..., 1] + 0.1], reach=1.0
+    )
+    x = uniform(3, 4, 2, seed=1)
+    assert torch.equal(cost.outside(x), torch.minimum(x[..., 0], x[..., 1] + 0.1))

@@ -342,3 +342,23 @@ def test_a_condition_that_bends_is_met_or_the_slack_says_so(decay: float) -> Non
     assert bool((missing[met] <= 2e-6 * asked[met] + 1e-12).all())
     assert bool((missing[~met] > 0).all())
     assert float(met.double().mean()) > 0.9
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_of_two_inputs_the_squares_of_what_is_missing_are_least_wherever_nothing_fits(seed: int) -> None:
+    normals, least = uniform(200, 3, 2, seed=seed), uniform(200, 3, seed=seed + 10, low=0.2, high=1.5)
+    wanted, low, high = uniform(200, 2, seed=seed + 20), tensor([-0.8, -torch.inf]), tensor([torch.inf, 0.9])
+    found = nearest_admissible(wanted, normals, least, low, high, cases(3, low.tolist(), high.tolist()))
+    length = normals.norm(dim=-1)
+
+    def missing(u: Tensor) -> Tensor:
+        short = least / length - (normals / length.unsqueeze(-1) * u.unsqueeze(-2)).sum(-1)
+        return short.clamp(min=0).square().sum(-1)
+
+    none = found.shortfall > 1e-6
+    assert 20 < int(none.sum()) < 200
+    for size in (1e-3, 0.1, 2.0):
+        for turn in range(60):
+            other = found.point + size * uniform(200, 2, seed=100 + turn)
+            other = torch.minimum(torch.maximum(other, low), high)
+            assert bool((missing(other) >= missing(found.point) - 1e-8)[none].all())

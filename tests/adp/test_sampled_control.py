@@ -6,8 +6,10 @@ import math
 
 import pytest
 import torch
+from helpers import uniform
 
 from staf_torch import adp, systems
+from staf_torch.adp.holding import Holding
 from staf_torch.adp.sampling import exact_hold
 
 SCALAR = systems.Linear([[0.0]], [[1.0]])
@@ -110,3 +112,18 @@ def test_others_that_move_by_themselves_do_not_make_a_loop_unstable() -> None:
         if stable:
             assert found.spectral_radius == pytest.approx(mass.spectral_radius, abs=1e-9)
             assert found.largest_period == pytest.approx(mass.largest_period, rel=1e-4)
+
+
+@pytest.mark.parametrize("discount", [0.0, 0.7])
+@pytest.mark.parametrize("substeps", [5, (3, 9)])
+def test_a_control_that_is_asked_again_and_stays_costs_what_a_held_one_costs(
+    discount: float, substeps: int | tuple[int, int]
+) -> None:
+    plant = systems.Linear([[0.0, 1.0], [-1.0, 0.2]], [[0.0], [1.0]])
+    cost = adp.QuadraticCost(1.0, 0.5, dim=2, inputs=1, discount=discount)
+    x, u = uniform(4, 2, seed=1), uniform(4, 1, seed=2)
+    held = Holding("simulate", plant, cost, 0.3, substeps)
+    after, paid = held(x, u)
+    again, spent = held(x, u, lambda now: u)
+    torch.testing.assert_close(again, after, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(spent, paid, rtol=1e-4, atol=1e-5)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 from helpers import basis_of, tensor, uniform
@@ -170,3 +172,10 @@ def test_an_ensemble_is_called_by_vmap(name: str) -> None:
 
     together = torch.func.vmap(call)(parameters, buffers)
     torch.testing.assert_close(together, torch.stack([member(y) for member in members]))
+
+
+def test_the_largest_reach_is_nothing_for_a_kernel_that_does_not_mind() -> None:
+    x = tensor([[300.0, 0.0], [math.nan, 0.0], [3.0, 4.0]])
+    assert basis_of("gaussian").largest_reach(x) == 0
+    assert basis_of("exponential", radius=0.5).largest_reach(x) == pytest.approx(150)
+    assert basis_of("exponential", radius=0.5).largest_reach(x[1:2]) == 0

@@ -16,6 +16,7 @@ from variants import KERNELS, LAYOUTS, RADII, directions_of, over
 import staf_torch as st
 from staf_torch.approximation.conditioning import lebesgue_constant, sup_error
 from staf_torch.centers import probe_points
+from staf_torch.centers.layouts import _exchange
 from staf_torch.targets import Cosine, Paper
 
 
@@ -230,3 +231,10 @@ def test_ball_is_no_worse_than_the_rings_in_the_plane() -> None:
             for u in (st.ball(count, 2), st.rings(count))
         ]
         assert (errors[0] <= 3 * errors[1]).all()
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_no_exchange_of_a_row_that_was_chosen_gains_one_percent(seed: int) -> None:
+    matrix = torch.randn(60, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+    chosen = _exchange(matrix, torch.arange(6))
+    assert float((matrix @ torch.linalg.inv(matrix[chosen])).abs().max()) < 1.01 + 1e-9

@@ -128,3 +128,15 @@ def test_bad_input_is_refused_by_name() -> None:
         env.step(np.array([1.0, 2.0]))
     with pytest.raises(ValueError, match=r"must be \(1, 2\) and finite"):
         env.reset(options={"state": [1.0, 2.0, 3.0]})
+
+
+def test_an_episode_without_a_horizon_of_its_own_takes_ten_seconds() -> None:
+    env = gymnasium.make("staf_torch/TwoState-v0", spread=1e-15)  # so near rest that it stays there
+    env.reset(seed=0)
+    steps, over = 0, False
+    while not over:
+        *_, ended, over, _ = env.step(np.zeros(env.action_space.shape))
+        steps += 1
+        assert not ended
+        assert steps <= 1000
+    assert steps == 1000

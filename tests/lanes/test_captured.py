@@ -11,6 +11,7 @@ from torch import Tensor
 
 from staf_torch import lanes
 from staf_torch.lanes import compiler
+from staf_torch.lanes.captured import _same
 
 pytestmark = pytest.mark.needs_compiler
 
@@ -154,3 +155,10 @@ def test_what_is_computed_twice_of_captured_numbers_is_read_once_unless_it_was_w
         assert program.compiles(x, steps=1)
         found, wanted = program(x, steps=1)[0], program.definition(x, steps=1)[0]
         torch.testing.assert_close(found, wanted, rtol=1e-12, atol=0)
+
+
+def test_only_one_number_is_the_same_as_a_number() -> None:
+    assert _same(torch.tensor(2.0), 2.0)
+    assert _same(torch.tensor([[2.0]]), 2.0)
+    assert not _same(torch.tensor(2.0), 3.0)
+    assert not _same(torch.tensor([2.0, 2.0]), 2.0)

@@ -67,6 +67,7 @@ OPERATIONS: dict[str, Callable[[Tensor], Tensor]] = {
     "atanh": lambda x: torch.atanh(x / (1 + x.abs())),
     "erfc": torch.erfc,
     "erfinv": lambda x: torch.erfinv(x / (1 + x.abs())),
+    "erfinv near one": lambda x: torch.erfinv((1 - 1e-9 * x.abs()).copysign(x)),
     "lgamma": lambda x: torch.lgamma(x.abs() + 0.1),
     "copysign": lambda x: torch.copysign(x, -x.flip(-1)),
     "angle": torch.angle,

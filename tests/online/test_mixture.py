@@ -6,6 +6,8 @@ import torch
 
 from staf_torch.online.bank import Bank
 from staf_torch.online.bank_rules import BankShape
+from staf_torch.online.kalman_filter import SURPRISE
+from staf_torch.online.mixture_definition import judge
 
 
 def test_what_a_function_that_saturates_takes_is_mapped_and_other_functions_are_left() -> None:
@@ -27,3 +29,20 @@ def test_what_a_function_that_saturates_takes_is_mapped_and_other_functions_are_
     assert mean < 0.95 * straight
     _, straight, mean = errors["does not"]
     assert mean < 1.01 * straight
+
+
+def test_no_single_error_moves_the_calibration_far() -> None:
+    draw = torch.Generator().manual_seed(1)
+    bank = Bank(BankShape(1, 1, 128, 8), 1, True)
+    x = torch.randn(60, 1, 1, generator=draw, dtype=torch.float64)
+    y = x.sin() + 0.1 * torch.randn(60, 1, 1, generator=draw, dtype=torch.float64)
+    rules, definition = bank._definition.rules, bank._definition
+    for k in range(60):
+        bank.predict(x[k])
+        bank.learn(x[k], y[k])
+    for size in (3.0, 1e2, 1e6):
+        stream = definition.each(bank.table.clone())[0]
+        before = stream["calibration"].clone()
+        judge(rules, stream, stream["mean"] + size, torch.tensor([True]), stream.number("clock"))
+        assert bool(stream["calibration"] > before)
+        assert bool(stream["calibration"] <= before * (1 + max(rules.error_rate, 1 / 60) * (SURPRISE - 1)))

@@ -84,3 +84,15 @@ def test_river_pipelines_take_the_adapter() -> None:
         preprocessing.StandardScaler(), RiverRegressor(st.StaFRegressor(memory=128, neighbours=8))
     )
     assert evaluate.progressive_val_score(samples, model, metrics.MAE()).get() < 0.3 * y.std()
+
+
+def test_a_score_is_that_of_scikit_learn_for_constant_targets_too() -> None:
+    r2_score = pytest.importorskip("sklearn.metrics").r2_score
+    draw = np.random.default_rng(0)
+    x = draw.standard_normal((40, 2))
+    for y in (np.sin(x[:, 0]), np.full(40, 3.0), np.stack([np.sin(x[:, 0]), np.full(40, 3.0)], 1)):
+        model = st.StaFRegressor(noise=0.1).fit(x, y)
+        for truth in (y, y + 1e-3, model.predict(x)):
+            for weight in (None, draw.uniform(0.5, 2.0, 40)):
+                wanted = r2_score(truth, model.predict(x), sample_weight=weight)
+                assert model.score(x, truth, weight) == pytest.approx(wanted, rel=1e-9, abs=1e-12)

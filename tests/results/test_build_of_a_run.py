@@ -31,3 +31,11 @@ def test_a_module_is_recorded_with_what_it_imports_and_an_installed_one_with_its
     package = {name for name in found if name.partition(".")[0] == "plants"}
     assert package >= {"plants.own", "plants.near", "plants.sub.far"}
     assert set(found) - package == ({"other", "further"} if folder == "mine" else set())
+
+
+def test_long_values_are_cut_and_a_module_without_a_file_has_no_hash() -> None:
+    assert build._shown("a" * 80) == "a" * 80
+    assert build._shown("a" * 81) == "a" * 77 + "..."
+    assert build._shown([1, 2]) == "[1, 2]"
+    assert build._hash("no_module_of_this_name.anywhere") is None
+    assert build._hash("staf_torch.results.build") is not None

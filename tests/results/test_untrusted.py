@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from staf_torch.results.build import digest
-from staf_torch.results.untrusted import UnreadableError, links_in, open_regular, too_deep
+from staf_torch.results.untrusted import UnreadableError, _plain_file, links_in, open_regular, too_deep
 
 
 def test_links_of_every_kind_are_found_and_files_and_folders_are_none(tmp_path: Path) -> None:
@@ -53,3 +53,18 @@ def test_what_lies_behind_a_linked_folder_is_not_read(tmp_path: Path) -> None:
     for read in (digest, open_regular):
         with pytest.raises(UnreadableError):
             read(behind, root=tmp_path / "run")
+
+
+def test_a_file_that_goes_while_it_is_looked_at_is_no_link(tmp_path: Path) -> None:
+    (tmp_path / "one").touch()
+    with os.scandir(tmp_path) as entries:
+        (entry,) = entries
+    (tmp_path / "one").unlink()
+    assert _plain_file(entry)
+
+
+def test_a_second_name_of_a_file_is_no_plain_file(tmp_path: Path) -> None:
+    (tmp_path / "one").touch()
+    os.link(tmp_path / "one", tmp_path / "two")
+    with os.scandir(tmp_path) as entries:
+        assert not any(_plain_file(entry) for entry in entries)

@@ -13,7 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from staf_torch import StateRadius
 from staf_torch.cli.staf import config_directory
-from staf_torch.settings.chase import ChaseProblem, chase_problem
+from staf_torch.settings.chase import ChaseProblem, _key, chase_problem
 from staf_torch.sweeps.hydra_compat.program import named_packages, trusted
 
 GROUPS = ("kernel", "centers", "target", "system", "optimizer")
@@ -170,3 +170,11 @@ def test_a_bad_value_is_named(name: str) -> None:
         error = error.__cause__
     for words in expected:
         assert words in "\n".join(messages)
+
+
+def test_settings_that_differ_by_what_they_refer_to_are_not_the_same_part() -> None:
+    one, two = (OmegaConf.create({"a": value, "part": {"b": "${a}"}}).part for value in (1, 2))
+    again = OmegaConf.create({"a": 1, "part": {"b": 1}}).part
+    assert _key(one) != _key(two)
+    assert _key(one) == _key(again)
+    assert _key(one) != _key(None)

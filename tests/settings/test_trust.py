@@ -30,3 +30,17 @@ def test_a_number_at_its_limit_is_accepted_and_one_more_is_refused(
         else:
             with pytest.raises(ValueError, match=re.escape(f"and {most:g} is the most")):
                 trust.checked(read, "config.yaml")
+
+
+@pytest.mark.parametrize("count", [trust._MOST_ENTRIES, trust._MOST_ENTRIES + 1])
+def test_a_list_may_have_so_many_entries_and_no_more(count: int, tmp_path: Path) -> None:
+    path = tmp_path / "config.yaml"
+    path.write_text(yaml.safe_dump({"radii": [0.5] * count}))
+    read = read_settings(path, tmp_path)
+    if count == trust._MOST_ENTRIES:
+        assert trust.checked(read, "config.yaml")["radii"] == [0.5] * count
+    else:
+        with pytest.raises(
+            ValueError, match=f"lists {count} entries, and {trust._MOST_ENTRIES} are the most"
+        ):
+            trust.checked(read, "config.yaml")

@@ -207,3 +207,21 @@ def test_a_missing_scipy_is_named_with_the_extra_that_brings_it(monkeypatch: pyt
     one = torch.eye(2, dtype=torch.float64)
     with pytest.raises(ValueError, match=r"needs SciPy.*staf_torch\[adp\]"):
         riccati(one, one, one, one)
+
+
+def test_a_plant_without_a_number_of_states_says_so() -> None:
+    plant = systems.Linear([[0.0]], [[1.0]])
+    plant.dim = None
+    with pytest.raises(ValueError, match=r"`Linear.dim` must be the number of states; got None"):
+        plant._size()
+
+
+def test_functions_from_outside_take_any_leading_dimensions() -> None:
+    def step(x: torch.Tensor, u: torch.Tensor) -> torch.Tensor:
+        return x.sin() + u * torch.ones(2, dtype=x.dtype)
+
+    plant = systems.StepPlant(step, dim=2, inputs=1, dt=0.1)
+    x, u = uniform(3, 4, 5, 2, seed=1), uniform(4, 5, 1, seed=2)
+    found = plant.step(x, u)
+    assert found.shape == (3, 4, 5, 2)
+    assert torch.equal(found, x.sin() + u)

@@ -16,7 +16,7 @@ from sweep_runs import BAD_COUNT, error, write_run, write_sweep
 from staf_torch.cli.table import main
 from staf_torch.results.reader import Collection, collect
 from staf_torch.tables import Layout, Style, Table, json_text, latex_text, parquet_bytes, tabulate
-from staf_torch.tables.aggregate import AGGREGATES, student_quantile
+from staf_torch.tables.aggregate import AGGREGATES, _expansion, student_quantile
 from staf_torch.tables.model import escape
 
 PIVOT = Layout(
@@ -304,3 +304,8 @@ def test_command_ends_with_one_sentence(
     out, err = capsys.readouterr()
     assert out == ""
     assert said in err.splitlines()[-1]
+
+
+@pytest.mark.parametrize("freedom", [200, 300, 400])
+def test_every_term_of_the_expansion_of_students_quantile_counts(freedom: int) -> None:
+    assert _expansion(freedom) == pytest.approx(float(student.ppf(0.975, freedom)), abs=1 / freedom**5)

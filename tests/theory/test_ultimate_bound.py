@@ -6,9 +6,11 @@ import math
 
 import pytest
 import torch
+from helpers import basis_of
 from variants import RATED, over
 
 from staf_torch import optim, theory
+from staf_torch.targets import Paper
 from staf_torch.theory.ultimate_bound import DriftConstants, ultimate_bound
 
 CONSTANTS = [DriftConstants(condition_number=30.0, speed=2.0, growth=growth) for growth in (0.0, 0.7, 40.0)]
@@ -52,3 +54,13 @@ def test_the_bound_is_the_fixed_point_of_its_recursion() -> None:
     found = ultimate_bound(constants, law, dt=dt, inner_steps=8)
     assert found.before == pytest.approx(s**2, rel=1e-9)
     assert found.after == pytest.approx((q * s) ** 2, rel=1e-9)
+
+
+def test_a_step_for_no_excess_and_velocities_of_another_shape_are_refused() -> None:
+    basis, target = basis_of("gaussian"), Paper()
+    states = torch.zeros(4, 2, dtype=torch.float64)
+    for excess in (0.0, -1.0, math.nan):
+        with pytest.raises(ValueError, match=r"paper_step\(excess="):
+            theory.paper_step(basis, target, states, states, excess=excess)
+    with pytest.raises(ValueError, match=r"velocities=\.\.\.\)` must have the shape of the states, \(4, 2\)"):
+        theory.drift_constants(basis, target, states, states[:3])

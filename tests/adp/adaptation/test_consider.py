@@ -101,3 +101,11 @@ def test_a_filter_of_other_states_is_refused() -> None:
     cost, law = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1), adp.LeastSquares([0.1, 1.0], 1.0)
     with pytest.raises(ValueError, match="filter"):
         adp.AdaptiveLQR(PENDULUM, cost, adp.IntegralWindows(PENDULUM, 0.1), law, filter=other)
+
+
+def test_what_noise_was_given_is_kept_to_the_last_bit() -> None:
+    for given in (0.1, [0.1, 0.3]):
+        made = adp.ConsiderFilter(PENDULUM, noise=given, process=0.7)
+        wanted = torch.tensor([0.1, 0.1] if given == 0.1 else given, dtype=torch.float64)
+        assert torch.equal(made.noise, wanted)
+        assert torch.equal(made.process, torch.tensor([0.7, 0.7], dtype=torch.float64))

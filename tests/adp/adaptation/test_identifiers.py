@@ -231,3 +231,19 @@ def test_the_variance_of_a_measured_rate_is_that_of_its_noise() -> None:
     equation = adp.measured_rate(MODEL, x, u, PENDULUM.motion(x, u), 0.3)
     torch.testing.assert_close(equation.variance, torch.full_like(equation.variance, 0.09))
     assert bool(equation.ready.all())
+
+
+def test_a_step_of_the_gradient_law_takes_any_leading_dimensions() -> None:
+    law, dt = adp.ConcurrentGradient(gain=2.0, rate=0.5), 0.1
+    s, theta, push = uniform(3, 4, 5, 2, seed=1), uniform(3, 4, 2, seed=2), uniform(3, 4, 2, seed=3)
+    gram, moment = s.mT @ s, uniform(3, 4, 2, seed=4)
+    found = law.step(theta, gram, moment, dt, push)
+    # implicit Euler: (after - theta) / dt = rate (gain (moment - gram after) + push)
+    pull = 2.0 * (moment - (gram @ found.unsqueeze(-1)).squeeze(-1)) + push
+    torch.testing.assert_close((found - theta) / dt, 0.5 * pull, rtol=1e-10, atol=1e-12)
+
+
+def test_a_plant_is_tried_without_the_users_random_numbers() -> None:
+    before = torch.get_rng_state()
+    adp.ParametricPlant(lambda x, u: (x * u).unsqueeze(-1), dim=1, inputs=1, theta=[0.5])
+    assert torch.equal(before, torch.get_rng_state())
