@@ -6,11 +6,14 @@ import math
 
 import pytest
 import torch
+from helpers import uniform
+from torch import Tensor
 
 from staf_torch import adp, systems
 from staf_torch.adp.shooting import starts
 from staf_torch.adp.shooting.direct import _cheapest
 from staf_torch.adp.shooting.newton import Plan
+from staf_torch.adp.shooting.stage import Stage
 
 DOUBLE = systems.Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
 COST = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
@@ -132,3 +135,29 @@ def test_a_guess_is_followed_along_its_knots_until_the_base_takes_over() -> None
     said = {0.0: 0.0, 0.5: 0.5, 1.0: 1.0, 1.5: 3.0, 1.75: 4.0, 2.0: 9.0, 3.0: 9.0}
     for time, want in said.items():
         torch.testing.assert_close(control(x, time), torch.full((3, 1), want, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("affine", [True, False])
+def test_the_gap_of_a_control_is_what_its_hamiltonian_exceeds_the_least_by(affine: bool) -> None:
+    def cubic(x: Tensor, u: Tensor) -> Tensor:
+        return torch.cat((x[..., 1:], u + 0.1 * u**3 - x[..., :1]), -1)
+
+    if affine:
+        plant: systems.Plant = systems.TwoState()
+    else:
+        plant = systems.RatePlant(cubic, dim=2, inputs=1)
+    cost = adp.QuadraticCost(1.0, 0.5, dim=2, inputs=1, low=-0.8, high=0.8)
+    x, costate, v = uniform(50, 2, seed=1), 2 * uniform(50, 2, seed=2), 0.8 * uniform(50, 1, seed=3)
+    gap = Stage(plant, cost).gap(x, v, costate)
+    slope = torch.func.vmap(torch.func.jacrev(lambda x, u: plant.motion(x[None], u[None])[0], argnums=1))(
+        x, v
+    )
+    pull = (slope * costate.unsqueeze(-1)).sum(-2)  # p' df/du, (B, m)
+
+    def hamiltonian(u: Tensor) -> Tensor:
+        return 0.5 * u.square().sum(-1) + (pull * u).sum(-1)
+
+    tried = torch.stack(
+        [hamiltonian(torch.full((50, 1), u).double()) for u in torch.linspace(-0.8, 0.8, 2001)]
+    )
+    torch.testing.assert_close(gap, hamiltonian(v) - tried.amin(0), rtol=1e-4, atol=1e-5)

@@ -14,11 +14,13 @@ from variants import KERNELS, over
 
 import staf_torch as st
 from staf_torch import systems
+from staf_torch.adp.simulation import LoopResult
 from staf_torch.approximation.conditioning import sup_error
 from staf_torch.engine import ChaseResult, chase_pieces
 from staf_torch.metrics import ball_error as ball_errors
 from staf_torch.metrics.ball_error import StateErrorPass
 from staf_torch.metrics.chase import ChaseMetrics, Member
+from staf_torch.metrics.closed_loop import tracking_metrics
 from staf_torch.numerics.linalg import condition_number
 from staf_torch.optim import SteepestDescent
 from staf_torch.targets import Paper
@@ -262,3 +264,31 @@ def test_window_of_the_paper_starts_at_its_settling_time() -> None:
     for dt in (0.05, 0.01, 0.001, 0.1, 0.3):
         assert Member(1, dt, 30 * dt).first == 30
         assert math.ceil(30 * dt / dt - 1e-9) == 30
+
+
+def test_tracking_is_measured_over_the_rows_that_did_not_diverge() -> None:
+    frozen = tensor([math.inf, math.inf, 0.3, math.inf])
+    state = uniform(4, 20, 4, seed=1)
+    result = LoopResult(
+        time=torch.arange(20).double(),
+        state=state,
+        control=uniform(4, 20, 1, seed=2),
+        actor_weights=torch.zeros(4, 20, 0),
+        critic_weights=torch.zeros(4, 20, 0),
+        running_cost=uniform(4, 20, seed=3) + 2,
+        identifier=torch.zeros(4, 20, 0),
+        frozen_at=frozen,
+    )
+    optimal, kept = tensor([0.5, 2.0, 1.0, math.nan]), [0, 1, 3]
+    truth, parameters = uniform(3, 2, seed=4), uniform(4, 20, 3, 2, seed=5)
+    found = tracking_metrics(result, parameters, truth, optimal)
+    assert found["cost"] == float(result.cost[kept].median())
+    ratios = sorted((result.cost[:2] / optimal[:2]).tolist())
+    assert found["cost_ratio"] in (ratios[0], pytest.approx(sum(ratios) / 2))
+    assert found["final_error"] == float(state[kept, -2:, :2].norm(dim=-1).max())
+    assert found["parameter_error"] == float((parameters[kept, -1] - truth).flatten(-2).norm(dim=-1).max())
+    assert found["diverged_fraction"] == 0.25
+    bare = tracking_metrics(result, None, truth, None)
+    assert bare["cost_ratio"] is None
+    assert bare["parameter_error"] is None
+    assert bare["cost"] == found["cost"]

@@ -73,3 +73,23 @@ def test_a_box_that_is_none_is_refused(low: float, confidence: float, rule: str)
     box = {"theta_low": [0.0, low], "theta_high": [1.0, 1.5]}
     with pytest.raises(ValueError, match=rule):
         adp.RobustFilter(WANTED, PENDULUM, edge, WINDOWS, law, dt=DT, confidence=confidence, **box)
+
+
+def test_a_control_is_left_to_the_last_bit_where_and_only_where_every_corner_allows_it() -> None:
+    mild = adp.Feedback(lambda x: 1.5 * x[..., :1] + 0.3)
+    low, high = tensor([0.0, 0.6]), tensor([0.4, 1.5])
+    law = adp.LeastSquares((0.5 * (low + high)).tolist(), deviation=(0.25 * (high - low)).tolist())
+    box = {"theta_low": low.tolist(), "theta_high": high.tolist()}
+    safe = adp.RobustFilter(mild, PENDULUM, edge, WINDOWS, law, dt=DT, decay=4.0, **box)
+    x = uniform(300, 2, seed=5, low=-0.6, high=0.6)
+    wanted, u = mild.policy(x), safe.step(x, safe.init(x), x.new_zeros(300, 0, 2), DT)[0]
+    rooms = []
+    for first in (0.0, 0.4):
+        for second in (0.6, 1.5):
+            z = adp.ChangingPlant(PENDULUM).start(x, tensor([first, second]).repeat(300, 1), at=1.0)
+            normal, least, _ = safe.filter.inequalities(z, wanted, x[:, 0])
+            rooms.append(((normal * wanted.unsqueeze(-2)).sum(-1) - least).amin(-1))
+    room, left = torch.stack(rooms).amin(0), (u == wanted).all(-1)
+    assert 30 < int(left.sum()) < 290
+    assert bool(left[room > 1e-6].all())
+    assert not bool(left[room < -1e-6].any())
