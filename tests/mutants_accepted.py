@@ -21,6 +21,7 @@ _STYLE = (
     "handlelength",
     "frameon",
     "rotation",
+    "size",
 )
 _SPEED = "decides which of two ways that find the same is taken: the threshold is of speed alone"
 _EDGE = "a number that equals a tolerance (below 1e-3) to the last bit, which none does but by chance"
@@ -28,6 +29,10 @@ _LENGTHS = "an assertion of our own that lengths agree; other assertions are no 
 _TOLERANCE = 1e-3
 _LIMIT = "a limit that is chosen, of a hundred or more, by one"
 _SIZE = "the size of a page of figures"
+_ONES = "zeros and ones, which are exact in every dtype, and meet numbers of float64"
+_DIGITS = "how many digits a table or a log shows"
+_ROWS = "of (B, n), the one shape that comes there"
+_TIE = "of two that are equal to the last bit either is right"
 _EDGES = {ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt}
 _ROOT = Path(__file__).resolve().parent.parent
 
@@ -42,8 +47,10 @@ def accepted(mutant: Mutant) -> str | None:
         return _DEVICE
     if _without(mutant, "encoding"):
         return _ENCODING
-    if mutant.room == "figures" and any(_without(mutant, name) for name in _STYLE):
+    if mutant.room == "figures" and any(_without(mutant, name) or _of(mutant, name) for name in _STYLE):
         return _LOOKS
+    if mutant.room == "adp" and mutant.was.startswith("torch.eye(") and _without(mutant, "dtype"):
+        return _ONES
     if _of_a_limit(mutant):
         return _LIMIT
     if mutant.room == "figures" and re.search(r"\bpage\(", mutant.context) and _is_number(mutant.was):
@@ -69,6 +76,11 @@ def _without(mutant: Mutant, name: str) -> bool:
     """Whether all that a mutant changes is that a call lacks an argument of that name."""
     fewer = re.sub(rf",?\s*\b{name}=[^,()]*(\([^()]*\))?[^,()]*(?=[,)])", "", mutant.was, count=1)
     return fewer != mutant.was and _plain(fewer) == _plain(mutant.now)
+
+
+def _of(mutant: Mutant, name: str) -> bool:
+    """Whether a mutant changes the number of an argument of that name."""
+    return _is_number(mutant.was) and f"{name}={mutant.was}" in mutant.context
 
 
 def _of_lengths(mutant: Mutant) -> bool:
@@ -111,6 +123,173 @@ def _plain(text: str) -> str:
 
 # (file, line, what changes, into what) -> why
 ACCEPTED: dict[tuple[str, str, str, str], str] = {
+    (
+        "staf_torch/adp/detour_plans.py",
+        "found = self._rows(torch.cat((x, known), dim=-1))",
+        "-1",
+        "(1)",
+    ): _ROWS,
+    (
+        "staf_torch/experiments/avoidance.py",
+        "return torch.zeros(2, dtype=torch.float64)",
+        "torch.zeros(2, dtype=torch.float64)",
+        "torch.zeros(2)",
+    ): _ONES,
+    (
+        "staf_torch/lanes/fusion.py",
+        "if 8 * len(entries) > 10 * len(set(entries)) or length[node] + more > _LONGEST:",
+        "8 * len(entries) > 10 * len(set(entries)) or length[node] + more > _LONGEST",
+        "(8 * len(entries) > 10 * len(set(entries)) and length[node] + more > _LONGEST)",
+    ): _SPEED,
+    (
+        "staf_torch/lanes/tracing.py",
+        'shapes = ({0: Dim("batch", min=1)},) if batch is None else None',
+        "1",
+        "2",
+    ): "the program takes one row all the same: torch checks no lower end",
+    (
+        "staf_torch/lanes/program.py",
+        "program = Program(step, name=self.name, compile=self.compile, copies=self.copies)",
+        "Program(step, name=self.name, compile=self.compile, copies=self.copies)",
+        "Program(step, compile=self.compile, copies=self.copies)",
+    ): "a name in messages",
+    (
+        "staf_torch/metrics/chase.py",
+        "last = 0.0 if member.first <= 0 else _largest(found.last_above, rows, kept)",
+        "member.first <= 0",
+        "(member.first < 0)",
+    ): "nothing is above the largest excess of a window that begins at 0",
+    (
+        "staf_torch/cli/deployable.py",
+        "OmegaConf.set_struct(cfg, True)  # a setting that is missing is an error, not None",
+        "True",
+        "False",
+    ): "every setting that a run has is looked at, so that None says the same sentence: all were tried",
+    (
+        "staf_torch/deploy/c_header.py",
+        'uniform = row.get("uniform", x0.new_zeros(1, 0, x0.shape[-1]))',
+        "0",
+        "1",
+    ): "a controller that draws nothing does not look at what is drawn",
+    ("staf_torch/adp/safety_filter.py", "steps, least, most, acted = record.unbind(-1)", "-1", "(1)"): _ROWS,
+    ("staf_torch/figures/sweep.py", "axes.grid(False)", "axes.grid(False)", "pass"): _LOOKS,
+    (
+        "staf_torch/online/mixture_definition.py",
+        's["blend"].copy_(torch.cat((straight, mapped[:, None]), -1))',
+        "-1",
+        "(1)",
+    ): "of (K, B), the one shape that comes there",
+    (
+        "staf_torch/adp/following.py",
+        "(last, paid), _ = scan(step, (x, torch.zeros_like(x[:, 0])), window)",
+        "0",
+        "1",
+    ): "zeros like another column, which has the same shape",
+    (
+        "staf_torch/sweeps/workers.py",
+        "os._exit(1)",
+        "1",
+        "2",
+    ): "a code that nobody reads: who would read it has ended",
+    (
+        "staf_torch/sweeps/launcher.py",
+        "self._directory.mkdir(parents=True, exist_ok=True)",
+        "self._directory.mkdir(parents=True, exist_ok=True)",
+        "pass",
+    ): "Hydra's own sweeper makes it before; others need not",
+    (
+        "staf_torch/local_basis/graded.py",
+        "if upper.dim() > 0 and upper.shape[-1] != 1:",
+        "-1",
+        "(1)",
+    ): "of (B, 1), the one shape of bounds that differ by row",
+    (
+        "staf_torch/experiments/faults.py",
+        'out.table("faults", dataclasses.replace(Table.of(table, _COLUMNS), style=Style(digits=5)))',
+        "5",
+        "6",
+    ): _DIGITS,
+    (
+        "staf_torch/experiments/laws.py",
+        "errors = StateErrorPass(problem.basis, problem.target, expected=expected)  # of the same states "
+        "always",
+        "StateErrorPass(problem.basis, problem.target, expected=expected)",
+        "StateErrorPass(problem.basis, problem.target)",
+    ): _SPEED,
+    (
+        "staf_torch/figures/chase.py",
+        'axes.set_aspect("equal", adjustable="datalim")',
+        'axes.set_aspect("equal", adjustable="datalim")',
+        "axes.set_aspect('equal')",
+    ): "which of the box and the limits gives way to equal units",
+    (
+        "staf_torch/adp/adaptation/adaptive_lqr.py",
+        "self._like = self._start(torch.zeros(1, int(model.dim or 0), dtype=torch.float64), None)",
+        "0",
+        "1",
+    ): "a model of no states, which its constructor refuses",
+    (
+        "staf_torch/experiments/adp.py",
+        "return int(8 * 40 * min(rows * duration / dt, 2e5))  # type: ignore[operator]",
+        "40",
+        "41",
+    ): "about how many bytes",
+    (
+        "staf_torch/experiments/faults.py",
+        "law = LeastSquares([0.0] * 4 + [1.0] * 2, deviation=[10.0] * 4 + [1.0] * 2, floor=1e-5)",
+        "0.0",
+        "1.0",
+    ): "a first estimate, and every row has its own",
+    (
+        "staf_torch/engine/row_program.py",
+        "gram = _symmetric(structure.scaled()).expand(*x.shape[:-1], problem.basis.count, "
+        "problem.basis.count)",
+        "-1",
+        "(1)",
+    ): _ROWS,
+    (
+        "staf_torch/adp/detour_plans.py",
+        "improved = self._begun(torch.cat((x, found), dim=-1))",
+        "-1",
+        "(1)",
+    ): _ROWS,
+    ("staf_torch/numerics/box.py", "lower = cost < value", "cost < value", "(cost <= value)"): _TIE,
+    (
+        "staf_torch/theory/uniform_approximation.py",
+        "better = gained > best",
+        "gained > best",
+        "(gained >= best)",
+    ): _TIE,
+    (
+        "staf_torch/experiments/avoidance.py",
+        "return int(torch.where(collides, nearest, nearest + 100).argmin())",
+        "100",
+        "101",
+    ): "metres, farther than any disc is",
+    (
+        "staf_torch/metrics/ball_error.py",
+        "if any(part.dim() > 2 and part.shape[-3] > 1 for part in (offsets, core)):",
+        "part.shape[-3] > 1",
+        "(part.shape[-3] >= 1)",
+    ): _SPEED,
+    (
+        "staf_torch/centers/layouts.py",
+        "update[column] -= 1.0",
+        "update[column] -= 1.0",
+        "update[column] += 1.0",
+    ): "the sign of a column, of which the size alone counts",
+    (
+        "staf_torch/lanes/captured.py",
+        "at += (np.arange(size) * stride).reshape([-1] + [1] * (tensor.dim() - axis - 1))",
+        "1",
+        "2",
+    ): "any negative length is the unknown one to NumPy",
+    (
+        "staf_torch/engine/api.py",
+        "carry._replace(time=torch.full_like(old, begins), diverged_at=old.clamp(max=0)),",
+        "0",
+        "1",
+    ): "a time at which rows diverged before, of which only the sign counts",
     (
         "staf_torch/systems/mujoco_plant.py",
         "lost = np.logical_or.accumulate(~(found[1:, :, 0] > found[:-1, :, 0]), axis=0)",

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ..lanes import Program
 from ..numerics.box import box_minimum
-from ..numerics.checks import integer, positive_real, trailing
+from ..numerics.checks import fail, integer, positive_real, trailing
 from .plans import LocalModel, Plan, Reference, Trajectories
 from .sampled_problem import Derivatives, SampledProblem
 
@@ -95,7 +95,8 @@ class BoxDDP:
             ValueError: if a shape is wrong.
         """
         n, m = self.problem.dim, self.problem.inputs
-        trailing("BoxDDP.solve", "x0", x0, 2, n)
+        if trailing("BoxDDP.solve", "x0", x0, 2, n).dim() != 2:
+            raise fail("BoxDDP.solve", "x0", f"must have the shape (B, {n})", tuple(x0.shape))
         expected = (len(x0), self.steps, m)
         if control is None:
             gains = (-self.problem.k).expand(*expected, n)

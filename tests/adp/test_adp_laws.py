@@ -250,3 +250,10 @@ def test_three_states_cost_in_their_first_second_what_the_reference_run_does() -
 def test_bad_arguments_are_refused_by_name(call: object, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         call()  # type: ignore[operator]
+
+
+@pytest.mark.parametrize("shape", [(3,), (3, 2), (1, 3, 1)])
+def test_gains_of_rows_have_one_number_a_row(shape: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match=r"`Gains\(critic=...\)` must be a number or of the shape \(B, 1\)"):
+        adp.Gains(critic=torch.ones(shape))
+    assert adp.Gains(critic=torch.ones(3, 1)).critic.shape == (3, 1)

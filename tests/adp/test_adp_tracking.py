@@ -88,6 +88,8 @@ def test_least_singular_value_of_the_full_stack_never_falls() -> None:
 def test_bad_arguments_are_refused_by_name() -> None:
     with pytest.raises(ValueError, match=r"`TwoStateTracking\(theta=...\)` must be \(..., 3, 2\)"):
         adp.TwoStateTracking([[1.0, 2.0]])
+    with pytest.raises(ValueError, match=r"`TwoStateTracking\(theta=...\)` must be"):
+        adp.TwoStateTracking(torch.full((3, 2), torch.nan, dtype=torch.float64))
     with pytest.raises(ValueError, match=r"`ConcurrentLearning\(size=...\)` must be at least 3"):
         adp.ConcurrentLearning(3, 2, size=2)
     with pytest.raises(ValueError, match=r"`LeadingCoordinates\(dim=...\)` must be at least 2"):

@@ -112,3 +112,13 @@ def test_constraints_plant_and_period_are_checked() -> None:
     ahead = usual()
     with pytest.raises(ValueError, match=r"`DetourRollout\(dt=...\)` must be that of the loop"):
         ahead.step(BESIDE, ahead.init(BESIDE), BESIDE, 0.2)
+
+
+def test_the_cheapest_detour_of_a_row_is_that_of_the_row_alone() -> None:
+    ahead = usual(steps=8)
+    x = BESIDE + torch.tensor([[-0.4, -0.3, -0.8, 0.0], [3.0, 2.0, 0.0, 0.0], [-0.2, 0.1, -0.9, 0.1]])
+    before, done = torch.zeros(3, 3).double(), torch.zeros(3, 1).double()
+    found = ahead.cheapest(x, before, done)
+    alone = torch.cat([ahead.cheapest(x[k : k + 1], before[:1], done[:1]) for k in range(3)])
+    assert torch.equal(found, alone)
+    assert 0 < int((found[:, 2] > 0).sum()) < 3

@@ -246,3 +246,16 @@ def test_controllers_of_a_policy_share_programs_and_no_plan() -> None:
     copied = pickle.loads(pickle.dumps(policy)).controller()
     assert copied._begun is not one._begun
     torch.testing.assert_close(copied.step(far, copied.init(far), none, 0.25)[0], u, rtol=0, atol=1e-6)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("plan", [True, False])
+def test_report_says_how_often_the_lqr_would_meet_a_bound(plan: bool) -> None:
+    plant = systems.Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
+    policy = adp.near_optimal(plant, COST, dt=0.25, low=-1.0, high=1.0, plan=plan)
+    for spread, share in ((1e-3, 0.0), (1e3, 1.0)):
+        far = policy._drawn(4, spread, 0)
+        planner = policy.plans()
+        assert planner is not None
+        assert float(planner.strained(far).double().mean()) == share
+    assert policy.report(states=4, spread=1e-3, optimum=False)["strained"] == 0.0

@@ -362,3 +362,34 @@ def test_of_two_inputs_the_squares_of_what_is_missing_are_least_wherever_nothing
             other = found.point + size * uniform(200, 2, seed=100 + turn)
             other = torch.minimum(torch.maximum(other, low), high)
             assert bool((missing(other) >= missing(found.point) - 1e-8)[none].all())
+
+
+def test_a_condition_that_no_control_moves_leaves_a_finite_slack_and_the_others_kept() -> None:
+    still = systems.Linear([[0.0, 0.0], [0.0, 0.0]], [[0.0], [1.0]])  # x1 moves by nothing
+
+    def both(x: Tensor, t: Tensor) -> Tensor:
+        return torch.stack((0.5 - x[:, 0], 0.4 - x[:, 1]), dim=-1)
+
+    def first(x: Tensor, t: Tensor) -> Tensor:
+        return 0.5 - x[:, 0]
+
+    def second(x: Tensor, t: Tensor) -> Tensor:
+        return 0.4 - x[:, 1]
+
+    guard = adp.SafetyFilter(
+        adp.Feedback(lambda x: torch.ones_like(x[..., :1])),
+        still,
+        [first, second],
+        dt=0.1,
+        decay=1.0,
+        degree=1,
+    )
+    x = tensor([[0.7, 0.39], [0.2, 0.39], [0.7, 0.0]])
+    u, margin, slack = guard._definition(torch.cat((x, torch.ones(3, 1).double(), x[:, :1] * 0), -1)).split(
+        [1, 2, 1], -1
+    )
+    assert bool(torch.isfinite(slack).all())
+    torch.testing.assert_close(margin, both(x, x[:, 0]))
+    assert (
+        float((second(x + 0.1 * torch.cat((0 * u, u), -1), x[:, 0]) - 0.9 * second(x, x[:, 0])).min()) > -1e-9
+    )

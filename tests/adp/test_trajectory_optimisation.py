@@ -187,3 +187,9 @@ def test_a_plan_where_the_cost_is_concave_in_the_control_leads_to_a_minimum() ->
     assert float(torch.linalg.eigvalsh(bent.reshape(10, 10)).min()) > 0
     (slope,) = torch.autograd.grad(cost_of(problem, x0, control).sum(), control)
     assert float(slope.abs().max()) < 1e-4
+
+
+@pytest.mark.parametrize("shape", [(2,), (3, 5), (1, 3, 2)])
+def test_states_of_another_shape_are_refused_by_name(shape: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match=r"`BoxDDP.solve\(x0=...\)` must have"):
+        adp.BoxDDP(BOUNDED, steps=3).solve(torch.zeros(shape, dtype=torch.float64))

@@ -82,6 +82,8 @@ def test_what_is_mistyped_is_not_valid(group: str, settings: Any, whole: dict[st
         ("target", {"_target_": "valley.Valley", "depth": [1, 2]}),
         ("centers", {"radius": "${spread}", "count": 6}),
         ("experiment", {"task": "closeness.closeness", "defaults": [{"override /kernel": "matern"}]}),
+        (".", {"animation": False, "adp": {"q": 1.0}}),
+        (".", {"animation": True}),
         (".", {"animation": "html", "adp": {"q": [[1.0, 0.0], [0.0, 2.0]]}}),
     ],
 )

@@ -31,7 +31,7 @@ from staf_torch import (
     systems,
     targets,
 )
-from staf_torch.deploy import formats, sheet
+from staf_torch.deploy import approximators, formats, sheet
 from staf_torch.deploy.c_header import need_c_compiler, runner_c
 
 PLANT = systems.TwoState()
@@ -305,3 +305,18 @@ def test_what_cannot_be_deployed_is_refused(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(ValueError, match=r"pip install 'staf_torch\[onnx\]'"):
         formats.need_onnx()
+
+
+@pytest.mark.parametrize("reach", [0.5, 3.0])
+@pytest.mark.parametrize("p", [1, 4, 9])
+def test_a_term_is_negligible_where_its_derivative_is_within_a_quarter_of_the_rounding(
+    p: int, reach: float
+) -> None:
+    eps, edge = 1e-6, 0.25e-6 / (p * max(1.0, reach) ** p)
+    for share, wanted in ((0.99, True), (1.01, False)):
+        terms = [
+            torch.ones(1).double(),
+            *[torch.zeros(1).double()] * (p - 1),
+            torch.tensor([share * edge]).double(),
+        ]
+        assert approximators._negligible(terms, eps, reach) == wanted

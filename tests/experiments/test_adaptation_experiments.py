@@ -74,3 +74,32 @@ def test_the_plant_is_the_published_one() -> None:
         -sine,
     ]
     torch.testing.assert_close(icl.published().velocity(z, u), torch.tensor([wanted]).double())
+
+
+def test_first_estimates_are_drawn_on_both_sides_of_zero_and_a_run_takes_its_time() -> None:
+    case = faults.short_period(400, torch.Generator().manual_seed(3))
+    drawn = case.adaptive.theta[:, :4]
+    assert -5 <= float(drawn.min()) < -4.9
+    assert 4.9 < float(drawn.max()) <= 5
+    assert abs(float(drawn.mean())) < 0.3
+    assert bool((case.adaptive.theta[:, 4:] == 1).all())
+    few = faults.short_period(2, torch.Generator().manual_seed(3))
+    result = faults._simulated(few, faults._controllers(few)["adaptive"], 0.1)
+    assert float(result.time[-1]) == pytest.approx(0.1)
+
+
+def test_a_picture_of_the_first_row_shows_its_own_change() -> None:
+    case = faults.unstable(3, torch.Generator().manual_seed(0))
+    case = case._replace(at=torch.tensor([0.3, 0.1, 0.5], dtype=torch.float64))
+    results = {"adaptive": faults._simulated(case, faults._controllers(case)["adaptive"], 0.6)}
+    picture = faults._picture(case, results)
+    for time, truth in zip(picture.time.tolist(), picture.truth.tolist(), strict=True):
+        assert truth == pytest.approx([1.0, 1.0] if time < 0.3 - 1e-9 else [0.5, 1.0])
+
+
+def test_the_masses_are_half_and_twice_that_of_the_design_in_turn() -> None:
+    case = faults.mass(6, torch.Generator().manual_seed(0))
+    assert case.after[:, 0].tolist() == [2.0, 0.5] * 3  # 1 / mass
+    assert torch.equal(case.before, case.after)
+    assert bool((case.x0[:, 0].abs() >= 0.5).all())
+    assert bool((case.x0[:, 1].abs() <= 1).all())

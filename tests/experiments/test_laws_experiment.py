@@ -18,6 +18,7 @@ from staf_torch import optim, predictors
 from staf_torch.cli.staf import config_directory
 from staf_torch.experiments import chase_batch, gradient_chase, laws
 from staf_torch.experiments.laws import cases
+from staf_torch.metrics.ball_error import StateErrorPass
 from staf_torch.settings.chase import chase_problem
 
 
@@ -106,3 +107,17 @@ def test_progress_is_told_in_times_of_whole_problems_and_ends_with_all(
         assert sum(told) == times * problems * done // (rows * times)
     assert min(told) > 0
     chase_batch._Told(None, rows, times, problems).more(1)
+
+
+def test_errors_along_the_same_states_are_found_by_the_pass_that_is_given() -> None:
+    problem = chase_problem(settings("dt=0.05", "duration=0.5", "settle_time=0.2"))
+    asked = []
+
+    class Heard(StateErrorPass):
+        def __call__(self, *given):  # type: ignore[no-untyped-def]
+            asked.append(given[0].shape)
+            return super().__call__(*given)
+
+    heard = Heard(problem.basis, problem.target)
+    chase_batch.simulate([problem], [None], [False], errors=heard)
+    assert asked

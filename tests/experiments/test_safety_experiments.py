@@ -88,6 +88,10 @@ def test_scenarios_begin_clear_of_the_discs_and_are_the_same_again() -> None:
     assert x0.shape == (50, 16)
     assert float(avoidance.distance(x0, 0.4).min()) > 0.6
     assert float(x0[:, 6:8].abs().max()) <= 0.3
+    away = settings("experiment=avoidance").avoidance.distance
+    torch.testing.assert_close(x0[:, :2].norm(dim=-1), torch.full((50,), away, dtype=torch.float64))
+    assert bool((x0[:, :2].amin(0) < -0.9 * away).all())  # from all sides
+    assert bool((x0[:, :2].amax(0) > 0.9 * away).all())
     assert x0.equal(avoidance.scenarios(cfg))
     with pytest.raises(ValueError, match="must leave room for a start"):
         avoidance.scenarios(settings("experiment=avoidance", "avoidance.radius=9", "trajectories=1"))

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import composing
 import pytest
+import torch
 from omegaconf import DictConfig
 
 from staf_torch.experiments import exponential_bound, feasibility, layouts
@@ -86,3 +87,18 @@ def test_bad_settings_are_named(name: str, override: str, message: str, tmp_path
     with pytest.raises(ValueError, match=message):
         run(name, tmp_path, override)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("count", [5, 9])
+def test_the_bound_is_of_as_many_states_as_are_stated(count: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = []
+    bound = exponential_bound.theory.layout_errors
+
+    def layout_errors(target: object, kernel: object, domain: torch.Tensor, *rest: object) -> torch.Tensor:
+        seen.append(len(domain))
+        return bound(target, kernel, domain, *rest)
+
+    monkeypatch.setattr(exponential_bound.theory, "layout_errors", layout_errors)
+    lines = ("exponential_bound.epsilons=[0.1]", f"exponential_bound.states={count}")
+    exponential_bound.solve(settings("exponential_bound", *lines))
+    assert seen == [len(exponential_bound.theory.disc(1.0, count=count))]

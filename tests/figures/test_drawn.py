@@ -269,6 +269,7 @@ def test_discs_are_drawn_at_five_times_of_the_first_half() -> None:
     nearest = {"a": np.array([0.3, -0.1, 0.2]), "b": np.array([0.5, 0.4])}
     history = safety.AvoidanceHistory(T, paths, wave(9, 2, 2), 0.4, distances, costs, nearest)
     plane, apart, share, cost = visible(safety.draw_avoidance(history))
+    assert {line.get_drawstyle() for line in share.get_lines()[:2]} == {"steps-post"}  # a share up to there
     shown = [0, 1, 2, 3, 4] if T[4] >= 0.5 * T[-1] > T[3] else []
     centers = [tuple(center) for at in shown for center in history.discs[at]]
     np.testing.assert_allclose([disc.center for disc in plane.patches], centers)
@@ -429,6 +430,7 @@ def test_layouts_are_drawn_by_family_and_the_first_four_against_the_radius() -> 
         for k, (family, count) in enumerate(tried)
     ]
     left, right = visible(theory.draw_layouts(found, 0.2, radii))
+    assert [len(axes.get_legend().get_texts()) > 1 for axes in (left, right)] == [True, True]
     rings = [3, 6, 10, 15, 21], [1e-3, 2e-3, 3e-3, 4e-3, 5e-3]
     names = "centers $M$", r"$\sup\,|V - \hat V|$ on the ball"
     holds(left, [("rings", *rings), ("polygon", [3], [6e-3]), ("simplex", [3], [7e-3])], names, scales=LOG)

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import os
+
 import pytest
 import torch
 from torch import Tensor
 
 from staf_torch import lanes
+from staf_torch.lanes.pages import LARGE, fresh
 
 pytestmark = pytest.mark.needs_compiler
 
@@ -122,3 +125,15 @@ def test_a_long_history_that_bypasses_the_caches_is_that_of_its_pieces(rows: int
         pieces.append(found)
     assert same_bits(whole, torch.cat(pieces, dim=1))
     assert same_bits(after, carry)
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+def test_a_child_process_writes_to_a_large_result_of_its_own() -> None:
+    given = fresh(torch.zeros(1, dtype=torch.float64), LARGE // 8)
+    given.zero_()
+    child = os.fork()
+    if not child:
+        given.numpy()[:] = 1.0
+        os._exit(0)
+    assert os.waitpid(child, 0)[1] == 0
+    assert not bool(given.any())

@@ -185,3 +185,13 @@ def test_rotations_give_eigenvalues_in_their_order_with_their_vectors(size: int)
     torch.testing.assert_close(found, torch.linalg.eigvalsh(gram), rtol=0, atol=1e-12)
     torch.testing.assert_close(vectors * found.unsqueeze(-2) @ vectors.mT, gram, rtol=0, atol=1e-12)
     torch.testing.assert_close(vectors.mT @ vectors, torch.eye(size).double().expand_as(gram))
+
+
+@pytest.mark.parametrize("lead", [(), (5,), (2, 3)])
+def test_reflections_take_any_leading_dimensions(lead: tuple[int, ...]) -> None:
+    torch.manual_seed(4)
+    matrix = torch.randn(*lead, 9, 9).double()
+    q, r = orthogonal(matrix)
+    torch.testing.assert_close(q @ r, matrix, rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(q @ q.mT, torch.eye(9).double().expand_as(q), rtol=1e-12, atol=1e-12)
+    assert torch.equal(r, r.triu())

@@ -91,3 +91,16 @@ def test_places_that_nested_loops_reach() -> None:
     assert evenly((3, 5, 7, 13, 15, 17), [2, 3]) == ([10, 2], 3)
     assert evenly((3, 5, 7, 13, 15, 18), [2, 3]) is None
     assert evenly(None, [2, 3]) == ([0, 0], 0)
+
+
+def test_a_chain_of_maps_needs_no_memory_between_its_links() -> None:
+    def chain(x: Tensor, now: Tensor, row: tuple[()]) -> tuple[Tensor, Tensor]:
+        y = x
+        for k in range(6):
+            y = (y * 0.9 + 0.1 * k).sin()
+        return y, y[:, 0] + now
+
+    x, u = given()
+    program = lanes.Program(chain)
+    text = program.text(x, u[:, :1])
+    assert len(re.findall(rf"V a\d+\[{SIZE}\]", text)) <= 1

@@ -268,3 +268,17 @@ def test_the_inverse_of_the_error_function_is_one_up_to_its_ends() -> None:
     found = erfinv(y)
     torch.testing.assert_close(torch.erf(found), y, rtol=0, atol=4e-16)
     assert torch.equal(found.sign(), y.sign())
+
+
+def test_multiples_of_a_summand_count() -> None:
+    a, b = torch.randn(5, 3, dtype=torch.float64), torch.randn(5, 3, dtype=torch.float64)
+
+    def step(_: object, __: object, row: tuple[Tensor, Tensor]) -> tuple[tuple[()], tuple[Tensor, ...]]:
+        x, y = row
+        some = (x.add(y, alpha=2), x.sub(y, alpha=2), x.add(y, alpha=1), x.add(y, alpha=-3), x.sub(y))
+        return (), some
+
+    program = lanes.Program(step)
+    found, wanted = (run((), (), (a, b), steps=1)[1] for run in (program, program.definition))
+    for one, other in zip(found, wanted, strict=True):
+        assert torch.equal(one, other)

@@ -27,6 +27,7 @@ pytestmark = pytest.mark.needs_compiler
 SOURCE = """
 import math, numpy as np, torch
 gain, unread, notes, table = 2.0, 1.0, [1.0, 2.0], {"gain": 2.0}
+names, other = {"a"}, 1.0
 array, tensor = np.array([1.0, 2.0]), torch.tensor(2.0, dtype=torch.float64)
 helpers = ModuleType("helpers")
 helpers.gain, helpers.twice = 2.0, lambda x: 2 * x
@@ -62,6 +63,7 @@ FUNCTIONS = dict(
     call=outer,
     entry=lambda x: x * notes[0],
     key=lambda x: x * table["gain"],
+    member=lambda x: x * (2.0 if "a" in names else 3.0),
     array=lambda x: x * float(array[0]),
     tensor=lambda x: x * tensor,
     module=lambda x: x * helpers.gain,
@@ -78,6 +80,7 @@ CHANGES: dict[str, Callable[[Any], Any]] = {
     "call": lambda m: setattr(m, "inner", lambda x: 5 * x),
     "entry": lambda m: m.notes.__setitem__(0, 3.0),
     "key": lambda m: m.table.update(gain=3.0),
+    "member": lambda m: m.names.clear(),
     "array": lambda m: m.array.__setitem__(0, 3.0),
     "tensor": lambda m: m.tensor.fill_(3.0),
     "module": lambda m: setattr(m.helpers, "gain", 3.0),

@@ -240,3 +240,31 @@ def test_fit_and_evaluation_work_under_function_transforms() -> None:
     forward = torch.vmap(torch.func.jacfwd(estimate))(x).squeeze(1)
     torch.testing.assert_close(forward, jacobian, rtol=1e-10, atol=1e-10)
     assert torch.autograd.gradcheck(lambda at: basis.ideal_weights(at, smooth_target), (x.requires_grad_(),))
+
+
+@pytest.mark.parametrize("size", [0.2, 0.6, 1.0])
+@pytest.mark.parametrize("lead", [(), (9,), (2, 3), (2, 1, 3)])
+def test_directions_of_any_length_and_states_of_any_leading_dimensions(
+    size: float, lead: tuple[int, ...]
+) -> None:
+    generator = torch.Generator().manual_seed(3)
+    x = torch.randn(*lead, 2, dtype=torch.float64, generator=generator)
+    moving = st.StateFollowingCenters(size * st.rings(6), st.StateRadius(0.5 / size, 0.05 / size))
+    basis = st.StaFBasis(st.GaussianKernel(0.8), moving)
+    staf = st.StaF(basis, lead).fit_(x, smooth_target)
+    found = staf.at_offsets(moving.offsets(x))
+    torch.testing.assert_close(found, smooth_target(basis.centers(x)), rtol=1e-12, atol=1e-13)
+
+
+def test_directions_that_are_learned_are_set_up_anew_at_every_call() -> None:
+    x = torch.randn(4, 2, dtype=torch.float64)
+    centers = st.StateFollowingCenters(torch.nn.Parameter(st.rings(6)), 0.3)
+    basis = st.StaFBasis(st.GaussianKernel(0.8), centers)
+    for turn in (0.0, 0.4):
+        with torch.no_grad():
+            centers.directions.mul_(1 - turn * torch.rand(6, 2, dtype=torch.float64))
+        fixed = st.StaFBasis(
+            st.GaussianKernel(0.8), st.StateFollowingCenters(centers.directions.detach().clone(), 0.3)
+        )
+        weights = [each.ideal_weights(x, smooth_target) for each in (basis, fixed)]
+        torch.testing.assert_close(*weights, rtol=1e-6, atol=1e-6)

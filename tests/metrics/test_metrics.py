@@ -20,7 +20,7 @@ from staf_torch.engine import ChaseResult, chase_pieces
 from staf_torch.metrics import ball_error as ball_errors
 from staf_torch.metrics.ball_error import StateErrorPass
 from staf_torch.metrics.chase import ChaseMetrics, Member
-from staf_torch.metrics.closed_loop import tracking_metrics
+from staf_torch.metrics.closed_loop import adp_metrics, tracking_metrics
 from staf_torch.numerics.linalg import condition_number
 from staf_torch.optim import SteepestDescent
 from staf_torch.targets import Paper
@@ -292,3 +292,30 @@ def test_tracking_is_measured_over_the_rows_that_did_not_diverge() -> None:
     assert bare["cost_ratio"] is None
     assert bare["parameter_error"] is None
     assert bare["cost"] == found["cost"]
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_a_closed_loop_is_measured_with_and_without_a_known_optimum(known: bool) -> None:
+    state = 1e-4 * uniform(4, 20, 2, seed=1)
+    result = LoopResult(
+        time=torch.arange(20).double(),
+        state=state,
+        control=uniform(4, 20, 1, seed=2),
+        actor_weights=torch.zeros(4, 20, 0),
+        critic_weights=torch.zeros(4, 20, 0),
+        running_cost=uniform(4, 20, seed=3) + 2,
+        identifier=torch.zeros(4, 20, 0),
+        frozen_at=tensor([math.inf, math.inf, 0.3, math.inf]),
+    )
+    optimal = tensor([0.5, 2.0, 1.0, math.nan]) if known else None
+    found = adp_metrics(result, optimal_cost=optimal, control_error=None, value_error=None)
+    assert found["cost"] == float(result.cost[[0, 1, 3]].median())
+    assert found["diverged_fraction"] == 0.25
+    assert found["regulated_fraction"] == 0.75
+    assert found["final_state_norm"] == float(state[[0, 1, 3], -1].norm(dim=-1).max())
+    if optimal is None:
+        assert found["optimal_cost"] is found["cost_ratio"] is found["cost_ratio_max"] is None
+    else:
+        ratios = (result.cost[:2] / optimal[:2]).tolist()
+        assert found["cost_ratio_max"] == max(ratios)
+        assert found["cost_ratio_mean"] == pytest.approx(sum(ratios) / 2)

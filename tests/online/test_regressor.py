@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 import pickle
 
 import numpy as np
@@ -288,3 +289,22 @@ def test_arrays_give_arrays_and_every_point_of_a_stream_can_be_asked_for() -> No
     assert single.predict(x[-4:, 0]).shape == (4,)
     assert single.predict(x[-1, 0]).shape == ()
     assert single.predict(x[:0, 0]).shape == (0,)
+
+
+@pytest.mark.parametrize("base", [0.25, 4.0])
+def test_before_the_first_sample_the_variance_is_that_of_the_process(base: float) -> None:
+    filter_ = LocalFilter(frame_of("gaussian"), tensor([0.5]), tensor([1.0]), slack=1.0, base=base)
+    state = StreamState.empty(torch.zeros(0).double(), 1, 2, 6, 1)
+    mean, deviation = filter_.predict(state, tensor([[0.3, 0.1]]))
+    assert float(mean) == 0
+    assert float(deviation) == pytest.approx(math.sqrt(1.5 * base))
+
+
+@pytest.mark.parametrize("amplitude", [0.5, 3.0])
+def test_a_stream_without_a_sample_has_the_deviation_of_the_process_and_its_noise(amplitude: float) -> None:
+    model = st.StaFRegressor(radius=0.4, noise=0.3, amplitude=amplitude)
+    x = torch.zeros(2, 2).double()
+    model.partial_fit(x, tensor([1.0, math.nan]))  # the second has none
+    mean, deviation = model.predict(x, return_std=True)
+    assert float(mean[1]) == 0
+    assert float(deviation[1]) == pytest.approx(math.sqrt(amplitude**2 + 0.3**2))

@@ -208,3 +208,18 @@ def test_units_are_those_of_what_was_measured_of_each_coordinate() -> None:
     assert (
         int(never.n_samples_seen_) == 0
     )  # as without scaling: a coordinate is held, and there is nothing to hold
+
+
+def test_units_grow_with_a_coordinate_that_is_measured_every_second_time() -> None:
+    path, _ = drawn(torch.tensor([0.9, 0.9]).double(), 0.1, steps=400)
+    x = path.clone()
+    x[:120, 1] *= 0.01
+    x[::2, 1] = torch.nan
+    y = (2 * path).sin().sum(-1)
+    model = st.StaFRegressor(scaling=True)
+    for k in range(120):
+        model.partial_fit(x[k], y[k])
+    before = float(model._streams_.units[0, 4])
+    for k in range(120, 400):
+        model.partial_fit(x[k], y[k])
+    assert float(model._streams_.units[0, 4]) > 10 * before

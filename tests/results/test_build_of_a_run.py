@@ -39,3 +39,14 @@ def test_long_values_are_cut_and_a_module_without_a_file_has_no_hash() -> None:
     assert build._shown([1, 2]) == "[1, 2]"
     assert build._hash("no_module_of_this_name.anywhere") is None
     assert build._hash("staf_torch.results.build") is not None
+
+
+@pytest.mark.parametrize("name", ["metrics.json", "history.npz", "table.csv", "figure.png", "table.md"])
+def test_a_file_that_is_gone_is_missed_where_it_holds_numbers(name: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_bytes(b"1")
+    recorded = {name: [1, build.digest(tmp_path / name)]}
+    assert build.damage(tmp_path, recorded, thorough=True) is None
+    (tmp_path / name).unlink()
+    missing = f"{name} is missing" if name.endswith(("json", "npz", "csv")) else None
+    assert build.damage(tmp_path, recorded, thorough=True) == missing
+    assert build.damage(tmp_path, recorded, thorough=False) is None

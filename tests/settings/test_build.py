@@ -11,9 +11,9 @@ import torch
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
-from staf_torch import StateRadius
+from staf_torch import StateFollowingCenters, StateRadius
 from staf_torch.cli.staf import config_directory
-from staf_torch.settings.chase import ChaseProblem, _key, chase_problem
+from staf_torch.settings.chase import ChaseProblem, _key, chase_problem, make_centers
 from staf_torch.sweeps.hydra_compat.program import named_packages, trusted
 
 GROUPS = ("kernel", "centers", "target", "system", "optimizer")
@@ -178,3 +178,12 @@ def test_settings_that_differ_by_what_they_refer_to_are_not_the_same_part() -> N
     assert _key(one) != _key(two)
     assert _key(one) == _key(again)
     assert _key(one) != _key(None)
+
+
+def test_centers_of_the_users_own_class_are_made_and_other_things_refused() -> None:
+    rings = {"_target_": "staf_torch.rings", "count": 3}
+    given = {"_target_": "staf_torch.StateFollowingCenters", "directions": rings, "radius": 0.3}
+    made = make_centers(OmegaConf.create(given), 2)
+    assert isinstance(made, StateFollowingCenters)
+    with pytest.raises(ValueError, match="must be StateFollowingCenters"):
+        make_centers(OmegaConf.create({"_target_": "staf_torch.GaussianKernel", "width": 1.0}), 2)

@@ -166,3 +166,13 @@ def test_what_a_submission_raises_comes_back() -> None:
 
     with pytest.raises(OSError, match="invalid partition"):
         Controller().submit(begin)
+
+
+@pytest.mark.parametrize("count", [19, 20, 21, 45])
+def test_a_message_shows_twenty_jobs_and_says_that_there_are_more(
+    count: int, commands: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    make(commands, "scancel", "echo no >&2; exit 1")
+    Controller().cancel([str(job) for job in range(count)])
+    line = capsys.readouterr().err.rpartition("scancel ")[2].split()
+    assert line == [str(job) for job in range(min(count, 20))] + ["..."] * (count > 20)

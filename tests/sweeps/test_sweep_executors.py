@@ -14,10 +14,11 @@ from composing import compose
 from omegaconf import DictConfig
 
 from staf_torch.results.progress import SHOWN, Progress
-from staf_torch.sweeps import executors
+from staf_torch.sweeps import executors, workers
 from staf_torch.sweeps.batching import Batch, Done, Failed, Outcome, Written, completion, solve
-from staf_torch.sweeps.executors import EXECUTORS, Executor, executor
+from staf_torch.sweeps.executors import EXECUTORS, Executor, executor, planning
 from staf_torch.sweeps.executors.base import GivenUpError
+from staf_torch.sweeps.executors.ray_tasks import Ray
 from staf_torch.sweeps.executors.slurm import Submitit, Task
 from staf_torch.sweeps.hydra_compat import find_launcher
 from staf_torch.sweeps.launcher import SweepProgress
@@ -203,3 +204,53 @@ def test_a_signal_of_slurm_ends_the_job_and_is_no_error_of_its_batch(
     finally:
         signal.signal(signal.SIGUSR2, before)
     assert len(calls) == min(lost, 2) + 1
+
+
+def test_a_log_gets_a_line_of_progress_no_more_often_than_every_ten_seconds(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = [100.0]
+    monkeypatch.setattr("staf_torch.sweeps.launcher.time.monotonic", lambda: clock[0])
+    progress, lines = SweepProgress(total=100), []
+    for second in range(1, 36):
+        clock[0] = 100.0 + second
+        progress.computed(second)
+        lines += [second] * len(capsys.readouterr().err.splitlines())
+    assert lines == [10, 20, 30]
+
+
+class Direct(Lossy):
+    """One after the other, none of which is lost."""
+
+    def result(self, handle: Batch) -> Done:
+        return Done([Written({}, []) for _ in handle.directories], 1.0)
+
+
+def test_jobs_are_told_as_computed_when_their_batch_has_ended(settings: list[DictConfig]) -> None:
+    told: list[float] = []
+    places = [Path(str(2 * num)) for num in range(3)]
+    found = list(planning.compute(settings, places, Direct(), finished=[], tell=told.append))
+    assert sorted(index for index, *_ in found) == [0, 1, 2]
+    assert told == sorted(told)
+    assert told[-1] == 3
+
+
+def test_a_ray_that_cannot_begin_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
+    def init(**given: object) -> None:
+        raise RuntimeError("no\n  port is free")
+
+    ray = SimpleNamespace(is_initialized=lambda: False, init=init, remote=lambda **_: lambda f: f)
+    monkeypatch.setitem(sys.modules, "ray", ray)
+    with pytest.raises(LostError, match=r"Ray could not begin \(RuntimeError: no port is free\)"):
+        Ray(None, {})
+
+
+def test_how_a_worker_ended_is_told_by_its_code() -> None:
+    for code, said in (
+        (0, "it ended with exit code 0"),
+        (1, "it ended with exit code 1"),
+        (None, "it ended with exit code None"),
+        (-15, "it was ended by SIGTERM"),
+        (-9, "it was ended by SIGKILL, as the kernel does where memory runs out"),
+    ):
+        assert workers._end_of(code) == said

@@ -167,3 +167,10 @@ def test_figures_are_the_same_bytes_on_every_run(sweep: Path) -> None:
     maps = series.heat_maps(collect(sweep))[:1]
     one, two = (images(series.draw_heat_maps(maps)) for _ in range(2))
     assert one == two
+
+
+def test_there_is_no_map_where_only_one_of_radius_and_count_was_swept(tmp_path: Path) -> None:
+    for name in ("centers.radius", "centers.count"):
+        for num, value in enumerate((3, 6)):
+            write_run(tmp_path / name / str(num), {name: value}, {"ball_error": 0.1 * value})
+        assert series.heat_maps(collect(tmp_path / name)) == []

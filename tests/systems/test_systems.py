@@ -7,6 +7,7 @@ import math
 import re
 import sys
 
+import numpy as np
 import pytest
 import torch
 from helpers import tensor, uniform
@@ -225,3 +226,25 @@ def test_functions_from_outside_take_any_leading_dimensions() -> None:
     found = plant.step(x, u)
     assert found.shape == (3, 4, 5, 2)
     assert torch.equal(found, x.sin() + u)
+
+
+def test_a_missing_mujoco_is_named_with_the_extra_that_brings_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    with pytest.raises(ImportError, match=r"pip install 'staf_torch\[mujoco\]'"):
+        systems.MujocoPlant("<mujoco/>")
+
+
+def test_known_slopes_are_taken_and_others_of_another_shape_refused() -> None:
+    a, b = [[0.9, 0.1], [0.0, 1.1]], [[0.0], [0.3]]
+
+    def step(x, u):  # type: ignore[no-untyped-def]
+        return x @ np.array(a).T + u @ np.array(b).T
+
+    given = {"dim": 2, "inputs": 1, "dt": 0.1}
+    at = systems.StepPlant(step, slopes=lambda x, u: (np.array(a), np.array(b)), **given).linearisation()
+    assert at.matrix.tolist() == a
+    assert at.input_matrix.tolist() == b
+    for wrong in ((a, [[0.0, 0.3]]), ([a[0]], b)):
+        plant = systems.StepPlant(step, slopes=lambda x, u, wrong=wrong: wrong, **given)
+        with pytest.raises(ValueError, match=r"must have the shapes \(2, 2\) and \(2, 1\)"):
+            plant.linearisation()

@@ -12,6 +12,7 @@ from staf_torch import (
     targets,
     theory,
 )
+from staf_torch.theory.exponential_bound import DomainProblem
 
 PAPER = targets.Paper()
 
@@ -137,3 +138,13 @@ GOOD = {"target": PAPER, "domain": theory.disc(1.0, count=5), "radius": 0.1, "ep
 def test_bad_arguments_of_the_bound_are_named(wrong: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         theory.exponential_bound(**(GOOD | wrong))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("dim", [1, 2, 3, 4])
+@pytest.mark.parametrize("degree", [2, 8, 15])
+def test_a_ball_has_at_least_six_points_a_coefficient(dim: int, degree: int) -> None:
+    states = torch.zeros(1, dim, dtype=torch.float64)
+    problem = DomainProblem("a test", PAPER, torch.float64, states, 0.3, 1e-3, 20)
+    points = problem.offsets(degree, 1)
+    assert len(points) >= 6 * math.comb(dim + degree, degree) if dim > 1 else len(points) > 2 * degree
+    assert float(points.norm(dim=-1).max()) == pytest.approx(0.3)

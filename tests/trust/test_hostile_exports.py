@@ -5,6 +5,7 @@ from __future__ import annotations
 import pickle
 import resource
 import shutil
+import signal
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -134,6 +135,12 @@ def test_building_takes_no_more_time_than_its_limit(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr("staf_torch.settings.trust._SECONDS", 0.05)
     with pytest.raises(ValueError, match=r"takes more than 0\.05 s"), limited("this"):
         all(n == 0 for n in iter(int, 1))  # zeros without end
+
+
+def test_the_clock_is_stopped_when_all_is_built() -> None:
+    with limited("this"):
+        assert signal.getitimer(signal.ITIMER_PROF)[0] > 0
+    assert signal.getitimer(signal.ITIMER_PROF) == (0.0, 0.0)
 
 
 def test_building_in_a_thread_takes_no_more_time_than_its_limit(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,6 +8,7 @@ import shutil
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -298,3 +299,14 @@ def test_a_run_writes_through_no_planted_link(place: Path, tmp_path: Path) -> No
     assert code == 1
     assert "staf.log is a link" in err
     assert (tmp_path / "victim").read_text() == "mine"
+
+
+def test_who_holds_a_directory_touches_its_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(lock, "_BEAT", 0.01)
+    held = lock.DirectoryLock(tmp_path)
+    os.utime(tmp_path / lock.NAME, (0, 0))
+    until = time.monotonic() + 20
+    while os.stat(tmp_path / lock.NAME).st_mtime == 0:
+        assert time.monotonic() < until
+        time.sleep(0.01)
+    held.release()

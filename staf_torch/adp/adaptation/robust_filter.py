@@ -169,8 +169,7 @@ class RobustFilter(Controller):
         ]
         clock = torch.full_like(x[..., :1], 2.0)  # the plant of the filter has not changed yet
         states = [torch.cat((x, theta, theta, clock), dim=-1) for theta in corners]
-        unit, bounds = filter.unit.to(x), filter.bounds
-        least_u, most_u = bounds.low.to(x) / unit, bounds.high.to(x) / unit
+        least_u, most_u = filter.bounds.low.to(x), filter.bounds.high.to(x)
         u, met, slack, margin = wanted, None, torch.zeros_like(time), torch.zeros_like(time)
         for _ in range(_PASSES):
             found = [filter.inequalities(z, u, time) for z in states]
@@ -181,8 +180,7 @@ class RobustFilter(Controller):
             if met is None:
                 met = ((normal * u.unsqueeze(-2)).sum(-1) >= demand).all(-1)
                 margin = found[0][2].amin(-1)
-            nearest = nearest_admissible(wanted / unit, normal * unit, demand, least_u, most_u, filter.table)
-            u, slack = nearest.point * unit, nearest.shortfall
+            u, slack = nearest_admissible(wanted, normal, demand, least_u, most_u, filter.table)[:2]
         assert met is not None
         return torch.where(met.unsqueeze(-1), wanted, u), margin, torch.where(met, 0.0, slack)
 

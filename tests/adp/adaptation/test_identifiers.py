@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 
 import pytest
 import torch
@@ -247,3 +248,33 @@ def test_a_plant_is_tried_without_the_users_random_numbers() -> None:
     before = torch.get_rng_state()
     adp.ParametricPlant(lambda x, u: (x * u).unsqueeze(-1), dim=1, inputs=1, theta=[0.5])
     assert torch.equal(before, torch.get_rng_state())
+
+
+@pytest.mark.parametrize("novelty", [0.2, 0.7])
+def test_an_equation_is_new_where_it_differs_by_the_novelty_of_its_own_size(novelty: float) -> None:
+    stack = adp.HistoryStack(1, 2, size=3, novelty=novelty)
+    ready, one = torch.tensor([True]), torch.ones(1).double()
+    first = adp.Equation(tensor([[[1.0, 0.0]]]), one[:, None], one, ready)
+    for share, filled in ((0.98, 1.0), (1.02, 2.0)):
+        now = stack.step(stack.init(torch.zeros(1, 1).double()), first)
+        angle = 2 * math.asin(share * novelty / 2)  # as long, and so far away
+        turned = tensor([[[math.cos(angle), math.sin(angle)]]])
+        assert stack.step(now, first._replace(s=turned)).filled.tolist() == [filled]
+
+
+def test_a_probe_begins_upwards_and_every_input_turns_at_its_own_time() -> None:
+    def regressor(x: Tensor, u: Tensor) -> Tensor:
+        return torch.stack((x, u), dim=-1)
+
+    model = adp.ParametricPlant(regressor, dim=2, inputs=2, theta=[-0.5, 1.0])
+    windows = adp.IntegralWindows(model, 0.2)
+    cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=2)
+    law = adp.LeastSquares([-0.5, 1.0], deviation=0.1)
+    adaptive = adp.AdaptiveLQR(model, cost, windows, law, probe=0.3)
+    time = torch.linspace(0, 4, 4001, dtype=torch.float64)
+    found = adaptive._probing(time)
+    assert found[0].tolist() == [0.3, 0.3]
+    assert found.abs().unique().tolist() == [0.3]
+    for j in range(2):
+        turns = time[1:][found[1:, j] != found[:-1, j]]
+        torch.testing.assert_close(turns.diff(), torch.full_like(turns[1:], 0.2 * (2 + j)), rtol=0, atol=2e-3)

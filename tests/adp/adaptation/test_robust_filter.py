@@ -75,8 +75,11 @@ def test_a_box_that_is_none_is_refused(low: float, confidence: float, rule: str)
         adp.RobustFilter(WANTED, PENDULUM, edge, WINDOWS, law, dt=DT, confidence=confidence, **box)
 
 
-def test_a_control_is_left_to_the_last_bit_where_and_only_where_every_corner_allows_it() -> None:
-    mild = adp.Feedback(lambda x: 1.5 * x[..., :1] + 0.3)
+@pytest.mark.parametrize(("gain", "least"), [(1.5, 0.3), (0.2, 0.1), (-4.0, 1.0)])
+def test_a_control_is_left_to_the_last_bit_where_and_only_where_every_corner_allows_it(
+    gain: float, least: float
+) -> None:
+    mild = adp.Feedback(lambda x: gain * x[..., :1] + least)
     low, high = tensor([0.0, 0.6]), tensor([0.4, 1.5])
     law = adp.LeastSquares((0.5 * (low + high)).tolist(), deviation=(0.25 * (high - low)).tolist())
     box = {"theta_low": low.tolist(), "theta_high": high.tolist()}

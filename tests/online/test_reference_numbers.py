@@ -1,0 +1,105 @@
+"""Predictions on one stream, as they were: what any constant of the two modes changes."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+import staf_torch as st
+
+
+def hard_stream(steps: int) -> tuple[Tensor, Tensor]:
+    """Inputs that come back and jump, one still at first; a function that switches; outliers and gaps."""
+    time = torch.arange(steps, dtype=torch.float64)
+    x = torch.stack(((0.31 * time).sin() + 0.2 * (1.7 * time).cos(), (0.43 * time).cos()), -1)
+    x[:, 1] = torch.where(time < 60, 0.02 * x[:, 1], x[:, 1])  # it moves by far more than its unit later
+    x[150:170] += 6.0
+    y = torch.where(time < 200, (2 * x[:, 0]).sin() + x[:, 1], 0.5 - x[:, 0] * x[:, 1])
+    y = y + 0.05 * (7.3 * time).sin()
+    y[90::37] += 9.0
+    x[100::23, 1], y[110::31] = math.nan, math.nan
+    return x, y
+
+
+def predictions(model: st.StaFRegressor, steps: int) -> Tensor:
+    """Mean and deviation of every thirtieth sample, before it is learned."""
+    x, y = hard_stream(steps)
+    found = []
+    for k in range(steps):
+        if k % 30 == 29:
+            found.append(torch.cat([part.reshape(-1) for part in model.predict(x[k], return_std=True)]))
+        model.partial_fit(x[k], y[k])
+    return torch.stack(found)
+
+
+MODELS = {
+    "filter": lambda: st.StaFRegressor(scaling=True),
+    "filter of a kernel": lambda: st.StaFRegressor("matern", 0.4, noise=0.1, forgetting=0.99),
+    "bank": lambda: st.StaFRegressor(memory=128, neighbours=8, scaling=True),
+    "bank that keeps all": lambda: st.StaFRegressor(memory=256, neighbours=20, scaling=True),
+}
+WANTED: dict[str, list[list[float]]] = {
+    "filter": [
+        [0.787991374, 0.0984753474],
+        [-0.857362883, 0.219568791],
+        [1.37342886, 0.595942481],
+        [-0.38874006, 0.450967168],
+        [1.21955495, 1.72589956],
+        [-0.922264582, 2.93918685],
+        [0.0296480892, 2.821364],
+        [7.94539559, 3.30011373],
+        [1.54916929, 1.56459188],
+        [-0.28462115, 1.94608504],
+        [2.13083861, 1.60817581],
+    ],
+    "filter of a kernel": [
+        [0.882961397, 0.0790107103],
+        [-0.594309377, 0.125439199],
+        [1.91505577, 0.13974053],
+        [-0.316563004, 0.397360441],
+        [1.24131496, 0.795207432],
+        [-0.705728509, 2.08696175],
+        [0.522972003, 2.6481701],
+        [3.95128736, 2.8562156],
+        [0.861944474, 1.01742947],
+        [-0.300037962, 1.46019397],
+        [1.35325791, 1.66191603],
+    ],
+    "bank": [
+        [0.867963967, 0.121869328],
+        [-0.569437126, 0.0725023459],
+        [1.75763951, 0.102551404],
+        [-0.409282714, 0.0542395926],
+        [1.29978688, 0.0644419442],
+        [-0.865328474, 0.283752076],
+        [0.613588933, 1.87046104],
+        [3.75941571, 8.87156656],
+        [0.89199746, 0.933581944],
+        [-0.212477619, 0.941045074],
+        [1.66583918, 1.06922363],
+    ],
+    "bank that keeps all": [
+        [0.873337867, 0.12202945],
+        [-0.568966693, 0.0718204739],
+        [1.75255918, 0.106736402],
+        [-0.40654822, 0.0555620266],
+        [1.30468546, 0.0655421377],
+        [-0.935789833, 0.471439424],
+        [0.6089919, 2.21659936],
+        [3.82088741, 20.0418011],
+        [0.904542857, 0.756281313],
+        [-0.489425912, 0.918389249],
+        [1.23635892, 1.24864199],
+    ],
+}
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_predictions_are_the_recorded_ones(name: str) -> None:
+    found = predictions(MODELS[name](), 330)
+    torch.testing.assert_close(
+        found, torch.tensor(WANTED[name], dtype=torch.float64), rtol=3e-4, atol=1e-6
+    )  # of the definition, too
