@@ -180,7 +180,8 @@ class RobustFilter(Controller):
             if met is None:
                 met = ((normal * u.unsqueeze(-2)).sum(-1) >= demand).all(-1)
                 margin = found[0][2].amin(-1)
-            u, slack = nearest_admissible(wanted, normal, demand, least_u, most_u, filter.table)[:2]
+            nearest = nearest_admissible(wanted, normal, demand, least_u, most_u, filter.table)
+            u, slack = nearest.point, nearest.shortfall
         assert met is not None
         return torch.where(met.unsqueeze(-1), wanted, u), margin, torch.where(met, 0.0, slack)
 
