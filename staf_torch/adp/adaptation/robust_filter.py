@@ -173,7 +173,7 @@ class RobustFilter(Controller):
         u, met, slack, margin = wanted, None, torch.zeros_like(time), torch.zeros_like(time)
         for _ in range(_PASSES):
             found = [filter.inequalities(z, u, time) for z in states]
-            normal = sum(part[0] for part in found) / len(found)
+            normal = sum((part[0] for part in found[1:]), found[0][0]) / len(found)
             # The demand of every corner, taken over to the mean normal at this u.
             demands = [part[1] + ((normal - part[0]) * u.unsqueeze(-2)).sum(-1) for part in found]
             demand = torch.stack(demands, dim=-1).amax(-1)
