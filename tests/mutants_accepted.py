@@ -124,6 +124,30 @@ def _plain(text: str) -> str:
 # (file, line, what changes, into what) -> why
 ACCEPTED: dict[tuple[str, str, str, str], str] = {
     (
+        "staf_torch/adp/receding_horizon.py",
+        "done, steps = plan[:, :1], plan[:, 1:].unflatten(-1, (self.steps, width))",
+        "-1",
+        "(1)",
+    ): _ROWS,
+    (
+        "staf_torch/centers/layouts.py",
+        "if float(cardinal[row, column].abs()) < 1.01:",
+        "float(cardinal[row, column].abs()) < 1.01",
+        "(float(cardinal[row, column].abs()) <= 1.01)",
+    ): _TIE,
+    (
+        "staf_torch/lanes/tracer.py",
+        "one = graph.constant(1.0, graph.type[int(array.flat[0])])",
+        "0",
+        "1",
+    ): "the type of an array's entries, which all have the same",
+    (
+        "staf_torch/engine/api.py",
+        "if self._program is not None:  # nothing but what it returns is kept",
+        "self._program is not None",
+        "(self._program is None)",
+    ): "pieces of time, on which no result depends",
+    (
         "staf_torch/adp/detour_plans.py",
         "found = self._rows(torch.cat((x, known), dim=-1))",
         "-1",

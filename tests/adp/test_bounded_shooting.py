@@ -131,6 +131,7 @@ def test_guesses_hold_each_input_at_each_end_and_then_wander_between_them(bounde
 def test_a_guess_is_followed_along_its_knots_until_the_base_takes_over() -> None:
     guess = starts.Guess(torch.tensor([[0.0], [1.0], [5.0]], dtype=torch.float64), 2.0)
     control = starts.guided(guess, lambda x: x.new_full((*x.shape[:-1], 1), 9.0))
+    assert control(torch.zeros(4, 5, 2), 0.0).shape == (4, 5, 1)
     x = torch.zeros(3, 2, dtype=torch.float64)
     said = {0.0: 0.0, 0.5: 0.5, 1.0: 1.0, 1.5: 3.0, 1.75: 4.0, 2.0: 9.0, 3.0: 9.0}
     for time, want in said.items():

@@ -124,3 +124,8 @@ def test_what_cannot_follow_a_path_says_so() -> None:
     assert (
         adp.held_stability(adp.LQR(PLANT, COST), PLANT, DT, at=waves(NONE.new_zeros(()))).spectral_radius < 1
     )
+
+
+def test_the_set_point_is_the_path_at_its_beginning_in_double_precision() -> None:
+    cost = adp.TrackingCost(1.0, 1.0, dim=2, inputs=1, path=lambda t: torch.stack((0.1 + t, 0.3 - t), dim=-1))
+    assert torch.equal(cost.set_point(), torch.tensor([0.1, 0.3], dtype=torch.float64))

@@ -126,3 +126,20 @@ def test_hastened_control_is_that_of_the_parts(caplog: pytest.LogCaptureFixture)
 
 def rows_of(state: Any, rows: slice) -> Any:
     return state._replace(**{name: part[rows] for name, part in state._asdict().items()})
+
+
+@torch.no_grad()
+def test_a_plan_that_is_followed_is_followed_alike_in_a_program(
+    memory: adp.GlobalValue, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mpc = adp.RecedingHorizon(memory.problem, steps=12, iterations=0, memory=memory)
+    carried, x = mpc.init(RESETS[:3]), RESETS[:3]
+    for _ in range(14):  # also behind its end
+        u, after = mpc._followed(x, carried.identifier)
+        with monkeypatch.context() as inside:
+            inside.setattr("staf_torch.adp.receding_horizon.tracing_now", lambda: True)
+            traced, its = mpc._followed(x, carried.identifier)
+        torch.testing.assert_close(traced, u, rtol=0, atol=1e-12)
+        assert torch.equal(its.identifier, after.identifier)
+        carried = after
+        x, _ = memory.problem.advance(x, u)

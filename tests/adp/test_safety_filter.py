@@ -393,3 +393,12 @@ def test_a_condition_that_no_control_moves_leaves_a_finite_slack_and_the_others_
     assert (
         float((second(x + 0.1 * torch.cat((0 * u, u), -1), x[:, 0]) - 0.9 * second(x, x[:, 0])).min()) > -1e-9
     )
+
+
+def test_who_rests_on_the_edge_violates_nothing() -> None:
+    guard = adp.SafetyFilter(adp.Feedback(lambda x: 0 * x[..., :1]), LINE, lambda x, t: x[:, 0], dt=0.1)
+    x0 = tensor([[0.0, 0.0], [1.0, 0.0]])
+    run = adp.simulate(guard, LINE, COST, x0, dt=0.1, steps=3, compile=False)
+    report = guard.report(run)
+    assert report["minimum_margin"] == 0
+    assert report["constraint_violations"] == 0

@@ -238,3 +238,13 @@ def test_no_exchange_of_a_row_that_was_chosen_gains_one_percent(seed: int) -> No
     matrix = torch.randn(60, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
     chosen = _exchange(matrix, torch.arange(6))
     assert float((matrix @ torch.linalg.inv(matrix[chosen])).abs().max()) < 1.01 + 1e-9
+
+
+@pytest.mark.parametrize(
+    ("count", "dim", "size"),
+    [(6, 2, 2.532074936052183), (15, 4, 3.5553808006399574), (10, 3, 1.0367437255901455)],
+)
+def test_layouts_of_the_ball_are_the_recorded_ones(count: int, dim: int, size: float) -> None:
+    u = st.ball(count, dim)
+    weights = torch.arange(1, u.numel() + 1, dtype=torch.float64).sin().view_as(u)
+    assert float((weights * u).sum()) == pytest.approx(size, rel=1e-9)

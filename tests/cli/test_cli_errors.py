@@ -94,4 +94,5 @@ def test_the_command_itself_ends_with_code_one_and_no_traceback(tmp_path: Path) 
     assert ended.returncode == 1
     assert ended.stderr.endswith("staf: `ConstantRadius(radius=...)` must be positive; got -0.1.\n")
     assert "Traceback" not in ended.stderr
+    assert "Error executing job" not in ended.stderr  # Hydra's own words
     assert ended.stdout == ""

@@ -64,6 +64,8 @@ def test_a_learner_as_c_follows_its_run_and_what_does_not_learn_is_refused(
         export_learning(runs / "lqr", calls=20)
     with pytest.raises(SystemExit, match="must go with --to c"):
         main([str(runs / "actor"), "--to", "pt2", "--learning"])
+    with pytest.raises(SystemExit, match="must be 1 for a controller that learns"):
+        main([str(runs / "actor"), "--to", "c", "--learning", "--batch", "2"])
 
 
 @pytest.mark.parametrize(("name", "row"), [("chase", 1), ("actor", 1), ("lqr", 0)])

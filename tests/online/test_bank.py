@@ -10,7 +10,7 @@ from torch import Tensor
 
 import staf_torch as st
 from staf_torch.online.bank import Bank
-from staf_torch.online.bank_rules import BankShape
+from staf_torch.online.bank_rules import MEMBERS, BankShape, group
 from staf_torch.online.quadratic_models import QuadraticModels
 
 COMPILED = Bank(BankShape(2, 1, 128, 8), 1, True).compiled
@@ -305,3 +305,10 @@ def test_compiled_bank_waits_for_an_output_as_the_definition_does() -> None:
         for part in ("y", "low", "high", "last_y", "center", "spread"):
             torch.testing.assert_close(both[0][part], both[1][part], rtol=1e-5, atol=1e-6)
         slow.table.copy_(fast.table)
+
+
+def test_members_are_grouped_by_their_kind() -> None:
+    found = [group(member) for member in range(MEMBERS)]
+    assert found[:18] == [0, 1, 2, 3, 4, 5] * 3  # alike but for fading
+    assert found[18:-2] == [6] * 6 + [7] * 8 + [8] * 8 + [9] * 8  # the latest, filters, quadratics, trackers
+    assert found[-2:] == [10, -1]

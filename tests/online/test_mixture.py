@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 
 from staf_torch.online.bank import Bank
 from staf_torch.online.bank_rules import BankShape
 from staf_torch.online.kalman_filter import SURPRISE
-from staf_torch.online.mixture_definition import judge
+from staf_torch.online.mixture_definition import _reweighed, judge
 
 
 def test_what_a_function_that_saturates_takes_is_mapped_and_other_functions_are_left() -> None:
@@ -46,3 +47,13 @@ def test_no_single_error_moves_the_calibration_far() -> None:
         judge(rules, stream, stream["mean"] + size, torch.tensor([True]), stream.number("clock"))
         assert bool(stream["calibration"] > before)
         assert bool(stream["calibration"] <= before * (1 + max(rules.error_rate, 1 / 60) * (SURPRISE - 1)))
+
+
+@pytest.mark.parametrize("count", [2, 5, 40])
+@pytest.mark.parametrize("share", [0.0, 0.001, 0.3])
+def test_weights_add_up_and_none_is_below_its_equal_share(count: int, share: float) -> None:
+    logs = 30 * torch.randn(7, count, dtype=torch.float64, generator=torch.Generator().manual_seed(count))
+    weights = _reweighed(share, logs).exp()
+    torch.testing.assert_close(weights.sum(-1), torch.ones(7, dtype=torch.float64))
+    assert bool((weights >= share / count * (1 - 1e-12)).all())
+    assert torch.equal(weights.argsort(-1)[:, -1], logs.argsort(-1)[:, -1])

@@ -97,6 +97,8 @@ def test_a_sweep_is_that_of_the_command_and_shows_nothing(capsys: pytest.Capture
     assert {path.name for path in Path("one").iterdir()} == {path.name for path in Path("two").iterdir()}
     assert repr(found) == "<Runs 4 completed, over kernel, centers.radius>"
     best = found.best("ball_error")
+    with pytest.raises(ValueError, match=r"`Runs.best\(metric=...\)` must be one of"):
+        found.best("bal_error")
     errors = [run.metrics["ball_error"] for run in found]
     assert best.metrics["ball_error"] == min(errors)
     assert [run.metrics["ball_error"] for run in found.sort("ball_error")] == sorted(errors)

@@ -309,3 +309,14 @@ def test_command_ends_with_one_sentence(
 @pytest.mark.parametrize("freedom", [200, 300, 400])
 def test_every_term_of_the_expansion_of_students_quantile_counts(freedom: int) -> None:
     assert _expansion(freedom) == pytest.approx(float(student.ppf(0.975, freedom)), abs=1 / freedom**5)
+
+
+def test_the_expansion_has_the_coefficients_of_abramowitz_and_stegun() -> None:
+    x = statistics.NormalDist().inv_cdf(0.975)
+    g1 = (x**3 + x) / 4
+    g2 = (5 * x**5 + 16 * x**3 + 3 * x) / 96
+    g3 = (3 * x**7 + 19 * x**5 + 17 * x**3 - 15 * x) / 384
+    g4 = (79 * x**9 + 776 * x**7 + 1482 * x**5 - 1920 * x**3 - 945 * x) / 92160
+    for freedom in (1, 2, 7):  # 26.7.5
+        found = x + g1 / freedom + g2 / freedom**2 + g3 / freedom**3 + g4 / freedom**4
+        assert _expansion(freedom) == pytest.approx(found, rel=1e-12)
