@@ -24,7 +24,7 @@ from ..results.reader import Run, collect
 from ..results.untrusted import links_in, visible
 from . import lock
 from .batching import sentence
-from .hydra_compat import BrokenSweep
+from .hydra_compat import BrokenSweep, breaking_off
 from .job import PRINTS
 from .report import write_report
 
@@ -109,7 +109,9 @@ class SweepDirectory(Callback):
             raise SystemExit(f"staf: {sentence(error)}") from error
 
     def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
-        """Give the directory back: the report has been written."""
+        """Give the directory back: the report has been written, or no job has begun."""
+        if _in_vain(config):
+            _remove(_directory(config))
         lock.give_back(_directory(config))
 
     def on_run_start(self, config: DictConfig, **_: Any) -> None:
@@ -138,7 +140,7 @@ class SweepReport(Callback):
         """Write the report; nothing that goes wrong here may look like a sweep gone wrong."""
         directory = _directory(config)
         figures = OmegaConf.select(config, "figures") if self._figures is None else self._figures
-        if not directory.is_dir():
+        if not directory.is_dir() or _in_vain(config):
             return
         try:
             text = write_report(directory, figures=figures is not False)
@@ -259,13 +261,29 @@ def close(sweep: BrokenSweep) -> None:
     if own.lost():
         lock.give_back(directory)
         return
-    if any(directory.glob(f"**/{records.RUN}")):
+    if _has_begun(directory):
         sweep.end()
         return
-    for name in (records.SWEEP, "multirun.yaml"):
+    _remove(directory)
+    lock.give_back(directory)
+
+
+def _has_begun(directory: Path) -> bool:
+    return any(directory.glob(f"**/{records.RUN}"))
+
+
+def _in_vain(config: DictConfig) -> bool:
+    """Whether the sweep that ends now is ours, and was broken before its first job."""
+    own = lock.held(_directory(config))
+    ours = own is not None and not own.lost() and not records.resumed(config)
+    return ours and breaking_off() and not _has_begun(_directory(config))
+
+
+def _remove(directory: Path) -> None:
+    """Take away what a sweep without jobs leaves."""
+    for name in (records.SWEEP, "multirun.yaml", lock.NAME):
         (directory / name).unlink(missing_ok=True)
     shutil.rmtree(directory / ".submitit", ignore_errors=True)
-    lock.give_back(directory)
     with contextlib.suppress(OSError):  # not empty: it was there before
         directory.rmdir()
 

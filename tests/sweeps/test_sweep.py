@@ -21,7 +21,6 @@ from staf_torch.cli.staf import command_line
 from staf_torch.results import run_record as records
 from staf_torch.sweeps import launcher as launch
 from staf_torch.sweeps.callbacks import SweepReport, claim
-from staf_torch.sweeps.hydra_compat.program import HAS_WHITELIST
 
 SHORT = ["duration=0.05", "settle_time=0", "figures=false", "history=false"]
 GRID = [
@@ -232,8 +231,7 @@ def test_an_unknown_swept_key_starts_nothing(place: Path) -> None:
     code, _, err = one(str(place), ["-m", "centers.raduis=0.1,0.2", *SHORT])
     assert code == 1
     assert err == "staf: there is no setting `centers.raduis`; `staf --help` lists them.\n"
-    if not HAS_WHITELIST:  # Hydra 1.4 composes the jobs once the folder is there, which stays
-        assert set((place / "runs").iterdir()) == before
+    assert set((place / "runs").iterdir()) == before
 
 
 def test_a_batch_that_raises_is_retried_to_find_the_culprit(

@@ -21,6 +21,7 @@ from .plain_composing import PlainComposer as PlainComposer
 from .products import Product as Product
 from .products import sweep_size as sweep_size
 from .program import BrokenSweep as BrokenSweep
+from .program import breaking_off as breaking_off
 from .program import broken_sweep as broken_sweep
 from .program import everything_trusted as everything_trusted
 from .program import find_launcher as find_launcher

@@ -11,6 +11,7 @@ import sys
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
+from types import FrameType
 from typing import Any, NamedTuple
 
 import hydra
@@ -153,6 +154,15 @@ class BrokenSweep(NamedTuple):
         """Tell the callbacks that the sweep is over, where Hydra does not: version 1.3 forgets it."""
         if not HAS_WHITELIST:
             self.callbacks.on_multirun_end(config=self.config, config_name=self.config.hydra.job.config_name)
+
+
+def breaking_off() -> bool:
+    """Return whether an exception ends the sweep that calls back now: version 1.4 calls back then too."""
+    broken = {id(frame) for frame, _ in traceback.walk_tb(sys.exc_info()[2])}
+    frame: FrameType | None = sys._getframe()
+    while frame is not None and frame.f_code.co_name != "multirun":
+        frame = frame.f_back
+    return frame is not None and id(frame) in broken
 
 
 def broken_sweep(error: BaseException) -> BrokenSweep | None:
