@@ -49,8 +49,14 @@ def accepted(mutant: Mutant) -> str | None:
         return _ENCODING
     if mutant.room == "figures" and any(_without(mutant, name) or _of(mutant, name) for name in _STYLE):
         return _LOOKS
-    if mutant.room == "adp" and mutant.was.startswith("torch.eye(") and _without(mutant, "dtype"):
+    if mutant.room in ("adp", "online") and mutant.was.startswith("torch.eye(") and _without(mutant, "dtype"):
         return _ONES
+    if re.match(r"(Program|RowFunction)\(", mutant.was) and _without(mutant, "name"):
+        return "a name in messages"
+    if _is_number(mutant.was) and f"stacklevel={mutant.was}" in mutant.context:
+        return "the line that a warning names"
+    if mutant.file == "staf_torch/lanes/cuda.py":
+        return _DEVICE
     if _of_a_limit(mutant):
         return _LIMIT
     if mutant.room == "figures" and re.search(r"\bpage\(", mutant.context) and _is_number(mutant.was):
@@ -123,6 +129,43 @@ def _plain(text: str) -> str:
 
 # (file, line, what changes, into what) -> why
 ACCEPTED: dict[tuple[str, str, str, str], str] = {
+    (
+        "staf_torch/local_basis/graded.py",
+        "for j in range(top + terms - 1, top, -1):",
+        "top + terms - 1",
+        "(top + terms + 1)",
+    ): "two more terms of a series that has converged",
+    (
+        "staf_torch/lanes/combinators.py",
+        "loop.carry += [graph.args[new[0]][0]] if large else new",
+        "0",
+        "1",
+    ): "the array that all of its entries are of",
+    (
+        "staf_torch/kernels/base.py",
+        "if own is None or left is None:",
+        "own is None or left is None",
+        "(own is None and left is None)",
+    ): "a kernel has a gradient for all arguments or for none",
+    ("staf_torch/lanes/fusion.py", "_LONGEST = 24  # operations in one expression", "24", "25"): _SPEED,
+    (
+        "staf_torch/settings/trust.py",
+        "return 0",
+        "0",
+        "1",
+    ): "memory where the system tells none, which Linux does",
+    (
+        "staf_torch/cli/doctor.py",
+        "found = float(chase(states, basis, Paper(), SteepestDescent(), inner_steps=10).excess[0, -1])",
+        "chase(states, basis, Paper(), SteepestDescent(), inner_steps=10)",
+        "chase(states, basis, Paper(), SteepestDescent())",
+    ): "ten is the default",
+    (
+        "staf_torch/figures/safety.py",
+        "reach = 0.06 * (ends[1] - ends[0])",
+        "ends[1] - ends[0]",
+        "(ends[1] + ends[0])",
+    ): "how far the shade behind a wall reaches",
     (
         "staf_torch/adp/receding_horizon.py",
         "done, steps = plan[:, :1], plan[:, 1:].unflatten(-1, (self.steps, width))",

@@ -242,7 +242,7 @@ def _refuse_links(directory: Path) -> None:
     blocking = next((p for p in (directory, *directory.parents) if p.exists() and not p.is_dir()), None)
     if blocking is not None:
         raise NotADirectoryError(errno.ENOTDIR, "Not a directory", str(blocking))
-    found = [path for path in links_in(directory) if ".submitit" not in path.parts]
+    found = sorted(path for path in links_in(directory) if ".submitit" not in path.parts)
     if found:
         more = f" and {len(found) - 1} more" if len(found) > 1 else ""
         raise ValueError(

@@ -8,6 +8,7 @@ from helpers_swingup import cost_of, double_integrator, pendulum
 from torch import Tensor
 
 from staf_torch import adp
+from staf_torch.adp.path_integral import _hats
 
 X0 = torch.tensor([[4.0, 0.0], [-2.0, 3.0]], dtype=torch.float64)
 
@@ -80,3 +81,12 @@ def test_states_from_which_nothing_is_finite_get_the_feedback() -> None:
 def test_wrong_arguments_are_named(more: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         sampler(double_integrator(), **more)
+
+
+@pytest.mark.parametrize(("steps", "knots"), [(11, 2), (30, 4), (7, 7), (101, 13)])
+def test_between_knots_a_line_is_a_line(steps: int, knots: int) -> None:
+    hats = _hats(steps, knots)
+    torch.testing.assert_close(hats.sum(1), torch.ones(steps, dtype=torch.float64), rtol=0, atol=1e-14)
+    line = 0.3 + 0.7 * torch.linspace(0, 1, knots, dtype=torch.float64)
+    wanted = 0.3 + 0.7 * torch.linspace(0, 1, steps, dtype=torch.float64)
+    torch.testing.assert_close(hats @ line, wanted, rtol=0, atol=1e-14)

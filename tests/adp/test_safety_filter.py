@@ -402,3 +402,17 @@ def test_who_rests_on_the_edge_violates_nothing() -> None:
     report = guard.report(run)
     assert report["minimum_margin"] == 0
     assert report["constraint_violations"] == 0
+
+
+@pytest.mark.parametrize("m", [1, 2, 3])
+def test_in_plain_torch_too_no_row_knows_what_the_others_are(m: int) -> None:
+    normals, wanted, least = uniform(6, 2, m, seed=1), 2 * uniform(6, m, seed=2), uniform(6, 2, seed=3)
+    wanted[2], least[3], normals[4] = 1e12, 1e12, 1e-9 * normals[4]
+    low, high = torch.full((m,), -0.7, dtype=torch.float64), torch.full((m,), 0.9, dtype=torch.float64)
+    table = cases(2, low.tolist(), high.tolist())
+    together = nearest_admissible(wanted, normals, least, low, high, table)
+    for k in range(6):
+        rows = slice(k, k + 1)
+        alone = nearest_admissible(wanted[rows], normals[rows], least[rows], low, high, table)
+        torch.testing.assert_close(alone.point, together.point[rows], rtol=1e-12, atol=1e-12)
+        torch.testing.assert_close(alone.shortfall, together.shortfall[rows], rtol=1e-9, atol=1e-12)

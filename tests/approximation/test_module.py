@@ -273,6 +273,8 @@ def test_a_model_built_on_the_meta_device_is_filled_by_a_state_dict(name: str, a
         empty.to_empty(device="cpu")
     empty.load_state_dict(known.state_dict(), assign=assign)
     assert torch.equal(empty.rowwise(x + 0.01), known.rowwise(x + 0.01))
+    for key, value in empty.state_dict().items():  # nothing is left without numbers
+        assert torch.equal(value, known.state_dict()[key]), key
 
 
 def test_a_model_without_values_says_how_it_gets_them() -> None:

@@ -83,6 +83,7 @@ def test_first_estimates_are_drawn_on_both_sides_of_zero_and_a_run_takes_its_tim
     assert 4.9 < float(drawn.max()) <= 5
     assert abs(float(drawn.mean())) < 0.3
     assert bool((case.adaptive.theta[:, 4:] == 1).all())
+    assert case.after[7].tolist() == [-1.175, 0.9871, -8.458, -0.8776, 0.7, 0.0]
     few = faults.short_period(2, torch.Generator().manual_seed(3))
     result = faults._simulated(few, faults._controllers(few)["adaptive"], 0.1)
     assert float(result.time[-1]) == pytest.approx(0.1)

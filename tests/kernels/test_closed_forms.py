@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import pytest
 import torch
 from helpers import uniform
 from variants import KERNELS, over
@@ -109,3 +110,16 @@ def test_hyperparameters_of_an_entry_each_are_kernels_one_by_one(question: str, 
     else:
         shape = (3, *alone[0].shape)
         torch.testing.assert_close(found.expand(shape), torch.stack(alone), rtol=1e-13, atol=1e-14)
+
+
+@pytest.mark.parametrize("smoothness", [1.5, 2.5])
+@pytest.mark.parametrize("distance", [0.0, 1e-9, 1e-3, 0.5])
+def test_a_matern_kernel_has_two_derivatives_everywhere(smoothness: float, distance: float) -> None:
+    kernel = st.MaternKernel(smoothness, 0.8)
+    c = torch.tensor([0.3, -0.2], dtype=torch.float64)
+    x = c + distance * torch.tensor([0.6, 0.8], dtype=torch.float64)
+    bend = torch.autograd.functional.hessian(lambda x: kernel(x[None], c[None])[0, 0], x)
+    curvature = {1.5: 3.0, 2.5: 5.0 / 3.0}[smoothness] / 0.8**2  # -phi''(0) in every direction
+    assert bool(torch.isfinite(bend).all())
+    if distance < 1e-6:
+        torch.testing.assert_close(bend, -curvature * torch.eye(2, dtype=torch.float64), rtol=1e-6, atol=1e-6)

@@ -133,3 +133,18 @@ def test_passes_that_meet_a_row_first_in_their_body_are_a_loop() -> None:
     start, now, row = (torch.rand(*shape, dtype=torch.float64) for shape in ((3,), (3, 2), (3,)))
     for one, other in zip(program(start, now, row), program.definition(start, now, row), strict=True):
         torch.testing.assert_close(one, other, rtol=1e-15, atol=1e-16)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 5])
+@pytest.mark.parametrize("operation", ["sum", "max", "min"])
+def test_points_of_any_number_are_reduced_alike_in_a_program(count: int, operation: str) -> None:
+    x = torch.randn(6, count, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(count))
+
+    def step(carry: Tensor, now: Tensor, row: Tensor) -> tuple[Tensor, Tensor]:
+        return carry, lanes.reduce(lambda points: points.sin() * points, row, operation)  # type: ignore[arg-type]
+
+    program = lanes.Program(step)
+    start, now = torch.zeros(6).double(), torch.zeros(6, 1).double()
+    assert program.compiles(start, now, x)
+    found, wanted = program(start, now, x)[1], program.definition(start, now, x)[1]
+    torch.testing.assert_close(found, wanted, rtol=1e-14, atol=1e-14)

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from staf_torch import lanes
 from staf_torch.lanes.eliminations import (
+    determinant,
     eigen,
     eigenvalues,
     inverse,
@@ -190,8 +191,24 @@ def test_rotations_give_eigenvalues_in_their_order_with_their_vectors(size: int)
 @pytest.mark.parametrize("lead", [(), (5,), (2, 3)])
 def test_reflections_take_any_leading_dimensions(lead: tuple[int, ...]) -> None:
     torch.manual_seed(4)
-    matrix = torch.randn(*lead, 9, 9).double()
-    q, r = orthogonal(matrix)
-    torch.testing.assert_close(q @ r, matrix, rtol=1e-12, atol=1e-12)
-    torch.testing.assert_close(q @ q.mT, torch.eye(9).double().expand_as(q), rtol=1e-12, atol=1e-12)
-    assert torch.equal(r, r.triu())
+    some = torch.randn(*lead, 9, 9).double()
+    for matrix in (some, torch.eye(9) + 1e-7 * some, 1e-7 * some - torch.eye(9)):  # two that hardly turn
+        q, r = orthogonal(matrix)
+        torch.testing.assert_close(q @ r, matrix, rtol=1e-12, atol=1e-13)
+        torch.testing.assert_close(q @ q.mT, torch.eye(9).double().expand_as(q), rtol=1e-12, atol=1e-13)
+        assert torch.equal(r, r.triu())
+
+
+@pytest.mark.parametrize("lead", [(), (5,), (2, 5)])
+@pytest.mark.parametrize("size", [1, 2, 3, 4, 6])
+def test_a_determinant_is_that_of_torch_also_where_rows_change_places(
+    size: int, lead: tuple[int, ...]
+) -> None:
+    torch.manual_seed(size)
+    matrix = torch.randn(*lead, size, size).double()
+    if lead:
+        matrix[..., 0, :, :] = torch.eye(size).flip(0)
+        matrix[..., 1, :, :] = torch.eye(size).roll(1, 0)
+        matrix[..., 2, :, 0] = 0
+        matrix[..., 3, 0, 0] = 0
+    torch.testing.assert_close(determinant(matrix), torch.linalg.det(matrix), rtol=1e-11, atol=1e-12)

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from staf_torch import lanes
-from staf_torch.lanes.replacements import REPLACEMENTS, erfinv
+from staf_torch.lanes.replacements import REPLACEMENTS, erfinv, sort
 
 pytestmark = pytest.mark.needs_compiler
 
@@ -282,3 +282,18 @@ def test_multiples_of_a_summand_count() -> None:
     found, wanted = (run((), (), (a, b), steps=1)[1] for run in (program, program.definition))
     for one, other in zip(found, wanted, strict=True):
         assert torch.equal(one, other)
+
+
+@pytest.mark.parametrize("descending", [True, False])
+@pytest.mark.parametrize(
+    ("shape", "dim"), [((7,), 0), ((4, 7), -1), ((7, 4), 0), ((2, 3, 7), -1), ((2, 7, 3), 1)]
+)
+def test_entries_are_ordered_as_torch_does_along_any_dimension(
+    shape: tuple[int, ...], dim: int, descending: bool
+) -> None:
+    x = torch.randn(shape, dtype=torch.float64, generator=torch.Generator().manual_seed(1)).mul(2).round()
+    x.view(-1)[3] = torch.nan
+    found, places = sort(x, dim, descending)
+    wanted = torch.sort(x, dim=dim, descending=descending, stable=True)
+    torch.testing.assert_close(found, wanted.values, rtol=0, atol=0, equal_nan=True)
+    assert torch.equal(places, wanted.indices)

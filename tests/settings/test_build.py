@@ -13,7 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from staf_torch import StateFollowingCenters, StateRadius
 from staf_torch.cli.staf import config_directory
-from staf_torch.settings.chase import ChaseProblem, _key, chase_problem, make_centers
+from staf_torch.settings.chase import ChaseProblem, _key, chase_problem, make, make_centers
 from staf_torch.sweeps.hydra_compat.program import named_packages, trusted
 
 GROUPS = ("kernel", "centers", "target", "system", "optimizer")
@@ -187,3 +187,9 @@ def test_centers_of_the_users_own_class_are_made_and_other_things_refused() -> N
     assert isinstance(made, StateFollowingCenters)
     with pytest.raises(ValueError, match="must be StateFollowingCenters"):
         make_centers(OmegaConf.create({"_target_": "staf_torch.GaussianKernel", "width": 1.0}), 2)
+
+
+def test_what_a_constructor_does_not_know_or_lacks_is_said_in_its_words() -> None:
+    for given, said in (({"widht": 2.0}, "widht"), ({"width": 2.0, "length": 1.0}, "length")):
+        with pytest.raises(ValueError, match=rf"`staf_torch.GaussianKernel` cannot be built .*{said}"):
+            make(OmegaConf.create({"_target_": "staf_torch.GaussianKernel", **given}))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import os
 from pathlib import Path
 
 import pytest
@@ -93,3 +94,16 @@ def test_files_of_experiments_alone_set_the_mode_and_none_includes_another() -> 
         else:
             assert OmegaConf.select(settings, "hydra.mode") is None, file
             assert "mode" not in settings or "hydra" not in file.parts, file
+
+
+@pytest.mark.parametrize("before", [None, "", "0", "1"])
+def test_whether_errors_are_shown_in_full_is_as_it_was_behind_a_program(
+    before: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
+    if before is not None:
+        monkeypatch.setenv("HYDRA_FULL_ERROR", before)
+    with program.full_errors() as wanted:
+        assert wanted == (before == "1")
+        assert os.environ["HYDRA_FULL_ERROR"] == "1"
+    assert os.environ.get("HYDRA_FULL_ERROR") == before

@@ -142,6 +142,8 @@ def full_errors() -> Iterator[bool]:
     finally:
         if before is None:
             os.environ.pop("HYDRA_FULL_ERROR", None)
+        else:
+            os.environ["HYDRA_FULL_ERROR"] = before
 
 
 class BrokenSweep(NamedTuple):
