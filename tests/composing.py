@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from omegaconf import DictConfig
 
-from staf_torch.sweeps.hydra_compat import Composer, config_loader
+from staf_torch.sweeps.hydra_compat import Composer, config_loader, find_launcher
 from staf_torch.sweeps.hydra_compat.program import HAS_WHITELIST
 
 HYDRA: dict[str, str] = {} if HAS_WHITELIST else {"version_base": "1.3"}  # 1.4 deprecates the argument
@@ -15,6 +15,7 @@ HYDRA: dict[str, str] = {} if HAS_WHITELIST else {"version_base": "1.3"}  # 1.4 
 
 @functools.cache
 def _composer() -> Composer:
+    find_launcher()  # also where the package is on the path and not installed
     return Composer(config_loader(), hydra_node=False)
 
 

@@ -22,11 +22,15 @@ _STYLE = (
     "frameon",
     "rotation",
     "size",
+    "ncols",
+    "borderaxespad",
 )
 _SPEED = "decides which of two ways that find the same is taken: the threshold is of speed alone"
-_EDGE = "a number that equals a tolerance (below 1e-3) to the last bit, which none does but by chance"
+_EDGE = (
+    "a number that equals a tolerance (below 1e-3, or above 1e100) to the last bit: none does but by chance"
+)
 _LENGTHS = "an assertion of our own that lengths agree; other assertions are no mutants either"
-_TOLERANCE = 1e-3
+_TOLERANCE, _HUGE = 1e-3, 1e100
 _LIMIT = "a limit that is chosen, of a hundred or more, by one"
 _SIZE = "the size of a page of figures"
 _ONES = "zeros and ones, which are exact in every dtype, and meet numbers of float64"
@@ -49,7 +53,7 @@ def accepted(mutant: Mutant) -> str | None:
         return _ENCODING
     if mutant.room == "figures" and any(_without(mutant, name) or _of(mutant, name) for name in _STYLE):
         return _LOOKS
-    if mutant.room in ("adp", "online") and mutant.was.startswith("torch.eye(") and _without(mutant, "dtype"):
+    if mutant.was.startswith("torch.eye(") and _without(mutant, "dtype"):
         return _ONES
     if re.match(r"(Program|RowFunction)\(", mutant.was) and _without(mutant, "name"):
         return "a name in messages"
@@ -108,7 +112,8 @@ def _at_a_tolerance(mutant: Mutant) -> bool:
         return False
     if _EDGES.get(type(was.ops[0])) is not type(now.ops[0]):
         return False
-    return any(0 < _number(mutant.file, side) < _TOLERANCE for side in (was.left, was.comparators[0]))
+    numbers = [_number(mutant.file, side) for side in (was.left, was.comparators[0])]
+    return any(0 < number < _TOLERANCE or number > _HUGE for number in numbers)
 
 
 def _number(file: str, node: ast.expr) -> float:
@@ -129,6 +134,18 @@ def _plain(text: str) -> str:
 
 # (file, line, what changes, into what) -> why
 ACCEPTED: dict[tuple[str, str, str, str], str] = {
+    (
+        "staf_torch/systems/integrators.py",
+        '_kept = Kept("a trajectory", 16)',
+        "16",
+        "17",
+    ): "how many programs are kept",
+    (
+        "staf_torch/lanes/tracer.py",
+        "return self.pack(np.array(list(place), dtype=np.int64), kind), np.array(places, dtype=np.int64)",
+        "np.array(places, dtype=np.int64)",
+        "np.array(places)",
+    ): "the dtype that NumPy gives whole numbers",
     (
         "staf_torch/local_basis/graded.py",
         "for j in range(top + terms - 1, top, -1):",

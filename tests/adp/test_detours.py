@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from staf_torch import adp, systems
+from staf_torch.adp.detours import _detours
 
 PLANE = systems.Linear(torch.eye(4).roll(2, dims=1).triu().tolist(), torch.eye(4)[:, 2:].tolist())
 COST = adp.QuadraticCost(1.0, 1.0, dim=4, inputs=2, low=-1.0, high=1.0)
@@ -122,3 +123,14 @@ def test_the_cheapest_detour_of_a_row_is_that_of_the_row_alone() -> None:
     alone = torch.cat([ahead.cheapest(x[k : k + 1], before[:1], done[:1]) for k in range(3)])
     assert torch.equal(found, alone)
     assert 0 < int((found[:, 2] > 0).sum()) < 3
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_detours_lead_to_all_sides(count: int) -> None:
+    found = _detours(count, torch.tensor([0.5, 2.0]).double(), [3, 8])
+    assert len(found) == 4 * (3**count - 1)
+    assert sorted(found[:, -1].unique().tolist()) == [3, 8]
+    assert sorted({round(size, 9) for size in found[:, :-1].norm(dim=-1).tolist()}) == [0.5, 2.0]
+    ways = {tuple(row) for row in found.mul(1e6).round().tolist()}
+    assert len(ways) == len(found)  # none twice
+    assert {(*(-x for x in way[:-1]), way[-1]) for way in ways} == ways  # each with its opposite
