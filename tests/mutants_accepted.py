@@ -135,6 +135,30 @@ def _plain(text: str) -> str:
 # (file, line, what changes, into what) -> why
 ACCEPTED: dict[tuple[str, str, str, str], str] = {
     (
+        "staf_torch/lanes/eliminations.py",
+        "best = torch.where(order < 0, whole[..., 0].abs(), -1.0).argmax(-1, keepdim=True)",
+        "1.0",
+        "2.0",
+    ): "below every size, as any negative number is",
+    (
+        "staf_torch/adp/box_filter.py",
+        "return torch.where(done.unsqueeze(-1) > 0, u, found), torch.maximum(done, met), 0 * left + _LEAST",
+        "-1",
+        "(1)",
+    ): _ROWS,
+    (
+        "staf_torch/centers/layouts.py",
+        "return torch.stack((angle.sin(), angle.cos()), dim=-1)",
+        "-1",
+        "(1)",
+    ): "of angles (N,)",
+    (
+        "staf_torch/lanes/schedule.py",
+        "if loop.node in self.live and loop.node not in self.ahead and graph.depth[loop.node] != ROW:",
+        "loop.node in self.live and loop.node not in self.ahead and graph.depth[loop.node] != ROW",
+        "(loop.node in self.live or loop.node not in self.ahead or graph.depth[loop.node] != ROW)",
+    ): _SPEED,
+    (
         "staf_torch/systems/integrators.py",
         '_kept = Kept("a trajectory", 16)',
         "16",

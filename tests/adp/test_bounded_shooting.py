@@ -12,7 +12,7 @@ from torch import Tensor
 from staf_torch import adp, systems
 from staf_torch.adp.shooting import starts
 from staf_torch.adp.shooting.direct import _cheapest
-from staf_torch.adp.shooting.newton import Plan
+from staf_torch.adp.shooting.newton import Plan, _boxed_step
 from staf_torch.adp.shooting.stage import Stage
 
 DOUBLE = systems.Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
@@ -162,3 +162,24 @@ def test_the_gap_of_a_control_is_what_its_hamiltonian_exceeds_the_least_by(affin
         [hamiltonian(torch.full((50, 1), u).double()) for u in torch.linspace(-0.8, 0.8, 2001)]
     )
     torch.testing.assert_close(gap, hamiltonian(v) - tried.amin(0), rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("inputs", [1, 2, 3])
+def test_a_boxed_step_has_the_least_model_of_all_in_the_box(inputs: int, seed: int) -> None:
+    size, rows = 2, 40
+    root = uniform(rows, size + inputs, size + inputs, seed=seed)
+    curvature = root @ root.mT + 0.1 * torch.eye(size + inputs)
+    slope = 2 * uniform(rows, size + inputs, seed=seed + 10)
+    low, high = -uniform(rows, inputs, seed=seed + 20).abs(), uniform(rows, inputs, seed=seed + 30).abs()
+    offset, _, definite = _boxed_step(slope, curvature, size, low, high)
+    assert bool(definite.all())
+    assert bool(((offset >= low) & (offset <= high)).all())
+
+    def model(v: Tensor) -> Tensor:
+        bent = (curvature[:, size:, size:] @ v.unsqueeze(-1)).squeeze(-1)
+        return ((slope[:, size:] + 0.5 * bent) * v).sum(-1)
+
+    for turn in range(300):
+        other = low + (high - low) * (0.5 + 0.5 * uniform(rows, inputs, seed=1000 + turn))
+        assert bool((model(offset) <= model(other) + 1e-12).all())

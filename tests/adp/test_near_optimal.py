@@ -78,7 +78,7 @@ def test_report_says_what_was_chosen_and_how_good_it_is() -> None:
     assert report["regulated"] == 1.0
     assert 1.0 - 1e-3 <= report["over_optimum_median"] < 1.05
     assert report["over_base_max"] <= 1.01
-    assert report["good_spread"] >= 0.5
+    assert report["good_spread"] in (0.5, 1.0, 2.0)  # times 1, 2 and 4 of half a unit
     assert report["microseconds"] > 0
 
 

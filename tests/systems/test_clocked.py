@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+from helpers import uniform
 
 from staf_torch import systems
 
@@ -50,3 +51,9 @@ def test_plant_without_a_size_is_refused() -> None:
 
     with pytest.raises(ValueError, match=r"`Clocked\(plant=...\)` must say its `dim`"):
         systems.Clocked(Any())
+
+
+def test_a_step_takes_any_leading_dimensions() -> None:
+    plant = systems.Clocked(systems.StepPlant(lambda x, u: x.sin() + u, dim=1, inputs=1, dt=0.1))
+    x, u = uniform(3, 4, 2, seed=1), uniform(3, 4, 1, seed=2)
+    torch.testing.assert_close(plant.step(x, u), torch.cat((x[..., :1].sin() + u, x[..., 1:] + 0.1), dim=-1))
