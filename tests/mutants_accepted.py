@@ -73,13 +73,17 @@ def _is_number(text: str) -> bool:
 
 
 def _of_a_limit(mutant: Mutant) -> bool:
-    """Whether a named whole number of at least a hundred has become the next one."""
-    named = re.match(r"_?[A-Z][A-Z_, ]* = [^\"']*$", mutant.context.split("#")[0].strip())
+    """Whether a whole number of at least a hundred, a named one or of passes, has become the next one."""
+    named = re.match(rf"_?[A-Z][A-Z_, ]* = [^\"']*$|for \w+ in range\({mutant.was}\):", _code(mutant))
     numbers = mutant.was.replace("_", ""), mutant.now.replace("_", "")
     if named is None or not all(each.isdecimal() for each in numbers):
         return False
     was, now = map(int, numbers)
     return was >= 100 and now == was + 1
+
+
+def _code(mutant: Mutant) -> str:
+    return mutant.context.split("#")[0].strip()
 
 
 def _without(mutant: Mutant, name: str) -> bool:
