@@ -74,7 +74,7 @@ def _is_number(text: str) -> bool:
 
 def _of_a_limit(mutant: Mutant) -> bool:
     """Whether a whole number of at least a hundred, a named one or of passes, has become the next one."""
-    named = re.match(rf"_?[A-Z][A-Z_, ]* = [^\"']*$|for \w+ in range\({mutant.was}\):", _code(mutant))
+    named = re.match(rf"_?[A-Z][A-Z_, ]* = [^\"']*$|for \w+ in range\({re.escape(mutant.was)}\):", _code(mutant))
     numbers = mutant.was.replace("_", ""), mutant.now.replace("_", "")
     if named is None or not all(each.isdecimal() for each in numbers):
         return False
