@@ -74,7 +74,9 @@ def _is_number(text: str) -> bool:
 
 def _of_a_limit(mutant: Mutant) -> bool:
     """Whether a whole number of at least a hundred, a named one or of passes, has become the next one."""
-    named = re.match(rf"_?[A-Z][A-Z_, ]* = [^\"']*$|for \w+ in range\({re.escape(mutant.was)}\):", _code(mutant))
+    named = re.match(
+        rf"_?[A-Z][A-Z_, ]* = [^\"']*$|for \w+ in range\({re.escape(mutant.was)}\):", _code(mutant)
+    )
     numbers = mutant.was.replace("_", ""), mutant.now.replace("_", "")
     if named is None or not all(each.isdecimal() for each in numbers):
         return False
@@ -138,6 +140,30 @@ def _plain(text: str) -> str:
 
 # (file, line, what changes, into what) -> why
 ACCEPTED: dict[tuple[str, str, str, str], str] = {
+    (
+        "staf_torch/adp/identification.py",
+        "return torch.where(change > self.novelty**2 * s.square().sum(-1), empty, -1)",
+        "1",
+        "2",
+    ): "a place that is none, as any below 0 is",
+    (
+        "staf_torch/online/experience_memory.py",
+        "here = torch.where(fine.unsqueeze(-1), x, 0.0).to(self.states)",
+        "0.0",
+        "1.0",
+    ): "of a row that is not stored",
+    (
+        "staf_torch/online/bank_definition.py",
+        'doubtful = bool((seen & (away > most * torch.maximum(s["variance"], s["pace"]).sqrt())).any())',
+        'away > most * torch.maximum(s["variance"], s["pace"]).sqrt()',
+        "(away >= most * torch.maximum(s['variance'], s['pace']).sqrt())",
+    ): _TIE,
+    (
+        "staf_torch/local_basis/graded.py",
+        "terms: Tensor = (vector @ columns).unflatten(-1, self.inverse.shape[-3:-1])",
+        "3",
+        "4",
+    ): "of (K, M, M), the one shape that comes there",
     (
         "staf_torch/lanes/eliminations.py",
         "best = torch.where(order < 0, whole[..., 0].abs(), -1.0).argmax(-1, keepdim=True)",

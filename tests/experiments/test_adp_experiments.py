@@ -12,6 +12,7 @@ from composing import settings
 from PIL import Image
 
 from staf_torch import adp, systems
+from staf_torch.adp import reference_optimum
 from staf_torch.experiments import adp as adp_experiment
 from staf_torch.experiments import adp_comparison, adp_tracking
 
@@ -164,3 +165,25 @@ def test_tracking_learns_at_points_of_either_kind(points: str) -> None:
     assert isinstance(learner, adp.ActorCritic)
     kind = {"random": adp.RandomPoints, "quadrature": adp.QuadraturePoints}[points]
     assert isinstance(learner.extrapolation, kind)
+
+
+def test_the_optimum_is_sought_over_the_horizon_that_is_stated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = []
+
+    class Heard(reference_optimum.DirectShooting):
+        def __init__(self, *given, **named):  # type: ignore[no-untyped-def]
+            asked.append(named)
+            super().__init__(*given, **named)
+
+    monkeypatch.setattr(reference_optimum, "DirectShooting", Heard)
+    lines = (
+        "experiment=adp",
+        "system=pendulum",
+        "adp/policy=lqr",
+        "figures=false",
+        "adp.optimum.horizon=2.5",
+    )
+    adp_experiment.ClosedLoop()(settings(*lines, "adp.optimum.intervals=40", *SHORT), tmp_path)
+    assert [(named["horizon"], named["intervals"]) for named in asked] == [(2.5, 40)]

@@ -8,6 +8,7 @@ from helpers import basis_of, tensor, uniform
 from variants import KERNELS, RADII, over
 
 import staf_torch as st
+from staf_torch.local_basis.base import from_scaled
 from staf_torch.targets import Paper
 
 NEWTON = {name: KERNELS[name] for name in KERNELS if name not in ("exponential", "gaussian", "polynomial")}
@@ -77,3 +78,13 @@ def test_a_radius_that_moves_gives_what_the_constant_one_of_its_size_gives(
         expected = alone.local(at).fit(alone.values(at, Paper()))
         assert found[row].isfinite().all()
         torch.testing.assert_close(found[row], expected, rtol=1e-7, atol=1e-7)
+
+
+def test_weights_whose_factor_underflows_are_lost_unless_they_are_zero() -> None:
+    kernel = st.ExponentialKernel()
+    x = torch.tensor([[30.0, 0.0], [1.0, 0.0]], dtype=torch.float64)  # e^-900 and e^-1
+    some = torch.tensor([[2.0, 0.0], [2.0, 0.0]], dtype=torch.float64)
+    found = from_scaled(kernel, x, some)
+    assert bool(found[0].isnan().all())
+    assert bool(torch.isfinite(found[1]).all())
+    assert from_scaled(kernel, x, 0 * some).tolist() == [[0.0, 0.0], [0.0, 0.0]]

@@ -38,6 +38,7 @@ def predictions(model: st.StaFRegressor, steps: int) -> Tensor:
 MODELS = {
     "filter": lambda: st.StaFRegressor(scaling=True),
     "filter of a kernel": lambda: st.StaFRegressor("matern", 0.4, noise=0.1, forgetting=0.99),
+    "tuned filter": lambda: st.StaFRegressor().tune(*(part[:100] for part in hard_stream(100))),
     "bank": lambda: st.StaFRegressor(memory=128, neighbours=8, scaling=True),
     "bank that keeps all": lambda: st.StaFRegressor(memory=256, neighbours=20, scaling=True),
 }
@@ -68,6 +69,19 @@ WANTED: dict[str, list[list[float]]] = {
         [-0.300037962, 1.46019397],
         [1.35325791, 1.66191603],
     ],
+    "tuned filter": [
+        [0.888956288, 0.0302549852],
+        [-0.633684022, 0.195251568],
+        [1.88388226, 0.0385204462],
+        [-0.306384541, 0.4858233],
+        [1.38961769, 1.81851143],
+        [-0.79869684, 3.60010591],
+        [0.00266605329, 5.45294095],
+        [-0.744380408, 4.85412067],
+        [1.41622895, 2.75325105],
+        [-0.259514613, 6.96201322],
+        [1.75828716, 6.27523364],
+    ],
     "bank": [
         [0.867963967, 0.121869328],
         [-0.569437126, 0.0725023459],
@@ -96,6 +110,12 @@ WANTED: dict[str, list[list[float]]] = {
     ],
 }
 
+TUNED = [
+    [0.821217993, 3.79935981, 2.45071376],
+    [1, 0.999944854, 0.999936861],
+    [0.25, 0.25, 0.25],
+]
+
 
 @pytest.mark.parametrize("name", MODELS)
 def test_predictions_are_the_recorded_ones(name: str) -> None:
@@ -103,3 +123,14 @@ def test_predictions_are_the_recorded_ones(name: str) -> None:
     torch.testing.assert_close(
         found, torch.tensor(WANTED[name], dtype=torch.float64), rtol=3e-4, atol=1e-6
     )  # of the definition, too
+
+
+def test_what_tuning_finds_is_the_recorded() -> None:
+    """Streams of which one prefers near centers and others far ones, one forgets and others do not."""
+    x, y = hard_stream(120)
+    time = torch.arange(120, dtype=torch.float64)
+    several = torch.stack((y, (0.3 * x[:, 0]).exp(), torch.where(time < 60, x[:, 0], -x[:, 0])), 1)
+    tuned = st.StaFRegressor().tune(x.unsqueeze(1).expand(-1, 3, -1), several)
+    assert tuned._tuning is not None
+    found = torch.stack((tuned._tuning.likelihood, tuned._tuning.forgetting, tuned._tuning.radius))
+    torch.testing.assert_close(found, torch.tensor(TUNED, dtype=torch.float64), rtol=1e-4, atol=1e-6)
