@@ -72,8 +72,6 @@ def _profile(smoothness: float, t2: Tensor) -> Tensor:
     small = torch.where(near, t2, 0.0)
     even = _horner(series[0::2], small)
     odd = _horner(series[1::2], small)
-    if series[1] == 0.0:  # t^3 and up: written as t^2 * t, whose two derivatives exist
-        odd = small * _horner(series[3::2], small)
     t = torch.where(near, 1.0, root)
     far = _horner(_POLYNOMIALS[smoothness], t) * (-t).exp()
     return torch.where(near, even + root * odd, far)

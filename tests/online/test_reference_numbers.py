@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
 import staf_torch as st
+from staf_torch.online.bank import Bank
 
 
 def hard_stream(steps: int) -> tuple[Tensor, Tensor]:
@@ -123,6 +125,18 @@ def test_predictions_are_the_recorded_ones(name: str) -> None:
     torch.testing.assert_close(
         found, torch.tensor(WANTED[name], dtype=torch.float64), rtol=3e-4, atol=1e-6
     )  # of the definition, too
+
+
+def test_predictions_of_the_definition_are_the_recorded_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = Bank.__init__
+
+    def defined(bank: Bank, *given: Any, **named: Any) -> None:
+        made(bank, *given, **named)
+        bank._run = None
+
+    monkeypatch.setattr(Bank, "__init__", defined)
+    found = predictions(MODELS["bank"](), 240)
+    torch.testing.assert_close(found, torch.tensor(WANTED["bank"])[:8].double(), rtol=3e-4, atol=1e-6)
 
 
 def test_what_tuning_finds_is_the_recorded() -> None:
