@@ -407,7 +407,7 @@ def test_who_rests_on_the_edge_violates_nothing() -> None:
 @pytest.mark.parametrize("m", [1, 2, 3])
 def test_in_plain_torch_too_no_row_knows_what_the_others_are(m: int) -> None:
     normals, wanted, least = uniform(6, 2, m, seed=1), 2 * uniform(6, m, seed=2), uniform(6, 2, seed=3)
-    wanted[2], least[3], normals[4] = 1e12, 1e12, 1e-9 * normals[4]
+    wanted[2], least[3], normals[4], least[5] = 1e12, 1e12, 1e-9 * normals[4], 5.0  # the last: none fits
     low, high = torch.full((m,), -0.7, dtype=torch.float64), torch.full((m,), 0.9, dtype=torch.float64)
     table = cases(2, low.tolist(), high.tolist())
     together = nearest_admissible(wanted, normals, least, low, high, table)

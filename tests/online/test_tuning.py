@@ -223,3 +223,8 @@ def test_units_grow_with_a_coordinate_that_is_measured_every_second_time() -> No
     for k in range(120, 400):
         model.partial_fit(x[k], y[k])
     assert float(model._streams_.units[0, 4]) > 10 * before
+
+
+def test_what_is_forgotten_is_a_share() -> None:
+    assert all(0 < each <= 1 for each in tuning.FORGETTING)
+    assert max(tuning.FORGETTING) == 1

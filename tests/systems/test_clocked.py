@@ -54,6 +54,6 @@ def test_plant_without_a_size_is_refused() -> None:
 
 
 def test_a_step_takes_any_leading_dimensions() -> None:
-    plant = systems.Clocked(systems.StepPlant(lambda x, u: x.sin() + u, dim=1, inputs=1, dt=0.1))
-    x, u = uniform(3, 4, 2, seed=1), uniform(3, 4, 1, seed=2)
-    torch.testing.assert_close(plant.step(x, u), torch.cat((x[..., :1].sin() + u, x[..., 1:] + 0.1), dim=-1))
+    plant = systems.Clocked(systems.StepPlant(lambda x, u: x.sin() + u, dim=3, inputs=1, dt=0.1))
+    x, u = uniform(3, 5, 4, seed=1), uniform(3, 5, 1, seed=2)
+    torch.testing.assert_close(plant.step(x, u), torch.cat((x[..., :3].sin() + u, x[..., 3:] + 0.1), dim=-1))
