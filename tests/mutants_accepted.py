@@ -63,7 +63,7 @@ def accepted(mutant: Mutant) -> str | None:
         return _DEVICE
     if _of_a_limit(mutant):
         return _LIMIT
-    if mutant.room == "figures" and re.search(r"\bpage\(", mutant.context) and _is_number(mutant.was):
+    if mutant.room == "figures" and re.search(r"\bpage\(", mutant.context) and re.search(r"\d", mutant.was):
         return _SIZE
     return ACCEPTED.get(mutant.key)
 
@@ -140,6 +140,19 @@ def _plain(text: str) -> str:
 
 # (file, line, what changes, into what) -> why
 ACCEPTED: dict[tuple[str, str, str, str], str] = {
+    (
+        "staf_torch/adp/shooting/newton.py",
+        "for _ in range(2 * slope.shape[-1]):",
+        "2",
+        "3",
+    ): "passes of a search that has ended before",
+    (
+        "staf_torch/adp/adaptation/parametric.py",
+        "theta=torch.ones(plant.inputs, dtype=torch.float64),",
+        "torch.ones(plant.inputs, dtype=torch.float64)",
+        "torch.ones(plant.inputs)",
+    ): "the constructor makes float64 of it",
+    ("staf_torch/lanes/combinators.py", "_FEW = 4  # passes of a loop that is only tried", "4", "5"): _SPEED,
     (
         "staf_torch/lanes/runs.py",
         "step, length = 0, 1",

@@ -183,3 +183,21 @@ def test_a_boxed_step_has_the_least_model_of_all_in_the_box(inputs: int, seed: i
     for turn in range(300):
         other = low + (high - low) * (0.5 + 0.5 * uniform(rows, inputs, seed=1000 + turn))
         assert bool((model(offset) <= model(other) + 1e-12).all())
+
+
+def test_guesses_are_those_of_their_seed_and_of_nobodys_else() -> None:
+    cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=2, low=-1.0, high=0.5)
+    x0, base = torch.zeros(3, 2).double(), adp.Feedback(lambda x: -x).policy
+    before = torch.get_rng_state()
+    first = starts.guesses(cost, base, x0, 2.0, 12, seed=3)
+    assert torch.equal(before, torch.get_rng_state())
+    torch.rand(5)
+    again, other = (
+        starts.guesses(cost, base, x0, 2.0, 12, seed=3),
+        starts.guesses(cost, base, x0, 2.0, 12, seed=4),
+    )
+    assert all(
+        torch.equal(a.knots, b.knots) and a.until == b.until for a, b in zip(first, again, strict=True)
+    )
+    assert any(not torch.equal(a.knots, b.knots) for a, b in zip(first, other, strict=True))
+    assert all(bool(((g.knots >= -1) & (g.knots <= 0.5)).all()) for g in first)

@@ -140,3 +140,11 @@ def test_an_episode_without_a_horizon_of_its_own_takes_ten_seconds() -> None:
         assert not ended
         assert steps <= 1000
     assert steps == 1000
+
+
+def test_every_registered_name_is_of_its_own_plant() -> None:
+    for name, plant in envs.PLANTS.items():
+        assert gymnasium.registry[name].kwargs == {"plant": plant}
+        made = gymnasium.make(name).unwrapped.plant
+        assert type(made).__name__ == name.removeprefix("staf_torch/").removesuffix("-v0")
+    assert gymnasium.registry[envs.OWN_PLANT].kwargs == {}

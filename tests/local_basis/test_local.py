@@ -8,7 +8,9 @@ from helpers import basis_of, tensor, uniform
 from variants import KERNELS, RADII, over
 
 import staf_torch as st
+from staf_torch.engine.quantities import _paper_weights
 from staf_torch.local_basis.base import from_scaled
+from staf_torch.local_basis.newton import newton_space
 from staf_torch.targets import Paper
 
 NEWTON = {name: KERNELS[name] for name in KERNELS if name not in ("exponential", "gaussian", "polynomial")}
@@ -88,3 +90,21 @@ def test_weights_whose_factor_underflows_are_lost_unless_they_are_zero() -> None
     assert bool(found[0].isnan().all())
     assert bool(torch.isfinite(found[1]).all())
     assert from_scaled(kernel, x, 0 * some).tolist() == [[0.0, 0.0], [0.0, 0.0]]
+
+
+@pytest.mark.parametrize("kernel", [st.ExponentialKernel(), st.GaussianKernel(0.7), st.MaternKernel(1.5)])
+def test_weights_of_a_newton_space_of_any_kernel_interpolate(kernel: st.Kernel) -> None:
+    x, offsets = uniform(5, 2, seed=1), 0.6 * st.rings(6)
+    space, centers = newton_space(kernel, x, offsets), x.unsqueeze(-2) + offsets
+    values = Paper()(centers)
+    weights = space.weights(space.fit(values))
+    found = (kernel(centers, centers) * weights.unsqueeze(-2)).sum(-1)
+    torch.testing.assert_close(found, values, rtol=1e-8, atol=1e-8)
+
+
+def test_weights_of_the_paper_that_are_zero_stay_so_where_their_factor_underflows() -> None:
+    scaled, units = tensor([[0.0, 2.0], [0.0, 2.0]]), tensor([[0.0], [0.5]])
+    found = _paper_weights(scaled, units)
+    assert found[:, 0].tolist() == [0.0, 0.0]
+    assert bool(found[0, 1].isnan())
+    assert float(found[1, 1]) == 1.0

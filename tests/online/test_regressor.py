@@ -308,3 +308,12 @@ def test_a_stream_without_a_sample_has_the_deviation_of_the_process_and_its_nois
     mean, deviation = model.predict(x, return_std=True)
     assert float(mean[1]) == 0
     assert float(deviation[1]) == pytest.approx(math.sqrt(amplitude**2 + 0.3**2))
+
+
+def test_a_learned_kernel_is_taken_as_it_is_and_learns_nothing_here() -> None:
+    kernel = st.GaussianKernel(torch.nn.Parameter(torch.tensor(0.8)))
+    model = st.StaFRegressor(kernel, 0.4).partial_fit(tensor([0.3, 0.1]), tensor(1.0))
+    mean, deviation = model.predict(tensor([0.3, 0.2]), return_std=True)
+    assert not mean.requires_grad
+    assert not deviation.requires_grad
+    assert kernel.width.requires_grad

@@ -107,3 +107,15 @@ def test_whether_errors_are_shown_in_full_is_as_it_was_behind_a_program(
         assert wanted == (before == "1")
         assert os.environ["HYDRA_FULL_ERROR"] == "1"
     assert os.environ.get("HYDRA_FULL_ERROR") == before
+
+
+def test_variables_that_a_sweep_changes_are_as_they_were(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("STAF_BEFORE", "1")
+    monkeypatch.setenv("STAF_GONE", "1")
+    monkeypatch.delenv("STAF_NEW", raising=False)
+    with in_process._environment():
+        os.environ["STAF_BEFORE"] = "2"
+        os.environ["STAF_NEW"] = "3"
+        del os.environ["STAF_GONE"]
+    assert (os.environ["STAF_BEFORE"], os.environ["STAF_GONE"]) == ("1", "1")
+    assert "STAF_NEW" not in os.environ

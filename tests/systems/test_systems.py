@@ -248,3 +248,19 @@ def test_known_slopes_are_taken_and_others_of_another_shape_refused() -> None:
         plant = systems.StepPlant(step, slopes=lambda x, u, wrong=wrong: wrong, **given)
         with pytest.raises(ValueError, match=r"must have the shapes \(2, 2\) and \(2, 1\)"):
             plant.linearisation()
+
+
+def test_the_thrust_of_a_quadrotor_pushes_along_its_axis_and_pays_for_its_energy() -> None:
+    plant = systems.PlanarQuadrotor(mass=1.3, inertia=0.2, gravity=9.0)
+    x, u = uniform(20, 6, seed=1).requires_grad_(), uniform(20, 2, seed=2)
+    speed = x[:, 3:]
+    energy = (
+        0.65 * (speed[:, 0].square() + speed[:, 1].square())
+        + 0.1 * speed[:, 2].square()
+        + 1.3 * 9.0 * x[:, 1]
+    )
+    (slope,) = torch.autograd.grad(energy.sum(), x)
+    moved = plant.drift(x) + (plant.effectiveness(x) @ u.unsqueeze(-1)).squeeze(-1)
+    along = -x[:, 2].sin() * x[:, 3] + x[:, 2].cos() * x[:, 4]  # its speed along its own axis
+    power = (1.3 * 9.0 + u[:, 0]) * along + u[:, 1] * x[:, 5]
+    torch.testing.assert_close((slope * moved).sum(-1), power)
