@@ -24,6 +24,9 @@ _STYLE = (
     "size",
     "ncols",
     "borderaxespad",
+    "length",
+    "columnspacing",
+    "handletextpad",
 )
 _SPEED = "decides which of two ways that find the same is taken: the threshold is of speed alone"
 _EDGE = (
@@ -96,7 +99,8 @@ def _without(mutant: Mutant, name: str) -> bool:
 
 def _of(mutant: Mutant, name: str) -> bool:
     """Whether a mutant changes the number of an argument of that name."""
-    return _is_number(mutant.was) and f"{name}={mutant.was}" in mutant.context
+    stated = f"{name}={mutant.was}", f'"{name}": {mutant.was}'
+    return _is_number(mutant.was) and any(each in mutant.context for each in stated)
 
 
 def _of_lengths(mutant: Mutant) -> bool:
@@ -140,6 +144,43 @@ def _plain(text: str) -> str:
 
 # (file, line, what changes, into what) -> why
 ACCEPTED: dict[tuple[str, str, str, str], str] = {
+    (
+        "staf_torch/systems/user_plants.py",
+        "x, u = torch.zeros(dim, dtype=torch.float64), torch.zeros(inputs, dtype=torch.float64)",
+        "torch.zeros(inputs, dtype=torch.float64)",
+        "torch.zeros(inputs)",
+    ): _ONES,
+    ("staf_torch/metrics/ball_error.py", "self._seen += x.numel() // x.shape[-1]", "-1", "(1)"): _SPEED,
+    (
+        "staf_torch/online/tuning.py",
+        "count = left_out.shape[1]",
+        "1",
+        "2",
+    ): "of (S, n, n): as many choices as coordinates",
+    (
+        "staf_torch/theory/minimal_count.py",
+        "grid = extent * ball_grid(dim, _SHELLS, _DIRECTIONS.get(dim, 256)).to(states)",
+        "256",
+        "257",
+    ): _LIMIT,
+    (
+        "staf_torch/adp/global_value.py",
+        "far = (self.problem.offset(now, last) / self.region).square().sum(-1) >= self.spacing**2",
+        "-1",
+        "(1)",
+    ): _ROWS,
+    (
+        "staf_torch/online/local_functions.py",
+        "pairs = None if rate is None else (gram.unsqueeze(1) * shared.mT).flatten(0, 1)",
+        "rate is None",
+        "(rate is not None)",
+    ): _SPEED,
+    (
+        "staf_torch/sweeps/member_rows.py",
+        "_DIGITS = 16  # of the hash of what made a row: enough to tell two settings apart",
+        "16",
+        "17",
+    ): "how long a name is",
     (
         "staf_torch/adp/shooting/newton.py",
         "for _ in range(2 * slope.shape[-1]):",

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ..numerics.checks import fail, positive_real
 from ..numerics.differences import STEP, central_slopes
-from ..numerics.linalg import check_modes, solver, unstabilisable_mode
+from ..numerics.linalg import check_modes, exponential, solver, unstabilisable_mode
 from ..systems import Clocked, Plant
 from .cost import Cost
 
@@ -59,7 +59,7 @@ def exact_hold(f: Tensor, g: Tensor, q: Tensor, r: Tensor, period: float, *, dis
     h = period / 2**doublings
     rate = torch.block_diag(q.double(), r.double())
     rows = torch.cat((-whole.mT, rate), dim=1), torch.cat((torch.zeros_like(whole), whole), dim=1)
-    step = torch.linalg.matrix_exp(h * torch.cat(rows))
+    step = exponential(h * torch.cat(rows))
     flow = step[n + m :, n + m :]
     paid = flow.mT @ step[: n + m, n + m :]
     for _ in range(doublings):

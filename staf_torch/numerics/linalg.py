@@ -170,3 +170,14 @@ def row_jacobian(function: Callable[[Tensor], Tensor], at: Tensor) -> tuple[Tens
     units = torch.eye(math.prod(outputs), dtype=values.dtype, device=values.device)
     rows = [pull(unit.reshape(outputs).expand_as(values).contiguous())[0] for unit in units.unbind(0)]
     return values, torch.stack(rows, dim=-2).unflatten(-2, outputs)
+
+
+def exponential(matrix: Tensor) -> Tensor:
+    """e^A: (..., n, n).
+
+    Up to version 2.14 torch has a wrong coefficient for a single matrix whose norm is .0003 to .05, and loses
+    six digits there; not for several (https://github.com/pytorch/pytorch/issues/196592).
+    """
+    if matrix.numel() > matrix.shape[-1] ** 2:
+        return torch.linalg.matrix_exp(matrix)
+    return torch.linalg.matrix_exp(torch.stack((matrix, matrix)))[0]

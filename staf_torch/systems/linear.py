@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ..numerics.checks import fail, vector
-from ..numerics.linalg import riccati
+from ..numerics.linalg import exponential, riccati
 from .base import ControlAffineSystem
 
 
@@ -56,7 +56,7 @@ class Linear(ControlAffineSystem):
         return self.input_matrix.to(x).expand(*x.shape, self.inputs)
 
     def flow(self, x: Tensor, time: Tensor) -> Tensor:
-        propagators = torch.linalg.matrix_exp(time[:, None, None] * self.matrix.to(time))
+        propagators = exponential(time[:, None, None] * self.matrix.to(time))
         # Row by row, so that the bits of a trajectory do not depend on the batch.
         states: Tensor = (propagators.to(x) * x[..., None, None, :]).sum(-1)
         return states

@@ -127,3 +127,16 @@ def test_a_control_that_is_asked_again_and_stays_costs_what_a_held_one_costs(
     again, spent = held(x, u, lambda now: u)
     torch.testing.assert_close(again, after, rtol=1e-4, atol=1e-5)
     torch.testing.assert_close(spent, paid, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("period", [1e-3, 0.3, 20.0])
+def test_what_a_hold_pays_is_exact_however_long_it_is(period: float) -> None:
+    rates = torch.tensor([-30.0, -1.0], dtype=torch.float64)
+    held = exact_hold(
+        rates.diag(), torch.zeros(2, 1).double(), torch.eye(2).double(), torch.ones(1, 1).double(), period
+    )
+    rounding = 1e-14 * (1 + 30 * period)  # the exponent's own
+    torch.testing.assert_close(held.a, (rates * period).exp().diag(), rtol=rounding, atol=1e-300)
+    wanted = (1 - (2 * rates * period).exp()) / (-2 * rates)  # of x1^2 + x2^2 from one
+    torch.testing.assert_close(held.paid[:2, :2], wanted.diag(), rtol=1e-12, atol=1e-300)
+    assert float(held.paid[2, 2]) == pytest.approx(period)

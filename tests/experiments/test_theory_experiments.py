@@ -107,3 +107,11 @@ def test_the_bound_is_of_as_many_states_as_are_stated(count: int, monkeypatch: p
 def test_where_no_layout_is_good_enough_none_is_needed_by_name() -> None:
     good = torch.tensor([[False, True, True], [False, False, False], [True, False, True]])
     assert feasibility._first(good, torch.tensor([3, 6, 10])).tolist() == [6, 0, 3]
+
+
+def test_a_bound_that_no_degree_reaches_has_a_row_without_numbers() -> None:
+    cfg = settings("exponential_bound", "exponential_bound.epsilons=[1e-6]", "exponential_bound.max_degree=1")
+    (row,) = exponential_bound.solve(cfg).values()
+    assert list(row) == ["N", "S", "count", "m", "error", *list(row)[5:]]
+    assert {"degree", "one_polynomial_count", "one_polynomial_m", "one_polynomial_error"} <= row.keys()
+    assert row["N"] is row["degree"] is None

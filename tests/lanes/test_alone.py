@@ -6,6 +6,7 @@ import itertools
 import random
 import time
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ import staf_torch as st
 from staf_torch import lanes
 from staf_torch.lanes import Program
 from staf_torch.lanes import program as programs
+from staf_torch.lanes.alone import undrawn
 from staf_torch.lanes.content import reads_users_code
 from staf_torch.lanes.function import Rows
 from staf_torch.lanes.tracer import NotLoweredError
@@ -184,3 +186,15 @@ def test_loops_are_tried_by_a_few_passes_and_what_they_call_is_still_seen(
         0
     ]
     torch.testing.assert_close(found, torch.full_like(rows, 0.2))
+
+
+def test_who_tries_a_program_draws_no_random_numbers() -> None:
+    def states() -> tuple[Tensor, Any, Any]:
+        return torch.get_rng_state(), np.random.get_state()[1].tolist(), random.getstate()  # noqa: NPY002
+
+    before = states()
+    with undrawn():
+        torch.rand(3), np.random.rand(3), random.random()  # noqa: NPY002
+    after = states()
+    assert torch.equal(before[0], after[0])
+    assert before[1:] == after[1:]

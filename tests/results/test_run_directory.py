@@ -59,3 +59,12 @@ def test_metrics_that_are_refused_leave_the_directory_open(tmp_path: Path) -> No
         run.metrics({"error": float("nan")})
     run.metrics({"error": None})
     assert (tmp_path / "metrics.json").exists()
+
+
+def test_figures_are_not_written_through_a_link(tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "run" / "figures").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(OSError, match="it is a link, which is not written through"):
+        RunDirectory(tmp_path / "run").figure("one", {"png": b"1"})
+    assert list((tmp_path / "elsewhere").iterdir()) == []

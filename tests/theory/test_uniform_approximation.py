@@ -12,6 +12,7 @@ from torch import Tensor
 from staf_torch import (
     theory,
 )
+from staf_torch.centers import probe_points
 from staf_torch.theory.uniform_approximation import ball_grid, monomials, near_best, supremum
 
 
@@ -52,6 +53,7 @@ def test_grid_and_covering_lie_in_their_balls(dim: int) -> None:
     states = theory.disc(2.0, dim=dim, count=20, center=[1.0] * dim)
     assert states.shape == (20, dim)
     assert torch.equal(states[0], torch.ones(dim).double())
+    torch.testing.assert_close(states, 1 + 2 * probe_points(20, dim))
     assert (states - 1).norm(dim=-1).max() <= 2 + 1e-12
 
 
