@@ -178,6 +178,6 @@ def exponential(matrix: Tensor) -> Tensor:
     Up to version 2.14 torch has a wrong coefficient for a single matrix whose norm is .0003 to .05, and loses
     six digits there; not for several (https://github.com/pytorch/pytorch/issues/196592).
     """
-    if matrix.numel() > matrix.shape[-1] ** 2:
-        return torch.linalg.matrix_exp(matrix)
-    return torch.linalg.matrix_exp(torch.stack((matrix, matrix)))[0]
+    several = matrix.numel() > matrix.shape[-1] ** 2
+    found: Tensor = torch.linalg.matrix_exp(matrix if several else torch.stack((matrix, matrix)))
+    return found if several else found[0]
