@@ -145,6 +145,18 @@ def _plain(text: str) -> str:
 # (file, line, what changes, into what) -> why
 ACCEPTED: dict[tuple[str, str, str, str], str] = {
     (
+        "staf_torch/experiments/adp.py",
+        "_NAMED = 20  # diverged trajectories that the log lists by number",
+        "20",
+        "21",
+    ): "how much a log lists",
+    (
+        "staf_torch/sweeps/workers.py",
+        "while time.monotonic() - since < patience:",
+        "time.monotonic() - since < patience",
+        "(time.monotonic() - since <= patience)",
+    ): _TIE,
+    (
         "staf_torch/systems/user_plants.py",
         "x, u = torch.zeros(dim, dtype=torch.float64), torch.zeros(inputs, dtype=torch.float64)",
         "torch.zeros(inputs, dtype=torch.float64)",

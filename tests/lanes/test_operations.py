@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -268,6 +269,10 @@ def test_the_inverse_of_the_error_function_is_one_up_to_its_ends() -> None:
     found = erfinv(y)
     torch.testing.assert_close(torch.erf(found), y, rtol=0, atol=4e-16)
     assert torch.equal(found.sign(), y.sign())
+    beyond = erfinv(torch.tensor([1.0, -1.0, 1.5, -2.0], dtype=torch.float64))
+    torch.testing.assert_close(
+        beyond, torch.tensor([math.inf, -math.inf, math.nan, math.nan]).double(), equal_nan=True
+    )
 
 
 def test_multiples_of_a_summand_count() -> None:
