@@ -60,6 +60,8 @@ def accepted(mutant: Mutant) -> str | None:
         return _ONES
     if re.match(r"(Program|RowFunction)\(", mutant.was) and _without(mutant, "name"):
         return "a name in messages"
+    if mutant.room == "figures" and f"colour({mutant.was})" in mutant.context:
+        return "which of our colours"
     if _is_number(mutant.was) and f"stacklevel={mutant.was}" in mutant.context:
         return "the line that a warning names"
     if mutant.file == "staf_torch/lanes/cuda.py":
@@ -144,6 +146,12 @@ def _plain(text: str) -> str:
 
 # (file, line, what changes, into what) -> why
 ACCEPTED: dict[tuple[str, str, str, str], str] = {
+    (
+        "staf_torch/adp/traced_search.py",
+        "gain = (cost - best) / cost.abs().clamp(min=1e-300)",
+        "cost - best",
+        "(cost + best)",
+    ): _SPEED,
     ("staf_torch/lanes/graph.py", "if right == -1:", "-1", "(1)"): _SPEED,
     (
         "staf_torch/experiments/adp.py",
