@@ -58,6 +58,8 @@ def test_every_experiment_has_recorded_metrics() -> None:
 
 @pytest.mark.parametrize("name", CASES)
 def test_metrics_are_the_recorded_ones(name: str, tmp_path: Path) -> None:
+    if name == "adp_tracking":  # its optimum is a Riccati equation's
+        pytest.importorskip("scipy", reason="needs the extra adp")
     recorded = json.loads(RECORDED.read_text())[name]
     found = metrics_of(name, tmp_path)
     assert found.keys() == recorded.keys()
