@@ -10,6 +10,7 @@ import pytest
 import torch
 from composing import settings
 
+from staf_torch import systems
 from staf_torch.experiments import avoidance, safe_box
 from staf_torch.experiments.vehicles import vehicle
 
@@ -95,3 +96,14 @@ def test_scenarios_begin_clear_of_the_discs_and_are_the_same_again() -> None:
     assert x0.equal(avoidance.scenarios(cfg))
     with pytest.raises(ValueError, match="must leave room for a start"):
         avoidance.scenarios(settings("experiment=avoidance", "avoidance.radius=9", "trajectories=1"))
+
+
+def test_starts_beside_walls_are_beside_one_each() -> None:
+    cfg = settings("experiment=safe_box", "safe_box.states=200", "safe_box.near=1e-5")
+    low, high = torch.tensor([-1.0, -2.0]), torch.tensor([0.5, 3.0])
+    box = systems.Barrier(systems.TwoState(), low=low.tolist(), high=high.tolist())
+    x = safe_box._beside_walls(cfg, box)
+    apart = torch.stack((x - box.low, box.high - x)).abs()  # (2, B, n)
+    beside = (apart - 1e-5).abs() < 1e-12
+    assert beside.sum((0, 2)).tolist() == [1] * 200
+    assert bool((beside.sum(1) > 20).all())  # every wall has some

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import pytest
 import torch
+from helpers import uniform
 from torch import Tensor
 
 from staf_torch import adp, systems
@@ -265,3 +266,13 @@ def test_a_robot_is_that_of_scalars_and_one_that_no_mass_matrix_has_is_refused()
     robot, x, u = systems.TwoLinkRobot(), 2 * drawn(20, 4) - 1, drawn(20, 2)
     expected = numbers([robot_rate(*row) for row in zip(x.tolist(), u.tolist(), strict=True)])
     torch.testing.assert_close(robot.rate(x, u), expected, rtol=1e-12, atol=1e-12)
+
+
+def test_an_angle_without_walls_has_the_same_coordinate_a_turn_further_on() -> None:
+    box = systems.Barrier(systems.Pendulum(), low=[None, -1.5], high=[None, 2.0])
+    x = torch.stack((uniform(20, seed=1, low=-0.4, high=1.9), uniform(20, seed=2)), dim=-1)
+    turn = torch.tensor([2 * math.pi, 0.0], dtype=torch.float64)
+    for of in (box.transform, box.coordinates):
+        torch.testing.assert_close(of(x + turn), of(x), rtol=1e-9, atol=1e-9)
+        torch.testing.assert_close(of(x - 2 * turn), of(x), rtol=1e-9, atol=1e-9)
+        torch.testing.assert_close(box.inverse(of(x + turn)), x, rtol=1e-9, atol=1e-9)
