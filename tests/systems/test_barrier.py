@@ -268,8 +268,10 @@ def test_a_robot_is_that_of_scalars_and_one_that_no_mass_matrix_has_is_refused()
     torch.testing.assert_close(robot.rate(x, u), expected, rtol=1e-12, atol=1e-12)
 
 
-def test_an_angle_without_walls_has_the_same_coordinate_a_turn_further_on() -> None:
-    box = systems.Barrier(systems.Pendulum(), low=[None, -1.5], high=[None, 2.0])
+def test_an_angle_with_walls_has_the_same_coordinate_a_turn_further_on() -> None:
+    pendulum = systems.Pendulum()
+    pendulum.periodic = (0,)
+    box = systems.Barrier(pendulum, low=[-0.5, None], high=[2.0, None])
     x = torch.stack((uniform(20, seed=1, low=-0.4, high=1.9), uniform(20, seed=2)), dim=-1)
     turn = torch.tensor([2 * math.pi, 0.0], dtype=torch.float64)
     for of in (box.transform, box.coordinates):
