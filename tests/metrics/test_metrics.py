@@ -17,6 +17,7 @@ from staf_torch import systems
 from staf_torch.adp.simulation import LoopResult
 from staf_torch.approximation.conditioning import sup_error
 from staf_torch.engine import ChaseResult, chase_pieces
+from staf_torch.metrics import Metric
 from staf_torch.metrics import ball_error as ball_errors
 from staf_torch.metrics.ball_error import StateErrorPass
 from staf_torch.metrics.chase import ChaseMetrics, Member
@@ -319,3 +320,16 @@ def test_a_closed_loop_is_measured_with_and_without_a_known_optimum(known: bool)
         ratios = (result.cost[:2] / optimal[:2]).tolist()
         assert found["cost_ratio_max"] == max(ratios)
         assert found["cost_ratio_mean"] == pytest.approx(sum(ratios) / 2)
+
+
+@pytest.mark.parametrize("larger", [True, False])
+def test_a_number_that_is_reported_is_finite_and_the_right_way_round(larger: bool) -> None:
+    class Own(Metric):
+        name, larger_is_better = "own", larger
+
+        def __call__(self, result: object, problem: object) -> torch.Tensor:
+            return torch.zeros(1, 1)
+
+    assert Own().from_badness(2.0) == (-2.0 if larger else 2.0)
+    for lost in (math.nan, math.inf, -math.inf):
+        assert Own().from_badness(lost) is None

@@ -17,7 +17,7 @@ from staf_torch.cli.table import main
 from staf_torch.results.reader import Collection, collect
 from staf_torch.tables import Layout, Style, Table, json_text, latex_text, parquet_bytes, tabulate
 from staf_torch.tables.aggregate import AGGREGATES, _expansion, student_quantile
-from staf_torch.tables.model import escape
+from staf_torch.tables.model import _uniform, escape
 
 PIVOT = Layout(
     rows=("kernel", "centers.radius"),
@@ -320,3 +320,11 @@ def test_the_expansion_has_the_coefficients_of_abramowitz_and_stegun() -> None:
     for freedom in (1, 2, 7):  # 26.7.5
         found = x + g1 / freedom + g2 / freedom**2 + g3 / freedom**3 + g4 / freedom**4
         assert _expansion(freedom) == pytest.approx(found, rel=1e-12)
+
+
+def test_a_column_of_numbers_has_nan_where_there_is_none() -> None:
+    found = _uniform([1, None, 2.5], True)
+    assert found[0::2] == [1, 2.5]
+    assert math.isnan(found[1])
+    assert _uniform([True, None], False) == [True, None]
+    assert _uniform(["a", None, [1, 2]], False) == ["a", None, "[1, 2]"]
