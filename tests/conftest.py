@@ -17,6 +17,7 @@ import hypothesis
 import pytest
 import torch
 from absent_extras import pytest_make_collect_report, pytest_runtest_makereport
+from recorded import Record
 
 __all__ = ["pytest_make_collect_report", "pytest_runtest_makereport"]
 
@@ -25,8 +26,9 @@ hypothesis.settings.load_profile("suite")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """An order of the tests by chance: folders, files and the tests of a file."""
+    """An order of the tests by chance: folders, files and the tests of a file; numbers recorded anew."""
     parser.addoption("--order", type=int, default=None, metavar="SEED", help="shuffle the tests by a seed")
+    parser.addoption("--record", action="store_true", help="write what `recorded.py` holds anew")
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
@@ -77,6 +79,12 @@ def _chases_run_by_their_definition(request: pytest.FixtureRequest, monkeypatch:
     """But where a test is marked `compiled`: every chase of its own kind is a program to compile."""
     if request.node.get_closest_marker("compiled") is None:
         monkeypatch.setattr("staf_torch.engine.row_program._SHORTEST", 10**9)
+
+
+@pytest.fixture
+def record(request: pytest.FixtureRequest) -> Record:
+    """Compares with what is recorded."""
+    return Record(request)
 
 
 @pytest.fixture(autouse=True)

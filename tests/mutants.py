@@ -102,6 +102,9 @@ def _skipped(tree: ast.AST) -> Iterator[int]:
             and node.func.id in ("cast", "TypeVar")
         ):
             parts = [node]
+        elif isinstance(node, ast.Call):  # of a matrix axis 1 is axis -1: -2 tells more
+            yield from (id(each) for each in node.args if _is_last_axis(each))
+            yield from (id(each.value) for each in node.keywords if _is_last_axis(each.value))
         elif isinstance(node, ast.Raise):
             parts = [node.exc, node.cause]
         elif isinstance(node, ast.Assert) or (isinstance(node, ast.Expr) and _says(node.value)):
@@ -112,6 +115,10 @@ def _skipped(tree: ast.AST) -> Iterator[int]:
                 parts = [node.value]  # an alias of types
         for part in filter(None, parts):
             yield from (id(inner) for inner in ast.walk(part))
+
+
+def _is_last_axis(node: ast.AST) -> bool:
+    return isinstance(node, ast.UnaryOp) and ast.unparse(node) == "-1"
 
 
 def _says(node: ast.AST) -> bool:

@@ -13,10 +13,12 @@ from mutants import Mutant
 from mutants_accepted import accepted
 from mutation_fork import begin, in_fork, place
 from mutation_map import Map, places, tests_near
+from source_rules import without_dtype
 
 OVERHEAD = 0.1  # seconds that a test costs beside what was measured
 UNKNOWN = 5.0  # seconds that a file of tests is taken for
 _ENDED = "by the clock, or the process ended"
+_READS = "test_structure.py"  # which reads the text, and runs no line
 FIRST = 4.0  # seconds of tests that are tried before files of more tests are read
 
 
@@ -60,6 +62,8 @@ def judge(mutant: Mutant) -> Verdict | None:
         return None
     path = place() / mutant.file
     source = path.read_text(encoding="utf-8")
+    if len(list(without_dtype(mutant.applied(source)))) > len(list(without_dtype(source))):
+        return Verdict(mutant, "killed", 1, 0.0, _READS)
     tests = _tests_for(mutant, source)
     if not tests:
         return Verdict(mutant, "unreached" if not _hits(mutant, source) else "too dear")

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 from public_names import public
+from recorded import Record
 
 from staf_torch.lanes import build
 
@@ -23,7 +24,7 @@ COMPILE = ("staf_torch.deploy.c_header.time_c", "staf_torch.lanes.function.ready
 
 @pytest.mark.parametrize("name", PUBLIC)
 def test_the_example_of_a_name_does_what_it_says(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, record: Record
 ) -> None:
     monkeypatch.chdir(tmp_path)
     if name in COMPILE and not build.compiler():
@@ -32,5 +33,8 @@ def test_the_example_of_a_name_does_what_it_says(
     text = inspect.cleandoc(thing.__doc__ or "")
     test = doctest.DocTestParser().get_doctest(text, dict(names), name, None, None)
     said: list[str] = []
-    doctest.DocTestRunner(verbose=False, optionflags=doctest.ELLIPSIS).run(test, out=said.append)
+    runner = doctest.DocTestRunner(verbose=False, optionflags=doctest.ELLIPSIS)
+    runner.run(test, out=said.append, clear_globs=False)
     assert said == [], "".join(said)
+    left = {key: value for key, value in test.globs.items() if key not in names and not key.startswith("__")}
+    record(left, rtol=1e-5)

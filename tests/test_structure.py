@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 from command_line import ROOT, one
 from public_names import PACKAGES, public
+from source_rules import without_dtype
 
 PACKAGE = ROOT / "staf_torch"
 TOP = re.findall(r"^(\w+):", (ROOT / "conf" / "config.yaml").read_text(encoding="utf-8"), re.MULTILINE)
@@ -190,3 +191,13 @@ def check_shown(name: str, text: str) -> None:
                 assert (ROOT / "conf" / group / f"{option}.yaml").is_file(), place
         elif program not in ("staf-table", "staf-export"):
             assert (ROOT / place).is_file(), place
+
+
+def test_no_number_depends_on_the_default_dtype_of_torch() -> None:
+    """It is the user's: every tensor that is made says of which dtype, or is cast at once."""
+    found = [
+        f"{path.relative_to(ROOT)}:{call}"
+        for path in sorted(PACKAGE.rglob("*.py"))
+        for call in without_dtype(path.read_text(encoding="utf-8"))
+    ]
+    assert found == []

@@ -217,7 +217,9 @@ class DetourRollout(Controller):
 
 def _detours(count: int, sizes: Tensor, lengths: Sequence[int]) -> Tensor:
     """Detours along all combinations of axes, of each size and length: (P, count + 1)."""
-    ways = torch.tensor([way for way in itertools.product((0.0, 1.0, -1.0), repeat=count) if any(way)])
+    ways = torch.tensor(
+        [way for way in itertools.product((0.0, 1.0, -1.0), repeat=count) if any(way)], dtype=torch.float64
+    )
     ways = ways.double() / ways.double().norm(dim=-1, keepdim=True)
     rows = [
         torch.cat((size * ways, ways.new_full((len(ways), 1), length)), dim=-1)

@@ -112,7 +112,8 @@ def _interval(wanted: Tensor, unit: Tensor, far: Tensor, low: Tensor, high: Tens
 
 def _in_plane(wanted: Tensor, unit: Tensor, far: Tensor, low: Tensor, high: Tensor) -> Tensor:
     """Two unknowns: the nearest corner or foot that satisfies all, else least squares of what is missing."""
-    sides = torch.cat((torch.eye(2), -torch.eye(2))).to(wanted)
+    sides = torch.eye(2).to(wanted)
+    sides = torch.cat((sides, -sides))
     lines = torch.cat((unit, sides.expand(*unit.shape[:-2], -1, -1)), dim=-2)
     aims = torch.cat((far, torch.cat((low, -high)).to(far).expand(*far.shape[:-1], -1)), dim=-1)
     total = aims.shape[-1]  # -inf of a bound that is not there: what lies on its edge fits nowhere

@@ -132,7 +132,7 @@ class SafetyFilter(Controller):
         self.register_buffer("decay", _one_each("decay", rates, count))
         kept = non_negative("SafetyFilter", "margin", torch.as_tensor(margin, dtype=torch.float64))
         self.register_buffer("margin", _one_each("margin", kept, count))
-        heavy = torch.ones(plant.inputs) if weight is None else torch.as_tensor(weight)
+        heavy = torch.ones(plant.inputs, dtype=torch.float64) if weight is None else torch.as_tensor(weight)
         heavy = positive("SafetyFilter", "weight", heavy.double())
         if heavy.shape != (plant.inputs,):
             raise fail("SafetyFilter", "weight", f"must be one for each of the {plant.inputs} inputs", weight)
@@ -144,7 +144,7 @@ class SafetyFilter(Controller):
         self.register_buffer("table", cases(count, low_.tolist(), high_.tolist()))
         self.table: Tensor
         self.degree, self.moving = self._probe(degree)
-        second = torch.tensor(self.degree) == 2
+        second = torch.tensor(self.degree, dtype=torch.int64) == 2
         if bool((second & (self.decay * self.hold > 1)).any()):
             rule = f"must be at most 1/dt = {1 / self.hold:g} where the relative degree is two"
             raise fail("SafetyFilter", "decay", rule, decay)

@@ -101,7 +101,7 @@ def linear_hold(plant: Plant, cost: Cost, period: float) -> Hold:
         return exact_hold(f, g, q, cost.r, period, discount=cost.discount)
     share = math.exp(-0.5 * cost.discount * plant.period)
     z = torch.zeros(len(f) + g.shape[1], len(f) + g.shape[1], dtype=torch.float64)
-    z[: len(f), : len(f)], z[: len(f), len(f) :], z[len(f) :, len(f) :] = f, g, torch.eye(g.shape[1])
+    z[: len(f), : len(f)], z[: len(f), len(f) :], z[len(f) :, len(f) :] = f, g, torch.eye(g.shape[1]).to(g)
     flow, paid = torch.eye(len(z), dtype=torch.float64), torch.zeros_like(z)
     rate = plant.period * torch.block_diag(q.double(), cost.r.double())
     for _ in range(periods("linear_hold", plant, period)):
@@ -260,7 +260,7 @@ def _moved(f: Tensor, g: Tensor, *, discrete: bool) -> Tensor:
 def _held(plant: Plant, f: Tensor, g: Tensor, dt: float) -> tuple[Tensor, Tensor]:
     """A and B of the linearised plant over dt seconds with u held."""
     if plant.period is None:
-        hold = exact_hold(f, g, 0 * f, torch.zeros(g.shape[1], g.shape[1]), dt)
+        hold = exact_hold(f, g, 0 * f, g.new_zeros(g.shape[1], g.shape[1]), dt)
         return hold.a, hold.b
     a, b = torch.eye(len(f), dtype=f.dtype), torch.zeros_like(g)
     for _ in range(periods("held_stability", plant, dt)):

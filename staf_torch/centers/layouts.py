@@ -263,7 +263,7 @@ def _pivot_rows(matrix: Tensor, count: int) -> Tensor:
         chosen.append(row)
         direction = rest[row] / rest[row].norm()
         rest = rest - (rest @ direction)[:, None] * direction
-    return torch.tensor(chosen)
+    return torch.tensor(chosen, dtype=torch.int64)
 
 
 def _exchange(matrix: Tensor, chosen: Tensor) -> Tensor:

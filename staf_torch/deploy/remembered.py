@@ -51,7 +51,7 @@ class RememberedPolicy(nn.Module):
         self.problem = copy.deepcopy(problem)
         self.candidates, self.lookahead, self.worst = memory.candidates, memory.lookahead, memory.worst
         steps = length - self.lookahead - 1  # of a trajectory; all later rows are the goal
-        rows = torch.cat((memory.entries, torch.tensor([memory.resting])))
+        rows = torch.cat((memory.entries, torch.tensor([memory.resting], dtype=torch.int64)))
         which, time = rows // length, rows % length
         used, place = which.unique(return_inverse=True)
         kept = used.unsqueeze(1) * length + torch.arange(steps + 1)

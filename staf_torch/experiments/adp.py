@@ -221,7 +221,7 @@ def _stacked(controllers: Sequence[Controller], rows: Sequence[int]) -> Controll
     if target is None:
         return stacked
     given = [one for each in controllers if (one := learner(each)) is not None]
-    counts = torch.tensor(rows)
+    counts = torch.tensor(rows, dtype=torch.int64)
     for name in ("critic", "actor", "gain"):
         values = torch.stack([getattr(one, name) for one in given])
         setattr(target, name, values.repeat_interleave(counts.to(values.device), dim=0))

@@ -175,7 +175,7 @@ class _Member:
         self.rows = len(problem.initial_states)
         self._thinned = _Thinned(problem.steps + 1) if drawn else None
         self._warnings: list[str] = []
-        self._diverged_at = torch.full((self.rows,), -1)
+        self._diverged_at = torch.full((self.rows,), -1, dtype=torch.int64)
 
     @property
     def keeps(self) -> bool:

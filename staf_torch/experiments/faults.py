@@ -134,7 +134,7 @@ def short_period(rows: int, generator: torch.Generator) -> Case:
     ).starting_from(first)
     known = true.expand(rows, 6)
     return Case(
-        *(model, cost, x0, known, known, torch.zeros(rows), 0.001, 0.0, 1e-2, adaptive),
+        *(model, cost, x0, known, known, x0.new_zeros(rows), 0.001, 0.0, 1e-2, adaptive),
         lambda: DirectShooting(model, cost).solve(x0[:1]).value.expand(rows),
     )
 
@@ -195,7 +195,7 @@ def mass(rows: int, generator: torch.Generator) -> Case:
             best[same] = shooting.solve(x0[same]).value
         return best
 
-    return Case(*(model, cost, x0, true, true, torch.zeros(rows), 0.001, 0.01, 0.05, adaptive), optimum)
+    return Case(*(model, cost, x0, true, true, x0.new_zeros(rows), 0.001, 0.01, 0.05, adaptive), optimum)
 
 
 CASES: dict[str, Callable[[int, torch.Generator], Case]] = {

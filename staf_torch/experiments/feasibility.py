@@ -60,7 +60,7 @@ def solve(
         ]
         found.append(torch.stack(of_layouts))
     errors = torch.stack(found).cpu()  # (R, L, T)
-    counts = torch.tensor([len(layout) for layout in layouts])
+    counts = torch.tensor([len(layout) for layout in layouts], dtype=torch.int64)
     allowed = torch.tensor(epsilons, dtype=errors.dtype)
     good = errors.unsqueeze(1) <= allowed[:, None, None]  # (R, E, L, T)
     return Needed(counts, errors, _first(good.mT, counts), _first(good.all(-1), counts))

@@ -29,7 +29,7 @@ class Vehicle(NamedTuple):
 
 def _mass(cfg: DictConfig, dt: float, bound: float) -> Vehicle:
     """p'' = u under its LQR."""
-    matrix, push = torch.zeros(4, 4), torch.zeros(4, 2)
+    matrix, push = torch.zeros(4, 4, dtype=torch.float64), torch.zeros(4, 2, dtype=torch.float64)
     matrix[0, 2] = matrix[1, 3] = push[2, 0] = push[3, 1] = 1.0
     cost = QuadraticCost(cfg.adp.q, cfg.adp.r, 4, 2, low=-bound, high=bound)
     lqr = LQR(Linear(matrix.tolist(), push.tolist()), cost, period=dt)

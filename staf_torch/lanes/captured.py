@@ -174,7 +174,7 @@ class Captured:
         found = {id(t): t for t in kept if id(t) not in made and not self._made_inside(t)}
         numbers = [t for t in found.values() if t.is_floating_point()]
         if not self._repeats:  # memory was written to: once more would write twice
-            numbers.append(torch.empty(0))
+            numbers.append(torch.empty(0, dtype=torch.float64))
         return Recipe(_joined(self._values), operations, self._reads, numbers, self._checks)
 
     def _made_inside(self, tensor: Tensor) -> bool:

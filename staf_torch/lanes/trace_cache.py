@@ -98,7 +98,7 @@ def save(path: Path, trace: Trace, tensors: Sequence[Tensor]) -> None:
         return
     file = io.BytesIO()
     try:
-        numberless = trace.recipe._replace(values=torch.empty(0))
+        numberless = trace.recipe._replace(values=torch.empty(0, dtype=torch.float64))
         _Writer(file, places, numberless).dump(tuple(trace._replace(recipe=numberless)))
         content = zlib.compress(file.getvalue(), level=1)  # 100 kilobytes to 15
         # Under a name of its own first: another process may be writing the same.
@@ -176,5 +176,5 @@ class _Reader(pickle.Unpickler):
         if kind == "given":
             return self._given[value]
         if kind == "made":  # stands for what the operation will make: its identity alone matters
-            return self._made.setdefault(value, torch.empty(0))
+            return self._made.setdefault(value, torch.empty(0, dtype=torch.float64))
         return torch.from_numpy(value)

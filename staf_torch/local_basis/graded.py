@@ -60,8 +60,8 @@ def graded_basis(directions: Tensor, degrees: Degrees | None = None) -> GradedBa
     found = functionals_of(u, degrees)
     functionals = found.functionals / found.strengths.unsqueeze(-2)
     known = tuple(range(len(degrees.sizes())))
-    degree = torch.tensor(degrees.each(), device=u.device)
-    members = degree == torch.tensor(known, device=u.device).unsqueeze(-1)  # (K, M)
+    degree = torch.tensor(degrees.each(), dtype=torch.int64, device=u.device)
+    members = degree == torch.tensor(known, dtype=torch.int64, device=u.device).unsqueeze(-1)  # (K, M)
     weights = functionals.unsqueeze(-2) * members
     factorial = torch.tensor([math.factorial(k) for k in degrees.each()], dtype=u.dtype, device=u.device)
     return GradedBasis(u, degrees.reach, functionals, weights, known, degree, factorial)

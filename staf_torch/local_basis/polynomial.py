@@ -126,7 +126,7 @@ class PolynomialSpace(NamedTuple):
     def _unscale(self) -> Tensor:
         """1 / (C(p, k_j) r^(2 k_j)): (..., M)."""
         p, like = self.kernel.degree, self.radius
-        degree = torch.tensor(self.degrees, device=like.device)
+        degree = torch.tensor(self.degrees, dtype=torch.int64, device=like.device)
         binomial = torch.tensor([math.comb(p, k) for k in self.degrees], dtype=like.dtype, device=like.device)
         unscale: Tensor = self.radius.square().unsqueeze(-1) ** -degree / binomial
         return unscale

@@ -161,10 +161,10 @@ class ChaseMetrics:
     def _firsts(self, start: int, batch: int) -> Tensor:
         """The index of the first settled time of each of the rows from ``start`` on: (B,)."""
         if self._members is None:
-            return torch.full((batch,), self._whole.first)
-        ends = torch.tensor([member.rows for member in self._members]).cumsum(0)
+            return torch.full((batch,), self._whole.first, dtype=torch.int64)
+        ends = torch.tensor([member.rows for member in self._members], dtype=torch.int64).cumsum(0)
         of_row = torch.searchsorted(ends, torch.arange(start, start + batch), right=True)
-        return torch.tensor([member.first for member in self._members])[of_row]
+        return torch.tensor([member.first for member in self._members], dtype=torch.int64)[of_row]
 
     def _gathered(self) -> _Rows:
         """All rows as one."""

@@ -297,7 +297,7 @@ class BankDefinition:
         judged = seen & ~first
         y = torch.where(judged, told, s["mean"] * spread + center)
         s["answered"].zero_()
-        s["far"].copy_(s["far"] + 1 if self._beyond(s, x, y) else torch.zeros(()))
+        s["far"].copy_(s["far"] + 1 if self._beyond(s, x, y) else 0 * s["far"])
         if s.number("far") >= STREAK:  # the stream has gone elsewhere for good
             time = s["time"].clone()
             self.clear(s)

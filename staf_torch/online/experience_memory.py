@@ -79,7 +79,9 @@ class ExperienceMemory(nn.Module):
         self.register_buffer("states", like.new_zeros(*batch_shape, capacity, basis.dim))
         self.register_buffer("coefficients", like.new_zeros(*batch_shape, capacity, basis.count))
         self.register_buffer("stored", torch.zeros(*batch_shape, capacity, dtype=torch.bool))
-        self.register_buffer("latest", torch.full(batch_shape, -1))  # the place written last
+        self.register_buffer(
+            "latest", torch.full(batch_shape, -1, dtype=torch.int64)
+        )  # the place written last
         self.register_buffer("origin", like.new_zeros(*batch_shape, basis.dim))  # where it was first stored
         self.register_buffer(
             "averaged", torch.zeros(*batch_shape, capacity, dtype=torch.int64)

@@ -153,7 +153,7 @@ class FilterStreams:
         self.first[rows, place[rows], :-1] = both[rows]
         self.turn = torch.where(usable & ~young, (self.turn + 1) % kept, self.turn)
         self.clock += usable & young
-        return usable & young & torch.isin(self.clock, torch.tensor(LEARNED_AT))
+        return usable & young & torch.isin(self.clock, torch.tensor(LEARNED_AT, dtype=self.clock.dtype))
 
     def _grow(self) -> None:
         """Give a coordinate that moves by far more than its unit a larger one, and learn the latest again."""

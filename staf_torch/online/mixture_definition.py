@@ -9,7 +9,7 @@ from .bank_rules import BLENDS, CARRIED, GROUPS, KNOTS, LOCAL, MEMBERS, QUADRATI
 from .kalman_filter import SURPRISE
 
 _LEAST = 1e-30  # of a variance
-_GROUP = torch.tensor([group(member) for member in range(MEMBERS)])
+_GROUP = torch.tensor([group(member) for member in range(MEMBERS)], dtype=torch.int64)
 
 
 def mix(r: Rules, s: dict[str, Tensor], low: Tensor, high: Tensor) -> None:

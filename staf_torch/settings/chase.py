@@ -223,7 +223,7 @@ def placement(device: object, dtype: object) -> tuple[torch.device, torch.dtype]
     choice(COMMAND_LINE, "dtype", dtype, tuple(DTYPES))
     try:
         place = torch.device(str(device))
-        torch.empty(0, device=place)
+        torch.empty(0, dtype=torch.uint8, device=place)  # every device has these
     except (RuntimeError, AssertionError) as error:
         reason = str(error).splitlines()[0]
         raise fail(COMMAND_LINE, "device", f"cannot be used here ({reason})", device) from error

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import io
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
 import pytest
+from figures.looks import looks, version
 from matplotlib.axes import Axes
 from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
+from recorded import Record
 
 from staf_torch.figures import adaptation, chase, closed_loop, rivals, safety, sweep, theory
 from staf_torch.figures.animation import Curves, Scene, _Stage, animate
@@ -24,6 +26,23 @@ T = np.linspace(0.5, 4.5, 9)
 def _not_laid_out(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where panels lie says nothing of what they hold, and takes nine tenths of the time."""
     monkeypatch.setattr("matplotlib.layout_engine.ConstrainedLayoutEngine.execute", lambda *_: None)
+
+
+@pytest.fixture(autouse=True)
+def _looks_are_the_recorded(monkeypatch: pytest.MonkeyPatch, record: Record) -> Iterator[None]:
+    """What is no number: colours, markers, sizes, where a legend is."""
+    drawn: list[Figure] = []
+    begin = Figure.__init__
+
+    def kept(figure: Figure, *given: Any, **named: Any) -> None:
+        begin(figure, *given, **named)
+        drawn.append(figure)
+
+    monkeypatch.setattr(Figure, "__init__", kept)
+    yield
+    found = {str(at): dict(enumerate(looks(figure))) for at, figure in enumerate(drawn)}
+    if record.known().get("matplotlib", version()) == version():
+        record({"matplotlib": version(), **found})
 
 
 Curve = tuple[str | None, Any, Any]  # name in the legend, x, y
