@@ -110,9 +110,9 @@ class Record:
         found: dict[str, Any] = {} if self.writes else kept.get(self.name, {})
         return found
 
-    def __call__(self, value: Any, *, rtol: float = 1e-6) -> None:
-        """Fail where numbers of the value differ by more than a share of their size."""
-        found = numbers(value)
+    def __call__(self, value: Any, *, rtol: float = 1e-6, texts: bool = True) -> None:
+        """Fail where numbers of the value differ by more than a share of their size, or its texts differ."""
+        found = {path: part for path, part in numbers(value).items() if texts or not isinstance(part, str)}
         known = json.loads(self.path.read_text()) if self.path.exists() else {}
         if self.writes:
             known[self.name] = found
