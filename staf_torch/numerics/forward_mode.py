@@ -22,17 +22,19 @@ def jacobian(function: Callable[[Tensor], Tensor], y: Tensor) -> Tensor:
     """ds_i/dy_j of a function of every row by itself, (..., n) -> (..., M): (..., M, n).
 
     A derivative along every coordinate where there are fewer of these than values, else one pass backwards a
-    value; backwards, too, where an operation of a user's own has no derivative in forward mode.
+    value; backwards, too, where an operation of a user's own has no derivative in forward mode, and where
+    the batch is traced as any: forward mode asks torch for its size as a number.
     """
     use_forward_mode()
     units = torch.eye(y.shape[-1], dtype=y.dtype, device=y.device)
-    try:
-        values, first = torch.func.jvp(function, (y,), (units[0].expand_as(y).clone(),))[:2]
-        if len(units) <= values.shape[-1]:
-            rest = [torch.func.jvp(function, (y,), (unit.expand_as(y).clone(),))[1] for unit in units[1:]]
-            return torch.stack([first, *rest], dim=-1)
-    except RuntimeError:  # NotImplementedError is one; what else is wrong is so backwards, too
-        pass
+    if not any(isinstance(size, torch.SymInt) for size in y.shape):
+        try:
+            values, first = torch.func.jvp(function, (y,), (units[0].expand_as(y).clone(),))[:2]
+            if len(units) <= values.shape[-1]:
+                rest = [torch.func.jvp(function, (y,), (unit.expand_as(y).clone(),))[1] for unit in units[1:]]
+                return torch.stack([first, *rest], dim=-1)
+        except RuntimeError:  # NotImplementedError is one; what else is wrong is so backwards, too
+            pass
     values, pull = torch.func.vjp(function, y)[:2]
     selectors = torch.eye(values.shape[-1], dtype=values.dtype, device=values.device)
     return torch.stack([pull(selector.expand(values.shape))[0] for selector in selectors], dim=-2)

@@ -95,6 +95,15 @@ CONTROLLERS = {
 }
 
 
+@pytest.mark.parametrize("name", ["actor", "actor_partial", "actor_gaussian", "quadratic", "rbf_grid"])
+def test_a_policy_is_traced_for_every_batch_whether_its_basis_has_a_closed_form_or_not(name: str) -> None:
+    policy = deploy.policy_of(CONTROLLERS[name])
+    program = deploy.trace(policy, torch.zeros(1, 2, dtype=torch.float64)).module()
+    for rows in (1, 3, 8):
+        x = torch.randn(rows, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(rows))
+        torch.testing.assert_close(program(x), policy(x))
+
+
 @pytest.mark.parametrize("name", list(SMOOTH_KERNELS))
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 def test_deployed_approximation_equals_the_module(name: str, dtype: torch.dtype) -> None:

@@ -1,7 +1,7 @@
-"""The C++ and C that are written for programs, recorded: nobody makes one longer, or other, without seeing it.
+"""The C++ and C that are written for programs, recorded: none becomes longer, or another, unseen.
 
-What torch makes of a function before it is lowered is its own: texts are compared under the version that they
-were recorded with.
+What torch makes of a function before it is lowered is its own: texts are compared under the version with
+which they were recorded.
 """
 
 from __future__ import annotations
