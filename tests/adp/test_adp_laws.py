@@ -257,3 +257,12 @@ def test_gains_of_rows_have_one_number_a_row(shape: tuple[int, ...]) -> None:
     with pytest.raises(ValueError, match=r"`Gains\(critic=...\)` must be a number or of the shape \(B, 1\)"):
         adp.Gains(critic=torch.ones(shape))
     assert adp.Gains(critic=torch.ones(3, 1)).critic.shape == (3, 1)
+
+
+def test_what_an_actor_critic_needs_of_its_plant_is_told() -> None:
+    points, basis = adp.QuadraturePoints(3, 2, BOX), adp.QuadraticBasis(2)
+    steps = systems.StepPlant(lambda x, u: x + u, dim=2, inputs=1, dt=0.1)
+    with pytest.raises(ValueError, match=r"`ActorCritic\(model=...\)` must be a ControlAffineSystem"):
+        adp.ActorCritic(basis, steps, COST, points)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"`ActorCritic\(basis=...\)` has 2 states, but the plant has 3"):
+        adp.ActorCritic(basis, systems.ThreeState(), COST, points)

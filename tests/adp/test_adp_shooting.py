@@ -146,3 +146,11 @@ def test_an_earlier_plan_is_a_start_that_costs_what_it_did() -> None:
     start = shooting._warm(best, x, torch.arange(2), best.time)
     torch.testing.assert_close(start.cost, best.value, rtol=1e-2, atol=0)
     torch.testing.assert_close(start.state, best.state, rtol=0, atol=0.02)
+
+
+def test_at_the_set_point_one_start_is_enough_and_nothing_is_paid() -> None:
+    shooting = adp.DirectShooting(systems.VanDerPol(), COST, intervals=16, horizon=2.0)
+    best = shooting.solve(torch.zeros(1, 2, dtype=torch.float64))
+    assert bool(best.converged.all())
+    assert float(best.value) == 0.0
+    assert int(best.iterations) <= 6

@@ -140,3 +140,14 @@ def test_what_a_hold_pays_is_exact_however_long_it_is(period: float) -> None:
     wanted = (1 - (2 * rates * period).exp()) / (-2 * rates)  # of x1^2 + x2^2 from one
     torch.testing.assert_close(held.paid[:2, :2], wanted.diag(), rtol=1e-12, atol=1e-300)
     assert float(held.paid[2, 2]) == pytest.approx(period)
+
+
+def test_a_clocked_loop_is_stable_around_the_state_that_is_told() -> None:
+    """x' = sin(x) + u is unstable at 0 and stable at pi without any control."""
+    plant = systems.Clocked(systems.RatePlant(lambda x, u: x.sin() + u, dim=1, inputs=1))
+    found = [
+        adp.held_stability(lambda x: 0 * x[..., :1], plant, 0.5, at=torch.tensor([at]).double())
+        for at in (0.0, math.pi)
+    ]
+    assert found[0].spectral_radius == pytest.approx(math.exp(0.5), rel=1e-4)
+    assert found[1].spectral_radius == pytest.approx(math.exp(-0.5), rel=1e-4)

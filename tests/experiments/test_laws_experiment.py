@@ -18,6 +18,7 @@ from staf_torch import optim, predictors
 from staf_torch.cli.staf import config_directory
 from staf_torch.experiments import chase_batch, gradient_chase, laws
 from staf_torch.experiments.laws import cases
+from staf_torch.experiments.registry import log_slope
 from staf_torch.metrics.ball_error import StateErrorPass
 from staf_torch.settings.chase import chase_problem
 
@@ -121,3 +122,13 @@ def test_errors_along_the_same_states_are_found_by_the_pass_that_is_given() -> N
     heard = Heard(problem.basis, problem.target)
     chase_batch.simulate([problem], [None], [False], errors=heard)
     assert asked
+
+
+def test_a_slope_is_of_the_points_that_are_known_and_above_the_floor() -> None:
+    x = [0.1, 0.2, 0.4, 0.8, 1.6]
+    cubes: list[float | None] = [2 * step**3 for step in x]
+    assert log_slope(x, cubes) == pytest.approx(3.0)
+    assert log_slope(x, [None, *cubes[1:3], 0.0, None]) == pytest.approx(3.0)
+    assert log_slope(x, [1.0, *cubes[1:]], above=1e9) is None
+    assert log_slope(x, [1e-3, *cubes[1:]], above=2e-3) == pytest.approx(3.0)  # of what is above alone
+    assert log_slope(x, [None, None, None, None, 1.0]) is None

@@ -2,8 +2,8 @@
 
     python tests/experiments/test_reference_metrics.py [case ...]  # records them anew
 
-A change that is meant is seen in the difference of `reference_metrics.json`. What else a run leaves, columns of
-its tables and of its history and what it says, is in `tests/recorded`.
+A change that is meant is seen in the difference of `reference_metrics.json`. What else a run leaves, columns
+of its tables and of its history and what it says, is in `tests/recorded`.
 """
 
 from __future__ import annotations

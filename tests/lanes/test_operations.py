@@ -89,6 +89,12 @@ OPERATIONS: dict[str, Callable[[Tensor], Tensor]] = {
     "slogdet": lambda x: torch.stack(tuple(torch.linalg.slogdet(matrix(x))), dim=-1),
     "logdet": lambda x: torch.logdet(matrix(x)).unsqueeze(-1),
     "lookup table": lookup,
+    "searched from the right": lambda x: torch.searchsorted(
+        torch.tensor(EDGES, dtype=x.dtype), (5 * x).round() / 10, right=True
+    ).to(x),
+    "searched from the left": lambda x: torch.searchsorted(
+        torch.tensor((-0.1, 0.1, 0.3), dtype=x.dtype), (5 * x).round() / 10, side="left"
+    ).to(x),
     "one hot": lambda x: functional.one_hot(x.argmax(-1), SIZE).to(x),
     "distances": lambda x: torch.cdist(x.unsqueeze(-2), x.flip(-1).unsqueeze(-2)).squeeze(-1),
     "constant of float32": lambda x: x + torch.eye(SIZE)[1],

@@ -89,3 +89,11 @@ def test_near_best_with_weights_is_the_best_that_linear_programming_finds(seed: 
     assert best * (1 - 1e-9) <= float(fit.error) <= 1.1 * best
     left = (weight * (f - monomials(z, 2) @ fit.coefficients[0])).abs().max()
     torch.testing.assert_close(left, fit.error[0])
+
+
+def test_a_disc_has_two_points_at_least() -> None:
+    two = theory.disc(0.5, count=2)
+    assert two.shape == (2, 2)
+    assert float(two.norm(dim=-1).max()) <= 0.5 * (1 + 1e-12)
+    with pytest.raises(ValueError, match=r"`disc\(count=...\)`"):
+        theory.disc(count=1)
