@@ -102,7 +102,9 @@ def _skipped(tree: ast.AST) -> Iterator[int]:
             and node.func.id in ("cast", "TypeVar")
         ):
             parts = [node]
-        elif isinstance(node, ast.Call):  # of a matrix axis 1 is axis -1: -2 tells more
+        elif isinstance(
+            node, ast.Call
+        ):  # of a matrix axis 1 is axis -1: -2 tells more, and it is there as well
             yield from (id(each) for each in node.args if _is_last_axis(each))
             yield from (id(each.value) for each in node.keywords if _is_last_axis(each.value))
         elif isinstance(node, ast.Raise):
@@ -118,7 +120,7 @@ def _skipped(tree: ast.AST) -> Iterator[int]:
 
 
 def _is_last_axis(node: ast.AST) -> bool:
-    return isinstance(node, ast.UnaryOp) and ast.unparse(node) == "-1"
+    return isinstance(node, ast.UnaryOp) and ast.unparse(node) in ("-1", "-2")
 
 
 def _says(node: ast.AST) -> bool:

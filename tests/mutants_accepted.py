@@ -50,6 +50,10 @@ def accepted(mutant: Mutant) -> str | None:
         return _EDGE
     if _of_lengths(mutant):
         return _LENGTHS
+    if mutant.was.startswith("zip(") and "strict=False" in mutant.was and _without(mutant, "strict"):
+        return "which is the default"
+    if re.match(r"work = [0-9.]+$", _code(mutant)) and _is_number(mutant.was):
+        return _SPEED
     if _without(mutant, "device"):
         return _DEVICE
     if _without(mutant, "encoding"):

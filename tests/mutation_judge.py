@@ -12,7 +12,7 @@ import pytest
 from mutants import Mutant
 from mutants_accepted import accepted
 from mutation_fork import begin, in_fork, place
-from mutation_map import Map, places, tests_near
+from mutation_map import CONTRACTS, Map, places, tests_near
 from source_rules import without_dtype
 
 OVERHEAD = 0.1  # seconds that a test costs beside what was measured
@@ -109,7 +109,7 @@ def _groups(tests: Sequence[str]) -> list[list[str]]:
 def _tests_for(mutant: Mutant, source: str) -> list[str]:
     """Those that execute the lines, the folder's own first and the short ones first, within the time."""
     hits = _hits(mutant, source)
-    near = {test: 0 if test.startswith(places(mutant.file)) else 1 for test in hits}
+    near = {test: 0 if test.startswith((*places(mutant.file), CONTRACTS)) else 1 for test in hits}
     order = sorted(hits, key=lambda test: (near[test], _cost([test]), test))
     chosen: list[str] = []
     for test in order:

@@ -42,7 +42,7 @@ disable_warnings = no-data-collected,module-not-imported,module-not-measured,cou
 _OUTSIDE = ("tests/outside/", "tests/cluster/", "tests/benchmarks/", "tests/examples/", "tests/test_wheel.py")
 _OUTSIDE += ("tests/test_structure.py", "tests/test_sanitized.py")
 """These install and build things or read files, and execute no line here."""
-_CONTRACTS = "tests/test_contracts.py"  # of what is defined at import, which it looks at in every file
+CONTRACTS = "tests/test_contracts.py"  # of what is defined at import, which it looks at in every file
 _LONGEST = 900.0  # seconds of the processor for one file of tests
 
 
@@ -297,10 +297,10 @@ def tests_near(known: Map, file: str, first: int, last: int, around: tuple[int, 
         The tests; none where the folder has none.
     """
     there = known.lines.get(file, {})
-    near = (*places(file), *((_CONTRACTS,) if around[2] else ()))
+    near = (*places(file), *((CONTRACTS,) if around[2] else ()))
     whole = {test for test in known.unmeasured if test.startswith(near) or _names(test, file)}
     if around[2]:
-        whole |= {test for test in known.fixtures if test.startswith(_CONTRACTS)}
+        whole |= {test for test in known.fixtures if test.startswith(CONTRACTS)}
     order = sorted(there)
     for begin, end in ((first, last), around[:2], (0, 10**9)):
         span = order[bisect.bisect_left(order, begin) : bisect.bisect_right(order, end)]

@@ -317,6 +317,16 @@ CASES: dict[str, Callable[[], Any]] = {
     "shooting of a saturated input": lambda: shot(
         systems.Pendulum(), COSTS["bounded_input"](), 0.5 * X0[:2], intervals=16
     ),
+    "shooting of three inputs": lambda: shot(
+        systems.RatePlant(
+            lambda x, u: torch.stack((x[..., 1] + u[..., 2], x[..., 0].sin() + u[..., 0] - u[..., 1]), -1),
+            dim=2,
+            inputs=3,
+        ),
+        adp.QuadraticCost(1.0, 1.0, dim=2, inputs=3),
+        0.6 * X0[:2],
+    ),
+    "shooting from rest": lambda: shot(systems.VanDerPol(), COST, 0 * X0[:1]),
     "box ddp": lambda: improved(pendulum(), HANGING, 30, iterations=12),
     "box ddp of a linear plant": lambda: improved(double_integrator(-1.0, 1.0), 2 * X0, 20),
     "plans around an edge": planned,

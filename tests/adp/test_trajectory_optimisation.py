@@ -12,6 +12,7 @@ from helpers_swingup import cost_of, double_integrator, pendulum
 from torch import Tensor
 
 from staf_torch import adp, systems
+from staf_torch.adp.trajectory_optimisation import _definite
 
 X0 = torch.tensor([[5.0, 0.0], [-1.0, 2.0]], dtype=torch.float64)
 BOUNDED = double_integrator(-1.0, 1.0)
@@ -193,3 +194,13 @@ def test_a_plan_where_the_cost_is_concave_in_the_control_leads_to_a_minimum() ->
 def test_states_of_another_shape_are_refused_by_name(shape: tuple[int, ...]) -> None:
     with pytest.raises(ValueError, match=r"`BoxDDP.solve\(x0=...\)` must have"):
         adp.BoxDDP(BOUNDED, steps=3).solve(torch.zeros(shape, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("size", [1, 2, 3, 4])
+def test_pivots_tell_whether_a_matrix_is_definite(size: int) -> None:
+    generator = torch.Generator().manual_seed(size)
+    some = torch.randn(200, size, size, dtype=torch.float64, generator=generator)
+    some = some + some.mT + (0.5 + size**0.5) * torch.eye(size)
+    positive = torch.linalg.eigvalsh(some)[:, 0] > 0
+    assert 10 < int(positive.sum()) < 190
+    assert torch.equal(_definite(some) > 0, positive)

@@ -10,9 +10,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from composing import settings as composed
 from PIL import Image
+from recorded import Record
 
 import staf_torch
+from staf_torch.experiments.registry import experiment
+from staf_torch.figures.animation import Scene
 
 BARE = ("figures=false", "history=false")
 SHORT = ("duration=0.02", "settle_time=0", *BARE)
@@ -69,3 +73,33 @@ def test_a_page_holds_its_frames_and_asks_no_server(tmp_path: Path) -> None:
 def test_what_cannot_be_animated_is_refused(settings: tuple[str, ...], words: str, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=words):
         staf_torch.run(*settings, directory=tmp_path / "run")
+
+
+SCENES: dict[str, tuple[tuple[str, ...], bool]] = {
+    "a chase of the plane": ((), True),
+    "a chase in space": (SPACE, False),
+    "a loop": (("experiment=adp",), True),
+    "a tracked path": (("experiment=adp_tracking",), False),
+    "discs": (("experiment=avoidance", "adp.compile=false"), False),
+}
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_what_moves_in_an_animation_is_the_recorded(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, record: Record
+) -> None:
+    settings, plane = SCENES[name]
+    short = ("duration=0.2", "dt=0.05", "trajectories=2", "figures=false", "animation=gif")
+    seen: list[Scene] = []
+
+    def animated(scene: Scene, kind: str) -> dict[str, bytes]:
+        seen.append(scene)
+        return {"gif": kind.encode()}
+
+    for experiment_ in ("gradient_chase", "adp", "adp_tracking", "avoidance"):
+        monkeypatch.setattr(f"staf_torch.experiments.{experiment_}.animate", animated)
+    cfg = composed(*settings, *short, *(() if "experiment" in str(settings) else ("settle_time=0",)))
+    experiment(cfg.task)(cfg, tmp_path)
+    (scene,) = seen
+    assert ("level lines" in scene.title) is plane
+    record(scene, rtol=1e-4)

@@ -45,10 +45,11 @@ def learned_of_several(model: st.StaFRegressor) -> Any:
     return model.state_dict(), model.predict(x[-1], return_std=True)
 
 
-def of_the_definition(neighbours: int, memory: int, steps: int) -> Any:
+def of_the_definition(neighbours: int, memory: int, steps: int, gone: int = 10**6) -> Any:
     bank = Bank(BankShape(2, 1, memory, neighbours), 1, True)
     bank._run = None
     x, y = hard_stream(steps)
+    y[gone:] = 1e4 + y[gone:]  # elsewhere for good
     for k in range(steps):
         bank.predict(x[k : k + 1])
         bank.learn(x[k : k + 1], y[k : k + 1].unsqueeze(-1))
@@ -68,6 +69,7 @@ CASES: dict[str, Callable[[], Any]] = {
     "filters that doubt": lambda: learned_of_several(st.StaFRegressor("matern", 0.8, robust=3.0, follow=0.5)),
     "banks of several": lambda: learned_of_several(st.StaFRegressor(memory=128, neighbours=8)),
     "the definition": lambda: of_the_definition(8, 128, 170),
+    "the definition of a stream that goes elsewhere": lambda: of_the_definition(8, 128, 90, gone=70),
     "smoothed": smoothed,
 }
 

@@ -193,3 +193,19 @@ def test_what_a_constructor_does_not_know_or_lacks_is_said_in_its_words() -> Non
     for given, said in (({"widht": 2.0}, "widht"), ({"width": 2.0, "length": 1.0}, "length")):
         with pytest.raises(ValueError, match=rf"`staf_torch.GaussianKernel` cannot be built .*{said}"):
             make(OmegaConf.create({"_target_": "staf_torch.GaussianKernel", **given}))
+
+
+class Demanding:
+    """A user's class that has an error of its own."""
+
+    def __init__(self, width: float) -> None:
+        raise {1.0: TypeError("a width of one"), 2.0: KeyError("unexpected keyword argument")}[width]
+
+
+@pytest.mark.parametrize(("width", "words"), [(1.0, "a width of one"), (2.0, "unexpected keyword")])
+def test_an_error_of_the_users_own_class_is_not_taken_for_one_of_the_settings(
+    width: float, words: str
+) -> None:
+    with pytest.raises(Exception, match=words) as caught:
+        make(OmegaConf.create({"_target_": f"{__name__}.Demanding", "width": width}))
+    assert "cannot be built from these settings" not in str(caught.value)
