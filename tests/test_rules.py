@@ -14,11 +14,13 @@ from typing import Any, NamedTuple
 
 import pytest
 import torch
+from helpers_swingup import double_integrator
 
 import staf_torch as st
 from staf_torch import adp, envs, optim, predictors, systems, theory
 from staf_torch.adp.bases import LeadingCoordinates
 from staf_torch.adp.closed_loop import ClosedLoop
+from staf_torch.adp.sampled_rollout import SampledRollout
 from staf_torch.adp.sampling import exact_hold
 from staf_torch.approximation.conditioning import lebesgue_constant, sup_error
 from staf_torch.deploy.approximators import RidgeApproximator
@@ -33,7 +35,6 @@ ELSEWHERE = {
     "cli",
 }  # rules of the command line: tests/cli/test_cli_errors.py
 OTHERS = {
-    "ParametricPlant": "in tests/adp/adaptation/test_identifiers.py",
     "ConcurrentTracker": "in tests/adp/adaptation/test_identifiers.py",
     "RobustFilter": "in tests/adp/adaptation/test_robust_filter.py",
     "Observed": "in tests/adp/adaptation/test_kalman.py",
@@ -44,26 +45,13 @@ OTHERS = {
     "StaF.gradient": "in tests/approximation/test_module.py",
     "StaF.hessian": "in tests/approximation/test_hessian.py",
     "ChaseOptimizer": "in tests/optim/test_torch_optimizer.py",
-    "BoxDDP": "in tests/adp/test_trajectory_optimisation.py",
-    "SampledProblem": "in tests/adp/test_trajectory_optimisation.py",
-    "SampledProblem.of": "in tests/adp/test_trajectory_optimisation.py",
-    "GlobalValue": "in tests/adp/test_global_value.py",
-    "learn_global_value": "in tests/adp/test_global_value.py",
     "AvoidanceCost": "in tests/adp/test_avoidance.py",
     "plan_around": "in tests/adp/test_avoidance.py",
     "BoxFilter": "in tests/adp/test_box_filter.py",
     "DetourPlans": "in tests/adp/test_detour_plans.py",
-    "DetourRollout": "in tests/adp/test_detours.py",
-    "SafetyFilter": "in tests/adp/test_safety_filter.py",
     "TwoLinkRobot": "numbers within a list, in tests/systems/test_barrier.py",
-    "StepPlant": "in tests/adp/test_user_plants.py",
     "MujocoPlant": "in tests/systems/test_mujoco_plant.py",
-    "RecedingHorizon": "in tests of its own",
     "EnergyShaping": "in tests/adp/test_energy_shaping.py",
-    "report": "in tests of its own",
-    "near_optimal": "in tests of its own",
-    "PathIntegral": "in tests/adp/test_path_integral.py",
-    "SampledRollout": "in tests of its own",
 }
 """Calls whose rules are held elsewhere."""
 
@@ -120,6 +108,33 @@ def stream_drift(**given: Any) -> adp.StreamDrift:
     return adp.StreamDrift(PLANT, st.GaussianKernel(2.0), torch.eye(2).double(), **{**usual, **given})
 
 
+INTEGRATOR = double_integrator(-1.0, 1.0)
+LIBRARY = adp.BoxDDP(INTEGRATOR, steps=60, compile=False).solve(X)
+
+
+def still(x: torch.Tensor, t: torch.Tensor) -> torch.Tensor:
+    """A disc that stands far away."""
+    return (x - 9.0).square().sum(-1) - 1.0
+
+
+def listed(given: dict[str, Any], *names: str) -> dict[str, Any]:
+    """The given arguments, those with these names as lists of one."""
+    return {name: [value] if name in names else value for name, value in given.items()}
+
+
+def parametric(**given: Any) -> adp.ParametricPlant:
+    settings = {"dim": 1, "inputs": 1, "theta": [0.5], **given}
+
+    def regressor(x: torch.Tensor, u: torch.Tensor) -> torch.Tensor:
+        return x.unsqueeze(-1)
+
+    def known(x: torch.Tensor, u: torch.Tensor) -> torch.Tensor:
+        return 0 * x if u.shape[-1] == 0 else u
+
+    return adp.ParametricPlant(regressor, known, **settings)
+
+
+REPORTED = adp.near_optimal(PLANT, COST, dt=0.1)
 WINDOWS, ESTIMATE = adp.IntegralWindows(ACTUATORS, 0.1), adp.LeastSquares([1.0], 0.5)
 
 
@@ -233,6 +248,40 @@ CALLS: dict[str, Callable[..., Any]] = {
     "AdaptiveLQR": lambda **given: adp.AdaptiveLQR(ACTUATORS, COST, WINDOWS, ESTIMATE, **given),
     "StreamDrift": lambda **given: stream_drift(**given),
     "DriftLQR": lambda **given: adp.DriftLQR(stream_drift(), COST, **given),
+    "BoxDDP": lambda **given: adp.BoxDDP(INTEGRATOR, **{"steps": 4, "compile": False, **given}),
+    "RecedingHorizon": lambda **given: adp.RecedingHorizon(
+        INTEGRATOR, **{"steps": 4, "compile": False, **given}
+    ),
+    "PathIntegral": lambda **given: adp.PathIntegral(
+        INTEGRATOR, **{"steps": 4, "knots": 2, "compile": False, **given}
+    ),
+    "SampledProblem": lambda **given: adp.SampledProblem(INTEGRATOR.step, **{"dim": 2, "inputs": 1, **given}),
+    "SampledProblem.of": lambda **given: adp.SampledProblem.of(PLANT, COST, **{"dt": 0.1, **given}),
+    "GlobalValue": lambda **given: adp.GlobalValue(INTEGRATOR, LIBRARY, [3.0, 3.0], **given),
+    "learn_global_value": lambda **given: adp.learn_global_value(
+        INTEGRATOR,
+        **{"region": [1.0, 1.0], "steps": 40, "trajectories": 2, "rounds": 0, "states": 1, **given},
+    ),
+    "DetourRollout": lambda **given: adp.DetourRollout(
+        LQR,
+        PLANT,
+        COST,
+        still,
+        **{"axes": EYE, "dt": 0.1, "steps": 2, "terminal": LQR.value, **listed(given, "sizes", "lengths")},
+    ),
+    "BoundedInputCost": lambda **given: adp.BoundedInputCost(
+        1.0, 1.0, **{"dim": 2, "inputs": 1, "bound": 1.0, **given}
+    ),
+    "SafetyFilter": lambda **given: adp.SafetyFilter(LQR, PLANT, still, **{"dt": 0.1, **given}),
+    "SampledRollout": lambda **given: SampledRollout(
+        BASIS, PLANT, COST, LQR, LQR.value, LQR.p, **{"period": 0.1, "steps": 4, **given}
+    ),
+    "StepPlant": lambda **given: systems.StepPlant(
+        lambda x, u: 0.9 * x + 0.1 * u, **{"dim": 1, "inputs": 1, "dt": 0.1, **given}
+    ),
+    "ParametricPlant": lambda **given: parametric(**given),
+    "near_optimal": lambda **given: adp.near_optimal(PLANT, COST, **{"dt": 0.1, **given}),
+    "report": lambda **given: REPORTED.report(**{"states": 2, "optimum": False, **given}),
     "riccati_rows": lambda **given: adp.riccati_rows(-EYE, EYE, EYE, EYE, **given),
 }
 """How to call, with arguments that are right beside the one in question."""
@@ -270,8 +319,16 @@ ABSENT |= {
     ("DirectShooting", "intervals"),
     ("simulate", "seed"),
     ("trajectory", "chunk"),
+    ("near_optimal", "dt"),
+    ("near_optimal", "horizon"),
+    ("report", "spread"),
+    ("SafetyFilter", "weight"),
+    ("BoundedInputCost", "bound"),
+    ("PathIntegral", "noise"),
 }
 """Arguments for which None has a meaning of its own."""
+NOT_ALONE = {("rings", "count"), ("SampledProblem", "dim"), ("StepPlant", "dim")}
+"""Arguments whose least value needs others beside it."""
 RULES = sorted({str(rule): rule for rule in rules() if rule.call in CALLS}.values())
 
 
@@ -293,7 +350,7 @@ def test_what_breaks_a_rule_is_refused_by_name(rule: Rule) -> None:
 @pytest.mark.parametrize("rule", RULES, ids=str)
 def test_the_edge_of_a_rule_is_accepted(rule: Rule) -> None:
     edge = list(EDGE.get(rule.kind, ())) + list(rule.allowed)
-    if rule.kind == "integer" and rule.least is not None and rule[:2] != ("rings", "count"):
+    if rule.kind == "integer" and rule.least is not None and rule[:2] not in NOT_ALONE:
         edge.append(rule.least)
     for value in edge:
         CALLS[rule.call](**{rule.argument: value})

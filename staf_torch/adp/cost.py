@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from ..numerics.angles import wrap
 from ..numerics.box import LARGEST, box_minimum, face_inverses
-from ..numerics.checks import fail, non_negative, positive_real, real, vector
+from ..numerics.checks import fail, non_negative, one_or_each, positive, positive_real, real, vector
 from ..numerics.linalg import positive_definite, positive_semidefinite
 from ..systems import Bounds, Plant
 from ..systems.bounds import Limit
@@ -299,7 +299,8 @@ class BoundedInputCost(Cost):
         if bound is not None:
             if low is not None or high is not None:
                 raise fail("BoundedInputCost", "bound", "must be None beside low and high", bound)
-            high = _size("bound", bound, inputs)
+            high = one_or_each("BoundedInputCost", "bound", bound, inputs)
+            positive("BoundedInputCost", "bound", high)
             low = -high
         super().__init__(state, control, dim, inputs, low=low, high=high, **more)  # type: ignore[arg-type]
         if not torch.equal(self.r, torch.diag(self.r.diagonal())):
@@ -376,15 +377,6 @@ def _square(call: str, name: str, value: Matrix, size: int) -> Tensor:
             return torch.tensor(vector(call, name, value, len(value)), dtype=torch.float64).diag()
         return torch.tensor([vector(call, name, row, len(value)) for row in value], dtype=torch.float64)
     return positive_real(call, name, value) * torch.eye(size, dtype=torch.float64)
-
-
-def _size(name: str, value: float | Sequence[float] | Tensor, inputs: int) -> Tensor:
-    if isinstance(value, int | float):
-        return torch.full((inputs,), positive_real("BoundedInputCost", name, value), dtype=torch.float64)
-    sizes = torch.as_tensor(value, dtype=torch.float64)
-    if sizes.shape != (inputs,) or not bool((sizes > 0).all()):
-        raise fail("BoundedInputCost", name, f"must be positive, one for each of the {inputs} inputs", value)
-    return sizes
 
 
 def _point(call: str, name: str, value: Sequence[float] | Tensor | None, size: int) -> Tensor | None:

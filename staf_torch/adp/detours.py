@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ..lanes import each, repeat
 from ..lanes.function import RowFunction
-from ..numerics.checks import fail, integer, non_negative, positive, positive_real
+from ..numerics.checks import fail, integer, non_negative, one_or_each, positive, positive_real, vector
 from ..systems import Plant, StepPlant
 from .controllers import Controller, ControllerState, Policy, Value
 from .cost import Cost
@@ -109,16 +109,14 @@ class DetourRollout(Controller):
         self.steps = integer("DetourRollout", "steps", steps, least=1)
         if self.steps % self.stride:
             raise fail("DetourRollout", "steps", f"must be a multiple of stride={self.stride}", steps)
-        kept = non_negative("DetourRollout", "margin", torch.as_tensor(margin, dtype=torch.float64))
-        if kept.dim() and kept.shape != (len(self.constraints),):
-            raise fail(
-                "DetourRollout", "margin", f"must be a number or {len(self.constraints)} of them", margin
-            )
+        kept = one_or_each("DetourRollout", "margin", margin, len(self.constraints))
+        non_negative("DetourRollout", "margin", kept)
         self.weight = positive_real("DetourRollout", "weight", weight)
-        large = positive("DetourRollout", "sizes", torch.as_tensor(list(sizes), dtype=torch.float64))
+        large = torch.tensor(vector("DetourRollout", "sizes", list(sizes)), dtype=torch.float64)
+        positive("DetourRollout", "sizes", large)
         long = [integer("DetourRollout", "lengths", length, least=1) for length in lengths]
         self.register_buffer("axes", along.clone())
-        self.register_buffer("margin", kept.expand(len(self.constraints)).clone())
+        self.register_buffer("margin", kept)
         self.register_buffer("fresh", _detours(len(along), large, long))
         self.register_buffer("changes", _changes(len(along)))
         self.axes: Tensor  # (k, n)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ..lanes import Program, each, scan
 from ..lanes.combinators import tracing_now
-from ..numerics.checks import fail, integer, positive_real, vector
+from ..numerics.checks import fail, integer, one_or_each, positive, positive_real
 from .controllers import Controller, ControllerState, carrying
 from .sampled_problem import SampledProblem
 
@@ -87,10 +87,7 @@ class PathIntegral(Controller):
             if not bool(torch.isfinite(scale).all()):
                 raise fail("PathIntegral", "noise", "must be given where an input has no bounds", noise)
         else:
-            given = [noise] * m if isinstance(noise, int | float) else list(noise)
-            scale = torch.tensor(vector("PathIntegral", "noise", given, m), dtype=torch.float64)
-            if not bool((scale > 0).all()):
-                raise fail("PathIntegral", "noise", "must be positive", noise)
+            scale = positive("PathIntegral", "noise", one_or_each("PathIntegral", "noise", noise, m))
         self.register_buffer("noise", scale)
         self.noise: Tensor
         self.register_buffer("spread", _hats(self.steps, self.knots))  # (T, knots)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ..lanes import repeat
 from ..lanes.function import RowFunction
-from ..numerics.checks import fail, non_negative, positive, positive_real, trailing
+from ..numerics.checks import fail, non_negative, one_or_each, positive, positive_real, trailing
 from ..systems import Bounds, Plant, StepPlant
 from ..systems.bounds import Limit
 from .controllers import Controller, ControllerState, Feedback, Policy
@@ -128,14 +128,12 @@ class SafetyFilter(Controller):
         count = len(self.constraints)
         own = Bounds(low, high, plant.inputs)
         self.bounds = plant.bounds if not own.present and plant.bounds is not None else own
-        rates = positive("SafetyFilter", "decay", torch.as_tensor(decay, dtype=torch.float64))
-        self.register_buffer("decay", _one_each("decay", rates, count))
-        kept = non_negative("SafetyFilter", "margin", torch.as_tensor(margin, dtype=torch.float64))
-        self.register_buffer("margin", _one_each("margin", kept, count))
-        heavy = torch.ones(plant.inputs, dtype=torch.float64) if weight is None else torch.as_tensor(weight)
-        heavy = positive("SafetyFilter", "weight", heavy.double())
-        if heavy.shape != (plant.inputs,):
-            raise fail("SafetyFilter", "weight", f"must be one for each of the {plant.inputs} inputs", weight)
+        rates = one_or_each("SafetyFilter", "decay", decay, count)
+        self.register_buffer("decay", positive("SafetyFilter", "decay", rates))
+        kept = one_or_each("SafetyFilter", "margin", margin, count)
+        self.register_buffer("margin", non_negative("SafetyFilter", "margin", kept))
+        heavy = one_or_each("SafetyFilter", "weight", 1.0 if weight is None else weight, plant.inputs)
+        positive("SafetyFilter", "weight", heavy)
         self.register_buffer("unit", heavy.rsqrt())
         self.decay: Tensor  # (k,) 1/s
         self.margin: Tensor  # (k,)
@@ -405,14 +403,3 @@ def _rate(phi: Rows, plant: Plant, x: Tensor, u: Tensor, t: Tensor) -> Tensor:
     along_x, along_t = torch.func.grad(phi, argnums=(0, 1))(x, t)
     rate: Tensor = (along_x * plant.motion(x, u)).sum() + along_t
     return rate
-
-
-def _one_each(name: str, value: Tensor, count: int) -> Tensor:
-    """One number a constraint, (k,)."""
-    if value.dim() == 0:
-        value = value.repeat(count)
-    if value.shape != (count,):
-        raise fail(
-            "SafetyFilter", name, f"must be a number or one for each of the {count} constraints", value
-        )
-    return value.clone()

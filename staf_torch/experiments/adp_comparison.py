@@ -18,7 +18,7 @@ from ..adp.reference_optimum import optimal_cost
 from ..figures.closed_loop import draw_comparison
 from ..figures.style import images
 from ..metrics.closed_loop import comparison_row, regulated
-from ..numerics.checks import fail, positive_real, vector
+from ..numerics.checks import COMMAND_LINE, fail, positive_real, vector
 from ..results.progress import SHOWN, Progress
 from ..results.run_directory import RunDirectory
 from ..settings.adp import adp_problem, changed, updated
@@ -166,11 +166,11 @@ def initial_weights(cfg: DictConfig, directory: Path, progress: Progress = SHOWN
 
 
 def _weights(cfg: DictConfig) -> list[float]:
-    weights = vector("staf", "initial_weights", plain(cfg.initial_weights))
+    weights = vector(COMMAND_LINE, "initial_weights", plain(cfg.initial_weights))
     if not weights:
-        raise fail("staf", "initial_weights", "must have at least one entry", weights)
+        raise fail(COMMAND_LINE, "initial_weights", "must have at least one entry", weights)
     for name in ("critic", "actor"):
-        positive_real("adp", name, cfg.adp[name])
+        positive_real(COMMAND_LINE, f"adp.{name}", cfg.adp[name])
     return weights
 
 

@@ -31,7 +31,7 @@ from ..figures.animation import animate
 from ..figures.closed_loop import TrackingHistory, draw_tracking
 from ..figures.style import images
 from ..metrics.closed_loop import tracking_metrics
-from ..numerics.checks import integer, positive_real
+from ..numerics.checks import COMMAND_LINE, integer, positive_real
 from ..results.progress import SHOWN, Progress
 from ..results.run_directory import RunDirectory
 from ..settings.adp import build, updated, value_basis
@@ -54,8 +54,8 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> dict[st
     weights = plain(cfg.adp.cost)
     cost = tracking_cost(weights["state"], weights["control"]).to(device)
     x0 = initial_states(cfg, plant.dim).to(device=device, dtype=dtype)
-    dt = positive_real("staf", "dt", cfg.dt)
-    steps = max(1, round(positive_real("staf", "duration", cfg.duration) / dt))
+    dt = positive_real(COMMAND_LINE, "dt", cfg.dt)
+    steps = max(1, round(positive_real(COMMAND_LINE, "duration", cfg.duration) / dt))
     results = {}
     controllers = _controllers(cfg, plant, cost)
     for name, controller in controllers.items():
@@ -66,7 +66,7 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> dict[st
             x0,
             dt=dt,
             steps=steps,
-            seed=integer("staf", "seed", cfg.seed, least=0),
+            seed=integer(COMMAND_LINE, "seed", cfg.seed, least=0),
             integrator=cfg.adp.integrator,
             compile=cfg.adp.compile,
         )

@@ -83,7 +83,7 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
     chosen = cfg.avoidance
     kind = animation_kind(cfg)
     x0 = scenarios(cfg).to(device=device, dtype=dtype)
-    radius = positive_real("avoidance", "radius", chosen.radius)
+    radius = positive_real(COMMAND_LINE, "avoidance.radius", chosen.radius)
     dt = positive_real(COMMAND_LINE, "dt", cfg.dt)
     steps = max(1, round(positive_real(COMMAND_LINE, "duration", cfg.duration) / dt))
     vehicle = made(cfg, dt)
@@ -102,7 +102,7 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
         dt=dt,
         low=[-bound for bound in vehicle.bounds],
         high=list(vehicle.bounds),
-        decay=positive_real("avoidance", "decay", chosen.decay),
+        decay=positive_real(COMMAND_LINE, "avoidance.decay", chosen.decay),
         margin=float(chosen.margin),
     )
     methods: dict[str, Controller] = {FILTERED: guard.to(device), BARE: Feedback(wanted)}
@@ -155,13 +155,13 @@ def scenarios(cfg: DictConfig) -> Tensor:
     chosen = cfg.avoidance
     count, discs = (
         integer(COMMAND_LINE, "trajectories", cfg.trajectories, 1),
-        integer("avoidance", "discs", chosen.discs, 1),
+        integer(COMMAND_LINE, "avoidance.discs", chosen.discs, 1),
     )
-    clear = positive_real("avoidance", "radius", chosen.radius) + _CLEAR
-    away = positive_real("avoidance", "distance", chosen.distance)
-    speed = positive_real("avoidance", "speed", chosen.speed)
+    clear = positive_real(COMMAND_LINE, "avoidance.radius", chosen.radius) + _CLEAR
+    away = positive_real(COMMAND_LINE, "avoidance.distance", chosen.distance)
+    speed = positive_real(COMMAND_LINE, "avoidance.speed", chosen.speed)
     generator = torch.Generator().manual_seed(integer(COMMAND_LINE, "seed", cfg.seed, least=0))
-    turns = choice("avoidance", "vehicle", chosen.vehicle, tuple(VEHICLES)) == "unicycle"
+    turns = choice(COMMAND_LINE, "avoidance.vehicle", chosen.vehicle, tuple(VEHICLES)) == "unicycle"
 
     def at_rest() -> Tensor:
         if not turns:
@@ -179,7 +179,7 @@ def scenarios(cfg: DictConfig) -> Tensor:
         if len(found) == count:
             return torch.stack(found)
     raise ValueError(
-        f"`avoidance(discs=...)` must leave room for a start; got {discs} of radius {chosen.radius}."
+        f"`staf avoidance.discs=...` must leave room for a start; got {discs} of radius {chosen.radius}."
     )
 
 

@@ -18,7 +18,7 @@ from ..engine.predictors import Predictor, Secant, Tangent
 from ..figures.chase import ConvergenceCurve, draw_convergence
 from ..figures.style import images
 from ..metrics.ball_error import StateErrorPass
-from ..numerics.checks import fail, integer, positive_real, vector
+from ..numerics.checks import COMMAND_LINE, fail, integer, positive_real, vector
 from ..optim import UpdateLaw
 from ..results.progress import SHOWN, Progress
 from ..results.run_directory import RunDirectory
@@ -139,8 +139,8 @@ class Curve(NamedTuple):
 def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> dict[str, float | None]:
     """Run what the settings describe and fill the run directory; `metrics.json` comes last."""
     problem = dataclasses.replace(chase_problem(cfg), certificate=True)
-    work = integer("laws", "work", cfg.laws.work, least=2)
-    excess = positive_real("laws", "excess", cfg.laws.excess)
+    work = integer(COMMAND_LINE, "laws.work", cfg.laws.work, least=2)
+    excess = positive_real(COMMAND_LINE, "laws.excess", cfg.laws.excess)
     steps = _steps(cfg, problem)
     compared, drawn = cases(work, problem.basis.count), curves(work, problem.basis.count)
     chases = len(compared) + len(drawn) * sum(problem.dt / dt for dt in steps)  # of as many times each
@@ -238,10 +238,18 @@ def _with(problem: ChaseProblem, case: Case) -> ChaseProblem:
 
 
 def _steps(cfg: DictConfig, problem: ChaseProblem) -> list[float]:
-    steps = [positive_real("laws", "steps", dt) for dt in vector("laws", "steps", plain(cfg.laws.steps))]
+    steps = [
+        positive_real(COMMAND_LINE, "laws.steps", dt)
+        for dt in vector(COMMAND_LINE, "laws.steps", plain(cfg.laws.steps))
+    ]
     duration = problem.dt * problem.steps
     if len(steps) < 2 or max(steps) > duration:
-        raise fail("laws", "steps", f"must be two or more steps within the duration ({duration:g} s)", steps)
+        raise fail(
+            COMMAND_LINE,
+            "laws.steps",
+            f"must be two or more steps within the duration ({duration:g} s)",
+            steps,
+        )
     return steps
 
 

@@ -16,7 +16,7 @@ from torch import Tensor
 from ..adp import BoxDDP, SampledProblem
 from ..figures.rivals import draw_rivals
 from ..figures.style import images
-from ..numerics.checks import choice, integer
+from ..numerics.checks import COMMAND_LINE, choice, integer
 from ..results.progress import SHOWN, Progress
 from ..results.run_directory import RunDirectory
 from ..settings.chase import plain
@@ -60,14 +60,18 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
     """Run every method on every plant and fill the run directory, the table after every plant; `metrics.json`
     comes last."""
     settings = cfg.rivals
-    cases = [CASES[str(choice("rivals", "plants", name, tuple(CASES)))] for name in plain(settings.plants)]
-    chosen = [
-        METHODS[str(choice("rivals", "methods", name, tuple(METHODS)))] for name in plain(settings.methods)
+    cases = [
+        CASES[str(choice(COMMAND_LINE, "rivals.plants", name, tuple(CASES)))]
+        for name in plain(settings.plants)
     ]
-    states = integer("rivals", "states", settings.states, least=1)
-    slow = min(states, integer("rivals", "slow", settings.slow, least=1))
-    calls = integer("rivals", "calls", settings.calls, least=1)
-    seed = integer("staf", "seed", cfg.seed, least=0)
+    chosen = [
+        METHODS[str(choice(COMMAND_LINE, "rivals.methods", name, tuple(METHODS)))]
+        for name in plain(settings.methods)
+    ]
+    states = integer(COMMAND_LINE, "rivals.states", settings.states, least=1)
+    slow = min(states, integer(COMMAND_LINE, "rivals.slow", settings.slow, least=1))
+    calls = integer(COMMAND_LINE, "rivals.calls", settings.calls, least=1)
+    seed = integer(COMMAND_LINE, "seed", cfg.seed, least=0)
     rows: list[dict[str, Any]] = []
     out = RunDirectory(directory)
     with progress.over(len(cases), "plants") as advance:

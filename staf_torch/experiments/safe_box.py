@@ -69,18 +69,17 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
     cost = make_cost(cfg, system).to(device)
     box = Barrier(system, plain(cfg.safe_box.low), plain(cfg.safe_box.high)).to(device)
     x0 = initial_states(cfg, system.dim).to(device=device, dtype=torch.float64)
-    s0 = box.transform(x0)
-    wanted = flag("adp", "optimum.shooting", cfg.adp.optimum.shooting)
-    best = _optimum(box, cost, s0[:1]) if wanted else None
+    wanted = flag(COMMAND_LINE, "adp.optimum.shooting", cfg.adp.optimum.shooting)
     others = {"left": _anywhere(cfg, box), "left_near": _beside_walls(cfg, box)}
     dt = positive_real(COMMAND_LINE, "dt", cfg.dt)
     steps = max(1, round(positive_real(COMMAND_LINE, "duration", cfg.duration) / dt))
-    followed = max(1, round(positive_real("safe_box", "followed", cfg.safe_box.followed) / dt))
+    followed = max(1, round(positive_real(COMMAND_LINE, "safe_box.followed", cfg.safe_box.followed) / dt))
     every = next(k for k in range(max(1, steps // 2000), steps + 1) if steps % k == 0)
     comparison = Comparison(_COLUMNS, ("cost", "minimum_margin", "constraint_violations"), _log)
     results: dict[str, LoopResult] = {}
     margins: dict[str, Tensor] = {}
     compared = methods(cfg, box, cost)
+    best = _optimum(box, cost, box.transform(x0[:1])) if wanted else None
     for name, method in compared.items():
         results[name] = _simulated(cfg, method, box, x0.to(dtype), steps, every)
         margins[name] = _margin(box, method.plant, results[name])
@@ -110,12 +109,12 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
 def methods(cfg: DictConfig, box: Barrier, cost: Cost) -> dict[str, Method]:
     """The LQR in both coordinates, by itself and behind the filters."""
     system, size, dt = box.plant, box.dim or 0, float(cfg.dt)
-    substeps = 1, integer("safe_box", "substeps", cfg.safe_box.substeps, least=1)
+    substeps = 1, integer(COMMAND_LINE, "safe_box.substeps", cfg.safe_box.substeps, least=1)
     of_s = LQR(box, cost)
     paid = QuadraticCost(cost.q, cost.r, size, cost.inputs, output=lambda x: box.coordinates(x))
     lqr = LQR(system, QuadraticCost(cost.q, cost.r, size, cost.inputs))
     found = {"LQR of s": Method(Feedback(of_s), box, cost)}
-    if flag("safe_box", "filter", cfg.safe_box.filter):
+    if flag(COMMAND_LINE, "safe_box.filter", cfg.safe_box.filter):
         held, renewed = (BoxFilter(of_s, box, dt=dt, renewed=renewed) for renewed in (False, True))
         found["LQR of s, filtered"] = Method(Feedback(held), box, cost, substeps)
         found["LQR of s, filtered, renewed"] = Method(Feedback(renewed), box, cost, substeps, renew=True)
@@ -179,7 +178,7 @@ def _prefix(name: str) -> str:
 
 def _anywhere(cfg: DictConfig, box: Barrier) -> Tensor:
     """States drawn uniformly from the box, from [-1, 1] around its middle where a wall is missing: (B, n)."""
-    count = integer("safe_box", "states", cfg.safe_box.states, least=1)
+    count = integer(COMMAND_LINE, "safe_box.states", cfg.safe_box.states, least=1)
     generator = torch.Generator().manual_seed(integer(COMMAND_LINE, "seed", cfg.seed, least=0))
     share = torch.rand(count, box.dim or 0, dtype=torch.float64, generator=generator)
     return (box.floor + (box.ceiling - box.floor) * share).clamp(box.low + 1e-9, box.high - 1e-9)
@@ -187,7 +186,7 @@ def _anywhere(cfg: DictConfig, box: Barrier) -> Tensor:
 
 def _beside_walls(cfg: DictConfig, box: Barrier) -> Tensor:
     """States of `_anywhere`, each moved to ``safe_box.near`` from one of the walls: (B, n)."""
-    near = positive_real("safe_box", "near", cfg.safe_box.near)
+    near = positive_real(COMMAND_LINE, "safe_box.near", cfg.safe_box.near)
     x = _anywhere(cfg, box)
     generator = torch.Generator().manual_seed(integer(COMMAND_LINE, "seed", cfg.seed, least=0))
     walls = [(k, side) for k in range(box.dim or 0) for side in (0, 1) if bool(box.walled[side, k])]

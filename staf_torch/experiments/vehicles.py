@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ..adp import LQR, QuadraticCost
 from ..adp.controllers import Policy
-from ..numerics.checks import choice, positive_real
+from ..numerics.checks import COMMAND_LINE, choice, positive_real
 from ..systems import Linear
 
 
@@ -46,7 +46,7 @@ def _unicycle(cfg: DictConfig, dt: float, bound: float) -> Vehicle:
     Speed and turning both move that point, the turning alone not the place: only there has a disc a relative
     degree of one. The bound of w lets the point move sideways as fast as ahead.
     """
-    ahead = positive_real("avoidance", "ahead", cfg.avoidance.ahead)
+    ahead = positive_real(COMMAND_LINE, "avoidance.ahead", cfg.avoidance.ahead)
 
     def direction(x: Tensor) -> Tensor:
         return torch.stack((x[..., 2].cos(), x[..., 2].sin()), dim=-1)
@@ -72,5 +72,5 @@ VEHICLES = {"mass": _mass, "unicycle": _unicycle}
 
 def vehicle(cfg: DictConfig, dt: float) -> Vehicle:
     """Build what `avoidance.vehicle` names, whose control is held for dt."""
-    name = str(choice("avoidance", "vehicle", cfg.avoidance.vehicle, tuple(VEHICLES)))
-    return VEHICLES[name](cfg, dt, positive_real("avoidance", "bound", cfg.avoidance.bound))
+    name = str(choice(COMMAND_LINE, "avoidance.vehicle", cfg.avoidance.vehicle, tuple(VEHICLES)))
+    return VEHICLES[name](cfg, dt, positive_real(COMMAND_LINE, "avoidance.bound", cfg.avoidance.bound))

@@ -105,6 +105,17 @@ def vector(call: str, name: str, value: object, length: int | None = None) -> li
     return [float(v) for v in numbers]
 
 
+def one_or_each(call: str, name: str, value: object, count: int) -> Tensor:
+    """One finite number for all of ``count``, or one for each of them: (count,) float64."""
+    given = number(call, name, value).tolist() if isinstance(value, Tensor) else value  # type: ignore[union-attr]
+    if not isinstance(given, Sequence):
+        given = [real(call, name, given)] * count
+    numbers = vector(call, name, given)
+    if len(numbers) != count:
+        raise fail(call, name, f"must be one number or a list of {count}", value)
+    return torch.tensor(numbers, dtype=torch.float64)
+
+
 def trailing(call: str, name: str, value: Tensor, dims: int, last: int | None = None) -> Tensor:
     """A tensor with at least ``dims`` dimensions, the last of a stated size where one is stated."""
     if not isinstance(value, Tensor):

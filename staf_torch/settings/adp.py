@@ -29,7 +29,7 @@ from ..adp import (
 from ..adp.problem import AdpProblem, OptimumSettings
 from ..adp.walls import walls
 from ..approximation.basis import StaFBasis
-from ..numerics.checks import choice, fail, flag, integer, positive_real
+from ..numerics.checks import COMMAND_LINE, choice, fail, flag, integer, positive_real
 from ..systems import ControlAffineSystem, Plant
 from ..systems.barrier import wall_numbers
 from . import config_directory
@@ -57,12 +57,12 @@ def adp_problem(cfg: DictConfig) -> AdpProblem:
     x0 = initial_states(cfg, system.dim).to(device=device, dtype=dtype)
     cost = make_cost(cfg, system)
     control = controller(cfg, system, cost)
-    dt = max(positive_real("staf", "dt", cfg.dt), control.period or 0.0)
+    dt = max(positive_real(COMMAND_LINE, "dt", cfg.dt), control.period or 0.0)
     control = _behind_walls(cfg, system, control, dt)
-    duration = positive_real("staf", "duration", cfg.duration)
+    duration = positive_real(COMMAND_LINE, "duration", cfg.duration)
     steps = round(duration / dt)
     if steps < 1:
-        raise fail("staf", "duration", f"must be at least one step (dt={dt})", duration)
+        raise fail(COMMAND_LINE, "duration", f"must be at least one step (dt={dt})", duration)
     for module in (system, cost, control):
         module.to(device=device, dtype=dtype)
     return AdpProblem(
@@ -73,7 +73,7 @@ def adp_problem(cfg: DictConfig) -> AdpProblem:
         dt=dt,
         steps=steps,
         every=_every(cfg.adp.record_every, steps, len(x0)),
-        seed=integer("staf", "seed", cfg.seed, least=0),
+        seed=integer(COMMAND_LINE, "seed", cfg.seed, least=0),
         integrator=cfg.adp.integrator,
         compile=cfg.adp.compile,
         optimum=_optimum_settings(cfg.adp.optimum),
@@ -100,7 +100,7 @@ def build(cfg: DictConfig, group: str, kind: type, **known: Callable[[], Any]) -
     maker = instantiate(node, _convert_="all", _partial_=True)
     made = functools.partial(maker, **given) if node.get("_partial_") else maker(**given)
     if not isinstance(made, kind):
-        raise fail("adp", group, f"must be a {kind.__name__}", made)
+        raise fail(COMMAND_LINE, f"adp.{group}", f"must be a {kind.__name__}", made)
     return made
 
 
@@ -108,9 +108,9 @@ def plant(cfg: DictConfig) -> Plant:
     """Build the plant, which must have inputs."""
     system = make(cfg.system)
     if not isinstance(system, Plant) or system.dim is None:
-        raise fail("adp", "system", "must be a `systems.Plant` with `dim`", system)
+        raise fail(COMMAND_LINE, "system", "must be a `systems.Plant` with `dim`", system)
     if _inputs(system) == 0:
-        raise fail("adp", "system", "must be a plant with inputs", type(system).__name__)
+        raise fail(COMMAND_LINE, "system", "must be a plant with inputs", type(system).__name__)
     return system
 
 
@@ -197,7 +197,7 @@ def changed(cfg: DictConfig, changes: Mapping[str, Any]) -> DictConfig:
                 options = {
                     path.stem: path for path in sorted(Path(config_directory(), "adp", name).glob("*.yaml"))
                 }
-                choice("adp", name, value, tuple(options))
+                choice(COMMAND_LINE, f"adp.{name}", value, tuple(options))
                 new.adp[name] = OmegaConf.load(options[value])
             else:
                 OmegaConf.update(new.adp, name, value)
@@ -233,16 +233,20 @@ def updated(cfg: DictConfig) -> DictConfig:
 
 def _optimum_settings(cfg: DictConfig) -> OptimumSettings:
     return OptimumSettings(
-        shooting=flag("adp", "optimum.shooting", cfg.shooting),
-        states=integer("adp", "optimum.states", cfg.states, least=0),
-        horizon=None if cfg.horizon is None else positive_real("adp", "optimum.horizon", cfg.horizon),
-        intervals=None if cfg.intervals is None else integer("adp", "optimum.intervals", cfg.intervals, 4),
+        shooting=flag(COMMAND_LINE, "adp.optimum.shooting", cfg.shooting),
+        states=integer(COMMAND_LINE, "adp.optimum.states", cfg.states, least=0),
+        horizon=None
+        if cfg.horizon is None
+        else positive_real(COMMAND_LINE, "adp.optimum.horizon", cfg.horizon),
+        intervals=None
+        if cfg.intervals is None
+        else integer(COMMAND_LINE, "adp.optimum.intervals", cfg.intervals, 4),
     )
 
 
 def _every(wanted: object, steps: int, batch: int) -> int:
     """Steps between recorded times: the wanted number, else one that keeps the record within bounds."""
     if wanted is not None:
-        return integer("adp", "record_every", wanted, least=1)
+        return integer(COMMAND_LINE, "adp.record_every", wanted, least=1)
     least = -(-steps * batch // _RECORDED)
     return next(k for k in range(max(1, least), steps + 1) if steps % k == 0) if least < steps else steps

@@ -19,7 +19,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from ..experiments.registry import Metrics, check_animation
 from ..lanes.build import compiler
-from ..numerics.checks import choice
+from ..numerics.checks import COMMAND_LINE, choice
 from ..results import run_record as records
 from ..results.files import MEMBERS, METRICS, partial_name
 from ..results.progress import SHOWN, Progress
@@ -197,6 +197,6 @@ def objective(cfg: DictConfig, metrics: Metrics) -> Metrics | float | tuple[floa
 
 
 def _number(name: str, metrics: Metrics) -> float:
-    choice("staf", "sweep.objective", name, tuple(metrics))
+    choice(COMMAND_LINE, "sweep.objective", name, tuple(metrics))
     value = metrics[name]
     return math.inf if value is None else float(value)  # null: there is no finite number

@@ -89,7 +89,7 @@ def adp_wall(x: Tensor, t: Tensor) -> Tensor:
         ({"steps": 3}, r"`DetourRollout\(steps=...\)` must be a multiple of stride=2"),
         ({"stride": 0}, r"`DetourRollout\(stride=...\)`"),
         ({"dt": 0.0}, r"`DetourRollout\(dt=...\)` must be positive"),
-        ({"margin": [0.1, 0.2]}, r"`DetourRollout\(margin=...\)` must be a number or 1 of them"),
+        ({"margin": [0.1, 0.2]}, r"`DetourRollout\(margin=...\)` must be one number or a list of 1"),
         ({"margin": -0.1}, r"`DetourRollout\(margin=...\)` must not be negative"),
         ({"weight": 0.0}, r"`DetourRollout\(weight=...\)` must be positive"),
         ({"sizes": [0.0]}, r"`DetourRollout\(sizes=...\)` must be positive"),

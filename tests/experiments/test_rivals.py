@@ -157,7 +157,7 @@ def test_equations_mean_the_same_to_casadi(name: str) -> None:
 
 def test_unknown_plants_and_methods_are_refused_by_name(tmp_path) -> None:  # type: ignore[no-untyped-def]
     cfg = settings("experiment=rivals", "rivals.plants=[rocket]")
-    with pytest.raises(ValueError, match=r"`rivals\(plants=...\)` must be one of .*; got 'rocket'"):
+    with pytest.raises(ValueError, match=r"`staf rivals.plants=...` must be one of .*; got 'rocket'"):
         rivals.run(cfg, tmp_path)
 
 

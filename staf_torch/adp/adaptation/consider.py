@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ...numerics.checks import fail, non_negative, real
+from ...numerics.checks import non_negative, one_or_each, positive
 from ...numerics.linalg import row_jacobian
 from ...systems import runge_kutta_step
 from .least_squares import Estimate
@@ -74,18 +74,10 @@ class ConsiderFilter:
         process: float | Sequence[float] = 0.0,
     ) -> None:
         n = model._size()
-        found = []
-        for name, given in (("noise", noise), ("process", process)):
-            several = list(given) if isinstance(given, Sequence) else [given] * n
-            if len(several) != n:
-                raise fail("ConsiderFilter", name, f"must be one number or {n}", given)
-            for value in several:
-                non_negative("ConsiderFilter", name, value)
-            found.append(torch.tensor(several, dtype=torch.float64))
-        if not all(real("ConsiderFilter", "noise", float(value)) > 0 for value in found[0]):
-            raise fail("ConsiderFilter", "noise", "must be positive", noise)
         self.model = model
-        self.noise, self.process = found
+        self.noise = positive("ConsiderFilter", "noise", one_or_each("ConsiderFilter", "noise", noise, n))
+        disturbed = one_or_each("ConsiderFilter", "process", process, n)
+        self.process = non_negative("ConsiderFilter", "process", disturbed)
 
     def init(self, x: Tensor) -> Considered:
         """Before the first measurement.

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ...numerics.checks import fail, non_negative, real
+from ...numerics.checks import fail, non_negative, one_or_each, positive, real, vector
 from ...numerics.linalg import row_jacobian
 from ...systems import Plant, runge_kutta_step
 from ..controllers import Controller, ControllerState
@@ -65,14 +65,9 @@ class KalmanFilter(abc.ABC):
         name, n = type(self).__name__, model._size()
         if not noise or not all(real(name, "noise", s) > 0 for s in noise):
             raise fail(name, "noise", "must be positive numbers, one an output", noise)
-        several = list(process) if isinstance(process, Sequence) else [process] * n
-        if len(several) != n:
-            raise fail(name, "process", f"must be one number or {n}", process)
-        for value in several:
-            non_negative(name, "process", value)
         self.model, self.output = model, output
         self.noise = torch.tensor(noise, dtype=torch.float64)
-        self.process = torch.tensor(several, dtype=torch.float64)
+        self.process = non_negative(name, "process", one_or_each(name, "process", process, n))
         seen = output(torch.zeros(1, n, dtype=torch.float64))
         if tuple(seen.shape) != (1, len(noise)):
             raise fail(name, "output", f"must map (1, {n}) to (1, {len(noise)})", tuple(seen.shape))
@@ -233,14 +228,12 @@ class Observed(Controller):
     ) -> None:
         super().__init__()
         n = filter.model._size()
-        several = list(deviation) if isinstance(deviation, Sequence) else [deviation] * n
-        if len(several) != n or not all(real("Observed", "deviation", s) > 0 for s in several):
-            raise fail("Observed", "deviation", f"must be positive, one number or {n}", deviation)
-        guess = filter.model.equilibrium() if mean is None else torch.tensor(mean, dtype=torch.float64)
-        if guess.shape != (n,):
-            raise fail("Observed", "mean", f"must have {n} numbers", mean)
+        spread = positive("Observed", "deviation", one_or_each("Observed", "deviation", deviation, n))
+        guess = filter.model.equilibrium()
+        if mean is not None:
+            guess = torch.tensor(vector("Observed", "mean", mean, n), dtype=torch.float64)
         self.controller, self.filter = controller, filter
-        self.guess, self.deviation = guess, torch.tensor(several, dtype=torch.float64)
+        self.guess, self.deviation = guess, spread
         self.draws, self.period = controller.draws, controller.period
         self._like = self._start(torch.zeros(1, 1, dtype=torch.float64))
         self._size = pack(self._like, 1).shape[-1]

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ...numerics.checks import fail, non_negative, positive_real, real, vector
+from ...numerics.checks import non_negative, one_or_each, positive, positive_real, real, vector
 from .windows import Equation
 
 
@@ -70,12 +70,9 @@ class LeastSquares:
         alarm: float | None = None,
     ) -> None:
         first = vector("LeastSquares", "theta", theta)
-        several = list(deviation) if isinstance(deviation, Sequence) else [deviation] * len(first)
-        if len(several) != len(first):
-            raise fail("LeastSquares", "deviation", f"must be one number or {len(first)}", deviation)
-        sizes = [positive_real("LeastSquares", "deviation", value) for value in several]
+        sizes = one_or_each("LeastSquares", "deviation", deviation, len(first))
         self.first = torch.tensor(first, dtype=torch.float64)
-        self.prior = torch.diag(torch.tensor(sizes, dtype=torch.float64).square())
+        self.prior = torch.diag(positive("LeastSquares", "deviation", sizes).square())
         self.floor = positive_real("LeastSquares", "floor", floor)
         non_negative("LeastSquares", "forgetting", forgetting)
         self.forgetting = real("LeastSquares", "forgetting", forgetting)

@@ -1,0 +1,123 @@
+"""Settings of every experiment that break a rule: refused by their name before anything is computed.
+
+Which there are is read from the source, `positive_real(COMMAND_LINE, "avoidance.radius", ...)`.
+"""
+
+from __future__ import annotations
+
+import ast
+import itertools
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+from composing import settings
+from omegaconf import OmegaConf
+
+import staf_torch
+from staf_torch.experiments.registry import experiment
+
+ROOT = Path(staf_torch.__file__).parent
+EXPERIMENTS: dict[str, tuple[str, ...]] = {
+    "adp": ("experiment=adp",),
+    "adp_loop": ("experiment=adp",),
+    "adp_comparison": ("experiment=adp_initial_weights",),
+    "adp_tracking": ("experiment=adp_tracking",),
+    "avoidance": ("experiment=avoidance",),
+    "chase": (),
+    "exponential_bound": ("experiment=exponential_bound",),
+    "faults": ("experiment=faults",),
+    "feasibility": ("experiment=feasibility",),
+    "flat_limit": ("experiment=flat_limit",),
+    "gradient_chase": (),
+    "icl": ("experiment=icl",),
+    "laws": ("experiment=laws",),
+    "layouts": ("experiment=layouts",),
+    "memory": ("experiment=memory",),
+    "rivals": ("experiment=rivals",),
+    "safe_box": ("experiment=safe_box",),
+    "registry": (),
+    "scenes": (),
+    "vehicles": ("experiment=avoidance", "avoidance.vehicle=unicycle"),
+}
+"""The settings that a file of experiments runs with."""
+
+OTHERS: dict[tuple[str, str], tuple[str, ...]] = {
+    ("chase", "centers.count"): ("centers=simplex",),
+    ("chase", "centers.directions"): ("centers=directions", "centers.directions=[[0.0, 0.0]]"),
+}
+"""Settings that are read beside others."""
+
+WRONG: dict[str, tuple[object, ...]] = {
+    "positive_real": (0, -1.0, "no", True, float("inf")),
+    "non_negative": (-1e-9, "no"),
+    "real": ("no", float("nan")),
+    "integer": (2.5, "3", True),
+    "flag": (1, "yes"),
+    "choice": ("no such choice",),
+    "vector": ("no", [float("nan"), 1.0], [True, 1.0]),
+}
+SHORT = {"duration": 0.02, "figures": False, "history": False, "animation": False}
+
+
+class Setting(NamedTuple):
+    """A rule about a setting, in the source."""
+
+    file: str
+    name: str
+    kind: str
+    least: int | None
+
+    def __str__(self) -> str:
+        return f"{self.file}-{self.name}-{self.kind}"
+
+
+def stated() -> Iterator[Setting]:
+    for path in sorted([*(ROOT / "experiments").glob("*.py"), *(ROOT / "settings").glob("*.py")]):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if not isinstance(node, ast.Call) or not isinstance(node.func, ast.Name) or len(node.args) < 3:
+                continue
+            call, name, least = node.args[0], node.args[1], None
+            if node.func.id not in WRONG or not isinstance(call, ast.Name) or call.id != "COMMAND_LINE":
+                continue
+            if not isinstance(name, ast.Constant):
+                continue  # a name that is put together: OTHERS
+            numbers = [*node.args[3:], *(word.value for word in node.keywords)]
+            if node.func.id == "integer" and isinstance(numbers[0], ast.Constant):
+                least = numbers[0].value
+            yield Setting(path.stem, name.value, node.func.id, least)
+
+
+SAID_BEFORE = {("chase", "centers.radius")}  # by the radius itself
+STATED = sorted({setting for setting in stated() if setting[:2] not in SAID_BEFORE}, key=str)
+
+
+def refused(given: tuple[str, ...], name: str, value: Any, directory: Path) -> None:
+    cfg = settings(*given)
+    for key, short in SHORT.items():
+        if key in cfg and key != name:
+            cfg[key] = short
+    if name == "centers.directions":
+        value = [value]
+    listed = OmegaConf.is_list(OmegaConf.select(cfg, name)) and not isinstance(value, list) and value != "no"
+    OmegaConf.update(cfg, name, [value] if listed else value, force_add=True)
+    directory.mkdir()
+    with pytest.raises(ValueError, match=re.escape(f"`staf {name}=...` must ")):
+        experiment(cfg.task)(cfg, directory)
+    assert not (directory / "metrics.json").exists()
+
+
+def test_every_file_with_rules_is_known_here() -> None:
+    assert {setting.file for setting in STATED} <= {*EXPERIMENTS}
+
+
+@pytest.mark.parametrize("setting", STATED, ids=str)
+def test_a_setting_that_breaks_its_rule_is_refused_by_name(setting: Setting, tmp_path: Path) -> None:
+    wrong = list(WRONG[setting.kind])
+    if setting.least is not None:
+        wrong.append(setting.least - 1)
+    given = OTHERS.get(setting[:2], EXPERIMENTS[setting.file])
+    for value, number in zip(wrong, itertools.count()):
+        refused(given, setting.name, value, tmp_path / str(number))
