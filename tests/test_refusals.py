@@ -1,4 +1,4 @@
-"""What no table of rules reads from the source: shapes, sizes that do not fit together, objects of another kind.
+"""What no table of rules reads from the source: shapes, sizes that do not fit, objects of another kind.
 
 One line each; the words that a user meets.
 """
