@@ -31,6 +31,7 @@ DISCOUNTED = adp.QuadraticCost(1.0, 1.0, 2, 1, discount=0.1)
 BASIS = st.StaFBasis(st.GaussianKernel(), st.StateFollowingCenters(st.rings(3), 0.3))
 PAPER = st.targets.Paper()
 EYE = torch.eye(2, dtype=torch.float64)
+MANY = systems.Linear((-EYE).tolist(), [[1.0] * 13] * 2)
 INTEGRATOR = double_integrator(-1.0, 1.0)
 LIBRARY = adp.BoxDDP(INTEGRATOR, steps=60, compile=False).solve(0.3 * EYE)
 MEMORY = adp.GlobalValue(INTEGRATOR, LIBRARY, [3.0, 3.0])
@@ -423,6 +424,35 @@ REFUSED: dict[str, tuple[Callable[[], Any], str]] = {
             dt=0.1,
         ),
         "`RobustFilter(theta_low=...)` must be a list of numbers",
+    ),
+    "greatest parameters": (
+        lambda: adp.RobustFilter(
+            adp.Feedback(HELD),
+            ACTUATORS,
+            still,
+            WINDOWS,
+            ESTIMATE,
+            theta_low=[0.5],
+            theta_high=["no"],
+            dt=0.1,
+        ),
+        "`RobustFilter(theta_high=...)` must be a list of numbers",
+    ),
+    "noise of a process": (
+        lambda: st.optim.RecursiveLeastSquares(process_noise=EYE[0, 0]),
+        "`RecursiveLeastSquares(process_noise=...)` must be a number",
+    ),
+    "prior": (lambda: st.optim.RecursiveLeastSquares(prior=0.0), "(prior=...)` must be positive"),
+    "batch of a trace": (lambda: trace(LQR, TWO, batch=0), "`trace(batch=...)` must be at least 1"),
+    "a truth value for a bound": (
+        lambda: systems.Bounds(True, None, 1),
+        "(low=...)` must be a number or one",
+    ),
+    "inputs of a rollout": (
+        lambda: SampledRollout(
+            BASIS, MANY, adp.QuadraticCost(1.0, 1.0, 2, 13), HELD, HELD.value, HELD.p, period=0.1
+        ),
+        "`SampledRollout(plant=...)` must have at most",
     ),
     # environments
     "controls of episodes": (

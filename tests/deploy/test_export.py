@@ -158,6 +158,37 @@ def test_pickled_history_is_refused(chase: Path) -> None:
         export(chase, "pt2")
 
 
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"to": "no"}, r"`staf-export\(to=...\)` must be one of"),
+        ({"dtype": "no"}, r"`staf-export\(dtype=...\)` must be one of"),
+        ({"row": -1}, r"`staf-export\(row=...\)` must be at least 0; got -1"),
+    ],
+)
+def test_arguments_of_the_function_are_refused_by_name(
+    given: dict[str, object], words: str, chase: Path
+) -> None:
+    with pytest.raises(ValueError, match=words):
+        export(chase, **{"to": "pt2", **given})  # type: ignore[arg-type]
+    if "dtype" in given:
+        with pytest.raises(ValueError, match=words):
+            export_learning(chase, **given)  # type: ignore[arg-type]
+
+
+def test_weights_and_settings_that_are_none_are_refused(chase: Path) -> None:
+    history = dict(np.load(chase / "history.npz"))
+    history["weights"][0, -1] = np.nan
+    np.savez(chase / "history.npz", **history)
+    with pytest.raises(ValueError, match="must be a trajectory whose weights can be represented"):
+        export(chase, "pt2")
+    (chase / ".hydra" / "config.yaml").write_text("[]")
+    with pytest.raises(ValueError, match="must be settings by name"):
+        export(chase, "pt2")
+    with pytest.raises(ValueError, match=r"must hold settings in \.hydra/config.yaml"):
+        export(chase, "pt2", trust=True)
+
+
 def test_bad_arguments_end_as_one_sentence(chase: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for arguments, message in (
         ([str(chase), "--row", "2"], "must be below the run's 2 trajectories; got 2"),

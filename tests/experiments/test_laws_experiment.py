@@ -56,7 +56,7 @@ def test_the_comparison_has_every_law() -> None:
 
 
 def test_steps_longer_than_the_run_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"laws\(steps=\.\.\.\)"):
+    with pytest.raises(ValueError, match=r"`staf laws.steps=..."):
         laws.run(settings("experiment=laws", "duration=1.0", "laws.steps=[2.0,1.0]"), tmp_path)
 
 

@@ -121,3 +121,67 @@ def test_a_setting_that_breaks_its_rule_is_refused_by_name(setting: Setting, tmp
     given = OTHERS.get(setting[:2], EXPERIMENTS[setting.file])
     for value, number in zip(wrong, itertools.count()):
         refused(given, setting.name, value, tmp_path / str(number))
+
+
+PUT_TOGETHER = [
+    ("experiment=icl", "icl.gain", [1.0]),
+    ("experiment=icl", "icl.rate", ["no", 1.0]),
+    ("experiment=exponential_bound", "exponential_bound.domain", 0.0),
+    ("experiment=exponential_bound", "exponential_bound.states", 1),
+    ("experiment=exponential_bound", "exponential_bound.max_degree", -1),
+    ("experiment=adp_initial_weights", "adp.critic", 0.0),
+    ("experiment=adp_initial_weights", "adp.actor", -1.0),
+]
+
+
+@pytest.mark.parametrize(("given", "name", "value"), PUT_TOGETHER)
+def test_a_setting_whose_name_is_put_together_is_refused_by_it(
+    given: str, name: str, value: object, tmp_path: Path
+) -> None:
+    refused((given,), name, value, tmp_path / "run")
+
+
+class Unmoved(staf_torch.systems.TwoState):
+    """A plant that does not say its dimension."""
+
+    dim = None
+
+
+OTHER_KINDS = [
+    (
+        ("experiment=safe_box",),
+        {"system": {"_target_": f"{__name__}.stepped"}},
+        "must be a ControlAffineSystem",
+    ),
+    (
+        ("experiment=adp",),
+        {"system": {"_target_": f"{__name__}.Unmoved"}},
+        "must be a `systems.Plant` with `dim`",
+    ),
+    ((), {"metric": {"_target_": "torch.nn.Identity"}}, "must be a `staf_torch.metrics.Metric`, or several"),
+    (
+        ("experiment=flat_limit",),
+        {
+            "system": {"_target_": "staf_torch.systems.Linear", "matrix": [[-1.0]]},
+            "initial_state": [1.0],
+            "centers": {"layout": "simplex", "count": None, "radius": 0.1, "shrink": {"offset": 0.0}},
+        },
+        "must have two states for flat_limit",
+    ),
+]
+
+
+def stepped() -> staf_torch.systems.Plant:
+    """A plant in steps, which has no rate."""
+    return staf_torch.systems.StepPlant(lambda x, u: 0.9 * x + u, dim=2, inputs=1, dt=0.1)
+
+
+@pytest.mark.parametrize(("given", "parts", "words"), OTHER_KINDS)
+def test_a_part_of_another_kind_is_refused(
+    given: tuple[str, ...], parts: dict[str, Any], words: str, tmp_path: Path
+) -> None:
+    cfg = settings(*given)
+    for name, part in parts.items():
+        cfg[name] = part
+    with pytest.raises(ValueError, match=words):
+        experiment(cfg.task)(cfg, tmp_path)

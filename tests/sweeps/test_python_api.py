@@ -201,6 +201,15 @@ def test_a_data_frame_over_kernel_radius_and_count_in_three_lines() -> None:
     assert frame.loc["matern", (0.2, 6)] == runs[7].metrics["ball_error"]
     whole = runs.to_pandas()
     assert list(whole["ball_error"]) == [run.metrics["ball_error"] for run in runs]
+    for arguments, words in (
+        (("kernel", "centers.count", "no"), r"`Runs.pivot\(metric=...\)` must be one of .*; got 'no'"),
+        (("kernel", "centers.count", "ball_error", "no"), r"`Runs.pivot\(aggregate=...\)` must be one of"),
+        (("kernel", "no", "ball_error"), r"`Runs\(name=...\)` must be one of .*; got 'no'"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            runs.pivot(*arguments)
+    with pytest.raises(ValueError, match=r"`Run\(history=...\)` cannot be read: the run kept none"):
+        _ = runs[0].history
     pytest.importorskip("pyarrow")
     assert runs.__arrow_c_stream__() is not None
     polars = pytest.importorskip("polars")
@@ -212,6 +221,8 @@ def test_a_pivot_has_no_number_where_a_run_has_none() -> None:
     runs = staf_torch.sweep("centers.count=6,7", "seed=0,1", *BARE)
     frame = runs.pivot("centers.count", "seed", "ball_error")
     assert frame.loc[7].isna().all()
+    with pytest.raises(ValueError, match=r"`Runs.best\(metric=...\)` must be one of ; got"):
+        runs.filter("centers.count=7").best("ball_error")
     assert runs.pivot("centers.count", "task", "ball_error").loc[6].notna().all()
 
 
