@@ -52,6 +52,31 @@ def test_where_nothing_is_in_its_way_and_no_bound_is_met_the_plan_is_the_lqr() -
     torch.testing.assert_close(plans.step(moved, after, x, 0.2)[0], ahead[:, 0], rtol=0.02, atol=0.01)
 
 
+def test_an_angle_counts_the_shorter_way_around() -> None:
+    plant = systems.RatePlant(
+        lambda x, u: torch.stack((x[..., 1], x[..., 0].sin() + u[..., 0]), -1),
+        dim=2,
+        inputs=1,
+        periodic=[0],
+    )
+    cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1, low=-2.0, high=2.0)
+    lqr = adp.LQR(plant, cost, period=0.1)
+    ahead = adp.DetourRollout(
+        *(lqr, plant, cost, lambda x, t: 9.0 + 0 * t + x[:, 1].square()),
+        axes=[[0.0, 1.0]],
+        dt=0.1,
+        steps=6,
+        terminal=lqr.value,
+    )
+    plans = adp.DetourPlans(ahead, first=3)
+    x = torch.tensor([[0.4, 0.1], [-0.7, 0.3]], dtype=torch.float64)
+    turned = x + 2 * torch.pi * torch.tensor([[1.0, 0.0], [-2.0, 0.0]], dtype=torch.float64)
+    u, after = plans.step(x, plans.init(x), x, 0.1)
+    other, same = plans.step(turned, plans.init(turned), x, 0.1)
+    torch.testing.assert_close(other, u, rtol=1e-6, atol=1e-6)
+    torch.testing.assert_close(same.identifier, after.identifier, rtol=1e-6, atol=1e-6)
+
+
 def test_no_change_of_a_plan_lowers_what_it_costs() -> None:
     plans = adp.DetourPlans(detours(margin=0.0, steps=6), first=6)
     best = plans.init(BESIDE).identifier[:, :-2]

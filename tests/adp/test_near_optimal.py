@@ -232,6 +232,7 @@ def test_controllers_of_a_policy_share_programs_and_no_plan() -> None:
     policy = adp.near_optimal(plant, COST, dt=0.25, low=-1.0, high=1.0)
     one, other = policy.controller(), policy.controller()
     assert one._begun is other._begun
+    assert next(iter(policy._loops.values())).held  # begins with the best of several
     dearer = copy.copy(policy)
     dearer.cost = adp.QuadraticCost(1.0, 9.0, dim=2, inputs=1, low=-1.0, high=1.0)
     assert dearer.controller()._begun is not one._begun  # plans of another cost are others

@@ -14,15 +14,19 @@ import json
 import re
 import sys
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 from composing import settings
+from figures.looks import looks, version
+from matplotlib.figure import Figure
 from recorded import Record
 
 from staf_torch.adp import DirectShooting
 from staf_torch.experiments.registry import EXPERIMENTS, experiment
+from staf_torch.results.progress import Progress
 
 RECORDED = Path(__file__).with_name("reference_metrics.json")
 CASES: dict[str, str] = {
@@ -50,14 +54,28 @@ CASES: dict[str, str] = {
 }
 
 
-def metrics_of(name: str, directory: Path) -> dict[str, float | None]:
+def taking(drawn: list[Figure]) -> Callable[[Figure], dict[str, bytes]]:
+    """What takes the place of writing a figure: it is kept."""
+
+    def images(figure: Figure) -> dict[str, bytes]:
+        drawn.append(figure)
+        return {}
+
+    return images
+
+
+def metrics_of(
+    name: str, directory: Path, figures: bool = False, told: list[float] | None = None
+) -> dict[str, float | None]:
     """The metrics of a case."""
-    cfg = settings("figures=false", *CASES[name].split())
+    cfg = settings(f"figures={figures}", *CASES[name].split())
     run = experiment(cfg.task)
     with pytest.MonkeyPatch.context() as patch:  # the optimum in a box on a mesh of its own takes 11 s
         coarse = functools.partial(DirectShooting, horizon=2.0, intervals=16)
         patch.setattr("staf_torch.experiments.safe_box.DirectShooting", coarse)
-        found: dict[str, float | None] = run(cfg, directory)
+        found: dict[str, float | None] = run(
+            cfg, directory, Progress([].append if told is None else told.append)
+        )
     return found
 
 
@@ -92,13 +110,22 @@ def _column(cells: list[str]) -> object:
 
 @pytest.mark.parametrize("name", CASES)
 def test_metrics_are_the_recorded_ones(
-    name: str, tmp_path: Path, record: Record, caplog: pytest.LogCaptureFixture
+    name: str,
+    tmp_path: Path,
+    record: Record,
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     caplog.set_level("INFO")
     if name == "adp_tracking":  # its optimum is a Riccati equation's
         pytest.importorskip("scipy", reason="needs the extra adp")
     recorded = json.loads(RECORDED.read_text())[name]
-    found = metrics_of(name, tmp_path)
+    drawn: list[Figure] = []
+    for module in {*EXPERIMENTS.values()}:
+        monkeypatch.setattr(f"staf_torch.experiments.{module.partition('.')[0]}.images", taking(drawn))
+    others = "\n" if record.known().get("looks", version()) == version() else "looks"
+    told: list[float] = []
+    found = metrics_of(name, tmp_path, figures=True, told=told)
     assert found.keys() == recorded.keys()
     for metric, number in recorded.items():
         least = 0.0 if metric == "rounding_floor" else 1e-9
@@ -106,13 +133,36 @@ def test_metrics_are_the_recorded_ones(
             metric
         )
     left = {} if name == "flat_limit" else left_in(tmp_path)  # its errors of other methods are rounding
-    record(left | {"said": said(caplog)}, rtol=1e-4)
+    record(
+        left | {"said": said(caplog), "progress": told} | shown_in(tmp_path) | pictured(drawn),
+        rtol=1e-4,
+        without=others,
+    )
+
+
+def shown_in(directory: Path) -> dict[str, object]:
+    """The words of the tables that are for reading, without their numbers."""
+    return {f"words:{path.name}": _words(path.read_text()) for path in sorted(directory.rglob("*.md"))}
+
+
+def pictured(drawn: list[Figure]) -> dict[str, object]:
+    """What figures hold: the data of their lines, and how they look without their numbers."""
+    found: dict[str, object] = {"looks": version()}
+    for figure in drawn:
+        lines = (line for axes in figure.axes for line in axes.lines)
+        found |= {f"line:{at}": line.get_xydata() for at, line in enumerate(lines)}
+        found |= {f"looks:{at}": _words(words) for at, words in enumerate(looks(figure))}
+    return found
+
+
+def _words(text: str) -> str:
+    return re.sub(r"[-+]?\d[\d.]*(e[-+]?\d+)?|/tmp/\S+|[ -]{2,}", "N", text)
 
 
 def said(caplog: pytest.LogCaptureFixture) -> list[str]:
     """The words of the log, without its numbers, of the library's own."""
     lines = (each.getMessage() for each in caplog.records if each.name.startswith("staf_torch"))
-    words = (re.sub(r"[-+]?[\d.]+(e[-+]?\d+)?|/tmp/\S+", "N", line) for line in lines)
+    words = map(_words, lines)
     return [line for line in words if "compiled" not in line]
 
 

@@ -115,6 +115,23 @@ def test_a_row_is_read_alone_as_with_the_others(tmp_path: Path, order: str) -> N
             np.testing.assert_array_equal(archive.read(name, row), array[row])
 
 
+@pytest.mark.parametrize("bit", range(16))
+def test_an_archive_that_says_it_is_encrypted_is_refused(tmp_path: Path, bit: int) -> None:
+    """The first bit of an entry's flags says so; the others say nothing that matters here."""
+    path = tmp_path / "history.npz"
+    np.savez(path, state=np.arange(4.0))
+    whole = bytearray(path.read_bytes())
+    listed = whole.index(b"PK\1\2")
+    flags = int.from_bytes(whole[listed + 8 : listed + 10], "little") | 1 << bit
+    whole[listed + 8 : listed + 10] = flags.to_bytes(2, "little")
+    path.write_bytes(whole)
+    if bit == 0:
+        with pytest.raises(UnreadableError, match="state is compressed"):
+            Archive(path)
+    elif bit in (1, 2, 3):
+        np.testing.assert_array_equal(Archive(path).read("state"), np.arange(4.0))
+
+
 HIDDEN = {
     "a comment": lambda whole, said: whole[:-2] + len(said).to_bytes(2, "little") + said,
     "a comment that is cut off": lambda whole, said: (

@@ -182,6 +182,17 @@ def test_markdown_joins_mean_and_spread_and_marks_the_best(found: Collection) ->
     assert len({len(line) for line in lines[2:8]}) == 1  # aligned
 
 
+@pytest.mark.parametrize(("number", "heads"), [(0.1, ["n"]), (None, ["n", "failed"])])
+def test_how_many_failed_is_shown_where_one_did_and_how_many_count_always(
+    tmp_path: Path, number: float | None, heads: list[str]
+) -> None:
+    for num in range(2):
+        write_run(tmp_path / str(num), {"seed": num, "dt": 0.1}, {"ball_error": number})
+    text = tabulate(collect(tmp_path), Layout(metrics=("ball_error",), aggregates=("mean",))).markdown()
+    shown = [cell.strip() for cell in next(line for line in text.splitlines() if "|" in line).split("|")]
+    assert [head for head in shown if head in ("n", "failed")] == heads
+
+
 def test_best_marks_all_that_look_alike(tmp_path: Path) -> None:
     for num, number in enumerate((0.1001, 0.1002, 0.2)):
         write_run(tmp_path / str(num), {"dt": num + 1}, {"ball_error": number})
