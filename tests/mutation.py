@@ -2,7 +2,7 @@
 
     python tests/mutation.py [--sample 100] [--seed 0] [--package kernels optim] [--jobs 2] [--minutes 30]
 
-A mutant runs the tests that execute its line, those of the same folder first and the short ones first,
+A mutant runs the tests that execute its line, those of the same folder and the short ones first,
 until one fails (`mutation_judge.py`). Which tests execute which line is measured once a file of tests
 (`mutation_map.py`) and kept in the user's cache. The committed tree counts, not the working one. Mutants in
 `mutants_accepted.py` change nothing that can be seen.

@@ -19,6 +19,7 @@ OVERHEAD = 0.1  # seconds that a test costs beside what was measured
 UNKNOWN = 5.0  # seconds that a file of tests is taken for
 _ENDED = "by the clock, or the process ended"
 _READS = "test_structure.py"  # which reads the text, and runs no line
+FAR = 5.0  # times as long a test of another folder is taken for: it is as likely to tell for that much less
 FIRST = 4.0  # seconds of tests that are tried before files of more tests are read
 
 
@@ -107,10 +108,13 @@ def _groups(tests: Sequence[str]) -> list[list[str]]:
 
 
 def _tests_for(mutant: Mutant, source: str) -> list[str]:
-    """Those that execute the lines, the folder's own first and the short ones first, within the time."""
+    """Those that execute the lines, the short ones first, within the time.
+
+    A test of the mutant's own folder comes where one of another folder that takes a part of its time would.
+    """
     hits = _hits(mutant, source)
-    near = {test: 0 if test.startswith((*places(mutant.file), CONTRACTS)) else 1 for test in hits}
-    order = sorted(hits, key=lambda test: (near[test], _cost([test]), test))
+    near = {test: 1.0 if test.startswith((*places(mutant.file), CONTRACTS)) else FAR for test in hits}
+    order = sorted(hits, key=lambda test: (near[test] * _cost([test]), test))
     chosen: list[str] = []
     for test in order:
         if _cost([*chosen, test]) <= _seconds:

@@ -15,6 +15,8 @@ from pathlib import Path
 from typing import Any
 
 import yaml
+from public_names import public
+from recorded import Record
 
 import staf_torch
 
@@ -84,3 +86,27 @@ def test_an_option_of_the_command_line_is_the_default_of_the_constructor() -> No
     differing = {(file, key): (value, default) for file, key, value, default in found if value != default}
     assert set(differing) == set(OTHERWISE), differing
     assert len(found) > 40
+
+
+def defaults(name: str, thing: object) -> Iterator[tuple[str, str]]:
+    """Argument and default of a class or function, of a class's own public methods too, as text."""
+    for key, parameter in inspect.signature(thing).parameters.items():  # type: ignore[arg-type]
+        if parameter.default is not parameter.empty:
+            yield f"{name}({key})", plain(parameter.default)
+    for key, method in vars(thing).items() if inspect.isclass(thing) else ():
+        method = getattr(method, "__func__", method)
+        if inspect.isfunction(method) and method.__module__.startswith("staf_torch") and key[0] != "_":
+            yield from defaults(f"{name}.{key}", method)
+
+
+def plain(value: object) -> str:
+    """A number, a text, several of them; of anything else its kind."""
+    if isinstance(value, tuple):
+        return f"({', '.join(map(plain, value))})"
+    return repr(value) if isinstance(value, bool | int | float | str | None) else type(value).__name__
+
+
+def test_defaults_of_public_arguments_are_the_recorded_ones(record: Record) -> None:
+    found = dict(each for name, (thing, _) in sorted(public().items()) for each in defaults(name, thing))
+    assert len(found) > 400
+    record(found)
