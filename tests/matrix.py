@@ -67,6 +67,7 @@ class Environment(NamedTuple):
     packages: Sequence[str] = ()
     compiler: bool = True
     privileged: bool = True
+    processor: bool = True  # all that it can; else what one of ten years ago could, which rounds otherwise
 
 
 ENVIRONMENTS = {
@@ -82,6 +83,7 @@ ENVIRONMENTS = {
     "no_extras": Environment("no extras", "3.11", ("torch==2.13.0", *CORE[1:], "hydra-core<1.4", *TOOLS)),
     "no_compiler": Environment("no C or C++ compiler on the path", compiler=False),
     "unprivileged": Environment("another user, home read-only", privileged=False),
+    "older_processor": Environment("no AVX-512; compiled without fused operations", processor=False),
 }
 
 
@@ -200,6 +202,13 @@ def _home(environment: Environment, scratch: Path) -> Iterator[dict[str, str]]:
                 if found.is_file() and not COMPILERS.search(found.name) and not place.is_symlink():
                     place.symlink_to(found)
         changed |= {"PATH": str(programs), "CXX": "", "CC": "", "XDG_CACHE_HOME": str(scratch / "cache")}
+    if not environment.processor:
+        # torch's own loops, those of its linear algebra, and what is compiled here.
+        wrapper, program = scratch / "g++", shutil.which("g++") or ""
+        wrapper.write_text(f'#!/bin/bash\nexec {program} "${{@/-march=native/-march=x86-64-v2}}"\n')
+        wrapper.chmod(0o755)
+        changed |= {"ATEN_CPU_CAPABILITY": "avx2", "MKL_ENABLE_INSTRUCTIONS": "AVX2"}
+        changed |= {"CXX": str(wrapper), "XDG_CACHE_HOME": str(scratch / "cache")}
     if not environment.privileged:
         home, temporary = scratch / "home", scratch / "tmp"
         home.mkdir(mode=0o555)

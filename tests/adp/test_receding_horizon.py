@@ -119,8 +119,8 @@ def test_hastened_control_is_that_of_the_parts(caplog: pytest.LogCaptureFixture)
         mpc.step(x[rows] + 0.1, rows_of(plan, rows), none[rows], 0.1) for rows in (slice(3), slice(1, 2))
     )
     assert not caplog.text
-    torch.testing.assert_close(whole[0], parts[0], rtol=0, atol=1e-12)
-    torch.testing.assert_close(whole[1].identifier, parts[1].identifier, rtol=0, atol=1e-12)
+    torch.testing.assert_close(whole[0], parts[0], rtol=0, atol=1e-8)  # of a search of a few rounds
+    torch.testing.assert_close(whole[1].identifier, parts[1].identifier, rtol=0, atol=1e-8)
     assert torch.equal(whole[0][1:2], alone[0])
 
 

@@ -79,7 +79,10 @@ def test_a_radius_that_moves_gives_what_the_constant_one_of_its_size_gives(
         alone = basis_of(kernel, count, float(moving(at)))
         expected = alone.local(at).fit(alone.values(at, Paper()))
         assert found[row].isfinite().all()
-        torch.testing.assert_close(found[row], expected, rtol=1e-7, atol=1e-7)
+        share = 1e-7 if bound < 5.0 else 1e-5  # of a Gram matrix that is all but singular there
+        torch.testing.assert_close(
+            found[row], expected, rtol=0, atol=share * max(1.0, float(expected.abs().max()))
+        )
 
 
 def test_weights_whose_factor_underflows_are_lost_unless_they_are_zero() -> None:

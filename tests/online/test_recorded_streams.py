@@ -74,7 +74,16 @@ CASES: dict[str, Callable[[], Any]] = {
 }
 
 
+INNER = {
+    "the definition": "filters",
+    "the definition of a stream that goes elsewhere": "filters",
+    "filter of a kernel": "0.table",
+}
+"""Parts with the weights of kernels that are all but dependent: their sum is known, each is rounding."""
+
+
 @pytest.mark.parametrize("name", CASES)
 def test_what_is_learned_is_the_recorded(name: str, record: Record) -> None:
-    # The definition keeps an inverse of entries of 1e8, of which four digits are those of every torch.
-    record(CASES[name](), rtol=2e-3 if "definition" in name else 1e-5)
+    # A bank keeps an inverse of entries of 1e8, of which four digits are those of every torch and processor.
+    inverse = "definition" in name or name == "bank"
+    record(CASES[name](), rtol=2e-3 if inverse else 1e-5, without=INNER.get(name, "\n"))
