@@ -1,0 +1,287 @@
+"""Which jobs share a tensor batch, what becomes of each, and in which words an error is told."""
+
+from __future__ import annotations
+
+import dataclasses
+import errno
+import itertools
+import logging
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from hydra.errors import HydraException, MissingConfigException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import ConfigKeyError, OmegaConfBaseException
+
+from staf_torch.experiments.registry import BatchedExperiment, Metrics
+from staf_torch.results.progress import SHOWN, Progress
+from staf_torch.sweeps import batching
+from staf_torch.sweeps.batching import (
+    DEFERRED,
+    Batch,
+    Computed,
+    Deferred,
+    Done,
+    Failed,
+    Written,
+    batches,
+    completion,
+    flat_or_none,
+    groups,
+    reason,
+    sentence,
+    solve,
+)
+from staf_torch.sweeps.workers import LostError
+
+
+class Sized(BatchedExperiment[Any]):
+    """An experiment whose settings say how much a solution keeps, and which shape it has."""
+
+    batchable = frozenset({"seed", "kept"})
+
+    def __call__(self, cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics:
+        return {"alone": 1.0}
+
+    def solve(self, cfgs: Sequence[DictConfig], progress: Progress) -> list[Any]:
+        if any(cfg.seed == 13 for cfg in cfgs):
+            raise RuntimeError("thirteen")
+        metrics = [{"seed": float(cfg.seed), "together": float(len(cfgs))} for cfg in cfgs]
+        return [ValueError("odd") if m["seed"] % 2 else SimpleNamespace(metrics=m) for m in metrics]
+
+    def write(self, cfg: DictConfig, directory: Path, solution: Any) -> Metrics:
+        return {**solution.metrics, "place": float(directory.name)}
+
+    def shape(self, settings: Mapping[str, object]) -> object:
+        return settings.get("shape")
+
+    def size(self, settings: Mapping[str, object]) -> int:
+        kept = settings.get("kept", 0)
+        assert isinstance(kept, int)
+        return kept
+
+
+@pytest.fixture(autouse=True)
+def _experiments(monkeypatch: pytest.MonkeyPatch) -> None:
+    def found(task: object) -> object:
+        if task not in ("sized", "alone"):
+            raise ValueError("no such task")
+        return Sized() if task == "sized" else lambda cfg, directory, progress=SHOWN: {"task": 2.0}
+
+    monkeypatch.setattr(batching, "experiment", found)
+
+
+def jobs(count: int, **more: Any) -> list[dict[str, Any]]:
+    return [{"task": "sized", "seed": n, **more} for n in range(count)]
+
+
+# Which share a batch
+
+
+@pytest.mark.parametrize("count", [1, 2, 6, 13])
+@pytest.mark.parametrize("least", [1, 3, 5, 100])
+@pytest.mark.parametrize("most", [None, 1, 2, 20])
+def test_batches_are_every_job_once_in_order_and_as_many_as_keep_all_workers_busy(
+    count: int, least: int, most: int | None
+) -> None:
+    found = batches(jobs(count), least=least, most=most)
+    assert [index for batch in found for index in batch] == list(range(count))
+    longest = max(map(len, found))
+    assert longest <= (most or count)
+    assert longest == min(most or count, -(-count // least))  # no shorter than that needs
+    assert all(len(batch) == longest for batch in found[:-1])
+
+
+def test_batches_of_two_groups_share_the_workers() -> None:
+    mixed = [{"task": "sized", "seed": n, "kernel": "ab"[n % 2]} for n in range(12)]
+    assert batches(mixed) == [[0, 2, 4, 6, 8, 10], [1, 3, 5, 7, 9, 11]]
+    assert batches(mixed, least=2) == batches(mixed)
+    four = [[0, 2, 4], [1, 3, 5], [6, 8, 10], [7, 9, 11]]
+    assert batches(mixed, least=4) == four
+    assert [len(batch) for batch in batches(mixed, least=3)] == [4, 4, 2, 2]
+
+
+def test_a_batch_is_as_long_as_memory_allows() -> None:
+    half = 2**27
+    assert batches(jobs(2, kept=half)) == [[0, 1]]
+    assert batches(jobs(2, kept=half + 1)) == [[0], [1]]
+    assert batches(jobs(9, kept=half // 2)) == [[0, 1, 2, 3], [4, 5, 6, 7], [8]]
+    assert batches([{**job, "kept": kept} for job, kept in zip(jobs(3), (2 * half, 0, 1), strict=True)]) == [
+        [0, 1],
+        [2],
+    ]
+    assert [len(batch) for batch in batches(jobs(300))] == [128, 128, 44]  # whatever they keep
+    assert [len(batch) for batch in batches(jobs(300), most=200)] == [200, 100]
+
+
+def test_jobs_that_can_share_no_batch_stand_alone() -> None:
+    lone = [
+        {"task": "alone", "seed": 1},
+        {"task": "alone", "seed": 1},
+        {"task": "nothing"},
+        {"seed": 1},  # without a task
+        None,
+        *jobs(2, members=["seed=0,1"]),
+    ]
+    assert groups([*lone, *jobs(2), *jobs(2, shape="other")]) == [*([n] for n in range(7)), [7, 8], [9, 10]]
+    assert groups([*jobs(2, members=None), *jobs(1)]) == [[0, 1], [2]]
+    assert batches(lone, least=1) == [[n] for n in range(7)]
+
+
+def test_settings_that_are_broken_have_no_flat_form() -> None:
+    assert flat_or_none(OmegaConf.create({"a": {"b": 1}, "c": [2]})) == {"a.b": 1, "c": [2]}
+    missing = flat_or_none(OmegaConf.create({"a": "${nowhere}"}))
+    assert missing == {"a": "${nowhere}"}
+    assert flat_or_none(3) is None  # type: ignore[arg-type]
+
+
+# What becomes of each
+
+
+def cfgs(*seeds: int, **more: Any) -> list[DictConfig]:
+    return [OmegaConf.create({"task": "sized", "seed": seed, **more}) for seed in seeds]
+
+
+def test_a_batch_has_an_outcome_a_job_and_an_error_is_that_of_its_job() -> None:
+    one, two, three = solve(cfgs(2, 3, 4), SHOWN)
+    assert isinstance(one, Computed)
+    assert isinstance(two, Failed)
+    assert isinstance(three, Computed)
+    assert one.metrics == {"seed": 2.0, "together": 3.0}
+    assert str(two.error) == "odd"
+    assert three.metrics == {"seed": 4.0, "together": 3.0}
+
+
+def test_a_batch_that_raises_is_tried_job_by_job_and_that_is_told(caplog: pytest.LogCaptureFixture) -> None:
+    found = solve(cfgs(2, 13), SHOWN)
+    assert isinstance(found[0], Computed)
+    assert found[0].metrics["together"] == 1.0
+    assert isinstance(found[1], Failed)
+    assert str(found[1].error) == "thirteen"
+    assert caplog.messages == ["a batch of 2 cannot run as one (RuntimeError: thirteen); each runs alone"]
+    caplog.clear()
+    (alone,) = solve(cfgs(13), SHOWN)
+    assert isinstance(alone, Failed)
+    assert caplog.messages == []
+
+
+def test_what_takes_no_part_in_batches_is_left_for_later() -> None:
+    assert solve([OmegaConf.create({"task": "alone"})] * 2, SHOWN) == [DEFERRED] * 2
+    assert solve(cfgs(2, 4, members=None)[:1], SHOWN) != [DEFERRED]
+    mixed = [*cfgs(2), *cfgs(4, members=["seed=1"])]
+    assert solve(mixed, SHOWN) == [DEFERRED, DEFERRED]
+    assert isinstance(DEFERRED, Deferred)
+
+
+def test_the_first_settings_name_the_experiment_of_a_batch() -> None:
+    (first, second) = solve([*cfgs(2), OmegaConf.create({"task": "alone", "seed": 4})], SHOWN)
+    assert isinstance(first, Computed)
+    assert isinstance(second, Computed)
+
+
+def test_what_is_left_to_do_follows_from_the_outcome(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.DEBUG)
+    (cfg,) = cfgs(2)
+    (computed,) = solve([cfg], SHOWN)
+    assert completion(cfg, computed)(cfg, tmp_path / "7") == {"seed": 2.0, "together": 1.0, "place": 7.0}
+    assert completion(cfg, DEFERRED)(cfg, tmp_path) == {"alone": 1.0}
+    with pytest.raises(ValueError, match="odd"):
+        completion(cfg, Failed(ValueError("odd")))
+    written = Written({"there": 3.0}, [(logging.WARNING, "100 % odd"), (logging.INFO, "told")])
+    assert completion(cfg, written)(cfg, tmp_path) == {"there": 3.0}
+    assert [(r.levelno, r.getMessage()) for r in caplog.records] == [(30, "100 % odd"), (20, "told")]
+
+
+def test_outcomes_are_values_that_nobody_changes() -> None:
+    for one in (Failed(ValueError()), Written({}, []), Computed(SimpleNamespace(metrics={})), DEFERRED):
+        for name in (*vars(one), "more"):
+            with pytest.raises(dataclasses.FrozenInstanceError):
+                setattr(one, name, None)
+    assert Done([DEFERRED], 1.0) == ([DEFERRED], 1.0)
+    assert Batch([], []).whole == ()
+
+
+# In which words
+
+
+def chained(*errors: BaseException) -> BaseException:
+    for error, cause in itertools.pairwise(errors):
+        error.__cause__ = cause
+    return errors[0]
+
+
+def missing(name: str | None, options: list[str] | None) -> MissingConfigException:
+    return MissingConfigException("not found", name, options)
+
+
+DISK = OSError(errno.ENOSPC, "No space left", "a/file")
+OTHERS = "; others come with the extras joblib, slurm, ray and optuna"
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (ValueError("ours"), "ours"),
+        (RuntimeError("theirs"), "theirs"),
+        (chained(HydraException("wrapped"), RuntimeError("between"), ValueError("ours")), "ours"),
+        (chained(HydraException("wrapped"), RuntimeError("between")), "wrapped"),
+        (chained(RuntimeError("theirs"), OmegaConfBaseException("omega")), "theirs"),
+        (DISK, "cannot write a/file: No space left"),
+        (OSError("no file"), "no file"),
+        (OSError(errno.ENOSPC, "No space left"), "[Errno 28] No space left"),
+        (chained(RuntimeError("theirs"), DISK), "theirs"),
+        (
+            ConfigKeyError("Could not override 'centers.raduis'.\nKey is not there"),
+            "there is no setting `centers.raduis`; `staf --help` lists them.",
+        ),
+        (HydraException("it Could not override 'a'"), "it Could not override 'a'"),
+        (missing("kernel/gauss", ["a", "b"]), "there is no `kernel/gauss`; there are a, b."),
+        (missing("hydra/launcher/x.yaml", ["a"]), f"there is no `hydra/launcher/x`; there are a{OTHERS}."),
+        (missing(None, ["a"]), "there is no ``; there are a."),
+        (missing("kernel/gauss", []), "not found"),
+        (missing("kernel/gauss", None), "not found"),
+    ],
+)
+def test_an_error_is_told_in_a_sentence(error: BaseException, words: str) -> None:
+    assert sentence(error) == words
+
+
+class BothError(ConfigKeyError, ValueError):
+    """An error of OmegaConf that is a ValueError as well, as some of its own are."""
+
+
+class HydraDiskError(HydraException, OSError):
+    """An error of Hydra's about a file."""
+
+    filename, strerror = "b", "gone"
+
+
+def test_an_error_of_a_library_is_not_ours_whatever_else_it_is() -> None:
+    assert sentence(chained(RuntimeError("outer"), BothError("inner"))) == "outer"
+    assert sentence(chained(RuntimeError("outer"), BothError("inner"), ValueError("ours"))) == "ours"
+    assert sentence(HydraDiskError("told by Hydra")) == "told by Hydra"
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (KeyboardInterrupt(), "interrupted"),
+        (KeyboardInterrupt("why"), "interrupted"),
+        (ValueError("a\n  b"), "a b"),
+        (ValueError(""), "ValueError: "),
+        (RuntimeError("defect"), "RuntimeError: defect"),
+        (RuntimeError(""), "RuntimeError: "),
+        (KeyError("name"), "KeyError: 'name'"),
+        (DISK, "cannot write a/file: No space left"),
+        (LostError("it was lost"), "it was lost"),
+        (HydraException("told"), "told"),
+        (ConfigKeyError("told"), "told"),
+    ],
+)
+def test_a_record_has_one_line_and_the_type_of_a_defect(error: BaseException, words: str) -> None:
+    assert reason(error) == words
