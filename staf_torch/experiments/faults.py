@@ -144,7 +144,7 @@ def unstable(rows: int, generator: torch.Generator) -> Case:
     the origin, between 0.1 and 0.5 s. An LQR that is made to be held for that long does not stand it."""
 
     def regressor(x: Tensor, u: Tensor) -> Tensor:
-        effect = u * torch.tensor([1.0, 0.1]).to(u)
+        effect = u * torch.tensor([1.0, 0.1], dtype=torch.float64).to(u)
         return torch.stack((torch.zeros_like(effect), effect), dim=-2)
 
     def known(x: Tensor, u: Tensor) -> Tensor:
