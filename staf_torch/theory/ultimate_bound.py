@@ -148,7 +148,8 @@ def ultimate_bound(
         return UltimateBound(math.inf, math.inf)
     growth = constants.growth * dt
     way = constants.speed * dt * (math.expm1(growth) / growth if growth > 0 else 1.0)
-    return UltimateBound(before=(way / left) ** 2, after=(q * way / left) ** 2)
+    before, after = way / left, q * way / left
+    return UltimateBound(before * before, after * after)  # inf past the largest number, where ** raises
 
 
 def step_for_bound(
@@ -211,8 +212,7 @@ def steps_for_bound(
         return None
     if one <= q:
         return 1
-    count = math.ceil(math.log(q) / math.log(one) - 1e-12)
-    return max(count, 1)
+    return math.ceil(math.log(q) / math.log(one) - 1e-12)
 
 
 def _contraction(call: str, constants: DriftConstants, law: UpdateLaw, inner_steps: int) -> float:
