@@ -12,13 +12,19 @@ from torch import Tensor
 from ..lanes import each, repeat
 
 MOST_CASES = 1000  # sets of active inequalities and bounds that are compared at most
-_FIRM, _SOFT = (
-    1e-14,
-    1e-10,
-)  # shortfall of a unit normal's inequality a unit of its multiplier, where it holds
 _ROUNDED, _OWN = 64, 2**20  # roundings by which a point may miss an inequality, and one on whose edge it is
-_GIVE = 1e-9  # of the squares of u - wanted, beside those of what is missing
-_MET = 1e-9  # error of a case, in units of u, below which it is the solution
+
+
+class _Small(NamedTuple):
+    """What is small beside 1, and yet not lost in it."""
+
+    firm: float  # shortfall of a unit normal's inequality a unit of its multiplier, where it holds
+    soft: float  # the same, where it cannot hold
+    give: float  # of the squares of u - wanted, beside those of what is missing
+    met: float  # error of a case, in units of u, below which it is the solution
+
+
+_DOUBLE, _SINGLE = _Small(1e-14, 1e-10, 1e-9, 1e-9), _Small(1e-6, 1e-4, 1e-5, 1e-4)
 
 
 class Nearest(NamedTuple):
@@ -83,7 +89,7 @@ def nearest_admissible(
         NaN where an input is NaN.
     """
     length = normals.square().sum(-1).sqrt()
-    length = torch.where(length > 0, length, 1.0)
+    length = torch.where(length == 0, 1.0, length)
     unit, far = normals / length.unsqueeze(-1), least / length
     size = wanted.shape[-1]
     if size == 1:
@@ -103,8 +109,8 @@ def nearest_admissible(
 def _interval(wanted: Tensor, unit: Tensor, far: Tensor, low: Tensor, high: Tensor) -> Tensor:
     """One unknown: u >= c where a = 1, u <= -c where a = -1."""
     slope = unit[..., 0]
-    bottom = torch.where(slope > 0, far, -torch.inf).amax(-1, keepdim=True)
-    top = torch.where(slope < 0, -far, torch.inf).amin(-1, keepdim=True)
+    bottom = torch.where(slope <= 0, -torch.inf, far).amax(-1, keepdim=True)
+    top = torch.where(slope >= 0, torch.inf, -far).amin(-1, keepdim=True)
     inside = torch.minimum(torch.maximum(wanted, bottom), top)
     met = torch.where(bottom > top, 0.5 * (bottom + top), inside)
     return torch.minimum(torch.maximum(met, low), high)
@@ -153,7 +159,7 @@ def _least_squares(wanted: Tensor, unit: Tensor, far: Tensor, low: Tensor, high:
     def subset(chosen: Tensor) -> Tensor:
         """The minima for a set of inequalities, on the plane and its edges: (..., S, k) -> (..., S, 15)."""
         a, b = (chosen * unit[..., k].unsqueeze(-2) for k in (0, 1))
-        aims, give = chosen * far.unsqueeze(-2), _GIVE
+        aims, give = chosen * far.unsqueeze(-2), _small(far).give
         aa, ab, bb = ((p * q).sum(-1) for p, q in ((a, a), (a, b), (b, b)))
         ra, rb = ((p * aims).sum(-1) for p in (a, b))
         ra, rb = ra + give * start[..., :1], rb + give * start[..., 1:]
@@ -180,7 +186,7 @@ def _least_squares(wanted: Tensor, unit: Tensor, far: Tensor, low: Tensor, high:
 
 
 def _best_case(wanted: Tensor, unit: Tensor, far: Tensor, low: Tensor, high: Tensor, table: Tensor) -> Tensor:
-    size, count = wanted.shape[-1], far.shape[-1]
+    size, count, small = wanted.shape[-1], far.shape[-1], _small(far)
 
     def case(points: Tensor) -> Tensor:
         """A firm and a soft u, and how far each is from a solution: (..., P, k + m) -> (..., P, 2 m + 2)."""
@@ -192,15 +198,15 @@ def _best_case(wanted: Tensor, unit: Tensor, far: Tensor, low: Tensor, high: Ten
         base = torch.where(side == 0, start, ends)
         right = active * (aims - (rows * base.unsqueeze(-2)).sum(-1))
         found = []
-        for give in (_FIRM, _SOFT):
+        for give in (small.firm, small.soft):
             matrix = gram + torch.diag_embed(1 - (1 - give) * active)
             push = _solve(matrix, right)
-            if give == _FIRM:  # once more for what is left: the give shall not show
+            if give == small.firm:  # once more for what is left: the give shall not show
                 push = push + _solve(matrix, right - (gram * push.unsqueeze(-2)).sum(-1))
             moved = start + (rows * push.unsqueeze(-1)).sum(-2)
             u = torch.minimum(torch.maximum(moved, low), high)
             short = aims - (rows * u.unsqueeze(-2)).sum(-1)
-            allowed = 0.0 if give == _FIRM else give * push
+            allowed = 0.0 if give == small.firm else give * push
             off = torch.maximum(torch.where(active > 0, (short - allowed).abs(), short), -push)
             error = off.amax(-1, keepdim=True)
             found += [u, torch.where(error < 0, 0.0, error)]
@@ -212,7 +218,11 @@ def _best_case(wanted: Tensor, unit: Tensor, far: Tensor, low: Tensor, high: Ten
     scale = 1 + wanted.abs().amax(-1, keepdim=True) + far.abs().amax(-1, keepdim=True)
     met, left = _first_least(firm, error.squeeze(-1))
     given, _ = _first_least(soft, soft_error.squeeze(-1))
-    return torch.where(left <= _MET * scale, met, given)
+    return torch.where(left <= small.met * scale, met, given)
+
+
+def _small(like: Tensor) -> _Small:
+    return _DOUBLE if like.dtype == torch.float64 else _SINGLE
 
 
 def _first_least(points: Tensor, error: Tensor) -> tuple[Tensor, Tensor]:
