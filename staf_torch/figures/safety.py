@@ -34,7 +34,7 @@ def draw_box(history: BoxHistory) -> Figure:
             plane.plot(path[:, 0], path[:, 1], dash(i), color=colour(i), label=name)
             margin.plot(history.time, history.margins[name], dash(i), color=colour(i))
             cost.plot(history.time, history.costs[name], dash(i), color=colour(i), label=name)
-        walls(plane, history.low[:2], history.high[:2])
+        walls(plane, history.low, history.high)
         plane.set(xlabel="$x_1$", ylabel="$x_2$")
         legend_of_all(figure, plane, 3)
         margin.set_ylabel("distance to the nearest wall")
@@ -51,7 +51,7 @@ def draw_box(history: BoxHistory) -> Figure:
 
 
 def walls(axes: Axes, low: np.ndarray, high: np.ndarray) -> None:
-    """Draw the walls of two coordinates, and shade what lies beyond."""
+    """Draw the walls of the first two coordinates, and shade what lies beyond."""
     for k, ends in enumerate((axes.get_xlim(), axes.get_ylim())):
         reach = 0.06 * (ends[1] - ends[0])
         for wall, sign in ((low[k], -1), (high[k], 1)):

@@ -12,7 +12,6 @@ from .style import WIDTH, colour, dash, legend_of_all, letter, marker, page, pos
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-    from matplotlib.lines import Line2D
 
 _FAMILIES = ("rings", "ball", "polygon", "simplex", "cross_polytope")
 _SLOPES = 4  # layouts of a family: with more centers rounding takes over at small radii
@@ -85,7 +84,7 @@ def draw_exponential_bound(found: Mapping[tuple[float, float], Mapping[str, floa
 
 def _plain_ticks(axes: Axes, found: Mapping[tuple[float, float], Mapping[str, float | None]]) -> None:
     """Plain counts, and the values of epsilon that were computed; decades alone would be too few."""
-    most = max((row[name] or 1 for row in found.values() for name in _BOUNDS), default=1)
+    most = max(row[name] or 1 for row in found.values() for name in _BOUNDS)
     ticks(axes, "y", [count for count in (1, 2, 3, 6, 10, 20, 50, 100, 200, 500, 1000) if count <= most])
     epsilons = sorted({epsilon for _, epsilon in found})
     shown = epsilons[:: -(-len(epsilons) // 6)]
@@ -147,11 +146,12 @@ def draw_layouts(found: Sequence[LayoutCurve], radius: float, radii: np.ndarray)
         left.set_xlabel("centers $M$")
         left.set_ylabel(r"$\sup\,|V - \hat V|$ on the ball")
         left.legend(loc="lower left", handlelength=3.2)
-        lines = [_against_radius(right, i, curve, radii) for i, curve in enumerate(_drawn(found))]
+        for i, curve in enumerate(_drawn(found)):
+            _against_radius(right, i, curve, radii)
         ticks(right, "x", radii)
         right.set_xlabel("radius $r$ of the ball")
         beside = {"loc": "center left", "bbox_to_anchor": (1.0, 0.5), "handlelength": 3.2}
-        right.legend(handles=lines, title="layout, $M$: slope", **beside)
+        right.legend(title="layout, $M$: slope", **beside)
         letter((left, right), f"$r = {radius:g}$", "slopes in $r$")
     return figure
 
@@ -178,11 +178,10 @@ def _drawn(found: Sequence[LayoutCurve]) -> list[LayoutCurve]:
     return kept[:_SLOPES] + [curve for curve in found if curve.family == "polygon"][-1:]
 
 
-def _against_radius(axes: Axes, i: int, curve: LayoutCurve, radii: np.ndarray) -> Line2D:
+def _against_radius(axes: Axes, i: int, curve: LayoutCurve, radii: np.ndarray) -> None:
     slope = "-" if curve.slope is None else f"{curve.slope:.2f}"
     (line,) = axes.plot(radii, positive(curve.errors), dash(i), marker=marker(i), markersize=4)
     line.set(color=colour(i), label=f"{curve.family}, {curve.centers}: {slope}")
-    return line
 
 
 def _power(number: float) -> str:

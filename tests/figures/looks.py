@@ -24,6 +24,8 @@ _ASKED = (
     *("xlim", "ylim", "xscale", "yscale", "xlabel", "ylabel", "size_inches", "dpi", "hatch", "fill", "clim"),
 )
 _USUAL = ("", "None", "True", "solid", "default", "nan")
+_OF_TEXTS = ("position", "size_inches", "text")
+_OF_TICKS = ("gridOn", "bottom", "left", "labelbottom", "labelleft")
 _COLOURS = ("color", "facecolor", "edgecolor", "markerfacecolor", "markeredgecolor")
 
 
@@ -50,7 +52,7 @@ def _artists(artist: Artist) -> Iterator[Artist]:
 def _said(artist: Any) -> Iterator[str]:
     for name in (*_ASKED, *_COLOURS):
         get = getattr(artist, f"get_{name}", None)
-        if get is None or (name in ("position", "size_inches") and not isinstance(artist, Text | Figure)):
+        if get is None or (name in _OF_TEXTS and not isinstance(artist, Text | Figure)):
             continue
         value = get()
         if name in _COLOURS:
@@ -59,6 +61,8 @@ def _said(artist: Any) -> Iterator[str]:
             value = value.get_text()
         if (said := _short(value)) not in _USUAL:
             yield f"{name} {said}"
+    if hasattr(artist, "levels"):
+        yield f"levels {_short(artist.levels)}"
     if isinstance(artist, Legend):
         columns = getattr(artist, "_ncols", 1)
         names = [text.get_text() for text in artist.get_texts()]
@@ -70,7 +74,10 @@ def _said(artist: Any) -> Iterator[str]:
         for axis in (artist.xaxis, artist.yaxis):
             ticks = axis.get_major_ticks()
             size = ticks[0]._size if ticks else None  # type: ignore[attr-defined]
-            yield f"ticks {_short(axis.get_majorticklocs())} of {size}"
+            told = {name: axis.get_tick_params().get(name) for name in _OF_TICKS}
+            said = ", ".join(name for name, on in told.items() if on)
+            yield f"ticks {_short(axis.get_majorticklocs())} of {size}: {said}"
+            yield f"{len(axis.get_minorticklocs())} minor ones"
 
 
 def _colour(value: Any) -> str:

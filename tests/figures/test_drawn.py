@@ -4,112 +4,33 @@ from __future__ import annotations
 
 import io
 import itertools
-from collections.abc import Iterator, Sequence
-from typing import Any
 
 import numpy as np
 import pytest
-from figures.looks import looks, version
-from matplotlib.axes import Axes
-from matplotlib.colors import to_hex, to_rgb
+from figures.drawing import (
+    EMPTY,
+    LINEAR_LOG,
+    LOG,
+    LOG_LINEAR,
+    Curve,
+    T,
+    holds,
+    legend,
+    lines,
+    span,
+    visible,
+    wave,
+)
 from matplotlib.figure import Figure
-from recorded import Record
 
 from staf_torch.figures import adaptation, chase, closed_loop, rivals, safety, sweep, theory
 from staf_torch.figures.animation import Curves, Scene, _Stage, animate
-from staf_torch.figures.style import _COLOURS, colour, positive
+from staf_torch.figures.style import colour, positive
 
-T = np.linspace(0.5, 4.5, 9)
-
-
-@pytest.fixture(autouse=True)
-def _not_laid_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where panels lie says nothing of what they hold, and takes nine tenths of the time."""
-    monkeypatch.setattr("matplotlib.layout_engine.ConstrainedLayoutEngine.execute", lambda *_: None)
+pytestmark = pytest.mark.usefixtures("not_laid_out", "looks_are_the_recorded")
 
 
-@pytest.fixture(autouse=True)
-def _looks_are_the_recorded(monkeypatch: pytest.MonkeyPatch, record: Record) -> Iterator[None]:
-    """What is no number: colours, markers, sizes, where a legend is."""
-    drawn: list[Figure] = []
-    begin = Figure.__init__
-
-    def kept(figure: Figure, *given: Any, **named: Any) -> None:
-        begin(figure, *given, **named)
-        drawn.append(figure)
-
-    monkeypatch.setattr(Figure, "__init__", kept)
-    yield
-    found = {str(at): dict(enumerate(looks(figure))) for at, figure in enumerate(drawn)}
-    if record.known().get("matplotlib", version()) == version():
-        record({"matplotlib": version(), **found})
-
-
-Curve = tuple[str | None, Any, Any]  # name in the legend, x, y
-
-
-def wave(*shape: int, low: float = 0.2) -> np.ndarray:
-    """Positive numbers, no two alike, with the times first."""
-    size = int(np.prod(shape))
-    return low + np.abs(np.sin(1.7 * np.arange(1, size + 1))).reshape(shape)
-
-
-def visible(figure: Figure) -> list[Axes]:
-    """The panels, none of which has a line in a colour that is not ours."""
-    panels = [axes for axes in figure.axes if axes.get_visible()]
-    for axes in panels:
-        for line in axes.get_lines():
-            shade = to_hex(line.get_color()).upper()
-            assert shade in _COLOURS or len(set(to_rgb(shade))) == 1, (
-                axes.get_title(),
-                line.get_label(),
-                shade,
-            )
-    return panels
-
-
-def lines(axes: Axes) -> list[Curve]:
-    """Name, x and y of every line of a panel."""
-    found = []
-    for line in axes.get_lines():
-        name = str(line.get_label())
-        x, y = (np.asarray(part, dtype=float) for part in line.get_data())
-        found.append((None if name.startswith("_") else name, x, y))
-    return found
-
-
-def holds(axes: Axes, curves: Sequence[Curve], names: tuple[str, str], **more: Any) -> None:
-    """The panel has these curves in this order, these names of its axes, and what else is told."""
-    assert (axes.get_xlabel(), axes.get_ylabel()) == names
-    scales = more.pop("scales", ("linear", "linear"))
-    assert (axes.get_xscale(), axes.get_yscale()) == scales
-    found = lines(axes)
-    assert [curve[0] for curve in found] == [curve[0] for curve in curves]
-    for (_, x, y), (name, want_x, want_y) in zip(found, curves, strict=True):
-        np.testing.assert_allclose(x, want_x, err_msg=str(name))
-        np.testing.assert_allclose(y, want_y, err_msg=str(name))
-    for limit, want in more.items():
-        np.testing.assert_allclose(getattr(axes, f"get_{limit}")(), want)
-    named = [line for line in axes.get_lines() if not str(line.get_label()).startswith("_")]
-    looks = [(line.get_color(), line.get_linestyle(), line.get_marker()) for line in named]
-    assert len(set(looks)) == len(looks)  # no two of one look
-
-
-def legend(thing: Any) -> list[str]:
-    """The entries of a legend of a panel, or of a whole figure."""
-    found = thing.get_legend() if isinstance(thing, Axes) else thing.legends[0]
-    return [text.get_text() for text in found.get_texts()]
-
-
-def span(along: np.ndarray) -> tuple[float, float]:
-    return float(along[0]), float(along[-1])
-
-
-LINEAR_LOG, LOG, LOG_LINEAR = ("linear", "log"), ("log", "log"), ("log", "linear")
-EMPTY = ([], [])
-
-
-@pytest.mark.parametrize("count", [2, 7])
+@pytest.mark.parametrize("count", [2, 6, 7])
 def test_the_panels_of_a_chase_hold_its_history(count: int) -> None:
     parts = [wave(9, 2), wave(9), wave(9) + 0.1 * T, wave(9) + 0.01 * T, wave(9, count), wave(9, count) + 1]
     excess = wave(9)
@@ -199,7 +120,7 @@ def test_a_memory_is_drawn_where_it_is_with_the_balls_of_its_models(dim: int) ->
     holds(revisits, [*curves, ("settled chase", [0, 1], [0.3, 0.3])], names, scales=LOG)
 
 
-@pytest.mark.parametrize(("weights", "shooting"), [(3, True), (6, False), (0, False)])
+@pytest.mark.parametrize(("weights", "shooting"), [(3, True), (5, True), (6, False), (7, False), (0, False)])
 def test_the_panels_of_a_closed_loop_hold_its_history(weights: int, shooting: bool) -> None:
     known = wave(9)
     known[::2] = np.nan

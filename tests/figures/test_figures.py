@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
-
 import matplotlib
 import numpy as np
 import pytest
-from command_line import environment
 
 from staf_torch.figures.chase import ChaseHistory, ConvergenceCurve, draw_chase, draw_convergence
 from staf_torch.figures.closed_loop import AdpHistory, draw_adp
@@ -82,9 +78,3 @@ def test_a_slope_that_is_not_known_is_a_dash() -> None:
 
 def test_colours_dashes_and_markers_begin_again() -> None:
     assert (colour(7), dash(4), marker(8)) == (colour(0), dash(0), marker(0))
-
-
-def test_the_figures_import_no_matplotlib_before_the_first_is_drawn() -> None:
-    rooms = ", ".join(f"staf_torch.figures.{name}" for name in ("chase", "closed_loop", "sweep", "theory"))
-    program = f"import sys, {rooms}; assert 'matplotlib' not in sys.modules"
-    subprocess.run([sys.executable, "-c", program], env=environment(), check=True)
