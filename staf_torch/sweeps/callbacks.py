@@ -115,15 +115,15 @@ class SweepDirectory(Callback):
         lock.give_back(_directory(config))
 
     def on_run_start(self, config: DictConfig, **_: Any) -> None:
-        """Refuse a run directory in which something leads elsewhere.
+        """Refuse a run directory in which something leads elsewhere, or that is below a file.
 
         Raises:
-            SystemExit: with what leads elsewhere.
+            SystemExit: with what leads elsewhere, or the file.
         """
         try:
             _refuse_links(Path(str(config.hydra.run.dir)))
-        except ValueError as error:
-            raise SystemExit(f"staf: {error}") from error
+        except (ValueError, OSError) as error:
+            raise SystemExit(f"staf: {sentence(error)}") from error
 
 
 class SweepReport(Callback):

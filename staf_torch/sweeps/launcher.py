@@ -62,7 +62,7 @@ class SweepProgress:
         self._start = self._shown = time.monotonic()
         # Not the log: while a job is replayed, that is the job's own.
         layout = "{percentage:3.0f}%|{bar:30}| {desc}"
-        self._bar = tqdm(total=total, bar_format=layout, leave=False, disable=None, file=sys.stderr)
+        self._bar = tqdm(total=total, bar_format=layout, leave=False, disable=None)
 
     def computed(self, jobs: float) -> None:
         """Note how many of the jobs that were left are computed, with or without their files."""
