@@ -126,7 +126,7 @@ def _access(env: Any, named: object) -> tuple[Read, Write]:
     if hasattr(env, "state"):
 
         def read_state(env: Any) -> Numbers:
-            return np.array(env.state, dtype=np.float64)
+            return np.array(env.state)
 
         def write_state(env: Any, x: Numbers) -> None:
             env.state = np.array(x)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import types
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from staf_torch import adp, systems
 gymnasium = pytest.importorskip("gymnasium", reason="needs the extra gym")
 
 from staf_torch import envs  # noqa: E402
+from staf_torch.envs.environment_plant import _Stepped  # noqa: E402
 
 # (environment, initial states, an action of the environment from a control of the plant, tolerance)
 CASES = {
@@ -150,3 +152,85 @@ def test_a_plant_made_twice_of_an_environment_that_draws_is_the_same_one() -> No
         for _ in range(2)
     )
     assert torch.equal(first.linearisation().matrix, second.linearisation().matrix)
+
+
+def test_an_environment_begins_with_the_seed_0() -> None:
+    env = Drawn()
+    envs.EnvironmentPlant(env, read=height, write=put_height, dt=0.1)
+    assert env.growth == gymnasium.utils.seeding.np_random(0)[0].uniform(1.0, 2.0)
+
+
+def height(env: Falling) -> np.ndarray:
+    return np.array([env.height])
+
+
+def put_height(env: Falling, x: np.ndarray) -> None:
+    env.height = float(x[0])
+
+
+def test_inputs_rest_and_period_are_those_given_or_those_of_the_environment() -> None:
+    env, own = Falling(), {"read": height, "write": put_height}
+    usual = envs.EnvironmentPlant(env, dt=0.25, **own)
+    assert usual.env is env
+    assert (usual.dim, usual.inputs, usual.period, usual.periodic) == (1, 1, 0.25, ())
+    assert usual.bounds is not None
+    assert (usual.bounds.low.tolist(), usual.bounds.high.tolist()) == ([-1.0], [1.0])
+    for given, wanted in (({"low": -0.5}, (-0.5, np.inf)), ({"high": 0.25}, (-np.inf, 0.25))):
+        bounds = envs.EnvironmentPlant(env, dt=0.25, **given, **own).bounds
+        assert bounds is not None
+        assert (float(bounds.low), float(bounds.high)) == wanted
+    rest = envs.EnvironmentPlant(env, dt=0.25, equilibrium=([2.0], [-2.0]), periodic=[0], **own)
+    assert (rest.equilibrium().tolist(), rest.periodic) == ([2.0], (0,))
+    env.dt = 0.5
+    assert envs.EnvironmentPlant(env, **own).period == 0.5
+    assert envs.EnvironmentPlant(env, dt=2.0, **own).period == 2.0
+    x, u = np.array([[1.0], [2.0], [-1.0]]), np.array([[1.0], [0.0], [3.0]])
+    stepped = _Stepped(env, height, put_height)
+    np.testing.assert_allclose(stepped(x, u), 1.1 * x + 0.1 * u, rtol=1e-15)
+    with pytest.raises(TypeError, match="takes NumPy arrays"):
+        stepped(torch.from_numpy(x), u)  # type: ignore[arg-type]
+
+
+def test_what_cannot_be_a_plant_is_refused() -> None:
+    for given in ({"read": height}, {"write": put_height}):
+        with pytest.raises(ValueError, match=r"`EnvironmentPlant\(read=...\)` and write go together"):
+            envs.EnvironmentPlant(Falling(), dt=0.1, **given)
+    square = Falling()
+    square.action_space = gymnasium.spaces.Box(-1.0, 1.0, (1, 1), np.float64)
+    with pytest.raises(ValueError, match="must have actions that are a vector of numbers"):
+        envs.EnvironmentPlant(square, read=height, write=put_height, dt=0.1)
+
+
+class Two(Falling):
+    """With its state where classic control has it, or where MuJoCo has."""
+
+    dt = 0.1
+
+    def __init__(self, keeps: str) -> None:
+        self.state: tuple[float, float] = (0.0, 0.0)
+        if keeps == "mujoco":
+            self.data = types.SimpleNamespace(qpos=np.zeros(1), qvel=np.zeros(1))
+            del self.state
+        if keeps != "state":
+            self.set_state = self.put
+
+    def put(self, qpos: np.ndarray, qvel: np.ndarray) -> None:
+        assert qpos.shape == qvel.shape == (1,)
+        self.data.qpos, self.data.qvel = qpos, qvel
+
+    def step(self, action):  # type: ignore[no-untyped-def]
+        if hasattr(self, "data"):
+            self.data.qpos = self.data.qpos + 0.1 * self.data.qvel
+            self.data.qvel = self.data.qvel + 0.1 * action
+        else:
+            place, speed = self.state
+            self.state = (place + 0.1 * speed, speed + 0.1 * float(action[0]))
+        return np.zeros(1), 0.0, False, False, {}
+
+
+@pytest.mark.parametrize("keeps", ["state", "mujoco", "state, and another method"])
+def test_a_state_is_found_where_classic_control_and_mujoco_have_it(keeps: str) -> None:
+    plant = envs.EnvironmentPlant(Two(keeps))
+    x, u = torch.tensor([[1.0, 2.0], [3.0, -1.0]]).double(), torch.tensor([[0.5], [-1.0]]).double()
+    wanted = torch.stack((x[:, 0] + 0.1 * x[:, 1], x[:, 1] + 0.1 * u[:, 0]), 1)
+    torch.testing.assert_close(plant.step(x, u), wanted)
