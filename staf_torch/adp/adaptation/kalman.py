@@ -167,7 +167,8 @@ class UnscentedKalman(KalmanFilter):
 
     def predicted(self, belief: Belief, dt: float) -> Belief:
         points, weights = self._points(belief)
-        mean, away = _mean(self.moved(points, belief.u.unsqueeze(-2), dt), weights)
+        held = belief.u.unsqueeze(-2).expand(*points.shape[:-1], -1)
+        mean, away = _mean(self.moved(points, held, dt), weights)
         spread = product((weights * away).mT, away)
         return Belief(mean, spread + self.disturbance(mean, dt), belief.u)
 

@@ -1,0 +1,201 @@
+"""What is identified, filtered and designed row by row: rows of any dimensions are rows, in their dtype."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from helpers import random_positive_definite, tensor, uniform
+from helpers_adaptation import PENDULUM
+from torch import Tensor
+
+from staf_torch import GaussianKernel, adp, rings, systems
+from staf_torch.adp.adaptation import redesign
+from staf_torch.adp.adaptation.carried import pack, unpack
+from staf_torch.adp.adaptation.measured import gaussian
+from staf_torch.lanes.tree import flatten
+
+ROWS = 12
+KNOWN = systems.Linear([[0.0, 1.0], [-0.4, 0.2]], [[0.0], [1.0]])
+CHANGING = adp.ChangingPlant(PENDULUM)
+X, OTHER, U = uniform(ROWS, 2, seed=1), uniform(ROWS, 2, seed=2), uniform(ROWS, 1, seed=3)
+SIZES = random_positive_definite(4, ROWS, size=2, log_condition=1.0)
+Z = torch.cat((X, uniform(ROWS, 4, seed=5), 1 + 0.5 * uniform(ROWS, 1, seed=6)), dim=-1)
+SLOPES, GAINS = uniform(ROWS, 2, 2, seed=7), uniform(ROWS, 2, 1, seed=8)
+FOUND = Callable[..., Any]
+
+
+def windowed(windows: Any) -> FOUND:
+    """Three equations of a window, whose states are those given, turned."""
+
+    def found(x: Tensor, other: Tensor, u: Tensor) -> Any:
+        now, said = windows.init(x), []
+        for k in range(5):
+            now, equation = windows.step(now, x + k * other, 0.125)
+            now = windows.holding(now, u + k)
+            said.append((now.s, now.elapsed, now.length, now.x, *equation))
+        return said
+
+    return found
+
+
+def stacked(x: Tensor, other: Tensor, u: Tensor) -> Any:
+    stack = adp.HistoryStack(1, 2, size=2, novelty=0.0)
+    now, ready = stack.init(x), torch.ones_like(x[..., 0]).bool()
+    for k in range(7):
+        s = torch.stack((x[..., 0] + k, other[..., 1] * (k % 3)), dim=-1).unsqueeze(-2)
+        now = stack.step(now, adp.Equation(s, s.sum(-1) + u, u[..., 0], ready))
+    return now
+
+
+def gradients(x: Tensor, other: Tensor, u: Tensor) -> Any:
+    law = adp.ConcurrentGradient(2.0, 0.5)
+    gram = x.unsqueeze(-1) * x.unsqueeze(-2)
+    return law.step(other, gram, x, 0.1), law.step(other, gram, x, 0.1, other)
+
+
+def squares(x: Tensor, other: Tensor, u: Tensor) -> Any:
+    law = adp.LeastSquares([0.3, -0.2], deviation=[0.5, 2.0], floor=0.1, forgetting=0.3, alarm=2.0)
+    now = law.init(x)
+    for k in range(3):
+        s = torch.stack((x + k, other), dim=-2)
+        now = law.step(now, adp.Equation(s, s.sum(-1), u[..., 0].square(), u[..., 0] > -0.5), 0.1)
+    return now
+
+
+def plants(x: Tensor, other: Tensor, u: Tensor) -> Any:
+    family = PENDULUM.family()
+    mine = PENDULUM.believing(other)
+    return mine.rate(x, u), mine.drift(x), mine.effectiveness(x), family.at(other)
+
+
+def filtered(kind: type[adp.KalmanFilter]) -> FOUND:
+    filter = kind(PENDULUM, lambda x: x[..., :1].sin(), noise=[0.1], process=[0.2, 0.3])
+
+    def found(x: Tensor, sizes: Tensor, u: Tensor) -> Any:
+        belief = adp.Belief(x, sizes, u)
+        return filter.step(belief, u, 0.1, u[..., 0] > 0), filter.predicted(belief, 0.1)
+
+    return found
+
+
+def considered(x: Tensor, sizes: Tensor, u: Tensor) -> Any:
+    filter = adp.ConsiderFilter(PENDULUM, noise=[0.1, 0.3], process=0.2)
+    estimate = adp.Estimate(x, sizes, u[..., 0], u[..., 0])
+    now = filter.init(x)
+    for k in range(3):
+        now = filter.step(now, x + 0.1 * k, u, estimate, 0.1)
+    return now
+
+
+def drifts(x: Tensor, other: Tensor, u: Tensor) -> Any:
+    drift = adp.StreamDrift(
+        KNOWN, GaussianKernel(2.0), 0.5 * rings(3), rows=[1], deviation=3.0, length=0.1, forgetting=0.2
+    )
+    now, window = drift.init(x), drift.windows.init(x)
+    for k in range(5):
+        windows, at = drift.window_of(now), x + 0.1 * k * other
+        window, equation = windows.step(window, at, 0.05)
+        window = windows.holding(window, u)
+        now = drift.step(now, equation, at, 0.05)
+    return now, drift.predict(now, other), drift.slopes(now, other), drift.matrix(now, other)
+
+
+def designed(slopes: Tensor, gains: Tensor, _: Tensor) -> Any:
+    q, r = torch.diag(tensor([1.0, 2.0])).to(slopes), tensor([[0.7]]).to(slopes)
+    p = adp.riccati_rows(slopes, gains, q, r, doublings=6)
+    made = redesign.Redesign(q, r, 4, 2)
+    pair, stage = redesign.Doubling(0 * p, 0 * p, 0 * p), torch.zeros_like(p[..., 0, 0])
+    first = made.step(pair, stage, 0 * p, slopes, gains)
+    second = made.step(*first, slopes, gains)
+    residual = redesign.riccati_residual(p, slopes, redesign.control_rate(gains, r), q)
+    return p, first, second, residual, made.solved(second[2], slopes, gains)
+
+
+CASES: dict[str, tuple[FOUND, tuple[Tensor, Tensor, Tensor]]] = {
+    "windows": (windowed(adp.IntegralWindows(PENDULUM, 0.375)), (X, OTHER, U)),
+    "smooth windows": (
+        windowed(adp.IntegralWindows(PENDULUM, 0.5, shape="smooth", first=0.25, noise=0.1)),
+        (X, OTHER, U),
+    ),
+    "slopes": (windowed(adp.SlopeWindows(PENDULUM, 0.25)), (X, OTHER, U)),
+    "a measured rate": (lambda x, rate, u: adp.measured_rate(PENDULUM, x, u, rate, 0.2), (X, OTHER, U)),
+    "a stack": (stacked, (X, OTHER, U)),
+    "a gradient": (gradients, (X, OTHER, U)),
+    "least squares": (squares, (X, OTHER, U)),
+    "a plant": (plants, (X, OTHER, U)),
+    "a changing plant": (
+        lambda z, _, u: (
+            CHANGING.theta(z),
+            CHANGING.rate(z, u),
+            CHANGING.drift(z),
+            CHANGING.effectiveness(z),
+        ),
+        (Z, X, U),
+    ),
+    "normal numbers": (lambda x, other, u: gaussian(x, 2), (X, OTHER, U)),
+    "an extended filter": (filtered(adp.ExtendedKalman), (X, SIZES, U)),
+    "an unscented filter": (filtered(adp.UnscentedKalman), (X, SIZES, U)),
+    "a filter that considers": (considered, (X, SIZES, U)),
+    "a drift": (drifts, (X, OTHER, U)),
+    "a design": (designed, (SLOPES, GAINS, U)),
+}
+
+
+def leaves(found: Any) -> list[Tensor]:
+    if isinstance(found, Tensor):
+        return [found]
+    return [leaf for part in found for leaf in leaves(part)]
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_rows_of_any_dimensions_are_rows(name: str) -> None:
+    of, given = CASES[name]
+    flat = leaves(of(*given))
+    assert flat
+    for shape in ((3, 2, 2), (2, 6), (4, 1, 3)):
+        deep = leaves(of(*(part.unflatten(0, shape) for part in given)))
+        for one, other in zip(flat, deep, strict=True):
+            assert other.shape == (*shape, *one.shape[1:])
+            torch.testing.assert_close(other.flatten(0, len(shape) - 1), one, rtol=1e-10, atol=1e-11)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_row_alone_and_one_without_dimensions_are_that_row(name: str) -> None:
+    of, given = CASES[name]
+    flat = leaves(of(*given))
+    for row in (0, 7):
+        for one, other, bare in zip(
+            flat,
+            leaves(of(*(part[row : row + 1] for part in given))),
+            leaves(of(*(part[row] for part in given))),
+            strict=True,
+        ):
+            torch.testing.assert_close(other[0], one[row], rtol=1e-10, atol=1e-11)
+            torch.testing.assert_close(bare, one[row], rtol=1e-10, atol=1e-11)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_single_precision_stays_single_and_near(name: str) -> None:
+    of, given = CASES[name]
+    for one, other in zip(leaves(of(*given)), leaves(of(*(part.float() for part in given))), strict=True):
+        assert other.dtype == (torch.float32 if one.is_floating_point() else one.dtype)
+        if one.is_floating_point():
+            torch.testing.assert_close(other.double(), one, rtol=2e-3, atol=2e-3)
+
+
+@pytest.mark.parametrize("lead", [1, 2, 3])
+def test_what_is_packed_is_unpacked_behind_any_dimensions(lead: int) -> None:
+    shape = (2, 3, 4)[:lead]
+    belief = adp.Belief(uniform(*shape, 2), uniform(*shape, 2, 2), uniform(*shape, 1))
+    estimate = adp.Estimate(uniform(*shape, 3), uniform(*shape, 3, 3), uniform(*shape), uniform(*shape))
+    for tree in (belief, estimate):
+        flat = pack(tree, lead)
+        assert flat.shape == (*shape, sum(leaf[(0,) * lead].numel() for leaf in flatten(tree)[0]))
+        like = type(tree)(*(leaf[(slice(0, 1),) * lead] for leaf in tree))
+        for given, found in zip(tree, unpack(like, flat, lead), strict=True):
+            assert torch.equal(given, found)
+        more = unpack(like, flat.unsqueeze(0), lead)
+        assert torch.equal(more[1][0], tree[1])

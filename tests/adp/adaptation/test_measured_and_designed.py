@@ -1,0 +1,208 @@
+"""What is seen with noise, plants that change and designs that are under way, beside what is written out."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+import torch
+from helpers import tensor, uniform
+from helpers_adaptation import COST, PENDULUM
+from torch import Tensor
+
+from staf_torch import adp, systems
+from staf_torch.adp.adaptation import redesign
+from staf_torch.adp.adaptation.measured import gaussian
+
+
+class Seeing(adp.Feedback):
+    """Keeps what it was told."""
+
+    draws = 3
+
+    def step(self, x: Tensor, carried: Any, uniform: Tensor, dt: float) -> Any:
+        self.told = x, uniform, dt
+        return super().step(x, carried, uniform, dt)
+
+
+@pytest.mark.parametrize(("dim", "own"), [(1, 2), (2, 1), (3, 2)])
+def test_what_is_seen_has_noise_of_its_own_draws_and_the_rest_goes_on(dim: int, own: int) -> None:
+    inside = Seeing(lambda x: x[..., :1])
+    noise = [0.1, 0.5, 2.0][:dim]
+    outside = adp.Measured(inside, noise=noise, dim=dim)
+    assert outside.draws == own + 3
+    assert outside.label == inside.label
+    x, drawn = uniform(5, 4, seed=1), uniform(5, own + 3, 4, seed=2)
+    u, _ = outside.step(x, outside.init(x), drawn, 0.25)
+    seen, rest, dt = inside.told
+    several = drawn[:, :own, :dim].flatten(1)
+    torch.testing.assert_close(seen, x[:, :dim] + tensor(noise) * gaussian(several, dim))
+    assert torch.equal(rest, drawn[:, own:, :dim])
+    assert dt == 0.25
+    assert torch.equal(u, seen[:, :1])
+    quiet = adp.Measured(inside, noise=0.0, dim=dim, output=lambda x: 2 * x[..., :dim])
+    assert quiet.draws == 3
+    quiet.step(x, quiet.init(x), drawn[:, own:], 0.25)
+    assert torch.equal(inside.told[0], 2 * x[:, :dim])
+    assert torch.equal(inside.told[1], drawn[:, own:, :dim])
+    assert quiet.noise.dtype == torch.float64
+
+
+def test_noise_is_given_once_or_for_every_output() -> None:
+    inside = adp.Feedback(lambda x: x)
+    assert adp.Measured(inside, noise=1, dim=2).noise.tolist() == [1.0, 1.0]
+    assert adp.Measured(inside, noise=[0.0, 0.5], dim=2).noise.tolist() == [0.0, 0.5]
+    for wrong in (-0.1, [0.1], [0.1, 0.1, 0.1], [0.1, -0.1], math.nan):
+        with pytest.raises(
+            ValueError, match=r"`Measured\(noise=...\)` must not be negative, one number or 2"
+        ):
+            adp.Measured(inside, noise=wrong, dim=2)
+
+
+def test_uniform_numbers_become_normal_ones_by_box_and_muller() -> None:
+    u = tensor([[-1.0, -0.5, 0.25, 0.5], [0.5, 0.9, -0.3, -1.0]])
+    size, angle = (-2 * ((1 - u[:, :2]) / 2).log()).sqrt(), math.pi * u[:, 2:]
+    wanted = torch.cat((size * angle.cos(), size * angle.sin()), dim=-1)
+    torch.testing.assert_close(gaussian(u, 4), wanted)
+    torch.testing.assert_close(gaussian(u, 3), wanted[:, :3])
+
+
+def test_a_plant_changes_when_its_clock_has_run_down() -> None:
+    plant = adp.ChangingPlant(PENDULUM)
+    assert (plant.dim, plant.inputs, plant.bounds) == (7, 1, None)
+    x0 = uniform(3, 2, seed=1)
+    z0 = plant.start(x0, [0.1, 1.0], [0.3, 3.0], at=tensor([0.0, 1.0, 4.0]))
+    assert z0.dtype == torch.float64
+    torch.testing.assert_close(z0[:, -1], (tensor([0.0, 1.0, 4.0]) / 10).exp())
+    torch.testing.assert_close(plant.theta(z0), tensor([[0.3, 3.0], [0.1, 1.0], [0.1, 1.0]]))
+    rate = plant.rate(z0, torch.ones(3, 1).double())
+    torch.testing.assert_close(rate[:, -1], -z0[:, -1] / 10)
+    assert not bool(rate[:, 2:-1].any())
+    torch.testing.assert_close(
+        plant.effectiveness(z0)[:, :2], PENDULUM.believing(plant.theta(z0)).effectiveness(x0)
+    )
+    assert plant.effectiveness(z0).shape == (3, 7, 1)
+    for theta in ([0.2, 2.0], tensor([[0.2, 2.0]] * 3)):
+        alone = plant.start(x0, theta)
+        assert torch.equal(alone[:, 2:4], alone[:, 4:6])
+        assert alone[:, -1].tolist() == [1.0] * 3
+        torch.testing.assert_close(plant.theta(alone), tensor([[0.2, 2.0]] * 3))
+    single = plant.start(x0.float(), tensor([[0.2, 2.0]] * 3), at=tensor([1.0] * 3))
+    assert single.dtype == torch.float32
+
+
+def test_the_cost_of_a_changing_plant_is_that_of_its_state() -> None:
+    plant = adp.ChangingPlant(PENDULUM)
+    wide, z = plant.cost(COST), uniform(4, 7, seed=3)
+    torch.testing.assert_close(wide.state_rate(z), COST.state_rate(z[:, :2]))
+    assert (wide.dim, COST.dim) == (7, 2)
+    seen = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1, output=lambda x: x[..., :2])
+    aimed = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1, target=[0.1, 0.0])
+    for cost in (seen, aimed):
+        with pytest.raises(
+            ValueError, match=r"`ChangingPlant\(cost=...\)` must be of x itself at the origin"
+        ):
+            plant.cost(cost)
+    turning = adp.ChangingPlant(
+        adp.ParametricPlant(
+            lambda x, u: torch.diag_embed(x), dim=2, inputs=1, theta=[1.0, 2.0], periodic=(0,)
+        )
+    )
+    assert turning.periodic == (0,)
+    with pytest.raises(ValueError, match="without angles"):
+        turning.cost(COST)
+
+
+@pytest.mark.parametrize(("doublings", "a_step"), [(4, 1), (4, 2), (6, 3), (3, 3)])
+def test_a_design_is_that_of_the_model_at_its_beginning(doublings: int, a_step: int) -> None:
+    q, r = torch.diag(tensor([1.0, 2.0])), tensor([[0.7]])
+    made = redesign.Redesign(q, r, doublings, a_step)
+    models = [
+        (uniform(5, 2, 2, seed=k), uniform(5, 2, 1, seed=20 + k)) for k in range(2 * doublings // a_step)
+    ]
+    zero = torch.zeros(5, 2, 2).double()
+    now = redesign.Doubling(zero, zero, zero), torch.zeros(5).double(), zero
+    for k, (a, b) in enumerate(models):
+        before = now[2]
+        now = made.step(*now, a, b)
+        done = (k + 1) * a_step % doublings
+        assert now[1].tolist() == [done] * 5
+        if done:
+            assert torch.equal(now[2], before)
+        else:
+            begun = models[k + 1 - doublings // a_step]
+            wanted = adp.riccati_rows(*begun, q, r, doublings=doublings)
+            torch.testing.assert_close(now[2], wanted, rtol=1e-12, atol=1e-12)
+            assert not bool(torch.stack(now[0]).any())
+
+
+def test_a_design_that_went_wrong_keeps_the_one_before_and_begins_again() -> None:
+    q, r = torch.eye(2).double(), torch.eye(1).double()
+    made, zero = redesign.Redesign(q, r, 2, 1), torch.zeros(2, 2, 2).double()
+    a, b = uniform(2, 2, 2, seed=1), uniform(2, 2, 1, seed=2)
+    good = made.step(
+        *made.step(redesign.Doubling(zero, zero, zero), torch.zeros(2).double(), zero, a, b), a, b
+    )
+    bad = a.clone()
+    bad[1] = torch.nan
+    first = made.step(*good, bad, b)
+    assert bool(torch.isfinite(torch.stack(first[0])).all())
+    assert not bool(first[0].h[1].any())
+    second = made.step(*first, a, b)
+    torch.testing.assert_close(second[2][0], good[2][0])
+    assert bool(torch.isfinite(second[2]).all())
+    again = made.step(*made.step(*second, a, b), a, b)
+    torch.testing.assert_close(again[2], good[2])
+
+
+@pytest.mark.parametrize(("share", "solved"), [(1.0, True), (1.005, True), (1.03, False), (0.5, False)])
+def test_a_design_is_of_the_model_of_now_where_its_equation_holds_to_a_hundredth(
+    share: float, solved: bool
+) -> None:
+    one = torch.ones(1, 1, 1).double()
+    made = redesign.Redesign(one[0], one[0], 8, 8)
+    exact = one * (1 + math.sqrt(2.0))  # 2 P - P^2 + 1 = 0
+    p = share * exact
+    residual = abs(2 * float(p) - float(p) ** 2 + 1) / (float(p) + float(p) ** 2 + 1)
+    found = redesign.riccati_residual(p, one, one, one[0])
+    assert float(found) == pytest.approx(residual, abs=1e-12)
+    assert made.solved(p, one, one).tolist() == [solved] == [residual < 0.01]
+
+
+def test_a_residual_is_a_share_of_its_largest_term_and_every_term_counts() -> None:
+    a, b, q, r = uniform(3, 2, 2, seed=1), uniform(3, 2, 1, seed=2), uniform(2, 2, seed=3), tensor([[0.7]])
+    p, q = uniform(3, 2, 2, seed=4), q @ q.mT
+    p, g = p + p.mT, b @ r @ b.mT
+    left = a.mT @ p + p @ a - p @ g @ p + q
+    size = (a.mT @ p).abs().amax((1, 2)) + (p @ g @ p).abs().amax((1, 2)) + q.abs().max()
+    torch.testing.assert_close(redesign.control_rate(b, r), g)
+    torch.testing.assert_close(redesign.riccati_residual(p, a, g, q), left.abs().amax((1, 2)) / size)
+
+
+def test_a_design_needs_a_doubling() -> None:
+    one = torch.ones(1, 1, 1).double()
+    assert float(adp.riccati_rows(one, one, one[0], one[0], doublings=1)) > 0
+    for wrong in (0, 1.5):
+        with pytest.raises(ValueError, match=r"`riccati_rows\(doublings=...\)`"):
+            adp.riccati_rows(one, one, one[0], one[0], doublings=wrong)  # type: ignore[arg-type]
+
+
+def test_noise_of_a_filter_of_a_plant_in_steps_counts_by_its_period() -> None:
+    plant = systems.StepPlant(
+        lambda x, u: torch.stack((x[..., 0] + 0.1 * x[..., 1], 0.9 * x[..., 1] + u[..., 0]), -1),
+        dim=2,
+        inputs=1,
+        dt=0.1,
+        equilibrium=[0.0, 0.0],
+    )
+    x, u = uniform(4, 2, seed=1), uniform(4, 1, seed=2)
+    for kind in (adp.ExtendedKalman, adp.UnscentedKalman):
+        filter = kind(plant, lambda x: x[..., :1], noise=[0.1], process=[0.2, 0.5])
+        size = torch.diag(tensor([0.3, 0.2])).expand(4, 2, 2)
+        after = filter.predicted(adp.Belief(x, size, u), 0.1)
+        flow = tensor([[1.0, 0.1], [0.0, 0.9]])
+        torch.testing.assert_close(after.mean, x @ flow.mT + torch.cat((0 * u, u), -1))
+        wanted = flow @ size[0] @ flow.mT + torch.diag(tensor([0.04, 0.25])) * 0.1
+        torch.testing.assert_close(after.covariance, wanted.expand(4, 2, 2))
+        assert torch.equal(after.u, u)
