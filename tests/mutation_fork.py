@@ -10,10 +10,11 @@ import shutil
 import signal
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pytest
+from _pytest.config import _prepareconfig
 
 PATIENCE = 10  # seconds by the clock for one of the processor, on a machine that is shared
 
@@ -43,23 +44,45 @@ def place() -> Path:
     return _place
 
 
-def in_fork(files: Sequence[str], plugin: object, limit: float, *, stop: bool) -> int | None:
-    """Run files of tests in a child.
+def collected(files: Sequence[str]) -> pytest.Session:
+    """Read files of tests in this process, which runs none of them: its children do, in `run_items`."""
+    _enter()
+    line = ["-q", "-p", "no:cacheprovider", "--assert=plain", "--tb=no", *files]
+    config = _prepareconfig(line, [])
+    config._do_configure()
+    session = pytest.Session.from_config(config)
+    config.hook.pytest_sessionstart(session=session)
+    config.hook.pytest_collection(session=session)
+    return session
+
+
+def run_items(items: Sequence[pytest.Item], plugin: object, *, stop: Callable[[], bool]) -> int:
+    """Run tests that were collected, one after another, until one says that it is enough; 0."""
+    for item, following in zip(items, [*items[1:], None], strict=True):
+        if not item.config.pluginmanager.is_registered(plugin):
+            item.config.pluginmanager.register(plugin)
+        item.config.hook.pytest_runtest_protocol(item=item, nextitem=following)
+        if stop():
+            break
+    return 0
+
+
+def in_fork(run: Callable[[], int], limit: float) -> int | None:
+    """Run a function in a child.
 
     Args:
-        files: paths in the tree.
-        plugin: of pytest; what it finds out, it must write where the parent reads.
+        run: returns a code below 256; what else it finds out, it must write where the parent reads.
         limit: seconds of the processor.
-        stop: at the first failure.
 
     Returns:
-        The exit code of pytest, or None where the child was ended or ended itself.
+        The code, or None where the child was ended or ended itself.
     """
     heard, told = os.pipe()
     child = os.fork()
     if child == 0:
         try:
-            os.write(told, bytes([_tested(files, plugin, int(limit), stop=stop)]))
+            _begin_child(int(limit))
+            os.write(told, bytes([run()]))
         finally:
             os._exit(0)
     os.close(told)
@@ -77,16 +100,32 @@ def in_fork(files: Sequence[str], plugin: object, limit: float, *, stop: bool) -
     return code[0] if code else None
 
 
-def _tested(files: Sequence[str], plugin: object, limit: int, *, stop: bool) -> int:
+def run_files(files: Sequence[str], plugin: object, *, stop: bool) -> int:
+    """Run files of tests, read anew; the exit code of pytest.
+
+    Args:
+        files: paths in the tree.
+        plugin: of pytest.
+        stop: at the first failure.
+    """
+    line = ["-q", "-p", "no:cacheprovider", "--assert=plain", "--tb=no", *(["-x"] if stop else []), *files]
+    return int(pytest.main(line, plugins=[plugin]))
+
+
+def _begin_child(limit: int) -> None:
     os.setsid()
     multiprocessing.current_process().daemon = False  # a worker of a pool may start no processes, tests may
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell ignores these in the background
     signal.signal(signal.SIGHUP, signal.SIG_DFL)
     resource.setrlimit(resource.RLIMIT_CPU, (limit, limit + 1))
+    _enter()
+
+
+def _enter() -> None:
+    """Be silent, and take the package from the copy of this process."""
     silent = os.open(os.devnull, os.O_WRONLY)
     os.dup2(silent, 1)
     os.dup2(silent, 2)
     os.chdir(_place)
-    sys.path[:0] = [str(_place)]
-    line = ["-q", "-p", "no:cacheprovider", "--assert=plain", "--tb=no", *(["-x"] if stop else []), *files]
-    return int(pytest.main(line, plugins=[plugin]))
+    if sys.path[0] != str(_place):
+        sys.path[:0] = [str(_place)]

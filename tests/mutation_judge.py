@@ -4,20 +4,23 @@ from __future__ import annotations
 
 import ast
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 import pytest
 from mutants import Mutant
 from mutants_accepted import accepted
-from mutation_fork import begin, in_fork, place
-from mutation_map import CONTRACTS, Map, places, tests_near
+from mutation_fork import begin, collected, in_fork, place, run_files, run_items
+from mutation_map import CONTRACTS, Map, places, test_files, tests_near
+from mutation_patch import Functions
 from source_rules import without_dtype
 
 OVERHEAD = 0.1  # seconds that a test costs beside what was measured
 UNKNOWN = 5.0  # seconds that a file of tests is taken for
 _ENDED = "by the clock, or the process ended"
+_ANEW, _CANNOT = "to be tried anew", 99
 _READS = "test_structure.py"  # which reads the text, and runs no line
 FAR = 5.0  # times as long a test of another folder is taken for: it is as likely to tell for that much less
 FIRST = 4.0  # seconds of tests that are tried before files of more tests are read
@@ -38,6 +41,8 @@ class Verdict(NamedTuple):
 _map = Map({}, {}, {})
 _seconds = 0.0
 _until = 0.0
+_session: pytest.Session
+_functions: Functions
 
 
 def begin_judging(tree: Path, compiled: Path, known: Map, seconds: float, until: float) -> None:
@@ -50,36 +55,46 @@ def begin_judging(tree: Path, compiled: Path, known: Map, seconds: float, until:
         seconds: of tests that a mutant is given, by what they took with the right code.
         until: reading of `time.monotonic` after which no mutant is begun.
     """
-    global _map, _seconds, _until
+    global _map, _seconds, _until, _session, _functions
     begin(tree, compiled)
     _map, _seconds, _until = known, seconds, until
+    _session = collected(test_files(place()))
+    _functions = Functions(place() / "staf_torch")
 
 
 def judge(mutant: Mutant) -> Verdict | None:
-    """Try a mutant; None where there is no time left."""
+    """Try a mutant; None where there is no time left.
+
+    A mutant inside a function is tried by tests that this process has read: its functions get the changed
+    code; what tests made while they were read is of the right one. What happens at import is tried anew.
+    """
     if accepted(mutant):
         return Verdict(mutant, "accepted")
     if time.monotonic() > _until:
         return None
     path = place() / mutant.file
     source = path.read_text(encoding="utf-8")
-    if len(list(without_dtype(mutant.applied(source)))) > len(list(without_dtype(source))):
+    changed = mutant.applied(source)
+    if len(list(without_dtype(changed))) > len(list(without_dtype(source))):
         return Verdict(mutant, "killed", 1, 0.0, _READS)
     tests = _tests_for(mutant, source)
     if not tests:
         return Verdict(mutant, "unreached" if not _hits(mutant, source) else "too dear")
     begun = time.monotonic()
-    path.write_text(mutant.applied(source), encoding="utf-8")
-    said, by, group = "survived", "", tests
+    path.write_text(changed, encoding="utf-8")
+    chosen = Chosen(tests)
     try:
-        for group in _groups(tests):
-            said, by = _run(group)
-            if said == "killed":
-                break
+        said = _ANEW
+        if not _around(mutant, source)[2]:
+            said = _run(chosen, lambda: _functions.change(path, source, changed, mutant.line))
+        if said == _ANEW:
+            said = _run_anew(chosen)
     finally:
         path.write_text(source, encoding="utf-8")
-    if by == _ENDED and _run(group)[1] == _ENDED:
-        said, by = "too dear", ""  # with the right code as well
+    by = next(iter(chosen.read()), "")
+    if said == "killed" and not by:
+        by = _ENDED
+        said = "too dear" if _run(chosen, lambda: True) == "killed" else said  # with the right code as well
     return Verdict(mutant, said, len(tests), time.monotonic() - begun, by)
 
 
@@ -88,23 +103,35 @@ def fail_anyway(tests: Sequence[str]) -> list[str]:
     if not tests:
         return []
     chosen = Chosen(tests)
-    in_fork(chosen.files, chosen, 30 + 3 * _cost(tests), stop=False)
+    _run(chosen, lambda: True, stop=False)
     return chosen.read()
 
 
-def _run(tests: Sequence[str]) -> tuple[str, str]:
-    chosen = Chosen(tests)
-    limit = 30 + 3 * _cost(tests)
-    code = in_fork(chosen.files, chosen, limit, stop=True)
-    if code is None:
-        return "killed", _ENDED
-    return ("survived" if code in (0, 5) else "killed"), next(iter(chosen.read()), "")
+def _run(chosen: Chosen, change: Callable[[], bool], *, stop: bool = True) -> str:
+    """Try tests that are collected, where the change can be made in the child."""
+
+    def tried() -> int:
+        if not change():
+            return _CANNOT
+        return run_items(chosen.items(_session), chosen, stop=lambda: stop and chosen.failed)
+
+    code = in_fork(tried, 30 + 3 * _cost(chosen.tests))
+    return _ANEW if code == _CANNOT else "killed" if chosen.read() or code is None else "survived"
 
 
-def _groups(tests: Sequence[str]) -> list[list[str]]:
-    """What is short first; the rest only where that says nothing, since reading its files takes a while."""
+def _run_anew(chosen: Chosen) -> str:
+    """Try tests in a process that imports the package: those that are short first.
+
+    The rest only where that says nothing, since reading its files takes a while.
+    """
+    tests = chosen.tests
     first = max(1, sum(_cost(tests[: at + 1]) < FIRST for at in range(len(tests))))
-    return [each for each in (list(tests[:first]), list(tests[first:])) if each]
+    for group in (Chosen(tests[:first], chosen.said), Chosen(tests[first:], chosen.said)):
+        if group.tests:
+            code = in_fork(partial(run_files, group.files, group, stop=True), 30 + 3 * _cost(group.tests))
+            if code not in (0, 5):
+                return "killed"
+    return "survived"
 
 
 def _tests_for(mutant: Mutant, source: str) -> list[str]:
@@ -151,18 +178,28 @@ def _around(mutant: Mutant, source: str) -> tuple[int, int, bool]:
 class Chosen:
     """The plugin of pytest that runs some tests in some order, and writes down which of them fail."""
 
-    def __init__(self, tests: Sequence[str]) -> None:
-        """Tests are named as pytest does, files before their tests."""
+    def __init__(self, tests: Sequence[str], said: Path | None = None) -> None:
+        """Tests are named as pytest does, files before their tests; a file may be named for what is said."""
+        self.tests = list(tests)
         self.rank = {test: at for at, test in enumerate(tests)}
         self.files = sorted({_file(test) for test in tests})
-        self.said = place().parent / f"failed-{place().name}.txt"
+        self.said = place().parent / f"failed-{place().name}.txt" if said is None else said
         self.said.write_text("")
+        self.failed = False
 
-    def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
+    def items(self, session: pytest.Session) -> list[pytest.Item]:
+        """The chosen ones of those that are collected."""
+        at = {
+            id(item): self.rank.get(item.nodeid, self.rank.get(_file(item.nodeid))) for item in session.items
+        }
+        return sorted(
+            (item for item in session.items if at[id(item)] is not None), key=lambda item: at[id(item)]
+        )
+
+    def pytest_collection_modifyitems(self, session: pytest.Session, items: list[pytest.Item]) -> None:
         """Keep the chosen ones."""
-        at = {id(item): self.rank.get(item.nodeid, self.rank.get(_file(item.nodeid))) for item in items}
-        items[:] = [item for item in items if at[id(item)] is not None]
-        items.sort(key=lambda item: at[id(item)])
+        session.items = items
+        items[:] = self.items(session)
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
         """Write down a test that fails."""
@@ -174,6 +211,7 @@ class Chosen:
 
     def _note(self, report: pytest.TestReport | pytest.CollectReport) -> None:
         if report.failed:
+            self.failed = True
             with self.said.open("a") as file:
                 print(report.nodeid, file=file)
 

@@ -28,7 +28,7 @@ from typing import Any, NamedTuple
 
 import coverage
 import pytest
-from mutation_fork import in_fork, place
+from mutation_fork import in_fork, place, run_files
 
 _SETTINGS = """
 [run]
@@ -143,7 +143,8 @@ def measure(test_file: str) -> tuple[str, dict[str, Any] | None]:
     """
     folder = Path(tempfile.mkdtemp(dir=place().parent, prefix="map-"))
     try:
-        if in_fork([test_file], Recorder(folder), _LONGEST, stop=False) is None:
+        recorder = Recorder(folder)
+        if in_fork(lambda: run_files([test_file], recorder, stop=False), _LONGEST) is None:
             return test_file, None
         found = _read(folder)
     finally:
