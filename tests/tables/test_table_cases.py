@@ -1,0 +1,264 @@
+"""Which columns and rows a table has, what they show and in which order, run by run and cell by cell."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+from recorded import Record
+
+from staf_torch.results.metric_info import MetricInfo
+from staf_torch.results.reader import Collection, Run
+from staf_torch.tables import Layout, Style, Table, latex_text, tabulate
+from staf_torch.tables.aggregate import AGGREGATES, as_text, half_width, place, rank
+
+DIGITS = {"digits": MetricInfo("digits", larger_is_better=True, headline=True)}
+
+
+def run(number: int, metrics: Mapping[str, float | None], **settings: Any) -> Run:
+    about = {k: settings.pop(k) for k in ("status", "reason", "member", "declared", "build") if k in settings}
+    given = {"status": "completed", **about}
+    return Run(Path(f"/runs/{number}"), settings, {"base": 1, **settings}, metrics, **given)
+
+
+def of(*runs: Run) -> Collection:
+    return Collection(runs, ())
+
+
+def names(table: Table) -> list[str]:
+    return list(table.names)
+
+
+def shown(table: Table) -> list[tuple[str, str]]:
+    return [(column.over, column.heading) for column in table.printed()]
+
+
+# Columns
+
+
+@pytest.mark.parametrize(
+    ("more", "about"),
+    [
+        ({}, ["status", "directory"]),
+        ({"reason": "why"}, ["status", "reason", "directory"]),
+        ({"status": "failed"}, ["status", "reason", "directory"]),
+        ({"member": 0}, ["status", "directory", "member"]),
+    ],
+)
+def test_a_table_of_runs_says_what_of_a_run_is_worth_it(more: dict[str, Any], about: list[str]) -> None:
+    table = tabulate(of(run(0, {"cost": 1.0}, a=1), run(1, {"cost": 2.0}, a=2, **more)))
+    assert names(table) == ["a", "cost", *about]
+    assert [(column.metric, column.shown) for column in table.columns[:2]] == [(None, True), ("cost", True)]
+    headings = [heading for _, heading in shown(table)]
+    assert "directory" not in headings
+    assert ("status" in headings) is ("status" in more)
+    assert table.rows[1].cells["directory"] == "/runs/1"
+    assert table.rows[1].cells.get("member") == more.get("member")
+
+
+def test_headlines_are_ours_in_their_order_then_those_of_ones_own_else_the_first_six_metrics() -> None:
+    metrics = {"digits": 3.0, "other": 1.0, "cost": 1.0, "ball_error": 1.0}
+    found = of(run(0, metrics, a=1, declared=DIGITS), run(1, metrics, a=2, declared=DIGITS))
+    headlines = ["ball_error", "cost", "digits"]
+    assert names(tabulate(found)) == ["a", *headlines, "status", "directory"]
+    every = tabulate(found, Layout(every_metric=True))
+    assert names(every) == ["a", *metrics, "status", "directory"]
+    assert [c.name for c in every.columns if c.larger_is_better] == ["digits"]
+    many = {f"m{k}": 1.0 for k in range(8)}
+    assert names(tabulate(of(run(0, many), run(1, many, a=2))))[1:7] == [f"m{k}" for k in range(6)]
+    named = tabulate(found, Layout(metrics=("other",), every_metric=True))
+    assert names(named) == ["a", "other", "status", "directory"]
+
+
+def test_rows_are_all_that_was_swept_but_the_seed_and_the_columns() -> None:
+    found = of(
+        *(run(s, {"cost": 1.0 + s}, a=a, b=b, seed=s) for a in (1, 2) for b in (True, "x") for s in (0, 1))
+    )
+    usual = tabulate(found, Layout(aggregates=("mean",), metrics=("cost",)))
+    assert names(usual) == ["a", "b", "cost.mean", "cost.n", "cost.failed", "reasons"]
+    assert [tuple(row.cells.values()) for row in usual.rows] == [
+        (a, b, 1.5, 2, 0, None) for a in (1, 2) for b in (True, "x")
+    ]
+    spread = tabulate(found, Layout(columns=("b", "seed"), aggregates=("max",), metrics=("cost",)))
+    places = ["b=true, seed=0", "b=x, seed=0", "b=true, seed=1", "b=x, seed=1"]  # texts as they came
+    assert names(spread) == [
+        "a",
+        *(f"cost.{what}[{at}]" for at in places for what in ("max", "n", "failed")),
+        "reasons",
+    ]
+    assert len(spread.rows) == 2
+    assert "seed" in names(tabulate(found))
+    assert names(tabulate(found, Layout(rows=("seed",), metrics=("cost",))))[:2] == ["seed", "cost.mean"]
+
+
+@pytest.mark.parametrize("seeds", [1, 2])
+def test_a_spread_stands_beside_the_mean_where_a_row_is_several_runs(seeds: int) -> None:
+    found = of(*(run(s, {"cost": float(s)}, a=a, seed=s) for a in (1, 2) for s in range(seeds)))
+    usual = names(tabulate(found, Layout(rows=("a",))))
+    assert usual == ["a", "cost.mean", *["cost.std"] * (seeds > 1), "cost.n", "cost.failed", "reasons"]
+
+
+def test_runs_of_different_builds_never_share_a_row() -> None:
+    found = of(*(run(k, {"cost": 1.0}, a=k % 2, build=f"b{k // 2}") for k in range(4)))
+    table = tabulate(found, Layout(rows=("a",)))
+    assert names(table)[:2] == ["a", "build"]
+    assert len(table.rows) == 4
+    assert names(tabulate(found, Layout(rows=("a",), columns=("build",))))[:2] == ["a", "cost.mean[build=b0]"]
+    assert names(tabulate(found, Layout(rows=("build", "a"))))[:3] == ["build", "a", "cost.mean"]
+
+
+# Reasons and notes
+
+
+def test_what_is_missing_has_its_reason() -> None:
+    found = of(
+        run(0, {"cost": 1.0, "x": None}, a=1, b=1),
+        run(1, {"cost": 2.0, "x": 3.0}, a=1, b=2),
+        run(2, {}, a=2, b=1, status="failed", reason="broke"),
+        run(3, {}, a=3, b=2, status="failed", reason="broke"),
+        run(4, {"cost": 1.0}, a=3, b=2),
+    )
+    table = tabulate(
+        found, Layout(rows=("a",), columns=("b",), aggregates=("mean", "std"), metrics=("cost", "x"))
+    )
+    reasons = [row.reasons for row in table.rows]
+    assert reasons[0] == {
+        "cost.std[b=1]": "needs two runs or more",
+        "cost.std[b=2]": "needs two runs or more",
+        "x.mean[b=1]": "not finite, or nothing to report",
+        "x.std[b=1]": "not finite, or nothing to report",
+        "x.std[b=2]": "needs two runs or more",
+    }
+    assert reasons[1]["cost.mean[b=1]"] == "broke"
+    assert reasons[1]["cost.mean[b=2]"] == "there is no such run"
+    assert reasons[2]["x.mean[b=2]"] == "broke; this run has no such metric"
+    assert [row.cells["reasons"] for row in table.rows] == [
+        "not finite, or nothing to report",
+        "broke",
+        "broke; this run has no such metric",
+    ]
+    counts = [(row.cells["cost.n[b=2]"], row.cells["cost.failed[b=2]"]) for row in table.rows]
+    assert counts == [(1, 0), (0, 0), (1, 1)]
+
+
+@pytest.mark.parametrize(("count", "said"), [(1, "/runs/0"), (3, "/runs/0, /runs/1, /runs/2"), (5, None)])
+def test_a_note_names_three_runs_and_counts_the_others(count: int, said: str | None) -> None:
+    failed = [run(k, {}, a=k, status="failed", reason="broke") for k in range(count)]
+    table = tabulate(of(*failed, run(9, {"cost": 1.0}, a=9)), Layout(rows=("a",)))
+    said = "/runs/0, /runs/1, /runs/2 and 2 more" if said is None else said
+    assert table.notes == (f"{count} of {count + 1} failed: broke (in {said})",)
+
+
+def test_a_setting_without_effect_is_told() -> None:
+    def swept(cost: Any) -> tuple[str, ...]:
+        settings = [(a, b) for a in (1, 2) for b in (1, 2)]
+        return tabulate(
+            of(*(run(k, {"cost": cost(*each)}, a=each[0], b=each[1]) for k, each in enumerate(settings)))
+        ).notes
+
+    def told(key: str) -> str:
+        return f"`{key}` was swept and changed no metric in any row."
+
+    assert swept(lambda a, b: 1.0 * a) == (told("b"),)
+    assert swept(lambda a, b: 1.0 * b) == (told("a"),)
+    assert swept(lambda a, b: 1.0) == (told("a"), told("b"))
+    assert swept(lambda a, b: 1.0 * a * b) == swept(lambda a, b: float(a == b == 2)) == ()
+    apart = of(run(0, {"cost": 1.0}, a=1, b=1), run(1, {"cost": 1.0}, a=2, b=2))  # nothing to compare
+    assert tabulate(apart).notes == ()
+    assert tabulate(of(run(0, {"cost": 1.0}, a=1), run(1, {}, a=2))).notes == ()
+
+
+# Order
+
+
+@pytest.mark.parametrize(
+    ("sort", "order"),
+    [
+        (("cost",), [2, 0, 1, 3]),
+        (("cost:desc",), [1, 0, 2, 3]),
+        (("digits",), [0, 2, 1, 3]),
+        (("digits:asc",), [1, 2, 0, 3]),
+        (("digits:desc",), [0, 2, 1, 3]),
+        (("word",), [0, 2, 3, 1]),
+        (("word:desc",), [1, 3, 0, 2]),
+        (("word", "cost"), [2, 0, 3, 1]),
+        ((), [0, 1, 2, 3]),
+    ],
+)
+def test_the_best_of_a_metric_is_first_numbers_before_texts_and_what_is_missing_last(
+    sort: tuple[str, ...], order: list[int]
+) -> None:
+    rows = [(2.0, 9.0, 1), (3.0, 7.0, "z"), (1.0, 8.0, 1.0), (None, None, "b")]
+    found = of(
+        *(run(k, {"cost": c, "digits": d}, a=k, word=w, declared=DIGITS) for k, (c, d, w) in enumerate(rows))
+    )
+    assert [row.cells["a"] for row in tabulate(found, Layout(sort=sort, every_metric=True)).rows] == order
+
+
+def test_a_metric_is_sorted_by_its_first_statistic() -> None:
+    found = of(
+        *(run(k, {"cost": c}, a=a) for k, (a, c) in enumerate([(1, 5.0), (1, 1.0), (2, 2.0), (3, 4.0)]))
+    )
+    table = tabulate(found, Layout(rows=("a",), aggregates=("min", "max"), sort=("cost",)))
+    assert [row.cells["a"] for row in table.rows] == [1, 2, 3]
+    table = tabulate(found, Layout(rows=("a",), aggregates=("min", "max"), sort=("cost.max:desc",)))
+    assert [row.cells["a"] for row in table.rows] == [1, 3, 2]
+    with pytest.raises(ValueError, match=r"`staf-table --sort` must be one of a, cost.min, .*; got 'b'"):
+        tabulate(found, Layout(rows=("a",), aggregates=("min",), sort=("b",)))
+
+
+def test_what_cannot_be_chosen_is_said() -> None:
+    with pytest.raises(
+        ValueError, match=r"`staf-table --metric` cannot be chosen: no run has any; got 'cost'"
+    ):
+        tabulate(of(run(0, {}, a=1)), Layout(metrics=("cost",)))
+
+
+@pytest.mark.parametrize(
+    ("value", "key", "text"),
+    [
+        (2, (False, 2.0), "2"),
+        (0.5, (False, 0.5), "0.5"),
+        (True, (True, 0.0), "true"),
+        ("a", (True, 0.0), "a"),
+    ],
+)
+def test_numbers_are_ranked_and_true_is_none(value: Any, key: tuple[bool, float], text: str) -> None:
+    assert rank(value) == key
+    assert as_text(value) == text
+    assert as_text([1, None]) == "[1, null]"
+    assert place(run(0, {}, k=value, b=None), ("k", "b")) == f"k={text}, b=null"
+
+
+def test_one_number_has_no_spread_and_two_have() -> None:
+    assert AGGREGATES["std"]([3.0]) is None
+    assert half_width([3.0]) is None
+    assert AGGREGATES["std"]([1.0, 3.0]) == pytest.approx(math.sqrt(2))
+    assert half_width([1.0, 3.0]) == pytest.approx(12.706204736174694)
+    assert half_width([1.0, 2.0, 3.0, 6.0]) == pytest.approx(3.182446305284263 * math.sqrt(14 / 3) / 2)
+
+
+@pytest.mark.parametrize("columns", [(), ("b",)], ids=["rows", "spread"])
+@pytest.mark.parametrize("seeds", [1, 2])
+@pytest.mark.parametrize(
+    "aggregates",
+    [("mean",), ("std",), ("std", "mean"), ("ci95", "mean"), ("mean", "std", "ci95"), ("max", "min")],
+    ids="-".join,
+)
+def test_headings_join_what_belongs_together(
+    aggregates: tuple[str, ...], seeds: int, columns: tuple[str, ...], record: Record
+) -> None:
+    found = of(
+        *(
+            run(s, {"cost": a + 4.0 * s, "digits": b - 2.0 * s}, a=a, b=b, seed=s, declared=DIGITS)
+            for a in (1, 2)
+            for b in (3, 4)
+            for s in range(seeds)
+        )
+    )
+    layout = Layout(rows=("a",), columns=columns, aggregates=aggregates, style=Style(bold=True))
+    table = tabulate(found, layout)
+    record({"columns": shown(table), "markdown": table.markdown().splitlines(), "latex": latex_text(table)})
