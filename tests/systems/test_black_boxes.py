@@ -1,0 +1,300 @@
+"""Functions that a user brings: what they are asked, how their slopes are found, and where a plant rests."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from helpers import tensor, uniform
+from torch import Tensor
+
+from staf_torch import systems
+from staf_torch.systems.black_box import BlackBox
+from staf_torch.systems.equilibria import check_rest, find_equilibrium, resting_input_at
+
+A, B = np.array([[0.9, 0.2], [-0.1, 0.8]]), np.array([[0.3], [0.5]])
+ZERO, NONE = torch.zeros(2).double(), torch.zeros(1).double()
+
+
+def linear(x: Any, u: Any) -> Any:
+    return x @ A.T + u @ B.T
+
+
+def with_torch(x: Tensor, u: Tensor) -> Tensor:
+    return x @ torch.from_numpy(A).mT + u @ torch.from_numpy(B).mT
+
+
+class Asked:
+    """Keeps what it was called with, and refuses tensors."""
+
+    def __init__(self) -> None:
+        self.calls: list[tuple[np.ndarray, np.ndarray]] = []
+
+    def __call__(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:
+        if isinstance(x, Tensor):
+            raise TypeError("no tensors")
+        self.calls.append((x.copy(), u.copy()))
+        return linear(x, u)
+
+
+def test_a_function_is_tried_near_its_point_with_two_inputs_a_row() -> None:
+    asked = Asked()
+    box = BlackBox("Test(step=...)", asked, tensor([5.0, -3.0]), tensor([2.0]))
+    assert box.torch is False
+    ((x, u),) = asked.calls
+    assert x.shape == (6, 2)
+    assert u.shape == (6, 1)
+    np.testing.assert_array_equal(x[:3], x[3:])
+    assert np.abs(u[:3] - u[3:]).min() > 0
+    for part, point in ((x, [5.0, -3.0]), (u, [2.0])):
+        away = np.abs(part - point)
+        assert 0.01 < away.max() < 0.6
+        assert len(np.unique(part[:3], axis=0)) == 3
+    again = Asked()
+    BlackBox("Test(step=...)", again, tensor([5.0, -3.0]), tensor([2.0]))
+    np.testing.assert_array_equal(again.calls[0][0], x)
+
+
+def test_functions_in_torch_are_known_by_their_derivative() -> None:
+    assert BlackBox("T", with_torch, ZERO, NONE).torch is True
+    detached = BlackBox(
+        "T", lambda x, u: with_torch(torch.as_tensor(x), torch.as_tensor(u)).detach(), ZERO, NONE
+    )
+    assert detached.torch is False
+    x, u = uniform(4, 2, seed=1).requires_grad_(), uniform(4, 1, seed=2)
+    assert BlackBox("T", with_torch, ZERO, NONE)(x, u).requires_grad
+    with torch.no_grad():
+        assert BlackBox("T", with_torch, ZERO, NONE).torch is True
+
+
+@pytest.mark.parametrize("function", [linear, with_torch])
+def test_leading_dimensions_of_state_and_input_are_broadcast(function: Any) -> None:
+    box = BlackBox("T", function if function is with_torch else Asked(), ZERO, NONE)
+    for lead in ((), (4,), (3, 4)):
+        for other in ((), (4,), (1, 4)):
+            x, u = uniform(*lead, 2, seed=1), uniform(*other, 1, seed=2)
+            found = box(x, u)
+            wanted = x @ torch.from_numpy(A).mT + u @ torch.from_numpy(B).mT
+            assert found.shape == wanted.shape
+            torch.testing.assert_close(found, wanted)
+    single = box(uniform(4, 2).float(), uniform(4, 1).float()) if function is linear else None
+    assert single is None or single.dtype == torch.float32
+
+
+def test_slopes_are_those_of_the_function_or_known() -> None:
+    for box in (BlackBox("T", with_torch, ZERO, NONE), BlackBox("T", Asked(), ZERO, NONE)):
+        at = box.linearisation(tensor([3.0, -1.0]), tensor([0.5]))
+        torch.testing.assert_close(at.matrix, tensor(A), rtol=0, atol=1e-8)
+        torch.testing.assert_close(at.input_matrix, tensor(B), rtol=0, atol=1e-8)
+        assert not at.matrix.requires_grad
+    seen: list[Any] = []
+
+    def slopes(x: np.ndarray, u: np.ndarray) -> tuple[Any, Any]:
+        seen.append((x, u))
+        return A.tolist(), B.tolist()
+
+    known = BlackBox("T", linear, ZERO, NONE, slopes).linearisation(tensor([3.0, -1.0]), tensor([0.5]))
+    assert known.matrix.dtype == known.input_matrix.dtype == torch.float64
+    assert known.matrix.tolist() == A.tolist()
+    assert (seen[0][0].tolist(), seen[0][1].tolist()) == ([3.0, -1.0], [0.5])
+    for spoiled in ((A * np.nan, B), (A, B * np.inf)):
+        box = BlackBox("T", linear, ZERO, NONE, lambda x, u, s=spoiled: s)  # type: ignore[misc]
+        with pytest.raises(ValueError, match=r"the `slopes` of `T` are not finite at the state \[0.0, 0.0\]"):
+            box.linearisation(ZERO, NONE)
+    for wrong in ((A[:1], B), (A, B.T), (A, np.ones((2, 2)))):
+        box = BlackBox("T", linear, ZERO, NONE, lambda x, u, s=wrong: s)  # type: ignore[misc]
+        with pytest.raises(ValueError, match=r"must have the shapes \(2, 2\) and \(2, 1\); got \("):
+            box.linearisation(ZERO, NONE)
+
+
+@pytest.mark.parametrize(("bend", "smooth"), [(0.115, True), (0.125, False)])
+def test_a_kink_of_a_twentieth_of_the_largest_slope_is_one(bend: float, smooth: bool) -> None:
+    """Slopes of a step of 6e-6, before the kink at 1e-4, and of 6e-4, five twelfths of it behind."""
+
+    def bent(x: Any, u: Any) -> Any:
+        if isinstance(x, Tensor):
+            raise TypeError
+        return x + u + bend * np.maximum(x - 1e-4, 0)
+
+    box = BlackBox("T", bent, torch.ones(1).double(), NONE)
+    at = torch.zeros(1).double()
+    if smooth:
+        assert float(box.linearisation(at, NONE).matrix) == pytest.approx(1.0, abs=1e-6)
+    else:
+        with pytest.raises(ValueError, match=r"slopes over 6e-06 and 0.0006 differ by 0.05. of the largest"):
+            box.linearisation(at, NONE)
+
+
+def test_a_feedback_is_followed_by_a_call_a_step_or_by_what_the_function_offers() -> None:
+    asked = Asked()
+    box = BlackBox("T", asked, ZERO, NONE)
+    asked.calls.clear()
+    x0 = uniform(3, 2, seed=5).numpy()
+    states, controls = box.follow(x0, lambda x: -x[:, :1], 4)
+    assert (states.shape, controls.shape, len(asked.calls)) == ((3, 5, 2), (3, 4, 1), 4)
+    np.testing.assert_array_equal(states[:, 0], x0)
+    np.testing.assert_array_equal(controls, -states[:, :4, :1])
+    for k in range(4):
+        np.testing.assert_allclose(states[:, k + 1], linear(states[:, k], controls[:, k]))
+
+    class Whole(Asked):
+        def follow_feedback(self, x: Any, feedback: Any, steps: int) -> Any:
+            return ("whole", steps)
+
+    assert BlackBox("T", Whole(), ZERO, NONE).follow(x0, lambda x: x, 7) == ("whole", 7)
+
+
+@pytest.mark.parametrize(
+    ("function", "message"),
+    [
+        (None, r"`T\(f\)` must be a function of x \(B, n\) and u \(B, m\); got None"),
+        (lambda x, u: [1.0], r"must map x and u of the shapes \(6, 2\) and \(6, 1\) to \(6, 2\); got \(1,\)"),
+        (
+            lambda x, u: 1 / 0,
+            r"raised ZeroDivisionError \(division by zero\) at x and u of the shapes \(3, 2\)",
+        ),
+        (lambda x, u: (_ for _ in ()).throw(KeyError()), r"raised KeyError \(\)"),
+        (lambda x, u: x + np.inf * u, r"not finite near x = \[0.0, 0.0\]"),
+        (lambda x, u: 2 * x, r"`T\(f\)` ignores u: another input changes nothing near x = \[0.0, 0.0\]"),
+    ],
+)
+def test_functions_that_are_none_are_told_why(function: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        BlackBox("T(f)", function, ZERO, NONE)
+
+
+def test_a_complaint_of_many_lines_is_told_by_its_first() -> None:
+    def fails(x: Any, u: Any) -> Any:
+        raise RuntimeError("first\nsecond")
+
+    with pytest.raises(ValueError, match=r"\(first\)") as caught:
+        BlackBox("T", fails, ZERO, NONE)
+    assert "second" not in str(caught.value)
+    assert isinstance(caught.value.__cause__, RuntimeError)
+
+
+# --- where a plant rests ------------------------------------------------------------------------------------
+
+
+class Moving(systems.Plant):
+    """x' = slope x + gain u + offset, each coordinate alone; not affine in name."""
+
+    def __init__(self, slope: float, gain: float, offset: float, dim: int = 1) -> None:
+        super().__init__()
+        self.slope, self.gain, self.offset, self.dim, self.inputs = slope, gain, offset, dim, 1
+
+    def motion(self, x: Tensor, u: Tensor) -> Tensor:
+        return self.slope * x + self.gain * u + self.offset
+
+    def linearisation(self, x: Tensor | None = None, u: Tensor | None = None) -> systems.Linearisation:
+        raise NotImplementedError
+
+
+@pytest.mark.parametrize(("slope", "gain"), [(3.0, 0.5), (0.5, 7.0), (1e-5, 1e-6)])
+def test_a_plant_rests_that_moves_by_a_millionth_of_its_rate(slope: float, gain: float) -> None:
+    """Of a thousandth at least."""
+    scale, one = max(slope, gain, 1e-3), torch.zeros(1).double()
+    for sign in (1, -1):
+        check_rest(Moving(slope, gain, sign * 0.99e-6 * scale), one, one)
+        with pytest.raises(
+            ValueError, match=r"Moving does not rest at the state \[0.0\] under the input \[0"
+        ):
+            check_rest(Moving(slope, gain, sign * 1.01e-6 * scale), one, one)
+
+
+def test_the_origin_of_a_plant_with_a_drift_is_spoken_of_as_such() -> None:
+    plant = systems.Linear([[1.0]], [[1.0]])
+    check_rest(plant, torch.zeros(1).double(), torch.zeros(1).double())
+    check_rest(plant, torch.ones(1).double(), -torch.ones(1).double())
+    for x, u in ((1.0, 0.0), (0.0, 1.0)):
+        with pytest.raises(ValueError, match=r"Linear does not rest at the state .* it moves by \[1.0\]"):
+            check_rest(plant, tensor([x]), tensor([u]))
+
+    class Pushed(systems.Linear):
+        def drift(self, x: Tensor) -> Tensor:
+            return super().drift(x) + 2.0
+
+    with pytest.raises(ValueError, match=r"`Pushed.drift` must be 0 at the origin.*got \[2.0\]"):
+        check_rest(Pushed([[1.0]], [[1.0]]), torch.zeros(1).double(), torch.zeros(1).double())
+
+
+class Cubic(Moving):
+    """x' = u^3 - 8 + x (1 + x^2), which rests at u = 2 with x = 0."""
+
+    calls = 0
+
+    def motion(self, x: Tensor, u: Tensor) -> Tensor:
+        self.calls += 1
+        return u**3 - 8 + x * (1 + x**2)
+
+
+def test_the_input_that_holds_a_state_is_found_from_a_guess_or_the_plants_own() -> None:
+    plant = Cubic(0, 0, 0)
+    x = torch.zeros(1).double()
+    assert float(resting_input_at(plant, x, tensor([1.0]))) == pytest.approx(2.0, rel=1e-12)
+    assert plant.calls < 40
+    assert float(resting_input_at(plant, x + 1, tensor([1.0]))) == pytest.approx(6 ** (1 / 3), rel=1e-12)
+    away = Moving(2.0, 4.0, -6.0)
+    assert float(resting_input_at(away, x)) == pytest.approx(1.5)
+    two = Moving(1.0, 1.0, 0.0, dim=2)  # nothing holds both at 1 and 0: the nearest
+    assert float(resting_input_at(two, tensor([1.0, 0.0]))) == pytest.approx(-0.5)
+
+
+def test_a_rest_is_searched_by_the_input_alone_and_then_by_both() -> None:
+    x, u = find_equilibrium(Cubic(0, 0, 0), tensor([0.5]), tensor([1.0]))
+    assert float(x) == 0.5
+    assert float(u) == pytest.approx((8 - 0.5 * 1.25) ** (1 / 3), rel=1e-12)
+    two = Moving(1.0, 1.0, 0.0, dim=2)
+    x, u = find_equilibrium(two, tensor([1.0, 0.0]), tensor([0.0]))
+    torch.testing.assert_close(x, -u.expand(2))
+    torch.testing.assert_close(u, tensor([-1 / 3]))  # by the smallest step
+
+    class Never(Moving):
+        def motion(self, x: Tensor, u: Tensor) -> Tensor:
+            return torch.stack((x[..., 0] + u[..., 0], 2.5 + 0 * x[..., 1]), dim=-1)
+
+    said = "Never has no equilibrium near the guess, the state [0.0, 0.0] and the input [1.0]: state 1 keeps"
+    with pytest.raises(ValueError, match=re.escape(said) + " moving, by 2.5"):
+        find_equilibrium(Never(0, 0, 0, dim=2), torch.zeros(2).double(), torch.ones(1).double())
+
+
+# --- plants of functions ------------------------------------------------------------------------------------
+
+
+def test_guesses_are_states_or_pairs_and_angles_are_counted_from_either_end() -> None:
+    def step(x: Any, u: Any) -> Any:
+        return x + 0.1 * np.concatenate((x[:, 1:], u - np.sin(x[:, :1])), axis=1)
+
+    given: dict[str, Any] = {"dim": 2, "inputs": 1, "dt": 0.1}
+    for guess, rest in (
+        (None, 0.0),
+        ([0.5, 0.0], np.sin(0.5)),
+        (([0.5, 0.0], [0.3]), np.sin(0.5)),
+        ((0.5, 0.0), np.sin(0.5)),  # a tuple of two numbers is a state
+        ((tensor([0.5, 0.0]), tensor([9.0])), np.sin(0.5)),
+    ):
+        plant = systems.StepPlant(step, equilibrium=guess, periodic=[-2, 0], **given)
+        assert plant.periodic == (0,)
+        assert float(plant.resting_input()) == pytest.approx(rest, abs=1e-9)
+        assert plant.equilibrium()[1] == 0.0
+        at = plant.linearisation()
+        cosine = float(torch.cos(plant.equilibrium()[0]))
+        torch.testing.assert_close(at.matrix, tensor([[1, 0.1], [-0.1 * cosine, 1]]), rtol=0, atol=1e-7)
+        elsewhere = plant.linearisation(tensor([1.0, 0.0]))
+        assert float(elsewhere.matrix[1, 0]) == pytest.approx(-0.1 * np.cos(1.0), abs=1e-7)
+    turned = plant.motion(tensor([3.1, 1.0]), tensor([0.0]))
+    assert float(turned[0]) == pytest.approx(0.1)
+    assert plant.bounds is None
+    assert systems.StepPlant(step, low=-1.0, **given).bounds is not None
+    for wrong in ([0.5], ([0.5, 0.0], [0.3, 0.1]), ([0.5], [0.3])):
+        with pytest.raises(
+            ValueError, match=r"\(equilibrium=...\)` must be 2 numbers, or those and 1 of the"
+        ):
+            systems.StepPlant(step, equilibrium=wrong, **given)  # type: ignore[arg-type]
+    for periodic in ([2], [-3]):
+        with pytest.raises(ValueError, match=r"`StepPlant\(periodic=...\)` must be coordinates of 2"):
+            systems.StepPlant(step, periodic=periodic, **given)
+    systems.StepPlant(step, periodic=[1, -2], **given)
