@@ -1,0 +1,275 @@
+"""The command line of what is resumed: taken over, changed, asked about or refused; nothing runs."""
+
+from __future__ import annotations
+
+import io
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from staf_torch import __version__
+from staf_torch.results import run_record as records
+from staf_torch.sweeps import resume
+from staf_torch.sweeps.resume import command_line, is_run_of_members, may_run_code, recorded
+
+
+def sweep(place: Path, typed: Sequence[str] = ("seed=0,1",), hydra: Sequence[str] = (), **more: Any) -> Path:
+    record = {"version": __version__, "overrides": typed, "hydra": hydra, **more}
+    (place / "sweep.json").write_text(json.dumps(record))
+    return place
+
+
+def run(place: Path, typed: Any = ("seed=3", "members=[x]"), **settings: Any) -> Path:
+    record = {"overrides": typed, "settings": {"members": ["x"], **settings}}
+    (place / "run.json").write_text(json.dumps(record))
+    return place
+
+
+def end(place: Path, kind: str = "sweep") -> list[str]:
+    """The last two words of the new command line."""
+    return [f"hydra.{kind}.dir={place}", f"sweep.resume={place}"]
+
+
+def lines(place: Path, *argv: str) -> list[str]:
+    return command_line([*argv, f"sweep.resume={place}"])
+
+
+def test_a_command_line_that_resumes_nothing_stays_as_it_is(tmp_path: Path) -> None:
+    for argv in (
+        [],
+        ["seed=1"],
+        ["-m", "sweep.resume=null", "seed=0"],
+        [f"sweep.resume={tmp_path}", "sweep.resume=null"],
+    ):
+        assert command_line(argv) == argv
+    place = sweep(tmp_path)
+    assert command_line(["sweep.resume=null", f"sweep.resume={place}"]) == [
+        "--multirun",
+        "seed=0,1",
+        *end(place),
+    ]
+
+
+def test_the_last_directory_that_is_named_counts_and_quotes_are_the_shells(tmp_path: Path) -> None:
+    (tmp_path / "one").mkdir()
+    place = sweep(tmp_path / "one")
+    for quote in "'\"":
+        line = ["sweep.resume=nowhere", f"sweep.resume={quote}{place}/../one/{quote}"]
+        assert command_line(line) == ["--multirun", "seed=0,1", *end(place)]
+
+
+def test_flags_stay_and_a_sweep_is_one(tmp_path: Path) -> None:
+    place = sweep(tmp_path)
+    for flags in (["-m"], ["--multirun"], ["-m", "--config-dir=conf"]):
+        assert lines(place, *flags) == [*flags, "seed=0,1", *end(place)]
+    assert lines(place, "--config-dir=conf", "--yes") == [
+        "--config-dir=conf",
+        "--multirun",
+        "seed=0,1",
+        *end(place),
+    ]
+
+
+def test_a_run_of_members_is_resumed_as_a_run(tmp_path: Path) -> None:
+    place = run(tmp_path)
+    assert is_run_of_members(place)
+    assert lines(place) == ["seed=3", "members=[x]", *end(place, "run")]
+    assert lines(place, "--config-dir=conf", "hydra.verbose=true") == [
+        "--config-dir=conf",
+        "seed=3",
+        "members=[x]",
+        "hydra.verbose=true",
+        *end(place, "run"),
+    ]
+    for flag in ("-m", "--multirun"):
+        with pytest.raises(
+            ValueError, match=rf"^{place} is one run, of many members: resume it without -m\.$"
+        ):
+            lines(place, flag)
+    for typed in (None, "seed=3", [1], ["seed=1", 2]):
+        run(tmp_path, typed)
+        with pytest.raises(ValueError, match=rf"`staf sweep.resume={place}`: its run.json has no overrides"):
+            lines(place)
+    run(tmp_path, members=None)
+    assert not is_run_of_members(place)
+    (tmp_path / "run.json").write_text(json.dumps({"settings": ["members"]}))
+    assert not is_run_of_members(place)
+    (tmp_path / "run.json").unlink()
+    assert not is_run_of_members(place)
+    sweep(run(tmp_path))
+    assert not is_run_of_members(place)
+
+
+def test_overrides_that_are_repeated_are_those_of_the_sweep_in_any_order(tmp_path: Path) -> None:
+    place = sweep(tmp_path, ["seed=0,1", "kernel=gaussian"])
+    whole = ["-m", "seed=0,1", "kernel=gaussian", *end(place)]
+    assert lines(place, "-m", "kernel=gaussian", "seed=0,1") == whole
+    start = rf"^`staf sweep.resume={place}` must have the overrides of that sweep, or none; got them "
+    for given, words in (
+        (["seed=0,1"], "without 'kernel=gaussian'. The sweep is: staf -m seed=0,1 kernel=gaussian$"),
+        (["seed=0,1", "kernel=gaussian", "dt=1", "spread=2"], "with 'dt=1 spread=2'. The sweep is"),
+        (["kernel=matern", "seed=0,1"], "without 'kernel=gaussian' and with 'kernel=matern'. The"),
+        (["seed=0,1", "kernel=gaussian", "seed=0,1"], "more than once. The"),
+    ):
+        with pytest.raises(ValueError, match=start + words):
+            lines(place, "-m", *given)
+
+
+def test_lines_about_hydra_are_taken_over_but_those_that_change(tmp_path: Path) -> None:
+    before = [
+        "hydra.verbose=true",
+        "hydra.mode=MULTIRUN",
+        "hydra.sweep.dir=old",
+        "+hydra.launcher.submitit.timeout_min=2",
+        "hydra/launcher=batched",
+        "sweep.objective=ball_error",
+    ]
+    place = sweep(tmp_path, hydra=before)
+    kept = [
+        "hydra.verbose=true",
+        "+hydra.launcher.submitit.timeout_min=2",
+        "hydra/launcher=batched",
+        "sweep.objective=ball_error",
+    ]
+    assert lines(place, "-m") == ["-m", "seed=0,1", *kept, *end(place)]
+    assert lines(place, "-m", "hydra.verbose=false", "hydra.mode=RUN", "sweep.objective=null") == [
+        *("-m", "seed=0,1", "+hydra.launcher.submitit.timeout_min=2", "hydra/launcher=batched"),
+        *("sweep.objective=null", "hydra.verbose=false", *end(place)),
+    ]
+    assert lines(place, "-m", "hydra/launcher=joblib", "hydra.launcher.n_jobs=3") == [
+        *("-m", "seed=0,1", "hydra.verbose=true", "sweep.objective=ball_error"),
+        *("hydra/launcher=joblib", "hydra.launcher.n_jobs=3", *end(place)),
+    ]
+
+
+@pytest.mark.parametrize("record", [None, "[]", '{"overrides": []}', '{"hydra": []}', "damaged"])
+def test_what_is_no_sweep_is_refused(record: str | None, tmp_path: Path) -> None:
+    if record is not None:
+        (tmp_path / "sweep.json").write_text(record)
+    with pytest.raises(
+        ValueError, match=rf"must be the directory of a sweep, with its sweep.json; got '{tmp_path}'"
+    ):
+        lines(tmp_path)
+    for spoilt in ({"overrides": "seed=1"}, {"overrides": [1]}, {"hydra": ["a", None]}, {"hydra": {"a": 1}}):
+        with pytest.raises(ValueError, match="must be the directory of a sweep"):
+            recorded(sweep(tmp_path, **spoilt), anyway=True)  # type: ignore[arg-type]
+
+
+def test_a_sweep_of_another_version_is_resumed_where_a_person_means_it(tmp_path: Path) -> None:
+    place = sweep(tmp_path, version="0.0.1" + "x" * 100)
+    with pytest.raises(
+        ValueError, match=rf"of this version \({__version__}\).*was written by 0.0.1x{{75}}\."
+    ):
+        lines(place)
+    with pytest.raises(ValueError, match="was written by"):
+        recorded(place)
+    anyway = "sweep.resume_anyway=true"
+    assert lines(place, anyway) == ["--multirun", "seed=0,1", anyway, *end(place)]
+    assert lines(sweep(tmp_path), anyway) == ["--multirun", "seed=0,1", anyway, *end(place)]
+    assert recorded(place) == (["seed=0,1"], [])
+
+
+def test_lines_of_ten_thousand_characters_are_read_unasked(tmp_path: Path) -> None:
+    def of(length: int) -> list[str]:
+        return [f"+note={'x' * (length - 12)}", "seed=1"]
+
+    hydra = ["hydra.verbose=true"]
+    place = sweep(tmp_path, of(10_000 - len(hydra[0])), hydra)
+    assert len(lines(place)) == 6
+    sweep(tmp_path, of(10_001 - len(hydra[0])), hydra)
+    with pytest.raises(
+        ValueError, match=f"{place} was started with lines of 10001 characters, and 10000 are"
+    ):
+        lines(place)
+    assert len(lines(place, "--yes")) == 6
+    assert len(lines(place, *of(10_001 - len(hydra[0])))) == 6  # who types them knows them
+
+
+def test_a_sweep_of_a_million_jobs_is_resumed_and_no_larger_one(tmp_path: Path) -> None:
+    assert lines(sweep(tmp_path, ["seed=range(1000000)"]))
+    with pytest.raises(ValueError, match=rf"{tmp_path} has a sweep of 1e\+06 jobs, and 1000000 are the most"):
+        lines(sweep(tmp_path, ["seed=range(1000001)"]))
+    assert lines(sweep(tmp_path, ["seed=range(1000001"]))  # Hydra says what is wrong with it
+
+
+# Code of somebody else
+
+
+class Terminal(io.StringIO):
+    """Where somebody sits, or not."""
+
+    def __init__(self, text: str = "", here: bool = True) -> None:
+        super().__init__(text)
+        self.here, self.flushed = here, ""
+
+    def isatty(self) -> bool:
+        return self.here
+
+    def flush(self) -> None:
+        self.flushed = self.getvalue()
+
+
+FOREIGN = ["kernel.path=evil.Kernel", "hydra.callbacks.a._target_=evil"]
+
+
+@pytest.mark.parametrize("answer", ["y\n", " YES \n", "n\n", "\n", "", "yess\n"])
+def test_somebody_at_a_terminal_is_asked_whether_lines_may_run(
+    answer: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place = sweep(tmp_path, [FOREIGN[0], "seed=1"], FOREIGN[1:])
+    err = Terminal()
+    monkeypatch.setattr(sys, "stdin", Terminal(answer))
+    monkeypatch.setattr(sys, "stderr", err)
+    shown = f"\n  {FOREIGN[0]}\n  {FOREIGN[1]}\n"
+    if answer in ("y\n", " YES \n"):
+        assert lines(place) == ["--multirun", FOREIGN[0], "seed=1", FOREIGN[1], *end(place)]
+    else:
+        with pytest.raises(ValueError, match="may run code of whoever started it") as told:
+            lines(place)
+        assert shown in str(told.value)
+        assert str(told.value).endswith("If you know them, repeat them, or add --yes.")
+    question = f"staf: {place} was started with lines that may run code:{shown}Run them? [y/N] "
+    assert err.getvalue() == err.flushed == question
+
+
+@pytest.mark.parametrize("absent", ["no input", "input", "errors"])
+def test_nobody_is_asked_where_there_is_no_terminal(
+    absent: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place, err = sweep(tmp_path, FOREIGN[:1]), Terminal("", absent != "errors")
+    monkeypatch.setattr(sys, "stdin", None if absent == "no input" else Terminal("y\n", absent != "input"))
+    monkeypatch.setattr(sys, "stderr", err)
+    with pytest.raises(ValueError, match="may run code of whoever started it"):
+        lines(place)
+    assert err.getvalue() == ""
+    assert lines(place, "--yes") == lines(place, FOREIGN[0]) == ["--multirun", FOREIGN[0], *end(place)]
+
+
+def test_lines_that_are_typed_again_are_known_one_by_one(tmp_path: Path) -> None:
+    place = sweep(tmp_path, ["seed=1"], [FOREIGN[1], "hydra.searchpath=[evil]"])
+    with pytest.raises(ValueError, match="whoever started it") as told:
+        lines(place, FOREIGN[1])
+    assert "searchpath" in str(told.value)
+    assert "_target_" not in str(told.value)
+
+
+def test_which_lines_may_run_code() -> None:
+    harmless = [
+        "hydra.launcher.batch=3",
+        "+hydra.launcher.batch=3",
+        "++seed=1",
+        "kernel=gaussian",
+        "hydration=1",
+    ]
+    harmful = ["hydra.launcher.batch=3;x", "hydra.run.dir2=x", "~hydra.callbacks", "+a=${b}", "x@y=1"]
+    assert [may_run_code(line) for line in harmless] == [False, True, False, False, True]
+    assert all(map(may_run_code, harmful))
+
+
+def test_own_lines_are_those_about_the_jobs() -> None:
+    assert resume._merged([], ["sweep.resume=a", "hydra.run.dir=b", "hydra.x=c"]) == ["hydra.x=c"]
+    assert records.own(["seed=1", "+sweep.objective=a", "sweeper=1"]) == ["seed=1", "sweeper=1"]
