@@ -37,10 +37,10 @@ class BoxFilter(nn.Module):
     and leaves room to brake from then on:
 
         min |u - policy(s)|^2 over the bounds of the plant, and for the distance d(t) of every wall
-        d(t) >= d(0)/2 for 0 <= t <= hold, and d(hold) >= hold times the speed towards it at the end,
+        d(t) >= d(0)/2 for 0 <= t <= hold, or d(hold) >= hold times the speed towards it at the end,
 
-    the second where inputs move the speed of a coordinate (relative degree two), so that the next hold can
-    stop it; where they move the coordinate itself the first is all that is asked. Where no control leaves
+    the second where inputs move the speed of a coordinate (relative degree two) and that of now does not use
+    up d(0) within the hold: the next hold can stop it, and a third of d(0) is left. Where no control leaves
     half of every distance a thousandth has to do. x(t) is that of the plant whose control is held, by two
     Runge-Kutta steps and Hermite's cubic between. Distances are those of s, with all digits also beside a
     wall. A wanted control that satisfies everything is applied bit for bit.
