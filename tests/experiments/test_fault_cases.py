@@ -247,7 +247,7 @@ def test_what_a_run_measures_is_in_its_table_its_metrics_and_its_figure(
         asked.append((rows, generator.initial_seed()))
         return case
 
-    measured = {"cost_median": 2.0, "cost_max": math.inf, "regulated": 0.5, "found_median": None}
+    measured = {"cost_median": 2.123456789, "cost_max": math.inf, "regulated": 0.5, "found_median": None}
     monkeypatch.setattr(faults, "CASES", {"my_case": mine})
     monkeypatch.setattr(faults, "_simulated", lambda case, control, duration: duration)
     monkeypatch.setattr(faults, "_measured", lambda case, method, result, best: measured)
@@ -260,11 +260,14 @@ def test_what_a_run_measures_is_in_its_table_its_metrics_and_its_figure(
     methods = ["ignorant LQR", "informed LQR", "adaptive"]
     assert seen == {"my case": dict.fromkeys(methods, 3.0)}
     assert (tmp_path / "figures" / "faults.txt").read_bytes() == b"drawn"
-    parts = {"cost_median": 2.0, "cost_max": None, "regulated": 0.5}
+    parts = {"cost_median": 2.123456789, "cost_max": None, "regulated": 0.5}
     keys = ("ignorant_LQR", "informed_LQR", "adaptive")
     assert found == {f"my_case_{key}_{name}": value for key in keys for name, value in parts.items()}
     lines = (tmp_path / "faults.csv").read_text().splitlines()
-    assert [line.split(",")[:3] for line in lines[1:]] == [["my case", name, "2.0"] for name in methods]
+    assert [line.split(",")[:3] for line in lines[1:]] == [
+        ["my case", name, "2.123456789"] for name in methods
+    ]
+    assert " 2.1235 " in (tmp_path / "faults.md").read_text()
     other = tmp_path / "other"
     other.mkdir()
     faults.run(settings(*given, "figures=false"), other)
