@@ -166,6 +166,8 @@ def test_a_plant_is_of_the_size_and_of_the_limits_of_its_model() -> None:
     assert plant.resting_input().tolist() == [0.0, 0.0]
     assert isinstance(plant.model, Model)
     assert not plant.traceable
+    assert plant.function._slopes == plant.function._function.slopes
+    assert {call["threads"] for call in CALLS} == {1}
     assert made(dt=1.0).period == 1.0
     assert made(periodic=()).periodic == ()
     assert made(periodic=(0,)).periodic == (0,)
@@ -249,6 +251,15 @@ def test_slopes_are_chained_over_the_steps_of_a_period() -> None:
         other = differences.linearisation(x, u)
         torch.testing.assert_close(known.matrix, other.matrix, rtol=1e-6, atol=1e-7)
         torch.testing.assert_close(known.input_matrix, other.input_matrix, rtol=1e-6, atol=1e-7)
+
+
+def test_slopes_begin_cold_whatever_was_simulated_before() -> None:
+    plant, x, u = made(dt=0.75), uniform(5, seed=3), uniform(2, seed=4)
+    first = plant.linearisation(x, u)
+    plant.linearisation(-2 * x, u)
+    again = plant.linearisation(x, u)
+    assert torch.equal(first.matrix, again.matrix)
+    assert torch.equal(first.input_matrix, again.input_matrix)
 
 
 def test_models_are_objects_texts_or_files(tmp_path: Path) -> None:
