@@ -1,0 +1,145 @@
+"""The minimum on a box has no slope that leads down; angles differ by turns; slopes are derivatives."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import pytest
+import torch
+from helpers import random_positive_definite, tensor, uniform
+
+from staf_torch.numerics.angles import wrap
+from staf_torch.numerics.box import LARGEST, box_minimum, face_inverses, faces
+from staf_torch.numerics.differences import STEP, central_slopes
+from staf_torch.numerics.forward_mode import jacobian
+
+
+@pytest.mark.parametrize("size", range(1, LARGEST + 1))
+def test_faces_are_all_cases_the_inside_first(size: int) -> None:
+    found = [tuple(row) for row in faces(size).tolist()]
+    assert found[0] == (0,) * size
+    assert len(found) == len(set(found)) == 3**size
+    assert set(found) == set(itertools.product((-1, 0, 1), repeat=size))
+    assert faces(size).dtype == torch.int64
+
+
+def test_the_inverse_of_a_face_is_that_of_its_free_unknowns() -> None:
+    curvature = random_positive_definite(3, 2, size=3)
+    found = face_inverses(curvature)
+    assert found.shape == (2, 27, 3, 3)
+    for at, face in enumerate(faces(3).tolist()):
+        free = [i for i, side in enumerate(face) if side == 0]
+        want = torch.zeros(2, 3, 3).double()
+        for row in range(2):
+            part = torch.linalg.inv(curvature[row][free][:, free])
+            for (i, a), (j, b) in itertools.product(enumerate(free), repeat=2):
+                want[row, a, b] = part[i, j]
+        torch.testing.assert_close(found[:, at], want)
+
+
+@pytest.mark.parametrize("known", [False, True])
+@pytest.mark.parametrize("size", range(1, LARGEST + 1))
+def test_a_minimum_on_a_box_has_no_slope_that_leads_down(size: int, known: bool) -> None:
+    rows = 60
+    curvature = random_positive_definite(size, rows, size=size)
+    slope = 3 * curvature.diagonal(dim1=-2, dim2=-1) * uniform(rows, size, low=-1.0, high=1.0, seed=size)
+    low, high = -uniform(rows, size, low=0.1, seed=7), uniform(rows, size, low=0.1, seed=8)
+    slope[::3] *= 0.02
+    low[::4], high[1::4] = -torch.inf, torch.inf
+    low[2::4, 0], high[2::4, -1] = -torch.inf, torch.inf
+    inverses = face_inverses(curvature) if known else None
+    u = box_minimum(curvature, slope, low, high, inverses)
+    gradient = (curvature @ u.unsqueeze(-1)).squeeze(-1) + slope
+    at_low, at_high = u == low, u == high
+    assert bool(((u >= low) & (u <= high)).all())
+    assert bool((gradient[at_low] >= -1e-9).all())
+    assert bool((gradient[at_high] <= 1e-9).all())
+    torch.testing.assert_close(
+        gradient[~at_low & ~at_high], torch.zeros(int((~at_low & ~at_high).sum())).double()
+    )
+    assert bool(at_low.any())
+    assert bool(at_high.any())
+    assert bool((~at_low & ~at_high).all(-1).any())
+
+
+def test_one_pair_of_bounds_serves_all_rows_and_what_is_nan_stays_so() -> None:
+    curvature, slope = random_positive_definite(1, 4, size=2), uniform(4, 2, seed=2)
+    low, high = tensor([-0.1, -0.2]), tensor([0.1, torch.inf])
+    together = box_minimum(curvature, slope, low, high)
+    each = [box_minimum(curvature[k], slope[k], low, high) for k in range(4)]
+    torch.testing.assert_close(together, torch.stack(each))
+    slope[1, 0] = torch.nan
+    spoiled = box_minimum(curvature, slope, low, high)
+    assert bool(spoiled[1].isnan().any())
+    torch.testing.assert_close(spoiled[[0, 2, 3]], together[[0, 2, 3]])
+    curvature[2] = torch.nan
+    assert bool(box_minimum(curvature, slope, low, high)[2].isnan().all())
+
+
+def test_more_than_four_unknowns_are_refused() -> None:
+    with pytest.raises(
+        ValueError, match=r"`box_minimum\(slope=\.\.\.\)` must have at most 4 unknowns; got 5\."
+    ):
+        box_minimum(torch.eye(5), torch.zeros(5), torch.zeros(5), torch.ones(5))
+
+
+@pytest.mark.parametrize("periodic", [(), (0,), (-1,), (0, 2), (2, -3), (0, 1, 2), (-1, -2, -3)])
+def test_angles_are_between_minus_pi_and_pi_and_other_coordinates_as_they_were(
+    periodic: tuple[int, ...],
+) -> None:
+    given = 20 * uniform(50, 3, low=-1.0, seed=4)
+    found = wrap(given, periodic)
+    angles = {index % 3 for index in periodic}
+    for k in range(3):
+        if k not in angles:
+            assert torch.equal(found[:, k], given[:, k])
+            continue
+        assert float(found[:, k].abs().max()) <= math.pi + 1e-12
+        turns = (given[:, k] - found[:, k]) / (2 * math.pi)
+        torch.testing.assert_close(turns, turns.round(), rtol=0, atol=1e-12)
+        assert float(turns.abs().max()) >= 2
+    assert torch.equal(wrap(found, periodic), found)
+
+
+@pytest.mark.parametrize("scale", [None, 1.0, 100.0])
+def test_slopes_are_found_in_one_call_with_steps_of_the_scale(scale: float | None) -> None:
+    at = tensor([0.5, -300.0, 2.0])
+    asked = []
+
+    def function(x: torch.Tensor) -> torch.Tensor:
+        asked.append(x)
+        return torch.stack((x[:, 0] ** 2 + 3 * x[:, 2], (0.01 * x[:, 1]).sin() * x[:, 0]), dim=-1)
+
+    size = None if scale is None else torch.full((3,), scale).double()
+    found = central_slopes(function, at, size)
+    want = tensor([[1.0, 0.0, 3.0], [math.sin(-3.0), 0.005 * math.cos(-3.0), 0.0]])
+    torch.testing.assert_close(found, want, rtol=0, atol=1e-7)
+    (probes,) = asked
+    steps = STEP * (tensor([1.0, 300.0, 2.0]) if size is None else size)
+    torch.testing.assert_close(probes, torch.cat((at + steps.diag(), at - steps.diag())), rtol=0, atol=0)
+    assert STEP == 6e-6
+
+
+@pytest.mark.parametrize(("dim", "count", "calls"), [(1, 1, 1), (2, 3, 2), (3, 3, 3), (3, 2, 2)])
+def test_a_jacobian_takes_a_pass_a_coordinate_or_a_pass_a_value_backwards(
+    dim: int, count: int, calls: int
+) -> None:
+    seen = []
+
+    def function(y: torch.Tensor) -> torch.Tensor:
+        seen.append(y)
+        weights = torch.arange(1.0, dim * count + 1, dtype=torch.float64).view(dim, count)
+        return (y.square() @ weights).sin()
+
+    found = jacobian(function, uniform(4, dim))
+    assert found.shape == (4, count, dim)
+    assert len(seen) == calls
+
+
+def test_a_jacobian_has_any_leading_dimensions() -> None:
+    y = uniform(2, 3, 2)
+    found = jacobian(lambda x: torch.stack((x[..., 0] * x[..., 1], x[..., 0], x[..., 1] ** 2), dim=-1), y)
+    one, zero = torch.ones(2, 3).double(), torch.zeros(2, 3).double()
+    rows = [(y[..., 1], y[..., 0]), (one, zero), (zero, 2 * y[..., 1])]
+    torch.testing.assert_close(found, torch.stack([torch.stack(row, -1) for row in rows], -2))
