@@ -159,7 +159,7 @@ def unstable(rows: int, generator: torch.Generator) -> Case:
     before = torch.ones(rows, 2, dtype=torch.float64)
     return Case(
         *(model, cost, x0, before, before * torch.tensor([0.5, 1.0]).to(before), at, 0.02, 0.002, 0.05),
-        AdaptiveLQR(model, cost, windows, law, a_step=14),
+        AdaptiveLQR(model, cost, windows, law),
         lambda: None,
     )
 
