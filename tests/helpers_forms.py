@@ -85,7 +85,17 @@ def arithmetic(a: Tensor, b: Tensor) -> list[Tensor]:
             torch.where(a > 0, a, 0.5),
             torch.where(a > 0, 1.0, b),
         ),
-        *(torch.where(a > b, b, a), a.sign(), a * 1, a / 4, a / -1, a.neg().neg(), (-a).abs(), a.sub(-b), a + -b),
+        *(
+            torch.where(a > b, b, a),
+            a.sign(),
+            a * 1,
+            a / 4,
+            a / -1,
+            a.neg().neg(),
+            (-a).abs(),
+            a.sub(-b),
+            a + -b,
+        ),
         *(
             a * 0,
             a + 0.0,

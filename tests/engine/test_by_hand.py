@@ -1,0 +1,377 @@
+"""The chase by its equations alone: row by row, time by time, in the paper's weights, K formed and solved.
+
+Every way of the library must find the same: the definition in one chunk and in chunks, and the row program,
+run here in plain torch.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from helpers import tensor
+from helpers_chase import LAW, circles
+from torch import Tensor
+
+import staf_torch as st
+from staf_torch import chase, chase_weights, optim, predictors
+from staf_torch.engine import api, chase_pieces, row_program
+from staf_torch.engine.result import concatenate
+from staf_torch.lanes.program import Program
+from staf_torch.targets import Paper
+
+pytestmark = pytest.mark.compiled
+
+ITERATIONS, FIRST = 2, tensor([[0.3, -0.2, 0.5], [0.0, 0.1, -0.4]])
+TIMES = 7
+STATES = torch.stack((circles(1, TIMES)[0], 0.7 * circles(3, TIMES)[2].flip(-1)))
+CENTERS = st.StateFollowingCenters(st.rings(3), st.StateRadius(0.7, 0.3))
+BASES = {
+    "exponential": st.StaFBasis(st.ExponentialKernel(), CENTERS),
+    "gaussian": st.StaFBasis(st.GaussianKernel(0.8), st.StateFollowingCenters(st.rings(3), 0.6)),
+    "polynomial": st.StaFBasis(st.PolynomialKernel(2), CENTERS),
+}
+PREDICTORS: dict[str, Any] = {
+    "none": None,
+    "secant": predictors.Secant(),
+    "guarded": predictors.Secant(guarded=True),
+    "first order": predictors.Tangent(1),
+    "second order": predictors.Tangent(2),
+}
+NAMES = (
+    "weights",
+    "ideal_weights",
+    "value",
+    "estimate",
+    "estimate_before",
+    "ideal_estimate",
+    "excess",
+    "excess_before",
+)
+TERMS = ("rate", "growth", "drift", "bound")
+
+
+def scaled_gram(basis: st.StaFBasis, x: Tensor) -> Tensor:
+    """e^{-g} K, whose weights are e^g times the paper's."""
+    gain = basis.kernel.log_gain(x)
+    return basis.gram(x) * (1.0 if gain is None else (-gain).exp())
+
+
+def gain(basis: st.StaFBasis, x: Tensor) -> Tensor:
+    found = basis.kernel.log_gain(x)
+    return torch.ones(x.shape[:-1]).double() if found is None else found.exp()
+
+
+def tangent(basis: st.StaFBasis, at: Tensor, dx: Tensor) -> tuple[Tensor, Tensor]:
+    """K^-1 dV and K^-1 dK, by central differences."""
+    step = 1e-4 * dx
+    rates = [
+        (8 * (f(at + step) - f(at - step)) - (f(at + 2 * step) - f(at - 2 * step))) / (12 * 1e-4)
+        for f in (lambda x: basis.values(x, Paper()), lambda x: scaled_gram(basis, x))
+    ]
+    gram = scaled_gram(basis, at)
+    return torch.linalg.solve(gram, rates[0]), torch.linalg.solve(gram, rates[1])
+
+
+def predicted(basis: st.StaFBasis, name: str, k: int, x: Tensor, path: list[Tensor]) -> Tensor:
+    """The paper's weights brought to time k, of those corrected before."""
+    held = path[-1]
+    if name == "none" or k == 0:
+        return held
+    if name in ("secant", "guarded"):
+        guess = 2 * held - (path[-2] if k > 1 else held)
+        if name == "guarded":
+            gram, values = basis.gram(x[k]), basis.values(x[k], Paper())
+            cost = [float(0.5 * a @ gram @ a - a @ values) for a in (guess, held)]
+            guess = guess if cost[0] <= cost[1] else held
+        return guess
+    a = gain(basis, x[k - 1]) * held
+    if name == "first order":
+        dx = (x[k] - x[k - 2]) / 2 if k > 1 else x[k] - x[k - 1]
+        u, j = tangent(basis, x[k - 1], dx)
+        a = a + u - j @ a
+    else:
+        u, j = tangent(basis, (x[k - 1] + x[k]) / 2, x[k] - x[k - 1])
+        a = a + u - j @ (a + (u - j @ a) / 2)
+    return a / gain(basis, x[k])
+
+
+@functools.cache
+def by_hand(kind: str, name: str, row_number: int) -> dict[str, Tensor]:
+    """One row."""
+    basis, x, first = BASES[kind], STATES[row_number], FIRST[row_number]
+    found: dict[str, list[Tensor]] = {each: [] for each in (*NAMES, *TERMS)}
+    path, past = [first], None
+    for k in range(len(x)):
+        gram, values = basis.gram(x[k]), basis.values(x[k], Paper())
+        ideal, row = torch.linalg.solve(gram, values), basis(x[k][None], x[k])[0]
+        before = after = predicted(basis, name, k, x, path)
+        for _ in range(ITERATIONS):
+            g = values - gram @ after
+            after = after + (g @ g) / (g @ gram @ g) * g
+        path = [*path, after] if k else [after]
+
+        def length(v: Tensor, K: Tensor = gram) -> Tensor:
+            return (v @ K @ v).sqrt()
+
+        rate = LAW.contraction(torch.linalg.cond(gram)) ** ITERATIONS
+        growth, drift, last = torch.ones(()).double(), length(before - ideal), torch.zeros(()).double()
+        if past is not None:
+            old, ideal_before = past
+            growth = torch.linalg.eigvals(torch.linalg.solve(old, gram)).real.max().sqrt()
+            drift = length((before - path[-2]) - (ideal - ideal_before))
+            last = ((path[-2] - ideal_before) @ old @ (path[-2] - ideal_before)).sqrt()
+        numbers = (after, ideal, Paper()(x[k]), row @ after, row @ before, row @ ideal)
+        terms = (rate, growth, drift, rate.sqrt() * (growth * last + drift))
+        excesses = (length(after - ideal).square(), length(before - ideal).square())
+        for each, number in zip((*NAMES, *TERMS), (*numbers, *excesses, *terms), strict=True):
+            found[each].append(number)
+        past = gram, ideal
+    return {each: torch.stack(parts) for each, parts in found.items()}
+
+
+@pytest.fixture(params=["definition", "chunks", "program", "program in pieces"])
+def run(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
+    """A chase in one of four ways."""
+    way: str = request.param
+    monkeypatch.setattr(Program, "compiles", lambda self, *given: True)
+    monkeypatch.setattr(Program, "__call__", Program.definition)
+    monkeypatch.setattr(row_program, "_SHORTEST", 1 if "program" in way else 10**9)
+    if way == "chunks":
+        monkeypatch.setattr(api, "chunk_length", lambda *_, **__: 3)
+
+    def run(states: Tensor, *given: Any, **options: Any) -> Any:
+        if way != "program in pieces":
+            return chase(states, *given, **options)
+        return concatenate(list(chase_pieces(states.split([1, 2, 1, TIMES - 4], 1), *given, **options)))
+
+    return run
+
+
+PAIRS = [
+    *(("exponential", name) for name in PREDICTORS),
+    ("gaussian", "secant"),
+    ("gaussian", "first order"),
+    ("polynomial", "none"),
+]
+
+
+@pytest.mark.parametrize(("name", "predictor"), PAIRS)
+def test_a_chase_is_what_its_equations_say(name: str, predictor: str, run: Callable[..., Any]) -> None:
+    basis = BASES[name]
+    result = run(
+        STATES,
+        basis,
+        Paper(),
+        LAW,
+        inner_steps=ITERATIONS,
+        weights=FIRST,
+        predictor=PREDICTORS[predictor],
+        certificate=True,
+    )
+    found = {each: getattr(result, each) for each in NAMES} | result.certificate._asdict()
+    for row in range(2):
+        wanted = by_hand(name, predictor, row)
+        for each in (*NAMES, *TERMS):
+            scale = float(wanted[each].abs().max())
+            torch.testing.assert_close(
+                found[each][row], wanted[each], rtol=0, atol=2e-6 * scale, msg=lambda m, e=each: f"{e}: {m}"
+            )
+    assert torch.equal(result.state, STATES)
+    assert result.diverged_at.tolist() == [-1, -1]
+    assert not result.certificate.violated.any()
+    scale = 1.0 if basis.gram_structure(STATES).scale is None else basis.gram_structure(STATES).scale
+    gains = gain(basis, STATES).unsqueeze(-1)
+    torch.testing.assert_close(result.coefficients, scale * gains * result.weights, rtol=1e-12, atol=1e-13)
+
+
+@pytest.mark.parametrize(("name", "predictor"), [("exponential", "none"), ("gaussian", "secant")])
+def test_a_row_that_is_lost_keeps_its_last_weights_and_its_neighbour_sees_nothing(
+    name: str, predictor: str, run: Callable[..., Any]
+) -> None:
+    options = {
+        "inner_steps": ITERATIONS,
+        "weights": FIRST,
+        "predictor": PREDICTORS[predictor],
+        "certificate": True,
+    }
+    whole = run(STATES, BASES[name], Paper(), LAW, **options)
+    for first in (1, TIMES - 1) if name == "exponential" else (0, 4):
+        spoilt = STATES.clone()
+        spoilt[1, first] = torch.nan
+        found = run(spoilt, BASES[name], Paper(), LAW, **options)
+        assert found.diverged_at.tolist() == [-1, first]
+        assert found.diverged.tolist() == [False, True]
+        for each in (*NAMES, "coefficients"):
+            one, other = getattr(found, each), getattr(whole, each)
+            torch.testing.assert_close(one[0], other[0], rtol=1e-9, atol=1e-12)
+            torch.testing.assert_close(one[1, :first], other[1, :first], rtol=1e-9, atol=1e-12)
+            assert each == "weights" or bool(one[1, first:].isnan().all())
+        last = whole.weights[1, first - 1] if first else FIRST[1]
+        torch.testing.assert_close(
+            found.weights[1, first:], last.expand(TIMES - first, 3), rtol=1e-9, atol=1e-12
+        )
+        for term in found.certificate[:-1]:
+            assert torch.equal(term.isnan(), torch.arange(TIMES) >= torch.tensor([[TIMES], [first]]))
+        assert not found.certificate.violated.any()
+
+
+LAWS = {
+    "steepest descent": LAW,
+    "exact": optim.Exact(),
+    "nesterov": optim.Nesterov(0.9),
+    "heavy ball": optim.HeavyBall(),
+    "fixed step": optim.FixedStep(),
+    "normalised LMS": optim.NormalisedLMS(0.7),
+    "preconditioned": optim.PreconditionedDescent(),
+    "least squares": optim.RecursiveLeastSquares(),
+}
+
+
+@pytest.mark.parametrize(("law", "name"), [*zip(LAWS, itertools.cycle(BASES), strict=False)])
+def test_every_way_of_a_chase_finds_the_same(name: str, law: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of all results and of the weights alone, with every time recorded and with the last one."""
+    given = BASES[name], Paper(), LAWS[law]
+    spoilt = STATES.clone()
+    spoilt[1, 4] = torch.inf
+    monkeypatch.setattr(Program, "compiles", lambda self, *given: True)
+    monkeypatch.setattr(Program, "__call__", Program.definition)
+    ways = {"definition": (10**9, 99), "chunks": (10**9, 4), "program": (1, 99)}
+    for states, predictor in ((STATES, None), (spoilt, predictors.Secant())):
+        found = {}
+        options = {"inner_steps": 2, "weights": FIRST[0], "predictor": predictor}
+        for way, (shortest, length) in ways.items():
+            monkeypatch.setattr(row_program, "_SHORTEST", shortest)
+            monkeypatch.setattr(api, "chunk_length", lambda *_, n=length, **__: n)
+            found[way] = chase(states, *given, **options)
+            for pieces in (states if way == "chunks" else iter(states.split([1, 2, 4], 1)),):
+                alone = chase_weights(pieces, *given, **options)
+                torch.testing.assert_close(alone.weights, found[way].weights, rtol=1e-8, atol=1e-10)
+                assert torch.equal(alone.diverged_at, found[way].diverged_at)
+                assert torch.equal(alone.diverged, found[way].diverged)
+            last = chase_weights(states.split([2, 5], 1), *given, **options, history=False)
+            torch.testing.assert_close(last.weights, found[way].weights[:, -1:], rtol=1e-8, atol=1e-10)
+        for way in ("chunks", "program"):
+            for each in ("weights", "estimate", "estimate_before", "value", "coefficients"):
+                one, other = getattr(found[way], each), getattr(found["definition"], each)
+                torch.testing.assert_close(one, other, rtol=1e-7, atol=1e-9, equal_nan=True)
+            assert found[way].diverged_at.tolist() == found["definition"].diverged_at.tolist()
+
+
+@pytest.mark.parametrize("way", ["definition", "program"])
+@pytest.mark.parametrize("run_all", [True, False])
+def test_a_reach_beyond_one_is_warned_of_once_in_however_many_pieces(
+    way: str, run_all: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where the first piece has none, and by a state that is not the last."""
+    monkeypatch.setattr(Program, "compiles", lambda self, *given: True)
+    monkeypatch.setattr(Program, "__call__", Program.definition)
+    monkeypatch.setattr(row_program, "_SHORTEST", 1 if way == "program" else 10**9)
+    basis = st.StaFBasis(st.ExponentialKernel(), st.StateFollowingCenters(st.rings(3), 0.5))
+    states = 0.5 * circles(2, 12)
+    states[1, 5] *= 6.0  # |x| r = 1.2 or so
+    states[0, 9] *= 9.0
+    worst = [float(0.5 * states[:, at].norm(dim=-1).max()) for at in (slice(4, 8), slice(8, 12))]
+    run: Callable[..., Any] = (lambda *given: list(chase_pieces(*given))) if run_all else chase_weights
+    with pytest.warns(UserWarning, match=f"r = {worst[0]:.3g} > 1") as seen:
+        run(states.split(4, dim=1), basis, Paper(), LAW)
+    assert len(seen) == 1
+    assert worst[1] > 1
+    chase(0.4 * states[:1, :4], basis, Paper(), LAW)  # nothing to say
+
+
+def test_what_a_law_does_not_ask_for_is_not_computed() -> None:
+    class Asking(optim.SteepestDescent):
+        seen: Any = None
+
+        def step(self, objective: Any, weights: Tensor, state: Any) -> Any:
+            Asking.seen = objective.precomputed
+            return super().step(objective, weights, state)
+
+    basis, x = BASES["exponential"], STATES[:, 4:5]
+    gram = torch.stack([scaled_gram(basis, each[0]) for each in x])
+    row = torch.stack([basis(each, each[0])[0] / gain(basis, each[0]) for each in x])
+    eigenvalues = torch.linalg.eigvalsh(gram)[:, [0, -1]]
+    ideal = basis.ideal_weights(x[:, 0], Paper()) * gain(basis, x[:, 0]).unsqueeze(-1)
+    wanted = {
+        "extremes": eigenvalues,
+        "ideal": ideal,
+        "inverse": torch.linalg.inv(gram),
+        "row": row,
+        "sampled": Paper()(x[:, 0]),
+    }
+    names = list(wanted)
+    for needs in ((), *((name,) for name in names), (names[0], names[3]), tuple(names)):
+        Asking.needs = frozenset(needs)
+        chase(x, basis, Paper(), Asking(), inner_steps=1)
+        for name in names:
+            part = getattr(Asking.seen, name)
+            assert (part is None) is (name not in needs), (needs, name)
+            if part is not None:
+                torch.testing.assert_close(part, wanted[name], rtol=1e-8, atol=1e-9)
+
+
+def test_pieces_are_as_long_as_the_numbers_of_a_time_let_them_be() -> None:
+    """4 matrices of M x M, and M + 2 vectors of n and some more: in 64 MiB."""
+    for count, rows, itemsize in ((3, 1, 8), (6, 10, 8), (10, 7, 4), (3, 1000, 4)):
+        basis = st.StaFBasis(st.GaussianKernel(), st.StateFollowingCenters(st.rings(count), 0.1))
+        numbers = 4 * count * count + (count + 2) * 10
+        assert api.chunk_length(rows, basis, itemsize) == 64 * 1024 * 1024 // (rows * numbers * itemsize)
+
+
+def test_zero_weights_are_zero_also_where_their_unit_overflows() -> None:
+    far = tensor([[[60.0, 0.0], [60.0, 0.01]]])
+    basis = st.StaFBasis(st.ExponentialKernel(), st.StateFollowingCenters(st.rings(3), 1e-3))
+    one = chase(far, basis, Paper(), LAW, weights=torch.zeros(3))
+    other = chase(far, basis, Paper(), LAW)
+    assert torch.equal(one.coefficients, other.coefficients)
+    assert one.coefficients.isfinite().all()
+    some = chase(far, basis, Paper(), LAW, weights=tensor([0.0, 1.0, 0.0]), inner_steps=0)
+    assert some.diverged_at.tolist() == [0]
+
+
+class Nothing(predictors.Predictor):
+    def predict(self, inputs: Any, weights: Tensor, previous: Tensor, unit: Tensor) -> Tensor:
+        assert inputs == ()
+        return weights * unit
+
+
+def test_predictors_know_their_work_and_their_names() -> None:
+    known = {
+        predictors.Secant(): (0, "secant", False),
+        predictors.Secant(guarded=True): (2, "secant", True),
+        predictors.Tangent(1): (8, "tangent order 1", False),
+        predictors.Tangent(): (14, "tangent order 2", False),
+        Nothing(): (0, "nothing", False),
+    }
+    for predictor, (work, title, guarded) in known.items():
+        assert (predictor.products(6), predictor.title, predictor.guarded) == (work, title, guarded)
+    plain, same = (
+        chase(STATES, BASES["exponential"], Paper(), LAW, predictor=p).weights for p in (None, Nothing())
+    )
+    torch.testing.assert_close(same, plain, rtol=1e-12, atol=1e-12)
+
+
+def test_many_centers_are_sampled_five_at_a_time_where_a_step_is_written_down() -> None:
+    sizes: list[int] = []
+
+    def target(x: Tensor) -> Tensor:
+        sizes.append(x.shape[-2])
+        return x.square().sum(-1)
+
+    from staf_torch.engine import recursion
+    from staf_torch.engine.problem import Problem
+
+    for count, wanted in ((10, {10}), (15, {5})):
+        basis = st.StaFBasis(st.GaussianKernel(), st.StateFollowingCenters(st.rings(count), 0.5))
+        problem = Problem("chase", basis, target, LAW, 1)
+        carry = row_program.first_carry(problem, recursion.start(problem, STATES, None))
+        sizes.clear()
+        Program(row_program.Step(problem, False)).text(carry, STATES)
+        assert set(sizes) == wanted
+        direct = problem.values(STATES)
+        torch.testing.assert_close(direct, basis.values(STATES, target), rtol=0, atol=0)
