@@ -1,0 +1,299 @@
+"""Runs in Python, read from folders that nobody ran: their order, choice, tables and what is shown."""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import os
+import re
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from sweep_runs import write_run
+
+from staf_torch.results.reader import collect
+from staf_torch.sweeps.runs import Run, Runs
+
+FIGURE: Any = object()
+GRID = [  # kernel, count, error, fraction that is regulated
+    ("gaussian", 6, 0.5, 0.25),
+    ("matern", 3, 0.125, 1.0),
+    ("gaussian", 3, 2.0, None),
+    ("matern", 6, None, 0.5),
+]
+
+
+@pytest.fixture
+def runs(tmp_path: Path) -> Runs:
+    for num, (kernel, count, error, fraction) in enumerate(GRID):
+        overrides = {"kernel": kernel, "centers.count": count, "initial_state": [1.0, float(num % 2)]}
+        write_run(tmp_path / str(num), overrides, {"ball_error": error, "regulated_fraction": fraction})
+    return Runs(collect(tmp_path), lambda run: {run.directory.name: FIGURE})
+
+
+def names(runs: Any) -> str:
+    return "".join(run.directory.name for run in runs)
+
+
+def test_runs_are_a_sequence(runs: Runs) -> None:
+    assert len(runs) == 4
+    assert names(runs) == "0123"
+    assert isinstance(runs[0], Run)
+    assert runs[-1].directory.name == "3"
+    assert isinstance(runs[1:3], Runs)
+    assert names(runs[1:3]) == "12"
+    assert runs[2].figures() == {"2": FIGURE}
+    assert runs[1:3][1].figures() == {"2": FIGURE}
+    assert repr(runs) == "<Runs 4 completed, over kernel, centers.count, initial_state>"
+    assert repr(runs[:0]) == "<Runs none, over nothing>"
+    with pytest.raises(IndexError):
+        runs[4]
+
+
+@pytest.mark.parametrize(
+    ("by", "order"),
+    [
+        (["ball_error"], "1023"),
+        (["ball_error:asc"], "1023"),
+        (["ball_error:desc"], "2013"),
+        (["regulated_fraction"], "1302"),  # the larger the better
+        (["regulated_fraction:asc"], "0312"),
+        (["regulated_fraction:desc"], "1302"),
+        (["kernel"], "0213"),
+        (["kernel:desc"], "1302"),
+        (["centers.count"], "1203"),
+        (["centers.count", "kernel"], "2103"),
+        (["kernel", "centers.count"], "2013"),
+        (["kernel:desc", "ball_error"], "1302"),
+        ([], "0123"),
+    ],
+)
+def test_runs_are_sorted_by_metrics_and_settings_with_what_is_missing_last(
+    by: list[str], order: str, runs: Runs
+) -> None:
+    assert names(runs.sort(*by)) == order
+
+
+def test_numbers_come_before_texts_and_each_in_its_order(tmp_path: Path) -> None:
+    values = ["b", 2, "a", True, -1, 10]
+    for num, value in enumerate(values):
+        write_run(tmp_path / str(num), {"spread": value}, {"ball_error": 1.0})
+    runs = Runs(collect(tmp_path), lambda run: {})
+    assert [values[int(name)] for name in names(runs.sort("spread"))] == [-1, True, 2, 10, "a", "b"]
+
+
+def test_the_best_run_is_that_of_the_best_number(runs: Runs) -> None:
+    assert runs.best("ball_error").directory.name == "1"
+    assert runs.best("regulated_fraction").directory.name == "1"
+    assert runs[2:].best("regulated_fraction").directory.name == "3"
+    with pytest.raises(ValueError, match=r"`Runs.best\(metric=...\)` has no number: .*; got 'ball_error'"):
+        runs[3:].best("ball_error")
+    with pytest.raises(ValueError, match=r"`Runs.best\(metric=...\)` must be one of 'ball_error'"):
+        runs.best("kernel")
+    with pytest.raises(ValueError, match=r"`Runs\(name=...\)` must be one of 'ball_error'.*; got 'speed'"):
+        runs.sort("speed")
+
+
+def test_runs_are_chosen_as_settings_are_typed_or_by_a_function(runs: Runs) -> None:
+    assert names(runs.filter("kernel=matern")) == "13"
+    assert names(runs.filter("+kernel=matern", "centers.count=6")) == "3"
+    assert names(runs.filter("initial_state=[1.0,1.0]")) == "13"
+    assert names(runs.filter("ball_error=0.5")) == "0"
+    assert names(runs.filter("ball_error=null")) == "3"
+    assert names(runs.filter(lambda run: (run.metrics["ball_error"] or 0) > 0.3, "kernel=gaussian")) == "02"
+    assert names(runs.filter()) == "0123"
+    assert isinstance(runs.filter("kernel=matern"), Runs)
+    with pytest.raises(ValueError, match=r"`Runs\(name=...\)` must be one of .*; got 'kernle'"):
+        runs.filter("kernle=matern")
+
+
+def test_a_table_has_the_best_in_bold_unless_somebody_says_otherwise(runs: Runs) -> None:
+    assert "**0.125**" in runs.table().markdown()
+    assert "**" not in runs.table(style=dataclasses.replace(runs.table().style, bold=False)).markdown()
+    assert "condition_number" not in runs.table().markdown()
+    assert [row.cells["ball_error"] for row in runs.table(sort=("ball_error",)).rows] == [
+        0.125,
+        0.5,
+        2.0,
+        None,
+    ]
+    shown = runs._repr_html_()
+    assert shown.startswith(
+        "<p><code>&lt;Runs 4 completed, over kernel, centers.count, initial_state&gt;</code></p>"
+    )
+    assert "<b>0.125</b>" in shown
+
+
+def test_a_run_is_what_was_read_with_a_function_that_draws(runs: Runs, tmp_path: Path) -> None:
+    (read,) = collect(tmp_path / "0").rows
+    run = Run.of(read, lambda run: {"a": FIGURE})
+    for field in dataclasses.fields(read):
+        assert getattr(run, field.name) == getattr(read, field.name)
+    other = Run.of(read, lambda run: {})
+    assert run == other  # whatever draws them
+    assert run.figures() == {"a": FIGURE}
+    for one, name in ((run, "status"), (runs, "found")):
+        with pytest.raises(dataclasses.FrozenInstanceError):
+            setattr(one, name, None)
+    assert repr(run).startswith("<Run completed: kernel=gaussian")
+    with pytest.raises(TypeError):
+        Run(*dataclasses.astuple(read), lambda run: {})  # type: ignore[misc]
+
+
+def test_a_history_is_read_where_one_was_kept(runs: Runs) -> None:
+    with pytest.raises(
+        ValueError, match=r"`Run\(history=...\)` cannot be read: the run kept none; got .*npz"
+    ):
+        _ = runs[0].history
+    np.savez(runs[1].directory / "history.npz", time=np.arange(3.0))
+    assert list(runs[1].history["time"]) == [0.0, 1.0, 2.0]
+
+
+def test_a_notebook_shows_metrics_and_the_pictures_of_the_run(
+    runs: Runs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place = runs[0].directory / "figures"
+    place.mkdir()
+    for name, content in (("b<", b"two"), ("a", b"one"), ("large", b"x" * 11)):
+        (place / f"{name}.png").write_bytes(content)
+    (place / "else.svg").write_bytes(b"three")
+    (tmp_path / "elsewhere.png").write_bytes(b"four")
+    (place / "link.png").symlink_to(tmp_path / "elsewhere.png")
+    monkeypatch.setattr("staf_torch.sweeps.runs._MOST_PICTURE", 10)
+    shown = runs[0]._repr_html_()
+    pictures = re.findall(r'alt="([^"]*)" src="data:image/png;base64,([^"]*)"', shown)
+    assert [(name, base64.b64decode(text)) for name, text in pictures] == [("a", b"one"), ("b&lt;", b"two")]
+    assert "<tr><th>ball_error</th><td>0.5</td></tr>" in shown
+    assert shown.startswith("<p><code>&lt;Run completed: ")
+    assert "<td>-</td>" in runs[3]._repr_html_()
+
+
+def test_a_folder_of_pictures_that_leads_elsewhere_is_not_shown(runs: Runs, tmp_path: Path) -> None:
+    (tmp_path / "theirs").mkdir()
+    (tmp_path / "theirs" / "a.png").write_bytes(b"one")
+    (runs[0].directory / "figures").symlink_to(tmp_path / "theirs")
+    assert "<img" not in runs[0]._repr_html_()
+
+
+def test_pictures_of_thirty_two_megabytes_are_shown(runs: Runs) -> None:
+    (runs[0].directory / "figures").mkdir()
+    path = runs[0].directory / "figures" / "a.png"
+    for size, count in ((2**25, 1), (2**25 + 1, 0)):
+        with path.open("wb") as file:
+            os.truncate(file.fileno(), size)
+        assert len(list(runs[0]._pictures())) == count
+
+
+# pandas
+
+
+def test_a_frame_is_made_of_all_metrics(runs: Runs, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_run(runs[0].directory.parent / "9", {"kernel": "own"}, {"condition_number": 1.0, "ball_error": 1.0})
+    found = Runs(collect(runs[0].directory.parent), lambda run: {})
+    monkeypatch.setattr("staf_torch.sweeps.runs.data_frame", lambda table: table)
+    assert "condition_number" in found.to_pandas().rows[4].cells
+
+
+class Frame:
+    """A frame of pandas that notes what is asked of it."""
+
+    def __init__(self, cells: dict[str, list[Any]]) -> None:
+        self.cells, self.asked = dict(cells), []
+
+    def __getitem__(self, name: str) -> Any:
+        column = self.cells[name]
+        return SimpleNamespace(astype=lambda kind: [None if each is None else kind(each) for each in column])
+
+    def __setitem__(self, name: str, column: list[Any]) -> None:
+        self.cells[name] = column
+
+    def groupby(self, names: list[str], **options: Any) -> Any:
+        self.asked.append((names, options))
+        return {"ball_error": self}
+
+    def agg(self, function: Any) -> Frame:
+        told = {name: lambda **options: self.asked.append(options) for name in ("mean", "std")}
+        function(SimpleNamespace(**told))
+        return self
+
+    def unstack(self, names: list[str]) -> Frame:
+        self.asked.append(names)
+        return self
+
+
+def test_what_a_pivot_asks_of_pandas(runs: Runs, monkeypatch: pytest.MonkeyPatch) -> None:
+    pandas = SimpleNamespace(DataFrame=Frame)
+    monkeypatch.setattr("staf_torch.sweeps.runs.require", lambda name, what: pandas)
+    frame = runs.pivot("kernel", ("centers.count", "initial_state"), "ball_error", "std")
+    assert frame.cells == {
+        "kernel": ["gaussian", "matern", "gaussian", "matern"],
+        "centers.count": [6, 3, 3, 6],
+        "initial_state": ["[1.0, 0.0]", "[1.0, 1.0]"] * 2,
+        "ball_error": [0.5, 0.125, 2.0, None],
+    }
+    along = ["centers.count", "initial_state"]
+    assert frame.asked == [(["kernel", *along], {"dropna": False}), {"skipna": False}, along]
+    for arguments, words in (
+        (("kernel", "centers.count", "speed"), r"`Runs.pivot\(metric=...\)` must be one of 'ball_error'"),
+        (
+            ("kernel", "centers.count", "ball_error", "sum"),
+            r"aggregate=...\)` must be one of 'mean', 'median'",
+        ),
+        (("kernel", ["seed", "no"], "ball_error"), r"`Runs\(name=...\)` must be one of .*; got 'no'"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            runs.pivot(*arguments)
+
+
+def test_a_frame_has_a_row_a_run_and_all_metrics(runs: Runs) -> None:
+    pytest.importorskip("pandas")
+    frame = runs.to_pandas()
+    assert list(frame["ball_error"].astype(float).fillna(-1.0)) == [0.5, 0.125, 2.0, -1.0]
+    assert "regulated_fraction" in frame
+    write_run(runs[0].directory.parent / "9", {"kernel": "own"}, {"condition_number": 1.0})
+    assert "condition_number" in Runs(collect(runs[0].directory.parent), lambda run: {}).to_pandas()
+
+
+def test_a_pivot_is_of_the_runs_that_share_a_cell(tmp_path: Path) -> None:
+    pandas = pytest.importorskip("pandas")
+    cells = [("a", 3, 1.0), ("a", 3, 2.0), ("a", 3, 6.0), ("b", 3, 4.0), ("b", 6, None), ("b", 6, 5.0)]
+    for num, (kernel, count, error) in enumerate(cells):
+        overrides = {"kernel": kernel, "centers.count": count, "seed": num, "initial_state": [1.0, num % 2]}
+        write_run(tmp_path / str(num), overrides, {"ball_error": error})
+    runs = Runs(collect(tmp_path), lambda run: {})
+    for aggregate, value in (("mean", 3.0), ("median", 2.0), ("min", 1.0), ("max", 6.0), ("std", 7**0.5)):
+        frame = runs.pivot("kernel", "centers.count", "ball_error", aggregate)
+        assert frame.loc["a", 3] == pytest.approx(value)
+        assert pandas.isna(frame.loc["b", 6])  # one of the two has none
+        assert pandas.isna(frame.loc["a", 6])
+    assert runs.pivot("kernel", "centers.count", "ball_error").loc["a", 3] == 3.0
+    both = runs.pivot(["kernel", "centers.count"], ["initial_state"], "ball_error")
+    assert both.loc[("a", 3), "[1.0, 0]"] == 3.5
+
+
+def test_a_setting_that_some_runs_lack_has_a_cell_of_its_own(tmp_path: Path) -> None:
+    pandas = pytest.importorskip("pandas")
+    for num, shrink in enumerate((None, 0.5)):
+        write_run(tmp_path / str(num), {"centers.shrink": shrink, "kernel": "a"}, {"ball_error": 1.0 + num})
+    frame = Runs(collect(tmp_path), lambda run: {}).pivot("kernel", "centers.shrink", "ball_error")
+    found = {None if pandas.isna(key) else key: frame[key].iloc[0] for key in frame.columns}
+    assert found == {None: 1.0, 0.5: 2.0}
+
+
+def test_an_arrow_stream_has_no_column_of_row_numbers(runs: Runs, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("pandas")
+    asked: list[Any] = []
+
+    class Table:
+        @staticmethod
+        def from_pandas(frame: Any, preserve_index: bool | None = None) -> Any:
+            asked.append((len(frame), preserve_index))
+            return SimpleNamespace(__arrow_c_stream__=lambda schema: ("stream", schema))
+
+    monkeypatch.setitem(sys.modules, "pyarrow", SimpleNamespace(Table=Table))
+    assert runs.__arrow_c_stream__("schema") == ("stream", "schema")
+    assert asked == [(4, False)]
