@@ -1,0 +1,296 @@
+"""Costs beside sums and integrals that are written out, what a plant lends them, and what they refuse."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+import torch
+from helpers import tensor, uniform
+from torch import Tensor
+
+from staf_torch import adp, systems
+
+Q = tensor([[2.0, 0.3], [0.3, 1.0]])
+R = tensor([[1.0, 0.0], [0.0, 3.0]])
+COUPLED = tensor([[1.0, 0.4], [0.4, 3.0]])
+X, U = uniform(5, 2, seed=1), uniform(5, 2, seed=2)
+
+
+def form(matrix: Tensor, x: Tensor) -> Tensor:
+    return torch.einsum("...i,ij,...j->...", x, matrix, x)
+
+
+class Crane(systems.Linear):
+    """Rests at (1, 5) under (0.2, -0.4); the first coordinate is an angle."""
+
+    def __init__(self, high: float | None = None) -> None:
+        super().__init__([[0.0, 1.0], [-1.0, -0.3]], [[1.0, 0.0], [0.2, 1.0]])
+        self.periodic = (0,)
+        self.bounds = None if high is None else systems.Bounds(-high, high, 2)
+
+    def equilibrium(self) -> Tensor:
+        return tensor([1.0, 5.0])
+
+    def resting_input(self) -> Tensor:
+        return tensor([0.2, -0.4])
+
+    def drift(self, x: Tensor) -> Tensor:
+        rest = tensor([0.2, -0.4])
+        return super().drift(x - tensor([1.0, 5.0])) - (self.input_matrix @ rest).to(x)
+
+
+SAT = {"low": -1.0, "high": [0.5, 2.0], "target_input": [0.1, -0.2]}
+COSTS: dict[str, tuple[dict[str, Any], Tensor]] = {
+    "plain": ({}, R),
+    "coupled": ({}, COUPLED),
+    "bounds": ({"low": [-0.4, -math.inf], "high": 0.6}, R),
+    "coupled bounds": ({"low": [-0.4, -math.inf], "high": 0.6}, COUPLED),
+    "target": ({"target": [0.5, -1.0], "target_input": [0.3, 0.1]}, R),
+    "coupled target": ({"target_input": [0.3, 0.1], "low": -0.5, "high": 0.5}, COUPLED),
+    "output": ({"output": lambda x: torch.stack((x.sum(-1).sin(), x[..., 0]), -1), "target": [0.5, 1.0]}, R),
+}
+
+
+@pytest.mark.parametrize("name", COSTS)
+def test_quadratic_costs_are_their_forms_and_their_policies_the_minimum(name: str) -> None:
+    given, r = COSTS[name]
+    cost = adp.QuadraticCost(Q, r, 2, 2, **given)
+    away = X - tensor(given.get("target", [0.0, 0.0]))
+    effort = U - tensor(given.get("target_input", [0.0, 0.0]))
+    if "output" in given:
+        away = given["output"](X) - given["output"](tensor([[0.5, 1.0]]))
+    torch.testing.assert_close(cost.state_rate(X), form(Q, away))
+    torch.testing.assert_close(cost.input_rate(U), form(r, effort))
+    torch.testing.assert_close(cost.rate(X, U), form(Q, away) + form(r, effort))
+    torch.testing.assert_close(cost.effort(U), effort)
+    torch.testing.assert_close(cost.input_of(effort), U)
+    torch.testing.assert_close(cost.unsaturated(U), U)
+    assert cost.plain is (name in ("plain", "coupled"))
+    g, p = uniform(5, 2, 2, seed=3), 2 * uniform(5, 2, seed=4)
+    u = cost.policy(g, p)
+    pull = torch.einsum("bnm,bn->bm", g, p)
+
+    def hamiltonian(v: Tensor) -> Tensor:
+        return cost.input_rate(v) + (v * pull).sum(-1)
+
+    if cost.bounds is None:
+        rest = tensor(given.get("target_input", [0.0, 0.0]))
+        torch.testing.assert_close(u, rest - 0.5 * torch.linalg.solve(r, pull.mT).mT)
+        assert torch.equal(cost.saturate(9 * U), 9 * U)
+    else:
+        assert bool(cost.bounds.contain(u).all())
+        assert torch.equal(cost.saturate(9 * U), cost.bounds.clip(9 * U))
+        assert float((u == cost.bounds.high).double().mean()) > 0
+    for turn in range(12):
+        moved = u + 1e-3 * tensor([math.cos(0.5236 * turn), math.sin(0.5236 * turn)])
+        moved = moved if cost.bounds is None else cost.bounds.clip(moved)
+        assert bool((hamiltonian(moved) >= hamiltonian(u) - 1e-12).all())
+
+
+def test_slopes_of_an_output_bend_the_cost_at_its_set_point() -> None:
+    given = COSTS["output"][0]
+    cost = adp.QuadraticCost(Q, R, 2, 2, **given)
+    slope = tensor([[math.cos(1.5), math.cos(1.5)], [1.0, 0.0]])
+    torch.testing.assert_close(cost.state_curvature(), slope.mT @ Q @ slope)
+    free = adp.QuadraticCost(Q, R, 2, 2, output=given["output"])
+    slope = tensor([[1.0, 1.0], [1.0, 0.0]])
+    torch.testing.assert_close(free.state_curvature(), slope.mT @ Q @ slope)
+    assert adp.QuadraticCost(Q, R, 2, 2).state_curvature() is not None
+    torch.testing.assert_close(adp.QuadraticCost(Q, R, 2, 2).state_curvature(), Q)
+    torch.testing.assert_close(free.state_rate(torch.zeros(1, 2).double()), torch.zeros(1).double())
+    narrow = adp.QuadraticCost([[4.0]], R, 2, 2, output=lambda x: x[..., :1] ** 2)
+    torch.testing.assert_close(narrow.state_rate(X), 4 * X[:, 0] ** 4)
+
+
+@pytest.mark.parametrize("given", [{"bound": [0.7, 2.0]}, {"bound": 0.7}, SAT])
+def test_smooth_bounds_cost_the_integral_of_the_inverse_of_their_saturation(given: dict[str, Any]) -> None:
+    cost = adp.BoundedInputCost(Q, R, 2, 2, **given)
+    rest = tensor(given.get("target_input", [0.0, 0.0]))
+    low = tensor([-1.0, -1.0]) if "low" in given else -tensor(given["bound"]).expand(2)
+    high = tensor([0.5, 2.0]) if "low" in given else tensor(given["bound"]).expand(2)
+    v = 3 * uniform(40, 2, seed=6)
+    effort = v - rest
+    side = torch.where(effort < 0, rest - low, high - rest)
+    u = cost.saturate(v)
+    torch.testing.assert_close(u, rest + side * (effort / side).tanh())
+    torch.testing.assert_close(
+        cost.unsaturated(u)[effort.abs() < 2], v[effort.abs() < 2], rtol=1e-6, atol=1e-6
+    )
+    share = torch.linspace(0, 1, 20001, dtype=torch.float64)
+    middle = 0.5 * (share[1:] + share[:-1])
+    e = (u - rest)[:10]
+    s = torch.where(e < 0, rest - low, high - rest)
+    inverse = s.unsqueeze(-1) * (e.unsqueeze(-1) * middle / s.unsqueeze(-1)).atanh()
+    paid = 2 * (R.diagonal() * (inverse.mean(-1) * e)).sum(-1)
+    torch.testing.assert_close(cost.input_rate(u[:10]), paid, rtol=1e-4, atol=1e-7)
+    edges = torch.stack((low, high))
+    finite = cost.unsaturated(edges)
+    far = torch.stack((rest - low, high - rest)) * math.atanh(1 - 1e-9)
+    torch.testing.assert_close((finite - rest).abs(), far)
+    torch.testing.assert_close(
+        cost.input_rate(edges), 2 * math.log(2) * (R.diagonal() * (edges - rest).square()).sum(-1)
+    )
+    assert torch.equal(cost.saturate(rest), rest)
+    g, p = uniform(5, 2, 2, seed=3), 2 * uniform(5, 2, seed=4)
+    pull = torch.einsum("bnm,bn->bm", g, p)
+    torch.testing.assert_close(cost.policy(g, p), cost.saturate(rest - 0.5 * pull / R.diagonal()))
+
+
+# --- what a plant lends -------------------------------------------------------------------------------------
+
+
+def test_a_cost_takes_from_its_plant_what_it_does_not_state() -> None:
+    free = adp.QuadraticCost(Q, R, 2, 2)
+    around = free.around(Crane(3.0))
+    assert around is not free
+    assert around.target is not None
+    assert around.target_input is not None
+    assert around.bounds is not None
+    assert (around.target.tolist(), around.target_input.tolist()) == ([1.0, 5.0], [0.2, -0.4])
+    assert (around.periodic, around.bounds.high.tolist()) == ((0,), [3.0, 3.0])
+    assert (free.target, free.target_input, free.bounds, free.periodic) == (None, None, None, ())
+    assert around.around(Crane(7.0)) is around
+    turned = around.deviation(tensor([[1.0 + 6.0, 5.5]]))
+    torch.testing.assert_close(turned, tensor([[6.0 - 2 * math.pi, 0.5]]))
+    assert around.set_point() is around.target
+    plant = Crane()
+    assert around.regulated(plant)[0] is plant
+    assert around.regulated(plant)[1] is around
+    own = adp.QuadraticCost(Q, R, 2, 2, low=-9.0, high=8.0)
+    assert own.around(Crane(3.0)).bounds is own.bounds
+    linear = systems.Linear([[0.0, 1.0], [-1.0, 0.0]], [[1.0, 0.0], [0.0, 1.0]])
+    assert free.around(linear) is free
+    assert (own.around(linear) is own, own.set_point()) == (True, None)
+    placed = adp.QuadraticCost(Q, R, 2, 2, target=[0.0, 0.0]).around(linear)
+    assert placed.target is None
+
+
+def test_the_input_of_a_set_point_is_stated_or_found() -> None:
+    plant = systems.Linear([[0.0, 1.0], [-1.0, 0.0]], [[1.0, 0.0], [0.0, 1.0]])
+    found = adp.QuadraticCost(Q, R, 2, 2, target=[2.0, -3.0]).around(plant)
+    torch.testing.assert_close(found.target_input, tensor([3.0, 2.0]))
+    stated = adp.QuadraticCost(Q, R, 2, 2, target=[2.0, -3.0], target_input=[3.0, 2.0]).around(plant)
+    torch.testing.assert_close(stated.target_input, tensor([3.0, 2.0]))
+    with pytest.raises(ValueError, match="does not rest"):
+        adp.QuadraticCost(Q, R, 2, 2, target=[2.0, -3.0], target_input=[3.0, 1.0]).around(plant)
+    with pytest.raises(ValueError, match="does not rest"):
+        adp.QuadraticCost(Q, R, 2, 2, target_input=[0.5, 0.0]).around(plant)
+
+
+def test_bounds_are_replaced_in_a_copy_that_is_prepared_anew() -> None:
+    cost = adp.QuadraticCost(Q, COUPLED, 2, 2)
+    assert cost.bounded(None, None) is cost
+    for low, high in ((-0.2, None), (None, 0.3), (-0.2, 0.3)):
+        other = cost.bounded(low, high)
+        assert other.bounds is not None
+        assert other.bounds.low.tolist() == [-math.inf if low is None else low] * 2
+        assert other.bounds.high.tolist() == [math.inf if high is None else high] * 2
+        assert bool(other.bounds.contain(other.policy(uniform(9, 2, 2), 9 * uniform(9, 2))).all())
+    assert cost.bounds is None
+    assert "_faces" not in dict(cost.named_buffers())
+    smooth = adp.BoundedInputCost(Q, R, 2, 2, bound=1.0)
+    wide = smooth.bounded(-2.0, 3.0)
+    assert float(wide.saturate(tensor([99.0, -99.0]))[0]) == pytest.approx(3.0)
+    assert float(smooth.saturate(tensor([99.0, -99.0]))[0]) == pytest.approx(1.0)
+
+
+def test_sizes_of_plant_and_cost_must_agree() -> None:
+    three = systems.Linear((-torch.eye(3)).tolist(), torch.eye(3)[:, :2].tolist())
+    one = systems.Linear((-torch.eye(2)).tolist(), [[0.0], [1.0]])
+    for plant, has in ((three, "3 and 2"), (one, "2 and 1")):
+        with pytest.raises(
+            ValueError, match=rf"`QuadraticCost` is for 2 states and 2 inputs; Linear has {has}"
+        ):
+            adp.QuadraticCost(Q, R, 2, 2).around(plant)
+    none = systems.Linear((-torch.eye(2)).tolist())  # a plant without inputs may be watched
+    assert adp.QuadraticCost(Q, R, 2, 2).around(none).dim == 2
+
+
+# --- what is stated -----------------------------------------------------------------------------------------
+
+
+def test_matrices_are_numbers_diagonals_or_matrices_in_double_precision() -> None:
+    for given, wanted in (
+        (2.0, [[2.0, 0.0], [0.0, 2.0]]),
+        (3, [[3.0, 0.0], [0.0, 3.0]]),
+        ([0.1, 0.3], [[0.1, 0.0], [0.0, 0.3]]),
+        (torch.tensor([0.5, 0.25]), [[0.5, 0.0], [0.0, 0.25]]),
+        ([[1.0, 0.1], [0.1, 0.2]], [[1.0, 0.1], [0.1, 0.2]]),
+        (torch.tensor([[1.0, 0.5], [0.5, 2.0]]), [[1.0, 0.5], [0.5, 2.0]]),
+    ):
+        cost = adp.QuadraticCost(given, given, 2, 2, terminal=given)  # type: ignore[arg-type]
+        for matrix in (cost.q, cost.r, cost.end):
+            assert matrix is not None
+            assert matrix.dtype == torch.float64
+            assert matrix.tolist() == wanted
+        torch.testing.assert_close(cost.r_inverse @ cost.r, torch.eye(2).double())
+        torch.testing.assert_close(cost.terminal(X), form(tensor(wanted), X))
+    aimed = adp.QuadraticCost(Q, R, 2, 2, terminal=Q, target=torch.tensor([0.5, 0.1]))
+    torch.testing.assert_close(aimed.terminal(X), form(Q, X - torch.tensor([0.5, 0.1]).double()))
+    assert aimed.target is not None
+    assert aimed.target.dtype == torch.float64
+    assert adp.QuadraticCost(Q, R, 2, 2, discount=1).discount == 1.0
+    assert adp.QuadraticCost(Q, R, 2, 2).discount == 0.0
+
+
+def test_many_inputs_have_bounds_where_they_are_not_coupled() -> None:
+    many = torch.eye(5).double()
+    assert adp.QuadraticCost(Q, many, 2, 5, low=-1.0).bounds is not None
+    assert adp.QuadraticCost(Q, many + 0.1, 2, 5).bounds is None
+    four = torch.eye(4).double() + 0.1
+    assert adp.QuadraticCost(Q, four, 2, 4, low=-1.0).bounds is not None
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"target": [1.0]}, r"`QuadraticCost\(target=...\)` must have 2 numbers"),
+        ({"target": [1.0, math.nan]}, r"`QuadraticCost\(target=...\)` must be finite"),
+        ({"target_input": [1.0, 2.0, 3.0]}, r"`QuadraticCost\(target_input=...\)` must have 2 numbers"),
+        ({"target": 3.0}, r"`QuadraticCost\(target=...\)`"),
+        ({"discount": -0.1}, r"`QuadraticCost\(discount=...\)` must not be negative"),
+        (
+            {"terminal": 1.0, "discount": 0.1},
+            r"\(terminal=...\)` must be None beside an output or a discount",
+        ),
+        (
+            {"terminal": 1.0, "output": lambda x: x},
+            r"\(terminal=...\)` must be None beside an output or a disc",
+        ),
+        ({"terminal": -Q}, r"`QuadraticCost\(terminal=...\)` must be positive semidefinite"),
+        ({"output": lambda x: x.sum()}, r"\(output=...\)` must map \(..., 2\) to \(..., p\); got \(\)"),
+        ({"output": lambda x: x.sum(-1)}, r"must map \(..., 2\) to \(..., p\); got \(1,\)"),
+        ({"output": lambda x: x.repeat(2, 1)}, r"must map \(..., 2\) to \(..., p\); got \(2, 2\)"),
+        ({"output": lambda x: 3.0}, r"must map \(..., 2\) to \(..., p\); got 3.0"),
+        ({"state": "Q"}, r"`QuadraticCost\(state=...\)` must be a number"),
+        ({"state": [1.0, 2.0, 3.0]}, r"`QuadraticCost\(state=...\)` must be \(2, 2\)"),
+        ({"state": [[1.0, 2.0], [3.0]]}, r"`QuadraticCost\(state=...\)` must have 2 entries"),
+        ({"state": []}, r"`QuadraticCost\(state=...\)`"),
+    ],
+)
+def test_what_is_no_cost_is_refused(given: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        adp.QuadraticCost(**{"state": Q, "control": R, "dim": 2, "inputs": 2} | given)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"control": COUPLED, "bound": 1.0}, r"`BoundedInputCost\(control=...\)` must be diagonal"),
+        ({"bound": 1.0, "high": 1.0}, r"`BoundedInputCost\(bound=...\)` must be None beside low and high"),
+        ({"bound": 1.0, "low": -1.0}, r"`BoundedInputCost\(bound=...\)` must be None beside low and high"),
+        ({"bound": [1.0, 0.0]}, r"`BoundedInputCost\(bound=...\)` must be positive"),
+        ({"bound": [1.0, 2.0, 3.0]}, r"`BoundedInputCost\(bound=...\)` must"),
+        ({"low": -1.0, "high": math.inf}, r"must be finite, with the input \[0.0, 0.0\] of the set-point"),
+        ({"low": -math.inf, "high": 1.0}, r"must be finite, with the input"),
+        ({"low": -1.0, "high": [0.0, 1.0]}, r"must be finite, with the input"),
+        ({"low": [0.0, -1.0], "high": 1.0}, r"must be finite, with the input"),
+        ({"low": -1.0, "high": 1.0, "target_input": [0.0, 1.0]}, r"with the input \[0.0, 1.0\] of the set-p"),
+        ({}, r"`BoundedInputCost\(bound=...\)` must be given, or low and high"),
+    ],
+)
+def test_what_is_no_smooth_bound_is_refused(given: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        adp.BoundedInputCost(**{"state": Q, "control": R, "dim": 2, "inputs": 2} | given)
