@@ -124,7 +124,7 @@ def test_a_row_is_regularised_more_where_nothing_pays_and_less_where_a_step_does
     assert plan.cost[[1, 2, 3, 4, 6, 7]].tolist() == pytest.approx(
         [1.0, 1.0 - TOLERANCE, 1.0, 0.5, -1.0, 0.9]
     )
-    assert plan.control[[1, 2, 3, 4, 7], 0, 0].tolist() == [0.0, 1.0, 0.0, 1.0, 1.0]
+    assert plan.control[[1, 2, 3, 4, 7], 0, 0].tolist() == [0.0, 1.0, 0.0, 5.0, 1.0]
     assert search.derived[:3] == [[1, 2, 3, 4, 5, 6, 7], [5, 7], [5]]  # what did not move keeps its own
 
 

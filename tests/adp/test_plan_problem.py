@@ -311,6 +311,15 @@ def test_slopes_of_a_period_are_those_of_what_it_costs() -> None:
         torch.testing.assert_close(b[k], ahead[1])
 
 
+def test_an_angle_presses_the_shorter_way_around() -> None:
+    plan = problem(Cart(periodic=(0,)), adp.QuadraticCost(Q, R, 3, 2), 3, (idle, idle))
+    x, t, turn = start(), torch.zeros(2).double(), tensor([2 * math.pi, 0.0, 0.0])
+    slope, bend = plan._stage(x, x[:, :0], t)
+    torch.testing.assert_close(slope, 2 * HOLD * x @ Q)
+    torch.testing.assert_close(bend, (2 * HOLD * Q).expand(2, 3, 3))
+    torch.testing.assert_close(plan._stage(x + turn, x[:, :0], t)[0], slope)
+
+
 def test_a_margin_that_is_just_kept_neither_costs_nor_presses() -> None:
     plan = problem(Cart(), adp.QuadraticCost(Q, R, 3, 2), 3, (lambda x, t: x[:, 0] + 0 * t, idle))
     x, t = tensor([[0.3, 1.0, 0.0], [0.0, 1.0, 0.0]]), torch.zeros(2).double()
