@@ -108,7 +108,7 @@ class Bank:
 
     def clear(self, rows: Tensor) -> None:
         """Let the streams with these numbers begin anew."""
-        part = self.table[rows]
+        part = self.table.new_zeros(len(rows), self.table.shape[1])  # what was counted included
         for stream in self._definition.each(part):
             self._definition.clear(stream)
         self.table[rows] = part

@@ -37,7 +37,7 @@ class FunctionPointers(ctypes.Structure):
         assert functions.rate is not None
         # C = P'L^-T is upper triangular in the order of the pivots, in which compiled code has the centers
         leading = (functions.shared == 0).long().cumprod(1).sum(1)
-        order = leading.argsort(stable=True)
+        order = leading.argsort()
         newton, offsets = functions.shared[order].contiguous(), functions.offsets.double()[order].contiguous()
         assert not newton.tril(-1).any()
         zero = torch.zeros_like(offsets[0])

@@ -63,11 +63,10 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
     def drop(self, streams: Any) -> Self:
         """Give up the streams with these numbers; the others close ranks."""
         gone = self._numbers("drop", streams)
-        stays = torch.ones(self._fitted("drop").n_streams_ or 1, dtype=torch.bool)
-        stays[gone] = False
-        if self.n_streams_ is None or not bool(stays.any()):
+        every = torch.arange(self._streams_.count)
+        rows = every[~torch.isin(every, gone)]
+        if self.n_streams_ is None or not len(rows):
             raise fail(self._call("drop"), "streams", "must leave a stream", streams)
-        rows = stays.nonzero().squeeze(-1)
         self._streams_.keep(rows)
         self._tuning = None if self._tuning is None else self._tuning.keep(rows)
         return self._resized()
@@ -140,7 +139,7 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
                 raise ValueError(f"`{name}(state=...)` {told}, this one {value}.")
         leading = () if streams is None else (streams,)
         x = torch.zeros(*leading, state["n_features_in_"], dtype=dtype)
-        twin._prepare(x, torch.zeros((*leading, *(() if outputs is None else (outputs,))), dtype=dtype))
+        twin._prepare(x, x.new_zeros((*leading, *(() if outputs is None else (outputs,)))))
         twin._streams_.load_state_dict(state)
         self.reset()
         vars(self).update({k: v for k, v in vars(twin).items() if k.endswith("_") or k == "_tuning"})

@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import importlib.util
 import math
+import sys
+import types
+from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 import staf_torch as st
 from staf_torch.online import RiverRegressor
+from staf_torch.online.scikit import NotFittedError
 
 EXPECTED = {
     "check_fit2d_predict1d": "a single point (n,) is a prediction of one stream",
@@ -104,9 +109,115 @@ def test_a_score_is_that_of_scikit_learn_for_constant_targets_too() -> None:
         return np.mean(scores)
 
     x = draw.standard_normal((40, 2))
-    for y in (np.sin(x[:, 0]), np.full(40, 3.0), np.stack([np.sin(x[:, 0]), np.full(40, 3.0)], 1)):
+    for y in (
+        np.sin(x[:, 0]),
+        1e-2 * np.sin(x[:, 0]),
+        np.full(40, 3.0),
+        np.stack([np.sin(x[:, 0]), np.full(40, 3.0)], 1),
+    ):
         model = st.StaFRegressor(noise=0.1).fit(x, y)
         for truth in (y, y + 2.0**-10):
             for weight in (None, 2.0 ** draw.integers(-1, 2, 40)):
                 wanted = r2(truth, model.predict(x), weight)
                 assert model.score(x, truth, weight) == pytest.approx(wanted, rel=1e-9, abs=1e-12)
+
+
+class Tag:
+    """Of scikit-learn, whatever it is: what it was made with."""
+
+    def __init__(self, **given: Any) -> None:
+        self.given = given
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Tag) and other.given == self.given
+
+    __hash__ = None  # type: ignore[assignment]
+
+
+def test_tags_say_that_several_targets_gaps_and_streams_are_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    names = ("InputTags", "RegressorTags", "Tags", "TargetTags")
+    monkeypatch.setitem(sys.modules, "sklearn", types.ModuleType("sklearn"))
+    utils = types.SimpleNamespace(**dict.fromkeys(names, Tag))
+    monkeypatch.setitem(sys.modules, "sklearn.utils", utils)  # type: ignore[arg-type]
+    assert st.StaFRegressor().__sklearn_tags__() == Tag(
+        estimator_type="regressor",
+        target_tags=Tag(required=True, multi_output=True, single_output=True),
+        regressor_tags=Tag(poor_score=True),  # of one that meets a shuffled table
+        input_tags=Tag(two_d_array=True, three_d_array=True, allow_nan=True),
+        non_deterministic=False,
+    )
+
+
+def test_a_regressor_without_a_sample_says_so_as_scikit_learn_does_where_that_is(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    class UnfittedError(Exception):
+        pass
+
+    monkeypatch.setitem(
+        sys.modules, "sklearn.exceptions", types.SimpleNamespace(NotFittedError=UnfittedError)
+    )  # type: ignore[arg-type]
+    with pytest.raises(UnfittedError, match=r"`StaFRegressor.predict` needs a first sample"):
+        st.StaFRegressor().predict(np.zeros(2))
+    monkeypatch.delitem(sys.modules, "sklearn.exceptions")
+    with pytest.raises(NotFittedError, match="needs a first sample") as told:
+        st.StaFRegressor().predict(np.zeros(2))
+    assert isinstance(told.value, ValueError)
+    assert isinstance(told.value, AttributeError)
+
+
+def test_parameters_are_the_arguments_and_those_of_the_kernel() -> None:
+    model = st.StaFRegressor(st.PolynomialKernel(3, 0.5), 0.4, memory=200)
+    own = model.get_params(deep=False)
+    assert list(own)[:3] == ["kernel", "radius", "count"]
+    assert "self" not in own
+    assert model.get_params() == own | {"kernel__degree": 3, "kernel__bias": 0.5}
+    assert repr(model).startswith(
+        f"StaFRegressor(kernel={model.kernel!r}, radius=0.4, count=None, centers=None,"
+    )
+    assert "kernel__" not in repr(model)
+    assert repr(model).endswith("memory=200, neighbours=56)")
+    assert st.StaFRegressor("matern").get_params() == st.StaFRegressor("matern").get_params(deep=False)
+    named = st.StaFRegressor("gaussian").set_params(kernel__width=0.25, noise=0.5)
+    assert isinstance(named.kernel, st.GaussianKernel)
+    assert (named.get_params()["kernel__width"], named.noise) == (0.25, 0.5)
+    grown = model.set_params(kernel__bias=2.0).kernel
+    assert isinstance(grown, st.PolynomialKernel)
+    assert (grown.degree, float(grown.bias)) == (3, 2.0)
+    wide = st.StaFRegressor(st.GaussianKernel(torch.tensor([0.5, 2.0])))
+    assert wide.get_params()["kernel__width"].tolist() == [0.5, 2.0]
+    with pytest.raises(ValueError, match=r"set_params\(params=...\)` must be one of \[\]"):
+        st.StaFRegressor("cubic").set_params(kernel__width=1.0)
+    with pytest.raises(ValueError, match=r"must be one of \['degree', 'bias'\]"):
+        model.set_params(kernel__width=1.0)
+
+
+def test_the_adapter_registers_with_river_and_keeps_to_one_model(monkeypatch: pytest.MonkeyPatch) -> None:
+    registered: list[type] = []
+    river = types.SimpleNamespace(Regressor=types.SimpleNamespace(register=registered.append))
+    monkeypatch.setitem(sys.modules, "river.base", river)  # type: ignore[arg-type]
+    adapter = RiverRegressor()
+    assert registered == [RiverRegressor]
+    assert adapter.model.memory == 500
+    assert adapter._supervised
+    monkeypatch.delitem(sys.modules, "river.base")
+    model = st.StaFRegressor("matern", 0.4)
+    adapter = RiverRegressor(model)
+    assert registered == [RiverRegressor]
+    assert adapter.model is model
+    assert adapter.predict_one({"a": 1}) == 0.0
+    for k in range(6):
+        assert adapter.learn_one({"a": 0.1 * k, 7: 1}, 1e-9 + k) is adapter
+    assert adapter.features == ("a", 7)
+    row = adapter._row({7: 0.1})
+    assert (row.dtype, row[1]) == (torch.float64, 0.1)
+    assert math.isnan(float(row[0]))
+    again = st.StaFRegressor("matern", 0.4)
+    for k in range(6):
+        again.partial_fit([0.1 * k, 1.0], np.float64(1e-9 + k))
+    assert adapter.predict_one({7: 1.0, "a": 0.25}) == float(again.predict([0.25, 1.0]))
+    clone = adapter.clone()
+    assert clone.model is not model
+    assert (clone.features, clone.predict_one({"a": 1}), clone.model.radius) == ((), 0.0, 0.4)
+    other = st.StaFRegressor(radius=0.1)
+    assert adapter.clone({"model": other}).model is other

@@ -1,0 +1,141 @@
+"""The compiled filter is its definition, sample by sample, wherever a rule decides."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from helpers import tensor
+from torch import Tensor
+
+import staf_torch as st
+from staf_torch.online.compiled_filter import CompiledFilter
+from staf_torch.online.kalman_filter import LANES, LocalFilter, StreamState
+from staf_torch.online.local_functions import LocalFunctions
+
+FUNCTIONS = LocalFunctions.of(st.GaussianKernel(0.8), 0.5 * st.rings(6))
+INF, NAN = math.inf, math.nan
+
+
+def path(steps: int) -> Tensor:
+    time = 0.21 * torch.arange(steps, dtype=torch.float64)
+    return torch.stack((time.sin(), (1.4 * time).cos()), -1)
+
+
+def targets(tiny: float) -> dict[str, list[float]]:
+    """Streams of values, each of which meets a rule of what is believed; ``tiny`` is the least share."""
+    usual = [0.4, -0.2, 0.5, 0.3, -0.1]
+    most = 0.5 / tiny
+    return {
+        "out of proportion": [
+            *usual,
+            most * 1.01,
+            0.4,
+            most,
+            0.1,
+            *[-1.1 * most] * 3,
+            0.0,
+            *[2 * most] * 6,
+            0.3,
+        ],
+        "small": [*usual, 0.5 * tiny, 0.2, *[0.4 * tiny] * 3, 0.0, *[-0.3 * tiny] * 6, *usual],
+        "both": [*usual, *[2 * most, 0.3 * tiny] * 5, *usual],
+        "at once": [0.3, 3 / tiny, 0.2, 3 / tiny],
+        "zeros at first": [0.0] * 5 + [4.0 / tiny, 0.1, 2.0],
+        "zeros alone": [0.0] * 45,
+        "outliers": [*usual, 9.0, *usual, *usual, -9.0, *usual, 9.0, *usual, *usual, 30.0, *usual],
+        "gaps": [NAN, NAN, 0.3, 0.2, NAN, INF, 0.1, -INF, 0.3, *usual],
+        "huge at first": [0.0, 0.0, 1e150 if tiny < 1e-5 else 1e15, 0.0, 0.1],
+    }
+
+
+def states(steps: int) -> dict[str, Tensor]:
+    """Paths: smooth; at exactly the distance at which centers follow; jumps; what was not measured."""
+    smooth = path(steps)
+    edge = torch.zeros(steps, 2, dtype=torch.float64)
+    edge[1::4, 0], edge[2::4, 1] = 0.5, -0.5
+    jumps = smooth.clone()
+    jumps[3::7] += 20.0
+    jumps[5::11] += 1e9
+    holes = smooth.clone()
+    holes[::5, 0], holes[2::6, 1], holes[7::8] = NAN, NAN, NAN
+    holes[9::10, 1] = INF
+    return {"smooth": smooth, "edge": edge, "jumps": jumps, "holes": holes}
+
+
+@pytest.mark.needs_compiler
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize("robust", [INF, 2.0])
+def test_compiled_filter_is_its_definition(robust: float, dtype: torch.dtype) -> None:
+    lists = targets(float(torch.finfo(dtype).eps) ** 0.5)
+    steps = max(map(len, lists.values()))
+    paths = states(steps)
+    rows = [(x, y) for x in paths.values() for y in lists.values()]
+    streams = len(rows)
+    x = torch.stack([path for path, _ in rows], 1).to(dtype)
+    y = torch.stack([tensor([*one, *[0.3] * (steps - len(one))]) for _, one in rows], 1).to(dtype)
+    ratio = torch.linspace(1e-3, 0.1, streams, dtype=torch.float64)
+    forgetting = torch.linspace(0.9, 1.0, streams, dtype=torch.float64)
+    definition = LocalFilter(FUNCTIONS, ratio, forgetting, 0.5, robust, 0.25)
+    like = torch.zeros(0, dtype=dtype)
+    fast, slow = (StreamState.empty(like, streams, 2, 6, 1) for _ in range(2))
+    compiled = CompiledFilter.build(definition, fast)
+    assert isinstance(compiled, CompiledFilter)
+    near = {
+        "rtol": 1e-4 if dtype == torch.float32 else 1e-6,
+        "atol": 1e-6 if dtype == torch.float32 else 1e-9,
+    }
+    for k in range(steps):
+        at = x[k].contiguous()
+        lapse = None if k % 3 else torch.linspace(0.0, 3.0, streams, dtype=torch.float64)
+        for found, expected in zip(compiled.predict(fast, at), definition.predict(slow, at), strict=True):
+            torch.testing.assert_close(found, expected, equal_nan=True, **near)
+        told = y[k].unsqueeze(-1).contiguous()
+        compiled.learn(fast, at, told, lapse)
+        definition.learn(slow, at, told, lapse)
+        assert torch.equal(fast.counts, slow.counts)
+        for name, found, expected in zip(
+            ("anchor", "last", "mean", "learned", "errors", "largest"),
+            fast.parts(fast.table),
+            slow.parts(slow.table),
+            strict=True,
+        ):
+            size = expected.nan_to_num().abs().flatten(0, -2).amax(0).clamp(min=1e-30)
+            torch.testing.assert_close(
+                found / size,
+                expected / size,
+                equal_nan=True,
+                msg=lambda told, name=name, k=k: f"{name} {k}: {told}",
+                **near,
+            )
+        slow.blocks.copy_(fast.blocks)  # a step from equal states: rounding does not add up
+    assert int(fast.counts[1].min()) == 0
+    assert int(fast.counts[1].max()) > 10
+    assert bool((fast.counts[3] < fast.counts[0]).any())  # some began afresh
+
+
+def test_numbers_of_streams_stand_together_and_come_back() -> None:
+    for streams in (1, LANES - 1, LANES, LANES + 1, 2 * LANES):
+        state = StreamState.empty(torch.zeros(0, dtype=torch.float32), streams, 2, 3, 2)
+        assert state.blocks.shape == (-(-streams // LANES), 2 * 2 + 2 * 3 + 6 + 2 + 1, LANES)
+        assert (state.streams, state.sizes, state.dtype) == (streams, (2, 3, 2), torch.float32)
+        assert state.table[:4].isnan().all()
+        assert not state.table[4:].any()
+        assert (state.counts.shape, state.counts.dtype) == ((4, streams), torch.int64)
+        table = torch.arange(19.0 * streams).reshape(19, streams)
+        state.put(table.double())
+        assert torch.equal(state.table, table)
+        assert torch.equal(state.blocks.transpose(0, 1).flatten(1)[:, :streams], table)
+        parts = state.parts(state.table)
+        assert torch.equal(state.whole(parts), table)
+        assert torch.equal(parts.learned, parts.learned.transpose(0, 1))
+        assert torch.equal(parts.learned[2, 0], table[4 + 6 + 3])  # below the diagonal, row by row
+        assert torch.equal(state.mean, table[4:10].unflatten(0, (2, 3)))
+        assert torch.equal(state.anchor, table[:2])
+        assert torch.equal(parts.last, table[2:4])
+        assert torch.equal(parts.errors, table[16:18])
+        assert torch.equal(parts.largest, table[18:])
+        other = state.with_table(table[:, :1], state.counts[:, :1])
+        assert torch.equal(other.table, table[:, :1])
+        assert other.counts.is_contiguous()

@@ -1,0 +1,295 @@
+"""How streams come, go, are saved and loaded; what shapes they keep to; which arguments decide."""
+
+from __future__ import annotations
+
+import math
+import pickle
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from helpers import tensor, uniform
+
+import staf_torch as st
+from staf_torch.online.compiled_filter import CompiledFilter, FunctionPointers
+from staf_torch.online.filter_arguments import Sizes, directions, filter_streams
+from staf_torch.online.local_functions import LocalFunctions
+
+BANK: dict[str, Any] = {"memory": 128, "neighbours": 8}
+
+
+def data(steps: int, *streams: int, outputs: int | None = None) -> tuple[torch.Tensor, torch.Tensor]:
+    """A stream of two inputs, or several, with one value or several."""
+    x = 0.4 * uniform(steps, *streams, 2, seed=1)
+    y = (2 * x).sin().sum(-1)
+    return x, y if outputs is None else torch.stack([y * (k + 1) for k in range(outputs)], -1)
+
+
+def test_fit_and_tune_forget_what_was_learned() -> None:
+    x, y = data(12)
+    model = st.StaFRegressor(radius=0.4)
+    fresh = model.fit(x[:6], y[:6]).predict(x[-1])
+    assert torch.equal(model.fit(x, y).fit(x[:6], y[:6]).predict(x[-1]), fresh)
+    assert int(model.n_samples_seen_) == 6
+    for each in (model, st.StaFRegressor(**BANK).fit(x, y)):
+        with pytest.raises(ValueError, match=r"`StaFRegressor.predict` needs a first sample"):
+            each.tune(x, y).predict(x[0])
+
+
+def test_streams_that_are_not_there_cannot_go_come_or_begin_anew() -> None:
+    x, y = data(3, 4)
+    model = st.StaFRegressor(radius=0.4)
+    for name, given in (("reset", ([0],)), ("drop", ([0],)), ("add", (1,)), ("state_dict", ())):
+        with pytest.raises(ValueError, match=rf"`StaFRegressor.{name}` needs a first sample: call `fit`"):
+            getattr(model, name)(*given)
+    model.fit(x, y)
+    for wrong in ([4], [-1], [0, 4], [0.0], [0.5, 1.5], [True], 9):
+        for name in ("reset", "drop"):
+            with pytest.raises(
+                ValueError, match=rf"`StaFRegressor.{name}\(streams=...\)` must be numbers of"
+            ):
+                getattr(model, name)(wrong)
+    with pytest.raises(ValueError, match="streams from 0 to 3; got"):
+        model.drop([4])
+    with pytest.raises(ValueError, match=r"`StaFRegressor.drop\(streams=...\)` must leave a stream"):
+        model.drop([0, 1, 2, 3])
+    for count in (0, -1, 1.5):
+        with pytest.raises(ValueError, match=r"`StaFRegressor.add\(streams=...\)`"):
+            model.add(count)  # type: ignore[arg-type]
+    assert model.n_samples_seen_.tolist() == [3] * 4
+    single = st.StaFRegressor(radius=0.4).fit(x[:, 0], y[:, 0])
+    for gone in ([], [0]):
+        with pytest.raises(ValueError, match="must leave a stream"):
+            single.drop(gone)
+    with pytest.raises(ValueError, match=r"`StaFRegressor.add` needs streams side by side, x \(S, n\)"):
+        single.add()
+    assert single.n_samples_seen_.shape == ()
+
+
+@pytest.mark.parametrize("settings", [{"radius": 0.4}, BANK, {"radius": 0.4, "scaling": True}])
+def test_streams_keep_their_numbers_outputs_and_order(settings: dict[str, Any]) -> None:
+    x, y = data(6, 4, outputs=2)
+    model = st.StaFRegressor(**settings).fit(x, y)
+    before = model.predict(x[-1])
+    assert before.shape == (4, 2)
+    assert model.drop([3, 1]) is model
+    assert (model.n_streams_, model.n_outputs_, model.n_features_in_) == (2, 2, 2)
+    torch.testing.assert_close(model.predict(x[-1, [0, 2]]), before[[0, 2]], rtol=1e-9, atol=1e-12)
+    assert model.add() is model
+    assert model.n_streams_ == 3
+    assert model.n_samples_seen_.tolist() == [6, 6, 0]
+    model.partial_fit(x[0, :3], y[0, :3])
+    assert model.reset(streams=np.array([2, 0, 0])) is model
+    assert model.n_samples_seen_.tolist() == [0, 7, 0]
+    assert model.n_skipped_.tolist() == [0, 0, 0]
+    assert model.predict(x[:0, :3].transpose(0, 1)).shape == (3, 0, 2)
+    assert model.reset(streams=1).n_samples_seen_.tolist() == [0, 0, 0]
+
+
+@pytest.mark.parametrize("settings", [{"radius": 0.4}, BANK])
+def test_samples_of_another_shape_are_refused_and_leave_the_streams_alone(settings: dict[str, Any]) -> None:
+    cases: list[tuple[tuple[Any, ...], list[tuple[tuple[int, ...], tuple[int, ...]]]]] = [
+        (((2,), ()), [((2,), (2,)), ((2,), (1,)), ((3,), ()), ((1, 2), (1,))]),
+        (((2,), (2,)), [((2,), ()), ((2,), (3,)), ((3,), (3,))]),
+        (((3, 2), (3,)), [((3, 2), (3, 2)), ((3, 2), (3, 1)), ((4, 2), (4,)), ((3, 3), (3,)), ((2,), ())]),
+        (((3, 2), (3, 1)), [((3, 2), (3,)), ((3, 2), (3, 2)), ((3, 1), (3, 1)), ((3, 3), (3, 1))]),
+    ]
+    for (of_x, of_y), wrong in cases:
+        model = st.StaFRegressor(**settings).partial_fit(torch.rand(of_x).double(), torch.rand(of_y).double())
+        for other_x, other_y in wrong:
+            x, y = torch.rand(other_x).double(), torch.rand(other_y).double()
+            with pytest.raises(ValueError, match=r"`StaFRegressor.partial_fit\(x=...\)` must have") as told:
+                model.partial_fit(x, y)
+            kept = f"the shape {of_x} of the first sample, with {of_x[-1]} features, and y {of_y}"
+            given = f"got the shape {other_x} and y's {other_y}: X has {other_x[-1]} features, but"
+            assert kept in str(told.value)
+            assert given in str(told.value)
+            if other_x != of_x and len(other_x) <= len(of_x):  # one more is of several points
+                with pytest.raises(ValueError, match=r"predict\(x=...\)` must have the shape") as told:
+                    model.predict(x)
+                assert f"got the shape {other_x}: X has {other_x[-1]} features" in str(told.value)
+        points = (*of_x[:-1], 5, of_x[-1])
+        assert model.predict(torch.zeros(points)).shape == (*of_x[:-1], 5, *of_y[len(of_x) - 1 :])
+        for other in ((*points[:-1], 4), (7, *points)):
+            with pytest.raises(ValueError, match=r"predict\(x=...\)` must have the shape"):
+                model.predict(torch.zeros(other))
+        assert int(model.n_samples_seen_.sum()) == (of_x[0] if len(of_x) == 2 else 1)
+
+
+@pytest.mark.parametrize("settings", [{"radius": 0.4}, {"radius": 0.4, "scaling": True}, BANK])
+def test_samples_in_any_form_are_the_same_samples(settings: dict[str, Any]) -> None:
+    """Rows of a transposed tensor, numbers that ask for a gradient, arrays, single precision."""
+    x, y = (part.float().double() for part in data(14, 3))
+    across = x.transpose(1, 2).contiguous().transpose(1, 2)
+    forms: dict[str, Any] = {
+        "rows": lambda k: (across[k], y[k]),
+        "with a gradient": lambda k: (x[k].clone().requires_grad_(), y[k].clone().requires_grad_()),
+        "arrays": lambda k: (x[k].numpy(), y[k].numpy()),
+        "single": lambda k: (x[k].float(), y[k].float()),
+        "targets every other": lambda k: (x[k], torch.stack((y[k], y[k]), -1)[:, 0]),
+        "lists": lambda k: (x[k].tolist(), y[k].tolist()),
+    }
+    plain = st.StaFRegressor(**settings)
+    for k in range(13):
+        plain.partial_fit(x[k], y[k])
+    wanted = plain.predict(x[13], return_std=True)
+    for form in forms.values():
+        model = st.StaFRegressor(**settings).partial_fit(x[0], y[0])
+        for k in range(1, 13):
+            model.partial_fit(*form(k))
+        for one, other in zip(model.predict(form(13)[0], return_std=True), wanted, strict=True):
+            assert torch.equal(torch.as_tensor(one).double(), other)
+    half = st.StaFRegressor(**settings).partial_fit(x[0].half(), y[0].half())
+    assert half.state_dict()["dtype"] == "torch.float64"
+
+
+def test_times_and_lapses_are_the_same_thing() -> None:
+    x, y = data(9, 2)
+    time = torch.tensor([0.0, 1.0, 1.5, 4.0, 4.0, 9.0, 9.5, 30.0, 31.0]).double()
+    settings: dict[str, Any] = {"radius": 0.4, "forgetting": 0.8}
+    whole = st.StaFRegressor(**settings).fit(x, y, time=time)
+    even = st.StaFRegressor(**settings).fit(x, y)
+    each = st.StaFRegressor(**settings)
+    for k in range(9):
+        each.partial_fit(x[k], y[k], lapse=1.0 if k == 0 else time[k] - time[k - 1])
+    assert torch.equal(whole.predict(x[0]), each.predict(x[0]))
+    assert float((whole.predict(x[0]) - even.predict(x[0])).abs().min()) > 1e-6
+    several = st.StaFRegressor(**settings).fit(x, y, time=torch.stack((time, torch.arange(9.0)), 1))
+    torch.testing.assert_close(
+        several.predict(x[0]), torch.stack((whole.predict(x[0])[0], even.predict(x[0])[1]))
+    )
+    alone = st.StaFRegressor(**settings).fit(x[:, 0], y[:, 0])
+    with pytest.raises(ValueError, match=r"lapse=...\)` must be finite and not negative, \(\) or \(1,\)"):
+        alone.partial_fit(x[0, 0], y[0, 0], lapse=[1.0, 1.0])
+    mean, _ = even.smooth(x[:1], y[:1])
+    assert mean.shape == (1, 2)  # a record of one sample
+
+
+def test_a_state_is_that_of_the_last_arguments_and_of_nothing_before() -> None:
+    x, y = data(40)
+    bank = st.StaFRegressor(**BANK).fit(x[:9], y[:9])
+    model = st.StaFRegressor(radius=0.4).fit(x, y).set_params(**BANK, radius=0.5)
+    assert hasattr(model, "centers_offsets_")
+    assert model.load_state_dict(bank.state_dict()) is model
+    assert not hasattr(model, "centers_offsets_")
+    assert torch.equal(model.predict(x[9]), bank.predict(x[9]))
+    plain = st.StaFRegressor(radius=0.4).fit(x, y)
+    tuned = st.StaFRegressor(radius=0.4).tune(x, y)
+    tuned.load_state_dict(plain.state_dict())
+    assert tuned._tuning is None
+    assert torch.equal(tuned.predict(x[9]), plain.predict(x[9]))
+    unfitted = pickle.loads(pickle.dumps(st.StaFRegressor(radius=0.3)))
+    assert repr(unfitted) == repr(st.StaFRegressor(radius=0.3))
+    assert not unfitted.__sklearn_is_fitted__()
+    assert plain.__sklearn_is_fitted__()
+
+
+def test_a_state_that_lacks_something_is_refused_by_what_it_lacks() -> None:
+    x, y = data(5, 2)
+    for settings in ({"radius": 0.4}, BANK):
+        model = st.StaFRegressor(**settings)
+        state = model.fit(x, y).state_dict()
+        told = r"`StaFRegressor.load_state_dict\(state=...\)` must"
+        for name in ("dtype", "n_streams_", "table"):
+            less = {key: value for key, value in state.items() if key != name}
+            with pytest.raises(
+                ValueError, match=rf"{told} be what `state_dict` returned; it has no \['{name}'\]"
+            ):
+                model.load_state_dict(less)
+        with pytest.raises(ValueError, match=rf"{told} be what .* returned; its dtype is 'torch.int8'"):
+            model.load_state_dict(state | {"dtype": "torch.int8"})
+        for table in (None, 3.0):
+            with pytest.raises(ValueError, match=rf"{told} have a tensor 'table'"):
+                model.load_state_dict(state | {"table": table})
+        for table in (state["table"][0], state["table"][:, :-1], state["table"][:-1]):
+            with pytest.raises(ValueError, match=rf"{told} have"):
+                model.load_state_dict(state | {"table": table.contiguous()})
+        other = {**state["arguments"], "memory": 3.0}
+        with pytest.raises(ValueError, match=rf"{told} be of .* it has memory=3.0, this one (None|128.0)"):
+            model.load_state_dict(state | {"arguments": other})
+    assert all(value is None or type(value) is float for value in state["arguments"].values())
+
+
+def model_of(**given: Any) -> Any:
+    return st.StaFRegressor(**given).partial_fit(tensor([0.0, 0.1]), tensor(1.0))
+
+
+def test_arguments_are_taken_at_their_edges_and_not_beyond() -> None:
+    finest = 2.0**-23  # 64 times the precision, as a variance
+    for amplitude in (1.0, 4.0):
+        model_of(noise=finest * amplitude, amplitude=amplitude)
+        with pytest.raises(
+            ValueError, match=r"noise=...\)` must be at least 1.2e-07 amplitude in torch.float64"
+        ):
+            model_of(noise=finest * amplitude * (1 - 1e-15), amplitude=amplitude)
+    model_of(forgetting=1.0, follow=0.0)
+    for name, value in (("forgetting", 1 + 1e-15), ("forgetting", -0.1), ("follow", -1e-300)):
+        with pytest.raises(ValueError, match=rf"\({name}=...\)` must (be in \(0, 1\]|not be negative)"):
+            model_of(**{name: value})
+    assert model_of(kernel="matern", count=1).centers_offsets_.shape == (1, 2)
+    single = LocalFunctions.of(st.GaussianKernel(), tensor([[0.3, 0.4]]))
+    assert FunctionPointers.of(single)[0].reach == 0.5
+    model_of(**BANK)
+    with pytest.raises(ValueError, match=r"memory=...\)` must be at least 128"):
+        model_of(memory=127)
+
+
+@pytest.mark.parametrize("count", [3, 6, 10, 15, 21, 28])
+def test_counts_of_rings_are_rings_in_the_plane(count: int) -> None:
+    assert torch.equal(directions(st.StaFRegressor(count=count), 2), st.rings(count))
+
+
+def test_centers_are_directions_in_the_closed_ball() -> None:
+    edge = [[1.0, 1e-9**0.5], [0.0, 0.0]]
+    model = model_of(kernel="matern", centers=edge, radius=0.25)
+    assert torch.equal(model.centers_offsets_, 0.25 * tensor(edge))
+    outside = [[0.0, 0.5], [(1 + 1.5e-9) ** 0.5, 0.0]]
+    for wrong in (outside, [[0.5, 0.5, 0.0]], [0.5, 0.5], [[[0.5, 0.5]]], [[math.nan, 0.0]]):
+        with pytest.raises(
+            ValueError, match=r"centers=...\)` must be directions \(M, 2\) in the closed unit"
+        ):
+            model_of(centers=wrong)
+
+
+def test_what_was_tuned_holds_for_as_many_streams_and_outputs_alone() -> None:
+    x, y = data(30)
+    tuned = st.StaFRegressor(radius=0.4).tune(x, y)
+    found = tuned._tuning
+    assert found is not None
+    for robust in (None, 3.0):
+        tuned.set_params(robust=robust).fit(x, y)
+        definition = tuned._streams_.definition  # type: ignore[union-attr]
+        assert definition.robust == (math.inf if robust is None else robust)
+        assert torch.equal(definition.ratio, found.ratio)
+        assert torch.equal(tuned.centers_offsets_, definition.functions.offsets)
+        torch.testing.assert_close(tuned.centers_offsets_, found.radius[0] * st.rings(6))
+    tuned.set_params(robust=None)
+    for of_x, of_y in ((x[:, None].repeat(1, 2, 1), y[:, None].repeat(1, 2)), (x, torch.stack((y, y), 1))):
+        untuned = st.StaFRegressor(radius=0.4).fit(of_x, of_y)
+        assert torch.equal(tuned.fit(of_x, of_y).predict(of_x[3]), untuned.predict(of_x[3]))
+
+
+@pytest.mark.needs_compiler
+def test_a_filter_is_compiled_where_its_kernel_and_numbers_allow() -> None:
+    for kernel, dtype, count, compiled in (
+        ("gaussian", torch.float64, 6, True),
+        ("gaussian", torch.float32, 6, True),
+        ("gaussian", torch.float64, 67, False),
+        ("matern", torch.float64, 6, False),
+        ("exponential", torch.float64, 6, False),
+    ):
+        model = st.StaFRegressor(kernel, 0.4, count)
+        streams, offsets = filter_streams(model, Sizes(2, 2, 1), torch.zeros(0, dtype=dtype), False)
+        assert isinstance(streams._filter, CompiledFilter) == streams.compiled == compiled
+        assert streams.dtype == dtype
+        assert offsets.shape == (count, 2)
+
+
+def test_a_kernel_that_is_learned_elsewhere_asks_for_no_gradient_here() -> None:
+    kernel = st.MaternKernel(2.5, torch.nn.Parameter(torch.tensor(0.8)))
+    model = st.StaFRegressor(kernel, 0.4).partial_fit(tensor([0.3, 0.1]), tensor(1.0))
+    assert not any(part.requires_grad for part in model.predict(tensor([0.3, 0.2]), return_std=True))
+    functions = model._streams_.definition.functions  # type: ignore[union-attr]
+    assert functions.shared is not None
+    assert not functions.shared.requires_grad
