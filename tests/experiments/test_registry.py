@@ -1,0 +1,150 @@
+"""How an experiment is found by its name or path, what a batch shares, and small numbers."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any, ClassVar
+
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+from staf_torch.experiments import registry
+from staf_torch.experiments.registry import (
+    EXPERIMENTS,
+    BatchedExperiment,
+    check_animation,
+    experiment,
+    finite,
+)
+
+
+class Mine(BatchedExperiment[Any]):
+    """Batches over a number, a group and a list."""
+
+    batchable: ClassVar[frozenset[str]] = frozenset({"number", "group.*", "group.inner.*", "plain.dotted"})
+
+    def __call__(self, cfg: Any, directory: Path, progress: Any = None) -> dict[str, float | None]:
+        return {}
+
+    def solve(self, cfgs: Any, progress: Any) -> list[Any]:
+        return []
+
+    def write(self, cfg: Any, directory: Path, solution: Any) -> dict[str, float | None]:
+        return {}
+
+
+class Moving(Mine):
+    """Has something that moves."""
+
+    animates = True
+
+
+not_callable = 3
+
+
+def plain(cfg: Any, directory: Path, progress: Any = None) -> dict[str, float | None]:
+    """A function is an experiment as it is."""
+    return {}
+
+
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_every_name_is_that_of_something_that_is_called_like_an_experiment(name: str) -> None:
+    found = experiment(name)
+    assert callable(found)
+    assert not isinstance(found, type)
+    moves = ("gradient_chase", "adp", "adp_tracking", "avoidance")
+    assert bool(getattr(found, "animates", False)) == (name in moves)
+    assert isinstance(found, BatchedExperiment) == (name in ("gradient_chase", "adp"))
+
+
+def test_an_experiment_of_ones_own_is_found_by_its_path() -> None:
+    assert experiment(f"{__name__}.plain") is plain
+    made = experiment(f"{__name__}.Mine")
+    assert isinstance(made, Mine)
+    assert made.animates is False
+    assert made.shape({}) is None
+    assert made.size({}) == 0
+
+
+@pytest.mark.parametrize(
+    ("task", "words"),
+    [
+        ("no such one", "must be one of 'gradient_chase'"),
+        (3, "must be one of 'gradient_chase'"),
+        (None, "must be one of 'gradient_chase'"),
+        ("no_such_module.run", r"cannot be imported \(No module named 'no_such_module'\)"),
+        (f"{__name__}.nothing", "cannot be imported .*has no attribute 'nothing'"),
+        (".run", "cannot be imported"),
+        (f"{__name__}.not_callable", "must be an experiment, which can be called"),
+    ],
+)
+def test_what_is_no_experiment_is_refused(task: object, words: str) -> None:
+    with pytest.raises(ValueError, match=rf"`staf task=...` {words}"):
+        experiment(task)
+
+
+def test_an_error_of_the_package_itself_is_not_that_of_a_setting(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(registry, "EXPERIMENTS", {"broken": "laws.no_such_function"})
+    with pytest.raises(AttributeError, match="no_such_function"):
+        experiment("broken")
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "shared"),
+    [
+        ("number", 2.5, "number"),
+        ("number", 3, "number"),
+        ("number", True, [True]),
+        ("number", "word", ["word"]),
+        ("number", None, [None]),
+        ("number", [1.0, [2, "a"], False], ["number", ["number", ["a"]], [False]]),
+        ("other", 2.5, 2.5),
+        ("group.a", 1.0, "number"),
+        ("group.inner.b", 1.0, "number"),
+        ("group.other.b", 1.0, "number"),
+        ("group", 1.0, 1.0),
+        ("plain.dotted", 1.0, "number"),
+        ("plain.other", 1.0, 1.0),
+        ("plain", 1.0, 1.0),
+    ],
+)
+def test_a_batch_shares_all_of_a_setting_but_the_numbers_that_may_differ(
+    name: str, value: object, shared: object
+) -> None:
+    assert Mine().shared(name, value) == shared
+
+
+@pytest.mark.parametrize(
+    ("task", "wanted", "refused"),
+    [
+        ("Moving", True, False),
+        ("Moving", "html", False),
+        ("Mine", False, False),
+        ("Mine", None, True),
+        ("plain", True, True),
+        ("plain", False, False),
+    ],
+)
+def test_an_animation_is_refused_where_nothing_moves(task: str, wanted: object, refused: bool) -> None:
+    cfg = OmegaConf.create({"task": f"{__name__}.{task}", "animation": wanted})
+    if not refused:
+        check_animation(cfg)
+        return
+    with pytest.raises(
+        ValueError, match=r"`staf animation=...` must be false for the task .*which has no animation"
+    ):
+        check_animation(cfg)
+
+
+def test_without_the_setting_there_is_no_animation() -> None:
+    check_animation(OmegaConf.create({"task": "laws"}))
+    check_animation(OmegaConf.create({"task": "no such one", "animation": False}))  # which is not asked for
+
+
+def test_what_is_not_finite_is_none() -> None:
+    assert finite(1.5) == finite(torch.tensor(1.5)) == 1.5
+    assert isinstance(finite(torch.tensor(1.5)), float)
+    assert finite(0) == 0.0
+    assert all(finite(each) is None for each in (None, math.nan, math.inf, torch.tensor(-math.inf)))
