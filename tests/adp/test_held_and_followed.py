@@ -75,7 +75,7 @@ def held(
 @pytest.mark.parametrize("discount", [0.0, 0.9])
 @pytest.mark.parametrize("renewed", [False, True])
 @pytest.mark.parametrize("kind", [Limited, Unlimited])
-@pytest.mark.parametrize("substeps", [1, 3, (1, 4), (2, 5)])
+@pytest.mark.parametrize("substeps", [1, 2, (1, 4), (2, 5)])
 def test_substeps_are_as_long_as_a_row_allows_and_the_last_takes_the_rest(
     substeps: Any, kind: type[Limited], renewed: bool, discount: float
 ) -> None:

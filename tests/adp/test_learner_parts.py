@@ -105,6 +105,30 @@ def test_bellman_terms_are_those_of_every_point(centers: str, other: bool) -> No
     torch.testing.assert_close(control.value(X, begun), (begun.critic * STAF(X, X)).sum(-1))
 
 
+@pytest.mark.parametrize("kind", [adp.Information, adp.Published])
+def test_rows_with_gains_of_their_own_are_those_rows_alone(kind: Any) -> None:
+    each = [
+        {"critic": 0.1 * k, "actor": 1.0 * k, "forgetting": 0.2 * k, "normalisation": 0.1} for k in (1, 2, 3)
+    ]
+    columns = {name: tensor([[row[name]] for row in each]) for name in ("critic", "actor", "forgetting")}
+    gains = adp.Gains(**columns, normalisation=0.1)
+    law = kind(gains)
+
+    def run(law: Any, x0: Tensor, seed: int) -> adp.LoopResult:
+        control = adp.Supervised(learner(law=law), adp.LQR(PLANT, COST), COST, 1.0)
+        settings: dict[str, Any] = {"dt": 0.01, "steps": 5, "seed": seed, "compile": False}
+        with torch.no_grad():
+            return adp.simulate(control, PLANT, COST, x0, **settings)
+
+    together = run(law, X, 4)
+    assert law.gains is gains
+    for row in range(3):
+        alone = run(kind(adp.Gains(**each[row])), X[row : row + 1], 4 + row)
+        for name in ("state", "critic_weights", "actor_weights", "running_cost"):
+            one, other = getattr(together, name)[row], getattr(alone, name)[0]
+            torch.testing.assert_close(one, other, rtol=1e-9, atol=1e-12)
+
+
 class Points(nn.Module):
     """Points that someone made, of a shape that may not fit."""
 

@@ -1,4 +1,4 @@
-"""What a rollout policy is made of, and what its maker of an LQR hands on."""
+"""What policies are made of: rollouts, supervised and pumped ones, and costs along a path."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 import torch
 from helpers import tensor, uniform
+from torch import Tensor
 
 import staf_torch as st
 from staf_torch import adp, systems
@@ -107,6 +108,25 @@ def test_another_base_than_an_lqr_is_measured_by_the_cost_that_is_given() -> Non
     for row, share in enumerate((5**0.5 / 8, 1.0, 5**0.5 / 16)):
         torch.testing.assert_close(found[row], base[row] + share * (u[row] - base[row]))
     assert adp.Supervised(adp.Feedback(LQR), LQR, COST).trust == 0.5
+
+
+def test_energy_is_pumped_far_from_the_goal_and_the_lqr_regulates_near_it() -> None:
+    plant = systems.Pendulum()
+    cost = adp.QuadraticCost(1.0, 0.3, dim=2, inputs=1, low=-2.0, high=1.5)
+
+    def energy(x: Tensor) -> Tensor:
+        return 0.5 * x[..., 1].square() + 9.81 * x[..., 0].cos()
+
+    pump = adp.EnergyShaping(plant, cost, energy, gain=0.05, capture=0.5, period=0.02)
+    x = uniform(40, 2, low=-3, high=3, seed=1)
+    x[:20] *= 0.05
+    g, lqr = plant.effectiveness(x)[..., 0], adp.LQR(plant, cost, period=0.02)
+    slope = torch.stack((-9.81 * x[:, 0].sin(), x[:, 1]), -1)
+    push = 0.05 * (9.81 - energy(x)) * (g * slope).sum(-1)
+    near = lqr.value(x) < 0.5
+    assert 0 < int(near.sum()) < 40
+    torch.testing.assert_close(pump(x)[:, 0], torch.where(near, lqr(x)[:, 0], push.clamp(-2.0, 1.5)))
+    assert pump.period == 0.02
 
 
 # --- costs along a path -------------------------------------------------------------------------------------

@@ -261,6 +261,19 @@ def test_a_rest_is_searched_by_the_input_alone_and_then_by_both() -> None:
         find_equilibrium(Never(0, 0, 0, dim=2), torch.zeros(2).double(), torch.ones(1).double())
 
 
+@pytest.mark.parametrize(("apart", "rests"), [(0.9e-5, True), (1.1e-5, False)])
+def test_what_moves_by_a_millionth_of_its_rate_is_a_rest_that_is_found(apart: float, rests: bool) -> None:
+    """Two coordinates that one input holds together, but for what they are apart."""
+
+    class Apart(Moving):
+        def motion(self, x: Tensor, u: Tensor) -> Tensor:
+            return 10 * (x + u) + apart * tensor([1.0, -1.0])
+
+    guess = torch.zeros(2).double()
+    x, _ = find_equilibrium(Apart(0, 0, 0, dim=2), guess, tensor([1.0]))
+    assert torch.equal(x, guess) is rests
+
+
 # --- plants of functions ------------------------------------------------------------------------------------
 
 

@@ -50,9 +50,9 @@ def test_constants_are_the_worst_of_differences(kernel: str, velocities: Tensor,
     assert found.speed == pytest.approx(max(speed), rel=1e-5)
     assert found.growth == pytest.approx(max(0.0, *growth), rel=1e-5, abs=1e-6)
     again = theory.drift_constants(basis, Paper(), STATES.view(2, 3, 2), velocities.view(2, 3, 2))
-    assert again == pytest.approx(found, rel=1e-12)
+    assert again == pytest.approx(found, rel=1e-8)
     alone = [theory.drift_constants(basis, Paper(), STATES[k], velocities[k]) for k in range(len(STATES))]
-    assert found == pytest.approx(tuple(max(each) for each in zip(*alone, strict=True)), rel=1e-9)
+    assert found == pytest.approx(tuple(max(each) for each in zip(*alone, strict=True)), rel=1e-7)
 
 
 @pytest.mark.parametrize(

@@ -103,9 +103,9 @@ def test_near_best_polynomials_are_those_of_the_iteration_written_out(degree: in
         tolerance = share * lawson(*args)[2]
         best, error, lower = lawson(*args, tolerance)
         found = near_best(z, degree, f[row : row + 1], weight[row : row + 1], tensor([tolerance]))
-        torch.testing.assert_close(found.coefficients[0], tensor(best), rtol=1e-11, atol=1e-12)
-        torch.testing.assert_close(found.error[0], tensor(error), rtol=1e-11, atol=0)
-        torch.testing.assert_close(found.lower[0], tensor(lower), rtol=1e-11, atol=0)
+        torch.testing.assert_close(found.coefficients[0], tensor(best), rtol=1e-10, atol=1e-11)
+        torch.testing.assert_close(found.error[0], tensor(error), rtol=1e-10, atol=0)
+        torch.testing.assert_close(found.lower[0], tensor(lower), rtol=1e-10, atol=0)
 
 
 def test_an_iteration_that_never_ends_is_given_25() -> None:
@@ -114,7 +114,7 @@ def test_an_iteration_that_never_ends_is_given_25() -> None:
     tolerance = 1.2 * lawson(*args)[2]  # neither met nor hopeless
     results = [lawson(*args, tolerance, iterations=k) for k in (24, 25, 26)]
     found = near_best(z, 2, f[:1], weight[:1], tensor([tolerance]))
-    torch.testing.assert_close(found.lower[0], tensor(results[1][2]), rtol=1e-11, atol=0)
+    torch.testing.assert_close(found.lower[0], tensor(results[1][2]), rtol=1e-10, atol=0)
     assert len({round(result[2], 9) for result in results}) == 3
 
 
@@ -160,7 +160,7 @@ def test_blocks_of_rows_stop_by_themselves(monkeypatch: pytest.MonkeyPatch) -> N
         one = slice(row, row + 1)
         alone = near_best(z, 2, f[one], weight[one], tolerance[one])
         for part, whole in zip(alone, found, strict=True):
-            torch.testing.assert_close(part, whole[one], rtol=1e-12, atol=0)
+            torch.testing.assert_close(part, whole[one], rtol=1e-8, atol=1e-12)
     monkeypatch.undo()
     together = near_best(z, 2, f, weight, tolerance)
     assert float((together.lower / found.lower - 1).abs().max()) > 1e-3
