@@ -196,6 +196,18 @@ def _write_sweep(directory: Path, record: Mapping[str, Any]) -> None:
 
 def quoted(value: str) -> str:
     """Return a text as a value in Hydra's grammar of overrides."""
-    if re.fullmatch(r"[A-Za-z0-9_./@+-]+", value):
+    if re.fullmatch(r"[A-Za-z0-9_./@+-]+", value) and not _is_other(value):
         return value
-    return "'" + value.replace("\\", "\\\\").replace("'", "\\'") + "'"
+    # Backslashes count there before a quote alone.
+    return (
+        "'" + re.sub(r"(\\*)('|\Z)", lambda found: 2 * found[1] + found[2].replace("'", "\\'"), value) + "'"
+    )
+
+
+def _is_other(word: str) -> bool:
+    """Return whether a word without quotes is a number, a truth value or null."""
+    try:
+        float(word)
+    except ValueError:
+        return word.lower() in ("null", "true", "false")
+    return True
