@@ -66,3 +66,23 @@ def test_scalar_arguments_hold_in_any_dimension(dim: int) -> None:
 def test_a_bad_argument_is_named_with_its_value(make, message: str) -> None:  # type: ignore[no-untyped-def]
     with pytest.raises(ValueError, match=re.escape(message)):
         make()
+
+
+def test_of_a_cosine_the_frequency_alone_is_saved_and_numbers_are_in_double_precision() -> None:
+    cosine = Cosine([1.0, 2.0], 0.5)
+    assert list(cosine.state_dict()) == ["frequency"]
+    assert (cosine.frequency.dtype, cosine.phase.dtype) == (torch.float64, torch.float64)
+    assert (Cosine(2).frequency.dtype, float(Cosine(2).frequency), float(Cosine().phase)) == (
+        torch.float64,
+        2.0,
+        0.0,
+    )
+    for given in (2, [[2.0, 1.0], [1.0, 3.0]], torch.eye(2)):
+        assert Quadratic(given).matrix.dtype == torch.float64
+    assert list(Quadratic().state_dict()) == ["matrix"]
+
+
+@pytest.mark.parametrize("shape", [(2,), (2, 3), (3, 2), (1, 2, 2)])
+def test_a_matrix_of_another_shape_is_refused(shape: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match=r"`Quadratic\(matrix=...\)` must be a number or \(n, n\)"):
+        Quadratic(torch.ones(shape))

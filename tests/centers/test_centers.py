@@ -248,3 +248,63 @@ def test_layouts_of_the_ball_are_the_recorded_ones(count: int, dim: int, size: f
     u = st.ball(count, dim)
     weights = torch.arange(1, u.numel() + 1, dtype=torch.float64).sin().view_as(u)
     assert float((weights * u).sum()) == pytest.approx(size, rel=1e-9)
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_directions_may_leave_the_ball_by_their_rounding_alone(dtype: torch.dtype) -> None:
+    eps = torch.finfo(dtype).eps
+    for beyond, fits in ((8 * eps, True), (64 * eps, False)):
+        directions = torch.tensor([[1.0 + beyond, 0.0], [0.0, 1.0]], dtype=dtype)
+        if fits:
+            assert torch.equal(st.StateFollowingCenters(directions, 0.1).directions, directions)
+        else:
+            with pytest.raises(ValueError, match="but direction 0 has the norm 1"):
+                st.StateFollowingCenters(directions, 0.1)
+    with pytest.raises(ValueError, match=r"but direction 1 has the norm 1\.25"):
+        st.StateFollowingCenters(tensor([[1.0, 0.0], [0.75, 1.0]]), 0.1)
+    with pytest.raises(ValueError, match="must be distinct, but direction 1 is repeated"):
+        st.StateFollowingCenters(tensor([[1.0, 0.0], [0.5, 0.0], [0.5, 0.0]]), 0.1)
+
+
+@pytest.mark.parametrize(("offset", "gain"), [(0.05, 1.5), (2.0, 1.5), (0.0, 0.5), (1.0, 1.0)])
+def test_a_radius_stays_below_its_bound_and_comes_as_near_as_one_likes(offset: float, gain: float) -> None:
+    radius = st.StateRadius(0.7, offset, gain)
+    nu = radius(tensor([[0.0, 0.0], *([10.0**k, 0.0] for k in range(-3, 7))]))
+    bound = float(radius.bound())
+    assert bool((nu <= bound * (1 + 1e-12)).all())
+    assert float(nu.max()) == pytest.approx(bound, rel=1e-9)
+    assert radius.constant is False
+    assert float(st.ConstantRadius(0.2).bound()) == 0.2
+
+
+class Ring(st.centers.Radius):
+    """A radius of the user's own."""
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        return x.norm(dim=-1)
+
+
+def test_a_radius_of_ones_own_is_not_constant_and_has_no_bound() -> None:
+    assert Ring().constant is False
+    assert Ring().bound() is None
+    centers = st.StateFollowingCenters(st.rings(3), Ring())
+    assert (centers.count, centers.dim) == (3, 2)
+    assert repr(centers).startswith("StateFollowingCenters(\n  count=3, dim=2\n")
+    torch.testing.assert_close(centers.offsets(tensor([3.0, 4.0])), 5 * st.rings(3))
+
+
+@pytest.mark.parametrize(("count", "dim"), [(5, 1), (13, 2), (14, 2), (50, 2), (9, 3), (10, 4)])
+def test_probe_points_are_on_the_line_on_three_circles_or_half_on_the_sphere(count: int, dim: int) -> None:
+    norms = probe_points(count, dim).norm(dim=-1)
+    assert len(norms) == count
+    if dim == 1:
+        torch.testing.assert_close(probe_points(5, 1), tensor([[0.0], [-1.0], [-1 / 3], [1 / 3], [1.0]]))
+    elif dim == 2:
+        inner, middle = (count - 1) // 12, (count - 1) // 4
+        wanted = [0.0, *[1.0] * (count - 1 - inner - middle), *[0.75] * middle, *[0.4] * inner]
+        torch.testing.assert_close(norms, tensor(wanted))
+    else:
+        sphere = int((norms > 1 - 1e-12).sum())
+        assert sphere == (count - 1) // 2
+        assert norms[0] == 0.0
+        assert bool((norms[1:] > 0).all())

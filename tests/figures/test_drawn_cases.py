@@ -72,6 +72,8 @@ def test_an_arc_may_leave_its_circle_by_a_hundredth(sizes: tuple[float, float]) 
     assert labelled(right)[1] is False
     solid = found._replace(state=np.concatenate((state, 0 * state[:, :1]), axis=1))
     assert visible(theory.draw_feasibility(solid))[0].get_xlabel() == "time (s)"
+    still = found._replace(state=0 * state)  # no circle either
+    assert visible(theory.draw_feasibility(still))[0].get_xlabel() == "time (s)"
 
 
 def test_without_rings_the_layouts_of_the_ball_are_drawn_against_the_radius_and_the_largest_polygon() -> None:
@@ -331,6 +333,7 @@ def test_a_page_plays_ten_pictures_a_second_and_keeps_what_differs_from_the_firs
     pictures = json.loads(found[1])
     assert len(pictures) == 3
     assert "show(frame + 1); }, 100);" in text
+    assert animation.FRAMES == 60  # of an experiment: six seconds
     opened = [Image.open(io.BytesIO(base64.b64decode(each))) for each in pictures]
     assert {picture.size for picture in opened} == {(900, 412)}
     shares = [np.asarray(picture.convert("RGBA"))[..., 3].astype(bool).mean() for picture in opened]
