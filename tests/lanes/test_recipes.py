@@ -1,0 +1,125 @@
+"""What of a program follows from tensors that a step finds outside, and which steps have no program."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from staf_torch.lanes.given import Given
+from staf_torch.lanes.one_row import trace
+from staf_torch.lanes.tracer import NotLoweredError
+
+
+def recipe(step: Callable[[Tensor], Any], rows: int = 2) -> Any:
+    x = torch.linspace(0, 1, 3 * rows, dtype=torch.float64).view(rows, 3)
+    return trace(lambda carry, now, row: (carry, step(row)), Given.of(x[:, 0], (), x, 1)).recipe
+
+
+A, B = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64), torch.tensor([5.0, 6.0, 7.0], dtype=torch.float64)
+
+
+def test_numbers_follow_from_what_was_found_and_from_nothing_else() -> None:
+    found = recipe(lambda x: x * (2 * A + 1) + A)
+    assert found.values.tolist() == [3.0, 5.0, 7.0, 1.0, 2.0, 3.0]
+    assert found.values.dtype == torch.float64
+    assert len(found.operations) == 2
+    assert [id(t) for t in found.found] == [id(A)]
+    assert found.again({id(A): B}).tolist() == [11.0, 13.0, 15.0, 5.0, 6.0, 7.0]
+    assert found.again({id(B): A}) is None
+    assert recipe(lambda x: x * 2).values.shape == (0,)
+    assert recipe(lambda x: x * 2).again({}).dtype == torch.float64
+    unused = recipe(lambda x: (x * A, [A.exp(), B.sin()])[0])
+    assert unused.operations == []
+    assert [id(t) for t in unused.found] == [id(A)]
+    some = recipe(lambda x: x[:, :2] * A[1:] + x[:, :1] * A.view(1, 3)[:, ::2])
+    assert some.values.tolist() == [2.0, 3.0, 1.0]  # the place that both read once
+    assert some.again({id(A): B}).tolist() == [6.0, 7.0, 5.0]
+    single = torch.tensor([0.5], dtype=torch.float32)
+    assert recipe(lambda x: x * single.double()).again({id(single): 2 * single}).tolist() == [1.0]
+    both = recipe(lambda x: torch.cat((x, A.view(1, 3), B.view(1, 3)), 1))
+    assert both.again({id(A): B, id(B): A}).tolist() == [5.0, 6.0, 7.0, 1.0, 2.0, 3.0]
+    kept = recipe(lambda x: x * torch.add(A, B, alpha=2))
+    assert kept.again({id(A): A, id(B): B}).tolist() == (A + 2 * B).tolist()
+
+
+def test_what_the_code_states_itself_is_no_number_of_the_table() -> None:
+    for step in (
+        lambda x: x * torch.tensor([1.0, 2.0, 4.0], dtype=torch.float64),
+        lambda x: x * torch.arange(3),
+        lambda x: x @ torch.eye(3, dtype=torch.float64) + torch.ones(3),
+        lambda x: x[:, torch.tensor([1, 0])] * 2,
+        lambda x: x * torch.zeros_like(A) + torch.full_like(A, 0.5) + A.new_ones(3),
+    ):
+        found = recipe(step)
+        assert found.values.tolist() == []
+        assert found.found == []
+    mask = torch.tensor([True, False, True])
+    assert recipe(lambda x: torch.where(mask, x, -x)).values.tolist() == []
+
+
+def test_a_number_that_was_read_must_be_the_same_again() -> None:
+    gain = torch.tensor(2.0, dtype=torch.float64)
+    found = recipe(lambda x: x * A if bool(gain > 1) else x)
+    assert len(found.checks) == 1
+    assert {id(t) for t in found.found} == {id(A), id(gain)}
+    assert found.again({id(A): B, id(gain): gain + 1}).tolist() == B.tolist()
+    assert found.again({id(A): B, id(gain): gain - 2}) is None
+
+
+def test_memory_that_was_written_to_is_not_written_again() -> None:
+    def step(x: Tensor) -> Tensor:
+        own = A.clone()
+        own += 1
+        return x * own
+
+    found = recipe(step)
+    assert found.values.tolist() == [2.0, 3.0, 4.0]
+    assert found.again({id(A): B}) is None
+
+
+def test_what_is_computed_twice_is_read_once() -> None:
+    assert len(recipe(lambda x: x * (A * 2) + (A * 2)).values) == 3
+    assert len(recipe(lambda x: x * (A * 2) + (A * 3)).values) == 6
+    assert len(recipe(lambda x: x * (A * 2.0) + (A * 2)).values) == 6  # to torch these are two
+    assert len(recipe(lambda x: x * A.exp() + A.sin()).values) == 6
+    assert len(recipe(lambda x: x * (A[:2] * 2).sum() + (A[1:] * 2).sum()).values) == 2
+    assert len(recipe(lambda x: x * (A + 1).mul(2) + (A + 1).mul(2)).values) == 3
+
+
+REFUSED: dict[str, tuple[Callable[[Tensor], Any], str]] = {
+    "a value of a row": (lambda x: x if bool(x.sum() > 0) else -x, "reads a value of a row"),
+    "an index of a row": (lambda x: x.nonzero(), "reads a value of a row"),
+    "NumPy": (lambda x: torch.as_tensor(x.numpy()), "`Tensor.numpy` takes numbers of a row out of torch"),
+    "a list": (lambda x: x + x.tolist()[0][0], "`Tensor.tolist` takes numbers of a row out of torch"),
+    "another dtype": (lambda x: x.to(torch.complex128), "has no lanes here"),
+    "bits": (lambda x: x.long() & 1, "logic on the bits of integers"),
+    "random": (lambda x: x + torch.rand(3), "draws random numbers"),
+    "no rows": (lambda x: x.sum(), "an output of the step has no dimension of rows"),
+    "more rows": (lambda x: torch.cat((x, x)), "an output of the step has no dimension of rows"),
+    "an error": (lambda x: x[:, 7], "IndexError"),
+    "a norm": (lambda x: torch.linalg.vector_norm(x, 3, -1), "a norm of order 3"),
+    "an unknown": (lambda x: torch.special.i0(x), "i0"),
+    "a scaled product": (lambda x: torch.addmm(x, x[:, :1], x, beta=2), "a scaled product"),
+    "rsub with alpha": (lambda x: torch.rsub(x, x, alpha=2), "has no scalar form here"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_is_no_function_of_a_row_is_refused_with_its_line(name: str) -> None:
+    step, why = REFUSED[name]
+    with pytest.raises(NotLoweredError) as error:
+        recipe(step)
+    assert why in str(error.value)
+    assert name == "no rows" or name == "more rows" or " at " in str(error.value)
+
+
+def test_a_carry_keeps_its_shapes_its_kinds_and_its_tree() -> None:
+    x = torch.ones(2, 3)
+    for after in (lambda c: c[:, :2], lambda c: c.double(), lambda c: (c,), lambda c: {"c": c}):
+        with pytest.raises(NotLoweredError, match="a carry of other shapes or dtypes than it was given"):
+            trace(lambda c, n, r, f=after: (f(c), ()), Given.of(x, (), (), 1))
+    trace(lambda c, n, r: (c + 1, c), Given.of(x, (), (), 1))
