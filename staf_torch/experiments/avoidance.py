@@ -89,7 +89,7 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
     vehicle = made(cfg, dt)
     discs = (x0.shape[-1] - vehicle.size) // 4
     system = AmongDiscs(vehicle, discs).to(device)
-    cost = vehicle_cost(cfg, vehicle, system.dim or 0)
+    cost = vehicle_cost(cfg, vehicle, system._size())
 
     def wanted(x: Tensor) -> Tensor:
         u: Tensor = vehicle.policy(x[..., : vehicle.size])

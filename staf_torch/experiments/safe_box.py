@@ -108,7 +108,7 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
 
 def methods(cfg: DictConfig, box: Barrier, cost: Cost) -> dict[str, Method]:
     """The LQR in both coordinates, by itself and behind the filters."""
-    system, size, dt = box.plant, box.dim or 0, float(cfg.dt)
+    system, size, dt = box.plant, box._size(), float(cfg.dt)
     substeps = 1, integer(COMMAND_LINE, "safe_box.substeps", cfg.safe_box.substeps, least=1)
     of_s = LQR(box, cost)
     paid = QuadraticCost(cost.q, cost.r, size, cost.inputs, output=lambda x: box.coordinates(x))
@@ -180,7 +180,7 @@ def _anywhere(cfg: DictConfig, box: Barrier) -> Tensor:
     """States drawn uniformly from the box, from [-1, 1] around its middle where a wall is missing: (B, n)."""
     count = integer(COMMAND_LINE, "safe_box.states", cfg.safe_box.states, least=1)
     generator = torch.Generator().manual_seed(integer(COMMAND_LINE, "seed", cfg.seed, least=0))
-    share = torch.rand(count, box.dim or 0, dtype=torch.float64, generator=generator)
+    share = torch.rand(count, box._size(), dtype=torch.float64, generator=generator)
     return (box.floor + (box.ceiling - box.floor) * share).clamp(box.low + 1e-9, box.high - 1e-9)
 
 
@@ -189,7 +189,7 @@ def _beside_walls(cfg: DictConfig, box: Barrier) -> Tensor:
     near = positive_real(COMMAND_LINE, "safe_box.near", cfg.safe_box.near)
     x = _anywhere(cfg, box)
     generator = torch.Generator().manual_seed(integer(COMMAND_LINE, "seed", cfg.seed, least=0))
-    walls = [(k, side) for k in range(box.dim or 0) for side in (0, 1) if bool(box.walled[side, k])]
+    walls = [(k, side) for k in range(box._size()) for side in (0, 1) if bool(box.walled[side, k])]
     chosen = torch.randint(len(walls), (len(x),), generator=generator)
     for number, (k, side) in enumerate(walls):
         beside = box.high[k] - near if side else box.low[k] + near

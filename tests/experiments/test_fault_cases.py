@@ -270,7 +270,8 @@ def test_what_a_run_measures_is_in_its_table_its_metrics_and_its_figure(
     assert " 2.1235 " in (tmp_path / "faults.md").read_text()
     other = tmp_path / "other"
     other.mkdir()
-    faults.run(settings(*given, "figures=false"), other)
+    faults.run(settings(*given, "figures=false", "trajectories=1"), other)
+    assert asked[-1] == (1, 5)
     assert not (other / "figures").exists()
     with pytest.raises(ValueError, match=r"`staf faults.cases=...` must be one of 'my_case'"):
         faults.run(settings(*given, "faults.cases=[other]"), other)

@@ -82,7 +82,12 @@ def test_a_source_is_simulated_with_its_gains_and_noise_and_is_paid_for_the_erro
 
     monkeypatch.setattr(icl, "simulate", simulate)
     cfg = cfg_of(
-        "trajectories=3", f"duration={duration}", f"dt={dt}", "icl.noise=0.3", "seed=4", "icl.size=7"
+        "trajectories=3",
+        f"duration={duration}",
+        f"dt={dt}",
+        "icl.noise=0.3",
+        "seed=4",
+        f"icl.size={7 if steps == 100 else 1}",
     )
     cfg.initial_state = [0.5, -0.25]
     plant, gains = icl.published(), icl._gains(cfg)

@@ -320,9 +320,10 @@ def test_a_tracking_run_has_three_loops_from_the_same_states(
     other.mkdir()
     monkeypatch.setattr(adp_tracking, "_optimal_cost", lambda plant, cost, x0: None)
     monkeypatch.setattr(adp_tracking, "tracking_metrics", lambda *given: dict.fromkeys("abcde"))
-    bare = settings(*TRACKED, "duration=0.0001", "figures=false", "history=false")
+    bare = settings(*TRACKED, "duration=0.0001", "figures=false", "history=false", "dtype=float32")
     assert adp_tracking.run(bare, other)["optimal_cost"] is None
     assert asked[-1][-1]["steps"] == 1
+    assert asked[-1][3].dtype == torch.float32
     assert [path.name for path in other.iterdir()] == ["metrics.json"]
 
 

@@ -239,3 +239,10 @@ def test_two_tables_are_shown_by_label() -> None:
     assert [[float(each) for each in line[1:]] for line in cells[2:5]] == [[1, 2], [3, 4], [5, 6]]
     assert cells[5] == ["start at a revisit", "excess after a step", "steps"]
     assert [[float(each) for each in line[1:]] for line in cells[7:]] == [[7, 8], [9, 10], [11, 12]]
+
+
+def test_a_memory_may_be_as_small_as_it_can() -> None:
+    names = ("capacity", "states", "revisits", "steps")
+    cfg = settings("experiment=memory", *(f"memory.{name}=1" for name in names), "memory.reach=0.5")
+    cfg.memory.spacing = 0.125
+    assert memory.settings_of(cfg) == Settings(1, 0.5, 0.125, 1, 1, 1)

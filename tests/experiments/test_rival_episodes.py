@@ -301,7 +301,12 @@ def test_a_run_has_a_row_a_plant_and_method_and_tells_how_far_it_is(
     assert told[-1] == 1
     other = tmp_path / "other"
     other.mkdir()
-    rivals.run(settings("experiment=rivals", *given, "rivals.slow=2", "figures=false"), other)
-    assert asked[-1][-1] == 2
+    rivals.run(
+        settings("experiment=rivals", *given, "rivals.slow=1", "rivals.states=2", "figures=false"), other
+    )
+    assert asked[-1][-1] == 1
+    least = ("rivals.states=1", "rivals.slow=1", "rivals.calls=1", "figures=false")
+    rivals.run(settings("experiment=rivals", *given, *least), other)
+    assert asked[-1][2:] == (1, 1, 1)
     assert not (other / "figures").exists()
     assert rivals._key("box-DDP of mine") == "box_ddp_of_mine"

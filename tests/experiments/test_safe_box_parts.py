@@ -55,6 +55,8 @@ def test_every_method_is_the_recorded_one(record: Record) -> None:
         {f"{name}: {path}": part for name, each in described.items() for path, part in each.items()},
         rtol=1e-5,
     )
+    single = safe_box.methods(cfg_of("dt=0.02", "safe_box.substeps=1"), box, cost)
+    assert single["LQR of s, filtered"].substeps == (1, 1)
     assert list(safe_box.methods(cfg_of("safe_box.filter=false"), box, cost)) == [NAMES[0], NAMES[4]]
     assert (
         Method(found[NAMES[0]].controller, box, cost).substeps,
@@ -72,6 +74,7 @@ def test_starts_are_anywhere_in_the_box_and_those_beside_a_wall_are_moved_there(
     assert (moved.sum(1) <= 1).all()
     near = torch.stack((beside - tensor(LOW), tensor(HIGH) - beside)).amin(0)[moved]
     torch.testing.assert_close(near, torch.full_like(near, 0.125))
+    assert safe_box._anywhere(cfg_of("safe_box.states=1"), box).shape == (1, 2)
     record({"few": beside[:7], "again": safe_box._beside_walls(cfg, box)[:7]})
     # Where a wall is missing no start is beside it, and the box is taken as [-1, 1] around its middle.
     open_box = systems.Barrier(systems.TwoState(), low=[-2.0, None], high=[3.0, None])
@@ -83,7 +86,9 @@ def test_starts_are_anywhere_in_the_box_and_those_beside_a_wall_are_moved_there(
 
 def test_a_start_is_never_on_a_wall() -> None:
     box, _ = parts()
-    wide = SimpleNamespace(dim=2, floor=10 * box.low, ceiling=10 * box.high, low=box.low, high=box.high)
+    wide = SimpleNamespace(
+        _size=lambda: 2, floor=10 * box.low, ceiling=10 * box.high, low=box.low, high=box.high
+    )
     x = safe_box._anywhere(cfg_of("safe_box.states=200"), wide)  # type: ignore[arg-type]
     for k in range(2):
         assert float(x[:, k].min() - box.low[k]) == pytest.approx(1e-9, rel=1e-4)
@@ -261,9 +266,10 @@ def test_every_method_runs_from_the_same_states_and_from_those_that_are_followed
     assert (tmp_path / "figures" / "safe_box.txt").exists()
     other = tmp_path / "other"
     other.mkdir()
-    short = ("duration=0.001", "safe_box.followed=0.001", "figures=false", "history=false")
+    short = ("duration=0.001", "safe_box.followed=0.001", "figures=false", "history=false", "dtype=float32")
     safe_box.run(cfg_of("dt=0.01", "safe_box.states=4", *short), other)
     assert [each[2:] for each in asked[-3:]] == [(1, 1)] * 3
+    assert {each[1].dtype for each in asked[-3:]} == {torch.float32}
     assert not (other / "figures").exists()
     assert not (other / "history.npz").exists()
 

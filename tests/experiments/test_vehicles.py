@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import math
 from pathlib import Path
 from types import SimpleNamespace
@@ -97,6 +98,7 @@ def test_scenarios_are_drawn_from_a_square_at_speeds_up_to_one_and_any_heading()
     clear = cfg.avoidance.radius + 0.6
     apart = (discs[..., :2] - x0[:, None, :2]).norm(dim=-1)
     assert clear < float(apart.min()) < clear + 0.1
+    assert avoidance.scenarios(cfg_of("mass", "trajectories=1", "avoidance.discs=1")).shape == (1, 8)
     mass = avoidance.scenarios(cfg_of("mass", "trajectories=2"))
     assert mass[:, 2:4].abs().max() == 0  # at rest
     assert not torch.equal(mass, avoidance.scenarios(cfg_of("mass", "trajectories=2", "seed=9")))
@@ -295,12 +297,15 @@ def test_the_filter_and_the_bare_policy_have_the_same_plant_cost_and_starts(
             np.testing.assert_allclose(history[f"{prefix}distance"], apart.numpy())
     files = {path.name for path in (tmp_path / "figures").iterdir()}
     assert files == {"avoidance.gif", "avoidance.txt"}
-    assert len((tmp_path / "avoidance.csv").read_text().splitlines()) == 3
+    first, *rows = csv.reader((tmp_path / "avoidance.csv").read_text().splitlines())
+    assert first[0] == "method"
+    assert [row[0] for row in rows] == [f"{one.label}, filtered", one.label]
     other = tmp_path / "other"
     other.mkdir()
-    cfg = cfg_of(kind, *given, "figures=false", "history=false", "duration=0.001")
+    cfg = cfg_of(kind, *given, "figures=false", "history=false", "duration=0.001", "dtype=float32")
     avoidance.run(cfg, other)
     assert asked[-1][-1]["steps"] == 1
+    assert asked[-1][3].dtype == torch.float32
     assert not (other / "figures").exists()
     assert not (other / "history.npz").exists()
     assert avoidance.run.animates is True
