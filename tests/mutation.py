@@ -44,6 +44,7 @@ PRELOADED += (
 
 def main() -> int:
     """Run the command line; the exit code is 1 where too few of them are killed."""
+    os.environ["OMP_NUM_THREADS"] = "1"  # before torch is imported: threads of OpenMP do not survive a fork
     options = _options()
     begun = time.monotonic()
     until = begun + 60 * options.minutes

@@ -13,7 +13,7 @@ import pytest
 from mutants import Mutant
 from mutants_accepted import accepted
 from mutation_fork import begin, collected, in_fork, place, run_files, run_items
-from mutation_map import CONTRACTS, Map, places, test_files, tests_near
+from mutation_map import CONTRACTS, Map, names, places, test_files, tests_near
 from mutation_patch import Functions
 from source_rules import without_dtype
 
@@ -137,11 +137,14 @@ def _run_anew(chosen: Chosen) -> str:
 def _tests_for(mutant: Mutant, source: str) -> list[str]:
     """Those that execute the lines, the short ones first, within the time.
 
-    A test of the mutant's own folder comes where one of another folder that takes a part of its time would.
+    A test of the mutant's own folder, or whose file imports the module, comes where another one that takes a
+    part of its time would.
     """
-    hits = _hits(mutant, source)
-    near = {test: 1.0 if test.startswith((*places(mutant.file), CONTRACTS)) else FAR for test in hits}
-    order = sorted(hits, key=lambda test: (near[test] * _cost([test]), test))
+    far = {
+        test: 1.0 if names(test, mutant.file) or test.startswith((*places(mutant.file), CONTRACTS)) else FAR
+        for test in _hits(mutant, source)
+    }
+    order = sorted(far, key=lambda test: (far[test] * _cost([test]), not names(test, mutant.file), test))
     chosen: list[str] = []
     for test in order:
         if _cost([*chosen, test]) <= _seconds:

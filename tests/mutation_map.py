@@ -299,7 +299,7 @@ def tests_near(known: Map, file: str, first: int, last: int, around: tuple[int, 
     """
     there = known.lines.get(file, {})
     near = (*places(file), *((CONTRACTS,) if around[2] else ()))
-    whole = {test for test in known.unmeasured if test.startswith(near) or _names(test, file)}
+    whole = {test for test in known.unmeasured if test.startswith(near) or names(test, file)}
     if around[2]:
         whole |= {test for test in known.fixtures if test.startswith(CONTRACTS)}
     order = sorted(there)
@@ -311,8 +311,13 @@ def tests_near(known: Map, file: str, first: int, last: int, around: tuple[int, 
     return {test for test in known.fixtures if test.startswith(places(file))} | whole
 
 
-def _names(test_file: str, file: str) -> bool:
-    """Whether a file of tests imports a module of the package, by its name."""
+def names(test: str, file: str) -> bool:
+    """Whether the file of a test imports a module of the package, by its name."""
+    return _imports(test.partition("::")[0], file)
+
+
+@cache
+def _imports(test_file: str, file: str) -> bool:
     room, *inner = Path(file).with_suffix("").parts[1:]
     if not inner:
         return False
