@@ -230,7 +230,9 @@ def test_a_run_of_laws_leaves_rows_and_slopes(tmp_path: Path, monkeypatch: pytes
     drawn = laws.curves(4, count)
     assert asked["sweep"] == ([case.key for case in drawn], [0.1, 0.2])
     assert asked["expected"] == int((len(keys) + len(drawn) * (0.5 + 0.25)) * 20) * 2
-    assert json.loads((tmp_path / "laws.json").read_text()) == [row]
+    text = (tmp_path / "laws.json").read_text()
+    assert json.loads(text) == [row]
+    assert text.startswith('[\n  {\n    "key": "exact_x1",\n')
     assert (tmp_path / "laws.csv").read_text().splitlines()[
         0
     ] == "law,iterations,predictor,products,ball_error"
@@ -240,3 +242,8 @@ def test_a_run_of_laws_leaves_rows_and_slopes(tmp_path: Path, monkeypatch: pytes
     other.mkdir()
     laws.run(settings("experiment=laws", *SHORT, *words, "figures=false"), other)
     assert not (other / "figures").exists()
+    row["products"], lost = math.nan, tmp_path / "lost"
+    lost.mkdir()
+    with pytest.raises(ValueError, match="JSON compliant"):
+        laws.run(settings("experiment=laws", *SHORT, *words, "figures=false"), lost)
+    assert not (lost / "laws.json").exists()
