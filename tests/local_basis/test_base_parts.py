@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import pytest
 import torch
@@ -11,7 +12,14 @@ from torch import Tensor
 
 import staf_torch as st
 from staf_torch.local_basis import base, choice
-from staf_torch.local_basis.elimination import Degrees, degrees_of, eliminate, homogeneous
+from staf_torch.local_basis.elimination import (
+    Degrees,
+    _independent,
+    degrees_of,
+    eliminate,
+    functionals_of,
+    homogeneous,
+)
 from staf_torch.local_basis.graded import Interpolation, _terms, graded_basis, over_points, phi, ridges
 
 SIZES = [((4096,), 1), ((4097,), 2), ((3, 4096), 3), ((2, 2, 2049), 3), ((), 1)]
@@ -247,3 +255,52 @@ def test_one_series_serves_where_the_squared_radius_is_at_most_one(
     assert (found is None) is not serves
     newton = st.StaFBasis(st.MaternKernel(1.5), basis.centers)
     assert newton._local_basis._series_serves(newton.kernel, newton.centers) is False
+
+
+def test_functionals_that_have_one_value_span_the_same_and_see_their_own_monomial_with_a_plus() -> None:
+    for points in (st.rings(10), st.ball(7, 3), uniform(4, 1, low=-1.0, seed=14)):
+        degrees = degrees_of(points)
+        found = functionals_of(points / degrees.reach, degrees)
+        assert found.degrees == degrees.each()
+        q = found.functionals
+        torch.testing.assert_close(q.mT @ q, torch.eye(len(points)).double(), rtol=0, atol=1e-12)
+        whole = eliminate(points / degrees.reach)
+        alphas = [row for block in degrees.monomials for row in block]
+        for j, (degree, alpha) in enumerate(zip(found.degrees, alphas, strict=True)):
+            for k in range(degree):
+                assert float((q[:, j] @ homogeneous(points, k)).abs().max()) < 1e-11
+            monomial = (points ** torch.tensor(alpha)).prod(-1)
+            assert float(q[:, j] @ monomial) > 0
+            assert float((q[:, j] @ homogeneous(points / degrees.reach, degree)).norm()) > 1e-6
+        for k in set(found.degrees):
+            ours, theirs = (
+                each.functionals[:, [j for j, degree in enumerate(each.degrees) if degree == k]]
+                for each in (found, whole)
+            )
+            torch.testing.assert_close(ours @ ours.mT, theirs @ theirs.mT, rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("kernel", [st.GaussianKernel(0.7), st.PolynomialKernel(3, 0.5)])
+def test_functionals_of_a_space_see_polynomials_of_their_degree_with_the_norm_one(
+    kernel: st.Kernel,
+) -> None:
+    basis = st.StaFBasis(kernel, st.StateFollowingCenters(0.8 * st.rings(6), 0.3))
+    space: Any = basis.local(tensor([0.4, -1.0]))
+    graded = isinstance(kernel, st.GaussianKernel)
+    rows = space.basis.functionals if graded else space.weights_
+    points = space.basis.directions if graded else space.directions
+    degrees = space.basis.degree.tolist() if graded else space.degrees
+    assert list(degrees) == [0, 1, 1, 2, 2, 2]
+    for j, k in enumerate(degrees):
+        assert float((rows[:, j] @ homogeneous(points, k)).norm()) == pytest.approx(1.0, rel=1e-6)
+
+
+def test_columns_are_chosen_where_they_are_long_the_first_of_many() -> None:
+    lengths = torch.diag(tensor([0.5, 0.7, 1.0, 0.9]))
+    assert _independent(lengths, 1) == (1,)  # .7^2 is above .37 of the longest
+    assert _independent(lengths, 2) == (1, 2)
+    assert _independent(torch.diag(tensor([0.6, 0.7, 1.0])), 1) == (1,)
+    assert _independent(torch.diag(tensor([0.61, 0.7, 1.0])), 1) == (0,)
+    twice = tensor([[1.0, 1.0, 0.0], [0.0, 1e-6, 1.0]])
+    assert _independent(twice, 2) == (0, 2)
+    assert _independent(torch.eye(3).double(), 3) == (0, 1, 2)
