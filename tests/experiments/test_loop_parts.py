@@ -191,9 +191,10 @@ def test_a_trajectory_is_restless_whose_rate_never_fell_to_a_quarter_in_the_last
     assert said.startswith("3 of 7 trajectories are not regulated: in the last quarter of the 3.5 s")
     caplog.clear()
     loops.count_the_restless(cost, result_of(7, 8, state=0 * state))
-    short = result_of(1, 3, state=tensor([[[1.0, 0.0], [1.0, 0.0], [0.1, 0.0]]]))
-    loops.count_the_restless(cost, short)  # of three times the last one
     assert caplog.messages == []
+    short = result_of(1, 3, state=tensor([[[1.0, 0.0], [0.1, 0.0], [1.0, 0.0]]]))
+    loops.count_the_restless(cost, short)  # of three times the last one
+    assert caplog.messages[0].startswith("1 of 1 trajectories")
 
 
 def solution(optimum: Reference, rows: int = 3, **metrics: float | None) -> LoopSolution:
