@@ -60,8 +60,8 @@ def test_a_control_is_held_for_the_period_of_the_controller_or_the_plant_or_a_mi
         assert found.time.dtype == torch.float64
 
 
-@pytest.mark.parametrize("every", [1, 2, 3, 4, 6, 12, 24])
-@pytest.mark.parametrize("ahead", [1, 4, 5, 1024])
+@pytest.mark.parametrize("every", [1, 3, 4, 12])
+@pytest.mark.parametrize("ahead", [1, 5, 1024])
 def test_pieces_of_a_run_change_nothing(monkeypatch: pytest.MonkeyPatch, every: int, ahead: int) -> None:
     whole = run(Noisy(), steps=24, seed=3)
     monkeypatch.setattr(simulation, "_DRAWN_AHEAD", ahead)

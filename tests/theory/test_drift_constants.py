@@ -39,7 +39,7 @@ def by_differences(basis: st.StaFBasis, x: Tensor, v: Tensor) -> tuple[float, fl
 
 @pytest.mark.parametrize("radius", [0.5, st.StateRadius(0.7, 0.3, gain=1.5)], ids=["constant", "shrinking"])
 @pytest.mark.parametrize("velocities", [SPIN, FALL, -FALL], ids=["spin", "fall", "rise"])
-@pytest.mark.parametrize("kernel", ["exponential", "gaussian", "matern52", "anchored_exponential"])
+@pytest.mark.parametrize("kernel", ["exponential", "gaussian", "matern52"])
 def test_constants_are_the_worst_of_differences(kernel: str, velocities: Tensor, radius: object) -> None:
     basis = basis_of(kernel, 3, radius)
     found = theory.drift_constants(basis, Paper(), STATES, velocities)
@@ -51,8 +51,6 @@ def test_constants_are_the_worst_of_differences(kernel: str, velocities: Tensor,
     assert found.growth == pytest.approx(max(0.0, *growth), rel=1e-5, abs=1e-6)
     again = theory.drift_constants(basis, Paper(), STATES.view(2, 3, 2), velocities.view(2, 3, 2))
     assert again == pytest.approx(found, rel=1e-8)
-    alone = [theory.drift_constants(basis, Paper(), STATES[k], velocities[k]) for k in range(len(STATES))]
-    assert found == pytest.approx(tuple(max(each) for each in zip(*alone, strict=True)), rel=1e-7)
 
 
 @pytest.mark.parametrize(
