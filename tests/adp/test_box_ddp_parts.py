@@ -263,3 +263,62 @@ def test_search_as_a_program_takes_the_steps_of_the_search_where_many_do_not_pay
     state, u, feedback = TracedSearch(search)(x, control, around)
     for traced, plain in ((state, found.state), (u, found.control), (feedback, found.feedback)):
         torch.testing.assert_close(traced, plain, rtol=0, atol=1e-8)
+
+
+# A row of the traced search: cost, mu, full, active; definite, promised; the costs of the five lengths; then
+# what is wanted: cost, mu, full, active, the length that is taken.
+WORSE = [2.0] * 5
+ROWS: list[tuple[list[float], list[float], list[float], list[float]]] = [
+    ([1.0, 1e-3, 1, 1], [1, -1.0], [1.5, 0.4, 0.6, 2.0, 2.0], [0.4, 4e-4, 1, 1, 0.5]),
+    ([1.0, 1e-3, 0, 0], [1, -1.0], [0.5] * 5, [1.0, 1e-3, 0, 0, 0.0]),  # not active
+    ([1.0, 1e-3, 1, 1], [0, -1.0], [0.5] * 5, [1.0, 8e-3, 0, 1, 0.0]),  # no minimum
+    ([1.0, 1e-3, 0, 1], [1, -TOLERANCE], [1.0] * 5, [1.0, 8e-3, 1, 0, 0.0]),  # little is promised
+    ([1.0, 1e-3, 1, 1], [0, -TOLERANCE], [1.0] * 5, [1.0, 8e-3, 0, 1, 0.0]),  # by no minimum
+    ([1.0, 1e-3, 1, 1], [1, -1.0], [1.0 - TOLERANCE, *WORSE[1:]], [1.0 - TOLERANCE, 4e-4, 1, 0, 1.0]),
+    ([1.0, 1.6, 1, 1], [1, 0.0], WORSE, [1.0, 12.8, 0, 1, 0.0]),  # of a stiff model
+    ([1.0, 0.9, 1, 1], [1, 0.0], WORSE, [1.0, 7.2, 0, 0, 0.0]),
+    ([1.0, 2e8, 1, 1], [1, -1.0], WORSE, [1.0, 1.6e9, 0, 0, 0.0]),
+    ([1.0, 1e8, 1, 1], [1, -1.0], WORSE, [1.0, 8e8, 0, 1, 0.0]),
+    ([1.0, 1e-3, 1, 1], [1, -1.0], [INF, math.nan, -INF, math.nan, INF], [1.0, 8e-3, 0, 1, 0.0]),
+    ([1.0, 2e-9, 1, 1], [1, -1.0], [2.0, 2.0, 0.5, 0.5, 0.7], [0.5, 1e-9, 1, 1, 0.2]),  # the longer of two
+    ([-1.0, 1e-3, 1, 1], [1, TOLERANCE], WORSE, [-1.0, 8e-3, 0, 0, 0.0]),
+    ([64.0, 1e-3, 1, 1], [1, -64.0], [64.0 - 64 * TOLERANCE, 99, 99, 99, 99], [63.9375, 4e-4, 1, 0, 1.0]),
+    ([64.0, 1e-3, 1, 1], [1, -64.0], [99, 99, 99, 99, 63.9], [63.9, 4e-4, 1, 1, 0.02]),
+    ([64.0, 1e-3, 1, 1], [1, -64.0 * TOLERANCE], [99.0] * 5, [64.0, 8e-3, 0, 0, 0.0]),
+]
+
+
+def test_a_row_of_the_traced_search_goes_on_as_that_of_the_search() -> None:
+    now, model, tried, wanted = (tensor([row[k] for row in ROWS]) for k in range(4))
+    calls, none = [], torch.zeros(len(ROWS), 3, 2).double()
+
+    class Traced(TracedSearch):
+        def _derivatives(self, state: Tensor, u: Tensor) -> Any:
+            return ()
+
+        def _backwards(self, state: Any, u: Any, known: Any, mu: Tensor, full: Tensor, ends: Any) -> Any:
+            assert torch.equal(torch.stack((mu, full), dim=1), now[:, 1:3])
+            end = Model(mu, mu, model[:, 1], model[:, 0])
+            return end, (none + 1, none + 2, mu, mu)
+
+        def _cost(self, x: Tensor, around: Any, length: Tensor, ends: Any) -> Tensor:
+            calls.append(float(length[0]))
+            return tried[:, len(calls) - 1]
+
+        def _rolled(self, x: Tensor, around: Any, length: Tensor, ends: Any) -> Any:
+            assert torch.equal(x, state[:, 0])
+            for part, given in zip(around, (state[:, :-1], none, none + 1, none + 2), strict=True):
+                assert torch.equal(part, given)
+            mark = length[:, None, None].expand(-1, 4, 2)
+            return mark, mark[:, :3] + 7, length
+
+    search = adp.BoxDDP(PROBLEM, steps=3, tolerance=TOLERANCE, compile=False)
+    state = torch.arange(4.0).double()[None, :, None].expand(len(ROWS), 4, 2) - 9
+    found = Traced(search)._iterated((state, none, *now.unbind(1)), None)  # type: ignore[arg-type]
+    assert calls == pytest.approx([1.0, 0.5, 0.2, 0.07, 0.02])
+    torch.testing.assert_close(torch.stack(found[2:], dim=1), wanted[:, :4], rtol=1e-12, atol=0)
+    better = wanted[:, 4] > 0
+    torch.testing.assert_close(found[0][better][:, 0, 0], wanted[better, 4])
+    torch.testing.assert_close(found[1][better][:, 0, 0], wanted[better, 4] + 7)
+    assert torch.equal(found[0][~better], state[~better])
+    assert torch.equal(found[1][~better], none[~better])

@@ -21,6 +21,10 @@ LENGTH = STEPS + AHEAD + 1
 PROBLEM = adp.SampledProblem(pushed, dim=2, inputs=2, low=[-1.0, -0.5], high=[0.5, 0.7], periodic=[0])
 
 
+def symmetric(a: Tensor) -> Tensor:
+    return 0.5 * (a + a.mT)
+
+
 def library(values: Tensor | None = None) -> Trajectories:
     """Five trajectories that nobody optimised; the second does not arrive and the fourth is not finite."""
     if values is None:
@@ -42,7 +46,7 @@ def library(values: Tensor | None = None) -> Trajectories:
         0.3 * uniform(rows, STEPS, M, N, seed=3),
         values,
         uniform(rows, STEPS + 1, N, seed=4),
-        uniform(rows, STEPS + 1, N, N, seed=5).abs() + 2 * torch.eye(N),
+        symmetric(uniform(rows, STEPS + 1, N, N, seed=5)) + 2 * torch.eye(N),
         torch.ones(rows) > 0,
     )
 
@@ -163,6 +167,20 @@ def test_the_cheapest_of_the_nearest_plans_is_followed(
     levels = [whole.control, *(u.expand(6, 2) for u in PROBLEM.levels())]
     ahead = torch.stack([now + known.value(after) for after, now in (pushed(x, u) for u in levels)]).amin(0)
     torch.testing.assert_close(known.bellman_residual(x), (ahead - whole.value) / whole.value)
+
+
+def test_far_is_what_costs_by_the_mean_of_the_curvatures_sizes(known: adp.GlobalValue) -> None:
+    bent = known.models[known.entries, 2 * N + 1 :].view(-1, N, N) - 3 * torch.eye(N)  # some bend down
+    known.models[known.entries, 2 * N + 1 :] = bent.flatten(1)
+    scaled = bent * known.region[:, None] * known.region
+    size = [torch.linalg.svd(one) for one in scaled]  # of a symmetric matrix: |H| = U S U'
+    mean = torch.stack([u @ s.diag() @ u.mT for u, s, _ in size]).mean(0)
+    mean = mean + 0.01 * mean.trace() / N * torch.eye(N)
+    frame = known._frame()
+    torch.testing.assert_close(frame @ frame.mT, mean / known.region[:, None] / known.region)
+    x = uniform(3, N, seed=9)
+    known.frame.copy_(frame)
+    torch.testing.assert_close(known.seen(x).square().sum(-1), ((x @ frame @ frame.mT) * x).sum(-1))
 
 
 def test_a_trajectory_that_must_not_help_is_no_candidate(known: adp.GlobalValue) -> None:
