@@ -218,7 +218,7 @@ def _detours(count: int, sizes: Tensor, lengths: Sequence[int]) -> Tensor:
     ways = torch.tensor(
         [way for way in itertools.product((0.0, 1.0, -1.0), repeat=count) if any(way)], dtype=torch.float64
     )
-    ways = ways.double() / ways.double().norm(dim=-1, keepdim=True)
+    ways = ways / ways.norm(dim=-1, keepdim=True)
     rows = [
         torch.cat((size * ways, ways.new_full((len(ways), 1), length)), dim=-1)
         for size, length in itertools.product(sizes, lengths)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from typing import Any
 
@@ -160,6 +161,8 @@ def test_a_condition_that_is_a_line_is_made_straight_twice_and_none_that_is_met(
     guard = Counted(lambda x: x[..., :1], LINE, lambda x, t: 0.5 - x[:, 1], dt=0.1)
     guard._definition(tensor([[*state, 0.5, 0.0]]))
     assert guard.count == count
+    guard._definition(tensor([[0.0, 0.5, 0.0, 0.0]]))  # what is met exactly is met
+    assert guard.count == count
 
 
 def test_a_condition_that_is_never_met_is_made_straight_eight_times() -> None:
@@ -198,6 +201,14 @@ def test_a_report_is_that_of_every_step_of_the_loop() -> None:
     assert 0 < report["constraint_violations"] < 5
     assert 0 < len(report["infeasible"]) < 5
     assert 0 < acted < 40
+
+
+def test_a_millionth_of_slack_is_rounding_and_more_is_none() -> None:
+    guard = adp.SafetyFilter(lambda x: x[..., :1], LINE, lambda x, t: x[:, 0], dt=0.1)
+    run = adp.simulate(guard, LINE, COST, tensor([[1.0, 0.0]] * 3), steps=1, compile=False)
+    record = run.identifier.clone()
+    record[:, -1, -2] = tensor([1e-6, 1.1e-6, 1.9e-6])
+    assert guard.report(dataclasses.replace(run, identifier=record))["infeasible"] == [1, 2]
 
 
 def test_the_last_state_counts_too() -> None:

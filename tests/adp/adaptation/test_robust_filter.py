@@ -30,6 +30,7 @@ def test_where_theta_is_known_it_is_the_safety_filter_of_that_plant() -> None:
     filter = adp.SafetyFilter(WANTED.policy, PENDULUM, edge, dt=DT, decay=4.0, degree=2)
     known = guard(TRUE, TRUE)
     u = known.step(x, known.init(x), x.new_zeros(3, 0, 2), DT)[0]
+    assert known.guarded(known.init(x).identifier).least.tolist() == [1e300] * 3  # nothing was seen
     torch.testing.assert_close(u, filter(x), rtol=1e-9, atol=1e-9)
     assert torch.equal(u[2], WANTED.policy(x)[2])  # far from the edge nothing is changed
 
