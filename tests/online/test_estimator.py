@@ -84,6 +84,10 @@ def test_streams_keep_their_numbers_outputs_and_order(settings: dict[str, Any]) 
     assert model.n_samples_seen_.tolist() == [0, 7, 0]
     assert model.n_skipped_.tolist() == [0, 0, 0]
     assert model.predict(x[:0, :3].transpose(0, 1)).shape == (3, 0, 2)
+    several = model.predict(x[:, :3].transpose(0, 1), return_std=True)
+    for k in range(6):
+        for whole, part in zip(several, model.predict(x[k, :3], return_std=True), strict=True):
+            assert torch.equal(whole[:, k], part)
     assert model.reset(streams=1).n_samples_seen_.tolist() == [0, 0, 0]
 
 

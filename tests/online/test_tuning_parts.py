@@ -116,7 +116,7 @@ def test_units_of_a_stretch_are_those_of_what_was_measured(monkeypatch: pytest.M
     x = torch.stack((100 + 3 * (0.5 * time).sin(), torch.full((steps,), 7.0).double()), -1)[:, None]
     y = (5 + 2 * (0.5 * time).sin())[:, None, None].clone()
     x[3, 0, 0], y[5, 0, 0], y[9, 0, 0] = torch.nan, torch.inf, torch.nan
-    found = tuning.tuning(x, y, st.rings(3))
+    found = tuning.tuning(x, y, st.rings(6))
     both = torch.cat((x, y), -1)[:, 0]
     for column, center in enumerate(found.center[0].tolist()):
         seen = both[:, column][both[:, column].isfinite()]
@@ -127,6 +127,12 @@ def test_units_of_a_stretch_are_those_of_what_was_measured(monkeypatch: pytest.M
     assert float(found.spread[0, 0]) == pytest.approx(float(moving.std(correction=0) * found.width[0, 0]))
     assert found.unknown[0].tolist() == [0.0, 1.0]  # a constant says nothing of its width
     assert float(found.spread[0, 1]) == pytest.approx(float(found.spread[0, 0]))
+    first = torch.cat((found.spread[:, :2] / found.width, found.spread[:, 2:]), 1)
+    first[0, 1] = 1.0
+    best = _Candidates(found.width[:, None], found.ratio.sqrt()[:, None], found.forgetting[:, None])
+    samples = (torch.cat((x, y), -1) - found.center) / first
+    score = tuning._scores(best, samples, 2, found.radius[0] * st.rings(6))
+    assert float(found.likelihood) == pytest.approx(float(score) / 16, rel=1e-6)  # of 24 samples
 
 
 def test_the_later_two_thirds_are_scored_each_before_it_is_learned() -> None:

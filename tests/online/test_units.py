@@ -47,6 +47,7 @@ def test_units_are_mean_and_deviation_of_what_is_usual() -> None:
         "none": np.full(9, NAN),
         "one": np.array([NAN] * 8 + [7.0]),
         "constant": np.full(9, 1e9),
+        "zeros": np.zeros(9),
         "two values": np.array([4.0] * 5 + [5.0] * 4),
         "an outlier": np.array([*draw.uniform(-1, 1, 8), 1e6]),
         "at the edge": np.array([-1.0, -1.0, -1.0, 0.0, 0.0, 0.0, 1.0, 1.0, 30.0]),
