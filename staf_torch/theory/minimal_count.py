@@ -21,7 +21,7 @@ from .uniform_approximation import ball_grid, supremum
 
 _BLOCK = 2**21  # kernel values in a temporary
 _SHELLS = 6
-_DIRECTIONS = {1: 2, 2: 128}  # of each shell; in space 256
+_DIRECTIONS = {2: 128}  # of each shell in the plane; in space 256, and on a line there are two
 _MOST_CENTERS = 500
 
 

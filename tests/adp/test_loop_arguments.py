@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from typing import Any
 
@@ -308,6 +309,14 @@ class Misshapen(systems.Linear):
 def test_arguments_of_a_run_are_refused_by_name(given: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         run(**given)
+
+
+@pytest.mark.parametrize("kind", [adp.LoopResult, adp.Gains])
+def test_what_a_run_returns_and_gains_are_not_changed(kind: type) -> None:
+    found = object.__new__(kind)
+    for name in kind.__dataclass_fields__:  # type: ignore[attr-defined]
+        with pytest.raises(dataclasses.FrozenInstanceError):
+            setattr(found, name, None)
 
 
 def test_arguments_at_their_edges_are_taken() -> None:

@@ -175,6 +175,14 @@ def test_degree_over_radius_that_is_whole_takes_one_more() -> None:
     assert built.m == 5
 
 
+@pytest.mark.parametrize("kind", [Construction, theory.ExponentialBound, theory.MinimalCount])
+def test_what_is_found_is_not_changed(kind: type) -> None:
+    found = object.__new__(kind)
+    for name in kind.__dataclass_fields__:  # type: ignore[attr-defined]
+        with pytest.raises(dataclasses.FrozenInstanceError):
+            setattr(found, name, None)
+
+
 @pytest.mark.parametrize("shape", [(1, 1, 4, 2), (4, 4, 2)])
 def test_offsets_of_a_construction_are_of_its_states(shape: tuple[int, ...]) -> None:
     built = theory.one_polynomial_bound(PAPER, STATES, 0.1, 0.1)
