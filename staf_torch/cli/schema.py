@@ -157,12 +157,12 @@ def _value(values: Sequence[Any], name: str, said: Mapping[str, str], hint: set[
     """Return the schema of values of one kind; an empty one, which takes all, where nothing is known."""
     inner = [value for value in values if isinstance(value, dict)]
     if inner:
-        targets = {str(value["_target_"]) for value in inner if value.get("_target_")}
+        targets = sorted({str(value["_target_"]) for value in inner if value.get("_target_")})
         target = next(iter(targets), None)
         keys = _merged([_without(each, {"_target_": 0}) for each in inner], f"{name}.", said, target)
         if target is None:
             return {"anyOf": [_closed(keys), {"type": "null"}]}
-        return {"anyOf": [_closed(keys | {"_target_": {"enum": sorted(targets)}}), _OWN]}
+        return {"anyOf": [_closed(keys | {"_target_": {"enum": targets}}), _OWN]}
     kinds = set(hint or ())
     for value in values:
         if value is None and hint is None:
