@@ -116,7 +116,14 @@ def test_units_of_a_stretch_are_those_of_what_was_measured(monkeypatch: pytest.M
     x = torch.stack((100 + 3 * (0.5 * time).sin(), torch.full((steps,), 7.0).double()), -1)[:, None]
     y = (5 + 2 * (0.5 * time).sin())[:, None, None].clone()
     x[3, 0, 0], y[5, 0, 0], y[9, 0, 0] = torch.nan, torch.inf, torch.nan
+    told: list[tuple[torch.Tensor, ...]] = []
+    monkeypatch.setattr(tuning, "_warn", lambda *given: told.append(given))
     found = tuning.tuning(x, y, st.rings(6))
+    ((covered, width, wider),) = told
+    assert torch.equal(width, found.spread[:, :2])
+    assert wider.tolist() == [[False, True]]
+    extent = float(x[:, 0, 0].nan_to_num(nan=100.0).max() - x[:, 0, 0].nan_to_num(nan=100.0).min())
+    torch.testing.assert_close(covered, torch.tensor([[extent, 0.0]]).double() / width)
     both = torch.cat((x, y), -1)[:, 0]
     for column, center in enumerate(found.center[0].tolist()):
         seen = both[:, column][both[:, column].isfinite()]
