@@ -123,7 +123,7 @@ def solve(
     if not left:
         solution, *rest = solve(matrix.mT, right.mT)
         return solution.mT.clone(), rest[0], rest[1], rest[2]
-    vector = right.dim() < matrix.dim()
+    vector = right.dim() == 1 or right.shape == matrix.shape[:-1]  # as torch tells them apart
     columns = right.unsqueeze(-1) if vector else right
     size, width = matrix.shape[-1], columns.shape[-1]
     place = torch.arange(size, dtype=matrix.dtype, device=matrix.device)

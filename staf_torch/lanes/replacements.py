@@ -135,7 +135,7 @@ def searchsorted(
     at = x.unsqueeze(-1)
     edges = boundaries if boundaries.dim() == 1 else boundaries.unsqueeze(-2)
     passed = ~(edges > at) if right or side == "right" else ~(edges >= at)
-    return passed.to(torch.int32 if out_int32 else torch.int64).sum(-1)
+    return passed.sum(-1)
 
 
 def fmin(a: Tensor, b: Tensor) -> Tensor:
@@ -162,8 +162,8 @@ def erfinv(y: Tensor) -> Tensor:
 
 
 def angle(x: Tensor) -> Tensor:
-    """The angle of real numbers: 0, or pi where negative."""
-    return torch.where(x < 0, torch.pi, x * 0)
+    """The angle of real numbers: 0, or pi where negative; NaN of NaN."""
+    return torch.where(x < 0, torch.pi, torch.where(x != x, x, 0.0))
 
 
 REPLACEMENTS: dict[str, Callable[..., Any]] = {
