@@ -27,7 +27,8 @@ pytestmark = pytest.mark.usefixtures("not_laid_out", "looks_are_the_recorded")
 
 def labelled(axes: Axes) -> tuple[bool, bool]:
     """Whether the numbers below, and those on the left, are shown."""
-    return bool(axes.xaxis.get_tick_params()["labelbottom"]), bool(axes.yaxis.get_tick_params()["labelleft"])
+    below, left = (axis.get_major_ticks()[0].label1.get_visible() for axis in (axes.xaxis, axes.yaxis))
+    return below, left
 
 
 def test_bounds_of_many_radii_are_in_rows_of_four_with_names_at_the_left_and_at_the_bottom() -> None:
