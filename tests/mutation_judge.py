@@ -17,7 +17,7 @@ from mutation_map import CONTRACTS, Map, names, places, test_files, tests_near
 from mutation_patch import Functions
 from source_rules import without_dtype
 
-OVERHEAD = 0.1  # seconds that a test costs beside what was measured
+OVERHEAD = 0.01  # seconds that a test costs beside what was measured
 UNKNOWN = 5.0  # seconds that a file of tests is taken for
 _ENDED = "by the clock, or the process ended"
 _ANEW, _CANNOT = "to be tried anew", 99

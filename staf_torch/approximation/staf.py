@@ -234,7 +234,7 @@ class StaF(nn.Module):
         """Refuse what is not (..., P, n), and (*batch_shape, n), which could be one point a batch entry."""
         trailing(call, "y", y, dims=2, last=self.basis.dim)
         batch = self.state.shape[:-1]
-        if len(batch) == y.dim() - 1 and y.shape[:-1] == batch:
+        if y.shape[:-1] == batch:
             raise ValueError(
                 f"`{call}(y=...)` of the shape {tuple(y.shape)} must say which points are meant: one of each "
                 f"batch entry ({one_each}), or all of them for every entry (`y.unsqueeze(0)`, (1, P, n))."
