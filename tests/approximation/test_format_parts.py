@@ -107,3 +107,14 @@ def test_cardinal_functions_are_one_at_their_own_center_and_sum_up_samples() -> 
     worst = (Paper()(x.unsqueeze(1) + z) - estimate).abs().amax(-1)
     torch.testing.assert_close(conditioning.sup_error(basis, x, Paper()), worst, rtol=1e-6, atol=1e-10)
     assert float(conditioning.lebesgue_constant(basis, x[0])) == pytest.approx(float(constant[0]))
+
+
+@pytest.mark.parametrize("batch", [(3,), (2, 3)])
+def test_points_that_could_be_of_one_entry_each_or_of_all_are_refused(batch: tuple[int, ...]) -> None:
+    staf = st.StaF(of(st.GaussianKernel()), batch).fit_(uniform(*batch, 2, seed=1), Paper())
+    y = uniform(*batch, 2, seed=2)
+    for call in (staf, staf.gradient):
+        with pytest.raises(ValueError, match="must say which points are meant: one of each batch entry"):
+            call(y)
+    for points in (y.unsqueeze(-2), uniform(4, 2, seed=4), uniform(*batch, 4, 2, seed=3)):
+        assert staf(points).shape[-1] == points.shape[-2]
