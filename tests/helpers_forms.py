@@ -326,6 +326,8 @@ def choices(a: Tensor, k: Tensor) -> list[Tensor]:
             a.gather(1, wide),
             a.gather(2, wide.mT),
             a.gather(1, wide[:, :2]),
+            a.gather(1, wide[:, :2, :2]),
+            a.scatter(2, wide[:, :2], a),
             a.scatter(1, wide, a.sin()),
             a.scatter(2, wide, 0.5),
         ),

@@ -174,7 +174,7 @@ class _Run:
     """
 
     def __init__(self, problem: Problem, states: Tensor, weights: Tensor | None, *, everything: bool) -> None:
-        self._problem, self._warned, self._reach = problem, False, 0.0
+        self._problem, self._warned = problem, False
         self.carry = start(problem, states, weights)
         self._first = row_program.first_carry(problem, self.carry)
         self._unit = self._first.unit  # of the last chunk, bit by bit: a row that diverged stays as it was

@@ -13,6 +13,9 @@ from recorded import Record
 from torch import Tensor
 
 from staf_torch import lanes
+from staf_torch.lanes.given import Given
+from staf_torch.lanes.one_row import trace
+from staf_torch.lanes.scalar_text import cuda_text
 
 SIZE = 67
 Step = Callable[[Any, Tensor, Tensor], tuple[Any, Any]]
@@ -83,6 +86,24 @@ def text(name: str, copies: int) -> str:
 def test_the_text_of_a_carry_is_the_recorded(name: str, record: Record) -> None:
     if record.known().get("torch", VERSION) == VERSION:
         record({"torch": VERSION, "text": [said(text(name, copies)) for copies in (1, 2)]})
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_the_text_for_another_processor_is_the_recorded(dtype: torch.dtype, record: Record) -> None:
+    """A thread a row: of a carry of numbers and flags, inputs of every time and of none, some shared."""
+
+    def step(carry: Any, now: Any, row: Any) -> tuple[Any, Any]:
+        x, flag = carry
+        y = lanes.repeat(3, lambda z: z * row[0] + now[1].sum(-1, keepdim=True), x)
+        x = torch.where(flag.unsqueeze(-1), y.exp() * now[0], x - row[1][:2])
+        return (x.flip(-1), x[:, 0] > 0), (x, flag, (x.unsqueeze(-1) * row[1]).sum(-1))
+
+    x, u, r = (uniform(*shape, seed=1).to(dtype) for shape in ((2, 2), (2, 4, 1), (3,)))
+    shared = torch.arange(12).view(4, 3).to(dtype)
+    given = Given.of((x, x[:, 0] > 0), (u, lanes.Shared(shared)), (x, lanes.Shared(r)), None)
+    if record.known().get("torch", VERSION) == VERSION:
+        text = cuda_text(*trace(step, given).program, name="go", shared=["now1", "row1"])
+        record({"torch": VERSION, "text": said(text)})
 
 
 def test_carries_that_no_other_reads_are_written_where_they_were() -> None:
