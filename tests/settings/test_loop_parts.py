@@ -122,3 +122,42 @@ def test_options_of_groups_are_exchanged_by_name_and_numbers_as_they_are() -> No
     assert (new.adp.trust, cfg.adp.trust != 3.0) == (3.0, True)
     with pytest.raises(ValueError, match=r"`staf adp.policy=...` must be one of .*'lqr'.*; got 'no'"):
         loops.changed(cfg, {"policy": "no"})
+
+
+class Asking(nn.Module):
+    """A policy that asks for all that there is."""
+
+    def __init__(self, **given: Any) -> None:
+        super().__init__()
+        self.given = given
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        return x
+
+
+def asking(
+    system: Any, model: Any, plant: Any, cost: Any, dim: Any, inputs: Any, lqr: Any,
+    basis: Any, extrapolation: Any, law: Any, critic: Any, actor: Any,
+) -> Asking:  # fmt: skip
+    return Asking(**locals())
+
+
+def test_a_policy_gets_whatever_it_asks_for_by_name() -> None:
+    weights = "adp.critic=[0.1,0.2,0.3]", "adp.actor=[0.4,0.5,0.6]", "adp.trust=null"
+    cfg = composing.settings("experiment=adp", *weights)
+    learner = loops.adp_problem(cfg).controller
+    assert isinstance(learner, adp.ActorCritic)
+    assert (learner.critic.tolist(), learner.actor.tolist()) == ([0.1, 0.2, 0.3], [0.4, 0.5, 0.6])
+    cfg = loops.updated(cfg)
+    cfg.adp.policy = {"_target_": f"{__name__}.asking"}
+    system = loops.plant(cfg)
+    cost = loops.make_cost(cfg, system)
+    held = loops.controller(cfg, system, cost)
+    assert isinstance(held, adp.Feedback)
+    given = held.policy.given
+    assert given["system"] is given["model"] is given["plant"] is system
+    assert (given["cost"], given["dim"], given["inputs"]) == (cost, 2, 1)
+    kinds = {"lqr": adp.LQR, "basis": adp.ValueBasis, "extrapolation": adp.Extrapolation}
+    for name, kind in {**kinds, "law": adp.ActorCriticLaw}.items():
+        assert isinstance(given[name], kind)
+    assert (given["critic"], given["actor"]) == ([0.1, 0.2, 0.3], [0.4, 0.5, 0.6])
