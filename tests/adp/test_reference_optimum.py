@@ -147,7 +147,9 @@ def test_some_recorded_states_are_shot_from(caplog: pytest.LogCaptureFixture) ->
     torch.testing.assert_close(found.control_error[:, at], (loop.control[:, at] - LQR(x)).norm(dim=-1))
     torch.testing.assert_close(found.value_error[:, at], (LQR.value(x) - x.square().sum(-1)).abs())
     said = "V* by direct shooting from 9 states, 24 intervals over 2.5 s: "
-    assert [record.message for record in caplog.records] == [said + "mesh error <= 1.0e-03, horizon <= 2.0e-03"]
+    assert [record.message for record in caplog.records] == [
+        said + "mesh error <= 1.0e-03, horizon <= 2.0e-03"
+    ]
 
 
 @pytest.mark.usefixtures("_shot")
