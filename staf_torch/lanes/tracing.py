@@ -34,13 +34,16 @@ def trace(module: nn.Module, example: Tensor, *, batch: int | None = None) -> Ex
 
     Args:
         module: (B, n) -> a tensor or a tuple of tensors.
-        example: an input, (B, n) with any B; its values do not matter, its dtype does.
+        example: an input, (B, n) with any B from 1; its values do not matter, its dtype does.
         batch: B; any by default.
 
     Raises:
         ValueError: if an argument breaks its rule, or the module cannot be traced for every batch.
     """
-    trailing("trace", "example", example, dims=2)
+    if trailing("trace", "example", example, dims=2).dim() > 2 or not len(example):
+        raise ValueError(
+            f"`trace(example=...)` must be states (B, n), one at least; got the shape {tuple(example.shape)}."
+        )
     rows = _TRACED if batch is None else integer("trace", "batch", batch, least=1)
     x = example[:1].detach().expand(rows, -1).clone()
     shapes = ({0: Dim("batch", min=1)},) if batch is None else None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+import sys
 import types
 from collections.abc import Callable
 from pathlib import Path
@@ -152,10 +153,13 @@ def test_classes_are_kept_with_what_they_inherit() -> None:
     assert len(inside_classes([int])) == 1
 
 
-def test_whose_code_it_is() -> None:
+def test_whose_code_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "script", types.ModuleType("script"))  # as a notebook: without a file
+    monkeypatch.setitem(sys.modules, "beside", types.ModuleType("beside"))
+    sys.modules["beside"].__file__ = str(Path.home() / "beside.py")
     for module in ("staf_torch", "staf_torch.lanes.tree", "math", "collections.abc", "torch.nn", "numpy"):
         assert installed(module)
-    for module in ("__main__", "no_such_module", __name__):
+    for module in ("script", "beside", "no_such_module", __name__):
         assert not installed(module)
     assert is_users(Module)
     assert is_users(test_whose_code_it_is)
