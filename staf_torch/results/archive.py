@@ -18,7 +18,6 @@ from .untrusted import UnreadableError, open_regular, visible
 _DIRECTORY = 2**16  # bytes of the list of arrays at most
 _END, _END_64, _LOCAL = struct.Struct("<4s4H2LH"), struct.Struct("<4sQ2H2L4Q"), struct.Struct("<4s5H3L2H")
 _LOCATOR = 20  # bytes between the two ends
-_HEADER = 10_000  # bytes of numpy's header at most
 
 
 class Stored(NamedTuple):
@@ -108,7 +107,7 @@ class Archive:
         reader = (
             np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
         )
-        shape, fortran, dtype = reader(file, max_header_size=_HEADER)
+        shape, fortran, dtype = reader(file)  # of 10 000 bytes at most, by numpy's own limit
         start = file.tell()
         size = dtype.itemsize * math.prod(shape)
         if dtype.hasobject or dtype.kind not in "biufU" or min(shape, default=0) < 0:

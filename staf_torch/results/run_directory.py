@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import math
 import os
 import shutil
 import tempfile
@@ -181,7 +182,7 @@ class HistoryWriter:
             if name not in self._files:
                 self._files[name] = self._open(name, piece)
             descriptor, header = self._files[name]
-            entry = piece.dtype.itemsize * int(np.prod(piece.shape[2:], dtype=np.int64))
+            entry = piece.dtype.itemsize * math.prod(piece.shape[2:])
             for row, block in enumerate(np.ascontiguousarray(piece)):
                 start = header + entry * (row * self._times + self._done)
                 os.pwrite(descriptor, block.tobytes(), start)
@@ -193,7 +194,7 @@ class HistoryWriter:
         for name, array in whole.items():
             np.save(self._scratch / f"{name}.npy", array)
         packed = self._scratch / HISTORY
-        with zipfile.ZipFile(packed, "w", zipfile.ZIP_STORED, allowZip64=True) as archive:
+        with zipfile.ZipFile(packed, "w", zipfile.ZIP_STORED) as archive:
             for name in (*whole, *self._files):
                 archive.write(self._scratch / f"{name}.npy", f"{name}.npy")
         os.replace(packed, self._path)
@@ -220,5 +221,4 @@ class HistoryWriter:
                 {"descr": piece.dtype.str, "fortran_order": False, "shape": shape},
             )
             header = file.tell()
-            file.truncate(header + piece.dtype.itemsize * int(np.prod(shape, dtype=np.int64)))
         return os.open(path, os.O_WRONLY), header

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import io
+import struct
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as some
 
-from staf_torch.results.archive import Archive
+from staf_torch.results.archive import Archive, _short_directory
 from staf_torch.results.run_directory import HistoryWriter
 from staf_torch.results.untrusted import UnreadableError
 
@@ -154,3 +157,84 @@ def test_an_archive_whose_list_is_not_at_its_very_end_is_refused(
     path.write_bytes(HIDDEN[how](path.read_bytes(), said))
     with pytest.raises(UnreadableError, match="does not end as an archive"):
         Archive(path)
+
+
+@pytest.mark.parametrize(
+    ("sign", "length", "before", "refused"),
+    [
+        (b"PK\6\6", 2**16, b"", False),
+        (b"PK\6\6", 2**16 + 1, b"", True),
+        (b"PK\6\6", 2**16 + 1, b"before", True),
+        (b"PK\6\7", 2**16 + 1, b"", False),  # no such end: the other one counts
+    ],
+)
+def test_the_list_of_a_large_archive_is_measured_by_its_second_end(
+    sign: bytes, length: int, before: bytes, refused: bool
+) -> None:
+    """56 bytes of the end for large files, 20 that say where it is, and 22 of the end for small ones."""
+    second = struct.pack("<4sQ2H2L4Q", sign, 44, 45, 45, 0, 0, 1, 1, length, 0)
+    whole = before + second + bytes(20) + struct.pack("<4s4H2LH", b"PK\5\6", 0, 0, 1, 1, 50, 0, 0)
+    if refused:
+        with pytest.raises(ValueError, match=f"lists its arrays in {length} bytes"):
+            _short_directory(io.BytesIO(whole), len(whole))
+    else:
+        _short_directory(io.BytesIO(whole), len(whole))
+
+
+def test_an_archive_may_be_empty_and_so_may_its_arrays(tmp_path: Path) -> None:
+    path = tmp_path / "history.npz"
+    zipfile.ZipFile(path, "w").close()
+    assert path.stat().st_size == 22
+    assert Archive(path).names == ()
+    np.savez(path, one=np.array(2.5), none=np.zeros((0, 3)))
+    archive = Archive(path)
+    assert archive.read("one").shape == ()
+    assert float(archive.read("one")) == 2.5
+    assert archive.read("none").shape == (0, 3)
+    for cut in (0, 21):
+        path.write_bytes(path.read_bytes()[-cut:] if cut else b"")
+        with pytest.raises(UnreadableError, match="cannot be read"):
+            Archive(path)
+
+
+def test_an_array_that_would_go_on_behind_the_file_is_refused(tmp_path: Path) -> None:
+    path, held = tmp_path / "history.npz", io.BytesIO()
+    np.lib.format.write_array_header_1_0(held, {"descr": "<f8", "fortran_order": False, "shape": (1000,)})
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("state.npy", held.getvalue() + bytes(80))
+    whole = bytearray(path.read_bytes())
+    listed = whole.index(b"PK\1\2")
+    said = struct.pack("<2L", *(len(held.getvalue()) + 8000,) * 2)
+    whole[listed + 20 : listed + 28] = said  # packed and unpacked size, as the list has them
+    path.write_bytes(whole)
+    with pytest.raises(UnreadableError, match="state has another size than it says"):
+        Archive(path)
+
+
+def test_a_header_of_more_than_ten_thousand_bytes_is_not_read(tmp_path: Path) -> None:
+    for blanks, taken in ((9000, True), (10_000, False)):
+        text = "{'descr': '<f8', 'fortran_order': False, 'shape': (1,), }".ljust(blanks) + "\n"
+        with zipfile.ZipFile(tmp_path / "history.npz", "w") as archive:
+            head = b"\x93NUMPY\1\0" + len(text).to_bytes(2, "little") + text.encode()
+            archive.writestr("a.npy", head + np.array([2.5]).tobytes())
+        if taken:
+            assert Archive(tmp_path / "history.npz").read("a").tolist() == [2.5]
+        else:
+            with pytest.raises(UnreadableError, match="cannot be read"):
+                Archive(tmp_path / "history.npz")
+
+
+def test_no_folder_between_a_run_and_its_archive_is_a_link(tmp_path: Path) -> None:
+    run, elsewhere = tmp_path / "run", tmp_path / "elsewhere"
+    for folder in (run / "deep", elsewhere):
+        folder.mkdir(parents=True)
+        np.savez(folder / "history.npz", a=np.arange(3.0))
+    archive = Archive(run / "deep" / "history.npz", run)
+    assert archive.read("a").tolist() == [0.0, 1.0, 2.0]
+    (run / "deep").rename(tmp_path / "moved")
+    (run / "deep").symlink_to(elsewhere)
+    with pytest.raises(UnreadableError, match="a link, which is not followed"):
+        archive.read("a")
+    with pytest.raises(UnreadableError, match="a link, which is not followed"):
+        Archive(run / "deep" / "history.npz", run)
+    assert Archive(run / "deep" / "history.npz").read("a").tolist() == [0.0, 1.0, 2.0]

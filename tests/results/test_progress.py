@@ -59,3 +59,50 @@ def test_a_long_run_on_a_terminal_draws_a_bar_and_wipes_it(
     assert drawn[-2].strip() == ""  # wiped at the end
     assert "\n" not in "".join(drawn)
     assert caplog.messages == []  # the bar says it already
+
+
+def test_lines_of_the_log_come_after_two_seconds_and_then_every_ten(
+    clock: _Clock, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
+    clock.now = 1000.0
+    _run(clock, 50.0)  # half a second each
+    # A step is told when the next one is asked for: the fourth at 2 s.
+    assert caplog.messages == [
+        f"{share} % of 100 times, {left} s left"
+        for share, left in ((4, 48), (24, 38), (44, 28), (64, 18), (84, 8))
+    ]
+
+
+def test_a_listener_is_told_shares_and_nothing_is_shown(
+    clock: _Clock,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level(logging.INFO)
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
+    monkeypatch.setattr("tqdm.std.time", clock.monotonic)
+    told: list[float] = []
+    for _ in progress.Progress(told.append).each("abcd", "letters"):
+        clock.now += 100.0
+    with progress.Progress(told.append).over(10, "steps") as advance:
+        advance(3)
+        advance(5)
+    assert told == [0.25, 0.5, 0.75, 1.0, 0.3, 0.8]
+    assert capsys.readouterr() == ("", "")
+    assert caplog.messages == []
+
+
+@pytest.mark.parametrize(("seconds", "drawn"), [(1.9, False), (2.6, True)])
+def test_a_bar_appears_after_two_seconds(
+    seconds: float,
+    drawn: bool,
+    clock: _Clock,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
+    monkeypatch.setattr("tqdm.std.time", clock.monotonic)
+    _run(clock, seconds)
+    assert ("/100 " in capsys.readouterr().err) == drawn

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+import os
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from staf_torch.results.run_directory import RunDirectory
+from staf_torch.results import run_directory
+from staf_torch.results.run_directory import History, RunDirectory
 from staf_torch.tables import Table
 
 
@@ -68,3 +71,51 @@ def test_figures_are_not_written_through_a_link(tmp_path: Path) -> None:
     with pytest.raises(OSError, match="it is a link, which is not written through"):
         RunDirectory(tmp_path / "run").figure("one", {"png": b"1"})
     assert list((tmp_path / "elsewhere").iterdir()) == []
+
+
+def test_lines_are_on_the_disk_one_by_one_and_get_their_name_in_the_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    partial, synced = tmp_path / ".rows.csv.partial", []
+    monkeypatch.setattr(run_directory.os, "fsync", lambda number: synced.append(partial.read_text()))
+    partial.write_text("left by an earlier run")
+    with RunDirectory(tmp_path).lines("rows.csv") as write:
+        write("one\n")
+        write("two\n")
+        assert not (tmp_path / "rows.csv").exists()
+    assert synced == ["one\n", "one\ntwo\n"]
+    assert [path.name for path in tmp_path.iterdir()] == ["rows.csv"]
+    partial.write_text("one\nhal")
+    with RunDirectory(tmp_path).lines("rows.csv", keep=4) as write:
+        write("2\n")
+    assert (tmp_path / "rows.csv").read_text() == "one\n2\n"
+
+
+def test_several_figures_share_a_folder(tmp_path: Path) -> None:
+    run = RunDirectory(tmp_path)
+    run.figure("one", {"png": b"1"})
+    run.figure("two", {"png": b"2"})
+    assert {path.name for path in (tmp_path / "figures").iterdir()} == {"one.png", "two.png"}
+
+
+def test_a_history_is_written_beside_itself_and_leaves_no_file_open(tmp_path: Path) -> None:
+    open_before = len(os.listdir("/proc/self/fd")) if os.path.isdir("/proc/self/fd") else None
+    with RunDirectory(tmp_path).history(2, 3) as history:
+        (scratch,) = tmp_path.iterdir()
+        assert scratch.name.startswith(".history-")
+        for begin, end in ((0, 1), (1, 3)):
+            whole = np.arange(2 * 3 * 4.0).reshape(2, 3, 2, 2)
+            empty = np.zeros((2, 3, 0))
+            history.add({"a": whole[:, begin:end], "b": whole[:, begin:end, 0, 0], "c": empty[:, begin:end]})
+        history.close(time=np.arange(3))
+        shutil.rmtree(scratch)  # by somebody else: it would have gone now
+    if open_before is not None:
+        assert len(os.listdir("/proc/self/fd")) == open_before
+    found = History(tmp_path / "history.npz")
+    assert list(found) == ["time", "a", "b", "c"]
+    assert (len(found), repr(found)) == (4, "<History time, a, b, c>")
+    np.testing.assert_array_equal(found["a"], whole)
+    np.testing.assert_array_equal(found["b"], whole[:, :, 0, 0])
+    assert found["c"].shape == (2, 3, 0)
+    assert found["a"] is found["a"]
+    assert [path.name for path in tmp_path.iterdir()] == ["history.npz"]
