@@ -1,0 +1,107 @@
+"""One step of the definition of a bank, from states of every age, against the same step of compiled code."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor, inf, nan
+
+from staf_torch.centers import simplex
+from staf_torch.kernels import GaussianKernel
+from staf_torch.online.bank import Bank
+from staf_torch.online.bank_definition import BankDefinition
+from staf_torch.online.bank_rules import RECENT, BankShape, Rules, size
+from staf_torch.online.local_functions import LocalFunctions
+
+BUT = ("asked", "gap")  # where nobody asked, two kinds of nothing; distances that are equal to the last bit
+INVERSES = ("tracker_inverse", "tracker_known", "tracker_weights")  # entries of up to 1e6, which cancel
+
+
+def events(outputs: int, away: int) -> tuple[Tensor, Tensor]:
+    """A stream with gaps, infinities, outliers alone and in pairs, that goes elsewhere for good."""
+    draw = torch.Generator().manual_seed(0)
+    x = 0.3 + 2 * torch.randn(150, 1, 2, generator=draw, dtype=torch.float64)
+    y = torch.stack([(x[..., 0] * (k + 1)).sin() + x[..., 1] + 3 * k for k in range(outputs)], -1)
+    y = y + 0.1 * torch.randn(y.shape, generator=draw, dtype=torch.float64)
+    x[12, 0, 1], y[14, 0, 0], x[16, 0, 0] = nan, nan, inf
+    y[:3, 0, 1:] = nan  # measured later
+    y[60], y[62], x[64, 0, 1] = 1e300, 200.0, 1e12
+    y[70], y[75:77], y[80] = 40.0, -40.0, 25.0  # one that waits in vain, and two that are learned
+    x[away:] += 1e9
+    return x, y
+
+
+YOUNG = (*range(6), 12, 14)
+OLD = (60, 62, 63, 71, 75, 76, 77)
+GONE = (90, 96, 97, 99)
+CASES = {
+    "units of its own, two outputs": (2, True, 8.0, 90, (*YOUNG, *OLD, *GONE)),
+    "units that are given, one output": (1, False, None, 150, (*YOUNG[:5], 16, *OLD[3:], 135)),
+}
+
+
+@pytest.mark.needs_compiler
+@pytest.mark.parametrize("name", CASES)
+def test_a_step_of_the_definition_is_that_of_compiled_code(name: str) -> None:
+    outputs, scaling, doubtful, away, looked_at = CASES[name]
+    shape = BankShape(2, outputs, 128, 8)
+    fast = Bank(shape, 1, scaling, doubtful)
+    slow = Bank(shape, 1, scaling, doubtful)
+    slow._run = None
+    x, y = events(outputs, away)
+    for k in range(looked_at[-1] + 1):
+        lapse = torch.tensor([0.3 + 0.2 * (k % 7)], dtype=torch.float64) if k % 3 else None
+        slow.table.copy_(fast.table)
+        for bank in (fast, slow) if k in looked_at else (fast,):
+            if k % 5 and k != 16:  # else it asks itself
+                bank.predict(x[k])
+            bank.learn(x[k], y[k], lapse)
+        if k in looked_at:
+            found, wanted = (bank._definition.each(bank.table)[0] for bank in (slow, fast))
+            for part, value in wanted.items():
+                if part not in BUT:
+                    size_of = 1e-3 * float(value.abs().max()) if part in INVERSES else 0.0
+                    torch.testing.assert_close(
+                        found[part],
+                        value,
+                        rtol=1e-5,
+                        atol=1e-6 + size_of,
+                        equal_nan=True,
+                        msg=lambda told, part=part, k=k: f"{part} {k}: {told}",
+                    )
+
+
+@pytest.mark.parametrize("scaling", [False, True])
+def test_a_store_gives_up_the_older_of_the_closest_pair_of_those_that_are_not_recent(scaling: bool) -> None:
+    """Against a search of all pairs; steps on a grid, so that some distances are equal."""
+    shape = BankShape(2, 1, RECENT + 6, 8)
+    functions = LocalFunctions.of(GaussianKernel(1.0), simplex(2))
+    definition = BankDefinition(shape, Rules.of(2, scaling), functions)
+    (s,) = definition.each(torch.zeros(1, size(shape), dtype=torch.float64))
+    definition.clear(s)
+    s["spread"].copy_(torch.tensor([1.0, 4.0, 1.0]))
+    unit = torch.tensor([1.0, 4.0 if scaling else 1.0], dtype=torch.float64)
+    draw = torch.Generator().manual_seed(1)
+    x = torch.randint(0, 12, (RECENT + 40, 2), generator=draw).double()
+    kept: list[int] = []  # clocks of the samples, from 1
+    for clock in range(1, len(x) + 1):
+        old = [each for each in kept if each <= clock - RECENT]
+        if len(kept) == shape.capacity:
+            apart = torch.cdist(x[[each - 1 for each in old]] / unit, x[[each - 1 for each in old]] / unit)
+            apart.fill_diagonal_(inf)
+            closest = apart.amin(1)
+            kept.remove(min(each for each, a in zip(old, closest, strict=True) if a <= closest.min() + 1e-9))
+        kept.append(clock)
+        s["clock"].fill_(float(clock))
+        definition._keep(s, x[clock - 1], torch.full((1,), float(clock)).double(), 0.5 * clock)
+        assert float(s["count"]) == len(kept)
+        order = s["order"][: len(kept)]
+        assert sorted(order.tolist()) == kept
+        at = order.long() - 1
+        assert torch.equal(s["x"][: len(kept)], x[at])
+        assert torch.equal(s["y"][: len(kept), 0], order)
+        assert torch.equal(s["when"][: len(kept)], 0.5 * order)
+        among = order <= clock + 1 - RECENT  # what is next to choose from
+        apart = torch.where(among[:, None] & among, torch.cdist(x[at] / unit, x[at] / unit), inf)
+        apart.fill_diagonal_(inf)
+        torch.testing.assert_close(s["gap"][: len(kept)], apart.amin(1).square())
