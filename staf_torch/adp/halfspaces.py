@@ -191,11 +191,10 @@ def _best_case(wanted: Tensor, unit: Tensor, far: Tensor, low: Tensor, high: Ten
     def case(points: Tensor) -> Tensor:
         """A firm and a soft u, and how far each is from a solution: (..., P, k + m) -> (..., P, 2 m + 2)."""
         active, side = points.split((count, size), dim=-1)
-        ends = torch.where(side < 0, low, torch.where(side > 0, high, 0.0))
         start, rows, aims = wanted.unsqueeze(-2), unit.unsqueeze(-3), far.unsqueeze(-2)
+        base = torch.where(side < 0, low, torch.where(side > 0, high, start))
         free = (side == 0).to(wanted).unsqueeze(-2) * rows  # (..., P, k, m)
         gram = active.unsqueeze(-1) * active.unsqueeze(-2) * (free.unsqueeze(-2) * free.unsqueeze(-3)).sum(-1)
-        base = torch.where(side == 0, start, ends)
         right = active * (aims - (rows * base.unsqueeze(-2)).sum(-1))
         found = []
         for give in (small.firm, small.soft):

@@ -238,9 +238,9 @@ class StreamDrift:
         half = (transfer[..., :, :, None, None, None] * split.unsqueeze(-5)).sum(-4)
         whole = (half.unsqueeze(-3) * transfer[..., None, None, :, :, None]).sum(-2)
         covariance = torch.eye(m * n, dtype=x.dtype, device=x.device) - whole.flatten(-2).flatten(-3, -2)
-        wide = moves.unsqueeze(-1)
+        wide = moves[..., None, None]
         return DriftEstimate(
-            torch.where(wide, x, now.anchor),
-            torch.where(wide.unsqueeze(-1), mean.flatten(-2), now.mean),
-            torch.where(wide.unsqueeze(-1), covariance, now.covariance),
+            torch.where(moves[..., None], x, now.anchor),
+            torch.where(wide, mean.flatten(-2), now.mean),
+            torch.where(wide, covariance, now.covariance),
         )
