@@ -64,10 +64,9 @@ class Captured:
     def __init__(self) -> None:
         self._stated: dict[int, Any] = {}  # storages, kept: an address is used once
         self._derived: dict[int, Any] = {}
-        self._found: dict[int, Any] = {}
         self._places: dict[tuple[int, str], dict[int, int]] = {}
         self._operations: list[tuple[Any, Sequence[Any], dict[str, Any], Any]] = []
-        self._reads: list[tuple[Tensor, np.ndarray[Any, Any]]] = []
+        self._reads: list[tuple[Tensor, np.ndarray[Any, Any]]] = []  # keeps them: an address is used once
         self._values: list[Tensor] = []  # read at once: memory may be written to later
         self._checks: list[tuple[Tensor, Any]] = []
         self._repeats = True
@@ -145,7 +144,6 @@ class Captured:
             at += (np.arange(size) * stride).reshape([-1] + [1] * (tensor.dim() - axis - 1))
         start = int(tensor.storage_offset())
         places = self._places.setdefault((self._first(tensor), kind), {})
-        self._found.setdefault(tensor.untyped_storage().data_ptr(), tensor.untyped_storage())
         flat, fresh = at.reshape(-1).tolist(), []
         for index, place in enumerate(flat):
             if start + place not in places:

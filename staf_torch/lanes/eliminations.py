@@ -48,7 +48,7 @@ def triangular(
     """T^-1 B: (..., M, M), (..., M, P); B T^-1 where not ``left``."""
     if not left:
         return triangular(matrix.mT, right.mT, upper=not upper, unitriangular=unitriangular).mT.clone()
-    if _many(matrix) and matrix.shape[-1] > 1:  # an upper triangle from behind is a lower one
+    if _many(matrix):  # an upper triangle from behind is a lower one
         flipped = (part.flip(-2) if upper else part for part in (matrix.flip(-1) if upper else matrix, right))
         solution = rolled.triangular(*flipped, unitriangular=unitriangular)
         return solution.flip(-2) if upper else solution

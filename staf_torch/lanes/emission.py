@@ -45,9 +45,7 @@ class Text(NamedTuple):
         return table.to(real)
 
 
-def emit(
-    graph: Graph, layout: Layout, following: Sequence[int], outputs: Sequence[int], copies: int = 0
-) -> Text:
+def emit(graph: Graph, layout: Layout, following: Sequence[int], outputs: Sequence[int], copies: int) -> Text:
     """Write a program.
 
     Args:

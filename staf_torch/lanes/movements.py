@@ -69,12 +69,8 @@ def moved(t: Tracer, func: Any, out: Any, args: Sequence[Any], kwargs: dict[str,
         return value
 
     values = [numbers(a, position == at) for position, a in enumerate(args)]
-    fill = 4 if name == "scatter" else 2 if name == "constant_pad_nd" else 3
-    if (
-        name in ("scatter", "constant_pad_nd")
-        and len(args) > fill - 1
-        and not isinstance(args[-1], Tensor | list)
-    ):
+    if name in ("scatter", "constant_pad_nd") and not isinstance(args[-1], Tensor | list):
+        # a number that torch is to fill with
         values[-1] = t.graph.constant(args[-1], kind) - zero
     result = func(*values, **{k: numbers(v, False) for k, v in kwargs.items()})
     return result.numpy() + zero

@@ -59,9 +59,10 @@ class Tracer(TorchDispatchMode):
         self,
         graph: Graph,
         lower: Callable[..., Any],
-        learning: bool = False,
-        widened: bool = False,
-        folded: bool = False,
+        *,
+        learning: bool,
+        widened: bool,
+        folded: bool,
     ) -> None:
         super().__init__()  # type: ignore[no-untyped-call]
         self.graph, self._lower, self._learning, self._widened = graph, lower, learning, widened

@@ -211,6 +211,27 @@ def test_a_name_without_a_value_and_sameness() -> None:
     assert Same(one) != one
 
 
+def test_what_a_function_closes_over_counts_by_its_content_and_a_module_by_itself() -> None:
+    assert key(scaled([1, 2.5])) == key(scaled([1, 2.5]))
+    one, other = types.ModuleType("one"), types.ModuleType("one")  # of no folder: a user may change them
+    assert not isinstance(written((scaled(one),)), str)
+    assert key(scaled(one)) == key(scaled(one)) != key(scaled(other))
+    assert isinstance(written((one,)), str)  # by itself nobody knows what is asked of it
+
+    def later(assigned: bool) -> Callable[[], Any]:
+        def inner() -> Any:
+            return name
+
+        if assigned:
+            name = object()
+        return inner
+
+    assert key(later(False)) == key(later(False)) != key(later(True))
+    space: dict[str, Any] = {}
+    exec("def nameless(): return 1", space)
+    assert is_users(space["nameless"])  # a function of no module
+
+
 # Watches.
 
 

@@ -81,6 +81,55 @@ def test_memory_that_was_written_to_is_not_written_again() -> None:
     assert found.again({id(A): B}) is None
 
 
+def test_what_was_equal_is_told_apart_once_one_of_both_is_written_to() -> None:
+    def one(x: Tensor) -> Tensor:
+        first, second = 2 * A, 2 * A
+        x = x * first
+        first += 1
+        return x * first + x * second
+
+    def other(x: Tensor) -> Tensor:
+        first, second = 2 * A, 2 * A
+        second += 1
+        return x * first + x * second + x * (2 * A)
+
+    assert recipe(one).values.tolist() == [2.0, 4.0, 6.0, 3.0, 5.0, 7.0, 2.0, 4.0, 6.0]
+    assert recipe(other).values.tolist() == [2.0, 4.0, 6.0, 3.0, 5.0, 7.0]
+    assert recipe(one).again({id(A): B}) is None
+
+
+def test_memory_of_the_step_holds_what_was_written_into_it() -> None:
+    def step(x: Tensor) -> Tensor:
+        own = torch.zeros(3, dtype=torch.float64)
+        x = x + own  # stated by the code until then
+        own[1] = A[2]
+        return x * own
+
+    assert recipe(step).values.tolist() == [0.0, 3.0, 0.0]
+    plain = recipe(lambda x: x * torch.zeros(3, dtype=torch.float64).add_(2.0))
+    assert plain.values.tolist() == []
+    assert plain.again({}) is not None
+
+
+def test_arrays_of_numpy_are_found_and_numbers_of_python_are_stated() -> None:
+    table = A.numpy()
+    found = recipe(lambda x: x * torch.as_tensor(table))
+    assert found.values.tolist() == A.tolist()
+    assert len(found.found) == 1
+    assert recipe(lambda x: x * torch.tensor(table.tolist(), dtype=torch.float64)).found == []
+    flags = recipe(lambda x: torch.where(A > 1.5, x, -x))  # made of numbers, and so of the table
+    assert flags.values.tolist() == [0.0, 1.0, 1.0]
+    assert flags.again({id(A): B}).tolist() == [1.0, 1.0, 1.0]
+
+
+def test_views_share_the_places_of_their_memory() -> None:
+    found = recipe(lambda x: x * A.view(3, 1)[:, 0] + x.flip(1) * A.flip(0) + (x * A[1]) * A[1:2].expand(3))
+    assert found.values.tolist() == [1.0, 2.0, 3.0, 3.0, 2.0, 1.0]  # `flip` makes others
+    table = torch.arange(6, dtype=torch.float64).view(2, 3)
+    found = recipe(lambda x: x[:, :2] @ table.mT[1:].mT * 2 + (x * table[1]).sum(-1, keepdim=True))
+    assert sorted(found.values.tolist()) == [1.0, 2.0, 3.0, 4.0, 5.0]
+
+
 def test_what_is_computed_twice_is_read_once() -> None:
     assert len(recipe(lambda x: x * (A * 2) + (A * 2)).values) == 3
     assert len(recipe(lambda x: x * (A * 2) + (A * 3)).values) == 6
