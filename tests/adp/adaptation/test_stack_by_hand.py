@@ -101,6 +101,16 @@ def test_a_row_that_is_not_a_number_does_not_stop_the_others() -> None:
     assert now.best.tolist() == [0.0, 0.0]
 
 
+def test_without_a_novelty_all_that_differs_is_new_and_what_is_alike_is_not() -> None:
+    stack = adp.HistoryStack(rows=1, parameters=2, size=3, novelty=0.0)
+    now = stack.init(torch.zeros(1, 1).double())
+    for s, filled in (([1.0, 0.0], 1), ([1.0, 0.0], 1), ([1.0, 1e-9], 2), ([1.0, 1e-9], 2)):
+        now = stack.step(now, given(s, 1.0))
+        assert float(now.filled) == filled
+    with pytest.raises(ValueError, match="novelty"):
+        adp.HistoryStack(rows=1, parameters=2, novelty=-0.1)
+
+
 @pytest.mark.parametrize(("z", "alarms"), [(9.99, 0.0), (10.0, 0.0), (10.01, 1.0), (-10.01, 1.0)])
 def test_an_alarm_goes_off_beyond_its_deviations_and_not_at_them(z: float, alarms: float) -> None:
     law = adp.LeastSquares([0.0], deviation=4.0, floor=3.0, alarm=2.0)  # sqrt(16 + 9) = 5
