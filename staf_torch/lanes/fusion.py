@@ -86,7 +86,8 @@ def ends_with(
         slot: of the carry, in memory.
         nodes: what it becomes.
     """
-    node = graph.args[nodes[0]][0] if graph.op[nodes[0]] == "elem" else nodes[0]
+    first = nodes[0]
+    node = graph.args[first][0] if graph.op[first] == "elem" else first
     if graph.op[node] != "map" or graph.size(node) != len(nodes) or schedule.uses[node] != len(nodes):
         return None
     whole = range(len(nodes))

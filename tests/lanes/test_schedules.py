@@ -235,6 +235,17 @@ def test_an_expression_has_twenty_four_operations_at_most(count: int, longest: i
     assert broken == ([longest] if count > longest else [])
 
 
+@pytest.mark.parametrize(("count", "taken"), [(11, True), (12, False)])
+def test_a_map_that_is_read_for_two_operands_is_written_twice(count: int, taken: bool) -> None:
+    m = Maps()
+    chain = [m.map("exp", m.pack)]
+    for k in range(count - 1):
+        chain.append(m.map(("neg", "exp")[k % 2], chain[-1]))
+    halves = tuple(range(5)), tuple(range(5, 10))
+    last = m.graph.add("map", (chain[-1], chain[-1]), REAL, ("add", (5,), *halves))
+    assert m.taken(last) == set(chain if taken else chain[:-1])
+
+
 def test_the_leaves_of_a_map_are_those_of_the_maps_in_it() -> None:
     m = Maps(3)
     first = m.map("exp", m.pack, at=[2, 0, 1])
@@ -243,6 +254,8 @@ def test_the_leaves_of_a_map_are_those_of_the_maps_in_it() -> None:
     assert list(leaves(m.graph, {first}, second)) == [(m.pack, (0, 1)), (m.state[0], None)]
     assert list(leaves(m.graph, {first}, second, (1,))) == [(m.pack, (1,)), (m.state[0], None)]
     assert evenly((5,), []) == ([], 5)
+    assert evenly(None, [2, 3]) == ([0, 0], 0)
+    assert evenly((3, 4), [1, 2]) == ([0, 1], 3)
     assert evenly((0, 1, 2, 0, 1, 2), [2, 3]) == ([0, 1], 0)
     assert evenly((4, 4), [2]) == ([0], 4)
     assert evenly((4, 2, 0), [3]) == ([-2], 4)

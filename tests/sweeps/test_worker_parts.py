@@ -82,6 +82,17 @@ def test_a_process_is_looked_at_every_second_until_it_has_gone(
     assert threads.daemons == [True]
 
 
+def test_a_process_lives_where_somebody_may_signal_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert workers._lives(os.getpid())
+    assert not workers._lives(2**22 + 1)  # more than there can be
+
+    def kill(pid: int, number: int) -> None:
+        raise PermissionError
+
+    monkeypatch.setattr(os, "kill", kill)
+    assert workers._lives(7)
+
+
 def test_a_process_of_another_beginning_is_another(threads: Threads, slept: list[float]) -> None:
     with pytest.raises(Ended):
         end_with(os.getpid(), "never")
