@@ -83,6 +83,16 @@ def test_rows_that_are_taken_over_end_in_the_same_file(done: int, tmp_path: Path
     assert one == other
 
 
+@pytest.mark.parametrize("gone", [PARTIAL, SUMS])
+def test_rows_without_their_sums_and_sums_without_rows_are_none(
+    gone: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    write(tmp_path, 0, 2, 3)
+    (tmp_path / gone).unlink()
+    assert left(tmp_path, "run") == Left([])
+    assert caplog.messages == []
+
+
 def test_rows_that_something_else_made_are_none(tmp_path: Path) -> None:
     assert left(tmp_path, "run") == Left([])
     write(tmp_path, 0, 2, 3)
