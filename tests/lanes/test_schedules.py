@@ -25,13 +25,13 @@ class Small:
     def __call__(self, op: str, *args: int) -> int:
         return self.graph.apply(op, *args)
 
-    def loop(self, count: int = 3, depth: int = STEP + 1) -> tuple[int, Loop, int]:
-        """A loop of one number that begins with x: its number, itself, and the number inside."""
+    def loop(self, initial: int | None = None, depth: int = STEP + 1) -> tuple[int, Loop, int]:
+        """A loop of one number that begins with x or another: its number, itself, and the number inside."""
         number = len(self.graph.loops)
-        loop = Loop(count, depth)
+        loop = Loop(3, depth)
         self.graph.loops.append(loop)
         inside = self.graph.add("carry", (), REAL, (number, 0), depth)
-        loop.carry, loop.initial = [inside], [self.x]
+        loop.carry, loop.initial = [inside], [self.x if initial is None else initial]
         return number, loop, inside
 
     def close(self, number: int, following: int, home: int) -> int:
@@ -124,6 +124,50 @@ def test_a_loop_stands_where_what_it_reads_is_known(b: Small) -> None:
     unread = Schedule(b.graph, [b.s], [])
     assert unread.live == {b.s}
     assert unread.carries == {}
+
+
+def test_only_what_steps_read_is_kept_of_what_a_row_has(b: Small) -> None:
+    product = b("mul", b.x, b.y)
+    power = b("exp", product)
+    assert Schedule(b.graph, [b("add", power, b.s)], []).cut() == [power]
+    for home, kept in ((ROW, []), (STEP, [product, power])):
+        again = Small()
+        product, power = again("mul", again.x, again.y), again("exp", again("mul", again.x, again.y))
+        number, _, inside = again.loop(product)
+        ends = again.close(number, again("mul", inside, power), home)
+        plan = Schedule(again.graph, [again("add", ends, again.s)], [])
+        assert plan.cut() == (kept or [ends])
+
+
+def test_only_what_steps_read_is_kept_of_what_times_decide(b: Small) -> None:
+    for home, kept in ((NOW, []), (STEP, ["root", "power"])):
+        again = Small()
+        found = {"root": again("sqrt", again.t), "power": again("exp", again("sqrt", again.t))}
+        number, loop, inside = again.loop(found["root"])
+        body = again("mul", inside, found["power"])
+        last = body if home == NOW else again("add", body, again.s)
+        ends = again.close(number, last, home)
+        plan = Schedule(again.graph, [again("add", ends, again.s)], [], ahead=True)
+        assert plan.cut_ahead() == ([found[name] for name in kept] or [ends])
+        assert plan.cut() == []
+        inner = {loop.node, inside, body, ends} if home == NOW else set()
+        assert plan.ahead == {again.t, *found.values(), *inner}
+        assert plan.body(number)[:2] == [inside, body] or home == STEP
+
+
+def test_a_loop_in_a_loop_is_found_with_it(b: Small) -> None:
+    outer, loop, inside = b.loop()
+    inner, other, deep = b.loop(inside, STEP + 2)
+    body = b("sin", deep)
+    middle = b.close(inner, body, STEP + 1)
+    ends = b.close(outer, b("add", middle, b.y), ROW)
+    plan = Schedule(b.graph, [b("add", ends, b.s)], [])
+    assert plan.body(inner) == [deep, body]
+    assert plan.body(outer) == [inside, other.node, middle, loop.following[0]]
+    assert plan.cut() == [ends]
+    assert loop.node in plan.block(ROW)
+    assert not plan.together(deep, inside)
+    assert plan.together(inside, middle)
 
 
 def test_what_passes_put_out_is_kept_with_what_it_needs(b: Small) -> None:
