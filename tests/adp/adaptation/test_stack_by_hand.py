@@ -90,6 +90,35 @@ def test_the_first_place_is_taken_where_it_is_the_best() -> None:
         )
 
 
+@pytest.mark.parametrize(
+    ("kept", "place"),
+    [
+        ([1.0005, 1.0], 1.0),  # the second is better by less than the factor that the first must be
+        ([1.0, 1.0005], 0.0),
+        ([1.0, -1.0], 0.0),  # of two that are as good the first
+    ],
+)
+def test_later_places_must_be_better_than_the_first_and_by_no_factor(kept: list[float], place: float) -> None:
+    stack = adp.HistoryStack(rows=1, parameters=1, size=2, novelty=0.0)
+    now = stack.init(torch.zeros(1, 1).double())
+    for s in (*kept, 2.0):
+        now = stack.step(now, given([s], 1.0))
+    for _ in range(2):
+        now = stack.step(now, given([0.0], 0.0, WAITING))
+    assert float(now.place) == place
+    assert now.s.flatten().tolist() == ([2.0, kept[1]] if place == 0 else [kept[0], 2.0])
+
+
+@pytest.mark.parametrize("size", [0.1, 1.0, 7.0])
+def test_what_is_new_is_measured_by_the_size_of_an_equation(size: float) -> None:
+    stack = adp.HistoryStack(rows=1, parameters=2, size=2, novelty=0.5)
+    for along, filled in ((0.4, 1), (0.7, 2)):  # beside sqrt(1 + along^2), of which the half counts
+        now = stack.init(torch.zeros(1, 1).double())
+        for s in ([size, 0.0], [size, along * size]):
+            now = stack.step(now, given(s, 1.0))
+        assert float(now.filled) == filled
+
+
 def test_a_row_that_is_not_a_number_does_not_stop_the_others() -> None:
     stack = adp.HistoryStack(rows=1, parameters=2, size=1)
     now = stack.init(torch.zeros(2, 1).double())
