@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import pytest
 import yaml
 from public_names import public
 from recorded import Record
@@ -109,4 +110,56 @@ def plain(value: object) -> str:
 def test_defaults_of_public_arguments_are_the_recorded_ones(record: Record) -> None:
     found = dict(each for name, (thing, _) in sorted(public().items()) for each in defaults(name, thing))
     assert len(found) > 400
+    record(found)
+
+
+ROOMS = (
+    "approximation",
+    "centers",
+    "engine",
+    "kernels",
+    "local_basis",
+    "metrics",
+    "numerics",
+    "online",
+    "optim",
+    "theory",
+)
+"""Rooms whose constants and defaults, of what is not public too, are recorded here."""
+
+
+def chosen(module: Any) -> Iterator[tuple[str, str]]:
+    """Constants of a module and of its classes, and defaults of all arguments and fields, as texts."""
+    for name, thing in vars(module).items():
+        if inspect.isfunction(thing) and thing.__module__ == module.__name__:
+            yield from defaults(name, thing)
+        elif inspect.isclass(thing) and thing.__module__ == module.__name__:
+            for key, value in vars(thing).items():
+                value = getattr(value, "__func__", value)
+                if inspect.isfunction(value) and value.__module__ == module.__name__:
+                    yield from defaults(f"{name}.{key}", value)
+                elif isinstance(value, bool | int | float) and not key.startswith(("__", "_abc", "_is_p")):
+                    yield f"{name}.{key}", repr(value)
+            for key, value in getattr(thing, "_field_defaults", {}).items():
+                yield f"{name}.{key}", plain(value)
+        elif name.strip("_").isupper() and isinstance(thing, bool | int | float | tuple | dict | str):
+            yield name, written(thing)
+
+
+def written(value: Any) -> str:
+    """As `plain`, of dictionaries too, and of what is in them."""
+    if isinstance(value, dict):
+        return f"{{{', '.join(f'{key!r}: {written(each)}' for key, each in value.items())}}}"
+    if isinstance(value, tuple):
+        return f"({', '.join(map(written, value))})"
+    return plain(value)
+
+
+@pytest.mark.parametrize("room", ROOMS)
+def test_constants_and_defaults_of_a_room_are_the_recorded_ones(room: str, record: Record) -> None:
+    package = importlib.import_module(f"staf_torch.{room}")
+    found = {}
+    for info in pkgutil.iter_modules(package.__path__, f"staf_torch.{room}."):
+        module = importlib.import_module(info.name)
+        found |= {f"{info.name.split('.', 2)[2]}.{name}": value for name, value in chosen(module)}
     record(found)
