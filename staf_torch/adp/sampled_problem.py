@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torch.nn.functional import pad
 
 from ..lanes import each
+from ..lanes.combinators import tracing_now
 from ..numerics.angles import wrap
 from ..numerics.checks import fail, integer, positive_real, trailing
 from ..numerics.forward_mode import use_forward_mode
@@ -219,29 +220,16 @@ class SampledProblem(nn.Module):
     def derivatives(self, x: Tensor, u: Tensor) -> Derivatives:
         """First and second derivatives of F and l with respect to z = (x, u): (B, n), (B, m).
 
-        Along pairs of coordinates: a compiled program goes through them, and its text is that of one.
+        In a program along pairs of coordinates: it goes through them, and its text is that of one. In plain
+        torch backwards, since a product with a number takes fifty times as long forward.
         """
-        use_forward_mode()
         z, n = torch.cat((x, u), dim=-1), self.dim
 
         def both(z: Tensor) -> Tensor:
             after, paid = self.advance(z[..., :n], z[..., n:])
             return torch.cat((after, paid.unsqueeze(-1)), dim=-1)
 
-        def along(pairs: Tensor) -> Tensor:
-            one, other = (direction.clone() for direction in pairs.chunk(2, dim=-1))
-            at = z.unsqueeze(1).expand_as(one).clone()
-            found = torch.func.jvp(lambda y: torch.func.jvp(both, (y,), (one,))[1], (at,), (other,))
-            return torch.cat((found[0], found[1]), dim=-1)
-
-        unit = torch.eye(z.shape[-1], dtype=z.dtype)
-        rows, columns = torch.tril_indices(len(unit), len(unit)).unbind(0)
-        pairs = torch.cat((unit[rows], unit[columns]), dim=-1).expand(len(z), -1, -1)
-        slope, bend = each(along, pairs, together=1).split(n + 1, dim=-1)  # (B, pairs, n + 1)
-        first = slope[:, rows == columns].mT
-        place = torch.zeros(len(unit), len(unit), dtype=torch.int64)
-        place[rows, columns] = place[columns, rows] = torch.arange(len(rows))
-        second = bend[:, place.flatten()].mT.unflatten(-1, place.shape)
+        first, second = (_in_pairs if tracing_now() else _backwards)(both, z, n + 1)
         return Derivatives(first[:, :n], second[:, :n], first[:, n], second[:, n])
 
     def _check(self) -> None:
@@ -293,3 +281,38 @@ class Derivatives(NamedTuple):
     second: Tensor  # d2F/dz2, (B, n, n + m, n + m)
     cost_first: Tensor  # (B, n + m)
     cost_second: Tensor  # (B, n + m, n + m)
+
+
+def _in_pairs(function: Callable[[Tensor], Tensor], z: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """First and second derivatives of ``count`` values of a row (B, d): (B, count, d), (B, count, d, d)."""
+    use_forward_mode()
+
+    def along(pairs: Tensor) -> Tensor:
+        one, other = (direction.clone() for direction in pairs.chunk(2, dim=-1))
+        at = z.unsqueeze(1).expand_as(one).clone()
+        found = torch.func.jvp(lambda y: torch.func.jvp(function, (y,), (one,))[1], (at,), (other,))
+        return torch.cat((found[0], found[1]), dim=-1)
+
+    unit = torch.eye(z.shape[-1], dtype=z.dtype)
+    rows, columns = torch.tril_indices(len(unit), len(unit)).unbind(0)
+    pairs = torch.cat((unit[rows], unit[columns]), dim=-1).expand(len(z), -1, -1)
+    slope, bend = each(along, pairs, together=1).split(count, dim=-1)  # (B, pairs, count)
+    place = torch.zeros(len(unit), len(unit), dtype=torch.int64)
+    place[rows, columns] = place[columns, rows] = torch.arange(len(rows))
+    return slope[:, rows == columns].mT, bend[:, place.flatten()].mT.unflatten(-1, place.shape)
+
+
+def _backwards(function: Callable[[Tensor], Tensor], z: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """`_in_pairs` by the slope of slopes: a row of a batch has d copies for each of its values."""
+    d = z.shape[-1]
+    value, entry = (torch.eye(size, dtype=z.dtype, device=z.device) for size in (count, d))
+
+    def slopes(z: Tensor) -> Tensor:
+        pull = torch.func.vjp(function, z)[1]
+        found: Tensor = pull(value.repeat(d, 1).expand(*z.shape[:-1], count))[0]
+        return found
+
+    at = z.unsqueeze(1).expand(-1, d * count, d).clone()
+    first, pull = torch.func.vjp(slopes, at)[:2]
+    second = pull(entry.repeat_interleave(count, dim=0).expand_as(first))[0]
+    return first[:, :count], second.unflatten(1, (d, count)).transpose(1, 2)

@@ -94,7 +94,14 @@ def test_information_form_never_diverges_over_seeds(dt: float) -> None:
     x0 = torch.tensor([-1.0, 1.0], dtype=torch.float64).repeat(200, 1)
     duration = 10.0 if dt > 0.001 else 1.0  # whatever diverges does so in the first second
     run = adp.simulate(
-        learner(adp.Information()), PLANT, COST, x0, dt=dt, steps=round(duration / dt), every=200
+        learner(adp.Information()),
+        PLANT,
+        COST,
+        x0,
+        dt=dt,
+        steps=round(duration / dt),
+        every=200,
+        compile=True,
     )
     assert not run.diverged.any()
     assert (run.state[:, -1].norm(dim=-1) < (1e-3 if duration > 5 else 0.6)).all()
@@ -103,7 +110,15 @@ def test_information_form_never_diverges_over_seeds(dt: float) -> None:
 def test_published_form_loses_some_seeds_that_the_information_form_keeps() -> None:
     x0 = torch.tensor([-1.0, 1.0], dtype=torch.float64).repeat(200, 1)
     run = adp.simulate(
-        learner(adp.Published()), PLANT, COST, x0, dt=0.001, steps=1000, every=1000, integrator="euler"
+        learner(adp.Published()),
+        PLANT,
+        COST,
+        x0,
+        dt=0.001,
+        steps=1000,
+        every=1000,
+        integrator="euler",
+        compile=True,
     )
     assert 0.15 <= float(run.diverged.double().mean()) <= 0.35  # MATH.md: 25 %
     assert torch.isfinite(run.state).all()
@@ -120,7 +135,9 @@ def test_all_states_of_the_unit_box_are_regulated() -> None:
 
 def test_random_extrapolation_costs_what_the_reference_says() -> None:
     x0 = torch.tensor([-1.0, 1.0], dtype=torch.float64).repeat(40, 1)
-    run = adp.simulate(learner(adp.Information()), PLANT, COST, x0, dt=0.001, steps=2500, every=2500)
+    run = adp.simulate(
+        learner(adp.Information()), PLANT, COST, x0, dt=0.001, steps=2500, every=2500, compile=True
+    )
     assert 2.82 <= float(run.cost.median()) <= 2.85
     assert float(run.cost.min()) > 2.79
     assert float(run.cost.max()) < 2.87
@@ -172,7 +189,7 @@ def test_global_basis_needs_points_in_a_fixed_box() -> None:
     for points in (adp.RandomPoints(1, 1.0, around="origin"), adp.RandomPoints(1, BOX)):
         basis = adp.QuadraticBasis(2)
         controller = adp.ActorCritic(basis, PLANT, COST, points, critic=start, actor=start)
-        run = adp.simulate(controller, PLANT, COST, x0, **settings)
+        run = adp.simulate(controller, PLANT, COST, x0, **settings, compile=True)
         regulated = run.state[:, -1].norm(dim=-1) < 1e-3
         shares.append(float(regulated.double().mean()))
         if len(shares) == 1:
@@ -188,7 +205,7 @@ def test_partial_gradient_is_the_same_law_from_twice_the_weights() -> None:
         controller = adp.ActorCritic(
             staf_basis(mode), PLANT, COST, adp.RandomPoints(1, BOX), critic=0.4 * scale, actor=0.28 * scale
         )
-        run = adp.simulate(controller, PLANT, COST, x0, dt=0.005, steps=400, every=400)
+        run = adp.simulate(controller, PLANT, COST, x0, dt=0.005, steps=400, every=400, compile=True)
         assert not run.diverged.any()
         costs.append(run.cost)
     assert float(costs[1].median()) < 1.3 * float(costs[0].median())
@@ -209,7 +226,7 @@ def test_three_states_cost_in_their_first_second_what_the_reference_run_does() -
     law = adp.Information(gains)
     controller = adp.ActorCritic(basis, plant, cost, points, law, critic=1.0, actor=0.85, gain=100.0)
     x0 = torch.tensor([[-0.5, 0.5, -0.25]], dtype=torch.float64).repeat(10, 1)
-    run = adp.simulate(controller, plant, cost, x0, dt=0.002, steps=500, every=500)
+    run = adp.simulate(controller, plant, cost, x0, dt=0.002, steps=500, every=500, compile=True)
     assert not run.diverged.any()
     # At 1 ms 3.11 to 3.13, of 9.22 after 50 s (MATH.md: 9.18 to 9.30): `staf experiment=adp_three_state`.
     assert float(run.cost.median()) == pytest.approx(3.13, abs=0.03)

@@ -84,7 +84,9 @@ def test_weights_of_a_row_whose_plant_returns_nan_freeze_with_it() -> None:
 def test_state_that_leaves_the_limit_counts_as_diverged() -> None:
     idle = adp.Feedback(lambda x: torch.zeros_like(x[..., :1]))
     plant = systems.Linear([[1.0, 0.0], [0.0, 2.0]], [[1.0], [1.0]])
-    run = adp.simulate(idle, plant, COST, uniform(5, 1.0), dt=0.01, steps=1000, every=1000, limit=50.0)
+    run = adp.simulate(
+        idle, plant, COST, uniform(5, 1.0), dt=0.01, steps=1000, every=1000, limit=50.0, compile=True
+    )
     assert run.diverged.all()
     assert (run.state[:, -1].norm(dim=-1) <= 50).all()
 
@@ -99,7 +101,7 @@ def test_cost_of_the_lqr_on_a_linear_plant_is_the_riccati_value() -> None:
     plant = systems.Linear([[0.0, 1.0], [2.0, -1.0]], [[0.0], [1.0]])
     lqr = adp.LQR(plant, COST)
     x0 = uniform(6, 2.0)
-    run = adp.simulate(adp.Feedback(lqr), plant, COST, x0, dt=0.005, steps=2000, every=2000)
+    run = adp.simulate(adp.Feedback(lqr), plant, COST, x0, dt=0.005, steps=2000, every=2000, compile=True)
     torch.testing.assert_close(run.cost, lqr.value(x0), rtol=1e-4, atol=0)
     torch.testing.assert_close(plant.optimal_value(x0, COST.q, COST.r), lqr.value(x0))
 
@@ -146,7 +148,7 @@ def test_supervisor_regulates_a_grid_of_initial_weights() -> None:
     inner = adp.ActorCritic(staf_basis(), PLANT, COST, points, critic=critic, actor=0.7 * critic)
     x0 = uniform(40, 2.0, seed=11).repeat(7, 1)
     guarded = adp.Supervised(inner, LQR, COST)
-    run = adp.simulate(guarded, PLANT, COST, x0, dt=0.01, steps=1000, every=1000)
+    run = adp.simulate(guarded, PLANT, COST, x0, dt=0.01, steps=1000, every=1000, compile=True)
     regulated = ~run.diverged & (run.state[:, -1].norm(dim=-1) < 1e-3)
     assert float(regulated.double().mean()) >= 0.95
 

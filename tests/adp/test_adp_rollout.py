@@ -64,9 +64,11 @@ def test_two_state_is_regulated_at_almost_the_optimal_cost() -> None:
     x0 = uniform(200, 2.0, seed=1)
     optimal = PLANT.optimal_value(x0, COST.q, COST.r)
     policy = rollout(horizon=0.5, steps=5)
-    run = adp.simulate(adp.Feedback(policy), PLANT, COST, x0, dt=0.01, steps=400, every=400)
+    run = adp.simulate(adp.Feedback(policy), PLANT, COST, x0, dt=0.01, steps=400, every=400, compile=True)
     # From here on the LQR: all states are so near to the origin that the rest costs less than 1e-6.
-    rest = adp.simulate(adp.Feedback(LQR), PLANT, COST, run.state[:, -1], dt=0.01, steps=600, every=600)
+    rest = adp.simulate(
+        adp.Feedback(LQR), PLANT, COST, run.state[:, -1], dt=0.01, steps=600, every=600, compile=True
+    )
     ratio = (run.cost + rest.cost) / optimal
     assert (rest.state[:, -1].norm(dim=-1) < 1e-3).all()
     assert float(ratio.mean()) <= 1.01
@@ -81,8 +83,10 @@ def test_three_state_beats_the_lqr_and_the_published_cost() -> None:
     # The radius shrinks: the plant has no derivative at 0, and a constant ball around the state would hold 0.
     radius = StateRadius(0.1, 1e-5)
     policy = rollout(plant, directions=ball(10, 3), radius=radius, cost=cost, horizon=1.0, steps=10)
-    run = adp.simulate(adp.Feedback(policy), plant, cost, x0, dt=0.02, steps=400, every=400)
-    lqr = adp.simulate(adp.Feedback(adp.LQR(plant, cost)), plant, cost, x0, dt=0.005, steps=2000, every=2000)
+    run = adp.simulate(adp.Feedback(policy), plant, cost, x0, dt=0.02, steps=400, every=400, compile=True)
+    lqr = adp.simulate(
+        adp.Feedback(adp.LQR(plant, cost)), plant, cost, x0, dt=0.005, steps=2000, every=2000, compile=True
+    )
     assert float(lqr.cost) == pytest.approx(2.786, abs=2e-3)
     assert 2.7047 <= float(run.cost) <= 2.7055  # the optimum is 2.70471
     assert run.state[0, -1].norm() < 1e-3
@@ -98,9 +102,9 @@ def test_quadrotor_is_regulated_at_less_than_the_cost_of_the_lqr() -> None:
     cross = torch.cat((corners, torch.zeros_like(corners[:1])))
     policy = rollout(plant, directions=cross, radius=0.05, cost=cost, horizon=0.5, steps=10)
     base = adp.Feedback(adp.LQR(plant, cost))
-    whole = adp.simulate(base, plant, cost, x0, dt=0.01, steps=1200, every=1200)
-    start = adp.simulate(adp.Feedback(policy), plant, cost, x0, dt=0.01, steps=200, every=200)
-    rest = adp.simulate(base, plant, cost, start.state[:, -1], dt=0.01, steps=1000, every=1000)
+    whole = adp.simulate(base, plant, cost, x0, dt=0.01, steps=1200, every=1200, compile=True)
+    start = adp.simulate(adp.Feedback(policy), plant, cost, x0, dt=0.01, steps=200, every=200, compile=True)
+    rest = adp.simulate(base, plant, cost, start.state[:, -1], dt=0.01, steps=1000, every=1000, compile=True)
     ratio = (start.cost + rest.cost) / whole.cost
     assert (rest.state[:, -1].norm(dim=-1) < 1e-3).all()
     assert float(ratio.mean()) < 0.996

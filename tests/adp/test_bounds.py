@@ -97,7 +97,7 @@ def test_improved_policy_under_hard_bounds_costs_less_than_the_clipped_lqr() -> 
     x0 = uniform(40, 0.5, seed=2)
     paid = {}
     for policy in (adp.LQR(plant, cost), adp.RolloutPolicy.of_lqr(plant, cost)):
-        run = adp.simulate(adp.Feedback(policy), plant, cost, x0, dt=0.02, steps=300, every=300)
+        run = adp.simulate(adp.Feedback(policy), plant, cost, x0, dt=0.02, steps=300, every=300, compile=True)
         assert (run.state[:, -1].norm(dim=-1) < 1e-2).all()
         paid[type(policy).__name__] = run.cost
     ratio = paid["RolloutPolicy"] / paid["LQR"]
@@ -111,7 +111,9 @@ def test_actor_critic_regulates_within_bounds(kind: str) -> None:
     smooth = adp.BoundedInputCost(1.0, 1.0, 2, 1, low=-1.0, high=1.3)
     cost = {"hard": hard, "smooth": smooth}[kind]
     learner = adp.ActorCritic(staf_basis(), PLANT, cost, adp.RandomPoints(1, BOX))
-    run = adp.simulate(learner, PLANT, cost, uniform(6, 0.7, seed=3), dt=0.01, steps=600, every=200)
+    run = adp.simulate(
+        learner, PLANT, cost, uniform(6, 0.7, seed=3), dt=0.01, steps=600, every=200, compile=True
+    )
     u = run.control[:, :-1]
     assert ((u >= -1.0) & (u <= 1.3)).all()
     assert (run.state[:, -1].norm(dim=-1) < 1e-2).all()
