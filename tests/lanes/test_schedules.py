@@ -144,15 +144,31 @@ def test_only_what_steps_read_is_kept_of_what_times_decide(b: Small) -> None:
         again = Small()
         found = {"root": again("sqrt", again.t), "power": again("exp", again("sqrt", again.t))}
         number, loop, inside = again.loop(found["root"])
-        body = again("mul", inside, found["power"])
+        third = again.graph.constant(0.3, REAL)  # of no time, be it inside
+        first = again("mul", inside, third)
+        body = again("mul", first, found["power"])
         last = body if home == NOW else again("add", body, again.s)
         ends = again.close(number, last, home)
         plan = Schedule(again.graph, [again("add", ends, again.s)], [], ahead=True)
         assert plan.cut_ahead() == ([found[name] for name in kept] or [ends])
         assert plan.cut() == []
-        inner = {loop.node, inside, body, ends} if home == NOW else set()
+        inner = {loop.node, inside, first, body, ends} if home == NOW else set()
         assert plan.ahead == {again.t, *found.values(), *inner}
-        assert plan.body(number)[:2] == [inside, body] or home == STEP
+        assert plan.body(number)[:2] == [inside, first]
+
+
+@pytest.mark.parametrize(("op", "depth"), [("row", ROW), ("now", NOW)])
+def test_of_an_entry_the_whole_array_is_kept(op: str, depth: int, b: Small) -> None:
+    graph = b.graph
+    numbers = [graph.add(op, (), REAL, (1, k), depth) for k in range(3)]
+    pack = graph.add("pack", numbers, REAL, 3)
+    array = graph.add("map", (pack,), REAL, ("exp", (3,), (0, 1, 2)))
+    entry = graph.add("elem", (array,), REAL, 1)
+    plan = Schedule(graph, [b("add", entry, b.s)], [], ahead=True)
+    assert (plan.cut() if op == "row" else plan.cut_ahead()) == [array]
+    assert (plan.cut_ahead() if op == "row" else plan.cut()) == []
+    unread = Schedule(graph, [b.s], [b("add", b.x, b.t)], ahead=True)
+    assert unread.cut() == unread.cut_ahead() == []
 
 
 def test_a_loop_in_a_loop_is_found_with_it(b: Small) -> None:
