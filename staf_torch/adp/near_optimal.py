@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import time
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -182,13 +183,14 @@ class NearOptimal(SampledRollout):
     def _good(self, states: int, width: float, seed: int) -> float:
         """The largest box of a few from which all states are regulated, else of smaller ones."""
 
-        def good(share: float) -> bool:
-            return bool(self._run(self.controller(), self._drawn(states, share * width, seed))[1].all())
+        def good(shares: Sequence[float]) -> list[float]:
+            x0 = torch.cat([self._drawn(states, share * width, seed) for share in shares])
+            fine = self._run(self.controller(), x0)[1].view(len(shares), states).all(dim=1)
+            return [share for share, all_are in zip(shares, fine.tolist(), strict=True) if all_are]
 
-        found = max(filter(good, (0.25, 0.5, 1.0, 2.0, 4.0)), default=None)
-        if found is None:  # units of which 1 is far: a gap of a centimetre in metres
-            found = next(filter(good, (2.0**-k for k in range(3, 13))), 0.0)
-        return found * width
+        # Where 1 is far, as a gap of a centimetre in metres, smaller boxes are tried.
+        found = good((0.25, 0.5, 1.0, 2.0, 4.0)) or good([2.0**-k for k in range(3, 13)])
+        return max(found, default=0.0) * width
 
     def _over_optimum(self, x0: Tensor, cost: Tensor, fine: Tensor) -> Tensor:
         if self.plant.period is not None or not self.plant.traceable or self.cost.discount:
