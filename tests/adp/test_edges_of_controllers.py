@@ -209,3 +209,49 @@ def test_pivots_of_zero_are_not_positive() -> None:
     matrices = tensor([[[1.0, 2.0], [2.0, 5.0]], [[1.0, 2.0], [2.0, 4.0]], [[0.0, 0.0], [0.0, 1.0]]])
     assert _definite(matrices).tolist() == [1.0, 0.0, 0.0]
     assert _definite(tensor([[[0.0]], [[1e-9]], [[0.5]], [[-1.0]]])).tolist() == [0.0, 1.0, 1.0, 0.0]
+
+
+def test_a_plant_whose_rows_have_parameters_of_their_own_is_tried_with_those_rows() -> None:
+    scale = uniform(2, 3, 1, seed=7)
+
+    def regressor(x: Tensor, u: Tensor) -> Tensor:
+        return (scale * u).unsqueeze(-1)
+
+    plant = adp.ParametricPlant(regressor, dim=1, inputs=1, theta=uniform(2, 3, 1, seed=8))
+    assert plant.parameters_count == 1
+    x, u = uniform(2, 3, 1, seed=9), uniform(2, 3, 1, seed=10)
+    torch.testing.assert_close(plant.rate(x, u), scale * u * plant.theta)
+
+
+def test_a_set_point_at_which_nothing_moves_is_stable_at_no_period() -> None:
+    found = adp.held_stability(
+        lambda x: 0 * x[..., :1], systems.Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]]), 0.1
+    )
+    assert found.spectral_radius == pytest.approx(1.0, abs=1e-6)
+    assert found.largest_period is None
+
+
+def test_one_state_is_optimised_by_shooting_as_its_riccati_equation_says() -> None:
+    value = math.sqrt(DECAY**2 + 1) - DECAY
+    found = adp.DirectShooting(ONE, COST, intervals=8, horizon=1.0).solve(X)
+    assert found.converged.tolist() == [True] * 3
+    torch.testing.assert_close(found.value, value * X.square().squeeze(-1), rtol=1e-5, atol=0)
+    torch.testing.assert_close(found.gradient, 2 * value * X, rtol=1e-4, atol=0)
+    torch.testing.assert_close(found.control, -value * X, rtol=1e-4, atol=0)
+    tight = adp.DirectShooting(ONE, COST, intervals=8, horizon=1.0, low=-0.1, high=0.1).solve(X)
+    assert tight.converged.tolist() == [True] * 3
+    assert float(tight.control[0]) == pytest.approx(-0.1)
+    assert float(tight.value[0]) > float(found.value[0])
+    torch.testing.assert_close(tight.value[2], found.value[2], rtol=1e-5, atol=0)
+
+
+@pytest.mark.needs_compiler
+@torch.no_grad()
+def test_two_states_are_asked_at_once_and_one_by_one() -> None:
+    policy = adp.RolloutPolicy.of_lqr(ONE, COST, centers=3, steps=2)
+    policy._compiled._asked = float("inf")
+    wanted = policy.control(X)
+    for x, u in ((X, wanted), (X[:2], wanted[:2]), (X[:1], wanted[:1]), (X[1], wanted[1])):
+        for _ in range(2):
+            torch.testing.assert_close(policy(x), u, rtol=1e-10, atol=1e-12)
+    assert policy._compiled.compiled
