@@ -150,7 +150,7 @@ def flat(cfg: DictConfig) -> dict[str, Any]:
     try:
         settings = OmegaConf.to_container(cfg, resolve=True)
     except OmegaConfBaseException:  # something refers to what is not there: as it is written
-        settings = OmegaConf.to_container(cfg, resolve=False)
+        settings = OmegaConf.to_container(cfg)
     assert isinstance(settings, dict)
     own_ones = {key: value for key, value in settings.items() if key not in (SETTINGS, "hydra")}
     return {key: plain(value) for key, value in flatten(own_ones).items()}

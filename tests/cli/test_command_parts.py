@@ -288,7 +288,7 @@ def test_the_self_test_has_its_number_to_a_millionth(
     expected = 6.23712254984
     clock = iter([10.0, 12.5])
     monkeypatch.setattr(doctor, "time", SimpleNamespace(perf_counter=lambda: next(clock)))
-    excess = torch.tensor([[0.0, expected * (1 + change)]], dtype=torch.float64)
+    excess = torch.tensor([[0.0, 1.0, expected * (1 + change)], [2.0] * 3], dtype=torch.float64)
     monkeypatch.setattr(doctor, "chase", lambda *given, **more: SimpleNamespace(excess=excess))
     said, found = doctor._self_test()
     assert found == good

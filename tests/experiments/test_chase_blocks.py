@@ -106,3 +106,31 @@ def test_another_warning_is_heard_all_the_same(monkeypatch: pytest.MonkeyPatch) 
     messages, _ = said(dataclasses.replace(problem, target=grumbling))
     assert "of the target itself" in messages
     assert sum(message.startswith("|x| r") for message in messages) == 1
+
+
+def test_a_chase_has_the_iterations_the_predictor_and_the_certificate_of_its_problem(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    words = ("optimizer.inner_steps=3", "predictor=tangent", "certificate=true")
+    problem = chase_problem(settings(*SHORT, *words))
+    asked: list[Any] = []
+
+    def noted(name: str) -> Any:
+        real = getattr(chase_batch, name)
+
+        def call(*given: Any, **more: Any) -> Any:
+            asked.append((name, more))
+            return real(*given, **more)
+
+        return call
+
+    for name in ("chase_pieces", "ChaseMetrics"):
+        monkeypatch.setattr(chase_batch, name, noted(name))
+    (found,) = chase_batch.simulate([problem], [None], [False])
+    ((_, metrics), (_, chase)) = asked
+    assert chase == {"inner_steps": 3, "predictor": problem.predictor, "certificate": problem.certificate}
+    assert problem.predictor is not None
+    assert problem.certificate
+    assert (metrics["inner_steps"], metrics["own"]) == (3, problem.metrics)
+    assert metrics["members"] == [(1, 0.05, 0.2)]
+    assert found.metrics["contraction_violations"] is not None

@@ -179,6 +179,8 @@ def test_the_list_of_a_large_archive_is_measured_by_its_second_end(
             _short_directory(io.BytesIO(whole), len(whole))
     else:
         _short_directory(io.BytesIO(whole), len(whole))
+        for short in (22, 23, 60, 97):  # too short for a second end
+            _short_directory(io.BytesIO(whole[-short:]), short)
 
 
 def test_an_archive_may_be_empty_and_so_may_its_arrays(tmp_path: Path) -> None:

@@ -247,3 +247,10 @@ def test_a_folder_that_cannot_be_listed_counts_as_a_link(
 
     monkeypatch.setattr(untrusted.os, "scandir", refused)
     assert sorted(links_in(tmp_path)) == [tmp_path / "a", tmp_path / "b" / "link"]
+
+
+def test_an_entry_of_a_list_has_a_line_of_its_own(tmp_path: Path) -> None:
+    (tmp_path / "config.yaml").write_text("a: 1\nlist:\n - 1\n - [2, 3]\n")
+    found = read_settings(tmp_path / "config.yaml", tmp_path)
+    lines = [found.line(key) for key in ("list", "list.0", "list.1", "list.1.1", "list.2", "")]
+    assert lines == ["2: list:", "3: - 1", "4: - [2, 3]", "4: - [2, 3]", "2: list:", "1: a: 1"]

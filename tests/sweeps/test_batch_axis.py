@@ -20,11 +20,13 @@ from staf_torch.sweeps.member_rows import Left
 SHORT = ["dt=0.05", "duration=1.0", "settle_time=0.5", "figures=false"]
 
 
-def run(directory: Path, lines: object, *base: str) -> tuple[Metrics, list[dict[str, Any]]]:
+def run(
+    directory: Path, lines: object, *base: str, progress: Progress | None = None
+) -> tuple[Metrics, list[dict[str, Any]]]:
     (cfg,) = compose([*SHORT, *base], [[]])
     cfg.members = lines
     start = members.Start("", Left([]))
-    metrics = members.run(cfg, directory, [*SHORT, *base], "config", start, Progress())
+    metrics = members.run(cfg, directory, [*SHORT, *base], "config", start, progress or Progress())
     record = json.loads((directory / "members.json").read_text())
     assert json.loads((directory / "metrics.json").read_text()) == metrics
     return metrics, record["members"]
@@ -32,7 +34,9 @@ def run(directory: Path, lines: object, *base: str) -> tuple[Metrics, list[dict[
 
 def test_members_are_the_rows_of_the_same_sweep(tmp_path: Path) -> None:
     lines = ["kernel=gaussian,matern", "centers.radius=0.1,0.2", "seed=range(2)", "trajectories=2"]
-    metrics, rows = run(tmp_path, lines, "optimizer.inner_steps=2", "dt=0.1")
+    told: list[float] = []
+    metrics, rows = run(tmp_path, lines, "optimizer.inner_steps=2", "dt=0.1", progress=Progress(told.append))
+    assert told == [0.0, *(each / 8 for each in range(1, 9))]
     assert metrics == {"members": 8, "failed": 0, "diverged": 0}
     assert rows[1]["overrides"] == ["kernel=gaussian", "centers.radius=0.1", "seed=1", "trajectories=2"]
     composer = Composer(config_loader(), hydra_node=False)

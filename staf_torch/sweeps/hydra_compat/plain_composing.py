@@ -74,7 +74,7 @@ class PlainComposer:
         if not independent({key: line.override for key, line in values.items()}):
             return None
         composed = self._composer(overrides)
-        tree = OmegaConf.to_container(composed, resolve=False)
+        tree = OmegaConf.to_container(composed)
         assert isinstance(tree, dict)
         if any(_refers(value) for value in _leaves(tree)):
             return None
