@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from typing import Any, NamedTuple
 
@@ -63,7 +62,7 @@ def eliminate(directions: Tensor) -> Elimination:
     count = directions.shape[-2]
     rest = torch.eye(count, dtype=directions.dtype, device=directions.device)
     functionals, strengths, degrees = [], [], []
-    for degree in itertools.count():
+    for degree in range(count + 2):  # two more than any needs, for rounding
         monomials = homogeneous(directions, degree)
         left, sigma, _ = torch.linalg.svd(rest.mT @ monomials, full_matrices=True)
         size = int((sigma > _SINGULAR).sum())
@@ -73,11 +72,11 @@ def eliminate(directions: Tensor) -> Elimination:
         rest = rest @ left[..., size:]
         if rest.shape[-1] == 0:
             break
-        if degree > count:
-            raise ValueError(
-                f"`StateFollowingCenters(directions=...)` must be told apart by polynomials: "
-                f"{rest.shape[-1]} of {count} directions coincide with others to rounding."
-            )
+    else:
+        raise ValueError(
+            f"`StateFollowingCenters(directions=...)` must be told apart by polynomials: "
+            f"{rest.shape[-1]} of {count} directions coincide with others to rounding."
+        )
     return Elimination(torch.cat(functionals, dim=-1), torch.cat(strengths, dim=-1), tuple(degrees))
 
 

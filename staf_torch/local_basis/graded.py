@@ -122,7 +122,7 @@ class Interpolation(NamedTuple):
 
     def shared(self) -> bool:
         """Whether one matrix serves all states."""
-        return self.chebyshev is None and self.inverse.dim() == 2
+        return self.inverse.dim() == 2
 
     def solve(self, values: Tensor) -> Tensor:
         """Psi^-1 v: (..., M) -> (..., M), computed in float64 whatever the dtype of v."""

@@ -69,6 +69,7 @@ def test_sample_that_is_known_takes_no_place_and_still_teaches() -> None:
     models, x = empty(16), torch.zeros(40, 2, dtype=torch.float64)
     learn(models, x, torch.ones(40, 1, dtype=torch.float64))
     assert models.counts[1].tolist() == [1.0, 1.0]
+    assert models.counts[2].tolist() == [2.0, 2.0]  # the place in use and the next are checked in turn
     mean, variance = models.predict(x[0][:, None], RATE, NOISE, JITTER)
     assert (mean - 1).abs().max() < 0.01
     assert ((variance - NOISE) < NOISE / 30).all()
