@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 import operator
+import warnings
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -222,4 +224,60 @@ def test_an_example_is_a_batch_of_states(shape: tuple[int, ...]) -> None:
 @pytest.mark.parametrize("batch", [0, -1, 1.5])
 def test_a_batch_has_a_row_at_least(batch: Any) -> None:
     with pytest.raises(ValueError, match=r"trace\(batch=...\)"):
+        tracing.trace(nn.Identity(), torch.zeros(1, 2), batch=batch)
+
+
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """What torch is asked for, which answers at once."""
+    found: dict[str, Any] = {}
+
+    def make(module: nn.Module, table: Any, **options: Any) -> Callable[[Tensor], str]:
+        warnings.warn("of the tracer about its own", stacklevel=1)  # nobody hears of it
+        found.update(module=module, options=options)
+        return lambda x: found.update(traced=x) or "graph"  # type: ignore[func-returns-value]
+
+    def export(graph: str, given: tuple[Tensor], **options: Any) -> SimpleNamespace:
+        found.update(exported=(graph, given[0]), **options)
+        return SimpleNamespace(run_decompositions=lambda table: ("decomposed", table))
+
+    monkeypatch.setattr(tracing, "make_fx", make)
+    monkeypatch.setattr(tracing, "fold", lambda graph: f"folded {graph}")
+    monkeypatch.setattr(tracing, "lift_numbers", lambda graph: f"lifted {graph}")
+    monkeypatch.setattr(torch.export, "export", export)
+    return found
+
+
+@pytest.mark.parametrize("batch", [None, 1, 5])
+def test_a_module_is_traced_for_a_batch_or_for_any(batch: int | None, asked: dict[str, Any]) -> None:
+    module = nn.Sequential(nn.Linear(2, 2), nn.Dropout()).train()
+    example = torch.tensor([[1.0, 2.0], [3.0, 4.0]])
+    program: Any = tracing.trace(module, example, batch=batch)
+    assert program == ("decomposed", {})
+    assert asked["exported"][0] == "lifted folded graph"
+    x = asked["traced"]
+    assert asked["exported"][1] is x
+    assert x.shape[1:] == (2,)
+    assert len(x) == batch if batch is not None else len(x) > 2
+    assert torch.equal(x, example[:1].expand_as(x))
+    assert not module.training
+    assert not any(each.requires_grad for each in module.parameters())
+    mode = "symbolic" if batch is None else "real"
+    assert asked["options"] == {"tracing_mode": mode, "_allow_non_fake_inputs": True}
+    if batch is not None:
+        assert asked["dynamic_shapes"] is None
+    else:
+        ((axis, dim),) = asked["dynamic_shapes"][0].items()
+        assert (axis, dim.__name__, dim.min) == (0, "batch", 1)
+
+
+@pytest.mark.parametrize(("batch", "said"), [(None, "any batch"), (4, "a batch of 4")])
+def test_what_cannot_be_traced_is_said_in_a_line(
+    batch: int | None, said: str, asked: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fold(graph: str) -> None:
+        raise KeyError("why\nand where")
+
+    monkeypatch.setattr(tracing, "fold", fold)
+    with pytest.raises(ValueError, match=rf"^`Identity` cannot be exported for {said}: 'why\\nand where'$"):
         tracing.trace(nn.Identity(), torch.zeros(1, 2), batch=batch)
