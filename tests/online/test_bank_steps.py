@@ -12,6 +12,7 @@ from staf_torch.online.bank import Bank
 from staf_torch.online.bank_definition import BankDefinition
 from staf_torch.online.bank_rules import RECENT, BankShape, Rules, size
 from staf_torch.online.local_functions import LocalFunctions
+from staf_torch.online.quadratic_models import quadratic_features
 
 BUT = ("asked", "gap")  # where nobody asked, two kinds of nothing; distances that are equal to the last bit
 INVERSES = ("tracker_inverse", "tracker_known", "tracker_weights")  # entries of up to 1e6, which cancel
@@ -105,3 +106,43 @@ def test_a_store_gives_up_the_older_of_the_closest_pair_of_those_that_are_not_re
         apart = torch.where(among[:, None] & among, torch.cdist(x[at] / unit, x[at] / unit), inf)
         apart.fill_diagonal_(inf)
         torch.testing.assert_close(s["gap"][: len(kept)], apart.amin(1).square())
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_features_are_products_squares_or_the_coordinates_alone(dtype: torch.dtype) -> None:
+    u = torch.tensor([2.0, -3.0, 5.0], dtype=dtype)
+    for values, count, wanted in (
+        (u[:1], 3, [1, 2, 4]),
+        (u[:2], 6, [1, 2, -3, 4, -6, 9]),
+        (u, 10, [1, 2, -3, 5, 4, -6, 10, 9, -15, 25]),
+        (u, 7, [1, 2, -3, 5, 4, 9, 25]),
+        (u, 4, [1, 2, -3, 5]),
+    ):
+        found = quadratic_features(values, count)
+        assert found.tolist() == wanted
+        assert found.dtype == dtype
+
+
+@pytest.mark.parametrize("kind", ["definition", pytest.param("compiled", marks=pytest.mark.needs_compiler)])
+def test_a_stream_that_goes_where_nothing_can_be_learned_waits_there(kind: str) -> None:
+    """Beyond 1e150 a sample is never kept: the eighth ends what was known, and a usual one begins."""
+    bank = Bank(BankShape(2, 1, 128, 8), 1, True)
+    if kind == "definition":
+        bank._run = None
+    x, y = events(1, 150)
+    for k in range(5):
+        bank.learn(x[k], y[k])
+    (stream,) = bank._definition.each(bank.table)
+    for k in range(10):
+        assert float(stream["count"]) == (5 if k < 8 else 0)
+        assert float(stream["far"]) == min(k, 8)
+        bank.learn(x[5], torch.full_like(y[5], 1e200))
+    assert float(stream["skipped"]) == 10
+    assert float(stream["learned"]) == 5
+    assert bank.predict(x[6])[0].tolist() == [[0.0]]
+    for k in range(6, 9):
+        bank.learn(x[k], y[k])
+    assert float(stream["far"]) == 0
+    assert (float(stream["count"]), float(stream["clock"])) == (3, 3)
+    assert (float(stream["learned"]), float(stream["skipped"])) == (8, 10)
+    assert float(stream["time"]) == 18
