@@ -69,7 +69,7 @@ def test_every_state_of_the_box_is_regulated_near_the_optimum_in_its_first_episo
     law = adp.PolicyIteration()
     control = adp.ActorCritic(basis, PLANT, COST, points, law, critic=start, actor=start)
     x0 = uniform(60, 2.0, seed=11)
-    run = adp.simulate(control, PLANT, COST, x0, dt=0.02, steps=250, every=250, compile=False)
+    run = adp.simulate(control, PLANT, COST, x0, dt=0.02, steps=250, every=250, compile=True)
     ratio = run.cost / (0.5 * x0[:, 0] ** 2 + x0[:, 1] ** 2)
     assert float(run.state[:, -1].norm(dim=-1).max()) < 0.05
     assert float(ratio.mean()) < 1.02

@@ -78,7 +78,7 @@ def test_places_that_no_model_reaches_are_not_a_number() -> None:
 
 
 def test_full_memory_leaves_no_gap_behind() -> None:
-    memory = filled(st.ExperienceMemory(basis_of("gaussian", radius=0.1), 48, reach=2.5), circle(500))
+    memory = filled(st.ExperienceMemory(basis_of("gaussian", radius=0.1), 48, reach=2.5), circle(250))
     assert int(memory.count) == 48
     assert memory.covered(circle(700)).all()
     assert float((memory.query(circle(700)) - V(circle(700))).abs().max()) < 0.02
@@ -222,14 +222,14 @@ def noisy_laps(laps: int, scale: float, visits: int = 64) -> float:
 
 
 def test_noise_goes_down_with_the_root_of_the_visits() -> None:
-    once, often = noisy_laps(1, 0.1), noisy_laps(100, 0.1)
+    once, often = noisy_laps(1, 0.1), noisy_laps(64, 0.1)
     assert often < 0.25 * once  # 1 / 8 (64 visits) but for the scatter of eight places
-    assert noisy_laps(50, 0.1, visits=1) > 0.5 * once
+    assert noisy_laps(20, 0.1, visits=1) > 0.5 * once
 
 
 def test_average_begins_anew_where_the_function_drifts() -> None:
-    basis, x = basis_of("gaussian", radius=0.1), circle(30)
-    memory = st.ExperienceMemory(basis, 40)
+    basis, x = basis_of("gaussian", radius=0.1), circle(30)[:10]
+    memory = st.ExperienceMemory(basis, 20)
     for lap in range(12):
         share = 1.0 if lap < 8 else -1.0
         for state in x:
