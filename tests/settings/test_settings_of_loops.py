@@ -12,6 +12,7 @@ from torch import nn
 
 from staf_torch import adp
 from staf_torch.settings import adp as loops
+from staf_torch.settings.chase import chase_problem
 from staf_torch.settings.plain import ManySettings, PlainSettings, to_read
 
 
@@ -100,6 +101,18 @@ def test_a_loop_has_the_steps_that_fit_its_duration_and_its_own_choices() -> Non
     for module in (single.system, single.cost, single.controller):
         assert isinstance(module, nn.Module)
         assert {buffer.dtype for buffer in module.buffers() if buffer.is_floating_point()} <= {torch.float32}
+
+
+def test_a_problem_is_where_and_as_precise_as_the_settings_say() -> None:
+    """On a device without numbers, which every machine has."""
+    asked = ("device=meta", "dtype=float32")
+    loop = loops.adp_problem(composing.settings("experiment=adp", "adp/policy=lqr", *asked))
+    chased = chase_problem(composing.settings(*asked))
+    parts = loop.system, loop.cost, loop.controller, chased.basis
+    held = [each for part in parts for each in part.state_dict().values() if each.is_floating_point()]
+    assert held
+    for each in (loop.initial_states, chased.initial_states, *held):
+        assert (each.device.type, each.dtype) == ("meta", torch.float32)
 
 
 def test_walls_put_a_filter_before_the_policy() -> None:
