@@ -140,8 +140,7 @@ class ExperienceMemory(nn.Module):
     def query(self, y: Tensor) -> Tensor:
         """V^(y): (..., P, n) -> (..., P); NaN where no stored model reaches."""
         weights = self._weights(y)
-        total = weights.sum(-1)
-        return (weights * self._local(y)).sum(-1) / torch.where(total > 0, total, torch.nan)
+        return (weights * self._local(y)).sum(-1) / weights.sum(-1)  # 0 / 0 where none reaches
 
     def gradient(self, y: Tensor) -> Tensor:
         """Gradient of the blend at y: (..., P, n) -> (..., P, n)."""

@@ -137,6 +137,14 @@ def test_state_of_another_model_is_refused(change: dict[str, Any]) -> None:
         st.StaFRegressor().load_state_dict({})
 
 
+def test_a_kernel_that_differs_in_its_seventh_digit_is_another_one() -> None:
+    x, y = streams(5, 2)
+    state = st.StaFRegressor(st.GaussianKernel(0.8)).fit(x, y[..., 0]).state_dict()
+    st.StaFRegressor(st.GaussianKernel(0.8 * (1 + 1e-12))).load_state_dict(state)
+    with pytest.raises(ValueError, match=r"kernel, radius and centers of this regressor; 'gram' differs"):
+        st.StaFRegressor(st.GaussianKernel(0.8 * (1 + 1e-6))).load_state_dict(state)
+
+
 def test_a_bank_saved_before_its_last_number_goes_on() -> None:
     x, y = streams(40, 2)
     model = st.StaFRegressor(memory=128, neighbours=8).fit(x[:30], y[:30, :, 0])

@@ -51,7 +51,7 @@ def dense(x: Tensor, y: Tensor, follow: float) -> tuple[Tensor, Tensor]:
     return gain @ y[seen], variance
 
 
-@pytest.mark.parametrize("missing", [[7], [0, 1, 2, 8, 9]])
+@pytest.mark.parametrize("missing", [[7], [0, 1, 2, 8, 9], [1, 2]])
 @pytest.mark.parametrize("follow", [100.0, 1.0, 0.0])
 def test_smoothing_is_conditioning_on_all_samples(follow: float, missing: list[int]) -> None:
     x, y = path(24), uniform(24, seed=3)

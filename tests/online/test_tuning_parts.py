@@ -156,3 +156,22 @@ def test_the_later_two_thirds_are_scored_each_before_it_is_learned() -> None:
             wanted += float(_log_density(y, mean, deviation))
         model.partial_fit(x, y)
     assert found.tolist() == [[pytest.approx(wanted, rel=1e-9)]]
+
+
+def test_a_coordinate_that_is_constant_says_nothing_whatever_the_constant(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for name, few in (("WIDTHS", (1.0,)), ("NOISES", (0.1,)), ("FORGETTING", (1.0,)), ("ROUNDS", ())):
+        monkeypatch.setattr(tuning, name, few)
+    time = 0.5 * torch.arange(24, dtype=torch.float64)
+    found = []
+    for constant in (0.0, 7.0, 1000.1, -1e-9):
+        x = torch.stack((3 * time.sin(), torch.full_like(time, constant)), -1)[:, None]
+        found.append(tuning.tuning(x, (2 * time).cos()[:, None, None], st.rings(6)))
+    for one, other in zip(found[0][1:], found[2][1:], strict=True):  # all but the center
+        torch.testing.assert_close(one, other)
+        assert bool(one.isfinite().all())
+    for each, constant in zip(found, (0.0, 7.0, 1000.1, -1e-9), strict=True):
+        torch.testing.assert_close(each.center[0, 1], tensor(constant))
+        torch.testing.assert_close(each.spread, found[0].spread)
+        assert each.unknown.tolist() == [[0.0, 1.0]]
