@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import warnings
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import composing
@@ -132,6 +133,9 @@ def test_equal_settings_share_one_object_and_its_warning_is_said_each_time() -> 
     assert parts(make, OmegaConf.create({"a": [1, {"b": 3}]})) is not first
     assert parts(lambda cfg: object(), OmegaConf.create(node)) is not first
     assert parts(make, 1) is parts(make, 1) is not parts(make, "1")
+    place = {"a": Path("b")}  # which JSON does not have
+    assert parts(make, PlainSettings(place)) is parts(make, OmegaConf.create(place))
+    assert parts(make, PlainSettings(place)) is not parts(make, PlainSettings({"a": Path("c")}))
     thing = [1]
     assert parts(make, thing) is parts(make, thing) is not parts(make, [1])
     assert len(made) == 6

@@ -11,6 +11,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import ConfigCompositionException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 from staf_torch.settings.plain import PlainSettings
 from staf_torch.sweeps.hydra_compat import (
@@ -154,6 +155,15 @@ def test_lines_are_parsed_once_and_not_kept_for_ever(monkeypatch: pytest.MonkeyP
 def test_a_key_that_there_is_not_is_hydras_error() -> None:
     with pytest.raises(ConfigCompositionException):
         composer()(["sead=1"])
+    make = composer()
+
+    def refused(values: object, cfg: object) -> None:
+        raise OmegaConfBaseException("in other words")
+
+    make._apply = refused
+    with pytest.raises(ConfigCompositionException) as told:
+        make(["seed=1"])
+    assert str(told.value.__cause__) == "in other words"
 
 
 @pytest.mark.parametrize(

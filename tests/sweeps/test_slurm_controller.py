@@ -53,6 +53,8 @@ def test_slurm_is_asked_every_ten_seconds_and_has_twenty_to_answer(
     assert asked[0]["timeout"] == 20.0
     assert asked[0]["line"][0] == "squeue"
     assert asked[0]["check"]
+    assert asked[0]["text"]
+    assert asked[0]["capture_output"]
 
 
 def test_jobs_are_cancelled_a_thousand_at_a_time_in_four_seconds(asked: list[dict[str, Any]]) -> None:
@@ -62,6 +64,7 @@ def test_jobs_are_cancelled_a_thousand_at_a_time_in_four_seconds(asked: list[dic
     assert [name for each in asked for name in each["line"][2:]] == names
     assert [len(each["line"]) - 2 for each in asked] == [1000] * 6 + [1]
     assert [each["timeout"] for each in asked] == [4.0, 3.0, 2.0, 1.0, 0.0, 0.0, 0.0]
+    assert all(each["text"] and each["capture_output"] for each in asked)  # what it says is no noise here
     asked.clear()
     Controller().cancel([])
     assert asked == []
