@@ -206,3 +206,18 @@ def test_units_are_learned_grown_and_left_as_by_a_stream_that_starts_over(steps:
     spreads = streams.units[:, 4]
     assert float(spreads[1]) > 1.0 > 0.1 > float(spreads[0])
     assert float(streams.units[3, 2]) < -1e9
+
+
+@pytest.mark.parametrize("at", [5, 10, 40])
+@pytest.mark.parametrize("wrong", [False, True])
+def test_a_sample_that_comes_when_units_are_learned_is_counted_once(at: int, wrong: bool) -> None:
+    """The sample by which units are due is out of all proportion, or is not."""
+    time = 0.4 * torch.arange(at, dtype=torch.float64)
+    x, y = torch.stack((time.sin(), time.cos()), -1), 50 + (2 * time).sin()
+    y[at - 1] = 1e30 if wrong else y[at - 1]
+    model = st.StaFRegressor(scaling=True).fit(x, y)
+    assert int(model.n_samples_seen_) == at - wrong
+    assert int(model.n_skipped_) == int(wrong)
+    model.partial_fit(x[0], torch.tensor(torch.nan).double())
+    assert int(model.n_skipped_) == 1 + wrong
+    assert float(model.predict(x[1])) == pytest.approx(50, abs=1.5)
