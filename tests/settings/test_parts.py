@@ -138,7 +138,7 @@ def test_equal_settings_share_one_object_and_its_warning_is_said_each_time() -> 
     assert parts(make, PlainSettings(place)) is not parts(make, PlainSettings({"a": Path("c")}))
     thing = [1]
     assert parts(make, thing) is parts(make, thing) is not parts(make, [1])
-    assert len(made) == 6
+    assert len(made) == 8
     for _ in range(2):
         with pytest.warns(UserWarning, match="^two$"):
             again = parts(make, 1, None)
