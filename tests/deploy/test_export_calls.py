@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
+import subprocess
 import sys
 import time
 from pathlib import Path
@@ -13,7 +15,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from staf_torch.deploy import formats, sheet
+from staf_torch.deploy import c_header, formats, sheet
 
 
 def test_an_onnx_model_is_optimised_named_and_made_without_a_word(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -112,3 +114,58 @@ def test_calls_are_timed_on_the_last_core_and_the_others_are_given_back(
     assert asked == [(0, {3}), (0, {1, 2, 3})]
     monkeypatch.delattr(os, "sched_setaffinity")
     assert sheet.latency(lambda x: None, torch.zeros(1, 2), calls=2).calls == 2
+
+
+def test_a_header_is_compiled_in_a_folder_of_its_own(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    header = tmp_path / "of an odd name.h"
+    header.write_text("/* a header */")
+    asked: list[Any] = []
+
+    def run(line: list[str], **given: Any) -> None:
+        folder = Path(given["cwd"])
+        asked.append(
+            (line, {**given, "cwd": None}, {each.name: each.read_text() for each in folder.iterdir()})
+        )
+
+    monkeypatch.setattr(subprocess, "run", run)
+    monkeypatch.setattr(c_header, "need_c_compiler", lambda: "some-cc")
+    monkeypatch.setattr(ctypes, "CDLL", lambda path: SimpleNamespace(call=Path(path).name))
+    assert c_header._built(header, "void call() {}", "#include <time.h>\n") == "call.so"
+    ((line, given, files),) = asked
+    assert line == ["some-cc", *["-O2", "-shared", "-fPIC", "-x", "c", "call.c", "-o", "call.so", "-lm"]]
+    assert given == {"cwd": None, "check": True, "capture_output": True}
+    source = '#include <time.h>\n#include "exported.h"\nvoid call() {}\n'
+    assert files == {"exported.h": "/* a header */", "call.c": source}
+
+
+@pytest.mark.parametrize(("dtype", "kind"), [(torch.float64, "double"), (torch.float32, "float")])
+def test_calls_in_c_get_rows_where_they_lie_and_their_times_are_counted(
+    dtype: torch.dtype, kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    texts: list[str] = []
+    number = ctypes.c_double if kind == "double" else ctypes.c_float
+
+    def timed(x: Any, taken: Any, rows: Any, n: Any) -> None:
+        assert (rows.value, n.value) == (101, 2)
+        assert (number * 2).from_address(x.value)[1] == 0.5
+        (ctypes.c_double * 101).from_address(taken.value)[:] = [float(k) for k in range(1, 102)]
+
+    def called(x: Any, first: Any, second: Any) -> None:
+        a, b = (number * 2).from_address(x.value)
+        number.from_address(first.value).value = a + b
+        (number * 2).from_address(second.value)[:] = [a, 2 * b]
+
+    def built(path: Path, function: str, head: str = "") -> Any:
+        texts.append(function)
+        return timed if head else called
+
+    monkeypatch.setattr(c_header, "_built", built)
+    found = c_header.time_c(Path("x.h"), torch.full((101, 2), 0.5, dtype=dtype), [1, 2])
+    assert (found.calls, found.median_us, found.worst_us) == (101, 51.0, 101.0)
+    assert found.p99_us == pytest.approx(100.0)
+    run = c_header.runner_c(Path("x.h"), [None, 2], dtype)
+    total, pair = run(torch.tensor([[1.0, 2.0], [3.0, 4.0]], dtype=dtype))
+    assert total.dtype == pair.dtype == dtype
+    assert (total.tolist(), pair.tolist()) == ([3.0, 7.0], [[1.0, 4.0], [3.0, 8.0]])
+    assert f"const {kind} *x, double *us" in texts[0]
+    assert texts[1] == f"void call(const {kind} *state, {kind} *o0, {kind} *o1) {{ staf(state, o0, o1); }}"
