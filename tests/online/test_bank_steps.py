@@ -2,15 +2,29 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 from torch import Tensor, inf, nan
 
 from staf_torch.centers import simplex
 from staf_torch.kernels import GaussianKernel
+from staf_torch.online import bank_definition
 from staf_torch.online.bank import Bank
 from staf_torch.online.bank_definition import BankDefinition
-from staf_torch.online.bank_rules import RECENT, BankShape, Rules, size
+from staf_torch.online.bank_rules import (
+    FADING,
+    PLAIN,
+    RECENT,
+    TRACKERS,
+    TURNED,
+    TURNED_FADING,
+    BankShape,
+    Rules,
+    size,
+)
+from staf_torch.online.learned_trackers import Choice, Learned, Stretch
 from staf_torch.online.local_functions import LocalFunctions
 from staf_torch.online.quadratic_models import quadratic_features
 
@@ -146,3 +160,46 @@ def test_a_stream_that_goes_where_nothing_can_be_learned_waits_there(kind: str) 
     assert (float(stream["count"]), float(stream["clock"])) == (3, 3)
     assert (float(stream["learned"]), float(stream["skipped"])) == (8, 10)
     assert float(stream["time"]) == 18
+
+
+def test_trackers_learn_from_the_latest_samples_that_are_believed(monkeypatch: pytest.MonkeyPatch) -> None:
+    shape, given = BankShape(2, 1, 200, 8), []
+    choices = [Choice(1.0 + k, 0.1 + k, 0.01 * (k + 1), 0.0) for k in range(4)]
+    metric = torch.tensor([[1.0, 0.0], [0.5, 2.0]], dtype=torch.float64)
+
+    def learned(s: Stretch) -> Learned:
+        given.append(s)
+        return Learned(*choices, metric)
+
+    monkeypatch.setattr(bank_definition, "learn_hyperparameters", learned)
+    functions = LocalFunctions.of(GaussianKernel(1.0), simplex(2))
+    definition = BankDefinition(shape, Rules.of(2, True), functions)
+    (s,) = definition.each(torch.zeros(1, size(shape), dtype=torch.float64))
+    definition.clear(s)
+    before = {name: s[f"tracker_{name}"].clone() for name in ("rate", "noise", "forgetting")}
+    draw = torch.Generator().manual_seed(3)
+    x, y = (torch.randn(160, n, generator=draw, dtype=torch.float64) for n in (2, 1))
+    x[20, 0], y[140] = 3e3, 1e200  # two that are not believed
+    units = torch.tensor([1.0, -1.0, 5.0, 0.5, 2.0, 4.0], dtype=torch.float64)
+    s["center"].copy_(units[:3])
+    s["spread"].copy_(units[3:])
+    x[150] = torch.tensor([1.0 + 0.5 * 999, -1.0])  # and one that just is
+    s["x"][:160], s["y"][:160], s["when"][:160] = x, y, 0.5 * torch.arange(160, dtype=torch.float64)
+    for clock in (160.0, 40.0):
+        s["clock"].fill_(clock)
+        definition._learn_trackers(s, 160)
+        (stretch,) = given
+        usable = [k for k in range(160) if k not in (20, 140)][-128:]
+        torch.testing.assert_close(stretch.at, (x[usable] - units[:2]) / units[3:5])
+        torch.testing.assert_close(stretch.y, (y[usable] - units[2]) / units[5])
+        assert torch.equal(stretch.when, 0.5 * torch.tensor(usable, dtype=torch.float64))
+        given.clear()
+    assert torch.equal(s["metric"], metric)
+    lanes = {TURNED: choices[0], PLAIN: choices[1], FADING: choices[2], TURNED_FADING: choices[3]}
+    for lane in range(TRACKERS):
+        found = [float(s[f"tracker_{name}"][lane]) for name in before]
+        if lane in lanes:
+            rate, noise, fade, _ = lanes[lane]
+            assert found == pytest.approx([rate, noise, math.exp(-2 * fade)])
+        else:
+            assert found == [float(each[lane]) for each in before.values()]
