@@ -32,7 +32,7 @@ def numpy_units(columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         away = np.abs(seen - seen[(len(seen) - 1) // 2])
         typical = np.sort(away)[(len(away) - 1) // 2]
         kept = seen[away <= 30 * typical] if typical else seen
-        mean, most = kept.mean(), max(np.abs(kept - kept.mean()).max(), 1e-320)
+        mean, most = kept.mean(), np.abs(kept - kept.mean()).max() or 1.0
         spread = most * np.sqrt(np.square((kept - mean) / most).mean())
         found.append((mean, spread if spread > 1e-12 * abs(mean) else 1.0))
     center, spread = zip(*found, strict=True)
