@@ -143,7 +143,7 @@ def test_equal_settings_share_one_object_and_its_warning_is_said_each_time() -> 
         with pytest.warns(UserWarning, match="^two$"):
             again = parts(make, 1, None)
     assert parts._made[make, 1, None] == (again, ["two"])
-    assert len(made) == 7
+    assert len(made) == 9
 
 
 class Rows(Metric):
