@@ -156,3 +156,38 @@ def test_a_start_is_nothing_where_nothing_is_remembered_and_the_nearest_beyond_a
             torch.testing.assert_close(memory.start(state), coefficients, rtol=1e-9, atol=1e-9)
     slope = memory.gradient(at(0.02))
     torch.testing.assert_close(slope, torch.zeros_like(slope), rtol=0, atol=1e-7)
+
+
+def test_the_same_model_twice_is_no_average_and_what_is_not_finite_moves_nothing() -> None:
+    memory = st.ExperienceMemory(BASIS, 3)
+    here, there = at(0.0, 1.0)
+    values = torch.arange(6.0, dtype=torch.float64)
+    for _ in range(2):
+        memory.add(here, model(here, 0.0)).add(there, model(there, values))
+    assert memory.averaged.tolist() == [1, 1, 0]
+    assert memory.scatter.tolist()[0] == 0.0
+    origin = memory.origin.clone()
+    assert torch.equal(origin, there)
+    for x, coefficients in (
+        (here, torch.full((6,), torch.nan).double()),
+        (here * torch.nan, model(here, 1.0)),
+    ):
+        memory.add(x, coefficients)
+        assert torch.equal(memory.origin, origin)
+        assert int(memory.latest) == 1
+    memory.add(here, model(here, values))
+    assert memory.averaged.tolist() == [1, 1, 0]
+    assert float(memory.scatter[0]) == pytest.approx(rms(values, torch.zeros(6)))
+
+
+def test_points_of_another_shape_are_refused_by_name() -> None:
+    memory = memory_of(0.0)
+    for wrong in (torch.zeros(3).double(), torch.zeros(4, 3).double(), torch.zeros(()).double()):
+        with pytest.raises(ValueError, match=r"`ExperienceMemory.start\(x=...\)` must"):
+            memory.start(wrong)
+    for wrong in (torch.zeros(2).double(), torch.zeros(4, 3).double(), torch.zeros(()).double()):
+        for call in (memory.query, memory.covered):
+            with pytest.raises(ValueError, match=r"`ExperienceMemory\(y=...\)` must"):
+                call(wrong)
+    assert memory.start(torch.zeros(2).double()).shape == (6,)
+    assert memory.query(torch.zeros(1, 2).double()).shape == (1,)
