@@ -139,6 +139,27 @@ def test_what_is_computed_twice_is_read_once() -> None:
     assert len(recipe(lambda x: x * (A + 1).mul(2) + (A + 1).mul(2)).values) == 3
 
 
+def test_an_order_of_captured_numbers_is_no_structure_of_the_text() -> None:
+    turned = A.flip(0)
+    for step, few in (
+        (lambda x: x[:, A.argsort()], [0.0, 1.0, 2.0]),
+        (lambda x: x.index_select(1, A.argsort()), [0.0, 1.0, 2.0]),
+        (lambda x: x.gather(1, A.argsort().expand(1, 3)), [0.0, 1.0, 2.0]),
+        (lambda x: x.gather(1, A.argsort().repeat(50).view(1, -1)), [0.0, 1.0, 2.0] * 50),  # by a loop
+        (lambda x: x.scatter(1, A.argsort().expand(1, 3), 2 * x), [0.0, 1.0, 2.0]),
+    ):
+        found = recipe(step)
+        assert found.values.tolist() == few
+        assert found.again({id(A): turned}).tolist() == few[::-1]
+
+
+def test_whole_powers_up_to_sixty_four_are_products() -> None:
+    x = torch.ones(2, 3, dtype=torch.float64)
+    for power in (2, 3, 63, 64, 65, -64, -65, 0.5, 2.5):
+        graph = trace(lambda c, n, r, p=power: (c, r**p), Given.of(x, (), x, 1)).program[0]
+        assert ("pow" in graph.op) == (power in (65, -65, 2.5))
+
+
 REFUSED: dict[str, tuple[Callable[[Tensor], Any], str]] = {
     "a value of a row": (lambda x: x if bool(x.sum() > 0) else -x, "reads a value of a row"),
     "an index of a row": (lambda x: x.nonzero(), "reads a value of a row"),
@@ -153,6 +174,22 @@ REFUSED: dict[str, tuple[Callable[[Tensor], Any], str]] = {
     "a norm": (lambda x: torch.linalg.vector_norm(x, 3, -1), "a norm of order 3"),
     "an unknown": (lambda x: torch.special.i0(x), "i0"),
     "a scaled product": (lambda x: torch.addmm(x, x[:, :1], x, beta=2), "a scaled product"),
+    "added at an index of a row": (
+        lambda x: x.index_put((torch.tensor([0]), x.argmax(-1)), x[:, 0], accumulate=True),
+        "`aten.index_put` at an index that the row computes",
+    ),
+    "added at an index that was captured": (
+        lambda x: x.index_put((torch.tensor([0]), A.argsort()[:1]), x[:, 0], accumulate=True),
+        "`aten.index_put` at an index that the row computes",
+    ),
+    "written at an index of a row": (
+        lambda x: x.index_put((torch.tensor([0]), x.argmax(-1)), x[:, 0]),
+        "`aten.index_put` at an index that the row computes",
+    ),
+    "two indices": (
+        lambda x: x[torch.tensor([0]), x.argmax(-1)],
+        "`aten.index` at an index that the row computes",
+    ),
     "rsub with alpha": (lambda x: torch.rsub(x, x, alpha=2), "has no scalar form here"),
 }
 
