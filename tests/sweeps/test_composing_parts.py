@@ -345,3 +345,20 @@ def test_lines_of_members_are_not_kept_for_ever(monkeypatch: pytest.MonkeyPatch)
     assert list(plain._lines) == ["seed=1", "seed=2"]
     plain([["seed=1"], ["seed=3"]])
     assert list(plain._lines) == ["seed=3"]
+
+
+@pytest.mark.parametrize(
+    ("key", "found"),
+    [
+        ("a", {"b": 1, "c": [2]}),
+        ("a.b", 1),
+        ("a.c", [2]),
+        ("a.c.0", None),
+        ("a.x", None),
+        ("x.b", None),
+        ("a.b.c", None),
+    ],
+)
+def test_a_place_that_there_is_not_is_the_whole_tree(key: str, found: Any) -> None:
+    tree = {"a": {"b": 1, "c": [2]}}
+    assert plain_composing._at(tree, key) == (tree if found is None else found)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from hydra.core.override_parser.types import Override, OverrideType
@@ -76,7 +76,7 @@ class PlainComposer:
         composed = self._composer(overrides)
         tree = OmegaConf.to_container(composed)
         assert isinstance(tree, dict)
-        if any(_refers(value) for value in _leaves(tree)):
+        if _refers(tree):
             return None
         settings = PlainSettings.of(tree)
         if any(_at(settings, key) != line.value for key, line in values.items()):
@@ -129,14 +129,6 @@ def _at(tree: Any, key: str) -> Any:
     return node
 
 
-def _leaves(value: Any) -> Iterator[Any]:
-    if isinstance(value, dict):
-        for inner in value.values():
-            yield from _leaves(inner)
-    else:
-        yield value
-
-
 def _refers(value: Any) -> bool:
-    """Return whether a value refers to other settings, or is missing."""
+    """Return whether something in a value refers to other settings, or is missing."""
     return "${" in str(value) or "???" in str(value)
