@@ -5,12 +5,14 @@ from __future__ import annotations
 import functools
 from collections.abc import Sequence
 
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from staf_torch.sweeps.hydra_compat import Composer, config_loader, find_launcher
 from staf_torch.sweeps.hydra_compat.program import HAS_WHITELIST
 
 HYDRA: dict[str, str] = {} if HAS_WHITELIST else {"version_base": "1.3"}  # 1.4 deprecates the argument
+# OmegaConf 2.4, which Hydra 1.4 takes, deprecates the new name again.
+register_resolver = OmegaConf.register_resolver if HAS_WHITELIST else OmegaConf.register_new_resolver
 
 
 @functools.cache

@@ -205,7 +205,7 @@ def sentence(error: BaseException) -> str:
     cause: BaseException | None = error
     while cause is not None:
         if isinstance(cause, ValueError) and not isinstance(cause, OmegaConfBaseException):
-            return str(cause)
+            return str(cause).partition("\nfull_key: ")[0]  # a line that Hydra 1.4 adds
         cause = cause.__cause__
     if isinstance(error, OSError) and not isinstance(error, HydraException) and error.filename:
         return f"cannot write {error.filename}: {error.strerror}"

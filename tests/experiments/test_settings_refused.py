@@ -158,7 +158,11 @@ OTHER_KINDS = [
         {"system": {"_target_": f"{__name__}.Unmoved"}},
         "must be a `systems.Plant` with `dim`",
     ),
-    ((), {"metric": {"_target_": "torch.nn.Identity"}}, "must be a `staf_torch.metrics.Metric`, or several"),
+    (
+        (),
+        {"metric": {"_target_": "staf_torch.systems.TwoState"}},
+        "must be a `staf_torch.metrics.Metric`, or several",
+    ),
     (
         ("experiment=flat_limit",),
         {

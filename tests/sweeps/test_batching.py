@@ -227,6 +227,7 @@ OTHERS = "; others come with the extras joblib, slurm, ray and optuna"
     ("error", "words"),
     [
         (ValueError("ours"), "ours"),
+        (ValueError("ours, and more\nfull_key: kernel"), "ours, and more"),
         (RuntimeError("theirs"), "theirs"),
         (chained(HydraException("wrapped"), RuntimeError("between"), ValueError("ours")), "ours"),
         (chained(HydraException("wrapped"), RuntimeError("between")), "wrapped"),

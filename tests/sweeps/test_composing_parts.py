@@ -7,6 +7,7 @@ from typing import Any
 
 import omegaconf.base
 import pytest
+from composing import register_resolver
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import ConfigCompositionException
 from hydra.types import RunMode
@@ -274,7 +275,7 @@ def test_a_sweep_composes_its_jobs_by_their_values(searchpath: bool) -> None:
 
 def test_what_was_looked_up_for_the_sweep_holds_for_its_jobs() -> None:
     called: list[int] = []
-    OmegaConf.register_new_resolver("staf_counted", lambda: called.append(1) or len(called), use_cache=True)
+    register_resolver("staf_counted", lambda: called.append(1) or len(called), use_cache=True)
     try:
         of_sweep = master()
         of_sweep.at = "${staf_counted:}"

@@ -122,7 +122,7 @@ def test_what_a_run_cannot_do_is_refused_and_recorded(tmp_path: Path) -> None:
     run(settings(animation=True, task=f"{__name__}.Moving"), tmp_path, ORIGIN)
     assert record(tmp_path)["status"] == "completed"
     with pytest.raises(ValueError, match=r"must be a `staf_torch.metrics.Metric`"):
-        run(settings(metric={"_target_": "builtins.dict"}), tmp_path, ORIGIN)
+        run(settings(metric={"_target_": "staf_torch.systems.TwoState"}), tmp_path, ORIGIN)
 
 
 def test_metrics_of_ones_own_are_described_in_the_record(tmp_path: Path) -> None:

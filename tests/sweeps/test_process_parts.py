@@ -11,6 +11,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from composing import register_resolver
 from hydra import version
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.plugins import Plugins
@@ -77,7 +78,7 @@ def test_what_another_application_has_is_set_aside_and_comes_back() -> None:
             assert GlobalHydra not in instances
             assert instances.get(Plugins) is before.get(Plugins)
             instances[GlobalHydra] = instances[JobRuntime] = object()
-            OmegaConf.register_new_resolver("staf_inside", lambda: 1)
+            register_resolver("staf_inside", lambda: 1)
             BaseContainer._resolvers.pop("oc.env")
         assert instances[GlobalHydra] is mine
         assert JobRuntime not in instances
