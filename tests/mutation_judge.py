@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import ast
+import os
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
+from multiprocessing import Pipe
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import NamedTuple
 
@@ -43,6 +46,7 @@ _seconds = 0.0
 _until = 0.0
 _session: pytest.Session
 _functions: Functions
+_anew: Connection  # to a process that has not imported the package
 
 
 def begin_judging(tree: Path, compiled: Path, known: Map, seconds: float, until: float) -> None:
@@ -55,8 +59,9 @@ def begin_judging(tree: Path, compiled: Path, known: Map, seconds: float, until:
         seconds: of tests that a mutant is given, by what they took with the right code.
         until: reading of `time.monotonic` after which no mutant is begun.
     """
-    global _map, _seconds, _until, _session, _functions
+    global _map, _seconds, _until, _session, _functions, _anew
     begin(tree, compiled)
+    _anew = _fork_that_imports_anew()
     _map, _seconds, _until = known, seconds, until
     _session = collected(test_files(place()))
     _functions = Functions(place() / "staf_torch")
@@ -128,10 +133,29 @@ def _run_anew(chosen: Chosen) -> str:
     first = max(1, sum(_cost(tests[: at + 1]) < FIRST for at in range(len(tests))))
     for group in (Chosen(tests[:first], chosen.said), Chosen(tests[first:], chosen.said)):
         if group.tests:
-            code = in_fork(partial(run_files, group.files, group, stop=True), 30 + 3 * _cost(group.tests))
-            if code not in (0, 5):
+            _anew.send((group.tests, group.said, 30 + 3 * _cost(group.tests)))
+            if _anew.recv() not in (0, 5):
                 return "killed"
     return "survived"
+
+
+def _fork_that_imports_anew() -> Connection:
+    """Fork a process before this one imports the package: its children import what the tree holds then.
+
+    It is sent tests, where to write what fails, and seconds, and sends back what `in_fork` returns.
+    """
+    ours, its = Pipe()
+    if os.fork() != 0:
+        its.close()
+        return ours
+    ours.close()
+    try:
+        while True:
+            tests, said, limit = its.recv()
+            chosen = Chosen(tests, said)
+            its.send(in_fork(partial(run_files, chosen.files, chosen, stop=True), limit))
+    finally:  # the other one has ended
+        os._exit(0)
 
 
 def _tests_for(mutant: Mutant, source: str) -> list[str]:
