@@ -244,6 +244,24 @@ def test_degrees_are_found_for_every_walled_coordinate() -> None:
         adp.BoxFilter(lambda s: s[..., :1], systems.Barrier(plant, [-1.0, None, -1.0], None), dt=0.1)
 
 
+class Inside(systems.Linear):
+    """A mass on a line that moves where it may be, and nowhere else."""
+
+    def __init__(self, low: list[float], high: list[float]) -> None:
+        super().__init__([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
+        self.low, self.high = torch.tensor(low).double(), torch.tensor(high).double()
+
+    def drift(self, x: Tensor) -> Tensor:
+        inside = ((x >= self.low) & (x <= self.high)).all(-1, keepdim=True)
+        return torch.where(inside, super().drift(x), 0.0)
+
+
+def test_degrees_are_looked_for_within_the_box() -> None:
+    low, high = [-1.0, -0.5], [2.0, 3.0]
+    guard = adp.BoxFilter(lambda s: s[..., :1], systems.Barrier(Inside(low, high), low, high), dt=0.1)
+    assert guard.degree == [2, 2, 1, 1]
+
+
 def test_a_coordinate_that_the_input_moves_keeps_half_of_its_distance() -> None:
     box = systems.Barrier(MASS, [None, -1.0], [None, 2.0])
     guard = adp.BoxFilter(lambda s: 40.0 * torch.sign(s[..., :1]), box, dt=HOLD)

@@ -289,6 +289,9 @@ def test_tracking_is_measured_over_the_rows_that_did_not_diverge() -> None:
     assert found["final_error"] == float(state[kept, -2:, :2].norm(dim=-1).max())
     assert found["parameter_error"] == float((parameters[kept, -1] - truth).flatten(-2).norm(dim=-1).max())
     assert found["diverged_fraction"] == 0.25
+    short = dataclasses.replace(result, state=state[:, :7])  # the last tenth of which is one time
+    last = float(state[kept, 6, :2].norm(dim=-1).max())
+    assert tracking_metrics(short, None, truth, None)["final_error"] == last
     bare = tracking_metrics(result, None, truth, None)
     assert bare["cost_ratio"] is None
     assert bare["parameter_error"] is None

@@ -268,6 +268,12 @@ def test_a_setting_that_would_diverge_is_refused(make: object) -> None:
         make()
 
 
+@pytest.mark.parametrize("given", [(1.0, None), (None, 0.5)])
+def test_heavy_ball_has_both_numbers_or_finds_both(given: tuple[float | None, float | None]) -> None:
+    with pytest.raises(ValueError, match="must be given with `step` or not at all"):
+        optim.HeavyBall(*given)
+
+
 @pytest.mark.parametrize("momentum", [0.0, 0.5, 0.9])
 def test_heavy_ball_takes_the_steps_with_which_it_converges_and_no_others(momentum: float) -> None:
     def radius(step: float) -> float:  # of the map (a, a before) where the curvature is largest
