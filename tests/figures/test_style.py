@@ -13,7 +13,7 @@ from command_line import environment
 from matplotlib.figure import Figure
 from recorded import Record
 
-from staf_torch.figures import style
+from staf_torch.figures import closed_loop, style
 
 ROOMS = ("adaptation", "animation", "chase", "closed_loop", "rivals", "safety", "style", "sweep", "theory")
 
@@ -146,3 +146,15 @@ def test_no_room_of_figures_imports_matplotlib_before_the_first_is_drawn() -> No
     rooms = ", ".join(f"staf_torch.figures.{name}" for name in ROOMS)
     program = f"import sys, {rooms}; assert 'matplotlib' not in sys.modules"
     subprocess.run([sys.executable, "-c", program], env=environment(), check=True)
+
+
+@pytest.mark.parametrize(("count", "columns"), [(5, 5), (6, 3), (7, 4)])
+def test_names_of_many_curves_stand_in_two_rows_that_end_in_the_corner(count: int, columns: int) -> None:
+    axes = Figure().subplots()
+    closed_loop._lines(axes, np.arange(3.0), np.ones((3, count)), "weights", "w%d")
+    legend = axes.get_legend()
+    assert legend is not None
+    assert [text.get_text() for text in legend.get_texts()] == [f"w{i + 1}" for i in range(count)]
+    assert legend._ncols == columns
+    corner = legend.get_bbox_to_anchor().transformed(axes.transAxes.inverted()).p0
+    np.testing.assert_allclose(corner, (1.0, 1.0), atol=1e-12)
