@@ -7,6 +7,9 @@ import torch
 from torch import Tensor
 
 from staf_torch import adp, systems
+from staf_torch.numerics.forward_mode import use_forward_mode
+
+use_forward_mode()
 
 DT, STEPS = 0.1, 30
 NONE = torch.empty(0, dtype=torch.float64)

@@ -13,6 +13,9 @@ from torch import Tensor
 
 from staf_torch import adp, systems
 from staf_torch.adp.trajectory_optimisation import _definite
+from staf_torch.numerics.forward_mode import use_forward_mode
+
+use_forward_mode()
 
 X0 = torch.tensor([[5.0, 0.0], [-1.0, 2.0]], dtype=torch.float64)
 BOUNDED = double_integrator(-1.0, 1.0)
