@@ -161,14 +161,20 @@ def _fork_that_imports_anew() -> Connection:
 def _tests_for(mutant: Mutant, source: str) -> list[str]:
     """Those that execute the lines, the short ones first, within the time.
 
-    A test of the mutant's own folder, or whose file imports the module, comes where another one that takes a
-    part of its time would.
+    Of what happens at import the contracts come first. A test of the mutant's own folder, or whose file
+    imports the module, comes where another one that takes a part of its time would.
     """
     far = {
         test: 1.0 if names(test, mutant.file) or test.startswith((*places(mutant.file), CONTRACTS)) else FAR
         for test in _hits(mutant, source)
     }
-    order = sorted(far, key=lambda test: (far[test] * _cost([test]), not names(test, mutant.file), test))
+    early = _around(mutant, source)[2]
+
+    def rank(test: str) -> tuple[bool, float, bool, str]:
+        looks = early and test.startswith(CONTRACTS)  # at what is made at import, quickly
+        return not looks, far[test] * _cost([test]), not names(test, mutant.file), test
+
+    order = sorted(far, key=rank)
     chosen: list[str] = []
     for test in order:
         if _cost([*chosen, test]) <= _seconds:
