@@ -143,7 +143,7 @@ def compare(
 def play(problem: SampledProblem, begin: Begin, x0: Tensor, steps: int, offline: float = 0.0) -> Episode:
     """Steer from x0 for a number of periods; what is applied is within the bounds."""
     steer, x = begin(x0), x0
-    spent, outside = torch.zeros_like(x0[:, 0]), 0.0
+    spent, outside = x0.new_zeros(len(x0)), 0.0
     controls, states = [], [x0]
     slack = _ROUNDED * (problem.bounds.high - problem.bounds.low)
     for _ in range(steps):

@@ -55,3 +55,15 @@ def test_a_policy_that_counts_its_calls_is_none() -> None:
     run = adp.simulate(policy, systems.TwoState(), COST, X0, dt=0.01, steps=10, compile=False)
     assert not run.diverged.any()
     assert policy.policy.calls >= 10  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("discount", [0.0, 0.7])
+def test_the_value_of_an_lqr_solves_the_hjb_equation_with_its_discount(discount: float) -> None:
+    plant = systems.Linear([[0.0, 1.0], [2.0, -1.0]], [[0.0], [1.0]])
+    cost = adp.QuadraticCost(1.5, 0.5, dim=2, inputs=1, discount=discount)
+    lqr = adp.LQR(plant, cost)
+    x = torch.tensor([[1.0, -0.3], [-0.4, 2.0]], dtype=torch.float64)
+    u = lqr(x)
+    slope = torch.func.grad(lambda x: lqr.value(x).sum())(x)
+    residual = cost.rate(x, u) + (slope * plant.motion(x, u)).sum(-1) - discount * lqr.value(x)
+    assert float(residual.abs().max()) < 1e-10

@@ -27,6 +27,7 @@ from staf_torch.lanes.eliminations import (
     solve_definite,
     triangular,
 )
+from staf_torch.lanes.tracer import NotLoweredError
 
 LEADS = ((), (2,), (2, 3))
 
@@ -250,3 +251,10 @@ def test_variances_of_few_numbers_and_of_other_precision() -> None:
         torch.float64,
     )
     assert product(x.float(), [0]).dtype == torch.float32
+
+
+def test_a_search_of_a_number_or_with_a_sorter_has_no_form() -> None:
+    edges = torch.arange(4.0)
+    for x, sorter in ((0.5, None), (edges, torch.arange(4)), (0.5, torch.arange(4))):
+        with pytest.raises(NotLoweredError, match="of a number or with a sorter"):
+            replacements.searchsorted(edges, x, sorter=sorter)
