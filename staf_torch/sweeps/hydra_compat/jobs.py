@@ -177,7 +177,7 @@ _OF_THE_JOB = ("job", "overrides", "runtime")
 def _hydra_yaml(node: DictConfig, kept: dict[str, str]) -> str:
     """Return `hydra.yaml` of a job; the parts in ``kept`` are taken from there, and it gets them all."""
     if kept:
-        parts: Any = {key: OmegaConf.to_container(node[key], enum_to_str=True) for key in _OF_THE_JOB}
+        parts: Any = {key: OmegaConf.to_container(node[key]) for key in _OF_THE_JOB}
     else:
         parts = OmegaConf.to_container(node, enum_to_str=True)
     for key, part in parts.items():
