@@ -13,7 +13,14 @@ from omegaconf import DictConfig, OmegaConf
 
 from staf_torch import StateFollowingCenters, StateRadius
 from staf_torch.cli.staf import config_directory
-from staf_torch.settings.chase import ChaseProblem, _key, chase_problem, make, make_centers
+from staf_torch.settings.chase import (
+    ChaseProblem,
+    _key,
+    chase_problem,
+    initial_states,
+    make,
+    make_centers,
+)
 from staf_torch.sweeps.hydra_compat.program import named_packages, trusted
 
 GROUPS = ("kernel", "centers", "target", "system", "optimizer")
@@ -209,3 +216,12 @@ def test_an_error_of_the_users_own_class_is_not_taken_for_one_of_the_settings(
     with pytest.raises(Exception, match=words) as caught:
         make(OmegaConf.create({"_target_": f"{__name__}.Demanding", "width": width}))
     assert "cannot be built from these settings" not in str(caught.value)
+
+
+def test_other_initial_states_are_drawn_in_a_box_around_the_stated_one() -> None:
+    cfg = composing.settings("trajectories=4", "seed=3", "spread=0.2", "initial_state=[1.0,-2.0]")
+    drawn = torch.rand(3, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
+    low = torch.tensor([0.8, -2.2], dtype=torch.float64)
+    found = initial_states(cfg, 2)
+    torch.testing.assert_close(found[0], low + 0.2)
+    torch.testing.assert_close(found[1:], low + 0.4 * drawn)
