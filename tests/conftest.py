@@ -9,6 +9,7 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import gc
+import logging
 import random
 from collections.abc import Generator, Iterator
 from pathlib import Path
@@ -72,6 +73,12 @@ def _settings_are_trusted_as_by_the_command() -> Iterator[None]:
 @pytest.fixture(autouse=True)
 def _same_random_numbers_in_every_order() -> None:
     torch.manual_seed(0)
+
+
+@pytest.fixture(autouse=True)
+def _log_tells_as_much_in_every_order() -> None:
+    """A command that a test ran in this process has set what the log tells."""
+    logging.root.setLevel(logging.WARNING)
 
 
 @pytest.fixture(autouse=True)
