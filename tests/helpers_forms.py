@@ -1,4 +1,4 @@
-"""Every operation of torch that has a scalar form, in lists, for `lanes/test_recorded_forms.py`."""
+"""Every operation of torch that has a scalar form, in lists, for tests of the text and of what it computes."""
 
 from __future__ import annotations
 

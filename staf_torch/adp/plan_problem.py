@@ -12,6 +12,7 @@ from ..lanes import repeat, scan
 from ..lanes.combinators import tracing_now
 from ..numerics.angles import wrap
 from ..numerics.box import box_minimum
+from ..numerics.linalg import row_jacobian
 from .cost import QuadraticCost, matvec
 from .detours import DetourRollout
 from .trajectory_optimisation import slopes_of_minimum
@@ -227,12 +228,10 @@ def _along(function: Callable[[Tensor], Tensor], z: Tensor) -> tuple[Tensor, Ten
     """A function's value (B, q) and its slopes along all coordinates of z (B, d): (B, q, d).
 
     Forward in a program, whose text is shorter so; backwards in plain torch, where a product with a number
-    takes fifty times as long forward.
+    takes thirty times as long forward.
     """
     if not tracing_now():
-        value, pull = torch.func.vjp(function, z)[:2]
-        selectors = torch.eye(value.shape[-1], dtype=value.dtype, device=value.device)
-        return value, torch.stack([pull(one.expand_as(value))[0] for one in selectors], dim=-2)
+        return row_jacobian(function, z)
     units = torch.eye(z.shape[-1], dtype=z.dtype, device=z.device)
     found = [torch.func.jvp(function, (z,), (unit.expand_as(z).clone(),)) for unit in units]
     return found[0][0], torch.stack([one[1] for one in found], dim=-1)

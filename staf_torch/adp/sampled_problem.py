@@ -221,7 +221,7 @@ class SampledProblem(nn.Module):
         """First and second derivatives of F and l with respect to z = (x, u): (B, n), (B, m).
 
         In a program along pairs of coordinates: it goes through them, and its text is that of one. In plain
-        torch backwards, since a product with a number takes fifty times as long forward.
+        torch backwards: a product with a number takes a hundred times as long twice forward.
         """
         z, n = torch.cat((x, u), dim=-1), self.dim
 
@@ -303,7 +303,10 @@ def _in_pairs(function: Callable[[Tensor], Tensor], z: Tensor, count: int) -> tu
 
 
 def _backwards(function: Callable[[Tensor], Tensor], z: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """`_in_pairs` by the slope of slopes: a row of a batch has d copies for each of its values."""
+    """`_in_pairs` by the slope of slopes: a row of a batch has d copies for each of its values.
+
+    Of few rows it is passes that take time: these are two, `row_jacobian` of itself makes ``count`` d.
+    """
     d = z.shape[-1]
     value, entry = (torch.eye(size, dtype=z.dtype, device=z.device) for size in (count, d))
 

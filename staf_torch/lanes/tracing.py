@@ -11,7 +11,7 @@ from torch._decomp import core_aten_decompositions
 from torch.export import Dim, ExportedProgram
 from torch.fx.experimental.proxy_tensor import make_fx
 
-from ..numerics.checks import integer, trailing
+from ..numerics.checks import fail, integer, trailing
 from .float64_constants import lift_numbers
 
 _TRACED = 3  # rows of the batch while tracing: a size that no other dimension is taken for by chance
@@ -41,9 +41,7 @@ def trace(module: nn.Module, example: Tensor, *, batch: int | None = None) -> Ex
         ValueError: if an argument breaks its rule, or the module cannot be traced for every batch.
     """
     if trailing("trace", "example", example, dims=2).dim() > 2 or not len(example):
-        raise ValueError(
-            f"`trace(example=...)` must be states (B, n), one at least; got the shape {tuple(example.shape)}."
-        )
+        raise fail("trace", "example", "must be states (B, n), one at least", tuple(example.shape))
     rows = _TRACED if batch is None else integer("trace", "batch", batch, least=1)
     x = example[:1].detach().expand(rows, -1).clone()
     shapes = ({0: Dim("batch", min=1)},) if batch is None else None

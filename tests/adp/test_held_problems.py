@@ -12,7 +12,7 @@ from recorded import Record
 from torch import Tensor
 
 from staf_torch import adp, systems
-from staf_torch.adp import sampling
+from staf_torch.adp import plan_problem, sampled_problem, sampling
 from staf_torch.adp.plans import LocalModel
 from staf_torch.adp.sampling import held_riccati, linear_hold, periods
 from staf_torch.numerics.forward_mode import use_forward_mode
@@ -30,6 +30,27 @@ def swung(x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
 
 
 SWUNG = adp.SampledProblem(swung, dim=3, inputs=2, low=[-1.0, -INF], high=[INF, 2.0], periodic=[-3])
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_derivatives_of_a_program_and_of_plain_torch_are_the_same(dtype: torch.dtype) -> None:
+    """Of values that are straight and constant, too, and beside a row that is no number."""
+
+    def values(z: Tensor) -> Tensor:
+        a, b, c = z.unbind(-1)
+        return torch.stack((a.sin() * b / (2 + c.square()), 3 * b - a, torch.full_like(a, 2.0), c**3), dim=-1)
+
+    z = uniform(4, 3, seed=3).to(dtype)
+    z[2, 1] = torch.nan
+    ways = (sampled_problem._in_pairs, sampled_problem._backwards)
+    (first, second), (same, bent) = (way(values, z, 4) for way in ways)
+    assert first.dtype == same.dtype == dtype
+    assert (first.shape, second.shape) == (same.shape, bent.shape) == ((4, 4, 3), (4, 4, 3, 3))
+    torch.testing.assert_close(same[[0, 1, 3]], first[[0, 1, 3]])
+    torch.testing.assert_close(bent[[0, 1, 3]], second[[0, 1, 3]])
+    value, slope = plan_problem._along(values, z)
+    torch.testing.assert_close(value, values(z), equal_nan=True)
+    torch.testing.assert_close(slope, same, equal_nan=True)
 
 
 def test_derivatives_of_a_step_are_those_of_its_row() -> None:
