@@ -1,4 +1,4 @@
-"""Every operation of torch that has a scalar form, in lists, for tests of the text and of what it computes."""
+"""Every operation of torch that has a scalar form, in lists, for tests of texts and of what they compute."""
 
 from __future__ import annotations
 
