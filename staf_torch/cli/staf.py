@@ -27,7 +27,7 @@ from ..sweeps.hydra_compat import (
 )
 from ..sweeps.job import Refused, execute
 from ..sweeps.resume import command_line
-from ..sweeps.signals import name_and_code, stopped_by_signals
+from ..sweeps.signals import name_and_code, stopped_by_signals, what_ended
 from . import doctor, reference, schema
 
 _WRITERS = {"schema": schema.main, "docs": reference.main}
@@ -62,8 +62,9 @@ def main() -> None:
             sweep = broken_sweep(error)
             if sweep is not None:
                 callbacks.close(sweep)
-            if isinstance(error, KeyboardInterrupt):
-                _end_by_signal(sweep, error)
+            ended_by = what_ended(error)
+            if isinstance(ended_by, KeyboardInterrupt):
+                _end_by_signal(sweep, ended_by)
             if wants_trace or not isinstance(error, USER_ERRORS):
                 raise
             sys.exit(f"staf: {sentence(error)}")

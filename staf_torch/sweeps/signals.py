@@ -64,6 +64,13 @@ def check() -> None:
         raise Stopped(_arrived[0])
 
 
+def what_ended(error: BaseException) -> BaseException:
+    """Return an error, or `Stopped` where a signal has arrived: of what the signal breaks off in another
+    library's settings or files an error of its own may be made, in whose place the signal stands."""
+    broken_off = _arrived and not isinstance(error, KeyboardInterrupt)
+    return Stopped(_arrived[0]) if broken_off else error
+
+
 def name_and_code(error: KeyboardInterrupt) -> tuple[str, int]:
     """Return what ended the program, and its exit code as shells have it."""
     number = error.number if isinstance(error, Stopped) else int(signal.SIGINT)

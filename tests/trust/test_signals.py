@@ -162,3 +162,27 @@ def test_a_signal_before_the_first_line_of_the_program_ends_in_a_sentence(
     signal.signal(number, before)
     assert ended.value.code == 128 + number
     assert capsys.readouterr().err == f"staf: ended by {number.name}\n"
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_an_error_that_a_signal_left_behind_in_a_library_is_told_as_the_signal(
+    number: signal.Signals, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """OmegaConf makes an error of its own of what is raised while it changes a node."""
+
+    def composing() -> None:
+        try:
+            signal.raise_signal(number)
+        finally:
+            raise AttributeError("'NoneType' object has no attribute '_invalidate_flags_cache'")
+
+    before = signal.signal(number, signal.SIG_DFL)  # a shell's background jobs ignore some
+    monkeypatch.setattr(staf, "_staf", composing)
+    monkeypatch.setattr(sys, "argv", ["staf", "figures=false"])
+    with pytest.raises(SystemExit) as ended:
+        staf.main()
+    signal.signal(number, before)
+    assert ended.value.code == 128 + number
+    assert capsys.readouterr().err == f"staf: ended by {number.name}\n"
+    error = ValueError("of no signal")
+    assert signals.what_ended(error) is error
