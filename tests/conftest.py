@@ -72,8 +72,8 @@ def _settings_are_trusted_as_by_the_command() -> Iterator[None]:
 
 @pytest.fixture(autouse=True)
 def _same_random_numbers_in_every_order() -> None:
-    # `torch.manual_seed` also writes down for every kind of device, with the stack, what is to be done when it
-    # begins to be used: a third of what pytest itself takes of a test, and a list that grows with each.
+    # `torch.manual_seed` also writes down, for every kind of device and with the stack, what is to be done
+    # when it begins to be used: a third of what pytest itself takes of a test, and a list that grows.
     torch.default_generator.manual_seed(0)
 
 
