@@ -45,11 +45,15 @@ def single(staf: st.StaF) -> st.StaF:
     ("layout", "kernel", "radius"),
     [
         (layout, kernel, radius)
-        for layout in LAYOUTS
-        for kernel in KERNELS
-        for radius in RADII
-        # The truth of 45 centers takes seconds: once each way there.
-        if layout != "ball45_8" or (kernel, radius) in (("exponential", 0.5), ("gaussian", 1e-3))
+        for n, layout in enumerate(LAYOUTS)
+        for k, kernel in enumerate(KERNELS)
+        for r, radius in enumerate(RADII)
+        # Every two of the three meet. The truth of 45 centers takes seconds: once each way there.
+        if (
+            (n + k + r) % 2
+            if layout != "ball45_8"
+            else (kernel, radius) in (("exponential", 0.5), ("gaussian", 1e-3))
+        )
     ],
 )
 def test_value_is_exact_to_rounding_at_every_radius(layout: str, kernel: str, radius: float) -> None:
@@ -73,9 +77,16 @@ def test_random_offsets_lose_no_more_than_their_lebesgue_constant(seed: int) -> 
     assert value_error(single(found[0]), *found[1:]) <= 5e-7 * max(1.0, constant)
 
 
-@pytest.mark.parametrize("radius", RADII)
-@pytest.mark.parametrize("kernel", KERNELS)
-@pytest.mark.parametrize("layout", ["rings6", "rings15", "rings28", "ball15_4"])
+@pytest.mark.parametrize(
+    ("layout", "kernel", "radius"),
+    [
+        (layout, kernel, radius)
+        for n, layout in enumerate(("rings6", "rings15", "rings28", "ball15_4"))
+        for k, kernel in enumerate(KERNELS)
+        for r, radius in enumerate(RADII)
+        if (n + k + r) % 2
+    ],
+)
 def test_gradient_is_exact_up_to_the_division_by_the_radius(layout: str, kernel: str, radius: float) -> None:
     directions = LAYOUTS[layout]()
     staf, truth, radius, zeta = problem(directions, kernel, radius, 3)
