@@ -9,7 +9,7 @@ import warnings
 import pytest
 import torch
 from helpers import tensor, uniform
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as some
 from variants import KERNELS, LAYOUTS, RADII, directions_of, over
 
@@ -160,6 +160,7 @@ def test_gradient_reaches_the_state_through_a_shrinking_radius() -> None:
 
 
 @over(KERNELS)
+@settings(max_examples=10)
 @given(order=some.permutations(range(6)), seed=some.integers(0, 1000))
 def test_permuted_centers_permute_the_weights_and_leave_the_estimate(
     name: str, order: list[int], seed: int
