@@ -35,12 +35,13 @@ CASES: dict[str, str] = {
     "adp_comparison": "experiment=adp_comparison duration=0.1 dt=0.01",
     "adp_initial_weights": "experiment=adp_initial_weights duration=0.1 dt=0.01",
     "adp_tracking": "experiment=adp_tracking duration=0.3 dt=0.01 trajectories=2",
-    "avoidance": "experiment=avoidance trajectories=3 duration=2.0 adp.compile=false",
+    "avoidance": "experiment=avoidance trajectories=3 duration=2.0 dt=0.04 adp.compile=false",
     "avoidance of a unicycle": "experiment=avoidance avoidance.vehicle=unicycle trajectories=2 duration=1.0 "
     "adp.compile=false",
     "exponential_bound": "experiment=exponential_bound exponential_bound.states=9 "
     "exponential_bound.radii=[0.1]",
-    "faults": "experiment=faults trajectories=3 duration=0.6",
+    "faults": "experiment=faults trajectories=3 duration=0.6 faults.cases=[unstable]",
+    "faults from the start": "experiment=faults trajectories=3 duration=0.2 faults.cases=[short_period,mass]",
     "feasibility": "experiment=feasibility feasibility.states=16 feasibility.radii=[0.1] "
     "feasibility.epsilons=[0.1,0.01]",
     "flat_limit": "experiment=flat_limit",
