@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import logging
 import math
+import statistics
 import time
-from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -35,6 +35,8 @@ _DECAY = 2.0  # time constants of the slowest mode of the LQR in the horizon
 _PLANNED = 3.0  # likewise with plans, which need the end to be nearer to the goal
 _STEPS = (12, 60)  # periods in the horizon, at least and at most
 _RESOLVED = 0.2  # length of an integration step in time constants of the plant's fastest mode
+_SHARES = (0.25, 0.5, 1.0, 2.0, 4.0)  # of the spread: boxes of states that a report tries
+_TIMED, _TIMING = (20, 400), 5e5  # controls that are timed: at least, at most; us that are enough
 _SETTLED = 9.2  # time constants for which the loops of a report run: the slowest mode falls to 1e-4
 _TRIES, _PATIENCE = 8, 1.0  # controls, and s, after which a simulator is called slow
 _SHARE = 0.5  # of a period that a control may take without a warning: another half for a slower moment
@@ -139,7 +141,9 @@ class NearOptimal(SampledRollout):
         width = positive_real("report", "spread", self.plant.spread if spread is None else spread)
         x0 = self._drawn(states, width, seed)
         stability = held_stability(self.control, self.plant, self.period, at=self.cost.target)
-        ours, fine = self._run(self.controller(), x0)
+        boxes = [self._drawn(states, share * width, seed + 1) for share in _SHARES]
+        costs, all_fine = self._run(self.controller(), torch.cat((x0, *boxes)))  # at once: rows are alone
+        ours, fine = costs[:states], all_fine[:states]
         base, also = self._run(Feedback(self.lqr), x0)
         both = fine & also
         over_base = (ours / base)[both]
@@ -160,7 +164,7 @@ class NearOptimal(SampledRollout):
             "over_base_max": float(over_base.max()) if len(over_base) else None,
             "over_optimum_median": _median(over_optimum),
             "over_optimum_max": float(over_optimum.max()) if len(over_optimum) else None,
-            "good_spread": self._good(states, width, seed + 1),
+            "good_spread": self._good(all_fine[states:].view(-1, states), states, width, seed + 1),
             "microseconds": self._microseconds(x0[:1]),
             "strained": None if planner is None else float(planner.strained(x0).double().mean()),
         }
@@ -180,17 +184,15 @@ class NearOptimal(SampledRollout):
         began = self.cost.deviation(x0).norm(dim=-1)
         return run.cost, (left <= _REGULATED * began) & ~run.diverged
 
-    def _good(self, states: int, width: float, seed: int) -> float:
-        """The largest box of a few from which all states are regulated, else of smaller ones."""
-
-        def good(shares: Sequence[float]) -> list[float]:
+    def _good(self, fine: Tensor, states: int, width: float, seed: int) -> float:
+        """The largest box of `_SHARES` from which all states are regulated, ``fine``, else a smaller one."""
+        shares: tuple[float, ...] = _SHARES
+        if not fine.all(dim=1).any():  # where 1 is far, as a gap of a centimetre in metres
+            shares = tuple(2.0**-k for k in range(3, 13))
             x0 = torch.cat([self._drawn(states, share * width, seed) for share in shares])
-            fine = self._run(self.controller(), x0)[1].view(len(shares), states).all(dim=1)
-            return [share for share, all_are in zip(shares, fine.tolist(), strict=True) if all_are]
-
-        # Where 1 is far, as a gap of a centimetre in metres, smaller boxes are tried.
-        found = good((0.25, 0.5, 1.0, 2.0, 4.0)) or good([2.0**-k for k in range(3, 13)])
-        return max(found, default=0.0) * width
+            fine = self._run(self.controller(), x0)[1].view(-1, states)
+        good = [share for share, kept in zip(shares, fine.all(dim=1).tolist(), strict=True) if kept]
+        return max(good, default=0.0) * width
 
     def _over_optimum(self, x0: Tensor, cost: Tensor, fine: Tensor) -> Tensor:
         if self.plant.period is not None or not self.plant.traceable or self.cost.discount:
@@ -201,12 +203,12 @@ class NearOptimal(SampledRollout):
     def _microseconds(self, x: Tensor) -> float:
         ready(self, x)
         controller = self.controller()
-        carried, none, taken = controller.init(x), x.new_zeros(len(x), 0), []
-        for _ in range(400):
+        carried, none, taken = controller.init(x), x.new_zeros(len(x), 0), list[float]()
+        while len(taken) < _TIMED[0] or (len(taken) < _TIMED[1] and sum(taken) < _TIMING):
             start = time.perf_counter_ns()
             _, carried = controller.step(x, carried, none, self.period)
             taken.append((time.perf_counter_ns() - start) / 1000)
-        return sorted(taken[200:])[100]
+        return statistics.median_high(taken[len(taken) // 2 :])  # the first ones warm the caches
 
 
 def near_optimal(

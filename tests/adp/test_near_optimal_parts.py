@@ -115,15 +115,18 @@ def test_a_report_compares_what_both_loops_regulate(monkeypatch: pytest.MonkeyPa
 
     def run(controller: Any, x0: Tensor) -> Any:
         asked.append(("run", len(x0)))
-        return runs["lqr" if isinstance(controller, adp.Feedback) else "ours"]
+        of_base = isinstance(controller, adp.Feedback)
+        cost, fine = runs["lqr" if of_base else "ours"]
+        more = torch.arange(len(x0) - 4)  # the states of the boxes, of which those of the third one are kept
+        return torch.cat((cost, more.double())), torch.cat((fine, (more // 4 == 2) & (not of_base)))
 
     def over(x0: Tensor, cost: Tensor, fine: Tensor) -> Tensor:
         assert torch.equal(cost, runs["ours"][0])
         assert torch.equal(fine, runs["ours"][1])
         return tensor([1.5, 3.0, 2.0])
 
-    def good(states: int, width: float, seed: int) -> float:
-        asked.append((states, width, seed))
+    def good(fine: Tensor, states: int, width: float, seed: int) -> float:
+        asked.append((fine.all(dim=1).tolist(), states, width, seed))
         return 0.125
 
     planner = SimpleNamespace(strained=lambda x: torch.arange(len(x)) < 1)
@@ -145,13 +148,13 @@ def test_a_report_compares_what_both_loops_regulate(monkeypatch: pytest.MonkeyPa
         "over_optimum_median": 2.0, "over_optimum_max": 3.0, "good_spread": 0.125, "microseconds": 1.0,
         "strained": 0.25,
     }  # fmt: skip
-    assert asked == [("run", 4), ("run", 4), (4, 0.5, 8)]
+    assert asked == [("run", 24), ("run", 4), ([False, False, True, False, False], 4, 0.5, 8)]
     runs["lqr"] = (runs["lqr"][0], torch.zeros(4) > 0)
     monkeypatch.setattr(policy, "plans", lambda: None)
     none = policy.report(optimum=False)
     assert [none[name] for name in ("over_base_median", "over_base_max", "strained")] == [None] * 3
     assert [none[name] for name in ("over_optimum_median", "over_optimum_max")] == [None] * 2
     assert none["spread"] == policy.plant.spread
-    assert asked[3:] == [("run", 20), ("run", 20), (20, policy.plant.spread, 1)]
+    assert asked[3:] == [("run", 120), ("run", 20), ([False] * 5, 20, policy.plant.spread, 1)]
     with pytest.raises(ValueError, match=r"`report\(spread=...\)` must be positive"):
         policy.report(spread=0.0)

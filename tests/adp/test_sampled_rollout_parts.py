@@ -299,7 +299,8 @@ def test_the_good_box_is_the_largest_from_which_all_come_home(
 
     monkeypatch.setattr(one, "_run", run)
     monkeypatch.setattr(one, "_drawn", lambda states, width, seed: tensor([[0.0], [width]]))
-    assert one._good(2, 0.5, 0) == found
+    tried = torch.tensor([[True, 0.5 * share <= largest] for share in module._SHARES])
+    assert one._good(tried, 2, 0.5, 0) == found
 
 
 def test_the_cost_is_compared_with_an_optimum_where_one_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -320,10 +321,17 @@ def test_the_cost_is_compared_with_an_optimum_where_one_is_known(monkeypatch: py
 
 
 def test_the_time_of_a_control_is_the_median_of_the_later_ones(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Call k takes 1000 k ns: of the last two hundred the middle one is the 300th."""
-    now = iter(tick for k in range(400) for tick in (10**6 * k, 10**6 * k + 1000 * k))
+    """Call k takes k units: of the last two hundred the middle one is the 300th; slow ones are fewer."""
     monkeypatch.setattr(module, "ready", lambda policy, x: None)
-    monkeypatch.setattr(module.time, "perf_counter_ns", lambda: next(now))
     one = made()
     monkeypatch.setattr(one, "controller", lambda: adp.Feedback(lambda x: -x))
-    assert one._microseconds(tensor([[0.1]])) == 300.0
+
+    def found(unit: int) -> tuple[float, int]:
+        ticks = [tick for k in range(400) for tick in (10**9 * k, 10**9 * k + unit * k)]
+        now = iter(ticks)
+        monkeypatch.setattr(module.time, "perf_counter_ns", lambda: next(now))
+        return one._microseconds(tensor([[0.1]])), 400 - len(list(now)) // 2
+
+    assert found(1000) == (300.0, 400)  # 80 ms in all
+    assert found(100_000) == (100 * 75.0, 101)  # 0 to 100 are .505 s
+    assert found(10**7) == (10**4 * 15.0, 20)  # 1.9 s
