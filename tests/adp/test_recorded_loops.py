@@ -54,7 +54,7 @@ def actor_critic(law: str) -> Any:
         "policy iteration": adp.PolicyIteration(),
     }
     control = learner(laws[law], adp.QuadraturePoints(7, 2, BOX))
-    return loop(control, PLANT, COST, 0.5 * X0[:2], 40, 0.005)
+    return loop(control, PLANT, COST, 0.5 * X0[:2], 30, 0.005)
 
 
 def explored(points: adp.Extrapolation) -> Any:
@@ -74,7 +74,7 @@ def identified() -> Any:
 
 def guarded(policy: Any, **given: Any) -> Any:
     guard = adp.SafetyFilter(policy, PLANE, crossing, **{"dt": 0.1, "decay": 3.0} | given)
-    run = loop(guard, PLANE, COST4, BESIDE, 30, 0.1)
+    run = loop(guard, PLANE, COST4, BESIDE, 18, 0.1)
     return run, guard.report(run)
 
 
@@ -107,7 +107,7 @@ def learned_gains(**settings: Any) -> Any:
     law = adp.LeastSquares([0.2, 0.7], deviation=[0.2, 0.6], floor=1e-4, forgetting=0.1, alarm=8.0)
     control = adp.AdaptiveLQR(PENDULUM, COST, windows, law, **{"doublings": 12, "a_step": 3} | settings)
     before, after = tensor([[0.05, 0.5], [0.2, 2.0]]), tensor([[0.3, 0.9], [0.2, 0.7]])
-    return measured(control, 0.003, 0.4 * X0[:2], 120, 0.01, before, after=after, at=0.6)
+    return measured(control, 0.003, 0.4 * X0[:2], 90, 0.01, before, after=after, at=0.5)
 
 
 def learned_drift() -> Any:
@@ -128,7 +128,7 @@ def kept_from_an_edge() -> Any:
         wanted, PENDULUM, lambda x, t: 0.5 - x[:, 0], windows, law, dt=0.01, decay=4.0, **box
     )
     start = tensor([[0.2, 0.3], [0.45, 0.1]])
-    return measured(safe, 0.0, start, 60, 0.01, tensor([[0.05, 0.6], [0.4, 1.5]]))
+    return measured(safe, 0.0, start, 30, 0.01, tensor([[0.05, 0.6], [0.4, 1.5]]))
 
 
 def waiting() -> Any:
@@ -193,7 +193,7 @@ def near_optimal(plant: Any, cost: adp.Cost, x0: Tensor, steps: int, **given: An
 def swung(**more: Any) -> Any:
     mpc = adp.RecedingHorizon(pendulum(), **{"steps": 25, "iterations": 2, "compile": False} | more)
     x, carried, found = HANGING, mpc.init(HANGING), []
-    for _ in range(6):
+    for _ in range(4):
         u, carried = mpc.step(x, carried, x.new_zeros(0), 0.0)
         x, paid = mpc.problem.advance(x, u)
         found.append((u, x, paid))
@@ -300,7 +300,7 @@ CASES: dict[str, Callable[[], Any]] = {
     "unscented kalman": lambda: followed(adp.UnscentedKalman),
     "concurrent tracker": lambda: tracked("integral"),
     "concurrent tracker of slopes": lambda: tracked("slope"),
-    "near optimal": lambda: near_optimal(PLANT, COST, X0, 15, dt=0.1, horizon=0.8),
+    "near optimal": lambda: near_optimal(PLANT, COST, X0, 6, dt=0.1, horizon=0.8),
     "near optimal, by the rules": lambda: near_optimal(systems.Pendulum(), COST, 0.3 * X0, 8, dt=0.05),
     "near optimal within bounds": lambda: near_optimal(
         systems.Pendulum(), COST, 0.4 * X0[:2], 4, dt=0.1, low=-4.0, high=6.0
