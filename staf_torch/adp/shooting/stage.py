@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
@@ -76,15 +76,31 @@ class Stage:
 
     def advance(self, x: Tensor, v: Tensor, h: Tensor) -> tuple[Tensor, Tensor]:
         """(..., n), (..., 2m), lengths h (...) in s: x+ (..., n), the cost (...)."""
+        after, at = self.moved(x, v, h)
+        return after, self.paid(at, v, h)
+
+    def moved(self, x: Tensor, v: Tensor, h: Tensor) -> tuple[Tensor, list[Tensor]]:
+        """x+ as of `advance`, and the four states (..., n) at which the Runge-Kutta step looks."""
+        (u1, u2, u4), step = self._inputs(v), h.unsqueeze(-1)
+        k1 = self.system.motion(x, u1)
+        at = [x, x + 0.5 * step * k1]
+        k2 = self.system.motion(at[1], u2)
+        at.append(x + 0.5 * step * k2)
+        k3 = self.system.motion(at[2], u2)
+        at.append(x + step * k3)
+        k4 = self.system.motion(at[3], u4)
+        return x + (step / 6) * (k1 + 2 * (k2 + k3) + k4), at
+
+    def paid(self, at: Sequence[Tensor], v: Tensor, h: Tensor) -> Tensor:
+        """The cost (...) of steps with these four states, which `moved` returned, (..., n) each."""
+        u1, u2, u4 = self._inputs(v)
+        c1, c2, c3, c4 = (self.cost.rate(x, u) for x, u in zip(at, (u1, u2, u2, u4), strict=True))
+        return (h / 6) * (c1 + 2 * (c2 + c3) + c4)
+
+    def _inputs(self, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """u at the start, in the middle and at the end of steps, (..., m) each."""
         first, last = v.chunk(2, dim=-1)
-        middle = 0.5 * (first + last)
-        u1, u2, u4 = (self.input(u) for u in (first, middle, last))
-        step = h.unsqueeze(-1)
-        k1, c1 = self._field(x, u1)
-        k2, c2 = self._field(x + 0.5 * step * k1, u2)
-        k3, c3 = self._field(x + 0.5 * step * k2, u2)
-        k4, c4 = self._field(x + step * k3, u4)
-        return x + (step / 6) * (k1 + 2 * (k2 + k3) + k4), (h / 6) * (c1 + 2 * (c2 + c3) + c4)
+        return self.input(first), self.input(0.5 * (first + last)), self.input(last)
 
     def expand(self, x: Tensor, v: Tensor, h: Tensor, end: Tensor) -> Expansion:
         """Derivatives at (B, N, n), (B, N, 2m), for the costate ``end`` (B, n) at the horizon."""
@@ -102,9 +118,6 @@ class Stage:
             columns = [_gradient(along[..., i], z) for i in range(z.shape[-1])]
         curvature = torch.stack(columns, dim=-1)
         return Expansion(slope, gradient, 0.5 * (curvature + curvature.mT))
-
-    def _field(self, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
-        return self.system.motion(x, u), self.cost.rate(x, u)
 
 
 def _input_slope(system: Plant, x: Tensor, u: Tensor) -> Tensor:
