@@ -99,13 +99,13 @@ def test_row_that_fails_on_the_coarse_mesh_starts_again_on_the_fine_one() -> Non
 
 def test_rows_are_alone_and_a_row_without_optimum_is_reported() -> None:
     x = torch.tensor([[-1.0, 1.0], [1.2, 0.3], [0.0, 0.0], [0.4, -0.7]], dtype=torch.float64)
-    best = adp.DirectShooting(HalfBroken(), COST, intervals=40, starts=2, iterations=20).solve(x)
+    best = adp.DirectShooting(HalfBroken(), COST, horizon=4.0, intervals=40, starts=2).solve(x)
     assert best.converged.tolist() == [True, False, True, True]
     assert torch.isnan(best.value[1])
     assert torch.isnan(best.control[1]).all()
     assert float(best.value[2]) == 0.0
     assert torch.equal(best.gradient[2], torch.zeros(2, dtype=torch.float64))
-    alone = adp.DirectShooting(PLANT, COST, intervals=40).solve(x[3:])
+    alone = adp.DirectShooting(PLANT, COST, horizon=4.0, intervals=40).solve(x[3:])
     torch.testing.assert_close(best.value[3], alone.value[0], rtol=1e-11, atol=0)
     torch.testing.assert_close(best.gradient[3], alone.gradient[0], rtol=1e-7, atol=1e-9)
 
