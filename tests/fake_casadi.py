@@ -6,12 +6,12 @@ Expressions are functions of the numbers of their symbols; its solver finds that
 from __future__ import annotations
 
 import types
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
-Known = Mapping[int, np.ndarray]
+Known = dict[Any, Any]  # arrays by the ids of symbols, and by those of expressions what was found before
 
 
 class MX:
@@ -20,7 +20,12 @@ class MX:
     __array_ufunc__ = None
 
     def __init__(self, of: Callable[[Known], Any], parts: Sequence[MX] = ()) -> None:
-        self.of = lambda known: _matrix(of(known))
+        def once(known: Known) -> np.ndarray:  # a state is a part of all that come later
+            if ("found", id(self)) not in known:
+                known["found", id(self)] = _matrix(of(known))
+            return known["found", id(self)]
+
+        self.of = once
         self.parts = list(parts)  # of which a column is put together
         self.shape: tuple[int, int] | None = None  # of a symbol
 
