@@ -94,7 +94,7 @@ def test_comparison_takes_a_plant_whose_optimum_no_formula_knows(tmp_path: Path)
 
 
 def test_initial_weights_leave_a_row_a_law(tmp_path: Path) -> None:
-    overrides = ["duration=2", "dt=0.02", "trajectories=5", "initial_weights=[0.1,1.0]"]
+    overrides = ["duration=1", "dt=0.02", "trajectories=5", "initial_weights=[0.1,1.0]"]
     metrics = adp_comparison.initial_weights(settings("experiment=adp_initial_weights", *overrides), tmp_path)
     assert metrics["supervised_diverged_fraction"] == 0
     assert metrics["published_diverged_fraction"] > 0

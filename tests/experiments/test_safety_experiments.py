@@ -67,7 +67,7 @@ def test_among_discs_the_filter_has_a_row_beside_the_lqr_and_a_film(tmp_path: Pa
 
 
 def test_a_unicycle_keeps_off_the_discs_that_its_policy_drives_into(tmp_path: Path) -> None:
-    short = ("duration=6", "dt=0.1", "trajectories=6", "figures=false", "history=false", "adp.compile=false")
+    short = ("duration=4", "dt=0.1", "trajectories=6", "figures=false", "history=false", "adp.compile=false")
     cfg = settings("experiment=avoidance", "avoidance.vehicle=unicycle", "avoidance.discs=2", *short)
     metrics = avoidance.run(cfg, tmp_path)
     assert metrics["constraint_violations"] == 0 < metrics["lookahead_constraint_violations"]
