@@ -91,6 +91,7 @@ def test_no_change_of_a_plan_lowers_what_it_costs() -> None:
 
 
 @pytest.mark.compiled
+@pytest.mark.needs_compiler
 def test_a_plan_leads_around_and_is_compiled_as_it_is_defined(caplog: pytest.LogCaptureFixture) -> None:
     plans = adp.DetourPlans(detours(steps=6), first=2)
     guard = adp.SafetyFilter(plans, PLANE, disc, dt=0.2, low=-1.0, high=1.0, decay=3.0)

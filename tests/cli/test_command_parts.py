@@ -306,7 +306,7 @@ def test_pages_are_written_into_a_folder(monkeypatch: pytest.MonkeyPatch) -> Non
         warnings.warn("Error parsing type annotation of x", stacklevel=1)
         made.append((modules, output_directory))
 
-    def configure(**options: str) -> None:
+    def configure(**options: str | bool) -> None:
         made.append(options)
 
     pdoc = SimpleNamespace(pdoc=pages, render=SimpleNamespace(configure=configure))
@@ -315,7 +315,7 @@ def test_pages_are_written_into_a_folder(monkeypatch: pytest.MonkeyPatch) -> Non
     assert reference.main([]) == "reference pages: site/index.html"
     assert reference.main(["a/b"]) == "reference pages: a/b/index.html"
     assert made[1::2] == [(reference.MODULES, Path("site")), (reference.MODULES, Path("a/b"))]
-    assert made[0] == {"docformat": "google", "footer_text": "staf_torch"}
+    assert made[0] == {"docformat": "google", "footer_text": "staf_torch", "show_source": False}
     with pytest.raises(ValueError, match="`staf docs` takes one folder; got 'a b'"):
         reference.main(["a", "b"])
 
