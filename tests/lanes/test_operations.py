@@ -291,8 +291,8 @@ def test_multiples_of_a_summand_count() -> None:
 
     program = lanes.Program(step)
     found, wanted = (run((), (), (a, b), steps=1)[1] for run in (program, program.definition))
-    for one, other in zip(found, wanted, strict=True):
-        assert torch.equal(one, other)
+    for one, other in zip(found, wanted, strict=True):  # torch fuses the product where the processor can
+        torch.testing.assert_close(one, other, rtol=1e-15, atol=4e-15)
 
 
 @pytest.mark.parametrize("descending", [True, False])
