@@ -144,6 +144,18 @@ def test_a_signal_within_a_finaliser_is_not_lost(number: signal.Signals) -> None
     signal.signal(number, before)
 
 
+def ends_in_a_sentence(number: signal.Signals, capsys: pytest.CaptureFixture[str]) -> None:
+    """Run the program, patched so that the signal comes while it runs."""
+    before = signal.signal(number, signal.SIG_DFL)  # a shell's background jobs ignore some
+    try:
+        with pytest.raises(SystemExit) as ended:
+            staf.main()
+    finally:
+        signal.signal(number, before)
+    assert ended.value.code == 128 + number
+    assert capsys.readouterr().err == f"staf: ended by {number.name}\n"
+
+
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_before_the_first_line_of_the_program_ends_in_a_sentence(
     number: signal.Signals, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -154,14 +166,9 @@ def test_a_signal_before_the_first_line_of_the_program_ends_in_a_sentence(
             signal.raise_signal(number)
             yield
 
-    before = signal.signal(number, signal.SIG_DFL)  # a shell's background jobs ignore some
     monkeypatch.setattr(staf, "stopped_by_signals", struck)
     monkeypatch.setattr(sys, "argv", ["staf", "figures=false"])
-    with pytest.raises(SystemExit) as ended:
-        staf.main()
-    signal.signal(number, before)
-    assert ended.value.code == 128 + number
-    assert capsys.readouterr().err == f"staf: ended by {number.name}\n"
+    ends_in_a_sentence(number, capsys)
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
@@ -176,13 +183,8 @@ def test_an_error_that_a_signal_left_behind_in_a_library_is_told_as_the_signal(
         finally:
             raise AttributeError("'NoneType' object has no attribute '_invalidate_flags_cache'")
 
-    before = signal.signal(number, signal.SIG_DFL)  # a shell's background jobs ignore some
     monkeypatch.setattr(staf, "_staf", composing)
     monkeypatch.setattr(sys, "argv", ["staf", "figures=false"])
-    with pytest.raises(SystemExit) as ended:
-        staf.main()
-    signal.signal(number, before)
-    assert ended.value.code == 128 + number
-    assert capsys.readouterr().err == f"staf: ended by {number.name}\n"
+    ends_in_a_sentence(number, capsys)
     error = ValueError("of no signal")
     assert signals.what_ended(error) is error

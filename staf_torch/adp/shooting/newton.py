@@ -146,7 +146,7 @@ def _driven(
         controls.append(v)
         seen.append(at)
     v = torch.stack(controls, dim=-2)
-    # What was paid for all intervals at once: a third of the time where it is asked for one by one.
+    # What was paid, for all intervals at once: one by one that is a good part of the time of a replay.
     paid = stage.paid([torch.stack(part, dim=-2) for part in zip(*seen, strict=True)], v, lengths)
     cost = paid.sum(-1) + terminal(x)  # type: ignore[operator]
     return Plan(torch.stack(states, dim=-2), v, torch.where(torch.isfinite(cost), cost, torch.inf))
