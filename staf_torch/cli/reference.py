@@ -30,8 +30,8 @@ def main(words: Sequence[str]) -> str:
         raise ValueError("`staf docs` needs pdoc: install the extra, pip install 'staf_torch[docs]'.")
     folder = Path(words[0] if words else "site")
     pdoc = importlib.import_module("pdoc")
-    # Without the code of what is documented, which a reader has: that was four fifths of the pages (one of
-    # 5 MB) and more than half of the time.
+    # Without the code of what is documented, which a reader has: that was four fifths of the largest page,
+    # half of all, and a third of the time.
     pdoc.render.configure(docformat="google", footer_text="staf_torch", show_source=False)
     with warnings.catch_warnings():
         # Those of a NamedTuple, or of a dataclass's ancestor, are evaluated where our names are not known:
