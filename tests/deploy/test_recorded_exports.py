@@ -24,7 +24,7 @@ X = tensor([[0.4, -0.3]])
 NUMBER = re.compile(r"(?<![\w.])\d+\.\d*(?:e[+-]?\d+)?f?")
 
 
-COMPUTED = ("rollout_of_moving_radius", "of bounds")
+COMPUTED = ("rollout_twice", "rollout_of_moving_radius", "of bounds")
 """What has numbers that are computed while it is written: which are equal is for a processor to say."""
 
 
