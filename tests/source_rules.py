@@ -21,8 +21,9 @@ def without_dtype(source: str) -> Iterator[str]:
         if (
             isinstance(node, ast.Call)
             and id(node) not in cast
-            and ast.unparse(node.func).removeprefix("torch.") in _MAKERS
-            and ast.unparse(node.func).startswith("torch.")
+            and isinstance(node.func, ast.Attribute)
+            and node.func.attr in _MAKERS
+            and ast.unparse(node.func.value) == "torch"
             and not any(word.arg in ("dtype", "out", None) for word in node.keywords)
         ):
             yield f"{node.lineno}: {ast.unparse(node)[:80]}"

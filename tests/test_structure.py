@@ -27,18 +27,23 @@ MODULES = {
 
 
 @functools.cache
+def nodes(path: Path) -> list[ast.AST]:
+    """Of a file, read once: all of them, from the outside in."""
+    return list(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
+
+
+@functools.cache
 def imports(name: str, path: Path) -> tuple[str, ...]:
     """Absolute names of all that a file imports, inside functions too, but for type checkers alone."""
     package = name if path.name == "__init__.py" else name.rpartition(".")[0]
-    tree = ast.parse(path.read_text(encoding="utf-8"))
     typing = {
         id(inner)
-        for node in ast.walk(tree)
+        for node in nodes(path)
         if isinstance(node, ast.If) and ast.unparse(node.test) in ("TYPE_CHECKING", "typing.TYPE_CHECKING")
         for inner in ast.walk(node)
     }
     found: list[str] = []
-    for node in ast.walk(tree):
+    for node in nodes(path):
         if id(node) in typing:
             continue
         if isinstance(node, ast.Import):
@@ -119,7 +124,7 @@ def test_private_functions_have_seven_parameters_at_most() -> None:
     crowded = [
         f"{name}.{node.name}"
         for name, path in MODULES.items()
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        for node in nodes(path)
         if isinstance(node, ast.FunctionDef) and node.name.startswith("_") and not node.name.startswith("__")
         if len([*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]) > 7
     ]
