@@ -13,8 +13,7 @@ from staf_torch.online.bank import Bank
 from staf_torch.online.bank_rules import MEMBERS, BankShape, group
 from staf_torch.online.quadratic_models import QuadraticModels
 
-COMPILED = Bank(BankShape(2, 1, 128, 8), 1, True).compiled
-needs_compiler = pytest.mark.skipif(not COMPILED, reason="needs a C++ compiler")
+needs_compiler = pytest.mark.needs_compiler
 
 
 def streams(steps: int, count: int, outputs: int = 1, seed: int = 0) -> tuple[Tensor, Tensor]:
@@ -40,10 +39,11 @@ def test_compiled_bank_is_what_the_definition_says() -> None:
     y[80, 0], x[90, 1] = 1e300, 1e12
     y[85, 0], y[95:97, 0] = 30.0, -20.0  # an outlier, and two that are learned
     x[105:, 1] += 1e9  # gone for good: it starts afresh
-    usual = {*range(24, 36), *range(52, 59), *range(62, 69), *range(72, 79), *range(118, 136)}
+    looked_at = {*range(12), 19, 20, 21, *range(39, 43), *range(49, 53), 60, 61, 70, 71, *range(79, 88)}
+    looked_at |= {90, 91, *range(94, 100), *range(105, 118), *range(136, 142)}
     for k in range(steps):
         lapse = None if k % 3 else torch.tensor([0.3, 1.7], dtype=torch.float64)
-        fast_alone = k in usual
+        fast_alone = k not in looked_at  # where nothing happens
         if k % 5 and not fast_alone:
             for found, expected in zip(fast.predict(x[k]), slow.predict(x[k]), strict=True):
                 torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-6)
@@ -118,7 +118,8 @@ def test_saved_state_goes_on_bit_for_bit(memory: int | None, tmp_path: object) -
 def test_state_of_other_sizes_is_refused(memory: int | None) -> None:
     x, y = streams(5, 2)
     state = st.StaFRegressor(memory=memory, neighbours=8).fit(x, y[..., 0]).state_dict()
-    other = st.StaFRegressor(count=10, memory=memory and 200, neighbours=8).fit(x, y[..., 0])
+    sizes = {"memory": 256, "neighbours": 20} if memory else {"count": 3}
+    other = st.StaFRegressor(**sizes).fit(x, y[..., 0])
     before = other.predict(x[0])
     older = {name: value for name, value in state.items() if name != "arguments"}
     for given, rule in ((state, "same arguments: it has (count|memory)="), (older, "numbers a stream")):
@@ -247,7 +248,7 @@ def test_a_sample_with_nothing_to_learn_is_skipped_and_does_no_harm(
     kind: str, given: tuple[float, float], told: tuple[float, float]
 ) -> None:
     """An input that is infinite or was not measured at all, a target that is infinite or not there."""
-    bank = Bank(BankShape(2, 2, 80, 10), 1, True)
+    bank = Bank(BankShape(2, 2, 128, 8), 1, True)
     bank = bank if kind == "compiled" else definition_of(bank)
     x, y = streams(4, 1, outputs=2)
     for state, value in zip(x, y, strict=True):

@@ -45,9 +45,9 @@ def test_what_a_function_that_saturates_takes_is_mapped_and_other_functions_are_
 
 def test_no_single_error_moves_the_calibration_far() -> None:
     draw = torch.Generator().manual_seed(1)
-    bank = Bank(BankShape(1, 1, 128, 8), 1, True)
-    x = torch.randn(60, 1, 1, generator=draw, dtype=torch.float64)
-    y = x.sin() + 0.1 * torch.randn(60, 1, 1, generator=draw, dtype=torch.float64)
+    bank = Bank(BankShape(2, 1, 128, 8), 1, True)
+    x = torch.randn(60, 1, 2, generator=draw, dtype=torch.float64)
+    y = x[..., :1].sin() + 0.1 * torch.randn(60, 1, 1, generator=draw, dtype=torch.float64)
     rules, definition = bank._definition.rules, bank._definition
     for k in range(60):
         bank.predict(x[k])

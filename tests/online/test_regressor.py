@@ -234,7 +234,7 @@ def test_nothing_winds_up_in_a_stream_that_stands_still() -> None:
 
 def test_memory_does_not_grow_with_the_stream() -> None:
     x, y = walks(3, 80)
-    model = learned(st.StaFRegressor(radius=0.3, count=10), x[:2], y[:2])
+    model = learned(st.StaFRegressor(radius=0.3, count=3), x[:2], y[:2])
     size = len(pickle.dumps(model))
     assert len(pickle.dumps(learned(model, x[2:], y[2:]))) == size
 
