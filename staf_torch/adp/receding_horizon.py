@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import torch
 from torch import Tensor
 
@@ -85,7 +87,8 @@ class RecedingHorizon(Controller):
         self._first = BoxDDP(problem, steps=steps, compile=compile)
         self._search: BoxDDP | None = None
         if iterations:
-            self._search = BoxDDP(problem, steps=steps, iterations=iterations, compile=compile)
+            self._search = copy.copy(self._first)  # by the same programs: none is traced twice
+            self._search.iterations = self.iterations
         self._hastened = False
         self._whole = Program(
             lambda carry, now, row: (carry, self._traced(*row)),

@@ -169,11 +169,14 @@ class RobustFilter(Controller):
         ]
         clock = torch.full_like(x[..., :1], 2.0)  # the plant of the filter has not changed yet
         states = [torch.cat((x, theta, theta, clock), dim=-1) for theta in corners]
+        count, every = len(states), torch.cat(states)
         least_u, most_u = filter.bounds.low.to(x), filter.bounds.high.to(x)
         u, met, slack, margin = wanted, None, torch.zeros_like(time), torch.zeros_like(time)
         for _ in range(_PASSES):
-            found = [filter.inequalities(z, u, time) for z in states]
-            normal = sum((part[0] for part in found[1:]), found[0][0]) / len(found)
+            # All corners at once: a call of a few rows takes as long as one of many.
+            parts = filter.inequalities(every, u.repeat(count, 1), time.repeat(count))
+            found = list(zip(*(part.chunk(count) for part in parts), strict=True))
+            normal = sum((part[0] for part in found[1:]), found[0][0]) / count
             # The demand of every corner, taken over to the mean normal at this u.
             demands = [part[1] + ((normal - part[0]) * u.unsqueeze(-2)).sum(-1) for part in found]
             demand = torch.stack(demands, dim=-1).amax(-1)
