@@ -74,7 +74,7 @@ def identified() -> Any:
 
 def guarded(policy: Any, **given: Any) -> Any:
     guard = adp.SafetyFilter(policy, PLANE, crossing, **{"dt": 0.1, "decay": 3.0} | given)
-    run = loop(guard, PLANE, COST4, BESIDE, 18, 0.1)
+    run = loop(guard, PLANE, COST4, BESIDE, 12, 0.1)
     return run, guard.report(run)
 
 
@@ -91,7 +91,7 @@ def in_a_box(**given: Any) -> Any:
     guard = adp.BoxFilter(adp.LQR(box, cost), box, dt=0.01, **given)
     s0 = box.transform(tensor([[4.9, 3.0], [-6.5, -2.0], [0.0, 6.9], [1.0, 0.5]]))
     renewed = bool(given.get("renewed"))
-    run = loop(adp.Feedback(guard), box, cost, s0, 20, 0.01, substeps=4, renew=renewed)
+    run = loop(adp.Feedback(guard), box, cost, s0, 12, 0.01, substeps=4, renew=renewed)
     return run, guard.share(s0), guard.hold(s0)
 
 
@@ -180,14 +180,16 @@ def tracked(source: str) -> Any:
     return loop(seen, actuated, cost, X0[:2], 60, 0.02)
 
 
-def near_optimal(plant: Any, cost: adp.Cost, x0: Tensor, steps: int, **given: Any) -> Any:
+def near_optimal(
+    plant: Any, cost: adp.Cost, x0: Tensor, steps: int, report: bool = True, **given: Any
+) -> Any:
     policy = adp.near_optimal(plant, cost, **given)
     with torch.no_grad():
         run = loop(policy.controller(), plant, cost, x0, steps, policy.period)
-        if "low" in given and "plan" not in given:
-            return run, policy(x0)  # a report of loops that plan takes 5 s
-        report = policy.report(states=3, spread=0.4, optimum=False, seed=1)
-        return run, policy(x0), policy.rollout(x0), {k: v for k, v in report.items() if k != "microseconds"}
+        if not report:  # it takes a second of loops
+            return run, policy(x0), policy.rollout(x0), policy.steps, policy.substeps
+        said = policy.report(states=3, spread=0.4, optimum=False, seed=1)
+        return run, policy(x0), policy.rollout(x0), {k: v for k, v in said.items() if k != "microseconds"}
 
 
 def swung(**more: Any) -> Any:
@@ -287,7 +289,7 @@ CASES: dict[str, Callable[[], Any]] = {
     ),
     "detours": lambda: loop(around(), PLANE, COST4, BESIDE, 12, 0.2),
     "plans around": lambda: loop(
-        adp.DetourPlans(around(steps=4, lengths=[2]), first=1), PLANE, COST4, BESIDE[:2], 3, 0.2
+        adp.DetourPlans(around(steps=4, lengths=[2]), first=1), PLANE, COST4, BESIDE[:2], 2, 0.2
     ),
     "box filter": in_a_box,
     "box filter, renewed": lambda: in_a_box(renewed=True),
@@ -300,17 +302,19 @@ CASES: dict[str, Callable[[], Any]] = {
     "unscented kalman": lambda: followed(adp.UnscentedKalman),
     "concurrent tracker": lambda: tracked("integral"),
     "concurrent tracker of slopes": lambda: tracked("slope"),
-    "near optimal": lambda: near_optimal(PLANT, COST, X0, 6, dt=0.1, horizon=0.8),
-    "near optimal, by the rules": lambda: near_optimal(systems.Pendulum(), COST, 0.3 * X0, 8, dt=0.05),
+    "near optimal": lambda: near_optimal(PLANT, COST, X0, 3, dt=0.2, horizon=0.8),
+    "near optimal, by the rules": lambda: near_optimal(
+        systems.Pendulum(), COST, 0.3 * X0, 8, report=False, dt=0.05
+    ),
     "near optimal within bounds": lambda: near_optimal(
-        systems.Pendulum(), COST, 0.4 * X0[:2], 4, dt=0.1, low=-4.0, high=6.0
+        systems.Pendulum(), COST, 0.4 * X0[:2], 3, report=False, dt=0.1, low=-4.0, high=6.0
     ),
     "near optimal that plans": lambda: near_optimal(
-        systems.Pendulum(), COST, 0.4 * X0, 4, dt=0.1, low=-4.0, high=6.0, plan=True
+        systems.Pendulum(), COST, 0.4 * X0[:2], 3, dt=0.1, low=-4.0, high=6.0, plan=True
     ),
     "near optimal of a simulator": lambda: near_optimal(SIMULATOR, LIMITED, 0.2 * X0, 6),
     "receding horizon": swung,
-    "receding horizon, held": lambda: swung(held=True, iterations=1),
+    "receding horizon, held": lambda: swung(held=True, iterations=1, steps=15),
     "receding horizon, followed": lambda: swung(iterations=0, steps=8),
     "path integral": sampled,
     "path integral of few knots": lambda: sampled(knots=3, noise=0.7),
