@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from staf_torch import adp, deploy, systems
+from staf_torch import adp, deploy, lanes, systems
 from staf_torch.deploy.c_header import runner_c
 
 
@@ -28,6 +28,23 @@ def drawn(dim: int, width: float, rows: int) -> torch.Tensor:
 
 COST = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
 SIMULATOR = systems.StepPlant(turn, dim=2, inputs=1, dt=0.05, periodic=[0], low=-2.0, high=2.0)
+DOUBLE = systems.Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
+
+
+@pytest.fixture(scope="module")
+def two_states() -> adp.NearOptimal:
+    """A policy that several tests ask, compiled once."""
+    policy = adp.near_optimal(systems.TwoState(), COST, dt=0.1, horizon=0.8)
+    lanes.ready(policy, torch.zeros(1, 2).double())
+    return policy
+
+
+@pytest.fixture(scope="module")
+def limited() -> dict[bool, adp.NearOptimal]:
+    """Of the mass with |u| <= 1, by whether it plans: what plans is traced once."""
+    return {
+        plan: adp.near_optimal(DOUBLE, COST, dt=0.25, low=-1.0, high=1.0, plan=plan) for plan in (False, True)
+    }
 
 
 @torch.no_grad()
@@ -40,9 +57,14 @@ SIMULATOR = systems.StepPlant(turn, dim=2, inputs=1, dt=0.05, periodic=[0], low=
     ids=["two states", "simulator"],
 )
 def test_improved_policy_is_never_worse_than_its_base(
-    plant: systems.Plant, cost: adp.Cost, dt: float | None, width: float, gain: float
+    plant: systems.Plant,
+    cost: adp.Cost,
+    dt: float | None,
+    width: float,
+    gain: float,
+    two_states: adp.NearOptimal,
 ) -> None:
-    policy = adp.near_optimal(plant, cost, dt=dt, horizon=0.8)
+    policy = two_states if cost is COST else adp.near_optimal(plant, cost, dt=dt, horizon=0.8)
     x0 = drawn(cost.dim, width, 24)
     steps = round(4.0 / policy.period)
     base, ours = (
@@ -67,8 +89,8 @@ def test_where_a_bound_holds_the_base_at_the_end_its_own_control_is_kept() -> No
 
 
 @torch.no_grad()
-def test_report_says_what_was_chosen_and_how_good_it_is() -> None:
-    policy = adp.near_optimal(systems.TwoState(), COST, dt=0.1, horizon=0.8)
+def test_report_says_what_was_chosen_and_how_good_it_is(two_states: adp.NearOptimal) -> None:
+    policy = two_states
     report = policy.report(states=3, spread=0.5)
     with pytest.raises(ValueError, match="must be of the states"):
         policy.gradient(torch.zeros(2).double())
@@ -104,35 +126,37 @@ def test_bad_arguments_are_refused_by_name() -> None:
         adp.near_optimal(systems.Pendulum(), COST, dt=0.1, horizon=0.2)
 
 
-def test_plan_takes_over_where_the_lqr_would_meet_a_bound() -> None:
+def test_plan_takes_over_where_the_lqr_would_meet_a_bound(limited: dict[bool, adp.NearOptimal]) -> None:
     """A mass at 5 m with |u| <= 1: the LQR's rollouts overshoot; the plan is the optimum of its horizon."""
-    plant = systems.Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
-    policy = adp.near_optimal(plant, COST, dt=0.25, low=-1.0, high=1.0, plan=True)
+    plant, policy = DOUBLE, limited[True]
     x = torch.tensor([[3.0, 1.0], [0.05, 0.0], [-3.0, -1.0]], dtype=torch.float64)
     assert policy.planner is not None
     assert policy.planner.strained(x).tolist() == [True, False, True]
     u = policy(x)
-    best = adp.BoxDDP(policy.planner.problem, steps=policy.steps).solve(x[::2])
+    search = adp.BoxDDP(policy.planner.problem, steps=policy.steps)
+    best = search.solve(x[::2])
     torch.testing.assert_close(u[::2], best.control[:, 0], rtol=0, atol=1e-3)
     torch.testing.assert_close(u[0], -u[2])
     torch.testing.assert_close(u[1], policy.control(x[1]), rtol=0, atol=1e-9)
     assert torch.equal(policy(x[1]), u[1])
     loop = policy.controller()  # carries its plan
     run = adp.simulate(loop, plant, policy.cost, x, dt=0.25, steps=60, compile=False)
-    whole = adp.BoxDDP(policy.planner.problem, steps=60).solve(x)
+    search.steps = 60  # by the same programs
+    whole = search.solve(x)
     torch.testing.assert_close(run.cost, whole.cost, rtol=1e-4, atol=1e-6)
     assert isinstance(adp.near_optimal(plant, COST, dt=0.25, plan=True).controller(), adp.Feedback)
     again = pickle.loads(pickle.dumps(policy))
     torch.testing.assert_close(again(x), u)
     assert adp.near_optimal(plant, COST, dt=0.25, plan=True).planner is None
-    assert adp.near_optimal(plant, COST, dt=0.25, low=-1.0, high=1.0).planner is None
+    assert limited[False].planner is None
 
 
 @torch.no_grad()
-def test_loop_carries_a_plan_only_where_the_lqr_would_meet_a_bound() -> None:
+def test_loop_carries_a_plan_only_where_the_lqr_would_meet_a_bound(
+    limited: dict[bool, adp.NearOptimal],
+) -> None:
     """The same mass without `plan`: from afar the optimum, also where it is only pushed there in the loop."""
-    plant = systems.Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
-    policy = adp.near_optimal(plant, COST, dt=0.25, low=-1.0, high=1.0)
+    plant, policy = DOUBLE, limited[False]
     loop, planner = policy.controller(), policy.plans()
     assert planner is not None
     x = torch.tensor([[3.0, 1.0], [0.05, 0.0], [-3.0, -1.0]], dtype=torch.float64)
@@ -154,8 +178,8 @@ def test_loop_carries_a_plan_only_where_the_lqr_would_meet_a_bound() -> None:
 
 
 @torch.no_grad()
-def test_another_control_than_the_bases_promises_less_over_both_horizons() -> None:
-    policy = adp.near_optimal(systems.TwoState(), COST, dt=0.1, horizon=0.8)
+def test_another_control_than_the_bases_promises_less_over_both_horizons(two_states: adp.NearOptimal) -> None:
+    policy = two_states
     x, discount = drawn(2, 2.0, 300), math.exp(-COST.discount * 0.1)
 
     def promised(u: torch.Tensor) -> torch.Tensor:
@@ -188,7 +212,7 @@ class Gap(systems.ControlAffineSystem):
 
 
 def test_report_finds_the_region_of_a_plant_in_small_units() -> None:
-    policy = adp.near_optimal(Gap(), adp.QuadraticCost(1.0, 1.0, dim=1, inputs=1), dt=0.02, horizon=0.2)
+    policy = adp.near_optimal(Gap(), adp.QuadraticCost(1.0, 1.0, dim=1, inputs=1), dt=0.05, horizon=0.2)
     report = policy.report(states=8, optimum=False)
     assert report["regulated"] == 0  # in the box of 1
     assert 1 / 256 <= report["good_spread"] <= 1 / 32
@@ -227,9 +251,8 @@ def test_simulator_is_followed_in_numpy_to_the_same_promise(
 
 
 @torch.no_grad()
-def test_controllers_of_a_policy_share_programs_and_no_plan() -> None:
-    plant = systems.Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
-    policy = adp.near_optimal(plant, COST, dt=0.25, low=-1.0, high=1.0)
+def test_controllers_of_a_policy_share_programs_and_no_plan(limited: dict[bool, adp.NearOptimal]) -> None:
+    policy = limited[False]
     one, other = policy.controller(), policy.controller()
     assert one._begun is other._begun
     assert next(iter(policy._loops.values())).held  # begins with the best of several
@@ -253,12 +276,19 @@ def test_controllers_of_a_policy_share_programs_and_no_plan() -> None:
 
 @torch.no_grad()
 @pytest.mark.parametrize("plan", [True, False])
-def test_report_says_how_often_the_lqr_would_meet_a_bound(plan: bool) -> None:
-    plant = systems.Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
-    policy = adp.near_optimal(plant, COST, dt=0.25, low=-1.0, high=1.0, plan=plan)
+def test_states_are_told_from_which_the_lqr_would_meet_a_bound(
+    plan: bool, limited: dict[bool, adp.NearOptimal]
+) -> None:
+    policy = limited[plan]
     for spread, share in ((1e-3, 0.0), (1e3, 1.0)):
         far = policy._drawn(4, spread, 0)
         planner = policy.plans()
         assert planner is not None
         assert float(planner.strained(far).double().mean()) == share
-    assert policy.report(states=4, spread=1e-3, optimum=False)["strained"] == 0.0
+
+
+@torch.no_grad()
+def test_report_says_the_share_of_its_states_from_which_the_lqr_would_meet_a_bound() -> None:
+    plant, cost = systems.Linear([[0.0]], [[1.0]]), adp.QuadraticCost(1.0, 1.0, dim=1, inputs=1)
+    policy = adp.near_optimal(plant, cost, dt=1.0, horizon=4.0, low=-1.0, high=1.0)
+    assert policy.report(states=2, spread=1e-3, optimum=False)["strained"] == 0.0
