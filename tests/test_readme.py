@@ -68,6 +68,7 @@ def python_blocks(path: Path) -> list[tuple[int, str]]:
     return [(text[: block.start(1)].count("\n"), block[1]) for block in found]
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize("path", [p for p in [README, *MANUALS] if python_blocks(p)], ids=name)
 def test_python_blocks_of_a_page_run_one_after_another(
     path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
