@@ -69,9 +69,9 @@ def three_states() -> tuple[adp.Controller, systems.ControlAffineSystem, adp.Cos
 
 
 def of_basis(
-    basis: adp.ValueBasis, points: adp.Extrapolation
+    basis: adp.ValueBasis, points: adp.Extrapolation, law: adp.ActorCriticLaw | None = None
 ) -> tuple[adp.Controller, systems.ControlAffineSystem, adp.Cost]:
-    return adp.ActorCritic(basis, PLANT, COST, points), PLANT, COST
+    return adp.ActorCritic(basis, PLANT, COST, points, law), PLANT, COST
 
 
 def learned(
@@ -82,18 +82,19 @@ def learned(
 
 CASES: dict[str, Callable[[], tuple[adp.Controller, systems.ControlAffineSystem, adp.Cost]]] = {
     "information": lambda: learned(adp.Information()),
-    "information, bounded": lambda: learned(adp.Information(bound=2.0)),
-    "published": lambda: learned(adp.Published()),
-    "frozen": lambda: learned(adp.Frozen()),
-    "policy iteration": lambda: learned(adp.PolicyIteration(), adp.QuadraturePoints(2, 2, BOX)),
-    "three fixed points": lambda: learned(adp.Information(), adp.RandomPoints(3, BOX, "fixed")),
-    "partial gradient, quadrature": lambda: of_basis(staf_basis("partial"), adp.QuadraturePoints(2, 2, BOX)),
-    "a kernel without closed form": lambda: of_basis(
-        staf_basis("total", AnchoredKernel(GaussianKernel(2.0))), adp.RandomPoints(1, BOX)
+    "frozen, quadratic basis": lambda: of_basis(
+        adp.QuadraticBasis(2), adp.RandomPoints(1, BOX), adp.Frozen()
     ),
-    "quadratic basis": lambda: of_basis(adp.QuadraticBasis(2), adp.RandomPoints(1, BOX)),
-    "grid, around the origin": lambda: of_basis(
-        adp.RBFGridBasis(2, 3, 2.0), adp.RandomPoints(1, 2.0, around="origin")
+    "policy iteration, partial gradient": lambda: of_basis(
+        staf_basis("partial"), adp.QuadraturePoints(2, 2, BOX), adp.PolicyIteration()
+    ),
+    "bounded, three fixed points, a kernel without closed form": lambda: of_basis(
+        staf_basis("total", AnchoredKernel(GaussianKernel(2.0))),
+        adp.RandomPoints(3, BOX, "fixed"),
+        adp.Information(bound=2.0),
+    ),
+    "published, a grid around the origin": lambda: of_basis(
+        adp.RBFGridBasis(2, 3, 2.0), adp.RandomPoints(1, 2.0, around="origin"), adp.Published()
     ),
     "supervised": lambda: (
         adp.Supervised(learner(adp.Information()), adp.LQR(PLANT, COST), COST),
@@ -101,11 +102,9 @@ CASES: dict[str, Callable[[], tuple[adp.Controller, systems.ControlAffineSystem,
         COST,
     ),
     "three states": three_states,
-    "pendulum": lambda: of_lqr(systems.Pendulum()),
     "quadrotor": lambda: of_lqr(systems.PlanarQuadrotor()),
     "foreign plant": lambda: of_lqr(Foreign()),
-    "rollout": rollout,
-    "rollout, shrinking": lambda: rollout(radius=StateRadius(0.1, 1e-2)),
+    "rollout": lambda: rollout(radius=StateRadius(0.1, 1e-2)),
 }
 
 
@@ -153,9 +152,10 @@ def test_a_row_has_the_same_bits_at_every_batch_and_beside_every_neighbour(case:
     assert not beside[2][1::2].any()
 
 
-def test_a_compiled_run_is_that_of_the_definition() -> None:
+def test_a_compiled_run_is_that_of_the_definition(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("staf_torch.adp.simulation._DRAWN_AHEAD", 170)  # a piece of 165 steps, and the rest
     x0 = uniform(3, 1.0)
-    settings = {"dt": 0.01, "steps": 1030, "every": 103}
+    settings = {"dt": 0.01, "steps": 220, "every": 55}
     fast = adp.simulate(learner(adp.Information()), PLANT, COST, x0, compile=True, **settings)
     plain = adp.simulate(learner(adp.Information()), PLANT, COST, x0, compile=False, **settings)
     for field in dataclasses.fields(fast):
@@ -200,7 +200,7 @@ def test_what_cannot_be_compiled_runs_in_plain_torch_with_one_line(
         plant = systems.TwoState()
         monkeypatch.setattr(compiler, "function", refuse)
     lqr, x0 = adp.Feedback(adp.LQR(PLANT, COST)), uniform(2, 1.0)
-    settings = {"dt": 0.013, "steps": 200, "every": 100}
+    settings = {"dt": 0.013, "steps": 40, "every": 20}
     with caplog.at_level(logging.WARNING):
         run = adp.simulate(lqr, plant, COST, x0, compile=True, **settings)
     plain = adp.simulate(lqr, PLANT, COST, x0, compile=False, **settings)
@@ -225,7 +225,7 @@ def test_rows_with_gains_of_their_own_are_compiled_and_are_those_rows_alone() ->
         whole.actor_weights, run(critic, slice(0, 3), False).actor_weights, rtol=CLOSE, atol=CLOSE
     )
     for k in range(3):
-        alone = run(float(critic[k]), slice(k, k + 1), True)
+        alone = run(float(critic[k]), slice(k, k + 1), False)
         torch.testing.assert_close(whole.state[k : k + 1], alone.state, rtol=CLOSE, atol=CLOSE)
     law = adp.Information(adp.Gains(critic=critic))
     controller = adp.ActorCritic(adp.QuadraticBasis(2), PLANT, COST, adp.RandomPoints(1, 1.0), law)
