@@ -19,10 +19,16 @@ from staf_torch.lanes import build
 PUBLIC = public()
 
 
+RUNS = ("results", "sweeps", "tables")  # examples of these rooms run simulations of hundreds of steps
 COMPILE = ("staf_torch.deploy.c_header.time_c", "staf_torch.lanes.function.ready")  # their examples do
 
 
-@pytest.mark.parametrize("name", PUBLIC)
+def asked(name: str) -> object:
+    """A name, whose chases are compiled where its example has long ones."""
+    return pytest.param(name, marks=[pytest.mark.compiled] if name.split(".")[1] in RUNS else [])
+
+
+@pytest.mark.parametrize("name", [asked(name) for name in PUBLIC])
 def test_the_example_of_a_name_does_what_it_says(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, record: Record
 ) -> None:
