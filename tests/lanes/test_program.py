@@ -115,8 +115,10 @@ def test_threads_do_not_change_bits() -> None:
         torch.set_num_threads(threads)
 
 
-@pytest.mark.parametrize("law", [optim.SteepestDescent(), optim.ConjugateGradient(), optim.Nesterov()])
-@pytest.mark.parametrize("count", [3, 6, 15])
+@pytest.mark.parametrize(
+    ("law", "count"),
+    [(optim.SteepestDescent(), 15), (optim.ConjugateGradient(), 3), (optim.Nesterov(), 6)],
+)
 def test_a_law_repeated_is_the_definition(law: optim.UpdateLaw, count: int) -> None:
     """M = 15 keeps its products as loops over memory, the others are written out."""
     factor = torch.randn(9, 5, count, count, dtype=torch.float64)
@@ -240,22 +242,19 @@ def test_without_a_compiler_the_definition_runs(
     assert torch.equal(found, program.definition(*given)[0])
 
 
-@pytest.mark.parametrize("kept", [0, 5000])
-def test_a_damaged_cache_is_built_again(kept: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> None:
-    given, program = inputs(3), lanes.Program(pendulum)
-    sizes, built = [], tmp_path
-    for name in "ab":  # a process opens a library of one path once
+def test_a_damaged_cache_is_built_again(monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> None:
+    given, whole, built = inputs(3), b"", tmp_path
+    for name, kept in (("whole", None), ("empty", 0), ("cut", 5000)):  # a process opens one path once
         monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / name))
         monkeypatch.setattr(compiler, "_loaded", {})
         folder = tmp_path / name / "staf_torch"
-        if name == "b":
+        if kept is not None:
             folder.mkdir(parents=True)
-            (folder / built.name).write_bytes(built.read_bytes()[:kept])
+            (folder / built.name).write_bytes(whole[:kept])
         assert lanes.Program(pendulum).compiles(*given)
         (built,) = folder.glob("lanes-*.so")
-        sizes.append(built.stat().st_size)
-    assert sizes[0] == sizes[1]
-    assert program.compiles(*given)
+        whole = whole or built.read_bytes()
+        assert built.stat().st_size == len(whole) > 5000
 
 
 def test_a_cache_that_cannot_be_written_is_replaced(monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> None:
