@@ -66,7 +66,7 @@ def test_gradient_and_control_solve_the_hjb_equation(
     assert (residual.abs() < 1e-4 * cost.rate(x, best.control)).all()
     torch.testing.assert_close(best.control, cost.policy(g, best.gradient))
     lqr = adp.LQR(plant, cost)
-    run = adp.simulate(adp.Feedback(lqr), plant, cost, x, dt=0.05, steps=200, every=200)
+    run = adp.simulate(adp.Feedback(lqr), plant, cost, x, dt=0.1, steps=100, every=100)
     assert (best.value < run.cost * (1 + 1e-4)).all()
 
 
@@ -90,8 +90,8 @@ class HalfBroken(systems.TwoState):
 
 
 def test_row_that_fails_on_the_coarse_mesh_starts_again_on_the_fine_one() -> None:
-    x = uniform(6, 2.0)
-    best = adp.DirectShooting(PLANT, COST, intervals=40, iterations=10).solve(x)
+    x = uniform(6, 2.0)[:3]
+    best = adp.DirectShooting(PLANT, COST, intervals=32, iterations=10).solve(x)
     assert torch.isinf(best.mesh_error).all()  # nothing to compare with
     assert best.converged.all()
     assert (best.value / PLANT.optimal_value(x, COST.q, COST.r) - 1).abs().max() < 1e-4
@@ -99,13 +99,13 @@ def test_row_that_fails_on_the_coarse_mesh_starts_again_on_the_fine_one() -> Non
 
 def test_rows_are_alone_and_a_row_without_optimum_is_reported() -> None:
     x = torch.tensor([[-1.0, 1.0], [1.2, 0.3], [0.0, 0.0], [0.4, -0.7]], dtype=torch.float64)
-    best = adp.DirectShooting(HalfBroken(), COST, horizon=4.0, intervals=40, starts=2).solve(x)
+    best = adp.DirectShooting(HalfBroken(), COST, horizon=4.0, intervals=24, starts=2).solve(x)
     assert best.converged.tolist() == [True, False, True, True]
     assert torch.isnan(best.value[1])
     assert torch.isnan(best.control[1]).all()
     assert float(best.value[2]) == 0.0
     assert torch.equal(best.gradient[2], torch.zeros(2, dtype=torch.float64))
-    alone = adp.DirectShooting(PLANT, COST, horizon=4.0, intervals=40).solve(x[3:])
+    alone = adp.DirectShooting(PLANT, COST, horizon=4.0, intervals=24).solve(x[3:])
     torch.testing.assert_close(best.value[3], alone.value[0], rtol=1e-11, atol=0)
     torch.testing.assert_close(best.gradient[3], alone.gradient[0], rtol=1e-7, atol=1e-9)
 
