@@ -32,27 +32,28 @@ from staf_torch.results.progress import Progress
 RECORDED = Path(__file__).with_name("reference_metrics.json")
 CASES: dict[str, str] = {
     "adp": "experiment=adp duration=0.3 dt=0.005 trajectories=2",
-    "adp_comparison": "experiment=adp_comparison duration=0.1 dt=0.01",
+    "adp_comparison": "experiment=adp_comparison duration=0.04 dt=0.01",
     "adp_initial_weights": "experiment=adp_initial_weights duration=0.1 dt=0.01",
     "adp_tracking": "experiment=adp_tracking duration=0.3 dt=0.01 trajectories=2",
-    "avoidance": "experiment=avoidance trajectories=3 duration=2.0 dt=0.04 adp.compile=false",
-    "avoidance of a unicycle": "experiment=avoidance avoidance.vehicle=unicycle trajectories=2 duration=1.0 "
-    "adp.compile=false",
+    "avoidance": "experiment=avoidance trajectories=3 duration=2.0 dt=0.1 adp.compile=false",
+    "avoidance of a unicycle": "experiment=avoidance avoidance.vehicle=unicycle trajectories=2 "
+    "duration=1.0 dt=0.1 adp.compile=false",
     "exponential_bound": "experiment=exponential_bound exponential_bound.states=9 "
     "exponential_bound.radii=[0.1]",
     "faults": "experiment=faults trajectories=3 duration=0.6 faults.cases=[unstable]",
-    "faults from the start": "experiment=faults trajectories=3 duration=0.2 faults.cases=[short_period,mass]",
+    "faults from the start": "experiment=faults trajectories=3 duration=0.05 "
+    "faults.cases=[short_period,mass]",
     "feasibility": "experiment=feasibility feasibility.states=16 feasibility.radii=[0.1] "
     "feasibility.epsilons=[0.1,0.01]",
-    "flat_limit": "experiment=flat_limit",
+    "flat_limit": "experiment=flat_limit flat_limit.radii.per_decade=2 flat_limit.radii.smallest=1e-4",
     "gradient_chase": "dt=0.05 duration=1.0 settle_time=0.5 trajectories=3 certificate=true centers.count=6 "
     "spread=0.4",
-    "icl": "experiment=icl trajectories=3 dt=0.005 duration=0.5 settle_time=0.1 icl.length=[0.02,0.04]",
-    "laws": "experiment=laws dt=0.05 duration=1.0 settle_time=0.5 laws.steps=[0.1,0.05] laws.work=4",
+    "icl": "experiment=icl trajectories=3 dt=0.01 duration=0.5 settle_time=0.1 icl.length=[0.02,0.04]",
+    "laws": "experiment=laws dt=0.1 duration=1.0 settle_time=0.5 laws.steps=[0.2,0.1] laws.work=4",
     "layouts": "experiment=layouts layouts.states=4 layouts.radii=[0.1,0.2]",
-    "memory": "experiment=memory",
-    "safe_box": "experiment=safe_box duration=0.2 dt=0.01 trajectories=2 safe_box.states=4 safe_box.decay=20 "
-    "safe_box.substeps=4",
+    "memory": "experiment=memory duration=8 dt=0.02 memory.steps=30 memory.revisits=6 memory.states=40",
+    "safe_box": "experiment=safe_box duration=0.1 dt=0.01 trajectories=2 safe_box.states=4 safe_box.decay=20 "
+    "safe_box.substeps=2 safe_box.followed=0.03",
 }
 
 
@@ -76,7 +77,7 @@ def metrics_of(
     cfg = settings(f"figures={figures}", *CASES[name].split())
     run = experiment(cfg.task)
     with pytest.MonkeyPatch.context() as patch:  # the optimum in a box on a mesh of its own takes 11 s
-        coarse = functools.partial(DirectShooting, horizon=2.0, intervals=16)
+        coarse = functools.partial(DirectShooting, horizon=0.5, intervals=8)
         patch.setattr("staf_torch.experiments.safe_box.DirectShooting", coarse)
         found: dict[str, float | None] = run(
             cfg, directory, Progress([].append if told is None else told.append)
