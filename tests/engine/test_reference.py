@@ -24,9 +24,10 @@ BASIS = st.StaFBasis(st.ExponentialKernel(), st.StateFollowingCenters(st.rings(3
 
 @functools.cache
 def simulation(dt: float = 0.01, inner_steps: int = 10) -> ChaseResult:
-    """The whole run from a = 0 at x = (1, 0)."""
+    """The whole run from a = 0 at x = (1, 0), in rows that are alike: the program of 32 parts serves."""
     steps = math.floor(END / dt)
     states = systems.simulate(systems.Oscillator(), tensor([[1.0, 0.0]]), dt=dt, steps=steps)
+    states = states.expand(32, -1, -1)
     return st.chase(states, BASIS, Paper(), SteepestDescent(), inner_steps=inner_steps)
 
 

@@ -42,9 +42,7 @@ CASES = {
     "conjugate gradient": (GAUSS, optim.ConjugateGradient(), predictors.Secant(guarded=True)),
     "exact": (MOVING, optim.Exact(), None),
     "fixed step": (GAUSS, optim.FixedStep(), predictors.Secant()),
-    "absolute step": (WELL, optim.FixedStep(0.05, relative=False), None),
     "heavy ball": (WELL, optim.HeavyBall(), None),
-    "heavy ball with gains": (POLYNOMIAL, optim.HeavyBall(0.9, 0.5), None),
     "nesterov": (WELL, optim.Nesterov(0.9), predictors.Tangent(1)),
     "normalised LMS": (MOVING, optim.NormalisedLMS(0.7), None),
     "core preconditioner": (WELL, optim.PreconditionedDescent(), None),
@@ -114,13 +112,13 @@ def test_the_compiled_chase_is_the_definition(name: str, definition) -> None:
 
 
 def test_a_certificate_and_the_weights_alone_are_compiled(definition) -> None:
-    got = compiled(chase, STATES, WELL, Paper(), LAW, inner_steps=3, certificate=True)
-    want = definition(chase, STATES, WELL, Paper(), LAW, inner_steps=3, certificate=True)
+    got = compiled(chase, STATES, WELL, Paper(), LAW, inner_steps=2, certificate=True)
+    want = definition(chase, STATES, WELL, Paper(), LAW, inner_steps=2, certificate=True)
     assert got.certificate is not None
     assert want.certificate is not None
     for a, b in zip(got.certificate, want.certificate, strict=True):
         torch.testing.assert_close(a, b, rtol=1e-8, atol=1e-9)
-    alone = compiled(chase_weights, STATES, WELL, Paper(), LAW, inner_steps=3)
+    alone = compiled(chase_weights, STATES, WELL, Paper(), LAW, inner_steps=2)
     torch.testing.assert_close(
         alone.weights, want.weights, rtol=0, atol=1e-10 * float(want.weights.abs().max())
     )
@@ -154,19 +152,18 @@ def test_many_centers_stay_loops_over_arrays(definition) -> None:
 
 def test_rows_have_the_bits_that_they_have_in_any_batch_and_beside_any_row() -> None:
     """Ten iterations at a condition number of 10^4: a rounding would become a digit."""
-    states = circles(300, 17)
-    for basis, law in ((BASES["exponential"], LAW), (MOVING, optim.Nesterov())):
-        whole = compiled(chase_weights, states, basis, Paper(), law).weights
-        for first, batch in ((0, 1), (193, 7), (200, 64)):
-            part = chase_weights(states[first : first + batch], basis, Paper(), law).weights
-            assert torch.equal(part, whole[first : first + batch])
-        spoilt = states.clone()
-        spoilt[5, 3:], spoilt[7, 9] = torch.nan, torch.inf
-        result = chase_weights(spoilt, basis, Paper(), law)
-        others = [i for i in range(300) if i not in (5, 7)]
-        assert torch.equal(result.weights[others], whole[others])
-        assert result.diverged_at[[5, 7]].tolist() == [3, 9]
-        assert torch.equal(result.weights[5, 3:], whole[5, 2].expand(14, -1))
+    states, basis = circles(300, 17), BASES["exponential"]
+    whole = compiled(chase_weights, states, basis, Paper(), LAW).weights
+    for first, batch in ((0, 1), (193, 7), (200, 64)):
+        part = chase_weights(states[first : first + batch], basis, Paper(), LAW).weights
+        assert torch.equal(part, whole[first : first + batch])
+    spoilt = states.clone()
+    spoilt[5, 3:], spoilt[7, 9] = torch.nan, torch.inf
+    result = chase_weights(spoilt, basis, Paper(), LAW)
+    others = [i for i in range(300) if i not in (5, 7)]
+    assert torch.equal(result.weights[others], whole[others])
+    assert result.diverged_at[[5, 7]].tolist() == [3, 9]
+    assert torch.equal(result.weights[5, 3:], whole[5, 2].expand(14, -1))
 
 
 @pytest.mark.needs_compiler
@@ -185,20 +182,18 @@ def test_chunks_of_time_continue_to_the_bit_and_remember_who_diverged() -> None:
 
 
 @pytest.mark.needs_compiler
-@pytest.mark.parametrize("law", [LAW, optim.Nesterov(0.7)], ids=["steepest descent", "nesterov"])
 def test_another_radius_width_gain_or_phase_compiles_and_traces_nothing(
-    law: optim.UpdateLaw, definition, monkeypatch: pytest.MonkeyPatch
+    definition, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def basis(width: float, radius: float) -> StaFBasis:
         return StaFBasis(GaussianKernel(width), StateFollowingCenters(rings(3), radius))
 
-    compiled(chase, STATES, basis(0.8, 0.7), Cosine([1.0, 0.3], 0.2), law, inner_steps=2)
+    compiled(chase, STATES, basis(0.8, 0.7), Cosine([1.0, 0.3], 0.2), optim.Nesterov(0.7), inner_steps=2)
     monkeypatch.setattr(compiler, "_run", None)
     monkeypatch.setattr(row_program.Program, "_build", None)
     # Numbers that are 1, equal to others, or a power of two.
     for width, radius, phase, step in ((1.0, 0.5, 0.0, 1.0), (0.5, 0.5, 0.5, 0.5), (0.9, 0.6, -1.0, 0.25)):
-        other = law if law is LAW else optim.Nesterov(step)
-        args = STATES, basis(width, radius), Cosine([phase, 1.0], phase), other
+        args = STATES, basis(width, radius), Cosine([phase, 1.0], phase), optim.Nesterov(step)
         got = compiled(chase, *args, inner_steps=2)
         assert_close(got, definition(chase, *args, inner_steps=2), 1e-10)
 
@@ -252,8 +247,8 @@ def test_a_learned_target_keeps_its_gradient(run, kind) -> None:
 
 @pytest.mark.parametrize("run", [chase, chase_weights])
 def test_a_reach_beyond_one_is_warned_of_once(run) -> None:
-    states = 3.0 * circles(3, TIMES)
+    states = 3.0 * circles(9, TIMES)
     states[1, 2:] = torch.inf
     with pytest.warns(UserWarning, match=r"\|x\| r = |Shrink") as seen:
-        run(2 * states, BASES["exponential"], Paper(), LAW)
+        run(2 * states, WELL, Paper(), LAW, inner_steps=2)
     assert len(seen) == 1
