@@ -56,7 +56,7 @@ def test_row_of_the_vectorised_environment_is_the_single_one(name: str) -> None:
 
 @pytest.mark.parametrize("make", [lambda: adp.Feedback(LQR), rollout, learner])
 def test_rewards_of_an_episode_add_up_to_minus_the_cost_of_the_simulation(make) -> None:  # type: ignore[no-untyped-def]
-    steps, x0 = 300, torch.tensor([[-1.0, 1.0], [0.5, 0.7]], dtype=torch.float64)
+    steps, x0 = 60, torch.tensor([[-1.0, 1.0], [0.5, 0.7]], dtype=torch.float64)
     wanted = adp.simulate(make(), PLANT, COST, x0, dt=0.01, steps=steps)
     many = gymnasium.make_vec("staf_torch/TwoState-v0", num_envs=2, horizon=100.0, bound=1000.0)
     seen, _ = many.reset(options={"state": x0.numpy()})
@@ -70,10 +70,10 @@ def test_rewards_of_an_episode_add_up_to_minus_the_cost_of_the_simulation(make) 
 
 @pytest.mark.parametrize("make", [lambda: adp.Feedback(LQR), rollout])
 def test_policy_regulates_the_two_state_plant(make) -> None:  # type: ignore[no-untyped-def]
-    many = gymnasium.make_vec("staf_torch/TwoState-v0", num_envs=8, dt=0.05, spread=2.0)
+    many = gymnasium.make_vec("staf_torch/TwoState-v0", num_envs=4, dt=0.05, spread=2.0)
     agent = envs.Agent(make(), dt=0.05)
     seen, _ = many.reset(seed=0)
-    for _ in range(160):
+    for _ in range(120):
         seen, _, terminated, _, _ = many.step(agent(seen))
         assert not terminated.any()
     assert np.linalg.norm(seen, axis=-1).max() < 1e-2

@@ -18,16 +18,15 @@ PAPER = targets.Paper()
 
 
 @pytest.mark.parametrize(
-    ("radius", "epsilon", "N", "S", "count", "one"),
+    ("radius", "epsilon", "N", "S", "count", "one", "states"),
     [
-        (0.1, 1e-2, 2, 2, 15, 6),
-        (0.1, 1e-3, 3, 2, 21, 10),
-        (0.1, 1e-4, 3, 3, 28, 10),
-        (0.5, 1e-2, 5, 4, 55, 15),
-        (0.5, 1e-4, 8, 5, 105, 28),
+        (0.1, 1e-2, 2, 2, 15, 6, 53),
+        (0.1, 1e-3, 3, 2, 21, 10, 17),
+        (0.1, 1e-4, 3, 3, 28, 10, 53),
+        (0.5, 1e-2, 5, 4, 55, 15, 53),
+        (0.5, 1e-4, 8, 5, 105, 28, 17),
     ],
 )
-@pytest.mark.parametrize("states", [17, 53])
 def test_bound_of_the_paper_example_is_the_reference(
     radius: float, epsilon: float, N: int, S: int, count: int, one: int, states: int
 ) -> None:

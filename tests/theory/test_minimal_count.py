@@ -22,7 +22,7 @@ from staf_torch import (
 )
 
 PAPER = targets.Paper()
-CIRCLE_ANGLES = torch.arange(64, dtype=torch.float64) * (2 * math.pi / 64)
+CIRCLE_ANGLES = torch.arange(32, dtype=torch.float64) * (2 * math.pi / 32)
 CIRCLE = torch.stack((CIRCLE_ANGLES.cos(), -CIRCLE_ANGLES.sin()), dim=-1)
 
 REFERENCE_COUNTS = {0.05: (2, 6, 6, 10, 15), 0.1: (3, 6, 10, 10, 21), 0.2: (6, 10, 15, 15, 28)}
