@@ -315,7 +315,7 @@ def paper_step(
             quadratic = torch.einsum("...i,...ij,...j->...", a, basis.kernel(c, c), a)
             return (quadratic - 2 * (a * target(c)).sum(-1)).sum()
 
-        gradient: Tensor = torch.func.grad(error)(centers).flatten(-2).norm(dim=-1)
+        gradient: Tensor = torch.func.grad(error)(centers.expand(*a.shape, -1)).flatten(-2).norm(dim=-1)
         return gradient
 
     delta = float(
@@ -328,14 +328,13 @@ def paper_step(
 
 
 def _ascend(function: Callable[[Tensor], Tensor], like: Tensor, radius: Tensor) -> Tensor:
-    """max of a function (N, M) -> (N,) over |a| <= radius, by normalised gradient ascent on the sphere."""
+    """max of a function (..., M) -> (...) over |a| <= radius at each of N states, ``like`` being (N, M), by
+    normalised gradient ascent on the sphere from all starts side by side."""
     generator = torch.Generator().manual_seed(0)
-    best = like.new_zeros(())
-    for _ in range(_STARTS):
-        start = torch.randn(like.shape[-1], generator=generator, dtype=torch.float64).to(like)
-        a = (radius * start / start.norm()).expand(like.shape)
-        for _ in range(_ASCENTS):
-            gradient: Tensor = torch.func.grad(lambda at: function(at).sum())(a)
-            a = radius * gradient / gradient.norm(dim=-1, keepdim=True)
-        best = torch.maximum(best, function(a).max())
-    return best
+    drawn = [torch.randn(like.shape[-1], generator=generator, dtype=torch.float64) for _ in range(_STARTS)]
+    starts = torch.stack(drawn).to(like)
+    a = (radius * starts / starts.norm(dim=-1, keepdim=True)).unsqueeze(1).expand(-1, *like.shape)
+    for _ in range(_ASCENTS):
+        gradient: Tensor = torch.func.grad(lambda at: function(at).sum())(a)
+        a = radius * gradient / gradient.norm(dim=-1, keepdim=True)
+    return function(a).max()
