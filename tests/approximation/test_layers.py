@@ -93,7 +93,8 @@ def test_a_hyperparameter_a_row_is_what_it_would_be_alone(name: str) -> None:
 def test_gradients_reach_everything_that_is_learned_in_every_mode(name: str, radius: str) -> None:
     outputs = 2 if name in ("exponential", "user_defined") else None
     staf, y = learnable(name, radius, outputs=outputs)
-    for mode in MODES if radius == "shrinking" else MODES[::2]:
+    own = MODES if name == "exponential" else MODES[1::2]
+    for mode in own if radius == "shrinking" else MODES[::2]:
         function, at = as_function(staf, mode, target_of(outputs))
         inputs = (y[:1].requires_grad_(), *at)
         assert torch.autograd.gradcheck(function, inputs, atol=1e-5, rtol=1e-4, fast_mode=True), mode
