@@ -32,18 +32,19 @@ class Hysteresis(adp.Controller):
 @pytest.mark.needs_compiler
 @pytest.mark.compiled
 def test_a_state_of_ones_own_is_carried_row_by_row(caplog: pytest.LogCaptureFixture) -> None:
-    x0 = torch.randn(9, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    x0 = torch.randn(18, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
     x0[4] = torch.nan
     runs = [
-        adp.simulate(Hysteresis(), PLANT, COST, x0, dt=0.02, steps=200, compile=compile)
+        adp.simulate(Hysteresis(), PLANT, COST, x0, dt=0.02, steps=100, compile=compile)
         for compile in (True, False)
     ]
     assert not caplog.text
     torch.testing.assert_close(runs[0].state, runs[1].state, rtol=1e-10, atol=1e-10, equal_nan=True)
-    assert runs[0].diverged.tolist() == [row == 4 for row in range(9)]
-    assert runs[0].critic_weights.shape == (9, 201, 0)
-    alone = adp.simulate(Hysteresis(), PLANT, COST, x0[2:3], dt=0.02, steps=200, compile=True)
+    assert runs[0].diverged.tolist() == [row == 4 for row in range(18)]
+    assert runs[0].critic_weights.shape == (18, 101, 0)
+    alone = adp.simulate(Hysteresis(), PLANT, COST, x0[2:11], dt=0.02, steps=100, compile=True)
     assert torch.equal(alone.state[0], runs[0].state[2])
+    assert torch.equal(alone.state[3:], runs[0].state[5:11])
 
 
 class Broken(Hysteresis):

@@ -124,9 +124,17 @@ def test_costs_with_outputs_discount_and_blind_directions() -> None:
     for cost in (seen, blind, adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1, discount=0.7)):
         for period in (None, 0.2):
             lqr = adp.LQR(linear, cost, period=period)
-            dt = period or 0.01
+            dt = period or 0.02
             run = adp.simulate(
-                adp.Feedback(lqr), linear, cost, x0, dt=dt, steps=round(30 / dt), every=10, substeps=4
+                adp.Feedback(lqr),
+                linear,
+                cost,
+                x0,
+                dt=dt,
+                steps=round(16 / dt),
+                every=10,
+                substeps=2,
+                compile=True,
             )
             assert float(run.cost) == pytest.approx(float(lqr.value(x0)), rel=2e-4)
     unseen = adp.QuadraticCost([[0.0, 0.0], [0.0, 1.0]], 1.0, dim=2, inputs=1)

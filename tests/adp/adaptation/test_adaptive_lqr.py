@@ -111,16 +111,13 @@ def test_a_design_that_cannot_be_made_leaves_the_robust_policy_and_not_a_dead_ro
 
 
 @pytest.mark.needs_compiler
-@pytest.mark.parametrize("case", ["filter", "rollout"])
-def test_compiled_steps_are_those_of_the_definition(case: str) -> None:
+def test_compiled_steps_are_those_of_the_definition() -> None:
     more = {
-        "rollout": {"a_step": 1, "rollout": adp.RolloutPolicy.of_lqr(PENDULUM, COST, steps=2)},
-        "filter": {
-            "a_step": 2,
-            "probe": 1.0,
-            "filter": adp.ConsiderFilter(PENDULUM, noise=0.01, process=0.01),
-        },
-    }[case]
+        "a_step": 2,
+        "probe": 1.0,
+        "filter": adp.ConsiderFilter(PENDULUM, noise=0.01, process=0.01),
+        "rollout": adp.RolloutPolicy.of_lqr(PENDULUM, COST, steps=2),
+    }
     controller = adp.Measured(adaptive(**more), noise=0.01, dim=2)
     loop = ClosedLoop(controller, CHANGING, CHANGING.cost(COST), dt=0.005)
     z0 = CHANGING.start(uniform(9, 2, seed=1), (1.5 + uniform(9, 2, seed=2)) * TRUE)
