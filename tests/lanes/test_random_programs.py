@@ -60,8 +60,8 @@ SPECIAL = (0.0, -0.0, 1.0, -1.0, torch.inf, -torch.inf, torch.nan, 5e-324, -1e-3
 Drawn = list[tuple[str, int, int]]
 drawn = st.lists(
     st.tuples(st.sampled_from(sorted(ONE | TWO)), st.integers(0, 50), st.integers(0, 50)),
-    min_size=25,
-    max_size=40,
+    min_size=12,
+    max_size=25,
 )
 
 
