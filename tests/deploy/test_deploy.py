@@ -95,7 +95,7 @@ CONTROLLERS = {
 }
 
 
-@pytest.mark.parametrize("name", ["actor", "actor_partial", "actor_gaussian", "quadratic", "rbf_grid"])
+@pytest.mark.parametrize("name", ["actor_partial", "actor_gaussian", "quadratic", "rbf_grid"])
 def test_a_policy_is_traced_for_every_batch_whether_its_basis_has_a_closed_form_or_not(name: str) -> None:
     policy = deploy.policy_of(CONTROLLERS[name])
     program = deploy.trace(policy, torch.zeros(1, 2, dtype=torch.float64)).module()
