@@ -125,6 +125,8 @@ def test_a_sweep_is_that_of_the_command_and_shows_nothing(
     assert found.filter("kernel=matern").sort("ball_error")[0].setting("kernel") == "matern"
     assert "<b>" in found._repr_html_()
     assert len(staf_torch.read_runs(two)) == 4
+    assert list(best.figures()) == ["gradient_chase"]  # the run drew none: drawn anew
+    assert not (best.directory / "figures").exists()
 
 
 @pytest.mark.usefixtures("_untouched")
@@ -239,17 +241,14 @@ def test_tables_for_pandas_name_the_extra(monkeypatch: pytest.MonkeyPatch) -> No
         runs.to_pandas()
 
 
-def test_own_function_to_figure_in_six_lines_of_a_notebook_that_draws_anew_what_was_not_drawn() -> None:
+def test_own_function_to_figure_in_six_lines_of_a_notebook() -> None:
     Path("mine.py").write_text("def valley(x):\n    return x[..., 0] ** 2 + x[..., 0] * x[..., 1] ** 3\n")
     # pip install staf_torch
     from staf_torch import run
 
-    found = run("target=custom", "target.path=mine.valley", *BARE)
+    found = run("target=custom", "target.path=mine.valley", *SHORT)
     assert found.metrics["ball_error"] < 0.1
-    ((name, figure),) = found.figures().items()
-    assert name == "gradient_chase"
-    assert isinstance(figure, Figure)
-    assert not (found.directory / "figures").exists()
+    assert isinstance(found.figures()["gradient_chase"], Figure)
 
 
 @pytest.mark.parametrize("frozen", [True, False])
