@@ -39,7 +39,7 @@ def continuous(law: ActorCriticLaw, duration: float) -> tuple[Tensor, adp.Weight
 
     time = 0.0
     while time < duration - 1e-12:
-        h = min(0.02, 1e-3 + 6e-3 * time, duration - time)
+        h = min(0.1, 1e-3 + 0.02 * time, duration - time)
         k1 = field(y)
         k2 = field(ahead(y, k1, h / 2))
         k3 = field(ahead(y, k2, h / 2))

@@ -21,6 +21,7 @@ from staf_torch import (
     StateRadius,
     adp,
     ball,
+    rings,
     systems,
 )
 from staf_torch.adp.closed_loop import ClosedLoop, LoopState, program, row_gains
@@ -56,16 +57,19 @@ def of_lqr(
     return adp.Feedback(adp.LQR(plant, cost)), plant, cost
 
 
-def rollout(**settings: object) -> tuple[adp.Controller, systems.ControlAffineSystem, adp.Cost]:
-    return adp.Feedback(adp.RolloutPolicy.of_lqr(PLANT, COST, **settings)), PLANT, COST  # type: ignore[arg-type]
+def rollout() -> tuple[adp.Controller, systems.ControlAffineSystem, adp.Cost]:
+    lqr = adp.LQR(PLANT, COST)  # as in `test_adp_rollout.py`, whose program serves here too
+    basis = StaFBasis(ExponentialKernel(), StateFollowingCenters(rings(6), 0.1))
+    policy = adp.RolloutPolicy(basis, PLANT, COST, lqr, lqr.value, horizon=0.5, steps=5)
+    return adp.Feedback(policy), PLANT, COST
 
 
 def three_states() -> tuple[adp.Controller, systems.ControlAffineSystem, adp.Cost]:
     plant = systems.ThreeState()
-    centers = StateFollowingCenters(ball(8, 3), StateRadius(0.7, 1e-5))
+    centers = StateFollowingCenters(ball(8, 3), StateRadius(0.7, 0.0, 2.0))  # as in `test_adp_laws.py`
     basis = adp.StaFValueBasis(StaFBasis(AnchoredKernel(ExponentialKernel()), centers))
     cost = quadratic(plant)
-    return adp.ActorCritic(basis, plant, cost, adp.RandomPoints(1, BOX)), plant, cost
+    return adp.ActorCritic(basis, plant, cost, adp.RandomPoints(1, 0.24)), plant, cost
 
 
 def of_basis(
@@ -104,7 +108,7 @@ CASES: dict[str, Callable[[], tuple[adp.Controller, systems.ControlAffineSystem,
     "three states": three_states,
     "quadrotor": lambda: of_lqr(systems.PlanarQuadrotor()),
     "foreign plant": lambda: of_lqr(Foreign()),
-    "rollout": lambda: rollout(radius=StateRadius(0.1, 1e-2)),
+    "rollout": rollout,
 }
 
 

@@ -93,7 +93,7 @@ def test_no_change_of_a_plan_lowers_what_it_costs() -> None:
 @pytest.mark.compiled
 @pytest.mark.needs_compiler
 def test_a_plan_leads_around_and_is_compiled_as_it_is_defined(caplog: pytest.LogCaptureFixture) -> None:
-    plans = adp.DetourPlans(detours(steps=6), first=2)
+    plans = adp.DetourPlans(detours(steps=4), first=1)
     guard = adp.SafetyFilter(plans, PLANE, disc, dt=0.2, low=-1.0, high=1.0, decay=3.0)
     defined = adp.simulate(guard, PLANE, COST, BESIDE, steps=2, compile=False)
     compiled = adp.simulate(guard, PLANE, COST, BESIDE, steps=40, compile=True)
@@ -176,16 +176,16 @@ def test_a_plan_that_costs_more_than_expected_is_left_for_another_way() -> None:
         appearing,
         axes=torch.eye(2, 4),
         dt=0.2,
-        steps=10,
+        steps=7,
         terminal=LQR.value,
         margin=0.02,
         sizes=[0.6],
-        lengths=[4],
+        lengths=[3],
     )
-    plans = adp.DetourPlans(ways, first=4)
+    plans = adp.DetourPlans(ways, first=2)
     x = BESIDE
     carried = plans.init(x).identifier
-    idle = torch.zeros(1, 20).double()
+    idle = torch.zeros(1, 14).double()
     done = torch.ones(1, 1).double()
     for control, expected, other in (
         (idle, 1.0, True),
@@ -198,9 +198,9 @@ def test_a_plan_that_costs_more_than_expected_is_left_for_another_way() -> None:
         assert bool(found < alone) is other
         assert bool(found <= alone)
     # Where nothing is in its way a plan costs what was expected of it, so that no other is looked for.
-    free = adp.DetourPlans(detours(steps=8), first=2)
+    free = adp.DetourPlans(detours(steps=4), first=2)
     u, after = free.step(AWAY, free.init(AWAY), AWAY, 0.2)
-    ahead, given = free._problem._advance(AWAY, u), after.identifier[:, :-2].unflatten(-1, (8, 2))
+    ahead, given = free._problem._advance(AWAY, u), after.identifier[:, :-2].unflatten(-1, (4, 2))
     others, later = free._problem.others(ahead), after.identifier[:, -1:]
     total = free._problem.follow(ahead, others, later, given, lambda y, others, u, k: u).total
     torch.testing.assert_close(total, after.identifier[:, -2], rtol=1e-9, atol=1e-12)
