@@ -205,7 +205,8 @@ def test_partial_gradient_is_the_same_law_from_twice_the_weights() -> None:
         controller = adp.ActorCritic(
             staf_basis(mode), PLANT, COST, adp.RandomPoints(1, BOX), critic=0.4 * scale, actor=0.28 * scale
         )
-        run = adp.simulate(controller, PLANT, COST, x0, dt=0.005, steps=400, every=400, compile=True)
+        compile = mode == "total"  # the program of other tests
+        run = adp.simulate(controller, PLANT, COST, x0, dt=0.01, steps=200, every=200, compile=compile)
         assert not run.diverged.any()
         costs.append(run.cost)
     assert float(costs[1].median()) < 1.3 * float(costs[0].median())

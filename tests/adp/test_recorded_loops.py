@@ -22,6 +22,8 @@ COST = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
 LQR = adp.LQR(PLANT, COST)
 X0 = tensor([[-1.0, 1.0], [0.7, 0.4], [1.9, -1.6]])
 HANGING = tensor([[3.0, 0.2], [-2.5, 0.5], [0.3, -0.4]])
+DOUBLE = systems.Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])  # of `test_near_optimal.py`: one program
+PUSHED = tensor([[2.0, 1.0], [0.05, 0.0]])  # from the first the LQR would meet a bound
 LIMITED = adp.QuadraticCost(1.0, 0.3, dim=2, inputs=1, low=-2.0, high=1.5)
 PLANE = systems.Linear(torch.eye(4).roll(2, dims=1).triu().tolist(), torch.eye(4)[:, 2:].tolist())
 COST4 = adp.QuadraticCost(1.0, 1.0, dim=4, inputs=2, low=-1.0, high=1.0)
@@ -181,15 +183,15 @@ def tracked(source: str) -> Any:
 
 
 def near_optimal(
-    plant: Any, cost: adp.Cost, x0: Tensor, steps: int, report: bool = True, **given: Any
+    plant: Any, cost: adp.Cost, x0: Tensor, steps: int, report: float = 0.4, **given: Any
 ) -> Any:
     policy = adp.near_optimal(plant, cost, **given)
     with torch.no_grad():
         run = loop(policy.controller(), plant, cost, x0, steps, policy.period)
-        if not report:  # it takes a second of loops
+        if not report:  # of states so far away: it takes a second of loops
             return run, policy(x0), policy.rollout(x0), policy.steps, policy.substeps
         lanes.ready(policy, x0)  # the report does so at its end
-        said = policy.report(states=3, spread=0.4, optimum=False, seed=1)
+        said = policy.report(states=3, spread=report, optimum=False, seed=1)
         return run, policy(x0), policy.rollout(x0), {k: v for k, v in said.items() if k != "microseconds"}
 
 
@@ -305,13 +307,13 @@ CASES: dict[str, Callable[[], Any]] = {
     "concurrent tracker of slopes": lambda: tracked("slope"),
     "near optimal": lambda: near_optimal(PLANT, COST, X0, 3, dt=0.1, horizon=0.8),
     "near optimal, by the rules": lambda: near_optimal(
-        systems.Pendulum(), COST, 0.3 * X0, 8, report=False, dt=0.05
+        systems.Pendulum(), COST, 0.3 * X0, 8, report=0.0, dt=0.05
     ),
     "near optimal within bounds": lambda: near_optimal(
-        systems.Pendulum(), COST, 0.4 * X0[:2], 3, report=False, dt=0.1, low=-4.0, high=6.0
+        *(DOUBLE, COST, PUSHED, 5), report=0.0, dt=0.25, low=-1.0, high=1.0
     ),
     "near optimal that plans": lambda: near_optimal(
-        systems.Pendulum(), COST, 0.4 * X0[:2], 3, dt=0.1, low=-4.0, high=6.0, plan=True
+        *(DOUBLE, COST, PUSHED, 4), report=0.8, dt=0.25, low=-1.0, high=1.0, plan=True
     ),
     "near optimal of a simulator": lambda: near_optimal(SIMULATOR, LIMITED, 0.2 * X0, 6),
     "receding horizon": swung,
