@@ -273,6 +273,8 @@ class Program:
                 made = self._known(given, copies)
             if (lines := made.text.source.count("\n")) > _LONGEST:
                 raise NotLoweredError(f"the program is {lines} lines long, which take a compiler minutes")
+            if not self._alone(given):  # before a compiler is asked for what would not be used
+                return None
             call = compiler.function(made.text.source)
         except (NotLoweredError, OSError) as error:
             _say(self.name, str(error), "no build" if isinstance(error, OSError) else None)
