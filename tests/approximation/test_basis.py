@@ -9,7 +9,7 @@ import mpmath
 import pytest
 import torch
 from helpers import basis_of, centers_of, tensor, uniform
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as some
 from variants import KERNELS, TARGETS, over
 
@@ -83,6 +83,7 @@ def test_batch_equals_loop(name: str) -> None:
 
 
 @over(KERNELS)
+@settings(max_examples=8)
 @given(seed=SEEDS)
 def test_ideal_weights_minimise_the_native_error(name: str, seed: int) -> None:
     basis = basis_of(name, radius=0.7)

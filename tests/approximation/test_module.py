@@ -13,7 +13,7 @@ from variants import KERNELS, RADII, over
 import staf_torch as st
 from staf_torch.targets import Cosine, Paper
 
-BATCHES = ((), (4,), (2, 3))
+BATCHES = ((), (2, 3))
 STEP = 1e-5
 
 

@@ -104,6 +104,7 @@ CASES: dict[str, Callable[[], Any]] = {
             )
         )
         for law, predictor in PAIRS
+        if law != "heavy ball" or predictor in LARGE
         for count in ((3, 10) if law == "steepest descent" and predictor in LARGE else (3,))
     },
     "cholesky": lambda: of_a_matrix(torch.linalg.cholesky, 5),

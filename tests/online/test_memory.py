@@ -51,7 +51,7 @@ def test_weights_are_a_partition_of_unity() -> None:
     basis = st.StaFBasis(st.PolynomialKernel(2), basis.centers)
     target = st.targets.Quadratic([[2.0, 0.5], [0.5, 1.0]])
     memory = filled(st.ExperienceMemory(basis, 40), circle(40), target)
-    y = circle(171) * 1.05
+    y = circle(57) * 1.05
     torch.testing.assert_close(memory(y), target(y), rtol=0, atol=1e-9)
     expected = 2 * y @ tensor([[2.0, 0.5], [0.5, 1.0]])
     torch.testing.assert_close(memory.gradient(y), expected, rtol=0, atol=1e-7)
@@ -167,7 +167,7 @@ def test_bad_arguments_are_named() -> None:
 
 
 def settings(*overrides: str) -> DictConfig:
-    small = ["memory.states=40", "memory.revisits=8", "memory.steps=40", "settle_time=2", "duration=5.2"]
+    small = ["memory.states=20", "memory.revisits=4", "memory.steps=20", "settle_time=2", "duration=4"]
     return composing.settings("experiment=memory", *small, *overrides)
 
 
