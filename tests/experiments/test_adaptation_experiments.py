@@ -15,15 +15,20 @@ from staf_torch.experiments import faults, icl
 
 
 def test_faults_leave_a_row_a_case_and_method(tmp_path: Path) -> None:
-    cfg = settings("experiment=faults", "trajectories=2", "duration=0.03", "faults.cases=[mass,short_period]")
+    cfg = settings(
+        "experiment=faults",
+        "trajectories=2",
+        "duration=0.02",
+        "figures=false",
+        "faults.cases=[mass,short_period]",
+    )
     metrics = faults.run(cfg, tmp_path)
     assert json.loads((tmp_path / "metrics.json").read_text()) == metrics
     lines = (tmp_path / "faults.md").read_text().splitlines()
     assert len(lines) == 2 + 6
     # Before anything is known the adaptive policy is not the informed one; the optimum is below all.
     assert metrics["mass_adaptive_cost_median"] != metrics["mass_informed_LQR_cost_median"]
-    assert metrics["short_period_adaptive_parameter_error"] < 1e-4  # found within 30 ms
-    assert (tmp_path / "figures" / "faults.png").stat().st_size > 10_000
+    assert metrics["short_period_adaptive_parameter_error"] < 1e-4  # found within 20 ms
 
 
 def test_integral_and_derivative_see_the_same_plant_and_gains(tmp_path: Path) -> None:

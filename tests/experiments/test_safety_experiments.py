@@ -19,7 +19,7 @@ SHORT = ("duration=0.02", "dt=0.01", "trajectories=2", "adp.optimum.shooting=fal
 
 
 def test_the_box_has_a_row_a_method_and_keeps_what_starts_inside(tmp_path: Path) -> None:
-    cfg = settings("experiment=safe_box", *SHORT, *FEW)
+    cfg = settings("experiment=safe_box", *SHORT, *FEW, "figures=false")
     metrics = safe_box.run(cfg, tmp_path)
     assert json.loads((tmp_path / "metrics.json").read_text()) == metrics
     assert metrics["constraint_violations"] == 0
@@ -32,7 +32,6 @@ def test_the_box_has_a_row_a_method_and_keeps_what_starts_inside(tmp_path: Path)
     )
     assert metrics["lqr_of_x_filtered_cost"] == metrics["lqr_of_x_cost"]  # bit for bit: no wall is near
     assert len((tmp_path / "safe_box.csv").read_text().splitlines()) == 6
-    assert (tmp_path / "figures" / "safe_box.png").stat().st_size > 5000
     with np.load(tmp_path / "history.npz") as history:
         assert history["state"].shape == history["barrier_state"].shape == (2, 3, 2)
         assert float(history["margin"].min()) == pytest.approx(metrics["minimum_margin"])
@@ -51,6 +50,7 @@ def test_among_discs_the_filter_has_a_row_beside_the_lqr_and_a_film(tmp_path: Pa
         "trajectories=3",
         "adp.compile=false",
         "animation=gif",
+        "figures=false",
         "avoidance.discs=2",
     )
     cfg = settings("experiment=avoidance", *short)
@@ -59,15 +59,14 @@ def test_among_discs_the_filter_has_a_row_beside_the_lqr_and_a_film(tmp_path: Pa
     assert metrics["constraint_violations"] == metrics["lqr_constraint_violations"] == 0
     assert metrics["cost"] >= 0.99 * metrics["lqr_cost"]
     assert len((tmp_path / "avoidance.csv").read_text().splitlines()) == 3
-    for name in ("avoidance.png", "avoidance.gif"):
-        assert (tmp_path / "figures" / name).stat().st_size > 5000
+    assert (tmp_path / "figures" / "avoidance.gif").stat().st_size > 5000
     with np.load(tmp_path / "history.npz") as history:
         assert history["state"].shape == (3, 6, 12)
         assert float(history["distance"].min()) == pytest.approx(metrics["minimum_margin"])
 
 
 def test_a_unicycle_keeps_off_the_discs_that_its_policy_drives_into(tmp_path: Path) -> None:
-    short = ("duration=4", "dt=0.1", "trajectories=6", "figures=false", "history=false", "adp.compile=false")
+    short = ("duration=4", "dt=0.2", "trajectories=6", "figures=false", "history=false", "adp.compile=false")
     cfg = settings("experiment=avoidance", "avoidance.vehicle=unicycle", "avoidance.discs=2", *short)
     metrics = avoidance.run(cfg, tmp_path)
     assert metrics["constraint_violations"] == 0 < metrics["lookahead_constraint_violations"]
