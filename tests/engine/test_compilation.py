@@ -61,11 +61,10 @@ for name, changed in faults.items():  # each in a fork, so that torch is importe
     os.environ.update(changed)
     tempfile.tempdir = os.environ.get("TMPDIR")
     basis = st.StaFBasis(st.ExponentialKernel(), st.StateFollowingCenters(st.rings(3), 0.1))
-    for dtype in (torch.float64, torch.float32):
-        for run in (st.chase, st.chase_weights):
-            states = torch.ones(2, 17, 2, dtype=dtype)
-            weights = run(states, basis, st.targets.Paper(), st.optim.SteepestDescent())
-            assert weights.weights.isfinite().all()
+    for dtype, run in ((torch.float64, st.chase), (torch.float32, st.chase_weights)):
+        states = torch.ones(2, 17, 2, dtype=dtype)
+        weights = run(states, basis, st.targets.Paper(), st.optim.SteepestDescent(), inner_steps=2)
+        assert weights.weights.isfinite().all()
     sys.stdout.flush()
     os._exit(0)
 """
