@@ -15,7 +15,7 @@ from torch import Tensor
 
 import staf_torch as st
 from staf_torch import lanes
-from staf_torch.lanes import Program
+from staf_torch.lanes import Program, compiler
 from staf_torch.lanes import program as programs
 from staf_torch.lanes.alone import undrawn
 from staf_torch.lanes.content import reads_users_code
@@ -68,8 +68,11 @@ def _nothing_was_said(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("name", OTHERS)
-def test_what_is_no_function_of_a_row_is_not_compiled(name: str, caplog: pytest.LogCaptureFixture) -> None:
+def test_what_is_no_function_of_a_row_is_not_compiled(
+    name: str, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
     function, reason = OTHERS[name]
+    monkeypatch.setattr(compiler, "function", None)  # which nobody asks in vain
     program = Program(lambda x, _, __: (x, function(x)))
     assert not program.compiles(X, steps=3)
     (line,) = caplog.messages
