@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import importlib
 import importlib.util
 import logging
@@ -54,8 +55,13 @@ class Callbacks:
         self.told.append(("end", config.hydra.job.num, job_return.status))
 
 
+@functools.cache
+def whole_composer() -> Composer:
+    return Composer(config_loader())
+
+
 def composed(place: Path, num: int, *lines: str) -> tuple[DictConfig, DictConfig]:
-    whole = Composer(config_loader())([f"hydra.sweep.dir={place}", *lines])
+    whole = whole_composer()([f"hydra.sweep.dir={place}", *lines])
     with read_write(whole.hydra), open_dict(whole.hydra):
         whole.hydra.job.num, whole.hydra.job.id = num, str(num)
     own = [line for line in lines if "hydra" not in line]

@@ -178,7 +178,6 @@ def test_members_are_the_product_of_lists() -> None:
     expected = [[f"seed={s}", f"kernel={k}"] for s in (1, 2) for k in ("gaussian", "matern")]
     assert list(member_overrides(lists, config_loader())) == expected
     assert list(member_overrides("seed=1,2", config_loader())) == [["seed=1"], ["seed=2"]]
-    assert len(member_overrides(["seed=range(1000000)"], config_loader())) == 10**6
     for setting, words in (
         ([], "must be a list of overrides, like 'seed=range"),
         (None, "must be a list of overrides, like 'seed=range"),
