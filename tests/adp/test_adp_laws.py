@@ -160,7 +160,7 @@ def test_information_matrix_stays_positive_definite() -> None:
     "law", [adp.Information(bound=0.5), adp.Published(bound=0.5)], ids=["information", "published"]
 )
 def test_projection_keeps_the_weights_in_their_ball(law: ActorCriticLaw) -> None:
-    run = adp.simulate(learner(law), PLANT, COST, uniform(10, 1.0), dt=0.005, steps=200, every=1)
+    run = adp.simulate(learner(law), PLANT, COST, uniform(10, 1.0), dt=0.01, steps=80, every=1)
     for weights in (run.critic_weights, run.actor_weights):
         norms = weights[:, 1:].norm(dim=-1)
         assert norms.max() <= 0.5 + 1e-12

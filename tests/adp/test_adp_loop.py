@@ -27,7 +27,7 @@ def controllers() -> list[adp.Controller]:
 @pytest.mark.parametrize("controller", controllers(), ids=lambda c: type(c).__name__)
 def test_rows_are_alone(controller: adp.Controller) -> None:
     x0 = uniform(4, 1.0)
-    settings = {"dt": 0.005, "steps": 40}
+    settings = {"dt": 0.005, "steps": 16}
     whole = adp.simulate(controller, PLANT, COST, x0, seed=10, **settings)
     for row in range(4):
         alone = adp.simulate(controller, PLANT, COST, x0[row : row + 1], seed=10 + row, **settings)
@@ -46,8 +46,8 @@ class Broken(systems.TwoState):
 
 def test_row_of_a_plant_that_returns_nan_freezes_and_the_others_do_not_notice() -> None:
     x0 = torch.tensor([[-1.0, 1.0], [0.7, 1.5], [0.5, -0.5]], dtype=torch.float64)
-    run = adp.simulate(adp.Feedback(LQR), Broken(), COST, x0, dt=0.01, steps=300)
-    sound = adp.simulate(adp.Feedback(LQR), PLANT, COST, x0, dt=0.01, steps=300)
+    run = adp.simulate(adp.Feedback(LQR), Broken(), COST, x0, dt=0.01, steps=120)
+    sound = adp.simulate(adp.Feedback(LQR), PLANT, COST, x0, dt=0.01, steps=120)
     assert run.diverged.tolist() == [False, True, False]
     assert 0 < float(run.frozen_at[1]) < 1
     for row in (0, 2):
@@ -56,7 +56,7 @@ def test_row_of_a_plant_that_returns_nan_freezes_and_the_others_do_not_notice() 
     assert torch.isfinite(run.cost).all()
     frozen = round(float(run.frozen_at[1]) / 0.01)
     torch.testing.assert_close(
-        run.state[1, frozen:], run.state[1, frozen].expand(301 - frozen, 2), rtol=0, atol=0
+        run.state[1, frozen:], run.state[1, frozen].expand(121 - frozen, 2), rtol=0, atol=0
     )
     assert torch.isnan(run.control[1, frozen:]).all()
 

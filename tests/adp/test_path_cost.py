@@ -11,7 +11,7 @@ from staf_torch.numerics.forward_mode import use_forward_mode
 
 use_forward_mode()
 
-DT, STEPS = 0.1, 30
+DT, STEPS = 0.1, 20
 NONE = torch.empty(0, dtype=torch.float64)
 X0 = torch.tensor([[0.2, 0.0, 0.0], [-0.4, 1.0, 0.0]], dtype=torch.float64)
 

@@ -178,7 +178,7 @@ def test_discs_that_move_and_appear_are_avoided_within_the_bounds() -> None:
 def test_rows_that_cannot_be_kept_are_named() -> None:
     guard = adp.SafetyFilter(lambda x: -x[..., 1:], LINE, wall, dt=0.05, low=-1.0, high=1.0)
     x0 = tensor([[1.0, 0.0], [0.0, -2.0], [2.0, 0.0]])
-    run = adp.simulate(guard, LINE, COST, x0, steps=20, compile=False)
+    run = adp.simulate(guard, LINE, COST, x0, steps=8, compile=False)
     report = guard.report(run)
     assert report["infeasible"] == [1]
     assert report["constraint_violations"] == 1
