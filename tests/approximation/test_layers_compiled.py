@@ -119,7 +119,7 @@ class ValueAndGradient(nn.Module):
     ("name", "strict"),
     [
         ("exponential", True),  # the front end of torch.compile; the others by the default one
-        *((name, False) for name in ("gaussian", "matern52", "anchored_gaussian")),
+        *((name, False) for name in ("gaussian", "anchored_gaussian")),
     ],
 )
 @pytest.mark.filterwarnings("ignore::UserWarning")  # torch 2.6, of its own nodes

@@ -106,7 +106,7 @@ def test_around_one_anchor_the_filter_is_gaussian_process_regression(kernel: str
 
 @pytest.mark.parametrize("kernel", ["exponential", "gaussian", "matern52", "polynomial", "user_defined"])
 def test_drifting_functions_are_predicted(kernel: str) -> None:
-    x, y = walks(8, 100)
+    x, y = walks(8, 80)
     model = st.StaFRegressor(KERNELS[kernel].make(), radius=0.4, noise=0.05)
     errors = []
     for state, value in zip(x, y, strict=True):
