@@ -14,23 +14,6 @@ from omegaconf import OmegaConf
 from staf_torch.experiments import faults, icl
 
 
-def test_faults_leave_a_row_a_case_and_method(tmp_path: Path) -> None:
-    cfg = settings(
-        "experiment=faults",
-        "trajectories=2",
-        "duration=0.02",
-        "figures=false",
-        "faults.cases=[mass,short_period]",
-    )
-    metrics = faults.run(cfg, tmp_path)
-    assert json.loads((tmp_path / "metrics.json").read_text()) == metrics
-    lines = (tmp_path / "faults.md").read_text().splitlines()
-    assert len(lines) == 2 + 6
-    # Before anything is known the adaptive policy is not the informed one; the optimum is below all.
-    assert metrics["mass_adaptive_cost_median"] != metrics["mass_informed_LQR_cost_median"]
-    assert metrics["short_period_adaptive_parameter_error"] < 1e-4  # found within 20 ms
-
-
 def test_integral_and_derivative_see_the_same_plant_and_gains(tmp_path: Path) -> None:
     short = ("trajectories=3", "dt=0.005", "duration=0.3", "settle_time=0.1", "icl.length=[0.02,0.04]")
     metrics = icl.run(settings("experiment=icl", "figures=false", *short), tmp_path)

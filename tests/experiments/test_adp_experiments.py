@@ -82,16 +82,6 @@ def test_experiment_writes_its_run_directory(overrides: list[str], tmp_path: Pat
         assert (tmp_path / "figures" / cfg.task).with_suffix(ending).stat().st_size > 5000
 
 
-def test_comparison_writes_a_row_a_method(tmp_path: Path) -> None:
-    cfg = settings("experiment=adp_comparison", "duration=0.01", "trajectories=1", "adp.order=2")
-    adp_comparison.run(cfg, tmp_path)
-    lines = (tmp_path / "comparison.csv").read_text().splitlines()
-    assert len(lines) == 13
-    assert lines[0].startswith("method,functions,points,ratio_median")
-    assert len((tmp_path / "comparison.md").read_text().splitlines()) == 14
-    assert (tmp_path / "figures" / "adp_comparison.png").stat().st_size > 5000
-
-
 def test_comparison_takes_a_plant_whose_optimum_no_formula_knows(tmp_path: Path) -> None:
     pytest.importorskip("scipy")
     overrides = ["system=van_der_pol", "duration=0.01", "trajectories=1", "adp.order=2", "figures=false"]

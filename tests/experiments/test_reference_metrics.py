@@ -90,6 +90,13 @@ def test_every_experiment_has_recorded_metrics() -> None:
     assert json.loads(RECORDED.read_text()).keys() == CASES.keys()
 
 
+def test_what_is_recorded_of_faults_is_what_is_claimed_of_them() -> None:
+    """The adaptive policy knows nothing at first, so is not the informed one; it finds what failed at once."""
+    recorded = json.loads(RECORDED.read_text())["faults from the start"]
+    assert recorded["mass_adaptive_cost_median"] != recorded["mass_informed_LQR_cost_median"]
+    assert recorded["short_period_adaptive_parameter_error"] < 1e-4
+
+
 def left_in(directory: Path) -> dict[str, object]:
     """Columns of tables and arrays of histories, without what was measured by a clock."""
     found: dict[str, object] = {}
@@ -133,6 +140,7 @@ def test_metrics_are_the_recorded_ones(
     told: list[float] = []
     found = metrics_of(name, tmp_path, figures=True, told=told)
     assert found.keys() == recorded.keys()
+    assert json.loads((tmp_path / "metrics.json").read_text()) == found
     for metric, number in recorded.items():
         if metric.startswith(FAILING):
             continue
