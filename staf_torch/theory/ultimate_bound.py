@@ -328,12 +328,13 @@ def paper_step(
 
 
 def _ascend(function: Callable[[Tensor], Tensor], like: Tensor, radius: Tensor) -> Tensor:
-    """max of a function (..., M) -> (...) over |a| <= radius at each of N states, ``like`` being (N, M), by
+    """max of a function (..., M) -> (...) over |a| <= radius at each state, ``like`` being (..., M), by
     normalised gradient ascent on the sphere from all starts side by side."""
     generator = torch.Generator().manual_seed(0)
     drawn = [torch.randn(like.shape[-1], generator=generator, dtype=torch.float64) for _ in range(_STARTS)]
     starts = torch.stack(drawn).to(like)
-    a = (radius * starts / starts.norm(dim=-1, keepdim=True)).unsqueeze(1).expand(-1, *like.shape)
+    starts = radius * starts / starts.norm(dim=-1, keepdim=True)
+    a = starts.view(_STARTS, *[1] * (like.dim() - 1), -1).expand(-1, *like.shape)
     for _ in range(_ASCENTS):
         gradient: Tensor = torch.func.grad(lambda at: function(at).sum())(a)
         a = radius * gradient / gradient.norm(dim=-1, keepdim=True)
