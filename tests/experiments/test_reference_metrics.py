@@ -91,7 +91,7 @@ def test_every_experiment_has_recorded_metrics() -> None:
 
 
 def test_what_is_recorded_of_faults_is_what_is_claimed_of_them() -> None:
-    """The adaptive policy knows nothing at first, so is not the informed one; it finds what failed at once."""
+    """The adaptive policy knows nothing at first, so is not the informed one; it finds a failure at once."""
     recorded = json.loads(RECORDED.read_text())["faults from the start"]
     assert recorded["mass_adaptive_cost_median"] != recorded["mass_informed_LQR_cost_median"]
     assert recorded["short_period_adaptive_parameter_error"] < 1e-4
