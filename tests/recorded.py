@@ -9,6 +9,7 @@ held here. A change that is meant is seen in the difference of `tests/recorded/`
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 import math
 from collections.abc import Iterator, Mapping
@@ -95,6 +96,13 @@ def differences(found: Numbers, kept: Mapping[str, Any], rtol: float) -> list[st
     return sorted(said)
 
 
+@functools.cache
+def _kept(path: Path) -> dict[str, Any]:
+    """What is recorded in a file, which is read once."""
+    found: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
+    return found
+
+
 class Record:
     """Compares what a test found with what is recorded under its name, or records it."""
 
@@ -106,8 +114,7 @@ class Record:
 
     def known(self) -> dict[str, Any]:
         """What is recorded of this test."""
-        kept = json.loads(self.path.read_text()) if self.path.exists() else {}
-        found: dict[str, Any] = {} if self.writes else kept.get(self.name, {})
+        found: dict[str, Any] = {} if self.writes else _kept(self.path).get(self.name, {})
         return found
 
     def __call__(self, value: Any, *, rtol: float = 1e-6, texts: bool = True, without: str = "\n") -> None:
@@ -116,13 +123,14 @@ class Record:
         Parts whose path begins with ``without`` are not asked here, as those of another version are not.
         """
         found = {path: part for path, part in numbers(value).items() if texts or not isinstance(part, str)}
-        known = json.loads(self.path.read_text()) if self.path.exists() else {}
         if self.writes:
+            known = json.loads(self.path.read_text()) if self.path.exists() else {}
             known[self.name] = found
             FOLDER.mkdir(exist_ok=True)
             lines = [f" {json.dumps(name)}: {json.dumps(known[name])}" for name in sorted(known)]
             self.path.write_text("{\n" + ",\n".join(lines) + "\n}\n")
             return
+        known = _kept(self.path)
         assert self.name in known, f"nothing is recorded of {self.name}: run it with --record"
         kept = {path: part for path, part in known[self.name].items() if not path.startswith(without)}
         found = {path: part for path, part in found.items() if not path.startswith(without)}
