@@ -68,8 +68,13 @@ def python_blocks(path: Path) -> list[tuple[int, str]]:
     return [(text[: block.start(1)].count("\n"), block[1]) for block in found]
 
 
-@pytest.mark.compiled
-@pytest.mark.parametrize("path", [p for p in [README, *MANUALS] if python_blocks(p)], ids=name)
+def asked(path: Path) -> object:
+    """A page, whose chases are compiled where it has long ones."""
+    marks = [pytest.mark.compiled] if path in (README, ROOT / "staf_torch" / "sweeps" / "README.md") else []
+    return pytest.param(path, marks=marks, id=name(path))
+
+
+@pytest.mark.parametrize("path", [asked(p) for p in [README, *MANUALS] if python_blocks(p)])
 def test_python_blocks_of_a_page_run_one_after_another(
     path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import pickle
-import subprocess
 import sys
 import warnings
 
@@ -41,15 +40,6 @@ def test_a_submodule_goes_with_its_package() -> None:
         warnings.simplefilter("ignore")
         from staf_torch.chase.predictors import Secant
     assert Secant is staf_torch.predictors.Secant
-
-
-def test_chase_stays_a_function_also_after_the_old_import() -> None:
-    code = (
-        "import warnings; warnings.simplefilter('ignore'); import staf_torch; before = staf_torch.chase\n"
-        "from staf_torch.chase import chase_weights\n"
-        "assert callable(before) and callable(staf_torch.chase) and callable(chase_weights)"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def test_an_old_pickle_finds_its_classes() -> None:

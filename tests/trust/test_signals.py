@@ -1,4 +1,4 @@
-"""A sweep that a signal ends: with its report and the line that resumes, and to the same table in the end."""
+"""What ends a run or a sweep: signals, with a report and the line that resumes, and kills, without a word."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class AutoExecutor:
         read = paths.result_pickle.read_bytes
         return types.SimpleNamespace(job_id=str(self.count), paths=paths, result=read)
 """
-SIGNALLED = """
+SIGNALLED = '''
 import os, random, signal, sys, time
 import staf_torch.cli.staf as app
 import staf_torch.sweeps.executors.controller as controller
@@ -72,7 +72,31 @@ def start(place, *argv):
 def ended(child):
     return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
 
+def killed_before_a_name(survived):
+    """A run that is killed just before the file after so many others gets its name."""
+    child = os.fork()
+    if child == 0:
+        os.mkdir(f"run{survived}")
+        os.chdir(f"run{survived}")
+        sys.stdout = sys.stderr = open(os.devnull, "w")
+        calls, replace = [], os.replace
+
+        def killing(*names):
+            calls.append(names)
+            if len(calls) > survived:
+                os.kill(os.getpid(), signal.SIGKILL)
+            replace(*names)
+
+        os.replace = killing
+        sys.argv = ["staf", "duration=0.05", "settle_time=0", "figures=false"]
+        app.main()
+        os._exit(0)
+    return child
+
+begin = time.monotonic()
 codes = {"whole": ended(start("whole", *GRID, "hydra.sweep.dir=whole"))}
+whole = time.monotonic() - begin
+codes["runs"] = [ended(killed_before_a_name(survived)) for survived in range(5)]
 chance = random.Random(3)
 for number in (signal.SIGTERM, signal.SIGHUP, signal.SIGINT):
     place = number.name
@@ -81,6 +105,16 @@ for number in (signal.SIGTERM, signal.SIGHUP, signal.SIGINT):
     while not os.path.exists(f"{place}/{jobs}/run.json"):
         time.sleep(0.0005)
     os.kill(child, number)
+    codes[place] = ended(child)
+    codes[f"{place} again"] = ended(start(f"{place}2", f"sweep.resume={place}"))
+
+for place in ("killed0", "killed1"):
+    child = start(place, *GRID, f"hydra.sweep.dir={place}")
+    while not os.path.exists(f"{place}/sweep.json"):  # anywhere from the first file of the sweep on
+        assert os.waitpid(child, os.WNOHANG) == (0, 0), "the sweep ended before it began"
+        time.sleep(0.001)
+    time.sleep(chance.uniform(0, whole))
+    os.kill(child, signal.SIGKILL)
     codes[place] = ended(child)
     codes[f"{place} again"] = ended(start(f"{place}2", f"sweep.resume={place}"))
 
@@ -95,18 +129,26 @@ codes["slurm"] = ended(child)
 codes["slurm again"] = ended(start("slurm2", "sweep.resume=slurm", "hydra.launcher.executor=inline"))
 import json
 print(json.dumps(codes))
-"""
+'''
 
 
-def test_signals_end_a_sweep_with_its_report_and_the_line_that_resumes(tmp_path: Path) -> None:
-    (tmp_path / "submitit.py").write_text(SUBMITIT)
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where sweeps were ended and resumed, by children of one process; `codes.json` says how each ended."""
+    folder = tmp_path_factory.mktemp("signals")
+    (folder / "submitit.py").write_text(SUBMITIT)
     for name, first in (("squeue", "grep -q completed slurm/0/run.json || exit 1"), ("scancel", "")):
-        (tmp_path / name).write_text(f'#!/bin/sh\n{first}\n: > "$0.hangs"\nexec sleep 30\n')
-        (tmp_path / name).chmod(0o755)
+        (folder / name).write_text(f'#!/bin/sh\n{first}\n: > "$0.hangs"\nexec sleep 30\n')
+        (folder / name).chmod(0o755)
     line = [sys.executable, "-c", SIGNALLED]
-    run = subprocess.run(line, cwd=tmp_path, env=environment(), capture_output=True, text=True, check=False)
+    run = subprocess.run(line, cwd=folder, env=environment(), capture_output=True, text=True, check=False)
     assert run.returncode == 0, run.stderr
-    codes = json.loads(run.stdout)
+    (folder / "codes.json").write_text(run.stdout)
+    return folder
+
+
+def test_signals_end_a_sweep_with_its_report_and_the_line_that_resumes(place: Path) -> None:
+    codes = json.loads((place / "codes.json").read_text())
     assert codes["whole"] == 1  # two jobs have a count that there is not
     for name, code, said in (
         ("SIGTERM", 143, "ended by SIGTERM"),
@@ -114,14 +156,51 @@ def test_signals_end_a_sweep_with_its_report_and_the_line_that_resumes(tmp_path:
         ("SIGINT", 130, "interrupted"),
         ("slurm", 143, "ended by SIGTERM; 1 jobs are complete"),  # whose commands hang
     ):
-        log = (tmp_path / f"{name}.log").read_text()
+        log = (place / f"{name}.log").read_text()
         assert codes[name] == code, log
         assert f"staf: {said}" in log
         assert f"staf -m sweep.resume={name}" in log
         assert "report: " in log
         assert codes[f"{name} again"] == 1
-        assert (tmp_path / name / "table.csv").read_text() == (tmp_path / "whole" / "table.csv").read_text()
-    assert "cancels 5 jobs (scancel did not end in time)" in (tmp_path / "slurm.log").read_text()
+        assert (place / name / "table.csv").read_text() == (place / "whole" / "table.csv").read_text()
+    assert "cancels 5 jobs (scancel did not end in time)" in (place / "slurm.log").read_text()
+
+
+def test_a_sweep_killed_at_a_random_time_ends_as_if_it_had_not_been(place: Path) -> None:
+    expected = rows(place / "whole")
+    assert len(expected) == 6
+    assert sum(isinstance(row, str) for row in expected.values()) == 2
+    for name in ("killed0", "killed1"):
+        assert rows(place / name) == expected
+
+
+def test_a_killed_run_leaves_no_file_that_reads_as_complete(place: Path) -> None:
+    """Killed just before a file gets its name: the record that it runs (0), the history (1), the metrics (2),
+    the record that it is complete (3), never (4)."""
+    assert json.loads((place / "codes.json").read_text())["runs"] == [-9, -9, -9, -9, 0]
+    present, status = [], []
+    for survived in range(5):
+        (run,) = (place / f"run{survived}" / "runs").iterdir()
+        present.append({path.name for path in run.glob("*.*") if not path.name.startswith(".")})
+        status.append(json.loads((run / "run.json").read_text())["status"] if survived else None)
+    names = ["staf.log", "run.json", "history.npz", "metrics.json"]
+    assert present == [set(names[:1]), set(names[:2]), set(names[:3]), set(names), set(names)]
+    assert status == [None, "running", "running", "running", "completed"]
+
+
+def rows(sweep: Path) -> dict[str, object]:
+    """Every job of the sweep: its metrics to the last bit, or why it has none."""
+    found: dict[str, object] = {}
+    for job in json.loads((sweep / "sweep.json").read_text())["jobs"]:
+        run = sweep / str(job["num"])
+        about = json.loads((run / "run.json").read_text())
+        assert about["overrides"] == job["overrides"]
+        assert about["status"] in ("completed", "failed")
+        done = about["status"] == "completed"
+        found[" ".join(job["overrides"])] = (
+            json.loads((run / "metrics.json").read_text()) if done else about["reason"]
+        )
+    return found
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
