@@ -37,14 +37,7 @@ NEEDS = {  # what some options cannot do without, or that makes them small
     "centers=directions": ["centers.directions=[[0,1],[1,0],[-1,0]]"],
     "system=cart_pole": ["centers=simplex", "target=quadratic", "initial_state=[0.1,0,0,0]"],
     "system=planar_quadrotor": ["centers=simplex", "target=quadratic", "initial_state=[0.1,0,0,0,0,0]"],
-    "experiment=adp_three_state": ["adp.optimum.shooting=false", "duration=0.01"],
     "experiment=adp_policy_iteration": ["duration=0.01"],
-    "experiment=rivals": [
-        "rivals.plants=[double_integrator]",
-        "rivals.methods=[discrete LQR,MPPI]",
-        "rivals.states=1",
-        "rivals.calls=2",
-    ],
     "system=two_link_robot": ["centers=simplex", "target=quadratic", "initial_state=[0.1,0,0,0]"],
     "system=three_state": ["centers=simplex", "target=quadratic", "initial_state=[0.1,0,0]"],
 }
@@ -57,7 +50,8 @@ CUSTOM = {
     "target": "plants.bowl",
     "tracker": "plants.Lines",
 }
-RECORDED = {word for case in CASES.values() for word in case.split()}  # what runs there, figures and all
+ELSEWHERE = {word for case in CASES.values() for word in case.split()}  # what runs there, figures and all
+ELSEWHERE |= {"experiment=adp_three_state", "experiment=rivals"}  # tests/experiments has them end to end
 UNRATED = {  # laws that promise no rate of contraction
     f"optimizer={law}"
     for law in (
@@ -80,7 +74,7 @@ def _options() -> dict[str, list[str]]:
         more += NEEDS.get(f"{group}={option}", [])
         if option == "ablation":
             lines[f"{group}={option}"] = [f"{group}={option}", *ABLATION]
-        elif group != "adp" and option != "mujoco" and f"{group}={option}" not in RECORDED:
+        elif group != "adp" and option != "mujoco" and f"{group}={option}" not in ELSEWHERE:
             lines[f"{group}={option}"] = [f"{group}={option}", *more]
     return lines
 
