@@ -257,6 +257,7 @@ def test_controllers_of_a_policy_share_programs_and_no_plan(limited: dict[bool, 
     assert one._begun is other._begun
     assert next(iter(policy._loops.values())).held  # begins with the best of several
     dearer = copy.copy(policy)
+    dearer._modules = dict(policy._modules)  # torch lets copies share them: the cost of both would change
     dearer.cost = adp.QuadraticCost(1.0, 9.0, dim=2, inputs=1, low=-1.0, high=1.0)
     assert dearer.controller()._begun is not one._begun  # plans of another cost are others
     far, near = torch.tensor([[3.0, 1.0]]).double(), torch.tensor([[0.05, 0.0]]).double()
