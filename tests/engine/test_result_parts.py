@@ -39,6 +39,15 @@ def test_a_certificate_comes_to_a_result_without_what_is_lost() -> None:
     assert torch.equal(wide.isnan().any(-1), lost)
 
 
+@pytest.mark.parametrize("run", [chase, chase_weights])
+def test_a_row_may_be_lost_from_its_first_time_on(run: Any) -> None:
+    states = circles(3, 4)
+    states[1, 0], states[2, 2] = torch.nan, torch.inf
+    result = run(states, BASES["gaussian"], targets.Paper(), LAW, inner_steps=1)
+    assert result.diverged_at.tolist() == [-1, 0, 2]
+    assert result.diverged.tolist() == [False, True, True]
+
+
 @pytest.mark.parametrize("certificate", [False, True])
 def test_pieces_of_time_are_joined_and_a_single_one_is_itself(certificate: bool) -> None:
     whole = chase(
