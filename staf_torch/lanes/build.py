@@ -173,6 +173,12 @@ def _cache() -> Path:
             return folder
     except OSError:
         pass
+    return _cache_of_the_process()
+
+
+@functools.cache
+def _cache_of_the_process() -> Path:
+    """Where nothing may be written at home: one folder, which goes with the process."""
     folder = Path(tempfile.mkdtemp(prefix="staf_torch-"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     return folder
