@@ -31,6 +31,7 @@ _MOST_BYTES = 2**30  # a trace is some 15 kilobytes, a library 30
 _DIGEST = 32  # bytes at the end of a library in the cache
 _one_at_a_time = threading.Lock()  # threads of a chase ask for the same at the same time
 _said: set[str] = set()  # what has been logged
+_temporary: dict[int, Path] = {}  # caches, by the process that made them
 
 
 @functools.cache
@@ -176,12 +177,20 @@ def _cache() -> Path:
     return _cache_of_the_process()
 
 
-@functools.cache
 def _cache_of_the_process() -> Path:
     """Where nothing may be written at home: one folder, which goes with the process."""
-    folder = Path(tempfile.mkdtemp(prefix="staf_torch-"))
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    process = os.getpid()
+    folder = _temporary.get(process)
+    if folder is None or not folder.is_dir():  # somebody may have tidied up
+        folder = _temporary[process] = Path(tempfile.mkdtemp(prefix="staf_torch-"))
+        atexit.register(_remove, folder, process)
     return folder
+
+
+def _remove(folder: Path, process: int) -> None:
+    """Remove a folder where its process ends; a fork of it ends by itself."""
+    if os.getpid() == process:
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 @functools.cache

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import hashlib
 import os
 import subprocess
@@ -200,17 +199,23 @@ def test_a_cache_that_cannot_be_written_is_replaced_until_the_end_of_the_process
     ended: list[Callable[..., Any]] = []
     monkeypatch.setattr(build.atexit, "register", lambda f, *a, **k: ended.append(lambda: f(*a, **k)))
     monkeypatch.setattr(build.os, "access", lambda *_: False)
-    own = functools.cache(build._cache_of_the_process.__wrapped__)  # not that of this process
-    monkeypatch.setattr(build, "_cache_of_the_process", own)
+    monkeypatch.setattr(build, "_temporary", {})  # not that of this process
     other = build._cache()
     assert build._cache() == other  # what one program left there another one finds
     assert other.name.startswith("staf_torch-")
     assert other.is_dir()
     (other / "file").write_text("x")
     (end,) = ended
+    with monkeypatch.context() as fork:
+        fork.setattr(build.os, "getpid", lambda: -1)
+        end()
+        assert other.exists()  # a fork leaves it to the process
     end()
     assert not other.exists()
     end()  # nor does it mind that somebody was first
+    another = build._cache()  # nor are later programs lost
+    assert another.is_dir()
+    ended[-1]()
 
 
 def test_a_cache_that_cannot_be_pruned_serves_all_the_same(
