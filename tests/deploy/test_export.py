@@ -177,7 +177,8 @@ def test_arguments_of_the_function_are_refused_by_name(
 
 
 def test_weights_and_settings_that_are_none_are_refused(chase: Path) -> None:
-    history = dict(np.load(chase / "history.npz"))
+    with np.load(chase / "history.npz") as archive:
+        history = dict(archive)
     history["weights"][0, -1] = np.nan
     np.savez(chase / "history.npz", **history)
     with pytest.raises(ValueError, match="must be a trajectory whose weights can be represented"):

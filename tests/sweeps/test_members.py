@@ -237,10 +237,10 @@ def test_writing_what_was_solved_leaves_what_a_run_leaves(tmp_path: Path) -> Non
         batching.completion(cfg, outcome)(cfg, tmp_path / name)
     files = [{p.name: p for p in (tmp_path / name).iterdir()} for name in ("batch", "alone")]
     assert files[0].keys() == files[1].keys() == {"metrics.json", "history.npz"}
-    found, expected = (np.load(each["history.npz"]) for each in files)
-    assert found.files == expected.files
-    for key in ("time", "state", "value", "estimate", "weights"):
-        assert np.array_equal(found[key], expected[key]), key
+    with np.load(files[0]["history.npz"]) as found, np.load(files[1]["history.npz"]) as expected:
+        assert found.files == expected.files
+        for key in ("time", "state", "value", "estimate", "weights"):
+            assert np.array_equal(found[key], expected[key]), key
     numbers = [json.loads(each["metrics.json"].read_text()) for each in files]
     assert numbers[0] == pytest.approx(numbers[1], rel=1e-9, abs=1e-12)
 

@@ -86,9 +86,9 @@ def test_a_run_leaves_what_the_command_leaves(
     assert found.metrics == json.loads(Path("one/metrics.json").read_text())
     assert found.settings["centers.radius"] == 0.2
     assert found.history["state"].shape == (1, 31, 2)
-    other = np.load(two / "history.npz")
-    assert sorted(found.history) == sorted(other)
-    assert all(np.array_equal(array, other[name]) for name, array in found.history.items())
+    with np.load(two / "history.npz") as other:
+        assert sorted(found.history) == sorted(other)
+        assert all(np.array_equal(array, other[name]) for name, array in found.history.items())
     (figure,) = found.figures().values()
     assert isinstance(figure, Figure)
     assert len(repr(found)) < 120
