@@ -220,11 +220,17 @@ def tensors(value: Any) -> list[Tensor]:
     """The tensors in nested lists, tuples and dictionaries."""
     if isinstance(value, Tensor):
         return [value]
-    if isinstance(value, list | tuple):
-        return [tensor for part in value for tensor in tensors(part)]
+    found = list[Tensor]()
     if isinstance(value, dict):
-        return [tensor for part in value.values() for tensor in tensors(part)]
-    return []
+        value = value.values()
+    elif not isinstance(value, (list, tuple)):
+        return found
+    for part in value:
+        if isinstance(part, Tensor):
+            found.append(part)
+        elif isinstance(part, (list, tuple, dict)):
+            found += tensors(part)
+    return found
 
 
 def _read(tensor: Tensor, at: np.ndarray[Any, Any]) -> Tensor:

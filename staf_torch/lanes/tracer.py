@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import traceback
 from collections.abc import Callable, Sequence
@@ -133,10 +134,7 @@ class Tracer(TorchDispatchMode):
 
     def each(self, function: Callable[..., int], *arrays: Ids) -> Ids:
         """The function of every entry of arrays that broadcast."""
-        spread = np.broadcast_arrays(*arrays)
-        flat = [array.reshape(-1).tolist() for array in spread]
-        out = [function(*entries) for entries in zip(*flat, strict=True)]
-        return np.array(out, dtype=np.int64).reshape(spread[0].shape)
+        return _of_each(function, _broadcast(arrays))
 
     def map(self, op: str, *arrays: Ids, least: int = LARGE) -> Ids:
         """An operation of every entry of arrays that broadcast: scalar by scalar, or a loop over many.
@@ -147,7 +145,7 @@ class Tracer(TorchDispatchMode):
             least: entries above which it is a loop.
         """
         graph = self.graph
-        spread = np.broadcast_arrays(*arrays)
+        spread = _broadcast(arrays)
         if spread[0].size > least and not self._folds(spread):
             operands = [self._operand(part.reshape(-1)) for part in spread]
             type = FLAG if op in ("lt", "le", "eq", "ne") else graph.type[int(spread[-1].flat[0])]
@@ -155,8 +153,8 @@ class Tracer(TorchDispatchMode):
             array = graph.add("map", [node for node, _ in operands], type, aux)
             return self.entries(array, type, spread[0].size).reshape(spread[0].shape)
         if op == "where":
-            return self.each(graph.where, *spread)
-        return self.each(lambda *entries: graph.apply(op, *entries), *spread)
+            return _of_each(graph.where, spread)
+        return _of_each(lambda *entries: graph.apply(op, *entries), spread)
 
     def cast(self, array: Ids, kind: str) -> Ids:
         """Every entry as another type."""
@@ -245,18 +243,18 @@ class Tracer(TorchDispatchMode):
 
     def _view(self, held: Ids, tensor: Tensor) -> Ids:
         strides = [8 * s for s in tensor.stride()]
-        return np.lib.stride_tricks.as_strided(held[tensor.storage_offset() :], tensor.shape, strides)
+        return np.ndarray(tensor.shape, np.int64, held, 8 * tensor.storage_offset(), strides)
 
     def _dispatch(
         self, func: Any, types: Any, args: Sequence[Any] = (), kwargs: dict[str, Any] | None = None
     ) -> Any:
         kwargs = kwargs or {}
         tensors = _tensors((args, kwargs))
-        wanted = [t for t in tensors if self._learning and t.requires_grad and not self.traced(t)]
+        wanted = [t for t in tensors if t.requires_grad and not self.traced(t)] if self._learning else []
         if any(self.captured.from_outside(tensor) for tensor in wanted):
             raise NotLoweredError("a derivative with respect to a constant of the program may be wanted")
-        name = func._schema.name.removeprefix("aten::")
-        if torch.Tag.nondeterministic_seeded in func.tags and not _own_generator(args, kwargs):
+        name, draws, writes = _facts(func)
+        if draws and not _own_generator(args, kwargs):
             raise NotLoweredError(f"`{func}` draws random numbers")
         if name in _BLANK or not any(self.traced(tensor) for tensor in tensors):
             out = func(*args, **kwargs)
@@ -268,7 +266,7 @@ class Tracer(TorchDispatchMode):
             return func(*args, **kwargs)
         if name.endswith("_") and not name.endswith("__"):
             return self._in_place(func, name.removesuffix("_"), args, kwargs)
-        if any(argument.alias_info and argument.alias_info.is_write for argument in func._schema.arguments):
+        if writes:
             raise NotLoweredError(f"`{func}` writes to an argument")
         out = func(*args, **kwargs)
         results = _tensors(out)
@@ -276,7 +274,8 @@ class Tracer(TorchDispatchMode):
             return out  # views
         nodes = self._lower(self, func, name, out, args, kwargs)
         for result, entries in zip(results, nodes if isinstance(nodes, list) else [nodes], strict=True):
-            self.attach(result, np.broadcast_to(entries, result.shape))
+            alike = entries.shape == result.shape
+            self.attach(result, entries if alike else np.broadcast_to(entries, result.shape))
         return out
 
     def _in_place(self, func: Any, name: str, args: Sequence[Any], kwargs: dict[str, Any]) -> Tensor:
@@ -290,6 +289,30 @@ class Tracer(TorchDispatchMode):
         held = self._storages[target.untyped_storage().data_ptr()][1]
         self._view(held, target)[...] = nodes
         return target
+
+
+@functools.cache
+def _facts(func: Any) -> tuple[str, bool, bool]:
+    """The name of an operation, whether it draws random numbers and whether it writes to an argument.
+
+    torch makes the list of its arguments anew whenever it is asked, which takes as long as the operation.
+    """
+    writes = any(argument.alias_info and argument.alias_info.is_write for argument in func._schema.arguments)
+    draws = torch.Tag.nondeterministic_seeded in func.tags
+    return func._schema.name.removeprefix("aten::"), draws, writes
+
+
+def _broadcast(arrays: Sequence[Ids]) -> Sequence[Ids]:
+    """The arrays in one shape, which most have already."""
+    alike = all(array.shape == arrays[0].shape for array in arrays)
+    return arrays if alike else np.broadcast_arrays(*arrays)
+
+
+def _of_each(function: Callable[..., int], spread: Sequence[Ids]) -> Ids:
+    """The function of every entry of arrays of one shape."""
+    flat = [array.reshape(-1).tolist() for array in spread]
+    out = [function(*entries) for entries in zip(*flat, strict=True)]
+    return np.array(out, dtype=np.int64).reshape(spread[0].shape)
 
 
 def _own_generator(args: Sequence[Any], kwargs: dict[str, Any]) -> bool:
