@@ -7,6 +7,7 @@ and the names of the package that the name itself is in.
 from __future__ import annotations
 
 import doctest
+import functools
 import inspect
 from pathlib import Path
 
@@ -15,6 +16,8 @@ from public_names import public
 from recorded import Record
 
 from staf_torch.lanes import build
+from staf_torch.sweeps.python_api import sweep
+from staf_torch.sweeps.runs import Runs
 
 PUBLIC = public()
 
@@ -28,6 +31,16 @@ def asked(name: str) -> object:
     return pytest.param(name, marks=[pytest.mark.compiled] if name.split(".")[1] in RUNS else [])
 
 
+@functools.cache
+def kept(*lines: str) -> Runs:
+    """What examples of tables and runs begin with: they only read it."""
+    return sweep(*lines)
+
+
+def swept(*lines: str, **places: str) -> Runs:
+    return sweep(*lines, **places) if places else kept(*lines)
+
+
 @pytest.mark.parametrize("name", [asked(name) for name in PUBLIC])
 def test_the_example_of_a_name_does_what_it_says(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, record: Record
@@ -36,6 +49,8 @@ def test_the_example_of_a_name_does_what_it_says(
     if name in COMPILE and not build.compiler():
         pytest.skip("needs a C++ compiler")
     thing, names = PUBLIC[name]
+    if thing is not sweep and names.get("sweep") is sweep:
+        names = {**names, "sweep": swept}
     text = inspect.cleandoc(thing.__doc__ or "")
     test = doctest.DocTestParser().get_doctest(text, dict(names), name, None, None)
     said: list[str] = []
