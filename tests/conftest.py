@@ -64,9 +64,11 @@ def pytest_collection() -> Generator[None, object, object]:
 @pytest.fixture(autouse=True, scope="session")
 def _settings_are_trusted_as_by_the_command() -> Iterator[None]:
     """Hydra 1.4 builds only what a program trusts: here the package, and what tests define."""
+    from composed_once import pieces
+
     from staf_torch.sweeps.hydra_compat.program import trusted
 
-    with trusted(path.stem for path in Path(__file__).parent.rglob("*.py")):
+    with trusted(path.stem for path in Path(__file__).parent.rglob("*.py")), pieces():
         yield
 
 

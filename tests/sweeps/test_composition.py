@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import json
 import pickle
+from pathlib import Path
 
 import pytest
+from composed_once import pieces
 from composing import compose
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+from hydra._internal.utils import create_config_search_path
 from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import OmegaConf
@@ -45,17 +49,27 @@ JOBS = [
 @pytest.mark.parametrize("job", JOBS, ids=" ".join)
 def test_a_configuration_is_the_one_that_hydra_composes(job: list[str]) -> None:
     loader = config_loader()
-    expected = loader.load_configuration("config", ["dt=0.02", *job], RunMode.RUN)
+    with pieces(kept=False):  # what is kept for the other tests is compared here as well
+        expected = loader.load_configuration("config", ["dt=0.02", *job], RunMode.RUN)
     composer = Composer(loader)
     first, again = (composer(["dt=0.02", *job]) for _ in range(2))
     for found in (first, again):
         assert OmegaConf.to_yaml(found) == OmegaConf.to_yaml(expected)
-        assert pickle.dumps(OmegaConf.to_container(found)) == pickle.dumps(OmegaConf.to_container(expected))
+        assert repr(OmegaConf.to_container(found)) == repr(OmegaConf.to_container(expected))
         assert OmegaConf.is_struct(found)
         assert not OmegaConf.is_readonly(found)
         assert found.hydra.runtime._metadata.flags == expected.hydra.runtime._metadata.flags
     first.seed = 99
     assert again.seed == expected.seed
+
+
+def test_a_file_that_was_written_again_is_read_again(tmp_path: Path) -> None:
+    loader = ConfigLoaderImpl(create_config_search_path(str(tmp_path)))
+    for text, value in (("a: 1", 1), ("a: 2", 2), ("defaults: [b, _self_]", 3)):
+        (tmp_path / "own.yaml").write_text(text)
+        (tmp_path / "b.yaml").write_text("a: 3")
+        for _ in range(2):
+            assert loader.load_configuration("own", [], RunMode.RUN).a == value
 
 
 SAME_KEYS = [
