@@ -45,7 +45,7 @@ def test_identified_drift_converges_and_the_error_with_it() -> None:
     learner = adp.ActorCritic(basis, TRACKING, cost, adp.RandomPoints(1, 0.3), critic=1.5, actor=1.5)
     x0 = torch.tensor([[-0.5, 0.5, 0.0, 1.0], [0.4, 0.2, 0.0, 1.0]], dtype=torch.float64)
     start = torch.zeros(3, 2, dtype=torch.float64)
-    tracker = adp.IdentifyingTracker(learner, TRACKING, adp.ConcurrentLearning(3, 2, 10, gain=5.0), start)
+    tracker = adp.IdentifyingTracker(learner, TRACKING, adp.ConcurrentLearning(3, 2, 6, gain=5.0), start)
     known = adp.simulate(learner, TRACKING, cost, x0, dt=0.01, steps=500, every=10, compile=True)
     run = adp.simulate(tracker, TRACKING, cost, x0, dt=0.01, steps=500, every=10, compile=True)
     assert not run.diverged.any()

@@ -18,6 +18,9 @@ BOX = systems.Barrier(CHAIN, low=[-7.0, -5.0], high=[5.0, 7.0])
 COST = adp.QuadraticCost(10.0, 0.1, dim=2, inputs=1)
 OF_S = adp.LQR(BOX, COST)
 DT = 1e-3
+# Who brakes before the one wall comes to the other one: half of the program of four walls.
+CORNER = systems.Barrier(CHAIN, low=[None, -5.0], high=[5.0, None])
+OF_CORNER = adp.LQR(CORNER, COST)
 
 
 def beside_the_walls(count: int) -> Tensor:
@@ -80,14 +83,14 @@ def test_a_control_that_is_renewed_in_time_keeps_every_start() -> None:
 
 @pytest.mark.compiled
 def test_substeps_are_few_away_from_walls_and_many_beside_them() -> None:
-    guard = adp.Feedback(adp.BoxFilter(OF_S, BOX, dt=DT, renewed=True))
-    near = BOX.transform(beside_the_walls(12))
-    away = BOX.transform(tensor([[0.0, 1.0], [-3.0, 2.0], [2.0, -1.0]]))
+    guard = adp.Feedback(adp.BoxFilter(OF_CORNER, CORNER, dt=DT, renewed=True))
+    near = CORNER.transform(beside_the_walls(18))[beside_the_walls(18)[:, 0] > 0]
+    away = CORNER.transform(tensor([[0.0, 1.0], [-3.0, 2.0], [2.0, -1.0]]))
     settings = {"dt": DT, "steps": 2, "renew": True}
 
     def run(s0: Tensor, substeps: int | tuple[int, int], compile: bool = False) -> adp.LoopResult:
         more = settings | {"substeps": substeps, "compile": compile}
-        return adp.simulate(guard, BOX, COST, s0, **more)  # type: ignore[arg-type]
+        return adp.simulate(guard, CORNER, COST, s0, **more)  # type: ignore[arg-type]
 
     mixed, compiled = (run(torch.cat((near, away)), (1, 6), compile) for compile in (False, True))
     assert not bool(mixed.diverged.any())
@@ -120,10 +123,11 @@ def test_a_way_that_is_a_line_has_slopes(dtype: torch.dtype) -> None:
 
 @pytest.mark.compiled
 def test_compiled_it_keeps_the_same_starts() -> None:
-    s0 = BOX.transform(beside_the_walls(40))
-    guard = adp.BoxFilter(OF_S, BOX, dt=DT)
-    run = adp.simulate(adp.Feedback(guard), BOX, COST, s0, steps=4, substeps=16, compile=True)
+    s0 = CORNER.transform(beside_the_walls(40))[beside_the_walls(40)[:, 0] > 0]
+    guard = adp.BoxFilter(OF_CORNER, CORNER, dt=DT)
+    run = adp.simulate(adp.Feedback(guard), CORNER, COST, s0, steps=4, substeps=16, compile=True)
     assert torch.equal(run.diverged, guard.share(s0) >= 1)
+    assert 5 < int(run.diverged.sum()) < len(s0) - 5
 
 
 def test_where_no_wall_is_near_not_a_bit_changes_and_rows_are_alone() -> None:

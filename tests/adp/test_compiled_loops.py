@@ -72,6 +72,13 @@ def three_states() -> tuple[adp.Controller, systems.ControlAffineSystem, adp.Cos
     return adp.ActorCritic(basis, plant, cost, adp.RandomPoints(1, 0.24)), plant, cost
 
 
+def policy_iteration() -> tuple[adp.Controller, systems.ControlAffineSystem, adp.Cost]:
+    basis = staf_basis("total", AnchoredKernel(GaussianKernel(4.0)))  # as in `test_policy_iteration.py`
+    points, start = adp.QuadraturePoints(2, 2, half_width=0.2), basis.weights_near_square()
+    law = adp.PolicyIteration()
+    return adp.ActorCritic(basis, PLANT, COST, points, law, critic=start, actor=start), PLANT, COST
+
+
 def of_basis(
     basis: adp.ValueBasis, points: adp.Extrapolation, law: adp.ActorCriticLaw | None = None
 ) -> tuple[adp.Controller, systems.ControlAffineSystem, adp.Cost]:
@@ -86,19 +93,17 @@ def learned(
 
 CASES: dict[str, Callable[[], tuple[adp.Controller, systems.ControlAffineSystem, adp.Cost]]] = {
     "information": lambda: learned(adp.Information()),
-    "frozen, quadratic basis": lambda: of_basis(
-        adp.QuadraticBasis(2), adp.RandomPoints(1, BOX), adp.Frozen()
+    "frozen, partial gradient": lambda: of_basis(
+        staf_basis("partial"), adp.RandomPoints(1, BOX), adp.Frozen()
     ),
-    "policy iteration, partial gradient": lambda: of_basis(
-        staf_basis("partial"), adp.QuadraturePoints(2, 2, BOX), adp.PolicyIteration()
-    ),
-    "bounded, three fixed points, a kernel without closed form": lambda: of_basis(
+    "policy iteration": policy_iteration,
+    "bounded, two fixed points, a kernel without closed form": lambda: of_basis(
         staf_basis("total", AnchoredKernel(GaussianKernel(2.0))),
-        adp.RandomPoints(3, BOX, "fixed"),
+        adp.RandomPoints(2, BOX, "fixed"),
         adp.Information(bound=2.0),
     ),
     "published, a grid around the origin": lambda: of_basis(
-        adp.RBFGridBasis(2, 3, 2.0), adp.RandomPoints(1, 2.0, around="origin"), adp.Published()
+        adp.RBFGridBasis(2, 2, 2.0), adp.RandomPoints(1, 2.0, around="origin"), adp.Published()
     ),
     "supervised": lambda: (
         adp.Supervised(learner(adp.Information()), adp.LQR(PLANT, COST), COST),
@@ -114,7 +119,7 @@ CASES: dict[str, Callable[[], tuple[adp.Controller, systems.ControlAffineSystem,
 
 def start(case: str, rows: int) -> tuple[ClosedLoop, LoopState, Tensor]:
     controller, plant, cost = CASES[case]()
-    loop = ClosedLoop(controller, plant, cost, dt=0.001)
+    loop = ClosedLoop(controller, plant, cost, dt=0.02 if case == "policy iteration" else 0.001)
     dim = cost.q.shape[0]
     x0 = uniform(rows * dim, 0.5).reshape(-1, dim)[:rows]
     generator = torch.Generator().manual_seed(1)

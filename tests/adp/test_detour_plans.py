@@ -93,10 +93,16 @@ def test_no_change_of_a_plan_lowers_what_it_costs() -> None:
 @pytest.mark.compiled
 @pytest.mark.needs_compiler
 def test_a_plan_leads_around_and_is_compiled_as_it_is_defined(caplog: pytest.LogCaptureFixture) -> None:
-    plans = adp.DetourPlans(detours(steps=4), first=1)
-    guard = adp.SafetyFilter(plans, PLANE, disc, dt=0.2, low=-1.0, high=1.0, decay=3.0)
-    defined = adp.simulate(guard, PLANE, COST, BESIDE, steps=2, compile=False)
-    compiled = adp.simulate(guard, PLANE, COST, BESIDE, steps=40, compile=True)
+    # A point whose speed is the control: a program of half the size.
+    point = systems.Linear(torch.zeros(2, 2).tolist(), torch.eye(2).tolist())
+    cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=2, low=-1.0, high=1.0)
+    lqr = adp.LQR(point, cost, period=0.2)
+    given = {"axes": torch.eye(2), "steps": 4, "margin": 0.02, "sizes": [0.6], "lengths": [5]}
+    ways = adp.DetourRollout(lqr, point, cost, disc, dt=0.2, terminal=lqr.value, **given)  # type: ignore[arg-type]
+    plans, x0 = adp.DetourPlans(ways, first=1), BESIDE[:, :2]
+    guard = adp.SafetyFilter(plans, point, disc, dt=0.2, low=-1.0, high=1.0, decay=3.0)
+    defined = adp.simulate(guard, point, cost, x0, steps=2, compile=False)
+    compiled = adp.simulate(guard, point, cost, x0, steps=24, compile=True)
     torch.testing.assert_close(compiled.state[:, :3], defined.state, rtol=1e-9, atol=1e-9)
     assert all("is compiled, once" in record.getMessage() for record in caplog.records)  # and not refused
     assert guard.report(compiled)["constraint_violations"] == 0

@@ -6,7 +6,7 @@ import pickle
 
 import pytest
 import torch
-from helpers_swingup import GRID, REGION, RESETS, double_integrator
+from helpers_swingup import GRID, REGION, RESETS
 from torch import Tensor
 
 from staf_torch import adp
@@ -105,11 +105,11 @@ def test_control_at_rest_on_top_is_the_regulator(memory: adp.GlobalValue) -> Non
 
 
 def test_memory_survives_a_pickle_and_keeps_to_the_bounds(memory: adp.GlobalValue) -> None:
-    problem = double_integrator(-1.0, 1.0)
-    grown = adp.learn_global_value(problem, [3.0, 3.0], steps=60, trajectories=6, rounds=0, candidates=4)
+    problem = memory.problem
+    grown = adp.learn_global_value(problem, REGION, steps=60, trajectories=6, rounds=0, candidates=4)
     # A problem made by a function inside a function does not pickle: the module's own does.
     copied = pickle.loads(pickle.dumps(grown.library))
-    again = adp.GlobalValue(problem, copied, [3.0, 3.0], candidates=4)
+    again = adp.GlobalValue(problem, copied, REGION, candidates=4)
     x = torch.tensor([[2.0, 1.0], [-0.1, 0.0]], dtype=torch.float64)
     assert torch.equal(again(x), grown(x))
     assert bool(problem.bounds.contain(grown(x)).all())

@@ -79,7 +79,8 @@ def test_behind_a_barrier_the_mean_of_the_filter_costs_less_than_what_is_measure
         windows = adp.IntegralWindows(plant, 0.05, states=box.inverse)
         law = adp.LeastSquares([1.0], deviation=0.5, floor=1e-6)
         filter = adp.ConsiderFilter(model, noise=0.01) if filtered else None
-        own = adp.Measured(adp.AdaptiveLQR(model, cost, windows, law, filter=filter), noise=0.01, dim=2)
+        adaptive = adp.AdaptiveLQR(model, cost, windows, law, filter=filter, doublings=7)  # a short program
+        own = adp.Measured(adaptive, noise=0.01, dim=2)
         run = adp.simulate(own, truth, cost, s0, dt=0.005, steps=600, every=20, compile=True)
         assert not bool(run.diverged.any())
         assert float(box.margin(run.state).min()) > 0.2
