@@ -27,7 +27,7 @@ def test_every_number_of_an_input_reaches_its_row_and_time(dtype: torch.dtype) -
         return carry, now
 
     program = lanes.Program(step)
-    for rows in (1, 9, 65) if dtype == torch.float64 else (9, 65):
+    for rows in (1, 9, 65) if dtype == torch.float64 else (65,):
         for times in (1, 20, 70):
             given = [torch.rand(rows, times, *shape, dtype=dtype) for shape in ((), (1,), (2,), (3,), (2, 5))]
             given.append(torch.rand(rows, times, 4, dtype=dtype)[..., ::2])  # neither dense nor alone
