@@ -1,21 +1,21 @@
-"""Runs many command lines in one process, so that torch is imported once, each in a directory of its own.
-
-As a script: `python command_line.py JOBS RESULTS` with two JSON files.
-"""
+"""Runs many command lines in a fork of this process, which has torch, each in a directory of its own."""
 
 from __future__ import annotations
 
 import contextlib
+import importlib
 import io
 import json
 import logging
 import os
-import subprocess
 import sys
 import traceback
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
+
+from absent_extras import heard
 
 ROOT = Path(__file__).resolve().parent.parent
 PLANTS = '''
@@ -101,17 +101,42 @@ def run_all(jobs: Mapping[str, Sequence[str]], base: Path, module: str = PLANTS)
         folder.mkdir()
         (folder / "plants.py").write_text(module)
         (folder / "blocked").write_text("a file where a directory should be\n")
-    from absent_extras import heard  # not in the process that runs them
-
-    listed = [{"folder": str(folders[name]), "argv": list(argv)} for name, argv in jobs.items()]
-    (base / "jobs.json").write_text(json.dumps(listed))
-    program = [sys.executable, __file__, str(base / "jobs.json"), str(base / "results.json")]
-    ended = subprocess.run(program, cwd=base, env=environment(), capture_output=True, text=True, check=False)
-    assert ended.returncode == 0, ended.stderr
-    results = json.loads((base / "results.json").read_text())
-    for code, *said in results:
+    found = _in_a_fork(
+        [(str(folders[name]), list(argv)) for name, argv in jobs.items()], base / "results.json"
+    )
+    for code, *said in found:
         heard(code, *said)
-    return {name: Outcome(*found, folders[name]) for name, found in zip(jobs, results, strict=True)}
+    return {name: Outcome(*one, folders[name]) for name, one in zip(jobs, found, strict=True)}
+
+
+def _in_a_fork(jobs: Sequence[tuple[str, list[str]]], results: Path) -> list[tuple[int, str, str]]:
+    """Run command lines in a child, with all that this process has imported."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # Python 3.12 warns where there are threads
+        child = os.fork()
+    if not child:
+        try:
+            importlib.reload(warnings)  # what is told of them, as in an interpreter that has just begun
+            logging.root.handlers.clear()  # those of pytest
+            results.write_text(json.dumps([one(folder, argv) for folder, argv in jobs]))
+            _keep_coverage()
+        except BaseException:
+            results.with_suffix(".error").write_text(traceback.format_exc())
+        finally:
+            os._exit(0)
+    os.waitpid(child, 0)
+    error = results.with_suffix(".error")
+    assert results.exists(), error.read_text() if error.exists() else "the child was ended"
+    found: list[tuple[int, str, str]] = json.loads(results.read_text())
+    return found
+
+
+def _keep_coverage() -> None:
+    """Write what a child executed, where somebody measures it: a fork that ends itself keeps nothing."""
+    measuring = sys.modules["coverage"].Coverage.current() if "coverage" in sys.modules else None
+    if measuring is not None:
+        measuring.stop()
+        measuring.save()
 
 
 def environment() -> dict[str, str]:
@@ -148,9 +173,3 @@ def one(folder: str, argv: list[str]) -> tuple[int, str, str]:
     sys.path[:] = path
     sys.modules.pop("plants", None)
     return code, out.getvalue(), err.getvalue()
-
-
-if __name__ == "__main__":
-    jobs = json.loads(Path(sys.argv[1]).read_text())
-    target = Path(sys.argv[2])
-    target.write_text(json.dumps([one(job["folder"], job["argv"]) for job in jobs]))
