@@ -11,9 +11,9 @@ import os
 import sys
 import traceback
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from absent_extras import heard
 
@@ -101,16 +101,14 @@ def run_all(jobs: Mapping[str, Sequence[str]], base: Path, module: str = PLANTS)
         folder.mkdir()
         (folder / "plants.py").write_text(module)
         (folder / "blocked").write_text("a file where a directory should be\n")
-    found = _in_a_fork(
-        [(str(folders[name]), list(argv)) for name, argv in jobs.items()], base / "results.json"
-    )
+    found = in_a_child(lambda: [one(str(folders[name]), list(argv)) for name, argv in jobs.items()], base)
     for code, *said in found:
         heard(code, *said)
     return {name: Outcome(*one, folders[name]) for name, one in zip(jobs, found, strict=True)}
 
 
-def _in_a_fork(jobs: Sequence[tuple[str, list[str]]], results: Path) -> list[tuple[int, str, str]]:
-    """Run command lines in a child, with all that this process has imported."""
+def in_a_child(work: Callable[[], Any], base: Path) -> Any:
+    """What JSON keeps of what a function returns in a child, with all that this process has imported."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # Python 3.12 warns where there are threads
         child = os.fork()
@@ -118,17 +116,15 @@ def _in_a_fork(jobs: Sequence[tuple[str, list[str]]], results: Path) -> list[tup
         try:
             importlib.reload(warnings)  # what is told of them, as in an interpreter that has just begun
             logging.root.handlers.clear()  # those of pytest
-            results.write_text(json.dumps([one(folder, argv) for folder, argv in jobs]))
+            (base / "results.json").write_text(json.dumps(work()))
             _keep_coverage()
         except BaseException:
-            results.with_suffix(".error").write_text(traceback.format_exc())
+            (base / "error").write_text(traceback.format_exc())
         finally:
             os._exit(0)
     os.waitpid(child, 0)
-    error = results.with_suffix(".error")
-    assert results.exists(), error.read_text() if error.exists() else "the child was ended"
-    found: list[tuple[int, str, str]] = json.loads(results.read_text())
-    return found
+    assert not (base / "error").exists(), (base / "error").read_text()
+    return json.loads((base / "results.json").read_text())
 
 
 def _keep_coverage() -> None:

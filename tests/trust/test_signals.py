@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import signal
-import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from command_line import environment
+from command_line import in_a_child
 
 from staf_torch.cli import staf
 from staf_torch.sweeps import signals
@@ -46,27 +46,29 @@ SIGNALLED = '''
 import os, random, signal, sys, time
 import staf_torch.cli.staf as app
 import staf_torch.sweeps.executors.controller as controller
-import staf_torch.experiments.gradient_chase  # so that the children share it
 
 GRID = ["centers.count=3,4,6", "centers.radius=0.1,0.2", "hydra.launcher.batch=1"]
 GRID += ["duration=0.05", "settle_time=0", "figures=false", "history=false"]
 
+def run(place, *argv):
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_DFL)
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
+    sys.stdout = sys.stderr = open(f"{place}.log", "a")
+    sys.argv = ["staf", "-m", *argv]
+    code = 0
+    try:
+        app.main()
+    except SystemExit as end:
+        code = end.code if isinstance(end.code, int) else int(end.code is not None)
+        sys.stderr.write(f"{end.code}\\n")
+    sys.stderr.flush()
+    return code
+
 def start(place, *argv):
     child = os.fork()
     if child == 0:
-        for number in (signal.SIGTERM, signal.SIGHUP):
-            signal.signal(number, signal.SIG_DFL)
-        signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
-        sys.stdout = sys.stderr = open(f"{place}.log", "a")
-        sys.argv = ["staf", "-m", *argv]
-        code = 0
-        try:
-            app.main()
-        except SystemExit as end:
-            code = end.code if isinstance(end.code, int) else int(end.code is not None)
-            sys.stderr.write(f"{end.code}\\n")
-        sys.stderr.flush()
-        os._exit(code)
+        os._exit(run(place, *argv))
     return child
 
 def ended(child):
@@ -93,6 +95,7 @@ def killed_before_a_name(survived):
         os._exit(0)
     return child
 
+run("shared", *GRID, "hydra.sweep.dir=shared")  # what it imports and composes the children share, too
 begin = time.monotonic()
 codes = {"whole": ended(start("whole", *GRID, "hydra.sweep.dir=whole"))}
 whole = time.monotonic() - begin
@@ -127,8 +130,6 @@ while not os.path.exists("squeue.hangs"):
 os.kill(child, signal.SIGTERM)
 codes["slurm"] = ended(child)
 codes["slurm again"] = ended(start("slurm2", "sweep.resume=slurm", "hydra.launcher.executor=inline"))
-import json
-print(json.dumps(codes))
 '''
 
 
@@ -140,11 +141,19 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name, first in (("squeue", "grep -q completed slurm/0/run.json || exit 1"), ("scancel", "")):
         (folder / name).write_text(f'#!/bin/sh\n{first}\n: > "$0.hangs"\nexec sleep 30\n')
         (folder / name).chmod(0o755)
-    line = [sys.executable, "-c", SIGNALLED]
-    run = subprocess.run(line, cwd=folder, env=environment(), capture_output=True, text=True, check=False)
-    assert run.returncode == 0, run.stderr
-    (folder / "codes.json").write_text(run.stdout)
+    codes = in_a_child(lambda: ended_and_resumed(folder), folder)
+    (folder / "codes.json").write_text(json.dumps(codes))
     return folder
+
+
+def ended_and_resumed(folder: Path) -> object:
+    """Run `SIGNALLED` in a folder whose modules it finds; return the codes."""
+    os.chdir(folder)
+    sys.path.insert(0, "")
+    sys.modules.pop("submitit", None)
+    names: dict[str, object] = {}
+    exec(SIGNALLED, names)
+    return names["codes"]
 
 
 def test_signals_end_a_sweep_with_its_report_and_the_line_that_resumes(place: Path) -> None:
