@@ -260,8 +260,9 @@ def _moved(f: Tensor, g: Tensor, *, discrete: bool) -> Tensor:
 def _held(plant: Plant, f: Tensor, g: Tensor, dt: float) -> tuple[Tensor, Tensor]:
     """A and B of the linearised plant over dt seconds with u held."""
     if plant.period is None:
-        hold = exact_hold(f, g, 0 * f, g.new_zeros(g.shape[1], g.shape[1]), dt)
-        return hold.a, hold.b
+        n, m = g.shape
+        flow = exponential(dt * torch.cat((torch.cat((f, g), dim=1), f.new_zeros(m, n + m))))
+        return flow[:n, :n], flow[:n, n:]
     a, b = torch.eye(len(f), dtype=f.dtype), torch.zeros_like(g)
     for _ in range(periods("held_stability", plant, dt)):
         a, b = f @ a, f @ b + g

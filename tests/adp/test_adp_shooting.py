@@ -45,20 +45,20 @@ def test_three_state_optimum() -> None:
 
 
 @pytest.mark.parametrize(
-    ("plant", "cost"),
+    ("plant", "cost", "intervals"),
     [
-        (systems.Pendulum(), COST),
-        (systems.VanDerPol(), COST),
-        (systems.Pendulum(), adp.BoundedInputCost(1.0, 0.1, 2, 1, bound=8.0)),
-        (systems.PlanarQuadrotor(), adp.QuadraticCost(1.0, 1.0, 6, 2)),
+        (systems.Pendulum(), COST, 40),
+        (systems.VanDerPol(), COST, 40),
+        (systems.Pendulum(), adp.BoundedInputCost(1.0, 0.1, 2, 1, bound=8.0), 48),
+        (systems.PlanarQuadrotor(), adp.QuadraticCost(1.0, 1.0, 6, 2), None),
     ],
     ids=["pendulum", "van der pol", "bounded pendulum", "quadrotor"],
 )
 def test_gradient_and_control_solve_the_hjb_equation(
-    plant: systems.ControlAffineSystem, cost: adp.Cost
+    plant: systems.ControlAffineSystem, cost: adp.Cost, intervals: int | None
 ) -> None:
     x = 0.2 * torch.randn(5, plant.dim, dtype=torch.float64, generator=torch.Generator().manual_seed(4))
-    best = adp.DirectShooting(plant, cost).solve(x)
+    best = adp.DirectShooting(plant, cost, intervals=intervals).solve(x)
     assert best.converged.all()
     g = plant.effectiveness(x)
     rate = plant.drift(x) + (g @ best.control.unsqueeze(-1)).squeeze(-1)
@@ -90,7 +90,7 @@ class HalfBroken(systems.TwoState):
 
 
 def test_row_that_fails_on_the_coarse_mesh_starts_again_on_the_fine_one() -> None:
-    x = uniform(6, 2.0)[:3]
+    x = uniform(6, 2.0)[:1]
     best = adp.DirectShooting(PLANT, COST, intervals=32, iterations=10).solve(x)
     assert torch.isinf(best.mesh_error).all()  # nothing to compare with
     assert best.converged.all()

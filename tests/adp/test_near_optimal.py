@@ -127,9 +127,9 @@ def test_bad_arguments_are_refused_by_name() -> None:
 
 
 def test_plan_takes_over_where_the_lqr_would_meet_a_bound(limited: dict[bool, adp.NearOptimal]) -> None:
-    """A mass at 5 m with |u| <= 1: the LQR's rollouts overshoot; the plan is the optimum of its horizon."""
+    """A mass at 2 m with |u| <= 1: the LQR's rollouts overshoot; the plan is the optimum of its horizon."""
     plant, policy = DOUBLE, limited[True]
-    x = torch.tensor([[3.0, 1.0], [0.05, 0.0], [-3.0, -1.0]], dtype=torch.float64)
+    x = torch.tensor([[2.0, 0.5], [0.05, 0.0], [-2.0, -0.5]], dtype=torch.float64)
     assert policy.planner is not None
     assert policy.planner.strained(x).tolist() == [True, False, True]
     u = policy(x)
@@ -140,8 +140,8 @@ def test_plan_takes_over_where_the_lqr_would_meet_a_bound(limited: dict[bool, ad
     torch.testing.assert_close(u[1], policy.control(x[1]), rtol=0, atol=1e-9)
     assert torch.equal(policy(x[1]), u[1])
     loop = policy.controller()  # carries its plan
-    run = adp.simulate(loop, plant, policy.cost, x, dt=0.25, steps=60, compile=False)
-    search.steps = 60  # by the same programs
+    run = adp.simulate(loop, plant, policy.cost, x, dt=0.25, steps=40, compile=False)
+    search.steps = 40  # by the same programs
     whole = search.solve(x)
     torch.testing.assert_close(run.cost, whole.cost, rtol=1e-4, atol=1e-6)
     assert isinstance(adp.near_optimal(plant, COST, dt=0.25, plan=True).controller(), adp.Feedback)
@@ -212,7 +212,7 @@ class Gap(systems.ControlAffineSystem):
 
 
 def test_report_finds_the_region_of_a_plant_in_small_units() -> None:
-    policy = adp.near_optimal(Gap(), adp.QuadraticCost(1.0, 1.0, dim=1, inputs=1), dt=0.05, horizon=0.2)
+    policy = adp.near_optimal(Gap(), adp.QuadraticCost(25.0, 1.0, dim=1, inputs=1), dt=0.05, horizon=0.2)
     report = policy.report(states=8, optimum=False)
     assert report["regulated"] == 0  # in the box of 1
     assert 1 / 256 <= report["good_spread"] <= 1 / 32
