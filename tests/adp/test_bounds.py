@@ -29,20 +29,21 @@ class Two(systems.ControlAffineSystem):
         return torch.cat((PLANT.effectiveness(x), torch.ones_like(x).unsqueeze(-1)), dim=-1)
 
 
-def grid_minimum(cost: adp.Cost, pull: Tensor, low: list[float], high: list[float]) -> Tensor:
+def grid(cost: adp.Cost, low: list[float], high: list[float]) -> tuple[Tensor, Tensor]:
+    """Points of the box, and what an input there costs."""
     axes = [torch.linspace(max(a, -6.0), min(b, 6.0), 801).double() for a, b in zip(low, high, strict=True)]
     points = torch.cartesian_prod(*axes)
-    value = cost.input_rate(points) + (points * pull).sum(-1)
-    return points[value.argmin()]
+    return points, cost.input_rate(points)
 
 
 @pytest.mark.parametrize("control", [torch.diag(COUPLED.diagonal()), COUPLED], ids=["diagonal", "coupled"])
 def test_policy_is_the_minimum_over_the_box(control: Tensor) -> None:
     cost = adp.QuadraticCost(1.0, control, 2, 2, low=LOW, high=HIGH, target_input=[0.2, -0.3])
     g = torch.eye(2, dtype=torch.float64)
+    points, paid = grid(cost, LOW, HIGH)
     for pull in uniform(8, 8.0, seed=5):
         u = cost.policy(g, pull)
-        found = grid_minimum(cost, pull, LOW, HIGH)
+        found = points[(paid + points @ pull).argmin()]
         assert (u - found).abs().max() < 0.01
         assert cost.bounds.contain(u)
         assert cost.input_rate(u) + u @ pull <= cost.input_rate(found) + found @ pull + 1e-12

@@ -16,7 +16,7 @@ class Turning(systems.Pendulum):
 
 
 PLANT = Turning(damping=0.0)
-COST = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1, low=-2.0, high=2.0)
+COST = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1, low=-5.0, high=5.0)
 
 
 def energy(x: Tensor) -> Tensor:
@@ -33,11 +33,11 @@ def test_pendulum_swings_up_from_everywhere_within_its_bounds_where_the_lqr_does
     policy = pump()
     ours, lqr = (
         adp.simulate(adp.Feedback(one), PLANT, COST, x0, dt=0.02, steps=steps, compile=False)
-        for one, steps in ((policy, 500), (policy.lqr, 60))
+        for one, steps in ((policy, 260), (policy.lqr, 60))
     )
     assert (policy.lqr.cost.deviation(ours.state[:, -1]).norm(dim=-1) < 1e-3).all()
     assert (policy.lqr.cost.deviation(lqr.state[:, -1]).norm(dim=-1) > 0.1).any()
-    assert ours.control[:, :-1].abs().max() <= 2
+    assert ours.control[:, :-1].abs().max() <= 5
     # Where it pumps, the energy comes nearer to that of the goal at every step.
     x = torch.tensor([[2.5, 1.0]], dtype=torch.float64)
     after = systems.runge_kutta_step(lambda z: PLANT.rate(z, policy(x)), x, 0.02)

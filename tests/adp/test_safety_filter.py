@@ -147,7 +147,7 @@ def test_a_wall_is_never_crossed_and_a_larger_margin_keeps_farther_away() -> Non
     least = []
     for margin in (0.0, 0.05):
         guard = adp.SafetyFilter(lambda x: 0 * x[..., :1] - 3, LINE, wall, dt=0.1, decay=4.0, margin=margin)
-        run = adp.simulate(guard, LINE, COST, x0, steps=16, compile=False)
+        run = adp.simulate(guard, LINE, COST, x0, steps=10, compile=False)
         report = guard.report(run)
         assert report["constraint_violations"] == 0
         assert report["infeasible"] == []
@@ -165,12 +165,12 @@ def test_discs_that_move_and_appear_are_avoided_within_the_bounds() -> None:
     assert guard.degree == (2, 2)
     assert guard.moving
     x0 = tensor([[2.0, 0.5, 0.0, 0.0], [1.5, -0.9, 0.0, 0.0]])
-    run = adp.simulate(guard, PLANE, COST4, x0, steps=25, every=5, compile=False)
+    run = adp.simulate(guard, PLANE, COST4, x0, steps=15, every=5, compile=False)
     report = guard.report(run)
     assert report["minimum_margin"] > 0
     assert 0 < report["acted"] < 1
     assert float(run.control[:, :-1].abs().max()) <= 1
-    bare = adp.simulate(adp.Feedback(lqr), PLANE, COST4, x0, dt=0.1, steps=25, every=5, compile=False)
+    bare = adp.simulate(adp.Feedback(lqr), PLANE, COST4, x0, dt=0.1, steps=15, every=5, compile=False)
     assert float(guard.margins(bare.state, bare.time).min()) < 0
     assert "filtered" in guard.label
 
