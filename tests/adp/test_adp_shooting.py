@@ -111,7 +111,7 @@ def test_rows_are_alone_and_a_row_without_optimum_is_reported() -> None:
 
 
 def test_too_few_iterations_are_reported_and_not_passed_off_as_an_optimum() -> None:
-    best = adp.DirectShooting(PLANT, COST, intervals=20, iterations=1).solve(uniform(4, 2.0))
+    best = adp.DirectShooting(PLANT, COST, intervals=8, iterations=1).solve(uniform(4, 2.0))
     assert not best.converged.any()
     assert torch.isnan(best.value).all()
 

@@ -98,7 +98,7 @@ def test_improved_policy_under_hard_bounds_costs_less_than_the_clipped_lqr() -> 
     x0 = uniform(40, 0.5, seed=2)
     paid = {}
     for policy in (adp.LQR(plant, cost), adp.RolloutPolicy.of_lqr(plant, cost)):
-        run = adp.simulate(adp.Feedback(policy), plant, cost, x0, dt=0.1, steps=60, every=60, compile=False)
+        run = adp.simulate(adp.Feedback(policy), plant, cost, x0, dt=0.1, steps=40, every=40, compile=False)
         assert (run.state[:, -1].norm(dim=-1) < 1e-2).all()
         paid[type(policy).__name__] = run.cost
     ratio = paid["RolloutPolicy"] / paid["LQR"]

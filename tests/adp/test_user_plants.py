@@ -131,10 +131,10 @@ def test_costs_with_outputs_discount_and_blind_directions() -> None:
                 cost,
                 x0,
                 dt=dt,
-                steps=round(16 / dt),
+                steps=round(8 / dt),
                 every=10,
                 substeps=2,
-                compile=True,
+                compile=period is None,
             )
             assert float(run.cost) == pytest.approx(float(lqr.value(x0)), rel=2e-4)
     unseen = adp.QuadraticCost([[0.0, 0.0], [0.0, 1.0]], 1.0, dim=2, inputs=1)

@@ -116,7 +116,7 @@ def test_compiled_steps_are_those_of_the_definition() -> None:
         "a_step": 2,
         "probe": 1.0,
         "filter": adp.ConsiderFilter(PENDULUM, noise=0.01, process=0.01),
-        "rollout": adp.RolloutPolicy.of_lqr(PENDULUM, COST, steps=2),
+        "rollout": adp.RolloutPolicy.of_lqr(PENDULUM, COST, centers=3, steps=2),
     }
     controller = adp.Measured(adaptive(**more), noise=0.01, dim=2)
     loop = ClosedLoop(controller, CHANGING, CHANGING.cost(COST), dt=0.005)
