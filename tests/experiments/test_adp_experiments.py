@@ -17,7 +17,7 @@ from staf_torch.experiments import adp as adp_experiment
 from staf_torch.experiments import adp_comparison, adp_tracking
 
 SHORT = ["duration=0.1", "dt=0.005"]
-TRACKED = ("duration=0.05", "dt=0.01", "animation=gif", "figures=false")
+TRACKED = ("duration=0.03", "dt=0.01", "animation=gif", "figures=false")
 
 
 def moves(path: Path) -> None:
@@ -116,7 +116,7 @@ def test_tracking_writes_its_run_directory(tmp_path: Path) -> None:
     assert metrics["optimal_cost"] == pytest.approx(1.4223, abs=1e-3)
     assert metrics["identified_parameter_error"] < metrics["unidentified_parameter_error"]
     with np.load(tmp_path / "history.npz") as history:
-        assert history["parameters"].shape == (1, 6, 3, 2)
+        assert history["parameters"].shape == (1, 4, 3, 2)
     moves(tmp_path / "figures" / "tracking.gif")
 
 

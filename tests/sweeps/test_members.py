@@ -22,7 +22,7 @@ from staf_torch.sweeps.batching import DEFERRED, Computed, Failed, Outcome
 from staf_torch.sweeps.hydra_compat import Composer, config_loader
 from staf_torch.sweeps.members import member_overrides
 
-SHORT = ("dt=0.05", "duration=1.5", "settle_time=0.5", "figures=false")
+SHORT = ("dt=0.05", "duration=1.0", "settle_time=0.5", "figures=false")
 _composer: list[Composer] = []
 
 
@@ -121,7 +121,10 @@ LOOPS = {
         ["adp/law=published", "trajectories=2", "adp.gain=250"],
         ["adp.gains.critic_extrapolated=0.25,0.1", "adp.gains.forgetting=0.003,0.01"],
     ),
-    "supervised": (["adp.trust=0.5", "duration=0.5"], ["adp.actor=[0.2,0.3,0.4],[0.5,0.5,0.5]", "seed=0,1"]),
+    "supervised": (
+        ["adp.trust=0.5", "duration=0.5", "dt=0.01"],
+        ["adp.actor=[0.2,0.3,0.4],[0.5,0.5,0.5]", "seed=0,1"],
+    ),
     "quadratic": (
         ["adp/basis=quadratic"],
         ["adp.gains.normalisation=0.05,0.5", "adp.gains.forgetting=0.003,0.01"],
