@@ -9,6 +9,7 @@ from pathlib import Path
 import composing
 import pytest
 import torch
+from experiments.test_reference_metrics import CASES, RECORDED
 from omegaconf import DictConfig
 
 from staf_torch.experiments import exponential_bound, feasibility, layouts
@@ -26,41 +27,40 @@ def settings(name: str, *overrides: str) -> DictConfig:
     return composing.settings(f"experiment={name}", *SMALL[name], *overrides)
 
 
-Run = tuple[Path, dict[str, float | None]]
-
-
-@pytest.fixture(scope="module")
-def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Run]:
-    """A run of each, without figures: those are looked at by `test_reference_metrics.py`."""
-    places = {name: tmp_path_factory.mktemp(name) for name in MODULES}
-    return {name: (place, run(name, place, "figures=false")) for name, place in places.items()}
-
-
 def run(name: str, directory: Path, *overrides: str) -> dict[str, float | None]:
     metrics: dict[str, float | None] = MODULES[name].run(settings(name, *overrides), directory)
     assert json.loads((directory / "metrics.json").read_text()) == metrics
     return metrics
 
 
-@pytest.mark.parametrize("name", MODULES)
-def test_experiment_leaves_its_metrics_and_tables(name: str, runs: dict[str, Run]) -> None:
+def leaves_its_tables(name: str, directory: Path, *overrides: str) -> None:
+    """Run without figures: those are looked at by `test_reference_metrics.py`."""
     assert name in EXPERIMENTS
-    directory, metrics = runs[name]
-    assert metrics
+    metrics = run(name, directory, "figures=false", *overrides)
+    assert any(value is not None for value in metrics.values())
     rows = list(csv.DictReader((directory / f"{name}.csv").read_text().splitlines()))
     assert len((directory / f"{name}.md").read_text().splitlines()) >= 3
     assert len(rows) >= 2
     assert not (directory / "figures").exists()
 
 
-def test_experiments_report_the_reference_numbers(runs: dict[str, Run]) -> None:
-    bound, counts, found = (runs[name][1] for name in ("exponential_bound", "feasibility", "layouts"))
+def test_experiments_report_the_reference_numbers() -> None:
+    """What `test_reference_metrics.py` finds again, of the same small settings."""
+    for name, lines in SMALL.items():
+        assert CASES[name].split() == [f"experiment={name}", *lines]
+    recorded = json.loads(RECORDED.read_text())
+    bound, counts, found = (recorded[name] for name in ("exponential_bound", "feasibility", "layouts"))
     names = ("N", "S", "count", "one_polynomial_count", "measured_count")
     assert [bound[f"r0.1.eps0.001.{name}"] for name in names] == [3, 2, 21, 10, 10]
     assert counts == {"r0.1.eps0.1.count": 3, "r0.1.eps0.01.count": 6}
     for count, order in ((3, 2), (6, 3), (10, 4)):
         assert found[f"rings{count}.slope"] == pytest.approx(order, abs=0.15)
     assert found["polygon15.slope"] == pytest.approx(2, abs=0.1)
+
+
+def test_the_bound_leaves_its_tables(tmp_path: Path) -> None:
+    lines = ("exponential_bound.epsilons=[0.1,0.2]", "exponential_bound.states=5")
+    leaves_its_tables("exponential_bound", tmp_path, *lines)
 
 
 PLANE = "kernel=gaussian dtype=float32 centers.radius=0.2"
@@ -73,8 +73,8 @@ SPACE = (
 @pytest.mark.parametrize("overrides", [PLANE.split(), SPACE.split()], ids=["plane", "space"])
 @pytest.mark.parametrize("name", ["feasibility", "layouts"])
 def test_common_settings_hold(name: str, overrides: list[str], tmp_path: Path) -> None:
-    metrics = run(name, tmp_path, "figures=false", *overrides)
-    assert any(value is not None for value in metrics.values())
+    fewer = {"feasibility": "feasibility.states=9", "layouts": "layouts.states=2"}[name]
+    leaves_its_tables(name, tmp_path, fewer, *overrides)
 
 
 @pytest.mark.parametrize(
