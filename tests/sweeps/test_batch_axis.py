@@ -84,7 +84,7 @@ def test_members_keep_a_history_only_where_it_is_asked_for(tmp_path: Path) -> No
 
 def test_experiments_without_batches_run_one_by_one(tmp_path: Path) -> None:
     metrics, rows = run(
-        tmp_path, ["centers.radius=0.1,0.2"], "experiment=layouts", "layouts.radii=[0.1]", "layouts.states=4"
+        tmp_path, ["centers.radius=0.1,0.2"], "experiment=layouts", "layouts.radii=[0.1]", "layouts.states=2"
     )
     assert metrics["failed"] == 0
     assert all(row["metrics"] for row in rows)
