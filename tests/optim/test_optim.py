@@ -94,7 +94,8 @@ def test_kantorovich_rate_is_attained_in_the_worst_direction() -> None:
 def test_law_finds_the_ideal_weights(name: str, seed: int) -> None:
     objective = problem(seed, log_condition=0.5)
     ideal = torch.linalg.solve(objective.gram, objective.values)
-    found = run(LAWS[name], objective, torch.zeros(6, 4, dtype=torch.float64), 90)
+    steps = 150 if name == "fixed absolute step" else 75  # one in twenty seeds needs more than 90 of it
+    found = run(LAWS[name], objective, torch.zeros(6, 4, dtype=torch.float64), steps)
     torch.testing.assert_close(found, ideal, rtol=1e-8, atol=1e-10)
 
 
