@@ -21,6 +21,7 @@ DT = 1e-3
 # Who brakes before the one wall comes to the other one: half of the program of four walls.
 CORNER = systems.Barrier(CHAIN, low=[None, -5.0], high=[5.0, None])
 OF_CORNER = adp.LQR(CORNER, COST)
+WALL = systems.Barrier(CHAIN, low=None, high=[5.0, None])
 
 
 def beside_the_walls(count: int) -> Tensor:
@@ -39,14 +40,14 @@ def can_be_kept(count: int) -> Tensor:
     x = beside_the_walls(count)
     outward = torch.sign(x[:, 0])
     low, high = torch.zeros(len(x)).double(), torch.full((len(x),), 2e4).double()
-    for _ in range(25):
+    for _ in range(20):
         middle = 0.5 * (low + high)
         inside = (followed(x, -outward * middle)[..., 1].add(-1).abs() < 6).all(0)
         low, high = torch.where(inside, middle, low), torch.where(inside, high, middle)
     return (followed(x, -outward * low)[..., 0].add(1).abs() < 6).all(0)
 
 
-def followed(x: Tensor, u: Tensor, pieces: int = 40) -> Tensor:
+def followed(x: Tensor, u: Tensor, pieces: int = 30) -> Tensor:
     """x at so many times of a hold."""
     states = []
     for _ in range(pieces):
@@ -83,14 +84,14 @@ def test_a_control_that_is_renewed_in_time_keeps_every_start() -> None:
 
 @pytest.mark.compiled
 def test_substeps_are_few_away_from_walls_and_many_beside_them() -> None:
-    guard = adp.Feedback(adp.BoxFilter(OF_CORNER, CORNER, dt=DT, renewed=True))
-    near = CORNER.transform(beside_the_walls(18))[beside_the_walls(18)[:, 0] > 0]
-    away = CORNER.transform(tensor([[0.0, 1.0], [-3.0, 2.0], [2.0, -1.0]]))
+    guard = adp.Feedback(adp.BoxFilter(adp.LQR(WALL, COST), WALL, dt=DT, renewed=True))
+    near = WALL.transform(beside_the_walls(18))[beside_the_walls(18)[:, 0] > 0]
+    away = WALL.transform(tensor([[0.0, 1.0], [-3.0, 2.0], [2.0, -1.0]]))
     settings = {"dt": DT, "steps": 2, "renew": True}
 
     def run(s0: Tensor, substeps: int | tuple[int, int], compile: bool = False) -> adp.LoopResult:
         more = settings | {"substeps": substeps, "compile": compile}
-        return adp.simulate(guard, CORNER, COST, s0, **more)  # type: ignore[arg-type]
+        return adp.simulate(guard, WALL, COST, s0, **more)  # type: ignore[arg-type]
 
     mixed, compiled = (run(torch.cat((near, away)), (1, 6), compile) for compile in (False, True))
     assert not bool(mixed.diverged.any())

@@ -161,12 +161,12 @@ def test_loop_carries_a_plan_only_where_the_lqr_would_meet_a_bound(
     assert planner is not None
     x = torch.tensor([[3.0, 1.0], [0.05, 0.0], [-3.0, -1.0]], dtype=torch.float64)
     run, alone = (
-        adp.simulate(loop, plant, policy.cost, rows, dt=0.25, steps=12, compile=False) for rows in (x, x[:1])
+        adp.simulate(loop, plant, policy.cost, rows, dt=0.25, steps=10, compile=False) for rows in (x, x[:1])
     )
     assert torch.equal(alone.state[0], run.state[0])
-    assert planner.strained(run.state[0]).tolist() == [True] * 8 + [False] * 5
+    assert planner.strained(run.state[0]).tolist() == [True] * 8 + [False] * 3
     best = adp.BoxDDP(planner.problem, steps=60).solve(x)
-    torch.testing.assert_close(run.control[:, :12], best.control[:, :12], rtol=0, atol=1e-2)
+    torch.testing.assert_close(run.control[:, :10], best.control[:, :10], rtol=0, atol=1e-2)
     near, none = x[1:2], x.new_zeros(1, 0)
     u, carried = loop.step(near, loop.init(near), none, 0.25)
     assert torch.equal(u, policy(near))

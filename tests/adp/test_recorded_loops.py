@@ -76,7 +76,7 @@ def identified() -> Any:
 
 def guarded(policy: Any, **given: Any) -> Any:
     guard = adp.SafetyFilter(policy, PLANE, crossing, **{"dt": 0.1, "decay": 3.0} | given)
-    run = loop(guard, PLANE, COST4, BESIDE, 12, 0.1)
+    run = loop(guard, PLANE, COST4, BESIDE, 8, 0.1)
     return run, guard.report(run)
 
 
@@ -93,7 +93,7 @@ def in_a_box(**given: Any) -> Any:
     guard = adp.BoxFilter(adp.LQR(box, cost), box, dt=0.01, **given)
     s0 = box.transform(tensor([[4.9, 3.0], [-6.5, -2.0], [0.0, 6.9], [1.0, 0.5]]))
     renewed = bool(given.get("renewed"))
-    run = loop(adp.Feedback(guard), box, cost, s0, 12, 0.01, substeps=4, renew=renewed)
+    run = loop(adp.Feedback(guard), box, cost, s0, 8, 0.01, substeps=4, renew=renewed)
     return run, guard.share(s0), guard.hold(s0)
 
 
@@ -130,7 +130,7 @@ def kept_from_an_edge() -> Any:
         wanted, PENDULUM, lambda x, t: 0.5 - x[:, 0], windows, law, dt=0.01, decay=4.0, **box
     )
     start = tensor([[0.2, 0.3], [0.45, 0.1]])
-    return measured(safe, 0.0, start, 30, 0.01, tensor([[0.05, 0.6], [0.4, 1.5]]))
+    return measured(safe, 0.0, start, 20, 0.01, tensor([[0.05, 0.6], [0.4, 1.5]]))
 
 
 def waiting() -> Any:
@@ -198,7 +198,7 @@ def near_optimal(
 def swung(**more: Any) -> Any:
     mpc = adp.RecedingHorizon(pendulum(), **{"steps": 25, "iterations": 2, "compile": False} | more)
     x, carried, found = HANGING, mpc.init(HANGING), []
-    for _ in range(4):
+    for _ in range(3):
         u, carried = mpc.step(x, carried, x.new_zeros(0), 0.0)
         x, paid = mpc.problem.advance(x, u)
         found.append((u, x, paid))
