@@ -225,10 +225,8 @@ class Program:
         """The compiled program for such inputs, None where there is none."""
         if not self.compile or not given.ordinary():
             return None
-        shapes = given.key()
-        # Few rows take the program of many where there is one: it has the same bits, and a compiler is slow.
-        copies = self.copies or int(given.rows <= _FEW and (shapes, 0) not in self._compiled)
-        key = shapes, copies
+        copies = self.copies or int(given.rows <= _FEW)
+        key = given.key(), copies
         if key not in self._compiled:
             self._compiled[key] = self._again(key) or self._build(given, copies)
         built = self._compiled[key]
