@@ -23,6 +23,7 @@ from staf_torch.sweeps.hydra_compat import (
     PlainComposer,
     Product,
     config_loader,
+    find_launcher,
     interpolations_parsed_once,
     parse_override,
     sweep_size,
@@ -44,6 +45,11 @@ JOBS = [
     ["hydra.job.name=other", "hydra.sweep.subdir=x", "seed=1"],
     ["figures='no, thanks'", "duration=1e-3"],
 ]
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _launcher() -> None:
+    find_launcher()  # also where the package is on the path and not installed
 
 
 @pytest.mark.parametrize("job", JOBS, ids=" ".join)
