@@ -14,6 +14,7 @@ from staf_torch import (
     StateFollowingCenters,
     StateRadius,
     adp,
+    ball,
     cross_polytope,
     rings,
     systems,
@@ -81,7 +82,7 @@ def test_three_state_beats_the_lqr_and_the_published_cost() -> None:
     x0 = torch.tensor([[-0.5, 0.5, -0.25]], dtype=torch.float64)
     # The radius shrinks: the plant has no derivative at 0, and a constant ball around the state would hold 0.
     radius = StateRadius(0.1, 1e-5)
-    policy = rollout(plant, directions=cross_polytope(3), radius=radius, cost=cost, horizon=1.0, steps=10)
+    policy = rollout(plant, directions=ball(10, 3), radius=radius, cost=cost, horizon=1.0, steps=10)
     run = adp.simulate(adp.Feedback(policy), plant, cost, x0, dt=0.02, steps=400, every=400, compile=True)
     lqr = adp.simulate(
         adp.Feedback(adp.LQR(plant, cost)), plant, cost, x0, dt=0.005, steps=2000, every=2000, compile=True
@@ -147,10 +148,7 @@ def test_bad_arguments_are_refused_by_name() -> None:
         ({"horizon": 0.0}, r"`RolloutPolicy\(horizon=...\)` must be positive"),
         ({"steps": 0}, r"`RolloutPolicy\(steps=...\)` must be at least 1"),
         ({"depth": 0}, r"`RolloutPolicy\(depth=...\)` must be at least 1"),
-        (
-            {"directions": cross_polytope(3)},
-            r"`RolloutPolicy\(basis=...\)` must have the plant's 2 states; got 3",
-        ),
+        ({"directions": ball(10, 3)}, r"`RolloutPolicy\(basis=...\)` must have the plant's 2 states; got 3"),
     ):
         with pytest.raises(ValueError, match=message):
             rollout(**settings)

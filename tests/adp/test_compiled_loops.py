@@ -74,7 +74,7 @@ def three_states() -> tuple[adp.Controller, systems.ControlAffineSystem, adp.Cos
 
 def policy_iteration() -> tuple[adp.Controller, systems.ControlAffineSystem, adp.Cost]:
     basis = staf_basis("total", AnchoredKernel(GaussianKernel(4.0)))  # as in `test_policy_iteration.py`
-    points, start = adp.QuadraturePoints(2, 2, half_width=0.2), basis.weights_near_square()
+    points, start = adp.QuadraturePoints(3, 2, half_width=0.2), basis.weights_near_square()
     law = adp.PolicyIteration()
     return adp.ActorCritic(basis, PLANT, COST, points, law, critic=start, actor=start), PLANT, COST
 
