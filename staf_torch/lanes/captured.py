@@ -220,7 +220,7 @@ def tensors(value: Any) -> list[Tensor]:
     """The tensors in nested lists, tuples and dictionaries."""
     if isinstance(value, Tensor):
         return [value]
-    found = list[Tensor]()
+    found: list[Tensor] = []
     if isinstance(value, dict):
         value = value.values()
     elif not isinstance(value, (list, tuple)):
