@@ -14,7 +14,6 @@ from pathlib import Path
 from mutants import Mutant
 
 _DEVICE = "of another device than the processor, which machines that run the tests lack"
-_ENCODING = "of a locale other than UTF-8, which machines that run the tests lack"
 _LOOKS = "how a line of a figure is drawn, not where"
 _STYLE = (
     "marker",
@@ -58,8 +57,6 @@ def accepted(mutant: Mutant) -> str | None:
         return _SPEED
     if _without(mutant, "device"):
         return _DEVICE
-    if _without(mutant, "encoding"):
-        return _ENCODING
     if mutant.room == "figures" and any(_without(mutant, name) or _of(mutant, name) for name in _STYLE):
         return _LOOKS
     if mutant.was.startswith("torch.eye(") and _without(mutant, "dtype"):

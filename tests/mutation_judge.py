@@ -18,7 +18,7 @@ from mutants_accepted import accepted
 from mutation_fork import begin, collected, in_fork, place, run_files, run_items
 from mutation_map import CONTRACTS, Map, names, places, test_files, tests_near
 from mutation_patch import Functions
-from source_rules import without_dtype
+from source_rules import broken
 
 OVERHEAD = 0.01  # seconds that a test costs beside what was measured
 UNKNOWN = 5.0  # seconds that a file of tests is taken for
@@ -80,7 +80,7 @@ def judge(mutant: Mutant) -> Verdict | None:
     path = place() / mutant.file
     source = path.read_text(encoding="utf-8")
     changed = mutant.applied(source)
-    if len(list(without_dtype(changed))) > len(list(without_dtype(source))):
+    if len(broken(changed)) > len(broken(source)):
         return Verdict(mutant, "killed", 1, 0.0, _READS)
     tests = _tests_for(mutant, source)
     if not tests:

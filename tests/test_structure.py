@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 from command_line import ROOT, one
 from public_names import PACKAGES, public
-from source_rules import without_dtype
+from source_rules import without_dtype, without_encoding
 
 PACKAGE = ROOT / "staf_torch"
 TOP = re.findall(r"^(\w+):", (ROOT / "conf" / "config.yaml").read_text(encoding="utf-8"), re.MULTILINE)
@@ -204,5 +204,14 @@ def test_no_number_depends_on_the_default_dtype_of_torch() -> None:
         f"{path.relative_to(ROOT)}:{call}"
         for path in sorted(PACKAGE.rglob("*.py"))
         for call in without_dtype(path.read_text(encoding="utf-8"))
+    ]
+    assert found == []
+
+
+def test_no_file_is_read_in_the_encoding_of_a_locale() -> None:
+    found = [
+        f"{path.relative_to(ROOT)}:{call}"
+        for path in sorted(PACKAGE.rglob("*.py"))
+        for call in without_encoding(path.read_text(encoding="utf-8"))
     ]
     assert found == []

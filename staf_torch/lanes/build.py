@@ -150,7 +150,7 @@ def _key(program: str, source: Path, definitions: tuple[str, ...]) -> str:
     files = sorted(
         {source, *source.parent.glob("_*.hpp"), *_FOLDER.glob("_*.hpp")}, key=lambda file: file.name
     )
-    sources = [file.read_text() for file in files]
+    sources = [file.read_text(encoding="utf-8") for file in files]
     parts = (*sources, *_FLAGS, *definitions, version, platform.platform(), _processor())
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:16]
 
@@ -158,7 +158,7 @@ def _key(program: str, source: Path, definitions: tuple[str, ...]) -> str:
 def _processor() -> str:
     """-march=native follows the processor: a home directory may be shared between several."""
     try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError:
         return platform.processor()
     return "\n".join(sorted({line for line in lines if line.startswith(("model name", "flags", "Features"))}))

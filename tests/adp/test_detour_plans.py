@@ -210,3 +210,34 @@ def test_a_plan_that_costs_more_than_expected_is_left_for_another_way() -> None:
     others, later = free._problem.others(ahead), after.identifier[:, -1:]
     total = free._problem.follow(ahead, others, later, given, lambda y, others, u, k: u).total
     torch.testing.assert_close(total, after.identifier[:, -2], rtol=1e-9, atol=1e-12)
+
+
+def test_what_a_period_cost_is_taken_off_at_the_time_of_that_period() -> None:
+    """What is in the way from .3 to .5 s, everywhere, costs the third period, and none of those after it."""
+
+    def passing(x: Tensor, t: Tensor) -> Tensor:
+        return torch.where((t > 0.3) & (t < 0.5), -0.05, 10.0) + 0.0 * x[:, 0]
+
+    ways = adp.DetourRollout(
+        LQR,
+        PLANE,
+        COST,
+        passing,
+        axes=torch.eye(2, 4),
+        dt=0.2,
+        steps=4,
+        terminal=LQR.value,
+        sizes=[0.6],
+        lengths=[3],
+    )
+    plans = adp.DetourPlans(ways, first=1)
+    problem, begun = plans._problem, plans.init(AWAY)
+    known = torch.cat((begun.identifier[:, :-1], torch.full((2, 1), 2.0, dtype=torch.float64)), dim=-1)
+    found = plans._definition(torch.cat((AWAY, known), dim=-1))
+    u, given, expected, done = found.split((2, 8, 1, 1), dim=-1)
+    assert problem.penalty(AWAY, torch.full((2,), 0.4, dtype=torch.float64)).min() > 1
+    ahead = problem._advance(AWAY, u)
+    plan = problem.follow(
+        ahead, problem.others(ahead), done, given.unflatten(-1, (4, 2)), lambda y, others, u, k: u
+    )
+    torch.testing.assert_close(plan.total, expected[:, 0], rtol=1e-9, atol=1e-9)

@@ -110,6 +110,14 @@ def test_the_bound_is_of_as_many_states_as_are_stated(count: int, monkeypatch: p
     assert seen == [len(exponential_bound.theory.disc(1.0, count=count))]
 
 
+def test_the_bound_holds_in_space_too() -> None:
+    lines = ("exponential_bound.epsilons=[0.1]", "exponential_bound.states=5", "centers.radius=0.05")
+    ((radius, epsilon), row), *_ = exponential_bound.solve(
+        settings("exponential_bound", *lines, *SPACE.split())
+    ).items()
+    assert row["measured_count"] <= row["one_polynomial_count"] <= row["count"]
+
+
 def test_where_no_layout_is_good_enough_none_is_needed_by_name() -> None:
     good = torch.tensor([[False, True, True], [False, False, False], [True, False, True]])
     assert feasibility._first(good, torch.tensor([3, 6, 10])).tolist() == [6, 0, 3]

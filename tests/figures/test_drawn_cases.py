@@ -77,6 +77,16 @@ def test_an_arc_may_leave_its_circle_by_a_hundredth(sizes: tuple[float, float]) 
     assert visible(theory.draw_feasibility(still))[0].get_xlabel() == "time (s)"
 
 
+def test_values_of_epsilon_are_named_six_in_a_row() -> None:
+    for count, columns in ((6, 6), (7, 6)):
+        epsilons = 0.5 ** np.arange(count)
+        needed = np.full((count, 9), 3.0)
+        found = theory.Feasibility(
+            T, np.ones((9, 3)), 0.5, T[:1], epsilons, np.array([3]), needed, needed[:, :1].T
+        )
+        assert theory.draw_feasibility(found).legends[0]._ncols == columns
+
+
 def test_without_rings_the_layouts_of_the_ball_are_drawn_against_the_radius_and_the_largest_polygon() -> None:
     radii = np.array([0.1, 0.2, 0.4])
     tried = ("ball", 3), ("ball", 5), ("polygon", 3), ("polygon", 7), ("cross_polytope", 4)

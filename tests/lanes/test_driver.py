@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import mmap
 import os
 
 import pytest
@@ -137,3 +138,13 @@ def test_a_child_process_writes_to_a_large_result_of_its_own() -> None:
         os._exit(0)
     assert os.waitpid(child, 0)[1] == 0
     assert not bool(given.any())
+
+
+@pytest.mark.skipif(not hasattr(mmap, "MADV_HUGEPAGE"), reason="needs huge pages")
+def test_large_results_are_mappings_of_their_own() -> None:
+    like = torch.zeros(1, dtype=torch.float64)
+    for shape in ((LARGE // 8,), (3, LARGE // 8 + 1), (7, LARGE // 16)):
+        large = fresh(like, *shape)
+        assert large.shape == shape
+        assert large.is_contiguous()
+        assert large.data_ptr() % mmap.PAGESIZE == 0  # what `malloc` returns begins after its own notes

@@ -298,6 +298,23 @@ def test_float64_inside_a_program_of_float32_is_carried_in_double_throughout() -
     torch.testing.assert_close(end, want_end, rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.parametrize("kind", [torch.float32, torch.float16])
+def test_numbers_of_a_lesser_dtype_inside_a_program_are_rounded_as_they_are(kind: torch.dtype) -> None:
+    """float32 of a program of float64, half precision of one of float32: no lanes have them."""
+    given = torch.float64 if kind == torch.float32 else torch.float32
+
+    def step(x: Tensor, u: Tensor, row: Any) -> tuple[Tensor, Tensor]:
+        x = (x.to(kind) / 3).to(given) + u
+        return x, x
+
+    program = lanes.Program(step)
+    generator = torch.Generator().manual_seed(4)
+    x, u = (torch.randn(5, *shape, dtype=given, generator=generator) for shape in ((2,), (3, 2)))
+    assert not program.compiles(x, u)
+    for found, right in zip(program(x, u), program.definition(x, u), strict=True):
+        assert torch.equal(found, right)
+
+
 @pytest.mark.parametrize("rows", [1, 5, 21])
 def test_a_carry_of_many_entries_stays_in_memory(rows: int) -> None:
     """Matrices that change places, a part of one that moves on, flags, and numbers beside them."""

@@ -40,6 +40,7 @@ def test_an_exponential_is_exact_at_every_norm_and_the_same_alone(size: int) -> 
     for one, alone in zip(matrix, found, strict=True):
         torch.testing.assert_close(exponential(one), alone, rtol=0, atol=2e-15)
         torch.testing.assert_close(exponential(one[None])[0], alone, rtol=0, atol=2e-15)
+        torch.testing.assert_close(exponential(one[None, None])[0, 0], alone, rtol=0, atol=2e-15)
 
 
 def test_a_matrix_that_is_not_finite_has_no_condition_number_and_spoils_no_other() -> None:

@@ -65,6 +65,7 @@ def test_jobs_are_cancelled_a_thousand_at_a_time_in_four_seconds(asked: list[dic
     assert [len(each["line"]) - 2 for each in asked] == [1000] * 6 + [1]
     assert [each["timeout"] for each in asked] == [4.0, 3.0, 2.0, 1.0, 0.0, 0.0, 0.0]
     assert all(each["text"] and each["capture_output"] for each in asked)  # what it says is no noise here
+    assert not any(each["check"] for each in asked)  # what could not be cancelled keeps no other job running
     asked.clear()
     Controller().cancel([])
     assert asked == []

@@ -136,6 +136,9 @@ def test_the_step_of_concurrent_learning_solves_its_implicit_equation() -> None:
     pull = (s * (z - (s * after[:, None]).sum(-1)).unsqueeze(-1)).sum(1)
     wanted = 0.2 * rate[:, None] * (push + gain[:, None] * pull)
     torch.testing.assert_close(after - theta, wanted, rtol=1e-10, atol=1e-12)
+    law = adp.ConcurrentGradient(gain.expand(2, 3), rate)  # a number for every row of several dimensions
+    lead = [value.expand(2, *value.shape) for value in (theta, gram, moment)]
+    torch.testing.assert_close(law.step(*lead, 0.2, push), after.expand(2, 3, 3), rtol=0, atol=1e-14)
 
 
 def test_least_squares_are_those_of_all_equations_at_once_with_the_first_estimate() -> None:
