@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from itertools import islice
 from typing import NamedTuple
 
 import numpy as np
@@ -215,17 +216,18 @@ def held_stability(
     basis = _moved(f, g, discrete=system.period is not None)
     f, g, slope = basis.mT @ f @ basis, basis.mT @ g, slope @ basis
 
-    def radius(dt: float) -> float:
-        a, b = _held(system, f, g, dt)
+    def spectral(a: Tensor, b: Tensor) -> float:
         return float(torch.linalg.eigvals(a + b @ slope).abs().max())
+
+    def radius(dt: float) -> float:
+        return spectral(*_held(system, f, g, dt))
 
     now = radius(period)
     if system.period is not None:
-        stable = [radius(k * system.period) < 1 for k in range(1, _STEPS + 1)] if now >= 1 else [True]
-        if all(stable):
+        stable = next((k for k, ab in enumerate(islice(_steps(f, g), _STEPS)) if spectral(*ab) >= 1), None)
+        if stable is None:
             return HeldStability(now, math.inf)
-        first = stable.index(False)
-        return HeldStability(now, first * system.period if first else None)
+        return HeldStability(now, stable * system.period if stable else None)
     modes = torch.linalg.eigvals(f + g @ slope)
     if float(modes.real.max()) >= 0:
         return HeldStability(now, None)
@@ -263,7 +265,13 @@ def _held(plant: Plant, f: Tensor, g: Tensor, dt: float) -> tuple[Tensor, Tensor
         n, m = g.shape
         flow = exponential(dt * torch.cat((torch.cat((f, g), dim=1), f.new_zeros(m, n + m))))
         return flow[:n, :n], flow[:n, n:]
-    a, b = torch.eye(len(f), dtype=f.dtype), torch.zeros_like(g)
-    for _ in range(periods("held_stability", plant, dt)):
+    count = periods("held_stability", plant, dt)
+    return next(islice(_steps(f, g), count - 1, None))
+
+
+def _steps(f: Tensor, g: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
+    """A and B of 1, 2, ... steps of a plant in discrete time with u held."""
+    a, b = f, g
+    while True:
+        yield a, b
         a, b = f @ a, f @ b + g
-    return a, b

@@ -235,9 +235,11 @@ class StaF(nn.Module):
         trailing(call, "y", y, dims=2, last=self.basis.dim)
         batch = self.state.shape[:-1]
         if y.shape[:-1] == batch:
+            ones = ", ".join("1" for _ in batch)
             raise ValueError(
                 f"`{call}(y=...)` of the shape {tuple(y.shape)} must say which points are meant: one of each "
-                f"batch entry ({one_each}), or all of them for every entry (`y.unsqueeze(0)`, (1, P, n))."
+                f"batch entry ({one_each}), or all of them for every entry (`y.reshape({ones}, -1, "
+                f"{y.shape[-1]})`, ({ones}, P, n))."
             )
 
     def _along(self, y: Tensor, z: Tensor, mode: str, target: Target | None) -> Callable[[Tensor], Tensor]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import logging
 import math
 from typing import Any, NamedTuple
 
@@ -37,8 +38,10 @@ KERNELS: dict[str, type[Kernel]] = {
 """Kernels by name, with the defaults of their constructors."""
 
 
+_log = logging.getLogger(__name__)
 _NAME = "StaFRegressor"
 _RINGS = (3, 6, 10, 15, 21, 28)
+_EXPLAINED = 0.5  # of the variance: a ball of 2.3 widths of the Gaussian kernel
 _PLAIN = 64  # rounding errors of the covariance: less noise than that would leave no digit of it
 
 
@@ -86,9 +89,25 @@ def filter_streams(model: Any, sizes: Sizes, like: Tensor, scaling: bool) -> tup
         for value in (ratio, forgetting)
     ]
     functions = LocalFunctions.of(kernel, offsets)
+    _check_reach(functions, radius)
     filter_ = LocalFilter(functions, law[0], law[1], follow * radius, robust, amplitude**2)
     state = StreamState.empty(like, streams, dim, len(offsets), outputs)
     return FilterStreams(filter_, state, scaling), offsets
+
+
+def _check_reach(functions: LocalFunctions, radius: float) -> None:
+    """Raise where the kernel overflows within the ball, and tell of one that is narrow for it."""
+    explained = functions.explained()
+    if math.isnan(explained) and functions.shared is not None:
+        rule = f"must be so small that {type(functions.kernel).__name__} does not overflow within the ball"
+        raise fail(_NAME, "radius", rule, radius)
+    if explained < _EXPLAINED:
+        _log.warning(
+            "`StaFRegressor(radius=%g)`: half way to a center the centers explain %.2g of the variance of "
+            "what is learned (%s): estimates fall back to zero between them. Take a smaller radius, or a "
+            "wider kernel",
+            *(radius, explained, type(functions.kernel).__name__),
+        )
 
 
 def directions(model: Any, dim: int) -> Tensor:

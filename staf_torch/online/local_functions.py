@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -68,6 +69,19 @@ class LocalFunctions(NamedTuple):
             return (z.square().sum(0) * self.rate).exp().to(z)
         point = z.mT.double().unsqueeze(-2)
         return self.kernel.core(x.mT.double(), point, point).flatten().to(z)
+
+    def explained(self) -> float:
+        """The least share of V's variance that the centers explain half way to one of them, in [0, 1].
+
+        Around the origin, for a kernel whose functions differ from state to state. NaN where the kernel
+        overflows within the ball.
+        """
+        z = self.offsets.mT / 2
+        gram = self.kernel.core(torch.zeros_like(self.offsets[0]), self.offsets, self.offsets)
+        if not bool(torch.isfinite(gram).all()):  # the Newton basis of which is zero
+            return math.nan
+        psi = self.functions(torch.zeros_like(z), z)
+        return float((psi.square().sum(0) / self.variance(torch.zeros_like(z), z)).amin())
 
     @property
     def stationary(self) -> bool:

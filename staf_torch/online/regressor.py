@@ -53,7 +53,8 @@ class StaFRegressor(StreamEstimator):
     Args:
         kernel: a `Kernel`, or the name of one in `KERNELS`.
         radius: of the centers around the latest x, positive, in the units of x; about the distance over
-            which V looks quadratic, half a kernel's width or so.
+            which V looks quadratic, half a kernel's width or so. The log tells of one so large that the
+            centers explain less than half of the variance between them.
         count: M, centers; None takes C(n + 2, 2), enough for quadratics.
         centers: directions (M, n) in the closed unit ball in place of ``count``, such as
             ``torch.cat((cross_polytope(n), torch.zeros(1, n)))``.

@@ -12,7 +12,7 @@ from recorded import Record
 from torch import Tensor
 
 from staf_torch import adp, systems
-from staf_torch.adp import plan_problem, sampled_problem, sampling
+from staf_torch.adp import plan_problem, sampled_problem
 from staf_torch.adp.plans import LocalModel
 from staf_torch.adp.sampling import held_riccati, linear_hold, periods
 from staf_torch.numerics.forward_mode import use_forward_mode
@@ -269,17 +269,19 @@ def test_a_period_is_a_multiple_to_a_billionth() -> None:
             periods("call", plant, dt)
 
 
-def test_a_loop_in_steps_is_stable_up_to_a_number_of_its_periods(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sampling, "_STEPS", 8)  # a thousand take a second
+def test_a_loop_in_steps_is_stable_up_to_a_number_of_its_periods() -> None:
+    """Whatever the period is that it is asked for."""
     plant = in_steps(tensor([[1.0]]), tensor([[0.1]]))
-    assert adp.held_stability(lambda x: -3 * x, plant, 0.7) == (pytest.approx(1.1), pytest.approx(0.6))
-    assert adp.held_stability(lambda x: -3 * x, plant, 0.6) == (pytest.approx(0.8), INF)
+    for period in (0.1, 0.3, 0.6, 0.7, 2.0):
+        wanted = pytest.approx(abs(1 - 3 * period)), pytest.approx(0.6)
+        assert adp.held_stability(lambda x: -3 * x, plant, period) == wanted
+    assert adp.held_stability(lambda x: -2 / 99.95 * x, plant, 0.1).largest_period == pytest.approx(99.9)
+    assert adp.held_stability(lambda x: -2 / 100.05 * x, plant, 0.1).largest_period == INF  # of 1000 tried
     assert adp.held_stability(lambda x: 3 * x, plant, 0.1) == (pytest.approx(1.3), None)
     assert adp.held_stability(lambda x: 0 * x, plant, 0.1) == (1.0, None)
 
 
-def test_others_beside_a_loop_in_steps_count_only_where_they_grow(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sampling, "_STEPS", 8)
+def test_others_beside_a_loop_in_steps_count_only_where_they_grow() -> None:
     for other, counted in ((1.0, False), (-1.0, False), (-1.2, True), (1.2, True)):
         plant = in_steps(tensor([[1.0, 0.3], [0.0, other]]), tensor([[0.1], [0.0]]))
         found = adp.held_stability(lambda x: -3 * x[..., :1], plant, 0.1).spectral_radius

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import math
+import re
 from typing import Any
 
 import pytest
@@ -116,5 +118,11 @@ def test_points_that_could_be_of_one_entry_each_or_of_all_are_refused(batch: tup
     for call in (staf, staf.gradient):
         with pytest.raises(ValueError, match="must say which points are meant: one of each batch entry"):
             call(y)
+    ones = [1] * len(batch)
+    with pytest.raises(ValueError, match=re.escape(f"y.reshape({', '.join(map(str, ones))}, -1, 2)")):
+        staf(y)
+    all_of_them = staf(y.reshape(*ones, -1, 2))  # as it says
+    assert all_of_them.shape == (*batch, math.prod(batch))
+    torch.testing.assert_close(all_of_them[(0,) * len(batch)][0], staf(y.unsqueeze(-2))[(0,) * len(batch)][0])
     for points in (y.unsqueeze(-2), uniform(4, 2, seed=4), uniform(*batch, 4, 2, seed=3)):
         assert staf(points).shape[-1] == points.shape[-2]

@@ -8,7 +8,7 @@ from helpers import tensor, uniform
 from variants import Cauchy
 
 import staf_torch as st
-from staf_torch.online.filter_arguments import directions
+from staf_torch.online.filter_arguments import KERNELS, directions
 
 
 @pytest.mark.parametrize(
@@ -17,6 +17,10 @@ from staf_torch.online.filter_arguments import directions
         ({"kernel": "cubic"}, "kernel.*must be one of"),
         ({"kernel": st.GaussianKernel(tensor([1.0, 2.0]))}, "kernel.*one value a hyperparameter"),
         ({"radius": 0.0}, "radius.*must be positive"),
+        (
+            {"radius": 0.5, "kernel": st.GaussianKernel(0.015)},
+            "radius.*GaussianKernel does not overflow.*0.5",
+        ),
         ({"count": 0}, "count.*at least 1"),
         ({"noise": 1e-9}, "noise.*at least"),
         ({"amplitude": -1.0}, "amplitude.*must be positive"),
@@ -27,6 +31,30 @@ from staf_torch.online.filter_arguments import directions
 def test_bad_arguments_are_named(arguments: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         st.StaFRegressor(**arguments).partial_fit(tensor([0.0, 1.0]), 1.0)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("kernel", [*map(str, KERNELS), Cauchy()], ids=str)
+@pytest.mark.parametrize("dim", [1, 2, 4])
+def test_a_kernel_that_is_narrow_for_its_ball_is_told(
+    kernel: st.Kernel | str, dim: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Against the variance that is left by values at the centers, by dense algebra."""
+    told = []
+    for radius in (0.5, 1.5, 2.5, 4.0):
+        caplog.clear()
+        model = st.StaFRegressor(kernel, radius=radius)
+        model.partial_fit(torch.zeros(dim).double(), 1.0)
+        own = KERNELS[kernel]().double() if isinstance(kernel, str) else kernel.double()
+        centers, points = model.centers_offsets_, model.centers_offsets_ / 2
+        cross, gram = own(points, centers), own(centers, centers)
+        known = cross @ torch.linalg.pinv(gram, rtol=1e-12, hermitian=True) @ cross.mT
+        share = float((known.diagonal() / own(points, points).diagonal()).min())
+        told.append(bool(caplog.messages))
+        assert told[-1] == (share < 0.5)
+        if told[-1]:
+            assert caplog.messages[0].startswith(f"`StaFRegressor(radius={radius:g})`: half way to a center")
+            assert f"explain {share:.2g} of the variance" in caplog.messages[0]
+    assert told == ([False] * 4 if kernel == "polynomial" else [False, False, told[2], True])
 
 
 def test_bad_samples_are_named() -> None:
