@@ -92,7 +92,8 @@ def fold(graph: fx.GraphModule) -> fx.GraphModule:
     for name, buffer in list(graph.named_buffers()):
         if name in used:
             setattr(graph, name, buffer.detach().clone())  # not a view of more than a file should hold
-        else:
+    for name, _ in [*graph.named_buffers(), *graph.named_parameters()]:
+        if name not in used:
             delattr(graph, name)
     graph.recompile()
     return graph

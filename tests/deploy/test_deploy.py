@@ -300,6 +300,17 @@ def test_work_of_a_linear_controller_is_counted() -> None:
     assert counted == sheet.Work(parameters=2, flops=4, functions=0, bytes_constants=16, bytes_in_out=24)
 
 
+def test_weights_of_a_network_are_counted_and_kept_once() -> None:
+    network = torch.nn.Sequential(torch.nn.Linear(2, 3), torch.nn.Tanh(), torch.nn.Linear(3, 1)).double()
+    program = deploy.trace(network, torch.zeros(1, 2).double())
+    counted = sheet.work(program)
+    assert (counted.parameters, counted.functions) == (2 * 3 + 3 + 3 + 1, 3)
+    assert counted.flops == 3 * (2 * 2 - 1) + 3 + (2 * 3 - 1) + 1
+    assert sum(part.numel() for part in program.state_dict.values()) == 13
+    x = torch.randn(5, 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    torch.testing.assert_close(program.module()(x), network(x))
+
+
 def test_what_cannot_be_deployed_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ValueError, match=r"`policy_of\(controller=...\)` must be"):
         deploy.policy_of(lambda x: x)  # type: ignore[arg-type]
