@@ -27,7 +27,7 @@ from .bank_rules import (
     size,
 )
 from .compiled_filter import FunctionPointers
-from .filter_streams import refuse_other
+from .filter_streams import refuse_other, table_of
 from .local_functions import LocalFunctions
 
 _NUMBERS = len(Rules.of(1, True).numbers())
@@ -133,12 +133,10 @@ class Bank:
             ValueError: if the table has another shape, dtype or device, or numbers that no bank has written:
                 compiled code goes by them.
         """
-        table = state.get("table")
-        if not isinstance(table, Tensor):
-            raise ValueError("`StaFRegressor.load_state_dict(state=...)` must have a tensor 'table'.")
-        if "arguments" not in state and table.shape[-1] == size(self.shape) - 1:  # of an older version
+        table = table_of(state)
+        if "arguments" not in state and table.shape[1] == size(self.shape) - 1:  # of an older version
             table = torch.nn.functional.pad(table, (0, 1))
-        refuse_other({"table": table}, {"table": self.table}, size(self.shape), table.shape[-1])
+        refuse_other({"table": table}, {"table": self.table}, size(self.shape), table.shape[1])
         refuse_unwritten(self.shape, table)
         self.replace(table.clone())
 

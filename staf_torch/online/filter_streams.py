@@ -312,13 +312,12 @@ class FilterStreams:
             ValueError: if a tensor has another shape, dtype or device, since compiled code goes by these, or
                 if kernel or centers are others.
         """
-        if not isinstance(state.get("table"), Tensor):
-            raise ValueError("`StaFRegressor.load_state_dict(state=...)` must have a tensor 'table'.")
+        given_table = table_of(state)
         state = {"turn": torch.zeros_like(self.turn)} | state  # of older versions
-        refuse_other(state, self._learned(), self.state.blocks.shape[1], state["table"].shape[0])
+        refuse_other(state, self._learned(), self.state.blocks.shape[1], given_table.shape[0])
         for name, own in self._fixed().items():
             given = state.get(name, own)  # which older versions did not save
-            like = given.shape == own.shape and given.dtype == own.dtype
+            like = isinstance(given, Tensor) and given.shape == own.shape and given.dtype == own.dtype
             if not like or not torch.allclose(given, own, rtol=1e-9):
                 told = "must have the kernel, radius and centers of this regressor"
                 raise ValueError(f"`StaFRegressor.load_state_dict(state=...)` {told}; {name!r} differs.")
@@ -331,6 +330,15 @@ class FilterStreams:
 def _typical(values: Tensor) -> Tensor:
     """The lower median of every column, which streams that are added begin with: (S, ...) -> (1, ...)."""
     return values.median(0).values[None]
+
+
+def table_of(state: dict[str, Any]) -> Tensor:
+    """The table of a saved state, of two dimensions; raises where it has none."""
+    table = state.get("table")
+    if not isinstance(table, Tensor) or table.dim() != 2:
+        rule = "must have a tensor 'table' of two dimensions"
+        raise ValueError(f"`StaFRegressor.load_state_dict(state=...)` {rule}.")
+    return table
 
 
 def refuse_other(state: dict[str, Any], own: dict[str, Tensor], expected: int, given: int) -> None:

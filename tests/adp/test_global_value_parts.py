@@ -195,7 +195,10 @@ def test_a_trajectory_that_must_not_help_is_no_candidate(known: adp.GlobalValue)
         others = [e for e in known.entries.tolist() if e // LENGTH != int(own[row])]
         far = {e: float((known.seen(known.plans[e, :N]) - size[row]).norm()) for e in others}
         assert set(sorted(far, key=lambda e: far[e])[:1]) <= set(entries[row, :-1].tolist())
-    assert torch.equal(known.choose(x, own).entry, known.choose(x, own).entry)
+    known.candidates = 12
+    near = known._rows[known._tree.query(size.numpy(), min(48, len(known._rows)))[1]]
+    for row, entries in enumerate(known.nearest(x, own)[:, :-1].tolist()):  # the others, the nearest first
+        assert entries == [e for e in near[row] if e // LENGTH != int(own[row])][:12]
 
 
 def test_a_replayed_plan_ends_in_the_feedback_of_the_goal(known: adp.GlobalValue) -> None:

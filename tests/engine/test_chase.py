@@ -127,6 +127,7 @@ def test_a_row_that_is_never_finite_keeps_its_first_weights() -> None:
     first = uniform(3)
     result = run(states, "gaussian", weights=first)
     assert result.diverged_at.tolist() == [-1, -1, 0, -1]
+    assert result.diverged.tolist() == [False, False, True, False]
     assert torch.equal(result.weights[2], first.expand(41, 3))
 
 

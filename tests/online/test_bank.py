@@ -191,6 +191,16 @@ def test_a_saved_bank_with_numbers_that_no_bank_writes_is_refused(name: str, val
         bank.load_state_dict({"table": table})
 
 
+@pytest.mark.parametrize("memory", [None, 128])
+@pytest.mark.parametrize("shape", [None, (), (7,), (1, 2, 3)])
+def test_what_is_no_table_is_refused(memory: int | None, shape: tuple[int, ...] | None) -> None:
+    x, y = streams(5, 2)
+    model = st.StaFRegressor(memory=memory, neighbours=8).fit(x, y[..., 0])
+    table = None if shape is None else torch.zeros(shape, dtype=torch.float64)
+    with pytest.raises(ValueError, match=r"load_state_dict.*must have a tensor 'table' of two dimensions"):
+        model.load_state_dict(model.state_dict() | {"table": table})
+
+
 def test_a_table_in_which_every_sample_calls_itself_recent_stays_inside() -> None:
     bank = Bank(BankShape(2, 1, 128, 8), 1, True)
     (stream,) = bank._definition.each(bank.table)

@@ -73,7 +73,8 @@ def test_units_are_mean_and_deviation_of_what_is_usual() -> None:
 class Alone:
     """One stream with units: its filter starts over from the samples themselves whenever units change."""
 
-    def __init__(self, ratio: float, forgetting: float) -> None:
+    def __init__(self, ratio: float, forgetting: float, stretch: Tensor) -> None:
+        self.stretch = stretch.numpy()
         self.law = LocalFilter(FUNCTIONS, tensor([ratio]), tensor([forgetting]), 0.5)
         self.begin()
         self.learned = self.skipped = 0
@@ -119,6 +120,7 @@ class Alone:
                 self.waited = 0.0
                 if len(self.young) in (2, 5, 10, 20, 40):
                     self.center, self.spread = numpy_units(np.stack([each for each, _ in self.young]))
+                    self.spread = self.spread * self.stretch
                     count = self.over(self.young)
                     self.learned, self.skipped = self.learned + count, self.skipped + 1 - count
                     self.learned = max(self.learned, int(self.state.counts[0]))
@@ -137,7 +139,7 @@ class Alone:
 
     def grow(self) -> None:
         latest = np.stack([each for each, _ in self.latest])[:, :2]
-        moves = numpy_units(latest)[1]
+        moves = numpy_units(latest)[1] * self.stretch[:2]
         told = (~np.isnan(latest)).sum(0) >= 20
         still = np.nanmax(latest, 0) == np.nanmin(latest, 0)
         grown = told & ~still & (moves > 3 * self.spread[:2])
@@ -186,8 +188,11 @@ def test_units_are_learned_grown_and_left_as_by_a_stream_that_starts_over(steps:
     ratio = torch.linspace(1e-3, 0.1, count, dtype=torch.float64)
     forgetting = torch.linspace(0.95, 1.0, count, dtype=torch.float64)
     state = StreamState.empty(torch.zeros(0).double(), count, 2, 6, 1)
-    streams = FilterStreams(LocalFilter(FUNCTIONS, ratio, forgetting, 0.5), state, True)
-    alone = [Alone(float(ratio[k]), float(forgetting[k])) for k in range(count)]
+    stretch = torch.linspace(0.5, 2.0, 3 * count, dtype=torch.float64).view(
+        count, 3
+    )  # widths that were tuned
+    streams = FilterStreams(LocalFilter(FUNCTIONS, ratio, forgetting, 0.5), state, True, None, stretch)
+    alone = [Alone(float(ratio[k]), float(forgetting[k]), stretch[k]) for k in range(count)]
     for k in range(steps):
         lapse = None if k % 4 else torch.linspace(0.5, 2.0, count, dtype=torch.float64)
         at = torch.stack((both[k, :, 0], both[k, :, 1]), 1)
