@@ -282,6 +282,7 @@ CALLS: dict[str, Callable[..., Any]] = {
         lambda x, u: 0.9 * x + 0.1 * u, **{"dim": 1, "inputs": 1, "dt": 0.1, **given}
     ),
     "ParametricPlant": lambda **given: parametric(**given),
+    "held_stability": lambda **given: adp.held_stability(LQR, PLANT, **{"period": 0.1, **given}),
     "near_optimal": lambda **given: adp.near_optimal(PLANT, COST, **{"dt": 0.1, **given}),
     "report": lambda **given: REPORTED.report(**{"states": 2, "optimum": False, **given}),
     "riccati_rows": lambda **given: adp.riccati_rows(-EYE, EYE, EYE, EYE, **given),

@@ -25,7 +25,7 @@ from .receding_horizon import RecedingHorizon
 from .rollout import ball_directions
 from .sampled_problem import SampledProblem
 from .sampled_rollout import SampledRollout
-from .sampling import held_stability
+from .sampling import HeldLoop, held_stability
 from .shooting import DirectShooting
 from .simulation import simulate
 from .strained_plans import StrainedPlans
@@ -335,7 +335,7 @@ def _warn_if_slow(policy: NearOptimal) -> None:
 def _slowest(lqr: LQR, plant: Plant) -> float:
     """The decay of the slowest mode of the held LQR's loop, 1/s."""
     assert lqr.period is not None
-    radius = held_stability(lqr, plant, lqr.period, at=lqr.cost.target).spectral_radius
+    radius = HeldLoop.of(lqr, plant, at=lqr.cost.target).spectral_radius(lqr.period)
     return -math.log(max(min(radius, 1 - 1e-9), 1e-9)) / lqr.period
 
 

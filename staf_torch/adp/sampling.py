@@ -197,50 +197,73 @@ def held_stability(
     Raises:
         ValueError: if the period breaks its rule, or the plant is clocked and ``at`` is missing.
     """
-    if isinstance(system, Clocked):  # whose clock would count as a mode that never decays
-        if at is None:
-            raise fail(
-                "held_stability", "at", "must be a state of the path at t = 0, for a clocked plant", at
+    positive_real("held_stability", "period", period)
+    loop = HeldLoop.of(policy, system, at=at)
+    return HeldStability(loop.spectral_radius(period), loop.largest_period())
+
+
+class HeldLoop(NamedTuple):
+    """A linearised loop, of which `held_stability` tells all: what is asked for alone is computed."""
+
+    plant: Plant
+    f: Tensor  # F, (n, n), of the states that inputs reach
+    g: Tensor  # G, (n, m)
+    slope: Tensor  # of the policy, (m, n)
+    finite: bool  # whether all these are
+
+    @classmethod
+    def of(cls, policy: Callable[[Tensor], Tensor], system: Plant, *, at: Tensor | None = None) -> HeldLoop:
+        """The loop at a set-point; arguments as those of `held_stability`."""
+        if isinstance(system, Clocked):  # whose clock would count as a mode that never decays
+            if at is None:
+                rule = "must be a state of the path at t = 0, for a clocked plant"
+                raise fail("held_stability", "at", rule, at)
+            clocked = system
+            return cls.of(lambda x: policy(clocked.at(x)), system.plant, at=at)
+        at = system.equilibrium() if at is None else at
+        with torch.no_grad():
+            slope = central_slopes(
+                lambda x: policy(x).double().expand(len(x), -1),
+                at.double(),
+                torch.full_like(at, _PROBE / STEP),
             )
-        clocked = system
-        return held_stability(lambda x: policy(clocked.at(x)), system.plant, period, at=at)
-    at = system.equilibrium() if at is None else at
-    with torch.no_grad():
-        slope = central_slopes(
-            lambda x: policy(x).double().expand(len(x), -1), at.double(), torch.full_like(at, _PROBE / STEP)
-        )
-        held = policy(at.unsqueeze(0))[0].double()
-    f, g = (t.double() for t in system.linearisation(at, held))
-    if not bool(torch.isfinite(torch.cat((f, g, slope.mT), dim=-1)).all()):
-        return HeldStability(math.nan, None)
-    basis = _moved(f, g, discrete=system.period is not None)
-    f, g, slope = basis.mT @ f @ basis, basis.mT @ g, slope @ basis
+            held = policy(at.unsqueeze(0))[0].double()
+        f, g = (t.double() for t in system.linearisation(at, held))
+        if not bool(torch.isfinite(torch.cat((f, g, slope.mT), dim=-1)).all()):
+            return cls(system, f, g, slope, False)
+        basis = _moved(f, g, discrete=system.period is not None)
+        return cls(system, basis.mT @ f @ basis, basis.mT @ g, slope @ basis, True)
 
-    def spectral(a: Tensor, b: Tensor) -> float:
-        return float(torch.linalg.eigvals(a + b @ slope).abs().max())
+    def spectral_radius(self, period: float) -> float:
+        """Of one period; NaN where something has no finite slope."""
+        return self._radius(*_held(self.plant, self.f, self.g, period)) if self.finite else math.nan
 
-    def radius(dt: float) -> float:
-        return spectral(*_held(system, f, g, dt))
+    def largest_period(self) -> float | None:
+        """As `HeldStability` says."""
+        if not self.finite:
+            return None
+        if self.plant.period is not None:
+            tried = enumerate(islice(_steps(self.f, self.g), _STEPS))
+            stable = next((k for k, held in tried if self._radius(*held) >= 1), None)
+            if stable is None:
+                return math.inf
+            return stable * self.plant.period if stable else None
+        modes = torch.linalg.eigvals(self.f + self.g @ self.slope)
+        if float(modes.real.max()) >= 0:
+            return None
+        first, last = (math.log10(reach / float(modes.abs().max())) for reach in _REACH)
+        periods = torch.logspace(first, last, _PERIODS, dtype=torch.float64).tolist()
+        count = next((k for k, dt in enumerate(periods) if self.spectral_radius(dt) >= 1), None)
+        if count is None:
+            return math.inf
+        low, high = periods[count - 1] if count else 0.0, periods[count]
+        while high - low > 1e-6 * high:
+            middle = 0.5 * (low + high)
+            low, high = (middle, high) if self.spectral_radius(middle) < 1 else (low, middle)
+        return low
 
-    now = radius(period)
-    if system.period is not None:
-        stable = next((k for k, ab in enumerate(islice(_steps(f, g), _STEPS)) if spectral(*ab) >= 1), None)
-        if stable is None:
-            return HeldStability(now, math.inf)
-        return HeldStability(now, stable * system.period if stable else None)
-    modes = torch.linalg.eigvals(f + g @ slope)
-    if float(modes.real.max()) >= 0:
-        return HeldStability(now, None)
-    first_tried, last = (math.log10(reach / float(modes.abs().max())) for reach in _REACH)
-    tried = torch.logspace(first_tried, last, _PERIODS, dtype=torch.float64).tolist()
-    count = next((k for k, dt in enumerate(tried) if radius(dt) >= 1), None)
-    if count is None:
-        return HeldStability(now, math.inf)
-    low, high = tried[count - 1] if count else 0.0, tried[count]
-    while high - low > 1e-6 * high:
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if radius(middle) < 1 else (low, middle)
-    return HeldStability(now, low)
+    def _radius(self, a: Tensor, b: Tensor) -> float:
+        return float(torch.linalg.eigvals(a + b @ self.slope).abs().max())
 
 
 def _moved(f: Tensor, g: Tensor, *, discrete: bool) -> Tensor:

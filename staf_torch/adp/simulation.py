@@ -16,7 +16,7 @@ from .closed_loop import ClosedLoop, program, record, row_gains
 from .controllers import Controller, Feedback, Policy
 from .cost import Cost
 from .holding import fewest_and_most
-from .sampling import held_stability
+from .sampling import HeldLoop
 
 _log = logging.getLogger(__name__)
 _DRAWN_AHEAD = 1024  # steps whose random numbers are drawn at once
@@ -148,15 +148,16 @@ def simulate(
 
 def warn_if_unstable(policy: Policy, system: Plant, cost: Cost, dt: float) -> None:
     """Say in the log that the linearised loop of a policy held for dt is not stable, and which period is."""
-    stability = held_stability(policy, system, dt, at=cost.set_point())
-    if not stability.spectral_radius >= 1:
+    held = HeldLoop.of(policy, system, at=cost.set_point())
+    radius = held.spectral_radius(dt)
+    if not radius >= 1:
         return
-    most = stability.largest_period
+    most = held.largest_period()
     remedy = "at no period" if most is None else f"up to {most:.4g} s"
     _log.warning(
         "the control is held for dt = %.4g s, at which the linearised loop has the spectral radius %.4g: it "
         "is unstable; it is stable %s. `LQR(plant, cost, period=dt)` is made to be held.",
-        *(dt, stability.spectral_radius, remedy),
+        *(dt, radius, remedy),
     )
 
 

@@ -23,11 +23,11 @@ from ..adp import (
     LoopResult,
     SafetyFilter,
     Supervised,
-    held_stability,
     simulate,
 )
 from ..adp.problem import AdpProblem
 from ..adp.reference_optimum import Reference, compare
+from ..adp.sampling import HeldLoop
 from ..figures.animation import animate
 from ..figures.closed_loop import AdpHistory, draw_adp
 from ..figures.style import images
@@ -154,7 +154,7 @@ def held_radius(problem: AdpProblem, result: LoopResult) -> float | None:
     rows = range(min(_LINEARISED, len(result.state)) if result.actor_weights.shape[-1] else 1)
     at = problem.cost.around(problem.system).target
     radii = [
-        held_stability(_frozen(problem, result, row), problem.system, problem.dt, at=at).spectral_radius
+        HeldLoop.of(_frozen(problem, result, row), problem.system, at=at).spectral_radius(problem.dt)
         for row in rows
     ]
     return max(radii) if all(map(math.isfinite, radii)) else None

@@ -294,6 +294,9 @@ def test_a_loop_at_its_edge_and_one_without_a_slope_are_not_said_to_be_stable() 
     broken = adp.held_stability(lambda x: math.nan * x, line, 0.5)
     assert math.isnan(broken.spectral_radius)
     assert broken.largest_period is None
+    for period in (0.0, -0.5, math.inf):
+        with pytest.raises(ValueError, match=r"`held_stability\(period=...\)` must be (positive|finite)"):
+            adp.held_stability(lambda x: 0 * x, line, period)
 
 
 def test_the_largest_period_is_found_to_a_millionth_and_is_the_recorded(record: Record) -> None:
