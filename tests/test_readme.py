@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import re
 import shlex
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -93,6 +94,25 @@ def test_front_page_is_two_screens() -> None:
     lines = read(README).splitlines()
     assert lines[0].startswith("# ")
     assert len(lines) <= 160
+
+
+def test_versions_are_those_of_the_last_run_of_the_matrix() -> None:
+    """Of the front page, with its date, and of the classifiers: the table of tests/README.md has them."""
+    rows = [line for line in read(ROOT / "tests" / "README.md").splitlines() if " passed, " in line]
+    tried: dict[str, set[str]] = {
+        each: {found for row in rows for found in re.findall(rf"{each} (\d+\.\d+)", row)}
+        for each in ("Python", "torch", "Hydra")
+    }
+    ends = {each: sorted(found, key=lambda v: int(v.partition(".")[2])) for each, found in tried.items()}
+    (line,) = re.findall(r"^Python 3.*?\d{4}-\d\d-\d\d", read(README), re.MULTILINE | re.DOTALL)
+    python, torch, hydra = ends.values()
+    assert line.startswith(f"Python {python[0]} to {python[-1]}, torch {torch[0]} to {torch[-1]}, Hydra ")
+    assert re.findall(r"1\.\d", line.partition("Hydra")[2].partition(":")[0]) == hydra
+    dates = {found for row in rows for found in re.findall(r"\d{4}-\d\d-\d\d", row)}
+    assert line[-10:] in dates
+    about = tomllib.loads(read(ROOT / "pyproject.toml"))["project"]
+    named = [c.rpartition(" ")[2] for c in about["classifiers"] if c.startswith("Programming Language")]
+    assert named == python
 
 
 def test_first_commands_end_with_pytest() -> None:
