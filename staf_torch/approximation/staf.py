@@ -236,10 +236,10 @@ class StaF(nn.Module):
         batch = self.state.shape[:-1]
         if y.shape[:-1] == batch:
             ones = ", ".join("1" for _ in batch)
+            whole = "y.unsqueeze(0)" if len(batch) == 1 else f"y.reshape({ones}, -1, {y.shape[-1]})"
             raise ValueError(
                 f"`{call}(y=...)` of the shape {tuple(y.shape)} must say which points are meant: one of each "
-                f"batch entry ({one_each}), or all of them for every entry (`y.reshape({ones}, -1, "
-                f"{y.shape[-1]})`, ({ones}, P, n))."
+                f"batch entry ({one_each}), or all of them for every entry (`{whole}`, ({ones}, P, n))."
             )
 
     def _along(self, y: Tensor, z: Tensor, mode: str, target: Target | None) -> Callable[[Tensor], Tensor]:

@@ -119,7 +119,8 @@ def test_points_that_could_be_of_one_entry_each_or_of_all_are_refused(batch: tup
         with pytest.raises(ValueError, match="must say which points are meant: one of each batch entry"):
             call(y)
     ones = [1] * len(batch)
-    with pytest.raises(ValueError, match=re.escape(f"y.reshape({', '.join(map(str, ones))}, -1, 2)")):
+    said = "y.unsqueeze(0)" if len(batch) == 1 else "y.reshape(1, 1, -1, 2)"
+    with pytest.raises(ValueError, match=re.escape(said)):
         staf(y)
     all_of_them = staf(y.reshape(*ones, -1, 2))  # as it says
     assert all_of_them.shape == (*batch, math.prod(batch))
