@@ -28,7 +28,7 @@ from pathlib import Path
 from mutants import Mutant, mutants_of, room_of
 from mutation_fork import begin
 from mutation_judge import Verdict, begin_judging, fail_anyway, judge
-from mutation_map import kept_at, known, measure, places, test_files
+from mutation_map import Map, kept_at, known, measure, places, test_files
 from mutation_notes import Notes
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -54,6 +54,8 @@ def main() -> int:
         _export(_git("rev-parse", options.commit).strip(), tree)
         _prepare(tree)
         found = list(_all_mutants(tree, options.package, options.file))
+        if options.few:
+            found = _seldom_executed(found, known(CACHE / "map", tree), options.few)
         drawn = random.Random(options.seed).sample(found, min(options.sample, len(found)))
         notes = Notes(options.into, found, drawn)
         left = notes.left(again=options.again, without=options.without)
@@ -85,6 +87,9 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--package", nargs="*", default=[], help="to draw from; all of staf_torch by default")
     parser.add_argument("--file", nargs="*", default=[], help="to draw from, staf_torch/...; all by default")
+    parser.add_argument(
+        "--few", type=int, default=0, help="draw from lines that at most so many tests execute"
+    )
     parser.add_argument("--into", type=Path, help="file of the sample and its verdicts, where a run goes on")
     parser.add_argument("--again", action="store_true", help="try what survived once more")
     parser.add_argument("--without", nargs="*", default=[], help="packages that are left for another run")
@@ -115,6 +120,17 @@ def _all_mutants(tree: Path, packages: Iterable[str], files: Iterable[str]) -> I
         if (packages and room_of(name) not in packages) or (files and name not in files):
             continue
         yield from mutants_of(name, path.read_text(encoding="utf-8"))
+
+
+def _seldom_executed(mutants: Iterable[Mutant], measured: Map, most: int) -> list[Mutant]:
+    """Those in lines that few tests execute, as far as the map goes: what survives is mostly there."""
+    few = []
+    for mutant in mutants:
+        lines = measured.lines.get(mutant.file, {})
+        tests = set[str]().union(*(lines.get(n, set()) for n in range(mutant.line, mutant.last_line + 1)))
+        if 0 < len(tests) <= most:
+            few.append(mutant)
+    return few
 
 
 def _measure_the_new(tree: Path, compiled: Path, jobs: int, until: float, near: tuple[str, ...]) -> None:
