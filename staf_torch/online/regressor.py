@@ -209,11 +209,11 @@ class StaFRegressor(StreamEstimator):
             self._prepare(states, values)
         streams = self._streams_
         if states.shape != self._shape_ or (values.dim() == states.dim()) != (self.n_outputs_ is not None):
-            self._check("partial_fit", states, values)
+            raise self._refusal("partial_fit", states, values)
         rows = states.to(streams.dtype).reshape(streams.count, self.n_features_in_).contiguous()
         targets = values.to(streams.dtype).reshape(streams.count, -1).contiguous()
         if targets.shape[1] != (self.n_outputs_ or 1):
-            self._check("partial_fit", states, values)
+            raise self._refusal("partial_fit", states, values)
         if lapse is not None:
             lapse = lapse.expand(streams.count).contiguous()
         streams.learn(rows, targets, lapse)
@@ -243,7 +243,7 @@ class StaFRegressor(StreamEstimator):
         several = points.dim() == own + 1
         shape_of_one = (*points.shape[:-2], points.shape[-1]) if several else tuple(points.shape)
         if shape_of_one != self._shape_:
-            self._check("predict", points)
+            raise self._refusal("predict", points)
         streams = self._streams_
         shape = (streams.count, self.n_features_in_)
         at = [
@@ -305,17 +305,14 @@ class StaFRegressor(StreamEstimator):
         self.n_streams_ = None if x.dim() == 1 else count
         self.n_outputs_ = outputs if y.dim() == x.dim() else None
 
-    def _check(self, call: str, x: Tensor, y: Tensor | None = None) -> None:
-        """Raise unless the shapes are those of the first sample."""
+    def _refusal(self, call: str, x: Tensor, y: Tensor | None = None) -> ValueError:
+        """The error of a sample whose shapes are not those of the first one."""
         outputs = () if self.n_outputs_ is None else (self.n_outputs_,)
-        several = call == "predict" and x.dim() == len(self._shape_) + 1
-        own = (*x.shape[:-2], x.shape[-1]) if several else tuple(x.shape)
-        if own != self._shape_ or (y is not None and y.shape != (*self._shape_[:-1], *outputs)):
-            given = f"{tuple(x.shape)}" + ("" if y is None else f" and y's {tuple(y.shape)}")
-            raise ValueError(
-                f"`{_NAME}.{call}(x=...)` must have the shape {self._shape_} of the first sample, with "
-                f"{self.n_features_in_} features, and y {(*self._shape_[:-1], *outputs)}; "
-                f"got the shape {given}: "
-                f"X has {x.shape[-1]} features, but {_NAME} is expecting {self.n_features_in_} features "
-                "as input."
-            )
+        given = f"{tuple(x.shape)}" + ("" if y is None else f" and y's {tuple(y.shape)}")
+        return ValueError(
+            f"`{_NAME}.{call}(x=...)` must have the shape {self._shape_} of the first sample, with "
+            f"{self.n_features_in_} features, and y {(*self._shape_[:-1], *outputs)}; "
+            f"got the shape {given}: "
+            f"X has {x.shape[-1]} features, but {_NAME} is expecting {self.n_features_in_} features "
+            "as input."
+        )

@@ -192,6 +192,14 @@ def test_a_carried_plan_is_laid_out_as_it_is_read() -> None:
         adp.RecedingHorizon(BOX, steps=3, iterations=-1)
 
 
+def test_plans_within_bounds_hasten_what_tells_whether_a_bound_is_met() -> None:
+    asked: list[str] = []
+    plans = bounded_plans.BoundedPlans.__new__(bounded_plans.BoundedPlans)
+    plans._strained = SimpleNamespace(hasten=lambda: asked.append("strained"))  # type: ignore[assignment]
+    plans.hasten()
+    assert asked == ["strained"]
+
+
 def test_a_plan_that_is_followed_answers_with_its_feedback_and_ends_in_that_of_the_goal(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

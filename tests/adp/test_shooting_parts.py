@@ -134,6 +134,9 @@ def test_many_states_are_solved_in_pieces_each_with_its_own_earlier_plans(
     assert seen[3:] == [None]
     with pytest.raises(ValueError, match=r"state a `horizon` of 8 s, or solve at most 2 states at once"):
         direct._joined([optimum(1.0), optimum(1.0, last=8.0), optimum(2.0)])
+    early, late = tensor([0.0, 3.0, 6.0, 7.0]), tensor([0.0, 1.0, 2.0, 9.0])  # the end of one tells
+    with pytest.raises(ValueError, match="state a `horizon` of 9 s"):
+        direct._joined([optimum(1.0)._replace(time=early), optimum(1.0)._replace(time=late)])
 
 
 def test_one_start_is_believed_near_the_lqr_where_following_it_is_not_dear() -> None:
@@ -187,6 +190,8 @@ def test_values_agree_to_a_ten_thousandth_of_the_lowest() -> None:
     assert starts.agreement(values, 1e-4).tolist() == [2, 3, 1]
     assert starts.said([2.0, 2.0001, 3.0, 5.0], 2.0).endswith("others up to 2.5 times as much")
     assert starts.said([2.0, 2.0001], 2.0).endswith("others up to 1 times as much")
+    assert starts.said([2.0, INF], 2.0).endswith("others up to inf times as much")
+    assert starts.said([2.0, math.nan], 2.0).endswith("others up to 1 times as much")
 
 
 def solution(cost: float, converged: bool, promise: float) -> Solution:

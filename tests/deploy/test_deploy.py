@@ -300,6 +300,14 @@ def test_work_of_a_linear_controller_is_counted() -> None:
     assert counted == sheet.Work(parameters=2, flops=4, functions=0, bytes_constants=16, bytes_in_out=24)
 
 
+class Products(nn.Module):
+    """The product of a row's (2, 3) matrix and its first row."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        matrix = x.view(-1, 2, 3)
+        return torch.bmm(matrix, matrix[:, :1].mT)
+
+
 def test_weights_of_a_network_are_counted_and_kept_once() -> None:
     network = torch.nn.Sequential(torch.nn.Linear(2, 3), torch.nn.Tanh(), torch.nn.Linear(3, 1)).double()
     program = deploy.trace(network, torch.zeros(1, 2).double())
@@ -307,6 +315,8 @@ def test_weights_of_a_network_are_counted_and_kept_once() -> None:
     assert (counted.parameters, counted.functions) == (2 * 3 + 3 + 3 + 1, 3)
     assert counted.flops == 3 * (2 * 2 - 1) + 3 + (2 * 3 - 1) + 1
     assert sum(part.numel() for part in program.state_dict.values()) == 13
+    pairs = deploy.trace(Products(), torch.zeros(1, 6))
+    assert sheet.work(pairs).flops == 2 * 1 * (2 * 3 - 1)  # of a (2, 3) and a (3, 1) matrix
     x = torch.randn(5, 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     torch.testing.assert_close(program.module()(x), network(x))
 

@@ -66,8 +66,10 @@ def test_an_onnx_model_runs_on_one_thread_of_the_processor(monkeypatch: pytest.M
 
     stub = SimpleNamespace(SessionOptions=SimpleNamespace, InferenceSession=Session)
     monkeypatch.setitem(sys.modules, "onnxruntime", stub)
-    monkeypatch.setattr(formats, "need_onnx", lambda: None)
+    needed: list[str] = []
+    monkeypatch.setattr(formats, "need_onnx", lambda: needed.append("onnx"))
     run = formats.runner_onnx(Path("policy.onnx"))
+    assert needed == ["onnx"]
     x = torch.tensor([[1.0, 2.0]]).double()
     double, total = run(x)
     assert (double.tolist(), total.tolist()) == ([[2.0, 4.0]], [3.0])

@@ -60,6 +60,10 @@ def test_memory_in_c_has_the_control_of_the_library_and_says_what_a_call_takes(
     assert 0.1 < float((u.abs() < 2).double().mean()) < 1  # not a bound everywhere
     one = source.functions / (memory.candidates + 1)
     assert one == int(one) >= memory.lookahead  # a sine a step
+    tables = sum(part.numel() for part in (policy.plans, policy.models, policy.searched))
+    assert tables < source.constants < tables + 100
+    a_plan = source.flops - len(policy.searched) * (3 * 2 + 1) - 2 * (2 * 2 + 4)  # without the comparisons
+    assert a_plan % (memory.candidates + 1) == 0
     said = f"compares {2 * len(memory.entries)} states and takes at most {source.flops} additions"
     assert said in path.read_text()
     timed = deploy.time_c(path, x, [1])

@@ -277,7 +277,7 @@ def test_a_run_has_a_row_a_plant_and_method_and_tells_how_far_it_is(
     def compare(case: Case, methods: list[Method], x0: Tensor, calls: int, slow: int) -> list[dict[str, Any]]:
         asked.append((case.name, [method.name for method in methods], len(x0), calls, slow))
         assert torch.equal(x0, case.states(len(x0), 3))
-        some = {"ratio_median": 1.5, "ratio_max": math.inf, "regulated": 1.0, "violations": 0.0}
+        some = {"ratio_median": 1.2345678, "ratio_max": math.inf, "regulated": 1.0, "violations": 0.0}
         return [{"plant": case.name, "method": method.name, "lines": 3} | some for method in methods]
 
     monkeypatch.setattr(rivals, "compare", compare)
@@ -293,9 +293,10 @@ def test_a_run_has_a_row_a_plant_and_method_and_tells_how_far_it_is(
         for plant in ("pendulum", "quadrotor")
         for name in ("near_optimal_planned", "box_ddp")
     ]
-    some = {"ratio_median": 1.5, "ratio_max": None, "regulated": 1.0, "violations": 0.0}
+    some = {"ratio_median": 1.2345678, "ratio_max": None, "regulated": 1.0, "violations": 0.0}
     assert found == {f"{key}_{name}": number for key in keys for name, number in some.items()}
     assert len((tmp_path / "rivals.csv").read_text().splitlines()) == 5
+    assert " 1.2346 |" in (tmp_path / "rivals.md").read_text()  # five digits
     assert len(drawn[0]) == 4
     assert (tmp_path / "figures" / "rivals.txt").exists()
     assert told[-1] == 1

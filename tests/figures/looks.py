@@ -70,6 +70,11 @@ def _said(artist: Any) -> Iterator[str]:
             round(getattr(artist, each), 6) for each in ("borderaxespad", "handlelength", "columnspacing")
         ]
         yield f"at {artist._loc_real}, {columns} columns, {padding}, {names}"  # type: ignore[attr-defined]
+        box, whole = artist.get_bbox_to_anchor(), artist.parent.bbox
+        at = (box.p0 - whole.p0) / whole.size
+        yield f"beside {_short(at.round(4))}, title of {artist.get_title().get_size():g}"
+        for line in artist.get_lines():
+            yield f"{line.get_linestyle()} {line.get_marker()} {_colour(line.get_color())}"
     if isinstance(artist, Axes):
         for axis in (artist.xaxis, artist.yaxis):
             ticks = axis.get_major_ticks()

@@ -170,5 +170,16 @@ def test_the_cache_forgets_what_nobody_has_used_and_nothing_of_today(
     assert left() == kept - {"lanes-mid.so"}
     monkeypatch.setattr(build, "_MOST_BYTES", 0)
     assert left() == {"lanes-new.so", "tmpnow", "notes.txt"}
+    for name in ("lanes-a.so", "lanes-b.so"):  # another process takes the second one away at the same time
+        (tmp_path / name).touch()
+        os.utime(tmp_path / name, (now - 99 * day,) * 2)
+    unlink = Path.unlink
+
+    def both(path: Path, missing_ok: bool = False) -> None:
+        unlink(path, missing_ok)
+        unlink(tmp_path / "lanes-b.so", missing_ok=True)
+
+    monkeypatch.setattr(Path, "unlink", both)
+    assert left() == {"lanes-new.so", "tmpnow", "notes.txt"}
     build.used(tmp_path / "lanes-new.so")
     assert (tmp_path / "lanes-new.so").stat().st_mtime > now

@@ -148,3 +148,5 @@ def test_large_results_are_mappings_of_their_own() -> None:
         assert large.shape == shape
         assert large.is_contiguous()
         assert large.data_ptr() % mmap.PAGESIZE == 0  # what `malloc` returns begins after its own notes
+    small = [fresh(like, LARGE // 64) for _ in range(9)]
+    assert any(each.data_ptr() % mmap.PAGESIZE for each in small)

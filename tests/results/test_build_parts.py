@@ -282,6 +282,11 @@ def test_a_run_that_was_completed_before_is_found_again(
     ):
         begun(spread=2).finished(tmp_path)
     assert begun(spread=2).finished(tmp_path, anyway=True) == {"ball": 1.0}
+    then = begun(spread=2)
+    then._about["version"] = "0.0.1"
+    told = one._differences(then._about)  # which version first: the others follow from it
+    assert told.startswith("it was written by staf_torch 0.0.1, and this is ")
+    assert "; spread was 2 and is now " in told
     with pytest.raises(ValueError, match="holds the run 'dt=1', where this sweep has 'dt=1 seed=2'"):
         begun(["dt=1", "seed=2"]).finished(tmp_path, anyway=True)
     (tmp_path / "metrics.json").write_text('{"ball": 2.0}')

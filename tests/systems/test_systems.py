@@ -201,6 +201,9 @@ def test_a_bad_argument_is_named_with_its_value(make, message: str) -> None:  # 
 def test_a_matrix_that_is_not_square_is_called_so() -> None:
     with pytest.raises(ValueError, match="Linear"):
         systems.Linear(tensor([1.0, 2.0]))
+    for rows in ([1.0, 2.0], ["12", "34"], [[1.0, 2.0], 3.0]):
+        with pytest.raises(ValueError, match=r"`Linear\(matrix=...\)` must be \(n, n\); got "):
+            systems.Linear(rows)  # type: ignore[arg-type]
 
 
 def test_a_missing_scipy_is_named_with_the_extra_that_brings_it(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -80,6 +80,5 @@ def agreement(values: Tensor, tolerance: float) -> Tensor:
 
 def said(values: Sequence[float], best: float) -> str:
     """What a row's starts found, in words."""
-    others = [value for value in values if value > best * (1 + 1e-4)]
-    most = max(others) / best if others else 1.0
+    most = max((value for value in values if value > best), default=best) / best
     return f"local: one start alone found it, others up to {most:.3g} times as much"
