@@ -137,7 +137,8 @@ class RecedingHorizon(Controller):
             return u, carrying(plan)
         row = x, carried.identifier
         if self._hastened and self._whole.compiles((), (), row, steps=1):
-            u, plan = (part[:, 0] for part in self._whole((), (), row, steps=1)[1])
+            _, found = self._whole((), (), row, steps=1)
+            u, plan = (part[:, 0] for part in found)
             return u, carrying(plan)
         control, reference = self._begun(x, carried.identifier)
         found = self._search.solve(x, control, reference, self._terminal(x, control, reference))

@@ -90,7 +90,7 @@ class RememberedPolicy(nn.Module):
         rows = x.unsqueeze(1).expand(-1, count, -1).flatten(0, 1)
         cost, control, _ = self.follow(rows, window, self.models[self.end[at]])
         best = cost.unflatten(0, (-1, count)).argmin(1, keepdim=True)
-        u = control.unflatten(0, (-1, count)).gather(1, best.unsqueeze(-1).expand(-1, -1, control.shape[-1]))
+        u = control.unflatten(0, (-1, count)).gather(1, best[..., None].expand(-1, -1, control.shape[-1]))
         chosen: Tensor = u.squeeze(1)
         return chosen
 

@@ -85,9 +85,7 @@ class Kept:
         found = skeleton(copies, *parts)
         if found is None:
             self._say_why(parts)
-            program = Program(step, name=self._name, copies=copies)
-            program.described(None, ())
-            return program
+            return Program(step, name=self._name, copies=copies)
         key, tensors = found
         inside = [value for part in code(key) for value in part.values()]
         if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors):

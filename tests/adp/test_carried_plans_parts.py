@@ -200,6 +200,20 @@ def test_plans_within_bounds_hasten_what_tells_whether_a_bound_is_met() -> None:
     assert asked == ["strained"]
 
 
+def test_the_first_control_of_the_best_plan_is_applied(monkeypatch: pytest.MonkeyPatch) -> None:
+    plans = bounded_plans.BoundedPlans.__new__(bounded_plans.BoundedPlans)
+    plans._search = object()  # type: ignore[assignment]
+    control, x = uniform(4, 7, 2), uniform(4, 3)
+
+    def best(search: object, at: Tensor) -> SimpleNamespace:
+        assert search is plans._search
+        assert at is x
+        return SimpleNamespace(control=control)
+
+    monkeypatch.setattr(bounded_plans, "best_held", best)
+    assert torch.equal(plans(x), control[:, 0])
+
+
 def test_a_plan_that_is_followed_answers_with_its_feedback_and_ends_in_that_of_the_goal(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

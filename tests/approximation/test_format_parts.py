@@ -91,6 +91,9 @@ def test_condition_numbers_are_those_of_the_matrices(name: str) -> None:
     torch.testing.assert_close(found.condition, whole, rtol=1e-6, atol=0)
     torch.testing.assert_close(found.core_condition, torch.linalg.cond(core), rtol=1e-6, atol=0)
     assert found.condition.shape == (4,)
+    for shape in ((), (2, 3)):
+        many = conditioning.conditioning(basis, uniform(*shape, 2, low=0.3))
+        assert many.condition.shape == shape
     assert bool((found.rank == 6).all())
     assert bool((found.effective_rank == 6).all())
 

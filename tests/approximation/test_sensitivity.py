@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import mpmath as mp
 import pytest
 import torch
@@ -63,6 +65,13 @@ def test_state_jacobian_is_that_of_the_ideal_weights(kernel: str, radius: str) -
     for row, at in zip(found, x, strict=True):
         expected = torch.func.jacrev(lambda y: basis.ideal_weights(y, smooth_target))(at)
         assert_close(row, expected, 1e-7)
+
+
+@pytest.mark.parametrize("function", [weight_jacobian, state_jacobian])
+def test_states_of_another_space_are_refused(function: Callable[..., torch.Tensor]) -> None:
+    for shape in ((3,), (4, 3), (4, 1)):
+        with pytest.raises(ValueError, match=rf"`{function.__name__}\(x=...\)` must "):
+            function(basis_of("gaussian", 3), uniform(*shape), smooth_target)
 
 
 def test_state_jacobian_is_the_weight_jacobian_along_the_moving_centers() -> None:

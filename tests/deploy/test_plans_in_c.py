@@ -27,7 +27,7 @@ def memory() -> adp.GlobalValue:
     x = torch.tensor([[0.3, 0.0], [-0.2, 0.1], [turn - 0.2, 0.3], [-turn + 0.2, -0.5]], dtype=torch.float64)
     states, controls = [x], []
     for _ in range(60):  # the linear feedback, instead of a search that takes seconds
-        controls.append(problem.linear_feedback(states[-1]))
+        controls.append(0.98 * problem.linear_feedback(states[-1]))  # told from the feedback of the goal
         states.append(problem.advance(states[-1], controls[-1])[0])
     state, control = torch.stack(states, dim=1), torch.stack(controls, dim=1)
     gains, bent = (-problem.k).expand(4, 60, 1, 2), (2 * problem.p).expand(4, 61, 2, 2)
@@ -35,6 +35,13 @@ def memory() -> adp.GlobalValue:
     fine = torch.ones(4, dtype=torch.bool)
     library = adp.Trajectories(state, control, gains, problem.terminal(state), slope, bent, fine)
     return adp.GlobalValue(problem, library, [math.pi, 8.0], candidates=12, lookahead=6)
+
+
+def test_trajectories_are_followed_to_their_ends(memory: adp.GlobalValue) -> None:
+    """Where controls are small: to as many digits."""
+    ends = memory.plans[memory.entries, :2]
+    x = torch.cat((ends, 0.9 * ends))
+    torch.testing.assert_close(deploy.policy_of(memory)(x), memory(x), rtol=1e-9, atol=0)
 
 
 def states(count: int) -> Tensor:

@@ -87,6 +87,14 @@ def test_values_of_epsilon_are_named_six_in_a_row() -> None:
         assert theory.draw_feasibility(found).legends[0]._ncols == columns
 
 
+def test_methods_in_a_box_are_named_three_in_a_row() -> None:
+    paths, margins, costs = ({name: wave(9, *size) for name in "abcd"} for size in ((2,), (), ()))
+    nowhere = np.full(2, np.inf)
+    figure = safety.draw_box(safety.BoxHistory(T, paths, margins, costs, wave(9, 2), -nowhere, nowhere))
+    assert legend(figure) == list("abcd")
+    assert figure.legends[0]._ncols == 3
+
+
 def test_without_rings_the_layouts_of_the_ball_are_drawn_against_the_radius_and_the_largest_polygon() -> None:
     radii = np.array([0.1, 0.2, 0.4])
     tried = ("ball", 3), ("ball", 5), ("polygon", 3), ("polygon", 7), ("cross_polytope", 4)

@@ -143,6 +143,7 @@ def test_one_hot_and_finite_are_those_of_torch() -> None:
     index = torch.tensor([[0, 2], [1, 1]])
     alike(_one_hot(index, 4), torch.nn.functional.one_hot(index, 4), torch.float64)
     alike(_one_hot(index), torch.nn.functional.one_hot(index), torch.float64)
+    assert _one_hot(torch.tensor([0, 1]), 1).tolist() == [[1], [0]]  # nothing is read back to be checked
     alike(_one_hot(torch.tensor([0]), 1), torch.nn.functional.one_hot(torch.tensor([0]), 1), torch.float64)
     x = torch.tensor([1.0, torch.nan, torch.inf, -torch.inf, -2.0])
     assert _is_finite(x).tolist() == torch.isfinite(x).tolist()

@@ -191,6 +191,14 @@ def test_a_saved_bank_with_numbers_that_no_bank_writes_is_refused(name: str, val
         bank.load_state_dict({"table": table})
 
 
+@pytest.mark.parametrize("name", ["counts", "units", "clock", "turn", "first", "ratio", "forgetting"])
+def test_what_is_no_tensor_is_refused(name: str) -> None:
+    x, y = streams(5, 2)
+    model = st.StaFRegressor().fit(x, y[..., 0])
+    with pytest.raises(ValueError, match=rf"load_state_dict.*must have a tensor '{name}'; got \[1.0\]"):
+        model.load_state_dict(model.state_dict() | {name: [1.0]})
+
+
 @pytest.mark.parametrize("memory", [None, 128])
 @pytest.mark.parametrize("shape", [None, (), (7,), (1, 2, 3)])
 def test_what_is_no_table_is_refused(memory: int | None, shape: tuple[int, ...] | None) -> None:

@@ -175,3 +175,13 @@ def test_a_coordinate_that_is_constant_says_nothing_whatever_the_constant(
         torch.testing.assert_close(each.center[0, 1], tensor(constant))
         torch.testing.assert_close(each.spread, found[0].spread)
         assert each.unknown.tolist() == [[0.0, 1.0]]
+
+
+def test_a_coordinate_that_was_measured_once_is_where_it_was_seen() -> None:
+    x, y = torch.zeros(30, 2, 2).double(), torch.linspace(0, 1, 30).double().expand(2, 30).mT.unsqueeze(-1)
+    x[..., 0] = 3.0 + y.squeeze(-1).sin()
+    x[..., 1] = math.nan
+    x[7, :, 1] = tensor([5.0, -2.0])
+    found = tuning.tuning(x, y, st.ball(6, 2))
+    torch.testing.assert_close(found.center[:, 1], tensor([5.0, -2.0]))
+    torch.testing.assert_close(found.center[:, 0], x[..., 0].mean(0))

@@ -123,7 +123,6 @@ class StreamDrift:
             theta=[0.0] * (count * dim),
             rows=self.rows,
             periodic=known.periodic,
-            bounds=known.bounds,
         )
         shape = "smooth" if smooth else "box"
         self.windows = IntegralWindows(plant, length, shape=shape, noise=noise)
