@@ -392,7 +392,7 @@ def _processes(kernels: Tensor, noise: Tensor, rest: Tensor, line: Tensor) -> tu
         rest: values, (members, K, k).
         line: what is added to the means, (K,).
     """
-    a, count = kernels.clone(), kernels.shape[1] - 1
+    a, count = kernels.clone(), kernels.shape[-1] - 1
     a[:, :count, :count] += noise[:, None, None] * torch.eye(count, dtype=a.dtype)
     seen, mean = torch.zeros_like(noise), torch.zeros_like(rest[..., 0])
     amplitude, right = torch.zeros_like(mean), rest.clone()

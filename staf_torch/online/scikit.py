@@ -59,7 +59,7 @@ class ScikitEstimator:
         """
         truth, found = np.asarray(y, np.float64), np.asarray(self.predict(x), np.float64)  # type: ignore[attr-defined]
         weight = np.ones(len(truth)) if sample_weight is None else np.asarray(sample_weight, np.float64)
-        weight = weight.reshape(-1, *[1] * (truth.ndim - 1))
+        weight = weight if truth.ndim == 1 else weight[:, None]
         total = (weight * (truth - np.average(truth, 0, weight.ravel())) ** 2).sum(0)
         left = (weight * (truth - found) ** 2).sum(0)
         return float(np.mean(1 - np.where(total > 0, left / np.where(total > 0, total, 1), left > 0)))

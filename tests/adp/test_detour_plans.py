@@ -212,6 +212,15 @@ def test_a_plan_that_costs_more_than_expected_is_left_for_another_way() -> None:
     torch.testing.assert_close(total, after.identifier[:, -2], rtol=1e-9, atol=1e-12)
 
 
+def test_a_plan_is_kept_where_no_other_way_is_cheaper_however_little_was_expected() -> None:
+    """A plan that was improved twelve times, and a detour that is improved once."""
+    plans = adp.DetourPlans(detours(steps=7), first=12, iterations=1)
+    control, none = plans.init(BESIDE).identifier[:, :-2], torch.zeros(1, 1).double()
+    alone = plans._improved(BESIDE, control, none, 1)[-1]
+    found = plans._kept(BESIDE, control, torch.full((1,), 1e-9, dtype=torch.float64), none)[1].total
+    torch.testing.assert_close(found, alone, rtol=1e-12, atol=0)
+
+
 def test_what_a_period_cost_is_taken_off_at_the_time_of_that_period() -> None:
     """What is in the way from .3 to .5 s, everywhere, costs the third period, and none of those after it."""
 

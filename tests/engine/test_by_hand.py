@@ -29,6 +29,7 @@ pytestmark = pytest.mark.compiled
 ITERATIONS, FIRST = 2, tensor([[0.3, -0.2, 0.5], [0.0, 0.1, -0.4]])
 TIMES = 7
 STATES = torch.stack((circles(1, TIMES)[0], 0.7 * circles(3, TIMES)[2].flip(-1)))
+STATES = STATES * torch.linspace(1.0, 1.3, TIMES)[:, None]  # spirals: the gain of a kernel, e^|x|^2, changes
 CENTERS = st.StateFollowingCenters(st.rings(3), st.StateRadius(0.7, 0.3))
 BASES = {
     "exponential": st.StaFBasis(st.ExponentialKernel(), CENTERS),

@@ -144,6 +144,15 @@ def test_code_of_a_user_is_found_inside_of_the_librarys(caplog: pytest.LogCaptur
     assert not reads_users_code(torch.nn.Linear(2, 2), st.GaussianKernel(), torch.tanh)
 
 
+def test_what_a_step_reads_now_is_asked_anew_of_a_single_row_too() -> None:
+    held = torch.nn.Sequential(torch.nn.Identity())
+    program = Program(lambda carry, now, row: (carry, held(row)))
+    x, none = X[:1], torch.zeros(1, 1).double()
+    assert torch.equal(program(none, none, x)[1][0, 0], x[0])
+    held[0] = Noisy()
+    assert len({float(program(none, none, x)[1][0, 0, 0]) for _ in range(5)}) == 5
+
+
 def test_a_header_of_a_noisy_function_is_refused() -> None:
     program = Program(lambda carry, now, row: (carry, (Noisy()(row["x"]),)), name="the header")
     with pytest.raises(NotLoweredError, match="called again"):

@@ -136,6 +136,21 @@ def test_passes_that_meet_a_row_first_in_their_body_are_a_loop() -> None:
         torch.testing.assert_close(one, other, rtol=1e-15, atol=1e-16)
 
 
+@pytest.mark.parametrize("together", [1, 2])
+def test_points_from_uneven_places_are_each_met(together: int) -> None:
+    places = [0, 1, 3, 7, 8]
+
+    def step(x: Tensor, now: Tensor, row: Tensor) -> Pair:
+        all_of_them = lanes.each(lambda point: point.square() - point, row, together=together)
+        some = all_of_them[:, places]
+        return x, lanes.each(lambda point: point.sin() - 2 * point, some, together=together)
+
+    program, row = lanes.Program(step), torch.arange(18.0, dtype=torch.float64).view(2, 9)
+    start, now = torch.zeros(2).double(), torch.zeros(2, 1).double()
+    assert program.compiles(start, now, row)
+    torch.testing.assert_close(program(start, now, row)[1], program.definition(start, now, row)[1])
+
+
 def test_points_of_any_number_are_reduced_alike_in_a_program() -> None:
     draw = torch.Generator().manual_seed(1)
     rows = tuple(torch.randn(6, k, 2, dtype=torch.float64, generator=draw) for k in (1, 2, 3, 5))

@@ -226,3 +226,21 @@ def test_a_sample_that_comes_when_units_are_learned_is_counted_once(at: int, wro
     model.partial_fit(x[0], torch.tensor(torch.nan).double())
     assert int(model.n_skipped_) == 1 + wrong
     assert float(model.predict(x[1])) == pytest.approx(50, abs=1.5)
+
+
+def test_a_stream_that_is_reset_learns_its_units_anew_and_the_others_go_on() -> None:
+    draw = torch.Generator().manual_seed(2)
+    x = torch.rand(120, 2, 2, generator=draw, dtype=torch.float64).cumsum(0) * tensor([1.0, 30.0])
+    y = x.sin().sum(-1)
+    model, through, fresh = (st.StaFRegressor(scaling=True) for _ in range(3))
+    model.fit(x[:60], y[:60]).reset([0])
+    for k in range(60, 120):
+        model.partial_fit(x[k], y[k])
+    through.fit(x[:60], y[:60])
+    for k in range(60, 120):
+        through.partial_fit(x[k], y[k])
+        fresh.partial_fit(x[k], y[k])
+    point = x[-1]
+    found = model.predict(point)
+    torch.testing.assert_close(found[0], fresh.predict(point)[0])
+    torch.testing.assert_close(found[1], through.predict(point)[1])

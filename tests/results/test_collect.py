@@ -126,6 +126,11 @@ def test_a_folder_with_half_of_hydras_files_is_skipped_with_the_reason(tmp_path:
     (skipped,) = found.skipped
     assert skipped.path == tmp_path / "1"
     assert "overrides.yaml cannot be read" in skipped.reason
+    (tmp_path / "1" / ".hydra").mkdir()
+    for text in ("a: 1", "'ab'", "3", ""):
+        (tmp_path / "1" / ".hydra" / "overrides.yaml").write_text(text)
+        (skipped,) = collect(tmp_path).skipped
+        assert skipped.reason.endswith("overrides.yaml holds no list")
 
 
 def test_runs_of_another_version_are_read_and_named(tmp_path: Path) -> None:

@@ -97,7 +97,7 @@ class Redesign:
             pair = doubling_step(pair)
         stage = stage + self.a_step
         done = stage >= self.doublings
-        sound = done & torch.isfinite(pair.h).all(-1).all(-1)
+        sound = done & torch.isfinite(pair.h).flatten(-2).all(-1)
         p = torch.where(sound[..., None, None], pair.h, p)
         # A design that went wrong must not end the row: its pair starts from zero.
         pair = Doubling(
