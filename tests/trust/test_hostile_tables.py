@@ -26,7 +26,8 @@ LIMITED = """
 import io, json, contextlib, resource, sys
 from staf_torch.cli.table import main
 resource.setrlimit(resource.RLIMIT_AS, (int(sys.argv[1]),) * 2)
-resource.setrlimit(resource.RLIMIT_CPU, (100, 100))
+hard = resource.getrlimit(resource.RLIMIT_CPU)[1]  # which nobody may raise
+resource.setrlimit(resource.RLIMIT_CPU, (100 if hard < 0 else min(100, hard), hard))
 found = {}
 for folder in sys.argv[2:]:
     out, err = io.StringIO(), io.StringIO()
