@@ -76,8 +76,8 @@ def trace(step: Step, given: Given, *, widened: bool = False, folded: bool = Fal
         leaves, shape = flatten(out)
         if any(leaf.dim() == 0 or leaf.shape[0] != 1 for leaf in leaves):
             raise NotLoweredError("an output of the step has no dimension of rows")
-        following = [node for end in ends for node in tracer.nodes(end).reshape(-1).tolist()]
-        outputs = [node for leaf in leaves for node in tracer.nodes(leaf).reshape(-1).tolist()]
+        following = [node for end in ends for node in tracer.nodes(end).ravel().tolist()]
+        outputs = [node for leaf in leaves for node in tracer.nodes(leaf).ravel().tolist()]
         layout = Layout(
             [_entries(leaf, 1) for leaf in given.row],
             [_entries(leaf, 2) for leaf in given.now],

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -73,6 +74,8 @@ def test_memory_in_c_has_the_control_of_the_library_and_says_what_a_call_takes(
     assert a_plan % (memory.candidates + 1) == 0
     said = f"compares {2 * len(memory.entries)} states and takes at most {source.flops} additions"
     assert said in path.read_text()
+    (follows,) = re.findall(r"void staf_follow\(([^)]*)\)", path.read_text())
+    assert re.findall(r"\w+(?=\[|,|$)", follows)[-2:] == ["cost", "control"], follows
     timed = deploy.time_c(path, x, [1])
     assert timed.calls == 200
     assert 0 < timed.median_us <= timed.p99_us <= timed.worst_us

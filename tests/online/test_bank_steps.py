@@ -86,6 +86,22 @@ def test_a_step_of_the_definition_is_that_of_compiled_code(name: str) -> None:
                     )
 
 
+@pytest.mark.parametrize("spread", [1e-3, 1.0, 50.0])
+def test_what_is_beyond_is_so_many_spreads_away(spread: float) -> None:
+    shape, functions = BankShape(2, 1, 128, 8), LocalFunctions.of(GaussianKernel(1.0), simplex(2))
+    definition = BankDefinition(shape, Rules.of(2, True), functions)
+    (s,) = definition.each(torch.zeros(1, size(shape), dtype=torch.float64))
+    definition.clear(s)
+    s["spread"].copy_(torch.tensor([spread, 2 * spread, 3 * spread]))
+    s["center"].copy_(torch.tensor([1.0, 2.0, 3.0]))
+    for k in range(3):
+        for share, clock, beyond in ((1.001, 40, True), (0.999, 40, False), (1.001, 39, False)):
+            s["clock"].fill_(clock)
+            both = s["center"].clone()
+            both[k] -= share * definition.rules.far * float(s["spread"][k])
+            assert definition._beyond(s, both[:2], both[2:]) is beyond
+
+
 @pytest.mark.parametrize("scaling", [False, True])
 def test_a_store_gives_up_the_older_of_the_closest_pair_of_those_that_are_not_recent(scaling: bool) -> None:
     """Against a search of all pairs; steps on a grid, so that some distances are equal."""

@@ -267,3 +267,35 @@ def test_the_thrust_of_a_quadrotor_pushes_along_its_axis_and_pays_for_its_energy
     along = -x[:, 2].sin() * x[:, 3] + x[:, 2].cos() * x[:, 4]  # its speed along its own axis
     power = (1.3 * 9.0 + u[:, 0]) * along + u[:, 1] * x[:, 5]
     torch.testing.assert_close((slope * moved).sum(-1), power)
+
+
+def moved(plant: systems.ControlAffineSystem, x: Tensor, u: Tensor) -> Tensor:
+    return plant.drift(x) + (plant.effectiveness(x) @ u.unsqueeze(-1)).squeeze(-1)
+
+
+def test_the_torque_of_a_pendulum_pays_for_its_energy_and_its_friction() -> None:
+    mass, length, damping, gravity = 1.3, 0.7, 0.4, 9.0
+    plant = systems.Pendulum(mass, length, damping, gravity)
+    x, u = 3 * uniform(20, 2, seed=1).requires_grad_(), uniform(20, 1, seed=2)
+    energy = 0.5 * mass * length**2 * x[:, 1].square() + mass * gravity * length * x[:, 0].cos()
+    (slope,) = torch.autograd.grad(energy.sum(), x)
+    power = u[:, 0] * x[:, 1] - damping * x[:, 1].square()
+    torch.testing.assert_close((slope * moved(plant, x, u)).sum(-1), power)
+
+
+def test_the_push_of_a_cart_pays_for_the_energy_and_is_the_change_of_the_momentum() -> None:
+    cart, pole, half, gravity = 1.7, 0.3, 0.4, 9.0
+    plant = systems.CartPole(cart, pole, half, gravity)
+    x, u = 3 * uniform(20, 4, seed=1).requires_grad_(), uniform(20, 1, seed=2)
+    _, angle, speed, turning = x.unbind(-1)
+    momentum = (cart + pole) * speed + pole * half * turning * angle.cos()
+    energy = (
+        0.5 * (cart + pole) * speed.square()
+        + pole * half * speed * turning * angle.cos()
+        + 0.5 * (4 / 3) * pole * half**2 * turning.square()  # of a rod about its end
+        + pole * gravity * half * angle.cos()
+    )
+    flow = moved(plant, x, u)
+    for kept, rate in ((momentum, u[:, 0]), (energy, u[:, 0] * speed)):
+        (slope,) = torch.autograd.grad(kept.sum(), x, retain_graph=True)
+        torch.testing.assert_close((slope * flow).sum(-1), rate)
