@@ -12,7 +12,7 @@ from helpers import tensor, uniform
 from helpers_plans import pushed
 from torch import Tensor
 
-from staf_torch import adp
+from staf_torch import adp, deploy
 from staf_torch.adp import global_value
 from staf_torch.adp.plans import Trajectories
 
@@ -167,6 +167,11 @@ def test_the_cheapest_of_the_nearest_plans_is_followed(
     levels = [whole.control, *(u.expand(6, 2) for u in PROBLEM.levels())]
     ahead = torch.stack([now + known.value(after) for after, now in (pushed(x, u) for u in levels)]).amin(0)
     torch.testing.assert_close(known.bellman_residual(x), (ahead - whole.value) / whole.value)
+
+
+def test_what_is_exported_of_two_inputs_is_the_same(known: adp.GlobalValue) -> None:
+    x = tensor([3.0, 0.9]) * uniform(6, N, seed=8)
+    torch.testing.assert_close(deploy.policy_of(known)(x), known(x))
 
 
 def test_far_is_what_costs_by_the_mean_of_the_curvatures_sizes(known: adp.GlobalValue) -> None:

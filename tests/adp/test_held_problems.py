@@ -288,6 +288,13 @@ def test_others_beside_a_loop_in_steps_count_only_where_they_grow() -> None:
         assert found == pytest.approx(abs(other) if counted else 0.7)
 
 
+def test_a_period_that_is_shorter_than_all_that_are_tried_is_found() -> None:
+    """x' = 1000 x + u under u = -1001 x: held for T, e^{1000 T} < 2001."""
+    plant = systems.Linear([[1000.0]], [[1.0]])
+    found = adp.held_stability(lambda x: -1001 * x, plant, 1e-3).largest_period
+    assert found == pytest.approx(math.log(2001) / 1000, rel=1e-5)
+
+
 def test_a_loop_at_its_edge_and_one_without_a_slope_are_not_said_to_be_stable() -> None:
     line = systems.Linear([[0.0]], [[1.0]])
     assert adp.held_stability(lambda x: 0 * x, line, 0.5) == (1.0, None)

@@ -38,6 +38,8 @@ def test_packages_are_those_that_a_command_line_or_its_folder_names(
     assert program.named_packages(["dt=0.1", "-m"]) == []
     (Path(folder) / "kernel.yaml").write_bytes("_target_: größe.kernels.Narrow\n".encode())
     assert program.named_packages(line) == ["größe", "mine", "other"]  # files are UTF-8 wherever it runs
+    (Path(folder) / "kernel.yaml").write_bytes(b"_target_: theirs.kernels.Narrow  # \xff\n")
+    assert program.named_packages(line) == ["mine", "other", "theirs"]
     monkeypatch.setattr(program, "HAS_WHITELIST", False)
     assert program.named_packages(line) == []
 

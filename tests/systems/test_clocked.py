@@ -57,3 +57,6 @@ def test_a_step_takes_any_leading_dimensions() -> None:
     plant = systems.Clocked(systems.StepPlant(lambda x, u: x.sin() + u, dim=3, inputs=1, dt=0.1))
     x, u = uniform(3, 5, 4, seed=1), uniform(3, 5, 1, seed=2)
     torch.testing.assert_close(plant.step(x, u), torch.cat((x[..., :3].sin() + u, x[..., 3:] + 0.1), dim=-1))
+    f, g = plant.linearisation()
+    torch.testing.assert_close(f, torch.eye(4, dtype=torch.float64))  # the clock's as well
+    torch.testing.assert_close(g, torch.tensor([[1.0], [1.0], [1.0], [0.0]]).double())

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 from collections.abc import Sequence
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -252,11 +254,21 @@ def test_a_metric_that_no_run_has_is_a_column_of_nan() -> None:
 
 def test_what_a_table_cannot_do_without_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     for package in ("pandas", "pyarrow"):
-        monkeypatch.setitem(__import__("sys").modules, package, None)
+        monkeypatch.setitem(sys.modules, package, None)
     with pytest.raises(ValueError, match=r"^a DataFrame needs pandas: install the extra `tables`"):
         data_frame(TABLE)
+    monkeypatch.setitem(sys.modules, "pandas", SimpleNamespace())  # which is not asked for anything
     with pytest.raises(ValueError, match=r"^Parquet needs pyarrow: install the extra `tables`"):
         parquet_bytes(TABLE)
+
+
+def test_cells_of_a_frame_are_numbers_where_the_column_is_of_a_metric(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setitem(sys.modules, "pandas", SimpleNamespace(DataFrame=dict))
+    frame = data_frame(Table((Column("m", "m"), Column("a")), (Row({"m": None, "a": None}),)))
+    assert frame["a"] == [None]
+    assert math.isnan(frame["m"][0])
 
 
 def test_a_column_without_texts_is_of_numbers() -> None:
