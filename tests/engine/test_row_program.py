@@ -27,7 +27,7 @@ from staf_torch.engine import predictors, row_program
 from staf_torch.lanes import compiler
 from staf_torch.targets import Cosine, Paper
 
-pytestmark = pytest.mark.compiled
+pytestmark = [pytest.mark.compiled, pytest.mark.needs_compiler]
 
 TIMES = 20
 STATES = circles(9, TIMES)
@@ -160,7 +160,6 @@ def test_rows_have_the_bits_that_they_have_in_any_batch_and_beside_any_row() -> 
     assert torch.equal(result.weights[5, 3:], whole[5, 2].expand(14, -1))
 
 
-@pytest.mark.needs_compiler
 def test_chunks_of_time_continue_to_the_bit_and_remember_who_diverged() -> None:
     states = circles(9, 60)
     states[4, 45:] = states[2, 25:] = states[7, 19:] = torch.nan
@@ -175,7 +174,6 @@ def test_chunks_of_time_continue_to_the_bit_and_remember_who_diverged() -> None:
     torch.testing.assert_close(last.weights[:, 0], whole.weights[:, -1], rtol=1e-14, atol=0)
 
 
-@pytest.mark.needs_compiler
 def test_another_radius_width_gain_or_phase_compiles_and_traces_nothing(
     definition, monkeypatch: pytest.MonkeyPatch
 ) -> None:
