@@ -45,6 +45,17 @@ def test_trajectories_are_followed_to_their_ends(memory: adp.GlobalValue) -> Non
     torch.testing.assert_close(deploy.policy_of(memory)(x), memory(x), rtol=1e-9, atol=0)
 
 
+def test_tables_hold_every_candidate_from_its_place_to_the_goal(memory: adp.GlobalValue) -> None:
+    policy = deploy.policy_of(memory)
+    goal = memory.plans[memory.resting]
+    for entry, first, last in zip(memory.entries.tolist(), policy.first.tolist(), policy.last.tolist()):
+        rows = policy.plans[first : last + 1]
+        assert torch.equal(rows, memory.plans[entry : entry + len(rows)])
+        ended = (rows[:, 2:] == goal[2:]).all(-1)
+        assert ended.tolist() == [False] * (len(rows) - 1) + [True]
+        assert last - first == 60 - entry % memory.length
+
+
 def states(count: int) -> Tensor:
     """Upright give or take a little, some a turn away, and a quarter of them anywhere."""
     generator = torch.Generator().manual_seed(0)
@@ -74,6 +85,7 @@ def test_memory_in_c_has_the_control_of_the_library_and_says_what_a_call_takes(
     assert a_plan % (memory.candidates + 1) == 0
     said = f"compares {2 * len(memory.entries)} states and takes at most {source.flops} additions"
     assert said in path.read_text()
+    assert "rint(" in path.read_text()
     (follows,) = re.findall(r"void staf_follow\(([^)]*)\)", path.read_text())
     assert re.findall(r"\w+(?=\[|,|$)", follows)[-2:] == ["cost", "control"], follows
     timed = deploy.time_c(path, x, [1])
@@ -87,6 +99,7 @@ def test_memory_in_float_chooses_nearly_the_same_control(memory: adp.GlobalValue
     deploy.export_c(deploy.policy_of(memory, dtype=torch.float32), x, path, ["u"])
     (u,) = runner_c(path, [1], torch.float32)(x)
     assert float((u.double() - memory(x.double())).abs().median()) < 1e-4
+    assert "rintf(" in path.read_text()
 
 
 def test_traced_memory_has_the_control_of_the_library_at_every_batch(memory: adp.GlobalValue) -> None:

@@ -7,6 +7,7 @@ import hashlib
 import importlib
 import io
 import os
+import shutil
 import pickle
 import pickletools
 import zlib
@@ -180,6 +181,15 @@ def test_the_cache_forgets_what_nobody_has_used_and_nothing_of_today(
         unlink(tmp_path / "lanes-b.so", missing_ok=True)
 
     monkeypatch.setattr(Path, "unlink", both)
+    (tmp_path / "tmpgone").mkdir()
+    os.utime(tmp_path / "tmpgone", (now - 3 * day,) * 2)
+    taken = shutil.rmtree
+
+    def twice(path: Path, ignore_errors: bool = False) -> None:
+        taken(path)  # by another process, and then by this one
+        taken(path, ignore_errors=ignore_errors)
+
+    monkeypatch.setattr(shutil, "rmtree", twice)
     assert left() == {"lanes-new.so", "tmpnow", "notes.txt"}
     build.used(tmp_path / "lanes-new.so")
     assert (tmp_path / "lanes-new.so").stat().st_mtime > now
