@@ -48,7 +48,9 @@ def test_trajectories_are_followed_to_their_ends(memory: adp.GlobalValue) -> Non
 def test_tables_hold_every_candidate_from_its_place_to_the_goal(memory: adp.GlobalValue) -> None:
     policy = deploy.policy_of(memory)
     goal = memory.plans[memory.resting]
-    for entry, first, last in zip(memory.entries.tolist(), policy.first.tolist(), policy.last.tolist()):
+    for entry, first, last in zip(
+        memory.entries.tolist(), policy.first[:-1].tolist(), policy.last[:-1].tolist(), strict=True
+    ):
         rows = policy.plans[first : last + 1]
         assert torch.equal(rows, memory.plans[entry : entry + len(rows)])
         ended = (rows[:, 2:] == goal[2:]).all(-1)

@@ -7,9 +7,9 @@ import hashlib
 import importlib
 import io
 import os
-import shutil
 import pickle
 import pickletools
+import shutil
 import zlib
 from collections.abc import Callable
 from pathlib import Path
