@@ -9,6 +9,7 @@ import inspect
 import re
 import shlex
 import sys
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import pytest
@@ -198,20 +199,14 @@ def check_shown(name: str, text: str) -> None:
             assert (ROOT / place).is_file(), place
 
 
-def test_no_number_depends_on_the_default_dtype_of_torch() -> None:
-    """It is the user's: every tensor that is made says of which dtype, or is cast at once."""
+@pytest.mark.parametrize("rule", [without_dtype, without_encoding], ids=["dtype", "encoding"])
+def test_no_number_depends_on_the_default_dtype_of_torch_and_no_text_on_a_locale(
+    rule: Callable[[str], Iterable[str]],
+) -> None:
+    """These are the user's: every tensor that is made says of which dtype, or is cast at once."""
     found = [
         f"{path.relative_to(ROOT)}:{call}"
         for path in sorted(PACKAGE.rglob("*.py"))
-        for call in without_dtype(path.read_text(encoding="utf-8"))
-    ]
-    assert found == []
-
-
-def test_no_file_is_read_in_the_encoding_of_a_locale() -> None:
-    found = [
-        f"{path.relative_to(ROOT)}:{call}"
-        for path in sorted(PACKAGE.rglob("*.py"))
-        for call in without_encoding(path.read_text(encoding="utf-8"))
+        for call in rule(path.read_text(encoding="utf-8"))
     ]
     assert found == []

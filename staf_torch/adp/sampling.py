@@ -164,7 +164,8 @@ class HeldStability(NamedTuple):
         Shown by `staf experiment=adp adp/policy=lqr`.
     """
 
-    spectral_radius: float  # of one period: below 1 the set-point is asymptotically stable
+    spectral_radius: float  # of one period: below 1 the set-point is asymptotically stable; inf where it
+    # overflows, NaN where something has no finite slope
     largest_period: float | None  # s, up to which every period is stable; None: unstable at every period, or
     # not known because something has no finite slope;
     # inf: stable up to 100 time constants of the fastest mode, or 1000 steps of a plant in discrete time
@@ -263,7 +264,8 @@ class HeldLoop(NamedTuple):
         return low
 
     def _radius(self, a: Tensor, b: Tensor) -> float:
-        return float(torch.linalg.eigvals(a + b @ self.slope).abs().max())
+        held = a + b @ self.slope
+        return float(torch.linalg.eigvals(held).abs().max()) if bool(held.isfinite().all()) else math.inf
 
 
 def _moved(f: Tensor, g: Tensor, *, discrete: bool) -> Tensor:

@@ -71,15 +71,18 @@ class LocalFunctions(NamedTuple):
         return self.kernel.core(x.mT.double(), point, point).flatten().to(z)
 
     def explained(self) -> float:
-        """The least share of V's variance that the centers explain half way to one of them, in [0, 1].
+        """The least share of V's variance that the centers explain half way from the state to one of them.
 
-        Around the origin, for a kernel whose functions differ from state to state. NaN where the kernel
-        overflows within the ball.
+        In [0, 1]; around the origin, for a kernel whose functions differ from state to state. NaN where the
+        kernel overflows within the ball.
         """
-        z = self.offsets.mT / 2
-        gram = self.kernel.core(torch.zeros_like(self.offsets[0]), self.offsets, self.offsets)
+        d = self.offsets
+        gram = self.kernel.core(torch.zeros_like(d[0]), d, d)
         if not bool(torch.isfinite(gram).all()):  # the Newton basis of which is zero
             return math.nan
+        z = d[(d != 0).any(-1)].mT / 2  # a center at the state explains all there
+        if not z.numel():
+            return 1.0
         psi = self.functions(torch.zeros_like(z), z)
         return float((psi.square().sum(0) / self.variance(torch.zeros_like(z), z)).amin())
 

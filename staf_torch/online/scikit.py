@@ -59,7 +59,7 @@ class ScikitEstimator:
         """
         truth, found = np.asarray(y, np.float64), np.asarray(self.predict(x), np.float64)  # type: ignore[attr-defined]
         weight = np.ones(len(truth)) if sample_weight is None else np.asarray(sample_weight, np.float64)
-        weight = weight if truth.ndim == 1 else weight[:, None]
+        weight = weight.reshape(len(truth), 1) if truth.ndim > 1 else weight.ravel()
         total = (weight * (truth - np.average(truth, 0, weight.ravel())) ** 2).sum(0)
         left = (weight * (truth - found) ** 2).sum(0)
         return float(np.mean(1 - np.where(total > 0, left / np.where(total > 0, total, 1), left > 0)))

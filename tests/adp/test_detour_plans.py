@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from collections.abc import Callable
 
 import pytest
 import torch
@@ -35,10 +36,10 @@ class Wide(systems.ControlAffineSystem):
         return torch.eye(6, dtype=x.dtype)[:, 2:4].expand(*x.shape[:-1], 6, 2)
 
 
-def detours(**given: object) -> adp.DetourRollout:
+def detours(constraint: Callable[[Tensor, Tensor], Tensor] = disc, **given: object) -> adp.DetourRollout:
     settings = {"axes": torch.eye(2, 4), "dt": 0.2, "steps": 12, "terminal": LQR.value, "margin": 0.02}
     settings |= {"sizes": [0.6], "lengths": [5]}
-    return adp.DetourRollout(LQR, PLANE, COST, disc, **{**settings, **given})  # type: ignore[arg-type]
+    return adp.DetourRollout(LQR, PLANE, COST, constraint, **{**settings, **given})  # type: ignore[arg-type]
 
 
 def test_where_nothing_is_in_its_way_and_no_bound_is_met_the_plan_is_the_lqr() -> None:
@@ -175,20 +176,7 @@ def test_a_plan_that_costs_more_than_expected_is_left_for_another_way() -> None:
     def appearing(x: Tensor, t: Tensor) -> Tensor:
         return torch.where(t < 0.1, 10.0, (x[:, 0] - 1.0).square() + (x[:, 1] + 0.1).square() - 0.16)
 
-    ways = adp.DetourRollout(
-        LQR,
-        PLANE,
-        COST,
-        appearing,
-        axes=torch.eye(2, 4),
-        dt=0.2,
-        steps=7,
-        terminal=LQR.value,
-        margin=0.02,
-        sizes=[0.6],
-        lengths=[3],
-    )
-    plans = adp.DetourPlans(ways, first=2)
+    plans = adp.DetourPlans(detours(appearing, steps=7, lengths=[3]), first=2)
     x = BESIDE
     carried = plans.init(x).identifier
     idle = torch.zeros(1, 14).double()
@@ -227,19 +215,7 @@ def test_what_a_period_cost_is_taken_off_at_the_time_of_that_period() -> None:
     def passing(x: Tensor, t: Tensor) -> Tensor:
         return torch.where((t > 0.3) & (t < 0.5), -0.05, 10.0) + 0.0 * x[:, 0]
 
-    ways = adp.DetourRollout(
-        LQR,
-        PLANE,
-        COST,
-        passing,
-        axes=torch.eye(2, 4),
-        dt=0.2,
-        steps=4,
-        terminal=LQR.value,
-        sizes=[0.6],
-        lengths=[3],
-    )
-    plans = adp.DetourPlans(ways, first=1)
+    plans = adp.DetourPlans(detours(passing, steps=4, lengths=[3], margin=0.0), first=1)
     problem, begun = plans._problem, plans.init(AWAY)
     known = torch.cat((begun.identifier[:, :-1], torch.full((2, 1), 2.0, dtype=torch.float64)), dim=-1)
     found = plans._definition(torch.cat((AWAY, known), dim=-1))

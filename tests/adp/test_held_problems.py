@@ -15,6 +15,7 @@ from staf_torch import adp, systems
 from staf_torch.adp import plan_problem, sampled_problem
 from staf_torch.adp.plans import LocalModel
 from staf_torch.adp.sampling import held_riccati, linear_hold, periods
+from staf_torch.adp.simulation import warn_if_unstable
 from staf_torch.numerics.forward_mode import use_forward_mode
 
 INF = math.inf
@@ -286,6 +287,19 @@ def test_others_beside_a_loop_in_steps_count_only_where_they_grow() -> None:
         plant = in_steps(tensor([[1.0, 0.3], [0.0, other]]), tensor([[0.1], [0.0]]))
         found = adp.held_stability(lambda x: -3 * x[..., :1], plant, 0.1).spectral_radius
         assert found == pytest.approx(abs(other) if counted else 0.7)
+
+
+@pytest.mark.parametrize("period", [1.0, 1000.0, 1e5])
+def test_a_loop_that_overflows_within_a_period_is_unstable_and_told(
+    period: float, caplog: pytest.LogCaptureFixture
+) -> None:
+    plant, stepped = systems.Linear([[1000.0]], [[1.0]]), in_steps(tensor([[1.5e4]]), tensor([[1.0]]))
+    for each, gain in ((plant, -1001.0), (stepped, -1.5e4)):
+        assert adp.held_stability(lambda x, gain=gain: gain * x, each, period).spectral_radius > 1
+    assert adp.held_stability(lambda x: -1001 * x, plant, period).spectral_radius == INF
+    cost = adp.QuadraticCost(1.0, 1.0, dim=1, inputs=1)
+    warn_if_unstable(lambda x: -1001 * x, plant, cost, period)
+    assert "has the spectral radius inf" in caplog.text
 
 
 def test_a_period_that_is_shorter_than_all_that_are_tried_is_found() -> None:

@@ -57,6 +57,18 @@ def test_a_kernel_that_is_narrow_for_its_ball_is_told(
     assert told == ([False] * 4 if kernel == "polynomial" else [False, False, told[2], True])
 
 
+@pytest.mark.parametrize("centers", [st.rings(6), st.simplex(2), torch.zeros(1, 2).double()])
+def test_a_kernel_that_is_zero_at_its_anchor_is_looked_at_too(
+    centers: torch.Tensor, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Whatever it says at the origin, where it has no variance."""
+    for width, told in ((0.8, False), (0.05, True)):
+        caplog.clear()
+        kernel = st.AnchoredKernel(st.GaussianKernel(width))
+        st.StaFRegressor(kernel, radius=0.3, centers=centers).partial_fit(tensor([0.5, 0.5]), 1.0)
+        assert bool(caplog.messages) == (told and len(centers) > 1)
+
+
 def test_bad_samples_are_named() -> None:
     model = st.StaFRegressor(Cauchy())
     with pytest.raises(ValueError, match="needs a first sample"):

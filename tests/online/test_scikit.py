@@ -120,6 +120,8 @@ def test_a_score_is_that_of_scikit_learn_for_constant_targets_too() -> None:
             for weight in (None, 2.0 ** draw.integers(-1, 2, 40)):
                 wanted = r2(truth, model.predict(x), weight)
                 assert model.score(x, truth, weight) == pytest.approx(wanted, rel=1e-9, abs=1e-12)
+                column = None if weight is None else weight[:, None]
+                assert model.score(x, truth, column) == pytest.approx(wanted, rel=1e-9, abs=1e-12)
     model.predict = lambda x: np.full(40, 3.0)  # type: ignore[method-assign]
     assert (model.score(x, np.full(40, 3.0)), model.score(x, np.full(40, 3.0 + 2.0**-10))) == (1.0, 0.0)
 
