@@ -286,12 +286,14 @@ def _moved(f: Tensor, g: Tensor, *, discrete: bool) -> Tensor:
 
 def _held(plant: Plant, f: Tensor, g: Tensor, dt: float) -> tuple[Tensor, Tensor]:
     """A and B of the linearised plant over dt seconds with u held."""
+    n, m = g.shape
+    moved, held = torch.cat((f, g), dim=1), torch.eye(n + m, dtype=f.dtype)[n:]
     if plant.period is None:
-        n, m = g.shape
-        flow = exponential(dt * torch.cat((torch.cat((f, g), dim=1), f.new_zeros(m, n + m))))
-        return flow[:n, :n], flow[:n, n:]
-    count = periods("held_stability", plant, dt)
-    return next(islice(_steps(f, g), count - 1, None))
+        flow = exponential(dt * torch.cat((moved, 0 * held)))
+    else:
+        count = periods("held_stability", plant, dt)
+        flow = torch.linalg.matrix_power(torch.cat((moved, held)), count)
+    return flow[:n, :n], flow[:n, n:]
 
 
 def _steps(f: Tensor, g: Tensor) -> Iterator[tuple[Tensor, Tensor]]:

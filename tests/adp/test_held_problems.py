@@ -289,6 +289,15 @@ def test_others_beside_a_loop_in_steps_count_only_where_they_grow() -> None:
         assert found == pytest.approx(abs(other) if counted else 0.7)
 
 
+def test_a_period_of_a_billion_steps_is_answered_at_once() -> None:
+    plant = in_steps(tensor([[0.5, 0.1], [0.0, 0.4]]), tensor([[0.1], [0.2]]))
+    found = adp.held_stability(lambda x: 0.3 * x[..., :1], plant, 1e8)
+    rest = torch.linalg.solve(
+        torch.eye(2).double() - tensor([[0.5, 0.1], [0.0, 0.4]]), tensor([[0.1], [0.2]])
+    )
+    assert found.spectral_radius == pytest.approx(0.3 * float(rest[0]))
+
+
 @pytest.mark.parametrize("period", [1.0, 1000.0, 1e5])
 def test_a_loop_that_overflows_within_a_period_is_unstable_and_told(
     period: float, caplog: pytest.LogCaptureFixture
