@@ -22,6 +22,9 @@ from recorded import Record
 
 __all__ = ["pytest_make_collect_report", "pytest_runtest_makereport"]
 
+COMPILED = {"adp", "deploy", "envs", "lanes", "online", "systems"}
+"""Rooms whose tests leave the choice to compile to the library."""
+
 hypothesis.settings.register_profile("suite", max_examples=25, deadline=None, derandomize=True)
 hypothesis.settings.load_profile("suite")
 
@@ -86,10 +89,14 @@ def _log_tells_as_much_in_every_order() -> None:
 
 
 @pytest.fixture(autouse=True)
-def _chases_run_by_their_definition(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """But where a test is marked `compiled`: every chase of its own kind is a program to compile."""
-    if request.node.get_closest_marker("compiled") is None:
-        monkeypatch.setattr("staf_torch.engine.row_program._SHORTEST", 10**9)
+def _nothing_compiles_by_itself(request: pytest.FixtureRequest) -> Iterator[None]:
+    """But in the rooms of `COMPILED` and where a test is marked `compiled`: a build is a second a program."""
+    from staf_torch import lanes
+
+    room = request.path.relative_to(Path(__file__).parent).parts[0]
+    compiled = room in COMPILED or request.node.get_closest_marker("compiled") is not None
+    with lanes.compiling("auto" if compiled else "never"):
+        yield
 
 
 @pytest.fixture

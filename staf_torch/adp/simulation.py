@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from ..lanes import Program
+from ..lanes.compiling import worth
 from ..numerics.checks import choice, fail, integer, trailing
 from ..systems import ControlAffineSystem, Plant
 from .closed_loop import ClosedLoop, program, record, row_gains
@@ -129,7 +130,7 @@ def simulate(
     choice("simulate", "compile", compile, (True, False, "auto"))
     most = fewest_and_most("simulate", substeps)[1]
     work = steps * (most + max(getattr(part, "work", 1.0) for part in controller.modules()) - 1)
-    worth = work * (1 + len(x0) / 200) >= _PAYS if compile == "auto" else bool(compile)
+    pays = work * (1 + len(x0) / 200) >= _PAYS
     if dt is None:
         dt = controller.period or system.period or _DT
     more = {"integrator": integrator, "substeps": substeps, "renew": renew, "limit": limit}
@@ -139,11 +140,10 @@ def simulate(
         controller.check(x0)
     if isinstance(controller, Feedback) and x0.device.type == "cpu":
         warn_if_unstable(controller.policy, system, cost, dt)
-    if compile == "auto" and any(getattr(part, "costly", False) for part in controller.modules()):
-        worth = False
-    worth = worth and system.traceable
+    pays = pays and not any(getattr(part, "costly", False) for part in controller.modules())
+    compiled = (worth(pays) if compile == "auto" else bool(compile)) and system.traceable
     with torch.no_grad():
-        return _run(loop, program(loop, worth), x0, steps, every, _seeds(seed, len(x0)), progress)
+        return _run(loop, program(loop, compiled), x0, steps, every, _seeds(seed, len(x0)), progress)
 
 
 def warn_if_unstable(policy: Policy, system: Plant, cost: Cost, dt: float) -> None:

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from ..approximation.basis import GramStructure, Target
 from ..lanes import Program
+from ..lanes.compiling import worth
 from ..lanes.kept import Kept, number
 from ..lanes.plan import ordinary
 from ..optim.base import UpdateLaw
@@ -139,7 +140,7 @@ def program(problem: Problem, states: Tensor, carry: RowCarry, *, everything: bo
         carry: what it starts from.
         everything: whether all results are wanted, or the weights alone.
     """
-    if states.shape[1] < _SHORTEST or not ordinary((states, carry.chase.weights)):
+    if not worth(states.shape[1] >= _SHORTEST) or not ordinary((states, carry.chase.weights)):
         return None
     settings = problem.inner_steps, problem.certificate, everything
     owners = problem.basis, problem.target, problem.law, problem.predictor, *settings

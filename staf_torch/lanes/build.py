@@ -10,6 +10,7 @@ import hashlib
 import logging
 import os
 import platform
+import shlex
 import shutil
 import subprocess
 import tempfile
@@ -108,12 +109,17 @@ def _program() -> str | None:
     return next(filter(None, map(shutil.which, (os.environ.get("CXX", ""), *_COMPILERS))), None)
 
 
+def flags(ours: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the compiler's options: ours, then the user's `CXXFLAGS`, of which the last one holds."""
+    return (*ours, *shlex.split(os.environ.get("CXXFLAGS", "")))
+
+
 def _library(source: Path, definitions: tuple[str, ...]) -> Path:
     """The path of the shared object, built if it is not in the cache."""
     program = _program()
     if program is None:
         raise FileNotFoundError(f"none of {', '.join(_COMPILERS)} is on the path")
-    command = [program, *_FLAGS, f"-I{_FOLDER}", *(f"-D{each}" for each in definitions), str(source)]
+    command = [program, *flags(_FLAGS), f"-I{_FOLDER}", *(f"-D{each}" for each in definitions), str(source)]
     path = _cache() / f"{source.stem.removeprefix('_')}-{_key(program, source, definitions)}.so"
     if not is_whole(path):
         # Under a name of its own first: another process may be building the same.
@@ -151,7 +157,7 @@ def _key(program: str, source: Path, definitions: tuple[str, ...]) -> str:
         {source, *source.parent.glob("_*.hpp"), *_FOLDER.glob("_*.hpp")}, key=lambda file: file.name
     )
     sources = [file.read_text(encoding="utf-8") for file in files]
-    parts = (*sources, *_FLAGS, *definitions, version, platform.platform(), _processor())
+    parts = (*sources, *flags(_FLAGS), *definitions, version, platform.platform(), _processor())
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:16]
 
 

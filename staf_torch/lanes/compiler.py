@@ -13,7 +13,7 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 
-from .build import _COMPILERS, _cache, _processor, _run, is_whole, seal
+from .build import _COMPILERS, _cache, _processor, _run, flags, is_whole, seal
 
 _FOLDER = Path(__file__).parent
 _HEADERS = ("_lanes.hpp", "_lanes_functions.hpp", "_driver.hpp")
@@ -65,7 +65,7 @@ def _build(source: str, path: Path) -> None:
             _log.warning("a program of %d lines is compiled, once: some %.0f s", lines, lines / 1600)
         long = lines > _LONG and "clang" not in _version(compiler).lower()
         more = _FLAGS_OF_LONG if long else ()
-        _run([compiler, *_FLAGS, *more, "-I", str(_FOLDER), str(text), "-o", str(built)])
+        _run([compiler, *flags(_FLAGS), *more, "-I", str(_FOLDER), str(text), "-o", str(built)])
         seal(built)
         os.replace(built, path)
 
@@ -78,7 +78,7 @@ def _compiler() -> str:
 
 
 def _key(source: str) -> str:
-    return hashlib.sha256("\0".join((source, *_surroundings(_compiler()))).encode()).hexdigest()[:24]
+    return hashlib.sha256("\0".join((source, *flags(()), *_surroundings(_compiler()))).encode()).hexdigest()[:24]
 
 
 @functools.cache

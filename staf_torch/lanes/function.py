@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from .combinators import Tree, tracing_now
+from .compiling import worth
 from .kept import Kept
 from .plan import Plan, ordinary
 from .program import Program
@@ -66,7 +67,7 @@ class RowFunction:
         if not ordinary((x,)) or x.numel() == 0 or tracing_now():
             return self._function(x)
         rows = x.numel() / x.shape[-1]
-        if self._asked + rows / 200 < _PAYS:  # a large batch pays for itself
+        if not worth(self._asked + rows / 200 >= _PAYS):  # a large batch pays for itself
             self._asked += 1 + rows / 200
             return self._function(x)
         if self._served is None or self._changed():

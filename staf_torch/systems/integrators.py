@@ -9,6 +9,7 @@ from torch import Tensor
 
 from ..lanes import Program
 from ..lanes.combinators import Tree
+from ..lanes.compiling import worth
 from ..lanes.kept import Kept
 from ..numerics.checks import integer, positive_real, trailing
 from .base import ControlAffineSystem
@@ -68,7 +69,7 @@ def trajectory(
     size = total if chunk is None else integer("trajectory", "chunk", chunk, least=1)
     flow = getattr(system, "flow", None)  # a user's module need not have one
     x = x0
-    program = _program(system, dt, compile=total * (1 + len(x0) / 200) >= _PAYS)
+    program = _program(system, dt, compile=worth(total * (1 + len(x0) / 200) >= _PAYS))
     for start in range(0, total, size):
         stop = min(start + size, total)
         time = torch.arange(start, stop, dtype=torch.float64) * dt
