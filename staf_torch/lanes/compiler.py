@@ -78,7 +78,9 @@ def _compiler() -> str:
 
 
 def _key(source: str) -> str:
-    return hashlib.sha256("\0".join((source, *flags(()), *_surroundings(_compiler()))).encode()).hexdigest()[:24]
+    return hashlib.sha256("\0".join((source, *flags(()), *_surroundings(_compiler()))).encode()).hexdigest()[
+        :24
+    ]
 
 
 @functools.cache
