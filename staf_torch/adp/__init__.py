@@ -1,7 +1,5 @@
 """Adaptive dynamic programming: learn or compute a controller while, or before, it controls."""
 
-import warnings
-
 from .actor_critic import ActorCritic as ActorCritic
 from .adaptation import Adaptation as Adaptation
 from .adaptation import AdaptiveActorCritic as AdaptiveActorCritic
@@ -201,15 +199,3 @@ __all__ = [
     "tracking_cost",
     "value_gradient",
 ]
-
-
-def __getattr__(name: str) -> type:
-    """Serve `Memory`, the name of `ControllerState` until 0.2, for one release.
-
-    Raises:
-        AttributeError: for every other name.
-    """
-    if name != "Memory":
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    warnings.warn("staf_torch.adp.Memory is now staf_torch.adp.ControllerState.", FutureWarning, stacklevel=2)
-    return ControllerState

@@ -93,18 +93,6 @@ class ConventionModule(nn.Module, abc.ABC):
         self._prepare()  # in the new dtype, on the new device
         return self
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        if "convention" not in state.get("_buffers", {}):
-            raise ValueError(
-                "`StaFBasis` was pickled by an earlier version of staf_torch, whose coefficients mean "
-                "another function here: sample it with that version, and fit the samples anew."
-            )
-        super().__setstate__(state)  # type: ignore[no-untyped-call]
-        if "_local_basis" not in state:  # pickled before the local basis was an object of its own
-            self._adopt(None)
-            self._adopt(decode("pickle.load", self.convention))
-            self._prepare()
-
 
 def record(
     kernel: Kernel, centers: StateFollowingCenters, kind: str, degrees: Degrees | None

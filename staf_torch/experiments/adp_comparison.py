@@ -21,7 +21,7 @@ from ..metrics.closed_loop import comparison_row, regulated
 from ..numerics.checks import COMMAND_LINE, fail, positive_real, vector
 from ..results.progress import SHOWN, Progress
 from ..results.run_directory import RunDirectory
-from ..settings.adp import adp_problem, changed, updated
+from ..settings.adp import adp_problem, changed
 from ..settings.chase import plain
 from ..tables import Style, Table
 from ..tables.columns import significant
@@ -96,7 +96,7 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> dict[st
 
 def variant(cfg: DictConfig, changes: dict[str, Any]) -> AdpProblem:
     """The closed loop of the settings with other ones under `adp`, recorded at its ends."""
-    chosen = changed(updated(cfg), changes)
+    chosen = changed(cfg, changes)
     with open_dict(chosen):
         if changes.get("law") == "published":
             chosen.dt = min(cfg.dt, _PUBLISHED_STEP)  # its own step: Euler fails sooner at a longer one

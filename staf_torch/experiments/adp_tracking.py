@@ -34,7 +34,7 @@ from ..metrics.closed_loop import tracking_metrics
 from ..numerics.checks import COMMAND_LINE, integer, positive_real
 from ..results.progress import SHOWN, Progress
 from ..results.run_directory import RunDirectory
-from ..settings.adp import build, updated, value_basis
+from ..settings.adp import build, value_basis
 from ..settings.chase import initial_states, placement, plain
 from ..systems import TwoState
 from ..tables.columns import significant
@@ -50,7 +50,6 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> dict[st
     """Run the three variants and fill the run directory; `metrics.json` comes last."""
     device, dtype = placement(cfg.device, cfg.dtype)
     plant = TwoStateTracking().to(device)
-    cfg = updated(cfg)
     weights = plain(cfg.adp.cost)
     cost = tracking_cost(weights["state"], weights["control"]).to(device)
     x0 = initial_states(cfg, plant.dim).to(device=device, dtype=dtype)

@@ -20,7 +20,6 @@ from ..metrics.safety import constraint_metrics
 from ..numerics.checks import COMMAND_LINE, choice, integer, positive_real
 from ..results.progress import SHOWN, Progress
 from ..results.run_directory import RunDirectory
-from ..settings.adp import updated
 from ..settings.chase import placement
 from ..systems import ControlAffineSystem
 from .comparison import Comparison
@@ -79,7 +78,6 @@ class AmongDiscs(ControlAffineSystem):
 def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics:
     """Run both methods in every scenario and fill the run directory; `metrics.json` comes last."""
     device, dtype = placement(cfg.device, cfg.dtype)
-    cfg = updated(cfg)
     chosen = cfg.avoidance
     kind = animation_kind(cfg)
     x0 = scenarios(cfg).to(device=device, dtype=dtype)

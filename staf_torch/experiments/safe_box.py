@@ -29,7 +29,7 @@ from ..metrics.safety import constraint_metrics
 from ..numerics.checks import COMMAND_LINE, fail, flag, integer, positive_real
 from ..results.progress import SHOWN, Progress
 from ..results.run_directory import RunDirectory
-from ..settings.adp import make_cost, plant, updated
+from ..settings.adp import make_cost, plant
 from ..settings.chase import initial_states, placement, plain
 from ..systems import Barrier, ControlAffineSystem, Plant
 from .comparison import Comparison
@@ -62,7 +62,6 @@ class Method(NamedTuple):
 def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics:
     """Run every method from the same states and fill the run directory; `metrics.json` comes last."""
     device, dtype = placement(cfg.device, cfg.dtype)
-    cfg = updated(cfg)
     system = plant(cfg).to(device)
     if not isinstance(system, ControlAffineSystem) or system.dim is None:
         raise fail(COMMAND_LINE, "system", "must be a ControlAffineSystem", system)

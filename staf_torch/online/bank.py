@@ -134,8 +134,6 @@ class Bank:
                 compiled code goes by them.
         """
         table = table_of(state)
-        if "arguments" not in state and table.shape[1] == size(self.shape) - 1:  # of an older version
-            table = torch.nn.functional.pad(table, (0, 1))
         refuse_other({"table": table}, {"table": self.table}, size(self.shape), table.shape[1])
         refuse_unwritten(self.shape, table)
         self.replace(table.clone())

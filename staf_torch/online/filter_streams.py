@@ -313,12 +313,11 @@ class FilterStreams:
                 if kernel or centers are others.
         """
         given_table = table_of(state)
-        state = {"turn": torch.zeros_like(self.turn)} | state  # of older versions
         refuse_other(state, self._learned(), self.state.blocks.shape[1], given_table.shape[0])
         for name, own in self._fixed().items():
-            given = state.get(name, own)  # which older versions did not save
+            given = state.get(name)
             like = isinstance(given, Tensor) and given.shape == own.shape and given.dtype == own.dtype
-            if not like or not torch.allclose(given, own, rtol=1e-9):
+            if not (like and torch.allclose(torch.as_tensor(given), own, rtol=1e-9)):
                 told = "must have the kernel, radius and centers of this regressor"
                 raise ValueError(f"`StaFRegressor.load_state_dict(state=...)` {told}; {name!r} differs.")
         kept = self.state.with_table(state["table"], state["counts"].clone())

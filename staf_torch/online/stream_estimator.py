@@ -128,10 +128,7 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
         streams, outputs, dtype = state["n_streams_"], state["n_outputs_"], _DTYPES[state["dtype"]]
         twin = type(self)(**self.get_params(deep=False))
         if "tuning" in state:
-            tuned = state["tuning"]
-            ones = torch.ones_like(tuned["center"])[:, : state["n_features_in_"]]  # of older versions
-            tuned = {"width": ones, "unknown": torch.zeros_like(ones)} | tuned
-            twin._tuning = Tuning(**tuned)
+            twin._tuning = Tuning(**state["tuning"])
         own, given = twin._plain_arguments(), state.get("arguments", {})
         for key, value in own.items():
             if key in given and given[key] != value:

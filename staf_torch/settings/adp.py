@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import inspect
 import math
-import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -35,12 +34,7 @@ from ..systems.barrier import wall_numbers
 from . import config_directory
 from .chase import initial_states, make, make_centers, placement, plain
 
-_GROUPS = ("policy", "law", "basis", "extrapolation")  # that were strings before they were config groups
-_TARGETS = {  # of nodes that had none in version 0.1
-    "gains": "staf_torch.adp.Gains",
-    "half_width": "staf_torch.settings.chase.make_radius",
-    "cost": "staf_torch.adp.QuadraticCost",
-}
+_GROUPS = ("policy", "law", "basis", "extrapolation")  # config groups below `adp` that `changed` can exchange
 _RECORDED = 200_000  # states of all trajectories together that are recorded unless asked for
 
 
@@ -50,7 +44,6 @@ def adp_problem(cfg: DictConfig) -> AdpProblem:
     Raises:
         ValueError: if a setting breaks its rule; the message names it.
     """
-    cfg = updated(cfg)
     device, dtype = placement(cfg.device, cfg.dtype)
     system = plant(cfg)
     assert system.dim is not None
@@ -91,9 +84,11 @@ def build(cfg: DictConfig, group: str, kind: type, **known: Callable[[], Any]) -
             that name and the node does not give it.
 
     Raises:
-        ValueError: if the object is of another type.
+        ValueError: if the node is not an option of its group, or the object is of another type.
     """
     node = cfg.adp[group]
+    if not isinstance(node, DictConfig):
+        raise fail(COMMAND_LINE, f"adp.{group}", f"must be an option of the group: adp/{group}=NAME", node)
     asked = inspect.signature(get_object(node["_target_"])).parameters
     given = {name: make_it() for name, make_it in known.items() if name in asked and name not in node}
     # Not through instantiate's own keywords, which would copy the objects.
@@ -201,33 +196,6 @@ def changed(cfg: DictConfig, changes: Mapping[str, Any]) -> DictConfig:
                 new.adp[name] = OmegaConf.load(options[value])
             else:
                 OmegaConf.update(new.adp, name, value)
-    return new
-
-
-def updated(cfg: DictConfig) -> DictConfig:
-    """Copy the settings, with those under `adp` that version 0.1 wrote in today's form.
-
-    Warns:
-        FutureWarning: for each of them, with its new name.
-
-    Raises:
-        ValueError: if a string names no option of its group.
-    """
-    old = {group: cfg.adp[group] for group in _GROUPS if isinstance(cfg.adp[group], str)}
-    new = changed(cfg, old)
-    said = {f"adp.{group}={name}": f"adp/{group}={name}" for group, name in old.items()}
-    with open_dict(new):
-        new.adp.setdefault("walls", {"low": None, "high": None, "decay": 2.0})  # later than 0.2
-        for name, target in _TARGETS.items():
-            new.adp[name].setdefault("_target_", target)
-        cost = new.adp.cost
-        bound = cost.pop("bound", None) if cost["_target_"] == _TARGETS["cost"] else None
-        if bound is not None:
-            said[f"adp.cost.bound={bound}"] = f"adp/cost=bounded_input adp.cost.bound={bound}"
-            cost["_target_"], cost["bound"] = "staf_torch.adp.BoundedInputCost", bound
-    for before, now in said.items():
-        message = f"the setting `{before}` is now `{now}`; the old one goes in the next release."
-        warnings.warn(message, FutureWarning, stacklevel=3)
     return new
 
 

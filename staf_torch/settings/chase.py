@@ -237,7 +237,7 @@ def make_centers(cfg: DictConfig | PlainSettings, dim: int) -> StateFollowingCen
         ValueError: if the layout does not exist in that dimension, or has another number of centers.
     """
     settings = plain(cfg)
-    if settings.pop("_target_", _CENTERS) == _CENTERS:  # run directories of version 0.1 have none
+    if settings.pop("_target_", _CENTERS) == _CENTERS:
         return centers_of(**settings, dim=dim)
     made = make(cfg)
     if not isinstance(made, StateFollowingCenters):

@@ -123,15 +123,18 @@ def test_tracking_writes_its_run_directory(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (["adp.policy=ppo"], r"`staf adp.policy=...` must be one of"),
+        (["adp.policy=ppo"], r"`staf adp.policy=...` must be an option of the group: adp/policy=NAME"),
         (["adp.extrapolated_around=0"], r"`RandomPoints\(around=...\)` must be one of 'state', 'origin'"),
         (["adp.extrapolated_around=origin"], r"`RandomPoints\(half_width=...\)` must be constant"),
         (["adp.rbf_grid.flat=1", "adp/basis=rbf_grid"], r"`RBFGridBasis\(flat=...\)` must be true or false"),
         (["adp.optimum.shooting=1"], r"`staf adp.optimum.shooting=...` must be true or false"),
         (["adp.optimum.states=-1"], r"`staf adp.optimum.states=...` must be at least 0"),
-        (["adp.law=newton"], r"`staf adp.law=...` must be one of"),
-        (["adp.basis=fourier"], r"`staf adp.basis=...` must be one of"),
-        (["adp.extrapolation=grid"], r"`staf adp.extrapolation=...` must be one of"),
+        (["adp.law=newton"], r"`staf adp.law=...` must be an option of the group: adp/law=NAME"),
+        (["adp.basis=fourier"], r"`staf adp.basis=...` must be an option of the group: adp/basis=NAME"),
+        (
+            ["adp.extrapolation=grid"],
+            r"`staf adp.extrapolation=...` must be an option of the group: adp/extrapolation=NAME",
+        ),
         (["adp.cost.state=[[1,0],[0,-1]]"], r"`QuadraticCost\(state=...\)` must be positive semidefinite"),
         (["adp.cost.control=0"], r"`QuadraticCost\(control=...\)` must be positive"),
         (["system=oscillator"], r"`staf system=...` must be a plant with inputs; got 'Oscillator'"),
@@ -158,7 +161,7 @@ def test_trajectories_that_do_not_come_to_rest_are_counted(caplog: pytest.LogCap
 
 @pytest.mark.parametrize("points", ["random", "quadrature"])
 def test_tracking_learns_at_points_of_either_kind(points: str) -> None:
-    cfg = adp_tracking.updated(settings("experiment=adp_tracking", f"adp/extrapolation={points}"))
+    cfg = settings("experiment=adp_tracking", f"adp/extrapolation={points}")
     plant, cost = adp.TwoStateTracking(), adp_tracking.tracking_cost(10.0, 1.0)
     learner = adp_tracking._controllers(cfg, plant, cost)["known"]
     assert isinstance(learner, adp.ActorCritic)

@@ -238,7 +238,7 @@ def test_drifts_are_known_identified_or_kept_as_first_guessed() -> None:
         "adp.identification.gain=4",
         "adp.identification.size=9",
     )
-    cfg = adp_tracking.updated(settings(*TRACKED, *words))
+    cfg = settings(*TRACKED, *words)
     plant, cost = adp.TwoStateTracking(), adp.tracking_cost(10.0, 1.0)
     found: dict[str, Any] = adp_tracking._controllers(cfg, plant, cost)
     known, identified, kept = found.values()

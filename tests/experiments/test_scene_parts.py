@@ -95,7 +95,7 @@ def test_what_follows_the_state_is_found_in_a_controller() -> None:
     assert scenes._moving(grid) is None
     rollout = adp_problem(settings("experiment=adp", "adp/policy=rollout", "adp.rollout.depth=1")).controller
     assert isinstance(scenes._moving(rollout), st.StaFBasis)
-    cfg = adp_tracking.updated(settings("experiment=adp_tracking"))
+    cfg = settings("experiment=adp_tracking")
     trackers = adp_tracking._controllers(cfg, adp.TwoStateTracking(), adp_tracking.tracking_cost(10.0, 1.0))
     known: Any = trackers["known"]
     assert scenes._inner(trackers["identified"]) is known

@@ -146,18 +146,6 @@ def test_a_kernel_that_differs_in_its_seventh_digit_is_another_one() -> None:
         st.StaFRegressor(st.GaussianKernel(0.8 * (1 + 1e-6))).load_state_dict(state)
 
 
-def test_a_bank_saved_before_its_last_number_goes_on() -> None:
-    x, y = streams(40, 2)
-    model = st.StaFRegressor(memory=128, neighbours=8).fit(x[:30], y[:30, :, 0])
-    state = {name: value for name, value in model.state_dict().items() if name != "arguments"}
-    state["table"] = state["table"][:, :-1].contiguous()
-    again = st.StaFRegressor(memory=128, neighbours=8).load_state_dict(state)
-    for k in range(30, 40):
-        assert torch.equal(model.predict(x[k]), again.predict(x[k]))
-        model.partial_fit(x[k], y[k, :, 0])
-        again.partial_fit(x[k], y[k, :, 0])
-
-
 @pytest.mark.parametrize("memory", [None, 128])
 def test_no_saved_state_leads_compiled_code_outside(memory: int | None) -> None:
     x, y = streams(5, 2)

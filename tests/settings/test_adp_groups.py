@@ -1,4 +1,4 @@
-"""Closed loops from settings: the groups below `adp`, a user's own options, the keys of version 0.1."""
+"""Closed loops from settings: the groups below `adp`, a user's own options."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from pathlib import Path
 import composing
 import pytest
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from staf_torch import adp, systems
 from staf_torch.adp.problem import AdpProblem
 from staf_torch.cli.staf import config_directory
-from staf_torch.settings.adp import adp_problem, make_cost, updated
+from staf_torch.settings.adp import adp_problem, make_cost
 from staf_torch.sweeps.hydra_compat.program import trusted
 
 GROUPS = ("policy", "law", "basis", "extrapolation", "cost")
@@ -56,45 +56,6 @@ def test_options_combine() -> None:
     assert (learner.basis.count, learner.extrapolation.count) == (3, 49)
     assert isinstance(learner.law, adp.Published)
     torch.testing.assert_close(learner.critic, torch.tensor([1.0, 0.0, 1.0], dtype=torch.float64))
-
-
-OLD = {
-    "adp.policy=rollout": ["adp/policy=rollout"],
-    "adp.policy=none": ["adp/policy=none"],
-    "adp.law=published": ["adp/law=published"],
-    "adp.basis=rbf_grid": ["adp/basis=rbf_grid"],
-    "adp.extrapolation=quadrature": ["adp/extrapolation=quadrature"],
-}
-
-
-@pytest.mark.parametrize("old", OLD)
-def test_a_string_of_the_last_version_says_its_new_name(old: str) -> None:
-    with pytest.warns(FutureWarning, match=f"`{old}` is now `{OLD[old][0]}`"):
-        before = problem(old)
-    assert torch.equal(control(before), control(problem(*OLD[old])))
-
-
-def test_a_bound_of_the_last_version_chooses_the_cost() -> None:
-    cfg = settings("adp/policy=lqr", "adp.cost.bound=2")
-    with pytest.warns(FutureWarning, match="is now `adp/cost=bounded_input adp.cost.bound=2`"):
-        built = adp_problem(cfg)
-    assert isinstance(built.cost, adp.BoundedInputCost)
-    assert cfg.adp.cost.bound == 2  # the settings are the caller's
-
-
-def test_settings_that_the_last_version_wrote_build_what_they_did() -> None:
-    cfg = settings()
-    OmegaConf.set_struct(cfg, False)
-    written = {"policy": "actor_critic", "law": "information", "basis": "staf", "extrapolation": "random"}
-    cfg.adp = OmegaConf.merge(cfg.adp, written, {"cost": None})
-    cfg.adp.cost = {"state": 1.0, "control": 1.0, "bound": None}
-    for name in ("q", "r"):
-        del cfg.adp[name]
-    for name in ("gains", "half_width"):
-        del cfg.adp[name]["_target_"]
-    with pytest.warns(FutureWarning):
-        before = adp_problem(cfg)
-    assert torch.equal(control(before), control(problem()))
 
 
 MODULE = '''
@@ -182,5 +143,5 @@ def test_model_of_mujoco_is_a_plant_of_closed_loops(tmp_path: Path) -> None:
 def test_a_cost_has_the_sizes_of_any_kind_of_plant() -> None:
     step = systems.StepPlant(lambda x, u: 0.9 * x + u.sum(-1, keepdim=True), dim=3, inputs=2, dt=0.1)
     for plant, dim, inputs in ((step, 3, 2), (systems.ThreeState(), 3, 2), (systems.TwoState(), 2, 1)):
-        cost = make_cost(updated(settings()), plant)
+        cost = make_cost(settings(), plant)
         assert (cost.dim, cost.inputs) == (dim, inputs)

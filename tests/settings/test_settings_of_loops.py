@@ -161,7 +161,6 @@ def test_a_policy_gets_whatever_it_asks_for_by_name() -> None:
     learner = loops.adp_problem(cfg).controller
     assert isinstance(learner, adp.ActorCritic)
     assert (learner.critic.tolist(), learner.actor.tolist()) == ([0.1, 0.2, 0.3], [0.4, 0.5, 0.6])
-    cfg = loops.updated(cfg)
     cfg.adp.policy = {"_target_": f"{__name__}.asking"}
     system = loops.plant(cfg)
     cost = loops.make_cost(cfg, system)
