@@ -37,3 +37,9 @@ def random_positive_definite(seed: int, *batch: int, size: int, log_condition: f
     exponent = torch.rand(*batch, size, dtype=torch.float64, generator=generator) * log_condition
     matrix = (rotation * 10.0 ** exponent.unsqueeze(-2)) @ rotation.mT
     return (matrix + matrix.mT) / 2
+
+
+def changed(given: Any, **parts: Any) -> Any:
+    """A named tuple with some of its parts replaced."""
+    names = type(given).__match_args__
+    return type(given)(*(parts.get(name, part) for name, part in zip(names, given, strict=True)))

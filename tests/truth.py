@@ -63,14 +63,14 @@ class Truth:
             self.radius = mp.mpf(radius)
             self.x = _exact(x)
             self.d = [[self.radius * e for e in _exact(row)] for row in directions]
-            gram = mp.matrix([[self._kernel(a, b) for b in self.d] for a in self.d])
+            gram = mp.matrix([[self.kernel(a, b) for b in self.d] for a in self.d])
             samples = mp.matrix([value(self._at(d)) for d in self.d])  # type: ignore[operator]
             self.b = mp.cholesky_solve(gram, samples)
 
     def _at(self, z: Point) -> list[mp.mpf]:
         return [a + e for a, e in zip(self.x, z, strict=True)]
 
-    def _kernel(self, z: Point, d: Point) -> mp.mpf:
+    def kernel(self, z: Point, d: Point) -> mp.mpf:
         """k(x + z, x + d) without the constant e^{x'x}."""
         if self.polynomial is not None:
             degree, bias = self.polynomial
@@ -83,12 +83,12 @@ class Truth:
     def value(self, zeta: Tensor) -> mp.mpf:
         with mp.workdps(self.digits):
             z = [self.radius * e for e in _exact(zeta)]
-            return mp.fsum(b * self._kernel(z, d) for b, d in zip(self.b, self.d, strict=True))
+            return mp.fsum(b * self.kernel(z, d) for b, d in zip(self.b, self.d, strict=True))
 
     def gradient(self, zeta: Tensor) -> list[mp.mpf]:
         with mp.workdps(self.digits):
             z = [self.radius * e for e in _exact(zeta)]
-            rows = [(b * self._kernel(z, d), d) for b, d in zip(self.b, self.d, strict=True)]
+            rows = [(b * self.kernel(z, d), d) for b, d in zip(self.b, self.d, strict=True)]
             if self.width is None:
                 return [mp.fsum(k * (self.x[i] + d[i]) for k, d in rows) for i in range(len(z))]
             square = mp.mpf(self.width) ** 2

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import math
+import re
 
 import pytest
 import torch
+from helpers import tensor
 from helpers_theory import random_offsets
+from torch import Tensor
 
 from staf_torch import (
     targets,
@@ -139,11 +142,81 @@ def test_bad_arguments_of_the_bound_are_named(wrong: dict[str, object], message:
         theory.exponential_bound(**(GOOD | wrong))  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("dim", [1, 2, 3, 4])
-@pytest.mark.parametrize("degree", [2, 8, 15])
-def test_a_ball_has_at_least_six_points_a_coefficient(dim: int, degree: int) -> None:
-    states = torch.zeros(1, dim, dtype=torch.float64)
-    problem = DomainProblem("a test", PAPER, torch.float64, states, 0.3, 1e-3, 20)
-    points = problem.offsets(degree, 1)
-    assert len(points) >= 6 * math.comb(dim + degree, degree) if dim > 1 else len(points) > 2 * degree
-    assert float(points.norm(dim=-1).max()) == pytest.approx(0.3)
+STATES = theory.disc(1.0, count=5)
+
+
+def problem(
+    target: object = PAPER,
+    states: Tensor = STATES,
+    radius: float = 0.2,
+    epsilon: float = 0.05,
+    max_degree: int = 16,
+) -> DomainProblem:
+    return DomainProblem("a test", target, torch.float64, states, radius, epsilon, max_degree)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("states", [STATES, tensor([[0.3, -0.8]]), theory.disc(0.5, dim=1, count=3)])
+@pytest.mark.parametrize("epsilon", [0.01, 0.4])
+def test_tolerances_are_those_of_the_proof(states: Tensor, epsilon: float) -> None:
+    """eps' / (2 A) and eps' / (2 A |V|), A = sup e^{y'x}, eps' + eps'^2 / (4 A |V|) = epsilon."""
+    target = targets.Cosine(2.0) if states.shape[1] == 1 else PAPER
+    given = problem(target, states, epsilon=epsilon)
+    points = states.unsqueeze(1) + given.offsets(30, 3)
+    size = float(target(points).abs().max())
+    norms = states.norm(dim=-1)
+    A = float((norms * (norms + 0.2)).max().exp())
+    split = given.split()
+    assert split + split**2 / (4 * A * size) == pytest.approx(epsilon, rel=1e-4)
+    assert given.norms()[0] == pytest.approx(size, rel=1e-3)
+    value, exponential, product = given.value(), given.exponential(), given.product()
+    ones = torch.ones(len(states), dtype=torch.float64)
+    torch.testing.assert_close(value.tolerance, split / (2 * A) * ones)
+    shrink = (-states.square().sum(-1)).exp()  # e^{-x'x}, which is divided out
+    wanted = split / (2 * A * given.norms()[0]) / shrink
+    torch.testing.assert_close(exponential.tolerance, wanted)
+    torch.testing.assert_close(product.tolerance, epsilon * ones)
+    z = given.offsets(1, 1)
+    growth = (states @ z.mT).exp()
+    for functions, values, weight in (
+        (value, target(states.unsqueeze(1) + z), torch.ones_like(growth)),
+        (exponential, 1 / growth, torch.ones_like(growth)),
+        (product, target(states.unsqueeze(1) + z) / growth, growth),
+    ):
+        torch.testing.assert_close(functions.evaluate(z), (values, weight))
+
+
+def test_a_target_of_no_size_divides_nothing() -> None:
+    zero = problem(lambda y: 0 * y[..., 0])
+    assert zero.norms()[0] == 0.05
+    assert bool(torch.isfinite(zero.exponential().tolerance).all())
+
+
+def test_the_last_degree_that_is_allowed_is_tried() -> None:
+    bound = theory.exponential_bound(PAPER, STATES, 0.1, 1e-2)
+    assert (bound.N, bound.S) == (2, 2)
+    assert theory.exponential_bound(PAPER, STATES, 0.1, 1e-2, max_degree=2).N == 2
+    with pytest.raises(ValueError, match=r"polynomials of degree 1 \(3 terms\)"):
+        theory.exponential_bound(PAPER, STATES, 0.1, 1e-2, max_degree=1)
+    assert theory.exponential_bound(lambda y: 0 * y[..., 0], STATES, 0.1, 1e-2, max_degree=0).N == 0
+
+
+def test_the_message_says_by_how_much_the_last_degree_fails() -> None:
+    """V = y_1 around the origin: a constant leaves its mean square, and eps' / 2 is allowed."""
+    split = 0.2 / (1 + math.sqrt(1 + 4 * 0.1 / (4 * 0.5)))
+    with pytest.raises(ValueError, match="leave V an error of") as caught:
+        theory.exponential_bound(lambda y: y[..., 0], torch.zeros(1, 2).double(), 0.5, 0.1, max_degree=0)
+    said = re.search(
+        r"of degree 0 \(1 terms\).*of ([0-9.]+) times what is allowed \(([0-9.]+)\)", str(caught.value)
+    )
+    assert said is not None
+    assert float(said[2]) == pytest.approx(split / 2, rel=1e-2)
+    z = problem(states=torch.zeros(1, 2).double(), radius=0.5).offsets(0, 1)
+    assert float(said[1]) == pytest.approx(float(z[:, 0].square().mean().sqrt()) / (split / 2), rel=1e-2)
+
+
+def test_degree_over_radius_that_is_whole_takes_one_more() -> None:
+    """|l| / m < r, strictly: the farthest center is in the open ball."""
+    built = problem(lambda y: y[..., 0], torch.zeros(1, 2).double(), 0.25, 0.9).construct(
+        (tensor([[0.0, 0.25, 0.0]]),), (1,)
+    )
+    assert built.m == 5

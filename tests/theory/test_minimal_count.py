@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 import math
+import re
 
+import mpmath as mp
 import pytest
 import torch
+from helpers import basis_of, tensor, uniform
 from helpers_theory import random_offsets
+from torch import Tensor
+from truth import Truth, smooth
+from variants import KERNELS, over
 
+import staf_torch as st
 from staf_torch import (
     ExponentialKernel,
     GaussianKernel,
@@ -20,6 +27,8 @@ from staf_torch import (
     targets,
     theory,
 )
+from staf_torch.targets import Paper
+from staf_torch.theory import power_function
 
 PAPER = targets.Paper()
 CIRCLE_ANGLES = torch.arange(32, dtype=torch.float64) * (2 * math.pi / 32)
@@ -124,3 +133,164 @@ def test_bad_arguments_of_the_smallest_count_are_named(wrong: dict[str, object],
 def test_bad_arguments_of_the_domain_are_named(wrong: dict[str, object]) -> None:
     with pytest.raises(ValueError, match=r"disc\("):
         theory.disc(**wrong)  # type: ignore[arg-type]
+
+
+LINE = tensor([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.5, 0.0]])
+STATES = tensor([[1.0, 0.0], [0.3, -0.9], [-1.2, 0.4], [0.2, 0.1], [0.0, 0.8], [-0.5, -0.5], [0.9, 0.9]])
+
+
+def test_an_error_that_equals_what_is_allowed_is_allowed() -> None:
+    layouts = [st.rings(3), st.rings(6), st.rings(10)]
+    kernel = st.ExponentialKernel()
+    errors = theory.layout_errors(Paper(), kernel, STATES, 0.1, layouts)
+    for k, layout in enumerate(layouts):
+        epsilon = float(errors[k].max())
+        assert theory.minimal_count(Paper(), kernel, STATES, 0.1, epsilon, layouts).count == len(layout)
+
+
+def test_the_best_layout_that_fails_is_named_and_none_that_has_no_error() -> None:
+    """The target is no number at a center of the smaller layout, which no point of the grid meets."""
+    x, kernel = tensor([[0.4, 0.2]]), st.ExponentialKernel()
+    layouts = [st.ball(5, 2), st.rings(6), st.rings(3)]
+    hole = x[0] + 0.1 * layouts[0][1]
+
+    def target(y: Tensor) -> Tensor:
+        values: Tensor = torch.where((y - hole).norm(dim=-1) < 1e-12, torch.nan, Paper()(y))
+        return values
+
+    errors = theory.layout_errors(target, kernel, x, 0.1, layouts)
+    assert errors.isnan().flatten().tolist() == [True, False, False]
+    with pytest.raises(ValueError, match=r"the best one \(6 centers\)") as caught:
+        theory.minimal_count(target, kernel, x, 0.1, 1e-12, layouts)
+    said = re.search(r"an error of ([0-9.e-]+)", str(caught.value))
+    assert said is not None
+    assert float(said[1]) == pytest.approx(float(errors[1]), rel=1e-2)
+
+
+def test_what_names_no_layout_is_refused() -> None:
+    for call in (theory.layout_errors, theory.minimal_count):
+        given = (Paper(), st.GaussianKernel(), STATES, 0.1)
+        more = (1e-2, []) if call is theory.minimal_count else ([],)
+        with pytest.raises(ValueError, match=rf"`{call.__name__}\(layouts=...\)` must name at least one"):
+            call(*given, *more)  # type: ignore[operator]
+    with pytest.raises(ValueError, match=r"`layout_errors\(layouts=...\)` must have 2 entries"):
+        theory.layout_errors(Paper(), st.GaussianKernel(), STATES, 0.1, [st.ball(3, 3)])
+    with pytest.raises(ValueError, match=r"`layout_errors\(states=...\)` must be a floating-point"):
+        theory.layout_errors(Paper(), st.GaussianKernel(), STATES.long(), 0.1, [st.rings(3)])
+    with pytest.raises(ValueError, match=r"`minimal_count\(states=...\)` must be a floating-point"):
+        theory.minimal_count(Paper(), st.GaussianKernel(), STATES.long(), 0.1, 0.1)
+
+
+# --- the power function -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "kernel", [st.ExponentialKernel(), st.GaussianKernel(0.8)], ids=["exponential", "gaussian"]
+)
+@pytest.mark.parametrize("layout", [LINE, LINE[:3], st.rings(6)], ids=["line", "short line", "rings"])
+@pytest.mark.parametrize("x", [tensor([0.3, -0.4]), STATES[:3], STATES[:6].view(2, 3, 2)])
+def test_the_power_function_is_that_of_its_formula_where_nothing_cancels(
+    kernel: st.Kernel, layout: Tensor, x: Tensor
+) -> None:
+    basis = st.StaFBasis(kernel, st.StateFollowingCenters(layout, 0.9))
+    z = 0.9 * tensor([[0.1, 0.9], [0.7, -0.6], [-0.3, -0.5], [0.2, 0.3]]).expand(*x.shape[:-1], 4, 2)
+    y, c = x.unsqueeze(-2) + z, basis.centers(x)
+    across, gram = kernel(y, c), kernel(c, c)
+    own = kernel(y.unsqueeze(-2), y.unsqueeze(-2)).squeeze(-1).squeeze(-1)
+    left = own - (across * torch.linalg.solve(gram, across.mT).mT).sum(-1)
+    found = power_function(basis, x, z)
+    assert found.shape == (*x.shape[:-1], 4)
+    torch.testing.assert_close(found, left.sqrt(), rtol=1e-4, atol=0)
+    torch.testing.assert_close(
+        power_function(basis, x, z, relative=True), (left / own).sqrt(), rtol=1e-4, atol=0
+    )
+
+
+def test_centers_in_one_point_have_their_limit() -> None:
+    """At the origin, where a radius that shrinks to nothing leaves all centers in one place."""
+    basis = st.StaFBasis(
+        st.ExponentialKernel(), st.StateFollowingCenters(st.rings(3), st.StateRadius(0.5, 0.0))
+    )
+    x = tensor([[0.0, 0.0], [0.6, 0.0]])
+    z = tensor([[0.0, 0.0], [0.05, 0.02]])
+    both = power_function(basis, x, z)
+    assert both[0].tolist() == [0.0, 0.0]
+    torch.testing.assert_close(both[1], power_function(basis, x[1], z))
+    assert float(both[1, 1]) > 0
+
+
+@pytest.mark.parametrize("kernel", [st.ExponentialKernel(), st.MaternKernel(2.5)], ids=["smooth", "matern"])
+def test_states_and_points_of_the_power_function_are_of_the_dimension_of_the_basis(kernel: st.Kernel) -> None:
+    basis = st.StaFBasis(kernel, st.StateFollowingCenters(st.rings(3), 0.5))
+    two, three = torch.zeros(1, 2).double(), torch.zeros(1, 3).double()
+    with pytest.raises(ValueError, match=r"`power_function\(x=...\)` must have 2 entries"):
+        power_function(basis, three, two)
+    with pytest.raises(ValueError, match=r"`power_function\(z=...\)` must have 2 entries"):
+        power_function(basis, two, three)
+    with pytest.raises(ValueError, match=r"`power_function\(z=...\)` must have at least 2 dimensions"):
+        power_function(basis, two, two[0])
+
+
+POWER_LAYOUTS = {
+    "rings3": st.rings(3),
+    "rings6": st.rings(6),
+    "rings10": st.rings(10),
+    "ball10_3": st.ball(10, 3),
+    "polygon4": st.polygon(4),
+    "ball8_2": st.ball(8, 2),
+    "cross_polytope3": st.cross_polytope(3),
+    "one": torch.zeros(1, 2, dtype=torch.float64),
+}
+
+
+@pytest.mark.parametrize("radius", [1e-8, 1e-3, 0.1, 0.5])
+@pytest.mark.parametrize("width", [None, 0.7])
+@pytest.mark.parametrize("layout", POWER_LAYOUTS)
+def test_power_function_keeps_its_digits_at_every_radius(
+    layout: str, width: float | None, radius: float
+) -> None:
+    u = POWER_LAYOUTS[layout]
+    dim = u.shape[1]
+    x = uniform(dim, low=-0.6, high=0.6, seed=1)
+    zeta = uniform(5, dim, low=-0.57, high=0.57, seed=2)
+    kernel = st.ExponentialKernel() if width is None else st.GaussianKernel(width)
+    basis = st.StaFBasis(kernel, st.StateFollowingCenters(u, radius))
+    found = power_function(basis, x, radius * zeta)
+    truth = Truth(u, radius, x, smooth, width)
+    with mp.workdps(truth.digits):
+        gram = mp.matrix([[truth.kernel(a, b) for b in truth.d] for a in truth.d])
+        for point, value in zip(zeta, found, strict=True):
+            z = [truth.radius * mp.mpf(float(e)) for e in point]
+            row = mp.matrix([truth.kernel(z, d) for d in truth.d])
+            square = truth.kernel(z, z) - (row.T * mp.cholesky_solve(gram, row))[0]
+            gain = mp.exp(mp.fsum(e * e for e in truth.x) / 2) if width is None else 1
+            expected = mp.sqrt(square) * gain
+            assert abs(mp.mpf(float(value)) - expected) <= mp.mpf(1e-11) * expected
+
+
+@over(KERNELS)
+def test_power_function_vanishes_at_the_centers_and_bounds_the_error_of_kernel_functions(name: str) -> None:
+    basis, x = basis_of(name, 6, 0.4), uniform(3, 2, low=0.3)
+    offsets = basis.centers.offsets(x)
+    size = float(basis.gram(x).abs().max()) ** 0.5
+    assert float(power_function(basis, x, offsets).max()) <= 1e-6 * size
+    z = 0.4 * uniform(4, 2, low=-0.6, high=0.6)
+    # V = k(., v): ||V - V^|| = P(v), so |V(y) - V^(y)| <= P(y) P(v).
+    v = x + 0.3
+    error = basis.kernel(x.unsqueeze(-2) + z, v.unsqueeze(-2)).squeeze(-1)
+    space = basis.local(x)
+    samples = basis.kernel(basis.centers(x), v.unsqueeze(-2)).squeeze(-1)
+    error = (error - space.evaluate(z, space.fit(samples))).abs()
+    bound = power_function(basis, x, z) * power_function(basis, x, torch.full((1, 2), 0.3).double())
+    assert (error <= bound * (1 + 1e-6) + 1e-9 * size**2).all()
+
+
+def test_relative_power_function_is_finite_where_the_kernel_overflows() -> None:
+    basis = st.StaFBasis(st.ExponentialKernel(), st.StateFollowingCenters(st.rings(6), 1e-3))
+    z = 1e-3 * uniform(4, 2, low=-0.5, high=0.5)
+    near, far = (
+        power_function(basis, torch.tensor([s, 0.0]).double(), z, relative=True) for s in (0.0, 1000.0)
+    )
+    torch.testing.assert_close(far, near, rtol=1e-9, atol=0)
+    with pytest.raises(ValueError, match=r"`power_function\(z=...\)` must have 2 entries"):
+        power_function(basis, torch.zeros(2).double(), torch.zeros(4, 3).double())

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 import torch
-from helpers import basis_of
+from helpers import basis_of, tensor
+from torch import Tensor
 from variants import RATED, over
 
-from staf_torch import optim, theory
+import staf_torch as st
+from staf_torch import optim, systems, theory
 from staf_torch.targets import Paper
-from staf_torch.theory.ultimate_bound import DriftConstants, ultimate_bound
+from staf_torch.theory.ultimate_bound import DriftConstants, PaperStep, ultimate_bound
 
 CONSTANTS = [DriftConstants(condition_number=30.0, speed=2.0, growth=growth) for growth in (0.0, 0.7, 40.0)]
 
@@ -35,15 +38,6 @@ def test_fewest_iterations_are_enough_and_one_fewer_is_not(
         assert steps == 1 or radius(constants, RATED[law], dt, steps - 1, before) > excess
 
 
-@pytest.mark.parametrize("constants", CONSTANTS, ids=lambda c: f"growth {c.growth:g}")
-@pytest.mark.parametrize("before", [False, True])
-def test_largest_step_meets_the_bound_with_equality(constants: DriftConstants, before: bool) -> None:
-    law = optim.SteepestDescent()
-    for excess in (1e-6, 1e-2):
-        dt = theory.step_for_bound(constants, law, excess=excess, inner_steps=3, before=before)
-        assert radius(constants, law, dt, 3, before) == pytest.approx(excess, rel=1e-6)
-
-
 def test_the_bound_is_the_fixed_point_of_its_recursion() -> None:
     """s+ = q e^{G dt} s + W (e^{G dt} - 1) / G, iterated."""
     constants, law, dt = CONSTANTS[1], optim.SteepestDescent(), 0.05
@@ -64,3 +58,206 @@ def test_a_step_for_no_excess_and_velocities_of_another_shape_are_refused() -> N
             theory.paper_step(basis, target, states, states, excess=excess)
     with pytest.raises(ValueError, match=r"velocities=\.\.\.\)` must have the shape of the states, \(4, 2\)"):
         theory.drift_constants(basis, target, states, states[:3])
+
+
+STATES = tensor([[1.0, 0.2], [0.4, -0.9], [-0.7, 0.5], [0.1, 0.3], [1.2, -0.2], [-0.3, -0.6]])
+SPIN, FALL = systems.Oscillator().drift(STATES), -0.5 * STATES
+EXACT = optim.Exact()
+
+
+def by_differences(basis: st.StaFBasis, x: Tensor, v: Tensor) -> tuple[float, float, float]:
+    """Kappa, W and G of one state, K' and w' as differences of what the basis gives nearby."""
+    h = 1e-5
+
+    def gram(at: Tensor) -> np.ndarray:
+        return basis.gram(at).numpy()
+
+    def ideal(at: Tensor) -> np.ndarray:
+        return basis.ideal_weights(at, Paper()).numpy()
+
+    matrix, rate = gram(x), (gram(x + h * v) - gram(x - h * v)) / (2 * h)
+    speed = (ideal(x + h * v) - ideal(x - h * v)) / (2 * h)
+    growth = np.linalg.eigvals(np.linalg.solve(matrix, rate)).real.max() / 2
+    return float(np.linalg.cond(matrix)), math.sqrt(speed @ matrix @ speed), float(growth)
+
+
+@pytest.mark.parametrize("radius", [0.5, st.StateRadius(0.7, 0.3, gain=1.5)], ids=["constant", "shrinking"])
+@pytest.mark.parametrize("velocities", [SPIN, FALL, -FALL], ids=["spin", "fall", "rise"])
+@pytest.mark.parametrize("kernel", ["exponential", "gaussian", "matern52"])
+def test_constants_are_the_worst_of_differences(kernel: str, velocities: Tensor, radius: object) -> None:
+    basis = basis_of(kernel, 3, radius)
+    found = theory.drift_constants(basis, Paper(), STATES, velocities)
+    kappa, speed, growth = zip(
+        *(by_differences(basis, x, v) for x, v in zip(STATES, velocities, strict=True)), strict=True
+    )
+    assert found.condition_number == pytest.approx(max(kappa), rel=1e-6)
+    assert found.speed == pytest.approx(max(speed), rel=1e-5)
+    assert found.growth == pytest.approx(max(0.0, *growth), rel=1e-5, abs=1e-6)
+    again = theory.drift_constants(basis, Paper(), STATES.view(2, 3, 2), velocities.view(2, 3, 2))
+    assert again == pytest.approx(found, rel=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("kernel", "directions", "state"),
+    [
+        (st.MaternKernel(), tensor([[1e-30, 0.0], [0.0, 0.0]]), [0.3, 0.1]),  # one center, twice
+        (st.AnchoredKernel(st.ExponentialKernel()), tensor([[1.0, 0.0], [0.0, 1.0]]), [-0.5, 0.0]),  # k(0, 0)
+        (st.PolynomialKernel(2, 1.0), torch.zeros(1, 2).double(), [1e160, 0.0]),  # past the largest number
+    ],
+    ids=["twice", "at the origin", "too large"],
+)
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_states_whose_matrix_is_singular_are_refused(
+    kernel: st.Kernel, directions: Tensor, state: list[float]
+) -> None:
+    basis = st.StaFBasis(kernel, st.StateFollowingCenters(directions, 0.5))
+    x = tensor([state])
+    with pytest.raises(ValueError, match=r"drift_constants\(states=...\)` must have a positive definite K"):
+        theory.drift_constants(basis, Paper(), x, torch.ones_like(x))
+
+
+NONE = DriftConstants(condition_number=30.0, speed=0.0, growth=0.0)
+STILL = DriftConstants(condition_number=30.0, speed=0.0, growth=0.7)
+FLAT = DriftConstants(condition_number=30.0, speed=2.0, growth=0.0)
+SLOW = DriftConstants(condition_number=30.0, speed=2.0, growth=1e-3)
+MOVING = DriftConstants(condition_number=30.0, speed=2.0, growth=0.7)
+STEEP = DriftConstants(condition_number=1e20, speed=2.0, growth=0.0)  # no iteration gains anything
+
+
+@over(RATED, "law")
+@pytest.mark.parametrize("constants", [FLAT, SLOW, MOVING])
+@pytest.mark.parametrize("before", [False, True])
+def test_the_largest_step_is_as_large_as_the_bound_allows(
+    law: str, constants: DriftConstants, before: bool
+) -> None:
+    for excess, steps in ((1e-4, 1), (0.3, 4), (9.0, 11)):
+        given = {"excess": excess, "inner_steps": steps, "before": before}
+        dt = theory.step_for_bound(constants, RATED[law], **given)  # type: ignore[arg-type]
+        if math.isinf(dt):
+            assert isinstance(RATED[law], optim.Exact)
+            assert not before
+            continue
+        bound = ultimate_bound(constants, RATED[law], dt=dt, inner_steps=steps)
+        assert (bound.before if before else bound.after) == pytest.approx(excess, rel=1e-8)
+
+
+def test_without_a_way_any_step_will_do_that_the_growth_of_the_norm_allows() -> None:
+    law = optim.SteepestDescent()
+    for before in (False, True):
+        assert theory.step_for_bound(NONE, law, excess=0.5, inner_steps=3, before=before) == math.inf
+        dt = theory.step_for_bound(STILL, law, excess=0.5, inner_steps=3, before=before)
+        assert (29 / 31) ** 3 * math.exp(0.7 * dt) == pytest.approx(1.0)
+    assert theory.step_for_bound(STILL, EXACT, excess=0.5, inner_steps=3) == math.inf
+    assert theory.step_for_bound(MOVING, EXACT, excess=0.5, inner_steps=1) == math.inf
+    dt = theory.step_for_bound(FLAT, EXACT, excess=0.5, inner_steps=1, before=True)
+    assert dt == pytest.approx(math.sqrt(0.5) / 2.0)
+
+
+def test_where_nothing_contracts_nothing_is_promised() -> None:
+    law = optim.SteepestDescent()
+    assert ultimate_bound(STEEP, law, dt=0.1, inner_steps=3) == (math.inf, math.inf)
+    for before in (False, True):
+        assert theory.steps_for_bound(STEEP, law, excess=0.1, dt=1e-3, before=before) is None
+        assert theory.step_for_bound(STEEP, law, excess=0.1, inner_steps=3, before=before) == 0.0
+    growing = DriftConstants(condition_number=30.0, speed=1.0, growth=-2 * math.log(29 / 31))
+    assert ultimate_bound(growing, law, dt=1.01, inner_steps=2) == (math.inf, math.inf)
+    assert math.isfinite(ultimate_bound(growing, law, dt=0.99, inner_steps=2).before)
+
+
+def test_a_growth_past_the_largest_number_is_promised_nothing() -> None:
+    """Of the exact solution, which contracts any growth, as far as the growth is a number."""
+    for growth, after, steps in ((300.0, 0.0, 1), (700.0, 0.0, 1), (700.5, math.inf, None)):
+        for dt in (1.0, 0.5):
+            constants = DriftConstants(30.0, 1.0, growth / dt)
+            found = ultimate_bound(constants, EXACT, dt=dt, inner_steps=1)
+            assert found.after == after
+            assert found.before > 1e200
+            assert theory.steps_for_bound(constants, EXACT, excess=0.1, dt=dt) == steps
+    assert ultimate_bound(DriftConstants(30.0, 1.0, 700.0), EXACT, dt=1.0, inner_steps=1).before == math.inf
+
+
+def test_a_way_as_long_as_the_radius_leaves_no_iterations_before_the_correction() -> None:
+    law = optim.SteepestDescent()
+    for excess, dt in ((1.0, 0.5), (0.25, 0.5), (1.0, 0.6)):
+        assert theory.steps_for_bound(FLAT, law, excess=excess, dt=dt, before=True) is None
+    assert theory.steps_for_bound(FLAT, law, excess=1.0, dt=0.5) is not None
+    assert theory.steps_for_bound(FLAT, law, excess=1.0, dt=0.49, before=True) is not None
+
+
+@pytest.mark.parametrize("before", [False, True])
+@pytest.mark.parametrize("constants", [FLAT, SLOW, MOVING])
+def test_what_a_number_of_iterations_promises_needs_that_number(
+    constants: DriftConstants, before: bool
+) -> None:
+    """To the last bit: neither one more nor one fewer."""
+    law = optim.SteepestDescent()
+    for steps in range(1, 25):
+        bound = ultimate_bound(constants, law, dt=0.01, inner_steps=steps)
+        if math.isfinite(bound.before):
+            excess = bound.before if before else bound.after
+            assert (
+                theory.steps_for_bound(constants, law, excess=excess * (1 + 1e-14), dt=0.01, before=before)
+                == steps
+            )
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda law: ultimate_bound(MOVING, law, dt=0.1, inner_steps=1),
+        lambda law: theory.step_for_bound(MOVING, law, excess=0.1, inner_steps=1),
+        lambda law: theory.steps_for_bound(MOVING, law, excess=0.1, dt=0.1),
+    ],
+    ids=["bound", "step", "steps"],
+)
+def test_a_law_without_a_known_contraction_is_refused(call: object) -> None:
+    with pytest.raises(ValueError, match=r"law=...\)` must have a known contraction an iteration.*HeavyBall"):
+        call(optim.HeavyBall())  # type: ignore[operator]
+
+
+# --- the paper's own step -----------------------------------------------------------------------------------
+
+
+def step_of(states: Tensor, velocities: Tensor, **given: object) -> PaperStep:
+    return theory.paper_step(basis_of("exponential", 3), Paper(), states, velocities, **given)  # type: ignore[arg-type]
+
+
+def test_constants_of_the_papers_step_are_written_out() -> None:
+    basis = basis_of("exponential", 3)
+    found = step_of(STATES, SPIN, excess=0.35)
+    weights = basis.ideal_weights(STATES, Paper())
+    assert found.radius == pytest.approx(max(math.sqrt(float(w @ w)) for w in weights))
+    assert found.speed == pytest.approx(math.sqrt(3) * float(SPIN.norm(dim=-1).max()))
+    kappa = max(np.linalg.cond(basis.gram_structure(x).scaled().numpy()) for x in STATES)
+    assert found.contraction == pytest.approx(((kappa - 1) / (kappa + 1)) ** 2)
+    h, slopes = 1e-5, []
+    for x, a in zip(STATES, weights, strict=True):
+        centers = basis.centers(x)
+
+        def error(c: Tensor, a: Tensor = a) -> float:
+            return float(a @ basis.kernel(c, c) @ a - 2 * a @ Paper()(c))
+
+        moves = torch.eye(6, dtype=torch.float64).view(6, 3, 2) * h
+        slopes.append(
+            math.hypot(*((error(centers + move) - error(centers - move)) / (2 * h) for move in moves))
+        )
+    assert found.ideal_gradient == pytest.approx(max(slopes), rel=1e-4)
+    assert found.gradient >= found.ideal_gradient
+    worst = max(found.gradient, found.ideal_gradient)
+    assert found.dt == pytest.approx(0.35 * (1 - found.contraction) / (2 * found.speed * worst))
+    far = step_of(STATES, SPIN, excess=0.35, initial_weights=tensor([0.0, 3e4, 4e4]))
+    assert far.radius == pytest.approx(max(5e4, found.radius))
+    near = step_of(STATES, SPIN, excess=0.35, initial_weights=tensor([0.0, 3e-4, 4e-4]))
+    assert near == found
+
+
+def test_states_that_stand_still_may_take_any_step_and_slow_ones_a_long_one() -> None:
+    assert step_of(STATES[:2], 0 * SPIN[:2], excess=0.35).dt == math.inf
+    quick, slow = (step_of(STATES[:2], rate * SPIN[:2], excess=0.35) for rate in (1.0, 0.01))
+    assert slow.dt == pytest.approx(100 * quick.dt)
+
+
+def test_states_of_a_step_are_rows() -> None:
+    for wrong in (STATES[0], torch.zeros(4, 3).double(), torch.zeros(2).double()):
+        with pytest.raises(ValueError, match=r"paper_step\(states="):
+            step_of(wrong, wrong, excess=1.0)

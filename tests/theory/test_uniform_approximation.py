@@ -6,6 +6,7 @@ import math
 
 import pytest
 import torch
+from helpers import tensor, uniform
 from helpers_theory import random_offsets
 from torch import Tensor
 
@@ -13,7 +14,8 @@ from staf_torch import (
     theory,
 )
 from staf_torch.centers import probe_points
-from staf_torch.theory.uniform_approximation import ball_grid, monomials, near_best, supremum
+from staf_torch.centers.layouts import monomials
+from staf_torch.theory.uniform_approximation import ball_grid, near_best, supremum
 
 
 def test_near_best_polynomial_of_a_power_is_chebyshevs() -> None:
@@ -91,9 +93,77 @@ def test_near_best_with_weights_is_the_best_that_linear_programming_finds(seed: 
     torch.testing.assert_close(left, fit.error[0])
 
 
-def test_a_disc_has_two_points_at_least() -> None:
-    two = theory.disc(0.5, count=2)
-    assert two.shape == (2, 2)
-    assert float(two.norm(dim=-1).max()) <= 0.5 * (1 + 1e-12)
-    with pytest.raises(ValueError, match=r"`disc\(count=...\)`"):
-        theory.disc(count=1)
+def test_a_grid_of_no_points_is_refused() -> None:
+    for given, name in (((0, 1, 1), "dim"), ((1, 0, 1), "shells"), ((1, 1, 0), "directions")):
+        with pytest.raises(ValueError, match=rf"ball_grid\({name}=...\)` must be at least 1; got 0"):
+            ball_grid(*given)
+
+
+def test_a_disc_is_of_the_plane_unless_said_and_stands_where_it_is_said() -> None:
+    assert theory.disc().shape == (97, 2)
+    assert float(theory.disc().norm(dim=-1).max()) == pytest.approx(1.0)
+    moved = theory.disc(0.5, dim=3, count=30, center=[0.1, 0.2, 0.3])
+    assert torch.equal(moved[0], tensor([0.1, 0.2, 0.3]))
+    torch.testing.assert_close(moved, tensor([0.1, 0.2, 0.3]) + theory.disc(0.5, dim=3, count=30))
+    assert theory.disc(dim=1, count=2).shape == (2, 1)
+    for name, wrong in (("dim", 0), ("count", 1)):
+        with pytest.raises(ValueError, match=rf"`disc\({name}=...\)` must be at least"):
+            theory.disc(**{name: wrong})  # type: ignore[arg-type]
+
+
+# --- Lawson's iteration -------------------------------------------------------------------------------------
+
+
+def problem(seed: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Points of the plane, three waves there, and weights from a tenth to ten."""
+    z = ball_grid(2, 4, 16)
+    f = (uniform(3, 2, low=-3, high=3, seed=seed) @ z.mT).sin() + uniform(3, 1, seed=seed + 1)
+    return z, f, 10 ** uniform(3, len(z), seed=seed + 2)
+
+
+@pytest.mark.parametrize("power", [-40, 40])
+def test_near_best_polynomials_scale_with_the_function(power: int) -> None:
+    z, f, weight = problem(3)
+    tolerance, scale = tensor([0.5, 1.0, 3.0]), 2.0**power
+    one = near_best(z, 2, f, weight, tolerance)
+    other = near_best(z, 2, scale * f, weight, scale * tolerance)
+    for name in ("coefficients", "error", "lower"):
+        torch.testing.assert_close(getattr(other, name), scale * getattr(one, name), rtol=1e-12, atol=0)
+
+
+def test_a_polynomial_is_found_and_its_rounding_is_enough() -> None:
+    z = ball_grid(2, 4, 16)
+    exact = uniform(4, 10, seed=9) * 2.0 ** tensor([[-60], [-30], [0], [30]])
+    f = exact @ monomials(z, 3).mT
+    found = near_best(z, 3, f, torch.ones_like(f), torch.zeros(4).double())
+    size = f.abs().amax(-1)
+    torch.testing.assert_close(found.coefficients / size[:, None], exact / size[:, None], rtol=0, atol=1e-12)
+    assert bool((found.error < 1e-14 * size).all())
+    assert bool((found.lower <= found.error).all())
+
+
+def test_a_row_that_is_good_enough_as_zero_stays_zero() -> None:
+    z, f, weight = problem(5)
+    size = (weight * f).abs().amax(-1)
+    found = near_best(z, 2, f, weight, size / 0.69)
+    assert float(found.coefficients.abs().max()) == 0.0
+    torch.testing.assert_close(found.error, size)
+    found = near_best(z, 2, f, weight, size / 0.71)
+    assert bool((found.coefficients.abs().amax(-1) > 0).all())
+    assert bool((found.error < size).all())
+
+
+# --- suprema ------------------------------------------------------------------------------------------------
+
+
+def test_a_number_that_is_none_on_the_grid_is_told_of_its_function_only() -> None:
+    grid = ball_grid(2, 3, 6)
+
+    def function(z: Tensor) -> Tensor:
+        values = z.sum(-1).expand(2, *z.shape[-2:-1]) if z.dim() == 2 else z.sum(-1)
+        broken = (z.norm(dim=-1) == 0).expand_as(values) & tensor([[0.0], [1.0]]).bool()
+        return torch.where(broken, torch.nan, values)
+
+    found = supremum(function, grid, 1.0)
+    assert found[0] == pytest.approx(math.sqrt(2), rel=1e-6)
+    assert math.isnan(found[1])
