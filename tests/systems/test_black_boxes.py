@@ -40,36 +40,6 @@ class Asked:
         return linear(x, u)
 
 
-def test_a_function_is_tried_near_its_point_with_two_inputs_a_row() -> None:
-    asked = Asked()
-    box = BlackBox("Test(step=...)", asked, tensor([5.0, -3.0]), tensor([2.0]))
-    assert box.torch is False
-    ((x, u),) = asked.calls
-    assert x.shape == (6, 2)
-    assert u.shape == (6, 1)
-    np.testing.assert_array_equal(x[:3], x[3:])
-    assert np.abs(u[:3] - u[3:]).min() > 0
-    for part, point in ((x, [5.0, -3.0]), (u, [2.0])):
-        away = np.abs(part - point)
-        assert 0.01 < away.max() < 0.6
-        assert len(np.unique(part[:3], axis=0)) == 3
-    again = Asked()
-    BlackBox("Test(step=...)", again, tensor([5.0, -3.0]), tensor([2.0]))
-    np.testing.assert_array_equal(again.calls[0][0], x)
-
-
-def test_functions_in_torch_are_known_by_their_derivative() -> None:
-    assert BlackBox("T", with_torch, ZERO, NONE).torch is True
-    detached = BlackBox(
-        "T", lambda x, u: with_torch(torch.as_tensor(x), torch.as_tensor(u)).detach(), ZERO, NONE
-    )
-    assert detached.torch is False
-    x, u = uniform(4, 2, seed=1).requires_grad_(), uniform(4, 1, seed=2)
-    assert BlackBox("T", with_torch, ZERO, NONE)(x, u).requires_grad
-    with torch.no_grad():
-        assert BlackBox("T", with_torch, ZERO, NONE).torch is True
-
-
 @pytest.mark.parametrize("function", [linear, with_torch])
 def test_leading_dimensions_of_state_and_input_are_broadcast(function: Any) -> None:
     box = BlackBox("T", function if function is with_torch else Asked(), ZERO, NONE)
@@ -166,16 +136,6 @@ def test_functions_that_are_none_are_told_why(function: Any, message: str) -> No
         BlackBox("T(f)", function, ZERO, NONE)
 
 
-def test_a_complaint_of_many_lines_is_told_by_its_first() -> None:
-    def fails(x: Any, u: Any) -> Any:
-        raise RuntimeError("first\nsecond")
-
-    with pytest.raises(ValueError, match=r"\(first\)") as caught:
-        BlackBox("T", fails, ZERO, NONE)
-    assert "second" not in str(caught.value)
-    assert isinstance(caught.value.__cause__, RuntimeError)
-
-
 # --- where a plant rests ------------------------------------------------------------------------------------
 
 
@@ -203,22 +163,6 @@ def test_a_plant_rests_that_moves_by_a_millionth_of_its_rate(slope: float, gain:
             ValueError, match=r"Moving does not rest at the state \[0.0\] under the input \[0"
         ):
             check_rest(Moving(slope, gain, sign * 1.01e-6 * scale), one, one)
-
-
-def test_the_origin_of_a_plant_with_a_drift_is_spoken_of_as_such() -> None:
-    plant = systems.Linear([[1.0]], [[1.0]])
-    check_rest(plant, torch.zeros(1).double(), torch.zeros(1).double())
-    check_rest(plant, torch.ones(1).double(), -torch.ones(1).double())
-    for x, u in ((1.0, 0.0), (0.0, 1.0)):
-        with pytest.raises(ValueError, match=r"Linear does not rest at the state .* it moves by \[1.0\]"):
-            check_rest(plant, tensor([x]), tensor([u]))
-
-    class Pushed(systems.Linear):
-        def drift(self, x: Tensor) -> Tensor:
-            return super().drift(x) + 2.0
-
-    with pytest.raises(ValueError, match=r"`Pushed.drift` must be 0 at the origin.*got \[2.0\]"):
-        check_rest(Pushed([[1.0]], [[1.0]]), torch.zeros(1).double(), torch.zeros(1).double())
 
 
 class Cubic(Moving):
@@ -311,3 +255,58 @@ def test_guesses_are_states_or_pairs_and_angles_are_counted_from_either_end() ->
         with pytest.raises(ValueError, match=r"`StepPlant\(periodic=...\)` must be coordinates of 2"):
             systems.StepPlant(step, periodic=periodic, **given)
     systems.StepPlant(step, periodic=[1, -2], **given)
+
+
+def moved(x: Any, u: Any) -> Any:
+    """Rows of (x_2, u), of arrays alone."""
+    if isinstance(x, Tensor):
+        raise TypeError("no tensors")
+    return np.concatenate((x[:, 1:], u), axis=1)
+
+
+def test_a_function_that_cuts_its_graph_is_no_function_in_torch() -> None:
+    def cut(x: Any, u: Any) -> Any:
+        after = 0.9 * torch.as_tensor(x) + torch.as_tensor(u)
+        return after.detach() if isinstance(x, Tensor) else after.numpy()
+
+    assert BlackBox("Test(step=...)", cut, ZERO, NONE).torch is False
+    assert BlackBox("Test(step=...)", lambda x, u: 0.9 * x + u, ZERO, NONE).torch is True
+
+
+KINDS: dict[str, Any] = {
+    "float32": lambda found: found.astype(np.float32),
+    "objects": lambda found: found.astype(object),
+    "lists": lambda found: found.tolist(),
+}
+
+
+@pytest.mark.parametrize("kind", sorted(KINDS))
+def test_what_a_function_returns_becomes_numbers_of_the_state(kind: str) -> None:
+    def step(x: Any, u: Any) -> Any:
+        return KINDS[kind](moved(x, u))
+
+    box = BlackBox("Test(step=...)", step, ZERO, NONE)
+    x, u = tensor([[0.5, 0.25], [1.0, -2.0]]), tensor([[4.0], [0.125]])
+    after = box(x, u)
+    assert after.dtype == torch.float64
+    assert after.tolist() == [[0.25, 4.0], [-2.0, 0.125]]
+    assert box(x.float(), u.float()).dtype == torch.float32
+    states, controls = box.follow(x.numpy(), lambda x: 0.5 * x[:, :1], 3)
+    assert states.dtype == np.float64
+    assert states[0].tolist() == [[0.5, 0.25], [0.25, 0.25], [0.25, 0.125], [0.125, 0.125]]
+    assert controls[0].tolist() == [[0.25], [0.125], [0.125]]
+
+
+@pytest.mark.parametrize("kind", [systems.StepPlant, systems.RatePlant])
+def test_a_plant_rests_in_double_precision_and_every_coordinate_may_be_an_angle(kind: Any) -> None:
+    more = {"dt": 0.1} if kind is systems.StepPlant else {}
+    plant = kind(lambda x, u: 0.5 * x + u, dim=1, inputs=1, periodic=[0, -1], **more)
+    assert plant.periodic == (0,)
+    for part in (plant.equilibrium(), plant.resting_input()):
+        assert part.dtype == torch.float64
+    exact = kind(lambda x, u: 0 * x + x.detach() + u - 0.1, dim=1, inputs=1, equilibrium=[0.1], **more)
+    wanted = 0.1 if kind is systems.StepPlant else 0.0
+    assert float(exact.equilibrium()) == 0.1
+    assert float(exact.resting_input()) == pytest.approx(wanted, abs=1e-12)
+    with pytest.raises(ValueError, match="periodic"):
+        kind(lambda x, u: 0.5 * x + u, dim=1, inputs=1, periodic=[1], **more)

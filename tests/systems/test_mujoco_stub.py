@@ -22,6 +22,13 @@ Integrator = enum.IntEnum("Integrator", ["mjINT_EULER", "mjINT_RK4"], start=0)
 State = enum.IntEnum("State", {"mjSTATE_QPOS": 2, "mjSTATE_FULLPHYSICS": 15})
 
 
+class Made:
+    """An object with these attributes."""
+
+    def __init__(self, **given: Any) -> None:
+        vars(self).update(given)
+
+
 class Model:
     """A slide and a hinge around (0.5, -1), and an activation that follows the first of two inputs."""
 
@@ -32,11 +39,11 @@ class Model:
         self.jnt_type, self.jnt_limited = np.array([2, 3]), np.array([0, 0], dtype=np.uint8)
         self.actuator_ctrllimited = np.array([1, 0], dtype=np.uint8)
         self.actuator_ctrlrange = np.array([[-1.0, 2.0], [0.0, 0.0]])
-        self.opt = types.SimpleNamespace(timestep=0.25, integrator=0)
+        self.opt = Made(timestep=0.25, integrator=0)
         self.names, self.warm = ["slide", "hinge"], 0.3
 
     def joint(self, index: int) -> Any:
-        return types.SimpleNamespace(name=self.names[index])
+        return Made(name=self.names[index])
 
     @staticmethod
     def from_xml_string(text: str) -> Model:
@@ -107,19 +114,13 @@ def transition(model: Model, data: Data, eps: float, centered: bool, a: Any, b: 
     a[:], b[:] = slopes[:, :5], slopes[:, 5:]
 
 
-CALLS: list[dict[str, Any]] = []
-
-
 def rollout(
     models: list[Model], data: list[Data], initial: np.ndarray, control: np.ndarray, **given: Any
 ) -> None:
-    CALLS.append({"threads": len(data), **given})
-    assert len(models) == len(initial) == len(control)
-    warm = given.get("initial_warmstart")
     for k, model in enumerate(models):
         each = data[k % len(data)]
         set_state(model, each, initial[k], 15)
-        each.qacc_warmstart[:] = 9.0 if warm is None else warm[k]
+        each.qacc_warmstart[:] = given["initial_warmstart"][k]
         for j in range(given["nstep"]):
             each.ctrl[:] = control[k, j]
             step(model, each)
@@ -130,15 +131,14 @@ def rollout(
 def _stub(monkeypatch: pytest.MonkeyPatch) -> None:
     stub: Any = types.ModuleType("mujoco")
     stub.MjModel, stub.MjData, stub.mjtJoint, stub.mjtIntegrator = Model, Data, Joint, Integrator
-    stub.mjtState, stub.rollout = State, types.SimpleNamespace(rollout=rollout)
+    stub.mjtState, stub.rollout = State, Made(rollout=rollout)
     stub.mj_step, stub.mj_resetData, stub.mj_setState, stub.mj_getState = step, reset, set_state, get_state
     stub.mjd_transitionFD = transition
     stub.mj_stateSize = lambda model, kind: 1 + model.nq + model.nv + model.na + model.more
     monkeypatch.setitem(sys.modules, "mujoco", stub)
-    CALLS.clear()
 
 
-def made(change: Callable[[Model], None] = lambda model: None, **given: Any) -> systems.MujocoPlant:
+def made(change: Callable[[Model], object] = lambda model: None, **given: Any) -> systems.MujocoPlant:
     model = Model()
     change(model)
     return systems.MujocoPlant(model, **given)
@@ -163,103 +163,49 @@ def test_a_plant_is_of_the_size_and_of_the_limits_of_its_model() -> None:
     assert plant.bounds is not None
     assert (plant.bounds.low.tolist(), plant.bounds.high.tolist()) == ([-1.0, -np.inf], [2.0, np.inf])
     assert plant.equilibrium().tolist() == [0.5, -1.0, 0.0, 0.0, 0.0]
-    assert plant.resting_input().tolist() == [0.0, 0.0]
-    assert isinstance(plant.model, Model)
-    assert not plant.traceable
-    assert plant.function._slopes == plant.function._function.slopes
-    assert {call["threads"] for call in CALLS} == {1}
     assert made(dt=1.0).period == 1.0
-    assert made(periodic=()).periodic == ()
     assert made(periodic=(0,)).periodic == (0,)
-
-
-def test_limits_that_are_given_take_the_place_of_those_of_the_model() -> None:
-    for given, low, high in (({"low": -3.0}, -3.0, np.inf), ({"high": 3.0}, -np.inf, 3.0)):
-        bounds = made(**given).bounds
-        assert bounds is not None
-        assert (bounds.low.tolist(), bounds.high.tolist()) == ([low] * 2, [high] * 2)
-
-    def free(model: Model) -> None:
-        model.actuator_ctrllimited[:] = 0
-        model.jnt_limited[1] = 1
-
-    assert made(free).bounds is None
-    assert made(free).periodic == ()  # a hinge with a limit does not turn around
-
-
-def test_the_rest_is_searched_from_a_guess_that_is_given() -> None:
-    plant = made(equilibrium=([0.7, -1.0, 0.0, 0.0, 0.0], [0.3, 0.0]))
-    assert float(plant.resting_input().abs().max()) > 0.1 or float(plant.equilibrium()[0]) == 0.5
-    rest, held = plant.equilibrium(), plant.resting_input()
-    torch.testing.assert_close(plant.step(rest, held), rest, rtol=0, atol=1e-6)
+    own = made(low=-3.0).bounds  # limits that are given take the place of those of the model
+    assert own is not None
+    assert (own.low.tolist(), own.high.tolist()) == ([-3.0] * 2, [np.inf] * 2)
+    free = made(lambda model: vars(model).update(actuator_ctrllimited=np.zeros(2), jnt_limited=np.ones(2)))
+    assert free.bounds is None
+    assert free.periodic == ()  # a hinge with a limit does not turn around
 
 
 @pytest.mark.parametrize("threads", [1, 2])
 @pytest.mark.parametrize("frames", [1, 5])
-def test_rows_are_those_of_the_simulator(threads: int, frames: int) -> None:
+def test_rows_are_those_of_the_simulator_one_period_or_many(threads: int, frames: int) -> None:
     plant = made(dt=0.25 * frames, threads=threads)
     x, u = uniform(4, 5, seed=1), uniform(4, 2, seed=2)
     x[2, 3] = 1e7  # it explodes at once: the clock begins anew, and ends at 1 again after five steps
-    CALLS.clear()
     found = plant.step(x, u)
     np.testing.assert_array_equal(found.numpy(), after(x, u, frames))
     assert bool(found[2].isnan().all())
-    (call,) = CALLS
-    assert (call["threads"], call["nstep"], call["persistent_pool"]) == (threads, frames, threads > 1)
-    assert call["skip_checks"] is True
-    with pytest.raises(TypeError, match="NumPy"):
-        plant.function._function(x, u)
+
+    def feedback(z: np.ndarray) -> np.ndarray:
+        return np.stack((-z[:, 0] - z[:, 3], 0.1 * z[:, 1]), axis=1)
+
+    states, controls = plant.function.follow(x.numpy(), feedback, 4)
+    assert (states.shape, controls.shape) == ((4, 5, 5), (4, 4, 2))
+    for k in range(4):
+        now, held = torch.from_numpy(states[:, k].copy()), torch.from_numpy(controls[:, k].copy())
+        np.testing.assert_array_equal(states[[0, 1, 3], k + 1], after(now, held, frames)[[0, 1, 3]])
+    assert np.isnan(states[2, 1:]).all()
 
 
-@pytest.mark.parametrize("threads", [1, 2])
-@pytest.mark.parametrize("frames", [1, 5])
-def test_a_simulation_that_goes_on_has_the_bits_of_single_periods(threads: int, frames: int) -> None:
-    plant = made(dt=0.25 * frames, threads=threads)
-    for rows in (2, 4, 3):
-        x = uniform(rows, 5, seed=rows).numpy()
-        x[1, 2] = 1e7
-
-        def feedback(z: np.ndarray) -> np.ndarray:
-            return np.stack((-z[:, 0] - z[:, 3], 0.1 * z[:, 1]), axis=1)
-
-        states, controls = plant.function.follow(x, feedback, 4)
-        assert (states.shape, controls.shape) == ((rows, 5, 5), (rows, 4, 2))
-        np.testing.assert_array_equal(states[:, 0], x)
-        for k in range(4):
-            np.testing.assert_array_equal(controls[0, k], feedback(states[:, k])[0])
-            now, u = torch.from_numpy(states[:, k].copy()), torch.from_numpy(controls[:, k].copy())
-            kept = [row for row in range(rows) if row != 1]
-            np.testing.assert_array_equal(states[kept, k + 1], after(now, u, frames)[kept])
-        assert np.isnan(states[1, 1:]).all()
-    simulation = plant.function._function
-    assert len(simulation._followers) == (0 if threads > 1 else 4)
-    assert simulation.__getstate__()["_followers"] == []
-    assert simulation.__getstate__()["frames"] == frames
-
-
-def test_slopes_are_chained_over_the_steps_of_a_period() -> None:
-    def cold(model: Model) -> None:
-        model.warm = 0.0
-
+def test_slopes_are_chained_over_the_steps_of_a_period_and_begin_cold() -> None:
     x, u = uniform(5, seed=3), uniform(2, seed=4)
     for frames in (1, 3):
-        known = made(cold, dt=0.25 * frames).linearisation(x, u)
-        differences = made(
-            lambda model: (cold(model), setattr(model.opt, "integrator", 1))[0], dt=0.25 * frames
-        )
-        assert differences.function._slopes is None
-        other = differences.linearisation(x, u)
+        plant = made(lambda model: vars(model).update(warm=0.0), dt=0.25 * frames)
+        known = plant.linearisation(x, u)
+        plant.linearisation(-2 * x, u)
+        assert torch.equal(plant.linearisation(x, u).matrix, known.matrix)  # whatever was simulated before
+        rk4 = made(lambda model: (vars(model).update(warm=0.0), setattr(model.opt, "integrator", 1)),
+                   dt=0.25 * frames)  # fmt: skip
+        other = rk4.linearisation(x, u)  # MuJoCo has no slopes of it: by differences
         torch.testing.assert_close(known.matrix, other.matrix, rtol=1e-6, atol=1e-7)
         torch.testing.assert_close(known.input_matrix, other.input_matrix, rtol=1e-6, atol=1e-7)
-
-
-def test_slopes_begin_cold_whatever_was_simulated_before() -> None:
-    plant, x, u = made(dt=0.75), uniform(5, seed=3), uniform(2, seed=4)
-    first = plant.linearisation(x, u)
-    plant.linearisation(-2 * x, u)
-    again = plant.linearisation(x, u)
-    assert torch.equal(first.matrix, again.matrix)
-    assert torch.equal(first.input_matrix, again.input_matrix)
 
 
 def test_models_are_objects_texts_or_files(tmp_path: Path) -> None:

@@ -7,7 +7,6 @@ import math
 import re
 import sys
 
-import numpy as np
 import pytest
 import torch
 from helpers import tensor, uniform
@@ -198,14 +197,6 @@ def test_a_bad_argument_is_named_with_its_value(make, message: str) -> None:  # 
         make()
 
 
-def test_a_matrix_that_is_not_square_is_called_so() -> None:
-    with pytest.raises(ValueError, match="Linear"):
-        systems.Linear(tensor([1.0, 2.0]))
-    for rows in ([1.0, 2.0], ["12", "34"], [[1.0, 2.0], 3.0]):
-        with pytest.raises(ValueError, match=r"`Linear\(matrix=...\)` must be \(n, n\); got "):
-            systems.Linear(rows)  # type: ignore[arg-type]
-
-
 def test_a_missing_scipy_is_named_with_the_extra_that_brings_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "scipy.linalg", None)
     one = torch.eye(2, dtype=torch.float64)
@@ -213,44 +204,10 @@ def test_a_missing_scipy_is_named_with_the_extra_that_brings_it(monkeypatch: pyt
         riccati(one, one, one, one)
 
 
-def test_a_plant_without_a_number_of_states_says_so() -> None:
-    plant = systems.Linear([[0.0]], [[1.0]])
-    plant.dim = None
-    with pytest.raises(ValueError, match=r"`Linear.dim` must be the number of states; got None"):
-        plant._size()
-
-
-def test_functions_from_outside_take_any_leading_dimensions() -> None:
-    def step(x: torch.Tensor, u: torch.Tensor) -> torch.Tensor:
-        return x.sin() + u * torch.ones(2, dtype=x.dtype)
-
-    plant = systems.StepPlant(step, dim=2, inputs=1, dt=0.1)
-    x, u = uniform(3, 4, 5, 2, seed=1), uniform(4, 5, 1, seed=2)
-    found = plant.step(x, u)
-    assert found.shape == (3, 4, 5, 2)
-    assert torch.equal(found, x.sin() + u)
-
-
 def test_a_missing_mujoco_is_named_with_the_extra_that_brings_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "mujoco", None)
     with pytest.raises(ImportError, match=r"pip install 'staf_torch\[mujoco\]'"):
         systems.MujocoPlant("<mujoco/>")
-
-
-def test_known_slopes_are_taken_and_others_of_another_shape_refused() -> None:
-    a, b = [[0.9, 0.1], [0.0, 1.1]], [[0.0], [0.3]]
-
-    def step(x, u):  # type: ignore[no-untyped-def]
-        return x @ np.array(a).T + u @ np.array(b).T
-
-    given = {"dim": 2, "inputs": 1, "dt": 0.1}
-    at = systems.StepPlant(step, slopes=lambda x, u: (np.array(a), np.array(b)), **given).linearisation()
-    assert at.matrix.tolist() == a
-    assert at.input_matrix.tolist() == b
-    for wrong in ((a, [[0.0, 0.3]]), ([a[0]], b)):
-        plant = systems.StepPlant(step, slopes=lambda x, u, wrong=wrong: wrong, **given)
-        with pytest.raises(ValueError, match=r"must have the shapes \(2, 2\) and \(2, 1\)"):
-            plant.linearisation()
 
 
 def test_the_thrust_of_a_quadrotor_pushes_along_its_axis_and_pays_for_its_energy() -> None:
