@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import types
 
 import numpy as np
 import pytest
@@ -14,37 +13,10 @@ from staf_torch import adp, systems
 gymnasium = pytest.importorskip("gymnasium", reason="needs the extra gym")
 
 from staf_torch import envs  # noqa: E402
-from staf_torch.envs.environment_plant import _Stepped  # noqa: E402
-
-# (environment, initial states, an action of the environment from a control of the plant, tolerance)
-CASES = {
-    "Pendulum-v1": ([[3.0, 7.9], [0.1, -0.3]], lambda u: u, 1e-12),
-    "CartPole-v1": ([[0.1, -0.2, 0.05, 0.3], [0.0, 0.5, -0.02, -0.6]], lambda u: int(u[0] > 0), 1e-12),
-    "Acrobot-v1": ([[0.4, -0.7, 3.0, -2.0], [3.0, 0.2, 12.5, 28.0]], lambda u: int(u[0]) + 1, 1e-10),
-    # Its state is kept in float32.
-    "MountainCarContinuous-v0": ([[-1.19, -0.05], [0.3, 0.02]], lambda u: u, 1e-6),
-}
-
-
-@pytest.mark.parametrize("name", list(CASES))
-def test_classic_control_in_torch_follows_the_real_environment(name: str) -> None:
-    starts, act, tolerance = CASES[name]
-    plant, env = envs.classic_control(name), gymnasium.make(name).unwrapped
-    levels = [plant.bounds.low, plant.bounds.high]
-    for start in starts:
-        env.reset(seed=0)
-        env.state = np.array(start)
-        x = torch.tensor([start], dtype=torch.float64)
-        for k in range(8):
-            u = levels[(k // 3) % 2]
-            env.step(act(u.numpy()))
-            x = plant.step(x, u.unsqueeze(0))
-            apart = plant.difference(x[0], torch.from_numpy(np.array(env.state, dtype=np.float64)))
-            assert float(apart.abs().max()) < tolerance
 
 
 def test_every_classic_plant_has_a_regulator() -> None:
-    for name in CASES:
+    for name in SIZES:
         plant = envs.classic_control(name)
         lqr = adp.LQR(plant, adp.QuadraticCost(1.0, 1.0, dim=plant.dim, inputs=1))
         assert adp.held_stability(lqr, plant, plant.period, at=plant.equilibrium()).spectral_radius < 1
@@ -119,15 +91,6 @@ def test_environment_of_your_own_says_how_its_state_is_read_and_written() -> Non
         envs.classic_control("Ant-v5")
 
 
-def test_angle_of_the_pendulum_is_the_same_a_turn_further_on() -> None:
-    plant = envs.classic_control("Pendulum-v1")
-    x = torch.tensor([[0.3, 0.1]], dtype=torch.float64)
-    turned = x + torch.tensor([2 * math.pi, 0.0], dtype=torch.float64)
-    u = torch.tensor([[0.5]], dtype=torch.float64)
-    apart = plant.difference(plant.step(turned, u), plant.step(x, u))
-    torch.testing.assert_close(apart, torch.zeros_like(x), rtol=0, atol=1e-12)
-
-
 class Drawn(Falling):
     """An environment that draws a parameter whenever it begins."""
 
@@ -185,10 +148,8 @@ def test_inputs_rest_and_period_are_those_given_or_those_of_the_environment() ->
     assert envs.EnvironmentPlant(env, **own).period == 0.5
     assert envs.EnvironmentPlant(env, dt=2.0, **own).period == 2.0
     x, u = np.array([[1.0], [2.0], [-1.0]]), np.array([[1.0], [0.0], [3.0]])
-    stepped = _Stepped(env, height, put_height)
-    np.testing.assert_allclose(stepped(x, u), 1.1 * x + 0.1 * u, rtol=1e-15)
-    with pytest.raises(TypeError, match="takes NumPy arrays"):
-        stepped(torch.from_numpy(x), u)  # type: ignore[arg-type]
+    stepped = usual.step(torch.from_numpy(x), torch.from_numpy(u))
+    np.testing.assert_allclose(stepped.numpy(), 1.1 * x + 0.1 * u, rtol=1e-15)
 
 
 def test_what_cannot_be_a_plant_is_refused() -> None:
@@ -201,6 +162,11 @@ def test_what_cannot_be_a_plant_is_refused() -> None:
         envs.EnvironmentPlant(square, read=height, write=put_height, dt=0.1)
 
 
+class Data:
+    def __init__(self) -> None:
+        self.qpos, self.qvel = np.zeros(1), np.zeros(1)
+
+
 class Two(Falling):
     """With its state where classic control has it, or where MuJoCo has."""
 
@@ -209,7 +175,7 @@ class Two(Falling):
     def __init__(self, keeps: str) -> None:
         self.state: tuple[float, float] = (0.0, 0.0)
         if keeps == "mujoco":
-            self.data = types.SimpleNamespace(qpos=np.zeros(1), qvel=np.zeros(1))
+            self.data = Data()
             del self.state
         if keeps != "state":
             self.set_state = self.put
@@ -234,3 +200,75 @@ def test_a_state_is_found_where_classic_control_and_mujoco_have_it(keeps: str) -
     x, u = torch.tensor([[1.0, 2.0], [3.0, -1.0]]).double(), torch.tensor([[0.5], [-1.0]]).double()
     wanted = torch.stack((x[:, 0] + 0.1 * x[:, 1], x[:, 1] + 0.1 * u[:, 0]), 1)
     torch.testing.assert_close(plant.step(x, u), wanted)
+
+
+# inputs in [-most, most], period, angles, where it rests
+SIZES = {
+    "Pendulum-v1": (2.0, 0.05, (0,), [0.0, 0.0]),
+    "CartPole-v1": (10.0, 0.02, (2,), [0.0, 0.0, 0.0, 0.0]),
+    "Acrobot-v1": (1.0, 0.2, (0, 1), [math.pi, 0.0, 0.0, 0.0]),
+    "MountainCarContinuous-v0": (1.0, 1.0, (), [0.45, 0.0]),
+}
+# spread of states around a middle, levels of the input, what an environment makes of them, tolerance
+STATES = {
+    "Pendulum-v1": ([3.0, 9.0], [0.0, 0.0], [-5.0, -1.0, 0.0, 0.7, 3.0], lambda u: np.array([u]), 1e-13),
+    "CartPole-v1": ([2.0, 3.0, 0.2, 3.0], [0.0] * 4, [-10.0, 10.0], lambda u: int(u > 0), 1e-13),
+    "Acrobot-v1": ([3.0, 3.0, 13.0, 29.0], [0.0] * 4, [-1.0, 0.0, 1.0], lambda u: int(u) + 1, 1e-11),
+    "MountainCarContinuous-v0": (
+        [0.95, 0.09],  # its state is kept in float32
+        [-0.3, 0.0],
+        [-3.0, -1.0, 0.0, 0.3, 2.0],
+        lambda u: np.array([u]),
+        2e-7,
+    ),
+}
+
+
+@pytest.mark.parametrize("name", SIZES)
+def test_a_plant_of_classic_control_has_the_sizes_of_its_environment(name: str) -> None:
+    most, period, periodic, rest = SIZES[name]
+    plant = envs.classic_control(name)
+    assert (plant.dim, plant.inputs, plant.period, plant.periodic) == (len(rest), 1, period, periodic)
+    assert plant.bounds is not None
+    assert plant.bounds.low.tolist() == [-most]
+    assert plant.bounds.high.tolist() == [most]
+    torch.testing.assert_close(plant.equilibrium(), torch.tensor(rest, dtype=torch.float64))
+    at_rest, held = plant.equilibrium()[None], plant.resting_input()[None]
+    torch.testing.assert_close(plant.step(at_rest, held), at_rest, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", STATES)
+def test_every_state_steps_as_in_the_real_environment(name: str) -> None:
+    spread, middle, levels, act, tolerance = STATES[name]
+    draw = np.random.default_rng(0)
+    starts = middle + spread * draw.uniform(-1, 1, (40, len(spread)))
+    pushes = np.array([levels[k % len(levels)] for k in range(40)])
+    env, wanted = gymnasium.make(name).unwrapped, []
+    env.reset(seed=0)
+    for start, push in zip(starts, pushes, strict=True):
+        env.state = np.array(start)
+        env.steps_beyond_terminated = None
+        env.step(act(push))
+        wanted.append(np.array(env.state, dtype=np.float64))
+    plant = envs.classic_control(name)
+    found = plant.step(torch.from_numpy(starts), torch.from_numpy(pushes)[:, None])
+    assert found.dtype == torch.float64
+    apart = plant.difference(found, torch.from_numpy(np.stack(wanted)))
+    assert float(apart.abs().max()) < tolerance
+    single = plant.step(torch.from_numpy(starts).float(), torch.from_numpy(pushes)[:, None].float())
+    assert single.dtype == torch.float32
+
+
+@pytest.mark.parametrize("push", [-10.0, -3.0, 0.0, 10.0])
+def test_a_cart_and_its_pole_keep_their_equations_of_motion(push: float) -> None:
+    """Of a pole of 0.1 kg and 1 m on a cart of 1 kg, by Lagrange, at any force."""
+    x = torch.tensor([[0.3, -0.4, 0.7, 1.3], [0.0, 0.5, -2.0, -0.6]], dtype=torch.float64)
+    u = torch.full((2, 1), push, dtype=torch.float64)
+    rate = (envs.classic_control("CartPole-v1").step(x, u) - x) / 0.02
+    torch.testing.assert_close(rate[:, [0, 2]], x[:, [1, 3]], rtol=1e-10, atol=1e-12)
+    sine, cosine, turning = x[:, 2].sin(), x[:, 2].cos(), x[:, 3]
+    speeding, bending = rate[:, 1], rate[:, 3]
+    force = 1.1 * speeding + 0.05 * (bending * cosine - turning.square() * sine)
+    torch.testing.assert_close(force, u[:, 0], rtol=1e-9, atol=1e-10)
+    torque = 0.1 * 0.5 * (4 / 3 * 0.5 * bending + speeding * cosine)
+    torch.testing.assert_close(torque, 0.1 * 0.5 * 9.8 * sine, rtol=1e-9, atol=1e-10)

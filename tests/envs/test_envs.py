@@ -2,18 +2,32 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
-from staf_torch import ExponentialKernel, StaFBasis, StateFollowingCenters, StateRadius, adp, rings, systems
+from staf_torch import (
+    AnchoredKernel,
+    ExponentialKernel,
+    StaFBasis,
+    StateFollowingCenters,
+    StateRadius,
+    adp,
+    rings,
+    systems,
+)
 
 gymnasium = pytest.importorskip("gymnasium", reason="needs the extra gym")
 
+from gymnasium import spaces  # noqa: E402
 from gymnasium.utils import env_checker  # noqa: E402
 from gymnasium.vector import AutoresetMode  # noqa: E402
 
-from staf_torch import AnchoredKernel, envs  # noqa: E402
+from staf_torch import envs  # noqa: E402
+from staf_torch.envs.episodes import make_plant, start  # noqa: E402
 
 PLANT = systems.TwoState()
 COST = adp.QuadraticCost(1.0, 1.0, 2, 1)
@@ -56,7 +70,7 @@ def test_row_of_the_vectorised_environment_is_the_single_one(name: str) -> None:
 
 @pytest.mark.parametrize("make", [lambda: adp.Feedback(LQR), rollout, learner])
 def test_rewards_of_an_episode_add_up_to_minus_the_cost_of_the_simulation(make) -> None:  # type: ignore[no-untyped-def]
-    steps, x0 = 60, torch.tensor([[-1.0, 1.0], [0.5, 0.7]], dtype=torch.float64)
+    steps, x0 = 20, torch.tensor([[-1.0, 1.0], [0.5, 0.7]], dtype=torch.float64)
     wanted = adp.simulate(make(), PLANT, COST, x0, dt=0.01, steps=steps)
     many = gymnasium.make_vec("staf_torch/TwoState-v0", num_envs=2, horizon=100.0, bound=1000.0)
     seen, _ = many.reset(options={"state": x0.numpy()})
@@ -66,28 +80,6 @@ def test_rewards_of_an_episode_add_up_to_minus_the_cost_of_the_simulation(make) 
         total += reward
     np.testing.assert_allclose(-total, wanted.cost.numpy(), rtol=1e-10)
     np.testing.assert_allclose(seen, wanted.state[:, -1].numpy(), rtol=1e-9, atol=1e-12)
-
-
-@pytest.mark.parametrize("make", [lambda: adp.Feedback(LQR), rollout])
-def test_policy_regulates_the_two_state_plant(make) -> None:  # type: ignore[no-untyped-def]
-    many = gymnasium.make_vec("staf_torch/TwoState-v0", num_envs=4, dt=0.05, spread=2.0)
-    agent = envs.Agent(make(), dt=0.05)
-    seen, _ = many.reset(seed=0)
-    for _ in range(120):
-        seen, _, terminated, _, _ = many.step(agent(seen))
-        assert not terminated.any()
-    assert np.linalg.norm(seen, axis=-1).max() < 1e-2
-
-
-def test_actions_of_torch_and_of_numpy_are_the_same() -> None:
-    found = []
-    for action in (torch.tensor([0.5]), np.array([0.5]), np.array([0.5], dtype=np.float32)):
-        env = gymnasium.make("staf_torch/Pendulum-v0").unwrapped
-        env.reset(seed=3)
-        found.append(env.step(action))
-    for other in found[1:]:
-        np.testing.assert_array_equal(other[0], found[0][0])
-        assert other[1:] == found[0][1:]
 
 
 def test_finished_row_begins_anew_and_the_others_go_on() -> None:
@@ -130,21 +122,247 @@ def test_bad_input_is_refused_by_name() -> None:
         env.reset(options={"state": [1.0, 2.0, 3.0]})
 
 
-def test_an_episode_without_a_horizon_of_its_own_takes_ten_seconds() -> None:
-    env = gymnasium.make("staf_torch/TwoState-v0", spread=1e-15)  # so near rest that it stays there
-    env.reset(seed=0)
-    steps, over = 0, False
-    while not over:
-        *_, ended, over, _ = env.step(np.zeros(env.action_space.shape))
-        steps += 1
-        assert not ended
-        assert steps <= 1000
-    assert steps == 1000
+class Recorder(adp.Controller):
+    """Says what it was asked with, and counts its steps in what it carries."""
+
+    def __init__(self, draws: int) -> None:
+        super().__init__()
+        self.draws = draws
+        self.seen: list[tuple[Tensor, Tensor, float]] = []
+
+    def init(self, x0: Tensor) -> Any:
+        return torch.zeros(len(x0), dtype=x0.dtype)
+
+    def step(self, x: Tensor, carried: Any, uniform: Tensor, dt: float) -> tuple[Tensor, Any]:
+        self.seen.append((x, uniform, dt))
+        return torch.stack((carried, x[:, 0], x[:, 1]), -1), carried + 1
 
 
-def test_every_registered_name_is_of_its_own_plant() -> None:
-    for name, plant in envs.PLANTS.items():
-        assert gymnasium.registry[name].kwargs == {"plant": plant}
-        made = gymnasium.make(name).unwrapped.plant
-        assert type(made).__name__ == name.removeprefix("staf_torch/").removesuffix("-v0")
-    assert gymnasium.registry[envs.OWN_PLANT].kwargs == {}
+@pytest.mark.parametrize("seed", [0, 5])
+def test_rows_of_an_agent_draw_from_their_own_seeds(seed: int) -> None:
+    controller = Recorder(draws=3)
+    agent = envs.Agent(controller, dt=0.5, seed=seed) if seed else envs.Agent(controller)
+    observation = np.array([[1.0, 2.0], [3.0, 4.0]], dtype=np.float32)
+    draw = [torch.Generator().manual_seed(seed + row) for row in range(2)]
+    rounds = []
+    for at in range(2):
+        found = agent(observation)
+        np.testing.assert_array_equal(found, [[at, 1.0, 2.0], [at, 3.0, 4.0]])
+        rounds.append(torch.stack([torch.rand(3, 2, dtype=torch.float64, generator=each) for each in draw]))
+    agent.begin()
+    np.testing.assert_array_equal(agent(torch.from_numpy(observation))[:, 0], 0.0)
+    for (x, uniform, dt), wanted in zip(controller.seen, [*rounds, rounds[0]], strict=True):
+        assert x.dtype == torch.float64
+        assert dt == (0.5 if seed else 0.01)
+        assert torch.equal(uniform, 2 * wanted - 1)
+
+
+@pytest.mark.parametrize(
+    ("horizon", "steps"), [(0.7, 7), (0.3, 3), (0.25, 3), (0.1, 1), (0.1 * (3 + 1.5e-9), 4), (0.6 + 2e-16, 6)]
+)
+def test_an_episode_is_truncated_at_its_horizon_and_not_before(horizon: float, steps: int) -> None:
+    plant, cost = systems.TwoState(), adp.QuadraticCost(1.0, 1.0, 2, 1)
+    episodes = envs.Episodes(plant, cost, 2, dt=0.1, horizon=horizon, limit=9.0, penalty=7.0)
+    episodes.begin(torch.tensor([True, True]), torch.zeros(2, 2, dtype=torch.float64))
+    for at in range(1, steps + 1):
+        reward, terminated, truncated = episodes.step(torch.zeros(2, 1, dtype=torch.float64))
+        assert episodes.age.tolist() == [at, at]
+        assert truncated.tolist() == [at == steps] * 2
+        assert terminated.tolist() == [False, False]
+        assert reward.tolist() == [0.0, 0.0]
+    assert episodes.age.dtype == torch.int64
+    assert episodes.state.dtype == torch.float64
+    episodes.begin(torch.tensor([False, True]), torch.ones(2, 2))
+    assert episodes.age.tolist() == [steps, 0]
+    assert episodes.state.tolist() == [[0.0, 0.0], [1.0, 1.0]]
+
+
+def test_leaving_the_limit_ends_an_episode_and_costs_the_penalty() -> None:
+    plant, cost = systems.VanDerPol(), adp.QuadraticCost(1.0, 1.0, 2, 1)
+    episodes = envs.Episodes(plant, cost, 3, dt=0.1, horizon=9.0, limit=2.0, penalty=7.0)
+    x0 = torch.tensor([[0.0, 1.99], [0.1, 0.1], [0.0, -1.99]], dtype=torch.float64)
+    episodes.begin(torch.ones(3, dtype=torch.bool), x0)
+    u = torch.tensor([[20.0], [0.0], [-20.0]], dtype=torch.float64)
+    reward, terminated, _ = episodes.step(u)
+    assert terminated.tolist() == [True, False, True]
+    assert reward[[0, 2]].tolist() == [-7.0, -7.0]
+    assert -0.1 < float(reward[1]) < 0
+    assert torch.equal(episodes.state[[0, 2]], x0[[0, 2]])
+    with pytest.raises(ValueError, match=r"`Episodes\(penalty=...\)` must be positive"):
+        envs.Episodes(plant, cost, 3, dt=0.1, horizon=9.0, limit=2.0, penalty=0.0)
+    with pytest.raises(ValueError, match=r"`Episodes\(horizon=...\)` must be positive"):
+        envs.Episodes(plant, cost, 3, dt=0.1, horizon=-1.0, limit=2.0, penalty=1.0)
+
+
+def box(space: Any) -> tuple[Any, ...]:
+    assert isinstance(space, spaces.Box)
+    return space.low.tolist(), space.high.tolist(), space.dtype
+
+
+def test_spaces_are_the_limit_of_states_and_the_bounds_of_inputs() -> None:
+    env = envs.PlantEnv("TwoState")
+    assert box(env.observation_space) == ([-100.0] * 2, [100.0] * 2, np.float64)
+    assert box(env.action_space) == ([-20.0], [20.0], np.float64)
+    assert torch.equal(env.cost.q, torch.eye(2, dtype=torch.float64))
+    assert torch.equal(env.cost.r, torch.eye(1, dtype=torch.float64))
+    assert env.spread == 1.0
+    assert envs.PlantEnv("Pendulum").spread == systems.Pendulum.spread == 0.5
+    many = envs.PlantVectorEnv("TwoState", num_envs=3, bound=2.5, limit=7.0, spread=0.25)
+    assert box(many.single_observation_space) == ([-7.0] * 2, [7.0] * 2, np.float64)
+    assert box(many.single_action_space) == ([-2.5], [2.5], np.float64)
+    assert box(many.observation_space) == ([[-7.0] * 2] * 3, [[7.0] * 2] * 3, np.float64)
+    assert box(many.action_space) == ([[-2.5]] * 3, [[2.5]] * 3, np.float64)
+    assert (many.num_envs, many.spread) == (3, 0.25)
+    bounded = adp.BoundedInputCost(1.0, 1.0, dim=2, inputs=1, bound=3.0)
+    assert box(envs.PlantEnv("TwoState", bounded).action_space)[:2] == ([-3.0], [3.0])
+    assert box(envs.PlantEnv("TwoState", bounded, bound=2.0).action_space)[:2] == ([-2.0], [2.0])
+    for wrong in (-1.0, 0.0):
+        with pytest.raises(ValueError, match=r"`PlantEnv\(bound=...\)` must be positive"):
+            envs.PlantEnv(bound=wrong)
+    for call, kind in (("PlantEnv", envs.PlantEnv), ("PlantVectorEnv", envs.PlantVectorEnv)):
+        with pytest.raises(ValueError, match=rf"`{call}\(spread=...\)` must be positive"):
+            kind(spread=0.0)
+    with pytest.raises(ValueError, match=r"`PlantVectorEnv\(num_envs=...\)` must be at least 1"):
+        envs.PlantVectorEnv(num_envs=0)
+
+
+def test_a_plant_is_given_by_name_class_path_or_itself() -> None:
+    own = systems.TwoState()
+    assert make_plant(own) is own
+    for given in ("TwoState", systems.TwoState, "staf_torch.systems.TwoState"):
+        assert type(make_plant(given)) is systems.TwoState
+    for given in ("no.such.module", "staf_torch.systems.NoPlant", "staf_torch..systems"):
+        with pytest.raises(ValueError, match=r"`PlantEnv\(plant=...\)` cannot be imported \(.*got"):
+            make_plant(given)
+    for given in ("math.pi", 3, systems.Oscillator):
+        with pytest.raises(ValueError, match="must be a ControlAffineSystem with states and inputs"):
+            make_plant(given)  # type: ignore[arg-type]
+    assert {"staf_torch/TwoState-v0", "staf_torch/Pendulum-v0"} <= set(envs.PLANTS)
+    assert all(name.removeprefix("staf_torch/") == f"{plant}-v0" for name, plant in envs.PLANTS.items())
+    assert "staf_torch/ControlAffineSystem-v0" not in envs.PLANTS
+    assert "staf_torch/Oscillator-v0" not in envs.PLANTS
+
+
+def test_a_start_is_uniform_or_as_stated_for_every_row() -> None:
+    found = start(None, [np.random.default_rng(seed) for seed in range(500)], 0.5, 3)
+    assert found.shape == (500, 3)
+    assert float(found.min()) < -0.49
+    assert float(found.max()) > 0.49
+    assert float(found.abs().max()) <= 0.5
+    two = [np.random.default_rng(0)] * 2
+    assert start({}, two, 0.5, 3).shape == (2, 3)
+    stated = torch.tensor([1.0, 2.0, 3.0])
+    for given in (stated, stated.numpy(), [[1.0, 2.0, 3.0]] * 2):
+        found = start({"state": given}, two, 0.5, 3)
+        assert found.tolist() == [[1.0, 2.0, 3.0]] * 2
+        assert found.dtype == torch.float64
+    whole = torch.zeros(2, 3, dtype=torch.float64)
+    start({"state": whole}, two, 0.5, 3).fill_(1.0)
+    assert not whole.any()  # a copy
+    for wrong in (torch.zeros(3, 3), torch.zeros(2, 2), torch.tensor([1.0, np.nan, 0.0]), [[np.inf] * 3] * 2):
+        with pytest.raises(ValueError, match=r'reset\(options\["state"\].*must be \(2, 3\) and finite'):
+            start({"state": wrong}, two, 0.5, 3)
+
+
+def test_seeds_are_one_a_row_and_go_on_without_new_ones() -> None:
+    def fresh() -> envs.PlantVectorEnv:
+        return envs.PlantVectorEnv("TwoState", num_envs=3)
+
+    first, second = fresh(), fresh()
+    a, _ = first.reset(seed=4)
+    b, _ = second.reset(seed=[4, 5, 6])
+    np.testing.assert_array_equal(a, b)
+    after = [env.reset()[0] for env in (first, second)]
+    np.testing.assert_array_equal(*after)
+    assert not np.array_equal(after[0], a)
+    masked, _ = first.reset(options={"reset_mask": np.array([0, 1, 0])})
+    np.testing.assert_array_equal(masked[[0, 2]], after[0][[0, 2]])
+    assert not np.array_equal(masked[1], after[0][1])
+    none, _ = first.reset(options={"reset_mask": np.zeros(3)})
+    np.testing.assert_array_equal(none, masked)
+    assert not np.array_equal(fresh().reset()[0], fresh().reset()[0])
+    single = envs.PlantEnv("TwoState")
+    np.testing.assert_array_equal(single.reset(seed=5)[0], a[1])
+
+
+@pytest.mark.parametrize("mode", list(AutoresetMode))
+def test_rows_that_are_truncated_begin_anew_as_their_mode_says(mode: AutoresetMode) -> None:
+    many = envs.PlantVectorEnv("TwoState", num_envs=2, dt=0.1, horizon=0.3, autoreset_mode=mode.value)
+    assert many.metadata == {"render_modes": [], "autoreset_mode": mode}
+    assert envs.PlantVectorEnv().metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
+    idle = np.zeros((2, 1))
+    many.reset(seed=1)
+    many.step(idle)
+    many.reset(options={"reset_mask": np.array([False, True])})
+    many.step(idle)
+    seen, reward, terminated, truncated, info = many.step(idle)  # the third of row 0
+    assert (terminated.tolist(), truncated.tolist()) == ([False, False], [True, False])
+    assert (reward < 0).all()
+    if mode is AutoresetMode.SAME_STEP:
+        assert set(info) == {"final_obs", "_final_obs", "final_info", "_final_info"}
+        assert info["_final_obs"].tolist() == info["_final_info"].tolist() == [True, False]
+        assert info["final_info"] == {}
+        assert info["final_obs"][1] is None
+        assert not np.array_equal(info["final_obs"][0], seen[0])
+        assert many.episodes.age.tolist() == [0, 2]
+    else:
+        assert info == {}
+        assert many.episodes.age.tolist() == [3, 2]
+    before = seen.copy()
+    seen, reward, terminated, truncated, info = many.step(idle)
+    assert not terminated.any()
+    over = {
+        AutoresetMode.NEXT_STEP: [False, True],
+        AutoresetMode.SAME_STEP: [False, True],
+        AutoresetMode.DISABLED: [True, True],
+    }[mode]
+    assert truncated.tolist() == over
+    assert (reward == 0).tolist() == [mode is AutoresetMode.NEXT_STEP, False]
+    assert ("final_obs" in info) == (mode is AutoresetMode.SAME_STEP)
+    assert not (before == seen).all(1).any()
+    if mode is AutoresetMode.NEXT_STEP:
+        assert many.episodes.age.tolist() == [0, 3]
+        many.reset(options={"reset_mask": np.array([False, True])})
+        reward = many.step(idle)[1]
+        assert (reward < 0).all()  # what was begun by hand does not begin once more
+
+
+def test_stated_states_begin_the_masked_rows_alone() -> None:
+    many = envs.PlantVectorEnv("TwoState", num_envs=3)
+    before, _ = many.reset(seed=0)
+    stated = np.array([[0.1, 0.2], [0.3, 0.4], [0.5, 0.6]])
+    options = {"state": stated, "reset_mask": np.array([True, False, True])}
+    seen, info = many.reset(options=options)
+    np.testing.assert_array_equal(seen[[0, 2]], stated[[0, 2]])
+    np.testing.assert_array_equal(seen[1], before[1])
+    assert info == {}
+    kept = seen.copy()
+    many.step(np.ones((3, 1)))
+    np.testing.assert_array_equal(seen, kept)  # what was shown is a copy
+    with pytest.raises(ValueError, match=r"`step\(action=...\)` must have the shape \(3, 1\)"):
+        many.step(np.zeros(3))
+    actions = np.zeros((3, 1))
+    actions[1] = np.nextafter(20.0, 21.0)
+    with pytest.raises(ValueError, match=r"must lie in \[-20, 20\]"):
+        many.step(actions)
+    actions[1] = 20.0
+    many.step(actions)
+    with pytest.raises(ValueError, match=r"must lie in \[-1, 1\]"):
+        envs.PlantVectorEnv("TwoState", bound=1.0).step(torch.full((1, 1), torch.nan))
+
+
+def test_names_that_are_registered_make_both_kinds_and_are_registered_once() -> None:
+    before = dict(gymnasium.registry)
+    envs.register_plants()
+    assert dict(gymnasium.registry) == before
+    name = "staf_torch/TwoState-v0"
+    kept = gymnasium.registry.pop(name)
+    try:
+        envs.register_plants()
+        made = gymnasium.registry[name]
+        assert made.entry_point == kept.entry_point == "staf_torch.envs:PlantEnv"
+        assert made.vector_entry_point == "staf_torch.envs:PlantVectorEnv"
+        assert made.kwargs == {"plant": "TwoState"}
+    finally:
+        gymnasium.registry[name] = kept
+    assert gymnasium.registry[envs.OWN_PLANT].vector_entry_point == "staf_torch.envs:PlantVectorEnv"
