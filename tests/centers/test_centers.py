@@ -16,7 +16,6 @@ from variants import KERNELS, LAYOUTS, RADII, directions_of, over
 import staf_torch as st
 from staf_torch.approximation.conditioning import lebesgue_constant, sup_error
 from staf_torch.centers import probe_points
-from staf_torch.centers.layouts import _exchange
 from staf_torch.targets import Cosine, Paper
 
 
@@ -218,8 +217,7 @@ def test_a_bad_argument_is_named_with_its_value(make, message: str) -> None:  # 
 def test_ball_is_unisolvent_and_well_conditioned_up_to_twelve_dimensions(dim: int, degree: int) -> None:
     count = math.comb(dim + degree, degree)
     basis = st.StaFBasis(st.GaussianKernel(), st.StateFollowingCenters(st.ball(count, dim), 1e-3))
-    sizes = [int((basis._local_basis.graded.degree == k).sum()) for k in range(degree + 1)]
-    assert sizes == [math.comb(dim + k - 1, k) for k in range(degree + 1)]
+    assert int(torch.linalg.matrix_rank(monomials(st.ball(count, dim), degree))) == count
     # Of Fekete points at most the number of points; these stay well below it.
     assert float(lebesgue_constant(basis, torch.zeros(dim).double(), points=2000)) < 0.4 * count + 1
 
@@ -232,13 +230,6 @@ def test_ball_is_no_worse_than_the_rings_in_the_plane() -> None:
             for u in (st.ball(count, 2), st.rings(count))
         ]
         assert (errors[0] <= 3 * errors[1]).all()
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_no_exchange_of_a_row_that_was_chosen_gains_one_percent(seed: int) -> None:
-    matrix = torch.randn(60, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
-    chosen = _exchange(matrix, torch.arange(6))
-    assert float((matrix @ torch.linalg.inv(matrix[chosen])).abs().max()) < 1.01 + 1e-9
 
 
 @pytest.mark.parametrize(
@@ -276,36 +267,3 @@ def test_a_radius_stays_below_its_bound_and_comes_as_near_as_one_likes(offset: f
     assert float(nu.max()) == pytest.approx(bound, rel=1e-9)
     assert radius.constant is False
     assert float(st.ConstantRadius(0.2).bound()) == 0.2
-
-
-class Ring(st.centers.Radius):
-    """A radius of the user's own."""
-
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        return x.norm(dim=-1)
-
-
-def test_a_radius_of_ones_own_is_not_constant_and_has_no_bound() -> None:
-    assert Ring().constant is False
-    assert Ring().bound() is None
-    centers = st.StateFollowingCenters(st.rings(3), Ring())
-    assert (centers.count, centers.dim) == (3, 2)
-    assert repr(centers).startswith("StateFollowingCenters(\n  count=3, dim=2\n")
-    torch.testing.assert_close(centers.offsets(tensor([3.0, 4.0])), 5 * st.rings(3))
-
-
-@pytest.mark.parametrize(("count", "dim"), [(5, 1), (13, 2), (14, 2), (50, 2), (9, 3), (10, 4)])
-def test_probe_points_are_on_the_line_on_three_circles_or_half_on_the_sphere(count: int, dim: int) -> None:
-    norms = probe_points(count, dim).norm(dim=-1)
-    assert len(norms) == count
-    if dim == 1:
-        torch.testing.assert_close(probe_points(5, 1), tensor([[0.0], [-1.0], [-1 / 3], [1 / 3], [1.0]]))
-    elif dim == 2:
-        inner, middle = (count - 1) // 12, (count - 1) // 4
-        wanted = [0.0, *[1.0] * (count - 1 - inner - middle), *[0.75] * middle, *[0.4] * inner]
-        torch.testing.assert_close(norms, tensor(wanted))
-    else:
-        sphere = int((norms > 1 - 1e-12).sum())
-        assert sphere == (count - 1) // 2
-        assert norms[0] == 0.0
-        assert bool((norms[1:] > 0).all())

@@ -6,10 +6,12 @@ from collections.abc import Callable
 
 import pytest
 import torch
-from helpers import uniform
+from helpers import tensor, uniform
+from torch import Tensor
 from variants import KERNELS, over
 
 import staf_torch as st
+from staf_torch.kernels import base
 
 ONE_AN_ENTRY: dict[str, Callable[[torch.Tensor], st.Kernel]] = {
     "gaussian": lambda width: st.GaussianKernel(width),
@@ -123,3 +125,48 @@ def test_a_matern_kernel_has_two_derivatives_everywhere(smoothness: float, dista
     assert bool(torch.isfinite(bend).all())
     if distance < 1e-6:
         torch.testing.assert_close(bend, -curvature * torch.eye(2, dtype=torch.float64), rtol=1e-6, atol=1e-6)
+
+
+class Cauchy(st.Kernel):
+    """A kernel of the user's, with its value alone."""
+
+    def forward(self, x1: Tensor, x2: Tensor) -> Tensor:
+        return 1 / (1 + base.squared_distance(x1, x2))
+
+
+class Steep(Cauchy):
+    """One with a scale of its own, of which it tells no gradient."""
+
+    def log_scale(self, x: Tensor, z: Tensor) -> Tensor:
+        return (z * x.unsqueeze(-2)).sum(-1) + z[..., 0] ** 2
+
+
+def test_a_kernel_promises_nothing_that_it_does_not_say() -> None:
+    kernel, x = Cauchy(), uniform(3, 2)
+    z, d, b = uniform(3, 4, 2, seed=1), uniform(3, 5, 2, seed=2), uniform(3, 5, seed=3)
+    torch.testing.assert_close(kernel.core(x, z, d), kernel(x.unsqueeze(-2) + z, x.unsqueeze(-2) + d))
+    assert (kernel.state_free, kernel.scale_slope) == (False, None)
+    nothing = [kernel.gradient(z, d, b), kernel.core_gradient(x, z, d, b), kernel.log_gain(x)]
+    nothing += [kernel.log_scale(x, z), kernel.log_scale_gradient(x, z), kernel.exponent_rate()]
+    nothing += [kernel.follow(z, z), kernel.anchored_gradient(z, d, b)]  # type: ignore[list-item]
+    assert nothing == [None] * 8
+    assert kernel.polynomial_degree() is kernel.rank(3) is None
+    assert kernel.extra_repr() == ""
+
+
+def test_the_gradient_of_a_scale_is_found_where_it_is_not_told() -> None:
+    x, z = uniform(3, 2), uniform(3, 4, 2, seed=1)
+    found = Steep().log_scale_gradient(x, z)
+    assert found is not None
+    wanted = x.unsqueeze(-2) + torch.stack((2 * z[..., 0], 0 * z[..., 0]), -1)
+    torch.testing.assert_close(found, wanted)
+
+
+def test_products_and_differences_are_those_of_all_pairs() -> None:
+    x1, x2, w = uniform(3, 4, 2, seed=4), uniform(3, 5, 2, seed=5), uniform(3, 4, 5, seed=6)
+    torch.testing.assert_close(base.inner(x1, x2), torch.einsum("bpn,bmn->bpm", x1, x2))
+    apart = x1.unsqueeze(-2) - x2.unsqueeze(-3)
+    torch.testing.assert_close(base.squared_distance(x1, x2), apart.square().sum(-1))
+    torch.testing.assert_close(base.weighted_differences(w, x2, x1), -(w.unsqueeze(-1) * apart).sum(-2))
+    far = base.squared_distance(tensor([[1e8, 0.0]]), tensor([[1e8 + 1e-7, 0.0]]))
+    assert float(far) == pytest.approx(float((torch.tensor(1e8).double() + 1e-7 - 1e8) ** 2), rel=1e-12)

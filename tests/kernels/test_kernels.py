@@ -53,13 +53,6 @@ def test_batch_equals_loop(name: str, batch: tuple[int, ...]) -> None:
 
 
 @over(KERNELS)
-def test_points_and_centers_broadcast(name: str) -> None:
-    kernel = KERNELS[name].make()
-    y, c = uniform(5, 1, 4, 2), uniform(3, 2)
-    assert kernel(y, c).shape == (5, 1, 4, 3)
-
-
-@over(KERNELS)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_dtype_of_the_points_is_the_dtype_of_the_values(name: str, dtype: torch.dtype) -> None:
     kernel = KERNELS[name].make()
@@ -226,13 +219,6 @@ def test_rank_of_a_polynomial_kernel_is_the_rank_of_its_gram_matrix(
     kernel = st.AnchoredKernel(kernel) if anchored else kernel
     points = uniform(40, 3)
     assert kernel.rank(3) == int(torch.linalg.matrix_rank(kernel(points, points), rtol=1e-10))
-
-
-def test_a_width_per_batch_entry_equals_one_kernel_an_entry() -> None:
-    width = tensor([0.5, 1.0, 2.0])
-    y, c = uniform(3, 4, 2), uniform(3, 5, 2)
-    loop = [st.GaussianKernel(float(w))(a, b) for w, a, b in zip(width, y, c, strict=True)]
-    torch.testing.assert_close(st.GaussianKernel(width)(y, c), torch.stack(loop), rtol=1e-14, atol=0)
 
 
 def test_rational_quadratic_kernel_tends_to_the_gaussian() -> None:

@@ -122,16 +122,6 @@ def test_a_mode_that_does_not_decay_needs_an_input(
     )
 
 
-def test_what_counts_as_no_decay_and_as_no_input_is_measured_by_the_size_of_the_plant() -> None:
-    a = torch.diag(tensor([-1e3, -0.5e-6]))
-    assert linalg.unstabilisable_mode(a, tensor([[1.0], [0.0]])) == -0.5e-6
-    assert linalg.unstabilisable_mode(torch.diag(tensor([-1e3, -2e-6])), tensor([[1.0], [0.0]])) is None
-    assert linalg.unstabilisable_mode(torch.diag(tensor([-1e3, 1.0])), tensor([[1.0], [0.5e-6]])) == 1.0
-    assert linalg.unstabilisable_mode(torch.diag(tensor([-1e3, 1.0])), tensor([[1.0], [1e-5]])) is None
-    assert linalg.unstabilisable_mode(torch.diag(tensor([-0.1, 0.0])), tensor([[0.0], [0.5e-9]])) == 0.0
-    assert linalg.unstabilisable_mode(torch.diag(tensor([-0.1, 0.0])), tensor([[0.0], [2e-9]])) is None
-
-
 A, B, EYE = tensor([[0.0, 1.0], [-1.0, 0.0]]), tensor([[0.0], [1.0]]), torch.eye(2).double()
 TURN, ZERO = A, torch.zeros(2, 1).double()
 

@@ -12,8 +12,8 @@ from torch import Tensor
 from variants import LAWS
 
 from staf_torch import optim
-from staf_torch.optim.base import line_search, worse_than_none
-from staf_torch.optim.objective import NativeError, Precomputed, ScaledError, extremes
+from staf_torch.optim.base import line_search
+from staf_torch.optim.objective import NativeError, ScaledError, extremes
 
 KAPPA = tensor([1.0, 2.5, 100.0, 1e8])
 
@@ -58,29 +58,6 @@ def test_an_error_in_factors_is_that_of_the_whole_matrix(scaled: bool | None) ->
     torch.testing.assert_close(high, values[:, -1])
 
 
-def test_what_is_known_is_taken_and_not_found_again() -> None:
-    plain = objective()
-    known = Precomputed(
-        extremes=uniform(4, 2, seed=6), ideal=uniform(4, 3, seed=7), inverse=uniform(4, 3, 3, seed=8),
-        row=uniform(4, 3, seed=9), sampled=uniform(4, seed=10),
-    )  # fmt: skip
-    for error in (
-        NativeError(plain.gram, plain.values, known),
-        ScaledError(plain.gram[0], None, plain.values, plain.gram, known),
-    ):
-        assert torch.equal(torch.stack(error.spectrum(), -1), known.extremes)
-        assert error.minimiser() is known.ideal
-        solved = torch.einsum("bij,bj->bi", known.inverse, plain.values)
-        torch.testing.assert_close(error.solve(plain.values), solved)
-        assert error.sample() == (known.row, known.sampled)
-    later = Precomputed(ideal=uniform(2, 5, 3, seed=11)).at(3)
-    assert later.extremes is None
-    assert torch.equal(later.ideal, uniform(2, 5, 3, seed=11)[:, 3])
-    for missing in (Precomputed(row=known.row), Precomputed(sampled=known.sampled)):
-        with pytest.raises(ValueError, match="This law learns from V at the state alone"):
-            NativeError(plain.gram, plain.values, missing).sample()
-
-
 def test_eigenvalues_of_a_matrix_that_is_not_finite_spoil_no_other() -> None:
     gram = torch.diag_embed(tensor([[1.0, 4.0, 2.0], [1.0, 4.0, 2.0], [3.0, 5.0, 9.0]]))
     gram[1, 0, 2] = torch.inf
@@ -99,14 +76,6 @@ def test_a_line_search_ends_where_the_slope_does() -> None:
     assert line_search(error, g, 0 * p).tolist() == [[0.0]] * 4
     flat = NativeError(-error.gram, error.values)
     assert line_search(flat, g, p).tolist() == [[0.0]] * 4
-
-
-@pytest.mark.parametrize("factor", [0.5, 1.9, 2.1, 5.0, -0.1])
-def test_weights_are_worse_than_none_beyond_twice_the_minimum(factor: float) -> None:
-    error = objective()
-    a = factor * error.minimiser()
-    found = worse_than_none(error, a, error.descent(a))
-    assert found.tolist() == [[not 0 <= factor <= 2]] * 4
 
 
 class Plain(optim.UpdateLaw):

@@ -7,12 +7,14 @@ import io
 
 import pytest
 import torch
+from helpers import random_positive_definite, uniform
 from helpers_laws import TARGET, basis, quadratic
 from torch import Tensor, nn
 from variants import LAWS
 
 from staf_torch import optim
 from staf_torch.optim.objective import NativeError
+from staf_torch.optim.torch_optimizer import ChaseOptimizer, LossObjective
 
 USABLE = {name: law for name, law in LAWS.items() if name != "normalised lms"}
 
@@ -138,13 +140,6 @@ def test_groups_have_their_own_number_of_iterations() -> None:
     assert copy.deepcopy(optimizer).param_groups[1]["inner_steps"] == 4
 
 
-def test_a_loss_that_is_linear_moves_nothing() -> None:
-    parameter = nn.Parameter(torch.zeros(2, 3, dtype=torch.float64))
-    optimizer = optim.ChaseOptimizer([parameter], optim.SteepestDescent())
-    optimizer.step(lambda: (2 * parameter).sum())
-    assert not bool(parameter.any())
-
-
 def test_a_vector_is_one_problem_and_single_precision_stays() -> None:
     parameter = nn.Parameter(torch.zeros(3))
     target = torch.tensor([1.0, -2.0, 0.5])
@@ -176,3 +171,51 @@ def test_what_it_cannot_use_is_refused_in_a_sentence() -> None:
 
     with pytest.raises(ValueError, match="without calling `backward`"):
         optimizer.step(backward)
+
+
+GRAM, VALUES = random_positive_definite(1, 4, size=3), uniform(4, 3, seed=2)
+
+
+def loss_of(a: Tensor) -> Tensor:
+    """a'K a - 2 V'a + 7, a number a row."""
+    return ((a.unsqueeze(-2) @ GRAM).squeeze(-2) * a).sum(-1) - 2 * (VALUES * a).sum(-1) + 7
+
+
+def made(at: Tensor, slope: Tensor | None = None) -> tuple[LossObjective, nn.Parameter]:
+    parameter = nn.Parameter(at)
+    (found,) = torch.autograd.grad(loss_of(parameter).sum(), parameter, create_graph=True)
+    return LossObjective(parameter, found if slope is None else slope), parameter
+
+
+def test_a_loss_has_the_matrix_and_the_vector_of_its_quadratic() -> None:
+    found, _ = made(uniform(4, 3, seed=3))
+    v = uniform(4, 3, seed=4)
+    torch.testing.assert_close(found.gram, GRAM)
+    torch.testing.assert_close(found.values, VALUES)
+    torch.testing.assert_close(found.curvature(v), (GRAM @ v.unsqueeze(-1)).squeeze(-1))
+    torch.testing.assert_close(found.descent(v), 2 * (VALUES - (GRAM @ v.unsqueeze(-1)).squeeze(-1)))
+    torch.testing.assert_close(found.minimiser(), torch.linalg.solve(GRAM, VALUES))
+    torch.testing.assert_close(found.solve(v), torch.linalg.solve(GRAM, v))
+    values = torch.linalg.eigvalsh(GRAM)
+    low, high = found.spectrum()
+    torch.testing.assert_close(torch.stack((low, high), -1), values[:, [0, -1]])
+    assert found.values is found.values
+    assert not found.curvature(v).requires_grad
+    with pytest.raises(ValueError, match=r"^A loss has no sample at a state\.$"):
+        found.sample()
+
+
+def test_a_loss_that_is_linear_has_no_curvature() -> None:
+    found, parameter = made(uniform(4, 3, seed=5), -2 * VALUES)
+    assert found.curvature(parameter.detach()).tolist() == [[0.0] * 3] * 4
+    torch.testing.assert_close(found.values, VALUES)
+    other = nn.Parameter(uniform(4, 3, seed=6))
+    apart = LossObjective(parameter, (other.square() - other.detach().square()) - 2 * VALUES)  # of another's
+    assert apart.curvature(parameter.detach()).tolist() == [[0.0] * 3] * 4
+
+
+@pytest.mark.parametrize("size", [(), (3,)])
+def test_parameters_are_rows_of_floating_point_numbers(size: tuple[int, ...]) -> None:
+    whole = torch.ones(size, dtype=torch.int64 if size else torch.float64)
+    with pytest.raises(ValueError, match=r"must be floating-point tensors \(..., M\); got the shape"):
+        ChaseOptimizer([whole], optim.SteepestDescent())
