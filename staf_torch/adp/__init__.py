@@ -7,6 +7,7 @@ from .adaptation import AdaptiveLQR as AdaptiveLQR
 from .adaptation import Belief as Belief
 from .adaptation import ChangingPlant as ChangingPlant
 from .adaptation import ConcurrentGradient as ConcurrentGradient
+from .adaptation import ConcurrentLearning as ConcurrentLearning
 from .adaptation import ConcurrentTracker as ConcurrentTracker
 from .adaptation import Considered as Considered
 from .adaptation import ConsiderFilter as ConsiderFilter
@@ -19,6 +20,8 @@ from .adaptation import Estimate as Estimate
 from .adaptation import ExtendedKalman as ExtendedKalman
 from .adaptation import Guarded as Guarded
 from .adaptation import HistoryStack as HistoryStack
+from .adaptation import Identified as Identified
+from .adaptation import IdentifyingTracker as IdentifyingTracker
 from .adaptation import IntegralWindows as IntegralWindows
 from .adaptation import KalmanFilter as KalmanFilter
 from .adaptation import LearnedModel as LearnedModel
@@ -65,9 +68,6 @@ from .extrapolation import Extrapolation as Extrapolation
 from .extrapolation import QuadraturePoints as QuadraturePoints
 from .extrapolation import RandomPoints as RandomPoints
 from .global_value import GlobalValue as GlobalValue
-from .identification import ConcurrentLearning as ConcurrentLearning
-from .identification import Identified as Identified
-from .identification import IdentifyingTracker as IdentifyingTracker
 from .laws import ActorCriticLaw as ActorCriticLaw
 from .laws import Frozen as Frozen
 from .laws import Gains as Gains

@@ -128,13 +128,7 @@ class ActorCritic(Controller):
     def step(
         self, x: Tensor, carried: ControllerState, uniform: Tensor, dt: float
     ) -> tuple[Tensor, ControllerState]:
-        return self.step_with(self.model, x, carried, uniform, dt)
-
-    def step_with(
-        self, model: ControlAffineSystem, x: Tensor, carried: ControllerState, uniform: Tensor, dt: float
-    ) -> tuple[Tensor, ControllerState]:
-        """`step` with a model of the moment, for instance one that is being identified."""
-        terms = self.terms(x, carried.actor, uniform, model)
+        terms = self.terms(x, carried.actor, uniform)
         return terms.control[..., 0, :], self.moved(terms, carried, dt)
 
     def moved(self, terms: BellmanTerms, carried: ControllerState, dt: float) -> ControllerState:

@@ -102,8 +102,9 @@ def test_a_full_stack_takes_a_pair_only_where_the_least_eigenvalue_grows() -> No
     """Of vectors along the axes the eigenvalues are exact: along an axis that is known, nothing grows."""
     learning = adp.ConcurrentLearning(2, 1, size=2)
     known = learning.init(torch.zeros(1, 2, 1).double())
-    kept = known._replace(regressors=torch.tensor([[[2.0, 0.0], [3.0, 0.0]]]).double())
-    y = torch.ones(1, 1).double()
+    y, kept = torch.ones(1, 1).double(), known
+    for s in ([2.0, 0.0], [3.0, 0.0]):
+        kept = learning.remember(kept, torch.tensor([s]).double(), y)
     again = learning.remember(kept, torch.tensor([[5.0, 0.0]]).double(), y)
     assert torch.equal(again.regressors, kept.regressors)
     other = learning.remember(kept, torch.tensor([[0.0, 1.0]]).double(), y)

@@ -18,7 +18,6 @@ from staf_torch.adp.tracking import (
     desired_rate,
     feedforward,
     input_gain,
-    parametric_drift,
     regressor,
     true_parameters,
 )
@@ -94,14 +93,12 @@ def test_bellman_terms_are_those_of_every_point(centers: str, other: bool) -> No
             found = control.value_gradient(X, critic, DRAWN)[row, j]
             torch.testing.assert_close(found, slopes.mT @ critic[row])
     begun = control.init(X)
-    u, after = control.step_with(at, X, begun, DRAWN, 0.01)
-    wanted = control.terms(X, begun.actor, DRAWN, model)
-    torch.testing.assert_close(u, wanted.control[:, 0])
-    moved = control.moved(wanted, begun, 0.01)
-    for part, right in zip(after, moved, strict=True):
-        torch.testing.assert_close(part, right)
     if not other:
-        torch.testing.assert_close(control.step(X, begun, DRAWN, 0.01)[0], u)
+        wanted = control.terms(X, begun.actor, DRAWN)
+        u, after = control.step(X, begun, DRAWN, 0.01)
+        torch.testing.assert_close(u, wanted.control[:, 0])
+        for part, right in zip(after, control.moved(wanted, begun, 0.01), strict=True):
+            torch.testing.assert_close(part, right)
     torch.testing.assert_close(control.value(X, begun), (begun.critic * STAF(X, X)).sum(-1))
 
 
@@ -224,38 +221,6 @@ def test_the_error_plant_is_written_out() -> None:
     cost = adp.tracking_cost([[2.0, 0.5], [0.5, 1.0]], 3.0)
     assert cost.q.tolist() == [[2, 0.5, 0, 0], [0.5, 1, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0]]
     assert (cost.r.tolist(), cost.dim, cost.inputs) == ([[3.0]], 4, 1)
-
-
-def test_a_tracker_acts_on_its_model_of_the_moment_and_then_learns_from_the_measured_rate() -> None:
-    plant, cost = adp.TwoStateTracking(), adp.tracking_cost(10.0, 1.0)
-    basis = adp.LeadingCoordinates(adp.QuadraticBasis(2), 4)
-    inner = adp.ActorCritic(basis, plant, cost, adp.RandomPoints(1, 0.3))
-    first, learning = uniform(3, 2, seed=5), adp.ConcurrentLearning(3, 2, 4, gain=3.0)
-    tracker = adp.IdentifyingTracker(inner, plant, learning, first)
-    x, drawn = uniform(3, 4, seed=6), uniform(3, 1, 4, seed=7)
-    carried = tracker.init(x)
-    assert carried.identifier.shape == (3, 6 + 3 * 4 + 2 * 4)
-    known = tracker.identified(carried)
-    assert torch.equal(known.theta, first.expand(3, 3, 2))
-    assert not known.regressors.any()
-    for _ in range(2):
-        u, after = tracker.step(x, carried, drawn, 0.05)
-        known = tracker.identified(carried)
-        for row in range(3):
-            one = slice(row, row + 1)
-            theta, desired = known.theta[row], x[row, 2:]
-            mine = adp.ControllerState(*(part[one] for part in carried))
-            mu, moved = inner.step_with(adp.TwoStateTracking(theta), x[one], mine, drawn[one], 0.05)
-            excess = feedforward(desired, theta) - feedforward(desired, plant.theta)
-            torch.testing.assert_close(u[row], mu[0] + excess)
-            torch.testing.assert_close(after.critic[row], moved.critic[0])
-            state = x[row, :2] + desired
-            stack = adp.Identified(*(part[row] for part in known))
-            wanted = learning.step(stack, regressor(state), parametric_drift(plant.theta, state), 0.05)
-            for part, right in zip(tracker.identified(after), wanted, strict=True):
-                torch.testing.assert_close(part[row], right)
-        carried, x = after, x + 0.1
-    torch.testing.assert_close(tracker.value(x, carried), inner.value(x, carried))
 
 
 def test_the_stack_is_as_long_as_it_has_parameters_at_least() -> None:

@@ -1,6 +1,7 @@
 """Learning while running: what a plant's parameters are, found and used while the plant is controlled."""
 
 from .adaptive_actor_critic import AdaptiveActorCritic as AdaptiveActorCritic
+from .adaptive_actor_critic import IdentifyingTracker as IdentifyingTracker
 from .adaptive_actor_critic import LearnedModel as LearnedModel
 from .adaptive_lqr import Adaptation as Adaptation
 from .adaptive_lqr import AdaptiveLQR as AdaptiveLQR
@@ -9,7 +10,9 @@ from .consider import ConsiderFilter as ConsiderFilter
 from .drift_lqr import DriftAdaptation as DriftAdaptation
 from .drift_lqr import DriftLQR as DriftLQR
 from .history_stack import ConcurrentGradient as ConcurrentGradient
+from .history_stack import ConcurrentLearning as ConcurrentLearning
 from .history_stack import HistoryStack as HistoryStack
+from .history_stack import Identified as Identified
 from .history_stack import Stack as Stack
 from .kalman import Belief as Belief
 from .kalman import ExtendedKalman as ExtendedKalman

@@ -1,9 +1,10 @@
-"""The actor-critic on a plant that is identified while it controls; its weights wait for the model."""
+"""Actor-critics on a plant that is identified while it is controlled."""
 
 from __future__ import annotations
 
+import abc
 import copy
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -13,10 +14,35 @@ from ..actor_critic import ActorCritic
 from ..bellman import BellmanTerms
 from ..controllers import Controller, ControllerState, Policy
 from ..cost import matvec
+from ..tracking import TwoStateTracking, feedforward, parametric_drift, regressor
 from .carried import pack, unpack
+from .history_stack import ConcurrentLearning, Identified
 from .least_squares import Estimate, LeastSquares
 from .parametric import ParametricPlant
 from .windows import IntegralWindows, Window
+
+
+class IdentifyingActorCritic(Controller, abc.ABC):
+    """`ActorCritic` on the model of the moment, with what is known of the plant in the carried identifier."""
+
+    def __init__(self, learner: ActorCritic) -> None:
+        super().__init__()
+        self.learner, self.draws = learner, learner.draws
+        self._like: Any = None  # what is carried, of one row
+
+    @abc.abstractmethod
+    def start(self, x0: Tensor) -> Any:
+        """What is known of the plant at first, a tree with a row each of (B, n)."""
+
+    def init(self, x0: Tensor) -> ControllerState:
+        return self.learner.init(x0)._replace(identifier=pack(self.start(x0), 1))
+
+    def knowledge(self, identifier: Tensor) -> Any:
+        """What the rows of `LoopResult.identifier` say, (..., K)."""
+        return unpack(self._like, identifier, 1)
+
+    def value(self, x: Tensor, carried: ControllerState) -> Tensor | None:
+        return self.learner.value(x, carried)
 
 
 class LearnedModel(NamedTuple):
@@ -34,7 +60,7 @@ class LearnedModel(NamedTuple):
     window: Window
 
 
-class AdaptiveActorCritic(Controller):
+class AdaptiveActorCritic(IdentifyingActorCritic):
     """`ActorCritic` on the model x' = h + Y theta^ of the moment, whose weights wait while that is in doubt.
 
     At the state and at every extrapolated point y the Bellman equation says that V^ falls by the cost rate
@@ -93,20 +119,18 @@ class AdaptiveActorCritic(Controller):
         confidence: float = 3.0,
         share: float = 0.1,
     ) -> None:
-        super().__init__()
+        super().__init__(learner)
         if model.dim != learner.basis.dim:
             rule = f"must have the {learner.basis.dim} states of the learner's basis"
             raise fail("AdaptiveActorCritic", "model", rule, model.dim)
         if len(law.first) != model.parameters_count:
             rule = f"must have the model's {model.parameters_count} parameters"
             raise fail("AdaptiveActorCritic", "law", rule, len(law.first))
-        self.learner, self.model, self.windows, self.law = learner, model, windows, law
-        self.robust = robust
+        self.model, self.windows, self.law, self.robust = model, windows, law, robust
         self.confidence = positive_real("AdaptiveActorCritic", "confidence", confidence)
         self.share = positive_real("AdaptiveActorCritic", "share", share)
-        self.draws = learner.draws
         self.known: Estimate | None = None
-        self._like = self._start(torch.zeros(1, model._size(), dtype=torch.float64))
+        self._like = self.start(torch.zeros(1, learner.basis.dim, dtype=torch.float64))
 
     def knowing(self, estimate: Estimate) -> AdaptiveActorCritic:
         """A copy that begins with what an episode has learned of theta, of one row (p,) or of each (B, p)."""
@@ -114,13 +138,12 @@ class AdaptiveActorCritic(Controller):
         other.known = estimate
         return other
 
-    def init(self, x0: Tensor) -> ControllerState:
-        return self.learner.init(x0)._replace(identifier=pack(self._start(x0, self.known), 1))
-
-    def knowledge(self, identifier: Tensor) -> LearnedModel:
-        """What the rows of `LoopResult.identifier` say, (..., K)."""
-        found: LearnedModel = unpack(self._like, identifier, 1)
-        return found
+    def start(self, x0: Tensor) -> LearnedModel:
+        estimate = self.law.init(x0)
+        if self.known is not None:
+            pairs = zip(self.known, estimate, strict=True)
+            estimate = Estimate(*(part.to(x0).expand(like.shape).clone() for part, like in pairs))
+        return LearnedModel(estimate, torch.zeros_like(x0[..., 0]), self.windows.init(x0))
 
     def step(
         self, x: Tensor, carried: ControllerState, uniform: Tensor, dt: float
@@ -133,7 +156,7 @@ class AdaptiveActorCritic(Controller):
             carried = _chosen(anew, self.learner.init(x), carried)
         model = self.model.believing(estimate.theta.unsqueeze(-2))  # one a row, for all its points
         terms = self.learner.terms(x, carried.actor, uniform, model)
-        certain = self._certain(x, carried.critic, uniform, terms, estimate)
+        certain = self.certain(x, carried.critic, uniform, terms, estimate)
         moved = _chosen(certain, self.learner.moved(terms, carried, dt), carried)
         u = terms.control[..., 0, :]
         if self.robust is not None:
@@ -144,20 +167,18 @@ class AdaptiveActorCritic(Controller):
         after = LearnedModel(estimate, certain.to(x), self.windows.holding(window, u))
         return u, moved._replace(identifier=pack(after, x.dim() - 1))
 
-    def value(self, x: Tensor, carried: ControllerState) -> Tensor | None:
-        return self.learner.value(x, carried)
-
-    def _start(self, x: Tensor, known: Estimate | None = None) -> LearnedModel:
-        estimate = self.law.init(x)
-        if known is not None:
-            rows = (part.to(x).expand(like.shape).clone() for part, like in zip(known, estimate, strict=True))
-            estimate = Estimate(*rows)
-        return LearnedModel(estimate, torch.zeros_like(x[..., 0]), self.windows.init(x))
-
-    def _certain(
+    def certain(
         self, x: Tensor, critic: Tensor, uniform: Tensor, terms: BellmanTerms, estimate: Estimate
     ) -> Tensor:
-        """Whether V^ falls at all points nearly as it should for every theta that may be: (...) bool."""
+        """Whether V^ falls at all points nearly as it should for every theta that may be: (...) bool.
+
+        Args:
+            x: (..., n).
+            critic: weights of V^, (..., M).
+            uniform: draws of the extrapolated points.
+            terms: of the Bellman equation at these points, with the model of the moment.
+            estimate: theta^ with its covariance.
+        """
         slope = self.learner.value_gradient(x, critic, uniform)  # (..., P, n)
         points = self.learner.points(x, uniform)
         lever = (self.model.regressor(points, terms.control) * slope.unsqueeze(-1)).sum(-2)  # v, (..., P, p)
@@ -172,3 +193,62 @@ def _chosen(where: Tensor, one: ControllerState, other: ControllerState) -> Cont
         for new, old in zip(one[:3], other[:3], strict=True)
     )
     return ControllerState(critic, actor, gain, other.identifier)
+
+
+class IdentifyingTracker(IdentifyingActorCritic):
+    """`ActorCritic` on the model theta^ of the moment, and u = mu + ud(theta^).
+
+    The plant takes mu measured from the ud of the true theta, so this returns mu + ud(theta^) - ud(theta):
+    the control u that reaches the plant knows theta^ alone, and the cost counts what it deviates from the
+    true feedforward. The plant's rate x' is measured without noise.
+
+    Example:
+        >>> plant, cost = adp.TwoStateTracking(), adp.tracking_cost(10.0, 1.0)
+        >>> basis = adp.LeadingCoordinates(adp.QuadraticBasis(2), dim=4)
+        >>> learner = adp.ActorCritic(basis, plant, cost, adp.RandomPoints(1, half_width=0.3))
+        >>> unknown = torch.zeros(3, 2).double()
+        >>> tracker = adp.IdentifyingTracker(learner, plant, adp.ConcurrentLearning(3, 2), unknown)
+        >>> x0 = torch.tensor([[-0.1, 0.1, 0.0, 1.0]]).double()  # e and xd
+        >>> run = adp.simulate(tracker, plant, cost, x0, dt=0.005, steps=10)
+        >>> tracker.knowledge(run.identifier).theta.shape
+        torch.Size([1, 11, 3, 2])
+
+        Shown by `staf experiment=adp_tracking`.
+
+    Args:
+        learner: the actor-critic.
+        plant: the true plant; only its measured drift and its ud, to convert the input, are used.
+        identifier: of theta, p = 3 and n = 2.
+        theta: the first estimate, (3, 2).
+    """
+
+    def __init__(
+        self, learner: ActorCritic, plant: TwoStateTracking, identifier: ConcurrentLearning, theta: Tensor
+    ) -> None:
+        super().__init__(learner)
+        self.plant, self.identifier = plant, identifier
+        self.model = TwoStateTracking(theta)
+        self.register_buffer("first", self.model.theta)
+        self.first: Tensor
+        self._like = self.start(torch.zeros(1, 4, dtype=torch.float64))
+
+    def start(self, x0: Tensor) -> Identified:
+        return self.identifier.init(self.first.to(x0).repeat(len(x0), 1, 1))
+
+    def step(
+        self, x: Tensor, carried: ControllerState, uniform: Tensor, dt: float
+    ) -> tuple[Tensor, ControllerState]:
+        known = self.identified(carried)
+        model = self.model.believing(known.theta.unsqueeze(-3))  # one theta a row, for all its points
+        terms = self.learner.terms(x, carried.actor, uniform, model)
+        state, desired = x[..., :2] + x[..., 2:], x[..., 2:]
+        excess = feedforward(desired, known.theta) - feedforward(desired, self.plant.theta)
+        measured = parametric_drift(self.plant.theta, state)
+        known = self.identifier.step(known, regressor(state), measured, dt)
+        after = self.learner.moved(terms, carried, dt)._replace(identifier=pack(known, x.dim() - 1))
+        return terms.control[..., 0, :] + excess.unsqueeze(-1), after
+
+    def identified(self, carried: ControllerState) -> Identified:
+        """The identifier's part of what the controller carries."""
+        found: Identified = self.knowledge(carried.identifier)
+        return found

@@ -160,7 +160,7 @@ class AdaptiveLQR(Controller):
         a, b = self.family.at(estimate.theta)
         doubling, stage, p = self.redesign.step(now.doubling, now.stage, now.p, a, b)
         k = product(product(self.cost.r_inverse.to(b), b.mT), p)
-        certain = self.redesign.solved(p, a, b) & (self._doubt(estimate.covariance, p, k) < 1)
+        certain = self.redesign.solved(p, a, b) & (self.doubt(estimate.covariance, p, k) < 1)
         belief = now.belief
         if self.filter is not None and belief is not None:
             belief = self.filter.step(belief, x, now.window.u, estimate, dt)
@@ -202,8 +202,14 @@ class AdaptiveLQR(Controller):
             None if self.filter is None else self.filter.init(x),
         )
 
-    def _doubt(self, covariance: Tensor, p: Tensor, k: Tensor) -> Tensor:
-        """c^2 sum_ij C_ij tr(W^-1 M_i W^-1 M_j): (...)."""
+    def doubt(self, covariance: Tensor, p: Tensor, k: Tensor) -> Tensor:
+        """c^2 sum_ij C_ij tr(W^-1 M_i W^-1 M_j) of a covariance and a design: below 1 it is certain, (...).
+
+        Args:
+            covariance: C, (..., p, p).
+            p: P of the Riccati equation, (..., n, n).
+            k: R^-1 B'P, (..., m, n).
+        """
         r = self.cost.r.to(p)
         weight = torch.linalg.inv_ex(self.curvature.to(p) + product(product(k.mT, r), k))[0]
         slopes = self.family.a_slopes.to(p) - product(self.family.b_slopes.to(p), k.unsqueeze(-3))

@@ -1,4 +1,4 @@
-"""A history stack that is worth most, and concurrent learning from it."""
+"""The history stack whose equations determine the parameters best, and concurrent learning from it."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ class Stack(NamedTuple):
     """
 
     s: Tensor  # (..., N, r, p), zero where empty
-    z: Tensor  # (..., N, r)
+    z: Tensor  # (..., N, r), with several right-hand sides (..., N, r, n)
     gram: Tensor  # (..., p, p) the sum of S'S
-    moment: Tensor  # (..., p) the sum of S'z
+    moment: Tensor  # (..., p) the sum of S'z, or (..., p, n)
     filled: Tensor  # (...) places
     tried_s: Tensor  # (..., r, p) the equation that looks for a place, or found the last empty one
-    tried_z: Tensor  # (..., r)
+    tried_z: Tensor  # (..., r), or (..., r, n)
     turn: Tensor  # (...) the place that is tried next; 0: none, k: place k - 1; -1: nothing is tried
     best: Tensor  # (...) the largest least eigenvalue so far
     place: Tensor  # (...) where; -1: as it is
@@ -65,6 +65,7 @@ class HistoryStack:
         parameters: p.
         size: N, at least 1.
         novelty: relative change of S that fills an empty place, not negative.
+        outputs: n, right-hand sides of an equation, z (..., r, n); None for one, z (..., r).
 
     Raises:
         ValueError: if an argument breaks its rule.
@@ -73,20 +74,25 @@ class HistoryStack:
     learning", ACC 2011; the search over several steps is our own.
     """
 
-    def __init__(self, rows: int, parameters: int, size: int = 20, novelty: float = 0.05) -> None:
+    def __init__(
+        self, rows: int, parameters: int, size: int = 20, novelty: float = 0.05, outputs: int | None = None
+    ) -> None:
         self.rows = integer("HistoryStack", "rows", rows, least=1)
         self.parameters = integer("HistoryStack", "parameters", parameters, least=1)
         self.size = integer("HistoryStack", "size", size, least=1)
         non_negative("HistoryStack", "novelty", novelty)
         self.novelty = real("HistoryStack", "novelty", novelty)
+        sides = () if outputs is None else (integer("HistoryStack", "outputs", outputs, least=1),)
+        self._sides: tuple[int, ...] = sides
 
     def init(self, x: Tensor) -> Stack:
         """An empty stack, a row each of (..., n)."""
         lead, (r, p) = x.shape[:-1], (self.rows, self.parameters)
         zero = x.new_zeros(lead)
-        s, z = x.new_zeros(*lead, self.size, r, p), x.new_zeros(*lead, self.size, r)
-        gram, moment = x.new_zeros(*lead, p, p), x.new_zeros(*lead, p)
-        return Stack(s, z, gram, moment, zero, s[..., 0, :, :], z[..., 0, :], zero - 1, zero, zero - 1)
+        s, z = x.new_zeros(*lead, self.size, r, p), x.new_zeros(*lead, self.size, r, *self._sides)
+        gram, moment = x.new_zeros(*lead, p, p), x.new_zeros(*lead, p, *self._sides)
+        tried_s, tried_z = x.new_zeros(*lead, r, p), x.new_zeros(*lead, r, *self._sides)
+        return Stack(s, z, gram, moment, zero, tried_s, tried_z, zero - 1, zero, zero - 1)
 
     def step(self, state: Stack, equation: Equation) -> Stack:
         """The stack after one more trial, with the equation where it is ready and fits."""
@@ -101,21 +107,32 @@ class HistoryStack:
         after: Stack = repeat(1, trial, (state, equation), where=busy)[0]
         return after
 
-    def _trial(self, state: Stack, equation: Equation) -> Stack:
-        slots, full = torch.arange(self.size, device=state.s.device), state.filled >= self.size
+    def take(self, state: Stack, equation: Equation) -> Stack:
+        """The stack with the equation in it, where it is ready and fits: all places are tried at once."""
+        fills = self._fills(state, equation)
+        trials = state.gram.unsqueeze(-3) + (_gram(equation.s).unsqueeze(-3) - _gram(state.s))
+        best, place = torch.linalg.eigvalsh(_finite(trials))[..., 0].max(dim=-1)
+        enough = best > _BETTER * torch.linalg.eigvalsh(_finite(state.gram))[..., 0]
+        replaces = equation.ready & (state.filled >= self.size) & enough
+        goes = torch.where(fills, state.filled, torch.where(replaces, place, -1))
+        return self._placed(_tried(state, equation, goes >= 0), goes, fills)
+
+    def _fills(self, state: Stack, equation: Equation) -> Tensor:
+        """Whether the equation goes to an empty place: it differs enough from the one before."""
         change = (equation.s - state.tried_s).square().sum((-2, -1))
         new = change > self.novelty**2 * equation.s.square().sum((-2, -1))
-        fills = equation.ready & ~full & (new | (state.filled == 0))
-        begins = equation.ready & full & (state.turn < 0)
-        taken = fills | begins
-        tried_s = torch.where(taken[..., None, None], equation.s, state.tried_s)
-        tried_z = torch.where(taken.unsqueeze(-1), equation.z, state.tried_z)
+        return equation.ready & (state.filled < self.size) & (new | (state.filled == 0))
+
+    def _trial(self, state: Stack, equation: Equation) -> Stack:
+        fills = self._fills(state, equation)
+        begins = equation.ready & (state.filled >= self.size) & (state.turn < 0)
+        state = _tried(state, equation, fills | begins)
         turn = torch.where(begins, 0.0, state.turn)
         # One trial: the sums with the equation in place turn - 1, or as they are.
-        out = (slots == (turn - 1).unsqueeze(-1)).to(state.s).unsqueeze(-1)  # (..., N, 1)
-        out_s = (out.unsqueeze(-1) * state.s).sum(-3)
-        trying = (turn > 0).unsqueeze(-1)
-        added = torch.where(trying.unsqueeze(-1), _gram(tried_s) - _gram(out_s), 0.0)
+        slots = torch.arange(self.size, device=state.s.device)
+        out = (slots == (turn - 1).unsqueeze(-1)).to(state.s)  # (..., N)
+        trying = _beside(turn > 0, state.gram)
+        added = torch.where(trying, _gram(state.tried_s) - _gram(_picked(out, state.s)), 0.0)
         least = torch.linalg.eigvalsh(_finite(state.gram + added))[..., 0]
         # The first place must beat the stack by a factor, every later one the best so far.
         needed = torch.where(state.place >= 0, state.best, _BETTER * state.best)
@@ -124,26 +141,41 @@ class HistoryStack:
         place = torch.where(turn == 0, -1.0, torch.where(better, turn - 1, state.place))
         done = turn >= self.size
         # The equation goes to an empty place, or to the best one once all have been tried.
-        goes = torch.where(fills, state.filled, torch.where(done, place, -1.0)).unsqueeze(-1)
-        chosen = slots == goes
-        left = (done & (place >= 0)).unsqueeze(-1)
-        again = (slots == place.unsqueeze(-1)).to(state.s).unsqueeze(-1) * left.to(state.s).unsqueeze(-1)
-        gone_s, gone_z = (again.unsqueeze(-1) * state.s).sum(-3), (again * state.z).sum(-2)
-        moves = goes >= 0
-        gram = state.gram + torch.where(moves.unsqueeze(-1), _gram(tried_s) - _gram(gone_s), 0.0)
-        moment = state.moment + torch.where(moves, _moment(tried_s, tried_z) - _moment(gone_s, gone_z), 0.0)
-        return Stack(
-            torch.where(chosen[..., None, None], tried_s.unsqueeze(-3), state.s),
-            torch.where(chosen.unsqueeze(-1), tried_z.unsqueeze(-2), state.z),
-            gram,
-            moment,
-            state.filled + fills.to(state.filled),
-            tried_s,
-            tried_z,
-            torch.where(done | (turn < 0), -1.0, turn + 1),
-            best,
-            place,
+        goes = torch.where(fills, state.filled, torch.where(done, place, -1.0))
+        turn = torch.where(done | (turn < 0), -1.0, turn + 1)
+        return self._placed(state, goes, fills)._replace(turn=turn, best=best, place=place)
+
+    def _placed(self, state: Stack, goes: Tensor, fills: Tensor) -> Stack:
+        """The stack with the equation that was tried in a place, -1 for none; empty places hold zeros."""
+        chosen = torch.arange(self.size, device=state.s.device) == goes.unsqueeze(-1)
+        s, z, share = state.tried_s, state.tried_z, chosen.to(state.s)
+        gone_s, gone_z = _picked(share, state.s), _picked(share, state.z)
+        gram, moment = _gram(s) - _gram(gone_s), _moment(s, z) - _moment(gone_s, gone_z)
+        return state._replace(
+            s=torch.where(_beside(chosen, state.s), s.unsqueeze(-3), state.s),
+            z=torch.where(_beside(chosen, state.z), z.unsqueeze(chosen.dim() - 1), state.z),
+            gram=state.gram + torch.where(_beside(goes >= 0, gram), gram, 0.0),
+            moment=state.moment + torch.where(_beside(goes >= 0, moment), moment, 0.0),
+            filled=state.filled + fills.to(state.filled),
         )
+
+
+def _tried(state: Stack, equation: Equation, where: Tensor) -> Stack:
+    """The stack that tries the equation from now on, in the rows where it is taken."""
+    s = torch.where(_beside(where, state.tried_s), equation.s, state.tried_s)
+    return state._replace(
+        tried_s=s, tried_z=torch.where(_beside(where, state.tried_z), equation.z, state.tried_z)
+    )
+
+
+def _beside(flags: Tensor, of: Tensor) -> Tensor:
+    """Flags with as many dimensions as what they choose from."""
+    return flags[(..., *[None] * (of.dim() - flags.dim()))]
+
+
+def _picked(share: Tensor, of: Tensor) -> Tensor:
+    """The sum over the places, weighted: (..., N), (..., N, *shape) -> (..., *shape)."""
+    return (_beside(share, of) * of).sum(share.dim() - 1)
 
 
 def _gram(s: Tensor) -> Tensor:
@@ -152,8 +184,15 @@ def _gram(s: Tensor) -> Tensor:
 
 
 def _moment(s: Tensor, z: Tensor) -> Tensor:
-    """S'z: (..., r, p), (..., r) -> (..., p)."""
-    return (s * z.unsqueeze(-1)).sum(-2)
+    """S'z: (..., r, p), (..., r) -> (..., p), or with (..., r, n) -> (..., p, n)."""
+    if z.dim() < s.dim():
+        return (s * z.unsqueeze(-1)).sum(-2)
+    return (s.unsqueeze(-1) * z.unsqueeze(-2)).sum(-3)
+
+
+def _outer(a: Tensor, b: Tensor) -> Tensor:
+    """ab': (..., p), (..., n) -> (..., p, n)."""
+    return a.unsqueeze(-1) * b.unsqueeze(-2)
 
 
 def _finite(gram: Tensor) -> Tensor:
@@ -206,9 +245,91 @@ class ConcurrentGradient:
             dt: s.
             push: (..., p).
         """
-        lead = theta.new_zeros(theta.shape[:-1])
+        lead = gram.new_zeros(gram.shape[:-2])
         rate, gain = dt * (lead + self.rate).unsqueeze(-1), (lead + self.gain).unsqueeze(-1)
         identity = torch.eye(theta.shape[-1], dtype=theta.dtype, device=theta.device)
         inverse = torch.linalg.inv_ex(identity + (rate * gain).unsqueeze(-1) * gram)[0]
         pull = gain * moment if push is None else gain * moment + push
         return matvec(inverse, theta + rate * pull)
+
+
+class Identified(NamedTuple):
+    """The state of `ConcurrentLearning`, a row a trajectory.
+
+    Example:
+        >>> adp.ConcurrentLearning(3, 2).init(torch.zeros(1, 3, 2)).rates.shape  # the history stack
+        torch.Size([1, 10, 2])
+
+        Shown by `staf experiment=adp_tracking`.
+    """
+
+    theta: Tensor  # estimate, (..., p, n)
+    stack: Stack
+
+    @property
+    def regressors(self) -> Tensor:
+        """s_j of the history stack, (..., N, p); zero rows are empty."""
+        return self.stack.s.squeeze(-2)
+
+    @property
+    def rates(self) -> Tensor:
+        """y_j = x'_j - g_j u_j, (..., N, n)."""
+        return self.stack.z.squeeze(-2)
+
+
+class ConcurrentLearning:
+    """theta' = gain (s (y - theta's)' + sum_j s_j (y_j - theta's_j)'), with y = x' - g u measured.
+
+    A `HistoryStack` of N pairs (s_j, y_j) makes theta converge without persistent excitation once
+    sum_j s_j s_j' has full rank. All places are tried with every pair: a new pair takes the place with which
+    the least eigenvalue of that sum grows most, if it grows.
+
+    Example:
+        >>> learning = adp.ConcurrentLearning(parameters=3, outputs=2, size=10)
+        >>> known = learning.init(torch.zeros(1, 3, 2).double())
+        >>> known.theta.shape, known.regressors.shape
+        (torch.Size([1, 3, 2]), torch.Size([1, 10, 3]))
+
+        Shown by `staf experiment=adp_tracking`.
+
+    Args:
+        parameters: p, rows of theta.
+        outputs: n, columns of theta.
+        size: N, at least p.
+        gain: positive, 1/s. The step is implicit, so no gain is too large for it.
+        novelty: relative change of s that fills an empty place.
+
+    Raises:
+        ValueError: if an argument breaks its rule.
+
+    Source: Chowdhary and Johnson, "Concurrent learning for convergence in adaptive control without
+    persistency of excitation", CDC 2010, and its singular-value maximising algorithm (ACC 2011).
+    """
+
+    def __init__(
+        self, parameters: int, outputs: int, size: int = 10, gain: float = 1.0, novelty: float = 0.05
+    ) -> None:
+        self.parameters = integer("ConcurrentLearning", "parameters", parameters, least=1)
+        self.outputs = integer("ConcurrentLearning", "outputs", outputs, least=1)
+        self.size = integer("ConcurrentLearning", "size", size, least=parameters)
+        self.gain = positive_real("ConcurrentLearning", "gain", gain)
+        self.novelty = positive_real("ConcurrentLearning", "novelty", novelty)
+        self.law = ConcurrentGradient(self.gain)
+        self.stack = HistoryStack(1, parameters, size, novelty, outputs)
+
+    def init(self, theta: Tensor) -> Identified:
+        """An empty stack with the first estimate theta (..., p, n)."""
+        return Identified(theta, self.stack.init(theta[..., 0]))
+
+    def step(self, state: Identified, s: Tensor, y: Tensor, dt: float) -> Identified:
+        """The estimate after ``dt`` seconds of the measurement y (..., n) at the regressor s (..., p)."""
+        stack = self.remember(state, s, y).stack
+        gram, moment = stack.gram + _outer(s, s), stack.moment + _outer(s, y)
+        theta = self.law.step(state.theta.mT, gram.unsqueeze(-3), moment.mT, dt).mT  # column by column
+        return Identified(theta, stack)
+
+    def remember(self, state: Identified, s: Tensor, y: Tensor) -> Identified:
+        """The stack with the pair in it, where that is worth it."""
+        zero = torch.zeros_like(s[..., 0])
+        pair = Equation(s.unsqueeze(-2), y.unsqueeze(-2), zero, torch.ones_like(zero).bool())
+        return state._replace(stack=self.stack.take(state.stack, pair))

@@ -41,9 +41,9 @@ def test_where_the_policy_is_certain_every_theta_within_the_deviations_is_stabil
     k = b.mT @ p
     shape = tensor([[1.0, 0.3], [0.3, 0.5]])
     # The largest covariance of this shape of which the policy is still certain.
-    scale = float(control._doubt(shape[None], p, k))
+    scale = float(control.doubt(shape[None], p, k))
     covariance = shape / scale * (1 - 1e-9)
-    assert float(control._doubt(covariance[None], p, k)) < 1
+    assert float(control.doubt(covariance[None], p, k)) < 1
     directions = uniform(2000, 2, seed=4)
     edge = 2.0 * directions / directions.norm(dim=-1, keepdim=True) @ torch.linalg.cholesky(covariance).mT
     closed_a, closed_b = family.at(theta + edge)
@@ -129,35 +129,6 @@ def test_compiled_steps_are_those_of_the_definition() -> None:
         torch.testing.assert_close(one, other, rtol=1e-9, atol=1e-9)
     part = steps(loop.init(z0[:3]), draws[:3])[0]  # rows do not know of each other
     assert torch.equal(part.carried.identifier, got.carried.identifier[:3])
-
-
-def test_noise_has_the_deviations_that_are_asked_for() -> None:
-    seen: list[torch.Tensor] = []
-
-    def policy(x: torch.Tensor) -> torch.Tensor:
-        seen.append(x)
-        return 0 * x[..., :1]
-
-    measured = adp.Measured(
-        adp.Feedback(policy), noise=[0.5, 0.0, 2.0], dim=3, output=lambda x: x[..., [0, 1, 0]]
-    )
-    x, draws = torch.ones(20000, 2).double(), uniform(20000, measured.draws, 3, seed=1)
-    measured.step(x, measured.init(x), draws, 0.1)
-    (y,) = seen
-    torch.testing.assert_close(y.mean(0), tensor([1.0, 1.0, 1.0]), rtol=0, atol=0.05)
-    torch.testing.assert_close(y.std(0), tensor([0.5, 0.0, 2.0]), rtol=0.03, atol=0)
-    assert abs(float(torch.corrcoef(y[:, [0, 2]].mT)[0, 1])) < 0.03
-
-
-def test_a_changing_plant_has_the_parameters_of_its_row_and_time() -> None:
-    z0 = CHANGING.start(uniform(2, 2), tensor([[0.1, 1.0], [0.2, 2.0]]), [0.3, 3.0], at=tensor([0.25, 9.0]))
-    u = torch.ones(2, 1).double()
-    torch.testing.assert_close(CHANGING.rate(z0, u)[:, :2], PENDULUM.believing(z0[:, 2:4]).rate(z0[:, :2], u))
-    z = z0
-    for _ in range(26):
-        z = systems.runge_kutta_step(lambda z: CHANGING.motion(z, u), z, 0.01)
-    torch.testing.assert_close(CHANGING.theta(z), tensor([[0.3, 3.0], [0.2, 2.0]]))
-    torch.testing.assert_close(CHANGING.drift(z0) + CHANGING.effectiveness(z0)[..., 0], CHANGING.rate(z0, u))
 
 
 def test_behind_walls_parameters_are_learned_from_the_plant_and_the_design_is_of_the_barrier() -> None:

@@ -8,11 +8,12 @@ from typing import Any
 
 import pytest
 import torch
-from helpers import random_positive_definite, tensor, uniform
+from helpers import changed, tensor, uniform
 from helpers_adaptation import COST, PENDULUM, friction_and_inertia, gravity
 from torch import Tensor
 
 from staf_torch import GaussianKernel, adp, rings, systems
+from staf_torch.adp.tracking import regressor
 
 LAW = adp.LeastSquares([0.1, 1.0], deviation=0.5)
 WINDOWS = adp.IntegralWindows(PENDULUM, 0.1)
@@ -24,93 +25,6 @@ def drift_of(**given: Any) -> adp.StreamDrift:
     usual = {"known": KNOWN, "kernel": GaussianKernel(2.0), "offsets": CENTERS}
     usual |= {"rows": [1], "deviation": 3.0, "length": 0.1, "floor": 0.05}
     return adp.StreamDrift(**(usual | given))  # type: ignore[arg-type]
-
-
-def learned(drift: adp.StreamDrift) -> adp.DriftEstimate:
-    rows, count = 4, drift.offsets.numel()
-    sizes = random_positive_definite(3, rows, size=count, log_condition=1.0) / 12
-    return adp.DriftEstimate(
-        0.3 * uniform(rows, 2, seed=1), uniform(rows, len(drift.rows), count, seed=2), sizes
-    )
-
-
-@pytest.mark.parametrize("forgetting", [0.0, 0.7])
-@pytest.mark.parametrize("rows", [[1], [0, 1]])
-def test_a_drift_is_learned_as_a_kalman_filter_written_out_learns_its_weights(
-    forgetting: float, rows: list[int]
-) -> None:
-    drift = drift_of(forgetting=forgetting, rows=rows)
-    now, x = learned(drift), 0.3 * uniform(4, 2, seed=5)
-    s, z, variance = (
-        uniform(4, len(rows), 6, seed=6),
-        uniform(4, len(rows), seed=7),
-        tensor([0.0, 0.1, 0.2, 0.3]),
-    )
-    s = s[:, :1].expand_as(s)
-    ready = torch.tensor([True, True, False, True])
-    after = drift.step(now, adp.Equation(s, z, variance, ready), x, 0.2)
-    assert torch.equal(after.anchor, now.anchor)  # within the ball nothing moves
-    identity = torch.eye(6).double()
-    for k in range(4):
-        p, mean = now.covariance[k], now.mean[k]
-        p = identity + (p - identity) / (1 + 0.2 * forgetting) if forgetting else p
-        psi = drift.kernel((x[k] - now.anchor[k])[None], drift.offsets)[0] @ drift.basis
-        rest = max(0.0, 1 - float(psi @ psi))
-        noise = float(variance[k]) + 0.05**2 + (0.1 * 3.0) ** 2 * rest * float(x[k] @ x[k])
-        if bool(ready[k]):
-            h = 3.0 * s[k, 0]
-            gain = p @ h / (float(h @ p @ h) + noise)
-            mean = mean + torch.outer(z[k] - mean @ h, gain)
-            p = p - torch.outer(gain, p @ h)
-        torch.testing.assert_close(after.mean[k], mean, rtol=1e-9, atol=1e-10)
-        torch.testing.assert_close(after.covariance[k], p, rtol=1e-9, atol=1e-10)
-
-
-def test_centers_that_move_take_with_them_what_the_old_ones_say_of_the_new() -> None:
-    drift = drift_of(rows=[0, 1])
-    now = learned(drift)
-    x = now.anchor + tensor([[0.6, 0.0], [0.0, -0.55], [0.49, 0.0], [0.7, 0.7]])
-    quiet = torch.zeros(4, 2, 6).double()
-    ready = torch.tensor([True, True, True, False])
-    after = drift.step(now, adp.Equation(quiet, quiet[..., 0], quiet[:, 0, 0], ready), x, 0.2)
-    identity = torch.eye(6).double()
-    for k, moved in enumerate((True, True, False, False)):
-        there = drift.kernel(x[k] - now.anchor[k] + drift.offsets, drift.offsets)
-        transfer = torch.kron(drift.basis.mT @ there @ drift.basis, torch.eye(2).double())
-        mean, p = (
-            now.mean[k] @ transfer.mT,
-            identity - transfer @ (identity - now.covariance[k]) @ transfer.mT,
-        )
-        torch.testing.assert_close(after.anchor[k], x[k] if moved else now.anchor[k])
-        torch.testing.assert_close(after.mean[k], mean if moved else now.mean[k], rtol=1e-9, atol=1e-10)
-        torch.testing.assert_close(
-            after.covariance[k], p if moved else now.covariance[k], rtol=1e-9, atol=1e-10
-        )
-
-
-def test_what_is_believed_of_a_drift_is_the_sum_over_its_weights() -> None:
-    drift = drift_of(rows=[0, 1])
-    now, x = learned(drift), uniform(4, 2, seed=8)
-    a, covariance = drift.slopes(now, x)
-    mean, spread = drift.predict(now, x)
-    whole, same = drift.matrix(now, x)
-    for k in range(4):
-        psi = drift.kernel((x[k] - now.anchor[k])[None], drift.offsets)[0] @ drift.basis
-        features = torch.kron(psi[None], torch.eye(2).double())  # a = features weights
-        wanted = 3.0 * now.mean[k] @ features.mT
-        left = max(0.0, 1 - float(psi @ psi)) * torch.eye(2).double()
-        size = 9.0 * (features @ now.covariance[k] @ features.mT + left)
-        torch.testing.assert_close(a[k], wanted)
-        torch.testing.assert_close(covariance[k], size)
-        torch.testing.assert_close(mean[k], wanted @ x[k])
-        torch.testing.assert_close(spread[k], (x[k] @ size @ x[k]).sqrt().expand(2))
-        torch.testing.assert_close(whole[k], KNOWN.matrix + wanted)
-        regressor = drift.window_of(now).model.regressor(x, x[:, :1])[k]
-        torch.testing.assert_close(regressor, torch.outer(psi, x[k]).flatten().expand(2, 6))
-    assert torch.equal(same, covariance)
-    one = drift_of(rows=[1]).window_of(now).model.regressor(x, x[:, :1])
-    assert not bool(one[:, 0].any())
-    assert bool(one[:, 1].any())
 
 
 def test_a_known_rate_of_the_seventh_degree_counts_exactly() -> None:
@@ -129,10 +43,6 @@ def test_a_known_rate_of_the_seventh_degree_counts_exactly() -> None:
 
 
 def test_a_drift_is_refused_what_it_cannot_be() -> None:
-    drift = drift_of(noise=0.2, smooth=True)
-    assert (drift.windows.noise, drift.windows.smooth, drift.windows.length) == (0.2, True, 0.1)
-    assert drift.radius == pytest.approx(0.5)
-    assert (drift.windows.model.rows, drift.windows.model.inputs, drift.windows.model.dim) == ([1], 1, 2)
     wrong: tuple[tuple[str, Any], ...] = (
         ("known", systems.Pendulum),
         ("kernel", torch.nn.Identity()),
@@ -254,26 +164,6 @@ def test_a_family_is_the_slopes_at_a_set_point() -> None:
         plant.family()
 
 
-def test_a_doubt_is_the_double_sum_over_the_parameters() -> None:
-    control = adp.AdaptiveLQR(PENDULUM, COST, WINDOWS, LAW, confidence=2.0)
-    family, p = PENDULUM.family(), random_positive_definite(1, 3, size=2)
-    covariance, k = random_positive_definite(2, 3, size=2), uniform(3, 1, 2, seed=4)
-    found = control._doubt(covariance, p, k)
-    for row in range(3):
-        weight = torch.linalg.inv(torch.eye(2).double() + k[row].mT @ k[row])
-        terms = []
-        for i in range(2):
-            slope = family.a_slopes[i] - family.b_slopes[i] @ k[row]
-            terms.append(p[row] @ slope + (p[row] @ slope).mT)
-        wanted = sum(
-            4 * covariance[row, i, j] * (weight @ terms[i] @ weight @ terms[j]).trace()
-            for i in range(2)
-            for j in range(2)
-        )
-        torch.testing.assert_close(found[row], wanted)
-    assert math.isinf(float(control._doubt(covariance * torch.nan, p, k)[0]))
-
-
 def test_an_adaptive_policy_begins_where_it_is_told_and_refuses_what_it_cannot_be() -> None:
     control, x0 = adp.AdaptiveLQR(PENDULUM, COST, WINDOWS, LAW, doublings=6, a_step=2), uniform(3, 2, seed=1)
     now = control.adaptation(control.init(x0).identifier)
@@ -318,60 +208,133 @@ def test_an_adaptive_policy_begins_where_it_is_told_and_refuses_what_it_cannot_b
     assert (drifting.redesign.doublings, drifting.redesign.a_step) == (4, 1)
 
 
-def test_a_tracker_pushes_by_its_gains_and_learns_from_its_error_at_once() -> None:
-    plant = adp.ParametricPlant(
-        lambda z, u: torch.stack((z.sin(), z), dim=-1), lambda z, u: u, dim=1, inputs=1, theta=[2.0, 1.0]
-    )
-    feedback, gain, rate = tensor([2.0, 3.0]), tensor([0.5, 0.7]), tensor([1.0, 4.0])
-    tracker = adp.ConcurrentTracker(
-        *(plant, lambda z: (0.5 * z.cos(), -0.2 + 0 * z)),
-        **{
-            "length": [0.1, 0.2],
-            "feedback": feedback,
-            "gain": gain,
-            "rate": rate,
-            "size": 3,
-            "first": [0.3, -0.1],
-        },
-    )
-    x = tensor([[0.4], [-0.6]])
-    start = tracker.init(x)
-    now = tracker.tracking(start.identifier)
-    assert torch.equal(now.theta, tensor([[0.3, -0.1]] * 2))
-    assert now.window.length.tolist() == [0.1, 0.2]
-    assert now.stack.s.shape == (2, 3, 1, 2)
-    u, after = tracker.step(x, start, x, 0.05)
-    error, y = x - 0.5 * x.cos(), torch.cat((x.sin(), x), -1)
-    theta = now.theta + 0.05 * rate[:, None] * y * error  # nothing is remembered yet
-    torch.testing.assert_close(tracker.tracking(after.identifier).theta, theta)
-    torch.testing.assert_close(u, -0.2 - (y * theta).sum(-1, keepdim=True) - feedback[:, None] * error)
-    torch.testing.assert_close(tracker.tracking(after.identifier).window.u, u)
-    plain = adp.ConcurrentTracker(plant, lambda z: (z, z), length=0.1, feedback=1.0, gain=1.0)
-    assert plain.stack.size == 20
-    assert not bool(plain.tracking(plain.init(x).identifier).theta.any())
-    for name in ("length", "feedback", "gain", "rate"):
-        for wrong in (0.0, [1.0, -1.0], [[1.0]]):
-            given: dict[str, Any] = {"length": 0.1, "feedback": 1.0, "gain": 1.0} | {name: wrong}
-            with pytest.raises(ValueError, match=rf"`ConcurrentTracker\({name}=...\)` must be positive"):
-                adp.ConcurrentTracker(plant, lambda z: (z, z), **given)
+PLANT = systems.TwoState()
+TRUE = tensor([-1.0, 1.0, 0.0, -0.5, 0.0, -0.5])
+FIRST = [1.0, 0.0, 1.0]  # of x'x
 
 
-def test_a_learner_and_its_model_belong_together() -> None:
-    learner = adp.ActorCritic(adp.QuadraticBasis(2), PENDULUM, COST, adp.RandomPoints(1, half_width=0.5))
-    wide = adp.ParametricPlant(lambda x, u: x.unsqueeze(-1), dim=3, inputs=1, theta=[0.1])
-    with pytest.raises(ValueError, match=r"model=...\)` must have the 2 states of the learner's basis"):
-        adp.AdaptiveActorCritic(learner, wide, WINDOWS, LAW)
-    with pytest.raises(ValueError, match=r"law=...\)` must have the model's 2 parameters"):
-        adp.AdaptiveActorCritic(learner, PENDULUM, WINDOWS, adp.LeastSquares([0.1], deviation=1.0))
-    for name in ("confidence", "share"):
-        with pytest.raises(ValueError, match=rf"`AdaptiveActorCritic\({name}=...\)` must be positive"):
-            adp.AdaptiveActorCritic(learner, PENDULUM, WINDOWS, LAW, **{name: 0.0})
-    one = adp.AdaptiveActorCritic(learner, PENDULUM, WINDOWS, LAW)
-    assert one.draws == learner.draws
-    known = adp.Estimate(tensor([0.7, 2.0]), torch.eye(2).double(), tensor(0.5), tensor(3.0))
-    started = one.knowing(known)
-    x0 = uniform(3, 2, seed=1)
-    now = started.knowledge(started.init(x0).identifier)
-    for part, given in zip(now.estimate, known, strict=True):
-        assert torch.equal(part, given.expand(part.shape))
-    assert torch.equal(one.knowledge(one.init(x0).identifier).estimate.theta, LAW.first.expand(3, 2))
+def both_rows(x: Tensor, u: Tensor) -> Tensor:
+    s = regressor(x)
+    zero = torch.zeros_like(s)
+    return torch.stack((torch.cat((s, zero), -1), torch.cat((zero, s), -1)), dim=-2)
+
+
+def pushed(x: Tensor, u: Tensor) -> Tensor:
+    return (PLANT.effectiveness(x) * u.unsqueeze(-2)).sum(-1)
+
+
+MODEL = adp.ParametricPlant(both_rows, pushed, dim=2, inputs=1, theta=TRUE)
+LEARNER = adp.ActorCritic(
+    adp.QuadraticBasis(2),
+    PLANT,
+    COST,
+    adp.QuadraturePoints(3, 2, half_width=0.2),
+    adp.PolicyIteration(),
+    critic=FIRST,
+    actor=FIRST,
+)
+
+
+def adaptive(law: adp.LeastSquares | None = None, **settings: object) -> adp.AdaptiveActorCritic:
+    if law is None:
+        law = adp.LeastSquares([0.0] * 6, deviation=3.0, floor=1e-5)
+    windows = adp.IntegralWindows(MODEL, 0.01)
+    return adp.AdaptiveActorCritic(LEARNER, MODEL, windows, law, **settings)  # type: ignore[arg-type]
+
+
+def loop(control: adp.Controller, x0: Tensor, steps: int, plant: systems.Plant = PLANT) -> adp.LoopResult:
+    return adp.simulate(control, plant, COST, x0, dt=0.01, steps=steps, compile=False)
+
+
+def test_weights_wait_in_doubt_and_every_state_is_regulated_near_the_optimum() -> None:
+    control = adaptive()
+    # From the first three, weights that moved before the drift was known diverged.
+    x0 = torch.cat((tensor([[0.858, 0.7204], [-1.8829, -1.4841], [-1.9202, -1.7179]]), uniform(5, 2) * 2))
+    run = loop(control, x0, 150)
+    now = control.knowledge(run.identifier)
+    assert torch.equal(now.certain[:, 0], torch.zeros(len(x0)).double())
+    assert bool((now.certain[:, -1] == 1).all())
+    waited = now.certain.cumsum(1) == 0
+    weights = run.critic_weights[waited]
+    assert torch.equal(weights, tensor(FIRST).expand_as(weights))
+    first, last = (PLANT.optimal_value(x, COST.q, COST.r) for x in (x0, run.state[:, -1]))
+    assert first is not None
+    assert last is not None
+    assert float(((run.cost + last) / first).mean()) < 1.04
+    assert float((last / first).max()) < 0.1
+
+
+def test_where_the_model_is_certain_v_falls_for_every_theta_within_the_deviations() -> None:
+    control = adaptive(confidence=2.0, share=1.0)
+    x, critic = tensor([[1.0, -0.5]]), tensor([[0.6, 0.1, 0.9]])
+    uniforms = x.new_zeros(1, control.draws, 2)
+    terms = LEARNER.terms(x, critic, uniforms, MODEL.believing(TRUE))
+    shape = torch.diag(tensor([1.0, 2.0, 0.5, 1.0, 1.5, 0.7]))
+
+    def certain(scale: float) -> bool:
+        estimate = changed(control.law.init(x, TRUE[None]), covariance=scale * shape[None])
+        return bool(control.certain(x, critic, uniforms, terms, estimate))
+
+    low, high = 1e-8, 1e4
+    for _ in range(60):
+        middle = (low * high) ** 0.5
+        low, high = (middle, high) if certain(middle) else (low, middle)
+    slope, points = LEARNER.value_gradient(x, critic, uniforms), LEARNER.points(x, uniforms)
+    directions = uniform(2000, 6, seed=1)
+    errors = 2.0 * directions / directions.norm(dim=-1, keepdim=True) * (low * shape.diagonal()).sqrt()
+    off = (both_rows(points, terms.control) @ errors[:, None, :, None]).squeeze(-1)  # (2000, P, 2)
+    falls = -terms.rate + (slope * off).sum(-1)  # of V^, where the Bellman equation holds for theta^
+    assert float(falls.max()) < 0
+    assert float((falls / terms.rate).max()) > -0.5  # that is not because little is allowed
+
+
+def test_a_model_that_is_known_makes_it_the_actor_critic() -> None:
+    law = adp.LeastSquares(TRUE.tolist(), deviation=1e-9, floor=1.0)
+    x0 = uniform(5, 2)
+    found, wanted = loop(adaptive(law), x0, 15), loop(LEARNER, x0, 15)
+    torch.testing.assert_close(found.state, wanted.state, rtol=0, atol=1e-7)
+    torch.testing.assert_close(found.critic_weights, wanted.critic_weights, rtol=1e-5, atol=1e-5)
+
+
+def test_rows_do_not_touch_and_what_was_learned_is_known_in_the_next_episode() -> None:
+    control, x0 = adaptive(), uniform(6, 2)
+    whole, alone = loop(control, x0, 40), loop(control, x0[2:3], 40)
+    assert torch.equal(whole.state[2:3], alone.state)
+    assert torch.equal(whole.identifier[2:3], alone.identifier)
+    learned = control.knowledge(loop(control, tensor([[-1.5, 1.5]]), 80).identifier).estimate
+    next_one = control.knowing(adp.Estimate(*(part[0, -1] for part in learned)))
+    again = control.knowledge(loop(next_one, x0, 3).identifier)
+    assert bool((again.certain[:, 1] == 1).all())  # from the first step
+    assert bool((control.knowledge(loop(control, x0, 3).identifier).certain[:, 1] == 0).all())
+
+
+def test_the_robust_policy_has_the_control_in_doubt() -> None:
+    law = adp.LeastSquares([0.0] * 6, deviation=1e6, floor=1e3)  # nothing is ever learned
+    robust = adp.LQR(PLANT, COST)
+    x0 = uniform(4, 2)
+    found = loop(adaptive(law, robust=robust), x0, 10)
+    assert torch.equal(found.state, loop(adp.Feedback(robust), x0, 10).state)
+    assert torch.equal(found.critic_weights[:, -1], tensor(FIRST).expand(4, 3))
+
+
+def test_weights_begin_anew_where_the_plant_becomes_another_one() -> None:
+    damping = adp.ParametricPlant(
+        lambda x, u: torch.stack((torch.zeros_like(u), -x[..., 1:]), dim=-2),
+        lambda x, u: torch.stack((x[..., 1], u[..., 0] - x[..., 0].sin()), dim=-1),
+        dim=2,
+        inputs=1,
+        theta=[0.3],
+        rows=[1],
+    )
+    plant = adp.ChangingPlant(damping)
+    z0 = plant.start(tensor([[2.0, 0.0]]), before=[0.3], after=[3.0], at=0.5)
+    law = adp.LeastSquares([0.0], deviation=3.0, floor=1e-4, alarm=8.0)
+    inside = adp.AdaptiveActorCritic(LEARNER, damping, adp.IntegralWindows(damping, 0.01), law)
+    control = adp.Measured(inside, noise=0.0, dim=2)
+    run = adp.simulate(control, plant, plant.cost(COST), z0, dt=0.01, steps=80, compile=False)
+    now = inside.knowledge(run.identifier)
+    anew = int((now.estimate.resets[0] > 0).to(torch.int8).argmax())
+    assert 50 <= anew <= 53
+    before, after = ((run.critic_weights[0, k] - tensor(FIRST)).abs().max() for k in (anew - 1, anew))
+    assert float(after) < 0.7 * float(before)
+    assert float(now.estimate.theta[0, -1, 0]) == pytest.approx(3.0, abs=1e-2)

@@ -7,7 +7,7 @@ import math
 
 import pytest
 import torch
-from helpers import tensor, uniform
+from helpers import changed, tensor, uniform
 from helpers_adaptation import PENDULUM, TRUE, equations
 from torch import Tensor
 
@@ -55,15 +55,6 @@ def test_the_noise_of_an_equation_has_the_variance_that_is_stated(shape: str) ->
         assert float(equation.variance[0]) < 0.1 * 2e-6
 
 
-def test_windows_double_up_to_the_longest() -> None:
-    windows = adp.IntegralWindows(MODEL, 0.08, first=0.02)
-    now, ends = windows.init(torch.zeros(1, 2).double()), []
-    for k in range(32):
-        now, equation = windows.step(now, torch.zeros(1, 2).double(), 0.01)
-        ends += [k] if bool(equation.ready) else []
-    assert ends == [2, 6, 14, 22, 30]
-
-
 def test_a_measured_rate_gives_the_equation_exactly() -> None:
     x, u = uniform(5, 2, seed=1), uniform(5, 1, seed=2)
     equation = adp.measured_rate(MODEL, x, u, PENDULUM.motion(x, u), 0.0)
@@ -75,14 +66,16 @@ def least(s: Tensor) -> float:
     return float(torch.linalg.eigvalsh((s.mT @ s).sum(0))[0])
 
 
-def test_the_stack_takes_the_place_that_an_exhaustive_search_finds() -> None:
+@pytest.mark.parametrize("at_once", [False, True])
+def test_the_stack_takes_the_place_that_an_exhaustive_search_finds(at_once: bool) -> None:
     stack, rows = adp.HistoryStack(1, 3, size=4, novelty=0.0), 5
     now = stack.init(uniform(rows, 1))
     want: list[list[Tensor]] = [[] for _ in range(rows)]
-    changed = 0
+    replaced = 0
     for equation in equations(20, rows, uniform(3, seed=9), states=1):
-        for turn in range(6):
-            now = stack.step(now, equation if turn == 0 else equation._replace(ready=equation.ready & False))
+        now = stack.take(now, equation) if at_once else now
+        for turn in range(0 if at_once else 6):
+            now = stack.step(now, equation if turn == 0 else changed(equation, ready=equation.ready & False))
         for row, kept in enumerate(want):
             if len(kept) < 4:
                 kept.append(equation.s[row])
@@ -92,8 +85,8 @@ def test_the_stack_takes_the_place_that_an_exhaustive_search_finds() -> None:
             best = max(range(4), key=values.__getitem__)
             if values[best] > 1.001 * least(torch.stack(kept)):
                 kept[:] = trials[best]
-                changed += 1
-    assert changed > 10
+                replaced += 1
+    assert replaced > 10
     for row, kept in enumerate(want):
         assert torch.equal(now.s[row], torch.stack(kept))
     torch.testing.assert_close((now.s * uniform(3, seed=9)).sum(-1), now.z, rtol=1e-14, atol=1e-14)
@@ -143,7 +136,7 @@ def test_the_step_of_concurrent_learning_solves_its_implicit_equation() -> None:
 
 def test_least_squares_are_those_of_all_equations_at_once_with_the_first_estimate() -> None:
     law = adp.LeastSquares([1.0, -1.0, 0.5], deviation=[2.0, 1.0, 0.5], floor=0.3)
-    given = [e._replace(z=e.z + uniform(4, 2, seed=70)) for e in equations(7, 4, uniform(4, 3, seed=8))]
+    given = [changed(e, z=e.z + uniform(4, 2, seed=70)) for e in equations(7, 4, uniform(4, 3, seed=8))]
     now = law.init(uniform(4, 2))
     for equation in given:
         now = law.step(now, equation, 0.1)
@@ -159,7 +152,7 @@ def test_least_squares_are_exact_without_noise_and_wait_for_an_equation() -> Non
     law, true = adp.LeastSquares([0.0] * 4, deviation=5.0, floor=1e-7), uniform(6, 4, seed=5)
     now = law.init(uniform(6, 2))
     for equation in equations(4, 6, true):
-        waiting = equation._replace(ready=torch.zeros(6, dtype=torch.bool))
+        waiting = changed(equation, ready=torch.zeros(6, dtype=torch.bool))
         assert all(torch.equal(a, b) for a, b in zip(law.step(now, waiting, 0.1), now, strict=True))
         now = law.step(now, equation, 0.1)
     torch.testing.assert_close(now.theta, true, rtol=0, atol=1e-8)
@@ -178,23 +171,10 @@ def test_an_alarm_opens_the_covariance_of_the_row_that_changed_alone() -> None:
     torch.testing.assert_close(now.theta, second, rtol=0, atol=1e-4)
 
 
-def test_least_squares_take_any_dimensions_of_rows() -> None:
-    """The alarm goes off in some of them, forgetting is on, and no two sizes are the same."""
-    law = adp.LeastSquares([0.0] * 4, deviation=0.1, forgetting=0.5, alarm=3.0)
-    given, now = equations(5, 6, uniform(6, 4, seed=5)), law.init(uniform(6, 2))
-    many = law.init(uniform(3, 2, 2))
-    for equation in given:
-        now = law.step(now, equation, 0.1)
-        many = law.step(many, adp.Equation(*(part.unflatten(0, (3, 2)) for part in equation)), 0.1)
-    assert 0 < float(now.resets.min()) < float(now.resets.max())
-    for flat, deep in zip(now, many, strict=True):
-        assert torch.equal(flat, deep.flatten(0, 1))
-
-
 def test_forgetting_never_opens_the_covariance_beyond_its_first_size() -> None:
     law = adp.LeastSquares([0.0, 0.0], deviation=2.0, forgetting=3.0)
     now = law.init(torch.zeros(1, 2).double())
-    quiet = equations(1, 1, TRUE)[0]._replace(ready=torch.tensor([False]))
+    quiet = changed(equations(1, 1, TRUE)[0], ready=torch.tensor([False]))
     now = law.step(now, equations(1, 1, TRUE)[0], 0.1)
     traces = []
     for _ in range(300):
@@ -230,29 +210,6 @@ def test_what_breaks_a_rule_is_refused_with_its_name(make, rule: str) -> None:
         make()
 
 
-def test_the_variance_of_a_measured_rate_is_that_of_its_noise() -> None:
-    x, u = uniform(4, 2), uniform(4, 1)
-    equation = adp.measured_rate(MODEL, x, u, PENDULUM.motion(x, u), 0.3)
-    torch.testing.assert_close(equation.variance, torch.full_like(equation.variance, 0.09))
-    assert bool(equation.ready.all())
-
-
-def test_a_step_of_the_gradient_law_takes_any_leading_dimensions() -> None:
-    law, dt = adp.ConcurrentGradient(gain=2.0, rate=0.5), 0.1
-    s, theta, push = uniform(3, 4, 5, 2, seed=1), uniform(3, 4, 2, seed=2), uniform(3, 4, 2, seed=3)
-    gram, moment = s.mT @ s, uniform(3, 4, 2, seed=4)
-    found = law.step(theta, gram, moment, dt, push)
-    # implicit Euler: (after - theta) / dt = rate (gain (moment - gram after) + push)
-    pull = 2.0 * (moment - (gram @ found.unsqueeze(-1)).squeeze(-1)) + push
-    torch.testing.assert_close((found - theta) / dt, 0.5 * pull, rtol=1e-10, atol=1e-12)
-
-
-def test_a_plant_is_tried_without_the_users_random_numbers() -> None:
-    before = torch.get_rng_state()
-    adp.ParametricPlant(lambda x, u: (x * u).unsqueeze(-1), dim=1, inputs=1, theta=[0.5])
-    assert torch.equal(before, torch.get_rng_state())
-
-
 @pytest.mark.parametrize("novelty", [0.2, 0.7])
 def test_an_equation_is_new_where_it_differs_by_the_novelty_of_its_own_size(novelty: float) -> None:
     stack = adp.HistoryStack(1, 2, size=3, novelty=novelty)
@@ -262,22 +219,136 @@ def test_an_equation_is_new_where_it_differs_by_the_novelty_of_its_own_size(nove
         now = stack.step(stack.init(torch.zeros(1, 1).double()), first)
         angle = 2 * math.asin(share * novelty / 2)  # as long, and so far away
         turned = tensor([[[math.cos(angle), math.sin(angle)]]])
-        assert stack.step(now, first._replace(s=turned)).filled.tolist() == [filled]
+        assert stack.step(now, changed(first, s=turned)).filled.tolist() == [filled]
 
 
-def test_a_probe_begins_upwards_and_every_input_turns_at_its_own_time() -> None:
-    def regressor(x: Tensor, u: Tensor) -> Tensor:
-        return torch.stack((x, u), dim=-1)
+TURNING = adp.ParametricPlant(
+    lambda x, u: torch.stack((torch.zeros_like(x), torch.cat((x[..., :1].sin(), u), -1)), dim=-2),
+    lambda x, u: torch.stack((x[..., 1], -0.5 * x[..., 1] + x[..., 0].cos()), dim=-1),
+    dim=2,
+    inputs=1,
+    theta=[1.0, 2.0],
+    rows=[1],
+    periodic=(0,),
+)
+DT = 0.125  # exact in binary, as are the lengths: edges are edges
 
-    model = adp.ParametricPlant(regressor, dim=2, inputs=2, theta=[-0.5, 1.0])
-    windows = adp.IntegralWindows(model, 0.2)
-    cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=2)
-    law = adp.LeastSquares([-0.5, 1.0], deviation=0.1)
-    adaptive = adp.AdaptiveLQR(model, cost, windows, law, probe=0.3)
-    time = torch.linspace(0, 4, 4001, dtype=torch.float64)
-    found = adaptive._probing(time)
-    assert found[0].tolist() == [0.3, 0.3]
-    assert found.abs().unique().tolist() == [0.3]
-    for j in range(2):
-        turns = time[1:][found[1:, j] != found[:-1, j]]
-        torch.testing.assert_close(turns.diff(), torch.full_like(turns[1:], 0.2 * (2 + j)), rtol=0, atol=2e-3)
+
+def swept(count: int) -> tuple[Tensor, Tensor]:
+    """States and inputs of so many times, (T, 2) and (T, 1)."""
+    k = torch.arange(count, dtype=torch.float64)
+    return torch.stack((3.0 + 0.1 * k, (0.7 * k).sin()), -1), (1.3 * k).cos().unsqueeze(-1)
+
+
+@pytest.mark.parametrize(
+    ("length", "first", "ends"),
+    [
+        (0.5, None, [(0, 4), (4, 8), (8, 12)]),
+        (0.3125, None, [(0, 3), (3, 6), (6, 9)]),  # two periods and a half: the third ends it
+        (0.5, 0.125, [(0, 1), (1, 3), (3, 7), (7, 11)]),
+    ],
+)
+@pytest.mark.parametrize("shape", ["box", "smooth"])
+@pytest.mark.parametrize("model", [TURNING, PENDULUM])
+def test_a_window_is_the_sum_over_its_steps(
+    model: adp.ParametricPlant, length: float, first: float | None, ends: list[tuple[int, int]], shape: str
+) -> None:
+    x, u = swept(13)
+    windows = adp.IntegralWindows(model, length, shape=shape, first=first, noise=0.3)
+    now, found = windows.init(x[0]), []
+    assert float(now.elapsed) == -1
+    for k in range(13):
+        now, equation = windows.step(now, x[k], DT)
+        now = windows.holding(now, u[k])
+        assert torch.equal(now.x, x[k])
+        if bool(equation.ready):
+            found.append((k, equation))
+            assert float(now.elapsed) == 0
+            assert not bool(now.s.any() or now.z.any())
+    assert [k for k, _ in found[: len(ends)]] == [end for _, end in ends]
+    size = length if first is None else first
+    for (begin, end), (_, equation) in zip(ends, found, strict=False):
+        s, z = torch.zeros(2, model.parameters_count).double(), torch.zeros(2).double()
+        for k in range(begin, end):
+            t = (k - begin + 0.5) * DT
+            phi = math.sin(math.pi * t / size) ** 2 if shape == "smooth" else 1.0
+            moved = model.difference(x[k + 1], x[k])
+            s += phi * DT * 0.5 * (model.regressor(x[k], u[k]) + model.regressor(x[k + 1], u[k]))
+            z += phi * (moved - DT * 0.5 * (model.rest_of(x[k], u[k]) + model.rest_of(x[k + 1], u[k])))
+        torch.testing.assert_close(equation.s, s[model.rows], rtol=1e-12, atol=1e-13)
+        torch.testing.assert_close(equation.z, z[model.rows], rtol=1e-12, atol=1e-13)
+        noise = math.pi**2 * DT / (2 * size) if shape == "smooth" else 2.0
+        assert float(equation.variance) == pytest.approx(0.09 * noise)
+        size = min(2 * size, length)
+
+
+def test_rows_may_have_windows_of_their_own_lengths() -> None:
+    lengths = tensor([0.25, 0.5, 1.0])
+    for windows in (adp.IntegralWindows(PENDULUM, 2.0), adp.SlopeWindows(PENDULUM, 2.0)):
+        now, ready = windows.init(torch.zeros(3, 2).double(), lengths), []
+        for _ in range(9):
+            now, equation = windows.step(now, torch.zeros(3, 2).double(), DT)  # type: ignore[arg-type]
+            ready.append(equation.ready)
+        assert torch.equal(torch.stack(ready).sum(0), torch.tensor([4, 2, 1]))
+    assert adp.IntegralWindows(PENDULUM, 2.0).init(torch.zeros(3, 2)).length.tolist() == [2.0] * 3
+    assert adp.IntegralWindows(PENDULUM, 2.0, first=0.5).init(torch.zeros(1, 2)).longest.tolist() == [2.0]
+
+
+def test_a_row_that_went_wrong_does_not_end_the_others() -> None:
+    stack = adp.HistoryStack(1, 2, size=2, novelty=0.0)
+    now, alone = stack.init(torch.zeros(2, 2).double()), stack.init(torch.zeros(1, 2).double())
+    for k in range(6):
+        s = uniform(2, 1, 2, seed=k)
+        bad = s.clone()
+        bad[1] = torch.nan
+        z, ready = torch.zeros(2, 1).double(), torch.ones(2).bool()
+        now = stack.step(now, adp.Equation(bad, z, z[:, 0], ready))
+        alone = stack.step(alone, adp.Equation(s[:1], z[:1], z[:1, 0], ready[:1]))
+    for both, one in zip(now, alone, strict=True):
+        assert torch.equal(both[:1], one)
+
+
+@pytest.mark.parametrize(
+    ("length", "middle", "end"), [(0.5, 2, 4), (0.25, 1, 2), (0.375, 2, 3), (0.3125, 1, 3)]
+)
+def test_a_slope_is_the_difference_over_a_window_and_y_that_of_its_middle(
+    length: float, middle: int, end: int
+) -> None:
+    x, u = swept(9)
+    windows = adp.SlopeWindows(TURNING, length)
+    now, begin, found = windows.init(x[0]), 0, 0
+    assert float(now.elapsed) == -1
+    for k in range(9):
+        before = now
+        now, equation = windows.step(now, x[k], DT)
+        now = windows.holding(now, u[k])
+        at = k - begin
+        if k and at == middle:
+            torch.testing.assert_close(now.s, TURNING.regressor(x[k], u[k - 1])[[1]])
+            torch.testing.assert_close(now.h, TURNING.rest_of(x[k], u[k - 1])[[1]])
+        elif at != middle:
+            assert torch.equal(now.s, before.s)
+            assert torch.equal(now.h, before.h)
+        assert bool(equation.ready) == (k > 0 and at == end)
+        if bool(equation.ready):
+            rate = TURNING.difference(x[k], x[begin])[1] / (end * DT)
+            torch.testing.assert_close(equation.z, (rate - now.h[0]).reshape(1))
+            torch.testing.assert_close(equation.s, now.s)
+            begin, found = k, found + 1
+        assert float(now.elapsed) == (k - begin) * DT
+        assert torch.equal(now.x, x[begin])
+        assert float(equation.variance) == 0
+    assert found >= 2
+
+
+@pytest.mark.parametrize("outputs", [1, 3])
+def test_the_step_solves_its_implicit_equation(outputs: int) -> None:
+    """theta+ - theta = gain dt sum_j s_j (y_j - theta+'s_j)' over the stack and the present pair."""
+    learning = adp.ConcurrentLearning(3, outputs, size=3, gain=2.0)
+    state = learning.init(uniform(3, outputs, seed=1))
+    for k in range(5):
+        s, y = uniform(3, seed=2 + k), uniform(outputs, seed=20 + k)
+        before, state = state, learning.step(state, s, y, 0.1)
+        pairs = [*zip(state.regressors, state.rates, strict=True), (s, y)]
+        pull = sum(torch.outer(a, b - state.theta.mT @ a) for a, b in pairs)
+        torch.testing.assert_close(state.theta - before.theta, 2.0 * 0.1 * pull, rtol=1e-10, atol=1e-12)

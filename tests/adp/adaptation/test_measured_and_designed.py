@@ -3,50 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import pytest
 import torch
 from helpers import tensor, uniform
 from helpers_adaptation import COST, PENDULUM
-from torch import Tensor
 
 from staf_torch import adp, systems
 from staf_torch.adp.adaptation import redesign
-from staf_torch.adp.adaptation.measured import gaussian
-
-
-class Seeing(adp.Feedback):
-    """Keeps what it was told."""
-
-    draws = 3
-
-    def step(self, x: Tensor, carried: Any, uniform: Tensor, dt: float) -> Any:
-        self.told = x, uniform, dt
-        return super().step(x, carried, uniform, dt)
-
-
-@pytest.mark.parametrize(("dim", "own"), [(1, 2), (2, 1), (3, 2)])
-def test_what_is_seen_has_noise_of_its_own_draws_and_the_rest_goes_on(dim: int, own: int) -> None:
-    inside = Seeing(lambda x: x[..., :1])
-    noise = [0.1, 0.5, 2.0][:dim]
-    outside = adp.Measured(inside, noise=noise, dim=dim)
-    assert outside.draws == own + 3
-    assert outside.label == inside.label
-    x, drawn = uniform(5, 4, seed=1), uniform(5, own + 3, 4, seed=2)
-    u, _ = outside.step(x, outside.init(x), drawn, 0.25)
-    seen, rest, dt = inside.told
-    several = drawn[:, :own, :dim].flatten(1)
-    torch.testing.assert_close(seen, x[:, :dim] + tensor(noise) * gaussian(several, dim))
-    assert torch.equal(rest, drawn[:, own:, :dim])
-    assert dt == 0.25
-    assert torch.equal(u, seen[:, :1])
-    quiet = adp.Measured(inside, noise=0.0, dim=dim, output=lambda x: 2 * x[..., :dim])
-    assert quiet.draws == 3
-    quiet.step(x, quiet.init(x), drawn[:, own:], 0.25)
-    assert torch.equal(inside.told[0], 2 * x[:, :dim])
-    assert torch.equal(inside.told[1], drawn[:, own:, :dim])
-    assert quiet.noise.dtype == torch.float64
 
 
 def test_noise_is_given_once_or_for_every_output() -> None:
@@ -58,14 +22,6 @@ def test_noise_is_given_once_or_for_every_output() -> None:
             ValueError, match=r"`Measured\(noise=...\)` must not be negative, one number or 2"
         ):
             adp.Measured(inside, noise=wrong, dim=2)
-
-
-def test_uniform_numbers_become_normal_ones_by_box_and_muller() -> None:
-    u = tensor([[-1.0, -0.5, 0.25, 0.5], [0.5, 0.9, -0.3, -1.0]])
-    size, angle = (-2 * ((1 - u[:, :2]) / 2).log()).sqrt(), math.pi * u[:, 2:]
-    wanted = torch.cat((size * angle.cos(), size * angle.sin()), dim=-1)
-    torch.testing.assert_close(gaussian(u, 4), wanted)
-    torch.testing.assert_close(gaussian(u, 3), wanted[:, :3])
 
 
 def test_a_plant_changes_when_its_clock_has_run_down() -> None:
@@ -170,24 +126,6 @@ def test_a_design_is_of_the_model_of_now_where_its_equation_holds_to_a_hundredth
     assert made.solved(p, one, one).tolist() == [solved] == [residual < 0.01]
 
 
-def test_a_residual_is_a_share_of_its_largest_term_and_every_term_counts() -> None:
-    a, b, q, r = uniform(3, 2, 2, seed=1), uniform(3, 2, 1, seed=2), uniform(2, 2, seed=3), tensor([[0.7]])
-    p, q = uniform(3, 2, 2, seed=4), q @ q.mT
-    p, g = p + p.mT, b @ r @ b.mT
-    left = a.mT @ p + p @ a - p @ g @ p + q
-    size = (a.mT @ p).abs().amax((1, 2)) + (p @ g @ p).abs().amax((1, 2)) + q.abs().max()
-    torch.testing.assert_close(redesign.control_rate(b, r), g)
-    torch.testing.assert_close(redesign.riccati_residual(p, a, g, q), left.abs().amax((1, 2)) / size)
-
-
-def test_a_design_needs_a_doubling() -> None:
-    one = torch.ones(1, 1, 1).double()
-    assert float(adp.riccati_rows(one, one, one[0], one[0], doublings=1)) > 0
-    for wrong in (0, 1.5):
-        with pytest.raises(ValueError, match=r"`riccati_rows\(doublings=...\)`"):
-            adp.riccati_rows(one, one, one[0], one[0], doublings=wrong)  # type: ignore[arg-type]
-
-
 def test_noise_of_a_filter_of_a_plant_in_steps_counts_by_its_period() -> None:
     plant = systems.StepPlant(
         lambda x, u: torch.stack((x[..., 0] + 0.1 * x[..., 1], 0.9 * x[..., 1] + u[..., 0]), -1),
@@ -240,3 +178,21 @@ def test_what_an_observer_begins_with_and_what_is_refused_of_filters() -> None:
             adp.UnscentedKalman(plant, lambda x: x, noise=noise)
     with pytest.raises(ValueError, match=r"`ExtendedKalman\(output=...\)` must map \(1, 2\) to \(1, 1\)"):
         adp.ExtendedKalman(plant, lambda x: x, noise=[0.1])
+
+
+def test_noise_has_the_deviations_that_are_asked_for() -> None:
+    seen: list[torch.Tensor] = []
+
+    def policy(x: torch.Tensor) -> torch.Tensor:
+        seen.append(x)
+        return 0 * x[..., :1]
+
+    measured = adp.Measured(
+        adp.Feedback(policy), noise=[0.5, 0.0, 2.0], dim=3, output=lambda x: x[..., [0, 1, 0]]
+    )
+    x, draws = torch.ones(20000, 2).double(), uniform(20000, measured.draws, 3, seed=1)
+    measured.step(x, measured.init(x), draws, 0.1)
+    (y,) = seen
+    torch.testing.assert_close(y.mean(0), tensor([1.0, 1.0, 1.0]), rtol=0, atol=0.05)
+    torch.testing.assert_close(y.std(0), tensor([0.5, 0.0, 2.0]), rtol=0.03, atol=0)
+    assert abs(float(torch.corrcoef(y[:, [0, 2]].mT)[0, 1])) < 0.03

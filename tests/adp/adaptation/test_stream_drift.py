@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from helpers import tensor, uniform
+from helpers import changed, tensor, uniform
 from torch import Tensor
 
 from staf_torch import ExponentialKernel, GaussianKernel, adp, rings, systems
@@ -59,7 +59,7 @@ def test_moved_centers_keep_what_was_known_and_own_up_to_what_they_lost() -> Non
     start = torch.zeros(1, 2).double()
     now = drift.init(start)
     for x in 0.6 * uniform(40, 1, 2, seed=3):
-        now = now._replace(anchor=start)  # keep them, whatever x is
+        now = changed(now, anchor=start)  # keep them, whatever x is
         now = drift.step(now, equation(drift, now, x, x.sum(-1, keepdim=True)), start, 0.05)
     x = tensor([[0.4, 0.45]])  # beyond the ball of 0.5
     s, z, variance, ready = equation(drift, now, x, x[:, :1])
@@ -155,22 +155,3 @@ def test_arguments_are_checked(change: dict[str, object], message: str) -> None:
 def test_a_kernel_that_knows_where_it_is_is_refused() -> None:
     with pytest.raises(ValueError, match="translation invariant"):
         adp.StreamDrift(KNOWN, ExponentialKernel(), CENTERS, rows=[1], deviation=1.0, length=0.1)
-
-
-@pytest.mark.parametrize(("smooth", "shape"), [(False, "box"), (True, "smooth")])
-def test_windows_of_a_drift_have_the_shape_that_is_asked_for(smooth: bool, shape: str) -> None:
-    """The equation of a window tells which: one of sin^2 gives less weight to its ends."""
-    x = tensor([[0.3, -0.2]])
-    found = []
-    drift = made(smooth=smooth)
-    for windows in (
-        drift.windows,
-        adp.IntegralWindows(drift.window_of(drift.init(x)).model, 0.05, shape=shape),
-    ):
-        now, equations = windows.init(x), []
-        for k in range(12):
-            now, equation_ = windows.step(now, x * (1 + 0.1 * k) ** 2, 0.01)
-            now = windows.holding(now, x[:, :1])
-            equations.append(equation_.z[..., -1:])
-        found.append(torch.stack(equations))
-    torch.testing.assert_close(found[0], found[1])
