@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from ..lanes import repeat
 from ..lanes.function import RowFunction
 from ..numerics.checks import fail, positive_real, trailing
+from ..numerics.runge_kutta import runge_kutta_mean, runge_kutta_stages
 from ..systems import Barrier, Bounds
 from .controllers import Policy
 from .halfspaces import cases, nearest_admissible
@@ -210,18 +211,14 @@ class BoxFilter(nn.Module):
 
     def _held(self, x: Tensor, u: Tensor, hold: Tensor) -> Held:
         motion, half = self.box.plant.motion, (0.5 * hold).unsqueeze(-1)
-        start = motion(x, u)
 
-        def advance(done: Tensor, k1: Tensor) -> tuple[Tensor, Tensor]:
-            k2 = motion(x + done + 0.5 * half * k1, u)
-            k3 = motion(x + done + 0.5 * half * k2, u)
-            k4 = motion(x + done + half * k3, u)
-            done = done + (half / 6) * (k1 + 2 * (k2 + k3) + k4)
-            return done, motion(x + done, u)
+        def advance(done: Tensor) -> tuple[Tensor, Tensor]:
+            slopes = runge_kutta_stages(lambda at, share: motion(x + at, u), done, half)[1]
+            return done + runge_kutta_mean(slopes, half), slopes[0]
 
-        middle, between = advance(torch.zeros_like(x), start)
-        end, last = advance(middle, between)
-        return Held(middle, end, (start, between, last))
+        middle, start = advance(torch.zeros_like(x))
+        end, between = advance(middle)
+        return Held(middle, end, (start, between, motion(x + end, u)))
 
     def __getstate__(self) -> dict[str, Any]:
         return {**vars(self), "_rows": None}

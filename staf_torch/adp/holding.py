@@ -29,7 +29,7 @@ def fewest_and_most(call: str, substeps: int | tuple[int, int]) -> tuple[int, in
 
 
 Stage = tuple[Tensor, Tensor, Tensor]
-"""The slope of the last stage, the mean of the slopes, and what was paid."""
+"""The slope of the last stage, the sum of what the slopes count, and what was paid."""
 
 
 class Holding:
@@ -120,20 +120,43 @@ def runge_kutta_held(
     plant: Plant, cost: Cost, x: Tensor, u: Tensor, length: float | Tensor
 ) -> tuple[Tensor, Tensor]:
     """x+ and the discounted cost of one Runge-Kutta step with u held, of one length, s, or one a row."""
-    asked, counted, worth = _shares(length, cost.discount, x)
     rate = cost.input_rate(u)
 
-    def stage(now: Stage, share: tuple[Tensor, Tensor, Tensor]) -> tuple[Stage, tuple[()]]:
-        slope, mean, paid = now
-        ahead, count, value = share
-        at = plant.displaced(x, ahead * slope)
-        slope = plant.velocity(at, u)
-        mean = mean + count * slope
-        return (slope, mean, paid + value * (rate + cost.state_rate(at))), ()
+    def field(at: Tensor) -> tuple[Tensor, Tensor]:
+        return plant.velocity(at, u), rate + cost.state_rate(at)
 
-    start = (torch.zeros_like(x), torch.zeros_like(x), torch.zeros_like(rate))
-    (_, mean, paid), _ = scan(stage, start, (asked, counted, worth), dim=0)  # a program has a stage once
-    return plant.displaced(x, mean), paid
+    return runge_kutta_loop(plant, field, x, length, cost.discount)
+
+
+def runge_kutta_loop(
+    plant: Plant,
+    field: Callable[[Tensor], tuple[Tensor, Tensor]],
+    x: Tensor,
+    length: float | Tensor,
+    discount: float = 0.0,
+) -> tuple[Tensor, Tensor]:
+    """`numerics.runge_kutta` as a loop over the stages, of which a program then contains one.
+
+    Args:
+        plant: whose states these are.
+        field: the velocity and the cost rate at a state.
+        x: (..., n).
+        length: s, a number or one a row.
+        discount: 1/s, of what is paid.
+
+    Returns:
+        x+ (..., n) and what was paid, (...).
+    """
+
+    def stage(now: Stage, share: tuple[Tensor, Tensor, Tensor]) -> tuple[Stage, tuple[()]]:
+        slope, moved, paid = now
+        ahead, count, value = share
+        slope, rate = field(plant.displaced(x, ahead * slope))
+        return (slope, moved + count * slope, paid + value * rate), ()
+
+    start = torch.zeros_like(x), torch.zeros_like(x), torch.zeros_like(x[..., 0])
+    (_, moved, paid), _ = scan(stage, start, _shares(length, discount, x), dim=0)
+    return plant.displaced(x, moved), paid
 
 
 def _shares(length: float | Tensor, discount: float, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -13,6 +13,7 @@ from ..lanes.combinators import tracing_now
 from ..numerics.angles import wrap
 from ..numerics.box import box_minimum
 from ..numerics.linalg import row_jacobian
+from ..numerics.runge_kutta import runge_kutta_step
 from .cost import QuadraticCost, matvec
 from .detours import DetourRollout
 from .trajectory_optimisation import slopes_of_minimum
@@ -122,12 +123,8 @@ class PlanProblem:
 
     def _advance(self, x: Tensor, u: Tensor) -> Tensor:
         """x after a period: one Runge-Kutta step."""
-        plant, h = self.plant, self.hold
-        k1 = plant.velocity(x, u)
-        k2 = plant.velocity(plant.displaced(x, 0.5 * h * k1), u)
-        k3 = plant.velocity(plant.displaced(x, 0.5 * h * k2), u)
-        k4 = plant.velocity(plant.displaced(x, h * k3), u)
-        return plant.displaced(x, (h / 6) * (k1 + 2 * (k2 + k3) + k4))
+        plant = self.plant
+        return runge_kutta_step(lambda at: plant.velocity(at, u), x, self.hold, plant.displaced)
 
     def bounds(self, like: Tensor) -> tuple[Tensor, Tensor]:
         """(m,) each; infinite where there are none."""

@@ -11,13 +11,14 @@ from torch import Tensor, nn
 from ..approximation.basis import StaFBasis
 from ..centers import Radius, StateFollowingCenters, ball, cross_polytope, rings
 from ..kernels import ExponentialKernel, GaussianKernel, Kernel
-from ..lanes import each, repeat, scan
+from ..lanes import each, repeat
 from ..lanes.function import RowFunction, Rows
 from ..lanes.plan import Plan
 from ..numerics.checks import fail, integer, positive_real
 from ..systems import Barrier, ControlAffineSystem
 from .controllers import LQR, Policy, Value
 from .cost import Cost
+from .holding import runge_kutta_loop
 
 _NAME = "a rollout policy"
 _KEPT = 64  # forms of one state that are remembered
@@ -174,23 +175,11 @@ class RolloutPolicy(nn.Module):
 
     def rollout(self, x: Tensor) -> Tensor:
         """Cost of the base policy over the horizon, and the terminal value: (..., n) -> (...)."""
-        h = self.horizon / self.steps
-        # Classical Runge-Kutta: the times at which a stage asks, and the shares of what it answers.
-        asked = x.new_tensor((0.0, 0.5 * h, 0.5 * h, h))
-        shares = x.new_tensor((h / 6, h / 3, h / 3, h / 6))
+        length = self.horizon / self.steps
 
         def step(now: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
-            start = now[0]
-
-            def stage(
-                carry: tuple[Tensor, Tensor, Tensor], at: tuple[Tensor, Tensor]
-            ) -> tuple[tuple[Tensor, Tensor, Tensor], tuple[()]]:
-                slope, end, spent = carry
-                slope, rate = self._field(self.model.displaced(start, at[0] * slope))
-                return (slope, self.model.displaced(end, at[1] * slope), spent + at[1] * rate), ()
-
-            (_, end, spent), _ = scan(stage, (torch.zeros_like(start), *now), (asked, shares), dim=0)
-            return end, spent
+            after, paid = runge_kutta_loop(self.model, self._field, now[0], length)
+            return after, now[1] + paid
 
         def whole(x: Tensor) -> Tensor:
             x, spent = repeat(self.steps, step, (x, torch.zeros_like(x[..., 0])))

@@ -13,6 +13,7 @@ from torch import Tensor
 from ..lanes import repeat
 from ..lanes.function import RowFunction
 from ..numerics.checks import fail, non_negative, one_or_each, positive, positive_real, trailing
+from ..numerics.runge_kutta import runge_kutta_step
 from ..systems import Bounds, Plant, StepPlant
 from ..systems.bounds import Limit
 from .controllers import Controller, ControllerState, Feedback, Policy
@@ -322,12 +323,8 @@ class SafetyFilter(Controller):
 
     def _advance(self, x: Tensor, u: Tensor) -> Tensor:
         """x after half a hold."""
-        plant, h = self.plant, 0.5 * self.hold
-        k1 = plant.velocity(x, u)
-        k2 = plant.velocity(plant.displaced(x, 0.5 * h * k1), u)
-        k3 = plant.velocity(plant.displaced(x, 0.5 * h * k2), u)
-        k4 = plant.velocity(plant.displaced(x, h * k3), u)
-        return plant.displaced(x, (h / 6) * (k1 + 2 * (k2 + k3) + k4))
+        plant = self.plant
+        return runge_kutta_step(lambda at: plant.velocity(at, u), x, 0.5 * self.hold, plant.displaced)
 
     def _level(self, k: int) -> Rows:
         """phi of one row: (1, n), () -> ()."""

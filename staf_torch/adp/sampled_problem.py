@@ -16,6 +16,7 @@ from ..numerics.angles import wrap
 from ..numerics.checks import fail, integer, positive_real, trailing
 from ..numerics.forward_mode import use_forward_mode
 from ..numerics.linalg import positive_semidefinite, solver
+from ..numerics.runge_kutta import runge_kutta_mean, runge_kutta_stages
 from ..systems import Bounds, Plant
 from ..systems.bounds import Limit
 from .cost import Cost
@@ -141,14 +142,9 @@ class SampledProblem(nn.Module):
             raise fail("SampledProblem.of", "dt", f"must be the plant's period, {plant.period} s", dt)
 
         def held(x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
-            k1, c1 = plant.motion(x, u), cost.rate(x, u)
-            x2 = x + 0.5 * h * k1
-            k2, c2 = plant.motion(x2, u), cost.rate(x2, u)
-            x3 = x + 0.5 * h * k2
-            k3, c3 = plant.motion(x3, u), cost.rate(x3, u)
-            x4 = x + h * k3
-            k4, c4 = plant.motion(x4, u), cost.rate(x4, u)
-            return x + (h / 6) * (k1 + 2 * (k2 + k3) + k4), (h / 6) * (c1 + 2 * (c2 + c3) + c4)
+            states, slopes = runge_kutta_stages(lambda at, share: plant.motion(at, u), x, h)
+            paid = runge_kutta_mean([cost.rate(at, u) for at in states], h)
+            return x + runge_kutta_mean(slopes, h), paid
 
         def stepped(x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
             assert plant.period is not None

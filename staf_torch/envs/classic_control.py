@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from ..numerics.checks import choice
+from ..numerics.runge_kutta import runge_kutta_step
 from ..systems import StepPlant
 
 
@@ -91,11 +92,7 @@ def _acrobot() -> StepPlant:
         return torch.stack((turn1, turn2, -(m12 * bend2 + swing1) / m11, bend2), dim=-1)
 
     def step(x: Tensor, u: Tensor) -> Tensor:
-        k1 = rate(x, u)
-        k2 = rate(x + 0.5 * dt * k1, u)
-        k3 = rate(x + 0.5 * dt * k2, u)
-        k4 = rate(x + dt * k3, u)
-        after = x + (dt / 6) * (k1 + 2 * (k2 + k3) + k4)
+        after = runge_kutta_step(lambda at: rate(at, u), x, dt)
         limit = fastest.to(after)
         turning = torch.maximum(torch.minimum(after[..., 2:], limit), -limit)
         return torch.cat((after[..., :2], turning), dim=-1)

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from .. import adp
 from ..adp import SampledProblem
+from ..numerics.runge_kutta import SHARES, runge_kutta_mean, runge_kutta_stages
 from .rival_plants import Case
 
 Steer = Callable[[Tensor], Tensor]
@@ -191,14 +192,9 @@ def ipopt_program(casadi: Any, case: Case, problem: SampledProblem, steps: int) 
     if case.discrete:
         after, spent = motion(x), h * paid(x, t)
     else:
-        at = [x]
-        k = [motion(x)]
-        for share in (0.5, 0.5, 1.0):
-            at.append(x + share * h * k[-1])
-            k.append(motion(at[-1]))
-        costs = [paid(each, t + s * h) for each, s in zip(at, (0.0, 0.5, 0.5, 1.0), strict=True)]
-        after = x + h / 6 * (k[0] + 2 * (k[1] + k[2]) + k[3])
-        spent = h / 6 * (costs[0] + 2 * (costs[1] + costs[2]) + costs[3])
+        at, slopes = runge_kutta_stages(lambda at, share: motion(at), x, h)
+        after = x + runge_kutta_mean(slopes, h)
+        spent = runge_kutta_mean([paid(each, t + s * h) for each, s in zip(at, SHARES, strict=True)], h)
     step = casadi.Function("step", [x, u, t], [after, spent])
     states, controls = casadi.MX.sym("X", n, steps + 1), casadi.MX.sym("U", m, steps)
     start = casadi.MX.sym("p", n + 1)

@@ -1,5 +1,6 @@
 """Plants, one a file, and their trajectories."""
 
+from ..numerics.runge_kutta import runge_kutta_step as runge_kutta_step
 from .barrier import Barrier as Barrier
 from .base import ControlAffineSystem as ControlAffineSystem
 from .base import Linearisation as Linearisation
@@ -8,7 +9,6 @@ from .base import Units as Units
 from .bounds import Bounds as Bounds
 from .cart_pole import CartPole as CartPole
 from .clocked import Clocked as Clocked
-from .integrators import runge_kutta_step as runge_kutta_step
 from .integrators import simulate as simulate
 from .integrators import trajectory as trajectory
 from .linear import Linear as Linear

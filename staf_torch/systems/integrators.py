@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import torch
 from torch import Tensor
@@ -12,27 +12,11 @@ from ..lanes.combinators import Tree
 from ..lanes.compiling import worth
 from ..lanes.kept import Kept
 from ..numerics.checks import integer, positive_real, trailing
+from ..numerics.runge_kutta import runge_kutta_step
 from .base import ControlAffineSystem
 
 _PAYS = 10_000  # steps of a small batch in plain torch (some .1 ms each) that take as long as to compile
 _kept = Kept("a trajectory", 16)
-
-
-def runge_kutta_step(field: Callable[[Tensor], Tensor], x: Tensor, dt: float) -> Tensor:
-    """One step of the classical fourth-order Runge-Kutta method: (..., n) -> (..., n).
-
-    Example:
-        >>> x = systems.runge_kutta_step(lambda x: -x, torch.ones(1).double(), dt=0.1)
-        >>> round(float(x), 6)  # exp(-0.1) = 0.904837
-        0.904837
-
-        Shown by `staf system=van_der_pol`.
-    """
-    k1 = field(x)
-    k2 = field(x + 0.5 * dt * k1)
-    k3 = field(x + 0.5 * dt * k2)
-    k4 = field(x + dt * k3)
-    return x + (dt / 6) * (k1 + 2 * k2 + 2 * k3 + k4)
 
 
 def trajectory(

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from ...numerics.linalg import row_jacobian
-from ...systems import ControlAffineSystem, Plant, runge_kutta_step
+from ...numerics.runge_kutta import SHARES, runge_kutta_mean, runge_kutta_stages, runge_kutta_step
+from ...systems import ControlAffineSystem, Plant
 from ..cost import BoundedInputCost, Cost
 
 
@@ -81,26 +82,19 @@ class Stage:
 
     def moved(self, x: Tensor, v: Tensor, h: Tensor) -> tuple[Tensor, list[Tensor]]:
         """x+ as of `advance`, and the four states (..., n) at which the Runge-Kutta step looks."""
-        (u1, u2, u4), step = self._inputs(v), h.unsqueeze(-1)
-        k1 = self.system.motion(x, u1)
-        at = [x, x + 0.5 * step * k1]
-        k2 = self.system.motion(at[1], u2)
-        at.append(x + 0.5 * step * k2)
-        k3 = self.system.motion(at[2], u2)
-        at.append(x + step * k3)
-        k4 = self.system.motion(at[3], u4)
-        return x + (step / 6) * (k1 + 2 * (k2 + k3) + k4), at
+        u, step = self._inputs(v), h.unsqueeze(-1)
+        at, slopes = runge_kutta_stages(lambda at, share: self.system.motion(at, u[share]), x, step)
+        return x + runge_kutta_mean(slopes, step), at
 
     def paid(self, at: Sequence[Tensor], v: Tensor, h: Tensor) -> Tensor:
         """The cost (...) of steps with these four states, which `moved` returned, (..., n) each."""
-        u1, u2, u4 = self._inputs(v)
-        c1, c2, c3, c4 = (self.cost.rate(x, u) for x, u in zip(at, (u1, u2, u2, u4), strict=True))
-        return (h / 6) * (c1 + 2 * (c2 + c3) + c4)
+        u = self._inputs(v)
+        return runge_kutta_mean([self.cost.rate(x, u[share]) for x, share in zip(at, SHARES, strict=True)], h)
 
-    def _inputs(self, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """u at the start, in the middle and at the end of steps, (..., m) each."""
+    def _inputs(self, v: Tensor) -> dict[float, Tensor]:
+        """u (..., m) at the shares of a step at which its stages stand."""
         first, last = v.chunk(2, dim=-1)
-        return self.input(first), self.input(0.5 * (first + last)), self.input(last)
+        return {0.0: self.input(first), 0.5: self.input(0.5 * (first + last)), 1.0: self.input(last)}
 
     def expand(self, x: Tensor, v: Tensor, h: Tensor, end: Tensor) -> Expansion:
         """Derivatives at (B, N, n), (B, N, 2m), for the costate ``end`` (B, n) at the horizon."""

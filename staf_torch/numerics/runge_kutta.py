@@ -1,0 +1,63 @@
+"""The classical Runge-Kutta step of fourth order, for whatever has sums and products with numbers."""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Callable, Sequence
+
+from torch import Tensor
+
+SHARES = (0.0, 0.5, 0.5, 1.0)
+"""Of the step, at which its four stages stand."""
+
+
+def runge_kutta_step(
+    field: Callable[[Tensor], Tensor],
+    x: Tensor,
+    dt: float | Tensor,
+    displaced: Callable[[Tensor, Tensor], Tensor] = operator.add,
+) -> Tensor:
+    """One step of the classical fourth-order Runge-Kutta method: (..., n) -> (..., n).
+
+    Example:
+        >>> x = systems.runge_kutta_step(lambda x: -x, torch.ones(1).double(), dt=0.1)
+        >>> round(float(x), 6)  # exp(-0.1) = 0.904837
+        0.904837
+
+        Shown by `staf system=van_der_pol`.
+
+    Args:
+        field: x' from x.
+        x: (..., n).
+        dt: length of the step, a number or (..., 1).
+        displaced: the state that a step leads to, as `systems.Plant.displaced`; by default the sum.
+    """
+    _, slopes = runge_kutta_stages(lambda at, share: field(at), x, dt, displaced)
+    return displaced(x, runge_kutta_mean(slopes, dt))
+
+
+def runge_kutta_stages(
+    field: Callable[[Tensor, float], Tensor],
+    x: Tensor,
+    dt: float | Tensor,
+    displaced: Callable[[Tensor, Tensor], Tensor] = operator.add,
+) -> tuple[list[Tensor], list[Tensor]]:
+    """The four states at which a step asks the field, and its answers there.
+
+    Args:
+        field: x' from x and the share of the step that has passed, one of `SHARES`.
+        x: (..., n).
+        dt: as in `runge_kutta_step`.
+        displaced: likewise.
+    """
+    states, slopes = [x], [field(x, SHARES[0])]
+    for share in SHARES[1:]:
+        states.append(displaced(x, share * dt * slopes[-1]))
+        slopes.append(field(states[-1], share))
+    return states, slopes
+
+
+def runge_kutta_mean(values: Sequence[Tensor], dt: float | Tensor) -> Tensor:
+    """The integral over a step of what has these values at its four stages (Simpson's rule)."""
+    first, second, third, last = values
+    return (dt / 6) * (first + 2 * (second + third) + last)
