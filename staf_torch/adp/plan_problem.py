@@ -11,12 +11,12 @@ from torch import Tensor
 from ..lanes import repeat, scan
 from ..lanes.combinators import tracing_now
 from ..numerics.angles import wrap
-from ..numerics.box import box_minimum
+from ..numerics.box import minimum_and_slopes
 from ..numerics.linalg import row_jacobian
+from ..numerics.riccati import product, riccati_step
 from ..numerics.runge_kutta import runge_kutta_step
 from .cost import QuadraticCost, matvec
 from .detours import DetourRollout
-from .trajectory_optimisation import slopes_of_minimum
 
 _TRIES, _SHORTER = 6, 0.3  # lengths of a step that are tried, each this share of the one before
 
@@ -152,20 +152,20 @@ class PlanProblem:
 
         def period(now: tuple[Tensor, ...], given: tuple[Tensor, ...]) -> tuple[tuple[Tensor, ...], Any]:
             (gradient, curvature, k), (y, others, u) = now, given
-            a, b = self._slopes(y, others, u)
             lx, lxx = self._stage(y, others, (done[:, 0] + k) * self.hold)
-            pulled_a, pulled_b = _product(curvature, a), _product(curvature, b)
-            qx = lx + matvec(a.mT, gradient)
-            qu = matvec(bend, u if rest is None else u - rest.to(u)) + matvec(b.mT, gradient)
-            qxx, qux = lxx + _product(a.mT, pulled_a), _product(b.mT, pulled_a)
-            quu = bend + _product(b.mT, pulled_b)
-            change = box_minimum(quu, qu, low - u, high - u)
-            feedback = slopes_of_minimum(quu, qux, (change > low - u) & (change < high - u))
-            turn = feedback.mT
-            slope = qx + matvec(turn, matvec(quu, change) + qu) + matvec(qux.mT, change)
-            cross = _product(turn, qux)
-            bent = qxx + _product(turn, _product(quu, feedback)) + cross + cross.mT
-            return (slope, 0.5 * (bent + bent.mT), k - 1), (change, feedback)
+            lu = matvec(bend, u if rest is None else u - rest.to(u))
+            apart = y.new_zeros(*y.shape, u.shape[-1])  # no cost of a state and an input together
+            upper = torch.cat((lxx, apart), dim=-1)
+            lower = torch.cat((apart.mT, bend.expand(len(y), -1, -1)), dim=-1)
+            found = riccati_step(
+                gradient,
+                curvature,
+                self._slopes(y, others, u),
+                torch.cat((lx, lu), dim=-1),
+                torch.cat((upper, lower), dim=-2),
+                lambda s, cross, bent: minimum_and_slopes(bent, s, cross, low - u, high - u),
+            )
+            return (found.gradient, found.curvature, k - 1), (found.change, found.feedback)
 
         last = torch.full_like(plan.total, float(self.steps))
         end = self._end(plan.states[:, -1], others[:, -1], (done[:, 0] + last) * self.hold)
@@ -173,11 +173,10 @@ class PlanProblem:
         _, (change, feedback) = scan(period, (*end, last - 1), given)
         return change.flip(1), feedback.flip(1)
 
-    def _slopes(self, y: Tensor, others: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
-        """A and B of a period: (B, p, p), (B, p, m)."""
+    def _slopes(self, y: Tensor, others: Tensor, u: Tensor) -> Tensor:
+        """A and B of a period beside each other: (B, p, p + m)."""
         p, z = self.moved, torch.cat((y, u), dim=-1)
-        _, slope = _along(lambda z: self._ahead(z[..., :p], others, z[..., p:]), z)
-        return slope[..., :p], slope[..., p:]
+        return _along(lambda z: self._ahead(z[..., :p], others, z[..., p:]), z)[1]
 
     def _stage(self, y: Tensor, others: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
         """Slope and curvature (Gauss and Newton's) of what the states of a period cost: (B, p), (B, p, p)."""
@@ -187,9 +186,9 @@ class PlanProblem:
         if cost.target is not None:
             error = error - see(cost.target.to(y))
         error = error if cost.output is not None else wrap(error, cost.periodic)
-        heavy = 2 * self.hold * _product(slope.mT, cost.q.to(y).expand(len(y), -1, -1))
+        heavy = 2 * self.hold * product(slope.mT, cost.q.to(y).expand(len(y), -1, -1))
         gradient, curvature = self._pressure(y, others, t)
-        return gradient + matvec(heavy, error), curvature + _product(heavy, slope)
+        return gradient + matvec(heavy, error), curvature + product(heavy, slope)
 
     def _end(self, y: Tensor, others: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
         """Slope and curvature of V_T, and of what is missing there."""
@@ -232,9 +231,3 @@ def _along(function: Callable[[Tensor], Tensor], z: Tensor) -> tuple[Tensor, Ten
     units = torch.eye(z.shape[-1], dtype=z.dtype, device=z.device)
     found = [torch.func.jvp(function, (z,), (unit.expand_as(z).clone(),)) for unit in units]
     return found[0][0], torch.stack([one[1] for one in found], dim=-1)
-
-
-def _product(a: Tensor, b: Tensor) -> Tensor:
-    """(..., i, j), (..., j, k) -> (..., i, k), entry by entry: a program folds what is 0."""
-    total: Tensor = (a.unsqueeze(-1) * b.unsqueeze(-3)).sum(-2)
-    return total

@@ -8,8 +8,9 @@ import torch
 from torch import Tensor
 
 from ..lanes import Program
-from ..numerics.box import box_minimum
+from ..numerics.box import minimum_and_slopes
 from ..numerics.checks import fail, integer, positive_real, trailing
+from ..numerics.riccati import riccati_step
 from .plans import LocalModel, Plan, Reference, Trajectories
 from .sampled_problem import Derivatives, SampledProblem
 
@@ -239,26 +240,22 @@ class BoxDDP:
         """One step of the recursion, backward in time."""
         (first, second, cost_first, cost_second, control), (mu, full) = now, row
         n = self.problem.dim
-        pulled = (after.curvature.unsqueeze(-1) * first.unsqueeze(-3)).sum(-2)  # H F_z, (B, n, n + m)
-        q1 = cost_first + (after.gradient.unsqueeze(-1) * first).sum(-2)
         bent = (after.gradient[..., None, None] * second).sum(-3)
-        q2 = cost_second + (first.unsqueeze(-1) * pulled.unsqueeze(-2)).sum(-3) + full[:, None, None] * bent
-        qx, qu, qxx, qux, quu = q1[:, :n], q1[:, n:], q2[:, :n, :n], q2[:, n:, :n], q2[:, n:, n:]
-        unit = torch.eye(quu.shape[-1], dtype=quu.dtype)
         scale = cost_second[:, n:, n:].diagonal(dim1=-2, dim2=-1).abs().mean(-1)
-        firm = quu + (mu * scale)[:, None, None] * unit
+        firmness = (mu * scale)[:, None, None] * torch.eye(control.shape[-1], dtype=control.dtype)
         low, high = self.problem.bounds.low - control, self.problem.bounds.high - control
-        change = box_minimum(firm, qu, low, high)
-        feedback = slopes_of_minimum(firm, qux, (change > low) & (change < high))
-        moved = (quu * change.unsqueeze(-2)).sum(-1)  # Q_uu k
-        rest = quu.unsqueeze(-1) * feedback.unsqueeze(-3)
-        turned = rest.sum(-2)  # Q_uu K, (B, m, n)
-        gradient = qx + (feedback * (moved + qu).unsqueeze(-1)).sum(-2) + (qux * change.unsqueeze(-1)).sum(-2)
-        cross = (feedback.unsqueeze(-1) * qux.unsqueeze(-2)).sum(-3)
-        curvature = qxx + (feedback.unsqueeze(-1) * turned.unsqueeze(-2)).sum(-3) + cross + cross.mT
-        curvature = 0.5 * (curvature + curvature.mT)
-        promised = after.promised + (qu * change).sum(-1) + 0.5 * (moved * change).sum(-1)
-        model = Model(gradient, curvature, promised, after.definite * _definite(firm))
+        definite = after.definite
+
+        def minimum(slope: Tensor, cross: Tensor, hessian: Tensor) -> tuple[Tensor, Tensor]:
+            nonlocal definite
+            firm = hessian + firmness
+            definite = definite * _definite(firm)
+            return minimum_and_slopes(firm, slope, cross, low, high)
+
+        curved = cost_second + full[:, None, None] * bent
+        found = riccati_step(after.gradient, after.curvature, first, cost_first, curved, minimum)
+        gradient, curvature, promised, change, feedback = found
+        model = Model(gradient, curvature, after.promised + promised, definite)
         return model, (change, feedback, gradient, curvature)
 
     def _models(self, plan: Plan, converged: Tensor, terminal: LocalModel) -> Trajectories:
@@ -303,21 +300,6 @@ class Model(NamedTuple):
     curvature: Tensor  # (B, n, n)
     promised: Tensor  # (B,)
     definite: Tensor  # (B,) 1 or 0
-
-
-def slopes_of_minimum(hessian: Tensor, cross: Tensor, free: Tensor) -> Tensor:
-    """du/dx of the minimum of u'Hu/2 + (s + C x)'u over a box: (B, m, n), 0 for inputs at a bound.
-
-    Args:
-        hessian: H, (B, m, m).
-        cross: C, (B, m, n).
-        free: whether an input lies between its bounds, (B, m) bool.
-    """
-    share = free.to(hessian)
-    masked = hessian * share.unsqueeze(-1) * share.unsqueeze(-2) + torch.diag_embed(1 - share)
-    inverse = 1 / masked if masked.shape[-1] == 1 else torch.linalg.inv(masked)
-    turn: Tensor = -(inverse.unsqueeze(-1) * (share.unsqueeze(-1) * cross).unsqueeze(-3)).sum(-2)
-    return turn
 
 
 def _definite(a: Tensor) -> Tensor:

@@ -86,6 +86,29 @@ def box_minimum(
     return best
 
 
+def minimum_and_slopes(
+    curvature: Tensor, slope: Tensor, cross: Tensor, low: Tensor, high: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return `box_minimum` of u'Hu / 2 + (c + C x)'u at x = 0, and du/dx there: (B, m), (B, m, n)."""
+    u = box_minimum(curvature, slope, low, high)
+    return u, slopes_of_minimum(curvature, cross, (u > low) & (u < high))
+
+
+def slopes_of_minimum(hessian: Tensor, cross: Tensor, free: Tensor) -> Tensor:
+    """du/dx of the minimum of u'Hu/2 + (s + C x)'u over a box: (B, m, n), 0 for inputs at a bound.
+
+    Args:
+        hessian: H, (B, m, m).
+        cross: C, (B, m, n).
+        free: whether an input lies between its bounds, (B, m) bool.
+    """
+    share = free.to(hessian)
+    masked = hessian * share.unsqueeze(-1) * share.unsqueeze(-2) + torch.diag_embed(1 - share)
+    inverse = 1 / masked if masked.shape[-1] == 1 else torch.linalg.inv(masked)
+    turn: Tensor = -(inverse.unsqueeze(-1) * (share.unsqueeze(-1) * cross).unsqueeze(-3)).sum(-2)
+    return turn
+
+
 def _clip(u: Tensor, low: Tensor, high: Tensor) -> Tensor:
     return torch.minimum(torch.maximum(u, low), high)
 

@@ -9,6 +9,7 @@ from typing import NamedTuple, Protocol, TypeVar
 import torch
 from torch import Tensor
 
+from ...numerics.riccati import riccati_step
 from .stage import Expansion, Stage, closed_stage
 
 Rows = TypeVar("Rows", "Plan", "Direction")
@@ -50,62 +51,49 @@ def direction(
             that the model pushes outward stays there, and gets no feedback.
     """
     slope, gradient, curvature = expansion
-    size = end.shape[-1]
-    s, S = end, end_curvature
+    costate, bent = end, end_curvature
     decrement, definite = torch.zeros_like(end[:, 0]), torch.ones_like(end[:, 0], dtype=torch.bool)
     offsets, feedbacks, costates = [], [], [end]
     for k in range(slope.shape[1] - 1, -1, -1):
-        J = slope[:, k]
-        q = gradient[:, k] + (J * s.unsqueeze(-1)).sum(-2)
-        Q = curvature[:, k] + J.mT @ S @ J
-        if room is None:
-            offset, feedback, good = _free_step(q, Q, size)
-            fall = -0.5 * (q[:, size:] * offset).sum(-1)
-        else:
-            offset, feedback, good = _boxed_step(q, Q, size, room[0][:, k], room[1][:, k])
-            pushed = (Q[:, size:, size:] @ offset.unsqueeze(-1)).squeeze(-1)
-            fall = -((q[:, size:] + 0.5 * pushed) * offset).sum(-1)
-        definite = definite & good
-        if room is None:
-            s = q[:, :size] + (Q[:, size:, :size] * offset.unsqueeze(-1)).sum(-2)
-            S = Q[:, :size, :size] + Q[:, :size, size:] @ feedback
-        else:  # at a bound the offset is not the model's minimum: all terms count
-            pulled = q[:, size:] + (Q[:, size:, size:] @ offset.unsqueeze(-1)).squeeze(-1)
-            s = q[:, :size] + (Q[:, size:, :size] * offset.unsqueeze(-1)).sum(-2)
-            s = s + (feedback * pulled.unsqueeze(-1)).sum(-2)
-            cross = Q[:, :size, size:] @ feedback
-            S = Q[:, :size, :size] + cross + cross.mT + feedback.mT @ Q[:, size:, size:] @ feedback
-        S = 0.5 * (S + S.mT)
-        decrement = decrement + fall
-        offsets.append(offset)
-        feedbacks.append(feedback)
-        costates.append(s)
+
+        def minimum(q: Tensor, cross: Tensor, Q: Tensor, k: int = k) -> tuple[Tensor, Tensor]:
+            nonlocal definite
+            box = () if room is None else (room[0][:, k], room[1][:, k])
+            offset, feedback, good = _boxed_step(q, cross, Q, *box) if box else _free_step(q, cross, Q)
+            definite = definite & good
+            return offset, feedback
+
+        step = riccati_step(costate, bent, slope[:, k], gradient[:, k], curvature[:, k], minimum)
+        costate, bent, decrement = step.gradient, step.curvature, decrement - step.promised
+        offsets.append(step.change)
+        feedbacks.append(step.feedback)
+        costates.append(costate)
     offset, feedback = torch.stack(offsets[::-1], dim=1), torch.stack(feedbacks[::-1], dim=1)
-    return Direction(offset, feedback, s, decrement, definite, torch.stack(costates[::-1], dim=1))
+    return Direction(offset, feedback, costate, decrement, definite, torch.stack(costates[::-1], dim=1))
 
 
-def _free_step(q: Tensor, Q: Tensor, size: int) -> tuple[Tensor, Tensor, Tensor]:
+def _free_step(slope: Tensor, cross: Tensor, curvature: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Offset, feedback and definiteness of the model of one interval, (B, 2m), (B, 2m, n), (B,)."""
-    factor, info = torch.linalg.cholesky_ex(Q[:, size:, size:])
-    right = torch.cat((q[:, size:, None], Q[:, size:, :size]), dim=-1)
-    solved = -torch.cholesky_solve(right, factor)
+    factor, info = torch.linalg.cholesky_ex(curvature)
+    solved = -torch.cholesky_solve(torch.cat((slope.unsqueeze(-1), cross), dim=-1), factor)
     return solved[..., 0], solved[..., 1:], info == 0
 
 
-def _boxed_step(q: Tensor, Q: Tensor, size: int, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _boxed_step(
+    slope: Tensor, cross: Tensor, curvature: Tensor, low: Tensor, high: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
     """`_free_step` within a box, by projected Newton steps: what leaves it is fixed at its bound, and freed
     where the model pulls it back."""
-    slope, curvature = q[:, size:], Q[:, size:, size:]
     offset, held = torch.zeros_like(slope), None
     for _ in range(2 * slope.shape[-1]):
         pull = slope + (curvature @ offset.unsqueeze(-1)).squeeze(-1)
         fixed = ((offset <= low) & (pull > 0)) | ((offset >= high) & (pull < 0))
         if held is not None and torch.equal(fixed, held):  # costs time alone: every further pass is this one
             break
-        held, free = fixed, (~fixed).to(q)
+        held, free = fixed, (~fixed).to(slope)
         both = free.unsqueeze(-1) * free.unsqueeze(-2)
         factor, info = torch.linalg.cholesky_ex(both * curvature + torch.diag_embed(1 - free))
-        right = torch.cat(((free * pull).unsqueeze(-1), free.unsqueeze(-1) * Q[:, size:, :size]), dim=-1)
+        right = torch.cat(((free * pull).unsqueeze(-1), free.unsqueeze(-1) * cross), dim=-1)
         solved = -torch.cholesky_solve(right, factor)
         offset = torch.minimum(torch.maximum(offset + solved[..., 0], low), high)
     bent = (offset <= low) | (offset >= high)
