@@ -315,6 +315,7 @@ ABSENT |= {
 ABSENT |= {
     ("IntegralWindows", "first"),
     ("LeastSquares", "alarm"),
+    ("HistoryStack", "outputs"),
     ("AdaptiveLQR", "a_step"),
     ("DriftLQR", "a_step"),
     ("PlantEnv", "bound"),
