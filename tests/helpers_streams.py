@@ -28,5 +28,4 @@ MODELS = {
     "filter of a kernel": lambda: st.StaFRegressor("matern", 0.4, noise=0.1, forgetting=0.99),
     "tuned filter": lambda: st.StaFRegressor().tune(*(part[:100] for part in hard_stream(100))),
     "bank": lambda: st.StaFRegressor(memory=128, neighbours=8, scaling=True),
-    "bank that keeps all": lambda: st.StaFRegressor(memory=256, neighbours=20, scaling=True),
 }

@@ -84,7 +84,7 @@ def learned() -> Any:
 def tuned() -> Any:
     time = np.arange(30) * 0.1
     stream = np.stack((np.cos(time), np.sin(time)), -1)
-    return tuple(st.StaFRegressor().tune(stream, stream[:, 0] ** 2)._tuning)
+    return tuple(st.StaFRegressor().tune(stream, stream[:, 0] ** 2).tuning)
 
 
 def rated(name: str) -> Any:

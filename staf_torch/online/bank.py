@@ -74,9 +74,18 @@ class Bank:
         doubtful: standard deviations beyond which a sample waits for the next one: if that is as far off,
             both are learned, else the first is skipped. By default 30, and 8 for an error of more than 12
             spreads of y. Where more than one in twenty is doubted, none waits.
+        compile: whether compiled code runs where there is a compiler; else the definition.
     """
 
-    def __init__(self, shape: BankShape, streams: int, scaling: bool, doubtful: float | None = None) -> None:
+    def __init__(
+        self,
+        shape: BankShape,
+        streams: int,
+        scaling: bool,
+        doubtful: float | None = None,
+        *,
+        compile: bool = True,
+    ) -> None:
         assert shape.capacity >= RECENT  # a full store gives up a sample that is not recent
         self.shape, self.scaling, self.dtype = shape, scaling, torch.float64
         width = CARRIED_WIDTH * math.sqrt(shape.dim)
@@ -84,8 +93,8 @@ class Bank:
         rules = Rules.of(shape.dim, scaling, doubtful)
         pointers, self._held = FunctionPointers.of(functions)
         self._rules = _Rules((ctypes.c_double * _NUMBERS)(*rules.numbers()), pointers)
-        self._call, self._run = _Call(), _built(shape)
-        self._definition = BankDefinition(shape, rules, functions)
+        self._call, self._run = _Call(), _built(shape) if compile else None
+        self.definition = BankDefinition(shape, rules, functions)
         self.table = torch.zeros(0, size(shape), dtype=torch.float64)
         self.add(streams)
 
@@ -109,8 +118,8 @@ class Bank:
     def clear(self, rows: Tensor) -> None:
         """Let the streams with these numbers begin anew."""
         part = self.table.new_zeros(len(rows), self.table.shape[1])  # what was counted included
-        for stream in self._definition.each(part):
-            self._definition.clear(stream)
+        for stream in self.definition.each(part):
+            self.definition.clear(stream)
         self.table[rows] = part
 
     @property
@@ -153,8 +162,8 @@ class Bank:
         shape = len(self.table), self.shape.outputs
         mean, deviation = x.new_empty(shape), x.new_empty(shape)
         if self._run is None:
-            for i, stream in enumerate(self._definition.each(self.table)):
-                mean[i], deviation[i] = self._definition.predict(stream, x[i])
+            for i, stream in enumerate(self.definition.each(self.table)):
+                mean[i], deviation[i] = self.definition.predict(stream, x[i])
             return mean, deviation
         call = self._call
         call.mode, call.x, call.mean, call.deviation = 1, x.data_ptr(), mean.data_ptr(), deviation.data_ptr()
@@ -165,8 +174,8 @@ class Bank:
         """Learn one sample a stream: (S, n), (S, K), contiguous float64; time since the last sample, (S,)."""
         if self._run is None:
             lapses = [1.0] * len(x) if lapse is None else lapse.tolist()
-            for s, *sample in zip(self._definition.each(self.table), x, y, lapses, strict=True):
-                self._definition.learn(s, *sample)
+            for s, *sample in zip(self.definition.each(self.table), x, y, lapses, strict=True):
+                self.definition.learn(s, *sample)
             return
         call = self._call
         call.mode, call.x, call.y = 2, x.data_ptr(), y.data_ptr()

@@ -78,6 +78,11 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
         return self
 
     @property
+    def tuning(self) -> Tuning | None:
+        """Hyperparameters that `tune` found, if it was asked."""
+        return self._tuning
+
+    @property
     def n_samples_seen_(self) -> Tensor:
         return self._counted(self._streams_.learned)
 

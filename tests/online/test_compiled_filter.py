@@ -11,7 +11,7 @@ from torch import Tensor
 
 import staf_torch as st
 from staf_torch.online.compiled_filter import CompiledFilter
-from staf_torch.online.kalman_filter import LANES, LocalFilter, StreamState
+from staf_torch.online.kalman_filter import LocalFilter, StreamState
 from staf_torch.online.local_functions import LocalFunctions
 
 FUNCTIONS = LocalFunctions.of(st.GaussianKernel(0.8), 0.5 * st.rings(6))
@@ -113,29 +113,3 @@ def test_compiled_filter_is_its_definition(robust: float, dtype: torch.dtype) ->
     assert int(fast.counts[1].min()) == 0
     assert int(fast.counts[1].max()) > 10
     assert bool((fast.counts[3] < fast.counts[0]).any())  # some began afresh
-
-
-def test_numbers_of_streams_stand_together_and_come_back() -> None:
-    for streams in (1, LANES - 1, LANES, LANES + 1, 2 * LANES):
-        state = StreamState.empty(torch.zeros(0, dtype=torch.float32), streams, 2, 3, 2)
-        assert state.blocks.shape == (-(-streams // LANES), 2 * 2 + 2 * 3 + 6 + 2 + 1, LANES)
-        assert (state.streams, state.sizes, state.dtype) == (streams, (2, 3, 2), torch.float32)
-        assert state.table[:4].isnan().all()
-        assert not state.table[4:].any()
-        assert (state.counts.shape, state.counts.dtype) == ((4, streams), torch.int64)
-        table = torch.arange(19.0 * streams).reshape(19, streams)
-        state.put(table.double())
-        assert torch.equal(state.table, table)
-        assert torch.equal(state.blocks.transpose(0, 1).flatten(1)[:, :streams], table)
-        parts = state.parts(state.table)
-        assert torch.equal(state.whole(parts), table)
-        assert torch.equal(parts.learned, parts.learned.transpose(0, 1))
-        assert torch.equal(parts.learned[2, 0], table[4 + 6 + 3])  # below the diagonal, row by row
-        assert torch.equal(state.mean, table[4:10].unflatten(0, (2, 3)))
-        assert torch.equal(state.anchor, table[:2])
-        assert torch.equal(parts.last, table[2:4])
-        assert torch.equal(parts.errors, table[16:18])
-        assert torch.equal(parts.largest, table[18:])
-        other = state.with_table(table[:, :1], state.counts[:, :1])
-        assert torch.equal(other.table, table[:, :1])
-        assert other.counts.is_contiguous()

@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 import torch
 from helpers import tensor, uniform
+from variants import Cauchy
 
 import staf_torch as st
-from staf_torch.online.compiled_filter import CompiledFilter, FunctionPointers
-from staf_torch.online.filter_arguments import Sizes, directions, filter_streams
-from staf_torch.online.local_functions import LocalFunctions
+from staf_torch.online.filter_arguments import KERNELS, Sizes, directions, filter_streams
 
 BANK: dict[str, Any] = {"memory": 128, "neighbours": 8}
 
@@ -181,7 +180,7 @@ def test_a_state_is_that_of_the_last_arguments_and_of_nothing_before() -> None:
     plain = st.StaFRegressor(radius=0.4).fit(x, y)
     tuned = st.StaFRegressor(radius=0.4).tune(x, y)
     tuned.load_state_dict(plain.state_dict())
-    assert tuned._tuning is None
+    assert tuned.tuning is None
     assert torch.equal(tuned.predict(x[9]), plain.predict(x[9]))
     unfitted = pickle.loads(pickle.dumps(st.StaFRegressor(radius=0.3)))
     assert repr(unfitted) == repr(st.StaFRegressor(radius=0.3))
@@ -232,8 +231,6 @@ def test_arguments_are_taken_at_their_edges_and_not_beyond() -> None:
         with pytest.raises(ValueError, match=rf"\({name}=...\)` must (be in \(0, 1\]|not be negative)"):
             model_of(**{name: value})
     assert model_of(kernel="matern", count=1).centers_offsets_.shape == (1, 2)
-    single = LocalFunctions.of(st.GaussianKernel(), tensor([[0.3, 0.4]]))
-    assert FunctionPointers.of(single)[0].reach == 0.5
     model_of(**BANK)
     with pytest.raises(ValueError, match=r"memory=...\)` must be at least 128"):
         model_of(memory=127)
@@ -259,16 +256,10 @@ def test_centers_are_directions_in_the_closed_ball() -> None:
 def test_what_was_tuned_holds_for_as_many_streams_and_outputs_alone() -> None:
     x, y = data(30)
     tuned = st.StaFRegressor(radius=0.4).tune(x, y)
-    found = tuned._tuning
-    assert found is not None
-    for robust in (None, 3.0):
-        tuned.set_params(robust=robust).fit(x, y)
-        definition = tuned._streams_.definition  # type: ignore[union-attr]
-        assert definition.robust == (math.inf if robust is None else robust)
-        assert torch.equal(definition.ratio, found.ratio)
-        assert torch.equal(tuned.centers_offsets_, definition.functions.offsets)
-        torch.testing.assert_close(tuned.centers_offsets_, found.radius[0] * st.rings(6))
-    tuned.set_params(robust=None)
+    assert tuned.tuning is not None
+    tuned.fit(x, y)
+    torch.testing.assert_close(tuned.centers_offsets_, tuned.tuning.radius[0] * st.rings(6))
+    assert torch.equal(tuned.state_dict()["ratio"], tuned.tuning.ratio)
     for of_x, of_y in ((x[:, None].repeat(1, 2, 1), y[:, None].repeat(1, 2)), (x, torch.stack((y, y), 1))):
         untuned = st.StaFRegressor(radius=0.4).fit(of_x, of_y)
         assert torch.equal(tuned.fit(of_x, of_y).predict(of_x[3]), untuned.predict(of_x[3]))
@@ -285,7 +276,7 @@ def test_a_filter_is_compiled_where_its_kernel_and_numbers_allow() -> None:
     ):
         model = st.StaFRegressor(kernel, 0.4, count)
         streams, offsets = filter_streams(model, Sizes(2, 2, 1), torch.zeros(0, dtype=dtype), False)
-        assert isinstance(streams._filter, CompiledFilter) == streams.compiled == compiled
+        assert streams.compiled == compiled
         assert streams.dtype == dtype
         assert offsets.shape == (count, 2)
 
@@ -294,6 +285,84 @@ def test_a_kernel_that_is_learned_elsewhere_asks_for_no_gradient_here() -> None:
     kernel = st.MaternKernel(2.5, torch.nn.Parameter(torch.tensor(0.8)))
     model = st.StaFRegressor(kernel, 0.4).partial_fit(tensor([0.3, 0.1]), tensor(1.0))
     assert not any(part.requires_grad for part in model.predict(tensor([0.3, 0.2]), return_std=True))
-    functions = model._streams_.definition.functions  # type: ignore[union-attr]
-    assert functions.shared is not None
-    assert not functions.shared.requires_grad
+    assert not any(part.requires_grad for part in model.state_dict().values() if hasattr(part, "dtype"))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"kernel": "cubic"}, "kernel.*must be one of"),
+        ({"kernel": st.GaussianKernel(tensor([1.0, 2.0]))}, "kernel.*one value a hyperparameter"),
+        ({"radius": 0.0}, "radius.*must be positive"),
+        (
+            {"radius": 0.5, "kernel": st.GaussianKernel(0.015)},
+            "radius.*GaussianKernel does not overflow.*0.5",
+        ),
+        ({"count": 0}, "count.*at least 1"),
+        ({"noise": 1e-9}, "noise.*at least"),
+        ({"amplitude": -1.0}, "amplitude.*must be positive"),
+        ({"forgetting": 1.5}, r"forgetting.*in \(0, 1\]"),
+        ({"follow": -1.0}, "follow.*must not be negative"),
+    ],
+)
+def test_bad_arguments_are_named(arguments: dict[str, object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        st.StaFRegressor(**arguments).partial_fit(tensor([0.0, 1.0]), 1.0)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("kernel", [*map(str, KERNELS), Cauchy()], ids=str)
+@pytest.mark.parametrize("dim", [1, 2, 4])
+def test_a_kernel_that_is_narrow_for_its_ball_is_told(
+    kernel: st.Kernel | str, dim: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Against the variance that is left by values at the centers, by dense algebra."""
+    told = []
+    for radius in (0.5, 1.5, 2.5, 4.0):
+        caplog.clear()
+        model = st.StaFRegressor(kernel, radius=radius)
+        model.partial_fit(torch.zeros(dim).double(), 1.0)
+        own = KERNELS[kernel]().double() if isinstance(kernel, str) else kernel.double()
+        centers, points = model.centers_offsets_, model.centers_offsets_ / 2
+        cross, gram = own(points, centers), own(centers, centers)
+        known = cross @ torch.linalg.pinv(gram, rtol=1e-12, hermitian=True) @ cross.mT
+        share = float((known.diagonal() / own(points, points).diagonal()).min())
+        told.append(bool(caplog.messages))
+        assert told[-1] == (share < 0.5)
+        if told[-1]:
+            assert caplog.messages[0].startswith(f"`StaFRegressor(radius={radius:g})`: half way to a center")
+            assert f"explain {share:.2g} of the variance" in caplog.messages[0]
+    assert told == ([False] * 4 if kernel == "polynomial" else [False, False, told[2], True])
+
+
+@pytest.mark.parametrize("centers", [st.rings(6), st.simplex(2), torch.zeros(1, 2).double()])
+def test_a_kernel_that_is_zero_at_its_anchor_is_looked_at_too(
+    centers: torch.Tensor, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Whatever it says at the origin, where it has no variance."""
+    for width, told in ((0.8, False), (0.05, True)):
+        caplog.clear()
+        kernel = st.AnchoredKernel(st.GaussianKernel(width))
+        st.StaFRegressor(kernel, radius=0.3, centers=centers).partial_fit(tensor([0.5, 0.5]), 1.0)
+        assert bool(caplog.messages) == (told and len(centers) > 1)
+
+
+def test_bad_samples_are_named() -> None:
+    model = st.StaFRegressor(Cauchy())
+    with pytest.raises(ValueError, match="needs a first sample"):
+        model.predict(tensor([0.0]))
+    with pytest.raises(ValueError, match=r"must have the shape \(n,\) or \(S, n\)"):
+        model.partial_fit(uniform(3, 2), uniform(4))
+    with pytest.raises(ValueError, match=r"params.*must be one of"):
+        model.set_params(width=1.0)
+    model.partial_fit(uniform(3, 2), uniform(3))
+    with pytest.raises(ValueError, match=r"must have the shape \(3, 2\).*got the shape \(4, 2\)"):
+        model.partial_fit(uniform(4, 2), uniform(4))
+    with pytest.raises(ValueError, match=r"predict.*must have the shape \(3, 2\)"):
+        model.predict(uniform(3, 5))
+    with pytest.raises(ValueError, match="array of numbers"):
+        model.predict("no")
+
+
+@pytest.mark.parametrize("dim", [1, 2, 3, 5])
+def test_as_many_directions_as_a_quadratic_function_has_numbers_by_default(dim: int) -> None:
+    assert directions(st.StaFRegressor(), dim).shape == ((dim + 1) * (dim + 2) // 2, dim)

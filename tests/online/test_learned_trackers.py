@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
 from staf_torch.online.bank import Bank
 from staf_torch.online.bank_rules import FADING, PLAIN, TURNED, TURNED_FADING, BankShape
 from staf_torch.online.learned_trackers import (
     Choice,
     Stretch,
-    learn_hyperparameters,
     likelihoods,
     search,
     sensitivity,
 )
+from staf_torch.online.tracker_models import TrackerModels
 
 
 def stretch(count: int, outputs: int = 1, noise: float = 0.1) -> Stretch:
@@ -65,95 +65,24 @@ def test_metric_counts_the_direction_in_which_the_function_changes() -> None:
     torch.testing.assert_close(metric.square().sum(), torch.tensor(2.0, dtype=torch.float64))
 
 
-def test_metric_of_a_constant_is_that_of_the_units() -> None:
-    s = stretch(40)
-    metric = sensitivity(s._replace(y=torch.zeros_like(s.y)), search(s))
-    torch.testing.assert_close(metric, torch.eye(2, dtype=torch.float64))
-
-
 def test_compiled_bank_chooses_what_the_definition_does() -> None:
     shape, s = BankShape(2, 2, 128, 8), stretch(40, outputs=2)
-    fast, slow = Bank(shape, 1, True), Bank(shape, 1, True)
+    fast, slow = Bank(shape, 1, True), Bank(shape, 1, True, compile=False)
     if not fast.compiled:
         pytest.skip("needs a C++ compiler")
-    slow._run = None
     for x, y in zip(s.at[:, None], s.y[:, None], strict=True):
         slow.table.copy_(fast.table)
         fast.learn(x.contiguous(), y.contiguous())
     slow.learn(s.at[-1:], s.y[-1:])
-    found, expected = (bank._definition.each(bank.table)[0] for bank in (fast, slow))
+    found, expected = (bank.definition.each(bank.table)[0] for bank in (fast, slow))
     for name in ("tracker_rate", "tracker_noise", "tracker_forgetting", "metric"):
         torch.testing.assert_close(found[name], expected[name], rtol=1e-6, atol=1e-9)
     lanes = [TURNED, PLAIN, FADING, TURNED_FADING]
-    at_first = Bank(shape, 1, True)._definition.each(fast.table.clone())[0]
-    fast._definition.clear(at_first)
+    at_first = Bank(shape, 1, True).definition.each(fast.table.clone())[0]
+    fast.definition.clear(at_first)
     changed = found["tracker_rate"] != at_first["tracker_rate"]
     assert changed[lanes].all()
     assert int(changed.sum()) == 4
-
-
-def by_hand(s: Stretch) -> dict[str, tuple[float, float, float]]:
-    """Rate, noise and fade of the four by grids that are written out: the same search, in NumPy."""
-
-    def score(at: np.ndarray, rate: float, noise: float, fade: float) -> float:
-        apart = np.square(at[:, None] - at).sum(-1)
-        age = np.abs(when[:, None] - when)
-        gram = np.exp(-rate * apart - fade * age) + max(noise, 1e-7) * np.eye(len(at))
-        fits = (y * np.linalg.solve(gram, y)).sum(0)
-        return float(-0.5 * y.shape[1] * np.linalg.slogdet(gram)[1] - 0.5 * len(y) * np.log(fits).sum())
-
-    def best_of(at: np.ndarray, cases: list[tuple[float, float, float]]) -> tuple[float, float, float]:
-        return max(cases, key=lambda case: score(at, *case))
-
-    def around(at: np.ndarray, best: tuple[float, float, float], *by: float) -> tuple[float, float, float]:
-        rate, noise, fade = best
-        wider, noisier = by
-        steps = [(a, b) for a in (0, -1, 1) for b in (0, -1, 1)]
-        return best_of(at, [(rate / wider ** (2 * a), noise * noisier**b, fade) for a, b in steps])
-
-    def plain(at: np.ndarray) -> tuple[float, float, float]:
-        widths = [2.0**k for k in range(-2, 6)]  # in sqrt(n)
-        rates = [1 / (2 * at.shape[1] * width**2) for width in widths]
-        best = best_of(at, [(rate, noise, 0.0) for rate in rates for noise in (1e-6, 1e-4, 1e-2, 0.3)])
-        return around(at, around(at, best, math.sqrt(2), 10.0), 2**0.25, math.sqrt(10))
-
-    def fading(at: np.ndarray, best: tuple[float, float, float]) -> tuple[float, float, float]:
-        rate, noise, _ = best
-        fades = (5e-4, 5e-3, 1.5e-2, 5e-2)
-        cases = [best, *((rate / by**2, noise / of, f) for by, of in ((1, 1), (2, 10)) for f in fades)]
-        return around(at, best_of(at, cases), 2.0, 10.0)
-
-    x, y, when = (part.numpy() for part in s)
-    first = plain(x)
-    turned = x @ sensitivity(s, Choice(*first, 0.0)).numpy()
-    second = plain(turned)
-    return {
-        "plain": first,
-        "turned": second,
-        "fading": fading(x, first),
-        "turned_fading": fading(turned, second),
-    }
-
-
-STRETCHES = {
-    "smooth": stretch(30, noise=0.03),
-    "noise alone": stretch(30, outputs=2, noise=20.0),
-    "no noise": stretch(30, noise=0.0),
-    "slow": stretch(30, noise=0.01)._replace(at=0.05 * stretch(30).at),
-    "fast": stretch(30, noise=0.01)._replace(at=9.0 * stretch(30).at),
-    "a walk": stretch(30)._replace(y=stretch(30).at.cumsum(0)),
-    "a fast walk": stretch(30)._replace(y=stretch(30).at.cumsum(0), when=4.0 * stretch(30).when),
-}
-
-
-@pytest.mark.parametrize("name", STRETCHES)
-def test_what_is_chosen_is_what_the_grids_written_out_say(name: str) -> None:
-    s = STRETCHES[name]
-    found, wanted = learn_hyperparameters(s), by_hand(s)
-    for kind, (rate, noise, fade) in wanted.items():
-        choice = getattr(found, kind)
-        assert choice[:3] == pytest.approx((rate, max(noise, 1e-7), fade), rel=1e-9), kind
-    torch.testing.assert_close(found.metric, sensitivity(s, found.plain))
 
 
 def test_the_metric_is_the_mean_outer_product_of_gradients_and_a_tenth_of_its_trace() -> None:
@@ -170,3 +99,89 @@ def test_the_metric_is_the_mean_outer_product_of_gradients_and_a_tenth_of_its_tr
     metric = sensitivity(s, c)
     torch.testing.assert_close(metric @ metric.mT, wanted)
     assert not metric.triu(1).any()
+
+
+RATE = torch.tensor([0.5, 2.0], dtype=torch.float64)
+NOISE = torch.tensor([0.01, 0.1], dtype=torch.float64)
+JITTER, WRONG = 1e-6, 0.1
+
+
+def empty(places: int, dim: int = 2, outputs: int = 1) -> TrackerModels:
+    size = places * (places + 1) // 2
+    shapes = (places, dim, 2), (outputs, places, 2), (size, 2), (size, 2), (3, 2)
+    return TrackerModels(*(torch.zeros(shape, dtype=torch.float64) for shape in shapes))
+
+
+def learn(models: TrackerModels, x: Tensor, y: Tensor, share: float = 1.0) -> None:
+    for point, value in zip(x, y, strict=True):
+        models.learn(
+            point[:, None], value, RATE, NOISE, torch.full((2,), share, dtype=torch.float64), JITTER, WRONG
+        )
+
+
+def samples(count: int) -> tuple[Tensor, Tensor]:
+    x = torch.randn(count, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    return x, torch.stack(((2 * x[:, 0]).sin(), x[:, 1] ** 2), -1)
+
+
+def test_with_room_for_all_samples_it_is_the_gaussian_process() -> None:
+    (x, y), models = samples(20), empty(32, outputs=2)
+    learn(models, x, y)
+    at = torch.tensor([0.3, -0.2], dtype=torch.float64)
+    mean, variance = models.predict(at[:, None], RATE, NOISE, JITTER)
+    for lane in range(2):
+        gram = (-RATE[lane] * torch.cdist(x, x).square()).exp()
+        gram += (JITTER + NOISE[lane]) * torch.eye(20, dtype=torch.float64)
+        k = (-RATE[lane] * (x - at).square().sum(-1)).exp()
+        solved = torch.linalg.solve(gram, torch.cat((y, k[:, None]), 1))
+        torch.testing.assert_close(mean[:, lane], k @ solved[:, :2], rtol=1e-6, atol=1e-8)
+        expected = 1 + JITTER + NOISE[lane] - k @ solved[:, 2]
+        torch.testing.assert_close(variance[lane], expected, rtol=1e-6, atol=1e-8)
+
+
+def test_full_process_keeps_its_size_and_what_matters() -> None:
+    (x, y), models = samples(150), empty(24, outputs=2)
+    learn(models, x, y)
+    assert models.counts[1].max() <= 23
+    errors = torch.stack(
+        [models.predict(p[:, None], RATE, NOISE, JITTER)[0][:, 0] - v for p, v in zip(x, y, strict=True)]
+    )
+    assert errors.square().mean().sqrt() < 0.6 * y.std()
+    inverse = torch.zeros(24, 24, dtype=torch.float64)
+    first, second = torch.tril_indices(24, 24)
+    inverse[first, second] = inverse[second, first] = models.inverse[:, 1]
+    kept = inverse.diagonal() > 0
+    points = models.points[kept][..., 1]
+    gram = (-RATE[1] * torch.cdist(points, points).square()).exp()
+    identity = torch.eye(len(points), dtype=torch.float64)
+    torch.testing.assert_close(
+        inverse[kept][:, kept] @ (gram + JITTER * identity), identity, rtol=0, atol=1e-6
+    )
+
+
+def test_sample_that_is_known_takes_no_place_and_still_teaches() -> None:
+    models, x = empty(16), torch.zeros(40, 2, dtype=torch.float64)
+    learn(models, x, torch.ones(40, 1, dtype=torch.float64))
+    assert models.counts[1].tolist() == [1.0, 1.0]
+    assert models.counts[2].tolist() == [2.0, 2.0]  # the place in use and the next are checked in turn
+    mean, variance = models.predict(x[0][:, None], RATE, NOISE, JITTER)
+    assert (mean - 1).abs().max() < 0.01
+    assert ((variance - NOISE) < NOISE / 30).all()
+
+
+def test_what_was_learned_fades_to_nothing() -> None:
+    (x, y), models = samples(10), empty(16, outputs=2)
+    learn(models, x, y)
+    learn(models, x[:1] + 100, y[:1], share=1e-12)
+    mean, variance = models.predict(x[3][:, None], RATE, NOISE, JITTER)
+    assert mean.abs().max() < 1e-5
+    torch.testing.assert_close(variance, 1 + JITTER + NOISE)
+
+
+def test_process_whose_inverse_has_drifted_begins_anew() -> None:
+    (x, y), models = samples(10), empty(16, outputs=2)
+    learn(models, x, y)
+    models.inverse[:, 0] *= 1.5
+    learn(models, x[:9] + 5, y[:9])
+    assert models.counts[1, 0] < 10
+    assert models.counts[1, 1] == 15

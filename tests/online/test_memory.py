@@ -2,21 +2,14 @@
 
 from __future__ import annotations
 
-import csv
-import json
 import math
-from pathlib import Path
 
-import composing
 import pytest
 import torch
 from helpers import basis_of, tensor, uniform
-from omegaconf import DictConfig
 from torch import Tensor
 
 import staf_torch as st
-from staf_torch.experiments import memory as experiment
-from staf_torch.experiments.registry import EXPERIMENTS
 
 V = st.targets.Paper()
 
@@ -101,15 +94,6 @@ def test_fresher_model_takes_the_place_of_the_stale_one() -> None:
     assert float((memory.query(y) - V(y)).abs().max()) < 0.01
 
 
-def test_last_model_is_refreshed_while_the_state_stays() -> None:
-    basis, x = basis_of("gaussian", radius=0.1), tensor([1.0, 0.0])
-    memory = st.ExperienceMemory(basis, 5)
-    for share in (0.0, 0.5, 1.0):
-        memory.add(x, share * basis.local(x).fit(basis.values(x, V)))
-    assert int(memory.count) == 1
-    assert abs(float(memory.query(x.unsqueeze(0)) - V(x))) < 1e-3
-
-
 def test_every_row_has_a_memory_of_its_own() -> None:
     basis, x = (
         basis_of("exponential", radius=0.1),
@@ -166,48 +150,6 @@ def test_bad_arguments_are_named() -> None:
         memory.add(uniform(2, 2), uniform(2, 3))
 
 
-def settings(*overrides: str) -> DictConfig:
-    small = ["memory.states=20", "memory.revisits=4", "memory.steps=20", "settle_time=2", "duration=4"]
-    return composing.settings("experiment=memory", *small, *overrides)
-
-
-def test_revisited_region_settles_in_one_step_from_the_memory(tmp_path: Path) -> None:
-    assert "memory" in EXPERIMENTS
-    metrics = experiment.run(settings("figures=false"), tmp_path)
-    assert json.loads((tmp_path / "metrics.json").read_text()) == metrics
-    found = {name: number for name, number in metrics.items() if number is not None}
-    assert found["revisit_steps_memory"] == 1
-    assert found["revisit_steps_carried"] > 5
-    assert found["revisit_steps_zero"] > 5
-    assert 100 * found["revisit_excess_memory"] < found["revisit_excess_carried"]
-    assert found["covered_fraction"] == 1
-    assert found["memory_max_error"] <= found["passing_max_error"]
-    assert 100 * found["memory_max_error"] < found["last_max_error"]
-    assert len(list(csv.DictReader((tmp_path / "memory.csv").read_text().splitlines()))) == 1
-    assert "carried weights" in (tmp_path / "memory.md").read_text()
-
-
-def test_common_settings_hold(tmp_path: Path) -> None:
-    overrides = ["trajectories=2", "kernel=gaussian", "centers.radius=0.2", "duration=7", "figures=false"]
-    metrics = experiment.run(settings(*overrides, "dt=0.05", "memory.capacity=16"), tmp_path)
-    assert metrics["models"] == 16
-    assert not (tmp_path / "figures").exists()
-
-
-@pytest.mark.parametrize(
-    ("override", "message"),
-    [
-        ("memory.capacity=0", r"memory\.capacity.*at least 1"),
-        ("memory.reach=-1", r"memory\.reach.*must be positive"),
-        ("settle_time=100", r"settle_time.*within the duration"),
-    ],
-)
-def test_bad_settings_are_named(override: str, message: str, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=message):
-        experiment.run(settings(override), tmp_path)
-    assert not list(tmp_path.iterdir())
-
-
 def noisy_laps(laps: int, scale: float, visits: int = 64) -> float:
     """Error of memories that met two places in turn so often, each model with noise of its own."""
     basis, x = basis_of("gaussian", radius=0.1), circle(30)[:16].view(8, 2, 2)
@@ -236,3 +178,120 @@ def test_average_begins_anew_where_the_function_drifts() -> None:
             noise = 1e-3 * uniform(6, seed=lap)
             memory.add(state, basis.local(state).fit(share * basis.values(state, V) + noise))
     assert float((memory.query(x) + V(x)).abs().max()) < 0.01
+
+
+RADIUS = 0.1
+BASIS = st.StaFBasis(st.PolynomialKernel(2), st.StateFollowingCenters(st.rings(6), RADIUS))
+
+
+def at(*places: float) -> Tensor:
+    """States on the first axis."""
+    return torch.stack([tensor([place, 0.0]) for place in places])
+
+
+def model(x: Tensor, values: Tensor | float) -> Tensor:
+    """Coefficients whose values at the centers of x are these."""
+    return BASIS.local(x).fit(torch.zeros(6, dtype=torch.float64) + values)
+
+
+def memory_of(*places: float, capacity: int = 5, **given: float) -> st.ExperienceMemory:
+    """Constants 1, 2, ... at these places."""
+    memory = st.ExperienceMemory(BASIS, capacity, **given)  # type: ignore[arg-type]
+    for value, x in enumerate(at(*places), 1):
+        memory.add(x, model(x, float(value)))
+    return memory
+
+
+@pytest.mark.parametrize("reach", [1.0, 2.0, 3.5])
+def test_models_are_weighed_by_their_distance(reach: float) -> None:
+    memory = memory_of(0.0, 0.08, 0.3, reach=reach)
+    y = torch.cat((at(0.0, 0.01, 0.05, 0.0801, 0.15), tensor([[0.02, 0.06]])))
+    t = (y[:, None] - at(0.0, 0.08, 0.3)).square().sum(-1) / (reach * RADIUS) ** 2
+    weights = (1 - t).clamp(min=0.0) ** 3 / (t + 1e-4) ** 2
+    wanted = (weights * tensor([1.0, 2.0, 3.0])).sum(-1) / weights.sum(-1)
+    torch.testing.assert_close(memory.query(y), wanted, rtol=1e-9, atol=1e-9, equal_nan=True)
+    assert memory.covered(y).tolist() == (t < 1).any(-1).tolist()
+    edge = at(-reach * RADIUS * (1 - 1e-12), -reach * RADIUS * (1 + 1e-12))
+    assert memory.covered(edge).tolist() == [True, False]
+    assert memory.query(edge).isnan().tolist() == [False, True]
+    assert torch.equal(memory(y), memory.query(y)) or bool(memory.query(y).isnan().any())
+
+
+def places(memory: st.ExperienceMemory) -> list[float | None]:
+    """The states kept, place by place."""
+    pairs = zip(memory.states[:, 0].tolist(), memory.stored.tolist(), strict=True)
+    return [round(x, 6) if stored else None for x, stored in pairs]
+
+
+def test_a_model_follows_the_state_for_half_of_the_spacing_and_is_left_alone_then() -> None:
+    memory = memory_of(0.0)  # models are at least .05 apart
+    for place, kept in (
+        (0.0249, [0.0249]),  # still
+        (0.0251, [0.0249]),  # left alone
+        (-0.0249, [-0.0249]),
+        (0.0, [0.0]),
+        (0.0499, [0.0]),
+        (0.0501, [0.0, 0.0501]),
+        (0.0749, [0.0, 0.0749]),
+        (0.0001, [0.0, 0.0749]),  # a revisit: a fresher model at the old state
+        (0.0252, [0.0, 0.0749]),
+    ):
+        x = at(place)[0]
+        memory.add(x, model(x, 5.0))
+        assert [each for each in places(memory) if each is not None] == kept, place
+    assert int(memory.count) == 2
+    assert places(memory)[2:] == [None] * 3
+    before = places(memory)
+    memory.add(tensor([9.0, torch.nan]), model(at(0.0)[0], 1.0))
+    memory.add(tensor([9.0, 0.0]), torch.full((6,), torch.inf, dtype=torch.float64))
+    assert places(memory) == before
+    assert int(memory.latest) == 0
+
+
+@pytest.mark.parametrize(
+    ("kept", "given_up"),
+    [
+        ((0.0, 0.06, 0.2), 1),
+        ((0.06, 0.0, 0.2), 0),
+        ((0.2, 0.0, 0.06), 2),
+        ((0.5, 0.0, 0.06, 0.7, 0.2), 2),
+        ((0.0, 0.3, 0.36, 0.5), 2),
+        ((0.0, 0.2, 0.26, 0.5), 1),
+    ],
+)
+def test_of_the_closest_pair_the_one_with_the_closer_second_neighbour_is_given_up(
+    kept: tuple[float, ...], given_up: int
+) -> None:
+    memory = memory_of(*kept, capacity=len(kept))
+    assert places(memory) == list(kept)
+    x = at(3.0)[0]
+    memory.add(x, model(x, 9.0))
+    assert places(memory) == [3.0 if slot == given_up else place for slot, place in enumerate(kept)]
+    two = memory_of(0.0, 1.0, capacity=2).add(x, model(x, 9.0))
+    assert sorted(each for each in places(two) if each is not None)[-1] == 3.0
+
+
+def test_a_start_is_nothing_where_nothing_is_remembered_and_the_nearest_beyond_a_support() -> None:
+    memory = memory_of(0.0, 0.3, reach=1.0)
+    x = at(0.0, 0.09, 0.15, 0.25)
+    found = memory.start(x)
+    assert found.isnan().all(-1).tolist() == [False, False, True, False]
+    for state, coefficients, value in zip(x, found, (1.0, 1.0, None, 2.0), strict=True):
+        if value is not None:
+            torch.testing.assert_close(coefficients, model(state, value), rtol=1e-6, atol=1e-6)
+            torch.testing.assert_close(memory.start(state), coefficients, rtol=1e-9, atol=1e-9)
+    slope = memory.gradient(at(0.02))
+    torch.testing.assert_close(slope, torch.zeros_like(slope), rtol=0, atol=1e-7)
+
+
+def test_points_of_another_shape_are_refused_by_name() -> None:
+    memory = memory_of(0.0)
+    for wrong in (torch.zeros(3).double(), torch.zeros(4, 3).double(), torch.zeros(()).double()):
+        with pytest.raises(ValueError, match=r"`ExperienceMemory.start\(x=...\)` must"):
+            memory.start(wrong)
+    for wrong in (torch.zeros(2).double(), torch.zeros(4, 3).double(), torch.zeros(()).double()):
+        for call in (memory.query, memory.covered):
+            with pytest.raises(ValueError, match=r"`ExperienceMemory\(y=...\)` must"):
+                call(wrong)
+    assert memory.start(torch.zeros(2).double()).shape == (6,)
+    assert memory.query(torch.zeros(1, 2).double()).shape == (1,)

@@ -9,7 +9,8 @@ import pickle
 import numpy as np
 import pytest
 import torch
-from helpers import tensor, uniform
+from helpers import changed, tensor, uniform
+from helpers_streams import MODELS, hard_stream
 from torch import Tensor
 from variants import KERNELS, over
 
@@ -38,6 +39,14 @@ def learned(model: st.StaFRegressor, x: Tensor, y: Tensor) -> st.StaFRegressor:
     for state, value in zip(x, y, strict=True):
         model.partial_fit(state, value)
     return model
+
+
+def assert_same(model: st.StaFRegressor, other: st.StaFRegressor, x: Tensor, tolerance: float) -> None:
+    """Mean and deviation around the latest centers, which all that was learned decides."""
+    points = x.unsqueeze(-2) + 0.2 * st.rings(6)
+    pairs = zip(*(each.predict(points, return_std=True) for each in (model, other)), strict=True)
+    for found, expected in pairs:
+        torch.testing.assert_close(found, expected, rtol=tolerance, atol=tolerance)
 
 
 @over(KERNELS, "kernel")
@@ -87,7 +96,7 @@ def test_around_one_anchor_the_filter_is_gaussian_process_regression(kernel: str
     filter_ = LocalFilter(frame, tensor([ratio]), tensor([1.0]), slack=1.0)
     filter_.learn(state, SEVERAL[:, :1].mT, tensor([[0.0]]))  # the first sample says where the centers are
     parts = state.parts(state.table)
-    nothing = parts._replace(mean=torch.zeros_like(parts.mean), learned=torch.zeros_like(parts.learned))
+    nothing = changed(parts, mean=torch.zeros_like(parts.mean), learned=torch.zeros_like(parts.learned))
     state.put(state.whole(nothing))
     for k in range(20):
         filter_.learn(state, (SEVERAL[:, :1] + z[:, k : k + 1]).mT, y[k : k + 1, None])
@@ -180,10 +189,7 @@ def test_prediction_before_a_sample_changes_nothing_of_what_is_learned(kernel: s
         else:
             asked.partial_fit(state, value)
         plain.partial_fit(state, value)
-    torch.testing.assert_close(asked._streams_.state.mean, plain._streams_.state.mean, rtol=1e-8, atol=1e-8)
-    torch.testing.assert_close(
-        asked._streams_.state.learned, plain._streams_.state.learned, rtol=1e-8, atol=1e-8
-    )
+    assert_same(asked, plain, x[-1], tolerance=1e-8)
 
 
 @pytest.mark.needs_compiler
@@ -205,38 +211,26 @@ def test_what_was_learned_fades_alike_beside_streams_that_skip() -> None:
     for forgetting in (0.999, 0.6):
         whole = learned(st.StaFRegressor(radius=0.3, noise=0.05, forgetting=forgetting), x, y)
         beside = learned(st.StaFRegressor(radius=0.3, noise=0.05, forgetting=forgetting), x, broken)
-        for name in ("mean", "learned"):
-            found, expected = (
-                getattr(beside._streams_.state, name)[..., 0],
-                getattr(whole._streams_.state, name)[..., 0],
-            )
-            torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-10)
+        pairs = zip(*(model.predict(x[-1], return_std=True) for model in (beside, whole)), strict=True)
+        for found, expected in pairs:
+            torch.testing.assert_close(found[0], expected[0], rtol=1e-9, atol=1e-10)
 
 
 def test_skipped_sample_leaves_the_stream_as_it_was() -> None:
     x, y = walks(2, 30)
     model = learned(st.StaFRegressor(radius=0.3), x, y)
-    before = copy.deepcopy(model._streams_.state)
+    before = copy.deepcopy(model)
     model.partial_fit(torch.full_like(x[0], torch.nan), y[0], lapse=0.0)
-    for name in ("anchor", "mean", "learned"):
-        assert torch.equal(getattr(before, name), getattr(model._streams_.state, name))
+    assert_same(model, before, x[3] + 0.1, tolerance=0.0)
 
 
 def test_nothing_winds_up_in_a_stream_that_stands_still() -> None:
     model = st.StaFRegressor(radius=0.3, forgetting=0.9)
     for k in range(1500):
         model.partial_fit(tensor([0.3, 0.1]), tensor(1.0 + 0.01 * (-1) ** k))
-    values = torch.linalg.eigvalsh(model._streams_.state.learned[..., 0])
-    assert float(values.min()) >= -1e-12
-    assert float(values.max()) <= 1 + 1e-12
-    assert abs(float(model.predict(tensor([0.3, 0.1]))) - 1) < 0.02
-
-
-def test_memory_does_not_grow_with_the_stream() -> None:
-    x, y = walks(3, 80)
-    model = learned(st.StaFRegressor(radius=0.3, count=3), x[:2], y[:2])
-    size = len(pickle.dumps(model))
-    assert len(pickle.dumps(learned(model, x[2:], y[2:]))) == size
+    mean, deviation = model.predict(tensor([0.3, 0.1]), return_std=True)
+    assert abs(float(mean) - 1) < 0.02
+    assert 0 < float(deviation) < 0.1
 
 
 @pytest.mark.parametrize("jump", [3.0, 30.0])
@@ -291,15 +285,6 @@ def test_arrays_give_arrays_and_every_point_of_a_stream_can_be_asked_for() -> No
     assert single.predict(x[:0, 0]).shape == (0,)
 
 
-@pytest.mark.parametrize("base", [0.25, 4.0])
-def test_before_the_first_sample_the_variance_is_that_of_the_process(base: float) -> None:
-    filter_ = LocalFilter(frame_of("gaussian"), tensor([0.5]), tensor([1.0]), slack=1.0, base=base)
-    state = StreamState.empty(torch.zeros(0).double(), 1, 2, 6, 1)
-    mean, deviation = filter_.predict(state, tensor([[0.3, 0.1]]))
-    assert float(mean) == 0
-    assert float(deviation) == pytest.approx(math.sqrt(1.5 * base))
-
-
 @pytest.mark.parametrize("amplitude", [0.5, 3.0])
 def test_a_stream_without_a_sample_has_the_deviation_of_the_process_and_its_noise(amplitude: float) -> None:
     model = st.StaFRegressor(radius=0.4, noise=0.3, amplitude=amplitude)
@@ -310,10 +295,22 @@ def test_a_stream_without_a_sample_has_the_deviation_of_the_process_and_its_nois
     assert float(deviation[1]) == pytest.approx(math.sqrt(amplitude**2 + 0.3**2))
 
 
-def test_a_learned_kernel_is_taken_as_it_is_and_learns_nothing_here() -> None:
-    kernel = st.GaussianKernel(torch.nn.Parameter(torch.tensor(0.8)))
-    model = st.StaFRegressor(kernel, 0.4).partial_fit(tensor([0.3, 0.1]), tensor(1.0))
-    mean, deviation = model.predict(tensor([0.3, 0.2]), return_std=True)
-    assert not mean.requires_grad
-    assert not deviation.requires_grad
-    assert kernel.width.requires_grad
+ACCURACY = {  # root mean square of errors up to 2, and of errors in deviations up to 5
+    "filter": (0.8397, 1.2769),
+    "filter of a kernel": (0.7459, 1.3232),
+    "tuned filter": (0.8952, 1.4110),
+    "bank": (0.6222, 1.1728),
+}
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_accuracy_on_a_hard_stream_is_as_measured(name: str) -> None:
+    """To 3 %: single predictions after many samples hang on the order of sums, their mean does not."""
+    (x, y), model, found = hard_stream(330), MODELS[name](), []
+    for k in range(330):
+        if k >= 30 and not y[k].isnan():
+            mean, deviation = model.predict(x[k], return_std=True)
+            square = (mean - y[k]).square()
+            found.append(torch.stack((square.clamp(max=4.0), (square / deviation**2).clamp(max=25.0))))
+        model.partial_fit(x[k], y[k])
+    assert torch.stack(found).mean(0).sqrt().tolist() == pytest.approx(ACCURACY[name], rel=0.03)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from staf_torch.online.samples import lapse_of, lapses, like_given, pair, tensor_of
+from staf_torch.online.samples import lapse_of, lapses, pair, tensor_of
 
 
 @pytest.mark.parametrize(
@@ -30,13 +30,6 @@ def test_a_value_keeps_its_floats_and_integers_become_double(value: Any, dtype: 
     assert found.dtype == dtype
     assert found.tolist() == [1.0, 2.0]
     assert not found.requires_grad
-
-
-def test_an_array_is_read_in_place_unless_it_is_not_to_be_written() -> None:
-    array = np.array([1.0, 2.0])
-    assert tensor_of("call", "x", array).data_ptr() == array.ctypes.data
-    array.flags.writeable = False  # of which torch would warn
-    assert tensor_of("call", "x", array).data_ptr() != array.ctypes.data
 
 
 class Sparse:
@@ -188,10 +181,3 @@ def test_a_lapse_that_is_no_time_is_refused(lapse: Any) -> None:
     rule = r"`StaFRegressor.partial_fit\(lapse=...\)` must be finite and not negative, \(\) or \(3,\);"
     with pytest.raises(ValueError, match=rule):
         lapse_of(lapse, 3)
-
-
-def test_tensors_are_answered_by_tensors_and_all_else_by_arrays() -> None:
-    found = torch.ones(2)
-    assert like_given(torch.zeros(1), found) is found
-    for given in (np.zeros(1), [0.0], 1.0):
-        assert isinstance(like_given(given, found), np.ndarray)

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import math
 import pickle
 
+import numpy as np
 import pytest
 import torch
+from helpers import tensor
 from torch import Tensor
 
 import staf_torch as st
-from staf_torch.online import tuning
-from staf_torch.online.tuning import _log_density
+from staf_torch.online.filter_streams import total, units_of
 
 
 def drawn(width: Tensor, noise: float, steps: int = 220, seed: int = 0) -> tuple[Tensor, Tensor]:
@@ -47,7 +49,7 @@ def test_tuned_regressor_predicts_as_one_that_knows_what_the_stream_was_drawn_wi
 def test_each_coordinate_and_each_stream_has_its_own_width() -> None:
     along = [drawn(torch.tensor(w).double(), 0.05) for w in ([0.5, 50.0], [50.0, 0.5])]
     x, y = (torch.stack([pair[k] for pair in along], 1) for k in range(2))
-    found = st.StaFRegressor().tune(x, y)._tuning
+    found = st.StaFRegressor().tune(x, y).tuning
     assert found is not None
     assert float(found.spread[0, 1]) > 1.5 * float(found.spread[0, 0])
     assert float(found.spread[1, 0]) > 1.5 * float(found.spread[1, 1])
@@ -57,27 +59,12 @@ def test_streams_that_drift_forget_and_others_do_not() -> None:
     x, y = drawn(torch.tensor([0.7, 0.7]).double(), 0.05)
     drift = y + (0.15 * torch.arange(len(y), dtype=torch.float64)).sin() * x[:, 0]
     tuned = st.StaFRegressor().tune(x[:, None].expand(-1, 2, -1), torch.stack((y, drift), 1))
-    found = tuned._tuning
+    found = tuned.tuning
     assert found is not None
     gains = (1 - found.forgetting) / found.ratio  # what a stream forgets between samples beside their noise
     assert float(gains[1]) > 3 * float(gains[0])
     never = st.StaFRegressor(st.GaussianKernel(0.7), 0.35, noise=0.05, forgetting=1.0)
     assert errors(st.StaFRegressor().tune(x, drift), x, drift) < 0.85 * errors(never, x, drift)
-
-
-def test_settings_of_a_regressor_that_nobody_tuned_are_among_the_candidates(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """So that what is tuned is never less likely on its stretch; here every other candidate is a poor one."""
-    for name, poor in (("WIDTHS", (300.0,)), ("NOISES", (3.0,)), ("FORGETTING", (0.5,)), ("ROUNDS", ())):
-        monkeypatch.setattr(tuning, name, poor)
-    x, y = drawn(torch.tensor([0.7, 0.7]).double(), 0.05, steps=90)
-    found = st.StaFRegressor().tune(x, y)._tuning
-    assert found is not None
-    default = st.StaFRegressor()
-    assert abs(float(found.ratio[0]) - default.noise**2) < 1e-15
-    assert float(found.forgetting[0]) == default.forgetting
-    assert torch.equal(found.width[0], torch.ones(2).double())
 
 
 def test_tuning_knows_no_units_and_is_saved_with_what_was_learned() -> None:
@@ -98,7 +85,7 @@ def test_tuning_knows_no_units_and_is_saved_with_what_was_learned() -> None:
 
 def test_there_is_nothing_to_tune_in_the_accurate_mode() -> None:
     x, y = drawn(torch.tensor([0.7, 0.7]).double(), 0.1, steps=30)
-    assert st.StaFRegressor(memory=128).tune(x, y)._tuning is None
+    assert st.StaFRegressor(memory=128).tune(x, y).tuning is None
     with pytest.raises(ValueError, match=r"tune.*must have the shape"):
         st.StaFRegressor().tune(x[:, 0], y)
 
@@ -110,18 +97,16 @@ def test_tuned_streams_keep_their_hyperparameters_when_others_go_and_come() -> N
     tuned = st.StaFRegressor().tune(x, y)
     again = pickle.loads(pickle.dumps(tuned))  # before the first sample too
     for model in (tuned, again):
-        model.fit(x, y).drop([0]).add(1).reset(streams=[1])
+        model.fit(x, y).drop([1]).add(1).reset(streams=[0])
     assert torch.equal(tuned.predict(x[3]), again.predict(x[3]))
     other = st.StaFRegressor().load_state_dict(tuned.state_dict())
-    order = [1, 2, 0]
-    alone = st.StaFRegressor()
-    alone._tuning = None if tuned._tuning is None else tuned._tuning.keep(torch.tensor([1]))
+    order, alone = [0, 2, 1], st.StaFRegressor().tune(x[:, :1], y[:, :1])
     for k in range(60):
         for model in (tuned, other):
             model.partial_fit(x[k, order], y[k, order])
-        alone.partial_fit(x[k, 2:3], y[k, 2:3])
+        alone.partial_fit(x[k, :1], y[k, :1])
     assert torch.equal(tuned.predict(x[9, order]), other.predict(x[9, order]))
-    assert torch.equal(tuned.predict(x[9, order])[1], alone.predict(x[9, 2:3])[0])  # begun anew, still tuned
+    assert torch.equal(tuned.predict(x[9, order])[0], alone.predict(x[9, :1])[0])  # begun anew, still tuned
     assert float((tuned.predict(x[59, order]) - y[59, order])[2].abs()) < 1.0  # one that nobody tuned
 
 
@@ -147,8 +132,8 @@ def test_stretch_in_which_a_coordinate_hardly_moves_says_so_and_nothing_about_it
 def test_tuning_of_a_stream_is_the_same_whoever_is_beside() -> None:
     pairs = [drawn(torch.tensor([0.7, 0.7]).double(), 0.1, steps=60, seed=seed) for seed in range(7)]
     x, y = (torch.stack([pair[k] for pair in pairs], 1) for k in range(2))
-    together = st.StaFRegressor().tune(x, y)._tuning
-    alone = {k: st.StaFRegressor().tune(x[:, k], y[:, k])._tuning for k in (1, 6)}
+    together = st.StaFRegressor().tune(x, y).tuning
+    alone = {k: st.StaFRegressor().tune(x[:, k], y[:, k]).tuning for k in (1, 6)}
     assert together is not None
     for k, own in alone.items():
         assert own is not None
@@ -162,16 +147,6 @@ def test_samples_that_no_candidate_explains_do_not_choose() -> None:
     broken[torch.tensor([70, 71, 110])] += torch.tensor([40.0, -30.0, 40.0]).double()
     found = [errors(st.StaFRegressor().tune(x[:150], each[:150]), x, y) for each in (y, broken)]
     assert found[1] < 1.7 * found[0]  # 4.4 to 6.5 with a Gaussian density alone
-
-
-def test_density_of_zero_loses_against_one_that_is_not() -> None:
-    y = torch.tensor([[1.0], [1.0], [torch.nan], [0.5]]).double()
-    mean = torch.tensor([[0.9, 1e200], [1.0, torch.nan], [0.0, 1.0], [0.0, 0.0]]).double()
-    deviation = torch.tensor([[0.1, 1e-150], [0.1, 0.1], [0.1, 0.1], [0.0, 0.1]]).double()
-    found = _log_density(y, mean, deviation)
-    assert torch.isfinite(found).all()  # so that one sample throws no candidate away
-    assert (found[:2, 0] > found[:2, 1]).all()
-    assert found[2].tolist() == [0.0, 0.0]
 
 
 @pytest.mark.parametrize("tunes", [True, False])
@@ -199,7 +174,7 @@ def test_units_are_those_of_what_was_measured_of_each_coordinate() -> None:
     for k in range(2):
         x[k::3, k] = torch.nan  # of three samples one is complete
     model = st.StaFRegressor(scaling=True).fit(x, y)
-    center, spread = model._streams_.units[0].chunk(2)  # type: ignore[union-attr]
+    center, spread = model.state_dict()["units"][0].chunk(2)
     for k in range(2):
         seen = x[:40, k][~x[:40, k].isnan()]
         assert float((center[k] - seen.mean()).abs()) < 1e-9 * float(center[k])
@@ -219,12 +194,92 @@ def test_units_grow_with_a_coordinate_that_is_measured_every_second_time() -> No
     model = st.StaFRegressor(scaling=True)
     for k in range(120):
         model.partial_fit(x[k], y[k])
-    before = float(model._streams_.units[0, 4])
+    before = float(model.state_dict()["units"][0, 4])
     for k in range(120, 400):
         model.partial_fit(x[k], y[k])
-    assert float(model._streams_.units[0, 4]) > 10 * before
+    assert float(model.state_dict()["units"][0, 4]) > 10 * before
 
 
-def test_what_is_forgotten_is_a_share() -> None:
-    assert all(0 < each <= 1 for each in tuning.FORGETTING)
-    assert max(tuning.FORGETTING) == 1
+NAN, INF = math.nan, math.inf
+
+
+def numpy_units(columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and deviation of what is no further than 30 median deviations from the median."""
+    found = []
+    for column in columns.T:
+        seen = np.sort(column[~np.isnan(column)])
+        if not len(seen):
+            found.append((0.0, 1.0))
+            continue
+        away = np.abs(seen - seen[(len(seen) - 1) // 2])
+        typical = np.sort(away)[(len(away) - 1) // 2]
+        kept = seen[away <= 30 * typical] if typical else seen
+        mean, most = kept.mean(), np.abs(kept - kept.mean()).max() or 1.0
+        spread = most * np.sqrt(np.square((kept - mean) / most).mean())
+        found.append((mean, spread if spread > 1e-12 * abs(mean) else 1.0))
+    center, spread = zip(*found, strict=True)
+    return np.array(center), np.array(spread)
+
+
+def test_units_are_mean_and_deviation_of_what_is_usual() -> None:
+    draw = np.random.default_rng(0)
+    columns = {
+        "usual": 3 + 2 * draw.standard_normal(9),
+        "holes": np.where(np.arange(9) % 3 == 0, NAN, draw.standard_normal(9)),
+        "none": np.full(9, NAN),
+        "one": np.array([NAN] * 8 + [7.0]),
+        "constant": np.full(9, 1e9),
+        "zeros": np.zeros(9),
+        "two values": np.array([4.0] * 5 + [5.0] * 4),
+        "an outlier": np.array([*draw.uniform(-1, 1, 8), 1e6]),
+        "at the edge": np.array([-1.0, -1.0, -1.0, 0.0, 0.0, 0.0, 1.0, 1.0, 30.0]),
+        "beyond the edge": np.array([-1.0, -1.0, -1.0, 0.0, 0.0, 0.0, 1.0, 1.0, 30.001]),
+        "mostly the same": np.array([2.0] * 8 + [90.0]),
+        "huge": 1e300 * draw.standard_normal(9),
+        "tiny": 1e-300 * draw.standard_normal(9),
+        "hardly": 1e6 + 1.5e-6 * np.array([1, -1, 1, -1, 1, -1, 1, -1, 0.5]),
+        "too little": 1e6 + 0.5e-6 * np.array([1, -1, 1, -1, 1, -1, 1, -1, 0.5]),
+    }
+    for name, column in columns.items():
+        center, spread = units_of(torch.from_numpy(column)[:, None])
+        wanted = numpy_units(column[:, None])
+        np.testing.assert_allclose((center.numpy(), spread.numpy()), wanted, rtol=1e-6, err_msg=name)
+    whole = torch.from_numpy(np.stack(list(columns.values()), 1))
+    for together, alone in zip(
+        units_of(whole), zip(*map(units_of, whole.split(1, 1)), strict=True), strict=True
+    ):
+        assert torch.equal(together, torch.cat(alone))  # bits do not depend on what stands beside
+    torch.testing.assert_close(total(whole[:, :1]), whole[:, 0].sum()[None])
+
+
+@pytest.mark.parametrize("at", [5, 10, 40])
+@pytest.mark.parametrize("wrong", [False, True])
+def test_a_sample_that_comes_when_units_are_learned_is_counted_once(at: int, wrong: bool) -> None:
+    """The sample by which units are due is out of all proportion, or is not."""
+    time = 0.4 * torch.arange(at, dtype=torch.float64)
+    x, y = torch.stack((time.sin(), time.cos()), -1), 50 + (2 * time).sin()
+    y[at - 1] = 1e30 if wrong else y[at - 1]
+    model = st.StaFRegressor(scaling=True).fit(x, y)
+    assert int(model.n_samples_seen_) == at - wrong
+    assert int(model.n_skipped_) == int(wrong)
+    model.partial_fit(x[0], torch.tensor(torch.nan).double())
+    assert int(model.n_skipped_) == 1 + wrong
+    assert float(model.predict(x[1])) == pytest.approx(50, abs=1.5)
+
+
+def test_a_stream_that_is_reset_learns_its_units_anew_and_the_others_go_on() -> None:
+    draw = torch.Generator().manual_seed(2)
+    x = torch.rand(120, 2, 2, generator=draw, dtype=torch.float64).cumsum(0) * tensor([1.0, 30.0])
+    y = x.sin().sum(-1)
+    model, through, fresh = (st.StaFRegressor(scaling=True) for _ in range(3))
+    model.fit(x[:60], y[:60]).reset([0])
+    for k in range(60, 120):
+        model.partial_fit(x[k], y[k])
+    through.fit(x[:60], y[:60])
+    for k in range(60, 120):
+        through.partial_fit(x[k], y[k])
+        fresh.partial_fit(x[k], y[k])
+    point = x[-1]
+    found = model.predict(point)
+    torch.testing.assert_close(found[0], fresh.predict(point)[0])
+    torch.testing.assert_close(found[1], through.predict(point)[1])
