@@ -5,15 +5,13 @@ from __future__ import annotations
 import contextlib
 import copy
 import dataclasses
-import math
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
 import torch
-from hydra.errors import InstantiationException
+import yaml
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 from torch import Tensor, nn
 
 from .. import __version__
@@ -25,25 +23,18 @@ from ..deploy.sheet import Port
 from ..experiments.adp import learner
 from ..numerics.checks import fail, integer
 from ..results import run_record as records
-from ..results.archive import Archive
-from ..results.files import HISTORY
-from ..results.settings_file import read_settings
-from ..results.untrusted import UnreadableError
+from ..results.files import HISTORY, HYDRA
+from ..results.run_directory import History
+from ..results.untrusted import UnreadableError, read_bytes
 from ..settings.adp import adp_problem
 from ..settings.chase import chase_problem
-from ..settings.trust import checked, limited
+from ..settings.trust import foreign_settings, refusal
 from ..sweeps.hydra_compat import everything_trusted
 from ..systems import Units
 
 _POINTS = 1000
 _FOLLOWED = 500  # steps of a run that a learning controller is compared over
 _READ = ("state", "weights", "estimate", "actor_weights", "control")  # of the history
-_MOST_NUMBERS = 2**25  # of one trajectory
-_UNBUILDABLE = (
-    *(OmegaConfBaseException, InstantiationException, KeyError, IndexError, AttributeError, TypeError),
-    *(AssertionError, RuntimeError),
-)
-"""What settings of another version, or of nobody's, raise while they are built."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -114,19 +105,21 @@ def _opened(
     run: Path, row: int, tasks: Mapping[str, object], trust: bool
 ) -> Iterator[tuple[DictConfig, dict[str, np.ndarray], bool, str | None]]:
     """Context: settings in float64, history of one trajectory, whether it is as precise, and who wrote it."""
-    cfg = _settings(run, trust)
-    if cfg.get("task") not in tasks:
-        raise fail("staf-export", "RUN", f"must be a run of {' or '.join(tasks)}", cfg.get("task"))
     integer("staf-export", "row", row, least=0)
-    history = _history(run, row)
     record = records.read(run / records.RUN) or {}
     written_by = str(record["version"]) if record.get("version") is not None else None
     try:
+        cfg = _settings(run, trust)
+        if cfg.get("task") not in tasks:
+            raise fail("staf-export", "RUN", f"must be a run of {' or '.join(tasks)}", cfg.get("task"))
+        history = _history(run, row)
         precise = cfg.dtype == "float64"
         cfg.dtype, cfg.device = "float64", "cpu"
-        with everything_trusted() if trust else limited(f"What {run} describes"):
+        with everything_trusted() if trust else contextlib.nullcontext():
             yield cfg, history, precise, written_by
-    except _UNBUILDABLE as error:
+    except (ValueError, OSError):
+        raise
+    except Exception as error:  # settings of another version, or of nobody's
         raise ValueError(
             f"{run} was written by staf_torch {written_by or '(another version)'}, whose settings "
             f"staf_torch {__version__} does not understand ({_first_line(error)}): run it anew, "
@@ -138,18 +131,29 @@ def _first_line(error: Exception) -> str:
     return next(iter(str(error).splitlines()), type(error).__name__)
 
 
+class _PlainLoader(yaml.SafeLoader):
+    """Loader of plain values. Aliases are refused: by them a short file can stand for an endless tree."""
+
+    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
+        """Return the next node."""
+        if self.check_event(yaml.AliasEvent):
+            raise yaml.YAMLError("it has an alias, which Hydra never writes")
+        return super().compose_node(parent, index)
+
+
 def _settings(run: Path, trust: bool) -> DictConfig:
-    path = run / ".hydra" / "config.yaml"
-    if not path.is_file():
-        raise fail("staf-export", "RUN", "must be a run directory, with .hydra/config.yaml", str(run))
+    if not (run / HYDRA / "config.yaml").exists():
+        raise fail("staf-export", "RUN", f"must be a run directory, with {HYDRA}/config.yaml", str(run))
     try:
-        cfg = (
-            OmegaConf.load(path) if trust else OmegaConf.create(checked(read_settings(path, run), str(path)))
-        )
-    except UnreadableError as error:
-        raise ValueError(f"{run} has settings that are not read without --trust: {error}.") from error
+        found = yaml.load(read_bytes(run / HYDRA / "config.yaml"), _PlainLoader)
+    except (yaml.YAMLError, RecursionError) as error:
+        raise UnreadableError(f"{run} has no settings that can be read: {_first_line(error)}") from error
+    lines = [] if trust else foreign_settings(found)
+    if lines:
+        raise ValueError(refusal(run, lines))
+    cfg = OmegaConf.create(found)
     if not isinstance(cfg, DictConfig):
-        raise fail("staf-export", "RUN", "must hold settings in .hydra/config.yaml", str(run))
+        raise fail("staf-export", "RUN", f"must hold settings in {HYDRA}/config.yaml", str(run))
     OmegaConf.set_struct(cfg, True)  # a setting that is missing is an error, not None
     return cfg
 
@@ -161,20 +165,12 @@ def _history(run: Path, row: int) -> dict[str, np.ndarray]:
         raise ValueError(
             f"{run} has no history.npz, which holds the weights: run with history=false, or not ended."
         )
-    try:
-        archive = Archive(path, run)
-        names = [name for name in _READ if name in archive.names]
-        if "state" not in names:
-            raise UnreadableError(f"{path} has no states")
-        batch = archive.shape("state")[:1]
-        if batch and row >= batch[0]:
-            raise fail("staf-export", "row", f"must be below the run's {batch[0]} trajectories", row)
-        for name in names:
-            if math.prod(archive.shape(name)[1:]) > _MOST_NUMBERS or len(archive.shape(name)) < 2:
-                raise UnreadableError(f"{path} has {archive.shape(name)} numbers of {name}")
-        return {name: archive.read(name, row) for name in names}
-    except (UnreadableError, IndexError) as error:
-        raise ValueError(str(error)) from error
+    history = History(path)
+    if "state" not in history or history["state"].ndim != 3:
+        raise UnreadableError(f"{path} has no states of trajectories")
+    if row >= len(history["state"]):
+        raise fail("staf-export", "row", f"must be below the run's {len(history['state'])} trajectories", row)
+    return {name: history[name][row] for name in _READ if name in history}
 
 
 def _reproduced(name: str, found: Tensor, recorded: np.ndarray, precise: bool) -> None:

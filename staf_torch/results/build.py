@@ -28,14 +28,14 @@ _CHUNK = 2**20
 _ABSENT = "nothing"
 
 
-def digest(path: Path, *, root: Path | None = None) -> str:
+def digest(path: Path) -> str:
     """Return the SHA-256 of a regular file, which may be of any size.
 
     Raises:
-        UnreadableError: if there is none; arguments as of `open_regular`.
+        UnreadableError: if there is none.
     """
     found = hashlib.sha256()
-    with open_regular(path, root=root) as file:
+    with open_regular(path) as file:
         while piece := file.read(_CHUNK):
             found.update(piece)
     return found.hexdigest()
@@ -244,10 +244,7 @@ def record_checksum(record: Mapping[str, Any]) -> str:
 
 
 def damaged(directory: Path, record: Mapping[str, Any], *, thorough: bool) -> str | None:
-    """Return what is wrong with a run's record or files, None: nothing; ``thorough`` as of `damage`.
-
-    Records of versions that wrote no checksums pass.
-    """
+    """Return what is wrong with a run's record or files, None: nothing; ``thorough`` as of `damage`."""
     if "checksum" in record and record["checksum"] != record_checksum(record):
         return f"{RUN} is damaged: its checksum is another one"
     files = record.get("files")
@@ -271,7 +268,7 @@ def damage(directory: Path, recorded: Mapping[str, Any], *, thorough: bool) -> s
             size = path.lstat().st_size
             if size != about[0]:
                 return f"{name} is damaged: it has {size} bytes in place of {about[0]}"
-            if thorough and digest(path, root=directory) != about[1]:
+            if thorough and digest(path) != about[1]:
                 return f"{name} is damaged: its checksum is another one"
         except UnreadableError as error:
             return str(error)

@@ -29,7 +29,6 @@ from .files import (
     RUNNING,
     SWEEP,
     UNFINISHED,
-    flatten,
     parse_overrides,
     partial_name,
     plain,
@@ -42,15 +41,9 @@ from .run import Collection as Collection
 from .run import Run as Run
 from .run import Skipped as Skipped
 from .run import identity as identity
-from .run import layers
-from .settings_file import read_settings
-from .untrusted import UnreadableError, parse_object, read_lines, read_object, too_deep, visible
+from .untrusted import UnreadableError, parse_object, read_lines, read_object, visible
 
-_OVERRIDES = "overrides.yaml"
 _LISTED = 8  # jobs that have not started, by their numbers
-_COLUMNS = 5000  # names of settings and metrics of all runs together
-_DEEPEST = 16  # levels of folders
-_MOST_JOBS = 2**24  # bytes of `sweep.json`
 
 
 def collect(path: str | Path | Sequence[str | Path]) -> Collection:
@@ -76,7 +69,6 @@ def collect(path: str | Path | Sequence[str | Path]) -> Collection:
     rows: list[Run] = []
     skipped: list[Skipped] = []
     others: list[Path] = []
-    names: set[str] = set()  # of all columns
     for start in paths:
         if not start.is_dir():
             raise fail("collect", "path", "must be a directory that exists", str(start))
@@ -85,9 +77,7 @@ def collect(path: str | Path | Sequence[str | Path]) -> Collection:
                 others.append(directory)
                 continue
             try:
-                found = read_run(directory)
-                names |= _further_names(names, found)
-                rows += found
+                rows += read_run(directory)
             except UnreadableError as error:
                 skipped.append(Skipped(directory, str(error)))
             except Exception as error:  # one bad run never costs the others
@@ -102,28 +92,14 @@ def collect(path: str | Path | Sequence[str | Path]) -> Collection:
     return dataclasses.replace(collection, remarks=remarks)
 
 
-def _further_names(known: set[str], runs: Sequence[Run]) -> set[str]:
-    """Return the names of columns that these runs bring.
-
-    Raises:
-        UnreadableError: where there would be more than any table has: memory is rows times columns.
-    """
-    shared = {id(part): part for run in runs for part in layers(run.settings)}
-    parts = [*shared.values(), *(part for run in runs for part in (run.metrics, run.overrides))]
-    further = {name for part in parts for name in part if name not in known}
-    if further and len(known) + len(further) > _COLUMNS:
-        raise UnreadableError(f"brings settings and metrics of {len(further)} more names")
-    return further
-
-
 def _directories(start: Path, skipped: list[Skipped]) -> Iterator[Path]:
     """The folders at and under a path, numbers in their names in order; none below a run directory.
 
     Those that cannot be looked at are added to ``skipped``.
     """
-    waiting = [(start, 0)]
+    waiting = [start]
     while waiting:
-        folder, depth = waiting.pop()
+        folder = waiting.pop()
         yield folder
         try:
             if _is_run(folder):
@@ -134,14 +110,11 @@ def _directories(start: Path, skipped: list[Skipped]) -> Iterator[Path]:
             skipped.append(Skipped(folder, f"cannot be listed: {error.strerror}"))
             continue
         inner = [name for name in sorted(names, key=_natural) if not name.startswith(".") and name != FIGURES]
-        if depth == _DEEPEST and inner:
-            skipped.append(Skipped(folder, f"has folders {_DEEPEST} levels down, which are not looked at"))
-            continue
-        waiting += [(folder / name, depth + 1) for name in reversed(inner)]
+        waiting += [folder / name for name in reversed(inner)]
 
 
 def _is_run(directory: Path) -> bool:
-    files = (RUN, MEMBERS, METRICS, f"{HYDRA}/{_OVERRIDES}")
+    files = (RUN, MEMBERS, METRICS, f"{HYDRA}/overrides.yaml")
     return any(os.path.lexists(directory / name) for name in files)
 
 
@@ -155,7 +128,7 @@ def _not_started(directory: Path, rows: Sequence[Run]) -> Iterator[Skipped]:
     if not os.path.lexists(directory / SWEEP):
         return
     try:
-        jobs = read_object(directory / SWEEP, _MOST_JOBS).get("jobs")
+        jobs = read_object(directory / SWEEP).get("jobs")
     except UnreadableError as error:
         yield Skipped(directory, str(error))
         return
@@ -177,15 +150,10 @@ def read_run(directory: Path) -> list[Run]:
     """Return the runs of a run directory: one, or one a member.
 
     Raises:
-        UnreadableError: if not even the settings can be read.
+        UnreadableError: if its record cannot be read.
     """
-    if not os.path.lexists(directory / RUN):
-        return [_without_record(directory, None)]
-    try:
-        record = read_object(directory / RUN)
-        run = _of_record(directory, record)
-    except UnreadableError as error:
-        return [_without_record(directory, str(error))]
+    record = read_object(directory / RUN)
+    run = _of_record(directory, record)
     wrong = damaged(directory, record, thorough=False)
     if wrong is not None:
         return [dataclasses.replace(run, status=UNFINISHED, reason=wrong, metrics={})]
@@ -252,14 +220,14 @@ def read_members(directory: Path, name: str = MEMBERS) -> Iterator[Mapping[str, 
     In a file that is not complete, which has another ``name``, the last line may be cut off.
 
     Raises:
-        UnreadableError: if it has another form, and is too large to be read as a whole.
+        UnreadableError: if it has another form.
     """
     lines = read_lines(directory / name)
     if name != MEMBERS:
         yield from (parse_object(line[:-2], name) for line in lines if line.endswith(b"},\n"))
         return
     if not re.fullmatch(rb'\{"version": "[^"]*", "members": \[\n', next(lines, b"")):
-        listed = read_object(directory / MEMBERS, _MOST_JOBS).get("members")
+        listed = read_object(directory / MEMBERS).get("members")
         if not isinstance(listed, list) or not all(isinstance(member, dict) for member in listed):
             raise UnreadableError(f"{MEMBERS} has no list of members")
         yield from listed
@@ -293,40 +261,6 @@ def _member(run: Run, number: int, member: Mapping[str, Any]) -> Run:
 def _of_axis(key: str) -> bool:
     """Whether a setting lists the members themselves."""
     return key == "members" or key.startswith("members.")
-
-
-def _without_record(directory: Path, why: str | None) -> Run:
-    """What Hydra's own files and the metrics say: a run of a version without `run.json`, or a damaged one."""
-    try:
-        overrides, settings = _of_hydra(directory / HYDRA)
-    except UnreadableError as error:
-        raise UnreadableError("; ".join(filter(None, (why, str(error))))) from error
-    metrics, lost, unread = _measured(directory, {})
-    if unread is not None and not (directory / METRICS).exists():
-        unread = f"has no {METRICS}: it goes on, failed or was killed"
-    reason = "; ".join(filter(None, (why, unread))) or None
-    status = COMPLETED if unread is None else UNFINISHED
-    task = _text(settings.get("task"))
-    return Run(directory, overrides, settings, metrics, status, reason, task=task, lost=lost)
-
-
-def _of_hydra(folder: Path) -> tuple[dict[str, Value], dict[str, Value]]:
-    def load(name: str) -> Any:
-        try:
-            return read_settings(folder / name, folder.parent).tree
-        except UnreadableError as error:
-            raise UnreadableError(f"{HYDRA}/{error}") from error
-
-    lines = load(_OVERRIDES)
-    if not isinstance(lines, list):
-        raise UnreadableError(f"{HYDRA}/{_OVERRIDES} holds no list")
-    try:
-        composed, choices = load("config.yaml"), load("hydra.yaml")["hydra"]["runtime"]["choices"]
-        options = {group: option for group, option in choices.items() if not group.startswith("hydra/")}
-        settings = _settings({"settings": flatten(composed) | options})
-    except (UnreadableError, KeyError, TypeError, AttributeError):
-        settings = {}  # the overrides tell runs apart without them
-    return parse_overrides(str(line) for line in lines), settings
 
 
 def _measured(
@@ -368,18 +302,16 @@ def _settings(record: Mapping[str, Any]) -> dict[str, Value]:
     if not isinstance(found, dict):
         return {}
     # One object for equal names and words: the settings of a thousand runs take a third of the memory.
-    return {sys.intern(key): _shared(_setting(key, value)) for key, value in found.items()}
+    return {sys.intern(key): _shared(_setting(value)) for key, value in found.items()}
 
 
 def _shared(value: Value) -> Value:
     return sys.intern(value) if isinstance(value, str) else value
 
 
-def _setting(key: str, value: Any) -> Value:
+def _setting(value: Any) -> Value:
     if isinstance(value, float) and not math.isfinite(value):
         return repr(value)
-    if too_deep(value):
-        raise UnreadableError(f"the setting {key} is nested too deep")
     return json.dumps(value) if isinstance(value, dict) else plain(value)
 
 

@@ -12,12 +12,15 @@ import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 import numpy as np
+from numpy.lib.npyio import NpzFile
 
-from .archive import Archive
 from .files import FIGURES, HISTORY, METRICS, open_after, partial_name, write_bytes, write_metrics, write_text
+from .untrusted import UnreadableError, open_regular, visible
+
+T = TypeVar("T")
 
 
 class Printable(Protocol):
@@ -130,26 +133,45 @@ class History(Mapping[str, np.ndarray]):
     """
 
     def __init__(self, path: Path) -> None:
-        self._archive = Archive(path)
+        self._path = path
         self._read: dict[str, np.ndarray] = {}
+        self._names: tuple[str, ...] = self._of_archive(lambda archive: tuple(archive.files))
 
     def __getitem__(self, name: str) -> np.ndarray:
-        """Return an array."""
+        """Return an array.
+
+        Raises:
+            KeyError: if there is none of that name.
+            UnreadableError: if it is damaged.
+        """
+        if name not in self._names:
+            raise KeyError(f"{name!r} is not in {self._path}; there are {', '.join(self._names)}")
         if name not in self._read:
-            self._read[name] = self._archive.read(name)
+            self._read[name] = self._of_archive(lambda archive: archive[name])
         return self._read[name]
 
     def __iter__(self) -> Iterator[str]:
         """Yield the names."""
-        return iter(self._archive.names)
+        return iter(self._names)
 
     def __len__(self) -> int:
         """Return the number of arrays."""
-        return len(self._archive.names)
+        return len(self._names)
 
     def __repr__(self) -> str:
         """Return the names."""
-        return f"<History {', '.join(self._archive.names)}>"
+        return visible(f"<History {', '.join(self._names)}>")
+
+    def _of_archive(self, read: Callable[[NpzFile], T]) -> T:
+        """Return what a function reads of the archive; pickles are refused."""
+        try:
+            with open_regular(self._path) as file, np.load(file, allow_pickle=False) as archive:
+                return read(archive)
+        except UnreadableError:
+            raise
+        except Exception as error:  # zipfile and numpy raise a dozen kinds over damaged bytes
+            why = visible(" ".join(str(error).split()))
+            raise UnreadableError(f"{self._path} cannot be read: {why}") from error
 
 
 class HistoryWriter:

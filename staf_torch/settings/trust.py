@@ -1,67 +1,78 @@
-"""What settings of unknown origin may build: the library's own parts, of plain arguments, of modest size.
+"""One rule: reading a run never runs code, and building what it describes needs `--trust` for foreign code.
 
-`instantiate` calls whatever `_target_` names, and interpolations can hide the name. So the settings of a run
-that is loaded are resolved here first, by references alone, and only then looked at.
+Reading is JSON, plain YAML and arrays without pickles. Settings that name nothing but this package's own
+classes may be built. Everything else (a class or function from elsewhere, a `task` of one's own, a resolver
+such as `${oc.env:HOME}`, Hydra's search path and callbacks) can run code of whoever wrote the folder, or read
+the environment: it is shown and refused until the user says `--trust`.
 """
 
 from __future__ import annotations
 
-import contextlib
-import ctypes
 import functools
 import inspect
-import math
 import re
-import resource
-import signal
-import threading
-import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
-from .. import adp, kernels, optim, systems, targets
-from .._renamed import new_name
-from ..adp import ActorCriticLaw, Controller, Cost, Extrapolation, Gains, ValueBasis
-from ..engine import predictors
-from ..engine.predictors import Predictor
-from ..kernels import Kernel
-from ..optim import UpdateLaw
-from ..results.settings_file import SettingsFile
-from ..systems import ControlAffineSystem
+from ..results.untrusted import visible
 from . import config_directory
 
 _TARGET = re.compile(r"_target_: *(staf_torch\.[\w.]+)")
 _NOT_PARTS = (
-    "staf_torch.settings.chase.load",  # imports what it is told
-    "staf_torch.systems.MujocoPlant",  # reads any file, by a parser that no limit here can stop
-    "staf_torch.sweeps.",  # end of runs
+    "staf_torch.settings.chase.load",  # imports any object by its path
+    "staf_torch.systems.MujocoPlant",  # reads any file
+    "staf_torch.sweeps.",  # callbacks and trackers
 )
-_REFERENCE = re.compile(r"\$\{([A-Za-z_][\w.]*)\}")
-_MOST_NODES, _MOST_TEXT, _DEEPEST = 20_000, 1000, 30
-_SIZES: Mapping[str, float] = {
-    **dict.fromkeys(("seed", "duration", "settle_time"), math.inf),
-    **dict.fromkeys(("trajectories", "inner_steps", "record_every"), 1e6),
-}
-_MOST_STEPS = 1e7  # of a trajectory
-_SIZE = 1000  # of any other whole number: counts of centers, orders, degrees, points
-_MOST_ENTRIES = 1000  # of a list
-_MEMORY, _SECONDS = 256 * 2**20, 4.0  # of building, beyond what the process had
-_LOOK = 0.05  # s between two looks at the time of another thread
-_SPECIAL = {"_target_", "_partial_", "_convert_", "_recursive_"}
+_REFERENCE = re.compile(r"\$\{[\w.]+\}")
+_HARMLESS = re.compile(
+    r"hydra/launcher=(batched|basic|joblib)|hydra/sweeper=(basic|optuna)|hydra\.mode=\w+|hydra\.verbose=\w+"
+    r"|hydra\.launcher\.(executor|workers|batch|n_jobs)=\w+"
+    r"|\+*hydra\.launcher\.submitit\.(timeout_min|mem_gb|nodes|cpus_per_task|gpus_per_node|cluster)=\w+"
+    r"|\+*hydra\.launcher\.submitit\.slurm_(partition|account|qos|time|array_parallelism)=[\w-]+"
+    r"|\+*hydra\.launcher\.ray\.num_cpus=\d+|hydra\.sweeper\.(n_trials|n_jobs|sampler\.seed)=\d+"
+    r"|hydra\.sweeper\.direction=\w+|hydra\.sweep\.dir=.*|hydra\.run\.dir=.*"
+)
+"""Hydra's own overrides that can only say where and how often jobs run."""
+_MAY_RUN = re.compile(r"_[a-z]+_\b|\$\{|\\|\bpath\b|\btask\b|\btracker\b|hydra|@|=.*(/|\.\.)")
+"""What an override of a job contains if it names code, another file or the environment."""
+
+
+def may_run_code(override: str) -> bool:
+    """Return whether an override may lead to code, files or variables that are not this package's own."""
+    if override.lstrip("+~").startswith(("hydra.", "hydra/")):
+        return _HARMLESS.fullmatch(override) is None
+    return _MAY_RUN.search(override) is not None
+
+
+def foreign_settings(settings: Any) -> list[str]:
+    """Return `key: value` of every setting of a run that needs trust, before any interpolation is resolved.
+
+    Args:
+        settings: dictionaries, lists and plain values, as `.hydra/config.yaml` has them.
+    """
+    return [f"{key}: {value}" for key, value in _leaves(settings) if _is_foreign(key, value)]
+
+
+def refusal(place: Path, lines: Sequence[str]) -> str:
+    """Return the message that shows the lines of a folder which may run foreign code."""
+    shown = "".join(f"\n  {visible(line)}" for line in lines)
+    return f"{place} has lines that may run code of whoever wrote it:{shown}\nIf you know them, add --trust."
 
 
 @functools.cache
 def constructors() -> frozenset[str]:
-    """Return the dotted paths that settings may name without trust: parts that are made of plain values.
+    """Return the dotted paths that settings may name without trust.
 
-    They are what the package's own `conf/` names, and the other classes of the same kinds.
+    They are the targets of the package's own `conf/`, and the other public classes of the same kinds.
     """
+    from .. import adp, kernels, optim, systems, targets
+    from ..engine import predictors
+
     kinds = (
-        *(Kernel, UpdateLaw, ControlAffineSystem, Predictor),
-        *(ActorCriticLaw, Controller, Cost, Extrapolation, Gains, ValueBasis, adp.LQR, adp.RolloutPolicy),
-        *(targets.Paper, targets.Quadratic, targets.Cosine),
+        *(kernels.Kernel, optim.UpdateLaw, systems.ControlAffineSystem, predictors.Predictor),
+        *(adp.ActorCriticLaw, adp.Controller, adp.Cost, adp.Extrapolation, adp.Gains, adp.ValueBasis),
+        *(adp.LQR, adp.RolloutPolicy, targets.Paper, targets.Quadratic, targets.Cosine),
     )
     rooms = {
         **dict.fromkeys(("staf_torch.kernels", "staf_torch"), kernels),
@@ -84,178 +95,19 @@ def constructors() -> frozenset[str]:
     return frozenset(found)
 
 
-def checked(settings: SettingsFile, place: str) -> dict[str, Any]:
-    """Return the settings of a run, resolved, if they build nothing but `constructors` of modest size.
-
-    Args:
-        settings: as they are in the file.
-        place: of the file, for the message.
-
-    Raises:
-        ValueError: if they ask for more; the message shows the line.
-    """
-
-    def refuse(key: str, why: str) -> ValueError:
-        line = settings.line(key)
-        return ValueError(f"{place}:{line}\n  {why}: add --trust if you know who wrote these settings.")
-
-    tree = _Resolved(settings.tree, refuse).tree
-    if not isinstance(tree, dict):
-        raise refuse("", "must be settings by name")
-    for key, value in _leaves(tree):
-        name = key.rpartition(".")[2]
-        if name == "_target_" and value is not None and not _ours(value):
-            raise refuse(key, f"names {value!r}, which may run code of somebody else")
-        if name.startswith("_") and name.endswith("_") and name not in _SPECIAL:
-            raise refuse(key, f"has {name}, which the library never writes")
-        if isinstance(value, list) and len(value) > _MOST_ENTRIES:
-            raise refuse(key, f"lists {len(value)} entries, and {_MOST_ENTRIES} are the most")
-        most = _SIZES.get(name, _SIZE if isinstance(value, int) else math.inf)
-        if isinstance(value, int | float) and not isinstance(value, bool) and not abs(value) <= most:
-            raise refuse(key, f"asks for {value!r}, and {most:g} is the most")
-    duration, dt = tree.get("duration"), tree.get("dt")
-    steps = duration / dt if isinstance(duration, int | float) and isinstance(dt, int | float) and dt else 0
-    if not abs(steps) <= _MOST_STEPS:
-        raise refuse("dt", f"asks for {steps:.3g} steps, and {_MOST_STEPS:g} are the most")
-    return tree
-
-
-def _ours(target: object) -> bool:
-    named = str(target)
-    return named in constructors() or new_name(named) in constructors()
-
-
-class _Resolved:
-    """A tree of settings in which `${a.b}` is replaced by the value of that key, and nothing else happens."""
-
-    def __init__(self, tree: Any, refuse: Any) -> None:
-        self._root, self._refuse, self._left = tree, refuse, _MOST_NODES
-        self.tree = self._of(tree, "", 0)
-
-    def _of(self, value: Any, key: str, depth: int) -> Any:
-        self._left -= 1
-        if self._left < 0 or depth > _DEEPEST:
-            raise self._refuse(key, "grows without end when its references are followed")
-        prefix = f"{key}." if key else ""
-        if isinstance(value, dict):
-            if any("$" in str(name) for name in value):
-                raise self._refuse(key, "has an interpolation for a name")
-            return {name: self._of(inner, f"{prefix}{name}", depth + 1) for name, inner in value.items()}
-        if isinstance(value, list):
-            return [self._of(inner, f"{prefix}{n}", depth + 1) for n, inner in enumerate(value)]
-        if not isinstance(value, str):
-            return value
-        if "$" not in value:
-            if len(value) > _MOST_TEXT:
-                raise self._refuse(
-                    key, f"is a text of {len(value)} characters, and {_MOST_TEXT} are the most"
-                )
-            return value
-        named = _REFERENCE.fullmatch(value)
-        if named is None:
-            raise self._refuse(key, "has an interpolation that is no plain reference")
-        return self._of(self._at(named[1], key), key, depth + 1)
-
-    def _at(self, path: str, key: str) -> Any:
-        found = self._root
-        for part in path.split("."):
-            if not isinstance(found, dict) or part not in found:
-                raise self._refuse(key, f"refers to {path}, which there is not")
-            found = found[part]
-        return found
+def _is_foreign(key: str, value: Any) -> bool:
+    names = key.split(".")
+    if "_target_" in names and value is not None:
+        return value not in constructors()
+    if names[-1] == "task" and "." in str(value):
+        return True
+    return isinstance(value, str) and "$" in _REFERENCE.sub("", value)
 
 
 def _leaves(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
-    """Every value with its dotted key; lists as a whole, and then each of their entries."""
-    prefix = f"{key}." if key else ""
-    if isinstance(value, dict):
-        for name, inner in value.items():
-            yield from _leaves(inner, f"{prefix}{name}")
-        return
-    yield key, value
-    if isinstance(value, list):
-        for number, inner in enumerate(value):
-            yield from _leaves(inner, f"{prefix}{number}")
-
-
-@contextlib.contextmanager
-def limited(what: str) -> Iterator[None]:
-    """Let what is built here take a quarter of a gigabyte and four seconds of CPU time at most.
-
-    Sizes multiply in more ways than `checked` knows. Memory is limited on Linux alone, and time while Python
-    code runs: a single call of a library in C ends first.
-
-    Raises:
-        ValueError: where that is exceeded.
-    """
-    soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
-    most = _data_bytes() + _MEMORY
-    main = threading.current_thread() is threading.main_thread()
-    try:
-        if most > _MEMORY:
-            resource.setrlimit(resource.RLIMIT_DATA, (most if hard < 0 else min(most, hard), hard))
-        with _stopped_by_signal() if main else _stopped_by_thread():
-            yield
-    except _TooLongError as error:
-        raise ValueError(f"{what} takes more than {_SECONDS:g} s to build: add --trust to wait.") from error
-    except (MemoryError, RuntimeError) as error:
-        if isinstance(error, MemoryError) or "memory" in str(error):
-            raise ValueError(
-                f"{what} takes more memory to build than {_MEMORY} bytes: add --trust."
-            ) from error
-        raise
-    finally:
-        resource.setrlimit(resource.RLIMIT_DATA, (soft, hard))
-
-
-class _TooLongError(Exception):
-    """The time is over."""
-
-
-@contextlib.contextmanager
-def _stopped_by_signal() -> Iterator[None]:
-    """Raise `_TooLongError` in the main thread when the process has used its time."""
-
-    def stop(number: int, frame: FrameType | None) -> None:
-        raise _TooLongError
-
-    before = signal.signal(signal.SIGPROF, stop)
-    try:
-        signal.setitimer(signal.ITIMER_PROF, _SECONDS)
-        yield
-    finally:
-        signal.setitimer(signal.ITIMER_PROF, 0)
-        signal.signal(signal.SIGPROF, before)
-
-
-@contextlib.contextmanager
-def _stopped_by_thread() -> Iterator[None]:
-    """Raise `_TooLongError` in a thread that is not the main one and gets no signals; a third one watches."""
-    watched = threading.get_ident()
-    clock = time.pthread_getcpuclockid(watched)
-    until = time.clock_gettime(clock) + _SECONDS
-    ended, lock = threading.Event(), threading.Lock()
-
-    def watch() -> None:
-        while not ended.wait(_LOOK):
-            with lock:
-                if not ended.is_set() and time.clock_gettime(clock) > until:
-                    raised = ctypes.py_object(_TooLongError)
-                    ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(watched), raised)
-                    return
-
-    threading.Thread(target=watch, daemon=True).start()
-    try:
-        yield
-    finally:
-        with lock:  # from here on nothing is raised that has not been
-            ended.set()
-
-
-def _data_bytes() -> int:
-    """Memory of this process that counts against RLIMIT_DATA; 0 where that cannot be told."""
-    with contextlib.suppress(OSError), open("/proc/self/status", encoding="utf-8") as lines:
-        for line in lines:
-            if line.startswith("VmData:"):
-                return int(line.split()[1]) * 1024
-    return 0
+    """Yield every plain value with its dotted key."""
+    if isinstance(value, dict | list):
+        for name, inner in value.items() if isinstance(value, dict) else enumerate(value):
+            yield from _leaves(inner, f"{key}.{name}" if key else str(name))
+    else:
+        yield key, value

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,34 +12,24 @@ from hydra.errors import HydraException
 from .. import __version__
 from ..results import run_record as records
 from ..results.untrusted import visible
+from ..settings.trust import may_run_code
 from .hydra_compat import overrides_in, parse_override, sweep_size
 from .members import MOST_JOBS
 
 _RESUME = "sweep.resume="
 _ANYWAY = "sweep.resume_anyway=true"
-_YES = "--yes"
+_YES = "--trust"
 _NOT_TAKEN_OVER = ("hydra.mode", "hydra.run.dir", "hydra.sweep.dir", "sweep.resume", "sweep.resume_anyway")
 _LONGEST = (
     10_000  # characters: a list in brackets of that length takes Hydra's grammar 1.7 s, one of 50 000 86 s
 )
-_HARMLESS = re.compile(
-    r"hydra/launcher=(batched|basic|joblib)|hydra/sweeper=(basic|optuna)|hydra\.mode=\w+|hydra\.verbose=\w+"
-    r"|hydra\.launcher\.(executor|workers|batch|n_jobs)=\w+"
-    r"|\+*hydra\.launcher\.submitit\.(timeout_min|mem_gb|nodes|cpus_per_task|gpus_per_node|cluster)=\w+"
-    r"|\+*hydra\.launcher\.submitit\.slurm_(partition|account|qos|time|array_parallelism)=[\w-]+"
-    r"|\+*hydra\.launcher\.ray\.num_cpus=\d+|hydra\.sweeper\.(n_trials|n_jobs|sampler\.seed)=\d+"
-    r"|hydra\.sweeper\.direction=\w+|hydra\.sweep\.dir=.*|hydra\.run\.dir=.*"
-)
-"""Hydra's lines that can only say where and how often jobs run."""
-_MAY_RUN = re.compile(r"_[a-z]+_\b|\$\{|\\|\bpath\b|\btask\b|\btracker\b|hydra|@|=.*(/|\.\.)")
-"""What a line about the jobs needs in order to name code, another file or the environment."""
 
 
 def command_line(argv: Sequence[str]) -> list[str]:
     """Return the arguments with those of the sweep that `sweep.resume` names, if it names one.
 
-    Lines of the sweep that may run code of somebody else are shown, and need a yes at the terminal, `--yes`,
-    or to be repeated on the command line.
+    Lines of the sweep that may run code of somebody else are shown, and need a yes at the terminal,
+    `--trust`, or to be repeated on the command line.
 
     Raises:
         ValueError: if no sweep is there, one of other settings or of another version is, or nobody said yes.
@@ -95,13 +84,6 @@ def _check_size(directory: Path, typed: Sequence[str]) -> None:
         return
     if size > MOST_JOBS:
         raise ValueError(f"{directory} has a sweep of {size:g} jobs, and {MOST_JOBS} are the most.")
-
-
-def may_run_code(line: str) -> bool:
-    """Return whether a line that somebody else has written may lead to code, files or variables of theirs."""
-    if _is_hydra(line):
-        return _HARMLESS.fullmatch(line) is None
-    return _MAY_RUN.search(line) is not None
 
 
 def is_run_of_members(directory: Path) -> bool:

@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     DataFrame = Any
 
 Draw = Callable[["Run"], Mapping[str, "Figure"]]
-_MOST_PICTURE = 2**25  # bytes
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -86,7 +85,7 @@ class Run(reader.Run):
         """Yield name and content of every picture in this folder; a link may lead to anything."""
         for path in sorted((self.directory / FIGURES).glob("*.png")):
             with contextlib.suppress(UnreadableError):
-                yield path.stem, read_bytes(path, _MOST_PICTURE, root=self.directory)
+                yield path.stem, read_bytes(path)
 
 
 @dataclasses.dataclass(frozen=True, repr=False)

@@ -104,10 +104,9 @@ def test_centers_that_there_are_not_are_refused(given: dict[str, Any], said: str
         chase.centers_of(**given)
 
 
-@pytest.mark.parametrize("named", [True, False])
-def test_settings_of_centers_need_no_target(named: bool) -> None:
+def test_settings_of_centers_are_read_plain_or_as_hydras() -> None:
     node = {"layout": "simplex", "count": None, "radius": 0.2, "shrink": None}
-    target = {"_target_": "staf_torch.settings.chase.centers_of"} if named else {}
+    target = {"_target_": "staf_torch.settings.chase.centers_of"}
     for cfg in (OmegaConf.create(node | target), PlainSettings(node | target)):
         made = chase.make_centers(cfg, 3)
         assert torch.equal(made.directions, st.simplex(3))

@@ -66,7 +66,7 @@ def test_flags_stay_and_a_sweep_is_one(tmp_path: Path) -> None:
     place = sweep(tmp_path)
     for flags in (["-m"], ["--multirun"], ["-m", "--config-dir=conf"]):
         assert lines(place, *flags) == [*flags, "seed=0,1", *end(place)]
-    assert lines(place, "--config-dir=conf", "--yes") == [
+    assert lines(place, "--config-dir=conf", "--trust") == [
         "--config-dir=conf",
         "--multirun",
         "seed=0,1",
@@ -185,7 +185,7 @@ def test_lines_of_ten_thousand_characters_are_read_unasked(tmp_path: Path) -> No
         ValueError, match=f"{place} was started with lines of 10001 characters, and 10000 are"
     ):
         lines(place)
-    assert len(lines(place, "--yes")) == 6
+    assert len(lines(place, "--trust")) == 6
     assert len(lines(place, *of(10_001 - len(hydra[0])))) == 6  # who types them knows them
 
 
@@ -231,7 +231,7 @@ def test_somebody_at_a_terminal_is_asked_whether_lines_may_run(
         with pytest.raises(ValueError, match="may run code of whoever started it") as told:
             lines(place)
         assert shown in str(told.value)
-        assert str(told.value).endswith("If you know them, repeat them, or add --yes.")
+        assert str(told.value).endswith("If you know them, repeat them, or add --trust.")
     question = f"staf: {place} was started with lines that may run code:{shown}Run them? [y/N] "
     assert err.getvalue() == err.flushed == question
 
@@ -246,7 +246,7 @@ def test_nobody_is_asked_where_there_is_no_terminal(
     with pytest.raises(ValueError, match="may run code of whoever started it"):
         lines(place)
     assert err.getvalue() == ""
-    assert lines(place, "--yes") == lines(place, FOREIGN[0]) == ["--multirun", FOREIGN[0], *end(place)]
+    assert lines(place, "--trust") == lines(place, FOREIGN[0]) == ["--multirun", FOREIGN[0], *end(place)]
 
 
 def test_lines_that_are_typed_again_are_known_one_by_one(tmp_path: Path) -> None:

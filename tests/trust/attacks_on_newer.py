@@ -93,7 +93,7 @@ def checksums_of_members_that_are_a_pipe(arena: Arena) -> Attack:
 def a_folder_of_members_that_leads_elsewhere(arena: Arena) -> Attack:
     (arena.one / "members").symlink_to(arena.victim, target_is_directory=True)
     command, _ = killed_members(arena, ["seed=0,1"])
-    return [*command, "--yes"], None
+    return [*command, "--trust"], None
 
 
 @attack

@@ -51,7 +51,7 @@ def modules_of_a_run_that_are_imported_to_be_hashed(arena: Arena) -> Attack:
             f"{job}/run.json",
             lambda found: found["build"]["modules"].update({"evil_mod": "0" * 12, "os": "1"}),
         )
-    return arena.resume("--yes")
+    return arena.resume("--trust")
 
 
 @attack
@@ -186,7 +186,7 @@ def an_archive_whose_files_overlap(arena: Arena) -> Attack:
 @attack
 def dangling_links_where_files_are_made(arena: Arena) -> Attack:
     """A link to a file that does not exist yet: whoever opens it to write makes that file."""
-    command, _ = arena.resume("--yes")
+    command, _ = arena.resume("--trust")
     job = arena.many / "2"
     (job / ".hydra").mkdir(parents=True)
     for name in (
@@ -208,7 +208,7 @@ def a_lock_of_no_process(arena: Arena) -> Attack:
     """Numbers that no process has, and the host of this machine, so that they are looked up."""
     lock = {"host": socket.gethostname(), "pid": 10**30, "token": {"x": []}, "started": "soon"}
     (arena.many / ".lock").write_text(json.dumps(lock))
-    return arena.resume("--yes")
+    return arena.resume("--trust")
 
 
 @attack
@@ -221,7 +221,7 @@ def rows_of_members_that_speak(arena: Arena) -> Attack:
         {"number": -1, "overrides": [evil] * 3, "status": "completed", "metrics": {"ball_error": [1]}},
     ]
     command, _ = members_cut_off(arena, rows)
-    return [*command, "--yes"], None
+    return [*command, "--trust"], None
 
 
 @attack

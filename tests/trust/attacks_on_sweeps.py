@@ -48,7 +48,7 @@ def flags_among_the_lines(arena: Arena) -> Attack:
     folder.mkdir(parents=True)
     arena.module(arena.cwd)
     (folder / "gaussian.yaml").write_text("_target_: evil_mod.V\n")
-    for flag in ("--config-dir", str(folder.parent), "-cd", str(folder.parent), "--yes"):
+    for flag in ("--config-dir", str(folder.parent), "-cd", str(folder.parent), "--trust"):
         arena.json("sweep.json", lambda found, flag=flag: found["hydra"].insert(0, flag))
     return arena.line("kernel=gaussian")
 

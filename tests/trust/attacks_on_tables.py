@@ -115,7 +115,7 @@ def a_page_of_the_sweep(arena: Arena) -> Attack:
         bad = re.findall(r"<script>alert|<img src=x|<svg/onload", page)
         return f"report.html has {bad}" if bad else None
 
-    return arena.resume("--yes")[0], check
+    return arena.resume("--trust")[0], check
 
 
 @attack

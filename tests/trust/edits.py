@@ -196,7 +196,7 @@ def main() -> int:
         for number in range(chosen.edits + 3):
             edit = nothing if number >= chosen.edits else KINDS[number % len(KINDS)]
             named, line, patches = edit(place, package, chance)
-            code, said = command(place, *line, "sweep.resume=sweep", "--yes", patches=patches)
+            code, said = command(place, *line, "sweep.resume=sweep", "--trust", patches=patches)
             ran = (place / "sweep" / "2" / "metrics.json").exists()
             good = code == 0 and ran if edit is nothing else code == 1 and named in said and not ran
             told, quiet = told + (good and edit is not nothing), quiet + (good and edit is nothing)

@@ -155,7 +155,7 @@ def one(
         (place / "ballast").unlink(missing_ok=True)
         # Where no job had begun, the sweep has taken its directory back and says nothing of resuming.
         begun = (place / "sweep" / "sweep.json").exists()
-        line = ["sweep.resume=sweep", "--yes"] if begun else line
+        line = ["sweep.resume=sweep", "--trust"] if begun else line
         again = Sweep(place, line, environment).end()
         table = place / "sweep" / "table.csv"
         same = again == 0 and table.exists() and table.read_bytes() == whole[0]

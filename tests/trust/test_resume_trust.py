@@ -73,7 +73,7 @@ def place(whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def resume(place: Path, *more: str) -> tuple[int, str, str]:
-    return one(str(place), ["-m", "--config-dir", "conf", "sweep.resume=sweep", "--yes", *more])
+    return one(str(place), ["-m", "--config-dir", "conf", "sweep.resume=sweep", "--trust", *more])
 
 
 def edit(path: str, before: str, after: str) -> Callable[[Path], None]:
@@ -206,7 +206,7 @@ def test_a_line_of_somebody_else_is_shown_and_not_run(line: str, tmp_path: Path)
     with pytest.raises(ValueError, match="may run code of whoever started it") as refused:
         command_line(["-m", f"sweep.resume={tmp_path}"])
     assert line.split()[-1] in str(refused.value)
-    assert {*jobs, *hydra} <= set(command_line(["-m", f"sweep.resume={tmp_path}", "--yes"]))
+    assert {*jobs, *hydra} <= set(command_line(["-m", f"sweep.resume={tmp_path}", "--trust"]))
     assert command_line(["-m", f"sweep.resume={tmp_path}", "seed=0", *jobs, *hydra])  # repeated: known
 
 
