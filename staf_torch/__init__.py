@@ -13,7 +13,7 @@ Every name below is imported when it is first used (PEP 562): `staf-table` needs
 import importlib
 from typing import TYPE_CHECKING
 
-from . import _conf, _renamed
+from . import _conf
 from ._version import __version__ as __version__
 
 if TYPE_CHECKING:  # for type checkers and editors; the tables below say it again for Python
@@ -103,8 +103,6 @@ else:
             value = getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
         elif name in _MODULES:
             value = importlib.import_module(f"{__name__}.{_MODULES[name]}")
-        elif _renamed.new_name(f"{__name__}.{name}") is not None:
-            value = importlib.import_module(f"{__name__}.{name}")
         else:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
         globals()[name] = value
@@ -115,4 +113,3 @@ else:
 
 
 _conf.install()
-_renamed.install()

@@ -1,29 +1,28 @@
-"""Rules that the text of a file keeps, whatever runs: of `test_structure.py`, and of `mutation.py`."""
+"""Rules that the text of a file keeps, whatever runs: each takes all nodes of its tree, from the outside in."""
 
 from __future__ import annotations
 
 import ast
-from collections.abc import Iterator
+import re
+from collections.abc import Iterator, Sequence
 
 _MAKERS = ("zeros", "ones", "full", "empty", "eye", "linspace", "logspace", "rand", "randn", "tensor")
 _CASTS = ("double", "to", "long", "type_as")
 _TEXT = ("read_text", "write_text")
+_DOCUMENTED = {"_asdict", "_field_defaults", "_fields", "_make", "_replace", "_exit", "_dynamo", "_inductor"}
+"""Of named tuples, `os` and torch: their manuals name them."""
+_PATCHES = {"setattr", "delattr", "setitem", "delitem", "patch", "object", "multiple", "dict"}
+_PRIVATE = re.compile(r"staf_torch(\.\w+)*\._[a-z]\w*")
 
 
-def broken(source: str) -> list[str]:
-    """What of a file breaks a rule: by line."""
-    return [*without_dtype(source), *without_encoding(source)]
-
-
-def without_dtype(source: str) -> Iterator[str]:
+def without_dtype(nodes: Sequence[ast.AST]) -> Iterator[str]:
     """Calls that make a tensor of torch's default dtype, which is the user's: by line."""
-    tree = ast.parse(source)
     cast = {
         id(node.func.value)
-        for node in ast.walk(tree)
+        for node in nodes
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr in _CASTS
     }
-    for node in ast.walk(tree):
+    for node in nodes:
         if (
             isinstance(node, ast.Call)
             and id(node) not in cast
@@ -35,9 +34,9 @@ def without_dtype(source: str) -> Iterator[str]:
             yield f"{node.lineno}: {ast.unparse(node)[:80]}"
 
 
-def without_encoding(source: str) -> Iterator[str]:
+def without_encoding(nodes: Sequence[ast.AST]) -> Iterator[str]:
     """Calls that read or write text in the encoding of the user's locale: by line."""
-    for node in ast.walk(ast.parse(source)):
+    for node in nodes:
         if not isinstance(node, ast.Call) or any(word.arg in ("encoding", None) for word in node.keywords):
             continue
         name = ast.unparse(node.func)
@@ -46,3 +45,119 @@ def without_encoding(source: str) -> Iterator[str]:
         opened = name.rpartition(".")[2] == "open" and name != "os.open" and not binary
         if opened or (isinstance(node.func, ast.Attribute) and node.func.attr in _TEXT):
             yield f"{node.lineno}: {ast.unparse(node)[:80]}"
+
+
+def looks_inside(nodes: Sequence[ast.AST]) -> Iterator[str]:
+    """What a test must not do, by line: read private names, replace or fake parts of the package."""
+    ours = set(_imported(nodes))
+    made = ours | set(_made(nodes, ours))
+    for node in nodes:
+        for told in (_private(node), _patched(node, made), _assigned(node, ours)):
+            if told:
+                yield f"{node.lineno}: {told}"  # type: ignore[attr-defined]
+
+
+def _imported(nodes: Sequence[ast.AST]) -> Iterator[str]:
+    """Names that a file has from the package."""
+    for node in nodes:
+        if isinstance(node, ast.ImportFrom) and (node.module or "").partition(".")[0] == "staf_torch":
+            yield from (each.asname or each.name for each in node.names)
+        elif isinstance(node, ast.Import):
+            ours = (each for each in node.names if each.name.partition(".")[0] == "staf_torch")
+            yield from (each.asname or "staf_torch" for each in ours)
+
+
+def _made(nodes: Sequence[ast.AST], ours: set[str]) -> Iterator[str]:
+    """Variables that hold what a call of the package returned, or one of its modules."""
+    for node in nodes:
+        if isinstance(node, ast.Assign) and (_root(node.value) in ours or _names_the_package(node.value)):
+            yield from (target.id for target in node.targets if isinstance(target, ast.Name))
+
+
+def _root(node: ast.AST) -> str | None:
+    """The name that an expression such as `name.part(...).other[0]` begins with."""
+    while isinstance(node, ast.Attribute | ast.Call | ast.Subscript):
+        node = node.func if isinstance(node, ast.Call) else node.value
+    return node.id if isinstance(node, ast.Name) else None
+
+
+def _names_the_package(node: ast.AST) -> bool:
+    """Whether it is a dotted name of the package, `import_module` of one, or an entry of `sys.modules`."""
+    if isinstance(node, ast.Call) and ast.unparse(node.func).endswith("import_module"):
+        node = node.args[0]
+    elif isinstance(node, ast.Subscript) and ast.unparse(node.value) == "sys.modules":
+        node = node.slice
+    elif isinstance(node, ast.Call | ast.Subscript | ast.JoinedStr):
+        return False
+    texts = [each.value for each in ast.walk(node) if isinstance(each, ast.Constant)]
+    return any(isinstance(text, str) and re.match(r"staf_torch\b(\.|$)", text) for text in texts)
+
+
+def _private(node: ast.AST) -> str | None:
+    if isinstance(node, ast.Attribute):
+        if node.attr == "__new__" and not ast.unparse(node.value).startswith("super("):
+            return f"calls {ast.unparse(node)}"
+        own = isinstance(node.value, ast.Name) and node.value.id in ("self", "cls")
+        if not own and _is_private(node.attr):
+            return f"reads {ast.unparse(node)[-60:]}"
+    if isinstance(node, ast.ImportFrom):
+        names = [*(node.module or "").split("."), *(each.name for each in node.names)]
+        wanted = [name for name in names if _is_private(name) or name == "SimpleNamespace"]
+        return f"imports {wanted[0]}" if wanted else None
+    if isinstance(node, ast.Constant) and isinstance(node.value, str) and _PRIVATE.fullmatch(node.value):
+        return f"names {node.value}"
+    if isinstance(node, ast.Call) and ast.unparse(node.func) in ("getattr", "hasattr") and len(node.args) > 1:
+        name = node.args[1]
+        if isinstance(name, ast.Constant) and _is_private(str(name.value)):
+            return f"reads {name.value}"
+    named = node.id if isinstance(node, ast.Name) else node.attr if isinstance(node, ast.Attribute) else ""
+    return "uses SimpleNamespace" if named == "SimpleNamespace" else None
+
+
+def _is_private(name: str) -> bool:
+    return (
+        name.startswith("_")
+        and name.strip("_") != ""
+        and not name.startswith("__")
+        and name not in _DOCUMENTED
+    )
+
+
+def _patched(node: ast.AST, ours: set[str]) -> str | None:
+    """Of `monkeypatch`, `unittest.mock` or `setattr`, with a thing of the package or its dotted name."""
+    if not isinstance(node, ast.Call) or not node.args:
+        return None
+    called, of = ast.unparse(node.func).rpartition(".")[2], ast.unparse(node.func)
+    if called not in ("setattr", "delattr") and not (called in _PATCHES and "patch" in of):
+        return None
+    target = node.args[0]
+    if _root(target) in ours or _names_the_package(target):
+        return f"patches {ast.unparse(target)}"
+    return None
+
+
+def _assigned(node: ast.AST, ours: set[str]) -> str | None:
+    """Assignments to what was imported: `module.name = ...`, `vars(module)[...] = ...`, `del module.name`."""
+    targets: list[ast.expr] = []
+    if isinstance(node, ast.Assign | ast.Delete):
+        targets = node.targets
+    elif isinstance(node, ast.AugAssign | ast.AnnAssign):
+        targets = [node.target]
+    for target in targets:
+        if isinstance(target, ast.Subscript):
+            inner = target.value
+            if isinstance(inner, ast.Call) and ast.unparse(inner.func) == "vars" and inner.args:
+                target = ast.Attribute(inner.args[0], "name")
+            elif isinstance(inner, ast.Attribute):
+                target = inner
+            else:
+                continue
+        if isinstance(target, ast.Attribute) and _plain_root(target.value) in ours:
+            return f"changes {ast.unparse(target)}"
+    return None
+
+
+def _plain_root(node: ast.AST) -> str | None:
+    while isinstance(node, ast.Attribute):
+        node = node.value
+    return node.id if isinstance(node, ast.Name) else None

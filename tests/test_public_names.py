@@ -1,34 +1,142 @@
-"""The examples in the docstrings of public names do what they say; `test_structure.py` asks each for one.
+"""Public names: they are there, their examples do what they say, and they have a place on the reference pages.
 
-They begin where a reader does: after `import torch`, `from pathlib import Path`, `from staf_torch import *`,
+An example begins where a reader does: after `import torch`, `from pathlib import Path`, `from staf_torch import *`,
 and the names of the package that the name itself is in.
 """
 
 from __future__ import annotations
 
+import ast
 import doctest
 import functools
+import importlib
 import inspect
+import re
+import shlex
+import subprocess
+import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
-from public_names import public
-from recorded import Record
+import torch
+from browser import CHROMIUM, Browser
+from command_line import ROOT, environment
 
+import staf_torch
+from staf_torch.cli import reference
 from staf_torch.lanes import build
 from staf_torch.sweeps.python_api import sweep
 from staf_torch.sweeps.runs import Runs
 
+CONTRACT = """
+    StaF StaFBasis StaFRegressor ExperienceMemory
+    ExponentialKernel GaussianKernel MaternKernel InverseMultiquadricKernel RationalQuadraticKernel
+    PolynomialKernel AnchoredKernel StateFollowingCenters ConstantRadius StateRadius
+    rings polygon simplex cross_polytope ball chase ChaseResult optim systems targets theory adp
+    systems.StepPlant systems.RatePlant systems.Barrier systems.simulate optim.ChaseOptimizer
+    adp.QuadraticCost adp.simulate adp.near_optimal
+"""
+"""What users import (DESIGN.md, section 4)."""
+PACKAGES = [
+    *("adp", "centers", "deploy", "engine", "envs", "kernels", "lanes", "metrics", "online", "optim"),
+    *("systems", "tables", "targets", "theory"),
+]
+API = {"read_runs", "run", "sweep"}  # not in `__all__`: they import Hydra
+TOP = re.findall(r"^(\w+):", (ROOT / "conf" / "config.yaml").read_text(encoding="utf-8"), re.MULTILINE)
+RUNS = ("results", "sweeps", "tables")  # examples of these rooms run simulations of hundreds of steps
+COMPILE = ("staf_torch.deploy.c_header.time_c", "staf_torch.lanes.function.ready")  # their examples do
+ATTRIBUTE = re.compile(r'\b(id|href|src)="([^"]*)"')
+
+
+def public() -> dict[str, tuple[object, dict[str, Any]]]:
+    """Module and name -> the class or function, and the names that its example may use."""
+    top = {name: getattr(staf_torch, name) for name in (*staf_torch.__all__, *API)}
+    common = {"torch": torch, "Path": Path} | top
+    common |= {name: getattr(staf_torch, name) for name in PACKAGES}
+    found: dict[str, tuple[object, dict[str, Any]]] = {}
+    for package in ("", *PACKAGES):
+        module = importlib.import_module(f"staf_torch.{package}".rstrip("."))
+        own = top if package == "" else {name: getattr(module, name) for name in module.__all__}
+        for thing in own.values():
+            if inspect.isclass(thing) or inspect.isfunction(thing):
+                found.setdefault(f"{thing.__module__}.{thing.__name__}", (thing, common | own))
+    return found
+
+
 PUBLIC = public()
 
 
-RUNS = ("results", "sweeps", "tables")  # examples of these rooms run simulations of hundreds of steps
-COMPILE = ("staf_torch.deploy.c_header.time_c", "staf_torch.lanes.function.ready")  # their examples do
+# --- names --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", CONTRACT.split())
+def test_a_name_of_the_contract_is_there(name: str) -> None:
+    assert callable(functools.reduce(getattr, name.split("."), staf_torch)) or name.islower()
+
+
+def test_every_name_that_type_checkers_see_is_listed_and_can_be_had() -> None:
+    tree = ast.parse(Path(staf_torch.__file__).read_text(encoding="utf-8"))
+    (block,) = [
+        node for node in tree.body if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
+    ]
+    named = {str(a.asname) for node in block.body if isinstance(node, ast.ImportFrom) for a in node.names}
+    assert named - API == set(staf_torch.__all__) <= set(dir(staf_torch))
+    assert all(getattr(staf_torch, name) is not None for name in named)
+    with pytest.raises(AttributeError, match="has no attribute 'Staf'"):
+        _ = staf_torch.Staf
+
+
+@pytest.mark.parametrize("package", [name for name in PACKAGES if name != "targets"])
+def test_all_lists_what_a_package_hands_on(package: str) -> None:
+    module = importlib.import_module(f"staf_torch.{package}")
+    tree = ast.parse(Path(str(module.__file__)).read_text(encoding="utf-8"))
+    handed = {
+        alias.asname
+        for node in tree.body
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+        if alias.asname == alias.name and not inspect.ismodule(getattr(module, alias.name))
+    }
+    defined = {
+        node.name
+        for node in tree.body
+        if isinstance(node, ast.ClassDef | ast.FunctionDef) and not node.name.startswith("_")
+    }
+    assert handed | defined <= set(module.__all__)
+    assert all(hasattr(module, name) for name in module.__all__)
+
+
+@pytest.mark.parametrize(
+    ("program", "wanted", "unwanted"),
+    [
+        ("from staf_torch import *; StaF, adp, chase", {"torch"}, {"hydra", "omegaconf", "matplotlib"}),
+        (
+            "from staf_torch.cli.table import main\ntry: main(['--help'])\nexcept SystemExit: pass",
+            {"staf_torch"},
+            {"torch", "numpy", "hydra", "omegaconf", "matplotlib", "pandas", "jinja2"},
+        ),
+    ],
+    ids=["library", "staf-table"],
+)
+def test_an_import_brings_nothing_that_it_does_not_need(
+    program: str, wanted: set[str], unwanted: set[str]
+) -> None:
+    program += "\nimport sys; print('loaded:', *{name.partition('.')[0] for name in sys.modules})"
+    line = [sys.executable, "-W", "error", "-c", program]
+    ended = subprocess.run(line, env=environment(), capture_output=True, text=True, check=True)
+    loaded = set(ended.stdout.rpartition("loaded:")[2].split())
+    assert wanted <= loaded
+    assert loaded.isdisjoint(unwanted)
+
+
+# --- examples -----------------------------------------------------------------------------------------------
 
 
 def asked(name: str) -> object:
     """A name, whose chases are compiled where its example has long ones."""
-    return pytest.param(name, marks=[pytest.mark.compiled] if name.split(".")[1] in RUNS else [])
+    compiled = name in COMPILE or name.split(".")[1] in RUNS
+    return pytest.param(name, marks=[pytest.mark.compiled] if compiled else [])
 
 
 @functools.cache
@@ -43,7 +151,7 @@ def swept(*lines: str, **places: str) -> Runs:
 
 @pytest.mark.parametrize("name", [asked(name) for name in PUBLIC])
 def test_the_example_of_a_name_does_what_it_says(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, record: Record
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     if name in COMPILE and not build.compiler():
@@ -52,10 +160,77 @@ def test_the_example_of_a_name_does_what_it_says(
     if thing is not sweep and names.get("sweep") is sweep:
         names = {**names, "sweep": swept}
     text = inspect.cleandoc(thing.__doc__ or "")
+    assert ">>> " in text, f"the docstring of {name} needs an example"
     test = doctest.DocTestParser().get_doctest(text, dict(names), name, None, None)
     said: list[str] = []
-    runner = doctest.DocTestRunner(verbose=False, optionflags=doctest.ELLIPSIS)
-    runner.run(test, out=said.append, clear_globs=False)
+    doctest.DocTestRunner(verbose=False, optionflags=doctest.ELLIPSIS).run(test, out=said.append)
     assert said == [], "".join(said)
-    left = {key: value for key, value in test.globs.items() if key not in names and not key.startswith("__")}
-    record(left, rtol=1e-5, texts=False)  # they name versions and folders
+
+
+@pytest.mark.parametrize("name", PUBLIC)
+def test_a_name_says_where_it_is_shown_and_that_is_there(name: str) -> None:
+    """A configuration, a command, or a file."""
+    shown = re.findall(r"Shown by `([^`]+)`", " ".join((PUBLIC[name][0].__doc__ or "").split()))
+    assert shown, f"the docstring of {name} needs a line: Shown by `staf experiment=...`."
+    for place in shown:
+        program, *words = shlex.split(place)
+        if program == "staf":
+            groups = [word.split("=") for word in words if (ROOT / "conf" / word.partition("=")[0]).is_dir()]
+            assert groups or all("." in word or word.split("=")[0] in TOP for word in words), place
+            for group, option in groups:
+                assert (ROOT / "conf" / group / f"{option}.yaml").is_file(), place
+        elif program not in ("staf-table", "staf-export"):
+            assert (ROOT / place).is_file(), place
+
+
+# --- pages of `staf docs` -----------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The pages, made without a warning."""
+    pytest.importorskip("pdoc")
+    folder = tmp_path_factory.mktemp("reference")
+    line = [sys.executable, "-W", "error", "-m", "staf_torch", "docs", "site"]
+    ended = subprocess.run(line, env=environment(), capture_output=True, text=True, check=False, cwd=folder)
+    assert (ended.returncode, ended.stderr) == (0, "")
+    assert ended.stdout == "reference pages: site/index.html\n"
+    return folder / "site"
+
+
+def test_every_public_name_is_on_a_page_and_every_link_leads_somewhere(site: Path) -> None:
+    attributes = {page: ATTRIBUTE.findall(page.read_text(encoding="utf-8")) for page in site.rglob("*.html")}
+    ids = {page: {value for kind, value in found if kind == "id"} for page, found in attributes.items()}
+    assert {name.rpartition(".")[2] for name in PUBLIC} - set().union(*ids.values()) == set()
+    lost, count = [], 0
+    for page, found in attributes.items():
+        for kind, value in found:
+            if kind == "id" or "${" in value or value.startswith(("https://pdoc.dev", "data:")):
+                continue  # the search's own template, the generator's mark
+            file, _, anchor = value.partition("#")
+            target = (page.parent / file).resolve() if file else page
+            count += 1
+            if not target.exists() or (anchor and anchor not in ids[target]):
+                lost.append(f"{page.name}: {value}")
+    assert count > 1000
+    assert lost == []
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium here")
+def test_the_search_finds_ideal_weights_and_asks_no_server(site: Path, tmp_path: Path) -> None:
+    with Browser(tmp_path) as browser:
+        browser.open(f"{(site / 'staf_torch.html').as_uri()}?search=ideal+weights")
+        for _ in range(2000):  # the index is being read
+            found = browser.value("document.querySelector('main').innerText")
+            if "StaFBasis.ideal_weights" in found:
+                break
+        assert found.index("StaFBasis.ideal_weights") < 1000  # among the first
+        assert {address.partition(":")[0] for address in browser.requests} <= {"file", "data", "blob"}
+
+
+def test_without_pdoc_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pdoc", None)
+    with pytest.raises(ValueError, match=r"install the extra, pip install 'staf_torch\[docs\]'"):
+        reference.main([])
+    with pytest.raises(ValueError, match=r"takes one folder; got 'a b'"):
+        reference.main(["a", "b"])

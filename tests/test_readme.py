@@ -16,7 +16,6 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
 from staf_torch import __version__
-from staf_torch._renamed import RENAMED
 from staf_torch.cli import export, table
 from staf_torch.cli.staf import main as main  # its import registers the launcher of `staf -m`
 from staf_torch.lanes import build
@@ -40,13 +39,6 @@ def name(path: Path) -> str:
 
 def read(path: Path) -> str:
     return path.read_text(encoding="utf-8")
-
-
-def test_changelog_names_every_module_that_moved() -> None:
-    text = read(ROOT / "CHANGELOG.md")
-    for old, new in RENAMED.items():
-        row = rf"`staf_torch\.{re.escape(old)}`[^|]*\| `staf_torch\.{re.escape(new)}`"
-        assert re.search(row, text), old
 
 
 def test_citation_is_of_this_version_and_names_the_paper() -> None:

@@ -1,36 +1,72 @@
-"""How the package hangs together: no circle, Hydra's inside in one module, a short way to the engine."""
+"""How the package hangs together, and what no test may do: read from the text."""
 
 from __future__ import annotations
 
 import ast
+import dataclasses
 import functools
 import importlib
 import inspect
-import re
-import shlex
-import sys
-from collections.abc import Callable, Iterable
+import pkgutil
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
-from command_line import ROOT, one
-from public_names import PACKAGES, public
-from source_rules import without_dtype, without_encoding
+import yaml
+from command_line import ROOT
+from source_rules import looks_inside, without_dtype, without_encoding
 
-PACKAGE = ROOT / "staf_torch"
-TOP = re.findall(r"^(\w+):", (ROOT / "conf" / "config.yaml").read_text(encoding="utf-8"), re.MULTILINE)
+import staf_torch
+
+PACKAGE, CONF, TESTS = ROOT / "staf_torch", ROOT / "conf", ROOT / "tests"
 DOCUMENTED = {"hydra.core.hydra_config", "hydra.core.config_store"}  # of `hydra.core`, what Hydra documents
 MODULES = {
     ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path
     for path in sorted(PACKAGE.rglob("*.py"))
     if "plugins" not in path.parts
 }
+NOT_YET = {
+    "adp",
+    "approximation",
+    "centers",
+    "cli",
+    "composed_once.py",
+    "deploy",
+    "engine",
+    "envs",
+    "experiments",
+    "figures",
+    "helpers_experiments.py",
+    "kernels",
+    "lanes",
+    "local_basis",
+    "metrics",
+    "online",
+    "optim",
+    "results",
+    "sanitized.py",
+    "settings",
+    "sweeps",
+    "systems",
+    "tables",
+    "test_default_dtype.py",
+    "test_readme.py",
+    "test_sanitized.py",
+    "theory",
+    "trust",
+}
+"""Rooms of tests that still look inside."""
+Rule = Callable[[Sequence[ast.AST]], Iterable[str]]
 
 
 @functools.cache
 def nodes(path: Path) -> list[ast.AST]:
     """Of a file, read once: all of them, from the outside in."""
     return list(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
+
+
+# --- imports ------------------------------------------------------------------------------------------------
 
 
 @functools.cache
@@ -58,13 +94,9 @@ def imports(name: str, path: Path) -> tuple[str, ...]:
 
 def imported_modules(name: str, path: Path) -> set[str]:
     """Modules of the package that a file imports; `from a import b` is of a.b where that is a module."""
-    found = set()
-    for target in imports(name, path):
-        for candidate in (target, target.rpartition(".")[0]):
-            if candidate in MODULES and candidate != name:
-                found.add(candidate)
-                break
-    return found
+    candidates = ((target, target.rpartition(".")[0]) for target in imports(name, path))
+    found = (next((each for each in pair if each in MODULES), name) for pair in candidates)
+    return set(found) - {name}
 
 
 def circle(graph: dict[str, set[str]]) -> list[str]:
@@ -86,20 +118,12 @@ def circle(graph: dict[str, set[str]]) -> list[str]:
     return next((found for node in sorted(graph) if (found := visit(node, []))), [])
 
 
-def test_a_circle_is_found() -> None:
+def test_no_file_and_no_room_imports_in_a_circle_not_even_inside_functions() -> None:
     assert circle({"a": {"b"}, "b": {"c"}, "c": {"b"}}) == ["b", "c", "b"]
-    assert circle({"a": {"b", "c"}, "b": {"c"}, "c": set()}) == []
-
-
-def test_no_file_imports_in_a_circle_not_even_inside_functions() -> None:
-    graph = {
+    files = {
         name: imported_modules(name, path) for name, path in MODULES.items() if path.name != "__init__.py"
     }
-    assert len(graph) > 100
-    assert circle(graph) == []
-
-
-def test_no_room_imports_in_a_circle_not_even_inside_functions() -> None:
+    assert circle(files) == []
     rooms: dict[str, set[str]] = {}
     for name, path in MODULES.items():
         room = name.split(".")[1] if "." in name else ""
@@ -110,103 +134,131 @@ def test_no_room_imports_in_a_circle_not_even_inside_functions() -> None:
     assert circle(rooms) == []
 
 
-@pytest.mark.parametrize("name", MODULES)
-def test_the_inside_of_hydra_is_used_in_one_folder(name: str) -> None:
-    if name.startswith("staf_torch.sweeps.hydra_compat"):
-        return
-    for target in imports(name, MODULES[name]):
-        assert not target.startswith("hydra._internal")
-        assert not (target.startswith("hydra.") and "._" in target)
-        if target.startswith("hydra.core"):
-            assert target.rpartition(".")[0] in DOCUMENTED, target
+def test_the_inside_of_hydra_is_used_in_one_folder() -> None:
+    for name, path in MODULES.items():
+        for target in () if name.startswith("staf_torch.sweeps.hydra_compat") else imports(name, path):
+            assert not target.startswith("hydra._internal"), name
+            assert not (target.startswith("hydra.") and "._" in target), name
+            assert not target.startswith("hydra.core") or target.rpartition(".")[0] in DOCUMENTED, name
 
 
-def test_private_functions_have_seven_parameters_at_most() -> None:
-    crowded = [
-        f"{name}.{node.name}"
-        for name, path in MODULES.items()
-        for node in nodes(path)
-        if isinstance(node, ast.FunctionDef) and node.name.startswith("_") and not node.name.startswith("__")
-        if len([*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]) > 7
+# --- classes and settings -----------------------------------------------------------------------------------
+
+
+@functools.cache
+def classes() -> list[type]:
+    """Every class of the package."""
+    skipped = ("plugins", "__main__", ".conf")
+    names = [info.name for info in pkgutil.walk_packages(staf_torch.__path__, "staf_torch.")]
+    modules = [importlib.import_module(n) for n in names if not any(each in n for each in skipped)]
+    return [
+        kind
+        for m in modules
+        for kind in vars(m).values()
+        if inspect.isclass(kind) and kind.__module__ == m.__name__
     ]
-    assert [
-        name for name in crowded if name.split(".")[1] in ("cli", "sweeps", "experiments", "results")
-    ] == []
 
 
-def test_the_engine_is_six_frames_from_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from staf_torch.experiments import chase_batch
-
-    ways: list[list[str]] = []
-    pieces = chase_batch.chase_pieces
-
-    def counted(*args: object, **kwargs: object) -> object:
-        files = [frame.filename for frame in inspect.stack(0)[1:]]
-        own = [name for name in files if name.startswith(str(PACKAGE))]
-        assert not any("engine" in name.removeprefix(str(PACKAGE)) for name in own)
-        ways.append(own)
-        return pieces(*args, **kwargs)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(chase_batch, "chase_pieces", counted)
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", list(sys.argv))
-    code, _, err = one(str(tmp_path), ["duration=0.05", "settle_time=0", "figures=false"])
-    assert code == 0, err
-    (way,) = ways
-    assert len(way) <= 6
-    assert len({Path(name).name for name in way}) <= 5
+CHANGING = {"Loop": "a loop while it is traced", "StreamState": "a filter's, written in place"}
 
 
-@pytest.mark.parametrize("package", [name for name in PACKAGES if name != "targets"])
-def test_all_lists_what_a_package_hands_on(package: str) -> None:
-    module = importlib.import_module(f"staf_torch.{package}")
-    tree = ast.parse(Path(str(module.__file__)).read_text(encoding="utf-8"))
-    handed = {
-        alias.asname
-        for node in tree.body
-        if isinstance(node, ast.ImportFrom)
-        for alias in node.names
-        if alias.asname == alias.name and not inspect.ismodule(getattr(module, alias.name))
-    }
-    defined = {
-        node.name
-        for node in tree.body
-        if isinstance(node, ast.ClassDef | ast.FunctionDef) and not node.name.startswith("_")
-    }
-    assert handed | defined <= set(module.__all__)
-    assert all(hasattr(module, name) for name in module.__all__)
+def test_every_dataclass_is_frozen_but_for_two_that_say_why() -> None:
+    kinds = [kind for kind in classes() if dataclasses.is_dataclass(kind)]
+    assert len(kinds) > 30
+    open_ = {kind.__name__ for kind in kinds if not kind.__dataclass_params__.frozen}  # type: ignore[attr-defined]
+    assert open_ == set(CHANGING)
 
 
-def test_every_public_name_has_an_example_and_says_where_it_is_shown() -> None:
-    for name, (thing, _) in public().items():
-        text = thing.__doc__ or ""
-        assert ">>> " in text, f"the docstring of {name} needs an example"
-        check_shown(name, text)
+OTHERWISE = {
+    ("experiment/adp_policy_iteration.yaml", "width"): "the experiment's own",
+    ("optimizer/jacobi.yaml", "preconditioner"): "the option's name says so",
+    ("system/two_state_as_printed.yaml", "as_printed"): "the option's name says so",
+}
 
 
-def check_shown(name: str, text: str) -> None:
-    """What "Shown by" names must exist: a configuration, a command, or a file."""
-    shown = re.findall(r"Shown by `([^`]+)`", " ".join(text.split()))
-    assert shown, f"the docstring of {name} needs a line: Shown by `staf experiment=...`."
-    for place in shown:
-        program, *words = shlex.split(place)
-        if program == "staf":
-            groups = [word.split("=") for word in words if (ROOT / "conf" / word.partition("=")[0]).is_dir()]
-            assert groups or all("." in word or word.split("=")[0] in TOP for word in words), place
-            for group, option in groups:
-                assert (ROOT / "conf" / group / f"{option}.yaml").is_file(), place
-        elif program not in ("staf-table", "staf-export"):
-            assert (ROOT / place).is_file(), place
+def objects(node: Any) -> Iterator[dict[str, Any]]:
+    """Every node of settings that makes an object of the package."""
+    for value in node.values() if isinstance(node, dict) else ():
+        yield from objects(value)
+    if isinstance(node, dict) and str(node.get("_target_", "")).startswith("staf_torch."):
+        yield node
+
+
+def parameters(target: str) -> dict[str, inspect.Parameter]:
+    """Of what a target makes: of the class, also where a method of it makes one from settings."""
+    classes()  # all packages are attributes then
+    thing: Any = staf_torch
+    found = [thing := getattr(thing, name) for name in target.split(".")[1:]]
+    kind = next((each for each in found if inspect.isclass(each)), found[-1])
+    return dict(inspect.signature(kind).parameters)
+
+
+def test_an_option_of_the_command_line_is_the_default_of_the_constructor() -> None:
+    differing, count = {}, 0
+    for path in sorted(CONF.rglob("*.yaml")):
+        for node in objects(yaml.safe_load(path.read_text(encoding="utf-8"))):
+            known = parameters(node["_target_"])
+            for key, value in node.items():
+                default = known[key].default if key in known else None
+                written = (
+                    isinstance(value, bool | int | float | str) and "$" not in str(value) and value != "???"
+                )
+                if written and default not in (inspect.Parameter.empty, None):
+                    count += 1
+                    if value != default:
+                        differing[str(path.relative_to(CONF)), key] = value, default
+    assert count > 40
+    assert set(differing) == set(OTHERWISE), differing
+
+
+# --- lines --------------------------------------------------------------------------------------------------
+
+
+def told(files: Iterable[Path], rule: Rule) -> list[str]:
+    """What a rule says of files, each with its place."""
+    return [f"{path.relative_to(ROOT)}:{line}" for path in sorted(files) for line in rule(nodes(path))]
 
 
 @pytest.mark.parametrize("rule", [without_dtype, without_encoding], ids=["dtype", "encoding"])
-def test_no_number_depends_on_the_default_dtype_of_torch_and_no_text_on_a_locale(
-    rule: Callable[[str], Iterable[str]],
-) -> None:
+def test_no_number_depends_on_the_default_dtype_of_torch_and_no_text_on_a_locale(rule: Rule) -> None:
     """These are the user's: every tensor that is made says of which dtype, or is cast at once."""
-    found = [
-        f"{path.relative_to(ROOT)}:{call}"
-        for path in sorted(PACKAGE.rglob("*.py"))
-        for call in rule(path.read_text(encoding="utf-8"))
-    ]
-    assert found == []
+    assert told(PACKAGE.rglob("*.py"), rule) == []
+
+
+def test_no_test_looks_inside_the_package() -> None:
+    """Public names only: what cannot be seen through them no user loses."""
+    files = [path for path in TESTS.rglob("*.py") if path.relative_to(TESTS).parts[0] not in NOT_YET]
+    assert told(files, looks_inside) == []
+
+
+FORBIDDEN = """
+from staf_torch.lanes import _part
+from types import SimpleNamespace
+policy._cached
+adp.LQR.__new__(adp.LQR)
+getattr(policy, "_cached")
+monkeypatch.setattr(adp.rollout, "horizon", 1)
+monkeypatch.setattr("staf_torch.adp.rollout.horizon", 1)
+policy = adp.LQR(); monkeypatch.setattr(policy, "period", 1)
+monkeypatch.setitem(adp.TABLE, "a", 1)
+mock.patch.object(adp, "LQR")
+patch("staf_torch.adp.LQR")
+room = importlib.import_module("staf_torch.adp"); monkeypatch.delattr(room, "LQR")
+adp.LQR = None
+vars(adp)["LQR"] = None
+""".strip().splitlines()
+ALLOWED = """
+self._own; cls._own; os._exit(0); pair._replace(x=1)
+monkeypatch.setenv("CXX", "clang++")
+monkeypatch.setitem(sys.modules, "scipy", None)
+policy = adp.LQR(); policy.period = 0.1
+"""
+
+
+@pytest.mark.parametrize("line", FORBIDDEN)
+def test_a_line_that_looks_inside_is_found(line: str) -> None:
+    assert [*looks_inside([*ast.walk(ast.parse(f"from staf_torch import adp\n{line}"))])]
+
+
+def test_a_line_of_ones_own_is_not() -> None:
+    assert [*looks_inside([*ast.walk(ast.parse(f"from staf_torch import adp\n{ALLOWED}"))])] == []
