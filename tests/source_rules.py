@@ -1,4 +1,4 @@
-"""Rules that the text of a file keeps, whatever runs: each takes all nodes of its tree, from the outside in."""
+"""Rules that the text of a file keeps, whatever runs: each takes the nodes of its tree, outer ones first."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Public names: they are there, their examples do what they say, and they have a place on the reference pages.
+"""Public names: they are there, their examples do what they say, and `staf docs` has a page for each.
 
-An example begins where a reader does: after `import torch`, `from pathlib import Path`, `from staf_torch import *`,
-and the names of the package that the name itself is in.
+An example begins where a reader does: after `import torch`, `from pathlib import Path`,
+`from staf_torch import *`, and the names of the package that the name itself is in.
 """
 
 from __future__ import annotations
