@@ -281,7 +281,8 @@ def test_slopes_of_a_period_are_those_of_what_it_costs() -> None:
     y, others, t = x[:, :2], x[:, 2:], tensor([0.3, 0.5])
     slope, bend = plan._stage(y, others, t)
     end_slope, end_bend = plan._end(y, others, t)
-    a, b = plan._slopes(y, others, PUSH.expand(2, -1)).split((2, 1), dim=-1)
+    both = plan._slopes(y, others, PUSH.expand(2, -1))
+    a, b = both[..., :2], both[..., 2:]
     for k in range(2):
 
         def whole(y: Tensor, k: int = k) -> Tensor:
