@@ -1,95 +1,141 @@
-"""Value bases and the points at which the Bellman error is asked."""
+"""Bases of a value function and the points at which the Bellman error is computed, beside their formulas."""
 
 from __future__ import annotations
 
+import itertools
+import math
+from typing import Any
+
 import pytest
 import torch
-from helpers_adp import COST, PLANT, staf_basis, uniform
+from helpers import tensor, uniform
+from helpers_adp import COST, PLANT, staf_basis
+from torch import Tensor
 
-from staf_torch import (
-    AnchoredKernel,
-    ConstantRadius,
-    ExponentialKernel,
-    GaussianKernel,
-    StaFBasis,
-    StateFollowingCenters,
-    StateRadius,
-    adp,
-    rings,
-)
+import staf_torch as st
+from staf_torch import adp
+from staf_torch.centers import Radius
+
+
+def test_quadratic_functions_are_the_products_of_the_coordinates() -> None:
+    y = uniform(4, 3, seed=1)
+    pairs = list(itertools.combinations_with_replacement(range(3), 2))
+    basis = adp.QuadraticBasis(3)
+    assert (basis.count, basis.dim, basis.follows_state) == (6, 3, False)
+    torch.testing.assert_close(basis(y, 9 * y), torch.stack([y[:, i] * y[:, j] for i, j in pairs], -1))
+    torch.testing.assert_close(
+        basis.value(torch.arange(6).double(), y), (torch.arange(6) * basis(y, y)).sum(-1)
+    )
+    weights = dict(zip(pairs, basis.weights_near_square(), strict=True))
+    for (i, j), weight in weights.items():
+        assert weight == pytest.approx(float(i == j), abs=1e-9)
+
+
+@pytest.mark.parametrize("flat", [True, False])
+@pytest.mark.parametrize("width", [None, 0.7])
+def test_bumps_on_a_grid_are_those_of_the_formula(width: float | None, flat: bool) -> None:
+    basis = adp.RBFGridBasis(2, 3, 1.5, width, flat=flat)
+    wide = 1.5 if width is None else width
+    y = uniform(4, 2, seed=1)
+    columns = []
+    for c in itertools.product((-1.5, 0.0, 1.5), repeat=2):
+        center = tensor(c)
+        zero = math.exp(-float(center @ center) / (2 * wide**2))
+        bump = (-(y - center).square().sum(-1) / (2 * wide**2)).exp()
+        columns.append(bump - zero - ((y @ center) * zero / wide**2 if flat else 0.0))
+    torch.testing.assert_close(basis(y, y), torch.stack(columns, -1))
+    slopes = torch.func.vmap(torch.func.jacrev(lambda at: basis(at, at)))(y)
+    torch.testing.assert_close(basis.gradient(y, y), slopes)
+    at = torch.zeros(1, 2).double()
+    assert float(basis(at, at).abs().max()) < 1e-15
+    assert (float(basis.gradient(at, at).abs().max()) < 1e-15) is flat
+
+
+class Growing(Radius):
+    """A user's radius: of its slope the library knows nothing."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        return 0.2 + 0.3 * x[..., 0].square()
 
 
 @pytest.mark.parametrize("mode", ["total", "partial"])
-@pytest.mark.parametrize("radius", [StateRadius(0.7, 1e-5), StateRadius(0.3, 0.2, 2.0), ConstantRadius(0.2)])
-def test_closed_form_gradient_equals_automatic_differentiation(mode: str, radius: torch.nn.Module) -> None:
-    basis = StaFBasis(AnchoredKernel(ExponentialKernel()), StateFollowingCenters(rings(6), radius))
-    value = adp.StaFValueBasis(basis, mode)
-    y, x = uniform(7, 1.5).reshape(7, 1, 2), uniform(7, 1.5, seed=1).reshape(7, 1, 2)
-    assert value._closed
-    torch.testing.assert_close(value.gradient(y, x), value._automatic(y, x), rtol=1e-12, atol=1e-13)
-    torch.testing.assert_close(value(y, x), basis(y.unsqueeze(-2), x).squeeze(-2), rtol=1e-13, atol=1e-15)
-
-
 @pytest.mark.parametrize(
-    "basis",
-    [
-        staf_basis(),
-        staf_basis("partial"),
-        staf_basis("total", AnchoredKernel(GaussianKernel(0.8))),
-        staf_basis("partial", GaussianKernel(0.8)),
-        adp.QuadraticBasis(2),
-        adp.RBFGridBasis(2, points=3),
-        adp.RBFGridBasis(2, points=3, flat=False),
-    ],
-    ids=["staf", "staf-partial", "gaussian", "gaussian-partial", "quadratic", "rbf", "rbf-value-only"],
+    "radius", [0.4, st.StateRadius(0.7, 0.2, gain=1.5), Growing()], ids=["constant", "shrinking", "own"]
 )
-def test_gradient_of_every_basis_is_a_difference_quotient(basis: adp.ValueBasis) -> None:
-    y = uniform(6, 1.5)
-    moves = getattr(basis, "mode", "partial") == "total"
-    step = 1e-6
-    for axis in range(2):
-        h = torch.zeros(2, dtype=torch.float64)
-        h[axis] = step
-        centers = (y + h, y - h) if moves else (y, y)
-        quotient = (basis(y + h, centers[0]) - basis(y - h, centers[1])) / (2 * step)
-        torch.testing.assert_close(basis.gradient(y, y)[..., axis], quotient, rtol=1e-7, atol=1e-8)
-    assert basis(y, y).shape == (6, basis.count)
+@pytest.mark.parametrize(
+    "kernel",
+    [st.AnchoredKernel(st.ExponentialKernel()), st.GaussianKernel(0.8)],
+    ids=["anchored", "gaussian"],
+)
+def test_functions_around_the_state_and_their_slopes(kernel: st.Kernel, radius: Any, mode: str) -> None:
+    centers = st.StateFollowingCenters(st.rings(3), radius)
+    basis = adp.StaFValueBasis(st.StaFBasis(kernel, centers), mode)
+    x, y = uniform(4, 2, seed=1), uniform(4, 2, seed=2)
+    assert basis.follows_state
+    share = 1.0 if mode == "total" else 0.0  # of a move of y by which the centers move, too
+    torch.testing.assert_close(basis(y, x), kernel(y.unsqueeze(-2), centers(x)).squeeze(-2))
+    for at in (x, y):
+        rows = zip(at, x, strict=True)
+        moved = [(lambda h, y=y, x=x: basis(y + h, x + share * h)) for y, x in rows]
+        slopes = torch.stack([torch.func.jacrev(row)(torch.zeros(2).double()) for row in moved])
+        torch.testing.assert_close(basis.gradient(at, x), slopes, rtol=1e-11, atol=1e-12)
+    assert basis.gradient(y, x).shape == (4, 3, 2)
+
+
+def test_leading_coordinates_are_those_of_the_error() -> None:
+    basis = adp.LeadingCoordinates(adp.QuadraticBasis(2), 4)
+    y, x = uniform(3, 4, seed=1), uniform(3, 4, seed=2)
+    inner = adp.QuadraticBasis(2)
+    torch.testing.assert_close(basis(y, x), inner(y[:, :2], x[:, :2]))
+    found = basis.gradient(y, x)
+    torch.testing.assert_close(found[..., :2], inner.gradient(y[:, :2], x[:, :2]))
+    assert not found[..., 2:].any()
+    assert adp.LeadingCoordinates(adp.QuadraticBasis(2), 2).dim == 2
+    with pytest.raises(ValueError, match=r"`LeadingCoordinates\(dim=...\)` must be at least 2"):
+        adp.LeadingCoordinates(adp.QuadraticBasis(2), 1)
 
 
 def test_bellman_error_of_the_optimum_is_zero_in_the_quadratic_basis() -> None:
     basis = adp.QuadraticBasis(2)
     optimum = torch.tensor([0.5, 0.0, 1.0], dtype=torch.float64)  # x1^2 / 2 + x2^2
-    x = uniform(50, 2.0).unsqueeze(-2)
+    x = uniform(50, 2, low=-2, high=2, seed=0).unsqueeze(-2)
     terms = adp.bellman_terms(basis, PLANT, COST, x, x, optimum.expand(50, 3))
     assert adp.bellman_error(terms, optimum).abs().max() < 1e-12
 
 
-@pytest.mark.parametrize(
-    "extrapolation", [adp.RandomPoints(3, 0.2), adp.QuadraturePoints(4, 2, 0.2, "fixed")]
-)
-def test_extrapolated_points_stay_in_their_box_and_their_weights_sum_to_one(
-    extrapolation: adp.Extrapolation,
-) -> None:
-    x = uniform(9, 1.0)
-    draws = 2 * torch.rand(9, extrapolation.draws, 2, dtype=torch.float64) - 1
-    points = extrapolation(x, draws)
-    assert points.shape == (9, extrapolation.count, 2)
-    assert (points - x.unsqueeze(-2)).abs().max() <= 0.2
-    assert float(extrapolation.weights.sum()) == pytest.approx(1.0)
+@pytest.mark.parametrize("basis", [adp.QuadraticBasis(2), adp.RBFGridBasis(2)], ids=["quadratic", "grid"])
+def test_a_global_basis_starts_near_the_square(basis: adp.ValueBasis) -> None:
+    weights = torch.tensor(basis.weights_near_square(), dtype=torch.float64)
+    y = uniform(50, 2, seed=0)
+    torch.testing.assert_close(basis.value(weights, y), y.square().sum(-1), rtol=0, atol=0.05)
+    assert not basis.follows_state
+    assert adp.LeadingCoordinates(staf_basis(), 4).follows_state
 
 
-def test_box_around_the_origin_stays_there() -> None:
-    rule = adp.RandomPoints(2, 0.5, around="origin")
-    draws = 2 * torch.rand(9, 2, 2, dtype=torch.float64) - 1
-    torch.testing.assert_close(rule(uniform(9, 2.0), draws), 0.5 * draws, rtol=0, atol=0)
-
-
-def test_flat_rbf_basis_has_neither_value_nor_gradient_at_the_origin() -> None:
-    at = torch.zeros(1, 2, dtype=torch.float64)
-    for flat in (True, False):
-        basis = adp.RBFGridBasis(2, flat=flat)
-        assert basis(at, at).abs().max() < 1e-15
-        assert (float(basis.gradient(at, at).abs().max()) < 1e-15) is flat
+@pytest.mark.parametrize("around", ["state", "origin"])
+def test_points_are_the_cube_scaled_around_the_state_or_the_origin(around: str) -> None:
+    x = uniform(3, 2, seed=1)
+    middle = x if around == "state" else 0 * x
+    drawn = uniform(3, 4, 2, seed=2)
+    points = adp.RandomPoints(4, 0.3, around=around)
+    torch.testing.assert_close(points(x, drawn), middle.unsqueeze(1) + 0.3 * drawn)
+    assert (points.count, points.draws, points.moving, points.weights.tolist()) == (4, 4, True, [0.25] * 4)
+    rule = adp.QuadraturePoints(3, 2, 0.3, "fixed", around=around)
+    node = math.sqrt(0.6)
+    grid = tensor(list(itertools.product((-node, 0.0, node), repeat=2)))
+    torch.testing.assert_close(rule(x, x.new_zeros(3, 0, 2)), middle.unsqueeze(1) + 0.3 * grid)
+    masses = [a * b / 4 for a, b in itertools.product((5 / 9, 8 / 9, 5 / 9), repeat=2)]
+    torch.testing.assert_close(rule.weights, tensor(masses))
+    assert (rule.count, rule.draws, rule.moving) == (9, 0, False)
+    if around == "state":
+        shrinking = st.StateRadius(0.5, 0.1)
+        found = adp.RandomPoints(4, shrinking)(x, drawn)
+        torch.testing.assert_close(found, x.unsqueeze(1) + shrinking(x)[:, None, None] * drawn)
+    else:
+        with pytest.raises(
+            ValueError, match=r"\(half_width=...\)` must be constant for a box around the origin"
+        ):
+            adp.RandomPoints(4, st.StateRadius(0.5, 0.1), around="origin")
 
 
 def test_quadrature_takes_the_mean_over_the_box() -> None:
@@ -99,10 +145,21 @@ def test_quadrature_takes_the_mean_over_the_box() -> None:
     assert float(mean) == pytest.approx(0.5**10 / 35, rel=1e-12)
 
 
-@pytest.mark.parametrize("basis", [adp.QuadraticBasis(2), adp.RBFGridBasis(2)], ids=["quadratic", "grid"])
-def test_a_global_basis_starts_near_the_square(basis: adp.ValueBasis) -> None:
-    weights = torch.tensor(basis.weights_near_square(), dtype=torch.float64)
-    y = uniform(50, 1.0)
-    torch.testing.assert_close(basis.value(weights, y), y.square().sum(-1), rtol=0, atol=0.05)
-    assert not basis.follows_state
-    assert adp.LeadingCoordinates(staf_basis(), 4).follows_state
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: adp.RandomPoints(0, 0.1), r"`RandomPoints\(count=...\)` must be at least 1"),
+        (lambda: staf_basis("both"), r"`StaFValueBasis\(gradient=...\)` must be one of 'total', 'partial'"),
+        (lambda: adp.RBFGridBasis(2, points=1), r"`RBFGridBasis\(points=...\)` must be at least 2"),
+        (lambda: adp.RandomPoints(1, 0.3, around="here"), r"`RandomPoints\(around=...\)` must be one of"),
+        (lambda: adp.QuadraturePoints(0, 2, 0.3), r"`QuadraturePoints\(order=...\)` must be at least 1"),
+        (lambda: adp.QuadraturePoints(1, 0, 0.3), r"`QuadraturePoints\(dim=...\)` must be at least 1"),
+        (lambda: adp.QuadraturePoints(1, 1, 0.3, "x"), r"`QuadraturePoints\(centers=...\)` must be 'moving'"),
+        (lambda: adp.StaFValueBasis(3), r"`StaFValueBasis\(basis=...\)` must be a StaFBasis; got 3"),  # type: ignore[arg-type]
+        (lambda: adp.PolicyIteration(damping=0.0), r"`PolicyIteration\(damping=...\)` must be positive"),
+        (lambda: adp.PolicyIteration(settling=0.0), r"`PolicyIteration\(settling=...\)` must be positive"),
+    ],
+)
+def test_points_bases_and_laws_refuse_what_they_are_not(call: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        call()

@@ -1,8 +1,9 @@
-"""Costs beside sums and integrals that are written out, what a plant lends them, and what they refuse."""
+"""Costs beside sums and integrals that are written out: their policies, bounds, set-points and ends."""
 
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -10,12 +11,15 @@ import torch
 from helpers import tensor, uniform
 from torch import Tensor
 
-from staf_torch import adp, systems
+from staf_torch import adp, deploy, systems
+from staf_torch.deploy.c_header import runner_c
+from staf_torch.numerics.box import box_minimum
 
 Q = tensor([[2.0, 0.3], [0.3, 1.0]])
 R = tensor([[1.0, 0.0], [0.0, 3.0]])
 COUPLED = tensor([[1.0, 0.4], [0.4, 3.0]])
 X, U = uniform(5, 2, seed=1), uniform(5, 2, seed=2)
+FULL = tensor([[2.0, 0.5, 0.1, 0.0], [0.5, 1.5, 0.2, 0.1], [0.1, 0.2, 1.0, 0.3], [0.0, 0.1, 0.3, 1.2]])
 
 
 def form(matrix: Tensor, x: Tensor) -> Tensor:
@@ -97,7 +101,6 @@ def test_slopes_of_an_output_bend_the_cost_at_its_set_point() -> None:
     free = adp.QuadraticCost(Q, R, 2, 2, output=given["output"])
     slope = tensor([[1.0, 1.0], [1.0, 0.0]])
     torch.testing.assert_close(free.state_curvature(), slope.mT @ Q @ slope)
-    assert adp.QuadraticCost(Q, R, 2, 2).state_curvature() is not None
     torch.testing.assert_close(adp.QuadraticCost(Q, R, 2, 2).state_curvature(), Q)
     torch.testing.assert_close(free.state_rate(torch.zeros(1, 2).double()), torch.zeros(1).double())
     narrow = adp.QuadraticCost([[4.0]], R, 2, 2, output=lambda x: x[..., :1] ** 2)
@@ -136,6 +139,45 @@ def test_smooth_bounds_cost_the_integral_of_the_inverse_of_their_saturation(give
     g, p = uniform(5, 2, 2, seed=3), 2 * uniform(5, 2, seed=4)
     pull = torch.einsum("bnm,bn->bm", g, p)
     torch.testing.assert_close(cost.policy(g, p), cost.saturate(rest - 0.5 * pull / R.diagonal()))
+
+
+def test_four_inputs_that_are_bounded_may_be_weighed_together_and_five_may_not() -> None:
+    cost = adp.QuadraticCost(1.0, FULL, dim=2, inputs=4, low=-0.3, high=0.2)
+    effectiveness, gradient = uniform(5, 2, 4, seed=1), 4 * uniform(5, 2, seed=2)
+    found = cost.policy(effectiveness, gradient)
+    pull = (effectiveness.mT @ gradient.unsqueeze(-1)).squeeze(-1)
+
+    def paid(u: torch.Tensor) -> torch.Tensor:
+        return ((u @ FULL) * u).sum(-1) + (u * pull).sum(-1)
+
+    assert bool(((found >= -0.3) & (found <= 0.2)).all())
+    assert bool((found == 0.2).any())
+    for k in range(200):
+        other = (found + 0.1 * uniform(5, 4, seed=k)).clamp(-0.3, 0.2)
+        assert bool((paid(other) >= paid(found) - 1e-12).all())
+    five = torch.eye(5).double()
+    five[0, 1] = five[1, 0] = 0.1
+    with pytest.raises(ValueError, match="more than 4 bounded inputs"):
+        adp.QuadraticCost(1.0, five, dim=2, inputs=5, low=-1.0)
+    assert adp.QuadraticCost(1.0, five, dim=2, inputs=5).bounds is None
+
+
+@pytest.mark.parametrize("size", [1, 2, 3, 4])
+def test_box_minimum_satisfies_its_optimality_conditions(size: int) -> None:
+    generator = torch.Generator().manual_seed(size)
+    root = torch.randn(40, size, size, dtype=torch.float64, generator=generator)
+    H = root @ root.mT + 0.1 * torch.eye(size, dtype=torch.float64)
+    c = 3 * torch.randn(40, size, dtype=torch.float64, generator=generator)
+    low = -torch.rand(40, size, dtype=torch.float64, generator=generator)
+    high = low + 1.0
+    high[:, 0] = math.inf
+    u = box_minimum(H, c, low, high)
+    slope = (H @ u.unsqueeze(-1)).squeeze(-1) + c
+    assert ((u >= low) & (u <= high)).all()
+    assert (slope[(u > low) & (u < high)].abs() < 1e-9).all()
+    assert (slope[u == low] >= -1e-9).all()
+    assert (slope[u == high] <= 1e-9).all()
+    assert box_minimum(H, torch.nan * c, low, high).isnan().all()
 
 
 # --- what a plant lends -------------------------------------------------------------------------------------
@@ -189,7 +231,6 @@ def test_bounds_are_replaced_in_a_copy_that_is_prepared_anew() -> None:
         assert other.bounds.high.tolist() == [math.inf if high is None else high] * 2
         assert bool(other.bounds.contain(other.policy(uniform(9, 2, 2), 9 * uniform(9, 2))).all())
     assert cost.bounds is None
-    assert "_faces" not in dict(cost.named_buffers())
     smooth = adp.BoundedInputCost(Q, R, 2, 2, bound=1.0)
     wide = smooth.bounded(-2.0, 3.0)
     assert float(wide.saturate(tensor([99.0, -99.0]))[0]) == pytest.approx(3.0)
@@ -206,6 +247,124 @@ def test_sizes_of_plant_and_cost_must_agree() -> None:
             adp.QuadraticCost(Q, R, 2, 2).around(plant)
     none = systems.Linear((-torch.eye(2)).tolist())  # a plant without inputs may be watched
     assert adp.QuadraticCost(Q, R, 2, 2).around(none).dim == 2
+
+
+LOW, HIGH = [-1.0, -math.inf], [0.5, 2.0]
+
+
+class Two(systems.ControlAffineSystem):
+    """A plant of a user: the two-state plant with a second input."""
+
+    dim, inputs = 2, 2
+
+    def drift(self, x: Tensor) -> Tensor:
+        return systems.TwoState().drift(x)
+
+    def effectiveness(self, x: Tensor) -> Tensor:
+        return torch.cat((systems.TwoState().effectiveness(x), torch.ones_like(x).unsqueeze(-1)), dim=-1)
+
+
+@torch.no_grad()
+def test_loop_applies_no_control_beyond_the_bounds_whoever_asks_for_it() -> None:
+    cost = adp.QuadraticCost(1.0, 1.0, 2, 2, low=LOW, high=HIGH)
+    x0 = uniform(5, 2, low=-2, high=2, seed=1)
+    greedy = adp.Feedback(lambda x: 9 * torch.ones_like(x))
+    run = adp.simulate(greedy, Two(), cost, x0, dt=0.01, steps=20)
+    assert torch.equal(run.control[0, 0], torch.tensor(HIGH).double())
+    for policy in (adp.LQR(Two(), cost), adp.RolloutPolicy.of_lqr(Two(), cost, steps=3)):
+        u = adp.simulate(adp.Feedback(policy), Two(), cost, x0, dt=0.04, steps=40).control[:, :-1]
+        assert cost.bounds.contain(u).all()
+        assert (u[..., 0] == -1.0).any() or (u[..., 0] == 0.5).any()
+
+
+@pytest.mark.needs_compiler
+def test_exported_policy_keeps_asymmetric_bounds(tmp_path: Path) -> None:
+    cost = adp.QuadraticCost(1.0, tensor([[1.0, 0.6], [0.6, 2.0]]), 2, 2, low=LOW, high=HIGH)
+    policy = deploy.policy_of(adp.RolloutPolicy.of_lqr(Two(), cost, steps=2))
+    x = uniform(50, 2, low=-3, high=3, seed=4)
+    deploy.export_c(policy, x[:1], tmp_path / "staf.h", ["u"])
+    (u,) = runner_c(tmp_path / "staf.h", [2], torch.float64)(x)
+    torch.testing.assert_close(u, policy(x), rtol=1e-9, atol=1e-9)
+    assert cost.bounds.contain(u).all()
+
+
+# --- a terminal cost ----------------------------------------------------------------------------------------
+
+
+A, B = [[0.0, 1.0], [0.5, -0.1]], [[0.0], [1.0]]
+END, X0 = tensor([[8.0, 1.0], [1.0, 0.5]]), tensor([[1.0, -0.5], [-0.3, 0.8]])
+PLANT = systems.Linear(A, B)
+COST = adp.QuadraticCost(1.0, 0.5, 2, 1, terminal=END)
+
+
+def riccati_recursion(problem: adp.SampledProblem, steps: int) -> tuple[Tensor, Tensor]:
+    """P at the start and the gains (T, m, n) of the linear-quadratic problem that ends with x'Sx."""
+    at = problem.derivatives(torch.zeros(1, 2).double(), torch.zeros(1, 1).double())
+    a, b, w = at.first[0, :, :2], at.first[0, :, 2:], 0.5 * at.cost_second[0]
+    p, gains = END, []
+    for _ in range(steps):
+        inner = w[2:, 2:] + b.mT @ p @ b
+        cross = b.mT @ p @ a + w[2:, :2]
+        k = torch.linalg.solve(inner, cross)
+        p = w[:2, :2] + a.mT @ p @ a - cross.mT @ k
+        gains.insert(0, k)
+    return p, torch.stack(gains)
+
+
+def test_plan_of_a_linear_plant_is_the_regulator_of_its_horizon() -> None:
+    problem = adp.SampledProblem.of(PLANT, COST, dt=0.1)
+    p, gains = riccati_recursion(problem, 12)
+    found = adp.BoxDDP(problem, steps=12, compile=False).solve(X0)
+    torch.testing.assert_close(found.cost, (X0 @ p * X0).sum(-1), rtol=1e-9, atol=0)
+    torch.testing.assert_close(found.feedback, -gains.expand(2, -1, -1, -1), rtol=1e-7, atol=1e-7)
+    endless = adp.SampledProblem.of(PLANT, adp.QuadraticCost(1.0, 0.5, 2, 1), dt=0.1)
+    torch.testing.assert_close(endless.terminal(X0), (X0 @ endless.p * X0).sum(-1))
+    assert float((endless.k - gains[-1]).abs().max()) > 0.1  # the two differ near the end
+    follower = adp.RecedingHorizon(problem, steps=12, iterations=0, compile=False)
+    x, carried = X0, follower.init(X0)
+    for k in gains:
+        u, carried = follower.step(x, carried, X0, 0.1)
+        torch.testing.assert_close(u, -x @ k.mT, rtol=1e-6, atol=1e-7)
+        x, _ = problem.advance(x, u)
+
+
+def test_shooting_over_a_horizon_pays_the_terminal_cost() -> None:
+    horizon = 1.5
+    a, b = (torch.tensor(part, dtype=torch.float64) for part in (A, B))
+    hamiltonian = torch.cat(
+        (torch.cat((a, -b @ b.mT / 0.5), dim=1), torch.cat((-torch.eye(2).double(), -a.mT), dim=1))
+    )
+    both = torch.linalg.matrix_exp(-hamiltonian * horizon) @ torch.cat((torch.eye(2).double(), END))
+    p = both[2:] @ torch.linalg.inv(both[:2])  # of the Riccati differential equation, backward in time
+    found = adp.DirectShooting(PLANT, COST, horizon=horizon, intervals=20).solve(X0)
+    torch.testing.assert_close(found.value, (X0 @ p * X0).sum(-1), rtol=1e-4, atol=0)
+    left = (found.state[:, -1] @ END * found.state[:, -1]).sum(-1) / found.value
+    torch.testing.assert_close(found.horizon_error, left, rtol=1e-9, atol=0)
+
+
+def test_rollouts_end_with_the_terminal_cost_around_the_set_point() -> None:
+    cost = adp.QuadraticCost(1.0, 0.5, 2, 1, terminal=END, target=[0.4, 0.0])
+    policy = adp.RolloutPolicy.of_lqr(PLANT, cost, horizon=0.5, steps=5)
+    away = X0 - torch.tensor([0.4, 0.0], dtype=torch.float64)
+    torch.testing.assert_close(policy.terminal(X0), (away @ END * away).sum(-1))
+    none = adp.QuadraticCost(1.0, 0.5, 2, 1, terminal=torch.zeros(2, 2).double(), target=[0.4, 0.0])
+    cheaper = adp.RolloutPolicy.of_lqr(PLANT, none, horizon=0.5, steps=5)
+    assert bool((policy.rollout(X0) > cheaper.rollout(X0)).all())
+
+
+def test_what_knows_no_end_refuses_a_terminal_cost() -> None:
+    with pytest.raises(ValueError, match=r"terminal=...\)` must be None beside an output or a discount"):
+        adp.QuadraticCost(1.0, 1.0, 2, 1, terminal=1.0, discount=0.1)
+    with pytest.raises(ValueError, match=r"terminal=...\)` must be .*semidefinite"):
+        adp.QuadraticCost(1.0, 1.0, 2, 1, terminal=-END)
+    with pytest.raises(ValueError, match=r"near_optimal\(cost=...\)` must have no terminal cost"):
+        adp.near_optimal(PLANT, COST, dt=0.1)
+    with pytest.raises(ValueError, match=r"DirectShooting\(horizon=...\)` must be given beside a terminal"):
+        adp.DirectShooting(PLANT, COST)
+    problem = adp.SampledProblem.of(PLANT, COST, dt=0.1)
+    library = adp.BoxDDP(problem, steps=3, compile=False).solve(X0)
+    with pytest.raises(ValueError, match=r"GlobalValue\(problem=...\)` must have no terminal cost"):
+        adp.GlobalValue(problem, library, [1.0, 1.0])
 
 
 # --- what is stated -----------------------------------------------------------------------------------------
@@ -235,12 +394,14 @@ def test_matrices_are_numbers_diagonals_or_matrices_in_double_precision() -> Non
     assert adp.QuadraticCost(Q, R, 2, 2).discount == 0.0
 
 
-def test_many_inputs_have_bounds_where_they_are_not_coupled() -> None:
-    many = torch.eye(5).double()
-    assert adp.QuadraticCost(Q, many, 2, 5, low=-1.0).bounds is not None
-    assert adp.QuadraticCost(Q, many + 0.1, 2, 5).bounds is None
-    four = torch.eye(4).double() + 0.1
-    assert adp.QuadraticCost(Q, four, 2, 4, low=-1.0).bounds is not None
+def test_a_state_dict_has_the_matrices_and_not_what_follows_from_bounds() -> None:
+    smooth = adp.BoundedInputCost(1.0, 1.0, dim=2, inputs=2, bound=[1.0, 2.0])
+    coupled = adp.QuadraticCost(1.0, FULL[:2, :2], dim=2, inputs=2, low=-1.0, high=2.0)
+    for cost in (smooth, coupled):
+        assert sorted(cost.state_dict()) == ["q", "r", "r_inverse"]
+    ended = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1, terminal=3.0)
+    assert sorted(ended.state_dict()) == ["end", "q", "r", "r_inverse"]
+    torch.testing.assert_close(coupled.r_inverse @ FULL[:2, :2], torch.eye(2).double())
 
 
 @pytest.mark.parametrize(
@@ -264,6 +425,9 @@ def test_many_inputs_have_bounds_where_they_are_not_coupled() -> None:
         ({"output": lambda x: x.sum(-1)}, r"must map \(..., 2\) to \(..., p\); got \(1,\)"),
         ({"output": lambda x: x.repeat(2, 1)}, r"must map \(..., 2\) to \(..., p\); got \(2, 2\)"),
         ({"output": lambda x: 3.0}, r"must map \(..., 2\) to \(..., p\); got 3.0"),
+        ({"low": 1.0, "high": 1.0}, "must be below high"),
+        ({"low": [0.0, 1.0, 2.0]}, r"`Bounds\(low=...\)` must be a number or one for each"),
+        ({"high": math.nan}, r"`Bounds\(high=...\)` must be finite or inf"),
         ({"state": "Q"}, r"`QuadraticCost\(state=...\)` must be a number"),
         ({"state": [1.0, 2.0, 3.0]}, r"`QuadraticCost\(state=...\)` must be \(2, 2\)"),
         ({"state": [[1.0, 2.0], [3.0]]}, r"`QuadraticCost\(state=...\)` must have 2 entries"),
