@@ -1,15 +1,49 @@
-"""The closed loop: rows are alone, trouble stays in its row, bad input is named."""
+"""The closed loop: rows are alone, trouble stays in its row, every argument matters, bad input is refused."""
 
 from __future__ import annotations
 
+import math
+from typing import Any
+
+import numpy as np
 import pytest
 import torch
-from helpers_adp import BOX, COST, PLANT, learner, staf_basis, uniform
-from torch import Tensor
+from helpers import tensor, uniform
+from helpers_adp import BOX, COST, learner, staf_basis
+from helpers_adp import PLANT as TWO_STATE
+from helpers_adp import uniform as drawn
+from torch import Tensor, nn
 
-from staf_torch import adp, systems
+from staf_torch import adp, lanes, systems
 
-LQR = adp.LQR(PLANT, COST)
+LQR = adp.LQR(TWO_STATE, COST)
+UNSTABLE = systems.Linear([[0.0, 1.0], [2.0, -1.0]], [[0.0], [1.0]])
+PLANT = systems.Linear([[0.0, 1.0], [-1.0, -0.5]], [[0.0], [1.0]])
+PAID = adp.QuadraticCost(2.0, 0.5, dim=2, inputs=1)
+X0 = tensor([[1.0, 0.0], [-0.5, 0.8], [0.2, -0.3]])
+STEP = systems.StepPlant(lambda x, u: 0.9 * x + u, dim=2, inputs=1, dt=0.25)
+
+
+class Noisy(adp.Controller):
+    """u is the sum of its random numbers; it carries how many steps it has taken, and the last dt."""
+
+    draws = 2
+
+    def init(self, x0: Tensor) -> Tensor:
+        return x0.new_zeros(len(x0), 2)
+
+    def step(self, x: Tensor, carried: Tensor, uniform: Tensor, dt: float) -> tuple[Tensor, Tensor]:
+        assert uniform.shape == (len(x), 2, 2)
+        return uniform.flatten(1).sum(-1, keepdim=True), carried + tensor([1.0, dt])
+
+
+def zero(x: Tensor) -> Tensor:
+    return torch.zeros_like(x[..., :1])
+
+
+def run(controller: Any = zero, plant: Any = PLANT, cost: Any = PAID, x0: Tensor = X0, **given: Any) -> Any:
+    with torch.no_grad():
+        return adp.simulate(controller, plant, cost, x0, **{"dt": 0.01, "steps": 6, "compile": False} | given)
 
 
 def controllers() -> list[adp.Controller]:
@@ -19,46 +53,22 @@ def controllers() -> list[adp.Controller]:
         learner(adp.Published()),
         learner(adp.Frozen()),
         learner(adp.Information(), adp.RandomPoints(3, BOX, "fixed")),
-        adp.ActorCritic(adp.QuadraticBasis(2), PLANT, COST, adp.QuadraturePoints(2, 2, BOX)),
+        adp.ActorCritic(adp.QuadraticBasis(2), TWO_STATE, COST, adp.QuadraturePoints(2, 2, BOX)),
         adp.Supervised(learner(adp.Information()), LQR, COST),
     ]
 
 
 @pytest.mark.parametrize("controller", controllers(), ids=lambda c: type(c).__name__)
 def test_rows_are_alone(controller: adp.Controller) -> None:
-    x0 = uniform(4, 1.0)
+    x0 = drawn(4, 1.0)
     settings = {"dt": 0.005, "steps": 16}
-    whole = adp.simulate(controller, PLANT, COST, x0, seed=10, **settings)
+    whole = adp.simulate(controller, TWO_STATE, COST, x0, seed=10, **settings)
     for row in range(4):
-        alone = adp.simulate(controller, PLANT, COST, x0[row : row + 1], seed=10 + row, **settings)
+        alone = adp.simulate(controller, TWO_STATE, COST, x0[row : row + 1], seed=10 + row, **settings)
         for name in ("state", "critic_weights", "actor_weights", "running_cost"):
             torch.testing.assert_close(
                 getattr(whole, name)[row], getattr(alone, name)[0], rtol=1e-9, atol=1e-12
             )
-
-
-class Broken(systems.TwoState):
-    """Returns NaN on one side of a line."""
-
-    def drift(self, x: Tensor) -> Tensor:
-        return torch.where(x[..., :1] > 0.71, torch.nan, super().drift(x))
-
-
-def test_row_of_a_plant_that_returns_nan_freezes_and_the_others_do_not_notice() -> None:
-    x0 = torch.tensor([[-1.0, 1.0], [0.7, 1.5], [0.5, -0.5]], dtype=torch.float64)
-    run = adp.simulate(adp.Feedback(LQR), Broken(), COST, x0, dt=0.01, steps=120)
-    sound = adp.simulate(adp.Feedback(LQR), PLANT, COST, x0, dt=0.01, steps=120)
-    assert run.diverged.tolist() == [False, True, False]
-    assert 0 < float(run.frozen_at[1]) < 1
-    for row in (0, 2):
-        torch.testing.assert_close(run.state[row], sound.state[row], rtol=0, atol=0)
-    assert torch.isfinite(run.state).all()
-    assert torch.isfinite(run.cost).all()
-    frozen = round(float(run.frozen_at[1]) / 0.01)
-    torch.testing.assert_close(
-        run.state[1, frozen:], run.state[1, frozen].expand(121 - frozen, 2), rtol=0, atol=0
-    )
-    assert torch.isnan(run.control[1, frozen:]).all()
 
 
 class BrokenStrip(systems.TwoState):
@@ -72,7 +82,7 @@ def test_weights_of_a_row_whose_plant_returns_nan_freeze_with_it() -> None:
     x0 = torch.tensor([[0.1, 0.1], [-1.0, 1.0]], dtype=torch.float64)
     controller = learner(adp.Information(), adp.RandomPoints(1, 1e-3))
     run = adp.simulate(controller, BrokenStrip(), COST, x0, dt=0.01, steps=60)
-    alone = adp.simulate(controller, PLANT, COST, x0[:1], dt=0.01, steps=60)
+    alone = adp.simulate(controller, TWO_STATE, COST, x0[:1], dt=0.01, steps=60)
     assert run.diverged.tolist() == [False, True]
     torch.testing.assert_close(run.critic_weights[0], alone.critic_weights[0], rtol=1e-12, atol=0)
     frozen = round(float(run.frozen_at[1]) / 0.01)
@@ -81,58 +91,476 @@ def test_weights_of_a_row_whose_plant_returns_nan_freeze_with_it() -> None:
     assert torch.equal(run.critic_weights[1, frozen], run.critic_weights[1, -1])
 
 
-def test_state_that_leaves_the_limit_counts_as_diverged() -> None:
-    idle = adp.Feedback(lambda x: torch.zeros_like(x[..., :1]))
-    plant = systems.Linear([[1.0, 0.0], [0.0, 2.0]], [[1.0], [1.0]])
-    run = adp.simulate(
-        idle, plant, COST, uniform(5, 1.0), dt=0.05, steps=200, every=200, limit=50.0, compile=False
+class Broken(systems.TwoState):
+    """Returns NaN on one side of a line."""
+
+    def drift(self, x: Tensor) -> Tensor:
+        return torch.where(x[..., :1] > 0.71, torch.nan, super().drift(x))
+
+
+def test_row_of_a_plant_that_returns_nan_freezes_and_the_others_do_not_notice() -> None:
+    x0 = torch.tensor([[-1.0, 1.0], [0.7, 1.5], [0.5, -0.5]], dtype=torch.float64)
+    run = adp.simulate(adp.Feedback(LQR), Broken(), COST, x0, dt=0.01, steps=120)
+    sound = adp.simulate(adp.Feedback(LQR), TWO_STATE, COST, x0, dt=0.01, steps=120)
+    assert run.diverged.tolist() == [False, True, False]
+    assert 0 < float(run.frozen_at[1]) < 1
+    for row in (0, 2):
+        torch.testing.assert_close(run.state[row], sound.state[row], rtol=0, atol=0)
+    assert torch.isfinite(run.state).all()
+    assert torch.isfinite(run.cost).all()
+    frozen = round(float(run.frozen_at[1]) / 0.01)
+    torch.testing.assert_close(
+        run.state[1, frozen:], run.state[1, frozen].expand(121 - frozen, 2), rtol=0, atol=0
     )
-    assert run.diverged.all()
-    assert (run.state[:, -1].norm(dim=-1) <= 50).all()
+    assert torch.isnan(run.control[1, frozen:]).all()
 
 
 def test_initial_state_that_is_not_finite_is_frozen_from_the_start() -> None:
     x0 = torch.tensor([[float("nan"), 0.0], [0.1, 0.1]], dtype=torch.float64)
-    run = adp.simulate(adp.Feedback(LQR), PLANT, COST, x0, dt=0.01, steps=10)
+    run = adp.simulate(adp.Feedback(LQR), TWO_STATE, COST, x0, dt=0.01, steps=10)
     assert run.frozen_at.tolist() == [0.0, float("inf")]
 
 
 def test_cost_of_the_lqr_on_a_linear_plant_is_the_riccati_value() -> None:
-    plant = systems.Linear([[0.0, 1.0], [2.0, -1.0]], [[0.0], [1.0]])
+    plant = UNSTABLE
     lqr = adp.LQR(plant, COST)
-    x0 = uniform(6, 2.0)
+    x0 = drawn(6, 2.0)
     run = adp.simulate(adp.Feedback(lqr), plant, COST, x0, dt=0.005, steps=2000, every=2000, compile=True)
     torch.testing.assert_close(run.cost, lqr.value(x0), rtol=1e-4, atol=0)
     torch.testing.assert_close(plant.optimal_value(x0, COST.q, COST.r), lqr.value(x0))
 
 
-def test_recorded_times_are_those_of_every_step() -> None:
-    x0 = uniform(2, 1.0)
-    every = adp.simulate(learner(adp.Information()), PLANT, COST, x0, dt=0.005, steps=20)
-    some = adp.simulate(learner(adp.Information()), PLANT, COST, x0, dt=0.005, steps=20, every=5)
-    assert every.state.shape == (2, 21, 2)
-    torch.testing.assert_close(some.time, every.time[::5])
-    torch.testing.assert_close(some.state, every.state[:, ::5])
-    torch.testing.assert_close(some.control[:, :-1], every.control[:, :-1:5])
-    torch.testing.assert_close(some.running_cost, every.running_cost[:, ::5])
+@pytest.mark.parametrize("discount", [0.0, 0.7])
+def test_the_value_of_an_lqr_solves_the_hjb_equation_with_its_discount(discount: float) -> None:
+    plant = UNSTABLE
+    cost = adp.QuadraticCost(1.5, 0.5, dim=2, inputs=1, discount=discount)
+    lqr = adp.LQR(plant, cost)
+    x = torch.tensor([[1.0, -0.3], [-0.4, 2.0]], dtype=torch.float64)
+    u = lqr(x)
+    slope = torch.func.grad(lambda x: lqr.value(x).sum())(x)
+    residual = cost.rate(x, u) + (slope * plant.motion(x, u)).sum(-1) - discount * lqr.value(x)
+    assert float(residual.abs().max()) < 1e-10
 
 
-def test_supervised_control_stays_in_its_tube_and_is_untouched_inside() -> None:
-    guard = adp.Supervised(learner(adp.Information()), LQR, COST, trust=0.5)
-    x = uniform(200, 2.0)
-    base = LQR(x)
-    far = base + 10 * torch.randn(200, 1, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    assert ((guard.restrain(x, far) - base).abs() <= 0.5 * base.abs() * (1 + 1e-12)).all()
-    near = 1.3 * base
-    torch.testing.assert_close(guard.restrain(x, near), near, rtol=1e-14, atol=0)
-    assert torch.isfinite(guard.restrain(torch.zeros(1, 2).double(), torch.ones(1, 1).double())).all()
+# --- the arguments of a run ---------------------------------------------------------------------------------
+
+
+def test_a_control_is_held_for_the_period_of_the_controller_or_the_plant_or_a_millisecond() -> None:
+    held = Noisy()
+    held.period = 0.5
+    for controller, plant, dt, wanted in (
+        (zero, PLANT, None, 0.001),
+        (zero, PLANT, 0.02, 0.02),
+        (zero, STEP, None, 0.25),
+        (zero, STEP, 0.5, 0.5),
+        (held, PLANT, None, 0.5),
+        (held, STEP, None, 0.5),
+        (adp.LQR(PLANT, PAID, period=0.1), PLANT, None, 0.1),
+    ):
+        found = run(controller, plant, dt=dt, steps=4, every=2)
+        torch.testing.assert_close(found.time, tensor([0.0, 2.0, 4.0]) * wanted)
+        assert found.time.dtype == torch.float64
+
+
+def test_pieces_of_a_run_change_nothing() -> None:
+    """Random numbers are drawn for about a thousand steps at once: as one stream a row."""
+    whole = run(Noisy(), x0=X0[:1], steps=2100, seed=3)
+    numbers = torch.empty(2100, 4, dtype=torch.float64)
+    numbers.uniform_(-1.0, 1.0, generator=torch.Generator().manual_seed(3))
+    torch.testing.assert_close(whole.control[0, :-1, 0], numbers.sum(-1))
+    for every in (7, 1050):
+        done: list[int] = []
+        some = run(Noisy(), x0=X0[:1], steps=2100, seed=3, every=every, progress=done.append)
+        assert sum(done) == 2100
+        for name in ("state", "control", "running_cost"):
+            wanted = getattr(whole, name)[:, ::every]
+            torch.testing.assert_close(getattr(some, name), wanted, rtol=1e-12, atol=1e-14, equal_nan=True)
+        torch.testing.assert_close(some.time, whole.time[::every])
+
+
+def test_rows_draw_from_seeds_of_their_own() -> None:
+    first = run(Noisy(), seed=5)
+    for row in range(3):
+        alone = run(Noisy(), x0=X0[row : row + 1], seed=5 + row)
+        torch.testing.assert_close(first.control[row, :-1], alone.control[0, :-1])
+    listed = run(Noisy(), seed=[7, 5, 7])
+    torch.testing.assert_close(listed.control[1, :-1], first.control[0, :-1])
+    torch.testing.assert_close(listed.control[0, :-1], listed.control[2, :-1])
+    torch.testing.assert_close(listed.control[0, :-1], first.control[2, :-1])
+    assert not torch.allclose(first.control[0, :-1], first.control[1, :-1])
+    torch.testing.assert_close(run(Noisy()).control[:, :-1], run(Noisy(), seed=0).control[:, :-1])
+    numbers = run(Noisy(), steps=500).control[:, :-1] / 4  # the mean of four, each even on [-1, 1]
+    assert float(numbers.abs().max()) <= 1
+    assert abs(float(numbers.mean())) < 0.03
+    assert float(numbers.square().mean()) == pytest.approx(1 / 12, rel=0.1)
+    for wrong, message in (
+        ([1, 2], r"`simulate\(seed=...\)` must be one a row, 3; got 2"),
+        (-1, r"`simulate\(seed=...\)` must be at least 0"),
+        ([0, 1, -1], r"`simulate\(seed=...\)` must be at least 0"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            run(Noisy(), seed=wrong)
+
+
+@pytest.mark.parametrize("discount", [0.0, 0.7])
+@pytest.mark.parametrize("integrator", ["runge_kutta", "euler"])
+def test_what_is_paid_is_the_sum_over_the_steps(discount: float, integrator: str) -> None:
+    cost = adp.QuadraticCost(2.0, 0.5, dim=2, inputs=1, discount=discount)
+    found = run(Noisy(), cost=cost, dt=0.1, steps=8, integrator=integrator)
+    spent, x = torch.zeros(3).double(), X0
+    for k in range(8):
+        u = found.control[:, k]
+        if integrator == "euler":
+            step, paid = x + 0.1 * PLANT.rate(x, u), 0.1 * cost.rate(x, u)
+        else:
+            z = torch.cat((x, u), -1)
+            flow = torch.cat((torch.cat((PLANT.matrix, PLANT.input_matrix), 1), torch.zeros(1, 3).double()))
+            step, paid = (z @ torch.linalg.matrix_exp(0.1 * flow).mT)[:, :2], torch.zeros(3).double()
+            for share, mass in ((0.0, 1.0), (0.5, 4.0), (1.0, 1.0)):  # Simpson's rule
+                at = (z @ torch.linalg.matrix_exp(0.1 * share * flow).mT)[:, :2]
+                paid = paid + 0.1 * mass / 6 * math.exp(-discount * 0.1 * share) * cost.rate(at, u)
+        spent, x = spent + math.exp(-discount * 0.1 * k) * paid, step
+        torch.testing.assert_close(found.state[:, k + 1], x, rtol=1e-6, atol=1e-6)
+        torch.testing.assert_close(found.running_cost[:, k + 1], spent, rtol=1e-5, atol=1e-6)
+        x = found.state[:, k + 1]
+    assert torch.equal(found.cost, found.running_cost[:, 8])
+    assert torch.equal(found.running_cost[:, 0], torch.zeros(3).double())
+    assert bool(found.control[:, 8].isnan().all())
+    assert found.control.shape == (3, 9, 1)
+
+
+def test_a_row_at_the_limit_lives_and_one_beyond_is_frozen_in_time() -> None:
+    still = systems.StepPlant(lambda x, u: x + u, dim=2, inputs=1, dt=0.5)
+
+    def off(x: Tensor) -> Tensor:  # the third row walks away, a unit a step
+        return torch.where(x[..., :1] == x[..., 1:], torch.ones_like(x[..., :1]), 0.0)
+
+    x0 = tensor([[3.0, 4.0], [4.0, 3.1], [0.0, 0.0]])
+    cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
+    found = run(off, still, cost, x0, dt=0.5, steps=8, limit=5.0)
+    assert found.frozen_at.tolist() == [math.inf, 0.0, 1.5]
+    assert found.diverged.tolist() == [False, True, True]
+    assert found.state[2, :, 0].tolist() == [0.0, 1.0, 2.0, 3.0, 3.0, 3.0, 3.0, 3.0, 3.0]
+    assert found.control[2].isnan().flatten().tolist() == [False] * 3 + [True] * 6
+    assert float(found.cost[1]) == 0.0
+    assert float(found.cost[2]) == pytest.approx(0.5 * (3 + 2 * (0 + 1 + 4)))
+    assert run(zero, x0=1e6 * tensor([[0.6, 0.8]]), plant=STEP, dt=0.25, steps=1).diverged.tolist() == [False]
+    assert run(zero, x0=1e6 * tensor([[1.3, 0.0]]), plant=STEP, dt=0.25, steps=1).diverged.tolist() == [True]
+
+
+class Growing(Noisy):
+    """Its memory becomes infinite in the second step of the first row."""
+
+    def step(self, x: Tensor, carried: Tensor, uniform: Tensor, dt: float) -> tuple[Tensor, Tensor]:
+        u, after = super().step(x, carried, uniform, dt)
+        late = (after[:, :1] == 2) & (x[:, :1] > 0.5)
+        return u, torch.where(late, torch.inf, after)
+
+
+def test_a_memory_that_is_lost_freezes_its_row_alone() -> None:
+    found = run(Growing(), steps=5, dt=0.02)
+    assert found.frozen_at.tolist() == [0.02, math.inf, math.inf]
+    assert bool(torch.isfinite(found.state).all())
+    assert found.actor_weights.shape == found.critic_weights.shape == found.identifier.shape == (3, 6, 0)
+
+
+def test_a_control_that_is_renewed_follows_the_state_within_its_bounds() -> None:
+    cost = adp.QuadraticCost(2.0, 0.5, dim=2, inputs=1, low=-0.3, high=0.2)
+
+    def policy(x: Tensor) -> Tensor:
+        return -2 * x[..., 1:]
+
+    found = run(policy, cost=cost, dt=0.2, steps=3, substeps=4, renew=True)
+    fine = run(policy, cost=cost, dt=0.05, steps=12, every=4)
+    torch.testing.assert_close(found.state, fine.state, rtol=1e-12, atol=1e-14)
+    torch.testing.assert_close(found.cost, fine.cost)
+    held = run(policy, cost=cost, dt=0.2, steps=3, substeps=4)
+    assert float((held.state - fine.state).abs().max()) > 1e-4
+    free = run(policy, dt=0.2, steps=3, substeps=4, renew=True)
+    torch.testing.assert_close(free.state, run(policy, dt=0.05, steps=12, every=4).state)
+    for controller, plant in ((Noisy(), PLANT), (zero, STEP)):
+        with pytest.raises(
+            ValueError, match=r"`ClosedLoop\(renew=...\)` needs a feedback law and a plant in"
+        ):
+            run(controller, plant, dt=0.25, renew=True)
+
+
+def test_substeps_are_taken_within_a_step() -> None:
+    one, four = (run(zero, dt=0.8, steps=2, substeps=each).state for each in (1, 4))
+    fine = run(zero, dt=0.2, steps=8, every=4).state
+    torch.testing.assert_close(four, fine, rtol=1e-13, atol=1e-14)
+    assert float((one - fine).abs().max()) > 1e-5
+
+
+@pytest.mark.needs_compiler
+@pytest.mark.compiled
+@pytest.mark.parametrize(
+    ("given", "compiled"),
+    [
+        ({}, False),
+        ({"work": 1e4}, True),
+        ({"work": 1e4, "costly": True}, False),
+        ({"work": 1e4, "compile": False}, False),
+        (
+            {
+                "work": 1e4,
+                "plant": systems.StepPlant(lambda x, u: 0.9 * x + np.asarray(u), dim=2, inputs=1, dt=0.01),
+            },
+            False,
+        ),
+        ({"compile": True, "costly": True}, True),
+    ],
+)
+def test_a_loop_is_compiled_where_its_work_pays(given: dict[str, Any], compiled: bool) -> None:
+    calls = []
+
+    class Busy(adp.Controller):
+        work, costly = given.get("work", 1.0), given.get("costly", False)
+
+        def init(self, x0: Tensor) -> Tensor:
+            return torch.zeros_like(x0[:, 0])
+
+        def step(self, x: Tensor, carried: Tensor, uniform: Tensor, dt: float) -> tuple[Tensor, Tensor]:
+            calls.append(len(x))
+            return -x[:, 1:], carried
+
+    compile = given.get("compile", "auto")
+    run(Busy(), given.get("plant", PLANT), x0=X0[:2], steps=100, compile=compile)
+    assert (len(calls) < 30) is compiled  # else plain torch asks at every step
+    if compile == "auto":
+        calls.clear()
+        with lanes.compiling("never"):
+            run(Busy(), given.get("plant", PLANT), x0=X0[:2], steps=100, compile=compile)
+        assert len(calls) >= 100
+
+
+class Misshapen(systems.Linear):
+    def __init__(self, drift: Any = None, effectiveness: Any = None) -> None:
+        super().__init__(PLANT.matrix, PLANT.input_matrix)
+        self.other = {"drift": drift, "effectiveness": effectiveness}
+
+    def drift(self, x: Tensor) -> Any:  # type: ignore[override]
+        return super().drift(x) if self.other["drift"] is None else self.other["drift"](x)
+
+    def effectiveness(self, x: Tensor) -> Any:  # type: ignore[override]
+        g = self.other["effectiveness"]
+        return super().effectiveness(x) if g is None else g(x)
+
+
+class Pushed(systems.TwoState):
+    def drift(self, x: Tensor) -> Tensor:
+        return super().drift(x) + 1.0
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"controller": 3}, r"`simulate\(controller=...\)` must be a Controller or a function of x; got 3"),
+        ({"steps": 0}, r"`simulate\(steps=...\)` must be at least 1"),
+        ({"every": 0}, r"`simulate\(every=...\)` must be at least 1"),
+        ({"every": 4}, r"`simulate\(every=...\)` must divide the 6 steps; got 4"),
+        ({"compile": "no"}, r"`simulate\(compile=...\)` must be one of"),
+        ({"substeps": 0}, r"`simulate\(substeps=...\)` must be at least 1"),
+        ({"substeps": (3, 2)}, r"`simulate\(substeps=...\)` must be at least 3"),
+        ({"x0": torch.zeros(2, 1, 2).double()}, r"must have the shape \(B, n\); got \(2, 1, 2\)"),
+        ({"x0": torch.zeros(0, 2).double()}, r"must have the shape \(B, n\); got \(0, 2\)"),
+        ({"x0": torch.zeros(2, 3).double()}, r"`simulate\(x0=...\)` must have 2 entries"),
+        (
+            {"cost": adp.QuadraticCost(1.0, 1.0, 3, 1)},
+            r"`simulate\(cost=...\)` must be for the plant's 2 states",
+        ),
+        ({"plant": Misshapen(drift=lambda x: None)}, r"`Misshapen.drift` must map \(3, 2\) .*; got None"),
+        ({"plant": Misshapen(drift=lambda x: x[:, :1])}, r"`Misshapen.drift` .* got \(3, 1\)"),
+        ({"plant": Misshapen(effectiveness=lambda x: x)}, r"`Misshapen.effectiveness` .* to \(3, 2, 1\)"),
+        ({"plant": Pushed()}, r"`Pushed.drift` must be 0 at the origin"),
+        ({"dt": -1.0}, r"`ClosedLoop\(dt=...\)` must be positive"),
+        ({"integrator": "rk"}, r"`ClosedLoop\(integrator=...\)` must be one of"),
+        ({"x0": torch.zeros(2).double()}, r"`simulate\(x0=...\)` must have at least 2 dimensions"),
+        ({"limit": 0.0}, r"`ClosedLoop\(limit=...\)` must be positive"),
+    ],
+)
+def test_arguments_of_a_run_are_refused_by_name(given: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        run(**given)
+
+
+# --- controllers of a user ----------------------------------------------------------------------------------
+
+
+class Hysteresis(adp.Controller):
+    """A relay with a dead zone beside a feedback; it counts its switches."""
+
+    def init(self, x0: Tensor) -> Any:
+        mode = torch.zeros_like(x0[:, 0])
+        return {"mode": mode, "switches": mode.long(), "past": (x0, mode > 0)}
+
+    def step(self, x: Tensor, carried: Any, uniform: Tensor, dt: float) -> tuple[Tensor, Any]:
+        mode = torch.where(x[:, 0] > 0.2, 1.0, torch.where(x[:, 0] < -0.2, -1.0, carried["mode"]))
+        changed = mode != carried["mode"]
+        u = -(0.3 * mode + x.sum(-1) + 0.1 * (x - carried["past"][0]).sum(-1))
+        kept = {"mode": mode, "switches": carried["switches"] + changed.long(), "past": (x, changed)}
+        return u.unsqueeze(-1), kept
+
+
+@pytest.mark.needs_compiler
+@pytest.mark.compiled
+def test_a_state_of_ones_own_is_carried_row_by_row(caplog: pytest.LogCaptureFixture) -> None:
+    x0 = torch.randn(18, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    x0[4] = torch.nan
+    runs = [
+        adp.simulate(Hysteresis(), TWO_STATE, COST, x0, dt=0.02, steps=100, compile=compile)
+        for compile in (True, False)
+    ]
+    assert not caplog.text
+    torch.testing.assert_close(runs[0].state, runs[1].state, rtol=1e-10, atol=1e-10, equal_nan=True)
+    assert runs[0].diverged.tolist() == [row == 4 for row in range(18)]
+    assert runs[0].critic_weights.shape == (18, 101, 0)
+    alone = adp.simulate(Hysteresis(), TWO_STATE, COST, x0[2:11], dt=0.02, steps=100, compile=True)
+    assert torch.equal(alone.state[0], runs[0].state[2])
+    assert torch.equal(alone.state[3:], runs[0].state[5:11])
+
+
+class Misfit(Hysteresis):
+    def __init__(self, initial: Any, after: Any) -> None:
+        super().__init__()
+        self.initial, self.after = initial, after
+
+    def init(self, x0: Tensor) -> Any:
+        return self.initial
+
+    def step(self, x: Tensor, carried: Any, uniform: Tensor, dt: float) -> tuple[Tensor, Any]:
+        return -x[:, :1], self.after
+
+
+@pytest.mark.parametrize(
+    ("initial", "after", "message"),
+    [
+        (torch.tensor(0.0), None, r"`Misfit.init` must return tensors \(B, ...\), .* B = 3; got .* \(\)"),
+        (torch.zeros(3), torch.zeros(3, 1), r"`Misfit.step` must carry on .* \[\(3,\)\]; got \[\(3, 1\)\]"),
+        (torch.zeros(3), (torch.zeros(3),), r"`Misfit.step` must carry on what it got"),
+    ],
+)  # fmt: skip
+def test_what_is_carried_keeps_its_form(initial: Any, after: Any, message: str) -> None:
+    x0 = torch.ones(3, 2, dtype=torch.float64)
+    with pytest.raises(ValueError, match=message):
+        adp.simulate(Misfit(initial, after), TWO_STATE, COST, x0, dt=0.1, steps=2)
+
+
+@pytest.mark.parametrize("shape", [(3,), (3, 2), (1,)])
+def test_a_control_of_another_shape_is_refused(shape: tuple[int, ...]) -> None:
+    class Odd(adp.Controller):
+        def init(self, x0: Tensor) -> Any:
+            return ()
+
+        def step(self, x: Tensor, carried: Any, uniform: Tensor, dt: float) -> tuple[Tensor, Any]:
+            return torch.zeros(shape, dtype=x.dtype), carried
+
+    with pytest.raises(ValueError, match=r"\(3, 1\)"):
+        adp.simulate(Odd(), TWO_STATE, COST, torch.ones(3, 2, dtype=torch.float64), dt=0.1, steps=2)
+
+
+def test_a_function_of_the_state_is_a_controller_and_anything_else_is_not() -> None:
+    policy = lambda x: -3.0 * x[..., 1:]  # noqa: E731
+    one, other = (
+        adp.simulate(each, TWO_STATE, COST, X0, steps=20) for each in (policy, adp.Feedback(policy))
+    )
+    assert torch.equal(one.state, other.state)
+    with pytest.raises(
+        ValueError, match=r"`simulate\(controller=...\)` must be a Controller or a function of x"
+    ):
+        adp.simulate(3.0, TWO_STATE, COST, X0, steps=20)  # type: ignore[arg-type]
+
+
+def test_a_feedback_has_the_name_the_period_and_the_value_of_its_policy() -> None:
+    lqr = adp.LQR(TWO_STATE, COST, period=0.2)
+    assert (adp.Feedback(lqr).label, adp.Feedback(lqr).period) == ("LQR", 0.2)
+    plain = adp.Feedback(np.negative)
+    assert (plain.label, plain.period) == ("negative", None)
+    x = uniform(3, 2, seed=1)
+    assert plain.value(x, plain.init(x)) is None
+    torch.testing.assert_close(adp.Feedback(lqr, lqr.value).value(x, plain.init(x)), lqr.value(x))
+    assert [tuple(part.shape) for part in plain.init(x)] == [(3, 0), (3, 0), (3, 0, 0), (3, 0)]
+    guarded = adp.Supervised(adp.Feedback(lqr, lqr.value), lqr, COST)
+    assert (guarded.period, guarded.draws) == (0.2, 0)
+    torch.testing.assert_close(guarded.value(x, plain.init(x)), lqr.value(x))
+
+
+class Integral(nn.Module):
+    def __init__(self, in_place: bool, buffer: bool) -> None:
+        super().__init__()
+        zero = torch.zeros(3, 1, dtype=torch.float64)
+        if buffer:
+            self.register_buffer("total", zero)
+        else:
+            self.total = zero
+        self.in_place, self.calls = in_place, 0
+
+    def forward(self, x: Tensor) -> Tensor:
+        self.calls += 1
+        if self.in_place:
+            self.total += 0.01 * x[:, :1]
+        else:
+            self.total = self.total + 0.01 * x[:, :1]
+        return -3 * x[:, 1:] - self.total
+
+
+@pytest.mark.parametrize("buffer", [False, True])
+@pytest.mark.parametrize("in_place", [False, True])
+def test_a_policy_with_a_memory_is_refused(in_place: bool, buffer: bool) -> None:
+    policy = adp.Feedback(Integral(in_place, buffer))
+    with pytest.raises(ValueError, match=r"changed its `total`.*is a `Controller`"):
+        run(policy)
+
+
+class Counting(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.calls, self.gain = 0, torch.tensor([[-1.0, -3.0]], dtype=torch.float64)
+
+    def forward(self, x: Tensor) -> Tensor:
+        self.calls += 1
+        return x @ self.gain.mT
+
+
+def test_a_policy_that_counts_its_calls_is_none() -> None:
+    policy = adp.Feedback(Counting())
+    assert not run(policy).diverged.any()
+    assert policy.policy.calls >= 6  # type: ignore[attr-defined]
+
+
+# --- the supervisor -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("trust", [0.5, 1.0])
+def test_a_supervised_control_is_drawn_to_the_lqr_by_the_norm_of_its_cost(trust: float) -> None:
+    r = tensor([[1.0, 0.3], [0.3, 2.0]])
+    plant = systems.Linear([[0.0, 1.0], [1.0, 0.0]], [[1.0, 0.0], [0.0, 1.0]])
+    cost = adp.QuadraticCost(1.0, r, 2, 2, target=[0.5, 0.0])
+    lqr = adp.LQR(plant, cost)
+    guard = adp.Supervised(adp.Feedback(lambda x: 9 * x), lqr, cost, trust)
+    x, u = uniform(6, 2, seed=1), 3 * uniform(6, 2, seed=2)
+    u[0] = lqr(x[0]) * 1.01
+    rest = tensor([0.0, -0.5])  # holds the plant at (0.5, 0)
+    found = guard.restrain(x, u)
+    for row in range(6):
+        base = lqr(x[row])
+        apart, effort = u[row] - base, base - rest
+        allowed, wanted = trust * math.sqrt(effort @ r @ effort), math.sqrt(apart @ r @ apart)
+        share = min(1.0, allowed / wanted)
+        torch.testing.assert_close(found[row], base + share * apart)
+    assert guard.label == "supervised <lambda>"
+    carried = guard.init(x)
+    torch.testing.assert_close(guard.step(x, carried, x.new_zeros(6, 0, 2), 0.1)[0], guard.restrain(x, 9 * x))
+    for wrong in (0.0, 1.0 + 1e-9):
+        with pytest.raises(ValueError, match=r"`Supervised\(trust=...\)` must be in \(0, 1\]"):
+            adp.Supervised(adp.Feedback(lqr), lqr, cost, wrong)
 
 
 def test_supervised_linear_plant_is_stable_for_any_weights() -> None:
-    plant = systems.Linear([[0.0, 1.0], [2.0, -1.0]], [[0.0], [1.0]])
+    plant = UNSTABLE
     lqr = adp.LQR(plant, COST)
     guard = adp.Supervised(learner(adp.Information()), lqr, COST, trust=0.5)
-    x = uniform(500, 3.0)
+    x = drawn(500, 3.0)
     u = guard.restrain(
         x, 100 * torch.randn(500, 1, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
     )
@@ -145,64 +573,9 @@ def test_supervisor_regulates_a_grid_of_initial_weights() -> None:
     scales = torch.tensor([0.1, 0.2, 0.4, 0.7, 1.0, 1.5, 2.0], dtype=torch.float64).repeat_interleave(40)
     critic = scales.unsqueeze(-1).expand(-1, 3)
     points = adp.RandomPoints(1, BOX)
-    inner = adp.ActorCritic(staf_basis(), PLANT, COST, points, critic=critic, actor=0.7 * critic)
-    x0 = uniform(40, 2.0, seed=11).repeat(7, 1)
+    inner = adp.ActorCritic(staf_basis(), TWO_STATE, COST, points, critic=critic, actor=0.7 * critic)
+    x0 = drawn(40, 2.0, seed=11).repeat(7, 1)
     guarded = adp.Supervised(inner, LQR, COST)
-    run = adp.simulate(guarded, PLANT, COST, x0, dt=0.01, steps=1000, every=1000, compile=True)
+    run = adp.simulate(guarded, TWO_STATE, COST, x0, dt=0.01, steps=1000, every=1000, compile=True)
     regulated = ~run.diverged & (run.state[:, -1].norm(dim=-1) < 1e-3)
     assert float(regulated.double().mean()) >= 0.95
-
-
-def test_bounded_input_policy_minimises_the_hamiltonian() -> None:
-    cost = adp.BoundedInputCost(1.0, 2.0, 2, 1, bound=0.7)
-    x, gradient = uniform(20, 1.5), uniform(20, 3.0, seed=1)
-    g = PLANT.effectiveness(x)
-    u = cost.policy(g, gradient)
-    assert (u.abs() < 0.7).all()
-
-    def hamiltonian(v: Tensor) -> Tensor:
-        return cost.rate(x, v) + ((g @ v.unsqueeze(-1)).squeeze(-1) * gradient).sum(-1)
-
-    for step in (1e-3, -1e-3):
-        assert (hamiltonian(u + step) > hamiltonian(u)).all()
-    small = 1e-4 * u
-    torch.testing.assert_close(cost.input_rate(small), 2.0 * small.square().sum(-1), rtol=1e-6, atol=1e-14)
-    edge = cost.input_rate(torch.full((1, 1), 0.7, dtype=torch.float64))
-    assert float(edge) == pytest.approx(2 * 0.49 * 2.0 * 0.6931471805599453)
-
-
-class WrongShape(systems.TwoState):
-    def effectiveness(self, x: Tensor) -> Tensor:
-        return super().effectiveness(x).squeeze(-1)
-
-
-class Pushed(systems.TwoState):
-    def drift(self, x: Tensor) -> Tensor:
-        return super().drift(x) + 1.0
-
-
-@pytest.mark.parametrize(
-    ("plant", "x0", "settings", "message"),
-    [
-        (PLANT, torch.zeros(2, 3), {}, r"`simulate\(x0=...\)` must have 2 entries in its last dimension"),
-        (PLANT, torch.zeros(2), {}, r"`simulate\(x0=...\)` must have at least 2 dimensions"),
-        (PLANT, torch.zeros(0, 2), {}, r"`simulate\(x0=...\)` must have the shape \(B, n\)"),
-        (PLANT, torch.zeros(1, 2), {"steps": 0}, r"`simulate\(steps=...\)` must be at least 1"),
-        (PLANT, torch.zeros(1, 2), {"every": 3}, r"`simulate\(every=...\)` must divide the 10 steps"),
-        (PLANT, torch.zeros(1, 2), {"dt": -1.0}, r"`ClosedLoop\(dt=...\)` must be positive"),
-        (PLANT, torch.zeros(1, 2), {"integrator": "rk"}, r"`ClosedLoop\(integrator=...\)` must be one of"),
-        (PLANT, torch.zeros(1, 2), {"compile": "yes"}, r"`simulate\(compile=...\)` must be one of"),
-        (WrongShape(), torch.zeros(1, 2), {}, r"`WrongShape.effectiveness` must map \(1, 2\) to \(1, 2, 1\)"),
-        (Pushed(), torch.zeros(1, 2), {}, r"`Pushed.drift` must be 0 at the origin"),
-    ],
-)
-def test_bad_input_is_refused_by_name(
-    plant: systems.ControlAffineSystem, x0: Tensor, settings: dict[str, object], message: str
-) -> None:
-    with pytest.raises(ValueError, match=message):
-        adp.simulate(adp.Feedback(LQR), plant, COST, x0.double(), **{"dt": 0.01, "steps": 10} | settings)
-
-
-def test_trust_outside_its_range_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"`Supervised\(trust=...\)` must be in \(0, 1\]; got 1.5"):
-        adp.Supervised(adp.Feedback(LQR), LQR, COST, trust=1.5)
