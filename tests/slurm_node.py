@@ -10,6 +10,11 @@ import time
 from pathlib import Path
 
 PROGRAMS = ("munged", "slurmctld", "slurmd", "sbatch", "squeue", "scancel", "scontrol")
+SACCT = """#!/bin/sh
+# What accounting knows, without its database: submitit reads the states of its jobs by this command.
+echo "JobID|State|NodeList"
+exec squeue --noheader --me --states=all --format="%i|%T|%N"
+"""
 CONF = """
 ClusterName=test
 SlurmctldHost={host}
@@ -66,7 +71,7 @@ class SlurmNode:
 
     @property
     def environment(self) -> dict[str, str]:
-        path = os.pathsep.join([os.environ.get("PATH", ""), "/usr/sbin", "/usr/local/sbin"])
+        path = os.pathsep.join([str(self.place), os.environ.get("PATH", ""), "/usr/sbin", "/usr/local/sbin"])
         return {"SLURM_CONF": str(self.place / "slurm.conf"), "PATH": path}
 
     def __enter__(self) -> SlurmNode:
@@ -84,6 +89,8 @@ class SlurmNode:
         }
         (self.place / "slurm.conf").write_text(CONF.format(**about))
         (self.place / "cgroup.conf").write_text("CgroupPlugin=cgroup/v1\n")
+        (self.place / "sacct").write_text(SACCT)
+        (self.place / "sacct").chmod(0o755)
         (self.place / "munge.key").write_bytes(os.urandom(128))
         (self.place / "munge.key").chmod(0o400)
         files = {"key-file": "munge.key", "socket": "munge.socket", "pid-file": "munge.pid"}

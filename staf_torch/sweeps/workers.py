@@ -133,31 +133,6 @@ def end_with(pid: int, began: str | None = None, *, parent: bool = False) -> Non
     threading.Thread(target=watch, daemon=True).start()
 
 
-def end_with_file(path: Path, patience: float = 300.0) -> None:
-    """Let this process be killed when a file is removed, or not touched for a time.
-
-    For a process whose parent is on another machine of the same disk.
-
-    Args:
-        path: of the file.
-        patience: s.
-    """
-
-    def watch() -> None:
-        seen, since = -1, time.monotonic()
-        while time.monotonic() - since < patience:
-            try:
-                touched = path.stat().st_mtime_ns
-            except OSError:
-                break
-            if touched != seen:
-                seen, since = touched, time.monotonic()
-            time.sleep(min(_LOOK, patience / 10))
-        os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
-
-
 def _lives(pid: int) -> bool:
     try:
         os.kill(pid, 0)
