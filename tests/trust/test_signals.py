@@ -16,36 +16,9 @@ from command_line import in_a_child
 from staf_torch.cli import staf
 from staf_torch.sweeps import signals
 
-SUBMITIT = """
-import os, types
-from pathlib import Path
-
-class AutoExecutor:
-    '''As submitit's, on a SLURM that runs the first job and then goes away.'''
-    cluster, count = "slurm", 0
-
-    def __init__(self, folder, cluster):
-        self.folder = Path(folder)
-
-    def update_parameters(self, **parameters):
-        pass
-
-    def submit(self, task, *arguments):
-        self.count += 1
-        paths = types.SimpleNamespace(result_pickle=self.folder / str(self.count), stderr="none")
-        if self.count == 1 and os.fork() == 0:
-            try:
-                (self.folder / "partial").write_bytes(task(*arguments))
-                (self.folder / "partial").rename(paths.result_pickle)
-            finally:
-                os._exit(0)
-        read = paths.result_pickle.read_bytes
-        return types.SimpleNamespace(job_id=str(self.count), paths=paths, result=read)
-"""
 SIGNALLED = '''
 import os, random, signal, sys, time
 import staf_torch.cli.staf as app
-import staf_torch.sweeps.executors.controller as controller
 
 GRID = ["centers.count=3,4,6", "centers.radius=0.1,0.2", "hydra.launcher.batch=1"]
 GRID += ["duration=0.05", "settle_time=0", "figures=false", "history=false"]
@@ -120,16 +93,6 @@ for place in ("killed0", "killed1"):
     os.kill(child, signal.SIGKILL)
     codes[place] = ended(child)
     codes[f"{place} again"] = ended(start(f"{place}2", f"sweep.resume={place}"))
-
-controller._ASK, controller._END = 0.05, 0.3
-os.environ["PATH"] = os.pathsep.join([os.getcwd(), os.environ["PATH"]])
-slurm = ["hydra.launcher.executor=submitit", "+hydra.launcher.submitit.cluster=slurm"]
-child = start("slurm", *GRID, *slurm, "hydra.sweep.dir=slurm")
-while not os.path.exists("squeue.hangs"):
-    time.sleep(0.0005)
-os.kill(child, signal.SIGTERM)
-codes["slurm"] = ended(child)
-codes["slurm again"] = ended(start("slurm2", "sweep.resume=slurm", "hydra.launcher.executor=inline"))
 '''
 
 
@@ -137,10 +100,6 @@ codes["slurm again"] = ended(start("slurm2", "sweep.resume=slurm", "hydra.launch
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Where sweeps were ended and resumed, by children of one process; `codes.json` says how each ended."""
     folder = tmp_path_factory.mktemp("signals")
-    (folder / "submitit.py").write_text(SUBMITIT)
-    for name, first in (("squeue", "grep -q completed slurm/0/run.json || exit 1"), ("scancel", "")):
-        (folder / name).write_text(f'#!/bin/sh\n{first}\n: > "$0.hangs"\nexec sleep 30\n')
-        (folder / name).chmod(0o755)
     codes = in_a_child(lambda: ended_and_resumed(folder), folder)
     (folder / "codes.json").write_text(json.dumps(codes))
     return folder
@@ -150,7 +109,6 @@ def ended_and_resumed(folder: Path) -> object:
     """Run `SIGNALLED` in a folder whose modules it finds; return the codes."""
     os.chdir(folder)
     sys.path.insert(0, "")
-    sys.modules.pop("submitit", None)
     names: dict[str, object] = {}
     exec(SIGNALLED, names)
     return names["codes"]
@@ -163,7 +121,6 @@ def test_signals_end_a_sweep_with_its_report_and_the_line_that_resumes(place: Pa
         ("SIGTERM", 143, "ended by SIGTERM"),
         ("SIGHUP", 129, "ended by SIGHUP"),
         ("SIGINT", 130, "interrupted"),
-        ("slurm", 143, "ended by SIGTERM; 1 jobs are complete"),  # whose commands hang
     ):
         log = (place / f"{name}.log").read_text()
         assert codes[name] == code, log
@@ -172,7 +129,6 @@ def test_signals_end_a_sweep_with_its_report_and_the_line_that_resumes(place: Pa
         assert "report: " in log
         assert codes[f"{name} again"] == 1
         assert (place / name / "table.csv").read_text() == (place / "whole" / "table.csv").read_text()
-    assert "cancels 5 jobs (scancel did not end in time)" in (place / "slurm.log").read_text()
 
 
 def test_a_sweep_killed_at_a_random_time_ends_as_if_it_had_not_been(place: Path) -> None:
