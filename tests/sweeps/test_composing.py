@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 import json
+import math
 import pickle
 from pathlib import Path
 
 import pytest
-from composed_once import pieces
 from composing import compose
-from hydra._internal.config_loader_impl import ConfigLoaderImpl
-from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
-from hydra._internal.utils import create_config_search_path
 from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import OmegaConf
@@ -26,6 +24,8 @@ from staf_torch.sweeps.hydra_compat import (
     find_launcher,
     interpolations_parsed_once,
     parse_override,
+    search_paths,
+    searching,
     sweep_size,
 )
 
@@ -55,27 +55,18 @@ def _launcher() -> None:
 @pytest.mark.parametrize("job", JOBS, ids=" ".join)
 def test_a_configuration_is_the_one_that_hydra_composes(job: list[str]) -> None:
     loader = config_loader()
-    with pieces(kept=False):  # what is kept for the other tests is compared here as well
-        expected = loader.load_configuration("config", ["dt=0.02", *job], RunMode.RUN)
+    expected = loader.load_configuration("config", ["dt=0.02", *job], RunMode.RUN)
     composer = Composer(loader)
     first, again = (composer(["dt=0.02", *job]) for _ in range(2))
     for found in (first, again):
         assert OmegaConf.to_yaml(found) == OmegaConf.to_yaml(expected)
         assert repr(OmegaConf.to_container(found)) == repr(OmegaConf.to_container(expected))
-        assert OmegaConf.is_struct(found)
-        assert not OmegaConf.is_readonly(found)
-        assert found.hydra.runtime._metadata.flags == expected.hydra.runtime._metadata.flags
+        for flag in (OmegaConf.is_struct, OmegaConf.is_readonly):
+            assert [flag(one) for one in (found, found.hydra, found.hydra.runtime)] == [
+                flag(one) for one in (expected, expected.hydra, expected.hydra.runtime)
+            ]
     first.seed = 99
     assert again.seed == expected.seed
-
-
-def test_a_file_that_was_written_again_is_read_again(tmp_path: Path) -> None:
-    loader = ConfigLoaderImpl(create_config_search_path(str(tmp_path)))
-    for text, value in (("a: 1", 1), ("a: 2", 2), ("defaults: [b, _self_]", 3)):
-        (tmp_path / "own.yaml").write_text(text)
-        (tmp_path / "b.yaml").write_text("a: 3")
-        for _ in range(2):
-            assert loader.load_configuration("own", [], RunMode.RUN).a == value
 
 
 SAME_KEYS = [
@@ -130,17 +121,6 @@ def test_an_override_that_fails_leaves_nothing_in_an_object_that_is_used_again()
     )
 
 
-def test_only_the_choices_of_groups_are_composed(monkeypatch: pytest.MonkeyPatch) -> None:
-    composer = Composer(config_loader(), hydra_node=False)
-    loaded: list[object] = []
-    load = composer.anew
-    monkeypatch.setattr(composer, "anew", lambda lines: loaded.append(lines) or load(lines))
-    found = [composer([f"kernel={k}", f"seed={s}"]) for k in ("gaussian", "matern") for s in range(3)]
-    assert loaded == [("kernel=gaussian",), ("kernel=matern",)]
-    assert [cfg.seed for cfg in found] == [0, 1, 2, 0, 1, 2]
-    assert "hydra" not in found[0]
-
-
 @pytest.mark.parametrize(
     "line",
     ["kernle=gaussian", "centers.raduis=1", "kernel=nope", "seed=1,2", "~nothing", "+seed=1", "seed=[1"],
@@ -166,29 +146,55 @@ def test_settings_are_flat_and_resolved() -> None:
 
 
 def test_the_jobs_of_a_product_are_those_of_hydras_sweeper() -> None:
-    lines = [
-        "a=1,2,3",
-        "b=range(0,1,0.25)",
-        "c=7",
-        "a=4,5",
-        "d=choice(x,y)",
-        "e=range(5,0,-2)",
-        "f=[1],[2,3]",
-    ]
-    overrides = [parse_override(line) for line in lines]
-    (expected,) = BasicSweeper.split_arguments(overrides, None)
-    found = Product(overrides)
+    """The last list counts fastest; a key that comes twice has its first place and its last values."""
+    lines = {"a=1,2,3": None, "b=range(0,1,0.25)": ["0.0", "0.25", "0.5", "0.75"], "c=7": ["7"]}
+    lines |= {"a=4,5": ["4", "5"], "d=choice(x,y)": ["x", "y"], "e=range(5,0,-2)": ["5", "3", "1"]}
+    lines |= {"f=[1],[2,3]": ["[1]", "[2,3]"]}
+    found = Product([parse_override(line) for line in lines])
+    lists = [[f"{key}={value}" for value in lines[line] or ()] for key, line in (
+        ("a", "a=4,5"), ("b", "b=range(0,1,0.25)"), ("c", "c=7"), ("d", "d=choice(x,y)"),
+        ("e", "e=range(5,0,-2)"), ("f", "f=[1],[2,3]"),
+    )]  # fmt: skip
+    expected = [list(job) for job in itertools.product(*lists)]
     assert list(found) == expected
     assert found[3:-5:7] == expected[3:-5:7]
     assert found[-1] == expected[-1]
-    assert sweep_size(overrides) == 3 * len(found)  # `a` comes twice
 
 
 @pytest.mark.parametrize(
-    "line", ["seed=range(1000000000)", "seed=shuffle(range(0,1e12))", "seed=range(1,2,0)"]
+    ("lines", "size"),
+    [
+        ([], 1),
+        (["a=1,2,3", "b=x"], 3),
+        (["a=1,2,3", "b=range(2,7)"], 15),
+        (["a=range(0,1,0.3)"], 4),
+        (["a=range(5,0,-2)"], 3),
+        (["a=range(0,5,-1)"], 0),
+        (["a=range(1,2,0)"], math.inf),
+        (["a=interval(0,1)"], 1),
+        (["a=choice(x,y)"], 2),
+        (["a=shuffle(range(0,1e12))"], 1e12),
+        (["a=range(1000000000)", "b=1,2"], 2e9),
+    ],
 )
-def test_a_range_of_a_billion_numbers_is_counted_and_not_written_out(line: str) -> None:
-    assert sweep_size([parse_override(line)]) >= 1e9
+def test_the_size_of_a_sweep_is_counted_and_not_written_out(lines: list[str], size: float) -> None:
+    assert sweep_size([parse_override(line) for line in lines]) == size
+
+
+def test_brackets_without_end_are_refused_in_a_sentence() -> None:
+    with pytest.raises((ValueError, HydraException)):
+        parse_override("a=" + "[" * 1000)
+
+
+def test_a_worker_looks_for_settings_where_the_command_does(tmp_path: Path) -> None:
+    *usual, schema = search_paths()
+    (tmp_path / "kernel").mkdir()
+    (tmp_path / "kernel" / "own.yaml").write_text("width: 1.5\n")
+    paths = (*usual, ("command-line", f"file://{tmp_path}"), schema)
+    with searching(paths):
+        assert search_paths() == paths
+        assert config_loader().load_configuration("config", ["kernel=own"], RunMode.RUN).kernel.width == 1.5
+    assert search_paths() == (*usual, schema)
 
 
 def test_plain_settings_are_those_of_hydra_and_nothing_that_refers_to_another_is_plain() -> None:
