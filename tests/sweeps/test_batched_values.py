@@ -1,0 +1,226 @@
+"""Many configurations as one tensor batch: each member gets what it gets alone."""
+
+from __future__ import annotations
+
+import json
+import pickle
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from composing import settings
+from omegaconf import DictConfig
+
+from staf_torch.experiments.adp import ClosedLoop, LoopSolution
+from staf_torch.experiments.gradient_chase import ChaseSolution, GradientChase
+from staf_torch.results.progress import SHOWN
+from staf_torch.sweeps import batching
+from staf_torch.sweeps.batching import DEFERRED, Computed, Failed, Outcome
+from staf_torch.sweeps.hydra_compat import config_loader
+from staf_torch.sweeps.members import member_overrides
+
+SHORT = ("dt=0.05", "duration=0.5", "settle_time=0.25", "figures=false")
+
+
+def compose(base: Sequence[str], lines: Sequence[str]) -> list[DictConfig]:
+    return [settings(*SHORT, *base, *job) for job in member_overrides(list(lines), config_loader())]
+
+
+def solve(cfgs: Sequence[DictConfig]) -> list[Outcome]:
+    return batching.solve(cfgs, SHOWN)
+
+
+def flat(cfgs: Sequence[DictConfig]) -> list[batching.Flat | None]:
+    return [batching.flat_or_none(cfg) for cfg in cfgs]
+
+
+def groups(cfgs: Sequence[DictConfig]) -> list[list[int]]:
+    return batching.groups(flat(cfgs))
+
+
+def solutions(cfgs: Sequence[DictConfig]) -> list[ChaseSolution]:
+    found = [outcome.solution for outcome in solve(cfgs) if isinstance(outcome, Computed)]
+    assert len(found) == len(cfgs)
+    return [solution for solution in found if isinstance(solution, ChaseSolution)]
+
+
+def words(outcome: Outcome) -> str:
+    assert isinstance(outcome, Failed), outcome
+    return str(outcome.error)
+
+
+def first_inner_last(cfgs: Sequence[DictConfig], together: Sequence[Any]) -> list[tuple[DictConfig, Any]]:
+    """Three members and what they got: the first and the last differ in every setting that is listed."""
+    assert len(cfgs) == len(together)
+    return [(cfgs[index], together[index]) for index in sorted({0, len(cfgs) // 3, len(cfgs) - 1})]
+
+
+WIDTHS = {
+    "exponential": "seed=3,4",
+    "gaussian": "kernel.width=0.7,1.3",
+    "matern": "kernel.length_scale=0.7,1.3",
+    "inverse_multiquadric": "kernel.length_scale=0.7,1.3",
+    "rational_quadratic": "kernel.alpha=0.5,2",
+    "polynomial": "kernel.bias=0.5,2",
+    "anchored": "seed=3,4",
+}
+STARTS = ("centers.radius=0.1,0.3", "trajectories=1,3")
+BATCHES = {
+    **{kernel: ([f"kernel={kernel}", "centers.count=6"], [width]) for kernel, width in WIDTHS.items()},
+    "shrinking": (["kernel=gaussian", "centers.shrink.offset=0.1"], [WIDTHS["gaussian"]]),
+    "fixed step": (["optimizer=fixed_step", "kernel=gaussian"], ["optimizer.step=0.5,1.2"]),
+    "absolute step": (["optimizer=fixed_step", "optimizer.relative=false"], ["optimizer.step=0.01,0.2"]),
+    "heavy ball": (["optimizer=heavy_ball"], ["optimizer.step=0.5,0.9", "optimizer.momentum=0.3,0.5"]),
+    "nesterov": (["optimizer=nesterov"], ["optimizer.step=0.5,1.0", "optimizer.momentum=0.3,0.5"]),
+    "normalised lms": (["optimizer=normalised_lms"], ["optimizer.step=0.5,1.0"]),
+    "exact": (["optimizer=exact", "kernel=gaussian"], ["seed=3,4"]),
+    "secant": (["predictor=secant", "predictor.guarded=true", "certificate=true"], ["seed=3,4"]),
+    "tangent": (["predictor=tangent", "kernel=gaussian"], ["kernel.width=0.7,1.3"]),
+    "chaotic": (["optimizer.inner_steps=1"], ["seed=3,4"]),
+    "targets": (["target=cosine"], ["target.phase=0.0,1.0", "target.frequency=1,2"]),
+    "steps of time": (["system=linear"], ["dt=0.05,0.049", "settle_time=0.3,0.4,9.0"]),
+    "integrated": (["system=van_der_pol"], ["dt=0.05,0.049", "initial_state=[1.0,0.0],[0.5,0.5]"]),
+    "single precision": (["dtype=float32", "target=quadratic"], ["target.matrix=1.0,2.0"]),
+}
+
+
+@pytest.mark.parametrize("name", BATCHES)
+def test_a_member_gets_what_it_gets_alone(name: str) -> None:
+    base, lines = BATCHES[name]
+    cfgs = compose(base, [*STARTS, *lines])
+    (group,) = groups(cfgs)
+    assert group == list(range(len(cfgs)))
+    together = GradientChase().solve(cfgs, SHOWN)  # raises where `batching.solve` would run each alone
+    iterated = name not in ("exact", "tangent")  # those weights come from a factor of K
+    digits = 1e-9 if name != "single precision" else 1e-3
+    for cfg, found in first_inner_last(cfgs, together):
+        (alone,) = solutions([cfg])
+        assert isinstance(found, ChaseSolution), found
+        for key in ("state", "value", *(["weights"] if iterated else [])):
+            assert np.array_equal(found.history[key], alone.history[key]), key
+        missing = [{key for key, number in one.metrics.items() if number is None} for one in (found, alone)]
+        assert missing[0] == missing[1]
+        numbers = [{k: v for k, v in one.metrics.items() if v is not None} for one in (found, alone)]
+        assert numbers[0] == pytest.approx(numbers[1], rel=digits, abs=digits / 10)
+        assert np.array_equal(found.outcome.diverged_at, alone.outcome.diverged_at)
+
+
+CLOSED = ("dt=0.005", "duration=0.1", "adp.compile=false", "figures=false")
+LOOPS = {
+    "information": ([], ["seed=0,1", "adp.critic=0.4,0.8", "adp.gains.actor=1.2,2.0"]),
+    "published": (
+        ["adp/law=published", "trajectories=2", "adp.gain=250"],
+        ["adp.gains.critic_extrapolated=0.25,0.1", "adp.gains.forgetting=0.003,0.01"],
+    ),
+    "supervised": (
+        ["adp.trust=0.5", "duration=0.5", "dt=0.01"],
+        ["adp.actor=[0.2,0.3,0.4],[0.5,0.5,0.5]", "seed=0,1"],
+    ),
+    "quadratic": (
+        ["adp/basis=quadratic"],
+        ["adp.gains.normalisation=0.05,0.5", "adp.gains.forgetting=0.003,0.01"],
+    ),
+    "lqr": (["adp/policy=lqr"], ["initial_state=[-1.0,1.0],[0.5,0.5]"]),
+    "single precision": (["dtype=float32"], ["adp.gains.information=1,2", "seed=0,1"]),
+}
+
+
+@pytest.mark.parametrize("name", LOOPS)
+def test_a_closed_loop_in_a_batch_is_the_one_alone(name: str) -> None:
+    base, lines = LOOPS[name]
+    cfgs = compose(["experiment=adp", *CLOSED, *base], lines)
+    (group,) = groups(cfgs)
+    assert group == list(range(len(cfgs)))
+    together = ClosedLoop().solve(cfgs, SHOWN)
+    digits = 1e-9 if name != "single precision" else 1e-3
+    apart = []
+    for cfg, found in first_inner_last(cfgs, together):
+        (alone,) = ClosedLoop().solve([cfg], SHOWN)
+        if isinstance(found, Exception):
+            raise found  # which may say that an extra is absent
+        assert isinstance(found, LoopSolution)
+        assert isinstance(alone, LoopSolution)
+        for key in ("state", "control", "critic_weights", "actor_weights", "running_cost"):
+            ours, theirs = getattr(found.result, key).numpy(), getattr(alone.result, key).numpy()
+            np.testing.assert_allclose(ours, theirs, rtol=digits, atol=digits)
+        numbers = [{k: v for k, v in one.metrics.items() if v is not None} for one in (found, alone)]
+        assert numbers[0] == pytest.approx(numbers[1], rel=100 * digits, abs=digits)
+        apart.append(found.result.cost.sum().item())
+    assert len(set(apart)) == len(apart)  # the settings made a difference
+
+
+def test_only_what_may_differ_within_a_batch_shares_a_group() -> None:
+    cfgs = compose([], ["kernel=gaussian,matern", "centers.count=3,6", "centers.radius=0.1,0.2"])
+    assert groups(cfgs) == [[0, 1], [2, 3], [4, 5], [6, 7]]
+    cfgs = compose(["kernel=matern"], ["kernel.smoothness=0.5,1.5", "kernel.length_scale=1,2", "seed=1,2"])
+    assert groups(cfgs) == [list(range(8))]  # every number of a kernel, also of a user's own
+    cfgs = compose([], ["centers.shrink.offset=null,0.1,0.2", "optimizer.inner_steps=1,2"])
+    assert groups(cfgs) == [[0], [1], [2, 4], [3, 5]]
+
+
+def test_steps_of_time_share_a_group_where_their_number_is_the_same() -> None:
+    cfgs = compose([], ["dt=0.05,0.025,0.1"])
+    assert groups(cfgs) == [[0], [1], [2]]
+    cfgs = compose([], ["dt=0.05,0.1", "duration=0.5,1.0"])
+    assert groups(cfgs) == [[0, 3], [1], [2]]
+
+
+def test_experiments_without_batches_stay_alone() -> None:
+    cfgs = compose(["experiment=feasibility"], ["seed=1,2"])
+    assert groups(cfgs) == [[0], [1]]
+    assert solve(cfgs[:1]) == [DEFERRED]
+
+
+def test_a_member_that_is_refused_fails_alone_with_its_own_sentence() -> None:
+    cfgs = compose([], ["centers.radius=0.1,-1,0.2,oops"])
+    found = solve([cfgs[0], cfgs[1], cfgs[2]])
+    assert [type(one) for one in found] == [Computed, Failed, Computed]
+    assert words(found[1]) == "`ConstantRadius(radius=...)` must be positive; got -1."
+    assert groups(cfgs) == [[0, 1, 2], [3]]
+    assert "must be a number; got 'oops'" in words(solve([cfgs[3]])[0])
+
+
+def test_a_member_that_diverges_leaves_the_others_as_they_are() -> None:
+    cfgs = compose(["system=van_der_pol", "dt=0.2", "duration=20"], ["initial_state=[1.0,0.0],[90.0,90.0]"])
+    (kept, lost), (alone,) = solutions(cfgs), solutions(cfgs[:1])
+    assert lost.metrics["diverged_fraction"] == 1
+    assert lost.metrics["ultimate_error"] is None
+    assert kept.metrics == alone.metrics
+    assert np.array_equal(kept.history["weights"], alone.history["weights"])
+
+
+def test_a_layout_that_cannot_have_the_count_fails_alone() -> None:
+    cfgs = compose([], ["centers.count=3,7"])
+    assert groups(cfgs) == [[0], [1]]
+    assert "must be one of" in words(solve([cfgs[1]])[0])
+
+
+def test_warnings_belong_to_the_members_that_they_are_about(tmp_path: Path) -> None:
+    cfgs = compose(["history=false"], ["centers.radius=0.1,1.5", "seed=1,2"])
+    with warnings.catch_warnings(record=True) as given:
+        warnings.simplefilter("always")
+        solved = solutions(cfgs)
+    assert given == []
+    assert [len(one.warnings) for one in solved] == [0, 0, 1, 1]
+    with pytest.warns(UserWarning, match=r"\|x\| r = 1.5 > 1"):
+        GradientChase().write(cfgs[2], tmp_path, solved[2])
+
+
+def test_writing_what_was_solved_leaves_what_a_run_leaves(tmp_path: Path) -> None:
+    cfgs = compose(["kernel=gaussian"], ["seed=1,2", "trajectories=2"])
+    solved = pickle.loads(pickle.dumps(solve(cfgs)))
+    for name, cfg in (("batch", cfgs[0]), ("alone", cfgs[0])):
+        (tmp_path / name).mkdir()
+        outcome = DEFERRED if name == "alone" else solved[0]
+        batching.completion(cfg, outcome)(cfg, tmp_path / name)
+    files = [{p.name: p for p in (tmp_path / name).iterdir()} for name in ("batch", "alone")]
+    assert files[0].keys() == files[1].keys() == {"metrics.json", "history.npz"}
+    with np.load(files[0]["history.npz"]) as found, np.load(files[1]["history.npz"]) as expected:
+        assert found.files == expected.files
+        for key in ("time", "state", "value", "estimate", "weights"):
+            assert np.array_equal(found[key], expected[key]), key
+    numbers = [json.loads(each["metrics.json"].read_text()) for each in files]
+    assert numbers[0] == pytest.approx(numbers[1], rel=1e-9, abs=1e-12)
