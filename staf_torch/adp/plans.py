@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
+import torch
 from torch import Tensor
 
 from .sampled_problem import SampledProblem
@@ -84,3 +85,16 @@ class Plan(NamedTuple):
     def rows(self, index: Tensor) -> Plan:
         """Some of the rows."""
         return Plan(*(part[index] for part in self))
+
+
+Some = TypeVar("Some", bound=tuple[Tensor, ...])
+
+
+def chosen(rows: Tensor, new: Some, old: Some) -> Some:
+    """The tensors of ``new`` in ``rows`` (B,), those of ``old`` in the others."""
+
+    def pick(a: Tensor, b: Tensor) -> Tensor:
+        return torch.where(rows.reshape(-1, *[1] * (a.dim() - 1)), a, b)
+
+    picked = map(pick, new, old)
+    return type(new)(*picked) if hasattr(new, "_fields") else type(new)(picked)

@@ -16,7 +16,6 @@ from .global_value import GlobalValue
 from .memory_growth import best_from
 from .plans import LocalModel, Reference, Trajectories
 from .sampled_problem import SampledProblem
-from .traced_search import TracedSearch
 from .trajectory_optimisation import BoxDDP
 
 
@@ -91,7 +90,7 @@ class RecedingHorizon(Controller):
             self._search.iterations = self.iterations
         self._hastened = False
         self._whole = Program(
-            lambda carry, now, row: (carry, self._traced(*row)),
+            lambda carry, now, row: (carry, self._improved(*row)),
             name="a plan improved",
             compile=compile,
         )
@@ -132,17 +131,13 @@ class RecedingHorizon(Controller):
         """The first control of the improved plan (B, m), and the plan a step further on."""
         if self._search is None:
             return self._followed(x, carried.identifier)
-        if self.memory is None and tracing_now():  # a closed loop that is compiled, a header of C
-            u, plan = self._traced(x, carried.identifier)
-            return u, carrying(plan)
         row = x, carried.identifier
-        if self._hastened and self._whole.compiles((), (), row, steps=1):
+        if self._hastened and not tracing_now() and self._whole.compiles((), (), row, steps=1):
             _, found = self._whole((), (), row, steps=1)
             u, plan = (part[:, 0] for part in found)
-            return u, carrying(plan)
-        control, reference = self._begun(x, carried.identifier)
-        found = self._search.solve(x, control, reference, self._terminal(x, control, reference))
-        return found.control[:, 0], self._ahead(_rows(found), found.state[:, -1])
+        else:
+            u, plan = self._improved(*row)
+        return u, carrying(plan)
 
     def _begun(self, x: Tensor, plan: Tensor) -> tuple[Tensor, Reference]:
         """What a search begins from: the memory's plan, or the carried one (B, 1 + T w)."""
@@ -152,12 +147,12 @@ class RecedingHorizon(Controller):
         state, control, feedback = plan[:, 1:].unflatten(-1, (self.steps, -1)).split((n, m, m * n), dim=-1)
         return control, Reference(state, feedback.unflatten(-1, (m, n)))
 
-    def _traced(self, x: Tensor, plan: Tensor) -> tuple[Tensor, Tensor]:
-        """`step` for a program: the first control and the numbers that are carried."""
+    def _improved(self, x: Tensor, plan: Tensor) -> tuple[Tensor, Tensor]:
+        """The first control of an improved plan and the numbers that are carried: (B, n), (B, 1 + T w)."""
         assert self._search is not None
-        state, u, feedback = TracedSearch(self._search)(x, *self._begun(x, plan))
-        improved = torch.cat((state[:, :-1], u, feedback.flatten(2)), dim=-1)
-        return u[:, 0], self._ahead(improved, state[:, -1]).identifier
+        control, reference = self._begun(x, plan)
+        found = self._search.solve(x, control, reference, self._terminal(x, control, reference))
+        return found.control[:, 0], self._ahead(_rows(found), found.state[:, -1]).identifier
 
     def _remembered(self, x: Tensor) -> tuple[Tensor, Reference]:
         assert self.memory is not None

@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from ..lanes import Program
+from ..lanes import Program, repeat, scan
+from ..lanes.combinators import tracing_now
 from ..numerics.box import minimum_and_slopes
 from ..numerics.checks import fail, integer, positive_real, trailing
 from ..numerics.riccati import riccati_step
-from .plans import LocalModel, Plan, Reference, Trajectories
+from .plans import LocalModel, Plan, Reference, Trajectories, chosen
 from .sampled_problem import Derivatives, SampledProblem
 
 LENGTHS = (1.0, 0.5, 0.2, 0.07, 0.02)  # shares of a step that are tried side by side
 EASIER, HARDER = 0.4, 8.0  # what success and failure do to the regularisation of a row
 # Of the regularisation, in units of the cost's curvature in u:
 LEAST, FIRST, TRUSTED, MOST = 1e-9, 1e-3, 1.0, 1e9
+CONVERGED = -1.0
 _NUMBERS = 2**25  # second derivatives that are held at once
 
 
@@ -115,9 +117,10 @@ class BoxDDP:
         together = max(1, _NUMBERS // (self.steps * (n + 1) * (n + m) ** 2))
         with torch.no_grad():
             whole = x0, self.problem.admissible(control), *reference, *terminal
+            if len(x0) <= together:
+                return self._solve(*whole)
             parts = [
-                self._solve(x, u, Reference(*around[:2]), LocalModel(*around[2:]))
-                for x, u, *around in zip(*(part.split(together) for part in whole), strict=True)
+                self._solve(*some) for some in zip(*(part.split(together) for part in whole), strict=True)
             ]
         return Trajectories(*(torch.cat(column) for column in zip(*parts, strict=True)))
 
@@ -129,70 +132,99 @@ class BoxDDP:
             goal = self.problem.goals(x0, self.steps)[:, -1]
         return LocalModel(goal, none[:, 0], none, bent)
 
-    def _solve(self, x0: Tensor, control: Tensor, reference: Reference, terminal: LocalModel) -> Trajectories:
-        none, lengths = torch.zeros_like(control), x0.new_ones(1)
-        whole = self._rollouts(x0, reference.state, control, none, reference.feedback, lengths, terminal)
-        mu, full = torch.full_like(whole.cost, FIRST), torch.ones_like(whole.cost)
-        converged = torch.zeros(len(x0), dtype=torch.bool)
-        active = torch.isfinite(whole.cost).nonzero().squeeze(1)
-        now, known, ends = whole.rows(active), None, terminal.rows(active)
+    def _solve(self, x0: Tensor, control: Tensor, *more: Tensor) -> Trajectories:
+        """`solve` for as many rows as fit; ``more`` are the fields of a reference and of a terminal model."""
+        reference, terminal = Reference(*more[:2]), LocalModel(*more[2:])
+        around = reference.state, control, torch.zeros_like(control), reference.feedback
+        plan = self._followed(x0, around, x0.new_ones(len(x0), 1), terminal)
+        going, ones = torch.isfinite(plan.cost).to(x0), torch.ones_like(plan.cost)
+        found = Progress(*plan, FIRST * ones, ones.clone(), going)
+        if tracing_now():  # a program of one row has no rows to leave out
+            return self._models(
+                repeat(
+                    self.iterations,
+                    lambda now: self._iterated(now, self._derivatives(now), terminal),
+                    found,
+                    where=lambda now: now.going > 0,
+                ),
+                terminal,
+            )
+        rows = going.nonzero().squeeze(1)
+        now, ends, known = found.rows(rows), terminal.rows(rows), None
         for _ in range(self.iterations):
-            if not len(active):
+            if not len(rows):
                 break
             known = self._derivatives(now) if known is None else known
-            found = self._search(now, known, mu[active], full[active], ends)
-            better = found.cost < now.cost
-            gain = (now.cost - found.cost) / now.cost.abs().clamp(min=1e-300)
-            now = _chosen(better, found.plan, now)
-            for part, current in zip(whole, now, strict=True):
-                part[active] = current
-            small = found.promised.abs() <= self.tolerance * now.cost.abs()
-            done = (better & (gain <= self.tolerance)) | (found.definite & small)
-            done = done & (mu[active] <= TRUSTED)
-            converged[active] = done
-            easier = (mu[active] * EASIER).clamp(min=LEAST)
-            mu[active] = torch.where(better, easier, mu[active] * HARDER)
-            full[active] = torch.where(better, full[active], 1 - full[active])
-            on = ~done & (mu[active] <= MOST)
-            kept = active[on]
+            after = self._iterated(now, known, ends)
+            for part, current in zip(found, after, strict=True):
+                part[rows] = current
+            on = after.going > 0
+            fresh = (after.cost < now.cost)[on]
             known = Derivatives(*(part[on] for part in known))
-            fresh = better[on]
-            now, ends = now.rows(on), ends.rows(on)
+            rows, now, ends = rows[on], after.rows(on), ends.rows(on)
             if bool(fresh.any()):  # saves work: rows that did not move keep their derivatives
-                new = self._derivatives(now.rows(fresh))
-                for old, fresher in zip(known, new, strict=True):
+                for old, fresher in zip(known, self._derivatives(now.rows(fresh)), strict=True):
                     old[fresh] = fresher
-            active = kept
-        return self._models(whole, converged, terminal)
+        return self._models(found, terminal)
 
-    def _rollouts(
-        self,
-        x0: Tensor,
-        state: Tensor,
-        control: Tensor,
-        change: Tensor,
-        feedback: Tensor,
-        lengths: Tensor,
-        terminal: LocalModel,
+    def _iterated(self, now: Progress, known: Derivatives, terminal: LocalModel) -> Progress:
+        """One iteration: a backward pass, the best length of its change, and what that says of the row."""
+        end, (change, feedback, _, _) = self._backwards(now, known, now.mu, now.full, terminal)
+        definite = end.definite > 0
+        around = now.state[:, :-1], now.control, change, feedback
+        tried = self._best(now.state[:, 0], around, terminal)
+        better = definite & (tried.cost < now.cost)
+        gain = (now.cost - tried.cost) / now.cost.abs().clamp(min=1e-300)
+        plan = chosen(better, tried, Plan(*now[:4]))
+        small = end.promised.abs() <= self.tolerance * plan.cost.abs()
+        done = ((better & (gain <= self.tolerance)) | (definite & small)) & (now.mu <= TRUSTED)
+        mu = torch.where(better, (now.mu * EASIER).clamp(min=LEAST), now.mu * HARDER)
+        going = torch.where(done, CONVERGED, (mu <= MOST).to(mu))
+        return Progress(*plan, mu, torch.where(better, now.full, 1 - now.full), going)
+
+    def _best(self, x0: Tensor, around: tuple[Tensor, ...], terminal: LocalModel) -> Plan:
+        """The cheapest of five lengths of a change: side by side, but in a program one after the other."""
+        lengths = x0.new_tensor(LENGTHS).expand(len(x0), -1)
+        if not tracing_now():
+            return self._followed(x0, around, lengths.contiguous(), terminal)
+
+        def attempt(now: tuple[Tensor, Tensor], length: Tensor) -> tuple[tuple[Tensor, Tensor], tuple[()]]:
+            cost = self._followed(x0, around, length.unsqueeze(1), terminal).cost
+            lower = cost < now[0]
+            return (torch.where(lower, cost, now[0]), torch.where(lower, length, now[1])), ()
+
+        none = torch.zeros_like(x0[:, 0])
+        (_, length), _ = scan(attempt, (none + torch.inf, none), lengths)
+        return self._followed(x0, around, length.unsqueeze(1), terminal)
+
+    def _followed(
+        self, x0: Tensor, around: tuple[Tensor, ...], lengths: Tensor, terminal: LocalModel
     ) -> Plan:
-        """The best of u = control + length change + feedback (x - state) within the bounds."""
-        shares = lengths.expand(len(x0), -1).contiguous()
-        start = x0.unsqueeze(1).expand(-1, len(lengths), -1).contiguous()
-        end, (x, u, paid) = self._forth(start, (state, control, change, feedback), shares)
+        """The best of u = control + length change + feedback (x - state) within the bounds.
+
+        Args:
+            x0: (B, n).
+            around: state, control, change and feedback, (B, T, ...) each.
+            lengths: that are tried, (B, L).
+            terminal: V_T.
+        """
+        start = x0.unsqueeze(1).expand(-1, lengths.shape[1], -1).contiguous()
+        end, (x, u, paid) = self._along(self._forth, start, around, lengths)
         last = terminal.at(self.problem, end)  # (B, L)
         cost = paid.sum(1) + last
         cost = torch.where(torch.isfinite(cost), cost, torch.inf)
+        states, parts = torch.cat((x, end.unsqueeze(1)), dim=1), torch.cat((paid, last.unsqueeze(1)), dim=1)
+        if lengths.shape[1] == 1:
+            return Plan(states.squeeze(2), u.squeeze(2), cost.squeeze(1), parts.squeeze(2))
         best, at = cost.min(1)
-        pick = at[:, None, None, None]
-        states = torch.cat((x, end.unsqueeze(1)), dim=1)
-        return Plan(
-            states.gather(2, pick.expand(-1, self.steps + 1, 1, x.shape[-1])).squeeze(2),
-            u.gather(2, pick.expand(-1, self.steps, 1, u.shape[-1])).squeeze(2),
-            best,
-            torch.cat((paid, last.unsqueeze(1)), dim=1)
-            .gather(2, at[:, None, None].expand(-1, self.steps + 1, 1))
-            .squeeze(2),
-        )
+        rows = torch.arange(len(x0))
+        return Plan(states[rows, :, at], u[rows, :, at], best, parts[rows, :, at])
+
+    def _along(self, program: Program, carry: Any, now: Any, row: Any) -> tuple[Any, Any]:
+        """A step taken at all times: by its program, or as a loop of the program that is being traced."""
+        if tracing_now():
+            return scan(lambda carry, now: program.step(carry, now, row), carry, now)
+        return program(carry, now, row)
 
     def forward(
         self, x: Tensor, now: tuple[Tensor, ...], lengths: Tensor
@@ -206,32 +238,21 @@ class BoxDDP:
         after, paid = self.problem.advance(x, u)
         return after, (x, u, paid)
 
-    def _derivatives(self, plan: Plan) -> Derivatives:
+    def _derivatives(self, plan: Progress) -> Derivatives:
         """Along the trajectories: (B, T, ...)."""
-        x, u = plan.state[:, :-1].flatten(0, 1), plan.control.flatten(0, 1)
-        _, found = self._expand((), (), (x, u), steps=1)
-        shape = plan.control.shape[:2]
-        return Derivatives(*(part[:, 0].unflatten(0, shape) for part in found))
-
-    def _search(
-        self, plan: Plan, known: Derivatives, mu: Tensor, full: Tensor, terminal: LocalModel
-    ) -> Found:
-        """A backward pass and the best of the five lengths forward."""
-        end, (change, feedback, _, _) = self._backwards(plan, known, mu, full, terminal)
-        definite = end.definite > 0
-        lengths = plan.cost.new_tensor(LENGTHS)
-        x, u = plan.state, plan.control
-        tried = self._rollouts(x[:, 0], x[:, :-1], u, change, feedback, lengths, terminal)
-        cost = torch.where(definite, tried.cost, torch.inf)
-        return Found(tried, cost, end.promised, definite)
+        x, u = plan.state[:, :-1], plan.control
+        if tracing_now():
+            return Derivatives(*scan(lambda _, now: ((), self.problem.derivatives(*now)), (), (x, u))[1])
+        _, found = self._expand((), (), (x.flatten(0, 1), u.flatten(0, 1)), steps=1)  # all times are rows
+        return Derivatives(*(part[:, 0].unflatten(0, u.shape[:2]) for part in found))
 
     def _backwards(
-        self, plan: Plan, known: Derivatives, mu: Tensor, full: Tensor, terminal: LocalModel
+        self, plan: Progress, known: Derivatives, mu: Tensor, full: Tensor, terminal: LocalModel
     ) -> tuple[Model, tuple[Tensor, ...]]:
         slope, bent = terminal.slope(self.problem, plan.state[:, -1]), terminal.curvature.contiguous()
         last = Model(slope, bent, torch.zeros_like(mu), torch.ones_like(mu))
         reverse = tuple(part.flip(1) for part in (*known, plan.control))
-        end, out = self._back(last, reverse, (mu, full))
+        end, out = self._along(self._back, last, reverse, (mu, full))
         return end, tuple(part.flip(1) for part in out)
 
     def backward(
@@ -258,16 +279,18 @@ class BoxDDP:
         model = Model(gradient, curvature, after.promised + promised, definite)
         return model, (change, feedback, gradient, curvature)
 
-    def _models(self, plan: Plan, converged: Tensor, terminal: LocalModel) -> Trajectories:
+    def _models(self, plan: Progress, terminal: LocalModel) -> Trajectories:
         """The local models along finished trajectories, with as little regularisation as they bear."""
-        known = self._derivatives(plan)
-        small = torch.full_like(plan.cost, LEAST)
-        end, out = self._backwards(plan, known, small, torch.ones_like(small), terminal)
-        _, gauss = self._backwards(plan, known, small, torch.zeros_like(small), terminal)
-        fine = (end.definite > 0) & torch.isfinite(end.curvature).flatten(1).all(-1)
-        _, feedback, gradient, curvature = (
-            torch.where(fine[(..., *([None] * (a.dim() - 1)))], a, b) for a, b in zip(out, gauss, strict=True)
-        )
+        known, small = self._derivatives(plan), torch.full_like(plan.cost, LEAST)
+
+        def models(_: tuple[()], full: Tensor) -> tuple[tuple[()], tuple[Tensor, ...]]:
+            end, (_change, *parts) = self._backwards(plan, known, small, full, terminal)
+            return (), (*parts, (end.definite > 0) & torch.isfinite(end.curvature).all(-1).all(-1))
+
+        both = torch.stack((torch.ones_like(small), torch.zeros_like(small)), dim=1)
+        *parts, fine = scan(models, (), both)[1]  # the second model is that of Gauss and Newton
+        exact, gauss = zip(*(part.unbind(1) for part in parts), strict=True)
+        feedback, gradient, curvature = chosen(fine[:, 0], exact, gauss)
         last = terminal.slope(self.problem, plan.state[:, -1])
         return Trajectories(
             plan.state,
@@ -276,21 +299,24 @@ class BoxDDP:
             plan.paid.flip(1).cumsum(1).flip(1),
             torch.cat((gradient, last.unsqueeze(1)), dim=1),
             torch.cat((curvature, terminal.curvature.unsqueeze(1)), dim=1),
-            converged & torch.isfinite(plan.cost),
+            (plan.going == CONVERGED) & torch.isfinite(plan.cost),
         )
 
 
-Known = tuple[Tensor, ...]
-"""The fields of `Derivatives`, (B, T, ...)."""
+class Progress(NamedTuple):
+    """Plans, and how the search goes on with each."""
 
+    state: Tensor  # (B, T + 1, n)
+    control: Tensor  # (B, T, m)
+    cost: Tensor  # (B,)
+    paid: Tensor  # of every step, and at last the terminal value, (B, T + 1)
+    mu: Tensor  # regularisation, (B,)
+    full: Tensor  # 1 with the second derivatives of the plant, 0 without, (B,)
+    going: Tensor  # 1 goes on, 0 has given up, `CONVERGED` has converged, (B,)
 
-class Found(NamedTuple):
-    """What one iteration found."""
-
-    plan: Plan
-    cost: Tensor  # (B,); inf where the model was not definite
-    promised: Tensor  # change of the cost by the model, (B,), negative
-    definite: Tensor  # (B,) bool
+    def rows(self, index: Tensor) -> Progress:
+        """Some of the rows."""
+        return Progress(*(part[index] for part in self))
 
 
 class Model(NamedTuple):
@@ -310,9 +336,3 @@ def _definite(a: Tensor) -> Tensor:
         fine = fine * (pivot > 0)
         a = a[..., 1:, 1:] - a[..., 1:, :1] * a[..., :1, 1:] / pivot[..., None, None]
     return fine
-
-
-def _chosen(better: Tensor, new: Plan, old: Plan) -> Plan:
-    return Plan(
-        *(torch.where(better[(..., *([None] * (a.dim() - 1)))], a, b) for a, b in zip(new, old, strict=True))
-    )
