@@ -13,7 +13,7 @@ from torch import Tensor
 from ..numerics.checks import choice, fail, integer, positive_real
 from ..systems import Plant
 from .cost import Matrix, QuadraticCost
-from .plans import Reference, Trajectories
+from .plans import Reference, Trajectories, chosen
 from .sampled_problem import SampledProblem
 from .trajectory_optimisation import BoxDDP
 
@@ -120,17 +120,9 @@ class AvoidancePlans(NamedTuple):
 
     def or_cheaper(self, other: AvoidancePlans) -> AvoidancePlans:
         """The cheaper plan of every row; of two that touch an obstacle the other one."""
-        gain = ~(self.cost < other.cost)
-
-        def chosen(new: Tensor, old: Tensor) -> Tensor:
-            return torch.where(gain.reshape(-1, *[1] * (new.dim() - 1)), new, old)
-
-        parts = zip(other.trajectories, self.trajectories, strict=True)
-        return AvoidancePlans(
-            Trajectories(*(chosen(new, old) for new, old in parts)),
-            chosen(other.cost, self.cost),
-            chosen(other.margin, self.margin),
-        )
+        kept = self.cost < other.cost
+        trajectories = chosen(kept, self.trajectories, other.trajectories)
+        return AvoidancePlans(trajectories, *chosen(kept, self[1:], other[1:]))
 
 
 def plan_around(

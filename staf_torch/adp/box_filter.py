@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -219,13 +219,6 @@ class BoxFilter(nn.Module):
         middle, start = advance(torch.zeros_like(x))
         end, between = advance(middle)
         return Held(middle, end, (start, between, motion(x + end, u)))
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {**vars(self), "_rows": None}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        super().__setstate__(state)  # type: ignore[no-untyped-call]
-        self._rows = RowFunction(self._definition, self, "a box filter")
 
 
 def _excursion(held: Held, k: int, side: int, hold: Tensor) -> Tensor:

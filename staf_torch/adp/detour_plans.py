@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from torch import Tensor
 
@@ -11,8 +9,7 @@ from ..lanes import repeat
 from ..lanes.function import RowFunction
 from ..numerics.box import LARGEST
 from ..numerics.checks import fail, integer, positive_real
-from ..numerics.forward_mode import use_forward_mode
-from .controllers import Controller, ControllerState
+from .controllers import Controller, ControllerState, carrying
 from .cost import QuadraticCost
 from .detours import DetourRollout
 from .plan_problem import Plan, PlanProblem
@@ -91,19 +88,8 @@ class DetourPlans(Controller):
         self.weight = positive_real("DetourPlans", "weight", weight)
         self._problem = PlanProblem(detours, cost, self.moved, self.weight)
         self._check_others()
-        self._prepare()
-
-    def _prepare(self) -> None:
-        use_forward_mode()
         self._rows = RowFunction(self._definition, self, "a plan around what moves")
         self._begun = RowFunction(self._first_plan, self, "first plans around what moves")
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {**vars(self), "_rows": None, "_begun": None}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        super().__setstate__(state)  # type: ignore[no-untyped-call]
-        self._prepare()
 
     def init(self, x0: Tensor) -> ControllerState:
         """The best of the first plans from the states x0 (B, n), some 200 of each."""
@@ -115,10 +101,8 @@ class DetourPlans(Controller):
         found = improved.unflatten(0, (len(starts), count))
         total = torch.where(torch.isfinite(found[..., 0]), found[..., 0], torch.inf)
         best = found[total.argmin(0), torch.arange(count, device=x0.device), 1:]
-        empty = x0.new_zeros(count, 0)
         expected, done = x0.new_full((count, 1), torch.inf), x0.new_zeros(count, 1)
-        known = torch.cat((best, expected, done), dim=-1)  # the plan, its J, the periods so far
-        return ControllerState(empty, empty, x0.new_zeros(count, 0, 0), known)
+        return carrying(torch.cat((best, expected, done), dim=-1))  # the plan, its J, the periods so far
 
     def step(
         self, x: Tensor, carried: ControllerState, uniform: Tensor, dt: float

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -13,7 +12,7 @@ from ..lanes import each, repeat
 from ..lanes.function import RowFunction
 from ..numerics.checks import fail, integer, non_negative, one_or_each, positive, positive_real, vector
 from ..systems import Plant, StepPlant
-from .controllers import Controller, ControllerState, Policy, Value
+from .controllers import Controller, ControllerState, Policy, Value, carrying
 from .cost import Cost
 from .holding import Holding
 from .safety_filter import Constraint
@@ -127,9 +126,7 @@ class DetourRollout(Controller):
         self._rows = RowFunction(self._definition, self, "a choice of detours")
 
     def init(self, x0: Tensor) -> ControllerState:
-        empty = x0.new_zeros(len(x0), 0)
-        known = x0.new_zeros(len(x0), len(self.axes) + 2)  # the detour, its length, the periods so far
-        return ControllerState(empty, empty, x0.new_zeros(len(x0), 0, 0), known)
+        return carrying(x0.new_zeros(len(x0), len(self.axes) + 2))  # the detour, its length, periods so far
 
     def step(
         self, x: Tensor, carried: ControllerState, uniform: Tensor, dt: float
@@ -140,13 +137,6 @@ class DetourRollout(Controller):
         found = self._rows(torch.cat((x, known), dim=-1))
         u, known = found.split((self.plant.inputs, known.shape[-1]), dim=-1)
         return u, carried._replace(identifier=known)
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {**vars(self), "_rows": None}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        super().__setstate__(state)  # type: ignore[no-untyped-call]
-        self._rows = RowFunction(self._definition, self, "a choice of detours")
 
     def _definition(self, z: Tensor) -> Tensor:
         """Of rows of (x, detour, periods so far) the control, and both for the next period."""

@@ -9,14 +9,14 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ..lanes import Program
+from ..lanes import Program, scan
 from ..numerics.checks import fail, integer, positive_real, trailing, vector
-from .following import follow_plan
-from .plans import LocalModel, Reference, Trajectories
+from .plans import LocalModel, Reference, Trajectories, around, packed, resting, unpacked
 from .sampled_problem import SampledProblem
 
 _TOGETHER = 4096  # candidates rolled out at once
 _ROUND = 0.01  # share of the metric that counts every coordinate, also one of which no cost depends
+_REACH = 0.3  # of the region: a rollout that ends further from what it follows has lost it
 _ARRIVED = 0.01  # share of a trajectory's cost that may be the terminal value: else it did not reach the goal
 
 
@@ -236,13 +236,11 @@ class GlobalValue(nn.Module):
             entries: rows of the memory, (B,).
             steps: T.
         """
-        n, m = self.problem.dim, self.problem.inputs
         time = entries % self.length
         ahead = (time.unsqueeze(1) + torch.arange(steps)).clamp(max=self.length - 1)
-        plan = self.plans[(entries - time).unsqueeze(1) + ahead]
-        shift = x - self.problem.offset(x, plan[:, 0, :n]) - plan[:, 0, :n]
-        state, control, feedback = plan.split((n, m, m * n), dim=-1)
-        return control, Reference(state + shift.unsqueeze(1), feedback.unflatten(-1, (m, n)))
+        state, control, feedback = unpacked(self.problem, self.plans[(entries - time).unsqueeze(1) + ahead])
+        shift = x - self.problem.offset(x, state[:, 0]) - state[:, 0]
+        return control, Reference(state + shift.unsqueeze(1), feedback)
 
     def seen(self, x: Tensor) -> Tensor:
         """Coordinates F'(x - goal) of the search, whose squares add up to d'Gd: (..., n) -> (..., n)."""
@@ -270,14 +268,9 @@ class GlobalValue(nn.Module):
 
     def _plans(self) -> Tensor:
         """What is followed: the library, and then the goal under its linear feedback."""
-        library, problem = self.library, self.problem
-        count, m = len(library.state), problem.inputs
-        hold = torch.cat(
-            (self._goals(), problem.rest.expand(count, m), (-problem.k).reshape(1, -1).expand(count, -1)), -1
-        )
-        parts = library.state[:, :-1], library.control, library.feedback.flatten(2)
-        whole = torch.cat((torch.cat(parts, dim=-1), hold.unsqueeze(1).expand(-1, self.lookahead + 1, -1)), 1)
-        return whole.flatten(0, 1)
+        library, hold = self.library, resting(self.problem, self._goals()).unsqueeze(1)
+        steps = packed(library.state[:, :-1], library.control, library.feedback)
+        return torch.cat((steps, hold.expand(-1, self.lookahead + 1, -1)), dim=1).flatten(0, 1)
 
     def _models(self) -> Tensor:
         """What is left to pay: along the library, and then at the goal."""
@@ -303,3 +296,36 @@ class GlobalValue(nn.Module):
             keep.append(far & self.arrives)
         which, time = torch.stack(keep, dim=1).nonzero(as_tuple=True)
         return which * self.length + time
+
+
+def follow_plan(
+    problem: SampledProblem, region: Tensor, worst: float, x: Tensor, window: Tensor, end: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Cost (B,), first control (B, m) and arrival (B,) bool of following a plan, a row each.
+
+    Args:
+        problem: plant, cost and bounds in steps.
+        region: half the width of the box of states, (n,).
+        worst: the largest value that is remembered, added where the plan is lost.
+        x: (B, n).
+        window: state, control and feedback of H steps, (B, H, n + m + m n).
+        end: state, value, gradient and curvature after them, (B, n + 1 + n + n n).
+    """
+    n = problem.dim
+
+    def step(now: tuple[Tensor, Tensor], plan: Tensor) -> tuple[tuple[Tensor, Tensor], tuple[()]]:
+        after, paid = problem.advance(now[0], around(problem, now[0], plan))
+        return (after, now[1] + paid), ()
+
+    first = window[:, 0]
+    x = first[:, :n] + problem.offset(x, first[:, :n])
+    (last, paid), _ = scan(step, (x, torch.zeros_like(x[:, 0])), window)
+    state, value, gradient, curvature = end.split((n, 1, n, n * n), dim=-1)
+    d = last - state
+    bent = (curvature.unflatten(-1, (n, n)) * d.unsqueeze(-2)).sum(-1)
+    rest = value.squeeze(-1) + ((gradient + 0.5 * bent) * d).sum(-1)
+    far = (d / region).square().sum(-1)
+    covered = (far < _REACH**2) & torch.isfinite(paid)
+    lost = paid + value.squeeze(-1) + worst * (1 + far)
+    cost = torch.where(covered, paid + rest, lost)
+    return torch.where(torch.isfinite(cost), cost, torch.inf), around(problem, x, first), covered

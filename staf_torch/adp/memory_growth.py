@@ -11,21 +11,13 @@ from torch import Tensor
 
 from ..numerics.checks import integer
 from .global_value import GlobalValue
-from .plans import Reference, Trajectories
+from .plans import Reference, Trajectories, chosen
 from .sampled_problem import SampledProblem
 from .trajectory_optimisation import BoxDDP
 
 _log = logging.getLogger(__name__)
 _HELD = 10  # steps for which a random first control is held
-_PREFIXES = (
-    2,
-    4,
-    7,
-    11,
-    16,
-    22,
-    30,
-)  # steps for which a corner of the bounds is held before a plan is followed
+_PREFIXES = (2, 4, 7, 11, 16, 22, 30)  # steps for which a corner of the bounds is held before a plan
 _WORTH = 0.01  # relative gain of cost for which a state's trajectory is kept
 _BEST = 3  # guesses of a state from which it is optimised
 
@@ -117,13 +109,7 @@ def swept(memory: GlobalValue, search: BoxDDP) -> Trajectories:
     library = memory.library
     own = torch.arange(len(library.cost))
     found = best_from(memory, search, library.state[:, 0], own)
-    better = found.cost < library.cost
-    return Trajectories(
-        *(
-            torch.where(better[(..., *([None] * (new.dim() - 1)))], new, old)
-            for new, old in zip(found, library, strict=True)
-        )
-    )
+    return chosen(found.cost < library.cost, found, library)
 
 
 def best_from(memory: GlobalValue, search: BoxDDP, x: Tensor, own: Tensor | None = None) -> Trajectories:

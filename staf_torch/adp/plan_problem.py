@@ -12,6 +12,7 @@ from ..lanes import repeat, scan
 from ..lanes.combinators import tracing_now
 from ..numerics.angles import wrap
 from ..numerics.box import minimum_and_slopes
+from ..numerics.forward_mode import use_forward_mode
 from ..numerics.linalg import row_jacobian
 from ..numerics.riccati import product, riccati_step
 from ..numerics.runge_kutta import runge_kutta_step
@@ -228,6 +229,7 @@ def _along(function: Callable[[Tensor], Tensor], z: Tensor) -> tuple[Tensor, Ten
     """
     if not tracing_now():
         return row_jacobian(function, z)
+    use_forward_mode()
     units = torch.eye(z.shape[-1], dtype=z.dtype, device=z.device)
     found = [torch.func.jvp(function, (z,), (unit.expand_as(z).clone(),)) for unit in units]
     return found[0][0], torch.stack([one[1] for one in found], dim=-1)

@@ -87,6 +87,30 @@ class Plan(NamedTuple):
         return Plan(*(part[index] for part in self))
 
 
+def packed(state: Tensor, control: Tensor, feedback: Tensor) -> Tensor:
+    """Steps of a plan as numbers: (..., n), (..., m), (..., m, n) -> (..., n + m + m n)."""
+    return torch.cat((state, control, feedback.flatten(-2)), dim=-1)
+
+
+def unpacked(problem: SampledProblem, steps: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """State, control and feedback of `packed` steps."""
+    n, m = problem.dim, problem.inputs
+    state, control, feedback = steps.split((n, m, m * n), dim=-1)
+    return state, control, feedback.unflatten(-1, (m, n))
+
+
+def resting(problem: SampledProblem, goal: Tensor) -> Tensor:
+    """The linear feedback of goals (..., n) as `packed` steps."""
+    shape = goal.shape[:-1]
+    return packed(goal, problem.rest.expand(*shape, -1), (-problem.k).expand(*shape, -1, -1))
+
+
+def around(problem: SampledProblem, x: Tensor, step: Tensor) -> Tensor:
+    """The control of a `packed` step at another state than its own: (..., n), (..., w) -> (..., m)."""
+    state, control, feedback = unpacked(problem, step)
+    return problem.admissible(control + (feedback * (x - state).unsqueeze(-2)).sum(-1))
+
+
 Some = TypeVar("Some", bound=tuple[Tensor, ...])
 
 

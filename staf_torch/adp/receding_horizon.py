@@ -14,7 +14,7 @@ from .bounded_plans import best_held
 from .controllers import Controller, ControllerState, carrying
 from .global_value import GlobalValue
 from .memory_growth import best_from
-from .plans import LocalModel, Reference, Trajectories
+from .plans import LocalModel, Reference, Trajectories, around, packed, resting, unpacked
 from .sampled_problem import SampledProblem
 from .trajectory_optimisation import BoxDDP
 
@@ -121,9 +121,7 @@ class RecedingHorizon(Controller):
 
     def idle(self, x0: Tensor) -> ControllerState:
         """The linear feedback of the goal as a plan, not yet followed from the states x0 (B, n)."""
-        goal, gains = self.problem.goals(x0, self.steps)[:, :-1], (-self.problem.k).flatten()
-        parts = goal, self.problem.rest.expand(*goal.shape[:-1], -1), gains.expand(*goal.shape[:-1], -1)
-        return _carrying(torch.cat(parts, dim=-1))
+        return _carrying(resting(self.problem, self.problem.goals(x0, self.steps)[:, :-1]))
 
     def step(
         self, x: Tensor, carried: ControllerState, uniform: Tensor, dt: float
@@ -143,9 +141,8 @@ class RecedingHorizon(Controller):
         """What a search begins from: the memory's plan, or the carried one (B, 1 + T w)."""
         if self.memory is not None:
             return self._remembered(x)
-        n, m = self.problem.dim, self.problem.inputs
-        state, control, feedback = plan[:, 1:].unflatten(-1, (self.steps, -1)).split((n, m, m * n), dim=-1)
-        return control, Reference(state, feedback.unflatten(-1, (m, n)))
+        state, control, feedback = unpacked(self.problem, plan[:, 1:].unflatten(-1, (self.steps, -1)))
+        return control, Reference(state, feedback)
 
     def _improved(self, x: Tensor, plan: Tensor) -> tuple[Tensor, Tensor]:
         """The first control of an improved plan and the numbers that are carried: (B, n), (B, 1 + T w)."""
@@ -162,44 +159,35 @@ class RecedingHorizon(Controller):
         """The remembered model where a plan ends."""
         if self.memory is None or control is None or reference is None:
             return None
-        for k in range(self.steps):
-            apart = (x - reference.state[:, k]).unsqueeze(-2)
-            u = self.problem.admissible(control[:, k] + (reference.feedback[:, k] * apart).sum(-1))
-            x, _ = self.problem.advance(x, u)
+        for step in packed(reference.state, control, reference.feedback).unbind(1):
+            x, _ = self.problem.advance(x, around(self.problem, x, step))
         return self.memory.model(x)
 
     def _followed(self, x: Tensor, plan: Tensor) -> tuple[Tensor, ControllerState]:
         """The control of a plan that is not improved, (B, 1 + T w), and the plan with one step more done."""
-        n, m = self.problem.dim, self.problem.inputs
-        width, last = n + m + m * n, self.steps - 1
+        width, last = self.width // self.steps, self.steps - 1
         carried = _carrying(plan[:, 1:], plan[:, :1] + 1)
         if tracing_now():  # a program cannot ask for a number: it looks up the row of the plan
             done, steps = plan[:, :1], plan[:, 1:].unflatten(-1, (self.steps, width))
             now = steps.gather(1, done.clamp(max=last).long().unsqueeze(-1).expand(-1, -1, width)).squeeze(1)
-            return torch.where(done > last, self.problem.linear_feedback(x), self._around(x, now)), carried
+            planned = around(self.problem, x, now)
+            return torch.where(done > last, self.problem.linear_feedback(x), planned), carried
         begun = int(plan[0, 0])  # all rows began together
         if begun > last:
             return self.problem.linear_feedback(x), carried
-        return self._around(x, plan[:, 1 + begun * width : 1 + (begun + 1) * width]), carried
-
-    def _around(self, x: Tensor, plan: Tensor) -> Tensor:
-        """The control of one step of a plan (B, w) at x (B, n)."""
-        n, m = self.problem.dim, self.problem.inputs
-        state, control, feedback = plan.split((n, m, m * n), dim=-1)
-        away = (x - state).unsqueeze(-2)
-        return self.problem.admissible(control + (feedback.unflatten(-1, (m, n)) * away).sum(-1))
+        now = plan[:, 1 + begun * width : 1 + (begun + 1) * width]
+        return around(self.problem, x, now), carried
 
     def _ahead(self, plan: Tensor, last: Tensor) -> ControllerState:
         """The plan (B, T, w) from the next step on, and at its end the linear feedback of the goal near the
         last state (B, n)."""
-        goal, count, m = self.problem.goals(last, 0)[:, 0], len(last), self.problem.inputs
-        hold = goal, self.problem.rest.expand(count, m), (-self.problem.k).flatten().expand(count, -1)
-        return _carrying(torch.cat((plan[:, 1:], torch.cat(hold, dim=-1).unsqueeze(1)), dim=1))
+        hold = resting(self.problem, self.problem.goals(last, 0))
+        return _carrying(torch.cat((plan[:, 1:], hold), dim=1))
 
 
 def _rows(found: Trajectories) -> Tensor:
     """State, control and feedback of every step: (B, T, n + m + m n)."""
-    return torch.cat((found.state[:, :-1], found.control, found.feedback.flatten(2)), dim=-1)
+    return packed(found.state[:, :-1], found.control, found.feedback)
 
 
 def _carrying(plan: Tensor, done: Tensor | None = None) -> ControllerState:

@@ -382,13 +382,6 @@ class SafetyFilter(Controller):
                 return number
         return 0
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {**vars(self), "_rows": None}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        super().__setstate__(state)  # type: ignore[no-untyped-call]
-        self._rows = RowFunction(self._definition, self, "a safety filter")
-
 
 def _number(h: Constraint) -> Rows:
     """h of one row: (1, n), () -> ()."""

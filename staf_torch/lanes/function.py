@@ -62,6 +62,11 @@ class RowFunction:
         self._versions: list[int] = []
         self._around: Watch | None = None
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle what it is made of: a copy compiles programs of its own."""
+        compile = None if self._compile == self._one_program else self._compile
+        return RowFunction, (self._function, self._module, self._name, compile)
+
     def __call__(self, x: Tensor) -> Tensor:
         """y: (..., n) -> (..., m)."""
         if not ordinary((x,)) or x.numel() == 0 or tracing_now():

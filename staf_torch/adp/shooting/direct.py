@@ -13,8 +13,9 @@ from ...systems import Clocked, ControlAffineSystem, Linear, Plant
 from ...systems.bounds import Limit
 from ..controllers import LQR, Policy, Value
 from ..cost import Cost
+from ..plans import chosen
 from .mesh import graded, halved, split
-from .newton import Plan, Solution, choose, follow, minimise, replay
+from .newton import Plan, Solution, follow, minimise, replay
 from .optimum import Optimum
 from .stage import Stage
 from .starts import agreement, guesses, guided, said
@@ -239,7 +240,7 @@ class DirectShooting:
         if not bool(coarse.converged.all()):  # costs time alone: the other rows go on from where they are
             again = follow(self, _always(base), x0, time.diff())
             lower = ~coarse.converged & (again.cost < fine_start.cost)
-            fine_start = choose(~lower, fine_start, again)
+            fine_start = chosen(~lower, fine_start, again)
         return self._optimum(minimise(self, fine_start, time.diff()), coarse, time)
 
     def _finer(self, solution: Solution, lengths: Tensor) -> Plan:
@@ -264,7 +265,7 @@ class DirectShooting:
             control = self.stage.cost.policy(self.stage.system.effectiveness(x0), gradient)
 
         def where_known(values: Tensor) -> Tensor:
-            return torch.where(known[(..., *([None] * (values.dim() - 1)))], values, torch.nan)
+            return chosen(known, (values,), (torch.full_like(values, torch.nan),))[0]
 
         change = (plan.cost - coarse.plan.cost).abs() / value
         change = torch.where(coarse.converged, change, torch.inf)

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from typing import NamedTuple, Protocol, TypeVar
+from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 
 from ...numerics.riccati import riccati_step
+from ..plans import chosen
 from .stage import Expansion, Stage, closed_stage
-
-Rows = TypeVar("Rows", "Plan", "Direction")
 
 _ROUNDING = 1e-9  # relative promise below which a step that does not pay is one that rounding hides
 _LEAST_CURVATURE = 1e-6  # of its largest eigenvalue, that a convexified interval keeps
@@ -147,7 +146,7 @@ def improved(
     x0 = plan.state[:, 0]
     tried = replay(stage, plan, x0, lengths, terminal, step.feedback, step.offset)
     lower = tried.cost < plan.cost
-    best = choose(lower, tried, plan)
+    best = chosen(lower, tried, plan)
     if not bool(lower.all()):  # costs time alone: rows that took the whole step keep it
         shares = torch.tensor(_SHORTER, dtype=x0.dtype, device=x0.device)
         several = x0.expand(len(shares), *x0.shape)
@@ -157,17 +156,8 @@ def improved(
         rows = torch.arange(len(x0), device=x0.device)
         shortened = Plan(tried.state[which, rows], tried.control[which, rows], cost)
         pays = ~lower & (cost < plan.cost)
-        best, lower = choose(pays, shortened, best), lower | pays
+        best, lower = chosen(pays, shortened, best), lower | pays
     return best, lower
-
-
-def choose(rows: Tensor, new: Rows, old: Rows) -> Rows:
-    """The tensors of ``new`` in ``rows`` (B,), those of ``old`` in the others."""
-
-    def pick(a: Tensor, b: Tensor) -> Tensor:
-        return torch.where(rows[(..., *([None] * (a.dim() - 1)))], a, b)
-
-    return type(new)(*map(pick, new, old))
 
 
 class Problem(Protocol):
@@ -223,12 +213,12 @@ def minimise(problem: Problem, plan: Plan, lengths: Tensor) -> Solution:
             break
         moved, lower = improved(problem.stage, plan, lengths, problem.terminal, kept)
         moving = ~done & ~stuck
-        plan = choose(moving & lower, moved, plan)
+        plan = chosen(moving & lower, moved, plan)
         count = count + moving
         done = done | (moving & ~lower & (promise <= _ROUNDING))
         stuck = stuck | (moving & ~lower & ~done & rough)
         step, rough = _step(problem, plan, lengths, moving & ~lower)  # convexified where it did not pay
-        kept = choose(done | stuck, kept, step)
+        kept = chosen(done | stuck, kept, step)
     promise = torch.where(kept.definite, kept.decrement / plan.cost, torch.inf)
     return Solution(plan, kept.feedback, kept.gradient, done, kept.costates, promise, count)
 
@@ -243,7 +233,7 @@ def _step(problem: Problem, plan: Plan, lengths: Tensor, rough: Tensor) -> tuple
     step = direction(expansion, slope, curvature, room)
     rough = rough | ~step.definite
     if bool(rough.any()):  # costs time alone
-        step = choose(~rough, step, direction(convexified(expansion), slope, curvature, room))
+        step = chosen(~rough, step, direction(convexified(expansion), slope, curvature, room))
     return step, rough
 
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ..controllers import Controller, ControllerState
+from ..controllers import Controller, ControllerState, carrying
 
 
 class Optimum(NamedTuple):
@@ -83,8 +83,7 @@ class PlanReplay(Controller):
     def init(self, x0: Tensor) -> ControllerState:
         if len(x0) != len(self.plan):
             raise ValueError(f"This plan is for {len(self.plan)} initial states; got {len(x0)}.")
-        empty = x0.new_zeros(len(x0), 0)
-        return ControllerState(empty, empty, x0.new_zeros(len(x0), 0, 0), x0.new_zeros(len(x0), 1))
+        return carrying(x0.new_zeros(len(x0), 1))
 
     def step(
         self, x: Tensor, carried: ControllerState, uniform: Tensor, dt: float
