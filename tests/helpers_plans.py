@@ -1,15 +1,13 @@
-"""A plant that is pushed in steps, and trajectories that are marked by their row: for tests of plans."""
+"""A mass that is pushed in steps by two bounded inputs: what the tests of plans share."""
 
 from __future__ import annotations
 
 import math
 
 import torch
-from helpers import tensor
 from torch import Tensor
 
 from staf_torch import adp
-from staf_torch.adp.plans import Trajectories
 
 
 def pushed(x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
@@ -18,19 +16,3 @@ def pushed(x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
 
 
 BOX = adp.SampledProblem(pushed, dim=2, inputs=2, low=[-1.0, -2.0], high=[0.5, math.inf])
-
-
-def trajectories(*costs: float, steps: int = 3, mark: float = 0.0) -> Trajectories:
-    """Of two states and two inputs, marked by their row."""
-    rows = len(costs)
-    at = torch.arange(rows).double() + mark
-    value = tensor(costs)[:, None] * torch.linspace(1, 0, steps + 1, dtype=torch.float64)
-    return Trajectories(
-        at[:, None, None].expand(rows, steps + 1, 2).clone(),
-        at[:, None, None].expand(rows, steps, 2).clone(),
-        at[:, None, None, None].expand(rows, steps, 2, 2).clone(),
-        value,
-        at[:, None, None].expand(rows, steps + 1, 2).clone(),
-        at[:, None, None, None].expand(rows, steps + 1, 2, 2).clone(),
-        torch.ones(rows) > 0,
-    )

@@ -8,11 +8,12 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import torch
+from helpers import uniform
 from helpers_swingup import cost_of, double_integrator, pendulum
 from torch import Tensor
 
-from staf_torch import adp, systems
-from staf_torch.adp.trajectory_optimisation import _definite
+from staf_torch import adp, lanes, systems
+from staf_torch.adp.plans import Reference
 from staf_torch.numerics.forward_mode import use_forward_mode
 
 use_forward_mode()
@@ -93,25 +94,93 @@ def test_models_are_the_derivatives_of_the_optimal_cost() -> None:
     torch.testing.assert_close(found.curvature[0, 0].diagonal(), bent, rtol=1e-2, atol=1e-3)
 
 
-def test_rows_do_not_see_each_other() -> None:
+WAVED_X, WAVED_U = 2 * uniform(8, 2, seed=1), 1.4 * uniform(8, 3, 2, seed=2)
+WAVED_AROUND = Reference(WAVED_X.unsqueeze(1).expand(-1, 3, -1), 0.3 * uniform(8, 3, 2, 2, seed=3))
+
+
+def waved(low: float | None = None, high: float | None = None) -> adp.SampledProblem:
+    """A plant that is not linear, of two inputs whose cost bends down in places: many steps do not pay."""
+
+    def step(x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+        push = x[..., 0].sin() + u[..., 0] + u[..., 1] * x[..., 0]
+        after = torch.stack((x[..., 0] + 0.3 * x[..., 1], x[..., 1] + 0.3 * push), dim=-1)
+        waves = u.square() + 0.8 - 0.8 * (3 * u).cos()
+        return after, 0.3 * (x.square().sum(-1) + waves.sum(-1))
+
+    return adp.SampledProblem(step, dim=2, inputs=2, low=low, high=high)
+
+
+def test_no_iteration_raises_a_cost_and_what_is_called_converged_is_stationary() -> None:
+    problem = waved(-0.6, 0.9)
+    costs = []
+    for iterations in (1, 2, 4, 8, 60):
+        search = adp.BoxDDP(problem, steps=3, iterations=iterations, tolerance=1e-10, compile=False)
+        found = search.solve(WAVED_X, WAVED_U, WAVED_AROUND)
+        torch.testing.assert_close(cost_of(problem, WAVED_X, found.control), found.cost)
+        torch.testing.assert_close(found.value[:, -1], problem.terminal(found.state[:, -1]))
+        costs.append(found.cost)
+    assert bool((torch.stack(costs).diff(dim=0) <= 0).all())
+    assert int(found.converged.sum()) > 4
+    slope = torch.func.grad(lambda u: cost_of(problem, WAVED_X, u).sum())(found.control)
+    free = problem.bounds.inward(found.control, slope)[found.converged]
+    assert float(free.abs().max()) < 1e-3
+
+
+def test_one_iteration_is_seldom_called_convergence() -> None:
+    few = adp.BoxDDP(waved(), steps=3, iterations=1, tolerance=1e-10, compile=False)
+    assert not bool(few.solve(WAVED_X, WAVED_U, WAVED_AROUND).converged.any())
+
+
+def test_inputs_at_a_bound_do_not_answer_a_change_of_the_state() -> None:
+    problem = two_inputs(torch.tensor([-0.2, -1.0]), torch.tensor([0.7, torch.inf]))
+    x0 = torch.tensor([[2.0, -1.0, 0.5, 1.0], [-3.0, 1.0, 0.0, 0.0]], dtype=torch.float64)
+    found = adp.BoxDDP(problem, steps=15, tolerance=1e-11, compile=False).solve(x0, still(2, 15, 2))
+    held = (found.control == problem.bounds.low) | (found.control == problem.bounds.high)
+    assert bool(held.any())
+    assert not bool(found.feedback[held].any())
+    assert bool((found.feedback[~held] != 0).any(-1).all())
+
+
+@pytest.mark.parametrize("rows", [[1], [2, 1, 0]])
+def test_a_row_is_found_alike_alone_and_beside_one_that_is_no_number(rows: list[int]) -> None:
+    x0 = torch.tensor([[torch.nan, 0.0], [5.0, 0.0], [-1.0, 2.0]], dtype=torch.float64)
     search = adp.BoxDDP(BOUNDED, steps=12, compile=False)
-    both = search.solve(X0, still(2, 12))
-    alone = search.solve(X0[1:], still(1, 12))
-    torch.testing.assert_close(both.rows(torch.tensor([1])).state, alone.state, rtol=1e-12, atol=1e-12)
+    whole, some = search.solve(x0, still(3, 12)), search.solve(x0[rows], still(len(rows), 12))
+    assert whole.converged.tolist() == [False, True, True]
+    assert not math.isfinite(float(whole.cost[0]))
+    for one, other in zip(some, whole.rows(torch.tensor(rows)), strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-12, atol=1e-12, equal_nan=True)
 
 
-def test_compiled_passes_find_what_plain_torch_finds() -> None:
-    plain = adp.BoxDDP(BOUNDED, steps=12, compile=False).solve(X0, still(2, 12))
-    fast = adp.BoxDDP(BOUNDED, steps=12).solve(X0, still(2, 12))
-    torch.testing.assert_close(fast.state, plain.state, rtol=1e-8, atol=1e-8)
-    torch.testing.assert_close(fast.curvature, plain.curvature, rtol=1e-6, atol=1e-8)
+@torch.no_grad()
+@pytest.mark.compiled
+@pytest.mark.needs_compiler
+@pytest.mark.parametrize("iterations", [1, 12])
+def test_compiled_passes_and_the_whole_search_as_one_program_find_what_plain_torch_finds(
+    iterations: int,
+) -> None:
+    problem, x = waved(-0.6, 0.9), WAVED_X.clone()
+    x[5] = torch.nan
+    plain = adp.BoxDDP(problem, steps=3, iterations=iterations, compile=False)
+    found = plain.solve(x, WAVED_U, WAVED_AROUND)
+    passes = adp.BoxDDP(problem, steps=3, iterations=iterations).solve(x, WAVED_U, WAVED_AROUND)
 
+    def search(
+        carry: tuple[()], _: tuple[()], row: tuple[Tensor, ...]
+    ) -> tuple[tuple[()], tuple[Tensor, ...]]:
+        part = plain.solve(row[0], row[1], Reference(*row[2:]))
+        return carry, (part.state, part.control, part.feedback, part.cost)
 
-def test_row_that_cannot_be_followed_has_no_cost_and_did_not_converge() -> None:
-    x0 = torch.tensor([[torch.nan, 0.0], [1.0, 0.0]], dtype=torch.float64)
-    found = adp.BoxDDP(BOUNDED, steps=10, compile=False).solve(x0, still(2, 10))
-    assert found.converged.tolist() == [False, True]
-    assert not math.isfinite(float(found.cost[0]))
+    program = lanes.Program(search, name="a search")
+    given = x, WAVED_U, *(part.contiguous() for part in WAVED_AROUND)
+    assert program.compiles((), (), given, steps=1)
+    whole = [part[:, 0] for part in program((), (), given, steps=1)[1]]
+    fine = torch.arange(8) != 5
+    for k, wanted in enumerate((found.state, found.control, found.feedback, found.cost)):
+        for other in (whole[k], (passes.state, passes.control, passes.feedback, passes.cost)[k]):
+            torch.testing.assert_close(other[fine], wanted[fine], rtol=0, atol=1e-8)
+    assert torch.equal(passes.converged, found.converged)
+    assert bool(found.converged.any()) is (iterations > 1)
 
 
 def test_problem_of_a_plant_and_a_cost_pays_what_the_simulation_pays() -> None:
@@ -197,13 +266,3 @@ def test_a_plan_where_the_cost_is_concave_in_the_control_leads_to_a_minimum() ->
 def test_states_of_another_shape_are_refused_by_name(shape: tuple[int, ...]) -> None:
     with pytest.raises(ValueError, match=r"`BoxDDP.solve\(x0=...\)` must have"):
         adp.BoxDDP(BOUNDED, steps=3).solve(torch.zeros(shape, dtype=torch.float64))
-
-
-@pytest.mark.parametrize("size", [1, 2, 3, 4])
-def test_pivots_tell_whether_a_matrix_is_definite(size: int) -> None:
-    generator = torch.Generator().manual_seed(size)
-    some = torch.randn(200, size, size, dtype=torch.float64, generator=generator)
-    some = some + some.mT + (0.5 + size**0.5) * torch.eye(size)
-    positive = torch.linalg.eigvalsh(some)[:, 0] > 0
-    assert 10 < int(positive.sum()) < 190
-    assert torch.equal(_definite(some) > 0, positive)
