@@ -7,12 +7,13 @@ from typing import Any
 
 import pytest
 import torch
+from helpers import tensor
+from helpers_plans import BOX, pushed
 from helpers_swingup import GRID, RESETS, cost_of, double_integrator, pendulum
 from torch import Tensor
 
-from staf_torch import adp, systems
-from staf_torch.adp.plans import Reference
-from staf_torch.adp.traced_search import TracedSearch
+from staf_torch import adp, lanes, systems
+from staf_torch.adp.controllers import carrying
 
 NONE = torch.empty(0, dtype=torch.float64)
 
@@ -35,13 +36,15 @@ def test_linear_plant_gets_the_regulator_at_every_horizon() -> None:
     torch.testing.assert_close(cost_of(problem, x, controls), problem.terminal(x), rtol=1e-8, atol=1e-10)
 
 
-def test_bounds_hold_and_the_state_comes_to_rest() -> None:
-    problem = double_integrator(-1.0, 1.0)
-    x = torch.tensor([[3.0, 0.0], [-1.0, 2.0]], dtype=torch.float64)
-    controls, last = drive(adp.RecedingHorizon(problem, steps=25), x, 60)
+@pytest.mark.compiled
+def test_with_one_iteration_a_control_the_loop_comes_to_the_optimum_within_bounds() -> None:
+    problem, x = double_integrator(-1.0, 1.0), tensor([[3.0, 0.0], [-1.0, 2.0]])
+    controls, last = drive(adp.RecedingHorizon(problem, steps=25, iterations=1), x, 60)
     assert bool(problem.bounds.contain(controls).all())
     assert float(controls.abs().max()) == 1.0
     assert float(last.abs().max()) < 0.1
+    once = adp.BoxDDP(problem, steps=60).solve(x)
+    torch.testing.assert_close(cost_of(problem, x, controls), once.cost, rtol=1e-3, atol=0)
 
 
 def test_short_plan_that_ends_in_the_memory_swings_up(memory: adp.GlobalValue) -> None:
@@ -91,55 +94,67 @@ def test_memory_of_another_problem_is_refused(memory: adp.GlobalValue) -> None:
 
 
 @torch.no_grad()
-@pytest.mark.parametrize("iterations", [1, 3, 15])
-def test_search_as_a_program_finds_the_plan_of_the_search(iterations: int) -> None:
-    """Rows that converge, that meet bounds, that begin badly, and one that is no number."""
-    problem = double_integrator(-1.0, 1.0)
-    search = adp.BoxDDP(problem, steps=9, iterations=iterations, compile=False)
-    x = torch.tensor([[0.1, 0.0], [3.0, 1.0], [-2.0, 2.0], [math.nan, 0.0], [0.0, 0.0]], dtype=torch.float64)
-    generator = torch.Generator().manual_seed(iterations)
-    control = 3 * torch.rand(5, 9, 1, dtype=torch.float64, generator=generator) - 1.5
-    around = Reference(torch.zeros(5, 9, 2).double(), -problem.k.expand(5, 9, 1, 2))
-    found = search.solve(x, control, around)
-    state, u, feedback = TracedSearch(search)(x, control, around)
-    fine = torch.isfinite(x).all(-1)
-    for traced, plain in ((state, found.state), (u, found.control), (feedback, found.feedback)):
-        torch.testing.assert_close(traced[fine], plain[fine], rtol=0, atol=1e-7 if iterations > 3 else 1e-12)
-
-
-@torch.no_grad()
+@pytest.mark.compiled
 @pytest.mark.needs_compiler
 def test_hastened_control_is_that_of_the_parts(caplog: pytest.LogCaptureFixture) -> None:
     mpc = adp.RecedingHorizon(double_integrator(-1.0, 1.0), steps=9)
-    x = torch.tensor([[0.1, 0.0], [3.0, 1.0], [-2.0, 2.0]], dtype=torch.float64)
-    plan, none = mpc.init(x), x.new_zeros(3, 0)
+    x = torch.tensor([[0.1, 0.0], [3.0, 1.0], [-2.0, 2.0], [math.nan, 0.0]], dtype=torch.float64)
+    plan, none = mpc.init(x), x.new_zeros(4, 0)
     parts = mpc.step(x + 0.1, plan, none, 0.1)
     mpc.hasten()
-    whole, alone = (
-        mpc.step(x[rows] + 0.1, rows_of(plan, rows), none[rows], 0.1) for rows in (slice(3), slice(1, 2))
-    )
+    whole, alone = (mpc.step(x[k] + 0.1, rows_of(plan, k), none[k], 0.1) for k in (slice(4), slice(1, 2)))
     assert not caplog.text
-    torch.testing.assert_close(whole[0], parts[0], rtol=0, atol=1e-8)  # of a search of a few rounds
-    torch.testing.assert_close(whole[1].identifier, parts[1].identifier, rtol=0, atol=1e-8)
+    torch.testing.assert_close(whole[0][:3], parts[0][:3], rtol=0, atol=1e-8)  # of a search of a few rounds
+    torch.testing.assert_close(whole[1].identifier[:3], parts[1].identifier[:3], rtol=0, atol=1e-8)
     assert torch.equal(whole[0][1:2], alone[0])
 
 
 def rows_of(state: Any, rows: slice) -> Any:
-    return state._replace(**{name: part[rows] for name, part in state._asdict().items()})
+    return type(state)(*(part[rows] for part in state))
 
 
 @torch.no_grad()
-def test_a_plan_that_is_followed_is_followed_alike_in_a_program(
-    memory: adp.GlobalValue, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    mpc = adp.RecedingHorizon(memory.problem, steps=12, iterations=0, memory=memory)
-    carried, x = mpc.init(RESETS[:3]), RESETS[:3]
-    for _ in range(14):  # also behind its end
-        u, after = mpc._followed(x, carried.identifier)
-        with monkeypatch.context() as inside:
-            inside.setattr("staf_torch.adp.receding_horizon.tracing_now", lambda: True)
-            traced, its = mpc._followed(x, carried.identifier)
-        torch.testing.assert_close(traced, u, rtol=0, atol=1e-12)
-        assert torch.equal(its.identifier, after.identifier)
-        carried = after
-        x, _ = memory.problem.advance(x, u)
+@pytest.mark.compiled
+@pytest.mark.needs_compiler
+def test_a_plan_that_is_followed_is_its_feedback_and_then_that_of_the_goal_also_compiled() -> None:
+    mpc = adp.RecedingHorizon(BOX, steps=3, iterations=0, compile=False)
+    x0 = tensor([[2.0, 1.0], [-1.0, 0.5]])
+    found, carried, x = adp.BoxDDP(BOX, steps=3, compile=False).solve(x0), mpc.init(x0), x0 + 0.05
+
+    def step(
+        now: tuple[Tensor, Tensor], _: tuple[()], row: tuple[()]
+    ) -> tuple[tuple[Tensor, Tensor], Tensor]:
+        x, plan = now
+        u, after = mpc.step(x, carrying(plan), x, 0.1)
+        return (pushed(x, u)[0], after.identifier), u
+
+    program, whole = lanes.Program(step, name="a plan that is followed"), (x, carried.identifier)
+    assert program.compiles(whole, (), (), steps=5)
+    compiled = program(whole, steps=5)[1]
+    for k in range(5):  # also behind its end
+        u, carried = mpc.step(x, carried, x, 0.1)
+        answered = BOX.linear_feedback(x)
+        if k < 3:
+            away = (found.feedback[:, k] @ (x - found.state[:, k]).unsqueeze(-1)).squeeze(-1)
+            answered = BOX.admissible(found.control[:, k] + away)
+        torch.testing.assert_close(u, answered)
+        torch.testing.assert_close(compiled[:, k], u, rtol=0, atol=1e-12)
+        x, _ = pushed(x, u)
+
+
+def test_a_loop_carries_on_the_plans_of_the_rows_that_need_one() -> None:
+    """Near a bound a plan is carried; else the policy has the control, bit for bit. Rows are alone."""
+    plant = systems.Linear([[0.0, 1.0], [1.0, 0.0]], [[0.0], [1.0]])
+    cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1, low=-1.0, high=1.0)
+    policy = adp.near_optimal(plant, cost, dt=0.1)
+    loop, x = policy.controller(), tensor([[0.6, 0.1], [0.05, 0.0], [math.nan, 0.0]])
+    assert loop.label == adp.Feedback(policy).label
+    carried = loop.init(x)
+    for _ in range(2):
+        u, after = loop.step(x, carried, x, 0.1)
+        assert torch.equal(u[1:2], policy(x[1:2]))
+        one, its = loop.step(x[:1], rows_of(carried, slice(1)), x[:1], 0.1)
+        torch.testing.assert_close(one, u[:1], rtol=1e-9, atol=1e-9)
+        torch.testing.assert_close(its.identifier, after.identifier[:1], rtol=1e-9, atol=1e-9)
+        assert float(u[0].abs()) <= 1
+        carried, x = after, x + 0.1 * plant.motion(x, u)
