@@ -104,19 +104,6 @@ class Drawn(Falling):
         return np.array([self.height]), 0.0, False, False, {}
 
 
-def test_a_plant_made_twice_of_an_environment_that_draws_is_the_same_one() -> None:
-    first, second = (
-        envs.EnvironmentPlant(
-            Drawn(),
-            read=lambda env: np.array([env.height]),
-            write=lambda env, x: setattr(env, "height", float(x[0])),
-            dt=0.1,
-        )
-        for _ in range(2)
-    )
-    assert torch.equal(first.linearisation().matrix, second.linearisation().matrix)
-
-
 def test_an_environment_begins_with_the_seed_0() -> None:
     env = Drawn()
     envs.EnvironmentPlant(env, read=height, write=put_height, dt=0.1)

@@ -27,7 +27,6 @@ from gymnasium.utils import env_checker  # noqa: E402
 from gymnasium.vector import AutoresetMode  # noqa: E402
 
 from staf_torch import envs  # noqa: E402
-from staf_torch.envs.episodes import make_plant, start  # noqa: E402
 
 PLANT = systems.TwoState()
 COST = adp.QuadraticCost(1.0, 1.0, 2, 1)
@@ -80,46 +79,6 @@ def test_rewards_of_an_episode_add_up_to_minus_the_cost_of_the_simulation(make) 
         total += reward
     np.testing.assert_allclose(-total, wanted.cost.numpy(), rtol=1e-10)
     np.testing.assert_allclose(seen, wanted.state[:, -1].numpy(), rtol=1e-9, atol=1e-12)
-
-
-def test_finished_row_begins_anew_and_the_others_go_on() -> None:
-    unstable = torch.tensor([[0.0, 99.9], [0.1, 0.1]], dtype=torch.float64)
-    away = np.array([[20.0], [0.0]])
-    for mode in AutoresetMode:
-        many = envs.PlantVectorEnv("VanDerPol", num_envs=2, autoreset_mode=mode)
-        many.reset(seed=0, options={"state": unstable})
-        seen, reward, terminated, _, info = many.step(away)
-        assert terminated.tolist() == [True, False]
-        assert reward[0] == -1e4
-        if mode is AutoresetMode.SAME_STEP:
-            assert np.abs(seen[0]).max() <= 1
-            assert info["final_obs"][0].tolist() == [0.0, 99.9]
-        else:
-            assert seen[0].tolist() == [0.0, 99.9]
-        if mode is AutoresetMode.DISABLED:
-            seen, _ = many.reset(options={"reset_mask": np.array([True, False])})
-            assert np.abs(seen[0]).max() <= 1
-        before = seen[1]
-        seen, reward, terminated, _, _ = many.step(np.zeros((2, 1)))
-        assert not terminated.any()
-        assert np.abs(seen[0]).max() <= 1.1
-        assert (reward[0] == 0) == (mode is AutoresetMode.NEXT_STEP)
-        assert not np.array_equal(seen[1], before)
-
-
-def test_bad_input_is_refused_by_name() -> None:
-    with pytest.raises(ValueError, match=r"`PlantEnv\(plant=...\)` must be one of"):
-        envs.PlantEnv("Rocket")
-    with pytest.raises(ValueError, match=r"`PlantEnv\(plant=...\)` must be a ControlAffineSystem"):
-        envs.PlantEnv(systems.Oscillator())
-    env = envs.PlantEnv()
-    env.reset(seed=0)
-    with pytest.raises(ValueError, match=r"`step\(action=...\)` must lie in \[-20, 20\]"):
-        env.step(np.array([21.0]))
-    with pytest.raises(ValueError, match=r"`step\(action=...\)` must have the shape \(1,\)"):
-        env.step(np.array([1.0, 2.0]))
-    with pytest.raises(ValueError, match=r"must be \(1, 2\) and finite"):
-        env.reset(options={"state": [1.0, 2.0, 3.0]})
 
 
 class Recorder(adp.Controller):
@@ -226,44 +185,6 @@ def test_spaces_are_the_limit_of_states_and_the_bounds_of_inputs() -> None:
         envs.PlantVectorEnv(num_envs=0)
 
 
-def test_a_plant_is_given_by_name_class_path_or_itself() -> None:
-    own = systems.TwoState()
-    assert make_plant(own) is own
-    for given in ("TwoState", systems.TwoState, "staf_torch.systems.TwoState"):
-        assert type(make_plant(given)) is systems.TwoState
-    for given in ("no.such.module", "staf_torch.systems.NoPlant", "staf_torch..systems"):
-        with pytest.raises(ValueError, match=r"`PlantEnv\(plant=...\)` cannot be imported \(.*got"):
-            make_plant(given)
-    for given in ("math.pi", 3, systems.Oscillator):
-        with pytest.raises(ValueError, match="must be a ControlAffineSystem with states and inputs"):
-            make_plant(given)  # type: ignore[arg-type]
-    assert {"staf_torch/TwoState-v0", "staf_torch/Pendulum-v0"} <= set(envs.PLANTS)
-    assert all(name.removeprefix("staf_torch/") == f"{plant}-v0" for name, plant in envs.PLANTS.items())
-    assert "staf_torch/ControlAffineSystem-v0" not in envs.PLANTS
-    assert "staf_torch/Oscillator-v0" not in envs.PLANTS
-
-
-def test_a_start_is_uniform_or_as_stated_for_every_row() -> None:
-    found = start(None, [np.random.default_rng(seed) for seed in range(500)], 0.5, 3)
-    assert found.shape == (500, 3)
-    assert float(found.min()) < -0.49
-    assert float(found.max()) > 0.49
-    assert float(found.abs().max()) <= 0.5
-    two = [np.random.default_rng(0)] * 2
-    assert start({}, two, 0.5, 3).shape == (2, 3)
-    stated = torch.tensor([1.0, 2.0, 3.0])
-    for given in (stated, stated.numpy(), [[1.0, 2.0, 3.0]] * 2):
-        found = start({"state": given}, two, 0.5, 3)
-        assert found.tolist() == [[1.0, 2.0, 3.0]] * 2
-        assert found.dtype == torch.float64
-    whole = torch.zeros(2, 3, dtype=torch.float64)
-    start({"state": whole}, two, 0.5, 3).fill_(1.0)
-    assert not whole.any()  # a copy
-    for wrong in (torch.zeros(3, 3), torch.zeros(2, 2), torch.tensor([1.0, np.nan, 0.0]), [[np.inf] * 3] * 2):
-        with pytest.raises(ValueError, match=r'reset\(options\["state"\].*must be \(2, 3\) and finite'):
-            start({"state": wrong}, two, 0.5, 3)
-
-
 def test_seeds_are_one_a_row_and_go_on_without_new_ones() -> None:
     def fresh() -> envs.PlantVectorEnv:
         return envs.PlantVectorEnv("TwoState", num_envs=3)
@@ -349,20 +270,3 @@ def test_stated_states_begin_the_masked_rows_alone() -> None:
     many.step(actions)
     with pytest.raises(ValueError, match=r"must lie in \[-1, 1\]"):
         envs.PlantVectorEnv("TwoState", bound=1.0).step(torch.full((1, 1), torch.nan))
-
-
-def test_names_that_are_registered_make_both_kinds_and_are_registered_once() -> None:
-    before = dict(gymnasium.registry)
-    envs.register_plants()
-    assert dict(gymnasium.registry) == before
-    name = "staf_torch/TwoState-v0"
-    kept = gymnasium.registry.pop(name)
-    try:
-        envs.register_plants()
-        made = gymnasium.registry[name]
-        assert made.entry_point == kept.entry_point == "staf_torch.envs:PlantEnv"
-        assert made.vector_entry_point == "staf_torch.envs:PlantVectorEnv"
-        assert made.kwargs == {"plant": "TwoState"}
-    finally:
-        gymnasium.registry[name] = kept
-    assert gymnasium.registry[envs.OWN_PLANT].vector_entry_point == "staf_torch.envs:PlantVectorEnv"

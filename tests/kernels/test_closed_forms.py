@@ -114,19 +114,6 @@ def test_hyperparameters_of_an_entry_each_are_kernels_one_by_one(question: str, 
         torch.testing.assert_close(found.expand(shape), torch.stack(alone), rtol=1e-13, atol=1e-14)
 
 
-@pytest.mark.parametrize("smoothness", [1.5, 2.5])
-@pytest.mark.parametrize("distance", [0.0, 1e-9, 1e-3, 0.5])
-def test_a_matern_kernel_has_two_derivatives_everywhere(smoothness: float, distance: float) -> None:
-    kernel = st.MaternKernel(smoothness, 0.8)
-    c = torch.tensor([0.3, -0.2], dtype=torch.float64)
-    x = c + distance * torch.tensor([0.6, 0.8], dtype=torch.float64)
-    bend = torch.autograd.functional.hessian(lambda x: kernel(x[None], c[None])[0, 0], x)
-    curvature = {1.5: 3.0, 2.5: 5.0 / 3.0}[smoothness] / 0.8**2  # -phi''(0) in every direction
-    assert bool(torch.isfinite(bend).all())
-    if distance < 1e-6:
-        torch.testing.assert_close(bend, -curvature * torch.eye(2, dtype=torch.float64), rtol=1e-6, atol=1e-6)
-
-
 class Cauchy(st.Kernel):
     """A kernel of the user's, with its value alone."""
 
@@ -139,19 +126,6 @@ class Steep(Cauchy):
 
     def log_scale(self, x: Tensor, z: Tensor) -> Tensor:
         return (z * x.unsqueeze(-2)).sum(-1) + z[..., 0] ** 2
-
-
-def test_a_kernel_promises_nothing_that_it_does_not_say() -> None:
-    kernel, x = Cauchy(), uniform(3, 2)
-    z, d, b = uniform(3, 4, 2, seed=1), uniform(3, 5, 2, seed=2), uniform(3, 5, seed=3)
-    torch.testing.assert_close(kernel.core(x, z, d), kernel(x.unsqueeze(-2) + z, x.unsqueeze(-2) + d))
-    assert (kernel.state_free, kernel.scale_slope) == (False, None)
-    nothing = [kernel.gradient(z, d, b), kernel.core_gradient(x, z, d, b), kernel.log_gain(x)]
-    nothing += [kernel.log_scale(x, z), kernel.log_scale_gradient(x, z), kernel.exponent_rate()]
-    nothing += [kernel.follow(z, z), kernel.anchored_gradient(z, d, b)]  # type: ignore[list-item]
-    assert nothing == [None] * 8
-    assert kernel.polynomial_degree() is kernel.rank(3) is None
-    assert kernel.extra_repr() == ""
 
 
 def test_the_gradient_of_a_scale_is_found_where_it_is_not_told() -> None:

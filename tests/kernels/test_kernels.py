@@ -88,14 +88,6 @@ def test_factors_near_a_state_multiply_to_the_kernel(name: str) -> None:
 
 
 @over(KERNELS)
-def test_core_of_a_state_free_kernel_ignores_the_state(name: str) -> None:
-    kernel = KERNELS[name].make()
-    z, d = uniform(4, 2), uniform(3, 2)
-    if kernel.state_free:
-        assert torch.equal(kernel.core(tensor([0.3, -1.0]), z, d), kernel.core(tensor([0.0, 0.0]), z, d))
-
-
-@over(KERNELS)
 def test_exponent_rate_is_that_of_the_core(name: str) -> None:
     kernel = KERNELS[name].make()
     rate = kernel.exponent_rate()
@@ -230,24 +222,9 @@ def test_rational_quadratic_kernel_tends_to_the_gaussian() -> None:
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: st.GaussianKernel(width=-1.0), "`GaussianKernel(width=...)` must be positive; got -1.0."),
-        (lambda: st.GaussianKernel(width=0), "`GaussianKernel(width=...)` must be positive; got 0."),
-        (lambda: st.GaussianKernel(width=math.nan), "`GaussianKernel(width=...)` must be finite; got nan."),
         (lambda: st.GaussianKernel(width=tensor([1.0, 0.0])), "must be positive; got [1.0, 0.0]."),
-        (lambda: st.GaussianKernel(width="w"), "`GaussianKernel(width=...)` must be a number; got 'w'."),
         (lambda: st.GaussianKernel(width=torch.tensor([1])), "must be a floating-point tensor; got [1]."),
         (lambda: st.MaternKernel(smoothness=2.0), "(smoothness=...)` must be one of 0.5, 1.5, 2.5; got 2.0."),
-        (lambda: st.MaternKernel(length_scale=0.0), "`MaternKernel(length_scale=...)` must be positive"),
-        (lambda: st.InverseMultiquadricKernel(-1.0), "`InverseMultiquadricKernel(length_scale=...)` must be"),
-        (
-            lambda: st.RationalQuadraticKernel(alpha=0.0),
-            "`RationalQuadraticKernel(alpha=...)` must be positive",
-        ),
-        (lambda: st.RationalQuadraticKernel(length_scale=math.inf), "(length_scale=...)` must be finite"),
-        (lambda: st.PolynomialKernel(degree=0), "`PolynomialKernel(degree=...)` must be at least 1; got 0."),
-        (lambda: st.PolynomialKernel(degree=1.5), "(degree=...)` must be an integer; got 1.5."),
-        (lambda: st.PolynomialKernel(degree=True), "(degree=...)` must be an integer; got True."),
-        (lambda: st.PolynomialKernel(bias=-0.1), "(bias=...)` must not be negative; got -0.1."),
         (lambda: st.AnchoredKernel("k"), "`AnchoredKernel(kernel=...)` must be a Kernel; got str."),
         (lambda: st.AnchoredKernel(st.PolynomialKernel(2, 0.0)), "must have k(0, 0) > 0; got [0.0]"),
     ],

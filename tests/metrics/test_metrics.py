@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
-from typing import Any
 
 import pytest
 import torch
@@ -15,10 +14,9 @@ from variants import KERNELS, over
 import staf_torch as st
 from staf_torch import systems
 from staf_torch.approximation.conditioning import sup_error
-from staf_torch.centers import probe_points
 from staf_torch.engine import ChaseResult, chase_pieces
 from staf_torch.metrics import Metric
-from staf_torch.metrics.ball_error import PROBES, StateErrorPass
+from staf_torch.metrics.ball_error import StateErrorPass
 from staf_torch.metrics.chase import ChaseMetrics
 from staf_torch.numerics.linalg import condition_number
 from staf_torch.optim import SteepestDescent
@@ -88,58 +86,11 @@ def test_pieces_of_time_do_not_change_the_metrics(piece: int) -> None:
         assert found[key] == pytest.approx(number, rel=1e-9), key
 
 
-def test_settling_time_is_the_last_time_above_the_settled_excess() -> None:
-    found, result = gather(states())
-    above = result.excess[:, :40] > result.excess[:, 40:].amax(1, keepdim=True)
-    last = max(int(row.nonzero().max()) for row in above if row.any())
-    assert found["settling_time"] == pytest.approx((last + 1) * DT)
-    assert gather(states(), settle_time=0.0)[0]["settling_time"] == 0.0
-
-
-def test_a_window_after_the_end_has_nothing_to_report() -> None:
-    found, _ = gather(states(), settle_time=1e3)
-    assert found["diverged_fraction"] == 0.0
-    assert {key for key, number in found.items() if number is None} == KEYS - {"diverged_fraction"}
-
-
-def test_diverged_trajectories_are_counted_and_left_out() -> None:
-    poisoned = states()
-    poisoned[1, 60:] = torch.nan
-    found = gather(poisoned)[0]
-    basis, law = basis_of("exponential", 3), SteepestDescent()
-    metrics = ChaseMetrics(basis, Paper(), law, inner_steps=10, dt=DT, settle_time=2.0)
-    for result in chase_pieces([states()[[0, 2]]], basis, Paper(), law):
-        metrics.add(result)
-    others = metrics.summary()
-    assert found["diverged_fraction"] == pytest.approx(1 / 3)
-    for key in KEYS - {"diverged_fraction"}:
-        assert found[key] == pytest.approx(others[key], rel=1e-9), key
-
-
 def test_a_run_in_which_all_diverged_is_null_not_nan() -> None:
     found, _ = gather(torch.full_like(states(), torch.nan))
     assert found["diverged_fraction"] == 1.0
     assert all(number is None for key, number in found.items() if key != "diverged_fraction")
     json.dumps(found, allow_nan=False)
-
-
-class _Lazy(SteepestDescent):
-    """A law that promises the rate of the line search and walks a hundredth of its step."""
-
-    def step(self, objective, weights, state):  # type: ignore[no-untyped-def]
-        new, state = super().step(objective, weights, state)
-        return weights + 0.01 * (new - weights), state
-
-
-def test_a_law_that_breaks_its_promise_is_counted() -> None:
-    basis, law = basis_of("exponential", 3), _Lazy()
-    metrics = ChaseMetrics(basis, Paper(), law, inner_steps=10, dt=DT, settle_time=0.0)
-    for result in chase_pieces([states()], basis, Paper(), law):
-        metrics.add(result)
-    rate = law.contraction(condition_number(basis.gram(states())))
-    broken = int((result.excess > rate**10 * result.excess_before * (1 + 1e-9)).sum())
-    assert broken > 100
-    assert metrics.summary()["contraction_violations"] == broken
 
 
 def in_kernels(basis: st.StaFBasis, x: torch.Tensor, target: Callable[..., torch.Tensor]) -> torch.Tensor:
@@ -240,43 +191,3 @@ def test_a_number_that_is_reported_is_finite_and_the_right_way_round(larger: boo
     assert Own().from_badness(2.0) == (-2.0 if larger else 2.0)
     for lost in (math.nan, math.inf, -math.inf):
         assert Own().from_badness(lost) is None
-
-
-@pytest.mark.parametrize("lead", [(7,), (2, 4)])
-@pytest.mark.parametrize("radius", [0.4, st.StateRadius(0.5, 0.1)])
-@pytest.mark.parametrize("name", ["exponential", "gaussian", "matern52", "polynomial"])
-def test_errors_are_those_of_the_definition(name: str, radius: Any, lead: tuple[int, ...]) -> None:
-    basis, target = basis_of(name, 6, radius), Paper()
-    x = uniform(*lead, 2, low=0.3, seed=3)
-    flat = x.reshape(-1, 2)
-    weights = basis.ideal_weights(x, target)
-    off = weights * (1 + 0.1 * uniform(*lead, 6, seed=4))
-    gain, scaled = basis.kernel.log_gain(x), basis.gram_structure(x)
-    held = off if gain is None else off * gain.exp().unsqueeze(-1)
-    s = basis.kernel.log_scale(x, basis.centers.offsets(x))
-    held = held if s is None else held * s.exp()
-    found = StateErrorPass(basis, target, compile=False)(x, held, weights)
-    for row, at in enumerate(flat):
-        z = float(basis.centers.radius(at)) * probe_points(PROBES, 2)
-        sigma = basis(at + z, at)
-        chosen, best = off.reshape(-1, 6)[row], weights.reshape(-1, 6)[row]
-        exact = target(at + z)
-        parts = [part.reshape(-1)[row] for part in found]
-        torch.testing.assert_close(parts[0], (exact - sigma @ chosen).abs().max(), rtol=1e-6, atol=1e-9)
-        torch.testing.assert_close(parts[1], (exact - sigma @ best).abs().max(), rtol=1e-4, atol=1e-7)
-        y = at.clone().requires_grad_()
-        (target(y) - basis(y[None], at)[0] @ chosen).backward()
-        torch.testing.assert_close(parts[2], y.grad.norm(), rtol=1e-6, atol=1e-8)
-        torch.testing.assert_close(parts[4], best @ target(basis.centers(at)), rtol=1e-6, atol=1e-9)
-    kappa = torch.linalg.cond(scaled.scaled()).expand(lead)
-    torch.testing.assert_close(found.condition_number, kappa, rtol=1e-5, atol=0)
-
-
-def test_a_target_that_is_constant_has_no_gradient() -> None:
-    basis = basis_of("gaussian", 6, 0.3)
-    x = uniform(3, 2)
-    found = StateErrorPass(basis, lambda y: torch.ones(y.shape[:-1]).double(), compile=False)(
-        x, torch.zeros(3, 6).double(), torch.zeros(3, 6).double()
-    )
-    assert found.gradient_error.tolist() == [0.0] * 3
-    assert found.ball_error.tolist() == [1.0] * 3

@@ -197,15 +197,6 @@ def test_without_settings_every_time_counts_a_second_each() -> None:
     assert late.summary()["settling_time"] == max(int(t) + 1 for _, t in above.nonzero())
 
 
-def test_a_number_that_is_not_finite_is_none() -> None:
-    whole = result(False, ())
-    whole.estimate[0, 3] = math.inf
-    metrics = metrics_of(Law())
-    metrics.add(whole)
-    assert metrics.summary()["ultimate_error"] is None
-    assert metrics.summary()["floor_error"] is not None
-
-
 # Closed loops
 
 

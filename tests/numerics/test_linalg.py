@@ -73,29 +73,6 @@ def test_a_matrix_of_another_kind_is_refused(name: str, matrix: torch.Tensor, sa
         check("F", "q", matrix, 2)
 
 
-def test_definite_and_semidefinite_matrices_are_taken_in_double_precision() -> None:
-    singular = torch.diag(torch.tensor([0.0, 2.0]))
-    for check in (linalg.positive_definite, linalg.positive_semidefinite):
-        found = check("F", "q", torch.eye(2), 2)
-        assert found.dtype == torch.float64
-        assert torch.equal(found, torch.eye(2).double())
-    assert torch.equal(linalg.positive_semidefinite("F", "q", singular, 2), singular.double())
-    with pytest.raises(ValueError, match="must be positive definite"):
-        linalg.positive_definite("F", "q", singular, 2)
-    nearly = torch.diag(tensor([-1e-10, 100.0]))
-    assert torch.equal(linalg.positive_semidefinite("F", "q", 0.9 * nearly, 2), 0.9 * nearly)
-    with pytest.raises(ValueError, match="must be positive semidefinite"):
-        linalg.positive_semidefinite("F", "q", torch.diag(tensor([-1.2e-10, 100.0])), 2)
-    with pytest.raises(ValueError, match="must be positive semidefinite"):
-        linalg.positive_semidefinite("F", "q", torch.diag(tensor([-1.2e-10, 1e-9])), 2)
-    slightly = tensor([[1.0, 1.0 + 5e-13], [1.0, 3.0]])
-    assert torch.equal(linalg.positive_definite("F", "q", slightly, 2), slightly)
-    with pytest.raises(ValueError, match="must be symmetric"):
-        linalg.positive_definite("F", "q", tensor([[1.0, 1.0 + 2e-12], [1.0, 3.0]]), 2)
-    with pytest.raises(ValueError, match="must be symmetric"):
-        linalg.positive_definite("F", "q", tensor([[1.0, 1e-13], [0.0, 3.0]]), 2)
-
-
 @pytest.mark.parametrize(
     ("modes", "discrete", "found"),
     [
@@ -156,16 +133,6 @@ def test_a_plant_that_cannot_be_regulated_is_refused_with_its_mode(
 ) -> None:
     with pytest.raises(ValueError, match=re.escape(f"The linearisation of it at its equilibrium is {said}")):
         linalg.check_modes(*given, name="it", discrete=discrete)
-
-
-def test_a_mode_that_turns_is_named_with_both_parts_and_a_small_cost_sees_as_well_as_a_large_one() -> None:
-    with pytest.raises(ValueError, match=r"with the eigenvalue (0|-?[0-9.e-]+)[+-]1j 1/s\."):
-        linalg.check_modes(TURN, ZERO, EYE, name="it")
-    with pytest.raises(ValueError, match=r"with the eigenvalue [0-9.e-]*[+-]1j a step\."):
-        linalg.check_modes(TURN, ZERO, EYE, name="it", discrete=True)
-    unstable = torch.diag(tensor([2.0, -1.0]))
-    linalg.check_modes(unstable, B.flip(0), 1e-30 * EYE, name="it")
-    linalg.check_modes(torch.diag(tensor([0.9, -1e-9])), B, EYE, name="it", discrete=True)
 
 
 def test_a_riccati_equation_is_solved_and_its_parts_are_checked() -> None:

@@ -42,16 +42,6 @@ def test_bank_predicts_within_its_noise_and_says_so() -> None:
     assert 0.85 < float(z) < 1.25
 
 
-def test_raw_units_predict_as_standard_ones() -> None:
-    x, y = streams(150, 1)
-    plain = st.StaFRegressor(memory=128, neighbours=8).fit(x[:, 0], y[:, 0, 0])
-    raw = st.StaFRegressor(memory=128, neighbours=8).fit(1e3 * x[:, 0] - 5e4, 1e-4 * y[:, 0, 0] + 7)
-    found = (raw.predict(1e3 * x[0, 0] - 5e4) - 7) / 1e-4
-    torch.testing.assert_close(
-        found, plain.predict(x[0, 0]), rtol=0, atol=0.01
-    )  # units count before they are known
-
-
 @pytest.mark.needs_compiler
 def test_streams_have_the_same_bits_alone_and_beside_others() -> None:
     x, y = streams(150, 5)
@@ -148,23 +138,6 @@ def test_a_saved_bank_with_numbers_that_no_bank_writes_is_refused(name: str, val
     bank.definition.each(table)[1][name].view(-1)[-1:] = value
     with pytest.raises(ValueError, match=rf"load_state_dict.*must have {rule}"):
         bank.load_state_dict({"table": table})
-
-
-@pytest.mark.parametrize("name", ["counts", "units", "clock", "turn", "first", "ratio", "forgetting"])
-def test_what_is_no_tensor_is_refused(name: str) -> None:
-    x, y = streams(5, 2)
-    model = st.StaFRegressor().fit(x, y[..., 0])
-    with pytest.raises(ValueError, match=rf"load_state_dict.*must have a tensor '{name}'; got \[1.0\]"):
-        model.load_state_dict(model.state_dict() | {name: [1.0]})
-
-
-def test_a_table_in_which_every_sample_calls_itself_recent_stays_inside() -> None:
-    bank = Bank(BankShape(2, 1, 128, 8), 1, True)
-    (stream,) = bank.definition.each(bank.table)
-    stream["count"].fill_(128.0)
-    stream["order"].fill_(2.0)
-    bank.learn(torch.ones(1, 2, dtype=torch.float64), torch.ones(1, 1, dtype=torch.float64))
-    assert stream["order"].tolist() == [1.0, *[2.0] * 127]
 
 
 @pytest.mark.needs_compiler

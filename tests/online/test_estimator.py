@@ -218,24 +218,6 @@ def model_of(**given: Any) -> Any:
     return st.StaFRegressor(**given).partial_fit(tensor([0.0, 0.1]), tensor(1.0))
 
 
-def test_arguments_are_taken_at_their_edges_and_not_beyond() -> None:
-    finest = 2.0**-23  # 64 times the precision, as a variance
-    for amplitude in (1.0, 4.0):
-        model_of(noise=finest * amplitude, amplitude=amplitude)
-        with pytest.raises(
-            ValueError, match=r"noise=...\)` must be at least 1.2e-07 amplitude in torch.float64"
-        ):
-            model_of(noise=finest * amplitude * (1 - 1e-15), amplitude=amplitude)
-    model_of(forgetting=1.0, follow=0.0)
-    for name, value in (("forgetting", 1 + 1e-15), ("forgetting", -0.1), ("follow", -1e-300)):
-        with pytest.raises(ValueError, match=rf"\({name}=...\)` must (be in \(0, 1\]|not be negative)"):
-            model_of(**{name: value})
-    assert model_of(kernel="matern", count=1).centers_offsets_.shape == (1, 2)
-    model_of(**BANK)
-    with pytest.raises(ValueError, match=r"memory=...\)` must be at least 128"):
-        model_of(memory=127)
-
-
 @pytest.mark.parametrize("count", [3, 6, 10, 15, 21, 28])
 def test_counts_of_rings_are_rings_in_the_plane(count: int) -> None:
     assert torch.equal(directions(st.StaFRegressor(count=count), 2), st.rings(count))
@@ -334,18 +316,6 @@ def test_a_kernel_that_is_narrow_for_its_ball_is_told(
     assert told == ([False] * 4 if kernel == "polynomial" else [False, False, told[2], True])
 
 
-@pytest.mark.parametrize("centers", [st.rings(6), st.simplex(2), torch.zeros(1, 2).double()])
-def test_a_kernel_that_is_zero_at_its_anchor_is_looked_at_too(
-    centers: torch.Tensor, caplog: pytest.LogCaptureFixture
-) -> None:
-    """Whatever it says at the origin, where it has no variance."""
-    for width, told in ((0.8, False), (0.05, True)):
-        caplog.clear()
-        kernel = st.AnchoredKernel(st.GaussianKernel(width))
-        st.StaFRegressor(kernel, radius=0.3, centers=centers).partial_fit(tensor([0.5, 0.5]), 1.0)
-        assert bool(caplog.messages) == (told and len(centers) > 1)
-
-
 def test_bad_samples_are_named() -> None:
     model = st.StaFRegressor(Cauchy())
     with pytest.raises(ValueError, match="needs a first sample"):
@@ -361,8 +331,3 @@ def test_bad_samples_are_named() -> None:
         model.predict(uniform(3, 5))
     with pytest.raises(ValueError, match="array of numbers"):
         model.predict("no")
-
-
-@pytest.mark.parametrize("dim", [1, 2, 3, 5])
-def test_as_many_directions_as_a_quadratic_function_has_numbers_by_default(dim: int) -> None:
-    assert directions(st.StaFRegressor(), dim).shape == ((dim + 1) * (dim + 2) // 2, dim)

@@ -176,12 +176,3 @@ def test_what_was_learned_fades_to_nothing() -> None:
     mean, variance = models.predict(x[3][:, None], RATE, NOISE, JITTER)
     assert mean.abs().max() < 1e-5
     torch.testing.assert_close(variance, 1 + JITTER + NOISE)
-
-
-def test_process_whose_inverse_has_drifted_begins_anew() -> None:
-    (x, y), models = samples(10), empty(16, outputs=2)
-    learn(models, x, y)
-    models.inverse[:, 0] *= 1.5
-    learn(models, x[:9] + 5, y[:9])
-    assert models.counts[1, 0] < 10
-    assert models.counts[1, 1] == 15

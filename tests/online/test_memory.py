@@ -78,22 +78,6 @@ def test_full_memory_leaves_no_gap_behind() -> None:
     assert float((memory.query(half) - V(half)).abs().max()) < 0.02
 
 
-def test_one_model_is_kept_where_there_is_room_for_one() -> None:
-    memory = filled(st.ExperienceMemory(basis_of("gaussian", radius=0.1), 1), circle(10))
-    assert int(memory.count) == 1
-    torch.testing.assert_close(memory.states[0], circle(10)[-1])
-
-
-def test_fresher_model_takes_the_place_of_the_stale_one() -> None:
-    third, y = circle(200)[:67], circle(300)[:99]
-    memory = st.ExperienceMemory(basis_of("gaussian", radius=0.1), 20)
-    filled(memory, third, st.targets.Quadratic(3.0))
-    count = int(memory.count)
-    filled(memory, third)
-    assert int(memory.count) <= count + 2
-    assert float((memory.query(y) - V(y)).abs().max()) < 0.01
-
-
 def test_every_row_has_a_memory_of_its_own() -> None:
     basis, x = (
         basis_of("exponential", radius=0.1),
@@ -200,21 +184,6 @@ def memory_of(*places: float, capacity: int = 5, **given: float) -> st.Experienc
     for value, x in enumerate(at(*places), 1):
         memory.add(x, model(x, float(value)))
     return memory
-
-
-@pytest.mark.parametrize("reach", [1.0, 2.0, 3.5])
-def test_models_are_weighed_by_their_distance(reach: float) -> None:
-    memory = memory_of(0.0, 0.08, 0.3, reach=reach)
-    y = torch.cat((at(0.0, 0.01, 0.05, 0.0801, 0.15), tensor([[0.02, 0.06]])))
-    t = (y[:, None] - at(0.0, 0.08, 0.3)).square().sum(-1) / (reach * RADIUS) ** 2
-    weights = (1 - t).clamp(min=0.0) ** 3 / (t + 1e-4) ** 2
-    wanted = (weights * tensor([1.0, 2.0, 3.0])).sum(-1) / weights.sum(-1)
-    torch.testing.assert_close(memory.query(y), wanted, rtol=1e-9, atol=1e-9, equal_nan=True)
-    assert memory.covered(y).tolist() == (t < 1).any(-1).tolist()
-    edge = at(-reach * RADIUS * (1 - 1e-12), -reach * RADIUS * (1 + 1e-12))
-    assert memory.covered(edge).tolist() == [True, False]
-    assert memory.query(edge).isnan().tolist() == [False, True]
-    assert torch.equal(memory(y), memory.query(y)) or bool(memory.query(y).isnan().any())
 
 
 def places(memory: st.ExperienceMemory) -> list[float | None]:

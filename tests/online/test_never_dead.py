@@ -192,11 +192,3 @@ def test_time_passes_while_nothing_is_learned(memory: int | None) -> None:
             told.partial_fit(x[0], y[0], lapse=wrong)
         with pytest.raises(ValueError, match=r"fit\(time=.*finite and increasing"):
             told.fit(x[:3], y[:3], time=torch.tensor([0.0, 1.0, wrong]))
-
-
-def test_the_second_target_too_is_held_back_where_it_is_out_of_all_proportion() -> None:
-    x, _ = path(3)
-    model = st.StaFRegressor(radius=0.4, noise=0.05).partial_fit(x[0], torch.tensor(1.0).double())
-    model.partial_fit(x[1], torch.tensor(1e30).double())
-    assert int(model.n_skipped_) == 1
-    assert abs(float(model.predict(x[1]))) < 2

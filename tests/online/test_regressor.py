@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import math
-import pickle
 
 import numpy as np
 import pytest
@@ -249,26 +248,6 @@ def test_single_precision_is_close_to_double() -> None:
     single = learned(st.StaFRegressor(radius=0.3, noise=0.05), x.float(), y.float()).predict(x[-1].float())
     assert single.dtype == torch.float32
     torch.testing.assert_close(single.double(), double, rtol=0, atol=2e-3)
-
-
-def test_parameters_follow_the_conventions_of_scikit_learn() -> None:
-    model = st.StaFRegressor(st.MaternKernel(), radius=0.2, count=10)
-    again = st.StaFRegressor(**copy.deepcopy(model.get_params(deep=False)))
-    assert again.get_params(deep=False).keys() == model.get_params(deep=False).keys()
-    assert again.set_params(radius=0.4, noise=0.1) is again
-    assert (again.radius, again.noise, model.radius) == (0.4, 0.1, 0.2)
-    x, y = walks(1, 20)
-    model.partial_fit(x[0, 0], y[0, 0])
-    fitted = [name for name in vars(model) if name.endswith("_")]
-    assert {"n_features_in_", "n_streams_"} <= set(fitted)
-    assert model.n_features_in_ == 2
-    assert model.n_streams_ is None
-    model.fit(x, y)
-    assert model.n_streams_ == 1
-    expected = learned(st.StaFRegressor(st.MaternKernel(), radius=0.2, count=10), x, y)
-    torch.testing.assert_close(model.predict(x[-1]), expected.predict(x[-1]), rtol=0, atol=0)
-    torch.testing.assert_close(pickle.loads(pickle.dumps(model)).predict(x[-1]), model.predict(x[-1]))
-    assert "radius=0.2" in repr(model)
 
 
 def test_arrays_give_arrays_and_every_point_of_a_stream_can_be_asked_for() -> None:

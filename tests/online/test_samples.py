@@ -164,16 +164,6 @@ def test_times_that_do_not_increase_are_refused(time: list[Any]) -> None:
         lapses(time, shapes(4, 3, 2))
 
 
-@pytest.mark.parametrize(("lapse", "wanted"), [(0, 0.0), (2.5, 2.5), ([0.5], 0.5), (torch.tensor(3), 3.0)])
-def test_one_lapse_is_that_of_every_stream(lapse: Any, wanted: float) -> None:
-    for streams in (1, 3):
-        found = lapse_of(lapse, streams)
-        assert found.tolist() == [wanted] * streams
-        assert found.dtype == torch.float64
-        assert found.is_contiguous()
-    assert lapse_of([0.0, 1.0, 2.0], 3).tolist() == [0.0, 1.0, 2.0]
-
-
 @pytest.mark.parametrize(
     "lapse", [-0.5, [0.0, -1e-9, 1.0], torch.inf, [1.0, torch.nan, 1.0], [1.0, 2.0], [[1.0]], [1.0] * 4]
 )

@@ -133,31 +133,6 @@ def pretend(monkeypatch: pytest.MonkeyPatch, name: str, **names: Any) -> None:
     monkeypatch.setitem(sys.modules, name, module)
 
 
-class Tag:
-    """Of scikit-learn, whatever it is: what it was made with."""
-
-    def __init__(self, **given: Any) -> None:
-        self.given = given
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Tag) and other.given == self.given
-
-    __hash__ = None  # type: ignore[assignment]
-
-
-def test_tags_say_that_several_targets_gaps_and_streams_are_taken(monkeypatch: pytest.MonkeyPatch) -> None:
-    names = ("InputTags", "RegressorTags", "Tags", "TargetTags")
-    pretend(monkeypatch, "sklearn")
-    pretend(monkeypatch, "sklearn.utils", **dict.fromkeys(names, Tag))
-    assert st.StaFRegressor().__sklearn_tags__() == Tag(
-        estimator_type="regressor",
-        target_tags=Tag(required=True, multi_output=True, single_output=True),
-        regressor_tags=Tag(poor_score=True),  # of one that meets a shuffled table
-        input_tags=Tag(two_d_array=True, three_d_array=True, allow_nan=True),
-        non_deterministic=False,
-    )
-
-
 def test_a_regressor_without_a_sample_says_so_as_scikit_learn_does_where_that_is(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

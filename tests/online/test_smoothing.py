@@ -8,7 +8,6 @@ from helpers import tensor, uniform
 from torch import Tensor
 
 import staf_torch as st
-from staf_torch.online.kalman_filter import LocalFilter, StreamState
 from staf_torch.online.local_functions import LocalFunctions
 
 RADIUS, NOISE = 0.4, 0.2
@@ -119,64 +118,3 @@ def test_streams_outputs_units_and_times_are_smoothed_as_alone() -> None:
         torch.testing.assert_close(torch.from_numpy(mean[:, i]), alone, rtol=1e-9, atol=1e-9)
     with pytest.raises(ValueError, match=r"memory.*must be None to smooth"):
         st.StaFRegressor(memory=128).smooth(x, y)
-
-
-def joint(law: LocalFilter, x: Tensor, y: Tensor, lapse: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean and variance of V at every x (T, n) from all y (T,): the weights of all times as one Gaussian.
-
-    From one time to the next u' = A u + w, where A moves the centers, and the covariance of w is what is then
-    left of the filter's own I - lambda^lapse T D T'.
-    """
-    count, eye = len(law.functions.offsets), torch.eye(len(law.functions.offsets), dtype=torch.float64)
-    state = StreamState.empty(torch.zeros(0).double(), 1, x.shape[1], count, 1)
-    moves, rows, rest = [], [], []
-    last = eye  # covariance of the weights a time before, from what was seen until then
-    joined = torch.zeros(0, 0, dtype=torch.float64)
-    for k in range(len(x)):
-        old, known = state.anchor.clone(), state.learned[..., 0].clone()
-        law.learn(state, x[k : k + 1], y[k : k + 1, None], lapse[k : k + 1])
-        transfer, scaled = eye, eye
-        if not bool(old.isnan().any()) and not torch.equal(old, state.anchor):
-            move, factor = law.functions.transfer(old, state.anchor - old)
-            transfer = move[..., 0]
-            scaled = transfer if factor is None else transfer * factor
-        predicted = eye - law.forgetting ** lapse[k] * transfer @ known @ transfer.mT
-        z = x[k, :, None] - state.anchor
-        local = law.functions.local(state.anchor, z)
-        by = torch.ones(1).double() if local.log_factor is None else local.log_factor.exp()
-        psi = local.psi[:, 0]
-        left = law.functions.prior(state.anchor, z) - psi.square().sum()
-        moves.append((scaled, predicted - scaled @ last @ scaled.mT))
-        rows.append(by * psi)
-        rest.append(by.square() * left)
-        last = eye - state.learned[..., 0]
-    for k, (scaled, noise) in enumerate(moves):
-        cross = scaled @ joined[-count:] if k else joined.new_zeros(count, 0)
-        own = cross[:, -count:] @ scaled.mT + noise if k else eye
-        joined = torch.cat((torch.cat((joined, cross.mT), 1), torch.cat((cross, own), 1)))
-    design = torch.block_diag(*rows)
-    covariance = design @ joined @ design.mT
-    seen = ~y.isnan()
-    others = torch.diag(torch.cat(rest) + law.ratio)[seen][:, seen]
-    gain = torch.linalg.solve(covariance[seen][:, seen] + others, covariance[seen]).mT
-    variance = covariance.diagonal() - (gain * covariance[:, seen]).sum(1) + torch.cat(rest)
-    return gain @ y[seen], variance
-
-
-@pytest.mark.parametrize("dim", [1, 2])
-@pytest.mark.parametrize("kernel", [st.ExponentialKernel(), st.MaternKernel(2.5, 0.9)])
-def test_smoothing_is_conditioning_with_any_kernel_forgetting_times_and_amplitude(
-    kernel: st.Kernel, dim: int
-) -> None:
-    x, y = 0.5 * path(9)[:, :dim].contiguous(), uniform(9, seed=3)
-    y[[3, 6]] = torch.nan
-    time = tensor([0.0, 0.5, 1.0, 3.0, 3.5, 4.0, 6.0, 7.0, 7.25])
-    model = st.StaFRegressor(kernel, RADIUS, 3, noise=0.6, amplitude=2.0, forgetting=0.7, follow=0.5)
-    found = model.smooth(x, y, time)
-    lapse = torch.cat((tensor([1.0]), time.diff()))
-    offsets = RADIUS * (st.rings(3) if dim == 2 else st.ball(3, 1))
-    functions = LocalFunctions.of(kernel, offsets)
-    law = LocalFilter(functions, tensor([0.09]), tensor([0.7]), 0.5 * RADIUS, base=4.0)
-    mean, variance = joint(law, x, y, lapse)
-    torch.testing.assert_close(found[0], mean, rtol=1e-6, atol=1e-7)
-    torch.testing.assert_close(found[1].square(), 4.0 * variance, rtol=1e-5, atol=1e-7)

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import math
 import pickle
 
-import numpy as np
 import pytest
 import torch
 from helpers import tensor
 from torch import Tensor
 
 import staf_torch as st
-from staf_torch.online.filter_streams import total, units_of
 
 
 def drawn(width: Tensor, noise: float, steps: int = 220, seed: int = 0) -> tuple[Tensor, Tensor]:
@@ -183,73 +180,6 @@ def test_units_are_those_of_what_was_measured_of_each_coordinate() -> None:
     assert (
         int(never.n_samples_seen_) == 0
     )  # as without scaling: a coordinate is held, and there is nothing to hold
-
-
-def test_units_grow_with_a_coordinate_that_is_measured_every_second_time() -> None:
-    path, _ = drawn(torch.tensor([0.9, 0.9]).double(), 0.1, steps=400)
-    x = path.clone()
-    x[:120, 1] *= 0.01
-    x[::2, 1] = torch.nan
-    y = (2 * path).sin().sum(-1)
-    model = st.StaFRegressor(scaling=True)
-    for k in range(120):
-        model.partial_fit(x[k], y[k])
-    before = float(model.state_dict()["units"][0, 4])
-    for k in range(120, 400):
-        model.partial_fit(x[k], y[k])
-    assert float(model.state_dict()["units"][0, 4]) > 10 * before
-
-
-NAN, INF = math.nan, math.inf
-
-
-def numpy_units(columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and deviation of what is no further than 30 median deviations from the median."""
-    found = []
-    for column in columns.T:
-        seen = np.sort(column[~np.isnan(column)])
-        if not len(seen):
-            found.append((0.0, 1.0))
-            continue
-        away = np.abs(seen - seen[(len(seen) - 1) // 2])
-        typical = np.sort(away)[(len(away) - 1) // 2]
-        kept = seen[away <= 30 * typical] if typical else seen
-        mean, most = kept.mean(), np.abs(kept - kept.mean()).max() or 1.0
-        spread = most * np.sqrt(np.square((kept - mean) / most).mean())
-        found.append((mean, spread if spread > 1e-12 * abs(mean) else 1.0))
-    center, spread = zip(*found, strict=True)
-    return np.array(center), np.array(spread)
-
-
-def test_units_are_mean_and_deviation_of_what_is_usual() -> None:
-    draw = np.random.default_rng(0)
-    columns = {
-        "usual": 3 + 2 * draw.standard_normal(9),
-        "holes": np.where(np.arange(9) % 3 == 0, NAN, draw.standard_normal(9)),
-        "none": np.full(9, NAN),
-        "one": np.array([NAN] * 8 + [7.0]),
-        "constant": np.full(9, 1e9),
-        "zeros": np.zeros(9),
-        "two values": np.array([4.0] * 5 + [5.0] * 4),
-        "an outlier": np.array([*draw.uniform(-1, 1, 8), 1e6]),
-        "at the edge": np.array([-1.0, -1.0, -1.0, 0.0, 0.0, 0.0, 1.0, 1.0, 30.0]),
-        "beyond the edge": np.array([-1.0, -1.0, -1.0, 0.0, 0.0, 0.0, 1.0, 1.0, 30.001]),
-        "mostly the same": np.array([2.0] * 8 + [90.0]),
-        "huge": 1e300 * draw.standard_normal(9),
-        "tiny": 1e-300 * draw.standard_normal(9),
-        "hardly": 1e6 + 1.5e-6 * np.array([1, -1, 1, -1, 1, -1, 1, -1, 0.5]),
-        "too little": 1e6 + 0.5e-6 * np.array([1, -1, 1, -1, 1, -1, 1, -1, 0.5]),
-    }
-    for name, column in columns.items():
-        center, spread = units_of(torch.from_numpy(column)[:, None])
-        wanted = numpy_units(column[:, None])
-        np.testing.assert_allclose((center.numpy(), spread.numpy()), wanted, rtol=1e-6, err_msg=name)
-    whole = torch.from_numpy(np.stack(list(columns.values()), 1))
-    for together, alone in zip(
-        units_of(whole), zip(*map(units_of, whole.split(1, 1)), strict=True), strict=True
-    ):
-        assert torch.equal(together, torch.cat(alone))  # bits do not depend on what stands beside
-    torch.testing.assert_close(total(whole[:, :1]), whole[:, 0].sum()[None])
 
 
 @pytest.mark.parametrize("at", [5, 10, 40])

@@ -111,12 +111,6 @@ def test_jacobi_takes_one_iteration_on_a_diagonal_gram_matrix() -> None:
     torch.testing.assert_close(path[1], 1 / diagonal)
 
 
-def test_steepest_descent_meets_kantorovich_with_equality_in_the_worst_case() -> None:
-    objective = NativeError(torch.diag(torch.tensor([1.0, 50.0]).double()), torch.tensor([1.0, 1.0]).double())
-    excess = excess_path(optim.SteepestDescent(), objective, 5)
-    torch.testing.assert_close(excess[1:] / excess[:-1], torch.full((5,), (49 / 51) ** 2).double())
-
-
 @pytest.mark.parametrize(("name", "power"), [("heavy ball", 2), ("nesterov", 1)])
 def test_momentum_converges_at_its_rate(name: str, power: int) -> None:
     excess = excess_path(LAWS[name], quadratic(condition=400.0), 300)
@@ -205,12 +199,6 @@ def test_normalised_lms_projects_onto_the_weights_that_reproduce_the_sample() ->
     torch.testing.assert_close(along, along[:, :1].expand_as(along))
 
 
-def test_normalised_lms_says_what_it_misses() -> None:
-    bare = changed(quadratic(), precomputed=Precomputed())
-    with pytest.raises(ValueError, match="`row` and `sampled`"):
-        iterate(optim.NormalisedLMS(), bare, torch.zeros(5, 4).double(), 1)
-
-
 @pytest.mark.parametrize("name", LAWS)
 def test_weights_that_are_ideal_stay_finite_and_stay(name: str) -> None:
     objective = quadratic()
@@ -255,12 +243,6 @@ def test_a_setting_that_would_diverge_is_refused(make: object) -> None:
     assert callable(make)
     with pytest.raises(ValueError, match=r"`.*`"):
         make()
-
-
-@pytest.mark.parametrize("given", [(1.0, None), (None, 0.5)])
-def test_heavy_ball_has_both_numbers_or_finds_both(given: tuple[float | None, float | None]) -> None:
-    with pytest.raises(ValueError, match="must be given with `step` or not at all"):
-        optim.HeavyBall(*given)
 
 
 @pytest.mark.parametrize("momentum", [0.0, 0.5, 0.9])

@@ -66,18 +66,6 @@ def test_it_works_beside_adam_on_the_other_parameters() -> None:
     assert bool((other < 1).all())
 
 
-def test_a_loss_of_several_parameters_moves_each_and_skips_what_it_does_not_use() -> None:
-    first, second = quadratic(seed=1), quadratic(seed=2)
-    a, b, unused, frozen = (nn.Parameter(torch.zeros(5, 4, dtype=torch.float64)) for _ in range(4))
-    frozen.requires_grad_(False)
-    optimizer = optim.ChaseOptimizer([a, b, unused, frozen], optim.Exact())
-    optimizer.step(lambda: losses(first, a).sum() + losses(second, b).sum())
-    torch.testing.assert_close(a.detach(), first.minimiser())
-    torch.testing.assert_close(b.detach(), second.minimiser())
-    assert not bool(unused.any())
-    assert not bool(frozen.any())
-
-
 @pytest.mark.parametrize(
     "name", ["heavy ball", "recursive least squares", "barzilai-borwein", "steepest descent"]
 )
@@ -117,16 +105,6 @@ def test_a_scheduler_drives_the_step_size() -> None:
         scheduler.step()
         weights, _ = optim.FixedStep(size).step(objective, weights, ())
         torch.testing.assert_close(parameter.detach(), weights)
-
-
-def test_a_rate_of_zero_stands_still_and_a_law_without_a_step_size_has_no_rate() -> None:
-    objective = quadratic()
-    parameter = nn.Parameter(torch.zeros(5, 4, dtype=torch.float64))
-    optimizer = optim.ChaseOptimizer([parameter], optim.Nesterov())
-    optimizer.param_groups[0]["lr"] = 0.0
-    optimizer.step(lambda: losses(objective, parameter))
-    assert not bool(parameter.any())
-    assert "lr" not in optim.ChaseOptimizer([parameter], optim.HeavyBall()).param_groups[0]
 
 
 def test_groups_have_their_own_number_of_iterations() -> None:
@@ -205,17 +183,20 @@ def test_a_loss_has_the_matrix_and_the_vector_of_its_quadratic() -> None:
         found.sample()
 
 
-def test_a_loss_that_is_linear_has_no_curvature() -> None:
-    found, parameter = made(uniform(4, 3, seed=5), -2 * VALUES)
-    assert found.curvature(parameter.detach()).tolist() == [[0.0] * 3] * 4
-    torch.testing.assert_close(found.values, VALUES)
-    other = nn.Parameter(uniform(4, 3, seed=6))
-    apart = LossObjective(parameter, (other.square() - other.detach().square()) - 2 * VALUES)  # of another's
-    assert apart.curvature(parameter.detach()).tolist() == [[0.0] * 3] * 4
-
-
 @pytest.mark.parametrize("size", [(), (3,)])
 def test_parameters_are_rows_of_floating_point_numbers(size: tuple[int, ...]) -> None:
     whole = torch.ones(size, dtype=torch.int64 if size else torch.float64)
     with pytest.raises(ValueError, match=r"must be floating-point tensors \(..., M\); got the shape"):
         ChaseOptimizer([whole], optim.SteepestDescent())
+
+
+def test_a_loss_of_several_parameters_moves_each_and_skips_what_it_does_not_use() -> None:
+    first, second = quadratic(seed=1), quadratic(seed=2)
+    a, b, unused, frozen = (nn.Parameter(torch.zeros(5, 4, dtype=torch.float64)) for _ in range(4))
+    frozen.requires_grad_(False)
+    optimizer = optim.ChaseOptimizer([a, b, unused, frozen], optim.Exact())
+    optimizer.step(lambda: losses(first, a).sum() + losses(second, b).sum())
+    torch.testing.assert_close(a.detach(), first.minimiser())
+    torch.testing.assert_close(b.detach(), second.minimiser())
+    assert not bool(unused.any())
+    assert not bool(frozen.any())

@@ -60,13 +60,6 @@ def test_known_optimal_value_solves_the_hjb_equation(name: str) -> None:
     assert residual.abs().max() < 1e-11
 
 
-def test_known_optimal_value_scales_with_the_cost() -> None:
-    plant, cost = systems.TwoState(), adp.QuadraticCost(10.0, 10.0, 2, 1)
-    residual = adp.hjb_residual(plant, cost, lambda x: plant.optimal_value(x, cost.q, cost.r), states(2))
-    assert residual.abs().max() < 1e-11
-    assert plant.optimal_value(states(2), 10 * cost.q, cost.r) is None
-
-
 def test_printed_plant_does_not_solve_the_hjb_equation_and_is_stable_without_control() -> None:
     printed, right = systems.TwoState(as_printed=True), systems.TwoState()
     cost = unit_cost(right)
@@ -88,24 +81,6 @@ def test_uncontrollable_unstable_mode_is_named() -> None:
 def test_uncontrollable_stable_mode_is_no_obstacle() -> None:
     plant = systems.Linear([[1.5, 0.0], [0.0, -1.0]], [[1.0], [0.0]])
     assert torch.isfinite(adp.LQR(plant, unit_cost(plant)).k).all()
-
-
-@pytest.mark.parametrize(
-    ("q", "rule"),
-    [
-        (-1.0, "must be positive"),
-        ([[1.0, 0.0], [0.0, -1.0]], "must be positive (semi)?definite"),
-        ([[1.0, 0.5], [0.0, 1.0]], "must be symmetric"),
-        (torch.eye(3, dtype=torch.float64), r"must be \(2, 2\)"),
-        ([[1.0, float("nan")], [0.0, 1.0]], "must be finite"),
-    ],
-)
-def test_bad_cost_matrix_is_refused_by_name(q: object, rule: str) -> None:
-    with pytest.raises(ValueError, match=rf"`QuadraticCost\(state=...\)` {rule}"):
-        adp.QuadraticCost(q, 1.0, 2, 1)
-    if not isinstance(q, Tensor):
-        with pytest.raises(ValueError, match=rf"`QuadraticCost\(control=...\)` {rule}"):
-            adp.QuadraticCost(torch.eye(2, dtype=torch.float64), q, 2, 2)
 
 
 def test_plant_that_does_not_rest_at_the_origin_is_refused() -> None:
@@ -140,25 +115,6 @@ def test_plant_in_discrete_time_steps_with_its_period() -> None:
     f, g = plant.linearisation()
     torch.testing.assert_close(f, torch.tensor([[0.9, 0.0], [0.0, 1.0]]).double())
     assert g.tolist() == [[1.0], [0.0]]
-
-
-def test_clock_is_apart_in_the_linearisation() -> None:
-    plant = systems.Clocked(inner := systems.Pendulum())
-    at = torch.tensor([0.2, 0.0]).double()
-    f, g = plant.linearisation(plant.at(at), torch.zeros(1).double())
-    torch.testing.assert_close(f[:2, :2], inner.linearisation(at, torch.zeros(1).double()).matrix)
-    assert not f[2].any()
-    assert not f[:, 2].any()
-    assert g[2].tolist() == [0.0]
-
-
-def test_plant_without_a_size_is_refused() -> None:
-    class Any(systems.ControlAffineSystem):
-        def drift(self, x: torch.Tensor) -> torch.Tensor:
-            return -x
-
-    with pytest.raises(ValueError, match=r"`Clocked\(plant=...\)` must say its `dim`"):
-        systems.Clocked(Any())
 
 
 def test_a_step_takes_any_leading_dimensions() -> None:

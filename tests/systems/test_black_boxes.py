@@ -13,7 +13,7 @@ from torch import Tensor
 
 from staf_torch import systems
 from staf_torch.systems.black_box import BlackBox
-from staf_torch.systems.equilibria import check_rest, find_equilibrium, resting_input_at
+from staf_torch.systems.equilibria import find_equilibrium, resting_input_at
 
 A, B = np.array([[0.9, 0.2], [-0.1, 0.8]]), np.array([[0.3], [0.5]])
 ZERO, NONE = torch.zeros(2).double(), torch.zeros(1).double()
@@ -98,25 +98,6 @@ def test_a_kink_of_a_twentieth_of_the_largest_slope_is_one(bend: float, smooth: 
             box.linearisation(at, NONE)
 
 
-def test_a_feedback_is_followed_by_a_call_a_step_or_by_what_the_function_offers() -> None:
-    asked = Asked()
-    box = BlackBox("T", asked, ZERO, NONE)
-    asked.calls.clear()
-    x0 = uniform(3, 2, seed=5).numpy()
-    states, controls = box.follow(x0, lambda x: -x[:, :1], 4)
-    assert (states.shape, controls.shape, len(asked.calls)) == ((3, 5, 2), (3, 4, 1), 4)
-    np.testing.assert_array_equal(states[:, 0], x0)
-    np.testing.assert_array_equal(controls, -states[:, :4, :1])
-    for k in range(4):
-        np.testing.assert_allclose(states[:, k + 1], linear(states[:, k], controls[:, k]))
-
-    class Whole(Asked):
-        def follow_feedback(self, x: Any, feedback: Any, steps: int) -> Any:
-            return ("whole", steps)
-
-    assert BlackBox("T", Whole(), ZERO, NONE).follow(x0, lambda x: x, 7) == ("whole", 7)
-
-
 @pytest.mark.parametrize(
     ("function", "message"),
     [
@@ -151,18 +132,6 @@ class Moving(systems.Plant):
 
     def linearisation(self, x: Tensor | None = None, u: Tensor | None = None) -> systems.Linearisation:
         raise NotImplementedError
-
-
-@pytest.mark.parametrize(("slope", "gain"), [(3.0, 0.5), (0.5, 7.0), (1e-5, 1e-6)])
-def test_a_plant_rests_that_moves_by_a_millionth_of_its_rate(slope: float, gain: float) -> None:
-    """Of a thousandth at least."""
-    scale, one = max(slope, gain, 1e-3), torch.zeros(1).double()
-    for sign in (1, -1):
-        check_rest(Moving(slope, gain, sign * 0.99e-6 * scale), one, one)
-        with pytest.raises(
-            ValueError, match=r"Moving does not rest at the state \[0.0\] under the input \[0"
-        ):
-            check_rest(Moving(slope, gain, sign * 1.01e-6 * scale), one, one)
 
 
 class Cubic(Moving):
@@ -203,19 +172,6 @@ def test_a_rest_is_searched_by_the_input_alone_and_then_by_both() -> None:
     said = "Never has no equilibrium near the guess, the state [0.0, 0.0] and the input [1.0]: state 1 keeps"
     with pytest.raises(ValueError, match=re.escape(said) + " moving, by 2.5"):
         find_equilibrium(Never(0, 0, 0, dim=2), torch.zeros(2).double(), torch.ones(1).double())
-
-
-@pytest.mark.parametrize(("apart", "rests"), [(0.9e-5, True), (1.1e-5, False)])
-def test_what_moves_by_a_millionth_of_its_rate_is_a_rest_that_is_found(apart: float, rests: bool) -> None:
-    """Two coordinates that one input holds together, but for what they are apart."""
-
-    class Apart(Moving):
-        def motion(self, x: Tensor, u: Tensor) -> Tensor:
-            return 10 * (x + u) + apart * tensor([1.0, -1.0])
-
-    guess = torch.zeros(2).double()
-    x, _ = find_equilibrium(Apart(0, 0, 0, dim=2), guess, tensor([1.0]))
-    assert torch.equal(x, guess) is rests
 
 
 # --- plants of functions ------------------------------------------------------------------------------------
@@ -264,15 +220,6 @@ def moved(x: Any, u: Any) -> Any:
     return np.concatenate((x[:, 1:], u), axis=1)
 
 
-def test_a_function_that_cuts_its_graph_is_no_function_in_torch() -> None:
-    def cut(x: Any, u: Any) -> Any:
-        after = 0.9 * torch.as_tensor(x) + torch.as_tensor(u)
-        return after.detach() if isinstance(x, Tensor) else after.numpy()
-
-    assert BlackBox("Test(step=...)", cut, ZERO, NONE).torch is False
-    assert BlackBox("Test(step=...)", lambda x, u: 0.9 * x + u, ZERO, NONE).torch is True
-
-
 KINDS: dict[str, Any] = {
     "float32": lambda found: found.astype(np.float32),
     "objects": lambda found: found.astype(object),
@@ -295,18 +242,3 @@ def test_what_a_function_returns_becomes_numbers_of_the_state(kind: str) -> None
     assert states.dtype == np.float64
     assert states[0].tolist() == [[0.5, 0.25], [0.25, 0.25], [0.25, 0.125], [0.125, 0.125]]
     assert controls[0].tolist() == [[0.25], [0.125], [0.125]]
-
-
-@pytest.mark.parametrize("kind", [systems.StepPlant, systems.RatePlant])
-def test_a_plant_rests_in_double_precision_and_every_coordinate_may_be_an_angle(kind: Any) -> None:
-    more = {"dt": 0.1} if kind is systems.StepPlant else {}
-    plant = kind(lambda x, u: 0.5 * x + u, dim=1, inputs=1, periodic=[0, -1], **more)
-    assert plant.periodic == (0,)
-    for part in (plant.equilibrium(), plant.resting_input()):
-        assert part.dtype == torch.float64
-    exact = kind(lambda x, u: 0 * x + x.detach() + u - 0.1, dim=1, inputs=1, equilibrium=[0.1], **more)
-    wanted = 0.1 if kind is systems.StepPlant else 0.0
-    assert float(exact.equilibrium()) == 0.1
-    assert float(exact.resting_input()) == pytest.approx(wanted, abs=1e-12)
-    with pytest.raises(ValueError, match="periodic"):
-        kind(lambda x, u: 0.5 * x + u, dim=1, inputs=1, periodic=[1], **more)

@@ -135,7 +135,6 @@ def test_bad_arguments_of_the_domain_are_named(wrong: dict[str, object]) -> None
         theory.disc(**wrong)  # type: ignore[arg-type]
 
 
-LINE = tensor([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.5, 0.0]])
 STATES = tensor([[1.0, 0.0], [0.3, -0.9], [-1.2, 0.4], [0.2, 0.1], [0.0, 0.8], [-0.5, -0.5], [0.9, 0.9]])
 
 
@@ -167,43 +166,7 @@ def test_the_best_layout_that_fails_is_named_and_none_that_has_no_error() -> Non
     assert float(said[1]) == pytest.approx(float(errors[1]), rel=1e-2)
 
 
-def test_what_names_no_layout_is_refused() -> None:
-    for call in (theory.layout_errors, theory.minimal_count):
-        given = (Paper(), st.GaussianKernel(), STATES, 0.1)
-        more = (1e-2, []) if call is theory.minimal_count else ([],)
-        with pytest.raises(ValueError, match=rf"`{call.__name__}\(layouts=...\)` must name at least one"):
-            call(*given, *more)  # type: ignore[operator]
-    with pytest.raises(ValueError, match=r"`layout_errors\(layouts=...\)` must have 2 entries"):
-        theory.layout_errors(Paper(), st.GaussianKernel(), STATES, 0.1, [st.ball(3, 3)])
-    with pytest.raises(ValueError, match=r"`layout_errors\(states=...\)` must be a floating-point"):
-        theory.layout_errors(Paper(), st.GaussianKernel(), STATES.long(), 0.1, [st.rings(3)])
-    with pytest.raises(ValueError, match=r"`minimal_count\(states=...\)` must be a floating-point"):
-        theory.minimal_count(Paper(), st.GaussianKernel(), STATES.long(), 0.1, 0.1)
-
-
 # --- the power function -------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    "kernel", [st.ExponentialKernel(), st.GaussianKernel(0.8)], ids=["exponential", "gaussian"]
-)
-@pytest.mark.parametrize("layout", [LINE, LINE[:3], st.rings(6)], ids=["line", "short line", "rings"])
-@pytest.mark.parametrize("x", [tensor([0.3, -0.4]), STATES[:3], STATES[:6].view(2, 3, 2)])
-def test_the_power_function_is_that_of_its_formula_where_nothing_cancels(
-    kernel: st.Kernel, layout: Tensor, x: Tensor
-) -> None:
-    basis = st.StaFBasis(kernel, st.StateFollowingCenters(layout, 0.9))
-    z = 0.9 * tensor([[0.1, 0.9], [0.7, -0.6], [-0.3, -0.5], [0.2, 0.3]]).expand(*x.shape[:-1], 4, 2)
-    y, c = x.unsqueeze(-2) + z, basis.centers(x)
-    across, gram = kernel(y, c), kernel(c, c)
-    own = kernel(y.unsqueeze(-2), y.unsqueeze(-2)).squeeze(-1).squeeze(-1)
-    left = own - (across * torch.linalg.solve(gram, across.mT).mT).sum(-1)
-    found = power_function(basis, x, z)
-    assert found.shape == (*x.shape[:-1], 4)
-    torch.testing.assert_close(found, left.sqrt(), rtol=1e-4, atol=0)
-    torch.testing.assert_close(
-        power_function(basis, x, z, relative=True), (left / own).sqrt(), rtol=1e-4, atol=0
-    )
 
 
 def test_centers_in_one_point_have_their_limit() -> None:
@@ -217,18 +180,6 @@ def test_centers_in_one_point_have_their_limit() -> None:
     assert both[0].tolist() == [0.0, 0.0]
     torch.testing.assert_close(both[1], power_function(basis, x[1], z))
     assert float(both[1, 1]) > 0
-
-
-@pytest.mark.parametrize("kernel", [st.ExponentialKernel(), st.MaternKernel(2.5)], ids=["smooth", "matern"])
-def test_states_and_points_of_the_power_function_are_of_the_dimension_of_the_basis(kernel: st.Kernel) -> None:
-    basis = st.StaFBasis(kernel, st.StateFollowingCenters(st.rings(3), 0.5))
-    two, three = torch.zeros(1, 2).double(), torch.zeros(1, 3).double()
-    with pytest.raises(ValueError, match=r"`power_function\(x=...\)` must have 2 entries"):
-        power_function(basis, three, two)
-    with pytest.raises(ValueError, match=r"`power_function\(z=...\)` must have 2 entries"):
-        power_function(basis, two, three)
-    with pytest.raises(ValueError, match=r"`power_function\(z=...\)` must have at least 2 dimensions"):
-        power_function(basis, two, two[0])
 
 
 POWER_LAYOUTS = {

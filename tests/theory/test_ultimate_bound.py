@@ -62,7 +62,6 @@ def test_a_step_for_no_excess_and_velocities_of_another_shape_are_refused() -> N
 
 STATES = tensor([[1.0, 0.2], [0.4, -0.9], [-0.7, 0.5], [0.1, 0.3], [1.2, -0.2], [-0.3, -0.6]])
 SPIN, FALL = systems.Oscillator().drift(STATES), -0.5 * STATES
-EXACT = optim.Exact()
 
 
 def by_differences(basis: st.StaFBasis, x: Tensor, v: Tensor) -> tuple[float, float, float]:
@@ -116,8 +115,6 @@ def test_states_whose_matrix_is_singular_are_refused(
         theory.drift_constants(basis, Paper(), x, torch.ones_like(x))
 
 
-NONE = DriftConstants(condition_number=30.0, speed=0.0, growth=0.0)
-STILL = DriftConstants(condition_number=30.0, speed=0.0, growth=0.7)
 FLAT = DriftConstants(condition_number=30.0, speed=2.0, growth=0.0)
 SLOW = DriftConstants(condition_number=30.0, speed=2.0, growth=1e-3)
 MOVING = DriftConstants(condition_number=30.0, speed=2.0, growth=0.7)
@@ -141,18 +138,6 @@ def test_the_largest_step_is_as_large_as_the_bound_allows(
         assert (bound.before if before else bound.after) == pytest.approx(excess, rel=1e-8)
 
 
-def test_without_a_way_any_step_will_do_that_the_growth_of_the_norm_allows() -> None:
-    law = optim.SteepestDescent()
-    for before in (False, True):
-        assert theory.step_for_bound(NONE, law, excess=0.5, inner_steps=3, before=before) == math.inf
-        dt = theory.step_for_bound(STILL, law, excess=0.5, inner_steps=3, before=before)
-        assert (29 / 31) ** 3 * math.exp(0.7 * dt) == pytest.approx(1.0)
-    assert theory.step_for_bound(STILL, EXACT, excess=0.5, inner_steps=3) == math.inf
-    assert theory.step_for_bound(MOVING, EXACT, excess=0.5, inner_steps=1) == math.inf
-    dt = theory.step_for_bound(FLAT, EXACT, excess=0.5, inner_steps=1, before=True)
-    assert dt == pytest.approx(math.sqrt(0.5) / 2.0)
-
-
 def test_where_nothing_contracts_nothing_is_promised() -> None:
     law = optim.SteepestDescent()
     assert ultimate_bound(STEEP, law, dt=0.1, inner_steps=3) == (math.inf, math.inf)
@@ -162,43 +147,6 @@ def test_where_nothing_contracts_nothing_is_promised() -> None:
     growing = DriftConstants(condition_number=30.0, speed=1.0, growth=-2 * math.log(29 / 31))
     assert ultimate_bound(growing, law, dt=1.01, inner_steps=2) == (math.inf, math.inf)
     assert math.isfinite(ultimate_bound(growing, law, dt=0.99, inner_steps=2).before)
-
-
-def test_a_growth_past_the_largest_number_is_promised_nothing() -> None:
-    """Of the exact solution, which contracts any growth, as far as the growth is a number."""
-    for growth, after, steps in ((300.0, 0.0, 1), (700.0, 0.0, 1), (700.5, math.inf, None)):
-        for dt in (1.0, 0.5):
-            constants = DriftConstants(30.0, 1.0, growth / dt)
-            found = ultimate_bound(constants, EXACT, dt=dt, inner_steps=1)
-            assert found.after == after
-            assert found.before > 1e200
-            assert theory.steps_for_bound(constants, EXACT, excess=0.1, dt=dt) == steps
-    assert ultimate_bound(DriftConstants(30.0, 1.0, 700.0), EXACT, dt=1.0, inner_steps=1).before == math.inf
-
-
-def test_a_way_as_long_as_the_radius_leaves_no_iterations_before_the_correction() -> None:
-    law = optim.SteepestDescent()
-    for excess, dt in ((1.0, 0.5), (0.25, 0.5), (1.0, 0.6)):
-        assert theory.steps_for_bound(FLAT, law, excess=excess, dt=dt, before=True) is None
-    assert theory.steps_for_bound(FLAT, law, excess=1.0, dt=0.5) is not None
-    assert theory.steps_for_bound(FLAT, law, excess=1.0, dt=0.49, before=True) is not None
-
-
-@pytest.mark.parametrize("before", [False, True])
-@pytest.mark.parametrize("constants", [FLAT, SLOW, MOVING])
-def test_what_a_number_of_iterations_promises_needs_that_number(
-    constants: DriftConstants, before: bool
-) -> None:
-    """To the last bit: neither one more nor one fewer."""
-    law = optim.SteepestDescent()
-    for steps in range(1, 25):
-        bound = ultimate_bound(constants, law, dt=0.01, inner_steps=steps)
-        if math.isfinite(bound.before):
-            excess = bound.before if before else bound.after
-            assert (
-                theory.steps_for_bound(constants, law, excess=excess * (1 + 1e-14), dt=0.01, before=before)
-                == steps
-            )
 
 
 @pytest.mark.parametrize(
@@ -255,9 +203,3 @@ def test_states_that_stand_still_may_take_any_step_and_slow_ones_a_long_one() ->
     assert step_of(STATES[:2], 0 * SPIN[:2], excess=0.35).dt == math.inf
     quick, slow = (step_of(STATES[:2], rate * SPIN[:2], excess=0.35) for rate in (1.0, 0.01))
     assert slow.dt == pytest.approx(100 * quick.dt)
-
-
-def test_states_of_a_step_are_rows() -> None:
-    for wrong in (STATES[0], torch.zeros(4, 3).double(), torch.zeros(2).double()):
-        with pytest.raises(ValueError, match=r"paper_step\(states="):
-            step_of(wrong, wrong, excess=1.0)

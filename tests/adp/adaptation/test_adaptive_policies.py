@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import Any
 
 import pytest
 import torch
 from helpers import changed, tensor, uniform
-from helpers_adaptation import COST, PENDULUM, friction_and_inertia, gravity
+from helpers_adaptation import COST, friction_and_inertia, gravity
 from torch import Tensor
 
 from staf_torch import GaussianKernel, adp, rings, systems
 from staf_torch.adp.tracking import regressor
 
-LAW = adp.LeastSquares([0.1, 1.0], deviation=0.5)
-WINDOWS = adp.IntegralWindows(PENDULUM, 0.1)
 KNOWN = systems.Linear([[0.0, 1.0], [-0.4, 0.2]], [[0.0], [1.0]])
 CENTERS = 0.5 * rings(3)
 
@@ -162,50 +159,6 @@ def test_a_family_is_the_slopes_at_a_set_point() -> None:
             plant.family(x, u)
     with pytest.raises(ValueError, match=rule):
         plant.family()
-
-
-def test_an_adaptive_policy_begins_where_it_is_told_and_refuses_what_it_cannot_be() -> None:
-    control, x0 = adp.AdaptiveLQR(PENDULUM, COST, WINDOWS, LAW, doublings=6, a_step=2), uniform(3, 2, seed=1)
-    now = control.adaptation(control.init(x0).identifier)
-    assert now.alarmed_at.tolist() == [-1.0] * 3
-    assert now.time.tolist() == now.stage.tolist() == now.certain.tolist() == [0.0] * 3
-    own = uniform(3, 2, seed=2)
-    other = control.starting_from(own)
-    assert torch.equal(other.adaptation(other.init(x0).identifier).estimate.theta, own)
-    assert torch.equal(control.adaptation(control.init(x0).identifier).estimate.theta, LAW.first.expand(3, 2))
-    lqr = adp.LQR(PENDULUM.believing(LAW.first), COST)
-    torch.testing.assert_close(control.robust(x0), lqr(x0))
-    assert (control.redesign.doublings, control.redesign.a_step) == (6, 2)
-    assert adp.AdaptiveLQR(PENDULUM, COST, WINDOWS, LAW, doublings=6).redesign.a_step == 6
-    fading = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1, discount=0.1)
-    few = adp.LeastSquares([0.1], deviation=0.5)
-    make: tuple[tuple[Callable[[], object], str], ...] = (
-        (lambda: adp.AdaptiveLQR(PENDULUM, fading, WINDOWS, LAW), r"cost=...\)` must have no discount"),
-        (
-            lambda: adp.AdaptiveLQR(PENDULUM, COST, WINDOWS, few),
-            "law=...\\)` must have the model's 2 parameters",
-        ),
-        (lambda: adp.AdaptiveLQR(PENDULUM, COST, WINDOWS, LAW, probe=-0.1), "probe"),
-        (lambda: adp.AdaptiveLQR(PENDULUM, COST, WINDOWS, LAW, confidence=0.0), "confidence"),
-        (lambda: adp.AdaptiveLQR(PENDULUM, COST, WINDOWS, LAW, doublings=0), "doublings"),
-        (
-            lambda: adp.AdaptiveLQR(PENDULUM, COST, WINDOWS, LAW, doublings=6, a_step=4),
-            "must divide the 6 doublings",
-        ),
-        (lambda: adp.AdaptiveLQR(PENDULUM, COST, WINDOWS, LAW, a_step=0), "a_step"),
-        (lambda: adp.DriftLQR(drift_of(), fading), r"cost=...\)` must have no discount"),
-        (lambda: adp.DriftLQR(drift_of(), COST, doublings=6, a_step=4), "must divide the 6 doublings"),
-        (lambda: adp.DriftLQR(drift_of(), COST, doublings=0), "doublings"),
-        (lambda: adp.DriftLQR(drift_of(), COST, a_step=0), "a_step"),
-        (lambda: adp.DriftLQR(drift_of(), COST, confidence=0.0), "confidence"),
-    )
-    for each, message in make:
-        with pytest.raises(ValueError, match=message):
-            each()
-    assert adp.AdaptiveLQR(PENDULUM, COST, WINDOWS, LAW, doublings=1).redesign.doublings == 1
-    drifting = adp.DriftLQR(drift_of(), COST, doublings=4, a_step=1)
-    torch.testing.assert_close(drifting.robust(x0), adp.LQR(KNOWN, COST)(x0))
-    assert (drifting.redesign.doublings, drifting.redesign.a_step) == (4, 1)
 
 
 PLANT = systems.TwoState()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import math
 
 import pytest
 import torch
@@ -148,16 +147,6 @@ def test_least_squares_are_those_of_all_equations_at_once_with_the_first_estimat
     torch.testing.assert_close(now.theta, wanted, rtol=1e-9, atol=1e-12)
 
 
-def test_least_squares_are_exact_without_noise_and_wait_for_an_equation() -> None:
-    law, true = adp.LeastSquares([0.0] * 4, deviation=5.0, floor=1e-7), uniform(6, 4, seed=5)
-    now = law.init(uniform(6, 2))
-    for equation in equations(4, 6, true):
-        waiting = changed(equation, ready=torch.zeros(6, dtype=torch.bool))
-        assert all(torch.equal(a, b) for a, b in zip(law.step(now, waiting, 0.1), now, strict=True))
-        now = law.step(now, equation, 0.1)
-    torch.testing.assert_close(now.theta, true, rtol=0, atol=1e-8)
-
-
 def test_an_alarm_opens_the_covariance_of_the_row_that_changed_alone() -> None:
     law = adp.LeastSquares([0.0, 0.0], deviation=3.0, floor=1e-3, alarm=6.0)
     first, second = tensor([[1.0, 2.0], [1.0, 2.0]]), tensor([[1.0, 2.0], [1.0, 0.5]])
@@ -210,76 +199,7 @@ def test_what_breaks_a_rule_is_refused_with_its_name(make, rule: str) -> None:
         make()
 
 
-@pytest.mark.parametrize("novelty", [0.2, 0.7])
-def test_an_equation_is_new_where_it_differs_by_the_novelty_of_its_own_size(novelty: float) -> None:
-    stack = adp.HistoryStack(1, 2, size=3, novelty=novelty)
-    ready, one = torch.tensor([True]), torch.ones(1).double()
-    first = adp.Equation(tensor([[[1.0, 0.0]]]), one[:, None], one, ready)
-    for share, filled in ((0.98, 1.0), (1.02, 2.0)):
-        now = stack.step(stack.init(torch.zeros(1, 1).double()), first)
-        angle = 2 * math.asin(share * novelty / 2)  # as long, and so far away
-        turned = tensor([[[math.cos(angle), math.sin(angle)]]])
-        assert stack.step(now, changed(first, s=turned)).filled.tolist() == [filled]
-
-
-TURNING = adp.ParametricPlant(
-    lambda x, u: torch.stack((torch.zeros_like(x), torch.cat((x[..., :1].sin(), u), -1)), dim=-2),
-    lambda x, u: torch.stack((x[..., 1], -0.5 * x[..., 1] + x[..., 0].cos()), dim=-1),
-    dim=2,
-    inputs=1,
-    theta=[1.0, 2.0],
-    rows=[1],
-    periodic=(0,),
-)
 DT = 0.125  # exact in binary, as are the lengths: edges are edges
-
-
-def swept(count: int) -> tuple[Tensor, Tensor]:
-    """States and inputs of so many times, (T, 2) and (T, 1)."""
-    k = torch.arange(count, dtype=torch.float64)
-    return torch.stack((3.0 + 0.1 * k, (0.7 * k).sin()), -1), (1.3 * k).cos().unsqueeze(-1)
-
-
-@pytest.mark.parametrize(
-    ("length", "first", "ends"),
-    [
-        (0.5, None, [(0, 4), (4, 8), (8, 12)]),
-        (0.3125, None, [(0, 3), (3, 6), (6, 9)]),  # two periods and a half: the third ends it
-        (0.5, 0.125, [(0, 1), (1, 3), (3, 7), (7, 11)]),
-    ],
-)
-@pytest.mark.parametrize("shape", ["box", "smooth"])
-@pytest.mark.parametrize("model", [TURNING, PENDULUM])
-def test_a_window_is_the_sum_over_its_steps(
-    model: adp.ParametricPlant, length: float, first: float | None, ends: list[tuple[int, int]], shape: str
-) -> None:
-    x, u = swept(13)
-    windows = adp.IntegralWindows(model, length, shape=shape, first=first, noise=0.3)
-    now, found = windows.init(x[0]), []
-    assert float(now.elapsed) == -1
-    for k in range(13):
-        now, equation = windows.step(now, x[k], DT)
-        now = windows.holding(now, u[k])
-        assert torch.equal(now.x, x[k])
-        if bool(equation.ready):
-            found.append((k, equation))
-            assert float(now.elapsed) == 0
-            assert not bool(now.s.any() or now.z.any())
-    assert [k for k, _ in found[: len(ends)]] == [end for _, end in ends]
-    size = length if first is None else first
-    for (begin, end), (_, equation) in zip(ends, found, strict=False):
-        s, z = torch.zeros(2, model.parameters_count).double(), torch.zeros(2).double()
-        for k in range(begin, end):
-            t = (k - begin + 0.5) * DT
-            phi = math.sin(math.pi * t / size) ** 2 if shape == "smooth" else 1.0
-            moved = model.difference(x[k + 1], x[k])
-            s += phi * DT * 0.5 * (model.regressor(x[k], u[k]) + model.regressor(x[k + 1], u[k]))
-            z += phi * (moved - DT * 0.5 * (model.rest_of(x[k], u[k]) + model.rest_of(x[k + 1], u[k])))
-        torch.testing.assert_close(equation.s, s[model.rows], rtol=1e-12, atol=1e-13)
-        torch.testing.assert_close(equation.z, z[model.rows], rtol=1e-12, atol=1e-13)
-        noise = math.pi**2 * DT / (2 * size) if shape == "smooth" else 2.0
-        assert float(equation.variance) == pytest.approx(0.09 * noise)
-        size = min(2 * size, length)
 
 
 def test_rows_may_have_windows_of_their_own_lengths() -> None:
@@ -308,39 +228,6 @@ def test_a_row_that_went_wrong_does_not_end_the_others() -> None:
         assert torch.equal(both[:1], one)
 
 
-@pytest.mark.parametrize(
-    ("length", "middle", "end"), [(0.5, 2, 4), (0.25, 1, 2), (0.375, 2, 3), (0.3125, 1, 3)]
-)
-def test_a_slope_is_the_difference_over_a_window_and_y_that_of_its_middle(
-    length: float, middle: int, end: int
-) -> None:
-    x, u = swept(9)
-    windows = adp.SlopeWindows(TURNING, length)
-    now, begin, found = windows.init(x[0]), 0, 0
-    assert float(now.elapsed) == -1
-    for k in range(9):
-        before = now
-        now, equation = windows.step(now, x[k], DT)
-        now = windows.holding(now, u[k])
-        at = k - begin
-        if k and at == middle:
-            torch.testing.assert_close(now.s, TURNING.regressor(x[k], u[k - 1])[[1]])
-            torch.testing.assert_close(now.h, TURNING.rest_of(x[k], u[k - 1])[[1]])
-        elif at != middle:
-            assert torch.equal(now.s, before.s)
-            assert torch.equal(now.h, before.h)
-        assert bool(equation.ready) == (k > 0 and at == end)
-        if bool(equation.ready):
-            rate = TURNING.difference(x[k], x[begin])[1] / (end * DT)
-            torch.testing.assert_close(equation.z, (rate - now.h[0]).reshape(1))
-            torch.testing.assert_close(equation.s, now.s)
-            begin, found = k, found + 1
-        assert float(now.elapsed) == (k - begin) * DT
-        assert torch.equal(now.x, x[begin])
-        assert float(equation.variance) == 0
-    assert found >= 2
-
-
 @pytest.mark.parametrize("outputs", [1, 3])
 def test_the_step_solves_its_implicit_equation(outputs: int) -> None:
     """theta+ - theta = gain dt sum_j s_j (y_j - theta+'s_j)' over the stack and the present pair."""
@@ -352,3 +239,27 @@ def test_the_step_solves_its_implicit_equation(outputs: int) -> None:
         pairs = [*zip(state.regressors, state.rates, strict=True), (s, y)]
         pull = sum(torch.outer(a, b - state.theta.mT @ a) for a, b in pairs)
         torch.testing.assert_close(state.theta - before.theta, 2.0 * 0.1 * pull, rtol=1e-10, atol=1e-12)
+
+
+def test_windows_double_from_the_first_up_to_the_longest() -> None:
+    windows = adp.IntegralWindows(MODEL, 0.08, first=0.02)
+    now, ends = windows.init(torch.zeros(1, 2).double()), []
+    for k in range(32):
+        now, equation = windows.step(now, torch.zeros(1, 2).double(), 0.01)
+        ends += [k] if bool(equation.ready) else []
+    assert ends == [2, 6, 14, 22, 30]
+
+
+def test_slopes_over_a_window_are_exact_where_the_rate_is_constant() -> None:
+    plant = adp.ParametricPlant(
+        lambda x, u: u.unsqueeze(-1), lambda x, u: 0 * x + 3.0, dim=1, inputs=1, theta=[2.0]
+    )
+    windows, x, u, found = adp.SlopeWindows(plant, 0.5), torch.zeros(1, 1).double(), tensor([[1.5]]), 0
+    now = windows.init(x)
+    for _ in range(9):
+        now, equation = windows.step(now, x, 0.125)
+        now, x = windows.holding(now, u), x + 0.125 * plant.motion(x, u)
+        if bool(equation.ready):
+            torch.testing.assert_close(equation.s[..., 0] * 2.0, equation.z, rtol=1e-12, atol=0)
+            found += 1
+    assert found == 2

@@ -13,17 +13,6 @@ from staf_torch import adp, systems
 from staf_torch.adp.adaptation import redesign
 
 
-def test_noise_is_given_once_or_for_every_output() -> None:
-    inside = adp.Feedback(lambda x: x)
-    assert adp.Measured(inside, noise=1, dim=2).noise.tolist() == [1.0, 1.0]
-    assert adp.Measured(inside, noise=[0.0, 0.5], dim=2).noise.tolist() == [0.0, 0.5]
-    for wrong in (-0.1, [0.1], [0.1, 0.1, 0.1], [0.1, -0.1], math.nan):
-        with pytest.raises(
-            ValueError, match=r"`Measured\(noise=...\)` must not be negative, one number or 2"
-        ):
-            adp.Measured(inside, noise=wrong, dim=2)
-
-
 def test_a_plant_changes_when_its_clock_has_run_down() -> None:
     plant = adp.ChangingPlant(PENDULUM)
     assert (plant.dim, plant.inputs, plant.bounds) == (7, 1, None)
@@ -54,20 +43,8 @@ def test_the_cost_of_a_changing_plant_is_that_of_its_state() -> None:
     torch.testing.assert_close(wide.state_rate(z), COST.state_rate(z[:, :2]))
     assert (wide.dim, COST.dim) == (7, 2)
     seen = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1, output=lambda x: x[..., :2])
-    aimed = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1, target=[0.1, 0.0])
-    for cost in (seen, aimed):
-        with pytest.raises(
-            ValueError, match=r"`ChangingPlant\(cost=...\)` must be of x itself at the origin"
-        ):
-            plant.cost(cost)
-    turning = adp.ChangingPlant(
-        adp.ParametricPlant(
-            lambda x, u: torch.diag_embed(x), dim=2, inputs=1, theta=[1.0, 2.0], periodic=(0,)
-        )
-    )
-    assert turning.periodic == (0,)
-    with pytest.raises(ValueError, match="without angles"):
-        turning.cost(COST)
+    with pytest.raises(ValueError, match=r"`ChangingPlant\(cost=...\)` must be of x itself at the origin"):
+        plant.cost(seen)
 
 
 @pytest.mark.parametrize(("doublings", "a_step"), [(4, 1), (4, 2), (6, 3), (3, 3)])
@@ -144,40 +121,6 @@ def test_noise_of_a_filter_of_a_plant_in_steps_counts_by_its_period() -> None:
         wanted = flow @ size[0] @ flow.mT + torch.diag(tensor([0.04, 0.25])) * 0.1
         torch.testing.assert_close(after.covariance, wanted.expand(4, 2, 2))
         assert torch.equal(after.u, u)
-
-
-def test_what_an_observer_begins_with_and_what_is_refused_of_filters() -> None:
-    plant = systems.Pendulum()
-    plant.bounds = systems.Bounds(-0.5, 0.5, 1)
-    filter = adp.ExtendedKalman(plant, lambda x: x[..., :1], noise=[0.1])
-    inside = adp.Feedback(lambda x: 9 + 0 * x[..., :1])
-    for given, mean, spread in (
-        ({"deviation": 0.5}, [0.0, 0.0], [0.25, 0.25]),
-        ({"deviation": [0.5, 2.0], "mean": [0.3, -0.2]}, [0.3, -0.2], [0.25, 4.0]),
-    ):
-        seen = adp.Observed(inside, filter, **given)  # type: ignore[arg-type]
-        y = torch.zeros(3, 1).double()
-        belief = seen.belief(seen.init(y).identifier)
-        torch.testing.assert_close(belief.mean, tensor([mean] * 3))
-        torch.testing.assert_close(belief.covariance, torch.diag(tensor(spread)).expand(3, 2, 2))
-        assert belief.u.shape == (3, 1)
-    u, after = seen.step(y, seen.init(y), y, 0.1)
-    assert u.tolist() == [[9.0]] * 3
-    assert seen.belief(after.identifier).u.tolist() == [[0.5]] * 3  # what the actuator gives
-    first = filter.corrected(seen.belief(seen.init(y).identifier), y)
-    torch.testing.assert_close(seen.belief(after.identifier).mean, first.mean)
-    second = filter.step(seen.belief(after.identifier), y + 0.1, 0.1, torch.zeros(3).bool())
-    _, later = seen.step(y + 0.1, after, y, 0.1)
-    torch.testing.assert_close(seen.belief(later.identifier).mean, second.mean)
-    assert seen.label == f"{inside.label} of observed states"
-    for wrong in ({"mean": [0.1]}, {"mean": [0.1, math.nan]}):
-        with pytest.raises(ValueError, match=r"`Observed\(mean=...\)`"):
-            adp.Observed(inside, filter, deviation=0.5, **wrong)  # type: ignore[arg-type]
-    for noise in ([], [0.0], [-0.1], [0.1, 0.0]):
-        with pytest.raises(ValueError, match=r"`UnscentedKalman\(noise=...\)` must be positive numbers"):
-            adp.UnscentedKalman(plant, lambda x: x, noise=noise)
-    with pytest.raises(ValueError, match=r"`ExtendedKalman\(output=...\)` must map \(1, 2\) to \(1, 1\)"):
-        adp.ExtendedKalman(plant, lambda x: x, noise=[0.1])
 
 
 def test_noise_has_the_deviations_that_are_asked_for() -> None:
