@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
@@ -23,9 +25,9 @@ def check_rest(plant: Plant, x: Tensor, u: Tensor) -> None:
     Raises:
         ValueError: if the motion exceeds 1e-6 of the plant's rates there, with its value.
     """
-    moves = _motion(plant, x, u)
-    if bool((moves.abs() <= _REST * _scale(plant, x, u)).all()):
+    if _rests(plant, x, u):
         return
+    moves = _motion(plant, x, u)
     name = type(plant).__name__
     if not bool((x != 0).any() or (u != 0).any()) and hasattr(plant, "drift"):
         raise ValueError(
@@ -47,13 +49,7 @@ def resting_input_at(plant: Plant, x: Tensor, guess: Tensor | None = None) -> Te
         guess: (m,); by default the resting input of the plant.
     """
     u = plant.resting_input() if guess is None else guess
-    for _ in range(_STEPS):
-        slopes = central_slopes(lambda v: _motions(plant, x.expand(len(v), -1), v), u)
-        step = torch.linalg.lstsq(slopes, -_motion(plant, x, u).unsqueeze(-1), driver="gelsd").solution[:, 0]
-        u = u + step
-        if not bool(torch.isfinite(u).all()) or float(step.norm()) <= 1e-14 * (1 + float(u.norm())):
-            break
-    return u
+    return _gauss_newton(lambda v: _motions(plant, x.expand(len(v), -1), v), u)
 
 
 def find_equilibrium(plant: Plant, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
@@ -73,14 +69,8 @@ def find_equilibrium(plant: Plant, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor
     held = resting_input_at(plant, x, u)
     if bool(torch.isfinite(held).all()) and _rests(plant, x, held):
         return x, held
-    z, size = torch.cat((x, u)), len(x)
-    for _ in range(_STEPS):
-        slopes = central_slopes(lambda v: _motions(plant, v[:, :size], v[:, size:]), z)
-        moves = _motion(plant, z[:size], z[size:])
-        step = torch.linalg.lstsq(slopes, -moves.unsqueeze(-1), driver="gelsd").solution[:, 0]
-        z = z + step
-        if not bool(torch.isfinite(z).all()) or float(step.norm()) <= 1e-14 * (1 + float(z.norm())):
-            break
+    size = len(x)
+    z = _gauss_newton(lambda v: _motions(plant, v[:, :size], v[:, size:]), torch.cat((x, u)))
     if bool(torch.isfinite(z).all()) and _rests(plant, z[:size], z[size:]):
         return z[:size], z[size:]
     moves = _motion(plant, x, u)
@@ -90,6 +80,17 @@ def find_equilibrium(plant: Plant, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor
         f"{u.tolist()}: state {worst} keeps moving, by {float(moves[worst]):.6g}. Give a better "
         "`equilibrium=(state, input)`."
     )
+
+
+def _gauss_newton(motions: Callable[[Tensor], Tensor], z: Tensor) -> Tensor:
+    """Where nothing moves, by the smallest Gauss-Newton steps from z (k,): rows (B, k) -> (B, n)."""
+    for _ in range(_STEPS):
+        slopes, moves = central_slopes(motions, z), motions(z.unsqueeze(0))[0]
+        step = torch.linalg.lstsq(slopes, -moves.unsqueeze(-1), driver="gelsd").solution[:, 0]
+        z = z + step
+        if not bool(torch.isfinite(z).all()) or float(step.norm()) <= 1e-14 * (1 + float(z.norm())):
+            break
+    return z
 
 
 def _rests(plant: Plant, x: Tensor, u: Tensor) -> bool:

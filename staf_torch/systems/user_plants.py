@@ -23,7 +23,6 @@ class FunctionPlant(Plant):
         self,
         argument: str,
         function: Motion,
-        *,
         dim: int,
         inputs: int,
         periodic: Sequence[int],
@@ -107,17 +106,7 @@ class StepPlant(FunctionPlant):
         slopes: Slopes | None = None,
     ) -> None:
         period = positive_real("StepPlant", "dt", dt)
-        super().__init__(
-            "step",
-            step,
-            dim=dim,
-            inputs=inputs,
-            periodic=periodic,
-            equilibrium=equilibrium,
-            low=low,
-            high=high,
-            slopes=slopes,
-        )
+        super().__init__("step", step, dim, inputs, periodic, equilibrium, low, high, slopes)
         self.period = period
 
     def step(self, x: Tensor, u: Tensor) -> Tensor:
@@ -158,17 +147,7 @@ class RatePlant(FunctionPlant):
         high: Limit = None,
         slopes: Slopes | None = None,
     ) -> None:
-        super().__init__(
-            "rate",
-            rate,
-            dim=dim,
-            inputs=inputs,
-            periodic=periodic,
-            equilibrium=equilibrium,
-            low=low,
-            high=high,
-            slopes=slopes,
-        )
+        super().__init__("rate", rate, dim, inputs, periodic, equilibrium, low, high, slopes)
 
     def rate(self, x: Tensor, u: Tensor) -> Tensor:
         """x': (..., n), (..., m) -> (..., n)."""

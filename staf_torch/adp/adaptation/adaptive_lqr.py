@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ...numerics.checks import fail, integer, non_negative, positive_real, real
+from ...numerics.checks import fail, non_negative, positive_real, real
 from ..controllers import LQR, Controller, ControllerState, Policy
 from ..cost import Cost, matvec, quadratic
 from ..rollout import RolloutPolicy
@@ -113,8 +113,6 @@ class AdaptiveLQR(Controller):
     ) -> None:
         super().__init__()
         self.model, self.cost = model, cost.around(model)
-        if cost.discount:
-            raise fail("AdaptiveLQR", "cost", "must have no discount", cost.discount)
         p = model.parameters_count
         if len(law.first) != p:
             raise fail("AdaptiveLQR", "law", f"must have the model's {p} parameters", len(law.first))
@@ -124,13 +122,8 @@ class AdaptiveLQR(Controller):
         self.confidence = positive_real("AdaptiveLQR", "confidence", confidence)
         non_negative("AdaptiveLQR", "probe", probe)
         self.probe = real("AdaptiveLQR", "probe", probe)
-        integer("AdaptiveLQR", "doublings", doublings, least=1)
-        each = doublings if a_step is None else integer("AdaptiveLQR", "a_step", a_step, least=1)
-        if doublings % each:
-            raise fail("AdaptiveLQR", "a_step", f"must divide the {doublings} doublings", a_step)
+        self.redesign = Redesign.of("AdaptiveLQR", self.cost, doublings, a_step)
         self.family = model.family(self.cost.target, self.cost.target_input)
-        self.curvature = self.cost.state_curvature()
-        self.redesign = Redesign(self.curvature, self.cost.r_inverse, doublings, each)
         self.robust: Policy = LQR(model.believing(law.first), cost) if robust is None else robust
         self.theta: Tensor | None = None
         self._like = self._start(torch.zeros(1, int(model.dim or 0), dtype=torch.float64), None)
@@ -211,7 +204,7 @@ class AdaptiveLQR(Controller):
             k: R^-1 B'P, (..., m, n).
         """
         r = self.cost.r.to(p)
-        weight = torch.linalg.inv_ex(self.curvature.to(p) + product(product(k.mT, r), k))[0]
+        weight = torch.linalg.inv_ex(self.redesign.curvature.to(p) + product(product(k.mT, r), k))[0]
         slopes = self.family.a_slopes.to(p) - product(self.family.b_slopes.to(p), k.unsqueeze(-3))
         pushed = product(p.unsqueeze(-3), slopes)
         turned = product(weight.unsqueeze(-3), pushed + pushed.mT)  # (..., p, n, n)

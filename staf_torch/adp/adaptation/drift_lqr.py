@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ...numerics.checks import fail, integer, positive_real
+from ...numerics.checks import positive_real
 from ..controllers import LQR, Controller, ControllerState, Policy
 from ..cost import Cost, matvec, quadratic
 from .carried import pack, unpack
@@ -83,14 +83,8 @@ class DriftLQR(Controller):
     ) -> None:
         super().__init__()
         self.drift, self.model, self.cost = drift, drift.known, cost.around(drift.known)
-        if cost.discount:
-            raise fail("DriftLQR", "cost", "must have no discount", cost.discount)
         self.confidence = positive_real("DriftLQR", "confidence", confidence)
-        integer("DriftLQR", "doublings", doublings, least=1)
-        each = doublings if a_step is None else integer("DriftLQR", "a_step", a_step, least=1)
-        if doublings % each:
-            raise fail("DriftLQR", "a_step", f"must divide the {doublings} doublings", a_step)
-        self.redesign = Redesign(self.cost.state_curvature(), self.cost.r_inverse, doublings, each)
+        self.redesign = Redesign.of("DriftLQR", self.cost, doublings, a_step)
         self.robust: Policy = LQR(drift.known, cost) if robust is None else robust
         self._like = self._start(torch.zeros(1, int(drift.known.dim or 0), dtype=torch.float64))
 

@@ -7,7 +7,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ...numerics.checks import integer
+from ...numerics.checks import fail, integer
+from ..cost import Cost
 
 _SOLVED = 1e-2  # residual of the Riccati equation, for the model of the moment, of a design that is used
 
@@ -77,6 +78,21 @@ class Redesign:
     def __init__(self, curvature: Tensor, r_inverse: Tensor, doublings: int, a_step: int) -> None:
         self.curvature, self.r_inverse = curvature, r_inverse
         self.doublings, self.a_step = doublings, a_step
+
+    @classmethod
+    def of(cls, call: str, cost: Cost, doublings: int, a_step: int | None) -> Redesign:
+        """The designs of a cost without discount, in ``call``'s name; all doublings at once for None.
+
+        Raises:
+            ValueError: if an argument breaks its rule.
+        """
+        if cost.discount:
+            raise fail(call, "cost", "must have no discount", cost.discount)
+        integer(call, "doublings", doublings, least=1)
+        each = doublings if a_step is None else integer(call, "a_step", a_step, least=1)
+        if doublings % each:
+            raise fail(call, "a_step", f"must divide the {doublings} doublings", a_step)
+        return cls(cost.state_curvature(), cost.r_inverse, doublings, each)
 
     def step(
         self, pair: Doubling, stage: Tensor, p: Tensor, a: Tensor, b: Tensor
