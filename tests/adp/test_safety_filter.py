@@ -6,6 +6,7 @@ import copy
 import math
 import pickle
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +15,6 @@ from helpers import tensor, uniform
 from torch import Tensor
 
 from staf_torch import adp, deploy, systems
-from staf_torch.adp.halfspaces import cases, nearest_admissible
 from staf_torch.deploy.c_header import runner_c
 
 LINE = systems.Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
@@ -38,112 +38,26 @@ def passing(x: Tensor, t: Tensor) -> Tensor:
     return torch.where(t < 0.2, 10.0, (x[:, 0] - 0.5 * t).square() + (x[:, 1] - 0.8).square() - 0.09)
 
 
-def dense(wanted: np.ndarray, rows: np.ndarray, least: np.ndarray) -> np.ndarray | None:
-    """The nearest point by Lawson and Hanson's least distance programming; None where there is none."""
-    from scipy.optimize import nnls
-
-    matrix = np.vstack([rows.T, (least - rows @ wanted)[None]])
-    right = np.zeros(len(matrix))
-    right[-1] = 1.0
-    left = matrix @ nnls(matrix, right, maxiter=1000)[0] - right
-    return None if np.linalg.norm(left) < 1e-9 else wanted - left[:-1] / left[-1]
-
-
-@pytest.mark.parametrize(("m", "k"), [(1, 1), (1, 3), (2, 1), (2, 2), (2, 3), (3, 2), (4, 1)])
-def test_the_program_has_the_solution_of_a_dense_solver(m: int, k: int) -> None:
-    generator = torch.Generator().manual_seed(10 * m + k)
-    normals = torch.randn(60, k, m, dtype=torch.float64, generator=generator)
-    wanted = 2 * torch.randn(60, m, dtype=torch.float64, generator=generator)
-    least = 0.5 * torch.randn(60, k, dtype=torch.float64, generator=generator)
-    low, high = -uniform(m, low=0.2, high=1.2, seed=m), uniform(m, low=0.2, high=1.2, seed=k)
-    high[0] = torch.inf if m > 1 else high[0]
-    found = nearest_admissible(wanted, normals, least, low, high, cases(k, low.tolist(), high.tolist()))
-    bounded = torch.isfinite(high)
-    limits = torch.cat((torch.eye(m).double(), -torch.eye(m).double()[bounded]))
-    ends = torch.cat((low, -high[bounded]))
-    solved = 0
-    for row in range(60):
-        rows, right = torch.cat((normals[row], limits)), torch.cat((least[row], ends))
-        best = dense(wanted[row].numpy(), rows.numpy(), right.numpy())
-        if best is None:
-            assert float(found.shortfall[row]) > 1e-6
-            continue
-        solved += 1
-        assert np.abs(best - found.point[row].numpy()).max() < 1e-8
-        assert float(found.shortfall[row]) < 1e-8
-    assert solved > 10
-
-
-def test_where_nothing_fits_the_bounds_hold_and_the_squares_of_what_is_missing_are_least() -> None:
-    low, high = tensor([-1.0, -1.0]), tensor([1.0, 1.0])
-    normals, least = tensor([[[2.0, 0.0], [-1.0, 0.5]]]), tensor([[3.0, 2.0]])
-    found = nearest_admissible(
-        tensor([[0.3, 0.2]]), normals, least, low, high, cases(2, [-1.0] * 2, [1.0] * 2)
-    )
-    assert bool((found.point.abs() <= 1).all())
-    unit, far = normals[0] / normals[0].norm(dim=-1, keepdim=True), least[0] / normals[0].norm(dim=-1)
-
-    def missing(u: Tensor) -> Tensor:
-        return (far - u @ unit.mT).clamp(min=0).square().sum(-1)
-
-    assert float(missing(uniform(4000, 2, seed=1)).min()) > float(missing(found.point)[0]) - 1e-9
-    assert float(found.shortfall) == pytest.approx(float((far - unit @ found.point[0]).max()), abs=1e-12)
-    twice = nearest_admissible(
-        tensor([[0.0]]),
-        tensor([[[1.0], [-1.0]]]),
-        tensor([[0.5, 0.1]]),
-        low[:1],
-        high[:1],
-        cases(2, [-1.0], [1.0]),
-    )
-    assert float(twice.point) == pytest.approx(0.2)  # 0.3 is missing on either side
-    assert float(twice.shortfall) == pytest.approx(0.3)
-
-
-def test_too_many_cases_are_refused() -> None:
-    with pytest.raises(
-        ValueError, match="6 inequalities of 3 bounded unknowns have 1702 cases, more than 1000"
-    ):
-        cases(6, [-1.0] * 3, [1.0] * 3)
-
-
 def test_far_from_the_edge_not_a_bit_changes_and_rows_are_alone() -> None:
     guard = adp.SafetyFilter(
         lambda x: -x[..., 2:], PLANE, [disc, passing], dt=0.01, low=[-1.0, -2.0], high=1.5
     )
-    x, u = uniform(40, 4, seed=1, low=-2.0, high=2.0), uniform(40, 2, seed=2, low=-0.9, high=0.9)
-    t = uniform(40, low=0.0, high=2.0, seed=3)
+    x, u = uniform(24, 4, seed=1, low=-2.0, high=2.0), uniform(24, 2, seed=2, low=-0.9, high=0.9)
+    t = uniform(24, low=0.0, high=2.0, seed=3)
     found = guard.restrain(x, u, t)
     far = (found.margin > 2.5).all(-1)
-    assert 5 < int(far.sum()) < 35
+    assert 3 < int(far.sum()) < 21
     assert torch.equal(found.control[far], u[far])
     assert bool((found.control[~far] != u[~far]).any())
-    for row in (0, 7, 23):
+    for row in (0, 23):
         alone = guard.restrain(x[row : row + 1], u[row : row + 1], t[row : row + 1])
         assert all(torch.equal(a[0], b[row]) for a, b in zip(alone, found, strict=True))
     assert torch.equal(found.margin, guard.margins(x, t))
     assert guard.restrain(x[:4].reshape(2, 2, 4), u[:4].reshape(2, 2, 2), 0.3).slack.shape == (2, 2)
 
 
-def test_the_condition_is_met_by_the_plant_that_is_held() -> None:
-    """By a simulation of its own, and where it acts with equality."""
-    guard = adp.SafetyFilter(lambda x: x[..., :1] * 0 - 3, LINE, wall, dt=0.05, decay=2.0)
-    x = tensor([[0.4, -0.5], [0.0, -0.1], [1.0, -1.8], [3.0, 1.0]])
-    u = guard(x)
-    assert guard.degree == (2,)
-    assert float(u[3]) == -3.0
-    position, speed, h = x[:3, 0], x[:3, 1], 0.05
-    before = speed + 2 * (position + 0.1)
-    after = speed + h * u[:3, 0] + 2 * (position + h * speed + 0.5 * h * h * u[:3, 0] + 0.1)
-    dip = (0.25 * h * h * u[:3, 0]).clamp(min=0)  # of phi below its chord, where phi'' = 2 u > 0
-    kept = (1 - math.exp(-2 * h)) * dip
-    torch.testing.assert_close(after - math.exp(-2 * h) * before, kept, rtol=5e-3, atol=1e-9)
-
-
 def test_a_wall_is_never_crossed_and_a_larger_margin_keeps_farther_away() -> None:
-    x0 = torch.stack(
-        (uniform(30, low=0.2, high=2.0, seed=4), uniform(30, low=-0.2, high=1.0, seed=5)), dim=-1
-    )
+    x0 = torch.stack((uniform(8, low=0.2, high=2.0, seed=4), uniform(8, low=-0.2, high=1.0, seed=5)), dim=-1)
     least = []
     for margin in (0.0, 0.05):
         guard = adp.SafetyFilter(lambda x: 0 * x[..., :1] - 3, LINE, wall, dt=0.1, decay=4.0, margin=margin)
@@ -184,21 +98,6 @@ def test_rows_that_cannot_be_kept_are_named() -> None:
     assert report["constraint_violations"] == 1
     assert report["minimum_margin"] < 0 < report["largest_slack"]
     assert float(run.control[1, 0]) == 1.0  # as much as there is
-
-
-def test_degree_one_time_and_a_barrier_plant() -> None:
-    slow = adp.SafetyFilter(lambda x: 0 * x[..., :1], LINE, lambda x, t: 0.5 - x[:, 1] + 0.1 * t, dt=0.01)
-    assert slow.degree == (1,)
-    with pytest.raises(ValueError, match=r"`SafetyFilter\(t=...\)` must be given"):
-        slow(tensor([0.0, 0.4]))
-    u = slow.restrain(tensor([0.0, 0.6]), tensor([5.0]), 2.0).control  # 0.1 below the wall, which flees
-    assert float(u) == pytest.approx((1 - math.exp(-0.02)) / 0.01 * 0.1 + 0.1, rel=1e-6)
-    box = systems.Barrier(LINE, [-1.0, None], [1.0, None])
-    guard = adp.SafetyFilter(lambda s: 0 * s[..., :1] + 9.0, box, lambda s, t: 1 - s[:, 0], dt=0.1)
-    assert guard.degree == (2,)
-    run = adp.simulate(guard, box, COST, tensor([[0.0, 0.0]]), steps=8, compile=False)
-    assert guard.report(run)["minimum_margin"] > 0
-    assert guard.report(run)["acted"] > 0.4
 
 
 def test_policies_of_all_kinds_stand_behind_it() -> None:
@@ -285,14 +184,6 @@ def test_what_breaks_a_rule_is_refused(given: dict[str, object], message: str) -
         adp.SafetyFilter(**{**usual, **given})  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize(("stated", "most"), [({}, 0.3), ({"low": -0.2, "high": 0.2}, 0.2)])
-def test_bounds_of_the_plant_hold_where_the_filter_states_none(stated: dict[str, float], most: float) -> None:
-    plant = systems.Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
-    plant.bounds = systems.Bounds(-0.3, 0.3, 1)
-    shield = adp.SafetyFilter(lambda x: 5.0 + 0 * x[..., :1], plant, wall, dt=0.01, **stated)
-    assert shield(tensor([[1.0, 0.0]])).tolist() == [[most]]
-
-
 class Turning(systems.ControlAffineSystem):
     """(p, angle)' = (v cos, v sin, w): what v moves changes within a hold as w turns it."""
 
@@ -313,7 +204,7 @@ def test_a_condition_that_bends_is_met_or_the_slack_says_so(decay: float) -> Non
     shield = adp.SafetyFilter(
         lambda x: x[..., :2], Turning(), disc, dt=0.1, low=[-1, -5], high=[1, 5], decay=decay, degree=1
     )
-    x, angle = uniform(4000, 3, low=-1.0, high=1.0, seed=7), uniform(4000, low=0.0, high=6.28, seed=8)
+    x, angle = uniform(1000, 3, low=-1.0, high=1.0, seed=7), uniform(1000, low=0.0, high=6.28, seed=8)
     x[:, 0], x[:, 1] = (
         1 + (0.5 + 0.1 * x[:, 0].abs()) * angle.cos(),
         (0.5 + 0.1 * x[:, 1].abs()) * angle.sin(),
@@ -337,38 +228,15 @@ def test_a_condition_that_bends_is_met_or_the_slack_says_so(decay: float) -> Non
     asked = (required - end).clamp(min=0)
     end, required = after(found.control)
     missing = (required - end).clamp(min=0)
-    assert int((asked > 0).sum()) > 300
+    assert int((asked > 0).sum()) > 60
     met = found.slack < 1e-9
     assert bool((missing[met] <= 2e-6 * asked[met] + 1e-12).all())
     assert bool((missing[~met] > 0).all())
     assert float(met.double().mean()) > 0.9
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_of_two_inputs_the_squares_of_what_is_missing_are_least_wherever_nothing_fits(seed: int) -> None:
-    normals, least = uniform(200, 3, 2, seed=seed), uniform(200, 3, seed=seed + 10, low=0.2, high=1.5)
-    wanted, low, high = uniform(200, 2, seed=seed + 20), tensor([-0.8, -torch.inf]), tensor([torch.inf, 0.9])
-    found = nearest_admissible(wanted, normals, least, low, high, cases(3, low.tolist(), high.tolist()))
-    length = normals.norm(dim=-1)
-
-    def missing(u: Tensor) -> Tensor:
-        short = least / length - (normals / length.unsqueeze(-1) * u.unsqueeze(-2)).sum(-1)
-        return short.clamp(min=0).square().sum(-1)
-
-    none = found.shortfall > 1e-6
-    assert 20 < int(none.sum()) < 200
-    for size in (1e-3, 0.1, 2.0):
-        for turn in range(60):
-            other = found.point + size * uniform(200, 2, seed=100 + turn)
-            other = torch.minimum(torch.maximum(other, low), high)
-            assert bool((missing(other) >= missing(found.point) - 1e-8)[none].all())
-
-
 def test_a_condition_that_no_control_moves_leaves_a_finite_slack_and_the_others_kept() -> None:
     still = systems.Linear([[0.0, 0.0], [0.0, 0.0]], [[0.0], [1.0]])  # x1 moves by nothing
-
-    def both(x: Tensor, t: Tensor) -> Tensor:
-        return torch.stack((0.5 - x[:, 0], 0.4 - x[:, 1]), dim=-1)
 
     def first(x: Tensor, t: Tensor) -> Tensor:
         return 0.5 - x[:, 0]
@@ -385,11 +253,9 @@ def test_a_condition_that_no_control_moves_leaves_a_finite_slack_and_the_others_
         degree=1,
     )
     x = tensor([[0.7, 0.39], [0.2, 0.39], [0.7, 0.0]])
-    u, margin, slack = guard._definition(torch.cat((x, torch.ones(3, 1).double(), x[:, :1] * 0), -1)).split(
-        [1, 2, 1], -1
-    )
+    u, margin, slack = guard.restrain(x, torch.ones(3, 1).double())
     assert bool(torch.isfinite(slack).all())
-    torch.testing.assert_close(margin, both(x, x[:, 0]))
+    torch.testing.assert_close(margin, torch.stack((0.5 - x[:, 0], 0.4 - x[:, 1]), dim=-1))
     assert (
         float((second(x + 0.1 * torch.cat((0 * u, u), -1), x[:, 0]) - 0.9 * second(x, x[:, 0])).min()) > -1e-9
     )
@@ -404,15 +270,227 @@ def test_who_rests_on_the_edge_violates_nothing() -> None:
     assert report["constraint_violations"] == 0
 
 
-@pytest.mark.parametrize("m", [1, 2, 3])
-def test_in_plain_torch_too_no_row_knows_what_the_others_are(m: int) -> None:
-    normals, wanted, least = uniform(6, 2, m, seed=1), 2 * uniform(6, m, seed=2), uniform(6, 2, seed=3)
-    wanted[2], least[3], normals[4], least[5] = 1e12, 1e12, 1e-9 * normals[4], 5.0  # the last: none fits
-    low, high = torch.full((m,), -0.7, dtype=torch.float64), torch.full((m,), 0.9, dtype=torch.float64)
-    table = cases(2, low.tolist(), high.tolist())
-    together = nearest_admissible(wanted, normals, least, low, high, table)
-    for k in range(6):
-        rows = slice(k, k + 1)
-        alone = nearest_admissible(wanted[rows], normals[rows], least[rows], low, high, table)
-        torch.testing.assert_close(alone.point, together.point[rows], rtol=1e-12, atol=1e-12)
-        torch.testing.assert_close(alone.shortfall, together.shortfall[rows], rtol=1e-9, atol=1e-12)
+# What is asked of a control, beside the same written out -------------------------------------------------
+
+
+def stiff(x: Tensor, u: Tensor) -> Tensor:
+    """A rate that bends within a hold, and of which the input moves the second state alone."""
+    return torch.stack(
+        (x[..., 1] - 0.3 * x[..., 0] ** 3, 4 * x[..., 0].sin() - x[..., 1] + 2 * u[..., 0]), -1
+    )
+
+
+PLANT = systems.RatePlant(stiff, dim=2, inputs=1)
+
+
+def near(x: Tensor, t: Tensor) -> Tensor:
+    """Of degree two, and moving."""
+    return 0.8 - x[:, 0] - 0.2 * x[:, 0] ** 2 + 0.1 * (3 * t).sin()
+
+
+def slow(x: Tensor, t: Tensor) -> Tensor:
+    """Of degree one, and moving."""
+    return 1.5 - x[:, 1] + 0.2 * x[:, 0] ** 2 - 0.3 * t
+
+
+def advanced(x: Tensor, u: Tensor, hold: float) -> Tensor:
+    """Classical Runge-Kutta, once."""
+    a = stiff(x, u)
+    b = stiff(x + hold / 2 * a, u)
+    c = stiff(x + hold / 2 * b, u)
+    d = stiff(x + hold * c, u)
+    return x + hold * (a / 6 + b / 3 + c / 3 + d / 6)
+
+
+def level(h: Any, degree: int, decay: float, margin: float, x: Tensor, t: Tensor) -> Tensor:
+    """phi: h less the margin, or its rate at rest and decay times that."""
+    if degree == 1:
+        return h(x, t) - margin
+    x, t = x.detach().requires_grad_(), t.detach().requires_grad_()
+    value = h(x, t)
+    along_x, along_t = torch.autograd.grad(value.sum(), (x, t))
+    rate = (along_x * stiff(x, torch.zeros_like(x[:, :1]))).sum(-1) + along_t
+    return (rate + decay * (value - margin)).detach()
+
+
+def missing(given: dict[str, Any], x: Tensor, u: Tensor, t: Tensor, hold: float) -> Tensor:
+    """By how much a held control misses what is asked at its end."""
+    middle = advanced(x, u, hold / 2)
+    end = advanced(middle, u, hold / 2)
+    now, half, last = (
+        level(x=at, t=t + later, **given) for at, later in ((x, 0.0), (middle, hold / 2), (end, hold))
+    )
+    dip = ((now + last) / 2 - half).clamp(min=0)
+    return dip + math.exp(-given["decay"] * hold) * (now - dip) - last
+
+
+@pytest.mark.parametrize(("h", "degree", "margin"), [(near, 2, 0.3), (slow, 1, 0.2)])
+def test_the_control_is_the_nearest_that_meets_the_condition_written_out(
+    h: Any, degree: int, margin: float
+) -> None:
+    hold, decay = 0.12, 3.0
+    given = {"h": h, "degree": degree, "decay": decay, "margin": margin}
+    guard = adp.SafetyFilter(lambda x: x[..., :1], PLANT, h, dt=hold, decay=decay, margin=margin)
+    assert guard.degree == (degree,)
+    assert guard.moving
+    x, t = uniform(60, 2, seed=1), uniform(60, low=0.0, high=2.0, seed=2)
+    wanted = 3 + uniform(60, 1, seed=3)
+    found = guard.restrain(x, wanted, t)
+    asked = missing(given, x, wanted, t, hold)
+    assert torch.equal((found.control != wanted)[:, 0], asked > 0)
+    assert 10 < int((asked > 0).sum()) < 55
+    low, high = wanted - 60, wanted.clone()  # one is safe, the other is not
+    for _ in range(60):
+        middle = (low + high) / 2
+        safe = (missing(given, x, middle, t, hold) <= 0).unsqueeze(-1)
+        low, high = torch.where(safe, middle, low), torch.where(safe, high, middle)
+    nearest = torch.where((asked > 0).unsqueeze(-1), low, wanted)
+    torch.testing.assert_close(found.control, nearest, rtol=2e-5, atol=2e-5)
+    torch.testing.assert_close(found.margin[:, 0], h(x, t))
+    assert float(found.slack.max()) < 1e-6
+    # The line at a control has the slope of phi at the end, and its value.
+    normal, least, h_now = guard.inequalities(x, wanted, t)
+    ends = []
+    for other in (wanted - 1e-4, wanted + 1e-4):
+        end = advanced(advanced(x, other, hold / 2), other, hold / 2)
+        ends.append(level(h, degree, decay, margin, end, t + hold))
+    torch.testing.assert_close(normal[:, 0, 0] * hold, (ends[1] - ends[0]) / 2e-4, rtol=1e-5, atol=1e-6)
+    off = least[:, 0] - normal[:, 0, 0] * wanted[:, 0]
+    torch.testing.assert_close(off, asked / hold, rtol=1e-9, atol=1e-9)
+    assert torch.equal(h_now[:, 0], found.margin[:, 0])
+
+
+def test_the_slack_is_how_much_further_a_control_would_have_to_reach() -> None:
+    def fast(x: Tensor, t: Tensor) -> Tensor:
+        return 0.5 - x[:, 1]
+
+    for weight in (1.0, 4.0):
+        guard = adp.SafetyFilter(
+            lambda x: x[..., :1], LINE, fast, dt=0.1, decay=2.0, low=-1.0, high=1.0, weight=[weight]
+        )
+        x = tensor([[0.0, 0.45], [0.0, 0.9], [0.0, 0.0]])
+        found = guard.restrain(x, tensor([[1.0], [1.0], [1.0]]))
+        # x2 + 0.1 u <= 0.5 - e^-0.2 (0.5 - x2)
+        most = (0.5 - math.exp(-0.2) * (0.5 - x[:, 1]) - x[:, 1]) / 0.1
+        torch.testing.assert_close(found.control[:, 0], most.clamp(-1, 1))
+        torch.testing.assert_close(found.slack, (-1 - most).clamp(min=0) * weight**0.5, rtol=1e-9, atol=1e-12)
+
+
+def test_rows_of_any_dimensions_are_rows_with_a_time_of_their_own() -> None:
+    guard = adp.SafetyFilter(lambda x: 3 + x[..., :1], PLANT, [near, slow], dt=0.1, decay=[2.0, 5.0])
+    x, t = uniform(12, 2, seed=4), uniform(12, low=0.0, high=2.0, seed=5)
+    flat, margins = guard.restrain(x, 3 + x[:, :1], t), guard.margins(x, t)
+    assert flat.control.shape == (12, 1)
+    torch.testing.assert_close(margins, torch.stack((near(x, t), slow(x, t)), dim=-1))
+    for shape in ((3, 2, 2),):
+        deep, at = x.reshape(*shape, 2), t.reshape(shape)
+        found = guard.restrain(deep, 3 + deep[..., :1], at)
+        assert found.control.shape == (*shape, 1)
+        assert found.margin.shape == (*shape, 2)
+        assert found.slack.shape == shape
+        for one, other in zip(found, flat, strict=True):
+            torch.testing.assert_close(one.reshape(other.shape), other, rtol=1e-12, atol=1e-12)
+        torch.testing.assert_close(guard.margins(deep, at).reshape(12, 2), margins)
+        torch.testing.assert_close(guard(deep, at), found.control)
+    torch.testing.assert_close(guard(x[3], float(t[3])), flat.control[3])
+    torch.testing.assert_close(guard.margins(x, 0.0), guard.margins(x))
+    assert guard.margins(x[3], float(t[3])).shape == (2,)
+    for wrong in ({"x": x[:, :1]}, {"u": x}):
+        with pytest.raises(ValueError, match=rf"`SafetyFilter\({next(iter(wrong))}=...\)`"):
+            guard.restrain(**{"x": x, "u": x[:, :1], "t": 0.0} | wrong)
+
+
+def test_a_report_is_that_of_every_step_of_the_loop() -> None:
+    def rising(x: Tensor, t: Tensor) -> Tensor:
+        return 0.6 - x[:, 0] + 0.1 * t
+
+    given: dict[str, Any] = {"dt": 0.1, "decay": 3.0, "low": -1.0, "high": 1.0}
+    want = lambda x: 2 - x[..., :1] - x[..., 1:]  # noqa: E731
+    guard = adp.SafetyFilter(want, LINE, [rising, lambda x, t: 1.5 - x[:, 1]], **given)
+    x0 = tensor([[0.0, 0.0], [0.3, 1.4], [0.5, 1.6], [-1.0, 0.2], [-9.0, 0.0]])
+    run = adp.simulate(guard, LINE, COST, x0, steps=4, every=2, compile=False)
+    report = guard.report(run)
+    x, least, most, acted = x0, [], [], 0
+    for k in range(4):
+        t = torch.full((5,), 0.1 * k, dtype=torch.float64)
+        found = guard.restrain(x, want(x), t)
+        least.append(torch.minimum(rising(x, t), 1.5 - x[:, 1]))
+        most.append(found.slack)
+        acted += int((found.control != want(x).clamp(-1, 1)).sum())
+        x = x + 0.1 * torch.cat((x[:, 1:] + 0.05 * found.control, found.control), dim=-1)
+    torch.testing.assert_close(x, run.state[:, -1], rtol=1e-9, atol=1e-9)
+    least.append(torch.minimum(rising(x, tensor(0.4)), 1.5 - x[:, 1]))
+    smallest, largest = torch.stack(least).amin(0), torch.stack(most).amax(0)
+    assert report["minimum_margin"] == pytest.approx(float(smallest.min()), abs=1e-9)
+    assert report["constraint_violations"] == int((smallest < 0).sum())
+    assert report["infeasible"] == (largest > 1e-6).nonzero().flatten().tolist()
+    assert report["largest_slack"] == pytest.approx(float(largest.max()), rel=1e-6)
+    assert report["acted"] == pytest.approx(acted / 20)
+    assert 0 < report["constraint_violations"] < 5
+    assert 0 < len(report["infeasible"]) < 5
+    assert 0 < acted < 20
+
+
+def test_what_stands_behind_it_has_its_own_columns_and_value() -> None:
+    learner = adp.ActorCritic(adp.QuadraticBasis(2), LINE, COST, adp.RandomPoints(1, half_width=0.5))
+    inner = adp.SafetyFilter(adp.LQR(LINE, COST), LINE, lambda x, t: x[:, 0] + 9.0, dt=0.05)
+    outer = adp.SafetyFilter(inner, LINE, lambda x, t: x[:, 0] + 0.1, dt=0.05)
+    x0 = tensor([[1.0, -1.0], [0.2, -0.5]])
+    run = adp.simulate(outer, LINE, COST, x0, steps=3, compile=False)
+    assert run.identifier.shape[-1] == 8
+    alone = adp.SafetyFilter(adp.LQR(LINE, COST), LINE, lambda x, t: x[:, 0] + 0.1, dt=0.05)
+    other = adp.simulate(alone, LINE, COST, x0, steps=3, compile=False)
+    assert torch.equal(run.state, other.state)
+    assert outer.report(run) == alone.report(other)
+    assert run.identifier[:, -1, 0].tolist() == [3.0, 3.0]  # steps that the inner one counts
+    guard = adp.SafetyFilter(learner, LINE, lambda x, t: x[:, 0] + 0.1, dt=0.05)
+    assert guard.draws == learner.draws
+    carried = guard.init(x0)
+    assert carried.identifier[:, -4:].tolist() == [[0.0, math.inf, 0.0, 0.0]] * 2
+    value = learner.value(x0, learner.init(x0))
+    assert value is not None
+    torch.testing.assert_close(guard.value(x0, carried), value)
+    assert guard.label == f"filtered {learner.label}"
+    assert guard.period == guard.hold == 0.05
+
+
+def test_a_decay_of_one_over_the_hold_is_taken_and_more_where_the_degree_is_one() -> None:
+    adp.SafetyFilter(lambda x: x[..., :1], LINE, lambda x, t: x[:, 0], dt=0.125, decay=8.0)
+    adp.SafetyFilter(lambda x: x[..., :1], LINE, lambda x, t: x[:, 1], dt=0.125, decay=80.0)
+    both = [lambda x, t: x[:, 0], lambda x, t: x[:, 1]]
+    assert adp.SafetyFilter(lambda x: x[..., :1], LINE, both, dt=0.125, decay=[8.0, 80.0]).degree == (2, 1)
+    with pytest.raises(ValueError, match="must be at most 1/dt = 8 where"):
+        adp.SafetyFilter(lambda x: x[..., :1], LINE, both, dt=0.125, decay=[8.1, 1.0])
+
+
+def test_degrees_may_be_stated_for_all_or_each() -> None:
+    both = [lambda x, t: 1 - x[:, 0], lambda x, t: 1 - x[:, 1]]
+    for degree, found in ((1, (1, 1)), ([2, 1], (2, 1)), ([1, 2], (1, 2)), ((2, 2), (2, 2))):
+        assert adp.SafetyFilter(lambda x: x[..., :1], LINE, both, dt=0.1, degree=degree).degree == found
+    for wrong in (0, 3, [1], [1, 2, 1], [1, 3], []):
+        with pytest.raises(
+            ValueError, match=r"`SafetyFilter\(degree=...\)` must be 1 or 2, one a constraint"
+        ):
+            adp.SafetyFilter(lambda x: x[..., :1], LINE, both, dt=0.1, degree=wrong)
+    third = systems.Linear([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0] * 3], [[0.0], [0.0], [1.0]])
+    with pytest.raises(ValueError, match="neither first nor second derivative of number 1, at 160 states"):
+        adp.SafetyFilter(lambda x: x[..., :1], third, [lambda x, t: x[:, 2], lambda x, t: x[:, 0]], dt=0.1)
+
+
+@pytest.mark.parametrize("begin", [0.05, 0.5, 5.0, 50.0])
+def test_what_depends_on_the_time_is_found_whenever_it_begins_to(begin: float) -> None:
+    guard = adp.SafetyFilter(
+        lambda x: x[..., :1], LINE, lambda x, t: 1 - x[:, 1] + (t - begin).clamp(min=0), dt=0.1
+    )
+    assert guard.moving
+    assert not adp.SafetyFilter(lambda x: x[..., :1], LINE, lambda x, t: 1 - x[:, 1] + 0 * t, dt=0.1).moving
+
+
+@pytest.mark.parametrize(
+    ("stated", "most"), [({}, 0.3), ({"low": -0.2, "high": 0.2}, 0.2), ({"low": -1.0}, 5.0)]
+)
+def test_bounds_of_the_plant_hold_where_the_filter_states_none(stated: dict[str, float], most: float) -> None:
+    plant = systems.Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
+    plant.bounds = systems.Bounds(-0.3, 0.3, 1)
+    shield = adp.SafetyFilter(lambda x: 5.0 + 0 * x[..., :1], plant, wall, dt=0.01, **stated)
+    assert shield(tensor([[1.0, 0.0]])).tolist() == [[most]]
