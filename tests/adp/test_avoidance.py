@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 from helpers import tensor, uniform
+from helpers_swingup import cost_of as cost_along
 from torch import Tensor
 
 from staf_torch import adp, systems
@@ -32,47 +33,89 @@ def test_the_penalty_is_that_of_the_papers_outside_the_radius_of_avoidance() -> 
     torch.testing.assert_close(cost.state_rate(x), x.square().sum(-1) + 2 * published, rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize("kind", ["penalty", "log"])
-def test_the_rate_is_smooth_grows_inward_and_is_nothing_beyond_the_reach(kind: str) -> None:
-    cost = cost_of(kind=kind)
-    h = torch.linspace(-0.3, 0.6, 4001, dtype=torch.float64)
-    paid = cost.penalty(h)
-    assert bool((paid[h >= cost.reach] == 0).all())
-    assert bool((paid.diff()[h[1:] < cost.reach - 1e-3] < 0).all())
-    edge = tensor([0.01 * cost.reach])
-    slope = torch.func.grad(lambda h: cost.penalty(h).sum())
-    torch.testing.assert_close(slope(edge * (1 - 1e-9)), slope(edge * (1 + 1e-9)), rtol=1e-6, atol=0)
-    half = tensor([0.5 * cost.reach])
-    assert float(cost.penalty(half)) == pytest.approx(1.0 if kind == "penalty" else 0.480453, abs=1e-6)
+FORMULAS = {"penalty": lambda q: (1 / q - 1) ** 2, "log": lambda q: q.log() ** 2}
 
 
-def test_plans_touch_what_they_may_and_pay_as_their_weight_vanishes() -> None:
+@pytest.mark.parametrize("kind", FORMULAS)
+def test_the_penalty_is_its_formula_and_its_taylor_series_below_a_hundredth_of_the_reach(kind: str) -> None:
+    cost, formula, at = cost_of(kind=kind, reach=0.5), FORMULAS[kind], tensor(0.01)
+    q = torch.linspace(0.01, 1.0, 50, dtype=torch.float64)
+    torch.testing.assert_close(cost.penalty(0.5 * q), formula(q))
+    slope, bend = torch.func.grad(formula)(at), torch.func.grad(torch.func.grad(formula))(at)
+    below = torch.linspace(-2.0, 0.00999, 50, dtype=torch.float64)
+    wanted = formula(at) + slope * (below - at) + 0.5 * bend * (below - at) ** 2
+    torch.testing.assert_close(cost.penalty(0.5 * below), wanted)
+    assert not bool(cost.penalty(torch.linspace(0.5, 4.5, 20).double()).any())
+    assert cost.penalty((0.5 * q).float()).dtype == torch.float32
+
+
+def test_every_obstacle_counts_with_the_weight_for_any_leading_dimensions() -> None:
+    x = uniform(4, 3, 2, seed=1)
+    several = [beside, lambda x: x[..., 0] + 0.7, lambda x: 0.9 - x[..., 0]]
+    for weight in (1.0, 3.0):
+        cost = cost_of(obstacles=several, weight=weight)
+        paid = x.square().sum(-1) + weight * sum(cost.penalty(h(x)) for h in several)
+        torch.testing.assert_close(cost.state_rate(x), paid)
+        torch.testing.assert_close(cost.outside(x), torch.stack([h(x) for h in several]).amin(0))
+
+
+def slow(x: Tensor) -> Tensor:
     """A speed limit on the way home, which the optimum would exceed."""
+    return x[..., 1] + 0.4
 
-    def slow(x: Tensor) -> Tensor:
-        return x[..., 1] + 0.4
 
-    cost = adp.AvoidanceCost(
-        1.0, 1.0, dim=2, inputs=1, low=-1.0, high=1.0, obstacles=slow, reach=0.3, kind="log"
-    )
-    x0 = tensor([[2.0, 0.0]])
-    found = adp.plan_around(LINE, cost, x0, dt=0.3, steps=16, shrink=(1.0, 0.01), iterations=8, compile=False)
-    assert bool((found.margin > 0).all())
-    assert bool((found.margin < 0.03).all())
+@pytest.fixture(scope="module")
+def plans() -> tuple[adp.AvoidanceCost, dict[tuple[float, ...], adp.AvoidancePlans]]:
+    """From two starts, by what their weights shrink."""
+    limited = {"low": -1.0, "high": 1.0, "obstacles": slow, "reach": 0.3, "kind": "log"}
+    cost = adp.AvoidanceCost(1.0, 1.0, dim=2, inputs=1, **limited)  # type: ignore[arg-type]
+    x0, given = tensor([[2.0, 0.0], [-1.5, 0.5]]), {"dt": 0.3, "steps": 16, "iterations": 8, "compile": False}
+    return cost, {
+        shrink: adp.plan_around(LINE, cost, x0, shrink=shrink, **given)  # type: ignore[arg-type]
+        for shrink in ((1.0,), (1.0, 0.01))
+    }
+
+
+def test_plans_touch_what_they_may_and_pay_as_their_weight_vanishes(
+    plans: tuple[adp.AvoidanceCost, dict[tuple[float, ...], adp.AvoidancePlans]],
+) -> None:
+    cost, found = plans
+    heavy, light = found[1.0,], found[1.0, 0.01]
+    assert bool((light.margin[:1] > 0).all())
+    assert bool((light.margin[:1] < 0.03).all())
     assert float(cost.weight) == 1.0
-    assert float(found.trajectories.control.abs().max()) <= 1
+    assert float(light.trajectories.control.abs().max()) <= 1
+    assert bool((light.cost <= heavy.cost).all())
+    assert bool((light.cost < 0.99 * heavy.cost).any())
 
 
-def test_the_cheapest_plan_that_touches_nothing_stands_whatever_its_weight() -> None:
-    def plans(name: float, cost: list[float]) -> adp.AvoidancePlans:
-        rows = torch.full((4,), name, dtype=torch.float64)
-        parts = [rows[:, None, None], rows[:, None, None], rows[:, None], rows[:, None], rows, rows, rows > 0]
-        return adp.AvoidancePlans(Trajectories(*parts), tensor(cost), rows)
+def test_a_plan_is_paid_without_its_obstacles_and_is_that_of_its_start_alone(
+    plans: tuple[adp.AvoidanceCost, dict[tuple[float, ...], adp.AvoidancePlans]],
+) -> None:
+    cost, several = plans
+    found = several[1.0,]
+    state, control = found.trajectories.state, found.trajectories.control
+    free = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1, low=-1.0, high=1.0)
+    problem = adp.SampledProblem.of(LINE, free, dt=0.3)
+    torch.testing.assert_close(found.cost, cost_along(problem, state[:, 0], control))
+    torch.testing.assert_close(found.margin, slow(state).amin(-1))
+    given = {"dt": 0.3, "steps": 16, "iterations": 8, "compile": False, "shrink": (1.0,)}
+    alone = adp.plan_around(LINE, cost, state[1:, 0], **given)  # type: ignore[arg-type]
+    torch.testing.assert_close(alone.trajectories.state[0], state[1], rtol=1e-9, atol=1e-9)
 
-    heavy, light = plans(1.0, [1.0, torch.inf, 3.0, torch.inf]), plans(2.0, [2.0, 5.0, torch.inf, torch.inf])
-    found = heavy.or_cheaper(light)
-    assert found.cost.tolist() == [1.0, 5.0, 3.0, torch.inf]
-    assert found.margin.tolist() == found.trajectories.state.flatten().tolist() == [1.0, 2.0, 1.0, 2.0]
+
+def test_of_two_ways_around_a_disc_the_cheaper_one_is_found() -> None:
+    """One start lies above the middle of the disc, seen from the goal, and one below."""
+    plane = systems.Linear(torch.zeros(2, 2).tolist(), torch.eye(2).tolist())
+    disc = {"obstacles": lambda x: (x - tensor([1.0, 0.1])).square().sum(-1) - 0.16, "reach": 0.2}
+    cost = adp.AvoidanceCost(1.0, 1.0, dim=2, inputs=2, low=-1.0, high=1.0, **disc)  # type: ignore[arg-type]
+    given = {"dt": 0.25, "steps": 10, "iterations": 8, "compile": False, "shrink": (1.0,)}
+    found = adp.plan_around(plane, cost, tensor([[2.0, 0.5], [2.0, -0.1]]), **given)  # type: ignore[arg-type]
+    assert bool((found.margin >= 0).all())
+    x, y = found.trajectories.state.unbind(-1)
+    passed = y.gather(1, (x - 1).abs().argmin(1, keepdim=True))[:, 0]
+    assert float(passed[0]) > 0.4
+    assert float(passed[1]) < -0.2
 
 
 @pytest.mark.parametrize(
@@ -82,6 +125,7 @@ def test_the_cheapest_plan_that_touches_nothing_stands_whatever_its_weight() -> 
         ({"weight": -1.0}, r"`AvoidanceCost\(weight=...\)` must be positive"),
         ({"kind": "wall"}, "must be one of 'penalty', 'log'; got 'wall'"),
         ({"obstacles": []}, r"must be h\(x\) or a list of them"),
+        ({"obstacles": [beside, 1.0]}, r"must be h\(x\) or a list of them"),
     ],
 )
 def test_what_breaks_a_rule_is_refused(given: dict[str, object], message: str) -> None:
@@ -93,11 +137,3 @@ def test_what_breaks_a_rule_is_refused(given: dict[str, object], message: str) -
         adp.plan_around(LINE, cost_of(), tensor([[3.0, 0.0]]), dt=0.1, steps=4, shrink=(0.0,), compile=False)
     with pytest.raises(ValueError, match=r"`plan_around\(shrink=...\)` must have at least one share"):
         adp.plan_around(LINE, cost_of(), tensor([[3.0, 0.0]]), dt=0.1, steps=4, shrink=())
-
-
-def test_the_nearest_obstacle_is_found_for_any_leading_dimensions() -> None:
-    cost = adp.AvoidanceCost(
-        1.0, 1.0, dim=2, inputs=2, obstacles=[lambda x: x[..., 0], lambda x: x[..., 1] + 0.1], reach=1.0
-    )
-    x = uniform(3, 4, 2, seed=1)
-    assert torch.equal(cost.outside(x), torch.minimum(x[..., 0], x[..., 1] + 0.1))

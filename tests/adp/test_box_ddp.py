@@ -183,34 +183,6 @@ def test_compiled_passes_and_the_whole_search_as_one_program_find_what_plain_tor
     assert bool(found.converged.any()) is (iterations > 1)
 
 
-def test_problem_of_a_plant_and_a_cost_pays_what_the_simulation_pays() -> None:
-    plant = systems.Pendulum()
-    cost = adp.QuadraticCost(1.0, 0.1, dim=2, inputs=1, low=-3.0, high=5.0)
-    problem = adp.SampledProblem.of(plant, cost, dt=0.05)
-    x = torch.tensor([[0.3, -0.2]], dtype=torch.float64)
-    run = adp.simulate(adp.Feedback(problem.linear_feedback), plant, cost, x, dt=0.05, steps=20)
-    spent = torch.zeros(1, dtype=torch.float64)
-    for _ in range(20):
-        x, paid = problem.advance(x, problem.linear_feedback(x))
-        spent = spent + paid
-    torch.testing.assert_close(run.cost, spent, rtol=1e-12, atol=0)
-    torch.testing.assert_close(run.state[:, -1], x, rtol=1e-12, atol=1e-14)
-
-
-def pushed(x: Tensor, u: Tensor) -> Tensor:
-    return torch.stack((x[:, 0] + 0.1 * x[:, 1], x[:, 1] + 0.1 * u[:, 0]), dim=-1)
-
-
-def test_plant_in_steps_pays_its_period_times_the_rate() -> None:
-    plant = systems.StepPlant(pushed, dim=2, inputs=1, dt=0.1, low=-1.0, high=1.0)
-    problem = adp.SampledProblem.of(plant, adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1))
-    u = torch.tensor([[0.5], [-1.0]], dtype=torch.float64)
-    for mine, known in zip(problem.advance(X0, u), BOUNDED.advance(X0, u), strict=True):
-        torch.testing.assert_close(mine, known)
-    torch.testing.assert_close(problem.p, BOUNDED.p)
-    assert problem.bounds.high.tolist() == [1.0]
-
-
 def numpy_plant() -> systems.StepPlant:
     return systems.StepPlant(lambda x, u: x + 0.1 * np.tanh(np.asarray(u)), dim=1, inputs=1, dt=0.1)
 
