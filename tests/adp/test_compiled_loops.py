@@ -6,6 +6,8 @@ import copy
 import dataclasses
 import logging
 from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -21,13 +23,13 @@ from staf_torch import (
     StateRadius,
     adp,
     ball,
+    lanes,
     rings,
     systems,
 )
-from staf_torch.adp.closed_loop import ClosedLoop, LoopState, program, row_gains
-from staf_torch.lanes import compiler
-from staf_torch.lanes import program as programs
 
+PLAIN = "runs in plain torch, slower:"
+Case = tuple[adp.Controller, systems.ControlAffineSystem, adp.Cost]
 CLOSE = 1e-11  # of a number's size, after a few steps from equal states
 
 
@@ -52,19 +54,19 @@ def quadratic(plant: systems.ControlAffineSystem) -> adp.QuadraticCost:
 
 def of_lqr(
     plant: systems.ControlAffineSystem,
-) -> tuple[adp.Controller, systems.ControlAffineSystem, adp.Cost]:
+) -> Case:
     cost = quadratic(plant)
     return adp.Feedback(adp.LQR(plant, cost)), plant, cost
 
 
-def rollout() -> tuple[adp.Controller, systems.ControlAffineSystem, adp.Cost]:
+def rollout() -> Case:
     lqr = adp.LQR(PLANT, COST)  # as in `test_adp_rollout.py`, whose program serves here too
     basis = StaFBasis(ExponentialKernel(), StateFollowingCenters(rings(6), 0.1))
     policy = adp.RolloutPolicy(basis, PLANT, COST, lqr, lqr.value, horizon=0.5, steps=5)
     return adp.Feedback(policy), PLANT, COST
 
 
-def three_states() -> tuple[adp.Controller, systems.ControlAffineSystem, adp.Cost]:
+def three_states() -> Case:
     plant = systems.ThreeState()
     centers = StateFollowingCenters(ball(8, 3), StateRadius(0.7, 0.0, 2.0))  # as in `test_adp_laws.py`
     basis = adp.StaFValueBasis(StaFBasis(AnchoredKernel(ExponentialKernel()), centers))
@@ -72,26 +74,22 @@ def three_states() -> tuple[adp.Controller, systems.ControlAffineSystem, adp.Cos
     return adp.ActorCritic(basis, plant, cost, adp.RandomPoints(1, 0.24)), plant, cost
 
 
-def policy_iteration() -> tuple[adp.Controller, systems.ControlAffineSystem, adp.Cost]:
+def policy_iteration() -> Case:
     basis = staf_basis("total", AnchoredKernel(GaussianKernel(4.0)))  # as in `test_policy_iteration.py`
     points, start = adp.QuadraturePoints(3, 2, half_width=0.2), basis.weights_near_square()
     law = adp.PolicyIteration()
     return adp.ActorCritic(basis, PLANT, COST, points, law, critic=start, actor=start), PLANT, COST
 
 
-def of_basis(
-    basis: adp.ValueBasis, points: adp.Extrapolation, law: adp.ActorCriticLaw | None = None
-) -> tuple[adp.Controller, systems.ControlAffineSystem, adp.Cost]:
+def of_basis(basis: adp.ValueBasis, points: adp.Extrapolation, law: adp.ActorCriticLaw | None = None) -> Case:
     return adp.ActorCritic(basis, PLANT, COST, points, law), PLANT, COST
 
 
-def learned(
-    law: adp.ActorCriticLaw, points: adp.Extrapolation | None = None
-) -> tuple[adp.Controller, systems.ControlAffineSystem, adp.Cost]:
+def learned(law: adp.ActorCriticLaw, points: adp.Extrapolation | None = None) -> Case:
     return learner(law, points), PLANT, COST
 
 
-CASES: dict[str, Callable[[], tuple[adp.Controller, systems.ControlAffineSystem, adp.Cost]]] = {
+CASES: dict[str, Callable[[], Case]] = {
     "information": lambda: learned(adp.Information()),
     "frozen, partial gradient": lambda: of_basis(
         staf_basis("partial"), adp.RandomPoints(1, BOX), adp.Frozen()
@@ -117,78 +115,80 @@ CASES: dict[str, Callable[[], tuple[adp.Controller, systems.ControlAffineSystem,
 }
 
 
-def start(case: str, rows: int) -> tuple[ClosedLoop, LoopState, Tensor]:
-    controller, plant, cost = CASES[case]()
-    loop = ClosedLoop(controller, plant, cost, dt=0.02 if case == "policy iteration" else 0.001)
-    dim = cost.q.shape[0]
-    x0 = uniform(rows * dim, 0.5).reshape(-1, dim)[:rows]
-    generator = torch.Generator().manual_seed(1)
-    draws = 2 * torch.rand(rows, 10, controller.draws, dim, dtype=torch.float64, generator=generator) - 1
-    return loop, loop.init(x0), draws
+def run(case: Case, x0: Tensor, compile: bool, **given: Any) -> adp.LoopResult:
+    controller, plant, cost = case
+    settings = {"dt": 0.001, "steps": 10} | given
+    return adp.simulate(controller, plant, cost, x0, compile=compile, **settings)
 
 
-def leaves(state: LoopState) -> list[Tensor]:
-    return [*state[:4], *state.carried]
+def states(case: Case, rows: int) -> Tensor:
+    dim = case[2].dim
+    return uniform(rows * dim, 0.5).reshape(-1, dim)[:rows]
+
+
+def fields(result: adp.LoopResult) -> list[Tensor]:
+    return [getattr(result, field.name) for field in dataclasses.fields(result)]
 
 
 @pytest.mark.needs_compiler
-@pytest.mark.parametrize("case", CASES)
-def test_compiled_steps_are_those_of_the_definition(case: str) -> None:
-    loop, state, draws = start(case, 65)
-    steps = program(loop, True)
-    assert steps.compiles(state, draws)
-    after, out = steps(state, draws)
-    wanted, recorded = steps.definition(state, draws)
-    for got, want in zip((*leaves(after), *out), (*leaves(wanted), *recorded), strict=True):
+@pytest.mark.parametrize("name", CASES)
+def test_compiled_steps_are_those_of_the_definition(name: str, caplog: pytest.LogCaptureFixture) -> None:
+    case = CASES[name]()
+    dt, x0 = 0.02 if name == "policy iteration" else 0.001, states(case, 33)
+    fast, plain = (run(case, x0, compile, dt=dt) for compile in (True, False))
+    assert PLAIN not in caplog.text
+    for got, want in zip(fields(fast), fields(plain), strict=True):
         torch.testing.assert_close(got, want, rtol=CLOSE, atol=CLOSE, equal_nan=True)
 
 
 @pytest.mark.needs_compiler
-@pytest.mark.parametrize("case", ["information", "rollout"])
-def test_a_row_has_the_same_bits_at_every_batch_and_beside_every_neighbour(case: str) -> None:
-    loop, state, draws = start(case, 1000)
-    steps = program(loop, True)
-    whole = leaves(steps(state, draws)[0])
+@pytest.mark.parametrize("name", ["information", "rollout"])
+def test_a_row_has_the_same_bits_at_every_batch_and_beside_every_neighbour(name: str) -> None:
+    case = CASES[name]()
+    x0 = states(case, 200)
+    whole = fields(run(case, x0, True))[1:]
     for rows in (1, 7, 64):
-        part = loop.init(state.x[:rows])
-        for one, all_ in zip(leaves(steps(part, draws[:rows])[0]), whole, strict=True):
-            assert torch.equal(one, all_[:rows])
-    x0 = state.x.clone()
-    x0[1::2] = torch.tensor([float("nan"), 1e300], dtype=torch.float64)
-    beside = leaves(steps(loop.init(x0), draws)[0])
-    for one, all_ in zip(beside, whole, strict=True):
-        assert torch.equal(one[::2], all_[::2])
-    assert not beside[2][1::2].any()
+        for one, every in zip(fields(run(case, x0[:rows], True))[1:], whole, strict=True):
+            assert torch.equal(one.nan_to_num(), every[:rows].nan_to_num())
+    lost = x0.clone()
+    lost[1::2] = torch.tensor([float("nan"), 1e300], dtype=torch.float64)
+    beside = run(case, lost, True)
+    for one, every in zip(fields(beside)[1:], whole, strict=True):
+        assert torch.equal(one[::2].nan_to_num(), every[::2].nan_to_num())
+    assert beside.diverged.tolist() == [False, True] * 100
 
 
-def test_a_compiled_run_is_that_of_the_definition(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("staf_torch.adp.simulation._DRAWN_AHEAD", 170)  # a piece of 165 steps, and the rest
-    x0 = uniform(3, 1.0)
-    settings = {"dt": 0.01, "steps": 220, "every": 55}
-    fast = adp.simulate(learner(adp.Information()), PLANT, COST, x0, compile=True, **settings)
-    plain = adp.simulate(learner(adp.Information()), PLANT, COST, x0, compile=False, **settings)
-    for field in dataclasses.fields(fast):
-        got, want = getattr(fast, field.name), getattr(plain, field.name)
-        torch.testing.assert_close(got, want, rtol=1e-9, atol=1e-12, equal_nan=True)
+def test_a_compiled_run_in_pieces_is_that_of_the_definition() -> None:
+    x0 = uniform(2, 1.0)
+    fast, plain = (
+        run(learned(adp.Information()), x0, c, dt=0.01, steps=1100, every=55) for c in (True, False)
+    )
+    for got, want in zip(fields(fast), fields(plain), strict=True):
+        torch.testing.assert_close(got, want, rtol=1e-8, atol=1e-12, equal_nan=True)
 
 
 @pytest.mark.needs_compiler
-def test_loops_that_differ_in_gains_and_tensors_share_one_text(monkeypatch: pytest.MonkeyPatch) -> None:
-    loop, state, draws = start("information", 5)
-    first = program(loop, True)
-    assert first.compiles(state, draws)
-    assert program(loop, True) is first
-    monkeypatch.setattr(programs, "trace", None)
-    monkeypatch.setattr(compiler, "_build", None)
-    for gain in (0.5, 1.0, 2.0, 0.3):  # 1 and powers of two, which a text may spell out
-        other = copy.deepcopy(loop)
-        other.controller.law.gains = adp.Gains(critic_extrapolated=gain, actor=gain)
-        other.controller.basis.basis.centers.directions.mul_(gain)
-        steps = program(other, True)
-        assert steps is not first
-        assert steps.compiles(state, draws)
-        for got, want in zip(steps(state, draws)[1], steps.definition(state, draws)[1], strict=True):
-            torch.testing.assert_close(got, want, rtol=1e-9, atol=1e-12, equal_nan=True)
+def test_loops_that_differ_in_gains_and_tensors_share_one_program(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Own(systems.TwoState):
+        """A plant that no other test compiles."""
+
+        def drift(self, x: Tensor) -> Tensor:
+            return 1.01 * super().drift(x)
+
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    built, x0 = [], uniform(3, 1.0)
+    for gain in (0.7, 0.5, 1.0, 2.0):  # 1 and powers of two, which a text may spell out
+        law = adp.Information(adp.Gains(critic=gain, critic_extrapolated=gain, forgetting=0.01 * gain))
+        basis = staf_basis()
+        basis.basis.centers.directions.mul_(gain)
+        case = adp.ActorCritic(basis, Own(), COST, adp.RandomPoints(1, BOX), law), Own(), COST
+        fast, plain = (run(case, x0, compile) for compile in (True, False))
+        torch.testing.assert_close(fast.actor_weights, plain.actor_weights, rtol=1e-9, atol=1e-12)
+        built.append(sorted(path.name for path in tmp_path.rglob("*.so")))
+    assert built[0]
+    assert built[1:] == built[:1] * 3
 
 
 class Branching(systems.TwoState):
@@ -196,75 +196,63 @@ class Branching(systems.TwoState):
         return super().drift(x) * (2.0 if bool(x.sum() > 1e9) else 1.0)
 
 
-@pytest.mark.needs_compiler
-@pytest.mark.parametrize("reason", ["no compiler", "reads a value of a row"])
-def test_what_cannot_be_compiled_runs_in_plain_torch_with_one_line(
-    reason: str, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def refuse(_: str) -> object:
-        raise OSError("no compiler")
+class Another(systems.TwoState):
+    """A plant that no other test compiles."""
 
+    def drift(self, x: Tensor) -> Tensor:
+        return 1.0 * super().drift(x) + 0.0 * x.sin()
+
+
+@pytest.mark.needs_compiler
+@pytest.mark.parametrize("reason", ["is on the path", "reads a value of a row"])
+def test_what_cannot_be_compiled_runs_in_plain_torch_with_one_line(
+    reason: str, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     plant: systems.ControlAffineSystem = Branching()
-    if reason == "no compiler":
-        plant = systems.TwoState()
-        monkeypatch.setattr(compiler, "function", refuse)
+    if reason == "is on the path":
+        plant = Another()
+        for name, value in (("PATH", tmp_path), ("CXX", tmp_path / "none"), ("XDG_CACHE_HOME", tmp_path)):
+            monkeypatch.setenv(name, str(value))
     lqr, x0 = adp.Feedback(adp.LQR(PLANT, COST)), uniform(2, 1.0)
     settings = {"dt": 0.013, "steps": 40, "every": 20}
     with caplog.at_level(logging.WARNING):
-        run = adp.simulate(lqr, plant, COST, x0, compile=True, **settings)
-    plain = adp.simulate(lqr, PLANT, COST, x0, compile=False, **settings)
-    torch.testing.assert_close(run.state, plain.state, rtol=0, atol=0)
+        fast = run((lqr, plant, COST), x0, True, **settings)
+    plain = run((lqr, plant, COST), x0, False, **settings)
+    torch.testing.assert_close(fast.state, plain.state, rtol=0, atol=0)
     (line,) = [record.getMessage() for record in caplog.records]
-    assert line.startswith("the closed loop runs in plain torch, slower:")
+    assert line.startswith(f"the closed loop {PLAIN}")
     assert reason in line
 
 
 @pytest.mark.needs_compiler
-def test_rows_with_gains_of_their_own_are_compiled_and_are_those_rows_alone() -> None:
+def test_rows_with_gains_of_their_own_are_compiled_and_are_those_rows_alone(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     x0, critic = uniform(3, 1.0), torch.tensor([[0.1], [0.2], [0.4]], dtype=torch.float64)
 
-    def run(gain: float | Tensor, rows: slice, compile: bool) -> adp.LoopResult:
+    def learned(gain: float | Tensor, rows: slice, compile: bool) -> adp.LoopResult:
         law = adp.Information(adp.Gains(critic=gain))
         controller = adp.ActorCritic(adp.QuadraticBasis(2), PLANT, COST, adp.RandomPoints(1, 1.0), law)
-        settings = {"dt": 1e-3, "steps": 20, "seed": range(3)[rows], "compile": compile}
-        return adp.simulate(controller, PLANT, COST, x0[rows], **settings)
+        return run((controller, PLANT, COST), x0[rows], compile, steps=20, seed=range(3)[rows])
 
-    whole = run(critic, slice(0, 3), True)
-    torch.testing.assert_close(
-        whole.actor_weights, run(critic, slice(0, 3), False).actor_weights, rtol=CLOSE, atol=CLOSE
-    )
+    whole = learned(critic, slice(0, 3), True)
+    assert PLAIN not in caplog.text
+    plain = learned(critic, slice(0, 3), False)
+    torch.testing.assert_close(whole.actor_weights, plain.actor_weights, rtol=CLOSE, atol=CLOSE)
     for k in range(3):
-        alone = run(float(critic[k]), slice(k, k + 1), False)
+        alone = learned(float(critic[k]), slice(k, k + 1), False)
         torch.testing.assert_close(whole.state[k : k + 1], alone.state, rtol=CLOSE, atol=CLOSE)
-    law = adp.Information(adp.Gains(critic=critic))
-    controller = adp.ActorCritic(adp.QuadraticBasis(2), PLANT, COST, adp.RandomPoints(1, 1.0), law)
-    loop = ClosedLoop(controller, PLANT, COST, dt=1e-3)
-    draws = x0.new_zeros(3, 2, loop.controller.draws, 2)
-    assert program(loop, True).compiles(loop.init(x0), draws, row_gains(loop))
-
-
-def test_a_sweep_over_gains_needs_no_other_program() -> None:
-    basis, x0 = adp.QuadraticBasis(2), uniform(1, 1.0)
-
-    def text(critic: float, beta: float) -> str:
-        law = adp.Information(adp.Gains(critic=critic, forgetting=beta))
-        loop = ClosedLoop(
-            adp.ActorCritic(basis, PLANT, COST, adp.RandomPoints(1, 1.0), law), PLANT, COST, dt=1e-3
-        )
-        given = loop.init(x0), x0.new_zeros(1, 2, 1, 2)
-        return program(loop, True).text(*given)
-
-    assert text(0.3, 0.003) == text(0.7, 0.009)
 
 
 @pytest.mark.needs_compiler
-def test_a_rollout_policy_that_is_asked_often_compiles_itself_and_sees_what_changes() -> None:
+def test_a_compiled_rollout_policy_is_its_definition_and_sees_what_changes() -> None:
     policy = adp.RolloutPolicy.of_lqr(PLANT, COST, steps=4)
     x = uniform(50, 0.5)
-    policy._compiled._asked = float("inf")
+    assert lanes.ready(policy, x)
     torch.testing.assert_close(policy(x), policy.control(x), rtol=CLOSE, atol=CLOSE)
-    assert policy._compiled.compiled
-    assert torch.equal(policy(x[3]), policy(x)[3])
+    for one in (x[:2], x[:1], x[3]):  # of one state a lane has a center, of several a state
+        for _ in range(2):
+            torch.testing.assert_close(policy(one), policy.control(one), rtol=CLOSE, atol=CLOSE)
     for change in (lambda: setattr(policy, "horizon", 0.3), lambda: policy.base.k.mul_(1.1)):
         change()
         torch.testing.assert_close(policy(x), policy.control(x), rtol=CLOSE, atol=CLOSE)
