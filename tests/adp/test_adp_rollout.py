@@ -1,11 +1,20 @@
-"""The rollout policy: one Newton step on the HJB equation."""
+"""Rollout policies, one Newton step on the HJB equation, and the swing-up by energy."""
 
 from __future__ import annotations
 
+import copy
+import math
+import pickle
+from typing import Any
+
 import pytest
 import torch
+from helpers import tensor
+from helpers import uniform as unit
 from helpers_adp import COST, PLANT, uniform
+from torch import Tensor
 
+import staf_torch as st
 from staf_torch import (
     ExponentialKernel,
     GaussianKernel,
@@ -21,10 +30,11 @@ from staf_torch import (
 )
 
 LQR = adp.LQR(PLANT, COST)
+X = unit(3, 2, seed=1)
 
 
 def rollout(
-    plant: systems.ControlAffineSystem = PLANT, kernel: Kernel | None = None, **settings: object
+    plant: systems.ControlAffineSystem = PLANT, kernel: Kernel | None = None, **settings: Any
 ) -> adp.RolloutPolicy:
     cost = settings.pop("cost", COST)
     lqr = adp.LQR(plant, cost)
@@ -32,7 +42,7 @@ def rollout(
     basis = StaFBasis(
         kernel or ExponentialKernel(), StateFollowingCenters(directions, settings.pop("radius", 0.1))
     )
-    return adp.RolloutPolicy(basis, plant, cost, lqr, lqr.value, **settings)
+    return adp.RolloutPolicy(basis, plant, cost, settings.pop("base", lqr), lqr.value, **settings)
 
 
 @torch.no_grad()
@@ -57,6 +67,38 @@ def test_linear_plant_is_left_with_its_lqr() -> None:
     policy = rollout(plant, radius=1e-3)
     x = uniform(20, 2.0)
     torch.testing.assert_close(policy(x), policy.base(x), rtol=1e-4, atol=1e-4)
+
+
+def test_a_rollout_costs_the_integral_along_its_way_and_the_end() -> None:
+    """Of a linear plant under a linear policy, whose integral is known."""
+    plant = systems.Linear([[0.0, 1.0], [-1.0, -0.5]], [[0.0], [1.0]])
+    gain = tensor([[0.3, 0.4]])
+    basis = st.StaFBasis(st.GaussianKernel(), st.StateFollowingCenters(st.rings(6), 0.2))
+    cost = adp.QuadraticCost(2.0, 0.5, dim=2, inputs=1)
+    end = tensor([[3.0, 0.5], [0.5, 1.0]])
+    policy = adp.RolloutPolicy(
+        basis, plant, cost, lambda x: -x @ gain.mT, lambda x: ((x @ end) * x).sum(-1), horizon=0.8, steps=9
+    )
+    closed = plant.matrix - plant.input_matrix @ gain
+    paid = torch.eye(2).double() * 2.0 + 0.5 * gain.mT @ gain
+    times = torch.linspace(0, 0.8, 4001, dtype=torch.float64)
+    flows = torch.linalg.matrix_exp(times[:, None, None] * closed)
+    kernel = torch.trapezoid(flows.mT @ paid @ flows, dx=0.8 / 4000, dim=0) + flows[-1].mT @ end @ flows[-1]
+    x = unit(3, 4, 2, seed=1)
+    torch.testing.assert_close(policy.rollout(x), ((x @ kernel) * x).sum(-1), rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(policy.rollout(x[0, 0]), policy.rollout(x)[0, 0])
+    at = x[0]
+    torch.testing.assert_close(policy.value(at), ((at @ kernel) * at).sum(-1), rtol=1e-3, atol=1e-4)
+    torch.testing.assert_close(policy.gradient(at), 2 * at @ kernel, rtol=2e-2, atol=2e-2)
+    torch.testing.assert_close(policy.control(at), -policy.gradient(at) @ plant.input_matrix / (2 * 0.5))
+
+
+@torch.no_grad()
+def test_rollouts_of_one_state_cost_what_its_riccati_equation_says() -> None:
+    plant, cost = systems.Linear([[-0.5]], [[1.0]]), adp.QuadraticCost(1.0, 1.0, dim=1, inputs=1)
+    value = math.sqrt(0.5**2 + 1) - 0.5  # P of 0 = -2 a P + 1 - P^2
+    policy, x = adp.RolloutPolicy.of_lqr(plant, cost, centers=3, steps=4), tensor([[0.8], [-0.3], [0.05]])
+    torch.testing.assert_close(policy.rollout(x), value * x.square().squeeze(-1), rtol=1e-4, atol=0)
 
 
 @torch.no_grad()
@@ -122,6 +164,21 @@ def test_repetition_approaches_the_optimal_policy() -> None:
 
 
 @torch.no_grad()
+def test_improved_policy_under_hard_bounds_costs_less_than_the_clipped_lqr() -> None:
+    plant = systems.Pendulum()
+    cost = adp.QuadraticCost(1.0, 0.1, 2, 1, low=-6.0, high=9.0)
+    x0 = uniform(40, 0.5, seed=2)
+    paid = {}
+    for policy in (adp.LQR(plant, cost), adp.RolloutPolicy.of_lqr(plant, cost)):
+        run = adp.simulate(adp.Feedback(policy), plant, cost, x0, dt=0.1, steps=40, every=40, compile=False)
+        assert (run.state[:, -1].norm(dim=-1) < 1e-2).all()
+        paid[type(policy).__name__] = run.cost
+    ratio = paid["RolloutPolicy"] / paid["LQR"]
+    assert ratio.mean() < 1.0
+    assert ratio.max() < 1.01
+
+
+@torch.no_grad()
 def test_bounded_policy_respects_its_bound_and_regulates() -> None:
     plant = systems.Pendulum()
     cost = adp.BoundedInputCost(1.0, 0.1, 2, 1, bound=8.0)
@@ -143,17 +200,6 @@ def test_rows_and_leading_dimensions_are_alone(kernel: Kernel) -> None:
     torch.testing.assert_close(whole, rows, rtol=1e-10, atol=1e-11)
 
 
-def test_bad_arguments_are_refused_by_name() -> None:
-    for settings, message in (
-        ({"horizon": 0.0}, r"`RolloutPolicy\(horizon=...\)` must be positive"),
-        ({"steps": 0}, r"`RolloutPolicy\(steps=...\)` must be at least 1"),
-        ({"depth": 0}, r"`RolloutPolicy\(depth=...\)` must be at least 1"),
-        ({"directions": ball(10, 3)}, r"`RolloutPolicy\(basis=...\)` must have the plant's 2 states; got 3"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            rollout(**settings)
-
-
 def test_in_barrier_coordinates_rollouts_move_the_distances_to_the_walls() -> None:
     """Steps of 50 ms in s itself overflow from the published start, and left no control at all."""
     box = systems.Barrier(systems.TwoStateChain(), [-7.0, -5.0], [5.0, 7.0])
@@ -172,3 +218,138 @@ def test_beside_a_wall_the_slope_of_a_rollout_policy_is_that_of_what_its_rollout
     apart = 0.01 * torch.eye(2, dtype=torch.float64)
     wanted = (policy.rollout(s + apart) - policy.rollout(s - apart)) / 0.02
     torch.testing.assert_close(policy.gradient(s), wanted, rtol=0.01, atol=0.02)
+
+
+# --- arguments ----------------------------------------------------------------------------------------------
+
+
+def test_a_policy_of_the_lqr_is_that_of_its_parts() -> None:
+    found = adp.RolloutPolicy.of_lqr(PLANT, COST)
+    torch.testing.assert_close(found(X), rollout()(X))
+    more = {"horizon": 0.3, "steps": 4, "depth": 2, "period": 0.05}
+    given = adp.RolloutPolicy.of_lqr(PLANT, COST, centers=3, radius=0.2, kernel=st.GaussianKernel(), **more)  # type: ignore[arg-type]
+    torch.testing.assert_close(
+        given.control(X[:1]),
+        rollout(kernel=GaussianKernel(), directions=ball(3, 2), radius=0.2, **more).control(X[:1]),
+    )
+    assert adp.Feedback(given).period == 0.05
+
+
+def test_a_rollout_ends_with_the_value_of_the_lqr_or_the_terminal_cost() -> None:
+    ended = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1, terminal=7.0)
+    free, end = (adp.RolloutPolicy.of_lqr(PLANT, cost, horizon=1e-9, steps=1) for cost in (COST, ended))
+    torch.testing.assert_close(free.rollout(X), LQR.value(X), rtol=1e-6, atol=0)
+    torch.testing.assert_close(end.rollout(X), 7 * X.square().sum(-1), rtol=1e-6, atol=0)
+
+
+def test_a_policy_that_is_improved_twice_rolls_the_first_improvement_out() -> None:
+    twice, once = rollout(depth=2, steps=2, horizon=0.2), rollout(steps=2, horizon=0.2)
+    by_hand = rollout(base=once.control, steps=2, horizon=0.2)
+    torch.testing.assert_close(twice.control(X[:1]), by_hand.control(X[:1]))
+
+
+def test_a_copy_asks_for_itself() -> None:
+    policy = rollout(steps=2)
+    for other in (copy.deepcopy(policy), pickle.loads(pickle.dumps(rollout(steps=2)))):
+        torch.testing.assert_close(other(X), policy(X))
+        other.horizon = 0.1
+        torch.testing.assert_close(other(X), rollout(steps=2, horizon=0.1)(X))
+
+
+def test_the_usual_centers_are_as_many_as_quadratics_need_and_the_kernel_of_a_box_is_gaussian() -> None:
+    for dim, count in ((1, 3), (2, 6), (3, 10), (4, 9), (6, 13)):
+        plant = systems.Linear((-torch.eye(dim)).tolist(), torch.eye(dim)[:, :1].tolist())
+        policy = adp.RolloutPolicy.of_lqr(plant, adp.QuadraticCost(1.0, 1.0, dim=dim, inputs=1))
+        assert policy.basis.count == count
+        assert isinstance(policy.basis.kernel, ExponentialKernel)
+    box = systems.Barrier(PLANT, -3.0, 3.0)
+    assert isinstance(adp.RolloutPolicy.of_lqr(box, COST).basis.kernel, GaussianKernel)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (
+            {"plant": systems.StepPlant(lambda x, u: 0.9 * x + u, dim=2, inputs=1, dt=0.1)},
+            r"`RolloutPolicy\(model=...\)` must be a ControlAffineSystem",
+        ),
+        (
+            {"directions": ball(10, 3)},
+            r"`RolloutPolicy\(basis=...\)` must have the plant's 2 states; got 3",
+        ),
+        ({"horizon": 0.0}, r"`RolloutPolicy\(horizon=...\)` must be positive"),
+        ({"steps": 0}, r"`RolloutPolicy\(steps=...\)` must be at least 1"),
+        ({"depth": 0}, r"`RolloutPolicy\(depth=...\)` must be at least 1"),
+        ({"period": 0.0}, r"`RolloutPolicy\(period=...\)` must be positive"),
+    ],
+)
+def test_rollouts_refuse_what_they_cannot_take(given: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        rollout(**given)
+
+
+# --- energy -------------------------------------------------------------------------------------------------
+
+
+class Turning(systems.Pendulum):
+    """The pendulum whose angle is one."""
+
+    periodic = (0,)
+
+
+TURNING = Turning(damping=0.0)
+LIMITED = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1, low=-5.0, high=5.0)
+
+
+def energy(x: Tensor) -> Tensor:
+    return 0.5 * x[..., 1].square() + 9.81 * x[..., 0].cos()
+
+
+def pump(**more: object) -> adp.EnergyShaping:
+    return adp.EnergyShaping(TURNING, LIMITED, energy, **{"gain": 1.0, "capture": 0.5, "period": 0.02} | more)
+
+
+@torch.no_grad()
+def test_pendulum_swings_up_from_everywhere_within_its_bounds_where_the_lqr_does_not() -> None:
+    x0 = torch.tensor([[3.1, 0.0], [2.0, -1.0], [-1.0, 0.5], [0.0, 7.0]], dtype=torch.float64)
+    policy = pump()
+    ours, lqr = (
+        adp.simulate(adp.Feedback(one), TURNING, LIMITED, x0, dt=0.02, steps=steps, compile=False)
+        for one, steps in ((policy, 260), (policy.lqr, 60))
+    )
+    assert (policy.lqr.cost.deviation(ours.state[:, -1]).norm(dim=-1) < 1e-3).all()
+    assert (policy.lqr.cost.deviation(lqr.state[:, -1]).norm(dim=-1) > 0.1).any()
+    assert ours.control[:, :-1].abs().max() <= 5
+    # Where it pumps, the energy comes nearer to that of the goal at every step.
+    x = torch.tensor([[2.5, 1.0]], dtype=torch.float64)
+    after = systems.runge_kutta_step(lambda z: TURNING.rate(z, policy(x)), x, 0.02)
+    top = energy(torch.zeros(1, 2, dtype=torch.float64))
+    assert (energy(after) - top).abs() < (energy(x) - top).abs()
+
+
+def test_energy_is_pumped_far_from_the_goal_and_the_lqr_regulates_near_it() -> None:
+    plant = systems.Pendulum()
+    cost = adp.QuadraticCost(1.0, 0.3, dim=2, inputs=1, low=-2.0, high=1.5)
+
+    pump = adp.EnergyShaping(plant, cost, energy, gain=0.05, capture=0.5, period=0.02)
+    x = unit(40, 2, low=-3, high=3, seed=1)
+    x[:20] *= 0.05
+    g, lqr = plant.effectiveness(x)[..., 0], adp.LQR(plant, cost, period=0.02)
+    slope = torch.stack((-9.81 * x[:, 0].sin(), x[:, 1]), -1)
+    push = 0.05 * (9.81 - energy(x)) * (g * slope).sum(-1)
+    near = lqr.value(x) < 0.5
+    assert 0 < int(near.sum()) < 40
+    torch.testing.assert_close(pump(x)[:, 0], torch.where(near, lqr(x)[:, 0], push.clamp(-2.0, 1.5)))
+    assert pump.period == 0.02
+
+
+def test_bad_arguments_of_the_swing_up_are_refused_by_name() -> None:
+    free = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
+    with pytest.raises(ValueError, match=r"`EnergyShaping\(cost=...\)` or the plant must have bounds"):
+        adp.EnergyShaping(TURNING, free, energy, gain=1.0, capture=1.0)
+    for wrong in ({"gain": 0.0}, {"capture": -1.0}):
+        with pytest.raises(ValueError, match=rf"`EnergyShaping\({next(iter(wrong))}=...\)` must be"):
+            pump(**wrong)
+    step = systems.StepPlant(lambda x, u: x + 0.1 * u, dim=1, inputs=1, dt=0.1)
+    with pytest.raises(ValueError, match=r"`EnergyShaping\(system=...\)` must be a ControlAffineSystem"):
+        adp.EnergyShaping(step, LIMITED, energy, gain=1.0, capture=1.0)
