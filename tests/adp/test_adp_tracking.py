@@ -1,36 +1,61 @@
-"""Tracking as regulation, and the drift identified online."""
+"""Tracking: the error as a plant of its own, the drift identified online; costs along a path of the time."""
 
 from __future__ import annotations
 
+import math
+
+import numpy as np
 import pytest
 import torch
+from helpers import tensor, uniform
 from helpers_adp import staf_basis
 from torch import Tensor
 
 from staf_torch import adp, systems
-from staf_torch.adp.tracking import desired_rate, feedforward, regressor, true_parameters
+from staf_torch.adp.tracking import desired_rate, true_parameters
+from staf_torch.numerics.forward_mode import use_forward_mode
 
+use_forward_mode()
 TRACKING = adp.TwoStateTracking()
 
 
-def states(rows: int, dim: int, seed: int = 0) -> Tensor:
-    return torch.randn(rows, dim, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+def test_the_error_plant_is_written_out() -> None:
+    theta = uniform(3, 2, seed=1)
+    plant = adp.TwoStateTracking(theta)
+    x, u = uniform(5, 4, seed=2), uniform(5, 1, seed=3)
+    for row in range(5):
+        e1, e2, d1, d2 = x[row].tolist()
+
+        def s(a: float, b: float) -> np.ndarray:
+            return np.array([a, b, b * (1 - (math.cos(2 * a) + 2) ** 2)])
+
+        rate = np.array([d2 - d1, d2 - 2 * d1])
+        push = (rate - theta.numpy().T @ s(d1, d2))[1] / (math.cos(2 * d1) + 2)
+        gain = math.cos(2 * (e1 + d1)) + 2
+        error = theta.numpy().T @ s(e1 + d1, e2 + d2) - rate
+        wanted = [error[0], error[1] + gain * (push + float(u[row])), *rate]
+        torch.testing.assert_close(plant.rate(x[row], u[row]), tensor(wanted))
+    rows = uniform(5, 3, 2, seed=4)
+    believed = plant.believing(rows)
+    assert torch.equal(plant.theta, theta)
+    for row in range(5):
+        torch.testing.assert_close(believed.drift(x)[row], adp.TwoStateTracking(rows[row]).drift(x[row]))
+    cost = adp.tracking_cost([[2.0, 0.5], [0.5, 1.0]], 3.0)
+    assert cost.q.tolist() == [[2, 0.5, 0, 0], [0.5, 1, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0]]
+    assert (cost.r.tolist(), cost.dim, cost.inputs) == ([[3.0]], 4, 1)
 
 
-def test_true_parameters_are_those_of_the_two_state_plant() -> None:
-    x = states(50, 2)
-    torch.testing.assert_close(regressor(x) @ true_parameters(), systems.TwoState().drift(x))
-
-
-def test_error_plant_is_the_two_state_plant_seen_from_the_desired_state() -> None:
-    x = states(50, 4)
+def test_the_true_error_plant_is_the_two_state_plant_and_rests_on_the_track() -> None:
+    x = uniform(50, 4, seed=5)
     state, desired = x[:, :2] + x[:, 2:], x[:, 2:]
     plant = systems.TwoState()
-    pushed = plant.effectiveness(state)[..., 0] * feedforward(desired, TRACKING.theta).unsqueeze(-1)
-    error_rate = plant.drift(state) + pushed - desired_rate(desired)
-    torch.testing.assert_close(TRACKING.drift(x), torch.cat((error_rate, desired_rate(desired)), dim=-1))
-    on_track = torch.cat((torch.zeros(50, 2, dtype=torch.float64), desired), dim=-1)
+    pushed = (TRACKING.drift(x)[:, :2] + desired_rate(desired) - plant.drift(state))[:, 1]
+    along = plant.effectiveness(state)[:, 1, 0]
+    on_track = torch.cat((torch.zeros(50, 2).double(), desired), dim=-1)
     assert TRACKING.drift(on_track)[:, :2].abs().max() < 1e-14
+    there = plant.effectiveness(desired)[:, 1, 0]
+    needed = (desired_rate(desired) - plant.drift(desired))[:, 1] / there  # u_d, which holds the track
+    torch.testing.assert_close(pushed / along, needed)
 
 
 def test_desired_trajectory_solves_its_equation() -> None:
@@ -46,8 +71,8 @@ def test_identified_drift_converges_and_the_error_with_it() -> None:
     x0 = torch.tensor([[-0.5, 0.5, 0.0, 1.0], [0.4, 0.2, 0.0, 1.0]], dtype=torch.float64)
     start = torch.zeros(3, 2, dtype=torch.float64)
     tracker = adp.IdentifyingTracker(learner, TRACKING, adp.ConcurrentLearning(3, 2, 6, gain=5.0), start)
-    known = adp.simulate(learner, TRACKING, cost, x0, dt=0.01, steps=500, every=10, compile=True)
-    run = adp.simulate(tracker, TRACKING, cost, x0, dt=0.01, steps=500, every=10, compile=True)
+    known = adp.simulate(learner, TRACKING, cost, x0, dt=0.01, steps=500, every=100, compile=True)
+    run = adp.simulate(tracker, TRACKING, cost, x0, dt=0.01, steps=500, every=100, compile=True)
     assert not run.diverged.any()
     theta = run.identifier[:, -1, :6].reshape(2, 3, 2)
     assert (theta - true_parameters()).abs().max() < 5e-3
@@ -56,60 +81,182 @@ def test_identified_drift_converges_and_the_error_with_it() -> None:
     torch.testing.assert_close(run.state[:, :, 2:], known.state[:, :, 2:], rtol=1e-9, atol=1e-9)
 
 
-def test_memory_alone_identifies_where_the_present_excites_nothing() -> None:
-    truth = states(3, 2, seed=5)
-    law = adp.ConcurrentLearning(3, 2, size=5, gain=10.0)
-    state = law.init(torch.zeros(1, 3, 2, dtype=torch.float64))
-    for row in states(5, 3, seed=6):
-        state = law.step(state, row.unsqueeze(0), row.unsqueeze(0) @ truth, 0.01)
-    for _ in range(800):
-        still = torch.zeros(1, 3, dtype=torch.float64)
-        state = law.step(state, still, still @ truth, 0.05)
-    torch.testing.assert_close(state.theta[0], truth, rtol=1e-6, atol=1e-6)
-
-
-def test_least_singular_value_of_the_full_stack_never_falls() -> None:
-    law = adp.ConcurrentLearning(3, 2, size=4)
-    state = law.init(torch.zeros(2, 3, 2, dtype=torch.float64))
-    least = torch.zeros(2, dtype=torch.float64)
-    first = None
-    for row in states(200, 3, seed=7).unsqueeze(1) * torch.tensor([[1.0], [3.0]], dtype=torch.float64):
-        state = law.remember(state, row, row[..., :2])
-        now = torch.linalg.svdvals(state.regressors)[..., -1]
-        full = (state.regressors.square().sum(-1) > 0).all(-1)
-        assert (~full | (now >= least * (1 - 1e-12))).all()
-        least = torch.where(full, now, least)
-        first = least.clone() if first is None and bool(full.all()) else first
-    assert first is not None
-    assert (least > 2 * first).all()
-    torch.testing.assert_close(state.rates, state.regressors[..., :2])
-
-
 def test_bad_arguments_are_refused_by_name() -> None:
     with pytest.raises(ValueError, match=r"`TwoStateTracking\(theta=...\)` must be \(..., 3, 2\)"):
         adp.TwoStateTracking([[1.0, 2.0]])
     with pytest.raises(ValueError, match=r"`TwoStateTracking\(theta=...\)` must be"):
         adp.TwoStateTracking(torch.full((3, 2), torch.nan, dtype=torch.float64))
-    with pytest.raises(ValueError, match=r"`ConcurrentLearning\(size=...\)` must be at least 3"):
-        adp.ConcurrentLearning(3, 2, size=2)
     with pytest.raises(ValueError, match=r"`LeadingCoordinates\(dim=...\)` must be at least 2"):
         adp.LeadingCoordinates(staf_basis(), 1)
     with pytest.raises(ValueError, match=r"`QuadraticCost\(state=...\)` must be positive"):
         adp.tracking_cost(-1.0, 1.0)
 
 
-def test_a_full_stack_takes_a_pair_only_where_the_least_eigenvalue_grows() -> None:
-    """Of vectors along the axes the eigenvalues are exact: along an axis that is known, nothing grows."""
-    learning = adp.ConcurrentLearning(2, 1, size=2)
-    known = learning.init(torch.zeros(1, 2, 1).double())
-    y, kept = torch.ones(1, 1).double(), known
-    for s in ([2.0, 0.0], [3.0, 0.0]):
-        kept = learning.remember(kept, torch.tensor([s]).double(), y)
-    again = learning.remember(kept, torch.tensor([[5.0, 0.0]]).double(), y)
-    assert torch.equal(again.regressors, kept.regressors)
-    other = learning.remember(kept, torch.tensor([[0.0, 1.0]]).double(), y)
-    assert other.regressors.tolist() == [[[2.0, 0.0], [0.0, 1.0]]] or other.regressors.tolist() == [
-        [[0.0, 1.0], [3.0, 0.0]]
-    ]
-    better = learning.remember(other, torch.tensor([[0.0, 2.0]]).double(), y)
-    assert bool((torch.linalg.eigvalsh(better.regressors.mT @ better.regressors)[:, 0] > 1.0).all())
+# --- costs along a path -------------------------------------------------------------------------------------
+
+
+DT, STEPS = 0.1, 20
+NONE = torch.empty(0, dtype=torch.float64)
+X0 = torch.tensor([[0.2, 0.0, 0.0], [-0.4, 1.0, 0.0]], dtype=torch.float64)
+
+
+def waves(t: Tensor) -> Tensor:
+    """A place and a speed that a mass cannot have together."""
+    return torch.stack((t.sin(), 0.5 * (2 * t).cos()), dim=-1)
+
+
+def mass() -> systems.StepPlant:
+    def step(x: Tensor, u: Tensor) -> Tensor:
+        return torch.stack((x[:, 0] + DT * x[:, 1], x[:, 1] + DT * u[:, 0]), dim=-1)
+
+    return systems.StepPlant(step, dim=2, inputs=1, dt=DT)
+
+
+PLANT = systems.Clocked(mass())
+COST = adp.TrackingCost(4.0, 0.3, dim=2, inputs=1, path=waves)
+PROBLEM = adp.SampledProblem.of(PLANT, COST)
+
+
+def paid(controls: Tensor) -> Tensor:
+    """What controls (B, T, 1) cost from X0, with the LQR's value at the end."""
+    x, spent = X0, torch.zeros(len(X0), dtype=torch.float64)
+    for u in controls.unbind(1):
+        x, now = PROBLEM.advance(x, u)
+        spent = spent + now
+    return spent + PROBLEM.terminal(x)
+
+
+def drive(mpc: adp.RecedingHorizon, x: Tensor, steps: int) -> tuple[Tensor, Tensor]:
+    carried, controls = mpc.init(x), []
+    for _ in range(steps):
+        u, carried = mpc.step(x, carried, NONE, DT)
+        x, _ = PROBLEM.advance(x, u)
+        controls.append(u)
+    return torch.stack(controls, dim=1), x
+
+
+def test_plan_is_the_minimum_of_the_quadratic_program() -> None:
+    none = torch.zeros(len(X0), STEPS, 1, dtype=torch.float64)
+    slope = torch.func.grad(lambda u: paid(u).sum())(none).flatten(1)
+    bent: Tensor = torch.func.hessian(lambda u: paid(u.expand(2, -1, -1))[0])(none[:1]).reshape(STEPS, STEPS)
+    best = -torch.linalg.solve(bent, slope.mT).mT.unsqueeze(-1)
+    found = adp.BoxDDP(PROBLEM, steps=STEPS, compile=False).solve(X0)
+    torch.testing.assert_close(found.control, best, rtol=0, atol=1e-6)
+    torch.testing.assert_close(found.cost, paid(best), rtol=1e-10, atol=0)
+
+
+def test_feedback_is_the_plant_s_own_carried_along_the_path() -> None:
+    lqr, still = adp.LQR(PLANT, COST), adp.LQR(mass(), adp.QuadraticCost(4.0, 0.3, dim=2, inputs=1))
+    x = torch.tensor([[0.3, -0.2, 1.7]]).double()
+    away = x[:, :2] - waves(x[:, 2])
+    torch.testing.assert_close(lqr(x), still(away))
+    torch.testing.assert_close(lqr.value(x), still.value(away))
+    torch.testing.assert_close(PROBLEM.linear_feedback(x), lqr(x))
+    torch.testing.assert_close(COST.rate(x, lqr(x)), 4 * away.square().sum(-1) + 0.3 * lqr(x)[:, 0].square())
+
+
+def test_one_plan_is_followed_and_after_it_the_feedback() -> None:
+    found = adp.BoxDDP(PROBLEM, steps=STEPS, compile=False).solve(X0)
+    mpc = adp.RecedingHorizon(PROBLEM, steps=STEPS, iterations=0, compile=False)
+    controls, last = drive(mpc, X0, STEPS)
+    torch.testing.assert_close(controls, found.control, rtol=0, atol=1e-12)
+    beyond, after = drive(mpc, X0, STEPS + 1)
+    torch.testing.assert_close(beyond[:, -1], PROBLEM.linear_feedback(last))
+    pushed, _ = drive(mpc, X0, 1)
+    carried = mpc.init(X0)
+    aside = X0 + torch.tensor([0.1, 0.0, 0.0]).double()
+    answered, _ = mpc.step(aside, carried, NONE, DT)
+    torch.testing.assert_close(answered[:, 0] - pushed[:, 0, 0], 0.1 * found.feedback[:, 0, 0, 0])
+    assert after[:, 2].tolist() == pytest.approx([DT * (STEPS + 1)] * 2)
+
+
+def test_receding_horizon_plans_along_the_path_from_the_time_that_it_is() -> None:
+    mpc = adp.RecedingHorizon(PROBLEM, steps=10, iterations=1, compile=False)
+    controls, _ = drive(mpc, X0, 3)
+    _, x = drive(mpc, X0, 2)
+    plan = adp.BoxDDP(PROBLEM, steps=10, compile=False).solve(x)
+    torch.testing.assert_close(controls[:, 2], plan.control[:, 0], rtol=0, atol=1e-3)  # one iteration
+    assert float((PROBLEM.linear_feedback(x) - controls[:, 2]).abs().min()) > 0.01
+
+
+def test_closed_loop_in_continuous_time_counts_the_distance_from_the_path() -> None:
+    plant = systems.Clocked(systems.Linear([[0.0]], [[1.0]]))
+    cost = adp.TrackingCost(2.0, 1.0, dim=1, inputs=1, path=lambda t: t.unsqueeze(-1), low=-1.0, high=1.0)
+    run = adp.simulate(
+        adp.Feedback(lambda x: torch.ones_like(x[..., :1])), plant, cost, plant.at(NONE.new_zeros(1, 1)),
+        dt=0.1, steps=20,
+    )  # fmt: skip
+    torch.testing.assert_close(run.state[0, -1], torch.tensor([2.0, 2.0]).double())
+    torch.testing.assert_close(run.cost, torch.tensor([2.0]).double())  # of the control alone
+
+
+def test_what_cannot_follow_a_path_says_so() -> None:
+    with pytest.raises(ValueError, match=r"`TrackingCost\(plant=...\)` must have a clock"):
+        adp.LQR(mass(), COST)
+    with pytest.raises(ValueError, match=r"`near_optimal\(plant=...\)` must have no clock"):
+        adp.near_optimal(PLANT, COST)
+    with pytest.raises(ValueError, match=r"`DirectShooting\(system=...\)` must have no clock"):
+        adp.DirectShooting(systems.Clocked(systems.Pendulum()), COST)
+    with pytest.raises(ValueError, match=r"`held_stability\(at=...\)` must be a state of the path"):
+        adp.held_stability(adp.LQR(PLANT, COST), PLANT, DT)
+    with pytest.raises(
+        ValueError, match=r"`TrackingCost\(path=...\)` must map times \(2,\) to states \(2, 2\)"
+    ):
+        adp.TrackingCost(1.0, 1.0, dim=2, inputs=1, path=lambda t: t)
+    library = adp.BoxDDP(PROBLEM, steps=5, compile=False).solve(X0)
+    with pytest.raises(ValueError, match=r"`GlobalValue\(problem=...\)` must have a goal that stays"):
+        adp.GlobalValue(PROBLEM, library, region=[1.0, 1.0, 1.0])
+    with pytest.raises(ValueError, match=r"`SampledProblem\(step=...\)` must move the time"):
+        adp.SampledProblem(lambda x, u: (x, u[:, 0].square()), dim=3, inputs=1, path=waves)
+    assert (
+        adp.held_stability(adp.LQR(PLANT, COST), PLANT, DT, at=waves(NONE.new_zeros(()))).spectral_radius < 1
+    )
+
+
+def test_a_cost_along_a_path_takes_bounds_angles_and_rest_from_its_plant() -> None:
+    pendulum = systems.Pendulum()
+    pendulum.periodic, pendulum.bounds = (0,), systems.Bounds(-3.0, 4.0, 1)
+    plant = systems.Clocked(pendulum)
+    cost = adp.TrackingCost([2.0, 0.5], 0.3, 2, 1, path=lambda t: torch.stack((t, 0 * t), -1))
+    placed = cost.around(plant)
+    assert cost.bounds is None
+    assert cost.periodic == ()
+    assert placed.bounds is pendulum.bounds
+    assert placed.periodic == (0,)
+    assert placed.regulated(plant) == (pendulum, placed.still)
+    x, u = tensor([[0.3, -0.2, 1.5], [6.5, 0.1, 0.2]]), tensor([[0.5], [-1.0]])
+    away = tensor([[0.3 - 1.5, -0.2], [6.3 - 2 * torch.pi, 0.1]])
+    torch.testing.assert_close(placed.deviation(x), torch.cat((away, torch.zeros(2, 1).double()), -1))
+    wanted = (away.square() * tensor([2.0, 0.5])).sum(-1) + 0.3 * u[:, 0].square()
+    torch.testing.assert_close(placed.rate(x, u), wanted)
+    narrow = placed.bounded(-0.1, 0.2)
+    assert narrow.bounds is not None
+    assert narrow.still.bounds is not None
+    for limits in (narrow.bounds, narrow.still.bounds):
+        assert (limits.low.tolist(), limits.high.tolist()) == ([-0.1], [0.2])
+    assert placed.bounded(None, None) is placed
+    assert placed.still.bounds is pendulum.bounds
+    own = adp.TrackingCost(1.0, 1.0, 2, 1, path=cost.path, low=-1.0, high=1.5, target_input=[0.0])
+    assert own.around(plant).bounds is not None
+    assert own.around(plant).bounds.high.tolist() == [1.5]  # type: ignore[union-attr]
+    for wrong, shown in (
+        (lambda t: t, r"\(2,\)"),
+        (lambda t: 3.0, "3.0"),
+        (lambda t: torch.ones(3, 2), r"\(3, 2\)"),
+    ):
+        with pytest.raises(ValueError, match=rf"must map times \(2,\) to states \(2, 2\); got {shown}"):
+            adp.TrackingCost(1.0, 1.0, 2, 1, path=wrong)  # type: ignore[arg-type]
+
+
+def test_the_input_counts_from_where_it_rests_and_within_its_bounds_with_and_without_the_clock() -> None:
+    cost = adp.TrackingCost(
+        2.0, 3.0, dim=1, inputs=1, path=lambda t: t.unsqueeze(-1), low=-1.0, high=2.0, target_input=[0.5]
+    )
+    x, u = torch.tensor([[1.4, 1.0]], dtype=torch.float64), torch.tensor([[1.5]], dtype=torch.float64)
+    torch.testing.assert_close(cost.rate(x, u), torch.tensor([2 * 0.4**2 + 3.0]).double())
+    torch.testing.assert_close(cost.still.rate(x[:, :1], u), torch.tensor([2 * 1.4**2 + 3.0]).double())
+    for each in (cost, cost.still):
+        assert each.bounds is not None
+        assert (each.bounds.low.item(), each.bounds.high.item()) == (-1.0, 2.0)
+        assert each.target_input is not None
+        assert each.target_input.item() == 0.5
