@@ -1,21 +1,21 @@
-"""Problems in steps and loops that are held: edges, derivatives and regulators, beside plain formulas."""
+"""Problems in steps and controls that are held, beside loops, exponentials and plain formulas."""
 
 from __future__ import annotations
 
 import math
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from helpers import tensor, uniform
-from recorded import Record
 from torch import Tensor
 
-from staf_torch import adp, systems
-from staf_torch.adp import plan_problem, sampled_problem
+from staf_torch import adp, lanes, systems
+from staf_torch.adp.followed_simulation import followed
+from staf_torch.adp.following import follow_plan
+from staf_torch.adp.holding import Holding, fewest_and_most, runge_kutta_held
 from staf_torch.adp.plans import LocalModel
-from staf_torch.adp.sampling import held_riccati, linear_hold, periods
-from staf_torch.adp.simulation import warn_if_unstable
 from staf_torch.numerics.forward_mode import use_forward_mode
 
 INF = math.inf
@@ -33,25 +33,15 @@ def swung(x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
 SWUNG = adp.SampledProblem(swung, dim=3, inputs=2, low=[-1.0, -INF], high=[INF, 2.0], periodic=[-3])
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_derivatives_of_a_program_and_of_plain_torch_are_the_same(dtype: torch.dtype) -> None:
-    """Of values that are straight and constant, too, and beside a row that is no number."""
-
-    def values(z: Tensor) -> Tensor:
-        a, b, c = z.unbind(-1)
-        return torch.stack((a.sin() * b / (2 + c.square()), 3 * b - a, torch.full_like(a, 2.0), c**3), dim=-1)
-
-    z = uniform(4, 3, seed=3).to(dtype)
-    z[2, 1] = torch.nan
-    ways = (sampled_problem._in_pairs, sampled_problem._backwards)
-    (first, second), (same, bent) = (way(values, z, 4) for way in ways)
-    assert first.dtype == same.dtype == dtype
-    assert (first.shape, second.shape) == (same.shape, bent.shape) == ((4, 4, 3), (4, 4, 3, 3))
-    torch.testing.assert_close(same[[0, 1, 3]], first[[0, 1, 3]])
-    torch.testing.assert_close(bent[[0, 1, 3]], second[[0, 1, 3]])
-    value, slope = plan_problem._along(values, z)
-    torch.testing.assert_close(value, values(z), equal_nan=True)
-    torch.testing.assert_close(slope, same, equal_nan=True)
+@pytest.mark.needs_compiler
+def test_derivatives_in_a_program_are_those_of_plain_torch() -> None:
+    """Forward along pairs of coordinates there, backwards here; beside a row that is no number, too."""
+    x, u = uniform(4, 3, seed=3), uniform(4, 2, seed=4)
+    x[2, 1] = torch.nan
+    program = lanes.Program(lambda carry, now, row: (carry, tuple(SWUNG.derivatives(*row))))
+    _, found = program((), (), (x, u), steps=1)
+    for mine, wanted in zip(found, SWUNG.derivatives(x, u), strict=True):
+        torch.testing.assert_close(mine[[0, 1, 3], 0], wanted[[0, 1, 3]])
 
 
 def test_derivatives_of_a_step_are_those_of_its_row() -> None:
@@ -85,15 +75,13 @@ def test_levels_are_all_combinations_of_finite_bounds_and_rest() -> None:
     goals = SWUNG.goals(away[0], 2)
     assert goals.shape == (4, 3, 3)
     torch.testing.assert_close(goals, tensor([4 * math.pi, 0.0, 0.0]).expand(4, 3, 3))
-    assert (SWUNG.endless, SWUNG.tick) == (True, 0.0)
     assert torch.equal(SWUNG.end, SWUNG.p)
 
 
 @pytest.mark.parametrize(
     ("drift", "due", "refused"),
     [
-        (3.9e-6, 0.0, False), (4.1e-6, 0.0, True), (-4.1e-6, 0.0, True),
-        (0.0, 0.9e-6, False), (0.0, 1.1e-6, True), (0.0, -1.1e-6, True), (9e-6, 9e-6, True),
+        (3.9e-6, 0.0, False), (-4.1e-6, 0.0, True), (0.0, 0.9e-6, False), (0.0, -1.1e-6, True),
     ],
 )  # fmt: skip
 def test_a_goal_may_move_by_a_millionth_of_its_size_and_cost_a_millionth(
@@ -215,133 +203,238 @@ def test_a_local_model_is_a_quadratic_function_the_shorter_way_around() -> None:
     torch.testing.assert_close(model.slope(SWUNG, turned[:, 0]), slope)
 
 
-# Held loops --------------------------------------------------------------------------------------------
-
-CHAIN = systems.Linear([[0.0, 1.0], [3.0, -0.5]], [[0.0], [1.0]])
+# --- a control that is held ---------------------------------------------------------------------------------
 
 
-def in_steps(a: Tensor, b: Tensor, dt: float = 0.1) -> systems.StepPlant:
-    return systems.StepPlant(
-        lambda x, u: x @ a.mT + u @ b.mT, dim=len(a), inputs=b.shape[1], dt=dt, equilibrium=[0.0] * len(a)
-    )
+LIMITS = tensor([math.inf, 0.07, 0.21, 1e-3, 0.05])
+X, U = uniform(5, 2, seed=1), uniform(5, 1, seed=2)
 
 
-@pytest.mark.parametrize("discount", [0.0, 0.7])
-@pytest.mark.parametrize("steps", [False, True])
-def test_a_held_regulator_is_the_fixed_point_of_its_recursion(steps: bool, discount: float) -> None:
-    plant: systems.Plant = (
-        in_steps(tensor([[1.0, 0.1], [0.3, 0.95]]), tensor([[0.0], [0.1]])) if steps else CHAIN
-    )
-    cost = adp.QuadraticCost([2.0, 1.0], 0.3, 2, 1, discount=discount)
-    p, k = held_riccati(plant, cost, 0.3)
-    hold = linear_hold(plant, cost, 0.3)
-    closed = torch.cat((torch.eye(2).double(), -k))
-    ahead = hold.a - hold.b @ k
-    torch.testing.assert_close(p, closed.mT @ hold.paid @ closed + ahead.mT @ p @ ahead)
-    for other in (k + 1e-3 * tensor([[1.0, 0.0]]), k - 1e-3 * tensor([[0.0, 1.0]])):  # and K the best
-        around = torch.cat((torch.eye(2).double(), -other))
-        after = hold.a - hold.b @ other
-        worse = around.mT @ hold.paid @ around + after.mT @ p @ after - p
-        assert float(torch.linalg.eigvalsh(worse)[-1]) > 0
-        assert float(torch.linalg.eigvalsh(worse)[0]) > -1e-12
-    assert torch.equal(p, p.mT)
+class Limited(systems.VanDerPol):
+    """A plant whose rows have longest steps of their own, which grow with the distance from x_1 = 0."""
+
+    limited = True
+
+    def step_limit(self, x: Tensor, u: Tensor) -> Tensor | None:
+        return LIMITS * (1 + x[..., 0].square()) if self.limited else None
 
 
-@pytest.mark.parametrize("steps", [False, True])
-def test_a_mode_that_grows_slower_than_the_discount_need_not_be_stabilised(steps: bool) -> None:
-    """exp(-rho t / 2) x decays: 0.2 1/s beside a half of the discount."""
-    growth = math.exp(0.02) if steps else 0.2
-    f, g = tensor([[growth, 0.0], [0.0, 0.5 if steps else -1.0]]), tensor([[0.0], [1.0]])
-    plant: systems.Plant = in_steps(f, g) if steps else systems.Linear(f.tolist(), g.tolist())
-    p, _ = held_riccati(plant, adp.QuadraticCost(1.0, 1.0, 2, 1, discount=0.5), 0.1)
-    assert bool(torch.isfinite(p).all())
-    with pytest.raises(ValueError, match="not stabilisable"):
-        held_riccati(plant, adp.QuadraticCost(1.0, 1.0, 2, 1, discount=0.3), 0.1)
+class Unlimited(Limited):
+    limited = False
 
 
-def test_a_period_is_a_multiple_to_a_billionth() -> None:
-    plant = in_steps(tensor([[1.0]]), tensor([[1.0]]), 0.5)
-    assert periods("call", plant, 1.5 * (1 + 0.9e-9)) == 3
-    assert periods("call", plant, 1.5 * (1 - 0.9e-9)) == 3
-    for dt in (1.5 * (1 + 1.2e-9), 1.5 * (1 - 1.2e-9), 0.2):
-        with pytest.raises(
-            ValueError, match=r"`call\(dt=...\)` must be a multiple of the plant's period of 0.5 s"
-        ):
-            periods("call", plant, dt)
+def costs(discount: float) -> adp.QuadraticCost:
+    return adp.QuadraticCost([2.0, 0.5], 0.7, dim=2, inputs=1, discount=discount)
 
 
-def test_a_loop_in_steps_is_stable_up_to_a_number_of_its_periods() -> None:
-    """Whatever the period is that it is asked for."""
-    plant = in_steps(tensor([[1.0]]), tensor([[0.1]]))
-    for period in (0.1, 0.3, 0.6, 0.7, 2.0):
-        wanted = pytest.approx(abs(1 - 3 * period)), pytest.approx(0.6)
-        assert adp.held_stability(lambda x: -3 * x, plant, period) == wanted
-    assert adp.held_stability(lambda x: -2 / 99.95 * x, plant, 0.1).largest_period == pytest.approx(99.9)
-    assert adp.held_stability(lambda x: -2 / 100.05 * x, plant, 0.1).largest_period == INF  # of 1000 tried
-    assert adp.held_stability(lambda x: 3 * x, plant, 0.1) == (pytest.approx(1.3), None)
-    assert adp.held_stability(lambda x: 0 * x, plant, 0.1) == (1.0, None)
+def stepped(plant: Any, cost: adp.Cost, x: Tensor, u: Tensor, h: float) -> tuple[Tensor, float]:
+    """One Runge-Kutta step of one row, and what it pays, discounted from its start."""
+    k1 = plant.rate(x, u)
+    second = x + 0.5 * h * k1
+    k2 = plant.rate(second, u)
+    third = x + 0.5 * h * k2
+    k3 = plant.rate(third, u)
+    last = x + h * k3
+    k4 = plant.rate(last, u)
+    half = math.exp(-0.5 * cost.discount * h)
+    rates = [float(cost.rate(at, u)) for at in (x, second, third, last)]
+    paid = h / 6 * (rates[0] + 2 * half * (rates[1] + rates[2]) + half**2 * rates[3])
+    return x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4), paid
 
 
-def test_others_beside_a_loop_in_steps_count_only_where_they_grow() -> None:
-    for other, counted in ((1.0, False), (-1.0, False), (-1.2, True), (1.2, True)):
-        plant = in_steps(tensor([[1.0, 0.3], [0.0, other]]), tensor([[0.1], [0.0]]))
-        found = adp.held_stability(lambda x: -3 * x[..., :1], plant, 0.1).spectral_radius
-        assert found == pytest.approx(abs(other) if counted else 0.7)
+def held(
+    plant: Any, cost: adp.Cost, row: int, dt: float, least: int, most: int, policy: Any = None
+) -> tuple[Tensor, float]:
+    x, u, spent, left = X[row], U[row], 0.0, dt
+    for count in range(most, 0, -1):
+        if least != most and left <= 0:
+            break
+        if policy is not None and count < most:
+            u = policy(x)
+        length = left / count if least == most else min(left, dt / least)
+        if plant.limited:
+            length = min(length, float(LIMITS[row] * (1 + x[0] ** 2)))
+        length = length if count > 1 else left
+        after, paid = stepped(plant, cost, x, u, length)
+        spent += math.exp(-cost.discount * (dt - left)) * paid
+        x, left = after, left - length
+    return x, spent
 
 
-def test_a_period_of_a_billion_steps_is_answered_at_once() -> None:
-    plant = in_steps(tensor([[0.5, 0.1], [0.0, 0.4]]), tensor([[0.1], [0.2]]))
-    found = adp.held_stability(lambda x: 0.3 * x[..., :1], plant, 1e8)
-    rest = torch.linalg.solve(
-        torch.eye(2).double() - tensor([[0.5, 0.1], [0.0, 0.4]]), tensor([[0.1], [0.2]])
-    )
-    assert found.spectral_radius == pytest.approx(0.3 * float(rest[0]))
-
-
-@pytest.mark.parametrize("period", [1.0, 1000.0, 1e5])
-def test_a_loop_that_overflows_within_a_period_is_unstable_and_told(
-    period: float, caplog: pytest.LogCaptureFixture
+@pytest.mark.parametrize("discount", [0.0, 0.9])
+@pytest.mark.parametrize("renewed", [False, True])
+@pytest.mark.parametrize("kind", [Limited, Unlimited])
+@pytest.mark.parametrize("substeps", [2, (2, 5)])
+def test_substeps_are_as_long_as_a_row_allows_and_the_last_takes_the_rest(
+    substeps: Any, kind: type[Limited], renewed: bool, discount: float
 ) -> None:
-    plant, stepped = systems.Linear([[1000.0]], [[1.0]]), in_steps(tensor([[1.5e4]]), tensor([[1.0]]))
-    for each, gain in ((plant, -1001.0), (stepped, -1.5e4)):
-        assert adp.held_stability(lambda x, gain=gain: gain * x, each, period).spectral_radius > 1
-    assert adp.held_stability(lambda x: -1001 * x, plant, period).spectral_radius == INF
-    cost = adp.QuadraticCost(1.0, 1.0, dim=1, inputs=1)
-    warn_if_unstable(lambda x: -1001 * x, plant, cost, period)
-    assert "has the spectral radius inf" in caplog.text
+    plant, cost = kind(), costs(discount)
+
+    def policy(x: Tensor) -> Tensor:
+        return -1.5 * x[..., 1:]
+
+    hold = Holding("Test", plant, cost, 0.4, substeps)
+    least, most = (substeps, substeps) if isinstance(substeps, int) else substeps
+    x, spent = hold(X, U, policy if renewed else None)
+    own = renewed or plant.limited  # else all substeps are equal, as many as there may be
+    for row in range(5):
+        after, paid = held(plant, cost, row, 0.4, least if own else most, most, policy if renewed else None)
+        torch.testing.assert_close(x[row], after, rtol=1e-10, atol=1e-12)
+        assert float(spent[row]) == pytest.approx(paid, rel=1e-10)
 
 
-def test_a_period_that_is_shorter_than_all_that_are_tried_is_found() -> None:
-    """x' = 1000 x + u under u = -1001 x: held for T, e^{1000 T} < 2001."""
-    plant = systems.Linear([[1000.0]], [[1.0]])
-    found = adp.held_stability(lambda x: -1001 * x, plant, 1e-3).largest_period
-    assert found == pytest.approx(math.log(2001) / 1000, rel=1e-5)
+@pytest.mark.parametrize("discount", [0.0, 0.9])
+def test_a_step_is_as_long_as_it_is_told_for_all_rows_or_each(discount: float) -> None:
+    plant, cost = Unlimited(), costs(discount)
+    lengths = tensor([0.3, 0.0, 0.1, 0.25, 0.05])
+    each, paid = runge_kutta_held(plant, cost, X, U, lengths)
+    whole, spent = runge_kutta_held(plant, cost, X, U, 0.3)
+    for row in range(5):
+        for found, cost_of, h in ((each, paid, float(lengths[row])), (whole, spent, 0.3)):
+            after, wanted = stepped(plant, cost, X[row], U[row], h)
+            torch.testing.assert_close(found[row], after, rtol=1e-12, atol=1e-14)
+            assert float(cost_of[row]) == pytest.approx(wanted, rel=1e-12)
+    single, _ = runge_kutta_held(plant, cost, X.float(), U.float(), 0.3)
+    assert single.dtype == torch.float32
+    torch.testing.assert_close(single.double(), whole, rtol=1e-5, atol=1e-6)
 
 
-def test_a_loop_at_its_edge_and_one_without_a_slope_are_not_said_to_be_stable() -> None:
-    line = systems.Linear([[0.0]], [[1.0]])
-    assert adp.held_stability(lambda x: 0 * x, line, 0.5) == (1.0, None)
-    broken = adp.held_stability(lambda x: math.nan * x, line, 0.5)
-    assert math.isnan(broken.spectral_radius)
-    assert broken.largest_period is None
-    for period in (0.0, -0.5, math.inf):
-        with pytest.raises(ValueError, match=r"`held_stability\(period=...\)` must be (positive|finite)"):
-            adp.held_stability(lambda x: 0 * x, line, period)
+@pytest.mark.parametrize("substeps", [4, (2, 8)])
+def test_one_state_that_decays_is_held_as_its_exponential(substeps: Any) -> None:
+    decay, t = 0.5, 0.4
+    plant, cost = systems.Linear([[-decay]], [[1.0]]), adp.QuadraticCost(1.0, 1.0, dim=1, inputs=1)
+    start, u = tensor([[0.8], [-0.3], [0.05]]), tensor([[0.4], [0.0], [-1.0]])
+    center, apart, left = u / decay, start - u / decay, math.exp(-decay * t)
+    square = center**2 * t + 2 * center * apart * (1 - left) / decay + apart**2 * (1 - left**2) / (2 * decay)
+    for renewed in (None, lambda x: u):  # asked again, the same control costs the same
+        x, spent = Holding("Test", plant, cost, t, substeps)(start, u, renewed)
+        torch.testing.assert_close(x, center + left * apart, rtol=1e-6, atol=1e-8)
+        torch.testing.assert_close(spent, (square + u**2 * t).squeeze(-1), rtol=1e-4, atol=1e-6)
 
 
-def test_the_largest_period_is_found_to_a_millionth_and_is_the_recorded(record: Record) -> None:
-    """The steps of the bisection are what is recorded: they end a little below the true ones."""
-    found = {}
-    for name, a, b, gain in (
-        ("line", [[0.0]], [[1.0]], [[1.0]]),
-        ("steep line", [[0.0]], [[1.0]], [[40.0]]),
-        ("chain", [[0.0, 1.0], [3.0, -0.5]], [[0.0], [1.0]], [[9.0, 4.0]]),
-    ):
-        k = tensor(gain)
-        plant = systems.Linear(a, b)
-        found[name] = adp.held_stability(lambda x, k=k: -(x @ k.mT), plant, 0.1).largest_period
-    assert found["line"] is not None
-    assert 2.0 * (1 - 1e-6) <= found["line"] < 2.0
-    record({name: tensor([value] * 5).cumsum(0) for name, value in found.items()}, rtol=1e-9)
-    slow = systems.Linear([[-1.0]], [[1.0]])
-    assert adp.held_stability(lambda x: 0.5 * x, slow, 0.1).largest_period == INF
+@pytest.mark.parametrize("discount", [0.0, 0.9])
+@pytest.mark.parametrize("clocked", [False, True])
+def test_plants_in_steps_pay_at_the_start_of_each(discount: float, clocked: bool) -> None:
+    inner = systems.StepPlant(lambda x, u: 0.9 * x.sin() + u, dim=2, inputs=1, dt=0.1)
+    plant = systems.Clocked(inner) if clocked else inner
+    cost = costs(discount)
+    if clocked:
+        cost = adp.QuadraticCost([2.0, 0.5, 0.0], 0.7, dim=3, inputs=1, discount=discount)  # type: ignore[assignment]
+    x = torch.cat((X, 2 * torch.ones(5, 1).double()), -1) if clocked else X
+    after, spent = Holding("Test", plant, cost, 0.3)(x, U)
+    state, wanted = X, torch.zeros(5).double()
+    for k in range(3):
+        wanted = wanted + 0.1 * math.exp(-0.1 * discount * k) * costs(discount).rate(state, U)
+        state = 0.9 * state.sin() + U
+    torch.testing.assert_close(after[:, :2], state)
+    torch.testing.assert_close(spent, wanted)
+    if clocked:
+        torch.testing.assert_close(after[:, 2], torch.full((5,), 2.3).double())
+    with pytest.raises(ValueError, match="multiple of the plant's period"):
+        Holding("Test", plant, cost, 0.25)
+
+
+def test_numbers_of_substeps_are_one_or_a_range() -> None:
+    assert fewest_and_most("Test", 3) == (3, 3)
+    assert fewest_and_most("Test", (1, 1)) == (1, 1)
+    assert fewest_and_most("Test", (2, 16)) == (2, 16)
+    for wrong, least in ((0, 1), ((0, 2), 1), ((3, 2), 3)):
+        with pytest.raises(ValueError, match=rf"`Test\(substeps=...\)` must be at least {least}"):
+            fewest_and_most("Test", wrong)  # type: ignore[arg-type]
+
+
+# --- a feedback through a simulator, and a plan -------------------------------------------------------------
+
+
+def swing(x: np.ndarray, u: np.ndarray) -> np.ndarray:
+    if isinstance(x, Tensor):
+        raise TypeError("NumPy alone")
+    rate = x[:, 1] + 0.1 * (3.0 * np.sin(x[:, 0] - 0.2) + u[:, 0])
+    return np.stack((x[:, 0] + 0.1 * rate, rate), axis=1)
+
+
+def swinging(**given: Any) -> systems.StepPlant:
+    return systems.StepPlant(swing, dim=2, inputs=1, dt=0.1, equilibrium=[0.2, 0.0], **given)
+
+
+@pytest.mark.parametrize(
+    ("periodic", "bounds", "target"), [((), (None, None), None), ((0,), (-0.7, 0.4), [0.6, 0.0])]
+)
+@pytest.mark.parametrize("base", ["lqr", "smooth", "function"])
+def test_a_feedback_is_followed_as_it_is_asked(base: str, target: Any, bounds: Any, periodic: Any) -> None:
+    plant = swinging(periodic=periodic)
+    if base == "smooth":
+        cost: adp.Cost = adp.BoundedInputCost(1.0, 1.0, 2, 1, bound=3.0, target=target)
+    else:
+        cost = adp.QuadraticCost(1.0, 1.0, 2, 1, target=target, low=bounds[0], high=bounds[1])
+    lqr = adp.LQR(plant, cost)
+    policy = (lambda x: lqr(x).sin()) if base == "function" else lqr
+    limits = systems.Bounds(*bounds, 1)
+    follow = followed(plant, policy, limits, 0.1)
+    assert follow is not None
+    x0 = tensor([[0.3, 0.1], [6.0, -0.5], [-3.5, 0.4]]).view(3, 1, 2)
+    states, controls = follow(x0, 6)
+    assert (states.shape, controls.shape) == ((3, 1, 7, 2), (3, 1, 6, 1))
+    x = x0
+    for k in range(6):
+        torch.testing.assert_close(states[:, :, k], x, rtol=1e-11, atol=1e-12)
+        u = limits.clip(policy(x))
+        torch.testing.assert_close(controls[:, :, k], u, rtol=1e-11, atol=1e-12)
+        x = plant.step(x, u)
+    single, _ = follow(x0.float(), 2)
+    assert single.dtype == torch.float32
+
+
+def test_a_plan_costs_what_its_steps_pay_and_what_its_end_is_worth() -> None:
+    n, m, steps = 2, 1, 4
+    turn = 2 * math.pi
+
+    def advance(x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+        after = x + 0.1 * torch.stack((x[..., 1], u[..., 0] - x[..., 0]), -1)
+        return after, 0.1 * (x.square().sum(-1) + u.square().sum(-1))
+
+    def offset(x: Tensor, y: Tensor) -> Tensor:
+        away = x - y
+        return torch.stack((away[..., 0] - turn * (away[..., 0] / turn).round(), away[..., 1]), -1)
+
+    problem = adp.SampledProblem(advance, dim=n, inputs=m, low=-0.5, high=0.5, periodic=[0])
+    region, worst = tensor([2.0, 3.0]), 7.0
+    state, control = uniform(5, steps, n, seed=1), uniform(5, steps, m, seed=2)
+    feedback = uniform(5, steps, m * n, seed=3)
+    end = torch.cat(
+        (
+            0.3 * uniform(5, n, seed=4),
+            uniform(5, 1, seed=5),
+            uniform(5, n, seed=6),
+            uniform(5, n * n, seed=7),
+        ),
+        -1,
+    )
+    x = state[:, 0] + 0.2 * uniform(5, n, seed=8)
+    x[1] += tensor([turn, 0.0])
+    x[2] += tensor([0.0, 5.0])  # too far to arrive
+    x[3] += torch.nan
+    cost, first, covered = follow_plan(
+        problem, region, worst, x, torch.cat((state, control, feedback), -1), end
+    )
+    for row in range(5):
+        at, paid = state[row, 0] + offset(x[row], state[row, 0]), 0.0
+        for k in range(steps):
+            gain = feedback[row, k].view(m, n)
+            u = (control[row, k] + gain @ (at - state[row, k])).clamp(-0.5, 0.5)
+            if k == 0:
+                torch.testing.assert_close(first[row], u, equal_nan=True)
+            at, more = advance(at, u)
+            paid += float(more)
+        goal, value, slope, bend = end[row, :2], float(end[row, 2]), end[row, 3:5], end[row, 5:].view(2, 2)
+        d = at - goal
+        far = float((d / region).square().sum())
+        if math.isnan(paid):
+            assert float(cost[row]) == math.inf
+            assert not bool(covered[row])
+            continue
+        assert bool(covered[row]) is (far < 0.3**2)
+        rest = value + float(slope @ d + 0.5 * d @ bend @ d) if far < 0.3**2 else value + worst * (1 + far)
+        assert float(cost[row]) == pytest.approx(paid + rest, rel=1e-10)
+    assert covered.tolist()[2:4] == [False, False]
+    assert bool(covered[1])
