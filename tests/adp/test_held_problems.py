@@ -13,7 +13,7 @@ from torch import Tensor
 
 from staf_torch import adp, lanes, systems
 from staf_torch.adp.followed_simulation import followed
-from staf_torch.adp.following import follow_plan
+from staf_torch.adp.global_value import follow_plan
 from staf_torch.adp.holding import Holding, fewest_and_most, runge_kutta_held
 from staf_torch.adp.plans import LocalModel
 from staf_torch.numerics.forward_mode import use_forward_mode

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-import copy
 import math
 import pickle
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from helpers import tensor, uniform
+from torch import Tensor
 
+import staf_torch as st
 from staf_torch import adp, deploy, lanes, systems
 from staf_torch.deploy.c_header import runner_c
 
@@ -21,7 +24,7 @@ def turn(x: np.ndarray, u: np.ndarray) -> np.ndarray:
     return np.stack((x[:, 0] + 0.05 * rate, rate), axis=1)
 
 
-def drawn(dim: int, width: float, rows: int) -> torch.Tensor:
+def drawn(dim: int, width: float, rows: int) -> Tensor:
     generator = torch.Generator().manual_seed(3)
     return width * (2 * torch.rand(rows, dim, dtype=torch.float64, generator=generator) - 1)
 
@@ -102,6 +105,7 @@ def test_report_says_what_was_chosen_and_how_good_it_is(two_states: adp.NearOpti
     assert report["over_base_max"] <= 1.01
     assert report["good_spread"] in (0.5, 1.0, 2.0)  # times 1, 2 and 4 of half a unit
     assert report["microseconds"] > 0
+    assert report["strained"] is None
 
 
 @pytest.mark.needs_compiler
@@ -182,7 +186,7 @@ def test_another_control_than_the_bases_promises_less_over_both_horizons(two_sta
     policy = two_states
     x, discount = drawn(2, 2.0, 300), math.exp(-COST.discount * 0.1)
 
-    def promised(u: torch.Tensor) -> torch.Tensor:
+    def promised(u: Tensor) -> Tensor:
         after, paid = policy.holding(x, u)
         promise = policy.rollout(after)
         return torch.stack((paid + discount * promise.whole, paid + discount * promise.part))
@@ -204,10 +208,10 @@ class Gap(systems.ControlAffineSystem):
 
     dim, inputs = 1, 1
 
-    def drift(self, x: torch.Tensor) -> torch.Tensor:
+    def drift(self, x: Tensor) -> Tensor:
         return x + 1e4 * x**3
 
-    def effectiveness(self, x: torch.Tensor) -> torch.Tensor:
+    def effectiveness(self, x: Tensor) -> Tensor:
         return torch.ones(1, 1, dtype=x.dtype).expand(*x.shape, 1)
 
 
@@ -220,7 +224,7 @@ def test_report_finds_the_region_of_a_plant_in_small_units() -> None:
     assert 1 / 512 <= near["good_spread"] <= 1 / 25  # the same region, asked for by another box
 
 
-def torch_turn(x: torch.Tensor, u: torch.Tensor) -> torch.Tensor:
+def torch_turn(x: Tensor, u: Tensor) -> Tensor:
     """`turn` in torch."""
     rate = (x[:, 1] + 0.05 * (15.0 * x[:, 0].sin() + 3.0 * u[:, 0])).clamp(-8.0, 8.0)
     return torch.stack((x[:, 0] + 0.05 * rate, rate), dim=1)
@@ -251,41 +255,63 @@ def test_simulator_is_followed_in_numpy_to_the_same_promise(
 
 
 @torch.no_grad()
-def test_controllers_of_a_policy_share_programs_and_no_plan(limited: dict[bool, adp.NearOptimal]) -> None:
+def test_controllers_of_a_policy_share_no_plan(limited: dict[bool, adp.NearOptimal]) -> None:
     policy = limited[False]
     one, other = policy.controller(), policy.controller()
-    assert one._begun is other._begun
-    assert next(iter(policy._loops.values())).held  # begins with the best of several
-    dearer = copy.copy(policy)
-    dearer._modules = dict(policy._modules)  # torch lets copies share them: the cost of both would change
-    dearer.cost = adp.QuadraticCost(1.0, 9.0, dim=2, inputs=1, low=-1.0, high=1.0)
-    assert dearer.controller()._begun is not one._begun  # plans of another cost are others
-    far, near = torch.tensor([[3.0, 1.0]]).double(), torch.tensor([[0.05, 0.0]]).double()
+    far, near = tensor([[3.0, 1.0]]), tensor([[0.05, 0.0]])
     none = far.new_zeros(1, 0)
     plan, idle = one.init(far), other.init(near)
     u, after = one.step(far, plan, none, 0.25)
-    again, same = other.step(near, idle, none, 0.25)
-    assert same is idle  # nothing to carry: nothing is made
+    again, _ = other.step(near, idle, none, 0.25)
     assert torch.equal(again, policy(near))
     assert torch.equal(one.step(far, plan, none, 0.25)[0], u)  # nor is a plan changed by those who follow it
-    _, ended = one.step(near, after, none, 0.25)
-    assert bool((ended.identifier[:, 0] < 0).all())
+    assert torch.equal(one.step(near, after, none, 0.25)[0], policy(near))
     copied = pickle.loads(pickle.dumps(policy)).controller()
-    assert copied._begun is not one._begun
     torch.testing.assert_close(copied.step(far, copied.init(far), none, 0.25)[0], u, rtol=0, atol=1e-6)
+    assert policy.plans() is policy.plans()  # it holds programs
 
 
 @torch.no_grad()
 @pytest.mark.parametrize("plan", [True, False])
-def test_states_are_told_from_which_the_lqr_would_meet_a_bound(
+def test_states_are_known_from_which_the_lqr_would_meet_a_bound(
     plan: bool, limited: dict[bool, adp.NearOptimal]
 ) -> None:
-    policy = limited[plan]
+    planner = limited[plan].plans()
+    assert planner is not None
     for spread, share in ((1e-3, 0.0), (1e3, 1.0)):
-        far = policy._drawn(4, spread, 0)
-        planner = policy.plans()
+        assert float(planner.strained(drawn(2, spread, 4)).double().mean()) == share
+
+
+def made(decay: float = 2.0, dt: float = 0.1, **given: Any) -> adp.NearOptimal:
+    """Of a mode that the feedback hardly moves."""
+    cost = adp.QuadraticCost(1e-9, 1.0, dim=1, inputs=1, **given)
+    return adp.near_optimal(systems.Linear([[-decay]], [[1.0]]), cost, dt=dt)
+
+
+def test_plans_are_made_where_there_are_bounds_a_plant_in_torch_and_no_discount() -> None:
+    assert made().plans() is None
+    assert isinstance(made().controller(), adp.Feedback)
+    assert made(low=-1.0, discount=0.1).plans() is None
+    for inside in (torch.sin, np.sin):
+        plant = systems.StepPlant(lambda x, u, f=inside: 0.8 * f(x) + 0.1 * u, dim=1, inputs=1, dt=0.1)
+        policy = adp.near_optimal(plant, adp.QuadraticCost(1.0, 1.0, dim=1, inputs=1, low=-1.0))
+        assert (policy.plans() is not None) is (inside is torch.sin)
+    limited = made(low=-1.0)
+    for constants, steps in ((None, 12), (3.0, 16), (0.1, 12)):  # of half a second, in periods of .1 s
+        planner = limited.plans(constants)
         assert planner is not None
-        assert float(planner.strained(far).double().mean()) == share
+        assert planner.steps == steps
+
+
+@pytest.mark.parametrize(
+    ("seconds", "steps"), [(1.0, 12), (1.21, 12), (1.26, 16), (1.6, 16), (1.64, 16), (5.9, 60), (60.0, 60)]
+)
+def test_a_horizon_is_two_time_constants_in_four_quarters_of_whole_periods(
+    seconds: float, steps: int
+) -> None:
+    policy = made(2 / seconds)
+    assert policy.steps == steps
+    assert policy.substeps == math.ceil(0.1 * 2 / seconds / 0.2)
 
 
 @torch.no_grad()
@@ -293,3 +319,142 @@ def test_report_says_the_share_of_its_states_from_which_the_lqr_would_meet_a_bou
     plant, cost = systems.Linear([[0.0]], [[1.0]]), adp.QuadraticCost(1.0, 1.0, dim=1, inputs=1)
     policy = adp.near_optimal(plant, cost, dt=1.0, horizon=4.0, low=-1.0, high=1.0)
     assert policy.report(states=2, spread=1e-3, optimum=False)["strained"] == 0.0
+
+
+# --- rollouts of a base that is held ------------------------------------------------------------------------
+
+
+PLANT = systems.Linear(
+    [[0.0, 1.0, 0.0], [0.4, -0.3, 0.5], [0.0, 0.2, -0.6]], [[0.0, 0.3], [1.0, 0.2], [0.1, 0.8]]
+)
+GAIN = tensor([[1.0, 0.8, 0.1], [0.2, 0.1, 0.5]])
+METRIC = tensor([[2.0, 0.5, 0.1], [0.5, 1.0, 0.2], [0.1, 0.2, 1.5]])
+HEAVY = tensor([[0.6, 0.2], [0.2, 0.9]])
+
+
+def base(x: Tensor) -> Tensor:
+    return -x @ GAIN.mT
+
+
+def end(x: Tensor) -> Tensor:
+    return (x * (x @ METRIC)).sum(-1) + x[..., 0].sin()
+
+
+def sampled(cost: adp.Cost, policy: Any = base, terminal: Any = end, steps: int = 8) -> adp.SampledRollout:
+    around = torch.cat((st.cross_polytope(2), torch.zeros(1, 2).double()))
+    basis = st.StaFBasis(st.ExponentialKernel(), st.StateFollowingCenters(around, 0.1))
+    return adp.SampledRollout(basis, PLANT, cost, policy, terminal, METRIC, period=0.2, steps=steps)
+
+
+def bounded(discount: float) -> adp.QuadraticCost:
+    limits = {"low": [-1.0, -math.inf], "high": [0.5, 2.0]}
+    return adp.QuadraticCost(1.0, HEAVY, dim=3, inputs=2, discount=discount, **limits)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("discount", [0.0, 0.5])
+@pytest.mark.parametrize(("steps", "part"), [(4, 3), (5, 4), (10, 8)])
+def test_a_promise_is_the_sum_over_the_horizon_and_over_three_quarters_of_it(
+    steps: int, part: int, discount: float
+) -> None:
+    held = sampled(bounded(discount), steps=steps)
+    start = uniform(2, 3, 3, seed=1)
+    x, spent, wanted = start, torch.zeros(2, 3, dtype=torch.float64), []
+    for k in range(steps):
+        u = base(x).clamp(held.bounds.low, held.bounds.high)
+        x, paid = held.holding(x, u)
+        spent = spent + math.exp(-discount * 0.2 * k) * paid
+        wanted.append(spent + math.exp(-discount * 0.2 * (k + 1)) * end(x))
+    found = held.rollout(start)
+    torch.testing.assert_close(found.whole, wanted[-1])
+    torch.testing.assert_close(found.part, wanted[part - 1])
+    last = base(x)
+    assert torch.equal(found.free, ((last > held.bounds.low) & (last < held.bounds.high)).all(-1))
+    for one, some in ((start[1], (1,)), (start[0, 2], (0, 2))):
+        for mine, of_all in zip(held.rollout(one), found, strict=True):
+            torch.testing.assert_close(mine, of_all[some])
+    after, paid = held.holding(start, held.control(start))
+    ahead = held.rollout(after).whole
+    torch.testing.assert_close(held.value(start), paid + math.exp(-discount * 0.2) * ahead)
+
+
+def test_a_control_at_either_bound_is_not_free() -> None:
+    for level, free in ((0.5, False), (0.499, True), (-1.0, False), (-0.999, True), (0.7, False)):
+        held = sampled(bounded(0.3), lambda x, u=level: x.new_tensor([u, 0.1]).expand(*x.shape[:-1], 2))
+        assert held.rollout(torch.zeros(1, 3).double()).free.tolist() == [free]
+
+
+@pytest.mark.parametrize("limits", [(None, None), (-0.05, 0.02)])
+def test_a_proposal_is_the_newton_step_of_what_follows(limits: tuple[float | None, float | None]) -> None:
+    """Nothing is paid but at the end, slope'x, where a resting base drifts to: grad V is e^(A'T) slope."""
+    slope, h, steps = tensor([0.6, -0.9, 0.4]), 0.2, 8
+    cost = adp.QuadraticCost(
+        torch.zeros(3, 3).double(), HEAVY, dim=3, inputs=2, low=limits[0], high=limits[1]
+    )
+    held = sampled(cost, lambda x: 0 * x[..., :2], lambda x: x @ slope, steps=steps)
+    flow = torch.linalg.matrix_exp(
+        h * torch.cat((torch.cat((PLANT.matrix, PLANT.input_matrix), 1), torch.zeros(2, 5)), 0)
+    )
+    a, b = flow[:3, :3], flow[:3, 3:]
+    pull = b.mT @ torch.linalg.matrix_power(a, steps).mT @ slope
+    curved = 2 * (h * HEAVY + b.mT @ METRIC @ b)
+    x = 0.3 * uniform(4, 3, seed=3)
+    for d in held.proposal(x, torch.zeros(4, 2).double()):
+        rise = pull + curved @ d  # of the model: 0 inside, outward at a bound
+        for change, along in zip(d.tolist(), rise.tolist(), strict=True):
+            if limits[0] is not None and change in limits:
+                assert along * change < 0
+            else:
+                assert abs(along) < 2e-3
+
+
+@torch.no_grad()
+def test_an_input_that_moves_nothing_is_left_as_it_is() -> None:
+    chain = [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]]
+    plant = systems.Linear(chain, [[0.0, 0.0], [0.0, 0.0], [1.0, 0.0]])
+    policy = adp.near_optimal(plant, adp.QuadraticCost(1.0, 1.0, dim=3, inputs=2), dt=0.1)
+    x = uniform(4, 3, seed=1)
+    assert bool(policy(x).isfinite().all())
+    torch.testing.assert_close(policy(x)[:, 1], torch.zeros(4).double(), rtol=0, atol=1e-8)
+
+
+def test_four_inputs_are_the_most_that_are_improved_by_samples() -> None:
+    for inputs in (4, 5):
+        plant = systems.Linear((-torch.eye(2)).double(), uniform(2, inputs, seed=2))
+        cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=inputs)
+        if inputs == 4:
+            assert adp.near_optimal(plant, cost, dt=0.1)(torch.zeros(2).double()).shape == (4,)
+        else:
+            with pytest.raises(ValueError, match="at most 4 inputs"):
+                adp.near_optimal(plant, cost, dt=0.1)
+
+
+@torch.no_grad()
+def test_rollouts_of_one_held_state_cost_what_its_riccati_equation_says() -> None:
+    plant, cost = systems.Linear([[-0.5]], [[1.0]]), adp.QuadraticCost(1.0, 1.0, dim=1, inputs=1)
+    value = math.sqrt(0.5**2 + 1) - 0.5
+    held, x = adp.near_optimal(plant, cost, dt=0.1, low=-2.0, high=0.25), tensor([[0.08], [-0.03]])
+    p = float(held.lqr.p)
+    assert value < p < 1.01 * value
+    torch.testing.assert_close(held.rollout(x).whole, p * x.square().squeeze(-1), rtol=1e-5, atol=0)
+    edge = -0.25 / float(held.lqr.k)
+    around = tensor([[0.999 * edge], [1.001 * edge], [-7.0]])
+    assert held.meets_bound(around).tolist() == [[0.0], [1.0], [1.0]]
+
+
+def test_a_bound_is_met_where_the_base_reaches_it_within_the_horizon() -> None:
+    line, cost = systems.Linear([[0.0]], [[1.0]]), adp.QuadraticCost(1.0, 1.0, 1, 1, low=-1.0, high=2.0)
+    basis = st.StaFBasis(st.ExponentialKernel(), st.StateFollowingCenters(tensor([[1.0], [-1.0]]), 0.1))
+
+    def meets(gain: float, *x: float, steps: int = 4) -> list[float]:
+        held = adp.SampledRollout(
+            basis, line, cost, lambda x: gain * x, lambda x: x[..., 0], torch.eye(1), period=0.5, steps=steps
+        )
+        found = held.meets_bound(tensor([[one] for one in x]))
+        assert found.shape == (len(x), 1)
+        return found[:, 0].tolist()
+
+    assert meets(-1.0, 1.0, 0.99, -2.0, -1.99, 5.0, 0.0) == [1.0, 0.0, 1.0, 0.0, 1.0, 0.0]
+    # It grows by a half a period: 0.4, 0.6, 0.9, 1.35, 2.025 in the fifth.
+    assert meets(1.0, 0.4) == [0.0]
+    assert meets(1.0, 0.4, steps=5) == [1.0]
