@@ -236,14 +236,14 @@ def test_a_history_leaves_no_file_open_and_names_its_arrays(tmp_path: Path) -> N
         found["middle"]
 
 
-SPOILT: dict[str, Callable[[Path], None]] = {
-    "cut off": lambda path: path.write_bytes(path.read_bytes()[:-30]) and None,
+SPOILT: dict[str, Callable[[Path], Any]] = {
+    "cut off": lambda path: path.write_bytes(path.read_bytes()[:-30]),
     "of pickles": lambda path: np.savez(path, state=np.array([{}], dtype=object)),
-    "of changed bytes": lambda path: path.write_bytes(path.read_bytes().replace(b"\0\0", b"\1\1")) and None,
-    "empty": lambda path: path.write_bytes(b"") and None,
+    "of changed bytes": lambda path: path.write_bytes(path.read_bytes().replace(b"\0\0", b"\1\1")),
+    "empty": lambda path: path.write_bytes(b""),
     "one array": lambda path: np.save(path.open("wb"), np.arange(3.0)),
     "gone": lambda path: path.unlink(),
-    "a folder": lambda path: (path.unlink(), path.mkdir()) and None,
+    "a folder": lambda path: (path.unlink(), path.mkdir()),
 }
 
 

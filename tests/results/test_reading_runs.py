@@ -1,0 +1,313 @@
+"""Runs, members and sweeps in every state, read back: one bad run never costs the others."""
+
+from __future__ import annotations
+
+import json
+from collections import ChainMap
+from pathlib import Path
+from typing import Any
+
+import pytest
+from sweep_runs import BAD_COUNT, typed, write_run, write_sweep
+
+from staf_torch import __version__
+from staf_torch.results.metric_info import OWN, MetricInfo, read_infos
+from staf_torch.results.reader import Collection, Run, collect, read_run
+from staf_torch.results.run import identity
+from staf_torch.results.untrusted import UnreadableError
+
+
+def run(name: str = "a", overrides: Any = None, settings: Any = None, **more: Any) -> Run:
+    return Run(Path(name), overrides or {}, settings or {}, more.pop("metrics", {}), "completed", **more)
+
+
+def found(*rows: Run) -> Collection:
+    return Collection(rows, ())
+
+
+def test_a_sweep_has_a_row_a_job_in_the_order_of_the_jobs(tmp_path: Path) -> None:
+    rows = collect(write_sweep(tmp_path / "sweep"))
+    assert [each.directory.name for each in rows.rows] == [str(num) for num in range(36)]
+    assert rows.swept == ("kernel", "centers.radius", "centers.count", "seed")
+    first = rows.rows[0]
+    assert first.overrides == {"kernel": "exponential", "centers.radius": 0.05, "centers.count": 3, "seed": 0}
+    assert first.settings["initial_state"] == [1.0, 0.0]
+    assert first.metrics["ball_error"] == 5.0 * 0.05**2
+    assert (first.status, first.reason, first.version) == ("completed", None, __version__)
+    assert (rows.skipped, rows.remarks) == ((), ())
+    failed = [each for each in rows.rows if each.status == "failed"]
+    assert len(failed) == 12
+    assert {each.reason for each in failed} == {BAD_COUNT}
+    assert all(each.metrics == {} and each.setting("centers.count") == 7 for each in failed)
+
+
+def test_a_sweep_that_goes_on_has_rows_for_what_began_and_names_what_did_not(tmp_path: Path) -> None:
+    jobs = [{"num": num, "overrides": typed({"seed": num})} for num in range(12)]
+    (tmp_path / "sweep.json").write_text(json.dumps({"version": __version__, "jobs": jobs}))
+    write_run(tmp_path / "0", {"seed": 0}, {"ball_error": 1.0})
+    write_run(tmp_path / "1", {"seed": 1}, None, status="running")
+    rows = collect(tmp_path)
+    assert [each.status for each in rows.rows] == ["completed", "running"]
+    assert "killed" in str(rows.rows[1].reason)
+    (waiting,) = rows.skipped
+    assert waiting.path == tmp_path
+    assert waiting.reason == "10 of 12 jobs have not started: 2, 3, 4, 5, 6, 7, 8, 9, ..."
+
+
+@pytest.mark.parametrize("content", ["[1]", '{"jobs": 3}', '{"jobs": [1]}', "{"])
+def test_a_spoiled_list_of_jobs_costs_no_row(content: str, tmp_path: Path) -> None:
+    write_run(tmp_path / "0", {"seed": 1}, {"ball_error": 0.125})
+    (tmp_path / "sweep.json").write_text(content)
+    rows = collect(tmp_path)
+    assert (len(rows.rows), [each.path for each in rows.skipped]) == (1, [tmp_path])
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "said"),
+    [
+        ("metrics.json", '{"ball_error": 1', "metrics.json is not JSON"),
+        ("metrics.json", "[]", "metrics.json holds no object"),
+        ("run.json", '{"status": ', "run.json is not JSON"),
+        ("run.json", '{"version": "9.9", "status": "superposed"}', "written by staf_torch 9.9"),
+        ("members.json", '{"members": 3}', "members.json has no list of members"),
+    ],
+)
+def test_a_damaged_run_is_named_and_spares_the_others(
+    name: str, text: str, said: str, tmp_path: Path
+) -> None:
+    write_run(tmp_path / "0", {"seed": 0}, {"ball_error": 1.0})
+    (write_run(tmp_path / "1", {"seed": 1}, {"ball_error": 2.0}) / name).write_text(text)
+    (tmp_path / "2" / ".hydra").mkdir(parents=True)
+    (tmp_path / "2" / ".hydra" / "overrides.yaml").write_text("- seed=2\n")  # killed before its record
+    rows = collect(tmp_path)
+    assert rows.rows[0].metrics == {"ball_error": 1.0}
+    assert said in str([each.reason for each in (*rows.rows, *rows.skipped)])
+    assert "run.json cannot be read: No such file" in rows.skipped[-1].reason
+
+
+def test_runs_of_another_version_are_read_and_named(tmp_path: Path) -> None:
+    write_run(tmp_path / "0", {"seed": 0}, {"ball_error": 1.0}, version="0.0.9")
+    write_run(tmp_path / "1", {"seed": 1}, {"ball_error": 1.0})
+    rows = collect(tmp_path)
+    assert len(rows.rows) == 2
+    (remark,) = rows.remarks
+    assert "1 of 2 runs were written by staf_torch 0.0.9" in remark
+    assert str(tmp_path / "0") in remark
+
+
+@pytest.mark.parametrize("kind", ["missing", "empty", "a file", "other folders"])
+def test_a_path_without_runs_is_refused(kind: str, tmp_path: Path) -> None:
+    path = tmp_path / "path"
+    if kind == "a file":
+        path.write_text("")
+    elif kind != "missing":
+        (path / "figures" / "more").mkdir(parents=True) if kind == "other folders" else path.mkdir()
+    with pytest.raises(ValueError, match=r"`collect\(path=...\)` must (be a directory|hold a run)"):
+        collect(path)
+
+
+def test_folders_are_read_in_the_order_of_their_numbers_and_no_link_is_followed(tmp_path: Path) -> None:
+    for name in ("run10", "run9", "run", "a/b/c", ".hidden", "figures", "run9/inner"):
+        write_run(tmp_path / name, {"kernel": name}, {"ball_error": 1.0})
+    (tmp_path / "again").symlink_to(tmp_path)
+    assert [row.directory.name for row in collect(tmp_path).rows] == ["c", "run", "run9", "run10"]
+    both = collect([tmp_path / "run9", tmp_path / "run10"])
+    assert [each.setting("kernel") for each in both.rows] == ["run9", "run10"]
+
+
+def edited(place: Path, **more: Any) -> Run:
+    record = json.loads((place / "run.json").read_text())
+    (place / "run.json").write_text(json.dumps(record | more))
+    (one,) = read_run(place)
+    return one
+
+
+def test_odd_values_of_a_record_are_read_as_what_they_can_be(tmp_path: Path) -> None:
+    place = write_run(tmp_path / "run", {"seed": 1}, {"ball_error": 1.0}, reason="told")
+    one = edited(
+        place, seconds=True, version=3, task=["a"], build="b", overrides=["seed=1", 7], metrics={"m": {}}
+    )
+    assert (one.seconds, one.version, one.task, one.build) == (None, None, None, None)
+    assert (dict(one.overrides), dict(one.declared)) == ({"seed": 1}, {"m": MetricInfo("m")})
+    assert (one.status, one.reason) == ("completed", "told")
+    one = edited(place, settings={"a": {"b": 1}, "c": [1, [2]], "d": None, "e": float("nan")})
+    assert dict(one.settings) == {"a": '{"b": 1}', "c": [1, [2]], "d": None, "e": "nan"}
+    assert dict(edited(place, settings=[1]).settings) == {}
+    (place / "metrics.json").write_text(
+        '{"a": NaN, "b": -Infinity, "c": 1e999, "d": 2, "e": "word", "f": true}'
+    )
+    one = read_run(place)[0]
+    assert one.metrics == {"a": None, "b": None, "c": None, "d": 2}
+    assert one.absence("b") == "was -inf, which is not a number"
+
+
+@pytest.mark.parametrize(
+    ("status", "reason", "said"),
+    [
+        ("running", None, "has not ended: it goes on, or was killed"),
+        ("failed", None, "no reason was left"),
+        ("failed", "why", "why"),
+        ("completed", None, None),
+    ],
+)
+def test_a_run_says_why_it_has_no_result(
+    status: str, reason: str | None, said: str | None, tmp_path: Path
+) -> None:
+    place = write_run(tmp_path / "run", {}, {"ball_error": 1.0}, status=status, reason=reason)
+    (one,) = read_run(place)
+    assert (one.status, one.reason) == (status, said)
+    assert dict(one.metrics) == ({"ball_error": 1.0} if status == "completed" else {})
+
+
+def test_a_file_that_is_not_as_it_was_written_is_named(tmp_path: Path) -> None:
+    place = write_run(tmp_path / "run", {}, {"ball_error": 1.0})
+    for about, said in (([3, "0"], "it has 19 bytes in place of 3"), ([19, "0"], "its checksum is another")):
+        one = edited(place, files={"metrics.json": about})
+        assert (one.status, dict(one.metrics)) == ("unfinished", {})
+        assert f"metrics.json is damaged: {said}" in str(one.reason)
+    assert edited(place, files={"figure.png": [3, "0"]}).status == "completed"  # gone, and holds no number
+    assert edited(place, checksum="0").reason == "run.json is damaged: its checksum is another one"
+
+
+# Members
+
+
+def rows_of(place: Path, *lines: str, name: str = "members.json", end: str = "]}\n") -> list[Run]:
+    (place / name).write_text(f'{{"version": "1", "members": [\n{"".join(lines)}{end}')
+    return read_run(place)
+
+
+def member(num: Any, **more: Any) -> dict[str, Any]:
+    return {"num": num, "overrides": [f"seed={num}"], "status": "completed", "metrics": {"ball": 1.0}} | more
+
+
+def test_members_are_rows_like_those_of_jobs(tmp_path: Path) -> None:
+    overrides = {"members": "x", "members.own": 1, "kernel": "a"}
+    place = write_run(tmp_path / "run", overrides, {"members": 2})
+    one, two = rows_of(place, json.dumps(member(5)) + ",\n", json.dumps(member(True, status="failed")) + "\n")
+    assert (one.member, two.member) == (5, 1)
+    assert dict(one.overrides) == {"kernel": "a", "seed": 5}
+    assert (one.seconds, one.settings["seed"], one.settings["dt"]) == (None, 5, 0.01)
+    assert not {"members", "members.own"} & set(one.settings)
+    assert (dict(one.metrics), dict(two.metrics)) == ({"ball": 1.0}, {})
+    assert (two.status, two.reason) == ("failed", "no reason was left")
+    stated = member(0, settings={"dt": 3, "members": "x"})
+    assert dict(rows_of(place, json.dumps(stated) + "\n")[0].settings) == {"dt": 3}
+    with pytest.raises(UnreadableError, match=r"members.json ends before its last row"):
+        rows_of(place, json.dumps(member(5)) + ",\n", end="")
+    for odd in ('{"members": [1]}', '{"members": 1}', "[]"):
+        (place / "members.json").write_text(odd)
+        with pytest.raises(UnreadableError):
+            read_run(place)
+
+
+def test_members_of_a_run_that_goes_on_come_with_it(tmp_path: Path) -> None:
+    place = write_run(tmp_path / "run", {"members": "x"}, None, status="running")
+    line = json.dumps(member(0)) + ",\n"
+    rows = rows_of(place, line, line.replace("0", "1"), line[:20], name=".members.json.partial", end="")
+    assert [(each.member, each.status) for each in rows] == [
+        *((0, "completed"), (1, "completed"), (None, "running"))
+    ]
+
+
+# What a run and a collection say
+
+
+def test_a_run_is_shown_by_its_overrides_and_first_headline() -> None:
+    overrides = {"kernel": "gaussian", "figures": False, "members": None, "dt": 0.5}
+    metrics = {"gradient_error": 2.0, "ball_error": 0.123456, "ball_floor_error": None, "own": 1.0}
+    shown = repr(run(overrides=overrides, metrics=metrics))
+    assert shown == "<Run completed: kernel=gaussian figures=false members=null dt=0.5, ball_error=0.123>"
+    assert repr(run()) == "<Run completed: no overrides>"
+
+
+def test_anything_about_a_run_has_a_value_by_its_name_or_a_reason_why_not() -> None:
+    one = run(
+        "a\x1b[2Jb", {"dt": 1, "typed": 2}, {"dt": 3, "seconds": 4}, metrics={"ball": None}, seconds=5.0
+    )
+    assert [one.setting(key) for key in ("dt", "typed", "no")] == [3, 2, None]
+    assert [one.value(key) for key in ("dt", "ball", "seconds", "status")] == [3, None, 5.0, "completed"]
+    assert "\x1b" not in str(one.value("directory"))
+    assert one.absence("ball") == "not finite, or nothing to report"
+    assert one.absence("cost") == "this run has no such metric"
+    assert run(metrics={"ball": None}, reason="why").absence("ball") == "why"
+
+
+def test_values_are_the_same_in_a_table_as_numbers_are_but_no_number_is_a_text() -> None:
+    values: list[Any] = [1, 1.0, True, "1", None, [1], [1.0], "None", 0.5]
+    assert len({identity(value) for value in values}) == len(values) - 1
+    assert identity(1) == identity(1.0)
+
+
+def test_columns_are_overrides_then_settings_then_what_is_about_the_run() -> None:
+    both = found(
+        run(overrides={"z": 1}, settings={"a": 1, "z": 1}), run(overrides={"b": 1}, settings={"c": 1})
+    )
+    about = ("task", "status", "reason", "seconds", "version", "build", "directory", "member")
+    assert both.keys == ("z", "b", "a", "c", *about)
+
+
+def test_metrics_have_the_units_that_the_library_or_the_runs_declare() -> None:
+    own = MetricInfo("mine", unit="m", larger_is_better=True)
+    one = run(metrics={"b": 1.0, "mine": 2.0}, declared={"mine": own})
+    both = found(one, run(metrics={"ball_error": 1.0, "b": 2.0, "cost": 1.0}))
+    known = {info.name: info for info in OWN}
+    assert both.infos == {
+        **{"b": MetricInfo("b"), "mine": own},
+        **{name: known[name] for name in ("ball_error", "cost")},
+    }
+    assert read_infos({"mine": own.record(), "b": {"headline": 1}, "c": 3}) == {
+        **{"mine": own, "b": MetricInfo("b")}
+    }
+    assert read_infos(None) == read_infos([1]) == {}
+
+
+def test_what_was_swept_is_what_was_overridden_and_differs() -> None:
+    assert found(run(overrides={"a": 1, "b": 2})).swept == ("a", "b")
+    both = found(run(overrides={"a": 1, "b": 2, "c": 1}), run(overrides={"a": 1.0, "b": 3, "c": "1"}))
+    assert both.swept == ("b", "c")
+
+
+UNASKED: list[tuple[dict[str, Any], dict[str, Any], dict[str, Any], dict[str, Any], tuple[str, ...]]] = [
+    ({"dt": 1, "x": 2}, {"dt": 1, "x": 3}, {}, {}, ("x",)),
+    ({"dt": 1}, {"dt": 1, "x": 3}, {}, {}, ("x",)),
+    ({"dt": 1}, {}, {}, {}, ()),  # nothing is known of that one
+    ({"a": 1}, {"a": 2}, {"a": 1}, {"a": 2}, ()),
+    ({"a": 1, "a.b": 1, "a/c": 1, "ab": 1}, {"a": 2, "a.b": 2, "a/c": 2, "ab": 2}, {"a": 5}, {}, ("ab",)),
+    ({"x": 5, "y": 1}, {"x": 6, "y": 2}, {"r": 5}, {"r": 6}, ("y",)),  # x follows r
+    ({"x": [1, 5]}, {"x": [1, 6]}, {"r": 5}, {"r": 6}, ()),
+    ({"x": [1, 5]}, {"x": [2, 6]}, {"r": 5}, {"r": 6}, ("x",)),
+    ({"x": [1]}, {"x": [1, 2]}, {}, {}, ("x",)),
+    ({"k": "m", "x": 1}, {"k": "g", "x": 2}, {"k": "m"}, {"k": "g"}, ()),  # of another kernel
+]
+
+
+@pytest.mark.parametrize(("one", "two", "first", "second", "named"), UNASKED)
+def test_settings_that_differ_although_nobody_swept_them_are_named(
+    one: dict[str, Any],
+    two: dict[str, Any],
+    first: dict[str, Any],
+    second: dict[str, Any],
+    named: tuple[str, ...],
+) -> None:
+    assert found(run("a", first, one), run("b", second, two)).unswept == named
+    assert found(run("a", first, one), run("b", second, two, build="other")).unswept == (*named, "build")
+
+
+def test_members_share_the_settings_of_their_run() -> None:
+    shared = {"dt": 7, "seed": 0}
+    one, two = (run(overrides={"seed": n}, settings=ChainMap({"seed": n}, shared)) for n in (1, 2))
+    both = found(one, two)
+    assert (both.unswept, both.swept) == ((), ("seed",))
+    assert found(one, two, run(settings={"dt": 9, "seed": 0})).unswept == ("dt",)
+
+
+def test_a_remark_counts_the_values_of_a_setting_that_nobody_swept(tmp_path: Path) -> None:
+    for number, value in enumerate([1, 1, "two", [3], 4.5]):
+        write_run(tmp_path / str(number), {}, {"ball_error": 1.0})
+        record = json.loads((tmp_path / str(number) / "run.json").read_text())
+        record["settings"]["x"] = value
+        (tmp_path / str(number) / "run.json").write_text(json.dumps(record))
+    (remark,) = collect(tmp_path).remarks
+    counts = f"1 in 2 (as {tmp_path}/0), two in 1 (as {tmp_path}/2), [3] in 1 (as {tmp_path}/3) and 1 others"
+    assert remark == f"`x` differs between runs although nobody swept it: {counts}"

@@ -1,0 +1,407 @@
+"""A chase from settings: every option builds, every wrong value is named, equal settings share objects."""
+
+from __future__ import annotations
+
+import functools
+import math
+import re
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import composing
+import pytest
+import torch
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import DictConfig, OmegaConf
+from torch import Tensor
+
+import staf_torch as st
+from staf_torch import StateFollowingCenters
+from staf_torch.cli.staf import config_directory
+from staf_torch.metrics import Metric
+from staf_torch.settings import chase
+from staf_torch.settings.chase import ChaseProblem, chase_problem, make, make_centers
+from staf_torch.settings.plain import PlainSettings
+from staf_torch.sweeps.hydra_compat.program import named_packages, trusted
+
+GROUPS = ("kernel", "centers", "target", "system", "optimizer")
+OPTIONS = [
+    f"{group}={path.stem}"
+    for group in GROUPS
+    for path in sorted((Path(config_directory()) / group).glob("*.yaml"))
+    if path.stem
+    not in ("custom", "mujoco")  # of the user's own; the second in tests/settings/test_adp_groups.py
+]
+
+
+@functools.cache
+def composed(*choices: str) -> DictConfig:
+    return composing.settings(*choices)
+
+
+def settings(line: str) -> DictConfig:
+    """A command line as Hydra would compose it, each choice of groups but once."""
+    words = line.split()
+    choices = [word for word in words if word.partition("=")[0] in GROUPS]
+    values = [word for word in words if word not in choices]
+    cfg = composed(*choices).copy()
+    for value in OverridesParser.create().parse_overrides(values):
+        OmegaConf.update(cfg, value.key_or_group, value.value(), force_add=value.is_add())
+    return cfg
+
+
+def problem(line: str) -> ChaseProblem:
+    return chase_problem(settings(line))
+
+
+NEEDS = {  # what some options cannot do without
+    "centers=directions": "centers.directions=[[0,1],[1,0],[-1,0]]",
+    "system=cart_pole": "centers=simplex initial_state=[0,0,0,0]",
+    "system=planar_quadrotor": "centers=simplex initial_state=[0,0,0,0,0,0]",
+    "system=two_link_robot": "centers=simplex initial_state=[0,0,0,0]",
+    "system=three_state": "centers=simplex initial_state=[0,0,0]",
+}
+
+
+@pytest.mark.parametrize("option", OPTIONS)
+def test_every_option_of_every_group_builds_its_problem(option: str) -> None:
+    built = problem(f"{option} {NEEDS.get(option, '')}")
+    assert built.initial_states.shape == (1, built.basis.dim)
+    assert built.basis.count >= 3
+
+
+@pytest.mark.parametrize(
+    ("dt", "duration", "steps"), [(0.1, 0.3, 3), (0.01, 0.07, 7), (0.3, 0.9, 3), (1.0, 1.5, 1)]
+)
+def test_number_of_steps_survives_rounding(dt: float, duration: float, steps: int) -> None:
+    assert problem(f"dt={dt} duration={duration}").steps == steps
+
+
+def test_first_states_do_not_depend_on_how_many_follow_and_repeat_by_seed() -> None:
+    few, many = (problem(f"trajectories={b} seed=7").initial_states for b in (3, 50))
+    assert torch.equal(many[:3], few)
+    assert many[0].tolist() == [1.0, 0.0]
+    assert ((many - many[0]).abs() <= 0.5).all()
+    assert len(set(map(tuple, many.tolist()))) == 50
+    assert torch.equal(problem("trajectories=3 seed=7").initial_states, few)
+    assert not torch.equal(problem("trajectories=3 seed=8").initial_states, few)
+
+
+def test_single_precision_reaches_every_part() -> None:
+    built = problem("dtype=float32 kernel=gaussian target=quadratic trajectories=4")
+    assert built.initial_states.dtype == torch.float32
+    double = problem("kernel=gaussian target=quadratic trajectories=4")
+    torch.testing.assert_close(built.initial_states, double.initial_states.float(), rtol=0, atol=0)
+    floating = [buffer for buffer in built.basis.buffers() if buffer.is_floating_point()]
+    assert floating
+    assert all(buffer.dtype == torch.float32 for buffer in floating)
+
+
+BAD: dict[str, tuple[str, tuple[str, ...]]] = {
+    "count is a word": ("centers.count=abc", ("(count=...)` must be an integer; got 'abc'.",)),
+    "count of a simplex": ("centers=simplex centers.count=7", ("must be 3 (or null) for simplex", "got 7")),
+    "count of a ball": (
+        "centers=ball centers.count=null",
+        ("`ball(count=...)` must be an integer; got None.",),
+    ),
+    "radius is a word": ("centers.radius=abc", ("(radius=...)` must be a number; got 'abc'.",)),
+    "negative offset": ("centers.shrink.offset=-1", ("(offset=...)` must not be negative; got -1.",)),
+    "width is not a number": ("kernel=gaussian kernel.width=nan", ("(width=...)` must be finite; got nan.",)),
+    "smoothness": ("kernel=matern kernel.smoothness=1", ("(smoothness=...)` must be one of 0.5, 1.5, 2.5",)),
+    "long initial state": ("initial_state=[1,2,3]", ("initial_state=...` must have 2 entries",)),
+    "word in the initial state": (
+        "initial_state=[a,0.0]",
+        ("initial_state=...` must be a list of numbers",),
+    ),
+    "initial state is a number": ("initial_state=5", ("initial_state=...` must be a list of numbers",)),
+    "initial state is missing": ("initial_state=null", ("initial_state=...` must be a list of numbers",)),
+    "negative dt": ("dt=-0.01", ("`staf dt=...` must be positive; got -0.01.",)),
+    "dt is infinite": ("dt=inf", ("`staf dt=...` must be finite; got inf.",)),
+    "dt is null": ("dt=null", ("`staf dt=...` must be a number; got None.",)),
+    "duration is a word": ("duration=abc", ("`staf duration=...` must be a number; got 'abc'.",)),
+    "settle time is a word": ("settle_time=abc", ("`staf settle_time=...` must be a number; got 'abc'.",)),
+    "half a trajectory": ("trajectories=1.5", ("`staf trajectories=...` must be an integer; got 1.5.",)),
+    "negative spread": ("trajectories=2 spread=-1", ("`staf spread=...` must be positive; got -1.",)),
+    "negative seed": ("seed=-1", ("`staf seed=...` must be at least 0; got -1.",)),
+    "no iterations": (
+        "optimizer.inner_steps=0",
+        ("`staf optimizer.inner_steps=...` must be at least 1; got 0.",),
+    ),
+    "unknown device": ("device=nope", ("`staf device=...` cannot be used here",)),
+    "unknown dtype": ("dtype=float16", ("`staf dtype=...` must be one of 'float64', 'float32'",)),
+    "planar layout in space": (
+        "system=linear system.matrix=[[0,1,0],[0,0,1],[-1,-1,-1]] initial_state=[1,0,0]",
+        ("`centers=rings` lies in the plane, but the system has 3 states",),
+    ),
+    "matrix that is not square": (
+        "system=linear system.matrix=[[1,2]]",
+        ("`Linear(matrix=...)` must have 1",),
+    ),
+    "frequency": ("system.frequency=0", ("`Oscillator(frequency=...)` must be positive; got 0.",)),
+    "asymmetric target": ("target=quadratic target.matrix=[[1,2],[0,1]]", ("must be symmetric",)),
+    "path without a module": ("target=custom target.path=bowl", ("must be a dotted path",)),
+    "arguments of a function": (
+        "target=custom target.path=math.cos +target.arguments.a=1",
+        ("needs a class at math.cos",),
+    ),
+    "kernel that is none": ("kernel=custom kernel.path=math.cos", ("(kernel=...)` must be a Kernel",)),
+    "system that is none": ("system=custom system.path=math.cos", ("must be a plant with a method `drift`",)),
+    "target that is none": ("target=custom target.path=math.pi", ("`staf target=...` must be callable",)),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_a_bad_value_is_named(name: str) -> None:
+    line, expected = BAD[name]
+    own = trusted(named_packages(line.split()))  # as of the command
+    with own, pytest.raises(Exception) as found:  # noqa: PT011 (Hydra wraps some; the command unwraps them)
+        problem(line)
+    messages, error = [], found.value
+    while error is not None:
+        messages.append(str(error))
+        error = error.__cause__
+    for words in expected:
+        assert words in "\n".join(messages)
+
+
+def test_centers_of_the_users_own_class_are_made_and_other_things_refused() -> None:
+    rings = {"_target_": "staf_torch.rings", "count": 3}
+    given = {"_target_": "staf_torch.StateFollowingCenters", "directions": rings, "radius": 0.3}
+    made = make_centers(OmegaConf.create(given), 2)
+    assert isinstance(made, StateFollowingCenters)
+    with pytest.raises(ValueError, match="must be StateFollowingCenters"):
+        make_centers(OmegaConf.create({"_target_": "staf_torch.GaussianKernel", "width": 1.0}), 2)
+
+
+def test_what_a_constructor_does_not_know_or_lacks_is_said_in_its_words() -> None:
+    for given, said in (({"widht": 2.0}, "widht"), ({"width": 2.0, "length": 1.0}, "length")):
+        with pytest.raises(ValueError, match=rf"`staf_torch.GaussianKernel` cannot be built .*{said}"):
+            make(OmegaConf.create({"_target_": "staf_torch.GaussianKernel", **given}))
+
+
+class Demanding:
+    """A user's class that has an error of its own."""
+
+    def __init__(self, width: float) -> None:
+        raise {1.0: TypeError("a width of one"), 2.0: KeyError("unexpected keyword argument")}[width]
+
+
+@pytest.mark.parametrize(("width", "words"), [(1.0, "a width of one"), (2.0, "unexpected keyword")])
+def test_an_error_of_the_users_own_class_is_not_taken_for_one_of_the_settings(
+    width: float, words: str
+) -> None:
+    with pytest.raises(Exception, match=words) as caught:
+        make(OmegaConf.create({"_target_": f"{__name__}.Demanding", "width": width}))
+    assert "cannot be built from these settings" not in str(caught.value)
+
+
+POINTS = [[0.0, 1.0], [1.0, 0.0], [-1.0, 0.0]]
+
+
+@pytest.mark.parametrize(
+    ("given", "wanted"),
+    [
+        ({"layout": "rings", "count": 6}, lambda: st.rings(6)),
+        ({"layout": "polygon", "count": 4, "dim": 2}, lambda: st.polygon(4)),
+        ({"layout": "simplex", "dim": 3}, lambda: st.simplex(3)),
+        ({"layout": "simplex", "dim": 3, "count": 4}, lambda: st.simplex(3)),
+        ({"layout": "cross_polytope", "dim": 2, "count": 4}, lambda: st.cross_polytope(2)),
+        ({"layout": "ball", "dim": 3, "count": 4}, lambda: st.ball(4, 3)),
+        ({"layout": "directions", "directions": POINTS}, lambda: torch.tensor(POINTS).double()),
+        ({"layout": "directions", "directions": POINTS, "dim": 2}, lambda: torch.tensor(POINTS).double()),
+    ],
+)
+@pytest.mark.parametrize(
+    "size", [{}, {"radius": 0.3}, {"radius": 0.3, "shrink": {"offset": 0.2, "gain": 2.0}}]
+)
+def test_centers_are_those_of_the_layout_and_the_radius(
+    given: dict[str, Any], wanted: Callable[[], Tensor], size: dict[str, Any]
+) -> None:
+    made = chase.centers_of(**given, **size)
+    assert torch.equal(made.directions, wanted())
+    assert made.directions.dtype == torch.float64
+    x = torch.ones(made.dim).double()
+    square, radius = float(made.dim), size.get("radius", 0.1)
+    assert isinstance(made.radius, st.StateRadius if "shrink" in size else st.ConstantRadius)
+    expected = radius * (square + 0.2) / (1 + 2.0 * square) if "shrink" in size else radius
+    assert float(made.radius(x)) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        (
+            {"layout": "no"},
+            "'simplex', 'cross_polytope', 'ball', 'directions'; got 'no'.",
+        ),
+        (
+            {"layout": "polygon", "count": 3, "dim": 3},
+            "`centers=polygon` lies in the plane, but the system has 3 states: use",
+        ),
+        ({"layout": "rings", "count": None}, "`rings(count=...)` must be an integer; got None."),
+        ({"layout": "directions"}, "`staf centers.directions=...` must be a list of points; got None."),
+        (
+            {"layout": "directions", "directions": "???"},
+            "centers.directions=...` must be a list of points; got '???'.",
+        ),
+        (
+            {"layout": "directions", "directions": [[1.0]], "dim": 2},
+            "directions=...` must have 2 entries, one a state; got",
+        ),
+        (
+            {"layout": "ball", "count": 3},
+            "`centers(dim=...)` must be given for the layout ball: instantiate(..., dim=n)",
+        ),
+        (
+            {"layout": "simplex", "dim": 2, "count": 4},
+            "must be 3 (or null) for simplex with 2 states; got 4.",
+        ),
+        (
+            {"layout": "simplex", "dim": 2, "count": "4"},
+            "centers.count=...` must be an integer; got '4'.",
+        ),
+        ({"layout": "simplex", "dim": 2, "count": 0}, "`staf centers.count=...` must be at least 1; got 0."),
+    ],
+)
+def test_centers_that_there_are_not_are_refused(given: dict[str, Any], said: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(said)):
+        chase.centers_of(**given)
+
+
+def test_equal_settings_share_one_object_and_repeat_its_warning() -> None:
+    parts = chase.Parts()
+
+    def built(*given: Any) -> object:
+        if len(given) > 1:
+            warnings.warn("two", stacklevel=1)
+        return object()
+
+    node = {"a": [1, {"b": 2}]}
+    first = parts(built, OmegaConf.create(node))
+    assert parts(built, OmegaConf.create(node)) is first
+    assert parts(built, PlainSettings(node)) is first
+    assert parts(built, OmegaConf.create({"a": [1, {"b": 3}]})) is not first
+    referring = [OmegaConf.create({"c": value, "part": {"a": "${c}"}}).part for value in (1, 2, 1)]
+    made = [parts(built, each) for each in referring]
+    assert made[0] is made[2] is not made[1]
+    assert parts(built, 1) is parts(built, 1) is not parts(built, "1")
+    for _ in range(2):
+        with pytest.warns(UserWarning, match="^two$"):
+            parts(built, 1, None)
+
+
+class Rows(Metric):
+    """A metric of the user's."""
+
+    def __init__(self, name: str = "rows") -> None:
+        self.name = name
+
+    def __call__(self, result: Any, problem: Any) -> Tensor:
+        raise NotImplementedError
+
+
+def two(names: list[str]) -> Any:
+    return tuple(Rows(name) for name in names)
+
+
+def rows_and_words() -> Any:
+    return [Rows(), "word"]
+
+
+def metric(target: str, **more: Any) -> Any:
+    return chase.make_metrics(OmegaConf.create({"_target_": f"{__name__}.{target}", **more}))
+
+
+def test_metrics_are_none_one_or_several() -> None:
+    assert chase.make_metrics(None) == chase.make_metrics(OmegaConf.create({"_target_": None})) == ()
+    assert [each.name for each in metric("Rows")] == ["rows"]
+    assert [each.name for each in metric("two", names=["a", "b"])] == ["a", "b"]
+    assert isinstance(metric("Rows"), tuple)
+    with pytest.raises(ValueError, match=r"metric=...` must have a name that no other metric has; got 'a'"):
+        metric("two", names=["a", "a"])
+    with pytest.raises(ValueError, match=r"must have a name that no other metric has; got 'ball_error'"):
+        metric("Rows", name="ball_error")
+    with pytest.raises(ValueError, match=r"metric=...` must be a `staf_torch.metrics.Metric`, or several"):
+        metric("rows_and_words")
+
+
+def test_a_path_is_a_class_that_is_called_or_a_thing_as_it_is() -> None:
+    assert chase.load("math.pi") == math.pi
+    assert chase.load("math.cos", {}, inner_steps=3) is math.cos
+    assert chase.load(f"{__name__}.Rows", {"name": "x"}).name == "x"
+    assert chase.load(f"{__name__}.Rows").name == "rows"
+    for path, said in (
+        ("pi", "must be a dotted path `package.module.name`; got 'pi'."),
+        (3, "must be a dotted path `package.module.name`; got 3."),
+        (
+            "math.no_such",
+            "cannot be imported (module 'math' has no attribute 'no_such')",
+        ),
+        (
+            "no_such_module.x",
+            "cannot be imported (No module named 'no_such_module'); got",
+        ),
+    ):
+        with pytest.raises(ValueError, match=re.escape(f"`custom(path=...)` {said}")):
+            chase.load(path)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=re.escape("`custom(arguments=...)` needs a class at math.pi")):
+        chase.load("math.pi", {"a": 1})
+
+
+def test_settings_are_plain_python_whoever_made_them() -> None:
+    tree = {"a": 1, "b": {"c": [1, 2]}}
+    for cfg in (OmegaConf.create(tree), PlainSettings({"a": 1, "b": PlainSettings({"c": [1, 2]})})):
+        found = chase.plain(cfg)
+        assert found == tree
+        assert (type(found), type(found["b"]), type(found["b"]["c"])) == (dict, dict, list)
+    assert chase.plain(OmegaConf.create({"a": 1, "b": "${a}"})) == {"a": 1, "b": 1}
+    assert chase.plain("x") == "x"
+
+
+@pytest.mark.parametrize("spread", [0.5, 2.0])
+def test_states_are_the_stated_one_and_others_in_a_box_around_it(spread: float) -> None:
+    given = {"initial_state": [1.0, -3.0], "trajectories": 200, "spread": spread, "seed": 0}
+    states = chase.initial_states(OmegaConf.create(given), 2)
+    assert states.shape == (200, 2)
+    assert states[0].tolist() == [1.0, -3.0]
+    away = states[1:] - states[0]
+    assert 0.9 * spread < float(away.max()) <= spread
+    assert -spread <= float(away.min()) < -0.9 * spread
+    assert float(away.mean(0).abs().max()) < 0.15 * spread
+
+
+def test_a_list_of_numbers_is_sorted_and_has_no_number_twice() -> None:
+    cfg = OmegaConf.create({"a": {"b": [3, 1, 2.0, 1.0]}, "none": [], "word": "x", "zero": [1, 0]})
+    assert chase.numbers(cfg, "a.b") == [1.0, 2.0, 3.0]
+    for name, said in (
+        ("none", "must be a list of numbers; got []"),
+        ("word", "must be a list of numbers; got 'x'"),
+        ("absent", "must be a list of numbers; got None"),
+        ("zero", "must be positive; got 0"),
+    ):
+        with pytest.raises(ValueError, match=re.escape(f"`staf {name}=...` {said}")):
+            chase.numbers(cfg, name)
+    assert chase.case_name(0.10, 1e-3) == "r0.1.eps0.001"
+
+
+@pytest.mark.parametrize(
+    ("states", "index"), [(1, [0]), (4, [0, 2, 5, 7]), (10, list(range(10))), (99, list(range(10)))]
+)
+def test_states_of_a_trajectory_are_equally_spaced_without_the_last(states: int, index: list[int]) -> None:
+    cfg = composing.settings(
+        "experiment=layouts", "dt=0.1", "duration=1.0", "trajectories=3", "centers.radius=0.25"
+    )
+    OmegaConf.update(cfg, "experiment.states", states, force_add=True)
+    found = chase.local_problem(cfg, "experiment.states")
+    problem = chase.chase_problem(cfg)
+    path = torch.cat(
+        list(chase.trajectory(problem.system, problem.initial_states[:1], dt=0.1, steps=10)), dim=1
+    )[0]
+    torch.testing.assert_close(found.states, path[index])
+    torch.testing.assert_close(found.time, 0.1 * torch.tensor(index).double())
+    assert found.radius == 0.25
+    cfg.centers.shrink.offset = 0.1
+    with pytest.raises(ValueError, match=r"`staf centers.shrink.offset=...` must be null here: .*; got 0.1"):
+        chase.local_problem(cfg, "experiment.states")
