@@ -76,12 +76,9 @@ def _place(folder: Path) -> tuple[str, bool]:
     there = folder.absolute()
     while not there.exists():
         there = there.parent
-    good = os.access(there, os.W_OK)
+    wrong = ", not a folder" if not there.is_dir() else "" if os.access(there, os.W_OK) else ", read-only"
     files = sum(1 for path in folder.glob("*.so")) if folder.is_dir() else 0
-    return (
-        f"{folder.absolute()}{f', {files} libraries' if files else ''}{'' if good else ', read-only'}",
-        good,
-    )
+    return f"{folder.absolute()}{f', {files} libraries' if files else ''}{wrong}", not wrong
 
 
 def _self_test() -> tuple[str, bool]:

@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import ctypes
 import importlib.util
+import math
+import os
 import shutil
 import subprocess
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
+from helpers import tensor
 from torch import Tensor, nn
 from variants import SMOOTH_KERNELS
 
@@ -19,6 +24,7 @@ from staf_torch import (
     GaussianKernel,
     Kernel,
     MaternKernel,
+    PolynomialKernel,
     RationalQuadraticKernel,
     StaF,
     StaFBasis,
@@ -31,12 +37,13 @@ from staf_torch import (
     systems,
     targets,
 )
-from staf_torch.deploy import approximators, formats, sheet
+from staf_torch.deploy import controllers, formats, sheet
 from staf_torch.deploy.c_header import need_c_compiler, runner_c
 
 PLANT = systems.TwoState()
 COST = adp.QuadraticCost(1.0, 1.0, 2, 1)
 LQR = adp.LQR(PLANT, COST)
+X = tensor([[0.4, -0.3]])
 BOX = adp.RandomPoints(1, StateRadius(2.1, 1e-5))
 needs_onnx = pytest.mark.skipif(
     any(importlib.util.find_spec(name) is None for name in ("onnx", "onnxscript", "onnxruntime")),
@@ -97,7 +104,7 @@ CONTROLLERS = {
 }
 
 
-@pytest.mark.parametrize("name", ["actor_partial", "actor_gaussian", "quadratic", "rbf_grid"])
+@pytest.mark.parametrize("name", ["actor_partial", "quadratic"])
 def test_a_policy_is_traced_for_every_batch_whether_its_basis_has_a_closed_form_or_not(name: str) -> None:
     policy = deploy.policy_of(CONTROLLERS[name])
     program = deploy.trace(policy, torch.zeros(1, 2, dtype=torch.float64)).module()
@@ -254,45 +261,18 @@ def test_c_header_computes_the_same(name: str, dtype: torch.dtype, tmp_path: Pat
 
 
 @needs_onnx
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-def test_onnx_file_computes_the_same_in_onnxruntime(dtype: torch.dtype, tmp_path: Path) -> None:
-    """In double with the digits of numbers in the code."""
+def test_onnx_file_computes_the_same_in_onnxruntime(tmp_path: Path) -> None:
+    """With the digits of numbers in the code, too."""
     staf = fitted(ExponentialKernel(), 0.1)
-    module, names = deploy.approximator(staf, dtype), ["value", "gradient"]
-    if dtype == torch.float64:
-        module, names = WithThirds(module), [*names, "thirds"]
-    y = around(staf, 1.0).to(dtype)
+    module, y = WithThirds(deploy.approximator(staf)), around(staf, 1.0)
+    names = ["value", "gradient", "thirds"]
     deploy.export_onnx(deploy.trace(module, y), tmp_path / "a.onnx", ["state"], names)
     run = formats.runner_onnx(tmp_path / "a.onnx")
     for rows in (1, 7):
-        at = y[:rows].double()
-        value, gradient, *thirds = run(y[:rows])
-        tolerance = 1e-12 if dtype == torch.float64 else 1e-6
-        assert max(sheet.worst_difference((value, gradient), (staf(at), staf.gradient(at)))) <= tolerance
-        assert len(thirds) == len(names) - 2
-        for third in thirds:
-            assert sheet.worst_difference((third,), (module(at)[2],))[0] <= 1e-15
-
-
-def test_program_file_comes_back_with_its_note_and_another_format_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    x = torch.ones(3, 2, dtype=torch.float64)
-    path = tmp_path / "lqr.pt2"
-    program = deploy.trace(CASES["lqr"], x)
-    deploy.export_program(program, path, {"what": "lqr"})
-    loaded, note = deploy.load_program(path)
-    assert note == {"format": formats.FORMAT, "what": "lqr"}
-    torch.testing.assert_close(loaded.module()(x), LQR(x))
-    monkeypatch.setattr(formats, "FORMAT", formats.FORMAT + 1)
-    with pytest.raises(ValueError, match=r"has format 1 .* reads format 2: export the run anew"):
-        deploy.load_program(path)
-    torch.export.save(program, path)
-    with pytest.raises(ValueError, match="must have been written by staf-export"):
-        deploy.load_program(path)
-    path.write_bytes(b"no archive")
-    with pytest.raises(ValueError, match=r"must be a \.pt2 file of staf-export"):
-        deploy.load_program(path)
+        value, gradient, third = run(y[:rows])
+        wanted = (staf(y[:rows]), staf.gradient(y[:rows]))
+        assert max(sheet.worst_difference((value, gradient), wanted)) <= 1e-12
+        assert sheet.worst_difference((third,), (module(y[:rows])[2],))[0] <= 1e-15
 
 
 def test_work_of_a_linear_controller_is_counted() -> None:
@@ -321,36 +301,197 @@ def test_weights_of_a_network_are_counted_and_kept_once() -> None:
     torch.testing.assert_close(program.module()(x), network(x))
 
 
-def test_what_cannot_be_deployed_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(ValueError, match=r"`policy_of\(controller=...\)` must be"):
-        deploy.policy_of(lambda x: x)  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match=r"`ActorPolicy\(weights=...\)` must be 3 finite numbers"):
-        deploy.policy_of(actor(ExponentialKernel()), torch.full((3,), torch.nan))
-    two = StaF(fitted(ExponentialKernel(), 0.1).basis, (2,))
-    with pytest.raises(ValueError, match=r"must have one state; got the batch"):
-        deploy.approximator(two)
-    with pytest.raises(ValueError, match=r"reach=...\)` must be smaller"):
-        deploy.RidgeApproximator(fitted(ExponentialKernel(), 0.9), reach=1000.0)
-    with pytest.raises(ValueError, match=r"FoldedRollout\(policy=...\)` must have a constant radius"):
-        deploy.FoldedRollout(rollout(ExponentialKernel(), StateRadius(0.3, 0.1)))
-    monkeypatch.setenv("CXX", "no-such-compiler")
-    with pytest.raises(ValueError, match="there is no compiler here: install g"):
-        formats.need_compiler()
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(ValueError, match=r"pip install 'staf_torch\[onnx\]'"):
-        formats.need_onnx()
+def test_operations_are_counted_by_the_entries_that_they_make() -> None:
+    class Module(nn.Module):
+        def forward(self, x: Tensor) -> tuple[Tensor, ...]:
+            moved = torch.cat((x.unsqueeze(1), x.reshape(1, 1, 2)), 1).transpose(1, 2)
+            return 3.0 * x, x.sum(-1), x.mean(-1), x.amax(-1), x.exp() + x.sin(), moved
+
+    counted = sheet.work(deploy.trace(Module(), X, batch=1))
+    assert counted.flops == 2 + 1 + 1 + 1 + 2  # products, three reductions, sums; what only moves is free
+    assert counted.functions == 4
+    assert counted.bytes_in_out == 8 * (2 + 2 + 1 + 1 + 1 + 2 + 4)
 
 
-@pytest.mark.parametrize("reach", [0.5, 3.0])
-@pytest.mark.parametrize("p", [1, 4, 9])
-def test_a_term_is_negligible_where_its_derivative_is_within_a_quarter_of_the_rounding(
-    p: int, reach: float
+@pytest.mark.parametrize("note", ["", "one\ntwo"])
+def test_a_header_begins_with_its_note_and_what_a_call_takes(note: str, tmp_path: Path) -> None:
+    source = deploy.export_c(deploy.policy_of(LQR), torch.cat((X, X)), tmp_path / "p.h", ["u"], note=note)
+    assert (source.flops, source.functions) == (4, 0)
+    lines = (tmp_path / "p.h").read_text().splitlines()
+    at = lines.index(" * A call takes 4 additions and the like,")
+    assert lines[at + 1] == " * 0 calls of exp and the like, whatever the state is."
+    assert [line.removeprefix(" * ") for line in lines[1:at]] == note.split()
+
+
+def test_weights_are_of_an_actor_alone() -> None:
+    weights = tensor([0.5, 0.1, 1.0])
+    with pytest.raises(ValueError, match=r"weights=...\)` must be None for LQR; got \[0.5, 0.1, 1.0\]"):
+        deploy.policy_of(LQR, weights)
+    learner = actor(ExponentialKernel())
+    for chosen in (None, weights):
+        policy = deploy.policy_of(learner, chosen)
+        assert torch.equal(policy.weights, learner.actor if chosen is None else weights)
+        guarded = deploy.policy_of(adp.Supervised(learner, LQR, learner.cost), chosen)
+        assert torch.equal(guarded.policy.weights, policy.weights)
+        wall = adp.SafetyFilter(learner, PLANT, lambda x, t: 9.0 - x[:, 0], dt=0.1)
+        fenced = deploy.policy_of(wall, chosen)
+        assert torch.equal(fenced.policy.weights, policy.weights)
+    for wrong in (weights.expand(1, 3), torch.tensor([math.inf, 0.0, 0.0]).double()):
+        with pytest.raises(ValueError, match=r"`ActorPolicy\(weights=...\)` must be 3 finite numbers"):
+            deploy.ActorPolicy(learner, wrong)
+    with pytest.raises(ValueError, match=r"`ActorPolicy\(weights=...\)` must have 3 entries"):
+        deploy.ActorPolicy(learner, weights[:2])
+
+
+def test_a_policy_is_a_copy_that_learns_nothing_in_the_dtype_that_is_asked_for() -> None:
+    policy = deploy.policy_of(adp.Feedback(LQR))
+    assert policy is not LQR
+    assert not policy.training
+    assert {part.dtype for part in policy.buffers()} == {torch.float64}
+    assert {part.dtype for part in deploy.policy_of(LQR, dtype=torch.float32).buffers()} == {torch.float32}
+    layer = nn.Linear(2, 1).double()
+    assert not any(part.requires_grad for part in deploy.policy_of(layer).parameters())
+    assert all(part.requires_grad for part in layer.parameters())
+
+
+@pytest.mark.parametrize(
+    ("kernel", "radius", "folds"),
+    [
+        (ExponentialKernel(), 0.3, True),
+        (GaussianKernel(0.8), 0.3, True),
+        (MaternKernel(2.5), 0.3, True),
+        (PolynomialKernel(3), 0.3, False),
+        (GaussianKernel(0.8), StateRadius(0.3, 0.1), False),
+    ],
+)
+def test_a_rollout_is_folded_where_one_matrix_serves_all_states(
+    kernel: Kernel, radius: Any, folds: bool
 ) -> None:
-    eps, edge = 1e-6, 0.25e-6 / (p * max(1.0, reach) ** p)
-    for share, wanted in ((0.99, True), (1.01, False)):
-        terms = [
-            torch.ones(1).double(),
-            *[torch.zeros(1).double()] * (p - 1),
-            torch.tensor([share * edge]).double(),
-        ]
-        assert approximators._negligible(terms, eps, reach) == wanted
+    policy = rollout(kernel, radius)
+    assert controllers.foldable(policy) is folds
+    assert isinstance(deploy.policy_of(policy), deploy.FoldedRollout) is folds
+
+
+def test_a_series_holds_up_to_its_reach_and_not_beyond() -> None:
+    staf = fitted(GaussianKernel(0.8), 0.1)
+    found = deploy.RidgeApproximator(staf, reach=2.0)
+    assert (found.radius, found.reach) == (pytest.approx(0.1), 2.0)
+    assert deploy.RidgeApproximator(staf).reach == 10.0
+    far = torch.zeros_like(found.state)
+    far[0] = 0.2
+    for share, inside in ((0.999999, True), (1.000001, False)):
+        value, gradient = found((found.state + share * far)[None])
+        assert bool(value.isfinite().all()) is inside
+        assert bool(gradient.isfinite().all()) is inside
+    assert found.degree < deploy.RidgeApproximator(staf, reach=20.0).degree
+    assert deploy.RidgeApproximator(staf, torch.float32, reach=2.0).degree < found.degree
+    with pytest.raises(ValueError, match=r"`RidgeApproximator\(reach=...\)` must be positive; got 0"):
+        deploy.RidgeApproximator(staf, reach=0.0)
+
+
+def test_the_leanest_approximation_is_a_series_where_there_is_one() -> None:
+    kinds = {deploy.RidgeApproximator: GaussianKernel(0.8), deploy.LocalApproximator: MaternKernel(2.5)}
+    for kind, kernel in kinds.items():
+        staf = fitted(kernel, 0.1)
+        for dtype in (torch.float64, torch.float32):
+            found = deploy.approximator(staf, dtype)
+            assert type(found) is kind
+            value, gradient = found(staf.state[None].to(dtype))
+            assert (value.dtype, gradient.dtype) == (dtype, dtype)
+            assert found.radius == pytest.approx(0.1)
+    assert deploy.approximator(fitted(GaussianKernel(0.8), 0.1), reach=3.0).reach == 3.0
+
+
+def test_program_file_comes_back_with_its_note_and_another_format_is_refused(tmp_path: Path) -> None:
+    x = torch.ones(3, 2, dtype=torch.float64)
+    path = tmp_path / "lqr.pt2"
+    program = deploy.trace(CASES["lqr"], x)
+    deploy.export_program(program, path, {"what": "lqr"})
+    loaded, note = deploy.load_program(path)
+    assert note == {"format": 1, "what": "lqr"}
+    torch.testing.assert_close(loaded.module()(x), LQR(x))
+    torch.export.save(program, path, extra_files={"staf_torch.json": '{"format": 2}'})
+    with pytest.raises(ValueError, match=r"has format 2 .* reads format 1: export the run anew"):
+        deploy.load_program(path)
+    torch.export.save(program, path)
+    with pytest.raises(ValueError, match="must have been written by staf-export"):
+        deploy.load_program(path)
+    path.write_bytes(b"no archive")
+    with pytest.raises(ValueError, match=r"must be a \.pt2 file of staf-export"):
+        deploy.load_program(path)
+
+
+def test_what_cannot_be_deployed_is_refused() -> None:
+    two = StaF(fitted(ExponentialKernel(), 0.1).basis, (2,))
+    cases: list[tuple[Callable[[], Any], str]] = [
+        (lambda: deploy.policy_of(lambda x: x), r"`policy_of\(controller=...\)` must be"),  # type: ignore[arg-type]
+        (lambda: deploy.approximator(two), "must have one state; got the batch"),
+        (
+            lambda: deploy.RidgeApproximator(fitted(ExponentialKernel(), 0.9), reach=1000.0),
+            r"reach=...\)` must be smaller",
+        ),
+        (
+            lambda: deploy.FoldedRollout(rollout(ExponentialKernel(), StateRadius(0.3, 0.1))),
+            r"FoldedRollout\(policy=...\)` must have a constant radius",
+        ),
+    ]
+    for call, said in cases:
+        with pytest.raises(ValueError, match=said):
+            call()
+
+
+def test_without_a_compiler_it_is_said_what_to_install(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    module, x = deploy.policy_of(LQR), torch.zeros(1, 2, dtype=torch.float64)
+    deploy.export_c(module, x, tmp_path / "a.h", ["u"])
+    program = deploy.trace(module, x)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    for name in ("CC", "CXX"):
+        monkeypatch.delenv(name, raising=False)
+    for named in (None, "no-such-compiler"):
+        if named is not None:
+            monkeypatch.setenv("CC", named)
+            monkeypatch.setenv("CXX", named)
+        with pytest.raises(ValueError, match=rf"there is no C compiler here: .*; got {named!r}\.$"):
+            deploy.time_c(tmp_path / "a.h", x, [1])
+        with pytest.raises(ValueError, match=rf"there is no compiler here: .* got {named!r}\. ONNX and pt2"):
+            deploy.export_package(program, tmp_path / "a.pt2")
+
+
+def test_a_sheet_is_one_page_and_names_nothing_that_a_terminal_obeys() -> None:
+    port = {"name": "u", "size": None, "unit": "N", "region": "any"}
+    page = {
+        **{"file": "policy.h", "what": "u(x)", "run": "/runs/a`b\nc\x1b[2J", "row": 3, "version": "1.2"},
+        **{"torch": "2.9", "batch": "any", "dtype": "float32", "inputs": [port], "outputs": [port]},
+        "work": {"parameters": 7, "bytes_constants": 28, "bytes_in_out": 12, "flops": 40, "functions": 2},
+        "latency": {"calls": 100, "median_us": 1.26, "p99_us": 2.04, "worst_us": 30.0},
+        **{"runtime": "C", "machine": "a processor"},
+        **{"equality": {"u": 1.234e-7}, "float32_error": {"u": 0.5}},
+    }
+    lines = sheet.markdown(page).splitlines()
+    assert (
+        "From `/runs/a'b\\nc\\u001b[2J`, trajectory 3, by staf_torch 1.2 and torch 2.9. Batch B: any."
+        in lines
+    )
+    assert "| output | `u` | (B,) | float32 | N | any |" in lines
+    assert "| constants | 7 (28 bytes) |" in lines
+    assert "| bytes | 40: constants, input and output once |" in lines
+    assert "| latency, median | 1.3 us |" in lines
+    assert "| `u` | 1.2e-07 | 0.5 |" in lines
+
+
+def test_calls_are_timed_on_one_core_after_others_that_warm_it() -> None:
+    if not hasattr(os, "sched_getaffinity"):
+        pytest.skip("no choice of a core here")
+    before, cores = os.sched_getaffinity(0), []
+    found = sheet.latency(lambda x: cores.append(frozenset(os.sched_getaffinity(0))), X, calls=7)
+    assert found.calls == 7 < len(cores)
+    assert 0 <= found.median_us <= found.p99_us <= found.worst_us
+    assert set(cores) == {frozenset({max(before)})}
+    assert os.sched_getaffinity(0) == before
+
+
+def test_a_difference_is_a_share_of_the_largest_value() -> None:
+    got, wanted = (tensor([1.0, -4.5]), tensor([2.0])), (tensor([1.25, -4.0]), tensor([2.0]))
+    assert sheet.worst_difference(got, wanted) == [0.125, 0.0]

@@ -1,10 +1,12 @@
-"""`staf-export`, called in process."""
+"""`staf-export`: a run as a file for a device that computes what the run recorded, or a sentence why not."""
 
 from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,8 +14,8 @@ import torch
 from composing import settings
 from omegaconf import OmegaConf
 
-from staf_torch import deploy
-from staf_torch.cli.deployable import deployable
+from staf_torch import __version__, deploy, lanes
+from staf_torch.cli.deployable import deployable, learning
 from staf_torch.cli.export import export, export_learning, main
 from staf_torch.deploy.c_header import runner_c
 from staf_torch.experiments.registry import experiment
@@ -23,13 +25,17 @@ needs_cc = pytest.mark.skipif(
 )
 RUNS = {
     "chase": ["centers.count=6", "duration=0.1", "trajectories=2"],
-    "actor": ["experiment=adp", "duration=0.1", "dt=0.005", "trajectories=2", "adp.trust=0.5"],
+    "actor": [
+        *("experiment=adp", "duration=0.1", "dt=0.005", "trajectories=2", "adp.trust=0.5"),
+        "adp.record_every=2",
+    ],
     "lqr": ["experiment=adp", "duration=0.1", "dt=0.01", "adp/policy=lqr", "system=pendulum"],
     "guarded": [
         *("experiment=adp", "adp/basis=quadratic", "duration=0.1", "dt=0.01", "initial_state=[-1.0,0.0]"),
         "adp.walls.high=[null,0.05]",
     ],
     "rollout": ["experiment=adp", "duration=0.1", "dt=0.01", "adp/policy=rollout", "adp.rollout.steps=1"],
+    "quadrature": ["experiment=adp", "duration=0.05", "dt=0.005", "adp/extrapolation=quadrature"],
 }
 
 
@@ -40,56 +46,69 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
         cfg = settings("figures=false", *overrides)
         (folder / name / ".hydra").mkdir(parents=True)
         OmegaConf.save(cfg, folder / name / ".hydra" / "config.yaml")
-        experiment(cfg.task)(cfg, folder / name)
+        with lanes.compiling("never"):
+            experiment(cfg.task)(cfg, folder / name)
     return folder
 
 
 @pytest.fixture
-def chase(runs: Path, tmp_path: Path) -> Path:
-    """A copy of the chase that a test may spoil."""
-    return Path(shutil.copytree(runs / "chase", tmp_path / "chase"))
+def changed(runs: Path, tmp_path: Path) -> Callable[..., Path]:
+    """Copy a run, with settings, or arrays of its history, that a test changes."""
+
+    def made(name: str, arrays: dict[str, np.ndarray] | None = None, **changes: object) -> Path:
+        run = Path(shutil.copytree(runs / name, tmp_path / name, dirs_exist_ok=True))
+        cfg = OmegaConf.load(runs / name / ".hydra" / "config.yaml")
+        cfg.update(changes)
+        OmegaConf.save(cfg, run / ".hydra" / "config.yaml")
+        np.savez(run / "history.npz", **{**history(runs / name), **(arrays or {})})
+        return run
+
+    return made
 
 
-@needs_cc
-def test_a_learner_as_c_follows_its_run_and_what_does_not_learn_is_refused(
-    runs: Path, tmp_path: Path
+def history(run: Path) -> dict[str, np.ndarray]:
+    with np.load(run / "history.npz") as found:
+        return dict(found)
+
+
+@pytest.mark.parametrize(
+    ("name", "row", "to"),
+    [("chase", 1, "pt2"), ("lqr", 0, "pt2"), pytest.param("actor", 1, "c", marks=needs_cc)],
+)
+def test_an_exported_file_computes_what_the_run_recorded(
+    name: str, row: int, to: str, runs: Path, tmp_path: Path
 ) -> None:
-    page = export_learning(runs / "actor", output=tmp_path / "learner.h", row=1, calls=20)
-    assert page["equality"]["u"] < 1e-12
-    assert [port["name"] for port in page["inputs"]] == ["x", "uniform"]
-    text = (tmp_path / "learner.h").read_text()
-    assert "staf_start(staf_state *" in text
-    assert (tmp_path / "learner.h.md").exists()
-    with pytest.raises(ValueError, match=r"`staf-export\(learning=...\)` must be left away"):
-        export_learning(runs / "lqr", calls=20)
-    with pytest.raises(SystemExit, match="must go with --to c"):
-        main([str(runs / "actor"), "--to", "pt2", "--learning"])
-    with pytest.raises(SystemExit, match="must be 1 for a controller that learns"):
-        main([str(runs / "actor"), "--to", "c", "--learning", "--batch", "2"])
-
-
-@pytest.mark.parametrize(("name", "row"), [("chase", 1), ("actor", 1), ("lqr", 0)])
-def test_exported_program_computes_what_the_run_recorded(
-    name: str, row: int, runs: Path, tmp_path: Path
-) -> None:
-    path = tmp_path / "it.pt2"
-    page = export(runs / name, "pt2", output=path, row=row, calls=20)
-    program, note = deploy.load_program(path)
-    with np.load(runs / name / "history.npz") as history:
-        state, names = torch.from_numpy(history["state"][row]), ("value", "gradient")
-        wanted = history["estimate"][row, -1] if name == "chase" else None
-    found = program.module()(state[-1:])
-    if wanted is not None:
-        np.testing.assert_allclose(float(found[0]), wanted, rtol=1e-10)
-    assert note["version"] == page["version"]
-    assert list(page["equality"]) == (list(names) if name == "chase" else ["control"])
-    assert max(page["equality"].values()) <= 1e-12
+    path = tmp_path / "it"
+    page = export(runs / name, to, output=path, row=row, calls=20)
+    assert list(page["equality"]) == (["value", "gradient"] if name == "chase" else ["control"])
+    assert max(page["equality"].values()) <= (1e-12 if to == "pt2" else 1e-9)
     assert max(page["float32_error"].values()) <= 1e-5
     late = page["latency"]
     assert 0 < late["median_us"] <= late["p99_us"] <= late["worst_us"]
+    assert (page["version"], page["row"], page["latency"]["calls"]) == (__version__, row, 20)
     assert page["inputs"][0]["unit"] == ("rad, rad/s" if name == "lqr" else "1")
-    assert json.loads((tmp_path / "it.pt2.json").read_text()) == page
-    assert f"| flops | {page['work']['flops']}," in (tmp_path / "it.pt2.md").read_text()
+    assert json.loads((tmp_path / "it.json").read_text()) == page
+    assert f"| flops | {page['work']['flops']}," in (tmp_path / "it.md").read_text()
+    if to == "pt2":
+        program, note = deploy.load_program(path)
+        assert note["version"] == __version__
+        out = program.module()(torch.from_numpy(history(runs / name)["state"][row, -2:]))
+        recorded = history(runs / name)["estimate" if name == "chase" else "control"][row]
+        if name == "chase":
+            np.testing.assert_allclose(float(out[0][-1]), recorded[-1], rtol=1e-10)
+        else:
+            np.testing.assert_allclose(out[0].detach(), recorded[-2], rtol=1e-10)
+
+
+@needs_cc
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_a_controller_that_learns_follows_its_run_in_c(dtype: str, runs: Path, tmp_path: Path) -> None:
+    page = export_learning(runs / "actor", dtype=dtype, output=tmp_path / "learner.h", row=1, calls=20)
+    assert page["equality"]["u"] < (1e-12 if dtype == "float64" else 1e-4)
+    assert [port["name"] for port in page["inputs"]] == ["x", "uniform"]
+    assert (page["to"], page["dtype"], page["batch"]) == ("c", dtype, 1)
+    assert (tmp_path / "learner.h.md").exists()
+    assert "staf_start(staf_state *" in (tmp_path / "learner.h").read_text()
 
 
 @needs_cc
@@ -110,95 +129,140 @@ def test_a_filter_around_a_learned_policy_is_the_same_in_c(runs: Path, tmp_path:
 
 
 @pytest.mark.parametrize("name", list(RUNS))
-def test_controller_of_every_policy_is_rebuilt_and_reproduces_its_run(name: str, runs: Path) -> None:
-    found = deployable(runs / name)
+def test_a_run_of_every_policy_is_rebuilt_and_compared_over_the_region_that_it_visited(
+    name: str, runs: Path
+) -> None:
+    found, states = deployable(runs / name), history(runs / name)["state"][0]
+    points = found.points.numpy()
+    assert points.shape == (1000, 2)
+    assert torch.equal(deployable(runs / name, 0).points, found.points)
+    if name == "chase":
+        away = (points - states[-1]) / 0.1
+        lengths = np.linalg.norm(away, axis=1)
+        assert lengths.max() < 1 + 1e-9
+        for radius in (0.25, 0.5, 0.75):  # evenly spread over the disc
+            assert abs((lengths < radius).mean() - radius**2) < 0.06
+        assert found.input.region.startswith("the ball of radius 0.1 around (")
+    else:
+        share = (points - states.min(0)) / (states.max(0) - states.min(0))
+        assert 0 <= share.min() <= share.max() <= 1
+        for limit in (0.25, 0.5, 0.75):  # evenly spread over the box
+            np.testing.assert_allclose((share < limit).mean(0), limit, atol=0.06)
+        assert found.input.region.startswith("visited: [")
     out = found.module(torch.float64)(found.points[:4])
     assert all(torch.isfinite(part).all() for part in (out if isinstance(out, tuple) else (out,)))
+    learns = name in ("actor", "guarded", "quadrature")
+    assert found.what.endswith(", 3 actor weights as they were at the end.") == learns
 
 
-def test_run_that_this_version_does_not_reproduce_is_refused(chase: Path) -> None:
-    with np.load(chase / "history.npz") as history:
-        arrays = dict(history)
-    arrays["estimate"] = arrays["estimate"] + 1e-3
-    np.savez(chase / "history.npz", **arrays)
-    with pytest.raises(ValueError, match=r"cannot be reproduced.*Another version of staf_torch wrote it"):
-        export(chase, "pt2")
-    arrays["estimate"] = arrays["estimate"] * np.nan
-    np.savez(chase / "history.npz", **arrays)
-    with pytest.raises(ValueError, match="must be a trajectory that did not diverge"):
-        export(chase, "pt2")
-    assert not (chase / "export").exists()
+@pytest.mark.parametrize("row", [0, 1])
+def test_a_learner_sees_the_states_and_random_numbers_of_its_run(row: int, runs: Path) -> None:
+    found = learning(runs / "actor", row)
+    np.testing.assert_allclose(found.states[::2], history(runs / "actor")["state"][row, :-1], rtol=1e-9)
+    generator = torch.Generator().manual_seed(row)
+    drawn = torch.empty(20, 1, 2, dtype=torch.float64).uniform_(-1, 1, generator=generator)
+    assert torch.equal(found.uniform, drawn)
+    assert (found.dt, found.written_by) == (0.005, None)
+    plain = learning(runs / "quadrature")  # which draws no random numbers
+    assert [port.name for port in plain.inputs] == ["x"]
+    assert plain.uniform.shape == (10, 0, 2)
 
 
-def test_settings_of_another_version_are_refused_and_say_which(chase: Path) -> None:
-    cfg = OmegaConf.load(chase / ".hydra" / "config.yaml")
-    del cfg["settle_time"]
-    OmegaConf.save(cfg, chase / ".hydra" / "config.yaml")
-    (chase / "run.json").write_text('{"version": "0.0.1"}')
-    with pytest.raises(
-        ValueError, match=r"written by staf_torch 0\.0\.1, whose settings .* does not understand"
-    ):
-        export(chase, "pt2")
+# Refusals
 
 
-@pytest.mark.parametrize(
-    "target", ["os.system", "staf_torch.cli.staf.os.system", "staf_torch.settings.chase.load"]
-)
-def test_foreign_code_in_the_settings_is_not_run(target: str, chase: Path) -> None:
-    cfg = OmegaConf.load(chase / ".hydra" / "config.yaml")
-    cfg.target = {"_target_": target, "path": "os.getcwd"}
-    OmegaConf.save(cfg, chase / ".hydra" / "config.yaml")
-    with pytest.raises(ValueError, match=r"which may run code of somebody else: add --trust"):
-        export(chase, "pt2")
-
-
-def test_pickled_history_is_refused(chase: Path) -> None:
-    np.savez(chase / "history.npz", state=np.array([{"a": 1}], dtype=object))
-    with pytest.raises(ValueError, match="cannot be read: state holds no numbers"):
-        export(chase, "pt2")
-
-
-@pytest.mark.parametrize(
-    ("given", "words"),
-    [
-        ({"to": "no"}, r"`staf-export\(to=...\)` must be one of"),
-        ({"dtype": "no"}, r"`staf-export\(dtype=...\)` must be one of"),
-        ({"row": -1}, r"`staf-export\(row=...\)` must be at least 0; got -1"),
-    ],
-)
-def test_arguments_of_the_function_are_refused_by_name(
-    given: dict[str, object], words: str, chase: Path
+@pytest.mark.parametrize(("name", "key"), [("chase", "estimate"), ("actor", "control")])
+def test_a_history_that_its_settings_do_not_reproduce_is_refused(
+    name: str, key: str, changed: Callable[..., Path], runs: Path
 ) -> None:
-    with pytest.raises(ValueError, match=words):
-        export(chase, **{"to": "pt2", **given})  # type: ignore[arg-type]
-    if "dtype" in given:
-        with pytest.raises(ValueError, match=words):
-            export_learning(chase, **given)  # type: ignore[arg-type]
+    whole = history(runs / name)[key]
+    off = {key: whole + 1e-5 * float(np.nanmax(abs(whole)))}
+    reads: list[Callable[[Path], Any]] = [deployable] if name == "chase" else [deployable, learning]
+    for read in reads:
+        with pytest.raises(ValueError, match=rf"recorded {key} .* cannot be reproduced.*Another version"):
+            read(changed(name, off))
+        assert read(changed(name, off, dtype="float32")).written_by is None  # it has no more digits
+    run = changed(name, {key: whole * np.nan})
+    with pytest.raises(ValueError, match="must be a trajectory that did not diverge"):
+        export(run, "pt2")
+    assert not (run / "export").exists()
 
 
-def test_weights_and_settings_that_are_none_are_refused(chase: Path) -> None:
-    with np.load(chase / "history.npz") as archive:
-        history = dict(archive)
-    history["weights"][0, -1] = np.nan
-    np.savez(chase / "history.npz", **history)
-    with pytest.raises(ValueError, match="must be a trajectory whose weights can be represented"):
-        export(chase, "pt2")
-    (chase / ".hydra" / "config.yaml").write_text("[]")
-    with pytest.raises(ValueError, match="must be settings by name"):
-        export(chase, "pt2")
-    with pytest.raises(ValueError, match=r"must hold settings in \.hydra/config.yaml"):
-        export(chase, "pt2", trust=True)
+def test_settings_of_another_version_are_refused_and_say_which(changed: Callable[..., Path]) -> None:
+    run = changed("chase")
+    cfg = OmegaConf.load(run / ".hydra" / "config.yaml")
+    del cfg["settle_time"]
+    OmegaConf.save(cfg, run / ".hydra" / "config.yaml")
+    (run / "run.json").write_text('{"version": "0.0.1"}')
+    with pytest.raises(ValueError, match=r"by staf_torch 0\.0\.1, whose settings .* does not understand"):
+        export(run, "pt2")
 
 
-def test_bad_arguments_end_as_one_sentence(chase: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for arguments, message in (
-        ([str(chase), "--row", "2"], "must be below the run's 2 trajectories; got 2"),
-        ([str(chase.parent)], "must be a run directory"),
+def test_what_is_no_run_of_a_controller_is_refused(changed: Callable[..., Path], runs: Path) -> None:
+    weights = history(runs / "chase")["weights"]
+    weights[0, -1] = np.nan
+    cases: list[tuple[Callable[[], Any], str]] = [
+        (lambda: learning(runs / "lqr"), r"`staf-export\(learning=...\)` must be left away.*'Feedback'"),
+        (lambda: learning(runs / "chase"), "must be a run of adp; got 'gradient_chase'"),
+        (lambda: deployable(changed("chase", task="laws")), "must be a run of gradient_chase or adp; got"),
+        (lambda: deployable(changed("chase", {"state": np.zeros(())})), "has no states of trajectories"),
+        (lambda: deployable(changed("chase", {"weights": weights})), "weights can be represented"),
+        (lambda: export(runs / "chase", "no"), r"`staf-export\(to=...\)` must be one of"),
+        (lambda: export(runs / "chase", "pt2", dtype="no"), r"`staf-export\(dtype=...\)` must be one of"),
+        (lambda: export(runs / "chase", "pt2", row=-1), r"\(row=...\)` must be at least 0; got -1"),
+        (lambda: export(runs / "chase", "pt2", row=2), "must be below the run's 2 trajectories; got 2"),
+    ]
+    for call, said in cases:
+        with pytest.raises(ValueError, match=said):
+            call()
+
+
+@needs_cc
+def test_a_file_that_differs_from_the_library_is_removed(
+    runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    broken = tmp_path / "broken-cc"  # a compiler whose exponential is another function
+    cc = next(filter(None, map(shutil.which, ("cc", "gcc", "g++", "clang"))))
+    broken.write_text(f'#!/bin/sh\nexec {cc} -Dexp=cosh "$@"\n')
+    broken.chmod(0o755)
+    monkeypatch.setenv("CC", str(broken))
+    with pytest.raises(ValueError, match=r"it\.h differs from the library by .* and was removed"):
+        export(runs / "chase", "c", output=tmp_path / "new" / "it.h", calls=10)
+    assert not list((tmp_path / "new").iterdir())
+
+
+def test_the_command_ends_with_a_page_or_one_sentence(
+    changed: Callable[..., Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = changed("lqr")
+    main([str(run), "--to", "pt2", "--batch", "3", "--calls", "5"])
+    assert capsys.readouterr().out == (run / "export" / "controller.pt2.md").read_text()
+    assert json.loads((run / "export" / "controller.pt2.json").read_text())["batch"] == 3
+    for words, said in (
+        ([str(run), "--to", "pt2", "--row", "1"], "must be below the run's 1 trajectories; got 1"),
+        ([str(run.parent), "--to", "pt2"], "must be a run directory"),
+        ([str(run), "--to", "pt2", "--learning"], "must go with --to c"),
+        ([str(run), "--to", "c", "--learning", "--batch", "2"], "must be 1 for a controller that learns"),
     ):
-        with pytest.raises(SystemExit, match=message) as ended:
-            main([*arguments, "--to", "pt2"])
+        with pytest.raises(SystemExit, match=said) as ended:
+            main(words)
         assert str(ended.value).startswith("staf-export: ")
-    (chase / "history.npz").unlink()
+    (run / "history.npz").unlink()
     with pytest.raises(SystemExit, match="history=false"):
-        main([str(chase), "--to", "pt2"])
-    assert capsys.readouterr().out == ""
+        main([str(run), "--to", "pt2"])
+    for words in (["b"], ["b", "--to", "no"], ["--to", "c"], ["b", "--to", "c", "--dtype", "half"]):
+        with pytest.raises(SystemExit) as ended:
+            main(words)
+        assert ended.value.code == 2
+    assert capsys.readouterr().err.startswith("usage: staf-export ")
+
+
+@pytest.mark.parametrize("linked", ["export", "export/controller.pt2"])
+def test_nothing_is_written_through_a_link(linked: str, changed: Callable[..., Path], tmp_path: Path) -> None:
+    run, victim = changed("lqr"), tmp_path / "victim"
+    victim.mkdir()
+    (run / linked).parent.mkdir(exist_ok=True)
+    (run / linked).symlink_to(victim if linked == "export" else victim / "file")
+    with pytest.raises(ValueError, match="is a link"):
+        export(run, "pt2")
+    assert list(victim.iterdir()) == []
