@@ -6,7 +6,7 @@ import math
 
 import pytest
 import torch
-from helpers import tensor, uniform
+from helpers import changed, tensor, uniform
 from helpers_adp import BOX, COST, LAWS, PLANT, learner
 from torch import Tensor
 
@@ -108,7 +108,7 @@ def test_weights_are_projected_onto_a_ball_and_what_is_inside_is_left(kind: type
     gains, _ = gains_of(False)
     free, bounded = kind(gains), kind(gains, 1.0)
     sums = free.sums(TERMS, MASSES, WEIGHTS)
-    start = WEIGHTS._replace(critic=WEIGHTS.critic * tensor([[0.1], [1.0], [9.0]]))
+    start = changed(WEIGHTS, critic=WEIGHTS.critic * tensor([[0.1], [1.0], [9.0]]))
     for found, wanted in zip(
         bounded.step(sums, start, 0.01)[:2], free.step(sums, start, 0.01)[:2], strict=True
     ):
@@ -213,7 +213,7 @@ def test_step_tends_to_the_rate(law: ActorCriticLaw) -> None:
     controller = learner(law, adp.QuadraturePoints(3, 2, BOX))
     x = uniform(5, 2, seed=4)
     memory = adp.Weights(*controller.init(x)[:3])
-    memory = memory._replace(critic=torch.randn(5, 3, dtype=torch.float64, generator=generator))
+    memory = changed(memory, critic=torch.randn(5, 3, dtype=torch.float64, generator=generator))
     terms = controller.terms(x, memory.actor, x.new_zeros(5, 0, 2))
     sums = law.sums(terms, controller.extrapolation.weights, memory)
     h = 1e-8

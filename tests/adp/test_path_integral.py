@@ -8,13 +8,12 @@ from typing import Any
 
 import pytest
 import torch
+from helpers import changed, tensor
 from helpers_plans import BOX, pushed
 from helpers_swingup import cost_of, double_integrator, pendulum
 from torch import Tensor
 
-from staf_torch import adp
-from staf_torch.adp import path_integral
-from staf_torch.adp.path_integral import _hats
+from staf_torch import adp, lanes
 
 X0 = torch.tensor([[4.0, 0.0], [-2.0, 3.0]], dtype=torch.float64)
 
@@ -37,7 +36,7 @@ def test_plan_costs_no_more_than_the_feedback_and_less_where_it_does_not_know_th
     for seed in range(3):  # at the same state: the plan, which moves on a step each time, is moved back
         _, carried = mpc.step(x, carried, uniform(mpc, 2, seed), 0.1)
         plan = carried.identifier.view(2, 30, 1).roll(1, dims=1)
-        carried = carried._replace(identifier=plan.flatten(1))
+        carried = changed(carried, identifier=plan.flatten(1))
     found = mpc.costs(x, plan.unsqueeze(1))[:, 0]
     assert bool((found <= alone).all())
     assert float((found / alone).min()) < 0.95
@@ -89,60 +88,44 @@ def test_wrong_arguments_are_named(more: dict[str, object], message: str) -> Non
         sampler(double_integrator(), **more)
 
 
-@pytest.mark.parametrize(("steps", "knots"), [(11, 2), (30, 4), (7, 7), (101, 13)])
-def test_between_knots_a_line_is_a_line(steps: int, knots: int) -> None:
-    hats = _hats(steps, knots)
-    torch.testing.assert_close(hats.sum(1), torch.ones(steps, dtype=torch.float64), rtol=0, atol=1e-14)
-    line = 0.3 + 0.7 * torch.linspace(0, 1, knots, dtype=torch.float64)
-    wanted = 0.3 + 0.7 * torch.linspace(0, 1, steps, dtype=torch.float64)
-    torch.testing.assert_close(hats @ line, wanted, rtol=0, atol=1e-14)
-
-
 def sampled(**more: Any) -> adp.PathIntegral:
     given = {"steps": 6, "samples": 5, "knots": 3, "noise": [0.4, 0.7], "temperature": 0.3, "compile": False}
     return adp.PathIntegral(BOX, **{**given, **more})
 
 
-@pytest.mark.parametrize("tilted", [False, True])
-def test_a_plan_is_the_mean_of_its_samples_by_what_they_cost_or_the_cheapest(
-    tilted: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Costs by a table; a tilted mean costs more than the cheapest sample, which is then taken."""
-    mpc, rows = sampled(), 2
+@pytest.mark.parametrize(("steps", "knots"), [(11, 2), (30, 4), (7, 7)])
+def test_between_knots_a_line_is_a_line(steps: int, knots: int) -> None:
+    spread = sampled(steps=steps, knots=knots).spread
+    torch.testing.assert_close(spread.sum(1), torch.ones(steps).double(), rtol=0, atol=1e-14)
+    line = 0.3 + 0.7 * torch.linspace(0, 1, knots, dtype=torch.float64)
+    wanted = 0.3 + 0.7 * torch.linspace(0, 1, steps, dtype=torch.float64)
+    torch.testing.assert_close(spread @ line, wanted, rtol=0, atol=1e-14)
+    assert bool((spread >= 0).all())
+
+
+@pytest.mark.parametrize("temperature", [0.01, 0.3, 1e3])
+def test_a_plan_is_the_mean_of_its_samples_by_what_they_cost_or_the_cheapest(temperature: float) -> None:
+    mpc, rows = sampled(temperature=temperature), 4
     assert mpc.draws == 15  # 5 samples, 3 knots and 2 inputs in states of two numbers
-    numbers = (
-        1.98 * torch.rand(rows, 15, 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64) - 0.99
-    )
-    carried = mpc.init(torch.zeros(rows, 2).double())
-    assert carried.identifier.shape == (rows, 12)
-    before = 0.1 * torch.arange(24.0).double().view(rows, 6, 2)
-    carried = carried._replace(identifier=before.flatten(1))
-    costs = torch.tensor([[3.0, 2.0, 5.0, torch.inf, 2.5], [9.0, 9.0, 7.0, 9.0, 9.5]], dtype=torch.float64)
-    asked = []
-
-    def paid(x: Tensor, change: Tensor) -> Tensor:
-        asked.append(change)
-        best = costs.amin(1, keepdim=True)
-        return costs if len(asked) == 1 else best if tilted else best - 1e-9
-
-    monkeypatch.setattr(mpc, "costs", paid)
-    x = 0.1 * torch.ones(rows, 2).double()
+    generator = torch.Generator().manual_seed(1)
+    numbers = 1.98 * torch.rand(rows, 15, 2, generator=generator, dtype=torch.float64) - 0.99
+    x = 2 * torch.rand(rows, 2, generator=generator, dtype=torch.float64) - 1
+    before = 0.1 * torch.rand(rows, 6, 2, generator=generator, dtype=torch.float64)
+    carried = changed(mpc.init(x), identifier=before.flatten(1))
     u, after = mpc.step(x, carried, numbers, 0.1)
-    hats = _hats(6, 3)
+    scales = tensor([10 ** (-2 * k / 4) for k in range(5)])
     for row in range(rows):
         flat = numbers[row].flatten().tolist()
-        normal = torch.tensor([NormalDist().inv_cdf(0.5 + 0.5 * v) for v in flat], dtype=torch.float64)
-        change = torch.einsum("tk,skm->stm", hats, normal.view(5, 3, 2))
-        scales = torch.tensor([10 ** (-2 * k / 4) for k in range(5)], dtype=torch.float64)
-        tried = before[row] + change * scales[:, None, None] * torch.tensor([0.4, 0.7]).double()
-        tried[0], tried[1] = before[row], 0.0
-        torch.testing.assert_close(asked[0][row], tried, rtol=1e-7, atol=1e-9)
-        fine = torch.isfinite(costs[row])
-        excess = (costs[row] - costs[row].min())[fine]
-        weight = (-excess / (0.3 * excess.mean())).exp()
-        blended = (weight[:, None, None] * tried[fine]).sum(0) / weight.sum()
-        torch.testing.assert_close(asked[1][row, 0], blended, rtol=1e-7, atol=1e-9)
-        plan = tried[costs[row].argmin()] if tilted else blended
+        normal = tensor([NormalDist().inv_cdf(0.5 + 0.5 * v) for v in flat])
+        change = torch.einsum("tk,skm->stm", mpc.spread, normal.view(5, 3, 2))
+        tried = before[row] + change * scales[:, None, None] * tensor([0.4, 0.7])
+        tried[0], tried[1] = before[row], 0.0  # the plan itself and the feedback alone
+        costs = mpc.costs(x[row : row + 1], tried.unsqueeze(0))[0]
+        excess = costs - costs.min()
+        weight = (-excess / (temperature * excess.mean())).exp()
+        blended = (weight[:, None, None] * tried).sum(0) / weight.sum()
+        mixed = mpc.costs(x[row : row + 1], blended[None, None])[0, 0] < costs.min()
+        plan = blended if mixed else tried[costs.argmin()]
         wanted = torch.minimum(torch.maximum(plan[0] - x[row] @ BOX.k.mT, BOX.bounds.low), BOX.bounds.high)
         torch.testing.assert_close(u[row], wanted, rtol=1e-7, atol=1e-9)
         ahead = after.identifier[row].view(6, 2)
@@ -150,43 +133,27 @@ def test_a_plan_is_the_mean_of_its_samples_by_what_they_cost_or_the_cheapest(
         assert ahead[-1].tolist() == [0.0, 0.0]
 
 
-@pytest.mark.parametrize("traced", [False, True])
-def test_a_sample_costs_what_following_it_pays(traced: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    mpc, x = sampled(), torch.tensor([[0.4, -0.3], [1e200, 0.1]], dtype=torch.float64)
+@pytest.mark.needs_compiler
+def test_a_sample_costs_what_following_it_pays_in_plain_torch_and_in_a_program() -> None:
+    mpc, x = sampled(), tensor([[0.4, -0.3], [1e200, 0.1]])
     change = torch.rand(2, 3, 6, 2, generator=torch.Generator().manual_seed(2), dtype=torch.float64) - 0.5
-    monkeypatch.setattr(path_integral, "tracing_now", lambda: traced)
-    if traced:  # a program goes through the samples one by one
-        found = torch.cat([mpc.costs(x, one) for one in change.split(1, dim=1)], dim=1)
-    else:
-        found = mpc.costs(x, change)
-    for k in range(3):
-        at, spent = x[:1], 0.0
-        for step in range(6):
-            at, now = pushed(at, BOX.steered(at, change[:1, k, step]))
-            spent += float(now)
-        assert float(found[0, k]) == pytest.approx(spent + float(BOX.terminal(at)))
-        assert float(found[1, k]) == math.inf
-    assert not mpc._roll.compile
+    program = lanes.Program(lambda carry, now, row: (carry, mpc.costs(*row)))
+    for found in (mpc.costs(x, change), program((), (), (x, change), steps=1)[1][:, 0]):
+        for k in range(3):
+            at, spent = x[:1], 0.0
+            for step in range(6):
+                at, now = pushed(at, BOX.steered(at, change[:1, k, step]))
+                spent += float(now)
+            assert float(found[0, k]) == pytest.approx(spent + float(BOX.terminal(at)))
+            assert float(found[1, k]) == math.inf
 
 
-def test_numbers_at_the_end_of_their_range_and_samples_that_cost_the_same_give_a_finite_plan(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    mpc, x = sampled(), torch.zeros(1, 2).double()
-    asked = []
-
-    def same(x: Tensor, change: Tensor) -> Tensor:
-        asked.append(change)
-        return torch.ones(change.shape[:2]).double()
-
-    monkeypatch.setattr(mpc, "costs", same)
+def test_numbers_at_the_end_of_their_range_give_a_finite_plan() -> None:
+    mpc, x = sampled(), tensor([[0.3, -0.2]])
     ends = torch.ones(1, 15, 2).double()
     ends[0, ::2] = -1.0
-    _, after = mpc.step(x, mpc.init(x), ends, 0.1)
-    assert bool(torch.isfinite(asked[0]).all())
-    torch.testing.assert_close(asked[1][:, 0], asked[0].mean(1))  # of equal weights
-    assert float(asked[0].abs().max()) < 0.7 * 10**-0.99 * 8 * 10
-    assert not bool(after.identifier.any())  # the mean costs as much: the plan of before is kept
+    u, after = mpc.step(x, mpc.init(x), ends, 0.1)
+    assert bool(torch.isfinite(torch.cat((u, after.identifier), dim=-1)).all())
 
 
 def test_noise_is_half_the_range_and_least_arguments_are_accepted() -> None:
