@@ -1,29 +1,34 @@
-"""What Hydra calls when a sweep begins and ends: its directory and its report."""
+"""What Hydra calls when a sweep begins and ends: its directory, its report and its trackers."""
 
 from __future__ import annotations
 
-import contextlib
+import importlib.util
 import json
-import os
+import logging
 import sys
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from command_line import one
+from hydra.core.utils import JobReturn
 from omegaconf import DictConfig, OmegaConf
+from sweep_runs import write_run, write_sweep
 
-from staf_torch.sweeps import callbacks, lock
 from staf_torch.sweeps.callbacks import (
     SweepDirectory,
     SweepReport,
+    TensorBoardTracker,
+    Tracker,
+    TrackRuns,
     claim,
-    close,
-    farewell,
+    tracker,
 )
-from staf_torch.sweeps.hydra_compat import BrokenSweep
 from staf_torch.sweeps.job import PRINTS
+from staf_torch.sweeps.lock import TakenError, give_back, held
+from staf_torch.tables import Run, collect
 
 
 def settings(place: Path, *typed: str, **more: Any) -> DictConfig:
@@ -42,71 +47,53 @@ def resumed(place: Path) -> DictConfig:
 
 
 @pytest.fixture(autouse=True)
-def _nothing_stays_locked() -> Iterator[None]:
-    before = dict(lock._held)
+def _nothing_stays_locked(tmp_path: Path) -> Iterator[None]:
     yield
-    for key in set(lock._held) - set(before):
-        lock.give_back(Path(key))
-
-
-def held(place: Path) -> bool:
-    return lock.held(place) is not None
-
-
-@pytest.fixture
-def breaking(monkeypatch: pytest.MonkeyPatch) -> list[bool]:
-    """Whether an exception ends the sweep that calls back."""
-    now = [False]
-    monkeypatch.setattr(callbacks, "breaking_off", lambda: now[0])
-    return now
+    for path in (tmp_path, *tmp_path.rglob("*")):
+        give_back(path)
 
 
 # The directory
 
 
-def test_a_sweep_that_begins_has_a_directory_of_its_own_and_notes_what_was_typed(tmp_path: Path) -> None:
+def test_sweeps_of_the_same_moment_have_directories_of_their_own_and_note_what_was_typed(
+    tmp_path: Path,
+) -> None:
     place = tmp_path / "new" / "sweep"
-    for number, name in enumerate(("sweep", "sweep-2", "sweep-3")):
+
+    def begin(_: int) -> str:
         config = settings(place, "hydra.verbose=true")
         SweepDirectory().on_multirun_start(config)
-        taken = tmp_path / "new" / name
-        assert config.hydra.sweep.dir == str(taken)
-        more = [f"hydra.sweep.dir={taken}"] if number else []
+        taken = Path(config.hydra.sweep.dir)
+        more = [f"hydra.sweep.dir={taken}"] if taken != place else []  # also for its jobs
         assert list(config.hydra.overrides.hydra) == ["hydra.verbose=true", *more]
-        assert held(taken)
+        assert held(taken) is not None
         record = json.loads((taken / "sweep.json").read_text())
         assert (record["overrides"], record["hydra"]) == (["seed=0,1"], ["hydra.verbose=true", *more])
+        return taken.name
+
+    with ThreadPoolExecutor(4) as pool:
+        taken = set(pool.map(begin, range(4)))
+    assert taken == {"sweep", "sweep-2", "sweep-3", "sweep-4"}
 
 
 def test_a_directory_that_was_asked_for_is_taken_or_refused(tmp_path: Path) -> None:
     place = tmp_path / "new" / "sweep"
-    config = asked(place)
-    claim(config)
-    assert held(place)
-    assert config.hydra.sweep.dir == str(place)
-    assert list(config.hydra.overrides.hydra) == [f"hydra.sweep.dir={place}"]
-    with pytest.raises(lock.TakenError):
+    claim(asked(place))
+    assert held(place) is not None
+    with pytest.raises(TakenError):
         claim(asked(place))
-    lock.give_back(place)
+    give_back(place)
+    (place / "0").mkdir()
     (place / "notes.txt").write_text("")
     claim(asked(place))  # where something else is
-    lock.give_back(place)
-    (place / "0").mkdir()
-    claim(asked(place))
-    lock.give_back(place)
+    give_back(place)
     for left in ("sweep.json", "0/run.json"):
         (place / left).write_text("{}")
         with pytest.raises(ValueError, match=rf"{place} holds a sweep already.*sweep.resume={place}`"):
             claim(asked(place))
-        lock.give_back(place)
+        give_back(place)
         (place / left).unlink()
-
-
-def refused(config: DictConfig) -> str:
-    with pytest.raises(SystemExit) as told:
-        SweepDirectory().on_multirun_start(config)
-    assert not held(Path(str(config.hydra.sweep.dir)))
-    return str(told.value)
 
 
 @pytest.mark.parametrize("kind", [asked, resumed])
@@ -117,18 +104,19 @@ def test_nothing_is_written_through_what_leads_elsewhere(
     (place / ".submitit").mkdir(parents=True)
     (place / ".submitit" / "job").symlink_to(tmp_path)  # submitit's own
     SweepDirectory().on_multirun_start(kind(place))
-    assert held(place)
-    lock.give_back(place)
+    give_back(place)
     (place / "sweep.json").unlink(missing_ok=True)
-    for count, more in enumerate(("", " and 1 more", " and 2 more")):
+    for count, more in enumerate(("", " and 1 more")):
         (place / f"link{count}").symlink_to(tmp_path)
-        assert refused(kind(place)).startswith(f"staf: {place}/link0{more} is a link")
+        with pytest.raises(SystemExit, match=rf"^staf: {place}/link0{more} is a link"):
+            SweepDirectory().on_multirun_start(kind(place))
+        assert held(place) is None
 
 
 def test_a_sweep_that_is_resumed_keeps_what_was_noted(tmp_path: Path) -> None:
     (tmp_path / "sweep.json").write_text("kept")
     SweepDirectory().on_multirun_start(resumed(tmp_path))
-    assert held(tmp_path)
+    assert held(tmp_path) is not None
     assert (tmp_path / "sweep.json").read_text() == "kept"
 
 
@@ -136,208 +124,160 @@ def test_a_file_in_the_way_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     config = settings(tmp_path / "file" / "a" / "b")
     for begin in (SweepDirectory().on_run_start, SweepDirectory().on_multirun_start):
-        with pytest.raises(SystemExit) as told:
+        with pytest.raises(SystemExit, match=rf"^staf: cannot write {tmp_path}/file.*: Not a directory$"):
             begin(config)
-        assert str(told.value).startswith(f"staf: cannot write {tmp_path / 'file'}")
-        assert str(told.value).endswith(": Not a directory")
     SweepDirectory().on_run_start(settings(tmp_path / "not" / "there"))
-    SweepDirectory().on_run_start(settings(tmp_path))
     (tmp_path / "link").symlink_to("file")
     with pytest.raises(SystemExit, match=r"staf: .*link is a link"):
         SweepDirectory().on_run_start(settings(tmp_path))
 
 
-@pytest.mark.parametrize(
-    ("ours", "broken", "begun", "again", "stays"),
-    [
-        (True, True, False, False, False),
-        (True, False, False, False, True),
-        (True, True, True, False, True),
-        (True, True, False, True, True),
-        (False, True, False, False, True),
-    ],
-)
-def test_a_sweep_that_ends_gives_its_directory_back_and_takes_it_away_where_nothing_ran(
-    ours: bool, broken: bool, begun: bool, again: bool, stays: bool, tmp_path: Path, breaking: list[bool]
-) -> None:
-    place = tmp_path / "sweep"
-    config = settings(place)
-    claim(config)
-    (place / "multirun.yaml").write_text("")
-    (place / "sweep.json").write_text("")
-    (place / ".submitit" / "1").mkdir(parents=True)
-    if begun:
-        (place / "a" / "b").mkdir(parents=True)
-        (place / "a" / "b" / "run.json").write_text("{}")
-    if not ours:
-        lock.give_back(place)
-    breaking[0] = broken
-    SweepDirectory().on_multirun_end(resumed(place) if again else config)
-    assert place.exists() == stays
-    assert not held(place)
-    assert not stays or {"multirun.yaml", "sweep.json", ".submitit"} <= {p.name for p in place.iterdir()}
-
-
-def test_what_was_in_a_directory_before_stays_where_nothing_ran(tmp_path: Path, breaking: list[bool]) -> None:
-    (tmp_path / "notes.txt").write_text("")
-    claim(asked(tmp_path))
-    breaking[0] = True
-    SweepDirectory().on_multirun_end(asked(tmp_path))  # no multirun.yaml, no sweep.json, no .submitit
-    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
-
-
-# The end of a broken sweep
-
-
-class Told:
-    """Callbacks of a sweep that note that it is over."""
-
-    def __init__(self) -> None:
-        self.count = 0
-
-    def on_multirun_end(self, **_: Any) -> None:
-        self.count += 1
-
-
-@pytest.mark.parametrize("case", ["not ours", "lost", "begun", "in vain"])
-def test_a_broken_sweep_ends_with_its_report_or_without_a_trace(
-    case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    place, told = tmp_path / "sweep", Told()
-    monkeypatch.setattr(BrokenSweep, "end", lambda self: self.callbacks.on_multirun_end())
-    config = settings(place)
-    claim(config)
-    (place / "sweep.json").write_text("")
-    if case == "not ours":
-        lock.give_back(place)
-    if case == "begun":
-        (place / "0").mkdir()
-        (place / "0" / "run.json").write_text("{}")
-    if case == "lost":
-        os.rename(place, tmp_path / "moved")
-        place.mkdir()
-        (place / "sweep.json").write_text("")
-    close(BrokenSweep(config, told))
-    assert told.count == (case == "begun")
-    assert (place / "sweep.json").exists() == (case != "in vain")
-    assert place.exists() == (case != "in vain")
-    assert held(place) == (case == "begun")  # the callbacks give it back
-
-
-def test_a_farewell_says_what_is_complete_and_how_to_go_on(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("before", [True, False])
+def test_a_sweep_that_breaks_before_its_first_job_leaves_no_trace(
+    before: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    error = KeyboardInterrupt()
-    assert farewell(None, error, "interrupted") == "staf: interrupted"
-    for note in ("3 of 4", "resume"):
-        error.add_note(note)
-    assert farewell(None, error, "interrupted") == "staf: interrupted; 3 of 4; resume"
-    sweep = BrokenSweep(settings(tmp_path / "runs" / "one"), None)
-    assert farewell(sweep, error, "ended by SIGTERM") == "staf: ended by SIGTERM"
-    for name, text in (("0", '{"status": "completed"}'), ("1", '{"status": "running"}'), ("2", "damaged")):
-        (tmp_path / "runs" / "one" / name).mkdir(parents=True)
-        (tmp_path / "runs" / "one" / name / "run.json").write_text(text)
-    said = "staf: interrupted; 1 jobs are complete. Resume with:\n  staf -m sweep.resume=runs/one"
-    assert farewell(sweep, error, "interrupted") == said
+    if before:
+        (tmp_path / "sweep").mkdir()
+        (tmp_path / "sweep" / "notes.txt").write_text("")
+    code, _, err = one(
+        str(tmp_path), ["-m", "seed=0,1", "hydra.launcher.executor=thread", "hydra.sweep.dir=sweep"]
+    )
+    assert code == 1
+    assert "executor=...)` must be one of 'inline'" in err
+    assert "report" not in err
+    assert [str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*")] == (
+        ["sweep", "sweep/notes.txt"] if before else []
+    )
 
 
 # The report
 
 
-@pytest.fixture
-def drawn(monkeypatch: pytest.MonkeyPatch) -> list[bool]:
-    """Whether figures were asked for, a report each."""
-    wanted: list[bool] = []
-
-    def write(directory: Path, *, figures: bool = True) -> str:
-        wanted.append(figures)
-        return "the table"
-
-    monkeypatch.setattr(callbacks, "write_report", write)
-    return wanted
-
-
 @pytest.mark.parametrize(
-    ("own", "of_runs", "wanted"),
-    [
-        (None, True, True),
-        (None, False, False),
-        (None, None, True),
-        (True, False, True),
-        (False, True, False),
-        (True, True, True),
-        (False, False, False),
-    ],
+    ("own", "of_runs", "drawn"),
+    [(None, False, False), (True, False, True), (False, True, False)],
 )
 def test_figures_of_a_report_are_drawn_as_it_or_the_runs_say(
-    own: bool | None, of_runs: bool | None, wanted: bool, tmp_path: Path, drawn: list[bool]
+    own: bool | None, of_runs: bool, drawn: bool, tmp_path: Path
 ) -> None:
-    SweepReport(own).on_multirun_end(settings(tmp_path, figures=of_runs))
-    assert drawn == [wanted]
+    place = write_sweep(tmp_path / "sweep", ["gaussian"], counts=(3,), seeds=(0,))
+    SweepReport(own).on_multirun_end(settings(place, figures=of_runs))
+    assert (place / "figures").exists() == drawn
 
 
 @pytest.mark.parametrize("prints", [True, False])
 def test_a_report_is_printed_for_a_command_alone(
-    prints: bool, tmp_path: Path, drawn: list[bool], capsys: pytest.CaptureFixture[str]
+    prints: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    place = write_sweep(tmp_path / "sweep", ["gaussian"], seeds=(0,))
     token = PRINTS.set(prints)
     try:
-        SweepReport().on_multirun_end(settings(tmp_path))
+        SweepReport(False).on_multirun_end(settings(place))
     finally:
         PRINTS.reset(token)
-    assert capsys.readouterr().out == f"\nthe table\n  report: {tmp_path / 'report.html'}\n" * prints
-    assert drawn == [True]
+    table = (place / "table.md").read_text()
+    assert capsys.readouterr().out == f"\n{table}\n  report: {place / 'report.html'}\n" * prints
 
 
-def test_a_terminal_that_has_gone_costs_nothing(
-    tmp_path: Path, drawn: list[bool], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    flushed: list[int] = []
-    screen = SimpleNamespace(write=lambda text: None, flush=lambda: flushed.append(1))
-    monkeypatch.setattr(sys, "stdout", screen)
-    SweepReport().on_multirun_end(settings(tmp_path))
-    assert flushed == [1]
+class Gone:
+    """A terminal that has gone."""
 
-    def gone(_: str) -> None:
+    def write(self, _: str) -> None:
         raise BrokenPipeError
 
-    monkeypatch.setattr(screen, "write", gone)
-    SweepReport().on_multirun_end(settings(tmp_path))
-    assert flushed == [1]
 
-
-def test_there_is_no_report_where_nothing_ran(
-    tmp_path: Path, drawn: list[bool], breaking: list[bool]
+@pytest.mark.parametrize("kind", ["missing", "empty", "full", "no terminal"])
+def test_a_report_that_cannot_be_written_or_read_is_no_sweep_gone_wrong(
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     place = tmp_path / "sweep"
-    SweepReport().on_multirun_end(settings(place))
-    assert drawn == []
-    claim(settings(place))
-    breaking[0] = True
-    SweepReport().on_multirun_end(settings(place))
-    assert drawn == []
-    breaking[0] = False
-    SweepReport().on_multirun_end(settings(place))
-    assert drawn == [True]
+    if kind in ("full", "no terminal"):
+        write_sweep(place, ["gaussian"], seeds=(0,))
+    if kind == "empty":
+        place.mkdir()
+    if kind == "full":
+        (place / "table.md").mkdir()
+        with pytest.raises(SystemExit, match=r"^staf: no report of the sweep: cannot write .*table.md"):
+            SweepReport(False).on_multirun_end(settings(place))
+        return
+    monkeypatch.setattr(sys, "stdout", Gone())
+    SweepReport(False).on_multirun_end(settings(place))
+    assert (place / "report.html").exists() == (kind == "no terminal")
+    assert [line.startswith("no report of the sweep: ") for line in caplog.messages] == [True] * (
+        kind == "empty"
+    )
 
 
-@pytest.mark.parametrize("error", [OSError(28, "No space left", "table.md"), RuntimeError("a defect")])
-def test_a_report_that_cannot_be_written_is_no_sweep_gone_wrong(
-    error: Exception,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
-    capsys: pytest.CaptureFixture[str],
+# Trackers
+
+recorded: list[Run] = []
+
+
+class Kept(Tracker):
+    """Keeps what it is given, and refuses what it is told to."""
+
+    def __init__(self, given: Any = None) -> None:
+        if given == "refused":
+            raise ValueError("in our own words")
+        assert given is None or type(given) is dict  # plain values
+
+    def record(self, run: Run) -> None:
+        if run.metrics["ball_error"] == 9.0:
+            raise RuntimeError("no connection")
+        recorded.append(run)
+
+
+def tracked(target: str | None, place: Path | None = None, **more: Any) -> DictConfig:
+    node = {"runtime": {"output_dir": str(place)}}
+    return OmegaConf.create({"tracker": {"_target_": target, **more}, "hydra": node})
+
+
+KEPT = f"{__name__}.Kept"
+
+
+def test_a_tracker_is_made_before_the_runs_and_refuses_in_its_own_words() -> None:
+    for none in ({}, {"tracker": None}, {"tracker": {"_target_": None}}):
+        assert tracker(OmegaConf.create(none)) is None
+    assert isinstance(tracker(tracked(KEPT, given={"a": [1]})), Kept)
+    for begin in (TrackRuns().on_run_start, TrackRuns().on_multirun_start):
+        with pytest.raises(SystemExit, match=r"^staf: in our own words"):
+            begin(tracked(KEPT, given="refused"))
+        with pytest.raises(SystemExit, match=r"must be a staf_torch.sweeps.callbacks.Tracker|whitelist"):
+            begin(tracked("builtins.dict"))
+        begin(tracked(KEPT))
+
+
+def test_every_run_that_is_complete_is_recorded_once_and_an_error_is_a_warning(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    def fails(directory: Path, **_: Any) -> str:
-        raise error
+    caplog.set_level(logging.WARNING)
+    recorded.clear()
+    for name, status in (("a", "completed"), ("b", "failed"), ("c", "running"), ("d", "completed")):
+        write_run(tmp_path / "runs" / name, {"kernel": "own"}, {"ball_error": 1.0}, status=status)
+    TrackRuns().on_job_end(tracked(KEPT, tmp_path / "runs"), JobReturn())
+    assert [run.directory.name for run in recorded] == ["a", "d"]
+    assert recorded[0].settings["kernel"] == "own"
+    TrackRuns().on_job_end(OmegaConf.create({"tracker": None}), JobReturn())  # asks for nothing else
+    assert caplog.messages == []
+    write_run(tmp_path / "broken", {}, {"ball_error": 9.0})
+    TrackRuns().on_job_end(tracked(KEPT, tmp_path / "broken"), JobReturn())
+    assert caplog.messages == ["not tracked: RuntimeError: no connection"]
 
-    monkeypatch.setattr(callbacks, "write_report", fails)
-    disk = isinstance(error, OSError)
-    with pytest.raises(SystemExit) if disk else contextlib.nullcontext() as ended:
-        SweepReport().on_multirun_end(settings(tmp_path))
-    said = "staf: no report of the sweep: cannot write table.md: No space left"
-    assert not disk or str(ended.value) == said  # type: ignore[union-attr]
-    assert caplog.messages == ([] if disk else ["no report of the sweep: a defect"])
-    assert capsys.readouterr().out == ""
+
+def test_tensorboard_without_its_extra_names_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(SystemExit, match=r"pip install 'staf_torch\[tensorboard\]'"):
+        TrackRuns().on_multirun_start(tracked("staf_torch.sweeps.callbacks.TensorBoardTracker"))
+
+
+def test_tensorboard_reads_back_the_metrics(tmp_path: Path) -> None:
+    pytest.importorskip("tensorboard", reason="needs the extra `tensorboard`")
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    write_run(tmp_path / "run", {"kernel": "gaussian"}, {"ball_error": 0.25, "settling_time": None})
+    TensorBoardTracker().record(collect(tmp_path / "run").rows[0])
+    events = EventAccumulator(str(tmp_path / "run" / "tensorboard")).Reload()
+    assert [event.value for event in events.Scalars("ball_error")] == [0.25]
+    assert "settling_time" not in events.Tags()["scalars"]
+    assert "_hparams_/session_start_info" in events.summary_metadata
