@@ -83,7 +83,8 @@ class Run(reader.Run):
 
     def _pictures(self) -> Iterator[tuple[str, bytes]]:
         """Yield name and content of every picture in this folder; a link may lead to anything."""
-        for path in sorted((self.directory / FIGURES).glob("*.png")):
+        folder = self.directory / FIGURES
+        for path in () if folder.is_symlink() else sorted(folder.glob("*.png")):
             with contextlib.suppress(UnreadableError):
                 yield path.stem, read_bytes(path)
 
