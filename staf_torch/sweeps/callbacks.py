@@ -24,7 +24,7 @@ from ..results.reader import Run, collect
 from ..results.untrusted import links_in, visible
 from . import lock
 from .batching import sentence
-from .hydra_compat import BrokenSweep, breaking_off
+from .hydra_compat import BrokenSweep, as_typed, breaking_off
 from .job import PRINTS
 from .report import write_report
 
@@ -103,7 +103,7 @@ class SweepDirectory(Callback):
                 return
             claim(config)
             typed = config.hydra.overrides
-            records.begin_sweep(_directory(config), list(typed.task), list(typed.hydra))
+            records.begin_sweep(_directory(config), as_typed(typed.task), as_typed(typed.hydra))
         except (ValueError, OSError) as error:
             lock.give_back(_directory(config))
             raise SystemExit(f"staf: {sentence(error)}") from error
@@ -211,7 +211,7 @@ def claim(config: DictConfig) -> None:
         OSError: if it cannot be made.
     """
     wanted = str(config.hydra.sweep.dir)
-    if any(line.startswith("hydra.sweep.dir=") for line in config.hydra.overrides.hydra):
+    if any(line.startswith("hydra.sweep.dir=") for line in as_typed(config.hydra.overrides.hydra)):
         place = Path(wanted)
         place.mkdir(parents=True, exist_ok=True)
         lock.hold(place)

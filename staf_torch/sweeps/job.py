@@ -26,7 +26,7 @@ from ..results.progress import SHOWN, Progress
 from ..settings.chase import make_metrics
 from . import lock, members
 from .batching import DEFERRED, USER_ERRORS, Deferred, Outcome, completion, reason, sentence
-from .hydra_compat import SearchPaths, searching
+from .hydra_compat import SearchPaths, as_typed, searching
 
 _log = logging.getLogger(__name__)
 
@@ -45,9 +45,9 @@ class Origin(NamedTuple):
     @classmethod
     def of(cls, node: Any) -> Origin:
         """Return where the settings of the job with that node of Hydra's come from."""
-        search = tuple(line for line in node.overrides.hydra if line.startswith("hydra.searchpath"))
+        search = tuple(line for line in as_typed(node.overrides.hydra) if line.startswith("hydra.searchpath"))
         choices = {str(group): choice for group, choice in node.runtime.choices.items()}
-        return cls(list(node.overrides.task), choices, node.job.config_name, search)
+        return cls(as_typed(node.overrides.task), choices, node.job.config_name, search)
 
 
 class InWorker(NamedTuple):

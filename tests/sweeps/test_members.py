@@ -251,7 +251,7 @@ DAMAGE: dict[str, tuple[Any, int]] = {  # what is done, and the first row that i
 def test_a_resumed_job_computes_what_is_missing_and_ends_with_the_same_bytes(name: str, place: Path) -> None:
     spoil, first = DAMAGE[name]
     spoil(first)
-    code, said = staf("sweep.resume=killed", "--yes")
+    code, said = staf("sweep.resume=killed", "--trust")
     assert code == 0, said
     assert ("and those after it run again" in said) == (
         name in ("a cut row", "another digit", "a cut checksum")
@@ -291,21 +291,21 @@ def test_rows_of_other_settings_or_modules_are_refused_and_stay(place: Path) -> 
     ):
         text = Path(path).read_text()
         Path(path).write_text(text.replace(before, after))
-        code, said = staf("sweep.resume=killed", "--yes")
+        code, said = staf("sweep.resume=killed", "--trust")
         assert code == 1
         assert words in said
         assert computed() == []
         assert Path("killed", PARTIAL).read_bytes() == rows
         if path != "mine.py":
             Path(path).write_text(text)
-    code, said = staf("sweep.resume=killed", "sweep.resume_anyway=true", "--yes")
+    code, said = staf("sweep.resume=killed", "sweep.resume_anyway=true", "--trust")
     assert code == 0, said
     assert computed() == list(range(ALL))  # the job begins anew where a person means it
     assert members(Path("killed"))[2]["metrics"]["square"] == 12.0
 
 
 def test_one_run_is_not_resumed_as_a_sweep(place: Path) -> None:
-    code, said = staf("-m", "sweep.resume=killed", "--yes")
+    code, said = staf("-m", "sweep.resume=killed", "--trust")
     assert code == 1
     assert "is one run, of many members: resume it without -m" in said
 
@@ -317,7 +317,7 @@ def test_a_sweep_of_such_jobs_goes_on_within_the_job(place: Path) -> None:
     code, said = staf("-m", *lists, "hydra.sweep.dir=two")
     assert code == 130, said
     computed()
-    assert staf("-m", "sweep.resume=two", "--yes")[0] == 0
+    assert staf("-m", "sweep.resume=two", "--trust")[0] == 0
     assert computed() == list(range(50 + PIECE, 50 + ALL))  # the first piece of the second job stays
     assert (len(members(Path("two/0"))), len(members(Path("two/1")))) == (3, ALL)
 

@@ -2,33 +2,35 @@
 
 from __future__ import annotations
 
+import io
 import json
 import logging
 import os
+import re
 import shutil
 import subprocess
 import sys
+import warnings
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import pytest
 from command_line import environment, one
-from omegaconf import OmegaConf
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf
 
-from staf_torch.cli.staf import command_line
+from staf_torch.experiments.registry import Metrics
 from staf_torch.results import run_record as records
-from staf_torch.sweeps import launcher as launch
-from staf_torch.sweeps.callbacks import SweepReport, claim
+from staf_torch.results.files import write_metrics
+from staf_torch.results.progress import SHOWN, Progress
+from staf_torch.sweeps.job import objective
+from staf_torch.sweeps.launcher import SweepProgress
 
+pytestmark = pytest.mark.filterwarnings("always:odd 100")
 SHORT = ["duration=0.05", "settle_time=0", "figures=false", "history=false"]
-GRID = [
-    "centers.count=3,4,6",
-    "centers.radius=0.1,0.2",
-    "trajectories=2",
-    *SHORT,
-]  # rings of 4: there are none
+GRID = ["centers.count=3,4,6", "centers.radius=0.1,0.2", "trajectories=2", "+note='ü: x'", *SHORT]
+BAD = "`rings(count=...)` must be one of 3, 6, 10, 15, 21, 28; got 4."
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +47,6 @@ def sweep(place: Path, name: str, *argv: str, code: int = 0) -> tuple[Path, str]
     """A sweep into `runs/<name>`: its directory and what was said."""
     ended, out, err = one(str(place), ["-m", *argv, f"hydra.sweep.dir=runs/{name}"])
     assert ended == code, err
-    assert "Traceback" not in out + err
     return place / "runs" / name, out + err
 
 
@@ -84,13 +85,15 @@ def test_a_batched_sweep_leaves_what_the_basic_launcher_leaves(
         for found in (batched[0], basic[0])
     )
     assert ours == hydras
+    assert {"table.md", "report.html"} <= ours  # although jobs failed
     for num in range(6):
-        one_, other = batched[0] / str(num), basic[0] / str(num)
-        assert hydra_of(one_) == hydra_of(other)
-        assert (one_ / ".hydra/config.yaml").read_text() == (other / ".hydra/config.yaml").read_text()
-        assert (one_ / ".hydra/overrides.yaml").read_text() == (other / ".hydra/overrides.yaml").read_text()
+        run, other = batched[0] / str(num), basic[0] / str(num)
+        assert hydra_of(run) == hydra_of(other)
+        for name in ("config", "overrides"):
+            path = f".hydra/{name}.yaml"
+            assert (run / path).read_text() == (other / path).read_text()
         same = {"task", "overrides", "settings", "status", "reason", "version"}
-        assert {key: record(one_)[key] for key in same} == {key: record(other)[key] for key in same}
+        assert {key: record(run)[key] for key in same} == {key: record(other)[key] for key in same}
 
 
 def hydra_of(run: Path) -> Any:
@@ -108,28 +111,21 @@ def test_a_batched_sweep_finds_the_numbers_of_the_basic_launcher(
     assert ours.keys() == hydras.keys()
     for key, found in ours.items():
         expected = hydras[key]
-        if isinstance(expected, str):
-            assert found == expected
-        else:
-            assert found == pytest.approx(expected, rel=1e-9, abs=1e-12)
+        assert found == (
+            expected if isinstance(expected, str) else pytest.approx(expected, rel=1e-9, abs=1e-12)
+        )
 
 
-def test_a_count_that_the_layout_cannot_have_fails_alone_and_says_why(batched: tuple[Path, str]) -> None:
+def test_a_job_that_fails_fails_alone_and_says_why(batched: tuple[Path, str]) -> None:
     directory, said = batched
-    status = {num: record(directory / str(num))["status"] for num in range(6)}
-    assert status == {
-        0: "completed",
-        1: "completed",
-        2: "failed",
-        3: "failed",
-        4: "completed",
-        5: "completed",
-    }
-    reason = "`rings(count=...)` must be one of 3, 6, 10, 15, 21, 28; got 4."
-    assert record(directory / "2")["reason"] == reason
+    status = [record(directory / str(num))["status"] for num in range(6)]
+    assert status == [*["completed"] * 2, *["failed"] * 2, *["completed"] * 2]
+    assert record(directory / "2")["reason"] == BAD
     assert "job 2 (centers.count=4 centers.radius=0.1" in said
-    assert said.rstrip().endswith(f"staf: {reason}")
-    assert reason in (directory / "2" / "staf.log").read_text()
+    assert said.rstrip().endswith(f"staf: {BAD}")
+    assert "4 of 6 jobs completed, 2 failed" in said
+    assert "Traceback" not in said
+    assert BAD in (directory / "2" / "staf.log").read_text()
 
 
 def test_sweep_json_lists_the_jobs_and_run_json_their_settings(batched: tuple[Path, str]) -> None:
@@ -146,75 +142,46 @@ def test_sweep_json_lists_the_jobs_and_run_json_their_settings(batched: tuple[Pa
 def test_each_log_has_its_own_job_alone(batched: tuple[Path, str]) -> None:
     for num, count in ((0, 3), (4, 6)):
         log = (batched[0] / str(num) / "staf.log").read_text()
-        told = [line for line in log.splitlines() if "Gradient chase" in line]  # more where it was resumed
-        assert told
-        assert all(f"{count} centers" in line for line in told)
+        (told,) = [line for line in log.splitlines() if "Gradient chase" in line]
+        assert f"{count} centers" in told
 
 
+@pytest.mark.parametrize("launcher", ["batched", "basic"])
 def test_a_resumed_sweep_runs_what_is_missing_and_ends_with_the_same_bits(
-    place: Path, batched: tuple[Path, str]
+    launcher: str, place: Path, request: pytest.FixtureRequest
 ) -> None:
-    again = shutil.copytree(batched[0], place / "runs" / "again")  # other tests look at that one
+    again = shutil.copytree(request.getfixturevalue(launcher)[0], place / "runs" / f"{launcher}_again")
     before = rows(again)
     first = (again / "0" / "run.json").stat().st_mtime_ns
-    running = record(again / "5") | {"status": "running"}
-    (again / "5" / "run.json").write_text(json.dumps(running))
+    (again / "5" / "run.json").write_text(json.dumps(record(again / "5") | {"status": "running"}))
     (again / "4" / "run.json").unlink()
-    code, out, err = one(str(place), ["-m", "sweep.resume=runs/again"])
+    code, out, err = one(
+        str(place), ["-m", f"sweep.resume=runs/{launcher}_again", f"hydra/launcher={launcher}"]
+    )
     assert code == 1  # the failed ones fail again
-    assert "4 of 6 jobs completed, 2 failed" in out, err
-    assert rows(again) == before
-    assert (again / "0" / "run.json").stat().st_mtime_ns == first
-    assert not list((again / "0").glob(".*partial"))
-
-
-def test_other_launchers_resume_too(place: Path, basic: tuple[Path, str]) -> None:
-    again = shutil.copytree(basic[0], place / "runs" / "basic_again")
-    before = rows(again)
-    first = (again / "0" / "run.json").stat().st_mtime_ns
-    (again / "5" / "run.json").unlink()
-    code, out, _ = one(str(place), ["-m", *GRID, "sweep.resume=runs/basic_again", "hydra/launcher=basic"])
-    assert code == 1
-    assert "completed before: runs/basic_again/0" in out
+    told = (
+        "4 of 6 jobs completed, 2 failed" if launcher == "batched" else "completed before: runs/basic_again/0"
+    )
+    assert told in out, err
     assert rows(again) == before
     assert (again / "0" / "run.json").stat().st_mtime_ns == first
 
 
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
+def test_a_resumed_sweep_of_other_overrides_or_another_version_is_refused(
+    place: Path, batched: tuple[Path, str], tmp_path: Path
+) -> None:
+    for change, words in (
         (["seed=1"], "must have the overrides of that sweep, or none; got them without"),
         ([*GRID, "seed=1"], "with 'seed=1'"),
-    ],
-)
-def test_a_resumed_sweep_of_other_overrides_is_refused(
-    place: Path, batched: tuple[Path, str], change: list[str], words: str
-) -> None:
-    code, _, err = one(str(place), ["-m", *change, "sweep.resume=runs/batched"])
-    assert code == 1
-    assert words in err
-
-
-def test_what_is_no_sweep_of_this_version_is_not_resumed(place: Path, tmp_path: Path) -> None:
+    ):
+        code, _, err = one(str(place), ["-m", *change, "sweep.resume=runs/batched"])
+        assert code == 1
+        assert words in err
     _, _, err = one(str(place), ["-m", f"sweep.resume={tmp_path}"])
     assert "must be the directory of a sweep" in err
     (tmp_path / "sweep.json").write_text('{"version": "0.0.1", "overrides": [], "hydra": [], "jobs": []}')
     _, _, err = one(str(place), ["-m", f"sweep.resume={tmp_path}"])
     assert "written by 0.0.1" in err
-
-
-def test_a_resumed_sweep_keeps_hydras_settings_but_those_that_change(tmp_path: Path) -> None:
-    hydra = ["hydra.mode=MULTIRUN", "hydra.launcher.batch=2", "hydra.verbose=true", "hydra.sweep.dir=old"]
-    records.begin_sweep(tmp_path, ["seed=0,1", "sweep.objective=ball_error"], hydra)
-    place = records.quoted(str(tmp_path))
-    end = [f"hydra.sweep.dir={place}", f"sweep.resume={place}"]
-    kept = ["--multirun", "seed=0,1", "hydra.launcher.batch=2", "hydra.verbose=true"]
-    kept += ["sweep.objective=ball_error", *end]
-    assert command_line([f"sweep.resume={tmp_path}"]) == kept
-    other = ["-m", "seed=0,1", "hydra.verbose=true", "sweep.objective=null", "hydra/launcher=basic", *end]
-    changed = ["sweep.objective=null", "hydra/launcher=basic"]
-    assert command_line(["-m", f"sweep.resume={tmp_path}", *changed]) == other
-    assert command_line(["-m", "sweep.resume=null", "seed=0"]) == ["-m", "sweep.resume=null", "seed=0"]
 
 
 def test_a_directory_with_another_run_in_it_is_named(tmp_path: Path) -> None:
@@ -234,79 +201,112 @@ def test_an_unknown_swept_key_starts_nothing(place: Path) -> None:
     assert set((place / "runs").iterdir()) == before
 
 
-def test_a_batch_that_raises_is_retried_to_find_the_culprit(
-    place: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from staf_torch.experiments import gradient_chase
+@pytest.mark.parametrize("line", ["batch=0", "workers=0", "foreign=ask"])
+def test_what_the_launcher_is_told_is_checked_before_anything_runs(line: str, place: Path) -> None:
+    directory, said = sweep(place, "refused", "seed=0,1", f"hydra.launcher.{line}", code=1)
+    assert f"`hydra.launcher({line.partition('=')[0]}=...)` must be" in said
+    assert not directory.exists()
 
-    solve = gradient_chase.GradientChase.solve
 
-    def touchy(self: Any, cfgs: Any, progress: Any) -> Any:
-        if any(cfg.seed == 1 for cfg in cfgs):
-            raise RuntimeError("the second seed is unlucky")
-        return solve(self, cfgs, progress)
+# A user's experiment, and what befalls it
 
-    monkeypatch.setattr(gradient_chase.GradientChase, "solve", touchy)
-    monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
-    with pytest.raises(RuntimeError, match="unlucky"):  # a defect keeps its trace
-        run_main(place, ["-m", "seed=range(3)", *SHORT, "hydra.sweep.dir=runs/culprit"])
-    status = [record(place / f"runs/culprit/{num}")["status"] for num in range(3)]
+
+def own(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics:
+    """An experiment that notes where it runs and that something befalls, as its settings say."""
+    warnings.warn("odd 100 %", stacklevel=1)
+    harm = cfg.get("harm") if cfg.seed == 1 else None
+    if harm == "user":
+        raise ValueError("not like that")
+    if harm == "defect":
+        raise RuntimeError("the second seed is unlucky")
+    if harm == "Ctrl-C" and not Path("go on").exists():
+        raise KeyboardInterrupt
+    if harm == "a directory":
+        shutil.rmtree(directory.parent)
+    if harm == "a job":
+        shutil.rmtree(directory.parent / "0")
+    node = HydraConfig.get()
+    assert node.runtime.output_dir == str(directory.absolute())
+    assert json.loads((directory / "run.json").read_text())["status"] == "running"
+    found: Metrics = {"num": float(node.job.get("num", -1)), "set": float(os.environ.get("STAF_JOB", 0))}
+    write_metrics(directory / "metrics.json", found)
+    return found
+
+
+OWN = ["task=test_sweep.own", "figures=false"]
+
+
+def test_hydra_knows_of_a_job_while_it_runs_and_what_was_typed_is_kept_as_typed(place: Path) -> None:
+    more = ["+hydra.job.env_set.STAF_JOB=7", "hydra.sweep.subdir=x${hydra.job.num}", "+at=${centers.radius}"]
+    directory, _ = sweep(place, "own", *OWN, "seed=0,1,2", *more)
+    runs = [directory / f"x{num}" for num in range(3)]
+    assert [json.loads((run / "metrics.json").read_text()) for run in runs] == [
+        {"num": num, "set": 7.0} for num in range(3)
+    ]
+    assert "STAF_JOB" not in os.environ
+    assert json.loads((directory / "sweep.json").read_text())["overrides"][-1] == more[-1]  # as typed
+    assert all("odd 100 %" in (run / "staf.log").read_text() for run in runs)  # a warning
+    (runs[1] / "run.json").unlink()
+    _, out, err = one(str(place), ["-m", "sweep.resume=runs/own", "--trust"])
+    assert "3 of 3 jobs completed" in out, err
+
+
+def test_a_defect_keeps_its_trace_and_spares_the_others(place: Path) -> None:
+    directory, said = sweep(place, "defect", *OWN, "seed=range(3)", "+harm=defect", code=99)
+    assert "RuntimeError: the second seed is unlucky" in said
+    status = [record(directory / str(num))["status"] for num in range(3)]
     assert status == ["completed", "failed", "completed"]
-    assert record(place / "runs/culprit/1")["reason"] == "RuntimeError: the second seed is unlucky"
-    assert "Traceback" in (place / "runs/culprit/1/staf.log").read_text()
+    assert record(directory / "1")["reason"] == "RuntimeError: the second seed is unlucky"
+    assert "Traceback" in (directory / "1" / "staf.log").read_text()
 
 
-def run_main(place: Path, argv: list[str]) -> None:
-    """The command, with exceptions that are no user's error as they are."""
-    from staf_torch.cli.staf import main
-
-    os.chdir(place)
-    before = sys.argv
-    sys.argv = ["staf", *argv]
-    try:
-        main()
-    finally:
-        sys.argv = before
-
-
-def test_an_interrupted_sweep_says_how_to_resume(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    replay = launch.Launch._replay
-
-    def impatient(self: launch.Launch, job: launch.Job, *rest: Any) -> Any:
-        if job.num == 1:
-            raise KeyboardInterrupt
-        return replay(self, job, *rest)
-
-    monkeypatch.setattr(launch.Launch, "_replay", impatient)
-    directory, said = sweep(place, "interrupted", "seed=range(3)", *SHORT, code=130)
+def test_an_interrupted_sweep_says_how_to_resume(place: Path) -> None:
+    directory, said = sweep(place, "interrupted", *OWN, "seed=range(3)", "+harm=Ctrl-C", code=130)
     assert "1 jobs are complete" in said
     assert said.endswith("staf -m sweep.resume=runs/interrupted\n")
-    monkeypatch.undo()
-    code, out, _ = one(str(place), ["-m", "sweep.resume=runs/interrupted"])
-    assert code == 0
+    assert record(directory / "1")["reason"] == "interrupted"
+    (place / "go on").touch()
+    code, out, err = one(str(place), ["-m", "sweep.resume=runs/interrupted", "--trust"])
+    assert code == 0, err
     assert "3 of 3 jobs completed" in out
     assert len(rows(directory)) == 3
 
 
-def test_sweeps_of_the_same_moment_have_directories_of_their_own(tmp_path: Path) -> None:
-    def begin(_: int) -> str:
-        sweep = {"dir": str(tmp_path / "runs" / "now_sweep")}
-        cfg = OmegaConf.create({"hydra": {"sweep": sweep, "overrides": {"hydra": []}}})
-        claim(cfg)
-        moved = [line.partition("=")[2] for line in cfg.hydra.overrides.hydra]
-        assert moved in ([], [cfg.hydra.sweep.dir])
-        return str(cfg.hydra.sweep.dir)
+@pytest.mark.parametrize(
+    ("harm", "said", "status"),
+    [
+        ("a directory", "was removed or replaced while its sweep went on: stopped when", []),
+        ("a job", "the results of job 0 (task=test_sweep.own", ["completed", "completed"]),
+    ],
+)
+def test_results_that_are_taken_away_are_no_completed_jobs(
+    harm: str, said: str, status: list[str], place: Path
+) -> None:
+    directory, told = sweep(place, harm[-3:], *OWN, "seed=range(3)", f"+harm={harm}", code=1)
+    assert said in told
+    assert [record(run.parent)["status"] for run in sorted(directory.glob("*/run.json"))] == status
 
-    with ThreadPoolExecutor(8) as pool:
-        taken = list(pool.map(begin, range(8)))
-    assert len(set(taken)) == 8
-    assert {path.name for path in (tmp_path / "runs").iterdir()} == {Path(name).name for name in taken}
+
+@pytest.mark.parametrize("before", [True, False])
+@pytest.mark.parametrize(("harm", "code"), [("user", 1), ("defect", 99), ("Ctrl-C", 130)])
+def test_a_run_of_a_users_error_leaves_nothing_and_others_keep_all_that_there_is(
+    harm: str, code: int, before: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    if before:
+        (tmp_path / "run").mkdir()
+        (tmp_path / "run" / "notes.txt").write_text("")
+    ended, _, err = one(str(tmp_path), [*OWN, "seed=1", f"+harm={harm}", "hydra.run.dir=run"])
+    assert ended == code
+    left = {path.name for path in tmp_path.glob("run/*")}
+    kept = {"notes.txt"} if before else set()
+    assert left == (kept if harm == "user" else kept | {".hydra", "run.json", "staf.log"})
+    assert (tmp_path / "run").exists() == (before or harm != "user")
+    assert ("staf: not like that" in err) == (harm == "user")
 
 
-def test_an_objective_is_what_the_sweeper_is_told(place: Path) -> None:
-    from staf_torch.sweeps.job import objective
-
-    metrics = {"ball_error": 0.5, "settling_time": None}
+def test_an_objective_is_what_the_sweeper_is_told() -> None:
+    metrics: Metrics = {"ball_error": 0.5, "settling_time": None}
     none, one_, two, wrong = (
         OmegaConf.create({"sweep": {"objective": named}})
         for named in (None, "ball_error", ["settling_time", "ball_error"], "speed")
@@ -327,13 +327,39 @@ def test_the_plugin_imports_no_torch() -> None:
     subprocess.run([sys.executable, "-c", program], cwd=root, env=environment(), check=True)
 
 
-def test_a_sweep_with_a_failure_is_told_to_be_over(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Hydra forgets its callbacks then, and the table is made by one."""
-    told = []
+# Progress
 
-    def note(self: SweepReport, config: Any, **_: Any) -> None:
-        told.append(str(config.hydra.sweep.dir))
 
-    monkeypatch.setattr(SweepReport, "on_multirun_end", note)
-    sweep(place, "told", "centers.count=4", *SHORT, code=1)
-    assert told == ["runs/told"]
+def test_a_line_says_what_is_done_and_failed_and_the_time_that_is_left(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    progress = SweepProgress(10, 2)
+    assert progress.line == "2 of 10 jobs done"
+    progress.running(0.8)  # a tenth of the eight that are left
+    assert re.fullmatch(r"2 of 10 jobs done, \d+ s left", progress.line)
+    progress.ended("job 2", None)
+    progress.ended("job 3 (seed=1)", "it diverged")
+    assert re.fullmatch(r"4 of 10 jobs done, 1 failed, \d+ s left", progress.line)
+    progress.computed(8.0)
+    assert progress.line == "4 of 10 jobs done, 1 failed"  # no time is left, but for the files
+    progress.close()
+    assert capsys.readouterr() == ("", "job 3 (seed=1) failed: it diverged\n")  # no line within ten seconds
+
+
+class Terminal(io.StringIO):
+    """Where bars are shown."""
+
+    def isatty(self) -> bool:
+        return True
+
+
+def test_a_terminal_has_a_bar_that_is_wiped_in_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    shown = Terminal()
+    monkeypatch.setattr(sys, "stderr", shown)
+    progress = SweepProgress(4)
+    while "0 of 4 jobs done" not in shown.getvalue():
+        progress.computed(1.0)
+    assert re.search(r" 25%\|.{30}\| 0 of 4 jobs done, \d+ s left", shown.getvalue())
+    before = len(shown.getvalue())
+    progress.close()
+    assert not shown.getvalue()[before:].strip("\r \x1b[A")

@@ -7,6 +7,7 @@ from hydra.core.utils import env_override as env_override
 
 from .composing import Composer as Composer
 from .composing import JobLoader as JobLoader
+from .composing import as_typed as as_typed
 from .composing import interpolations_parsed_once as interpolations_parsed_once
 from .composing import parse_override as parse_override
 from .jobs import SweepContext as SweepContext

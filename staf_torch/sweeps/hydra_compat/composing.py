@@ -16,7 +16,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override, OverrideType
 from hydra.errors import ConfigCompositionException
 from hydra.types import HydraContext, RunMode
-from omegaconf import DictConfig, OmegaConf, open_dict, read_write
+from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict, read_write
 from omegaconf.errors import OmegaConfBaseException
 
 
@@ -50,6 +50,11 @@ def interpolations_parsed_once() -> Iterator[None]:
         yield
     finally:
         module.parse = parse
+
+
+def as_typed(lines: ListConfig) -> list[str]:
+    """Return overrides that Hydra has noted as they were typed: an interpolation in them is not looked up."""
+    return cast(list[str], OmegaConf.to_container(lines))
 
 
 MOST_LINES = 10_000  # that are kept: a million seeds are a million lines
@@ -208,7 +213,7 @@ def _note_overrides(composed: DictConfig, parsed: Sequence[Override]) -> None:
     app = [one for one in parsed if not one.is_hydra_override()]
     node: Any = composed.hydra
     lines: list[Any] = [one.input_line for one in app]
-    noted: Any = OmegaConf.to_container(node.overrides.task)  # as written: an interpolation is a text here
+    noted = as_typed(node.overrides.task)
     if len(noted) == len(lines):
         for index in (i for i, line in enumerate(lines) if line != noted[i]):
             node.overrides.task[index] = lines[index]
@@ -270,12 +275,16 @@ class JobLoader:
 
     def choices(self, master: DictConfig, overrides: Sequence[str]) -> tuple[str, ...] | None:
         """Return the lines that decide what Hydra's node holds, beside what is noted of the job itself."""
-        return None if self._unseen else self._whole.choices([*master.hydra.overrides.hydra, *overrides])
+        return (
+            None
+            if self._unseen
+            else self._whole.choices([*as_typed(master.hydra.overrides.hydra), *overrides])
+        )
 
     def _composed(
         self, composer: Composer, master: DictConfig, overrides: Sequence[str], *, reuse: bool
     ) -> DictConfig:
-        lines = [*master.hydra.overrides.hydra, *overrides]
+        lines = [*as_typed(master.hydra.overrides.hydra), *overrides]
         if self._unseen:
             composed = composer.anew(lines)
         else:

@@ -26,7 +26,7 @@ from hydra.types import HydraContext
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 from omegaconf._utils import OmegaConfDumper, get_omega_conf_dumper
 
-from .composing import JobLoader
+from .composing import JobLoader, as_typed
 from .log_handlers import handlers_aside
 from .program import HAS_WHITELIST
 
@@ -141,7 +141,7 @@ def _run_job(
         with read_write(config.hydra.runtime), open_dict(config.hydra.runtime):
             config.hydra.runtime.output_dir = os.path.normpath(directory)
         ret = JobReturn(
-            overrides=[str(line) for line in config.hydra.overrides.task],
+            overrides=as_typed(config.hydra.overrides.task),
             cfg=settings,
             hydra_cfg=config,
             working_dir=os.getcwd(),
