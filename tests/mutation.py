@@ -1,196 +1,300 @@
 """Change one operator, number or statement of the package at a time, and see whether a test notices.
 
-    python tests/mutation.py [--sample 100] [--seed 0] [--package kernels optim] [--jobs 2] [--minutes 30]
+    python tests/mutation.py [--sample 100] [--seed 1] [--jobs 2] [--seconds 60] [--room kernels optim]
 
-A mutant runs the tests that execute its line, those of the same folder and the short ones first,
-until one fails (`mutation_judge.py`). Which tests execute which line is measured once a file of tests
-(`mutation_map.py`) and kept in the user's cache. The committed tree counts, not the working one. Mutants in
-`mutants_accepted.py` change nothing that can be seen.
+Coverage measures once which test executes which line (a run of the suite; `--remap` measures again). A
+mutant runs the tests that execute its line, short ones first, in a process and a copy of the tree of its
+own, until one fails or there is no time for more. Those that survive are printed. It is a lamp and no
+score: many changes do no harm.
 """
 
 from __future__ import annotations
 
 import argparse
+import ast
 import compileall
+import contextlib
+import copy
+import itertools
 import json
-import multiprocessing
 import os
 import py_compile
+import queue
 import random
+import re
+import shutil
+import signal
 import subprocess
 import sys
 import tempfile
 import time
-from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any, NamedTuple
 
-from mutants import Mutant, mutants_of, room_of
-from mutation_fork import begin
-from mutation_judge import Verdict, begin_judging, fail_anyway, judge
-from mutation_map import Map, kept_at, known, measure, places, test_files
-from mutation_notes import Notes
+import coverage
+import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 CACHE = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "staf_torch-mutation"
-PRELOADED = ("torch", "torch._dynamo", "numpy", "scipy.linalg", "matplotlib.pyplot", "omegaconf")
-PRELOADED += (
-    "hypothesis.extra.numpy",
-    "hypothesis.strategies",
-    "hydra._internal.hydra",
-    "hydra.core.plugins",
-)
+MEASURED, SECONDS = CACHE / "coverage", CACHE / "seconds.json"
+SETTINGS = "[run]\nsource = staf_torch\nrelative_files = true\ncore = ctrace\n"
+PAIRS = "Lt LtE, Gt GtE, Eq NotEq, Is IsNot, In NotIn, Add Sub, Mult Div, BitAnd BitOr, And Or"
+OPERATORS = {a: b for pair in PAIRS.split(", ") for a, b in (pair.split(), pair.split()[::-1])}
+OPERATORS |= dict.fromkeys(("FloorDiv", "Mod", "Pow"), "Mult")
+SAYS = ("warn", "info", "debug", "warning", "error")  # calls that only say something
+SOONEST = 0.3  # share of a mutant's time that its tests take without it: what takes all of it hangs
 
 
-def main() -> int:
-    """Run the command line; the exit code is 1 where too few of them are killed."""
-    os.environ["OMP_NUM_THREADS"] = "1"  # before torch is imported: threads of OpenMP do not survive a fork
+# --- what is changed ----------------------------------------------------------------------------------------
+
+
+class Mutant(NamedTuple):
+    """One change of a file."""
+
+    file: str
+    line: int
+    last: int
+    begin: int  # in bytes
+    end: int
+    was: str
+    now: str
+
+    def applied(self, source: str) -> str:
+        """The changed file."""
+        raw = source.encode()
+        return (raw[: self.begin] + self.now.encode() + raw[self.end :]).decode()
+
+    def __str__(self) -> str:
+        short = (" ".join(each.split())[:70] for each in (self.was, self.now))
+        return f"{self.file}:{self.line}: {' -> '.join(short)}"
+
+
+def mutants_of(file: str, source: str) -> Iterator[Mutant]:
+    """Every mutant of a file."""
+    tree, raw, starts = ast.parse(source), source.encode(), [0]
+    for line in raw.splitlines(keepends=True):
+        starts.append(starts[-1] + len(line))
+    skipped = {id(inner) for part in idle(tree) for inner in ast.walk(part)}
+    for node in ast.walk(tree):
+        for place, now in () if id(node) in skipped else changes(node):
+            begin = starts[place.lineno - 1] + place.col_offset
+            end = starts[(place.end_lineno or 0) - 1] + (place.end_col_offset or 0)
+            was = raw[begin:end].decode()
+            if now != was:
+                yield Mutant(file, place.lineno, place.end_lineno or place.lineno, begin, end, was, now)
+
+
+def idle(tree: ast.AST) -> Iterator[ast.AST]:
+    """Parts that decide nothing when the program runs: annotations, texts of errors, what is logged."""
+    for node in ast.walk(tree):
+        parts: Sequence[ast.AST | None] = ()
+        called = ast.unparse(node.func).rpartition(".")[2] if isinstance(node, ast.Call) else ""
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            parts = [node.returns, *node.decorator_list]
+        elif isinstance(node, ast.arg | ast.AnnAssign):
+            parts = [node.annotation]
+        elif isinstance(node, ast.Raise):
+            parts = [node.exc, node.cause]
+        elif isinstance(node, ast.JoinedStr | ast.Assert) or called in (*SAYS, "cast", "TypeVar"):
+            parts = [node]
+        yield from filter(None, parts)
+
+
+def exchanged(operator: ast.AST) -> Any:
+    """The operator in the place of another one; None for the few that stay."""
+    name = OPERATORS.get(type(operator).__name__)
+    return name and getattr(ast, name)()
+
+
+def changes(node: ast.AST) -> Iterator[tuple[ast.expr | ast.stmt, str]]:
+    """Places of a node, and what stands there in a mutant."""
+    other = copy.deepcopy(node)
+    if isinstance(node, ast.Compare) and len(node.ops) == 1:
+        other.ops = [exchanged(node.ops[0])]  # type: ignore[attr-defined]
+        yield node, f"({ast.unparse(other)})"
+    elif isinstance(node, ast.BinOp | ast.BoolOp | ast.AugAssign) and exchanged(node.op) is not None:
+        other.op = exchanged(node.op)  # type: ignore[attr-defined]
+        text = ast.unparse(other)
+        if "'" not in text:  # texts cannot be subtracted
+            yield node, text if isinstance(node, ast.AugAssign) else f"({text})"
+    elif isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub | ast.Not | ast.Invert):
+        yield node, f"({ast.unparse(node.operand)})"
+    elif isinstance(node, ast.Constant) and isinstance(node.value, bool | int | float):
+        value = node.value
+        changed = (
+            not value
+            if isinstance(value, bool)
+            else value + 1
+            if isinstance(value, int)
+            else value * 2 or 1.0
+        )
+        yield node, repr(changed)
+    elif isinstance(node, ast.If | ast.IfExp | ast.While):
+        yield node.test, f"(not ({ast.unparse(node.test)}))"
+    elif isinstance(node, ast.Raise) or (isinstance(node, ast.Expr) and isinstance(node.value, ast.Call)):
+        yield node, "pass"
+    elif isinstance(node, ast.Call):
+        for keyword in node.keywords:
+            if keyword.arg not in (None, "stacklevel", "maxsplit"):
+                fewer = copy.copy(node)
+                fewer.keywords = [each for each in node.keywords if each is not keyword]
+                yield node, ast.unparse(fewer)
+
+
+# --- which tests execute what -------------------------------------------------------------------------------
+
+
+def pytest_runtest_logreport(report: pytest.TestReport) -> None:
+    """As a plugin of the run that is measured: what each test that passes takes."""
+    _taken[report.nodeid] = _taken.get(report.nodeid, 0.0) + report.duration
+    if not report.passed:
+        _failed.add(report.nodeid)
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Write it down, but in the workers of pytest-xdist."""
+    if not hasattr(session.config, "workerinput"):
+        kept = {name: seconds for name, seconds in _taken.items() if name not in _failed}
+        Path(os.environ["STAF_MUTATION_SECONDS"]).write_text(json.dumps(kept), encoding="utf-8")
+
+
+_taken: dict[str, float] = {}
+_failed: set[str] = set()
+
+
+def measure(tree: Path, jobs: int, tests: Sequence[str]) -> None:
+    """Run the suite once, and keep which test executed which line, and what each takes."""
+    CACHE.mkdir(parents=True, exist_ok=True)
+    (CACHE / "coveragerc").write_text(SETTINGS, encoding="utf-8")
+    line = ["-m", "pytest", "-q", "-p", "mutation", "-p", "no:cacheprovider", "--tb=no", f"-n{jobs}"]
+    line += [
+        "--cov=staf_torch",
+        "--cov-context=test",
+        "--cov-report=",
+        f"--cov-config={CACHE / 'coveragerc'}",
+    ]
+    told = {"COVERAGE_FILE": str(MEASURED), "STAF_MUTATION_SECONDS": str(SECONDS)}
+    subprocess.run([sys.executable, *line, *tests], cwd=tree, env=environment(tree) | told, check=False)
+
+
+def environment(tree: Path) -> dict[str, str]:
+    """In which tests run: the package of a tree, and a cache of programs that mutants share."""
+    path = os.pathsep.join(str(tree / part) for part in ("", "staf_torch/plugins", "tests"))
+    own = {"PYTHONPATH": path, "XDG_CACHE_HOME": str(CACHE / "programs"), "PYTHONDONTWRITEBYTECODE": "1"}
+    return {**os.environ, **own, "OMP_NUM_THREADS": "1"}
+
+
+def tests_of(mutant: Mutant, data: coverage.CoverageData, taken: dict[str, float], most: float) -> list[str]:
+    """Tests that execute the line, the short ones first; of a line that runs at import those of the file."""
+    lines = data.contexts_by_lineno(mutant.file)
+    own = {each for line in range(mutant.line, mutant.last + 1) for each in lines.get(line, ())} - {""}
+    names = {each.rpartition("|")[0] for each in own or {each for line in lines.values() for each in line}}
+    known = sorted(names & taken.keys(), key=lambda name: (taken[name], name))[:300]
+    until = itertools.accumulate(taken[name] for name in known)
+    return [name for name, seconds in zip(known, until, strict=True) if seconds < most] or files_that_name(
+        mutant
+    )
+
+
+def files_that_name(mutant: Mutant) -> list[str]:
+    """For what only other processes execute: files of tests that name the module."""
+    word = re.compile(rf"\b{Path(mutant.file).stem}\b")
+    files = [path.relative_to(ROOT) for path in sorted((ROOT / "tests").rglob("test_*.py"))]
+    return [str(path) for path in files if word.search((ROOT / path).read_text(encoding="utf-8"))][:5]
+
+
+# --- what becomes of a mutant -------------------------------------------------------------------------------
+
+
+def judged(mutant: Mutant, tree: Path, tests: Sequence[str], seconds: float) -> str:
+    """Run tests on a mutant: "killed", "hangs", "survives", or why nothing can be said."""
+    if not tests:
+        return "survives: no test executes it"
+    path = tree / mutant.file
+    source = path.read_text(encoding="utf-8")
+    path.write_text(mutant.applied(source), encoding="utf-8")
+    line = [sys.executable, "-m", "pytest", "-x", "-q", "-n0", "-p", "no:cacheprovider", "--tb=no", *tests]
+    line = ["bash", "-c", 'ulimit -v 25000000; exec "$@"', "_", *line]  # kB
+    with (tree / "said.txt").open("w+", encoding="utf-8") as said:
+        process = subprocess.Popen(
+            line, cwd=tree, env=environment(tree), start_new_session=True, stdout=said, stderr=said
+        )
+        try:
+            code = process.wait(seconds)
+        except subprocess.TimeoutExpired:
+            return "hangs"
+        finally:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+            path.write_text(source, encoding="utf-8")
+        said.seek(0)
+        if code == 5 or "no match in any of" in said.read():  # such a test is no longer there
+            return "unknown: the map is old, --remap"
+    return "killed" if code else "survives"
+
+
+def copied(into: Path) -> Path:
+    """The files of the working tree that git knows, compiled so that a changed file is compiled anew."""
+    named = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True)
+    for name in filter(None, named.stdout.split("\0")):
+        if (ROOT / name).is_file():
+            (into / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(ROOT / name, into / name)
+    mode = py_compile.PycInvalidationMode.CHECKED_HASH
+    compileall.compile_dir(into / "staf_torch", quiet=2, invalidation_mode=mode)
+    return into
+
+
+def main() -> None:
+    """Draw mutants, try them and print those that survive."""
     options = _options()
-    begun = time.monotonic()
-    until = begun + 60 * options.minutes
-    compiled = CACHE.parent / "staf_torch"
+    files = sorted(path for path in (ROOT / "staf_torch").rglob("*.py") if "plugins" not in path.parts)
+    names = [str(path.relative_to(ROOT)) for path in files]
+    chosen = [name for name in names if not options.room or name.split("/")[1] in options.room]
+    every = [each for name in chosen for each in mutants_of(name, (ROOT / name).read_text(encoding="utf-8"))]
+    sample = random.Random(options.seed).sample(every, min(options.sample, len(every)))
+    begun, found = time.monotonic(), dict[Mutant, str]()
     with tempfile.TemporaryDirectory(prefix="staf-mutation-") as scratch:
-        tree = Path(scratch) / "tree"
-        _export(_git("rev-parse", options.commit).strip(), tree)
-        _prepare(tree)
-        found = list(_all_mutants(tree, options.package, options.file))
-        if options.few:
-            found = _seldom_executed(found, known(CACHE / "map", tree), options.few)
-        drawn = random.Random(options.seed).sample(found, min(options.sample, len(found)))
-        notes = Notes(options.into, found, drawn)
-        left = notes.left(again=options.again, without=options.without)
-        near = tuple({place for _, each in left for place in places(each.file)})
-        _measure_the_new(tree, compiled, options.jobs, begun + 60 * options.mapping, near)
-        print(f"{len(found)} mutants, {len(notes.sample)} of them drawn, {len(left)} to try", flush=True)
-        arguments = tree, compiled, known(CACHE / "map", tree), options.seconds, until
-        with multiprocessing.get_context("fork").Pool(options.jobs, begin_judging, arguments) as pool:
-            tried = []
-            for (at, _), verdict in zip(left, pool.imap(judge, [each for _, each in left]), strict=True):
-                if verdict is not None:
-                    _tell(verdict)
-                    notes.add(at, verdict)
-                    tried.append((at, verdict))
-            liars = pool.apply(fail_anyway, [sorted({each.by for _, each in tried if "::" in each.by})])
-    for at, verdict in tried:
-        if verdict.by in liars:
-            print(f"no witness, fails with the right code: {verdict.by}")
-            notes.add(at, verdict._replace(said="survived"))
-    verdicts = notes.verdicts()
-    print(f"{time.monotonic() - begun:.0f} s, {sum(os.times()[:4]):.0f} of the processor")
-    print(f"tried, in its order: {len(verdicts)} of {len(notes.sample)}")
-    return int(_report(verdicts) < options.least)
+        trees: queue.Queue[Path] = queue.Queue()
+        for job in range(options.jobs):
+            trees.put(copied(Path(scratch, str(job))))
+        if options.remap or not SECONDS.exists():
+            measure(Path(scratch, "0"), options.jobs, options.tests)
+        taken = json.loads(SECONDS.read_text(encoding="utf-8"))
+        data = coverage.CoverageData(str(MEASURED))
+        data.read()
+        tests = {each: tests_of(each, data, taken, SOONEST * options.seconds) for each in sample}
+
+        def tried(mutant: Mutant) -> None:
+            tree = trees.get()
+            try:
+                found[mutant] = judged(mutant, tree, tests[mutant], options.seconds)
+            finally:
+                trees.put(tree)
+            print(f"[{len(found)}/{len(sample)}] {mutant}: {found[mutant]}", flush=True)
+
+        with ThreadPoolExecutor(options.jobs) as pool:
+            list(pool.map(tried, sample))
+    alive = [mutant for mutant in sample if found[mutant].startswith("survives")]
+    seconds = time.monotonic() - begun
+    print(f"\n{len(alive)} of {len(sample)} survive, of {len(every)} mutants, {seconds:.0f} s:")
+    print(*sorted(map(str, alive)), sep="\n")
 
 
 def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--sample", type=int, default=100)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--package", nargs="*", default=[], help="to draw from; all of staf_torch by default")
-    parser.add_argument("--file", nargs="*", default=[], help="to draw from, staf_torch/...; all by default")
-    parser.add_argument(
-        "--few", type=int, default=0, help="draw from lines that at most so many tests execute"
-    )
-    parser.add_argument("--into", type=Path, help="file of the sample and its verdicts, where a run goes on")
-    parser.add_argument("--again", action="store_true", help="try what survived once more")
-    parser.add_argument("--without", nargs="*", default=[], help="packages that are left for another run")
-    parser.add_argument("--commit", default="HEAD")
-    parser.add_argument("--jobs", type=int, default=1)
-    parser.add_argument("--seconds", type=float, default=45, help="of tests that a mutant is given")
-    parser.add_argument("--least", type=float, default=95, help="score in percent that is asked for")
-    parser.add_argument("--minutes", type=float, default=600, help="after which no mutant is begun")
-    parser.add_argument("--mapping", type=float, default=600, help="minutes of these for the map")
+    parser.add_argument("--sample", type=int, default=100, help="mutants that are drawn")
+    for name, usual in (("--seed", 1), ("--jobs", 2)):
+        parser.add_argument(name, type=int, default=usual)
+    parser.add_argument("--seconds", type=float, default=60.0, help="for a mutant")
+    parser.add_argument("--room", nargs="*", help="of the package; all by default")
+    parser.add_argument("--remap", action="store_true", help="measure again which test executes what")
+    parser.add_argument("--tests", nargs="*", default=["tests"], help="that are measured; all by default")
     return parser.parse_args()
 
 
-def _git(*words: str) -> str:
-    return subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True, check=True).stdout
-
-
-def _export(commit: str, tree: Path) -> None:
-    tree.mkdir()
-    archive = subprocess.Popen(["git", "archive", commit], cwd=ROOT, stdout=subprocess.PIPE)
-    subprocess.run(["tar", "-x", "-C", str(tree)], stdin=archive.stdout, check=True)
-    if archive.wait() != 0:
-        raise SystemExit(f"git archive {commit} failed")
-
-
-def _all_mutants(tree: Path, packages: Iterable[str], files: Iterable[str]) -> Iterator[Mutant]:
-    for path in sorted((tree / "staf_torch").rglob("*.py")):
-        name = str(path.relative_to(tree))
-        if (packages and room_of(name) not in packages) or (files and name not in files):
-            continue
-        yield from mutants_of(name, path.read_text(encoding="utf-8"))
-
-
-def _seldom_executed(mutants: Iterable[Mutant], measured: Map, most: int) -> list[Mutant]:
-    """Those in lines that few tests execute, as far as the map goes: what survives is mostly there."""
-    few = []
-    for mutant in mutants:
-        lines = measured.lines.get(mutant.file, {})
-        tests = set[str]().union(*(lines.get(n, set()) for n in range(mutant.line, mutant.last_line + 1)))
-        if 0 < len(tests) <= most:
-            few.append(mutant)
-    return few
-
-
-def _measure_the_new(tree: Path, compiled: Path, jobs: int, until: float, near: tuple[str, ...]) -> None:
-    """Measure which lines are executed by the files of tests that changed since the map was made.
-
-    Those of the folders in which the mutants are, ``near``, come first: there may be no time for all.
-    """
-    store = CACHE / "map"
-    store.mkdir(parents=True, exist_ok=True)
-    new = [each for each in test_files(tree) if not kept_at(store, tree, each).exists()]
-    new.sort(key=lambda name: not name.startswith(near))
-    if not new or time.monotonic() >= until:
-        return
-    print(f"measuring which lines {len(new)} files of tests execute", flush=True)
-    with multiprocessing.get_context("fork").Pool(jobs, begin, (tree, compiled)) as pool:
-        for name, found in pool.imap_unordered(measure, new):
-            if found is not None:
-                kept_at(store, tree, name).write_text(json.dumps(found))
-                print(f"{sum(found['seconds'].values()):6.1f} s {len(found['seconds']):4} {name}", flush=True)
-            if time.monotonic() > until:
-                pool.terminate()
-                print("no time to measure the others: whole files of them run, of the mutant's own folder")
-                break
-
-
-def _prepare(tree: Path) -> None:
-    """Compile by content: a file that changes within a second is seen to change. Import what is slow."""
-    mode = py_compile.PycInvalidationMode.CHECKED_HASH
-    for folder in ("staf_torch", "tests"):
-        compileall.compile_dir(tree / folder, quiet=1, invalidation_mode=mode)
-    for name in PRELOADED:
-        __import__(name)
-
-
-# What is said of it
-
-
-def _tell(verdict: Verdict) -> None:
-    by = f" ({verdict.by})" if verdict.by else ""
-    where = f"{verdict.mutant.file}:{verdict.mutant.line}"
-    took = f"[{verdict.tests} tests, {verdict.seconds:.0f} s]"
-    print(
-        f"{verdict.said:9} {where}: {verdict.mutant.was!r} -> {verdict.mutant.now!r}  {took}{by}", flush=True
-    )
-
-
-def _report(verdicts: list[Verdict]) -> float:
-    """Print a row a room; the score of all in percent, without the accepted ones."""
-    rooms: dict[str, Counter[str]] = defaultdict(Counter)
-    for verdict in verdicts:
-        rooms[verdict.mutant.room][verdict.said] += 1
-        rooms["all"][verdict.said] += 1
-    kinds = ("killed", "survived", "too dear", "unreached", "accepted")
-    print(f"\n{'room':16} " + " ".join(f"{kind:>9}" for kind in kinds) + "  score")
-    for room, count in sorted(rooms.items(), key=lambda item: (item[0] == "all", item[0])):
-        counted = count.total() - count["accepted"]
-        score = f"{100 * count['killed'] / counted:.0f} %" if counted else "-"
-        print(f"{room:16} " + " ".join(f"{count[kind]:9}" for kind in kinds) + f"  {score:>5}")
-    return 100 * rooms["all"]["killed"] / max(rooms["all"].total() - rooms["all"]["accepted"], 1)
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -50,8 +50,6 @@ NOT_YET = {
     "sweeps",
     "systems",
     "tables",
-    "test_default_dtype.py",
-    "test_readme.py",
     "test_sanitized.py",
     "theory",
     "trust",
