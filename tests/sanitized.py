@@ -71,10 +71,11 @@ def run(
         "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]),
         "XDG_CACHE_HOME": str(cache),
         "CXX": compiler,
+        "CXXFLAGS": " ".join((*FLAGS, level, *(("-shared-libasan",) if "clang" in compiler else ()))),
         "OMP_NUM_THREADS": "1",
     }
     line = [sys.executable, __file__, "--inside", "--calls", str(calls), "--seed", str(seed)]
-    line += ["--kinds", *kinds, f"--level={level}"]
+    line += ["--kinds", *kinds]
     ended = subprocess.run(line, env=environment, capture_output=True, text=True, check=False)
     if "none bad" not in ended.stdout:
         return f"exit {ended.returncode}: {ended.stdout}{ended.stderr[-5000:]}"
@@ -83,19 +84,15 @@ def run(
     return ended.stdout.strip()
 
 
-def inside(calls: int, seed: int, chosen: Sequence[str], level: str) -> None:
+def inside(calls: int, seed: int, chosen: Sequence[str]) -> None:
     """Call native code so often, in a process that has the sanitizers loaded."""
     import torch
 
     from staf_torch import GaussianKernel, StaFBasis, StateFollowingCenters, chase, lanes, optim, rings
-    from staf_torch.lanes import build, compiler
     from staf_torch.online import StaFRegressor
     from staf_torch.online.bank import Bank
     from staf_torch.online.bank_rules import RECENT, BankShape, Rules
 
-    more = (*FLAGS, level, *(("-shared-libasan",) if "clang" in os.environ["CXX"] else ()))
-    build._FLAGS += more
-    compiler._FLAGS += more
     chance = random.Random(seed)
     torch.manual_seed(seed)
 
@@ -177,14 +174,12 @@ def inside(calls: int, seed: int, chosen: Sequence[str], level: str) -> None:
         """Some samples for some streams, of which some go on; compiled code against the definition."""
         streams, steps = chance.choice((0, 1, 1, 2, 3)), chance.choice((0, 1, 2, 12, 70))
         shape = BankShape(dim=2, outputs=1, capacity=RECENT, neighbours=3)
-        # A Gram matrix of k + 1 points has at most this condition, by which rounding may grow.
-        rounding = (
-            (shape.neighbours + 1) / min(Rules._field_defaults["noise"]) * torch.finfo(torch.float64).eps
-        )
         bank, plain = Bank(shape, streams, chance.random() < 0.5), None
+        # A Gram matrix of k + 1 points has at most this condition, by which rounding may grow.
+        condition = (shape.neighbours + 1) / min(Rules.of(shape.dim, bank.scaling, None).noise)
+        rounding = condition * torch.finfo(torch.float64).eps
         if chance.random() < 0.1:
-            plain = Bank(shape, streams, bank.scaling)
-            plain._run = None
+            plain = Bank(shape, streams, bank.scaling, compile=False)
         for at in range(steps):
             x = torch.rand(bank.count, 2, dtype=torch.float64)
             x = x * chance.choice([1e-300, 1.0, 1e150]) if plain is None else x  # there rounding decides
@@ -237,7 +232,7 @@ def main() -> int:
     parser.add_argument("--inside", action="store_true", help=argparse.SUPPRESS)
     chosen = parser.parse_args()
     if chosen.inside:
-        inside(chosen.calls, chosen.seed, chosen.kinds, chosen.level)
+        inside(chosen.calls, chosen.seed, chosen.kinds)
         return 0
     if why := missing(chosen.compiler):
         print(why)

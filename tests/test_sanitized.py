@@ -14,7 +14,7 @@ from staf_torch.lanes import build
 @pytest.mark.skipif(sanitized.missing() is not None, reason=sanitized.missing() or "")
 def test_no_shape_or_layout_makes_native_code_read_outside() -> None:
     kinds = ["programs", "banks"]  # a bank runs what a filter does
-    builds = build._cache() / "sanitized"  # kept, by a hash of their sources: they take seven seconds
+    builds = build.cache() / "sanitized"  # kept, by a hash of their sources: they take seven seconds
     said = sanitized.run(6, 1, builds, kinds=kinds, level="-O0")
     assert said.startswith("6 calls of")
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib.metadata
 import os
 import platform
-import shutil
 import sys
 import tempfile
 import time
@@ -19,7 +18,7 @@ from ..approximation.basis import StaFBasis
 from ..centers import StateFollowingCenters, rings
 from ..engine import chase
 from ..kernels import ExponentialKernel
-from ..lanes.build import _COMPILERS, _cache
+from ..lanes.build import cache, find_compiler
 from ..optim import SteepestDescent
 from ..results.build import source
 from ..systems import Oscillator, simulate
@@ -49,14 +48,13 @@ def _findings() -> Iterator[tuple[str, str, bool]]:
     yield "staf_torch", f"{__version__} in {Path(__file__).resolve().parent.parent}", True
     yield "python", f"{platform.python_version()}, {platform.platform()}", True
     yield "packages", ", ".join(f"{name} {_installed(name)}" for name in _PACKAGES), True
-    compiler = next(filter(None, map(shutil.which, (os.environ.get("CXX", ""), *_COMPILERS))), None)
-    yield "compiler", compiler or "none: everything runs in plain torch, slower", True
+    yield "compiler", find_compiler() or "none: everything runs in plain torch, slower", True
     cores = os.cpu_count()
     set_by = os.environ.get("OMP_NUM_THREADS", "not set")
     yield "threads", f"{torch.get_num_threads()} of torch, {cores} cores, OMP_NUM_THREADS {set_by}", True
     yield "gpu", torch.cuda.get_device_name(0) if torch.cuda.is_available() else "none", True
     for name, place in (
-        ("cache", _cache()),
+        ("cache", cache()),
         ("runs", Path("runs")),
         ("scratch", Path(tempfile.gettempdir())),
     ):

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from . import compiler, trace_cache
+from . import build, trace_cache
 from .alone import doubt, undrawn
 from .combinators import Tree
 from .content import reads_users_code, signature, skeleton
@@ -275,7 +275,7 @@ class Program:
                 raise NotLoweredError(f"the program is {lines} lines long, which take a compiler minutes")
             if not self._alone(given):  # before a compiler is asked for what would not be used
                 return None
-            call = compiler.function(made.text.source)
+            call = build.function(made.text.source)
         except (NotLoweredError, OSError) as error:
             _say(self.name, str(error), "no build" if isinstance(error, OSError) else None)
             return None

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from .build import _cache, used
+from .build import cache, used
 from .captured import Recipe
 from .captured import tensors as tensors_of
 from .emission import Text
@@ -63,7 +63,7 @@ def place(*described: object) -> Path:
     """
     around = _package(), torch.__version__, platform.python_version(), str(torch.get_default_dtype())
     digest = hashlib.sha256(repr((*around, *described)).encode()).hexdigest()
-    return _cache() / f"trace-{digest[:24]}"
+    return cache() / f"trace-{digest[:24]}"
 
 
 def load(path: Path, tensors: Sequence[Tensor]) -> Trace | None:
