@@ -42,7 +42,16 @@ _ALLOWED = frozenset(
 )
 _NAMED = (torch.dtype, torch.memory_format, torch.layout)
 _NAMESPACES = ("aten", "prims")
-_DAMAGED = (OSError, pickle.UnpicklingError, AttributeError, EOFError, IndexError, ValueError, zlib.error)
+_DAMAGED = (
+    OSError,
+    pickle.UnpicklingError,
+    AttributeError,
+    EOFError,
+    IndexError,
+    ValueError,
+    TypeError,
+    zlib.error,
+)
 
 
 class Trace(NamedTuple):

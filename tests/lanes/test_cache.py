@@ -1,195 +1,270 @@
-"""What the user's cache must not do: bring back code that was replaced, run what a file says, grow."""
+"""The user's cache of libraries: nothing is built twice, nothing damaged is loaded; without it torch serves."""
 
 from __future__ import annotations
 
-import functools
-import hashlib
-import importlib
-import io
+import ctypes
+import itertools
+import multiprocessing
 import os
-import pickle
-import pickletools
 import shutil
-import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
-from unittest import mock
 
 import pytest
 import torch
-from torch import Tensor, nn
-from variants import KERNELS, over
+from torch import Tensor
 
-from staf_torch import StaFBasis, StateFollowingCenters, chase, kernels, optim, rings, targets
-from staf_torch.lanes import build, compiler, patches, trace_cache
-from staf_torch.lanes.captured import Recipe
-from staf_torch.lanes.kept import Kept
-from staf_torch.lanes.program import Program
+from staf_torch import lanes
+from staf_torch.lanes import build
 
+pytestmark = [
+    pytest.mark.needs_compiler,
+    pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork"),
+    pytest.mark.filterwarnings("ignore::DeprecationWarning"),  # of a fork beside threads
+]
+SIZES = itertools.count(2)
 X = torch.linspace(-1, 1, 10, dtype=torch.float64).view(5, 2)
 
 
-def of(kept: Kept, kernel: nn.Module) -> Program:
-    def step(x: Tensor, now: Any, row: Any) -> tuple[Tensor, Tensor]:
-        x = 0.5 * x + 0.1 * kernel(x.unsqueeze(-2), torch.ones(1, 2).double()).squeeze(-2)
+def new_program(name: str = "program") -> lanes.Program:
+    """A program whose text no other program of this process has."""
+    count = next(SIZES)
+
+    def step(x: Tensor, now: object, row: object) -> tuple[Tensor, Tensor]:
+        for _ in range(count):
+            x = (x * x).sin()
         return x, x.sum(-1)
 
-    found = kept.of(step, kernel, owners=(kernel,))
-    assert found is not None
-    return found
+    return lanes.Program(step, name=name)
+
+
+def right(program: lanes.Program) -> None:
+    """Fail where a program is not compiled, or computes anything but its definition."""
+    assert program.compiles(X, steps=2)
+    torch.testing.assert_close(program(X, steps=2), program.definition(X, steps=2))
+
+
+def in_children(*functions: Callable[[], Any]) -> None:
+    """Run functions in processes of their own, side by side: what one of them loads no other has."""
+    context = multiprocessing.get_context("fork")
+    processes = [context.Process(target=function) for function in functions]
+    for process in processes:
+        process.start()
+    for process in processes:
+        process.join(120)
+        assert process.exitcode == 0
 
 
 @pytest.fixture
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """An empty cache for traces; what is compiled stays where it is."""
-    monkeypatch.setattr("staf_torch.lanes.trace_cache._cache", lambda: tmp_path)
-    return tmp_path
+    """An empty cache in a folder that is not there yet; libraries are built in half the time."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "new"))
+    monkeypatch.setenv("CXXFLAGS", "-O0")
+    return tmp_path / "new" / "staf_torch"
 
 
-def twice(self: nn.Module, x1: Tensor, x2: Tensor) -> Tensor:
-    return 2 * (x1 @ x2.mT)
+def script(path: Path, *lines: str) -> Path:
+    path.write_text("\n".join(("#!/bin/sh", *lines)) + "\n")
+    path.chmod(0o755)
+    return path
 
 
-@pytest.mark.parametrize("same_process", [True, False])
-def test_a_method_that_was_replaced_meets_no_old_trace(
-    same_process: bool, cache: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.fixture
+def calls(cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[], Sequence[str]]:
+    """What a compiler was asked to build so far: it notes its words and hands them on."""
+    log, compiler = tmp_path / "log", build.find_compiler()
+    noting = script(tmp_path / "noting", f'echo "$@" >> {log}', f'exec {compiler} "$@"')
+    monkeypatch.setenv("CXX", str(noting))
+    return lambda: [line for line in log.read_text().splitlines() if " -o " in line] if log.exists() else []
+
+
+def test_a_program_is_built_once_for_all_processes(cache: Path, calls: Callable[[], Sequence[str]]) -> None:
+    program = new_program()
+    in_children(lambda: right(program))
+    in_children(lambda: right(program), lambda: right(program))
+    right(program)
+    right(lanes.Program(program.step, name="another of the same text"))
+    (command,) = calls()
+    assert {"-march=native", "-ffp-contract=off"} <= {*command.split()}  # rounding is as it is written down
+    assert [path.suffix for path in cache.iterdir()] == [".so"]  # and nothing is left beside it
+
+
+def test_processes_that_build_the_same_at_once_do_not_disturb_each_other(cache: Path) -> None:
+    program = new_program()
+    in_children(*[lambda: right(program)] * 2)
+    assert [path.suffix for path in cache.iterdir()] == [".so"]
+
+
+def test_other_options_and_another_compiler_are_another_library(
+    cache: Path, calls: Callable[[], Sequence[str]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    kernel, kept = kernels.ExponentialKernel(), Kept("a test")
-    for _ in range(3):  # from the second on a watch says whether something has changed
-        before = of(kept, kernel)(X, steps=1)[1]
-    assert len(list(cache.iterdir())) == 1
-    assert kept.unchanged(kernel) is not None
-    monkeypatch.setattr(kernels.ExponentialKernel, "forward", twice)
-    assert not patches.unpatched()
-    assert kept.unchanged(kernel) is None
-    program = of(kept if same_process else Kept("a test"), kernel)
-    found = program(X, steps=1)[1]
-    torch.testing.assert_close(found, program.definition(X, steps=1)[1])
-    assert not torch.allclose(found, before)
-    assert len(list(cache.iterdir())) == 1  # nor is it written for others
+    program = new_program()
+    in_children(lambda: right(program))
+    monkeypatch.setenv("CXXFLAGS", "-O0 -DNOTHING=1")
+    in_children(lambda: right(program))
+    assert calls()[1].index("-O0 -DNOTHING=1") > calls()[1].index("-O2")  # the last one holds
+    newer = script(
+        tmp_path / "newer", f'[ "$1" = --version ] && echo newer && exit; exec {os.environ["CXX"]} "$@"'
+    )
+    monkeypatch.setenv("CXX", str(newer))
+    in_children(lambda: right(program))
+    assert len(calls()) == len(list(cache.glob("lanes-*.so"))) == 3
 
 
-class Called:
-    def __call__(self, *given: Any) -> Any:
-        return given
+DAMAGES: dict[str, Callable[[bytes], bytes]] = {
+    "half": lambda content: content[: len(content) // 2],
+    "empty": lambda content: b"",
+    "a byte changed": lambda content: content[:100] + bytes([content[100] ^ 1]) + content[101:],
+    "without its digest": lambda content: content[:-32],
+}
 
 
-@pytest.mark.parametrize(
-    "put",
-    [
-        lambda patch: patch.setattr("staf_torch.lanes.pivoted_cholesky.pivoted_cholesky", twice),
-        lambda patch: patch.setattr(kernels.ExponentialKernel, "forward", staticmethod(twice)),
-        lambda patch: patch.setattr(kernels.ExponentialKernel, "state_free", property(twice)),
-        lambda patch: patch.setattr(kernels.ExponentialKernel, "forward", kernels.GaussianKernel.forward),
-        lambda patch: patch.setattr(kernels.ExponentialKernel, "forward", functools.partial(twice, None)),
-        lambda patch: patch.setattr("staf_torch.lanes.pivoted_cholesky.pivoted_cholesky", mock.MagicMock()),
-        lambda patch: patch.setattr("staf_torch.lanes.pivoted_cholesky.pivoted_cholesky", Called()),
-    ],
-)
-def test_foreign_functions_are_seen_and_the_librarys_own_are_not(
-    put: Callable[[pytest.MonkeyPatch], None], monkeypatch: pytest.MonkeyPatch
+def test_a_damaged_library_is_built_again_and_never_loaded(
+    cache: Path, calls: Callable[[], Sequence[str]]
 ) -> None:
-    assert patches.unpatched()
-    put(monkeypatch)
-    assert not patches.unpatched()
-    monkeypatch.undo()
-    assert patches.unpatched()
+    program = new_program()
+    in_children(lambda: right(program))
+    (path,) = cache.iterdir()
+    whole = path.read_bytes()
+    for count, damage in enumerate(DAMAGES.values(), start=2):
+        path.write_bytes(damage(whole))
+        in_children(lambda: right(program))
+        assert len(calls()) == count
+        assert len(path.read_bytes()) == len(whole)
 
 
-def test_no_module_of_the_package_looks_patched() -> None:
-    for name in ("adp", "envs", "experiments", "metrics", "online", "theory"):
-        importlib.import_module(f"staf_torch.{name}")
-    patched = [] if patches.unpatched() else [name for name, (_, own) in patches._seen.items() if not own]
-    assert not patched
+FAULTS: dict[str, tuple[dict[str, str], str]] = {
+    "no compiler": ({"PATH": "/nonexistent", "CXX": ""}, "none of g++, c++, clang++ is on the path"),
+    "a compiler that fails": ({"CXX": "/bin/false"}, "failed"),
+    "a compiler that refuses the text": ({"CXXFLAGS": "-include no_such_file.hpp"}, "no_such_file.hpp"),
+    "a compiler that hangs": ({"STAF_COMPILE_SECONDS": "0.2"}, "took more than 0.2 s"),
+}
 
 
-class Harm:
-    def __reduce__(self) -> Any:
-        return os.system, ("exit 0",)
-
-
-@pytest.mark.parametrize("content", [Harm(), Path("x"), os.getcwd])
-def test_a_file_that_names_other_code_is_no_trace(content: object, cache: Path) -> None:
-    path = cache / "trace-0"
-    packed = zlib.compress(pickle.dumps((content,)))
-    path.write_bytes(packed + hashlib.sha256(packed).digest())
-    with pytest.raises(pickle.UnpicklingError, match="does not belong into a trace"):
-        trace_cache._Reader(io.BytesIO(pickle.dumps((content,))), ()).load()
-    assert trace_cache.load(path, ()) is None
-
-
-def test_a_trace_names_no_module_for_what_torch_has_by_name() -> None:
-    """pickle would name the first module that has imported torch: a user's, which no other process knows."""
-    named, file = (torch.contiguous_format, torch.float32, torch.strided), io.BytesIO()
-    trace_cache._Writer(file, {}, Recipe(torch.empty(0), [], [], [], [])).dump(named)
-    codes = {code.name for code, _, _ in pickletools.genops(file.getvalue())}
-    assert not codes & {"GLOBAL", "STACK_GLOBAL", "INST"}
-    assert trace_cache._Reader(io.BytesIO(file.getvalue()), ()).load() == named
-
-
-@pytest.mark.compiled
-@over(KERNELS)
-def test_what_was_traced_of_a_chase_is_there_for_the_next_process(
-    name: str, cache: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("fault", FAULTS)
+def test_where_nothing_can_be_built_plain_torch_serves_and_one_line_says_why(
+    fault: str,
+    cache: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
-    kernel, kept = KERNELS[name].make(), []
-    write = trace_cache.save
+    settings, reason = FAULTS[fault]
+    hanging = script(tmp_path / "hanging", '[ "$1" = --version ] && exit 0', "exec sleep 60")
+    if "hangs" in fault:
+        monkeypatch.setenv("CXX", str(hanging))
+    for name, value in settings.items():
+        monkeypatch.setenv(name, value)
+    program = new_program(f"a program with {fault}")
+    for _ in range(2):
+        assert not program.compiles(X, steps=2)
+        assert torch.equal(program(X, steps=2)[0], program.definition(X, steps=2)[0])
+    (line,) = caplog.messages
+    assert line.startswith(f"a program with {fault} runs in plain torch, slower: ")
+    assert reason in line
+    assert "\n" not in line
+    assert not list(cache.glob("*.so"))
 
-    def save(path: Path, trace: trace_cache.Trace, tensors: Any) -> None:
-        write(path, trace, tensors)
-        kept.append(trace_cache.load(path, tensors))
 
-    monkeypatch.setattr(trace_cache, "save", save)
-    monkeypatch.setattr(compiler, "function", mock.Mock(side_effect=OSError("not asked")))
-    basis = StaFBasis(kernel, StateFollowingCenters(rings(3), 0.3))
-    x = 0.01 * torch.arange(32).double().view(1, 16, 2)
-    chase(x, basis, targets.Quadratic(2.0), optim.SteepestDescent(), inner_steps=2, certificate=True)
-    ours = type(kernel).__module__.startswith("staf_torch")
-    assert [trace is not None for trace in kept] == [True] * ours  # a user's own is traced in every process
-
-
-def test_the_cache_forgets_what_nobody_has_used_and_nothing_of_today(
+def test_a_home_that_cannot_be_written_is_replaced_by_a_folder_of_the_process(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    day, now = build._DAY, 1e9
-    ages = {"lanes-new.so": 0.5, "trace-old": 61, "lanes-old.so": 70, "lanes-mid.so": 20, "trace-mid": 10}
-    ages |= {"tmpabc": 2, "tmpnow": 0.01, "notes.txt": 400}
-    for name, days in ages.items():
-        (tmp_path / name).write_bytes(b"0" * 100)
-        os.utime(tmp_path / name, (now - days * day,) * 2)
-    (tmp_path / "tmpdir").mkdir()
-    os.utime(tmp_path / "tmpdir", (now - 3 * day,) * 2)
+    (tmp_path / "file").write_text("no folder")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    folder = build.cache()
+    assert folder == build.cache()  # what one program leaves there another one finds
+    assert not folder.is_relative_to(tmp_path)
+    right(new_program())
+    assert len(list(folder.glob("lanes-*.so"))) == 1
+    shutil.rmtree(folder)  # somebody tidies up
+    assert build.cache().is_dir()
 
-    def left() -> set[str]:
-        build.prune(tmp_path, now=now)
+
+def test_the_cache_is_where_the_user_has_his_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert build.cache() == tmp_path / ".cache" / "staf_torch"
+
+
+def test_checkouts_of_one_version_share_a_library_and_others_do_not(
+    calls: Callable[[], Sequence[str]], tmp_path: Path
+) -> None:
+    found = []
+    for place, number in (("one", 7), ("two", 7), ("three", 9)):
+        (tmp_path / place).mkdir()
+        (tmp_path / place / "_seven.cpp").write_text(
+            '#include "_number.hpp"\nextern "C" int staf_seven() { return number + N; }\n'
+        )
+        (tmp_path / place / "_number.hpp").write_text(f"constexpr int number = {number};")
+        function: Any = build.compiled(tmp_path / place / "_seven.cpp", "N=3")
+        function.restype = ctypes.c_int
+        found.append(function())
+    assert found == [10, 10, 12]
+    assert len(calls()) == 2
+    build.compiled(tmp_path / "one" / "_seven.cpp", "N=4")
+    assert len(calls()) == 3
+
+
+def test_a_file_that_cannot_be_compiled_is_none_and_said_once(
+    cache: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    for definition in ("N=1", "N=2"):
+        (tmp_path / "_unwritten.cpp").write_text("this is no C++")
+        assert build.compiled(tmp_path / "_unwritten.cpp", definition) is None
+    (line,) = caplog.messages
+    assert "unwritten" in line
+    assert "plain torch" in line
+
+
+@pytest.mark.parametrize("name", ["g++", "clang++"])
+def test_a_long_program_is_built_by_every_compiler_and_a_slow_one_is_told(
+    name: str, cache: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Options that spare one compiler half of its time are errors to another."""
+    if shutil.which(name) is None:
+        pytest.skip(f"there is no {name} here")
+    monkeypatch.setenv("CXX", name)
+    text = lanes.Program(lambda x, *_: (x + 1, x)).text(torch.zeros(1), steps=1)
+    for lines, told in ((2000, False), (7000, True)):
+        build.function(text + f"// {name}\n" * lines)
+        assert ("is compiled, once: some 4 s" in caplog.text) is told
+    assert len(list(cache.glob("lanes-*.so"))) == 2
+
+
+def test_the_cache_forgets_what_nobody_has_used_and_nothing_of_today(tmp_path: Path) -> None:
+    day, now = 86_400, 1e9
+
+    def put(name: str, days: float, size: int = 100) -> None:
+        (tmp_path / name).write_bytes(b"0" * size)
+        os.utime(tmp_path / name, (now - days * day,) * 2)
+
+    def left(**options: Any) -> set[str]:
+        build.prune(tmp_path, now=now, **options)
         return {path.name for path in tmp_path.iterdir()}
 
+    ages = {"lanes-new.so": 0.5, "trace-old": 61, "lanes-old.so": 70, "lanes-mid.so": 20, "trace-mid": 10}
+    ages |= {"tmpabc": 2, "tmpnow": 0.01, "notes.txt": 400}  # left over, being written, of somebody else
+    for name, days in ages.items():
+        put(name, days)
+    (tmp_path / "tmpdir").mkdir()
+    os.utime(tmp_path / "tmpdir", (now - 3 * day,) * 2)
     kept = {"lanes-new.so", "lanes-mid.so", "trace-mid", "tmpnow", "notes.txt"}
     assert left() == kept
-    monkeypatch.setattr(build, "_MOST_BYTES", 300)
-    assert left() == kept - {"lanes-mid.so"}
-    monkeypatch.setattr(build, "_MOST_BYTES", 0)
-    assert left() == {"lanes-new.so", "tmpnow", "notes.txt"}
-    for name in ("lanes-a.so", "lanes-b.so"):  # another process takes the second one away at the same time
-        (tmp_path / name).touch()
-        os.utime(tmp_path / name, (now - 99 * day,) * 2)
-    unlink = Path.unlink
-
-    def both(path: Path, missing_ok: bool = False) -> None:
-        unlink(path, missing_ok)
-        unlink(tmp_path / "lanes-b.so", missing_ok=True)
-
-    monkeypatch.setattr(Path, "unlink", both)
-    (tmp_path / "tmpgone").mkdir()
-    os.utime(tmp_path / "tmpgone", (now - 3 * day,) * 2)
-    taken = shutil.rmtree
-
-    def twice(path: Path, ignore_errors: bool = False) -> None:
-        taken(path)  # by another process, and then by this one
-        taken(path, ignore_errors=ignore_errors)
-
-    monkeypatch.setattr(shutil, "rmtree", twice)
-    assert left() == {"lanes-new.so", "tmpnow", "notes.txt"}
+    assert left(largest=400) == kept
+    assert left(largest=399) == kept - {"lanes-mid.so"}  # the oldest, and no more than there need be
+    assert left(largest=0) == {"lanes-new.so", "tmpnow", "notes.txt"}
     build.used(tmp_path / "lanes-new.so")
     assert (tmp_path / "lanes-new.so").stat().st_mtime > now
+    build.used(tmp_path / "absent")  # nothing to note
+    build.prune(tmp_path)  # by the clock of the machine the others are old
+    assert {path.name for path in tmp_path.iterdir()} == {"lanes-new.so", "notes.txt"}
+
+
+def test_what_is_in_use_is_noted_so_that_it_stays(cache: Path) -> None:
+    program = new_program()
+    in_children(lambda: right(program))
+    (path,) = cache.iterdir()
+    os.utime(path, (1e9, 1e9))
+    right(program)
+    assert path.stat().st_mtime > 1e9 + 1

@@ -1,225 +1,354 @@
-"""Traces in a file: what is written of one, what is read back, and which content is refused."""
+"""Captured tensors are numbers of a table: steps that differ in them share a trace and a library, within a
+process and through the user's cache, from which nothing is run and nothing old comes back."""
 
 from __future__ import annotations
 
 import hashlib
-import io
+import importlib
+import multiprocessing
 import os
 import pickle
-import tempfile
 import zlib
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
+import numpy as np
 import pytest
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+from variants import KERNELS
 
-from staf_torch.lanes import trace_cache
-from staf_torch.lanes.emission import Text
-from staf_torch.lanes.given import Given
-from staf_torch.lanes.one_row import trace
-from staf_torch.lanes.trace_cache import Trace, load, place, save
+from staf_torch import StaFBasis, StateFollowingCenters, chase, kernels, lanes, optim, rings, targets
+from staf_torch.lanes import patches
+from staf_torch.lanes.kept import Kept
+from staf_torch.lanes.program import Program, Step
 
-A, B = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64), torch.tensor([5.0, 6.0, 7.0], dtype=torch.float64)
+pytestmark = pytest.mark.needs_compiler
 
-
-def traced(step: Callable[[Tensor], Any]) -> Trace:
-    """What is kept of a step, with an empty program in the place of its text."""
-    x = torch.linspace(0, 1, 6, dtype=torch.float64).view(2, 3)
-    found = trace(lambda carry, now, row: (carry, step(row)), Given.of(x[:, 0], (), x, 1))
-    text = Text("void f();\n", [0.5, 0.0], [(1, 0)])
-    return Trace(text, found.recipe, torch.float64, found.outputs, found.structure)
+X = torch.linspace(-1, 1, 10, dtype=torch.float64).view(5, 2)
+NUMBERS = (torch.tensor([0.3, -1.7, 0.9]), torch.tensor([1.0, 1.0, 0.0]), torch.tensor([-0.0, 0.5, 1 / 64]))
 
 
-def again(step: Callable[[Tensor], Any], old: list[Tensor], new: list[Tensor], path: Path) -> list[float]:
-    """The numbers of a step that another process reads with other tensors."""
-    save(path, traced(step), old)
-    found = load(path, new)
+@pytest.fixture(autouse=True)
+def _libraries_are_built_in_half_the_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CXXFLAGS", "-O0")
+
+
+@pytest.fixture
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty cache."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    return tmp_path / "staf_torch"
+
+
+def traces(cache: Path) -> list[Path]:
+    return list(cache.glob("trace-*"))
+
+
+# Numbers of a table.
+
+
+class Everything:
+    """All that a step may do with captured numbers: masks, indices, powers, matrices, memory of its own."""
+
+    def __init__(self, numbers: Tensor) -> None:
+        self.numbers, self.calls = numbers, 0
+
+    def __call__(self, x: Tensor, u: Tensor, row: Tensor) -> tuple[Tensor, tuple[Tensor, ...]]:
+        self.calls += 1
+        a = self.numbers.to(x)
+        matrix = torch.eye(3).to(x) + a[:, None] * a.exp()
+        factor = torch.linalg.cholesky_ex(matrix.mT @ matrix + torch.eye(3).to(x)).L
+        x = 0.5 * x + torch.linalg.solve_triangular(factor, x[:, a.argsort()].mT, upper=False).mT
+        x = torch.where(a > 0, x * a, x - a) + (a[0] ** 2) * u[:, None]
+        own = torch.zeros(3).to(x)
+        before = own + x  # the step's own memory until here
+        own[1] = a[2]
+        own.mul_(2)
+        rows = lanes.scan(
+            lambda c, r: (c * r[0] + a * r[1], ()), x, torch.tensor(((1.0, 0.3), (0.7, 2.0))).to(x), dim=0
+        )
+        several = a.view(3, 1)[:, 0] * x + a.flip(0) * x + a[1:2].expand(3) * x + a[::2].sum() * a.max()
+        return x, ((x @ a).sin() + x.abs().pow(a.abs()).sum(-1), before + own * x, rows[0], several)
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_other_numbers_are_the_same_text_and_the_right_result(dtype: torch.dtype) -> None:
+    x, u = torch.rand(5, 3, dtype=dtype), torch.rand(5, 7, dtype=dtype)
+    assert len({Program(Everything(a)).text(x, u) for a in NUMBERS}) == 1
+    first = Program(Everything(NUMBERS[0]))
+    assert first.compiles(x, u)
+    tolerance = 1e-12 if dtype == torch.float64 else 1e-4
+    for a in NUMBERS:
+        step = Everything(a)
+        for program in (Program(step), first.with_others(step, [(NUMBERS[0], a)])):
+            assert program.compiles(x, u)
+            torch.testing.assert_close(
+                program(x, u), program.definition(x, u), rtol=tolerance, atol=tolerance
+            )
+
+
+class Made:
+    """A step that counts how often it is called."""
+
+    def __init__(self, function: Callable[[Tensor], Tensor]) -> None:
+        self.function, self.calls = function, 0
+
+    def __call__(self, x: Tensor, now: Any, row: Any) -> tuple[Tensor, Tensor]:
+        self.calls += 1
+        return x + 0.1 * self.function(x), x
+
+
+def test_a_program_with_other_tensors_traces_nothing_unless_more_than_they_decide() -> None:
+    old, new, hidden = torch.tensor(2.0), torch.tensor(-2.0), torch.tensor(1.0)
+    functions: dict[str, Callable[[Tensor], Callable[[Tensor], Tensor]]] = {
+        "made of it": lambda a: lambda x: x * (2 * a + 1).exp(),
+        "a number that it reads": lambda a: lambda x: x * (a + 1) if bool(a > 0) else -x,
+        "a tensor that nobody named": lambda a: lambda x: x * a + hidden,
+    }
+    for name, function in functions.items():
+        first = Program(Made(function(old)))
+        first(X, steps=1)
+        step = Made(function(new))
+        again = first.with_others(step, [(old, new)])
+        if name == "a tensor that nobody named":
+            hidden = torch.tensor(3.0)
+        found = again(X, steps=1)[0]
+        assert (step.calls == 0) is (name == "made of it")
+        torch.testing.assert_close(found, again.definition(X, steps=1)[0], rtol=1e-14, atol=0)
+
+
+def test_memory_that_a_step_writes_to_is_not_written_twice() -> None:
+    def step_of(a: Tensor) -> Step:
+        def step(x: Tensor, now: Any, row: Any) -> tuple[Tensor, Any]:
+            first, second = 2 * a, 2 * a
+            second += 1  # what was equal before is told apart
+            return (x * first.sum()).sin() + (x * second.sum()).sin() + (x * (2 * a).sum()).sin(), ()
+
+        return step
+
+    first = Program(step_of(NUMBERS[0]))
+    first(X.float(), steps=1)
+    for program in (Program(step_of(NUMBERS[2])), first.with_others(step_of(NUMBERS[2]), [NUMBERS[::2]])):
+        for _ in range(2):
+            found, wanted = program(X.float(), steps=1)[0], program.definition(X.float(), steps=1)[0]
+            torch.testing.assert_close(found, wanted, rtol=1e-6, atol=1e-6)
+
+
+def test_arrays_of_numpy_are_numbers_too_and_what_the_code_states_is_text() -> None:
+    table = np.array([1.0, 0.5])
+    program = Program(lambda x, now, row: (x * torch.as_tensor(table), ()))
+    texts = {program.text(X, steps=1)}
+    table[0] = 5.0
+    assert {program.text(X, steps=1)} == texts
+    torch.testing.assert_close(program(X, steps=1)[0], X * torch.tensor([5.0, 0.5]))
+    other = Program(lambda x, now, row: (x[:, torch.tensor([1, 0])] * torch.tensor([1.0, 2.0]).to(x), ()))
+    assert torch.equal(other(X, steps=1)[0], X.flip(1) * torch.tensor([1.0, 2.0]))
+
+
+# Programs that are kept, and traces in the cache.
+
+
+def layer(seed: int) -> nn.Module:
+    torch.manual_seed(seed)
+    return nn.Sequential(nn.Linear(2, 3), nn.Tanh(), nn.Linear(3, 2)).double().requires_grad_(False)
+
+
+def of(kept: Kept, module: nn.Module, *settings: Any) -> tuple[Program, Made]:
+    step = Made(module)
+    found = kept.of(step, module, *settings)
     assert found is not None
-    numbers: list[float] = found.recipe.values.tolist()
-    return numbers
+    return found, step
 
 
-STEPS: dict[str, tuple[Callable[[Tensor], Any], Callable[[Tensor], Tensor]]] = {
-    "itself": (lambda x: x * A, lambda a: a),
-    "made of it": (lambda x: x * (2 * A + 1).exp(), lambda a: (2 * a + 1).exp()),
-    "of another dtype": (lambda x: x * A.to(torch.float32).double(), lambda a: a.float().double()),
-    "with a constant of the step": (
-        lambda x: x * torch.add(A, torch.tensor([1.0, 0.0, 4.0]).double(), alpha=2),
-        lambda a: a + torch.tensor([2.0, 0.0, 8.0]),
-    ),
-    "of two that were made": (
-        lambda x: x * (A * 2 + A.sin()) * (A * 2).cumsum(0),
-        lambda a: torch.cat((a * 2 + a.sin(), (2 * a).cumsum(0))),
-    ),
-    "of one part of what was made": (lambda x: x * A.aminmax()[1], lambda a: a.max().reshape(1)),
-    "at strides": (lambda x: x[:, :2] * A[::2], lambda a: a[::2]),
-    "of a given memory format": (
-        lambda x: x * A.clone(memory_format=torch.contiguous_format).exp(),
-        lambda a: a.exp(),
-    ),
+def right(program: Program, x: Tensor = X) -> Tensor:
+    assert program.compiles(x, steps=3)
+    found, expected = program(x, steps=3)[1], program.definition(x, steps=3)[1]
+    torch.testing.assert_close(found, expected, rtol=1e-6 if x.dtype == torch.float32 else 1e-13, atol=1e-13)
+    return found
+
+
+def served(kept: Kept, module: nn.Module, *settings: Any) -> tuple[Tensor, bool]:
+    """What the program of a module computes, and whether it had to be traced."""
+    program, step = of(kept, module, *settings)
+    assert program.compiles(X, steps=3)
+    traced = step.calls > 0
+    return right(program), traced
+
+
+def test_other_tensors_are_the_same_program_with_other_numbers(cache: Path) -> None:
+    kept = Kept("a test")
+    first, traced = served(kept, layer(0))
+    other, again = served(kept, layer(1))
+    assert (traced, again) == (True, False)
+    assert not torch.equal(other, first)
+    same = layer(2)
+    before = of(kept, same)[0]
+    assert of(kept, same)[0] is before
+    same[0].bias.add_(1.0)  # type: ignore[operator]
+    assert of(kept, same)[0] is not before
+
+
+def test_a_trace_comes_from_the_cache_to_the_bit_and_with_other_numbers(cache: Path) -> None:
+    first, traced = served(Kept("a test"), layer(0))
+    assert traced
+    (path,) = traces(cache)
+    os.utime(path, (1e9, 1e9))
+    again, traced = served(Kept("a test"), layer(0))  # as another process would
+    assert torch.equal(again, first)
+    other, traced_too = served(Kept("a test"), layer(1))
+    assert not torch.equal(other, first)
+    assert not traced
+    assert not traced_too
+    assert path.stat().st_mtime > 1e9 + 1  # in use
+    assert not [each for each in cache.iterdir() if each.name.startswith("tmp")]
+
+
+def test_no_number_of_a_tensor_is_in_a_trace(cache: Path) -> None:
+    served(Kept("a test"), layer(0))
+    (path,) = traces(cache)
+    content = path.read_bytes()
+    path.unlink()
+    served(Kept("a test"), layer(1))
+    assert path.read_bytes() == content
+
+
+class Harm:
+    def __init__(self, place: Path) -> None:
+        self.place = place
+
+    def __reduce__(self) -> Any:
+        return os.mkdir, (str(self.place),)
+
+
+def sealed(value: object) -> bytes:
+    packed = zlib.compress(pickle.dumps(value))
+    return packed + hashlib.sha256(packed).digest()
+
+
+DAMAGES: dict[str, Callable[[bytes, Path], bytes]] = {
+    "empty": lambda content, _: b"",
+    "cut": lambda content, _: content[:100],
+    "a byte changed": lambda content, _: content[:40] + bytes([content[40] ^ 1]) + content[41:],
+    "something else": lambda content, _: sealed((1, 2)),
+    "code": lambda content, place: sealed(Harm(place)),
+    "code inside": lambda content, place: sealed((Harm(place), 1, 2, 3, 4)),
+    "a class of this package": lambda content, _: sealed((Kept("a test"),)),
+    "a function of Python": lambda content, _: sealed((os.getcwd,)),
 }
 
 
-@pytest.mark.parametrize("name", STEPS)
-def test_another_process_finds_the_numbers_that_follow_from_its_own_tensors(
-    name: str, tmp_path: Path
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_trace_that_is_none_is_written_again_and_nothing_in_it_is_run(
+    damage: str, cache: Path, tmp_path: Path
 ) -> None:
-    step, wanted = STEPS[name]
-    assert again(step, [A], [A], tmp_path / "trace") == wanted(A).tolist()
-    assert again(step, [A], [B], tmp_path / "trace") == wanted(B).tolist()
-
-
-def test_tensors_are_told_apart_by_the_order_in_which_they_were_given(tmp_path: Path) -> None:
-    step, path = lambda x: x * (A - 2 * B), tmp_path / "trace"
-    assert again(step, [A, B], [A, B], path) == (A - 2 * B).tolist()
-    assert again(step, [B, A], [A, B], path) == (B - 2 * A).tolist()
-    assert again(step, [A, B, A], [A, B, A], path) == (A - 2 * B).tolist()
-
-
-def test_all_that_was_written_comes_back_and_no_number_of_a_tensor_is_in_the_file(tmp_path: Path) -> None:
-    one = traced(lambda x: x * (A + 1))
-    save(tmp_path / "one", one, [A])
-    found = load(tmp_path / "one", [A])
-    assert found is not None
-    assert found.text == one.text
-    assert (found.real, found.outputs, found.structure) == (one.real, one.outputs, one.structure)
-    assert [at.tolist() for _, at in found.recipe.reads] == [at.tolist() for _, at in one.recipe.reads]
-    other = traced(lambda x: x * (B + 1))
-    save(tmp_path / "other", other, [B])
-    assert (tmp_path / "one").read_bytes() == (tmp_path / "other").read_bytes()
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["one", "other"]  # no scratch is left
-
-
-def test_where_numbers_follow_from_more_nothing_is_written(tmp_path: Path) -> None:
-    save(tmp_path / "trace", traced(lambda x: x * (A + B)), [A])
-    assert not list(tmp_path.iterdir())
-    assert load(tmp_path / "trace", [A]) is None
-    save(tmp_path / "no folder" / "trace", traced(lambda x: x * A), [A])  # and nobody hears of it
-
-
-def test_a_trace_is_written_beside_its_place_and_noted_as_used(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "no folder"))
-    path = tmp_path / "trace"
-    save(path, traced(lambda x: x * A), [A])
-    os.utime(path, (1e9, 1e9))
-    assert load(path, [A]) is not None
-    assert path.stat().st_mtime > 1e9 + 1
-
-
-def test_a_number_that_the_step_read_decides(tmp_path: Path) -> None:
-    gain = torch.tensor(2.0, dtype=torch.float64)
-    save(tmp_path / "trace", traced(lambda x: x * A if bool(gain > 1) else x), [gain, A])
-    assert load(tmp_path / "trace", [gain + 1, B]) is not None
-    assert load(tmp_path / "trace", [gain - 2, B]) is None
-
-
-def test_a_file_without_its_digest_is_no_trace(tmp_path: Path) -> None:
-    path = tmp_path / "trace"
-    save(path, traced(lambda x: x * A), [A])
+    first, _ = served(Kept("a test"), layer(0))
+    (path,) = traces(cache)
     content = path.read_bytes()
-    assert content[-32:] == hashlib.sha256(content[:-32]).digest()
-    for damaged in (content[:-1], content[1:], content + b"0", content[:40] + b"0" + content[41:], b"", b"0"):
-        path.write_bytes(damaged)
-        assert load(path, [A]) is None
-    other = zlib.compress(pickle.dumps((1, 2)))  # whole, of something else
-    path.write_bytes(other[:9] + hashlib.sha256(other[:9]).digest())
-    assert load(path, [A]) is None
+    path.write_bytes(DAMAGES[damage](content, tmp_path / "harm"))
+    again, traced = served(Kept("a test"), layer(0))
+    assert traced
+    assert torch.equal(again, first)
+    assert path.read_bytes() == content
+    assert not (tmp_path / "harm").exists()
 
 
-class Mine(NamedTuple):
-    """Of a user."""
-
-    x: int
-
-
-def read(*name: Any, given: tuple[Tensor, ...] = ()) -> Any:
-    """What a reader finds behind the name of something that is not in the file."""
-    return trace_cache._Reader(io.BytesIO(), given).persistent_load(name)
-
-
-def test_a_reader_knows_operations_dtypes_and_tensors_alone() -> None:
-    aten = torch.ops.aten
-    assert read("operation", "aten::add", "Tensor") is aten.add.Tensor
-    assert read("operation", "aten::exp", "") is aten.exp.default
-    assert read("operation", "prims::convert_element_type", "") is (
-        torch.ops.prims.convert_element_type.default
-    )
-    for value in (torch.float32, torch.int64, torch.bool, torch.contiguous_format, torch.strided):
-        assert read("named", str(value).removeprefix("torch.")) is value
-    assert read("given", 1, given=(A, B)) is B
-    assert torch.equal(read("value", A.numpy()), A)
-    reader = trace_cache._Reader(io.BytesIO(), ())
-    one, other = (reader.persistent_load(("made", k)) for k in (0, 1))
-    assert one is reader.persistent_load(("made", 0))
-    assert one is not other
-    for name in (
-        ("operation", "inductor::_alloc_from_pool", ""),
-        ("operation", "profiler::_record_function_enter", ""),
-        ("named", "load"),
-        ("named", "nn"),
-        ("named", "no such name"),
-    ):
-        with pytest.raises(pickle.UnpicklingError, match="not belong into a trace"):
-            read(*name)
-
-
-def test_a_reader_knows_the_named_tuples_of_this_package_alone() -> None:
-    reader = trace_cache._Reader(io.BytesIO(), ())
-    assert reader.find_class("staf_torch.lanes.emission", "Text") is Text
-    assert reader.find_class("torch", "Size") is torch.Size
-    assert reader.find_class("builtins", "slice") is slice
-    for module, name in (
-        (__name__, "Mine"),  # a named tuple of somebody else
-        ("staf_torch.lanes.graph", "Graph"),  # a class that is none
-        ("staf_torch.lanes.trace_cache", "load"),
-        ("staf_torch.lanes.trace_cache", "pickle.loads"),
-        ("staf_torch.lanes.trace_cache", "no such name"),
-        ("staf_torch.no_such_module", "Text"),
-        ("torch", "Tensor"),
-        ("builtins", "eval"),
-        ("os", "stat_result"),
-    ):
-        with pytest.raises(pickle.UnpicklingError, match="does not belong into a trace"):
-            reader.find_class(module, name)
-
-
-def test_a_place_follows_from_all_that_a_trace_depends_on(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(trace_cache, "_cache", lambda: tmp_path)
-    first = place(b"step", 1)
-    assert first == place(b"step", 1)
-    assert first.parent == tmp_path
-    assert first.name.startswith("trace-")
-    assert len(first.name) == len("trace-") + 24
-    found = {first, place(b"step", 2), place(b"step"), place(b"other", 1)}
+def test_another_setting_shape_or_dtype_is_another_trace(cache: Path) -> None:
+    served(Kept("a test"), layer(0))
+    served(Kept("a test"), layer(0), "another setting")
+    right(of(Kept("a test"), layer(0))[0], X[:, None])
+    right(of(Kept("a test"), layer(0).float())[0], X.float())
     before = torch.get_default_dtype()
-    torch.set_default_dtype(torch.float32 if before == torch.float64 else torch.float64)
+    torch.set_default_dtype(torch.float64 if before == torch.float32 else torch.float32)
     try:
-        found.add(place(b"step", 1))
+        served(Kept("a test"), layer(0))
     finally:
         torch.set_default_dtype(before)
-    monkeypatch.setattr(torch, "__version__", "0.0")
-    found.add(place(b"step", 1))
-    monkeypatch.setattr(trace_cache, "_package", lambda: "another version")
-    found.add(place(b"step", 1))
-    assert len(found) == 7
+    assert len(traces(cache)) == 5
 
 
-def test_the_digest_of_a_package_follows_from_every_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(trace_cache, "_PACKAGE", tmp_path)
-    found = set()
-    (tmp_path / "inner").mkdir()
-    for name, text in (("a.py", "1"), ("a.py", "2"), ("inner/b.py", "1"), ("inner/b.py", "2")):
-        (tmp_path / name).write_text(text)
-        found.add(trace_cache._package.__wrapped__())
-    (tmp_path / "note.txt").write_text("no code")
-    found.add(trace_cache._package.__wrapped__())
-    assert len(found) == 4
+class Mine(nn.Linear):
+    """Of a user: its code may change from process to process."""
+
+
+def test_code_of_a_user_and_tensors_that_nobody_named_keep_a_trace_out_of_the_cache(cache: Path) -> None:
+    served(Kept("a test"), nn.Sequential(Mine(2, 2)).double().requires_grad_(False))
+    hidden = torch.tensor(2.0, dtype=torch.float64)
+    program = Kept("a test").of(lambda x, _, __: (x * hidden, x), "named")
+    assert program is not None
+    right(program)
+    assert not traces(cache)
+
+
+def test_a_number_that_the_step_reads_decides_whether_a_trace_serves(cache: Path) -> None:
+    for number in (2.0, 3.0, -1.0):
+        scale = torch.tensor(number, dtype=torch.float64)
+        program = Kept("a test").of(
+            lambda x, _, __, scale=scale: (x * scale if bool(scale > 0) else -x, x), scale
+        )
+        assert program is not None
+        right(program)
+
+
+def test_the_latest_programs_are_kept_and_no_more() -> None:
+    kept, modules = Kept("a test", most=2), [nn.Sequential(*[nn.Tanh()] * k) for k in (1, 2, 3)]
+    one, two = (of(kept, module)[0] for module in modules[:2])
+    assert of(kept, modules[0])[0] is one  # which is now the latest
+    of(kept, modules[2])
+    assert of(kept, modules[0])[0] is one
+    assert of(kept, modules[1])[0] is not two
+
+
+def twice(self: nn.Module, x1: Tensor, x2: Tensor) -> Tensor:
+    return 2 * (x1 @ x2.mT)
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of a fork beside threads
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+def test_a_method_of_the_library_that_a_user_replaces_meets_no_old_trace_and_leaves_none(cache: Path) -> None:
+    """In a process of its own, which ends with the method that it has put there."""
+
+    def step_of(kernel: nn.Module) -> nn.Module:
+        return lambda x: kernel(x.unsqueeze(-2), torch.ones(1, 2).double()).squeeze(-2)  # type: ignore[return-value]
+
+    def program(kept: Kept, kernel: nn.Module) -> Program:
+        found = kept.of(Made(step_of(kernel)), kernel, owners=(kernel,))
+        assert found is not None
+        return found
+
+    def replaced() -> None:
+        kernel, kept = kernels.ExponentialKernel(), Kept("a test")
+        for _ in range(3):  # from the second on a watch says whether something has changed
+            before = right(program(kept, kernel))
+        assert patches.unpatched()
+        assert len(traces(cache)) == 1
+        assert kept.unchanged(kernel) is not None
+        kernels.ExponentialKernel.forward = twice  # type: ignore[method-assign]
+        assert not patches.unpatched()
+        assert kept.unchanged(kernel) is None
+        for other in (kept, Kept("a test")):
+            assert not torch.allclose(right(program(other, kernel)), before)
+        assert len(traces(cache)) == 1
+
+    process = multiprocessing.get_context("fork").Process(target=replaced)
+    process.start()
+    process.join(120)
+    assert process.exitcode == 0
+    assert patches.unpatched()
+
+
+def test_no_module_of_the_package_looks_patched() -> None:
+    for name in ("adp", "envs", "experiments", "metrics", "online", "theory"):
+        importlib.import_module(f"staf_torch.{name}")
+    assert patches.unpatched()
+
+
+@pytest.mark.compiled
+@pytest.mark.parametrize("name", ["exponential", "anchored_gaussian", "user_defined"])
+def test_what_was_traced_of_a_chase_is_there_for_the_next_process(name: str, cache: Path) -> None:
+    basis = StaFBasis(KERNELS[name].make(), StateFollowingCenters(rings(3), 0.3))
+    x = 0.01 * torch.arange(32).double().view(1, 16, 2)
+    with lanes.compiling("always"):
+        chase(x, basis, targets.Quadratic(2.0), optim.SteepestDescent(), inner_steps=2)
+    assert len(traces(cache)) == (name != "user_defined")  # a user's own is traced in every process

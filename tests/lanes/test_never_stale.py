@@ -1,0 +1,384 @@
+"""A step that reads something else than before (a global, a closure, an attribute, a tensor, a method) is not
+served by what was compiled of it."""
+
+from __future__ import annotations
+
+import ctypes
+import itertools
+import math
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor, nn
+
+from staf_torch.lanes import ready
+from staf_torch.lanes.function import RowFunction
+from staf_torch.lanes.kept import Kept
+from staf_torch.lanes.program import Program
+from staf_torch.lanes.watch import Watch
+from staf_torch.systems import simulate
+
+pytestmark = pytest.mark.needs_compiler
+SOURCE = """
+import math, numpy as np, torch
+gain, unread, notes, table = 2.0, 1.0, [1.0, 2.0], {"gain": 2.0}
+names, other = {"a"}, 1.0
+array, tensor = np.array([1.0, 2.0]), torch.tensor(2.0, dtype=torch.float64)
+helpers = ModuleType("helpers")
+helpers.gain, helpers.twice = 2.0, lambda x: 2 * x
+
+def inner(x): return x * gain
+def outer(x): return inner(x)
+def default(x, by=2.0): return x * by
+def closing(by): return lambda x: x * by
+def recursive(x, times=2): return x if times == 0 else recursive(x * gain, times - 1)
+def nested(x): return [by * gain * x for by in (1.0, 2.0)][0]
+def local(x):
+    from math import tau
+    return x * tau
+
+class Settings:
+    gain = 2.0
+    numbers = [1.0, 2.0]
+
+class Base:
+    def scaled(self, x): return inner(x)
+
+class Held(Base):
+    by = 2.0
+    @property
+    def half(self): return gain / 2
+    @staticmethod
+    def twice(x): return x * gain
+    def __call__(self, x): return super().scaled(x) * self.by
+
+held = Held()
+FUNCTIONS = dict(
+    number=lambda x: x * gain,
+    call=outer,
+    entry=lambda x: x * notes[0],
+    key=lambda x: x * table["gain"],
+    member=lambda x: x * (2.0 if "a" in names else 3.0),
+    array=lambda x: x * float(array[0]),
+    tensor=lambda x: x * tensor,
+    module=lambda x: x * helpers.gain,
+    function_of_a_module=lambda x: helpers.twice(x),
+    constant_of_a_class=lambda x: x * Settings.gain,
+    list_of_a_class=lambda x: x * Settings.numbers[0],
+    base=held, static=Held.twice, property=lambda x: x * held.half,
+    python=lambda x: x * math.tau, torch=lambda x: torch.tanh(x),
+    default=default, recursive=recursive, nested=nested, local=local,
+)
+"""
+CHANGES: dict[str, Callable[[Any], Any]] = {
+    "number": lambda m: setattr(m, "gain", 3.0),
+    "call": lambda m: setattr(m, "inner", lambda x: 5 * x),
+    "entry": lambda m: m.notes.__setitem__(0, 3.0),
+    "key": lambda m: m.table.update(gain=3.0),
+    "member": lambda m: m.names.clear(),
+    "array": lambda m: m.array.__setitem__(0, 3.0),
+    "tensor": lambda m: m.tensor.fill_(3.0),
+    "module": lambda m: setattr(m.helpers, "gain", 3.0),
+    "function_of_a_module": lambda m: setattr(m.helpers, "twice", lambda x: 3 * x),
+    "constant_of_a_class": lambda m: setattr(m.Settings, "gain", 3.0),
+    "list_of_a_class": lambda m: m.Settings.numbers.__setitem__(0, 3.0),
+    "base": lambda m: setattr(m, "gain", 3.0),
+    "static": lambda m: setattr(m, "gain", 3.0),
+    "property": lambda m: setattr(m, "gain", 3.0),
+    "python": lambda m: setattr(math, "tau", 7.0),
+    "torch": lambda m: setattr(torch, "tanh", torch.sin),
+    "default": lambda m: setattr(m.default, "__defaults__", (3.0,)),
+    "recursive": lambda m: setattr(m, "gain", 3.0),
+    "nested": lambda m: setattr(m, "gain", 3.0),
+    "local": lambda m: setattr(math, "tau", 7.0),
+}
+X = torch.linspace(-1, 1, 10, dtype=torch.float64).view(5, 2)
+
+
+@pytest.fixture(autouse=True)
+def _libraries_are_built_in_half_the_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CXXFLAGS", "-O0")
+
+
+@pytest.fixture
+def notebook(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """A module that lies in no folder of packages."""
+    module = ModuleType("notebook")
+    module.ModuleType = ModuleType  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "notebook", module)
+    monkeypatch.setattr(math, "tau", math.tau)  # each is put back at the end
+    monkeypatch.setattr(torch, "tanh", torch.tanh)
+    exec(compile(SOURCE, "notebook", "exec"), vars(module))
+    return module
+
+
+def of(kept: Kept, function: Callable[[Tensor], Tensor]) -> Any:
+    """The program of a function, as chases, loops and simulations ask for it."""
+    program = kept.unchanged(function)
+    if program is None:
+        program = kept.of(lambda x, _, __: (x, function(x)), function, owners=(function,))
+    return program
+
+
+def right(program: Any, function: Callable[[Tensor], Tensor]) -> None:
+    """Fail where a program gives anything but what the function gives now."""
+    torch.testing.assert_close(program(X, steps=1)[1][:, 0], function(X), rtol=1e-14, atol=1e-14)
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_a_function_is_computed_with_what_it_reads_at_the_moment(name: str, notebook: Any) -> None:
+    kept, function = Kept("a test"), notebook.FUNCTIONS[name]
+    own = Program(eval("lambda x, now, row: (x, f(x))", vars(notebook) | {"f": function}))
+    before = [of(kept, function) for _ in range(4)]  # the last by what is watched
+    assert all(program is before[0] for program in before)
+    notebook.unread = 2.0
+    assert kept.unchanged(function) is before[0]
+    for program in (before[0], own):
+        right(program, function)
+    CHANGES[name](notebook)
+    if name == "torch":  # one that somebody has replaced has no scalar form
+        assert torch.equal(of(kept, function).definition(X, steps=1)[1][:, 0], X.sin())
+        return
+    for program in (of(kept, function), of(kept, function), own):
+        right(program, function)
+
+
+def test_closures_of_equal_content_share_a_program_and_others_do_not(notebook: Any) -> None:
+    kept = Kept("a test")
+    first = of(kept, notebook.closing(2.0))
+    assert of(kept, notebook.closing(2.0)) is first
+    assert of(kept, notebook.closing(3.0)) is not first
+    for by in torch.tensor([2.0, 3.0], dtype=torch.float64):
+        right(of(kept, notebook.closing(by)), lambda x, by=by: x * by)
+
+
+def test_a_function_that_an_editor_reloads_in_place_is_another(notebook: Any) -> None:
+    kept = Kept("a test")
+    right(of(kept, notebook.outer), notebook.outer)
+    notebook.inner.__code__ = (lambda x: 7 * x).__code__
+    right(of(kept, notebook.outer), lambda x: 7 * x)
+
+
+class Held(nn.Module):
+    """Of a user: it computes with numbers of every kind, some of them inside of others."""
+
+    def __init__(self, function: Callable[[Tensor], Tensor] = torch.sin) -> None:
+        super().__init__()
+        self.register_buffer("gain", torch.full((2,), 2.0).double())
+        self.inner = nn.Sequential(nn.Linear(2, 2), nn.Tanh()).double().requires_grad_(False)
+        self.setting, self.function, self.notes, self.table = 1.0, function, [1.0], np.ones(2)
+
+    def forward(self, x: Tensor) -> Tensor:
+        noted = self.setting * self.notes[0] * float(self.table[0])
+        return noted * self.gain * self.function(self.inner(x)) * (2 if self.training else 1)
+
+
+PARTS: dict[str, Callable[[Held], Any]] = {
+    "a number": lambda m: setattr(m, "setting", 2.0),
+    "an entry of a list": lambda m: m.notes.__setitem__(0, 3.0),
+    "an array": lambda m: m.table.__setitem__(0, 2.0),
+    "another buffer": lambda m: setattr(m, "gain", torch.ones(2).double()),
+    "a buffer in place": lambda m: m.gain.zero_(),
+    "a weight in place": lambda m: m.inner[0].weight.mul_(2),
+    "another weight": lambda m: setattr(
+        m.inner[0], "bias", nn.Parameter(torch.ones(2).double(), requires_grad=False)
+    ),
+    "another part": lambda m: m.inner.__setitem__(1, nn.Sigmoid()),
+    "another function": lambda m: setattr(m, "function", torch.cos),
+    "a mode": lambda m: m.eval(),
+    "a hook": lambda m: m.inner.register_forward_hook(lambda *given: given[2] + 1),
+}
+
+
+DEEP = ("an entry of a list", "an array", "a hook")
+"""Inside of what a module holds, where a `RowFunction` does not look: it watches attributes and tensors."""
+
+
+@pytest.mark.parametrize("part", PARTS)
+def test_a_module_is_computed_as_it_is_at_the_moment(part: str) -> None:
+    module = Held()
+    row, kept = RowFunction(module.forward, module, "a test"), Kept("a test")
+    row.hasten()
+    for _ in range(3):
+        torch.testing.assert_close(row(X), module(X), rtol=1e-13, atol=1e-14)
+        right(of(kept, module), module)
+    assert row.compiled
+    unchanged = kept.unchanged(module)
+    assert unchanged is not None
+    before = module(X)
+    PARTS[part](module)
+    assert not torch.allclose(module(X), before)
+    assert kept.unchanged(module) is None
+    if part not in DEEP:
+        torch.testing.assert_close(row(X), module(X), rtol=1e-13, atol=1e-14)
+    right(of(kept, module), module)
+    for _ in range(2):  # the second time it is known again
+        again = of(kept, module)
+    assert kept.unchanged(module) is again
+
+
+def test_where_a_derivative_may_be_wanted_there_is_no_program(notebook: Any) -> None:
+    kept, function = Kept("a test"), notebook.FUNCTIONS["tensor"]
+    for _ in range(3):
+        assert of(kept, function) is not None
+    notebook.tensor.requires_grad_()
+    assert of(kept, function) is None
+    with torch.no_grad():
+        assert of(kept, function) is not None
+
+
+def test_a_method_that_a_user_replaces_in_his_own_class_is_seen() -> None:
+    class Own(nn.Module):
+        gain = 2.0
+
+        def forward(self, x: Tensor) -> Tensor:
+            return x * self.gain
+
+    module, kept = Own(), Kept("a test")
+    changes: list[Callable[[], Any]] = [
+        lambda: None,
+        lambda: setattr(Own, "gain", 3.0),
+        lambda: setattr(Own, "forward", lambda self, x: x + self.gain),
+    ]
+    for change in changes:
+        change()
+        for _ in range(3):
+            right(of(kept, module), module)
+
+
+def test_a_function_of_rows_is_compiled_again_where_a_global_has_changed(notebook: Any) -> None:
+    module = Held(notebook.outer)
+    row = RowFunction(module.forward, module, "a test")
+    row.hasten()
+    for gain in (2.0, 5.0):
+        notebook.gain = gain
+        torch.testing.assert_close(row(X), module(X), rtol=1e-14, atol=0)
+    assert row.compiled
+
+
+def test_a_plant_that_reads_a_global_moves_by_its_number_of_the_moment(notebook: Any) -> None:
+    class Plant(nn.Module):
+        dim = 2
+
+        def drift(self, x: Tensor) -> Tensor:
+            return -notebook.inner(x)
+
+    def states() -> Tensor:
+        return simulate(Plant(), X, dt=0.01, steps=10_000)[:, 100]  # so many are compiled
+
+    for gain in (2.0, 3.0, 2.0):
+        notebook.gain = gain
+        torch.testing.assert_close(states(), X * math.exp(-gain), rtol=1e-7, atol=0)
+
+
+class Slots:
+    __slots__ = ("number",)
+
+
+def test_what_cannot_be_watched_is_read_at_every_call() -> None:
+    small, large, part = np.zeros(10), np.zeros(100_000), Slots()
+    part.number = 1.0
+    assert Watch(lambda x: x * small[0]).unchanged()
+    for value in (lambda x: x * large[0], part, (x for x in ())):
+        assert not Watch(value).unchanged()
+    kept = Kept("a test")
+    for number in (1.0, 1.0, 2.0):
+        part.number = number
+        program = kept.of(lambda x, _, __: (x, x * part.number), part, owners=(part,))
+        assert kept.unchanged(part) is None
+        assert program is not None
+        right(program, lambda x, number=number: x * number)
+
+
+class Refusing:
+    def __reduce__(self) -> Any:
+        raise RuntimeError("not this one")
+
+
+def deep() -> list[Any]:
+    inner: list[Any] = []
+    for _ in range(100_000):
+        inner = [inner]
+    return inner
+
+
+def generator() -> Iterator[float]:
+    yield 2.0
+
+
+UNWRITTEN = (
+    Refusing,
+    deep,
+    itertools.count,
+    threading.Lock,
+    generator,
+    lambda: ctypes.pointer(ctypes.c_double()),
+)
+
+
+@pytest.mark.parametrize("make", UNWRITTEN)
+def test_whatever_a_function_names_a_call_goes_on_and_the_log_says_what_it_costs(
+    make: Callable[[], Any], notebook: Any, caplog: pytest.LogCaptureFixture
+) -> None:
+    notebook.step = eval("lambda x, now, row: (x if other is None else 2 * x, 2 * x)", vars(notebook))
+    notebook.other = make()
+    torch.testing.assert_close(Program(notebook.step)(X, steps=3)[0], 8 * X)
+    caplog.clear()
+    kept = Kept("a test")
+    for _ in range(2):
+        program = kept.of(notebook.step, notebook.step)
+        assert program is not None
+        right(program, lambda x: 2 * x)
+    assert [line.startswith("a test is traced again at every call") for line in caplog.messages] == [True]
+
+
+def test_a_policy_is_ready_before_its_loop_begins_or_says_that_it_cannot_be(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    module, holder = Held(), nn.Module()
+    row = RowFunction(module.forward, module, "a test")
+    holder.row, holder.forward = row, row.__call__
+    assert not row.compiled
+    assert ready(holder, X[0])
+    assert row.compiled
+    torch.testing.assert_close(row(X[0]), module(X[0]), rtol=1e-13, atol=1e-13)
+    assert not ready(nn.Linear(2, 2).double(), X)
+    noisy = RowFunction(lambda x: module(x) + torch.randn(x.shape), module, "a noisy test")
+    holder.row, holder.inner, holder.forward = row, nn.Module(), lambda x: row(x) + noisy(x)
+    holder.inner.noisy = noisy
+    assert not ready(holder, X[0])
+    assert "draws random numbers" in caplog.text
+
+
+@pytest.mark.parametrize("shape", [(2,), (1, 2), (5, 2), (3, 4, 2), (2, 1, 3, 2), (0, 2)])
+def test_a_function_of_rows_takes_states_of_any_leading_dimensions(shape: tuple[int, ...]) -> None:
+    x = torch.randn(shape, dtype=torch.float64)
+    for _ in range(2):
+        torch.testing.assert_close(ANY(x), MODULE(x), rtol=1e-13, atol=1e-14)
+    learned = x.clone().requires_grad_()
+    assert ANY(learned).requires_grad
+    if x.dim() == 2 and len(x):
+        torch.testing.assert_close(torch.func.vmap(ANY)(x), MODULE(x))
+
+
+MODULE = Held()
+ANY = RowFunction(MODULE.forward, MODULE, "a test")
+ANY.hasten()
+
+
+@pytest.mark.parametrize(("rows", "most"), [(1, 101), (1000, 17), (20_000, 0)])
+def test_a_function_is_compiled_once_its_calls_would_have_paid_for_it(rows: int, most: int) -> None:
+    """A long batch pays for itself; a hundred calls of a single row do."""
+    module = Held()
+    row, x = RowFunction(module.forward, module, "a test"), torch.ones(rows, 2).double()
+    calls = 0
+    while not row.compiled:
+        row(x)
+        calls += 1
+    assert most // 2 <= calls - 1 <= most
