@@ -101,11 +101,6 @@ CHANGES: dict[str, Callable[[Any], Any]] = {
 X = torch.linspace(-1, 1, 10, dtype=torch.float64).view(5, 2)
 
 
-@pytest.fixture(autouse=True)
-def _libraries_are_built_in_half_the_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("CXXFLAGS", "-O0")
-
-
 @pytest.fixture
 def notebook(monkeypatch: pytest.MonkeyPatch) -> Any:
     """A module that lies in no folder of packages."""

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import ctypes
 import math
+import shutil
+import subprocess
 from collections.abc import Callable
+from typing import Any
 
+import helpers_forms as forms
 import numpy as np
 import pytest
 import torch
+from helpers import uniform
 from torch import Tensor
 from torch.nn import functional
 
@@ -166,7 +172,6 @@ def every() -> lanes.Program:
     return lanes.Program(step)
 
 
-@pytest.mark.compiled
 def test_compiled_operations_are_those_of_torch(every: lanes.Program) -> None:
     x = drawn(torch.float64)
     assert every.compiles(x, x.unsqueeze(1), x)
@@ -175,7 +180,6 @@ def test_compiled_operations_are_those_of_torch(every: lanes.Program) -> None:
         close(found[name], wanted[name], name)
 
 
-@pytest.mark.compiled
 def test_order_is_that_of_torch_for_what_is_no_number(every: lanes.Program) -> None:
     x = drawn(torch.float64)
     x[::2, 0] = torch.tensor([0.0, -0.0, torch.inf, -torch.inf, torch.nan, 5e-324, 1e30]).double().repeat(3)
@@ -186,7 +190,6 @@ def test_order_is_that_of_torch_for_what_is_no_number(every: lanes.Program) -> N
         close(found[name][:, 0], OPERATIONS[name](x), name)
 
 
-@pytest.mark.compiled
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 def test_remainders_are_exact_whatever_the_quotient(dtype: torch.dtype) -> None:
     """Beside NumPy: `torch.fmod` itself errs by a divisor where that is nearly subnormal (2.13, x86)."""
@@ -232,7 +235,6 @@ ZEROS: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
 }  # fmt: skip
 
 
-@pytest.mark.compiled
 def test_a_zero_keeps_its_sign_and_loses_it_as_in_torch() -> None:
     """Terms that add a zero may only go where no sign of a zero depends on them: 1/x tells."""
 
@@ -248,20 +250,6 @@ def test_a_zero_keeps_its_sign_and_loses_it_as_in_torch() -> None:
     assert program.compiles(x, x.unsqueeze(1), x)
     found, wanted = (call(x, x.unsqueeze(1), x)[1] for call in (program, program.definition))
     torch.testing.assert_close(1 / found, 1 / wanted, rtol=1e-14, atol=0)
-
-
-def test_an_error_of_the_tracer_leaves_the_definition(caplog: pytest.LogCaptureFixture) -> None:
-    class Odd:
-        def __call__(self, x: Tensor) -> Tensor:
-            if torch.utils._python_dispatch._get_current_dispatch_mode() is not None:
-                raise KeyError("lost while tracing")
-            return 2 * x
-
-    odd = Odd()
-    program = lanes.Program(lambda carry, now, row: (carry, odd(row)))
-    x = torch.randn(5, 2, dtype=torch.float64)
-    assert torch.equal(program(x, x.unsqueeze(1), x)[1][:, 0], 2 * x)
-    assert "KeyError" in caplog.text
 
 
 @pytest.mark.parametrize("dims", [None, (0,), (2,), (-1,), (0, 1), (0, 2), (0, 1, 2)])
@@ -293,20 +281,6 @@ def test_the_inverse_of_the_error_function_is_one_up_to_its_ends() -> None:
     )
 
 
-def test_multiples_of_a_summand_count() -> None:
-    a, b = torch.randn(5, 3, dtype=torch.float64), torch.randn(5, 3, dtype=torch.float64)
-
-    def step(_: object, __: object, row: tuple[Tensor, Tensor]) -> tuple[tuple[()], tuple[Tensor, ...]]:
-        x, y = row
-        some = (x.add(y, alpha=2), x.sub(y, alpha=2), x.add(y, alpha=1), x.add(y, alpha=-3), x.sub(y))
-        return (), some
-
-    program = lanes.Program(step)
-    found, wanted = (run((), (), (a, b), steps=1)[1] for run in (program, program.definition))
-    for one, other in zip(found, wanted, strict=True):  # torch fuses the product where the processor can
-        torch.testing.assert_close(one, other, rtol=1e-15, atol=4e-15)
-
-
 @pytest.mark.parametrize("descending", [True, False])
 @pytest.mark.parametrize(
     ("shape", "dim"), [((7,), 0), ((4, 7), -1), ((7, 4), 0), ((2, 3, 7), -1), ((2, 7, 3), 1)]
@@ -320,3 +294,111 @@ def test_entries_are_ordered_as_torch_does_along_any_dimension(
     wanted = torch.sort(x, dim=dim, descending=descending, stable=True)
     torch.testing.assert_close(found, wanted.values, rtol=0, atol=0, equal_nan=True)
     assert torch.equal(places, wanted.indices)
+
+
+# Every operation as C, by one call of a C compiler.
+
+
+def x(*shape: int) -> Tensor:
+    return uniform(2, *shape, seed=1)
+
+
+def i(*shape: int) -> Tensor:
+    return torch.arange(torch.Size(shape).numel()).reshape(1, *shape).repeat(2, *[1] * len(shape)) % 3
+
+
+def at(*shape: int, of: int) -> Tensor:
+    """Places that rows have: (2, ...), of which some are equal."""
+    return (7 * torch.arange(2 * torch.Size(shape).numel()) % 5 % of).view(2, *shape)
+
+
+def without_signs(a: Tensor) -> list[Tensor]:
+    """Factorisations, of eigenvectors the sizes of their entries."""
+    return [part.abs() if k == 16 else part for k, part in enumerate(forms.decomposed(a))]
+
+
+def captured(a: Tensor) -> list[Tensor]:
+    """Numbers that are found outside."""
+    gain = torch.tensor([2.0, -0.5, 3.0], dtype=torch.float64)
+    chosen = torch.where(torch.tensor([True, False, True]), a, gain[0])
+    return [a * gain + gain.exp(), chosen, (a @ gain).unsqueeze(-1), a.abs() ** gain.abs()]
+
+
+FORMS: dict[str, tuple[Callable[..., Any], tuple[Tensor, ...]]] = {
+    **{name: (lambda a, name=name: forms.by_name([name], a), (x(3),)) for name in forms.ONE},
+    **{name: (lambda a, b, name=name: forms.by_name([name], a, b), (x(3), x(3) + 2)) for name in forms.TWO},
+    "powers": (forms.powers, (x(3), x(3) + 2)),
+    "arithmetic": (forms.arithmetic, (x(3), x(3) + 2)),
+    "logic": (forms.logic, (x(3), x(3) + 2)),
+    "integers": (forms.integers, (x(3).float(), i(3))),
+    "blank": (forms.blank, (x(3),)),
+    "reductions": (forms.reductions, (x(2, 3, 2),)),
+    "products": (forms.products, (x(3, 2), x(2, 3))),
+    "slopes": (forms.slopes, (x(3, 2), x(2, 3))),
+    "movements": (forms.movements, (x(3, 3),)),
+    **{f"choices of {n}": (forms.choices, (x(n, n), i(n))) for n in (3, 6)},
+    "replaced": (forms.replaced, (x(4),)),
+    "large": (forms.large, (x(65),)),
+    "decomposed": (without_signs, (x(3, 3) + 3 * torch.eye(3),)),
+    "choices in three dimensions": (forms.more_choices, (x(3, 4, 5), at(2, 2, 2, of=2))),
+    "writes": (forms.written, (x(3, 4), at(3, of=4))),
+    "digits": (forms.rounded, (x(4),)),
+    "nested": (forms.nested, (x(4, 2), x(2))),
+    "points": (lambda a: forms.points(a, 2), (x(5, 3),)),
+    **{f"loops of {n}": (forms.loops, (x(4, n), x(n))) for n in (2, 65)},
+    "captured": (captured, (x(3),)),
+}  # fmt: skip
+ORDER = {name: f"form{k}" for k, name in enumerate(FORMS)}
+
+
+def leaves(found: Any) -> list[Tensor]:
+    """A nested tree of results as a list, each with a dimension of one row."""
+    if isinstance(found, Tensor):
+        return [found if found.shape[:1] == (1,) else found.unsqueeze(0)]
+    return [leaf for part in found for leaf in leaves(part)]
+
+
+@pytest.fixture(scope="module")
+def library(tmp_path_factory: pytest.TempPathFactory) -> ctypes.CDLL:
+    """All forms as functions of C, unoptimised."""
+    compiler = next(filter(None, map(shutil.which, ("gcc", "cc", "clang"))), None)
+    if compiler is None:
+        pytest.skip("needs a C compiler")
+    texts, folder = [], tmp_path_factory.mktemp("forms")
+    for name, (body, rows) in FORMS.items():
+        program = lanes.Program(lambda carry, now, row, body=body: ((), leaves(body(*row))))
+        one = tuple(row[:1] for row in rows)
+        count = len(one) + len(leaves(body(*one)))
+        texts.append(program.c_source(ORDER[name], row=one))
+        words = ", ".join(f"p[{k}]" for k in range(count))
+        texts.append(f"void call_{ORDER[name]}(void **p) {{ {ORDER[name]}({words}); }}\n")
+    (folder / "forms.c").write_text("".join(texts))
+    out = folder / "forms.so"
+    subprocess.run(
+        [compiler, "-std=c99", "-O0", "-shared", "-fPIC", folder / "forms.c", "-o", out, "-lm"], check=True
+    )
+    return ctypes.CDLL(str(out))
+
+
+@pytest.mark.filterwarnings("ignore:`torch.jit.script` is deprecated")
+@pytest.mark.parametrize("name", FORMS)
+def test_c_of_an_operation_computes_what_torch_does(name: str, library: ctypes.CDLL) -> None:
+    body, rows = FORMS[name]
+    real = torch.float32 if rows[0].dtype == torch.float32 else torch.float64
+    bound = 1e-11 if real == torch.float64 else 1e-5
+    for k in range(2):
+        alone = [row[k : k + 1] for row in rows]
+        wanted = leaves(body(*alone))
+        outs = [torch.empty(leaf.shape[1:], dtype=real) for leaf in wanted]
+        given = [part.to(real).contiguous() for part in alone]
+        places = [part.data_ptr() for part in (*given, *outs)]
+        library[f"call_{ORDER[name]}"]((ctypes.c_void_p * len(places))(*places))
+        for at, (found, leaf) in enumerate(zip(outs, wanted, strict=True)):
+            torch.testing.assert_close(
+                found.to(leaf.dtype).double(),  # of a flag, what is not 0 is true
+                leaf[0].double(),
+                rtol=bound,
+                atol=bound,
+                equal_nan=True,
+                msg=lambda text, at=at: f"result {at}: {text}",
+            )

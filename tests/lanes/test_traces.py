@@ -30,11 +30,6 @@ X = torch.linspace(-1, 1, 10, dtype=torch.float64).view(5, 2)
 NUMBERS = (torch.tensor([0.3, -1.7, 0.9]), torch.tensor([1.0, 1.0, 0.0]), torch.tensor([-0.0, 0.5, 1 / 64]))
 
 
-@pytest.fixture(autouse=True)
-def _libraries_are_built_in_half_the_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("CXXFLAGS", "-O0")
-
-
 @pytest.fixture
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An empty cache."""

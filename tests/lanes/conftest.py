@@ -1,0 +1,15 @@
+"""In this room libraries are built in a third of the time, but where rounding or speed is the matter."""
+
+from __future__ import annotations
+
+import pytest
+
+AS_FOR_USERS = ("test_programs", "test_functions", "test_random_programs")
+
+
+@pytest.fixture(autouse=True)
+def _libraries_are_built_without_optimisation(
+    request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if request.path.stem not in AS_FOR_USERS:
+        monkeypatch.setenv("CXXFLAGS", "-O0")

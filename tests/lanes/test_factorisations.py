@@ -1,0 +1,468 @@
+"""Factorisations, orders and tables in scalar operations find what LAPACK and torch find, also compiled."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import hypothesis.strategies as st
+import pytest
+import torch
+from helpers import random_positive_definite, uniform
+from hypothesis import given
+from torch import Tensor
+
+from staf_torch import lanes
+from staf_torch.lanes import replacements
+from staf_torch.lanes.eliminations import (
+    cholesky,
+    cholesky_solve,
+    determinant,
+    eigen,
+    eigenvalues,
+    inverse,
+    log_determinant,
+    orthogonal,
+    solve,
+    solve_definite,
+    triangular,
+)
+from staf_torch.lanes.pivoted_cholesky import pivoted_cholesky
+from staf_torch.lanes.tracer import NotLoweredError
+from staf_torch.numerics.linalg import condition_number
+
+LEADS = ((), (2,), (2, 3))
+SEEDS = st.integers(0, 2**31)
+
+
+def drawn(*shape: int, dtype: torch.dtype = torch.float64) -> Tensor:
+    generator = torch.Generator().manual_seed(sum(shape))
+    return torch.randn(*shape, dtype=torch.float64, generator=generator).to(dtype)
+
+
+def alike(found: Any, wanted: Any, dtype: torch.dtype) -> None:
+    bound = 2000 * torch.finfo(dtype).eps
+    assert found.dtype == wanted.dtype
+    assert found.shape == wanted.shape
+    sizes = wanted.double().abs()
+    scale = 1 + float(sizes[sizes.isfinite()].max()) if bool(sizes.isfinite().any()) else 1.0
+    torch.testing.assert_close(found, wanted, rtol=bound, atol=bound * scale, equal_nan=True)
+
+
+def pairs(size: int, lead: tuple[int, ...], dtype: torch.dtype) -> Iterator[tuple[Any, Any]]:
+    """What is found and what torch finds, of one matrix or more."""
+    a = drawn(*lead, size, size, dtype=dtype) + 3 * torch.eye(size, dtype=dtype)
+    gram, b = a @ a.mT + torch.eye(size, dtype=dtype), drawn(*lead, size, 2, dtype=dtype)
+    for upper in (False, True):
+        found, failed = cholesky(gram, upper=upper)
+        yield found, torch.linalg.cholesky(gram, upper=upper)
+        yield failed, torch.linalg.cholesky_ex(gram)[1]
+        yield cholesky_solve(b, found, upper), torch.linalg.solve(gram, b)
+    for upper, left, unit in itertools.product((True, False), repeat=3):
+        right = b if left else b.mT
+        yield (
+            triangular(a / 4, right, upper=upper, left=left, unitriangular=unit),
+            torch.linalg.solve_triangular(a / 4, right, upper=upper, left=left, unitriangular=unit),
+        )
+    inverted, failed = inverse(a)
+    yield inverted, torch.linalg.inv(a)
+    yield failed, torch.linalg.inv_ex(a)[1]
+    yield solve_definite(gram, b[..., 0]), torch.linalg.solve(gram, b[..., :1]).squeeze(-1)
+    for right, options in ((b, {}), (b.mT, {"left": False}), (b[..., 0], {})):
+        if right.dim() == a.dim() or lead != ():
+            solution, factor, pivots, info = solve(a, right, **options)
+            wanted = torch.linalg.solve_ex(a, right, **options)
+            yield solution, wanted[0]
+            yield info, wanted[1]
+            assert factor.isnan().all()
+            assert factor.shape == a.shape
+            assert pivots.dtype == torch.int32
+            assert bool((pivots == -1).all())
+            assert pivots.shape == a.shape[:-1]
+    q, r = orthogonal(a)
+    yield q @ r, a
+    yield q @ q.mT, torch.eye(size, dtype=dtype).expand_as(a)
+    values, vectors = eigen(gram)
+    yield values, torch.linalg.eigvalsh(gram)
+    yield vectors * values.unsqueeze(-2) @ vectors.mT, gram
+    yield eigenvalues(gram), torch.linalg.eigvalsh(gram)
+    for matrix in (a, a.flip(-1), a.roll(1, -1), 0 * a):  # rows change places
+        yield determinant(matrix), torch.linalg.det(matrix)
+    yield from zip(log_determinant(-a), torch.linalg.slogdet(-a), strict=True)
+
+
+@pytest.mark.parametrize("lead", LEADS)
+@pytest.mark.parametrize(
+    ("size", "dtype"), [(1, torch.float64), (2, torch.float32), (4, torch.float64), (9, torch.float64)]
+)
+def test_factorisations_of_any_batch_are_those_of_torch(
+    size: int, lead: tuple[int, ...], dtype: torch.dtype
+) -> None:
+    for found, wanted in pairs(size, lead, dtype):
+        alike(found, wanted, dtype)
+
+
+def test_right_sides_and_matrices_broadcast() -> None:
+    a, b = drawn(3, 3) + 3 * torch.eye(3), drawn(4, 3, 2)
+    alike(solve(a, b)[0], torch.linalg.solve(a, b), torch.float64)
+    alike(solve(drawn(5, 1, 3, 3), b)[0], torch.linalg.solve(drawn(5, 1, 3, 3), b), torch.float64)
+    several = drawn(2, 3, 3) + 3 * torch.eye(3)
+    for right in (drawn(3, 3), drawn(3, 1), drawn(1, 3, 2)):
+        alike(solve(several, right)[0], torch.linalg.solve(several, right), torch.float64)
+        alike(solve(several[:1], right)[0], torch.linalg.solve(several[:1], right), torch.float64)
+    alike(solve(several[0], drawn(3))[0], torch.linalg.solve(several[0], drawn(3)), torch.float64)
+    wide, many = drawn(9, 9) + 5 * torch.eye(9), drawn(4, 9, 2)
+    wanted = torch.linalg.solve_triangular(wide, many, upper=True)
+    alike(triangular(wide, many, upper=True), wanted, torch.float64)
+
+
+@pytest.mark.parametrize("size", [3, 9])
+def test_the_first_pivot_that_is_not_positive_is_told(size: int) -> None:
+    gram = torch.eye(size).double().repeat(5, 1, 1)
+    gram[1, 0, 0], gram[2, 1, 1], gram[3, 2, 2], gram[4, 1, 1] = 0.0, -1.0, torch.nan, 0.0
+    gram[4, 2, 2] = -1.0
+    found = cholesky(gram)[1]
+    assert found.tolist() == [0, 1, 2, 3, 2]
+    assert found.dtype == torch.int32
+    singular = torch.eye(size).double().repeat(3, 1, 1)
+    singular[1, :, 0], singular[2, 2:, 2:] = 0.0, 0.0
+    assert solve(singular, singular)[3].tolist() == [0, 1, 3]
+
+
+def test_pivots_are_the_largest_of_their_columns_in_size() -> None:
+    """Rows that would lose all digits without an exchange, with numbers of either sign."""
+    for head in (1e-20, -1e-20, 0.0):
+        a = torch.tensor([[head, 1.0, 2.0], [-3.0, 1.0, 0.0], [2.0, 5.0, 1.0]], dtype=torch.float64)
+        b = torch.tensor([[1.0], [2.0], [3.0]], dtype=torch.float64)
+        alike(solve(a, b)[0], torch.linalg.solve(a, b), torch.float64)
+        alike(inverse(a)[0], torch.linalg.inv(a), torch.float64)
+        alike(determinant(a), torch.linalg.det(a), torch.float64)
+        alike(log_determinant(a)[1], torch.linalg.slogdet(a)[1], torch.float64)
+
+
+def matrices(size: int, dtype: torch.dtype = torch.float64) -> torch.Tensor:
+    torch.manual_seed(size)
+    some = torch.randn(9, size, size, dtype=dtype)
+    some = some @ some.mT
+    some[0], some[1] = 0.0, 3 * torch.eye(size)
+    some[2] *= 1e-30 if dtype == torch.float32 else 1e-300
+    some[3] *= 1e30 if dtype == torch.float32 else 1e150
+    some[4] = torch.rand(size, dtype=dtype).diag()
+    some[5] -= 7 * torch.eye(size)
+    return some
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("size", [1, 2, 3, 6, 15])
+def test_eigenvalues_are_those_of_lapack_to_rounding_of_the_largest(size: int, dtype: torch.dtype) -> None:
+    given = matrices(size, dtype)
+    wanted = torch.linalg.eigvalsh(given.double())
+    error = (eigenvalues(given).double() - wanted).abs().amax(-1)
+    assert (error <= 16 * torch.finfo(dtype).eps * wanted.abs().amax(-1)).all()
+
+
+def test_eigenvalues_of_a_row_that_is_not_finite_are_nan() -> None:
+    given = matrices(3)
+    given[4, 1, 0] = given[4, 0, 1] = torch.nan
+    found = eigenvalues(given)
+    assert found[4].isnan().all()
+    assert torch.isfinite(found[:4]).all()
+
+
+@pytest.mark.parametrize("size", [1, 2, 5, 13])
+def test_a_definite_system_is_solved_to_the_rounding_of_its_condition(size: int) -> None:
+    torch.manual_seed(size)
+    some, right = torch.randn(9, size, size).double(), torch.randn(9, size).double()
+    gram = some @ some.mT + 0.1 * torch.eye(size)
+    error = solve_definite(gram, right) - torch.linalg.solve(gram, right)
+    assert (error.norm(dim=-1) <= 1e-13 * torch.linalg.cond(gram) * right.norm(dim=-1)).all()
+    gram[..., 0, 1:] = torch.nan  # above the diagonal nothing is read
+    assert solve_definite(gram, right).isfinite().all()
+
+
+# Compiled.
+
+DEFINITE: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
+    "factor": lambda gram, b: torch.linalg.cholesky_ex(gram)[0],
+    "upper factor": lambda gram, b: torch.linalg.cholesky_ex(gram, upper=True)[0],
+    "from a lower factor": lambda gram, b: torch.cholesky_solve(b, gram),
+    "from an upper factor": lambda gram, b: torch.cholesky_solve(b, gram, upper=True),
+    "inverse": lambda gram, b: torch.linalg.inv_ex(gram - gram.new_tensor(4.0).expand(gram.shape))[0],
+}
+for _upper, _left, _unit in itertools.product([True, False], repeat=3):
+    DEFINITE[f"triangle {_upper} {_left} {_unit}"] = lambda gram, b, upper=_upper, left=_left, unit=_unit: (
+        torch.linalg.solve_triangular(gram, b if left else b.mT, upper=upper, left=left, unitriangular=unit)
+    )
+
+
+@pytest.mark.needs_compiler
+def test_programs_factor_and_solve_as_torch_does() -> None:
+    """Four by four written out, nine by nine a row a pass; of other triangles only one is read;
+    a pivot that is not positive, first pivots that are zero, rows that are lost."""
+    torch.manual_seed(1)
+    few, many = (torch.randn(9, size, size).double() for size in (4, 9))
+    grams = [some @ some.mT + torch.eye(some.shape[-1]) for some in (few, many)]
+    grams[1][3] -= 4 * torch.eye(9)
+    singular = [some.clone() for some in (few[:, :3, :3], many)]
+    for some in singular:
+        some[:, 0, 0], some[3], some[4, 0] = 0, 0, torch.nan
+    given = few + 5 * torch.eye(4), many + 5 * torch.eye(9), *grams, *singular, torch.randn(9, 9, 2).double()
+
+    def step(_: object, __: object, row: tuple[Tensor, ...]) -> tuple[tuple[()], dict[str, Any]]:
+        matrix, near, gram, definite, small, large, b = row
+        parts = {name: matrix if "triangle" in name or "from" in name else gram for name in DEFINITE}
+        found: dict[str, Any] = {name: DEFINITE[name](of, b[:, :4]) for name, of in parts.items()}
+        found["of many"] = torch.linalg.cholesky_ex(definite)
+        found["from many"] = torch.cholesky_solve(b, near)
+        found["triangle of many"] = torch.linalg.solve_triangular(near.mT, b, upper=True, unitriangular=True)
+        found["pivots"] = torch.linalg.solve_ex(small, small.mT + 1, left=False)[0]
+        found["many pivots"] = torch.linalg.solve_ex(large, b)[0]
+        found["eigenvalues"] = torch.linalg.eigvalsh(gram)
+        return (), found
+
+    program = lanes.Program(step)
+    assert program.compiles((), (), given, steps=1)
+    found, wanted = (run((), (), given, steps=1)[1] for run in (program, program.definition))
+    (factor, failed), (known, place) = found.pop("of many"), wanted.pop("of many")
+    assert torch.equal(failed, place)
+    assert place[3] > 0
+    fine = [0, 1, 2, 5, 6, 7, 8]
+    torch.testing.assert_close(factor[fine], known[fine], rtol=1e-9, atol=1e-9)
+    for name, one in found.items():
+        rows = fine if "pivots" in name else slice(None)
+        torch.testing.assert_close(
+            one[rows], wanted[name][rows], rtol=1e-9, atol=1e-9, msg=lambda m, n=name: f"{n}: {m}"
+        )
+        assert "pivots" not in name or not one[[3, 4]].isfinite().any()
+
+
+# Orders.
+
+SPECIAL = torch.tensor(
+    [
+        [3.0, torch.nan, 1.0, 3.0, -0.0, 0.0, torch.inf],
+        [2.0, 2.0, torch.nan, torch.nan, -1.0, -torch.inf, 2.0],
+    ]
+)
+NUMBERS = torch.tensor([[3.0, 1.0, 2.0, 3.0, -1.0, 0.5, 2.0], [2.0, 2.0, 5.0, 4.0, -1.0, -7.0, 2.0]])
+
+
+def shapes(x: Tensor) -> Iterator[tuple[Tensor, int]]:
+    yield x, -1
+    yield x, 1
+    yield x.mT.contiguous(), 0
+    yield x[0], 0
+    yield x.unsqueeze(1), 2
+    yield x.mT.unsqueeze(0), -2
+
+
+def test_orders_and_running_extremes_are_those_of_torch_along_any_dimension() -> None:
+    for x, dim in (*shapes(SPECIAL), *shapes(NUMBERS)):
+        for name in ("cummax", "cummin"):
+            for one, other in zip(
+                getattr(replacements, name)(x, dim), getattr(torch, name)(x, dim), strict=True
+            ):
+                alike(one, other, torch.float32)
+        for keep in (False, True):
+            found, wanted = replacements.median(x, dim, keep), torch.median(x, dim, keep)
+            alike(found[0], wanted[0], torch.float32)
+            alike(
+                torch.gather(x, dim, found[1] if keep else found[1].unsqueeze(dim)).squeeze(dim),
+                wanted[0].squeeze(dim) if keep else wanted[0],
+                torch.float32,
+            )
+        alike(replacements.median(x), torch.median(x), torch.float32)
+        alike(replacements.cumprod(x, dim), torch.cumprod(x, dim), torch.float32)
+        alike(
+            replacements.cumprod(x, dim, dtype=torch.float64),
+            torch.cumprod(x, dim, dtype=torch.float64),
+            torch.float32,
+        )
+    assert replacements.median(NUMBERS, -1)[0].shape == (2,)
+    for x, dim in shapes(NUMBERS):
+        for k, keep in ((1, False), (3, True), (7, False)):
+            alike(
+                replacements.kthvalue(x, k, dim, keep)[0], torch.kthvalue(x, k, dim, keep)[0], torch.float32
+            )
+        for largest in (True, False):
+            alike(replacements.topk(x, 3, dim, largest)[0], torch.topk(x, 3, dim, largest)[0], torch.float32)
+    alike(replacements.topk(NUMBERS, 2)[0], torch.topk(NUMBERS, 2)[0], torch.float32)
+    alike(replacements.sort(NUMBERS)[0], torch.sort(NUMBERS)[0], torch.float32)
+    alike(replacements.kthvalue(NUMBERS, 2)[0], torch.kthvalue(NUMBERS, 2)[0], torch.float32)
+    value, place = replacements.sort(torch.tensor(3.0))
+    assert (value.item(), place.item(), place.dtype) == (3.0, 0, torch.int64)
+
+
+def test_places_in_a_table_are_those_of_torch() -> None:
+    edges, x = torch.tensor([-1.0, 0.0, 0.0, 2.0]), torch.tensor([[-2.0, -1.0, 0.0], [1.0, 2.0, torch.nan]])
+    for options in ({}, {"right": True}, {"side": "right"}, {"side": "left"}):
+        wanted = torch.searchsorted(edges, x, **options)
+        alike(replacements.searchsorted(edges, x, **options), wanted, torch.float32)
+        rows = torch.stack((edges, edges + 1))
+        alike(
+            replacements.searchsorted(rows, x, **options),
+            torch.searchsorted(rows, x, **options),
+            torch.float32,
+        )
+
+
+CALLS: dict[str, Callable[[Callable[..., Any], Tensor], Any]] = {
+    "fmin": lambda f, x: f(x, x.flip(-1)),
+    "fmax": lambda f, x: f(x, x.flip(-1)),
+    "angle": lambda f, x: f(x),
+}
+
+
+@pytest.mark.parametrize("name", CALLS)
+def test_what_is_no_number_is_as_in_torch(name: str) -> None:
+    for x in (SPECIAL, NUMBERS):
+        alike(
+            CALLS[name](getattr(replacements, name), x), CALLS[name](getattr(torch, name), x), torch.float32
+        )
+
+
+def test_variances_of_few_numbers_and_of_other_precision() -> None:
+    x = drawn(3, 4, 5)
+    for dims in ([0], [1, 2], [-1], None):
+        for correction in (0.0, 1.0, 2.0):
+            found = replacements.REPLACEMENTS["prims::var"](x, dims, correction)
+            alike(found, torch.var(x, dims, correction=correction), torch.float64)
+    assert replacements.REPLACEMENTS["prims::var"](x[:1], [0]).isnan().all()
+    single = replacements.REPLACEMENTS["prims::sum"](x.float(), [0], output_dtype=torch.float64)
+    alike(single, x.float().sum(0, dtype=torch.float64), torch.float64)
+    product = replacements.REPLACEMENTS["prims::prod"]
+    alike(
+        product(x.float(), [0, 2], output_dtype=torch.float64),
+        x.float().double().prod(2).prod(0),
+        torch.float64,
+    )
+    assert product(x.float(), [0]).dtype == torch.float32
+
+
+def test_a_search_of_a_number_or_with_a_sorter_has_no_form() -> None:
+    edges = torch.arange(4.0)
+    for x, sorter in ((0.5, None), (edges, torch.arange(4)), (0.5, torch.arange(4))):
+        with pytest.raises(NotLoweredError, match="of a number or with a sorter"):
+            replacements.searchsorted(edges, x, sorter=sorter)
+
+
+# Pivoted Cholesky.
+
+
+def low_rank(seed: int, *batch: int, size: int, rank: int) -> torch.Tensor:
+    half = uniform(*batch, size, rank, seed=seed)
+    return half @ half.mT
+
+
+def reassembled(gram: torch.Tensor) -> torch.Tensor:
+    """L L' with its columns beyond the rank dropped, back in the order of K."""
+    factor, order, _ = found = pivoted_cholesky(gram)
+    kept = factor * found.kept().unsqueeze(-2)
+    position = order.argsort(-1)
+    rows = kept.gather(-2, position.unsqueeze(-1).expand(kept.shape))
+    return rows @ rows.mT
+
+
+@given(seed=SEEDS, size=st.integers(1, 9))
+def test_factor_reproduces_a_positive_definite_matrix(seed: int, size: int) -> None:
+    gram = random_positive_definite(seed, 4, size=size)
+    found = pivoted_cholesky(gram)
+    assert (found.rank == size).all()
+    assert torch.equal(found.factor, found.factor.tril())
+    torch.testing.assert_close(reassembled(gram), gram, rtol=0, atol=1e-14 * size * float(gram.abs().max()))
+
+
+@given(seed=SEEDS, size=st.integers(2, 9), data=st.data())
+def test_rank_of_a_deficient_matrix_is_reported(seed: int, size: int, data: st.DataObject) -> None:
+    rank = data.draw(st.integers(1, size - 1))
+    gram = low_rank(seed, 3, size=size, rank=rank)
+    assert (pivoted_cholesky(gram).rank <= rank).all()
+    torch.testing.assert_close(reassembled(gram), gram, rtol=0, atol=1e-13 * size * float(gram.abs().max()))
+
+
+def test_rank_of_well_separated_deficient_matrices_is_exact() -> None:
+    for rank in range(1, 6):
+        assert (pivoted_cholesky(low_rank(rank, 20, size=6, rank=rank)).rank == rank).all()
+
+
+@given(seed=SEEDS, size=st.integers(1, 8))
+def test_solves_invert_the_matrix(seed: int, size: int) -> None:
+    gram = random_positive_definite(seed, 3, size=size)
+    values = uniform(3, size, seed=seed)
+    found = pivoted_cholesky(gram)
+    solved = found.solve_upper(found.solve_lower(values))
+    torch.testing.assert_close((gram @ solved.unsqueeze(-1)).squeeze(-1), values, rtol=0, atol=1e-11)
+    beta = found.solve_lower(values)  # |beta|^2 = v'K^-1 v, the squared native norm of the interpolant
+    torch.testing.assert_close(beta.square().sum(-1), (values * solved).sum(-1), rtol=1e-10, atol=1e-14)
+
+
+def test_solution_of_a_deficient_system_uses_only_the_pivots_kept() -> None:
+    gram = low_rank(3, 5, size=6, rank=3)
+    weights = uniform(5, 6)
+    values = (gram @ weights.unsqueeze(-1)).squeeze(-1)  # in the range of K, so a solution exists
+    found = pivoted_cholesky(gram)
+    solved = found.solve_upper(found.solve_lower(values))
+    torch.testing.assert_close((gram @ solved.unsqueeze(-1)).squeeze(-1), values, rtol=1e-10, atol=1e-11)
+    assert ((solved != 0).sum(-1) == 3).all()
+
+
+def test_batch_equals_loop() -> None:
+    gram = torch.cat(
+        [
+            random_positive_definite(1, 3, size=5),
+            low_rank(2, 3, size=5, rank=2),
+            torch.zeros(1, 5, 5).double(),
+        ]
+    )
+    values = uniform(7, 5)
+    together = pivoted_cholesky(gram)
+    for row in range(7):
+        alone = pivoted_cholesky(gram[row])
+        assert torch.equal(together.order[row], alone.order)
+        assert torch.equal(together.rank[row], alone.rank)
+        assert torch.equal(together.factor[row], alone.factor)
+        torch.testing.assert_close(
+            together.solve_upper(together.solve_lower(values))[row],
+            alone.solve_upper(alone.solve_lower(values[row])),
+            rtol=1e-13,
+            atol=0,
+        )
+
+
+@pytest.mark.parametrize("poison", [torch.nan, torch.inf])
+def test_a_matrix_that_is_not_finite_has_rank_zero_and_spoils_no_other(poison: float) -> None:
+    clean = random_positive_definite(1, 4, size=4)
+    gram = clean.clone()
+    gram[2, 1, 3] = gram[2, 3, 1] = poison
+    found, expected = pivoted_cholesky(gram), pivoted_cholesky(clean)
+    assert found.rank.tolist() == [4, 4, 0, 4]
+    others = [0, 1, 3]
+    assert torch.equal(found.factor[others], expected.factor[others])
+    assert torch.isinf(condition_number(gram)[others]).sum() == 0
+    assert torch.isnan(condition_number(gram)[2])
+
+
+def test_one_factor_serves_many_right_hand_sides() -> None:
+    gram = random_positive_definite(5, size=4)
+    values = uniform(6, 7, 4)
+    found = pivoted_cholesky(gram)
+    expected = torch.linalg.solve(gram, values.unsqueeze(-1)).squeeze(-1)
+    torch.testing.assert_close(found.solve_upper(found.solve_lower(values)), expected, rtol=1e-9, atol=1e-11)
+
+
+def test_scaling_of_the_matrix_does_not_change_the_rank() -> None:
+    gram = low_rank(7, 4, size=6, rank=4)
+    for scale in (2.0**-600, 1.0, 2.0**600):
+        assert (pivoted_cholesky(gram * scale).rank == 4).all()
+
+
+def test_factorisation_can_be_differentiated() -> None:
+    gram = random_positive_definite(3, size=4, log_condition=1.0).requires_grad_()
+    values = uniform(4)
+
+    def solve(matrix: torch.Tensor) -> torch.Tensor:
+        found = pivoted_cholesky((matrix + matrix.mT) / 2)
+        return found.solve_upper(found.solve_lower(values))
+
+    assert torch.autograd.gradcheck(solve, (gram,))
