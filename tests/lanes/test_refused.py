@@ -1,4 +1,4 @@
-"""A step that is more than a function of its row runs as it was written, and the log says why."""
+"""What has no compiled form runs as it was written, and one line of the log says why and where."""
 
 from __future__ import annotations
 
@@ -15,9 +15,7 @@ from torch import Tensor
 
 import staf_torch as st
 from staf_torch import lanes
-from staf_torch.lanes import Program, compiler
-from staf_torch.lanes import program as programs
-from staf_torch.lanes.alone import undrawn
+from staf_torch.lanes import Program, Shared
 from staf_torch.lanes.content import reads_users_code
 from staf_torch.lanes.function import Rows
 from staf_torch.lanes.tracer import NotLoweredError
@@ -62,20 +60,13 @@ OTHERS: dict[str, tuple[Callable[[Tensor], Tensor], str]] = {
 }
 
 
-@pytest.fixture(autouse=True)
-def _nothing_was_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(programs, "_said", set())
-
-
 @pytest.mark.parametrize("name", OTHERS)
-def test_what_is_no_function_of_a_row_is_not_compiled(
-    name: str, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_no_function_of_a_row_is_not_compiled(name: str, caplog: pytest.LogCaptureFixture) -> None:
     function, reason = OTHERS[name]
-    monkeypatch.setattr(compiler, "function", None)  # which nobody asks in vain
-    program = Program(lambda x, _, __: (x, function(x)))
+    program = Program(lambda x, _, __: (x, function(x)), name=f"{name}, refused")
     assert not program.compiles(X, steps=3)
     (line,) = caplog.messages
+    assert line.startswith(f"{name}, refused runs in plain torch, slower: ")
     assert reason in line
 
 
@@ -200,13 +191,144 @@ def test_loops_are_tried_by_a_few_passes_and_what_they_call_is_still_seen(
     torch.testing.assert_close(found, torch.full_like(rows, 0.2))
 
 
-def test_who_tries_a_program_draws_no_random_numbers() -> None:
-    def states() -> tuple[Tensor, Any, Any]:
-        return torch.get_rng_state(), np.random.get_state()[1].tolist(), random.getstate()  # noqa: NPY002
+Step = Callable[[Tensor, Any, Any], tuple[Any, Any]]
 
-    before = states()
-    with undrawn():
-        torch.rand(3), np.random.rand(3), random.random()  # noqa: NPY002
-    after = states()
-    assert torch.equal(before[0], after[0])
-    assert before[1:] == after[1:]
+
+def mixed_by(share: float, row: int) -> Step:
+    """A step in which one of two rows differs from itself alone by a share of its size."""
+
+    def step(carry: Tensor, now: Any, other: Any) -> tuple[Tensor, Any]:
+        after = carry.clone()
+        after[row if len(carry) > 1 else 0] *= 1.0 + share * (len(carry) > 1)
+        return after, ()
+
+    return step
+
+
+@pytest.mark.parametrize("row", [0, 1])
+@pytest.mark.parametrize(("share", "compiles"), [(0.0, True), (0.009, True), (0.011, False), (0.5, False)])
+def test_a_row_that_another_changes_by_a_hundredth_gives_a_step_away(
+    row: int, share: float, compiles: bool
+) -> None:
+    x = torch.tensor([[1.0, 2.0], [3.0, 4.0]], dtype=torch.float64)
+    assert Program(mixed_by(share, row)).compiles(x, steps=1) is compiles
+
+
+def test_a_step_that_writes_into_its_inputs_is_tried_with_copies() -> None:
+    def step(carry: Tensor, now: Any, row: Any) -> tuple[Tensor, Any]:
+        for part in (carry, *now):
+            part.zero_()
+        return carry + 1, ()
+
+    inputs = torch.rand(4, 2), (torch.rand(4, 3, 2), Shared(torch.rand(3)))
+    before = inputs[0].clone(), inputs[1][0].clone(), inputs[1][1].tensor.clone()
+    assert Program(step).compiles(*inputs)
+    assert torch.equal(Program(step)(*inputs)[0], torch.ones(4, 2))
+    for one, other in zip((inputs[0], inputs[1][0], inputs[1][1].tensor), before, strict=True):
+        assert torch.equal(one, other)
+
+
+def test_other_results_among_others_are_found_out(caplog: pytest.LogCaptureFixture) -> None:
+    count = itertools.count()
+    steps: dict[str, Step] = {
+        "more": lambda c, n, r: (c, (c,) * len(c)),
+        "another shape": lambda c, n, r: (c, c.repeat(1, len(c))),
+        "more each time": lambda c, n, r: (c, (c,) * (1 + next(count))),
+    }
+    for name, step in steps.items():
+        assert not Program(step, name=name).compiles(X, steps=1)
+
+
+# What has no scalar form.
+
+A = torch.tensor([1.0, 2.0], dtype=torch.float64)
+REFUSED: dict[str, tuple[Callable[[Tensor], Any], str]] = {
+    "a value of a row": (lambda x: x if bool(x.sum() > 0) else -x, "reads a value of a row"),
+    "an index of a row": (lambda x: x.nonzero(), "reads a value of a row"),
+    "NumPy": (lambda x: torch.as_tensor(x.numpy()), "`Tensor.numpy` takes numbers of a row out of torch"),
+    "a list": (lambda x: x + x.tolist()[0][0], "`Tensor.tolist` takes numbers of a row out of torch"),
+    "another dtype": (lambda x: x.to(torch.complex128), "has no lanes here"),
+    "bits": (lambda x: x.long() & 1, "logic on the bits of integers"),
+    "random": (lambda x: x + torch.rand(2), "draws random numbers"),
+    "no rows": (lambda x: x.sum(), "an output of the step has no dimension of rows"),
+    "more rows": (lambda x: torch.cat((x, x)), "an output of the step has no dimension of rows"),
+    "an error": (lambda x: x[:, 7], "IndexError"),
+    "a norm": (lambda x: torch.linalg.vector_norm(x, 3, -1), "a norm of order 3"),
+    "an unknown": (lambda x: torch.special.i0(x), "i0"),
+    "a scaled product": (lambda x: torch.addmm(x, x[:, :1], x[:1], beta=2), "a scaled product"),
+    "a scatter that reduces": (
+        lambda x: x.scatter_reduce(1, x.argsort(), x, reduce="amax"),
+        "scatter_reduce",
+    ),
+    "added at an index of a row": (
+        lambda x: x.index_put((torch.tensor([0]), x.argmax(-1)), x[:, 0], accumulate=True),
+        "`aten.index_put` at an index that the row computes",
+    ),
+    "written at an index that was captured": (
+        lambda x: x.index_put((torch.tensor([0]), A.argsort()[:1]), x[:, 0]),
+        "`aten.index_put` at an index that the row computes",
+    ),
+    "two indices": (
+        lambda x: x[torch.tensor([0]), x.argmax(-1)],
+        "`aten.index` at an index that the row computes",
+    ),
+    "rsub with alpha": (lambda x: torch.rsub(x, x, alpha=2), "has no scalar form here"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_an_operation_without_a_scalar_form_is_named_with_its_line(name: str) -> None:
+    function, why = REFUSED[name]
+    program = Program(lambda carry, now, row: (carry, function(row)))
+    with pytest.raises(NotLoweredError) as error:
+        program.text(X[:, 0], (), X, steps=1)
+    assert why in str(error.value)
+    assert name in ("no rows", "more rows") or f"{__name__.rpartition('.')[2]}.py" in str(error.value)
+
+
+def test_a_carry_keeps_its_shapes_its_kinds_and_its_tree() -> None:
+    x = torch.ones(2, 3)
+    changes: tuple[Callable[[Tensor], Any], ...] = (
+        *(lambda c: c[:, :2], lambda c: c.double(), lambda c: (c,), lambda c: {"c": c}),
+    )
+    for after in changes:
+        with pytest.raises(NotLoweredError, match="a carry of other shapes or dtypes than it was given"):
+            Program(lambda c, n, r, f=after: (f(c), ())).text(x, steps=1)
+
+
+def test_what_cannot_be_compiled_is_told_once_and_runs(caplog: pytest.LogCaptureFixture) -> None:
+    program = Program(lambda x, _, __: (torch.special.i0(x), x), name="the odd one")
+    for _ in range(2):
+        found = program(X, steps=2)[0]
+    (line,) = caplog.messages
+    assert line.startswith("the odd one runs in plain torch, slower: ")
+    assert torch.equal(found, torch.special.i0(torch.special.i0(X)))
+
+
+def test_an_error_while_tracing_leaves_the_definition(caplog: pytest.LogCaptureFixture) -> None:
+    class Odd:
+        def __init__(self) -> None:
+            self.called = 0
+
+        def __call__(self, x: Tensor) -> Tensor:
+            self.called += 1
+            if self.called == 1:  # a program is traced first
+                raise KeyError("lost while tracing")
+            return 2 * x
+
+    odd = Odd()
+    program = Program(lambda carry, now, row: (carry, odd(row)), name="one with an error")
+    assert torch.equal(program(X, X.unsqueeze(1), X)[1][:, 0], 2 * X)
+    assert "KeyError" in caplog.text
+
+
+def test_a_text_that_would_take_a_compiler_minutes_is_not_given_to_it(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    def step(x: Tensor, now: Any, row: Any) -> tuple[Tensor, Any]:
+        for _ in range(11_000):
+            x = x.sin()
+        return x, ()
+
+    assert not Program(step, name="a long one").compiles(X, steps=1)
+    assert "lines long, which take a compiler minutes" in caplog.text
