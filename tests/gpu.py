@@ -11,8 +11,8 @@ import time
 import torch
 
 from staf_torch import lanes
-from tests.lanes.test_program import pendulum
-from tests.lanes.test_scalar_text import flow, given
+from tests.lanes.test_c_and_cuda import flow, given
+from tests.lanes.test_programs import pendulum
 
 
 def main() -> int:

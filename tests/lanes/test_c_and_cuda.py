@@ -1,4 +1,4 @@
-"""Programs as plain C and as CUDA C: the numbers are those of the definition."""
+"""Programs as plain C, as CUDA C and on a device that has no numbers: what they compute is the definition."""
 
 from __future__ import annotations
 
@@ -11,13 +11,16 @@ from typing import Any
 
 import pytest
 import torch
+from recorded import Record
 from torch import Tensor
 
-from staf_torch import lanes, optim
+from staf_torch import StaFBasis, adp, centers, kernels, lanes, optim, systems, targets
+from staf_torch.adp.closed_loop import ClosedLoop
+from staf_torch.metrics.ball_error import StateErrorPass
 from staf_torch.optim.objective import NativeError, Precomputed
 
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-O1", "-shared", "-fPIC")
-pytestmark = pytest.mark.skipif(shutil.which("gcc") is None, reason="no C compiler")
+needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason="no C compiler")
 
 
 def flow(carry: Any, u: Tensor, row: Any) -> Any:
@@ -51,6 +54,7 @@ def pointer(tensor: Tensor) -> ctypes.c_void_p:
     return ctypes.c_void_p(tensor.data_ptr())
 
 
+@needs_gcc
 @pytest.mark.parametrize(("dtype", "bound"), [(torch.float64, 1e-12), (torch.float32, 2e-5)])
 def test_c_of_a_step_is_the_definition(dtype: torch.dtype, bound: float, tmp_path: Path) -> None:
     carry, u, row = given(1, dtype)
@@ -75,7 +79,8 @@ def test_c_of_a_step_is_the_definition(dtype: torch.dtype, bound: float, tmp_pat
     assert state[2:].tolist() == [9.0, float(end["above"][0])]
 
 
-@pytest.mark.parametrize("law", [optim.SteepestDescent(), optim.ConjugateGradient(), optim.BarzilaiBorwein()])
+@needs_gcc
+@pytest.mark.parametrize("law", [optim.ConjugateGradient(), optim.BarzilaiBorwein()])
 def test_c_of_a_learning_step_is_the_definition(law: optim.UpdateLaw, tmp_path: Path) -> None:
     factor = torch.randn(1, 4, 6, 6, dtype=torch.float64)
     gram = factor @ factor.mT + 5 * torch.eye(6, dtype=torch.float64)
@@ -103,13 +108,62 @@ def test_c_of_a_learning_step_is_the_definition(law: optim.UpdateLaw, tmp_path: 
     torch.testing.assert_close(found, program.definition(start, (gram, values))[1][0], rtol=1e-12, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", ["9x", "state", "t3", "a-b"])
+def moved(carry: Any, now: Any, row: Any) -> tuple[Any, Any]:
+    return {"x": carry["x"] + now * row["gain"]}, (carry["x"], now)
+
+
+def test_a_header_starts_with_the_first_row_and_has_the_names_of_its_trees() -> None:
+    carry = {"x": torch.tensor([[0.5, 2.0], [7.0, 9.0]], dtype=torch.float64)}
+    given = carry, torch.ones(2, 4, 2).double(), {"gain": torch.ones(2, 1).double()}
+    text = lanes.Program(moved).c_source("go", *given, note="a word")
+    assert " * a word\n" in text
+    for part in ("state->x[0] = 0.5;", "state->x[1] = 2.0;", "const double now[2]", "const double gain[1]"):
+        assert part in text
+    assert "double out0[2], double out1[2])" in text
+    named = lanes.Program(moved).c_source("go", *given, outputs=["a", "b"])
+    assert "/*" not in named
+    assert "double a[2], double b[2])" in named
+
+
+@pytest.mark.parametrize("name", ["9x", "state", "t3", "a-b", "double"])
 def test_a_name_that_c_does_not_take_is_refused(name: str) -> None:
     program = lanes.Program(lambda x, _, __: (x, x))
     with pytest.raises(ValueError, match="names of C"):
         program.c_source("f", torch.ones(1), outputs=[name])
 
 
+VERSION = ".".join(torch.__version__.split(".")[:2])
+TEXTS: dict[str, Callable[[], str]] = {
+    "C of a step": lambda: lanes.Program(moved).c_source(
+        "go", {"x": torch.ones(1, 2)}, torch.ones(1, 1, 2), {"gain": torch.ones(1, 1)}
+    ),
+    "C of a loop": lambda: lanes.Program(
+        lambda x, u, _: (lanes.repeat(9, lambda z: 0.5 * (z + u / z), x, where=lambda z: z * z > u), ())
+    ).c_source("root", torch.ones(1), torch.ones(1, 1)),
+    "C++ of a step": lambda: lanes.Program(moved, copies=1).text(
+        {"x": torch.ones(1, 2)}, torch.ones(1, 1, 2), {"gain": torch.ones(1, 1)}
+    ),
+    "C++ of many entries": lambda: lanes.Program(
+        lambda x, u, _: (torch.where(x > 1, 0.5 * x.roll(1, -1), x) + u.unsqueeze(-1), x.sum(-1)), copies=2
+    ).text(torch.ones(1, 65), torch.ones(1, 1)),
+    "CUDA of a step": lambda: (
+        lanes.cuda.Kernel(
+            lanes.Program(moved),
+            *({"x": torch.ones(1, 2)}, torch.ones(1, 1, 2), {"gain": lanes.Shared(torch.ones(1))}),
+            compile=lambda source, name: lambda *_: None,
+        ).source
+    ),
+}
+
+
+@pytest.mark.parametrize("name", TEXTS)
+def test_the_text_of_a_small_program_is_the_recorded(name: str, record: Record) -> None:
+    """Under the torch with which it was recorded: what torch makes of a function is its own."""
+    if record.known().get("torch", VERSION) == VERSION:
+        record({"torch": VERSION, "text": TEXTS[name]()})
+
+
+@needs_gcc
 @pytest.mark.parametrize(("dtype", "bound"), [(torch.float64, 1e-12), (torch.float32, 2e-5)])
 def test_cuda_text_on_a_host_is_the_definition(dtype: torch.dtype, bound: float, tmp_path: Path) -> None:
     """No device is needed: g++ compiles the kernel, a loop is the grid."""
@@ -147,3 +201,63 @@ def host_compiler(folder: Path) -> Callable[[str, str], Callable[..., None]]:
         return run
 
     return compile
+
+
+# No step reads a tensor back to the host: on the meta device, which has no numbers, that would raise.
+
+DIRECTIONS = torch.tensor([[1.0, 0.0], [-0.5, 0.8], [-0.5, -0.8]], dtype=torch.float64)
+
+
+@pytest.mark.parametrize("kernel", [kernels.ExponentialKernel(), kernels.GaussianKernel(1.0)])
+@pytest.mark.parametrize("radius", [0.3, centers.StateRadius(0.7, 0.01)])
+@pytest.mark.parametrize("law", [optim.SteepestDescent(), optim.ConjugateGradient(), optim.Nesterov()])
+def test_a_chase_on_a_device_stays_there(kernel: Any, radius: Any, law: optim.UpdateLaw) -> None:
+    following = centers.StateFollowingCenters(DIRECTIONS, radius)
+
+    def step(carry: Any, x: Tensor, _: Any) -> Any:
+        near = following(x)
+        gram = kernel(near, near)
+        objective = NativeError(gram, near.square().sum(-1), Precomputed(extremes=torch.ones_like(x) * 2.0))
+        carry = carry[0], law.begin(objective, *carry)
+        carry = lanes.repeat(2, lambda c: law.step(objective, *c), carry)
+        return carry, carry[0]
+
+    states = torch.empty(5, 4, 2, dtype=torch.float64, device="meta")
+    weights = states.new_empty(5, 3)
+    end, history = lanes.Program(step)((weights, law.init(weights)), states)
+    assert end[0].device.type == history.device.type == "meta"
+    assert history.shape == (5, 4, 3)
+
+
+def test_the_meta_device_notices_a_value_that_is_read() -> None:
+    x = torch.empty(3, 2, device="meta")
+    with pytest.raises((RuntimeError, NotImplementedError), match="meta"):
+        lanes.Program(lambda x, _, __: (x if bool((x > 0).all()) else -x, ()))(x, steps=1)
+
+
+@pytest.mark.parametrize("kernel", [kernels.ExponentialKernel, kernels.GaussianKernel, kernels.MaternKernel])
+@pytest.mark.parametrize("radius", [0.3, centers.StateRadius(0.7, 0.01)])
+def test_the_errors_around_states_on_a_device_stay_there(kernel: Any, radius: Any) -> None:
+    basis = StaFBasis(kernel(), centers.StateFollowingCenters(DIRECTIONS, radius)).to("meta")
+    x = torch.empty(3, 6, 2, dtype=torch.float64, device="meta")
+    ideal = basis.ideal_weights(x, targets.Paper())
+    errors = StateErrorPass(basis, targets.Paper())(x, ideal, ideal)
+    assert {(part.device.type, tuple(part.shape)) for part in errors} == {("meta", (3, 6))}
+
+
+@pytest.mark.parametrize("law", [adp.laws.Information, adp.laws.Published, adp.laws.Frozen])
+def test_a_learning_closed_loop_on_a_device_stays_there(law: Any) -> None:
+    plant, cost = systems.TwoState(), adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
+    following = centers.StateFollowingCenters(DIRECTIONS, centers.StateRadius(0.7, 1e-5))
+    basis = adp.StaFValueBasis(StaFBasis(kernels.AnchoredKernel(kernels.ExponentialKernel()), following))
+    points = adp.RandomPoints(1, centers.StateRadius(2.1, 1e-5))
+    loop = ClosedLoop(adp.ActorCritic(basis, plant, cost, points, law()), plant, cost, dt=1e-3).to("meta")
+    x0 = torch.empty(3, 2, dtype=torch.float64, device="meta")
+    state, u = loop(loop.init(x0), x0.new_empty(3, loop.controller.draws, 2))
+    assert {part.device.type for part in (u, state.x, state.alive, state.cost, *state.carried)} == {"meta"}
+
+
+def test_a_rollout_policy_on_a_device_stays_there() -> None:
+    plant, cost = systems.TwoState(), adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
+    policy = adp.RolloutPolicy.of_lqr(plant, cost, steps=2).to("meta")
+    assert policy(torch.empty(3, 2, dtype=torch.float64, device="meta")).device.type == "meta"
