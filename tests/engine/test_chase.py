@@ -1,19 +1,22 @@
-"""The gradient chase: its inequality, its rows, its pieces."""
+"""The gradient chase: its inequality, its rows, its pieces; its weights alone are the same weights."""
 
 from __future__ import annotations
 
 import dataclasses
 import re
+import threading
+from typing import Any
 
 import pytest
 import torch
 from helpers import basis_of, tensor, uniform
+from helpers_chase import BASES, LAW, circles
+from torch import Tensor
 from variants import KERNELS, LAWS, PAPER_LAW, over
 
 import staf_torch as st
-from staf_torch import systems
-from staf_torch.engine import ChaseResult, chase_pieces
-from staf_torch.engine import api as engine
+from staf_torch import chase, chase_weights, optim, systems, targets
+from staf_torch.engine import ChaseResult, chase_pieces, chunk_length
 from staf_torch.engine.result import concatenate
 from staf_torch.numerics.linalg import condition_number
 from staf_torch.optim import SteepestDescent
@@ -113,24 +116,6 @@ def test_a_row_that_is_not_finite_freezes_alone_and_is_reported(name: str, poiso
             assert torch.isnan(found[key][row, first:]).all(), key
 
 
-@pytest.mark.parametrize("kernel", ["gaussian", "exponential"])
-def test_weights_of_a_frozen_row_stay_what_they_last_were(kernel: str) -> None:
-    states = orbit(*STARTS)
-    states[1, 17:] = torch.nan
-    weights = run(states, kernel).weights[1]
-    assert torch.equal(weights[17:], weights[16].expand(24, 3))
-
-
-def test_a_row_that_is_never_finite_keeps_its_first_weights() -> None:
-    states = orbit(*STARTS)
-    states[2] = torch.nan
-    first = uniform(3)
-    result = run(states, "gaussian", weights=first)
-    assert result.diverged_at.tolist() == [-1, -1, 0, -1]
-    assert result.diverged.tolist() == [False, False, True, False]
-    assert torch.equal(result.weights[2], first.expand(41, 3))
-
-
 def test_a_target_that_is_not_finite_somewhere_freezes_only_the_row_that_goes_there() -> None:
     states = orbit((1.0, 0.0), (0.4, 0.0), steps=126)
 
@@ -142,34 +127,24 @@ def test_a_target_that_is_not_finite_somewhere_freezes_only_the_row_that_goes_th
     assert torch.isfinite(result.estimate[1]).all()
 
 
-@pytest.mark.parametrize("size", [1, 3000, 100_000])
 @pytest.mark.parametrize("kernel", ["exponential", "user_defined"])
-def test_length_of_the_pieces_does_not_change_the_result(
-    size: int, kernel: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    states = orbit(*STARTS)
+@pytest.mark.parametrize("sizes", [[1] * 41, [5, 1, 35], [40, 1]])
+def test_the_length_of_pieces_does_not_change_the_result(sizes: list[int], kernel: str) -> None:
+    states, basis = orbit(*STARTS), basis_of(kernel, count=3, radius=0.3)
     states[2, 11:] = torch.inf
     whole = fields(run(states, kernel))
-    monkeypatch.setattr(engine, "_WORKING_BYTES", size)
-    assert engine.chunk_length(4, basis_of(kernel, 3), 8) < 41 or size > 3000
-    for key, value in fields(run(states, kernel)).items():
+    pieces = chase_pieces(states.split(sizes, dim=1), basis, Paper(), SteepestDescent())
+    for key, value in fields(concatenate(pieces)).items():
         torch.testing.assert_close(value, whole[key], rtol=1e-12, atol=1e-12, equal_nan=True)
 
 
-def test_pieces_of_a_user_are_those_of_the_whole() -> None:
-    states, basis = orbit(*STARTS), basis_of("matern52", 3)
-    parts = chase_pieces(states.split([5, 1, 35], dim=1), basis, Paper(), SteepestDescent())
-    weights = torch.cat([part.weights for part in parts], dim=1)
-    whole = st.chase(states, basis, Paper(), SteepestDescent()).weights
-    torch.testing.assert_close(weights, whole, rtol=1e-12, atol=1e-12)
-
-
-def test_working_memory_bounds_the_length_of_a_piece() -> None:
+def test_a_long_history_is_chased_in_pieces_of_some_64_megabytes() -> None:
     basis = basis_of("exponential", 3)
-    assert engine.chunk_length(10**9, basis, 8) == 1
-    lengths = [engine.chunk_length(batch, basis, 8) for batch in (1, 10, 100)]
+    lengths = [chunk_length(batch, basis, 8) for batch in (1, 10, 100, 10**9)]
     assert lengths == sorted(lengths, reverse=True)
-    assert lengths[0] * 4 * 9 * 8 <= engine._WORKING_BYTES
+    assert lengths[-1] == 1
+    for batch, length in zip((1, 10, 100), lengths, strict=False):
+        assert 2**24 < batch * length * 4 * 9 * 8 <= 2**26  # four matrices a time
 
 
 @over(KERNELS)
@@ -301,3 +276,90 @@ def test_pieces_of_time_are_one_result_again(ends: tuple[int, ...], certificate:
         )
         for a, b in pairs:
             assert (a is b is None) or torch.equal(a, b), field.name
+
+
+# The weights alone.
+
+
+@pytest.mark.parametrize("name", BASES)
+def test_chase_weights_are_those_of_chase(name: str) -> None:
+    states, basis = circles(9, 12), BASES[name]
+    want = chase(states, basis, Paper(), LAW, inner_steps=3).weights
+    options = {"basis": basis, "target": Paper(), "law": LAW, "inner_steps": 3}
+    atol = 1e-8 * float(want.abs().max())
+    pieces = list(states.split(5, dim=1))
+    for got in (chase_weights(states, **options), chase_weights(pieces, **options)):
+        torch.testing.assert_close(got.weights, want, rtol=0, atol=atol)
+    last = chase_weights(pieces, **options, history=False).weights
+    torch.testing.assert_close(last, want[:, -1:], rtol=0, atol=atol)
+
+
+@pytest.mark.filterwarnings("ignore:`torch.jit.script`")  # inside torch.func.jvp of torch 2.13
+def test_gradients_flow_through_chase_weights() -> None:
+    states, basis = circles(2, 3), BASES["exponential, moving radius"]
+
+    def final(first: Tensor) -> Tensor:
+        result = chase_weights(states, basis, targets.Quadratic(), LAW, inner_steps=2, weights=first)
+        return result.weights[:, -1]
+
+    first = torch.ones(2, 3, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(final, (first,))
+    _, tangent = torch.func.jvp(final, (first.detach(),), (torch.ones_like(first),))
+    assert bool((tangent != 0).any())
+
+
+@pytest.mark.parametrize("run_chase", [chase, chase_weights])
+def test_a_row_that_is_lost_keeps_the_last_weights_it_had_or_the_first(run_chase: Any) -> None:
+    states, first = circles(3, 8), uniform(10, seed=1)
+    states[1, 0], states[2, 4:] = torch.nan, torch.inf
+    result = run_chase(states, BASES["gaussian"], Paper(), LAW, weights=first)
+    assert result.diverged_at.tolist() == [-1, 0, 4]
+    assert result.diverged.tolist() == [False, True, True]
+    assert bool(torch.isfinite(result.weights).all())
+    torch.testing.assert_close(result.weights[1], first.expand(8, -1), rtol=1e-13, atol=0)
+    assert torch.equal(result.weights[2, 4:], result.weights[2, 3].expand(4, -1))
+
+
+@pytest.mark.parametrize("given", [torch.zeros(3, 2), torch.zeros(2, 0, 2), torch.zeros(2, 3, 5)])
+def test_chase_weights_refuses_states_of_another_shape(given: Tensor) -> None:
+    with pytest.raises(ValueError, match=r"`chase_weights\(states=\.\.\.\)` must"):
+        chase_weights(given.double(), BASES["exponential"], Paper(), LAW)
+
+
+def test_chase_weights_refuses_no_piece_at_all() -> None:
+    with pytest.raises(ValueError, match="at least one piece"):
+        chase_weights([], BASES["exponential"], Paper(), LAW)
+
+
+@pytest.mark.parametrize("name", BASES)
+@pytest.mark.parametrize(
+    "law", [optim.Exact(), optim.NormalisedLMS(), optim.Nesterov()], ids=lambda law: type(law).__name__
+)
+def test_chase_weights_gives_every_law_what_it_needs(name: str, law: optim.UpdateLaw) -> None:
+    states, basis = circles(9, 12), BASES[name]
+    want = chase(states, basis, Paper(), law, inner_steps=3).weights
+    got = chase_weights(states, basis, Paper(), law, inner_steps=3).weights
+    torch.testing.assert_close(got, want, rtol=0, atol=1e-8 * float(want.abs().max()))
+
+
+@pytest.mark.parametrize("run_chase", [chase, chase_weights])
+def test_a_users_target_is_called_from_one_thread_with_all_rows_in_memory_order(run_chase) -> None:
+    states = circles(200, 4)
+    seen = []
+
+    def target(x: Tensor) -> Tensor:
+        seen.append((threading.get_ident(), x.shape[0]))
+        return x.view(-1, 2).square().sum(-1).view(x.shape[:-1])
+
+    got = run_chase(states, BASES["exponential"], target, LAW).weights
+    assert set(seen) == {(threading.get_ident(), 200)}
+    want = run_chase(states, BASES["exponential"], targets.Quadratic(), LAW).weights
+    torch.testing.assert_close(got, want, rtol=0, atol=1e-8 * float(want.abs().max()))
+
+
+def test_a_piece_keeps_its_record_of_divergence_when_the_next_one_diverges() -> None:
+    states = circles(3, 8)
+    states[1, 6] = torch.nan
+    first, second = chase_pieces(states.split(4, dim=1), BASES["exponential"], Paper(), LAW)
+    assert first.diverged_at.tolist() == [-1, -1, -1]
+    assert second.diverged_at.tolist() == [-1, 6, -1]
