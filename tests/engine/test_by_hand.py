@@ -1,7 +1,7 @@
 """The chase by its equations alone: row by row, time by time, in the paper's weights, K formed and solved.
 
-Every way of the library must find the same: the definition in one chunk and in chunks, and the row program,
-run here in plain torch.
+Every way of the library must find the same: the definition in one piece and in pieces, and the step of a row,
+which is what is compiled, in plain torch.
 """
 
 from __future__ import annotations
@@ -19,12 +19,14 @@ from torch import Tensor
 
 import staf_torch as st
 from staf_torch import chase, chase_weights, optim, predictors
-from staf_torch.engine import api, chase_pieces, row_program
+from staf_torch.engine import ChaseResult, chase_pieces
+from staf_torch.engine.problem import Problem
+from staf_torch.engine.quantities import with_certificate
+from staf_torch.engine.recursion import start
 from staf_torch.engine.result import concatenate
-from staf_torch.lanes.program import Program
+from staf_torch.engine.row_program import Step, first_carry
+from staf_torch.lanes import Program
 from staf_torch.targets import Paper
-
-pytestmark = pytest.mark.compiled
 
 ITERATIONS, FIRST = 2, tensor([[0.3, -0.2, 0.5], [0.0, 0.1, -0.4]])
 TIMES = 7
@@ -135,22 +137,44 @@ def by_hand(kind: str, name: str, row_number: int) -> dict[str, Tensor]:
     return {each: torch.stack(parts) for each, parts in found.items()}
 
 
-@pytest.fixture(params=["definition", "chunks", "program", "program in pieces"])
-def run(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
-    """A chase in one of four ways."""
-    way: str = request.param
-    monkeypatch.setattr(Program, "compiles", lambda self, *given: True)
-    monkeypatch.setattr(Program, "__call__", Program.definition)
-    monkeypatch.setattr(row_program, "_SHORTEST", 1 if "program" in way else 10**9)
-    if way == "chunks":
-        monkeypatch.setattr(api, "chunk_length", lambda *_, **__: 3)
+def in_pieces(states: Tensor, *given: Any, **options: Any) -> ChaseResult:
+    return concatenate(list(chase_pieces(states.split([1, 2, 1, TIMES - 4], 1), *given, **options)))
 
-    def run(states: Tensor, *given: Any, **options: Any) -> Any:
-        if way != "program in pieces":
-            return chase(states, *given, **options)
-        return concatenate(list(chase_pieces(states.split([1, 2, 1, TIMES - 4], 1), *given, **options)))
 
-    return run
+def by_steps(
+    states: Tensor,
+    basis: st.StaFBasis,
+    target: Callable[[Tensor], Tensor],
+    law: optim.UpdateLaw,
+    *,
+    inner_steps: int = 10,
+    predictor: Any = None,
+    weights: Tensor | None = None,
+    certificate: bool = False,
+) -> ChaseResult:
+    """The step of a row, time after time in plain torch; its weights alone are the same."""
+    problem = Problem("chase", basis, target, law, inner_steps, predictor, certificate)
+    carry = first_carry(problem, start(problem, states, weights))
+    after, out = Program(Step(problem, True), compile=False)(carry, states)
+    few = Program(Step(problem, False), compile=False)(carry, states)[1].weights
+    result = out.numbers.result(states, after.chase.diverged_at)
+    torch.testing.assert_close(few, result.weights, rtol=1e-9, atol=1e-11)
+    if not certificate:
+        return result
+    return with_certificate(result, out.certificate, torch.zeros_like(result.value, dtype=torch.bool))
+
+
+WAYS: dict[str, Callable[..., ChaseResult]] = {
+    "definition": chase,
+    "in pieces": in_pieces,
+    "by steps": by_steps,
+}
+
+
+@pytest.fixture(params=WAYS)
+def run(request: pytest.FixtureRequest) -> Callable[..., ChaseResult]:
+    """A chase in one of three ways."""
+    return WAYS[request.param]
 
 
 PAIRS = [
@@ -234,52 +258,38 @@ LAWS = {
 
 
 @pytest.mark.parametrize(("law", "name"), [*zip(LAWS, itertools.cycle(BASES), strict=False)])
-def test_every_way_of_a_chase_finds_the_same(name: str, law: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_way_of_a_chase_finds_the_same(name: str, law: str) -> None:
     """Of all results and of the weights alone, with every time recorded and with the last one."""
-    given = BASES[name], Paper(), LAWS[law]
+    given, options = (BASES[name], Paper(), LAWS[law]), {"inner_steps": ITERATIONS, "weights": FIRST}
     spoilt = STATES.clone()
     spoilt[1, 4] = torch.inf
-    monkeypatch.setattr(Program, "compiles", lambda self, *given: True)
-    monkeypatch.setattr(Program, "__call__", Program.definition)
-    ways = {"definition": (10**9, 99), "chunks": (10**9, 4), "program": (1, 99)}
-    for states, predictor in ((STATES, None), (spoilt, predictors.Secant())):
-        found = {}
-        options = {"inner_steps": 2, "weights": FIRST[0], "predictor": predictor}
-        for way, (shortest, length) in ways.items():
-            monkeypatch.setattr(row_program, "_SHORTEST", shortest)
-            monkeypatch.setattr(api, "chunk_length", lambda *_, n=length, **__: n)
-            found[way] = chase(states, *given, **options)
-            for pieces in (states if way == "chunks" else iter(states.split([1, 2, 4], 1)),):
-                alone = chase_weights(pieces, *given, **options)
-                torch.testing.assert_close(alone.weights, found[way].weights, rtol=1e-8, atol=1e-10)
-                assert torch.equal(alone.diverged_at, found[way].diverged_at)
-                assert torch.equal(alone.diverged, found[way].diverged)
-            last = chase_weights(states.split([2, 5], 1), *given, **options, history=False)
-            torch.testing.assert_close(last.weights, found[way].weights[:, -1:], rtol=1e-8, atol=1e-10)
-        for way in ("chunks", "program"):
+    for states in (STATES, spoilt):
+        whole = chase(states, *given, **options)
+        for way in (in_pieces, by_steps):
+            found = way(states, *given, **options)
             for each in ("weights", "estimate", "estimate_before", "value", "coefficients"):
-                one, other = getattr(found[way], each), getattr(found["definition"], each)
+                one, other = getattr(found, each), getattr(whole, each)
                 torch.testing.assert_close(one, other, rtol=1e-7, atol=1e-9, equal_nan=True)
-            assert found[way].diverged_at.tolist() == found["definition"].diverged_at.tolist()
+            assert torch.equal(found.diverged_at, whole.diverged_at)
+        for pieces in (states, iter(states.split([1, 2, 4], 1))):
+            alone = chase_weights(pieces, *given, **options)
+            torch.testing.assert_close(alone.weights, whole.weights, rtol=1e-8, atol=1e-10)
+            assert torch.equal(alone.diverged_at, whole.diverged_at)
+        last = chase_weights(states.split([2, 5], 1), *given, **options, history=False)
+        torch.testing.assert_close(last.weights, whole.weights[:, -1:], rtol=1e-8, atol=1e-10)
 
 
-@pytest.mark.parametrize("way", ["definition", "program"])
 @pytest.mark.parametrize("run_all", [True, False])
-def test_a_reach_beyond_one_is_warned_of_once_in_however_many_pieces(
-    way: str, run_all: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_reach_beyond_one_is_warned_of_once_in_however_many_pieces(run_all: bool) -> None:
     """Also where the first piece has none, and by a state that is not the last."""
-    monkeypatch.setattr(Program, "compiles", lambda self, *given: True)
-    monkeypatch.setattr(Program, "__call__", Program.definition)
-    monkeypatch.setattr(row_program, "_SHORTEST", 1 if way == "program" else 10**9)
     basis = st.StaFBasis(st.ExponentialKernel(), st.StateFollowingCenters(st.rings(3), 0.5))
     states = 0.5 * circles(2, 12)
     states[1, 5] *= 6.0  # |x| r = 1.2 or so
     states[0, 9] *= 9.0
     worst = [float(0.5 * states[:, at].norm(dim=-1).max()) for at in (slice(4, 8), slice(8, 12))]
-    run: Callable[..., Any] = (lambda *given: list(chase_pieces(*given))) if run_all else chase_weights
-    with pytest.warns(UserWarning, match=f"r = {worst[0]:.3g} > 1") as seen:
-        run(states.split(4, dim=1), basis, Paper(), LAW)
+    chased: Callable[..., Any] = (lambda *given: list(chase_pieces(*given))) if run_all else chase_weights
+    with pytest.warns(UserWarning, match=f"r = {worst[0]:.3g} > 1.*Shrink the radius") as seen:
+        chased(states.split(4, dim=1), basis, Paper(), LAW)
     assert len(seen) == 1
     assert worst[1] > 1
     chase(0.4 * states[:1, :4], basis, Paper(), LAW)  # nothing to say
@@ -316,14 +326,6 @@ def test_what_a_law_does_not_ask_for_is_not_computed() -> None:
                 torch.testing.assert_close(part, wanted[name], rtol=1e-8, atol=1e-9)
 
 
-def test_pieces_are_as_long_as_the_numbers_of_a_time_let_them_be() -> None:
-    """4 matrices of M x M, and M + 2 vectors of n and some more: in 64 MiB."""
-    for count, rows, itemsize in ((3, 1, 8), (6, 10, 8), (10, 7, 4), (3, 1000, 4)):
-        basis = st.StaFBasis(st.GaussianKernel(), st.StateFollowingCenters(st.rings(count), 0.1))
-        numbers = 4 * count * count + (count + 2) * 10
-        assert api.chunk_length(rows, basis, itemsize) == 64 * 1024 * 1024 // (rows * numbers * itemsize)
-
-
 def test_zero_weights_are_zero_also_where_their_unit_overflows() -> None:
     far = tensor([[[60.0, 0.0], [60.0, 0.01]]])
     basis = st.StaFBasis(st.ExponentialKernel(), st.StateFollowingCenters(st.rings(3), 1e-3))
@@ -341,38 +343,8 @@ class Nothing(predictors.Predictor):
         return weights * unit
 
 
-def test_predictors_know_their_work_and_their_names() -> None:
-    known = {
-        predictors.Secant(): (0, "secant", False),
-        predictors.Secant(guarded=True): (2, "secant", True),
-        predictors.Tangent(1): (8, "tangent order 1", False),
-        predictors.Tangent(): (14, "tangent order 2", False),
-        Nothing(): (0, "nothing", False),
-    }
-    for predictor, (work, title, guarded) in known.items():
-        assert (predictor.products(6), predictor.title, predictor.guarded) == (work, title, guarded)
+def test_a_predictor_that_keeps_the_weights_is_none() -> None:
     plain, same = (
         chase(STATES, BASES["exponential"], Paper(), LAW, predictor=p).weights for p in (None, Nothing())
     )
     torch.testing.assert_close(same, plain, rtol=1e-12, atol=1e-12)
-
-
-def test_many_centers_are_sampled_five_at_a_time_where_a_step_is_written_down() -> None:
-    sizes: list[int] = []
-
-    def target(x: Tensor) -> Tensor:
-        sizes.append(x.shape[-2])
-        return x.square().sum(-1)
-
-    from staf_torch.engine import recursion
-    from staf_torch.engine.problem import Problem
-
-    for count, wanted in ((10, {10}), (15, {5})):
-        basis = st.StaFBasis(st.GaussianKernel(), st.StateFollowingCenters(st.rings(count), 0.5))
-        problem = Problem("chase", basis, target, LAW, 1)
-        carry = row_program.first_carry(problem, recursion.start(problem, STATES, None))
-        sizes.clear()
-        Program(row_program.Step(problem, False)).text(carry, STATES)
-        assert set(sizes) == wanted
-        direct = problem.values(STATES)
-        torch.testing.assert_close(direct, basis.values(STATES, target), rtol=0, atol=0)

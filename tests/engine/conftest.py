@@ -1,0 +1,13 @@
+"""In this room libraries are built in a third of the time, but where bits are the matter."""
+
+from __future__ import annotations
+
+import pytest
+
+
+@pytest.fixture(autouse=True)
+def _libraries_are_built_without_optimisation(
+    request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if "bit" not in request.node.name:
+        monkeypatch.setenv("CXXFLAGS", "-O0")
