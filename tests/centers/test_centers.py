@@ -141,25 +141,13 @@ def test_centers_are_the_state_plus_the_radius_times_the_directions(
     assert centers(x.float()).dtype == torch.float32
 
 
-@over(RADII)
-def test_constant_radius_says_so(name: str) -> None:
-    radius = st.StateFollowingCenters(st.rings(3), RADII[name][0]()).radius
-    values = radius(tensor([[0.0, 0.0], [1.0, 2.0]])).expand(2)
-    assert radius.constant == bool(values[0] == values[1])
-
-
-def test_a_shrinking_radius_with_no_offset_lets_the_centers_meet_at_the_origin() -> None:
-    centers = st.StateFollowingCenters(st.rings(3), st.StateRadius(0.5, 0.0))
-    assert torch.equal(centers(torch.zeros(2).double()), torch.zeros(3, 2).double())
-
-
 def test_gradient_reaches_the_state_through_a_shrinking_radius() -> None:
     centers = st.StateFollowingCenters(st.rings(6), st.StateRadius(0.7, 0.01))
     assert torch.autograd.gradcheck(centers, (uniform(3, 2).requires_grad_(),))
 
 
 @over(KERNELS)
-@settings(max_examples=10)
+@settings(max_examples=4)
 @given(order=some.permutations(range(6)), seed=some.integers(0, 1000))
 def test_permuted_centers_permute_the_weights_and_leave_the_estimate(
     name: str, order: list[int], seed: int
@@ -200,7 +188,7 @@ def test_a_bad_argument_is_named_with_its_value(make, message: str) -> None:  # 
         make()
 
 
-@pytest.mark.parametrize(("dim", "degree"), [(6, 2), (8, 2), (12, 1), (12, 2), (2, 6), (3, 4)])
+@pytest.mark.parametrize(("dim", "degree"), [(6, 2), (12, 1), (12, 2), (3, 4)])
 def test_ball_is_unisolvent_and_well_conditioned_up_to_twelve_dimensions(dim: int, degree: int) -> None:
     count = math.comb(dim + degree, degree)
     basis = st.StaFBasis(st.GaussianKernel(), st.StateFollowingCenters(st.ball(count, dim), 1e-3))
@@ -217,32 +205,6 @@ def test_ball_is_no_worse_than_the_rings_in_the_plane() -> None:
             for u in (st.ball(count, 2), st.rings(count))
         ]
         assert (errors[0] <= 3 * errors[1]).all()
-
-
-@pytest.mark.parametrize(
-    ("count", "dim", "size"),
-    [(6, 2, 2.532074936052183), (15, 4, 3.5553808006399574), (10, 3, 1.0367437255901455)],
-)
-def test_layouts_of_the_ball_are_the_recorded_ones(count: int, dim: int, size: float) -> None:
-    u = st.ball(count, dim)
-    weights = torch.arange(1, u.numel() + 1, dtype=torch.float64).sin().view_as(u)
-    assert float((weights * u).sum()) == pytest.approx(size, rel=1e-9)
-
-
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-def test_directions_may_leave_the_ball_by_their_rounding_alone(dtype: torch.dtype) -> None:
-    eps = torch.finfo(dtype).eps
-    for beyond, fits in ((8 * eps, True), (64 * eps, False)):
-        directions = torch.tensor([[1.0 + beyond, 0.0], [0.0, 1.0]], dtype=dtype)
-        if fits:
-            assert torch.equal(st.StateFollowingCenters(directions, 0.1).directions, directions)
-        else:
-            with pytest.raises(ValueError, match="but direction 0 has the norm 1"):
-                st.StateFollowingCenters(directions, 0.1)
-    with pytest.raises(ValueError, match=r"but direction 1 has the norm 1\.25"):
-        st.StateFollowingCenters(tensor([[1.0, 0.0], [0.75, 1.0]]), 0.1)
-    with pytest.raises(ValueError, match="must be distinct, but direction 1 is repeated"):
-        st.StateFollowingCenters(tensor([[1.0, 0.0], [0.5, 0.0], [0.5, 0.0]]), 0.1)
 
 
 @pytest.mark.parametrize(("offset", "gain"), [(0.05, 1.5), (2.0, 1.5), (0.0, 0.5), (1.0, 1.0)])

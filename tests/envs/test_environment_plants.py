@@ -118,37 +118,6 @@ def put_height(env: Falling, x: np.ndarray) -> None:
     env.height = float(x[0])
 
 
-def test_inputs_rest_and_period_are_those_given_or_those_of_the_environment() -> None:
-    env, own = Falling(), {"read": height, "write": put_height}
-    usual = envs.EnvironmentPlant(env, dt=0.25, **own)
-    assert usual.env is env
-    assert (usual.dim, usual.inputs, usual.period, usual.periodic) == (1, 1, 0.25, ())
-    assert usual.bounds is not None
-    assert (usual.bounds.low.tolist(), usual.bounds.high.tolist()) == ([-1.0], [1.0])
-    for given, wanted in (({"low": -0.5}, (-0.5, np.inf)), ({"high": 0.25}, (-np.inf, 0.25))):
-        bounds = envs.EnvironmentPlant(env, dt=0.25, **given, **own).bounds
-        assert bounds is not None
-        assert (float(bounds.low), float(bounds.high)) == wanted
-    rest = envs.EnvironmentPlant(env, dt=0.25, equilibrium=([2.0], [-2.0]), periodic=[0], **own)
-    assert (rest.equilibrium().tolist(), rest.periodic) == ([2.0], (0,))
-    env.dt = 0.5
-    assert envs.EnvironmentPlant(env, **own).period == 0.5
-    assert envs.EnvironmentPlant(env, dt=2.0, **own).period == 2.0
-    x, u = np.array([[1.0], [2.0], [-1.0]]), np.array([[1.0], [0.0], [3.0]])
-    stepped = usual.step(torch.from_numpy(x), torch.from_numpy(u))
-    np.testing.assert_allclose(stepped.numpy(), 1.1 * x + 0.1 * u, rtol=1e-15)
-
-
-def test_what_cannot_be_a_plant_is_refused() -> None:
-    for given in ({"read": height}, {"write": put_height}):
-        with pytest.raises(ValueError, match=r"`EnvironmentPlant\(read=...\)` and write go together"):
-            envs.EnvironmentPlant(Falling(), dt=0.1, **given)
-    square = Falling()
-    square.action_space = gymnasium.spaces.Box(-1.0, 1.0, (1, 1), np.float64)
-    with pytest.raises(ValueError, match="must have actions that are a vector of numbers"):
-        envs.EnvironmentPlant(square, read=height, write=put_height, dt=0.1)
-
-
 class Data:
     def __init__(self) -> None:
         self.qpos, self.qvel = np.zeros(1), np.zeros(1)

@@ -7,7 +7,6 @@ from collections.abc import Callable
 import pytest
 import torch
 from helpers import tensor, uniform
-from torch import Tensor
 from variants import KERNELS, over
 
 import staf_torch as st
@@ -112,28 +111,6 @@ def test_hyperparameters_of_an_entry_each_are_kernels_one_by_one(question: str, 
     else:
         shape = (3, *alone[0].shape)
         torch.testing.assert_close(found.expand(shape), torch.stack(alone), rtol=1e-13, atol=1e-14)
-
-
-class Cauchy(st.Kernel):
-    """A kernel of the user's, with its value alone."""
-
-    def forward(self, x1: Tensor, x2: Tensor) -> Tensor:
-        return 1 / (1 + base.squared_distance(x1, x2))
-
-
-class Steep(Cauchy):
-    """One with a scale of its own, of which it tells no gradient."""
-
-    def log_scale(self, x: Tensor, z: Tensor) -> Tensor:
-        return (z * x.unsqueeze(-2)).sum(-1) + z[..., 0] ** 2
-
-
-def test_the_gradient_of_a_scale_is_found_where_it_is_not_told() -> None:
-    x, z = uniform(3, 2), uniform(3, 4, 2, seed=1)
-    found = Steep().log_scale_gradient(x, z)
-    assert found is not None
-    wanted = x.unsqueeze(-2) + torch.stack((2 * z[..., 0], 0 * z[..., 0]), -1)
-    torch.testing.assert_close(found, wanted)
 
 
 def test_products_and_differences_are_those_of_all_pairs() -> None:

@@ -119,15 +119,6 @@ def test_gradient_at_coincident_points_is_finite(name: str) -> None:
     assert torch.isfinite(gradient).all()
 
 
-@pytest.mark.parametrize("smoothness", [0.5, 1.5, 2.5])
-@pytest.mark.parametrize("dim", [1, 3])
-def test_gradient_of_a_matern_kernel_vanishes_at_its_center(smoothness: float, dim: int) -> None:
-    kernel = st.MaternKernel(smoothness, 0.7)
-    c = uniform(1, dim)
-    gradient = torch.func.grad(lambda at: kernel(at, c).sum())(c.clone())
-    assert torch.equal(gradient, torch.zeros_like(gradient))
-
-
 @pytest.mark.parametrize("smoothness", [1.5, 2.5])
 @pytest.mark.parametrize("dim", [1, 2, 4])
 def test_hessian_of_a_matern_kernel_at_its_center_is_minus_nu_over_nu_minus_one(

@@ -184,19 +184,6 @@ def test_of_a_window_after_the_end_there_is_nothing(settle: float, ends: bool) -
     assert found["diverged_fraction"] == 0.0
 
 
-def test_without_settings_every_time_counts_a_second_each() -> None:
-    whole = result(False, ())
-    metrics = metrics_of(Law())
-    metrics.add(whole)
-    found = metrics.summary()
-    assert found["ultimate_excess"] == float(whole.excess.max())
-    assert found["settling_time"] == 0.0
-    late = metrics_of(Law(), settle_time=11.0)
-    late.add(whole)
-    above = whole.excess[:, :11] > whole.excess[:, 11:]
-    assert late.summary()["settling_time"] == max(int(t) + 1 for _, t in above.nonzero())
-
-
 # Closed loops
 
 

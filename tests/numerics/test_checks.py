@@ -28,12 +28,6 @@ def test_a_tensor_of_numbers_is_given_back_as_it_is(check: Callable[..., Any]) -
         assert type(found) is float
 
 
-@pytest.mark.parametrize("check", [checks.real, checks.positive_real])
-def test_a_number_is_given_back_as_a_float(check: Callable[..., Any]) -> None:
-    assert check("F", "x", 2) == 2.0
-    assert type(check("F", "x", 2)) is float
-
-
 def test_values_at_the_edge_are_accepted() -> None:
     assert float(checks.non_negative("F", "x", 0.0)) == 0.0
     assert checks.integer("F", "x", 3, least=3) == 3

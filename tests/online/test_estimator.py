@@ -13,7 +13,7 @@ from helpers import tensor, uniform
 from variants import Cauchy
 
 import staf_torch as st
-from staf_torch.online.filter_arguments import KERNELS, Sizes, directions, filter_streams
+from staf_torch.online.filter_arguments import KERNELS
 
 BANK: dict[str, Any] = {"memory": 128, "neighbours": 8}
 
@@ -53,10 +53,6 @@ def test_streams_that_are_not_there_cannot_go_come_or_begin_anew() -> None:
         model.drop([4])
     with pytest.raises(ValueError, match=r"`StaFRegressor.drop\(streams=...\)` must leave a stream"):
         model.drop([0, 1, 2, 3])
-    for count in (0, -1, 1.5):
-        with pytest.raises(ValueError, match=r"`StaFRegressor.add\(streams=...\)`"):
-            model.add(count)  # type: ignore[arg-type]
-    assert model.n_samples_seen_.tolist() == [3] * 4
     single = st.StaFRegressor(radius=0.4).fit(x[:, 0], y[:, 0])
     for gone in ([], [0]):
         with pytest.raises(ValueError, match="must leave a stream"):
@@ -218,11 +214,6 @@ def model_of(**given: Any) -> Any:
     return st.StaFRegressor(**given).partial_fit(tensor([0.0, 0.1]), tensor(1.0))
 
 
-@pytest.mark.parametrize("count", [3, 6, 10, 15, 21, 28])
-def test_counts_of_rings_are_rings_in_the_plane(count: int) -> None:
-    assert torch.equal(directions(st.StaFRegressor(count=count), 2), st.rings(count))
-
-
 def test_centers_are_directions_in_the_closed_ball() -> None:
     edge = [[1.0, 1e-9**0.5], [0.0, 0.0]]
     model = model_of(kernel="matern", centers=edge, radius=0.25)
@@ -245,22 +236,6 @@ def test_what_was_tuned_holds_for_as_many_streams_and_outputs_alone() -> None:
     for of_x, of_y in ((x[:, None].repeat(1, 2, 1), y[:, None].repeat(1, 2)), (x, torch.stack((y, y), 1))):
         untuned = st.StaFRegressor(radius=0.4).fit(of_x, of_y)
         assert torch.equal(tuned.fit(of_x, of_y).predict(of_x[3]), untuned.predict(of_x[3]))
-
-
-@pytest.mark.needs_compiler
-def test_a_filter_is_compiled_where_its_kernel_and_numbers_allow() -> None:
-    for kernel, dtype, count, compiled in (
-        ("gaussian", torch.float64, 6, True),
-        ("gaussian", torch.float32, 6, True),
-        ("gaussian", torch.float64, 67, False),
-        ("matern", torch.float64, 6, False),
-        ("exponential", torch.float64, 6, False),
-    ):
-        model = st.StaFRegressor(kernel, 0.4, count)
-        streams, offsets = filter_streams(model, Sizes(2, 2, 1), torch.zeros(0, dtype=dtype), False)
-        assert streams.compiled == compiled
-        assert streams.dtype == dtype
-        assert offsets.shape == (count, 2)
 
 
 def test_a_kernel_that_is_learned_elsewhere_asks_for_no_gradient_here() -> None:

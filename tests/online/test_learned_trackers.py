@@ -56,15 +56,6 @@ def test_search_finds_the_noise_and_a_width_that_no_neighbour_beats() -> None:
     assert int(around.argmax()) == 1
 
 
-def test_metric_counts_the_direction_in_which_the_function_changes() -> None:
-    s = stretch(120)
-    metric = sensitivity(s, search(s))
-    directions = torch.tensor([[2.0, 1.0], [-1.0, 2.0]], dtype=torch.float64)
-    along, across = (directions @ metric).norm(dim=1)
-    assert along > 2.5 * across
-    torch.testing.assert_close(metric.square().sum(), torch.tensor(2.0, dtype=torch.float64))
-
-
 def test_compiled_bank_chooses_what_the_definition_does() -> None:
     shape, s = BankShape(2, 2, 128, 8), stretch(40, outputs=2)
     fast, slow = Bank(shape, 1, True), Bank(shape, 1, True, compile=False)
@@ -157,16 +148,6 @@ def test_full_process_keeps_its_size_and_what_matters() -> None:
     torch.testing.assert_close(
         inverse[kept][:, kept] @ (gram + JITTER * identity), identity, rtol=0, atol=1e-6
     )
-
-
-def test_sample_that_is_known_takes_no_place_and_still_teaches() -> None:
-    models, x = empty(16), torch.zeros(40, 2, dtype=torch.float64)
-    learn(models, x, torch.ones(40, 1, dtype=torch.float64))
-    assert models.counts[1].tolist() == [1.0, 1.0]
-    assert models.counts[2].tolist() == [2.0, 2.0]  # the place in use and the next are checked in turn
-    mean, variance = models.predict(x[0][:, None], RATE, NOISE, JITTER)
-    assert (mean - 1).abs().max() < 0.01
-    assert ((variance - NOISE) < NOISE / 30).all()
 
 
 def test_what_was_learned_fades_to_nothing() -> None:

@@ -192,31 +192,6 @@ def places(memory: st.ExperienceMemory) -> list[float | None]:
     return [round(x, 6) if stored else None for x, stored in pairs]
 
 
-def test_a_model_follows_the_state_for_half_of_the_spacing_and_is_left_alone_then() -> None:
-    memory = memory_of(0.0)  # models are at least .05 apart
-    for place, kept in (
-        (0.0249, [0.0249]),  # still
-        (0.0251, [0.0249]),  # left alone
-        (-0.0249, [-0.0249]),
-        (0.0, [0.0]),
-        (0.0499, [0.0]),
-        (0.0501, [0.0, 0.0501]),
-        (0.0749, [0.0, 0.0749]),
-        (0.0001, [0.0, 0.0749]),  # a revisit: a fresher model at the old state
-        (0.0252, [0.0, 0.0749]),
-    ):
-        x = at(place)[0]
-        memory.add(x, model(x, 5.0))
-        assert [each for each in places(memory) if each is not None] == kept, place
-    assert int(memory.count) == 2
-    assert places(memory)[2:] == [None] * 3
-    before = places(memory)
-    memory.add(tensor([9.0, torch.nan]), model(at(0.0)[0], 1.0))
-    memory.add(tensor([9.0, 0.0]), torch.full((6,), torch.inf, dtype=torch.float64))
-    assert places(memory) == before
-    assert int(memory.latest) == 0
-
-
 @pytest.mark.parametrize(
     ("kept", "given_up"),
     [
@@ -251,16 +226,3 @@ def test_a_start_is_nothing_where_nothing_is_remembered_and_the_nearest_beyond_a
             torch.testing.assert_close(memory.start(state), coefficients, rtol=1e-9, atol=1e-9)
     slope = memory.gradient(at(0.02))
     torch.testing.assert_close(slope, torch.zeros_like(slope), rtol=0, atol=1e-7)
-
-
-def test_points_of_another_shape_are_refused_by_name() -> None:
-    memory = memory_of(0.0)
-    for wrong in (torch.zeros(3).double(), torch.zeros(4, 3).double(), torch.zeros(()).double()):
-        with pytest.raises(ValueError, match=r"`ExperienceMemory.start\(x=...\)` must"):
-            memory.start(wrong)
-    for wrong in (torch.zeros(2).double(), torch.zeros(4, 3).double(), torch.zeros(()).double()):
-        for call in (memory.query, memory.covered):
-            with pytest.raises(ValueError, match=r"`ExperienceMemory\(y=...\)` must"):
-                call(wrong)
-    assert memory.start(torch.zeros(2).double()).shape == (6,)
-    assert memory.query(torch.zeros(1, 2).double()).shape == (1,)

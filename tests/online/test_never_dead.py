@@ -72,7 +72,7 @@ def test_stream_that_moves_away_for_good_starts_afresh_there(memory: int | None)
     assert error_after(model, x, y) < 0.3
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(some.lists(some.tuples(MAGNITUDES, MAGNITUDES, MAGNITUDES), min_size=1, max_size=25), some.booleans())
 def test_filter_is_alive_after_anything(samples: list[tuple[float, float, float]], single: bool) -> None:
     dtype = torch.float32 if single else torch.float64

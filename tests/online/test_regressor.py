@@ -112,7 +112,7 @@ def test_around_one_anchor_the_filter_is_gaussian_process_regression(kernel: str
     torch.testing.assert_close(state.learned[..., 0], expected, rtol=1e-7, atol=1e-8)
 
 
-@pytest.mark.parametrize("kernel", ["exponential", "gaussian", "matern52", "polynomial", "user_defined"])
+@pytest.mark.parametrize("kernel", ["exponential", "gaussian", "user_defined"])
 def test_drifting_functions_are_predicted(kernel: str) -> None:
     x, y = walks(8, 80)
     model = st.StaFRegressor(KERNELS[kernel].make(), radius=0.4, noise=0.05)
@@ -173,7 +173,7 @@ def test_samples_that_are_not_finite_are_skipped_and_counted() -> None:
     assert torch.isfinite(found).all()
 
 
-@pytest.mark.parametrize("kernel", ["exponential", "gaussian", "matern52", "user_defined"])
+@pytest.mark.parametrize("kernel", ["gaussian", "user_defined"])
 def test_prediction_before_a_sample_changes_nothing_of_what_is_learned(kernel: str) -> None:
     x, y = walks(4, 30)
     plain, asked = (st.StaFRegressor(KERNELS[kernel].make(), 0.3, noise=0.05) for _ in range(2))

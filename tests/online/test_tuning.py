@@ -182,21 +182,6 @@ def test_units_are_those_of_what_was_measured_of_each_coordinate() -> None:
     )  # as without scaling: a coordinate is held, and there is nothing to hold
 
 
-@pytest.mark.parametrize("at", [5, 10, 40])
-@pytest.mark.parametrize("wrong", [False, True])
-def test_a_sample_that_comes_when_units_are_learned_is_counted_once(at: int, wrong: bool) -> None:
-    """The sample by which units are due is out of all proportion, or is not."""
-    time = 0.4 * torch.arange(at, dtype=torch.float64)
-    x, y = torch.stack((time.sin(), time.cos()), -1), 50 + (2 * time).sin()
-    y[at - 1] = 1e30 if wrong else y[at - 1]
-    model = st.StaFRegressor(scaling=True).fit(x, y)
-    assert int(model.n_samples_seen_) == at - wrong
-    assert int(model.n_skipped_) == int(wrong)
-    model.partial_fit(x[0], torch.tensor(torch.nan).double())
-    assert int(model.n_skipped_) == 1 + wrong
-    assert float(model.predict(x[1])) == pytest.approx(50, abs=1.5)
-
-
 def test_a_stream_that_is_reset_learns_its_units_anew_and_the_others_go_on() -> None:
     draw = torch.Generator().manual_seed(2)
     x = torch.rand(120, 2, 2, generator=draw, dtype=torch.float64).cumsum(0) * tensor([1.0, 30.0])

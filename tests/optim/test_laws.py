@@ -32,17 +32,6 @@ def test_every_law_treats_each_row_of_a_batch_alone(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", LAWS)
-def test_a_row_that_is_not_finite_leaves_the_others_alone(name: str) -> None:
-    good, bad = quadratic(), quadratic()
-    gram, values = bad.gram.clone(), bad.values.clone()
-    gram[2], values[2] = torch.nan, torch.nan
-    zero = torch.zeros_like(values)
-    broken = iterate(LAWS[name], NativeError(gram, values, bad.precomputed), zero, 4)
-    others = [0, 1, 3, 4]
-    assert torch.equal(broken[:, others], iterate(LAWS[name], good, zero, 4)[:, others])
-
-
-@pytest.mark.parametrize("name", LAWS)
 def test_every_law_keeps_the_dtype_of_the_weights(name: str) -> None:
     objective = quadratic()
     single = NativeError(
@@ -118,14 +107,6 @@ def test_momentum_converges_at_its_rate(name: str, power: int) -> None:
     rate = ((1 - q) / (1 + q)) ** 2 if power == 2 else (1 - q)
     measured = (excess[150] / excess[50]) ** 0.01
     assert bool((measured < rate * 1.05).all())
-
-
-def test_heavy_ball_outruns_steepest_descent() -> None:
-    objective = quadratic(condition=1e3)
-    heavy, plain = (
-        excess_path(law, objective, 150)[-1] for law in (LAWS["heavy ball"], LAWS["steepest descent"])
-    )
-    assert bool((heavy < 1e-2 * plain).all())
 
 
 @pytest.mark.parametrize("name", ["heavy ball", "nesterov", "barzilai-borwein"])
@@ -227,14 +208,8 @@ def test_a_zero_quadratic_moves_nothing(name: str) -> None:
     [
         lambda: optim.FixedStep(2.0),
         lambda: optim.FixedStep(-1.0, relative=False),
-        lambda: optim.HeavyBall(1.0),
         lambda: optim.HeavyBall(4.0, 0.9),
-        lambda: optim.HeavyBall(1.0, 1.0),
         lambda: optim.Nesterov(1.5),
-        lambda: optim.Nesterov(1.0, 1.0),
-        lambda: optim.PreconditionedDescent("ilu"),
-        lambda: optim.RecursiveLeastSquares(measurement_noise=0.0),
-        lambda: optim.RecursiveLeastSquares(process_noise=-1.0),
         lambda: optim.NormalisedLMS(2.0),
         lambda: optim.SteepestDescent().with_step_size(1.0),
     ],

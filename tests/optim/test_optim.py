@@ -149,10 +149,3 @@ def test_excess_is_a_quarter_of_the_squared_dual_norm_of_the_gradient() -> None:
     ideal, g = torch.linalg.solve(objective.gram, objective.values), objective.descent(a)
     dual = (g * torch.linalg.solve(objective.gram, g)).sum(-1) / 4
     torch.testing.assert_close(objective.excess(a, ideal), dual, rtol=1e-9, atol=1e-10)
-
-
-def test_rows_are_bit_for_bit_as_they_would_be_alone() -> None:
-    objective, a = problem(3, batch=33, size=5), uniform(33, 5)
-    for row in range(33):
-        alone = NativeError(objective.gram[row], objective.values[row])
-        assert torch.equal(objective.descent(a)[row], alone.descent(a[row]))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pytest
 import torch
-from helpers import uniform
 from torch import Tensor
 from variants import PLANTS, over
 
@@ -60,29 +59,6 @@ def test_known_optimal_value_solves_the_hjb_equation(name: str) -> None:
     assert residual.abs().max() < 1e-11
 
 
-def test_printed_plant_does_not_solve_the_hjb_equation_and_is_stable_without_control() -> None:
-    printed, right = systems.TwoState(as_printed=True), systems.TwoState()
-    cost = unit_cost(right)
-    line = torch.linspace(-2, 2, 401, dtype=torch.float64)
-    grid = torch.cartesian_prod(line, line)
-    residual = adp.hjb_residual(printed, cost, lambda x: right.optimal_value(x, cost.q, cost.r), grid)
-    # x2^2 (2 (cos 2 x1 + 2)^2 - 1), largest at (0, 2); MATH.md's 66.8 is that of a coarser grid.
-    assert float(residual.abs().max()) == pytest.approx(68.0, rel=1e-12)
-    assert torch.linalg.eigvals(printed.linearisation().matrix).real.max() < 0
-    assert torch.linalg.eigvals(right.linearisation().matrix).real.max() > 0
-
-
-def test_uncontrollable_unstable_mode_is_named() -> None:
-    plant = systems.Linear([[1.5, 0.0], [0.0, -1.0]], [[0.0], [1.0]])
-    with pytest.raises(ValueError, match=r"linearisation of Linear .* not stabilisable.*eigenvalue 1.5 1/s"):
-        adp.LQR(plant, unit_cost(plant))
-
-
-def test_uncontrollable_stable_mode_is_no_obstacle() -> None:
-    plant = systems.Linear([[1.5, 0.0], [0.0, -1.0]], [[1.0], [0.0]])
-    assert torch.isfinite(adp.LQR(plant, unit_cost(plant)).k).all()
-
-
 def test_plant_that_does_not_rest_at_the_origin_is_refused() -> None:
     class Pushed(systems.VanDerPol):
         def drift(self, x: Tensor) -> Tensor:
@@ -115,12 +91,3 @@ def test_plant_in_discrete_time_steps_with_its_period() -> None:
     f, g = plant.linearisation()
     torch.testing.assert_close(f, torch.tensor([[0.9, 0.0], [0.0, 1.0]]).double())
     assert g.tolist() == [[1.0], [0.0]]
-
-
-def test_a_step_takes_any_leading_dimensions() -> None:
-    plant = systems.Clocked(systems.StepPlant(lambda x, u: x.sin() + u, dim=3, inputs=1, dt=0.1))
-    x, u = uniform(3, 5, 4, seed=1), uniform(3, 5, 1, seed=2)
-    torch.testing.assert_close(plant.step(x, u), torch.cat((x[..., :3].sin() + u, x[..., 3:] + 0.1), dim=-1))
-    f, g = plant.linearisation()
-    torch.testing.assert_close(f, torch.eye(4, dtype=torch.float64))  # the clock's as well
-    torch.testing.assert_close(g, torch.tensor([[1.0], [1.0], [1.0], [0.0]]).double())

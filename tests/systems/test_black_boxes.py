@@ -202,15 +202,13 @@ def test_guesses_are_states_or_pairs_and_angles_are_counted_from_either_end() ->
     assert float(turned[0]) == pytest.approx(0.1)
     assert plant.bounds is None
     assert systems.StepPlant(step, low=-1.0, **given).bounds is not None
-    for wrong in ([0.5], ([0.5, 0.0], [0.3, 0.1]), ([0.5], [0.3])):
+    for wrong in ([0.5], ([0.5, 0.0], [0.3, 0.1])):
         with pytest.raises(
             ValueError, match=r"\(equilibrium=...\)` must be 2 numbers, or those and 1 of the"
         ):
             systems.StepPlant(step, equilibrium=wrong, **given)  # type: ignore[arg-type]
-    for periodic in ([2], [-3]):
-        with pytest.raises(ValueError, match=r"`StepPlant\(periodic=...\)` must be coordinates of 2"):
-            systems.StepPlant(step, periodic=periodic, **given)
-    systems.StepPlant(step, periodic=[1, -2], **given)
+    with pytest.raises(ValueError, match=r"`StepPlant\(periodic=...\)` must be coordinates of 2"):
+        systems.StepPlant(step, periodic=[-3], **given)
 
 
 def moved(x: Any, u: Any) -> Any:

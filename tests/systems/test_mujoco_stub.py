@@ -208,21 +208,6 @@ def test_slopes_are_chained_over_the_steps_of_a_period_and_begin_cold() -> None:
         torch.testing.assert_close(known.input_matrix, other.input_matrix, rtol=1e-6, atol=1e-7)
 
 
-def test_models_are_objects_texts_or_files(tmp_path: Path) -> None:
-    assert systems.MujocoPlant("  <mujoco/>").dim == 5
-    path = tmp_path / "model.xml"
-    path.write_text("<mujoco/>")
-    for given in (path, str(path)):
-        assert systems.MujocoPlant(given).dim == 5
-    with pytest.raises(ValueError, match="must be the path of an XML file, XML text or an MjModel; got 3"):
-        systems.MujocoPlant(3)
-    text = "<wrong>" + 200 * "x"
-    with pytest.raises(ValueError, match=r"cannot be read \(XML Error: wrong\)") as caught:
-        systems.MujocoPlant(text)
-    assert str(caught.value).count("x") < 100
-    assert isinstance(caught.value.__cause__, ValueError)
-
-
 @pytest.mark.parametrize(
     ("change", "given", "message"),
     [

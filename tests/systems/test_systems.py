@@ -92,12 +92,6 @@ def test_rows_are_as_they_would_be_alone(name: str) -> None:
             torch.testing.assert_close(together[row], alone, rtol=1e-14, atol=1e-15)
 
 
-def test_oscillator_stays_on_its_circle_over_a_long_time() -> None:
-    states = simulate(systems.Oscillator(), torch.tensor([[3.0, 4.0]]), dt=1e4, steps=100)[0]
-    assert states.dtype == torch.float32
-    torch.testing.assert_close(states.norm(dim=-1), torch.full((101,), 5.0), rtol=1e-6, atol=0)
-
-
 def test_linear_system_of_any_size_flows_as_its_matrix_exponential() -> None:
     matrix = uniform(4, 4)
     plant = systems.Linear(matrix)

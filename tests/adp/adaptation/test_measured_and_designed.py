@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import pytest
 import torch
 from helpers import tensor, uniform
@@ -24,17 +22,6 @@ def test_a_plant_changes_when_its_clock_has_run_down() -> None:
     rate = plant.rate(z0, torch.ones(3, 1).double())
     torch.testing.assert_close(rate[:, -1], -z0[:, -1] / 10)
     assert not bool(rate[:, 2:-1].any())
-    torch.testing.assert_close(
-        plant.effectiveness(z0)[:, :2], PENDULUM.believing(plant.theta(z0)).effectiveness(x0)
-    )
-    assert plant.effectiveness(z0).shape == (3, 7, 1)
-    for theta in ([0.2, 2.0], tensor([[0.2, 2.0]] * 3)):
-        alone = plant.start(x0, theta)
-        assert torch.equal(alone[:, 2:4], alone[:, 4:6])
-        assert alone[:, -1].tolist() == [1.0] * 3
-        torch.testing.assert_close(plant.theta(alone), tensor([[0.2, 2.0]] * 3))
-    single = plant.start(x0.float(), tensor([[0.2, 2.0]] * 3), at=tensor([1.0] * 3))
-    assert single.dtype == torch.float32
 
 
 def test_the_cost_of_a_changing_plant_is_that_of_its_state() -> None:
@@ -87,20 +74,6 @@ def test_a_design_that_went_wrong_keeps_the_one_before_and_begins_again() -> Non
     assert bool(torch.isfinite(second[2]).all())
     again = made.step(*made.step(*second, a, b), a, b)
     torch.testing.assert_close(again[2], good[2])
-
-
-@pytest.mark.parametrize(("share", "solved"), [(1.0, True), (1.005, True), (1.03, False), (0.5, False)])
-def test_a_design_is_of_the_model_of_now_where_its_equation_holds_to_a_hundredth(
-    share: float, solved: bool
-) -> None:
-    one = torch.ones(1, 1, 1).double()
-    made = redesign.Redesign(one[0], one[0], 8, 8)
-    exact = one * (1 + math.sqrt(2.0))  # 2 P - P^2 + 1 = 0
-    p = share * exact
-    residual = abs(2 * float(p) - float(p) ** 2 + 1) / (float(p) + float(p) ** 2 + 1)
-    found = redesign.riccati_residual(p, one, one, one[0])
-    assert float(found) == pytest.approx(residual, abs=1e-12)
-    assert made.solved(p, one, one).tolist() == [solved] == [residual < 0.01]
 
 
 def test_noise_of_a_filter_of_a_plant_in_steps_counts_by_its_period() -> None:

@@ -137,21 +137,6 @@ def test_rows_are_learned_by_themselves(learned) -> None:
     torch.testing.assert_close(alone.state[0], run.state[1, :9], rtol=1e-12, atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"deviation": 0.0}, "deviation"),
-        ({"floor": 0.0}, "floor"),
-        ({"length": -1.0}, "length"),
-        ({"rows": [2]}, "rows"),
-        ({"forgetting": -1.0}, "forgetting"),
-    ],
-)
-def test_arguments_are_checked(change: dict[str, object], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        made(**change)
-
-
 def test_a_kernel_that_knows_where_it_is_is_refused() -> None:
     with pytest.raises(ValueError, match="translation invariant"):
         adp.StreamDrift(KNOWN, ExponentialKernel(), CENTERS, rows=[1], deviation=1.0, length=0.1)
