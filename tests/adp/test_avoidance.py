@@ -9,7 +9,6 @@ from helpers_swingup import cost_of as cost_along
 from torch import Tensor
 
 from staf_torch import adp, systems
-from staf_torch.adp.plans import Trajectories
 
 LINE = systems.Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
 

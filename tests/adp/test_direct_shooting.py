@@ -1,0 +1,468 @@
+"""Direct shooting: against every optimum that is known, and against the HJB equation where none is."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+import torch
+from helpers import tensor
+from helpers import uniform as random
+from helpers_adp import COST, PLANT, uniform
+from torch import Tensor
+
+from staf_torch import adp, systems
+from staf_torch.adp.shooting import newton, starts
+from staf_torch.adp.shooting.mesh import graded, halved
+from staf_torch.adp.shooting.stage import Expansion, Stage
+
+DOUBLE = systems.Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
+LINEAR = systems.Linear([[0.0, 1.0], [2.0, -1.0]], [[0.0], [1.0]])
+X3 = torch.tensor([[-0.5, 0.5, -0.25]], dtype=torch.float64)
+
+
+@pytest.mark.parametrize("plant", [PLANT, LINEAR], ids=lambda p: type(p).__name__)
+def test_known_optimum_is_found_and_bounded_from_above(plant: systems.ControlAffineSystem) -> None:
+    x = uniform(5, 2.0, seed=2)
+    best = adp.DirectShooting(plant, COST).solve(x)
+    known = plant.optimal_value(x, COST.q, COST.r)
+    assert best.converged.all()
+    excess = best.value / known - 1
+    assert excess.min() > -1e-8
+    assert excess.max() < 3e-6
+    assert (excess <= best.mesh_error + best.horizon_error).all()
+    gradient = adp.value_gradient(lambda y: plant.optimal_value(y, COST.q, COST.r), x)
+    torch.testing.assert_close(best.gradient, gradient, rtol=1e-4, atol=1e-5)
+    control = COST.policy(plant.effectiveness(x), gradient)
+    torch.testing.assert_close(best.control, control, rtol=1e-4, atol=2e-4)
+
+
+def test_error_falls_with_the_mesh() -> None:
+    x = uniform(5, 1.5, seed=3)
+    known = LINEAR.optimal_value(x, COST.q, COST.r)
+    excess = [adp.DirectShooting(LINEAR, COST, intervals=n).solve(x).value / known - 1 for n in (20, 40)]
+    assert (excess[1] < excess[0] / 8).all()
+
+
+def test_three_state_optimum() -> None:
+    plant, cost = systems.ThreeState(), adp.QuadraticCost(10.0, 1.0, 3, 2)
+    best = adp.DirectShooting(plant, cost).solve(torch.cat((X3, 0.1 * X3)))
+    # The rollout policy reaches 2.708, the LQR 2.786. The plant is homogeneous, so V* is, of degree 2.
+    assert float(best.value[0]) == pytest.approx(2.70471, abs=2e-5)
+    torch.testing.assert_close(best.value[1], 0.01 * best.value[0], rtol=1e-6, atol=0)
+
+
+@pytest.mark.parametrize(
+    ("plant", "cost", "intervals"),
+    [
+        (systems.Pendulum(), COST, 40),
+        (systems.VanDerPol(), COST, 40),
+        (systems.Pendulum(), adp.BoundedInputCost(1.0, 0.1, 2, 1, bound=8.0), 48),
+        (systems.PlanarQuadrotor(), adp.QuadraticCost(1.0, 1.0, 6, 2), None),
+    ],
+    ids=["pendulum", "van der pol", "bounded pendulum", "quadrotor"],
+)
+def test_gradient_and_control_solve_the_hjb_equation(
+    plant: systems.ControlAffineSystem, cost: adp.Cost, intervals: int | None
+) -> None:
+    x = 0.2 * torch.randn(2, plant.dim, dtype=torch.float64, generator=torch.Generator().manual_seed(4))
+    best = adp.DirectShooting(plant, cost, intervals=intervals).solve(x)
+    assert best.converged.all()
+    g = plant.effectiveness(x)
+    rate = plant.drift(x) + (g @ best.control.unsqueeze(-1)).squeeze(-1)
+    residual = cost.rate(x, best.control) + (best.gradient * rate).sum(-1)
+    assert (residual.abs() < 1e-4 * cost.rate(x, best.control)).all()
+    torch.testing.assert_close(best.control, cost.policy(g, best.gradient))
+    lqr = adp.LQR(plant, cost)
+    run = adp.simulate(adp.Feedback(lqr), plant, cost, x, dt=0.1, steps=100, every=100)
+    assert (best.value < run.cost * (1 + 1e-4)).all()
+
+
+def test_tracking_has_an_optimum_with_a_base_and_a_terminal_value_of_its_own() -> None:
+    lqr = adp.LQR(PLANT, adp.QuadraticCost(10.0, 1.0, 2, 1))
+    shooting = adp.DirectShooting(
+        adp.TwoStateTracking(),
+        adp.tracking_cost(10.0, 1.0),
+        base=lambda x: lqr(x[..., :2]),
+        terminal=lambda x: lqr.value(x[..., :2]),
+        horizon=4.0,
+        intervals=60,
+    )
+    best = shooting.solve(torch.tensor([[-0.5, 0.5, 0.0, 1.0]], dtype=torch.float64))
+    assert float(best.value) == pytest.approx(1.4223, abs=1e-4)
+
+
+class HalfBroken(systems.TwoState):
+    def drift(self, x: Tensor) -> Tensor:
+        return torch.where(x[..., :1] > 1.0, torch.nan, super().drift(x))
+
+
+def test_row_that_fails_on_the_coarse_mesh_starts_again_on_the_fine_one() -> None:
+    x = uniform(6, 2.0)[:1]
+    best = adp.DirectShooting(PLANT, COST, intervals=32, iterations=10, starts=1).solve(x)
+    assert torch.isinf(best.mesh_error).all()  # nothing to compare with
+    assert best.converged.all()
+    assert (best.value / PLANT.optimal_value(x, COST.q, COST.r) - 1).abs().max() < 1e-4
+
+
+def test_rows_are_alone_and_a_row_without_optimum_is_reported() -> None:
+    x = torch.tensor([[-1.0, 1.0], [1.2, 0.3], [0.0, 0.0], [0.4, -0.7]], dtype=torch.float64)
+    best = adp.DirectShooting(HalfBroken(), COST, horizon=4.0, intervals=24, starts=2).solve(x)
+    assert best.converged.tolist() == [True, False, True, True]
+    assert torch.isnan(best.value[1])
+    assert torch.isnan(best.control[1]).all()
+    assert float(best.value[2]) == 0.0
+    assert torch.equal(best.gradient[2], torch.zeros(2, dtype=torch.float64))
+    alone = adp.DirectShooting(PLANT, COST, horizon=4.0, intervals=24).solve(x[3:])
+    torch.testing.assert_close(best.value[3], alone.value[0], rtol=1e-11, atol=0)
+    torch.testing.assert_close(best.gradient[3], alone.gradient[0], rtol=1e-7, atol=1e-9)
+
+
+def test_too_few_iterations_are_reported_and_not_passed_off_as_an_optimum() -> None:
+    best = adp.DirectShooting(PLANT, COST, intervals=8, iterations=1).solve(uniform(4, 2.0))
+    assert not best.converged.any()
+    assert torch.isnan(best.value).all()
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"horizon": -1.0}, r"`DirectShooting\(horizon=...\)` must be positive"),
+        ({"intervals": 2}, r"`DirectShooting\(intervals=...\)` must be at least 4"),
+        ({"intervals": 81}, r"`DirectShooting\(intervals=...\)` must be even"),
+        ({"tolerance": 0.0}, r"`DirectShooting\(tolerance=...\)` must be positive"),
+        ({"iterations": 0}, r"`DirectShooting\(iterations=...\)` must be at least 1"),
+    ],
+)
+def test_bad_arguments_are_refused_by_name(settings: dict[str, object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        adp.DirectShooting(PLANT, COST, **settings)
+
+
+def test_plant_that_cannot_be_stabilised_and_states_of_another_size_are_refused() -> None:
+    stuck = systems.Linear([[1.5, 0.0], [0.0, -1.0]], [[0.0], [1.0]])
+    with pytest.raises(ValueError, match=r"Linear .* not stabilisable.*eigenvalue 1.5 1/s"):
+        adp.DirectShooting(stuck, COST)
+    with pytest.raises(ValueError, match=r"`DirectShooting.solve\(x0=...\)` must have 2 entries"):
+        adp.DirectShooting(PLANT, COST).solve(torch.zeros(1, 3, dtype=torch.float64))
+
+
+def test_at_the_set_point_one_start_is_enough_and_nothing_is_paid() -> None:
+    shooting = adp.DirectShooting(systems.VanDerPol(), COST, intervals=16, horizon=2.0)
+    best = shooting.solve(torch.zeros(1, 2, dtype=torch.float64))
+    assert bool(best.converged.all())
+    assert float(best.value) == 0.0
+    assert int(best.iterations) <= 6
+
+
+# Inputs with bounds, several starts ---------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def convex() -> adp.Optimum:
+    start = torch.tensor([[5.0, 0.0], [0.5, 0.0], [-5.0, 0.0]], dtype=torch.float64)
+    return adp.DirectShooting(DOUBLE, COST, low=-1.0, high=1.0).solve(start)
+
+
+def test_double_integrator_with_a_hard_bound_is_solved(convex: adp.Optimum) -> None:
+    # 53.1619: IPOPT on 400 intervals over 20 s of a control that is linear on each (Runge-Kutta).
+    assert convex.converged.all()
+    assert float(convex.value[0]) == pytest.approx(53.162, rel=1e-4)
+    torch.testing.assert_close(convex.value[2], convex.value[0], rtol=1e-9, atol=0)
+    assert (convex.plan.abs() <= 1.0).all()
+    assert float(convex.plan[0].min()) == -1.0
+    assert float(convex.optimality.max()) < 1e-4
+    free = adp.DirectShooting(DOUBLE, COST).solve(torch.tensor([[0.5, 0.0]], dtype=torch.float64))
+    torch.testing.assert_close(convex.value[1], free.value[0], rtol=1e-5, atol=0)
+    assert repr(convex).startswith("Optimum(3 states, value ")
+    assert len(repr(convex)) < 120
+
+
+@torch.no_grad()
+def test_plan_is_replayed_at_its_cost(convex: adp.Optimum) -> None:
+    dt = 0.02
+    run = adp.simulate(
+        convex.replay(),
+        DOUBLE,
+        COST,
+        convex.state[:, 0],
+        dt=dt,
+        steps=round(float(convex.time[-1]) / dt),
+        compile=False,
+    )
+    torch.testing.assert_close(run.cost, convex.value, rtol=3e-3, atol=0)
+    assert (run.state[:, -1].norm(dim=-1) < 1e-2).all()
+
+
+def test_saturated_swing_up_is_not_passed_off_as_an_optimum() -> None:
+    hanging = torch.tensor([[0.0, math.pi, 0.0, 0.0]], dtype=torch.float64)
+    cost = adp.BoundedInputCost(1.0, 0.1, dim=4, inputs=1, bound=10.0)
+    shooting = adp.DirectShooting(systems.CartPole(), cost, horizon=3.0, intervals=8, starts=1, iterations=1)
+    best = shooting.solve(hanging)
+    assert not best.converged.any()
+    assert best.reason[0].startswith("not stationary")
+    assert best.reason[0] in repr(best)
+
+
+def test_row_without_a_finite_start_says_so() -> None:
+    class Exploding(systems.Linear):
+        def drift(self, x: torch.Tensor) -> torch.Tensor:
+            return super().drift(x) + torch.where(x[..., :1] > 2.0, math.inf, 0.0)
+
+    plant = Exploding([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
+    best = adp.DirectShooting(plant, COST, intervals=20).solve(torch.tensor([[3.0, 0.0]]).double())
+    assert best.reason == (
+        "the cost is not finite from here under any start: give a `base` that does not diverge",
+    )
+
+
+def test_what_cannot_be_shot_is_refused_by_name() -> None:
+    step = systems.StepPlant(lambda x, u: 0.5 * x + u, dim=1, inputs=1, dt=0.1)
+    with pytest.raises(ValueError, match=r"`DirectShooting\(system=...\)` must be in continuous time"):
+        adp.DirectShooting(step, adp.QuadraticCost(1.0, 1.0, dim=1, inputs=1))
+    discounted = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1, discount=0.1)
+    with pytest.raises(ValueError, match=r"`DirectShooting\(cost=...\)` must have no discount"):
+        adp.DirectShooting(DOUBLE, discounted)
+
+
+def test_the_horizon_grows_until_little_is_left_at_its_end() -> None:
+    far = torch.tensor([[60.0, 0.0]], dtype=torch.float64)
+    given = {"low": -1.0, "high": 1.0, "intervals": 24, "starts": 1, "iterations": 60}
+    search = adp.DirectShooting(DOUBLE, COST, **given)
+    found = search.solve(far)
+    assert float(found.time[-1]) / search.horizon in (2.0, 4.0, 8.0)
+    assert float(found.horizon_error) < 1e-3
+    stated = adp.DirectShooting(DOUBLE, COST, **given, horizon=8.0).solve(far)
+    assert float(stated.time[-1]) == pytest.approx(8.0)
+    assert float(stated.horizon_error) > 1e-3
+    near = 0.1 * random(256, 2, seed=1)
+    with pytest.raises(ValueError, match=r"state a `horizon` of 2[0-9.]+ s, or solve at most 256 states"):
+        search.solve(torch.cat((near, far)))
+
+
+def test_more_states_than_are_solved_at_once_are_those_of_each_alone() -> None:
+    x, search = uniform(258, 1.0, seed=6), adp.DirectShooting(LINEAR, COST, intervals=24, horizon=3.0)
+    found, alone = search.solve(x), search.solve(x[[3, 257]])
+    for part in ("value", "gradient", "control", "state", "plan", "mesh_error", "optimality"):
+        torch.testing.assert_close(getattr(found, part)[[3, 257]], getattr(alone, part), rtol=1e-9, atol=1e-9)
+    assert found.reason == ("",) * 258
+
+
+def test_of_two_valleys_the_lower_one_is_found_from_several_starts() -> None:
+    """x' = u and a cost y(x)^2 + u^2, 0 at 0 and at 10: V = 2 int |y| to the valley nearer by area."""
+
+    def y(x: Tensor) -> Tensor:
+        return 11 - x - 11 / (1 + x)
+
+    plant, ridge = systems.RatePlant(lambda x, u: 1 * u, dim=1, inputs=1), 11**0.5 - 1
+    cost = adp.QuadraticCost(1.0, 1.0, dim=1, inputs=1, output=y)
+    x = torch.tensor([[3.2]], dtype=torch.float64)  # to 0 the area is 14.3, to 10, downhill, 19.3
+    left, whole = (11 * a - a**2 / 2 - 11 * math.log(1 + a) for a in (3.2, 10.0))
+    given: dict[str, Any] = {"base": lambda x: torch.where(x < ridge, -y(x), y(x)), "horizon": 6.0}
+    given["terminal"] = lambda x: y(x)[..., 0].square()
+    downhill = adp.DirectShooting(plant, cost, **given, intervals=80).solve(x)  # no LQR to doubt it by
+    search = adp.DirectShooting(plant, cost, **given, starts=3)
+    found = search.solve(torch.cat((x, 0.1 * x)))
+    assert float(downhill.value) == pytest.approx(2 * (whole - left), rel=1e-2)
+    assert float(found.value[0]) == pytest.approx(2 * left, rel=1e-2)
+    assert found.reason[0] == "" or found.reason[0].startswith("local: one start alone found it")
+    again = search.solve(torch.cat((x, 0.1 * x)), warm=found)
+    torch.testing.assert_close(again.value, found.value, rtol=1e-6, atol=0)
+    assert again.converged.tolist() == [True, True]  # an earlier plan is a start that agrees
+
+
+# Its pieces -----------------------------------------------------------------------------------------------
+
+
+FAST = systems.Linear([[-40.0]], [[1.0]])
+SLOW = systems.Linear([[0.0, 1.0], [-2.0, -3.0]], [[0.0], [1.0]])
+LIGHT = adp.QuadraticCost(1e-6, 1.0, dim=2, inputs=1)  # the feedback hardly moves the modes
+
+
+@pytest.mark.parametrize("bounded", [False, True])
+def test_horizon_and_intervals_follow_the_modes_of_the_loop(bounded: bool) -> None:
+    limits = {"low": -1.0, "high": 1.0} if bounded else {}
+    found = adp.DirectShooting(SLOW, LIGHT, **limits)  # modes of -1 and -2 in 1/s
+    assert found.horizon == pytest.approx(9.2, rel=1e-5)
+    assert found.intervals == 80  # 37 would resolve them
+    assert found.iterations == (120 if bounded else 50)
+    long = adp.DirectShooting(SLOW, LIGHT, horizon=60.0, **limits)
+    assert (long.horizon, long.intervals) == (60.0, 120 if bounded else 240)
+    less = adp.DirectShooting(SLOW, LIGHT, horizon=26.0, **limits)
+    assert less.intervals == 104
+    assert adp.DirectShooting(SLOW, LIGHT, horizon=26.4, **limits).intervals == 106
+    given = adp.DirectShooting(SLOW, LIGHT, intervals=4, iterations=1, starts=1, seed=0, **limits)
+    assert (given.intervals, given.iterations, given.starts, given.seed) == (4, 1, 1, 0)
+    fast = adp.DirectShooting(FAST, adp.QuadraticCost(1e-6, 1.0, dim=1, inputs=1), horizon=1.0, **limits)
+    assert fast.intervals == 80
+
+
+@pytest.mark.parametrize("intervals", [2, 4, 21])
+def test_intervals_of_a_mesh_grow_by_one_factor_to_six_times_the_first(intervals: int) -> None:
+    time = graded(3.0, intervals)
+    lengths = time.diff()
+    assert len(time) == intervals + 1
+    assert float(time[0]) == 0
+    assert float(time[-1]) == pytest.approx(3.0, rel=1e-14)
+    assert float(lengths[-1] / lengths[0]) == pytest.approx(6.0)
+    growth = lengths[1:] / lengths[:-1]
+    torch.testing.assert_close(growth, growth[:1].expand_as(growth))
+    torch.testing.assert_close(halved(time)[::2], time, rtol=0, atol=0)
+    torch.testing.assert_close(halved(time)[1::2], 0.5 * (time[1:] + time[:-1]))
+
+
+@pytest.mark.parametrize("bounded", [True, False])
+def test_guesses_hold_each_input_at_each_end_and_then_wander_between_them(bounded: bool) -> None:
+    limits = {"low": [-1.0, -2.0], "high": [1.5, 3.0]} if bounded else {}
+    cost = adp.QuadraticCost(1.0, 1.0, 2, 2, target_input=[0.5, 0.25], target=[0.0, 0.0], **limits)
+    base = lambda x: 2 * x + torch.tensor([0.5, 0.25]).to(x)  # noqa: E731
+    x0 = torch.tensor([[0.1, -0.2], [-0.3, 0.1]], dtype=torch.float64)
+    found = starts.guesses(cost, base, x0, 10.0, 5, seed=3)
+    low, high = ([-1.0, -2.0], [1.5, 3.0]) if bounded else ([0.5 - 1.8, 0.25 - 1.2], [0.5 + 1.8, 0.25 + 1.2])
+    constant, wandering = found[:-5], found[-5:]
+    assert [each.until for each in constant] == [
+        3.0,
+        *(10 * s for s in (0.02, 0.04, 0.08, 0.14, 0.22, 0.32) for _ in range(4)),
+    ]
+    rest = torch.tensor([0.5, 0.25], dtype=torch.float64)
+    torch.testing.assert_close(constant[0].knots, rest.expand(2, 2))
+    for k, guess in enumerate(constant[1:]):
+        level = rest.clone()
+        level[k % 4 // 2] = (low, high)[k % 2][k % 4 // 2]
+        torch.testing.assert_close(guess.knots, level.expand(2, 2))
+    knots = torch.stack([each.knots for each in wandering])
+    assert knots.shape == (5, 6, 2)
+    ends = torch.tensor([low, high], dtype=torch.float64)
+    assert bool(((knots >= ends[0] - 1e-12) & (knots <= ends[1] + 1e-12)).all())
+    for end in ends:  # a sixth of them, at each
+        assert 0.05 < float((knots - end).abs().lt(1e-12).double().mean()) < 0.4
+    assert all(0 < each.until < 6 for each in wandering)
+    again = starts.guesses(cost, base, x0, 10.0, 5, seed=4)
+    assert not torch.equal(again[-1].knots, found[-1].knots)
+
+
+def test_a_guess_is_followed_along_its_knots_until_the_base_takes_over() -> None:
+    guess = starts.Guess(torch.tensor([[0.0], [1.0], [5.0]], dtype=torch.float64), 2.0)
+    control = starts.guided(guess, lambda x: x.new_full((*x.shape[:-1], 1), 9.0))
+    assert control(torch.zeros(4, 5, 2), 0.0).shape == (4, 5, 1)
+    x = torch.zeros(3, 2, dtype=torch.float64)
+    said = {0.0: 0.0, 0.5: 0.5, 1.0: 1.0, 1.5: 3.0, 1.75: 4.0, 2.0: 9.0, 3.0: 9.0}
+    for time, want in said.items():
+        torch.testing.assert_close(control(x, time), torch.full((3, 1), want, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("affine", [True, False])
+def test_the_gap_of_a_control_is_what_its_hamiltonian_exceeds_the_least_by(affine: bool) -> None:
+    def cubic(x: Tensor, u: Tensor) -> Tensor:
+        return torch.cat((x[..., 1:], u + 0.1 * u**3 - x[..., :1]), -1)
+
+    if affine:
+        plant: systems.Plant = systems.TwoState()
+    else:
+        plant = systems.RatePlant(cubic, dim=2, inputs=1)
+    cost = adp.QuadraticCost(1.0, 0.5, dim=2, inputs=1, low=-0.8, high=0.8)
+    x, costate, v = random(50, 2, seed=1), 2 * random(50, 2, seed=2), 0.8 * random(50, 1, seed=3)
+    gap = Stage(plant, cost).gap(x, v, costate)
+    slope = torch.func.vmap(torch.func.jacrev(lambda x, u: plant.motion(x[None], u[None])[0], argnums=1))(
+        x, v
+    )
+    pull = (slope * costate.unsqueeze(-1)).sum(-2)  # p' df/du, (B, m)
+
+    def hamiltonian(u: Tensor) -> Tensor:
+        return 0.5 * u.square().sum(-1) + (pull * u).sum(-1)
+
+    tried = torch.stack(
+        [hamiltonian(torch.full((50, 1), u).double()) for u in torch.linspace(-0.8, 0.8, 2001)]
+    )
+    torch.testing.assert_close(gap, hamiltonian(v) - tried.amin(0), rtol=1e-4, atol=1e-5)
+
+
+def model_cost(expansion: Expansion, z: Tensor, v: Tensor, end: Tensor, bend: Tensor) -> Tensor:
+    """The quadratic model of one row: d_0 (n,), (N, 2m) changes of the control."""
+    total = torch.zeros((), dtype=torch.float64)
+    d = z
+    for k in range(len(v)):
+        both = torch.cat((d, v[k]))
+        total = total + expansion.gradient[0, k] @ both + 0.5 * both @ expansion.curvature[0, k] @ both
+        d = expansion.slope[0, k] @ both
+    return total + end[0] @ d + 0.5 * d @ bend[0] @ d
+
+
+@pytest.mark.parametrize("roomy", [None, 1e3, 0.05])
+def test_a_direction_is_the_minimum_of_the_model_and_promises_what_it_falls_by(roomy: float | None) -> None:
+    n, m, steps = 2, 2, 3
+    root = random(1, steps, n + m, n + m, seed=1)
+    expansion = Expansion(
+        random(1, steps, n, n + m, seed=2),
+        random(1, steps, n + m, seed=3),
+        root @ root.mT + 0.5 * torch.eye(n + m).double(),
+    )
+    end, bend = random(1, n, seed=4), torch.eye(n).double()[None] * 1.5
+    wide = torch.full((1, steps, m), roomy or 0.0, dtype=torch.float64)
+    room = None if roomy is None else (-wide, wide)
+    found = newton.direction(expansion, end, bend, room)
+    assert found.definite.tolist() == [True]
+
+    def followed(d: Tensor) -> Tensor:
+        controls = []
+        for k in range(steps):
+            controls.append(found.offset[0, k] + found.feedback[0, k] @ d)
+            d = expansion.slope[0, k] @ torch.cat((d, controls[-1]))
+        return torch.stack(controls)
+
+    none = torch.zeros(n).double()
+    value = lambda z: model_cost(expansion, z, followed(z), end, bend)  # noqa: E731
+    torch.testing.assert_close(value(none), -found.decrement[0])
+    torch.testing.assert_close(torch.func.jacrev(value)(none), found.gradient[0])
+    torch.testing.assert_close(found.costates[0, 0], found.gradient[0])
+    assert torch.equal(found.costates[:, -1], end)
+    if roomy == 0.05:
+        assert float(found.offset.abs().max()) == 0.05
+        assert bool((found.feedback[found.offset.abs() == 0.05] == 0).all())
+        return
+    for z in (none, tensor([0.3, -0.2])):  # also from beside the plan
+        slope = torch.func.jacrev(lambda v, z=z: model_cost(expansion, z, v, end, bend))(followed(z))
+        assert float(slope.abs().max()) < 1e-9
+
+
+def test_a_model_that_bends_down_has_no_minimum_until_it_is_made_convex() -> None:
+    curvature = torch.diag_embed(tensor([[[1.0, -2.0, 3.0], [1.0, 2.0, 3.0], [4e3, 1e-5, 1.0]]]))
+    curvature[0, 1, 0, 0] = math.nan
+    expansion = Expansion(random(1, 3, 1, 3), random(1, 3, 3), curvature)
+    found = newton.convexified(expansion)
+    assert found.curvature[0, 0].tolist() == torch.diag(tensor([1.0, 2.0, 3.0])).tolist()
+    torch.testing.assert_close(found.curvature[0, 1].diag(), tensor([3e-6, 2.0, 3.0]))
+    torch.testing.assert_close(found.curvature[0, 2].diag(), tensor([4e3, 4e-3, 1.0]))
+    assert found.slope is expansion.slope
+    none = torch.zeros(2, 1, 2).double()
+    flat = Expansion(none.unsqueeze(2), none, torch.zeros(2, 1, 2, 2).double())
+    flat.curvature[0, 0, 1, 1], flat.curvature[1, 0, 1, 1] = -1.0, 1.0
+    step = newton.direction(flat, torch.zeros(2, 1).double(), torch.zeros(2, 1, 1).double())
+    assert step.definite.tolist() == [False, True]
+
+
+def test_a_plan_that_is_replayed_holds_the_mean_of_each_period_and_stays_at_its_end() -> None:
+    time = 4 * torch.linspace(0, 1, 5, dtype=torch.float64) ** 2
+    plan = torch.tensor([1.0, -2.0]).double().view(2, 1, 1, 1) + torch.arange(8.0).double().view(4, 2, 1)
+    runner = adp.PlanReplay(time, plan)
+
+    def u(t: float, row: int) -> float:
+        if t >= 4.0:
+            return float(plan[row, -1, 1, 0])
+        k = int((time <= t).sum()) - 1
+        share = (t - float(time[k])) / float(time[k + 1] - time[k])
+        first, last = plan[row, k, :, 0].tolist()
+        return first + share * (last - first)
+
+    x = torch.zeros(2, 2).double()
+    carried = runner.init(x)
+    for period in range(5):
+        got, carried = runner.step(x, carried, x, 0.9)
+        times = 0.9 * (period + (torch.arange(400) + 0.5) / 400)
+        for row in range(2):
+            mean = sum(u(float(t), row) for t in times) / 400
+            assert float(got[row, 0]) == pytest.approx(mean, abs=8e-3)
+    torch.testing.assert_close(carried.identifier, torch.full((2, 1), 4.5).double())
+    with pytest.raises(ValueError, match=r"This plan is for 2 initial states; got 3\."):
+        runner.init(torch.zeros(3, 2).double())
