@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import pickle
+from typing import Any
 
 import pytest
 import torch
+from helpers import tensor
 from torch import Tensor
 
 from staf_torch import adp, systems
-from staf_torch.adp.detours import _detours
+from staf_torch.adp.controllers import carrying
 
 PLANE = systems.Linear(torch.eye(4).roll(2, dims=1).triu().tolist(), torch.eye(4)[:, 2:].tolist())
 COST = adp.QuadraticCost(1.0, 1.0, dim=4, inputs=2, low=-1.0, high=1.0)
@@ -50,16 +52,6 @@ def test_a_detour_is_cheaper_than_giving_way_at_the_last_moment() -> None:
     assert costs[1] < 0.99 * costs[0]
 
 
-def test_a_detour_is_carried_on_and_becomes_shorter() -> None:
-    ahead = usual(sizes=[0.5], lengths=[9])
-    x, carried = torch.tensor([[1.6, -0.3, -0.8, 0.0]], dtype=torch.float64), ahead.init(BESIDE)
-    u, carried = ahead.step(x, carried, x, 0.1)
-    s, left = carried.identifier[:, :2], float(carried.identifier[0, 2])
-    assert left == 8
-    away = torch.cat((s, torch.zeros_like(s)), dim=-1)
-    torch.testing.assert_close(u, LQR(x - away))
-
-
 def test_rows_do_not_see_each_other() -> None:
     ahead, many = usual(steps=8), 2 * torch.randn(6, 4, dtype=torch.float64)
     carried = ahead.init(many)
@@ -95,6 +87,8 @@ def adp_wall(x: Tensor, t: Tensor) -> Tensor:
         ({"weight": 0.0}, r"`DetourRollout\(weight=...\)` must be positive"),
         ({"sizes": [0.0]}, r"`DetourRollout\(sizes=...\)` must be positive"),
         ({"lengths": [0]}, r"`DetourRollout\(lengths=...\)`"),
+        ({"axes": [1.0] * 4}, r"`DetourRollout\(axes=...\)` must be 1 to 4 rows of 4 finite"),
+        ({"axes": []}, r"`DetourRollout\(axes=...\)` must be 1 to 4 rows of 4 finite"),
     ],
 )
 def test_arguments_that_break_their_rule_are_named(given: dict[str, object], rule: str) -> None:
@@ -116,22 +110,104 @@ def test_constraints_plant_and_period_are_checked() -> None:
         ahead.step(BESIDE, ahead.init(BESIDE), BESIDE, 0.2)
 
 
-def test_the_cheapest_detour_of_a_row_is_that_of_the_row_alone() -> None:
-    ahead = usual(steps=8)
-    x = BESIDE + torch.tensor([[-0.4, -0.3, -0.8, 0.0], [3.0, 2.0, 0.0, 0.0], [-0.2, 0.1, -0.9, 0.1]])
-    before, done = torch.zeros(3, 3).double(), torch.zeros(3, 1).double()
-    found = ahead.cheapest(x, before, done)
-    alone = torch.cat([ahead.cheapest(x[k : k + 1], before[:1], done[:1]) for k in range(3)])
-    assert torch.equal(found, alone)
-    assert 0 < int((found[:, 2] > 0).sum()) < 3
-
-
 @pytest.mark.parametrize("count", [1, 2, 3])
-def test_detours_lead_to_all_sides(count: int) -> None:
-    found = _detours(count, torch.tensor([0.5, 2.0]).double(), [3, 8])
+def test_detours_lead_to_all_sides_and_are_varied_along_each_axis(count: int) -> None:
+    ahead = usual(axes=torch.eye(count, 4), sizes=[0.5, 2.0], lengths=[3, 8])
+    found = ahead.fresh
     assert len(found) == 4 * (3**count - 1)
     assert sorted(found[:, -1].unique().tolist()) == [3, 8]
     assert sorted({round(size, 9) for size in found[:, :-1].norm(dim=-1).tolist()}) == [0.5, 2.0]
     ways = {tuple(row) for row in found.mul(1e6).round().tolist()}
     assert len(ways) == len(found)  # none twice
     assert {(*(-x for x in way[:-1]), way[-1]) for way in ways} == ways  # each with its opposite
+    changes = {tuple(row) for row in ahead.changes.mul(1e6).round().tolist()}
+    assert len(changes) == len(ahead.changes) == 1 + 4 * count
+    assert {tuple(-x for x in way) for way in changes} == changes
+    assert not bool(ahead.changes[:, -1].any())  # a length stays
+
+
+# Beside rollouts that are written out ---------------------------------------------------------------------
+
+
+CHEAP = adp.QuadraticCost(1.0, 0.5, dim=4, inputs=2, low=[-1.0, -0.8], high=[0.9, 1.0])
+
+
+def above(x: Tensor, t: Tensor) -> Tensor:
+    return x[:, 1] + 0.6 - 0.1 * t
+
+
+AXES = [[1.0, 0.0, 0.0, 0.0], [0.5, 2.0, 0.0, 0.0]]
+
+
+def ways(kind: type[adp.DetourRollout] = adp.DetourRollout, **given: Any) -> adp.DetourRollout:
+    usual = {"axes": AXES, "dt": 0.1, "steps": 8, "stride": 2, "terminal": LQR.value, "weight": 50.0}
+    usual |= {"margin": [0.02, 0.3], "sizes": [0.4, 1.0], "lengths": [3, 6]}
+    return kind(LQR, PLANE, CHEAP, [crossing, above], **(usual | given))
+
+
+def paid(x: Tensor, u: Tensor, time: float) -> tuple[Tensor, Tensor]:
+    """The next state of a mass and what a control costs over so long, of one row."""
+    rates, slopes, at = [], [], x
+    for share in (0.0, 0.5, 0.5, 1.0):
+        at = x + share * time * slopes[-1] if slopes else x
+        slopes.append(torch.cat((at[2:], u)))
+        rates.append(at @ at + 0.5 * u @ u)
+    step, rate = (part[0] + 2 * part[1] + 2 * part[2] + part[3] for part in (slopes, rates))
+    return x + time / 6 * step, time / 6 * rate
+
+
+def total(x: Tensor, detour: Tensor, done: float, stride: int = 2, steps: int = 8) -> tuple[Tensor, Tensor]:
+    """J of one row and one detour without what is missing, and that."""
+    spent, missing = torch.zeros(()).double(), torch.zeros(()).double()
+    s = detour[:2] @ tensor(AXES)
+    for k in range(0, steps, stride):
+        u = CHEAP.bounds.clip(LQR((x - s if k < float(detour[2]) else x)[None]))[0]
+        x, cost = paid(x, u, stride * 0.1)
+        t = tensor((done + k + stride) * 0.1)
+        short = [(margin - h(x[None], t)[0]).clamp(min=0) for h, margin in ((crossing, 0.02), (above, 0.3))]
+        spent, missing = spent + cost, missing + stride * 0.1 * sum(short)
+    return spent + LQR.value(x), missing
+
+
+STATES = tensor([[1.9, 0.0, 0.0, 0.0], [1.4, -0.5, -0.8, 0.2], [0.9, 0.6, 0.3, -1.2], [-1.0, 1.5, 0.1, 0.3]])
+BEFORE = tensor([[0.3, -0.2, 2.0], [0.0, 0.5, 4.0], [0.0, 0.0, 0.0], [-0.4, 0.1, 5.0]])
+DONE = tensor([[0.0], [3.0], [5.0], [11.0]])
+
+
+@pytest.mark.parametrize("stride", [1, 2])
+def test_the_cheapest_of_all_candidates_is_taken_and_followed_a_period(stride: int) -> None:
+    ahead, kinds = ways(stride=stride), set()
+    found = ahead.cheapest(STATES, BEFORE, DONE)
+    u, after = ahead.step(STATES, carrying(torch.cat((BEFORE, DONE), dim=-1)), STATES, 0.1)
+    for row in range(4):
+        tried = torch.cat((torch.zeros(1, 3).double(), BEFORE[row] + ahead.changes, ahead.fresh))
+        parts = [total(STATES[row], one, float(DONE[row]), stride) for one in tried]
+        best = min(range(len(tried)), key=lambda k, parts=parts: float(parts[k][0] + 50 * parts[k][1]))
+        torch.testing.assert_close(found[row], tried[best])
+        kinds.add((best > 0) + (best > 9))
+        chosen = tried[best] if float(parts[0][1]) > 0 else tried[0]  # the policy where it misses nothing
+        s = chosen[:2] @ tensor(AXES) if float(chosen[2]) > 0 else torch.zeros(4).double()
+        torch.testing.assert_close(u[row], CHEAP.bounds.clip(LQR(STATES[row] - s)))
+        left = max(float(chosen[2]) - 1, 0.0)
+        wanted = torch.cat((chosen[:2], tensor([left, float(DONE[row]) + 1])))
+        torch.testing.assert_close(after.identifier[row], wanted)
+    assert len(kinds) >= stride
+    alone = torch.cat(
+        [ahead.cheapest(*(part[k : k + 1] for part in (STATES, BEFORE, DONE))) for k in range(4)]
+    )
+    assert torch.equal(found, alone)
+
+
+def test_along_a_detour_the_goal_is_elsewhere_until_its_length_is_over() -> None:
+    ahead, tried = ways(), tensor([[0.3, -0.2, 2.0]]).repeat(4, 1)
+    s = tensor([0.3, -0.2]) @ tensor(AXES)
+    for k, moved in ((0.0, True), (1.0, True), (2.0, False), (3.0, False)):
+        found = ahead.control_along(STATES, tried, torch.full((4,), k).double())
+        torch.testing.assert_close(found, CHEAP.bounds.clip(LQR(STATES - s if moved else STATES)))
+
+
+def test_of_costs_that_are_no_numbers_none_is_the_least() -> None:
+    none = ways(terminal=lambda x: torch.nan * x[..., 0]).cheapest(STATES, BEFORE, DONE)
+    assert not bool(none.any())  # the policy itself
+    some = ways(terminal=lambda x: torch.where(x[..., 1] > 0.3, torch.nan, LQR.value(x)))
+    assert bool(some.cheapest(STATES, BEFORE, DONE).isfinite().all())

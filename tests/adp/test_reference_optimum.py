@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
 import logging
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -12,9 +12,8 @@ from helpers import uniform
 from torch import Tensor
 
 from staf_torch import adp, systems
-from staf_torch.adp import reference_optimum
 from staf_torch.adp.problem import AdpProblem, OptimumSettings
-from staf_torch.adp.reference_optimum import _chosen, compare, known_value, optima, optimal_cost
+from staf_torch.adp.reference_optimum import compare, known_value, optima, optimal_cost
 
 PLANT = systems.Linear([[0.0, 1.0], [2.0, -1.0]], [[0.0], [1.0]])
 COST = adp.QuadraticCost(1.0, 0.5, dim=2, inputs=1)
@@ -28,10 +27,9 @@ class Weak(adp.Feedback):
 
     def __init__(self, values: bool = True) -> None:
         super().__init__(lambda x: 0.5 * LQR(x) - 2 * x[..., :1])
-        self.values, self.asked = values, []  # type: ignore[var-annotated]
+        self.values = values
 
     def value(self, x: Tensor, carried: adp.ControllerState) -> Tensor | None:
-        self.asked.append((len(x), tuple(carried.critic.shape), tuple(carried.actor.shape)))
         return x.square().sum(-1) if self.values else None
 
 
@@ -69,15 +67,7 @@ def test_a_controller_without_an_idea_of_the_value_has_no_error_of_it() -> None:
     assert found.control_error is not None
 
 
-def test_values_are_asked_for_in_blocks_with_the_weights_of_their_time(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    whole = compare(problem(), result()).value_error
-    monkeypatch.setattr(reference_optimum, "_AT_ONCE", 7)
-    controller = Weak()
-    found = compare(problem(controller), result()).value_error
-    torch.testing.assert_close(found, whole)
-    assert [rows for rows, *_ in controller.asked] == [7, 7, 4]
+def test_the_value_of_a_learner_is_that_of_the_weights_of_its_time() -> None:
     points = adp.RandomPoints(1, 0.3)
     learner = adp.ActorCritic(adp.QuadraticBasis(2), PLANT, COST, points, critic=[1.0, 0.3, 1.0])
     with torch.no_grad():
@@ -96,71 +86,30 @@ def test_where_no_formula_is_known_and_nothing_is_shot_nothing_is_said() -> None
         assert compare(given, result()) == (None, None, None)
 
 
-class Shot:
-    """In place of `DirectShooting`: keeps how it was made, and answers by the LQR."""
-
-    made: list[dict[str, Any]]
-    lost = False
-
-    def __init__(self, system: Any, cost: Any, **given: Any) -> None:
-        Shot.made.append({"system": system, "cost": cost, **given})
-        self.intervals, self.horizon = 24, 2.5
-
-    def solve(self, x: Tensor) -> Any:
-        Shot.made[-1]["x"] = x
-        if Shot.lost is None:
-            raise ValueError("no LQR\nat all")
-        value, converged = LQR.value(x).clone(), torch.ones(len(x)).bool()
-        error = torch.full((len(x),), 1e-3).double()
-        if Shot.lost:
-            value[1], converged[2], error[1] = torch.nan, False, torch.nan
-        return SimpleNamespace(
-            value=value, control=LQR(x), converged=converged, mesh_error=error, horizon_error=2 * error
-        )
-
-
-@pytest.fixture
-def _shot(monkeypatch: pytest.MonkeyPatch) -> None:
-    Shot.made, Shot.lost = [], False
-    monkeypatch.setattr(reference_optimum, "DirectShooting", Shot)
-
-
-@pytest.mark.usefixtures("_shot")
-def test_some_recorded_states_are_shot_from(caplog: pytest.LogCaptureFixture) -> None:
-    loop = result()
-    given = problem(cost=BOUNDED, shooting=True, states=9)
+def test_some_recorded_states_are_shot_from_where_no_formula_is_known(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    loop, given = result(), problem(cost=BOUNDED, shooting=True, states=9)
     with caplog.at_level(logging.INFO):
         found = compare(given, loop)
-    (made,) = Shot.made
-    assert (made["horizon"], made["intervals"]) == (2.5, 24)
-    assert made["cost"] is not given.cost
-    assert made["system"] is not PLANT
-    at = [0, 1, 3]  # of six times the last, where no control is, is left out
-    torch.testing.assert_close(made["x"], loop.state[:, at].flatten(0, 1))
     assert found.cost is not None
     assert found.control_error is not None
     assert found.value_error is not None
-    torch.testing.assert_close(found.cost, LQR.value(X0))
-    assert found.control_error.shape == found.value_error.shape == (3, 6)
+    at = [0, 1, 3]  # of six times the last, where no control is, is left out
     assert found.control_error.isnan().all(0).tolist() == [False, False, True, False, True, True]
+    search = adp.DirectShooting(PLANT, BOUNDED, horizon=2.5, intervals=24)
     x = loop.state[:, at]
-    torch.testing.assert_close(found.control_error[:, at], (loop.control[:, at] - LQR(x)).norm(dim=-1))
-    torch.testing.assert_close(found.value_error[:, at], (LQR.value(x) - x.square().sum(-1)).abs())
-    said = "V* by direct shooting from 9 states, 24 intervals over 2.5 s: "
-    assert [record.message for record in caplog.records] == [
-        said + "mesh error <= 1.0e-03, horizon <= 2.0e-03"
-    ]
-
-
-@pytest.mark.usefixtures("_shot")
-def test_one_state_a_row_gives_the_cost_alone_and_float_stays_float() -> None:
-    for states in (3, 0):
-        found = compare(problem(cost=BOUNDED, shooting=True, states=states), result())
-        assert found.cost is not None
-        assert (found.control_error, found.value_error) == (None, None)
-    single = optima(problem(cost=BOUNDED, shooting=True), X0.float().view(3, 1, 2))
+    best = search.solve(x.flatten(0, 1))
+    assert bool(best.converged.all())
+    value, control = best.value.view(3, 3), best.control.view(3, 3, 1)
+    torch.testing.assert_close(found.cost, value[:, 0], rtol=1e-9, atol=0)
+    off = (loop.control[:, at] - control).norm(dim=-1)
+    torch.testing.assert_close(found.control_error[:, at], off, rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(found.value_error[:, at], (value - x.square().sum(-1)).abs())
+    (said,) = [record.getMessage() for record in caplog.records]
+    assert "9 states, 24 intervals over 2.5 s" in said
+    single = optima(given, X0.float().view(3, 1, 2))
     assert single is not None
-    assert Shot.made[-1]["x"].dtype == torch.float64
     assert (single.value.dtype, single.value.shape, single.control.shape) == (
         torch.float32,
         (3, 1),
@@ -168,32 +117,23 @@ def test_one_state_a_row_gives_the_cost_alone_and_float_stays_float() -> None:
     )
 
 
-@pytest.mark.usefixtures("_shot")
+@pytest.mark.parametrize("states", [3, 0])
+def test_one_state_a_row_gives_the_cost_alone(states: int) -> None:
+    found = compare(problem(cost=BOUNDED, shooting=True, states=states), result())
+    assert found.cost is not None
+    assert (found.control_error, found.value_error) == (None, None)
+
+
 def test_what_shooting_does_not_find_is_told(caplog: pytest.LogCaptureFixture) -> None:
-    given = problem(cost=BOUNDED, shooting=True)
-    Shot.lost = True
-    assert optima(given, X0) is not None
-    assert [record.message for record in caplog.records] == [
-        "direct shooting found no optimum from 1 of 3 states",
-        "V* of 1 of 3 states may be a local minimum only",
-    ]
+    """On four intervals no control is stationary; a plant without an LQR has no optimum at all."""
+    found = optima(problem(cost=BOUNDED, shooting=True, intervals=4, horizon=9.0), X0)
+    assert found is not None
+    lost = int(found.value.isnan().sum())
+    assert lost > 0
+    assert f"direct shooting found no optimum from {lost} of 3 states" in caplog.text
     caplog.clear()
-    Shot.lost = None  # type: ignore[assignment]
+    stuck = systems.Linear([[1.5, 0.0], [0.0, -1.0]], [[0.0], [1.0]])
+    given = dataclasses.replace(problem(cost=BOUNDED, shooting=True), system=stuck)
     assert optima(given, X0) is None
     assert compare(given, result()) == (None, None, None)
-    assert {record.message for record in caplog.records} == {"the optimum is not known: no LQR"}
-
-
-@pytest.mark.parametrize(
-    ("times", "count", "chosen"),
-    [
-        (11, 5, [0, 2, 4, 6, 8]),
-        (11, 10, list(range(10))),
-        (11, 99, list(range(10))),
-        (11, 0, [0]),
-        (2, 4, [0]),
-        (6, 2, [0, 2]),
-    ],
-)
-def test_times_are_chosen_evenly_from_the_first(times: int, count: int, chosen: list[int]) -> None:
-    assert _chosen(times, count).tolist() == chosen
+    assert "the optimum is not known: " in caplog.text
