@@ -15,7 +15,6 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from absent_extras import heard
 
 ROOT = Path(__file__).resolve().parent.parent
 PLANTS = '''
@@ -102,8 +101,6 @@ def run_all(jobs: Mapping[str, Sequence[str]], base: Path, module: str = PLANTS)
         (folder / "plants.py").write_text(module)
         (folder / "blocked").write_text("a file where a directory should be\n")
     found = in_a_child(lambda: [one(str(folders[name]), list(argv)) for name, argv in jobs.items()], base)
-    for code, *said in found:
-        heard(code, *said)
     return {name: Outcome(*one, folders[name]) for name, one in zip(jobs, found, strict=True)}
 
 

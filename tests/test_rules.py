@@ -1,6 +1,7 @@
 """Every argument with a rule: its edge is accepted, what lies beyond is refused by name, rule and value.
 
 The rules are read from the source, `integer("rings", "count", count, least=1)`; how to call is written here.
+What no rule in the source says, shapes and kinds that do not fit, is in `REFUSED`.
 """
 
 from __future__ import annotations
@@ -28,32 +29,13 @@ from staf_torch.envs.episodes import Episodes
 from staf_torch.systems import trajectory
 
 ROOT = Path(st.__file__).parent
-ELSEWHERE = {
-    "settings",
-    "experiments",
-    "sweeps",
-    "cli",
-}  # rules of the command line: tests/cli/test_cli_errors.py
+ELSEWHERE = {"settings", "experiments", "sweeps", "cli"}  # rules of the command line
 OTHERS = {
-    "ConcurrentTracker": "in tests/adp/adaptation/test_identifiers.py",
-    "RobustFilter": "in tests/adp/adaptation/test_robust_filter.py",
-    "Observed": "in tests/adp/adaptation/test_kalman.py",
-    "ConsiderFilter": "in tests/adp/adaptation/test_consider.py",
-    "trace": "takes an exported program",
-    "Cosine": "numbers and lists alike, in tests/test_targets.py",
-    "paper_step": "of the theorem, in tests/theory/test_errata.py",
-    "StaF.gradient": "in tests/approximation/test_module.py",
-    "StaF.hessian": "in tests/approximation/test_hessian.py",
-    "ChaseOptimizer": "in tests/optim/test_torch_optimizer.py",
-    "AvoidanceCost": "in tests/adp/test_avoidance.py",
-    "plan_around": "in tests/adp/test_avoidance.py",
-    "BoxFilter": "in tests/adp/test_box_filter.py",
-    "DetourPlans": "in tests/adp/test_detour_plans.py",
-    "TwoLinkRobot": "numbers within a list, in tests/systems/test_barrier.py",
-    "MujocoPlant": "in tests/systems/test_mujoco_plant.py",
-    "EnergyShaping": "in tests/adp/test_energy_shaping.py",
+    *("ConcurrentTracker", "RobustFilter", "Observed", "ConsiderFilter", "trace", "Cosine"),
+    *("paper_step", "StaF.gradient", "StaF.hessian", "ChaseOptimizer", "AvoidanceCost", "plan_around"),
+    *("BoxFilter", "DetourPlans", "TwoLinkRobot", "MujocoPlant", "EnergyShaping"),
 }
-"""Calls whose rules are held elsewhere."""
+"""Calls whose rules the tests of their rooms hold."""
 
 
 class Rule(NamedTuple):
@@ -106,8 +88,8 @@ ACTUATORS = adp.ParametricPlant.of_effectiveness(PLANT)
 
 
 def stream_drift(**given: Any) -> adp.StreamDrift:
-    usual = {"rows": [1], "deviation": 1.0, "length": 0.1}
-    return adp.StreamDrift(PLANT, st.GaussianKernel(2.0), torch.eye(2).double(), **{**usual, **given})
+    usual = {"known": PLANT, "kernel": st.GaussianKernel(2.0), "offsets": EYE}
+    return adp.StreamDrift(**{**usual, "rows": [1], "deviation": 1.0, "length": 0.1, **given})
 
 
 INTEGRATOR = double_integrator(-1.0, 1.0)
@@ -289,6 +271,169 @@ CALLS: dict[str, Callable[..., Any]] = {
 }
 """How to call, with arguments that are right beside the one in question."""
 
+HELD, DISCOUNTED = adp.LQR(PLANT, COST, period=0.1), adp.QuadraticCost(1.0, 1.0, 2, 1, discount=0.1)
+MEMORY, EXPERIENCE = adp.GlobalValue(INTEGRATOR, LIBRARY, [3.0, 3.0]), st.ExperienceMemory(BASIS, 4)
+POINTS, PAPER = adp.RandomPoints(1, 1.0), st.targets.Paper()
+TWO, THREE = (torch.zeros(1, size, dtype=torch.float64) for size in (2, 3))
+STAF = st.StaF(BASIS).fit_(TWO[0], PAPER)
+
+
+def regressor(x: torch.Tensor, u: torch.Tensor) -> torch.Tensor:
+    """Of one parameter, in the second row of two states."""
+    return torch.stack((0 * x[..., 0], x[..., 0]), -1).unsqueeze(-1)
+
+
+def rows(**given: Any) -> adp.ParametricPlant:
+    settings = {"regressor": regressor, "dim": 2, "inputs": 1, "theta": [0.5], **given}
+    return adp.ParametricPlant(settings.pop("regressor"), lambda x, u: x * u, **settings)
+
+
+def kalman(**given: Any) -> adp.KalmanFilter:
+    return adp.ExtendedKalman(PLANT, lambda x: x[..., :1], **{"noise": [0.1], **given})
+
+
+def observed(**given: Any) -> Any:
+    return adp.Observed(adp.Feedback(HELD), kalman(), **{"deviation": 1.0, **given})
+
+
+def regressed(x: Any = None, **given: Any) -> Any:
+    """A regressor that has met one sample, where its arguments are checked."""
+    x = torch.tensor([0.1, 0.2]) if x is None else x
+    return st.StaFRegressor(**given).partial_fit(x, x[..., 0])
+
+
+REFUSED: list[tuple[Callable[[], Any], str]] = [
+    (lambda: BASIS(THREE, TWO[0]), "must have 2 entries in its last dimension"),
+    (lambda: BASIS.local(THREE), "`StaFBasis.local(x=...)` must have 2 entries"),
+    (lambda: STAF.hessian(TWO, mode="no"), "`StaF.hessian(mode=...)` must be one of"),
+    (lambda: STAF(THREE), "must have 2 entries in its last dimension"),
+    (
+        lambda: st.chase(
+            0.1 * torch.ones(1, 2, 2).double(), BASIS, PAPER, st.optim.SteepestDescent(), weights=TWO[0]
+        ),
+        "(weights=...)` must have 3 entries",
+    ),
+    (lambda: EXPERIENCE(THREE), "`ExperienceMemory(y=...)` must have 2 entries"),
+    (lambda: EXPERIENCE.add(THREE[0], THREE[0]), "`ExperienceMemory.add(x=...)` must have 2 entries"),
+    (lambda: EXPERIENCE.add(TWO[0], TWO[0]), "`ExperienceMemory.add(coefficients=...)` must have 3 entries"),
+    (lambda: regressed(noise=0.0), "`StaFRegressor(noise=...)` must be positive"),
+    (lambda: regressed(forgetting="no"), "`StaFRegressor(forgetting=...)` must be a number"),
+    (lambda: regressed(memory=3), "`StaFRegressor(memory=...)` must be at least"),
+    (lambda: regressed(memory=128, neighbours=7), "(neighbours=...)` must be at least 8"),
+    (lambda: regressed(0.1 * EYE, robust=3.0).add(0), "add(streams=...)` must be at least 1"),
+    (
+        lambda: theory.drift_constants(BASIS, PAPER, THREE, THREE),
+        "`drift_constants(states=...)` must have 2 entries",
+    ),
+    (lambda: theory.power_function(BASIS, THREE, TWO), "`power_function(x=...)` must have 2 entries"),
+    (
+        lambda: theory.layout_errors(st.GaussianKernel(), PAPER, TWO, 0.3, [THREE]),
+        "(layouts=...)` must have 2 entries",
+    ),
+    (lambda: systems.Bounds("no", None, 1), "`Bounds(low=...)` must be a number or one an input"),
+    (lambda: systems.Linear([[0.0]], [[1.0], [1.0]]), "must have 1 rows, one a state"),
+    (lambda: systems.TwoLinkRobot([1.0, 2.0]), "`TwoLinkRobot(inertia=...)` must have 3 entries"),
+    (lambda: systems.TwoStateChain([1.0]), "`TwoStateChain(theta=...)` must have 4 entries"),
+    (
+        lambda: systems.RatePlant(lambda x, u: x + u, dim=1, inputs=1, equilibrium=["no"]),
+        "(equilibrium=...)` must be a list of numbers",
+    ),
+    (lambda: adp.QuadraticCost(1.0, 1.0, 2, 1, discount=-1.0), "(discount=...)` must not be neg"),
+    (
+        lambda: adp.BoundedInputCost(1.0, [[2.0, 1.0], [1.0, 2.0]], 2, 2, bound=1.0),
+        "`BoundedInputCost(control=...)` must be diagonal",
+    ),
+    (lambda: adp.QuadraticCost(["no", 1.0], 1.0, 2, 1), "must be a list of numbers"),
+    (lambda: adp.QuadraticCost(1.0, 1.0, 2, 1, target=[1.0]), "(target=...)` must have 2 numbers"),
+    (
+        lambda: adp.QuadraticCost(1.0, 1.0, 2, 1, output=lambda x: x[0]),
+        "(output=...)` must map (..., 2) to (..., p)",
+    ),
+    (
+        lambda: adp.ActorCritic(adp.QuadraticBasis(2), PLANT, COST, POINTS, critic=TWO[0]),
+        "`ActorCritic(critic=...)` must have 3 entries",
+    ),
+    (
+        lambda: adp.RolloutPolicy(
+            BASIS, systems.StepPlant(lambda x, u: 0.9 * x + u, dim=2, inputs=1, dt=0.1), COST, LQR, LQR.value
+        ),
+        "`RolloutPolicy(model=...)` must be a ControlAffineSystem",
+    ),
+    (
+        lambda: SampledRollout(
+            st.StaFBasis(st.GaussianKernel(), st.StateFollowingCenters(st.simplex(3), 0.3)),
+            *(PLANT, COST, HELD, HELD.value, HELD.p),
+            period=0.1,
+        ),
+        "`SampledRollout(basis=...)` must have the plant's 2 states or its 1 inputs",
+    ),
+    (
+        lambda: adp.near_optimal(PLANT, COST, dt=0.1).report(spread=-1.0),
+        "`report(spread=...)` must be positive",
+    ),
+    (
+        lambda: adp.SafetyFilter(LQR, PLANT, still, dt=0.1).restrain(THREE, TWO[:, :1]),
+        "`SafetyFilter(x=...)` must have 2 entries",
+    ),
+    (lambda: MEMORY.value(THREE), "`GlobalValue.value(x=...)` must have 2 entries"),
+    (
+        lambda: adp.SampledProblem.of(
+            systems.StepPlant(lambda x, u: 0.9 * x + u, dim=2, inputs=1, dt=0.1), COST, dt=0.2
+        ),
+        "`SampledProblem.of(dt=...)` must be the plant's period, 0.1 s",
+    ),
+    (
+        lambda: adp.simulate(adp.Feedback(LQR), PLANT, COST, THREE, dt=0.1, steps=1),
+        "`simulate(x0=...)` must have 2 entries",
+    ),
+    (
+        lambda: adp.simulate(adp.Feedback(LQR), PLANT, COST, TWO, dt=0.1, steps=1, seed=[0, 1]),
+        "`simulate(seed=...)` must be one a row, 1",
+    ),
+    (
+        lambda: adp.simulate(
+            adp.Feedback(LQR), PLANT, adp.QuadraticCost(1.0, 1.0, 3, 1), TWO, dt=0.1, steps=1
+        ),
+        "`simulate(cost=...)` must be for the plant's 2 states",
+    ),
+    (
+        lambda: adp.AdaptiveLQR(ACTUATORS, DISCOUNTED, WINDOWS, ESTIMATE),
+        "`AdaptiveLQR(cost=...)` must have no discount",
+    ),
+    (
+        lambda: adp.AdaptiveLQR(ACTUATORS, COST, WINDOWS, adp.LeastSquares([1.0, 1.0], 0.5)),
+        "`AdaptiveLQR(law=...)` must have the model's 1 parameters",
+    ),
+    (
+        lambda: adp.AdaptiveLQR(ACTUATORS, COST, WINDOWS, ESTIMATE, doublings=4, a_step=3),
+        "`AdaptiveLQR(a_step=...)` must divide the 4 doublings",
+    ),
+    (lambda: stream_drift(known=None), "`StreamDrift(known=...)` must be a ControlAffine"),
+    (
+        lambda: stream_drift(kernel=st.ExponentialKernel()),
+        "`StreamDrift(kernel=...)` must be translation invariant",
+    ),
+    (lambda: stream_drift(offsets=THREE), "(offsets=...)` must be numbers (M, 2)"),
+    (lambda: kalman(noise=[]), "(noise=...)` must be positive numbers, one an output"),
+    (lambda: observed(deviation=[1.0]), "`Observed(deviation=...)` must be one number or a list"),
+    (lambda: observed(mean=[1.0]), "`Observed(mean=...)` must have 2 entries"),
+    (
+        lambda: rows(rows=[0]),
+        "`ParametricPlant(rows=...)` must have all states whose regressor does not vanish",
+    ),
+    (
+        lambda: rows(regressor=lambda x, u: 1 + regressor(x, u)).family(),
+        "`ParametricPlant(regressor=...)` must vanish at the set-point",
+    ),
+    (
+        lambda: adp.ChangingPlant(ACTUATORS).cost(adp.QuadraticCost(1.0, 1.0, 2, 1, target=[1.0, 0.0])),
+        "`ChangingPlant(cost=...)` must be of x itself at the origin",
+    ),
+    (
+        lambda: Episodes(PLANT, COST, 1, dt=0.1, horizon=1.0, limit=5.0, penalty=1.0).step(TWO),
+        "`Episodes.step(u=...)` must have the shape (1, 1)",
+    ),
+]
 NO_NUMBER: tuple[object, ...] = (math.nan, math.inf, "0.1", True, None)
 WRONG: dict[str, tuple[object, ...]] = {
     "positive": (*NO_NUMBER, 0.0, -1.0, torch.tensor([1.0, 0.0]), torch.tensor([1]), torch.tensor(math.nan)),
@@ -301,34 +446,12 @@ WRONG: dict[str, tuple[object, ...]] = {
 }
 EDGE: dict[str, tuple[object, ...]] = {"non_negative": (0.0,), "flag": (True, False)}
 ABSENT = {
-    ("RBFGridBasis", "width"),
-    ("Supervised", "momentum"),
-    ("HeavyBall", "momentum"),
-    ("Nesterov", "momentum"),
-}
-ABSENT |= {
-    ("HeavyBall", "step"),
-    ("RolloutPolicy", "period"),
-    ("DirectShooting", "horizon"),
-    ("StaF", "out_features"),
-}
-ABSENT |= {
-    ("IntegralWindows", "first"),
-    ("LeastSquares", "alarm"),
-    ("HistoryStack", "outputs"),
-    ("AdaptiveLQR", "a_step"),
-    ("DriftLQR", "a_step"),
-    ("PlantEnv", "bound"),
-    ("DirectShooting", "iterations"),
-    ("DirectShooting", "intervals"),
-    ("simulate", "seed"),
-    ("trajectory", "chunk"),
-    ("near_optimal", "dt"),
-    ("near_optimal", "horizon"),
-    ("report", "spread"),
-    ("SafetyFilter", "weight"),
-    ("BoundedInputCost", "bound"),
-    ("PathIntegral", "noise"),
+    *("RBFGridBasis.width", "Supervised.momentum", "HeavyBall.momentum", "Nesterov.momentum"),
+    *("HeavyBall.step", "RolloutPolicy.period", "DirectShooting.horizon", "StaF.out_features"),
+    *("IntegralWindows.first", "LeastSquares.alarm", "HistoryStack.outputs", "AdaptiveLQR.a_step"),
+    *("DriftLQR.a_step", "PlantEnv.bound", "DirectShooting.iterations", "DirectShooting.intervals"),
+    *("simulate.seed", "trajectory.chunk", "near_optimal.dt", "near_optimal.horizon", "report.spread"),
+    *("SafetyFilter.weight", "BoundedInputCost.bound", "PathIntegral.noise"),
 }
 """Arguments for which None has a meaning of its own."""
 NOT_ALONE = {("rings", "count"), ("SampledProblem", "dim"), ("StepPlant", "dim")}
@@ -343,7 +466,11 @@ def test_every_call_with_a_rule_is_known_here() -> None:
 
 @pytest.mark.parametrize("rule", RULES, ids=str)
 def test_what_breaks_a_rule_is_refused_by_name(rule: Rule) -> None:
-    wrong = [value for value in WRONG[rule.kind] if value is not None or rule[:2] not in ABSENT]
+    wrong = [
+        value
+        for value in WRONG[rule.kind]
+        if value is not None or f"{rule.call}.{rule.argument}" not in ABSENT
+    ]
     if rule.kind == "integer" and rule.least is not None:
         wrong += [rule.least - 1, rule.least - 100]
     for value in wrong:
@@ -359,3 +486,9 @@ def test_the_edge_of_a_rule_is_accepted(rule: Rule) -> None:
         edge.append(rule.least)
     for value in edge:
         CALLS[rule.call](**{rule.argument: value})
+
+
+@pytest.mark.parametrize(("call", "words"), REFUSED, ids=[words for _, words in REFUSED])
+def test_what_does_not_fit_is_refused_in_its_words(call: Callable[[], Any], words: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(words)):
+        call()
