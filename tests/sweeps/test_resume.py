@@ -12,9 +12,7 @@ from typing import Any
 import pytest
 
 from staf_torch import __version__
-from staf_torch.results import run_record as records
-from staf_torch.sweeps import resume
-from staf_torch.sweeps.resume import command_line, is_run_of_members, may_run_code, recorded
+from staf_torch.sweeps.resume import command_line, is_run_of_members, recorded
 
 
 def sweep(place: Path, typed: Sequence[str] = ("seed=0,1",), hydra: Sequence[str] = (), **more: Any) -> Path:
@@ -255,21 +253,3 @@ def test_lines_that_are_typed_again_are_known_one_by_one(tmp_path: Path) -> None
         lines(place, FOREIGN[1])
     assert "searchpath" in str(told.value)
     assert "_target_" not in str(told.value)
-
-
-def test_which_lines_may_run_code() -> None:
-    harmless = [
-        "hydra.launcher.batch=3",
-        "+hydra.launcher.batch=3",
-        "++seed=1",
-        "kernel=gaussian",
-        "hydration=1",
-    ]
-    harmful = ["hydra.launcher.batch=3;x", "hydra.run.dir2=x", "~hydra.callbacks", "+a=${b}", "x@y=1"]
-    assert [may_run_code(line) for line in harmless] == [False, True, False, False, True]
-    assert all(map(may_run_code, harmful))
-
-
-def test_own_lines_are_those_about_the_jobs() -> None:
-    assert resume._merged([], ["sweep.resume=a", "hydra.run.dir=b", "hydra.x=c"]) == ["hydra.x=c"]
-    assert records.own(["seed=1", "+sweep.objective=a", "sweeper=1"]) == ["seed=1", "sweeper=1"]
