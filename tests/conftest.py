@@ -17,6 +17,7 @@ from pathlib import Path
 import hypothesis
 import pytest
 import torch
+import yaml
 from absent_extras import pytest_make_collect_report, pytest_runtest_makereport
 from recorded import Record
 
@@ -66,12 +67,14 @@ def pytest_collection() -> Generator[None, object, object]:
 
 @pytest.fixture(autouse=True, scope="session")
 def _settings_are_trusted_as_by_the_command() -> Iterator[None]:
-    """Hydra 1.4 builds only what a program trusts: here the package, and what tests define."""
-    from composed_once import pieces
+    """Hydra 1.4 builds only what a program trusts: here the package, and what tests define.
 
+    It also reads `conf/` anew for each of some hundred commands, faster by the parser in C.
+    """
     from staf_torch.sweeps.hydra_compat.program import trusted
 
-    with trusted(path.stem for path in Path(__file__).parent.rglob("*.py")), pieces():
+    yaml.SafeLoader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+    with trusted(path.stem for path in Path(__file__).parent.rglob("*.py")):
         yield
 
 

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.resources
 import importlib.util
+import io
 import itertools
-import json
+import logging
 import os
 import re
-import subprocess
+import runpy
 import sys
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from command_line import ROOT
+from command_line import ROOT, in_a_child
 from composing import HYDRA
 from hydra import compose, initialize
 from hydra.utils import instantiate
@@ -41,24 +44,23 @@ def sweeps(tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, str]]:
         launchers.append(["joblib", "hydra.launcher.n_jobs=1"])
     lines = [["-m", f"hydra/launcher={name}", *more, *common] for name, *more in launchers]
     lines.append(["-m", "hydra/launcher=batched", "hydra.launcher.foreign=run", "steps=1"])
-    path = os.pathsep.join([str(ROOT), str(ROOT / "staf_torch" / "plugins"), *_extras()])
-    program = [sys.executable, "-W", "error", str(Path(__file__).with_name("own_app_sweeps.py")), str(APP)]
-    ended = subprocess.run(
-        [*program, json.dumps(lines)],
-        cwd=place,
-        env=os.environ | {"PYTHONPATH": path},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert ended.returncode == 0, ended.stdout + ended.stderr
-    said = json.loads((place / "said.json").read_text())
+    said = in_a_child(lambda: [swept(place, line) for line in lines], place)
     return [{"line": " ".join(line), **text} for line, text in zip(lines, said, strict=True)]
 
 
-def _extras() -> list[str]:
-    """Folders of this process's path that hold extras, such as joblib."""
-    return [entry for entry in os.environ.get("PYTHONPATH", "").split(os.pathsep) if entry]
+def swept(place: Path, line: list[str]) -> dict[str, str]:
+    """Run the application; return what it printed and logged, and the error that ended it."""
+    os.chdir(place)
+    said, error = io.StringIO(), ""
+    sys.argv = [str(APP), *line]
+    with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said), warnings.catch_warnings():
+        warnings.simplefilter("error")
+        try:
+            runpy.run_path(str(APP), run_name="__main__")
+        except (Exception, SystemExit) as raised:
+            error = str(raised)
+    logging.getLogger().handlers.clear()  # which would write to a stream that is gone
+    return {"out": said.getvalue(), "error": error}
 
 
 @pytest.mark.parametrize("launcher", ["basic", "batched", "joblib"])

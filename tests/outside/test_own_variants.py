@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
 import re
-import subprocess
+import shlex
 import sys
 from pathlib import Path
 
 import gymnasium
 import numpy as np
 import pytest
-from command_line import ROOT, environment
+from command_line import ROOT, in_a_child, one
 
-from staf_torch import envs
+from staf_torch import envs, lanes
+from staf_torch.cli import export, table
 from staf_torch.tables import collect
 
 PAGE = (ROOT / "conf" / "README.md").read_text(encoding="utf-8")
@@ -29,13 +32,29 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name, text in FILES.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text(text)
-    (folder / "jobs.json").write_text(json.dumps(COMMANDS))
-    program = [sys.executable, str(Path(__file__).with_name("commands.py")), "jobs.json", "results.json"]
-    ended = subprocess.run(
-        program, cwd=folder, env=environment(), capture_output=True, text=True, check=False
-    )
-    assert ended.returncode == 0, ended.stderr
+    with lanes.compiling("never"):
+        in_a_child(lambda: ran(folder), folder)
     return folder
+
+
+def ran(folder: Path) -> list[tuple[int, str]]:
+    """Run the command lines of the three programs in a folder: exit code, and output and errors together."""
+    sys.path.insert(0, str(folder))
+    found = []
+    for line in COMMANDS:
+        program, *arguments = shlex.split(line)
+        if program == "staf":
+            code, out, err = one(str(folder), arguments)
+            found.append((code, out + err))
+            continue
+        main = {"staf-table": table.main, "staf-export": export.main}[program]
+        said = io.StringIO()
+        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+            try:
+                found.append((int(main(arguments) or 0), said.getvalue()))
+            except SystemExit as end:
+                found.append((1, said.getvalue() + str(end)))
+    return found
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +73,6 @@ def test_a_variant_is_one_class_and_one_yaml() -> None:
     assert len(modules) == len(groups)
 
 
-@pytest.mark.needs_compiler
 def test_own_variants_run_and_their_metric_is_declared_in_the_record(place: Path, said: list[str]) -> None:
     metrics = json.loads((place / "runs/own/metrics.json").read_text())
     record = json.loads((place / "runs/own/run.json").read_text())
@@ -69,7 +87,6 @@ def test_own_variants_run_and_their_metric_is_declared_in_the_record(place: Path
     }
 
 
-@pytest.mark.needs_compiler
 def test_a_sweep_over_own_hyperparameters_has_a_row_for_each(place: Path, said: list[str]) -> None:
     runs = collect(place / "runs/sweep").rows
     assert [run.status for run in runs] == ["completed"] * 4
@@ -78,7 +95,6 @@ def test_a_sweep_over_own_hyperparameters_has_a_row_for_each(place: Path, said: 
     assert len({run.metrics["digits"] for run in runs}) == 4
 
 
-@pytest.mark.needs_compiler
 def test_an_own_experiment_is_swept(place: Path, said: list[str]) -> None:
     near, far = (run.metrics["distance"] for run in collect(place / "runs/closeness").rows)
     assert near is not None
@@ -86,7 +102,6 @@ def test_an_own_experiment_is_swept(place: Path, said: list[str]) -> None:
     assert 0 < near < far
 
 
-@pytest.mark.needs_compiler
 def test_a_table_sorts_and_marks_an_own_metric_by_its_declaration(place: Path, said: list[str]) -> None:
     runs = collect(place / "runs/sweep").rows
     best = max(run.metrics["digits"] for run in runs)
@@ -96,13 +111,11 @@ def test_a_table_sorts_and_marks_an_own_metric_by_its_declaration(place: Path, s
     assert shown == sorted(shown, reverse=True)
 
 
-@pytest.mark.needs_compiler
 def test_the_sheet_of_an_own_plant_has_its_units(place: Path, said: list[str]) -> None:
     assert "m, m/s" in said[SHEET]
     assert "| N |" in said[SHEET]
 
 
-@pytest.mark.needs_compiler
 def test_an_own_plant_is_an_environment_by_its_dotted_path(
     place: Path, said: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
