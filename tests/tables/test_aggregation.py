@@ -1,21 +1,34 @@
-"""Which columns and rows a table has, what they show and in which order, run by run and cell by cell."""
+"""From runs to rows: what is aggregated over what, against numbers by hand and SciPy, in which order."""
 
 from __future__ import annotations
 
 import math
+import statistics
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import pytest
-from recorded import Record
+from scipy.stats import t as student
+from sweep_runs import BAD_COUNT, error, write_run, write_sweep
 
 from staf_torch.results.metric_info import MetricInfo
-from staf_torch.results.reader import Collection, Run
-from staf_torch.tables import Layout, Style, Table, latex_text, tabulate
-from staf_torch.tables.aggregate import AGGREGATES, as_text, half_width, place, rank
+from staf_torch.results.reader import Collection, Run, collect
+from staf_torch.tables import Layout, Style, Table, tabulate
+from staf_torch.tables.aggregate import AGGREGATES, student_quantile
 
 DIGITS = {"digits": MetricInfo("digits", larger_is_better=True, headline=True)}
+PIVOT = Layout(
+    rows=("kernel", "centers.radius"),
+    columns=("centers.count",),
+    metrics=("ball_error",),
+    style=Style(bold=True),
+)
+
+
+@pytest.fixture(scope="module")
+def found(tmp_path_factory: pytest.TempPathFactory) -> Collection:
+    return collect(write_sweep(tmp_path_factory.mktemp("sweep") / "runs"))
 
 
 def run(number: int, metrics: Mapping[str, float | None], **settings: Any) -> Run:
@@ -36,7 +49,71 @@ def shown(table: Table) -> list[tuple[str, str]]:
     return [(column.over, column.heading) for column in table.printed()]
 
 
-# Columns
+def test_without_wishes_a_row_is_a_run(found: Collection) -> None:
+    table = tabulate(found)
+    assert len(table.rows) == 36
+    assert table.names[:4] == ("kernel", "centers.radius", "centers.count", "seed")
+    assert "reason" in table.names
+    failed = [row for row in table.rows if row.cells["status"] == "failed"]
+    assert len(failed) == 12
+    assert all(row.cells["ball_error"] is None for row in failed)
+    assert {row.reasons["ball_error"] for row in failed} == {BAD_COUNT}
+
+
+def test_aggregates_are_over_what_is_in_neither_rows_nor_columns(found: Collection) -> None:
+    layout = Layout(**{**PIVOT.__dict__, "aggregates": tuple(AGGREGATES)})
+    table = tabulate(found, layout)
+    assert len(table.rows) == 4
+    row = table.rows[1].cells
+    assert (row["kernel"], row["centers.radius"]) == ("exponential", 0.1)
+    numbers = [error(0.1, 6, seed) for seed in range(3)]
+    expected = {
+        "mean": statistics.mean(numbers),
+        "std": statistics.stdev(numbers),
+        "ci95": student.ppf(0.975, 2) * statistics.stdev(numbers) / math.sqrt(3),
+        "min": min(numbers),
+        "max": max(numbers),
+        "median": statistics.median(numbers),
+    }
+    for name, value in expected.items():
+        assert row[f"ball_error.{name}[centers.count=6]"] == pytest.approx(value, rel=1e-12), name
+    assert (row["ball_error.n[centers.count=6]"], row["ball_error.failed[centers.count=6]"]) == (3, 0)
+    assert (row["ball_error.n[centers.count=7]"], row["ball_error.failed[centers.count=7]"]) == (0, 3)
+    assert row["ball_error.mean[centers.count=7]"] is None
+    assert row["reasons"] == BAD_COUNT
+
+
+def test_a_group_in_which_some_runs_failed_says_of_how_many(tmp_path: Path) -> None:
+    write_run(tmp_path / "0", {"seed": 0}, {"ball_error": 1.0})
+    write_run(tmp_path / "1", {"seed": 1}, {"ball_error": None})
+    write_run(tmp_path / "2", {"seed": 2}, None, status="failed", reason="why")
+    (row,) = tabulate(collect(tmp_path), Layout(aggregates=("mean", "std"))).rows
+    assert (row.cells["ball_error.mean"], row.cells["ball_error.n"], row.cells["ball_error.failed"]) == (
+        1.0,
+        1,
+        2,
+    )
+    assert row.cells["ball_error.std"] is None
+    assert row.cells["reasons"] == "not finite, or nothing to report; why"
+
+
+@pytest.mark.parametrize("option", ["rows", "columns", "metrics", "aggregates", "sort"])
+def test_an_unknown_name_is_refused_with_those_that_exist(option: str, found: Collection) -> None:
+    with pytest.raises(ValueError, match=r"must be one of .*; got 'ball_eror'") as raised:
+        tabulate(found, Layout(**{option: ("ball_eror",)}))
+    known = {"metrics": "ball_error", "aggregates": "ci95", "sort": "ball_error"}.get(option, "centers.count")
+    assert known in str(raised.value)
+
+
+@pytest.mark.parametrize("freedom", [1, 2, 3, 10, 99, 100, 199, 200, 201, 300, 1000, 10**6])
+def test_quantile_of_students_t_is_exact(freedom: int) -> None:
+    assert student_quantile(freedom) == pytest.approx(student.ppf(0.975, freedom), rel=1e-10)
+
+
+def test_aggregates_of_huge_numbers_do_not_overflow() -> None:
+    numbers = [1.7e308, 1.6e308, 1.5e308]
+    assert AGGREGATES["mean"](numbers) == pytest.approx(1.6e308)
+    assert AGGREGATES["std"](numbers) == pytest.approx(1e307)
 
 
 @pytest.mark.parametrize(
@@ -110,9 +187,6 @@ def test_runs_of_different_builds_never_share_a_row() -> None:
     assert names(tabulate(found, Layout(rows=("build", "a"))))[:3] == ["build", "a", "cost.mean"]
 
 
-# Reasons and notes
-
-
 def test_what_is_missing_has_its_reason() -> None:
     found = of(
         run(0, {"cost": 1.0, "x": None}, a=1, b=1),
@@ -171,9 +245,6 @@ def test_a_setting_without_effect_is_told() -> None:
     assert tabulate(of(run(0, {"cost": 1.0}, a=1), run(1, {}, a=2))).notes == ()
 
 
-# Order
-
-
 @pytest.mark.parametrize(
     ("sort", "order"),
     [
@@ -215,50 +286,3 @@ def test_what_cannot_be_chosen_is_said() -> None:
         ValueError, match=r"`staf-table --metric` cannot be chosen: no run has any; got 'cost'"
     ):
         tabulate(of(run(0, {}, a=1)), Layout(metrics=("cost",)))
-
-
-@pytest.mark.parametrize(
-    ("value", "key", "text"),
-    [
-        (2, (False, 2.0), "2"),
-        (0.5, (False, 0.5), "0.5"),
-        (True, (True, 0.0), "true"),
-        ("a", (True, 0.0), "a"),
-    ],
-)
-def test_numbers_are_ranked_and_true_is_none(value: Any, key: tuple[bool, float], text: str) -> None:
-    assert rank(value) == key
-    assert as_text(value) == text
-    assert as_text([1, None]) == "[1, null]"
-    assert place(run(0, {}, k=value, b=None), ("k", "b")) == f"k={text}, b=null"
-
-
-def test_one_number_has_no_spread_and_two_have() -> None:
-    assert AGGREGATES["std"]([3.0]) is None
-    assert half_width([3.0]) is None
-    assert AGGREGATES["std"]([1.0, 3.0]) == pytest.approx(math.sqrt(2))
-    assert half_width([1.0, 3.0]) == pytest.approx(12.706204736174694)
-    assert half_width([1.0, 2.0, 3.0, 6.0]) == pytest.approx(3.182446305284263 * math.sqrt(14 / 3) / 2)
-
-
-@pytest.mark.parametrize("columns", [(), ("b",)], ids=["rows", "spread"])
-@pytest.mark.parametrize("seeds", [1, 2])
-@pytest.mark.parametrize(
-    "aggregates",
-    [("mean",), ("std",), ("std", "mean"), ("ci95", "mean"), ("mean", "std", "ci95"), ("max", "min")],
-    ids="-".join,
-)
-def test_headings_join_what_belongs_together(
-    aggregates: tuple[str, ...], seeds: int, columns: tuple[str, ...], record: Record
-) -> None:
-    found = of(
-        *(
-            run(s, {"cost": a + 4.0 * s, "digits": b - 2.0 * s}, a=a, b=b, seed=s, declared=DIGITS)
-            for a in (1, 2)
-            for b in (3, 4)
-            for s in range(seeds)
-        )
-    )
-    layout = Layout(rows=("a",), columns=columns, aggregates=aggregates, style=Style(bold=True))
-    table = tabulate(found, layout)
-    record({"columns": shown(table), "markdown": table.markdown().splitlines(), "latex": latex_text(table)})

@@ -1,0 +1,369 @@
+"""What a table shows in Markdown, LaTeX, HTML, CSV, JSON and Parquet: every bit, few digits, plain texts."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+from sweep_runs import BAD_COUNT, write_run, write_sweep
+from tables.test_aggregation import PIVOT
+
+from staf_torch.results.reader import Collection, collect
+from staf_torch.tables import (
+    Layout,
+    Style,
+    Table,
+    html_text,
+    json_text,
+    latex_text,
+    parquet_bytes,
+    tabulate,
+)
+from staf_torch.tables.columns import Column, Number, Row, printed, significant
+from staf_torch.tables.model import data_frame, escape
+
+
+@pytest.fixture(scope="module")
+def found(tmp_path_factory: pytest.TempPathFactory) -> Collection:
+    return collect(write_sweep(tmp_path_factory.mktemp("sweep") / "runs"))
+
+
+TABLE = Table(
+    (Column("a"), Column("m", "m", heading="M & m"), Column("hidden", shown=False)),
+    (
+        Row({"a": "<x> & y", "m": 0.25, "hidden": 1}),
+        Row({"a": None, "m": 0.5, "hidden": math.nan}),
+        Row({"a": "c", "m": None, "hidden": -math.inf}, {"m": "why"}),
+    ),
+    notes=("a <note> of 100 %",),
+    style=Style(bold=True),
+)
+
+
+VALUES = (0.1001, 0.1002, 0.2, None, "gone")
+
+
+def parsed(text: str) -> list[dict[str, str]]:
+    return list(csv.DictReader(io.StringIO(text)))
+
+
+def test_csv_gives_back_every_bit(found: Collection) -> None:
+    rows = parsed(tabulate(found, Layout(every_metric=True)).csv())
+    assert len(rows) == 36
+    for row, run in zip(rows, found.rows, strict=True):
+        for name, number in run.metrics.items():
+            assert row[name] == "" if number is None else float(row[name]).hex() == number.hex()
+        assert Path(row["directory"]) == run.directory
+
+
+def test_json_is_valid_and_says_why_a_number_is_missing(found: Collection) -> None:
+    content = json.loads(json_text(tabulate(found, Layout(every_metric=True))), parse_constant=pytest.fail)
+    for row, run in zip(content["rows"], found.rows, strict=True):
+        assert row["ball_error"] == run.metrics.get("ball_error")
+        if row["ball_error"] is None:
+            assert row["reasons"]["ball_error"] == BAD_COUNT
+        else:
+            assert row["reasons"] == {"settling_time": "not finite, or nothing to report"}
+
+
+def test_json_stays_valid_where_an_aggregate_overflows(tmp_path: Path) -> None:
+    for num, number in enumerate((1.7e308, -1.7e308)):
+        write_run(tmp_path / str(num), {"seed": num}, {"ball_error": number})
+    table = tabulate(collect(tmp_path), Layout(aggregates=("mean", "std")))
+    (row,) = json.loads(json_text(table), parse_constant=pytest.fail)["rows"]
+    assert (row["ball_error.mean"], row["ball_error.std"]) == (0.0, None)
+    assert row["reasons"] == {"ball_error.std": "inf is not a JSON number"}
+
+
+def test_parquet_gives_back_every_bit(found: Collection) -> None:
+    pandas = pytest.importorskip("pandas", reason="Parquet needs the extra `tables`")
+    pytest.importorskip("pyarrow", reason="Parquet needs the extra `tables`")
+    frame = pandas.read_parquet(io.BytesIO(parquet_bytes(tabulate(found, Layout(every_metric=True)))))
+    assert frame["ball_error"].dtype == frame["settling_time"].dtype == "float64"
+    for number, run in zip(frame["ball_error"], found.rows, strict=True):
+        expected = run.metrics.get("ball_error")
+        assert math.isnan(number) if expected is None else number == expected
+
+
+def test_markdown_joins_mean_and_spread_and_marks_the_best(found: Collection) -> None:
+    text = tabulate(found, PIVOT).markdown()
+    lines = text.splitlines()
+    assert lines[0] == "ball_error, mean ± std"
+    heads = [cell.strip() for cell in lines[2].strip("|").split("|")]
+    counts = ["centers.count=3", "centers.count=6", "centers.count=7"]
+    assert heads == ["kernel", "centers.radius", *counts, "n", "failed"]
+    cells = [cell.strip() for cell in lines[4].strip("|").split("|")]
+    assert cells == [
+        "exponential",
+        "0.05",
+        "**0.0128 ± 0.0003**",
+        "**0.00064 ± 1.5e-05**",
+        "-",
+        "0-3",
+        "0-3",
+    ]
+    assert "**" not in lines[5]
+    assert f"12 of 36 failed: {BAD_COUNT}" in text
+    assert len({len(line) for line in lines[2:8]}) == 1  # aligned
+
+
+def test_latex_has_booktabs_two_lines_of_headings_and_powers_of_ten(found: Collection) -> None:
+    text = latex_text(tabulate(found, PIVOT))
+    lines = text.splitlines()
+    assert lines[0] == r"\begin{tabular}{lrrrrll}"
+    assert lines[2] == r" &  & \multicolumn{3}{c}{ball\_error, mean \ensuremath{\pm} std} &  &  \\"
+    assert lines[3] == r"\cmidrule(lr){3-5}"
+    assert [line for line in lines if "rule" in line and "cmid" not in line] == [
+        r"\toprule",
+        r"\midrule",
+        r"\bottomrule",
+    ]
+    body = lines[lines.index(r"\midrule") + 1 : lines.index(r"\bottomrule")]
+    assert len(body) == 4
+    assert all(line.endswith(r" \\") and line.count(" & ") == 6 for line in body)
+    assert r"\boldmath\textbf{$0.00064 \pm 1.5 \times 10^{-5}$}" in body[0]
+    assert lines[-2].startswith("% 12 of 36 failed")
+    assert lines[-1] == "% `kernel` was swept and changed no metric in any row."
+
+
+def test_latex_prints_every_special_character_as_it_is() -> None:
+    special = "\\ { } $ & # ^ _ % ~ < > | \" ' ` -- [ ] *"
+    expected = (
+        r"\textbackslash{} \{ \} \$ \& \# \textasciicircum{} \_ \% \textasciitilde{} \textless{} "
+        r"\textgreater{} \textbar{} \symbol{34} \textquotesingle{} \textasciigrave{} -{}-{} {[} {]} {*}"
+    )
+    assert escape(special) == expected
+    assert escape("two\nlines") == "two lines"
+
+
+def test_a_setting_with_anything_in_it_stays_in_its_cell(tmp_path: Path) -> None:
+    nasty = 'a|b & c \\ "d"\n<e>'
+    write_run(tmp_path / "0", {"kernel": nasty}, {"ball_error": 1.0})
+    write_run(tmp_path / "1", {"kernel": [1, [2.5]]}, {"ball_error": 2.0})
+    table = tabulate(collect(tmp_path))
+    assert parsed(table.csv())[0]["kernel"] == nasty
+    assert json.loads(parsed(table.csv())[1]["kernel"]) == [1, [2.5]]
+    assert json.loads(json_text(table))["rows"][0]["kernel"] == nasty
+    assert 'a\\|b & c \\\\ "d" \\<e>' in table.markdown()
+    assert latex_text(table).count("\\\\\n") == 3
+
+
+def test_a_table_shows_three_digits_and_the_csv_all_of_them() -> None:
+    rows = [{"law": "a|b", "excess": 1 / 3, "count": 2}, {"law": "exact", "excess": None, "count": 1100.0}]
+    assert Table.of(rows, {"law": "law", "excess": "J/J*", "count": "n"}).markdown() == (
+        "| law   |  J/J* |    n |\n"
+        "| ----- | ----: | ---: |\n"
+        "| a\\|b  | 0.333 |    2 |\n"
+        "| exact |     - | 1100 |\n"
+    )
+    assert Table.of(rows).csv() == f"law,excess,count\na|b,{1 / 3!r},2\nexact,,1100.0\n"
+
+
+@pytest.mark.parametrize(
+    ("number", "digits", "said"),
+    [
+        (None, 3, "-"),
+        (3, 1, "3"),
+        (10**7, 3, "10000000"),
+        (-999999.0, 3, "-999999"),
+        (1e6, 3, "1e+06"),
+        (-1e6, 3, "-1e+06"),
+        (999999.5, 3, "1e+06"),
+        (0.0, 3, "0"),
+        (1.5, 1, "2"),
+        (math.pi, 5, "3.1416"),
+        (math.inf, 3, "inf"),
+        (math.nan, 3, "nan"),
+    ],
+)
+def test_numbers_have_so_many_digits_and_small_whole_ones_all(number: Any, digits: int, said: str) -> None:
+    assert significant(number, digits) == said
+
+
+@pytest.mark.parametrize(
+    ("column", "style", "best"),
+    [
+        (Column("m", metric="m"), Style(bold=True), {0, 1}),
+        (Column("m", metric="m", larger_is_better=True), Style(bold=True), {2}),
+        (Column("m", metric="m"), Style(bold=True, digits=4), {0}),
+        (Column("m", metric="m"), Style(), set()),
+        (Column("m"), Style(bold=True), set()),
+    ],
+)
+def test_the_best_is_marked_with_all_that_look_like_it(column: Column, style: Style, best: set[int]) -> None:
+    (found,) = printed([column], [Row({"m": value}) for value in VALUES], style)
+    assert found.best == best
+    assert not found.numeric
+    (alone,) = printed([column], [Row({"m": 0.1}), Row({"m": None})], style)
+    assert alone.best == frozenset()
+    assert alone.numeric
+    (two,) = printed([column], [Row({"m": 0.3}), Row({"m": 0.1})], style)
+    assert len(two.best) == (1 if best else 0)
+
+
+@pytest.mark.parametrize(
+    ("statuses", "headings"), [(("completed",) * 2, ["a"]), (("completed", "failed"), ["a", "status"])]
+)
+def test_that_all_runs_ended_well_is_not_said(statuses: Sequence[str], headings: list[str]) -> None:
+    rows = [Row({"a": "completed", "status": status}) for status in statuses]
+    assert [c.heading for c in printed([Column("a"), Column("status")], rows, Style())] == headings
+
+
+def test_counts_that_differ_are_a_range_and_those_that_failed_are_shown_where_some_did() -> None:
+    columns = [
+        *(Column(f"m.{what}[{at}]", "m", what, at) for at in ("x", "y") for what in ("mean", "n", "failed")),
+    ]
+
+    def counts(*pairs: tuple[int, int]) -> list[tuple[str, tuple[object, ...]]]:
+        rows = [
+            Row(
+                {
+                    **{f"m.mean[{at}]": 1.0 for at in "xy"},
+                    **{f"m.n[{at}]": n for at, n in zip("xy", pair, strict=True)},
+                    **{f"m.failed[{at}]": 2 - n for at, n in zip("xy", pair, strict=True)},
+                }
+            )
+            for pair in pairs
+        ]
+        return [(c.heading, c.cells) for c in printed(columns, rows, Style())[2:]]
+
+    assert counts((2, 2), (2, 2)) == [("n", (Number(2), Number(2)))]
+    assert counts((1, 2), (2, 2)) == [("n", ("1-2", Number(2))), ("failed", ("0-1", Number(0)))]
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("a|b", "a\\|b"),
+        ("a\\b <i>", "a\\\\b \\<i>"),
+        ("`a|b*`", "`a\\|b*`"),
+        ("`a", "\\`a"),
+        ("``a``", "\\`\\`a\\`\\`"),
+        ("2 * 3", "2 * 3"),
+        ("2 * 3 * 4", "2 \\* 3 \\* 4"),
+        ("[a](b)", "\\[a\\](b)"),
+        ("[a] b", "[a] b"),
+        ("[a]: b", "\\[a\\]: b"),
+        ("# a", "\\# a"),
+        ("####### a", "####### a"),
+        ("- a", "\\- a"),
+        ("-a", "-a"),
+        ("--- a", "\\--- a"),
+        ("> a", "\\> a"),
+        ("a\n\n b", "a b"),
+        ("a `b` *c* `d*`", "a `b` \\*c\\* `d*`"),
+    ],
+)
+def test_markdown_shows_a_text_as_it_is(text: str, said: str) -> None:
+    assert Table.of([{"a": text}]).markdown().splitlines()[2].strip("| ") == said.strip("| ")
+
+
+@pytest.mark.parametrize(
+    ("number", "said"),
+    [(1.2e-5, r"1.2 \times 10^{-5}"), (1e6, r"1 \times 10^{6}"), (0.5, "0.5"), (math.inf, "inf")],
+)
+def test_latex_has_powers_of_ten(number: float, said: str) -> None:
+    assert f"${said}$" in latex_text(Table.of([{"a": number}]))
+
+
+@pytest.mark.parametrize(
+    ("cell", "said"),
+    [
+        ("=1", "'=1"),
+        (" @a", "' @a"),
+        ("a=1", "a=1"),
+        ("-1", "'-1"),
+        (-1, "-1"),
+        (True, "true"),
+        (None, ""),
+        ([1, "a"], '"[1, ""a""]"'),
+    ],
+)
+def test_a_spreadsheet_computes_nothing(cell: Any, said: str) -> None:
+    assert Table.of([{"a": cell, "b": 1}]).csv() == f"a,b\n{said},1\n"
+
+
+def test_a_page_has_the_best_bold_and_every_text_as_it_is() -> None:
+    assert html_text(TABLE) == (
+        "<table><thead><tr><th>a</th><th>M &amp; m</th></tr></thead><tbody>"
+        "<tr><td>&lt;x&gt; &amp; y</td><td><b>0.25</b></td></tr>"
+        "<tr><td>-</td><td>0.5</td></tr>"
+        "<tr><td>c</td><td>-</td></tr></tbody></table><p>a &lt;note&gt; of 100 %</p>"
+    )
+
+
+def test_latex_has_the_best_bold_dashes_and_notes_as_comments() -> None:
+    assert latex_text(TABLE).splitlines()[2:] == [
+        r"a & M \& m \\",
+        r"\midrule",
+        r"\textless{}x\textgreater{} \& y & \boldmath\textbf{$0.25$} \\",
+        r"-- & $0.5$ \\",
+        r"c & -- \\",
+        r"\bottomrule",
+        r"\end{tabular}",
+        "% a <note> of 100 %",
+    ]
+    assert latex_text(TABLE).startswith("\\begin{tabular}{lr}\n\\toprule\n")
+
+
+def test_json_has_null_and_a_reason_for_what_it_cannot_hold() -> None:
+    text = json_text(TABLE)
+    assert text.startswith('{\n  "columns": [\n    "a",\n    "m",\n    "hidden"\n  ],')
+    assert text.endswith("]\n}\n")
+    rows = json.loads(text)["rows"]
+    assert [row["reasons"] for row in rows] == [
+        {},
+        {"hidden": "nan is not a JSON number"},
+        {"m": "why", "hidden": "-inf is not a JSON number"},
+    ]
+    assert [row["hidden"] for row in rows] == [1, None, None]
+    assert "é" in json_text(Table.of([{"a": "é"}]))
+
+
+def test_a_table_of_rows_has_all_of_their_keys_or_those_with_headings() -> None:
+    rows = [{"a": 1}, {"b": 2, "a": 3}]
+    assert list(Table.of(rows).names) == ["a", "b"]
+    named = Table.of(rows, {"b": "B", "a": ""})
+    assert list(named.names) == ["b", "a"]
+    assert [column.heading for column in named.printed()] == ["B", "a"]
+    assert [column.cells for column in named.printed()] == [(None, Number(2)), (Number(1), Number(3))]
+
+
+@pytest.mark.parametrize(
+    ("cells", "metric", "want"),
+    [
+        ([1, 2.5], None, [1, 2.5]),
+        ([1, 2.5], "m", [1, 2.5]),
+        ([True, False], None, [True, False]),
+        ([True, 1], None, ["true", "1"]),
+        (["a", 1, [1, 2]], None, ["a", "1", "[1, 2]"]),
+    ],
+)
+def test_a_column_of_a_frame_has_one_type(cells: list[Any], metric: str | None, want: list[Any]) -> None:
+    pytest.importorskip("pandas", reason="frames need the extra `tables`")
+    frame = data_frame(Table((Column("a", metric),), tuple(Row({"a": cell}) for cell in cells)))
+    assert frame["a"].tolist() == want
+
+
+def test_a_metric_that_no_run_has_is_a_column_of_nan() -> None:
+    pandas = pytest.importorskip("pandas", reason="frames need the extra `tables`")
+    frame = data_frame(Table((Column("m", "m"), Column("a")), (Row({"m": None, "a": None}),)))
+    assert frame["m"].dtype == "float64"
+    assert frame["a"].dtype == object
+    assert isinstance(frame, pandas.DataFrame)
+
+
+def test_a_missing_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    for package in ("pandas", "pyarrow"):
+        monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(ValueError, match=r"^a DataFrame needs pandas: install the extra `tables`"):
+        data_frame(TABLE)
+    with pytest.raises(ValueError, match=r"^Parquet needs pyarrow: .*pip install 'staf_torch\[tables\]'"):
+        parquet_bytes(TABLE)
