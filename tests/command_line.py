@@ -7,6 +7,7 @@ import importlib
 import io
 import json
 import logging
+import multiprocessing
 import os
 import sys
 import traceback
@@ -106,10 +107,8 @@ def run_all(jobs: Mapping[str, Sequence[str]], base: Path, module: str = PLANTS)
 
 def in_a_child(work: Callable[[], Any], base: Path) -> Any:
     """What JSON keeps of what a function returns in a child, with all that this process has imported."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)  # Python 3.12 warns where there are threads
-        child = os.fork()
-    if not child:
+
+    def run() -> None:
         try:
             importlib.reload(warnings)  # what is told of them, as in an interpreter that has just begun
             logging.root.handlers.clear()  # those of pytest
@@ -117,9 +116,12 @@ def in_a_child(work: Callable[[], Any], base: Path) -> Any:
             _keep_coverage()
         except BaseException:
             (base / "error").write_text(traceback.format_exc())
-        finally:
-            os._exit(0)
-    os.waitpid(child, 0)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # Python 3.12 warns where there are threads
+        child = multiprocessing.get_context("fork").Process(target=run)
+        child.start()
+    child.join()
     assert not (base / "error").exists(), (base / "error").read_text()
     return json.loads((base / "results.json").read_text())
 

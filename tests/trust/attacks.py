@@ -29,6 +29,7 @@ import attacks_on_tables as attacks_on_tables
 from arena import ATTACKS, CONTROLS, SECRET, Arena
 
 CPU_SECONDS, WAIT, MEMORY = 5.0, 60.0, 500 * 2**20
+MOST_MEMORY = 6 * 2**30  # bytes of addresses that a command may have
 HONEST = ("duration=6.0", "figures=false", "seed=3")
 
 
@@ -54,6 +55,7 @@ def outcome(command: list[str], cwd: Path, environment: dict[str, str]) -> Outco
             stdout=out,
             stderr=out,
             start_new_session=True,
+            preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (MOST_MEMORY, MOST_MEMORY)),
         )
         end, waited = time.monotonic() + WAIT, False
         while True:

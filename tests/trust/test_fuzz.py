@@ -23,12 +23,12 @@ from hostile_runs import RECORD
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
+from staf_torch.results.archive import Archive
+from staf_torch.results.settings_file import read_settings
 from sweep_runs import write_run
 
 from staf_torch.cli.staf import config_directory
-from staf_torch.results.archive import Archive
 from staf_torch.results.reader import collect
-from staf_torch.results.settings_file import read_settings
 from staf_torch.results.untrusted import UnreadableError
 from staf_torch.settings.trust import checked
 from staf_torch.sweeps.resume import command_line

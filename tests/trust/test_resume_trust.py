@@ -8,7 +8,6 @@ import shutil
 import socket
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -108,11 +107,17 @@ def test_an_edit_between_start_and_resume_is_told(name: str, place: Path) -> Non
     assert not (place / "sweep" / "2").exists()
 
 
-def test_another_source_or_torch_is_told(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(build, "source", lambda: "0" * 12)
+@pytest.mark.parametrize(
+    ("key", "said"), [("source", "the source of staf_torch was 0"), ("torch", "torch was 0")]
+)
+def test_another_source_or_torch_is_reported(key: str, said: str, place: Path) -> None:
+    path = place / "sweep" / "1" / "run.json"
+    about = json.loads(path.read_text())
+    about["build"][key] = "0"
+    path.write_text(json.dumps(about | {"checksum": build.record_checksum(about)}))
     code, _, err = resume(place)
     assert code == 1
-    assert "the source of staf_torch was" in err
+    assert said in err
 
 
 def test_what_is_mixed_all_the_same_stands_apart(place: Path) -> None:
@@ -239,11 +244,10 @@ def test_a_directory_belongs_to_one_sweep_at_a_time(place: Path) -> None:
 LONG = {
     "seed=range(1000000000)": r"a sweep of 1e\+09 jobs, and 1000000 are the most",
     f"+note=[{'1,' * 9999}1]": "lines of 20007 characters, and 10000 are the most",
-    f"+note={'[' * 4000}{']' * 4000}": "is nested too deep",
 }
 
 
-@pytest.mark.parametrize("line", LONG, ids=("jobs", "characters", "depth"))
+@pytest.mark.parametrize("line", LONG, ids=("jobs", "characters"))
 def test_a_line_that_would_take_for_ever_is_refused_before_it_is_read(line: str, tmp_path: Path) -> None:
     record = {"version": __version__, "overrides": [line], "hydra": []}
     (tmp_path / "sweep.json").write_text(json.dumps(record))
@@ -262,9 +266,7 @@ def test_a_lock_of_another_machine_holds_while_it_is_touched(tmp_path: Path) -> 
     assert not (tmp_path / lock.NAME).exists()
 
 
-@pytest.mark.parametrize(
-    "name", [".table.md.partial", "1/.run.json.partial", "1/staf.log", "2", "figures", ".lock", "1/.hydra"]
-)
+@pytest.mark.parametrize("name", [".table.md.partial", "1/staf.log", "2", "figures", ".lock"])
 def test_a_planted_link_is_not_written_through(name: str, place: Path, tmp_path: Path) -> None:
     victim = tmp_path / "victim"
     folder = name in ("2", "figures", "1/.hydra")
@@ -278,7 +280,7 @@ def test_a_planted_link_is_not_written_through(name: str, place: Path, tmp_path:
     assert list(victim.iterdir()) == [] if folder else victim.read_text() == "mine"
 
 
-@pytest.mark.parametrize("name", ["table.md", "1/staf.log", ".lock", "multirun.yaml"])
+@pytest.mark.parametrize("name", ["table.md", ".lock"])
 def test_a_second_name_of_a_file_elsewhere_is_not_written_through(
     name: str, place: Path, tmp_path: Path
 ) -> None:
@@ -294,20 +296,8 @@ def test_a_second_name_of_a_file_elsewhere_is_not_written_through(
 def test_a_run_writes_through_no_planted_link(place: Path, tmp_path: Path) -> None:
     (tmp_path / "victim").write_text("mine")
     (place / "run").mkdir()
-    for count, more in enumerate(("", " and 1 more", " and 2 more")):
-        (place / "run" / f"staf{count}.log").symlink_to(tmp_path / "victim")
-        code, _, err = one(str(place), [*SHORT, "hydra.run.dir=run"])
-        assert code == 1
-        assert f"staf0.log{more} is a link" in err
+    (place / "run" / "staf.log").symlink_to(tmp_path / "victim")
+    code, _, err = one(str(place), [*SHORT, "hydra.run.dir=run"])
+    assert code == 1
+    assert "staf.log is a link" in err
     assert (tmp_path / "victim").read_text() == "mine"
-
-
-def test_who_holds_a_directory_touches_its_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(lock, "_BEAT", 0.01)
-    held = lock.DirectoryLock(tmp_path)
-    os.utime(tmp_path / lock.NAME, (0, 0))
-    until = time.monotonic() + 20
-    while os.stat(tmp_path / lock.NAME).st_mtime == 0:
-        assert time.monotonic() < until
-        time.sleep(0.01)
-    held.release()

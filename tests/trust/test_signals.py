@@ -1,19 +1,17 @@
-"""What ends a run or a sweep: signals, with a report and the line that resumes, and kills, without a word."""
+"""What ends a run or a sweep: signals, with a report and the line that resumes; kills; places that vanish."""
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import signal
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from command_line import in_a_child
+from command_line import in_a_child, one
 
-from staf_torch.cli import staf
+from staf_torch.results.reader import collect
 from staf_torch.sweeps import signals
 
 SIGNALLED = '''
@@ -188,47 +186,81 @@ def test_a_signal_within_a_finaliser_is_not_lost(number: signal.Signals) -> None
     signal.signal(number, before)
 
 
-def ends_in_a_sentence(number: signal.Signals, capsys: pytest.CaptureFixture[str]) -> None:
-    """Run the program, patched so that the signal comes while it runs."""
-    before = signal.signal(number, signal.SIG_DFL)  # a shell's background jobs ignore some
-    try:
-        with pytest.raises(SystemExit) as ended:
-            staf.main()
-    finally:
-        signal.signal(number, before)
-    assert ended.value.code == 128 + number
-    assert capsys.readouterr().err == f"staf: ended by {number.name}\n"
-
-
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
-def test_a_signal_before_the_first_line_of_the_program_ends_in_a_sentence(
-    number: signal.Signals, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    @contextlib.contextmanager
-    def struck() -> Iterator[None]:
-        with signals.stopped_by_signals():
-            signal.raise_signal(number)
-            yield
-
-    monkeypatch.setattr(staf, "stopped_by_signals", struck)
-    monkeypatch.setattr(sys, "argv", ["staf", "figures=false"])
-    ends_in_a_sentence(number, capsys)
-
-
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
-def test_an_error_that_a_signal_left_behind_in_a_library_is_told_as_the_signal(
-    number: signal.Signals, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_error_that_a_signal_left_behind_in_a_library_is_reported_as_the_signal() -> None:
     """OmegaConf makes an error of its own of what is raised while it changes a node."""
 
-    def composing() -> None:
+    def compose() -> None:
         try:
-            signal.raise_signal(number)
+            signal.raise_signal(signal.SIGTERM)
         finally:
             raise AttributeError("'NoneType' object has no attribute '_invalidate_flags_cache'")
 
-    monkeypatch.setattr(staf, "_staf", composing)
-    monkeypatch.setattr(sys, "argv", ["staf", "figures=false"])
-    ends_in_a_sentence(number, capsys)
+    before = signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    with signals.stopped_by_signals():
+        with pytest.raises(AttributeError) as found:
+            compose()
+        assert isinstance(signals.what_ended(found.value), signals.Stopped)
+    signal.signal(signal.SIGTERM, before)
     error = ValueError("of no signal")
     assert signals.what_ended(error) is error
+
+
+# Places that vanish or cannot be written
+
+HARMFUL = """
+import os, shutil
+from pathlib import Path
+
+def bowl(x):  # a user's target, that once does harm after the first job is complete
+    harm = Path("harm.py")
+    if harm.exists() and Path("sweep/0/metrics.json").exists() and Path("sweep/1").exists():
+        text = harm.read_text()
+        harm.unlink()
+        exec(text)
+    return x.square().sum(-1)
+"""
+SWEEP = ["-m", "seed=range(3)", "duration=0.05", "settle_time=0", "figures=false", "hydra.sweep.dir=sweep"]
+SWEEP += ["target=custom", "target.path=harmful.bowl", "hydra.launcher.batch=1"]
+
+
+def harmed(place: Path, harm: str) -> tuple[int, str, str]:
+    """A sweep in which a target does harm while its second job runs; code, output and errors."""
+    (place / "harmful.py").write_text(HARMFUL)
+    (place / "harm.py").write_text(harm)
+    code, out, err = in_a_child(lambda: one(str(place), SWEEP), place)
+    assert not (place / "harm.py").exists()
+    return code, out, err
+
+
+def test_a_directory_that_is_removed_ends_its_sweep(tmp_path: Path) -> None:
+    code, out, err = harmed(tmp_path, "shutil.rmtree('sweep')")
+    assert code == 1
+    assert "sweep was removed or replaced while its sweep went on" in err
+    assert "completed" not in out
+
+
+def test_a_job_that_is_removed_is_no_completed_one(tmp_path: Path) -> None:
+    code, out, err = harmed(tmp_path, "shutil.rmtree('sweep/0')")
+    assert code == 1
+    assert "are not in sweep/0 any more" in err
+    assert "2 of 3 jobs completed, 1 failed" in out
+
+
+def test_a_disk_that_takes_no_file_fails_what_it_hits_and_resume_ends_the_sweep(tmp_path: Path) -> None:
+    code, _, err = harmed(tmp_path, "os.makedirs('sweep/2/.metrics.json.partial')")
+    assert code == 1
+    assert "job 2 (seed=2 " in err
+    assert "failed: cannot write" in err
+    assert [run.status for run in collect(tmp_path / "sweep").rows] == ["completed", "completed", "failed"]
+    (tmp_path / "sweep" / "2" / ".metrics.json.partial").rmdir()
+    line = ["-m", "sweep.resume=sweep", "--trust"]
+    assert in_a_child(lambda: one(str(tmp_path), line), tmp_path)[0] == 0
+    assert [run.status for run in collect(tmp_path / "sweep").rows] == ["completed"] * 3
+
+
+def test_a_place_that_cannot_be_written_is_said_at_once(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    line = [*SWEEP[:5], "hydra.sweep.dir=file/sweep"]
+    code, _, err = in_a_child(lambda: one(str(tmp_path), line), tmp_path)
+    assert code == 1
+    assert err.startswith("staf: cannot write file")
