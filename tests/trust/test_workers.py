@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import subprocess
 import sys
@@ -12,9 +11,8 @@ from pathlib import Path
 import pytest
 import worker_tasks
 from command_line import environment
-from harms import ended_with_us, working_in
 
-from staf_torch.sweeps.workers import LostError, Worker, beginning, end_with, ready
+from staf_torch.sweeps.workers import LostError, Worker, ready
 
 LOST = {
     "die": "it was ended by SIGKILL",
@@ -57,27 +55,22 @@ def test_workers_end_with_their_parent_however_it_ends(number: signal.Signals, t
     assert gone(workers)
 
 
-def test_a_process_ends_with_another_that_is_no_direct_parent() -> None:
-    program = "import sys, time; from staf_torch.sweeps.workers import end_with; end_with(int(sys.argv[1]));"
-    program += "print('watching', flush=True); time.sleep(600)"
+@pytest.mark.parametrize("reused", [False, True])
+def test_a_process_ends_with_another_and_with_one_whose_number_is_used_again(reused: bool) -> None:
+    program = "import sys, time; from staf_torch.sweeps.workers import beginning, end_with;"
+    program += "print('watching', flush=True); pid = int(sys.argv[1]);"
+    program += f"end_with(pid, {'an earlier time' if reused else None!r} or beginning(pid)); time.sleep(600)"
     with subprocess.Popen(["sleep", "600"]) as watched:
         line = [sys.executable, "-c", program, str(watched.pid)]
         with subprocess.Popen(line, env=environment(), stdout=subprocess.PIPE, text=True) as other:
             assert other.stdout is not None
             assert other.stdout.readline() == "watching\n"
-            assert other.poll() is None
-            watched.kill()
-            watched.wait()
+            if not reused:
+                assert other.poll() is None
+                watched.kill()
+                watched.wait()
             assert other.wait(60) == 1
-
-
-def test_a_number_that_is_used_again_is_no_parent(monkeypatch: pytest.MonkeyPatch) -> None:
-    ended: list[int] = []
-    monkeypatch.setattr(os, "_exit", ended.append)
-    monkeypatch.setattr("staf_torch.sweeps.workers.threading.Thread.start", lambda thread: thread.run())
-    end_with(os.getpid(), "another time")
-    assert ended == [1]
-    assert beginning(os.getpid()) != ""
+        watched.kill()
 
 
 def lives(pid: int) -> bool:
@@ -95,17 +88,3 @@ def gone(pids: list[int]) -> bool:
             return True
         time.sleep(0.1)
     return False
-
-
-def test_kills_that_are_broken_off_leave_no_process(tmp_path: Path) -> None:
-    """One that begins another and ends by SIGTERM, and one that does not care for it."""
-    deaf = "trap '' TERM; : > deaf; while :; do sleep 0.05; done"
-    script = f'(sleep 60 & : > begun; wait) & sh -c "{deaf}" & wait'
-    with subprocess.Popen(["sh", "-c", script], cwd=tmp_path) as run:
-        while not all((tmp_path / name).exists() for name in ("begun", "deaf")):
-            time.sleep(0.01)
-        assert len(working_in(tmp_path)) >= 4
-        with pytest.raises(SystemExit), ended_with_us(tmp_path, 0.2):
-            raise SystemExit
-        assert not working_in(tmp_path)
-        assert run.wait() != 0
