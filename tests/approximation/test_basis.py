@@ -14,6 +14,8 @@ from hypothesis import strategies as some
 from variants import KERNELS, TARGETS, over
 
 import staf_torch as st
+from staf_torch.approximation import conditioning
+from staf_torch.centers import probe_points
 from staf_torch.targets import Cosine, Paper, Quadratic
 
 SEEDS = some.integers(0, 2**31)
@@ -201,3 +203,38 @@ class _WrongShape(torch.nn.Module):
 def test_a_bad_argument_is_named_with_its_value(make, message: str) -> None:  # type: ignore[no-untyped-def]
     with pytest.raises(ValueError, match=re.escape(message)):
         make()
+
+
+# Conditioning.
+
+
+@pytest.mark.parametrize("name", ["gaussian", "matern32", "exponential"])
+def test_condition_numbers_are_those_of_the_matrices(name: str) -> None:
+    basis, x = basis_of(name, 6, 0.8), uniform(4, 2, low=0.3)
+    found = conditioning.conditioning(basis, x)
+    structure = basis.gram_structure(x)
+    whole, core = torch.linalg.cond(structure.scaled()).expand(4), structure.core
+    torch.testing.assert_close(found.condition, whole, rtol=1e-6, atol=0)
+    torch.testing.assert_close(found.core_condition, torch.linalg.cond(core), rtol=1e-6, atol=0)
+    assert found.condition.shape == (4,)
+    for shape in ((), (2, 3)):
+        many = conditioning.conditioning(basis, uniform(*shape, 2, low=0.3))
+        assert many.condition.shape == shape
+    assert bool((found.rank == 6).all())
+    assert bool((found.effective_rank == 6).all())
+
+
+def test_cardinal_functions_are_one_at_their_own_center_and_sum_up_samples() -> None:
+    basis, x = basis_of("gaussian", 6, st.StateRadius(0.8, 0.1)), uniform(4, 2, low=0.3)
+    at_centers = conditioning.cardinal_functions(basis, x, basis.centers.offsets(x))
+    torch.testing.assert_close(at_centers, torch.eye(6).double().expand(4, 6, 6), rtol=0, atol=1e-9)
+    z = basis.centers.radius(x)[:, None, None] * probe_points(500, 2)
+    functions = conditioning.cardinal_functions(basis, x, z)
+    constant = functions.abs().sum(-1).amax(-1)
+    torch.testing.assert_close(conditioning.lebesgue_constant(basis, x), constant)
+    fewer = conditioning.lebesgue_constant(basis, x, 5)
+    assert bool((fewer <= constant + 1e-12).all())
+    estimate = torch.einsum("bpm,bm->bp", functions, Paper()(basis.centers(x)))
+    worst = (Paper()(x.unsqueeze(1) + z) - estimate).abs().amax(-1)
+    torch.testing.assert_close(conditioning.sup_error(basis, x, Paper()), worst, rtol=1e-6, atol=1e-10)
+    assert float(conditioning.lebesgue_constant(basis, x[0])) == pytest.approx(float(constant[0]))

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable
 
 import pytest
 import torch
 from helpers import basis_of, centers_of, tensor, uniform
-from variants import KERNELS, RADII, over
+from variants import KERNELS, RADII, SMOOTH_KERNELS, over
 
 import staf_torch as st
 from staf_torch.targets import Cosine, Paper
@@ -125,16 +126,6 @@ def test_batch_entries_are_as_they_would_be_alone(name: str) -> None:
 
 
 @over(KERNELS)
-def test_state_dict_restores_the_approximation(name: str) -> None:
-    staf = fitted(name, (2,))
-    fresh = st.StaF(basis_of(name, radius=0.5), (2,))
-    fresh.load_state_dict(staf.state_dict())
-    y = uniform(2, 4, 2)
-    assert torch.equal(fresh(y), staf(y))
-    assert torch.equal(fresh.weights, staf.weights)
-
-
-@over(KERNELS)
 def test_single_precision_goes_through(name: str) -> None:
     double = fitted(name, (3,))
     single = st.StaF(basis_of(name, radius=0.5), (3,)).to(torch.float32)
@@ -246,19 +237,6 @@ def test_rowwise_is_every_entry_at_its_own_point(outputs: int | None) -> None:
     torch.testing.assert_close(several[1], values, rtol=1e-12, atol=1e-13)
 
 
-def test_a_shape_that_could_mean_either_names_both() -> None:
-    basis = st.StaFBasis(st.GaussianKernel(), st.StateFollowingCenters(st.rings(6), radius=0.1))
-    staf, x = st.StaF(basis, (64,)), torch.zeros(64, 2, dtype=torch.float64)
-    with pytest.raises(ValueError, match=r"StaF.rowwise\(y\)`\), or all of them .*unsqueeze\(0\)"):
-        staf(x)
-    with pytest.raises(ValueError, match=r"StaF.gradient\(y.unsqueeze\(-2\)\)"):
-        staf.gradient(x)
-    with pytest.raises(ValueError, match=r"ends with \(64, 2\); got \(63, 2\)"):
-        staf.rowwise(x[1:])
-    assert staf(x.unsqueeze(0)).shape == (64, 64)
-    assert staf.rowwise(x).shape == (64,)
-
-
 @pytest.mark.parametrize("assign", [True, False])
 @over(KERNELS)
 def test_a_model_built_on_the_meta_device_is_filled_by_a_state_dict(name: str, assign: bool) -> None:
@@ -287,25 +265,80 @@ def test_a_model_without_values_says_how_it_gets_them() -> None:
         empty(torch.zeros(1, 2, dtype=torch.float64))
 
 
-def test_a_model_that_is_reset_knows_nothing_and_stands_at_zero() -> None:
-    model = st.StaF(st.StaFBasis(st.GaussianKernel(), st.StateFollowingCenters(st.rings(3), radius=0.5)))
-    with torch.no_grad():
-        model.coefficients.fill_(2.0)
-        model.state.fill_(1.0)
-    model.reset_parameters()
-    assert not model.coefficients.any()
-    assert not model.state.any()
-
-
-def test_a_dtype_and_a_device_that_are_given_are_those_of_all_that_is_held() -> None:
-    staf = st.StaF(basis_of("gaussian"), (2,), dtype=torch.float32, device="meta")
-    for held in (staf.coefficients, staf.state):
-        assert (held.dtype, held.device.type) == (torch.float32, "meta")
-    assert st.StaF(basis_of("gaussian")).coefficients.dtype == torch.float64
-
-
 def test_what_is_reset_is_as_new() -> None:
     staf = fitted("gaussian", (3,))
     staf.reset_parameters()
     for name, held in st.StaF(staf.basis, (3,)).state_dict().items():
         assert torch.equal(staf.state_dict()[name], held), name
+
+
+@pytest.mark.parametrize("batch", [(3,), (2, 3)])
+def test_points_that_could_be_of_one_entry_each_or_of_all_are_refused(batch: tuple[int, ...]) -> None:
+    staf = st.StaF(basis_of("gaussian"), batch).fit_(uniform(*batch, 2, seed=1), Paper())
+    y = uniform(*batch, 2, seed=2)
+    for call in (staf, staf.gradient):
+        with pytest.raises(ValueError, match="must say which points are meant: one of each batch entry"):
+            call(y)
+    ones = [1] * len(batch)
+    said = "y.unsqueeze(0)" if len(batch) == 1 else "y.reshape(1, 1, -1, 2)"
+    with pytest.raises(ValueError, match=re.escape(said)):
+        staf(y)
+    all_of_them = staf(y.reshape(*ones, -1, 2))  # as it says
+    assert all_of_them.shape == (*batch, math.prod(batch))
+    torch.testing.assert_close(all_of_them[(0,) * len(batch)][0], staf(y.unsqueeze(-2))[(0,) * len(batch)][0])
+    for points in (y.unsqueeze(-2), uniform(4, 2, seed=4), uniform(*batch, 4, 2, seed=3)):
+        assert staf(points).shape[-1] == points.shape[-2]
+
+
+# Second derivatives.
+
+
+def moved(staf: st.StaF, step: torch.Tensor, mode: str) -> st.StaF:
+    """The approximation at the state x + step, with what moves in this mode."""
+    if mode == "partial":
+        return staf
+    fresh = st.StaF(staf.basis, tuple(staf.state.shape[:-1]))
+    if mode == "total":
+        return fresh.fit_(staf.state + step, Paper())
+    weights = staf.weights.detach()
+    with torch.no_grad():
+        fresh.state.copy_(staf.state + step)
+        fresh.coefficients.copy_(staf.basis.local(fresh.state).coefficients(weights))
+    return fresh
+
+
+@pytest.mark.parametrize("mode", ["partial", "total_frozen_weights", "total"])
+@over(SMOOTH_KERNELS)
+def test_hessian_is_the_derivative_of_the_gradient(name: str, mode: str) -> None:
+    staf = st.StaF(basis_of(name, 6, 0.4), (3,)).fit_(uniform(3, 2, low=0.3), Paper())
+    y = staf.state.unsqueeze(-2) + uniform(3, 4, 2, low=-0.2, high=0.2)
+    found = staf.hessian(y, mode, Paper()).detach()
+    assert found.shape == (3, 4, 2, 2)
+    torch.testing.assert_close(found, found.mT, rtol=1e-7, atol=1e-7)
+    for axis in range(2):
+        step = torch.zeros(2, dtype=torch.float64)
+        step[axis] = STEP
+        ahead, behind = (
+            moved(staf, sign * step, mode).gradient(y + sign * step, mode, Paper()) for sign in (1, -1)
+        )
+        difference = ((ahead - behind) / (2 * STEP)).detach()
+        scale = float(difference.abs().max()) + 1
+        torch.testing.assert_close(found[..., axis, :], difference, rtol=0, atol=2e-5 * scale)
+
+
+@pytest.mark.filterwarnings("ignore:.*torch.jit.script:DeprecationWarning")  # torch's own, in jacfwd
+@over(SMOOTH_KERNELS)
+def test_weights_have_the_same_jacobian_forward_and_backward_alone_and_in_a_batch(name: str) -> None:
+    basis, x = basis_of(name, 6, 0.4), uniform(3, 2, low=0.3)
+
+    def weights(at: torch.Tensor) -> torch.Tensor:
+        return basis.ideal_weights(at, Paper())
+
+    backward = torch.func.vmap(torch.func.jacrev(weights))(x)
+    scale = float(backward.abs().max())
+    for row in range(3):
+        torch.testing.assert_close(
+            torch.func.jacrev(weights)(x[row]), backward[row], rtol=0, atol=1e-9 * scale
+        )
+    forward = torch.func.vmap(torch.func.jacfwd(weights))(x)
+    torch.testing.assert_close(forward, backward, rtol=0, atol=1e-8 * scale)

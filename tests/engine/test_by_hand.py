@@ -198,7 +198,9 @@ def test_a_chase_is_what_its_equations_say(name: str, predictor: str, run: Calla
         predictor=PREDICTORS[predictor],
         certificate=True,
     )
-    found = {each: getattr(result, each) for each in NAMES} | result.certificate._asdict()
+    found = {each: getattr(result, each) for each in NAMES} | {
+        each: getattr(result.certificate, each) for each in TERMS
+    }
     for row in range(2):
         wanted = by_hand(name, predictor, row)
         for each in (*NAMES, *TERMS):

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 from helpers import basis_of, tensor, uniform
 from variants import KERNELS, RADII, over
 
 import staf_torch as st
-from staf_torch.engine.quantities import _paper_weights
+from staf_torch.local_basis import choice
 from staf_torch.local_basis.base import from_scaled
+from staf_torch.local_basis.elimination import Degrees, degrees_of, eliminate, functionals_of, homogeneous
 from staf_torch.local_basis.newton import newton_space
 from staf_torch.targets import Paper
 
@@ -105,9 +108,103 @@ def test_weights_of_a_newton_space_of_any_kernel_interpolate(kernel: st.Kernel) 
     torch.testing.assert_close(found, values, rtol=1e-8, atol=1e-8)
 
 
-def test_weights_of_the_paper_that_are_zero_stay_so_where_their_factor_underflows() -> None:
-    scaled, units = tensor([[0.0, 2.0], [0.0, 2.0]]), tensor([[0.0], [0.5]])
-    found = _paper_weights(scaled, units)
-    assert found[:, 0].tolist() == [0.0, 0.0]
-    assert bool(found[0, 1].isnan())
-    assert float(found[1, 1]) == 1.0
+@pytest.mark.parametrize("kernel", ["exponential", "gaussian", "polynomial"])
+@pytest.mark.parametrize("lead", [(4097,), (2, 2, 2049)])
+def test_a_large_batch_that_goes_in_blocks_is_what_its_rows_are(kernel: str, lead: tuple[int, ...]) -> None:
+    basis, x = basis_of(kernel, 3, st.StateRadius(0.4, 0.1)), uniform(*lead, 2, low=0.3, seed=1)
+    values = basis.values(x, Paper())
+    found = basis.local(x).fit(values).reshape(-1, 3)
+    for row in (0, 4095, 4096, len(found) - 1):
+        alone = basis.local(x.reshape(-1, 2)[row]).fit(values.reshape(-1, 3)[row])
+        torch.testing.assert_close(found[row], alone, rtol=1e-10, atol=1e-12)
+
+
+# What fixes a basis.
+
+
+@pytest.mark.parametrize(("dim", "count"), [(1, 4), (2, 6), (2, 7), (3, 9)])
+def test_functionals_are_orthonormal_and_blind_to_lower_degrees(dim: int, count: int) -> None:
+    points = uniform(count, dim, low=-1.0, seed=count)
+    points = points / points.norm(dim=-1).max()
+    found = eliminate(points)
+    q = found.functionals
+    torch.testing.assert_close(q.mT @ q, torch.eye(count).double(), rtol=0, atol=1e-12)
+    assert list(found.degrees) == sorted(found.degrees)
+    for j, degree in enumerate(found.degrees):
+        for k in range(degree):
+            assert float((q[:, j] @ homogeneous(points, k)).abs().max()) < 1e-12
+        seen = float((q[:, j] @ homogeneous(points, degree)).norm())
+        assert seen == pytest.approx(float(found.strengths[j]), rel=1e-9)
+        assert seen > 1e-6
+    for k in range(max(found.degrees)):
+        assert found.degrees.count(k) == math.comb(dim + k - 1, k)
+
+
+def test_functionals_that_have_one_value_span_the_same_and_see_their_own_monomial_with_a_plus() -> None:
+    for points in (st.rings(10), st.ball(7, 3), uniform(4, 1, low=-1.0, seed=14)):
+        degrees = degrees_of(points)
+        found = functionals_of(points / degrees.reach, degrees)
+        assert found.degrees == degrees.each()
+        q = found.functionals
+        torch.testing.assert_close(q.mT @ q, torch.eye(len(points)).double(), rtol=0, atol=1e-12)
+        whole = eliminate(points / degrees.reach)
+        alphas = [row for block in degrees.monomials for row in block]
+        for j, (degree, alpha) in enumerate(zip(found.degrees, alphas, strict=True)):
+            for k in range(degree):
+                assert float((q[:, j] @ homogeneous(points, k)).abs().max()) < 1e-11
+            monomial = (points ** torch.tensor(alpha)).prod(-1)
+            assert float(q[:, j] @ monomial) > 0
+            assert float((q[:, j] @ homogeneous(points / degrees.reach, degree)).norm()) > 1e-6
+        for k in set(found.degrees):
+            ours, theirs = (
+                each.functionals[:, [j for j, degree in enumerate(each.degrees) if degree == k]]
+                for each in (found, whole)
+            )
+            torch.testing.assert_close(ours @ ours.mT, theirs @ theirs.mT, rtol=0, atol=1e-10)
+
+
+def test_homogeneous_monomials_have_the_norm_of_the_power() -> None:
+    points = uniform(5, 3, low=-1.0, seed=13)
+    for degree in range(4):
+        rows = homogeneous(points, degree)
+        assert rows.shape == (5, math.comb(2 + degree, degree))
+        torch.testing.assert_close(rows @ rows.mT, (points @ points.mT) ** degree)
+
+
+def test_degrees_come_back_from_lists_and_count_their_monomials() -> None:
+    found = degrees_of(0.3 * st.rings(6))
+    assert found.reach == pytest.approx(0.3)
+    assert found.sizes() == (1, 2, 3)
+    assert found.each() == (0, 1, 1, 2, 2, 2)
+    assert [sum(row) for block in found.monomials for row in block] == [0, 1, 1, 2, 2, 2]
+    listed = {"monomials": [[list(row) for row in block] for block in found.monomials], "reach": found.reach}
+    assert Degrees.of(listed) == found
+    assert degrees_of(torch.zeros(1, 2).double()) == Degrees((((0, 0),),), 1.0)
+
+
+def test_points_that_coincide_are_refused_with_their_number() -> None:
+    points = torch.cat((st.rings(3), st.rings(3)[:2] + 1e-16))
+    with pytest.raises(ValueError, match=r"must be told apart by polynomials: 2 of 5 directions coincide"):
+        eliminate(points)
+
+
+@pytest.mark.parametrize(
+    ("kernel", "count", "kind"),
+    [
+        (st.ExponentialKernel(), 6, "graded"),
+        (st.GaussianKernel(0.5), 3, "graded"),
+        (st.MaternKernel(1.5), 3, "newton"),
+        (st.PolynomialKernel(2), 6, "polynomial"),
+        (st.PolynomialKernel(3), 6, "polynomial"),
+        (st.PolynomialKernel(1), 6, "newton"),
+        (st.PolynomialKernel(1), 3, "polynomial"),
+    ],
+)
+def test_a_kernel_gets_the_basis_that_it_allows(kernel: st.Kernel, count: int, kind: str) -> None:
+    found, degrees = choice.choose(kernel, st.rings(count))
+    assert found == kind
+    assert (degrees is None) is (kind == "newton")
+    empty = torch.empty(count, 2, device="meta")
+    named, nothing = choice.choose(kernel, empty)
+    assert nothing is None
+    assert named == ("polynomial" if isinstance(kernel, st.PolynomialKernel) else kind)

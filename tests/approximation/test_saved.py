@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import io
+import json
 from collections.abc import Callable
 from typing import Any
 
@@ -14,7 +15,7 @@ from torch import nn
 from variants import KERNELS, over
 
 import staf_torch as st
-from staf_torch.approximation.coefficient_format import decode
+from staf_torch.approximation.coefficient_format import decode, described, encode
 from staf_torch.targets import Paper
 
 X = [0.5, 0.4]
@@ -104,12 +105,11 @@ def test_another_width_radius_or_layout_is_loaded_with_the_coefficients() -> Non
     torch.testing.assert_close(again(y), saved(y), rtol=1e-12, atol=1e-12)
 
 
-def test_a_file_of_an_earlier_version_says_why_it_is_refused() -> None:
-    staf = fitted()
-    old = {key: value for key, value in staf.state_dict().items() if "convention" not in key}
+def test_coefficients_without_a_record_are_refused() -> None:
+    bare = {key: value for key, value in fitted().state_dict().items() if "convention" not in key}
     for strict in (True, False):
         with pytest.raises(ValueError, match="earlier version of staf_torch wrote them"):
-            fitted().load_state_dict(old, strict=strict)
+            fitted().load_state_dict(bare, strict=strict)
 
 
 def test_a_file_of_a_later_version_says_why_it_is_refused() -> None:
@@ -142,9 +142,47 @@ def test_averaged_and_assigned_state_dicts_load() -> None:
     assert torch.equal(bare(tensor([X])), one(tensor([X])))
 
 
-def test_the_record_is_readable_by_people_and_machines() -> None:
-    record = decode("test", fitted("matern52").basis.convention)
-    assert record["kernel"] == "MaternKernel(smoothness=2.5)"
-    assert record["centers"] == [6, 2]
-    graded = decode("test", fitted("gaussian").basis.convention)["degrees"]["monomials"]
-    assert graded == [[[0, 0]], [[1, 0], [0, 1]], [[2, 0], [1, 1], [0, 2]]]
+def test_a_record_tells_all_that_coefficients_depend_on_beside_tensors() -> None:
+    found = decode("f", fitted(st.AnchoredKernel(st.MaternKernel(1.5))).basis.convention)
+    assert found == {
+        "format": 2,
+        "kernel": "AnchoredKernel(kernel=MaternKernel(smoothness=1.5))",
+        "basis": "newton",
+        "radius": "ConstantRadius()",
+        "centers": [6, 2],
+    }
+    graded = decode("f", fitted().basis.convention)
+    assert graded["basis"] == "graded"
+    assert graded["degrees"]["reach"] == pytest.approx(1.0)
+    assert [len(block) for block in graded["degrees"]["monomials"]] == [1, 2, 3]
+
+
+@pytest.mark.parametrize(("key", "value"), [("format", 1), ("basis", "graded"), ("centers", None)])
+def test_a_record_of_another_format_or_basis_is_refused(key: str, value: Any) -> None:
+    own = fitted("matern32").basis
+    own.check_convention("F", own.convention)
+    with pytest.raises(ValueError, match=rf"saved with {value}, loaded into"):
+        own.check_convention("F", encode(decode("F", own.convention) | {key: value}))
+
+
+def test_a_record_survives_averaging_and_nothing_else_is_one() -> None:
+    record = {"b": [1, 2], "a": "é"}
+    stored = encode(record)
+    assert stored.dtype == torch.uint8
+    assert bytes(stored.tolist()) == json.dumps(record, sort_keys=True).encode()
+    assert decode("f", stored.double() + 0.4) == record
+    listed = encode([1])  # type: ignore[arg-type]
+    for wrong in (torch.tensor([1, 2, 255]).to(torch.uint8), listed, stored[:-1]):
+        with pytest.raises(ValueError, match="`f`: the entry `convention` must be what a StaFBasis wrote"):
+            decode("f", wrong)
+
+
+def test_a_module_is_described_by_its_plain_settings_and_its_children() -> None:
+    class Own(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.b, self.a, self.flag, self.name, self.hidden = 2, 1.5, True, "x", [1]
+            self._private = 3
+            self.inner = nn.Identity()
+
+    assert described(Own()) == "Own(a=1.5, b=2, flag=True, name='x', inner=Identity())"
