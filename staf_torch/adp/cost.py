@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import abc
-import copy
 from collections.abc import Callable, Sequence
 from typing import Self
 
@@ -12,7 +11,7 @@ from torch import Tensor, nn
 
 from ..numerics.angles import wrap
 from ..numerics.box import LARGEST, box_minimum, face_inverses
-from ..numerics.checks import fail, non_negative, one_or_each, positive, positive_real, real, vector
+from ..numerics.checks import copied, fail, non_negative, one_or_each, positive, positive_real, real, vector
 from ..numerics.linalg import positive_definite, positive_semidefinite
 from ..systems import Bounds, Plant
 from ..systems.bounds import Limit
@@ -117,7 +116,7 @@ class Cost(nn.Module, abc.ABC):
             x = self.target
             u = resting_input_at(plant, x) if self.target_input is None else self.target_input
         check_rest(plant, x, u)
-        placed = copy.copy(self)
+        placed = copied(self)
         placed.target = x if bool((x != 0).any()) else None
         placed.target_input = u if bool((u != 0).any()) else None
         placed.periodic = plant.periodic
@@ -125,7 +124,6 @@ class Cost(nn.Module, abc.ABC):
         same = all(getattr(placed, k) is getattr(self, k) for k in ("target", "target_input", "bounds"))
         if same and self.periodic == plant.periodic:
             return self
-        placed._buffers, placed._modules = dict(self._buffers), dict(self._modules)
         placed._prepare()
         return placed
 
@@ -133,9 +131,8 @@ class Cost(nn.Module, abc.ABC):
         """This cost with other bounds of the inputs; the same where both are None."""
         if low is None and high is None:
             return self
-        other = copy.copy(self)
+        other = copied(self)
         other.bounds = Bounds(low, high, self.inputs)
-        other._buffers, other._modules = dict(self._buffers), dict(self._modules)
         other._prepare()
         return other
 

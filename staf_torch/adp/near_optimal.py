@@ -93,10 +93,10 @@ class NearOptimal(SampledRollout):
 
     def __getstate__(self) -> dict[str, Any]:
         made = {"planner": self.planner is not None, "_planners": {}, "_loops": {}}
-        return {**super().__getstate__(), **made}
+        return {**vars(self), **made}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        super().__setstate__(state)
+        super().__setstate__(state)  # type: ignore[no-untyped-call]
         self.planner = self.plans() if state["planner"] else None
 
     def plans(self, constants: float | None = None) -> BoundedPlans | None:

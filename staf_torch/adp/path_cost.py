@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable
 from typing import Self
 
@@ -10,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ..numerics.angles import wrap
-from ..numerics.checks import fail
+from ..numerics.checks import copied, fail
 from ..systems import Clocked, Plant
 from ..systems.bounds import Limit
 from .cost import Cost, Matrix, QuadraticCost
@@ -79,8 +78,7 @@ class TrackingCost(QuadraticCost):
         """
         if not isinstance(plant, Clocked):
             raise fail("TrackingCost", "plant", "must have a clock: `systems.Clocked(plant)`", plant)
-        placed = copy.copy(self)
-        placed._buffers, placed._modules = dict(self._buffers), dict(self._modules)
+        placed = copied(self)
         placed.still = self.still.around(plant.plant)
         placed.target_input, placed.bounds = placed.still.target_input, placed.still.bounds
         placed.periodic = plant.periodic

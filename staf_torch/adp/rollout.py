@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import Any
 
@@ -90,7 +91,7 @@ class RolloutPolicy(nn.Module):
         self.steps = integer("RolloutPolicy", "steps", steps, least=1)
         self.depth = integer("RolloutPolicy", "depth", depth, least=1)
         self.period = None if period is None else positive_real("RolloutPolicy", "period", period)
-        self._compiled = RowFunction(self.control, self, _NAME, lambda: _TwoPrograms(self))
+        self._compiled = RowFunction(self.control, self, _NAME, functools.partial(_TwoPrograms, self))
         self.base: Policy = base
         if depth > 1:
             settings = {"horizon": horizon, "steps": steps, "depth": depth - 1}
@@ -142,13 +143,6 @@ class RolloutPolicy(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """u: (..., n) -> (..., m)."""
         return self._compiled(x)
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {**vars(self), "_compiled": None}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        super().__setstate__(state)  # type: ignore[no-untyped-call]
-        self._compiled = RowFunction(self.control, self, _NAME, lambda: _TwoPrograms(self))
 
     def control(self, x: Tensor) -> Tensor:
         """`forward` in plain torch: (..., n) -> (..., m)."""

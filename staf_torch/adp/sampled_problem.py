@@ -15,7 +15,7 @@ from ..lanes.combinators import tracing_now
 from ..numerics.angles import wrap
 from ..numerics.checks import fail, integer, positive_real, trailing
 from ..numerics.forward_mode import use_forward_mode
-from ..numerics.linalg import positive_semidefinite, solver
+from ..numerics.linalg import discrete_riccati, positive_semidefinite
 from ..numerics.runge_kutta import runge_kutta_mean, runge_kutta_stages
 from ..systems import Bounds, Plant
 from ..systems.bounds import Limit
@@ -254,18 +254,15 @@ class SampledProblem(nn.Module):
         """P and K of the linear-quadratic problem at the goal."""
         at = self.derivatives(self.goal.unsqueeze(0), self.rest.unsqueeze(0))
         m, n = self.inputs, self.dim - (self.path is not None)
-        a, b, w = at.first[0, :n, :n], at.first[0, :n, -m:], 0.5 * at.cost_second[0]
-        q, s, r = w[:n, :n], w[:n, -m:], w[-m:, -m:]
-        solve = solver("solve_discrete_are")
+        kept = [*range(n), *range(self.dim, self.dim + m)]  # without the time
+        paid = 0.5 * at.cost_second[0][kept][:, kept]
         try:
-            solved = solve(*(t.numpy() for t in (a, b, q, r)), s=s.numpy())
+            p, k = discrete_riccati(at.first[0, :n, :n], at.first[0, :n, -m:], paid)
         except (np.linalg.LinAlgError, ValueError) as error:
             raise ValueError(
                 "`SampledProblem(step=...)` has no linear-quadratic regulator at the goal: its linearisation "
                 f"cannot be stabilised, or its cost is not convex there ({error})."
             ) from error
-        p = 0.5 * torch.from_numpy(solved + solved.T)
-        k = torch.linalg.solve(r + b.mT @ p @ b, b.mT @ p @ a + s.mT)
         clock = self.dim - n
         return pad(p, (0, clock, 0, clock)), pad(k, (0, clock))
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -117,7 +117,7 @@ class SampledRollout(nn.Module):
         self.register_buffer("probe", _PROBE * torch.where(torch.isfinite(span), span, 1.0))  # (m,)
         self.probe: Tensor
         self.along = None if basis.dim == cost.dim else _along(basis)
-        self._compiled = self._compile()
+        self._compiled = RowFunction(self.control, self, "a sampled rollout") if plant.traceable else None
         self._followed = followed(plant, base, self.bounds, self.period)
 
     def forward(self, x: Tensor) -> Tensor:
@@ -128,14 +128,6 @@ class SampledRollout(nn.Module):
     def compiled(self) -> bool:
         """Whether a compiled program has served a call."""
         return self._compiled is not None and self._compiled.compiled
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {**vars(self), "_compiled": None, "_followed": None}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        super().__setstate__(state)  # type: ignore[no-untyped-call]
-        self._compiled = self._compile()
-        self._followed = followed(self.plant, self.base, self.bounds, self.period)
 
     def control(self, x: Tensor) -> Tensor:
         """`forward` in plain torch: (..., n) -> (..., m)."""
@@ -264,11 +256,6 @@ class SampledRollout(nn.Module):
 
     def _discount(self) -> float:
         return math.exp(-self.cost.discount * self.period)
-
-    def _compile(self) -> RowFunction | None:
-        if not self.plant.traceable:
-            return None
-        return RowFunction(self.control, self, "a sampled rollout")
 
 
 def _rise(basis: StaFBasis, z: Tensor, values: Tensor) -> Tensor:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ..numerics.checks import fail, positive_real
 from ..numerics.differences import STEP, central_slopes
-from ..numerics.linalg import check_modes, exponential, solver, unstabilisable_mode
+from ..numerics.linalg import check_modes, discrete_riccati, exponential, unstabilisable_mode
 from ..systems import Clocked, Plant
 from .cost import Cost
 
@@ -143,15 +143,10 @@ def held_riccati(plant: Plant, cost: Cost, period: float) -> tuple[Tensor, Tenso
     )
     if unstabilisable_mode(hold.a, hold.b, discrete=True) is not None:
         raise ValueError(fault)
-    dare = solver("solve_discrete_are")
-    q, s, r = hold.paid[:n, :n], hold.paid[:n, n:], hold.paid[n:, n:]
     try:
-        solved = dare(*(t.numpy() for t in (hold.a, hold.b, q, r)), s=s.numpy())
+        return discrete_riccati(hold.a, hold.b, hold.paid)
     except np.linalg.LinAlgError as error:
         raise ValueError(fault) from error
-    p = 0.5 * torch.from_numpy(solved + solved.T)
-    k = torch.linalg.solve(r + hold.b.mT @ p @ hold.b, hold.b.mT @ p @ hold.a + s.mT)
-    return p, k
 
 
 class HeldStability(NamedTuple):

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import copy
-
 import torch
 from torch import Tensor
 
-from ..numerics.checks import fail, number
+from ..numerics.checks import copied, fail, number
 from ..systems import ControlAffineSystem
 from .cost import Matrix, QuadraticCost
 
@@ -62,9 +60,7 @@ class TwoStateTracking(ControlAffineSystem):
 
     def believing(self, theta: Tensor) -> TwoStateTracking:
         """A copy with other parameters, (..., 3, 2); not checked, so that a row may go wrong alone."""
-        other = copy.copy(self)
-        other._buffers = {**self._buffers, "theta": theta}
-        return other
+        return copied(self, theta=theta)
 
     def effectiveness(self, x: Tensor) -> Tensor:
         gain = input_gain(x[..., 0] + x[..., 2])

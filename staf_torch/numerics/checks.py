@@ -6,8 +6,10 @@ Each check returns the value it was given, converted where that is safe, so that
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Collection, Sequence
+from typing import TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -15,6 +17,8 @@ from torch import Tensor, nn
 from . import COMMAND_LINE as COMMAND_LINE
 from . import fail as fail
 from . import show
+
+Module = TypeVar("Module", bound=nn.Module)
 
 
 def number(call: str, name: str, value: object) -> float | Tensor:
@@ -155,6 +159,13 @@ def hold(module: nn.Module, name: str, value: Tensor) -> None:
         module.register_parameter(name, value)
     else:
         module.register_buffer(name, value)
+
+
+def copied(module: Module, **buffers: Tensor) -> Module:
+    """A shallow copy of a module, with other tensors in place of some; not checked."""
+    other = copy.copy(module)
+    other._buffers, other._modules = {**module._buffers, **buffers}, dict(module._modules)
+    return other
 
 
 def shown(module: nn.Module) -> str:

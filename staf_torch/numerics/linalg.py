@@ -151,6 +151,24 @@ def riccati(a: Tensor, b: Tensor, q: Tensor, r: Tensor, *, name: str = "the syst
     return 0.5 * (p + p.mT)
 
 
+def discrete_riccati(a: Tensor, b: Tensor, paid: Tensor) -> tuple[Tensor, Tensor]:
+    """P and K of x+ = A x + B u that pays z'Wz a step, z = (x, u): the best control -K x, of the value x'Px.
+
+    Args:
+        a: A, (n, n).
+        b: B, (n, m).
+        paid: W, (n + m, n + m).
+
+    Raises:
+        numpy.linalg.LinAlgError, ValueError: of SciPy, if there is none; ValueError if SciPy is missing.
+    """
+    n = len(a)
+    q, s, r = paid[:n, :n], paid[:n, n:], paid[n:, n:]
+    solved = solver("solve_discrete_are")(*(t.numpy() for t in (a, b, q, r)), s=s.numpy())
+    p = 0.5 * torch.from_numpy(solved + solved.T)
+    return p, torch.linalg.solve(r + b.mT @ p @ b, b.mT @ p @ a + s.mT)
+
+
 def row_jacobian(function: Callable[[Tensor], Tensor], at: Tensor) -> tuple[Tensor, Tensor]:
     """Values and derivatives of a function of rows, in which no row sees another.
 
