@@ -1,7 +1,7 @@
 """Tests of what is not installed are skipped: a plugin of `conftest.py`.
 
-The library names the extra that it lacks (`pip install 'staf_torch[adp]'`), an import names its module. Where that
-is really absent, a test, or a file of tests, that ends so says nothing of the library.
+The library names the extra that it lacks (`pip install 'staf_torch[adp]'`), an import names its module. Where
+that is really absent, a test, or a file of tests, that ends so says nothing of the library.
 """
 
 from __future__ import annotations

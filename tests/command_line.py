@@ -16,7 +16,6 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-
 ROOT = Path(__file__).resolve().parent.parent
 PLANTS = '''
 import torch

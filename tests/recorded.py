@@ -1,9 +1,9 @@
-"""Numbers as they were: what a run found, in a few digits, beside what was recorded of it.
+"""Metrics of whole experiments, a few texts and facts of laws, compared with what was recorded of them.
 
-    pytest tests/adp/test_recorded_loops.py --record  # writes them anew
+    pytest tests/experiments/test_reference_metrics.py --record  # writes them anew
 
-A property says what must be so; what is a choice (a threshold, a number of tries, a share) has none, and is
-held here. A change that is meant is seen in the difference of `tests/recorded/`.
+A change that is meant is seen in the difference of `tests/recorded/`. Numbers that the last bits decide are
+no records: the next processor, compiler or version rounds otherwise.
 """
 
 from __future__ import annotations
@@ -22,9 +22,7 @@ import torch
 from torch import Tensor, nn
 
 FOLDER = Path(__file__).with_name("recorded")
-_FEW = (
-    4  # numbers that are kept as they are; of more, two sums with weights, that of their sizes, and how many
-)
+_FEW = 4  # numbers that are kept as they are; of more, two sums with weights, that of sizes, and how many
 _NOISE = 1e-9  # what a number may differ by, whatever its size
 _DEEP = 4  # objects in objects
 _MEASURED = ("seconds", "microseconds", "digests")  # of a run: no two are alike
@@ -117,12 +115,12 @@ class Record:
         found: dict[str, Any] = {} if self.writes else _kept(self.path).get(self.name, {})
         return found
 
-    def __call__(self, value: Any, *, rtol: float = 1e-6, texts: bool = True, without: str = "\n") -> None:
+    def __call__(self, value: Any, *, rtol: float = 1e-6, without: str = "\n") -> None:
         """Fail where numbers of the value differ by more than a share of their size, or its texts differ.
 
         Parts whose path begins with ``without`` are not asked here, as those of another version are not.
         """
-        found = {path: part for path, part in numbers(value).items() if texts or not isinstance(part, str)}
+        found = numbers(value)
         if self.writes:
             known = json.loads(self.path.read_text()) if self.path.exists() else {}
             known[self.name] = found

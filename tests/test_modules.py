@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from variants import over
 
 import staf_torch as st
-from staf_torch import adp, deploy, systems, targets
+from staf_torch import adp, systems, targets
 from staf_torch.adp.bases import LeadingCoordinates
 from staf_torch.adp.closed_loop import ClosedLoop
 from staf_torch.adp.tracking import true_parameters
@@ -209,32 +209,18 @@ MODULES: dict[str, Case] = {
     "SupervisedPolicy": Case(lambda s: SupervisedPolicy(lqr(s), adp.Supervised(learner(1.0), lqr(), cost()))),
     "FoldedRollout": Case(lambda s: FoldedRollout(rollout(s))),
 }
-OTHERS = {"_Held", "ConventionModule", "FunctionPlant", "StepPlant", "RatePlant"}
-OTHERS |= {
-    "SampledProblem",
-    "GlobalValue",
-    "BoxFilter",
-    "SafetyFilter",
-    "DetourPlans",
-    "DetourRollout",
-    "FilteredPolicy",
-    "PlanReplay",
-    "RememberedPolicy",
-}
-OTHERS |= {"AmongDiscs"}  # of an experiment
-OTHERS |= {"RecedingHorizon", "PathIntegral", "MujocoPlant", "EnvironmentPlant", "EnergyShaping"}
-OTHERS |= {"NearOptimal", "SampledRollout", "StrainedPlans"}
-OTHERS |= {
-    "ParametricPlant",
-    "ChangingPlant",
-    "AdaptiveActorCritic",
-    "AdaptiveLQR",
-    "DriftLQR",
-    "ConcurrentTracker",
-    "Measured",
-    "RobustFilter",
-    "Observed",
-    "_Informed",
+OTHERS = {
+    *("ConventionModule", "FunctionPlant", "StepPlant", "RatePlant", "SampledProblem"),
+    *("GlobalValue", "BoxFilter", "SafetyFilter", "DetourPlans", "DetourRollout", "FilteredPolicy"),
+    *("PlanReplay", "RememberedPolicy", "AmongDiscs", "RecedingHorizon", "PathIntegral", "MujocoPlant"),
+    *("EnvironmentPlant", "EnergyShaping", "NearOptimal", "SampledRollout", "StrainedPlans"),
+    *("ParametricPlant", "ChangingPlant", "AdaptiveActorCritic", "AdaptiveLQR", "DriftLQR"),
+    *(
+        "ConcurrentTracker",
+        "Measured",
+        "RobustFilter",
+        "Observed",
+    ),
 }
 """What wraps a function of the user's own, or takes minutes to make: tested in its room."""
 
@@ -246,8 +232,9 @@ def concrete() -> set[str]:
         if "plugins" in info.name or "__main__" in info.name or ".conf" in info.name:
             continue
         for name, kind in vars(importlib.import_module(info.name)).items():
-            if inspect.isclass(kind) and issubclass(kind, nn.Module) and kind.__module__ == info.name:
-                found |= set() if inspect.isabstract(kind) or kind is deploy else {name}
+            own = inspect.isclass(kind) and issubclass(kind, nn.Module) and kind.__module__ == info.name
+            if own and not inspect.isabstract(kind) and not name.startswith("_"):
+                found.add(name)
     return found
 
 
