@@ -52,7 +52,7 @@ def looks_inside(nodes: Sequence[ast.AST]) -> Iterator[str]:
     ours = set(_imported(nodes))
     made = ours | set(_made(nodes, ours))
     for node in nodes:
-        for told in (_private(node), _patched(node, made), _assigned(node, ours)):
+        for told in (_private(node), _patched(node, ours, made), _assigned(node, ours)):
             if told:
                 yield f"{node.lineno}: {told}"  # type: ignore[attr-defined]
 
@@ -123,17 +123,16 @@ def _is_private(name: str) -> bool:
     )
 
 
-def _patched(node: ast.AST, ours: set[str]) -> str | None:
+def _patched(node: ast.AST, ours: set[str], made: set[str]) -> str | None:
     """Of `monkeypatch`, `unittest.mock` or `setattr`, with a thing of the package or its dotted name."""
     if not isinstance(node, ast.Call) or not node.args:
         return None
-    called, of = ast.unparse(node.func).rpartition(".")[2], ast.unparse(node.func)
+    of, target = ast.unparse(node.func), node.args[0]
+    called = of.rpartition(".")[2]
     if called not in ("setattr", "delattr") and not (called in _PATCHES and "patch" in of):
         return None
-    target = node.args[0]
-    if _root(target) in ours or _names_the_package(target):
-        return f"patches {ast.unparse(target)}"
-    return None
+    known = ours if of == called else made  # `setattr(policy, "horizon", 1)` is a user's own
+    return f"patches {ast.unparse(target)}" if _root(target) in known or _names_the_package(target) else None
 
 
 def _assigned(node: ast.AST, ours: set[str]) -> str | None:
