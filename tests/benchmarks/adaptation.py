@@ -15,7 +15,7 @@ import torch
 from staf_torch import adp, systems
 from staf_torch.experiments import avoidance, faults, icl, safe_box
 from staf_torch.experiments.vehicles import VEHICLES, vehicle
-from staf_torch.settings.adp import make_cost, updated
+from staf_torch.settings.adp import make_cost
 from staf_torch.settings.adp import plant as make_plant
 from staf_torch.settings.chase import initial_states
 from staf_torch.sweeps.hydra_compat import Composer, config_loader
@@ -44,7 +44,7 @@ def loops(rows: int) -> dict[str, Loop]:
 def in_the_box(rows: int) -> dict[str, tuple[Loop, dict[str, object]]]:
     """The methods of `staf experiment=safe_box`, each with the settings of its loop."""
     composer = Composer(config_loader(), hydra_node=False)
-    cfg = updated(composer(["experiment=safe_box", f"trajectories={rows}", f"dt={DT}"]))
+    cfg = composer(["experiment=safe_box", f"trajectories={rows}", f"dt={DT}"])
     system = make_plant(cfg)
     box = systems.Barrier(system, list(cfg.safe_box.low), list(cfg.safe_box.high))
     x0 = initial_states(cfg, system.dim)
@@ -60,7 +60,7 @@ def among_discs(rows: int, kind: str) -> Loop:
     """A vehicle of `staf experiment=avoidance` behind its filter."""
     composer = Composer(config_loader(), hydra_node=False)
     given = ["experiment=avoidance", f"trajectories={rows}", f"avoidance.vehicle={kind}", f"dt={DT}"]
-    cfg = updated(composer(given))
+    cfg = composer(given)
     own, chosen = vehicle(cfg, DT), cfg.avoidance
     plant = avoidance.AmongDiscs(own, chosen.discs)
     discs = [avoidance.apart(own, k, chosen.radius) for k in range(chosen.discs)]

@@ -28,7 +28,6 @@ from torch import Tensor
 from staf_torch import adp, systems
 from staf_torch.experiments import avoidance
 from staf_torch.experiments.vehicles import vehicle
-from staf_torch.settings.adp import updated
 from staf_torch.sweeps.hydra_compat import Composer, config_loader
 
 DT, STEPS, AHEAD, RADIUS, DISCS = 0.1, 150, 40, 0.4, 3
@@ -190,9 +189,8 @@ def among(kind: str, count: int, seed: int) -> Loop:
         terminal=end,
         margin=0.04,
     )
-    center = own._replace(
-        point=lambda x: x[..., :2], reach=0.0
-    )  # of a unicycle: what the rival keeps outside
+    # Of a unicycle: what the rival keeps outside.
+    center = own._replace(point=lambda x: x[..., :2], reach=0.0)
     near = [avoidance.apart(center, k, RADIUS) for k in range(DISCS)]
     # What a vehicle cuts of a disc between samples at 1.5 m/s of each other is 7 mm.
     ways = adp.DetourRollout(

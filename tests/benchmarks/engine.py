@@ -3,8 +3,7 @@
 States given, ten iterations, the weights of every time returned; exponential kernel, the paper's V, rings.
 The rounds of all programs of a row alternate; a speed is the best of the rounds, in CPU seconds of this
 process, so that other programs on the machine matter little. The benchmark refuses a chase that was not
-compiled. Peers that are not installed are skipped by name (extra `bench`). Writes
-runs/benchmarks/engine.json.
+compiled. Peers that are not installed are skipped by name. Writes runs/benchmarks/engine.json.
 """
 
 from __future__ import annotations
@@ -43,7 +42,6 @@ OTHERS: dict[str, st.optim.UpdateLaw] = {
     "PreconditionedDescent, jacobi": st.optim.PreconditionedDescent("jacobi"),
     "RecursiveLeastSquares": st.optim.RecursiveLeastSquares(),
 }
-
 PREDICTED = {"tangent + 1": predictors.Tangent(), "secant + 1": predictors.Secant()}
 
 
