@@ -12,7 +12,6 @@ from torch import Tensor
 
 import staf_torch as st
 
-KERNELS = ["gaussian", "exponential", "matern", "inverse_multiquadric", "rational_quadratic"]
 MAGNITUDES = some.floats(-1e300, 1e300) | some.sampled_from([math.nan, math.inf, -math.inf, 5e-324, 0.0])
 
 
@@ -34,7 +33,7 @@ def error_after(model: st.StaFRegressor, x: Tensor, y: Tensor) -> float:
 
 @pytest.mark.parametrize(
     ("kernel", "dtype"),
-    [*((kernel, torch.float64) for kernel in KERNELS), *((k, torch.float32) for k in ("gaussian", "matern"))],
+    [("exponential", torch.float64), ("matern", torch.float64), ("gaussian", torch.float32)],
 )
 def test_filter_recovers_from_far_inputs(kernel: str, dtype: torch.dtype) -> None:
     """Four streams side by side, each with another one."""
@@ -87,7 +86,7 @@ def test_filter_is_alive_after_anything(samples: list[tuple[float, float, float]
     assert error_after(model, x, y) < 0.3
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(some.lists(some.tuples(MAGNITUDES, MAGNITUDES, MAGNITUDES), min_size=1, max_size=25))
 def test_bank_is_alive_after_anything(samples: list[tuple[float, float, float]]) -> None:
     model = st.StaFRegressor(memory=128, neighbours=8)

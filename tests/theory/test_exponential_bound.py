@@ -52,7 +52,7 @@ def test_verified_error_bounds_the_error_at_random_points_and_is_within_epsilon(
 ) -> None:
     target, domain, radius = DOMAINS[name]
     bound = theory.exponential_bound(target, domain, radius, epsilon)
-    z = random_offsets(radius, len(domain), 2000, domain.shape[-1])
+    z = random_offsets(radius, len(domain), 500, domain.shape[-1])
     for built in (bound.two_polynomials, bound.one_polynomial):
         worst = float((target(domain.unsqueeze(-2) + z) - built(z)).abs().max())
         assert worst <= built.error <= epsilon

@@ -179,14 +179,12 @@ POWER_LAYOUTS = {
     "rings6": st.rings(6),
     "rings10": st.rings(10),
     "ball10_3": st.ball(10, 3),
-    "polygon4": st.polygon(4),
-    "ball8_2": st.ball(8, 2),
     "cross_polytope3": st.cross_polytope(3),
     "one": torch.zeros(1, 2, dtype=torch.float64),
 }
 
 
-@pytest.mark.parametrize("radius", [1e-8, 1e-3, 0.1, 0.5])
+@pytest.mark.parametrize("radius", [1e-8, 0.1, 0.5])
 @pytest.mark.parametrize("width", [None, 0.7])
 @pytest.mark.parametrize("layout", POWER_LAYOUTS)
 def test_power_function_keeps_its_digits_at_every_radius(
