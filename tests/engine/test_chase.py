@@ -15,7 +15,7 @@ from torch import Tensor
 from variants import KERNELS, LAWS, PAPER_LAW, over
 
 import staf_torch as st
-from staf_torch import chase, chase_weights, optim, systems, targets
+from staf_torch import chase, chase_weights, systems, targets
 from staf_torch.engine import ChaseResult, chase_pieces, chunk_length
 from staf_torch.engine.result import concatenate
 from staf_torch.numerics.linalg import condition_number
@@ -251,47 +251,7 @@ def test_weights_that_underflow_are_not_a_number_while_the_estimate_is_one() -> 
     assert not result.diverged.any()
 
 
-@pytest.mark.parametrize("ends", [(9,), (4, 9), (1, 2, 9)])
-@pytest.mark.parametrize("certificate", [True, False])
-def test_pieces_of_time_are_one_result_again(ends: tuple[int, ...], certificate: bool) -> None:
-    x0 = uniform(2, 2, low=0.3, seed=1)
-    states = systems.simulate(systems.Oscillator(), x0, dt=0.05, steps=8)
-    whole = st.chase(states, basis_of("gaussian"), Paper(), SteepestDescent(), certificate=certificate)
-    spans = [slice(begin, end) for begin, end in zip((0, *ends), ends, strict=False)]
-
-    def cut(thing: object, at: slice) -> object:
-        return thing[:, at] if isinstance(thing, torch.Tensor) and thing.dim() > 1 else thing
-
-    pieces = []
-    for at in spans:
-        fields = {field.name: cut(getattr(whole, field.name), at) for field in dataclasses.fields(whole)}
-        if whole.certificate is not None:
-            fields["certificate"] = type(whole.certificate)(*(cut(each, at) for each in whole.certificate))
-        pieces.append(ChaseResult(**fields))
-    again = concatenate(pieces)
-    for field in dataclasses.fields(whole):
-        one, two = getattr(whole, field.name), getattr(again, field.name)
-        pairs = (
-            zip(one, two, strict=True) if field.name == "certificate" and one is not None else [(one, two)]
-        )
-        for a, b in pairs:
-            assert (a is b is None) or torch.equal(a, b), field.name
-
-
 # The weights alone.
-
-
-@pytest.mark.parametrize("name", BASES)
-def test_chase_weights_are_those_of_chase(name: str) -> None:
-    states, basis = circles(9, 12), BASES[name]
-    want = chase(states, basis, Paper(), LAW, inner_steps=3).weights
-    options = {"basis": basis, "target": Paper(), "law": LAW, "inner_steps": 3}
-    atol = 1e-8 * float(want.abs().max())
-    pieces = list(states.split(5, dim=1))
-    for got in (chase_weights(states, **options), chase_weights(pieces, **options)):
-        torch.testing.assert_close(got.weights, want, rtol=0, atol=atol)
-    last = chase_weights(pieces, **options, history=False).weights
-    torch.testing.assert_close(last, want[:, -1:], rtol=0, atol=atol)
 
 
 @pytest.mark.filterwarnings("ignore:`torch.jit.script`")  # inside torch.func.jvp of torch 2.13
@@ -329,17 +289,6 @@ def test_chase_weights_refuses_states_of_another_shape(given: Tensor) -> None:
 def test_chase_weights_refuses_no_piece_at_all() -> None:
     with pytest.raises(ValueError, match="at least one piece"):
         chase_weights([], BASES["exponential"], Paper(), LAW)
-
-
-@pytest.mark.parametrize("name", BASES)
-@pytest.mark.parametrize(
-    "law", [optim.Exact(), optim.NormalisedLMS(), optim.Nesterov()], ids=lambda law: type(law).__name__
-)
-def test_chase_weights_gives_every_law_what_it_needs(name: str, law: optim.UpdateLaw) -> None:
-    states, basis = circles(9, 12), BASES[name]
-    want = chase(states, basis, Paper(), law, inner_steps=3).weights
-    got = chase_weights(states, basis, Paper(), law, inner_steps=3).weights
-    torch.testing.assert_close(got, want, rtol=0, atol=1e-8 * float(want.abs().max()))
 
 
 @pytest.mark.parametrize("run_chase", [chase, chase_weights])

@@ -1,4 +1,4 @@
-"""Factorisations, orders and tables in scalar operations find what LAPACK and torch find, also compiled."""
+"""Factorisations in scalar operations find what LAPACK finds, also compiled."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from hypothesis import given
 from torch import Tensor
 
 from staf_torch import lanes
-from staf_torch.lanes import replacements
 from staf_torch.lanes.eliminations import (
     cholesky,
     cholesky_solve,
@@ -29,7 +28,6 @@ from staf_torch.lanes.eliminations import (
     triangular,
 )
 from staf_torch.lanes.pivoted_cholesky import pivoted_cholesky
-from staf_torch.lanes.tracer import NotLoweredError
 from staf_torch.numerics.linalg import condition_number
 
 LEADS = ((), (2,), (2, 3))
@@ -237,116 +235,6 @@ def test_programs_factor_and_solve_as_torch_does() -> None:
         assert "pivots" not in name or not one[[3, 4]].isfinite().any()
 
 
-# Orders.
-
-SPECIAL = torch.tensor(
-    [
-        [3.0, torch.nan, 1.0, 3.0, -0.0, 0.0, torch.inf],
-        [2.0, 2.0, torch.nan, torch.nan, -1.0, -torch.inf, 2.0],
-    ]
-)
-NUMBERS = torch.tensor([[3.0, 1.0, 2.0, 3.0, -1.0, 0.5, 2.0], [2.0, 2.0, 5.0, 4.0, -1.0, -7.0, 2.0]])
-
-
-def shapes(x: Tensor) -> Iterator[tuple[Tensor, int]]:
-    yield x, -1
-    yield x, 1
-    yield x.mT.contiguous(), 0
-    yield x[0], 0
-    yield x.unsqueeze(1), 2
-    yield x.mT.unsqueeze(0), -2
-
-
-def test_orders_and_running_extremes_are_those_of_torch_along_any_dimension() -> None:
-    for x, dim in (*shapes(SPECIAL), *shapes(NUMBERS)):
-        for name in ("cummax", "cummin"):
-            for one, other in zip(
-                getattr(replacements, name)(x, dim), getattr(torch, name)(x, dim), strict=True
-            ):
-                alike(one, other, torch.float32)
-        for keep in (False, True):
-            found, wanted = replacements.median(x, dim, keep), torch.median(x, dim, keep)
-            alike(found[0], wanted[0], torch.float32)
-            alike(
-                torch.gather(x, dim, found[1] if keep else found[1].unsqueeze(dim)).squeeze(dim),
-                wanted[0].squeeze(dim) if keep else wanted[0],
-                torch.float32,
-            )
-        alike(replacements.median(x), torch.median(x), torch.float32)
-        alike(replacements.cumprod(x, dim), torch.cumprod(x, dim), torch.float32)
-        alike(
-            replacements.cumprod(x, dim, dtype=torch.float64),
-            torch.cumprod(x, dim, dtype=torch.float64),
-            torch.float32,
-        )
-    assert replacements.median(NUMBERS, -1)[0].shape == (2,)
-    for x, dim in shapes(NUMBERS):
-        for k, keep in ((1, False), (3, True), (7, False)):
-            alike(
-                replacements.kthvalue(x, k, dim, keep)[0], torch.kthvalue(x, k, dim, keep)[0], torch.float32
-            )
-        for largest in (True, False):
-            alike(replacements.topk(x, 3, dim, largest)[0], torch.topk(x, 3, dim, largest)[0], torch.float32)
-    alike(replacements.topk(NUMBERS, 2)[0], torch.topk(NUMBERS, 2)[0], torch.float32)
-    alike(replacements.sort(NUMBERS)[0], torch.sort(NUMBERS)[0], torch.float32)
-    alike(replacements.kthvalue(NUMBERS, 2)[0], torch.kthvalue(NUMBERS, 2)[0], torch.float32)
-    value, place = replacements.sort(torch.tensor(3.0))
-    assert (value.item(), place.item(), place.dtype) == (3.0, 0, torch.int64)
-
-
-def test_places_in_a_table_are_those_of_torch() -> None:
-    edges, x = torch.tensor([-1.0, 0.0, 0.0, 2.0]), torch.tensor([[-2.0, -1.0, 0.0], [1.0, 2.0, torch.nan]])
-    for options in ({}, {"right": True}, {"side": "right"}, {"side": "left"}):
-        wanted = torch.searchsorted(edges, x, **options)
-        alike(replacements.searchsorted(edges, x, **options), wanted, torch.float32)
-        rows = torch.stack((edges, edges + 1))
-        alike(
-            replacements.searchsorted(rows, x, **options),
-            torch.searchsorted(rows, x, **options),
-            torch.float32,
-        )
-
-
-CALLS: dict[str, Callable[[Callable[..., Any], Tensor], Any]] = {
-    "fmin": lambda f, x: f(x, x.flip(-1)),
-    "fmax": lambda f, x: f(x, x.flip(-1)),
-    "angle": lambda f, x: f(x),
-}
-
-
-@pytest.mark.parametrize("name", CALLS)
-def test_what_is_no_number_is_as_in_torch(name: str) -> None:
-    for x in (SPECIAL, NUMBERS):
-        alike(
-            CALLS[name](getattr(replacements, name), x), CALLS[name](getattr(torch, name), x), torch.float32
-        )
-
-
-def test_variances_of_few_numbers_and_of_other_precision() -> None:
-    x = drawn(3, 4, 5)
-    for dims in ([0], [1, 2], [-1], None):
-        for correction in (0.0, 1.0, 2.0):
-            found = replacements.REPLACEMENTS["prims::var"](x, dims, correction)
-            alike(found, torch.var(x, dims, correction=correction), torch.float64)
-    assert replacements.REPLACEMENTS["prims::var"](x[:1], [0]).isnan().all()
-    single = replacements.REPLACEMENTS["prims::sum"](x.float(), [0], output_dtype=torch.float64)
-    alike(single, x.float().sum(0, dtype=torch.float64), torch.float64)
-    product = replacements.REPLACEMENTS["prims::prod"]
-    alike(
-        product(x.float(), [0, 2], output_dtype=torch.float64),
-        x.float().double().prod(2).prod(0),
-        torch.float64,
-    )
-    assert product(x.float(), [0]).dtype == torch.float32
-
-
-def test_a_search_of_a_number_or_with_a_sorter_has_no_form() -> None:
-    edges = torch.arange(4.0)
-    for x, sorter in ((0.5, None), (edges, torch.arange(4)), (0.5, torch.arange(4))):
-        with pytest.raises(NotLoweredError, match="of a number or with a sorter"):
-            replacements.searchsorted(edges, x, sorter=sorter)
-
-
 # Pivoted Cholesky.
 
 
@@ -379,11 +267,6 @@ def test_rank_of_a_deficient_matrix_is_reported(seed: int, size: int, data: st.D
     gram = low_rank(seed, 3, size=size, rank=rank)
     assert (pivoted_cholesky(gram).rank <= rank).all()
     torch.testing.assert_close(reassembled(gram), gram, rtol=0, atol=1e-13 * size * float(gram.abs().max()))
-
-
-def test_rank_of_well_separated_deficient_matrices_is_exact() -> None:
-    for rank in range(1, 6):
-        assert (pivoted_cholesky(low_rank(rank, 20, size=6, rank=rank)).rank == rank).all()
 
 
 @given(seed=SEEDS, size=st.integers(1, 8))
@@ -441,14 +324,6 @@ def test_a_matrix_that_is_not_finite_has_rank_zero_and_spoils_no_other(poison: f
     assert torch.equal(found.factor[others], expected.factor[others])
     assert torch.isinf(condition_number(gram)[others]).sum() == 0
     assert torch.isnan(condition_number(gram)[2])
-
-
-def test_one_factor_serves_many_right_hand_sides() -> None:
-    gram = random_positive_definite(5, size=4)
-    values = uniform(6, 7, 4)
-    found = pivoted_cholesky(gram)
-    expected = torch.linalg.solve(gram, values.unsqueeze(-1)).squeeze(-1)
-    torch.testing.assert_close(found.solve_upper(found.solve_lower(values)), expected, rtol=1e-9, atol=1e-11)
 
 
 def test_scaling_of_the_matrix_does_not_change_the_rank() -> None:

@@ -18,7 +18,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from staf_torch import lanes
-from staf_torch.lanes.replacements import REPLACEMENTS, erfinv, sort
+from staf_torch.lanes.replacements import erfinv, sort
 
 pytestmark = pytest.mark.needs_compiler
 
@@ -252,23 +252,6 @@ def test_a_zero_keeps_its_sign_and_loses_it_as_in_torch() -> None:
     torch.testing.assert_close(1 / found, 1 / wanted, rtol=1e-14, atol=0)
 
 
-@pytest.mark.parametrize("dims", [None, (0,), (2,), (-1,), (0, 1), (0, 2), (0, 1, 2)])
-def test_reductions_over_any_dimensions_are_those_of_numpy(dims: tuple[int, ...] | None) -> None:
-    x = torch.randn(2, 3, 4, dtype=torch.float64)
-    wanted = {
-        "prims::sum": np.sum(x.numpy(), axis=dims),
-        "prims::prod": np.prod(x.numpy(), axis=dims),
-        "prims::var": np.var(x.numpy(), axis=dims, ddof=1),
-    }
-    for name, value in wanted.items():
-        found = REPLACEMENTS[name](x, dims)
-        torch.testing.assert_close(found, torch.as_tensor(value), msg=name)
-    for name in ("prims::sum", "prims::prod"):
-        assert REPLACEMENTS[name](x.float(), dims, output_dtype=torch.float64).dtype == torch.float64
-    plain = REPLACEMENTS["prims::var"](x, dims, 0.0)
-    torch.testing.assert_close(plain, torch.as_tensor(np.var(x.numpy(), axis=dims)))
-
-
 def test_the_inverse_of_the_error_function_is_one_up_to_its_ends() -> None:
     near = 1 - torch.logspace(-15, 0, 200, dtype=torch.float64)
     y = torch.cat((-near, near))
@@ -338,6 +321,7 @@ FORMS: dict[str, tuple[Callable[..., Any], tuple[Tensor, ...]]] = {
     "movements": (forms.movements, (x(3, 3),)),
     **{f"choices of {n}": (forms.choices, (x(n, n), i(n))) for n in (3, 6)},
     "replaced": (forms.replaced, (x(4),)),
+    "orders": (forms.orders, (x(3, 4),)),
     "large": (forms.large, (x(65),)),
     "decomposed": (without_signs, (x(3, 3) + 3 * torch.eye(3),)),
     "choices in three dimensions": (forms.more_choices, (x(3, 4, 5), at(2, 2, 2, of=2))),

@@ -104,9 +104,3 @@ def check(compiled: lanes.Program, given: list[Any], program: Drawn, bound: floa
             assert torch.equal(one.isnan(), other.isnan()), name
         else:
             torch.testing.assert_close(one, other, rtol=bound, atol=bound, msg=lambda m, n=name: f"{n}: {m}")
-
-
-@pytest.mark.parametrize("name", sorted(ONE | TWO))
-def test_every_operation_has_a_scalar_form(name: str) -> None:
-    x = torch.randn(2, 3, dtype=torch.float64)
-    lanes.Program(step_of([(name, 0, 2)])).text(x, x.unsqueeze(1), x)
