@@ -167,11 +167,6 @@ def test_anchoring_takes_one_dimension_from_a_polynomial_space() -> None:
         st.StaFBasis(kernel, centers_of(6))
 
 
-def test_count_and_dimension_are_those_of_the_centers() -> None:
-    basis = basis_of("gaussian", 10, dim=3)
-    assert (basis.count, basis.dim) == (10, 3)
-
-
 class _WrongShape(torch.nn.Module):
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         return x

@@ -125,28 +125,6 @@ def test_batch_entries_are_as_they_would_be_alone(name: str) -> None:
             torch.testing.assert_close(staf(y)[row], alone(y[row]), rtol=1e-9, atol=1e-10)
 
 
-@over(KERNELS)
-def test_single_precision_goes_through(name: str) -> None:
-    double = fitted(name, (3,))
-    single = st.StaF(basis_of(name, radius=0.5), (3,)).to(torch.float32)
-    single.fit_(double.state.float(), Paper())
-    y = double.state.unsqueeze(-2) + uniform(3, 4, 2, low=-0.3, high=0.3)
-    values = single(y.float())
-    assert values.dtype == torch.float32
-    assert single.weights.dtype == torch.float32
-    for mode in ("partial", "total_frozen_weights", "total"):
-        assert single.gradient(y.float(), mode).dtype == torch.float32
-    torch.testing.assert_close(values.double(), double(y), rtol=5e-3, atol=5e-3)
-
-
-@over(KERNELS)
-def test_single_precision_goes_through_for_one_state_with_a_shrinking_radius(name: str) -> None:
-    staf = st.StaF(basis_of(name, radius=st.StateRadius(0.7, 0.1))).to(torch.float32)
-    staf.fit_(torch.tensor([0.8, 0.4]), Paper())
-    assert staf(torch.tensor([[0.8, 0.4]])).dtype == torch.float32
-    assert staf.weights.dtype == torch.float32
-
-
 @pytest.mark.parametrize("norm", [30.0, 100.0, 1000.0])
 def test_exponential_kernel_does_not_overflow_far_from_the_origin(norm: float) -> None:
     """The scaled form: V^(x + z) = e^{x'z} sum_i b_i e^{z'd_i}, b = K0^-1 [V(c_i) e^{-x'd_i}]."""
@@ -164,13 +142,6 @@ def test_exponential_kernel_does_not_overflow_far_from_the_origin(norm: float) -
     # x + z - x rounds z to eps |x|, and V^ has slopes of the size of b / radius there.
     torch.testing.assert_close(found, expected, rtol=1e-8, atol=1e-8)
     torch.testing.assert_close(found, Cosine(0.5)(x + z), rtol=0, atol=1e-2)
-
-
-def test_fit_returns_the_module_and_moves_its_state() -> None:
-    staf = st.StaF(basis_of("gaussian"))
-    x = tensor([0.5, 0.5])
-    assert staf.fit_(x, Paper()) is staf
-    assert torch.equal(staf.state, x)
 
 
 def test_coefficients_are_parameters_that_a_loss_can_train() -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import math
-import warnings
 
 import mpmath as mp
 import pytest
@@ -134,39 +133,6 @@ def test_weights_that_cannot_be_represented_are_refused_and_named() -> None:
     assert torch.isnan(weights[1]).all()
     with pytest.raises(ValueError, match=r"`StaF.weights` of the batch entries \[\[1\]\] must be"):
         _ = staf.weights
-
-
-@pytest.mark.parametrize("layout", ["rings6", "rings15", "ball15_4", "polygon4"])
-@pytest.mark.parametrize("kernel", KERNELS)
-def test_state_dependent_radius_agrees_with_the_constant_one(layout: str, kernel: str) -> None:
-    directions = LAYOUTS[layout]()
-    generator = torch.Generator().manual_seed(7)
-    x = 3 * torch.randn(40, directions.shape[1], dtype=torch.float64, generator=generator)
-    zeta = ball_points(5, directions.shape[1], generator)
-    moving = st.StateFollowingCenters(directions, st.StateRadius(0.5, 1e-9))
-    make, _ = KERNELS[kernel]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # |x| r > 1 at some of these states
-        staf = st.StaF(st.StaFBasis(make(), moving), (40,)).fit_(x, smooth_target)
-        nu = moving.radius(x)
-        found = staf.at_offsets(nu[:, None, None] * zeta)
-        for row in range(0, 40, 3):
-            fixed = st.StateFollowingCenters(directions, float(nu[row]))
-            alone = st.StaF(st.StaFBasis(make(), fixed)).fit_(x[row], smooth_target)
-            expected = alone.at_offsets(nu[row] * zeta)
-            torch.testing.assert_close(found[row], expected, rtol=2e-13, atol=0)
-
-
-def test_centers_that_meet_leave_the_value_at_the_state() -> None:
-    centers = st.StateFollowingCenters(st.rings(6), st.StateRadius(0.5, 0.0))
-    basis = st.StaFBasis(st.ExponentialKernel(), centers)
-    x = torch.tensor([[0.0, 0.0], [1.0, 0.5]], dtype=torch.float64)
-    space = basis.local(x)
-    assert space.rank.tolist() == [1, 6]
-    estimate = space.evaluate(
-        torch.zeros(2, 1, 2, dtype=torch.float64), space.fit(basis.values(x, smooth_target))
-    )
-    torch.testing.assert_close(estimate[0, 0], smooth_target(x[0]), rtol=1e-14, atol=0)
 
 
 def test_a_sample_that_is_not_a_number_spoils_its_row_only() -> None:
