@@ -164,14 +164,14 @@ def test_a_control_is_held_for_the_period_of_the_controller_or_the_plant_or_a_mi
 
 def test_pieces_of_a_run_change_nothing() -> None:
     """Random numbers are drawn for about a thousand steps at once: as one stream a row."""
-    whole = run(Noisy(), x0=X0[:1], steps=2100, seed=3)
-    numbers = torch.empty(2100, 4, dtype=torch.float64)
+    whole = run(Noisy(), x0=X0[:1], steps=1050, seed=3)
+    numbers = torch.empty(1050, 4, dtype=torch.float64)
     numbers.uniform_(-1.0, 1.0, generator=torch.Generator().manual_seed(3))
     torch.testing.assert_close(whole.control[0, :-1, 0], numbers.sum(-1))
-    for every in (7, 1050):
+    for every in (7, 525):
         done: list[int] = []
-        some = run(Noisy(), x0=X0[:1], steps=2100, seed=3, every=every, progress=done.append)
-        assert sum(done) == 2100
+        some = run(Noisy(), x0=X0[:1], steps=1050, seed=3, every=every, progress=done.append)
+        assert sum(done) == 1050
         for name in ("state", "control", "running_cost"):
             wanted = getattr(whole, name)[:, ::every]
             torch.testing.assert_close(getattr(some, name), wanted, rtol=1e-12, atol=1e-14, equal_nan=True)

@@ -159,10 +159,8 @@ def test_a_row_has_the_same_bits_at_every_batch_and_beside_every_neighbour(name:
 
 
 def test_a_compiled_run_in_pieces_is_that_of_the_definition() -> None:
-    x0 = uniform(2, 1.0)
-    fast, plain = (
-        run(learned(adp.Information()), x0, c, dt=0.01, steps=1100, every=55) for c in (True, False)
-    )
+    case, x0 = of_lqr(Foreign()), uniform(2, 1.0)
+    fast, plain = (run(case, x0, compile, dt=0.01, steps=1100, every=55) for compile in (True, False))
     for got, want in zip(fields(fast), fields(plain), strict=True):
         torch.testing.assert_close(got, want, rtol=1e-8, atol=1e-12, equal_nan=True)
 
