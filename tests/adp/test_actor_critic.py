@@ -230,20 +230,6 @@ def test_global_basis_needs_points_in_a_fixed_box() -> None:
     assert shares[1] < 0.9
 
 
-def test_partial_gradient_is_the_same_law_from_twice_the_weights() -> None:
-    x0 = drawn(20, 1.0, seed=5)
-    costs = []
-    for mode, scale in (("total", 1.0), ("partial", 2.0)):
-        controller = adp.ActorCritic(
-            staf_basis(mode), PLANT, UNIT, adp.RandomPoints(1, BOX), critic=0.4 * scale, actor=0.28 * scale
-        )
-        compile = mode == "total"  # the program of other tests
-        run = adp.simulate(controller, PLANT, UNIT, x0, dt=0.01, steps=200, every=200, compile=compile)
-        assert not run.diverged.any()
-        costs.append(run.cost)
-    assert float(costs[1].median()) < 1.3 * float(costs[0].median())
-
-
 def test_three_states_cost_in_their_first_second_what_the_reference_run_does() -> None:
     directions = torch.tensor(
         [

@@ -145,21 +145,8 @@ def test_quadrature_takes_the_mean_over_the_box() -> None:
     assert float(mean) == pytest.approx(0.5**10 / 35, rel=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (lambda: adp.RandomPoints(0, 0.1), r"`RandomPoints\(count=...\)` must be at least 1"),
-        (lambda: staf_basis("both"), r"`StaFValueBasis\(gradient=...\)` must be one of 'total', 'partial'"),
-        (lambda: adp.RBFGridBasis(2, points=1), r"`RBFGridBasis\(points=...\)` must be at least 2"),
-        (lambda: adp.RandomPoints(1, 0.3, around="here"), r"`RandomPoints\(around=...\)` must be one of"),
-        (lambda: adp.QuadraturePoints(0, 2, 0.3), r"`QuadraturePoints\(order=...\)` must be at least 1"),
-        (lambda: adp.QuadraturePoints(1, 0, 0.3), r"`QuadraturePoints\(dim=...\)` must be at least 1"),
-        (lambda: adp.QuadraturePoints(1, 1, 0.3, "x"), r"`QuadraturePoints\(centers=...\)` must be 'moving'"),
-        (lambda: adp.StaFValueBasis(3), r"`StaFValueBasis\(basis=...\)` must be a StaFBasis; got 3"),  # type: ignore[arg-type]
-        (lambda: adp.PolicyIteration(damping=0.0), r"`PolicyIteration\(damping=...\)` must be positive"),
-        (lambda: adp.PolicyIteration(settling=0.0), r"`PolicyIteration\(settling=...\)` must be positive"),
-    ],
-)
-def test_points_bases_and_laws_refuse_what_they_are_not(call: Any, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        call()
+def test_points_and_bases_refuse_what_they_are_not() -> None:
+    with pytest.raises(ValueError, match=r"`QuadraturePoints\(centers=...\)` must be 'moving' or 'fixed'"):
+        adp.QuadraturePoints(1, 1, 0.3, "x")
+    with pytest.raises(ValueError, match=r"`StaFValueBasis\(basis=...\)` must be a StaFBasis; got 3"):
+        adp.StaFValueBasis(3)  # type: ignore[arg-type]

@@ -246,17 +246,3 @@ def test_a_cost_along_a_path_takes_bounds_angles_and_rest_from_its_plant() -> No
     ):
         with pytest.raises(ValueError, match=rf"must map times \(2,\) to states \(2, 2\); got {shown}"):
             adp.TrackingCost(1.0, 1.0, 2, 1, path=wrong)  # type: ignore[arg-type]
-
-
-def test_the_input_counts_from_where_it_rests_and_within_its_bounds_with_and_without_the_clock() -> None:
-    cost = adp.TrackingCost(
-        2.0, 3.0, dim=1, inputs=1, path=lambda t: t.unsqueeze(-1), low=-1.0, high=2.0, target_input=[0.5]
-    )
-    x, u = torch.tensor([[1.4, 1.0]], dtype=torch.float64), torch.tensor([[1.5]], dtype=torch.float64)
-    torch.testing.assert_close(cost.rate(x, u), torch.tensor([2 * 0.4**2 + 3.0]).double())
-    torch.testing.assert_close(cost.still.rate(x[:, :1], u), torch.tensor([2 * 1.4**2 + 3.0]).double())
-    for each in (cost, cost.still):
-        assert each.bounds is not None
-        assert (each.bounds.low.item(), each.bounds.high.item()) == (-1.0, 2.0)
-        assert each.target_input is not None
-        assert each.target_input.item() == 0.5

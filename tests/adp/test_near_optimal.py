@@ -418,17 +418,6 @@ def test_an_input_that_moves_nothing_is_left_as_it_is() -> None:
     torch.testing.assert_close(policy(x)[:, 1], torch.zeros(4).double(), rtol=0, atol=1e-8)
 
 
-def test_four_inputs_are_the_most_that_are_improved_by_samples() -> None:
-    for inputs in (4, 5):
-        plant = systems.Linear((-torch.eye(2)).double(), uniform(2, inputs, seed=2))
-        cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=inputs)
-        if inputs == 4:
-            assert adp.near_optimal(plant, cost, dt=0.1)(torch.zeros(2).double()).shape == (4,)
-        else:
-            with pytest.raises(ValueError, match="at most 4 inputs"):
-                adp.near_optimal(plant, cost, dt=0.1)
-
-
 @torch.no_grad()
 def test_rollouts_of_one_held_state_cost_what_its_riccati_equation_says() -> None:
     plant, cost = systems.Linear([[-0.5]], [[1.0]]), adp.QuadraticCost(1.0, 1.0, dim=1, inputs=1)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import logging
 import math
 import time
@@ -195,15 +194,3 @@ def test_share_of_the_period_that_a_control_takes_is_said_from_a_half_on(
     share = f"{100 * seconds / 0.1:.0f} % of the 0.1 s for which it is held: a slower moment and it is late"
     assert (share in caplog.text) == said
     assert bool(caplog.text) == said
-
-
-def test_one_control_in_time_is_enough_where_others_share_the_processor(
-    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    ends = itertools.accumulate([0.3, 0.2, 0.2, 0.04], initial=0.0)  # the period is 0.1 s
-    now = itertools.chain.from_iterable((end, end) for end in ends)
-    next(now)
-    monkeypatch.setattr(time, "perf_counter", lambda: next(now))
-    with caplog.at_level(logging.WARNING):
-        adp.near_optimal(pendulum(turn, dt=0.1), COST, horizon=0.4)
-    assert not caplog.text
