@@ -339,10 +339,6 @@ def test_rollouts_end_with_the_terminal_cost_around_the_set_point() -> None:
 
 
 def test_what_knows_no_end_refuses_a_terminal_cost() -> None:
-    with pytest.raises(ValueError, match=r"terminal=...\)` must be None beside an output or a discount"):
-        adp.QuadraticCost(1.0, 1.0, 2, 1, terminal=1.0, discount=0.1)
-    with pytest.raises(ValueError, match=r"terminal=...\)` must be .*semidefinite"):
-        adp.QuadraticCost(1.0, 1.0, 2, 1, terminal=-END)
     with pytest.raises(ValueError, match=r"near_optimal\(cost=...\)` must have no terminal cost"):
         adp.near_optimal(PLANT, COST, dt=0.1)
     with pytest.raises(ValueError, match=r"DirectShooting\(horizon=...\)` must be given beside a terminal"):
@@ -390,31 +386,16 @@ def test_a_state_dict_has_the_matrices_and_not_what_follows_from_bounds() -> Non
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"target": [1.0]}, r"`QuadraticCost\(target=...\)` must have 2 numbers"),
         ({"target": [1.0, math.nan]}, r"`QuadraticCost\(target=...\)` must be finite"),
         ({"target_input": [1.0, 2.0, 3.0]}, r"`QuadraticCost\(target_input=...\)` must have 2 numbers"),
-        ({"target": 3.0}, r"`QuadraticCost\(target=...\)`"),
-        ({"discount": -0.1}, r"`QuadraticCost\(discount=...\)` must not be negative"),
-        (
-            {"terminal": 1.0, "discount": 0.1},
-            r"\(terminal=...\)` must be None beside an output or a discount",
-        ),
-        (
-            {"terminal": 1.0, "output": lambda x: x},
-            r"\(terminal=...\)` must be None beside an output or a disc",
-        ),
+        ({"terminal": 1.0, "discount": 0.1}, r"must be None beside an output or a discount"),
+        ({"terminal": 1.0, "output": lambda x: x}, r"must be None beside an output or a discount"),
         ({"terminal": -Q}, r"`QuadraticCost\(terminal=...\)` must be positive semidefinite"),
-        ({"output": lambda x: x.sum()}, r"\(output=...\)` must map \(..., 2\) to \(..., p\); got \(\)"),
         ({"output": lambda x: x.sum(-1)}, r"must map \(..., 2\) to \(..., p\); got \(1,\)"),
-        ({"output": lambda x: x.repeat(2, 1)}, r"must map \(..., 2\) to \(..., p\); got \(2, 2\)"),
-        ({"output": lambda x: 3.0}, r"must map \(..., 2\) to \(..., p\); got 3.0"),
         ({"low": 1.0, "high": 1.0}, "must be below high"),
         ({"low": [0.0, 1.0, 2.0]}, r"`Bounds\(low=...\)` must be a number or one for each"),
-        ({"high": math.nan}, r"`Bounds\(high=...\)` must be finite or inf"),
-        ({"state": "Q"}, r"`QuadraticCost\(state=...\)` must be a number"),
         ({"state": [1.0, 2.0, 3.0]}, r"`QuadraticCost\(state=...\)` must be \(2, 2\)"),
         ({"state": [[1.0, 2.0], [3.0]]}, r"`QuadraticCost\(state=...\)` must have 2 entries"),
-        ({"state": []}, r"`QuadraticCost\(state=...\)`"),
     ],
 )
 def test_what_is_no_cost_is_refused(given: dict[str, Any], message: str) -> None:
@@ -427,12 +408,7 @@ def test_what_is_no_cost_is_refused(given: dict[str, Any], message: str) -> None
     [
         ({"control": COUPLED, "bound": 1.0}, r"`BoundedInputCost\(control=...\)` must be diagonal"),
         ({"bound": 1.0, "high": 1.0}, r"`BoundedInputCost\(bound=...\)` must be None beside low and high"),
-        ({"bound": 1.0, "low": -1.0}, r"`BoundedInputCost\(bound=...\)` must be None beside low and high"),
-        ({"bound": [1.0, 0.0]}, r"`BoundedInputCost\(bound=...\)` must be positive"),
-        ({"bound": [1.0, 2.0, 3.0]}, r"`BoundedInputCost\(bound=...\)` must"),
         ({"low": -1.0, "high": math.inf}, r"must be finite, with the input \[0.0, 0.0\] of the set-point"),
-        ({"low": -math.inf, "high": 1.0}, r"must be finite, with the input"),
-        ({"low": -1.0, "high": [0.0, 1.0]}, r"must be finite, with the input"),
         ({"low": [0.0, -1.0], "high": 1.0}, r"must be finite, with the input"),
         ({"low": -1.0, "high": 1.0, "target_input": [0.0, 1.0]}, r"with the input \[0.0, 1.0\] of the set-p"),
         ({}, r"`BoundedInputCost\(bound=...\)` must be given, or low and high"),
