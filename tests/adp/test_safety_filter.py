@@ -15,6 +15,7 @@ from helpers import tensor, uniform
 from torch import Tensor
 
 from staf_torch import adp, deploy, systems
+from staf_torch.adp.walls import walls
 from staf_torch.deploy.c_header import runner_c
 
 LINE = systems.Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
@@ -54,6 +55,18 @@ def test_far_from_the_edge_not_a_bit_changes_and_rows_are_alone() -> None:
         assert all(torch.equal(a[0], b[row]) for a, b in zip(alone, found, strict=True))
     assert torch.equal(found.margin, guard.margins(x, t))
     assert guard.restrain(x[:4].reshape(2, 2, 4), u[:4].reshape(2, 2, 2), 0.3).slack.shape == (2, 2)
+
+
+@pytest.mark.parametrize(("low", "high"), [(2.0, 5.0), (-1.0, 1.0), (2.0, math.inf), (-math.inf, -2.0)])
+def test_a_wall_of_a_box_is_crossed_at_the_rate_of_the_coordinate(low: float, high: float) -> None:
+    (h,) = walls([-math.inf, low], [math.inf, high])
+    for wall, inward in ((low, 1.0), (high, -1.0)):
+        if math.isfinite(wall):
+            at = torch.tensor([[9.0, wall]], dtype=torch.float64, requires_grad=True)
+            value = h(at, 0.0)
+            (slope,) = torch.autograd.grad(value.sum(), at)
+            assert value.item() == pytest.approx(0.0, abs=1e-15)
+            assert slope[0].tolist() == pytest.approx([0.0, inward])
 
 
 def test_a_wall_is_never_crossed_and_a_larger_margin_keeps_farther_away() -> None:
