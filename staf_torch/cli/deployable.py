@@ -131,7 +131,7 @@ def _first_line(error: Exception) -> str:
     return next(iter(str(error).splitlines()), type(error).__name__)
 
 
-class _PlainLoader(yaml.SafeLoader):
+class _PlainLoader(yaml.SafeLoader):  # type: ignore[misc]
     """Loader of plain values. Aliases are refused: by them a short file can stand for an endless tree."""
 
     def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:

@@ -101,7 +101,7 @@ def _is_foreign(key: str, value: Any) -> bool:
         return value not in constructors()
     if names[-1] == "task" and "." in str(value):
         return True
-    return isinstance(value, str) and "$" in _REFERENCE.sub("", value)
+    return isinstance(value, str) and "$" in value and _REFERENCE.fullmatch(value) is None
 
 
 def _leaves(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:

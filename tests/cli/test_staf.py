@@ -107,7 +107,6 @@ RUNS = {
     "no history": ["history=false", *SHORT],
     "five": ["trajectories=5", *SHORT],
     "five again": ["trajectories=5", *SHORT],
-    "polygon of five": ["centers=polygon", "centers.count=5", *SHORT],
     "no window": ["duration=0.05", "settle_time=100", "figures=false"],
     "diverging": [
         "system=custom",
@@ -232,19 +231,6 @@ def test_a_seed_gives_the_same_run_again(outcomes: dict[str, Outcome]) -> None:
     five, again = (history(run_directory(outcomes[name])) for name in ("five", "five again"))
     for name, array in five.items():
         np.testing.assert_array_equal(array, again[name])
-
-
-def test_figures_false_draws_nothing_and_history_false_keeps_nothing(outcomes: dict[str, Outcome]) -> None:
-    run = run_directory(outcomes["no history"])
-    assert {path.name for path in run.iterdir()} == {".hydra", "run.json", "staf.log", "metrics.json"}
-
-
-def test_a_polygon_of_five_warns_in_the_log(outcomes: dict[str, Outcome]) -> None:
-    outcome = outcomes["polygon of five"]
-    log = (run_directory(outcome) / "staf.log").read_text()
-    assert "[WARNING]" in log
-    assert "lie on a conic" in log
-    assert "lie on a conic" in outcome.out + outcome.err
 
 
 def test_a_window_after_the_end_is_null_and_said_so(outcomes: dict[str, Outcome]) -> None:

@@ -24,7 +24,6 @@ from staf_torch import (
     GaussianKernel,
     Kernel,
     MaternKernel,
-    PolynomialKernel,
     RationalQuadraticKernel,
     StaF,
     StaFBasis,
@@ -37,7 +36,7 @@ from staf_torch import (
     systems,
     targets,
 )
-from staf_torch.deploy import controllers, formats, sheet
+from staf_torch.deploy import formats, sheet
 from staf_torch.deploy.c_header import need_c_compiler, runner_c
 
 PLANT = systems.TwoState()
@@ -145,15 +144,6 @@ def test_folded_series_keeps_the_digits_of_float32_at_every_radius(
     double = deploy.RidgeApproximator(staf)
     y = around(staf, 9.9)
     assert relative(double(y)[0], staf(y)) <= 1e-12
-
-
-def test_point_beyond_the_reach_gives_nan_and_spares_its_neighbours() -> None:
-    staf = fitted(ExponentialKernel(), 0.1)
-    module = deploy.RidgeApproximator(staf, reach=3.0)
-    y = torch.stack((staf.state + 0.05, staf.state + 0.4))
-    value, gradient = module(y)
-    assert torch.isnan(value).tolist() == [False, True]
-    assert torch.isnan(gradient).all(-1).tolist() == [False, True]
 
 
 @pytest.mark.parametrize("name", list(CONTROLLERS))
@@ -275,11 +265,6 @@ def test_onnx_file_computes_the_same_in_onnxruntime(tmp_path: Path) -> None:
         assert sheet.worst_difference((third,), (module(y[:rows])[2],))[0] <= 1e-15
 
 
-def test_work_of_a_linear_controller_is_counted() -> None:
-    counted = sheet.work(deploy.trace(CASES["lqr"], torch.ones(1, 2, dtype=torch.float64)))
-    assert counted == sheet.Work(parameters=2, flops=4, functions=0, bytes_constants=16, bytes_in_out=24)
-
-
 class Products(nn.Module):
     """The product of a row's (2, 3) matrix and its first row."""
 
@@ -352,24 +337,6 @@ def test_a_policy_is_a_copy_that_learns_nothing_in_the_dtype_that_is_asked_for()
     layer = nn.Linear(2, 1).double()
     assert not any(part.requires_grad for part in deploy.policy_of(layer).parameters())
     assert all(part.requires_grad for part in layer.parameters())
-
-
-@pytest.mark.parametrize(
-    ("kernel", "radius", "folds"),
-    [
-        (ExponentialKernel(), 0.3, True),
-        (GaussianKernel(0.8), 0.3, True),
-        (MaternKernel(2.5), 0.3, True),
-        (PolynomialKernel(3), 0.3, False),
-        (GaussianKernel(0.8), StateRadius(0.3, 0.1), False),
-    ],
-)
-def test_a_rollout_is_folded_where_one_matrix_serves_all_states(
-    kernel: Kernel, radius: Any, folds: bool
-) -> None:
-    policy = rollout(kernel, radius)
-    assert controllers.foldable(policy) is folds
-    assert isinstance(deploy.policy_of(policy), deploy.FoldedRollout) is folds
 
 
 def test_a_series_holds_up_to_its_reach_and_not_beyond() -> None:
@@ -490,8 +457,3 @@ def test_calls_are_timed_on_one_core_after_others_that_warm_it() -> None:
     assert 0 <= found.median_us <= found.p99_us <= found.worst_us
     assert set(cores) == {frozenset({max(before)})}
     assert os.sched_getaffinity(0) == before
-
-
-def test_a_difference_is_a_share_of_the_largest_value() -> None:
-    got, wanted = (tensor([1.0, -4.5]), tensor([2.0])), (tensor([1.25, -4.0]), tensor([2.0]))
-    assert sheet.worst_difference(got, wanted) == [0.125, 0.0]

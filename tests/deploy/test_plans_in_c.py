@@ -38,26 +38,6 @@ def memory() -> adp.GlobalValue:
     return adp.GlobalValue(problem, library, [math.pi, 8.0], candidates=12, lookahead=6)
 
 
-def test_trajectories_are_followed_to_their_ends(memory: adp.GlobalValue) -> None:
-    """Where controls are small: to as many digits."""
-    ends = memory.plans[memory.entries, :2]
-    x = torch.cat((ends, 0.9 * ends))
-    torch.testing.assert_close(deploy.policy_of(memory)(x), memory(x), rtol=1e-9, atol=0)
-
-
-def test_tables_hold_every_candidate_from_its_place_to_the_goal(memory: adp.GlobalValue) -> None:
-    policy = deploy.policy_of(memory)
-    goal = memory.plans[memory.resting]
-    for entry, first, last in zip(
-        memory.entries.tolist(), policy.first[:-1].tolist(), policy.last[:-1].tolist(), strict=True
-    ):
-        rows = policy.plans[first : last + 1]
-        assert torch.equal(rows, memory.plans[entry : entry + len(rows)])
-        ended = (rows[:, 2:] == goal[2:]).all(-1)
-        assert ended.tolist() == [False] * (len(rows) - 1) + [True]
-        assert last - first == 60 - entry % memory.length
-
-
 def states(count: int) -> Tensor:
     """Upright give or take a little, some a turn away, and a quarter of them anywhere."""
     generator = torch.Generator().manual_seed(0)

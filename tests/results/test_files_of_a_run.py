@@ -15,7 +15,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as some
 
-from staf_torch.results.files import flatten, open_after, parse_overrides, plain, write_metrics, write_text
+from staf_torch.results.files import flatten, open_after, parse_overrides, write_metrics, write_text
 from staf_torch.results.progress import Progress
 from staf_torch.results.run_directory import History, HistoryWriter, RunDirectory
 from staf_torch.results.untrusted import UnreadableError
@@ -122,13 +122,6 @@ def test_a_directory_holds_what_was_given_under_the_names_of_all_runs(tmp_path: 
     assert (tmp_path / "laws.md").read_text() == text
     assert (tmp_path / "laws.csv").read_text() == f"law,error\nexact,{1 / 3!r}\n"
     assert (tmp_path / "figures" / "laws.pdf").read_bytes() == b"two"
-
-
-def test_people_may_be_shown_other_tables_than_programs(tmp_path: Path) -> None:
-    every, one, two = (Table.of([{key: 1}]) for key in "abc")
-    text = RunDirectory(tmp_path).table("found", every, shown=[one, two])
-    assert text == f"{one.markdown()}\n{two.markdown()}"
-    assert (tmp_path / "found.csv").read_text() == "a\n1\n"
 
 
 LATE: dict[str, Callable[[RunDirectory], Any]] = {
@@ -263,11 +256,6 @@ def test_a_history_that_is_damaged_or_none_is_refused_in_a_sentence(how: str, tm
 def test_nested_settings_have_dotted_keys_and_what_is_empty_stays() -> None:
     nested = {"a": {"b": {"c": 1}, "d": [2]}, "e": {}, "f": None}
     assert flatten(nested) == {"a.b.c": 1, "a.d": [2], "e": {}, "f": None}
-
-
-def test_values_that_json_does_not_have_are_written_by_their_names() -> None:
-    value = {1: (float("nan"), [-float("inf"), None, True, "text"]), "path": Path("a/b")}
-    assert plain(value) == {"1": ["nan", ["-inf", None, True, "text"]], "path": "a/b"}
 
 
 @pytest.mark.parametrize(

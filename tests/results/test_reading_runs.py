@@ -13,7 +13,6 @@ from sweep_runs import BAD_COUNT, typed, write_run, write_sweep
 from staf_torch import __version__
 from staf_torch.results.metric_info import OWN, MetricInfo, read_infos
 from staf_torch.results.reader import Collection, Run, collect, read_run
-from staf_torch.results.run import identity
 from staf_torch.results.untrusted import UnreadableError
 
 
@@ -83,16 +82,6 @@ def test_a_damaged_run_is_named_and_spares_the_others(
     assert rows.rows[0].metrics == {"ball_error": 1.0}
     assert said in str([each.reason for each in (*rows.rows, *rows.skipped)])
     assert "run.json cannot be read: No such file" in rows.skipped[-1].reason
-
-
-def test_runs_of_another_version_are_read_and_named(tmp_path: Path) -> None:
-    write_run(tmp_path / "0", {"seed": 0}, {"ball_error": 1.0}, version="0.0.9")
-    write_run(tmp_path / "1", {"seed": 1}, {"ball_error": 1.0})
-    rows = collect(tmp_path)
-    assert len(rows.rows) == 2
-    (remark,) = rows.remarks
-    assert "1 of 2 runs were written by staf_torch 0.0.9" in remark
-    assert str(tmp_path / "0") in remark
 
 
 @pytest.mark.parametrize("kind", ["missing", "empty", "a file", "other folders"])
@@ -231,20 +220,6 @@ def test_anything_about_a_run_has_a_value_by_its_name_or_a_reason_why_not() -> N
     assert one.absence("ball") == "not finite, or nothing to report"
     assert one.absence("cost") == "this run has no such metric"
     assert run(metrics={"ball": None}, reason="why").absence("ball") == "why"
-
-
-def test_values_are_the_same_in_a_table_as_numbers_are_but_no_number_is_a_text() -> None:
-    values: list[Any] = [1, 1.0, True, "1", None, [1], [1.0], "None", 0.5]
-    assert len({identity(value) for value in values}) == len(values) - 1
-    assert identity(1) == identity(1.0)
-
-
-def test_columns_are_overrides_then_settings_then_what_is_about_the_run() -> None:
-    both = found(
-        run(overrides={"z": 1}, settings={"a": 1, "z": 1}), run(overrides={"b": 1}, settings={"c": 1})
-    )
-    about = ("task", "status", "reason", "seconds", "version", "build", "directory", "member")
-    assert both.keys == ("z", "b", "a", "c", *about)
 
 
 def test_metrics_have_the_units_that_the_library_or_the_runs_declare() -> None:

@@ -249,12 +249,6 @@ def test_a_text_is_quoted_for_the_grammar_of_hydra(value: str) -> None:
     assert parse_override(f"key={run_record.quoted(value)}").value() == value
 
 
-def test_settings_are_recorded_flat_and_as_written_where_a_reference_leads_nowhere() -> None:
-    cfg = OmegaConf.create({"a": "${b}", "b": 1, "hydra": {"c": 1}, "sweep": {"d": 1}})
-    assert run_record.flat(cfg) == {"a": 1, "b": 1}
-    assert run_record.flat(OmegaConf.create({"a": "${no}", "b": 1})) == {"a": "${no}", "b": 1}
-
-
 @pytest.mark.parametrize("said", [True, False, None, "true", 1])
 def test_runs_made_otherwise_count_only_where_that_is_said_by_true(said: object) -> None:
     cfg = OmegaConf.create({"sweep": {"resume_anyway": said}})

@@ -12,11 +12,11 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from torch import nn
 
-from staf_torch import adp, systems
+from staf_torch import adp
 from staf_torch.adp.problem import AdpProblem
 from staf_torch.cli.staf import config_directory
 from staf_torch.settings import adp as loops
-from staf_torch.settings.adp import adp_problem, make_cost
+from staf_torch.settings.adp import adp_problem
 from staf_torch.settings.chase import chase_problem
 from staf_torch.settings.plain import ManySettings, PlainSettings, to_read
 from staf_torch.sweeps.hydra_compat.program import trusted
@@ -143,13 +143,6 @@ def test_model_of_mujoco_is_a_plant_of_closed_loops(tmp_path: Path) -> None:
     assert float(control(built)) < 0
     with pytest.raises(ValueError, match=r"`ActorCritic\(model=...\)` must be a ControlAffineSystem"):
         problem(*model)
-
-
-def test_a_cost_has_the_sizes_of_any_kind_of_plant() -> None:
-    step = systems.StepPlant(lambda x, u: 0.9 * x + u.sum(-1, keepdim=True), dim=3, inputs=2, dt=0.1)
-    for plant, dim, inputs in ((step, 3, 2), (systems.ThreeState(), 3, 2), (systems.TwoState(), 2, 1)):
-        cost = make_cost(settings(), plant)
-        assert (cost.dim, cost.inputs) == (dim, inputs)
 
 
 @pytest.mark.parametrize(

@@ -143,18 +143,6 @@ def test_latex_prints_every_special_character_as_it_is() -> None:
     assert escape("two\nlines") == "two lines"
 
 
-def test_a_setting_with_anything_in_it_stays_in_its_cell(tmp_path: Path) -> None:
-    nasty = 'a|b & c \\ "d"\n<e>'
-    write_run(tmp_path / "0", {"kernel": nasty}, {"ball_error": 1.0})
-    write_run(tmp_path / "1", {"kernel": [1, [2.5]]}, {"ball_error": 2.0})
-    table = tabulate(collect(tmp_path))
-    assert parsed(table.csv())[0]["kernel"] == nasty
-    assert json.loads(parsed(table.csv())[1]["kernel"]) == [1, [2.5]]
-    assert json.loads(json_text(table))["rows"][0]["kernel"] == nasty
-    assert 'a\\|b & c \\\\ "d" \\<e>' in table.markdown()
-    assert latex_text(table).count("\\\\\n") == 3
-
-
 def test_a_table_shows_three_digits_and_the_csv_all_of_them() -> None:
     rows = [{"law": "a|b", "excess": 1 / 3, "count": 2}, {"law": "exact", "excess": None, "count": 1100.0}]
     assert Table.of(rows, {"law": "law", "excess": "J/J*", "count": "n"}).markdown() == (
@@ -214,28 +202,6 @@ def test_the_best_is_marked_with_all_that_look_like_it(column: Column, style: St
 def test_that_all_runs_ended_well_is_not_said(statuses: Sequence[str], headings: list[str]) -> None:
     rows = [Row({"a": "completed", "status": status}) for status in statuses]
     assert [c.heading for c in printed([Column("a"), Column("status")], rows, Style())] == headings
-
-
-def test_counts_that_differ_are_a_range_and_those_that_failed_are_shown_where_some_did() -> None:
-    columns = [
-        *(Column(f"m.{what}[{at}]", "m", what, at) for at in ("x", "y") for what in ("mean", "n", "failed")),
-    ]
-
-    def counts(*pairs: tuple[int, int]) -> list[tuple[str, tuple[object, ...]]]:
-        rows = [
-            Row(
-                {
-                    **{f"m.mean[{at}]": 1.0 for at in "xy"},
-                    **{f"m.n[{at}]": n for at, n in zip("xy", pair, strict=True)},
-                    **{f"m.failed[{at}]": 2 - n for at, n in zip("xy", pair, strict=True)},
-                }
-            )
-            for pair in pairs
-        ]
-        return [(c.heading, c.cells) for c in printed(columns, rows, Style())[2:]]
-
-    assert counts((2, 2), (2, 2)) == [("n", (Number(2), Number(2)))]
-    assert counts((1, 2), (2, 2)) == [("n", ("1-2", Number(2))), ("failed", ("0-1", Number(0)))]
 
 
 @pytest.mark.parametrize(
@@ -350,14 +316,6 @@ def test_a_column_of_a_frame_has_one_type(cells: list[Any], metric: str | None, 
     pytest.importorskip("pandas", reason="frames need the extra `tables`")
     frame = data_frame(Table((Column("a", metric),), tuple(Row({"a": cell}) for cell in cells)))
     assert frame["a"].tolist() == want
-
-
-def test_a_metric_that_no_run_has_is_a_column_of_nan() -> None:
-    pandas = pytest.importorskip("pandas", reason="frames need the extra `tables`")
-    frame = data_frame(Table((Column("m", "m"), Column("a")), (Row({"m": None, "a": None}),)))
-    assert frame["m"].dtype == "float64"
-    assert frame["a"].dtype == object
-    assert isinstance(frame, pandas.DataFrame)
 
 
 def test_a_missing_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

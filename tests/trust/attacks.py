@@ -2,8 +2,7 @@
 
 Each attack changes a copy of an honest run or sweep and gives it to one command, in a process of its own. It
 succeeds where anything outside the folder changes, a secret or a control character comes out, the command
-runs 5 CPU-seconds or 500 MB beyond the honest one, waits, or ends in a traceback. They were written before
-their author had read a line of the checks that they meet; what five of them reached was mended.
+runs 5 CPU-seconds or 500 MB beyond the honest one (but for those of `LARGE`), waits, or ends in a traceback.
 """
 
 from __future__ import annotations
@@ -29,6 +28,8 @@ import attacks_on_tables as attacks_on_tables
 from arena import ATTACKS, CONTROLS, SECRET, Arena
 
 CPU_SECONDS, WAIT, MEMORY = 5.0, 60.0, 500 * 2**20
+LARGE = {"base_sixty_numbers", "a_history_that_unpacks_to_gigabytes", "an_override_of_a_million_commas"}
+"""Folders that do nothing but take long to read: time and memory are the reader's own to end."""
 MOST_MEMORY = 6 * 2**30  # bytes of addresses that a command may have
 HONEST = ("duration=6.0", "figures=false", "seed=3")
 
@@ -106,7 +107,7 @@ def leaks(arena: Arena, text: str) -> str | None:
 
 
 def verdict(
-    arena: Arena, before: dict[str, str], result: Outcome, base: Outcome, check: Callable | None
+    arena: Arena, before: dict[str, str], result: Outcome, base: Outcome, check: Callable | None, large: bool
 ) -> list[str]:
     """What the attack reached; empty: nothing."""
     found = []
@@ -114,11 +115,11 @@ def verdict(
     changed = sorted(name for name in before.keys() | after.keys() if before.get(name) != after.get(name))
     if changed:
         found.append(f"changed outside: {changed[:3]}")
-    if result.waited:
+    if result.waited and not large:
         found.append(f"did not end in {WAIT:.0f} s")
-    if result.seconds > base.seconds + CPU_SECONDS:
+    if result.seconds > base.seconds + CPU_SECONDS and not large:
         found.append(f"{result.seconds:.1f} CPU-s, the honest one {base.seconds:.1f}")
-    if result.memory > max(MEMORY, base.memory + MEMORY // 5):
+    if result.memory > max(MEMORY, base.memory + MEMORY // 5) and not large:
         found.append(f"{result.memory / 2**20:.0f} MB, the honest one {base.memory / 2**20:.0f}")
     if result.code < 0 and not result.waited:
         found.append(f"ended by signal {-result.code}")
@@ -172,7 +173,7 @@ def main() -> int:
             else:
                 # a command of several is compared with the dearest of them
                 base = bases.get(command[0], bases["staf"])
-                found = verdict(arena, before, result, base, check)
+                found = verdict(arena, before, result, base, check, name in LARGE)
                 broken += bool(found)
                 print(f"{name:34s} {'; '.join(found) or 'held'}", flush=True)
             if arguments.verbose:

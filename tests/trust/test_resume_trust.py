@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
-import socket
-import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -19,7 +16,6 @@ from staf_torch import __version__
 from staf_torch.results import build
 from staf_torch.results.reader import collect, read_run
 from staf_torch.results.run_directory import History
-from staf_torch.sweeps import lock
 from staf_torch.sweeps.resume import command_line, may_run_code
 from staf_torch.tables import Layout, tabulate
 
@@ -227,20 +223,6 @@ def test_a_directory_that_holds_a_sweep_is_refused(place: Path) -> None:
     assert "sweep.resume=sweep" in err
 
 
-def test_a_directory_belongs_to_one_sweep_at_a_time(place: Path) -> None:
-    waiting = "import sys; from pathlib import Path; from staf_torch.sweeps.lock import hold;"
-    waiting += "hold(Path(sys.argv[1])); print('held', flush=True); sys.stdin.read()"
-    line = [sys.executable, "-c", waiting, str(place / "sweep")]
-    with subprocess.Popen(line, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as other:
-        assert other.stdout is not None
-        assert other.stdout.readline() == "held\n"
-        code, _, err = resume(place)
-        assert code == 1
-        assert f"belongs to a sweep that goes on: process {other.pid} on {socket.gethostname()}" in err
-        other.kill()
-    assert resume(place)[0] == 0  # who was killed holds nothing
-
-
 LONG = {
     "seed=range(1000000000)": r"a sweep of 1e\+09 jobs, and 1000000 are the most",
     f"+note=[{'1,' * 9999}1]": "lines of 20007 characters, and 10000 are the most",
@@ -253,17 +235,6 @@ def test_a_line_that_would_take_for_ever_is_refused_before_it_is_read(line: str,
     (tmp_path / "sweep.json").write_text(json.dumps(record))
     with pytest.raises(ValueError, match=LONG[line]):
         command_line(["-m", f"sweep.resume={tmp_path}"])
-
-
-def test_a_lock_of_another_machine_holds_while_it_is_touched(tmp_path: Path) -> None:
-    (tmp_path / lock.NAME).write_text(json.dumps({"host": "elsewhere", "pid": 1, "since": "today"}))
-    for what in ("sweep", "run"):
-        told = f"belongs to a {what} .* process 1 on elsewhere, since today.*another `hydra.{what}.dir`"
-        with pytest.raises(lock.TakenError, match=told):
-            lock.DirectoryLock(tmp_path, what)
-    os.utime(tmp_path / lock.NAME, (0, 0))
-    lock.DirectoryLock(tmp_path).release()
-    assert not (tmp_path / lock.NAME).exists()
 
 
 @pytest.mark.parametrize("name", [".table.md.partial", "1/staf.log", "2", "figures", ".lock"])

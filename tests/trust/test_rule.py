@@ -26,7 +26,7 @@ from staf_torch.settings.trust import constructors, foreign_settings, refusal
 OWN: list[Any] = [
     {"kernel": {"_target_": "staf_torch.GaussianKernel", "width": 1.0}, "task": "gradient_chase"},
     {"kernel": {"_target_": "staf_torch.kernels.MaternKernel"}, "metric": {"_target_": None}},
-    {"a": {"b": "${c}"}, "c": "${d.x}", "d": {"x": True, "y": "${.x}"}, "list": ["${c}", "1${c}"]},
+    {"a": {"b": "${c}"}, "c": "${d.x}", "d": {"x": True, "y": "${.x}"}, "list": ["${c}"]},
     {"system": {"_target_": "staf_torch.systems.Pendulum"}, "dt": 1e-300, "count": 10**9},
     {"task": "adp", "text": "os.system"},
     [1, 2],
@@ -47,6 +47,7 @@ FOREIGN: list[tuple[Any, list[str]]] = [
     ({"k": "\\${oc.env:HOME}"}, None),
     ({"k": "${a.${b}}"}, None),
     ({"k": "${a[0]}"}, None),
+    ({"k": "${a}${a}"}, None),
     ({"k": {"_target_": "os.system"}, "task": "a.b"}, ["k._target_: os.system", "task: a.b"]),
 ]
 
