@@ -18,7 +18,6 @@ from ..lanes import ready
 from ..numerics.checks import fail, flag, positive_real
 from ..systems import Clocked, Plant
 from ..systems.bounds import Limit
-from .bounded_plans import BoundedPlans
 from .controllers import LQR, Controller, Feedback
 from .cost import Cost
 from .receding_horizon import RecedingHorizon
@@ -28,7 +27,7 @@ from .sampled_rollout import SampledRollout
 from .sampling import HeldLoop, held_stability
 from .shooting import DirectShooting
 from .simulation import simulate
-from .strained_plans import StrainedPlans
+from .strained_plans import BoundedPlans, StrainedPlans
 
 _log = logging.getLogger(__name__)
 _DECAY = 2.0  # time constants of the slowest mode of the LQR in the horizon

@@ -10,13 +10,14 @@ from torch import Tensor
 from ..lanes import Program
 from ..lanes.combinators import tracing_now
 from ..numerics.checks import fail, flag, integer
-from .bounded_plans import best_held
 from .controllers import Controller, ControllerState, carrying
 from .global_value import GlobalValue
 from .memory_growth import best_from
 from .plans import LocalModel, Reference, Trajectories, around, packed, resting, unpacked
 from .sampled_problem import SampledProblem
 from .trajectory_optimisation import BoxDDP
+
+_LENGTHS = (2, 4, 7, 12, 20, 30)  # periods for which a corner of the bounds is held before the feedback
 
 
 class RecedingHorizon(Controller):
@@ -194,3 +195,30 @@ def _carrying(plan: Tensor, done: Tensor | None = None) -> ControllerState:
     """A plan (B, T, w) and how many of its steps are done, (B, 1); none by default."""
     done = plan.new_zeros(len(plan), 1) if done is None else done
     return carrying(torch.cat((done, plan.flatten(1)), dim=1))
+
+
+def best_held(search: BoxDDP, x: Tensor) -> Trajectories:
+    """The cheapest trajectories from x (B, n) that a search reaches from the linear feedback of the goal, and
+    from each corner of the bounds, held for 2 to 30 periods before it."""
+    control, feedback = _guesses(search.problem, search.steps)
+    count, b = len(control), len(x)
+    goal = search.problem.goals(x, search.steps)[:, :-1]
+    found = search.solve(
+        x.repeat(count, 1),
+        control.repeat_interleave(b, 0),
+        Reference(goal.repeat(count, 1, 1), feedback.repeat_interleave(b, 0)),
+    )
+    cost = torch.where(torch.isfinite(found.cost), found.cost, torch.inf).view(count, b)
+    return found.rows(cost.argmin(0) * b + torch.arange(b))
+
+
+def _guesses(problem: SampledProblem, steps: int) -> tuple[Tensor, Tensor]:
+    """First controls (G, T, m), and their feedback (G, T, m, n); the linear feedback first."""
+    levels = problem.levels()
+    corners = levels[(levels != problem.rest).all(-1)]
+    held = [(length, u) for length in _LENGTHS if length < steps for u in corners]
+    control = problem.rest.repeat(1 + len(held), steps, 1)
+    feedback = (-problem.k).repeat(1 + len(held), steps, 1, 1)
+    for k, (length, u) in enumerate(held, 1):
+        control[k, :length], feedback[k, :length] = u, 0.0
+    return control, feedback

@@ -393,3 +393,21 @@ def _rate(phi: Rows, plant: Plant, x: Tensor, u: Tensor, t: Tensor) -> Tensor:
     along_x, along_t = torch.func.grad(phi, argnums=(0, 1))(x, t)
     rate: Tensor = (along_x * plant.motion(x, u)).sum() + along_t
     return rate
+
+
+def walls(low: Sequence[float], high: Sequence[float]) -> list[Constraint]:
+    """h of every coordinate with a wall, in its units: (x - low)(high - x)/(high - low), or the distance to
+    its one wall.
+
+    Args:
+        low: of the n coordinates, -inf for no wall.
+        high: likewise, inf for none.
+    """
+    pairs = enumerate(zip(low, high, strict=True))
+    return [_within(k, *pair) for k, pair in pairs if not all(map(math.isinf, pair))]
+
+
+def _within(k: int, low: float, high: float) -> Constraint:
+    if math.isinf(low) or math.isinf(high):
+        return lambda x, t: high - x[:, k] if math.isinf(low) else x[:, k] - low
+    return lambda x, t: (x[:, k] - low) * (high - x[:, k]) / (high - low)

@@ -7,10 +7,43 @@ from torch import Tensor
 
 from ..lanes import repeat
 from ..lanes.combinators import tracing_now
-from .bounded_plans import BoundedPlans
+from ..lanes.function import RowFunction
 from .controllers import Controller, ControllerState, carrying
-from .receding_horizon import RecedingHorizon
+from .receding_horizon import RecedingHorizon, best_held
+from .sampled_problem import SampledProblem
 from .sampled_rollout import SampledRollout
+from .trajectory_optimisation import BoxDDP
+
+_ITERATIONS = 15
+
+
+class BoundedPlans:
+    """u_0 of the cheapest plan over T periods by `BoxDDP`, begun from the linear feedback of the goal and
+    from each corner of the bounds that is held for 2 to 30 periods before it.
+
+    Args:
+        problem: plant, cost and bounds in steps.
+        steps: T.
+        policy: whose base is the linear feedback; a program is kept by what the policy holds, as a problem
+            holds closures, which are not known again.
+    """
+
+    def __init__(self, problem: SampledProblem, steps: int, policy: SampledRollout) -> None:
+        self.problem, self.steps = problem, steps
+        self._search = BoxDDP(problem, steps=steps, iterations=_ITERATIONS)
+        self._strained = RowFunction(policy.meets_bound, policy, "whether a bound is met")
+
+    def strained(self, x: Tensor) -> Tensor:
+        """Whether the base, followed over the policy's horizon, meets a bound: (B, n) -> (B,) bool."""
+        return self._strained(x).reshape(-1) > 0
+
+    def hasten(self) -> None:
+        """Compile `strained` at its next call."""
+        self._strained.hasten()
+
+    def __call__(self, x: Tensor) -> Tensor:
+        """u: (B, n) -> (B, m)."""
+        return best_held(self._search, x).control[:, 0]
 
 
 class StrainedPlans(Controller):

@@ -22,7 +22,7 @@ from ..adp import (
     SafetyFilter,
     simulate,
 )
-from ..adp.walls import walls
+from ..adp.safety_filter import walls
 from ..figures.safety import BoxHistory, draw_box
 from ..figures.style import images
 from ..metrics.safety import constraint_metrics

@@ -26,7 +26,7 @@ from ..adp import (
     ValueBasis,
 )
 from ..adp.problem import AdpProblem, OptimumSettings
-from ..adp.walls import walls
+from ..adp.safety_filter import walls
 from ..approximation.basis import StaFBasis
 from ..numerics.checks import COMMAND_LINE, choice, fail, flag, integer, positive_real
 from ..systems import ControlAffineSystem, Plant

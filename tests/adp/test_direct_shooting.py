@@ -14,7 +14,7 @@ from torch import Tensor
 
 from staf_torch import adp, systems
 from staf_torch.adp.shooting import newton, starts
-from staf_torch.adp.shooting.mesh import graded, halved
+from staf_torch.adp.shooting.direct import graded, halved
 from staf_torch.adp.shooting.stage import Expansion, Stage
 
 DOUBLE = systems.Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])

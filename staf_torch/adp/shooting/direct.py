@@ -14,7 +14,6 @@ from ...systems.bounds import Limit
 from ..controllers import LQR, Policy, Value
 from ..cost import Cost
 from ..plans import chosen
-from .mesh import graded, halved, split
 from .newton import Plan, Solution, follow, minimise, replay
 from .optimum import Optimum
 from .stage import Stage
@@ -31,6 +30,7 @@ _NEAR = (0.5, 2.0)  # value over the LQR's, inside which one start is believed,
 _PLAIN = 1.5  # where following the base costs at most so many times what was found from it
 _MIRRORED = 1e-9  # relative difference of cost below which two guesses are one and its mirror image
 _REST = 1e-3  # share of the value that the terminal cost may be, before the horizon grows
+_GRADING = 6.0  # ratio of a mesh's last interval to the first
 _DOUBLINGS = 3  # of the horizon
 _SPLINES = 8  # random guesses
 
@@ -393,3 +393,37 @@ def _rates(system: Plant, lqr: LQR) -> tuple[float, float]:
     a, b = system.linearisation(lqr.cost.target, lqr.cost.target_input)
     modes = torch.linalg.eigvals(a.to(lqr.p) - b.to(lqr.p) @ lqr.k)
     return float(-modes.real.max()), float(modes.abs().max())
+
+
+def graded(horizon: float, intervals: int) -> Tensor:
+    """Times of a mesh whose intervals grow in geometric progression: (N + 1,) from 0 to the horizon."""
+    power = math.log(_GRADING) * torch.arange(intervals + 1, dtype=torch.float64) / max(1, intervals - 1)
+    return horizon * power.expm1() / power[-1].expm1()
+
+
+def halved(time: Tensor) -> Tensor:
+    """The same times and those half-way: (N + 1,) -> (2N + 1,)."""
+    middle = 0.5 * (time[1:] + time[:-1])
+    return torch.cat((time[:1], torch.stack((middle, time[1:]), dim=-1).flatten()))
+
+
+def split(stage: Stage, plan: Plan, feedback: Tensor, lengths: Tensor) -> tuple[Plan, Tensor]:
+    """The same control on half intervals, and a feedback around it.
+
+    Args:
+        stage: of the problem.
+        plan: on N intervals.
+        feedback: around it, (B, N, 2m, n).
+        lengths: of the N intervals, (N,).
+
+    Returns:
+        A plan on 2N intervals (of the old cost) and its feedback (B, 2N, 2m, n).
+    """
+    first, last = plan.control.chunk(2, dim=-1)
+    middle = 0.5 * (first + last)
+    early, late = torch.cat((first, middle), dim=-1), torch.cat((middle, last), dim=-1)
+    between, _ = stage.advance(plan.state[:, :-1], early, 0.5 * lengths.expand(plan.control.shape[:2]))
+    state = torch.stack((plan.state[:, :-1], between), dim=2).flatten(1, 2)
+    state = torch.cat((state, plan.state[:, -1:]), dim=1)
+    control = torch.stack((early, late), dim=2).flatten(1, 2)
+    return Plan(state, control, plan.cost), feedback.repeat_interleave(2, dim=1)
