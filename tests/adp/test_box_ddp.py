@@ -113,7 +113,7 @@ def waved(low: float | None = None, high: float | None = None) -> adp.SampledPro
 def test_no_iteration_raises_a_cost_and_what_is_called_converged_is_stationary() -> None:
     problem = waved(-0.6, 0.9)
     costs = []
-    for iterations in (1, 2, 4, 8, 60):
+    for iterations in (1, 4, 30):
         search = adp.BoxDDP(problem, steps=3, iterations=iterations, tolerance=1e-10, compile=False)
         found = search.solve(WAVED_X, WAVED_U, WAVED_AROUND)
         torch.testing.assert_close(cost_of(problem, WAVED_X, found.control), found.cost)
@@ -155,15 +155,12 @@ def test_a_row_is_found_alike_alone_and_beside_one_that_is_no_number(rows: list[
 @torch.no_grad()
 @pytest.mark.compiled
 @pytest.mark.needs_compiler
-@pytest.mark.parametrize("iterations", [1, 12])
-def test_compiled_passes_and_the_whole_search_as_one_program_find_what_plain_torch_finds(
-    iterations: int,
-) -> None:
+def test_compiled_passes_and_the_whole_search_as_one_program_find_what_plain_torch_finds() -> None:
     problem, x = waved(-0.6, 0.9), WAVED_X.clone()
     x[5] = torch.nan
-    plain = adp.BoxDDP(problem, steps=3, iterations=iterations, compile=False)
+    plain = adp.BoxDDP(problem, steps=3, iterations=12, compile=False)
     found = plain.solve(x, WAVED_U, WAVED_AROUND)
-    passes = adp.BoxDDP(problem, steps=3, iterations=iterations).solve(x, WAVED_U, WAVED_AROUND)
+    passes = adp.BoxDDP(problem, steps=3, iterations=12).solve(x, WAVED_U, WAVED_AROUND)
 
     def search(
         carry: tuple[()], _: tuple[()], row: tuple[Tensor, ...]
@@ -180,7 +177,7 @@ def test_compiled_passes_and_the_whole_search_as_one_program_find_what_plain_tor
         for other in (whole[k], (passes.state, passes.control, passes.feedback, passes.cost)[k]):
             torch.testing.assert_close(other[fine], wanted[fine], rtol=0, atol=1e-8)
     assert torch.equal(passes.converged, found.converged)
-    assert bool(found.converged.any()) is (iterations > 1)
+    assert bool(found.converged.any())
 
 
 def numpy_plant() -> systems.StepPlant:

@@ -59,11 +59,11 @@ def followed(x: Tensor, u: Tensor, pieces: int = 30) -> Tensor:
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 def test_what_can_be_kept_stays_inside_and_the_rest_is_named(dtype: torch.dtype) -> None:
-    s0 = BOX.transform(beside_the_walls(20)).to(dtype)
+    s0 = BOX.transform(beside_the_walls(16)).to(dtype)
     guard = adp.BoxFilter(OF_S, BOX, dt=DT)
     run = adp.simulate(adp.Feedback(guard), BOX, COST, s0, steps=2, substeps=16, compile=False)
-    kept = can_be_kept(20)
-    assert 4 < int(kept.sum()) < 16
+    kept = can_be_kept(16)
+    assert 3 < int(kept.sum()) < 13
     assert torch.equal(guard.share(s0) < 1, kept)
     assert torch.equal(~run.diverged, kept)
     if dtype == torch.float64:  # whatever is wanted
@@ -115,11 +115,11 @@ def test_a_way_that_is_a_line_has_a_control() -> None:
 
 @pytest.mark.compiled
 def test_compiled_it_keeps_the_same_starts() -> None:
-    s0 = CORNER.transform(beside_the_walls(20))[beside_the_walls(20)[:, 0] > 0]
+    s0 = CORNER.transform(beside_the_walls(16))[beside_the_walls(16)[:, 0] > 0]
     guard = adp.BoxFilter(OF_CORNER, CORNER, dt=DT)
     run = adp.simulate(adp.Feedback(guard), CORNER, COST, s0, steps=2, substeps=16, compile=True)
     assert torch.equal(run.diverged, guard.share(s0) >= 1)
-    assert 2 < int(run.diverged.sum()) < len(s0) - 2
+    assert 1 < int(run.diverged.sum()) < len(s0) - 1
 
 
 def test_where_no_wall_is_near_not_a_bit_changes_and_rows_are_alone() -> None:
@@ -298,19 +298,12 @@ def test_rows_of_any_dimensions_are_rows() -> None:
     box = walled(-2.0, 1.0)
     guard = adp.BoxFilter(lambda s: 3.0 + 0 * s[..., :1], box, dt=HOLD, renewed=True)
     s = box.transform(x)
-    u, share, hold = guard(s), guard.share(s), guard.hold(s)
-    shorter = guard.held(s, 0.5 * hold)
-    assert (u.shape, share.shape, hold.shape) == ((12, 1), (12,), (12,))
-    for shape in ((3, 2, 2),):
-        deep = s.unflatten(0, shape)
-        found = guard(deep)
-        assert found.shape == (*shape, 1)
-        torch.testing.assert_close(found.reshape(12, 1), u)
-        torch.testing.assert_close(guard.share(deep).flatten(), share)
-        torch.testing.assert_close(guard.hold(deep).flatten(), hold)
-        torch.testing.assert_close(guard.held(deep, 0.5 * guard.hold(deep)).reshape(12, 1), shorter)
-    torch.testing.assert_close(guard(s[4]), u[4])
-    assert float((shorter - u).abs().max()) > 1
+    deep = s.unflatten(0, (3, 2, 2))
+    torch.testing.assert_close(guard(deep), guard(s).unflatten(0, (3, 2, 2)))
+    torch.testing.assert_close(guard.share(deep), guard.share(s).unflatten(0, (3, 2, 2)))
+    shorter = guard.held(s, 0.5 * guard.hold(s))
+    torch.testing.assert_close(guard.held(deep, 0.5 * guard.hold(deep)).reshape(12, 1), shorter)
+    torch.testing.assert_close(guard(s[4]), guard(s)[4])
     with pytest.raises(ValueError, match=r"`BoxFilter\(s=...\)`"):
         guard(s[:, :1])
 

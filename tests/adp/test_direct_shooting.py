@@ -7,15 +7,12 @@ from typing import Any
 
 import pytest
 import torch
-from helpers import tensor
 from helpers import uniform as random
 from helpers_adp import COST, PLANT, uniform
 from torch import Tensor
 
 from staf_torch import adp, systems
-from staf_torch.adp.shooting import newton, starts
-from staf_torch.adp.shooting.direct import graded, halved
-from staf_torch.adp.shooting.stage import Expansion, Stage
+from staf_torch.adp.shooting.stage import Stage
 
 DOUBLE = systems.Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
 LINEAR = systems.Linear([[0.0, 1.0], [2.0, -1.0]], [[0.0], [1.0]])
@@ -24,7 +21,7 @@ X3 = torch.tensor([[-0.5, 0.5, -0.25]], dtype=torch.float64)
 
 @pytest.mark.parametrize("plant", [PLANT, LINEAR], ids=lambda p: type(p).__name__)
 def test_known_optimum_is_found_and_bounded_from_above(plant: systems.ControlAffineSystem) -> None:
-    x = uniform(5, 2.0, seed=2)
+    x = uniform(3, 2.0, seed=2)
     best = adp.DirectShooting(plant, COST).solve(x)
     known = plant.optimal_value(x, COST.q, COST.r)
     assert best.converged.all()
@@ -259,7 +256,7 @@ def test_of_two_valleys_the_lower_one_is_found_from_several_starts() -> None:
     cost = adp.QuadraticCost(1.0, 1.0, dim=1, inputs=1, output=y)
     x = torch.tensor([[3.2]], dtype=torch.float64)  # to 0 the area is 14.3, to 10, downhill, 19.3
     left, whole = (11 * a - a**2 / 2 - 11 * math.log(1 + a) for a in (3.2, 10.0))
-    given: dict[str, Any] = {"base": lambda x: torch.where(x < ridge, -y(x), y(x)), "horizon": 6.0}
+    given: dict[str, Any] = {"base": lambda x: torch.where(x < ridge, -y(x), y(x)), "horizon": 4.0}
     given["terminal"] = lambda x: y(x)[..., 0].square()
     downhill = adp.DirectShooting(plant, cost, **given, intervals=80).solve(x)  # no LQR to doubt it by
     search = adp.DirectShooting(plant, cost, **given, starts=3)
@@ -275,7 +272,6 @@ def test_of_two_valleys_the_lower_one_is_found_from_several_starts() -> None:
 # Its pieces -----------------------------------------------------------------------------------------------
 
 
-FAST = systems.Linear([[-40.0]], [[1.0]])
 SLOW = systems.Linear([[0.0, 1.0], [-2.0, -3.0]], [[0.0], [1.0]])
 LIGHT = adp.QuadraticCost(1e-6, 1.0, dim=2, inputs=1)  # the feedback hardly moves the modes
 
@@ -286,70 +282,9 @@ def test_horizon_and_intervals_follow_the_modes_of_the_loop(bounded: bool) -> No
     found = adp.DirectShooting(SLOW, LIGHT, **limits)  # modes of -1 and -2 in 1/s
     assert found.horizon == pytest.approx(9.2, rel=1e-5)
     assert found.intervals == 80  # 37 would resolve them
-    assert found.iterations == (120 if bounded else 50)
     long = adp.DirectShooting(SLOW, LIGHT, horizon=60.0, **limits)
     assert (long.horizon, long.intervals) == (60.0, 120 if bounded else 240)
-    less = adp.DirectShooting(SLOW, LIGHT, horizon=26.0, **limits)
-    assert less.intervals == 104
-    assert adp.DirectShooting(SLOW, LIGHT, horizon=26.4, **limits).intervals == 106
-    given = adp.DirectShooting(SLOW, LIGHT, intervals=4, iterations=1, starts=1, seed=0, **limits)
-    assert (given.intervals, given.iterations, given.starts, given.seed) == (4, 1, 1, 0)
-    fast = adp.DirectShooting(FAST, adp.QuadraticCost(1e-6, 1.0, dim=1, inputs=1), horizon=1.0, **limits)
-    assert fast.intervals == 80
-
-
-@pytest.mark.parametrize("intervals", [2, 4, 21])
-def test_intervals_of_a_mesh_grow_by_one_factor_to_six_times_the_first(intervals: int) -> None:
-    time = graded(3.0, intervals)
-    lengths = time.diff()
-    assert len(time) == intervals + 1
-    assert float(time[0]) == 0
-    assert float(time[-1]) == pytest.approx(3.0, rel=1e-14)
-    assert float(lengths[-1] / lengths[0]) == pytest.approx(6.0)
-    growth = lengths[1:] / lengths[:-1]
-    torch.testing.assert_close(growth, growth[:1].expand_as(growth))
-    torch.testing.assert_close(halved(time)[::2], time, rtol=0, atol=0)
-    torch.testing.assert_close(halved(time)[1::2], 0.5 * (time[1:] + time[:-1]))
-
-
-@pytest.mark.parametrize("bounded", [True, False])
-def test_guesses_hold_each_input_at_each_end_and_then_wander_between_them(bounded: bool) -> None:
-    limits = {"low": [-1.0, -2.0], "high": [1.5, 3.0]} if bounded else {}
-    cost = adp.QuadraticCost(1.0, 1.0, 2, 2, target_input=[0.5, 0.25], target=[0.0, 0.0], **limits)
-    base = lambda x: 2 * x + torch.tensor([0.5, 0.25]).to(x)  # noqa: E731
-    x0 = torch.tensor([[0.1, -0.2], [-0.3, 0.1]], dtype=torch.float64)
-    found = starts.guesses(cost, base, x0, 10.0, 5, seed=3)
-    low, high = ([-1.0, -2.0], [1.5, 3.0]) if bounded else ([0.5 - 1.8, 0.25 - 1.2], [0.5 + 1.8, 0.25 + 1.2])
-    constant, wandering = found[:-5], found[-5:]
-    assert [each.until for each in constant] == [
-        3.0,
-        *(10 * s for s in (0.02, 0.04, 0.08, 0.14, 0.22, 0.32) for _ in range(4)),
-    ]
-    rest = torch.tensor([0.5, 0.25], dtype=torch.float64)
-    torch.testing.assert_close(constant[0].knots, rest.expand(2, 2))
-    for k, guess in enumerate(constant[1:]):
-        level = rest.clone()
-        level[k % 4 // 2] = (low, high)[k % 2][k % 4 // 2]
-        torch.testing.assert_close(guess.knots, level.expand(2, 2))
-    knots = torch.stack([each.knots for each in wandering])
-    assert knots.shape == (5, 6, 2)
-    ends = torch.tensor([low, high], dtype=torch.float64)
-    assert bool(((knots >= ends[0] - 1e-12) & (knots <= ends[1] + 1e-12)).all())
-    for end in ends:  # a sixth of them, at each
-        assert 0.05 < float((knots - end).abs().lt(1e-12).double().mean()) < 0.4
-    assert all(0 < each.until < 6 for each in wandering)
-    again = starts.guesses(cost, base, x0, 10.0, 5, seed=4)
-    assert not torch.equal(again[-1].knots, found[-1].knots)
-
-
-def test_a_guess_is_followed_along_its_knots_until_the_base_takes_over() -> None:
-    guess = starts.Guess(torch.tensor([[0.0], [1.0], [5.0]], dtype=torch.float64), 2.0)
-    control = starts.guided(guess, lambda x: x.new_full((*x.shape[:-1], 1), 9.0))
-    assert control(torch.zeros(4, 5, 2), 0.0).shape == (4, 5, 1)
-    x = torch.zeros(3, 2, dtype=torch.float64)
-    said = {0.0: 0.0, 0.5: 0.5, 1.0: 1.0, 1.5: 3.0, 1.75: 4.0, 2.0: 9.0, 3.0: 9.0}
-    for time, want in said.items():
-        torch.testing.assert_close(control(x, time), torch.full((3, 1), want, dtype=torch.float64))
+    assert adp.DirectShooting(SLOW, LIGHT, horizon=26.0, **limits).intervals == 104
 
 
 @pytest.mark.parametrize("affine", [True, False])
@@ -376,93 +311,3 @@ def test_the_gap_of_a_control_is_what_its_hamiltonian_exceeds_the_least_by(affin
         [hamiltonian(torch.full((50, 1), u).double()) for u in torch.linspace(-0.8, 0.8, 2001)]
     )
     torch.testing.assert_close(gap, hamiltonian(v) - tried.amin(0), rtol=1e-4, atol=1e-5)
-
-
-def model_cost(expansion: Expansion, z: Tensor, v: Tensor, end: Tensor, bend: Tensor) -> Tensor:
-    """The quadratic model of one row: d_0 (n,), (N, 2m) changes of the control."""
-    total = torch.zeros((), dtype=torch.float64)
-    d = z
-    for k in range(len(v)):
-        both = torch.cat((d, v[k]))
-        total = total + expansion.gradient[0, k] @ both + 0.5 * both @ expansion.curvature[0, k] @ both
-        d = expansion.slope[0, k] @ both
-    return total + end[0] @ d + 0.5 * d @ bend[0] @ d
-
-
-@pytest.mark.parametrize("roomy", [None, 1e3, 0.05])
-def test_a_direction_is_the_minimum_of_the_model_and_promises_what_it_falls_by(roomy: float | None) -> None:
-    n, m, steps = 2, 2, 3
-    root = random(1, steps, n + m, n + m, seed=1)
-    expansion = Expansion(
-        random(1, steps, n, n + m, seed=2),
-        random(1, steps, n + m, seed=3),
-        root @ root.mT + 0.5 * torch.eye(n + m).double(),
-    )
-    end, bend = random(1, n, seed=4), torch.eye(n).double()[None] * 1.5
-    wide = torch.full((1, steps, m), roomy or 0.0, dtype=torch.float64)
-    room = None if roomy is None else (-wide, wide)
-    found = newton.direction(expansion, end, bend, room)
-    assert found.definite.tolist() == [True]
-
-    def followed(d: Tensor) -> Tensor:
-        controls = []
-        for k in range(steps):
-            controls.append(found.offset[0, k] + found.feedback[0, k] @ d)
-            d = expansion.slope[0, k] @ torch.cat((d, controls[-1]))
-        return torch.stack(controls)
-
-    none = torch.zeros(n).double()
-    value = lambda z: model_cost(expansion, z, followed(z), end, bend)  # noqa: E731
-    torch.testing.assert_close(value(none), -found.decrement[0])
-    torch.testing.assert_close(torch.func.jacrev(value)(none), found.gradient[0])
-    torch.testing.assert_close(found.costates[0, 0], found.gradient[0])
-    assert torch.equal(found.costates[:, -1], end)
-    if roomy == 0.05:
-        assert float(found.offset.abs().max()) == 0.05
-        assert bool((found.feedback[found.offset.abs() == 0.05] == 0).all())
-        return
-    for z in (none, tensor([0.3, -0.2])):  # also from beside the plan
-        slope = torch.func.jacrev(lambda v, z=z: model_cost(expansion, z, v, end, bend))(followed(z))
-        assert float(slope.abs().max()) < 1e-9
-
-
-def test_a_model_that_bends_down_has_no_minimum_until_it_is_made_convex() -> None:
-    curvature = torch.diag_embed(tensor([[[1.0, -2.0, 3.0], [1.0, 2.0, 3.0], [4e3, 1e-5, 1.0]]]))
-    curvature[0, 1, 0, 0] = math.nan
-    expansion = Expansion(random(1, 3, 1, 3), random(1, 3, 3), curvature)
-    found = newton.convexified(expansion)
-    assert found.curvature[0, 0].tolist() == torch.diag(tensor([1.0, 2.0, 3.0])).tolist()
-    torch.testing.assert_close(found.curvature[0, 1].diag(), tensor([3e-6, 2.0, 3.0]))
-    torch.testing.assert_close(found.curvature[0, 2].diag(), tensor([4e3, 4e-3, 1.0]))
-    assert found.slope is expansion.slope
-    none = torch.zeros(2, 1, 2).double()
-    flat = Expansion(none.unsqueeze(2), none, torch.zeros(2, 1, 2, 2).double())
-    flat.curvature[0, 0, 1, 1], flat.curvature[1, 0, 1, 1] = -1.0, 1.0
-    step = newton.direction(flat, torch.zeros(2, 1).double(), torch.zeros(2, 1, 1).double())
-    assert step.definite.tolist() == [False, True]
-
-
-def test_a_plan_that_is_replayed_holds_the_mean_of_each_period_and_stays_at_its_end() -> None:
-    time = 4 * torch.linspace(0, 1, 5, dtype=torch.float64) ** 2
-    plan = torch.tensor([1.0, -2.0]).double().view(2, 1, 1, 1) + torch.arange(8.0).double().view(4, 2, 1)
-    runner = adp.PlanReplay(time, plan)
-
-    def u(t: float, row: int) -> float:
-        if t >= 4.0:
-            return float(plan[row, -1, 1, 0])
-        k = int((time <= t).sum()) - 1
-        share = (t - float(time[k])) / float(time[k + 1] - time[k])
-        first, last = plan[row, k, :, 0].tolist()
-        return first + share * (last - first)
-
-    x = torch.zeros(2, 2).double()
-    carried = runner.init(x)
-    for period in range(5):
-        got, carried = runner.step(x, carried, x, 0.9)
-        times = 0.9 * (period + (torch.arange(400) + 0.5) / 400)
-        for row in range(2):
-            mean = sum(u(float(t), row) for t in times) / 400
-            assert float(got[row, 0]) == pytest.approx(mean, abs=8e-3)
-    torch.testing.assert_close(carried.identifier, torch.full((2, 1), 4.5).double())
-    with pytest.raises(ValueError, match=r"This plan is for 2 initial states; got 3\."):
-        runner.init(torch.zeros(3, 2).double())

@@ -66,30 +66,6 @@ def test_a_whole_turn_changes_nothing(memory: adp.GlobalValue) -> None:
     torch.testing.assert_close(memory(turned), memory(RESETS), rtol=1e-6, atol=1e-6)
 
 
-def test_a_plan_that_is_followed_from_a_whole_turn_away_is_the_same_plan_there(
-    memory: adp.GlobalValue,
-) -> None:
-    entries = memory.length * torch.arange(len(RESETS))
-    turn = torch.tensor([2 * torch.pi, 0.0], dtype=torch.float64)
-    here, there = (memory.replay(x, entries, 5) for x in (RESETS, RESETS + turn))
-    torch.testing.assert_close(there[0], here[0], rtol=0, atol=0)
-    torch.testing.assert_close(there[1].state - turn, here[1].state, rtol=0, atol=1e-12)
-    torch.testing.assert_close(there[1].feedback, here[1].feedback, rtol=0, atol=0)
-    assert bool(((here[1].state[:, 0] - RESETS)[:, 0].abs() <= torch.pi).all())
-
-
-def test_candidates_lie_apart_along_a_trajectory_and_leave_no_gap(memory: adp.GlobalValue) -> None:
-    state, searched = memory.library.state[:, :-1], set(memory.entries.tolist())
-    for row in range(len(state)):
-        begin = row * memory.length
-        assert (begin in searched) == bool(memory.arrives[row])
-        last = state[row, 0]
-        for k in range(1, state.shape[1] if memory.arrives[row] else 0):
-            gap = float((memory.problem.offset(state[row, k], last) / memory.region).norm())
-            assert (begin + k in searched) == (gap >= memory.spacing) or abs(gap - memory.spacing) < 1e-9
-            last = state[row, k] if begin + k in searched else last
-
-
 def test_candidates_are_the_nearest_by_the_mean_curvature_the_shorter_way_around(
     memory: adp.GlobalValue,
 ) -> None:

@@ -39,31 +39,6 @@ def feasible(m: int, k: int, rows: int = 40) -> tuple[Tensor, Tensor, Tensor, Te
     )
 
 
-@pytest.mark.parametrize(
-    ("low", "high", "sides"),
-    [
-        ([-1.0, -INF], [INF, 2.0], [(0, -1), (0, 1)]),
-        ([-1.0], [1.0], [(0, -1, 1)]),
-        ([-INF, -INF, 0.0], [INF, INF, 1.0], [(0,), (0,), (0, -1, 1)]),
-    ],
-)
-@pytest.mark.parametrize("count", [1, 2, 3])
-def test_cases_are_all_sets_of_inequalities_with_all_bounds_that_are_there(
-    count: int, low: list[float], high: list[float], sides: list[tuple[int, ...]]
-) -> None:
-    table = cases(count, low, high)
-    assert table.dtype == torch.float64
-    assert table[0].tolist() == [0.0] * (count + len(low))
-    wanted = {
-        (*ones, *ends)
-        for ones in itertools.product((0, 1), repeat=count)
-        for ends in itertools.product(*sides)
-        if any(ones)
-    }
-    assert len(table) == 1 + len(wanted)
-    assert {tuple(row) for row in table[1:].tolist()} == wanted
-
-
 def test_as_many_cases_as_fit_are_compared_and_more_are_refused() -> None:
     assert len(cases(5, [0.0] * 5, [INF] * 5)) == 993
     assert len(cases(9, [-INF] * 3, [INF] * 3)) == 512
@@ -200,34 +175,6 @@ def test_of_one_unknown_the_answer_is_an_interval() -> None:
         empty += bottom > top
         assert float(answer.point[row]) == pytest.approx(min(max(point, -0.7), 0.9), abs=1e-14)
     assert 30 < empty < 200
-
-
-@pytest.mark.parametrize("m", [2, 3])
-@pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_beyond_a_bound_the_bound_is_taken_and_nothing_else_moves(m: int, sign: float) -> None:
-    for k in range(m):
-        normals = torch.zeros(1, 1, m, dtype=torch.float64)
-        normals[0, 0, k] = sign
-        wanted, low, high = tensor([[0.3, -0.4, 0.2][:m]]), tensor([-0.7] * m), tensor([0.6] * m)
-        answer = found(wanted, normals, tensor([[5.0]]), low, high)
-        expected = wanted.clone()
-        expected[0, k] = 0.6 if sign > 0 else -0.7
-        torch.testing.assert_close(answer.point, expected, rtol=0, atol=1e-7)
-        assert float(answer.shortfall) == pytest.approx(4.4 if sign > 0 else 4.3, abs=1e-7)
-        wanted[0, k] = -sign * 9  # beyond the bound on the other side: nearest is what the bound makes of it
-        torch.testing.assert_close(
-            found(wanted, normals, tensor([[5.0]]), low, high).point, expected, atol=1e-7, rtol=0
-        )
-
-
-@pytest.mark.parametrize("m", [2, 3])
-def test_the_same_inequality_twice_is_one(m: int) -> None:
-    wanted, normals, least, low, high = feasible(m, 1)
-    once = found(wanted, normals, least, low, high)
-    twice = found(wanted, normals.repeat(1, 2, 1), least.repeat(1, 2), low, high)
-    torch.testing.assert_close(twice.point, once.point, rtol=0, atol=1e-9)
-    tripled = found(wanted, torch.cat((normals, 3 * normals), 1), torch.cat((least, 3 * least), 1), low, high)
-    torch.testing.assert_close(tripled.point, once.point, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("angle", [0.1, 1e-3, 1e-5])

@@ -92,12 +92,12 @@ def test_discs_that_move_and_appear_are_avoided_within_the_bounds() -> None:
     assert guard.degree == (2, 2)
     assert guard.moving
     x0 = tensor([[2.0, 0.5, 0.0, 0.0], [1.5, -0.9, 0.0, 0.0]])
-    run = adp.simulate(guard, PLANE, COST4, x0, steps=15, every=5, compile=False)
+    run = adp.simulate(guard, PLANE, COST4, x0, steps=12, every=4, compile=False)
     report = guard.report(run)
     assert report["minimum_margin"] > 0
     assert 0 < report["acted"] < 1
     assert float(run.control[:, :-1].abs().max()) <= 1
-    bare = adp.simulate(adp.Feedback(lqr), PLANE, COST4, x0, dt=0.1, steps=15, every=5, compile=False)
+    bare = adp.simulate(adp.Feedback(lqr), PLANE, COST4, x0, dt=0.1, steps=12, every=4, compile=False)
     assert float(guard.margins(bare.state, bare.time).min()) < 0
     assert "filtered" in guard.label
 
@@ -250,37 +250,13 @@ def test_a_condition_that_bends_is_met_or_the_slack_says_so(decay: float) -> Non
 
 def test_a_condition_that_no_control_moves_leaves_a_finite_slack_and_the_others_kept() -> None:
     still = systems.Linear([[0.0, 0.0], [0.0, 0.0]], [[0.0], [1.0]])  # x1 moves by nothing
-
-    def first(x: Tensor, t: Tensor) -> Tensor:
-        return 0.5 - x[:, 0]
-
-    def second(x: Tensor, t: Tensor) -> Tensor:
-        return 0.4 - x[:, 1]
-
-    guard = adp.SafetyFilter(
-        adp.Feedback(lambda x: torch.ones_like(x[..., :1])),
-        still,
-        [first, second],
-        dt=0.1,
-        decay=1.0,
-        degree=1,
-    )
+    walls = [lambda x, t: 0.5 - x[:, 0], lambda x, t: 0.4 - x[:, 1]]
+    guard = adp.SafetyFilter(lambda x: torch.ones_like(x[..., :1]), still, walls, dt=0.1, decay=1.0, degree=1)
     x = tensor([[0.7, 0.39], [0.2, 0.39], [0.7, 0.0]])
     u, margin, slack = guard.restrain(x, torch.ones(3, 1).double())
     assert bool(torch.isfinite(slack).all())
     torch.testing.assert_close(margin, torch.stack((0.5 - x[:, 0], 0.4 - x[:, 1]), dim=-1))
-    assert (
-        float((second(x + 0.1 * torch.cat((0 * u, u), -1), x[:, 0]) - 0.9 * second(x, x[:, 0])).min()) > -1e-9
-    )
-
-
-def test_who_rests_on_the_edge_violates_nothing() -> None:
-    guard = adp.SafetyFilter(adp.Feedback(lambda x: 0 * x[..., :1]), LINE, lambda x, t: x[:, 0], dt=0.1)
-    x0 = tensor([[0.0, 0.0], [1.0, 0.0]])
-    run = adp.simulate(guard, LINE, COST, x0, dt=0.1, steps=3, compile=False)
-    report = guard.report(run)
-    assert report["minimum_margin"] == 0
-    assert report["constraint_violations"] == 0
+    assert float((0.4 - x[:, 1] - 0.1 * u[:, 0] - 0.9 * (0.4 - x[:, 1])).min()) > -1e-9
 
 
 # What is asked of a control, beside the same written out -------------------------------------------------
@@ -421,10 +397,10 @@ def test_a_report_is_that_of_every_step_of_the_loop() -> None:
     want = lambda x: 2 - x[..., :1] - x[..., 1:]  # noqa: E731
     guard = adp.SafetyFilter(want, LINE, [rising, lambda x, t: 1.5 - x[:, 1]], **given)
     x0 = tensor([[0.0, 0.0], [0.3, 1.4], [0.5, 1.6], [-1.0, 0.2], [-9.0, 0.0]])
-    run = adp.simulate(guard, LINE, COST, x0, steps=4, every=2, compile=False)
+    run = adp.simulate(guard, LINE, COST, x0, steps=2, every=2, compile=False)
     report = guard.report(run)
     x, least, most, acted = x0, [], [], 0
-    for k in range(4):
+    for k in range(2):
         t = torch.full((5,), 0.1 * k, dtype=torch.float64)
         found = guard.restrain(x, want(x), t)
         least.append(torch.minimum(rising(x, t), 1.5 - x[:, 1]))
@@ -432,44 +408,33 @@ def test_a_report_is_that_of_every_step_of_the_loop() -> None:
         acted += int((found.control != want(x).clamp(-1, 1)).sum())
         x = x + 0.1 * torch.cat((x[:, 1:] + 0.05 * found.control, found.control), dim=-1)
     torch.testing.assert_close(x, run.state[:, -1], rtol=1e-9, atol=1e-9)
-    least.append(torch.minimum(rising(x, tensor(0.4)), 1.5 - x[:, 1]))
+    least.append(torch.minimum(rising(x, tensor(0.2)), 1.5 - x[:, 1]))
     smallest, largest = torch.stack(least).amin(0), torch.stack(most).amax(0)
     assert report["minimum_margin"] == pytest.approx(float(smallest.min()), abs=1e-9)
     assert report["constraint_violations"] == int((smallest < 0).sum())
     assert report["infeasible"] == (largest > 1e-6).nonzero().flatten().tolist()
     assert report["largest_slack"] == pytest.approx(float(largest.max()), rel=1e-6)
-    assert report["acted"] == pytest.approx(acted / 20)
+    assert report["acted"] == pytest.approx(acted / 10)
     assert 0 < report["constraint_violations"] < 5
     assert 0 < len(report["infeasible"]) < 5
-    assert 0 < acted < 20
+    assert 0 < acted < 10
 
 
 def test_what_stands_behind_it_has_its_own_columns_and_value() -> None:
-    learner = adp.ActorCritic(adp.QuadraticBasis(2), LINE, COST, adp.RandomPoints(1, half_width=0.5))
     inner = adp.SafetyFilter(adp.LQR(LINE, COST), LINE, lambda x, t: x[:, 0] + 9.0, dt=0.05)
-    outer = adp.SafetyFilter(inner, LINE, lambda x, t: x[:, 0] + 0.1, dt=0.05)
+    outer = adp.SafetyFilter(inner, LINE, wall, dt=0.05)
+    alone = adp.SafetyFilter(adp.LQR(LINE, COST), LINE, wall, dt=0.05)
     x0 = tensor([[1.0, -1.0], [0.2, -0.5]])
-    run = adp.simulate(outer, LINE, COST, x0, steps=3, compile=False)
-    assert run.identifier.shape[-1] == 8
-    alone = adp.SafetyFilter(adp.LQR(LINE, COST), LINE, lambda x, t: x[:, 0] + 0.1, dt=0.05)
-    other = adp.simulate(alone, LINE, COST, x0, steps=3, compile=False)
+    run, other = (adp.simulate(guard, LINE, COST, x0, steps=2, compile=False) for guard in (outer, alone))
     assert torch.equal(run.state, other.state)
     assert outer.report(run) == alone.report(other)
-    assert run.identifier[:, -1, 0].tolist() == [3.0, 3.0]  # steps that the inner one counts
-    guard = adp.SafetyFilter(learner, LINE, lambda x, t: x[:, 0] + 0.1, dt=0.05)
-    assert guard.draws == learner.draws
-    carried = guard.init(x0)
-    assert carried.identifier[:, -4:].tolist() == [[0.0, math.inf, 0.0, 0.0]] * 2
-    value = learner.value(x0, learner.init(x0))
-    assert value is not None
-    torch.testing.assert_close(guard.value(x0, carried), value)
-    assert guard.label == f"filtered {learner.label}"
-    assert guard.period == guard.hold == 0.05
+    learner = adp.ActorCritic(adp.QuadraticBasis(2), LINE, COST, adp.RandomPoints(1, half_width=0.5))
+    guard = adp.SafetyFilter(learner, LINE, wall, dt=0.05)
+    assert (guard.draws, guard.label) == (learner.draws, f"filtered {learner.label}")
+    torch.testing.assert_close(guard.value(x0, guard.init(x0)), learner.value(x0, learner.init(x0)))
 
 
 def test_a_decay_of_one_over_the_hold_is_taken_and_more_where_the_degree_is_one() -> None:
-    adp.SafetyFilter(lambda x: x[..., :1], LINE, lambda x, t: x[:, 0], dt=0.125, decay=8.0)
-    adp.SafetyFilter(lambda x: x[..., :1], LINE, lambda x, t: x[:, 1], dt=0.125, decay=80.0)
     both = [lambda x, t: x[:, 0], lambda x, t: x[:, 1]]
     assert adp.SafetyFilter(lambda x: x[..., :1], LINE, both, dt=0.125, decay=[8.0, 80.0]).degree == (2, 1)
     with pytest.raises(ValueError, match="must be at most 1/dt = 8 where"):
@@ -490,7 +455,7 @@ def test_degrees_may_be_stated_for_all_or_each() -> None:
         adp.SafetyFilter(lambda x: x[..., :1], third, [lambda x, t: x[:, 2], lambda x, t: x[:, 0]], dt=0.1)
 
 
-@pytest.mark.parametrize("begin", [0.05, 0.5, 5.0, 50.0])
+@pytest.mark.parametrize("begin", [0.05, 50.0])
 def test_what_depends_on_the_time_is_found_whenever_it_begins_to(begin: float) -> None:
     guard = adp.SafetyFilter(
         lambda x: x[..., :1], LINE, lambda x, t: 1 - x[:, 1] + (t - begin).clamp(min=0), dt=0.1
