@@ -30,8 +30,8 @@ _FOLDER = Path(__file__).parent
 _SHARED = ("-march=native", "-std=c++17", "-shared", "-fPIC")
 # What -O3 adds to these takes a filter twice as long to build, and makes nothing faster.
 _OF_FILES = ("-O2", "-fpeel-loops", *_SHARED, "-pthread")
-_OF_PROGRAMS = ("-O2", *_SHARED, "-w", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math")
-_OF_PROGRAMS += ("-fno-signaling-nans",)
+_ROUNDED_AS_WRITTEN = ("-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math", "-fno-signaling-nans")
+_OF_PROGRAMS = ("-O2", *_SHARED, "-w", *_ROUNDED_AS_WRITTEN)
 # A long program takes GCC half the time without what looks at all of its loops and branches together.
 _LONG, _OF_LONG = 1500, ("-fira-region=one", "-fno-tree-pre", "-fno-gcse")  # lines
 _SLOW = 6000  # lines from which a user hears of it: some seconds
@@ -81,8 +81,8 @@ def function(text: str) -> Callable[..., None]:
         found = _programs.get(text)
         if found is None:
             found = ctypes.CDLL(str(_library("lanes", text, _OF_PROGRAMS, _FOLDER))).lanes_run
-            found.restype = None  # type: ignore[attr-defined]
-            found.argtypes = (ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64)  # type: ignore[attr-defined]
+            found.restype = None
+            found.argtypes = (ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64)
             _programs[text] = found
         return found
 
