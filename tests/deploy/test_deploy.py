@@ -265,27 +265,6 @@ def test_onnx_file_computes_the_same_in_onnxruntime(tmp_path: Path) -> None:
         assert sheet.worst_difference((third,), (module(y[:rows])[2],))[0] <= 1e-15
 
 
-class Products(nn.Module):
-    """The product of a row's (2, 3) matrix and its first row."""
-
-    def forward(self, x: Tensor) -> Tensor:
-        matrix = x.view(-1, 2, 3)
-        return torch.bmm(matrix, matrix[:, :1].mT)
-
-
-def test_weights_of_a_network_are_counted_and_kept_once() -> None:
-    network = torch.nn.Sequential(torch.nn.Linear(2, 3), torch.nn.Tanh(), torch.nn.Linear(3, 1)).double()
-    program = deploy.trace(network, torch.zeros(1, 2).double())
-    counted = sheet.work(program)
-    assert (counted.parameters, counted.functions) == (2 * 3 + 3 + 3 + 1, 3)
-    assert counted.flops == 3 * (2 * 2 - 1) + 3 + (2 * 3 - 1) + 1
-    assert sum(part.numel() for part in program.state_dict.values()) == 13
-    pairs = deploy.trace(Products(), torch.zeros(1, 6))
-    assert sheet.work(pairs).flops == 2 * 1 * (2 * 3 - 1)  # of a (2, 3) and a (3, 1) matrix
-    x = torch.randn(5, 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    torch.testing.assert_close(program.module()(x), network(x))
-
-
 def test_operations_are_counted_by_the_entries_that_they_make() -> None:
     class Module(nn.Module):
         def forward(self, x: Tensor) -> tuple[Tensor, ...]:
@@ -296,16 +275,6 @@ def test_operations_are_counted_by_the_entries_that_they_make() -> None:
     assert counted.flops == 2 + 1 + 1 + 1 + 2  # products, three reductions, sums; what only moves is free
     assert counted.functions == 4
     assert counted.bytes_in_out == 8 * (2 + 2 + 1 + 1 + 1 + 2 + 4)
-
-
-@pytest.mark.parametrize("note", ["", "one\ntwo"])
-def test_a_header_begins_with_its_note_and_what_a_call_takes(note: str, tmp_path: Path) -> None:
-    source = deploy.export_c(deploy.policy_of(LQR), torch.cat((X, X)), tmp_path / "p.h", ["u"], note=note)
-    assert (source.flops, source.functions) == (4, 0)
-    lines = (tmp_path / "p.h").read_text().splitlines()
-    at = lines.index(" * A call takes 4 additions and the like,")
-    assert lines[at + 1] == " * 0 calls of exp and the like, whatever the state is."
-    assert [line.removeprefix(" * ") for line in lines[1:at]] == note.split()
 
 
 def test_weights_are_of_an_actor_alone() -> None:

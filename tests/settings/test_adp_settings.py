@@ -9,7 +9,7 @@ from typing import Any
 import composing
 import pytest
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from torch import nn
 
 from staf_torch import adp
@@ -18,7 +18,6 @@ from staf_torch.cli.staf import config_directory
 from staf_torch.settings import adp as loops
 from staf_torch.settings.adp import adp_problem
 from staf_torch.settings.chase import chase_problem
-from staf_torch.settings.plain import ManySettings, PlainSettings, to_read
 from staf_torch.sweeps.hydra_compat.program import trusted
 
 GROUPS = ("policy", "law", "basis", "extrapolation", "cost")
@@ -169,30 +168,6 @@ def test_of_many_states_so_few_are_recorded_that_they_fit(steps: int, batch: int
 def test_a_wrong_number_below_adp_is_named(wrong: str, said: str) -> None:
     with pytest.raises(ValueError, match=f"`staf adp.{wrong.partition('=')[0]}=...` {said}"):
         problem("adp/policy=lqr", f"adp.{wrong}")
-
-
-def test_settings_of_members_are_made_once_and_only_where_they_are_asked_for() -> None:
-    asked = []
-
-    def make(index: int) -> Any:
-        asked.append(index)
-        return OmegaConf.create({"made": index})
-
-    plains = [PlainSettings({"plain": 0}), None, PlainSettings({"plain": 2})]
-    many = ManySettings(plains, [{"k": k} for k in range(3)], make)
-    assert len(many) == 3
-    assert many.read() == [plains[0], {"made": 1}, plains[2]]
-    assert many[-1].made == many[2].made == 2
-    assert asked == [1, 2]
-    with pytest.raises(IndexError):
-        many[3]
-    part = many[1:]
-    assert isinstance(part, ManySettings)
-    assert [dict(each) for each in part.flat] == [{"k": 1}, {"k": 2}]
-    assert [each.made for each in part] == [1, 2]
-    assert to_read(many.of([2, 0])) == [plains[2], plains[0]]
-    others = [OmegaConf.create({"a": 1})]
-    assert to_read(others) is others
 
 
 def looped(*overrides: str) -> Any:

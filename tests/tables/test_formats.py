@@ -26,7 +26,7 @@ from staf_torch.tables import (
     parquet_bytes,
     tabulate,
 )
-from staf_torch.tables.columns import Column, Number, Row, printed, significant
+from staf_torch.tables.columns import Column, Row, printed, significant
 from staf_torch.tables.model import data_frame, escape
 
 
@@ -265,20 +265,6 @@ def test_a_page_has_the_best_bold_and_every_text_as_it_is() -> None:
     )
 
 
-def test_latex_has_the_best_bold_dashes_and_notes_as_comments() -> None:
-    assert latex_text(TABLE).splitlines()[2:] == [
-        r"a & M \& m \\",
-        r"\midrule",
-        r"\textless{}x\textgreater{} \& y & \boldmath\textbf{$0.25$} \\",
-        r"-- & $0.5$ \\",
-        r"c & -- \\",
-        r"\bottomrule",
-        r"\end{tabular}",
-        "% a <note> of 100 %",
-    ]
-    assert latex_text(TABLE).startswith("\\begin{tabular}{lr}\n\\toprule\n")
-
-
 def test_json_has_null_and_a_reason_for_what_it_cannot_hold() -> None:
     text = json_text(TABLE)
     assert text.startswith('{\n  "columns": [\n    "a",\n    "m",\n    "hidden"\n  ],')
@@ -291,15 +277,6 @@ def test_json_has_null_and_a_reason_for_what_it_cannot_hold() -> None:
     ]
     assert [row["hidden"] for row in rows] == [1, None, None]
     assert "é" in json_text(Table.of([{"a": "é"}]))
-
-
-def test_a_table_of_rows_has_all_of_their_keys_or_those_with_headings() -> None:
-    rows = [{"a": 1}, {"b": 2, "a": 3}]
-    assert list(Table.of(rows).names) == ["a", "b"]
-    named = Table.of(rows, {"b": "B", "a": ""})
-    assert list(named.names) == ["b", "a"]
-    assert [column.heading for column in named.printed()] == ["B", "a"]
-    assert [column.cells for column in named.printed()] == [(None, Number(2)), (Number(1), Number(3))]
 
 
 @pytest.mark.parametrize(

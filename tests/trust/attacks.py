@@ -28,7 +28,12 @@ import attacks_on_tables as attacks_on_tables
 from arena import ATTACKS, CONTROLS, SECRET, Arena
 
 CPU_SECONDS, WAIT, MEMORY = 5.0, 60.0, 500 * 2**20
-LARGE = {"base_sixty_numbers", "a_history_that_unpacks_to_gigabytes", "an_override_of_a_million_commas"}
+LARGE = {
+    "base_sixty_numbers",
+    "a_history_that_unpacks_to_gigabytes",
+    "an_override_of_a_million_commas",
+    "a_record_of_three_hundred_megabytes",
+}
 """Folders that do nothing but take long to read: time and memory are the reader's own to end."""
 MOST_MEMORY = 6 * 2**30  # bytes of addresses that a command may have
 HONEST = ("duration=6.0", "figures=false", "seed=3")
