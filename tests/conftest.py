@@ -36,6 +36,21 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--record", action="store_true", help="write what `recorded.py` holds anew")
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_cmdline_main(config: pytest.Config) -> None:
+    """Two processes where there are two cores and whole folders are asked for; `-n` says otherwise."""
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        return  # a worker of pytest-xdist, which calls this too, must start none of its own: they would never end
+    option = config.option
+    if getattr(option, "numprocesses", 0) is not None:
+        return  # as the command line says; without pytest-xdist there is no such option
+    folders = any(Path(each.partition("::")[0]).is_dir() for each in config.args)
+    alone = option.usepdb or option.collectonly or option.record or option.capture == "no"
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    if folders and not alone and cores > 1:
+        option.numprocesses, option.dist = 2, "worksteal"
+
+
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Shuffle, but leave files in one piece: what the tests of a file share is made once."""
     seed = config.getoption("--order")
