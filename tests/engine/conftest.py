@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import pytest
 
 
@@ -10,4 +12,4 @@ def _libraries_are_built_without_optimisation(
     request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if "bit" not in request.node.name:
-        monkeypatch.setenv("CXXFLAGS", "-O0")
+        monkeypatch.setenv("CXXFLAGS", f"{os.environ.get('CXXFLAGS', '')} -O0")

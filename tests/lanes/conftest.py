@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import pytest
 
 AS_FOR_USERS = ("test_programs", "test_functions", "test_random_programs")
@@ -12,4 +14,4 @@ def _libraries_are_built_without_optimisation(
     request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if request.path.stem not in AS_FOR_USERS:
-        monkeypatch.setenv("CXXFLAGS", "-O0")
+        monkeypatch.setenv("CXXFLAGS", f"{os.environ.get('CXXFLAGS', '')} -O0")

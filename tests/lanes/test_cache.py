@@ -100,7 +100,7 @@ def test_other_options_and_another_compiler_are_another_library(
 ) -> None:
     program = new_program()
     in_children(lambda: right(program))
-    monkeypatch.setenv("CXXFLAGS", "-O0 -DNOTHING=1")
+    monkeypatch.setenv("CXXFLAGS", f"{os.environ['CXXFLAGS']} -DNOTHING=1")
     in_children(lambda: right(program))
     assert calls()[1].index("-O0 -DNOTHING=1") > calls()[1].index("-O2")  # the last one holds
     newer = script(
