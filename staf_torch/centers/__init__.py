@@ -11,15 +11,4 @@ from .state_following import Radius as Radius
 from .state_following import StateFollowingCenters as StateFollowingCenters
 from .state_following import StateRadius as StateRadius
 
-__all__ = [
-    "ConstantRadius",
-    "Radius",
-    "StateFollowingCenters",
-    "StateRadius",
-    "ball",
-    "cross_polytope",
-    "polygon",
-    "probe_points",
-    "rings",
-    "simplex",
-]
+__all__ = [name for name, value in globals().items() if callable(value) and not name.startswith("_")]

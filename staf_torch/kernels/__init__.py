@@ -10,14 +10,4 @@ from .polynomial import PolynomialKernel as PolynomialKernel
 from .radial import RadialKernel as RadialKernel
 from .rational_quadratic import RationalQuadraticKernel as RationalQuadraticKernel
 
-__all__ = [
-    "AnchoredKernel",
-    "ExponentialKernel",
-    "GaussianKernel",
-    "InverseMultiquadricKernel",
-    "Kernel",
-    "MaternKernel",
-    "PolynomialKernel",
-    "RadialKernel",
-    "RationalQuadraticKernel",
-]
+__all__ = [name for name, value in globals().items() if callable(value) and not name.startswith("_")]

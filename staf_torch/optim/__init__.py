@@ -13,17 +13,4 @@ from .recursive_least_squares import RecursiveLeastSquares as RecursiveLeastSqua
 from .steepest_descent import SteepestDescent as SteepestDescent
 from .torch_optimizer import ChaseOptimizer as ChaseOptimizer
 
-__all__ = [
-    "BarzilaiBorwein",
-    "ChaseOptimizer",
-    "ConjugateGradient",
-    "Exact",
-    "FixedStep",
-    "HeavyBall",
-    "Nesterov",
-    "NormalisedLMS",
-    "PreconditionedDescent",
-    "RecursiveLeastSquares",
-    "SteepestDescent",
-    "UpdateLaw",
-]
+__all__ = [name for name, value in globals().items() if callable(value) and not name.startswith("_")]

@@ -24,28 +24,4 @@ from .user_plants import RatePlant as RatePlant
 from .user_plants import StepPlant as StepPlant
 from .van_der_pol import VanDerPol as VanDerPol
 
-__all__ = [
-    "Barrier",
-    "Bounds",
-    "CartPole",
-    "Clocked",
-    "ControlAffineSystem",
-    "Linear",
-    "Linearisation",
-    "MujocoPlant",
-    "Oscillator",
-    "Pendulum",
-    "PlanarQuadrotor",
-    "Plant",
-    "RatePlant",
-    "StepPlant",
-    "ThreeState",
-    "TwoLinkRobot",
-    "TwoState",
-    "TwoStateChain",
-    "Units",
-    "VanDerPol",
-    "runge_kutta_step",
-    "simulate",
-    "trajectory",
-]
+__all__ = [name for name, value in globals().items() if callable(value) and not name.startswith("_")]

@@ -19,23 +19,4 @@ from .ultimate_bound import steps_for_bound as steps_for_bound
 from .ultimate_bound import ultimate_bound as ultimate_bound
 from .uniform_approximation import disc as disc
 
-__all__ = [
-    "Construction",
-    "DriftConstants",
-    "ExponentialBound",
-    "MinimalCount",
-    "PaperStep",
-    "UltimateBound",
-    "disc",
-    "drift_constants",
-    "exponential_bound",
-    "layout_errors",
-    "minimal_count",
-    "one_polynomial_bound",
-    "paper_step",
-    "power_function",
-    "standard_layouts",
-    "step_for_bound",
-    "steps_for_bound",
-    "ultimate_bound",
-]
+__all__ = [name for name, value in globals().items() if callable(value) and not name.startswith("_")]

@@ -34,9 +34,6 @@ class IdentifyingActorCritic(Controller, abc.ABC):
     def start(self, x0: Tensor) -> Any:
         """What is known of the plant at first, a tree with a row each of (B, n)."""
 
-    def init(self, x0: Tensor) -> ControllerState:
-        return self.learner.init(x0)._replace(identifier=pack(self.start(x0), 1))
-
     def knowledge(self, identifier: Tensor) -> Any:
         """What the rows of `LoopResult.identifier` say, (..., K)."""
         return unpack(self._like, identifier, 1)
@@ -138,6 +135,9 @@ class AdaptiveActorCritic(IdentifyingActorCritic):
         other.known = estimate
         return other
 
+    def init(self, x0: Tensor) -> ControllerState:
+        return self.learner.init(x0)._replace(identifier=pack(self.start(x0), 1))
+
     def start(self, x0: Tensor) -> LearnedModel:
         estimate = self.law.init(x0)
         if self.known is not None:
@@ -231,6 +231,9 @@ class IdentifyingTracker(IdentifyingActorCritic):
         self.register_buffer("first", self.model.theta)
         self.first: Tensor
         self._like = self.start(torch.zeros(1, 4, dtype=torch.float64))
+
+    def init(self, x0: Tensor) -> ControllerState:
+        return self.learner.init(x0)._replace(identifier=pack(self.start(x0), 1))
 
     def start(self, x0: Tensor) -> Identified:
         return self.identifier.init(self.first.to(x0).repeat(len(x0), 1, 1))
