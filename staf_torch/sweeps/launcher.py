@@ -11,7 +11,7 @@ import sys
 import time
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar, overload
+from typing import Any, NamedTuple
 
 from omegaconf import DictConfig
 from tqdm.auto import tqdm
@@ -34,6 +34,7 @@ from .hydra_compat import (
     without_hydra_overrides,
 )
 from .job import PRINTS, InWorker, Origin, execute, objective, silence_terminal
+from .lazy import Lazy, T
 
 _log = logging.getLogger(__name__)
 
@@ -42,7 +43,6 @@ _NOT_BATCHED = (
     "the jobs of this program cannot share tensor batches, which only the experiments of `staf` can; "
     "they run one by one. hydra/launcher=joblib runs them side by side"
 )
-T = TypeVar("T")
 _KEPT_JOBS = 128  # as many as a batch has
 _COLLECTED = 64  # jobs after which their settings are collected
 _BAR_EVERY, _LINE_EVERY = 0.2, 10.0  # s
@@ -132,73 +132,6 @@ def job_name(num: int, overrides: Sequence[str]) -> str:
     return f"job {num} ({' '.join(records.own(without_hydra_overrides(overrides)))})"
 
 
-class _Jobs(Sequence[Job]):
-    """The jobs of a sweep, composed when they are asked for: many settings take much memory.
-
-    Args:
-        numbered: number of a job to its overrides, in order.
-        make: composes a job.
-    """
-
-    def __init__(self, numbered: Mapping[int, list[str]], make: Callable[[int, list[str]], Job]) -> None:
-        self._numbered, self._make = numbered, make
-        self._order = list(numbered)
-        self._kept: dict[int, Job] = {}  # the latest ones
-
-    def __len__(self) -> int:
-        return len(self._order)
-
-    @overload
-    def __getitem__(self, index: int) -> Job: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> list[Job]: ...
-
-    def __getitem__(self, index: int | slice) -> Job | list[Job]:
-        if isinstance(index, slice):
-            return [self[i] for i in range(*index.indices(len(self)))]
-        num = self._order[index]
-        if num not in self._kept:
-            while len(self._kept) >= _KEPT_JOBS:
-                del self._kept[next(iter(self._kept))]
-            self._kept[num] = self._make(num, self._numbered[num])
-        return self._kept[num]
-
-    @property
-    def numbers(self) -> list[int]:
-        """The numbers of the jobs, in order."""
-        return self._order
-
-    def overrides(self, index: int) -> list[str]:
-        """Return the overrides of a job, which is not composed."""
-        return self._numbered[self._order[index]]
-
-    def forget(self, job: Job) -> None:
-        """Drop a job that has ended; its settings are its own from `__getitem__` on."""
-        self._kept.pop(job.num, None)
-
-
-class _Each(Sequence[T]):
-    """A function of every index, called when the entry is asked for."""
-
-    def __init__(self, count: int, function: Callable[[int], T]) -> None:
-        self._indices, self._function = range(count), function
-
-    def __len__(self) -> int:
-        return len(self._indices)
-
-    @overload
-    def __getitem__(self, index: int) -> T: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> list[T]: ...
-
-    def __getitem__(self, index: int | slice) -> T | list[T]:
-        if isinstance(index, slice):
-            return [self._function(i) for i in self._indices[index]]
-        return self._function(self._indices[index])
-
-
 class Launch:
     """One call of Hydra's: a list of jobs to run.
 
@@ -228,16 +161,14 @@ class Launch:
             self._directory.mkdir(parents=True, exist_ok=True)
             numbered = {first + i: list(overrides) for i, overrides in enumerate(job_overrides)}
             records.list_jobs(self._directory, numbered)
-            jobs = _Jobs(numbered, self._job)
             returns = self._finished(numbered)
-            progress = SweepProgress(len(jobs), len(returns))
+            progress = SweepProgress(len(numbered), len(returns))
             try:
-                with contextlib.closing(self._computed(jobs, set(returns), progress)) as computed:
+                with contextlib.closing(self._computed(numbered, set(returns), progress)) as computed:
                     for job, task in computed:
                         signals.check()
-                        self._still_there(len(returns), len(jobs))
+                        self._still_there(len(returns), len(numbered))
                         ended = self._replay(job, task)
-                        jobs.forget(job)
                         failure = ended._return_value if ended.status == JobStatus.FAILED else None
                         progress.ended(job.name, None if failure is None else reason(failure))
                         returns[job.num] = ended
@@ -247,7 +178,7 @@ class Launch:
                 progress.close()
         self._refuse_lost(numbered, returns)
         failed = sum(ended.status == JobStatus.FAILED for ended in returns.values())
-        _log.info("%d of %d jobs completed, %d failed", len(jobs) - failed, len(jobs), failed)
+        _log.info("%d of %d jobs completed, %d failed", len(numbered) - failed, len(numbered), failed)
         return [returns[num] for num in numbered]
 
     def _replay(self, job: Job, task: Callable[[DictConfig], Any]) -> JobReturn:
@@ -278,9 +209,6 @@ class Launch:
                 error = ValueError(f"the results of {name} are not in {directory} any more")
                 sys.stderr.write(f"{name} failed: {error}\n")
                 ended.status, ended.return_value = JobStatus.FAILED, error
-
-    def _job(self, num: int, overrides: list[str]) -> Job:
-        return Job(num, overrides, self._context.settings(overrides))
 
     def _whole(self, job: Job) -> InWorker | None:
         """Return what runs a job of many members in a worker, None for other jobs."""
@@ -317,30 +245,40 @@ class Launch:
         return found
 
     def _computed(
-        self, jobs: _Jobs, finished: set[int], progress: SweepProgress
+        self, numbered: Mapping[int, list[str]], finished: set[int], progress: SweepProgress
     ) -> Generator[tuple[Job, Callable[[DictConfig], Any]], None, None]:
         """Yield every job that is not finished with the task that ends it, as the tensor batches end."""
+        order, about = list(numbered), self._launcher
+
+        @functools.lru_cache(_KEPT_JOBS)
+        def job(index: int) -> Job:
+            num = order[index]
+            return Job(num, numbered[num], self._context.settings(numbered[num]))
+
         if self._task is not execute:
-            if self._launcher.foreign == "warn":
+            if about.foreign == "warn":
                 _log.warning("%s (hydra.launcher.foreign=run says nothing)", _NOT_BATCHED)
-            yield from ((job, self._task) for job in jobs)
+            yield from ((job(index), self._task) for index in range(len(order)))
             return
-        if len(finished) == len(jobs):
+        if len(finished) == len(order):
             return
-        about = self._launcher
+
+        def each(make: Callable[[int], T]) -> Lazy[T]:
+            return Lazy(len(order), make)
+
         with executor(about.executor, about.workers, about.arguments, self._directory) as workers:
             outcomes = compute(
-                _Each(len(jobs), lambda index: jobs[index].settings),
-                _Each(len(jobs), lambda index: self._place_of(jobs[index])),
+                each(lambda index: job(index).settings),
+                each(lambda index: self._place_of(job(index))),
                 workers,
-                flat=_Each(len(jobs), lambda index: self._flat(jobs.overrides(index))),
-                finished={i for i, num in enumerate(jobs.numbers) if num in finished},
-                whole=() if about.executor == "inline" else _Each(len(jobs), lambda i: self._whole(jobs[i])),
+                flat=each(lambda index: self._flat(numbered[order[index]])),
+                finished={i for i, num in enumerate(order) if num in finished},
+                whole=() if about.executor == "inline" else each(lambda index: self._whole(job(index))),
                 most=about.batch,
                 tell=progress.computed,
             )
             for index, outcome, seconds in outcomes:
-                yield jobs[index], _off_the_terminal(outcome, seconds, Progress(progress.running))
+                yield job(index), _off_the_terminal(outcome, seconds, Progress(progress.running))
 
 
 @contextlib.contextmanager

@@ -34,9 +34,9 @@ from .hydra_compat import (
     Composer,
     ConfigLoader,
     PlainComposer,
-    Product,
     config_loader,
     parse_override,
+    product,
     sweep_size,
 )
 from .member_rows import FOLDER, Left, left, made_by, rows_left, writer
@@ -197,7 +197,7 @@ def member_overrides(setting: Any, loader: ConfigLoader) -> Sequence[list[str]]:
             raise fail(COMMAND_LINE, "members", "must be about the experiment alone", line)
     if sweep_size(overrides) > MOST_JOBS:
         raise fail(COMMAND_LINE, "members", f"must be {MOST_JOBS} at most, in several jobs if need be", lines)
-    return Product(overrides)
+    return product(overrides)
 
 
 def _result(

@@ -19,11 +19,11 @@ from staf_torch.settings.plain import PlainSettings
 from staf_torch.sweeps.hydra_compat import (
     Composer,
     PlainComposer,
-    Product,
     config_loader,
     find_launcher,
     interpolations_parsed_once,
     parse_override,
+    product,
     search_paths,
     searching,
     sweep_size,
@@ -150,7 +150,7 @@ def test_the_jobs_of_a_product_are_those_of_hydras_sweeper() -> None:
     lines = {"a=1,2,3": None, "b=range(0,1,0.25)": ["0.0", "0.25", "0.5", "0.75"], "c=7": ["7"]}
     lines |= {"a=4,5": ["4", "5"], "d=choice(x,y)": ["x", "y"], "e=range(5,0,-2)": ["5", "3", "1"]}
     lines |= {"f=[1],[2,3]": ["[1]", "[2,3]"]}
-    found = Product([parse_override(line) for line in lines])
+    found = product([parse_override(line) for line in lines])
     lists = [[f"{key}={value}" for value in lines[line] or ()] for key, line in (
         ("a", "a=4,5"), ("b", "b=range(0,1,0.25)"), ("c", "c=7"), ("d", "d=choice(x,y)"),
         ("e", "e=range(5,0,-2)"), ("f", "f=[1],[2,3]"),

@@ -6,7 +6,6 @@ import logging
 import os
 from collections.abc import Callable, Collection, Generator, Sequence
 from pathlib import Path
-from typing import overload
 
 from omegaconf import DictConfig
 
@@ -14,41 +13,10 @@ from ...experiments.registry import Experiment
 from ...results.progress import Progress
 from ...settings.plain import ManySettings
 from ..batching import Batch, Flat, Outcome, batches, flat_or_none
+from ..lazy import Lazy
 from .base import Executor
 
 _log = logging.getLogger(__name__)
-
-
-class _Batches(Sequence[Batch]):
-    """Batches whose settings are looked up when a batch begins."""
-
-    def __init__(
-        self,
-        planned: Sequence[list[int]],
-        settings: Sequence[DictConfig],
-        directories: Sequence[Path],
-        whole: Sequence[Experiment | None],
-    ) -> None:
-        self._planned, self._settings, self._directories = planned, settings, directories
-        self._whole = whole
-
-    def __len__(self) -> int:
-        return len(self._planned)
-
-    @overload
-    def __getitem__(self, index: int) -> Batch: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> list[Batch]: ...
-
-    def __getitem__(self, index: int | slice) -> Batch | list[Batch]:
-        if isinstance(index, slice):
-            return [self[i] for i in range(*index.indices(len(self)))]
-        jobs = self._planned[index]
-        places = [os.path.abspath(self._directories[i]) for i in jobs]  # a worker may have another folder
-        settings = self._settings
-        some = settings.of(jobs) if isinstance(settings, ManySettings) else [settings[i] for i in jobs]
-        return Batch(some, places, [self._whole[i] for i in jobs] if self._whole else ())
 
 
 def compute(
@@ -82,11 +50,17 @@ def compute(
     planned = batches(flat, least=workers.pieces, most=most)
     planned = [batch for batch in planned if not set(finished).issuperset(batch)]
     _log.info("%d jobs in %d tensor batches", len(settings), len(planned))
-    given = _Batches(planned, settings, directories, whole)
+
+    def batch(number: int) -> Batch:
+        jobs = planned[number]
+        places = [os.path.abspath(directories[i]) for i in jobs]  # a worker may have another folder
+        some = settings.of(jobs) if isinstance(settings, ManySettings) else [settings[i] for i in jobs]
+        return Batch(some, places, [whole[i] for i in jobs] if whole else ())
+
     wanted = [[i for i in batch if i not in finished] for batch in planned]
     left = [len(batch) for batch in wanted]
     listening = Progress(lambda share: tell(done + share * next(filter(None, left), 0)))
-    for number, (outcomes, seconds) in workers.map(given, listening):
+    for number, (outcomes, seconds) in workers.map(Lazy(len(planned), batch), listening):
         done, left[number] = done + left[number], 0
         tell(done)
         found = dict(zip(planned[number], outcomes, strict=True))

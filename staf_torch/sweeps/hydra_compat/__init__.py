@@ -19,7 +19,7 @@ from .loading import search_paths as search_paths
 from .loading import searching as searching
 from .mode import mode_read_from_its_file as mode_read_from_its_file
 from .plain_composing import PlainComposer as PlainComposer
-from .products import Product as Product
+from .products import product as product
 from .products import sweep_size as sweep_size
 from .program import BrokenSweep as BrokenSweep
 from .program import breaking_off as breaking_off

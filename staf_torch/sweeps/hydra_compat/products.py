@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import overload
 
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.override_parser.types import Override, RangeSweep
+
+from ..lazy import Lazy
 
 
 def sweep_size(overrides: Sequence[Override]) -> float:
@@ -24,37 +25,22 @@ def _length(override: Override) -> float:
     return max(0, math.ceil(steps)) if math.isfinite(steps) else math.inf
 
 
-class Product(Sequence[list[str]]):
-    """The overrides of every job of a sweep, in the order of Hydra's own sweeper; each made when asked for.
+def product(overrides: Sequence[Override]) -> Lazy[list[str]]:
+    """Return the overrides of every job of a sweep, in the order of Hydra's own sweeper.
 
     Args:
         overrides: with sweeps among them.
     """
+    lists: dict[str, list[str]] = {}  # a key that comes twice has its first place and last values
+    for one in overrides:
+        (listed,) = BasicSweeper.split_arguments([one], None)
+        lists[one.get_key_element()] = [line for (line,) in listed]
 
-    def __init__(self, overrides: Sequence[Override]) -> None:
-        self._lists: dict[str, list[str]] = {}  # a key that comes twice has its first place and last values
-        for one in overrides:
-            (listed,) = BasicSweeper.split_arguments([one], None)
-            self._lists[one.get_key_element()] = [line for (line,) in listed]
-        self._numbers = range(math.prod(map(len, self._lists.values())))
-
-    def __len__(self) -> int:
-        return len(self._numbers)
-
-    @overload
-    def __getitem__(self, index: int) -> list[str]: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> list[list[str]]: ...
-
-    def __getitem__(self, index: int | slice) -> list[str] | list[list[str]]:
-        if isinstance(index, slice):
-            return [self._job(number) for number in self._numbers[index]]
-        return self._job(self._numbers[index])
-
-    def _job(self, number: int) -> list[str]:
+    def job(number: int) -> list[str]:
         lines = []
-        for values in reversed(self._lists.values()):
+        for values in reversed(lists.values()):
             number, place = divmod(number, len(values))
             lines.append(values[place])
         return lines[::-1]
+
+    return Lazy(math.prod(map(len, lists.values())), job)
