@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 import time
 from pathlib import Path
 
@@ -15,7 +16,7 @@ def work(what: str, note: str) -> bytes:
     if what == "die":
         os.kill(os.getpid(), signal.SIGKILL)
     if what == "exit":
-        os._exit(3)
+        sys.exit(3)
     if what == "raise":
         raise OSError("no more memory")
     if what == "sleep":
@@ -24,8 +25,6 @@ def work(what: str, note: str) -> bytes:
 
 
 if __name__ == "__main__":  # a parent of two workers, which are at work when it says so
-    import sys
-
     from staf_torch.sweeps.workers import Worker
 
     for number in (signal.SIGHUP, signal.SIGTERM):  # which `nohup` lets a whole suite ignore

@@ -242,22 +242,6 @@ def test_an_error_is_told_in_a_sentence(error: BaseException, words: str) -> Non
     assert sentence(error) == words
 
 
-class BothError(ConfigKeyError, ValueError):
-    """An error of OmegaConf that is a ValueError as well, as some of its own are."""
-
-
-class HydraDiskError(HydraException, OSError):
-    """An error of Hydra's about a file."""
-
-    filename, strerror = "b", "gone"
-
-
-def test_an_error_of_a_library_is_not_ours_whatever_else_it_is() -> None:
-    assert sentence(chained(RuntimeError("outer"), BothError("inner"))) == "outer"
-    assert sentence(chained(RuntimeError("outer"), BothError("inner"), ValueError("ours"))) == "ours"
-    assert sentence(HydraDiskError("told by Hydra")) == "told by Hydra"
-
-
 @pytest.mark.parametrize(
     ("error", "words"),
     [

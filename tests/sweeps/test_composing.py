@@ -181,11 +181,6 @@ def test_the_size_of_a_sweep_is_counted_and_not_written_out(lines: list[str], si
     assert sweep_size([parse_override(line) for line in lines]) == size
 
 
-def test_brackets_without_end_are_refused_in_a_sentence() -> None:
-    with pytest.raises((ValueError, HydraException)):
-        parse_override("a=" + "[" * 1000)
-
-
 def test_a_worker_looks_for_settings_where_the_command_does(tmp_path: Path) -> None:
     *usual, schema = search_paths()
     (tmp_path / "kernel").mkdir()

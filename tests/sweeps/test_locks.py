@@ -45,13 +45,6 @@ def test_a_lock_says_whose_it_is_and_leaves_nothing(tmp_path: Path) -> None:
     assert open_files() == before
 
 
-def test_a_lock_whose_file_is_taken_away_is_given_back_all_the_same(tmp_path: Path) -> None:
-    taken = DirectoryLock(tmp_path)
-    (tmp_path / NAME).unlink()
-    taken.release()
-    assert list(tmp_path.iterdir()) == []
-
-
 @pytest.mark.parametrize("what", ["sweep", "run"])
 def test_a_second_owner_is_told_of_the_first_in_this_process_or_another(what: str, tmp_path: Path) -> None:
     first = hold(tmp_path)

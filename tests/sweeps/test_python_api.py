@@ -105,21 +105,7 @@ def test_a_sweep_is_that_of_the_command_and_shows_nothing(
     assert {path.name for path in Path("one").iterdir()} == {path.name for path in two.iterdir()}
     assert repr(found) == "<Runs 4 completed, over kernel, centers.radius>"
     best = found.best("ball_error")
-    with pytest.raises(ValueError, match=r"`Runs.best\(metric=...\)` must be one of"):
-        found.best("bal_error")
-    errors = [run.metrics["ball_error"] for run in found]
-    assert best.metrics["ball_error"] == min(errors)
-    assert [run.metrics["ball_error"] for run in found.sort("ball_error")] == sorted(errors)
-    assert [run.setting("centers.radius") for run in found.sort("centers.radius:desc")] == [
-        0.2,
-        0.2,
-        0.1,
-        0.1,
-    ]
-    assert len(found.filter("kernel=matern", lambda run: run.setting("centers.radius") == 0.1)) == 1
-    assert len(found[1:3]) == 2
-    assert found.filter("kernel=matern").sort("ball_error")[0].setting("kernel") == "matern"
-    assert "<b>" in notebook(found)
+    assert best.metrics["ball_error"] == min(run.metrics["ball_error"] for run in found)
     assert len(staf_torch.read_runs(two)) == 4
     assert list(best.figures()) == ["gradient_chase"]  # the run drew none: drawn anew
     assert not (best.directory / "figures").exists()

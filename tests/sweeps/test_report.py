@@ -17,8 +17,7 @@ from sweep_runs import BAD_COUNT, error, write_run, write_sweep
 from staf_torch.figures import sweep as series
 from staf_torch.figures.style import images
 from staf_torch.results.reader import collect
-from staf_torch.results.run_directory import RunDirectory
-from staf_torch.sweeps.report import draw_sweep, page, write_report
+from staf_torch.sweeps.report import page, write_report
 from staf_torch.tables import tabulate
 
 NASTY = "<script>alert(1)</script>\"'&${x}{{ 7 * 7 }}"
@@ -116,20 +115,6 @@ def test_curves_are_the_geometric_means_over_the_seeds_with_their_interval(large
     assert (shown.radii, shown.counts) == ((0.05, 0.1), (3, 6, 7))
     assert shown.errors[2] == (None, None)  # where all runs failed
     assert shown.errors[0][0] == pytest.approx(5.12 * 0.05**2, rel=1e-3)
-
-
-def test_figures_are_only_those_that_the_swept_settings_allow(tmp_path: Path) -> None:
-    for num, steps in enumerate((1, 10)):
-        metrics = {"ball_error": 1.0 / steps, "products_per_second": 100 * (steps + 1.0)}
-        write_run(tmp_path / str(num), {"optimizer.inner_steps": steps}, metrics)
-    found = collect(tmp_path)
-    assert series.error_against_radius(found) == []
-    assert series.heat_maps(found) == []
-    (panel,) = series.cost_against_accuracy(found)
-    (curve,) = panel.curves
-    assert curve.label == "steepest descent"
-    assert [(point.x, point.middle) for point in curve.points] == [(200.0, 1.0), (1100.0, 0.1)]
-    assert set(draw_sweep(found, RunDirectory(tmp_path))) == {"Cost against accuracy"}
 
 
 def test_an_error_of_a_figure_costs_that_figure_alone(

@@ -64,12 +64,6 @@ def test_flags_stay_and_a_sweep_is_one(tmp_path: Path) -> None:
     place = sweep(tmp_path)
     for flags in (["-m"], ["--multirun"], ["-m", "--config-dir=conf"]):
         assert lines(place, *flags) == [*flags, "seed=0,1", *end(place)]
-    assert lines(place, "--config-dir=conf", "--trust") == [
-        "--config-dir=conf",
-        "--multirun",
-        "seed=0,1",
-        *end(place),
-    ]
 
 
 def test_a_run_of_members_is_resumed_as_a_run(tmp_path: Path) -> None:
@@ -245,11 +239,3 @@ def test_nobody_is_asked_where_there_is_no_terminal(
         lines(place)
     assert err.getvalue() == ""
     assert lines(place, "--trust") == lines(place, FOREIGN[0]) == ["--multirun", FOREIGN[0], *end(place)]
-
-
-def test_lines_that_are_typed_again_are_known_one_by_one(tmp_path: Path) -> None:
-    place = sweep(tmp_path, ["seed=1"], [FOREIGN[1], "hydra.searchpath=[evil]"])
-    with pytest.raises(ValueError, match="whoever started it") as told:
-        lines(place, FOREIGN[1])
-    assert "searchpath" in str(told.value)
-    assert "_target_" not in str(told.value)

@@ -128,16 +128,6 @@ def test_a_table_has_the_best_in_bold_unless_somebody_says_otherwise(runs: Runs)
     assert "<b>0.125</b>" in shown
 
 
-def test_a_run_is_what_was_read_with_a_function_that_draws(runs: Runs, tmp_path: Path) -> None:
-    (read,) = collect(tmp_path / "0").rows
-    run = Run.of(read, lambda run: {"a": FIGURE})
-    for field in dataclasses.fields(read):
-        assert getattr(run, field.name) == getattr(read, field.name)
-    assert run == Run.of(read, lambda run: {})  # whatever draws them
-    assert run.figures() == {"a": FIGURE}
-    assert repr(run).startswith("<Run completed: kernel=gaussian")
-
-
 def test_a_history_is_read_where_one_was_kept(runs: Runs) -> None:
     with pytest.raises(
         ValueError, match=r"`Run\(history=...\)` cannot be read: the run kept none; got .*npz"

@@ -167,23 +167,6 @@ def test_a_resumed_sweep_runs_what_is_missing_and_ends_with_the_same_bits(
     assert (again / "0" / "run.json").stat().st_mtime_ns == first
 
 
-def test_a_resumed_sweep_of_other_overrides_or_another_version_is_refused(
-    place: Path, batched: tuple[Path, str], tmp_path: Path
-) -> None:
-    for change, words in (
-        (["seed=1"], "must have the overrides of that sweep, or none; got them without"),
-        ([*GRID, "seed=1"], "with 'seed=1'"),
-    ):
-        code, _, err = one(str(place), ["-m", *change, "sweep.resume=runs/batched"])
-        assert code == 1
-        assert words in err
-    _, _, err = one(str(place), ["-m", f"sweep.resume={tmp_path}"])
-    assert "must be the directory of a sweep" in err
-    (tmp_path / "sweep.json").write_text('{"version": "0.0.1", "overrides": [], "hydra": [], "jobs": []}')
-    _, _, err = one(str(place), ["-m", f"sweep.resume={tmp_path}"])
-    assert "written by 0.0.1" in err
-
-
 def test_a_directory_with_another_run_in_it_is_named(tmp_path: Path) -> None:
     about = {"version": records.__version__, "overrides": ["seed=1"], "status": "completed"}
     (tmp_path / "run.json").write_text(json.dumps(about))
