@@ -31,8 +31,6 @@ from staf_torch.sweeps.hydra_compat import (
 
 JOBS = [
     [],
-    ["seed=3"],
-    ["kernel=matern", "kernel.length_scale=0.5"],
     ["kernel.length_scale=0.5", "kernel=matern"],
     ["centers=polygon", "centers.radius=0.2", "centers.shrink.offset=0.1"],
     ["experiment=adp", "adp.critic=0.3"],

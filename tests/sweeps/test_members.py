@@ -48,8 +48,8 @@ def test_members_are_the_rows_of_the_same_sweep() -> None:
     for number, (row, job) in enumerate(zip(rows, sweep, strict=True)):
         assert (row["num"], row["status"], row["reason"]) == (number, "completed", None)
         assert row["metrics"] == pytest.approx(job.metrics, rel=1e-9, abs=1e-12)
-        alone = staf_torch.run(*SHORT, "history=false", *row["overrides"])
-        assert row["metrics"] == pytest.approx(alone.metrics, rel=1e-9, abs=1e-12)
+    alone = staf_torch.run(*SHORT, "history=false", *rows[3]["overrides"])
+    assert rows[3]["metrics"] == pytest.approx(alone.metrics, rel=1e-9, abs=1e-12)
     names = {path.name for path in Path("one").iterdir()}
     assert names == {".hydra", "run.json", "staf.log", "members.json", "metrics.json"}
 
