@@ -217,10 +217,10 @@ class Gap(systems.ControlAffineSystem):
 
 def test_report_finds_the_region_of_a_plant_in_small_units() -> None:
     policy = adp.near_optimal(Gap(), adp.QuadraticCost(25.0, 1.0, dim=1, inputs=1), dt=0.05, horizon=0.2)
-    report = policy.report(states=8, optimum=False)
+    report = policy.report(states=4, optimum=False)
     assert report["regulated"] == 0  # in the box of 1
     assert 1 / 256 <= report["good_spread"] <= 1 / 32
-    near = policy.report(states=8, spread=0.01, optimum=False)
+    near = policy.report(states=4, spread=0.01, optimum=False)
     assert 1 / 512 <= near["good_spread"] <= 1 / 25  # the same region, asked for by another box
 
 
@@ -312,13 +312,6 @@ def test_a_horizon_is_two_time_constants_in_four_quarters_of_whole_periods(
     policy = made(2 / seconds)
     assert policy.steps == steps
     assert policy.substeps == math.ceil(0.1 * 2 / seconds / 0.2)
-
-
-@torch.no_grad()
-def test_report_says_the_share_of_its_states_from_which_the_lqr_would_meet_a_bound() -> None:
-    plant, cost = systems.Linear([[0.0]], [[1.0]]), adp.QuadraticCost(1.0, 1.0, dim=1, inputs=1)
-    policy = adp.near_optimal(plant, cost, dt=1.0, horizon=4.0, low=-1.0, high=1.0)
-    assert policy.report(states=2, spread=1e-3, optimum=False)["strained"] == 0.0
 
 
 # --- rollouts of a base that is held ------------------------------------------------------------------------
