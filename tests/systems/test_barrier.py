@@ -330,9 +330,6 @@ def test_steps_are_half_the_time_to_the_nearest_wall_ahead(name: str) -> None:
         assert float(found[k]) == pytest.approx(0.5 * min(times), rel=1e-9)
 
 
-# --- boxes of inputs ----------------------------------------------------------------------------------------
-
-
 def test_inputs_at_their_bounds_are_inside_and_are_not_pushed_out() -> None:
     bounds = systems.Bounds([-1.0, 0.0], [2.0, INF], 2)
     u = tensor([[-1.0, 0.0], [2.0, 5.0], [0.5, 1.0], [-1.5, 1.0], [2.5, 1.0], [0.5, -0.1]])

@@ -15,7 +15,7 @@ from variants import SYSTEMS, over
 
 from staf_torch import systems
 from staf_torch.numerics.linalg import riccati
-from staf_torch.systems import runge_kutta_step, simulate, trajectory
+from staf_torch.systems import simulate, trajectory
 
 
 class Integrated(systems.ControlAffineSystem):
@@ -121,12 +121,6 @@ def test_a_trajectory_that_escapes_leaves_the_others_alone() -> None:
     )
     first = int((~torch.isfinite(states[1, :, 0])).nonzero()[0])
     assert not torch.isfinite(states[1, first:]).any()
-
-
-def test_one_step_of_a_field_linear_in_time_is_its_taylor_polynomial() -> None:
-    x, dt = tensor([[2.0]]), 0.5
-    expected = 2.0 * sum(dt**k / math.factorial(k) for k in range(5))
-    assert runge_kutta_step(lambda at: at, x, dt).item() == pytest.approx(expected, rel=1e-15)
 
 
 def test_trajectories_can_be_differentiated() -> None:

@@ -158,9 +158,6 @@ def test_the_best_layout_that_fails_is_named_and_none_that_has_no_error() -> Non
     assert float(said[1]) == pytest.approx(float(errors[1]), rel=1e-2)
 
 
-# --- the power function -------------------------------------------------------------------------------------
-
-
 def test_centers_in_one_point_have_their_limit() -> None:
     """At the origin, where a radius that shrinks to nothing leaves all centers in one place."""
     basis = st.StaFBasis(

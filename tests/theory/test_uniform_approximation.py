@@ -93,9 +93,6 @@ def test_near_best_with_weights_is_the_best_that_linear_programming_finds(seed: 
     torch.testing.assert_close(left, fit.error[0])
 
 
-# --- Lawson's iteration -------------------------------------------------------------------------------------
-
-
 def test_a_polynomial_is_found_and_its_rounding_is_enough() -> None:
     z = ball_grid(2, 4, 16)
     exact = uniform(4, 10, seed=9) * 2.0 ** tensor([[-60], [-30], [0], [30]])
@@ -105,9 +102,6 @@ def test_a_polynomial_is_found_and_its_rounding_is_enough() -> None:
     torch.testing.assert_close(found.coefficients / size[:, None], exact / size[:, None], rtol=0, atol=1e-12)
     assert bool((found.error < 1e-14 * size).all())
     assert bool((found.lower <= found.error).all())
-
-
-# --- suprema ------------------------------------------------------------------------------------------------
 
 
 def test_a_number_that_is_none_on_the_grid_is_told_of_its_function_only() -> None:
