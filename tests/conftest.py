@@ -40,7 +40,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def pytest_cmdline_main(config: pytest.Config) -> None:
     """Two processes where there are two cores and whole folders are asked for; `-n` says otherwise."""
     if "PYTEST_XDIST_WORKER" in os.environ:
-        return  # a worker of pytest-xdist, which calls this too, must start none of its own: they would never end
+        return  # a worker of pytest-xdist, which calls this too, starts none of its own: they would never end
     option = config.option
     if getattr(option, "numprocesses", 0) is not None:
         return  # as the command line says; without pytest-xdist there is no such option
