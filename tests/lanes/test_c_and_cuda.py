@@ -19,7 +19,7 @@ from staf_torch.adp.closed_loop import ClosedLoop
 from staf_torch.metrics.ball_error import StateErrorPass
 from staf_torch.optim.objective import NativeError, Precomputed
 
-STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-O1", "-shared", "-fPIC")
+STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-O0", "-shared", "-fPIC")
 needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason="no C compiler")
 
 
@@ -191,7 +191,7 @@ def host_compiler(folder: Path) -> Callable[[str, str], Callable[..., None]]:
         launch += "for (threadIdx.x = 0; threadIdx.x < block; ++threadIdx.x) "
         launch += f"{name}({', '.join(names)}); }}\n"
         library = built(
-            shim + source + launch, folder, f"{name}.cpp", ("g++", "-O1", "-w", "-shared", "-fPIC")
+            shim + source + launch, folder, f"{name}.cpp", ("g++", "-O0", "-w", "-shared", "-fPIC")
         )
 
         def run(grid: Any, block: Any, args: Any) -> None:
