@@ -54,11 +54,10 @@ def test_three_state_optimum() -> None:
     ("plant", "cost", "intervals"),
     [
         (systems.Pendulum(), COST, 40),
-        (systems.VanDerPol(), COST, 40),
         (systems.Pendulum(), adp.BoundedInputCost(1.0, 0.1, 2, 1, bound=8.0), 48),
         (systems.PlanarQuadrotor(), adp.QuadraticCost(1.0, 1.0, 6, 2), None),
     ],
-    ids=["pendulum", "van der pol", "bounded pendulum", "quadrotor"],
+    ids=["pendulum", "bounded pendulum", "quadrotor"],
 )
 def test_gradient_and_control_solve_the_hjb_equation(
     plant: systems.ControlAffineSystem, cost: adp.Cost, intervals: int | None
