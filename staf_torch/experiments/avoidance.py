@@ -11,20 +11,19 @@ import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
-from ..adp import Controller, Feedback, LoopResult, QuadraticCost, SafetyFilter, simulate
+from ..adp import Feedback, LoopResult, QuadraticCost, SafetyFilter
 from ..adp.safety_filter import Constraint
 from ..figures.animation import FRAMES, Curves, Scene, animate
 from ..figures.safety import AvoidanceHistory, draw_avoidance
-from ..figures.style import images
 from ..metrics.safety import constraint_metrics
 from ..numerics.checks import COMMAND_LINE, choice, integer, positive_real
 from ..results.progress import SHOWN, Progress
 from ..results.run_directory import RunDirectory
 from ..settings.chase import placement
 from ..systems import ControlAffineSystem
-from .comparison import Comparison
 from .registry import Metrics, finite
 from .scenes import animation_kind
+from .study import Method, Study, write_history
 from .vehicles import VEHICLES, Vehicle
 from .vehicles import vehicle as made
 
@@ -87,7 +86,7 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
     vehicle = made(cfg, dt)
     discs = (x0.shape[-1] - vehicle.size) // 4
     system = AmongDiscs(vehicle, discs).to(device)
-    cost = vehicle_cost(cfg, vehicle, system._size())
+    cost = vehicle_cost(cfg, vehicle, x0.shape[-1]).to(device)
 
     def wanted(x: Tensor) -> Tensor:
         u: Tensor = vehicle.policy(x[..., : vehicle.size])
@@ -102,42 +101,39 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
         high=list(vehicle.bounds),
         decay=positive_real(COMMAND_LINE, "avoidance.decay", chosen.decay),
         margin=float(chosen.margin),
-    )
-    methods: dict[str, Controller] = {FILTERED: guard.to(device), BARE: Feedback(wanted)}
-    results: dict[str, LoopResult] = {}
-    distances: dict[str, Tensor] = {}
-    comparison = Comparison(_COLUMNS, ("cost_mean", "minimum_margin", "constraint_violations"), _log)
-    for name, controller in methods.items():
-        result = simulate(
-            controller, system, cost.to(device), x0, dt=dt, steps=steps, compile=cfg.adp.compile
-        )
-        results[name], distances[name] = result, distance(result.state, radius, vehicle.size)
+    ).to(device)
+    methods = {
+        name: Method(each, system, cost) for name, each in ((FILTERED, guard), (BARE, Feedback(wanted)))
+    }
+    results = {
+        name: method.run(x0, dt=dt, steps=steps, compile=cfg.adp.compile) for name, method in methods.items()
+    }
+    distances = {name: distance(result.state, radius, vehicle.size) for name, result in results.items()}
+    study = Study("avoidance", _COLUMNS, ("cost_mean", "minimum_margin", "constraint_violations"), _log)
+    for name, result in results.items():
         measured = constraint_metrics(result, distances[name])
         measured["cost"], measured["cost_mean"] = finite(result.cost.median()), finite(result.cost.mean())
-        final = _still(vehicle, result.state[:, -1])
-        measured["final_state_norm"] = finite(final.median())
-        if controller is guard:
-            report = guard.report(result)
-            measured |= {"infeasible": float(len(report["infeasible"])), "acted": report["acted"]}
-            for row in report["infeasible"][:20]:
-                _log.info("scenario %d: at a time no admissible control met the condition", row)
-        prefix, suffix = ("", ", filtered") if controller is guard else (f"{vehicle.label.lower()}_", "")
-        comparison.add(prefix, measured, method=vehicle.label + suffix)
-    out = RunDirectory(directory)
-    told = _telling(distances)
+        measured["final_state_norm"] = finite(_still(vehicle, result.state[:, -1]).median())
+        if name == BARE:
+            study.add(f"{vehicle.label.lower()}_", measured, method=vehicle.label)
+            continue
+        report = guard.report(result)
+        measured |= {"infeasible": float(len(report["infeasible"])), "acted": report["acted"]}
+        for row in report["infeasible"][:20]:
+            _log.info("scenario %d: at a time no admissible control met the condition", row)
+        study.add("", measured, method=f"{vehicle.label}, filtered")
+    out, filtered = RunDirectory(directory), results[FILTERED]
+    shown = _drawn(vehicle, results, distances, _telling(distances), radius)
     if cfg.history:
-        arrays = {"state": results[FILTERED].state, "control": results[FILTERED].control}
-        arrays |= {"distance": distances[FILTERED], f"{vehicle.label.lower()}_distance": distances[BARE]}
-        arrays["running_cost"] = results[FILTERED].running_cost
-        with out.history(len(x0), steps + 1) as writer:
-            writer.add({name: array.cpu().numpy() for name, array in arrays.items()})
-            writer.close(time=results[BARE].time.numpy())
-    comparison.write(out, "avoidance")
+        arrays = {"state": filtered.state, "control": filtered.control, "distance": distances[FILTERED]}
+        arrays |= {
+            f"{vehicle.label.lower()}_distance": distances[BARE],
+            "running_cost": filtered.running_cost,
+        }
+        write_history(out, filtered.time, arrays)
     if kind is not None:
-        out.figure("avoidance", animate(_scene(vehicle, results, distances, told, radius), kind))
-    if cfg.figures:
-        out.figure("avoidance", images(draw_avoidance(_drawn(vehicle, results, distances, told, radius))))
-    return out.metrics(comparison.metrics)
+        out.figure("avoidance", animate(_scene(vehicle, shown), kind))
+    return study.write(out, (lambda: draw_avoidance(shown)) if cfg.figures else None)
 
 
 run.animates = True  # type: ignore[attr-defined]
@@ -242,20 +238,13 @@ def _drawn(
     )
 
 
-def _scene(
-    vehicle: Vehicle,
-    results: dict[str, LoopResult],
-    distances: dict[str, Tensor],
-    row: int,
-    radius: float,
-) -> Scene:
+def _scene(vehicle: Vehicle, drawn: AvoidanceHistory) -> Scene:
     """The scenario in motion: the vehicle under the filter, the discs, and the distance to the nearest."""
-    drawn = _drawn(vehicle, results, distances, row, radius)
     names = f"{vehicle.label}, filtered", vehicle.label
     # Nothing moves to look at once the mass is home: two thirds of the time are shown.
     at = np.unique(np.linspace(0, 2 * (len(drawn.time) - 1) // 3, FRAMES).round().astype(int))
     both = np.stack([drawn.distances[name][at] for name in names], axis=1)
-    edges = np.full((*drawn.discs[at].shape[:2], 1), radius)
+    edges = np.full((*drawn.discs[at].shape[:2], 1), drawn.radius)
     return Scene(
         title=f"the filtered {vehicle.label}, and its way alone (dotted)",
         time=drawn.time[at],

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 import logging
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from omegaconf import DictConfig
@@ -28,16 +27,14 @@ from ..adp import (
     Measured,
     ParametricPlant,
     QuadraticCost,
-    simulate,
 )
 from ..figures.adaptation import FaultPicture, draw_faults
-from ..figures.style import images
 from ..numerics.checks import COMMAND_LINE, choice, flag, integer, positive_real
 from ..results.progress import SHOWN, Progress
 from ..results.run_directory import RunDirectory
 from ..settings.chase import plain
-from ..tables import Style, Table
-from .registry import Metrics, finite
+from .registry import Metrics
+from .study import Method, Study
 
 _log = logging.getLogger(__name__)
 _COLUMNS = {
@@ -77,31 +74,25 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
     rows = integer(COMMAND_LINE, "trajectories", cfg.trajectories, least=1)
     duration = positive_real(COMMAND_LINE, "duration", cfg.duration)
     generator = torch.Generator().manual_seed(integer(COMMAND_LINE, "seed", cfg.seed, least=0))
-    table: list[dict[str, Any]] = []
+    study = Study("faults", _COLUMNS, ("cost_median", "cost_max", "regulated"), _log, digits=5)
     pictures: dict[str, FaultPicture] = {}
-    metrics: Metrics = {}
     for name in plain(cfg.faults.cases):
         choice(COMMAND_LINE, "faults.cases", name, tuple(CASES))
         case = CASES[name](rows, generator)
-        results = {
-            method: _simulated(case, control, duration) for method, control in _controllers(case).items()
-        }
+        results = {method: _run(case, control, duration) for method, control in _controllers(case).items()}
         best = case.optimum()
         for method, result in results.items():
-            measured = _measured(case, method, result, best)
-            table.append({"case": name.replace("_", " "), "method": method} | measured)
-            key = f"{name}_{method.replace(' ', '_')}_"
-            metrics |= {key + what: finite(value) for what, value in measured.items() if value is not None}
-            _log.info(
-                "%-12s %-8s cost %.5g, largest %.5g, regulated %.4g",
-                *(name, method, measured["cost_median"], measured["cost_max"], measured["regulated"]),
+            measured = _measured(case, result, best)
+            if method == "adaptive":
+                measured |= _learned(case, result)
+            study.add(
+                f"{name}_{method.replace(' ', '_')}_",
+                {what: value for what, value in measured.items() if value is not None},
+                case=name.replace("_", " "),
+                method=method,
             )
         pictures[name.replace("_", " ")] = _picture(case, results)
-    out = RunDirectory(directory)
-    out.table("faults", dataclasses.replace(Table.of(table, _COLUMNS), style=Style(digits=5)))
-    if figures:
-        out.figure("faults", images(draw_faults(pictures)))
-    return out.metrics(metrics)
+    return study.write(RunDirectory(directory), (lambda: draw_faults(pictures)) if figures else None)
 
 
 def short_period(rows: int, generator: torch.Generator) -> Case:
@@ -226,7 +217,7 @@ class _Informed(torch.nn.Module):
 
 def _controllers(case: Case) -> dict[str, Controller]:
     """What the state and noise are measured for, by name: the last parameters are seen by who knows them."""
-    n, p = case.model._size(), case.model.parameters_count
+    n, p = case.x0.shape[-1], case.model.parameters_count
     design = LQR(case.model.believing(_design(case)), case.cost, period=case.dt)
     later = [*range(n), *range(n + p, n + 2 * p)]
     return {
@@ -249,43 +240,42 @@ def _design(case: Case) -> Tensor:
     return theta
 
 
-def _simulated(case: Case, controller: Controller, duration: float) -> LoopResult:
+def _run(case: Case, controller: Controller, duration: float) -> LoopResult:
     plant = ChangingPlant(case.model)
     z0 = plant.start(case.x0, case.before, case.after, case.at)
     every = max(1, round(_RECORDED / case.dt))
     steps = every * max(1, round(duration / case.dt / every))
-    return simulate(controller, plant, plant.cost(case.cost), z0, dt=case.dt, steps=steps, every=every)
+    return Method(controller, plant, plant.cost(case.cost)).run(z0, dt=case.dt, steps=steps, every=every)
 
 
-def _measured(case: Case, method: str, result: LoopResult, best: Tensor | None) -> dict[str, float | None]:
-    n = case.model._size()
+def _measured(case: Case, result: LoopResult, best: Tensor | None) -> dict[str, float | None]:
     late = result.time >= result.time[-1] - _SETTLED
-    regulated = (result.state[:, late, :n].norm(dim=-1) < case.near).all(-1) & ~result.diverged
+    norm = result.state[:, late, : case.x0.shape[-1]].norm(dim=-1)
+    regulated = (norm < case.near).all(-1) & ~result.diverged
     ratio = None if best is None else torch.where(result.diverged, torch.inf, result.cost / best)
-    row: dict[str, float | None] = {
+    return {
         "cost_median": float(result.cost.median()),
         "cost_max": float(result.cost.max()),
         "ratio_median": None if ratio is None else float(ratio.median()),
         "ratio_max": None if ratio is None else float(ratio.max()),
         "regulated": float(regulated.double().mean()),
-        "found_median": None,
-        "parameter_error": None,
     }
-    if method == "adaptive":
-        now = case.adaptive.adaptation(result.identifier)
-        if case.adaptive.law.alarm is None:  # found: the model is certain enough for the first time
-            found = (now.certain.cumsum(1) == 0).sum(1) * (result.time[1] - result.time[0])
-        else:
-            alarmed = now.alarmed_at[:, -1]
-            found = torch.where(alarmed < 0, torch.inf, alarmed - case.at.to(alarmed))
-        row["found_median"] = float(found.median())
-        error = (now.estimate.theta[:, -1] - case.after).abs() / case.after.abs().clamp(min=1.0)
-        row["parameter_error"] = float(error.max())
-    return row
+
+
+def _learned(case: Case, result: LoopResult) -> dict[str, float | None]:
+    """When the adaptive policy had found the plant, in the median, and its largest error at the end."""
+    now = case.adaptive.adaptation(result.identifier)
+    if case.adaptive.law.alarm is None:  # found: the model is certain enough for the first time
+        found = (now.certain.cumsum(1) == 0).sum(1) * (result.time[1] - result.time[0])
+    else:
+        alarmed = now.alarmed_at[:, -1]
+        found = torch.where(alarmed < 0, torch.inf, alarmed - case.at.to(alarmed))
+    error = (now.estimate.theta[:, -1] - case.after).abs() / case.after.abs().clamp(min=1.0)
+    return {"found_median": float(found.median()), "parameter_error": float(error.max())}
 
 
 def _picture(case: Case, results: dict[str, LoopResult]) -> FaultPicture:
-    n, adaptive = case.model._size(), results["adaptive"]
+    n, adaptive = case.x0.shape[-1], results["adaptive"]
     now = case.adaptive.adaptation(adaptive.identifier)
     time = adaptive.time.numpy()
     truth = torch.where((adaptive.time < case.at[0])[:, None], case.before[0], case.after[0])

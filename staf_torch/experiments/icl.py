@@ -10,15 +10,14 @@ import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
-from ..adp import ConcurrentTracker, LoopResult, Measured, ParametricPlant, QuadraticCost, simulate
+from ..adp import ConcurrentTracker, Measured, ParametricPlant, QuadraticCost
 from ..figures.adaptation import GainSets, draw_gain_sets
-from ..figures.style import images
 from ..numerics.checks import COMMAND_LINE, fail, flag, integer, non_negative, positive_real, real, vector
 from ..results.progress import SHOWN, Progress
 from ..results.run_directory import RunDirectory
 from ..settings.chase import plain
-from .comparison import Comparison
 from .registry import Metrics
+from .study import Method, Study
 
 _log = logging.getLogger(__name__)
 SOURCES = {"integral": "integral", "slope": "derivative"}
@@ -57,30 +56,26 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
         raise fail(COMMAND_LINE, "settle_time", "must be before the end", cfg.settle_time)
     rms = {name: _rms(each.error[:, late]) for name, each in found.items()}
     rms_theta = {name: _rms(each.theta[:, late] - plant.theta) for name, each in found.items()}
-    comparison = Comparison(_COLUMNS, ("error_median", "parameter_error_median"), _log)
+    study = Study("icl", _COLUMNS, ("error_median", "parameter_error_median"), _log, digits=4)
     for name, each in found.items():
         measured = {"diverged": float(each.diverged)}
         for what, values in (("error", rms[name]), ("parameter_error", rms_theta[name])):
             parts = {"median": values.median(), "best": values.min(), "worst": values.max()}
             measured |= {f"{what}_{key}": float(value) for key, value in parts.items()}
-        comparison.add(f"{name}_", measured, method=name)
+        study.add(f"{name}_", measured, method=name)
     for what, values_of in (("error", rms), ("parameter_error", rms_theta)):
         better = (values_of["integral"] < values_of["derivative"]).double().mean()
-        comparison.metrics[f"integral_better_{what}"] = float(better)
-    out = RunDirectory(directory)
-    comparison.write(out, "icl", digits=4)
-    if figures:
-        shown = int(rms_theta["integral"].argmin())
-        picture = GainSets(
-            time=time.numpy(),
-            parameters=found["integral"].theta[shown].numpy(),
-            truth=plant.theta.numpy(),
-            error={name: values.numpy() for name, values in rms.items()},
-            parameter_error={name: values.numpy() for name, values in rms_theta.items()},
-            followed={name: each.error[shown].norm(dim=-1).numpy() for name, each in found.items()},
-        )
-        out.figure("icl", images(draw_gain_sets(picture)))
-    return out.metrics(comparison.metrics)
+        study.metrics[f"integral_better_{what}"] = float(better)
+    shown = int(rms_theta["integral"].argmin())
+    picture = GainSets(
+        time=time.numpy(),
+        parameters=found["integral"].theta[shown].numpy(),
+        truth=plant.theta.numpy(),
+        error={name: values.numpy() for name, values in rms.items()},
+        parameter_error={name: values.numpy() for name, values in rms_theta.items()},
+        followed={name: each.error[shown].norm(dim=-1).numpy() for name, each in found.items()},
+    )
+    return study.write(RunDirectory(directory), (lambda: draw_gain_sets(picture)) if figures else None)
 
 
 def _followed(cfg: DictConfig, plant: ParametricPlant, gains: dict[str, Tensor], source: str) -> Followed:
@@ -91,20 +86,13 @@ def _followed(cfg: DictConfig, plant: ParametricPlant, gains: dict[str, Tensor],
     noise = real(COMMAND_LINE, "icl.noise", cfg.icl.noise)
     size = integer(COMMAND_LINE, "icl.size", cfg.icl.size, 1)
     start = [*vector(COMMAND_LINE, "initial_state", plain(cfg.initial_state), 2), 1.0, 0.0, 1.0]
-    tracker = ConcurrentTracker(
-        plant,
-        reference,
-        source=source,
-        size=size,
-        feedback=gains["feedback"],
-        gain=gains["gain"],
-        rate=gains["rate"],
-        length=gains["length"],
-    )
-    result = simulate(
+    tracker = ConcurrentTracker(plant, reference, source=source, size=size, **gains)
+    method = Method(
         Measured(tracker, noise=[noise, noise, 0.0, 0.0, 0.0], dim=5),
         plant,
         QuadraticCost(1.0, 1.0, 5, 2, output=lambda z: z[..., :2] - reference(z)[0]),
+    )
+    result = method.run(
         torch.tensor([start], dtype=torch.float64).repeat(len(gains["rate"]), 1),
         dt=dt,
         steps=every * max(1, round(duration / dt / every)),
@@ -112,7 +100,8 @@ def _followed(cfg: DictConfig, plant: ParametricPlant, gains: dict[str, Tensor],
         seed=integer(COMMAND_LINE, "seed", cfg.seed, least=0),
     )
     theta = tracker.tracking(result.identifier).theta.clone()  # without the stacks beside it
-    return Followed(result.time, _tracking_error(result), theta, int(result.diverged.sum()))
+    error = result.state[..., :2] - reference(result.state)[0]
+    return Followed(result.time, error, theta, int(result.diverged.sum()))
 
 
 def published() -> ParametricPlant:
@@ -161,11 +150,6 @@ def _gains(cfg: DictConfig) -> dict[str, Tensor]:
             )
         found[name] = low + (high - low) * drawn[:, k]
     return found
-
-
-def _tracking_error(result: LoopResult) -> Tensor:
-    """x - xd, (B, T, 2)."""
-    return result.state[..., :2] - reference(result.state)[0]
 
 
 def _rms(values: Tensor) -> Tensor:

@@ -1,0 +1,130 @@
+"""The frame of a study: methods beside each other, of each a row, metrics and a line of the log."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from torch import Tensor
+
+from ..adp import Controller, Cost, LoopResult, simulate
+from ..figures.style import images
+from ..results.run_directory import Printable, RunDirectory
+from ..systems import Plant
+from ..tables import Style, Table
+from ..tables.columns import significant
+from .registry import Metrics, finite
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Drawing = Callable[[], "Figure"]
+
+
+class Method(NamedTuple):
+    """What a study compares: a controller, the plant that it steers, and what is paid there."""
+
+    controller: Controller
+    plant: Plant
+    cost: Cost
+    options: Mapping[str, Any] = {}  # of `simulate`, beside those that all methods share
+
+    def run(self, x0: Tensor, **shared: Any) -> LoopResult:
+        """Run the closed loop from the states of the plant, (B, n)."""
+        return simulate(self.controller, self.plant, self.cost, x0, **shared, **self.options)
+
+
+class Study:
+    """Collect what methods have reached, in the order of the table, and write it.
+
+    Args:
+        name: of the table.
+        columns: of the table: name of a number or label -> heading.
+        logged: numbers that the log shows of a method; empty: no line.
+        log: where the study logs.
+        digits: of the table.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        columns: Mapping[str, str],
+        logged: Sequence[str],
+        log: logging.Logger,
+        digits: int = 3,
+    ) -> None:
+        self._name, self._columns, self._logged, self._log = name, dict(columns), tuple(logged), log
+        self._style = Style(digits=digits)
+        self.rows: list[dict[str, Any]] = []
+        self.metrics: Metrics = {}
+
+    def add(
+        self,
+        prefix: str,
+        measured: Mapping[str, float | None],
+        more: Mapping[str, float | str | None] | None = None,
+        **labels: str,
+    ) -> None:
+        """Add a method.
+
+        Args:
+            prefix: of its names in `metrics.json`; empty for the method that the study is about.
+            measured: name -> number, or None where there is none.
+            more: what the table has of it and `metrics.json` has not, as times.
+            labels: what the row is called, by column.
+        """
+        self.rows.append(labels | dict(measured) | dict(more or {}))
+        self.metrics |= {prefix + name: finite(value) for name, value in measured.items()}
+        if self._logged:
+            shown = [f"{name.replace('_', ' ')} {significant(measured[name], 5)}" for name in self._logged]
+            self._log.info("%s: %s", ", ".join(labels.values()), ", ".join(shown))
+
+    def write_table(self, out: RunDirectory) -> None:
+        """Write the table of the methods so far."""
+        table = Table.of(self.rows, self._columns)
+        out.table(self._name, dataclasses.replace(table, style=self._style))
+
+    def write(self, out: RunDirectory, drawing: Drawing | None, figure: str | None = None) -> Metrics:
+        """Write the table, the figure where one is wanted, and `metrics.json` at last.
+
+        Args:
+            out: the run directory.
+            drawing: draws the figure; None: it is not wanted.
+            figure: its name, that of the table by default.
+        """
+        self.write_table(out)
+        if drawing is not None:
+            out.figure(figure or self._name, images(drawing()))
+        return out.metrics(self.metrics)
+
+
+def report(
+    out: RunDirectory,
+    log: logging.Logger,
+    name: str,
+    table: Table,
+    drawing: Drawing | None,
+    *,
+    shown: Printable | Sequence[Printable] = (),
+    heading: str = "",
+) -> None:
+    """Write a table and the figure of the same name, and log the table below a heading."""
+    text = out.table(name, table, shown=shown)
+    for line in [heading, *text.splitlines()] if heading else text.splitlines():
+        log.info("%s", line)
+    if drawing is not None:
+        out.figure(name, images(drawing()))
+
+
+def label_key(label: str) -> str:
+    """Return a method's label as it stands in the names of metrics: lower case, words joined by _."""
+    return "_".join(label.lower().replace(",", "").replace("-", "_").split())
+
+
+def write_history(out: RunDirectory, time: Tensor, arrays: Mapping[str, Tensor]) -> None:
+    """Write `history.npz`: time (T,), and (B, T, ...) arrays by their names."""
+    with out.history(*next(iter(arrays.values())).shape[:2]) as writer:
+        writer.add({name: array.cpu().numpy() for name, array in arrays.items()})
+        writer.close(time=time.numpy())
