@@ -2,30 +2,29 @@
 
 from __future__ import annotations
 
-import dataclasses
 import logging
 import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from omegaconf import DictConfig, open_dict
 from torch import Tensor
 
-from ..adp import Controller, Feedback, LoopResult, RolloutPolicy
+from ..adp import Controller, Feedback, RolloutPolicy
 from ..adp.problem import AdpProblem
 from ..adp.reference_optimum import optimal_cost
 from ..figures.closed_loop import draw_comparison
-from ..figures.style import images
 from ..metrics.closed_loop import comparison_row, regulated
 from ..numerics.checks import COMMAND_LINE, fail, positive_real, vector
 from ..results.progress import SHOWN, Progress
 from ..results.run_directory import RunDirectory
 from ..settings.adp import adp_problem, changed
 from ..settings.chase import plain
-from ..tables import Style, Table
-from ..tables.columns import significant
+from ..tables import Table
 from .adp import learner, solve
+from .study import Study, label_key
 
 _log = logging.getLogger(__name__)
 _FIXED = {"extrapolated_around": "origin", "half_width": {"radius": 1.0, "offset": None}, "trust": None}
@@ -65,8 +64,8 @@ _COLUMNS = {
 
 def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> dict[str, float | None]:
     """Run every method and fill the run directory; `metrics.json` comes last."""
-    rows: list[dict[str, Any]] = []
-    ratios: dict[str, Tensor] = {}
+    study = Study("comparison", _COLUMNS, ("ratio_median", "ratio_max", "regulated"), _log, digits=4)
+    ratios: dict[str, np.ndarray] = {}
     best: Tensor | None = None
     for name, changes in _ROWS.items():
         problem = variant(cfg, changes)
@@ -74,24 +73,13 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> dict[st
         start = time.perf_counter()
         result = solve(problem, progress)
         seconds = (time.perf_counter() - start) / (problem.steps * len(problem.initial_states))
-        row, ratio = _row(problem, result, best)
-        row |= {"method": name, "microseconds": 1e6 * seconds}
-        rows.append(row)
-        ratios[name] = ratio
-        shown = ("ratio_median", "ratio_max", "regulated")
-        numbers = [significant(row[key], 4) for key in shown]
-        _log.info("%-34s J/J* median %s, max %s, regulated %s", name, *numbers)
-    out = RunDirectory(directory)
-    out.table("comparison", dataclasses.replace(Table.of(rows, _COLUMNS), style=Style(digits=4)))
-    if cfg.figures:
-        drawn = {name: ratio.cpu().numpy() for name, ratio in ratios.items()}
-        out.figure("adp_comparison", images(draw_comparison(drawn)))
-    metrics: dict[str, float | None] = {}
-    for row in rows:
-        prefix = "_".join(row["method"].lower().replace(",", "").replace("-", "_").split())
-        measured = {key: value for key, value in row.items() if key not in ("method", "microseconds")}
-        metrics |= {f"{prefix}_{key}": value for key, value in measured.items()}
-    return out.metrics(metrics)
+        ratio = torch.where(result.diverged, torch.inf, result.cost / best)
+        functions, points = _size(problem.controller)
+        row = {"functions": functions, "points": points} | comparison_row(result, ratio)
+        study.add(f"{label_key(name)}_", row, {"microseconds": 1e6 * seconds}, method=name)
+        ratios[name] = torch.where(regulated(result), ratio, torch.inf).cpu().numpy()
+    drawing = (lambda: draw_comparison(ratios)) if cfg.figures else None
+    return study.write(RunDirectory(directory), drawing, "adp_comparison")
 
 
 def variant(cfg: DictConfig, changes: dict[str, Any]) -> AdpProblem:
@@ -118,13 +106,6 @@ def _optimum(problem: AdpProblem) -> Tensor:
             f"shooting (adp.optimum.shooting); got {type(problem.system).__name__}."
         )
     return best
-
-
-def _row(problem: AdpProblem, result: LoopResult, best: Tensor) -> tuple[dict[str, Any], Tensor]:
-    ratio = torch.where(result.diverged, torch.inf, result.cost / best)
-    functions, points = _size(problem.controller)
-    row = {"functions": functions, "points": points} | comparison_row(result, ratio)
-    return row, torch.where(regulated(result), ratio, torch.inf)
 
 
 def _size(controller: Controller) -> tuple[int, int]:

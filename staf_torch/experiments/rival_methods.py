@@ -219,7 +219,7 @@ def ipopt_program(casadi: Any, case: Case, problem: SampledProblem, steps: int) 
 
 
 @dataclasses.dataclass(frozen=True)
-class Method:
+class Rival:
     """A row of the table."""
 
     name: str
@@ -252,16 +252,16 @@ class Method:
 METHODS = {
     method.name: method
     for method in (
-        Method("LQR", lqr, ("scipy",)),
-        Method("discrete LQR", discrete_lqr, ("scipy",)),
-        Method("near_optimal", near_optimal, ("scipy",), (steered,)),
-        Method("near_optimal planned", planned, ("scipy",), (steered,)),
-        Method("GlobalValue", global_value, ("scipy",)),
-        Method("box-DDP", box_ddp, ("scipy",), (steered,)),
-        Method("PathIntegral", path_integral, ("scipy",), (steered,)),
-        Method("plan followed", plan, ("scipy",), (steered,)),
-        Method("IPOPT", ipopt, ("casadi",), (ipopt_program,), slow=True),
-        Method("MPPI", mppi, ("pytorch-mppi",), slow=True),
+        Rival("LQR", lqr, ("scipy",)),
+        Rival("discrete LQR", discrete_lqr, ("scipy",)),
+        Rival("near_optimal", near_optimal, ("scipy",), (steered,)),
+        Rival("near_optimal planned", planned, ("scipy",), (steered,)),
+        Rival("GlobalValue", global_value, ("scipy",)),
+        Rival("box-DDP", box_ddp, ("scipy",), (steered,)),
+        Rival("PathIntegral", path_integral, ("scipy",), (steered,)),
+        Rival("plan followed", plan, ("scipy",), (steered,)),
+        Rival("IPOPT", ipopt, ("casadi",), (ipopt_program,), slow=True),
+        Rival("MPPI", mppi, ("pytorch-mppi",), slow=True),
     )
 }
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import dataclasses
 import logging
 import time
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -15,16 +16,15 @@ from torch import Tensor
 
 from ..adp import BoxDDP, SampledProblem
 from ..figures.rivals import draw_rivals
-from ..figures.style import images
 from ..numerics.checks import COMMAND_LINE, choice, integer
 from ..results.progress import SHOWN, Progress
 from ..results.run_directory import RunDirectory
 from ..settings.chase import plain
-from ..tables import Style, Table
 from ..tables.columns import significant
-from .registry import Metrics, finite
-from .rival_methods import METHODS, Begin, Method, UnsuitableError, ipopt_program
+from .registry import Metrics
+from .rival_methods import METHODS, Begin, Rival, UnsuitableError, ipopt_program
 from .rival_plants import CASES, Case
+from .study import Study, label_key
 
 _log = logging.getLogger(__name__)
 _ROUNDED = 1e-6  # of the range of an input, beyond which it violates its bound: solvers round
@@ -60,83 +60,70 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
     """Run every method on every plant and fill the run directory, the table after every plant; `metrics.json`
     comes last."""
     settings = cfg.rivals
-    cases = [
-        CASES[str(choice(COMMAND_LINE, "rivals.plants", name, tuple(CASES)))]
-        for name in plain(settings.plants)
-    ]
-    chosen = [
-        METHODS[str(choice(COMMAND_LINE, "rivals.methods", name, tuple(METHODS)))]
-        for name in plain(settings.methods)
-    ]
+    cases, chosen = _chosen("plants", settings.plants, CASES), _chosen("methods", settings.methods, METHODS)
     states = integer(COMMAND_LINE, "rivals.states", settings.states, least=1)
     slow = min(states, integer(COMMAND_LINE, "rivals.slow", settings.slow, least=1))
     calls = integer(COMMAND_LINE, "rivals.calls", settings.calls, least=1)
     seed = integer(COMMAND_LINE, "seed", cfg.seed, least=0)
-    rows: list[dict[str, Any]] = []
-    out = RunDirectory(directory)
+    study, out = Study("rivals", _COLUMNS, (), _log, digits=5), RunDirectory(directory)
     with progress.over(len(cases), "plants") as advance:
         for case in cases:
-            rows += compare(case, chosen, case.states(states, seed), calls, slow)
-            out.table("rivals", dataclasses.replace(Table.of(rows, _COLUMNS), style=Style(digits=5)))
+            for method, measured, more in compare(case, chosen, case.states(states, seed), calls, slow):
+                study.add(f"{case.name}_{label_key(method)}_", measured, more, plant=case.name, method=method)
+            study.write_table(out)
             advance(1)
-    if cfg.figures:
-        out.figure("rivals", images(draw_rivals(rows)))
-    measured = ("ratio_median", "ratio_max", "regulated", "violations")
-    return out.metrics(
-        {
-            f"{row['plant']}_{_key(row['method'])}_{name}": finite(row[name])
-            for row in rows
-            for name in measured
-        }
-    )
+    return study.write(out, (lambda: draw_rivals(study.rows)) if cfg.figures else None)
+
+
+def _chosen(what: str, names: object, known: Mapping[str, Any]) -> list[Any]:
+    return [known[str(choice(COMMAND_LINE, f"rivals.{what}", name, tuple(known)))] for name in plain(names)]
+
+
+class Row(NamedTuple):
+    """What a method reached on one plant."""
+
+    method: str
+    measured: dict[str, float | None]  # of its controls, for the metrics; None: it did not run
+    more: dict[str, Any]  # times, sizes and a note, for the table
 
 
 def compare(
-    case: Case, methods: list[Method], x0: Tensor, calls: int, slow: int | None = None
-) -> list[dict[str, Any]]:
+    case: Case, rivals: Sequence[Rival], x0: Tensor, calls: int, slow: int | None = None
+) -> list[Row]:
     """The rows of one plant; slow methods run from so many of the states and a fifth of the calls are timed,
     with a note of it; None: as many as the others."""
     problem = case.problem()
     episodes: dict[str, Episode] = {}
     times: dict[str, list[float]] = {}
     notes: dict[str, str] = {}
-    for method in methods:
-        if method.missing is not None:
-            notes[method.name] = f"{method.missing} is not installed"
+    for rival in rivals:
+        if rival.missing is not None:
+            notes[rival.name] = f"{rival.missing} is not installed"
             continue
         began = time.process_time()
         try:
-            begin = method.prepare(case)
+            begin = rival.prepare(case)
             begin(x0[:1])  # a plan of the whole episode is made here
         except UnsuitableError as why:
-            notes[method.name] = str(why)
+            notes[rival.name] = str(why)
             continue
         offline = time.process_time() - began
-        few = method.slow and slow is not None and slow < len(x0)
+        few = rival.slow and slow is not None and slow < len(x0)
         if few:
-            notes[method.name] = f"from {slow} of the {len(x0)} states"
-        tried = x0[:slow] if few else x0
-        episodes[method.name] = play(problem, begin, tried, case.steps, offline)
-        times[method.name] = timed(problem, begin, x0[:1], -(-calls // 5) if few else calls)
-        _log.info(
-            "%s, %s: mean cost %s",
-            case.name,
-            method.name,
-            significant(float(episodes[method.name].cost.mean()), 5),
-        )
+            notes[rival.name] = f"from {slow} of the {len(x0)} states"
+        episode = play(problem, begin, x0[:slow] if few else x0, case.steps, offline)
+        episodes[rival.name] = episode
+        times[rival.name] = timed(problem, begin, x0[:1], -(-calls // 5) if few else calls)
+        _log.info("%s, %s: mean cost %s", case.name, rival.name, significant(float(episode.cost.mean()), 5))
     best = best_known(case, problem, x0, list(episodes.values()))
-    rows = []
-    for method in methods:
-        row: dict[str, Any] = {"plant": case.name, "method": method.name, "note": notes.get(method.name)}
-        row |= {"lines": method.lines, "megabytes": None if method.missing else method.megabytes}
-        row |= dict.fromkeys(
-            ("ratio_median", "ratio_max", "regulated", "violations", "us_median", "us_p99", "offline")
+    return [
+        Row(
+            rival.name,
+            _measured(episodes.get(rival.name), best, case.left),
+            _told(rival, episodes.get(rival.name), times.get(rival.name), notes.get(rival.name)),
         )
-        if method.name in episodes:
-            episode = episodes[method.name]
-            row |= _measured(episode, times[method.name], best[: len(episode.cost)], case.left)
-        rows.append(row)
-    return rows
+        for rival in rivals
+    ]
 
 
 @torch.no_grad()
@@ -206,7 +193,10 @@ def _by_ipopt(case: Case, problem: SampledProblem, x0: Tensor, control: Tensor, 
     return torch.tensor(found, dtype=torch.float64)
 
 
-def _measured(episode: Episode, times: list[float], best: Tensor, share: float) -> dict[str, Any]:
+def _measured(episode: Episode | None, best: Tensor, share: float) -> dict[str, float | None]:
+    if episode is None:
+        return dict.fromkeys(("ratio_median", "ratio_max", "regulated", "violations"))
+    best = best[: len(episode.cost)]
     up = episode.left <= share * best
     ratio = (episode.cost / best)[up]
     return {
@@ -214,11 +204,17 @@ def _measured(episode: Episode, times: list[float], best: Tensor, share: float) 
         "ratio_max": float(ratio.max()) if len(ratio) else None,
         "regulated": float(up.double().mean()),
         "violations": episode.outside,
-        "us_median": float(np.median(times)),
-        "us_p99": float(np.quantile(times, 0.99)),
-        "offline": episode.offline,
     }
 
 
-def _key(method: str) -> str:
-    return method.lower().replace(" ", "_").replace("-", "_")
+def _told(
+    rival: Rival, episode: Episode | None, times: list[float] | None, note: str | None
+) -> dict[str, Any]:
+    return {
+        "us_median": None if times is None else float(np.median(times)),
+        "us_p99": None if times is None else float(np.quantile(times, 0.99)),
+        "offline": None if episode is None else episode.offline,
+        "megabytes": None if rival.missing else rival.megabytes,
+        "lines": rival.lines,
+        "note": note,
+    }

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
-from typing import NamedTuple
 
 import torch
 from omegaconf import DictConfig
@@ -13,18 +12,15 @@ from torch import Tensor
 from ..adp import (
     LQR,
     BoxFilter,
-    Controller,
     Cost,
     DirectShooting,
     Feedback,
     LoopResult,
     QuadraticCost,
     SafetyFilter,
-    simulate,
 )
 from ..adp.safety_filter import walls
 from ..figures.safety import BoxHistory, draw_box
-from ..figures.style import images
 from ..metrics.safety import constraint_metrics
 from ..numerics.checks import COMMAND_LINE, fail, flag, integer, positive_real
 from ..results.progress import SHOWN, Progress
@@ -32,8 +28,8 @@ from ..results.run_directory import RunDirectory
 from ..settings.adp import make_cost, plant
 from ..settings.chase import initial_states, placement, plain
 from ..systems import Barrier, ControlAffineSystem, Plant
-from .comparison import Comparison
 from .registry import Metrics, finite
+from .study import Method, Study, label_key, write_history
 
 _log = logging.getLogger(__name__)
 _COLUMNS = {
@@ -47,16 +43,6 @@ _COLUMNS = {
     "largest_control": "largest |u|",
 }
 _NAMED = 20  # starts that the log lists
-
-
-class Method(NamedTuple):
-    """What is compared: a controller, the coordinates it runs in, and how."""
-
-    controller: Controller
-    plant: Plant
-    cost: Cost
-    substeps: int | tuple[int, int] = 1
-    renew: bool = False
 
 
 def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics:
@@ -74,41 +60,36 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
     steps = max(1, round(positive_real(COMMAND_LINE, "duration", cfg.duration) / dt))
     followed = max(1, round(positive_real(COMMAND_LINE, "safe_box.followed", cfg.safe_box.followed) / dt))
     every = next(k for k in range(max(1, steps // 2000), steps + 1) if steps % k == 0)
-    comparison = Comparison(_COLUMNS, ("cost", "minimum_margin", "constraint_violations"), _log)
+    study = Study("safe_box", _COLUMNS, ("cost", "minimum_margin", "constraint_violations"), _log)
+    best = _optimum(box, cost, box.transform(x0[:1])) if wanted else None
+    study.metrics["optimal_cost"] = best
     results: dict[str, LoopResult] = {}
     margins: dict[str, Tensor] = {}
     compared = methods(cfg, box, cost)
-    best = _optimum(box, cost, box.transform(x0[:1])) if wanted else None
     for name, method in compared.items():
-        results[name] = _simulated(cfg, method, box, x0.to(dtype), steps, every)
+        results[name] = _run(cfg, method, box, x0.to(dtype), steps, every)
         margins[name] = _margin(box, method.plant, results[name])
         measured = _measured(results[name], margins[name], best)
         for what, starts in others.items():
-            tried = _simulated(
-                cfg, method, box, starts.to(dtype), followed, 1 if method.plant is system else followed
-            )
+            recorded = 1 if method.plant is system else followed
+            tried = _run(cfg, method, box, starts.to(dtype), followed, recorded)
             left = constraint_metrics(tried, _margin(box, method.plant, tried))["constraint_violations"]
             measured[f"{what}_fraction"] = (left or 0.0) / len(starts)
-        comparison.add("" if name == "LQR of s" else _prefix(name), measured, method=name)
-    metrics = {"optimal_cost": best} | comparison.metrics | _unavoidable(cfg, box, cost, others)
-    out = RunDirectory(directory)
+        study.add("" if name == "LQR of s" else f"{label_key(name)}_", measured, method=name)
+    study.metrics |= _unavoidable(cfg, box, cost, others)
+    out, first = RunDirectory(directory), results["LQR of s"]
     if cfg.history:
-        first = results["LQR of s"]
         arrays = {"state": box.inverse(first.state), "barrier_state": first.state, "control": first.control}
         arrays |= {"running_cost": first.running_cost, "margin": margins["LQR of s"]}
-        with out.history(*first.state.shape[:2]) as writer:
-            writer.add({name: array.cpu().numpy() for name, array in arrays.items()})
-            writer.close(time=first.time.numpy())
-    comparison.write(out, "safe_box")
-    if cfg.figures:
-        out.figure("safe_box", images(draw_box(_drawn(box, compared, results, margins))))
-    return out.metrics(metrics)
+        write_history(out, first.time, arrays)
+    drawn = _drawn(box, compared, results, margins)
+    return study.write(out, (lambda: draw_box(drawn)) if cfg.figures else None)
 
 
 def methods(cfg: DictConfig, box: Barrier, cost: Cost) -> dict[str, Method]:
     """The LQR in both coordinates, by itself and behind the filters."""
-    system, size, dt = box.plant, box._size(), float(cfg.dt)
-    substeps = 1, integer(COMMAND_LINE, "safe_box.substeps", cfg.safe_box.substeps, least=1)
+    system, size, dt = box.plant, len(box.low), float(cfg.dt)
+    substeps = {"substeps": (1, integer(COMMAND_LINE, "safe_box.substeps", cfg.safe_box.substeps, least=1))}
     of_s = LQR(box, cost)
     paid = QuadraticCost(cost.q, cost.r, size, cost.inputs, output=lambda x: box.coordinates(x))
     lqr = LQR(system, QuadraticCost(cost.q, cost.r, size, cost.inputs))
@@ -116,7 +97,9 @@ def methods(cfg: DictConfig, box: Barrier, cost: Cost) -> dict[str, Method]:
     if flag(COMMAND_LINE, "safe_box.filter", cfg.safe_box.filter):
         held, renewed = (BoxFilter(of_s, box, dt=dt, renewed=renewed) for renewed in (False, True))
         found["LQR of s, filtered"] = Method(Feedback(held), box, cost, substeps)
-        found["LQR of s, filtered, renewed"] = Method(Feedback(renewed), box, cost, substeps, renew=True)
+        found["LQR of s, filtered, renewed"] = Method(
+            Feedback(renewed), box, cost, substeps | {"renew": True}
+        )
         kept = walls(box.low.tolist(), box.high.tolist())
         guard = SafetyFilter(lqr, system, kept, dt=dt, decay=float(cfg.safe_box.decay))
         found["LQR of x, filtered"] = Method(guard, system, paid)
@@ -127,22 +110,11 @@ def methods(cfg: DictConfig, box: Barrier, cost: Cost) -> dict[str, Method]:
     return found
 
 
-def _simulated(
-    cfg: DictConfig, method: Method, box: Barrier, x0: Tensor, steps: int, every: int
-) -> LoopResult:
+def _run(cfg: DictConfig, method: Method, box: Barrier, x0: Tensor, steps: int, every: int) -> LoopResult:
     """Run one method from states x of the box; every ``every``-th step is recorded."""
-    if method.plant is box:
-        x0 = box.transform(x0.double()).to(x0)
-    return simulate(
-        *(method.controller, method.plant, method.cost, x0),
-        dt=float(cfg.dt),
-        steps=steps,
-        every=every,
-        seed=integer(COMMAND_LINE, "seed", cfg.seed, least=0),
-        substeps=method.substeps,
-        renew=method.renew,
-        compile=cfg.adp.compile,
-    )
+    seed = integer(COMMAND_LINE, "seed", cfg.seed, least=0)
+    start = box.transform(x0.double()).to(x0) if method.plant is box else x0
+    return method.run(start, dt=float(cfg.dt), steps=steps, every=every, seed=seed, compile=cfg.adp.compile)
 
 
 def _measured(result: LoopResult, margin: Tensor, best: float | None) -> dict[str, float | None]:
@@ -171,15 +143,11 @@ def _unavoidable(cfg: DictConfig, box: Barrier, cost: Cost, starts: dict[str, Te
     return found
 
 
-def _prefix(name: str) -> str:
-    return "_".join(name.lower().replace(",", "").split()) + "_"
-
-
 def _anywhere(cfg: DictConfig, box: Barrier) -> Tensor:
     """States drawn uniformly from the box, from [-1, 1] around its middle where a wall is missing: (B, n)."""
     count = integer(COMMAND_LINE, "safe_box.states", cfg.safe_box.states, least=1)
     generator = torch.Generator().manual_seed(integer(COMMAND_LINE, "seed", cfg.seed, least=0))
-    share = torch.rand(count, box._size(), dtype=torch.float64, generator=generator)
+    share = torch.rand(count, len(box.low), dtype=torch.float64, generator=generator)
     return (box.floor + (box.ceiling - box.floor) * share).clamp(box.low + 1e-9, box.high - 1e-9)
 
 
@@ -188,7 +156,7 @@ def _beside_walls(cfg: DictConfig, box: Barrier) -> Tensor:
     near = positive_real(COMMAND_LINE, "safe_box.near", cfg.safe_box.near)
     x = _anywhere(cfg, box)
     generator = torch.Generator().manual_seed(integer(COMMAND_LINE, "seed", cfg.seed, least=0))
-    walls = [(k, side) for k in range(box._size()) for side in (0, 1) if bool(box.walled[side, k])]
+    walls = [(k, side) for k in range(len(box.low)) for side in (0, 1) if bool(box.walled[side, k])]
     chosen = torch.randint(len(walls), (len(x),), generator=generator)
     for number, (k, side) in enumerate(walls):
         beside = box.high[k] - near if side else box.low[k] + near
