@@ -40,11 +40,11 @@ from ..settings.chase import make_metrics
 from ..tables.columns import significant
 from .registry import BatchedExperiment, Metrics
 from .scenes import animation_kind, loop_scene
+from .study import log_diverged, write_history
 
 _log = logging.getLogger(__name__)
 _LINEARISED = 8  # rows of a learning controller whose loop is linearised
 _SETTLING = 0.25  # share of the first cost rate of a state, below which it is on its way
-_NAMED = 20  # diverged trajectories that the log lists by number
 
 
 @dataclasses.dataclass(frozen=True)
@@ -95,8 +95,8 @@ class ClosedLoop(BatchedExperiment[LoopSolution]):
         """Fill the run directory with what was solved; `metrics.json` comes last."""
         out = RunDirectory(directory)
         if cfg.history:
-            write_history(out, solution.result)
-        name_the_diverged(solution.result)
+            write_history(out, solution.result.time, recorded(solution.result))
+        log_diverged(_log, solution.result.state[:, 0], solution.result.frozen_at)
         kind = animation_kind(cfg)
         if kind is not None:
             out.figure("closed_loop", animate(loop_scene(adp_problem(cfg), solution.result), kind))
@@ -246,23 +246,10 @@ def learner(controller: Controller) -> ActorCritic | None:
     return controller if isinstance(controller, ActorCritic) else None
 
 
-def write_history(out: RunDirectory, result: LoopResult, **more: Tensor) -> None:
-    """Write `history.npz`: time (T,), and (B, T, ...) arrays of everything recorded, and ``more`` of them."""
+def recorded(result: LoopResult) -> dict[str, Tensor]:
+    """Return what a history holds of a closed loop, by name."""
     names = ("state", "control", "actor_weights", "critic_weights", "running_cost")
-    arrays = {name: getattr(result, name) for name in names} | more
-    with out.history(*result.state.shape[:2]) as writer:
-        writer.add({name: array.cpu().numpy() for name, array in arrays.items()})
-        writer.close(time=result.time.numpy())
-
-
-def name_the_diverged(result: LoopResult) -> None:
-    """One warning a diverged trajectory, up to a number of them."""
-    rows = result.diverged.nonzero().flatten().tolist()
-    for row in rows[:_NAMED]:
-        start = [round(v, 6) for v in result.state[row, 0].tolist()]
-        _log.warning("trajectory %d from %s diverged at t = %.6g s", row, start, float(result.frozen_at[row]))
-    if len(rows) > _NAMED:
-        _log.warning("and %d more trajectories diverged", len(rows) - _NAMED)
+    return {name: getattr(result, name) for name in names}
 
 
 def count_the_restless(cost: Cost, result: LoopResult) -> None:

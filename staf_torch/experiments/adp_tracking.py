@@ -24,7 +24,6 @@ from ..adp import (
     LoopResult,
     QuadraticCost,
     TwoStateTracking,
-    simulate,
     tracking_cost,
 )
 from ..figures.animation import animate
@@ -38,8 +37,9 @@ from ..settings.adp import build, value_basis
 from ..settings.chase import initial_states, placement, plain
 from ..systems import TwoState
 from ..tables.columns import significant
-from .adp import write_history
+from .adp import recorded
 from .scenes import animation_kind, tracking_scene
+from .study import Method, write_history
 
 _log = logging.getLogger(__name__)
 _PARAMETERS = 6
@@ -55,20 +55,13 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> dict[st
     x0 = initial_states(cfg, plant.dim).to(device=device, dtype=dtype)
     dt = positive_real(COMMAND_LINE, "dt", cfg.dt)
     steps = max(1, round(positive_real(COMMAND_LINE, "duration", cfg.duration) / dt))
-    results = {}
     controllers = _controllers(cfg, plant, cost)
-    for name, controller in controllers.items():
-        results[name] = simulate(
-            controller.to(device),
-            plant,
-            cost,
-            x0,
-            dt=dt,
-            steps=steps,
-            seed=integer(COMMAND_LINE, "seed", cfg.seed, least=0),
-            integrator=cfg.adp.integrator,
-            compile=cfg.adp.compile,
-        )
+    shared = {"dt": dt, "steps": steps, "seed": integer(COMMAND_LINE, "seed", cfg.seed, least=0)}
+    shared |= {"integrator": cfg.adp.integrator, "compile": cfg.adp.compile}
+    results = {
+        name: Method(controller.to(device), plant, cost).run(x0, **shared)
+        for name, controller in controllers.items()
+    }
     best = _optimal_cost(plant, cost, x0)
     metrics: dict[str, float | None] = {"optimal_cost": None if best is None else float(best.nanmedian())}
     for name, result in results.items():
@@ -84,7 +77,7 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> dict[st
     parameters = _parameters(identified)
     assert parameters is not None
     if cfg.history:
-        write_history(out, identified, parameters=parameters)
+        write_history(out, identified.time, recorded(identified) | {"parameters": parameters})
     kind = animation_kind(cfg)
     if kind is not None:
         out.figure("tracking", animate(tracking_scene(controllers["identified"], identified), kind))

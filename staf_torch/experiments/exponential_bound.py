@@ -9,7 +9,6 @@ import torch
 from omegaconf import DictConfig
 
 from .. import theory
-from ..figures.style import images
 from ..figures.theory import draw_exponential_bound
 from ..kernels import ExponentialKernel
 from ..numerics.checks import COMMAND_LINE, fail, integer, positive_real
@@ -17,6 +16,7 @@ from ..results.progress import SHOWN, Progress
 from ..results.run_directory import RunDirectory
 from ..settings.chase import ChaseProblem, case_name, chase_problem, numbers
 from ..tables import Table
+from .study import report
 
 Bounds = dict[tuple[float, float], dict[str, float | None]]
 """What was found, by radius and epsilon."""
@@ -43,11 +43,8 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> dict[st
     found = solve(cfg, progress)
     rows = [{"radius": radius, "epsilon": epsilon, **row} for (radius, epsilon), row in found.items()]
     out = RunDirectory(directory)
-    text = out.table("exponential_bound", Table.of(rows, _HEADINGS))
-    if cfg.figures:
-        out.figure("exponential_bound", images(draw_exponential_bound(found)))
-    for line in text.splitlines():
-        _log.info("%s", line)
+    drawing = (lambda: draw_exponential_bound(found)) if cfg.figures else None
+    report(out, _log, "exponential_bound", Table.of(rows, _HEADINGS), drawing)
     metrics = {
         f"{case_name(*case)}.{name}": value for case, row in found.items() for name, value in row.items()
     }

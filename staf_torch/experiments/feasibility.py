@@ -12,14 +12,16 @@ from omegaconf import DictConfig
 from torch import Tensor
 
 from .. import theory
-from ..figures.style import images
 from ..figures.theory import Feasibility, draw_feasibility
 from ..results.progress import SHOWN, Progress
 from ..results.run_directory import RunDirectory
 from ..settings.chase import LocalProblem, case_name, local_problem, numbers
 from ..tables import Table
+from .registry import Metrics
+from .study import report
 
 _log = logging.getLogger(__name__)
+Rows = list[dict[str, float | int | None]]
 
 
 class Needed(NamedTuple):
@@ -39,11 +41,16 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> dict[st
     shown = sorted({*radii, problem.radius})
     needed = solve(problem, shown, epsilons, progress)
     out = RunDirectory(directory)
-    metrics = _write(out, needed, shown, epsilons)
+    rows, wide, metrics = _counted(needed, shown, epsilons)
+    headings = {"radius": "r"} | {f"{epsilon:g}": f"eps = {epsilon:g}" for epsilon in epsilons}
+    drawing = (lambda: draw_feasibility(_drawn(problem, needed, shown, epsilons))) if cfg.figures else None
+    report(
+        *(out, _log, "feasibility", Table.of(rows), drawing),
+        shown=Table.of(wide, headings),
+        heading="Smallest M with sup |V - V^| <= eps on the ball along the trajectory, ideal weights:",
+    )
     pointwise = needed.pointwise[shown.index(problem.radius)]  # (E, T)
     out.text("feasibility_pointwise.csv", _pointwise(problem, pointwise, epsilons).csv())
-    if cfg.figures:
-        out.figure("feasibility", images(draw_feasibility(_drawn(problem, needed, shown, epsilons))))
     return out.metrics(metrics)
 
 
@@ -71,12 +78,11 @@ def _first(good: Tensor, counts: Tensor) -> Tensor:
     return torch.where(good.any(-1), counts[good.int().argmax(-1)], 0)
 
 
-def _write(
-    out: RunDirectory, needed: Needed, radii: list[float], epsilons: list[float]
-) -> dict[str, float | None]:
-    rows: list[dict[str, float | int | None]] = []
-    wide: list[dict[str, float | int | None]] = []
-    metrics: dict[str, float | None] = {}
+def _counted(needed: Needed, radii: list[float], epsilons: list[float]) -> tuple[Rows, Rows, Metrics]:
+    """A row a radius and epsilon, a row a radius with a column an epsilon, and the metrics."""
+    rows: Rows = []
+    wide: Rows = []
+    metrics: Metrics = {}
     for i, radius in enumerate(radii):
         wide.append({"radius": radius})
         for j, epsilon in enumerate(epsilons):
@@ -86,12 +92,7 @@ def _write(
             row = {"radius": radius, "epsilon": epsilon, "count": count}
             rows.append(row | {"least_pointwise": least, "error": error})
             wide[-1][f"{epsilon:g}"] = metrics[f"{case_name(radius, epsilon)}.count"] = count
-    headings = {"radius": "r"} | {f"{epsilon:g}": f"eps = {epsilon:g}" for epsilon in epsilons}
-    text = out.table("feasibility", Table.of(rows), shown=Table.of(wide, headings))
-    _log.info("Smallest M with sup |V - V^| <= eps on the ball along the trajectory, ideal weights:")
-    for line in text.splitlines():
-        _log.info("%s", line)
-    return metrics
+    return rows, wide, metrics
 
 
 def _pointwise(problem: LocalProblem, pointwise: Tensor, epsilons: list[float]) -> Table:

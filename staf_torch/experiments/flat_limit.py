@@ -20,7 +20,6 @@ from torch import Tensor
 
 from ..approximation.basis import StaFBasis, Target
 from ..centers import StateFollowingCenters, probe_points, rings
-from ..figures.style import images
 from ..figures.theory import ErrorPanel, draw_errors
 from ..kernels import ExponentialKernel, GaussianKernel, Kernel
 from ..local_basis import evaluate_scaled, newton_space
@@ -32,6 +31,7 @@ from ..settings.chase import DTYPES, chase_problem, plain
 from ..tables import Table
 from ..targets import Paper
 from .registry import finite
+from .study import report
 
 _log = logging.getLogger(__name__)
 _POINTS = 9  # of the ball at which the approximants are compared
@@ -202,12 +202,10 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> dict[st
     samples = solve(problem, progress)
     found = summary(samples)
     out = RunDirectory(directory)
-    text = out.table("flat_limit", _every(samples), shown=_shown(problem, samples))
-    if figures:
-        out.figure("flat_limit", images(draw_errors(_panels(samples), rows=len(DTYPES))))
-    _log.info("Relative value error against the radius, %s:", type(problem.kernel).__name__)
-    for line in text.splitlines():
-        _log.info("%s", line)
+    drawing = (lambda: draw_errors(_panels(samples), rows=len(DTYPES))) if figures else None
+    heading = f"Relative value error against the radius, {type(problem.kernel).__name__}:"
+    shown = _shown(problem, samples)
+    report(out, _log, "flat_limit", _every(samples), drawing, shown=shown, heading=heading)
     return out.metrics(found)
 
 

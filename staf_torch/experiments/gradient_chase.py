@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+import torch
 from omegaconf import DictConfig
 
 from ..figures.animation import animate
@@ -26,9 +27,9 @@ from ..tables.columns import significant
 from .chase_batch import Outcome, simulate
 from .registry import BatchedExperiment, Metrics
 from .scenes import animation_kind, chase_scene
+from .study import log_diverged
 
 _log = logging.getLogger(__name__)
-_NAMED = 20  # diverged trajectories that the log lists by number
 
 
 @dataclasses.dataclass(frozen=True)
@@ -239,7 +240,8 @@ def _wanted(cfg: DictConfig | PlainSettings, problem: ChaseProblem) -> tuple[boo
 def _finish(out: RunDirectory, solved: ChaseSolution, cfg: DictConfig) -> dict[str, float | None]:
     """What follows the history: the log, the figure, the animation, the metrics."""
     outcome = solved.outcome
-    _name_the_diverged(solved)
+    diverged = torch.where(outcome.diverged_at < 0, torch.inf, outcome.diverged_at * solved.title.dt)
+    log_diverged(_log, solved.starts, diverged, "; its weights are frozen from there on")
     kind = animation_kind(cfg)
     if kind is not None:
         out.figure("chase", animate(chase_scene(chase_problem(cfg), outcome.drawn), kind))
@@ -251,19 +253,6 @@ def _finish(out: RunDirectory, solved: ChaseSolution, cfg: DictConfig) -> dict[s
 
 def _times(title: Title) -> np.ndarray:
     return np.arange(title.times) * title.dt
-
-
-def _name_the_diverged(solved: ChaseSolution) -> None:
-    rows = (solved.outcome.diverged_at >= 0).nonzero().flatten().tolist()
-    for row in rows[:_NAMED]:
-        _log.warning(
-            "trajectory %d from %s diverged at t = %.6g s; its weights are frozen from there on",
-            row,
-            solved.starts[row].tolist(),
-            float(solved.outcome.diverged_at[row]) * solved.title.dt,
-        )
-    if len(rows) > _NAMED:
-        _log.warning("and %d more trajectories diverged", len(rows) - _NAMED)
 
 
 def _summarise(title: Title, metrics: dict[str, float | None]) -> None:

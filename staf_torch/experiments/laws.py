@@ -16,7 +16,6 @@ from omegaconf import DictConfig
 from .. import optim, theory
 from ..engine.predictors import Predictor, Secant, Tangent
 from ..figures.chase import ConvergenceCurve, draw_convergence
-from ..figures.style import images
 from ..metrics.ball_error import StateErrorPass
 from ..numerics.checks import COMMAND_LINE, fail, integer, positive_real, vector
 from ..optim import UpdateLaw
@@ -27,6 +26,7 @@ from ..systems import trajectory
 from ..tables import Table
 from .gradient_chase import solve
 from .registry import finite, log_slope
+from .study import report
 
 _log = logging.getLogger(__name__)
 _STATES = 400  # at which the a-priori constants are taken
@@ -151,11 +151,20 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> dict[st
     promised = promises(problem, excess)
     out = RunDirectory(directory)
     every = Table.of([{name: value for name, value in row.items() if name != "key"} for row in rows])
-    text = out.table("laws", every, shown=Table.of(rows, _HEADINGS))
     out.text("laws.json", json.dumps(rows, indent=2, allow_nan=False) + "\n")
-    if cfg.figures:
-        out.figure("laws", images(draw_convergence(_lines(swept, steps))))
-    _summarise(problem, text, swept, promised, excess)
+    report(
+        *(
+            out,
+            _log,
+            "laws",
+            every,
+            (lambda: draw_convergence(_lines(swept, steps))) if cfg.figures else None,
+        ),
+        shown=Table.of(rows, _HEADINGS),
+        heading=f"Worst over t >= {problem.settle_time:g} s, dt = {problem.dt:g} s, "
+        f"{problem.basis.count} centers:",
+    )
+    _summarise(problem, swept, promised, excess)
     metrics = {
         f"{row['key']}.{name}": value
         for row in rows
@@ -268,16 +277,10 @@ def _lines(swept: list[Curve], steps: list[float]) -> list[ConvergenceCurve]:
 
 def _summarise(
     problem: ChaseProblem,
-    text: str,
     swept: list[Curve],
     promised: dict[str, float | None],
     excess: float,
 ) -> None:
-    _log.info(
-        "Worst over t >= %g s, dt = %g s, %d centers:", problem.settle_time, problem.dt, problem.basis.count
-    )
-    for line in text.splitlines():
-        _log.info("%s", line)
     _log.info("Excess before the correction ~ dt^slope:")
     for curve in swept:
         slope = "-" if curve.slope is None else f"{curve.slope:.2f}"

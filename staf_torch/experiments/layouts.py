@@ -15,13 +15,13 @@ from torch import Tensor
 
 from .. import theory
 from ..centers import ball, cross_polytope, polygon, rings, simplex
-from ..figures.style import images
 from ..figures.theory import LayoutCurve, draw_layouts
 from ..results.progress import SHOWN, Progress
 from ..results.run_directory import RunDirectory
 from ..settings.chase import LocalProblem, local_problem, numbers
 from ..tables import Table
 from .registry import finite, log_slope
+from .study import report
 
 _log = logging.getLogger(__name__)
 _DEGREES = 7  # of `ball`: C(n + k, n) points for k = 0 .. 6
@@ -45,12 +45,10 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> dict[st
     found = solve(problem, radii, progress)
     out = RunDirectory(directory)
     rows = _rows(found, radii)
-    text = out.table("layouts", Table.of(rows), shown=Table.of(rows, _HEADINGS))
-    _log.info("sup |V - V^| on the ball, r = %g, ideal weights, and its slope in r:", problem.radius)
-    for line in text.splitlines():
-        _log.info("%s", line)
-    if cfg.figures:
-        out.figure("layouts", images(draw_layouts(found, problem.radius, np.array(radii))))
+    drawing = (lambda: draw_layouts(found, problem.radius, np.array(radii))) if cfg.figures else None
+    heading = f"sup |V - V^| on the ball, r = {problem.radius:g}, ideal weights, and its slope in r:"
+    shown = Table.of(rows, _HEADINGS)
+    report(out, _log, "layouts", Table.of(rows), drawing, shown=shown, heading=heading)
     metrics: dict[str, float | None] = {}
     for curve in found:
         key = f"{curve.family}{curve.centers}"

@@ -13,7 +13,6 @@ from torch import Tensor
 from ..centers import probe_points
 from ..engine import ChaseResult, chase
 from ..figures.chase import MemoryPicture, draw_memory
-from ..figures.style import images
 from ..numerics.checks import COMMAND_LINE, fail, flag, integer, positive_real
 from ..online.experience_memory import ExperienceMemory
 from ..results.progress import SHOWN, Progress
@@ -22,6 +21,7 @@ from ..settings.chase import ChaseProblem, chase_problem
 from ..systems import trajectory
 from ..tables import Table
 from .registry import finite
+from .study import report
 
 _log = logging.getLogger(__name__)
 _PROBES = 13  # points of the ball around each state
@@ -72,11 +72,9 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> dict[st
     again = revisits(problem, settings, memory, found, first)
     metrics = summary(memory, region, again)
     out = RunDirectory(directory)
-    text = out.table("memory", Table.of([metrics]), shown=_shown(metrics))
-    for line in text.splitlines():
-        _log.info("%s", line)
-    if figures:
-        out.figure("memory", images(draw_memory(_picture(states[0, first:], memory, region, again))))
+    picture = _picture(states[0, first:], memory, region, again)
+    drawing = (lambda: draw_memory(picture)) if figures else None
+    report(out, _log, "memory", Table.of([metrics]), drawing, shown=_shown(metrics))
     return out.metrics(metrics)
 
 

@@ -7,6 +7,7 @@ import logging
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
 from torch import Tensor
 
 from ..adp import Controller, Cost, LoopResult, simulate
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Drawing = Callable[[], "Figure"]
+_NAMED = 20  # diverged trajectories that the log lists by number
 
 
 class Method(NamedTuple):
@@ -128,3 +130,20 @@ def write_history(out: RunDirectory, time: Tensor, arrays: Mapping[str, Tensor])
     with out.history(*next(iter(arrays.values())).shape[:2]) as writer:
         writer.add({name: array.cpu().numpy() for name, array in arrays.items()})
         writer.close(time=time.numpy())
+
+
+def log_diverged(log: logging.Logger, starts: Tensor | np.ndarray, at: Tensor, also: str = "") -> None:
+    """Warn of each diverged trajectory, up to twenty of them by number.
+
+    Args:
+        log: where the experiment logs.
+        starts: initial states, (B, n).
+        at: s, when a row diverged; inf where it did not, (B,).
+        also: what else happens to it.
+    """
+    rows = at.isfinite().nonzero().flatten().tolist()
+    for row in rows[:_NAMED]:
+        start = [round(value, 6) for value in starts[row].tolist()]
+        log.warning("trajectory %d from %s diverged at t = %.6g s%s", row, start, float(at[row]), also)
+    if len(rows) > _NAMED:
+        log.warning("and %d more trajectories diverged", len(rows) - _NAMED)
