@@ -1,46 +1,107 @@
-"""What the objects of an experiment are made of, without running it."""
+"""Every experiment, run short and once for all tests: its metrics, files, figures, log and progress."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from typing import Any
+import csv
+import functools
+import json
+import logging
+import tempfile
+from pathlib import Path
+from typing import Any, NamedTuple
 
-import numpy as np
-from torch import Tensor, nn
+import pytest
+from composing import settings
+from matplotlib.figure import Figure
 
-Made = dict[str, Any]
-"""Numbers, tensors and words by their path."""
-_DEEP = 6
+from staf_torch.experiments.registry import experiment
+from staf_torch.figures.style import keep_figures
+from staf_torch.results.progress import Progress
+
+CASES: dict[str, str] = {
+    "adp": "experiment=adp duration=0.3 dt=0.005 trajectories=2",
+    "adp_comparison": "experiment=adp_comparison duration=0.04 dt=0.01 trajectories=20",
+    "adp_initial_weights": "experiment=adp_initial_weights duration=0.5 dt=0.02 trajectories=5 "
+    "initial_weights=[0.1,1.0]",
+    "adp_tracking": "experiment=adp_tracking duration=0.3 dt=0.01 trajectories=2",
+    "avoidance": "experiment=avoidance trajectories=3 duration=2.0 dt=0.1 adp.compile=false",
+    "avoidance of a unicycle": "experiment=avoidance avoidance.vehicle=unicycle trajectories=2 "
+    "duration=1.0 dt=0.1 adp.compile=false",
+    "exponential_bound": "experiment=exponential_bound exponential_bound.states=9 "
+    "exponential_bound.radii=[0.1]",
+    "faults": "experiment=faults trajectories=3 duration=0.6 faults.cases=[unstable]",
+    "faults from the start": "experiment=faults trajectories=3 duration=0.05 "
+    "faults.cases=[short_period,mass]",
+    "feasibility": "experiment=feasibility feasibility.states=16 feasibility.radii=[0.1] "
+    "feasibility.epsilons=[0.1,0.01]",
+    "flat_limit": "experiment=flat_limit flat_limit.radii.per_decade=1 flat_limit.counts=[3,6,15]",
+    "gradient_chase": "dt=0.05 duration=1.0 settle_time=0.5 trajectories=3 certificate=true centers.count=6 "
+    "spread=0.4",
+    "icl": "experiment=icl trajectories=3 dt=0.01 duration=0.5 settle_time=0.1 icl.length=[0.02,0.04]",
+    "laws": "experiment=laws dt=0.1 duration=1.0 settle_time=0.5 laws.steps=[0.1,0.05] laws.work=4",
+    "layouts": "experiment=layouts layouts.states=4 layouts.radii=[0.1,0.2]",
+    "memory": "experiment=memory duration=8 dt=0.02 memory.steps=30 memory.revisits=6 memory.states=40",
+    "rivals": "experiment=rivals rivals.plants=[double_integrator] rivals.methods=[LQR,discrete~LQR,IPOPT] "
+    "rivals.states=1 rivals.calls=10",
+    "safe_box": "experiment=safe_box duration=0.1 dt=0.01 trajectories=2 safe_box.states=4 safe_box.decay=20 "
+    "safe_box.substeps=2 safe_box.followed=0.03 adp.optimum.horizon=0.5 adp.optimum.intervals=8",
+}
 
 
-def made_of(value: Any) -> Made:
-    """Numbers, tensors and words of an object, of what it has, and so on; functions are left out.
-
-    Each object is told once, where it is met first.
-    """
-    return dict(_parts(value, "", _DEEP, set()))
+def words(name: str) -> list[str]:
+    """The settings of a case; a ~ is a space."""
+    return [word.replace("~", " ") for word in CASES[name].split()]
 
 
-def _parts(value: Any, path: str, deep: int, seen: set[int]) -> Iterator[tuple[str, Any]]:
-    if isinstance(value, str | bool | int | float | Tensor | np.ndarray):
-        yield path, value
-    elif deep and id(value) not in seen:
-        seen.add(id(value))
-        for name, part in _inside(value):
-            yield from _parts(part, f"{path}.{name}".strip("."), deep - 1, seen)
+class Ran(NamedTuple):
+    """What a run returned, wrote, drew and logged."""
+
+    metrics: dict[str, float | None]
+    directory: Path
+    figures: list[Figure]
+    log: str
+    progress: list[float]
+
+    def rows(self, name: str) -> list[dict[str, str]]:
+        """The rows of one of its tables."""
+        return list(csv.DictReader((self.directory / f"{name}.csv").read_text().splitlines()))
 
 
-def _inside(value: Any) -> Iterator[tuple[str, Any]]:
-    if isinstance(value, Mapping):
-        yield from ((str(name), part) for name, part in value.items())
-    elif hasattr(value, "_fields"):
-        yield from zip(value._fields, value, strict=True)
-    elif isinstance(value, list | tuple):
-        yield from ((str(at), part) for at, part in enumerate(value))
-    elif isinstance(value, nn.Module):
-        held = {k: part for k, part in vars(value).items() if not k.startswith("_") and k != "training"}
-        yield from (held | value._buffers | value._parameters | value._modules).items()
-        yield "kind", type(value).__name__
-    elif type(value).__module__.startswith("staf_torch"):
-        yield from ((name, part) for name, part in vars(value).items() if not name.startswith("_"))
-        yield "kind", type(value).__name__
+@functools.cache
+def ran(name: str, *more: str) -> Ran:
+    """Run a case of `CASES` with its figures, neither laid out nor rendered: that takes a second."""
+    folder = tempfile.TemporaryDirectory()
+    _FOLDERS.append(folder)  # removed at exit
+    return run(Path(folder.name), *words(name), "figures=true", *more)
+
+
+def run(directory: Path, *overrides: str) -> Ran:
+    """Run any settings in a directory."""
+    cfg = settings(*overrides)
+    told: list[float] = []
+    handler, log = _Lines(), logging.getLogger("staf_torch")
+    level = log.level
+    log.addHandler(handler)
+    log.setLevel("INFO")
+    try:
+        with pytest.MonkeyPatch.context() as patch, keep_figures() as kept:
+            patch.setattr("matplotlib.layout_engine.ConstrainedLayoutEngine.execute", lambda *given: None)
+            patch.setattr(Figure, "savefig", lambda figure, file, **named: file.write(b"not rendered"))
+            metrics = experiment(cfg.task)(cfg, directory, Progress(told.append))
+    finally:
+        log.removeHandler(handler)
+        log.setLevel(level)
+    assert json.loads((directory / "metrics.json").read_text(), parse_constant=pytest.fail) == metrics
+    return Ran(metrics, directory, [figure for figure, _ in kept], "\n".join(handler.lines), told)
+
+
+class _Lines(logging.Handler):
+    def __init__(self) -> None:
+        super().__init__()
+        self.lines: list[str] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.lines.append(record.getMessage())
+
+
+_FOLDERS: list[Any] = []

@@ -19,13 +19,14 @@ from ..adp import (
     QuadraticCost,
     SafetyFilter,
 )
+from ..adp.problem import OptimumSettings
 from ..adp.safety_filter import walls
 from ..figures.safety import BoxHistory, draw_box
 from ..metrics.safety import constraint_metrics
 from ..numerics.checks import COMMAND_LINE, fail, flag, integer, positive_real
 from ..results.progress import SHOWN, Progress
 from ..results.run_directory import RunDirectory
-from ..settings.adp import make_cost, plant
+from ..settings.adp import make_cost, optimum_settings, plant
 from ..settings.chase import initial_states, placement, plain
 from ..systems import Barrier, ControlAffineSystem, Plant
 from .registry import Metrics, finite
@@ -54,14 +55,14 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
     cost = make_cost(cfg, system).to(device)
     box = Barrier(system, plain(cfg.safe_box.low), plain(cfg.safe_box.high)).to(device)
     x0 = initial_states(cfg, system.dim).to(device=device, dtype=torch.float64)
-    wanted = flag(COMMAND_LINE, "adp.optimum.shooting", cfg.adp.optimum.shooting)
+    shooting = optimum_settings(cfg.adp.optimum)
     others = {"left": _anywhere(cfg, box), "left_near": _beside_walls(cfg, box)}
     dt = positive_real(COMMAND_LINE, "dt", cfg.dt)
     steps = max(1, round(positive_real(COMMAND_LINE, "duration", cfg.duration) / dt))
     followed = max(1, round(positive_real(COMMAND_LINE, "safe_box.followed", cfg.safe_box.followed) / dt))
     every = next(k for k in range(max(1, steps // 2000), steps + 1) if steps % k == 0)
     study = Study("safe_box", _COLUMNS, ("cost", "minimum_margin", "constraint_violations"), _log)
-    best = _optimum(box, cost, box.transform(x0[:1])) if wanted else None
+    best = _optimum(box, cost, box.transform(x0[:1]), shooting) if shooting.shooting else None
     study.metrics["optimal_cost"] = best
     results: dict[str, LoopResult] = {}
     margins: dict[str, Tensor] = {}
@@ -169,9 +170,10 @@ def _margin(box: Barrier, system: Plant, result: LoopResult) -> Tensor:
     return box.margin(result.state if system is box else box.coordinates(result.state))
 
 
-def _optimum(box: Barrier, cost: Cost, s0: Tensor) -> float | None:
+def _optimum(box: Barrier, cost: Cost, s0: Tensor, chosen: OptimumSettings) -> float | None:
     """The least cost of s from the first state, by direct shooting; None where none was found."""
-    found = DirectShooting(box, cost).solve(s0.double())
+    shooting = DirectShooting(box, cost, horizon=chosen.horizon, intervals=chosen.intervals)
+    found = shooting.solve(s0.double())
     if not bool(found.converged[0]):
         _log.warning("the optimum is not known: %s", found.reason[0])
     return finite(found.value[0])

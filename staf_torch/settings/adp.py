@@ -69,7 +69,7 @@ def adp_problem(cfg: DictConfig) -> AdpProblem:
         seed=integer(COMMAND_LINE, "seed", cfg.seed, least=0),
         integrator=cfg.adp.integrator,
         compile=cfg.adp.compile,
-        optimum=_optimum_settings(cfg.adp.optimum),
+        optimum=optimum_settings(cfg.adp.optimum),
     )
 
 
@@ -199,7 +199,8 @@ def changed(cfg: DictConfig, changes: Mapping[str, Any]) -> DictConfig:
     return new
 
 
-def _optimum_settings(cfg: DictConfig) -> OptimumSettings:
+def optimum_settings(cfg: DictConfig) -> OptimumSettings:
+    """Return the settings `adp.optimum`, checked."""
     return OptimumSettings(
         shooting=flag(COMMAND_LINE, "adp.optimum.shooting", cfg.shooting),
         states=integer(COMMAND_LINE, "adp.optimum.states", cfg.states, least=0),

@@ -1,43 +1,52 @@
-"""Methods beside those of others: the table is what the numbers say."""
+"""Methods beside those of others: the plants, what each method is asked, and what the table says."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
+import sys
+import types
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
+import fake_casadi
 import numpy as np
 import pytest
 import torch
-from composing import settings
+from helpers import tensor, uniform
+from helpers_experiments import ran, run
 from torch import Tensor
 
+from staf_torch import adp
 from staf_torch.experiments import rival_methods, rivals
-from staf_torch.experiments.rival_methods import METHODS, Method, ipopt_program
-from staf_torch.experiments.rival_plants import CASES, TorchMath
+from staf_torch.experiments.rival_methods import METHODS, Begin, Rival, UnsuitableError, ipopt_program
+from staf_torch.experiments.rival_plants import CASES, Case, TorchMath
 
 SHORT = dataclasses.replace(CASES["double_integrator"], steps=60, horizon=20)
 
 
-def idle(case):  # type: ignore[no-untyped-def]
-    """No control at all."""
-    return lambda x0: lambda x: torch.zeros(len(x), case.inputs, dtype=x.dtype)
+def constant(value: float) -> Callable[[Case], Begin]:
+    """A method that always wants the same input."""
 
+    def prepare(case: Case) -> Begin:
+        """Two lines of code, without this one."""
+        return lambda x0: lambda x: torch.full((len(x), case.inputs), value, dtype=x.dtype)
 
-def shouting(case):  # type: ignore[no-untyped-def]
-    """More than the bounds allow."""
-    return lambda x0: lambda x: torch.full((len(x), case.inputs), 3.0, dtype=x.dtype)
+    return prepare
 
 
 def test_rows_say_what_was_lost_violated_and_not_tried() -> None:
     methods = [
         METHODS["discrete LQR"],
         METHODS["GlobalValue"],
-        Method("idle", idle),
-        Method("shouting", shouting),
-        Method("absent", idle, ("no-such-package",)),
+        Rival("idle", constant(0.0)),
+        Rival("shouting", constant(3.0)),
+        Rival("absent", constant(0.0), ("no-such-package",)),
     ]
-    x0 = torch.tensor([[0.5, 0.0], [4.0, 1.0]], dtype=torch.float64)
-    best, unsuited, lost, loud, absent = rivals.compare(SHORT, methods, x0, calls=3)
+    rows = rivals.compare(SHORT, methods, tensor([[0.5, 0.0]]), calls=3)
+    assert [row.method for row in rows] == [method.name for method in methods]
+    best, unsuited, lost, loud, absent = (row.measured | row.more for row in rows)
     assert (best["regulated"], best["violations"]) == (1, 0)
     assert 1 - 1e-9 <= best["ratio_median"] <= best["ratio_max"] < 1.1
     assert (unsuited["ratio_median"], unsuited["note"]) == (None, "the LQR reaches the goal")
@@ -45,23 +54,99 @@ def test_rows_say_what_was_lost_violated_and_not_tried() -> None:
     assert loud["violations"] == pytest.approx(1)
     assert absent["note"] == "no-such-package is not installed"
     assert (absent["regulated"], absent["megabytes"]) == (None, None)
-    assert (lost["lines"], best["us_median"] > 0) == (2, True)
+    assert (lost["lines"], lost["megabytes"], best["us_median"] > 0) == (2, 0, True)
+    assert best["megabytes"] > 10  # of SciPy
 
 
 def test_slow_methods_run_from_fewer_states_and_say_so() -> None:
-    def timid(case):  # type: ignore[no-untyped-def]
-        """The regulator, and a third of it far out."""
-        steer = rival_methods.discrete_lqr(case)(None)
+    def timid(case: Case) -> Begin:
+        steer = rival_methods.discrete_lqr(case)(tensor([]))
         return lambda x0: lambda x: torch.where(x[:, :1].abs() > 1, 0.3, 1.0) * steer(x)
 
-    slow = Method("slow", timid, slow=True)
-    x0 = torch.tensor([[0.5, 0.0], [0.2, 0.1], [1.2, 0.0]], dtype=torch.float64)
-    every, few = rivals.compare(SHORT, [Method("fast", timid), slow], x0, calls=3, slow=1)
-    assert (every["note"], few["note"]) == (None, "from 1 of the 3 states")
-    assert every["ratio_max"] > 1.001  # it has seen the last one
-    assert few["ratio_max"] == pytest.approx(1)
+    slow = Rival("slow", timid, slow=True)
+    x0 = tensor([[0.5, 0.0], [0.2, 0.1], [1.2, 0.0]])
+    every, few = rivals.compare(SHORT, [Rival("fast", timid), slow], x0, calls=3, slow=1)
+    assert (every.more["note"], few.more["note"]) == (None, "from 1 of the 3 states")
+    assert every.measured["ratio_max"] > 1.001  # it has seen the last one
+    assert few.measured["ratio_max"] == pytest.approx(1)
     (whole,) = rivals.compare(SHORT, [slow], x0, calls=3, slow=3)
-    assert whole["note"] is None
+    assert whole.more["note"] is None
+
+
+def test_an_episode_pays_for_what_the_bounds_left_of_the_controls() -> None:
+    problem, x0 = SHORT.problem(), tensor([[0.5, 0.0], [1.0, -1.0]])
+    high = float(problem.bounds.high)
+    wanted = iter([0.5, high + 1e-7, high + 1e-3, -5.0])  # within, rounding beyond, and twice beyond
+    episode = rivals.play(problem, lambda x0: lambda x: torch.full((2, 1), next(wanted)).double(), x0, 4)
+    assert episode.outside == pytest.approx(0.5)
+    assert episode.control[0, :, 0].tolist() == [0.5, high, high, -1.0]
+    spent = torch.zeros(2).double()
+    for k in range(4):
+        after, paid = problem.advance(episode.state[:, k], episode.control[:, k])
+        torch.testing.assert_close(episode.state[:, k + 1], after)
+        spent = spent + paid
+    torch.testing.assert_close(episode.cost, spent + problem.terminal(episode.state[:, -1]))
+    lost = rivals.play(problem, constant(0.0)(SHORT), tensor([[math.nan, 0.0], [0.1, 0.0]]), 2)
+    assert lost.cost.isinf().tolist() == [True, False]
+    assert len(rivals.timed(problem, constant(0.0)(SHORT), x0, 20)) == 18  # without the first tenth
+
+
+def test_the_best_known_cost_is_no_method_s_and_never_above_one() -> None:
+    problem, x0 = SHORT.problem(), tensor([[2.0, 0.0], [4.0, 1.0], [-3.0, 0.5]])
+    good = rivals.play(problem, rival_methods.discrete_lqr(SHORT), x0, SHORT.steps)
+    first = rivals.play(problem, rival_methods.box_ddp(SHORT), x0[:1], SHORT.steps)
+    poor = rivals.play(problem, constant(1.0)(SHORT), x0, SHORT.steps)
+    best = rivals.best_known(SHORT, problem, x0, [good, first, poor])
+    assert bool((best <= good.cost).all())
+    assert float(best[0]) <= float(first.cost)
+    torch.testing.assert_close(best, rivals.best_known(SHORT, problem, x0, [good]), rtol=1e-6, atol=0)
+    claimed = dataclasses.replace(first, cost=0.5 * first.cost)  # whatever was reached is known
+    assert float(rivals.best_known(SHORT, problem, x0, [claimed])[0]) == float(claimed.cost)
+
+
+def test_the_study_has_a_row_for_every_method_and_a_note_where_a_package_is_missing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    result = ran("rivals")
+    lqr, ours, ipopt = result.rows("rivals")
+    assert [row["method"] for row in (lqr, ours, ipopt)] == ["LQR", "discrete LQR", "IPOPT"]
+    assert 1 - 1e-9 <= float(ours["ratio_max"]) <= float(lqr["ratio_max"]) * (1 + 1e-9)
+    if METHODS["IPOPT"].missing is not None:
+        assert ipopt["note"] == "casadi is not installed"
+        assert result.metrics["double_integrator_ipopt_ratio_median"] is None
+    (points,) = result.figures
+    assert points.axes[0].get_title() == "double integrator"
+
+
+@pytest.mark.parametrize("word", ["rivals.plants=[rocket]", "rivals.methods=[luck]"])
+def test_unknown_plants_and_methods_are_refused_by_name(word: str, tmp_path: Path) -> None:
+    name = word.partition("=")[0]
+    with pytest.raises(ValueError, match=rf"`staf {name}=...` must be one of"):
+        run(tmp_path, "experiment=rivals", word)
+
+
+@pytest.mark.parametrize(
+    ("method", "plant", "why"),
+    [
+        ("LQR", "pendulum", "needs a plant in continuous time"),
+        ("near_optimal", "figure_eight", "follows no path"),
+        ("near_optimal planned", "figure_eight", "follows no path"),
+        ("GlobalValue", "cart_pole_10N", "the LQR reaches the goal"),
+    ],
+)
+def test_a_plant_that_a_method_is_not_made_for_is_refused(method: str, plant: str, why: str) -> None:
+    with pytest.raises(UnsuitableError, match=why):
+        METHODS[method].prepare(CASES[plant])
+
+
+def test_a_sampling_controller_draws_the_same_numbers_in_every_episode() -> None:
+    mpc = adp.PathIntegral(SHORT.problem(), steps=5, samples=20, knots=3)
+    x = tensor([[1.0, 0.0], [0.5, 0.2]])
+    begin = rival_methods.steered(SHORT, mpc)
+    first, second = begin(x), begin(x)
+    once, again = first(x), second(x)
+    assert torch.equal(once, again)
+    assert torch.equal(first(x), second(x))  # the plans that they carry, too
 
 
 @pytest.mark.parametrize("name", list(CASES))
@@ -155,51 +240,6 @@ def test_equations_mean_the_same_to_casadi(name: str) -> None:
     assert float(cost) == pytest.approx(float(solved["f"]), rel=1e-6)
 
 
-def test_unknown_plants_and_methods_are_refused_by_name(tmp_path) -> None:  # type: ignore[no-untyped-def]
-    cfg = settings("experiment=rivals", "rivals.plants=[rocket]")
-    with pytest.raises(ValueError, match=r"`staf rivals.plants=...` must be one of .*; got 'rocket'"):
-        rivals.run(cfg, tmp_path)
-
-
-def test_the_size_of_a_package_is_that_of_its_files() -> None:
-    assert rival_methods._size("numpy") > 10 * rival_methods._size("pytest") > 0
-
-
-# Period (s), duration (s), diagonals of Q and R, bounds of the inputs, half the box of states, periods ahead.
-TABLE = {
-    "double_integrator": (0.1, 15, (1, 1), (1,), (-1,), (1,), (5, 1), 50),
-    "pendulum": (0.05, 10, (20, 2), (0.02,), (-2,), (2,), (math.pi, 1), 50),
-    "cart_pole_10N": (0.02, 5, (1, 1, 0.1, 0.1), (0.01,), (-10,), (10,), (0.3,) * 4, 50),
-    "cart_pole_5N": (0.02, 5, (1, 1, 0.1, 0.1), (0.01,), (-5,), (5,), (0.3,) * 4, 50),
-    "cart_pole_to_1m": (1 / 15, 6, (5, 5, 0.1, 0.1), (0.1,), (-10,), (10,), (1, 0.2, 0.2, 0.2), 20),
-    "quadrotor": (0.02, 4, (1,) * 6, (1, 1), (-9.81, -1), (9.81, 1), (0.4,) * 6, 50),
-    "figure_eight": (
-        0.02,
-        6,
-        (5, 0.1, 5, 0.1, 0.1, 0.1),
-        (0.1, 0.1),
-        (0.0563,) * 2,
-        (0.2967,) * 2,
-        (0.05,) * 6,
-        20,
-    ),
-    "cart_pole_swing_up": (0.02, 6, (1, 1, 0.1, 0.1), (0.01,), (-10,), (10,), (1, math.pi, 1, 2), 120),
-}
-
-
-@pytest.mark.parametrize("name", list(CASES))
-def test_published_numbers_are_of_these_cases(name: str) -> None:
-    case, cost = CASES[name], CASES[name].cost()
-    found = (case.dt, case.steps * case.dt, *case.weights, case.low, case.high, case.box, case.horizon)
-    for one, two in zip(found, TABLE[name], strict=True):
-        assert one == pytest.approx(two)
-    if case.path is None:
-        x = (case.goal() + 0.1).unsqueeze(0)
-        u = torch.full((1, case.inputs), 0.2, dtype=torch.float64)
-        paid = 0.01 * sum(case.weights[0]) + 0.04 * sum(case.weights[1])
-        assert float(cost.rate(x, u)) == pytest.approx(paid)
-
-
 @pytest.mark.parametrize("name", list(CASES))
 def test_an_angle_is_a_coordinate_that_may_turn_once_more_and_not_less(name: str) -> None:
     case = CASES[name]
@@ -219,11 +259,96 @@ def test_an_angle_is_a_coordinate_that_may_turn_once_more_and_not_less(name: str
     assert set(case.periodic) == {k for k in range(case.dim) if k in case.plant().periodic}
 
 
-@pytest.mark.parametrize("name", list(CASES))
-def test_a_memory_of_trajectories_is_for_plants_that_begin_far_from_their_goal(name: str) -> None:
-    case = CASES[name]
-    turns = any(case.box[k] >= math.pi for k in case.periodic)  # it begins anywhere on a circle
-    assert case.swing == turns
+def program(case: Case, steps: int) -> tuple[Any, fake_casadi.Solver]:
+    """What solves a case by IPOPT, and the solver behind it."""
+    made: list[fake_casadi.Solver] = []
+    return ipopt_program(fake_casadi.module(made), case, case.problem(), steps), made[0]
+
+
+@pytest.mark.parametrize(
+    ("name", "changes"),
+    [
+        ("double_integrator", {"rest": (0.0,), "target": (0.5, 0.0)}),
+        ("pendulum", {}),
+        ("cart_pole_to_1m", {}),
+        ("quadrotor", {}),
+        ("figure_eight", {}),
+    ],
+)
+def test_the_program_of_ipopt_has_the_cost_the_motion_and_the_bounds_of_the_problem(
+    name: str, changes: dict[str, Any]
+) -> None:
+    case = dataclasses.replace(CASES[name], **changes)
+    solve, solver = program(case, 5)
+    problem, n, m, begun = case.problem(), case.dim, case.inputs, 0.0 if case.path is None else 0.7
+    # Any states at all: the cost is theirs, and what the motion misses them by is the constraint.
+    states, control = uniform(6, n, low=-2, high=2, seed=1), uniform(5, m, low=-1, high=1, seed=2)
+    for k in case.periodic:
+        states[:, k] = tensor([0.4, 3.3, -3.6, 7.0, -9.1, 12.2])  # several turns away
+    full = states
+    if case.path is not None:
+        full = torch.cat((states, begun + case.dt * torch.arange(6).double().unsqueeze(-1)), dim=-1)
+    moved, paid = problem.advance(full[:-1], control)
+    total = float(paid.sum() + problem.terminal(full[-1:]))
+    start = uniform(n, seed=3).numpy()
+    guess = np.concatenate([states.numpy().ravel(), control.numpy().ravel()])
+    found = solve(guess, np.append(start, begun))
+    assert found["success"]
+    assert found["f"].item() == pytest.approx(total, rel=1e-9)
+    expected = torch.cat((states[0] - torch.as_tensor(start), (states[1:] - moved[:, :n]).flatten()))
+    np.testing.assert_allclose(found["g"].ravel(), expected.numpy(), rtol=1e-9, atol=1e-9)
+    (asked,) = solver.asked
+    assert asked["lbx"].tolist() == [-math.inf] * 6 * n + list(case.low) * 5
+    assert asked["ubx"].tolist() == [math.inf] * 6 * n + list(case.high) * 5
+
+
+def test_ipopt_begins_at_rest_and_then_from_its_last_plan_a_period_later(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    case = dataclasses.replace(SHORT, horizon=3, rest=(0.25,))
+    made: list[fake_casadi.Solver] = []
+    monkeypatch.setitem(sys.modules, "casadi", fake_casadi.module(made))
+    x0 = tensor([[1.0, 2.0], [-1.0, 3.0]])
+    steer = rival_methods.ipopt(case)(x0)
+    (solver,) = made
+    assert steer(x0).tolist() == [[0.25], [0.25]]
+    steer(x0 + 1)
+    first, other, second, _ = solver.asked
+    assert first["x0"].tolist() == [1.0, 2.0] * 4 + [0.25] * 3
+    assert other["x0"].tolist() == [-1.0, 3.0] * 4 + [0.25] * 3  # a plan a row
+    assert second["x0"].tolist() == first["x0"].tolist()  # moved on by a period, which was at rest
+    assert [each["p"].tolist() for each in (first, second)] == [[1.0, 2.0, 0.0], [2.0, 3.0, 0.1]]
+
+
+def test_mppi_asks_for_the_cost_after_the_step_and_at_the_last_one_for_the_rest_of_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    made: list[Any] = []
+
+    class Batched:
+        def __init__(self, *given: Any, **named: Any) -> None:
+            self.given, self.named, self.U = given, named, torch.ones(2, 3)
+            made.append(self)
+
+        def command(self, x: Tensor) -> str:
+            return "its command"
+
+    module: Any = types.ModuleType("pytorch_mppi")
+    module.MPPI_Batched = Batched
+    monkeypatch.setitem(sys.modules, "pytorch_mppi", module)
+    case = dataclasses.replace(CASES["quadrotor"], horizon=4)
+    problem, x, u = case.problem(), uniform(3, 6, seed=1), uniform(3, 2, seed=2)
+    steer: Any = rival_methods.mppi(case)(x)
+    (one,) = made
+    assert steer(x) == "its command"
+    assert torch.equal(one.U, torch.zeros(2, 3))  # it begins from no control, not from noise
+    motion, cost, *_ = one.given
+    moved, paid = problem.advance(x, u)
+    torch.testing.assert_close(motion(x, u, 0), moved)
+    torch.testing.assert_close(cost(x, u, 2), paid)
+    torch.testing.assert_close(cost(x, u, 3), paid + problem.terminal(x))
+    assert torch.equal(one.named["u_max"], problem.bounds.high)
+    assert one.named["horizon"] == 4
 
 
 def test_a_plan_of_ipopt_begins_from_the_last_one_a_period_later() -> None:

@@ -1,0 +1,268 @@
+"""Gradient chases alone and in batches, their laws side by side, and the memory beyond the ball."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from composing import settings
+from helpers_experiments import CASES, ran, run
+from hydra.errors import HydraException
+from torch import Tensor
+from variants import LAWS
+
+from staf_torch import optim, predictors
+from staf_torch.cli.staf import config_directory
+from staf_torch.experiments import chase_batch, gradient_chase, laws, memory
+from staf_torch.experiments.gradient_chase import ChaseSolution, GradientChase
+from staf_torch.results.progress import Progress
+from staf_torch.settings.chase import ChaseProblem, chase_problem
+
+SHORT = ("dt=0.05", "duration=0.5", "settle_time=0.2")
+
+
+def options(group: str) -> list[str]:
+    """The library's own; `custom` has its test in tests/cli."""
+    found = (path.stem for path in Path(config_directory(), group).glob("*.yaml"))
+    return sorted(name for name in found if name != "custom")
+
+
+def test_every_law_is_compared_and_the_exact_one_has_the_order_of_its_predictor() -> None:
+    result = ran("laws")
+    rows = json.loads((result.directory / "laws.json").read_text())
+    assert len(rows) == len(laws.cases(4, 3)) == len({row["key"] for row in rows})
+    assert {row["predictor"] for row in rows} == {"none", "secant", "tangent order 1", "tangent order 2"}
+    read = [float(row["ultimate_excess"]) for row in result.rows("laws")]
+    assert read == [row["ultimate_excess"] for row in rows]
+    found = result.metrics
+    assert found["exact_x1.slope"] == pytest.approx(2, abs=0.3)
+    assert found["exact_x1_tangent_order_1.slope"] == pytest.approx(4, abs=0.6)
+    assert {value for name, value in found.items() if name.endswith("certificate_violations")} == {0.0}
+    # More iterations of the paper's law are better, the exact law leaves nothing, a predictor helps.
+    assert found["steepest_descent_x3.ultimate_excess"] < found["steepest_descent_x1.ultimate_excess"]
+    assert found["exact_x1.ultimate_excess"] < 1e-6 * found["steepest_descent_x3.ultimate_excess"]
+    before = [found[f"exact_x1{p}.ultimate_excess_before"] for p in ("_tangent_order_2", "_secant", "")]
+    assert before == sorted(before)
+    # What was promised before the run is kept by it.
+    measured = found["steepest_descent_x3.ultimate_excess_before"]
+    assert measured < found["a_priori.ultimate_excess_before"]
+    assert found["a_priori.paper_step"] < found["a_priori.step"] < 0.1
+
+
+def test_the_comparison_has_every_law_at_the_same_work() -> None:
+    assert {type(law) for law in LAWS.values()} == {type(case.law) for case in laws.cases(11, 3)}
+    dear = [case.name for case in laws.cases(11, 3) if case.products > 11]
+    assert dear == ["recursive least squares"]
+    for work, count in ((2, 3), (11, 2), (30, 12)):
+        found = laws.cases(work, count)
+        assert len({case.key for case in found}) == len(found)
+        for case in found:
+            extra = 0 if case.predictor is None else case.predictor.products(count)
+            assert case.products == case.law.products(count, case.iterations) + extra
+        assert {case.key for case in laws.curves(work, count)} <= {case.key for case in found}
+
+
+@pytest.mark.parametrize("steps", ["[2.0,1.0]", "[0.5]"])
+def test_two_steps_within_the_duration_are_needed(steps: str, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"`staf laws.steps=...` must be two or more steps within"):
+        run(tmp_path, "experiment=laws", "duration=1.0", "figures=false", f"laws.steps={steps}")
+
+
+@pytest.mark.parametrize("name", options("optimizer"))
+def test_every_law_is_an_option_with_its_iterations(name: str) -> None:
+    problem = chase_problem(settings(f"optimizer={name}", "optimizer.inner_steps=3"))
+    assert isinstance(problem.law, optim.UpdateLaw)
+    assert problem.inner_steps == 3
+
+
+def test_there_is_an_option_for_every_law_and_every_predictor() -> None:
+    found = {type(chase_problem(settings(f"optimizer={name}")).law) for name in options("optimizer")}
+    assert found == {type(law) for law in LAWS.values()}
+    made = {name: chase_problem(settings(f"predictor={name}")).predictor for name in options("predictor")}
+    assert made.pop("none") is None
+    kinds = {name: type(value) for name, value in made.items()}
+    assert kinds == {"secant": predictors.Secant, "tangent": predictors.Tangent}
+    with pytest.raises(HydraException):
+        settings("predictor=oracle")
+
+
+def test_single_precision_runs_every_law(tmp_path: Path) -> None:
+    few = (
+        "dtype=float32",
+        "dt=0.1",
+        "duration=1.0",
+        "settle_time=0.5",
+        "laws.work=2",
+        "laws.steps=[0.2,0.1]",
+    )
+    metrics = run(tmp_path, "experiment=laws", *few, "figures=false").metrics
+    assert all(value == 0 for name, value in metrics.items() if name.endswith("diverged_fraction"))
+    assert torch.get_default_dtype() == torch.float32
+
+
+def test_a_certified_chase_counts_its_violations() -> None:
+    problem = chase_problem(settings(*SHORT, "predictor=tangent", "certificate=true"))
+    assert gradient_chase.solve(problem).metrics["certificate_violations"] == 0
+    bare = gradient_chase.solve(dataclasses.replace(problem, certificate=False))
+    assert "certificate_violations" not in bare.metrics
+
+
+def test_a_memory_knows_the_region_that_passing_models_forget() -> None:
+    found = ran("memory").metrics
+    assert found["covered_fraction"] == 1
+    assert found["memory_rms_error"] < 0.1 * found["last_rms_error"]
+    assert found["memory_max_error"] < found["last_max_error"]
+    excess = [found[f"revisit_excess_{name}"] for name in ("memory", "carried", "zero")]
+    assert excess[0] < min(excess[1:])  # a start from the memory is the best at a revisit
+    assert found["revisit_steps_memory"] <= found["revisit_steps_carried"]
+    where, region, revisits = ran("memory").figures[0].axes
+    assert len(where.collections[0].get_offsets()) == found["models"]
+    worst = max(float(np.max(line.get_ydata())) for line in region.get_lines())
+    assert worst == pytest.approx(max(found[f"{k}_max_error"] for k in ("memory", "passing", "last")))
+    labels = [line.get_label() for line in revisits.get_lines()]
+    assert labels == [*memory.STARTS.values(), "settled chase"]
+
+
+@pytest.mark.parametrize("wrong", ["1.0", "1.2"])
+def test_a_memory_of_a_run_that_never_settles_is_refused(wrong: str, tmp_path: Path) -> None:
+    words = ("dt=0.05", "duration=1.0", "figures=false", f"settle_time={wrong}")
+    with pytest.raises(ValueError, match=r"`staf settle_time=...` must lie within the duration"):
+        run(tmp_path, "experiment=memory", *words)
+
+
+def test_alone_or_in_a_batch_a_chase_has_the_same_metrics_history_and_figure(tmp_path: Path) -> None:
+    alone = ran("gradient_chase", "history=true")
+    cfgs = [
+        settings(*CASES["gradient_chase"].split(), "figures=true", "history=true", *more)
+        for more in ((), ("centers.radius=0.05",), ("seed=5",), ("dt=-1",))
+    ]
+    told: list[float] = []
+    first, other, seeded, wrong = GradientChase().solve(cfgs, Progress(told.append))
+    assert told[-1] == pytest.approx(1)
+    assert isinstance(wrong, ValueError)
+    assert isinstance(first, ChaseSolution)
+    assert isinstance(other, ChaseSolution)
+    assert isinstance(seeded, ChaseSolution)
+    for name, number in alone.metrics.items():
+        assert first.metrics[name] == pytest.approx(number, rel=1e-9, abs=1e-13), name
+    assert other.metrics["ultimate_error"] != first.metrics["ultimate_error"]
+    GradientChase().write(settings(*CASES["gradient_chase"].split(), "history=true"), tmp_path, first)
+    with np.load(alone.directory / "history.npz") as one, np.load(tmp_path / "history.npz") as two:
+        assert {*one} == {*two} >= {"time", *chase_batch.HISTORY}
+        for name in one:
+            np.testing.assert_allclose(one[name], two[name], rtol=1e-9, atol=1e-12)
+        assert one["state"].shape == (3, 21, 2)
+        np.testing.assert_allclose(one["time"], 0.05 * np.arange(21))
+        state, value, *_ = alone.figures[0].axes
+        np.testing.assert_array_equal(state.get_lines()[1].get_ydata(), one["state"][0, :, 1])
+        np.testing.assert_array_equal(value.get_lines()[1].get_ydata(), one["estimate"][0])
+
+
+def test_more_rows_than_go_through_time_together_change_nothing() -> None:
+    """A run without a history goes in blocks of 4096 rows, one with a history in one."""
+    few = ("dt=0.1", "duration=0.3", "settle_time=0.1", "trajectories=4100", "spread=0.4")
+    problem = chase_problem(settings(*few))
+    told: list[int] = []
+    kept: list[Any] = []
+    (blocks,) = chase_batch.simulate([problem], [None], [True], told.append)
+    (whole,) = chase_batch.simulate([problem], [kept.append], [True])
+    assert {piece["state"].shape[0] for piece in kept} == {4100}
+    assert sum(piece["state"].shape[1] for piece in kept) == sum(told) == 4
+    for name, number in whole.metrics.items():
+        assert blocks.metrics[name] == pytest.approx(number, rel=1e-9, abs=1e-14), name
+    for name, array in whole.drawn.items():
+        np.testing.assert_allclose(blocks.drawn[name], array, rtol=1e-9, atol=1e-12)
+
+
+def test_a_long_trajectory_is_thinned_for_its_figure_as_if_it_came_in_one_piece() -> None:
+    problem = chase_problem(
+        settings("dt=0.001", "duration=4.01", "settle_time=0.1", "optimizer.inner_steps=1")
+    )
+    kept: list[Any] = []
+    (found,) = chase_batch.simulate([problem], [kept.append], [True])
+    assert len(kept) >= 20  # progress is seen
+    state = np.concatenate([piece["state"] for piece in kept], axis=1)[0]
+    assert state.shape[0] == 4011
+    np.testing.assert_array_equal(found.drawn["state"], state[::2])
+    np.testing.assert_allclose(found.drawn["time"], 0.002 * np.arange(2006))
+
+
+def far(start: str) -> ChaseProblem:
+    return chase_problem(settings(*SHORT, "centers.radius=0.1", f"initial_state={start}", "trajectories=3"))
+
+
+def said(*problems: ChaseProblem) -> tuple[list[str], list[chase_batch.Outcome]]:
+    with warnings.catch_warnings(record=True) as given:
+        warnings.simplefilter("always")
+        found = chase_batch.simulate(problems, [None] * len(problems), [False] * len(problems))
+    return [str(each.message) for each in given], found
+
+
+def test_a_problem_alone_is_warned_of_its_farthest_state_and_of_several_each_keeps_its_own() -> None:
+    near, away = far("[2.0,0.0]"), far("[12.0,0.0]")
+    messages, (outcome,) = said(away)
+    assert [message[:11] for message in messages] == ["|x| r = 1.2"]
+    assert outcome.warnings == ()  # it has been said
+    assert said(near)[0] == []
+    shared = dataclasses.replace(away, basis=near.basis, target=near.target, law=near.law)
+    for second in (away, shared):  # in a batch of its own, and in one with the other
+        messages, (one, two) = said(near, second)
+        assert messages == []
+        assert one.warnings == ()
+        assert [warning[:11] for warning in two.warnings] == ["|x| r = 1.2"]
+
+    def grumbling(x: Tensor) -> Tensor:
+        warnings.warn("of the target itself", stacklevel=1)
+        return near.target(x)
+
+    messages, _ = said(dataclasses.replace(near, target=grumbling))
+    assert "of the target itself" in messages
+
+
+def test_a_warning_of_a_batch_is_given_again_where_a_member_is_written(tmp_path: Path) -> None:
+    cfg = settings(*SHORT, "figures=false", "history=false")
+    (solved,) = GradientChase().solve([cfg], Progress([].append))
+    assert isinstance(solved, ChaseSolution)
+    with pytest.warns(UserWarning, match="of the batch"):
+        GradientChase().write(cfg, tmp_path, dataclasses.replace(solved, warnings=("of the batch",)))
+    assert [path.name for path in tmp_path.iterdir()] == ["metrics.json"]
+
+
+def test_a_trajectory_that_diverges_is_named_with_its_time(tmp_path: Path) -> None:
+    exploding = ("system=linear", "system.matrix=[[2000,0],[0,2000]]", "kernel=gaussian")
+    result = run(tmp_path, *SHORT, *exploding, "trajectories=25", "figures=false")
+    assert result.metrics["diverged_fraction"] == 1
+    assert "trajectory 0 from [" in result.log
+    assert "its weights are frozen from there on" in result.log
+    assert "and 5 more trajectories diverged" in result.log
+    assert "nothing to report" in result.log
+
+
+@pytest.mark.parametrize(
+    ("given", "steps", "rows"),
+    [
+        ({}, 10, 16),
+        ({"history": False}, 10, 1),
+        ({"duration": 0.3}, 3, 16),  # 2.9999999999999996 steps
+        ({"dt": 0}, "none", 0),
+        ({"duration": float("inf")}, "none", 0),
+        ({"trajectories": "many"}, 10, 0),
+    ],
+)
+def test_the_shape_and_the_size_of_a_batch_follow_from_its_settings(
+    given: dict[str, Any], steps: int | str, rows: int
+) -> None:
+    known: dict[str, Any] = {
+        **{"dt": 0.1, "duration": 1.0, "trajectories": 3, "history": True, "centers.count": 5},
+        **{"initial_state": [1.0, 0.0], "optimizer.inner_steps": 7},
+    }
+    chase = GradientChase()
+    assert chase.shape(known | given) == [steps, 7]
+    expected = 8 * steps * (3 * rows + 17) if rows and isinstance(steps, int) else 0
+    assert chase.size(known | given) == expected

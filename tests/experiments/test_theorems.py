@@ -1,0 +1,262 @@
+"""The experiments on the theorems: the orders, counts and digits that they claim, and what they refuse."""
+
+from __future__ import annotations
+
+import math
+from decimal import Decimal
+from pathlib import Path
+
+import mpmath as mp
+import pytest
+import torch
+from composing import settings
+from helpers import tensor, uniform
+from helpers_experiments import CASES, Ran, ran, run, words
+from truth import Truth, paper
+
+import staf_torch as st
+from staf_torch.experiments import exponential_bound, feasibility, flat_limit, layouts
+from staf_torch.experiments.registry import log_slope
+from staf_torch.settings.chase import LocalProblem
+
+PLANE = "kernel=gaussian dtype=float32 centers.radius=0.2"
+SPACE = (
+    "target=quadratic system=linear system.matrix=[[-1,0,0],[0,-1,0],[0,0,-2]] "
+    "initial_state=[1,0.5,0.2] centers=ball"
+)
+
+
+@pytest.fixture(params=["plane", "space"])
+def elsewhere(request: pytest.FixtureRequest) -> list[str]:
+    """Common settings with another kernel and dtype, and with three states."""
+    return {"plane": PLANE, "space": SPACE}[request.param].split()
+
+
+def test_the_local_basis_has_the_order_of_its_layout() -> None:
+    found = ran("layouts").metrics
+    for count, order in ((3, 2), (6, 3), (10, 4)):
+        assert found[f"rings{count}.slope"] == pytest.approx(order, abs=0.15)
+    assert found["polygon15.slope"] == pytest.approx(2, abs=0.1)  # however many centers
+    for row in ran("layouts").rows("layouts"):
+        assert float(row["r0.2"]) > float(row["r0.1"])
+
+
+@pytest.mark.parametrize("dim", [1, 2, 3])
+def test_a_layout_of_order_k_has_as_many_centers_as_polynomials_below_it(dim: int) -> None:
+    for each in layouts.layouts(dim):
+        assert each.directions.shape[1] == dim
+        assert len(each.directions) <= 130
+        if each.family in ("ball", "rings"):
+            assert len(each.directions) == math.comb(dim + each.order - 1, dim)
+    families = {each.family for each in layouts.layouts(dim)}
+    assert families == {"ball", "simplex", "cross_polytope"} | ({"rings", "polygon"} if dim == 2 else set())
+
+
+def test_the_bound_of_the_paper_is_far_above_what_is_needed() -> None:
+    bound = ran("exponential_bound").metrics
+    names = ("N", "S", "count", "one_polynomial_count", "measured_count")
+    assert [bound[f"r0.1.eps0.001.{name}"] for name in names] == [3, 2, 21, 10, 10]
+    rows = ran("exponential_bound").rows("exponential_bound")
+    for row in rows:
+        assert float(row["measured_count"]) <= float(row["one_polynomial_count"]) <= float(row["count"])
+        assert float(row["error"]) <= float(row["epsilon"])
+
+
+def bounds(*more: str) -> exponential_bound.Bounds:
+    small = (
+        "exponential_bound.states=5",
+        "exponential_bound.radii=[0.1]",
+        "exponential_bound.epsilons=[0.1]",
+    )
+    return exponential_bound.solve(settings("experiment=exponential_bound", *small, *more))
+
+
+def test_the_bound_holds_in_space_too_and_has_no_numbers_where_no_degree_does() -> None:
+    (row,) = bounds("centers.radius=0.05", *SPACE.split()).values()
+    assert row["measured_count"] <= row["one_polynomial_count"] <= row["count"]
+    (none,) = bounds("exponential_bound.epsilons=[1e-6]", "exponential_bound.max_degree=1").values()
+    assert none.keys() == row.keys()
+    assert none["N"] is none["degree"] is none["count"] is None
+
+
+def test_fewer_centers_are_needed_where_more_error_is_allowed_and_at_each_state_than_at_all() -> None:
+    result = ran("feasibility")
+    assert result.metrics == {
+        "r0.1.eps0.1.count": 3,
+        "r0.1.eps0.01.count": 6,
+    }
+    for row in result.rows("feasibility"):
+        assert int(row["least_pointwise"]) <= int(row["count"])
+        assert float(row["error"]) <= float(row["epsilon"])
+    along = result.rows("feasibility_pointwise")
+    assert len(along) == 16
+    assert all(int(row["eps0.1"]) <= 3 and int(row["eps0.01"]) <= 6 for row in along)
+
+
+def test_where_no_layout_is_good_enough_none_is_said_to_be() -> None:
+    states = tensor([[1.0, 0.0], [0.0, 1.0]])
+    kernel, target = st.ExponentialKernel(), st.targets.Paper()
+    problem = LocalProblem(
+        target=target, kernel=kernel, radius=0.3, states=states, time=torch.arange(2).double()
+    )
+    found = feasibility.solve(problem, [0.3], [1e-300, 1e3])
+    assert found.overall.tolist() == [[0, int(found.counts[0])]]
+    assert found.pointwise[0, 0].tolist() == [0, 0]
+
+
+@pytest.mark.parametrize("name", ["feasibility", "layouts"])
+def test_common_settings_hold(name: str, elsewhere: list[str], tmp_path: Path) -> None:
+    fewer = {"feasibility": "feasibility.states=9", "layouts": "layouts.states=2"}[name]
+    result = run(tmp_path, *words(name), fewer, *elsewhere, "figures=false")
+    assert any(value is not None for value in result.metrics.values())
+    assert len(result.rows(name)) >= 2
+    assert not (tmp_path / "figures").exists()
+
+
+@pytest.mark.parametrize("count", [1, 3, 15])
+@pytest.mark.parametrize("radius", [1e-8, 0.5])
+@pytest.mark.parametrize("width", [None, 0.8])
+def test_the_truth_of_the_flat_limit_agrees_with_another_implementation_to_25_digits(
+    count: int, radius: float, width: float | None
+) -> None:
+    directions = st.polygon(1) if count == 1 else st.rings(count)
+    x, zeta = uniform(2, seed=count), uniform(3, 2, low=-0.7, high=0.7, seed=7)
+    truth = Truth(directions, radius, x, paper, width)
+    for value, z in zip(flat_limit.interpolant(directions, radius, x, zeta, width), zeta, strict=True):
+        expected = Decimal(mp.nstr(truth.value(z), 40))
+        assert abs(value - expected) <= Decimal("1e-25") * abs(expected)
+
+
+def error(method: str, dtype: str, centers: int, radius: float) -> float:
+    """A relative error of the case; inf where the method fails."""
+    (row,) = [
+        row
+        for row in ran("flat_limit").rows("flat_limit")
+        if (row["dtype"], int(row["centers"])) == (dtype, centers)
+        and math.isclose(float(row["radius"]), radius, rel_tol=1e-6)
+    ]
+    return float(row[method] or "inf")
+
+
+def test_the_graded_basis_keeps_all_digits_at_every_radius() -> None:
+    for row in ran("flat_limit").rows("flat_limit"):
+        assert float(row["graded"]) <= {"float64": 5e-15, "float32": 5e-7}[row["dtype"]]
+    assert ran("flat_limit").metrics["graded_error_float64"] <= 5e-15
+
+
+@pytest.mark.parametrize(
+    ("method", "centers", "radius", "expected"),
+    [
+        ("cholesky", 3, 1e-6, 3e-10),
+        ("cholesky", 6, 1e-1, 3e-13),
+        ("cholesky", 6, 1e-3, 4e-9),
+        ("cholesky", 15, 1e-1, 2e-10),
+        ("jitter", 3, 1e-1, 9e-12),
+        ("jitter", 3, 1e-6, 5e-7),
+        ("jitter", 6, 1e-1, 7e-10),
+        ("jitter", 6, 1e-3, 2e-6),
+        ("jitter", 6, 1e-6, 4e-7),
+        ("jitter", 15, 1e-1, 5e-7),
+        ("jitter", 15, 1e-6, 2e-7),
+        ("pivoted", 3, 1e-6, 3e-10),
+        ("pivoted", 6, 1e-3, 3e-9),
+        ("pivoted", 6, 1e-6, 3e-10),
+        ("pivoted", 15, 1e-2, 2e-8),
+    ],
+)
+def test_other_methods_lose_what_the_reference_says(
+    method: str, centers: int, radius: float, expected: float
+) -> None:
+    # Rounding error is a random number, and another state or processor gives another one: a factor of 10.
+    assert expected / 10 <= error(method, "float64", centers, radius) <= 10 * expected
+
+
+@pytest.mark.parametrize(
+    ("dtype", "centers", "fails", "works"),
+    [
+        ("float64", 6, 1e-5, 1e-3),
+        ("float64", 15, 1e-3, 1e-1),
+        ("float32", 3, 1e-4, 1e-3),
+        ("float32", 6, 1e-2, 1e-1),
+        ("float32", 15, 1e-1, 0.5),
+    ],
+)
+def test_plain_cholesky_fails_below_its_radius(dtype: str, centers: int, fails: float, works: float) -> None:
+    assert error("cholesky", dtype, centers, fails) == math.inf
+    assert math.isfinite(error("cholesky", dtype, centers, works))
+    found = ran("flat_limit").metrics
+    assert fails <= found[f"cholesky_fails_at_{dtype}_{centers}"] * (1 + 1e-6) < works
+    assert found[f"cholesky_error_{dtype}_{centers}"] is None
+    assert found[f"graded_fails_at_{dtype}_{centers}"] is None
+    assert "fails" in (ran("flat_limit").directory / "flat_limit.md").read_text()
+
+
+def test_the_flat_limit_is_a_gaussian_s_too_and_takes_one_count(tmp_path: Path) -> None:
+    few = ("flat_limit.counts=6", "flat_limit.radii.smallest=1e-3", "flat_limit.radii.per_decade=1")
+    result = run(tmp_path, "experiment=flat_limit", "kernel=gaussian", "dtype=float32", *few, "figures=false")
+    assert result.metrics["graded_error_float64"] <= 5e-15
+    rows = result.rows("flat_limit")
+    assert [float(row["radius"]) for row in rows[::2]] == pytest.approx([1e-3, 1e-2, 1e-1, 0.5], rel=1e-6)
+    assert len(rows) == 2 * 4
+
+
+def test_an_error_is_relative_to_the_largest_value_and_infinite_without_a_number() -> None:
+    truth = [Decimal(2), Decimal(-4)]
+    assert flat_limit.relative_error(tensor([2.0, -3.0]), truth) == 0.25
+    assert flat_limit.relative_error(tensor([2.0, math.nan]), truth) == math.inf
+
+
+@pytest.mark.parametrize(
+    ("name", "override", "message"),
+    [
+        ("exponential_bound", "kernel=gaussian", "must be exponential"),
+        ("exponential_bound", "exponential_bound.radii=[]", "list of numbers"),
+        ("exponential_bound", "exponential_bound.epsilons=[0]", "must be positive"),
+        ("feasibility", "feasibility.states=0", r"feasibility\.states.*at least 1"),
+        ("feasibility", "feasibility.radii=0.1", "list of numbers"),
+        ("layouts", "layouts.radii=[a]", "must be a number"),
+        ("layouts", "centers.shrink.offset=0.1", "constant radius"),
+        ("flat_limit", "kernel=matern", r"`staf kernel=...` must be exponential or gaussian"),
+        ("flat_limit", "target=quadratic", r"`staf target=...` must be paper"),
+        ("flat_limit", "flat_limit.counts=[]", r"`staf flat_limit.counts=...` must not be empty"),
+        ("flat_limit", "flat_limit.counts=[0]", r"`staf flat_limit.counts=...` must be at least 1"),
+        ("flat_limit", "flat_limit.counts=[7]", r"rings"),
+        ("flat_limit", "flat_limit.radii.smallest=0.9e-30", r"radii.smallest=...` must be at least 1e-30"),
+        ("flat_limit", "flat_limit.radii.smallest=0.5", r"below the largest radius \(0.5\)"),
+        ("flat_limit", "flat_limit.radii.per_decade=0", r"per_decade=...` must be at least 1"),
+    ],
+)
+def test_wrong_settings_are_named_before_anything_is_written(
+    name: str, override: str, message: str, tmp_path: Path
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        run(tmp_path, *CASES[name].split(), override)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_slope_is_of_the_points_that_are_known_and_above_the_floor() -> None:
+    x = [0.1, 0.2, 0.4, 0.8, 1.6]
+    cubes: list[float | None] = [2 * step**3 for step in x]
+    assert log_slope(x, cubes) == pytest.approx(3.0)
+    assert log_slope(x, [None, *cubes[1:3], 0.0, None]) == pytest.approx(3.0)
+    assert log_slope(x, [1e-3, *cubes[1:]], above=2e-3) == pytest.approx(3.0)  # of what is above alone
+    assert log_slope(x, [None, None, None, None, 1.0]) is None
+
+
+def test_the_case_of_every_theorem_leaves_its_table() -> None:
+    for name in ("exponential_bound", "feasibility", "layouts", "flat_limit"):
+        result: Ran = ran(name)
+        assert len((result.directory / f"{name}.md").read_text().splitlines()) >= 3
+        assert result.log.count("\n") >= 3
+
+
+def test_blocks_of_rows_change_nothing() -> None:
+    basis = st.StaFBasis(st.ExponentialKernel(), st.StateFollowingCenters(st.rings(6), 0.1))
+    x = uniform(3, 2000, 2, seed=1).requires_grad_()
+    values = uniform(2, 1, 2000, 6, seed=2)  # broadcasts against the states
+    together = basis.local(x).fit(values)
+    assert together.shape == (2, 3, 2000, 6)
+    torch.testing.assert_close(together[1, 2], basis.local(x[2]).fit(values[1, 0]), rtol=1e-13, atol=1e-14)
+    (slope,) = torch.autograd.grad(together[:, 1, 40:50].sum(), x)
+    assert bool((slope[1, 40:50] != 0).all())
+    assert float(slope.norm()) == pytest.approx(float(slope[1, 40:50].norm()))
