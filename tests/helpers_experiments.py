@@ -23,7 +23,7 @@ CASES: dict[str, str] = {
     "adp_comparison": "experiment=adp_comparison duration=0.04 dt=0.01 trajectories=20",
     "adp_initial_weights": "experiment=adp_initial_weights duration=0.5 dt=0.02 trajectories=5 "
     "initial_weights=[0.1,1.0]",
-    "adp_tracking": "experiment=adp_tracking duration=0.3 dt=0.01 trajectories=2",
+    "adp_tracking": "experiment=adp_tracking duration=0.3 dt=0.01",
     "avoidance": "experiment=avoidance trajectories=3 duration=2.0 dt=0.1 adp.compile=false",
     "avoidance of a unicycle": "experiment=avoidance avoidance.vehicle=unicycle trajectories=2 "
     "duration=1.0 dt=0.1 adp.compile=false",

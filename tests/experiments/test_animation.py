@@ -1,4 +1,4 @@
-"""`staf animation=...`: the first trajectory in motion, as a GIF or as a page."""
+"""`staf animation=...`: the first trajectory in motion, as a GIF or as a page, and what each scene shows."""
 
 from __future__ import annotations
 
@@ -7,21 +7,25 @@ import io
 import json
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from composing import settings as composed
+from helpers import tensor
 from PIL import Image
-from recorded import Record
 
 import staf_torch
-from staf_torch.experiments.registry import experiment
-from staf_torch.figures.animation import Scene
+from staf_torch import adp
+from staf_torch.experiments import chase_batch, scenes
+from staf_torch.settings.adp import adp_problem
+from staf_torch.settings.chase import chase_problem
 
-BARE = ("figures=false", "history=false")
-SHORT = ("duration=0.02", "settle_time=0", *BARE)
+SHORT = ("duration=0.02", "settle_time=0", "figures=false", "history=false")
 LINE = ("system=linear", "system.matrix=[[-1.0]]")
 SPACE = ("target=quadratic", "system=three_state", "initial_state=[1.0,0.0,0.0]", "centers=simplex")
+NEAR = ("dt=0.01", "duration=1", "settle_time=0", "centers.radius=0.1")
 
 
 def drawn(directory: Path, *settings: str) -> Path:
@@ -30,15 +34,27 @@ def drawn(directory: Path, *settings: str) -> Path:
     return path
 
 
-@pytest.mark.parametrize("settings", [(), SPACE], ids=["plane", "space"])
+@pytest.mark.parametrize(
+    ("settings", "name"),
+    [
+        ((*SHORT, *SPACE), "chase"),
+        (
+            ("experiment=adp_tracking", "duration=0.02", "dt=0.01", "figures=false"),
+            "tracking",
+        ),
+    ],
+    ids=["chase", "tracking"],
+)
 def test_an_animation_has_a_frame_a_time_and_what_moves_moves(
-    settings: tuple[str, ...], tmp_path: Path
+    settings: tuple[str, ...], name: str, tmp_path: Path
 ) -> None:
-    path = drawn(tmp_path / "run", *SHORT, *settings, "animation=true")
-    assert path.name == "chase.gif"
+    if name == "tracking":
+        pytest.importorskip("scipy")
+    path = drawn(tmp_path / "run", *settings, "animation=true")
+    assert path.name == f"{name}.gif"
     with Image.open(path) as picture:
         assert picture.n_frames == 3
-        assert picture.size[0] > 500
+        assert picture.info["duration"] == 100  # ms
         first = np.asarray(picture.convert("RGB"))
         picture.seek(2)
         last = np.asarray(picture.convert("RGB"))
@@ -75,32 +91,70 @@ def test_what_cannot_be_animated_is_refused(settings: tuple[str, ...], words: st
         staf_torch.run(*settings, directory=tmp_path / "run")
 
 
-SCENES: dict[str, tuple[tuple[str, ...], bool]] = {
-    "a chase of the plane": ((), True),
-    "a chase in space": (SPACE, False),
-    "a loop": (("experiment=adp",), True),
-    "a tracked path": (("experiment=adp_tracking",), False),
-    "discs": (("experiment=avoidance", "adp.compile=false"), False),
-}
+@pytest.mark.parametrize("dim", [2, 3])
+def test_the_scene_of_a_chase_is_of_its_own_basis_target_and_weights(dim: int) -> None:
+    problem = chase_problem(composed(*NEAR, *(SPACE if dim == 3 else ())))
+    (outcome,) = chase_batch.simulate([problem], [None], [True])
+    scene, given = scenes.chase_scene(problem, outcome.drawn), outcome.drawn
+    at = np.round(np.linspace(0, 100, 60)).astype(int)
+    np.testing.assert_array_equal(scene.time, given["time"][at])
+    np.testing.assert_array_equal(scene.state, given["state"][at, :2])
+    np.testing.assert_array_equal(scene.curves.values, given["weights"][at])
+    np.testing.assert_array_equal(scene.curves.ideal, given["ideal_weights"][at])
+    x, k = torch.as_tensor(given["state"][at]), 17
+    np.testing.assert_allclose(scene.centers, problem.basis.centers(x)[..., :2].numpy())
+    # In the middle of the way through the ball V and V^ are those at the state itself.
+    middle = len(scene.along) // 2
+    assert scene.along[middle] == pytest.approx(0, abs=1e-6)
+    assert scene.value[k, middle] == pytest.approx(float(problem.target(x[k])), rel=1e-5)
+    estimate = problem.basis(x[k : k + 1], x[k]) @ torch.as_tensor(given["weights"][at[k]])
+    assert scene.estimate[k, middle] == pytest.approx(float(estimate), rel=1e-5)
+    assert (scene.grid is not None) == (dim == 2)
+    if scene.grid is not None:  # rows along the second coordinate
+        corner = problem.target(tensor([[scene.grid[0][3], scene.grid[1][70]]]))
+        assert scene.grid[2][70, 3] == pytest.approx(float(corner))
 
 
-@pytest.mark.parametrize("name", SCENES)
-def test_what_moves_in_an_animation_is_the_recorded(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, record: Record
+@pytest.mark.parametrize(
+    ("words", "centers", "curves"),
+    [
+        ((), 3, "weights of the critic"),
+        (("adp/policy=lqr",), 0, "control"),
+        (("adp/policy=rollout",), 6, "control"),
+    ],
+    ids=["learning", "lqr", "rollout"],
+)
+def test_the_scene_of_a_loop_has_the_centers_that_follow_it_and_the_optimal_value(
+    words: tuple[str, ...], centers: int, curves: str
 ) -> None:
-    settings, plane = SCENES[name]
-    short = ("duration=0.2", "dt=0.05", "trajectories=2", "figures=false", "animation=gif")
-    seen: list[Scene] = []
+    problem = adp_problem(composed("experiment=adp", "dt=0.02", "duration=0.2", *words))
+    result = adp.simulate(
+        problem.controller, problem.system, problem.cost, problem.initial_states, dt=0.02, steps=10
+    )
+    scene = scenes.loop_scene(problem, result)
+    assert scene.centers.shape[1:] == (centers, 2)
+    assert scene.curves.title == curves
+    assert scene.relative
+    middle = len(scene.along) // 2
+    x1, x2 = scene.state[-1]
+    assert scene.value[-1, middle] == pytest.approx(0.5 * x1**2 + x2**2, rel=1e-5)  # V* of the paper's plant
+    assert (np.diff(scene.time) > 0).all()
+    assert scene.grid is not None
 
-    def animated(scene: Scene, kind: str) -> dict[str, bytes]:
-        seen.append(scene)
-        return {"gif": kind.encode()}
 
-    for experiment_ in ("gradient_chase", "adp", "adp_tracking", "avoidance"):
-        monkeypatch.setattr(f"staf_torch.experiments.{experiment_}.animate", animated)
-    monkeypatch.setattr("staf_torch.experiments.adp_tracking._optimal_cost", lambda *given: None)  # not shown
-    cfg = composed(*settings, *short, *(() if "experiment" in str(settings) else ("settle_time=0",)))
-    experiment(cfg.task)(cfg, tmp_path)
-    (scene,) = seen
-    assert ("level lines" in scene.title) is plane
-    record(scene, rtol=1e-4)
+def test_the_scene_of_a_tracked_path_is_in_the_plane_of_the_path() -> None:
+    plant = adp.TwoStateTracking()
+    result = adp.simulate(
+        adp.Feedback(lambda x: torch.zeros_like(x[..., :1])),
+        plant,
+        adp.tracking_cost(10.0, 1.0),
+        tensor([[1.0, 0.5, 0.3, -0.2]]),
+        dt=0.01,
+        steps=5,
+    )
+    scene: Any = scenes.tracking_scene(
+        adp.Feedback(adp.LQR(staf_torch.systems.TwoState(), adp.QuadraticCost(1.0, 1.0, 2, 1))), result
+    )
+    desired = result.state[0, :, 2:4].numpy()
+    np.testing.assert_allclose(scene.followed, desired)
+    np.testing.assert_allclose(scene.state, result.state[0, :, :2].numpy() + desired)

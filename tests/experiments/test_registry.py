@@ -10,7 +10,6 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from staf_torch.experiments import registry
 from staf_torch.experiments.registry import (
     EXPERIMENTS,
     BatchedExperiment,
@@ -83,12 +82,6 @@ def test_an_experiment_of_ones_own_is_found_by_its_path() -> None:
 def test_what_is_no_experiment_is_refused(task: object, words: str) -> None:
     with pytest.raises(ValueError, match=rf"`staf task=...` {words}"):
         experiment(task)
-
-
-def test_an_error_of_the_package_itself_is_not_that_of_a_setting(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(registry, "EXPERIMENTS", {"broken": "laws.no_such_function"})
-    with pytest.raises(AttributeError, match="no_such_function"):
-        experiment("broken")
 
 
 @pytest.mark.parametrize(
