@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from omegaconf import DictConfig
@@ -86,7 +86,8 @@ def _followed(cfg: DictConfig, plant: ParametricPlant, gains: dict[str, Tensor],
     noise = real(COMMAND_LINE, "icl.noise", cfg.icl.noise)
     size = integer(COMMAND_LINE, "icl.size", cfg.icl.size, 1)
     start = [*vector(COMMAND_LINE, "initial_state", plain(cfg.initial_state), 2), 1.0, 0.0, 1.0]
-    tracker = ConcurrentTracker(plant, reference, source=source, size=size, **gains)
+    given: dict[str, Any] = dict(gains)
+    tracker = ConcurrentTracker(plant, reference, source=source, size=size, **given)
     method = Method(
         Measured(tracker, noise=[noise, noise, 0.0, 0.0, 0.0], dim=5),
         plant,
