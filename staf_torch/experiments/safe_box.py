@@ -62,11 +62,11 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
     followed = max(1, round(positive_real(COMMAND_LINE, "safe_box.followed", cfg.safe_box.followed) / dt))
     every = next(k for k in range(max(1, steps // 2000), steps + 1) if steps % k == 0)
     study = Study("safe_box", _COLUMNS, ("cost", "minimum_margin", "constraint_violations"), _log)
+    compared = methods(cfg, box, cost)  # asks for the settings' rules before anything takes time
     best = _optimum(box, cost, box.transform(x0[:1]), shooting) if shooting.shooting else None
     study.metrics["optimal_cost"] = best
     results: dict[str, LoopResult] = {}
     margins: dict[str, Tensor] = {}
-    compared = methods(cfg, box, cost)
     for name, method in compared.items():
         results[name] = _run(cfg, method, box, x0.to(dtype), steps, every)
         margins[name] = _margin(box, method.plant, results[name])
