@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from omegaconf import DictConfig, OmegaConf
 
 from staf_torch.sweeps.hydra_compat import Composer, config_loader, find_launcher
-from staf_torch.sweeps.hydra_compat.program import HAS_WHITELIST
+from staf_torch.sweeps.hydra_compat.inside import HAS_WHITELIST
 
 HYDRA: dict[str, str] = {} if HAS_WHITELIST else {"version_base": "1.3"}  # 1.4 deprecates the argument
 # OmegaConf 2.4, which Hydra 1.4 takes, deprecates the new name again.
@@ -18,7 +18,7 @@ register_resolver = OmegaConf.register_resolver if HAS_WHITELIST else OmegaConf.
 @functools.cache
 def _composer() -> Composer:
     find_launcher()  # also where the package is on the path and not installed
-    return Composer(config_loader(), hydra_node=False)
+    return Composer(config_loader())
 
 
 def settings(*overrides: str) -> DictConfig:

@@ -86,7 +86,7 @@ def _settings_are_trusted_as_by_the_command() -> Iterator[None]:
 
     It also reads `conf/` anew for each of some hundred commands, faster by the parser in C.
     """
-    from staf_torch.sweeps.hydra_compat.program import trusted
+    from staf_torch.sweeps.hydra_compat import trusted
 
     yaml.SafeLoader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     with trusted(path.stem for path in Path(__file__).parent.rglob("*.py")):

@@ -19,7 +19,6 @@ from ..sweeps.hydra_compat import (
     broken_sweep,
     find_launcher,
     full_errors,
-    mode_read_from_its_file,
     named_packages,
     program,
     trusted,
@@ -52,7 +51,7 @@ def main() -> None:
         try:
             argv = command_line(typed[1:])
             sys.argv = [typed[0], *with_mode(argv)]
-            with trusted(named_packages(argv)), mode_read_from_its_file():
+            with trusted(named_packages(argv)):
                 _staf()
         except Refused as refused:
             if wants_trace and refused.__cause__ is not None:

@@ -5,11 +5,10 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import gc
 import logging
 import sys
 import time
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -29,7 +28,6 @@ from .hydra_compat import (
     JobStatus,
     SweepContext,
     directory_of,
-    interpolations_parsed_once,
     search_paths,
     without_hydra_overrides,
 )
@@ -44,7 +42,6 @@ _NOT_BATCHED = (
     "they run one by one. hydra/launcher=joblib runs them side by side"
 )
 _KEPT_JOBS = 128  # as many as a batch has
-_COLLECTED = 64  # jobs after which their settings are collected
 _BAR_EVERY, _LINE_EVERY = 0.2, 10.0  # s
 
 
@@ -154,28 +151,25 @@ class Launch:
 
     def run(self, job_overrides: Sequence[Sequence[str]], first: int) -> list[JobReturn]:
         """Run the jobs, numbered from ``first``, and return Hydra's records of them, in order."""
-        with _seldom_collecting(), interpolations_parsed_once():
-            self._context.start()
-            if not PRINTS.get():
-                silence_terminal()
-            self._directory.mkdir(parents=True, exist_ok=True)
-            numbered = {first + i: list(overrides) for i, overrides in enumerate(job_overrides)}
-            records.list_jobs(self._directory, numbered)
-            returns = self._finished(numbered)
-            progress = SweepProgress(len(numbered), len(returns))
-            try:
-                with contextlib.closing(self._computed(numbered, set(returns), progress)) as computed:
-                    for job, task in computed:
-                        signals.check()
-                        self._still_there(len(returns), len(numbered))
-                        ended = self._replay(job, task)
-                        failure = ended._return_value if ended.status == JobStatus.FAILED else None
-                        progress.ended(job.name, None if failure is None else reason(failure))
-                        returns[job.num] = ended
-                        if len(returns) % _COLLECTED == 0:
-                            gc.collect()  # settings refer to their parents, and go no other way
-            finally:
-                progress.close()
+        self._context.start()
+        if not PRINTS.get():
+            silence_terminal()
+        self._directory.mkdir(parents=True, exist_ok=True)
+        numbered = {first + i: list(overrides) for i, overrides in enumerate(job_overrides)}
+        records.list_jobs(self._directory, numbered)
+        returns = self._finished(numbered)
+        progress = SweepProgress(len(numbered), len(returns))
+        try:
+            with contextlib.closing(self._computed(numbered, set(returns), progress)) as computed:
+                for job, task in computed:
+                    signals.check()
+                    self._still_there(len(returns), len(numbered))
+                    ended = self._replay(job, task)
+                    failure = ended._return_value if ended.status == JobStatus.FAILED else None
+                    progress.ended(job.name, None if failure is None else reason(failure))
+                    returns[job.num] = ended
+        finally:
+            progress.close()
         self._refuse_lost(numbered, returns)
         failed = sum(ended.status == JobStatus.FAILED for ended in returns.values())
         _log.info("%d of %d jobs completed, %d failed", len(numbered) - failed, len(numbered), failed)
@@ -183,9 +177,9 @@ class Launch:
 
     def _replay(self, job: Job, task: Callable[[DictConfig], Any]) -> JobReturn:
         """Run a job whose outcome is known as Hydra runs one, and keep no settings of it."""
-        config = self._context.job_config(job.num, job.overrides, reuse=self._context.own_callbacks)
+        config = self._context.job_config(job.num, job.overrides)
         self._directories[job.num] = directory_of(config)
-        ended = self._context.run_job(task, config, job.settings, job.overrides)
+        ended = self._context.run_job(task, config, job.settings)
         ended.cfg = ended.hydra_cfg = None
         return ended
 
@@ -214,18 +208,18 @@ class Launch:
         """Return what runs a job of many members in a worker, None for other jobs."""
         if job.settings.get("members") is None:
             return None
-        config = self._context.job_config(job.num, job.overrides, reuse=True)
+        config = self._context.job_config(job.num, job.overrides)
         return InWorker(Origin.of(config.hydra), search_paths())
 
     def _flat(self, overrides: Sequence[str]) -> Flat | None:
         """Return the settings of a job by dotted keys."""
-        return flat_or_none(self._context.settings(overrides, reuse=True))
+        return flat_or_none(self._context.settings(overrides))
 
     def _place_of(self, job: Job) -> Path:
         """Return the run directory of a job."""
         if self._numbered and not any(line.lstrip("+~").startswith("hydra") for line in job.overrides):
             return self._directory / str(job.num)
-        return directory_of(self._context.job_config(job.num, job.overrides, reuse=True))
+        return directory_of(self._context.job_config(job.num, job.overrides))
 
     def _finished(self, numbered: Mapping[int, list[str]]) -> dict[int, JobReturn]:
         """Return the jobs that an earlier start of this sweep completed."""
@@ -234,8 +228,8 @@ class Launch:
             return found
         anyway = records.resumed_anyway(self._context.master)
         for num, overrides in numbered.items():
-            settings = self._context.settings(overrides, reuse=True)
-            config = self._context.job_config(num, overrides, reuse=True)
+            settings = self._context.settings(overrides)
+            config = self._context.job_config(num, overrides)
             record = records.RunRecord(settings, config.hydra.runtime.choices, overrides, compiler())
             metrics = record.finished(directory_of(config), anyway=anyway)
             if metrics is not None:
@@ -279,23 +273,6 @@ class Launch:
             )
             for index, outcome, seconds in outcomes:
                 yield job(index), _off_the_terminal(outcome, seconds, Progress(progress.running))
-
-
-@contextlib.contextmanager
-def _seldom_collecting() -> Iterator[None]:
-    """Look for garbage seldom: Hydra copies configurations a dozen times a job, and Python would look through
-    all of them for cycles after every few, a fifth of the time of a sweep."""
-    before = gc.get_threshold()
-    ours = gc.get_freeze_count() == 0  # what a program has frozen itself cannot be told apart afterwards
-    if ours:
-        gc.freeze()  # the half a million objects of torch are here to stay
-    gc.set_threshold(20_000, 5, 5)
-    try:
-        yield
-    finally:
-        gc.set_threshold(*before)
-        if ours:
-            gc.unfreeze()
 
 
 def _off_the_terminal(outcome: Outcome, seconds: float, progress: Progress) -> Callable[[DictConfig], Any]:

@@ -33,7 +33,6 @@ from .executors import Inline, compute
 from .hydra_compat import (
     Composer,
     ConfigLoader,
-    PlainComposer,
     config_loader,
     parse_override,
     product,
@@ -83,12 +82,12 @@ def run(
     loader = config_loader()
     jobs = member_overrides(cfg.members, loader)
     fixed = ("figures=false", f"history={str(keep).lower()}")
-    composer = PlainComposer(Composer(loader, config_name, hydra_node=False, always=[*base, *fixed]))
+    composer = Composer(loader, config_name)
     out, before = RunDirectory(directory), start.left
     done = len(before.made)
 
     def composed(begin: int) -> ManySettings:
-        return composer([[*base, *job, *fixed] for job in jobs[begin : begin + _PIECE]])
+        return composer.many([[*base, *job, *fixed] for job in jobs[begin : begin + _PIECE]])
 
     cfgs = composed(0)  # before anything is written: most wrong names are refused here
     for begin in range(0, done, _PIECE):

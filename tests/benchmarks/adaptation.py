@@ -43,7 +43,7 @@ def loops(rows: int) -> dict[str, Loop]:
 
 def in_the_box(rows: int) -> dict[str, tuple[Loop, dict[str, object]]]:
     """The methods of `staf experiment=safe_box`, each with the settings of its loop."""
-    composer = Composer(config_loader(), hydra_node=False)
+    composer = Composer(config_loader())
     cfg = composer(["experiment=safe_box", f"trajectories={rows}", f"dt={DT}"])
     system = make_plant(cfg)
     box = systems.Barrier(system, list(cfg.safe_box.low), list(cfg.safe_box.high))
@@ -58,7 +58,7 @@ def in_the_box(rows: int) -> dict[str, tuple[Loop, dict[str, object]]]:
 
 def among_discs(rows: int, kind: str) -> Loop:
     """A vehicle of `staf experiment=avoidance` behind its filter."""
-    composer = Composer(config_loader(), hydra_node=False)
+    composer = Composer(config_loader())
     given = ["experiment=avoidance", f"trajectories={rows}", f"avoidance.vehicle={kind}", f"dt={DT}"]
     cfg = composer(given)
     own, chosen = vehicle(cfg, DT), cfg.avoidance

@@ -153,7 +153,7 @@ class Loop(NamedTuple):
 def among(kind: str, count: int, seed: int) -> Loop:
     """The scenarios of `staf experiment=avoidance` with a period of 0.1 s."""
     given = ["experiment=avoidance", f"trajectories={count}", f"avoidance.vehicle={kind}", f"seed={seed}"]
-    cfg = Composer(config_loader(), hydra_node=False)([*given, f"dt={DT}"])
+    cfg = Composer(config_loader())([*given, f"dt={DT}"])
     own, x0 = vehicle(cfg, DT), avoidance.scenarios(cfg)
     plant = avoidance.AmongDiscs(own, DISCS)
     cost = avoidance.vehicle_cost(cfg, own, int(plant.dim or 0))

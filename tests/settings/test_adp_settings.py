@@ -18,7 +18,7 @@ from staf_torch.cli.staf import config_directory
 from staf_torch.settings import adp as loops
 from staf_torch.settings.adp import adp_problem
 from staf_torch.settings.chase import chase_problem
-from staf_torch.sweeps.hydra_compat.program import trusted
+from staf_torch.sweeps.hydra_compat import trusted
 
 GROUPS = ("policy", "law", "basis", "extrapolation", "cost")
 OPTIONS = [

@@ -24,7 +24,7 @@ from staf_torch.metrics import Metric
 from staf_torch.settings import chase
 from staf_torch.settings.chase import ChaseProblem, chase_problem, make, make_centers
 from staf_torch.settings.plain import PlainSettings
-from staf_torch.sweeps.hydra_compat.program import named_packages, trusted
+from staf_torch.sweeps.hydra_compat import named_packages, trusted
 
 GROUPS = ("kernel", "centers", "target", "system", "optimizer")
 OPTIONS = [

@@ -18,10 +18,8 @@ from staf_torch.results.run_record import flat
 from staf_torch.settings.plain import PlainSettings
 from staf_torch.sweeps.hydra_compat import (
     Composer,
-    PlainComposer,
     config_loader,
     find_launcher,
-    interpolations_parsed_once,
     parse_override,
     product,
     search_paths,
@@ -55,7 +53,7 @@ def test_a_configuration_is_the_one_that_hydra_composes(job: list[str]) -> None:
     loader = config_loader()
     expected = loader.load_configuration("config", ["dt=0.02", *job], RunMode.RUN)
     composer = Composer(loader)
-    first, again = (composer(["dt=0.02", *job]) for _ in range(2))
+    first, again = (composer.whole(["dt=0.02", *job]) for _ in range(2))
     for found in (first, again):
         assert OmegaConf.to_yaml(found) == OmegaConf.to_yaml(expected)
         assert repr(OmegaConf.to_container(found)) == repr(OmegaConf.to_container(expected))
@@ -64,7 +62,7 @@ def test_a_configuration_is_the_one_that_hydra_composes(job: list[str]) -> None:
                 flag(one) for one in (expected, expected.hydra, expected.hydra.runtime)
             ]
     first.seed = 99
-    assert again.seed == expected.seed
+    assert again.seed == composer(["dt=0.02", *job]).seed == expected.seed
 
 
 SAME_KEYS = [
@@ -85,38 +83,18 @@ SAME_KEYS = [
 ]
 
 
-def test_an_object_that_is_used_again_holds_nothing_of_the_call_before() -> None:
+def test_a_configuration_holds_nothing_of_those_composed_before() -> None:
     loader = config_loader()
-    always = ["dt=0.02", "seed=3", "trajectories=2"]
-    composers = {node: Composer(loader, hydra_node=node, always=always) for node in (True, False)}
-    objects: dict[bool, set[int]] = {True: set(), False: set()}
-    with interpolations_parsed_once():
-        for job in SAME_KEYS:
-            line = ["dt=0.02", "trajectories=2", *job]
-            expected = OmegaConf.to_container(Composer(loader).anew(line))
-            for hydra_node, composer in composers.items():
-                if not hydra_node:
-                    del expected["hydra"]
-                found = composer.reused(line)
-                objects[hydra_node].add(id(found))
-                assert pickle.dumps(OmegaConf.to_container(found)) == pickle.dumps(expected), job
-                assert pickle.dumps(OmegaConf.to_container(composer(line))) == pickle.dumps(expected), job
-                OmegaConf.set_readonly(found.hydra if hydra_node else found, hydra_node)
-    assert all(len(used) < len(SAME_KEYS) for used in objects.values())
-
-
-def test_an_override_that_fails_leaves_nothing_in_an_object_that_is_used_again() -> None:
-    composer = Composer(config_loader(), hydra_node=False)
-    assert composer.reused(["seed=3", "spread=1"]).seed == 3
-    for _ in range(2):
-        with pytest.raises(HydraException):
-            composer.reused(["seed=4", "spraed=1"])
-    again = composer.reused(["seed=5", "spread=1"])
-    assert (again.seed, again.spread) == (5, 1)
-    assert (
-        composer.reused(["spread=2"]).seed
-        == config_loader().load_configuration("config", [], RunMode.RUN).seed
-    )
+    composer = Composer(loader)
+    for job in SAME_KEYS:
+        line = ["dt=0.02", "trajectories=2", *job]
+        expected = OmegaConf.to_container(loader.load_configuration("config", line, RunMode.RUN))
+        found = composer.whole(line)
+        assert pickle.dumps(OmegaConf.to_container(found)) == pickle.dumps(expected), job
+        del expected["hydra"]
+        found = composer(line)
+        assert pickle.dumps(OmegaConf.to_container(found)) == pickle.dumps(expected), job
+        OmegaConf.update(found, "seed", 77, force_add=True)
 
 
 @pytest.mark.parametrize(
@@ -126,11 +104,11 @@ def test_an_override_that_fails_leaves_nothing_in_an_object_that_is_used_again()
 def test_what_hydra_refuses_is_refused_in_its_words(line: str) -> None:
     loader = config_loader()
     with pytest.raises(HydraException) as expected:
-        loader.load_configuration("config", [line], RunMode.RUN)
+        loader.load_configuration("config", ["dt=0.02", line], RunMode.RUN)
     composer = Composer(loader)
     for _ in range(2):
         with pytest.raises(type(expected.value)) as found:
-            composer([line])
+            composer(["dt=0.02", line])
         assert str(found.value) == str(expected.value)
 
 
@@ -194,8 +172,8 @@ def test_plain_settings_are_those_of_hydra_and_nothing_that_refers_to_another_is
     lines = [
         ["dt=0.02", "trajectories=2", *job] for job in (*SAME_KEYS, *JOBS[:-2], ["seed=5", "spread=2.0"])
     ]
-    composer = Composer(config_loader(), hydra_node=False, always=["dt=0.02", "trajectories=2"])
-    many = PlainComposer(composer)(lines)
+    composer = Composer(config_loader())
+    many = composer.many(lines)
     plain = []
     for line, found, by_key in zip(lines, many.read(), many.flat, strict=True):
         expected = composer(line)
@@ -205,8 +183,8 @@ def test_plain_settings_are_those_of_hydra_and_nothing_that_refers_to_another_is
             assert json.dumps(found) == json.dumps(OmegaConf.to_container(expected)), line
         else:
             assert found == expected
-    assert [job for job in SAME_KEYS if job not in plain] == [*SAME_KEYS[5:11]]
+    assert [job for job in SAME_KEYS if job not in plain] == [*SAME_KEYS[5:7], *SAME_KEYS[9:11]]
     assert many[-1] == composer(lines[-1])
     assert many.of([2, 0])[1] == composer(lines[0])
     with pytest.raises(HydraException):
-        PlainComposer(composer)([["seed=1"], ["sead=1"]])
+        composer.many([["seed=1"], ["sead=1"]])

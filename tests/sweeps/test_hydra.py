@@ -13,8 +13,8 @@ from omegaconf import OmegaConf
 from staf_torch.settings import config_directory
 from staf_torch.sweeps.hydra_compat import find_launcher, full_errors, named_packages, overrides_in, with_mode
 from staf_torch.sweeps.hydra_compat.in_process import application
+from staf_torch.sweeps.hydra_compat.inside import HAS_WHITELIST
 from staf_torch.sweeps.hydra_compat.log_handlers import handlers_aside
-from staf_torch.sweeps.hydra_compat.program import HAS_WHITELIST
 
 OWN = "target._target_=mine.targets.Wave"
 
@@ -54,7 +54,6 @@ def test_the_mode_of_an_experiment_is_said_where_only_the_newer_hydra_needs_it(f
         ([], False),
         (["experiment=ablation", "kernel=gaussian"], True),
         (["experiment=ablation", "experiment=adp"], False),
-        (["experiment=adp", "++experiment=ablation"], True),
         (["experiment=ablation", "hydra.mode=RUN"], False),
         (["experiment=adp", "hydra.mode=MULTIRUN"], True),
     ],

@@ -24,7 +24,7 @@ from staf_torch.cli.table import main
 from staf_torch.deploy import sheet
 from staf_torch.experiments.registry import experiment
 from staf_torch.results.reader import collect
-from staf_torch.sweeps.hydra_compat.program import HAS_WHITELIST
+from staf_torch.sweeps.hydra_compat.inside import HAS_WHITELIST
 from staf_torch.tables import html_text, json_text, latex_text, tabulate
 
 # `staf-table`

@@ -1,4 +1,4 @@
-"""What depends on the inside of Hydra 1.3 and 1.4; no module outside this folder does."""
+"""What knows Hydra 1.3 and 1.4 well; its inside is imported in `inside` alone."""
 
 from hydra.core.config_loader import ConfigLoader as ConfigLoader
 from hydra.core.utils import JobReturn as JobReturn
@@ -8,28 +8,25 @@ from hydra.core.utils import env_override as env_override
 from .composing import Composer as Composer
 from .composing import JobLoader as JobLoader
 from .composing import as_typed as as_typed
-from .composing import interpolations_parsed_once as interpolations_parsed_once
 from .composing import parse_override as parse_override
+from .inside import SearchPaths as SearchPaths
+from .inside import config_loader as config_loader
+from .inside import everything_trusted as everything_trusted
+from .inside import search_paths as search_paths
+from .inside import searching as searching
+from .inside import trusted as trusted
+from .inside import trusted_packages as trusted_packages
 from .jobs import SweepContext as SweepContext
 from .jobs import directory_of as directory_of
 from .jobs import without_hydra_overrides as without_hydra_overrides
-from .loading import SearchPaths as SearchPaths
-from .loading import config_loader as config_loader
-from .loading import search_paths as search_paths
-from .loading import searching as searching
-from .mode import mode_read_from_its_file as mode_read_from_its_file
-from .plain_composing import PlainComposer as PlainComposer
 from .products import product as product
 from .products import sweep_size as sweep_size
 from .program import BrokenSweep as BrokenSweep
 from .program import breaking_off as breaking_off
 from .program import broken_sweep as broken_sweep
-from .program import everything_trusted as everything_trusted
 from .program import find_launcher as find_launcher
 from .program import full_errors as full_errors
 from .program import named_packages as named_packages
 from .program import overrides_in as overrides_in
 from .program import program as program
-from .program import trusted as trusted
-from .program import trusted_packages as trusted_packages
 from .program import with_mode as with_mode

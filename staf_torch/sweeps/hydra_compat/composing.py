@@ -1,23 +1,29 @@
-"""Settings from overrides: Hydra's composition, made fast for jobs that differ in values alone."""
+"""Settings from overrides: Hydra composes each choice of config groups once, and values are set in copies.
+
+Hydra takes some 40 ms a configuration, nearly all of it for the defaults list and for merging files, and the
+jobs of a sweep differ in values mostly. A test holds the results to Hydra's own, to the last flag.
+"""
 
 from __future__ import annotations
 
-import contextlib
-import functools
 import pickle
-from collections.abc import Collection, Iterator, Mapping, Sequence
+import re
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, cast
 
-import omegaconf.base
-from hydra._internal import config_loader_impl
-from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override, OverrideType
-from hydra.errors import ConfigCompositionException
 from hydra.types import HydraContext, RunMode
 from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict, read_write
 from omegaconf.errors import OmegaConfBaseException
+
+from ...results import run_record as records
+from ...results.files import plain as as_json
+from ...settings.plain import ManySettings, PlainSettings
+
+_MOST_LINES = 10_000  # that are kept: a million seeds are a million lines
+_MOST_COMPOSED = 1000  # configurations that are kept
 
 
 def parse_override(line: str, loader: ConfigLoader | None = None) -> Override:
@@ -34,204 +40,223 @@ def parse_override(line: str, loader: ConfigLoader | None = None) -> Override:
     return parsed
 
 
-@contextlib.contextmanager
-def interpolations_parsed_once() -> Iterator[None]:
-    """Keep the parse trees of interpolations, which OmegaConf makes anew for every value that it looks up.
-
-    Such as `${hydra.job.num}`: a millisecond each time, in a sweep a few times a job.
-    """
-    module: Any = omegaconf.base
-    parse = getattr(module, "parse", None)
-    if parse is None:
-        yield
-        return
-    module.parse = functools.lru_cache(1000)(parse)
-    try:
-        yield
-    finally:
-        module.parse = parse
-
-
 def as_typed(lines: ListConfig) -> list[str]:
     """Return overrides that Hydra has noted as they were typed: an interpolation in them is not looked up."""
     return cast(list[str], OmegaConf.to_container(lines))
 
 
-MOST_LINES = 10_000  # that are kept: a million seeds are a million lines
+class _Line(NamedTuple):
+    """One override."""
+
+    override: Override
+    key: str
+    value: Any
+    sets: bool  # a number, a text or a list at a key that is there, and nothing else
+    refers: bool  # whether the value is known with the other settings alone
+    path: str | None  # the key with a dot behind every part; None: what is composed depends on it
+
+
+class _Composed(NamedTuple):
+    """The configuration of one choice of groups, pickled: copied a fifth as fast otherwise."""
+
+    whole: bytes
+    settings: bytes  # without Hydra's node
 
 
 class Composer:
-    """``loader.load_configuration(config_name, overrides, RunMode.RUN)``, fast where it is called often.
-
-    Hydra takes some 40 ms a configuration, nearly all of it for the defaults list and for merging files. Here
-    each choice of config groups is composed once, and the values are then applied. A test holds the result to
-    Hydra's own, to the last flag.
+    """The configurations of a program by their overrides, as its loader composes them.
 
     Args:
         loader: Hydra's, of the program.
         config_name: of the primary configuration.
-        hydra_node: False for the configuration as a task sees it, which is the larger part of the time.
-        whole: a composer of the same configurations with Hydra's node, whose choices are not composed again.
-        always: overrides that all calls share; their values are applied once.
     """
 
-    def __init__(
-        self,
-        loader: ConfigLoader,
-        config_name: str | None = "config",
-        *,
-        hydra_node: bool = True,
-        always: Collection[str] = (),
-        whole: Composer | None = None,
-    ) -> None:
-        self._loader, self._name, self._hydra_node, self._whole = loader, config_name, hydra_node, whole
-        self._parser = OverridesParser.create()
-        self._parsed: dict[str, Override] = {}
-        self._always = frozenset(always)
-        self._chosen: dict[tuple[Any, ...], bytes] = {}  # pickled: copied a fifth as fast otherwise
-        self._groups: dict[str, bool] = {}
-        self._reused: _Reused | None = None
-        self._apply = getattr(ConfigLoaderImpl, "_apply_overrides_to_config", None)
-        self._repository = getattr(loader, "repository", None)
+    def __init__(self, loader: ConfigLoader, config_name: str | None = "config") -> None:
+        self._loader, self._name = loader, config_name
+        self._lines: dict[str, _Line] = {}
+        self._groups: dict[tuple[str, ...], bool] = {}
+        self._composed: dict[tuple[str, ...], _Composed] = {}
+        self._bases: dict[tuple[tuple[str, ...], ...], _Base | None] = {}
 
     def __call__(self, overrides: Sequence[str]) -> DictConfig:
-        """Return the configuration of these overrides; the caller may change it.
+        """Return the configuration of these overrides as a task sees it, without Hydra's node.
+
+        The caller may change it.
 
         Raises:
             hydra.errors.HydraException, ValueError: what Hydra itself raises.
         """
-        parsed = [self.parsed(line) for line in overrides]
-        chosen = self.choices(overrides)
-        if chosen is None:
-            return self.anew(overrides)
-        values = [one for one in parsed if not self.chooses(one)]
-        first: list[Override] = []
-        if self._always and independent({one.key_or_group: one for one in values}):
-            first = [one for one in values if one.input_line in self._always]
-        key = (chosen, *(one.input_line for one in first))
-        if key not in self._chosen:
-            made = self.anew(chosen) if self._whole is None else self._without_node(self._whole(chosen))
-            self._set(made, first, parsed)
-            self._chosen[key] = pickle.dumps(made)
-        composed: DictConfig = pickle.loads(self._chosen[key])
-        self._set(composed, [one for one in values if one not in first], parsed)
-        return composed
+        return self._with_values(overrides, self._read(overrides), hydra_node=False)
 
-    def reused(self, overrides: Sequence[str]) -> DictConfig:
-        """Return the configuration of these overrides in an object that the next call of this may change.
+    def whole(self, overrides: Sequence[str]) -> DictConfig:
+        """Return the configuration of these overrides with Hydra's node; all else as of a call."""
+        lines = self._read(overrides)
+        config = self._with_values(overrides, lines, hydra_node=True)
+        with read_write(config.hydra):
+            _note_overrides(config.hydra, [line.override for line in lines])
+        return config
 
-        Where the values of the same keys alone are others than in the call before, those are set: a third of
-        the time of a new object. Errors as of a call.
+    def many(self, jobs: Sequence[Sequence[str]]) -> ManySettings:
+        """Return the settings of many jobs by their overrides; errors are those of a call.
+
+        They are plain dictionaries where no setting refers to another one and jobs set the same keys, each a
+        number, a text or a list at a place of its own: the first of such jobs alone is composed.
         """
-        parsed, chosen = [self.parsed(line) for line in overrides], self.choices(overrides)
-        values = {one.key_or_group: one for one in parsed if not self.chooses(one)}
-        before, self._reused = self._reused, None  # an error leaves some of the values
-        if chosen is None or not independent(values):
-            return self(overrides)
-        if before is not None and before.chosen == chosen and list(before.values) == list(values):
-            composed = before.composed
-            further = [one for key, one in values.items() if one is not before.values[key]]
-            self._set(composed, further, parsed)
-        else:
-            composed = self(overrides)
-        self._reused = _Reused(chosen, values, composed)
-        return composed
+        plain: list[PlainSettings | None] = []
+        flat: list[Mapping[str, Any]] = []
+        for overrides in jobs:
+            lines = self._read(overrides)
+            values = {line.key: line for line in lines if line.sets}
+            key = _others(lines), tuple(values)
+            if key not in self._bases:
+                self._bases[key] = self._base(overrides, lines, values)
+            base = self._bases[key]
+            if base is None or any(line.refers for line in values.values()):
+                tree, by_key = None, records.flat(self(overrides))
+            else:
+                tree, by_key = base.with_values(values)
+            plain.append(tree)
+            flat.append(by_key)
+        return ManySettings(plain, flat, lambda i: self(jobs[i]))
 
-    def choices(self, overrides: Sequence[str]) -> tuple[str, ...] | None:
-        """Return the overrides that decide what is composed; None where Hydra must compose it itself."""
-        chosen = tuple(line for line in overrides if self.chooses(self.parsed(line)))
-        return None if self._apply is None or any("searchpath" in line for line in chosen) else chosen
+    def _read(self, overrides: Sequence[str]) -> list[_Line]:
+        searched = tuple(line for line in overrides if line.lstrip("+~").startswith("hydra.searchpath"))
+        return [self._lines.get(line) or self._line(line, searched) for line in overrides]
 
-    def _set(self, composed: DictConfig, values: Sequence[Override], parsed: Sequence[Override]) -> None:
-        """Set values in a configuration, and note in Hydra's node all overrides that led to it."""
-        assert self._apply is not None
+    def _line(self, text: str, searched: tuple[str, ...]) -> _Line:
+        override = parse_override(text)
+        key, value = override.key_or_group, override.value()
+        groups = (key, *searched)
+        if groups not in self._groups:
+            self._groups[groups] = bool(self._loader.get_group_options(key, None, self._name, [*searched]))
+        sweeps, is_value = override.is_sweep_override(), isinstance(value, dict) or not self._groups[groups]
+        chooses = sweeps or override.is_hydra_override() or override.package is not None or not is_value
+        path = None if chooses else re.sub(r"[\[\].]+", ".", key).rstrip(".") + "."
+        sets = not chooses and override.type == OverrideType.CHANGE and not isinstance(value, dict)
+        line = _Line(override, key, value, sets, _refers(value), path)
+        if not searched:
+            if len(self._lines) >= _MOST_LINES:
+                self._lines.clear()
+            self._lines[text] = line
+        return line
+
+    def _with_values(
+        self, overrides: Sequence[str], lines: Sequence[_Line], *, hydra_node: bool
+    ) -> DictConfig:
+        """Set values in a copy of what Hydra composes of the other overrides, or let it compose all."""
+        values = [line for line in lines if line.sets]
+        others = [line for line in lines if not line.sets]
+        if any(_overlap(one, other) for one in others for other in values):
+            return self._copy(overrides, hydra_node)  # their order counts
+        config = self._copy(_others(lines), hydra_node)
         try:
-            self._apply(values, composed)
-        except OmegaConfBaseException as error:
-            raise ConfigCompositionException() from error
-        if self._hydra_node:
-            with read_write(composed.hydra):  # a job may have run with it
-                _note_overrides(composed, parsed)
+            for line in values:
+                OmegaConf.update(config, line.key, line.value, merge=True)
+        except OmegaConfBaseException:
+            return self._copy(overrides, hydra_node)  # which raises in Hydra's words
+        return config
 
-    def anew(self, overrides: Sequence[str]) -> DictConfig:
-        """Return the configuration as Hydra itself composes it; arguments and errors as of a call."""
-        return self._without_node(self._loader.load_configuration(self._name, list(overrides), RunMode.RUN))
+    def _copy(self, overrides: Sequence[str], hydra_node: bool) -> DictConfig:
+        """Return a copy of what Hydra composes of these overrides."""
+        key = tuple(overrides)
+        if key not in self._composed:
+            config = self._loader.load_configuration(self._name, list(overrides), RunMode.RUN)
+            whole = pickle.dumps(config)
+            with read_write(config), open_dict(config):
+                del config["hydra"]
+            if len(self._composed) >= _MOST_COMPOSED:
+                self._composed.clear()
+            self._composed[key] = _Composed(whole, pickle.dumps(config))
+        composed = self._composed[key]
+        return cast(DictConfig, pickle.loads(composed.whole if hydra_node else composed.settings))
 
-    def _without_node(self, composed: DictConfig) -> DictConfig:
-        """Remove Hydra's node, unless it is wanted."""
-        if not self._hydra_node:
-            with read_write(composed), open_dict(composed):
-                del composed["hydra"]
-        return composed
-
-    def parsed(self, line: str) -> Override:
-        """Return an override, parsed and looked at once. Errors as of a call."""
-        if line not in self._parsed:
-            if len(self._parsed) >= MOST_LINES:
-                self._parsed.clear()
-            (parsed,) = self._parser.parse_overrides([line])
-            if parsed.is_sweep_override():
-                self.anew([line])  # refused there, in Hydra's words
-            self._parsed[line] = parsed
-        return self._parsed[line]
-
-    def chooses(self, override: Override) -> bool:
-        """Return whether the override decides what is composed, beyond the value of one key."""
-        key = override.key_or_group
-        if override.is_hydra_override() or self._repository is None:
-            return True
-        if key not in self._groups:
-            self._groups[key] = bool(self._repository.group_exists(key))
-        return self._groups[key] and not isinstance(override.value(), dict)
-
-
-class _Reused(NamedTuple):
-    """The configuration that `Composer.reused` returned last."""
-
-    chosen: tuple[str, ...]
-    values: dict[str, Override]  # by their keys
-    composed: DictConfig
+    def _base(
+        self, overrides: Sequence[str], lines: Sequence[_Line], values: Mapping[str, _Line]
+    ) -> _Base | None:
+        """Compose one job for all of its kind; None where their settings are not plain."""
+        others = [line for line in lines if not line.sets]
+        own = list(values.values())
+        if any(_overlap(one, other) for i, one in enumerate(own) for other in (*own[:i], *others)):
+            return None
+        composed = self(overrides)
+        tree = OmegaConf.to_container(composed)
+        assert isinstance(tree, dict)
+        if _refers(tree):
+            return None
+        settings = PlainSettings.of(tree)
+        if any(_at(settings, key) != line.value for key, line in values.items()):
+            return None  # an entry of a list, or a key that is written in another way
+        return _Base(settings, records.flat(composed), dict(values))
 
 
-def independent(values: Mapping[str, Override]) -> bool:
-    """Return whether each override sets a number, a text or a list at a key of its own, with none above it.
+class _Base(NamedTuple):
+    """The settings of one job, from which those of others follow."""
 
-    Then one of them may be set anew, and what it was leaves nothing.
-    """
-    for key, one in values.items():
-        above = {key[:i] for i, letter in enumerate(key) if letter == "."}
-        value = one.value()
-        if one.type != OverrideType.CHANGE or not above.isdisjoint(values):
-            return False
-        if isinstance(value, dict) or "${" in str(value):
-            return False
-    return True
+    tree: PlainSettings
+    flat: Mapping[str, Any]
+    values: Mapping[str, _Line]
+
+    def with_values(self, values: Mapping[str, _Line]) -> tuple[PlainSettings, Mapping[str, Any]]:
+        """Return the settings, nested and by dotted keys, with other values of the same keys."""
+        tree, flat = PlainSettings(self.tree), dict(self.flat)
+        for key, line in values.items():
+            if line is self.values[key]:
+                continue
+            *path, last = key.split(".")
+            node = tree
+            for part in path:
+                node[part] = PlainSettings(node[part])
+                node = node[part]
+            node[last] = line.value
+            if key in flat:
+                flat[key] = as_json(line.value)
+        return tree, flat
 
 
-def _note_overrides(composed: DictConfig, parsed: Sequence[Override]) -> None:
-    """Write into Hydra's node what Hydra notes there of the overrides."""
-    app = [one for one in parsed if not one.is_hydra_override()]
-    node: Any = composed.hydra
-    lines: list[Any] = [one.input_line for one in app]
-    noted = as_typed(node.overrides.task)
-    if len(noted) == len(lines):
-        for index in (i for i, line in enumerate(lines) if line != noted[i]):
-            node.overrides.task[index] = lines[index]
-    else:
-        node.overrides.task = lines
-    directory_name = getattr(config_loader_impl, "get_overrides_dirname", None)  # Hydra 1.3; then a resolver
-    if directory_name is not None:
+def _others(lines: Sequence[_Line]) -> tuple[str, ...]:
+    """Return the overrides that do more than to set a value."""
+    return tuple(str(line.override.input_line) for line in lines if not line.sets)
+
+
+def _overlap(one: _Line, other: _Line) -> bool:
+    """Return whether two overrides concern the same setting, or one a part of the other's."""
+    if one.path is None or other.path is None:
+        return False
+    return one.path.startswith(other.path) or other.path.startswith(one.path)
+
+
+def _at(tree: Any, key: str) -> Any:
+    """Return the value at a dotted key; the tree itself where there is none."""
+    node = tree
+    for part in key.split("."):
+        if not isinstance(node, dict) or part not in node:
+            return tree
+        node = node[part]
+    return node
+
+
+def _refers(value: Any) -> bool:
+    """Return whether something in a value refers to other settings, or is missing."""
+    return "${" in str(value) or "???" in str(value)
+
+
+def _note_overrides(node: Any, parsed: Sequence[Override]) -> None:
+    """Write into Hydra's node what Hydra notes there of all overrides."""
+    task = [one for one in parsed if not one.is_hydra_override()]
+    lines = [str(one.input_line) for one in task]
+    if as_typed(node.overrides.task) == lines:
+        return
+    node.overrides.task = lines
+    if not OmegaConf.is_interpolation(node.job, "override_dirname"):  # it is one in Hydra 1.4
         style = node.job.config.override_dirname
-        node.job.override_dirname = directory_name(
-            overrides=app, kv_sep=style.kv_sep, item_sep=style.item_sep, exclude_keys=style.exclude_keys
-        )
+        named = sorted(str(one.input_line) for one in task if one.key_or_group not in style.exclude_keys)
+        node.job.override_dirname = style.item_sep.join(named).replace("=", style.kv_sep)
 
 
 class JobLoader:
-    """Hydra's loader for a sweep whose launcher is ours: jobs are composed as `Composer` does it.
+    """Hydra's loader for a sweep whose launcher is ours: jobs are composed by a `Composer`.
 
-    Sweepers compose each job as a test and throw the result away: they get the settings without Hydra's node,
-    in an object that is used again. Our launcher takes that node from `whole`.
+    Sweepers compose each job as a test before our launcher does.
 
     Args:
         loader: Hydra's own, asked for all else.
@@ -239,12 +264,7 @@ class JobLoader:
     """
 
     def __init__(self, loader: ConfigLoader, master: DictConfig) -> None:
-        self._loader = loader
-        name = master.hydra.job.config_name
-        self._whole = Composer(loader, name)
-        self._settings = Composer(loader, name, hydra_node=False, whole=self._whole)
-        self.hydra_yaml: dict[tuple[str, ...], dict[str, str]] = {}  # parts of `hydra.yaml`, by `choices`
-        self._unseen = bool(master.hydra.searchpath)  # groups that a `Composer` cannot see
+        self._loader, self._composer = loader, Composer(loader, master.hydra.job.config_name)
 
     @classmethod
     def install(cls, context: HydraContext, master: DictConfig) -> None:
@@ -256,39 +276,18 @@ class JobLoader:
         return getattr(self._loader, name)
 
     def load_sweep_config(self, master_config: DictConfig, sweep_overrides: Sequence[str]) -> DictConfig:
-        """Return the settings of a job without Hydra's node, in an object that the next call may change."""
-        return self._composed(self._settings, master_config, sweep_overrides, reuse=True)
+        """Return the configuration of a job with Hydra's node."""
+        config = self._composer.whole(_of_job(master_config, sweep_overrides))
+        # Times and the like are those at which the sweep began.
+        OmegaConf.copy_cache(from_config=master_config, to_config=config)
+        return config
 
     def settings(self, master: DictConfig, overrides: Sequence[str]) -> DictConfig:
         """Return the settings of a job as its task sees them, without Hydra's node."""
-        return self._composed(self._settings, master, overrides, reuse=False)
+        config = self._composer(_of_job(master, overrides))
+        OmegaConf.copy_cache(from_config=master, to_config=config)
+        return config
 
-    def whole(self, master: DictConfig, overrides: Sequence[str], *, reuse: bool) -> DictConfig:
-        """Return the configuration of a job with Hydra's node.
 
-        Args:
-            master: settings of the sweep.
-            overrides: of the job.
-            reuse: whether the next call may change the object.
-        """
-        return self._composed(self._whole, master, overrides, reuse=reuse)
-
-    def choices(self, master: DictConfig, overrides: Sequence[str]) -> tuple[str, ...] | None:
-        """Return the lines that decide what Hydra's node holds, beside what is noted of the job itself."""
-        return (
-            None
-            if self._unseen
-            else self._whole.choices([*as_typed(master.hydra.overrides.hydra), *overrides])
-        )
-
-    def _composed(
-        self, composer: Composer, master: DictConfig, overrides: Sequence[str], *, reuse: bool
-    ) -> DictConfig:
-        lines = [*as_typed(master.hydra.overrides.hydra), *overrides]
-        if self._unseen:
-            composed = composer.anew(lines)
-        else:
-            composed = composer.reused(lines) if reuse else composer(lines)
-        # Times and the like are those at which the sweep began.
-        OmegaConf.copy_cache(from_config=master, to_config=composed)
-        return composed
+def _of_job(master: DictConfig, overrides: Sequence[str]) -> list[str]:
+    return [*as_typed(master.hydra.overrides.hydra), *overrides]

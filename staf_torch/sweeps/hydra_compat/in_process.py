@@ -8,46 +8,41 @@ import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
-from hydra import version
-from hydra._internal.hydra import Hydra
-from hydra._internal.utils import create_config_search_path
+from hydra import initialize_config_dir, version
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.plugins import Plugins
-from hydra.core.singleton import Singleton
 from hydra.core.utils import JobRuntime
 from hydra.types import RunMode
-from hydra.version import VersionBase
-from omegaconf import DictConfig
-from omegaconf.basecontainer import BaseContainer
+from omegaconf import DictConfig, OmegaConf
 
 from ...settings import config_directory
+from .inside import HAS_WHITELIST, trusted
 from .log_handlers import handlers_aside
-from .mode import mode_read_from_its_file
-from .program import HAS_WHITELIST, find_launcher, named_packages, trusted, with_mode
+from .program import find_launcher, named_packages, with_mode
 
-_OF_AN_APPLICATION: tuple[type, ...] = (GlobalHydra, HydraConfig, JobRuntime, VersionBase)
-"""Hydra's singletons that belong to the application that runs; plugins and the store are everyone's."""
+_RESOLVERS = ("now", "hydra", "python_version", "hydra_override_dirname", "hydra_deprecated_override_dirname")
+"""Hydra's own, which it registers where it begins."""
 
 
 class Application(NamedTuple):
     """The library's own Hydra application, alive within `application`."""
 
-    hydra: Hydra
+    hydra: Any
     seen: list[DictConfig]  # settings that Hydra composed, the latest last
 
     def is_sweep(self, overrides: Sequence[str]) -> bool:
         """Return whether the settings themselves ask for a sweep, as those of `experiment=ablation` do."""
-        lines, hydra = with_mode(overrides), cast(Any, self.hydra)
-        with mode_read_from_its_file():
-            if HAS_WHITELIST:
-                read = hydra.get_mode("config", lines, OverridesParser.create().parse_overrides(lines))
-            else:
-                read = hydra.get_mode("config", lines)
-        return bool(read == RunMode.MULTIRUN)
+        loader = self.hydra.config_loader
+        try:
+            found = loader.load_configuration(
+                "config", with_mode(overrides), RunMode.MULTIRUN, validate_sweep_overrides=False
+            )
+        except Exception:  # the run itself raises it
+            return False
+        return bool(found.hydra.mode == RunMode.MULTIRUN)
 
     def run(self, task: Callable[[DictConfig], Any], overrides: Sequence[str]) -> Path:
         """Run one job and return its directory.
@@ -75,14 +70,14 @@ class Application(NamedTuple):
 def application() -> Iterator[Application]:
     """Yield the application; what the process had of Hydra, logging and import path comes back in the end."""
     with contextlib.ExitStack() as stack:
-        for guard in (_import_path, _environment, _singletons, handlers_aside):
+        for guard in (_import_path, _environment, _other_application, handlers_aside):
             stack.enter_context(guard())
         find_launcher()
         _register_launcher()
-        if hasattr(version, "setbase") and not HAS_WHITELIST:  # 1.4 warns of it
-            version.setbase("1.3")
+        base = {} if HAS_WHITELIST else {"version_base": "1.3"}  # 1.4 warns of it
+        stack.enter_context(initialize_config_dir(config_directory(), "staf", **base))
         stack.enter_context(trusted())
-        hydra = Hydra.create_main_hydra2("staf", create_config_search_path(config_directory()))
+        hydra: Any = GlobalHydra.instance().hydra
         seen: list[DictConfig] = []
         compose = hydra.compose_config
 
@@ -90,7 +85,7 @@ def application() -> Iterator[Application]:
             seen.append(compose(*arguments, **keywords))
             return seen[-1]
 
-        hydra.compose_config = remembered  # type: ignore[method-assign]
+        hydra.compose_config = remembered
         yield Application(hydra, seen)
 
 
@@ -124,16 +119,18 @@ def _environment() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _singletons() -> Iterator[None]:
-    """Set the singletons and the resolvers of another application aside."""
-    instances: dict[type, Any] = Singleton._instances
-    aside: dict[type, Any] = {kind: instances.pop(kind) for kind in _OF_AN_APPLICATION if kind in instances}
-    resolvers = dict(BaseContainer._resolvers)
+def _other_application() -> Iterator[None]:
+    """Set aside what another application of the process has of Hydra."""
+    theirs, config, job = GlobalHydra.instance(), HydraConfig.instance(), JobRuntime.instance()
+    kept = theirs.hydra, config.cfg, job.conf, version.getbase()
+    resolvers = [name for name in _RESOLVERS if OmegaConf.has_resolver(name)]
+    theirs.clear()
+    config.cfg, job.conf = None, OmegaConf.create()
     try:
         yield
     finally:
-        for kind in _OF_AN_APPLICATION:
-            instances.pop(kind, None)
-        instances.update(aside)
-        BaseContainer._resolvers.clear()
-        BaseContainer._resolvers.update(resolvers)
+        GlobalHydra.set_instance(theirs)
+        theirs.hydra, config.cfg, job.conf, version.VersionBase.instance().version_base = kept
+        for name in _RESOLVERS:
+            if name not in resolvers and OmegaConf.has_resolver(name):
+                OmegaConf.clear_resolver(name)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.override_parser.types import Override, RangeSweep
 
 from ..lazy import Lazy
@@ -33,8 +32,10 @@ def product(overrides: Sequence[Override]) -> Lazy[list[str]]:
     """
     lists: dict[str, list[str]] = {}  # a key that comes twice has its first place and last values
     for one in overrides:
-        (listed,) = BasicSweeper.split_arguments([one], None)
-        lists[one.get_key_element()] = [line for (line,) in listed]
+        key = one.get_key_element()
+        sweeps = one.is_discrete_sweep()
+        values = one.sweep_string_iterator() if sweeps else [one.get_value_element_as_str()]
+        lists[key] = [f"{key}={value}" for value in values]
 
     def job(number: int) -> list[str]:
         lines = []

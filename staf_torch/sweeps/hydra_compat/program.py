@@ -4,32 +4,28 @@ from __future__ import annotations
 
 import contextlib
 import importlib.util
-import inspect
 import os
 import re
 import sys
 import traceback
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import FrameType
 from typing import Any, NamedTuple
 
 import hydra
-from hydra._internal.utils import get_args_parser
 from omegaconf import DictConfig, OmegaConf
 
 from ...settings import config_directory
+from .inside import HAS_WHITELIST, TRUSTED, arguments
 
 _PACKAGE = Path(__file__).resolve().parents[2]
-_TRUSTED = ("staf_torch.*",)
 _NAMES = re.compile(r"(?:_target_|\bpath)['\"]?\s*[=:]\s*['\"]?([A-Za-z_]\w*\.[\w.]*\w)")
-HAS_WHITELIST = "execution_whitelist" in inspect.signature(hydra.main).parameters
-"""Hydra 1.4: only trusted targets are instantiated. That version also ends sweeps that failed by itself."""
 
 
 def program(task: Callable[[DictConfig], Any]) -> Callable[[], None]:
     """Return ``task`` as a Hydra application over `conf/`, which reads `sys.argv`."""
-    options = {"execution_whitelist": _TRUSTED} if HAS_WHITELIST else {"version_base": "1.3"}
+    options = {"execution_whitelist": TRUSTED} if HAS_WHITELIST else {"version_base": "1.3"}
     decorate: Any = hydra.main
     decorated: Callable[[], None] = decorate(config_path=config_directory(), config_name="config", **options)(
         task
@@ -58,39 +54,7 @@ def find_launcher() -> None:
 
 def overrides_in(argv: Sequence[str]) -> list[str]:
     """Return the overrides among the words of a command line."""
-    return list(get_args_parser().parse_known_args(list(argv))[0].overrides)
-
-
-@contextlib.contextmanager
-def trusted(packages: Iterable[str] = ()) -> Iterator[None]:
-    """Let settings name objects of this package and of ``packages``: Hydra 1.4 trusts nothing by itself."""
-    with contextlib.ExitStack() as stack:
-        if HAS_WHITELIST:
-            from hydra._internal.execution_policy import execution_whitelist
-
-            stack.enter_context(execution_whitelist((*_TRUSTED, *(f"{name}.*" for name in packages))))
-        yield
-
-
-def everything_trusted() -> contextlib.AbstractContextManager[object]:
-    """Let settings name any object, as Hydra 1.3 does, where a user has asked for trust."""
-    if not HAS_WHITELIST:
-        return contextlib.nullcontext()
-    from hydra._internal import execution_policy
-
-    found: contextlib.AbstractContextManager[object] = execution_policy.execution_whitelist(
-        execution_policy.UNSAFE_DISABLE_EXECUTION_CHECKS
-    )
-    return found
-
-
-def trusted_packages() -> list[str]:
-    """Return the packages that settings may name at present, beside this one; workers get them."""
-    if not HAS_WHITELIST:
-        return []
-    from hydra._internal.execution_policy import _get_active_execution_whitelist as active
-
-    return [pattern.removesuffix(".*") for pattern in active() or () if pattern not in _TRUSTED]
+    return list(arguments(argv).overrides)
 
 
 def named_packages(argv: Sequence[str]) -> list[str]:
@@ -129,7 +93,7 @@ def with_mode(argv: Sequence[str]) -> list[str]:
 
 def _config_folders(argv: Sequence[str]) -> list[str]:
     """Return the directory of `--config-dir`, as a list of one or none."""
-    return list(filter(None, [get_args_parser().parse_known_args(list(argv))[0].config_dir]))
+    return list(filter(None, [arguments(argv).config_dir]))
 
 
 @contextlib.contextmanager

@@ -1,0 +1,86 @@
+"""All that is taken from the inside of Hydra: its search path, its parser of a command line, its trust."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import inspect
+from collections.abc import Iterable, Iterator
+from contextvars import ContextVar
+from typing import cast
+
+import hydra
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from hydra._internal.utils import create_config_search_path, get_args_parser
+from hydra.core.config_loader import ConfigLoader
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.plugins import Plugins
+
+from ...settings import config_directory
+
+HAS_WHITELIST = "execution_whitelist" in inspect.signature(hydra.main).parameters
+"""Hydra 1.4: only trusted targets are instantiated. That version also ends sweeps that failed by itself."""
+if HAS_WHITELIST:
+    from hydra._internal import execution_policy
+
+TRUSTED = ("staf_torch.*",)
+SearchPaths = tuple[tuple[str, str], ...]
+"""Provider and place of every folder in which Hydra looks for settings."""
+_PATHS: ContextVar[SearchPaths | None] = ContextVar("_PATHS", default=None)
+
+
+def arguments(argv: Iterable[str]) -> argparse.Namespace:
+    """Return the words of a command line as Hydra reads them; what it does not know is left out."""
+    return cast(argparse.Namespace, get_args_parser().parse_known_args(list(argv))[0])
+
+
+def config_loader() -> ConfigLoader:
+    """Return Hydra's loader: of the running program, else one for the paths of `searching` or `conf/`."""
+    if GlobalHydra.instance().is_initialized():
+        return GlobalHydra.instance().config_loader()
+    Plugins.instance()  # the sources of configurations are plugins
+    given = _PATHS.get()
+    found = create_config_search_path(config_directory())
+    if given is not None:
+        found.get_path().clear()
+        for provider, place in given:
+            found.append(provider, place)
+    return ConfigLoaderImpl(found)
+
+
+def search_paths() -> SearchPaths:
+    """Return where the running program looks for settings."""
+    return tuple((each.provider, each.path) for each in config_loader().get_search_path().get_path())
+
+
+@contextlib.contextmanager
+def searching(paths: SearchPaths) -> Iterator[None]:
+    """Let `config_loader` look in those places where no program of Hydra's is running."""
+    token = _PATHS.set(paths)
+    try:
+        yield
+    finally:
+        _PATHS.reset(token)
+
+
+def trusted(packages: Iterable[str] = ()) -> contextlib.AbstractContextManager[object]:
+    """Let settings name objects of this package and of ``packages``: Hydra 1.4 trusts nothing by itself."""
+    return _trusting((*TRUSTED, *(f"{name}.*" for name in packages)))
+
+
+def everything_trusted() -> contextlib.AbstractContextManager[object]:
+    """Let settings name any object, as Hydra 1.3 does, where a user has asked for trust."""
+    return _trusting(execution_policy.UNSAFE_DISABLE_EXECUTION_CHECKS if HAS_WHITELIST else None)
+
+
+def _trusting(patterns: object) -> contextlib.AbstractContextManager[object]:
+    if not HAS_WHITELIST:
+        return contextlib.nullcontext()
+    found: contextlib.AbstractContextManager[object] = execution_policy.execution_whitelist(patterns)
+    return found
+
+
+def trusted_packages() -> list[str]:
+    """Return the packages that settings may name at present, beside this one; workers get them."""
+    active = execution_policy._get_active_execution_whitelist() if HAS_WHITELIST else None
+    return [pattern.removesuffix(".*") for pattern in active or () if pattern not in TRUSTED]
