@@ -178,7 +178,7 @@ class Launch:
     def _replay(self, job: Job, task: Callable[[DictConfig], Any]) -> JobReturn:
         """Run a job whose outcome is known as Hydra runs one, and keep no settings of it."""
         config = self._context.job_config(job.num, job.overrides)
-        self._directories[job.num] = directory_of(config)
+        self._directories[job.num] = self._place_of(job)
         ended = self._context.run_job(task, config, job.settings)
         ended.cfg = ended.hydra_cfg = None
         return ended

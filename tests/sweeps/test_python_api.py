@@ -211,18 +211,6 @@ def test_own_function_to_figure_in_six_lines_of_a_notebook() -> None:
     assert isinstance(found.figures()["gradient_chase"], Figure)
 
 
-@pytest.mark.parametrize("frozen", [True, False])
-@pytest.mark.usefixtures("_untouched")
-def test_what_a_program_keeps_from_the_collector_stays_so(frozen: bool) -> None:
-    was = gc.get_freeze_count() > 0  # by conftest.py
-    (gc.freeze if frozen else gc.unfreeze)()
-    try:
-        staf_torch.sweep(*BARE)
-        assert (gc.get_freeze_count() > 0) == frozen
-    finally:
-        (gc.freeze if was else gc.unfreeze)()
-
-
 def test_memory_is_flat_over_sweeps() -> None:
     counts = []
     for _ in range(5):

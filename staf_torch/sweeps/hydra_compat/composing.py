@@ -69,10 +69,15 @@ class Composer:
     Args:
         loader: Hydra's, of the program.
         config_name: of the primary configuration.
+        searched: folders that the primary configuration itself adds to Hydra's search path.
     """
 
-    def __init__(self, loader: ConfigLoader, config_name: str | None = "config") -> None:
+    def __init__(
+        self, loader: ConfigLoader, config_name: str | None = "config", searched: Sequence[str] = ()
+    ) -> None:
         self._loader, self._name = loader, config_name
+        folders = ",".join(map(records.quoted, searched))
+        self._searched = (f"hydra.searchpath=[{folders}]",) if folders else ()
         self._lines: dict[str, _Line] = {}
         self._groups: dict[tuple[str, ...], bool] = {}
         self._composed: dict[tuple[str, ...], _Composed] = {}
@@ -112,11 +117,12 @@ class Composer:
                 self._bases[key] = self._base(overrides, lines, values)
             base = self._bases[key]
             if base is None or any(line.refers for line in values.values()):
-                tree, by_key = None, records.flat(self(overrides))
+                plain.append(None)
+                flat.append(records.flat(self(overrides)))
             else:
                 tree, by_key = base.with_values(values)
-            plain.append(tree)
-            flat.append(by_key)
+                plain.append(tree)
+                flat.append(by_key)
         return ManySettings(plain, flat, lambda i: self(jobs[i]))
 
     def _read(self, overrides: Sequence[str]) -> list[_Line]:
@@ -128,7 +134,8 @@ class Composer:
         key, value = override.key_or_group, override.value()
         groups = (key, *searched)
         if groups not in self._groups:
-            self._groups[groups] = bool(self._loader.get_group_options(key, None, self._name, [*searched]))
+            where = [*(searched or self._searched)]
+            self._groups[groups] = bool(self._loader.get_group_options(key, None, overrides=where))
         sweeps, is_value = override.is_sweep_override(), isinstance(value, dict) or not self._groups[groups]
         chooses = sweeps or override.is_hydra_override() or override.package is not None or not is_value
         path = None if chooses else re.sub(r"[\[\].]+", ".", key).rstrip(".") + "."
@@ -256,15 +263,15 @@ def _note_overrides(node: Any, parsed: Sequence[Override]) -> None:
 class JobLoader:
     """Hydra's loader for a sweep whose launcher is ours: jobs are composed by a `Composer`.
 
-    Sweepers compose each job as a test before our launcher does.
-
     Args:
         loader: Hydra's own, asked for all else.
         master: the settings of the sweep.
     """
 
     def __init__(self, loader: ConfigLoader, master: DictConfig) -> None:
-        self._loader, self._composer = loader, Composer(loader, master.hydra.job.config_name)
+        node = master.hydra
+        self._loader, self._master, self._always = loader, master, as_typed(node.overrides.hydra)
+        self._composer = Composer(loader, node.job.config_name, as_typed(node.searchpath))
 
     @classmethod
     def install(cls, context: HydraContext, master: DictConfig) -> None:
@@ -276,18 +283,21 @@ class JobLoader:
         return getattr(self._loader, name)
 
     def load_sweep_config(self, master_config: DictConfig, sweep_overrides: Sequence[str]) -> DictConfig:
-        """Return the configuration of a job with Hydra's node."""
-        config = self._composer.whole(_of_job(master_config, sweep_overrides))
-        # Times and the like are those at which the sweep began.
-        OmegaConf.copy_cache(from_config=master_config, to_config=config)
-        return config
+        """Return the settings of a job without Hydra's node, which takes three times as long.
 
-    def settings(self, master: DictConfig, overrides: Sequence[str]) -> DictConfig:
+        Sweepers call this for every job, to see whether it can be composed.
+        """
+        return self.settings(sweep_overrides)
+
+    def settings(self, overrides: Sequence[str]) -> DictConfig:
         """Return the settings of a job as its task sees them, without Hydra's node."""
-        config = self._composer(_of_job(master, overrides))
-        OmegaConf.copy_cache(from_config=master, to_config=config)
+        return self._at_the_same_time(self._composer([*self._always, *overrides]))
+
+    def whole(self, overrides: Sequence[str]) -> DictConfig:
+        """Return the configuration of a job with Hydra's node."""
+        return self._at_the_same_time(self._composer.whole([*self._always, *overrides]))
+
+    def _at_the_same_time(self, config: DictConfig) -> DictConfig:
+        """Let times and the like be those at which the sweep began."""
+        OmegaConf.copy_cache(from_config=self._master, to_config=config)
         return config
-
-
-def _of_job(master: DictConfig, overrides: Sequence[str]) -> list[str]:
-    return [*as_typed(master.hydra.overrides.hydra), *overrides]

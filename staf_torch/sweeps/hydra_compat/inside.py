@@ -7,7 +7,6 @@ import contextlib
 import inspect
 from collections.abc import Iterable, Iterator
 from contextvars import ContextVar
-from typing import cast
 
 import hydra
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
@@ -21,7 +20,7 @@ from ...settings import config_directory
 HAS_WHITELIST = "execution_whitelist" in inspect.signature(hydra.main).parameters
 """Hydra 1.4: only trusted targets are instantiated. That version also ends sweeps that failed by itself."""
 if HAS_WHITELIST:
-    from hydra._internal import execution_policy
+    import hydra._internal.execution_policy as execution_policy
 
 TRUSTED = ("staf_torch.*",)
 SearchPaths = tuple[tuple[str, str], ...]
@@ -31,7 +30,7 @@ _PATHS: ContextVar[SearchPaths | None] = ContextVar("_PATHS", default=None)
 
 def arguments(argv: Iterable[str]) -> argparse.Namespace:
     """Return the words of a command line as Hydra reads them; what it does not know is left out."""
-    return cast(argparse.Namespace, get_args_parser().parse_known_args(list(argv))[0])
+    return get_args_parser().parse_known_args(list(argv))[0]
 
 
 def config_loader() -> ConfigLoader:

@@ -46,11 +46,11 @@ class SweepContext(NamedTuple):
 
     def settings(self, overrides: Sequence[str]) -> DictConfig:
         """Return the settings of a job as its task sees them; the caller may change them."""
-        return self._loader.settings(self.master, overrides)
+        return self._loader.settings(overrides)
 
     def job_config(self, num: int, overrides: Sequence[str]) -> DictConfig:
         """Return the configuration of job ``num`` with Hydra's node; the caller may change it."""
-        config = self._loader.load_sweep_config(self.master, overrides)
+        config = self._loader.whole(overrides)
         with read_write(config.hydra), open_dict(config.hydra):
             config.hydra.job.id = str(num)
             config.hydra.job.num = num

@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 
 from hydra.core.override_parser.types import Override, RangeSweep
+from hydra.errors import HydraException
 
 from ..lazy import Lazy
 
@@ -29,11 +30,16 @@ def product(overrides: Sequence[Override]) -> Lazy[list[str]]:
 
     Args:
         overrides: with sweeps among them.
+
+    Raises:
+        hydra.errors.HydraException: for a sweep over an interval, which is no list.
     """
     lists: dict[str, list[str]] = {}  # a key that comes twice has its first place and last values
     for one in overrides:
-        key = one.get_key_element()
-        sweeps = one.is_discrete_sweep()
+        key, sweeps = one.get_key_element(), one.is_sweep_override()
+        if sweeps and not one.is_discrete_sweep():
+            assert one.value_type is not None
+            raise HydraException(f"BasicSweeper does not support sweep type : {one.value_type.name}")
         values = one.sweep_string_iterator() if sweeps else [one.get_value_element_as_str()]
         lists[key] = [f"{key}={value}" for value in values]
 
