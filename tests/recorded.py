@@ -53,7 +53,7 @@ def _inside(value: Any) -> Iterator[tuple[str, Any]]:
     elif isinstance(value, Mapping):
         yield from ((str(name), part) for name, part in value.items())
     elif hasattr(value, "_fields"):
-        yield from zip(value._fields, value, strict=True)
+        yield from zip(type(value).__match_args__, value, strict=True)
     elif isinstance(value, list | tuple):
         yield from ((str(at), part) for at, part in enumerate(value))
     elif dataclasses.is_dataclass(value) and not isinstance(value, type):

@@ -190,7 +190,8 @@ def among(kind: str, count: int, seed: int) -> Loop:
         margin=0.04,
     )
     # Of a unicycle: what the rival keeps outside.
-    center = own._replace(point=lambda x: x[..., :2], reach=0.0)
+    parts = dict(zip(type(own).__match_args__, own, strict=True))
+    center = type(own)(**(parts | {"point": lambda x: x[..., :2], "reach": 0.0}))
     near = [avoidance.apart(center, k, RADIUS) for k in range(DISCS)]
     # What a vehicle cuts of a disc between samples at 1.5 m/s of each other is 7 mm.
     ways = adp.DetourRollout(

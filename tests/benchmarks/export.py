@@ -5,6 +5,7 @@ python tests/benchmarks/export.py FOLDER       # exports what FOLDER lacks, then
 
 from __future__ import annotations
 
+import importlib
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -51,7 +52,10 @@ def runners(folder: Path, dtype: torch.dtype, y: Tensor) -> dict[str, Callable[[
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     session = onnxruntime.InferenceSession(str(onnx), options, providers=["CPUExecutionProvider"])
-    feed, model = {"state": y.numpy()}, torch._inductor.aoti_load_package(str(package))
+    feed, model = (
+        {"state": y.numpy()},
+        importlib.import_module("torch._inductor").aoti_load_package(str(package)),
+    )
     lean = deploy.approximator(fitted(), dtype)
     return {
         "onnxruntime, session.run": lambda _: session.run(None, feed),
