@@ -26,7 +26,7 @@ from .executors import compute, executor
 from .hydra_compat import (
     JobReturn,
     JobStatus,
-    SweepContext,
+    SweepJobs,
     directory_of,
     search_paths,
     without_hydra_overrides,
@@ -138,10 +138,10 @@ class Launch:
 
     def __init__(self, launcher: Any) -> None:
         self._launcher = launcher
-        self._context = SweepContext(launcher.hydra_context, launcher.config)
+        self._jobs: SweepJobs = launcher.hydra_context.config_loader
         self._task: Callable[[DictConfig], Any] = launcher.task_function
         self._directory = Path(str(launcher.config.hydra.sweep.dir))
-        self._numbered = self._context.numbered
+        self._numbered = self._jobs.numbered
         self._directories: dict[int, Path] = {}  # of the jobs that ran
         if launcher.batch is not None:
             integer("hydra.launcher", "batch", launcher.batch, least=1)
@@ -151,7 +151,7 @@ class Launch:
 
     def run(self, job_overrides: Sequence[Sequence[str]], first: int) -> list[JobReturn]:
         """Run the jobs, numbered from ``first``, and return Hydra's records of them, in order."""
-        self._context.start()
+        self._jobs.start()
         if not PRINTS.get():
             silence_terminal()
         self._directory.mkdir(parents=True, exist_ok=True)
@@ -177,9 +177,9 @@ class Launch:
 
     def _replay(self, job: Job, task: Callable[[DictConfig], Any]) -> JobReturn:
         """Run a job whose outcome is known as Hydra runs one, and keep no settings of it."""
-        config = self._context.job_config(job.num, job.overrides)
+        config = self._jobs.whole(job.num, job.overrides)
         self._directories[job.num] = self._place_of(job)
-        ended = self._context.run_job(task, config, job.settings)
+        ended = self._jobs.run(task, config, job.settings)
         ended.cfg = ended.hydra_cfg = None
         return ended
 
@@ -208,33 +208,33 @@ class Launch:
         """Return what runs a job of many members in a worker, None for other jobs."""
         if job.settings.get("members") is None:
             return None
-        config = self._context.job_config(job.num, job.overrides)
+        config = self._jobs.whole(job.num, job.overrides)
         return InWorker(Origin.of(config.hydra), search_paths())
 
     def _flat(self, overrides: Sequence[str]) -> Flat | None:
         """Return the settings of a job by dotted keys."""
-        return flat_or_none(self._context.settings(overrides))
+        return flat_or_none(self._jobs.settings(overrides))
 
     def _place_of(self, job: Job) -> Path:
         """Return the run directory of a job."""
         if self._numbered and not any(line.lstrip("+~").startswith("hydra") for line in job.overrides):
             return self._directory / str(job.num)
-        return directory_of(self._context.job_config(job.num, job.overrides))
+        return directory_of(self._jobs.whole(job.num, job.overrides))
 
     def _finished(self, numbered: Mapping[int, list[str]]) -> dict[int, JobReturn]:
         """Return the jobs that an earlier start of this sweep completed."""
         found: dict[int, JobReturn] = {}
-        if not records.resumed(self._context.master):
+        if not records.resumed(self._jobs.master):
             return found
-        anyway = records.resumed_anyway(self._context.master)
+        anyway = records.resumed_anyway(self._jobs.master)
         for num, overrides in numbered.items():
-            settings = self._context.settings(overrides)
-            config = self._context.job_config(num, overrides)
+            settings = self._jobs.settings(overrides)
+            config = self._jobs.whole(num, overrides)
             record = records.RunRecord(settings, config.hydra.runtime.choices, overrides, compiler())
             metrics = record.finished(directory_of(config), anyway=anyway)
             if metrics is not None:
                 ended = JobReturn(overrides=overrides, status=JobStatus.COMPLETED)
-                ended.return_value = objective(self._context.master, metrics)
+                ended.return_value = objective(self._jobs.master, metrics)
                 found[num] = ended
         return found
 
@@ -247,7 +247,7 @@ class Launch:
         @functools.lru_cache(_KEPT_JOBS)
         def job(index: int) -> Job:
             num = order[index]
-            return Job(num, numbered[num], self._context.settings(numbered[num]))
+            return Job(num, numbered[num], self._jobs.settings(numbered[num]))
 
         if self._task is not execute:
             if about.foreign == "warn":

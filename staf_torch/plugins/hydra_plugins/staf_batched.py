@@ -56,9 +56,10 @@ class BatchedLauncher(launcher.Launcher):
 
     def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
         """Keep what Hydra hands over before the sweep."""
-        from staf_torch.sweeps.hydra_compat import JobLoader
+        from staf_torch.sweeps.hydra_compat import SweepJobs
 
-        JobLoader.install(hydra_context, config)
+        if not isinstance(hydra_context.config_loader, SweepJobs):
+            SweepJobs(hydra_context, config)
         self.hydra_context, self.task_function, self.config = hydra_context, task_function, config
 
     def launch(self, job_overrides: Sequence[Sequence[str]], initial_job_idx: int) -> Sequence[Any]:

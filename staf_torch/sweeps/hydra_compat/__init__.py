@@ -6,7 +6,6 @@ from hydra.core.utils import JobStatus as JobStatus
 from hydra.core.utils import env_override as env_override
 
 from .composing import Composer as Composer
-from .composing import JobLoader as JobLoader
 from .composing import as_typed as as_typed
 from .composing import parse_override as parse_override
 from .inside import SearchPaths as SearchPaths
@@ -16,7 +15,7 @@ from .inside import search_paths as search_paths
 from .inside import searching as searching
 from .inside import trusted as trusted
 from .inside import trusted_packages as trusted_packages
-from .jobs import SweepContext as SweepContext
+from .jobs import SweepJobs as SweepJobs
 from .jobs import directory_of as directory_of
 from .jobs import without_hydra_overrides as without_hydra_overrides
 from .products import product as product

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, cast
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override, OverrideType
-from hydra.types import HydraContext, RunMode
+from hydra.types import RunMode
 from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict, read_write
 from omegaconf.errors import OmegaConfBaseException
 
@@ -258,46 +258,3 @@ def _note_overrides(node: Any, parsed: Sequence[Override]) -> None:
         style = node.job.config.override_dirname
         named = sorted(str(one.input_line) for one in task if one.key_or_group not in style.exclude_keys)
         node.job.override_dirname = style.item_sep.join(named).replace("=", style.kv_sep)
-
-
-class JobLoader:
-    """Hydra's loader for a sweep whose launcher is ours: jobs are composed by a `Composer`.
-
-    Args:
-        loader: Hydra's own, asked for all else.
-        master: the settings of the sweep.
-    """
-
-    def __init__(self, loader: ConfigLoader, master: DictConfig) -> None:
-        node = master.hydra
-        self._loader, self._master, self._always = loader, master, as_typed(node.overrides.hydra)
-        self._composer = Composer(loader, node.job.config_name, as_typed(node.searchpath))
-
-    @classmethod
-    def install(cls, context: HydraContext, master: DictConfig) -> None:
-        """Let a sweep compose by a loader of this class."""
-        if not isinstance(context.config_loader, cls):
-            context.config_loader = cast(ConfigLoader, cls(context.config_loader, master))
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._loader, name)
-
-    def load_sweep_config(self, master_config: DictConfig, sweep_overrides: Sequence[str]) -> DictConfig:
-        """Return the settings of a job without Hydra's node, which takes three times as long.
-
-        Sweepers call this for every job, to see whether it can be composed.
-        """
-        return self.settings(sweep_overrides)
-
-    def settings(self, overrides: Sequence[str]) -> DictConfig:
-        """Return the settings of a job as its task sees them, without Hydra's node."""
-        return self._at_the_same_time(self._composer([*self._always, *overrides]))
-
-    def whole(self, overrides: Sequence[str]) -> DictConfig:
-        """Return the configuration of a job with Hydra's node."""
-        return self._at_the_same_time(self._composer.whole([*self._always, *overrides]))
-
-    def _at_the_same_time(self, config: DictConfig) -> DictConfig:
-        """Let times and the like be those at which the sweep began."""
-        OmegaConf.copy_cache(from_config=self._master, to_config=config)
-        return config

@@ -6,9 +6,10 @@ import functools
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 import yaml
+from hydra.core.config_loader import ConfigLoader
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.utils import (
     JobReturn,
@@ -25,35 +26,48 @@ from hydra.types import HydraContext
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 from omegaconf._utils import OmegaConfDumper
 
-from .composing import JobLoader, as_typed
+from .composing import Composer, as_typed
 from .inside import HAS_WHITELIST
 from .log_handlers import handlers_aside
 
 
-class SweepContext(NamedTuple):
-    """What Hydra hands to a launcher."""
+class SweepJobs:
+    """The jobs of a sweep whose launcher is ours, composed by a `Composer`; for the rest, Hydra's own loader.
 
-    hydra: HydraContext
-    master: DictConfig  # settings of the sweep
+    Args:
+        context: of the sweep, as Hydra hands it to a launcher; from now on it has this loader.
+        master: settings of the sweep.
+    """
 
-    def start(self) -> None:
-        """Register Hydra's resolvers and send the log to the sweep's own handlers."""
-        setup_globals()
-        trust: dict[str, Any] = {}
-        if HAS_WHITELIST:
-            trust = {"execution_whitelist": cast(Any, self.hydra).execution_whitelist}
-        configure_log(self.master.hydra.hydra_logging, self.master.hydra.verbose, **trust)
+    def __init__(self, context: HydraContext, master: DictConfig) -> None:
+        node = master.hydra
+        self.master, self._context, self._loader = master, context, context.config_loader
+        self._always = as_typed(node.overrides.hydra)
+        self._composer = Composer(self._loader, node.job.config_name, as_typed(node.searchpath))
+        context.config_loader = cast(ConfigLoader, self)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._loader, name)
+
+    def load_sweep_config(self, master_config: DictConfig, sweep_overrides: Sequence[str]) -> DictConfig:
+        """Return `settings`: sweepers compose every job as a test, and the node takes as long again."""
+        return self.settings(sweep_overrides)
 
     def settings(self, overrides: Sequence[str]) -> DictConfig:
         """Return the settings of a job as its task sees them; the caller may change them."""
-        return self._loader.settings(overrides)
+        return self._at_the_same_time(self._composer([*self._always, *overrides]))
 
-    def job_config(self, num: int, overrides: Sequence[str]) -> DictConfig:
+    def whole(self, num: int, overrides: Sequence[str]) -> DictConfig:
         """Return the configuration of job ``num`` with Hydra's node; the caller may change it."""
-        config = self._loader.whole(overrides)
+        config = self._at_the_same_time(self._composer.whole([*self._always, *overrides]))
         with read_write(config.hydra), open_dict(config.hydra):
             config.hydra.job.id = str(num)
             config.hydra.job.num = num
+        return config
+
+    def _at_the_same_time(self, config: DictConfig) -> DictConfig:
+        """Let times and the like be those at which the sweep began."""
+        OmegaConf.copy_cache(from_config=self.master, to_config=config)
         return config
 
     @property
@@ -62,18 +76,15 @@ class SweepContext(NamedTuple):
         node: Any = OmegaConf.to_container(self.master.hydra.sweep)
         return bool(node["subdir"] == "${hydra.job.num}")
 
-    @property
-    def _loader(self) -> JobLoader:
-        loader = self.hydra.config_loader
-        assert isinstance(loader, JobLoader)
-        return loader
+    def start(self) -> None:
+        """Register Hydra's resolvers and send the log to the sweep's own handlers."""
+        setup_globals()
+        trust: dict[str, Any] = {}
+        if HAS_WHITELIST:
+            trust = {"execution_whitelist": cast(Any, self._context).execution_whitelist}
+        configure_log(self.master.hydra.hydra_logging, self.master.hydra.verbose, **trust)
 
-    def run_job(
-        self,
-        task: Callable[[DictConfig], Any],
-        config: DictConfig,
-        settings: DictConfig,
-    ) -> JobReturn:
+    def run(self, task: Callable[[DictConfig], Any], config: DictConfig, settings: DictConfig) -> JobReturn:
         """Run one job as every launcher does: directory, `.hydra/`, log, callbacks and status.
 
         Args:
@@ -83,14 +94,8 @@ class SweepContext(NamedTuple):
         """
         with handlers_aside():  # what comes after belongs to no job's log
             if not HAS_WHITELIST and not config.hydra.job.chdir:
-                return _run_job(self.hydra.callbacks, task, config, settings)
-            return run_job(
-                hydra_context=self.hydra,
-                task_function=task,
-                config=config,
-                job_dir_key="hydra.sweep.dir",
-                job_subdir_key="hydra.sweep.subdir",
-            )
+                return _run_job(self._context.callbacks, task, config, settings)
+            return run_job(task, config, "hydra.sweep.dir", "hydra.sweep.subdir", self._context)
 
 
 def directory_of(config: DictConfig) -> Path:
