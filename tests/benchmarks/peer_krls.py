@@ -8,7 +8,6 @@ whose dictionaries grow at a step are computed apart, all others pay for the upd
 from __future__ import annotations
 
 import torch
-from drifting_streams import Method, grid
 from torch import Tensor
 
 CAPACITY = 128
@@ -68,7 +67,3 @@ class KRLS:
         self.points[rows, at] = x
         self.size[rows] += 1
         self.most = min(CAPACITY, int(self.size.max()) + 1)
-
-
-def methods(noise: float) -> list[Method]:
-    return [Method("ALD-KRLS", KRLS, grid(width=[0.4, 0.6, 0.9, 1.4], nu=[1e-1, 1e-2, 1e-3, 1e-4]), 1000)]
