@@ -179,21 +179,11 @@ def replaced(a: Tensor) -> list[Tensor]:
     edges = torch.tensor([-0.5, 0.0, 0.5], dtype=a.dtype)
     found = [
         *a.sort(-1), *a.sort(-1, descending=True), *a.topk(2), *a.topk(2, largest=False), *a.kthvalue(2),
-    ]
-    found += [
         *a.kthvalue(3, keepdim=True), *a.median(-1), *a.median(-1, keepdim=True), a.median(), *a.cummax(-1),
-    ]
-    found += [
         *a.cummin(-1), a.cumprod(-1), a.var(-1), a.std(-1), a.angle(), torch.fmin(a, a.flip(-1)),
-        a.argsort(-1),
-    ]
-    found += [
-        torch.searchsorted(edges, a.contiguous()), torch.bucketize(a, edges, right=True),
-        torch.fmax(a, a.flip(-1)),
-    ]
-    found += [
+        a.argsort(-1), torch.searchsorted(edges, a.contiguous()), torch.bucketize(a, edges, right=True),
         torch.searchsorted(edges, a.contiguous(), side='right', out_int32=True), a.quantile(0.25, -1),
-        a.nanmean(-1),
+        a.nanmean(-1), torch.fmax(a, a.flip(-1)),
     ]
     return [*found, torch.nn.functional.one_hot(a.argmax(-1), 4), a.cumprod(0), a.nan_to_num(0.5)]
 
@@ -287,13 +277,10 @@ def written(a: Tensor, k: Tensor) -> list[Tensor]:
     c[:, torch.tensor([0, 2, 0])] += 2 * a
     c[..., 1] *= a[..., 0]
     return [
-        b, c, a.clone().masked_fill_(a < 0, 3.0),
+        b, c, a.clone().masked_fill_(a < 0, 3.0), a.index_add(1, torch.tensor([2, 2]), a[:, :2], alpha=3),
         a.index_put((torch.tensor([0]), torch.tensor([2, 2, 0])), a[:, 1, :1].expand(-1, 4), accumulate=True),
-        *(torch.nn.functional.pad(a, pad, value=v) for pad, v in (([1, 2], 0.0), ([0, 1, 2, 0], 1.5))),
-        torch.nn.functional.pad(a, [2, 1]), a.index_add(1, torch.tensor([2, 2]), a[:, :2], alpha=3),
-        a.index_copy(2, torch.tensor([3]), a[..., :1]), torch.nn.functional.one_hot(k, 5),
-        a.take_along_dim(k.unsqueeze(-1), 2), a.tril(-1), a.triu(1), a.roll((1, -1), (1, 2)), a.flip(1, 2),
-        a.diagonal(1, 1, 2).diag_embed(1),
+        torch.nn.functional.pad(a, [2, 1]), a.index_copy(2, torch.tensor([3]), a[..., :1]),
+        torch.nn.functional.one_hot(k, 5), a.take_along_dim(k.unsqueeze(-1), 2), a.roll((1, -1), (1, 2)),
     ]
 
 
@@ -302,14 +289,8 @@ def rounded(a: Tensor) -> list[Tensor]:
     a = 37.7 * a
     return [
         *(a.round(decimals=d) for d in (-2, -1, 0, 1, 2)), a.fmod(2.5), a.remainder(2.5), a.remainder(-2.5),
-        -a % 3, a // 2.5, torch.div(a, 3, rounding_mode='trunc'), a.cumsum(1), (a / 9).cumprod(1),
-        *a.cummax(1), *a.cummin(1), *a.max(1), *a.min(1), a.argmax(1), a.argmin(1), a.amax(1, keepdim=True),
-        a.std(1), a.var(1, correction=0), a.mean(1), *(a.norm(p, 1) for p in (1, 2, float('inf'))),
-        torch.add(a, a.cos(), alpha=3), torch.sub(a, a.cos(), alpha=0.5), torch.rsub(a, 2.0),
-        torch.addcmul(a, a, a.sin(), value=0.3), torch.addcdiv(a, a, a.exp() + 1, value=-2.0),
-        a.lerp(a.sin(), 0.3), a ** 64, a ** 3, a.abs() ** 65, a.abs() ** (-0.5), a ** (-3), a ** 0,
-        a.abs() ** 0.5, a.abs() ** torch.tensor([2.0, 0.5, -1.0, 7.0])[:a.shape[1]], 1.5 ** a.sin(),
-        a.clamp(min=0.5), a.clamp(max=1.0),
+        -a % 3, a // 2.5, (a / 9).cumprod(1), *a.cummin(1), a.var(1, correction=0), a ** 64, a.abs() ** 65,
+        a.abs() ** torch.tensor([2.0, 0.5, -1.0, 7.0])[:a.shape[1]], 1.5 ** a.sin(),
     ]
 
 

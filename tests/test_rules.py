@@ -82,7 +82,7 @@ LQR = adp.LQR(PLANT, COST)
 BASIS = st.StaFBasis(st.GaussianKernel(), st.StateFollowingCenters(st.rings(3), 0.3))
 X = torch.tensor([[0.5, -0.4]], dtype=torch.float64)
 EYE = torch.eye(2, dtype=torch.float64)
-CONSTANTS = theory.DriftConstants(condition_number=10.0, speed=1.0, growth=0.1)
+BOUND = theory.DriftConstants(10.0, speed=1.0, growth=0.1), optim.SteepestDescent()
 GRID = adp.RBFGridBasis(2, 2)
 ACTUATORS = adp.ParametricPlant.of_effectiveness(PLANT)
 
@@ -122,35 +122,9 @@ REPORTED = adp.near_optimal(PLANT, COST, dt=0.1)
 WINDOWS, ESTIMATE = adp.IntegralWindows(ACTUATORS, 0.1), adp.LeastSquares([1.0], 0.5)
 
 
-def bound(name: str) -> Callable[..., Any]:
-    function = getattr(theory, name)
-
-    def call(**given: Any) -> Any:
-        usual = {
-            "ultimate_bound": {"dt": 0.01, "inner_steps": 2},
-            "step_for_bound": {"excess": 1.0, "inner_steps": 2},
-        }
-        settings = usual.get(name, {"excess": 1.0, "dt": 0.01})
-        return function(CONSTANTS, optim.SteepestDescent(), **{**settings, **given})
-
-    return call
-
-
-def loop(**given: Any) -> Any:
-    return ClosedLoop(adp.Feedback(LQR), PLANT, COST, **{"dt": 0.01, **given})
-
-
-def rollout(**given: Any) -> Any:
-    return adp.RolloutPolicy(BASIS, PLANT, COST, LQR, LQR.value, **{"steps": 1, "horizon": 0.1, **given})
-
-
-def simulated(**given: Any) -> Any:
-    usual = {"dt": 0.01, "steps": 2, "compile": False}
-    return adp.simulate(adp.Feedback(LQR), PLANT, COST, X, **{**usual, **given})
-
-
-def episodes(**given: Any) -> Any:
-    return Episodes(PLANT, COST, 1, **{"dt": 0.1, "horizon": 1.0, "limit": 5.0, "penalty": 1.0, **given})
+def of(make: Callable[..., Any], *given: Any, **usual: Any) -> Callable[..., Any]:
+    """A call with arguments that are right beside the one in question."""
+    return lambda **asked: make(*given, **{**usual, **asked})
 
 
 def trajectories(**given: Any) -> Any:
@@ -158,93 +132,72 @@ def trajectories(**given: Any) -> Any:
     return list(trajectory(systems.Oscillator(), X, **{**usual, **given}))
 
 
+PLAIN: tuple[Callable[..., Any], ...] = (
+    *(adp.QuadraticBasis, st.rings, st.polygon, st.simplex, st.cross_polytope),
+    *(st.ConstantRadius, predictors.Tangent, envs.PlantEnv, envs.PlantVectorEnv, envs.classic_control),
+    *(st.GaussianKernel, st.MaternKernel, st.PolynomialKernel, st.RationalQuadraticKernel, optim.FixedStep),
+    *(
+        optim.NormalisedLMS,
+        adp.PolicyIteration,
+        optim.PreconditionedDescent,
+        systems.Oscillator,
+        systems.Pendulum,
+    ),
+    *(systems.PlanarQuadrotor, systems.VanDerPol, systems.CartPole, theory.disc),
+)
 CALLS: dict[str, Callable[..., Any]] = {
-    "ActorCritic": lambda **given: adp.ActorCritic(
-        adp.QuadraticBasis(2), PLANT, COST, adp.RandomPoints(1, 1.0), **given
-    ),
-    "StaFValueBasis": lambda **given: adp.StaFValueBasis(BASIS, **given),
-    "QuadraticBasis": lambda **given: adp.QuadraticBasis(**given),
-    "RBFGridBasis": lambda **given: adp.RBFGridBasis(**{"dim": 2, "points": 2, **given}),
-    "LeadingCoordinates": lambda **given: LeadingCoordinates(GRID, **given),
-    "ClosedLoop": loop,
-    "Supervised": lambda **given: adp.Supervised(adp.Feedback(LQR, LQR.value), LQR, COST, **given),
-    "RandomPoints": lambda **given: adp.RandomPoints(**{"count": 1, "half_width": 1.0, **given}),
-    "QuadraturePoints": lambda **given: adp.QuadraturePoints(
-        **{"order": 1, "dim": 1, "half_width": 1.0, **given}
-    ),
-    "ConcurrentLearning": lambda **given: adp.ConcurrentLearning(**{"parameters": 2, "outputs": 2, **given}),
-    "RolloutPolicy": rollout,
-    "exact_hold": lambda **given: exact_hold(-EYE, EYE[:, :1], EYE, EYE[:1, :1], **given),
-    "DirectShooting": lambda **given: adp.DirectShooting(PLANT, COST, **given),
-    "simulate": simulated,
-    "lebesgue_constant": lambda **given: lebesgue_constant(BASIS, X, **given),
-    "sup_error": lambda **given: sup_error(BASIS, X, st.targets.Paper(), **given),
-    "StaF": lambda **given: st.StaF(BASIS, **given),
-    "rings": st.rings,
-    "polygon": st.polygon,
-    "simplex": st.simplex,
-    "cross_polytope": st.cross_polytope,
-    "ball": lambda **given: st.ball(**{"count": 2, "dim": 2, **given}),
-    "probe_points": lambda **given: st.centers.probe_points(**{"dim": 2, **given}),
-    "ConstantRadius": st.ConstantRadius,
-    "StateRadius": lambda **given: st.StateRadius(**{"radius": 1.0, "offset": 0.1, **given}),
-    "RidgeApproximator": lambda **given: RidgeApproximator(
-        st.StaF(BASIS).fit_(X[0], st.targets.Paper()), **given
-    ),
-    "Tangent": predictors.Tangent,
-    "PlantEnv": lambda **given: envs.PlantEnv(**given),
-    "PlantVectorEnv": lambda **given: envs.PlantVectorEnv(**given),
-    "Episodes": episodes,
-    "Agent": lambda **given: envs.Agent(LQR, **given),
-    "classic_control": envs.classic_control,
-    "GaussianKernel": st.GaussianKernel,
-    "MaternKernel": st.MaternKernel,
-    "PolynomialKernel": st.PolynomialKernel,
-    "RationalQuadraticKernel": st.RationalQuadraticKernel,
-    "ExperienceMemory": lambda **given: st.ExperienceMemory(BASIS, **{"capacity": 2, **given}),
-    "FixedStep": optim.FixedStep,
-    "HeavyBall": lambda **given: optim.HeavyBall(**{"step": 0.5, "momentum": 0.5, **given}),
-    "Nesterov": lambda **given: optim.Nesterov(**{"step": 0.5, "momentum": 0.5, **given}),
-    "NormalisedLMS": optim.NormalisedLMS,
-    "PolicyIteration": adp.PolicyIteration,
-    "PreconditionedDescent": optim.PreconditionedDescent,
+    **{each.__name__: each for each in PLAIN},
+    "ActorCritic": of(adp.ActorCritic, adp.QuadraticBasis(2), PLANT, COST, adp.RandomPoints(1, 1.0)),
+    "StaFValueBasis": of(adp.StaFValueBasis, BASIS),
+    "RBFGridBasis": of(adp.RBFGridBasis, dim=2, points=2),
+    "LeadingCoordinates": of(LeadingCoordinates, GRID),
+    "ClosedLoop": of(ClosedLoop, adp.Feedback(LQR), PLANT, COST, dt=0.01),
+    "Supervised": of(adp.Supervised, adp.Feedback(LQR, LQR.value), LQR, COST),
+    "RandomPoints": of(adp.RandomPoints, count=1, half_width=1.0),
+    "QuadraturePoints": of(adp.QuadraturePoints, order=1, dim=1, half_width=1.0),
+    "ConcurrentLearning": of(adp.ConcurrentLearning, parameters=2, outputs=2),
+    "RolloutPolicy": of(adp.RolloutPolicy, BASIS, PLANT, COST, LQR, LQR.value, steps=1, horizon=0.1),
+    "exact_hold": of(exact_hold, -EYE, EYE[:, :1], EYE, EYE[:1, :1]),
+    "DirectShooting": of(adp.DirectShooting, PLANT, COST),
+    "simulate": of(adp.simulate, adp.Feedback(LQR), PLANT, COST, X, dt=0.01, steps=2, compile=False),
+    "lebesgue_constant": of(lebesgue_constant, BASIS, X),
+    "sup_error": of(sup_error, BASIS, X, st.targets.Paper()),
+    "StaF": of(st.StaF, BASIS),
+    "ball": of(st.ball, count=2, dim=2),
+    "probe_points": of(st.centers.probe_points, dim=2),
+    "StateRadius": of(st.StateRadius, radius=1.0, offset=0.1),
+    "RidgeApproximator": of(RidgeApproximator, st.StaF(BASIS).fit_(X[0], st.targets.Paper())),
+    "Episodes": of(Episodes, PLANT, COST, 1, dt=0.1, horizon=1.0, limit=5.0, penalty=1.0),
+    "Agent": of(envs.Agent, LQR),
+    "ExperienceMemory": of(st.ExperienceMemory, BASIS, capacity=2),
+    "HeavyBall": of(optim.HeavyBall, step=0.5, momentum=0.5),
+    "Nesterov": of(optim.Nesterov, step=0.5, momentum=0.5),
     "trajectory": trajectories,
-    "Oscillator": systems.Oscillator,
-    "Pendulum": systems.Pendulum,
-    "PlanarQuadrotor": systems.PlanarQuadrotor,
-    "VanDerPol": systems.VanDerPol,
-    "CartPole": systems.CartPole,
-    "ultimate_bound": bound("ultimate_bound"),
-    "step_for_bound": bound("step_for_bound"),
-    "steps_for_bound": bound("steps_for_bound"),
-    "disc": theory.disc,
-    "IntegralWindows": lambda **given: adp.IntegralWindows(ACTUATORS, **{"length": 0.1, **given}),
-    "SlopeWindows": lambda **given: adp.SlopeWindows(ACTUATORS, **given),
-    "HistoryStack": lambda **given: adp.HistoryStack(**{"rows": 1, "parameters": 1, **given}),
-    "LeastSquares": lambda **given: adp.LeastSquares([1.0], **{"deviation": 1.0, **given}),
-    "AdaptiveActorCritic": lambda **given: adp.AdaptiveActorCritic(
+    "ultimate_bound": of(theory.ultimate_bound, *BOUND, dt=0.01, inner_steps=2),
+    "step_for_bound": of(theory.step_for_bound, *BOUND, excess=1.0, inner_steps=2),
+    "steps_for_bound": of(theory.steps_for_bound, *BOUND, excess=1.0, dt=0.01),
+    "IntegralWindows": of(adp.IntegralWindows, ACTUATORS, length=0.1),
+    "SlopeWindows": of(adp.SlopeWindows, ACTUATORS),
+    "HistoryStack": of(adp.HistoryStack, rows=1, parameters=1),
+    "LeastSquares": of(adp.LeastSquares, [1.0], deviation=1.0),
+    "AdaptiveActorCritic": of(
+        adp.AdaptiveActorCritic,
         adp.ActorCritic(adp.QuadraticBasis(2), PLANT, COST, adp.RandomPoints(1, 1.0)),
         ACTUATORS,
         WINDOWS,
         ESTIMATE,
-        **given,
     ),
-    "AdaptiveLQR": lambda **given: adp.AdaptiveLQR(ACTUATORS, COST, WINDOWS, ESTIMATE, **given),
-    "StreamDrift": lambda **given: stream_drift(**given),
-    "DriftLQR": lambda **given: adp.DriftLQR(stream_drift(), COST, **given),
-    "BoxDDP": lambda **given: adp.BoxDDP(INTEGRATOR, **{"steps": 4, "compile": False, **given}),
-    "RecedingHorizon": lambda **given: adp.RecedingHorizon(
-        INTEGRATOR, **{"steps": 4, "compile": False, **given}
-    ),
-    "PathIntegral": lambda **given: adp.PathIntegral(
-        INTEGRATOR, **{"steps": 4, "knots": 2, "compile": False, **given}
-    ),
-    "SampledProblem": lambda **given: adp.SampledProblem(INTEGRATOR.step, **{"dim": 2, "inputs": 1, **given}),
-    "SampledProblem.of": lambda **given: adp.SampledProblem.of(PLANT, COST, **{"dt": 0.1, **given}),
-    "GlobalValue": lambda **given: adp.GlobalValue(INTEGRATOR, LIBRARY, [3.0, 3.0], **given),
-    "learn_global_value": lambda **given: adp.learn_global_value(
-        INTEGRATOR,
-        **{"region": [1.0, 1.0], "steps": 40, "trajectories": 2, "rounds": 0, "states": 1, **given},
+    "AdaptiveLQR": of(adp.AdaptiveLQR, ACTUATORS, COST, WINDOWS, ESTIMATE),
+    "StreamDrift": stream_drift,
+    "DriftLQR": of(adp.DriftLQR, stream_drift(), COST),
+    "BoxDDP": of(adp.BoxDDP, INTEGRATOR, steps=4, compile=False),
+    "RecedingHorizon": of(adp.RecedingHorizon, INTEGRATOR, steps=4, compile=False),
+    "PathIntegral": of(adp.PathIntegral, INTEGRATOR, steps=4, knots=2, compile=False),
+    "SampledProblem": of(adp.SampledProblem, INTEGRATOR.step, dim=2, inputs=1),
+    "SampledProblem.of": of(adp.SampledProblem.of, PLANT, COST, dt=0.1),
+    "GlobalValue": of(adp.GlobalValue, INTEGRATOR, LIBRARY, [3.0, 3.0]),
+    "learn_global_value": of(
+        adp.learn_global_value, INTEGRATOR, region=[1.0, 1.0], steps=40, trajectories=2, rounds=0, states=1
     ),
     "DetourRollout": lambda **given: adp.DetourRollout(
         LQR,
@@ -253,21 +206,15 @@ CALLS: dict[str, Callable[..., Any]] = {
         still,
         **{"axes": EYE, "dt": 0.1, "steps": 2, "terminal": LQR.value, **listed(given, "sizes", "lengths")},
     ),
-    "BoundedInputCost": lambda **given: adp.BoundedInputCost(
-        1.0, 1.0, **{"dim": 2, "inputs": 1, "bound": 1.0, **given}
-    ),
-    "SafetyFilter": lambda **given: adp.SafetyFilter(LQR, PLANT, still, **{"dt": 0.1, **given}),
-    "SampledRollout": lambda **given: SampledRollout(
-        BASIS, PLANT, COST, LQR, LQR.value, LQR.p, **{"period": 0.1, "steps": 4, **given}
-    ),
-    "StepPlant": lambda **given: systems.StepPlant(
-        lambda x, u: 0.9 * x + 0.1 * u, **{"dim": 1, "inputs": 1, "dt": 0.1, **given}
-    ),
-    "ParametricPlant": lambda **given: parametric(**given),
-    "held_stability": lambda **given: adp.held_stability(LQR, PLANT, **{"period": 0.1, **given}),
-    "near_optimal": lambda **given: adp.near_optimal(PLANT, COST, **{"dt": 0.1, **given}),
-    "report": lambda **given: REPORTED.report(**{"states": 2, "optimum": False, **given}),
-    "riccati_rows": lambda **given: adp.riccati_rows(-EYE, EYE, EYE, EYE, **given),
+    "BoundedInputCost": of(adp.BoundedInputCost, 1.0, 1.0, dim=2, inputs=1, bound=1.0),
+    "SafetyFilter": of(adp.SafetyFilter, LQR, PLANT, still, dt=0.1),
+    "SampledRollout": of(SampledRollout, BASIS, PLANT, COST, LQR, LQR.value, LQR.p, period=0.1, steps=4),
+    "StepPlant": of(systems.StepPlant, lambda x, u: 0.9 * x + 0.1 * u, dim=1, inputs=1, dt=0.1),
+    "ParametricPlant": parametric,
+    "held_stability": of(adp.held_stability, LQR, PLANT, period=0.1),
+    "near_optimal": of(adp.near_optimal, PLANT, COST, dt=0.1),
+    "report": of(REPORTED.report, states=2, optimum=False),
+    "riccati_rows": of(adp.riccati_rows, -EYE, EYE, EYE, EYE),
 }
 """How to call, with arguments that are right beside the one in question."""
 
@@ -321,10 +268,7 @@ REFUSED: list[tuple[Callable[[], Any], str]] = [
     (lambda: regressed(memory=3), "`StaFRegressor(memory=...)` must be at least"),
     (lambda: regressed(memory=128, neighbours=7), "(neighbours=...)` must be at least 8"),
     (lambda: regressed(0.1 * EYE, robust=3.0).add(0), "add(streams=...)` must be at least 1"),
-    (
-        lambda: theory.drift_constants(BASIS, PAPER, THREE, THREE),
-        "`drift_constants(states=...)` must have 2 entries",
-    ),
+    (lambda: theory.drift_constants(BASIS, PAPER, THREE, THREE), "`drift_constants(states=...)` must have 2"),
     (lambda: theory.power_function(BASIS, THREE, TWO), "`power_function(x=...)` must have 2 entries"),
     (
         lambda: theory.layout_errors(st.GaussianKernel(), PAPER, TWO, 0.3, [THREE]),
@@ -345,10 +289,7 @@ REFUSED: list[tuple[Callable[[], Any], str]] = [
     ),
     (lambda: adp.QuadraticCost(["no", 1.0], 1.0, 2, 1), "must be a list of numbers"),
     (lambda: adp.QuadraticCost(1.0, 1.0, 2, 1, target=[1.0]), "(target=...)` must have 2 numbers"),
-    (
-        lambda: adp.QuadraticCost(1.0, 1.0, 2, 1, output=lambda x: x[0]),
-        "(output=...)` must map (..., 2) to (..., p)",
-    ),
+    (lambda: adp.QuadraticCost(1.0, 1.0, 2, 1, output=lambda x: x[0]), "(output=...)` must map (..., 2) to"),
     (
         lambda: adp.ActorCritic(adp.QuadraticBasis(2), PLANT, COST, POINTS, critic=TWO[0]),
         "`ActorCritic(critic=...)` must have 3 entries",
@@ -409,18 +350,12 @@ REFUSED: list[tuple[Callable[[], Any], str]] = [
         "`AdaptiveLQR(a_step=...)` must divide the 4 doublings",
     ),
     (lambda: stream_drift(known=None), "`StreamDrift(known=...)` must be a ControlAffine"),
-    (
-        lambda: stream_drift(kernel=st.ExponentialKernel()),
-        "`StreamDrift(kernel=...)` must be translation invariant",
-    ),
+    (lambda: stream_drift(kernel=st.ExponentialKernel()), "`StreamDrift(kernel=...)` must be translation"),
     (lambda: stream_drift(offsets=THREE), "(offsets=...)` must be numbers (M, 2)"),
     (lambda: kalman(noise=[]), "(noise=...)` must be positive numbers, one an output"),
     (lambda: observed(deviation=[1.0]), "`Observed(deviation=...)` must be one number or a list"),
     (lambda: observed(mean=[1.0]), "`Observed(mean=...)` must have 2 entries"),
-    (
-        lambda: rows(rows=[0]),
-        "`ParametricPlant(rows=...)` must have all states whose regressor does not vanish",
-    ),
+    (lambda: rows(rows=[0]), "`ParametricPlant(rows=...)` must have all states whose regressor does not"),
     (
         lambda: rows(regressor=lambda x, u: 1 + regressor(x, u)).family(),
         "`ParametricPlant(regressor=...)` must vanish at the set-point",

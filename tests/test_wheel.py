@@ -75,31 +75,17 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return place / "venv"
 
 
-def _install(home: Path, *what: str | Path) -> None:
-    line = [home / "bin" / "python", "-m", "pip", "install", "--quiet", "--no-deps", "--no-index"]
-    _run(*line, "--no-compile", "--no-build-isolation", *what, cwd=home)
-
-
 def _imported(home: Path, cwd: Path) -> Path:
     """Where the environment finds the package, without the seconds of its import."""
     asked = "import importlib.util; print(importlib.util.find_spec('staf_torch').origin)"
     return Path(_run(home / "bin" / "python", "-c", asked, cwd=cwd).strip()).resolve()
 
 
-def _sweep_own_app(home: Path, work: Path) -> None:
-    """Sweep somebody's application over our groups by our launcher; every warning is an error."""
-    for path in (ROOT / "tests" / "examples").glob("own_app.*"):
-        (work / path.name).write_bytes(path.read_bytes())
-    line = ["-m", "kernel=gaussian,matern", "steps=2", "hydra/launcher=batched"]
-    said = _run(home / "bin" / "python", "-W", "error", "own_app.py", *line, cwd=work)
-    assert said.count("loss=") == 2
-    assert "not available" not in said
-
-
 def test_wheel_runs_in_a_clean_environment_from_any_directory(
     wheel: Path, home: Path, tmp_path: Path
 ) -> None:
-    _install(home, wheel)
+    install = ("-m", "pip", "install", "--quiet", "--no-deps", "--no-index", "--no-compile")
+    _run(home / "bin" / "python", *install, wheel, cwd=home)
     assert _imported(home, tmp_path).is_relative_to(home.resolve())
     said = _run(home / "bin" / "staf", "duration=0.1", "settle_time=0", "figures=false", cwd=tmp_path)
     assert "Gradient chase" in said
@@ -114,10 +100,11 @@ def test_wheel_runs_in_a_clean_environment_from_any_directory(
     assert json.loads((run / "metrics.json").read_text())["diverged_fraction"] == 0
     table = _run(home / "bin" / "staf-table", "runs", "--format", "csv", cwd=tmp_path)
     assert "ball_error" in table.splitlines()[0]
-    _sweep_own_app(home, tmp_path)
-
-
-def test_editable_install_serves_another_application_as_a_wheel_does(home: Path, tmp_path: Path) -> None:
-    _install(home, "--force-reinstall", "-e", ROOT)
-    assert _imported(home, tmp_path).is_relative_to(ROOT.resolve())
-    _sweep_own_app(home, tmp_path)
+    for path in (ROOT / "tests" / "examples").glob(
+        "own_app.*"
+    ):  # somebody's application, swept by our launcher
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    line = ["-m", "kernel=gaussian,matern", "steps=2", "hydra/launcher=batched"]
+    said = _run(home / "bin" / "python", "-W", "error", "own_app.py", *line, cwd=tmp_path)
+    assert said.count("loss=") == 2
+    assert "not available" not in said

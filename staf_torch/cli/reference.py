@@ -1,4 +1,4 @@
-"""`staf docs [FOLDER]`: the reference pages, made of the docstrings by pdoc (extra `docs`)."""
+"""`staf docs [FOLDER [MODULE ...]]`: the reference pages, made of the docstrings by pdoc (extra `docs`)."""
 
 from __future__ import annotations
 
@@ -21,11 +21,17 @@ MODULES = (
 def main(words: Sequence[str]) -> str:
     """Write the pages into a folder, `site` where none is named; return where they begin.
 
+    Args:
+        words: the folder, then the modules that get a page, all of `MODULES` by default.
+
     Raises:
-        ValueError: without pdoc, or for more than one folder.
+        ValueError: without pdoc, or for a module that has no page.
     """
-    if len(words) > 1:
-        raise ValueError(f"`staf docs` takes one folder; got {' '.join(words)!r}.")
+    chosen = words[1:] or MODULES
+    if unknown := [name for name in chosen if name not in MODULES]:
+        raise ValueError(
+            f"`staf docs FOLDER MODULE ...` takes modules of {', '.join(MODULES)}; got {unknown[0]!r}."
+        )
     if importlib.util.find_spec("pdoc") is None:
         raise ValueError("`staf docs` needs pdoc: install the extra, pip install 'staf_torch[docs]'.")
     folder = Path(words[0] if words else "site")
@@ -36,5 +42,5 @@ def main(words: Sequence[str]) -> str:
     with warnings.catch_warnings():
         # Those of a NamedTuple, or of a dataclass's ancestor, are evaluated where our names are not known:
         warnings.filterwarnings("ignore", "Error parsing type annotation")  # the text is then shown as it is
-        pdoc.pdoc(*MODULES, output_directory=folder)
+        pdoc.pdoc(*chosen, output_directory=folder)
     return f"reference pages: {folder / 'index.html'}"
