@@ -23,7 +23,7 @@ class DriftAdaptation(NamedTuple):
         >>> adp.DriftAdaptation._fields[:2]
         ('estimate', 'certain')
 
-        Shown by `tests/benchmarks/unknown_drift.py`.
+        Shown by `tests/adp/adaptation/test_stream_drift.py`.
     """
 
     estimate: DriftEstimate
@@ -54,7 +54,7 @@ class DriftLQR(Controller):
         >>> now.certain[0, [0, -1]], bool(run.state[0, -1].norm() < 0.05)
         (tensor([0., 1.], dtype=torch.float64), True)
 
-        Shown by `tests/benchmarks/unknown_drift.py`.
+        Shown by `tests/adp/adaptation/test_stream_drift.py`.
 
     Args:
         drift: the model and what learns it.

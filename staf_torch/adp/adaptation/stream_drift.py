@@ -30,7 +30,7 @@ class DriftEstimate(NamedTuple):
         >>> adp.DriftEstimate._fields
         ('anchor', 'mean', 'covariance')
 
-        Shown by `tests/benchmarks/unknown_drift.py`.
+        Shown by `tests/adp/adaptation/test_stream_drift.py`.
     """
 
     anchor: Tensor  # (..., n) the state that the centers surround
@@ -63,7 +63,7 @@ class StreamDrift:
         >>> mean, spread.round(decimals=3)  # nothing is known yet
         (tensor([[0.]], dtype=torch.float64), tensor([[2.]], dtype=torch.float64))
 
-        Shown by `tests/benchmarks/unknown_drift.py`.
+        Shown by `tests/adp/adaptation/test_stream_drift.py`.
 
     Args:
         known: h and g, whose equilibrium is x_s; its input there is held.
