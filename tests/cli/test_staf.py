@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 import csv
-import importlib.util
+import functools
 import json
 import math
 import statistics
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import numpy as np
 import pytest
 from command_line import Outcome, environment, run_all
+from composing import settings
 from experiments.test_reference_metrics import CASES
 
+import staf_torch
 from staf_torch.cli.staf import config_directory
+from staf_torch.experiments.registry import experiment
 
 KEYS = {
     "ultimate_error",
@@ -43,7 +47,7 @@ NEEDS = {  # what some options cannot do without, or that makes them small
     "system=two_link_robot": ["centers=simplex", "target=quadratic", "initial_state=[0.1,0,0,0]"],
     "system=three_state": ["centers=simplex", "target=quadratic", "initial_state=[0.1,0,0]"],
 }
-CUSTOM = {
+CUSTOM = {  # a user's own of every group, in one line
     "kernel": "plants.Cauchy",
     "metric": "plants.Largest",
     "optimizer": "plants.Shrinking",
@@ -57,7 +61,7 @@ ELSEWHERE |= {"experiment=adp_three_state", "experiment=rivals"}  # tests/experi
 UNRATED = {  # laws that promise no rate of contraction
     f"optimizer={law}"
     for law in (
-        *("barzilai_borwein", "custom", "heavy_ball", "jacobi", "nesterov"),
+        *("barzilai_borwein", "heavy_ball", "jacobi", "nesterov"),
         *("normalised_lms", "preconditioned_descent", "recursive_least_squares"),
     )
 }
@@ -72,38 +76,34 @@ def _options() -> dict[str, list[str]]:
     lines = {}
     for path in sorted(Path(config_directory()).glob("*/*.yaml")):
         group, option = path.parent.name, path.stem
-        more = [f"{group}.path={CUSTOM[group]}"] if option == "custom" else []
-        more += NEEDS.get(f"{group}={option}", [])
-        if option == "ablation":
-            lines[f"{group}={option}"] = [f"{group}={option}", *ABLATION]
-        elif group != "adp" and option != "mujoco" and f"{group}={option}" not in ELSEWHERE:
-            lines[f"{group}={option}"] = [f"{group}={option}", *more]
+        name = f"{group}={option}"
+        elsewhere = group in ("adp", "tracker") or option in ("ablation", "custom", "mujoco")
+        if not elsewhere and name not in ELSEWHERE:
+            lines[name] = [name, *NEEDS.get(name, [])]
     return lines
 
 
-def _together(options: dict[str, list[str]]) -> dict[str, list[str]]:
+def _together(options: dict[str, list[str]]) -> dict[str, tuple[str, ...]]:
     """The line that an option runs in: one of every group in a line, where they need no other group."""
     groups: dict[str, list[str]] = {}
     for name in options:
         group = name.partition("=")[0]
-        alone = group in ("experiment", "hydra") or name in NEEDS or group not in {*CUSTOM, "centers"}
-        if not alone:
+        if group in {*CUSTOM, "centers"} and name not in NEEDS:
             groups.setdefault(group, []).append(name)
-    lines = {name: [*SHORT, *words] for name, words in options.items() if name != "experiment=ablation"}
+    lines = {name: (*SHORT, *words) for name, words in options.items()}
     for number in range(max(map(len, groups.values()))):
         names = [members[number % len(members)] for members in groups.values()]
-        line = [word for name in names for word in options[name]] + SHORT
+        line = (*SHORT, *names)
         lines |= {members[number]: line for members in groups.values() if number < len(members)}
-    return lines | {name: options[name] for name in options if name == "experiment=ablation"}
+    return lines
 
 
 OPTIONS = _options()
-if importlib.util.find_spec("tensorboard") is None:  # an extra: test_tracking.py says so
-    del OPTIONS["tracker=tensorboard"]
 TOGETHER = _together(OPTIONS)
 RUNS = {
-    **{" ".join(line): line for line in TOGETHER.values()},
-    "figures": ["duration=0.3", "settle_time=0.1"],
+    "custom": [*(f"{g}=custom" for g in CUSTOM), *(f"{g}.path={own}" for g, own in CUSTOM.items()), *SHORT],
+    "ablation": ["experiment=ablation", *ABLATION],
+    "figures": SHORT[:2],
     "no history": ["history=false", *SHORT],
     "five": ["trajectories=5", *SHORT],
     "five again": ["trajectories=5", *SHORT],
@@ -146,33 +146,37 @@ def history(run: Path) -> dict[str, np.ndarray]:
         return dict(archive)
 
 
-@pytest.mark.parametrize("name", [name for name in OPTIONS if not name.startswith(("experiment", "hydra"))])
-def test_every_option_of_every_group_runs(name: str, outcomes: dict[str, Outcome]) -> None:
+@functools.cache
+def found_by(line: tuple[str, ...]) -> dict[str, float | None]:
+    """The metrics of a line whose experiment is called as the command calls it."""
+    cfg = settings(*line)
+    with tempfile.TemporaryDirectory() as folder:
+        return experiment(cfg.task)(cfg, Path(folder))
+
+
+@pytest.mark.parametrize("name", OPTIONS)
+def test_every_option_of_every_group_runs(name: str) -> None:
     line = TOGETHER[name]
-    run = run_directory(outcomes[" ".join(line)])
-    found = metrics(run)
-    own = {"largest_state"} if "metric=custom" in line else set()  # of the user's own metric in these tests
-    assert set(found) == KEYS | own
+    found = found_by(line)
+    if name.startswith("experiment="):
+        assert found
+        return
+    assert set(found) == KEYS
     rated = KEYS if UNRATED.isdisjoint(line) else KEYS - {"contraction_violations"}
     assert (found["contraction_violations"] is None) == (rated != KEYS)
     assert all(found[key] is not None and math.isfinite(found[key]) for key in rated)
     assert found["diverged_fraction"] == 0
-    assert {path.name for path in run.iterdir()} - {"tensorboard"} == {
-        ".hydra",
-        "run.json",
-        "staf.log",
-        "metrics.json",
-        "history.npz",
-    }
 
 
-@pytest.mark.parametrize(
-    "name", [name for name in OPTIONS if name.startswith("experiment") and name != "experiment=ablation"]
-)
-def test_every_other_experiment_runs(name: str, outcomes: dict[str, Outcome]) -> None:
-    assert {".hydra", "run.json", "staf.log", "metrics.json"} <= {
-        path.name for path in run_directory(outcomes[" ".join(TOGETHER[name])]).iterdir()
-    }
+def test_a_users_own_option_of_every_group_runs(outcomes: dict[str, Outcome]) -> None:
+    run = run_directory(outcomes["custom"])
+    found = metrics(run)
+    assert set(found) == KEYS | {"largest_state"}  # of the user's own metric
+    assert found["contraction_violations"] is None
+    assert all(math.isfinite(found[key]) for key in found.keys() - {"contraction_violations"})
+    assert f"tracked custom {found['ball_error']}" in (run / "staf.log").read_text()
+    files = {path.name for path in run.iterdir()}
+    assert files == {".hydra", "run.json", "staf.log", "metrics.json", "history.npz"}
 
 
 def test_a_run_directory_holds_exactly_what_is_promised(outcomes: dict[str, Outcome]) -> None:
@@ -277,7 +281,7 @@ def test_diverging_trajectories_are_counted_and_named_and_spare_the_others(
 
 def test_the_ablation_ends_with_the_errors_of_the_layouts(outcomes: dict[str, Outcome]) -> None:
     """MATH.md, section 1: worst of six states (not stated: hence 10 %), exponential kernel, r = 0.1."""
-    outcome = outcomes[" ".join(TOGETHER["experiment=ablation"])]
+    outcome = outcomes["ablation"]
     sweep = run_directory(outcome)
     with (sweep / "table.csv").open() as file:
         rows = list(csv.DictReader(file))
@@ -316,25 +320,22 @@ BAD: dict[str, tuple[str, tuple[str, ...]]] = {
     "unknown key": ("nonsense=1", ("nonsense",)),
     "unknown key of a group": ("kernel=gaussian kernel.wdth=2", ("wdth",)),
     "unknown argument": ("kernel=gaussian +kernel.wdth=2", ("wdth",)),
-    "unknown task": ("task=nope", ("`staf task=...` must be one of", "'nope'")),
     "broken syntax": ("initial_state=[1.0", ("[1.0",)),
-    "no count of rings": (
-        "centers.count=4",
-        ("`rings(count=...)` must be one of 3, 6, 10, 15, 21, 28; got 4.",),
+    "figures is a word": (
+        "figures=maybe",
+        (
+            "figures",
+            "maybe",
+        ),
     ),
-    "too many polynomial centers": (
-        "kernel=polynomial kernel.degree=1 centers.count=6",
-        ("has 6 centers", "has 3 dimensions: use at most 3 centers"),
+    "history is a word": (
+        "history=maybe",
+        (
+            "history",
+            "maybe",
+        ),
     ),
-    "duration under dt": ("duration=0.001", ("`staf duration=...` must be at least one step", "0.001")),
-    "device that is not there": ("device=cuda:7", ("`staf device=...` cannot be used here", "cuda:7")),
-    "figures is a word": ("figures=maybe", ("figures", "maybe")),
-    "history is a word": ("history=maybe", ("history", "maybe")),
     "custom without a path": ("kernel=custom", ("path",)),
-    "path to nothing": (
-        "target=custom target.path=nowhere.at_all",
-        ("`custom(path=...)` cannot be imported",),
-    ),
     "target of a wrong shape": (
         "target=custom target.path=plants.wrong",
         ("The target `wrong` must map points of shape (..., n) to values of shape (...)",),
@@ -343,7 +344,52 @@ BAD: dict[str, tuple[str, tuple[str, ...]]] = {
         "system=custom system.path=plants.Wrong",
         ("`Wrong.drift` must map (..., n) to (..., n)",),
     ),
-    "run directory under a file": ("hydra.run.dir=blocked/run", ("cannot write", "blocked")),
+    "run directory under a file": (
+        "hydra.run.dir=blocked/run",
+        (
+            "cannot write",
+            "blocked",
+        ),
+    ),
+}
+WRONG: dict[str, tuple[str, tuple[str, ...]]] = {  # refused by the library, whoever calls it
+    "module that is not there": ("task=nowhere.at_all", ("`staf task=...` cannot be imported",)),
+    "no count of rings": (
+        "centers.count=4",
+        ("`rings(count=...)` must be one of 3, 6, 10, 15, 21, 28; got 4.",),
+    ),
+    "too many polynomial centers": (
+        "kernel=polynomial kernel.degree=1 centers.count=6",
+        (
+            "has 6 centers",
+            "has 3 dimensions: use at most 3 centers",
+        ),
+    ),
+    "duration under dt": (
+        "duration=0.001",
+        (
+            "`staf duration=...` must be at least one step",
+            "0.001",
+        ),
+    ),
+    "device that is not there": (
+        "device=cuda:7",
+        (
+            "`staf device=...` cannot be used here",
+            "cuda:7",
+        ),
+    ),
+    "path to nothing": (
+        "target=custom target.path=nowhere.at_all",
+        ("`custom(path=...)` cannot be imported",),
+    ),
+    "unknown task": (
+        "task=nope",
+        (
+            "`staf task=...` must be one of",
+            "'nope'",
+        ),
+    ),
 }
 
 
@@ -367,6 +413,15 @@ def test_bad_input_gets_a_sentence_and_leaves_nothing(name: str, refused: dict[s
     runs = found.folder / "runs"
     assert found.left <= {"runs"}
     assert not runs.exists() or list(runs.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_a_wrong_setting_is_an_error_in_the_same_words_and_leaves_nothing(name: str, tmp_path: Path) -> None:
+    line, expected = WRONG[name]
+    with pytest.raises(ValueError, match=r"must|has|cannot") as raised:
+        staf_torch.run(*SHORT, *line.split(), directory=tmp_path / "run")
+    assert all(words in str(raised.value) for words in expected)
+    assert not list(tmp_path.glob("run/*"))
 
 
 def test_the_command_itself_ends_with_code_one_and_no_traceback(tmp_path: Path) -> None:

@@ -34,24 +34,9 @@ def drawn(directory: Path, *settings: str) -> Path:
     return path
 
 
-@pytest.mark.parametrize(
-    ("settings", "name"),
-    [
-        ((*SHORT, *SPACE), "chase"),
-        (
-            ("experiment=adp_tracking", "duration=0.02", "dt=0.01", "figures=false"),
-            "tracking",
-        ),
-    ],
-    ids=["chase", "tracking"],
-)
-def test_an_animation_has_a_frame_a_time_and_what_moves_moves(
-    settings: tuple[str, ...], name: str, tmp_path: Path
-) -> None:
-    if name == "tracking":
-        pytest.importorskip("scipy")
-    path = drawn(tmp_path / "run", *settings, "animation=true")
-    assert path.name == f"{name}.gif"
+def test_an_animation_has_a_frame_a_time_and_what_moves_moves(tmp_path: Path) -> None:
+    path = drawn(tmp_path / "run", *SHORT, *SPACE, "animation=true")
+    assert path.name == "chase.gif"
     with Image.open(path) as picture:
         assert picture.n_frames == 3
         assert picture.info["duration"] == 100  # ms
@@ -62,14 +47,18 @@ def test_an_animation_has_a_frame_a_time_and_what_moves_moves(
 
 
 def test_a_page_holds_its_frames_and_asks_no_server(tmp_path: Path) -> None:
-    text = drawn(tmp_path / "run", *SHORT, "animation=html").read_text()
+    pytest.importorskip("scipy")  # for the optimum of the path
+    words = ("experiment=adp_tracking", "duration=0.02", "dt=0.01", "figures=false", "animation=html")
+    path = drawn(tmp_path / "run", *words)
+    assert path.name == "tracking.html"
+    text = path.read_text()
     assert "http" not in text
     frames = json.loads(re.search(r"const pictures = (.*);", text)[1])
     assert len(frames) == 3
     whole, *changes = (Image.open(io.BytesIO(base64.b64decode(frame))).convert("RGBA") for frame in frames)
     assert whole.getextrema()[3][0] >= 254  # opaque, but for the palette's rounding
     assert all(picture.getextrema()[3] == (0, 255) for picture in changes)  # mostly transparent
-    assert max(map(len, frames[1:])) < 0.3 * len(frames[0])
+    assert max(map(len, frames[1:])) < 0.6 * len(frames[0])
 
 
 @pytest.mark.parametrize(

@@ -29,7 +29,7 @@ from staf_torch.sweeps.launcher import SweepProgress
 
 pytestmark = pytest.mark.filterwarnings("always:odd 100")
 SHORT = ["duration=0.05", "settle_time=0", "figures=false", "history=false"]
-GRID = ["centers.count=3,4,6", "centers.radius=0.1,0.2", "trajectories=2", "+note='ü: x'", *SHORT]
+GRID = ["centers.count=3,4,6", "centers.radius=0.1", "trajectories=2", "+note='ü: x'", *SHORT]
 BAD = "`rings(count=...)` must be one of 3, 6, 10, 15, 21, 28; got 4."
 
 
@@ -86,7 +86,7 @@ def test_a_batched_sweep_leaves_what_the_basic_launcher_leaves(
     )
     assert ours == hydras
     assert {"table.md", "report.html"} <= ours  # although jobs failed
-    for num in range(6):
+    for num in range(3):
         run, other = batched[0] / str(num), basic[0] / str(num)
         assert hydra_of(run) == hydra_of(other)
         for name in ("config", "overrides"):
@@ -118,19 +118,19 @@ def test_a_batched_sweep_finds_the_numbers_of_the_basic_launcher(
 
 def test_a_job_that_fails_fails_alone_and_says_why(batched: tuple[Path, str]) -> None:
     directory, said = batched
-    status = [record(directory / str(num))["status"] for num in range(6)]
-    assert status == [*["completed"] * 2, *["failed"] * 2, *["completed"] * 2]
-    assert record(directory / "2")["reason"] == BAD
-    assert "job 2 (centers.count=4 centers.radius=0.1" in said
+    status = [record(directory / str(num))["status"] for num in range(3)]
+    assert status == ["completed", "failed", "completed"]
+    assert record(directory / "1")["reason"] == BAD
+    assert "job 1 (centers.count=4 centers.radius=0.1" in said
     assert said.rstrip().endswith(f"staf: {BAD}")
-    assert "4 of 6 jobs completed, 2 failed" in said
+    assert "2 of 3 jobs completed, 1 failed" in said
     assert "Traceback" not in said
-    assert BAD in (directory / "2" / "staf.log").read_text()
+    assert BAD in (directory / "1" / "staf.log").read_text()
 
 
 def test_sweep_json_lists_the_jobs_and_run_json_their_settings(batched: tuple[Path, str]) -> None:
     listed = json.loads((batched[0] / "sweep.json").read_text())["jobs"]
-    assert [job["num"] for job in listed] == list(range(6))
+    assert [job["num"] for job in listed] == list(range(3))
     for job in listed:
         about = record(batched[0] / str(job["num"]))
         assert about["overrides"] == job["overrides"]
@@ -140,7 +140,7 @@ def test_sweep_json_lists_the_jobs_and_run_json_their_settings(batched: tuple[Pa
 
 
 def test_each_log_has_its_own_job_alone(batched: tuple[Path, str]) -> None:
-    for num, count in ((0, 3), (4, 6)):
+    for num, count in ((0, 3), (2, 6)):
         log = (batched[0] / str(num) / "staf.log").read_text()
         (told,) = [line for line in log.splitlines() if "Gradient chase" in line]
         assert f"{count} centers" in told
@@ -153,14 +153,14 @@ def test_a_resumed_sweep_runs_what_is_missing_and_ends_with_the_same_bits(
     again = shutil.copytree(request.getfixturevalue(launcher)[0], place / "runs" / f"{launcher}_again")
     before = rows(again)
     first = (again / "0" / "run.json").stat().st_mtime_ns
-    (again / "5" / "run.json").write_text(json.dumps(record(again / "5") | {"status": "running"}))
-    (again / "4" / "run.json").unlink()
+    (again / "2" / "run.json").write_text(json.dumps(record(again / "2") | {"status": "running"}))
+    (again / "1" / "run.json").unlink()
     code, out, err = one(
         str(place), ["-m", f"sweep.resume=runs/{launcher}_again", f"hydra/launcher={launcher}"]
     )
-    assert code == 1  # the failed ones fail again
+    assert code == 1  # the failed one fails again
     told = (
-        "4 of 6 jobs completed, 2 failed" if launcher == "batched" else "completed before: runs/basic_again/0"
+        "2 of 3 jobs completed, 1 failed" if launcher == "batched" else "completed before: runs/basic_again/0"
     )
     assert told in out, err
     assert rows(again) == before
