@@ -74,17 +74,16 @@ def held(name: str) -> Any:
     return plant.motion(x, u), plant.linearisation() if name != "three_state" else ()
 
 
+TIME = np.arange(80) * 0.1
+STREAM = np.stack((np.cos(TIME), np.sin(TIME)), -1)
+
+
 def learned() -> Any:
-    time = np.arange(80) * 0.1
-    stream = np.stack((np.cos(time), np.sin(time)), -1)
-    model = st.online.StaFRegressor().fit(stream, stream[:, 0] ** 2 + stream[:, 1])
-    return model.predict(stream[-1])
+    return st.StaFRegressor().fit(STREAM, STREAM[:, 0] ** 2 + STREAM[:, 1]).predict(STREAM[-1])
 
 
 def tuned() -> Any:
-    time = np.arange(30) * 0.1
-    stream = np.stack((np.cos(time), np.sin(time)), -1)
-    return tuple(st.StaFRegressor().tune(stream, stream[:, 0] ** 2).tuning)
+    return tuple(st.StaFRegressor().tune(STREAM[:30], STREAM[:30, 0] ** 2).tuning)
 
 
 def rated(name: str) -> Any:
@@ -109,12 +108,12 @@ THINGS: dict[str, Callable[[], Any]] = {
     **{f"states of {k}": lambda c=c: (c.goal(), c.states(4, 1), c.cost()) for k, c in CASES.items()},
     "guesses": shooting,
     "stream": learned,
-    "discs": lambda: avoidance.scenarios(
-        settings("experiment=avoidance", "trajectories=3", "avoidance.speed=0.1")
-    ),
-    "unicycles": lambda: avoidance.scenarios(
-        settings("experiment=avoidance", "trajectories=3", "avoidance.vehicle=unicycle")
-    ),
+    **{
+        kind: lambda k=kind: avoidance.scenarios(
+            settings("experiment=avoidance", "trajectories=3", f"avoidance.vehicle={k}")
+        )
+        for kind in ("mass", "unicycle")
+    },
     "motion": lambda: systems.simulate(systems.VanDerPol(), X, dt=0.05, steps=5),
     "minimal count": lambda: theory.minimal_count(
         TARGETS["paper"][0](), st.ExponentialKernel(), X, radius=0.3, epsilon=1e-2

@@ -220,6 +220,7 @@ CALLS: dict[str, Callable[..., Any]] = {
 
 HELD, DISCOUNTED = adp.LQR(PLANT, COST, period=0.1), adp.QuadraticCost(1.0, 1.0, 2, 1, discount=0.1)
 MEMORY, EXPERIENCE = adp.GlobalValue(INTEGRATOR, LIBRARY, [3.0, 3.0]), st.ExperienceMemory(BASIS, 4)
+HELD_PLANT = systems.StepPlant(lambda x, u: 0.9 * x + u, dim=2, inputs=1, dt=0.1)
 POINTS, PAPER = adp.RandomPoints(1, 1.0), st.targets.Paper()
 TWO, THREE = (torch.zeros(1, size, dtype=torch.float64) for size in (2, 3))
 STAF = st.StaF(BASIS).fit_(TWO[0], PAPER)
@@ -294,12 +295,7 @@ REFUSED: list[tuple[Callable[[], Any], str]] = [
         lambda: adp.ActorCritic(adp.QuadraticBasis(2), PLANT, COST, POINTS, critic=TWO[0]),
         "`ActorCritic(critic=...)` must have 3 entries",
     ),
-    (
-        lambda: adp.RolloutPolicy(
-            BASIS, systems.StepPlant(lambda x, u: 0.9 * x + u, dim=2, inputs=1, dt=0.1), COST, LQR, LQR.value
-        ),
-        "`RolloutPolicy(model=...)` must be a ControlAffineSystem",
-    ),
+    (lambda: adp.RolloutPolicy(BASIS, HELD_PLANT, COST, LQR, LQR.value), "(model=...)` must be a Control"),
     (
         lambda: SampledRollout(
             st.StaFBasis(st.GaussianKernel(), st.StateFollowingCenters(st.simplex(3), 0.3)),
@@ -308,25 +304,11 @@ REFUSED: list[tuple[Callable[[], Any], str]] = [
         ),
         "`SampledRollout(basis=...)` must have the plant's 2 states or its 1 inputs",
     ),
-    (
-        lambda: adp.near_optimal(PLANT, COST, dt=0.1).report(spread=-1.0),
-        "`report(spread=...)` must be positive",
-    ),
-    (
-        lambda: adp.SafetyFilter(LQR, PLANT, still, dt=0.1).restrain(THREE, TWO[:, :1]),
-        "`SafetyFilter(x=...)` must have 2 entries",
-    ),
+    (lambda: REPORTED.report(spread=-1.0), "`report(spread=...)` must be positive"),
+    (lambda: adp.SafetyFilter(LQR, PLANT, still, dt=0.1).restrain(THREE, TWO[:, :1]), "(x=...)` must have 2"),
     (lambda: MEMORY.value(THREE), "`GlobalValue.value(x=...)` must have 2 entries"),
-    (
-        lambda: adp.SampledProblem.of(
-            systems.StepPlant(lambda x, u: 0.9 * x + u, dim=2, inputs=1, dt=0.1), COST, dt=0.2
-        ),
-        "`SampledProblem.of(dt=...)` must be the plant's period, 0.1 s",
-    ),
-    (
-        lambda: adp.simulate(adp.Feedback(LQR), PLANT, COST, THREE, dt=0.1, steps=1),
-        "`simulate(x0=...)` must have 2 entries",
-    ),
+    (lambda: adp.SampledProblem.of(HELD_PLANT, COST, dt=0.2), "(dt=...)` must be the plant's period, 0.1 s"),
+    (lambda: adp.simulate(adp.Feedback(LQR), PLANT, COST, THREE, dt=0.1, steps=1), "(x0=...)` must have 2"),
     (
         lambda: adp.simulate(adp.Feedback(LQR), PLANT, COST, TWO, dt=0.1, steps=1, seed=[0, 1]),
         "`simulate(seed=...)` must be one a row, 1",
@@ -337,10 +319,7 @@ REFUSED: list[tuple[Callable[[], Any], str]] = [
         ),
         "`simulate(cost=...)` must be for the plant's 2 states",
     ),
-    (
-        lambda: adp.AdaptiveLQR(ACTUATORS, DISCOUNTED, WINDOWS, ESTIMATE),
-        "`AdaptiveLQR(cost=...)` must have no discount",
-    ),
+    (lambda: adp.AdaptiveLQR(ACTUATORS, DISCOUNTED, WINDOWS, ESTIMATE), "(cost=...)` must have no discount"),
     (
         lambda: adp.AdaptiveLQR(ACTUATORS, COST, WINDOWS, adp.LeastSquares([1.0, 1.0], 0.5)),
         "`AdaptiveLQR(law=...)` must have the model's 1 parameters",
@@ -356,10 +335,7 @@ REFUSED: list[tuple[Callable[[], Any], str]] = [
     (lambda: observed(deviation=[1.0]), "`Observed(deviation=...)` must be one number or a list"),
     (lambda: observed(mean=[1.0]), "`Observed(mean=...)` must have 2 entries"),
     (lambda: rows(rows=[0]), "`ParametricPlant(rows=...)` must have all states whose regressor does not"),
-    (
-        lambda: rows(regressor=lambda x, u: 1 + regressor(x, u)).family(),
-        "`ParametricPlant(regressor=...)` must vanish at the set-point",
-    ),
+    (lambda: rows(regressor=lambda x, u: 1 + regressor(x, u)).family(), "(regressor=...)` must vanish at"),
     (
         lambda: adp.ChangingPlant(ACTUATORS).cost(adp.QuadraticCost(1.0, 1.0, 2, 1, target=[1.0, 0.0])),
         "`ChangingPlant(cost=...)` must be of x itself at the origin",

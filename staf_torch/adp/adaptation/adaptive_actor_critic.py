@@ -49,7 +49,7 @@ class LearnedModel(NamedTuple):
         >>> adp.LearnedModel._fields
         ('estimate', 'certain', 'window')
 
-        Shown by `tests/benchmarks/identified_policy_iteration.py`.
+        Shown by `tests/adp/adaptation/test_adaptive_policies.py`.
     """
 
     estimate: Estimate
@@ -89,7 +89,7 @@ class AdaptiveActorCritic(IdentifyingActorCritic):
         >>> now.estimate.theta[0, -1].round(decimals=2), now.certain[0, [0, -1]]
         (tensor([0.3000], dtype=torch.float64), tensor([0., 1.], dtype=torch.float64))
 
-        Shown by `tests/benchmarks/identified_policy_iteration.py`.
+        Shown by `tests/adp/adaptation/test_adaptive_policies.py`.
 
     Args:
         learner: the actor-critic; its own model is not used.
