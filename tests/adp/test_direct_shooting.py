@@ -21,7 +21,7 @@ X3 = torch.tensor([[-0.5, 0.5, -0.25]], dtype=torch.float64)
 
 @pytest.mark.parametrize("plant", [PLANT, LINEAR], ids=lambda p: type(p).__name__)
 def test_known_optimum_is_found_and_bounded_from_above(plant: systems.ControlAffineSystem) -> None:
-    x = uniform(3, 2.0, seed=2)
+    x = uniform(2, 2.0, seed=2)
     best = adp.DirectShooting(plant, COST).solve(x)
     known = plant.optimal_value(x, COST.q, COST.r)
     assert best.converged.all()
@@ -36,7 +36,7 @@ def test_known_optimum_is_found_and_bounded_from_above(plant: systems.ControlAff
 
 
 def test_error_falls_with_the_mesh() -> None:
-    x = uniform(5, 1.5, seed=3)
+    x = uniform(2, 1.5, seed=3)
     known = LINEAR.optimal_value(x, COST.q, COST.r)
     excess = [adp.DirectShooting(LINEAR, COST, intervals=n).solve(x).value / known - 1 for n in (20, 40)]
     assert (excess[1] < excess[0] / 8).all()
@@ -62,7 +62,7 @@ def test_three_state_optimum() -> None:
 def test_gradient_and_control_solve_the_hjb_equation(
     plant: systems.ControlAffineSystem, cost: adp.Cost, intervals: int | None
 ) -> None:
-    x = 0.2 * torch.randn(2, plant.dim, dtype=torch.float64, generator=torch.Generator().manual_seed(4))
+    x = 0.2 * torch.randn(1, plant.dim, dtype=torch.float64, generator=torch.Generator().manual_seed(4))
     best = adp.DirectShooting(plant, cost, intervals=intervals).solve(x)
     assert best.converged.all()
     g = plant.effectiveness(x)
@@ -71,7 +71,7 @@ def test_gradient_and_control_solve_the_hjb_equation(
     assert (residual.abs() < 1e-4 * cost.rate(x, best.control)).all()
     torch.testing.assert_close(best.control, cost.policy(g, best.gradient))
     lqr = adp.LQR(plant, cost)
-    run = adp.simulate(adp.Feedback(lqr), plant, cost, x, dt=0.1, steps=100, every=100)
+    run = adp.simulate(adp.Feedback(lqr), plant, cost, x, dt=0.1, steps=100, every=100, compile=False)
     assert (best.value < run.cost * (1 + 1e-4)).all()
 
 
@@ -245,7 +245,7 @@ def test_of_two_valleys_the_lower_one_is_found_from_several_starts() -> None:
     given: dict[str, Any] = {"base": lambda x: torch.where(x < ridge, -y(x), y(x)), "horizon": 4.0}
     given["terminal"] = lambda x: y(x)[..., 0].square()
     downhill = adp.DirectShooting(plant, cost, **given, intervals=80).solve(x)  # no LQR to doubt it by
-    search = adp.DirectShooting(plant, cost, **given, starts=3)
+    search = adp.DirectShooting(plant, cost, **given, starts=3, intervals=40)
     found = search.solve(torch.cat((x, 0.1 * x)))
     assert float(downhill.value) == pytest.approx(2 * (whole - left), rel=1e-2)
     assert float(found.value[0]) == pytest.approx(2 * left, rel=1e-2)

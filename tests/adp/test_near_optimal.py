@@ -68,7 +68,7 @@ def test_improved_policy_is_never_worse_than_its_base(
     two_states: adp.NearOptimal,
 ) -> None:
     policy = two_states if cost is COST else adp.near_optimal(plant, cost, dt=dt, horizon=0.8)
-    x0 = drawn(cost.dim, width, 24)
+    x0 = drawn(cost.dim, width, 12)
     steps = round(4.0 / policy.period)
     base, ours = (
         adp.simulate(adp.Feedback(u), plant, cost, x0, dt=policy.period, steps=steps)
@@ -217,10 +217,10 @@ class Gap(systems.ControlAffineSystem):
 
 def test_report_finds_the_region_of_a_plant_in_small_units() -> None:
     policy = adp.near_optimal(Gap(), adp.QuadraticCost(25.0, 1.0, dim=1, inputs=1), dt=0.05, horizon=0.2)
-    report = policy.report(states=4, optimum=False)
+    report = policy.report(states=2, optimum=False)
     assert report["regulated"] == 0  # in the box of 1
     assert 1 / 256 <= report["good_spread"] <= 1 / 32
-    near = policy.report(states=4, spread=0.01, optimum=False)
+    near = policy.report(states=2, spread=0.01, optimum=False)
     assert 1 / 512 <= near["good_spread"] <= 1 / 25  # the same region, asked for by another box
 
 
@@ -231,8 +231,7 @@ def torch_turn(x: Tensor, u: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-@pytest.mark.parametrize("target", [None, (2 * math.pi, 0.0)])
-@pytest.mark.parametrize("smooth", [False, True])
+@pytest.mark.parametrize(("target", "smooth"), [(None, True), ((2 * math.pi, 0.0), False)])
 def test_simulator_is_followed_in_numpy_to_the_same_promise(
     target: tuple[float, float] | None, smooth: bool
 ) -> None:

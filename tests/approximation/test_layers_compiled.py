@@ -23,10 +23,9 @@ def fixed(
 
 
 CASES: dict[str, Callable[[], st.StaF]] = {
-    "exponential": lambda: fixed("exponential", 0.4, (4,), 2),
     "everything_learned": lambda: learnable("gaussian", "shrinking", (4,))[0],
 }
-MODES = {"exponential": "total_frozen_weights", "everything_learned": "total"}
+MODES = {"everything_learned": "total"}
 
 
 @over(CASES)
@@ -70,7 +69,9 @@ def test_inductor_differentiates_learned_hyperparameters_of_the_newton_basis(
     assert len(learned) == 3
     expected = torch.autograd.grad(value(), learned)
     torch.compiler.reset()
-    found = torch.autograd.grad(torch.compile(value)(), learned)
+    # Headers that are compiled before take longer than the few kernels that would share them.
+    options = {"cpp_cache_precompile_headers": False} if torch.__version__ >= "2.9" else {}
+    found = torch.autograd.grad(torch.compile(value, options=options)(), learned)
     for ours, theirs in zip(found, expected, strict=True):
         torch.testing.assert_close(ours, theirs, rtol=1e-9, atol=1e-9)
 
@@ -102,10 +103,7 @@ class ValueAndGradient(nn.Module):
 
 @pytest.mark.parametrize(
     ("name", "strict"),
-    [
-        ("exponential", True),  # the front end of torch.compile; the others by the default one
-        ("anchored_gaussian", False),
-    ],
+    [("exponential", False), ("anchored_gaussian", False)],
 )
 @pytest.mark.filterwarnings("ignore::UserWarning")  # torch 2.6, of its own nodes
 def test_export_takes_batches_of_any_size(name: str, strict: bool) -> None:

@@ -188,7 +188,7 @@ def test_a_bad_argument_is_named_with_its_value(make, message: str) -> None:  # 
         make()
 
 
-@pytest.mark.parametrize(("dim", "degree"), [(6, 2), (12, 1), (12, 2), (3, 4)])
+@pytest.mark.parametrize(("dim", "degree"), [(6, 2), (12, 1), (3, 4)])
 def test_ball_is_unisolvent_and_well_conditioned_up_to_twelve_dimensions(dim: int, degree: int) -> None:
     count = math.comb(dim + degree, degree)
     basis = st.StaFBasis(st.GaussianKernel(), st.StateFollowingCenters(st.ball(count, dim), 1e-3))
@@ -199,7 +199,7 @@ def test_ball_is_unisolvent_and_well_conditioned_up_to_twelve_dimensions(dim: in
 
 def test_ball_is_no_worse_than_the_rings_in_the_plane() -> None:
     x = torch.tensor([[0.9, 0.2], [-0.3, 0.8], [0.1, -1.0]]).double()
-    for count in (3, 6, 10, 15, 21, 28):
+    for count in (3, 10, 28):
         errors = [
             sup_error(st.StaFBasis(st.ExponentialKernel(), st.StateFollowingCenters(u, 0.1)), x, Paper())
             for u in (st.ball(count, 2), st.rings(count))

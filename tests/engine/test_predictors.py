@@ -124,7 +124,7 @@ def test_the_excess_falls_with_the_order_of_the_predictor(
     assert least < slope < most
 
 
-@pytest.mark.parametrize("count", [3, 6, 10, 15])
+@pytest.mark.parametrize("count", [3, 10])
 @pytest.mark.parametrize("kernel", SMOOTH_KERNELS)
 def test_the_exact_law_leaves_no_excess(kernel: str, count: int) -> None:
     rank = SMOOTH_KERNELS[kernel].make().rank(2)
@@ -136,9 +136,9 @@ def test_the_exact_law_leaves_no_excess(kernel: str, count: int) -> None:
 
 
 @pytest.mark.parametrize("name", LAWS)
-@pytest.mark.parametrize("predictor", ["none", "secant, guarded", "tangent, order 2"])
+@pytest.mark.parametrize("predictor", ["none", "tangent, order 2"])
 def test_no_law_blows_up_however_fast_the_ideal_weights_move(name: str, predictor: str) -> None:
-    x = states(batch=2, steps=30, dt=0.3)
+    x = states(batch=2, steps=20, dt=0.3)
     result = chase(x, basis(), TARGET, LAWS[name], inner_steps=5, predictor=PREDICTORS[predictor])
     none = (result.ideal_weights * basis().values(x, TARGET)).sum(-1).amax(1, keepdim=True)
     assert bool((result.excess_before < 100 * none).all())

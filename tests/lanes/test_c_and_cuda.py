@@ -55,7 +55,7 @@ def pointer(tensor: Tensor) -> ctypes.c_void_p:
 
 
 @needs_gcc
-@pytest.mark.parametrize(("dtype", "bound"), [(torch.float64, 1e-12), (torch.float32, 2e-5)])
+@pytest.mark.parametrize(("dtype", "bound"), [(torch.float32, 2e-5)])
 def test_c_of_a_step_is_the_definition(dtype: torch.dtype, bound: float, tmp_path: Path) -> None:
     carry, u, row = given(1, dtype)
     program = lanes.Program(flow)
@@ -164,7 +164,7 @@ def test_the_text_of_a_small_program_is_the_recorded(name: str, record: Record) 
 
 
 @needs_gcc
-@pytest.mark.parametrize(("dtype", "bound"), [(torch.float64, 1e-12), (torch.float32, 2e-5)])
+@pytest.mark.parametrize(("dtype", "bound"), [(torch.float64, 1e-12)])
 def test_cuda_text_on_a_host_is_the_definition(dtype: torch.dtype, bound: float, tmp_path: Path) -> None:
     """No device is needed: g++ compiles the kernel, a loop is the grid."""
     carry, u, row = given(37, dtype)
@@ -208,9 +208,13 @@ def host_compiler(folder: Path) -> Callable[[str, str], Callable[..., None]]:
 DIRECTIONS = torch.tensor([[1.0, 0.0], [-0.5, 0.8], [-0.5, -0.8]], dtype=torch.float64)
 
 
-@pytest.mark.parametrize("kernel", [kernels.ExponentialKernel(), kernels.GaussianKernel(1.0)])
-@pytest.mark.parametrize("radius", [0.3, centers.StateRadius(0.7, 0.01)])
-@pytest.mark.parametrize("law", [optim.SteepestDescent(), optim.ConjugateGradient(), optim.Nesterov()])
+@pytest.mark.parametrize(
+    ("kernel", "radius", "law"),
+    [
+        (kernels.ExponentialKernel(), 0.3, optim.ConjugateGradient()),
+        (kernels.GaussianKernel(1.0), centers.StateRadius(0.7, 0.01), optim.Nesterov()),
+    ],
+)
 def test_a_chase_on_a_device_stays_there(kernel: Any, radius: Any, law: optim.UpdateLaw) -> None:
     following = centers.StateFollowingCenters(DIRECTIONS, radius)
 
@@ -235,8 +239,10 @@ def test_the_meta_device_notices_a_value_that_is_read() -> None:
         lanes.Program(lambda x, _, __: (x if bool((x > 0).all()) else -x, ()))(x, steps=1)
 
 
-@pytest.mark.parametrize("kernel", [kernels.ExponentialKernel, kernels.GaussianKernel, kernels.MaternKernel])
-@pytest.mark.parametrize("radius", [0.3, centers.StateRadius(0.7, 0.01)])
+@pytest.mark.parametrize(
+    ("kernel", "radius"),
+    [(kernels.ExponentialKernel, centers.StateRadius(0.7, 0.01)), (kernels.MaternKernel, 0.3)],
+)
 def test_the_errors_around_states_on_a_device_stay_there(kernel: Any, radius: Any) -> None:
     basis = StaFBasis(kernel(), centers.StateFollowingCenters(DIRECTIONS, radius)).to("meta")
     x = torch.empty(3, 6, 2, dtype=torch.float64, device="meta")
@@ -245,7 +251,7 @@ def test_the_errors_around_states_on_a_device_stay_there(kernel: Any, radius: An
     assert {(part.device.type, tuple(part.shape)) for part in errors} == {("meta", (3, 6))}
 
 
-@pytest.mark.parametrize("law", [adp.laws.Information, adp.laws.Published, adp.laws.Frozen])
+@pytest.mark.parametrize("law", [adp.laws.Information, adp.laws.Published])
 def test_a_learning_closed_loop_on_a_device_stays_there(law: Any) -> None:
     plant, cost = systems.TwoState(), adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
     following = centers.StateFollowingCenters(DIRECTIONS, centers.StateRadius(0.7, 1e-5))

@@ -308,8 +308,8 @@ def captured(a: Tensor) -> list[Tensor]:
 
 
 FORMS: dict[str, tuple[Callable[..., Any], tuple[Tensor, ...]]] = {
-    **{name: (lambda a, name=name: forms.by_name([name], a), (x(3),)) for name in forms.ONE},
-    **{name: (lambda a, b, name=name: forms.by_name([name], a, b), (x(3), x(3) + 2)) for name in forms.TWO},
+    "of one": (lambda a: forms.by_name(forms.ONE, a), (x(3),)),
+    "of two": (lambda a, b: forms.by_name(forms.TWO, a, b), (x(3), x(3) + 2)),
     "powers": (forms.powers, (x(3), x(3) + 2)),
     "arithmetic": (forms.arithmetic, (x(3), x(3) + 2)),
     "logic": (forms.logic, (x(3), x(3) + 2)),
