@@ -245,7 +245,7 @@ def test_of_two_valleys_the_lower_one_is_found_from_several_starts() -> None:
     given: dict[str, Any] = {"base": lambda x: torch.where(x < ridge, -y(x), y(x)), "horizon": 4.0}
     given["terminal"] = lambda x: y(x)[..., 0].square()
     downhill = adp.DirectShooting(plant, cost, **given, intervals=80).solve(x)  # no LQR to doubt it by
-    search = adp.DirectShooting(plant, cost, **given, starts=3, intervals=40)
+    search = adp.DirectShooting(plant, cost, **given, starts=3)
     found = search.solve(torch.cat((x, 0.1 * x)))
     assert float(downhill.value) == pytest.approx(2 * (whole - left), rel=1e-2)
     assert float(found.value[0]) == pytest.approx(2 * left, rel=1e-2)
