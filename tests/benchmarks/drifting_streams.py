@@ -203,9 +203,7 @@ def met(rows: list[dict[str, Any]]) -> bool:
         print(f"{row['method']}: {ratio:.0f} times the speed, error {excess:+.1%}")
     good = rate >= RATE
     good &= any(peer["us"] / row["us"] >= RATIO and row["error"] <= peer["error"] for row in own)
-    print(
-        f"goals ({RATE:g} a second, {RATIO:g} times the speed at no higher error): {'met' if good else 'missed'}"
-    )
+    print(f"{'met' if good else 'missed'}: {RATE:g} samples a second, {RATIO:g} times the speed")
     return good
 
 

@@ -77,7 +77,7 @@ def test_pages_are_written_into_one_folder_by_pdoc(tmp_path: Path, monkeypatch: 
     said = reference.main([str(tmp_path / "site")])
     assert said == f"reference pages: {tmp_path / 'site' / 'index.html'}"
     assert "staf_torch.kernels" in (tmp_path / "site" / "index.html").read_text()
-    with pytest.raises(ValueError, match="`staf docs FOLDER MODULE ...` takes modules of"):
+    with pytest.raises(ValueError, match=r"`staf docs FOLDER MODULE \.\.\.` takes modules of"):
         reference.main(["a", "b"])
 
 
