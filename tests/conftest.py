@@ -11,6 +11,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import gc
 import logging
 import random
+import shutil
 from collections.abc import Generator, Iterator
 from pathlib import Path
 
@@ -25,6 +26,10 @@ __all__ = ["pytest_make_collect_report", "pytest_runtest_makereport"]
 
 COMPILED = {"adp", "deploy", "envs", "lanes", "online", "systems"}
 """Rooms whose tests leave the choice to compile to the library."""
+
+UNOPTIMISED = {"adp", "deploy", "engine", "lanes"}
+"""Rooms whose programs are built in a third of the time, but where bits, rounding or speed are the matter."""
+AS_FOR_USERS = ("bit", "test_compiled_is_the_definition", "within_their_bounds")
 
 hypothesis.settings.register_profile("suite", max_examples=25, deadline=None, derandomize=True)
 hypothesis.settings.load_profile("suite")
@@ -115,6 +120,29 @@ def _nothing_compiles_by_itself(request: pytest.FixtureRequest) -> Iterator[None
     compiled = room in COMPILED or request.node.get_closest_marker("compiled") is not None
     with lanes.compiling("auto" if compiled else "never"):
         yield
+
+
+@pytest.fixture(scope="session")
+def quick_cc(tmp_path_factory: pytest.TempPathFactory) -> Path | None:
+    """The C compiler, without optimisation."""
+    compiler = next(filter(None, map(shutil.which, ("cc", "gcc", "g++", "clang"))), None)
+    if compiler is None:
+        return None
+    path = Path(tmp_path_factory.mktemp("compiler") / "quick-cc")
+    path.write_text(f'#!/bin/sh\nexec {compiler} "$@" -O0\n')
+    path.chmod(0o755)
+    return path
+
+
+@pytest.fixture(autouse=True)
+def _builds_are_quick(
+    request: pytest.FixtureRequest, quick_cc: Path | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    room = request.path.relative_to(Path(__file__).parent).parts[0]
+    if room in UNOPTIMISED and not any(words in request.node.name for words in AS_FOR_USERS):
+        monkeypatch.setenv("CXXFLAGS", f"{os.environ.get('CXXFLAGS', '')} -O0")
+    if room in ("adp", "deploy") and quick_cc is not None:
+        monkeypatch.setenv("CC", str(quick_cc))
 
 
 @pytest.fixture

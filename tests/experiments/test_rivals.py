@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import sys
-import types
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -300,55 +298,6 @@ def test_the_program_of_ipopt_has_the_cost_the_motion_and_the_bounds_of_the_prob
     (asked,) = solver.asked
     assert asked["lbx"].tolist() == [-math.inf] * 6 * n + list(case.low) * 5
     assert asked["ubx"].tolist() == [math.inf] * 6 * n + list(case.high) * 5
-
-
-def test_ipopt_begins_at_rest_and_then_from_its_last_plan_a_period_later(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    case = dataclasses.replace(SHORT, horizon=3, rest=(0.25,))
-    made: list[fake_casadi.Solver] = []
-    monkeypatch.setitem(sys.modules, "casadi", fake_casadi.module(made))
-    x0 = tensor([[1.0, 2.0], [-1.0, 3.0]])
-    steer = rival_methods.ipopt(case)(x0)
-    (solver,) = made
-    assert steer(x0).tolist() == [[0.25], [0.25]]
-    steer(x0 + 1)
-    first, other, second, _ = solver.asked
-    assert first["x0"].tolist() == [1.0, 2.0] * 4 + [0.25] * 3
-    assert other["x0"].tolist() == [-1.0, 3.0] * 4 + [0.25] * 3  # a plan a row
-    assert second["x0"].tolist() == first["x0"].tolist()  # moved on by a period, which was at rest
-    assert [each["p"].tolist() for each in (first, second)] == [[1.0, 2.0, 0.0], [2.0, 3.0, 0.1]]
-
-
-def test_mppi_asks_for_the_cost_after_the_step_and_at_the_last_one_for_the_rest_of_it(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    made: list[Any] = []
-
-    class Batched:
-        def __init__(self, *given: Any, **named: Any) -> None:
-            self.given, self.named, self.U = given, named, torch.ones(2, 3)
-            made.append(self)
-
-        def command(self, x: Tensor) -> str:
-            return "its command"
-
-    module: Any = types.ModuleType("pytorch_mppi")
-    module.MPPI_Batched = Batched
-    monkeypatch.setitem(sys.modules, "pytorch_mppi", module)
-    case = dataclasses.replace(CASES["quadrotor"], horizon=4)
-    problem, x, u = case.problem(), uniform(3, 6, seed=1), uniform(3, 2, seed=2)
-    steer: Any = rival_methods.mppi(case)(x)
-    (one,) = made
-    assert steer(x) == "its command"
-    assert torch.equal(one.U, torch.zeros(2, 3))  # it begins from no control, not from noise
-    motion, cost, *_ = one.given
-    moved, paid = problem.advance(x, u)
-    torch.testing.assert_close(motion(x, u, 0), moved)
-    torch.testing.assert_close(cost(x, u, 2), paid)
-    torch.testing.assert_close(cost(x, u, 3), paid + problem.terminal(x))
-    assert torch.equal(one.named["u_max"], problem.bounds.high)
-    assert one.named["horizon"] == 4
 
 
 def test_a_plan_of_ipopt_begins_from_the_last_one_a_period_later() -> None:

@@ -209,31 +209,6 @@ def test_a_box_has_its_walls_where_it_has_any() -> None:
     assert margin.get_ylim()[0] == cost.get_ylim()[0] == 0
 
 
-def test_discs_are_drawn_at_five_times_of_the_first_half() -> None:
-    paths = {name: wave(9, 2) + k for k, name in enumerate("ab")}
-    distances, costs = ({name: wave(9) + k for k, name in enumerate("ab")} for _ in range(2))
-    nearest = {"a": np.array([0.3, -0.1, 0.2]), "b": np.array([0.5, 0.4])}
-    history = safety.AvoidanceHistory(T, paths, wave(9, 2, 2), 0.4, distances, costs, nearest)
-    plane, apart, share, cost = visible(safety.draw_avoidance(history))
-    shown = [0, 1, 2, 3, 4] if T[4] >= 0.5 * T[-1] > T[3] else []
-    centers = [tuple(center) for at in shown for center in history.discs[at]]
-    np.testing.assert_allclose([disc.center for disc in plane.patches], centers)
-    assert {disc.radius for disc in plane.patches} == {0.4}
-    curves: list[Curve] = []
-    for name, path in paths.items():
-        curves += [(name, *path.T), (None, *path[shown].T)]
-    holds(plane, curves, ("$p_1$ (m)", "$p_2$ (m)"))
-    assert plane.get_aspect() == 1
-    curves = [(name, T, values) for name, values in distances.items()]
-    names = "time (s)", "distance to the nearest disc (m)"
-    holds(apart, [*curves, (None, [0, 1], [0, 0])], names, xlim=span(T))
-    curves = [("a", [-0.1, 0.2, 0.3], [1 / 3, 2 / 3, 1]), ("b", [0.4, 0.5], [0.5, 1]), (None, [0, 0], [0, 1])]
-    names = "least distance on the way (m)", "share of the scenarios"
-    holds(share, curves, names, ylim=(0, 1.02))
-    holds(cost, [(name, T, v) for name, v in costs.items()], ("time (s)", "cost so far"), xlim=span(T))
-    assert cost.get_ylim()[0] == 0
-
-
 def test_a_fault_has_its_norms_above_and_its_parameters_below() -> None:
     certain = np.arange(9) > 3
     cases = {
@@ -308,30 +283,6 @@ def test_rivals_are_points_hollow_where_they_fail_from_some_states() -> None:
     grid = rivals.draw_rivals(four).axes
     assert [axes.get_visible() for axes in grid] == [True] * 4 + [False] * 2
     assert [axes.get_ylabel() for axes in grid[:4]] == ["median excess cost", "", "", "median excess cost"]
-
-
-def test_bounds_are_drawn_from_the_loose_to_the_strict() -> None:
-    keys = "count", "one_polynomial_count", "measured_count"
-    epsilons, radii = (0.1, 0.01), (0.4, 0.2)
-    found = {
-        (r, e): {key: None if (e, k) == (0.01, 2) else 3.0 * (k + 1) + 10 * r for k, key in enumerate(keys)}
-        for r in radii
-        for e in epsilons
-    }
-    figure = theory.draw_exponential_bound(found)
-    labels = "two polynomials (paper)", "one polynomial", "measured with ideal weights"
-    panels = visible(figure)
-    for n, (axes, r) in enumerate(zip(panels, sorted(radii), strict=True)):
-        curves = [
-            (label, epsilons, [found[r, e][key] or np.nan for e in epsilons])
-            for key, label in zip(keys, labels, strict=True)
-        ]
-        names = r"largest error $\epsilon$", "" if n else "kernels $M$"
-        holds(axes, curves, names, scales=LOG, xlim=(0.15, 0.01 / 1.5))
-        assert axes.get_title() == f"$r = {r:g}$"
-    assert [label.get_text() for label in panels[0].get_yticklabels()] == ["1", "2", "3", "6", "10"]
-    assert [label.get_text() for label in panels[0].get_xticklabels()] == ["$10^{-2}$", "$10^{-1}$"]
-    assert legend(figure) == list(labels)
 
 
 @pytest.mark.parametrize("circle", [True, False])

@@ -139,21 +139,6 @@ def test_a_map_has_a_row_a_count_and_a_column_a_radius(kernels: tuple[str, ...],
     assert len(maps) == len(kernels)
 
 
-@pytest.mark.parametrize(
-    ("settings", "label"),
-    [
-        ({"optimizer": "heavy_ball", "predictor": "tangent"}, "heavy ball, tangent predictor"),
-        ({"optimizer": "exact", "predictor": "none"}, "exact"),
-        ({"optimizer": "exact", "predictor": None}, "exact"),
-    ],
-)
-def test_a_law_is_named_with_its_predictor(settings: dict[str, Any], label: str, runs: Any) -> None:
-    given = [(settings | {STEPS: k}, errors(error=1 / k, work=10.0 * k)) for k in (2, 1)]
-    ((curve,),) = (panel.curves for panel in sweep.cost_against_accuracy(runs(given)))
-    assert curve.label == label
-    assert [(point.x, point.middle) for point in curve.points] == [(10.0, 1.0), (20.0, 0.5)]
-
-
 def test_radii_are_panels_where_laws_differ_and_lines_where_they_do_not(runs: Any) -> None:
     given = [
         ({"optimizer": law, RADIUS: r, STEPS: k}, errors(error=r / k, work=k))
@@ -195,8 +180,3 @@ def test_work_is_counted_in_products_or_where_centers_were_swept_in_multiplicati
 def test_a_sweep_of_nothing_that_a_figure_shows_has_none(runs: Any) -> None:
     found = runs([({"dt": dt}, {"ball_error": 1.0}) for dt in (0.1, 0.2)])
     assert [draw(found) for _, draw in sweep.SWEEP_FIGURES.values()] == [None, None, None]
-
-
-def test_twelve_panels_can_be_read(runs: Any) -> None:
-    found = runs([({"dt": k // 2, RADIUS: 1.0 + k % 2}, errors()) for k in range(24)])
-    assert len(sweep.error_against_radius(found)) == 12

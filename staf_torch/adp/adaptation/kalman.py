@@ -26,7 +26,7 @@ class Belief(NamedTuple):
         >>> adp.Belief._fields
         ('mean', 'covariance', 'u')
 
-        Shown by `tests/benchmarks/output_feedback.py`.
+        Shown by `tests/adp/adaptation/test_kalman.py`.
     """
 
     mean: Tensor  # (..., n)
@@ -41,7 +41,7 @@ class KalmanFilter(abc.ABC):
         >>> [issubclass(kind, adp.KalmanFilter) for kind in (adp.ExtendedKalman, adp.UnscentedKalman)]
         [True, True]
 
-        Shown by `tests/benchmarks/output_feedback.py`.
+        Shown by `tests/adp/adaptation/test_kalman.py`.
 
     Args:
         model: the plant, of a known number of states.
@@ -119,7 +119,7 @@ class ExtendedKalman(KalmanFilter):
         >>> sees_angle.corrected(unknown, torch.tensor([[0.5]])).mean.round(decimals=2)
         tensor([[0.5000, 0.0000]])
 
-        Shown by `tests/benchmarks/output_feedback.py`.
+        Shown by `tests/adp/adaptation/test_kalman.py`.
 
     Args: see `KalmanFilter`.
     """
@@ -158,7 +158,7 @@ class UnscentedKalman(KalmanFilter):
         >>> sees_sine.corrected(unknown, torch.tensor([[0.1]])).mean.round(decimals=2)
         tensor([[0.1000, 0.0000]])
 
-        Shown by `tests/benchmarks/output_feedback.py`.
+        Shown by `tests/adp/adaptation/test_kalman.py`.
 
     Args: see `KalmanFilter`.
 
@@ -207,7 +207,7 @@ class Observed(Controller):
         >>> bool(run.state[0, -1].norm() < 0.1), bool(run.diverged)
         (True, False)
 
-        Shown by `tests/benchmarks/output_feedback.py`.
+        Shown by `tests/adp/adaptation/test_kalman.py`.
 
     Args:
         controller: of the state.

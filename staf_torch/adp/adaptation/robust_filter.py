@@ -29,7 +29,7 @@ class Guarded(NamedTuple):
         >>> adp.Guarded._fields
         ('estimate', 'window', 'time', 'least', 'slack', 'acted')
 
-        Shown by `tests/benchmarks/unknown_friction.py`.
+        Shown by `tests/adp/adaptation/test_robust_filter.py`.
     """
 
     estimate: Estimate
@@ -67,7 +67,7 @@ class RobustFilter(Controller):
         >>> bool(now.least[0, -1] > 0), now.estimate.theta[0, -1].round(decimals=2)
         (True, tensor([0.5000], dtype=torch.float64))
 
-        Shown by `tests/benchmarks/unknown_friction.py`.
+        Shown by `tests/adp/adaptation/test_robust_filter.py`.
 
     Args:
         controller: of the wanted control.
