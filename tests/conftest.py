@@ -51,6 +51,7 @@ def pytest_cmdline_main(config: pytest.Config) -> None:
         return  # as the command line says; without pytest-xdist there is no such option
     folders = any(Path(each.partition("::")[0]).is_dir() for each in config.args)
     alone = option.usepdb or option.collectonly or option.record or option.capture == "no"
+    alone = alone or getattr(option, "cov_source", None)  # pytest-cov has chosen how it collects by now
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     if folders and not alone and cores > 1:
         option.numprocesses, option.dist = 2, "worksteal"
