@@ -16,7 +16,7 @@ from staf_torch import (
     rings,
     systems,
 )
-from staf_torch.adp.laws import ActorCriticLaw
+from staf_torch.adp.critic.laws import ActorCriticLaw
 
 PLANT = systems.TwoState()
 COST = adp.QuadraticCost(1.0, 1.0, 2, 1)

@@ -19,7 +19,7 @@ from variants import COSTS, DESCENDING, KERNELS, LAYOUTS, PLANTS, PREDICTORS, RA
 
 import staf_torch as st
 from staf_torch import adp, optim, predictors, systems, theory
-from staf_torch.adp.shooting.starts import guesses
+from staf_torch.adp.planning.shooting.starts import guesses
 from staf_torch.experiments import avoidance
 from staf_torch.experiments.rival_plants import CASES
 

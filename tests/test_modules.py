@@ -17,8 +17,8 @@ from variants import over
 
 import staf_torch as st
 from staf_torch import adp, systems, targets
-from staf_torch.adp.bases import LeadingCoordinates
-from staf_torch.adp.closed_loop import ClosedLoop
+from staf_torch.adp.critic.bases import LeadingCoordinates
+from staf_torch.adp.loop.step import ClosedLoop
 from staf_torch.adp.tracking import true_parameters
 from staf_torch.deploy.approximators import LocalApproximator, RidgeApproximator
 from staf_torch.deploy.controllers import ActorPolicy, FoldedRollout, SupervisedPolicy

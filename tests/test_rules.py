@@ -19,10 +19,10 @@ from helpers_swingup import double_integrator
 
 import staf_torch as st
 from staf_torch import adp, envs, optim, predictors, systems, theory
-from staf_torch.adp.bases import LeadingCoordinates
-from staf_torch.adp.closed_loop import ClosedLoop
-from staf_torch.adp.sampled_rollout import SampledRollout
-from staf_torch.adp.sampling import exact_hold
+from staf_torch.adp.critic.bases import LeadingCoordinates
+from staf_torch.adp.loop.step import ClosedLoop
+from staf_torch.adp.policies.sampled_rollout import SampledRollout
+from staf_torch.adp.problem.held_linear import exact_hold
 from staf_torch.approximation.conditioning import lebesgue_constant, sup_error
 from staf_torch.deploy.approximators import RidgeApproximator
 from staf_torch.envs.episodes import Episodes

@@ -210,7 +210,7 @@ policy._cached
 adp.LQR.__new__(adp.LQR)
 getattr(policy, "_cached")
 monkeypatch.setattr(adp.rollout, "horizon", 1)
-monkeypatch.setattr("staf_torch.adp.rollout.horizon", 1)
+monkeypatch.setattr("staf_torch.adp.policies.rollout.horizon", 1)
 policy = adp.LQR(); monkeypatch.setattr(policy, "period", 1)
 monkeypatch.setitem(adp.TABLE, "a", 1)
 mock.patch.object(adp, "LQR")

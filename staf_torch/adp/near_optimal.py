@@ -18,16 +18,16 @@ from ..lanes import ready
 from ..numerics.checks import fail, flag, positive_real
 from ..systems import Clocked, Plant
 from ..systems.bounds import Limit
-from .controllers import LQR, Controller, Feedback
-from .cost import Cost
-from .receding_horizon import RecedingHorizon
-from .rollout import ball_directions
-from .sampled_problem import SampledProblem
-from .sampled_rollout import SampledRollout
-from .sampling import HeldLoop, held_stability
-from .shooting import DirectShooting
-from .simulation import simulate
-from .strained_plans import BoundedPlans, StrainedPlans
+from .loop.controller import LQR, Controller, Feedback
+from .loop.simulation import simulate
+from .planning.receding_horizon import RecedingHorizon
+from .planning.shooting import DirectShooting
+from .planning.strained_plans import BoundedPlans, StrainedPlans
+from .policies.rollout import ball_directions
+from .policies.sampled_rollout import SampledRollout
+from .problem.cost import Cost
+from .problem.held_linear import HeldLoop, held_stability
+from .problem.sampled import SampledProblem
 
 _log = logging.getLogger(__name__)
 _DECAY = 2.0  # time constants of the slowest mode of the LQR in the horizon

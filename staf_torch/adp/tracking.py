@@ -7,7 +7,7 @@ from torch import Tensor
 
 from ..numerics.checks import copied, fail, number
 from ..systems import ControlAffineSystem
-from .cost import Matrix, QuadraticCost
+from .problem.cost import Matrix, QuadraticCost
 
 _TRUE = ((-1.0, -0.5), (1.0, 0.0), (0.0, -0.5))
 

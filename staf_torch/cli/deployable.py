@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from .. import __version__
 from ..adp import Controller, simulate
-from ..adp.simulation import uniform_numbers
+from ..adp.loop.simulation import uniform_numbers
 from ..approximation.staf import StaF
 from ..deploy import approximator, policy_of
 from ..deploy.sheet import Port

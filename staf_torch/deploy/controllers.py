@@ -20,7 +20,7 @@ from ..adp import (
     SafetyFilter,
     Supervised,
 )
-from ..adp.strained_plans import StrainedPlans
+from ..adp.planning.strained_plans import StrainedPlans
 from ..numerics.checks import fail, trailing
 from .remembered import RememberedPolicy
 

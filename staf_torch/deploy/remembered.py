@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from ..adp import GlobalValue
-from ..adp.global_value import follow_plan
+from ..adp.planning.global_value import follow_plan
 from ..lanes import Program
 
 

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from .. import systems
 from ..adp import Controller, ControllerState, Cost, Feedback, QuadraticCost
-from ..adp.closed_loop import ClosedLoop, LoopState
+from ..adp.loop.step import ClosedLoop, LoopState
 from ..numerics.checks import choice, fail, positive_real
 from ..systems import Bounds, ControlAffineSystem, Plant
 

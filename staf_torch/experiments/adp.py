@@ -25,9 +25,9 @@ from ..adp import (
     Supervised,
     simulate,
 )
-from ..adp.problem import AdpProblem
-from ..adp.reference_optimum import Reference, compare
-from ..adp.sampling import HeldLoop
+from ..adp.loop.setup import AdpProblem
+from ..adp.planning.shooting.reference_optimum import Reference, compare
+from ..adp.problem.held_linear import HeldLoop
 from ..figures.animation import animate
 from ..figures.closed_loop import AdpHistory, draw_adp
 from ..figures.style import images

@@ -13,8 +13,8 @@ from omegaconf import DictConfig, open_dict
 from torch import Tensor
 
 from ..adp import Controller, Feedback, RolloutPolicy
-from ..adp.problem import AdpProblem
-from ..adp.reference_optimum import optimal_cost
+from ..adp.loop.setup import AdpProblem
+from ..adp.planning.shooting.reference_optimum import optimal_cost
 from ..figures.closed_loop import draw_comparison
 from ..metrics.closed_loop import comparison_row, regulated
 from ..numerics.checks import COMMAND_LINE, fail, positive_real, vector

@@ -12,7 +12,7 @@ from omegaconf import DictConfig
 from torch import Tensor
 
 from ..adp import Feedback, LoopResult, QuadraticCost, SafetyFilter
-from ..adp.safety_filter import Constraint
+from ..adp.safety.safety_filter import Constraint
 from ..figures.animation import FRAMES, Curves, Scene, animate
 from ..figures.safety import AvoidanceHistory, draw_avoidance
 from ..metrics.safety import constraint_metrics

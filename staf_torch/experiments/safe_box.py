@@ -19,8 +19,8 @@ from ..adp import (
     QuadraticCost,
     SafetyFilter,
 )
-from ..adp.problem import OptimumSettings
-from ..adp.safety_filter import walls
+from ..adp.loop.setup import OptimumSettings
+from ..adp.safety.safety_filter import walls
 from ..figures.safety import BoxHistory, draw_box
 from ..metrics.safety import constraint_metrics
 from ..numerics.checks import COMMAND_LINE, fail, flag, integer, positive_real

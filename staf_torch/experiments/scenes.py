@@ -19,8 +19,8 @@ from ..adp import (
     StaFValueBasis,
     Supervised,
 )
-from ..adp.problem import AdpProblem
-from ..adp.reference_optimum import known_value
+from ..adp.loop.setup import AdpProblem
+from ..adp.planning.shooting.reference_optimum import known_value
 from ..approximation.basis import StaFBasis
 from ..figures.animation import FRAMES, KINDS, Curves, Scene
 from ..numerics.checks import COMMAND_LINE, choice, fail

@@ -10,7 +10,7 @@ from omegaconf import DictConfig
 from torch import Tensor
 
 from ..adp import LQR, QuadraticCost
-from ..adp.controllers import Policy
+from ..adp.loop.controller import Policy
 from ..numerics.checks import COMMAND_LINE, choice, positive_real
 from ..systems import Linear
 

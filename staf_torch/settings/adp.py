@@ -25,8 +25,8 @@ from ..adp import (
     Supervised,
     ValueBasis,
 )
-from ..adp.problem import AdpProblem, OptimumSettings
-from ..adp.safety_filter import walls
+from ..adp.loop.setup import AdpProblem, OptimumSettings
+from ..adp.safety.safety_filter import walls
 from ..approximation.basis import StaFBasis
 from ..numerics.checks import COMMAND_LINE, choice, fail, flag, integer, positive_real
 from ..systems import ControlAffineSystem, Plant

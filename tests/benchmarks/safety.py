@@ -19,7 +19,7 @@ from scipy.optimize import nnls
 from torch import Tensor
 
 from staf_torch import adp, systems
-from staf_torch.adp.halfspaces import nearest_admissible
+from staf_torch.adp.safety.quadratic_program import nearest_admissible
 
 INTEGRATOR = ([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
 

@@ -31,7 +31,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from helpers_swingup import CART_REGION, REGION, cart_pole, pendulum, step
 
 from staf_torch import adp
-from staf_torch.adp.memory_growth import best_from
+from staf_torch.adp.planning.global_value_learning import best_from
 
 _GRID, _CONTROLS, _EPISODE = 640, 33, 200
 

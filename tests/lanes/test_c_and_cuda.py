@@ -15,7 +15,7 @@ from recorded import Record
 from torch import Tensor
 
 from staf_torch import StaFBasis, adp, centers, kernels, lanes, optim, systems, targets
-from staf_torch.adp.closed_loop import ClosedLoop
+from staf_torch.adp.loop.step import ClosedLoop
 from staf_torch.metrics.ball_error import StateErrorPass
 from staf_torch.optim.objective import NativeError, Precomputed
 

@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 from ...numerics.checks import fail, positive_real
-from ..actor_critic import ActorCritic
-from ..bellman import BellmanTerms
-from ..controllers import Controller, ControllerState, Policy
-from ..cost import matvec
+from ..critic.actor_critic import ActorCritic
+from ..critic.bellman import BellmanTerms
+from ..loop.carried import pack, unpack
+from ..loop.controller import Controller, ControllerState, Policy
+from ..problem.cost import matvec
 from ..tracking import TwoStateTracking, feedforward, parametric_drift, regressor
-from .carried import pack, unpack
 from .history_stack import ConcurrentLearning, Identified
 from .least_squares import Estimate, LeastSquares
 from .parametric import ParametricPlant

@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from ...numerics.checks import fail, non_negative, positive_real, real
-from ..controllers import LQR, Controller, ControllerState, Policy
-from ..cost import Cost, matvec, quadratic
-from ..rollout import RolloutPolicy
-from .carried import pack, unpack
+from ..loop.carried import pack, unpack
+from ..loop.controller import LQR, Controller, ControllerState, Policy
+from ..policies.rollout import RolloutPolicy
+from ..problem.cost import Cost, matvec, quadratic
 from .consider import Considered, ConsiderFilter
 from .least_squares import Estimate, LeastSquares
 from .parametric import ParametricPlant

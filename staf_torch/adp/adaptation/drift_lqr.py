@@ -8,11 +8,11 @@ import torch
 from torch import Tensor
 
 from ...numerics.checks import positive_real
-from ..controllers import LQR, Controller, ControllerState, Policy
-from ..cost import Cost, matvec, quadratic
-from .carried import pack, unpack
+from ..loop.carried import pack, unpack
+from ..loop.controller import LQR, Controller, ControllerState, Policy
+from ..problem.cost import Cost, matvec, quadratic
+from .drift import DriftEstimate, StreamDrift
 from .redesign import Doubling, Redesign, product
-from .stream_drift import DriftEstimate, StreamDrift
 from .windows import Window
 
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ...lanes import repeat
 from ...numerics.checks import integer, non_negative, positive_real, real
-from ..cost import matvec
+from ..problem.cost import matvec
 from .windows import Equation
 
 _BETTER = 1.001  # factor by which a change must raise the least eigenvalue

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ...numerics.checks import fail, integer
-from ..cost import Cost
+from ..problem.cost import Cost
 
 _SOLVED = 1e-2  # residual of the Riccati equation, for the model of the moment, of a design that is used
 

@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 from ...numerics.checks import fail, positive_real, vector
-from ..controllers import Controller, ControllerState
-from ..halfspaces import nearest_admissible
-from ..safety_filter import Constraint, SafetyFilter
-from .carried import pack, unpack
+from ..estimation.measurement import ChangingPlant
+from ..loop.carried import pack, unpack
+from ..loop.controller import Controller, ControllerState
+from ..safety.quadratic_program import nearest_admissible
+from ..safety.safety_filter import Constraint, SafetyFilter
 from .least_squares import Estimate, LeastSquares
-from .measured import ChangingPlant
 from .parametric import ParametricPlant
 from .windows import IntegralWindows, Window
 

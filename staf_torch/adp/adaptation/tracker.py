@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from ...numerics.checks import choice, fail
-from ..controllers import Controller, ControllerState
-from .carried import pack, unpack
+from ..loop.carried import pack, unpack
+from ..loop.controller import Controller, ControllerState
 from .history_stack import ConcurrentGradient, HistoryStack, Stack
 from .parametric import ParametricPlant
 from .windows import IntegralWindows, SlopeWindow, SlopeWindows, Window

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from staf_torch import GaussianKernel, adp, rings, systems
 from staf_torch.adp.adaptation import redesign
-from staf_torch.adp.adaptation.measured import gaussian
+from staf_torch.adp.estimation.measurement import gaussian
 
 ROWS = 12
 KNOWN = systems.Linear([[0.0, 1.0], [-0.4, 0.2]], [[0.0], [1.0]])

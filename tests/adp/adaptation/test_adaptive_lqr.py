@@ -8,7 +8,7 @@ from helpers import tensor, uniform
 from helpers_adaptation import COST, PENDULUM, TRUE
 
 from staf_torch import adp, systems
-from staf_torch.adp.closed_loop import ClosedLoop, program
+from staf_torch.adp.loop.step import ClosedLoop, program
 from staf_torch.numerics.linalg import riccati
 
 WINDOWS = adp.IntegralWindows(PENDULUM, 0.1, shape="smooth", first=0.02, noise=0.01)

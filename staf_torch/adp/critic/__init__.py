@@ -1,0 +1,1 @@
+"""Learn a value while it is used: bases, Bellman errors, laws, the actor-critic."""

@@ -1,0 +1,120 @@
+"""The Hamilton-Jacobi-Bellman equation: how far a value function, or a critic, is from solving it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ...systems import ControlAffineSystem
+from ..problem.cost import Cost, matvec
+from .bases import ValueBasis
+
+
+def value_gradient(value: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:
+    """grad V, row by row: (..., n) -> (..., n).
+
+    Example:
+        >>> adp.value_gradient(lambda x: x.square().sum(-1), torch.tensor([[1.0, 2.0]]))
+        tensor([[2., 4.]])
+
+        Shown by `staf experiment=adp`.
+    """
+    with torch.enable_grad():
+        at = x.detach().requires_grad_()
+        return torch.autograd.grad(value(at).sum(), at)[0]
+
+
+def hjb_residual(
+    system: ControlAffineSystem, cost: Cost, value: Callable[[Tensor], Tensor], x: Tensor
+) -> Tensor:
+    """min_u of x'Qx + U(u) + grad V'(f + g u), which is 0 everywhere for V = V* alone.
+
+    Example:
+        >>> plant = systems.TwoState()
+        >>> cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
+        >>> x = torch.tensor([[1.0, 0.5]]).double()
+        >>> optimal = lambda x: 0.5 * x[..., 0] ** 2 + x[..., 1] ** 2
+        >>> bool(adp.hjb_residual(plant, cost, optimal, x).abs().max() < 1e-12)
+        True
+
+        Shown by `staf experiment=adp`.
+
+    Args:
+        system: the plant.
+        cost: the cost rate.
+        value: V, (..., n) -> (...), differentiable.
+        x: (..., n).
+
+    Returns:
+        (...).
+
+    Source: MATH.md section 4; for a quadratic cost x'Qx + f'grad V - 1/4 grad V' g R^-1 g' grad V.
+    """
+    gradient = value_gradient(value, x)
+    g = system.effectiveness(x)
+    u = cost.policy(g, gradient)
+    return cost.rate(x, u) + (gradient * (system.drift(x) + matvec(g, u))).sum(-1)
+
+
+class BellmanTerms(NamedTuple):
+    """What the laws need at some points, with the actor's control there.
+
+    The Bellman error of the critic weights Wc is delta = rate + regressor'Wc.
+    """
+
+    control: Tensor  # u = policy(Ds'Wa), (..., P, m)
+    regressor: Tensor  # w = Ds (f + g u), (..., P, M)
+    rate: Tensor  # r = x'Qx + U(u), (..., P)
+    push: Tensor  # G Wa = Ds g R^-1 g' Ds' Wa = -2 Ds g u, with bounds that of the u they leave, (..., P, M)
+
+
+def bellman_terms(
+    basis: ValueBasis, system: ControlAffineSystem, cost: Cost, points: Tensor, at: Tensor, actor: Tensor
+) -> BellmanTerms:
+    """The terms at ``points`` for the actor weights.
+
+    Example:
+        >>> plant = systems.TwoState()
+        >>> cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
+        >>> x, actor = torch.tensor([[1.0, 0.5]]).double(), torch.tensor([0.5, 0.0, 1.0]).double()
+        >>> terms = adp.bellman_terms(adp.QuadraticBasis(2), plant, cost, x, x, actor)
+        >>> terms.control.shape
+        torch.Size([1, 1])
+
+        Shown by `staf experiment=adp`.
+
+    Args:
+        basis: of the value function.
+        system: the model.
+        cost: the cost rate.
+        points: y, (..., P, n).
+        at: the states whose centers the points use, (..., P, n).
+        actor: Wa, (..., M).
+    """
+    gradient = basis.gradient(points, at)  # (..., P, M, n)
+    g = system.effectiveness(points)
+    value_gradient = (gradient * actor[..., None, :, None]).sum(-2)  # Ds'Wa, (..., P, n)
+    u = cost.policy(g, value_gradient)
+    driven = matvec(g, u)
+    regressor = matvec(gradient, system.drift(points) + driven)
+    pushed = matvec(g, cost.effort(u))
+    return BellmanTerms(u, regressor, cost.rate(points, u), -2 * matvec(gradient, pushed))
+
+
+def bellman_error(terms: BellmanTerms, critic: Tensor) -> Tensor:
+    """delta = r + w'Wc: (..., M) -> (..., P).
+
+    Example:
+        >>> plant = systems.TwoState()
+        >>> cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
+        >>> x, exact = torch.tensor([[1.0, 0.5]]).double(), torch.tensor([0.5, 0.0, 1.0]).double()  # of V*
+        >>> terms = adp.bellman_terms(adp.QuadraticBasis(2), plant, cost, x, x, exact)
+        >>> bool(adp.bellman_error(terms, exact).abs().max() < 1e-12)
+        True
+
+        Shown by `staf experiment=adp`.
+    """
+    return terms.rate + (terms.regressor * critic.unsqueeze(-2)).sum(-1)

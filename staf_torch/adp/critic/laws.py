@@ -1,0 +1,305 @@
+"""Actor-critic laws, and the sums over Bellman points that every law uses."""
+
+from __future__ import annotations
+
+import abc
+import dataclasses
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ...lanes import eliminations
+from ...lanes.combinators import tracing_now
+from ...numerics.checks import fail, number, positive_real
+from ..problem.cost import matvec
+from .bellman import BellmanTerms, bellman_error
+
+_UNROLLED = 12  # unknowns up to which elimination by whole-batch operations is the faster one
+
+Gain = float | Tensor
+"""A number, or (B, 1)."""
+
+
+def over_matrices(gain: Gain) -> Gain:
+    """A gain as a factor of (B, M, M)."""
+    return gain.unsqueeze(-1) if isinstance(gain, Tensor) else gain
+
+
+@dataclasses.dataclass(frozen=True)
+class Gains:
+    """Gains of the actor-critic laws; the defaults are the published ones of the two-state example.
+
+    Each is a number, or a tensor (B, 1) with one a trajectory.
+
+    Example:
+        >>> adp.Gains(actor=15.0).actor
+        15.0
+
+        Shown by `staf experiment=adp adp.gains.critic=0.01`.
+
+    Args:
+        critic: ec1, of the Bellman error at the state, 1/s.
+        critic_extrapolated: ec2, of the mean Bellman error at the extrapolated points, 1/s.
+        actor: ea1, towards the critic, 1/s.
+        actor_decay: ea2, towards zero, 1/s.
+        forgetting: beta of the least-squares gain, 1/s.
+        normalisation: nu in rho = 1 + nu w'w.
+        information: k1 of the least-squares gain; 1 in the published code, ec1 in its theory.
+        information_extrapolated: k2; 1 in the published code, ec2 in its theory.
+
+    Raises:
+        ValueError: if a gain is negative or not finite.
+
+    Source: MATH.md section 4.
+    """
+
+    critic: Gain = 0.001
+    critic_extrapolated: Gain = 0.25
+    actor: Gain = 1.2
+    actor_decay: Gain = 0.01
+    forgetting: Gain = 0.003
+    normalisation: Gain = 0.05
+    information: Gain = 1.0
+    information_extrapolated: Gain = 1.0
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            value = number("Gains", field.name, getattr(self, field.name))
+            if isinstance(value, Tensor) and (value.dim() != 2 or value.shape[-1] != 1):
+                raise fail("Gains", field.name, "must be a number or of the shape (B, 1)", tuple(value.shape))
+            if bool((torch.as_tensor(value) < 0).any()):
+                raise fail("Gains", field.name, "must not be negative", value)
+
+
+class Weights(NamedTuple):
+    """The state of an actor-critic.
+
+    Example:
+        >>> adp.Weights(critic=torch.ones(1, 3), actor=torch.ones(1, 3), gain=250 * torch.eye(3)).critic
+        tensor([[1., 1., 1.]])
+
+        Shown by `staf experiment=adp`.
+    """
+
+    critic: Tensor  # Wc, (..., M)
+    actor: Tensor  # Wa, (..., M)
+    gain: Tensor  # (..., M, M): Gam as published, Lam = Gam^-1 in information form
+
+
+class BellmanSums(NamedTuple):
+    """Sums over the state (index 0) and the extrapolated points of what drives the weights."""
+
+    critic_force: Tensor  # sum a_j w_j delta_j / rho_j, (..., M)
+    curvature: Tensor  # sum a_j w_j w_j' / rho_j, (..., M, M): d critic_force / d Wc
+    information: Tensor  # sum k_j w_j w_j' / rho_j^2, (..., M, M)
+    actor_force: Tensor  # sum a_j G_j Wa w_j'Wc / (4 rho_j), (..., M)
+
+
+class ActorCriticLaw(abc.ABC):
+    """How the weights move, given the Bellman terms.
+
+    Example:
+        >>> [issubclass(law, adp.ActorCriticLaw) for law in (adp.Information, adp.Published, adp.Frozen)]
+        [True, True, True]
+
+        Shown by `staf experiment=adp_comparison`.
+
+    Args:
+        gains: the gains.
+        bound: of the norm of Wc and of Wa: after a step they are projected onto that ball. None for no
+            projection.
+
+    Raises:
+        ValueError: if ``bound`` is not positive.
+    """
+
+    def __init__(self, gains: Gains | None = None, bound: float | None = None) -> None:
+        self.gains = Gains() if gains is None else gains
+        self.bound = None if bound is None else positive_real(type(self).__name__, "bound", bound)
+
+    @abc.abstractmethod
+    def init(self, critic: Tensor, actor: Tensor, gain: Tensor) -> Weights:
+        """Weights from Wc0 (..., M), Wa0 (..., M) and Gam0 (..., M, M)."""
+
+    @abc.abstractmethod
+    def rates(self, sums: BellmanSums, weights: Weights) -> Weights:
+        """d/dt of the weights: the law in continuous time."""
+
+    def step(self, sums: BellmanSums, weights: Weights, dt: float) -> Weights:
+        """The weights after ``dt`` seconds with the sums held, projected."""
+        critic, actor, gain = self._move(sums, weights, dt)
+        return Weights(self._project(critic), self._project(actor), gain)
+
+    @abc.abstractmethod
+    def _move(self, sums: BellmanSums, weights: Weights, dt: float) -> Weights:
+        """The same without the projection."""
+
+    def _project(self, weights: Tensor) -> Tensor:
+        if self.bound is None:
+            return weights
+        norm = weights.square().sum(-1, keepdim=True).sqrt()
+        return torch.where(norm > self.bound, self.bound / norm, 1.0) * weights
+
+    def sums(self, terms: BellmanTerms, masses: Tensor, weights: Weights) -> BellmanSums:
+        """Sums over the points of ``terms``, the state first, the others of weights ``masses`` (N,)."""
+        gains, w = self.gains, terms.regressor
+        masses = masses.to(w)
+        a = _shares(gains.critic, gains.critic_extrapolated, masses)
+        k = _shares(gains.information, gains.information_extrapolated, masses)
+        rho = 1 + gains.normalisation * w.square().sum(-1)  # (..., P)
+        share = a / rho
+        force = share * bellman_error(terms, weights.critic)
+        along = 0.25 * share * (w * weights.critic.unsqueeze(-2)).sum(-1)
+        outer = w.unsqueeze(-1) * w.unsqueeze(-2)  # (..., P, M, M)
+        return BellmanSums(
+            critic_force=(force.unsqueeze(-1) * w).sum(-2),
+            curvature=(share[..., None, None] * outer).sum(-3),
+            information=((k / rho.square())[..., None, None] * outer).sum(-3),
+            actor_force=(along.unsqueeze(-1) * terms.push).sum(-2),
+        )
+
+    def actor_rate(self, sums: BellmanSums, weights: Weights) -> Tensor:
+        """Wa' = -ea1 (Wa - Wc) - ea2 Wa + actor_force: (..., M)."""
+        pull = self.gains.actor * (weights.actor - weights.critic)
+        return sums.actor_force - pull - self.gains.actor_decay * weights.actor
+
+
+def _shares(here: Gain, there: Gain, masses: Tensor) -> Tensor:
+    """The gain at the state, then those at the points: (P,), or (B, P) where each trajectory has its own."""
+    first, rest = here * masses.new_ones(1), there * masses
+    rows = torch.broadcast_tensors(first.sum(-1), rest.sum(-1))[0].shape
+    return torch.cat((first.expand(*rows, -1), rest.expand(*rows, -1)), dim=-1)
+
+
+class Published(ActorCriticLaw):
+    """Forward Euler on
+
+        Wc'  = -Gam sum_j a_j w_j delta_j / rho_j
+        Gam' = beta Gam - Gam (sum_j k_j w_j w_j' / rho_j^2) Gam
+        Wa'  = -ea1 (Wa - Wc) - ea2 Wa + sum_j a_j G_j Wa w_j'Wc / (4 rho_j).
+
+    Euler does not keep Gam positive definite: at the published gains and 1 ms a quarter of the seeds
+    diverge. `Information` is the same law without that defect.
+
+    Example:
+        >>> law = adp.Published(adp.Gains(critic=0.01), bound=10.0)
+        >>> law.gains.critic, law.bound
+        (0.01, 10.0)
+
+        Shown by `staf experiment=adp adp/law=published`.
+
+    Source: Kamalapurkar, Rosenfeld and Dixon, via MATH.md section 4.
+    """
+
+    def init(self, critic: Tensor, actor: Tensor, gain: Tensor) -> Weights:
+        return Weights(critic, actor, gain)
+
+    def rates(self, sums: BellmanSums, weights: Weights) -> Weights:
+        gain = weights.gain
+        descent = (gain.unsqueeze(-2) * sums.information.unsqueeze(-3)).sum(-1)  # Gam S, with S = S'
+        shrink = (descent.unsqueeze(-1) * gain.unsqueeze(-3)).sum(-2)
+        return Weights(
+            critic=-matvec(gain, sums.critic_force),
+            actor=self.actor_rate(sums, weights),
+            gain=over_matrices(self.gains.forgetting) * gain - shrink,
+        )
+
+    def _move(self, sums: BellmanSums, weights: Weights, dt: float) -> Weights:
+        rates = self.rates(sums, weights)
+        return Weights(*(w + dt * rate for w, rate in zip(weights, rates, strict=True)))
+
+
+class Information(ActorCriticLaw):
+    """The published laws with Lam = Gam^-1,
+
+        Lam' = -beta Lam + sum_j k_j w_j w_j' / rho_j^2,
+
+    a sum of positive semidefinite terms: Lam is positive definite by construction at any step. The
+    critic's step is implicit in Wc, with A = sum_j a_j w_j w_j' / rho_j,
+
+        (Lam + dt A) (Wc+ - Wc) = -dt sum_j a_j w_j delta_j / rho_j,
+
+    which no least-squares gain can make unstable, and the actor's decay is implicit.
+
+    Example:
+        >>> law = adp.Information(adp.Gains(critic=0.01), bound=10.0)
+        >>> law.gains.critic, law.bound
+        (0.01, 10.0)
+
+        Shown by `staf experiment=adp adp/law=information`.
+
+    Source: MATH.md section 4 (the laws); the recursion is that of regularised recursive least squares.
+    """
+
+    def init(self, critic: Tensor, actor: Tensor, gain: Tensor) -> Weights:
+        return Weights(critic, actor, torch.linalg.inv(gain))
+
+    def rates(self, sums: BellmanSums, weights: Weights) -> Weights:
+        return Weights(
+            critic=-solve_definite(weights.gain, sums.critic_force),
+            actor=self.actor_rate(sums, weights),
+            gain=sums.information - over_matrices(self.gains.forgetting) * weights.gain,
+        )
+
+    def _move(self, sums: BellmanSums, weights: Weights, dt: float) -> Weights:
+        gains = self.gains
+        gain = _decay(gains.forgetting, dt) * weights.gain + dt * sums.information
+        move = solve_definite(gain + dt * sums.curvature, dt * sums.critic_force)
+        critic = weights.critic - move
+        decay = gains.actor + gains.actor_decay
+        actor = (weights.actor + dt * (gains.actor * critic + sums.actor_force)) / (1 + dt * decay)
+        return Weights(critic, actor, gain)
+
+
+def _decay(forgetting: Gain, dt: float) -> Gain:
+    """e^{-beta dt} as a factor of (B, M, M)."""
+    if isinstance(forgetting, Tensor):
+        return over_matrices((-forgetting * dt).exp())
+    return math.exp(-forgetting * dt)
+
+
+class Frozen(ActorCriticLaw):
+    """Wc' = Wa' = 0: the initial weights throughout.
+
+    Example:
+        >>> law = adp.Frozen(adp.Gains(critic=0.01), bound=10.0)
+        >>> law.gains.critic, law.bound
+        (0.01, 10.0)
+
+        Shown by `staf experiment=adp adp/law=frozen`.
+    """
+
+    def init(self, critic: Tensor, actor: Tensor, gain: Tensor) -> Weights:
+        return Weights(critic, actor, gain)
+
+    def rates(self, sums: BellmanSums, weights: Weights) -> Weights:
+        return Weights(*(0 * part for part in weights))
+
+    def _move(self, sums: BellmanSums, weights: Weights, dt: float) -> Weights:
+        return weights
+
+
+def solve_definite(matrix: Tensor, right: Tensor) -> Tensor:
+    """M^-1 b for M positive definite: (..., M, M), (..., M) -> (..., M).
+
+    Gauss-Jordan elimination without pivoting, which is stable for a positive definite matrix, as operations
+    over the whole batch: a library call a row would take most of a step's time. A row whose matrix is not
+    finite comes out non-finite, and the loop's monitor catches it. Where a program is traced, one half of the
+    matrix decides.
+    """
+    size = right.shape[-1]
+    if tracing_now():
+        return eliminations.solve_definite(matrix, right)
+    if size > _UNROLLED:
+        solution: Tensor = torch.linalg.solve_ex(matrix, right.unsqueeze(-1))[0].squeeze(-1)
+        return solution
+    identity = torch.eye(size, dtype=right.dtype, device=right.device)
+    augmented = torch.cat((matrix, right.unsqueeze(-1)), dim=-1)
+    for k in range(size):
+        pivot = augmented[..., k, :] / augmented[..., k, k, None]
+        # In row k this subtracts (a_kk - 1) times the scaled row, which leaves the scaled row.
+        column = augmented[..., :, k] - identity[k]
+        augmented = augmented - column.unsqueeze(-1) * pivot.unsqueeze(-2)
+    return augmented[..., size]

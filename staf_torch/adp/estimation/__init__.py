@@ -1,0 +1,1 @@
+"""Control what is measured with noise: outputs, Kalman filters."""

@@ -1,0 +1,285 @@
+"""Output feedback: a Kalman filter, extended or unscented, between what is measured and any controller."""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ...numerics.checks import fail, non_negative, one_or_each, positive, real, vector
+from ...numerics.linalg import row_jacobian
+from ...systems import Plant, runge_kutta_step
+from ..adaptation.redesign import product
+from ..loop.carried import pack, unpack
+from ..loop.controller import Controller, ControllerState
+from ..problem.cost import matvec
+from .measurement import Output
+
+
+class Belief(NamedTuple):
+    """What a Kalman filter knows of the state, a row a trajectory.
+
+    Example:
+        >>> adp.Belief._fields
+        ('mean', 'covariance', 'u')
+
+        Shown by `tests/adp/estimation/test_kalman.py`.
+    """
+
+    mean: Tensor  # (..., n)
+    covariance: Tensor  # (..., n, n)
+    u: Tensor  # (..., m) held since the last measurement
+
+
+class KalmanFilter(abc.ABC):
+    """The state from outputs y = h(x) + noise, with the model of the plant between measurements.
+
+    Example:
+        >>> [issubclass(kind, adp.KalmanFilter) for kind in (adp.ExtendedKalman, adp.UnscentedKalman)]
+        [True, True]
+
+        Shown by `tests/adp/estimation/test_kalman.py`.
+
+    Args:
+        model: the plant, of a known number of states.
+        output: h, (..., n) -> (..., q).
+        noise: standard deviation of every output, q positive numbers.
+        process: standard deviation of what disturbs each state in a second, one number or n, not negative:
+            the variance grows by its square times the time.
+
+    Raises:
+        ValueError: if an argument breaks its rule.
+    """
+
+    def __init__(
+        self,
+        model: Plant,
+        output: Output,
+        *,
+        noise: Sequence[float],
+        process: float | Sequence[float] = 0.0,
+    ) -> None:
+        name, n = type(self).__name__, model._size()
+        if not noise or not all(real(name, "noise", s) > 0 for s in noise):
+            raise fail(name, "noise", "must be positive numbers, one an output", noise)
+        self.model, self.output = model, output
+        self.noise = torch.tensor(noise, dtype=torch.float64)
+        self.process = non_negative(name, "process", one_or_each(name, "process", process, n))
+        seen = output(torch.zeros(1, n, dtype=torch.float64))
+        if tuple(seen.shape) != (1, len(noise)):
+            raise fail(name, "output", f"must map (1, {n}) to (1, {len(noise)})", tuple(seen.shape))
+
+    def step(self, belief: Belief, y: Tensor, dt: float, first: Tensor) -> Belief:
+        """The belief after ``dt`` seconds with the input held, and the measurement y (..., q) then.
+
+        Args:
+            belief: after the measurement before.
+            y: measured now.
+            dt: s.
+            first: (...) bool: whether y is the first measurement, for which no time has passed.
+        """
+        moved = self.predicted(belief, dt)
+        mean = torch.where(first.unsqueeze(-1), belief.mean, moved.mean)
+        covariance = torch.where(first[..., None, None], belief.covariance, moved.covariance)
+        return self.corrected(Belief(mean, covariance, belief.u), y)
+
+    @abc.abstractmethod
+    def predicted(self, belief: Belief, dt: float) -> Belief:
+        """The belief after dt seconds without a measurement."""
+
+    @abc.abstractmethod
+    def corrected(self, belief: Belief, y: Tensor) -> Belief:
+        """The belief with a measurement (..., q)."""
+
+    def moved(self, x: Tensor, u: Tensor, dt: float) -> Tensor:
+        """x after dt seconds with u held: (..., n), (..., m) -> (..., n)."""
+        if self.model.period is not None:
+            return x + self.model.motion(x, u)
+        return runge_kutta_step(lambda x: self.model.motion(x, u), x, dt)
+
+    def disturbance(self, like: Tensor, dt: float) -> Tensor:
+        """The covariance that dt seconds add, (n, n)."""
+        return torch.diag(self.process.to(like).square() * dt)
+
+
+class ExtendedKalman(KalmanFilter):
+    """Mean and covariance by the derivatives of the step and the output at the mean:
+
+        P- = F P F' + Q dt,   k = P- h / (h'P- h + r),   x^ += k (y - h(x^)),   P = P- - k h'P-,
+
+    the outputs one after the other.
+
+    Example:
+        >>> plant = systems.Pendulum()
+        >>> sees_angle = adp.ExtendedKalman(plant, lambda x: x[..., :1], noise=[0.01])
+        >>> unknown = adp.Belief(torch.zeros(1, 2), torch.eye(2)[None], torch.zeros(1, 1))
+        >>> sees_angle.corrected(unknown, torch.tensor([[0.5]])).mean.round(decimals=2)
+        tensor([[0.5000, 0.0000]])
+
+        Shown by `tests/adp/estimation/test_kalman.py`.
+
+    Args: see `KalmanFilter`.
+    """
+
+    def predicted(self, belief: Belief, dt: float) -> Belief:
+        def step(x: Tensor) -> Tensor:
+            return self.moved(x, belief.u, dt)
+
+        mean, slope = row_jacobian(step, belief.mean)
+        covariance = product(product(slope, belief.covariance), slope.mT)
+        return Belief(mean, covariance + self.disturbance(mean, dt), belief.u)
+
+    def corrected(self, belief: Belief, y: Tensor) -> Belief:
+        mean, covariance = belief.mean, belief.covariance
+        seen, slope = row_jacobian(self.output, mean)
+        left, variance = y - seen, self.noise.to(y).square()
+        start = mean
+        for k in range(y.shape[-1]):
+            h = slope[..., k, :]
+            ph = matvec(covariance, h)
+            gain = ph / ((h * ph).sum(-1) + variance[k]).unsqueeze(-1)
+            # What the outputs before have changed counts to first order, as everywhere in this filter.
+            new = left[..., k] - (h * (mean - start)).sum(-1)
+            mean = mean + gain * new.unsqueeze(-1)
+            covariance = covariance - gain.unsqueeze(-1) * ph.unsqueeze(-2)
+        return Belief(mean, covariance, belief.u)
+
+
+class UnscentedKalman(KalmanFilter):
+    """Mean and covariance from 2n + 1 points mean, mean +- sqrt(n + 1) L e_i that are moved and measured.
+
+    Example:
+        >>> plant = systems.Pendulum()
+        >>> sees_sine = adp.UnscentedKalman(plant, lambda x: x[..., :1].sin(), noise=[0.01])
+        >>> unknown = adp.Belief(torch.zeros(1, 2), 0.01 * torch.eye(2)[None], torch.zeros(1, 1))
+        >>> sees_sine.corrected(unknown, torch.tensor([[0.1]])).mean.round(decimals=2)
+        tensor([[0.1000, 0.0000]])
+
+        Shown by `tests/adp/estimation/test_kalman.py`.
+
+    Args: see `KalmanFilter`.
+
+    Source: Julier and Uhlmann, "Unscented filtering and nonlinear estimation", Proc. IEEE 92 (2004).
+    """
+
+    def predicted(self, belief: Belief, dt: float) -> Belief:
+        points, weights = self._points(belief)
+        held = belief.u.unsqueeze(-2).expand(*points.shape[:-1], -1)
+        mean, away = _mean(self.moved(points, held, dt), weights)
+        spread = product((weights * away).mT, away)
+        return Belief(mean, spread + self.disturbance(mean, dt), belief.u)
+
+    def corrected(self, belief: Belief, y: Tensor) -> Belief:
+        points, weights = self._points(belief)
+        seen, off = _mean(self.output(points), weights)
+        variance = torch.diag(self.noise.to(y).square())
+        inverse = torch.linalg.inv_ex(product((weights * off).mT, off) + variance)[0]
+        crossed = product((weights * (points - belief.mean.unsqueeze(-2))).mT, off)
+        gain = product(crossed, inverse)
+        mean = belief.mean + matvec(gain, y - seen)
+        return Belief(mean, belief.covariance - product(gain, crossed.mT), belief.u)
+
+    def _points(self, belief: Belief) -> tuple[Tensor, Tensor]:
+        """The points (..., 2n + 1, n) and their weights (2n + 1, 1)."""
+        n = belief.mean.shape[-1]
+        root = torch.linalg.cholesky_ex(belief.covariance)[0].mT * (n + 1) ** 0.5
+        middle = belief.mean.unsqueeze(-2)
+        weights = belief.mean.new_full((2 * n + 1, 1), 0.5 / (n + 1))
+        weights[0] = 1 / (n + 1)
+        return torch.cat((middle, middle + root, middle - root), dim=-2), weights
+
+
+class Observed(Controller):
+    """A controller of x that is told the mean of a Kalman filter in place of x; what it sees is y.
+
+    Example:
+        >>> plant, cost = systems.Pendulum(), adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
+        >>> def angle(x):
+        ...     return x[..., :1]
+        >>> filter = adp.ExtendedKalman(plant, angle, noise=[0.01], process=0.01)
+        >>> inside = adp.Observed(adp.Feedback(adp.LQR(plant, cost)), filter, deviation=0.5)
+        >>> outside = adp.Measured(inside, noise=0.01, dim=1, output=angle)
+        >>> x0 = torch.tensor([[0.3, -0.2]]).double()
+        >>> run = adp.simulate(outside, plant, cost, x0, dt=0.02, steps=200)
+        >>> bool(run.state[0, -1].norm() < 0.1), bool(run.diverged)
+        (True, False)
+
+        Shown by `tests/adp/estimation/test_kalman.py`.
+
+    Args:
+        controller: of the state.
+        filter: the Kalman filter.
+        deviation: of the first guess of the state, positive, one number or n.
+        mean: that guess, n numbers; None for the plant's equilibrium.
+
+    Raises:
+        ValueError: if an argument breaks its rule.
+    """
+
+    def __init__(
+        self,
+        controller: Controller,
+        filter: KalmanFilter,
+        *,
+        deviation: float | Sequence[float],
+        mean: Sequence[float] | None = None,
+    ) -> None:
+        super().__init__()
+        n = filter.model._size()
+        spread = positive("Observed", "deviation", one_or_each("Observed", "deviation", deviation, n))
+        guess = filter.model.equilibrium()
+        if mean is not None:
+            guess = torch.tensor(vector("Observed", "mean", mean, n), dtype=torch.float64)
+        self.controller, self.filter = controller, filter
+        self.guess, self.deviation = guess, spread
+        self.draws, self.period = controller.draws, controller.period
+        self._like = self._start(torch.zeros(1, 1, dtype=torch.float64))
+        self._size = pack(self._like, 1).shape[-1]
+
+    @property
+    def label(self) -> str:
+        return f"{self.controller.label} of observed states"
+
+    def init(self, x0: Tensor) -> ControllerState:
+        start = self._start(x0)
+        inner = self.controller.init(start[0].mean)
+        return inner._replace(identifier=torch.cat((pack(start, 1), inner.identifier), dim=-1))
+
+    def belief(self, identifier: Tensor) -> Belief:
+        """What the rows of `LoopResult.identifier` say of the state, (..., K)."""
+        found: Belief = unpack(self._like, identifier[..., : self._size], 1)[0]
+        return found
+
+    def step(
+        self, x: Tensor, carried: ControllerState, uniform: Tensor, dt: float
+    ) -> tuple[Tensor, ControllerState]:
+        own, rest = carried.identifier[..., : self._size], carried.identifier[..., self._size :]
+        belief, steps = unpack(self._like, own, 1)
+        belief = self.filter.step(belief, x, dt, steps == 0)
+        u, after = self.controller.step(belief.mean, carried._replace(identifier=rest), uniform, dt)
+        bounds = self.filter.model.bounds
+        held = u if bounds is None else bounds.clip(u)
+        packed = pack(_Observing(belief._replace(u=held), steps + 1), x.dim() - 1)
+        return u, after._replace(identifier=torch.cat((packed, after.identifier), dim=-1))
+
+    def _start(self, y: Tensor) -> _Observing:
+        rows, n, m = len(y), len(self.guess), self.filter.model.inputs
+        covariance = torch.diag(self.deviation.to(y).square()).expand(rows, n, n).clone()
+        mean = self.guess.to(y).expand(rows, n).clone()
+        return _Observing(Belief(mean, covariance, y.new_zeros(rows, m)), y.new_zeros(rows))
+
+
+class _Observing(NamedTuple):
+    """A belief, and how many measurements there were."""
+
+    belief: Belief
+    steps: Tensor  # (...)
+
+
+def _mean(points: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+    """The weighted mean (..., k) of points (..., P, k), and what each is away from it."""
+    mean = (weights * points).sum(-2)
+    return mean, points - mean.unsqueeze(-2)

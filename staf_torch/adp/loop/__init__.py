@@ -1,0 +1,1 @@
+"""A controller in a closed loop: its interface, one step, many steps, what is recorded."""

@@ -1,0 +1,307 @@
+"""What a controller in a closed loop is; feedback without a state of its own: the LQR; the supervisor."""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import pad
+
+from ...lanes.surroundings import is_users
+from ...numerics.checks import real
+from ...numerics.linalg import riccati
+from ...systems import Plant
+from ..problem.cost import Cost, matvec, quadratic
+from ..problem.held_linear import held_riccati
+
+Policy = Callable[[Tensor], Tensor]
+"""u from x: (..., n) -> (..., m)."""
+Value = Callable[[Tensor], Tensor]
+"""V from x: (..., n) -> (...)."""
+
+
+class ControllerState(NamedTuple):
+    """What a controller carries from step to step. Feedback laws leave all of it empty.
+
+    Example:
+        >>> rest = adp.Feedback(lambda x: -x[..., :1]).init(torch.ones(3, 2))
+        >>> rest.critic.shape, rest.gain.shape  # nothing is carried
+        (torch.Size([3, 0]), torch.Size([3, 0, 0]))
+
+        Shown by `staf experiment=adp`.
+    """
+
+    critic: Tensor  # Wc, (B, M)
+    actor: Tensor  # Wa, (B, M)
+    gain: Tensor  # Gam or Lam, (B, M, M)
+    identifier: Tensor  # what an identifier of the plant remembers, (B, K)
+
+
+Carried = ControllerState | Any
+"""What a controller carries from step to step: a `ControllerState`, or a tensor (B, ...) of its own, or
+tuples, dictionaries and named tuples of such, which are not recorded."""
+
+
+def carrying(known: Tensor) -> ControllerState:
+    """The state of a controller that carries numbers (B, w) and learns nothing."""
+    empty = known.new_zeros(len(known), 0)
+    return ControllerState(empty, empty, known.new_zeros(len(known), 0, 0), known)
+
+
+class Controller(nn.Module, abc.ABC):
+    """u and what the controller carries on, from the state and what it carried until then.
+
+    Example:
+        >>> class Integral(adp.Controller):  # carries the integral of x_1, (B,)
+        ...     def init(self, x0):
+        ...         return torch.zeros_like(x0[:, 0])
+        ...     def step(self, x, carried, uniform, dt):
+        ...         carried = carried + dt * x[:, 0]
+        ...         return -(x.sum(-1) + 0.5 * carried).unsqueeze(-1), carried
+        >>> cost, x0 = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1), torch.ones(3, 2).double()
+        >>> adp.simulate(Integral(), systems.TwoState(), cost, x0, dt=0.01, steps=10).diverged
+        tensor([False, False, False])
+
+        Shown by `staf experiment=adp_comparison`.
+
+    Attributes:
+        draws: uniform random points of [-1, 1]^n that a step needs, a row.
+        period: least time for which a control is held, s; None where any time will do.
+        label: a few words for a log or a sheet.
+        costly: whether a program of a step takes a compiler so long that a loop is compiled where that is
+            asked for alone.
+        work: steps of a feedback law that a control takes, about: such a loop pays for its compiler sooner.
+    """
+
+    draws: int = 0
+    period: float | None = None
+    costly: bool = False
+    work: float = 1.0
+
+    @property
+    def label(self) -> str:
+        return type(self).__name__
+
+    @abc.abstractmethod
+    def init(self, x0: Tensor) -> Carried:
+        """What is carried into the first step, a row each of the states x0 (B, n)."""
+
+    @abc.abstractmethod
+    def step(self, x: Tensor, carried: Carried, uniform: Tensor, dt: float) -> tuple[Tensor, Carried]:
+        """The control to hold for ``dt`` seconds, and what is carried on after them.
+
+        Args:
+            x: (B, n).
+            carried: from the step before, or from `init`.
+            uniform: (B, draws, n), uniform on [-1, 1].
+            dt: s.
+
+        Returns:
+            u (B, m), and what the next step gets as ``carried``.
+        """
+
+    def value(self, x: Tensor, carried: Carried) -> Tensor | None:
+        """V^(x) where the controller has an idea of it: (..., n) -> (...)."""
+        return None
+
+
+class Feedback(Controller):
+    """u = policy(x), which carries nothing.
+
+    Example:
+        >>> plant = systems.TwoState()
+        >>> cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
+        >>> policy = adp.Feedback(lambda x: -3.0 * x[..., 1:])
+        >>> x0 = torch.tensor([[0.5, 0.5]]).double()
+        >>> bool(adp.simulate(policy, plant, cost, x0, dt=0.01, steps=100).diverged.any())
+        False
+
+        Shown by `staf experiment=adp adp/policy=lqr`.
+
+    Args:
+        policy: (..., n) -> (..., m), a function of x alone: what has a memory is a `Controller`.
+        value: of the policy or of its design, (..., n) -> (...), for the record.
+
+    Raises:
+        ValueError: of `check`, at the start of a run.
+    """
+
+    def __init__(self, policy: Policy, value: Value | None = None) -> None:
+        super().__init__()
+        self.policy = policy
+        self.period = getattr(policy, "period", None)
+        self._value = value
+
+    @property
+    def label(self) -> str:
+        return getattr(self.policy, "__name__", type(self.policy).__name__)
+
+    def init(self, x0: Tensor) -> ControllerState:
+        empty = x0.new_zeros(x0.shape[0], 0)
+        return ControllerState(empty, empty, x0.new_zeros(x0.shape[0], 0, 0), empty)
+
+    def step(
+        self, x: Tensor, carried: ControllerState, uniform: Tensor, dt: float
+    ) -> tuple[Tensor, ControllerState]:
+        return self.policy(x), carried
+
+    def check(self, x0: Tensor) -> None:
+        """Refuse a policy of a user that has a memory: it would remember every check that asks it, too.
+
+        Args:
+            x0: states at which it is asked, (B, n).
+
+        Raises:
+            ValueError: if a call changes a tensor that the policy holds.
+        """
+        if not is_users(type(self.policy)):
+            return
+        before = _tensors_of(self.policy)
+        with torch.no_grad():
+            self.policy(x0)
+        for name, (tensor, version) in _tensors_of(self.policy).items():
+            if name not in before or tensor is not before[name][0] or version != before[name][1]:
+                raise ValueError(
+                    f"`Feedback(policy=...)` must be a function of the state; a call of {self.label} changed "
+                    f"its `{name}`. What has a memory is a `Controller`: `init` and `step` carry it by rows."
+                )
+
+    def value(self, x: Tensor, carried: ControllerState) -> Tensor | None:
+        return None if self._value is None else self._value(x)
+
+
+def _tensors_of(policy: Any) -> dict[str, tuple[Tensor, int]]:
+    """The tensors that an object holds itself, and how often each was written to."""
+    held = {**getattr(policy, "__dict__", {}), **getattr(policy, "_buffers", {})}
+    return {name: (x, x._version) for name, x in held.items() if isinstance(x, Tensor)}
+
+
+class LQR(nn.Module):
+    """u = u_s - K (x - x_s) with K = R^-1 B'P and P from the Riccati equation of the linearisation at the
+    set-point x_s of the cost, where u_s holds the plant; angles are differences in [-pi, pi]. Of a
+    `TrackingCost` P and K are those of the plant's equilibrium, and x_s moves along the path.
+
+    With bounds u is clipped to them, with a `BoundedInputCost` smoothly. A control that is held for long
+    needs other gains: with a ``period`` P and K are those of the linear plant whose control is held.
+
+    Example:
+        >>> plant = systems.TwoState()
+        >>> cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
+        >>> lqr = adp.LQR(plant, cost)
+        >>> lqr(torch.tensor([[0.0, 1.0]]).double()).round(decimals=3)  # u = -K x, here -3 x2
+        tensor([[-3.]], dtype=torch.float64)
+
+        Shown by `staf experiment=adp adp/policy=lqr`.
+
+    Args:
+        system: the plant.
+        cost: the cost rate.
+        period: s, positive, for which the control will be held; None for one that follows the state, or of a
+            plant in discrete time for its step.
+
+    Attributes:
+        cost: the cost, measured from the set-point of this plant.
+        p: P, (n, n): e'Pe is the value of the linear plant.
+        k: K, (m, n).
+
+    Raises:
+        ValueError: if the plant does not rest at the set-point, its linearisation cannot be stabilised, or
+            the cost does not see a mode that does not decay.
+    """
+
+    def __init__(self, system: Plant, cost: Cost, period: float | None = None) -> None:
+        super().__init__()
+        self.cost = cost.around(system)
+        self.period = system.period if period is None else period
+        system, still = self.cost.regulated(system)
+        if self.period is None:
+            a, b = system.linearisation(still.target, still.target_input)
+            name = type(system).__name__
+            rest = 0.5 * cost.discount * torch.eye(len(a), dtype=a.dtype)
+            p = riccati(a - rest, b, still.state_curvature(), cost.r, name=name)
+            k = cost.r_inverse @ b.to(p).mT @ p
+        else:
+            p, k = held_riccati(system, still, self.period)
+        clock = self.cost.dim - len(p)
+        p, k = pad(p, (0, clock, 0, clock)), pad(k, (0, clock))
+        self.register_buffer("p", p)
+        self.register_buffer("k", k)
+        self.p: Tensor
+        self.k: Tensor
+
+    def forward(self, x: Tensor) -> Tensor:
+        """u: (..., n) -> (..., m)."""
+        return self.cost.saturate(self.cost.input_of(-matvec(self.k, self.cost.deviation(x))))
+
+    def value(self, x: Tensor) -> Tensor:
+        """e'Pe: (..., n) -> (...)."""
+        return quadratic(self.p, self.cost.deviation(x))
+
+
+class Supervised(Controller):
+    """The control of another controller, drawn towards the LQR just as far as it must be:
+
+        u_applied = u_LQR + s (u - u_LQR),  s <= 1 the largest with |u_applied - u_LQR|_R <= trust |u_LQR|_R.
+
+    For a linear plant and trust <= 1/2 the Riccati value then falls at the rate of x'Qx at least, whatever
+    the weights are: V_P' <= -x'Qx - (1 - 2 trust) u_LQR'R u_LQR. It bounds a control that is too weak as
+    well as one that is too strong for its time step. The controller learns on as if its own control had
+    been applied: the laws ask the model, not the plant.
+
+    Example:
+        >>> plant = systems.TwoState()
+        >>> cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
+        >>> wild = adp.Feedback(lambda x: 10 * x[..., 1:])
+        >>> safe = adp.Supervised(wild, adp.LQR(plant, cost), cost, trust=0.5)
+        >>> x = torch.tensor([[0.0, 1.0]]).double()
+        >>> safe.restrain(x, torch.tensor([[10.0]]).double()).round(decimals=3)  # half of the LQR's
+        tensor([[-1.5000]], dtype=torch.float64)
+
+        Shown by `staf experiment=adp adp.trust=0.5`.
+
+    Args:
+        controller: the controller to supervise.
+        lqr: the base feedback, of the same plant and cost.
+        cost: the cost rate.
+        trust: in (0, 1].
+
+    Raises:
+        ValueError: if ``trust`` is not in (0, 1].
+    """
+
+    def __init__(self, controller: Controller, lqr: LQR, cost: Cost, trust: float = 0.5) -> None:
+        super().__init__()
+        if not 0 < real("Supervised", "trust", trust) <= 1:
+            raise ValueError(f"`Supervised(trust=...)` must be in (0, 1]; got {trust!r}.")
+        self.controller, self.lqr, self.trust = controller, lqr, trust
+        self.cost = lqr.cost if isinstance(lqr, LQR) else cost
+        self.draws, self.period = controller.draws, controller.period
+
+    @property
+    def label(self) -> str:
+        return f"supervised {self.controller.label}"
+
+    def init(self, x0: Tensor) -> ControllerState:
+        return self.controller.init(x0)
+
+    def step(
+        self, x: Tensor, carried: ControllerState, uniform: Tensor, dt: float
+    ) -> tuple[Tensor, ControllerState]:
+        u, after = self.controller.step(x, carried, uniform, dt)
+        return self.restrain(x, u), after
+
+    def restrain(self, x: Tensor, u: Tensor) -> Tensor:
+        """The control to apply in place of u: (..., n), (..., m) -> (..., m)."""
+        base = self.lqr(x)
+        apart = u - base
+        allowed = self.trust * quadratic(self.cost.r, self.cost.effort(base)).sqrt()
+        wanted = quadratic(self.cost.r, apart).sqrt()
+        share = torch.where(wanted > allowed, allowed / wanted, 1.0)
+        restrained: Tensor = base + share.unsqueeze(-1) * apart
+        return restrained
+
+    def value(self, x: Tensor, carried: ControllerState) -> Tensor | None:
+        return self.controller.value(x, carried)

@@ -1,0 +1,234 @@
+"""Closed loops over time: the steps, their random numbers, what is recorded of them."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+
+from ...lanes import Program
+from ...lanes.compiling import worth
+from ...numerics.checks import choice, fail, integer, trailing
+from ...systems import ControlAffineSystem, Plant
+from ..problem.cost import Cost
+from ..problem.held_linear import HeldLoop
+from ..problem.held_plant import fewest_and_most
+from .controller import Controller, Feedback, Policy
+from .step import ClosedLoop, program, record, row_gains
+
+_log = logging.getLogger(__name__)
+_DRAWN_AHEAD = 1024  # steps whose random numbers are drawn at once
+_NUMBERS = 1 << 24  # at most, of all rows together
+_DT = 0.001  # s, where neither controller nor plant has a period
+_PAYS = (
+    3000  # integration steps of a small batch in plain torch (some 1 ms each) that take as long as to compile
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class LoopResult:
+    """A closed loop at the recorded times 0, every dt, 2 every dt, ...
+
+    A row whose plant, control or weights became non-finite, or whose state left the ``limit``, is frozen at
+    its last good values from there on: `frozen_at` says when, and it counts as diverged.
+
+    Example:
+        >>> plant = systems.TwoState()
+        >>> cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
+        >>> x0 = torch.tensor([[0.5, 0.5]]).double()
+        >>> lqr = adp.Feedback(adp.LQR(plant, cost))
+        >>> result = adp.simulate(lqr, plant, cost, x0, dt=0.01, steps=50, every=10)
+        >>> result.state.shape, bool(result.diverged.any()), bool(result.cost > 0)
+        (torch.Size([1, 6, 2]), False, True)
+
+        Shown by `staf experiment=adp`.
+    """
+
+    time: Tensor  # (T,) seconds
+    state: Tensor  # (B, T, n)
+    control: Tensor  # (B, T, m) held from that time on; NaN at the end, where none is, and once frozen
+    actor_weights: Tensor  # (B, T, M); M = 0 for feedback laws
+    critic_weights: Tensor  # (B, T, M)
+    running_cost: Tensor  # (B, T) the cost from 0 to that time
+    identifier: Tensor  # (B, T, K) what the controller remembers of the plant; K = 0 without identification
+    frozen_at: Tensor  # (B,) seconds, inf for rows that never froze
+
+    @property
+    def cost(self) -> Tensor:
+        """(B,) the cost of the whole run; of a frozen row, until it froze."""
+        return self.running_cost[:, -1]
+
+    @property
+    def diverged(self) -> Tensor:
+        """(B,) bool."""
+        return torch.isfinite(self.frozen_at)
+
+
+def simulate(
+    controller: Controller | Policy,
+    system: Plant,
+    cost: Cost,
+    x0: Tensor,
+    *,
+    dt: float | None = None,
+    steps: int,
+    every: int = 1,
+    seed: int | Sequence[int] = 0,
+    integrator: str = "runge_kutta",
+    substeps: int | tuple[int, int] = 1,
+    renew: bool = False,
+    limit: float = 1e6,
+    compile: bool | str = "auto",
+    progress: Callable[[int], None] | None = None,
+) -> LoopResult:
+    """The closed loop of a controller and a plant from the initial states x0.
+
+    Row b draws from its own generator, seeded ``seed + b``: what it does depends on no other row.
+
+    Example:
+        >>> plant = systems.TwoState()
+        >>> cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
+        >>> lqr = adp.Feedback(adp.LQR(plant, cost))
+        >>> x0 = torch.tensor([[-1.0, 1.0]], dtype=torch.float64)
+        >>> adp.simulate(lqr, plant, cost, x0, dt=0.01, steps=100).cost.shape
+        torch.Size([1])
+
+        Shown by `staf experiment=adp`.
+
+    Args:
+        controller: the controller, or u from x, (..., n) -> (..., m), as `Feedback` takes it.
+        system: the plant.
+        cost: the cost rate that is integrated along.
+        x0: (B, n).
+        dt: s; the control is held that long. By default the period of the controller or of the plant, where
+            one has any, else 1 ms. A period at which the linearised loop is unstable is a warning in the log.
+        steps: at least 1.
+        every: steps from one recorded time to the next; divides ``steps``.
+        seed: of the first row, the next row having the next; or one a row.
+        integrator: as in `ClosedLoop`, and so are ``substeps`` and ``renew``.
+        limit: as in `ClosedLoop`.
+        compile: whether the loop is compiled by `lanes`: True, False, or ``auto`` (where the run is long
+            enough to pay for it, and never with a controller that improves plans: some seconds, once). What
+            cannot be compiled runs in plain torch, which is the definition, with one line in the log.
+        progress: called with the number of steps done since its last call.
+
+    Raises:
+        ValueError: if an argument breaks its rule, the plant does not rest at 0 or returns another shape.
+    """
+    if not isinstance(controller, Controller):
+        if not callable(controller):
+            raise fail("simulate", "controller", "must be a Controller or a function of x", controller)
+        controller = Feedback(controller)
+    cost = _check(system, cost, x0)
+    integer("simulate", "steps", steps, least=1)
+    integer("simulate", "every", every, least=1)
+    if steps % every:
+        raise fail("simulate", "every", f"must divide the {steps} steps", every)
+    choice("simulate", "compile", compile, (True, False, "auto"))
+    most = fewest_and_most("simulate", substeps)[1]
+    work = steps * (most + max(getattr(part, "work", 1.0) for part in controller.modules()) - 1)
+    pays = work * (1 + len(x0) / 200) >= _PAYS
+    if dt is None:
+        dt = controller.period or system.period or _DT
+    more = {"integrator": integrator, "substeps": substeps, "renew": renew, "limit": limit}
+    loop = ClosedLoop(controller, system, cost, dt=dt, **more)  # type: ignore[arg-type]
+    loop.to(x0.device)
+    if isinstance(controller, Feedback):
+        controller.check(x0)
+    if isinstance(controller, Feedback) and x0.device.type == "cpu":
+        warn_if_unstable(controller.policy, system, cost, dt)
+    pays = pays and not any(getattr(part, "costly", False) for part in controller.modules())
+    compiled = (worth(pays) if compile == "auto" else bool(compile)) and system.traceable
+    with torch.no_grad():
+        return _run(loop, program(loop, compiled), x0, steps, every, _seeds(seed, len(x0)), progress)
+
+
+def warn_if_unstable(policy: Policy, system: Plant, cost: Cost, dt: float) -> None:
+    """Say in the log that the linearised loop of a policy held for dt is not stable, and which period is."""
+    held = HeldLoop.of(policy, system, at=cost.set_point())
+    radius = held.spectral_radius(dt)
+    if not radius >= 1:
+        return
+    most = held.largest_period()
+    remedy = "at no period" if most is None else f"up to {most:.4g} s"
+    _log.warning(
+        "the control is held for dt = %.4g s, at which the linearised loop has the spectral radius %.4g: it "
+        "is unstable; it is stable %s. `LQR(plant, cost, period=dt)` is made to be held.",
+        *(dt, radius, remedy),
+    )
+
+
+def _run(
+    loop: ClosedLoop,
+    steps_of: Program,
+    x0: Tensor,
+    steps: int,
+    every: int,
+    seeds: Sequence[int],
+    progress: Callable[[int], None] | None,
+) -> LoopResult:
+    state = loop.init(x0)
+    pieces: list[tuple[Tensor, ...]] = []
+    draws, done, gains = loop.controller.draws, 0, row_gains(loop)
+    generators = [torch.Generator().manual_seed(seed) for seed in (seeds if draws else ())]
+    ahead = max(1, min(_DRAWN_AHEAD, _NUMBERS // (x0.numel() * max(draws, 1))))
+    while done < steps:
+        # A piece ends at a recorded time, or there is none inside.
+        count = ahead // every * every if every <= ahead else min(ahead, every - done % every)
+        count = min(count, steps - done)
+        uniform = uniform_numbers(x0, count, draws, generators)
+        state, out = steps_of(state, uniform, gains, every=min(every, count))
+        if done % every == 0:
+            pieces.append(out)
+        done += count
+        if progress is not None:
+            progress(count)
+    last = record(state, torch.full_like(pieces[-1][1][:, -1], torch.nan))
+    pieces.append(tuple(part.unsqueeze(1) for part in last))
+    x, u, actor, critic, spent, known = (torch.cat(column, dim=1) for column in zip(*pieces, strict=True))
+    time = torch.arange(0, steps + 1, every, dtype=torch.float64) * loop.dt
+    frozen_at = torch.where(state.alive, torch.inf, state.lived * loop.dt)
+    return LoopResult(time, x, u, actor, critic, spent, known, frozen_at)
+
+
+def _seeds(seed: int | Sequence[int], batch: int) -> Sequence[int]:
+    """The seed of every row."""
+    if isinstance(seed, Sequence):
+        seeds = [integer("simulate", "seed", each, least=0) for each in seed]
+        if len(seeds) != batch:
+            raise fail("simulate", "seed", f"must be one a row, {batch}", len(seeds))
+        return seeds
+    first = integer("simulate", "seed", seed, least=0)
+    return range(first, first + batch)
+
+
+def uniform_numbers(x0: Tensor, count: int, draws: int, generators: Sequence[torch.Generator]) -> Tensor:
+    """The next ``count`` steps' uniform numbers of [-1, 1], (B, count, draws, n), one generator a row."""
+    rows, dim = x0.shape
+    drawn = torch.empty(rows, count, draws, dim, dtype=torch.float64)
+    for row, generator in zip(drawn.unbind(0), generators, strict=False):
+        row.uniform_(-1.0, 1.0, generator=generator)
+    return drawn.to(x0)
+
+
+def _check(system: Plant, cost: Cost, x0: Tensor) -> Cost:
+    """Return the cost around the plant, once all shapes are right."""
+    trailing("simulate", "x0", x0, dims=2, last=system.dim)
+    if x0.dim() != 2 or x0.shape[0] == 0:
+        raise ValueError(f"`simulate(x0=...)` must have the shape (B, n); got {tuple(x0.shape)}.")
+    name, size, inputs = type(system).__name__, x0.shape[1], cost.inputs
+    if cost.dim != size:
+        raise fail("simulate", "cost", f"must be for the plant's {size} states", cost.dim)
+    affine = isinstance(system, ControlAffineSystem)
+    for method, shape in () if not affine else (("drift", x0.shape), ("effectiveness", (*x0.shape, inputs))):
+        returned = getattr(system, method)(x0)
+        if not isinstance(returned, Tensor) or returned.shape != shape:
+            got = tuple(returned.shape) if isinstance(returned, Tensor) else returned
+            raise ValueError(
+                f"`{name}.{method}` must map {tuple(x0.shape)} to {tuple(shape)} "
+                f"(the cost is for {inputs} inputs); got {got}."
+            )
+    return cost.around(system)

@@ -1,0 +1,223 @@
+"""One step of the closed loop, plant and controller together and all rows at once, and many of them."""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import functools
+from collections.abc import Iterator, Mapping, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from ...lanes import Program
+from ...lanes.kept import Kept, number
+from ...lanes.tree import flatten, unflatten
+from ...numerics.checks import choice, fail, flag, positive_real
+from ...systems import Plant
+from ..critic.laws import ActorCriticLaw, Gains
+from ..problem.cost import Cost
+from ..problem.held_plant import Holding, fewest_and_most
+from .controller import Carried, Controller, ControllerState, Feedback
+
+_kept = Kept("the closed loop", 16)
+
+
+class LoopState(NamedTuple):
+    """Everything that one step maps to the next."""
+
+    x: Tensor  # (B, n)
+    cost: Tensor  # (B,) the integral of the cost rate so far
+    alive: Tensor  # (B,) bool; a row that became non-finite keeps its last finite values
+    lived: Tensor  # (B,) steps taken alive
+    carried: Carried
+
+
+class ClosedLoop(nn.Module):
+    """One step of controller and plant: the control is computed at the state, clipped to the bounds of the
+    cost or the plant, and held for dt.
+
+    Args:
+        controller: the controller.
+        system: the plant.
+        cost: the cost rate.
+        dt: s.
+        integrator: of the plant over a step, ``runge_kutta`` (fourth order) or ``euler`` (as published). A
+            plant in discrete time takes its own steps.
+        substeps: Runge-Kutta steps while the control is held, at least 1; of a plant with a
+            `Plant.step_limit` each row has lengths of its own, and of two numbers, (1, 16), it takes the
+            first where no limit is met, the second at most.
+        renew: whether the control follows the state at every substep, in place of being held for dt. Of
+            feedback laws alone.
+        limit: a row whose state exceeds it in norm has diverged.
+
+    Raises:
+        ValueError: if an argument breaks its rule.
+    """
+
+    def __init__(
+        self,
+        controller: Controller,
+        system: Plant,
+        cost: Cost,
+        *,
+        dt: float,
+        integrator: str = "runge_kutta",
+        substeps: int | tuple[int, int] = 1,
+        renew: bool = False,
+        limit: float = 1e6,
+    ) -> None:
+        super().__init__()
+        choice("ClosedLoop", "integrator", integrator, ("runge_kutta", "euler"))
+        self.controller, self.system, self.cost = controller, system, cost.around(system)
+        self.dt = positive_real("ClosedLoop", "dt", dt)
+        self.substeps = fewest_and_most("ClosedLoop", substeps)[1]
+        self.limit = positive_real("ClosedLoop", "limit", limit)
+        self.renew = flag("ClosedLoop", "renew", renew)
+        if self.renew and (not isinstance(controller, Feedback) or system.period is not None):
+            rule = "needs a feedback law and a plant in continuous time"
+            raise fail("ClosedLoop", "renew", rule, controller.label)
+        self.euler = integrator == "euler" and system.period is None
+        self.holding = Holding("ClosedLoop", system, self.cost, self.dt, substeps)
+
+    def init(self, x0: Tensor) -> LoopState:
+        """The state at time 0 of the rows x0 (B, n)."""
+        alive = torch.isfinite(x0).all(-1)
+        zeros = x0.new_zeros(x0.shape[0])
+        carried = self.controller.init(x0)
+        for part in flatten(carried)[0]:
+            if part.shape[:1] != x0.shape[:1]:
+                raise ValueError(
+                    f"`{type(self.controller).__name__}.init` must return tensors (B, ...), here with "
+                    f"B = {x0.shape[0]}; got one of {tuple(part.shape)}."
+                )
+        return LoopState(x0, zeros, alive, zeros.clone(), carried)
+
+    def forward(self, state: LoopState, uniform: Tensor) -> tuple[LoopState, Tensor]:
+        """The state after dt seconds, and the control held until then, (B, m)."""
+        u, carried = self.controller.step(state.x, state.carried, uniform, self.dt)
+        wanted = (len(state.x), self.system.inputs)
+        if u.shape != wanted:
+            raise ValueError(
+                f"`{type(self.controller).__name__}.step` must return a control (B, m), here {wanted}; "
+                f"got {tuple(u.shape)}."
+            )
+        if self.cost.bounds is not None:  # an actuator that is asked for more gives its bound
+            u = self.cost.bounds.clip(u)
+        x, spent = self._advance(state.x, u)
+        good = torch.isfinite(spent) & (x.square().sum(-1) <= self.limit**2)
+        parts, before = flatten(carried), flatten(state.carried)
+        shapes, given = ([tuple(part.shape) for part in each[0]] for each in (parts, before))
+        if parts[1] != before[1] or shapes != given:
+            raise ValueError(
+                f"`{type(self.controller).__name__}.step` must carry on what it got, tensors of the shapes "
+                f"{given}; got {shapes}."
+            )
+        for part in (u, *parts[0]):
+            good = good & torch.isfinite(part).reshape(len(part), -1).all(-1)
+        alive = state.alive & good
+        pairs = zip(parts[0], before[0], strict=True)
+        kept = unflatten(parts[1], (_where(alive, new, old) for new, old in pairs))
+        if self.cost.discount:
+            spent = spent * torch.exp(-self.cost.discount * self.dt * state.lived)
+        cost = state.cost + torch.where(alive, spent, 0.0)
+        return LoopState(_where(alive, x, state.x), cost, alive, state.lived + alive, kept), u
+
+    def _advance(self, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+        """The state after dt with u held, and the cost until then."""
+        if self.euler:
+            return x + self.dt * self.system.motion(x, u), self.dt * self.cost.rate(x, u)
+        if self.renew and isinstance(self.controller, Feedback):
+            return self.holding(x, u, self._renewed)
+        return self.holding(x, u)
+
+    def _renewed(self, x: Tensor) -> Tensor:
+        u = self.controller.policy(x)  # type: ignore[operator]
+        return u if self.cost.bounds is None else self.cost.bounds.clip(u)
+
+
+def _where(alive: Tensor, new: Tensor, old: Tensor) -> Tensor:
+    return torch.where(alive[(..., *([None] * (new.dim() - 1)))], new, old)
+
+
+def program(loop: ClosedLoop, compile: bool) -> Program:
+    """Return ``loop`` over many steps: it records the state before every step, and the control.
+
+    Compiled loops that differ in gains and tensors alone share one text: `lanes.kept`.
+
+    Args:
+        loop: one step.
+        compile: whether to compile it at all; what cannot be compiled runs in plain torch.
+    """
+    if not compile:
+        return Program(functools.partial(recorded, loop), name="the closed loop", compile=False)
+    numbers = [_numbers(law.gains) for law in _laws(loop)]
+
+    def step(
+        state: LoopState, uniform: Tensor, gains: dict[str, Tensor]
+    ) -> tuple[LoopState, tuple[Tensor, ...]]:
+        with _with_gains(loop, numbers):
+            return recorded(loop, state, uniform, gains)
+
+    inputs = dict.fromkeys(row_gains(loop))  # whatever their numbers are here
+    with _with_gains(loop, [{**own, **inputs} for own in numbers]):
+        found = _kept.of(step, loop)
+    return Program(step, name="the closed loop") if found is None else found
+
+
+def _numbers(gains: Gains) -> dict[str, Tensor]:
+    """Return the gains that are floats as tensors, which no text knows."""
+    given = vars(gains).items()
+    return {name: number(name, v) for name, v in given if not isinstance(v, Tensor)}
+
+
+def row_gains(loop: ClosedLoop) -> dict[str, Tensor]:
+    """Return the gains (B, 1) of which every row has its own: inputs of `program`, by their names."""
+    gains = [law.gains for law in _laws(loop)]
+    return {name: value for each in gains for name, value in vars(each).items() if isinstance(value, Tensor)}
+
+
+def _laws(loop: ClosedLoop) -> list[ActorCriticLaw]:
+    laws = (getattr(module, "law", None) for module in loop.controller.modules())
+    return [law for law in laws if isinstance(law, ActorCriticLaw)]
+
+
+@contextlib.contextmanager
+def _with_gains(loop: ClosedLoop, given: Sequence[Mapping[str, Tensor | None]]) -> Iterator[None]:
+    """Context: each law has these gains, those of the one row that is traced among them."""
+    laws = _laws(loop)
+    before = [law.gains for law in laws]
+    try:
+        for law, gains, others in zip(laws, before, given, strict=True):
+            law.gains = copy.copy(gains)
+            vars(law.gains).update(others)  # without the checks, which would read a traced number
+        yield
+    finally:
+        for law, gains in zip(laws, before, strict=True):
+            law.gains = gains
+
+
+def recorded(
+    loop: ClosedLoop, state: LoopState, uniform: Tensor, gains: dict[str, Tensor]
+) -> tuple[LoopState, tuple[Tensor, ...]]:
+    """Return the state after one step, and what is recorded of the time before it.
+
+    Args:
+        loop: one step.
+        state: before the step.
+        uniform: its random numbers, (B, draws, n).
+        gains: of `row_gains`.
+    """
+    with _with_gains(loop, [gains] * len(_laws(loop))) if gains else contextlib.nullcontext():
+        after, u = loop(state, uniform)
+    return after, record(state, torch.where(after.alive.unsqueeze(-1), u, torch.nan))
+
+
+def record(state: LoopState, u: Tensor) -> tuple[Tensor, ...]:
+    """Return x, u, Wa, Wc, the cost and the identifier; nothing of what a controller names otherwise."""
+    carried = state.carried
+    if not isinstance(carried, ControllerState):
+        none = state.x.new_zeros(len(state.x), 0)
+        return state.x, u, none, none, state.cost, none
+    return state.x, u, carried.actor, carried.critic, state.cost, carried.identifier

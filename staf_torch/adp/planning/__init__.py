@@ -1,0 +1,1 @@
+"""Optimal trajectories, and policies that follow or remember them."""

@@ -1,0 +1,338 @@
+"""Box-constrained differential dynamic programming: optimal trajectories of many initial states at once."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from ...lanes import Program, repeat, scan
+from ...lanes.combinators import tracing_now
+from ...numerics.box import minimum_and_slopes
+from ...numerics.checks import fail, integer, positive_real, trailing
+from ...numerics.riccati import riccati_step
+from ..problem.sampled import Derivatives, SampledProblem
+from .plans import LocalModel, Plan, Reference, Trajectories, chosen
+
+LENGTHS = (1.0, 0.5, 0.2, 0.07, 0.02)  # shares of a step that are tried side by side
+EASIER, HARDER = 0.4, 8.0  # what success and failure do to the regularisation of a row
+# Of the regularisation, in units of the cost's curvature in u:
+LEAST, FIRST, TRUSTED, MOST = 1e-9, 1e-3, 1.0, 1e9
+CONVERGED = -1.0
+_NUMBERS = 2**25  # second derivatives that are held at once
+
+
+class BoxDDP:
+    """min sum_{k<T} l(x_k, u_k) + V_T(x_T) over bounded controls, from every state of a batch.
+
+    Backward in time, the quadratic model of l + V(F) around the trajectory is minimised over the box of
+    controls, which gives a change of the control and a feedback (0 at a bound); forward, five lengths of the
+    change are tried, each with the feedback, and a row takes the best that lowers its cost. A row that finds
+    none is regularised more, and changes between the full second derivatives and those of Gauss and Newton.
+
+    The minimum is a local one. No row sees another.
+
+    Example:
+        >>> def step(x, u):  # a cart without friction, for 0.1 s
+        ...     after = torch.stack((x[:, 0] + 0.1 * x[:, 1], x[:, 1] + 0.1 * u[:, 0]), dim=-1)
+        ...     return after, 0.1 * (x.square().sum(-1) + u.square().sum(-1))
+        >>> problem = adp.SampledProblem(step, dim=2, inputs=1, low=-1.0, high=1.0)
+        >>> found = adp.BoxDDP(problem, steps=20, compile=False).solve(torch.tensor([[1.0, 0.0]]).double())
+        >>> bool(found.converged.all()), float(found.control.abs().max()) <= 1
+        (True, True)
+
+        Shown by `staf_torch/adp/README.md`.
+
+    Args:
+        problem: plant, cost and bounds in steps.
+        steps: T.
+        iterations: at most.
+        tolerance: relative change of the cost at which a row has converged, positive.
+        compile: whether `lanes` compiles the passes: some seconds of a C++ compiler for a plant that is new
+            to its cache, and a hundred times faster then.
+
+    Raises:
+        ValueError: if an argument breaks its rule.
+
+    Source: Tassa, Mansard, Todorov, "Control-limited differential dynamic programming", ICRA (2014).
+    """
+
+    def __init__(
+        self,
+        problem: SampledProblem,
+        *,
+        steps: int,
+        iterations: int = 60,
+        tolerance: float = 1e-7,
+        compile: bool = True,
+    ) -> None:
+        self.problem = problem
+        self.steps = integer("BoxDDP", "steps", steps, least=1)
+        self.iterations = integer("BoxDDP", "iterations", iterations, least=1)
+        self.tolerance = positive_real("BoxDDP", "tolerance", tolerance)
+        self._expand = Program(
+            lambda carry, now, row: (carry, tuple(problem.derivatives(*row))),
+            name="derivatives of a step",
+            compile=compile,
+        )
+        self._back = Program(self.backward, name="a backward pass", compile=compile)
+        self._forth = Program(self.forward, name="a forward pass", compile=compile)
+
+    def solve(
+        self,
+        x0: Tensor,
+        control: Tensor | None = None,
+        reference: Reference | None = None,
+        terminal: LocalModel | None = None,
+    ) -> Trajectories:
+        """The trajectories from x0 that the search reaches from a first control.
+
+        Args:
+            x0: (B, n).
+            control: (B, T, m), used as it is, or around ``reference``; None for the goal's linear feedback.
+            reference: states and feedback that the first control goes with; none for open loop.
+            terminal: V_T, a model a row; None for the value of the goal's linear feedback.
+
+        Raises:
+            ValueError: if a shape is wrong.
+        """
+        n, m = self.problem.dim, self.problem.inputs
+        if trailing("BoxDDP.solve", "x0", x0, 2, n).dim() != 2:
+            raise fail("BoxDDP.solve", "x0", f"must have the shape (B, {n})", tuple(x0.shape))
+        expected = (len(x0), self.steps, m)
+        if control is None:
+            gains = (-self.problem.k).expand(*expected, n)
+            reference = Reference(self.problem.goals(x0, self.steps)[:, :-1], gains)
+            control = self.problem.rest.expand(expected)
+        if control.shape != expected:
+            raise ValueError(
+                f"`BoxDDP.solve(control=...)` must have the shape {expected}; got {tuple(control.shape)}."
+            )
+        if reference is None:
+            still = x0.unsqueeze(1).expand(-1, self.steps, -1)
+            reference = Reference(still, x0.new_zeros(*expected, n))
+        if terminal is None:
+            terminal = self.ends(x0)
+        together = max(1, _NUMBERS // (self.steps * (n + 1) * (n + m) ** 2))
+        with torch.no_grad():
+            whole = x0, self.problem.admissible(control), *reference, *terminal
+            if len(x0) <= together:
+                return self._solve(*whole)
+            parts = [
+                self._solve(*some) for some in zip(*(part.split(together) for part in whole), strict=True)
+            ]
+        return Trajectories(*(torch.cat(column) for column in zip(*parts, strict=True)))
+
+    def ends(self, x0: Tensor) -> LocalModel:
+        """V_T of plans from x0 (B, n): the value of the goal's linear feedback, or what the problem pays."""
+        none, bent = torch.zeros_like(x0), (2 * self.problem.end).expand(*x0.shape, x0.shape[-1])
+        goal = self.problem.goal.expand_as(x0)
+        if self.problem.path is not None:
+            goal = self.problem.goals(x0, self.steps)[:, -1]
+        return LocalModel(goal, none[:, 0], none, bent)
+
+    def _solve(self, x0: Tensor, control: Tensor, *more: Tensor) -> Trajectories:
+        """`solve` for as many rows as fit; ``more`` are the fields of a reference and of a terminal model."""
+        reference, terminal = Reference(*more[:2]), LocalModel(*more[2:])
+        around = reference.state, control, torch.zeros_like(control), reference.feedback
+        plan = self._followed(x0, around, x0.new_ones(len(x0), 1), terminal)
+        going, ones = torch.isfinite(plan.cost).to(x0), torch.ones_like(plan.cost)
+        found = Progress(*plan, FIRST * ones, ones.clone(), going)
+        if tracing_now():  # a program of one row has no rows to leave out
+            return self._models(
+                repeat(
+                    self.iterations,
+                    lambda now: self._iterated(now, self._derivatives(now), terminal),
+                    found,
+                    where=lambda now: now.going > 0,
+                ),
+                terminal,
+            )
+        rows = going.nonzero().squeeze(1)
+        now, ends, known = found.rows(rows), terminal.rows(rows), None
+        for _ in range(self.iterations):
+            if not len(rows):
+                break
+            known = self._derivatives(now) if known is None else known
+            after = self._iterated(now, known, ends)
+            for part, current in zip(found, after, strict=True):
+                part[rows] = current
+            on = after.going > 0
+            fresh = (after.cost < now.cost)[on]
+            known = Derivatives(*(part[on] for part in known))
+            rows, now, ends = rows[on], after.rows(on), ends.rows(on)
+            if bool(fresh.any()):  # saves work: rows that did not move keep their derivatives
+                for old, fresher in zip(known, self._derivatives(now.rows(fresh)), strict=True):
+                    old[fresh] = fresher
+        return self._models(found, terminal)
+
+    def _iterated(self, now: Progress, known: Derivatives, terminal: LocalModel) -> Progress:
+        """One iteration: a backward pass, the best length of its change, and what that says of the row."""
+        end, (change, feedback, _, _) = self._backwards(now, known, now.mu, now.full, terminal)
+        definite = end.definite > 0
+        around = now.state[:, :-1], now.control, change, feedback
+        tried = self._best(now.state[:, 0], around, terminal)
+        better = definite & (tried.cost < now.cost)
+        gain = (now.cost - tried.cost) / now.cost.abs().clamp(min=1e-300)
+        plan = chosen(better, tried, Plan(*now[:4]))
+        small = end.promised.abs() <= self.tolerance * plan.cost.abs()
+        done = ((better & (gain <= self.tolerance)) | (definite & small)) & (now.mu <= TRUSTED)
+        mu = torch.where(better, (now.mu * EASIER).clamp(min=LEAST), now.mu * HARDER)
+        going = torch.where(done, CONVERGED, (mu <= MOST).to(mu))
+        return Progress(*plan, mu, torch.where(better, now.full, 1 - now.full), going)
+
+    def _best(self, x0: Tensor, around: tuple[Tensor, ...], terminal: LocalModel) -> Plan:
+        """The cheapest of five lengths of a change: side by side, but in a program one after the other."""
+        lengths = x0.new_tensor(LENGTHS).expand(len(x0), -1)
+        if not tracing_now():
+            return self._followed(x0, around, lengths.contiguous(), terminal)
+
+        def attempt(now: tuple[Tensor, Tensor], length: Tensor) -> tuple[tuple[Tensor, Tensor], tuple[()]]:
+            cost = self._followed(x0, around, length.unsqueeze(1), terminal).cost
+            lower = cost < now[0]
+            return (torch.where(lower, cost, now[0]), torch.where(lower, length, now[1])), ()
+
+        none = torch.zeros_like(x0[:, 0])
+        (_, length), _ = scan(attempt, (none + torch.inf, none), lengths)
+        return self._followed(x0, around, length.unsqueeze(1), terminal)
+
+    def _followed(
+        self, x0: Tensor, around: tuple[Tensor, ...], lengths: Tensor, terminal: LocalModel
+    ) -> Plan:
+        """The best of u = control + length change + feedback (x - state) within the bounds.
+
+        Args:
+            x0: (B, n).
+            around: state, control, change and feedback, (B, T, ...) each.
+            lengths: that are tried, (B, L).
+            terminal: V_T.
+        """
+        start = x0.unsqueeze(1).expand(-1, lengths.shape[1], -1).contiguous()
+        end, (x, u, paid) = self._along(self._forth, start, around, lengths)
+        last = terminal.at(self.problem, end)  # (B, L)
+        cost = paid.sum(1) + last
+        cost = torch.where(torch.isfinite(cost), cost, torch.inf)
+        states, parts = torch.cat((x, end.unsqueeze(1)), dim=1), torch.cat((paid, last.unsqueeze(1)), dim=1)
+        if lengths.shape[1] == 1:
+            return Plan(states.squeeze(2), u.squeeze(2), cost.squeeze(1), parts.squeeze(2))
+        best, at = cost.min(1)
+        rows = torch.arange(len(x0))
+        return Plan(states[rows, :, at], u[rows, :, at], best, parts[rows, :, at])
+
+    def _along(self, program: Program, carry: Any, now: Any, row: Any) -> tuple[Any, Any]:
+        """A step taken at all times: by its program, or as a loop of the program that is being traced."""
+        if tracing_now():
+            return scan(lambda carry, now: program.step(carry, now, row), carry, now)
+        return program(carry, now, row)
+
+    def forward(
+        self, x: Tensor, now: tuple[Tensor, ...], lengths: Tensor
+    ) -> tuple[Tensor, tuple[Tensor, ...]]:
+        """One step of all lengths: x (B, L, n), (B, n), (B, m), (B, m), (B, m, n), (B, L)."""
+        state, control, change, feedback = now
+        apart = x - state.unsqueeze(1)
+        u = control.unsqueeze(1) + lengths.unsqueeze(-1) * change.unsqueeze(1)
+        u = u + (feedback.unsqueeze(1) * apart.unsqueeze(-2)).sum(-1)
+        u = self.problem.admissible(u)
+        after, paid = self.problem.advance(x, u)
+        return after, (x, u, paid)
+
+    def _derivatives(self, plan: Progress) -> Derivatives:
+        """Along the trajectories: (B, T, ...)."""
+        x, u = plan.state[:, :-1], plan.control
+        if tracing_now():
+            return Derivatives(*scan(lambda _, now: ((), self.problem.derivatives(*now)), (), (x, u))[1])
+        _, found = self._expand((), (), (x.flatten(0, 1), u.flatten(0, 1)), steps=1)  # all times are rows
+        return Derivatives(*(part[:, 0].unflatten(0, u.shape[:2]) for part in found))
+
+    def _backwards(
+        self, plan: Progress, known: Derivatives, mu: Tensor, full: Tensor, terminal: LocalModel
+    ) -> tuple[Model, tuple[Tensor, ...]]:
+        slope, bent = terminal.slope(self.problem, plan.state[:, -1]), terminal.curvature.contiguous()
+        last = Model(slope, bent, torch.zeros_like(mu), torch.ones_like(mu))
+        reverse = tuple(part.flip(1) for part in (*known, plan.control))
+        end, out = self._along(self._back, last, reverse, (mu, full))
+        return end, tuple(part.flip(1) for part in out)
+
+    def backward(
+        self, after: Model, now: tuple[Tensor, ...], row: tuple[Tensor, Tensor]
+    ) -> tuple[Model, tuple[Tensor, ...]]:
+        """One step of the recursion, backward in time."""
+        (first, second, cost_first, cost_second, control), (mu, full) = now, row
+        n = self.problem.dim
+        bent = (after.gradient[..., None, None] * second).sum(-3)
+        scale = cost_second[:, n:, n:].diagonal(dim1=-2, dim2=-1).abs().mean(-1)
+        firmness = (mu * scale)[:, None, None] * torch.eye(control.shape[-1], dtype=control.dtype)
+        low, high = self.problem.bounds.low - control, self.problem.bounds.high - control
+        definite = after.definite
+
+        def minimum(slope: Tensor, cross: Tensor, hessian: Tensor) -> tuple[Tensor, Tensor]:
+            nonlocal definite
+            firm = hessian + firmness
+            definite = definite * _definite(firm)
+            return minimum_and_slopes(firm, slope, cross, low, high)
+
+        curved = cost_second + full[:, None, None] * bent
+        found = riccati_step(after.gradient, after.curvature, first, cost_first, curved, minimum)
+        gradient, curvature, promised, change, feedback = found
+        model = Model(gradient, curvature, after.promised + promised, definite)
+        return model, (change, feedback, gradient, curvature)
+
+    def _models(self, plan: Progress, terminal: LocalModel) -> Trajectories:
+        """The local models along finished trajectories, with as little regularisation as they bear."""
+        known, small = self._derivatives(plan), torch.full_like(plan.cost, LEAST)
+
+        def models(_: tuple[()], full: Tensor) -> tuple[tuple[()], tuple[Tensor, ...]]:
+            end, (_change, *parts) = self._backwards(plan, known, small, full, terminal)
+            return (), (*parts, (end.definite > 0) & torch.isfinite(end.curvature).all(-1).all(-1))
+
+        both = torch.stack((torch.ones_like(small), torch.zeros_like(small)), dim=1)
+        *parts, fine = scan(models, (), both)[1]  # the second model is that of Gauss and Newton
+        exact, gauss = zip(*(part.unbind(1) for part in parts), strict=True)
+        feedback, gradient, curvature = chosen(fine[:, 0], exact, gauss)
+        last = terminal.slope(self.problem, plan.state[:, -1])
+        return Trajectories(
+            plan.state,
+            plan.control,
+            feedback,
+            plan.paid.flip(1).cumsum(1).flip(1),
+            torch.cat((gradient, last.unsqueeze(1)), dim=1),
+            torch.cat((curvature, terminal.curvature.unsqueeze(1)), dim=1),
+            (plan.going == CONVERGED) & torch.isfinite(plan.cost),
+        )
+
+
+class Progress(NamedTuple):
+    """Plans, and how the search goes on with each."""
+
+    state: Tensor  # (B, T + 1, n)
+    control: Tensor  # (B, T, m)
+    cost: Tensor  # (B,)
+    paid: Tensor  # of every step, and at last the terminal value, (B, T + 1)
+    mu: Tensor  # regularisation, (B,)
+    full: Tensor  # 1 with the second derivatives of the plant, 0 without, (B,)
+    going: Tensor  # 1 goes on, 0 has given up, `CONVERGED` has converged, (B,)
+
+    def rows(self, index: Tensor) -> Progress:
+        """Some of the rows."""
+        return Progress(*(part[index] for part in self))
+
+
+class Model(NamedTuple):
+    """Local model of the value at one time, and what the recursion adds up."""
+
+    gradient: Tensor  # (B, n)
+    curvature: Tensor  # (B, n, n)
+    promised: Tensor  # (B,)
+    definite: Tensor  # (B,) 1 or 0
+
+
+def _definite(a: Tensor) -> Tensor:
+    """1 where all pivots of (B, m, m) are positive, else 0."""
+    fine = torch.ones_like(a[..., 0, 0])
+    for _ in range(a.shape[-1]):
+        pivot = a[..., 0, 0]
+        fine = fine * (pivot > 0)
+        a = a[..., 1:, 1:] - a[..., 1:, :1] * a[..., :1, 1:] / pivot[..., None, None]
+    return fine

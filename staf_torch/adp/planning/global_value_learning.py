@@ -1,0 +1,173 @@
+"""How the memory of a global value grows: optimal trajectories from everywhere, each helping the others."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ...numerics.checks import integer
+from ..problem.sampled import SampledProblem
+from .ddp import BoxDDP
+from .global_value import GlobalValue
+from .plans import Reference, Trajectories, chosen
+
+_log = logging.getLogger(__name__)
+_HELD = 10  # steps for which a random first control is held
+_PREFIXES = (2, 4, 7, 11, 16, 22, 30)  # steps for which a corner of the bounds is held before a plan
+_WORTH = 0.01  # relative gain of cost for which a state's trajectory is kept
+_BEST = 3  # guesses of a state from which it is optimised
+
+
+class Guesses(NamedTuple):
+    """First controls for trajectories."""
+
+    owner: Tensor  # index of the state that each is for, (G,)
+    control: Tensor  # (G, T, m)
+    reference: Reference
+
+
+def learn_global_value(
+    problem: SampledProblem,
+    region: Sequence[float] | Tensor,
+    *,
+    steps: int,
+    trajectories: int = 150,
+    rounds: int = 4,
+    states: int = 400,
+    seed: int = 0,
+    candidates: int = 48,
+    lookahead: int = 60,
+) -> GlobalValue:
+    """Fill a memory with optimal trajectories until it knows the box goal +- region.
+
+    1. Trajectories from uniform states, optimised from no control and from two random ones.
+    2. A sweep: each is optimised again from the plans that the memory finds for it in the others, followed
+       by their feedback, also after holding a corner of the bounds for a while; the better one is kept.
+    3. Rounds: at fresh states the memory's own cost is compared with what such a sweep finds, and where the
+       optimum is more than 1 % lower the trajectory joins the library. Then another sweep.
+
+    Every round says in the log what share of the fresh states was known to 1 %.
+
+    Example:
+        >>> def step(x, u):  # a cart without friction, for 0.1 s
+        ...     after = torch.stack((x[:, 0] + 0.1 * x[:, 1], x[:, 1] + 0.1 * u[:, 0]), dim=-1)
+        ...     return after, 0.1 * (x.square().sum(-1) + u.square().sum(-1))
+        >>> problem = adp.SampledProblem(step, dim=2, inputs=1, low=-1.0, high=1.0)
+        >>> memory = adp.learn_global_value(problem, [1.5, 1.0], steps=80)  # doctest: +SKIP
+        >>> memory(torch.tensor([[0.9, 0.0]]).double()).shape  # doctest: +SKIP
+        torch.Size([1, 1])
+
+        Shown by `staf_torch/adp/README.md`.
+
+    Args:
+        problem: plant, cost and bounds in steps.
+        region: half the width of the box of states, (n,).
+        steps: T of a trajectory: enough to reach the goal from everywhere.
+        trajectories: of the first library.
+        rounds: of fresh states.
+        states: of a round.
+        seed: of the states and the random controls.
+        candidates: as in `GlobalValue`, and so is ``lookahead``.
+
+    Raises:
+        ValueError: if an argument breaks its rule, or no trajectory arrives at the goal.
+    """
+    integer("learn_global_value", "trajectories", trajectories, least=2)
+    integer("learn_global_value", "rounds", rounds, least=0)
+    integer("learn_global_value", "states", states, least=1)
+    generator = torch.Generator().manual_seed(integer("learn_global_value", "seed", seed, least=0))
+    width = torch.as_tensor(region, dtype=torch.float64)
+    search = BoxDDP(problem, steps=steps, iterations=40, tolerance=1e-5)
+
+    def memory(library: Trajectories) -> GlobalValue:
+        return GlobalValue(problem, library, width, candidates=candidates, lookahead=lookahead)
+
+    def drawn(count: int) -> Tensor:
+        uniform = torch.rand(count, problem.dim, generator=generator, dtype=torch.float64)
+        return problem.goal + width * (2 * uniform - 1)
+
+    library = swept(memory(_first(search, drawn(trajectories), generator)), search)
+    for round_ in range(rounds):
+        known = memory(library)
+        x = drawn(states)
+        before = known.choose(x).value
+        found = best_from(known, search, x)
+        better = before - found.cost > _WORTH * found.cost
+        share = float((~better).double().mean())
+        _log.info("round %d: %.1f %% of %d fresh states known to 1 %%", round_ + 1, 100 * share, states)
+        both = (torch.cat((old, new[better])) for old, new in zip(library, found, strict=True))
+        library = swept(memory(Trajectories(*both)), search)
+    return memory(library)
+
+
+def swept(memory: GlobalValue, search: BoxDDP) -> Trajectories:
+    """The library of a memory, each trajectory optimised again from what the others know."""
+    library = memory.library
+    own = torch.arange(len(library.cost))
+    found = best_from(memory, search, library.state[:, 0], own)
+    return chosen(found.cost < library.cost, found, library)
+
+
+def best_from(memory: GlobalValue, search: BoxDDP, x: Tensor, own: Tensor | None = None) -> Trajectories:
+    """The best trajectories from x (B, n) that the search reaches from plans of the memory.
+
+    Args:
+        memory: of which plans are followed.
+        search: that optimises them.
+        x: (B, n).
+        own: a trajectory for each state that must not help it, (B,).
+    """
+    guesses = _guesses(memory, search.steps, x, own)
+    found = search.solve(x[guesses.owner], guesses.control, guesses.reference)
+    order = found.cost.argsort(descending=True, stable=True)
+    best = torch.empty(len(x), dtype=torch.int64)
+    best[guesses.owner[order]] = order  # the last one written is the cheapest
+    return found.rows(best)
+
+
+def _first(search: BoxDDP, x: Tensor, generator: torch.Generator) -> Trajectories:
+    """Optimised from the control at rest, and from two that jump between the bounds."""
+    problem, steps = search.problem, search.steps
+    levels, shape = problem.levels(), (2 * len(x), -(-steps // _HELD))
+    random = levels[torch.randint(len(levels), shape, generator=generator)].repeat_interleave(_HELD, 1)
+    still = problem.rest.expand(len(x), steps, -1)
+    found = search.solve(x.repeat(3, 1), torch.cat((still, random[:, :steps])))
+    best = found.cost.unflatten(0, (3, -1)).argmin(0)
+    return found.rows(best * len(x) + torch.arange(len(x)))
+
+
+def _guesses(memory: GlobalValue, steps: int, x: Tensor, own: Tensor | None) -> Guesses:
+    """The cheapest plans, `_BEST` a state: followed at once, or after a control was held for a while."""
+    problem = memory.problem
+    entries = memory.nearest(x, own)
+    cost, _, _ = memory.follow(x, entries)
+    count = min(_BEST, cost.shape[1])
+    least, at = cost.topk(count, 1, largest=False)
+    plans = [
+        (least[:, k], 0, problem.rest, entries.gather(1, at[:, k : k + 1]).squeeze(1), x)
+        for k in range(count)
+    ]
+    for length in (length for length in _PREFIXES if length < steps):
+        for u in problem.levels():
+            after, paid = x, torch.zeros_like(x[:, 0])
+            for _ in range(length):
+                after, now = problem.advance(after, u.expand(len(x), -1))
+                paid = paid + now
+            then = memory.choose(after, own)
+            plans.append((paid + then.value, length, u, then.entry, after))
+    chosen = torch.stack([plan[0] for plan in plans], dim=1).topk(count, 1, largest=False).indices
+    parts = []
+    for k, (_, length, u, entry, after) in enumerate(plans):
+        rows = (chosen == k).any(1).nonzero().squeeze(1)
+        control, reference = memory.replay(after[rows], entry[rows], steps - length)
+        held = u.expand(len(rows), length, -1)
+        state = torch.cat((reference.state[:, :1].expand(-1, length, -1), reference.state), dim=1)
+        none = torch.zeros_like(reference.feedback[:, :1]).expand(-1, length, -1, -1)
+        feedback = torch.cat((none, reference.feedback), dim=1)
+        parts.append((rows, torch.cat((held, control), dim=1), state, feedback))
+    owner, control, state, feedback = (torch.cat(part) for part in zip(*parts, strict=True))
+    return Guesses(owner, control, Reference(state, feedback))

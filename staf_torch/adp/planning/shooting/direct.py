@@ -1,0 +1,429 @@
+"""Direct shooting: the optimum where no formula knows it, from every state of a batch, on two meshes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+
+from ....numerics.checks import fail, integer, positive_real, trailing
+from ....systems import Clocked, ControlAffineSystem, Linear, Plant
+from ....systems.bounds import Limit
+from ...loop.controller import LQR, Policy, Value
+from ...problem.cost import Cost
+from ..plans import chosen
+from .newton import Plan, Solution, follow, minimise, replay
+from .optimum import Optimum
+from .stage import Stage
+from .starts import agreement, guesses, guided, said
+
+_DECAY = 9.2  # time constants of the slowest mode in the horizon: it falls to 1e-4
+_RESOLVED = 0.5  # mean interval in time constants of the fastest mode
+_LEAST = 80  # intervals
+_MOST = 120  # intervals that are chosen at most where inputs are bounded
+_ROWS = 256  # states solved from at once: a graph of second derivatives is kept for each
+_GAP = 1e-3  # share of the value by which a stationary control may miss the minimum of the Hamiltonian
+_SAME = 1e-4  # relative, of the values of two starts that found the same
+_NEAR = (0.5, 2.0)  # value over the LQR's, inside which one start is believed,
+_PLAIN = 1.5  # where following the base costs at most so many times what was found from it
+_MIRRORED = 1e-9  # relative difference of cost below which two guesses are one and its mirror image
+_REST = 1e-3  # share of the value that the terminal cost may be, before the horizon grows
+_GRADING = 6.0  # ratio of a mesh's last interval to the first
+_DOUBLINGS = 3  # of the horizon
+_SPLINES = 8  # random guesses
+
+
+class DirectShooting:
+    """min int_0^T (x'Qx + U(u)) dt + V_T(x(T)) over controls that are linear on each of N intervals, by
+    Newton's method with the exact second derivatives from automatic differentiation.
+
+    Each iteration solves the linear-quadratic problem of the second-order expansion around the current
+    trajectory by a backward Riccati recursion, with hard bounds a box-constrained one, and takes the longest
+    share of its step that lowers the cost, forward in time with the recursion's feedback. Where the expansion
+    has no minimum, its absolute value takes its place. The problem is solved on N / 2 intervals first and
+    then on N.
+
+    A row is stationary when the model promises a relative improvement of less than ``tolerance`` and the
+    control minimises the Hamiltonian in u to a share of 1e-3 of the value: a saturated control without a
+    slope does not pass. A row whose value is not near its LQR's, or is much less than the base costs, is
+    started from more guesses: constant controls at the bounds for a while, none, random splines, each
+    followed by the base policies; the cheapest of them that are no mirror images are improved. It has
+    converged if two starts found the same lowest value to 1e-4, else its `reason` says ``local``. A row that
+    is not stationary is NaN, and its `reason` says why.
+
+    Every control that is found is admissible, so the value is an upper bound of V*, but for the errors of
+    the Runge-Kutta steps and of the horizon, which `Optimum` reports.
+
+    Example:
+        >>> plant = systems.TwoState()
+        >>> cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
+        >>> x0 = torch.tensor([[0.2, 0.1]]).double()
+        >>> round(float(adp.DirectShooting(plant, cost).solve(x0).value), 5)  # V* = x1^2 / 2 + x2^2
+        0.03
+        >>> limited = adp.DirectShooting(plant, cost, low=-0.1, high=0.1)
+        >>> limited.solve(x0).plan.abs().max() <= 0.1
+        tensor(True)
+
+        Shown by `staf experiment=adp_three_state`.
+
+    Args:
+        system: the plant, in continuous time and in torch; its rate must have second derivatives.
+        cost: the cost rate, without a discount.
+        base: the policy to start from, (..., n) -> (..., m), or several; the LQR by default.
+        terminal: V_T, (..., n) -> (...), with two derivatives; by default the cost's own terminal
+            cost, or else the Riccati value.
+        low: of the inputs, as in `systems.Bounds`; by default those of the cost, or else of the plant.
+        high: likewise.
+        horizon: T in s; by default so long that the slowest mode of the LQR has fallen to 1e-4, and twice to
+            eight times that where the terminal cost is more than 1e-3 of a value.
+        intervals: N, even; by default so many that the fastest mode of the LQR is resolved.
+        tolerance: positive, relative.
+        iterations: at most, on each mesh; by default 50, or 120 where inputs are bounded.
+        starts: guesses that are improved in a row that needs more than the base, at least 1.
+        seed: of the random guesses.
+
+    Raises:
+        ValueError: if an argument breaks its rule, or the LQR that a default asks for does not exist.
+
+    Source: Dunn and Bertsekas, "Efficient dynamic programming implementations of Newton's method for
+    unconstrained optimal control problems", JOTA 63 (1989); Tassa, Mansard and Todorov, "Control-limited
+    differential dynamic programming", ICRA 2014, for the box.
+    """
+
+    def __init__(
+        self,
+        system: Plant,
+        cost: Cost,
+        *,
+        base: Policy | Sequence[Policy] | None = None,
+        terminal: Value | None = None,
+        low: Limit = None,
+        high: Limit = None,
+        horizon: float | None = None,
+        intervals: int | None = None,
+        tolerance: float = 1e-12,
+        iterations: int | None = None,
+        starts: int = 6,
+        seed: int = 0,
+    ) -> None:
+        if system.period is not None or not system.traceable:
+            rule = "must be in continuous time and in torch: it is differentiated twice"
+            raise fail("DirectShooting", "system", rule, type(system).__name__)
+        if isinstance(system, Clocked):
+            rule = "must have no clock: a path is followed by `BoxDDP`"
+            raise fail("DirectShooting", "system", rule, system)
+        cost = cost.bounded(low, high).around(system)
+        if cost.end is not None and horizon is None:
+            raise fail("DirectShooting", "horizon", "must be given beside a terminal cost", None)
+        if cost.discount:
+            raise fail("DirectShooting", "cost", "must have no discount", cost.discount)
+        self.stage = Stage(system, cost)
+        rates = (1.0, 1.0)
+        self.lqr: LQR | None = None
+        if base is None or terminal is None or horizon is None or intervals is None:
+            self.lqr = LQR(system, cost)
+            rates = _rates(system, self.lqr)
+        given = () if base is None else tuple(base) if isinstance(base, Sequence) else (base,)
+        if not given or (len(given) > 1 and self.lqr is not None):
+            assert self.lqr is not None
+            given = (*given, self.lqr)
+        self.bases = given
+        if terminal is None:
+            assert self.lqr is not None
+            terminal = self.lqr.value if cost.end is None else cost.terminal
+        self.terminal = terminal
+        self.stated = (horizon, intervals)
+        chosen = _DECAY / rates[0] if horizon is None else horizon
+        self.horizon = positive_real("DirectShooting", "horizon", chosen)
+        if intervals is None:
+            wanted = self.horizon * rates[1] / _RESOLVED
+            most = math.inf if cost.bounds is None else _MOST
+            intervals = 2 * round(0.5 * min(max(_LEAST, wanted), most))
+        self.intervals = integer("DirectShooting", "intervals", intervals, least=4)
+        if self.intervals % 2:
+            raise fail("DirectShooting", "intervals", "must be even", intervals)
+        self.tolerance = positive_real("DirectShooting", "tolerance", tolerance)
+        steps = (50 if cost.bounds is None else 120) if iterations is None else iterations
+        self.iterations = integer("DirectShooting", "iterations", steps, least=1)
+        self.starts = integer("DirectShooting", "starts", starts, least=1)
+        self.seed = integer("DirectShooting", "seed", seed, least=0)
+
+    def solve(self, x0: Tensor, *, warm: Optimum | None = None) -> Optimum:
+        """The optima from x0, (B, n).
+
+        Args:
+            x0: (B, n).
+            warm: an earlier result for as many states, whose plans are one start more.
+
+        Raises:
+            ValueError: if x0 is no batch of states of the plant.
+        """
+        trailing("DirectShooting.solve", "x0", x0, dims=2, last=self.stage.system.dim)
+        with torch.no_grad():
+            parts = [
+                self._solve(
+                    rows, None if warm is None else selected(warm, k * _ROWS + torch.arange(len(rows)))
+                )
+                for k, rows in enumerate(x0.split(_ROWS))
+            ]
+        return parts[0] if len(parts) == 1 else _joined(parts)
+
+    def _solve(self, x0: Tensor, warm: Optimum | None) -> Optimum:
+        horizon, intervals = self.horizon, self.intervals
+        for doubling in range(_DOUBLINGS + 1):
+            found = self._over(x0, horizon, intervals, warm)
+            long = bool((found.horizon_error.nan_to_num() > _REST).any())
+            if self.stated[0] is not None or not long or doubling == _DOUBLINGS:
+                break
+            horizon *= 2
+            if self.stated[1] is None:
+                intervals = max(intervals, min(2 * intervals, _MOST))
+        return found
+
+    def _over(self, x0: Tensor, horizon: float, intervals: int, warm: Optimum | None) -> Optimum:
+        """The optima over a horizon: from the base, and where that is not enough from more starts."""
+        time = graded(horizon, intervals // 2).to(x0)
+        base = self.bases[0]
+        start = follow(self, _always(base), x0, time.diff())
+        found = self._improve(start, time, x0, base)
+        hard = ~self._believed(found, x0, start.cost)
+        if not bool(hard.any()):  # costs time alone
+            return found
+        rows = hard.nonzero().flatten()
+        plans = self._guessed(x0[rows], time)
+        if warm is not None:
+            plans.append(self._warm(warm, x0[rows], rows, time))
+        plans = _cheapest(plans, self.starts, start.cost[rows])
+        # All starts of all rows are one batch: what a step costs hardly depends on its size.
+        together = Plan(*(torch.cat(parts) for parts in zip(*plans, strict=True)))
+        improved = self._improve(together, time, x0[rows].repeat(len(plans), 1), base)
+        places = torch.arange(len(rows))
+        several = [selected(improved, k * len(rows) + places) for k in range(len(plans))]
+        return _merged(found, rows, several)
+
+    def _believed(self, found: Optimum, x0: Tensor, followed: Tensor) -> Tensor:
+        """Rows in which one start is enough, given what following the base costs there: (B,) bool."""
+        if self.lqr is None or isinstance(self.stage.system, Linear):
+            return found.converged
+        ratio = found.value / self.lqr.value(x0)
+        near = (ratio > _NEAR[0]) & (ratio < _NEAR[1]) & (followed <= _PLAIN * found.value)
+        return found.converged & ((x0 == 0).all(-1) | near)
+
+    def _guessed(self, x0: Tensor, time: Tensor) -> list[Plan]:
+        lengths, horizon = time.diff(), float(time[-1])
+        plans = [follow(self, _always(base), x0, lengths) for base in self.bases]
+        for base in self.bases:
+            several = guesses(self.stage.cost, base, x0, horizon, _SPLINES, self.seed)
+            plans += [follow(self, guided(guess, base), x0, lengths) for guess in several]
+        return plans
+
+    def _warm(self, warm: Optimum, x0: Tensor, rows: Tensor, time: Tensor) -> Plan:
+        """An earlier plan, held open loop on this mesh."""
+        runner = warm.replay()
+        runner.plan = runner.plan[rows]
+
+        def control(x: Tensor, t: float) -> Tensor:
+            k = min(int(torch.searchsorted(warm.time, t, right=True)) - 1, len(warm.time) - 2)
+            share = float((t - warm.time[k]) / (warm.time[k + 1] - warm.time[k]))
+            first, last = runner.plan[:, k].unbind(1)
+            return first + min(share, 1.0) * (last - first)
+
+        return follow(self, control, x0, time.diff())
+
+    def _improve(self, start: Plan, time: Tensor, x0: Tensor, base: Policy) -> Optimum:
+        """Newton's method on two meshes from a plan on the coarse one."""
+        coarse = minimise(self, start, time.diff())
+        fine_start = self._finer(coarse, time.diff())
+        time = halved(time)
+        if not bool(coarse.converged.all()):  # costs time alone: the other rows go on from where they are
+            again = follow(self, _always(base), x0, time.diff())
+            lower = ~coarse.converged & (again.cost < fine_start.cost)
+            fine_start = chosen(~lower, fine_start, again)
+        return self._optimum(minimise(self, fine_start, time.diff()), coarse, time)
+
+    def _finer(self, solution: Solution, lengths: Tensor) -> Plan:
+        """The same control on a mesh of half the intervals, with its cost there."""
+        plan, feedback = split(self.stage, solution.plan, solution.feedback, lengths)
+        halves = (0.5 * lengths).repeat_interleave(2)
+        none = torch.zeros_like(plan.control)
+        return replay(self.stage, plan, plan.state[:, 0], halves, self.terminal, feedback, none)
+
+    def _optimum(self, fine: Solution, coarse: Solution, time: Tensor) -> Optimum:
+        x0, plan = fine.plan.state[:, 0], fine.plan
+        value = self._finer(fine, time.diff()).cost  # the same control, more exactly integrated
+        left = self._left(fine, time) / value
+        rest = (self.stage.cost.deviation(x0) == 0).all(-1)  # where the optimum is to stay
+        good = fine.converged & torch.isfinite(value) & (left <= _GAP)
+        gradient = torch.where(rest.unsqueeze(-1), 0.0, fine.gradient)
+        value = torch.where(rest, 0.0, value)
+        known = good | rest
+        nodes = self.stage.input(plan.control.unflatten(-1, (2, -1)))
+        control = nodes[:, 0, 0]
+        if isinstance(self.stage.system, ControlAffineSystem):
+            control = self.stage.cost.policy(self.stage.system.effectiveness(x0), gradient)
+
+        def where_known(values: Tensor) -> Tensor:
+            return chosen(known, (values,), (torch.full_like(values, torch.nan),))[0]
+
+        change = (plan.cost - coarse.plan.cost).abs() / value
+        change = torch.where(coarse.converged, change, torch.inf)
+        share = self.terminal(plan.state[:, -1]) / value
+        return Optimum(
+            value=where_known(value),
+            gradient=where_known(gradient),
+            control=where_known(control),
+            state=where_known(plan.state),
+            time=time,
+            mesh_error=where_known(torch.where(rest, 0.0, change)),
+            horizon_error=where_known(torch.where(rest, 0.0, share)),
+            iterations=coarse.iterations + fine.iterations,
+            converged=known,
+            plan=where_known(nodes),
+            optimality=torch.where(rest, 0.0, left),
+            reason=tuple(_why(bool(known[b]), fine, float(left[b]), b) for b in range(len(x0))),
+        )
+
+    def _left(self, solution: Solution, time: Tensor) -> Tensor:
+        """int of the Hamiltonian over its minimum along a plan, (B,)."""
+        state, costate, lengths = solution.plan.state, solution.costates, time.diff()
+        first, last = solution.plan.control.chunk(2, dim=-1)
+        start = self.stage.gap(state[:, :-1], first, costate[:, :-1])
+        end = self.stage.gap(state[:, 1:], last, costate[:, 1:])
+        return (0.5 * lengths * (start + end)).sum(-1)
+
+
+def _always(policy: Policy) -> Callable[[Tensor, float], Tensor]:
+    """A policy as a control u(x, t)."""
+    return lambda x, t: policy(x)
+
+
+def _why(known: bool, solution: Solution, left: float, row: int) -> str:
+    """Why a row has no optimum, in words; empty where it has."""
+    if known:
+        return ""
+    if not bool(torch.isfinite(solution.plan.cost[row])):
+        return "the cost is not finite from here under any start: give a `base` that does not diverge"
+    if not bool(solution.converged[row]):
+        promise = float(solution.promise[row])
+        if not math.isfinite(promise):
+            return "not stationary: the expansion around the last trajectory is not finite or has no minimum"
+        return f"not stationary: the last model promised {promise:.2g} of the value"
+    return f"the control misses the minimum of the Hamiltonian by {left:.2g} of the value: it is saturated"
+
+
+def _cheapest(plans: list[Plan], count: int, used: Tensor) -> list[Plan]:
+    """The ``count`` cheapest of several plans that differ from each other and from one used, row by row.
+
+    Two that cost the same are mirror images, or one and the same: they would find the same, and agree with
+    nobody but themselves. All but the first of them come last, as plans that cost inf.
+
+    Args:
+        plans: of the rows.
+        count: at most.
+        used: cost of the plan that was improved already, (B,).
+    """
+    costs = torch.stack([used, *(plan.cost for plan in plans)])  # (1 + S, B)
+    apart = (costs.unsqueeze(1) - costs).abs() > _MIRRORED * costs
+    same = ~apart & torch.isfinite(costs)
+    earlier = torch.ones_like(same[..., 0]).tril(-1).unsqueeze(-1)  # plan i after plan j
+    costs = torch.where((same & earlier).any(1), torch.inf, costs)[1:]
+    order = costs.argsort(dim=0, stable=True)[: min(count, len(plans))]
+    rows = torch.arange(costs.shape[1])
+    state, control = (torch.stack([getattr(p, name) for p in plans]) for name in ("state", "control"))
+    return [Plan(state[k, rows], control[k, rows], costs[k, rows]) for k in order]
+
+
+def selected(optimum: Optimum, rows: Tensor) -> Optimum:
+    """Some rows of a result."""
+    parts = {name: part[rows] for name, part in _tensors(optimum).items()}
+    reason = tuple(optimum.reason[row] for row in rows.tolist())
+    return optimum._replace(**parts, reason=reason)
+
+
+def _tensors(optimum: Optimum) -> dict[str, Tensor]:
+    """What has a row a state."""
+    return {name: part for name, part in optimum._asdict().items() if name not in ("time", "reason")}
+
+
+def _merged(found: Optimum, rows: Tensor, several: list[Optimum]) -> Optimum:
+    """The best of several starts in some rows, and the others as they were."""
+    every = [selected(found, rows), *several]
+    values = torch.stack([each.value.nan_to_num(nan=torch.inf) for each in every])  # (S, B')
+    best, count = values.argmin(0), agreement(values, _SAME)
+    places = torch.arange(len(rows))
+    columns = {}
+    for name, whole in _tensors(found).items():
+        chosen = torch.stack([getattr(each, name) for each in every])[best, places]
+        columns[name] = whole.index_copy(0, rows, chosen)
+    spent = torch.stack([each.iterations for each in every]).sum(0)
+    columns["iterations"] = found.iterations.index_copy(0, rows, spent)
+    reasons, converged = list(found.reason), found.converged.clone()
+    for place, row in enumerate(rows.tolist()):
+        finite = [float(v) for v in values[:, place] if math.isfinite(v)]
+        converged[row] = int(count[place]) > 1 and bool(finite)
+        if not finite:
+            reasons[row] = found.reason[row]
+        else:
+            reasons[row] = "" if bool(converged[row]) else said(finite, min(finite))
+    columns["converged"] = converged
+    return found._replace(**columns, reason=tuple(reasons))
+
+
+def _joined(parts: list[Optimum]) -> Optimum:
+    """Results of pieces of a batch.
+
+    Raises:
+        ValueError: if a piece needed a longer horizon than another.
+    """
+    longest = max(parts, key=lambda part: float(part.time[-1])).time
+    if any(not torch.equal(part.time, longest) for part in parts):
+        raise ValueError(
+            "`DirectShooting.solve` needed different horizons for different states: state a `horizon` of "
+            f"{float(longest[-1]):.4g} s, or solve at most {_ROWS} states at once."
+        )
+    columns = {name: torch.cat([_tensors(part)[name] for part in parts]) for name in _tensors(parts[0])}
+    reason = tuple(one for part in parts for one in part.reason)
+    return parts[0]._replace(**columns, reason=reason)
+
+
+def _rates(system: Plant, lqr: LQR) -> tuple[float, float]:
+    """The slowest decay and the fastest rate of the LQR's modes, 1/s."""
+    a, b = system.linearisation(lqr.cost.target, lqr.cost.target_input)
+    modes = torch.linalg.eigvals(a.to(lqr.p) - b.to(lqr.p) @ lqr.k)
+    return float(-modes.real.max()), float(modes.abs().max())
+
+
+def graded(horizon: float, intervals: int) -> Tensor:
+    """Times of a mesh whose intervals grow in geometric progression: (N + 1,) from 0 to the horizon."""
+    power = math.log(_GRADING) * torch.arange(intervals + 1, dtype=torch.float64) / max(1, intervals - 1)
+    return horizon * power.expm1() / power[-1].expm1()
+
+
+def halved(time: Tensor) -> Tensor:
+    """The same times and those half-way: (N + 1,) -> (2N + 1,)."""
+    middle = 0.5 * (time[1:] + time[:-1])
+    return torch.cat((time[:1], torch.stack((middle, time[1:]), dim=-1).flatten()))
+
+
+def split(stage: Stage, plan: Plan, feedback: Tensor, lengths: Tensor) -> tuple[Plan, Tensor]:
+    """The same control on half intervals, and a feedback around it.
+
+    Args:
+        stage: of the problem.
+        plan: on N intervals.
+        feedback: around it, (B, N, 2m, n).
+        lengths: of the N intervals, (N,).
+
+    Returns:
+        A plan on 2N intervals (of the old cost) and its feedback (B, 2N, 2m, n).
+    """
+    first, last = plan.control.chunk(2, dim=-1)
+    middle = 0.5 * (first + last)
+    early, late = torch.cat((first, middle), dim=-1), torch.cat((middle, last), dim=-1)
+    between, _ = stage.advance(plan.state[:, :-1], early, 0.5 * lengths.expand(plan.control.shape[:2]))
+    state = torch.stack((plan.state[:, :-1], between), dim=2).flatten(1, 2)
+    state = torch.cat((state, plan.state[:, -1:]), dim=1)
+    control = torch.stack((early, late), dim=2).flatten(1, 2)
+    return Plan(state, control, plan.cost), feedback.repeat_interleave(2, dim=1)

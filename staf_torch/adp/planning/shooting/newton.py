@@ -1,0 +1,250 @@
+"""Newton's method on a transcribed optimal-control problem: one linear-quadratic problem an iteration."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from typing import NamedTuple, Protocol
+
+import torch
+from torch import Tensor
+
+from ....numerics.riccati import riccati_step
+from ..plans import chosen
+from .stage import Expansion, Stage, closed_stage
+
+_ROUNDING = 1e-9  # relative promise below which a step that does not pay is one that rounding hides
+_LEAST_CURVATURE = 1e-6  # of its largest eigenvalue, that a convexified interval keeps
+_SHORTER = (0.5, 0.25, 0.1, 0.03, 0.01)  # shares of the Newton step, where the whole one does not pay
+
+
+class Plan(NamedTuple):
+    """Trajectories of the transcribed problem, a row each."""
+
+    state: Tensor  # (B, N + 1, n)
+    control: Tensor  # v, (B, N, 2m)
+    cost: Tensor  # (B,) inf where it is not finite
+
+
+class Direction(NamedTuple):
+    """The Newton step of every row as an affine feedback v = v_k + share k_k + K_k (x - x_k)."""
+
+    offset: Tensor  # k, (B, N, 2m)
+    feedback: Tensor  # K, (B, N, 2m, n)
+    gradient: Tensor  # of the cost in x(0), after the step, (B, n)
+    decrement: Tensor  # how much the quadratic model falls, (B,)
+    definite: Tensor  # (B,) bool: the quadratic model had a minimum
+    costates: Tensor  # grad V along the plan, (B, N + 1, n)
+
+
+def direction(
+    expansion: Expansion, end: Tensor, end_curvature: Tensor, room: tuple[Tensor, Tensor] | None = None
+) -> Direction:
+    """The minimiser of the quadratic model, backwards in time.
+
+    Args:
+        expansion: of the current plan.
+        end: dV_T/dx at its last state, (B, n).
+        end_curvature: the second derivative there, (B, n, n).
+        room: how far v may fall and rise, (B, N, 2m) each; None where it is not bounded. A control at a bound
+            that the model pushes outward stays there, and gets no feedback.
+    """
+    slope, gradient, curvature = expansion
+    costate, bent = end, end_curvature
+    decrement, definite = torch.zeros_like(end[:, 0]), torch.ones_like(end[:, 0], dtype=torch.bool)
+    offsets, feedbacks, costates = [], [], [end]
+    for k in range(slope.shape[1] - 1, -1, -1):
+
+        def minimum(q: Tensor, cross: Tensor, Q: Tensor, k: int = k) -> tuple[Tensor, Tensor]:
+            nonlocal definite
+            box = () if room is None else (room[0][:, k], room[1][:, k])
+            offset, feedback, good = _boxed_step(q, cross, Q, *box) if box else _free_step(q, cross, Q)
+            definite = definite & good
+            return offset, feedback
+
+        step = riccati_step(costate, bent, slope[:, k], gradient[:, k], curvature[:, k], minimum)
+        costate, bent, decrement = step.gradient, step.curvature, decrement - step.promised
+        offsets.append(step.change)
+        feedbacks.append(step.feedback)
+        costates.append(costate)
+    offset, feedback = torch.stack(offsets[::-1], dim=1), torch.stack(feedbacks[::-1], dim=1)
+    return Direction(offset, feedback, costate, decrement, definite, torch.stack(costates[::-1], dim=1))
+
+
+def _free_step(slope: Tensor, cross: Tensor, curvature: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Offset, feedback and definiteness of the model of one interval, (B, 2m), (B, 2m, n), (B,)."""
+    factor, info = torch.linalg.cholesky_ex(curvature)
+    solved = -torch.cholesky_solve(torch.cat((slope.unsqueeze(-1), cross), dim=-1), factor)
+    return solved[..., 0], solved[..., 1:], info == 0
+
+
+def _boxed_step(
+    slope: Tensor, cross: Tensor, curvature: Tensor, low: Tensor, high: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """`_free_step` within a box, by projected Newton steps: what leaves it is fixed at its bound, and freed
+    where the model pulls it back."""
+    offset, held = torch.zeros_like(slope), None
+    for _ in range(2 * slope.shape[-1]):
+        pull = slope + (curvature @ offset.unsqueeze(-1)).squeeze(-1)
+        fixed = ((offset <= low) & (pull > 0)) | ((offset >= high) & (pull < 0))
+        if held is not None and torch.equal(fixed, held):  # costs time alone: every further pass is this one
+            break
+        held, free = fixed, (~fixed).to(slope)
+        both = free.unsqueeze(-1) * free.unsqueeze(-2)
+        factor, info = torch.linalg.cholesky_ex(both * curvature + torch.diag_embed(1 - free))
+        right = torch.cat(((free * pull).unsqueeze(-1), free.unsqueeze(-1) * cross), dim=-1)
+        solved = -torch.cholesky_solve(right, factor)
+        offset = torch.minimum(torch.maximum(offset + solved[..., 0], low), high)
+    bent = (offset <= low) | (offset >= high)
+    feedback = torch.where(bent.unsqueeze(-1), 0.0, solved[..., 1:])
+    return offset, feedback, info == 0
+
+
+def convexified(expansion: Expansion) -> Expansion:
+    """The same with every interval's curvature replaced by its absolute value: the model has a minimum."""
+    finite = torch.where(torch.isfinite(expansion.curvature), expansion.curvature, 0.0)
+    values, vectors = torch.linalg.eigh(finite)
+    size = values.abs()
+    size = torch.maximum(size, _LEAST_CURVATURE * size.amax(-1, keepdim=True))
+    return expansion._replace(curvature=(vectors * size.unsqueeze(-2)) @ vectors.mT)
+
+
+def replay(
+    stage: Stage, plan: Plan, x0: Tensor, lengths: Tensor, terminal: object, feedback: Tensor, offset: Tensor
+) -> Plan:
+    """The plan's control with feedback around its states and an offset, from x0 (..., B, n)."""
+
+    def control(x: Tensor, k: int) -> Tensor:
+        apart = (x - plan.state[:, k]).unsqueeze(-2)
+        return stage.admitted(plan.control[:, k] + offset[..., k, :] + (feedback[:, k] * apart).sum(-1))
+
+    return _driven(stage, control, x0, lengths, terminal)
+
+
+def _driven(
+    stage: Stage, control: Callable[[Tensor, int], Tensor], x0: Tensor, lengths: Tensor, terminal: object
+) -> Plan:
+    """The trajectories from x0 (..., B, n) under a control v(x, interval), with what they cost."""
+    x, states, controls, seen = x0, [x0], [], []
+    for k, h in enumerate(lengths.unbind()):
+        v = control(x, k)
+        x, at = stage.moved(x, v, h)
+        states.append(x)
+        controls.append(v)
+        seen.append(at)
+    v = torch.stack(controls, dim=-2)
+    # What was paid, for all intervals at once: one by one that is a good part of the time of a replay.
+    paid = stage.paid([torch.stack(part, dim=-2) for part in zip(*seen, strict=True)], v, lengths)
+    cost = paid.sum(-1) + terminal(x)  # type: ignore[operator]
+    return Plan(torch.stack(states, dim=-2), v, torch.where(torch.isfinite(cost), cost, torch.inf))
+
+
+def improved(
+    stage: Stage, plan: Plan, lengths: Tensor, terminal: object, step: Direction
+) -> tuple[Plan, Tensor]:
+    """The plan after the longest share of the step that lowers its cost, and which rows it lowered."""
+    x0 = plan.state[:, 0]
+    tried = replay(stage, plan, x0, lengths, terminal, step.feedback, step.offset)
+    lower = tried.cost < plan.cost
+    best = chosen(lower, tried, plan)
+    if not bool(lower.all()):  # costs time alone: rows that took the whole step keep it
+        shares = torch.tensor(_SHORTER, dtype=x0.dtype, device=x0.device)
+        several = x0.expand(len(shares), *x0.shape)
+        offsets = shares[:, None, None, None] * step.offset
+        tried = replay(stage, plan, several, lengths, terminal, step.feedback, offsets)
+        cost, which = tried.cost.min(dim=0)
+        rows = torch.arange(len(x0), device=x0.device)
+        shortened = Plan(tried.state[which, rows], tried.control[which, rows], cost)
+        pays = ~lower & (cost < plan.cost)
+        best, lower = chosen(pays, shortened, best), lower | pays
+    return best, lower
+
+
+class Problem(Protocol):
+    """What the iteration needs to know; `DirectShooting` has it."""
+
+    stage: Stage
+    terminal: Callable[[Tensor], Tensor]
+    tolerance: float
+    iterations: int
+
+
+class Solution(NamedTuple):
+    """Where the iteration ended, a row each."""
+
+    plan: Plan
+    feedback: Tensor  # of the last expansion, (B, N, 2m, n)
+    gradient: Tensor  # of the cost in x(0), (B, n)
+    converged: Tensor  # (B,) bool
+    costates: Tensor  # grad V along the plan, (B, N + 1, n)
+    promise: Tensor  # relative improvement that the last model promises, (B,)
+    iterations: Tensor  # (B,)
+
+
+def follow(problem: Problem, control: Callable[[Tensor, float], Tensor], x0: Tensor, lengths: Tensor) -> Plan:
+    """The trajectories under a control u(x, t) on a mesh: (B, n), (N,)."""
+    stage, times = problem.stage, [0.0, *itertools.accumulate(lengths.tolist())]
+
+    def both(x: Tensor, k: int) -> Tensor:
+        now, end, h = times[k], times[k + 1], lengths[k]
+        ahead = closed_stage(stage, _at(control, now), x, h)
+        v = [stage.cost.unsaturated(control(at, t)) for at, t in ((x, now), (ahead, end - 1e-9 * float(h)))]
+        return stage.admitted(torch.cat(v, dim=-1))
+
+    return _driven(stage, both, x0, lengths, problem.terminal)
+
+
+def _at(control: Callable[[Tensor, float], Tensor], t: float) -> Callable[[Tensor], Tensor]:
+    """The control of one time as a policy."""
+    return lambda x: control(x, t)
+
+
+def minimise(problem: Problem, plan: Plan, lengths: Tensor) -> Solution:
+    """Newton's iteration from a plan on a mesh of interval lengths (N,)."""
+    batch = len(plan.cost)
+    done = torch.zeros(batch, dtype=torch.bool, device=plan.cost.device)
+    stuck, rough = ~torch.isfinite(plan.cost), torch.zeros_like(done)
+    count = torch.zeros(batch, dtype=torch.int64, device=plan.cost.device)
+    kept, rough = _step(problem, plan, lengths, rough)
+    for _ in range(problem.iterations):
+        promise = kept.decrement / plan.cost
+        done = done | (~stuck & kept.definite & (promise <= problem.tolerance))
+        if bool((done | stuck).all()):  # costs time alone: rows that are done no longer move
+            break
+        moved, lower = improved(problem.stage, plan, lengths, problem.terminal, kept)
+        moving = ~done & ~stuck
+        plan = chosen(moving & lower, moved, plan)
+        count = count + moving
+        done = done | (moving & ~lower & (promise <= _ROUNDING))
+        stuck = stuck | (moving & ~lower & ~done & rough)
+        step, rough = _step(problem, plan, lengths, moving & ~lower)  # convexified where it did not pay
+        kept = chosen(done | stuck, kept, step)
+    promise = torch.where(kept.definite, kept.decrement / plan.cost, torch.inf)
+    return Solution(plan, kept.feedback, kept.gradient, done, kept.costates, promise, count)
+
+
+def _step(problem: Problem, plan: Plan, lengths: Tensor, rough: Tensor) -> tuple[Direction, Tensor]:
+    """The Newton step, of the convexified model in the rows ``rough`` and where it has no minimum."""
+    slope, curvature = _derivatives(problem.terminal, plan.state[:, -1])
+    batch, intervals = plan.control.shape[:2]
+    spread = lengths.expand(batch, intervals)
+    expansion = problem.stage.expand(plan.state[:, :-1], plan.control, spread, slope)
+    room = problem.stage.room(plan.control)
+    step = direction(expansion, slope, curvature, room)
+    rough = rough | ~step.definite
+    if bool(rough.any()):  # costs time alone
+        step = chosen(~rough, step, direction(convexified(expansion), slope, curvature, room))
+    return step, rough
+
+
+def _derivatives(value: Callable[[Tensor], Tensor], x: Tensor) -> tuple[Tensor, Tensor]:
+    """First and second derivatives of V_T: (B, n) -> (B, n), (B, n, n)."""
+    with torch.enable_grad():
+        at = x.detach().requires_grad_()
+        (slope,) = torch.autograd.grad(value(at).sum(), at, create_graph=True)
+        rows = [
+            torch.autograd.grad(s.sum(), at, retain_graph=True, materialize_grads=True)[0]
+            for s in slope.unbind(-1)
+        ]
+    curvature = torch.stack(rows, dim=-2)
+    return slope.detach(), 0.5 * (curvature + curvature.mT)

@@ -1,0 +1,104 @@
+"""What direct shooting found, and a controller that runs it."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ...loop.controller import Controller, ControllerState, carrying
+
+
+class Optimum(NamedTuple):
+    """The best trajectories found from x0, a row each; NaN in the rows where none was found.
+
+    Example:
+        >>> plant = systems.TwoState()
+        >>> cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
+        >>> found = adp.DirectShooting(plant, cost).solve(torch.tensor([[0.2, 0.1]]).double())
+        >>> bool(found.converged.all()), bool(found.mesh_error.max() < 1e-4)
+        (True, True)
+
+        Shown by `staf experiment=adp_three_state`.
+    """
+
+    value: Tensor  # V*(x0), (B,): the cost of the control that was found
+    gradient: Tensor  # grad V*(x0), (B, n)
+    control: Tensor  # u*(x0), (B, m)
+    state: Tensor  # (B, N + 1, n)
+    time: Tensor  # (N + 1,) seconds
+    mesh_error: Tensor  # relative change of the value since a mesh of half as many intervals, (B,); inf if
+    # that mesh was too coarse to converge on
+    horizon_error: Tensor  # share of the value that is the terminal cost, (B,)
+    iterations: Tensor  # Newton steps, all meshes and starts together, (B,)
+    converged: Tensor  # (B,) bool: stationary in u, and no other start was known to be lower by 1e-4
+    plan: Tensor  # u at the start and at the end of every interval, linear in between, (B, N, 2, m)
+    optimality: Tensor  # (B,) what is left of the Hamiltonian over its minimum, as a share of the value
+    reason: tuple[str, ...]  # a row: "" where it converged, else why it did not, or "local: ..."
+
+    def __repr__(self) -> str:
+        rows, times = self.state.shape[:2]
+        value = self.value[torch.isfinite(self.value)]
+        span = "none found" if not len(value) else f"{float(value.min()):.6g} to {float(value.max()):.6g}"
+        found = int(self.converged.sum())
+        why = sorted({reason for reason in self.reason if reason})
+        more = f"; {why[0]}" + (f" (and {len(why) - 1} more reasons)" if len(why) > 1 else "") if why else ""
+        return (
+            f"Optimum({rows} states, value {span}, {found} converged, {times - 1} intervals over "
+            f"{float(self.time[-1]):.4g} s{more})"
+        )
+
+    def replay(self) -> PlanReplay:
+        """A controller that runs the plan of every row, open loop; it holds the mean over each period."""
+        return PlanReplay(self.time, self.plan)
+
+
+class PlanReplay(Controller):
+    """u(t) of a plan that is linear on each interval, averaged over each period; its last value afterwards.
+
+    Example:
+        >>> plant = systems.TwoState()
+        >>> cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
+        >>> x0 = torch.tensor([[0.2, 0.1]]).double()
+        >>> found = adp.DirectShooting(plant, cost).solve(x0)
+        >>> run = adp.simulate(found.replay(), plant, cost, x0, dt=0.01, steps=100, compile=False)
+        >>> bool(run.cost < found.value)  # until then; the plan goes on
+        True
+
+        Shown by `staf_torch/adp/README.md`.
+
+    Args:
+        time: (N + 1,) seconds, from 0.
+        plan: (B, N, 2, m), u at the start and the end of every interval.
+    """
+
+    def __init__(self, time: Tensor, plan: Tensor) -> None:
+        super().__init__()
+        self.register_buffer("time", time)
+        self.register_buffer("plan", plan)
+        self.time: Tensor
+        self.plan: Tensor
+
+    def init(self, x0: Tensor) -> ControllerState:
+        if len(x0) != len(self.plan):
+            raise ValueError(f"This plan is for {len(self.plan)} initial states; got {len(x0)}.")
+        return carrying(x0.new_zeros(len(x0), 1))
+
+    def step(
+        self, x: Tensor, carried: ControllerState, uniform: Tensor, dt: float
+    ) -> tuple[Tensor, ControllerState]:
+        now = float(carried.identifier[0, 0])
+        u = (self.integral(now + dt) - self.integral(now)) / dt
+        return u.to(x), carried._replace(identifier=carried.identifier + dt)
+
+    def integral(self, until: float) -> Tensor:
+        """int_0^t u dt, (B, m)."""
+        lengths = self.time.diff()
+        share = ((until - self.time[:-1]) / lengths).clamp(0.0, 1.0)
+        first, last = self.plan.unbind(2)
+        weights = (lengths * share)[:, None]
+        reached = first + 0.5 * share[:, None] * (last - first)
+        beyond = max(0.0, until - float(self.time[-1]))
+        total: Tensor = (weights * reached).sum(1) + beyond * last[:, -1]
+        return total

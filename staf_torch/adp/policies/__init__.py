@@ -1,0 +1,1 @@
+"""Feedback that is computed from a model: rollouts, energy shaping, path integrals."""

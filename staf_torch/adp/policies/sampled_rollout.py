@@ -1,0 +1,276 @@
+"""A policy that is held for a period and improved by rollouts, never by its word alone."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from ...approximation.basis import StaFBasis
+from ...lanes import each, repeat, scan
+from ...lanes.function import RowFunction
+from ...numerics.box import LARGEST, box_minimum
+from ...numerics.checks import fail, integer, positive_real
+from ...systems import Bounds, Plant
+from ..loop.controller import Policy, Value
+from ..problem.cost import Cost, matvec
+from ..problem.held_plant import Holding
+from .followed_simulation import followed
+
+_SHARES = (1.0, 0.3)  # of the Newton step, that are tried
+_PROBE = 1e-3  # of the range of an input, or of 1, by which it is moved to find slopes
+_SHORTER = 0.75  # of the horizon, at which the promise of a control must hold as well
+_MARGIN = 1e-9  # relative, by which a control must be better than the base's
+
+
+Stretch = tuple[Tensor, Tensor, Tensor]
+"""The state, what was paid, and what a cost still counts."""
+
+
+class Promise(NamedTuple):
+    """What rollouts of the base say."""
+
+    whole: Tensor  # cost over the horizon and V_T at its end, (...)
+    part: Tensor  # likewise over three quarters of it
+    free: Tensor  # (...) bool: no bound holds the base's control at the end, so that V_T can be believed
+
+
+class Along(NamedTuple):
+    """A basis of the inputs, around which nothing changes with the state."""
+
+    places: Tensor  # z of the centers, (M, m)
+    weights: Tensor  # dV^/dz at 0 is these times the values at the centers, (m, M)
+    middle: int | None  # the center at z = 0
+
+
+class SampledRollout(nn.Module):
+    """u(x) = the best of u_b and u_b + s d, s in {1, 0.3}, by what a simulation of each costs:
+
+        Q(x, u) = cost of holding u for one period + sum of the base's costs over the horizon + V_T,
+        d = argmin over the box of (r_u + B'grad V^)'d + d'(R + B'P B) d,
+
+    where u_b is the base policy's control, B = dx+/du, and V^ interpolates, at M centers around the state
+    after one period, the cost of the base from there. The fit proposes; the comparison on rollouts of the
+    same length decides, state by state: a control that does not promise less than the base's, both over the
+    horizon and over three quarters of it (where V_T is wrong the two disagree), is not applied, nor is one
+    after which the base still ends at a bound. Slopes in u are central differences, so that a simulator in
+    NumPy will do. V^ may live along the inputs alone: with a basis of m coordinates z the centers are the
+    states x + sum_j z_j B_j / |B_j|, with B_j the columns of B, since B'grad V^ is all of grad V^ that d
+    takes. These are 2 m + 1 simulations in place of 2 n + 1.
+
+    Example:
+        >>> plant = systems.Pendulum()
+        >>> policy = adp.near_optimal(plant, adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1), dt=0.05)
+        >>> policy(torch.tensor([0.4, 0.0], dtype=torch.float64)).shape
+        torch.Size([1])
+
+        Shown by `staf_torch/adp/README.md`.
+
+    Args:
+        basis: kernel and centers, of the n states or of the m inputs; of the latter it is read once, here.
+        plant: in continuous or in discrete time, of at most 4 inputs.
+        cost: the cost rate.
+        base: the base policy, (..., n) -> (..., m).
+        terminal: V_T, (..., n) -> (...): the value of the base at the end of a rollout.
+        metric: P, (n, n), positive semidefinite, of the step's length: that of the LQR.
+        period: s, for which a control is held.
+        steps: periods in the horizon, at least 4.
+        substeps: integration steps a period of a plant in continuous time.
+
+    Raises:
+        ValueError: if an argument breaks its rule.
+
+    Source: Bertsekas, "Rollout, Policy Iteration, and Distributed Reinforcement Learning" (2020), ch. 2: a
+    rollout that keeps the base's control among its choices does not cost more than the base.
+    """
+
+    def __init__(
+        self,
+        basis: StaFBasis,
+        plant: Plant,
+        cost: Cost,
+        base: Policy,
+        terminal: Value,
+        metric: Tensor,
+        *,
+        period: float,
+        steps: int = 20,
+        substeps: int = 1,
+    ) -> None:
+        super().__init__()
+        cost = cost.around(plant)
+        if basis.dim not in (cost.dim, cost.inputs):
+            rule = f"must have the plant's {cost.dim} states or its {cost.inputs} inputs"
+            raise fail("SampledRollout", "basis", rule, basis.dim)
+        if cost.inputs > LARGEST:
+            raise fail("SampledRollout", "plant", f"must have at most {LARGEST} inputs", cost.inputs)
+        self.basis, self.plant, self.cost, self.base, self.terminal = basis, plant, cost, base, terminal
+        self.period = positive_real("SampledRollout", "period", period)
+        self.steps = integer("SampledRollout", "steps", steps, least=4)
+        self.holding = Holding("SampledRollout", plant, cost, self.period, substeps)
+        self.register_buffer("metric", metric.double())
+        self.metric: Tensor
+        self.bounds = Bounds(None, None, cost.inputs) if cost.bounds is None else cost.bounds
+        span = self.bounds.high - self.bounds.low
+        self.register_buffer("probe", _PROBE * torch.where(torch.isfinite(span), span, 1.0))  # (m,)
+        self.probe: Tensor
+        self.along = None if basis.dim == cost.dim else _along(basis)
+        self._compiled = RowFunction(self.control, self, "a sampled rollout") if plant.traceable else None
+        self._followed = followed(plant, base, self.bounds, self.period)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """u: (..., n) -> (..., m)."""
+        return self._compiled(x) if self._compiled is not None else self.control(x)
+
+    @property
+    def compiled(self) -> bool:
+        """Whether a compiled program has served a call."""
+        return self._compiled is not None and self._compiled.compiled
+
+    def control(self, x: Tensor) -> Tensor:
+        """`forward` in plain torch: (..., n) -> (..., m)."""
+        base = self.bounds.clip(self.base(x))
+        step, known = self._proposed(x, base)
+        tried = torch.stack([base, *(self.bounds.clip(base + share * step) for share in _SHARES)], dim=-2)
+        after, paid = self.holding(x.unsqueeze(-2).expand(*tried.shape[:-1], x.shape[-1]), tried)
+        promise, discount = self._promise(after, known), self._discount()
+        whole, part = paid + discount * promise.whole, paid + discount * promise.part  # (..., 3)
+        least = whole[..., :1] - _MARGIN * whole[..., :1].abs()
+        better = promise.free & (whole < least) & (part < part[..., :1])
+        u, best = base, whole[..., 0]
+        for k in range(1, tried.shape[-2]):
+            lower = better[..., k] & (whole[..., k] < best)
+            u = torch.where(lower.unsqueeze(-1), tried[..., k, :], u)
+            best = torch.where(lower, whole[..., k], best)
+        return u
+
+    def proposal(self, x: Tensor, base: Tensor) -> Tensor:
+        """The Newton step d from the base's control, by the fit: (..., n), (..., m) -> (..., m)."""
+        return self._proposed(x, base)[0]
+
+    def _proposed(self, x: Tensor, base: Tensor) -> tuple[Tensor, Promise]:
+        """`proposal`, and what the base promises from the centers, (..., M)."""
+        after, _ = self.holding(x, base)
+        probes = torch.diag(self.probe).to(x)
+        around = torch.cat((base.unsqueeze(-2) + probes, base.unsqueeze(-2) - probes), dim=-2)  # (..., 2m, m)
+        moved, paid = self.holding(x.unsqueeze(-2).expand(*around.shape[:-1], x.shape[-1]), around)
+        size, width = base.shape[-1], 2 * self.probe.to(x)
+        slopes = (moved[..., :size, :] - moved[..., size:, :]) / width.unsqueeze(-1)  # B', (..., m, n)
+        rise = (paid[..., :size] - paid[..., size:]) / width
+        if self.along is None:
+            known = self.rollout(self.basis.centers(after))
+            steep = matvec(slopes, _rise(self.basis, after, known.whole))
+        else:
+            reach = slopes.square().sum(-1).sqrt()  # |B_j|, (..., m)
+            units = slopes / torch.where(reach > 0, reach, 1.0).unsqueeze(-1)
+            away = (self.along.places.unsqueeze(-1) * units.unsqueeze(-3)).sum(-2)  # (..., M, n)
+            known = self.rollout(after.unsqueeze(-2) + away)
+            steep = reach * matvec(self.along.weights, known.whole)
+        pull = rise + self._discount() * steep
+        weighted = (slopes.unsqueeze(-2) * self.metric.to(x)).sum(-1)  # B'P, (..., m, n)
+        bent = (weighted.unsqueeze(-2) * slopes.unsqueeze(-3)).sum(-1)  # B'P B, (..., m, m)
+        curvature = 2 * (self.period * self.cost.r.to(x) + bent)
+        low, high = self.bounds.low.to(x) - base, self.bounds.high.to(x) - base
+        return box_minimum(curvature, pull, low, high), known
+
+    def gradient(self, x: Tensor) -> Tensor:
+        """grad V^ at x, of the base's cost fitted at the centers around it: (..., n) -> (..., n).
+
+        Raises:
+            ValueError: if the basis is of the inputs, along which alone V^ is then known.
+        """
+        if self.along is not None:
+            raise fail("SampledRollout", "basis", "must be of the states to know grad V^", self.basis.dim)
+        return _rise(self.basis, x, self.rollout(self.basis.centers(x)).whole)
+
+    def _promise(self, after: Tensor, known: Promise) -> Promise:
+        """What the base promises from (..., 1 + S, n), of which the first may be among the centers."""
+        middle = None if self.along is None else self.along.middle
+        if middle is None:
+            return self.rollout(after)
+        others = self.rollout(after[..., 1:, :])
+        first = (part[..., middle : middle + 1] for part in known)
+        return Promise(*(torch.cat(pair, dim=-1) for pair in zip(first, others, strict=True)))
+
+    def rollout(self, x: Tensor) -> Promise:
+        """What the base costs from x on: (..., n)."""
+        rest = max(1, self.steps - round(_SHORTER * self.steps))
+        passes = math.gcd(self.steps, rest)  # of a stretch of which both are made: a program has one loop
+        discount = self._discount()
+        if self._followed is not None:
+            return self._promised(x, self.steps - rest)
+
+        stretches = x.new_zeros(self.steps // passes)
+
+        def step(now: Stretch) -> Stretch:
+            at, spent, share = now
+            after, paid = self.holding(at, self.bounds.clip(self.base(at)))
+            return after, spent + share * paid, discount * share
+
+        def stretch(now: Stretch, _: Tensor) -> tuple[Stretch, Tensor]:
+            at, spent, share = repeat(passes, step, now)
+            return (at, spent, share), spent + share * self.terminal(at)
+
+        def whole(x: Tensor) -> Tensor:
+            none = torch.zeros_like(x[..., 0])
+            (at, _, _), promised = scan(stretch, (x, none, none + 1.0), stretches, dim=0)
+            u = self.base(at)
+            free = ((u > self.bounds.low.to(x)) & (u < self.bounds.high.to(x))).all(-1)
+            return torch.stack((promised[-1], promised[-1 - rest // passes], free.to(x)), dim=-1)
+
+        found: Tensor = each(whole, x, dim=x.dim() - 2) if x.dim() > 1 else whole(x)
+        return Promise(found[..., 0], found[..., 1], found[..., 2] > 0)
+
+    def meets_bound(self, x: Tensor) -> Tensor:
+        """1 where the base, followed over the horizon, meets a bound, else 0: (..., n) -> (..., 1)."""
+        low, high = self.bounds.low.to(x), self.bounds.high.to(x)
+
+        def step(now: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+            at, met = now
+            u = self.bounds.clip(self.base(at))
+            after, _ = self.holding(at, u)
+            return after, torch.where(((u <= low) | (u >= high)).any(-1), 1.0, met)
+
+        met: Tensor = repeat(self.steps, step, (x, torch.zeros_like(x[..., 0])))[1]
+        return met.unsqueeze(-1)
+
+    def _promised(self, x: Tensor, first: int) -> Promise:
+        """`rollout` of a simulator: it goes through all periods, and then all of it is paid for at once."""
+        assert self._followed is not None
+        states, controls = self._followed(x, self.steps)
+        paid = self.period * self.cost.rate(states[..., :-1, :], controls)
+        share = torch.exp(-self.cost.discount * self.period * torch.arange(self.steps + 1, dtype=x.dtype))
+        spent = (share[:-1] * paid).cumsum(-1)
+        part = spent[..., first - 1] + share[first] * self.terminal(states[..., first, :])
+        end = states[..., -1, :]
+        u = self.base(end)
+        free = ((u > self.bounds.low.to(x)) & (u < self.bounds.high.to(x))).all(-1)
+        return Promise(spent[..., -1] + share[-1] * self.terminal(end), part, free)
+
+    def value(self, x: Tensor) -> Tensor:
+        """What the chosen control promises: (..., n) -> (...)."""
+        after, paid = self.holding(x, self.control(x))
+        return paid + self._discount() * self.rollout(after).whole
+
+    def _discount(self) -> float:
+        return math.exp(-self.cost.discount * self.period)
+
+
+def _rise(basis: StaFBasis, z: Tensor, values: Tensor) -> Tensor:
+    """The slope at z of what fits the values at the centers there: (..., n), (..., M) -> (..., n)."""
+    space = basis.local(z)
+    coefficients = space.fit(values)
+    rise: Tensor = torch.func.grad(lambda d: space.evaluate(d.unsqueeze(-2), coefficients).sum())(
+        torch.zeros_like(z)
+    )
+    return rise
+
+
+def _along(basis: StaFBasis) -> Along:
+    middle = basis.centers.directions.new_zeros(basis.count, basis.dim)
+    places = basis.centers(middle[0])
+    weights = _rise(basis, middle, torch.eye(basis.count, dtype=middle.dtype)).mT  # a unit value a row
+    at = (places == 0).all(-1).nonzero().flatten().tolist()
+    return Along(places, weights, at[0] if at else None)

@@ -1,0 +1,394 @@
+"""What a controller is paid for, and the policy that a value gradient implies."""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Callable, Sequence
+from typing import Self
+
+import torch
+from torch import Tensor, nn
+
+from ...numerics.angles import wrap
+from ...numerics.box import LARGEST, box_minimum, face_inverses
+from ...numerics.checks import copied, fail, non_negative, one_or_each, positive, positive_real, real, vector
+from ...numerics.linalg import positive_definite, positive_semidefinite
+from ...systems import Bounds, Plant
+from ...systems.bounds import Limit
+from ...systems.equilibria import check_rest, resting_input_at
+
+_EDGE = 1 - 1e-9  # of the bound, beyond which artanh is that of this share
+
+Matrix = float | Sequence[float] | Sequence[Sequence[float]] | Tensor
+Output = Callable[[Tensor], Tensor]
+"""y from x: (..., n) -> (..., p)."""
+
+
+class Cost(nn.Module, abc.ABC):
+    """The cost rate e'Qe + U(u) of an infinite horizon, with U convex and 0 at the input that holds the plant
+    at the set-point. e is the state measured from there, angles in [-pi, pi], or an output of it.
+
+    Example:
+        >>> isinstance(adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1), adp.Cost)
+        True
+
+        Shown by `staf experiment=adp`.
+
+    Args:
+        state: Q, (n, n), positive semidefinite, or its diagonal (n,); a number q stands for q I.
+        control: R, (m, m), positive definite; a number likewise.
+        dim: n.
+        inputs: m.
+        low: of the inputs, as in `systems.Bounds`; both None for the bounds of the plant.
+        high: likewise.
+        target: the set-point, n numbers; None for the equilibrium of the plant.
+        target_input: the input there, m numbers; None for the one that holds the plant there.
+        output: y(x), (..., n) -> (..., p), in place of x: e = y(x) - y(target), and Q is (p, p) or a matrix.
+        discount: rho in 1/s: what is paid at t counts exp(-rho t).
+        terminal: S of e'Se, (n, n) or a number, paid where plans, shooting and rollouts end, in place of the
+            LQR's value; None for an endless horizon, which all else is for. Not with an output or a discount.
+
+    Raises:
+        ValueError: if Q is not positive semidefinite or R not positive definite of its size, or another
+            argument breaks its rule.
+    """
+
+    def __init__(
+        self,
+        state: Matrix,
+        control: Matrix,
+        dim: int,
+        inputs: int,
+        *,
+        low: Limit = None,
+        high: Limit = None,
+        target: Sequence[float] | Tensor | None = None,
+        target_input: Sequence[float] | Tensor | None = None,
+        output: Output | None = None,
+        discount: float = 0.0,
+        terminal: Matrix | None = None,
+    ) -> None:
+        super().__init__()
+        name = type(self).__name__
+        self.dim, self.inputs, self.output = dim, inputs, output
+        self.target = _point(name, "target", target, dim)
+        seen = dim if output is None else _outputs(name, output, dim)
+        q = positive_semidefinite(name, "state", _square(name, "state", state, seen), seen)
+        self.register_buffer("q", q)
+        r = positive_definite(name, "control", _square(name, "control", control, inputs), inputs)
+        self.register_buffer("r", r)
+        self.register_buffer("r_inverse", torch.linalg.inv(r))
+        self.q: Tensor
+        self.r: Tensor
+        self.r_inverse: Tensor
+        self.target_input = _point(name, "target_input", target_input, inputs)
+        non_negative(name, "discount", discount)
+        self.discount = real(name, "discount", discount)
+        if terminal is not None and (output is not None or self.discount):
+            raise fail(name, "terminal", "must be None beside an output or a discount", terminal)
+        end = None if terminal is None else _square(name, "terminal", terminal, dim)
+        self.register_buffer(
+            "end", None if end is None else positive_semidefinite(name, "terminal", end, dim)
+        )
+        self.end: Tensor | None
+        self.periodic: tuple[int, ...] = ()
+        bounds = Bounds(low, high, inputs)
+        self.bounds: Bounds | None = bounds if bounds.present else None
+        self._prepare()
+
+    def around(self, plant: Plant) -> Self:
+        """This cost with a plant's equilibrium, periodic coordinates and bounds where it states none of its
+        own; itself where there is nothing to add.
+
+        Raises:
+            ValueError: if the sizes differ, or the plant does not rest at the set-point within the bounds.
+        """
+        name = type(plant).__name__
+        if (plant.dim or self.dim) != self.dim or plant.inputs not in (0, self.inputs):
+            raise ValueError(
+                f"`{type(self).__name__}` is for {self.dim} states and {self.inputs} inputs; "
+                f"{name} has {plant.dim} and {plant.inputs}."
+            )
+        if self.target is None:
+            x = plant.equilibrium()
+            u = plant.resting_input() if self.target_input is None else self.target_input
+        else:
+            x = self.target
+            u = resting_input_at(plant, x) if self.target_input is None else self.target_input
+        check_rest(plant, x, u)
+        placed = copied(self)
+        placed.target = x if bool((x != 0).any()) else None
+        placed.target_input = u if bool((u != 0).any()) else None
+        placed.periodic = plant.periodic
+        placed.bounds = plant.bounds if self.bounds is None else self.bounds
+        same = all(getattr(placed, k) is getattr(self, k) for k in ("target", "target_input", "bounds"))
+        if same and self.periodic == plant.periodic:
+            return self
+        placed._prepare()
+        return placed
+
+    def bounded(self, low: Limit, high: Limit) -> Self:
+        """This cost with other bounds of the inputs; the same where both are None."""
+        if low is None and high is None:
+            return self
+        other = copied(self)
+        other.bounds = Bounds(low, high, self.inputs)
+        other._prepare()
+        return other
+
+    def set_point(self) -> Tensor | None:
+        """The state that the LQR is a feedback around, (n,); None for the origin."""
+        return self.target
+
+    def regulated(self, plant: Plant) -> tuple[Plant, Cost]:
+        """The plant and the cost, around it, whose LQR is that of this cost: themselves."""
+        return plant, self
+
+    @property
+    def plain(self) -> bool:
+        """Whether this is x'Qx + U(u) at the origin: no set-point, output, bounds or discount."""
+        stated = (self.target, self.target_input, self.output, self.bounds)
+        return all(one is None for one in stated) and not self.discount
+
+    def deviation(self, x: Tensor) -> Tensor:
+        """x - target, angles in [-pi, pi]: (..., n) -> (..., n)."""
+        return wrap(x if self.target is None else x - self.target.to(x), self.periodic)
+
+    def state_rate(self, x: Tensor) -> Tensor:
+        """e'Qe: (..., n) -> (...)."""
+        if self.output is None:
+            return quadratic(self.q, self.deviation(x))
+        target = torch.zeros_like(x) if self.target is None else self.target.to(x).expand_as(x)
+        return quadratic(self.q, self.output(x) - self.output(target))
+
+    def terminal(self, x: Tensor) -> Tensor:
+        """e'Se, of a cost with a terminal cost: (..., n) -> (...)."""
+        assert self.end is not None
+        return quadratic(self.end, self.deviation(x))
+
+    def state_curvature(self) -> Tensor:
+        """Half the second derivative of e'Qe at the set-point, (n, n): Q, or C'QC with C = dy/dx."""
+        if self.output is None:
+            return self.q
+        at = torch.zeros(self.dim, dtype=torch.float64) if self.target is None else self.target
+        slope: Tensor = torch.func.jacrev(self.output)(at).detach()
+        return slope.mT @ self.q @ slope
+
+    def rate(self, x: Tensor, u: Tensor) -> Tensor:
+        """e'Qe + U(u): (..., n), (..., m) -> (...)."""
+        return self.state_rate(x) + self.input_rate(u)
+
+    @abc.abstractmethod
+    def input_rate(self, u: Tensor) -> Tensor:
+        """U(u): (..., m) -> (...)."""
+
+    @abc.abstractmethod
+    def policy(self, effectiveness: Tensor, gradient: Tensor) -> Tensor:
+        """argmin_u of U(u) + p'g u, for g (..., n, m) and the value gradient p (..., n): (..., m)."""
+
+    @abc.abstractmethod
+    def saturate(self, v: Tensor) -> Tensor:
+        """The admissible input that a free one stands for: (..., m) -> (..., m)."""
+
+    def unsaturated(self, u: Tensor) -> Tensor:
+        """A free input that `saturate` maps to u, or near to it at the edge: (..., m) -> (..., m)."""
+        return u
+
+    @abc.abstractmethod
+    def _prepare(self) -> None:
+        """Check and compute what depends on the bounds and the set-point: when made, and around a plant."""
+
+    def effort(self, u: Tensor) -> Tensor:
+        """u - target_input: (..., m) -> (..., m)."""
+        return u if self.target_input is None else u - self.target_input.to(u)
+
+    def input_of(self, effort: Tensor) -> Tensor:
+        """effort + target_input: (..., m) -> (..., m)."""
+        return effort if self.target_input is None else effort + self.target_input.to(effort)
+
+    def _unconstrained(self, pull: Tensor) -> Tensor:
+        """-1/2 R^-1 g'p: (..., m)."""
+        return -0.5 * matvec(self.r_inverse, pull)
+
+
+class QuadraticCost(Cost):
+    """x'Qx + u'Ru, whose policy is u = -1/2 R^-1 g(x)' grad V, or with bounds the exact minimum over the box:
+    that clipped where R is diagonal, else the best face of the box (4 inputs at most).
+
+    The appendix of the paper loses the minus of the policy.
+
+    Example:
+        >>> bounded = adp.QuadraticCost(1.0, 0.1, dim=6, inputs=2, low=[-9.81, -1.0], high=[9.81, 1.0])
+        >>> cost = adp.QuadraticCost(2.0, 0.5, dim=2, inputs=1)  # Q = 2 I, R = 0.5
+        >>> float(cost.rate(torch.tensor([1.0, 1.0]).double(), torch.tensor([2.0]).double()))
+        6.0
+
+        Shown by `staf experiment=adp adp/cost=quadratic`.
+
+    Args: see `Cost`.
+
+    Raises:
+        ValueError: as in `Cost`, and if more than 4 bounded inputs have an R that is not diagonal.
+    """
+
+    def _prepare(self) -> None:
+        self._coupled = not torch.equal(self.r, torch.diag(self.r.diagonal()))
+        if self.bounds is None or not self._coupled:
+            return
+        if self.inputs > LARGEST:
+            rule = f"must be diagonal for more than {LARGEST} bounded inputs"
+            raise fail("QuadraticCost", "control", rule, self.r)
+        self.register_buffer("_faces", face_inverses(2 * self.r), persistent=False)
+
+    def input_rate(self, u: Tensor) -> Tensor:
+        return quadratic(self.r, self.effort(u))
+
+    def policy(self, effectiveness: Tensor, gradient: Tensor) -> Tensor:
+        pull = _pull(effectiveness, gradient)
+        if self.bounds is None or not self._coupled:
+            return self.saturate(self.input_of(self._unconstrained(pull)))
+        rest = torch.zeros_like(self.bounds.low) if self.target_input is None else self.target_input
+        low, high = (limit.to(pull) - rest.to(pull) for limit in (self.bounds.low, self.bounds.high))
+        faces = self.get_buffer("_faces").to(pull)
+        return self.input_of(box_minimum(2 * self.r.to(pull), pull, low, high, faces))
+
+    def saturate(self, v: Tensor) -> Tensor:
+        return v if self.bounds is None else self.bounds.clip(v)
+
+
+class BoundedInputCost(Cost):
+    """x'Qx + U(u) with inputs inside their bounds, whose policy saturates smoothly:
+
+        u = sat(-R^-1 g' grad V / 2),  sat(v)_i = b_i tanh(v_i / b_i),
+        U(u) = 2 sum_i R_ii b_i int_0^{u_i} artanh(w / b_i) dw,
+
+    with b_i the bound on the side of v_i. U is u'Ru for small u and finite at the bound.
+
+    Example:
+        >>> cost = adp.BoundedInputCost(1.0, 1.0, dim=2, inputs=1, bound=1.0)
+        >>> float(cost.rate(torch.tensor([1.0, 0.0]).double(), torch.tensor([0.0]).double()))
+        1.0
+
+        Shown by `staf experiment=adp adp/cost=bounded_input adp/policy=rollout`.
+
+    Args:
+        bound: of every |u_i|, a positive number or one an input, in the units of u; None where ``low`` and
+            ``high`` of `Cost` are given instead. The input at the set-point must lie between them.
+
+    Raises:
+        ValueError: if R is not diagonal, or the bounds are not finite with the set-point's input inside.
+
+    Source: Abu-Khalaf and Lewis, Automatica 41 (2005), with a diagonal R.
+    """
+
+    def __init__(
+        self,
+        state: Matrix,
+        control: Matrix,
+        dim: int,
+        inputs: int,
+        *,
+        bound: float | Sequence[float] | Tensor | None = None,
+        low: Limit = None,
+        high: Limit = None,
+        **more: object,
+    ) -> None:
+        if bound is not None:
+            if low is not None or high is not None:
+                raise fail("BoundedInputCost", "bound", "must be None beside low and high", bound)
+            high = one_or_each("BoundedInputCost", "bound", bound, inputs)
+            positive("BoundedInputCost", "bound", high)
+            low = -high
+        super().__init__(state, control, dim, inputs, low=low, high=high, **more)  # type: ignore[arg-type]
+        if not torch.equal(self.r, torch.diag(self.r.diagonal())):
+            raise fail("BoundedInputCost", "control", "must be diagonal", control)
+
+    def _prepare(self) -> None:
+        rest = torch.zeros(self.inputs, dtype=torch.float64)
+        rest = rest if self.target_input is None else self.target_input
+        if self.bounds is None:
+            raise fail("BoundedInputCost", "bound", "must be given, or low and high", None)
+        box = self.bounds.measured_from(rest)
+        if not bool(
+            (box.low < 0).all() and (box.high > 0).all() and torch.isfinite(box.high - box.low).all()
+        ):
+            rule = f"must be finite, with the input {rest.tolist()} of the set-point inside"
+            raise fail("BoundedInputCost", "low", rule, self.bounds)
+        self.register_buffer("_down", -box.low, persistent=False)
+        self.register_buffer("_up", box.high, persistent=False)
+        self._down: Tensor
+        self._up: Tensor
+        self._symmetric = torch.equal(self._down, self._up)
+
+    def input_rate(self, u: Tensor) -> Tensor:
+        effort = self.effort(u)
+        bound = self._side(effort)
+        share = effort / bound
+        # artanh's integral: v artanh v + log(1 - v^2)/2, in a form that is finite at |v| = 1.
+        up, down = 1 + share, 1 - share
+        integral = 0.5 * (torch.xlogy(up, up) + torch.xlogy(down, down))
+        return 2 * (self.r.diagonal().to(u) * bound * bound * integral).sum(-1)
+
+    def policy(self, effectiveness: Tensor, gradient: Tensor) -> Tensor:
+        return self.saturate(self.input_of(self._unconstrained(_pull(effectiveness, gradient))))
+
+    def saturate(self, v: Tensor) -> Tensor:
+        """sat(v), measured from the input of the set-point."""
+        effort = self.effort(v)
+        bound = self._side(effort)
+        return self.input_of(bound * (effort / bound).tanh())
+
+    def unsaturated(self, u: Tensor) -> Tensor:
+        """b artanh(u / b), finite at the bound itself."""
+        effort = self.effort(u)
+        bound = self._side(effort)
+        return self.input_of(bound * (effort / bound).clamp(-_EDGE, _EDGE).atanh())
+
+    def _side(self, effort: Tensor) -> Tensor:
+        """The bound on the side of the effort, (..., m) or (m,)."""
+        up = self._up.to(effort)
+        return up if self._symmetric else torch.where(effort < 0, self._down.to(effort), up)
+
+
+def quadratic(matrix: Tensor, x: Tensor) -> Tensor:
+    """x'Mx: (n, n), (..., n) -> (...)."""
+    return (matvec(matrix, x) * x).sum(-1)
+
+
+def matvec(matrix: Tensor, x: Tensor) -> Tensor:
+    """M x by broadcasting, which a compiler fuses where it would call a library for a product:
+    (..., k, n), (..., n) -> (..., k)."""
+    return (matrix.to(x) * x.unsqueeze(-2)).sum(-1)
+
+
+def _pull(effectiveness: Tensor, gradient: Tensor) -> Tensor:
+    """g'p: (..., m)."""
+    return (effectiveness * gradient.unsqueeze(-1)).sum(-2)
+
+
+def _square(call: str, name: str, value: Matrix, size: int) -> Tensor:
+    if isinstance(value, Tensor):
+        return value.to(torch.float64) if value.dim() != 1 else value.to(torch.float64).diag()
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        if value and all(isinstance(entry, int | float) for entry in value):
+            return torch.tensor(vector(call, name, value, len(value)), dtype=torch.float64).diag()
+        return torch.tensor([vector(call, name, row, len(value)) for row in value], dtype=torch.float64)
+    return positive_real(call, name, value) * torch.eye(size, dtype=torch.float64)
+
+
+def _point(call: str, name: str, value: Sequence[float] | Tensor | None, size: int) -> Tensor | None:
+    if value is None:
+        return None
+    given = value.tolist() if isinstance(value, Tensor) else value
+    if isinstance(given, Sequence) and len(given) != size:
+        raise fail(call, name, f"must have {size} numbers", value)
+    return torch.tensor(vector(call, name, given, size), dtype=torch.float64)
+
+
+def _outputs(call: str, output: Output, dim: int) -> int:
+    """p: the size of the output at a batch of one state."""
+    seen = output(torch.zeros(1, dim, dtype=torch.float64))
+    if not isinstance(seen, Tensor) or seen.dim() != 2 or len(seen) != 1:
+        shape = tuple(seen.shape) if isinstance(seen, Tensor) else seen
+        raise fail(call, "output", f"must map (..., {dim}) to (..., p)", shape)
+    return seen.shape[-1]

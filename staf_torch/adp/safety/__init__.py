@@ -1,0 +1,1 @@
+"""Keep constraints whatever the policy behind them wants."""

@@ -1,0 +1,299 @@
+"""Direct shooting: against every optimum that is known, and against the HJB equation where none is."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+import torch
+from helpers import uniform as random
+from helpers_adp import COST, PLANT, uniform
+from torch import Tensor
+
+from staf_torch import adp, systems
+from staf_torch.adp.planning.shooting.stage import Stage
+
+DOUBLE = systems.Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
+LINEAR = systems.Linear([[0.0, 1.0], [2.0, -1.0]], [[0.0], [1.0]])
+X3 = torch.tensor([[-0.5, 0.5, -0.25]], dtype=torch.float64)
+
+
+@pytest.mark.parametrize("plant", [PLANT, LINEAR], ids=lambda p: type(p).__name__)
+def test_known_optimum_is_found_and_bounded_from_above(plant: systems.ControlAffineSystem) -> None:
+    x = uniform(2, 2.0, seed=2)
+    best = adp.DirectShooting(plant, COST).solve(x)
+    known = plant.optimal_value(x, COST.q, COST.r)
+    assert best.converged.all()
+    excess = best.value / known - 1
+    assert excess.min() > -1e-8
+    assert excess.max() < 3e-6
+    assert (excess <= best.mesh_error + best.horizon_error).all()
+    gradient = adp.value_gradient(lambda y: plant.optimal_value(y, COST.q, COST.r), x)
+    torch.testing.assert_close(best.gradient, gradient, rtol=1e-4, atol=1e-5)
+    control = COST.policy(plant.effectiveness(x), gradient)
+    torch.testing.assert_close(best.control, control, rtol=1e-4, atol=2e-4)
+
+
+def test_error_falls_with_the_mesh() -> None:
+    x = uniform(2, 1.5, seed=3)
+    known = LINEAR.optimal_value(x, COST.q, COST.r)
+    excess = [adp.DirectShooting(LINEAR, COST, intervals=n).solve(x).value / known - 1 for n in (20, 40)]
+    assert (excess[1] < excess[0] / 8).all()
+
+
+def test_three_state_optimum() -> None:
+    plant, cost = systems.ThreeState(), adp.QuadraticCost(10.0, 1.0, 3, 2)
+    best = adp.DirectShooting(plant, cost).solve(torch.cat((X3, 0.1 * X3)))
+    # The rollout policy reaches 2.708, the LQR 2.786. The plant is homogeneous, so V* is, of degree 2.
+    assert float(best.value[0]) == pytest.approx(2.70471, abs=2e-5)
+    torch.testing.assert_close(best.value[1], 0.01 * best.value[0], rtol=1e-6, atol=0)
+
+
+@pytest.mark.parametrize(
+    ("plant", "cost", "intervals"),
+    [
+        (systems.Pendulum(), COST, 40),
+        (systems.Pendulum(), adp.BoundedInputCost(1.0, 0.1, 2, 1, bound=8.0), 48),
+        (systems.PlanarQuadrotor(), adp.QuadraticCost(1.0, 1.0, 6, 2), None),
+    ],
+    ids=["pendulum", "bounded pendulum", "quadrotor"],
+)
+def test_gradient_and_control_solve_the_hjb_equation(
+    plant: systems.ControlAffineSystem, cost: adp.Cost, intervals: int | None
+) -> None:
+    x = 0.2 * torch.randn(1, plant.dim, dtype=torch.float64, generator=torch.Generator().manual_seed(4))
+    best = adp.DirectShooting(plant, cost, intervals=intervals).solve(x)
+    assert best.converged.all()
+    g = plant.effectiveness(x)
+    rate = plant.drift(x) + (g @ best.control.unsqueeze(-1)).squeeze(-1)
+    residual = cost.rate(x, best.control) + (best.gradient * rate).sum(-1)
+    assert (residual.abs() < 1e-4 * cost.rate(x, best.control)).all()
+    torch.testing.assert_close(best.control, cost.policy(g, best.gradient))
+    lqr = adp.LQR(plant, cost)
+    run = adp.simulate(adp.Feedback(lqr), plant, cost, x, dt=0.1, steps=100, every=100, compile=False)
+    assert (best.value < run.cost * (1 + 1e-4)).all()
+
+
+def test_tracking_has_an_optimum_with_a_base_and_a_terminal_value_of_its_own() -> None:
+    lqr = adp.LQR(PLANT, adp.QuadraticCost(10.0, 1.0, 2, 1))
+    shooting = adp.DirectShooting(
+        adp.TwoStateTracking(),
+        adp.tracking_cost(10.0, 1.0),
+        base=lambda x: lqr(x[..., :2]),
+        terminal=lambda x: lqr.value(x[..., :2]),
+        horizon=4.0,
+        intervals=60,
+    )
+    best = shooting.solve(torch.tensor([[-0.5, 0.5, 0.0, 1.0]], dtype=torch.float64))
+    assert float(best.value) == pytest.approx(1.4223, abs=1e-4)
+
+
+class HalfBroken(systems.TwoState):
+    def drift(self, x: Tensor) -> Tensor:
+        return torch.where(x[..., :1] > 1.0, torch.nan, super().drift(x))
+
+
+def test_row_that_fails_on_the_coarse_mesh_starts_again_on_the_fine_one() -> None:
+    x = uniform(6, 2.0)[:1]
+    best = adp.DirectShooting(PLANT, COST, intervals=32, iterations=10, starts=1).solve(x)
+    assert torch.isinf(best.mesh_error).all()  # nothing to compare with
+    assert best.converged.all()
+    assert (best.value / PLANT.optimal_value(x, COST.q, COST.r) - 1).abs().max() < 1e-4
+
+
+def test_rows_are_alone_and_a_row_without_optimum_is_reported() -> None:
+    x = torch.tensor([[-1.0, 1.0], [1.2, 0.3], [0.0, 0.0], [0.4, -0.7]], dtype=torch.float64)
+    best = adp.DirectShooting(HalfBroken(), COST, horizon=4.0, intervals=24, starts=2).solve(x)
+    assert best.converged.tolist() == [True, False, True, True]
+    assert torch.isnan(best.value[1])
+    assert torch.isnan(best.control[1]).all()
+    assert float(best.value[2]) == 0.0
+    assert torch.equal(best.gradient[2], torch.zeros(2, dtype=torch.float64))
+    alone = adp.DirectShooting(PLANT, COST, horizon=4.0, intervals=24).solve(x[3:])
+    torch.testing.assert_close(best.value[3], alone.value[0], rtol=1e-11, atol=0)
+    torch.testing.assert_close(best.gradient[3], alone.gradient[0], rtol=1e-7, atol=1e-9)
+
+
+def test_too_few_iterations_are_reported_and_not_passed_off_as_an_optimum() -> None:
+    best = adp.DirectShooting(PLANT, COST, intervals=8, iterations=1).solve(uniform(4, 2.0))
+    assert not best.converged.any()
+    assert torch.isnan(best.value).all()
+
+
+def test_plant_that_cannot_be_stabilised_and_states_of_another_size_are_refused() -> None:
+    stuck = systems.Linear([[1.5, 0.0], [0.0, -1.0]], [[0.0], [1.0]])
+    with pytest.raises(ValueError, match=r"Linear .* not stabilisable.*eigenvalue 1.5 1/s"):
+        adp.DirectShooting(stuck, COST)
+    with pytest.raises(ValueError, match=r"`DirectShooting.solve\(x0=...\)` must have 2 entries"):
+        adp.DirectShooting(PLANT, COST).solve(torch.zeros(1, 3, dtype=torch.float64))
+    with pytest.raises(ValueError, match=r"`DirectShooting\(intervals=...\)` must be even"):
+        adp.DirectShooting(PLANT, COST, intervals=81)
+
+
+def test_at_the_set_point_one_start_is_enough_and_nothing_is_paid() -> None:
+    shooting = adp.DirectShooting(systems.VanDerPol(), COST, intervals=16, horizon=2.0)
+    best = shooting.solve(torch.zeros(1, 2, dtype=torch.float64))
+    assert bool(best.converged.all())
+    assert float(best.value) == 0.0
+    assert int(best.iterations) <= 6
+
+
+# Inputs with bounds, several starts ---------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def convex() -> adp.Optimum:
+    start = torch.tensor([[5.0, 0.0], [0.5, 0.0], [-5.0, 0.0]], dtype=torch.float64)
+    return adp.DirectShooting(DOUBLE, COST, low=-1.0, high=1.0).solve(start)
+
+
+def test_double_integrator_with_a_hard_bound_is_solved(convex: adp.Optimum) -> None:
+    # 53.1619: IPOPT on 400 intervals over 20 s of a control that is linear on each (Runge-Kutta).
+    assert convex.converged.all()
+    assert float(convex.value[0]) == pytest.approx(53.162, rel=1e-4)
+    torch.testing.assert_close(convex.value[2], convex.value[0], rtol=1e-9, atol=0)
+    assert (convex.plan.abs() <= 1.0).all()
+    assert float(convex.plan[0].min()) == -1.0
+    assert float(convex.optimality.max()) < 1e-4
+    free = adp.DirectShooting(DOUBLE, COST).solve(torch.tensor([[0.5, 0.0]], dtype=torch.float64))
+    torch.testing.assert_close(convex.value[1], free.value[0], rtol=1e-5, atol=0)
+    assert repr(convex).startswith("Optimum(3 states, value ")
+    assert len(repr(convex)) < 120
+
+
+@torch.no_grad()
+def test_plan_is_replayed_at_its_cost(convex: adp.Optimum) -> None:
+    dt = 0.02
+    run = adp.simulate(
+        convex.replay(),
+        DOUBLE,
+        COST,
+        convex.state[:, 0],
+        dt=dt,
+        steps=round(float(convex.time[-1]) / dt),
+        compile=False,
+    )
+    torch.testing.assert_close(run.cost, convex.value, rtol=3e-3, atol=0)
+    assert (run.state[:, -1].norm(dim=-1) < 1e-2).all()
+
+
+def test_saturated_swing_up_is_not_passed_off_as_an_optimum() -> None:
+    hanging = torch.tensor([[0.0, math.pi, 0.0, 0.0]], dtype=torch.float64)
+    cost = adp.BoundedInputCost(1.0, 0.1, dim=4, inputs=1, bound=10.0)
+    shooting = adp.DirectShooting(systems.CartPole(), cost, horizon=3.0, intervals=8, starts=1, iterations=1)
+    best = shooting.solve(hanging)
+    assert not best.converged.any()
+    assert best.reason[0].startswith("not stationary")
+    assert best.reason[0] in repr(best)
+
+
+def test_row_without_a_finite_start_says_so() -> None:
+    class Exploding(systems.Linear):
+        def drift(self, x: torch.Tensor) -> torch.Tensor:
+            return super().drift(x) + torch.where(x[..., :1] > 2.0, math.inf, 0.0)
+
+    plant = Exploding([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
+    best = adp.DirectShooting(plant, COST, intervals=20).solve(torch.tensor([[3.0, 0.0]]).double())
+    assert best.reason == (
+        "the cost is not finite from here under any start: give a `base` that does not diverge",
+    )
+
+
+def test_what_cannot_be_shot_is_refused_by_name() -> None:
+    step = systems.StepPlant(lambda x, u: 0.5 * x + u, dim=1, inputs=1, dt=0.1)
+    with pytest.raises(ValueError, match=r"`DirectShooting\(system=...\)` must be in continuous time"):
+        adp.DirectShooting(step, adp.QuadraticCost(1.0, 1.0, dim=1, inputs=1))
+    discounted = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1, discount=0.1)
+    with pytest.raises(ValueError, match=r"`DirectShooting\(cost=...\)` must have no discount"):
+        adp.DirectShooting(DOUBLE, discounted)
+
+
+def test_the_horizon_grows_until_little_is_left_at_its_end() -> None:
+    far = torch.tensor([[60.0, 0.0]], dtype=torch.float64)
+    given = {"low": -1.0, "high": 1.0, "intervals": 24, "starts": 1, "iterations": 60}
+    search = adp.DirectShooting(DOUBLE, COST, **given)
+    found = search.solve(far)
+    assert float(found.time[-1]) / search.horizon in (2.0, 4.0, 8.0)
+    assert float(found.horizon_error) < 1e-3
+    stated = adp.DirectShooting(DOUBLE, COST, **given, horizon=8.0).solve(far)
+    assert float(stated.time[-1]) == pytest.approx(8.0)
+    assert float(stated.horizon_error) > 1e-3
+    near = 0.1 * random(256, 2, seed=1)
+    with pytest.raises(ValueError, match=r"state a `horizon` of 2[0-9.]+ s, or solve at most 256 states"):
+        search.solve(torch.cat((near, far)))
+
+
+def test_more_states_than_are_solved_at_once_are_those_of_each_alone() -> None:
+    x, search = uniform(258, 1.0, seed=6), adp.DirectShooting(LINEAR, COST, intervals=24, horizon=3.0)
+    found, alone = search.solve(x), search.solve(x[[3, 257]])
+    for part in ("value", "gradient", "control", "state", "plan", "mesh_error", "optimality"):
+        torch.testing.assert_close(getattr(found, part)[[3, 257]], getattr(alone, part), rtol=1e-9, atol=1e-9)
+    assert found.reason == ("",) * 258
+
+
+def test_of_two_valleys_the_lower_one_is_found_from_several_starts() -> None:
+    """x' = u and a cost y(x)^2 + u^2, 0 at 0 and at 10: V = 2 int |y| to the valley nearer by area."""
+
+    def y(x: Tensor) -> Tensor:
+        return 11 - x - 11 / (1 + x)
+
+    plant, ridge = systems.RatePlant(lambda x, u: 1 * u, dim=1, inputs=1), 11**0.5 - 1
+    cost = adp.QuadraticCost(1.0, 1.0, dim=1, inputs=1, output=y)
+    x = torch.tensor([[3.2]], dtype=torch.float64)  # to 0 the area is 14.3, to 10, downhill, 19.3
+    left, whole = (11 * a - a**2 / 2 - 11 * math.log(1 + a) for a in (3.2, 10.0))
+    given: dict[str, Any] = {"base": lambda x: torch.where(x < ridge, -y(x), y(x)), "horizon": 4.0}
+    given["terminal"] = lambda x: y(x)[..., 0].square()
+    downhill = adp.DirectShooting(plant, cost, **given, intervals=80).solve(x)  # no LQR to doubt it by
+    search = adp.DirectShooting(plant, cost, **given, starts=3)
+    found = search.solve(torch.cat((x, 0.1 * x)))
+    assert float(downhill.value) == pytest.approx(2 * (whole - left), rel=1e-2)
+    assert float(found.value[0]) == pytest.approx(2 * left, rel=1e-2)
+    assert found.reason[0] == "" or found.reason[0].startswith("local: one start alone found it")
+    again = search.solve(torch.cat((x, 0.1 * x)), warm=found)
+    torch.testing.assert_close(again.value, found.value, rtol=1e-6, atol=0)
+    assert again.converged.tolist() == [True, True]  # an earlier plan is a start that agrees
+
+
+# Its pieces -----------------------------------------------------------------------------------------------
+
+
+SLOW = systems.Linear([[0.0, 1.0], [-2.0, -3.0]], [[0.0], [1.0]])
+LIGHT = adp.QuadraticCost(1e-6, 1.0, dim=2, inputs=1)  # the feedback hardly moves the modes
+
+
+@pytest.mark.parametrize("bounded", [False, True])
+def test_horizon_and_intervals_follow_the_modes_of_the_loop(bounded: bool) -> None:
+    limits = {"low": -1.0, "high": 1.0} if bounded else {}
+    found = adp.DirectShooting(SLOW, LIGHT, **limits)  # modes of -1 and -2 in 1/s
+    assert found.horizon == pytest.approx(9.2, rel=1e-5)
+    assert found.intervals == 80  # 37 would resolve them
+    long = adp.DirectShooting(SLOW, LIGHT, horizon=60.0, **limits)
+    assert (long.horizon, long.intervals) == (60.0, 120 if bounded else 240)
+    assert adp.DirectShooting(SLOW, LIGHT, horizon=26.0, **limits).intervals == 104
+
+
+@pytest.mark.parametrize("affine", [True, False])
+def test_the_gap_of_a_control_is_what_its_hamiltonian_exceeds_the_least_by(affine: bool) -> None:
+    def cubic(x: Tensor, u: Tensor) -> Tensor:
+        return torch.cat((x[..., 1:], u + 0.1 * u**3 - x[..., :1]), -1)
+
+    if affine:
+        plant: systems.Plant = systems.TwoState()
+    else:
+        plant = systems.RatePlant(cubic, dim=2, inputs=1)
+    cost = adp.QuadraticCost(1.0, 0.5, dim=2, inputs=1, low=-0.8, high=0.8)
+    x, costate, v = random(50, 2, seed=1), 2 * random(50, 2, seed=2), 0.8 * random(50, 1, seed=3)
+    gap = Stage(plant, cost).gap(x, v, costate)
+    slope = torch.func.vmap(torch.func.jacrev(lambda x, u: plant.motion(x[None], u[None])[0], argnums=1))(
+        x, v
+    )
+    pull = (slope * costate.unsqueeze(-1)).sum(-2)  # p' df/du, (B, m)
+
+    def hamiltonian(u: Tensor) -> Tensor:
+        return 0.5 * u.square().sum(-1) + (pull * u).sum(-1)
+
+    tried = torch.stack(
+        [hamiltonian(torch.full((50, 1), u).double()) for u in torch.linspace(-0.8, 0.8, 2001)]
+    )
+    torch.testing.assert_close(gap, hamiltonian(v) - tried.amin(0), rtol=1e-4, atol=1e-5)

@@ -1,0 +1,293 @@
+"""The memory of local models: near the optimum of the pendulum's swing-up, and what it says about itself."""
+
+from __future__ import annotations
+
+import logging
+import math
+import pickle
+import re
+
+import pytest
+import torch
+from helpers import tensor, uniform
+from helpers_plans import pushed
+from helpers_swingup import GRID, REGION, RESETS, double_integrator
+from torch import Tensor
+
+from staf_torch import adp, deploy
+from staf_torch.adp.planning.global_value_learning import best_from, swept
+from staf_torch.adp.planning.plans import Trajectories
+
+
+def swing(policy: adp.GlobalValue, x: Tensor) -> tuple[Tensor, Tensor]:
+    """The cost of 200 steps, and the last state."""
+    spent = torch.zeros_like(x[:, 0])
+    for _ in range(200):
+        x, paid = policy.problem.advance(x, policy(x))
+        spent = spent + paid
+    return spent, x
+
+
+def test_swing_up_costs_what_dynamic_programming_costs(memory: adp.GlobalValue) -> None:
+    spent, last = swing(memory, RESETS)
+    assert float(spent.mean() / GRID.mean()) < 1.01
+    assert float(memory.problem.terminal(last).max()) < 1e-3
+
+
+def test_value_is_the_cost_that_its_policy_pays(memory: adp.GlobalValue) -> None:
+    spent, _ = swing(memory, RESETS)
+    found = memory.choose(RESETS)
+    assert bool(found.covered.all())
+    assert float((found.value / spent).log().abs().median()) < 1e-3
+    torch.testing.assert_close(memory.value(RESETS), found.value)
+
+
+def test_bellman_residual_is_small_where_the_memory_knows_the_optimum(memory: adp.GlobalValue) -> None:
+    assert float(memory.bellman_residual(RESETS).abs().median()) < 1e-3
+
+
+def test_gradient_is_the_slope_of_the_value(memory: adp.GlobalValue) -> None:
+    library = memory.library.rows(memory.library.converged & memory.arrives)
+    x, h = library.state[library.cost.argsort()[[10, 30]], 3], 1e-5
+    for i, e in enumerate(h * torch.eye(2, dtype=torch.float64)):
+        rise = (memory.value(x + e) - memory.value(x - e)) / (2 * h)
+        torch.testing.assert_close(memory.gradient(x)[:, i], rise, rtol=1e-2, atol=1e-2)
+
+
+def test_one_state_gets_the_control_of_a_batch(memory: adp.GlobalValue) -> None:
+    batch = memory(RESETS)
+    single = torch.cat([memory(x.unsqueeze(0)) for x in RESETS])
+    torch.testing.assert_close(single, batch, rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(memory(RESETS.view(2, 4, 2)), batch.view(2, 4, 1), rtol=1e-12, atol=1e-12)
+
+
+def test_a_whole_turn_changes_nothing(memory: adp.GlobalValue) -> None:
+    turned = RESETS + torch.tensor([2 * torch.pi, 0.0], dtype=torch.float64)
+    torch.testing.assert_close(memory(turned), memory(RESETS), rtol=1e-6, atol=1e-6)
+
+
+def test_candidates_are_the_nearest_by_the_mean_curvature_the_shorter_way_around(
+    memory: adp.GlobalValue,
+) -> None:
+    curvature = memory.models[memory.entries, 5:].view(-1, 2, 2) * memory.region * memory.region[:, None]
+    size, axes = torch.linalg.eigh(curvature)
+    metric = torch.einsum("bij,bj,bkj->ik", axes, size.abs(), axes) / len(size)
+    metric = metric + 0.01 * metric.trace() / 2 * torch.eye(2, dtype=torch.float64)
+    x = torch.cat((RESETS, torch.tensor([[3.1, 0.5], [-3.1, -0.5]], dtype=torch.float64)))
+    d = memory.problem.offset(x.unsqueeze(1), memory.plans[memory.entries, :2]) / memory.region
+    far, wanted = (d @ metric * d).sum(-1).topk(memory.candidates, 1, largest=False)
+    assert bool((far[:, -1].sqrt() < torch.pi / memory.region[0] * metric[0, 0].sqrt()).all())  # not twice
+    found = memory.nearest(x)
+    assert torch.equal(found[:, :-1].sort().values, memory.entries[wanted].sort().values)
+    assert bool((found[:, -1] == memory.resting).all())
+
+
+def test_control_at_rest_on_top_is_the_regulator(memory: adp.GlobalValue) -> None:
+    x = torch.tensor([[0.01, -0.02]], dtype=torch.float64)
+    torch.testing.assert_close(memory(x), memory.problem.linear_feedback(x), rtol=1e-2, atol=1e-3)
+
+
+def test_memory_survives_a_pickle_and_keeps_to_the_bounds(memory: adp.GlobalValue) -> None:
+    problem = memory.problem
+    grown = adp.learn_global_value(problem, REGION, steps=60, trajectories=6, rounds=0, candidates=4)
+    # A problem made by a function inside a function does not pickle: the module's own does.
+    copied = pickle.loads(pickle.dumps(grown.library))
+    again = adp.GlobalValue(problem, copied, REGION, candidates=4)
+    x = torch.tensor([[2.0, 1.0], [-0.1, 0.0]], dtype=torch.float64)
+    assert torch.equal(again(x), grown(x))
+    assert bool(problem.bounds.contain(grown(x)).all())
+
+
+def test_bad_input_is_named(memory: adp.GlobalValue) -> None:
+    with pytest.raises(ValueError, match=r"region=....` must be positive"):
+        adp.GlobalValue(memory.problem, memory.library, [1.0, 0.0])
+    parts = memory.library
+    never = Trajectories(*parts[:3], torch.full_like(parts.value, torch.inf), *parts[4:])
+    with pytest.raises(ValueError, match="must have a trajectory that arrives"):
+        adp.GlobalValue(memory.problem, never, REGION)
+    with pytest.raises(ValueError, match=r"trajectories=....` must be at least 2"):
+        adp.learn_global_value(memory.problem, REGION, steps=10, trajectories=1)
+
+
+# A memory of plans that nobody optimised, row by row ----------------------------------------------------
+
+N, M, STEPS, AHEAD = 2, 2, 5, 3
+LENGTH = STEPS + AHEAD + 1
+PROBLEM = adp.SampledProblem(pushed, dim=2, inputs=2, low=[-1.0, -0.5], high=[0.5, 0.7], periodic=[0])
+
+
+def symmetric(a: Tensor) -> Tensor:
+    return 0.5 * (a + a.mT)
+
+
+def library(values: Tensor | None = None) -> Trajectories:
+    """Five trajectories that nobody optimised; the second does not arrive and the fourth is not finite."""
+    if values is None:
+        values = torch.linspace(1, 0, STEPS + 1, dtype=torch.float64) * tensor(
+            [[3.0], [2.0], [4.0], [math.inf], [5.0]]
+        )
+        values = torch.where(torch.isnan(values), torch.inf, values)
+        values[1, -1] = 1.0
+    rows = len(values)
+    state = (
+        tensor([2.0, 0.6])
+        * uniform(rows, STEPS + 1, N, seed=1)
+        * torch.linspace(1, 0.1, STEPS + 1).double()[:, None]
+    )
+    state[4:] = state[4:] + tensor([2 * math.pi, 0.0])  # ends a turn further on
+    return Trajectories(
+        state,
+        0.4 * uniform(rows, STEPS, M, seed=2),
+        0.3 * uniform(rows, STEPS, M, N, seed=3),
+        values,
+        uniform(rows, STEPS + 1, N, seed=4),
+        symmetric(uniform(rows, STEPS + 1, N, N, seed=5)) + 2 * torch.eye(N),
+        torch.ones(rows) > 0,
+    )
+
+
+@pytest.fixture(scope="module")
+def known() -> adp.GlobalValue:
+    """A memory of plans that nobody optimised."""
+    return adp.GlobalValue(
+        PROBLEM, library(), tensor([3.0, 1.0]), candidates=4, lookahead=AHEAD, spacing=0.05
+    )
+
+
+def test_what_leaves_more_than_a_hundredth_has_not_arrived() -> None:
+    values = torch.zeros(4, STEPS + 1).double()
+    values[:, 0] = tensor([1.0, 1.0, 100.0, 100.0])
+    values[:, -1] = tensor([0.01 + 0.9e-9, 0.01 + 1.2e-9, 1.0, 1.01])
+    found = adp.GlobalValue(PROBLEM, library(values), [3.0, 1.0], lookahead=AHEAD)
+    assert found.arrives.tolist() == [True, False, True, False]
+    with pytest.raises(ValueError, match=r"candidates=...\)` must be at least 1"):
+        adp.GlobalValue(PROBLEM, library(values), [3.0, 1.0], candidates=0)
+    with pytest.raises(ValueError, match=r"lookahead=...\)` must be at least 1"):
+        adp.GlobalValue(PROBLEM, library(values), [3.0, 1.0], lookahead=0)
+
+
+def followed(known: adp.GlobalValue, x: Tensor, entry: int) -> tuple[float, Tensor, bool]:
+    """What a remembered plan costs from x (n,), its first control, and whether it ends near its end."""
+
+    def control(x: Tensor, row: Tensor) -> Tensor:
+        u = row[N : N + M] + row[N + M :].view(M, N) @ (x - row[:N])
+        return torch.minimum(torch.maximum(u, PROBLEM.bounds.low), PROBLEM.bounds.high)
+
+    first = known.plans[entry]
+    x = x.clone()
+    x[0] = first[0] + torch.remainder(x[0] - first[0] + math.pi, 2 * math.pi) - math.pi
+    u, paid = control(x, first), 0.0
+    for k in range(AHEAD):
+        x, now = pushed(x, control(x, known.plans[entry + k]))
+        paid += float(now)
+    model = known.models[entry + AHEAD]
+    d, value, bent = x - model[:N], float(model[N]), model[2 * N + 1 :].view(N, N)
+    far = float((d / known.region).square().sum())
+    if far >= 0.09:
+        return paid + value + known.worst * (1 + far), u, False
+    return paid + value + float(model[N + 1 : 2 * N + 1] @ d + 0.5 * d @ bent @ d), u, True
+
+
+def test_the_cheapest_of_the_nearest_plans_is_followed(known: adp.GlobalValue) -> None:
+    x = tensor([3.0, 0.9]) * uniform(6, N, seed=7)
+    x[3] += tensor([2 * math.pi, 0.0])
+    entries, whole = known.nearest(x), known.choose(x)
+    assert entries.shape == (6, 5)
+    cost, control, covered = known.follow(x, entries)
+    for row in range(6):
+        several = [followed(known, x[row], int(entry)) for entry in entries[row]]
+        assert cost[row].tolist() == pytest.approx([one[0] for one in several])
+        assert covered[row].tolist() == [one[2] for one in several]
+        best = min(range(5), key=lambda k: several[k][0])
+        assert float(whole.value[row]) == pytest.approx(several[best][0])
+        torch.testing.assert_close(whole.control[row], several[best][1])
+        torch.testing.assert_close(control[row, best], several[best][1])
+        assert int(whole.entry[row]) == int(entries[row, best])
+        assert bool(whole.covered[row]) == several[best][2]
+    torch.testing.assert_close(known.value(x.view(2, 3, 2)), whole.value.view(2, 3))
+    torch.testing.assert_close(known(x.view(2, 3, 2)), whole.control.view(2, 3, 2))
+    for row in range(6):
+        torch.testing.assert_close(known(x[row]), whole.control[row])
+        torch.testing.assert_close(known(x[row : row + 1]), whole.control[row : row + 1])
+    model = known.models[whole.entry]
+    d = x - model[:, :N]
+    d[:, 0] = torch.remainder(d[:, 0] + math.pi, 2 * math.pi) - math.pi
+    bent = model[:, 2 * N + 1 :].view(-1, N, N)
+    wanted = model[:, N + 1 : 2 * N + 1] + (bent @ d.unsqueeze(-1)).squeeze(-1)
+    torch.testing.assert_close(known.gradient(x.view(2, 3, 2)), wanted.view(2, 3, 2))
+    torch.testing.assert_close(known.model(x).value, model[:, N])
+    levels = [whole.control, *(u.expand(6, 2) for u in PROBLEM.levels())]
+    ahead = torch.stack([now + known.value(after) for after, now in (pushed(x, u) for u in levels)]).amin(0)
+    torch.testing.assert_close(known.bellman_residual(x), (ahead - whole.value) / whole.value)
+
+
+def test_what_is_exported_of_two_inputs_is_the_same(known: adp.GlobalValue) -> None:
+    x = tensor([3.0, 0.9]) * uniform(6, N, seed=8)
+    torch.testing.assert_close(deploy.policy_of(known)(x), known(x))
+
+
+def test_a_trajectory_that_must_not_help_is_no_candidate(known: adp.GlobalValue) -> None:
+    x, own = known.library.state[[0, 2, 4], 1], torch.tensor([0, 2, 4])
+    assert bool((known.nearest(x)[:, 0] // LENGTH == own).all())
+    entries = known.nearest(x, own)
+    assert entries.shape == (3, 5)
+    assert bool((entries[:, :-1] // LENGTH != own[:, None]).all())
+    assert bool((entries[:, -1] == known.resting).all())
+
+
+def test_a_replayed_plan_ends_in_the_feedback_of_the_goal(known: adp.GlobalValue) -> None:
+    x = tensor([[0.4 - 2 * math.pi, 0.1], [0.5, -0.2]])
+    control, around = known.replay(x, torch.tensor([3, 4 * LENGTH + 1]), 12)
+    for row, first in ((0, 3), (1, 4 * LENGTH + 1)):
+        last = (first // LENGTH + 1) * LENGTH - 1
+        rows = [min(first + k, last) for k in range(12)]
+        assert torch.equal(control[row], known.plans[rows, N : N + M])
+        assert torch.equal(around.feedback[row], known.plans[rows, N + M :].view(12, M, N))
+        shift = around.state[row] - known.plans[rows, :N]
+        turns = float(shift[0, 0]) / (2 * math.pi)
+        assert turns == pytest.approx(round(turns), abs=1e-9)
+        torch.testing.assert_close(shift, shift[:1].expand(12, N), rtol=0, atol=1e-9)
+        assert abs(float(around.state[row, 0, 0] - x[row, 0])) <= math.pi
+
+
+def test_a_memory_that_is_copied_answers_alike(known: adp.GlobalValue) -> None:
+    x = tensor([3.0, 0.9]) * uniform(6, N, seed=7)
+    assert torch.equal(pickle.loads(pickle.dumps(known))(x), known(x))
+
+
+def test_a_memory_grows_by_what_it_did_not_know_and_says_so(caplog: pytest.LogCaptureFixture) -> None:
+    problem = double_integrator(-1.0, 1.0)
+
+    def learned(seed: int, rounds: int) -> adp.GlobalValue:
+        given = {"steps": 60, "trajectories": 3, "states": 4, "candidates": 7, "lookahead": 8}
+        return adp.learn_global_value(problem, [2.0, 1.0], rounds=rounds, seed=seed, **given)
+
+    with caplog.at_level(logging.INFO, "staf_torch.adp.planning.global_value_learning"):
+        grown = learned(3, 2)
+    said = [re.search(r"([0-9.]+) % of 4 fresh", record.getMessage()) for record in caplog.records]
+    unknown = sum(4 - round(0.04 * float(share[1])) for share in said if share)
+    assert len(said) == 2
+    assert len(grown.library.cost) == 3 + unknown
+    assert 0 < unknown < 8
+    first = learned(3, 0)
+    assert (len(first.library.cost), first.lookahead) == (3, 8)
+    assert bool((first.library.state[:, 0].abs() <= tensor([2.0, 1.0])).all())
+    torch.testing.assert_close(grown.library.state[:3, 0], first.library.state[:, 0])  # of the seed
+    assert not torch.equal(learned(4, 0).library.state[:, 0], first.library.state[:, 0])
+
+
+def test_plans_that_a_memory_begins_from_are_never_worse_than_it_and_a_sweep_raises_no_cost(
+    memory: adp.GlobalValue,
+) -> None:
+    search = adp.BoxDDP(memory.problem, steps=120, iterations=40, tolerance=1e-5)
+    x = torch.cat((RESETS[:4], tensor([[3.0, 0.2]])))
+    found = best_from(memory, search, x)
+    assert bool((found.cost <= memory.choose(x).value * (1 + 1e-6)).all())
+    torch.testing.assert_close(found.state[:, 0], x)
+    torch.testing.assert_close(best_from(memory, search, x[2:3]).cost, found.cost[2:3], rtol=1e-9, atol=0)
+    rough = adp.BoxDDP(memory.problem, steps=120, iterations=2).solve(memory.library.state[:6, 0])
+    small = adp.GlobalValue(memory.problem, rough, REGION, candidates=8)
+    better = swept(small, search)
+    assert bool((better.cost <= rough.cost).all())
+    assert bool((better.cost < 0.99 * rough.cost).any())
+    torch.testing.assert_close(better.state[:, 0], rough.state[:, 0])

@@ -1,0 +1,471 @@
+"""Control barrier functions of a held control: the program, where the filter acts, what it keeps."""
+
+from __future__ import annotations
+
+import copy
+import math
+import pickle
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from helpers import tensor, uniform
+from torch import Tensor
+
+from staf_torch import adp, deploy, systems
+from staf_torch.adp.safety.safety_filter import walls
+from staf_torch.deploy.c_header import runner_c
+
+LINE = systems.Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
+PLANE = systems.Linear(
+    np.kron([[0.0, 1.0], [0.0, 0.0]], np.eye(2)).tolist(), np.kron([[0.0], [1.0]], np.eye(2)).tolist()
+)
+COST = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
+COST4 = adp.QuadraticCost(1.0, 1.0, dim=4, inputs=2)
+
+
+def wall(x: Tensor, t: Tensor) -> Tensor:
+    return x[:, 0] + 0.1
+
+
+def disc(x: Tensor, t: Tensor) -> Tensor:
+    return (x[:, 0] - 1).square() + x[:, 1].square() - 0.25
+
+
+def passing(x: Tensor, t: Tensor) -> Tensor:
+    """A disc that moves, and is not there before 0.2 s."""
+    return torch.where(t < 0.2, 10.0, (x[:, 0] - 0.5 * t).square() + (x[:, 1] - 0.8).square() - 0.09)
+
+
+def test_far_from_the_edge_not_a_bit_changes_and_rows_are_alone() -> None:
+    guard = adp.SafetyFilter(
+        lambda x: -x[..., 2:], PLANE, [disc, passing], dt=0.01, low=[-1.0, -2.0], high=1.5
+    )
+    x, u = uniform(24, 4, seed=1, low=-2.0, high=2.0), uniform(24, 2, seed=2, low=-0.9, high=0.9)
+    t = uniform(24, low=0.0, high=2.0, seed=3)
+    found = guard.restrain(x, u, t)
+    far = (found.margin > 2.5).all(-1)
+    assert 3 < int(far.sum()) < 21
+    assert torch.equal(found.control[far], u[far])
+    assert bool((found.control[~far] != u[~far]).any())
+    for row in (0, 23):
+        alone = guard.restrain(x[row : row + 1], u[row : row + 1], t[row : row + 1])
+        assert all(torch.equal(a[0], b[row]) for a, b in zip(alone, found, strict=True))
+    assert torch.equal(found.margin, guard.margins(x, t))
+    assert guard.restrain(x[:4].reshape(2, 2, 4), u[:4].reshape(2, 2, 2), 0.3).slack.shape == (2, 2)
+
+
+@pytest.mark.parametrize(("low", "high"), [(2.0, 5.0), (-1.0, 1.0), (2.0, math.inf), (-math.inf, -2.0)])
+def test_a_wall_of_a_box_is_crossed_at_the_rate_of_the_coordinate(low: float, high: float) -> None:
+    (h,) = walls([-math.inf, low], [math.inf, high])
+    for wall, inward in ((low, 1.0), (high, -1.0)):
+        if math.isfinite(wall):
+            at = torch.tensor([[9.0, wall]], dtype=torch.float64, requires_grad=True)
+            value = h(at, 0.0)
+            (slope,) = torch.autograd.grad(value.sum(), at)
+            assert value.item() == pytest.approx(0.0, abs=1e-15)
+            assert slope[0].tolist() == pytest.approx([0.0, inward])
+
+
+def test_a_wall_is_never_crossed_and_a_larger_margin_keeps_farther_away() -> None:
+    x0 = torch.stack((uniform(8, low=0.2, high=2.0, seed=4), uniform(8, low=-0.2, high=1.0, seed=5)), dim=-1)
+    least = []
+    for margin in (0.0, 0.05):
+        guard = adp.SafetyFilter(lambda x: 0 * x[..., :1] - 3, LINE, wall, dt=0.1, decay=4.0, margin=margin)
+        run = adp.simulate(guard, LINE, COST, x0, steps=10, compile=False)
+        report = guard.report(run)
+        assert report["constraint_violations"] == 0
+        assert report["infeasible"] == []
+        assert report["minimum_margin"] >= margin
+        assert report["minimum_margin"] == pytest.approx(
+            float(guard.margins(run.state, 0.0).min()), abs=1e-12
+        )
+        least.append(guard.margins(run.state[:, -1], 0.0)[:, 0])
+    assert bool((least[0] < least[1]).all())
+
+
+def test_discs_that_move_and_appear_are_avoided_within_the_bounds() -> None:
+    lqr = adp.LQR(PLANE, COST4)
+    guard = adp.SafetyFilter(lqr, PLANE, [disc, passing], dt=0.1, low=-1.0, high=1.0)
+    assert guard.degree == (2, 2)
+    assert guard.moving
+    x0 = tensor([[2.0, 0.5, 0.0, 0.0], [1.5, -0.9, 0.0, 0.0]])
+    run = adp.simulate(guard, PLANE, COST4, x0, steps=12, every=4, compile=False)
+    report = guard.report(run)
+    assert report["minimum_margin"] > 0
+    assert 0 < report["acted"] < 1
+    assert float(run.control[:, :-1].abs().max()) <= 1
+    bare = adp.simulate(adp.Feedback(lqr), PLANE, COST4, x0, dt=0.1, steps=12, every=4, compile=False)
+    assert float(guard.margins(bare.state, bare.time).min()) < 0
+    assert "filtered" in guard.label
+
+
+def test_rows_that_cannot_be_kept_are_named() -> None:
+    guard = adp.SafetyFilter(lambda x: -x[..., 1:], LINE, wall, dt=0.05, low=-1.0, high=1.0)
+    x0 = tensor([[1.0, 0.0], [0.0, -2.0], [2.0, 0.0]])
+    run = adp.simulate(guard, LINE, COST, x0, steps=8, compile=False)
+    report = guard.report(run)
+    assert report["infeasible"] == [1]
+    assert report["constraint_violations"] == 1
+    assert report["minimum_margin"] < 0 < report["largest_slack"]
+    assert float(run.control[1, 0]) == 1.0  # as much as there is
+
+
+def test_policies_of_all_kinds_stand_behind_it() -> None:
+    x0 = tensor([[1.0, -0.3], [0.4, 0.0]])
+    learner = adp.ActorCritic(adp.QuadraticBasis(2), LINE, COST, adp.RandomPoints(1, half_width=0.5))
+    near = adp.near_optimal(LINE, COST, dt=0.05, low=-2.0, high=2.0)
+    for policy in (
+        adp.RolloutPolicy.of_lqr(LINE, COST),
+        near,
+        learner,
+        adp.Supervised(learner, adp.LQR(LINE, COST), COST),
+    ):
+        guard = adp.SafetyFilter(policy, LINE, wall, dt=0.05)
+        run = adp.simulate(guard, LINE, COST, x0, steps=2, compile=False)
+        assert not bool(run.diverged.any())
+        assert guard.report(run)["minimum_margin"] > 0
+    with pytest.raises(ValueError, match="must be a function of x to be asked at x"):
+        adp.SafetyFilter(learner, LINE, wall, dt=0.05)(x0)
+    with pytest.raises(ValueError, match=r"must be that of the loop, 0\.1 s; got 0\.05"):
+        adp.simulate(guard, LINE, COST, x0, dt=0.1, steps=1)
+
+
+def test_weights_say_which_input_shall_move() -> None:
+    def both(x: Tensor, t: Tensor) -> Tensor:
+        return 1 - x[:, 2] - x[:, 3]
+
+    x, want = tensor([0.0, 0.0, 0.5, 0.5]), tensor([1.0, 1.0])
+    even = adp.SafetyFilter(lambda x: x, PLANE, both, dt=0.01).restrain(x, want).control
+    dear = adp.SafetyFilter(lambda x: x, PLANE, both, dt=0.01, weight=[1e6, 1.0]).restrain(x, want).control
+    torch.testing.assert_close(even, tensor([0.0, 0.0]), rtol=0, atol=1e-9)
+    torch.testing.assert_close(dear, tensor([1.0, -1.0]), rtol=0, atol=1e-5)
+
+
+@pytest.mark.needs_compiler
+def test_in_c_it_is_the_same(tmp_path: Path) -> None:
+    guard = adp.SafetyFilter(adp.LQR(PLANE, COST4), PLANE, [passing], dt=0.05, low=-1.0, high=1.0)
+    policy = deploy.policy_of(guard)
+    z = torch.cat((uniform(30, 4, seed=8), uniform(30, 1, low=0.0, high=1.0, seed=9)), dim=-1)
+    deploy.export_c(policy, z[:1], tmp_path / "guard.h", ["control"])
+    (control,) = runner_c(tmp_path / "guard.h", [2], torch.float64)(z)
+    torch.testing.assert_close(control, policy(z), rtol=0, atol=1e-9)
+    torch.testing.assert_close(policy(z), guard(z[:, :4], z[:, 4]))
+    assert bool((control != guard.bounds.clip(adp.LQR(PLANE, COST4)(z[:, :4]))).any())
+
+
+def test_a_copy_a_pickle_and_single_precision_are_the_same_filter() -> None:
+    guard = adp.SafetyFilter(adp.LQR(LINE, COST), LINE, wall, dt=0.05)
+    x = tensor([[0.3, -0.5], [1.0, 0.0]])
+    for other in (copy.deepcopy(guard), pickle.loads(pickle.dumps(guard))):
+        assert torch.equal(other(x), guard(x))
+    single = guard(x.float())
+    assert single.dtype == torch.float32
+    torch.testing.assert_close(single.double(), guard(x), rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (
+            {"plant": systems.StepPlant(lambda x, u: x + u, dim=1, inputs=1, dt=0.1)},
+            "must be in continuous time",
+        ),
+        ({"constraints": []}, r"must be h\(x, t\) or a list of them"),
+        ({"constraints": lambda x, t: x}, r"must map \(3, n\) to \(3,\), number 0; got \(3, 2\)"),
+        (
+            {"constraints": lambda x, t: 1 + 0 * x[:, 0]},
+            "moves neither first nor second derivative of number 0",
+        ),
+        (
+            {"decay": [200.0], "degree": 2},
+            r"must be at most 1/dt = 100 where the relative degree is two; got",
+        ),
+        ({"decay": [1.0, 2.0]}, "must be one number or a list of 1"),
+        ({"weight": [1.0, 1.0]}, "must be one number or a list of 1"),
+        ({"degree": 3}, "must be 1 or 2, one a constraint"),
+    ],
+)
+def test_what_breaks_a_rule_is_refused(given: dict[str, object], message: str) -> None:
+    usual: dict[str, object] = {"policy": lambda x: x, "plant": LINE, "constraints": wall, "dt": 0.01}
+    with pytest.raises(ValueError, match=message):
+        adp.SafetyFilter(**{**usual, **given})  # type: ignore[arg-type]
+
+
+class Turning(systems.ControlAffineSystem):
+    """(p, angle)' = (v cos, v sin, w): what v moves changes within a hold as w turns it."""
+
+    dim, inputs = 3, 2
+
+    def drift(self, x: Tensor) -> Tensor:
+        return torch.zeros_like(x)
+
+    def effectiveness(self, x: Tensor) -> Tensor:
+        none, one = torch.zeros_like(x[..., 0]), torch.ones_like(x[..., 0])
+        rows = (x[..., 2].cos(), none), (x[..., 2].sin(), none), (none, one)
+        return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
+
+
+@pytest.mark.parametrize("decay", [9.0, 60.0])
+def test_a_condition_that_bends_is_met_or_the_slack_says_so(decay: float) -> None:
+    """A unicycle turns by half a radian within a hold: no line is like its condition."""
+    shield = adp.SafetyFilter(
+        lambda x: x[..., :2], Turning(), disc, dt=0.1, low=[-1, -5], high=[1, 5], decay=decay, degree=1
+    )
+    x, angle = uniform(1000, 3, low=-1.0, high=1.0, seed=7), uniform(1000, low=0.0, high=6.28, seed=8)
+    x[:, 0], x[:, 1] = (
+        1 + (0.5 + 0.1 * x[:, 0].abs()) * angle.cos(),
+        (0.5 + 0.1 * x[:, 1].abs()) * angle.sin(),
+    )
+    x = torch.cat((x[:, :2], 3.14 * x[:, 2:]), dim=-1)
+    x = x[disc(x, tensor(0.0)) >= 0]
+    wanted = uniform(len(x), 2, low=-1.0, high=1.0, seed=9) * tensor([1.0, 5.0])
+    found = shield.restrain(x, wanted)
+
+    def after(u: Tensor) -> tuple[Tensor, Tensor]:
+        halves = [x]
+        for _ in range(2):
+            halves.append(
+                systems.runge_kutta_step(lambda z: shield.plant.motion(z, u), halves[-1], 0.5 * shield.hold)
+            )
+        now, middle, end = (disc(each, tensor(0.0)) for each in halves)
+        dip = (0.5 * (now + end) - middle).clamp(min=0)
+        return end, dip + math.exp(-decay * shield.hold) * (now - dip)
+
+    end, required = after(wanted)
+    asked = (required - end).clamp(min=0)
+    end, required = after(found.control)
+    missing = (required - end).clamp(min=0)
+    assert int((asked > 0).sum()) > 60
+    met = found.slack < 1e-9
+    assert bool((missing[met] <= 2e-6 * asked[met] + 1e-12).all())
+    assert bool((missing[~met] > 0).all())
+    assert float(met.double().mean()) > 0.9
+
+
+def test_a_condition_that_no_control_moves_leaves_a_finite_slack_and_the_others_kept() -> None:
+    still = systems.Linear([[0.0, 0.0], [0.0, 0.0]], [[0.0], [1.0]])  # x1 moves by nothing
+    walls = [lambda x, t: 0.5 - x[:, 0], lambda x, t: 0.4 - x[:, 1]]
+    guard = adp.SafetyFilter(lambda x: torch.ones_like(x[..., :1]), still, walls, dt=0.1, decay=1.0, degree=1)
+    x = tensor([[0.7, 0.39], [0.2, 0.39], [0.7, 0.0]])
+    u, margin, slack = guard.restrain(x, torch.ones(3, 1).double())
+    assert bool(torch.isfinite(slack).all())
+    torch.testing.assert_close(margin, torch.stack((0.5 - x[:, 0], 0.4 - x[:, 1]), dim=-1))
+    assert float((0.4 - x[:, 1] - 0.1 * u[:, 0] - 0.9 * (0.4 - x[:, 1])).min()) > -1e-9
+
+
+# What is asked of a control, beside the same written out -------------------------------------------------
+
+
+def stiff(x: Tensor, u: Tensor) -> Tensor:
+    """A rate that bends within a hold, and of which the input moves the second state alone."""
+    return torch.stack(
+        (x[..., 1] - 0.3 * x[..., 0] ** 3, 4 * x[..., 0].sin() - x[..., 1] + 2 * u[..., 0]), -1
+    )
+
+
+PLANT = systems.RatePlant(stiff, dim=2, inputs=1)
+
+
+def near(x: Tensor, t: Tensor) -> Tensor:
+    """Of degree two, and moving."""
+    return 0.8 - x[:, 0] - 0.2 * x[:, 0] ** 2 + 0.1 * (3 * t).sin()
+
+
+def slow(x: Tensor, t: Tensor) -> Tensor:
+    """Of degree one, and moving."""
+    return 1.5 - x[:, 1] + 0.2 * x[:, 0] ** 2 - 0.3 * t
+
+
+def advanced(x: Tensor, u: Tensor, hold: float) -> Tensor:
+    """Classical Runge-Kutta, once."""
+    a = stiff(x, u)
+    b = stiff(x + hold / 2 * a, u)
+    c = stiff(x + hold / 2 * b, u)
+    d = stiff(x + hold * c, u)
+    return x + hold * (a / 6 + b / 3 + c / 3 + d / 6)
+
+
+def level(h: Any, degree: int, decay: float, margin: float, x: Tensor, t: Tensor) -> Tensor:
+    """phi: h less the margin, or its rate at rest and decay times that."""
+    if degree == 1:
+        return h(x, t) - margin
+    x, t = x.detach().requires_grad_(), t.detach().requires_grad_()
+    value = h(x, t)
+    along_x, along_t = torch.autograd.grad(value.sum(), (x, t))
+    rate = (along_x * stiff(x, torch.zeros_like(x[:, :1]))).sum(-1) + along_t
+    return (rate + decay * (value - margin)).detach()
+
+
+def missing(given: dict[str, Any], x: Tensor, u: Tensor, t: Tensor, hold: float) -> Tensor:
+    """By how much a held control misses what is asked at its end."""
+    middle = advanced(x, u, hold / 2)
+    end = advanced(middle, u, hold / 2)
+    now, half, last = (
+        level(x=at, t=t + later, **given) for at, later in ((x, 0.0), (middle, hold / 2), (end, hold))
+    )
+    dip = ((now + last) / 2 - half).clamp(min=0)
+    return dip + math.exp(-given["decay"] * hold) * (now - dip) - last
+
+
+@pytest.mark.parametrize(("h", "degree", "margin"), [(near, 2, 0.3), (slow, 1, 0.2)])
+def test_the_control_is_the_nearest_that_meets_the_condition_written_out(
+    h: Any, degree: int, margin: float
+) -> None:
+    hold, decay = 0.12, 3.0
+    given = {"h": h, "degree": degree, "decay": decay, "margin": margin}
+    guard = adp.SafetyFilter(lambda x: x[..., :1], PLANT, h, dt=hold, decay=decay, margin=margin)
+    assert guard.degree == (degree,)
+    assert guard.moving
+    x, t = uniform(60, 2, seed=1), uniform(60, low=0.0, high=2.0, seed=2)
+    wanted = 3 + uniform(60, 1, seed=3)
+    found = guard.restrain(x, wanted, t)
+    asked = missing(given, x, wanted, t, hold)
+    assert torch.equal((found.control != wanted)[:, 0], asked > 0)
+    assert 10 < int((asked > 0).sum()) < 55
+    low, high = wanted - 60, wanted.clone()  # one is safe, the other is not
+    for _ in range(60):
+        middle = (low + high) / 2
+        safe = (missing(given, x, middle, t, hold) <= 0).unsqueeze(-1)
+        low, high = torch.where(safe, middle, low), torch.where(safe, high, middle)
+    nearest = torch.where((asked > 0).unsqueeze(-1), low, wanted)
+    torch.testing.assert_close(found.control, nearest, rtol=2e-5, atol=2e-5)
+    torch.testing.assert_close(found.margin[:, 0], h(x, t))
+    assert float(found.slack.max()) < 1e-6
+    # The line at a control has the slope of phi at the end, and its value.
+    normal, least, h_now = guard.inequalities(x, wanted, t)
+    ends = []
+    for other in (wanted - 1e-4, wanted + 1e-4):
+        end = advanced(advanced(x, other, hold / 2), other, hold / 2)
+        ends.append(level(h, degree, decay, margin, end, t + hold))
+    torch.testing.assert_close(normal[:, 0, 0] * hold, (ends[1] - ends[0]) / 2e-4, rtol=1e-5, atol=1e-6)
+    off = least[:, 0] - normal[:, 0, 0] * wanted[:, 0]
+    torch.testing.assert_close(off, asked / hold, rtol=1e-9, atol=1e-9)
+    assert torch.equal(h_now[:, 0], found.margin[:, 0])
+
+
+def test_the_slack_is_how_much_further_a_control_would_have_to_reach() -> None:
+    def fast(x: Tensor, t: Tensor) -> Tensor:
+        return 0.5 - x[:, 1]
+
+    for weight in (1.0, 4.0):
+        guard = adp.SafetyFilter(
+            lambda x: x[..., :1], LINE, fast, dt=0.1, decay=2.0, low=-1.0, high=1.0, weight=[weight]
+        )
+        x = tensor([[0.0, 0.45], [0.0, 0.9], [0.0, 0.0]])
+        found = guard.restrain(x, tensor([[1.0], [1.0], [1.0]]))
+        # x2 + 0.1 u <= 0.5 - e^-0.2 (0.5 - x2)
+        most = (0.5 - math.exp(-0.2) * (0.5 - x[:, 1]) - x[:, 1]) / 0.1
+        torch.testing.assert_close(found.control[:, 0], most.clamp(-1, 1))
+        torch.testing.assert_close(found.slack, (-1 - most).clamp(min=0) * weight**0.5, rtol=1e-9, atol=1e-12)
+
+
+def test_rows_of_any_dimensions_are_rows_with_a_time_of_their_own() -> None:
+    guard = adp.SafetyFilter(lambda x: 3 + x[..., :1], PLANT, [near, slow], dt=0.1, decay=[2.0, 5.0])
+    x, t = uniform(12, 2, seed=4), uniform(12, low=0.0, high=2.0, seed=5)
+    flat, margins = guard.restrain(x, 3 + x[:, :1], t), guard.margins(x, t)
+    assert flat.control.shape == (12, 1)
+    torch.testing.assert_close(margins, torch.stack((near(x, t), slow(x, t)), dim=-1))
+    for shape in ((3, 2, 2),):
+        deep, at = x.reshape(*shape, 2), t.reshape(shape)
+        found = guard.restrain(deep, 3 + deep[..., :1], at)
+        assert found.control.shape == (*shape, 1)
+        assert found.margin.shape == (*shape, 2)
+        assert found.slack.shape == shape
+        for one, other in zip(found, flat, strict=True):
+            torch.testing.assert_close(one.reshape(other.shape), other, rtol=1e-12, atol=1e-12)
+        torch.testing.assert_close(guard.margins(deep, at).reshape(12, 2), margins)
+        torch.testing.assert_close(guard(deep, at), found.control)
+    torch.testing.assert_close(guard(x[3], float(t[3])), flat.control[3])
+    torch.testing.assert_close(guard.margins(x, 0.0), guard.margins(x))
+    assert guard.margins(x[3], float(t[3])).shape == (2,)
+    for wrong in ({"x": x[:, :1]}, {"u": x}):
+        with pytest.raises(ValueError, match=rf"`SafetyFilter\({next(iter(wrong))}=...\)`"):
+            guard.restrain(**{"x": x, "u": x[:, :1], "t": 0.0} | wrong)
+
+
+def test_a_report_is_that_of_every_step_of_the_loop() -> None:
+    def rising(x: Tensor, t: Tensor) -> Tensor:
+        return 0.6 - x[:, 0] + 0.1 * t
+
+    given: dict[str, Any] = {"dt": 0.1, "decay": 3.0, "low": -1.0, "high": 1.0}
+    want = lambda x: 2 - x[..., :1] - x[..., 1:]  # noqa: E731
+    guard = adp.SafetyFilter(want, LINE, [rising, lambda x, t: 1.5 - x[:, 1]], **given)
+    x0 = tensor([[0.0, 0.0], [0.3, 1.4], [0.5, 1.6], [-1.0, 0.2], [-9.0, 0.0]])
+    run = adp.simulate(guard, LINE, COST, x0, steps=2, every=2, compile=False)
+    report = guard.report(run)
+    x, least, most, acted = x0, [], [], 0
+    for k in range(2):
+        t = torch.full((5,), 0.1 * k, dtype=torch.float64)
+        found = guard.restrain(x, want(x), t)
+        least.append(torch.minimum(rising(x, t), 1.5 - x[:, 1]))
+        most.append(found.slack)
+        acted += int((found.control != want(x).clamp(-1, 1)).sum())
+        x = x + 0.1 * torch.cat((x[:, 1:] + 0.05 * found.control, found.control), dim=-1)
+    torch.testing.assert_close(x, run.state[:, -1], rtol=1e-9, atol=1e-9)
+    least.append(torch.minimum(rising(x, tensor(0.2)), 1.5 - x[:, 1]))
+    smallest, largest = torch.stack(least).amin(0), torch.stack(most).amax(0)
+    assert report["minimum_margin"] == pytest.approx(float(smallest.min()), abs=1e-9)
+    assert report["constraint_violations"] == int((smallest < 0).sum())
+    assert report["infeasible"] == (largest > 1e-6).nonzero().flatten().tolist()
+    assert report["largest_slack"] == pytest.approx(float(largest.max()), rel=1e-6)
+    assert report["acted"] == pytest.approx(acted / 10)
+    assert 0 < report["constraint_violations"] < 5
+    assert 0 < len(report["infeasible"]) < 5
+    assert 0 < acted < 10
+
+
+def test_what_stands_behind_it_has_its_own_columns_and_value() -> None:
+    inner = adp.SafetyFilter(adp.LQR(LINE, COST), LINE, lambda x, t: x[:, 0] + 9.0, dt=0.05)
+    outer = adp.SafetyFilter(inner, LINE, wall, dt=0.05)
+    alone = adp.SafetyFilter(adp.LQR(LINE, COST), LINE, wall, dt=0.05)
+    x0 = tensor([[1.0, -1.0], [0.2, -0.5]])
+    run, other = (adp.simulate(guard, LINE, COST, x0, steps=2, compile=False) for guard in (outer, alone))
+    assert torch.equal(run.state, other.state)
+    assert outer.report(run) == alone.report(other)
+    learner = adp.ActorCritic(adp.QuadraticBasis(2), LINE, COST, adp.RandomPoints(1, half_width=0.5))
+    guard = adp.SafetyFilter(learner, LINE, wall, dt=0.05)
+    assert (guard.draws, guard.label) == (learner.draws, f"filtered {learner.label}")
+    torch.testing.assert_close(guard.value(x0, guard.init(x0)), learner.value(x0, learner.init(x0)))
+
+
+def test_a_decay_of_one_over_the_hold_is_taken_and_more_where_the_degree_is_one() -> None:
+    both = [lambda x, t: x[:, 0], lambda x, t: x[:, 1]]
+    assert adp.SafetyFilter(lambda x: x[..., :1], LINE, both, dt=0.125, decay=[8.0, 80.0]).degree == (2, 1)
+    with pytest.raises(ValueError, match="must be at most 1/dt = 8 where"):
+        adp.SafetyFilter(lambda x: x[..., :1], LINE, both, dt=0.125, decay=[8.1, 1.0])
+
+
+def test_degrees_may_be_stated_for_all_or_each() -> None:
+    both = [lambda x, t: 1 - x[:, 0], lambda x, t: 1 - x[:, 1]]
+    for degree, found in ((1, (1, 1)), ([2, 1], (2, 1)), ([1, 2], (1, 2)), ((2, 2), (2, 2))):
+        assert adp.SafetyFilter(lambda x: x[..., :1], LINE, both, dt=0.1, degree=degree).degree == found
+    for wrong in (0, 3, [1], [1, 2, 1], [1, 3], []):
+        with pytest.raises(
+            ValueError, match=r"`SafetyFilter\(degree=...\)` must be 1 or 2, one a constraint"
+        ):
+            adp.SafetyFilter(lambda x: x[..., :1], LINE, both, dt=0.1, degree=wrong)
+    third = systems.Linear([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0] * 3], [[0.0], [0.0], [1.0]])
+    with pytest.raises(ValueError, match="neither first nor second derivative of number 1, at 160 states"):
+        adp.SafetyFilter(lambda x: x[..., :1], third, [lambda x, t: x[:, 2], lambda x, t: x[:, 0]], dt=0.1)
+
+
+@pytest.mark.parametrize("begin", [0.05, 50.0])
+def test_what_depends_on_the_time_is_found_whenever_it_begins_to(begin: float) -> None:
+    guard = adp.SafetyFilter(
+        lambda x: x[..., :1], LINE, lambda x, t: 1 - x[:, 1] + (t - begin).clamp(min=0), dt=0.1
+    )
+    assert guard.moving
+    assert not adp.SafetyFilter(lambda x: x[..., :1], LINE, lambda x, t: 1 - x[:, 1] + 0 * t, dt=0.1).moving
+
+
+@pytest.mark.parametrize(
+    ("stated", "most"), [({}, 0.3), ({"low": -0.2, "high": 0.2}, 0.2), ({"low": -1.0}, 5.0)]
+)
+def test_bounds_of_the_plant_hold_where_the_filter_states_none(stated: dict[str, float], most: float) -> None:
+    plant = systems.Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
+    plant.bounds = systems.Bounds(-0.3, 0.3, 1)
+    shield = adp.SafetyFilter(lambda x: 5.0 + 0 * x[..., :1], plant, wall, dt=0.01, **stated)
+    assert shield(tensor([[1.0, 0.0]])).tolist() == [[most]]
