@@ -7,10 +7,10 @@ from .adaptation.adaptive_lqr import Adaptation as Adaptation
 from .adaptation.adaptive_lqr import AdaptiveLQR as AdaptiveLQR
 from .adaptation.consider import Considered as Considered
 from .adaptation.consider import ConsiderFilter as ConsiderFilter
+from .adaptation.drift import DriftAdaptation as DriftAdaptation
 from .adaptation.drift import DriftEstimate as DriftEstimate
+from .adaptation.drift import DriftLQR as DriftLQR
 from .adaptation.drift import StreamDrift as StreamDrift
-from .adaptation.drift_lqr import DriftAdaptation as DriftAdaptation
-from .adaptation.drift_lqr import DriftLQR as DriftLQR
 from .adaptation.history_stack import ConcurrentGradient as ConcurrentGradient
 from .adaptation.history_stack import ConcurrentLearning as ConcurrentLearning
 from .adaptation.history_stack import HistoryStack as HistoryStack
@@ -49,9 +49,9 @@ from .critic.laws import ActorCriticLaw as ActorCriticLaw
 from .critic.laws import Frozen as Frozen
 from .critic.laws import Gains as Gains
 from .critic.laws import Information as Information
+from .critic.laws import PolicyIteration as PolicyIteration
 from .critic.laws import Published as Published
 from .critic.laws import Weights as Weights
-from .critic.policy_iteration import PolicyIteration as PolicyIteration
 from .estimation.kalman import Belief as Belief
 from .estimation.kalman import ExtendedKalman as ExtendedKalman
 from .estimation.kalman import KalmanFilter as KalmanFilter
@@ -69,6 +69,7 @@ from .loop.simulation import simulate as simulate
 from .near_optimal import NearOptimal as NearOptimal
 from .near_optimal import near_optimal as near_optimal
 from .planning.ddp import BoxDDP as BoxDDP
+from .planning.ddp import Trajectories as Trajectories
 from .planning.detour_ddp import DetourPlans as DetourPlans
 from .planning.detour_rollout import DetourRollout as DetourRollout
 from .planning.global_value import GlobalValue as GlobalValue
@@ -76,7 +77,6 @@ from .planning.global_value_learning import learn_global_value as learn_global_v
 from .planning.obstacle_cost import AvoidanceCost as AvoidanceCost
 from .planning.obstacle_cost import AvoidancePlans as AvoidancePlans
 from .planning.obstacle_cost import plan_around as plan_around
-from .planning.plans import Trajectories as Trajectories
 from .planning.receding_horizon import RecedingHorizon as RecedingHorizon
 from .planning.shooting import DirectShooting as DirectShooting
 from .planning.shooting import Optimum as Optimum

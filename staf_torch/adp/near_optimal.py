@@ -20,9 +20,8 @@ from ..systems import Clocked, Plant
 from ..systems.bounds import Limit
 from .loop.controller import LQR, Controller, Feedback
 from .loop.simulation import simulate
-from .planning.receding_horizon import RecedingHorizon
+from .planning.receding_horizon import BoundedPlans, RecedingHorizon, StrainedPlans
 from .planning.shooting import DirectShooting
-from .planning.strained_plans import BoundedPlans, StrainedPlans
 from .policies.rollout import ball_directions
 from .policies.sampled_rollout import SampledRollout
 from .problem.cost import Cost

@@ -20,7 +20,7 @@ from ..adp import (
     SafetyFilter,
     Supervised,
 )
-from ..adp.planning.strained_plans import StrainedPlans
+from ..adp.planning.receding_horizon import StrainedPlans
 from ..numerics.checks import fail, trailing
 from .remembered import RememberedPolicy
 

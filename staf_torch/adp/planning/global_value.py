@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from ...lanes import Program, scan
 from ...numerics.checks import fail, integer, positive_real, trailing, vector
 from ..problem.sampled import SampledProblem
-from .plans import LocalModel, Reference, Trajectories, around, packed, resting, unpacked
+from .ddp import LocalModel, Reference, Trajectories, around, packed, resting, unpacked
 
 _TOGETHER = 4096  # candidates rolled out at once
 _ROUND = 0.01  # share of the metric that counts every coordinate, also one of which no cost depends

@@ -11,9 +11,8 @@ from torch import Tensor
 
 from ...numerics.checks import integer
 from ..problem.sampled import SampledProblem
-from .ddp import BoxDDP
+from .ddp import BoxDDP, Reference, Trajectories, chosen
 from .global_value import GlobalValue
-from .plans import Reference, Trajectories, chosen
 
 _log = logging.getLogger(__name__)
 _HELD = 10  # steps for which a random first control is held

@@ -14,8 +14,7 @@ from ...numerics.checks import choice, fail, integer, positive_real
 from ...systems import Plant
 from ..problem.cost import Matrix, QuadraticCost
 from ..problem.sampled import SampledProblem
-from .ddp import BoxDDP
-from .plans import Reference, Trajectories, chosen
+from .ddp import BoxDDP, Reference, Trajectories, chosen
 
 Obstacle = Callable[[Tensor], Tensor]
 """h(x), at least 0 outside: (..., n) -> (...)."""

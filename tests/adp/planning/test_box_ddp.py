@@ -13,7 +13,7 @@ from helpers_swingup import cost_of, double_integrator, pendulum
 from torch import Tensor
 
 from staf_torch import adp, lanes, systems
-from staf_torch.adp.planning.plans import Reference
+from staf_torch.adp.planning.ddp import Reference
 from staf_torch.numerics.forward_mode import use_forward_mode
 
 use_forward_mode()

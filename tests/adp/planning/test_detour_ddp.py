@@ -16,7 +16,7 @@ from torch import Tensor
 
 from staf_torch import adp, systems
 from staf_torch.adp.loop.controller import carrying
-from staf_torch.adp.planning.plan_problem import PlanProblem
+from staf_torch.adp.planning.detour_ddp import PlanProblem
 
 PLANE = systems.Linear(torch.eye(4).roll(2, dims=1).triu().tolist(), torch.eye(4)[:, 2:].tolist())
 COST = adp.QuadraticCost(1.0, 1.0, dim=4, inputs=2, low=-1.0, high=1.0)

@@ -15,8 +15,8 @@ from helpers_swingup import GRID, REGION, RESETS, double_integrator
 from torch import Tensor
 
 from staf_torch import adp, deploy
+from staf_torch.adp.planning.ddp import Trajectories
 from staf_torch.adp.planning.global_value_learning import best_from, swept
-from staf_torch.adp.planning.plans import Trajectories
 
 
 def swing(policy: adp.GlobalValue, x: Tensor) -> tuple[Tensor, Tensor]:

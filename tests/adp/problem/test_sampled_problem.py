@@ -13,7 +13,7 @@ from helpers_swingup import double_integrator
 from torch import Tensor
 
 from staf_torch import adp, lanes, systems
-from staf_torch.adp.planning.plans import LocalModel
+from staf_torch.adp.planning.ddp import LocalModel
 from staf_torch.numerics.forward_mode import use_forward_mode
 
 INF = math.inf

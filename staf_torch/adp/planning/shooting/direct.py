@@ -13,7 +13,7 @@ from ....systems import Clocked, ControlAffineSystem, Linear, Plant
 from ....systems.bounds import Limit
 from ...loop.controller import LQR, Policy, Value
 from ...problem.cost import Cost
-from ..plans import chosen
+from ..ddp import chosen
 from .newton import Plan, Solution, follow, minimise, replay
 from .optimum import Optimum
 from .stage import Stage

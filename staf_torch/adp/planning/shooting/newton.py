@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ....numerics.riccati import riccati_step
-from ..plans import chosen
+from ..ddp import chosen
 from .stage import Expansion, Stage, closed_stage
 
 _ROUNDING = 1e-9  # relative promise below which a step that does not pay is one that rounding hides
