@@ -19,9 +19,9 @@ import staf_torch as st
 from staf_torch import adp, systems, targets
 from staf_torch.adp.critic.bases import LeadingCoordinates
 from staf_torch.adp.loop.step import ClosedLoop
-from staf_torch.adp.tracking import true_parameters
 from staf_torch.deploy.approximators import LocalApproximator, RidgeApproximator
 from staf_torch.deploy.controllers import ActorPolicy, FoldedRollout, SupervisedPolicy
+from staf_torch.systems.two_state_tracking import true_parameters
 
 X = torch.tensor([[0.5, -0.4], [0.3, 0.7], [-0.2, 0.6]], dtype=torch.float64)  # (B, n)
 BOX = (0.7, 1e-2)
@@ -116,7 +116,7 @@ def memory(s: float) -> st.ExperienceMemory:
 
 
 def tracker(s: float) -> nn.Module:
-    plant = adp.TwoStateTracking()
+    plant = systems.TwoStateTracking()
     box = adp.RandomPoints(1, st.StateRadius(2.0, 1e-2))
     centers = st.StateFollowingCenters(st.simplex(4), 0.3 * s)
     critic = adp.ActorCritic(
@@ -179,7 +179,7 @@ MODULES: dict[str, Case] = {
     "ClosedLoop": Case(
         lambda s: ClosedLoop(adp.Feedback(lqr(s)), systems.TwoState(), cost(s), dt=0.01), loop
     ),
-    "TwoStateTracking": Case(lambda s: adp.TwoStateTracking(s * true_parameters()), flows),
+    "TwoStateTracking": Case(lambda s: systems.TwoStateTracking(s * true_parameters()), flows),
     "ExperienceMemory": Case(memory),
     "Linear": Case(lambda s: systems.Linear([[0.0, s], [-s, -0.3]], [[0.0], [s]]), flows),
     "Oscillator": Case(systems.Oscillator, flows, carried=False),

@@ -18,6 +18,7 @@ from .adaptation.history_stack import Identified as Identified
 from .adaptation.history_stack import Stack as Stack
 from .adaptation.least_squares import Estimate as Estimate
 from .adaptation.least_squares import LeastSquares as LeastSquares
+from .adaptation.parametric import ChangingPlant as ChangingPlant
 from .adaptation.parametric import LinearFamily as LinearFamily
 from .adaptation.parametric import ParametricPlant as ParametricPlant
 from .adaptation.redesign import Doubling as Doubling
@@ -57,7 +58,6 @@ from .estimation.kalman import ExtendedKalman as ExtendedKalman
 from .estimation.kalman import KalmanFilter as KalmanFilter
 from .estimation.kalman import Observed as Observed
 from .estimation.kalman import UnscentedKalman as UnscentedKalman
-from .estimation.measurement import ChangingPlant as ChangingPlant
 from .estimation.measurement import Measured as Measured
 from .loop.controller import LQR as LQR
 from .loop.controller import Controller as Controller
@@ -92,11 +92,9 @@ from .problem.held_linear import HeldStability as HeldStability
 from .problem.held_linear import held_stability as held_stability
 from .problem.sampled import SampledProblem as SampledProblem
 from .problem.tracking_cost import TrackingCost as TrackingCost
+from .problem.tracking_cost import tracking_cost as tracking_cost
 from .safety.box_filter import BoxFilter as BoxFilter
 from .safety.safety_filter import Filtered as Filtered
 from .safety.safety_filter import SafetyFilter as SafetyFilter
-from .tracking import TwoStateTracking as TwoStateTracking
-from .tracking import desired_trajectory as desired_trajectory
-from .tracking import tracking_cost as tracking_cost
 
 __all__ = [name for name, value in globals().items() if callable(value) and not name.startswith("_")]

@@ -23,7 +23,6 @@ from ..adp import (
     LeadingCoordinates,
     LoopResult,
     QuadraticCost,
-    TwoStateTracking,
     tracking_cost,
 )
 from ..figures.animation import animate
@@ -35,7 +34,7 @@ from ..results.progress import SHOWN, Progress
 from ..results.run_directory import RunDirectory
 from ..settings.adp import build, value_basis
 from ..settings.chase import initial_states, placement, plain
-from ..systems import TwoState
+from ..systems import TwoState, TwoStateTracking
 from ..tables.columns import significant
 from .adp import recorded
 from .scenes import animation_kind, tracking_scene

@@ -20,6 +20,8 @@ from .three_state import ThreeState as ThreeState
 from .two_link_robot import TwoLinkRobot as TwoLinkRobot
 from .two_state import TwoState as TwoState
 from .two_state_chain import TwoStateChain as TwoStateChain
+from .two_state_tracking import TwoStateTracking as TwoStateTracking
+from .two_state_tracking import desired_trajectory as desired_trajectory
 from .user_plants import RatePlant as RatePlant
 from .user_plants import StepPlant as StepPlant
 from .van_der_pol import VanDerPol as VanDerPol

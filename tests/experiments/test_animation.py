@@ -17,7 +17,7 @@ from helpers import tensor
 from PIL import Image
 
 import staf_torch
-from staf_torch import adp
+from staf_torch import adp, systems
 from staf_torch.experiments import chase_batch, scenes
 from staf_torch.settings.adp import adp_problem
 from staf_torch.settings.chase import chase_problem
@@ -132,7 +132,7 @@ def test_the_scene_of_a_loop_has_the_centers_that_follow_it_and_the_optimal_valu
 
 
 def test_the_scene_of_a_tracked_path_is_in_the_plane_of_the_path() -> None:
-    plant = adp.TwoStateTracking()
+    plant = systems.TwoStateTracking()
     result = adp.simulate(
         adp.Feedback(lambda x: torch.zeros_like(x[..., :1])),
         plant,

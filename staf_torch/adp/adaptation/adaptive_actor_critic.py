@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 from ...numerics.checks import fail, positive_real
+from ...systems.two_state_tracking import TwoStateTracking, feedforward, parametric_drift, regressor
 from ..critic.actor_critic import ActorCritic
 from ..critic.bellman import BellmanTerms
 from ..loop.carried import pack, unpack
 from ..loop.controller import Controller, ControllerState, Policy
 from ..problem.cost import matvec
-from ..tracking import TwoStateTracking, feedforward, parametric_drift, regressor
 from .history_stack import ConcurrentLearning, Identified
 from .least_squares import Estimate, LeastSquares
 from .parametric import ParametricPlant
@@ -203,7 +203,7 @@ class IdentifyingTracker(IdentifyingActorCritic):
     true feedforward. The plant's rate x' is measured without noise.
 
     Example:
-        >>> plant, cost = adp.TwoStateTracking(), adp.tracking_cost(10.0, 1.0)
+        >>> plant, cost = systems.TwoStateTracking(), adp.tracking_cost(10.0, 1.0)
         >>> basis = adp.LeadingCoordinates(adp.QuadraticBasis(2), dim=4)
         >>> learner = adp.ActorCritic(basis, plant, cost, adp.RandomPoints(1, half_width=0.3))
         >>> unknown = torch.zeros(3, 2).double()

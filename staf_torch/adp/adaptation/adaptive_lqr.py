@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from ...numerics.checks import fail, non_negative, positive_real, real
+from ...numerics.riccati import product
 from ..loop.carried import pack, unpack
 from ..loop.controller import LQR, Controller, ControllerState, Policy
 from ..policies.rollout import RolloutPolicy
@@ -16,7 +17,7 @@ from ..problem.cost import Cost, matvec, quadratic
 from .consider import Considered, ConsiderFilter
 from .least_squares import Estimate, LeastSquares
 from .parametric import ParametricPlant
-from .redesign import Doubling, Redesign, product
+from .redesign import Doubling, Redesign
 from .windows import IntegralWindows, Window
 
 

@@ -10,10 +10,10 @@ from torch import Tensor
 
 from ...numerics.checks import non_negative, one_or_each, positive
 from ...numerics.linalg import row_jacobian
+from ...numerics.riccati import product
 from ...systems import runge_kutta_step
 from .least_squares import Estimate
 from .parametric import ParametricPlant
-from .redesign import product
 
 
 class Considered(NamedTuple):

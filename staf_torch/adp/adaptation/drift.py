@@ -13,12 +13,13 @@ from ...kernels import Kernel
 from ...lanes.pivoted_cholesky import newton_basis
 from ...numerics.checks import fail, non_negative, positive_real, real
 from ...numerics.linalg import row_jacobian
+from ...numerics.riccati import product
 from ...systems import ControlAffineSystem
 from ..loop.carried import pack, unpack
 from ..loop.controller import LQR, Controller, ControllerState, Policy
 from ..problem.cost import Cost, matvec, quadratic
 from .parametric import ParametricPlant
-from .redesign import Doubling, Redesign, product
+from .redesign import Doubling, Redesign
 from .windows import Equation, IntegralWindows, Window
 
 _NODES = (0.06943184420297371, 0.33000947820757187, 0.6699905217924281, 0.9305681557970262)

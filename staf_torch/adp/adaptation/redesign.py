@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from ...numerics.checks import fail, integer
+from ...numerics.riccati import product
 from ..problem.cost import Cost
 
 _SOLVED = 1e-2  # residual of the Riccati equation, for the model of the moment, of a design that is used
@@ -171,8 +172,3 @@ def riccati_residual(p: Tensor, a: Tensor, g: Tensor, q: Tensor) -> Tensor:
     left = flow + flow.mT - turned + q
     size = flow.abs().amax((-2, -1)) + turned.abs().amax((-2, -1)) + q.abs().max()
     return left.abs().amax((-2, -1)) / size
-
-
-def product(a: Tensor, b: Tensor) -> Tensor:
-    """A B by broadcasting, which a row program has as sums: (..., k, l), (..., l, m) -> (..., k, m)."""
-    return (a.unsqueeze(-1) * b.unsqueeze(-3)).sum(-2)

@@ -10,13 +10,12 @@ import torch
 from torch import Tensor
 
 from ...numerics.checks import fail, positive_real, vector
-from ..estimation.measurement import ChangingPlant
 from ..loop.carried import pack, unpack
 from ..loop.controller import Controller, ControllerState
 from ..safety.quadratic_program import nearest_admissible
 from ..safety.safety_filter import Constraint, SafetyFilter
 from .least_squares import Estimate, LeastSquares
-from .parametric import ParametricPlant
+from .parametric import ChangingPlant, ParametricPlant
 from .windows import IntegralWindows, Window
 
 _PASSES = 2  # linearisations of the conditions in u

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from ...numerics.checks import fail, non_negative, one_or_each, positive, real, vector
 from ...numerics.linalg import row_jacobian
+from ...numerics.riccati import product
 from ...systems import Plant, runge_kutta_step
-from ..adaptation.redesign import product
 from ..loop.carried import pack, unpack
 from ..loop.controller import Controller, ControllerState
 from ..problem.cost import matvec

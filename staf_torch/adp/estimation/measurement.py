@@ -1,8 +1,7 @@
-"""What a controller sees of a plant: outputs with noise; plants whose parameters change while they run."""
+"""Outputs with noise, which a controller gets in place of the state."""
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Callable, Sequence
 
@@ -10,14 +9,10 @@ import torch
 from torch import Tensor
 
 from ...numerics.checks import fail
-from ...systems import ControlAffineSystem
-from ..adaptation.parametric import ParametricPlant
 from ..loop.controller import Controller, ControllerState
-from ..problem.cost import Cost
 
 Output = Callable[[Tensor], Tensor]
 """y from x: (..., n) -> (..., q)."""
-_CLOCK = 10.0  # s in which the clock of a changing plant falls to 1/e
 
 
 def gaussian(uniform: Tensor, count: int) -> Tensor:
@@ -92,83 +87,3 @@ class Measured(Controller):
             drawn = uniform[..., : self._own, : self.dim].flatten(-2)
             y = y + self.noise.to(y) * gaussian(drawn, self.dim)
         return self.controller.step(y, carried, uniform[..., self._own :, : self.dim], dt)
-
-
-class ChangingPlant(ControlAffineSystem):
-    """A plant with parameters of its own in every row, which may change once:
-
-        state (x, theta_1, theta_2, c),  theta = theta_1 while c > 1 and theta_2 afterwards,  c' = -c / 10 s.
-
-    Example:
-        >>> plant = adp.ChangingPlant(adp.ParametricPlant.of_effectiveness(systems.Pendulum()))
-        >>> x0 = torch.tensor([[0.3, 0.0]]).double()
-        >>> z0 = plant.start(x0, before=[1.0], after=[0.5], at=2.0)
-        >>> z0.shape, plant.motion(z0, torch.ones(1, 1).double())[0, 1].round(decimals=3)
-        (torch.Size([1, 5]), tensor(3.8990, dtype=torch.float64))
-
-        Shown by `staf experiment=faults`.
-
-    Args:
-        model: the plant.
-    """
-
-    def __init__(self, model: ParametricPlant) -> None:
-        super().__init__()
-        self.model = model
-        self.own, self.count = model._size(), model.parameters_count
-        self.size = self.own + 2 * self.count + 1
-        self.dim, self.inputs = self.size, model.inputs
-        self.periodic, self.bounds = model.periodic, model.bounds
-
-    def start(
-        self,
-        x0: Tensor,
-        before: Sequence[float] | Tensor,
-        after: Sequence[float] | Tensor | None = None,
-        at: float | Tensor = 0.0,
-    ) -> Tensor:
-        """The state at time 0: (B, n) -> (B, n + 2 p + 1).
-
-        Args:
-            x0: (B, n).
-            before: theta_1, (p,) or (B, p).
-            after: theta_2, likewise; None for theta_1.
-            at: s, (B,) or one number, when theta changes.
-        """
-        first, last = (
-            torch.as_tensor(theta, dtype=x0.dtype, device=x0.device).expand(len(x0), self.count)
-            for theta in (before, before if after is None else after)
-        )
-        when = torch.as_tensor(at, dtype=x0.dtype, device=x0.device).expand(len(x0))
-        return torch.cat((x0, first, last, (when / _CLOCK).exp().unsqueeze(-1)), dim=-1)
-
-    def theta(self, z: Tensor) -> Tensor:
-        """The parameters of the moment: (..., N) -> (..., p)."""
-        first, last = z[..., self.own : -1].chunk(2, dim=-1)
-        return torch.where(z[..., -1:] > 1, first, last)
-
-    def rate(self, x: Tensor, u: Tensor) -> Tensor:
-        moved = self.model.believing(self.theta(x)).rate(x[..., : self.own], u)
-        still = torch.zeros_like(x[..., self.own : -1])
-        return torch.cat((moved, still, -x[..., -1:] / _CLOCK), dim=-1)
-
-    def drift(self, x: Tensor) -> Tensor:
-        return self.rate(x, x.new_zeros(*x.shape[:-1], self.inputs))
-
-    def effectiveness(self, x: Tensor) -> Tensor:
-        own = self.model.believing(self.theta(x)).effectiveness(x[..., : self.own])
-        rest = x.new_zeros(*x.shape[:-1], self.size - self.own, self.inputs)
-        return torch.cat((own, rest), dim=-2)
-
-    def cost(self, cost: Cost) -> Cost:
-        """The cost of x alone, for this plant.
-
-        Raises:
-            ValueError: if the cost has a set-point or an output of its own.
-        """
-        if cost.output is not None or cost.target is not None or self.periodic:
-            raise fail("ChangingPlant", "cost", "must be of x itself at the origin, without angles", cost)
-        own, wide = self.own, copy.copy(cost)
-        wide._buffers, wide._modules = dict(cost._buffers), dict(cost._modules)
-        wide.dim, wide.output = self.size, lambda z: z[..., :own]
-        return wide

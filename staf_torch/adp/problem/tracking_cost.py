@@ -104,3 +104,23 @@ class TrackingCost(QuadraticCost):
         """(x - x_d(t), 0), angles in [-pi, pi]: (..., n + 1) -> (..., n + 1)."""
         away = wrap(x[..., :-1] - self.path(x[..., -1]), self.periodic)
         return torch.cat((away, torch.zeros_like(x[..., -1:])), dim=-1)
+
+
+def tracking_cost(error: Matrix, control: Matrix) -> QuadraticCost:
+    """e'Qe + mu'R mu in the state (e, xd): nothing is paid for xd itself.
+
+    Example:
+        >>> adp.tracking_cost(10.0, 1.0).q.diagonal()  # of the error alone
+        tensor([10., 10.,  0.,  0.], dtype=torch.float64)
+
+        Shown by `staf experiment=adp_tracking`.
+
+    Args:
+        error: Q, (2, 2) or a number.
+        control: R, (1, 1) or a number.
+
+    Raises:
+        ValueError: if Q or R is not symmetric positive definite.
+    """
+    q = QuadraticCost(error, control, 2, 1).q
+    return QuadraticCost(torch.block_diag(q, torch.zeros_like(q)), control, 4, 1)

@@ -12,16 +12,16 @@ from helpers_adp import staf_basis
 from torch import Tensor
 
 from staf_torch import adp, systems
-from staf_torch.adp.tracking import desired_rate, true_parameters
 from staf_torch.numerics.forward_mode import use_forward_mode
+from staf_torch.systems.two_state_tracking import desired_rate, true_parameters
 
 use_forward_mode()
-TRACKING = adp.TwoStateTracking()
+TRACKING = systems.TwoStateTracking()
 
 
 def test_the_error_plant_is_written_out() -> None:
     theta = uniform(3, 2, seed=1)
-    plant = adp.TwoStateTracking(theta)
+    plant = systems.TwoStateTracking(theta)
     x, u = uniform(5, 4, seed=2), uniform(5, 1, seed=3)
     for row in range(5):
         e1, e2, d1, d2 = x[row].tolist()
@@ -39,7 +39,7 @@ def test_the_error_plant_is_written_out() -> None:
     believed = plant.believing(rows)
     assert torch.equal(plant.theta, theta)
     for row in range(5):
-        torch.testing.assert_close(believed.drift(x)[row], adp.TwoStateTracking(rows[row]).drift(x[row]))
+        torch.testing.assert_close(believed.drift(x)[row], systems.TwoStateTracking(rows[row]).drift(x[row]))
     cost = adp.tracking_cost([[2.0, 0.5], [0.5, 1.0]], 3.0)
     assert cost.q.tolist() == [[2, 0.5, 0, 0], [0.5, 1, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0]]
     assert (cost.r.tolist(), cost.dim, cost.inputs) == ([[3.0]], 4, 1)
@@ -60,8 +60,8 @@ def test_the_true_error_plant_is_the_two_state_plant_and_rests_on_the_track() ->
 
 def test_desired_trajectory_solves_its_equation() -> None:
     time = torch.linspace(0, 6, 50, dtype=torch.float64)
-    slope = (adp.desired_trajectory(time + 1e-6) - adp.desired_trajectory(time - 1e-6)) / 2e-6
-    torch.testing.assert_close(slope, desired_rate(adp.desired_trajectory(time)), rtol=1e-8, atol=1e-8)
+    slope = (systems.desired_trajectory(time + 1e-6) - systems.desired_trajectory(time - 1e-6)) / 2e-6
+    torch.testing.assert_close(slope, desired_rate(systems.desired_trajectory(time)), rtol=1e-8, atol=1e-8)
 
 
 def test_identified_drift_converges_and_the_error_with_it() -> None:
@@ -76,15 +76,15 @@ def test_identified_drift_converges_and_the_error_with_it() -> None:
     theta = run.identifier[:, -1, :6].reshape(2, 3, 2)
     assert (theta - true_parameters()).abs().max() < 5e-3
     assert (run.state[:, -1, :2].norm(dim=-1) < 2e-2).all()
-    desired = adp.desired_trajectory(run.time).expand(2, -1, -1)
+    desired = systems.desired_trajectory(run.time).expand(2, -1, -1)
     torch.testing.assert_close(run.state[:, :, 2:], desired, rtol=1e-6, atol=1e-6)
 
 
 def test_bad_arguments_are_refused_by_name() -> None:
     with pytest.raises(ValueError, match=r"`TwoStateTracking\(theta=...\)` must be \(..., 3, 2\)"):
-        adp.TwoStateTracking([[1.0, 2.0]])
+        systems.TwoStateTracking([[1.0, 2.0]])
     with pytest.raises(ValueError, match=r"`TwoStateTracking\(theta=...\)` must be"):
-        adp.TwoStateTracking(torch.full((3, 2), torch.nan, dtype=torch.float64))
+        systems.TwoStateTracking(torch.full((3, 2), torch.nan, dtype=torch.float64))
     with pytest.raises(ValueError, match=r"`LeadingCoordinates\(dim=...\)` must be at least 2"):
         adp.LeadingCoordinates(staf_basis(), 1)
     with pytest.raises(ValueError, match=r"`QuadraticCost\(state=...\)` must be positive"):

@@ -78,7 +78,7 @@ def test_gradient_and_control_solve_the_hjb_equation(
 def test_tracking_has_an_optimum_with_a_base_and_a_terminal_value_of_its_own() -> None:
     lqr = adp.LQR(PLANT, adp.QuadraticCost(10.0, 1.0, 2, 1))
     shooting = adp.DirectShooting(
-        adp.TwoStateTracking(),
+        systems.TwoStateTracking(),
         adp.tracking_cost(10.0, 1.0),
         base=lambda x: lqr(x[..., :2]),
         terminal=lambda x: lqr.value(x[..., :2]),

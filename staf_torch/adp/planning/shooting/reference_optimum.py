@@ -10,8 +10,12 @@ import torch
 from torch import Tensor
 
 from ....systems import ControlAffineSystem
-from ... import ControllerState, DirectShooting, LoopResult, QuadraticCost, value_gradient
+from ...critic.bellman import value_gradient
+from ...loop.controller import ControllerState
 from ...loop.setup import AdpProblem
+from ...loop.simulation import LoopResult
+from ...problem.cost import QuadraticCost
+from .direct import DirectShooting
 
 _log = logging.getLogger(__name__)
 _AT_ONCE = 4096  # states whose V^ is asked for at once

@@ -7,7 +7,6 @@ from torch import Tensor
 
 from ..numerics.checks import copied, fail, number
 from ..systems import ControlAffineSystem
-from .problem.cost import Matrix, QuadraticCost
 
 _TRUE = ((-1.0, -0.5), (1.0, 0.0), (0.0, -0.5))
 
@@ -20,10 +19,10 @@ class TwoStateTracking(ControlAffineSystem):
         f(x) = theta_true' s(x),  s = (x1, x2, x2 (1 - (cos 2 x1 + 2)^2)).
 
     The input is mu = u - ud, which vanishes where e does: the origin of e is an equilibrium for every xd, of
-    the cost e'Qe + mu'R mu (`tracking_cost`).
+    the cost e'Qe + mu'R mu (`adp.tracking_cost`).
 
     Example:
-        >>> plant = adp.TwoStateTracking()
+        >>> plant = systems.TwoStateTracking()
         >>> plant.dim, plant.theta.shape
         (4, torch.Size([3, 2]))
 
@@ -101,31 +100,11 @@ def feedforward(desired: Tensor, theta: Tensor) -> Tensor:
     return wanted[..., 1] / input_gain(desired[..., 0])
 
 
-def tracking_cost(error: Matrix, control: Matrix) -> QuadraticCost:
-    """e'Qe + mu'R mu in the state (e, xd): nothing is paid for xd itself.
-
-    Example:
-        >>> adp.tracking_cost(10.0, 1.0).q.diagonal()  # of the error alone
-        tensor([10., 10.,  0.,  0.], dtype=torch.float64)
-
-        Shown by `staf experiment=adp_tracking`.
-
-    Args:
-        error: Q, (2, 2) or a number.
-        control: R, (1, 1) or a number.
-
-    Raises:
-        ValueError: if Q or R is not symmetric positive definite.
-    """
-    q = QuadraticCost(error, control, 2, 1).q
-    return QuadraticCost(torch.block_diag(q, torch.zeros_like(q)), control, 4, 1)
-
-
 def desired_trajectory(time: Tensor) -> Tensor:
     """xd(t) = (sin t, cos t + sin t): (T,) -> (T, 2).
 
     Example:
-        >>> adp.desired_trajectory(torch.zeros(1).double())
+        >>> systems.desired_trajectory(torch.zeros(1).double())
         tensor([[0., 1.]], dtype=torch.float64)
 
         Shown by `staf experiment=adp_tracking`.
