@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import sys
 from collections.abc import Callable, Iterator
 from typing import NoReturn
@@ -15,14 +14,14 @@ from ..settings import config_directory as config_directory
 from ..sweeps import callbacks
 from ..sweeps.batching import USER_ERRORS, sentence
 from ..sweeps.hydra_compat import (
+    Application,
     BrokenSweep,
+    application,
     broken_sweep,
     find_launcher,
     full_errors,
-    named_packages,
+    is_about_settings,
     program,
-    trusted,
-    with_mode,
 )
 from ..sweeps.job import Refused, execute
 from ..sweeps.resume import command_line
@@ -31,7 +30,7 @@ from . import doctor, reference, schema
 
 _WRITERS = {"schema": schema.main, "docs": reference.main}
 find_launcher()
-_staf = program(execute)
+_showing = program(execute)
 
 
 def main() -> None:
@@ -45,30 +44,49 @@ def main() -> None:
         sys.exit(doctor.main())
     if sys.argv[1:2] and sys.argv[1] in _WRITERS:
         sys.exit(_written(_WRITERS[sys.argv[1]], sys.argv[2:]))
-    sys.path.insert(0, os.getcwd())  # so that `target.path=my_module.my_function` finds the user's file
     typed = sys.argv
     with _told_between_lines(), full_errors() as wants_trace, stopped_by_signals():
         try:
             argv = command_line(typed[1:])
-            sys.argv = [typed[0], *with_mode(argv)]
-            with trusted(named_packages(argv)):
-                _staf()
+            if is_about_settings(argv):
+                sys.argv = [typed[0], *argv]
+                _showing()
+                return
+            with application(argv) as app:
+                _run(app, wants_trace)
         except Refused as refused:
             if wants_trace and refused.__cause__ is not None:
                 raise refused.__cause__ from None
             raise
         except (Exception, KeyboardInterrupt) as error:
-            sweep = broken_sweep(error)
-            if sweep is not None:
-                callbacks.close(sweep)
-            ended_by = what_ended(error)
-            if isinstance(ended_by, KeyboardInterrupt):
-                _end_by_signal(sweep, ended_by)
-            if wants_trace or not isinstance(error, USER_ERRORS):
-                raise
-            sys.exit(f"staf: {sentence(error)}")
+            _end(error, wants_trace)
         finally:
             sys.argv = typed
+
+
+def _run(app: Application, wants_trace: bool) -> None:
+    """Run the job or the sweep of a command line, and end a sweep that breaks."""
+    try:
+        if app.multirun or app.is_sweep():
+            app.sweep(execute)
+        else:
+            app.run(execute)
+    except (Exception, KeyboardInterrupt) as error:
+        sweep = broken_sweep(error)
+        if sweep is None:
+            raise
+        callbacks.close(sweep)
+        _end(error, wants_trace, sweep)
+
+
+def _end(error: BaseException, wants_trace: bool, sweep: BrokenSweep | None = None) -> NoReturn:
+    """End the program as an error asks for: by a sentence, by the code of a signal, or by its trace."""
+    ended_by = what_ended(error)
+    if isinstance(ended_by, KeyboardInterrupt):
+        _end_by_signal(sweep, ended_by)
+    if wants_trace or not isinstance(error, USER_ERRORS):
+        raise error
+    sys.exit(f"staf: {sentence(error)}")
 
 
 @contextlib.contextmanager

@@ -19,8 +19,7 @@ from ..results.files import FAILED, FIGURES, MEMBERS, RUN
 from ..results.reader import collect, read_record
 from . import callbacks
 from .batching import sentence
-from .hydra_compat import broken_sweep, overrides_in
-from .hydra_compat.in_process import application
+from .hydra_compat import application, broken_sweep
 from .job import PRINTS, Refused, execute, silence_terminal
 from .resume import command_line
 from .runs import Run, Runs
@@ -51,13 +50,13 @@ def run(*overrides: str, directory: str | Path | None = None) -> Run:
         KeyboardInterrupt: after Ctrl-C; the run directory says `interrupted`.
     """
     place = [] if directory is None else [f"hydra.run.dir={records.quoted(str(directory))}"]
-    with _quietly(), keep_figures() as drawn, _plain_errors(), application() as app:
-        if app.is_sweep(overrides):
+    with _quietly(), keep_figures() as drawn, _plain_errors(), application([*overrides, *place]) as app:
+        if app.is_sweep():
             raise ValueError(
                 f"`staf_torch.run(...)` must be one run; got {' '.join(overrides)!r}, which is a sweep: "
                 "call `staf_torch.sweep`."
             )
-        path = app.run(_execute_silently, [*overrides, *place])
+        path = app.run(_execute_silently)
     figures = {
         png.stem: figure
         for png in sorted((path / FIGURES).glob("*.png"))
@@ -91,10 +90,13 @@ def sweep(*overrides: str, directory: str | Path | None = None) -> Runs:
         KeyboardInterrupt: after Ctrl-C, with the number of jobs that are complete and how to resume.
     """
     place = [] if directory is None else [f"hydra.sweep.dir={records.quoted(str(directory))}"]
-    with _quietly(), _plain_errors(), application() as app:
-        lines = overrides_in(command_line(["--multirun", *overrides, *place]))
+    with (
+        _quietly(),
+        _plain_errors(),
+        application(command_line(["--multirun", *overrides, *place])) as app,
+    ):
         try:
-            path = app.sweep(execute, lines)
+            path = app.sweep(execute)
         except BaseException as error:
             path = _ended_early(error)
     return read_runs(path)

@@ -65,6 +65,42 @@ def test_a_configuration_is_the_one_that_hydra_composes(job: list[str]) -> None:
     assert again.seed == composer(["dt=0.02", *job]).seed == expected.seed
 
 
+@pytest.mark.parametrize(
+    "line",
+    [
+        "seed=1,2 dt=0.02",
+        "kernel=matern,gaussian centers.radius=0.1,0.2 target=cosine",
+        "experiment=ablation hydra.mode=MULTIRUN",
+        "hydra.sweep.dir=here hydra.launcher.batch=3 hydra.launcher.executor=process seed=range(3)",
+        "hydra/launcher=basic +hydra.job.env_set.A=7 +note=a,b",
+    ],
+)
+@pytest.mark.parametrize("mode", [RunMode.MULTIRUN, RunMode.RUN])
+def test_the_configuration_of_a_sweep_is_the_one_that_hydra_composes(line: str, mode: RunMode) -> None:
+    loader = config_loader()
+    words = line.split()
+    if mode == RunMode.RUN:
+        words = [word for word in words if "," not in word and "range" not in word]
+    expected = loader.load_configuration("config", words, mode)
+    composer = Composer(loader)
+    for _ in range(2):
+        found = composer.load_configuration("config", words, mode)
+        assert OmegaConf.to_yaml(found) == OmegaConf.to_yaml(expected)
+        assert found.hydra.mode == expected.hydra.mode
+        assert OmegaConf.is_readonly(found.hydra) == OmegaConf.is_readonly(expected.hydra)
+
+
+@pytest.mark.parametrize("line", ["seed=1,2", "hydra.launcher.batch=1,2", "kernle=a"])
+def test_a_sweep_is_refused_where_a_run_was_asked_for(line: str) -> None:
+    loader = config_loader()
+    mode = RunMode.MULTIRUN if line.startswith("hydra") else RunMode.RUN
+    with pytest.raises(HydraException) as expected:
+        loader.load_configuration("config", [line], mode)
+    with pytest.raises(type(expected.value)) as found:
+        Composer(loader).load_configuration("config", [line], mode)
+    assert str(found.value) == str(expected.value)
+
+
 SAME_KEYS = [
     ["kernel=matern", "kernel.length_scale=0.5", "seed=3", "initial_state=[1,2]"],
     ["kernel=matern", "kernel.length_scale=0.7", "seed=3", "initial_state=[3]"],

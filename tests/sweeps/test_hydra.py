@@ -11,20 +11,22 @@ import pytest
 from omegaconf import OmegaConf
 
 from staf_torch.settings import config_directory
-from staf_torch.sweeps.hydra_compat import find_launcher, full_errors, named_packages, overrides_in, with_mode
-from staf_torch.sweeps.hydra_compat.in_process import application
+from staf_torch.sweeps.hydra_compat import (
+    application,
+    find_launcher,
+    full_errors,
+    is_about_settings,
+    named_packages,
+)
 from staf_torch.sweeps.hydra_compat.inside import HAS_WHITELIST
-from staf_torch.sweeps.hydra_compat.log_handlers import handlers_aside
+from staf_torch.sweeps.hydra_compat.jobs import handlers_aside
 
 OWN = "target._target_=mine.targets.Wave"
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> str:
-    (tmp_path / "experiment").mkdir()
     (tmp_path / "kernel.yaml").write_text("_target_: größe.kernels.Narrow\nwidth: 1.0\npath: ./a.b\n")
-    (tmp_path / "experiment" / "swept.yaml").write_text("hydra: {mode: MULTIRUN}\n")
-    (tmp_path / "experiment" / "plain.yaml").write_text("dt: 0.1\n")
     return str(tmp_path)
 
 
@@ -35,17 +37,6 @@ def test_packages_are_those_that_a_command_line_or_its_folder_names(folder: str)
         assert found == (["größe", "mine", "other"], ["mine", "other"], [])
     else:
         assert found == ([], [], [])  # Hydra 1.3 trusts all
-
-
-def test_the_mode_of_an_experiment_is_said_where_only_the_newer_hydra_needs_it(folder: str) -> None:
-    swept = ["experiment=swept", "--config-dir", folder]
-    told = ["experiment=swept", "hydra.mode=MULTIRUN", "--config-dir", folder]
-    assert with_mode(swept) == (told if HAS_WHITELIST else swept)
-    assert overrides_in(told) == told[:2]  # Hydra's own parser takes it for an override
-    for line in (told, [*swept, "-m"], ["experiment=plain", "--config-dir", folder], ["dt=0.1"], []):
-        assert with_mode(line) == line
-    last = with_mode(["experiment=plain", *swept])  # of two experiments the last one counts
-    assert last == ["experiment=plain", *(told if HAS_WHITELIST else swept)]
 
 
 @pytest.mark.parametrize(
@@ -61,8 +52,24 @@ def test_the_mode_of_an_experiment_is_said_where_only_the_newer_hydra_needs_it(f
 def test_settings_ask_for_a_sweep_where_their_experiment_or_the_last_word_says_so(
     overrides: list[str], sweeps: bool
 ) -> None:
-    with application() as app:
-        assert app.is_sweep(overrides) == sweeps
+    with application(overrides) as app:
+        assert app.is_sweep() == sweeps
+
+
+@pytest.mark.parametrize(
+    ("line", "shows"),
+    [
+        ("", False),
+        ("-m seed=1,2", False),
+        ("--config-dir here", False),
+        ("--cfg job", True),
+        ("--help", True),
+        ("--run --multirun", True),
+        ("--nope", True),
+    ],
+)
+def test_what_only_shows_something_and_what_is_wrong_is_left_to_hydra(line: str, shows: bool) -> None:
+    assert is_about_settings(line.split()) == shows
 
 
 def test_files_of_experiments_alone_set_the_mode_and_none_includes_another() -> None:

@@ -20,12 +20,14 @@ from .jobs import directory_of as directory_of
 from .jobs import without_hydra_overrides as without_hydra_overrides
 from .products import product as product
 from .products import sweep_size as sweep_size
+from .program import Application as Application
 from .program import BrokenSweep as BrokenSweep
+from .program import application as application
 from .program import breaking_off as breaking_off
 from .program import broken_sweep as broken_sweep
 from .program import find_launcher as find_launcher
 from .program import full_errors as full_errors
+from .program import is_about_settings as is_about_settings
 from .program import named_packages as named_packages
 from .program import overrides_in as overrides_in
 from .program import program as program
-from .program import with_mode as with_mode

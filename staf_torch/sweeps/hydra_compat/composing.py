@@ -1,11 +1,12 @@
 """Settings from overrides: Hydra composes each choice of config groups once, and values are set in copies.
 
-Hydra takes some 40 ms a configuration, nearly all of it for the defaults list and for merging files, and the
-jobs of a sweep differ in values mostly. A test holds the results to Hydra's own, to the last flag.
+Hydra takes 40 to 110 ms a configuration, nearly all of it for the defaults list and for merging files, and
+runs and jobs differ in values mostly. A test holds the results to Hydra's own, to the last flag.
 """
 
 from __future__ import annotations
 
+import os
 import pickle
 import re
 from collections.abc import Mapping, Sequence
@@ -14,6 +15,7 @@ from typing import Any, NamedTuple, cast
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override, OverrideType
+from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict, read_write
 from omegaconf.errors import OmegaConfBaseException
@@ -24,6 +26,7 @@ from ...settings.plain import ManySettings, PlainSettings
 
 _MOST_LINES = 10_000  # that are kept: a million seeds are a million lines
 _MOST_COMPOSED = 1000  # configurations that are kept
+_READ_BY_HYDRA = ("hydra.searchpath", "hydra.job.", "hydra.overrides", "hydra.runtime")  # while it composes
 
 
 def parse_override(line: str, loader: ConfigLoader | None = None) -> Override:
@@ -52,6 +55,7 @@ class _Line(NamedTuple):
     key: str
     value: Any
     sets: bool  # a number, a text or a list at a key that is there, and nothing else
+    of_hydra: bool  # whether it concerns Hydra's own node
     refers: bool  # whether the value is known with the other settings alone
     path: str | None  # the key with a dot behind every part; None: what is composed depends on it
 
@@ -64,7 +68,7 @@ class _Composed(NamedTuple):
 
 
 class Composer:
-    """The configurations of a program by their overrides, as its loader composes them.
+    """The configurations of a program by their overrides, as its loader composes them; else, that loader.
 
     Args:
         loader: Hydra's, of the program.
@@ -82,6 +86,40 @@ class Composer:
         self._groups: dict[tuple[str, ...], bool] = {}
         self._composed: dict[tuple[str, ...], _Composed] = {}
         self._bases: dict[tuple[tuple[str, ...], ...], _Base | None] = {}
+        self.latest_sweep: DictConfig | None = None
+        """What `load_configuration` returned last for a sweep."""
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._loader, name)
+
+    def load_configuration(
+        self,
+        config_name: str | None,
+        overrides: Sequence[str],
+        run_mode: RunMode,
+        from_shell: bool = True,
+        validate_sweep_overrides: bool = True,
+    ) -> DictConfig:
+        """Return what the method of Hydra's loader returns; what Hydra refuses, it refuses itself."""
+        found = self._alike(config_name, overrides, run_mode)
+        if found is None:
+            found = self._loader.load_configuration(
+                config_name, list(overrides), run_mode, from_shell, validate_sweep_overrides
+            )
+        if run_mode == RunMode.MULTIRUN:
+            self.latest_sweep = found
+        return found
+
+    def _alike(self, name: str | None, overrides: Sequence[str], mode: RunMode) -> DictConfig | None:
+        """Return the configuration of a run or a sweep from one with the same groups; None: it has none."""
+        try:
+            lines = self._read(overrides)
+            single = [line for line in lines if not line.override.is_sweep_override()]
+            swept_by_hydra = any(line.of_hydra and line not in single for line in lines)
+            refused = swept_by_hydra or (mode == RunMode.RUN and len(single) < len(lines))
+            return None if refused or name != self._name else self._noted(lines, single)
+        except (HydraException, OmegaConfBaseException):
+            return None
 
     def __call__(self, overrides: Sequence[str]) -> DictConfig:
         """Return the configuration of these overrides as a task sees it, without Hydra's node.
@@ -91,13 +129,18 @@ class Composer:
         Raises:
             hydra.errors.HydraException, ValueError: what Hydra itself raises.
         """
-        return self._with_values(overrides, self._read(overrides), hydra_node=False)
+        return self._with_values(self._read(overrides), hydra_node=False)
 
     def whole(self, overrides: Sequence[str]) -> DictConfig:
         """Return the configuration of these overrides with Hydra's node; all else as of a call."""
         lines = self._read(overrides)
-        config = self._with_values(overrides, lines, hydra_node=True)
+        return self._noted(lines, lines)
+
+    def _noted(self, lines: Sequence[_Line], applied: Sequence[_Line]) -> DictConfig:
+        """Compose some of the overrides, with Hydra's node, and note all of them there."""
+        config = self._with_values(applied, hydra_node=True)
         with read_write(config.hydra):
+            config.hydra.runtime.cwd = os.getcwd()
             _note_overrides(config.hydra, [line.override for line in lines])
         return config
 
@@ -110,7 +153,7 @@ class Composer:
         plain: list[PlainSettings | None] = []
         flat: list[Mapping[str, Any]] = []
         for overrides in jobs:
-            lines = self._read(overrides)
+            lines = [line for line in self._read(overrides) if not (line.sets and line.of_hydra)]
             values = {line.key: line for line in lines if line.sets}
             key = _others(lines), tuple(values)
             if key not in self._bases:
@@ -137,28 +180,28 @@ class Composer:
             where = [*(searched or self._searched)]
             self._groups[groups] = bool(self._loader.get_group_options(key, None, overrides=where))
         sweeps, is_value = override.is_sweep_override(), isinstance(value, dict) or not self._groups[groups]
-        chooses = sweeps or override.is_hydra_override() or override.package is not None or not is_value
+        chooses = sweeps or override.package is not None or not is_value or key.startswith(_READ_BY_HYDRA)
         path = None if chooses else re.sub(r"[\[\].]+", ".", key).rstrip(".") + "."
         sets = not chooses and override.type == OverrideType.CHANGE and not isinstance(value, dict)
-        line = _Line(override, key, value, sets, _refers(value), path)
+        line = _Line(override, key, value, sets, override.is_hydra_override(), _refers(value), path)
         if not searched:
             if len(self._lines) >= _MOST_LINES:
                 self._lines.clear()
             self._lines[text] = line
         return line
 
-    def _with_values(
-        self, overrides: Sequence[str], lines: Sequence[_Line], *, hydra_node: bool
-    ) -> DictConfig:
+    def _with_values(self, lines: Sequence[_Line], *, hydra_node: bool) -> DictConfig:
         """Set values in a copy of what Hydra composes of the other overrides, or let it compose all."""
         values = [line for line in lines if line.sets]
         others = [line for line in lines if not line.sets]
+        overrides = [str(line.override.input_line) for line in lines]
         if any(_overlap(one, other) for one in others for other in values):
             return self._copy(overrides, hydra_node)  # their order counts
         config = self._copy(_others(lines), hydra_node)
         try:
             for line in values:
-                OmegaConf.update(config, line.key, line.value, merge=True)
+                if hydra_node or not line.of_hydra:
+                    OmegaConf.update(config, line.key, line.value, merge=True)
         except OmegaConfBaseException:
             return self._copy(overrides, hydra_node)  # which raises in Hydra's words
         return config
@@ -251,6 +294,7 @@ def _note_overrides(node: Any, parsed: Sequence[Override]) -> None:
     """Write into Hydra's node what Hydra notes there of all overrides."""
     task = [one for one in parsed if not one.is_hydra_override()]
     lines = [str(one.input_line) for one in task]
+    node.overrides.hydra = [str(one.input_line) for one in parsed if one.is_hydra_override()]
     if as_typed(node.overrides.task) == lines:
         return
     node.overrides.task = lines

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import inspect
+import os
 from collections.abc import Iterable, Iterator
 from contextvars import ContextVar
 
@@ -12,8 +13,10 @@ import hydra
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra._internal.utils import create_config_search_path, get_args_parser
 from hydra.core.config_loader import ConfigLoader
+from hydra.core.config_search_path import SearchPathQuery
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.plugins import Plugins
+from hydra.errors import SearchPathException
 
 from ...settings import config_directory
 
@@ -23,28 +26,48 @@ if HAS_WHITELIST:
     import hydra._internal.execution_policy as execution_policy
 
 TRUSTED = ("staf_torch.*",)
-SearchPaths = tuple[tuple[str, str], ...]
-"""Provider and place of every folder in which Hydra looks for settings."""
-_PATHS: ContextVar[SearchPaths | None] = ContextVar("_PATHS", default=None)
 
 
 def arguments(argv: Iterable[str]) -> argparse.Namespace:
-    """Return the words of a command line as Hydra reads them; what it does not know is left out."""
-    return get_args_parser().parse_known_args(list(argv))[0]
+    """Return the words of a command line as Hydra reads them; ``unknown`` are those that it does not know."""
+    words, unknown = get_args_parser().parse_known_args(list(argv))
+    words.unknown = unknown
+    return words
+
+
+def loader(folder: str | None = None) -> ConfigLoader:
+    """Return Hydra's loader for `conf/`, and for the ``folder`` of `--config-dir`.
+
+    Raises:
+        hydra.errors.SearchPathException: if there is no such folder.
+    """
+    Plugins.instance()  # the sources of configurations are plugins
+    searched = create_config_search_path(config_directory())
+    if folder is not None:
+        if not os.path.isdir(folder):
+            raise SearchPathException(f"Additional config directory '{os.path.abspath(folder)}' not found")
+        place = f"file://{os.path.abspath(folder)}"
+        searched.prepend("command-line", place, SearchPathQuery(provider="schema"))
+    return ConfigLoaderImpl(searched)
+
+
+SearchPaths = tuple[tuple[str, str], ...]
+"""Provider and place of every folder in which Hydra looks for settings."""
+_PATHS: ContextVar[SearchPaths | None] = ContextVar("_PATHS", default=None)
 
 
 def config_loader() -> ConfigLoader:
     """Return Hydra's loader: of the running program, else one for the paths of `searching` or `conf/`."""
     if GlobalHydra.instance().is_initialized():
         return GlobalHydra.instance().config_loader()
-    Plugins.instance()  # the sources of configurations are plugins
-    given = _PATHS.get()
-    found = create_config_search_path(config_directory())
-    if given is not None:
-        found.get_path().clear()
-        for provider, place in given:
-            found.append(provider, place)
-    return ConfigLoaderImpl(found)
+    found, given = loader(), _PATHS.get()
+    if given is None:
+        return found
+    places = found.get_search_path()
+    places.get_path().clear()
+    for provider, place in given:
+        places.append(provider, place)
+    return ConfigLoaderImpl(places)
 
 
 def search_paths() -> SearchPaths:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
+import logging
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -28,7 +30,6 @@ from omegaconf._utils import OmegaConfDumper
 
 from .composing import Composer, as_typed
 from .inside import HAS_WHITELIST
-from .log_handlers import handlers_aside
 
 
 class SweepJobs:
@@ -43,7 +44,10 @@ class SweepJobs:
         node = master.hydra
         self.master, self._context, self._loader = master, context, context.config_loader
         self._always = as_typed(node.overrides.hydra)
-        self._composer = Composer(self._loader, node.job.config_name, as_typed(node.searchpath))
+        own = isinstance(self._loader, Composer)
+        self._composer: Composer = (
+            self._loader if own else Composer(self._loader, node.job.config_name, as_typed(node.searchpath))
+        )
         context.config_loader = cast(ConfigLoader, self)
 
     def __getattr__(self, name: str) -> Any:
@@ -167,3 +171,36 @@ def _dumper(base: Any) -> Any:
 def without_hydra_overrides(overrides: Sequence[str]) -> list[str]:
     """Return the overrides that are not about Hydra's own node."""
     return list(filter_overrides(overrides))
+
+
+@contextlib.contextmanager
+def handlers_aside() -> Iterator[None]:
+    """Hide the handlers of the process from `logging.config`, which closes all that it knows of.
+
+    In the end they come back, the level with them, and those made meanwhile are closed.
+    """
+    root = logging.getLogger()
+    handlers, level, known = root.handlers[:], root.level, logging._handlerList[:]  # type: ignore[attr-defined]
+    named = dict(logging._handlers)  # type: ignore[attr-defined]
+    disabled = {name for name, each in _loggers() if each.disabled}
+    logging._handlerList.clear()  # type: ignore[attr-defined]
+    logging._handlers.clear()  # type: ignore[attr-defined]
+    root.handlers[:] = []
+    try:
+        yield
+    finally:
+        for handler in root.handlers:
+            handler.close()
+        root.handlers[:] = handlers
+        if root.level != level:
+            root.setLevel(level)
+        for name, each in _loggers():
+            each.disabled = name in disabled
+        logging._handlerList[:0] = known  # type: ignore[attr-defined]
+        logging._handlers.update(named)  # type: ignore[attr-defined]
+
+
+def _loggers() -> list[tuple[str, logging.Logger]]:
+    """The loggers of the process but the root, by their names."""
+    known = logging.Logger.manager.loggerDict
+    return [(name, each) for name, each in known.items() if isinstance(each, logging.Logger)]

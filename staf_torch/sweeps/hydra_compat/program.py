@@ -1,8 +1,11 @@
-"""`staf` as a Hydra application, and what its command line says before Hydra reads it."""
+"""`staf` as a Hydra application: of its command line, and of Python, where a process may have another one."""
 
 from __future__ import annotations
 
+import argparse
 import contextlib
+import functools
+import importlib
 import importlib.util
 import os
 import re
@@ -14,18 +17,116 @@ from types import FrameType
 from typing import Any, NamedTuple
 
 import hydra
+from hydra import initialize_config_dir, version
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.plugins import Plugins
+from hydra.core.utils import JobRuntime
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from ...settings import config_directory
-from .inside import HAS_WHITELIST, TRUSTED, arguments
+from .composing import Composer
+from .inside import HAS_WHITELIST, TRUSTED, arguments, loader, trusted
+from .jobs import handlers_aside
 
 _PACKAGE = Path(__file__).resolve().parents[2]
 _NAMES = re.compile(r"(?:_target_|\bpath)['\"]?\s*[=:]\s*['\"]?([A-Za-z_]\w*\.[\w.]*\w)")
+_OUTSIDE = re.compile(r"hydra.(searchpath|job)")  # files and variables that may be others at the next call
+_SHOWING = (
+    "help",
+    "hydra_help",
+    "cfg",
+    "info",
+    "shell_completion",
+    "resolve",
+    "config_path",
+    "experimental_rerun",
+)
+_VERSION: dict[str, str] = {} if HAS_WHITELIST else {"version_base": "1.3"}  # 1.4 warns of it
+_RESOLVERS = ("now", "hydra", "python_version", "hydra_override_dirname", "hydra_deprecated_override_dirname")
+"""Hydra's own, which it registers where it begins."""
+
+
+class Application(NamedTuple):
+    """The library's own Hydra application, alive within `application`."""
+
+    hydra: Any
+    name: str  # of the primary configuration
+    overrides: tuple[str, ...]
+    multirun: bool  # whether the command line asks for a sweep
+
+    def is_sweep(self) -> bool:
+        """Return whether the settings themselves ask for a sweep, as those of `experiment=ablation` do."""
+        try:
+            found = self.hydra.config_loader.load_configuration(
+                self.name, list(self.overrides), RunMode.MULTIRUN, validate_sweep_overrides=False
+            )
+        except Exception:  # the run itself raises it
+            return False
+        return bool(found.hydra.mode == RunMode.MULTIRUN)
+
+    def run(self, task: Callable[[DictConfig], Any]) -> Path:
+        """Run one job and return its directory.
+
+        Raises:
+            BaseException: that of Hydra or of the task.
+        """
+        ended = self.hydra.run(self.name, task, [*self.overrides, "hydra.mode=RUN"])
+        config: Any = ended.hydra_cfg
+        return Path(config.hydra.runtime.output_dir)
+
+    def sweep(self, task: Callable[[DictConfig], Any]) -> Path:
+        """Run a sweep and return its directory.
+
+        Raises:
+            BaseException: that of Hydra, or of the first job that failed, after all jobs have ended.
+        """
+        self.hydra.multirun(self.name, task, [*self.overrides, "hydra.mode=MULTIRUN"])
+        return Path(self.hydra.config_loader.latest_sweep.hydra.sweep.dir).absolute()
+
+
+@contextlib.contextmanager
+def application(argv: Sequence[str]) -> Iterator[Application]:
+    """Yield the application of a command line.
+
+    What the process had of Hydra, logging, environment and import path comes back in the end.
+    """
+    words = arguments(argv)
+    name = words.config_name or "config"
+    with contextlib.ExitStack() as stack:
+        for guard in (_import_path, _environment, _other_application, handlers_aside):
+            stack.enter_context(guard())
+        find_launcher()
+        plugin = importlib.import_module(
+            "hydra_plugins.staf_batched"
+        )  # Hydra may have looked for plugins before
+        Plugins.instance().register(plugin.BatchedLauncher)
+        stack.enter_context(initialize_config_dir(config_directory(), "staf", **_VERSION))
+        stack.enter_context(trusted(named_packages(argv)))
+        running: Any = GlobalHydra.instance().hydra
+        changes = words.config_dir is not None or any(re.search(_OUTSIDE, line) for line in words.overrides)
+        running.config_loader = Composer(loader(words.config_dir), name) if changes else _composer(name)
+        yield Application(running, name, tuple(words.overrides), words.multirun)
+
+
+@functools.cache
+def _composer(name: str) -> Composer:
+    """Return the settings of the package alone, composed once a process: its files do not change."""
+    return Composer(loader(), name)
+
+
+def is_about_settings(argv: Sequence[str]) -> bool:
+    """Return whether a command line only shows something (`--help`, `--cfg job`, ...), or is a wrong one."""
+    words = arguments(argv)
+    return (
+        any(vars(words)[name] for name in _SHOWING) or (words.run and words.multirun) or bool(words.unknown)
+    )
 
 
 def program(task: Callable[[DictConfig], Any]) -> Callable[[], None]:
-    """Return ``task`` as a Hydra application over `conf/`, which reads `sys.argv`."""
-    options = {"execution_whitelist": TRUSTED} if HAS_WHITELIST else {"version_base": "1.3"}
+    """Return ``task`` as Hydra's own program over `conf/`, which reads `sys.argv`."""
+    options = {"execution_whitelist": TRUSTED} if HAS_WHITELIST else _VERSION
     decorate: Any = hydra.main
     decorated: Callable[[], None] = decorate(config_path=config_directory(), config_name="config", **options)(
         task
@@ -64,36 +165,11 @@ def named_packages(argv: Sequence[str]) -> list[str]:
     """
     if not HAS_WHITELIST:
         return []
-    named = re.findall(_NAMES, "\n".join(overrides_in(argv)))
-    for folder in _config_folders(argv):
-        for file in Path(folder).rglob("*.yaml"):
-            named += re.findall(_NAMES, file.read_text(encoding="utf-8", errors="replace"))
+    words: argparse.Namespace = arguments(argv)
+    named = re.findall(_NAMES, "\n".join(words.overrides))
+    for file in Path(words.config_dir).rglob("*.yaml") if words.config_dir else ():
+        named += re.findall(_NAMES, file.read_text(encoding="utf-8", errors="replace"))
     return sorted({name.partition(".")[0] for name in named})
-
-
-def with_mode(argv: Sequence[str]) -> list[str]:
-    """Return the arguments, and the `hydra.mode` that the file of `experiment=...` sets, for Hydra 1.4.
-
-    That version takes the mode from the command line or from the primary file alone.
-    """
-    given = overrides_in(argv)
-    chosen = [line.partition("=")[2] for line in given if line.startswith("experiment=")]
-    stated = any(line.startswith("hydra.mode=") for line in given) or {"-m", "--multirun"} & set(argv)
-    if not HAS_WHITELIST or stated or not chosen:
-        return list(argv)
-    for folder in (*_config_folders(argv), config_directory()):
-        file = Path(folder, "experiment", f"{chosen[-1]}.yaml")
-        if file.is_file():
-            mode = OmegaConf.select(OmegaConf.load(file), "hydra.mode")
-            behind = argv.index(f"experiment={chosen[-1]}") + 1  # overrides may not be parted by an option
-            added = [] if mode is None else [f"hydra.mode={mode}"]
-            return [*argv[:behind], *added, *argv[behind:]]
-    return list(argv)
-
-
-def _config_folders(argv: Sequence[str]) -> list[str]:
-    """Return the directory of `--config-dir`, as a list of one or none."""
-    return list(filter(None, [arguments(argv).config_dir]))
 
 
 @contextlib.contextmanager
@@ -140,3 +216,44 @@ def broken_sweep(error: BaseException) -> BrokenSweep | None:
         if frame.f_code.co_name == "multirun" and "callbacks" in frame.f_locals:
             return BrokenSweep(frame.f_locals["cfg"], frame.f_locals["callbacks"])
     return None
+
+
+@contextlib.contextmanager
+def _import_path() -> Iterator[None]:
+    """Let settings name modules of the working directory."""
+    before = sys.path[:]
+    sys.path.insert(0, os.getcwd())
+    try:
+        yield
+    finally:
+        sys.path[:] = before
+
+
+@contextlib.contextmanager
+def _environment() -> Iterator[None]:
+    """Restore the variables of the environment that jobs or the launcher set."""
+    before = dict(os.environ)
+    try:
+        yield
+    finally:
+        for name in set(os.environ) - set(before):
+            del os.environ[name]
+        os.environ.update(before)
+
+
+@contextlib.contextmanager
+def _other_application() -> Iterator[None]:
+    """Set aside what another application of the process has of Hydra."""
+    theirs, config, job = GlobalHydra.instance(), HydraConfig.instance(), JobRuntime.instance()
+    kept = theirs.hydra, config.cfg, job.conf, version.getbase()
+    resolvers = [name for name in _RESOLVERS if OmegaConf.has_resolver(name)]
+    theirs.clear()
+    config.cfg, job.conf = None, OmegaConf.create()
+    try:
+        yield
+    finally:
+        GlobalHydra.set_instance(theirs)
+        theirs.hydra, config.cfg, job.conf, version.VersionBase.instance().version_base = kept
+        for name in _RESOLVERS:
+            if name not in resolvers and OmegaConf.has_resolver(name):
+                OmegaConf.clear_resolver(name)
