@@ -47,8 +47,9 @@ if TYPE_CHECKING:  # for type checkers and editors; the tables below say it agai
     from .kernels import MaternKernel as MaternKernel
     from .kernels import PolynomialKernel as PolynomialKernel
     from .kernels import RationalQuadraticKernel as RationalQuadraticKernel
+    from .online import ExperienceMemory as ExperienceMemory
+    from .online import MixtureRegressor as MixtureRegressor
     from .online import StaFRegressor as StaFRegressor
-    from .online.experience_memory import ExperienceMemory as ExperienceMemory
     from .sweeps.python_api import read_runs as read_runs
     from .sweeps.python_api import run as run
     from .sweeps.python_api import sweep as sweep
@@ -78,8 +79,7 @@ else:
             *("AnchoredKernel", "ExponentialKernel", "GaussianKernel", "InverseMultiquadricKernel"),
             *("Kernel", "MaternKernel", "PolynomialKernel", "RationalQuadraticKernel"),
         ),
-        "online": ("StaFRegressor",),
-        "online.experience_memory": ("ExperienceMemory",),
+        "online": ("ExperienceMemory", "MixtureRegressor", "StaFRegressor"),
         "sweeps.python_api": ("read_runs", "run", "sweep"),  # not for `import *`: they import Hydra
     }
     _HOMES = {name: module for module, names in _NAMES.items() for name in names}

@@ -1,13 +1,17 @@
-"""A stream on which everything happens, and models of both modes."""
+"""A stream on which everything happens, and the regressors of streams."""
 
 from __future__ import annotations
 
+import functools
 import math
+from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import Tensor
 
 import staf_torch as st
+from staf_torch.online import MixtureRegressor
 
 
 def hard_stream(steps: int) -> tuple[Tensor, Tensor]:
@@ -23,9 +27,12 @@ def hard_stream(steps: int) -> tuple[Tensor, Tensor]:
     return x, y
 
 
+small_filter = functools.partial(st.StaFRegressor, radius=0.4, noise=0.05)
+mixture = functools.partial(MixtureRegressor, 128, 8)
+REGRESSORS: dict[str, Callable[..., Any]] = {"filter": small_filter, "mixture": mixture}
 MODELS = {
     "filter": lambda: st.StaFRegressor(scaling=True),
     "filter of a kernel": lambda: st.StaFRegressor("matern", 0.4, noise=0.1, forgetting=0.99),
     "tuned filter": lambda: st.StaFRegressor().tune(*(part[:100] for part in hard_stream(100))),
-    "bank": lambda: st.StaFRegressor(memory=128, neighbours=8, scaling=True),
+    "mixture": mixture,
 }

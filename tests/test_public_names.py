@@ -36,7 +36,7 @@ CONTRACT = """
     PolynomialKernel AnchoredKernel StateFollowingCenters ConstantRadius StateRadius
     rings polygon simplex cross_polytope ball chase ChaseResult optim systems targets theory adp
     systems.StepPlant systems.RatePlant systems.Barrier systems.simulate optim.ChaseOptimizer
-    adp.QuadraticCost adp.simulate adp.near_optimal
+    adp.QuadraticCost adp.simulate adp.near_optimal online.StaFRegressor online.MixtureRegressor
 """
 """What users import (DESIGN.md, section 4)."""
 PACKAGES = [

@@ -250,6 +250,11 @@ def regressed(x: Any = None, **given: Any) -> Any:
     return st.StaFRegressor(**given).partial_fit(x, x[..., 0])
 
 
+def mixed(**given: Any) -> Any:
+    """A mixture that has met one sample."""
+    return st.MixtureRegressor(**given).partial_fit(TWO[0], 1.0)
+
+
 REFUSED: list[tuple[Callable[[], Any], str]] = [
     (lambda: BASIS(THREE, TWO[0]), "must have 2 entries in its last dimension"),
     (lambda: BASIS.local(THREE), "`StaFBasis.local(x=...)` must have 2 entries"),
@@ -266,8 +271,8 @@ REFUSED: list[tuple[Callable[[], Any], str]] = [
     (lambda: EXPERIENCE.add(TWO[0], TWO[0]), "`ExperienceMemory.add(coefficients=...)` must have 3 entries"),
     (lambda: regressed(noise=0.0), "`StaFRegressor(noise=...)` must be positive"),
     (lambda: regressed(forgetting="no"), "`StaFRegressor(forgetting=...)` must be a number"),
-    (lambda: regressed(memory=3), "`StaFRegressor(memory=...)` must be at least"),
-    (lambda: regressed(memory=128, neighbours=7), "(neighbours=...)` must be at least 8"),
+    (lambda: mixed(memory=3), "`MixtureRegressor(memory=...)` must be at least"),
+    (lambda: mixed(memory=128, neighbours=7), "(neighbours=...)` must be at least 8"),
     (lambda: regressed(0.1 * EYE, robust=3.0).add(0), "add(streams=...)` must be at least 1"),
     (lambda: theory.drift_constants(BASIS, PAPER, THREE, THREE), "`drift_constants(states=...)` must have 2"),
     (lambda: theory.power_function(BASIS, THREE, TWO), "`power_function(x=...)` must have 2 entries"),

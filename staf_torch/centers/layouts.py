@@ -21,6 +21,9 @@ _RINGS: dict[int, tuple[tuple[int, float], ...]] = {
     21: ((11, 1.0), (7, 0.75), (3, 0.28)),
     28: ((13, 1.0), (9, 0.82), (5, 0.46), (1, 0.0)),
 }
+RING_COUNTS = tuple(_RINGS)
+"""Centers that `rings` has an arrangement for."""
+
 _CANDIDATES = 4000  # points of the cloud that `ball` chooses from
 _EXCHANGES = 2000
 

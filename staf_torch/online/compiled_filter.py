@@ -14,6 +14,9 @@ from ..lanes.build import compiled
 from .kalman_filter import LocalFilter, StreamState
 from .local_functions import LocalFunctions
 
+NATIVE = Path(__file__).with_name("native")
+"""The folder of the C++ of this room."""
+
 _REALS = {torch.float32: "float", torch.float64: "double"}
 _MOST = 66  # centers: beyond, unrolled loops and a stack frame of M^2 vectors no longer pay
 
@@ -48,7 +51,9 @@ class FunctionPointers(ctypes.Structure):
         return cls(*pointers, float(functions.rate), reach), held
 
 
-class _Call(ctypes.Structure):
+class FilterCall(ctypes.Structure):
+    """`Call` of _filter.cpp."""
+
     _fields_ = (
         ("streams", ctypes.c_int64),
         ("stride", ctypes.c_int64),
@@ -74,7 +79,7 @@ class CompiledFilter:
         pointers, self._held = FunctionPointers.of(definition.functions)
         self._held += [state.blocks, state.counts, definition.ratio, definition.forgetting]
         streams = state.streams
-        self._call = _Call(streams=streams, stride=streams, functions=pointers)
+        self._call = FilterCall(streams=streams, stride=streams, functions=pointers)
         self._call.table, self._call.counts = state.blocks.data_ptr(), state.counts.data_ptr()
         self._call.ratio, self._call.forgetting = (
             definition.ratio.data_ptr(),
@@ -95,7 +100,7 @@ class CompiledFilter:
         if not plain or real is None or state.count > _MOST or state.blocks.device.type != "cpu":
             return definition
         sizes = f"DIM={state.dim}", f"COUNT={state.count}", f"OUTPUTS={state.outputs}"
-        call = compiled(Path(__file__).with_name("_filter.cpp"), *sizes, f"REAL={real}")
+        call = compiled(NATIVE / "_filter.cpp", *sizes, f"REAL={real}")
         return definition if call is None else cls(definition, state, call)
 
     def predict(self, state: StreamState, x: Tensor) -> tuple[Tensor, Tensor]:

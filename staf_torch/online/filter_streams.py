@@ -68,11 +68,15 @@ class FilterStreams:
     def _hold(self, definition: LocalFilter, state: StreamState) -> None:
         """Filter these streams from now on."""
         self.definition, self.state = definition, state
-        self.count = state.streams
         self._filter = CompiledFilter.build(definition, state)
         self.compiled = isinstance(self._filter, CompiledFilter) and not self.scaling
         self._center, self._spread = self.units.to(self.dtype).split(state.dim + state.outputs, dim=1)
         self._calm = False  # until `_see`
+
+    @property
+    def count(self) -> int:
+        """Return S."""
+        return self.state.streams
 
     @property
     def learned(self) -> Tensor:
@@ -319,7 +323,7 @@ class FilterStreams:
             like = isinstance(given, Tensor) and given.shape == own.shape and given.dtype == own.dtype
             if not (like and torch.allclose(torch.as_tensor(given), own, rtol=1e-9)):
                 told = "must have the kernel, radius and centers of this regressor"
-                raise ValueError(f"`StaFRegressor.load_state_dict(state=...)` {told}; {name!r} differs.")
+                raise ValueError(f"`load_state_dict(state=...)` {told}; {name!r} differs.")
         kept = self.state.with_table(state["table"], state["counts"].clone())
         for name in ("units", "clock", "first", "turn"):
             setattr(self, name, state[name].clone())
@@ -336,7 +340,7 @@ def table_of(state: dict[str, Any]) -> Tensor:
     table = state.get("table")
     if not isinstance(table, Tensor) or table.dim() != 2:
         rule = "must have a tensor 'table' of two dimensions"
-        raise ValueError(f"`StaFRegressor.load_state_dict(state=...)` {rule}.")
+        raise ValueError(f"`load_state_dict(state=...)` {rule}.")
     return table
 
 
@@ -349,7 +353,7 @@ def refuse_other(state: dict[str, Any], own: dict[str, Tensor], expected: int, g
         expected: numbers a stream of the new one.
         given: numbers a stream of the saved table.
     """
-    name = "`StaFRegressor.load_state_dict(state=...)`"
+    name = "`load_state_dict(state=...)`"
     if given != expected:
         told = f"must have {expected} numbers a stream, as this version and these arguments have; got {given}"
         raise ValueError(f"{name} {told}.")

@@ -10,35 +10,36 @@ from typing import Any
 
 import torch
 
-from .regressor import StaFRegressor
+from .estimator import StreamEstimator
+from .mixture import MixtureRegressor
 
 
 class RiverRegressor:
-    """`learn_one` and `predict_one` around a `StaFRegressor`, for river's pipelines and metrics.
+    """`learn_one` and `predict_one` around a regressor of streams, for river's pipelines and metrics.
 
     Features are taken by the names of the first sample, in its order; one that is missing later was not
     measured. Nothing of river is imported: where it is, its `compose.Pipeline` and its metrics take this
     as a regressor.
 
     Example:
-        >>> model = RiverRegressor(StaFRegressor(memory=500))
+        >>> model = RiverRegressor(MixtureRegressor(memory=500))
         >>> _ = model.learn_one({"a": 1.0, "b": 2.0}, 3.0)
         >>> model.predict_one({"a": 1.0, "b": 2.0})
         3.0
 
-        Shown by `staf_torch/online/README.md`.
+        Shown by `staf_torch/online/mixture/README.md`.
 
     Args:
-        model: of one stream, with arguments of your choice.
+        model: a `StaFRegressor` or `MixtureRegressor` of one stream; by default the latter, ``memory=500``.
     """
 
     _supervised = True
 
-    def __init__(self, model: StaFRegressor | None = None) -> None:
+    def __init__(self, model: StreamEstimator | None = None) -> None:
         river = sys.modules.get("river.base")
         if river is not None:
             river.Regressor.register(type(self))  # for metrics, which ask what they are given
-        self.model = StaFRegressor(memory=500) if model is None else model
+        self.model = MixtureRegressor(memory=500) if model is None else model
         self.features: tuple[Any, ...] = ()
 
     def clone(self, new_params: Mapping[str, Any] | None = None, **kwargs: Any) -> RiverRegressor:

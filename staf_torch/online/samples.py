@@ -10,8 +10,6 @@ from torch import Tensor
 
 from ..numerics.checks import fail
 
-_NAME = "StaFRegressor"
-
 
 def tensor_of(call: str, name: str, value: Any) -> Tensor:
     """A tensor as it is, without gradient; arrays and numbers as tensors; integers as float64."""
@@ -37,49 +35,49 @@ def tensor_of(call: str, name: str, value: Any) -> Tensor:
 
 def pair(call: str, x: Any, y: Any, dims: tuple[int, int]) -> tuple[Tensor, Tensor]:
     if y is None:
-        raise ValueError(f"`{_NAME}.{call}` requires y to be passed, but the target y is None.")
-    states, values = tensor_of(f"{_NAME}.{call}", "x", x), tensor_of(f"{_NAME}.{call}", "y", y)
+        raise ValueError(f"`{call}` requires y to be passed, but the target y is None.")
+    states, values = tensor_of(call, "x", x), tensor_of(call, "y", y)
     if 0 in states.shape:
         shape = tuple(states.shape)
         what = f"{states.shape[-1]} feature(s)" if 0 in states.shape[-1:] else "0 sample(s)"
         told = f"must not be empty: {what} (shape={shape}) while a minimum of 1 is required"
-        raise ValueError(f"`{_NAME}.{call}(x=...)` {told}.")
+        raise ValueError(f"`{call}(x=...)` {told}.")
     fits = states.dim() in dims and values.shape[: states.dim() - 1] == states.shape[:-1]
     if not fits or values.dim() - states.dim() not in (-1, 0):
         rule = (
             "(n,) or (S, n)" if dims == (1, 2) else "(T, n) for one stream in time or (T, S, n) for S streams"
         )
         raise ValueError(
-            f"`{_NAME}.{call}(x=...)` must have the shape {rule}, and y that without n, or with K "
+            f"`{call}(x=...)` must have the shape {rule}, and y that without n, or with K "
             f"in its place; got {tuple(states.shape)} and {tuple(values.shape)}."
         )
     return states, values
 
 
-def lapses(time: Any, states: Tensor) -> Tensor | None:
+def lapses(call: str, time: Any, states: Tensor) -> Tensor | None:
     """Time since the sample before, (T, S) or (T, 1), 1 at the first; None without times."""
     if time is None:
         return None
-    given = tensor_of(f"{_NAME}.fit", "time", time).double()
+    given = tensor_of(call, "time", time).double()
     steps = given.diff(dim=0)
     fits = tuple(given.shape) in {(len(states),), tuple(states.shape[:-1])}
     if not fits or not bool(given.isfinite().all() and (steps >= 0).all() and steps.isfinite().all()):
         streams = "" if states.dim() == 2 else f" or {tuple(states.shape[:-1])}"
-        raise fail(f"{_NAME}.fit", "time", f"must be finite and increasing, ({len(states)},){streams}", time)
+        raise fail(call, "time", f"must be finite and increasing, ({len(states)},){streams}", time)
     return torch.cat((torch.ones_like(given[:1]), steps)).reshape(len(states), -1)
 
 
-def lapse_of(lapse: Any, streams: int) -> Tensor:
+def lapse_of(call: str, lapse: Any, streams: int) -> Tensor:
     """Time since the sample before, (S,) float64.
 
     Raises:
         ValueError: unless it is one number, or one for each stream, finite and not negative.
     """
-    given = tensor_of(f"{_NAME}.partial_fit", "lapse", lapse).double()
+    given = tensor_of(call, "lapse", lapse).double()
     fits = given.dim() <= 1 and given.numel() in (1, streams)
     if not fits or not bool(((given >= 0) & (given < torch.inf)).all()):
         told = f"must be finite and not negative, () or ({streams},)"
-        raise fail(f"{_NAME}.partial_fit", "lapse", told, lapse)
+        raise fail(call, "lapse", told, lapse)
     return given.expand(streams).contiguous()
 
 

@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from ..kernels import Kernel
+from ..kernels import NAMED, Kernel
 from ..numerics.checks import choice, fail
-from .filter_arguments import KERNELS
 
 
 class ScikitEstimator:
@@ -45,8 +44,8 @@ class ScikitEstimator:
 
     def _set_nested(self, name: str, own: str, nested: str, value: Any) -> None:
         kernel = getattr(self, own)
-        if isinstance(kernel, str) and kernel in KERNELS:
-            kernel = KERNELS[kernel]()
+        if isinstance(kernel, str) and kernel in NAMED:
+            kernel = NAMED[kernel]()
         known = _arguments(kernel) if isinstance(kernel, Kernel) else {}
         if nested not in known:
             raise fail(f"{type(self).__name__}.set_params", "params", f"must be one of {[*known]}", name)

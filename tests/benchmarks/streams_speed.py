@@ -53,7 +53,7 @@ def many(dim: int, count: int, dtype: torch.dtype, streams: int = 10_000, steps:
     )
 
 
-def single(model: st.StaFRegressor, dim: int, calls: int = 2000) -> str:
+def single(model: st.StaFRegressor | st.MixtureRegressor, dim: int, calls: int = 2000) -> str:
     samples = [(x[0].contiguous(), y[0]) for x, y in path(1, dim, calls + 1100, torch.float64)]
     for x, y in samples[:1100]:
         model.partial_fit(x, y)
@@ -163,7 +163,7 @@ def main() -> None:
     print(f"one stream, n = 2, M = 6: {single(regressor(2, 6), 2)}")
     print(f"one stream, n = 6, M = 28: {single(regressor(6, 28), 6)}")
     for neighbours in (32, 48):
-        model = st.StaFRegressor(memory=1000, neighbours=neighbours)
+        model = st.MixtureRegressor(1000, neighbours)
         print(f"one stream, bank of {neighbours} neighbours, n = 4: {single(model, 4)}")
     for streams in (1, 8):
         print(

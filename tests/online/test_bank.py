@@ -1,4 +1,4 @@
-"""The accurate mode: a bank of local models over remembered samples."""
+"""The mixture: a bank of local models over remembered samples."""
 
 from __future__ import annotations
 
@@ -6,14 +6,13 @@ from typing import Any
 
 import pytest
 import torch
+from helpers_streams import REGRESSORS, mixture
 from torch import Tensor, inf, nan
+from variants import over
 
 import staf_torch as st
-from staf_torch.online.bank import Bank
-from staf_torch.online.bank_rules import (
-    RECENT,
-    BankShape,
-)
+from staf_torch.online.mixture.bank import Bank
+from staf_torch.online.mixture.rules import RECENT, BankShape
 
 needs_compiler = pytest.mark.needs_compiler
 
@@ -28,7 +27,7 @@ def streams(steps: int, count: int, outputs: int = 1, seed: int = 0) -> tuple[Te
 
 def test_bank_predicts_within_its_noise_and_says_so() -> None:
     x, y = streams(400, 2)
-    model = st.StaFRegressor(memory=128, neighbours=8)
+    model = mixture()
     scores = []
     for k in range(400):
         if k > 200:
@@ -44,26 +43,26 @@ def test_bank_predicts_within_its_noise_and_says_so() -> None:
 def test_streams_have_the_same_bits_alone_and_beside_others() -> None:
     x, y = streams(150, 5)
     y[40, 1], x[60, 3] = torch.nan, 1e250
-    together = st.StaFRegressor(memory=128, neighbours=8).fit(x, y[..., 0])
+    together = mixture().fit(x, y[..., 0])
     for i in range(5):
-        alone = st.StaFRegressor(memory=128, neighbours=8).fit(x[:, i], y[:, i, 0])
+        alone = mixture().fit(x[:, i], y[:, i, 0])
         assert torch.equal(together.predict(x[0])[i], alone.predict(x[0, i]))
 
 
 def test_size_does_not_grow_with_the_stream() -> None:
     x, y = streams(300, 1)
-    model = st.StaFRegressor(memory=128, neighbours=8).fit(x[:2], y[:2, :, 0])
+    model = mixture().fit(x[:2], y[:2, :, 0])
     before = model.state_dict()["table"].numel()
     for state, value in zip(x[2:], y[2:, :, 0], strict=True):
         model.partial_fit(state, value)
     assert model.state_dict()["table"].numel() == before
 
 
-@pytest.mark.parametrize("memory", [None, 128])
-def test_saved_state_goes_on_bit_for_bit(memory: int | None, tmp_path: object) -> None:
+@over(REGRESSORS, "kind")
+def test_saved_state_goes_on_bit_for_bit(kind: str, tmp_path: object) -> None:
     x, y = streams(120, 3, outputs=2)
-    whole = st.StaFRegressor(memory=memory, neighbours=8, scaling=True)
-    again = st.StaFRegressor(memory=memory, neighbours=8, scaling=True)
+    whole = REGRESSORS[kind](scaling=True)
+    again = REGRESSORS[kind](scaling=True)
     for k in range(30):
         whole.partial_fit(x[k], y[k])
     torch.save(whole.state_dict(), f"{tmp_path}/state.pt")
@@ -74,16 +73,14 @@ def test_saved_state_goes_on_bit_for_bit(memory: int | None, tmp_path: object) -
     assert torch.equal(whole.predict(x[0]), again.predict(x[0]))
 
 
-@pytest.mark.parametrize("memory", [None, 128])
-def test_state_of_other_sizes_is_refused(memory: int | None) -> None:
+@over(REGRESSORS, "kind")
+def test_state_of_other_sizes_is_refused(kind: str) -> None:
     x, y = streams(5, 2)
-    state = st.StaFRegressor(memory=memory, neighbours=8).fit(x, y[..., 0]).state_dict()
+    state = REGRESSORS[kind]().fit(x, y[..., 0]).state_dict()
     other = st.StaFRegressor(count=3).fit(x, y[..., 0])
     before = other.predict(x[0])
-    older = {name: value for name, value in state.items() if name != "arguments"}
-    for given, rule in ((state, "same arguments: it has (count|memory)="), (older, "numbers a stream")):
-        with pytest.raises(ValueError, match=rf"load_state_dict.*{rule}"):
-            other.load_state_dict(given)
+    with pytest.raises(ValueError, match=r"load_state_dict.*same arguments: it has (count|radius)="):
+        other.load_state_dict(state)
     assert torch.equal(other.predict(x[0]), before)  # and leaves what was learned
 
 
@@ -97,17 +94,15 @@ def test_state_of_another_model_is_refused(change: dict[str, Any]) -> None:
         st.StaFRegressor().load_state_dict({})
 
 
-@pytest.mark.parametrize("memory", [None, 128])
-def test_no_saved_state_leads_compiled_code_outside(memory: int | None) -> None:
+@over(REGRESSORS, "kind")
+def test_no_saved_state_leads_compiled_code_outside(kind: str) -> None:
     x, y = streams(5, 2)
-    fitted = st.StaFRegressor(memory=memory, neighbours=8).fit(x, y[..., 0])
+    fitted = REGRESSORS[kind]().fit(x, y[..., 0])
     for name, tensor in fitted.state_dict().items():
         if isinstance(tensor, Tensor) and name != "first":
             for other in (tensor[..., :-1], tensor.float() if tensor.is_floating_point() else tensor.int()):
                 with pytest.raises(ValueError, match=r"load_state_dict.*must have"):
-                    st.StaFRegressor(memory=memory, neighbours=8).load_state_dict(
-                        fitted.state_dict() | {name: other}
-                    )
+                    REGRESSORS[kind]().load_state_dict(fitted.state_dict() | {name: other})
 
 
 @pytest.mark.parametrize(
@@ -131,11 +126,11 @@ def test_a_saved_bank_with_numbers_that_no_bank_writes_is_refused(name: str, val
 
 
 @pytest.mark.needs_compiler
-@pytest.mark.parametrize("memory", [None, 128])
-def test_streams_come_and_go_without_touching_the_others(memory: int | None) -> None:
+@over(REGRESSORS, "kind")
+def test_streams_come_and_go_without_touching_the_others(kind: str) -> None:
     x, y = streams(140, 4)
-    model = st.StaFRegressor(memory=memory, neighbours=8)
-    alone = st.StaFRegressor(memory=memory, neighbours=8)
+    model = REGRESSORS[kind]()
+    alone = REGRESSORS[kind]()
     for k in range(60):
         model.partial_fit(x[k, :3], y[k, :3, 0])
         alone.partial_fit(x[k, 2], y[k, 2, 0])
@@ -144,7 +139,7 @@ def test_streams_come_and_go_without_touching_the_others(memory: int | None) -> 
     model.drop([]).drop([0]).add(2).reset(streams=[0])
     assert model.n_streams_ == 4
     assert model.n_samples_seen_.tolist()[1:] == [60, 0, 0]
-    fresh = st.StaFRegressor(memory=memory, neighbours=8)
+    fresh = REGRESSORS[kind]()
     for k in range(60, 140):
         model.partial_fit(x[k, [1, 2, 3, 0]], y[k, [1, 2, 3, 0], 0])
         alone.partial_fit(x[k, 2], y[k, 2, 0])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import pickle
 from typing import Any
@@ -10,12 +11,13 @@ import numpy as np
 import pytest
 import torch
 from helpers import tensor, uniform
-from variants import Cauchy
+from helpers_streams import REGRESSORS, mixture, small_filter
+from variants import Cauchy, over
 
 import staf_torch as st
-from staf_torch.online.filter_arguments import KERNELS
+from staf_torch.kernels import NAMED
 
-BANK: dict[str, Any] = {"memory": 128, "neighbours": 8}
+KINDS = {**REGRESSORS, "filter with units": functools.partial(small_filter, scaling=True)}
 
 
 def data(steps: int, *streams: int, outputs: int | None = None) -> tuple[torch.Tensor, torch.Tensor]:
@@ -31,8 +33,8 @@ def test_fit_and_tune_forget_what_was_learned() -> None:
     fresh = model.fit(x[:6], y[:6]).predict(x[-1])
     assert torch.equal(model.fit(x, y).fit(x[:6], y[:6]).predict(x[-1]), fresh)
     assert int(model.n_samples_seen_) == 6
-    for each in (model, st.StaFRegressor(**BANK).fit(x, y)):
-        with pytest.raises(ValueError, match=r"`StaFRegressor.predict` needs a first sample"):
+    for each in (model, mixture().fit(x, y)):
+        with pytest.raises(ValueError, match=r"Regressor.predict` needs a first sample"):
             each.tune(x, y).predict(x[0])
 
 
@@ -62,10 +64,10 @@ def test_streams_that_are_not_there_cannot_go_come_or_begin_anew() -> None:
     assert single.n_samples_seen_.shape == ()
 
 
-@pytest.mark.parametrize("settings", [{"radius": 0.4}, BANK, {"radius": 0.4, "scaling": True}])
-def test_streams_keep_their_numbers_outputs_and_order(settings: dict[str, Any]) -> None:
+@over(KINDS, "kind")
+def test_streams_keep_their_numbers_outputs_and_order(kind: str) -> None:
     x, y = data(6, 4, outputs=2)
-    model = st.StaFRegressor(**settings).fit(x, y)
+    model = KINDS[kind]().fit(x, y)
     before = model.predict(x[-1])
     assert before.shape == (4, 2)
     assert model.drop([3, 1]) is model
@@ -86,8 +88,8 @@ def test_streams_keep_their_numbers_outputs_and_order(settings: dict[str, Any]) 
     assert model.reset(streams=1).n_samples_seen_.tolist() == [0, 0, 0]
 
 
-@pytest.mark.parametrize("settings", [{"radius": 0.4}, BANK])
-def test_samples_of_another_shape_are_refused_and_leave_the_streams_alone(settings: dict[str, Any]) -> None:
+@over(REGRESSORS, "kind")
+def test_samples_of_another_shape_are_refused_and_leave_the_streams_alone(kind: str) -> None:
     cases: list[tuple[tuple[Any, ...], list[tuple[tuple[int, ...], tuple[int, ...]]]]] = [
         (((2,), ()), [((2,), (2,)), ((2,), (1,)), ((3,), ()), ((1, 2), (1,))]),
         (((2,), (2,)), [((2,), ()), ((2,), (3,)), ((3,), (3,))]),
@@ -95,10 +97,10 @@ def test_samples_of_another_shape_are_refused_and_leave_the_streams_alone(settin
         (((3, 2), (3, 1)), [((3, 2), (3,)), ((3, 2), (3, 2)), ((3, 1), (3, 1)), ((3, 3), (3, 1))]),
     ]
     for (of_x, of_y), wrong in cases:
-        model = st.StaFRegressor(**settings).partial_fit(torch.rand(of_x).double(), torch.rand(of_y).double())
+        model = REGRESSORS[kind]().partial_fit(torch.rand(of_x).double(), torch.rand(of_y).double())
         for other_x, other_y in wrong:
             x, y = torch.rand(other_x).double(), torch.rand(other_y).double()
-            with pytest.raises(ValueError, match=r"`StaFRegressor.partial_fit\(x=...\)` must have") as told:
+            with pytest.raises(ValueError, match=r"Regressor.partial_fit\(x=...\)` must have") as told:
                 model.partial_fit(x, y)
             kept = f"the shape {of_x} of the first sample, with {of_x[-1]} features, and y {of_y}"
             given = f"got the shape {other_x} and y's {other_y}: X has {other_x[-1]} features, but"
@@ -116,8 +118,8 @@ def test_samples_of_another_shape_are_refused_and_leave_the_streams_alone(settin
         assert int(model.n_samples_seen_.sum()) == (of_x[0] if len(of_x) == 2 else 1)
 
 
-@pytest.mark.parametrize("settings", [{"radius": 0.4}, {"radius": 0.4, "scaling": True}, BANK])
-def test_samples_in_any_form_are_the_same_samples(settings: dict[str, Any]) -> None:
+@over(KINDS, "kind")
+def test_samples_in_any_form_are_the_same_samples(kind: str) -> None:
     """Rows of a transposed tensor, numbers that ask for a gradient, arrays, single precision."""
     x, y = (part.float().double() for part in data(14, 3))
     across = x.transpose(1, 2).contiguous().transpose(1, 2)
@@ -129,17 +131,17 @@ def test_samples_in_any_form_are_the_same_samples(settings: dict[str, Any]) -> N
         "targets every other": lambda k: (x[k], torch.stack((y[k], y[k]), -1)[:, 0]),
         "lists": lambda k: (x[k].tolist(), y[k].tolist()),
     }
-    plain = st.StaFRegressor(**settings)
+    plain = KINDS[kind]()
     for k in range(13):
         plain.partial_fit(x[k], y[k])
     wanted = plain.predict(x[13], return_std=True)
     for form in forms.values():
-        model = st.StaFRegressor(**settings).partial_fit(x[0], y[0])
+        model = KINDS[kind]().partial_fit(x[0], y[0])
         for k in range(1, 13):
             model.partial_fit(*form(k))
         for one, other in zip(model.predict(form(13)[0], return_std=True), wanted, strict=True):
             assert torch.equal(torch.as_tensor(one).double(), other)
-    half = st.StaFRegressor(**settings).partial_fit(x[0].half(), y[0].half())
+    half = KINDS[kind]().partial_fit(x[0].half(), y[0].half())
     assert half.state_dict()["dtype"] == "torch.float64"
 
 
@@ -167,12 +169,11 @@ def test_times_and_lapses_are_the_same_thing() -> None:
 
 def test_a_state_is_that_of_the_last_arguments_and_of_nothing_before() -> None:
     x, y = data(40)
-    bank = st.StaFRegressor(**BANK).fit(x[:9], y[:9])
-    model = st.StaFRegressor(radius=0.4).fit(x, y).set_params(**BANK, radius=0.5)
-    assert hasattr(model, "centers_offsets_")
-    assert model.load_state_dict(bank.state_dict()) is model
-    assert not hasattr(model, "centers_offsets_")
-    assert torch.equal(model.predict(x[9]), bank.predict(x[9]))
+    wide = st.StaFRegressor(radius=0.5).fit(x[:9], y[:9])
+    model = st.StaFRegressor(radius=0.4).fit(x, y).set_params(radius=0.5)
+    assert model.load_state_dict(wide.state_dict()) is model
+    assert torch.equal(model.centers_offsets_, wide.centers_offsets_)
+    assert torch.equal(model.predict(x[9]), wide.predict(x[9]))
     plain = st.StaFRegressor(radius=0.4).fit(x, y)
     tuned = st.StaFRegressor(radius=0.4).tune(x, y)
     tuned.load_state_dict(plain.state_dict())
@@ -186,11 +187,10 @@ def test_a_state_is_that_of_the_last_arguments_and_of_nothing_before() -> None:
 
 def test_a_state_that_lacks_something_is_refused_by_what_it_lacks() -> None:
     x, y = data(5, 2)
-    for settings in ({"radius": 0.4}, BANK):
-        model = st.StaFRegressor(**settings)
+    for model in (small_filter(), mixture()):
         state = model.fit(x, y).state_dict()
-        told = r"`StaFRegressor.load_state_dict\(state=...\)` must"
-        for name in ("dtype", "n_streams_", "table"):
+        told = r"load_state_dict\(state=...\)` must"
+        for name in ("dtype", "n_streams_", "arguments", "table"):
             less = {key: value for key, value in state.items() if key != name}
             with pytest.raises(
                 ValueError, match=rf"{told} be what `state_dict` returned; it has no \['{name}'\]"
@@ -204,8 +204,8 @@ def test_a_state_that_lacks_something_is_refused_by_what_it_lacks() -> None:
         for table in (state["table"][0], state["table"][:, :-1], state["table"][:-1]):
             with pytest.raises(ValueError, match=rf"{told} have"):
                 model.load_state_dict(state | {"table": table.contiguous()})
-        other = {**state["arguments"], "memory": 3.0}
-        with pytest.raises(ValueError, match=rf"{told} be of .* it has memory=3.0, this one (None|128.0)"):
+        other = {**state["arguments"], "robust": 3.0}
+        with pytest.raises(ValueError, match=rf"{told} be of .* it has robust=3.0, this one None"):
             model.load_state_dict(state | {"arguments": other})
     assert all(value is None or type(value) is float for value in state["arguments"].values())
 
@@ -267,7 +267,7 @@ def test_bad_arguments_are_named(arguments: dict[str, object], message: str) -> 
         st.StaFRegressor(**arguments).partial_fit(tensor([0.0, 1.0]), 1.0)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("kernel", [*map(str, KERNELS), Cauchy()], ids=str)
+@pytest.mark.parametrize("kernel", [*map(str, NAMED), Cauchy()], ids=str)
 @pytest.mark.parametrize("dim", [2])
 def test_a_kernel_that_is_narrow_for_its_ball_is_told(
     kernel: st.Kernel | str, dim: int, caplog: pytest.LogCaptureFixture
@@ -278,7 +278,7 @@ def test_a_kernel_that_is_narrow_for_its_ball_is_told(
         caplog.clear()
         model = st.StaFRegressor(kernel, radius=radius)
         model.partial_fit(torch.zeros(dim).double(), 1.0)
-        own = KERNELS[kernel]().double() if isinstance(kernel, str) else kernel.double()
+        own = NAMED[kernel]().double() if isinstance(kernel, str) else kernel.double()
         centers, points = model.centers_offsets_, model.centers_offsets_ / 2
         cross, gram = own(points, centers), own(centers, centers)
         known = cross @ torch.linalg.pinv(gram, rtol=1e-12, hermitian=True) @ cross.mT

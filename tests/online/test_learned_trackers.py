@@ -8,16 +8,16 @@ import pytest
 import torch
 from torch import Tensor
 
-from staf_torch.online.bank import Bank
-from staf_torch.online.bank_rules import FADING, PLAIN, TURNED, TURNED_FADING, BankShape
-from staf_torch.online.learned_trackers import (
-    Choice,
+from staf_torch.online.mixture.bank import Bank
+from staf_torch.online.mixture.members import (
+    Hyperparameters,
     Stretch,
+    TrackerModels,
     likelihoods,
     search,
     sensitivity,
 )
-from staf_torch.online.tracker_models import TrackerModels
+from staf_torch.online.mixture.rules import FADING, PLAIN, TURNED, TURNED_FADING, BankShape
 
 
 def stretch(count: int, outputs: int = 1, noise: float = 0.1) -> Stretch:
@@ -77,7 +77,7 @@ def test_compiled_bank_chooses_what_the_definition_does() -> None:
 
 
 def test_the_metric_is_the_mean_outer_product_of_gradients_and_a_tenth_of_its_trace() -> None:
-    s, c = stretch(25, outputs=2), Choice(0.4, 0.02, 0.0, 0.0)
+    s, c = stretch(25, outputs=2), Hyperparameters(0.4, 0.02, 0.0, 0.0)
     x = s.at.clone().requires_grad_()
     gram = (-0.4 * torch.cdist(s.at, s.at).square()).exp()
     solved = torch.linalg.solve(gram + 0.02 * torch.eye(25, dtype=torch.float64), s.y)

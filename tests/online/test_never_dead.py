@@ -6,9 +6,11 @@ import math
 
 import pytest
 import torch
+from helpers_streams import REGRESSORS, mixture
 from hypothesis import given, settings
 from hypothesis import strategies as some
 from torch import Tensor
+from variants import over
 
 import staf_torch as st
 
@@ -52,21 +54,21 @@ def test_filter_recovers_from_far_inputs(kernel: str, dtype: torch.dtype) -> Non
     assert (torch.stack(found[30:]).square().mean(0).sqrt() < 0.3).all()
 
 
-@pytest.mark.parametrize("memory", [None, 128])
+@over(REGRESSORS, "kind")
 @pytest.mark.parametrize("value", [1e30, -1e200, 1e300])
-def test_target_out_of_all_proportion_is_not_believed(memory: int | None, value: float) -> None:
+def test_target_out_of_all_proportion_is_not_believed(kind: str, value: float) -> None:
     x, y = path(100)
     bad = y.clone()
     bad[45:48] = value
-    model = st.StaFRegressor(radius=0.4, noise=0.05, memory=memory, neighbours=8).fit(x, bad)
+    model = REGRESSORS[kind]().fit(x, bad)
     assert int(model.n_skipped_) == 3
     assert error_after(model, x, y) < 0.3
 
 
-@pytest.mark.parametrize("memory", [None, 128])
-def test_stream_that_moves_away_for_good_starts_afresh_there(memory: int | None) -> None:
+@over(REGRESSORS, "kind")
+def test_stream_that_moves_away_for_good_starts_afresh_there(kind: str) -> None:
     x, y = path(120)
-    model = st.StaFRegressor(radius=0.4, noise=0.05, memory=memory, neighbours=8).fit(x, y)
+    model = REGRESSORS[kind]().fit(x, y)
     assert error_after(model, x + 1e7, y * 1e9) < 0.3e9
     assert error_after(model, x, y) < 0.3
 
@@ -89,7 +91,7 @@ def test_filter_is_alive_after_anything(samples: list[tuple[float, float, float]
 @settings(max_examples=15, deadline=None)
 @given(some.lists(some.tuples(MAGNITUDES, MAGNITUDES, MAGNITUDES), min_size=1, max_size=25))
 def test_bank_is_alive_after_anything(samples: list[tuple[float, float, float]]) -> None:
-    model = st.StaFRegressor(memory=128, neighbours=8)
+    model = mixture()
     for first, second, value in samples:
         model.partial_fit(
             torch.tensor([first, second], dtype=torch.float64), torch.tensor(value, dtype=torch.float64)
@@ -100,64 +102,65 @@ def test_bank_is_alive_after_anything(samples: list[tuple[float, float, float]])
         assert torch.isfinite(model.predict(state))
 
 
-@pytest.mark.parametrize("memory", [None, 128])
-def test_constants_and_repeats_are_learned(memory: int | None) -> None:
-    model = st.StaFRegressor(radius=0.4, noise=0.05, memory=memory, neighbours=8)
+@over(REGRESSORS, "kind")
+def test_constants_and_repeats_are_learned(kind: str) -> None:
+    model = REGRESSORS[kind]()
     for _ in range(150):
         model.partial_fit(torch.zeros(2).double(), torch.tensor(2.5).double())
     assert abs(float(model.predict(torch.zeros(2).double())) - 2.5) < 0.01
 
 
-@pytest.mark.parametrize("memory", [None, 128])
-def test_coordinate_that_was_not_measured_is_held_and_a_target_is_not_learned(memory: int | None) -> None:
+@over(REGRESSORS, "kind")
+def test_coordinate_that_was_not_measured_is_held_and_a_target_is_not_learned(kind: str) -> None:
     x, y = path(100)
     holed, told = x.clone(), y.clone()
     holed[20::9, 0], told[25::10] = torch.nan, torch.nan
-    model = st.StaFRegressor(radius=0.4, noise=0.05, memory=memory, neighbours=8).fit(holed, told)
+    model = REGRESSORS[kind]().fit(holed, told)
     assert int(model.n_skipped_) == len(told[25::10])
     assert math.isfinite(float(model.predict(torch.tensor([math.nan, 0.3], dtype=torch.float64))))
     assert error_after(model, x, y) < 0.2
 
 
-@pytest.mark.parametrize(("memory", "robusts"), [(None, (None, 4.0)), (128, (1e30, None))])
+@pytest.mark.parametrize(("kind", "robusts"), [("filter", (None, 4.0)), ("mixture", (1e30, None))])
 def test_outliers_count_less_in_the_bank_and_where_asked(
-    memory: int | None, robusts: tuple[float | None, float | None]
+    kind: str, robusts: tuple[float | None, float | None]
 ) -> None:
     x, y = path(300)
     draw = torch.Generator().manual_seed(0)
     noisy = y + 0.05 * torch.randn(300, generator=draw, dtype=torch.float64)
     noisy[20::25] += 20.0
-    kept = {"radius": 0.4, "noise": 0.05, "memory": memory, "neighbours": 8}
-    models = [st.StaFRegressor(robust=robust, **kept) for robust in robusts]
+    models = [REGRESSORS[kind](robust=robust) for robust in robusts]
     errors = [error_after(model.fit(x[:1], noisy[:1]), x[1:], noisy[1:]) for model in models]
     late = [float((model.predict(x[-4:]) - y[-4:]).abs().max()) for model in models]
     assert late[1] < 0.5 * late[0]
     assert errors[1] < 1.05 * errors[0]  # outliers themselves included
-    assert memory is None or int(models[1].n_skipped_) == len(noisy[20::25])
+    assert kind == "filter" or int(models[1].n_skipped_) == len(noisy[20::25])
 
 
 def test_spikes_that_are_not_rare_are_learned() -> None:
     angle = torch.arange(300, dtype=torch.float64) % 8
     x, y = torch.stack((angle.sin(), angle.cos()), -1), torch.where(angle == 3, 50.0, 0.0)
-    model = st.StaFRegressor(memory=128, neighbours=8).fit(x, y)
+    model = mixture().fit(x, y)
     assert abs(float(model.predict(x[3])) - 50) < 1.0
 
 
 def test_change_that_stays_is_learned_at_once_by_a_robust_bank() -> None:
     x, y = path(300)
     changed = torch.where(torch.arange(300) < 150, y, y + 30)
-    model = st.StaFRegressor(memory=128, neighbours=8, robust=5.0).fit(x[:180], changed[:180])
+    model = mixture(robust=5.0).fit(x[:180], changed[:180])
     assert int(model.n_samples_seen_) == 180
     assert abs(float(model.predict(x[180]) - changed[180])) < 1.0
 
 
 @pytest.mark.parametrize(("of_x", "of_y"), [(1e-300, 1e160), (1e200, 1.0), (1e-300, 1e-300), (1e140, 1e-140)])
-@pytest.mark.parametrize("settings", [{"memory": 128, "neighbours": 8}, {"scaling": True}, {}])
+@pytest.mark.parametrize(
+    ("kind", "settings"), [("mixture", {}), ("filter", {"scaling": True}), ("filter", {})]
+)
 def test_stream_is_alive_after_many_samples_of_another_magnitude(
-    settings: dict[str, float], of_x: float, of_y: float
+    kind: str, settings: dict[str, bool], of_x: float, of_y: float
 ) -> None:
     x, y = path(60)
-    model = st.StaFRegressor(radius=0.4, noise=0.05, **settings).fit(of_x * x, of_y * y)
+    model = REGRESSORS[kind](**settings).fit(of_x * x, of_y * y)
     error_after(model, *path(30))
     assert error_after(model, x, y) < 0.3
 
@@ -175,11 +178,11 @@ def test_units_are_learned_at_any_magnitude(of_x: float, of_y: float) -> None:
         torch.testing.assert_close(one / of_y, other, rtol=1e-3, atol=1e-3)
 
 
-@pytest.mark.parametrize("memory", [None, 128])
-def test_time_passes_while_nothing_is_learned(memory: int | None) -> None:
+@over(REGRESSORS, "kind")
+def test_time_passes_while_nothing_is_learned(kind: str) -> None:
     x, y = path(60)
-    settings = {"radius": 0.4, "noise": 0.05, "forgetting": 0.9, "memory": memory, "neighbours": 8}
-    waited, told = (st.StaFRegressor(**settings).fit(x, y) for _ in range(2))
+    settings = {"forgetting": 0.9} if kind == "filter" else {}
+    waited, told = (REGRESSORS[kind](**settings).fit(x, y) for _ in range(2))
     for _ in range(30):
         waited.partial_fit(x[-1], torch.tensor(math.nan))
     waited.partial_fit(x[20], y[20])

@@ -278,7 +278,7 @@ ACCURACY = {  # root mean square of errors up to 2, and of errors in deviations 
     "filter": (0.8397, 1.2769),
     "filter of a kernel": (0.7459, 1.3232),
     "tuned filter": (0.8952, 1.4110),
-    "bank": (0.6222, 1.1728),
+    "mixture": (0.6222, 1.1728),
 }
 
 

@@ -88,7 +88,7 @@ DO_NOT = [
 def test_shapes_that_fit_are_taken(
     dims: tuple[int, int], of_x: tuple[int, ...], of_y: tuple[int, ...]
 ) -> None:
-    x, y = pair("fit", shapes(*of_x), np.zeros(of_y), dims)
+    x, y = pair("call", shapes(*of_x), np.zeros(of_y), dims)
     assert (tuple(x.shape), tuple(y.shape)) == (of_x, of_y)
 
 
@@ -96,8 +96,8 @@ def test_shapes_that_fit_are_taken(
 def test_shapes_that_do_not_fit_are_named(
     dims: tuple[int, int], of_x: tuple[int, ...], of_y: tuple[int, ...]
 ) -> None:
-    with pytest.raises(ValueError, match=r"`StaFRegressor.fit\(x=...\)` must have the shape") as told:
-        pair("fit", shapes(*of_x), shapes(*of_y), dims)
+    with pytest.raises(ValueError, match=r"`call\(x=...\)` must have the shape") as told:
+        pair("call", shapes(*of_x), shapes(*of_y), dims)
     one, many = "(n,) or (S, n)", "(T, n) for one stream in time or (T, S, n) for S streams"
     wanted = f"the shape {one if dims == (1, 2) else many}, and y that without n, or with K in its place"
     assert f"{wanted}; got {of_x} and {of_y}." in str(told.value)
@@ -114,24 +114,24 @@ def test_shapes_that_do_not_fit_are_named(
 )
 def test_what_is_empty_is_named(of_x: tuple[int, ...], of_y: tuple[int, ...], what: str) -> None:
     with pytest.raises(ValueError, match="must not be empty") as told:
-        pair("fit", shapes(*of_x), shapes(*of_y), (2, 3))
-    wanted = f"`StaFRegressor.fit(x=...)` must not be empty: {what} while a minimum of 1 is required."
+        pair("call", shapes(*of_x), shapes(*of_y), (2, 3))
+    wanted = f"`call(x=...)` must not be empty: {what} while a minimum of 1 is required."
     assert str(told.value) == wanted
-    with pytest.raises(ValueError, match=r"`StaFRegressor.fit` requires y to be passed.*target y is None"):
-        pair("fit", shapes(*of_x), None, (2, 3))
+    with pytest.raises(ValueError, match=r"`call` requires y to be passed.*target y is None"):
+        pair("call", shapes(*of_x), None, (2, 3))
 
 
 def test_time_between_samples_is_1_before_the_first() -> None:
     one, several = shapes(4, 2), shapes(4, 3, 2)
-    assert lapses(None, one) is None
-    found = lapses([0, 0, 1.5, 2], one)
+    assert lapses("call", None, one) is None
+    found = lapses("call", [0, 0, 1.5, 2], one)
     assert found is not None
     assert found.tolist() == [[1.0], [0.0], [1.5], [0.5]]
     assert found.dtype == torch.float64
-    each = lapses(np.arange(12.0).reshape(4, 3), several)
+    each = lapses("call", np.arange(12.0).reshape(4, 3), several)
     assert each is not None
     assert each.tolist() == [[1.0] * 3, *[[3.0] * 3] * 3]
-    for_all = lapses(torch.tensor([3.0, 4.0, 7.0, 7.0]), several)
+    for_all = lapses("call", torch.tensor([3.0, 4.0, 7.0, 7.0]), several)
     assert for_all is not None
     assert for_all.tolist() == [[1.0], [1.0], [3.0], [0.0]]
 
@@ -147,18 +147,16 @@ def test_time_between_samples_is_1_before_the_first() -> None:
     ],
 )
 def test_times_that_do_not_increase_are_refused(time: list[Any]) -> None:
-    with pytest.raises(
-        ValueError, match=r"`StaFRegressor.fit\(time=...\)` must be finite and increasing, \(4,\);"
-    ):
-        lapses(time, shapes(4, 2))
+    with pytest.raises(ValueError, match=r"`call\(time=...\)` must be finite and increasing, \(4,\);"):
+        lapses("call", time, shapes(4, 2))
     with pytest.raises(ValueError, match=r"must be finite and increasing, \(4,\) or \(4, 3\);"):
-        lapses(time, shapes(4, 3, 2))
+        lapses("call", time, shapes(4, 3, 2))
 
 
 @pytest.mark.parametrize(
     "lapse", [-0.5, [0.0, -1e-9, 1.0], torch.inf, [1.0, torch.nan, 1.0], [1.0, 2.0], [[1.0]], [1.0] * 4]
 )
 def test_a_lapse_that_is_no_time_is_refused(lapse: Any) -> None:
-    rule = r"`StaFRegressor.partial_fit\(lapse=...\)` must be finite and not negative, \(\) or \(3,\);"
+    rule = r"`call\(lapse=...\)` must be finite and not negative, \(\) or \(3,\);"
     with pytest.raises(ValueError, match=rule):
-        lapse_of(lapse, 3)
+        lapse_of("call", lapse, 3)

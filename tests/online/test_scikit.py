@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import staf_torch as st
-from staf_torch.online import RiverRegressor
+from staf_torch.online import MixtureRegressor, RiverRegressor
 from staf_torch.online.scikit import NotFittedError
 
 EXPECTED = {
@@ -32,15 +32,15 @@ def test_an_argument_of_the_kernel_is_set_by_its_name_and_others_are_refused() -
     model = st.StaFRegressor(st.GaussianKernel(0.5)).set_params(kernel__width=0.8)
     assert isinstance(model.kernel, st.GaussianKernel)
     assert float(model.kernel.width) == 0.8
-    for name in ("kernel__length_scale", "memory__width", "centres"):
+    for name in ("kernel__length_scale", "radius__width", "centres"):
         with pytest.raises(ValueError, match=name):
             model.set_params(**{name: 1.0})
 
 
-@pytest.mark.filterwarnings("ignore:Estimator StaFRegressor does not inherit", "ignore:Skipping check")
+@pytest.mark.filterwarnings("ignore:Estimator MixtureRegressor does not inherit", "ignore:Skipping check")
 def test_check_estimator_passes_but_for_what_the_manual_names() -> None:
     checks = pytest.importorskip("sklearn.utils.estimator_checks")
-    model = st.StaFRegressor(memory=128, neighbours=8)
+    model = MixtureRegressor(128, 8)
     found = checks.check_estimator(model, expected_failed_checks=EXPECTED, on_fail=None)
     assert {check["check_name"] for check in found if check["status"] == "xfail"} == set(EXPECTED)
     assert [check["check_name"] for check in found if check["status"] == "failed"] == []
@@ -69,7 +69,7 @@ def test_pipelines_searches_and_several_targets_work() -> None:
 def test_river_adapter_takes_features_by_name() -> None:
     x, y = series(150)
     errors = []
-    model = RiverRegressor(st.StaFRegressor(memory=128, neighbours=8))
+    model = RiverRegressor(MixtureRegressor(128, 8))
     assert model.predict_one({"a": 1.0, "b": 2.0}) == 0.0
     for k, (row, value) in enumerate(zip(x.tolist(), y.tolist(), strict=True)):
         sample = {"a": row[0], "b": row[1]} if k % 2 else {"b": row[1], "a": row[0]}
@@ -85,9 +85,7 @@ def test_river_pipelines_take_the_adapter() -> None:
 
     x, y = series(100)
     samples = [({"a": a, "b": b}, value) for (a, b), value in zip(x.tolist(), y.tolist(), strict=True)]
-    model = compose.Pipeline(
-        preprocessing.StandardScaler(), RiverRegressor(st.StaFRegressor(memory=128, neighbours=8))
-    )
+    model = compose.Pipeline(preprocessing.StandardScaler(), RiverRegressor(MixtureRegressor(128, 8)))
     assert evaluate.progressive_val_score(samples, model, metrics.MAE()).get() < 0.3 * y.std()
 
 
@@ -149,7 +147,7 @@ def test_a_regressor_without_a_sample_says_so_as_scikit_learn_does_where_that_is
 
 
 def test_parameters_are_the_arguments_and_those_of_the_kernel() -> None:
-    model = st.StaFRegressor(st.PolynomialKernel(3, 0.5), 0.4, memory=200)
+    model = st.StaFRegressor(st.PolynomialKernel(3, 0.5), 0.4)
     own = model.get_params(deep=False)
     assert list(own)[:3] == ["kernel", "radius", "count"]
     assert "self" not in own
@@ -158,7 +156,7 @@ def test_parameters_are_the_arguments_and_those_of_the_kernel() -> None:
         f"StaFRegressor(kernel={model.kernel!r}, radius=0.4, count=None, centers=None,"
     )
     assert "kernel__" not in repr(model)
-    assert repr(model).endswith("memory=200, neighbours=56)")
+    assert repr(model).endswith("robust=None, scaling=False)")
     assert st.StaFRegressor("matern").get_params() == st.StaFRegressor("matern").get_params(deep=False)
     named = st.StaFRegressor("gaussian").set_params(kernel__width=0.25, noise=0.5)
     assert isinstance(named.kernel, st.GaussianKernel)

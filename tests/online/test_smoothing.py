@@ -116,5 +116,3 @@ def test_streams_outputs_units_and_times_are_smoothed_as_alone() -> None:
     for i in range(2):
         alone, _ = model.smooth(x[:, i], y[:, i], time)
         torch.testing.assert_close(torch.from_numpy(mean[:, i]), alone, rtol=1e-9, atol=1e-9)
-    with pytest.raises(ValueError, match=r"memory.*must be None to smooth"):
-        st.StaFRegressor(memory=128).smooth(x, y)

@@ -7,6 +7,7 @@ import pickle
 import pytest
 import torch
 from helpers import tensor
+from helpers_streams import mixture
 from torch import Tensor
 
 import staf_torch as st
@@ -80,9 +81,11 @@ def test_tuning_knows_no_units_and_is_saved_with_what_was_learned() -> None:
     )
 
 
-def test_there_is_nothing_to_tune_in_the_accurate_mode() -> None:
+def test_a_mixture_has_nothing_to_tune() -> None:
     x, y = drawn(torch.tensor([0.7, 0.7]).double(), 0.1, steps=30)
-    assert st.StaFRegressor(memory=128).tune(x, y).tuning is None
+    model = mixture()
+    assert model.tune(x, y) is model
+    assert not model.__sklearn_is_fitted__()
     with pytest.raises(ValueError, match=r"tune.*must have the shape"):
         st.StaFRegressor().tune(x[:, 0], y)
 

@@ -10,25 +10,12 @@ import math
 import torch
 from torch import Tensor
 
-from .bank_rules import (
-    FADING,
-    GROUPS,
-    PLAIN,
-    SEARCHED,
-    TRACKERS,
-    TURNED,
-    TURNED_FADING,
-    BankShape,
-    Rules,
-    layout,
-)
-from .filter_streams import units_of
-from .kalman_filter import STREAK, LocalFilter, StreamState
-from .learned_trackers import Stretch, learn_hyperparameters
-from .local_functions import LocalFunctions
-from .mixture_definition import judge, mix
-from .quadratic_models import QuadraticModels, quadratic_features
-from .tracker_models import TrackerModels
+from ..filter_streams import units_of
+from ..kalman_filter import STREAK, LocalFilter, StreamState
+from ..local_functions import LocalFunctions
+from .members import QuadraticModels, Stretch, TrackerModels, learn_hyperparameters, quadratic_features
+from .mixing import judge, mix
+from .rules import FADING, GROUPS, PLAIN, SEARCHED, TRACKERS, TURNED, TURNED_FADING, BankShape, Rules, parts
 
 _RESET = ("skipped", "learned")  # what a stream that begins anew keeps
 
@@ -52,20 +39,15 @@ class BankDefinition:
 
     def __init__(self, shape: BankShape, rules: Rules, functions: LocalFunctions) -> None:
         self.shape, self.rules, self.functions = shape, rules, functions
-        ratio = torch.full((len(rules.forgetting),), rules.carried_ratio, dtype=torch.float64)
-        forgetting = torch.tensor(rules.forgetting, dtype=torch.float64)
+        ratio = torch.full((len(rules.carried_forgetting),), rules.carried_ratio, dtype=torch.float64)
+        forgetting = torch.tensor(rules.carried_forgetting, dtype=torch.float64)
         self.share = torch.tensor(rules.quadratic_forgetting, dtype=torch.float64)
         self.prior = torch.tensor(rules.quadratic_prior, dtype=torch.float64)
         self.filter = LocalFilter(functions, ratio, forgetting, rules.carried_slack)
 
     def each(self, table: Tensor) -> list[Views]:
-        """The streams of a table."""
-        sizes = [math.prod(dims) for _, dims in layout(self.shape)]
-        found = []
-        for row in table:
-            cells = zip(layout(self.shape), row.split(sizes), strict=True)
-            found.append(Views({name: part.view(dims) for (name, dims), part in cells}))
-        return found
+        """Return the streams of a table."""
+        return [Views(parts(self.shape, row)) for row in table]
 
     def clear(self, s: Views) -> None:
         """Begin anew."""
@@ -104,7 +86,7 @@ class BankDefinition:
     def _filters(self, s: Views) -> StreamState:
         """The carried filters as streams of a `LocalFilter`, one a lane."""
         state = StreamState.empty(
-            s["x"], len(self.rules.forgetting), self.shape.dim, self.shape.dim + 1, len(s["error"])
+            s["x"], len(self.rules.carried_forgetting), self.shape.dim, self.shape.dim + 1, len(s["error"])
         )
         state.put(s["filters"][:-1])
         state.counts[3].copy_(s["filters"][-1])
@@ -126,7 +108,7 @@ class BankDefinition:
         u = torch.cat((torch.ones(1, dtype=torch.float64), (x - center[:n]) / spread[:n]))
         line = (s["linear"] * u).sum(-1)
         process = self._local_processes(s, x, u[1:], line)
-        carried = self.filter.moments(self._filters(s), u[1:].expand(len(r.forgetting), -1))
+        carried = self.filter.moments(self._filters(s), u[1:].expand(len(r.carried_forgetting), -1))
         latest = s["waiting_y" if s.number("waiting") == 1 else "last_y"]
         last = ((latest - center[n:]) / spread[n:])[:, None]
         common = (1 + (u * (s["covariance"] * u).sum(-1)).sum()).expand_as(last)
@@ -195,7 +177,7 @@ class BankDefinition:
         QuadraticModels(s["factor"], s["quadratic"]).learn(features, v, self.share**lapse, self.prior)
         rules = s["tracker_rate"], s["tracker_noise"], s["tracker_forgetting"] ** lapse
         _trackers(s).learn(_tracked_at(s, u[1:]), v, *rules, r.tracker_jitter, r.tracker_wrong)
-        state, lanes = self._filters(s), len(r.forgetting)
+        state, lanes = self._filters(s), len(r.carried_forgetting)
         lapses = torch.full((lanes,), lapse, dtype=torch.float64)
         self.filter.learn(state, u[1:].expand(lanes, -1), v.expand(lanes, -1), lapses)
         s["filters"][:-1].copy_(state.table)

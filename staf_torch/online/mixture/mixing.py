@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from .bank_rules import BLENDS, CARRIED, GROUPS, KNOTS, LOCAL, MEMBERS, QUADRATIC, Rules, group
-from .kalman_filter import SURPRISE
+from ..kalman_filter import SURPRISE
+from .rules import BLENDS, CARRIED, GROUPS, KNOTS, LOCAL, MEMBERS, QUADRATIC, Rules, group
 
 _LEAST = 1e-30  # of a variance
 _GROUP = torch.tensor([group(member) for member in range(MEMBERS)], dtype=torch.int64)

@@ -6,16 +6,18 @@ import ctypes
 import functools
 import math
 from collections.abc import Callable
-from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from ..centers import simplex
-from ..kernels import GaussianKernel
-from ..lanes.build import compiled
-from .bank_definition import BankDefinition
-from .bank_rules import (
+from ...centers import simplex
+from ...kernels import GaussianKernel
+from ...lanes.build import compiled
+from ..compiled_filter import NATIVE, FunctionPointers
+from ..filter_streams import refuse_other, table_of
+from ..local_functions import LocalFunctions
+from .definition import BankDefinition
+from .rules import (
     CARRIED_RADIUS,
     CARRIED_WIDTH,
     RECENT,
@@ -26,20 +28,19 @@ from .bank_rules import (
     refuse_unwritten,
     size,
 )
-from .compiled_filter import FunctionPointers
-from .filter_streams import refuse_other, table_of
-from .local_functions import LocalFunctions
 
 _NUMBERS = len(Rules.of(1, True).numbers())
 
 
-class _Rules(ctypes.Structure):
-    """`Rules` of _bank.cpp: numbers, then the local functions of the filters."""
+class RulesInC(ctypes.Structure):
+    """`Rules` of _bank.hpp: numbers, then the local functions of the filters."""
 
     _fields_ = (("numbers", ctypes.c_double * _NUMBERS), ("functions", FunctionPointers))
 
 
-class _Call(ctypes.Structure):
+class BankCall(ctypes.Structure):
+    """`Call` of _bank.cpp."""
+
     _fields_ = (
         ("streams", ctypes.c_int64),
         ("mode", ctypes.c_int64),
@@ -56,8 +57,8 @@ class Bank:
     with two rates of fading by age, and the k latest, each with three widths and two noises, amplitudes
     y'K^-1 y / k. Beside them stand eight filters (`LocalFilter`, M = n + 1), eight models quadratic in x
     (recursive least squares, five rates of forgetting), eight Gaussian processes on at most 95 samples of the
-    whole past that fade (`TrackerModels`; four learn width, noise, rate of fading and a metric, see
-    learned_trackers.py), that linear model and the last value.
+    whole past that fade (`TrackerModels`; four learn width, noise, rate of fading and a metric), that linear
+    model and the last value.
 
     Every member's variance is scaled by its running squared error. The members are mixed by discounted
     scores, part Student-t likelihood with the member's variance, part with the common running error, at
@@ -92,8 +93,8 @@ class Bank:
         functions = LocalFunctions.of(GaussianKernel(width), CARRIED_RADIUS * width * simplex(shape.dim))
         rules = Rules.of(shape.dim, scaling, doubtful)
         pointers, self._held = FunctionPointers.of(functions)
-        self._rules = _Rules((ctypes.c_double * _NUMBERS)(*rules.numbers()), pointers)
-        self._call, self._run = _Call(), _built(shape) if compile else None
+        self._rules = RulesInC((ctypes.c_double * _NUMBERS)(*rules.numbers()), pointers)
+        self._call, self._run = BankCall(), _built(shape) if compile else None
         self.definition = BankDefinition(shape, rules, functions)
         self.table = torch.zeros(0, size(shape), dtype=torch.float64)
         self.add(streams)
@@ -188,4 +189,4 @@ def _built(shape: BankShape) -> Callable[..., None] | None:
     sizes = f"DIM={shape.dim}", f"COUNT={shape.dim + 1}", f"OUTPUTS={shape.outputs}"
     kept = f"CAPACITY={shape.capacity}", f"NEIGHBOURS={shape.neighbours}"
     trackers = f"TRACKED={TRACKED}", f"SEARCHED={SEARCHED}"
-    return compiled(Path(__file__).with_name("_bank.cpp"), *sizes, *kept, *trackers)
+    return compiled(NATIVE / "_bank.cpp", *sizes, *kept, *trackers)

@@ -21,7 +21,7 @@ CARRIED_WIDTH, CARRIED_RADIUS = 8.0, 0.1  # of the filters: in sqrt(n), in width
 
 
 def group(member: int) -> int:
-    """Local processes alike but for fading, latest, filters, quadratics, trackers, linear: a member's group.
+    """Return the number of a member's group: processes alike but for fading, latest, ..., trackers, linear.
 
     -1 for the last value, which has no say in the correction.
     """
@@ -48,13 +48,21 @@ class BankShape(NamedTuple):
 
 
 class Rules(NamedTuple):
-    """What decides in a bank; chosen on public streams, those of the benchmark among them."""
+    """Constants of a bank, in the order of `Rules` in _bank.hpp; chosen on public streams."""
 
     width_rates: tuple[float, ...]  # 1 / (2 width^2) of the local processes' three widths
+    tracker_rate: tuple[float, ...]  # 1 / (2 width^2)
     scaling: bool
     carried_slack: float  # distance at which the filters' centers follow
     fade_rates: tuple[float, ...] = (1e-4, 1e-6)  # by age
-    noise: tuple[float, ...] = (0.09, 1e-8, 9e-4, 1e-12, 0.09, 1e-8) * 4  # a local process each
+    noise: tuple[float, ...] = (
+        0.09,
+        1e-8,
+        9e-4,
+        1e-12,
+        0.09,
+        1e-8,
+    ) * 4  # variances, in units of a local process's amplitude
     discounts: tuple[float, ...] = (0.9, 0.97, 0.995)  # of the scores in the three mixtures
     discount: float = 0.98  # of the scores of the mixtures
     share: float = 0.001  # of the weights that is equal
@@ -93,7 +101,7 @@ class Rules(NamedTuple):
         160,
         320,
     )  # samples after which units are learned: all are kept
-    forgetting: tuple[float, ...] = (0.9, 0.95, 0.97, 0.98, 0.99, 0.995, 0.999, 1.0)  # of the filters
+    carried_forgetting: tuple[float, ...] = (0.9, 0.95, 0.97, 0.98, 0.99, 0.995, 0.999, 1.0)  # of the filters
     carried_ratio: float = 1e-6  # variance of their noise
     quadratic_forgetting: tuple[float, ...] = (0.9999, 0.9999, 0.9999, 0.9999, 0.998, 0.99, 0.99, 0.97)
     quadratic_prior: tuple[float, ...] = (1e8, 1e4, 1e2, 1.0, 1e4, 1e4, 10.0, 1e2)  # of their coefficients
@@ -113,109 +121,85 @@ class Rules(NamedTuple):
     map_step: float = 0.25  # between knots, in units of y
     map_prior: float = 10.0  # samples that say that the map is the identity
     map_forgetting: float = 0.995
-    tracker_width: tuple[float, ...] = (0.5, 2.0, 2.0, 4.0, 1.0, 8.0, 4.0, 1.0)  # in sqrt(n)
     tracker_noise: tuple[float, ...] = (0.1, 1e-4, 1e-2, 0.1, 1e-4, 1e-4, 1e-4, 1e-2)  # variances
     tracker_forgetting: tuple[float, ...] = (1.0, 1.0, 1.0, 1.0, 0.999, 0.999, 0.99, 0.99)
-    tracker_rate: tuple[float, ...] = ()  # 1 / (2 width^2)
     tracker_jitter: float = 1e-6
     tracker_wrong: float = 0.1  # of an entry of 1, that rounding may add up to
     least: float = 1e-16  # of a member's running scale
 
     @classmethod
     def of(cls, dim: int, scaling: bool, doubtful: float | None = None) -> Rules:
-        """The rules for inputs (n,); widths in units of sqrt(n)."""
-        rates = tuple(1 / (2 * width**2 * dim) for width in (0.5, 1.5, 15.0))
-        slack = CARRIED_RADIUS * CARRIED_WIDTH * math.sqrt(dim)
-        tracker_rates = tuple(1 / (2 * width**2 * dim) for width in cls._field_defaults["tracker_width"])
-        found = cls(rates, scaling, slack, tracker_rate=tracker_rates)
+        """Return the rules for inputs (n,); widths in units of sqrt(n)."""
+        local, trackers = (0.5, 1.5, 15.0), (0.5, 2.0, 2.0, 4.0, 1.0, 8.0, 4.0, 1.0)
+        rates, tracker_rates = (tuple(1 / (2 * w**2 * dim) for w in widths) for widths in (local, trackers))
+        found = cls(rates, tracker_rates, scaling, CARRIED_RADIUS * CARRIED_WIDTH * math.sqrt(dim))
         return found if doubtful is None else found._replace(doubtful=doubtful, doubtful_outside=doubtful)
 
     def numbers(self) -> list[float]:
-        """In the order of `Rules` in _bank.cpp."""
-        members = [(select, pair) for select in range(4) for pair in range(6)]
-        found = [*self.width_rates, *self.width_rates, *self.fade_rates, *self.noise]
-        found += [pair // 2 + (3 if select == 3 else 0) for select, pair in members]
-        found += [(-1, 6, 7, -1)[select] for select, _ in members]
-        found += [*self.discounts, self.discount, self.share, self.drop, self.heavy, self.likelihood]
-        found += [self.members_rate, self.error_rate, self.linear_forgetting, self.linear_prior, self.recent]
-        found += [self.floor, self.margin, self.far, self.outlying, *self.learned_at, -1, float(self.scaling)]
-        found += [*self.forgetting, self.carried_ratio, self.carried_slack**2]
-        found += [*self.quadratic_forgetting, *self.quadratic_prior, self.pace, self.correction_prior]
-        found += [self.correction_forgetting, self.correction_most, self.correction_discount]
-        found += [
-            self.correction_share,
-            self.least,
-            *self.doubts,
-            self.doubt,
-            self.doubtful,
-            self.doubtful_outside,
-        ]
-        found += [self.outside, self.rare, self.doubted_rate, self.settled]
-        found += [self.squares_discount, self.squares_rate, self.squares_share, self.own_rate]
-        found += [self.best_rate, self.largest, self.uncalibrated, self.searched_at]
-        found += [self.map_step, self.map_prior, self.map_forgetting]
-        found += [*self.tracker_rate, *self.tracker_noise]
-        return [*found, *self.tracker_forgetting, self.tracker_jitter, self.tracker_wrong]
+        """Return all constants, one after the other."""
+        return [float(x) for field in self for x in (field if isinstance(field, tuple) else (field,))]
 
 
 def layout(shape: BankShape) -> list[tuple[str, tuple[int, ...]]]:
-    """Names and shapes of a stream's numbers, in the order of `Stream` in _bank.cpp."""
+    """Return names and shapes of a stream's numbers, in the order of `Stream` in _bank.hpp."""
     n, k, c, d = shape.dim, shape.outputs, shape.capacity, shape.features
     filters = 2 * n + k * (n + 1) + (n + 1) * (n + 2) // 2 + k + 2
     return [
         *((name, ()) for name in ("clock", "count", "far", "skipped", "learned", "time")),
-        ("last_x", (n,)),
-        ("last_y", (k,)),
-        ("asked", (n,)),
-        ("answered", ()),
+        *(("last_x", (n,)), ("last_y", (k,)), ("asked", (n,)), ("answered", ())),
         *((name, ()) for name in ("waiting", "trust", "doubted", "waiting_time", "waiting_lapse")),
-        ("waiting_x", (n,)),  # a sample that nobody expected, until the next one tells
-        ("waiting_y", (k,)),
-        ("center", (n + k,)),
-        ("spread", (n + k,)),
-        ("covariance", (n + 1, n + 1)),
-        ("linear", (k, n + 1)),
+        *(
+            ("waiting_x", (n,)),
+            ("waiting_y", (k,)),
+        ),  # a sample that nobody expected, until the next one tells
+        *(("center", (n + k,)), ("spread", (n + k,))),
+        *(("covariance", (n + 1, n + 1)), ("linear", (k, n + 1))),
         ("filters", (filters, CARRIED)),  # the rows of a `StreamState`, and the samples since it began
         (
             "factor",
             (d * (d + 1) // 2, QUADRATIC),
         ),  # of the quadratics' covariances U D U': columns of U, D last
-        ("quadratic", (k, d, QUADRATIC)),  # coefficients
-        ("quadratic_error", (k, QUADRATIC)),
-        ("tracked", (TRACKED, n, TRACKERS)),  # the parts of `TrackerModels`
-        ("tracker_weights", (k, TRACKED, TRACKERS)),
+        *(("quadratic", (k, d, QUADRATIC)), ("quadratic_error", (k, QUADRATIC))),  # coefficients
+        *(
+            ("tracked", (TRACKED, n, TRACKERS)),
+            ("tracker_weights", (k, TRACKED, TRACKERS)),
+        ),  # parts of `TrackerModels`
         *((f"tracker_{name}", (TRACKED * (TRACKED + 1) // 2, TRACKERS)) for name in ("known", "inverse")),
         ("tracker_counts", (3, TRACKERS)),
         *((f"tracker_{name}", (TRACKERS,)) for name in ("rate", "noise", "forgetting")),
         ("metric", (n, n)),  # A: two trackers see A'x
-        ("weights", (k, CLOCKS, MEMBERS)),  # logarithms
-        ("clock_weights", (k, CLOCKS)),
-        ("excess", (k, MEMBERS)),
-        ("usual", (k, MEMBERS)),  # running logarithms of the members' variances
+        *(("weights", (k, CLOCKS, MEMBERS)), ("clock_weights", (k, CLOCKS))),  # logarithms
+        *(
+            ("excess", (k, MEMBERS)),
+            ("usual", (k, MEMBERS)),
+        ),  # running scales; logarithms of the members' variances
         ("squares", (k, MEMBERS)),  # logarithms of the weights by squared errors
         *((name, (k,)) for name in ("error", "pace", "own", "best", "low", "high", "calibration")),
-        ("correction_covariance", (k, GROUPS, GROUPS)),
-        ("correction", (k, GROUPS)),  # coefficients
+        *(("correction_covariance", (k, GROUPS, GROUPS)), ("correction", (k, GROUPS))),  # coefficients
         ("away", (k, GROUPS)),  # of the groups from the mixture, in running errors
         ("corrected", (k, BLENDS)),  # logarithms of the weights of the four mixtures
         ("map", (k, 2, KNOTS)),  # corrections, and what is known of them
-        ("means", (k, MEMBERS)),
-        ("variances", (k, MEMBERS)),
-        ("mixed", (k, CLOCKS)),
-        ("mixed_variance", (k, CLOCKS)),
+        *((name, (k, MEMBERS)) for name in ("means", "variances")),
+        *((name, (k, CLOCKS)) for name in ("mixed", "mixed_variance")),
         ("blend", (k, BLENDS)),  # the mixture, the corrected one, that by squares, what the map makes of them
-        ("straight", (k,)),  # the mean without the map
-        ("mean", (k,)),
-        ("variance", (k,)),
-        ("x", (c, n)),
-        ("y", (c, k)),
-        *((name, (c,)) for name in ("when", "order", "gap")),
+        *(("straight", (k,)), ("mean", (k,)), ("variance", (k,))),  # straight: the mean without the map
+        *(("x", (c, n)), ("y", (c, k)), *((name, (c,)) for name in ("when", "order", "gap"))),
         ("unlearned", ()),  # time that has passed in samples that were skipped
     ]
 
 
+def parts(shape: BankShape, table: Tensor) -> dict[str, Tensor]:
+    """Return views of the numbers of streams (..., size) by name, (..., *dims)."""
+    fields = layout(shape)
+    split = table.split([math.prod(dims) for _, dims in fields], dim=-1)
+    return {
+        name: part.unflatten(-1, dims) if dims else part.squeeze(-1)
+        for (name, dims), part in zip(fields, split, strict=True)
+    }
+
+
 def size(shape: BankShape) -> int:
-    """Numbers a stream."""
+    """Return the count of numbers a stream."""
     return sum(math.prod(dims) for _, dims in layout(shape))
 
 
@@ -225,17 +209,13 @@ def refuse_unwritten(shape: BankShape, table: Tensor) -> None:
     Raises:
         ValueError: where a number of samples or a place is out of range, or a sample is not finite.
     """
-    sizes = [math.prod(dims) for _, dims in layout(shape)]
-    parts = dict(zip((name for name, _ in layout(shape)), table.split(sizes, dim=1), strict=True))
-    turns = parts["tracker_counts"][:, -TRACKERS:]
+    named = parts(shape, table)
+    count, turns = named["count"], named["tracker_counts"][:, -1]
     rules = {
-        f"a number of samples from 0 to {shape.capacity}": (parts["count"] >= 0)
-        & (parts["count"] <= shape.capacity),
+        f"a number of samples from 0 to {shape.capacity}": (count >= 0) & (count <= shape.capacity),
         f"a place from 0 to {TRACKED}": (turns >= 0) & (turns <= TRACKED),
-        "samples that are finite": (parts["x"].isfinite().all(1) & parts["y"].isfinite().all(1))[:, None],
+        "samples that are finite": named["x"].isfinite().all() & named["y"].isfinite().all(),
     }
     for rule, holds in rules.items():
         if not bool(holds.all()):
-            raise ValueError(
-                f"`StaFRegressor.load_state_dict(state=...)` must have {rule}; 'table' has another."
-            )
+            raise ValueError(f"`load_state_dict(state=...)` must have {rule}; 'table' has another.")

@@ -1,54 +1,27 @@
-// A call of `Bank` on many streams, one after the other: what bank.py defines. The members of the bank are
+// A call of `Bank` on many streams, one after the other: what mixture/definition.py defines. The members of the bank are
 // the lanes. DIM, COUNT, OUTPUTS, CAPACITY, NEIGHBOURS are given on the command line of the compiler.
 
-#include "_learned_trackers.hpp"
 #include "_mixture.hpp"
 
 #include <cstring>
 
 struct Call {
     int64_t streams, mode;  // 1 to predict, 2 to learn
-    double *table;  // of rows that began with zeros and were cleared
-
+    double *table;          // of rows that began with zeros and were cleared
     const double *x, *y, *lapse;  // (streams, n), (streams, K), (streams)
     double *mean, *deviation;     // (streams, K)
     const Rules *rules;
 };
 
-static double shift_of(const Rules &r, const Stream &s, int i) { return r.scaling ? s.center[i] : 0; }
-static double scale_of(const Rules &r, const Stream &s, int i) { return r.scaling ? s.spread[i] : 1; }
-
-static void scaled(const Rules &r, const Stream &s, const double *x, double *u) {
-    for (int i = 0; i < n; ++i) u[i] = (x[i] - shift_of(r, s, i)) / scale_of(r, s, i);
-}
-static double in_units(const Rules &r, const Stream &s, int o, double y) {
-    return (y - shift_of(r, s, n + o)) / scale_of(r, s, n + o);
-}
-static double apart(const Rules &r, const Stream &s, const double *a, const double *b) {
-    double sum = 0;
-    for (int i = 0; i < n; ++i) sum += square((a[i] - b[i]) / scale_of(r, s, i));
-    return sum;
-}
 static Filter filters_of(const Stream &s) {
     Filter f;
     std::memcpy(&f, s.filters, sizeof f);
     return f;
 }
 static Law law_of(const Rules &r) {
-    Law law{all(r.carried_ratio), V{}, all(r.carried_slack2), all(infinity), all(1), 0, std::numeric_limits<double>::max(), 1e231};
+    Law law{all(r.carried_ratio), V{}, all(square(r.carried_slack)), all(infinity), all(1), 0, std::numeric_limits<double>::max(), 1e231};
     for (int l = 0; l < lanes; ++l) law.forgetting[l] = r.carried_forgetting[l];
     return law;
-}
-
-// Lane which[l] of a, or of b from `lanes` on.
-INLINE V picked(V a, V b, Mask which) {
-#ifdef __clang__  // which has no builtin of it for lanes that are not constants
-    V found;
-    for (int l = 0; l < lanes; ++l) found[l] = which[l] < lanes ? a[which[l]] : b[which[l] - lanes];
-    return found;
-#else
-    return __builtin_shuffle(a, b, which);
-#endif
 }
 
 INLINE V row(const double *from) {
@@ -61,7 +34,7 @@ INLINE V row(const double *from) {
 constexpr int turned_lane = 0, plain_lane = 1, fading_lane = 4, turned_fading_lane = 5;
 
 INLINE TrackerRules tracker_rules(const Rules &r, const Stream &s) {
-    return {s.tracker_rate, s.tracker_noise, s.tracker_forgetting, r.trackers.jitter, r.trackers.wrong};
+    return {s.tracker_rate, s.tracker_noise, s.tracker_forgetting, r.tracker_jitter, r.tracker_wrong};
 }
 // Where the trackers see u: some in the coordinates of the metric.
 INLINE void tracked_at(const Stream &s, const double *u, V *at) {
@@ -98,7 +71,8 @@ static void clear(const Rules &r, Stream &s) {
         s.error[o] = s.pace[o] = s.own[o] = s.best[o] = s.calibration[o] = 1, s.low[o] = infinity, s.high[o] = -infinity;
         for (int g = 0; g < groups_of_members; ++g) s.correction_covariance[o][g][g] = r.correction_prior;
     }
-    s.tracker_rate = r.trackers.rate, s.tracker_noise = r.trackers.noise, s.tracker_forgetting = r.trackers.forgetting;
+    s.tracker_rate = row(r.tracker_rate), s.tracker_noise = row(r.tracker_noise);
+    s.tracker_forgetting = row(r.tracker_forgetting);
     for (int i = 0; i < n; ++i) s.metric[i][i] = 1;
     restart_linear(r, s);
 }
@@ -239,97 +213,6 @@ static void rescale(const Rules &r, Stream &s) {
     }
 }
 
-// The nearest and the latest samples, nearest or latest first: indices, and how many there are.
-static int choose(const Rules &r, const Stream &s, const double *x, int chosen[sides][near]) {
-    const int count = int(s.count), most = std::min(near, count);
-    double distance[C];
-    int index[C];
-    for (int j = 0; j < count; ++j) distance[j] = apart(r, s, s.x[j], x), index[j] = j;
-    std::partial_sort(index, index + most, index + count, [&](int a, int b) {
-        return distance[a] < distance[b] || (distance[a] == distance[b] && s.order[a] > s.order[b]);
-    });
-    std::copy(index, index + most, chosen[0]);
-    for (int j = 0; j < count; ++j) index[j] = j;
-    std::partial_sort(index, index + most, index + count, [&](int a, int b) { return s.order[a] > s.order[b]; });
-    std::copy(index, index + most, chosen[1]);
-    return most;
-}
-
-// The local Gaussian processes of what the linear model leaves: means and variances at x, in units.
-static void local_processes(const Rules &r, Stream &s, const double *x, const double *u, const double *line) {
-    int chosen[sides][near];
-    const int count = choose(r, s, x, chosen);
-    double at[sides][near + 1][n], when[near + 1], rest[sides][K][near];
-    for (int h = 0; h < sides; ++h) {
-        for (int i = 0; i < count; ++i) {
-            const int j = chosen[h][i];
-            scaled(r, s, s.x[j], at[h][i]);
-            if (h == 0) when[i] = s.when[j];
-            for (int o = 0; o < K; ++o) {
-                double sum = in_units(r, s, o, s.y[j][o]) - s.linear[o][0];
-                for (int k = 0; k < n; ++k) sum -= s.linear[o][k + 1] * at[h][i][k];
-                rest[h][o][i] = sum;
-            }
-        }
-        std::copy(u, u + n, at[h][count]);
-    }
-    when[count] = s.time;
-    static thread_local V gram[groups][near + 1][near + 1];
-    V exponents;
-    for (int l = 0; l < lanes; ++l) exponents[l] = -r.rates[l];
-    Mask width[groups], fade[groups];
-    V noise[groups];
-    for (int g = 0; g < groups; ++g)
-        for (int l = 0; l < lanes; ++l) {
-            width[g][l] = int64_t(r.width[g * lanes + l]);
-            fade[g][l] = r.fade[g * lanes + l] < 0 ? lanes : int64_t(r.fade[g * lanes + l]);
-            noise[g][l] = r.noise[g * lanes + l];
-        }
-    for (int i = 0; i <= count; ++i)
-        for (int j = 0; j < std::min(i + 1, count); ++j) {
-            double nearest = 0, latest = 0;
-            for (int k = 0; k < n; ++k) {
-                nearest += square(at[0][i][k] - at[0][j][k]);
-                latest += square(at[1][i][k] - at[1][j][k]);
-            }
-            const double age = std::fabs(when[i] - when[j]);
-            const V e = exponential(exponents * V{nearest, nearest, nearest, latest, latest, latest, age, age});
-            for (int g = 0; g < groups; ++g)
-                gram[g][i][j] = picked(e, e, width[g]) * picked(e, all(1), fade[g]);
-        }
-    for (int g = 0; g < groups; ++g) {
-        auto &a = gram[g];
-        V beta[K][near], mean[K], amplitude[K], seen{}, zero{};
-        for (int o = 0; o < K; ++o) mean[o] = amplitude[o] = zero;
-        for (int k = 0; k < count; ++k) {  // right-looking: the columns of the factor, and the solutions with them
-            V pivot = maximum(a[k][k] + noise[g], noise[g]);  // a Schur complement is no smaller than the noise
-            const V inverse = 1. / root(pivot);
-            for (int i = k + 1; i <= count; ++i) a[i][k] *= inverse;
-            for (int o = 0; o < K; ++o) {
-                V sum;
-                for (int l = 0; l < lanes; ++l) sum[l] = rest[(g * lanes + l) / 18][o][k];
-                for (int j = 0; j < k; ++j) sum -= a[k][j] * beta[o][j];
-                beta[o][k] = sum * inverse;
-                mean[o] += beta[o][k] * a[count][k];
-                amplitude[o] += beta[o][k] * beta[o][k];
-            }
-            seen += a[count][k] * a[count][k];
-            for (int j = k + 1; j < count; ++j) {
-                const V factor = a[j][k];
-                for (int i = j; i <= count; ++i) a[i][j] -= a[i][k] * factor;
-            }
-        }
-        for (int o = 0; o < K; ++o) {
-            amplitude[o] /= double(count);
-            const V variance = maximum(amplitude[o] * (1. + noise[g] - seen), amplitude[o] * noise[g]);
-            for (int l = 0; l < lanes; ++l) {
-                s.means[o][g * lanes + l] = line[o] + mean[o][l];
-                s.variances[o][g * lanes + l] = variance[l];
-            }
-        }
-    }
-}
-
 // What every member says at x, and their mixture.
 static void ask(const Rules &r, Stream &s, const double *x) {
     double u[unknowns] = {1}, line[K], spread = 1;
@@ -422,7 +305,7 @@ static void accept(const Rules &r, Stream &s, const double *x, const double *y, 
                    bool anew) {
     s.clock += 1, s.learned += 1;
     keep(r, s, x, y, time);
-    anew |= std::find(r.rescaled, r.rescaled + 9, s.clock) != r.rescaled + 9;
+    anew |= std::find(r.learned_at, r.learned_at + 8, s.clock) != r.learned_at + 8;
     if (anew && s.clock <= C) rescale(r, s);
     else carry(r, s, x, y, lapse);
 }
@@ -524,4 +407,3 @@ extern "C" void staf_bank(const Call *call) {
             learn(*call->rules, s, call->x + i * n, call->y + i * K, call->lapse ? call->lapse[i] : 1);
     }
 }
-extern "C" int64_t staf_size() { return sizeof(Stream) / sizeof(double); }

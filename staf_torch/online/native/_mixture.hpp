@@ -1,14 +1,10 @@
-// How the members of a bank are mixed and judged: what mixture_definition.py defines.
+// How the members of a bank are mixed and judged: what mixture/mixing.py defines.
 
 #pragma once
 
 #include "_bank.hpp"
 
-#include <algorithm>
-
-static double square(double a) { return a * a; }
-
-// The group of a member: see bank_rules.py.
+// The group of a member: see mixture/rules.py.
 constexpr int group_of(int i) {
     return i < 18                     ? i % 6
            : i < locals               ? 6

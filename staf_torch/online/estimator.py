@@ -1,0 +1,338 @@
+"""The base of regressors of streams: learning and predicting, streams that come and go, saved states."""
+
+from __future__ import annotations
+
+import abc
+import numbers
+from typing import Any, Protocol, Self
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..numerics.checks import fail, integer
+from .samples import lapse_of, lapses, like_given, pair, tensor_of
+from .scikit import ScikitEstimator, not_fitted
+
+_ABOUT = ("n_features_in_", "n_streams_", "n_outputs_")
+_DTYPES = {str(dtype): dtype for dtype in (torch.float32, torch.float64)}
+
+
+class Streams(Protocol):
+    """Streams side by side, none of which influences another."""
+
+    dtype: torch.dtype
+
+    @property
+    def compiled(self) -> bool:
+        """Return whether tensors of this dtype are read in place by compiled code."""
+
+    @property
+    def count(self) -> int:
+        """Return S."""
+
+    @property
+    def learned(self) -> Tensor:
+        """Return the samples learned, (S,) int64."""
+
+    @property
+    def skipped(self) -> Tensor:
+        """Return the samples skipped, (S,) int64."""
+
+    def predict(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Return mean and standard deviation of the next y at x (S, n): (S, K), (S, K)."""
+
+    def learn(self, x: Tensor, y: Tensor, lapse: Tensor | None = None) -> None:
+        """Learn one sample a stream: (S, n), (S, K), contiguous; time since the last sample, (S,) float64."""
+
+    def clear(self, rows: Tensor) -> None:
+        """Let the streams with these numbers begin anew."""
+
+    def add(self, streams: int) -> None:
+        """Begin further streams, behind the others."""
+
+    def keep(self, rows: Tensor) -> None:
+        """Go on with the streams with these numbers alone."""
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return copies of all tensors that learning changes."""
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Take over what `state_dict` of as many streams has."""
+
+
+class StreamEstimator(ScikitEstimator, abc.ABC):
+    """Streams that learn and predict, whose sizes come with the first sample.
+
+    Attributes:
+        n_features_in_: n, from the first sample on.
+        n_streams_: S, or None for a single stream without batch dimension.
+        n_outputs_: K, or None for y without a dimension of its own.
+        n_samples_seen_: samples that each stream has learned from, () or (S,).
+        n_skipped_: samples that were not learned, () or (S,).
+    """
+
+    n_features_in_: int
+    n_streams_: int | None
+    n_outputs_: int | None
+    _streams_: Streams
+    _shape_: tuple[int, ...]  # of a sample's x
+    _targets_: tuple[int, ...]  # of its y
+    _dtype_: torch.dtype
+
+    @abc.abstractmethod
+    def _begin(self, streams: int, outputs: int, like: Tensor) -> Streams:
+        """Check the arguments and return S new streams of K outputs, for states like (n,)."""
+
+    @abc.abstractmethod
+    def _decisive(self) -> tuple[str, ...]:
+        """Return the names of the arguments that what was learned depends on."""
+
+    def fit(self, x: Any, y: Any, time: Any = None) -> Self:
+        """Start afresh and learn from samples in the order of time.
+
+        Args:
+            x: (T, n), one stream in time, or (T, S, n), S streams.
+            y: x's shape without n, or with K in place of n for K outputs.
+            time: of the samples, (T,) or (T, S), increasing; 0, 1, 2 ... by default.
+
+        Raises:
+            ValueError: if a shape is another one.
+        """
+        states, values = pair(self._call("fit"), x, y, (2, 3))
+        lapse = lapses(self._call("fit"), time, states)
+        self.reset()
+        for k, (state, value) in enumerate(zip(states, values, strict=True)):
+            self._learn(state, value, None if lapse is None else lapse[k])
+        return self
+
+    def partial_fit(self, x: Any, y: Any, lapse: Any = None) -> Self:
+        """Learn from one sample a stream.
+
+        Args:
+            x: (n,) for a single stream, (S, n) for S streams side by side; tensors or arrays.
+            y: x's shape without n, or with K in place of n for K outputs.
+            lapse: time since the call before, () or (S,), finite, not negative; 1 by default.
+
+        Raises:
+            ValueError: if a shape is another one than at the first sample, or, at the first sample, an
+                argument of the constructor breaks its rule.
+        """
+        if lapse is None and self._is_plain(x) and self._is_plain(y, target=True):
+            self._streams_.learn(x, y)  # what compiled code reads as it is: nothing to convert or check
+            return self
+        call = self._call("partial_fit")
+        states, values = pair(call, x, y, (1, 2))
+        steps = None if lapse is None else lapse_of(call, lapse, len(states) if states.dim() == 2 else 1)
+        return self._learn(states, values, steps)
+
+    def _learn(self, states: Tensor, values: Tensor, lapse: Tensor | None) -> Self:
+        if not self._is_fitted():
+            self._prepare(states, values)
+        streams = self._streams_
+        if states.shape != self._shape_ or (values.dim() == states.dim()) != (self.n_outputs_ is not None):
+            raise self._refusal("partial_fit", states, values)
+        rows = states.to(streams.dtype).reshape(streams.count, self.n_features_in_).contiguous()
+        targets = values.to(streams.dtype).reshape(streams.count, -1).contiguous()
+        if targets.shape[1] != (self.n_outputs_ or 1):
+            raise self._refusal("partial_fit", states, values)
+        streams.learn(rows, targets, None if lapse is None else lapse.expand(streams.count).contiguous())
+        return self
+
+    def predict(self, x: Any, return_std: bool = False) -> Any:
+        """Predict the next y at x, before it is learned.
+
+        Args:
+            x: (n,) or (S, n), one point a stream, or (P, n) and (S, P, n) for P points of each.
+            return_std: whether to return the standard deviation of the error to expect as well: noise
+                included, and scaled by the running size of the errors so far.
+
+        Returns:
+            (...,), or (..., K) for K outputs, or a pair of them; an array where x is one, else a tensor.
+
+        Raises:
+            ValueError: before the first sample, or for another number of streams or dimensions.
+        """
+        if self._is_plain(x):
+            mean, deviation = self._streams_.predict(x)
+            mean = mean.view(self._targets_)
+            return (mean, deviation.view(self._targets_)) if return_std else mean
+        points = tensor_of(self._call("predict"), "x", x)
+        own = 1 if self._fitted("predict").n_streams_ is None else 2
+        several = points.dim() == own + 1
+        if ((*points.shape[:-2], points.shape[-1]) if several else tuple(points.shape)) != self._shape_:
+            raise self._refusal("predict", points)
+        streams, whole = self._streams_, points if several else points.unsqueeze(-2)
+        rows = whole.to(streams.dtype).reshape(streams.count, whole.shape[-2], whole.shape[-1])
+        found = [streams.predict(row.contiguous()) for row in rows.unbind(1)]
+        shape = (*points.shape[:-1], *(() if self.n_outputs_ is None else (self.n_outputs_,)))
+
+        def joined(which: int) -> Any:
+            parts = [pair[which] for pair in found]
+            return like_given(x, torch.stack(parts, 1).reshape(shape) if parts else points.new_empty(shape))
+
+        return (joined(0), joined(1)) if return_std else joined(0)
+
+    def _is_plain(self, value: Any, target: bool = False) -> bool:
+        """Return whether compiled code can read a sample in place."""
+        return (
+            type(value) is Tensor
+            and "_streams_" in self.__dict__
+            and self._streams_.compiled
+            and value.dtype is self._streams_.dtype
+            and value.shape == (self._targets_ if target else self._shape_)
+            and not value.requires_grad
+            and value.is_contiguous()
+        )
+
+    def _prepare(self, x: Tensor, y: Tensor) -> None:
+        """Infer the sizes from the first sample, check the arguments and begin the streams."""
+        dtype = x.dtype if x.dtype in (torch.float32, torch.float64) else torch.float64
+        count = 1 if x.dim() == 1 else x.shape[0]
+        outputs = y.shape[-1] if y.dim() == x.dim() else 1
+        self._streams_ = self._begin(count, outputs, torch.zeros(x.shape[-1], dtype=dtype, device=x.device))
+        self._shape_, self._targets_, self._dtype_ = tuple(x.shape), tuple(y.shape), dtype
+        self.n_features_in_ = x.shape[-1]
+        self.n_streams_ = None if x.dim() == 1 else count
+        self.n_outputs_ = outputs if y.dim() == x.dim() else None
+
+    def _refusal(self, call: str, x: Tensor, y: Tensor | None = None) -> ValueError:
+        """Return the error of a sample whose shapes are not those of the first one."""
+        outputs = () if self.n_outputs_ is None else (self.n_outputs_,)
+        given = f"{tuple(x.shape)}" + ("" if y is None else f" and y's {tuple(y.shape)}")
+        name = type(self).__name__
+        return ValueError(
+            f"`{name}.{call}(x=...)` must have the shape {self._shape_} of the first sample, with "
+            f"{self.n_features_in_} features, and y {(*self._shape_[:-1], *outputs)}; got the shape {given}: "
+            f"X has {x.shape[-1]} features, but {name} is expecting {self.n_features_in_} features as input."
+        )
+
+    def reset(self, streams: Any = None) -> Self:
+        """Forget everything, dimension and streams included; or what these streams learned."""
+        if streams is not None:
+            self._fitted("reset")._streams_.clear(self._numbers("reset", streams))
+            return self
+        for name in [name for name in vars(self) if name.endswith("_")]:
+            delattr(self, name)
+        return self
+
+    def add(self, streams: int = 1) -> Self:
+        """Begin further streams, numbered behind the others."""
+        if self._fitted("add").n_streams_ is None:
+            raise ValueError(
+                f"`{self._call('add')}` needs streams side by side, x (S, n); this is a single one."
+            )
+        self._streams_.add(integer(self._call("add"), "streams", streams, least=1))
+        return self._resized()
+
+    def drop(self, streams: Any) -> Self:
+        """Give up the streams with these numbers; the others close ranks."""
+        gone = self._numbers("drop", streams)
+        every = torch.arange(self._streams_.count)
+        rows = every[~torch.isin(every, gone)]
+        if self.n_streams_ is None or not len(rows):
+            raise fail(self._call("drop"), "streams", "must leave a stream", streams)
+        self._streams_.keep(rows)
+        return self._resized(rows)
+
+    def _resized(self, kept: Tensor | None = None) -> Self:
+        """Take over the count of streams after some were added, or after these alone were kept."""
+        self.n_streams_ = self._streams_.count
+        self._shape_ = (self._streams_.count, *self._shape_[1:])
+        self._targets_ = (self._streams_.count, *self._targets_[1:])
+        return self
+
+    @property
+    def n_samples_seen_(self) -> Tensor:
+        return self._counted(self._streams_.learned)
+
+    @property
+    def n_skipped_(self) -> Tensor:
+        return self._counted(self._streams_.skipped)
+
+    def _counted(self, count: Tensor) -> Tensor:
+        return count.squeeze(0) if self.n_streams_ is None else count
+
+    def _call(self, method: str) -> str:
+        """Return a method's name in messages."""
+        return f"{type(self).__name__}.{method}"
+
+    def _is_fitted(self) -> bool:
+        return "_streams_" in self.__dict__
+
+    def _fitted(self, call: str) -> Self:
+        if not self._is_fitted():
+            raise not_fitted(f"`{self._call(call)}` needs a first sample: call `fit` or `partial_fit`.")
+        return self
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return all that was learned, as tensors, numbers and strings, which ``weights_only=True`` loads."""
+        about = {name: getattr(self._fitted("state_dict"), name) for name in _ABOUT}
+        about |= {"dtype": str(self._dtype_), "arguments": self._plain_arguments()}
+        return about | self._extra_state() | self._streams_.state_dict()
+
+    def _extra_state(self) -> dict[str, Any]:
+        """Return what a saved state has beside the streams, which `_take_extra` takes over."""
+        return {}
+
+    def _take_extra(self, state: dict[str, Any]) -> None:
+        """Take over what `_extra_state` gave."""
+
+    def _plain_arguments(self) -> dict[str, Any]:
+        """Return decisive arguments that are numbers, flags or None; floats, as a search's may be NumPy's."""
+        found = {name: getattr(self, name) for name in self._decisive()}
+        plain = {k: v for k, v in found.items() if v is None or isinstance(v, numbers.Real | np.bool_)}
+        return {k: v if v is None else float(v) for k, v in plain.items()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> Self:
+        """Go on from a `state_dict` of a regressor with the same arguments, bit for bit.
+
+        Raises:
+            ValueError: for a state with other arguments, or of another version, that cannot be gone on from.
+                What this regressor has learned stays as it is then.
+        """
+        name = self._call("load_state_dict")
+        missing = [key for key in (*_ABOUT, "dtype", "arguments", "table") if key not in state]
+        if missing or state["dtype"] not in _DTYPES:
+            told = f"it has no {missing}" if missing else f"its dtype is {state['dtype']!r}"
+            raise ValueError(f"`{name}(state=...)` must be what `state_dict` returned; {told}.")
+        streams, outputs, dtype = state["n_streams_"], state["n_outputs_"], _DTYPES[state["dtype"]]
+        twin = type(self)(**self.get_params(deep=False))
+        twin._take_extra(state)
+        own, given = twin._plain_arguments(), state["arguments"]
+        for key in [*own, *given]:
+            if own.get(key, "none") != given.get(key, "none"):
+                told = (
+                    f"must be of a regressor with the same arguments: it has {key}={given.get(key, 'none')}"
+                )
+                raise ValueError(f"`{name}(state=...)` {told}, this one {own.get(key, 'none')}.")
+        leading = () if streams is None else (streams,)
+        x = torch.zeros(*leading, state["n_features_in_"], dtype=dtype)
+        twin._prepare(x, x.new_zeros((*leading, *(() if outputs is None else (outputs,)))))
+        twin._streams_.load_state_dict(state)
+        self.reset()
+        vars(self).update(vars(twin))
+        return self
+
+    def __getstate__(self) -> dict[str, Any]:
+        given = {name: getattr(self, name) for name in self._parameters()}
+        learned = {"learned": self.state_dict()} if self._is_fitted() else {}
+        return given | self._extra_state() | learned
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        learned = state.pop("learned", None)
+        vars(self).update({name: state[name] for name in self._parameters()})
+        self._take_extra(state)
+        if learned is not None:
+            self.load_state_dict(learned)
+
+    def _numbers(self, call: str, streams: Any) -> Tensor:
+        """Return the numbers of streams, (R,) int64."""
+        found = torch.as_tensor(np.asarray(streams)).reshape(-1)
+        most = self._fitted(call)._streams_.count
+        found = found.long() if found.numel() == 0 else found  # an empty list is of floats
+        wrong = found.is_floating_point() or found.dtype == torch.bool
+        if wrong or not bool(((found >= 0) & (found < most)).all()):
+            rule = f"must be numbers of streams from 0 to {most - 1}"
+            raise fail(self._call(call), "streams", rule, streams)
+        return found.long().unique()

@@ -1,0 +1,5 @@
+"""A mixture of forecasters on remembered samples."""
+
+from .regressor import MixtureRegressor as MixtureRegressor
+
+__all__ = ["MixtureRegressor"]
