@@ -69,9 +69,9 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 def pytest_runtest_setup(item: pytest.Item) -> None:
     """Skip what is about compiled programs where nothing can be compiled."""
     if item.get_closest_marker("needs_compiler") is not None:
-        from staf_torch.lanes import build
+        from staf_torch.lanes import compiler
 
-        if not build.compiler():
+        if not compiler.compiler():
             pytest.skip("needs a C++ compiler")
 
 

@@ -26,7 +26,7 @@ from command_line import ROOT, environment
 
 import staf_torch
 from staf_torch.cli import reference
-from staf_torch.lanes import build
+from staf_torch.lanes import compiler
 from staf_torch.sweeps.python_api import sweep
 from staf_torch.sweeps.runs import Runs
 
@@ -160,7 +160,7 @@ def test_the_example_of_a_name_does_what_it_says(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    if name in COMPILE and not build.compiler():
+    if name in COMPILE and not compiler.compiler():
         pytest.skip("needs a C++ compiler")
     thing, names = PUBLIC[name]
     if thing is not sweep and names.get("sweep") is sweep:

@@ -18,7 +18,7 @@ from omegaconf import OmegaConf
 from staf_torch import __version__
 from staf_torch.cli import export, table
 from staf_torch.cli.staf import main as main  # its import registers the launcher of `staf -m`
-from staf_torch.lanes import build
+from staf_torch.lanes import compiler
 
 README = ROOT / "README.md"
 MANUALS = sorted(
@@ -72,7 +72,7 @@ def test_python_blocks_of_a_page_run_one_after_another(
     path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    if path.parent.name == "deploy" and not build.compiler():
+    if path.parent.name == "deploy" and not compiler.compiler():
         pytest.skip("its C is compiled")
     names: dict[str, object] = {"__name__": "__main__"}
     for line, text in python_blocks(path):

@@ -8,13 +8,13 @@ import torch
 from torch import Tensor
 
 from staf_torch import lanes
-from staf_torch.lanes import build
+from staf_torch.lanes import cache
 
 
 @pytest.mark.skipif(sanitized.missing() is not None, reason=sanitized.missing() or "")
 def test_no_shape_or_layout_makes_native_code_read_outside() -> None:
     kinds = ["programs", "banks"]  # a bank runs what a filter does
-    builds = build.cache() / "sanitized"  # kept, by a hash of their sources: they take seven seconds
+    builds = cache.cache() / "sanitized"  # kept, by a hash of their sources: they take seven seconds
     said = sanitized.run(3, 1, builds, kinds=kinds, level="-O0")
     assert said.startswith("3 calls of")
 

@@ -18,7 +18,8 @@ from ..approximation.basis import StaFBasis
 from ..centers import StateFollowingCenters, rings
 from ..engine import chase
 from ..kernels import ExponentialKernel
-from ..lanes.build import cache, find_compiler
+from ..lanes.cache import cache
+from ..lanes.compiler import find_compiler
 from ..optim import SteepestDescent
 from ..results.build import source
 from ..systems import Oscillator, simulate

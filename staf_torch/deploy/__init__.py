@@ -1,7 +1,6 @@
 """Out to the device: a fixed approximation or controller as ONNX, a `torch.export` program, an AOTInductor
 package or C."""
 
-from ..lanes.tracing import trace as trace
 from .approximators import LocalApproximator as LocalApproximator
 from .approximators import RidgeApproximator as RidgeApproximator
 from .approximators import approximator as approximator
@@ -17,6 +16,7 @@ from .formats import export_onnx as export_onnx
 from .formats import export_package as export_package
 from .formats import export_program as export_program
 from .formats import load_program as load_program
+from .graph import trace as trace
 from .remembered import RememberedPolicy as RememberedPolicy
 
 __all__ = [

@@ -17,12 +17,12 @@ from torch import Tensor, nn
 
 from ..adp import Controller
 from ..lanes import Program
-from ..lanes.combinators import Tree
-from ..lanes.given import Given
-from ..lanes.graph import WIDE, Graph
-from ..lanes.one_row import trace
-from ..lanes.schedule import Schedule
-from ..lanes.tracer import NotLoweredError
+from ..lanes.call import Given
+from ..lanes.emit.schedule import Schedule
+from ..lanes.trace.graph import WIDE, Graph
+from ..lanes.trace.step import trace
+from ..lanes.trace.tracer import NotLoweredError
+from ..lanes.tree import Tree
 from .controllers import check_bounded
 from .formats import Run, as_tuple
 from .remembered import RememberedPolicy

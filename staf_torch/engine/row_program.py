@@ -14,9 +14,9 @@ from torch import Tensor, nn
 
 from ..approximation.basis import GramStructure, Target
 from ..lanes import Program
+from ..lanes.call import ordinary
 from ..lanes.compiling import worth
 from ..lanes.kept import Kept, number
-from ..lanes.plan import ordinary
 from ..optim.base import UpdateLaw
 from ..optim.objective import NativeError, Objective, Precomputed, ScaledError
 from .certificate import Certificate, certify, first_link

@@ -1,12 +1,12 @@
 """Row programs: torch functions of one row, compiled with a row in every vector lane."""
 
-from . import cuda as cuda
-from .combinators import each as each
-from .combinators import reduce as reduce
-from .combinators import repeat as repeat
-from .combinators import scan as scan
 from .compiling import compiling as compiling
+from .emit import cuda as cuda
 from .function import ready as ready
+from .loops import each as each
+from .loops import reduce as reduce
+from .loops import repeat as repeat
+from .loops import scan as scan
 from .program import Program as Program
 from .tree import Shared as Shared
 

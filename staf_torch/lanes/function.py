@@ -8,11 +8,12 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor, nn
 
-from .combinators import Tree, tracing_now
+from .call import Plan, ordinary
 from .compiling import worth
 from .kept import Kept
-from .plan import Plan, ordinary
+from .loops import tracing_now
 from .program import Program
+from .tree import Tree
 from .watch import Watch
 
 _PAYS = 100  # calls of a small batch in plain torch (some 10 ms each) that take as long as to compile

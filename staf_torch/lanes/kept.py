@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from .content import code, signature, skeleton, written
-from .one_row import Step
 from .program import Program
+from .trace.step import Step
 from .watch import Watch
 
 _log = logging.getLogger(__name__)

@@ -15,7 +15,7 @@ _PACKAGE = __name__.partition(".")[0]
 _BESIDE = frozenset(
     ("cli", "figures", "plugins", "results", "settings", "sweeps", "tables")
 )  # no step is there
-_KEEPING = frozenset(f"lanes.{name}" for name in ("build", "program", "trace_cache"))  # know no step
+_KEEPING = frozenset(f"lanes.{name}" for name in ("cache", "compiler", "program"))  # know no step
 _OTHERS = frozenset(("torch", "numpy", "scipy", "gymnasium", "mujoco", "hydra", "omegaconf", "matplotlib"))
 _OTHERS |= sys.stdlib_module_names - {"__main__", "unittest"}
 _seen: dict[

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from .combinators import scan
+from .loops import scan
 
 _Elimination = tuple[Tensor, Tensor, Tensor, Tensor]
 _IN_REGISTERS = 8  # rows of a matrix that a compiled program writes out entry by entry

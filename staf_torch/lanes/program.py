@@ -10,20 +10,19 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from . import build, trace_cache
-from .alone import doubt, undrawn
-from .combinators import Tree
+from . import cache
+from .cache import Trace
+from .call import Compiled, Given, Plan, form, ordinary
+from .compiler import machine_code
 from .content import reads_users_code, signature, skeleton
-from .emission import emit
-from .given import Given
-from .one_row import Step, trace
+from .emit.c import Names, c_text
+from .emit.cpp import emit
 from .patches import unpatched
-from .plan import Compiled, Plan, form, ordinary
-from .scalar_text import Names, c_text
+from .row_independence import doubt, undrawn
 from .surroundings import is_users
-from .trace_cache import Trace
-from .tracer import NotLoweredError
-from .tree import Shared, flatten, labels, plain, unflatten
+from .trace.step import Step, trace
+from .trace.tracer import NotLoweredError
+from .tree import Shared, Tree, flatten, labels, plain, unflatten
 from .watch import Watch
 
 _log = logging.getLogger(__name__)
@@ -275,7 +274,7 @@ class Program:
                 raise NotLoweredError(f"the program is {lines} lines long, which take a compiler minutes")
             if not self._alone(given):  # before a compiler is asked for what would not be used
                 return None
-            call = build.function(made.text.source)
+            call = machine_code(made.text.source)
         except (NotLoweredError, OSError) as error:
             _say(self.name, str(error), "no build" if isinstance(error, OSError) else None)
             return None
@@ -290,11 +289,11 @@ class Program:
         if self._described is None or shapes is None or not unpatched():
             return _written(self.step, given, copies)
         step, tensors = self._described
-        path = trace_cache.place(step, shapes, copies)
-        found = trace_cache.load(path, tensors)
+        path = cache.place(step, shapes, copies)
+        found = cache.load(path, tensors)
         if found is None:
             found = _written(self.step, given, copies)
-            trace_cache.save(path, found, tensors)
+            cache.save(path, found, tensors)
         return found
 
 

@@ -7,6 +7,9 @@ from typing import Any
 
 from torch import Tensor
 
+Tree = Any
+"""Nested tuples, lists, dictionaries or named tuples of tensors."""
+
 
 def flatten(tree: Any) -> tuple[list[Any], Hashable]:
     """The tensors of a tree, and what is needed to build the tree again from others.

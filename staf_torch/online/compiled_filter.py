@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from ..lanes.build import compiled
+from ..lanes.compiler import compiled
 from .kalman_filter import LocalFilter, StreamState
 from .local_functions import LocalFunctions
 

@@ -18,7 +18,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from ..experiments.registry import Metrics, check_animation
-from ..lanes.build import compiler
+from ..lanes.compiler import compiler
 from ..numerics.checks import COMMAND_LINE, choice
 from ..results import run_record as records
 from ..results.files import MEMBERS, METRICS, partial_name

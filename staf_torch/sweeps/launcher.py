@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 from omegaconf import DictConfig
 from tqdm.auto import tqdm
 
-from ..lanes.build import compiler
+from ..lanes.compiler import compiler
 from ..numerics.checks import choice, integer
 from ..results import run_record as records
 from ..results.files import METRICS

@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from ..lanes import Program
-from ..lanes.combinators import Tree
 from ..lanes.compiling import worth
 from ..lanes.kept import Kept
+from ..lanes.tree import Tree
 from ..numerics.checks import integer, positive_real, trailing
 from ..numerics.runge_kutta import runge_kutta_step
 from .base import ControlAffineSystem

@@ -16,7 +16,8 @@ import torch
 from torch import Tensor
 
 from staf_torch import lanes
-from staf_torch.lanes import build
+from staf_torch.lanes import cache as folder_of
+from staf_torch.lanes import compiler
 
 pytestmark = [
     pytest.mark.needs_compiler,
@@ -72,8 +73,8 @@ def script(path: Path, *lines: str) -> Path:
 @pytest.fixture
 def calls(cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[], Sequence[str]]:
     """What a compiler was asked to build so far: it notes its words and hands them on."""
-    log, compiler = tmp_path / "log", build.find_compiler()
-    noting = script(tmp_path / "noting", f'echo "$@" >> {log}', f'exec {compiler} "$@"')
+    log, own = tmp_path / "log", compiler.find_compiler()
+    noting = script(tmp_path / "noting", f'echo "$@" >> {log}', f'exec {own} "$@"')
     monkeypatch.setenv("CXX", str(noting))
     return lambda: [line for line in log.read_text().splitlines() if " -o " in line] if log.exists() else []
 
@@ -169,19 +170,19 @@ def test_a_home_that_cannot_be_written_is_replaced_by_a_folder_of_the_process(
 ) -> None:
     (tmp_path / "file").write_text("no folder")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
-    folder = build.cache()
-    assert folder == build.cache()  # what one program leaves there another one finds
+    folder = folder_of.cache()
+    assert folder == folder_of.cache()  # what one program leaves there another one finds
     assert not folder.is_relative_to(tmp_path)
     right(new_program())
     assert len(list(folder.glob("lanes-*.so"))) == 1
     shutil.rmtree(folder)  # somebody tidies up
-    assert build.cache().is_dir()
+    assert folder_of.cache().is_dir()
 
 
 def test_the_cache_is_where_the_user_has_his_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
     monkeypatch.setenv("HOME", str(tmp_path))
-    assert build.cache() == tmp_path / ".cache" / "staf_torch"
+    assert folder_of.cache() == tmp_path / ".cache" / "staf_torch"
 
 
 def test_checkouts_of_one_version_share_a_library_and_others_do_not(
@@ -194,12 +195,12 @@ def test_checkouts_of_one_version_share_a_library_and_others_do_not(
             '#include "_number.hpp"\nextern "C" int staf_seven() { return number + N; }\n'
         )
         (tmp_path / place / "_number.hpp").write_text(f"constexpr int number = {number};")
-        function: Any = build.compiled(tmp_path / place / "_seven.cpp", "N=3")
+        function: Any = compiler.compiled(tmp_path / place / "_seven.cpp", "N=3")
         function.restype = ctypes.c_int
         found.append(function())
     assert found == [10, 10, 12]
     assert len(calls()) == 2
-    build.compiled(tmp_path / "one" / "_seven.cpp", "N=4")
+    compiler.compiled(tmp_path / "one" / "_seven.cpp", "N=4")
     assert len(calls()) == 3
 
 
@@ -208,7 +209,7 @@ def test_a_file_that_cannot_be_compiled_is_none_and_said_once(
 ) -> None:
     for definition in ("N=1", "N=2"):
         (tmp_path / "_unwritten.cpp").write_text("this is no C++")
-        assert build.compiled(tmp_path / "_unwritten.cpp", definition) is None
+        assert compiler.compiled(tmp_path / "_unwritten.cpp", definition) is None
     (line,) = caplog.messages
     assert "unwritten" in line
     assert "plain torch" in line
@@ -224,7 +225,7 @@ def test_a_long_program_is_built_by_every_compiler_and_a_slow_one_is_told(
     monkeypatch.setenv("CXX", name)
     text = lanes.Program(lambda x, *_: (x + 1, x)).text(torch.zeros(1), steps=1)
     for lines, told in ((2000, False), (7000, True)):
-        build.function(text + f"// {name}\n" * lines)
+        compiler.machine_code(text + f"// {name}\n" * lines)
         assert ("is compiled, once: some 4 s" in caplog.text) is told
     assert len(list(cache.glob("lanes-*.so"))) == 2
 
@@ -237,7 +238,7 @@ def test_the_cache_forgets_what_nobody_has_used_and_nothing_of_today(tmp_path: P
         os.utime(tmp_path / name, (now - days * day,) * 2)
 
     def left(**options: Any) -> set[str]:
-        build.prune(tmp_path, now=now, **options)
+        folder_of.prune(tmp_path, now=now, **options)
         return {path.name for path in tmp_path.iterdir()}
 
     ages = {"lanes-new.so": 0.5, "trace-old": 61, "lanes-old.so": 70, "lanes-mid.so": 20, "trace-mid": 10}
@@ -251,10 +252,10 @@ def test_the_cache_forgets_what_nobody_has_used_and_nothing_of_today(tmp_path: P
     assert left(largest=400) == kept
     assert left(largest=399) == kept - {"lanes-mid.so"}  # the oldest, and no more than there need be
     assert left(largest=0) == {"lanes-new.so", "tmpnow", "notes.txt"}
-    build.used(tmp_path / "lanes-new.so")
+    folder_of.used(tmp_path / "lanes-new.so")
     assert (tmp_path / "lanes-new.so").stat().st_mtime > now
-    build.used(tmp_path / "absent")  # nothing to note
-    build.prune(tmp_path)  # by the clock of the machine the others are old
+    folder_of.used(tmp_path / "absent")  # nothing to note
+    folder_of.prune(tmp_path)  # by the clock of the machine the others are old
     assert {path.name for path in tmp_path.iterdir()} == {"lanes-new.so", "notes.txt"}
 
 

@@ -14,12 +14,12 @@ from hypothesis import given
 from torch import Tensor
 
 from staf_torch import lanes
-from staf_torch.lanes.eliminations import (
+from staf_torch.lanes.pivoted_cholesky import pivoted_cholesky
+from staf_torch.lanes.trace.eigenvalues import eigen, eigenvalues
+from staf_torch.lanes.trace.factorisations import (
     cholesky,
     cholesky_solve,
     determinant,
-    eigen,
-    eigenvalues,
     inverse,
     log_determinant,
     orthogonal,
@@ -27,7 +27,6 @@ from staf_torch.lanes.eliminations import (
     solve_definite,
     triangular,
 )
-from staf_torch.lanes.pivoted_cholesky import pivoted_cholesky
 from staf_torch.numerics.linalg import condition_number
 
 LEADS = ((), (2,), (2, 3))

@@ -18,7 +18,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from staf_torch import lanes
-from staf_torch.lanes.replacements import erfinv, sort
+from staf_torch.lanes.trace.decompositions import erfinv, sort
 
 pytestmark = pytest.mark.needs_compiler
 

@@ -18,7 +18,7 @@ from staf_torch import lanes
 from staf_torch.lanes import Program, Shared
 from staf_torch.lanes.content import reads_users_code
 from staf_torch.lanes.function import Rows
-from staf_torch.lanes.tracer import NotLoweredError
+from staf_torch.lanes.trace.tracer import NotLoweredError
 
 pytestmark = pytest.mark.needs_compiler
 

@@ -10,8 +10,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ...lanes import eliminations
-from ...lanes.combinators import tracing_now
+from ...lanes.loops import tracing_now
+from ...lanes.trace import factorisations
 from ...numerics.checks import fail, number, positive_real
 from ..problem.cost import matvec
 from .bellman import BellmanTerms, bellman_error
@@ -291,7 +291,7 @@ def solve_definite(matrix: Tensor, right: Tensor) -> Tensor:
     """
     size = right.shape[-1]
     if tracing_now():
-        return eliminations.solve_definite(matrix, right)
+        return factorisations.solve_definite(matrix, right)
     if size > _UNROLLED:
         solution: Tensor = torch.linalg.solve_ex(matrix, right.unsqueeze(-1))[0].squeeze(-1)
         return solution

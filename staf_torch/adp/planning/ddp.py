@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ...lanes import Program, repeat, scan
-from ...lanes.combinators import tracing_now
+from ...lanes.loops import tracing_now
 from ...numerics.box import minimum_and_slopes
 from ...numerics.checks import fail, integer, positive_real, trailing
 from ...numerics.riccati import riccati_step

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from ...lanes import repeat, scan
-from ...lanes.combinators import tracing_now
 from ...lanes.function import RowFunction
+from ...lanes.loops import tracing_now
 from ...numerics.angles import wrap
 from ...numerics.box import LARGEST, minimum_and_slopes
 from ...numerics.checks import fail, integer, positive_real

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from ...lanes import Program, repeat
-from ...lanes.combinators import tracing_now
 from ...lanes.function import RowFunction
+from ...lanes.loops import tracing_now
 from ...numerics.checks import fail, flag, integer
 from ..loop.controller import Controller, ControllerState, carrying
 from ..policies.sampled_rollout import SampledRollout

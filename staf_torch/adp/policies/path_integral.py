@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ...lanes import Program, each, scan
-from ...lanes.combinators import tracing_now
+from ...lanes.loops import tracing_now
 from ...numerics.checks import fail, integer, one_or_each, positive, positive_real
 from ..loop.controller import Controller, ControllerState, carrying
 from ..problem.sampled import SampledProblem

@@ -13,8 +13,8 @@ from ...approximation.basis import StaFBasis
 from ...centers import Radius, StateFollowingCenters, ball, cross_polytope, rings
 from ...kernels import ExponentialKernel, GaussianKernel, Kernel
 from ...lanes import each, repeat
+from ...lanes.call import Plan
 from ...lanes.function import RowFunction, Rows
-from ...lanes.plan import Plan
 from ...numerics.checks import fail, integer, positive_real
 from ...systems import Barrier, ControlAffineSystem
 from ..loop.controller import LQR, Policy, Value

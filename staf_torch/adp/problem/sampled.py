@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn.functional import pad
 
 from ...lanes import each
-from ...lanes.combinators import tracing_now
+from ...lanes.loops import tracing_now
 from ...numerics.angles import wrap
 from ...numerics.checks import fail, integer, positive_real, trailing
 from ...numerics.forward_mode import use_forward_mode

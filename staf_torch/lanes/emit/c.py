@@ -6,9 +6,9 @@ import bisect
 import math
 import re
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-from .graph import FLAG, REAL, ROW, STEP, WHOLE, WIDE, Graph
+from ..trace.graph import FLAG, REAL, ROW, STEP, WHOLE, WIDE, Graph
 from .schedule import Layout, Schedule
 from .statements import Writer
 
@@ -157,7 +157,7 @@ def c_text(
     All numbers, flags and integers too, are double (float for a program of float32).
 
     Args:
-        graph, layout, following, outputs: as in `emission.emit`.
+        graph, layout, following, outputs: as in `cpp.emit`.
         name: of the function.
         names: of its arguments.
         start: the numbers that the carry starts with.
@@ -197,84 +197,3 @@ def c_text(
     lines += [f"static inline void {name}({', '.join(arguments)})"]
     lines += writer._function(lambda: writer.body(names, following, outputs))
     return "\n".join([*lines, "", "#endif"]) + "\n"
-
-
-class _CudaWriter(_ScalarWriter):
-    def __init__(self, *given: Any, shared: Sequence[str]) -> None:
-        super().__init__(*given)
-        self._shared = frozenset(shared)
-
-    def _fma(self, a: str, b: str, c: str) -> str:
-        return f"fma{self._suffix}({a}, {b}, {c})"
-
-    def _buffer(self, op: str, place: int, j: int, at: str = "0") -> str:
-        slot, entry = self._slot(op, place)
-        name, sizes = self._names[op][slot], {"row": self.layout.rows, "now": self.layout.nows}[op]
-        index = f"{entry}" if at == "0" else f"({entry} + {at})"
-        if op == "now":
-            index = f"(t * {sizes[slot]} + {index})"
-        return f"{name}[{index}]" if name in self._shared else f"{name}[{index} * rows + r]"
-
-    def body(self, names: Names, following: Sequence[int], outputs: Sequence[int]) -> None:
-        self._lines.append("{")
-        self._line("const long long rows = row_count, times = time_count, every = period;")
-        self._line("const long long r = (long long)blockIdx.x * blockDim.x + threadIdx.x;")
-        self._line("if (r >= rows) return;")
-        self._block(self.schedule.block(ROW))
-        for place, node in enumerate(following):
-            slot, entry = self._slot("state", place)
-            value = self._typed(node, f"{names.carries[slot]}[{entry} * rows + r]")
-            self._line(f"{self._type(node)} s{place} = {value};")
-        self._line("for (long long t = 0; t < times; ++t) {")
-        self._level += 1
-        self._block(self.schedule.block(STEP))
-        self._line("if (t % every == 0) {")
-        done = 0
-        for name, size in zip(names.outputs, self.layout.outputs, strict=True):
-            for e in range(size):
-                value = self._ref(outputs[done + e], 0)
-                self._line(f"    {name}[(t / every * {size} + {e}) * rows + r] = {value};")
-            done += size
-        self._line("}")
-        self._assign([(f"s{k}", node) for k, node in enumerate(following)])
-        self._level -= 1
-        self._line("}")
-        for place in range(len(following)):
-            slot, entry = self._slot("state", place)
-            self._line(f"{names.carries[slot]}_end[{entry} * rows + r] = s{place};")
-        self._lines.append("}")
-
-
-def cuda_text(
-    graph: Graph,
-    layout: Layout,
-    following: Sequence[int],
-    outputs: Sequence[int],
-    *,
-    name: str,
-    shared: Sequence[str],
-) -> str:
-    """Return CUDA C of a program, a thread a row, all times inside.
-
-    ``NAME(row_count, time_count, period, row..., now..., carry..., carry_end..., out...)``; the numbers of a
-    time lie together, entry after entry, a row beside the other: (times, entries, rows), without rows where
-    shared.
-
-    Args:
-        graph, layout, following, outputs: as in `emission.emit`.
-        name: of the kernel.
-        shared: which of row0, row1, ..., now0, ... all rows share.
-    """
-    names = Names(
-        *([f"{kind}{k}" for k in range(len(sizes))] for kind, sizes in zip(_KINDS, layout, strict=True))
-    )
-    writer = _CudaWriter(graph, Schedule(graph, following, outputs), layout, names, shared=shared)
-    read = [f"const {writer.real} *{n}" for n in (*names.rows, *names.nows, *names.carries)]
-    written = [f"{writer.real} *{n}" for n in (*(f"{c}_end" for c in names.carries), *names.outputs)]
-    arguments = ["int row_count", "int time_count", "int period", *read, *written]
-    lines = [f'extern "C" __global__ void {name}({", ".join(arguments)})']
-    lines += writer._function(lambda: writer.body(names, following, outputs))
-    return "\n".join(lines) + "\n"
-
-
-_KINDS = ("row", "now", "carry", "out")

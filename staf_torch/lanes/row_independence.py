@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .combinators import few_passes
-from .given import Given
+from .call import Given
+from .loops import few_passes
 from .tree import Shared, flatten, plain
 
 _BITS = (1, -1, 3, -5, 17)  # units in the last place by which inputs are moved

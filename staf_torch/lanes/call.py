@@ -5,17 +5,52 @@ from __future__ import annotations
 import ctypes
 import functools
 import itertools
+import mmap
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
-from .openmp import openmp
-from .pages import LARGE, fresh
-from .tree import Shared, plain
+from .tree import Shared, Tree, flatten, plain, unflatten
+
+LARGE = 2**22  # bytes from which pages of two megabytes are worth asking for
+_HUGE = 2**21
+
+
+def fresh(like: Tensor, *shape: int) -> Tensor:
+    """Return an empty tensor.
+
+    A first write to ordinary pages costs more than the recursion that writes to them (4.8 megabytes took 3.2
+    ms, of huge pages .6). The system gives huge ones, if it does, only to memory that begins where such a
+    page may begin, and `malloc` does not: large tensors are mappings of their own, given back when the tensor
+    goes.
+
+    Args:
+        like: dtype and device.
+        shape: of the tensor.
+    """
+    size = torch.Size(shape).numel() * like.element_size()
+    if like.device.type != "cpu" or size < LARGE or not hasattr(mmap, "MADV_HUGEPAGE"):
+        return like.detach().new_empty(shape)
+    try:  # private: a child process has its own
+        memory = mmap.mmap(-1, -(-size // _HUGE) * _HUGE, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+        memory.madvise(mmap.MADV_HUGEPAGE)
+    except OSError:  # no more mappings, or a system without huge pages
+        return like.detach().new_empty(shape)
+    return torch.frombuffer(memory, dtype=like.dtype, count=size // like.element_size()).view(shape)
+
+
+@functools.cache
+def openmp(name: str) -> Callable[..., None] | None:
+    """A function of it; None where there is none."""
+    try:
+        return getattr(ctypes.CDLL(torch._C.__file__), name, None)
+    except OSError:
+        return None
+
 
 Form = tuple[torch.Size, tuple[int, ...], torch.dtype, bool]
 """Shape, strides and dtype of an input, and whether all rows share it."""
@@ -181,3 +216,58 @@ def _parallel() -> int | None:
     """The OpenMP entry that torch itself runs on: a second pool of threads would fight for the same cores."""
     entry = openmp("GOMP_parallel")
     return None if entry is None else ctypes.cast(entry, ctypes.c_void_p).value  # type: ignore[arg-type]
+
+
+class Given(NamedTuple):
+    """The inputs of a call as lists."""
+
+    carry: list[Tensor]
+    now: list[Any]
+    row: list[Any]
+    structures: dict[str, Any]
+    rows: int
+    times: int
+
+    @classmethod
+    def of(cls, carry: Tree, now: Tree, row: Tree, steps: int | None) -> Given:
+        leaves, structures = {}, {}
+        for name, tree in (("carry", carry), ("now", now), ("row", row)):
+            leaves[name], structures[name] = flatten(tree)
+        own = [leaf for name in ("carry", "now", "row") for leaf in leaves[name] if isinstance(leaf, Tensor)]
+        if not own:
+            raise ValueError(
+                "`Program(...)` must be given at least one tensor with a dimension of rows; got none."
+            )
+        if leaves["now"]:
+            first = leaves["now"][0]
+            steps = len(first.tensor) if isinstance(first, Shared) else first.shape[1]
+        if steps is None:
+            raise ValueError("`Program(steps=...)` must be given where no input has times; got None.")
+        return cls(**leaves, structures=structures, rows=own[0].shape[0], times=steps)
+
+    @property
+    def real(self) -> torch.dtype:
+        floats = [plain(leaf).dtype for leaf in (*self.carry, *self.now, *self.row)]
+        return torch.float64 if torch.float64 in floats or torch.float32 not in floats else torch.float32
+
+    def trees(self) -> Tree:
+        """The trees (row, now, carry)."""
+        return tuple(self.tree(name, getattr(self, name)) for name in ("row", "now", "carry"))
+
+    def tree(self, name: str, leaves: Sequence[Any]) -> Tree:
+        return unflatten(self.structures[name], iter(leaves))
+
+    def key(self) -> Hashable:
+        parts: list[Hashable] = [(leaf.shape[1:], leaf.dtype) for leaf in self.carry]
+        for skip, leaves in ((2, self.now), (1, self.row)):
+            for leaf in leaves:
+                shared = isinstance(leaf, Shared)
+                tensor = plain(leaf)
+                parts.append((tensor.shape[skip - shared :], tensor.dtype, shared))
+        return tuple(parts), tuple(self.structures.values())
+
+    def ordinary(self) -> bool:
+        """Whether all tensors are ordinary ones on the CPU of which nobody wants a derivative."""
+        if self.rows == 0 or self.times == 0:
+            return False
+        return ordinary((*self.carry, *self.now, *self.row))

@@ -11,11 +11,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from .fusion import ends_with, taken_over
-from .graph import FLAG, NOW, REAL, ROW, STEP, WHOLE, Graph
-from .schedule import Layout, Schedule
+from ..trace.graph import FLAG, NOW, REAL, ROW, STEP, WHOLE, Graph
+from ..trace.tracer import LARGE
+from .schedule import Layout, Schedule, ends_with, taken_over
 from .statements import Writer
-from .tracer import LARGE
 
 _FEW = 400  # nodes of a program of which two vectors fit the registers and caches side by side
 _WRITTEN_OUT = 8  # entries of an output that are stored one by one

@@ -4,16 +4,50 @@ from __future__ import annotations
 
 import abc
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import Any
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from .fusion import evenly, leaves
-from .graph import FIXED, Graph
-from .runs import runs
-from .schedule import Layout, Schedule
-from .tracer import NotLoweredError
+from ..trace.graph import FIXED, Graph
+from ..trace.tracer import NotLoweredError
+from .schedule import Layout, Schedule, evenly, leaves
+
+_SHORTEST = 4  # entries that are worth a loop
+
+
+class Run(NamedTuple):
+    """Some entries of a list: those from ``begin`` on."""
+
+    begin: int
+    length: int
+    first: int = 0  # place of the first of them in what they come from
+    step: int | None = None  # from place to place; None where each is an entry of its own
+
+
+def runs(places: Sequence[tuple[Hashable, int]]) -> list[Run]:
+    """Split a list of entries into runs.
+
+    Args:
+        places: of every entry what it is read from, and where in it.
+    """
+    found, k = list[Run](), 0
+    while k < len(places):
+        source, first = places[k]
+        step, length = 0, 1
+        if k + 1 < len(places) and places[k + 1][0] == source:
+            step = places[k + 1][1] - first
+        while k + length < len(places) and places[k + length] == (source, first + length * step):
+            length += 1
+        if length >= _SHORTEST:
+            found.append(Run(k, length, first, step))
+        else:
+            length = 1
+            alone = found.pop().length if found and found[-1].step is None else 0
+            found.append(Run(k - alone, alone + 1))
+        k += length
+    return found
+
 
 _INPUTS = ("const", "param", "elem", "result", "results", "collect", "carry", "carrys", "state", "row", "now")
 _ARRAYS = ("pack", "map", "dot", "collect", "carrys", "results")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -10,8 +11,33 @@ import torch
 from torch import Tensor
 
 from .graph import FLAG, REAL, Ids
-from .rules import RULES, common, numbers, rule
 from .tracer import NotLoweredError, Tracer
+
+Rule = Callable[..., Any]
+RULES: dict[str, Rule] = {}
+
+
+def rule(*names: str) -> Callable[[Rule], Rule]:
+    """Decorator: a function of (tracer, what torch returned, arguments) is the rule of these operations."""
+
+    def register(rule: Rule) -> Rule:
+        RULES.update(dict.fromkeys(names, rule))
+        return rule
+
+    return register
+
+
+def common(t: Tracer, *values: Any) -> str:
+    """The type in which torch computes with these together."""
+    given = [v for v in values if v is not None]
+    dtype = functools.reduce(torch.promote_types, [torch.result_type(v, w) for v in given for w in given])
+    return t.kind(dtype)
+
+
+def numbers(t: Tracer, kind: str, *values: Any) -> list[Ids]:
+    """The nodes of tensors and numbers, as one type."""
+    return [t.nodes(value, kind) for value in values]
+
 
 _LARGEST_POWER = 64
 

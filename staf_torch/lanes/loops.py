@@ -11,12 +11,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .graph import FLAG, STEP, Ids, Loop
-from .tracer import LARGE, NotLoweredError, Tracer
-from .tree import flatten, unflatten
+from .trace.graph import FLAG, STEP, Ids, Loop
+from .trace.tracer import LARGE, NotLoweredError, Tracer
+from .tree import Tree, flatten, unflatten
 
-Tree = Any
-"""Nested tuples, lists, dictionaries or named tuples of tensors."""
 _active = threading.local()
 _FEW = 4  # passes of a loop that is only tried
 

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import atexit
+import contextlib
 import functools
 import hashlib
 import io
+import logging
 import os
 import pickle
 import platform
+import shutil
 import sys
 import tempfile
+import time
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,11 +23,17 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from .build import cache, used
-from .captured import Recipe
-from .captured import tensors as tensors_of
-from .emission import Text
+from .emit.cpp import Text
+from .trace.captured_tensors import Recipe
+from .trace.captured_tensors import tensors as tensors_of
 
+_log = logging.getLogger(__name__)
+LARGEST = 2**30
+"""Bytes that the cache may hold: a trace is some 15 kilobytes, a library 30."""
+_SCRATCH = tempfile.gettempprefix()  # of names under which a file is written at first
+_DAY = 86_400.0
+_LONGEST_UNUSED = 60 * _DAY
+_temporary: dict[int, Path] = {}  # caches, by the process that made them
 _PACKAGE = Path(__file__).parent.parent
 _DIGEST = 32
 _ALLOWED = frozenset(
@@ -187,3 +198,80 @@ class _Reader(pickle.Unpickler):
         if kind == "made":  # stands for what the operation will make: its identity alone matters
             return self._made.setdefault(value, torch.empty(0, dtype=torch.float64))
         return torch.from_numpy(value)
+
+
+def cache() -> Path:
+    """Return the folder of libraries and traces: in `XDG_CACHE_HOME`, else in ``~/.cache``.
+
+    Where nothing may be written there, a folder that goes with the process.
+    """
+    home = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
+    folder = Path(home) / "staf_torch"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if os.access(folder, os.W_OK):
+            _pruned(folder)
+            return folder
+    except OSError:
+        pass
+    return _cache_of_the_process()
+
+
+def used(path: Path) -> None:
+    """Note that a file of the cache is in use now, which `prune` goes by."""
+    with contextlib.suppress(OSError):  # there is none, or it belongs to somebody else
+        os.utime(path)
+
+
+def prune(folder: Path, *, now: float | None = None, largest: int = LARGEST) -> None:
+    """Delete files of the cache that nobody has used for long, and the oldest while there are too many bytes.
+
+    What was used within a day stays in any case: another process may be about to load it. A library that a
+    process has loaded stays with that process. Names that this library did not give are left alone.
+
+    Args:
+        folder: of the cache.
+        now: in seconds; the present by default.
+        largest: bytes that may stay.
+    """
+    now = time.time() if now is None else now
+    found = list[tuple[float, int, Path]]()
+    for path in folder.iterdir():
+        with contextlib.suppress(OSError):  # deleted by another process
+            state = path.stat()
+            if path.suffix == ".so" or path.name.startswith(("trace-", _SCRATCH)):
+                found.append((state.st_mtime, state.st_size, path))
+    kept = sum(size for _, size, _ in found)
+    for last_use, size, path in sorted(found):
+        unused, left_over = now - last_use, path.name.startswith(_SCRATCH)  # by a process that was killed
+        if unused > _LONGEST_UNUSED or (unused > _DAY and (left_over or kept > largest)):
+            kept -= size
+            if path.is_dir():
+                shutil.rmtree(path, ignore_errors=True)
+            else:
+                path.unlink(missing_ok=True)
+
+
+@functools.cache
+def _pruned(folder: Path) -> None:
+    """Prune a cache once in a process."""
+    try:
+        prune(folder)
+    except OSError as error:
+        _log.debug("the cache %s was not pruned: %s", folder, error)
+
+
+def _cache_of_the_process() -> Path:
+    """Return a folder for this process alone, which is removed with it."""
+    process = os.getpid()
+    folder = _temporary.get(process)
+    if folder is None or not folder.is_dir():  # somebody may have tidied up
+        folder = _temporary[process] = Path(tempfile.mkdtemp(prefix="staf_torch-"))
+        atexit.register(_remove, folder, process)
+    return folder
+
+
+def _remove(folder: Path, process: int) -> None:
+    """Remove a folder where its process ends; a fork of it ends by itself."""
+    if os.getpid() == process:
+        shutil.rmtree(folder, ignore_errors=True)

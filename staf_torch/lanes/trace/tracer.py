@@ -15,11 +15,11 @@ from torch import Tensor
 from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes
 
-from .captured import Captured
-from .captured import tensors as _tensors
+from .captured_tensors import Captured
+from .captured_tensors import tensors as _tensors
 from .graph import FLAG, REAL, ROW, WHOLE, WIDE, Graph, Ids
 
-_OWN = (str(Path(__file__).parent), str(Path(torch.__file__).parent))
+_OWN = (str(Path(__file__).parent.parent), str(Path(torch.__file__).parent))
 LARGE = 64  # entries above which an operation on a tensor stays a loop over an array in memory
 _READS = ("_local_scalar_dense", "equal", "is_nonzero", "nonzero", "allclose", "masked_select")
 
@@ -50,7 +50,7 @@ class Tracer(TorchDispatchMode):
 
     Args:
         graph: written.
-        lower: the nodes of what an operation returns, `lowering.lower`.
+        lower: the nodes of what an operation returns, `step.lower`.
         learning: whether somebody may want a derivative with respect to a constant.
         widened: whether the numbers of a float32 program are carried in double.
         folded: whether the numbers of captured tensors become part of the text.

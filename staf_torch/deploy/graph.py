@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 import warnings
 from typing import Any, Literal
 
@@ -12,7 +13,6 @@ from torch.export import Dim, ExportedProgram
 from torch.fx.experimental.proxy_tensor import make_fx
 
 from ..numerics.checks import fail, integer, trailing
-from .float64_constants import lift_numbers
 
 _TRACED = 3  # rows of the batch while tracing: a size that no other dimension is taken for by chance
 
@@ -110,3 +110,46 @@ def _returns_tensor(node: fx.Node) -> bool:
     return isinstance(node.meta.get("val"), Tensor) and not any(
         isinstance(size, torch.SymInt) for size in node.meta["val"].shape
     )
+
+
+_ATEN = torch.ops.aten
+_TENSOR: dict[Any, Any] = {
+    **{getattr(_ATEN, name).Tensor: getattr(_ATEN, name).Tensor for name in ("add", "sub", "mul", "div")},
+    **{getattr(_ATEN, name).Scalar: getattr(_ATEN, name).Tensor for name in ("add", "sub", "mul", "div")},
+    **{getattr(_ATEN, name).Scalar: getattr(_ATEN, name).Tensor for name in ("le", "lt", "ge", "gt")},
+    _ATEN.pow.Tensor_Scalar: _ATEN.pow.Tensor_Tensor,
+}
+"""Operation: the same between tensors."""
+
+
+def lift_numbers(graph: fx.GraphModule) -> fx.GraphModule:
+    """The same graph with the numbers that float32 does not hold exactly as constants of their own."""
+    count = 0
+    for node in list(graph.graph.nodes):
+        inexact = [at for at, value in enumerate(node.args) if isinstance(value, float) and _inexact(value)]
+        if node.target not in _TENSOR or not inexact:
+            continue
+        dtype = next(n.meta["val"].dtype for n in node.all_input_nodes if isinstance(n.meta["val"], Tensor))
+        arguments = list(node.args)
+        for at in inexact:
+            name = f"number_{count}"
+            count += 1
+            value = torch.tensor(arguments[at], dtype=dtype)
+            graph.register_buffer(name, value)
+            with graph.graph.inserting_before(node):
+                constant = graph.graph.get_attr(name)
+            constant.meta["val"] = value
+            arguments[at] = constant
+        node.target, node.args = _TENSOR[node.target], tuple(arguments)
+    graph.recompile()
+    return graph
+
+
+def _inexact(value: float) -> bool:
+    if value != value or value in (float("inf"), float("-inf")):
+        return False
+    try:
+        rounded: float = struct.unpack("f", struct.pack("f", value))[0]
+    except OverflowError:
+        return True
+    return rounded != value

@@ -10,8 +10,7 @@ import torch
 from torch import Tensor, fx, nn
 from torch.fx.experimental.proxy_tensor import make_fx
 
-from staf_torch.lanes.float64_constants import lift_numbers
-from staf_torch.lanes.tracing import fold, trace
+from staf_torch.deploy.graph import fold, lift_numbers, trace
 
 X = torch.tensor([[1.0, -2.0], [0.5, 4.0]], dtype=torch.float64)
 TABLE = torch.arange(4, dtype=torch.float64).view(2, 2)

@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from .entrywise import zeros
+from .entrywise import RULES, numbers, rule, zeros
 from .graph import FLAG, WHOLE, Ids
-from .rules import RULES, numbers, rule
 from .tracer import LARGE, NotLoweredError, Tracer
 
 _FEW = 8  # numbers that need no loop

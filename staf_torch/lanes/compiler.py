@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import atexit
-import contextlib
 import ctypes
 import functools
 import hashlib
@@ -15,15 +13,14 @@ import shutil
 import subprocess
 import tempfile
 import threading
-import time
 from collections.abc import Callable
 from pathlib import Path
+
+from .cache import cache, used
 
 COMPILERS = ("g++", "c++", "clang++")
 """Names that are looked for where `CXX` names none."""
 
-LARGEST = 2**30
-"""Bytes that the cache may hold: a trace is some 15 kilobytes, a library 30."""
 
 _log = logging.getLogger(__name__)
 _FOLDER = Path(__file__).parent
@@ -35,14 +32,10 @@ _OF_PROGRAMS = ("-O2", *_SHARED, "-w", *_ROUNDED_AS_WRITTEN)
 # A long program takes GCC half the time without what looks at all of its loops and branches together.
 _LONG, _OF_LONG = 1500, ("-fira-region=one", "-fno-tree-pre", "-fno-gcse")  # lines
 _SLOW = 6000  # lines from which a user hears of it: some seconds
-_SCRATCH = tempfile.gettempprefix()  # of names under which a file is written at first
-_DAY = 86_400.0
-_LONGEST_UNUSED = 60 * _DAY
 _DIGEST = 32  # bytes at the end of a library in the cache
 _one_at_a_time = threading.Lock()  # threads of a chase ask for the same at the same time
 _said: set[str] = set()  # what has been logged
 _programs: dict[str, Callable[..., None]] = {}  # by their text
-_temporary: dict[int, Path] = {}  # caches, by the process that made them
 
 
 @functools.cache
@@ -68,11 +61,11 @@ def compiled(source: Path, *definitions: str) -> Callable[..., None] | None:
     return call
 
 
-def function(text: str) -> Callable[..., None]:
+def machine_code(text: str) -> Callable[..., None]:
     """Return the entry ``lanes_run`` of a program.
 
     Args:
-        text: C++, of `emission.emit`.
+        text: C++, of `cpp.emit`.
 
     Raises:
         OSError: if there is no compiler, or it refuses the text.
@@ -185,83 +178,3 @@ def _say(name: str, reason: str) -> None:
         _said.add(name)
     if first:
         _log.warning("the %s of a chase runs in plain torch, slower: nothing compiled (%s)", name, reason)
-
-
-# The cache.
-
-
-def cache() -> Path:
-    """Return the folder of libraries and traces: in `XDG_CACHE_HOME`, else in ``~/.cache``.
-
-    Where nothing may be written there, a folder that goes with the process.
-    """
-    home = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
-    folder = Path(home) / "staf_torch"
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        if os.access(folder, os.W_OK):
-            _pruned(folder)
-            return folder
-    except OSError:
-        pass
-    return _cache_of_the_process()
-
-
-def used(path: Path) -> None:
-    """Note that a file of the cache is in use now, which `prune` goes by."""
-    with contextlib.suppress(OSError):  # there is none, or it belongs to somebody else
-        os.utime(path)
-
-
-def prune(folder: Path, *, now: float | None = None, largest: int = LARGEST) -> None:
-    """Delete files of the cache that nobody has used for long, and the oldest while there are too many bytes.
-
-    What was used within a day stays in any case: another process may be about to load it. A library that a
-    process has loaded stays with that process. Names that this library did not give are left alone.
-
-    Args:
-        folder: of the cache.
-        now: in seconds; the present by default.
-        largest: bytes that may stay.
-    """
-    now = time.time() if now is None else now
-    found = list[tuple[float, int, Path]]()
-    for path in folder.iterdir():
-        with contextlib.suppress(OSError):  # deleted by another process
-            state = path.stat()
-            if path.suffix == ".so" or path.name.startswith(("trace-", _SCRATCH)):
-                found.append((state.st_mtime, state.st_size, path))
-    kept = sum(size for _, size, _ in found)
-    for last_use, size, path in sorted(found):
-        unused, left_over = now - last_use, path.name.startswith(_SCRATCH)  # by a process that was killed
-        if unused > _LONGEST_UNUSED or (unused > _DAY and (left_over or kept > largest)):
-            kept -= size
-            if path.is_dir():
-                shutil.rmtree(path, ignore_errors=True)
-            else:
-                path.unlink(missing_ok=True)
-
-
-@functools.cache
-def _pruned(folder: Path) -> None:
-    """Prune a cache once in a process."""
-    try:
-        prune(folder)
-    except OSError as error:
-        _log.debug("the cache %s was not pruned: %s", folder, error)
-
-
-def _cache_of_the_process() -> Path:
-    """Return a folder for this process alone, which is removed with it."""
-    process = os.getpid()
-    folder = _temporary.get(process)
-    if folder is None or not folder.is_dir():  # somebody may have tidied up
-        folder = _temporary[process] = Path(tempfile.mkdtemp(prefix="staf_torch-"))
-        atexit.register(_remove, folder, process)
-    return folder
-
-
-def _remove(folder: Path, process: int) -> None:
-    """Remove a folder where its process ends; a fork of it ends by itself."""
-    if os.getpid() == process:
-        shutil.rmtree(folder, ignore_errors=True)

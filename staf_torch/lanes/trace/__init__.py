@@ -1,0 +1,1 @@
+"""A step of one row, written down: from tensor operations to a scalar program."""

@@ -1,0 +1,275 @@
+"""Dense factorisations of small matrices in plain torch operations that have a scalar form.
+
+What `lower` finds here it traces in place of the operation of torch. Matrices are (..., M, M).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..loops import repeat
+from .tracer import LARGE
+
+
+def in_memory(matrix: Tensor) -> bool:
+    """Whether a matrix is one that stays in memory."""
+    return matrix.shape[-1] * matrix.shape[-2] > LARGE
+
+
+def cholesky(gram: Tensor, *, upper: bool = False, check_errors: bool = False) -> tuple[Tensor, Tensor]:
+    """L with L L' = K, and 0 or, where a pivot is not positive, its place: (...)."""
+    if in_memory(gram):
+        factor, failed = _rolled_cholesky(gram)
+        return factor.mT.clone() if upper else factor, failed
+    rest, columns = gram, []
+    failed = torch.zeros_like(gram[..., 0, 0], dtype=torch.int32)
+    for k in range(gram.shape[-1]):
+        pivot = rest[..., k, k]
+        failed = torch.where((failed == 0) & ~(pivot > 0), k + 1, failed)
+        below = rest[..., k:, k] / pivot.sqrt().unsqueeze(-1)
+        column = torch.cat((torch.zeros_like(gram[..., :k, k]), below), dim=-1)
+        columns.append(column)
+        rest = rest - column.unsqueeze(-1) * column.unsqueeze(-2)
+    factor = torch.stack(columns, dim=-1)
+    return factor.mT.clone() if upper else factor, failed.to(torch.int32)
+
+
+def triangular(
+    matrix: Tensor, right: Tensor, *, upper: bool, left: bool = True, unitriangular: bool = False
+) -> Tensor:
+    """T^-1 B: (..., M, M), (..., M, P); B T^-1 where not ``left``."""
+    if not left:
+        return triangular(matrix.mT, right.mT, upper=not upper, unitriangular=unitriangular).mT.clone()
+    if in_memory(matrix):  # an upper triangle from behind is a lower one
+        flipped = (part.flip(-2) if upper else part for part in (matrix.flip(-1) if upper else matrix, right))
+        solution = _rolled_triangular(*flipped, unitriangular=unitriangular)
+        return solution.flip(-2) if upper else solution
+    size = matrix.shape[-1]
+    found: dict[int, Tensor] = {}
+    for i in reversed(range(size)) if upper else range(size):
+        row = right[..., i, :]
+        for j, known in found.items():
+            row = row - matrix[..., i, j, None] * known
+        found[i] = row if unitriangular else row / matrix[..., i, i, None]
+    return torch.stack([found[i] for i in range(size)], dim=-2)
+
+
+def cholesky_solve(right: Tensor, factor: Tensor, upper: bool = False) -> Tensor:
+    """K^-1 B from a factor of K."""
+    lower = factor.mT if upper else factor
+    return triangular(lower.mT, triangular(lower, right, upper=False), upper=True)
+
+
+def inverse(matrix: Tensor, *, check_errors: bool = False) -> tuple[Tensor, Tensor]:
+    """A^-1, by elimination with pivots of the largest size in a column, and 0: (...)."""
+    size = matrix.shape[-1]
+    identity = torch.eye(size, dtype=matrix.dtype, device=matrix.device).expand_as(matrix)
+    if in_memory(matrix):
+        return solve(matrix, identity)[0], torch.zeros_like(matrix[..., 0, 0], dtype=torch.int32)
+    whole = torch.cat((matrix, identity), dim=-1)
+    for k in range(size):
+        best, chosen = whole[..., k, :], whole[..., k, k].abs()
+        others = []
+        for i in range(k + 1, size):
+            row = whole[..., i, :]
+            larger = (row[..., k].abs() > chosen).unsqueeze(-1)
+            chosen = torch.where(larger.squeeze(-1), row[..., k].abs(), chosen)
+            best, row = torch.where(larger, row, best), torch.where(larger, best, row)
+            others.append(row)
+        best = best / best[..., k, None]
+        above = [whole[..., i, :] for i in range(k)]
+        cleared = [row - row[..., k, None] * best for row in (*above, *others)]
+        whole = torch.stack([*cleared[:k], best, *cleared[k:]], dim=-2)
+    failed = torch.zeros_like(matrix[..., 0, 0], dtype=torch.int32)
+    return whole[..., size:].clone(), failed
+
+
+def solve_definite(matrix: Tensor, right: Tensor) -> Tensor:
+    """M^-1 b for M positive definite, read below its diagonal alone: (..., M, M), (..., M) -> (..., M).
+
+    Row by row: what `lower` meets are short vectors, so that no number goes through memory, and a third of
+    the operations of an elimination of the whole matrix are left.
+    """
+    rows = [matrix[..., i, : i + 1] for i in range(right.shape[-1])]
+    found = list[tuple[Tensor, Tensor]]()  # y_k and l_k in x_k = y_k - l_k'(x_k+1, ...)
+    while len(rows) > 1:
+        column = torch.cat([row[..., :1] for row in rows[1:]], dim=-1)
+        factor, y = column / rows[0], right[..., :1] / rows[0]
+        found.append((y, factor))
+        right = right[..., 1:] - column * y
+        rows = [row[..., 1:] - factor[..., i, None] * column[..., : i + 1] for i, row in enumerate(rows[1:])]
+    x = right / rows[0]
+    for y, factor in reversed(found):
+        x = torch.cat((y - (factor * x).sum(-1, keepdim=True), x), dim=-1)
+    return x
+
+
+def solve(
+    matrix: Tensor, right: Tensor, *, left: bool = True, check_errors: bool = False
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """A^-1 B, by elimination with pivots of the largest size in a column: (..., M, M), (..., M, P).
+
+    B A^-1 where not ``left``, (..., P, M). The factor and the pivots that torch returns besides, for
+    derivatives alone, are not found: NaN and -1. The last is 0, or the place of a pivot that is 0.
+    """
+    if not left:
+        solution, *rest = solve(matrix.mT, right.mT)
+        return solution.mT.clone(), rest[0], rest[1], rest[2]
+    vector = right.dim() == 1 or right.shape == matrix.shape[:-1]  # as torch tells them apart
+    columns = right.unsqueeze(-1) if vector else right
+    size, width = matrix.shape[-1], columns.shape[-1]
+    place = torch.arange(size, dtype=matrix.dtype, device=matrix.device)
+    # Not torch.broadcast_shapes, whose first call imports sympy for half a second.
+    batch = np.broadcast_shapes(matrix.shape[:-2], columns.shape[:-2])
+    both = matrix.expand(*batch, size, size), columns.expand(*batch, size, width)
+    zero = torch.zeros_like(torch.cat(both, dim=-1)[..., 0])
+
+    def eliminate(carry: tuple[Tensor, Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        whole, order, done, failed = carry
+        # The row of the largest entry in column 0, of those that have not been chosen: order is its pass.
+        best = torch.where(order < 0, whole[..., 0].abs(), -1.0).argmax(-1, keepdim=True)
+        chosen = (place == best).unsqueeze(-1)
+        row = torch.where(chosen, whole, 0.0).sum(-2)
+        failed = torch.where((failed == 0) & (row[..., 0] == 0), done + 1, failed)
+        row = (row / row[..., :1]).unsqueeze(-2)
+        whole = torch.where(chosen, row, whole - whole[..., :1] * row)
+        order = torch.where(chosen.squeeze(-1), done.unsqueeze(-1), order)
+        return torch.cat((whole[..., 1:], whole[..., :1]), dim=-1), order, done + 1, failed
+
+    start = torch.cat(both, dim=-1), zero - 1, zero[..., 0], zero[..., 0].clone()
+    whole, order, _, failed = repeat(size, eliminate, start)
+    # After as many passes the columns of B come first; row i holds the unknown of its pass.
+    belongs = order.unsqueeze(-2) == place.unsqueeze(-1)
+    solution = torch.where(belongs.unsqueeze(-1), whole[..., :width].unsqueeze(-3), 0.0).sum(-2)
+    factor, pivots = torch.full_like(matrix, torch.nan), torch.full_like(matrix[..., 0], -1).int()
+    return solution.squeeze(-1) if vector else solution, factor, pivots, failed.int()
+
+
+def orthogonal(matrix: Tensor, mode: str = "reduced") -> tuple[Tensor, Tensor]:
+    """Q and R of a square matrix by Householder's reflections."""
+    if in_memory(matrix):
+        return _rolled_orthogonal(matrix)
+    size = matrix.shape[-1]
+    rest = matrix
+    q = torch.eye(size, dtype=matrix.dtype, device=matrix.device).expand_as(matrix)
+    for k in range(size - 1):
+        column = rest[..., k:, k]
+        length = column.square().sum(-1).sqrt()
+        head = torch.where(column[..., 0] < 0, column[..., 0] - length, column[..., 0] + length)
+        vector = torch.cat((head.unsqueeze(-1), column[..., 1:]), dim=-1)
+        square = vector.square().sum(-1)
+        factor = torch.where(square > 0, 2 / torch.where(square > 0, square, 1.0), 0.0)
+        v = torch.cat((torch.zeros_like(rest[..., :k, k]), vector), dim=-1)
+        scaled = factor.unsqueeze(-1) * v
+        rest = rest - scaled.unsqueeze(-1) * (v.unsqueeze(-1) * rest).sum(-2, keepdim=True)
+        q = q - (q * v.unsqueeze(-2)).sum(-1, keepdim=True) * scaled.unsqueeze(-2)
+    return q.clone(), rest.triu()
+
+
+def _signs_and_pivots(matrix: Tensor) -> tuple[Tensor, Tensor]:
+    """The sign of the permutation, (...), and the pivots, (..., M), of an elimination with row exchanges."""
+    rest, pivots = matrix, []
+    sign = torch.ones_like(matrix[..., 0, 0])
+    while rest.shape[-1]:
+        best = rest[..., 0, :]
+        others = []
+        for i in range(1, rest.shape[-1]):
+            row = rest[..., i, :]
+            larger = row[..., :1].abs() > best[..., :1].abs()
+            sign = torch.where(larger.squeeze(-1), -sign, sign)
+            best, row = torch.where(larger, row, best), torch.where(larger, best, row)
+            others.append(row)
+        pivot = best[..., 0]
+        pivots.append(pivot)
+        below = best[..., 1:] / torch.where(pivot == 0, 1.0, pivot).unsqueeze(-1)
+        cleared = [row[..., 1:] - row[..., :1] * below for row in others]
+        rest = torch.stack(cleared, dim=-2) if cleared else rest[..., :0, :0]
+    return sign, torch.stack(pivots, dim=-1)
+
+
+def determinant(matrix: Tensor) -> Tensor:
+    """det A: (..., M, M) -> (...)."""
+    sign, pivots = _signs_and_pivots(matrix)
+    return sign * pivots.prod(-1)
+
+
+def log_determinant(matrix: Tensor) -> tuple[Tensor, Tensor]:
+    """The sign of det A and log |det A|: (..., M, M) -> (...), (...)."""
+    sign, pivots = _signs_and_pivots(matrix)
+    return sign * pivots.sign().prod(-1), pivots.abs().log().sum(-1)
+
+
+def log_of_determinant(matrix: Tensor) -> Tensor:
+    sign, size = log_determinant(matrix)
+    return torch.where(sign < 0, torch.nan, size)
+
+
+def _rolled_cholesky(gram: Tensor) -> tuple[Tensor, Tensor]:
+    """L with L L' = K, and 0 or, where a pivot is not positive, its place: (..., M, M), (...)."""
+    size = gram.shape[-1]
+    place, zero = _places(gram), torch.zeros_like(gram[..., 0])
+
+    def eliminate(carry: tuple[Tensor, Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        rest, factor, done, failed = carry  # row i is row done + i, cyclically
+        pivot = rest[..., 0, 0]
+        failed = torch.where((failed == 0) & ~(pivot > 0), done + 1, failed)
+        open_ = place < size - done.unsqueeze(-1)
+        column = torch.where(open_, rest[..., 0] / pivot.sqrt().unsqueeze(-1), 0.0)
+        rest = rest - column.unsqueeze(-1) * column.unsqueeze(-2)
+        rest = torch.constant_pad_nd(rest[..., 1:, 1:], [0, 1, 0, 1])
+        factor = torch.cat((factor[..., 1:], column.unsqueeze(-1)), dim=-1)
+        return rest, torch.cat((factor[..., 1:, :], factor[..., :1, :]), dim=-2), done + 1, failed
+
+    start = gram.clone(), torch.zeros_like(gram), zero[..., 0], zero[..., 0].clone()
+    _, factor, _, failed = repeat(size, eliminate, start)
+    return factor, failed.to(torch.int32)
+
+
+def _rolled_triangular(lower: Tensor, right: Tensor, *, unitriangular: bool) -> Tensor:
+    """T^-1 B of a lower triangle: (..., M, M), (..., M, P)."""
+    size = lower.shape[-1]
+    place, done = _places(lower), torch.zeros_like((lower[..., 0, :1] + right[..., 0, :1])[..., 0])
+    batch = done.shape
+
+    def substitute(carry: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+        matrix, rows, done = carry  # row i is row done + i, cyclically
+        found = rows[..., :1, :]
+        found = found if unitriangular else found / matrix[..., :1, :1]
+        open_ = (place < size - done.unsqueeze(-1)).unsqueeze(-1)
+        rows = torch.where(open_, rows - matrix[..., :1] * found, rows)
+        matrix = torch.cat((matrix[..., 1:, :], matrix[..., :1, :]), dim=-2)
+        matrix = torch.cat((matrix[..., 1:], matrix[..., :1]), dim=-1)
+        return matrix, torch.cat((rows[..., 1:, :], found), dim=-2), done + 1
+
+    start = lower.expand(*batch, size, size).clone(), right.expand(*batch, *right.shape[-2:]).clone(), done
+    solution: Tensor = repeat(size, substitute, start)[1]
+    return solution
+
+
+def _rolled_orthogonal(matrix: Tensor) -> tuple[Tensor, Tensor]:
+    """Q and R of a square matrix by Householder's reflections: (..., M, M), (..., M, M)."""
+    size, place = matrix.shape[-1], _places(matrix)
+
+    def reflect(carry: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+        rest, q, done = carry  # column i of the rest is column done + i, cyclically
+        here, open_ = place == done.unsqueeze(-1), place >= done.unsqueeze(-1)
+        column = torch.where(open_, rest[..., 0], 0.0)
+        length = column.square().sum(-1, keepdim=True).sqrt()
+        head = torch.where(column < 0, column - length, column + length)
+        vector = torch.where(here, head, column)
+        square = vector.square().sum(-1, keepdim=True)
+        scaled = torch.where(square > 0, 2 / torch.where(square > 0, square, 1.0), 0.0) * vector
+        rest = rest - scaled.unsqueeze(-1) * (vector.unsqueeze(-1) * rest).sum(-2, keepdim=True)
+        q = q - (q * vector.unsqueeze(-2)).sum(-1, keepdim=True) * scaled.unsqueeze(-2)
+        return torch.cat((rest[..., 1:], rest[..., :1]), dim=-1), q, done + 1
+
+    identity = torch.eye(size, dtype=matrix.dtype, device=matrix.device).expand_as(matrix)
+    start = matrix.clone(), identity.clone(), torch.zeros_like(matrix[..., 0, 0])
+    rest, q, _ = repeat(size - 1, reflect, start)
+    return q, torch.cat((rest[..., 1:], rest[..., :1]), dim=-1).triu()
+
+
+def _places(matrix: Tensor) -> Tensor:
+    return torch.arange(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)

@@ -1,0 +1,214 @@
+"""What a step does with a single row, written down."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+from torch._decomp import decomposition_table
+from torch.overrides import TorchFunctionMode
+
+from ..call import Given
+from ..emit.schedule import Layout
+from ..loops import tracing
+from ..tree import Shared, Tree, flatten, plain
+from . import reductions  # noqa: F401  its rules
+from .captured_tensors import Recipe
+from .decompositions import REPLACEMENTS
+from .eigenvalues import eigen, eigenvalues
+from .entrywise import RULES
+from .factorisations import (
+    cholesky,
+    cholesky_solve,
+    determinant,
+    inverse,
+    log_determinant,
+    log_of_determinant,
+    orthogonal,
+    solve,
+    triangular,
+)
+from .graph import NOW, STEP, Graph
+from .indexing import CHOICES, MOVEMENTS, added_at, many, moved
+from .tracer import NoReading, NotLoweredError, Tracer
+
+RULES["scatter_add"] = added_at
+
+
+def lower(t: Tracer, func: Any, name: str, out: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> Any:
+    """The nodes of what an operation returns: an array, or a list of them.
+
+    Args:
+        t: knows the nodes of the arguments.
+        func: the operation.
+        name: its name without overload.
+        out: what torch returned, for shapes and dtypes.
+        args, kwargs: of the operation.
+
+    Raises:
+        NotLoweredError: if there is no rule.
+    """
+    # What torch's own decompositions end in takes the arguments of the operation of the same name.
+    plain = name if name in REPLACEMENTS else name.removeprefix("prims::")
+    rule = RULES.get(plain)
+    rolled = (
+        len(args) > 2
+        and "reduce" not in kwargs
+        and many(name, *args[:3])
+        and (t.traced(args[2]) or not t.stated(args[2]))
+    )
+    if rule is not None and not rolled:
+        return rule(t, out, *args, **kwargs)
+    if name in MOVEMENTS and not rolled:
+        return moved(t, func, out, args, kwargs)
+    tables: Any = (CHOICES,) if rolled else (FACTORISATIONS, REPLACEMENTS)
+    decomposition = next((table[name] for table in tables if name in table), decomposition_table.get(func))
+    if decomposition is None and func._can_decompose():  # of several operations, also in torch
+        decomposition = func.decompose
+    if decomposition is None:
+        raise NotLoweredError(f"`{func}` has no scalar form here")
+    with t:
+        result = decomposition(*args, **kwargs)
+    parts = [result] if isinstance(result, Tensor) else list(result)
+    nodes = [t.nodes(part) for part in parts]
+    return nodes[0] if isinstance(result, Tensor) else nodes
+
+
+Step = Callable[[Tree, Tree, Tree], tuple[Tree, Tree]]
+
+
+class Traced(NamedTuple):
+    """A program as every back end takes it, and its outputs for one row."""
+
+    program: tuple[Graph, Layout, list[int], list[int]]
+    outputs: tuple[tuple[torch.Size, torch.dtype], ...]
+    structure: Any
+    recipe: Recipe
+
+
+def trace(step: Step, given: Given, *, widened: bool = False, folded: bool = False) -> Traced:
+    """Write down what a step does with a single row.
+
+    Args:
+        step: of the program.
+        given: inputs.
+        widened: whether the numbers of a float32 program are carried in double.
+        folded: whether the numbers of captured tensors become part of the text.
+
+    Raises:
+        NotLoweredError: if an operation has no scalar form.
+    """
+    graph = Graph(given.real == torch.float32 and not widened)
+    learning = torch.is_grad_enabled()
+    tracer = Tracer(graph, lower, learning=learning, widened=widened, folded=folded)
+
+    def inputs(op: str, leaves: Sequence[Any], depth: int, times: int) -> list[Tensor]:
+        traced = []
+        for slot, leaf in enumerate(leaves):
+            at = plain(leaf).detach()
+            at = at if isinstance(leaf, Shared) else at[:1]
+            at = at.select(0 if isinstance(leaf, Shared) else 1, 0) if times else at
+            traced.append(tracer.input(at, op, slot, depth))
+        return traced
+
+    with torch.no_grad():
+        row = given.tree("row", inputs("row", given.row, 0, 0))
+        now = given.tree("now", inputs("now", given.now, NOW, 1))
+        carry = inputs("state", given.carry, STEP, 0)
+        with tracer, tracing(tracer), NoReading(tracer), InPlainTorch(tracer.traced):
+            try:
+                after, out = step(given.tree("carry", carry), now, row)
+            except NotLoweredError:
+                raise
+            except (
+                Exception
+            ) as error:  # of the step itself, which the definition raises again, or of the tracer
+                raise NotLoweredError(f"{type(error).__name__}: {error}") from error
+        ends, structure = flatten(after)
+        if structure != given.structures["carry"] or [(e.shape, e.dtype) for e in ends] != [
+            (c.shape, c.dtype) for c in carry
+        ]:
+            raise NotLoweredError("the step returns a carry of other shapes or dtypes than it was given")
+        leaves, shape = flatten(out)
+        if any(leaf.dim() == 0 or leaf.shape[0] != 1 for leaf in leaves):
+            raise NotLoweredError("an output of the step has no dimension of rows")
+        following = [node for end in ends for node in tracer.nodes(end).ravel().tolist()]
+        outputs = [node for leaf in leaves for node in tracer.nodes(leaf).ravel().tolist()]
+        layout = Layout(
+            [_entries(leaf, 1) for leaf in given.row],
+            [_entries(leaf, 2) for leaf in given.now],
+            [_entries(leaf, 1) for leaf in given.carry],
+            [leaf.numel() for leaf in leaves],
+        )
+    shapes = tuple((leaf.shape[1:], leaf.dtype) for leaf in leaves)
+    return Traced((graph, layout, following, outputs), shapes, shape, tracer.captured.recipe())
+
+
+def _entries(leaf: Any, skip: int) -> int:
+    shape = leaf.tensor.shape[skip - 1 :] if isinstance(leaf, Shared) else leaf.shape[skip:]
+    return shape.numel()
+
+
+def _one_hot(index: Tensor, num_classes: int = -1) -> Tensor:
+    if num_classes < 1:  # torch would read the largest index
+        return torch.nn.functional.one_hot(index, num_classes)
+    return (index.unsqueeze(-1) == torch.arange(num_classes, device=index.device)).to(torch.int64)
+
+
+def _is_finite(x: Tensor) -> Tensor:
+    if not x.is_floating_point():
+        return torch.ones_like(x, dtype=torch.bool)
+    return x.abs() < math.inf  # one comparison, where torch has two
+
+
+class InPlainTorch(TorchFunctionMode):
+    """Context: a few functions of a traced tensor are plain torch operations, where one cannot see any more
+    below, where operations are traced, what was asked for: `eigvalsh` looks like `eigh`, which takes many
+    times as long; the slope of a determinant reads the factors that torch keeps; `one_hot` reads its input;
+    `isfinite` compares twice.
+
+    Args:
+        traced: whether a tensor depends on an input of the program.
+    """
+
+    def __init__(self, traced: Callable[[Tensor], bool]) -> None:
+        super().__init__()
+        self._traced = traced
+
+    def __torch_function__(
+        self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
+    ) -> Any:
+        kwargs = kwargs or {}
+        plain = _PLAIN.get(func)
+        if plain is not None and args and isinstance(args[0], Tensor):
+            wrapped = torch._C._functorch.is_functorch_wrapped_tensor(args[0])
+            if plain is eigenvalues:  # a bisection has no derivative worth the name
+                chosen = not wrapped and len(args) == 1 and not kwargs and self._traced(args[0])
+            else:
+                chosen = wrapped or self._traced(args[0])
+            if chosen:
+                return plain(*args, **kwargs)
+        return func(*args, **kwargs)
+
+
+_PLAIN: dict[Any, Callable[..., Any]] = {
+    torch.linalg.eigvalsh: eigenvalues,
+    torch.nn.functional.one_hot: _one_hot,
+    **dict.fromkeys((torch.isfinite, Tensor.isfinite), _is_finite),
+    **dict.fromkeys((torch.linalg.det, torch.det, Tensor.det), determinant),
+    **dict.fromkeys((torch.linalg.slogdet, torch.slogdet, Tensor.slogdet), log_determinant),
+    **dict.fromkeys((torch.logdet, Tensor.logdet), log_of_determinant),
+}
+
+FACTORISATIONS: dict[str, Callable[..., Any]] = {
+    "linalg_cholesky_ex": cholesky,
+    "linalg_solve_triangular": triangular,
+    "cholesky_solve": cholesky_solve,
+    "linalg_inv_ex": inverse,
+    "_linalg_solve_ex": solve,
+    "linalg_qr": orthogonal,
+    "_linalg_eigh": eigen,
+}
