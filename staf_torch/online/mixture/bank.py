@@ -10,7 +10,6 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-<<<<<<< HEAD:staf_torch/online/mixture/bank.py
 from ...centers import simplex
 from ...kernels import GaussianKernel
 from ...lanes.compiler import compiled
@@ -19,13 +18,6 @@ from ..filter_streams import refuse_other, table_of
 from ..local_functions import LocalFunctions
 from .definition import BankDefinition
 from .rules import (
-=======
-from ..centers import simplex
-from ..kernels import GaussianKernel
-from ..lanes.compiler import compiled
-from .bank_definition import BankDefinition
-from .bank_rules import (
->>>>>>> d8d1576 (Lanes in rooms: trace/ and emit/ beside the program, files that only make sense together merged; exported graphs go to deploy):staf_torch/online/bank.py
     CARRIED_RADIUS,
     CARRIED_WIDTH,
     RECENT,
