@@ -7,13 +7,13 @@ import importlib
 import inspect
 import pickle
 import pkgutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import pytest
 import torch
 from torch import Tensor, nn
-from variants import over
+from variants import CONTROLLERS, KERNELS, PLANTS, SYSTEMS, over
 
 import staf_torch as st
 from staf_torch import adp, systems, targets
@@ -142,8 +142,17 @@ def quadrature(s: float) -> nn.Module:
     return adp.QuadraturePoints(2, 2, s)
 
 
+def listed(made: Iterable[Callable[[], nn.Module]], call: Callable[[Any, Tensor], Tensor]) -> dict[str, Case]:
+    """The package's own variants of a table, by class, with the numbers that they have there."""
+    kinds = {type(make()): make for make in made}
+    own = {kind.__name__: make for kind, make in kinds.items() if kind.__module__.startswith("staf_torch.")}
+    return {name: Case(lambda s, make=make: make(), call, carried=False) for name, make in own.items()}
+
+
 MODULES: dict[str, Case] = {
-    "ExponentialKernel": Case(lambda s: st.ExponentialKernel(), pair, carried=False),
+    **listed((case.make for case in KERNELS.values()), pair),
+    **listed((*SYSTEMS.values(), *PLANTS.values()), flows),
+    **listed(CONTROLLERS.values(), control),
     "GaussianKernel": Case(st.GaussianKernel, pair),
     "MaternKernel": Case(lambda s: st.MaternKernel(2.5, s), pair),
     "InverseMultiquadricKernel": Case(st.InverseMultiquadricKernel, pair),
@@ -182,11 +191,6 @@ MODULES: dict[str, Case] = {
     "TwoStateTracking": Case(lambda s: systems.TwoStateTracking(s * true_parameters()), flows),
     "ExperienceMemory": Case(memory),
     "Linear": Case(lambda s: systems.Linear([[0.0, s], [-s, -0.3]], [[0.0], [s]]), flows),
-    "Oscillator": Case(systems.Oscillator, flows, carried=False),
-    "Pendulum": Case(lambda s: systems.Pendulum(mass=s), flows, carried=False),
-    "PlanarQuadrotor": Case(lambda s: systems.PlanarQuadrotor(mass=s), flows, carried=False),
-    "ThreeState": Case(lambda s: systems.ThreeState(), flows, carried=False),
-    "TwoState": Case(lambda s: systems.TwoState(), flows, carried=False),
     "TwoStateChain": Case(lambda s: systems.TwoStateChain([1.0, s, -0.5, 0.5]), flows),
     "TwoLinkRobot": Case(lambda s: systems.TwoLinkRobot(friction=[s, 1.0, 1.0, 1.0]), flows),
     "Barrier": Case(lambda s: systems.Barrier(systems.TwoState(), -s, [s, None]), flows),
@@ -194,8 +198,6 @@ MODULES: dict[str, Case] = {
         lambda s: systems.Clocked(systems.Linear([[-2 * s]], [[s]])),
         lambda module, x: module.motion(x, x[..., :1]),
     ),
-    "CartPole": Case(lambda s: systems.CartPole(cart=s), flows, carried=False),
-    "VanDerPol": Case(systems.VanDerPol, flows, carried=False),
     "Paper": Case(lambda s: targets.Paper(), carried=False),
     "Quadratic": Case(targets.Quadratic),
     "Cosine": Case(lambda s: targets.Cosine([s, 2 * s], 0.3)),

@@ -16,9 +16,10 @@ from typing import Any, NamedTuple
 import pytest
 import torch
 from helpers_swingup import double_integrator
+from variants import CONTROLLERS
 
 import staf_torch as st
-from staf_torch import adp, envs, optim, predictors, systems, theory
+from staf_torch import adp, envs, kernels, optim, predictors, systems, theory
 from staf_torch.adp.critic.bases import LeadingCoordinates
 from staf_torch.adp.loop.step import ClosedLoop
 from staf_torch.adp.policies.sampled_rollout import SampledRollout
@@ -26,6 +27,7 @@ from staf_torch.adp.problem.held_linear import exact_hold
 from staf_torch.approximation.conditioning import lebesgue_constant, sup_error
 from staf_torch.deploy.approximators import RidgeApproximator
 from staf_torch.envs.episodes import Episodes
+from staf_torch.numerics.registry import variants, without_arguments
 from staf_torch.systems import trajectory
 
 ROOT = Path(st.__file__).parent
@@ -135,16 +137,18 @@ def trajectories(**given: Any) -> Any:
 PLAIN: tuple[Callable[..., Any], ...] = (
     *(adp.QuadraticBasis, st.rings, st.polygon, st.simplex, st.cross_polytope),
     *(st.ConstantRadius, predictors.Tangent, envs.PlantEnv, envs.PlantVectorEnv, envs.classic_control),
-    *(st.GaussianKernel, st.MaternKernel, st.PolynomialKernel, st.RationalQuadraticKernel, optim.FixedStep),
-    *(
-        optim.NormalisedLMS,
-        adp.PolicyIteration,
-        optim.PreconditionedDescent,
-        systems.Oscillator,
-        systems.Pendulum,
-    ),
-    *(systems.PlanarQuadrotor, systems.VanDerPol, systems.CartPole, theory.disc),
+    *(adp.PolicyIteration, theory.disc),
 )
+ROOMS = ((kernels, kernels.Kernel), (optim, optim.UpdateLaw), (systems, systems.Plant))
+VARIANTS = {
+    **{
+        kind.__name__: kind
+        for r, base in ROOMS
+        for kind in without_arguments(variants(r.__name__, base)).values()
+    },
+    **{type(make()).__name__: make for make in CONTROLLERS.values()},
+}
+"""What needs no argument: files of the rooms, and controllers that `tests/variants.py` lists."""
 CALLS: dict[str, Callable[..., Any]] = {
     **{each.__name__: each for each in PLAIN},
     "ActorCritic": of(adp.ActorCritic, adp.QuadraticBasis(2), PLANT, COST, adp.RandomPoints(1, 1.0)),
@@ -373,6 +377,9 @@ ABSENT = {
 NOT_ALONE = {("rings", "count"), ("SampledProblem", "dim"), ("StepPlant", "dim")}
 """Arguments whose least value needs others beside it."""
 EVERY = tuple(rules())
+CALLS |= {
+    name: make for name, make in VARIANTS.items() if name in {rule.call for rule in EVERY} - {*CALLS, *OTHERS}
+}
 RULES = sorted({str(rule): rule for rule in EVERY if rule.call in CALLS}.values())
 
 

@@ -14,6 +14,7 @@ import torch
 from helpers import basis_of, tensor, uniform
 from variants import (
     ACTOR_CRITIC_LAWS,
+    CONTROLLERS,
     COSTS,
     KERNELS,
     LAWS,
@@ -76,6 +77,17 @@ def test_a_plant_declares_units_for_each_coordinate_or_for_all(name: str) -> Non
     assert isinstance(plant.units, Units)
     assert len(plant.units.state.split(", ")) in (1, plant.dim)
     assert plant.spread > 0
+
+
+@over(CONTROLLERS)
+def test_a_control_is_the_same_alone_and_beside_others(name: str) -> None:
+    controller, x = CONTROLLERS[name](), uniform(4, 2)
+    drawn = uniform(4, controller.draws, 2)
+    u, _ = controller.step(x, controller.init(x), drawn, 0.01)
+    for k in range(4):
+        own = slice(k, k + 1)
+        alone, _ = controller.step(x[own], controller.init(x[own]), drawn[own], 0.01)
+        torch.testing.assert_close(u[own], alone)
 
 
 @over(KERNELS)

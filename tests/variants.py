@@ -1,5 +1,5 @@
-"""Every variant of the library, listed once. A new kernel, layout, radius, plant, target, law or predictor is
-added here, and the properties in the test modules then hold it to account."""
+"""Every variant of the library, listed once. A new kernel, layout, radius, plant, target, law, predictor or
+controller is added here, and the properties in the test modules then hold it to account."""
 
 from __future__ import annotations
 
@@ -250,6 +250,9 @@ ACTOR_CRITIC_LAWS: dict[str, Callable[[], adp.ActorCriticLaw]] = {
     "published": adp.Published,
     "frozen": adp.Frozen,
     "policy_iteration": adp.PolicyIteration,
+}
+CONTROLLERS: dict[str, Callable[..., adp.Controller]] = {  # of two states and an input
+    "lqr": lambda: adp.Feedback(adp.LQR(systems.TwoState(), adp.QuadraticCost(1.0, 1.0, 2, 1))),
 }
 
 

@@ -1,4 +1,4 @@
-"""The variants that the files of a folder define."""
+"""The variants that the files of a folder define: no list names them."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import importlib
 import inspect
 import pkgutil
 import sys
+from collections.abc import Mapping
 from typing import Any, TypeVar
 
 _T = TypeVar("_T")
@@ -13,8 +14,6 @@ _T = TypeVar("_T")
 
 def variants(package: str, base: type[_T]) -> dict[str, type[_T]]:
     """Import every file of a package and return the public subclasses of a base, by class name.
-
-    So a variant is a file: no list names it.
 
     Args:
         package: its ``__name__``.
@@ -30,15 +29,20 @@ def variants(package: str, base: type[_T]) -> dict[str, type[_T]]:
     return found
 
 
-def without_arguments(kinds: dict[str, type[_T]]) -> dict[str, type[_T]]:
+def unlisted(names: Mapping[str, Any], base: type[_T]) -> dict[str, type[_T]]:
+    """Return the variants of files of which a package has no name yet, as lines for type checkers give it."""
+    listed = {kind.__module__ for kind in names.values() if inspect.isclass(kind)}
+    found = variants(names["__name__"], base)
+    return {name: kind for name, kind in found.items() if kind.__module__ not in listed}
+
+
+def without_arguments(kinds: Mapping[str, type[_T]]) -> dict[str, type[_T]]:
     """Return the concrete ones of some classes that need no argument, by the name of their file."""
 
     def needs_none(kind: type[Any]) -> bool:
         given = inspect.signature(kind).parameters.values()
-        return all(
-            each.default is not each.empty or each.kind in (each.VAR_POSITIONAL, each.VAR_KEYWORD)
-            for each in given
-        )
+        packed = inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD
+        return all(each.default is not each.empty or each.kind in packed for each in given)
 
     ready = (kind for kind in kinds.values() if not inspect.isabstract(kind) and needs_none(kind))
     return {

@@ -1,5 +1,6 @@
-"""Plants, one a file, and their trajectories."""
+"""Plants, one a file of this folder, and their trajectories."""
 
+from ..numerics.registry import unlisted as _unlisted
 from ..numerics.runge_kutta import runge_kutta_step as runge_kutta_step
 from .barrier import Barrier as Barrier
 from .base import ControlAffineSystem as ControlAffineSystem
@@ -25,5 +26,7 @@ from .two_state_tracking import desired_trajectory as desired_trajectory
 from .user_plants import RatePlant as RatePlant
 from .user_plants import StepPlant as StepPlant
 from .van_der_pol import VanDerPol as VanDerPol
+
+globals().update(_unlisted(globals(), Plant))  # a file is enough; lines above are for type checkers
 
 __all__ = [name for name, value in globals().items() if callable(value) and not name.startswith("_")]

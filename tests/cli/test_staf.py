@@ -14,9 +14,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from command_line import Outcome, environment, run_all
 from composing import settings
 from experiments.test_reference_metrics import CASES
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
 
 import staf_torch
 from staf_torch.cli.staf import config_directory
@@ -58,12 +61,11 @@ CUSTOM = {  # a user's own of every group, in one line
 }
 ELSEWHERE = {word for case in CASES.values() for word in case.split()}  # what runs there, figures and all
 ELSEWHERE |= {"experiment=adp_three_state", "experiment=rivals"}  # tests/experiments has them end to end
+LAWS = {path.stem: OmegaConf.load(path) for path in Path(config_directory(), "optimizer").glob("*.yaml")}
 UNRATED = {  # laws that promise no rate of contraction
-    f"optimizer={law}"
-    for law in (
-        *("barzilai_borwein", "heavy_ball", "jacobi", "nesterov"),
-        *("normalised_lms", "preconditioned_descent", "recursive_least_squares"),
-    )
+    f"optimizer={name}"
+    for name, node in LAWS.items()
+    if name != "custom" and instantiate(node).contraction(torch.ones(())) is None
 }
 ABLATION = ["kernel=exponential", "centers.radius=0.1"]  # of the sweep, what MATH.md has numbers for
 
