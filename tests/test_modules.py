@@ -60,7 +60,7 @@ def near(x: Tensor) -> Tensor:
 def control(module: Any, x: Tensor) -> Tensor:
     uniform = 0.5 * x.new_ones(len(x), max(1, module.draws), x.shape[-1])
     u, carried = module.step(x, module.init(x), uniform, 0.01)
-    return torch.cat([u, carried.critic, carried.actor], -1)
+    return torch.cat([u, *(part.reshape(len(x), -1) for part in module.recorded(carried).values())], -1)
 
 
 def loop(module: Any, x: Tensor) -> Tensor:
@@ -131,7 +131,7 @@ def tracker(s: float) -> nn.Module:
 def tracked(module: Any, x: Tensor) -> Tensor:
     x = torch.cat([x, x.flip(0)], -1)
     u, after = module.step(x, module.init(x), 0.5 * x.new_ones(len(x), 1, 4), 0.01)
-    return torch.cat([u, after.identifier], -1)
+    return torch.cat([u, after.known.theta.flatten(1)], -1)
 
 
 def onwards(t: Tensor) -> Tensor:

@@ -61,7 +61,6 @@ from .estimation.kalman import UnscentedKalman as UnscentedKalman
 from .estimation.measurement import Measured as Measured
 from .loop.controller import LQR as LQR
 from .loop.controller import Controller as Controller
-from .loop.controller import ControllerState as ControllerState
 from .loop.controller import Feedback as Feedback
 from .loop.controller import Supervised as Supervised
 from .loop.simulation import LoopResult as LoopResult

@@ -113,16 +113,15 @@ def export_learning_c(controller: Controller, x0: Tensor, path: Path, *, dt: flo
         ValueError: if the controller optimises on the way, or an operation of it has no C here.
     """
     check_bounded("export_learning_c", controller)
-    first = controller.init(x0[:1])
-    carry = {key: part for key, part in first._asdict().items() if part.numel()}
+    carry = controller.init(x0[:1])
     inputs = {"x": x0[:1]}
     if controller.draws:
         inputs["uniform"] = x0.new_zeros(1, controller.draws, x0.shape[-1])
 
     def step(carry: Tree, now: Tree, row: Tree) -> tuple[Tree, Tree]:
         uniform = row.get("uniform", x0.new_zeros(1, 0, x0.shape[-1]))
-        u, after = controller.step(row["x"], first._replace(**carry), uniform, dt)
-        return {key: getattr(after, key) for key in carry}, (u,)
+        u, after = controller.step(row["x"], carry, uniform, dt)
+        return after, (u,)
 
     return _write(path, Program(step, name="the header"), carry, inputs, ["u"], note)
 

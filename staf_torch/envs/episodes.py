@@ -13,7 +13,8 @@ from gymnasium import spaces
 from torch import Tensor
 
 from .. import systems
-from ..adp import Controller, ControllerState, Cost, Feedback, QuadraticCost
+from ..adp import Controller, Cost, Feedback, QuadraticCost
+from ..adp.loop.controller import Carried
 from ..adp.loop.step import ClosedLoop, LoopState
 from ..numerics.checks import choice, fail, positive_real
 from ..systems import Bounds, ControlAffineSystem, Plant
@@ -109,19 +110,11 @@ def start(
 class _Held(Controller):
     """u = what is carried: whoever steps the environment chooses it."""
 
-    def init(self, x0: Tensor) -> ControllerState:
-        return holding(x0.new_zeros(x0.shape[0], 0))
+    def init(self, x0: Tensor) -> Tensor:
+        return x0.new_zeros(x0.shape[0], 0)
 
-    def step(
-        self, x: Tensor, carried: ControllerState, uniform: Tensor, dt: float
-    ) -> tuple[Tensor, ControllerState]:
-        return carried.actor, carried
-
-
-def holding(u: Tensor) -> ControllerState:
-    """A controller's state that carries the control u (B, m) and nothing else."""
-    empty = u.new_zeros(u.shape[0], 0)
-    return ControllerState(empty, u, u.new_zeros(u.shape[0], 0, 0), empty)
+    def step(self, x: Tensor, carried: Tensor, uniform: Tensor, dt: float) -> tuple[Tensor, Tensor]:
+        return carried, carried
 
 
 class Episodes:
@@ -188,9 +181,7 @@ class Episodes:
         if u.shape != wanted:
             raise fail("Episodes.step", "u", f"must have the shape {wanted}", tuple(u.shape))
         alive = torch.ones_like(self.age, dtype=torch.bool)
-        before = LoopState(
-            self.state, self.state.new_zeros(len(u)), alive, self.age, holding(u.to(self.state))
-        )
+        before = LoopState(self.state, self.state.new_zeros(len(u)), alive, self.age, u.to(self.state))
         with torch.no_grad():
             after, _ = self.loop(before, self.state.new_zeros(len(u), 0, self.state.shape[1]))
         self.state = after.x
@@ -241,7 +232,7 @@ class Agent:
         self.controller = controller if isinstance(controller, Controller) else Feedback(controller)
         self.dt, self.seed = positive_real("Agent", "dt", dt), seed
         self.state, self.action = state, action
-        self._carried: ControllerState | None = None
+        self._carried: Carried | None = None
         self._generators: list[torch.Generator] = []
 
     def begin(self) -> None:

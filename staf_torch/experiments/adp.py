@@ -17,7 +17,6 @@ from torch import Tensor
 from ..adp import (
     ActorCritic,
     Controller,
-    ControllerState,
     Cost,
     Gains,
     LoopResult,
@@ -31,6 +30,7 @@ from ..adp.problem.held_linear import HeldLoop
 from ..figures.animation import animate
 from ..figures.closed_loop import AdpHistory, draw_adp
 from ..figures.style import images
+from ..lanes.tree import flatten, unflatten
 from ..metrics.closed_loop import adp_metrics
 from ..numerics.angles import wrap
 from ..results.progress import SHOWN, Progress
@@ -164,11 +164,9 @@ def _frozen(problem: AdpProblem, result: LoopResult, row: int) -> Callable[[Tens
     """u(x) of the controller with what it had learned at the end of a row."""
 
     def policy(x: Tensor) -> Tensor:
-        parts = (result.critic_weights, result.actor_weights, result.identifier)
-        critic, actor, known = (part[row, -1].expand(len(x), -1) for part in parts)
-        gain = torch.eye(critic.shape[-1], dtype=x.dtype).expand(len(x), -1, -1)
+        leaves, structure = flatten(result.carried)
+        carried = unflatten(structure, (part[row].expand(len(x), *part.shape[1:]) for part in leaves))
         drawn = x.new_zeros(len(x), problem.controller.draws, x.shape[-1])
-        carried = ControllerState(critic, actor, gain, known)
         return problem.controller.step(x, carried, drawn, problem.dt)[0]
 
     return policy
@@ -192,7 +190,7 @@ def simulate_together(
     """
     first = problems[0]
     rows = [len(problem.initial_states) for problem in problems]
-    together = simulate(
+    return simulate(
         _stacked([problem.controller for problem in problems], rows),
         first.system,
         first.cost,
@@ -206,10 +204,7 @@ def simulate_together(
         integrator=first.integrator,
         compile=first.compile,
         progress=progress,
-    )
-    fields = [field.name for field in dataclasses.fields(together) if field.name != "time"]
-    parts = zip(*(getattr(together, name).split(rows) for name in fields), strict=True)
-    return [LoopResult(together.time, **dict(zip(fields, part, strict=True))) for part in parts]
+    ).split(rows)
 
 
 def _stacked(controllers: Sequence[Controller], rows: Sequence[int]) -> Controller:

@@ -41,7 +41,6 @@ from .scenes import animation_kind, tracking_scene
 from .study import Method, write_history
 
 _log = logging.getLogger(__name__)
-_PARAMETERS = 6
 _HORIZON, _INTERVALS = 8.0, 160  # of direct shooting: the error has fallen to 1e-5 of itself
 
 
@@ -132,9 +131,7 @@ def _controllers(cfg: DictConfig, plant: TwoStateTracking, cost: QuadraticCost) 
 
 def _parameters(result: LoopResult) -> Tensor | None:
     """theta^ at the recorded times, (B, T, 3, 2); None where nothing is identified."""
-    if result.identifier.shape[-1] == 0:
-        return None
-    return result.identifier[..., :_PARAMETERS].reshape(*result.identifier.shape[:2], 3, 2)
+    return result.recorded.get("theta")
 
 
 def _errors(result: LoopResult) -> Tensor:

@@ -264,25 +264,23 @@ def _measured(case: Case, result: LoopResult, best: Tensor | None) -> dict[str, 
 
 def _learned(case: Case, result: LoopResult) -> dict[str, float | None]:
     """When the adaptive policy had found the plant, in the median, and its largest error at the end."""
-    now = case.adaptive.adaptation(result.identifier)
     if case.adaptive.law.alarm is None:  # found: the model is certain enough for the first time
-        found = (now.certain.cumsum(1) == 0).sum(1) * (result.time[1] - result.time[0])
+        found = (result["certain"].cumsum(1) == 0).sum(1) * (result.time[1] - result.time[0])
     else:
-        alarmed = now.alarmed_at[:, -1]
+        alarmed = result["alarmed_at"][:, -1]
         found = torch.where(alarmed < 0, torch.inf, alarmed - case.at.to(alarmed))
-    error = (now.estimate.theta[:, -1] - case.after).abs() / case.after.abs().clamp(min=1.0)
+    error = (result["theta"][:, -1] - case.after).abs() / case.after.abs().clamp(min=1.0)
     return {"found_median": float(found.median()), "parameter_error": float(error.max())}
 
 
 def _picture(case: Case, results: dict[str, LoopResult]) -> FaultPicture:
     n, adaptive = case.x0.shape[-1], results["adaptive"]
-    now = case.adaptive.adaptation(adaptive.identifier)
     time = adaptive.time.numpy()
     truth = torch.where((adaptive.time < case.at[0])[:, None], case.before[0], case.after[0])
     return FaultPicture(
         time=time,
         norms={name: result.state[0, :, :n].norm(dim=-1).numpy() for name, result in results.items()},
-        parameters=now.estimate.theta[0].numpy(),
+        parameters=adaptive["theta"][0].numpy(),
         truth=truth.numpy(),
-        certain=now.certain[0].numpy() > 0,
+        certain=adaptive["certain"][0].numpy() > 0,
     )

@@ -100,7 +100,7 @@ def _followed(cfg: DictConfig, plant: ParametricPlant, gains: dict[str, Tensor],
         every=every,
         seed=integer(COMMAND_LINE, "seed", cfg.seed, least=0),
     )
-    theta = tracker.tracking(result.identifier).theta.clone()  # without the stacks beside it
+    theta = result["theta"]
     error = result.state[..., :2] - reference(result.state)[0]
     return Followed(result.time, error, theta, int(result.diverged.sum()))
 

@@ -177,7 +177,7 @@ def _estimate(controller: Controller, points: Tensor, x: Tensor, critic: Tensor)
         around = x.unsqueeze(-2).expand(points.shape)
         estimate: Tensor = (inner.basis(points, around) * critic.unsqueeze(-2)).sum(-1)
         return estimate
-    return inner.value(points, inner.init(points[:, 0]))
+    return inner.value(points, {})
 
 
 def _known(problem: AdpProblem, x: Tensor) -> Tensor:

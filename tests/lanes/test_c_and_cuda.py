@@ -251,7 +251,7 @@ def test_the_errors_around_states_on_a_device_stay_there(kernel: Any, radius: An
     assert {(part.device.type, tuple(part.shape)) for part in errors} == {("meta", (3, 6))}
 
 
-@pytest.mark.parametrize("law", [adp.laws.Information, adp.laws.Published])
+@pytest.mark.parametrize("law", [adp.Information, adp.Published])
 def test_a_learning_closed_loop_on_a_device_stays_there(law: Any) -> None:
     plant, cost = systems.TwoState(), adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
     following = centers.StateFollowingCenters(DIRECTIONS, centers.StateRadius(0.7, 1e-5))

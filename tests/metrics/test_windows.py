@@ -188,12 +188,12 @@ def test_of_a_window_after_the_end_there_is_nothing(settle: float, ends: bool) -
 
 
 def loop(diverged: tuple[int, ...] = (), times: int = 21) -> LoopResult:
-    state, none = some(4, times, 4, seed=30), torch.zeros(4, times, 0).double()
+    state = some(4, times, 4, seed=30)
     state[0, -1], state[1, -1], state[2, -1] = 0.0, 0.0, 5e-4  # the norm of the third is 1e-3, not below
     frozen, paid = torch.full((4,), math.inf).double(), torch.zeros(4, times).double()
     frozen[list(diverged)], paid[:, -1] = 0.5, torch.tensor([3.0, 1.0, 2.0, 8.0]).double()
     time, u = torch.arange(times).double(), torch.zeros(4, times, 1).double()
-    return LoopResult(time, state, u, none, none, paid, none, frozen)
+    return LoopResult(time, state, u, paid, {}, frozen)
 
 
 @pytest.mark.parametrize("diverged", [(), (1,), (0, 2, 3)])

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import abc
 import copy
-from typing import Any, NamedTuple
+from collections.abc import Mapping
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -13,8 +13,8 @@ from ...numerics.checks import fail, positive_real
 from ...systems.two_state_tracking import TwoStateTracking, feedforward, parametric_drift, regressor
 from ..critic.actor_critic import ActorCritic
 from ..critic.bellman import BellmanTerms
-from ..loop.carried import pack, unpack
-from ..loop.controller import Controller, ControllerState, Policy
+from ..critic.laws import Weights
+from ..loop.controller import Controller, Policy
 from ..problem.cost import matvec
 from .history_stack import ConcurrentLearning, Identified
 from .least_squares import Estimate, LeastSquares
@@ -22,42 +22,23 @@ from .parametric import ParametricPlant
 from .windows import IntegralWindows, Window
 
 
-class IdentifyingActorCritic(Controller, abc.ABC):
-    """`ActorCritic` on the model of the moment, with what is known of the plant in the carried identifier."""
-
-    def __init__(self, learner: ActorCritic) -> None:
-        super().__init__()
-        self.learner, self.draws = learner, learner.draws
-        self._like: Any = None  # what is carried, of one row
-
-    @abc.abstractmethod
-    def start(self, x0: Tensor) -> Any:
-        """What is known of the plant at first, a tree with a row each of (B, n)."""
-
-    def knowledge(self, identifier: Tensor) -> Any:
-        """What the rows of `LoopResult.identifier` say, (..., K)."""
-        return unpack(self._like, identifier, 1)
-
-    def value(self, x: Tensor, carried: ControllerState) -> Tensor | None:
-        return self.learner.value(x, carried)
-
-
 class LearnedModel(NamedTuple):
-    """What an `AdaptiveActorCritic` knows of the plant, a row a trajectory.
+    """What an `AdaptiveActorCritic` carries, a row a trajectory.
 
     Example:
         >>> adp.LearnedModel._fields
-        ('estimate', 'certain', 'window')
+        ('weights', 'estimate', 'certain', 'window')
 
         Shown by `tests/adp/adaptation/test_adaptive_policies.py`.
     """
 
+    weights: Weights
     estimate: Estimate
     certain: Tensor  # (...) 1 where the weights move, 0 where they wait
     window: Window
 
 
-class AdaptiveActorCritic(IdentifyingActorCritic):
+class AdaptiveActorCritic(Controller):
     """`ActorCritic` on the model x' = h + Y theta^ of the moment, whose weights wait while that is in doubt.
 
     At the state and at every extrapolated point y the Bellman equation says that V^ falls by the cost rate
@@ -85,8 +66,7 @@ class AdaptiveActorCritic(IdentifyingActorCritic):
         >>> control = adp.AdaptiveActorCritic(learner, plant, adp.IntegralWindows(plant, 0.02), law)
         >>> x0 = torch.tensor([[1.0, 0.0]]).double()
         >>> run = adp.simulate(control, plant, cost, x0, dt=0.02, steps=50)
-        >>> now = control.knowledge(run.identifier)
-        >>> now.estimate.theta[0, -1].round(decimals=2), now.certain[0, [0, -1]]
+        >>> run["theta"][0, -1].round(decimals=2), run["certain"][0, [0, -1]]
         (tensor([0.3000], dtype=torch.float64), tensor([0., 1.], dtype=torch.float64))
 
         Shown by `tests/adp/adaptation/test_adaptive_policies.py`.
@@ -116,7 +96,8 @@ class AdaptiveActorCritic(IdentifyingActorCritic):
         confidence: float = 3.0,
         share: float = 0.1,
     ) -> None:
-        super().__init__(learner)
+        super().__init__()
+        self.learner, self.draws = learner, learner.draws
         if model.dim != learner.basis.dim:
             rule = f"must have the {learner.basis.dim} states of the learner's basis"
             raise fail("AdaptiveActorCritic", "model", rule, model.dim)
@@ -127,7 +108,6 @@ class AdaptiveActorCritic(IdentifyingActorCritic):
         self.confidence = positive_real("AdaptiveActorCritic", "confidence", confidence)
         self.share = positive_real("AdaptiveActorCritic", "share", share)
         self.known: Estimate | None = None
-        self._like = self.start(torch.zeros(1, learner.basis.dim, dtype=torch.float64))
 
     def knowing(self, estimate: Estimate) -> AdaptiveActorCritic:
         """A copy that begins with what an episode has learned of theta, of one row (p,) or of each (B, p)."""
@@ -135,37 +115,39 @@ class AdaptiveActorCritic(IdentifyingActorCritic):
         other.known = estimate
         return other
 
-    def init(self, x0: Tensor) -> ControllerState:
-        return self.learner.init(x0)._replace(identifier=pack(self.start(x0), 1))
-
-    def start(self, x0: Tensor) -> LearnedModel:
+    def init(self, x0: Tensor) -> LearnedModel:
         estimate = self.law.init(x0)
         if self.known is not None:
             pairs = zip(self.known, estimate, strict=True)
             estimate = Estimate(*(part.to(x0).expand(like.shape).clone() for part, like in pairs))
-        return LearnedModel(estimate, torch.zeros_like(x0[..., 0]), self.windows.init(x0))
+        return LearnedModel(
+            self.learner.init(x0), estimate, torch.zeros_like(x0[:, 0]), self.windows.init(x0)
+        )
 
-    def step(
-        self, x: Tensor, carried: ControllerState, uniform: Tensor, dt: float
-    ) -> tuple[Tensor, ControllerState]:
-        now = self.knowledge(carried.identifier)
+    def recorded(self, carried: LearnedModel) -> dict[str, Tensor]:
+        weights, estimate, certain, _ = carried
+        return {**self.learner.recorded(weights), **estimate.recorded(), "certain": certain}
+
+    def step(self, x: Tensor, now: LearnedModel, uniform: Tensor, dt: float) -> tuple[Tensor, LearnedModel]:
         window, equation = self.windows.step(now.window, x, dt)
-        estimate = self.law.step(now.estimate, equation, dt)
+        estimate, weights = self.law.step(now.estimate, equation, dt), now.weights
         if self.law.alarm is not None:
             anew = estimate.resets > now.estimate.resets
-            carried = _chosen(anew, self.learner.init(x), carried)
+            weights = _chosen(anew, self.learner.init(x), weights)
         model = self.model.believing(estimate.theta.unsqueeze(-2))  # one a row, for all its points
-        terms = self.learner.terms(x, carried.actor, uniform, model)
-        certain = self.certain(x, carried.critic, uniform, terms, estimate)
-        moved = _chosen(certain, self.learner.moved(terms, carried, dt), carried)
+        terms = self.learner.terms(x, weights.actor, uniform, model)
+        certain = self.certain(x, weights.critic, uniform, terms, estimate)
+        weights = _chosen(certain, self.learner.moved(terms, weights, dt), weights)
         u = terms.control[..., 0, :]
         if self.robust is not None:
             u = torch.where(certain.unsqueeze(-1), u, self.robust(x))
         bounds = self.learner.cost.bounds
         if bounds is not None:  # what the actuator will give, which the window must know
             u = bounds.clip(u)
-        after = LearnedModel(estimate, certain.to(x), self.windows.holding(window, u))
-        return u, moved._replace(identifier=pack(after, x.dim() - 1))
+        return u, LearnedModel(weights, estimate, certain.to(x), self.windows.holding(window, u))
+
+    def value(self, x: Tensor, recorded: Mapping[str, Tensor]) -> Tensor:
+        return self.learner.value(x, recorded)
 
     def certain(
         self, x: Tensor, critic: Tensor, uniform: Tensor, terms: BellmanTerms, estimate: Estimate
@@ -186,16 +168,22 @@ class AdaptiveActorCritic(IdentifyingActorCritic):
         return (self.confidence**2 * variance < (self.share * terms.rate).square()).all(-1)
 
 
-def _chosen(where: Tensor, one: ControllerState, other: ControllerState) -> ControllerState:
+def _chosen(where: Tensor, one: Weights, other: Weights) -> Weights:
     """The weights of one where it says so, those of the other elsewhere."""
-    critic, actor, gain = (
-        torch.where(where[(..., *[None] * (new.dim() - where.dim()))], new, old)
-        for new, old in zip(one[:3], other[:3], strict=True)
+    pairs = zip(one, other, strict=True)
+    return Weights(
+        *(torch.where(where[(..., *[None] * (new.dim() - where.dim()))], new, old) for new, old in pairs)
     )
-    return ControllerState(critic, actor, gain, other.identifier)
 
 
-class IdentifyingTracker(IdentifyingActorCritic):
+class Identifying(NamedTuple):
+    """What an `IdentifyingTracker` carries."""
+
+    weights: Weights
+    known: Identified
+
+
+class IdentifyingTracker(Controller):
     """`ActorCritic` on the model theta^ of the moment, and u = mu + ud(theta^).
 
     The plant takes mu measured from the ud of the true theta, so this returns mu + ud(theta^) - ud(theta):
@@ -210,7 +198,7 @@ class IdentifyingTracker(IdentifyingActorCritic):
         >>> tracker = adp.IdentifyingTracker(learner, plant, adp.ConcurrentLearning(3, 2), unknown)
         >>> x0 = torch.tensor([[-0.1, 0.1, 0.0, 1.0]]).double()  # e and xd
         >>> run = adp.simulate(tracker, plant, cost, x0, dt=0.005, steps=10)
-        >>> tracker.knowledge(run.identifier).theta.shape
+        >>> run["theta"].shape
         torch.Size([1, 11, 3, 2])
 
         Shown by `staf experiment=adp_tracking`.
@@ -225,33 +213,30 @@ class IdentifyingTracker(IdentifyingActorCritic):
     def __init__(
         self, learner: ActorCritic, plant: TwoStateTracking, identifier: ConcurrentLearning, theta: Tensor
     ) -> None:
-        super().__init__(learner)
+        super().__init__()
+        self.learner, self.draws = learner, learner.draws
         self.plant, self.identifier = plant, identifier
         self.model = TwoStateTracking(theta)
         self.register_buffer("first", self.model.theta)
         self.first: Tensor
-        self._like = self.start(torch.zeros(1, 4, dtype=torch.float64))
 
-    def init(self, x0: Tensor) -> ControllerState:
-        return self.learner.init(x0)._replace(identifier=pack(self.start(x0), 1))
+    def init(self, x0: Tensor) -> Identifying:
+        first = self.first.to(x0).repeat(len(x0), 1, 1)
+        return Identifying(self.learner.init(x0), self.identifier.init(first))
 
-    def start(self, x0: Tensor) -> Identified:
-        return self.identifier.init(self.first.to(x0).repeat(len(x0), 1, 1))
+    def recorded(self, carried: Identifying) -> dict[str, Tensor]:
+        return {**self.learner.recorded(carried.weights), "theta": carried.known.theta}
 
-    def step(
-        self, x: Tensor, carried: ControllerState, uniform: Tensor, dt: float
-    ) -> tuple[Tensor, ControllerState]:
-        known = self.identified(carried)
+    def step(self, x: Tensor, carried: Identifying, uniform: Tensor, dt: float) -> tuple[Tensor, Identifying]:
+        weights, known = carried
         model = self.model.believing(known.theta.unsqueeze(-3))  # one theta a row, for all its points
-        terms = self.learner.terms(x, carried.actor, uniform, model)
+        terms = self.learner.terms(x, weights.actor, uniform, model)
         state, desired = x[..., :2] + x[..., 2:], x[..., 2:]
         excess = feedforward(desired, known.theta) - feedforward(desired, self.plant.theta)
         measured = parametric_drift(self.plant.theta, state)
         known = self.identifier.step(known, regressor(state), measured, dt)
-        after = self.learner.moved(terms, carried, dt)._replace(identifier=pack(known, x.dim() - 1))
-        return terms.control[..., 0, :] + excess.unsqueeze(-1), after
+        u = terms.control[..., 0, :] + excess.unsqueeze(-1)
+        return u, Identifying(self.learner.moved(terms, weights, dt), known)
 
-    def identified(self, carried: ControllerState) -> Identified:
-        """The identifier's part of what the controller carries."""
-        found: Identified = self.knowledge(carried.identifier)
-        return found
+    def value(self, x: Tensor, recorded: Mapping[str, Tensor]) -> Tensor:
+        return self.learner.value(x, recorded)

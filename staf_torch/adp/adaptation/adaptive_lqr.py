@@ -10,14 +10,13 @@ from torch import Tensor
 
 from ...numerics.checks import fail, non_negative, positive_real, real
 from ...numerics.riccati import product
-from ..loop.carried import pack, unpack
-from ..loop.controller import LQR, Controller, ControllerState, Policy
+from ..loop.controller import LQR, Controller, Policy
 from ..policies.rollout import RolloutPolicy
 from ..problem.cost import Cost, matvec, quadratic
 from .consider import Considered, ConsiderFilter
 from .least_squares import Estimate, LeastSquares
 from .parametric import ParametricPlant
-from .redesign import Doubling, Redesign
+from .redesign import Design, Redesign
 from .windows import IntegralWindows, Window
 
 
@@ -31,8 +30,7 @@ class Adaptation(NamedTuple):
         >>> control = adp.AdaptiveLQR(plant, cost, adp.IntegralWindows(plant, 0.02), law)
         >>> x0 = torch.tensor([[0.5, 0.0]]).double()
         >>> run = adp.simulate(control, plant, cost, x0, dt=0.01, steps=40)
-        >>> now = control.adaptation(run.identifier)
-        >>> now.estimate.theta[0, -1].round(decimals=3), now.certain[0, [0, -1]]
+        >>> run["theta"][0, -1].round(decimals=3), run["certain"][0, [0, -1]]
         (tensor([1.], dtype=torch.float64), tensor([0., 1.], dtype=torch.float64))
 
         Shown by `staf experiment=faults`.
@@ -43,9 +41,7 @@ class Adaptation(NamedTuple):
     alarmed_at: Tensor  # (...) s, when the plant was last found to be another one; -1: never
     time: Tensor  # (...) s
     window: Window
-    doubling: Doubling
-    stage: Tensor  # (...) doublings done of the design that is under way
-    p: Tensor  # (..., n, n) of the design that is used
+    design: Design
     belief: Considered | None = None  # of the state, where it is filtered
 
 
@@ -74,7 +70,7 @@ class AdaptiveLQR(Controller):
         >>> law = adp.LeastSquares([0.3, 0.6], deviation=[0.3, 0.5])
         >>> control = adp.AdaptiveLQR(plant, cost, adp.IntegralWindows(plant, 0.05), law)
         >>> run = adp.simulate(control, plant, cost, torch.tensor([[0.5, 0.0]]).double(), dt=0.02, steps=150)
-        >>> control.adaptation(run.identifier).estimate.theta[0, -1].round(decimals=2)
+        >>> run["theta"][0, -1].round(decimals=2)
         tensor([0.1000, 1.0000], dtype=torch.float64)
 
         Shown by `staf experiment=faults`.
@@ -127,7 +123,6 @@ class AdaptiveLQR(Controller):
         self.family = model.family(self.cost.target, self.cost.target_input)
         self.robust: Policy = LQR(model.believing(law.first), cost) if robust is None else robust
         self.theta: Tensor | None = None
-        self._like = self._start(torch.zeros(1, int(model.dim or 0), dtype=torch.float64), None)
 
     def starting_from(self, theta: Tensor) -> AdaptiveLQR:
         """A copy whose rows have first estimates of their own, (B, p)."""
@@ -135,24 +130,22 @@ class AdaptiveLQR(Controller):
         other.theta = theta
         return other
 
-    def init(self, x0: Tensor) -> ControllerState:
-        none = x0.new_zeros(len(x0), 0)
-        start = pack(self._start(x0, self.theta), 1)
-        return ControllerState(none, none, x0.new_zeros(len(x0), 0, 0), start)
+    def init(self, x0: Tensor) -> Adaptation:
+        zero, filter = x0.new_zeros(len(x0)), self.filter
+        estimate, window = self.law.init(x0, self.theta), self.windows.init(x0)
+        belief = None if filter is None else filter.init(x0)
+        return Adaptation(estimate, zero, zero - 1, zero.clone(), window, Design.init(x0), belief)
 
-    def adaptation(self, identifier: Tensor) -> Adaptation:
-        """What the rows of `LoopResult.identifier` say, (..., K)."""
-        found: Adaptation = unpack(self._like, identifier, 1)
-        return found
+    def recorded(self, carried: Adaptation) -> dict[str, Tensor]:
+        own = {"certain": carried.certain, "alarmed_at": carried.alarmed_at}
+        return {**carried.estimate.recorded(), **own}
 
-    def step(
-        self, x: Tensor, carried: ControllerState, uniform: Tensor, dt: float
-    ) -> tuple[Tensor, ControllerState]:
-        now = self.adaptation(carried.identifier)
+    def step(self, x: Tensor, now: Adaptation, uniform: Tensor, dt: float) -> tuple[Tensor, Adaptation]:
         window, equation = self.windows.step(now.window, x, dt)
         estimate = self.law.step(now.estimate, equation, dt)
         a, b = self.family.at(estimate.theta)
-        doubling, stage, p = self.redesign.step(now.doubling, now.stage, now.p, a, b)
+        design = self.redesign.step(now.design, a, b)
+        p = design.p
         k = product(product(self.cost.r_inverse.to(b), b.mT), p)
         certain = self.redesign.solved(p, a, b) & (self.doubt(estimate.covariance, p, k) < 1)
         belief = now.belief
@@ -166,35 +159,9 @@ class AdaptiveLQR(Controller):
         if self.cost.bounds is not None:  # what the actuator will give, which the window must know
             u = self.cost.bounds.clip(u)
         alarmed = estimate.resets > now.estimate.resets
-        after = Adaptation(
-            estimate,
-            certain.to(x),
-            torch.where(alarmed, now.time, now.alarmed_at),
-            now.time + dt,
-            self.windows.holding(window, u),
-            doubling,
-            stage,
-            p,
-            belief,
-        )
-        return u, carried._replace(identifier=pack(after, x.dim() - 1))
-
-    def _start(self, x: Tensor, theta: Tensor | None) -> Adaptation:
-        estimate = self.law.init(x, theta)
-        square = x.new_zeros(len(x), x.shape[-1], x.shape[-1])
-        zero = x.new_zeros(len(x))
-        empty = Doubling(square, square.clone(), square.clone())
-        return Adaptation(
-            estimate,
-            zero,
-            zero - 1,
-            zero.clone(),
-            self.windows.init(x),
-            empty,
-            zero.clone(),
-            square.clone(),
-            None if self.filter is None else self.filter.init(x),
-        )
+        alarmed_at = torch.where(alarmed, now.time, now.alarmed_at)
+        window = self.windows.holding(window, u)
+        return u, Adaptation(estimate, certain.to(x), alarmed_at, now.time + dt, window, design, belief)
 
     def doubt(self, covariance: Tensor, p: Tensor, k: Tensor) -> Tensor:
         """c^2 sum_ij C_ij tr(W^-1 M_i W^-1 M_j) of a covariance and a design: below 1 it is certain, (...).

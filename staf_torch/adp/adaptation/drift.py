@@ -15,11 +15,10 @@ from ...numerics.checks import fail, non_negative, positive_real, real
 from ...numerics.linalg import row_jacobian
 from ...numerics.riccati import product
 from ...systems import ControlAffineSystem
-from ..loop.carried import pack, unpack
-from ..loop.controller import LQR, Controller, ControllerState, Policy
+from ..loop.controller import LQR, Controller, Policy
 from ..problem.cost import Cost, matvec, quadratic
 from .parametric import ParametricPlant
-from .redesign import Doubling, Redesign
+from .redesign import Design, Redesign
 from .windows import Equation, IntegralWindows, Window
 
 _NODES = (0.06943184420297371, 0.33000947820757187, 0.6699905217924281, 0.9305681557970262)
@@ -262,9 +261,7 @@ class DriftAdaptation(NamedTuple):
     estimate: DriftEstimate
     certain: Tensor  # (...) 1 where the learned model has the control, 0 where the robust policy has it
     window: Window
-    doubling: Doubling
-    stage: Tensor  # (...) doublings done of the design that is under way
-    p: Tensor  # (..., n, n) of the design that is used
+    design: Design
 
 
 class DriftLQR(Controller):
@@ -274,7 +271,7 @@ class DriftLQR(Controller):
         certain:  2 c s |(Pe)_rows| < e'We,   e = x - x_s,   W = Q + K'RK,
 
     with s the standard deviation of the drift at x: e'Pe falls at x for every drift within c deviations. The
-    robust policy has the control elsewhere; `DriftAdaptation.certain` says where.
+    robust policy has the control elsewhere; `LoopResult` records it as ``certain``.
 
     Example:
         >>> known = systems.Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
@@ -283,8 +280,7 @@ class DriftLQR(Controller):
         >>> control = adp.DriftLQR(drift, cost)
         >>> x0 = torch.tensor([[1.0, 0.0]]).double()
         >>> run = adp.simulate(control, systems.Pendulum(), cost, x0, dt=0.02, steps=150)
-        >>> now = control.adaptation(run.identifier)
-        >>> now.certain[0, [0, -1]], bool(run.state[0, -1].norm() < 0.05)
+        >>> run["certain"][0, [0, -1]], bool(run.state[0, -1].norm() < 0.05)
         (tensor([0., 1.], dtype=torch.float64), True)
 
         Shown by `tests/adp/adaptation/test_stream_drift.py`.
@@ -319,27 +315,24 @@ class DriftLQR(Controller):
         self.confidence = positive_real("DriftLQR", "confidence", confidence)
         self.redesign = Redesign.of("DriftLQR", self.cost, doublings, a_step)
         self.robust: Policy = LQR(drift.known, cost) if robust is None else robust
-        self._like = self._start(torch.zeros(1, int(drift.known.dim or 0), dtype=torch.float64))
 
-    def init(self, x0: Tensor) -> ControllerState:
-        none = x0.new_zeros(len(x0), 0)
-        return ControllerState(none, none, x0.new_zeros(len(x0), 0, 0), pack(self._start(x0), 1))
+    def init(self, x0: Tensor) -> DriftAdaptation:
+        windows = self.drift.windows.init(x0)
+        return DriftAdaptation(self.drift.init(x0), x0.new_zeros(len(x0)), windows, Design.init(x0))
 
-    def adaptation(self, identifier: Tensor) -> DriftAdaptation:
-        """What the rows of `LoopResult.identifier` say, (..., K)."""
-        found: DriftAdaptation = unpack(self._like, identifier, 1)
-        return found
+    def recorded(self, carried: DriftAdaptation) -> dict[str, Tensor]:
+        return {"certain": carried.certain}
 
     def step(
-        self, x: Tensor, carried: ControllerState, uniform: Tensor, dt: float
-    ) -> tuple[Tensor, ControllerState]:
-        now = self.adaptation(carried.identifier)
+        self, x: Tensor, now: DriftAdaptation, uniform: Tensor, dt: float
+    ) -> tuple[Tensor, DriftAdaptation]:
         windows = self.drift.window_of(now.estimate)
         window, equation = windows.step(now.window, x, dt)
         estimate = self.drift.step(now.estimate, equation, x, dt)
         a, covariance = self.drift.matrix(estimate, x)
         b = self.model.effectiveness(x)
-        doubling, stage, p = self.redesign.step(now.doubling, now.stage, now.p, a, b)
+        design = self.redesign.step(now.design, a, b)
+        p = design.p
         k = product(product(self.cost.r_inverse.to(b), b.mT), p)
         e = self.cost.deviation(x)
         # e'Pe falls by e'We a second, with d as it is believed; of d every row counts by 2 (Pe)_r.
@@ -351,11 +344,4 @@ class DriftLQR(Controller):
         u = torch.where(certain.unsqueeze(-1), wanted, self.robust(x))
         if self.cost.bounds is not None:  # what the actuator will give, which the window must know
             u = self.cost.bounds.clip(u)
-        after = DriftAdaptation(estimate, certain.to(x), windows.holding(window, u), doubling, stage, p)
-        return u, carried._replace(identifier=pack(after, x.dim() - 1))
-
-    def _start(self, x: Tensor) -> DriftAdaptation:
-        square, zero = x.new_zeros(len(x), x.shape[-1], x.shape[-1]), x.new_zeros(len(x))
-        empty = Doubling(square, square.clone(), square.clone())
-        windows = self.drift.windows.init(x)
-        return DriftAdaptation(self.drift.init(x), zero, windows, empty, zero.clone(), square.clone())
+        return u, DriftAdaptation(estimate, certain.to(x), windows.holding(window, u), design)

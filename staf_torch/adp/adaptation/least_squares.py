@@ -27,6 +27,10 @@ class Estimate(NamedTuple):
     surprise: Tensor  # (...) largest innovation of the last equation, in its standard deviations
     resets: Tensor  # (...) how often the covariance was opened again
 
+    def recorded(self) -> dict[str, Tensor]:
+        """What a `LoopResult` keeps of it."""
+        return {"theta": self.theta, "theta_covariance": self.covariance, "resets": self.resets}
+
 
 class LeastSquares:
     """theta^ of the equations S theta = z + noise by recursive least squares, one row of S after the other:

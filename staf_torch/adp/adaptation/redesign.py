@@ -66,6 +66,21 @@ def riccati_rows(a: Tensor, b: Tensor, q: Tensor, r_inverse: Tensor, *, doubling
     return now.h
 
 
+class Design(NamedTuple):
+    """The design that is used, and the one that is under way."""
+
+    p: Tensor  # P of the last one that was finished, (..., n, n)
+    doubling: Doubling  # of the one under way
+    stage: Tensor  # doublings done of it, (...); where it is 0 one begins with the model of now
+
+    @classmethod
+    def init(cls, x: Tensor) -> Design:
+        """None yet, a row each of (..., n)."""
+        square = x.new_zeros(*x.shape, x.shape[-1])
+        empty = Doubling(square, square.clone(), square.clone())
+        return cls(square.clone(), empty, x.new_zeros(x.shape[:-1]))
+
+
 class Redesign:
     """Riccati equations of rows solved while a loop runs: some doublings a control, one design after another.
 
@@ -95,18 +110,15 @@ class Redesign:
             raise fail(call, "a_step", f"must divide the {doublings} doublings", a_step)
         return cls(cost.state_curvature(), cost.r_inverse, doublings, each)
 
-    def step(
-        self, pair: Doubling, stage: Tensor, p: Tensor, a: Tensor, b: Tensor
-    ) -> tuple[Doubling, Tensor, Tensor]:
-        """The design under way, how far it is, and P of the last one that was finished.
+    def step(self, design: Design, a: Tensor, b: Tensor) -> Design:
+        """The designs after ``a_step`` doublings more.
 
         Args:
-            pair: of the design under way.
-            stage: doublings done of it, (...); where it is 0 one begins with the model of now.
-            p: P of the one before, (..., n, n).
+            design: before them.
             a: A of now, (..., n, n).
             b: B of now, (..., n, m).
         """
+        p, pair, stage = design
         begins = (stage == 0)[..., None, None]
         first = doubling_start(a, control_rate(b, self.r_inverse), self.curvature)
         pair = Doubling(*(torch.where(begins, new, old) for new, old in zip(first, pair, strict=True)))
@@ -120,7 +132,7 @@ class Redesign:
         pair = Doubling(
             *(torch.where(torch.isfinite(part) & ~done[..., None, None], part, 0.0) for part in pair)
         )
-        return pair, torch.where(done, 0.0, stage), p
+        return Design(p, pair, torch.where(done, 0.0, stage))
 
     def solved(self, p: Tensor, a: Tensor, b: Tensor) -> Tensor:
         """Whether P is of the model of now, (...) bool: a design may be older, or without a solution."""

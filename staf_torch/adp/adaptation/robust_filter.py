@@ -10,14 +10,14 @@ import torch
 from torch import Tensor
 
 from ...numerics.checks import fail, positive_real, vector
-from ..loop.carried import pack, unpack
-from ..loop.controller import Controller, ControllerState
+from ..loop.controller import Carried, Controller
 from ..safety.quadratic_program import nearest_admissible
 from ..safety.safety_filter import Constraint, SafetyFilter
 from .least_squares import Estimate, LeastSquares
 from .parametric import ChangingPlant, ParametricPlant
 from .windows import IntegralWindows, Window
 
+_FAR = 1e300  # h before anything was seen: finite, as what is carried must be
 _PASSES = 2  # linearisations of the conditions in u
 
 
@@ -26,16 +26,17 @@ class Guarded(NamedTuple):
 
     Example:
         >>> adp.Guarded._fields
-        ('estimate', 'window', 'time', 'least', 'slack', 'acted')
+        ('inner', 'estimate', 'window', 'time', 'least_margin', 'largest_slack', 'acted')
 
         Shown by `tests/adp/adaptation/test_robust_filter.py`.
     """
 
+    inner: Carried  # of the controller behind it
     estimate: Estimate
     window: Window
     time: Tensor  # (...) s
-    least: Tensor  # (...) smallest h so far
-    slack: Tensor  # (...) largest shortfall of a condition so far
+    least_margin: Tensor  # (...) smallest h so far
+    largest_slack: Tensor  # (...) largest shortfall of a condition so far
     acted: Tensor  # (...) steps in which the control was another than the wanted one
 
 
@@ -62,8 +63,7 @@ class RobustFilter(Controller):
         >>> safe = adp.RobustFilter(wanted, plant, wall, windows, law, dt=0.02, **box)
         >>> cost, x0 = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1), torch.tensor([[1.0, -2.0]]).double()
         >>> run = adp.simulate(safe, plant, cost, x0, steps=40)
-        >>> now = safe.guarded(run.identifier)
-        >>> bool(now.least[0, -1] > 0), now.estimate.theta[0, -1].round(decimals=2)
+        >>> bool(run["least_margin"][0, -1] > 0), run["theta"][0, -1].round(decimals=2)
         (True, tensor([0.5000], dtype=torch.float64))
 
         Shown by `tests/adp/adaptation/test_robust_filter.py`.
@@ -120,39 +120,27 @@ class RobustFilter(Controller):
             margin=margin,
         )
         self.period, self.draws = dt, controller.draws
-        self._like = self._start(torch.zeros(1, n, dtype=torch.float64))
-        self._size = pack(self._like, 1).shape[-1]
 
-    def init(self, x0: Tensor) -> ControllerState:
-        inner = self.controller.init(x0)
-        return inner._replace(identifier=torch.cat((pack(self._start(x0), 1), inner.identifier), dim=-1))
+    def init(self, x0: Tensor) -> Guarded:
+        zero, inner = x0.new_zeros(len(x0)), self.controller.init(x0)
+        estimate, window = self.law.init(x0), self.windows.init(x0)
+        return Guarded(inner, estimate, window, zero, torch.full_like(zero, _FAR), zero.clone(), zero.clone())
 
-    def guarded(self, identifier: Tensor) -> Guarded:
-        """What the rows of `LoopResult.identifier` say, (..., K)."""
-        found: Guarded = unpack(self._like, identifier[..., : self._size], 1)
-        return found
+    def recorded(self, carried: Guarded) -> dict[str, Tensor]:
+        own = {name: getattr(carried, name) for name in Guarded._fields[-3:]}
+        return {**self.controller.recorded(carried.inner), **carried.estimate.recorded(), **own}
 
-    def step(
-        self, x: Tensor, carried: ControllerState, uniform: Tensor, dt: float
-    ) -> tuple[Tensor, ControllerState]:
-        now, rest = self.guarded(carried.identifier), carried.identifier[..., self._size :]
-        wanted, after = self.controller.step(x, carried._replace(identifier=rest), uniform, dt)
+    def step(self, x: Tensor, now: Guarded, uniform: Tensor, dt: float) -> tuple[Tensor, Guarded]:
+        wanted, inner = self.controller.step(x, now.inner, uniform, dt)
         window, equation = self.windows.step(now.window, x, dt)
         estimate = self.law.step(now.estimate, equation, dt)
         u, h, slack = self._restrained(x, wanted, now.time, estimate)
         if self.plant.bounds is not None:
             u = self.plant.bounds.clip(u)
         acted = (u != wanted).any(-1).to(x)
-        kept = Guarded(
-            estimate,
-            self.windows.holding(window, u),
-            now.time + dt,
-            torch.minimum(now.least, h),
-            torch.maximum(now.slack, slack),
-            now.acted + acted,
-        )
-        packed = torch.cat((pack(kept, x.dim() - 1), after.identifier), dim=-1)
-        return u, after._replace(identifier=packed)
+        least, most = torch.minimum(now.least_margin, h), torch.maximum(now.largest_slack, slack)
+        window = self.windows.holding(window, u)
+        return u, Guarded(inner, estimate, window, now.time + dt, least, most, now.acted + acted)
 
     def _restrained(
         self, x: Tensor, wanted: Tensor, time: Tensor, estimate: Estimate
@@ -186,14 +174,6 @@ class RobustFilter(Controller):
             u, slack = nearest.point, nearest.shortfall
         assert met is not None
         return torch.where(met.unsqueeze(-1), wanted, u), margin, torch.where(met, 0.0, slack)
-
-    def _start(self, x: Tensor) -> Guarded:
-        zero = x.new_zeros(len(x))
-        estimate, window = self.law.init(x), self.windows.init(x)
-        return Guarded(estimate, window, zero, torch.full_like(zero, _FAR), zero.clone(), zero.clone())
-
-
-_FAR = 1e300  # h before anything was seen: finite, as what is carried must be
 
 
 def _of_leading(h: Constraint, count: int) -> Callable[[Tensor, Tensor], Tensor]:

@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from ...numerics.checks import choice, fail
-from ..loop.carried import pack, unpack
-from ..loop.controller import Controller, ControllerState
+from ..loop.controller import Controller
 from .history_stack import ConcurrentGradient, HistoryStack, Stack
 from .parametric import ParametricPlant
 from .windows import IntegralWindows, SlopeWindow, SlopeWindows, Window
@@ -59,7 +58,7 @@ class ConcurrentTracker(Controller):
         >>> run = adp.simulate(tracker, plant, cost, x0, dt=0.01, steps=400)
         >>> run.state[0, -1].round(decimals=2)
         tensor([1.], dtype=torch.float64)
-        >>> tracker.tracking(run.identifier).theta[0, -1].round(decimals=2)
+        >>> run["theta"][0, -1].round(decimals=2)
         tensor([2.], dtype=torch.float64)
 
         Shown by `staf experiment=icl`.
@@ -109,24 +108,17 @@ class ConcurrentTracker(Controller):
         p = plant.parameters_count
         self.stack = HistoryStack(len(plant.rows), p, size)
         self.first = torch.zeros(p).double() if first is None else torch.tensor(first, dtype=torch.float64)
-        self._like = self._start(
-            torch.zeros(1, plant._size(), dtype=torch.float64), [g.max() for g in self.gains]
-        )
 
-    def init(self, x0: Tensor) -> ControllerState:
-        none = x0.new_zeros(len(x0), 0)
-        start = pack(self._start(x0, self.gains), 1)
-        return ControllerState(none, none, x0.new_zeros(len(x0), 0, 0), start)
+    def init(self, x0: Tensor) -> Tracking:
+        feedback, gain, rate, length = (g.to(x0).expand(len(x0)).clone() for g in self.gains)
+        theta = self.first.to(x0).expand(len(x0), -1).clone()
+        return Tracking(theta, feedback, gain, rate, self.windows.init(x0, length), self.stack.init(x0))
 
-    def tracking(self, identifier: Tensor) -> Tracking:
-        """What the rows of `LoopResult.identifier` say, (..., K)."""
-        found: Tracking = unpack(self._like, identifier, 1)
-        return found
+    def recorded(self, carried: Tracking) -> dict[str, Tensor]:
+        return {"theta": carried.theta}
 
-    def step(
-        self, x: Tensor, carried: ControllerState, uniform: Tensor, dt: float
-    ) -> tuple[Tensor, ControllerState]:
-        now, m = self.tracking(carried.identifier), self.plant.inputs
+    def step(self, x: Tensor, now: Tracking, uniform: Tensor, dt: float) -> tuple[Tensor, Tracking]:
+        m = self.plant.inputs
         window, equation = self.windows.step(now.window, x, dt)  # type: ignore[arg-type]
         stack = self.stack.step(now.stack, equation)
         wanted, wanted_rate = self.reference(x)
@@ -136,10 +128,4 @@ class ConcurrentTracker(Controller):
         theta = ConcurrentGradient(now.gain, now.rate).step(now.theta, stack.gram, stack.moment, dt, push)
         u = wanted_rate - (y * theta.unsqueeze(-2)).sum(-1) - now.feedback.unsqueeze(-1) * error
         window = self.windows.holding(window, u)  # type: ignore[arg-type]
-        after = now._replace(theta=theta, window=window, stack=stack)
-        return u, carried._replace(identifier=pack(after, x.dim() - 1))
-
-    def _start(self, x: Tensor, gains: Sequence[Tensor]) -> Tracking:
-        feedback, gain, rate, length = (g.to(x).expand(len(x)).clone() for g in gains)
-        theta = self.first.to(x).expand(len(x), -1).clone()
-        return Tracking(theta, feedback, gain, rate, self.windows.init(x, length), self.stack.init(x))
+        return u, now._replace(theta=theta, window=window, stack=stack)

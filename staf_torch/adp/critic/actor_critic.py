@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import copy
+from collections.abc import Mapping
+from typing import Any, Self
+
 import torch
 from torch import Tensor
 
-from ...numerics.checks import fail, positive, trailing, vector
+from ...numerics.checks import copied, fail, positive, trailing, vector
 from ...systems import ControlAffineSystem
-from ..loop.controller import Controller, ControllerState
+from ..loop.controller import Controller
 from ..problem.cost import Cost
 from .bases import ValueBasis
 from .bellman import BellmanTerms, bellman_terms
@@ -90,17 +94,26 @@ class ActorCritic(Controller):
     def label(self) -> str:
         return f"actor-critic ({type(self.law).__name__})"
 
-    def init(self, x0: Tensor) -> ControllerState:
+    def init(self, x0: Tensor) -> Weights:
         rows = (x0.shape[0], self.basis.count)
         one = torch.eye(self.basis.count, dtype=x0.dtype, device=x0.device)
         gain = self.gain.to(x0)[..., None, None] * one
         critic, actor, gain = self.law.init(self.critic.to(x0), self.actor.to(x0), gain)
-        return ControllerState(
-            critic.expand(rows).clone(),
-            actor.expand(rows).clone(),
-            gain.expand(x0.shape[0], -1, -1).clone(),
-            x0.new_zeros(x0.shape[0], 0),
-        )
+        wide = gain.expand(len(x0), -1, -1)
+        return Weights(critic.expand(rows).clone(), actor.expand(rows).clone(), wide.clone())
+
+    def recorded(self, carried: Weights) -> dict[str, Tensor]:
+        return {"actor_weights": carried.actor, "critic_weights": carried.critic}
+
+    def numbers(self) -> dict[str, float | Tensor]:
+        return dict(vars(self.law.gains))
+
+    def with_numbers(self, numbers: Mapping[str, Any]) -> Self:
+        other = copied(self)
+        other.law, gains = copy.copy(self.law), copy.copy(self.law.gains)
+        vars(gains).update(numbers)  # without the checks, which would read a traced number
+        other.law.gains = gains
+        return other
 
     def terms(
         self, x: Tensor, actor: Tensor, uniform: Tensor, model: ControlAffineSystem | None = None
@@ -125,20 +138,16 @@ class ActorCritic(Controller):
         """The states around which the centers of the points stand, (..., P, n)."""
         return points if self.extrapolation.moving else x.unsqueeze(-2).expand(points.shape)
 
-    def step(
-        self, x: Tensor, carried: ControllerState, uniform: Tensor, dt: float
-    ) -> tuple[Tensor, ControllerState]:
+    def step(self, x: Tensor, carried: Weights, uniform: Tensor, dt: float) -> tuple[Tensor, Weights]:
         terms = self.terms(x, carried.actor, uniform)
         return terms.control[..., 0, :], self.moved(terms, carried, dt)
 
-    def moved(self, terms: BellmanTerms, carried: ControllerState, dt: float) -> ControllerState:
+    def moved(self, terms: BellmanTerms, weights: Weights, dt: float) -> Weights:
         """The weights after ``dt`` seconds with the Bellman terms of now."""
-        weights = Weights(carried.critic, carried.actor, carried.gain)
-        sums = self.law.sums(terms, self.extrapolation.weights, weights)
-        return ControllerState(*self.law.step(sums, weights, dt), carried.identifier)
+        return self.law.step(self.law.sums(terms, self.extrapolation.weights, weights), weights, dt)
 
-    def value(self, x: Tensor, carried: ControllerState) -> Tensor | None:
-        return self.basis.value(carried.critic, x)
+    def value(self, x: Tensor, recorded: Mapping[str, Tensor]) -> Tensor:
+        return self.basis.value(recorded["critic_weights"], x)
 
 
 def _weights(name: str, value: Initial, count: int) -> Tensor:

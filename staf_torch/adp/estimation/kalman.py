@@ -13,8 +13,7 @@ from ...numerics.checks import fail, non_negative, one_or_each, positive, real, 
 from ...numerics.linalg import row_jacobian
 from ...numerics.riccati import product
 from ...systems import Plant, runge_kutta_step
-from ..loop.carried import pack, unpack
-from ..loop.controller import Controller, ControllerState
+from ..loop.controller import Carried, Controller
 from ..problem.cost import matvec
 from .measurement import Output
 
@@ -192,6 +191,14 @@ class UnscentedKalman(KalmanFilter):
         return torch.cat((middle, middle + root, middle - root), dim=-2), weights
 
 
+class Observing(NamedTuple):
+    """What `Observed` carries."""
+
+    belief: Belief
+    steps: Tensor  # (B,) measurements so far
+    inner: Carried  # of the controller behind it
+
+
 class Observed(Controller):
     """A controller of x that is told the mean of a Kalman filter in place of x; what it sees is y.
 
@@ -236,47 +243,29 @@ class Observed(Controller):
         self.controller, self.filter = controller, filter
         self.guess, self.deviation = guess, spread
         self.draws, self.period = controller.draws, controller.period
-        self._like = self._start(torch.zeros(1, 1, dtype=torch.float64))
-        self._size = pack(self._like, 1).shape[-1]
 
     @property
     def label(self) -> str:
         return f"{self.controller.label} of observed states"
 
-    def init(self, x0: Tensor) -> ControllerState:
-        start = self._start(x0)
-        inner = self.controller.init(start[0].mean)
-        return inner._replace(identifier=torch.cat((pack(start, 1), inner.identifier), dim=-1))
+    def init(self, x0: Tensor) -> Observing:
+        rows, n, m = len(x0), len(self.guess), self.filter.model.inputs
+        covariance = torch.diag(self.deviation.to(x0).square()).expand(rows, n, n).clone()
+        mean = self.guess.to(x0).expand(rows, n).clone()
+        belief = Belief(mean, covariance, x0.new_zeros(rows, m))
+        return Observing(belief, x0.new_zeros(rows), self.controller.init(mean))
 
-    def belief(self, identifier: Tensor) -> Belief:
-        """What the rows of `LoopResult.identifier` say of the state, (..., K)."""
-        found: Belief = unpack(self._like, identifier[..., : self._size], 1)[0]
-        return found
+    def recorded(self, carried: Observing) -> dict[str, Tensor]:
+        belief, _, inner = carried
+        return {**self.controller.recorded(inner), "mean": belief.mean, "covariance": belief.covariance}
 
-    def step(
-        self, x: Tensor, carried: ControllerState, uniform: Tensor, dt: float
-    ) -> tuple[Tensor, ControllerState]:
-        own, rest = carried.identifier[..., : self._size], carried.identifier[..., self._size :]
-        belief, steps = unpack(self._like, own, 1)
+    def step(self, x: Tensor, carried: Observing, uniform: Tensor, dt: float) -> tuple[Tensor, Observing]:
+        belief, steps, inner = carried
         belief = self.filter.step(belief, x, dt, steps == 0)
-        u, after = self.controller.step(belief.mean, carried._replace(identifier=rest), uniform, dt)
+        u, inner = self.controller.step(belief.mean, inner, uniform, dt)
         bounds = self.filter.model.bounds
         held = u if bounds is None else bounds.clip(u)
-        packed = pack(_Observing(belief._replace(u=held), steps + 1), x.dim() - 1)
-        return u, after._replace(identifier=torch.cat((packed, after.identifier), dim=-1))
-
-    def _start(self, y: Tensor) -> _Observing:
-        rows, n, m = len(y), len(self.guess), self.filter.model.inputs
-        covariance = torch.diag(self.deviation.to(y).square()).expand(rows, n, n).clone()
-        mean = self.guess.to(y).expand(rows, n).clone()
-        return _Observing(Belief(mean, covariance, y.new_zeros(rows, m)), y.new_zeros(rows))
-
-
-class _Observing(NamedTuple):
-    """A belief, and how many measurements there were."""
-
-    belief: Belief
-    steps: Tensor  # (...)
+        return u, Observing(belief._replace(u=held), steps + 1, inner)
 
 
 def _mean(points: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ...numerics.checks import fail
-from ..loop.controller import Controller, ControllerState
+from ..loop.controller import Carried, Controller
 
 Output = Callable[[Tensor], Tensor]
 """y from x: (..., n) -> (..., q)."""
@@ -76,12 +76,13 @@ class Measured(Controller):
         """h(x): (..., n) -> (..., q)."""
         return x[..., : self.dim] if self.output is None else self.output(x)
 
-    def init(self, x0: Tensor) -> ControllerState:
+    def init(self, x0: Tensor) -> Carried:
         return self.controller.init(self.seen(x0))
 
-    def step(
-        self, x: Tensor, carried: ControllerState, uniform: Tensor, dt: float
-    ) -> tuple[Tensor, ControllerState]:
+    def recorded(self, carried: Carried) -> dict[str, Tensor]:
+        return self.controller.recorded(carried)
+
+    def step(self, x: Tensor, carried: Carried, uniform: Tensor, dt: float) -> tuple[Tensor, Carried]:
         y = self.seen(x)
         if self._own:
             drawn = uniform[..., : self._own, : self.dim].flatten(-2)

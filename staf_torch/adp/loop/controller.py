@@ -1,17 +1,17 @@
-"""What a controller in a closed loop is; feedback without a state of its own: the LQR; the supervisor."""
+"""The interface of controllers in a closed loop; feedback laws, the LQR, the supervisor."""
 
 from __future__ import annotations
 
 import abc
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping
+from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
 from ...lanes.surroundings import is_users
-from ...numerics.checks import real
+from ...numerics.checks import copied, real
 from ...numerics.linalg import riccati
 from ...systems import Plant
 from ..problem.cost import Cost, matvec, quadratic
@@ -23,32 +23,9 @@ Value = Callable[[Tensor], Tensor]
 """V from x: (..., n) -> (...)."""
 
 
-class ControllerState(NamedTuple):
-    """What a controller carries from step to step. Feedback laws leave all of it empty.
-
-    Example:
-        >>> rest = adp.Feedback(lambda x: -x[..., :1]).init(torch.ones(3, 2))
-        >>> rest.critic.shape, rest.gain.shape  # nothing is carried
-        (torch.Size([3, 0]), torch.Size([3, 0, 0]))
-
-        Shown by `staf experiment=adp`.
-    """
-
-    critic: Tensor  # Wc, (B, M)
-    actor: Tensor  # Wa, (B, M)
-    gain: Tensor  # Gam or Lam, (B, M, M)
-    identifier: Tensor  # what an identifier of the plant remembers, (B, K)
-
-
-Carried = ControllerState | Any
-"""What a controller carries from step to step: a `ControllerState`, or a tensor (B, ...) of its own, or
-tuples, dictionaries and named tuples of such, which are not recorded."""
-
-
-def carrying(known: Tensor) -> ControllerState:
-    """The state of a controller that carries numbers (B, w) and learns nothing."""
-    empty = known.new_zeros(len(known), 0)
-    return ControllerState(empty, empty, known.new_zeros(len(known), 0, 0), known)
+Carried = Any
+"""What a controller carries from step to step: a tensor (B, ...), or tuples, dictionaries and named tuples of
+such; () where it carries nothing."""
 
 
 class Controller(nn.Module, abc.ABC):
@@ -61,9 +38,11 @@ class Controller(nn.Module, abc.ABC):
         ...     def step(self, x, carried, uniform, dt):
         ...         carried = carried + dt * x[:, 0]
         ...         return -(x.sum(-1) + 0.5 * carried).unsqueeze(-1), carried
+        ...     def recorded(self, carried):  # what the result keeps of it, by name
+        ...         return {"integral": carried}
         >>> cost, x0 = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1), torch.ones(3, 2).double()
-        >>> adp.simulate(Integral(), systems.TwoState(), cost, x0, dt=0.01, steps=10).diverged
-        tensor([False, False, False])
+        >>> adp.simulate(Integral(), systems.TwoState(), cost, x0, dt=0.01, steps=10)["integral"].shape
+        torch.Size([3, 11])
 
         Shown by `staf experiment=adp_comparison`.
 
@@ -103,9 +82,32 @@ class Controller(nn.Module, abc.ABC):
             u (B, m), and what the next step gets as ``carried``.
         """
 
-    def value(self, x: Tensor, carried: Carried) -> Tensor | None:
-        """V^(x) where the controller has an idea of it: (..., n) -> (...)."""
+    def recorded(self, carried: Carried) -> dict[str, Tensor]:
+        """Name what `LoopResult` keeps of what is carried, tensors (B, ...); by default nothing.
+
+        A controller that holds another one passes on what that records.
+        """
+        return {}
+
+    def value(self, x: Tensor, recorded: Mapping[str, Tensor]) -> Tensor | None:
+        """Return V^(x), (..., n) -> (...), by what was recorded then; None where nothing estimates V."""
         return None
+
+    def numbers(self) -> dict[str, float | Tensor]:
+        """Name the numbers in which runs of one compiled loop may differ: floats, or (B, 1), one a row.
+
+        By default those of the controllers that this one holds.
+        """
+        inner = (child for child in self.children() if isinstance(child, Controller))
+        return {name: value for child in inner for name, value in child.numbers().items()}
+
+    def with_numbers(self, numbers: Mapping[str, Any]) -> Self:
+        """Return a copy with other numbers in place of those that `numbers` names; not checked."""
+        other = copied(self)
+        for name, child in self.named_children():
+            if isinstance(child, Controller):
+                other._modules[name] = child.with_numbers(numbers)
+        return other
 
 
 class Feedback(Controller):
@@ -139,13 +141,10 @@ class Feedback(Controller):
     def label(self) -> str:
         return getattr(self.policy, "__name__", type(self.policy).__name__)
 
-    def init(self, x0: Tensor) -> ControllerState:
-        empty = x0.new_zeros(x0.shape[0], 0)
-        return ControllerState(empty, empty, x0.new_zeros(x0.shape[0], 0, 0), empty)
+    def init(self, x0: Tensor) -> tuple[()]:
+        return ()
 
-    def step(
-        self, x: Tensor, carried: ControllerState, uniform: Tensor, dt: float
-    ) -> tuple[Tensor, ControllerState]:
+    def step(self, x: Tensor, carried: Carried, uniform: Tensor, dt: float) -> tuple[Tensor, Carried]:
         return self.policy(x), carried
 
     def check(self, x0: Tensor) -> None:
@@ -169,7 +168,7 @@ class Feedback(Controller):
                     f"its `{name}`. What has a memory is a `Controller`: `init` and `step` carry it by rows."
                 )
 
-    def value(self, x: Tensor, carried: ControllerState) -> Tensor | None:
+    def value(self, x: Tensor, recorded: Mapping[str, Tensor]) -> Tensor | None:
         return None if self._value is None else self._value(x)
 
 
@@ -284,12 +283,13 @@ class Supervised(Controller):
     def label(self) -> str:
         return f"supervised {self.controller.label}"
 
-    def init(self, x0: Tensor) -> ControllerState:
+    def init(self, x0: Tensor) -> Carried:
         return self.controller.init(x0)
 
-    def step(
-        self, x: Tensor, carried: ControllerState, uniform: Tensor, dt: float
-    ) -> tuple[Tensor, ControllerState]:
+    def recorded(self, carried: Carried) -> dict[str, Tensor]:
+        return self.controller.recorded(carried)
+
+    def step(self, x: Tensor, carried: Carried, uniform: Tensor, dt: float) -> tuple[Tensor, Carried]:
         u, after = self.controller.step(x, carried, uniform, dt)
         return self.restrain(x, u), after
 
@@ -303,5 +303,5 @@ class Supervised(Controller):
         restrained: Tensor = base + share.unsqueeze(-1) * apart
         return restrained
 
-    def value(self, x: Tensor, carried: ControllerState) -> Tensor | None:
-        return self.controller.value(x, carried)
+    def value(self, x: Tensor, recorded: Mapping[str, Tensor]) -> Tensor | None:
+        return self.controller.value(x, recorded)

@@ -11,13 +11,14 @@ from torch import Tensor
 
 from ...lanes import Program
 from ...lanes.compiling import worth
+from ...lanes.tree import flatten, unflatten
 from ...numerics.checks import choice, fail, integer, trailing
 from ...systems import ControlAffineSystem, Plant
 from ..problem.cost import Cost
 from ..problem.held_linear import HeldLoop
 from ..problem.held_plant import fewest_and_most
-from .controller import Controller, Feedback, Policy
-from .step import ClosedLoop, program, record, row_gains
+from .controller import Carried, Controller, Feedback, Policy
+from .step import ClosedLoop, program, record, row_numbers
 
 _log = logging.getLogger(__name__)
 _DRAWN_AHEAD = 1024  # steps whose random numbers are drawn at once
@@ -43,6 +44,8 @@ class LoopResult:
         >>> result = adp.simulate(lqr, plant, cost, x0, dt=0.01, steps=50, every=10)
         >>> result.state.shape, bool(result.diverged.any()), bool(result.cost > 0)
         (torch.Size([1, 6, 2]), False, True)
+        >>> list(result.recorded)  # an actor-critic records its weights: result["critic_weights"]
+        []
 
         Shown by `staf experiment=adp`.
     """
@@ -50,11 +53,27 @@ class LoopResult:
     time: Tensor  # (T,) seconds
     state: Tensor  # (B, T, n)
     control: Tensor  # (B, T, m) held from that time on; NaN at the end, where none is, and once frozen
-    actor_weights: Tensor  # (B, T, M); M = 0 for feedback laws
-    critic_weights: Tensor  # (B, T, M)
     running_cost: Tensor  # (B, T) the cost from 0 to that time
-    identifier: Tensor  # (B, T, K) what the controller remembers of the plant; K = 0 without identification
+    recorded: dict[str, Tensor]  # (B, T, ...) by name, of `Controller.recorded`: result["name"]
     frozen_at: Tensor  # (B,) seconds, inf for rows that never froze
+    carried: Carried = ()  # by the controller at the end, (B, ...)
+
+    def __getitem__(self, name: str) -> Tensor:
+        """(B, T, ...) of what the controller recorded."""
+        return self.recorded[name]
+
+    @property
+    def actor_weights(self) -> Tensor:
+        """(B, T, M) of an actor-critic; M = 0 where nothing learns."""
+        return self._weights("actor_weights")
+
+    @property
+    def critic_weights(self) -> Tensor:
+        """(B, T, M), likewise."""
+        return self._weights("critic_weights")
+
+    def _weights(self, name: str) -> Tensor:
+        return self.recorded.get(name, self.state[..., :0])
 
     @property
     def cost(self) -> Tensor:
@@ -65,6 +84,13 @@ class LoopResult:
     def diverged(self) -> Tensor:
         """(B,) bool."""
         return torch.isfinite(self.frozen_at)
+
+    def split(self, rows: Sequence[int]) -> list[LoopResult]:
+        """The results of so many rows each, in their order."""
+        fields = [getattr(self, field.name) for field in dataclasses.fields(self) if field.name != "time"]
+        leaves, structure = flatten(fields)
+        parts = zip(*(leaf.split(rows) for leaf in leaves), strict=True)
+        return [LoopResult(self.time, *unflatten(structure, iter(part))) for part in parts]
 
 
 def simulate(
@@ -171,8 +197,8 @@ def _run(
     progress: Callable[[int], None] | None,
 ) -> LoopResult:
     state = loop.init(x0)
-    pieces: list[tuple[Tensor, ...]] = []
-    draws, done, gains = loop.controller.draws, 0, row_gains(loop)
+    pieces: list[list[Tensor]] = []
+    draws, done, numbers = loop.controller.draws, 0, row_numbers(loop)
     generators = [torch.Generator().manual_seed(seed) for seed in (seeds if draws else ())]
     ahead = max(1, min(_DRAWN_AHEAD, _NUMBERS // (x0.numel() * max(draws, 1))))
     while done < steps:
@@ -180,18 +206,18 @@ def _run(
         count = ahead // every * every if every <= ahead else min(ahead, every - done % every)
         count = min(count, steps - done)
         uniform = uniform_numbers(x0, count, draws, generators)
-        state, out = steps_of(state, uniform, gains, every=min(every, count))
+        state, out = steps_of(state, uniform, numbers, every=min(every, count))
         if done % every == 0:
-            pieces.append(out)
+            pieces.append(flatten(out)[0])
         done += count
         if progress is not None:
             progress(count)
-    last = record(state, torch.full_like(pieces[-1][1][:, -1], torch.nan))
-    pieces.append(tuple(part.unsqueeze(1) for part in last))
-    x, u, actor, critic, spent, known = (torch.cat(column, dim=1) for column in zip(*pieces, strict=True))
+    last, structure = flatten(record(loop, state, torch.full_like(pieces[-1][1][:, -1], torch.nan)))
+    pieces.append([part.unsqueeze(1) for part in last])
+    kept = unflatten(structure, (torch.cat(column, dim=1) for column in zip(*pieces, strict=True)))
     time = torch.arange(0, steps + 1, every, dtype=torch.float64) * loop.dt
     frozen_at = torch.where(state.alive, torch.inf, state.lived * loop.dt)
-    return LoopResult(time, x, u, actor, critic, spent, known, frozen_at)
+    return LoopResult(time, kept.x, kept.u, kept.cost, kept.recorded, frozen_at, state.carried)
 
 
 def _seeds(seed: int | Sequence[int], batch: int) -> Sequence[int]:

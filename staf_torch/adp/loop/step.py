@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
-import copy
 import functools
-from collections.abc import Iterator, Mapping, Sequence
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Any, NamedTuple, Self
 
 import torch
 from torch import Tensor, nn
@@ -14,12 +12,11 @@ from torch import Tensor, nn
 from ...lanes import Program
 from ...lanes.kept import Kept, number
 from ...lanes.tree import flatten, unflatten
-from ...numerics.checks import choice, fail, flag, positive_real
+from ...numerics.checks import choice, copied, fail, flag, positive_real
 from ...systems import Plant
-from ..critic.laws import ActorCriticLaw, Gains
 from ..problem.cost import Cost
 from ..problem.held_plant import Holding, fewest_and_most
-from .controller import Carried, Controller, ControllerState, Feedback
+from .controller import Carried, Controller, Feedback
 
 _kept = Kept("the closed loop", 16)
 
@@ -80,6 +77,12 @@ class ClosedLoop(nn.Module):
             raise fail("ClosedLoop", "renew", rule, controller.label)
         self.euler = integrator == "euler" and system.period is None
         self.holding = Holding("ClosedLoop", system, self.cost, self.dt, substeps)
+
+    def with_numbers(self, numbers: Mapping[str, Any]) -> Self:
+        """Return a copy whose controller has other numbers: `Controller.with_numbers`."""
+        other = copied(self)
+        other._modules["controller"] = self.controller.with_numbers(numbers)
+        return other
 
     def init(self, x0: Tensor) -> LoopState:
         """The state at time 0 of the rows x0 (B, n)."""
@@ -144,7 +147,8 @@ def _where(alive: Tensor, new: Tensor, old: Tensor) -> Tensor:
 def program(loop: ClosedLoop, compile: bool) -> Program:
     """Return ``loop`` over many steps: it records the state before every step, and the control.
 
-    Compiled loops that differ in gains and tensors alone share one text: `lanes.kept`.
+    Compiled loops that differ in tensors and in the controller's `numbers` alone share one text:
+    `lanes.kept`.
 
     Args:
         loop: one step.
@@ -152,72 +156,47 @@ def program(loop: ClosedLoop, compile: bool) -> Program:
     """
     if not compile:
         return Program(functools.partial(recorded, loop), name="the closed loop", compile=False)
-    numbers = [_numbers(law.gains) for law in _laws(loop)]
+    numbers = loop.controller.numbers()
+    # Numbers of all rows as tensors, which no text knows; a row's own ones come with the row.
+    shared = {name: number(name, value) for name, value in numbers.items() if not isinstance(value, Tensor)}
 
-    def step(
-        state: LoopState, uniform: Tensor, gains: dict[str, Tensor]
-    ) -> tuple[LoopState, tuple[Tensor, ...]]:
-        with _with_gains(loop, numbers):
-            return recorded(loop, state, uniform, gains)
+    def step(state: LoopState, uniform: Tensor, own: Mapping[str, Tensor]) -> tuple[LoopState, Record]:
+        return recorded(loop, state, uniform, {**shared, **dict(own)})
 
-    inputs = dict.fromkeys(row_gains(loop))  # whatever their numbers are here
-    with _with_gains(loop, [{**own, **inputs} for own in numbers]):
-        found = _kept.of(step, loop)
+    parts = loop.with_numbers({**shared, **dict.fromkeys(row_numbers(loop))}) if numbers else loop
+    found = _kept.of(step, parts)
     return Program(step, name="the closed loop") if found is None else found
 
 
-def _numbers(gains: Gains) -> dict[str, Tensor]:
-    """Return the gains that are floats as tensors, which no text knows."""
-    given = vars(gains).items()
-    return {name: number(name, v) for name, v in given if not isinstance(v, Tensor)}
-
-
-def row_gains(loop: ClosedLoop) -> dict[str, Tensor]:
-    """Return the gains (B, 1) of which every row has its own: inputs of `program`, by their names."""
-    gains = [law.gains for law in _laws(loop)]
-    return {name: value for each in gains for name, value in vars(each).items() if isinstance(value, Tensor)}
-
-
-def _laws(loop: ClosedLoop) -> list[ActorCriticLaw]:
-    laws = (getattr(module, "law", None) for module in loop.controller.modules())
-    return [law for law in laws if isinstance(law, ActorCriticLaw)]
-
-
-@contextlib.contextmanager
-def _with_gains(loop: ClosedLoop, given: Sequence[Mapping[str, Tensor | None]]) -> Iterator[None]:
-    """Context: each law has these gains, those of the one row that is traced among them."""
-    laws = _laws(loop)
-    before = [law.gains for law in laws]
-    try:
-        for law, gains, others in zip(laws, before, given, strict=True):
-            law.gains = copy.copy(gains)
-            vars(law.gains).update(others)  # without the checks, which would read a traced number
-        yield
-    finally:
-        for law, gains in zip(laws, before, strict=True):
-            law.gains = gains
+def row_numbers(loop: ClosedLoop) -> dict[str, Tensor]:
+    """Return the numbers (B, 1) of which every row has its own: inputs of `program`, by their names."""
+    return {name: value for name, value in loop.controller.numbers().items() if isinstance(value, Tensor)}
 
 
 def recorded(
-    loop: ClosedLoop, state: LoopState, uniform: Tensor, gains: dict[str, Tensor]
-) -> tuple[LoopState, tuple[Tensor, ...]]:
+    loop: ClosedLoop, state: LoopState, uniform: Tensor, numbers: Mapping[str, Tensor]
+) -> tuple[LoopState, Record]:
     """Return the state after one step, and what is recorded of the time before it.
 
     Args:
         loop: one step.
         state: before the step.
         uniform: its random numbers, (B, draws, n).
-        gains: of `row_gains`.
+        numbers: of `Controller.numbers`, in place of the controller's own.
     """
-    with _with_gains(loop, [gains] * len(_laws(loop))) if gains else contextlib.nullcontext():
-        after, u = loop(state, uniform)
-    return after, record(state, torch.where(after.alive.unsqueeze(-1), u, torch.nan))
+    after, u = (loop.with_numbers(numbers) if numbers else loop)(state, uniform)
+    return after, record(loop, state, torch.where(after.alive.unsqueeze(-1), u, torch.nan))
 
 
-def record(state: LoopState, u: Tensor) -> tuple[Tensor, ...]:
-    """Return x, u, Wa, Wc, the cost and the identifier; nothing of what a controller names otherwise."""
-    carried = state.carried
-    if not isinstance(carried, ControllerState):
-        none = state.x.new_zeros(len(state.x), 0)
-        return state.x, u, none, none, state.cost, none
-    return state.x, u, carried.actor, carried.critic, state.cost, carried.identifier
+class Record(NamedTuple):
+    """What is kept of one time."""
+
+    x: Tensor  # (B, n)
+    u: Tensor  # (B, m)
+    cost: Tensor  # (B,)
+    recorded: dict[str, Tensor]  # of `Controller.recorded`, (B, ...) each
+
+
+def record(loop: ClosedLoop, state: LoopState, u: Tensor) -> Record:
+    """Return what is kept of a state and the control that is held from it on."""
+    return Record(state.x, u, state.cost, loop.controller.recorded(state.carried))

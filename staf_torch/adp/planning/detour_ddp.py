@@ -18,7 +18,7 @@ from ...numerics.forward_mode import use_forward_mode
 from ...numerics.linalg import row_jacobian
 from ...numerics.riccati import product, riccati_step
 from ...numerics.runge_kutta import runge_kutta_step
-from ..loop.controller import Controller, ControllerState, carrying
+from ..loop.controller import Controller
 from ..problem.cost import QuadraticCost, matvec
 from .detour_rollout import DetourRollout
 
@@ -244,6 +244,14 @@ _FRESH = 2  # rounds of iterations that a detour gets to be better than such a p
 _PROBES = 8  # states at which it is tried whether the inputs move what they must not
 
 
+class CarriedPlan(NamedTuple):
+    """What `DetourPlans` carries."""
+
+    control: Tensor  # (B, T, m)
+    expected: Tensor  # J of it, (B, 1)
+    done: Tensor  # periods since the beginning, (B, 1)
+
+
 class DetourPlans(Controller):
     """u_0 of a plan u_0, ..., u_{T-1} that follows the plant for T periods and has a low
 
@@ -315,7 +323,7 @@ class DetourPlans(Controller):
         self._rows = RowFunction(self._definition, self, "a plan around what moves")
         self._begun = RowFunction(self._first_plan, self, "first plans around what moves")
 
-    def init(self, x0: Tensor) -> ControllerState:
+    def init(self, x0: Tensor) -> CarriedPlan:
         """The best of the first plans from the states x0 (B, n), some 200 of each."""
         count, starts = len(x0), self._starts(x0)
         x, found = x0.repeat(len(starts), 1), starts.flatten(0, 1).flatten(1)
@@ -326,17 +334,15 @@ class DetourPlans(Controller):
         total = torch.where(torch.isfinite(found[..., 0]), found[..., 0], torch.inf)
         best = found[total.argmin(0), torch.arange(count, device=x0.device), 1:]
         expected, done = x0.new_full((count, 1), torch.inf), x0.new_zeros(count, 1)
-        return carrying(torch.cat((best, expected, done), dim=-1))  # the plan, its J, the periods so far
+        return CarriedPlan(best.unflatten(-1, (self.steps, -1)), expected, done)
 
-    def step(
-        self, x: Tensor, carried: ControllerState, uniform: Tensor, dt: float
-    ) -> tuple[Tensor, ControllerState]:
+    def step(self, x: Tensor, carried: CarriedPlan, uniform: Tensor, dt: float) -> tuple[Tensor, CarriedPlan]:
         if dt != self.hold:
             raise fail("DetourPlans", "dt", f"must be that of the loop, {dt:g} s", self.hold)
-        known = carried.identifier
-        found = self._rows(torch.cat((x, known), dim=-1))
-        u, known = found.split((self.plant.inputs, known.shape[-1]), dim=-1)
-        return u, carried._replace(identifier=known)
+        control = carried.control
+        found = self._rows(torch.cat((x, control.flatten(1), carried.expected, carried.done), dim=-1))
+        u, ahead, *rest = found.split((control.shape[-1], control[0].numel(), 1, 1), dim=-1)
+        return u, CarriedPlan(ahead.unflatten(-1, control.shape[1:]), *rest)
 
     def _check_others(self) -> None:
         """Raise where the moved states or the inputs change how another state moves."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -12,13 +13,20 @@ from ...lanes import each, repeat
 from ...lanes.function import RowFunction
 from ...numerics.checks import fail, integer, non_negative, one_or_each, positive, positive_real, vector
 from ...systems import Plant, StepPlant
-from ..loop.controller import Controller, ControllerState, Policy, Value, carrying
+from ..loop.controller import Controller, Policy, Value
 from ..problem.cost import Cost
 from ..problem.held_plant import Holding
 from ..safety.safety_filter import Constraint
 
 _AXES = 4  # at most: their combinations are 3^k - 1
 _AROUND = (0.2, 0.07)  # by which the detour of the period before is varied, in units of the axes
+
+
+class Detour(NamedTuple):
+    """What a `DetourRollout` carries."""
+
+    way: Tensor  # along each axis, and for how many periods, (B, k + 1)
+    done: Tensor  # periods since the beginning, (B, 1)
 
 
 class DetourRollout(Controller):
@@ -125,18 +133,15 @@ class DetourRollout(Controller):
         self.holding = Holding("DetourRollout", plant, self.cost, self.stride * self.hold)
         self._rows = RowFunction(self._definition, self, "a choice of detours")
 
-    def init(self, x0: Tensor) -> ControllerState:
-        return carrying(x0.new_zeros(len(x0), len(self.axes) + 2))  # the detour, its length, periods so far
+    def init(self, x0: Tensor) -> Detour:
+        return Detour(x0.new_zeros(len(x0), len(self.axes) + 1), x0.new_zeros(len(x0), 1))
 
-    def step(
-        self, x: Tensor, carried: ControllerState, uniform: Tensor, dt: float
-    ) -> tuple[Tensor, ControllerState]:
+    def step(self, x: Tensor, carried: Detour, uniform: Tensor, dt: float) -> tuple[Tensor, Detour]:
         if dt != self.hold:
             raise fail("DetourRollout", "dt", f"must be that of the loop, {dt:g} s", self.hold)
-        known = carried.identifier
-        found = self._rows(torch.cat((x, known), dim=-1))
-        u, known = found.split((self.plant.inputs, known.shape[-1]), dim=-1)
-        return u, carried._replace(identifier=known)
+        found = self._rows(torch.cat((x, *carried), dim=-1))
+        u, way, done = found.split((self.plant.inputs, carried.way.shape[-1], 1), dim=-1)
+        return u, Detour(way, done)
 
     def _definition(self, z: Tensor) -> Tensor:
         """Of rows of (x, detour, periods so far) the control, and both for the next period."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -11,7 +12,7 @@ from ...lanes import Program, repeat
 from ...lanes.function import RowFunction
 from ...lanes.loops import tracing_now
 from ...numerics.checks import fail, flag, integer
-from ..loop.controller import Controller, ControllerState, carrying
+from ..loop.controller import Controller
 from ..policies.sampled_rollout import SampledRollout
 from ..problem.sampled import SampledProblem
 from .ddp import BoxDDP, LocalModel, Reference, Trajectories, around, packed, resting, unpacked
@@ -19,6 +20,13 @@ from .global_value import GlobalValue
 from .global_value_learning import best_from
 
 _LENGTHS = (2, 4, 7, 12, 20, 30)  # periods for which a corner of the bounds is held before the feedback
+
+
+class Following(NamedTuple):
+    """The plan that a row follows."""
+
+    plan: Tensor  # state, control and feedback of every step, (B, T, n + m + m n)
+    done: Tensor  # steps that were followed of it, (B,); -1 where a row has no plan
 
 
 class RecedingHorizon(Controller):
@@ -105,53 +113,47 @@ class RecedingHorizon(Controller):
         """
         self._hastened = self._search is not None and self.memory is None
 
-    @property
-    def width(self) -> int:
-        """Numbers of a plan: T (n + m + m n)."""
-        n, m = self.problem.dim, self.problem.inputs
-        return self.steps * (n + m + m * n)
-
-    def init(self, x0: Tensor) -> ControllerState:
+    def init(self, x0: Tensor) -> Following:
         """The first plan, from the states x0 (B, n)."""
         if self._search is None and self.memory is not None:
-            return _carrying(_rows(best_from(self.memory, self._first, x0)))
+            return _following(best_from(self.memory, self._first, x0))
         if self.held:
-            return _carrying(_rows(best_held(self._first, x0)))
+            return _following(best_held(self._first, x0))
         control, reference = (None, None) if self.memory is None else self._remembered(x0)
         found = self._first.solve(x0, control, reference, self._terminal(x0, control, reference))
-        return _carrying(_rows(found))
+        return _following(found)
 
-    def idle(self, x0: Tensor) -> ControllerState:
+    def idle(self, x0: Tensor) -> Following:
         """The linear feedback of the goal as a plan, not yet followed from the states x0 (B, n)."""
-        return _carrying(resting(self.problem, self.problem.goals(x0, self.steps)[:, :-1]))
+        plan = resting(self.problem, self.problem.goals(x0, self.steps)[:, :-1])
+        return Following(plan, torch.zeros_like(plan[:, 0, 0]))
 
-    def step(
-        self, x: Tensor, carried: ControllerState, uniform: Tensor, dt: float
-    ) -> tuple[Tensor, ControllerState]:
+    def step(self, x: Tensor, carried: Following, uniform: Tensor, dt: float) -> tuple[Tensor, Following]:
         """The first control of the improved plan (B, m), and the plan a step further on."""
         if self._search is None:
-            return self._followed(x, carried.identifier)
-        row = x, carried.identifier
+            return self._followed(x, carried)
+        row = x, carried
         if self._hastened and not tracing_now() and self._whole.compiles((), (), row, steps=1):
-            _, found = self._whole((), (), row, steps=1)
-            u, plan = (part[:, 0] for part in found)
-        else:
-            u, plan = self._improved(*row)
-        return u, carrying(plan)
+            _, (u, after) = self._whole((), (), row, steps=1)
+            return u[:, 0], Following(after.plan[:, 0], after.done[:, 0])
+        return self._improved(*row)
 
-    def _begun(self, x: Tensor, plan: Tensor) -> tuple[Tensor, Reference]:
-        """What a search begins from: the memory's plan, or the carried one (B, 1 + T w)."""
+    def _begun(self, x: Tensor, carried: Following) -> tuple[Tensor, Reference]:
+        """What a search begins from: the memory's plan, or the carried one."""
         if self.memory is not None:
             return self._remembered(x)
-        state, control, feedback = unpacked(self.problem, plan[:, 1:].unflatten(-1, (self.steps, -1)))
+        state, control, feedback = unpacked(self.problem, carried.plan)
         return control, Reference(state, feedback)
 
-    def _improved(self, x: Tensor, plan: Tensor) -> tuple[Tensor, Tensor]:
-        """The first control of an improved plan and the numbers that are carried: (B, n), (B, 1 + T w)."""
+    def _improved(self, x: Tensor, carried: Following) -> tuple[Tensor, Following]:
+        """The first control of an improved plan, and the plan from the next step on, at its end the linear
+        feedback of the goal near the last state."""
         assert self._search is not None
-        control, reference = self._begun(x, plan)
+        control, reference = self._begun(x, carried)
         found = self._search.solve(x, control, reference, self._terminal(x, control, reference))
-        return found.control[:, 0], self._ahead(_rows(found), found.state[:, -1]).identifier
+        hold = resting(self.problem, self.problem.goals(found.state[:, -1], 0))
+        plan = torch.cat((_rows(found)[:, 1:], hold), dim=1)
+        return found.control[:, 0], Following(plan, torch.zeros_like(carried.done))
 
     def _remembered(self, x: Tensor) -> tuple[Tensor, Reference]:
         assert self.memory is not None
@@ -165,26 +167,18 @@ class RecedingHorizon(Controller):
             x, _ = self.problem.advance(x, around(self.problem, x, step))
         return self.memory.model(x)
 
-    def _followed(self, x: Tensor, plan: Tensor) -> tuple[Tensor, ControllerState]:
-        """The control of a plan that is not improved, (B, 1 + T w), and the plan with one step more done."""
-        width, last = self.width // self.steps, self.steps - 1
-        carried = _carrying(plan[:, 1:], plan[:, :1] + 1)
+    def _followed(self, x: Tensor, carried: Following) -> tuple[Tensor, Following]:
+        """The control of a plan that is not improved, and the plan with one step more done."""
+        plan, done = carried
+        last, after = self.steps - 1, Following(plan, done + 1)
         if tracing_now():  # a program cannot ask for a number: it looks up the row of the plan
-            done, steps = plan[:, :1], plan[:, 1:].unflatten(-1, (self.steps, width))
-            now = steps.gather(1, done.clamp(max=last).long().unsqueeze(-1).expand(-1, -1, width)).squeeze(1)
-            planned = around(self.problem, x, now)
-            return torch.where(done > last, self.problem.linear_feedback(x), planned), carried
-        begun = int(plan[0, 0])  # all rows began together
+            at = done.clamp(max=last).long()[:, None, None].expand(-1, -1, plan.shape[-1])
+            planned = around(self.problem, x, plan.gather(1, at).squeeze(1))
+            return torch.where((done > last).unsqueeze(-1), self.problem.linear_feedback(x), planned), after
+        begun = int(done[0])  # all rows began together
         if begun > last:
-            return self.problem.linear_feedback(x), carried
-        now = plan[:, 1 + begun * width : 1 + (begun + 1) * width]
-        return around(self.problem, x, now), carried
-
-    def _ahead(self, plan: Tensor, last: Tensor) -> ControllerState:
-        """The plan (B, T, w) from the next step on, and at its end the linear feedback of the goal near the
-        last state (B, n)."""
-        hold = resting(self.problem, self.problem.goals(last, 0))
-        return _carrying(torch.cat((plan[:, 1:], hold), dim=1))
+            return self.problem.linear_feedback(x), after
+        return around(self.problem, x, plan[:, begun]), after
 
 
 def _rows(found: Trajectories) -> Tensor:
@@ -192,10 +186,10 @@ def _rows(found: Trajectories) -> Tensor:
     return packed(found.state[:, :-1], found.control, found.feedback)
 
 
-def _carrying(plan: Tensor, done: Tensor | None = None) -> ControllerState:
-    """A plan (B, T, w) and how many of its steps are done, (B, 1); none by default."""
-    done = plan.new_zeros(len(plan), 1) if done is None else done
-    return carrying(torch.cat((done, plan.flatten(1)), dim=1))
+def _following(found: Trajectories) -> Following:
+    """A plan of which no step is done."""
+    plan = _rows(found)
+    return Following(plan, torch.zeros_like(plan[:, 0, 0]))
 
 
 def best_held(search: BoxDDP, x: Tensor) -> Trajectories:
@@ -281,59 +275,58 @@ class StrainedPlans(Controller):
     def label(self) -> str:
         return type(self.policy).__name__
 
-    def init(self, x0: Tensor) -> ControllerState:
+    def init(self, x0: Tensor) -> Following:
         """The first plans from x0 (B, n), of the rows that need one.
 
         After `lanes.ready` of the policy, what the loop may need is made and compiled here, too.
         """
-        carried = self._without(x0)
         if self.policy.compiled:
             self._planner.hasten()
             self._begun.hasten()
             self._begun.step(x0, self._begun.idle(x0), x0, self.policy.period)
-        rows = self._strained(x0).nonzero().squeeze(1)
+        carried, rows = self._without(x0), self._strained(x0).nonzero().squeeze(1)
         if len(rows):  # saves work: the best of several takes a tenth of a second
-            carried.identifier[rows] = self._begun.init(x0[rows]).identifier
+            carried = _replaced(carried, rows, self._begun.init(x0[rows]))
         return carried
 
-    def step(
-        self, x: Tensor, carried: ControllerState, uniform: Tensor, dt: float
-    ) -> tuple[Tensor, ControllerState]:
+    def step(self, x: Tensor, carried: Following, uniform: Tensor, dt: float) -> tuple[Tensor, Following]:
         if tracing_now():
             return self._traced(x, carried, uniform, dt)
         rows = self._strained(x).nonzero().squeeze(1)
-        none = carried.identifier[:, 0] < 0
+        none = carried.done < 0
         if not len(rows):  # saves work, as below: a plan takes milliseconds
             return self.policy(x), carried if bool(none.all()) else self._without(x)
         # The policy sees all rows, as each number of rows would be a program of its own.
         u = self.policy(x) if len(rows) < len(x) else x.new_empty(len(x), self.policy.cost.inputs)
-        plans, begins = carried.identifier[rows], none[rows].unsqueeze(-1)
-        plans = torch.where(begins, self._begun.idle(x[rows]).identifier, plans)
-        mine = carried._replace(**{name: part[rows] for name, part in carried._asdict().items()})
-        planned, ahead = self._begun.step(x[rows], mine._replace(identifier=plans), uniform[rows], dt)
-        after = self._without(x)
-        after.identifier[rows] = ahead.identifier
-        return u.index_copy(0, rows, planned), after
+        mine = Following(*(part[rows] for part in carried))
+        planned, ahead = self._begun.step(x[rows], self._or_idle(x[rows], mine), uniform[rows], dt)
+        return u.index_copy(0, rows, planned), _replaced(self._without(x), rows, ahead)
 
-    def _traced(
-        self, x: Tensor, carried: ControllerState, uniform: Tensor, dt: float
-    ) -> tuple[Tensor, ControllerState]:
+    def _traced(self, x: Tensor, carried: Following, uniform: Tensor, dt: float) -> tuple[Tensor, Following]:
         """`step` for a program, which plans where the row asks for it."""
-        met, known = self._strained(x), carried.identifier
-        plans = torch.where(known[:, :1] < 0, self._begun.idle(x).identifier, known)
+        met, plans = self._strained(x), self._or_idle(x, carried)
+        start = self.policy(x), self._without(x)
+        found: tuple[Tensor, Following] = repeat(
+            1, lambda _: self._begun.step(x, plans, uniform, dt), start, where=lambda _: met
+        )
+        return found
 
-        def plan(_: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
-            u, after = self._begun.step(x, carried._replace(identifier=plans), uniform, dt)
-            return u, after.identifier
+    def _or_idle(self, x: Tensor, carried: Following) -> Following:
+        """The plans, and where a row has none the linear feedback of the goal as one."""
+        none, idle = carried.done < 0, self._begun.idle(x)
+        plan = torch.where(none[:, None, None], idle.plan, carried.plan)
+        return Following(plan, torch.where(none, idle.done, carried.done))
 
-        start = self.policy(x), self._without(x).identifier
-        u, after = repeat(1, plan, start, where=lambda _: met)
-        return u, carrying(after)
-
-    def _without(self, x: Tensor) -> ControllerState:
-        """No plan in any row: -1 steps of it are done."""
-        return carrying(x.new_full((len(x), 1 + self._begun.width), -1.0))
+    def _without(self, x: Tensor) -> Following:
+        """No plan in any row."""
+        none = self._begun.idle(x)
+        return Following(torch.full_like(none.plan, -1.0), torch.full_like(none.done, -1.0))
 
     def _strained(self, x: Tensor) -> Tensor:
         """(B, n) -> (B,) bool; a row that has left the finite numbers has nothing to plan."""
         return self._planner.strained(x) & torch.isfinite(x).all(-1)
+
+
+def _replaced(carried: Following, rows: Tensor, by: Following) -> Following:
+    """Plans of which some rows are others."""
+    return Following(*(old.index_copy(0, rows, new) for old, new in zip(carried, by, strict=True)))

@@ -11,7 +11,7 @@ from torch import Tensor
 from ...lanes import Program, each, scan
 from ...lanes.loops import tracing_now
 from ...numerics.checks import fail, integer, one_or_each, positive, positive_real
-from ..loop.controller import Controller, ControllerState, carrying
+from ..loop.controller import Controller
 from ..problem.sampled import SampledProblem
 
 _INSIDE = 1 - 1e-12  # of a uniform number: its normal one is then finite
@@ -100,16 +100,14 @@ class PathIntegral(Controller):
             lambda carry, now, row: (carry, self._paid(*row)), name="sampled plans", compile=compile
         )
 
-    def init(self, x0: Tensor) -> ControllerState:
-        """No change of the feedback."""
-        return carrying(x0.new_zeros(len(x0), self.steps * self.problem.inputs))
+    def init(self, x0: Tensor) -> Tensor:
+        """No change of the feedback, (B, T, m)."""
+        return x0.new_zeros(len(x0), self.steps, self.problem.inputs)
 
-    def step(
-        self, x: Tensor, carried: ControllerState, uniform: Tensor, dt: float
-    ) -> tuple[Tensor, ControllerState]:
+    def step(self, x: Tensor, carried: Tensor, uniform: Tensor, dt: float) -> tuple[Tensor, Tensor]:
         """The first control of the improved plan (B, m), and the change a step further on."""
         count, m = len(x), self.problem.inputs
-        plan = carried.identifier.unflatten(-1, (1, self.steps, m))
+        plan = carried.unsqueeze(1)
         numbers = uniform.flatten(1)[:, : self.samples * self.knots * m]
         normal = math.sqrt(2) * (_INSIDE * numbers).erfinv().view(count, self.samples, self.knots, m)
         tried = plan + (self.spread @ normal) * self.scales[:, None, None] * self.noise  # (B, S, T, m)
@@ -129,7 +127,7 @@ class PathIntegral(Controller):
         better = self.costs(x, blended.unsqueeze(1))[:, 0] < least[:, 0]
         plan = torch.where(better[:, None, None], blended, chosen)
         ahead = torch.cat((plan[:, 1:], torch.zeros_like(plan[:, :1])), dim=1)
-        return self.problem.steered(x, plan[:, 0]), carrying(ahead.flatten(1))
+        return self.problem.steered(x, plan[:, 0]), ahead
 
     def costs(self, x: Tensor, change: Tensor) -> Tensor:
         """What changes of the feedback cost, inf where that is not finite: (B, n), (B, S, T, m) -> (B, S)."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -16,7 +16,7 @@ from ...numerics.checks import fail, non_negative, one_or_each, positive, positi
 from ...numerics.runge_kutta import runge_kutta_step
 from ...systems import Bounds, Plant, StepPlant
 from ...systems.bounds import Limit
-from ..loop.controller import Controller, ControllerState, Feedback, Policy
+from ..loop.controller import Carried, Controller, Feedback, Policy
 from ..loop.simulation import LoopResult
 from .quadratic_program import cases, nearest_admissible
 
@@ -29,7 +29,6 @@ _PASSES, _MOST = 2, 8  # linearisations at least, the first at the wanted contro
 _SOLVED = 1e-6  # of what a wanted control misses, at which it is
 _PROBES, _TIMES = 32, (0.0, 0.1, 1.0, 10.0, 100.0)  # states and times (s) at which constraints are tried
 _NOTHING = 1e-9  # of the slopes that make it, below which the effect of a control counts as none
-_RECORD = 4  # columns that the filter carries: steps, least margin, largest slack, steps with another control
 
 
 class Filtered(NamedTuple):
@@ -48,6 +47,16 @@ class Filtered(NamedTuple):
     control: Tensor  # (..., m)
     margin: Tensor  # h of every constraint now, (..., k)
     slack: Tensor  # (...) how much further u would have to reach, in its (weighted) units; 0: all is met
+
+
+class Watched(NamedTuple):
+    """What a `SafetyFilter` carries; all but the first are recorded by these names."""
+
+    inner: Carried  # of the controller behind it
+    filtered_steps: Tensor  # (B,)
+    least_margin: Tensor  # smallest h so far, (B,)
+    largest_slack: Tensor  # (B,)
+    acted: Tensor  # steps with another control than the wanted one, (B,)
 
 
 class SafetyFilter(Controller):
@@ -187,32 +196,26 @@ class SafetyFilter(Controller):
         control, margin, slack = found.split((u.shape[-1], len(self.constraints), 1), dim=-1)
         return Filtered(control, margin, slack.squeeze(-1))
 
-    def init(self, x0: Tensor) -> ControllerState:
-        inner = self.controller.init(x0)
-        record = x0.new_tensor([0.0, math.inf, 0.0, 0.0]).expand(len(x0), -1)
-        return inner._replace(identifier=torch.cat((inner.identifier, record), dim=-1))
+    def init(self, x0: Tensor) -> Watched:
+        none = x0.new_zeros(len(x0))
+        return Watched(self.controller.init(x0), none, none + math.inf, none.clone(), none.clone())
 
-    def step(
-        self, x: Tensor, carried: ControllerState, uniform: Tensor, dt: float
-    ) -> tuple[Tensor, ControllerState]:
+    def recorded(self, carried: Watched) -> dict[str, Tensor]:
+        inner, *own = carried
+        return {**self.controller.recorded(inner), **dict(zip(Watched._fields[1:], own, strict=True))}
+
+    def step(self, x: Tensor, carried: Watched, uniform: Tensor, dt: float) -> tuple[Tensor, Watched]:
         if dt != self.hold:
             raise fail("SafetyFilter", "dt", f"must be that of the loop, {dt:g} s", self.hold)
-        known = carried.identifier
-        u, after = self.controller.step(x, carried._replace(identifier=known[:, :-_RECORD]), uniform, dt)
-        steps, least, most, acted = known[:, -_RECORD:].unbind(-1)
+        inner, steps, least, most, acted = carried
+        u, inner = self.controller.step(x, inner, uniform, dt)
         found = self.restrain(x, u, steps * self.hold)
-        other = (found.control != self.bounds.clip(u)).any(-1)
-        record = (
-            steps + 1,
-            torch.minimum(least, found.margin.amin(-1)),
-            torch.maximum(most, found.slack),
-            acted + other,
-        )
-        columns = torch.cat((after.identifier, torch.stack(record, dim=-1)), dim=-1)
-        return found.control, after._replace(identifier=columns)
+        least, most = torch.minimum(least, found.margin.amin(-1)), torch.maximum(most, found.slack)
+        acted = acted + (found.control != self.bounds.clip(u)).any(-1)
+        return found.control, Watched(inner, steps + 1, least, most, acted)
 
-    def value(self, x: Tensor, carried: ControllerState) -> Tensor | None:
-        return self.controller.value(x, carried)
+    def value(self, x: Tensor, recorded: Mapping[str, Tensor]) -> Tensor | None:
+        return self.controller.value(x, recorded)
 
     def margins(self, x: Tensor, t: float | Tensor = 0.0) -> Tensor:
         """h of every constraint: (..., n) and a number or (...) -> (..., k)."""
@@ -230,8 +233,7 @@ class SafetyFilter(Controller):
             condition at a time; ``largest_slack``; ``acted``, the share of the steps in which the control was
             another than the wanted one within the bounds.
         """
-        record = result.identifier[:, -1, -_RECORD:]
-        steps, least, most, acted = record.unbind(-1)
+        steps, least, most, acted = (result[name][:, -1] for name in Watched._fields[1:])
         last = self.margins(result.state[:, -1], steps * self.hold).amin(-1)
         least = torch.minimum(least, last)
         return {

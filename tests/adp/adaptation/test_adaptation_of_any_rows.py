@@ -105,11 +105,10 @@ def designed(slopes: Tensor, gains: Tensor, _: Tensor) -> Any:
     q, r = torch.diag(tensor([1.0, 2.0])).to(slopes), tensor([[0.7]]).to(slopes)
     p = adp.riccati_rows(slopes, gains, q, r, doublings=6)
     made = redesign.Redesign(q, r, 4, 2)
-    pair, stage = redesign.Doubling(0 * p, 0 * p, 0 * p), torch.zeros_like(p[..., 0, 0])
-    first = made.step(pair, stage, 0 * p, slopes, gains)
-    second = made.step(*first, slopes, gains)
+    first = made.step(redesign.Design.init(p[..., 0]), slopes, gains)
+    second = made.step(first, slopes, gains)
     residual = redesign.riccati_residual(p, slopes, redesign.control_rate(gains, r), q)
-    return p, first, second, residual, made.solved(second[2], slopes, gains)
+    return p, first, second, residual, made.solved(second.p, slopes, gains)
 
 
 CASES: dict[str, tuple[FOUND, tuple[Tensor, Tensor, Tensor]]] = {

@@ -71,14 +71,13 @@ def test_a_plant_of_unknown_parameters_is_learned_and_the_robust_policy_has_it_u
         steps=150,
         compile=False,
     )
-    now = control.adaptation(run.identifier)
-    torch.testing.assert_close(now.estimate.theta[:, -1], true, rtol=2e-2, atol=2e-2)
-    x, u, certain = run.state[:, :-1, :2], run.control[:, :-1], now.certain[:, 1:-1].bool()
+    torch.testing.assert_close(run["theta"][:, -1], true, rtol=2e-2, atol=2e-2)
+    x, u, certain = run.state[:, :-1, :2], run.control[:, :-1], run["certain"][:, 1:-1].bool()
     assert not certain[:, 0].any()
     assert certain[:, -1].all()
     doubtful = ~certain
     torch.testing.assert_close(u[:, :-1][doubtful], (robust(x) + 0.25)[:, :-1][doubtful])
-    gain = [adp.LQR(PENDULUM.believing(row), COST).k for row in now.estimate.theta[:, -1]]
+    gain = [adp.LQR(PENDULUM.believing(row), COST).k for row in run["theta"][:, -1]]
     last = -(torch.stack(gain) @ x[:, -1].unsqueeze(-1)).squeeze(-1)
     torch.testing.assert_close(u[:, -1], last, rtol=1e-3, atol=1e-6)
 
@@ -97,7 +96,7 @@ def test_a_change_is_found_when_it_happens() -> None:
         steps=160,
         compile=False,
     )
-    alarmed = control.adaptation(run.identifier).alarmed_at[:, -1]
+    alarmed = run["alarmed_at"][:, -1]
     assert 0.5 <= float(alarmed[0]) <= 0.54
     assert float(alarmed[1]) == -1
 
@@ -107,7 +106,7 @@ def test_a_design_that_cannot_be_made_leaves_the_robust_policy_and_not_a_dead_ro
     control = adp.AdaptiveLQR(PENDULUM, COST, WINDOWS, law, robust=lambda x: 0 * x[..., :1], a_step=7)
     run = adp.simulate(control, PENDULUM, COST, tensor([[0.1, 0.0]]), dt=0.01, steps=60, compile=False)
     assert not run.diverged.any()
-    assert not control.adaptation(run.identifier).certain.any()
+    assert not run["certain"].any()
 
 
 @pytest.mark.needs_compiler
@@ -125,10 +124,9 @@ def test_compiled_steps_are_those_of_the_definition() -> None:
     state = loop.init(z0)
     assert steps.compiles(state, draws)
     got, want = steps(state, draws)[0], steps.definition(state, draws)[0]
-    for one, other in zip((*got[:4], *got.carried), (*want[:4], *want.carried), strict=True):
-        torch.testing.assert_close(one, other, rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(got, want, rtol=1e-9, atol=1e-9)
     part = steps(loop.init(z0[:3]), draws[:3])[0]  # rows do not know of each other
-    assert torch.equal(part.carried.identifier, got.carried.identifier[:3])
+    assert torch.equal(part.carried.estimate.theta, got.carried.estimate.theta[:3])
 
 
 def test_behind_walls_parameters_are_learned_from_the_plant_and_the_design_is_of_the_barrier() -> None:
@@ -152,10 +150,9 @@ def test_behind_walls_parameters_are_learned_from_the_plant_and_the_design_is_of
     control = adp.AdaptiveLQR(model, cost, windows, law, robust=lambda s: -10 * s[..., 1:], doublings=8)
     s0 = box.transform(tensor([[-6.5, 6.5]]))
     run = adp.simulate(control, box, cost, s0, dt=0.001, steps=20, compile=False)
-    now = control.adaptation(run.identifier)
-    assert bool(now.certain[0, 6:].all())
-    assert not bool(now.certain[0, 1])
-    torch.testing.assert_close(now.estimate.theta[0, -1], tensor(true), rtol=0, atol=1e-3)
+    assert bool(run["certain"][0, 6:].all())
+    assert not bool(run["certain"][0, 1])
+    torch.testing.assert_close(run["theta"][0, -1], tensor(true), rtol=0, atol=1e-3)
     lqr = adp.LQR(box, cost)
     torch.testing.assert_close(run.control[0, 15:20], lqr(run.state[0, 15:20]), rtol=1e-2, atol=1e-2)
     with pytest.raises(ValueError, match="must be around a ParametricPlant"):

@@ -196,10 +196,10 @@ def test_weights_wait_in_doubt_and_every_state_is_regulated_near_the_optimum() -
     # From the first three, weights that moved before the drift was known diverged.
     x0 = torch.cat((tensor([[0.858, 0.7204], [-1.8829, -1.4841], [-1.9202, -1.7179]]), uniform(5, 2) * 2))
     run = loop(control, x0, 150)
-    now = control.knowledge(run.identifier)
-    assert torch.equal(now.certain[:, 0], torch.zeros(len(x0)).double())
-    assert bool((now.certain[:, -1] == 1).all())
-    waited = now.certain.cumsum(1) == 0
+    certain = run["certain"]
+    assert torch.equal(certain[:, 0], torch.zeros(len(x0)).double())
+    assert bool((certain[:, -1] == 1).all())
+    waited = certain.cumsum(1) == 0
     weights = run.critic_weights[waited]
     assert torch.equal(weights, tensor(FIRST).expand_as(weights))
     first, last = (PLANT.optimal_value(x, COST.q, COST.r) for x in (x0, run.state[:, -1]))
@@ -245,12 +245,11 @@ def test_rows_do_not_touch_and_what_was_learned_is_known_in_the_next_episode() -
     control, x0 = adaptive(), uniform(6, 2)
     whole, alone = loop(control, x0, 40), loop(control, x0[2:3], 40)
     assert torch.equal(whole.state[2:3], alone.state)
-    assert torch.equal(whole.identifier[2:3], alone.identifier)
-    learned = control.knowledge(loop(control, tensor([[-1.5, 1.5]]), 80).identifier).estimate
-    next_one = control.knowing(adp.Estimate(*(part[0, -1] for part in learned)))
-    again = control.knowledge(loop(next_one, x0, 3).identifier)
-    assert bool((again.certain[:, 1] == 1).all())  # from the first step
-    assert bool((control.knowledge(loop(control, x0, 3).identifier).certain[:, 1] == 0).all())
+    assert torch.equal(whole["theta"][2:3], alone["theta"])
+    learned = loop(control, tensor([[-1.5, 1.5]]), 80).carried.estimate
+    next_one = control.knowing(adp.Estimate(*(part[0] for part in learned)))
+    assert bool((loop(next_one, x0, 3)["certain"][:, 1] == 1).all())  # from the first step
+    assert bool((loop(control, x0, 3)["certain"][:, 1] == 0).all())
 
 
 def test_the_robust_policy_has_the_control_in_doubt() -> None:
@@ -277,9 +276,8 @@ def test_weights_begin_anew_where_the_plant_becomes_another_one() -> None:
     inside = adp.AdaptiveActorCritic(LEARNER, damping, adp.IntegralWindows(damping, 0.01), law)
     control = adp.Measured(inside, noise=0.0, dim=2)
     run = adp.simulate(control, plant, plant.cost(COST), z0, dt=0.01, steps=80, compile=False)
-    now = inside.knowledge(run.identifier)
-    anew = int((now.estimate.resets[0] > 0).to(torch.int8).argmax())
+    anew = int((run["resets"][0] > 0).to(torch.int8).argmax())
     assert 50 <= anew <= 53
     before, after = ((run.critic_weights[0, k] - tensor(FIRST)).abs().max() for k in (anew - 1, anew))
     assert float(after) < 0.7 * float(before)
-    assert float(now.estimate.theta[0, -1, 0]) == pytest.approx(3.0, abs=1e-2)
+    assert float(run["theta"][0, -1, 0]) == pytest.approx(3.0, abs=1e-2)

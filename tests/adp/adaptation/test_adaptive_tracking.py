@@ -73,7 +73,7 @@ def test_identified_drift_converges_and_the_error_with_it() -> None:
     tracker = adp.IdentifyingTracker(learner, TRACKING, adp.ConcurrentLearning(3, 2, 6, gain=5.0), start)
     run = adp.simulate(tracker, TRACKING, cost, x0, dt=0.01, steps=500, every=100, compile=True)
     assert not run.diverged.any()
-    theta = run.identifier[:, -1, :6].reshape(2, 3, 2)
+    theta = run["theta"][:, -1]
     assert (theta - true_parameters()).abs().max() < 5e-3
     assert (run.state[:, -1, :2].norm(dim=-1) < 2e-2).all()
     desired = systems.desired_trajectory(run.time).expand(2, -1, -1)

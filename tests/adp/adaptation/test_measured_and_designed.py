@@ -41,39 +41,36 @@ def test_a_design_is_that_of_the_model_at_its_beginning(doublings: int, a_step: 
     models = [
         (uniform(5, 2, 2, seed=k), uniform(5, 2, 1, seed=20 + k)) for k in range(2 * doublings // a_step)
     ]
-    zero = torch.zeros(5, 2, 2).double()
-    now = redesign.Doubling(zero, zero, zero), torch.zeros(5).double(), zero
+    now = redesign.Design.init(torch.zeros(5, 2).double())
     for k, (a, b) in enumerate(models):
-        before = now[2]
-        now = made.step(*now, a, b)
+        before = now.p
+        now = made.step(now, a, b)
         done = (k + 1) * a_step % doublings
-        assert now[1].tolist() == [done] * 5
+        assert now.stage.tolist() == [done] * 5
         if done:
-            assert torch.equal(now[2], before)
+            assert torch.equal(now.p, before)
         else:
             begun = models[k + 1 - doublings // a_step]
             wanted = adp.riccati_rows(*begun, q, r, doublings=doublings)
-            torch.testing.assert_close(now[2], wanted, rtol=1e-12, atol=1e-12)
-            assert not bool(torch.stack(now[0]).any())
+            torch.testing.assert_close(now.p, wanted, rtol=1e-12, atol=1e-12)
+            assert not bool(torch.stack(now.doubling).any())
 
 
 def test_a_design_that_went_wrong_keeps_the_one_before_and_begins_again() -> None:
     q, r = torch.eye(2).double(), torch.eye(1).double()
-    made, zero = redesign.Redesign(q, r, 2, 1), torch.zeros(2, 2, 2).double()
+    made, start = redesign.Redesign(q, r, 2, 1), redesign.Design.init(torch.zeros(2, 2).double())
     a, b = uniform(2, 2, 2, seed=1), uniform(2, 2, 1, seed=2)
-    good = made.step(
-        *made.step(redesign.Doubling(zero, zero, zero), torch.zeros(2).double(), zero, a, b), a, b
-    )
+    good = made.step(made.step(start, a, b), a, b)
     bad = a.clone()
     bad[1] = torch.nan
-    first = made.step(*good, bad, b)
-    assert bool(torch.isfinite(torch.stack(first[0])).all())
-    assert not bool(first[0].h[1].any())
-    second = made.step(*first, a, b)
-    torch.testing.assert_close(second[2][0], good[2][0])
-    assert bool(torch.isfinite(second[2]).all())
-    again = made.step(*made.step(*second, a, b), a, b)
-    torch.testing.assert_close(again[2], good[2])
+    first = made.step(good, bad, b)
+    assert bool(torch.isfinite(torch.stack(first.doubling)).all())
+    assert not bool(first.doubling.h[1].any())
+    second = made.step(first, a, b)
+    torch.testing.assert_close(second.p[0], good.p[0])
+    assert bool(torch.isfinite(second.p).all())
+    again = made.step(made.step(second, a, b), a, b)
+    torch.testing.assert_close(again.p, good.p)
 
 
 def test_noise_of_a_filter_of_a_plant_in_steps_counts_by_its_period() -> None:

@@ -30,7 +30,7 @@ def test_where_theta_is_known_it_is_the_safety_filter_of_that_plant() -> None:
     filter = adp.SafetyFilter(WANTED.policy, PENDULUM, edge, dt=DT, decay=4.0, degree=2)
     known = guard(TRUE, TRUE)
     u = known.step(x, known.init(x), x.new_zeros(3, 0, 2), DT)[0]
-    assert known.guarded(known.init(x).identifier).least.tolist() == [1e300] * 3  # nothing was seen
+    assert known.init(x).least_margin.tolist() == [1e300] * 3  # nothing was seen
     torch.testing.assert_close(u, filter(x), rtol=1e-9, atol=1e-9)
     assert torch.equal(u[2], WANTED.policy(x)[2])  # far from the edge nothing is changed
 
@@ -56,13 +56,12 @@ def test_an_edge_is_kept_while_the_parameters_are_learned_compiled_as_defined() 
     z0 = truth.start(tensor([[0.2, 0.3], [0.4, 0.0], [-0.5, 1.0]]), true)
     seen, cost = adp.Measured(safe, noise=0.0, dim=2), truth.cost(COST)
     run = adp.simulate(seen, truth, cost, z0, dt=DT, steps=150, compile=True)
-    now = safe.guarded(run.identifier)
     assert float(run.state[..., 0].max()) < 0.5
     assert float(run.state[:, -1, 0].min()) > 0.45  # and it comes near
-    torch.testing.assert_close(now.least[:, -1], (0.5 - run.state[:, :-1, 0]).amin(1))
-    torch.testing.assert_close(now.estimate.theta[:, -1], true, rtol=1e-2, atol=0)
-    assert float(now.slack.max()) < 1e-9
-    assert float(now.acted[:, -1].min()) > 0
+    torch.testing.assert_close(run["least_margin"][:, -1], (0.5 - run.state[:, :-1, 0]).amin(1))
+    torch.testing.assert_close(run["theta"][:, -1], true, rtol=1e-2, atol=0)
+    assert float(run["largest_slack"].max()) < 1e-9
+    assert float(run["acted"][:, -1].min()) > 0
     few = adp.simulate(seen, truth, cost, z0, dt=DT, steps=2, compile=False)
     torch.testing.assert_close(run.state[:, :3], few.state, rtol=1e-10, atol=1e-10)
     torch.testing.assert_close(run.control[:, :2], few.control[:, :2], rtol=1e-9, atol=1e-9)

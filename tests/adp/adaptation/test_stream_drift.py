@@ -120,8 +120,7 @@ def test_an_unknown_drift_is_learned_well_enough_to_regulate_near_the_optimum(le
 
 def test_the_robust_policy_has_the_control_until_the_model_is_certain(learned) -> None:
     control, run, _ = learned
-    now = control.adaptation(run.identifier)
-    certain = now.certain[:, 1:].bool()
+    certain = run["certain"][:, 1:].bool()
     assert not certain[:, 0].any()
     assert certain[:, 5:].double().mean() > 0.9
     x, u = run.state[:, :-1], run.control[:, :-1]

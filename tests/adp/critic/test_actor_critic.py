@@ -51,7 +51,6 @@ def test_weights_begin_as_numbers_lists_or_a_row_each() -> None:
     assert begun.critic.tolist() == [[0.4] * 3] * 3
     assert begun.actor.tolist() == [[0.28] * 3] * 3
     torch.testing.assert_close(begun.gain, torch.eye(3).double().expand(3, 3, 3) / 250)
-    assert begun.identifier.shape == (3, 0)
     own = uniform(3, 3, seed=3)
     gains = tensor([1.0, 2.0, 4.0])
     law = adp.Published()
@@ -103,7 +102,7 @@ def test_bellman_terms_are_those_of_every_point(centers: str, other: bool) -> No
         torch.testing.assert_close(u, wanted.control[:, 0])
         for part, right in zip(after, control.moved(wanted, begun, 0.01), strict=True):
             torch.testing.assert_close(part, right)
-    torch.testing.assert_close(control.value(X, begun), (begun.critic * STAF(X, X)).sum(-1))
+    torch.testing.assert_close(control.value(X, control.recorded(begun)), (begun.critic * STAF(X, X)).sum(-1))
 
 
 class Points(nn.Module):

@@ -239,7 +239,7 @@ def test_a_memory_that_is_lost_freezes_its_row_alone() -> None:
     found = run(Growing(), steps=5, dt=0.02)
     assert found.frozen_at.tolist() == [0.02, math.inf, math.inf]
     assert bool(torch.isfinite(found.state).all())
-    assert found.actor_weights.shape == found.critic_weights.shape == found.identifier.shape == (3, 6, 0)
+    assert found.actor_weights.shape == found.critic_weights.shape == (3, 6, 0)
 
 
 def test_a_control_that_is_renewed_follows_the_state_within_its_bounds() -> None:
@@ -439,11 +439,11 @@ def test_a_feedback_has_the_name_the_period_and_the_value_of_its_policy() -> Non
     lqr, x = adp.LQR(TWO_STATE, COST, period=0.2), uniform(3, 2, seed=1)
     plain, valued = adp.Feedback(np.negative), adp.Feedback(lqr, lqr.value)
     assert (plain.label, plain.period, valued.label, valued.period) == ("negative", None, "LQR", 0.2)
-    assert plain.value(x, plain.init(x)) is None
+    assert plain.value(x, {}) is None
     guarded = adp.Supervised(valued, lqr, COST)
     assert guarded.period == 0.2
     for each in (valued, guarded):
-        torch.testing.assert_close(each.value(x, plain.init(x)), lqr.value(x))
+        torch.testing.assert_close(each.value(x, {}), lqr.value(x))
 
 
 class Integral(nn.Module):

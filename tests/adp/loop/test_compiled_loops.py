@@ -27,6 +27,7 @@ from staf_torch import (
     rings,
     systems,
 )
+from staf_torch.lanes.tree import flatten
 
 PLAIN = "runs in plain torch, slower:"
 Case = tuple[adp.Controller, systems.ControlAffineSystem, adp.Cost]
@@ -127,7 +128,7 @@ def states(case: Case, rows: int) -> Tensor:
 
 
 def fields(result: adp.LoopResult) -> list[Tensor]:
-    return [getattr(result, field.name) for field in dataclasses.fields(result)]
+    return flatten([getattr(result, field.name) for field in dataclasses.fields(result)])[0]
 
 
 @pytest.mark.needs_compiler

@@ -11,12 +11,11 @@ from typing import Any
 
 import pytest
 import torch
-from helpers import tensor, uniform
+from helpers import changed, tensor, uniform
 from torch import Tensor
 
 from staf_torch import adp, systems
-from staf_torch.adp.loop.controller import carrying
-from staf_torch.adp.planning.detour_ddp import PlanProblem
+from staf_torch.adp.planning.detour_ddp import CarriedPlan, PlanProblem
 
 PLANE = systems.Linear(torch.eye(4).roll(2, dims=1).triu().tolist(), torch.eye(4)[:, 2:].tolist())
 COST = adp.QuadraticCost(1.0, 1.0, dim=4, inputs=2, low=-1.0, high=1.0)
@@ -71,7 +70,7 @@ def test_an_angle_counts_the_shorter_way_around() -> None:
     u, after = plans.step(x, plans.init(x), x, 0.1)
     other, same = plans.step(turned, plans.init(turned), x, 0.1)
     torch.testing.assert_close(other, u, rtol=1e-6, atol=1e-6)
-    torch.testing.assert_close(same.identifier, after.identifier, rtol=1e-6, atol=1e-6)
+    torch.testing.assert_close(same, after, rtol=1e-6, atol=1e-6)
 
 
 @pytest.mark.compiled
@@ -119,7 +118,9 @@ def test_rows_do_not_see_each_other_and_it_can_be_pickled() -> None:
     for k in range(2):
         one, its = plans.step(AWAY[k : k + 1], plans.init(AWAY[k : k + 1]), AWAY, 0.2)
         torch.testing.assert_close(one, u[k : k + 1], rtol=1e-10, atol=1e-10)
-        torch.testing.assert_close(its.identifier, after.identifier[k : k + 1], rtol=1e-10, atol=1e-10)
+        torch.testing.assert_close(
+            its, CarriedPlan(*(part[k : k + 1] for part in after)), rtol=1e-10, atol=1e-10
+        )
 
 
 def _picklable() -> adp.DetourRollout:
@@ -165,12 +166,10 @@ def total(plans: adp.DetourPlans, x: Tensor, control: Tensor, done: Tensor) -> T
 
 
 def planned(plans: adp.DetourPlans, x: Tensor, plan: Tensor, expected: float, done: float) -> Tensor:
-    """J of the plan that a step makes of one that is carried, (B, T m)."""
+    """J of the plan that a step makes of one that is carried, (B, T, m)."""
     none = torch.zeros(len(x), 1).double()
-    known = torch.cat((plan, none + expected, none + done), dim=-1)
-    u, after = plans.step(x, carrying(known), x, plans.hold)
-    ahead = after.identifier[:, :-2].unflatten(-1, (plans.steps, -1))
-    return total(plans, x, torch.cat((u.unsqueeze(1), ahead[:, :-1]), dim=1), none + done)
+    u, after = plans.step(x, CarriedPlan(plan, none + expected, none + done), x, plans.hold)
+    return total(plans, x, torch.cat((u.unsqueeze(1), after.control[:, :-1]), dim=1), none + done)
 
 
 def test_where_nothing_is_in_its_way_and_no_bound_is_met_the_plan_is_the_lqr() -> None:
@@ -178,16 +177,15 @@ def test_where_nothing_is_in_its_way_and_no_bound_is_met_the_plan_is_the_lqr() -
     u, after = plans.step(x, plans.init(x), x, 0.2)
     # J counts a period by its beginning, the LQR of 0.2 s by the integral.
     torch.testing.assert_close(u, LQR(x), rtol=0.3, atol=0.05)
-    ahead = after.identifier[:, :-2].unflatten(-1, (8, 2))
     moved = systems.runge_kutta_step(lambda y: PLANE.motion(y, u), x, 0.2)
-    torch.testing.assert_close(plans.step(moved, after, x, 0.2)[0], ahead[:, 0], rtol=0.02, atol=0.01)
-    expected = total(plans, moved, ahead, after.identifier[:, -1:])  # so that no other way is looked for
-    torch.testing.assert_close(expected, after.identifier[:, -2], rtol=1e-9, atol=1e-12)
+    torch.testing.assert_close(plans.step(moved, after, x, 0.2)[0], after.control[:, 0], rtol=0.02, atol=0.01)
+    expected = total(plans, moved, after.control, after.done)  # so that no other way is looked for
+    torch.testing.assert_close(expected, after.expected[:, 0], rtol=1e-9, atol=1e-12)
 
 
 def test_a_first_plan_costs_less_than_every_detour_and_no_change_of_it_lowers_that() -> None:
     plans = adp.DetourPlans(detours(margin=0.0, steps=6), first=6)
-    best = plans.init(BESIDE).identifier[:, :-2].unflatten(-1, (6, 2))
+    best = plans.init(BESIDE).control
     found, x, none = (
         total(plans, BESIDE, best, torch.zeros(1, 1).double()),
         BESIDE,
@@ -212,7 +210,7 @@ def test_a_plan_that_costs_more_than_expected_is_left_for_another_way() -> None:
         return torch.where(t < 0.1, 10.0, (x[:, 0] - 1.0).square() + (x[:, 1] + 0.1).square() - 0.16)
 
     plans = adp.DetourPlans(detours(appearing, steps=7, lengths=[3]), first=2)
-    idle = torch.zeros(1, 14).double()
+    idle = torch.zeros(1, 7, 2).double()
     left, kept = (float(planned(plans, BESIDE, idle, expected, 1.0)) for expected in (1.0, 1e9))
     assert left < kept
 
@@ -220,7 +218,7 @@ def test_a_plan_that_costs_more_than_expected_is_left_for_another_way() -> None:
 def test_a_plan_is_kept_where_no_other_way_is_cheaper_however_little_was_expected() -> None:
     """A plan that was improved eight times, and a detour that is improved once."""
     plans = adp.DetourPlans(detours(steps=5), first=8, iterations=1)
-    control = plans.init(BESIDE).identifier[:, :-2]
+    control = plans.init(BESIDE).control
     little, enough = (planned(plans, BESIDE, control, expected, 0.0) for expected in (1e-9, torch.inf))
     torch.testing.assert_close(little, enough, rtol=1e-12, atol=0)
 
@@ -232,12 +230,10 @@ def test_what_a_period_cost_is_taken_off_at_the_time_of_that_period() -> None:
         return torch.where((t > 0.3) & (t < 0.5), -0.05, 10.0) + 0.0 * x[:, 0]
 
     plans = adp.DetourPlans(detours(passing, steps=4, lengths=[3], margin=0.0), first=1)
-    begun = plans.init(AWAY).identifier
-    known = torch.cat((begun[:, :-1], torch.full((2, 1), 2.0, dtype=torch.float64)), dim=-1)
-    u, after = plans.step(AWAY, carrying(known), AWAY, 0.2)
-    given, expected, done = after.identifier.split((8, 1, 1), dim=-1)
+    begun = changed(plans.init(AWAY), done=torch.full((2, 1), 2.0, dtype=torch.float64))
+    u, (given, expected, done) = plans.step(AWAY, begun, AWAY, 0.2)
     ahead = systems.runge_kutta_step(lambda y: PLANE.motion(y, u), AWAY, 0.2)
-    later = total(plans, ahead, given.unflatten(-1, (4, 2)), done)
+    later = total(plans, ahead, given, done)
     torch.testing.assert_close(later, expected[:, 0], rtol=1e-9, atol=1e-9)
 
 

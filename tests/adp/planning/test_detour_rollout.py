@@ -11,7 +11,7 @@ from helpers import tensor
 from torch import Tensor
 
 from staf_torch import adp, systems
-from staf_torch.adp.loop.controller import carrying
+from staf_torch.adp.planning.detour_rollout import Detour
 
 PLANE = systems.Linear(torch.eye(4).roll(2, dims=1).triu().tolist(), torch.eye(4)[:, 2:].tolist())
 COST = adp.QuadraticCost(1.0, 1.0, dim=4, inputs=2, low=-1.0, high=1.0)
@@ -34,7 +34,7 @@ def test_where_nothing_is_in_its_way_the_policy_is_applied_bit_for_bit() -> None
     ahead, x = usual(), torch.tensor([[-2.0, 1.0, 0.3, 0.2], [-0.5, 2.0, 0.0, 0.1]], dtype=torch.float64)
     u, after = ahead.step(x, ahead.init(x), x, 0.1)
     assert torch.equal(u, LQR(x))
-    assert torch.equal(after.identifier, torch.tensor([[0.0, 0.0, 0.0, 1.0]] * 2).double())
+    assert (after.way.tolist(), after.done.tolist()) == ([[0.0] * 3] * 2, [[1.0]] * 2)
 
 
 @pytest.mark.compiled
@@ -59,7 +59,7 @@ def test_rows_do_not_see_each_other() -> None:
     for k in range(len(many)):
         one, its = ahead.step(many[k : k + 1], ahead.init(many[k : k + 1]), many, 0.1)
         torch.testing.assert_close(one, u[k : k + 1], rtol=1e-12, atol=1e-12)
-        torch.testing.assert_close(its.identifier, after.identifier[k : k + 1])
+        torch.testing.assert_close(its, Detour(*(part[k : k + 1] for part in after)))
 
 
 def test_it_can_be_pickled() -> None:
@@ -172,7 +172,7 @@ DONE = tensor([[0.0], [3.0], [5.0], [11.0]])
 def test_the_cheapest_of_all_candidates_is_taken_and_followed_a_period(stride: int) -> None:
     ahead, kinds = ways(stride=stride), set()
     found = ahead.cheapest(STATES, BEFORE, DONE)
-    u, after = ahead.step(STATES, carrying(torch.cat((BEFORE, DONE), dim=-1)), STATES, 0.1)
+    u, after = ahead.step(STATES, Detour(BEFORE, DONE), STATES, 0.1)
     for row in range(4):
         tried = torch.cat((torch.zeros(1, 3).double(), BEFORE[row] + ahead.changes, ahead.fresh))
         parts = [total(STATES[row], one, float(DONE[row]), stride) for one in tried]
@@ -184,7 +184,7 @@ def test_the_cheapest_of_all_candidates_is_taken_and_followed_a_period(stride: i
         torch.testing.assert_close(u[row], CHEAP.bounds.clip(LQR(STATES[row] - s)))
         left = max(float(chosen[2]) - 1, 0.0)
         wanted = torch.cat((chosen[:2], tensor([left, float(DONE[row]) + 1])))
-        torch.testing.assert_close(after.identifier[row], wanted)
+        torch.testing.assert_close(torch.cat(after, dim=-1)[row], wanted)
     assert len(kinds) >= stride
     alone = torch.cat(
         [ahead.cheapest(*(part[k : k + 1] for part in (STATES, BEFORE, DONE))) for k in range(4)]

@@ -13,7 +13,6 @@ from helpers_swingup import GRID, RESETS, cost_of, double_integrator, pendulum
 from torch import Tensor
 
 from staf_torch import adp, lanes, systems
-from staf_torch.adp.loop.controller import carrying
 
 NONE = torch.empty(0, dtype=torch.float64)
 
@@ -105,7 +104,7 @@ def test_hastened_control_is_that_of_the_parts(caplog: pytest.LogCaptureFixture)
     whole, alone = (mpc.step(x[k] + 0.1, rows_of(plan, k), none[k], 0.1) for k in (slice(4), slice(1, 2)))
     assert not caplog.text
     torch.testing.assert_close(whole[0][:3], parts[0][:3], rtol=0, atol=1e-8)  # of a search of a few rounds
-    torch.testing.assert_close(whole[1].identifier[:3], parts[1].identifier[:3], rtol=0, atol=1e-8)
+    torch.testing.assert_close(whole[1].plan[:3], parts[1].plan[:3], rtol=0, atol=1e-8)
     assert torch.equal(whole[0][1:2], alone[0])
 
 
@@ -121,14 +120,12 @@ def test_a_plan_that_is_followed_is_its_feedback_and_then_that_of_the_goal_also_
     x0 = tensor([[2.0, 1.0], [-1.0, 0.5]])
     found, carried, x = adp.BoxDDP(BOX, steps=3, compile=False).solve(x0), mpc.init(x0), x0 + 0.05
 
-    def step(
-        now: tuple[Tensor, Tensor], _: tuple[()], row: tuple[()]
-    ) -> tuple[tuple[Tensor, Tensor], Tensor]:
+    def step(now: tuple[Tensor, Any], _: tuple[()], row: tuple[()]) -> tuple[tuple[Tensor, Any], Tensor]:
         x, plan = now
-        u, after = mpc.step(x, carrying(plan), x, 0.1)
-        return (pushed(x, u)[0], after.identifier), u
+        u, after = mpc.step(x, plan, x, 0.1)
+        return (pushed(x, u)[0], after), u
 
-    program, whole = lanes.Program(step, name="a plan that is followed"), (x, carried.identifier)
+    program, whole = lanes.Program(step, name="a plan that is followed"), (x, carried)
     assert program.compiles(whole, (), (), steps=5)
     compiled = program(whole, steps=5)[1]
     for k in range(5):  # also behind its end
@@ -155,6 +152,6 @@ def test_a_loop_carries_on_the_plans_of_the_rows_that_need_one() -> None:
         assert torch.equal(u[1:2], policy(x[1:2]))
         one, its = loop.step(x[:1], rows_of(carried, slice(1)), x[:1], 0.1)
         torch.testing.assert_close(one, u[:1], rtol=1e-9, atol=1e-9)
-        torch.testing.assert_close(its.identifier, after.identifier[:1], rtol=1e-9, atol=1e-9)
+        torch.testing.assert_close(its.plan, after.plan[:1], rtol=1e-9, atol=1e-9)
         assert float(u[0].abs()) <= 1
         carried, x = after, x + 0.1 * plant.motion(x, u)

@@ -29,7 +29,7 @@ class Weak(adp.Feedback):
         super().__init__(lambda x: 0.5 * LQR(x) - 2 * x[..., :1])
         self.values = values
 
-    def value(self, x: Tensor, carried: adp.ControllerState) -> Tensor | None:
+    def value(self, x: Tensor, recorded: Any) -> Tensor | None:
         return x.square().sum(-1) if self.values else None
 
 

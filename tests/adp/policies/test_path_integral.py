@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 import torch
-from helpers import changed, tensor
+from helpers import tensor
 from helpers_plans import BOX, pushed
 from helpers_swingup import cost_of, double_integrator, pendulum
 from torch import Tensor
@@ -35,8 +35,7 @@ def test_plan_costs_no_more_than_the_feedback_and_less_where_it_does_not_know_th
     carried = mpc.init(x)
     for seed in range(3):  # at the same state: the plan, which moves on a step each time, is moved back
         _, carried = mpc.step(x, carried, uniform(mpc, 2, seed), 0.1)
-        plan = carried.identifier.view(2, 30, 1).roll(1, dims=1)
-        carried = changed(carried, identifier=plan.flatten(1))
+        plan = carried = carried.roll(1, dims=1)
     found = mpc.costs(x, plan.unsqueeze(1))[:, 0]
     assert bool((found <= alone).all())
     assert float((found / alone).min()) < 0.95
@@ -111,8 +110,7 @@ def test_a_plan_is_the_mean_of_its_samples_by_what_they_cost_or_the_cheapest(tem
     numbers = 1.98 * torch.rand(rows, 15, 2, generator=generator, dtype=torch.float64) - 0.99
     x = 2 * torch.rand(rows, 2, generator=generator, dtype=torch.float64) - 1
     before = 0.1 * torch.rand(rows, 6, 2, generator=generator, dtype=torch.float64)
-    carried = changed(mpc.init(x), identifier=before.flatten(1))
-    u, after = mpc.step(x, carried, numbers, 0.1)
+    u, after = mpc.step(x, before, numbers, 0.1)
     scales = tensor([10 ** (-2 * k / 4) for k in range(5)])
     for row in range(rows):
         flat = numbers[row].flatten().tolist()
@@ -128,7 +126,7 @@ def test_a_plan_is_the_mean_of_its_samples_by_what_they_cost_or_the_cheapest(tem
         plan = blended if mixed else tried[costs.argmin()]
         wanted = torch.minimum(torch.maximum(plan[0] - x[row] @ BOX.k.mT, BOX.bounds.low), BOX.bounds.high)
         torch.testing.assert_close(u[row], wanted, rtol=1e-7, atol=1e-9)
-        ahead = after.identifier[row].view(6, 2)
+        ahead = after[row]
         torch.testing.assert_close(ahead[:-1], plan[1:], rtol=1e-7, atol=1e-9)
         assert ahead[-1].tolist() == [0.0, 0.0]
 
@@ -153,7 +151,7 @@ def test_numbers_at_the_end_of_their_range_give_a_finite_plan() -> None:
     ends = torch.ones(1, 15, 2).double()
     ends[0, ::2] = -1.0
     u, after = mpc.step(x, mpc.init(x), ends, 0.1)
-    assert bool(torch.isfinite(torch.cat((u, after.identifier), dim=-1)).all())
+    assert bool(torch.isfinite(torch.cat((u, after[:, 0]), dim=-1)).all())
 
 
 def test_noise_is_half_the_range_and_least_arguments_are_accepted() -> None:

@@ -428,7 +428,9 @@ def test_what_stands_behind_it_has_its_own_columns_and_value() -> None:
     learner = adp.ActorCritic(adp.QuadraticBasis(2), LINE, COST, adp.RandomPoints(1, half_width=0.5))
     guard = adp.SafetyFilter(learner, LINE, wall, dt=0.05)
     assert (guard.draws, guard.label) == (learner.draws, f"filtered {learner.label}")
-    torch.testing.assert_close(guard.value(x0, guard.init(x0)), learner.value(x0, learner.init(x0)))
+    torch.testing.assert_close(
+        guard.value(x0, guard.recorded(guard.init(x0))), learner.basis.value(learner.init(x0).critic, x0)
+    )
 
 
 def test_a_decay_of_one_over_the_hold_is_taken_and_more_where_the_degree_is_one() -> None:

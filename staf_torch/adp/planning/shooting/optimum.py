@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ...loop.controller import Controller, ControllerState, carrying
+from ...loop.controller import Controller
 
 
 class Optimum(NamedTuple):
@@ -80,17 +80,16 @@ class PlanReplay(Controller):
         self.time: Tensor
         self.plan: Tensor
 
-    def init(self, x0: Tensor) -> ControllerState:
+    def init(self, x0: Tensor) -> Tensor:
+        """The time, (B, 1)."""
         if len(x0) != len(self.plan):
             raise ValueError(f"This plan is for {len(self.plan)} initial states; got {len(x0)}.")
-        return carrying(x0.new_zeros(len(x0), 1))
+        return x0.new_zeros(len(x0), 1)
 
-    def step(
-        self, x: Tensor, carried: ControllerState, uniform: Tensor, dt: float
-    ) -> tuple[Tensor, ControllerState]:
-        now = float(carried.identifier[0, 0])
+    def step(self, x: Tensor, carried: Tensor, uniform: Tensor, dt: float) -> tuple[Tensor, Tensor]:
+        now = float(carried[0, 0])
         u = (self.integral(now + dt) - self.integral(now)) / dt
-        return u.to(x), carried._replace(identifier=carried.identifier + dt)
+        return u.to(x), carried + dt
 
     def integral(self, until: float) -> Tensor:
         """int_0^t u dt, (B, m)."""

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from ....systems import ControlAffineSystem
 from ...critic.bellman import value_gradient
-from ...loop.controller import ControllerState
 from ...loop.setup import AdpProblem
 from ...loop.simulation import LoopResult
 from ...problem.cost import QuadraticCost
@@ -116,13 +115,11 @@ def _spread(values: Tensor, at: Tensor, times: int) -> Tensor:
 
 def _estimates(problem: AdpProblem, result: LoopResult, at: Tensor) -> Tensor | None:
     """V^ at the recorded states of the times ``at`` with the weights of then, (B, len(at))."""
-    pieces = []
-    parts = (result.state, result.critic_weights, result.actor_weights)
-    x, critic, actor = (t[:, at].flatten(0, 1) for t in parts)
+    pieces, x = [], result.state[:, at].flatten(0, 1)
+    known = {name: part[:, at].flatten(0, 1) for name, part in result.recorded.items()}
     for some in torch.arange(len(x)).split(_AT_ONCE):
-        carried = ControllerState(critic[some], actor[some], critic.new_zeros(0), critic.new_zeros(0))
         with torch.no_grad():
-            value = problem.controller.value(x[some], carried)
+            value = problem.controller.value(x[some], {name: part[some] for name, part in known.items()})
         if value is None:
             return None
         pieces.append(value)
