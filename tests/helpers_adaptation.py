@@ -7,6 +7,7 @@ from helpers import uniform
 from torch import Tensor
 
 from staf_torch import adp
+from staf_torch.adp.adaptation.windows import Equation
 
 TRUE = torch.tensor([0.1, 1.0], dtype=torch.float64)
 
@@ -24,11 +25,11 @@ PENDULUM = adp.ParametricPlant(friction_and_inertia, gravity, dim=2, inputs=1, t
 COST = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
 
 
-def equations(count: int, rows: int, theta: Tensor, states: int = 2, seed: int = 0) -> list[adp.Equation]:
+def equations(count: int, rows: int, theta: Tensor, states: int = 2, seed: int = 0) -> list[Equation]:
     """S theta = z without noise, S random: ``count`` of them for every one of some rows."""
     found = []
     for k in range(count):
         s = uniform(rows, states, theta.shape[-1], seed=seed + k)
         z = (s * theta.unsqueeze(-2)).sum(-1)
-        found.append(adp.Equation(s, z, s.new_zeros(rows), torch.ones(rows, dtype=torch.bool)))
+        found.append(Equation(s, z, s.new_zeros(rows), torch.ones(rows, dtype=torch.bool)))
     return found

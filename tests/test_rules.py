@@ -20,7 +20,9 @@ from variants import CONTROLLERS
 
 import staf_torch as st
 from staf_torch import adp, envs, kernels, optim, predictors, systems, theory
+from staf_torch.adp.adaptation.redesign import riccati_rows
 from staf_torch.adp.critic.bases import LeadingCoordinates
+from staf_torch.adp.estimation.kalman import KalmanFilter
 from staf_torch.adp.loop.step import ClosedLoop
 from staf_torch.adp.policies.sampled_rollout import SampledRollout
 from staf_torch.adp.problem.held_linear import exact_hold
@@ -218,7 +220,7 @@ CALLS: dict[str, Callable[..., Any]] = {
     "held_stability": of(adp.held_stability, LQR, PLANT, period=0.1),
     "near_optimal": of(adp.near_optimal, PLANT, COST, dt=0.1),
     "report": of(REPORTED.report, states=2, optimum=False),
-    "riccati_rows": of(adp.riccati_rows, -EYE, EYE, EYE, EYE),
+    "riccati_rows": of(riccati_rows, -EYE, EYE, EYE, EYE),
 }
 """How to call, with arguments that are right beside the one in question."""
 
@@ -240,7 +242,7 @@ def rows(**given: Any) -> adp.ParametricPlant:
     return adp.ParametricPlant(settings.pop("regressor"), lambda x, u: x * u, **settings)
 
 
-def kalman(**given: Any) -> adp.KalmanFilter:
+def kalman(**given: Any) -> KalmanFilter:
     return adp.ExtendedKalman(PLANT, lambda x: x[..., :1], **{"noise": [0.1], **given})
 
 

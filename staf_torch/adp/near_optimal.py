@@ -42,16 +42,7 @@ _REGULATED = 1e-2  # share of the distance from the set-point that is left
 
 
 class NearOptimal(SampledRollout):
-    """`SampledRollout` of an LQR as `near_optimal` makes it, with a report.
-
-    Example:
-        >>> plant = systems.Pendulum()
-        >>> policy = adp.near_optimal(plant, adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1), dt=0.05)
-        >>> policy.report(states=2, optimum=False)["spectral_radius"] < 1
-        True
-
-        Shown by `staf_torch/adp/README.md`.
-    """
+    """`SampledRollout` of an LQR as `near_optimal` makes it, with a report."""
 
     lqr: LQR
     radius: float

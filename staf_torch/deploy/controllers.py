@@ -12,15 +12,15 @@ from ..adp import (
     Controller,
     Feedback,
     GlobalValue,
-    NearOptimal,
     PathIntegral,
-    PlanReplay,
     RecedingHorizon,
     RolloutPolicy,
     SafetyFilter,
     Supervised,
 )
+from ..adp.near_optimal import NearOptimal
 from ..adp.planning.receding_horizon import StrainedPlans
+from ..adp.planning.shooting.optimum import PlanReplay
 from ..numerics.checks import fail, trailing
 from .remembered import RememberedPolicy
 

@@ -20,12 +20,12 @@ from ..adp import (
     Cost,
     Extrapolation,
     Feedback,
-    NearOptimal,
     SafetyFilter,
     Supervised,
     ValueBasis,
 )
 from ..adp.loop.setup import AdpProblem, OptimumSettings
+from ..adp.near_optimal import NearOptimal
 from ..adp.safety.safety_filter import walls
 from ..approximation.basis import StaFBasis
 from ..numerics.checks import COMMAND_LINE, choice, fail, flag, integer, positive_real

@@ -15,6 +15,8 @@ from torch import Tensor
 
 import staf_torch as st
 from staf_torch import adp, deploy, lanes, systems
+from staf_torch.adp.near_optimal import NearOptimal
+from staf_torch.adp.policies.sampled_rollout import SampledRollout
 from staf_torch.deploy.c_header import runner_c
 
 
@@ -35,7 +37,7 @@ DOUBLE = systems.Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
 
 
 @pytest.fixture(scope="module")
-def two_states() -> adp.NearOptimal:
+def two_states() -> NearOptimal:
     """A policy that several tests ask, compiled once."""
     policy = adp.near_optimal(systems.TwoState(), COST, dt=0.1, horizon=0.8)
     lanes.ready(policy, torch.zeros(1, 2).double())
@@ -43,7 +45,7 @@ def two_states() -> adp.NearOptimal:
 
 
 @pytest.fixture(scope="module")
-def limited() -> dict[bool, adp.NearOptimal]:
+def limited() -> dict[bool, NearOptimal]:
     """Of the mass with |u| <= 1, by whether it plans: what plans is traced once."""
     return {
         plan: adp.near_optimal(DOUBLE, COST, dt=0.25, low=-1.0, high=1.0, plan=plan) for plan in (False, True)
@@ -65,7 +67,7 @@ def test_improved_policy_is_never_worse_than_its_base(
     dt: float | None,
     width: float,
     gain: float,
-    two_states: adp.NearOptimal,
+    two_states: NearOptimal,
 ) -> None:
     policy = two_states if cost is COST else adp.near_optimal(plant, cost, dt=dt, horizon=0.8)
     x0 = drawn(cost.dim, width, 12)
@@ -92,7 +94,7 @@ def test_where_a_bound_holds_the_base_at_the_end_its_own_control_is_kept() -> No
 
 
 @torch.no_grad()
-def test_report_says_what_was_chosen_and_how_good_it_is(two_states: adp.NearOptimal) -> None:
+def test_report_says_what_was_chosen_and_how_good_it_is(two_states: NearOptimal) -> None:
     policy = two_states
     report = policy.report(states=3, spread=0.5)
     with pytest.raises(ValueError, match="must be of the states"):
@@ -130,7 +132,7 @@ def test_bad_arguments_are_refused_by_name() -> None:
         adp.near_optimal(systems.Pendulum(), COST, dt=0.1, horizon=0.2)
 
 
-def test_plan_takes_over_where_the_lqr_would_meet_a_bound(limited: dict[bool, adp.NearOptimal]) -> None:
+def test_plan_takes_over_where_the_lqr_would_meet_a_bound(limited: dict[bool, NearOptimal]) -> None:
     """A mass at 2 m with |u| <= 1: the LQR's rollouts overshoot; the plan is the optimum of its horizon."""
     plant, policy = DOUBLE, limited[True]
     x = torch.tensor([[2.0, 0.5], [0.05, 0.0], [-2.0, -0.5]], dtype=torch.float64)
@@ -157,7 +159,7 @@ def test_plan_takes_over_where_the_lqr_would_meet_a_bound(limited: dict[bool, ad
 
 @torch.no_grad()
 def test_loop_carries_a_plan_only_where_the_lqr_would_meet_a_bound(
-    limited: dict[bool, adp.NearOptimal],
+    limited: dict[bool, NearOptimal],
 ) -> None:
     """The same mass without `plan`: from afar the optimum, also where it is only pushed there in the loop."""
     plant, policy = DOUBLE, limited[False]
@@ -182,7 +184,7 @@ def test_loop_carries_a_plan_only_where_the_lqr_would_meet_a_bound(
 
 
 @torch.no_grad()
-def test_another_control_than_the_bases_promises_less_over_both_horizons(two_states: adp.NearOptimal) -> None:
+def test_another_control_than_the_bases_promises_less_over_both_horizons(two_states: NearOptimal) -> None:
     policy = two_states
     x, discount = drawn(2, 2.0, 300), math.exp(-COST.discount * 0.1)
 
@@ -254,7 +256,7 @@ def test_simulator_is_followed_in_numpy_to_the_same_promise(
 
 
 @torch.no_grad()
-def test_controllers_of_a_policy_share_no_plan(limited: dict[bool, adp.NearOptimal]) -> None:
+def test_controllers_of_a_policy_share_no_plan(limited: dict[bool, NearOptimal]) -> None:
     policy = limited[False]
     one, other = policy.controller(), policy.controller()
     far, near = tensor([[3.0, 1.0]]), tensor([[0.05, 0.0]])
@@ -273,7 +275,7 @@ def test_controllers_of_a_policy_share_no_plan(limited: dict[bool, adp.NearOptim
 @torch.no_grad()
 @pytest.mark.parametrize("plan", [True, False])
 def test_states_are_known_from_which_the_lqr_would_meet_a_bound(
-    plan: bool, limited: dict[bool, adp.NearOptimal]
+    plan: bool, limited: dict[bool, NearOptimal]
 ) -> None:
     planner = limited[plan].plans()
     assert planner is not None
@@ -281,7 +283,7 @@ def test_states_are_known_from_which_the_lqr_would_meet_a_bound(
         assert float(planner.strained(drawn(2, spread, 4)).double().mean()) == share
 
 
-def made(decay: float = 2.0, dt: float = 0.1, **given: Any) -> adp.NearOptimal:
+def made(decay: float = 2.0, dt: float = 0.1, **given: Any) -> NearOptimal:
     """Of a mode that the feedback hardly moves."""
     cost = adp.QuadraticCost(1e-9, 1.0, dim=1, inputs=1, **given)
     return adp.near_optimal(systems.Linear([[-decay]], [[1.0]]), cost, dt=dt)
@@ -332,10 +334,10 @@ def end(x: Tensor) -> Tensor:
     return (x * (x @ METRIC)).sum(-1) + x[..., 0].sin()
 
 
-def sampled(cost: adp.Cost, policy: Any = base, terminal: Any = end, steps: int = 8) -> adp.SampledRollout:
+def sampled(cost: adp.Cost, policy: Any = base, terminal: Any = end, steps: int = 8) -> SampledRollout:
     around = torch.cat((st.cross_polytope(2), torch.zeros(1, 2).double()))
     basis = st.StaFBasis(st.ExponentialKernel(), st.StateFollowingCenters(around, 0.1))
-    return adp.SampledRollout(basis, PLANT, cost, policy, terminal, METRIC, period=0.2, steps=steps)
+    return SampledRollout(basis, PLANT, cost, policy, terminal, METRIC, period=0.2, steps=steps)
 
 
 def bounded(discount: float) -> adp.QuadraticCost:
@@ -428,7 +430,7 @@ def test_a_bound_is_met_where_the_base_reaches_it_within_the_horizon() -> None:
     basis = st.StaFBasis(st.ExponentialKernel(), st.StateFollowingCenters(tensor([[1.0], [-1.0]]), 0.1))
 
     def meets(gain: float, *x: float, steps: int = 4) -> list[float]:
-        held = adp.SampledRollout(
+        held = SampledRollout(
             basis, line, cost, lambda x: gain * x, lambda x: x[..., 0], torch.eye(1), period=0.5, steps=steps
         )
         found = held.meets_bound(tensor([[one] for one in x]))

@@ -14,6 +14,7 @@ from helpers_swingup import double_integrator, pendulum
 from torch import Tensor
 
 from staf_torch import adp, deploy, systems
+from staf_torch.adp.planning.ddp import Trajectories
 from staf_torch.deploy.c_header import runner_c, runner_learning_c
 
 needs_cc = pytest.mark.skipif(
@@ -34,7 +35,7 @@ def memory() -> adp.GlobalValue:
     gains, bent = (-problem.k).expand(4, 60, 1, 2), (2 * problem.p).expand(4, 61, 2, 2)
     slope = (bent * problem.away(state).unsqueeze(-2)).sum(-1)
     fine = torch.ones(4, dtype=torch.bool)
-    library = adp.Trajectories(state, control, gains, problem.terminal(state), slope, bent, fine)
+    library = Trajectories(state, control, gains, problem.terminal(state), slope, bent, fine)
     return adp.GlobalValue(problem, library, [math.pi, 8.0], candidates=12, lookahead=6)
 
 

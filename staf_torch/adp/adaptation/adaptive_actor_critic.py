@@ -23,14 +23,7 @@ from .windows import IntegralWindows, Window
 
 
 class LearnedModel(NamedTuple):
-    """What an `AdaptiveActorCritic` carries, a row a trajectory.
-
-    Example:
-        >>> adp.LearnedModel._fields
-        ('weights', 'estimate', 'certain', 'window')
-
-        Shown by `tests/adp/adaptation/test_adaptive_policies.py`.
-    """
+    """What an `AdaptiveActorCritic` carries, a row a trajectory."""
 
     weights: Weights
     estimate: Estimate

@@ -21,20 +21,7 @@ from .windows import IntegralWindows, Window
 
 
 class Adaptation(NamedTuple):
-    """What an adaptive controller knows and does, a row a trajectory.
-
-    Example:
-        >>> plant = adp.ParametricPlant.of_effectiveness(systems.Pendulum())
-        >>> cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
-        >>> law = adp.LeastSquares([1.0], deviation=0.5)
-        >>> control = adp.AdaptiveLQR(plant, cost, adp.IntegralWindows(plant, 0.02), law)
-        >>> x0 = torch.tensor([[0.5, 0.0]]).double()
-        >>> run = adp.simulate(control, plant, cost, x0, dt=0.01, steps=40)
-        >>> run["theta"][0, -1].round(decimals=3), run["certain"][0, [0, -1]]
-        (tensor([1.], dtype=torch.float64), tensor([0., 1.], dtype=torch.float64))
-
-        Shown by `staf experiment=faults`.
-    """
+    """What an adaptive controller knows and does, a row a trajectory."""
 
     estimate: Estimate
     certain: Tensor  # (...) 1 where the redesigned policy has the control, 0 where the robust one has it

@@ -17,14 +17,7 @@ from .parametric import ParametricPlant
 
 
 class Considered(NamedTuple):
-    """What a `ConsiderFilter` knows: x = mean + e + sensitivity (theta - theta^), with Cov e = covariance.
-
-    Example:
-        >>> adp.Considered._fields
-        ('mean', 'covariance', 'sensitivity', 'theta', 'steps')
-
-        Shown by `staf experiment=faults`.
-    """
+    """What a `ConsiderFilter` knows: x = mean + e + sensitivity (theta - theta^), with Cov e = covariance."""
 
     mean: Tensor  # (..., n)
     covariance: Tensor  # (..., n, n) of what noise and disturbances make

@@ -27,14 +27,7 @@ _WEIGHTS = (0.17392742256872692, 0.32607257743127307, 0.32607257743127307, 0.173
 
 
 class DriftEstimate(NamedTuple):
-    """What a `StreamDrift` knows, a row a trajectory.
-
-    Example:
-        >>> adp.DriftEstimate._fields
-        ('anchor', 'mean', 'covariance')
-
-        Shown by `tests/adp/adaptation/test_stream_drift.py`.
-    """
+    """What a `StreamDrift` knows, a row a trajectory."""
 
     anchor: Tensor  # (..., n) the state that the centers surround
     mean: Tensor  # (..., r, M n) weights of the rows
@@ -249,14 +242,7 @@ class StreamDrift:
 
 
 class DriftAdaptation(NamedTuple):
-    """What a `DriftLQR` knows and does, a row a trajectory.
-
-    Example:
-        >>> adp.DriftAdaptation._fields[:2]
-        ('estimate', 'certain')
-
-        Shown by `tests/adp/adaptation/test_stream_drift.py`.
-    """
+    """What a `DriftLQR` knows and does, a row a trajectory."""
 
     estimate: DriftEstimate
     certain: Tensor  # (...) 1 where the learned model has the control, 0 where the robust policy has it

@@ -16,14 +16,7 @@ _BETTER = 1.001  # factor by which a change must raise the least eigenvalue
 
 
 class Stack(NamedTuple):
-    """The equations that are remembered, and the one that is being tried.
-
-    Example:
-        >>> adp.HistoryStack(rows=2, parameters=3, size=10).init(torch.zeros(1, 2).double()).s.shape
-        torch.Size([1, 10, 2, 3])
-
-        Shown by `staf experiment=icl`.
-    """
+    """The equations that are remembered, and the one that is being tried."""
 
     s: Tensor  # (..., N, r, p), zero where empty
     z: Tensor  # (..., N, r), with several right-hand sides (..., N, r, n)
@@ -46,11 +39,12 @@ class HistoryStack:
     problem, not N.
 
     Example:
+        >>> from staf_torch.adp.adaptation.windows import Equation
         >>> stack = adp.HistoryStack(rows=1, parameters=2, size=2)
         >>> now = stack.init(torch.zeros(1, 1).double())
         >>> for s in ([1.0, 0.0], [1.0, 0.1], [0.0, 1.0]):
         ...     one = torch.tensor([[s]]).double()
-        ...     equation = adp.Equation(one, one.sum(-1), torch.zeros(1), torch.tensor([True]))
+        ...     equation = Equation(one, one.sum(-1), torch.zeros(1), torch.tensor([True]))
         ...     for _ in range(4):
         ...         now = stack.step(now, equation)
         ...         equation = equation._replace(ready=torch.tensor([False]))
@@ -208,17 +202,6 @@ class ConcurrentGradient:
     It converges without persistent excitation once sum_j S_j'S_j has full rank. ``push`` is what the control
     adds, Y'e of an adaptive tracking law for one.
 
-    Example:
-        >>> law = adp.ConcurrentGradient(gain=1.0, rate=1.0)
-        >>> gram, moment = torch.eye(2).double(), torch.tensor([2.0, 3.0]).double()  # of a stack
-        >>> theta = torch.zeros(1, 2).double()
-        >>> for _ in range(200):
-        ...     theta = law.step(theta, gram, moment, 0.1)
-        >>> theta.round(decimals=4)
-        tensor([[2., 3.]], dtype=torch.float64)
-
-        Shown by `staf experiment=icl`.
-
     Args:
         gain: k_CL, positive, a number or one a row, (...).
         rate: Gam, positive, likewise: a multiple of the identity.
@@ -254,14 +237,7 @@ class ConcurrentGradient:
 
 
 class Identified(NamedTuple):
-    """The state of `ConcurrentLearning`, a row a trajectory.
-
-    Example:
-        >>> adp.ConcurrentLearning(3, 2).init(torch.zeros(1, 3, 2)).rates.shape  # the history stack
-        torch.Size([1, 10, 2])
-
-        Shown by `staf experiment=adp_tracking`.
-    """
+    """The state of `ConcurrentLearning`, a row a trajectory."""
 
     theta: Tensor  # estimate, (..., p, n)
     stack: Stack

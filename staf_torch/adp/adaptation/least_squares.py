@@ -13,14 +13,7 @@ from .windows import Equation
 
 
 class Estimate(NamedTuple):
-    """theta^ with its covariance, a row a trajectory.
-
-    Example:
-        >>> adp.LeastSquares([0.0, 0.0], deviation=5.0).init(torch.zeros(3, 2)).covariance.shape
-        torch.Size([3, 2, 2])
-
-        Shown by `staf experiment=faults`.
-    """
+    """theta^ with its covariance, a row a trajectory."""
 
     theta: Tensor  # (..., p)
     covariance: Tensor  # (..., p, p)
@@ -42,11 +35,12 @@ class LeastSquares:
     is another one: P opens to its first size again, and the old data are forgotten at once.
 
     Example:
+        >>> from staf_torch.adp.adaptation.windows import Equation
         >>> law = adp.LeastSquares([0.0, 0.0], deviation=10.0, floor=1e-6)
         >>> now = law.init(torch.zeros(1, 2).double())
         >>> s = torch.tensor([[[1.0, 2.0], [1.0, -1.0]]]).double()
         >>> z = s @ torch.tensor([3.0, 4.0]).double()
-        >>> equation = adp.Equation(s, z, torch.zeros(1), torch.tensor([True]))
+        >>> equation = Equation(s, z, torch.zeros(1), torch.tensor([True]))
         >>> law.step(now, equation, 0.01).theta.round(decimals=6)
         tensor([[3., 4.]], dtype=torch.float64)
 

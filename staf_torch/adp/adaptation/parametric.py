@@ -22,16 +22,7 @@ _AFFINE = 1e-9  # by which x' may differ from an affine function of u, as a shar
 
 
 class LinearFamily(NamedTuple):
-    """x' = A x + B u at a set-point, for every theta: A = A_0 + sum_i theta_i A_i, B likewise.
-
-    Example:
-        >>> family = adp.ParametricPlant.of_effectiveness(systems.Pendulum()).family()
-        >>> family.at(torch.tensor([0.5]).double())[1]  # half of the actuator is left
-        tensor([[0.0000],
-                [0.5000]], dtype=torch.float64)
-
-        Shown by `staf experiment=faults`.
-    """
+    """x' = A x + B u at a set-point, for every theta: A = A_0 + sum_i theta_i A_i, B likewise."""
 
     a: Tensor  # A_0, (n, n)
     a_slopes: Tensor  # A_i, (p, n, n)

@@ -15,15 +15,7 @@ _SOLVED = 1e-2  # residual of the Riccati equation, for the model of the moment,
 
 
 class Doubling(NamedTuple):
-    """The symplectic pair after 2^k steps; h tends to P.
-
-    Example:
-        >>> one = torch.ones(1, 1, 1).double()
-        >>> round(float(adp.riccati_rows(one, one, one, one)), 6)  # 2 P - P^2 + 1 = 0
-        2.414214
-
-        Shown by `staf experiment=faults`.
-    """
+    """The symplectic pair after 2^k steps; h tends to P."""
 
     a: Tensor  # (..., n, n)
     g: Tensor  # (..., n, n)
@@ -36,15 +28,6 @@ def riccati_rows(a: Tensor, b: Tensor, q: Tensor, r_inverse: Tensor, *, doubling
     Structured doubling on a Cayley transform of the Hamiltonian: k steps leave an error of rho^(2^k), with
     rho < 1 the largest |(l + c) / (l - c)| of the closed loop's eigenvalues l and c twice the norm of A and
     of the rate at which control acts. Where a row cannot be stabilised P is not a solution.
-
-    Example:
-        >>> a = torch.tensor([[[0.0, 1.0], [0.0, 0.0]]]).double()
-        >>> b = torch.tensor([[[0.0], [1.0]]]).double()
-        >>> adp.riccati_rows(a, b, torch.eye(2).double(), torch.eye(1).double()).round(decimals=4)
-        tensor([[[1.7321, 1.0000],
-                 [1.0000, 1.7321]]], dtype=torch.float64)
-
-        Shown by `staf experiment=faults`.
 
     Args:
         a: A, (..., n, n), 1/s.

@@ -22,14 +22,7 @@ _PASSES = 2  # linearisations of the conditions in u
 
 
 class Guarded(NamedTuple):
-    """What a `RobustFilter` carries, a row a trajectory.
-
-    Example:
-        >>> adp.Guarded._fields
-        ('inner', 'estimate', 'window', 'time', 'least_margin', 'largest_slack', 'acted')
-
-        Shown by `tests/adp/adaptation/test_robust_filter.py`.
-    """
+    """What a `RobustFilter` carries, a row a trajectory."""
 
     inner: Carried  # of the controller behind it
     estimate: Estimate

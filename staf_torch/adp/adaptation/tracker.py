@@ -20,14 +20,7 @@ Gain = float | Sequence[float] | Tensor
 
 
 class Tracking(NamedTuple):
-    """What a `ConcurrentTracker` carries, a row a trajectory.
-
-    Example:
-        >>> adp.Tracking._fields[:4]
-        ('theta', 'feedback', 'gain', 'rate')
-
-        Shown by `staf experiment=icl`.
-    """
+    """What a `ConcurrentTracker` carries, a row a trajectory."""
 
     theta: Tensor  # (..., p)
     feedback: Tensor  # (...) K

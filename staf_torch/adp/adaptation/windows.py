@@ -14,14 +14,7 @@ from .parametric import ParametricPlant
 
 
 class Equation(NamedTuple):
-    """S theta = z up to noise, a row a trajectory.
-
-    Example:
-        >>> adp.Equation(torch.ones(1, 2, 3), torch.ones(1, 2), torch.ones(1), torch.tensor([True])).z.shape
-        torch.Size([1, 2])
-
-        Shown by `staf experiment=icl`.
-    """
+    """S theta = z up to noise, a row a trajectory."""
 
     s: Tensor  # (..., r, p), a row each of the model's ``rows``
     z: Tensor  # (..., r)
@@ -30,15 +23,7 @@ class Equation(NamedTuple):
 
 
 class Window(NamedTuple):
-    """What is integrated of the window so far.
-
-    Example:
-        >>> windows = adp.IntegralWindows(adp.ParametricPlant.of_effectiveness(systems.Pendulum()), 0.1)
-        >>> windows.init(torch.zeros(5, 2)).s.shape
-        torch.Size([5, 2, 1])
-
-        Shown by `staf experiment=icl`.
-    """
+    """What is integrated of the window so far."""
 
     x: Tensor  # (..., n) the state that was measured last
     u: Tensor  # (..., m) the input held since
@@ -173,14 +158,7 @@ class IntegralWindows:
 
 
 class SlopeWindow(NamedTuple):
-    """What `SlopeWindows` remembers of the window so far.
-
-    Example:
-        >>> adp.SlopeWindow._fields[:2]
-        ('x', 'u')
-
-        Shown by `staf experiment=icl`.
-    """
+    """What `SlopeWindows` remembers of the window so far."""
 
     x: Tensor  # (..., n) at the window's beginning
     u: Tensor  # (..., m) held since the last measurement
@@ -256,14 +234,6 @@ class SlopeWindows:
 
 def measured_rate(model: ParametricPlant, x: Tensor, u: Tensor, rate: Tensor, noise: float) -> Equation:
     """Return the equation Y(x, u) theta = x' - h(x, u) of a measured rate.
-
-    Example:
-        >>> plant = adp.ParametricPlant.of_effectiveness(systems.Pendulum())
-        >>> x, u = torch.zeros(1, 2).double(), torch.ones(1, 1).double()
-        >>> adp.measured_rate(plant, x, u, plant.motion(x, u), 0.0).z
-        tensor([[0., 1.]], dtype=torch.float64)
-
-        Shown by `staf experiment=icl`.
 
     Args:
         model: the plant.

@@ -14,14 +14,7 @@ from .bases import ValueBasis
 
 
 def value_gradient(value: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:
-    """grad V, row by row: (..., n) -> (..., n).
-
-    Example:
-        >>> adp.value_gradient(lambda x: x.square().sum(-1), torch.tensor([[1.0, 2.0]]))
-        tensor([[2., 4.]])
-
-        Shown by `staf experiment=adp`.
-    """
+    """grad V, row by row: (..., n) -> (..., n)."""
     with torch.enable_grad():
         at = x.detach().requires_grad_()
         return torch.autograd.grad(value(at).sum(), at)[0]
@@ -76,16 +69,6 @@ def bellman_terms(
 ) -> BellmanTerms:
     """The terms at ``points`` for the actor weights.
 
-    Example:
-        >>> plant = systems.TwoState()
-        >>> cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
-        >>> x, actor = torch.tensor([[1.0, 0.5]]).double(), torch.tensor([0.5, 0.0, 1.0]).double()
-        >>> terms = adp.bellman_terms(adp.QuadraticBasis(2), plant, cost, x, x, actor)
-        >>> terms.control.shape
-        torch.Size([1, 1])
-
-        Shown by `staf experiment=adp`.
-
     Args:
         basis: of the value function.
         system: the model.
@@ -105,16 +88,5 @@ def bellman_terms(
 
 
 def bellman_error(terms: BellmanTerms, critic: Tensor) -> Tensor:
-    """delta = r + w'Wc: (..., M) -> (..., P).
-
-    Example:
-        >>> plant = systems.TwoState()
-        >>> cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
-        >>> x, exact = torch.tensor([[1.0, 0.5]]).double(), torch.tensor([0.5, 0.0, 1.0]).double()  # of V*
-        >>> terms = adp.bellman_terms(adp.QuadraticBasis(2), plant, cost, x, x, exact)
-        >>> bool(adp.bellman_error(terms, exact).abs().max() < 1e-12)
-        True
-
-        Shown by `staf experiment=adp`.
-    """
+    """delta = r + w'Wc: (..., M) -> (..., P)."""
     return terms.rate + (terms.regressor * critic.unsqueeze(-2)).sum(-1)

@@ -74,14 +74,7 @@ class Gains:
 
 
 class Weights(NamedTuple):
-    """The state of an actor-critic.
-
-    Example:
-        >>> adp.Weights(critic=torch.ones(1, 3), actor=torch.ones(1, 3), gain=250 * torch.eye(3)).critic
-        tensor([[1., 1., 1.]])
-
-        Shown by `staf experiment=adp`.
-    """
+    """The state of an actor-critic."""
 
     critic: Tensor  # Wc, (..., M)
     actor: Tensor  # Wa, (..., M)

@@ -19,14 +19,7 @@ from .measurement import Output
 
 
 class Belief(NamedTuple):
-    """What a Kalman filter knows of the state, a row a trajectory.
-
-    Example:
-        >>> adp.Belief._fields
-        ('mean', 'covariance', 'u')
-
-        Shown by `tests/adp/estimation/test_kalman.py`.
-    """
+    """What a Kalman filter knows of the state, a row a trajectory."""
 
     mean: Tensor  # (..., n)
     covariance: Tensor  # (..., n, n)
@@ -35,12 +28,6 @@ class Belief(NamedTuple):
 
 class KalmanFilter(abc.ABC):
     """The state from outputs y = h(x) + noise, with the model of the plant between measurements.
-
-    Example:
-        >>> [issubclass(kind, adp.KalmanFilter) for kind in (adp.ExtendedKalman, adp.UnscentedKalman)]
-        [True, True]
-
-        Shown by `tests/adp/estimation/test_kalman.py`.
 
     Args:
         model: the plant, of a known number of states.
@@ -114,7 +101,8 @@ class ExtendedKalman(KalmanFilter):
     Example:
         >>> plant = systems.Pendulum()
         >>> sees_angle = adp.ExtendedKalman(plant, lambda x: x[..., :1], noise=[0.01])
-        >>> unknown = adp.Belief(torch.zeros(1, 2), torch.eye(2)[None], torch.zeros(1, 1))
+        >>> from staf_torch.adp.estimation.kalman import Belief
+        >>> unknown = Belief(torch.zeros(1, 2), torch.eye(2)[None], torch.zeros(1, 1))
         >>> sees_angle.corrected(unknown, torch.tensor([[0.5]])).mean.round(decimals=2)
         tensor([[0.5000, 0.0000]])
 
@@ -153,7 +141,8 @@ class UnscentedKalman(KalmanFilter):
     Example:
         >>> plant = systems.Pendulum()
         >>> sees_sine = adp.UnscentedKalman(plant, lambda x: x[..., :1].sin(), noise=[0.01])
-        >>> unknown = adp.Belief(torch.zeros(1, 2), 0.01 * torch.eye(2)[None], torch.zeros(1, 1))
+        >>> from staf_torch.adp.estimation.kalman import Belief
+        >>> unknown = Belief(torch.zeros(1, 2), 0.01 * torch.eye(2)[None], torch.zeros(1, 1))
         >>> sees_sine.corrected(unknown, torch.tensor([[0.1]])).mean.round(decimals=2)
         tensor([[0.1000, 0.0000]])
 

@@ -16,19 +16,7 @@ from ..problem.sampled import Derivatives, SampledProblem
 
 
 class Trajectories(NamedTuple):
-    """Trajectories and the local models of the value along them: V(x) ~ V + g'd + d'Hd/2, d = x - x_k.
-
-    Example:
-        >>> def step(x, u):  # a cart without friction, for 0.1 s
-        ...     after = torch.stack((x[:, 0] + 0.1 * x[:, 1], x[:, 1] + 0.1 * u[:, 0]), dim=-1)
-        ...     return after, 0.1 * (x.square().sum(-1) + u.square().sum(-1))
-        >>> problem = adp.SampledProblem(step, dim=2, inputs=1, low=-1.0, high=1.0)
-        >>> found = adp.BoxDDP(problem, steps=20, compile=False).solve(torch.tensor([[1.0, 0.0]]).double())
-        >>> found.state.shape, found.feedback.shape
-        (torch.Size([1, 21, 2]), torch.Size([1, 20, 1, 2]))
-
-        Shown by `staf_torch/adp/README.md`.
-    """
+    """Trajectories and the local models of the value along them: V(x) ~ V + g'd + d'Hd/2, d = x - x_k."""
 
     state: Tensor  # (B, T + 1, n), not wrapped
     control: Tensor  # (B, T, m)

@@ -104,14 +104,7 @@ class AvoidanceCost(QuadraticCost):
 
 
 class AvoidancePlans(NamedTuple):
-    """Plans around obstacles.
-
-    Example:
-        >>> adp.AvoidancePlans._fields
-        ('trajectories', 'cost', 'margin')
-
-        Shown by `staf_torch/adp/README.md`.
-    """
+    """Plans around obstacles."""
 
     trajectories: Trajectories  # a row a start
     cost: Tensor  # (B,) of x'Qx + u'Ru alone; inf where every plan touches an obstacle

@@ -63,14 +63,6 @@ class SampledRollout(nn.Module):
     states x + sum_j z_j B_j / |B_j|, with B_j the columns of B, since B'grad V^ is all of grad V^ that d
     takes. These are 2 m + 1 simulations in place of 2 n + 1.
 
-    Example:
-        >>> plant = systems.Pendulum()
-        >>> policy = adp.near_optimal(plant, adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1), dt=0.05)
-        >>> policy(torch.tensor([0.4, 0.0], dtype=torch.float64)).shape
-        torch.Size([1])
-
-        Shown by `staf_torch/adp/README.md`.
-
     Args:
         basis: kernel and centers, of the n states or of the m inputs; of the latter it is read once, here.
         plant: in continuous or in discrete time, of at most 4 inputs.

@@ -150,14 +150,7 @@ def held_riccati(plant: Plant, cost: Cost, period: float) -> tuple[Tensor, Tenso
 
 
 class HeldStability(NamedTuple):
-    """The stability of a linearised loop whose control is held.
-
-    Example:
-        >>> adp.HeldStability(spectral_radius=0.97, largest_period=None).spectral_radius < 1
-        True
-
-        Shown by `staf experiment=adp adp/policy=lqr`.
-    """
+    """The stability of a linearised loop whose control is held."""
 
     spectral_radius: float  # of one period: below 1 the set-point is asymptotically stable; inf where it
     # overflows, NaN where something has no finite slope

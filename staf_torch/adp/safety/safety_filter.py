@@ -32,17 +32,7 @@ _NOTHING = 1e-9  # of the slopes that make it, below which the effect of a contr
 
 
 class Filtered(NamedTuple):
-    """What a filter says at states x.
-
-    Example:
-        >>> plant, walk = systems.Linear([[0.0]], [[1.0]]), lambda x: 0 * x + 3.0
-        >>> wall = adp.SafetyFilter(walk, plant, lambda x, t: 1 - x[:, 0], dt=0.01, decay=2.0)
-        >>> found = wall.restrain(torch.tensor([[0.5]]).double(), torch.tensor([[3.0]]).double())
-        >>> found.control.round(decimals=2), found.margin
-        (tensor([[0.9900]], dtype=torch.float64), tensor([[0.5000]], dtype=torch.float64))
-
-        Shown by `staf experiment=avoidance`.
-    """
+    """What a filter says at states x."""
 
     control: Tensor  # (..., m)
     margin: Tensor  # h of every constraint now, (..., k)

@@ -13,6 +13,11 @@ from torch import Tensor
 
 from staf_torch import GaussianKernel, adp, rings, systems
 from staf_torch.adp.adaptation import redesign
+from staf_torch.adp.adaptation.history_stack import ConcurrentGradient
+from staf_torch.adp.adaptation.least_squares import Estimate
+from staf_torch.adp.adaptation.redesign import riccati_rows
+from staf_torch.adp.adaptation.windows import Equation, measured_rate
+from staf_torch.adp.estimation.kalman import Belief, KalmanFilter
 from staf_torch.adp.estimation.measurement import gaussian
 
 ROWS = 12
@@ -44,12 +49,12 @@ def stacked(x: Tensor, other: Tensor, u: Tensor) -> Any:
     now, ready = stack.init(x), torch.ones_like(x[..., 0]).bool()
     for k in range(7):
         s = torch.stack((x[..., 0] + k, other[..., 1] * (k % 3)), dim=-1).unsqueeze(-2)
-        now = stack.step(now, adp.Equation(s, s.sum(-1) + u, u[..., 0], ready))
+        now = stack.step(now, Equation(s, s.sum(-1) + u, u[..., 0], ready))
     return now
 
 
 def gradients(x: Tensor, other: Tensor, u: Tensor) -> Any:
-    law = adp.ConcurrentGradient(2.0, 0.5)
+    law = ConcurrentGradient(2.0, 0.5)
     gram = x.unsqueeze(-1) * x.unsqueeze(-2)
     return law.step(other, gram, x, 0.1), law.step(other, gram, x, 0.1, other)
 
@@ -59,7 +64,7 @@ def squares(x: Tensor, other: Tensor, u: Tensor) -> Any:
     now = law.init(x)
     for k in range(3):
         s = torch.stack((x + k, other), dim=-2)
-        now = law.step(now, adp.Equation(s, s.sum(-1), u[..., 0].square(), u[..., 0] > -0.5), 0.1)
+        now = law.step(now, Equation(s, s.sum(-1), u[..., 0].square(), u[..., 0] > -0.5), 0.1)
     return now
 
 
@@ -69,11 +74,11 @@ def plants(x: Tensor, other: Tensor, u: Tensor) -> Any:
     return mine.rate(x, u), mine.drift(x), mine.effectiveness(x), family.at(other)
 
 
-def filtered(kind: type[adp.KalmanFilter]) -> FOUND:
+def filtered(kind: type[KalmanFilter]) -> FOUND:
     filter = kind(PENDULUM, lambda x: x[..., :1].sin(), noise=[0.1], process=[0.2, 0.3])
 
     def found(x: Tensor, sizes: Tensor, u: Tensor) -> Any:
-        belief = adp.Belief(x, sizes, u)
+        belief = Belief(x, sizes, u)
         return filter.step(belief, u, 0.1, u[..., 0] > 0), filter.predicted(belief, 0.1)
 
     return found
@@ -81,7 +86,7 @@ def filtered(kind: type[adp.KalmanFilter]) -> FOUND:
 
 def considered(x: Tensor, sizes: Tensor, u: Tensor) -> Any:
     filter = adp.ConsiderFilter(PENDULUM, noise=[0.1, 0.3], process=0.2)
-    estimate = adp.Estimate(x, sizes, u[..., 0], u[..., 0])
+    estimate = Estimate(x, sizes, u[..., 0], u[..., 0])
     now = filter.init(x)
     for k in range(3):
         now = filter.step(now, x + 0.1 * k, u, estimate, 0.1)
@@ -103,7 +108,7 @@ def drifts(x: Tensor, other: Tensor, u: Tensor) -> Any:
 
 def designed(slopes: Tensor, gains: Tensor, _: Tensor) -> Any:
     q, r = torch.diag(tensor([1.0, 2.0])).to(slopes), tensor([[0.7]]).to(slopes)
-    p = adp.riccati_rows(slopes, gains, q, r, doublings=6)
+    p = riccati_rows(slopes, gains, q, r, doublings=6)
     made = redesign.Redesign(q, r, 4, 2)
     first = made.step(redesign.Design.init(p[..., 0]), slopes, gains)
     second = made.step(first, slopes, gains)
@@ -118,7 +123,7 @@ CASES: dict[str, tuple[FOUND, tuple[Tensor, Tensor, Tensor]]] = {
         (X, OTHER, U),
     ),
     "slopes": (windowed(adp.SlopeWindows(PENDULUM, 0.25)), (X, OTHER, U)),
-    "a measured rate": (lambda x, rate, u: adp.measured_rate(PENDULUM, x, u, rate, 0.2), (X, OTHER, U)),
+    "a measured rate": (lambda x, rate, u: measured_rate(PENDULUM, x, u, rate, 0.2), (X, OTHER, U)),
     "a stack": (stacked, (X, OTHER, U)),
     "a gradient": (gradients, (X, OTHER, U)),
     "least squares": (squares, (X, OTHER, U)),

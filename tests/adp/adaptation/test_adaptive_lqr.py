@@ -8,6 +8,7 @@ from helpers import tensor, uniform
 from helpers_adaptation import COST, PENDULUM, TRUE
 
 from staf_torch import adp, systems
+from staf_torch.adp.adaptation.redesign import riccati_rows
 from staf_torch.adp.loop.step import ClosedLoop, program
 from staf_torch.numerics.linalg import riccati
 
@@ -24,12 +25,12 @@ def adaptive(**settings: object) -> adp.AdaptiveLQR:
 def test_riccati_equations_of_rows_are_solved_as_one_by_one(n: int, m: int) -> None:
     a, b = 10 ** uniform(20, 1, 1, seed=1) * uniform(20, n, n, seed=2), uniform(20, n, m, seed=3)
     q, r = torch.diag(1 + torch.arange(n).double()), 0.5 * torch.eye(m).double()
-    rows = adp.riccati_rows(a, b, q, torch.linalg.inv(r))
+    rows = riccati_rows(a, b, q, torch.linalg.inv(r))
     for row in range(20):
         wanted = riccati(a[row], b[row], q, r)
         torch.testing.assert_close(rows[row], wanted, rtol=1e-9, atol=1e-9 * float(wanted.abs().max()))
         assert torch.equal(
-            adp.riccati_rows(a[row : row + 1], b[row : row + 1], q, torch.linalg.inv(r))[0], rows[row]
+            riccati_rows(a[row : row + 1], b[row : row + 1], q, torch.linalg.inv(r))[0], rows[row]
         )
 
 
@@ -37,7 +38,7 @@ def test_where_the_policy_is_certain_every_theta_within_the_deviations_is_stabil
     control, family = adaptive(confidence=2.0), PENDULUM.family()
     theta = tensor([[0.3, 0.9]])
     a, b = family.at(theta)
-    p = adp.riccati_rows(a, b, COST.q, COST.r_inverse)
+    p = riccati_rows(a, b, COST.q, COST.r_inverse)
     k = b.mT @ p
     shape = tensor([[1.0, 0.3], [0.3, 0.5]])
     # The largest covariance of this shape of which the policy is still certain.

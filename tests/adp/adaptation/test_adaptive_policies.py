@@ -11,6 +11,7 @@ from helpers_adaptation import COST, friction_and_inertia, gravity
 from torch import Tensor
 
 from staf_torch import GaussianKernel, adp, rings, systems
+from staf_torch.adp.adaptation.least_squares import Estimate
 from staf_torch.systems.two_state_tracking import regressor
 
 KNOWN = systems.Linear([[0.0, 1.0], [-0.4, 0.2]], [[0.0], [1.0]])
@@ -247,7 +248,7 @@ def test_rows_do_not_touch_and_what_was_learned_is_known_in_the_next_episode() -
     assert torch.equal(whole.state[2:3], alone.state)
     assert torch.equal(whole["theta"][2:3], alone["theta"])
     learned = loop(control, tensor([[-1.5, 1.5]]), 80).carried.estimate
-    next_one = control.knowing(adp.Estimate(*(part[0] for part in learned)))
+    next_one = control.knowing(Estimate(*(part[0] for part in learned)))
     assert bool((loop(next_one, x0, 3)["certain"][:, 1] == 1).all())  # from the first step
     assert bool((loop(control, x0, 3)["certain"][:, 1] == 0).all())
 

@@ -11,6 +11,8 @@ from helpers_adaptation import PENDULUM, TRUE, equations
 from torch import Tensor
 
 from staf_torch import adp, systems
+from staf_torch.adp.adaptation.history_stack import ConcurrentGradient
+from staf_torch.adp.adaptation.windows import Equation, measured_rate
 
 MODEL = PENDULUM.believing(tensor([7.0, 7.0]))  # theta of the model is not used
 
@@ -56,7 +58,7 @@ def test_the_noise_of_an_equation_has_the_variance_that_is_stated(shape: str) ->
 
 def test_a_measured_rate_gives_the_equation_exactly() -> None:
     x, u = uniform(5, 2, seed=1), uniform(5, 1, seed=2)
-    equation = adp.measured_rate(MODEL, x, u, PENDULUM.motion(x, u), 0.0)
+    equation = measured_rate(MODEL, x, u, PENDULUM.motion(x, u), 0.0)
     torch.testing.assert_close(equation.s @ TRUE, equation.z, rtol=1e-14, atol=1e-14)
 
 
@@ -110,7 +112,7 @@ def test_the_least_eigenvalue_of_a_stack_never_falls_and_equals_do_not_fill_it()
 
 @pytest.mark.parametrize("gain", [1.0, 1e6])
 def test_concurrent_learning_is_exact_without_noise_at_every_gain(gain: float) -> None:
-    stack, law = adp.HistoryStack(2, 4, size=4), adp.ConcurrentGradient(gain, rate=2.0)
+    stack, law = adp.HistoryStack(2, 4, size=4), ConcurrentGradient(gain, rate=2.0)
     true = uniform(3, 4, seed=5)
     now, theta = stack.init(uniform(3, 2)), torch.zeros(3, 4).double()
     for equation in itertools.islice(itertools.cycle(equations(6, 3, true)), 400):
@@ -124,11 +126,11 @@ def test_the_step_of_concurrent_learning_solves_its_implicit_equation() -> None:
     gram, moment = s.mT @ s, (s * z.unsqueeze(-1)).sum(1)
     gain, rate = tensor([0.1, 1.0, 10.0]), tensor([2.0, 1.0, 0.5])
     theta = uniform(3, 3, seed=4)
-    after = adp.ConcurrentGradient(gain, rate).step(theta, gram, moment, 0.2, push)
+    after = ConcurrentGradient(gain, rate).step(theta, gram, moment, 0.2, push)
     pull = (s * (z - (s * after[:, None]).sum(-1)).unsqueeze(-1)).sum(1)
     wanted = 0.2 * rate[:, None] * (push + gain[:, None] * pull)
     torch.testing.assert_close(after - theta, wanted, rtol=1e-10, atol=1e-12)
-    law = adp.ConcurrentGradient(gain.expand(2, 3), rate)  # a number for every row of several dimensions
+    law = ConcurrentGradient(gain.expand(2, 3), rate)  # a number for every row of several dimensions
     lead = [value.expand(2, *value.shape) for value in (theta, gram, moment)]
     torch.testing.assert_close(law.step(*lead, 0.2, push), after.expand(2, 3, 3), rtol=0, atol=1e-14)
 
@@ -196,8 +198,8 @@ def test_a_row_that_went_wrong_does_not_end_the_others() -> None:
         bad = s.clone()
         bad[1] = torch.nan
         z, ready = torch.zeros(2, 1).double(), torch.ones(2).bool()
-        now = stack.step(now, adp.Equation(bad, z, z[:, 0], ready))
-        alone = stack.step(alone, adp.Equation(s[:1], z[:1], z[:1, 0], ready[:1]))
+        now = stack.step(now, Equation(bad, z, z[:, 0], ready))
+        alone = stack.step(alone, Equation(s[:1], z[:1], z[:1, 0], ready[:1]))
     for both, one in zip(now, alone, strict=True):
         assert torch.equal(both[:1], one)
 

@@ -9,6 +9,8 @@ from helpers_adaptation import COST, PENDULUM
 
 from staf_torch import adp, systems
 from staf_torch.adp.adaptation import redesign
+from staf_torch.adp.adaptation.redesign import riccati_rows
+from staf_torch.adp.estimation.kalman import Belief
 
 
 def test_a_plant_changes_when_its_clock_has_run_down() -> None:
@@ -51,7 +53,7 @@ def test_a_design_is_that_of_the_model_at_its_beginning(doublings: int, a_step: 
             assert torch.equal(now.p, before)
         else:
             begun = models[k + 1 - doublings // a_step]
-            wanted = adp.riccati_rows(*begun, q, r, doublings=doublings)
+            wanted = riccati_rows(*begun, q, r, doublings=doublings)
             torch.testing.assert_close(now.p, wanted, rtol=1e-12, atol=1e-12)
             assert not bool(torch.stack(now.doubling).any())
 
@@ -85,7 +87,7 @@ def test_noise_of_a_filter_of_a_plant_in_steps_counts_by_its_period() -> None:
     for kind in (adp.ExtendedKalman, adp.UnscentedKalman):
         filter = kind(plant, lambda x: x[..., :1], noise=[0.1], process=[0.2, 0.5])
         size = torch.diag(tensor([0.3, 0.2])).expand(4, 2, 2)
-        after = filter.predicted(adp.Belief(x, size, u), 0.1)
+        after = filter.predicted(Belief(x, size, u), 0.1)
         flow = tensor([[1.0, 0.1], [0.0, 0.9]])
         torch.testing.assert_close(after.mean, x @ flow.mT + torch.cat((0 * u, u), -1))
         wanted = flow @ size[0] @ flow.mT + torch.diag(tensor([0.04, 0.25])) * 0.1

@@ -8,6 +8,8 @@ from helpers import changed, tensor, uniform
 from torch import Tensor
 
 from staf_torch import ExponentialKernel, GaussianKernel, adp, rings, systems
+from staf_torch.adp.adaptation.drift import DriftEstimate
+from staf_torch.adp.adaptation.windows import Equation
 
 KNOWN = systems.Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
 COST = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
@@ -19,10 +21,10 @@ def made(**settings: object) -> adp.StreamDrift:
     return adp.StreamDrift(KNOWN, GaussianKernel(2.0), CENTERS, **given)  # type: ignore[arg-type]
 
 
-def equation(drift: adp.StreamDrift, now: adp.DriftEstimate, x: Tensor, z: Tensor) -> adp.Equation:
+def equation(drift: adp.StreamDrift, now: DriftEstimate, x: Tensor, z: Tensor) -> Equation:
     """That the drift at x is z / length, as a window in which the state rests would say."""
     s = drift.windows.length * drift.window_of(now).model.regressor(x, x[..., :1])[..., drift.rows, :]
-    return adp.Equation(s, z, torch.zeros(len(x)).double(), torch.ones(len(x)).bool())
+    return Equation(s, z, torch.zeros(len(x)).double(), torch.ones(len(x)).bool())
 
 
 def test_without_moving_centers_the_posterior_is_that_of_the_gaussian_process() -> None:
@@ -41,12 +43,10 @@ def test_without_moving_centers_the_posterior_is_that_of_the_gaussian_process() 
     gram = length**2 * covariance(at, at) + drift.floor**2 * torch.eye(3).double()
     across = length * covariance(tried, at)
     wanted = across @ torch.linalg.solve(gram, z)
-    mean, _ = drift.predict(adp.DriftEstimate(*(part.expand(2, *part.shape[1:]) for part in now)), tried)
+    mean, _ = drift.predict(DriftEstimate(*(part.expand(2, *part.shape[1:]) for part in now)), tried)
     # Between the centers the local functions are an interpolation: it errs by what the rest has.
     torch.testing.assert_close(mean, wanted, rtol=0.02, atol=0.02)
-    at_centers, spread = drift.predict(
-        adp.DriftEstimate(*(part.expand(3, *part.shape[1:]) for part in now)), at
-    )
+    at_centers, spread = drift.predict(DriftEstimate(*(part.expand(3, *part.shape[1:]) for part in now)), at)
     torch.testing.assert_close(
         at_centers, length * covariance(at, at) @ torch.linalg.solve(gram, z), rtol=1e-9, atol=1e-9
     )
@@ -63,7 +63,7 @@ def test_moved_centers_keep_what_was_known_and_own_up_to_what_they_lost() -> Non
         now = drift.step(now, equation(drift, now, x, x.sum(-1, keepdim=True)), start, 0.05)
     x = tensor([[0.4, 0.45]])  # beyond the ball of 0.5
     s, z, variance, ready = equation(drift, now, x, x[:, :1])
-    ended = adp.Equation(0 * s, 0 * z, variance, ready)  # says nothing, but a window ends
+    ended = Equation(0 * s, 0 * z, variance, ready)  # says nothing, but a window ends
     moved = drift.step(now, ended, x, 0.05)
     assert torch.equal(moved.anchor, x)
     before, after = drift.predict(now, x), drift.predict(moved, x)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from staf_torch import adp, systems
 from staf_torch.adp.critic.bellman import BellmanTerms
-from staf_torch.adp.critic.laws import ActorCriticLaw, solve_definite
+from staf_torch.adp.critic.laws import ActorCriticLaw, Weights, solve_definite
 from staf_torch.numerics.runge_kutta import runge_kutta_step
 
 GAINS = {
@@ -31,7 +31,7 @@ TERMS = BellmanTerms(
 )
 MASSES = tensor([0.5, 0.3, 0.2])
 ROOT = uniform(B, M, M, seed=5)
-WEIGHTS = adp.Weights(uniform(B, M, seed=6), uniform(B, M, seed=7), ROOT @ ROOT.mT + torch.eye(M).double())
+WEIGHTS = Weights(uniform(B, M, seed=6), uniform(B, M, seed=7), ROOT @ ROOT.mT + torch.eye(M).double())
 
 
 def gains_of(rows: bool) -> tuple[adp.Gains, list[dict[str, float]]]:
@@ -155,15 +155,15 @@ def test_definite_systems_are_solved_in_every_size(size: int) -> None:
     torch.testing.assert_close(spoiled[1:], found[1:])
 
 
-def continuous(law: ActorCriticLaw, duration: float) -> tuple[Tensor, adp.Weights, Tensor]:
+def continuous(law: ActorCriticLaw, duration: float) -> tuple[Tensor, Weights, Tensor]:
     """The laws and the plant as one differential equation, by Runge-Kutta on steps that start short."""
     controller = learner(law, adp.QuadraturePoints(7, 2, BOX))
     x = tensor([[-1.0, 1.0]])
     none, sizes = x.new_zeros(1, 0, 2), (2, 3, 3, 9, 1)
 
-    def parts(y: Tensor) -> tuple[Tensor, adp.Weights, Tensor]:
+    def parts(y: Tensor) -> tuple[Tensor, Weights, Tensor]:
         x, critic, actor, gain, paid = y.split(sizes, dim=-1)
-        return x, adp.Weights(critic, actor, gain.unflatten(-1, (3, 3))), paid
+        return x, Weights(critic, actor, gain.unflatten(-1, (3, 3))), paid
 
     def field(y: Tensor) -> Tensor:
         x, weights, _ = parts(y)
@@ -209,7 +209,7 @@ def test_step_tends_to_the_rate(law: ActorCriticLaw) -> None:
     generator = torch.Generator().manual_seed(3)
     controller = learner(law, adp.QuadraturePoints(3, 2, BOX))
     x = uniform(5, 2, seed=4)
-    memory = adp.Weights(*controller.init(x)[:3])
+    memory = Weights(*controller.init(x)[:3])
     memory = changed(memory, critic=torch.randn(5, 3, dtype=torch.float64, generator=generator))
     terms = controller.terms(x, memory.actor, x.new_zeros(5, 0, 2))
     sums = law.sums(terms, controller.extrapolation.weights, memory)
@@ -240,7 +240,7 @@ def test_optimal_weights_of_the_quadratic_basis_stay_put_but_for_the_actor_decay
     x = uniform(20, 2, seed=0)
     memory = controller.init(x)
     terms = controller.terms(x, memory.actor, uniform(20, 2, seed=2).unsqueeze(1))
-    sums = controller.law.sums(terms, controller.extrapolation.weights, adp.Weights(*memory[:3]))
+    sums = controller.law.sums(terms, controller.extrapolation.weights, Weights(*memory[:3]))
     assert sums.critic_force.abs().max() < 1e-13
 
 

@@ -14,6 +14,7 @@ from torch import Tensor
 
 import staf_torch as st
 from staf_torch import adp
+from staf_torch.adp.critic.bellman import bellman_error, bellman_terms
 from staf_torch.centers import Radius
 
 
@@ -99,8 +100,8 @@ def test_bellman_error_of_the_optimum_is_zero_in_the_quadratic_basis() -> None:
     basis = adp.QuadraticBasis(2)
     optimum = torch.tensor([0.5, 0.0, 1.0], dtype=torch.float64)  # x1^2 / 2 + x2^2
     x = uniform(50, 2, low=-2, high=2, seed=0).unsqueeze(-2)
-    terms = adp.bellman_terms(basis, PLANT, COST, x, x, optimum.expand(50, 3))
-    assert adp.bellman_error(terms, optimum).abs().max() < 1e-12
+    terms = bellman_terms(basis, PLANT, COST, x, x, optimum.expand(50, 3))
+    assert bellman_error(terms, optimum).abs().max() < 1e-12
 
 
 @pytest.mark.parametrize("basis", [adp.QuadraticBasis(2), adp.RBFGridBasis(2)], ids=["quadratic", "grid"])

@@ -9,6 +9,8 @@ from helpers_adaptation import PENDULUM
 from torch import Tensor
 
 from staf_torch import adp, systems
+from staf_torch.adp.adaptation.least_squares import Estimate
+from staf_torch.adp.estimation.kalman import Belief, KalmanFilter
 from staf_torch.adp.loop.step import ClosedLoop, program
 
 LINEAR = systems.Linear([[0.0, 1.0, 0.0], [2.0, -0.5, 1.0], [0.0, 0.3, -1.0]], [[0.0], [1.0], [0.5]])
@@ -21,13 +23,13 @@ def outputs(x: Tensor) -> Tensor:
     return (C.to(x) * x.unsqueeze(-2)).sum(-1)
 
 
-def believed(rows: int) -> adp.Belief:
+def believed(rows: int) -> Belief:
     root = uniform(rows, 3, 3, seed=1) + torch.eye(3).double()
-    return adp.Belief(uniform(rows, 3, seed=2), root @ root.mT, uniform(rows, 1, seed=3))
+    return Belief(uniform(rows, 3, seed=2), root @ root.mT, uniform(rows, 1, seed=3))
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_on_a_linear_plant_a_filter_is_that_of_kalman(kind: type[adp.KalmanFilter]) -> None:
+def test_on_a_linear_plant_a_filter_is_that_of_kalman(kind: type[KalmanFilter]) -> None:
     filter, belief, y = (
         kind(LINEAR, outputs, noise=NOISE, process=PROCESS),
         believed(4),
@@ -49,7 +51,7 @@ def test_on_a_linear_plant_a_filter_is_that_of_kalman(kind: type[adp.KalmanFilte
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_an_unstable_pendulum_is_held_by_its_angle_alone(kind: type[adp.KalmanFilter]) -> None:
+def test_an_unstable_pendulum_is_held_by_its_angle_alone(kind: type[KalmanFilter]) -> None:
     plant, cost = systems.Pendulum(), adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
     filter = kind(plant, lambda x: x[..., :1].sin(), noise=[0.01], process=0.02)
     inside = adp.Observed(adp.Feedback(adp.LQR(plant, cost)), filter, deviation=0.5)
@@ -65,7 +67,7 @@ def test_an_unstable_pendulum_is_held_by_its_angle_alone(kind: type[adp.KalmanFi
 
 @pytest.mark.needs_compiler
 @pytest.mark.parametrize("kind", KINDS)
-def test_compiled_filters_are_those_of_the_definition_row_by_row(kind: type[adp.KalmanFilter]) -> None:
+def test_compiled_filters_are_those_of_the_definition_row_by_row(kind: type[KalmanFilter]) -> None:
     plant = systems.Linear([[0.0, 1.0], [2.0, -0.5]], [[0.0], [1.0]])  # two states: a shorter program
     cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
 
@@ -101,10 +103,10 @@ def test_what_breaks_a_rule_is_refused_with_its_name(settings: dict, rule: str) 
 DT = 0.05
 
 
-def estimate(theta: torch.Tensor, variance: float) -> adp.Estimate:
+def estimate(theta: torch.Tensor, variance: float) -> Estimate:
     eye = torch.eye(theta.shape[-1]).to(theta).expand(*theta.shape, -1)
     zero = torch.zeros_like(theta[..., 0])
-    return adp.Estimate(theta, variance * eye, zero, zero)
+    return Estimate(theta, variance * eye, zero, zero)
 
 
 def test_where_theta_is_known_the_filter_is_that_of_kalman() -> None:
@@ -113,7 +115,7 @@ def test_where_theta_is_known_the_filter_is_that_of_kalman() -> None:
     kalman = adp.ExtendedKalman(PENDULUM, lambda x: x, noise=[0.1, 0.3], process=[0.05, 0.2])
     y, u = uniform(rows, 2, seed=1), uniform(rows, 1, seed=2)
     now = own.step(own.init(y), y, u, estimate(theta, 0.0), DT)
-    belief = adp.Belief(now.mean, now.covariance, u)
+    belief = Belief(now.mean, now.covariance, u)
     for k in range(3):
         y = uniform(rows, 2, seed=3 + k)
         now = own.step(now, y, u, estimate(theta, 0.0), DT)

@@ -12,6 +12,7 @@ from helpers_adp import COST, PLANT, uniform
 from torch import Tensor
 
 from staf_torch import adp, systems
+from staf_torch.adp.critic.bellman import value_gradient
 from staf_torch.adp.planning.shooting.stage import Stage
 
 DOUBLE = systems.Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
@@ -29,7 +30,7 @@ def test_known_optimum_is_found_and_bounded_from_above(plant: systems.ControlAff
     assert excess.min() > -1e-8
     assert excess.max() < 3e-6
     assert (excess <= best.mesh_error + best.horizon_error).all()
-    gradient = adp.value_gradient(lambda y: plant.optimal_value(y, COST.q, COST.r), x)
+    gradient = value_gradient(lambda y: plant.optimal_value(y, COST.q, COST.r), x)
     torch.testing.assert_close(best.gradient, gradient, rtol=1e-4, atol=1e-5)
     control = COST.policy(plant.effectiveness(x), gradient)
     torch.testing.assert_close(best.control, control, rtol=1e-4, atol=2e-4)

@@ -9,6 +9,7 @@ from helpers_swingup import cost_of as cost_along
 from torch import Tensor
 
 from staf_torch import adp, systems
+from staf_torch.adp.planning.obstacle_cost import AvoidancePlans
 
 LINE = systems.Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
 
@@ -64,7 +65,7 @@ def slow(x: Tensor) -> Tensor:
 
 
 @pytest.fixture(scope="module")
-def plans() -> tuple[adp.AvoidanceCost, dict[tuple[float, ...], adp.AvoidancePlans]]:
+def plans() -> tuple[adp.AvoidanceCost, dict[tuple[float, ...], AvoidancePlans]]:
     """From two starts, by what their weights shrink."""
     limited = {"low": -1.0, "high": 1.0, "obstacles": slow, "reach": 0.3, "kind": "log"}
     cost = adp.AvoidanceCost(1.0, 1.0, dim=2, inputs=1, **limited)  # type: ignore[arg-type]
@@ -76,7 +77,7 @@ def plans() -> tuple[adp.AvoidanceCost, dict[tuple[float, ...], adp.AvoidancePla
 
 
 def test_plans_touch_what_they_may_and_pay_as_their_weight_vanishes(
-    plans: tuple[adp.AvoidanceCost, dict[tuple[float, ...], adp.AvoidancePlans]],
+    plans: tuple[adp.AvoidanceCost, dict[tuple[float, ...], AvoidancePlans]],
 ) -> None:
     cost, found = plans
     heavy, light = found[1.0,], found[1.0, 0.01]
@@ -89,7 +90,7 @@ def test_plans_touch_what_they_may_and_pay_as_their_weight_vanishes(
 
 
 def test_a_plan_is_paid_without_its_obstacles_and_is_that_of_its_start_alone(
-    plans: tuple[adp.AvoidanceCost, dict[tuple[float, ...], adp.AvoidancePlans]],
+    plans: tuple[adp.AvoidanceCost, dict[tuple[float, ...], AvoidancePlans]],
 ) -> None:
     cost, several = plans
     found = several[1.0,]

@@ -28,6 +28,7 @@ from staf_torch import (
     rings,
     systems,
 )
+from staf_torch.adp.critic.bellman import value_gradient
 
 LQR = adp.LQR(PLANT, COST)
 X = unit(3, 2, seed=1)
@@ -53,7 +54,7 @@ def test_rollout_of_the_optimal_policy_returns_the_optimal_value() -> None:
         return PLANT.optimal_value(x, COST.q, COST.r)
 
     def best(x: torch.Tensor) -> torch.Tensor:
-        return COST.policy(PLANT.effectiveness(x), adp.value_gradient(value, x))
+        return COST.policy(PLANT.effectiveness(x), value_gradient(value, x))
 
     policy = adp.RolloutPolicy(basis, PLANT, COST, best, value, horizon=0.5, steps=20)
     x = uniform(30, 2.0)
@@ -157,7 +158,7 @@ def test_quadrotor_is_regulated_at_less_than_the_cost_of_the_lqr() -> None:
 def test_repetition_approaches_the_optimal_policy() -> None:
     x = uniform(20, 1.5, seed=3)
     best = COST.policy(
-        PLANT.effectiveness(x), adp.value_gradient(lambda y: PLANT.optimal_value(y, COST.q, COST.r), x)
+        PLANT.effectiveness(x), value_gradient(lambda y: PLANT.optimal_value(y, COST.q, COST.r), x)
     )
     errors = [float((rollout(horizon=0.6, steps=6, depth=depth)(x) - best).abs().mean()) for depth in (1, 2)]
     assert errors[1] < 0.5 * errors[0]

@@ -57,17 +57,6 @@ class Optimum(NamedTuple):
 class PlanReplay(Controller):
     """u(t) of a plan that is linear on each interval, averaged over each period; its last value afterwards.
 
-    Example:
-        >>> plant = systems.TwoState()
-        >>> cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
-        >>> x0 = torch.tensor([[0.2, 0.1]]).double()
-        >>> found = adp.DirectShooting(plant, cost).solve(x0)
-        >>> run = adp.simulate(found.replay(), plant, cost, x0, dt=0.01, steps=100, compile=False)
-        >>> bool(run.cost < found.value)  # until then; the plan goes on
-        True
-
-        Shown by `staf_torch/adp/README.md`.
-
     Args:
         time: (N + 1,) seconds, from 0.
         plan: (B, N, 2, m), u at the start and the end of every interval.
