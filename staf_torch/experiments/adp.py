@@ -60,7 +60,7 @@ class LoopSolution:
     periodic: tuple[int, ...] = ()  # coordinates that are angles
 
 
-class ClosedLoop(BatchedExperiment[LoopSolution]):
+class Regulation(BatchedExperiment[LoopSolution]):
     """Optimal regulation; initial states, seeds, initial weights and gains share a tensor batch."""
 
     animates = True

@@ -66,13 +66,13 @@ def simulate(
         alike.setdefault(key, []).append(i)
     found: dict[int, Outcome] = {}
     for indices in alike.values():
-        members = [_Member(problems[i], sinks[i], drawn[i]) for i in indices]
+        members = [_BatchMember(problems[i], sinks[i], drawn[i]) for i in indices]
         found |= zip(indices, _run(members, advance, errors, alone=len(problems) == 1), strict=True)
     return [found[i] for i in range(len(problems))]
 
 
 def _run(
-    members: Sequence[_Member],
+    members: Sequence[_BatchMember],
     advance: Callable[[int], None] | None,
     errors: StateErrorPass | None,
     *,
@@ -129,7 +129,7 @@ def _run(
     return [member.outcome(found) for member, found in zip(members, metrics.summaries(), strict=True)]
 
 
-def _distribute(result: ChaseResult, first: int, members: Sequence[_Member], *, alone: bool) -> None:
+def _distribute(result: ChaseResult, first: int, members: Sequence[_BatchMember], *, alone: bool) -> None:
     """Give every member what a piece has of its rows; the piece begins at row ``first`` of the batch."""
     start, count = 0, result.state.shape[0]
     for member in members:
@@ -167,7 +167,7 @@ class _Reach:
         self._basis.warn_reach(self._worst, stacklevel=3)
 
 
-class _Member:
+class _BatchMember:
     """One problem of a batch: what is kept of its rows."""
 
     def __init__(self, problem: ChaseProblem, sink: Sink | None, drawn: bool) -> None:

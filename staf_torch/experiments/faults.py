@@ -28,7 +28,7 @@ from ..adp import (
     ParametricPlant,
     QuadraticCost,
 )
-from ..figures.adaptation import FaultPicture, draw_faults
+from ..figures.closed_loop import FaultPicture, draw_faults
 from ..numerics.checks import COMMAND_LINE, choice, flag, integer, positive_real
 from ..results.progress import SHOWN, Progress
 from ..results.run_directory import RunDirectory
@@ -52,7 +52,7 @@ _RECORDED = 0.01  # s between recorded times, about
 _SETTLED = 1.0  # s at the end in which a regulated state stays near the origin
 
 
-class Case(NamedTuple):
+class FaultCase(NamedTuple):
     """One plant, what happens to it, and the policy that learns it."""
 
     model: ParametricPlant
@@ -95,7 +95,7 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
     return study.write(RunDirectory(directory), (lambda: draw_faults(pictures)) if figures else None)
 
 
-def short_period(rows: int, generator: torch.Generator) -> Case:
+def short_period(rows: int, generator: torch.Generator) -> FaultCase:
     """The F/A-18's short period with effectiveness (.7, 0): drift and effectiveness unknown, the drift's
     first estimate uniform in [-5, 5].
 
@@ -124,13 +124,13 @@ def short_period(rows: int, generator: torch.Generator) -> Case:
         probe=1.0,
     ).starting_from(first)
     known = true.expand(rows, 6)
-    return Case(
+    return FaultCase(
         *(model, cost, x0, known, known, x0.new_zeros(rows), 0.001, 0.0, 1e-2, adaptive),
         lambda: DirectShooting(model, cost).solve(x0[:1]).value.expand(rows),
     )
 
 
-def unstable(rows: int, generator: torch.Generator) -> Case:
+def unstable(rows: int, generator: torch.Generator) -> FaultCase:
     """x1'' = 25 x1 + u1 + u2/10, controlled every 20 ms, of whose first actuator half is lost on the way to
     the origin, between 0.1 and 0.5 s. An LQR that is made to be held for that long does not stand it."""
 
@@ -148,14 +148,14 @@ def unstable(rows: int, generator: torch.Generator) -> Case:
     law = LeastSquares([1.0, 1.0], deviation=[0.3, 0.05], floor=1e-3, forgetting=0.2, alarm=5.0)
     windows = IntegralWindows(model, 0.06, noise=0.002)
     before = torch.ones(rows, 2, dtype=torch.float64)
-    return Case(
+    return FaultCase(
         *(model, cost, x0, before, before * torch.tensor([0.5, 1.0]).to(before), at, 0.02, 0.002, 0.05),
         AdaptiveLQR(model, cost, windows, law),
         lambda: None,
     )
 
 
-def mass(rows: int, generator: torch.Generator) -> Case:
+def mass(rows: int, generator: torch.Generator) -> FaultCase:
     """An inverted pendulum with half or twice the mass of the design, states measured with noise of 0.01."""
 
     def regressor(x: Tensor, u: Tensor) -> Tensor:
@@ -186,10 +186,10 @@ def mass(rows: int, generator: torch.Generator) -> Case:
             best[same] = shooting.solve(x0[same]).value
         return best
 
-    return Case(*(model, cost, x0, true, true, x0.new_zeros(rows), 0.001, 0.01, 0.05, adaptive), optimum)
+    return FaultCase(*(model, cost, x0, true, true, x0.new_zeros(rows), 0.001, 0.01, 0.05, adaptive), optimum)
 
 
-CASES: dict[str, Callable[[int, torch.Generator], Case]] = {
+CASES: dict[str, Callable[[int, torch.Generator], FaultCase]] = {
     "short_period": short_period,
     "unstable": unstable,
     "mass": mass,
@@ -199,7 +199,7 @@ CASES: dict[str, Callable[[int, torch.Generator], Case]] = {
 class _Informed(torch.nn.Module):
     """u = -K e with the gain of every row's own plant, as it is in the end."""
 
-    def __init__(self, case: Case) -> None:
+    def __init__(self, case: FaultCase) -> None:
         super().__init__()
         self.own = case.after.unique(dim=0)
         self.laws = [LQR(case.model.believing(theta), case.cost, period=case.dt) for theta in self.own]
@@ -215,7 +215,7 @@ class _Informed(torch.nn.Module):
         return u
 
 
-def _controllers(case: Case) -> dict[str, Controller]:
+def _controllers(case: FaultCase) -> dict[str, Controller]:
     """What the state and noise are measured for, by name: the last parameters are seen by who knows them."""
     n, p = case.x0.shape[-1], case.model.parameters_count
     design = LQR(case.model.believing(_design(case)), case.cost, period=case.dt)
@@ -232,7 +232,7 @@ def _controllers(case: Case) -> dict[str, Controller]:
     }
 
 
-def _design(case: Case) -> Tensor:
+def _design(case: FaultCase) -> Tensor:
     """The parameters that an ignorant design believes: healthy actuators, the nominal mass."""
     theta = case.adaptive.law.first.clone()
     if case.model.parameters_count == 6:  # the drift is known to it, the fault is not
@@ -240,7 +240,7 @@ def _design(case: Case) -> Tensor:
     return theta
 
 
-def _run(case: Case, controller: Controller, duration: float) -> LoopResult:
+def _run(case: FaultCase, controller: Controller, duration: float) -> LoopResult:
     plant = ChangingPlant(case.model)
     z0 = plant.start(case.x0, case.before, case.after, case.at)
     every = max(1, round(_RECORDED / case.dt))
@@ -248,7 +248,7 @@ def _run(case: Case, controller: Controller, duration: float) -> LoopResult:
     return Method(controller, plant, plant.cost(case.cost)).run(z0, dt=case.dt, steps=steps, every=every)
 
 
-def _measured(case: Case, result: LoopResult, best: Tensor | None) -> dict[str, float | None]:
+def _measured(case: FaultCase, result: LoopResult, best: Tensor | None) -> dict[str, float | None]:
     late = result.time >= result.time[-1] - _SETTLED
     norm = result.state[:, late, : case.x0.shape[-1]].norm(dim=-1)
     regulated = (norm < case.near).all(-1) & ~result.diverged
@@ -262,7 +262,7 @@ def _measured(case: Case, result: LoopResult, best: Tensor | None) -> dict[str, 
     }
 
 
-def _learned(case: Case, result: LoopResult) -> dict[str, float | None]:
+def _learned(case: FaultCase, result: LoopResult) -> dict[str, float | None]:
     """When the adaptive policy had found the plant, in the median, and its largest error at the end."""
     if case.adaptive.law.alarm is None:  # found: the model is certain enough for the first time
         found = (result["certain"].cumsum(1) == 0).sum(1) * (result.time[1] - result.time[0])
@@ -273,7 +273,7 @@ def _learned(case: Case, result: LoopResult) -> dict[str, float | None]:
     return {"found_median": float(found.median()), "parameter_error": float(error.max())}
 
 
-def _picture(case: Case, results: dict[str, LoopResult]) -> FaultPicture:
+def _picture(case: FaultCase, results: dict[str, LoopResult]) -> FaultPicture:
     n, adaptive = case.x0.shape[-1], results["adaptive"]
     time = adaptive.time.numpy()
     truth = torch.where((adaptive.time < case.at[0])[:, None], case.before[0], case.after[0])

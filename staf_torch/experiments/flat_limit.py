@@ -175,7 +175,7 @@ def _dot(a: Point, b: Point) -> Decimal:
     return sum((p * q for p, q in zip(a, b, strict=True)), Decimal(0))
 
 
-class Problem(NamedTuple):
+class FlatLimit(NamedTuple):
     """What the settings describe, checked; all numbers such that float32 can hold them."""
 
     kernel: Kernel
@@ -186,7 +186,7 @@ class Problem(NamedTuple):
     per_decade: int
 
 
-class Sample(NamedTuple):
+class FlatLimitErrors(NamedTuple):
     """The errors at one count, dtype and radius."""
 
     centers: int
@@ -209,7 +209,7 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> dict[st
     return out.metrics(found)
 
 
-def problem_of(cfg: DictConfig) -> Problem:
+def problem_of(cfg: DictConfig) -> FlatLimit:
     """The settings, checked.
 
     Raises:
@@ -226,10 +226,10 @@ def problem_of(cfg: DictConfig) -> Problem:
         raise fail(COMMAND_LINE, "system", "must have two states for flat_limit", len(state))
     name = "flat_limit.radii.per_decade"
     per_decade = integer(COMMAND_LINE, name, cfg.flat_limit.radii.per_decade, least=1)
-    return Problem(kernel, target, state, _counts(cfg), _radii(cfg, per_decade), per_decade)
+    return FlatLimit(kernel, target, state, _counts(cfg), _radii(cfg, per_decade), per_decade)
 
 
-def solve(problem: Problem, progress: Progress = SHOWN) -> list[Sample]:
+def solve(problem: FlatLimit, progress: Progress = SHOWN) -> list[FlatLimitErrors]:
     """Every method in both dtypes, at every count and radius."""
     zeta = probe_points(_POINTS, 2).float().double()
     width = float(problem.kernel.width) if isinstance(problem.kernel, GaussianKernel) else None
@@ -246,11 +246,11 @@ def solve(problem: Problem, progress: Progress = SHOWN) -> list[Sample]:
                 key: relative_error(method(basis, problem.target, x, z), truth)
                 for key, (_, method) in METHODS.items()
             }
-            found.append(Sample(count, name, radius, error))
+            found.append(FlatLimitErrors(count, name, radius, error))
     return found
 
 
-def summary(samples: list[Sample]) -> dict[str, float | None]:
+def summary(samples: list[FlatLimitErrors]) -> dict[str, float | None]:
     """By method and dtype: the worst error (null where it fails somewhere), over all counts and at each,
     and the largest radius at which it fails (null where it never does)."""
     found: dict[str, float | None] = {}
@@ -287,7 +287,7 @@ def _radii(cfg: DictConfig, per_decade: int) -> list[float]:
     return torch.tensor([*grid, largest], dtype=torch.float32).tolist()
 
 
-def _shown(problem: Problem, samples: list[Sample]) -> Table:
+def _shown(problem: FlatLimit, samples: list[FlatLimitErrors]) -> Table:
     """Methods against the radii of whole decades from the smallest up, and the worst of all radii."""
     shown = problem.radii[: -1 : problem.per_decade]
     headings = {"dtype": "dtype", "centers": "centers", "method": "method"}
@@ -303,7 +303,7 @@ def _shown(problem: Problem, samples: list[Sample]) -> Table:
     return Table.of(rows, headings)
 
 
-def _every(samples: list[Sample]) -> Table:
+def _every(samples: list[FlatLimitErrors]) -> Table:
     rows: list[dict[str, Value]] = []
     for s in samples:
         about: dict[str, Value] = {"dtype": s.dtype, "centers": s.centers, "radius": s.radius}
@@ -315,7 +315,7 @@ def _cell(error: float) -> str:
     return f"{error:.0e}" if math.isfinite(error) else "fails"
 
 
-def _panels(samples: list[Sample]) -> list[ErrorPanel]:
+def _panels(samples: list[FlatLimitErrors]) -> list[ErrorPanel]:
     """A panel for each dtype and count."""
     return [
         ErrorPanel(

@@ -11,7 +11,7 @@ from omegaconf import DictConfig
 from torch import Tensor
 
 from ..adp import ConcurrentTracker, Measured, ParametricPlant, QuadraticCost
-from ..figures.adaptation import GainSets, draw_gain_sets
+from ..figures.closed_loop import GainSets, draw_gain_sets
 from ..numerics.checks import COMMAND_LINE, fail, flag, integer, non_negative, positive_real, real, vector
 from ..results.progress import SHOWN, Progress
 from ..results.run_directory import RunDirectory
@@ -35,7 +35,7 @@ _COLUMNS = {
 }
 
 
-class Followed(NamedTuple):
+class SourceRun(NamedTuple):
     """What the rows did with one source of the equations."""
 
     time: Tensor  # (T,) s
@@ -78,7 +78,7 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
     return study.write(RunDirectory(directory), (lambda: draw_gain_sets(picture)) if figures else None)
 
 
-def _followed(cfg: DictConfig, plant: ParametricPlant, gains: dict[str, Tensor], source: str) -> Followed:
+def _followed(cfg: DictConfig, plant: ParametricPlant, gains: dict[str, Tensor], source: str) -> SourceRun:
     """The closed loops of all gains with the equations of one source."""
     dt = positive_real(COMMAND_LINE, "dt", cfg.dt)
     duration = positive_real(COMMAND_LINE, "duration", cfg.duration)
@@ -102,7 +102,7 @@ def _followed(cfg: DictConfig, plant: ParametricPlant, gains: dict[str, Tensor],
     )
     theta = result["theta"]
     error = result.state[..., :2] - reference(result.state)[0]
-    return Followed(result.time, error, theta, int(result.diverged.sum()))
+    return SourceRun(result.time, error, theta, int(result.diverged.sum()))
 
 
 def published() -> ParametricPlant:

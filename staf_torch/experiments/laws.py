@@ -45,7 +45,7 @@ _HEADINGS = {
 }
 
 
-class Case(NamedTuple):
+class LawCase(NamedTuple):
     """One row of the comparison."""
 
     law: UpdateLaw
@@ -70,7 +70,7 @@ class Case(NamedTuple):
         return "_".join(words.replace("(", "").replace(")", "").split()).lower()
 
 
-def cases(work: int, count: int) -> list[Case]:
+def cases(work: int, count: int) -> list[LawCase]:
     """Every law at up to ``work`` products with K a time step, then the predictors.
 
     Laws that are done sooner are not given more, and what a predictor costs is taken from the iterations;
@@ -111,12 +111,12 @@ def cases(work: int, count: int) -> list[Case]:
     return list({case.key: case for case in rows}.values())  # with two centers a row would repeat itself
 
 
-def _case(law: UpdateLaw, iterations: int, predictor: Predictor | None, count: int) -> Case:
+def _case(law: UpdateLaw, iterations: int, predictor: Predictor | None, count: int) -> LawCase:
     extra = 0 if predictor is None else predictor.products(count)
-    return Case(law, iterations, predictor, law.products(count, iterations) + extra)
+    return LawCase(law, iterations, predictor, law.products(count, iterations) + extra)
 
 
-def curves(work: int, count: int) -> list[Case]:
+def curves(work: int, count: int) -> list[LawCase]:
     """The rows worth a curve over the step: each predictor, with the cheapest law and with the exact one."""
     exact, cheap, paper = ("exact", 1), ("steepest descent", 1), ("steepest descent", work - 1)
     shown = {
@@ -128,10 +128,10 @@ def curves(work: int, count: int) -> list[Case]:
     return [row for row in cases(work, count) if (row.name, row.iterations) in shown[row.predicted]]
 
 
-class Curve(NamedTuple):
+class LawCurve(NamedTuple):
     """The excess before the correction against the step."""
 
-    case: Case
+    case: LawCase
     excess: list[float | None]  # a step
     slope: float | None  # d log(excess) / d log(dt), least squares
 
@@ -176,7 +176,7 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> dict[st
 
 
 def table(
-    problem: ChaseProblem, compared: list[Case], errors: StateErrorPass, progress: Progress = SHOWN
+    problem: ChaseProblem, compared: list[LawCase], errors: StateErrorPass, progress: Progress = SHOWN
 ) -> list[dict[str, str | float | None]]:
     """One row a case: what it is, what it costs, and the metrics of its gradient chase."""
     rows: list[dict[str, str | float | None]] = []
@@ -195,11 +195,11 @@ def table(
 
 def sweep(
     problem: ChaseProblem,
-    drawn: list[Case],
+    drawn: list[LawCase],
     steps: list[float],
     errors: StateErrorPass,
     progress: Progress = SHOWN,
-) -> list[Curve]:
+) -> list[LawCurve]:
     """Each case over the same horizon at every step."""
     duration = problem.dt * problem.steps
     counts = [math.floor(duration / dt + 1e-9) for dt in steps]
@@ -211,7 +211,7 @@ def sweep(
             ]
             for dt, count in zip(steps, counts, strict=True)
         ]
-        found.append(Curve(case, excess, log_slope(steps, excess)))
+        found.append(LawCurve(case, excess, log_slope(steps, excess)))
     return found
 
 
@@ -242,7 +242,7 @@ def promises(problem: ChaseProblem, excess: float) -> dict[str, float | None]:
     return {name: finite(value) for name, value in found.items()}
 
 
-def _with(problem: ChaseProblem, case: Case) -> ChaseProblem:
+def _with(problem: ChaseProblem, case: LawCase) -> ChaseProblem:
     return dataclasses.replace(problem, law=case.law, inner_steps=case.iterations, predictor=case.predictor)
 
 
@@ -262,7 +262,7 @@ def _steps(cfg: DictConfig, problem: ChaseProblem) -> list[float]:
     return steps
 
 
-def _lines(swept: list[Curve], steps: list[float]) -> list[ConvergenceCurve]:
+def _lines(swept: list[LawCurve], steps: list[float]) -> list[ConvergenceCurve]:
     return [
         ConvergenceCurve(
             label=f"{curve.case.name} x{curve.case.iterations}"
@@ -277,7 +277,7 @@ def _lines(swept: list[Curve], steps: list[float]) -> list[ConvergenceCurve]:
 
 def _summarise(
     problem: ChaseProblem,
-    swept: list[Curve],
+    swept: list[LawCurve],
     promised: dict[str, float | None],
     excess: float,
 ) -> None:

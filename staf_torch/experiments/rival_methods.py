@@ -17,7 +17,7 @@ from torch import Tensor
 from .. import adp
 from ..adp import SampledProblem
 from ..numerics.runge_kutta import SHARES, runge_kutta_mean, runge_kutta_stages
-from .rival_plants import Case
+from .rival_plants import RivalPlant
 
 Steer = Callable[[Tensor], Tensor]
 """u (B, m) from x (B, n), called once a period: it may remember its last plan."""
@@ -32,7 +32,7 @@ class UnsuitableError(Exception):
     """A method is not made for a plant; the message says why."""
 
 
-def lqr(case: Case) -> Begin:
+def lqr(case: RivalPlant) -> Begin:
     """Gains in continuous time, held for the period."""
     if case.discrete:
         raise UnsuitableError("needs a plant in continuous time")
@@ -40,13 +40,13 @@ def lqr(case: Case) -> Begin:
     return lambda x0: policy
 
 
-def discrete_lqr(case: Case) -> Begin:
+def discrete_lqr(case: RivalPlant) -> Begin:
     """The gains that are made for the period."""
     policy = adp.LQR(case.plant(), case.cost(), period=case.dt)
     return lambda x0: policy
 
 
-def near_optimal(case: Case) -> Begin:
+def near_optimal(case: RivalPlant) -> Begin:
     """The discrete LQR improved by rollouts, and by a plan as long as a bound is met."""
     if case.path is not None:
         raise UnsuitableError("follows no path")
@@ -54,7 +54,7 @@ def near_optimal(case: Case) -> Begin:
     return steered(case, policy.controller())
 
 
-def planned(case: Case) -> Begin:
+def planned(case: RivalPlant) -> Begin:
     """`near_optimal` with a plan that it carries, where bounds bite."""
     if case.path is not None:
         raise UnsuitableError("follows no path")
@@ -62,7 +62,7 @@ def planned(case: Case) -> Begin:
     return steered(case, policy.controller())
 
 
-def global_value(case: Case) -> Begin:
+def global_value(case: RivalPlant) -> Begin:
     """A memory of optimal trajectories."""
     if not case.swing:
         raise UnsuitableError("the LQR reaches the goal")
@@ -72,22 +72,22 @@ def global_value(case: Case) -> Begin:
     return lambda x0: memory
 
 
-def box_ddp(case: Case) -> Begin:
+def box_ddp(case: RivalPlant) -> Begin:
     """Receding horizon by box-DDP, three iterations a period."""
     return steered(case, adp.RecedingHorizon(case.problem(), steps=case.horizon))
 
 
-def plan(case: Case) -> Begin:
+def plan(case: RivalPlant) -> Begin:
     """One plan of the whole episode by box-DDP, followed with its feedback."""
     return steered(case, adp.RecedingHorizon(case.problem(), steps=case.steps, iterations=0))
 
 
-def path_integral(case: Case) -> Begin:
+def path_integral(case: RivalPlant) -> Begin:
     """Our own sampling, around the feedback."""
     return steered(case, adp.PathIntegral(case.problem(), steps=case.horizon, samples=_SAMPLES))
 
 
-def steered(case: Case, mpc: adp.Controller) -> Begin:
+def steered(case: RivalPlant, mpc: adp.Controller) -> Begin:
     """A controller that carries a state, as a function of x."""
 
     def begin(x0: Tensor) -> Steer:
@@ -105,7 +105,7 @@ def steered(case: Case, mpc: adp.Controller) -> Begin:
     return begin
 
 
-def ipopt(case: Case) -> Begin:
+def ipopt(case: RivalPlant) -> Begin:
     """Receding horizon by CasADi and IPOPT: multiple shooting, begun from the last plan."""
     import casadi
 
@@ -136,7 +136,7 @@ def ipopt(case: Case) -> Begin:
     return begin
 
 
-def mppi(case: Case) -> Begin:
+def mppi(case: RivalPlant) -> Begin:
     """Model-predictive path integrals: 200 sampled sequences a period."""
     from pytorch_mppi import MPPI_Batched
 
@@ -168,7 +168,7 @@ def mppi(case: Case) -> Begin:
     return begin
 
 
-def ipopt_program(casadi: Any, case: Case, problem: SampledProblem, steps: int) -> Any:
+def ipopt_program(casadi: Any, case: RivalPlant, problem: SampledProblem, steps: int) -> Any:
     """IPOPT on min sum l(x, u) + V_T over (states, controls): called with a guess x0 and p = (x, t)."""
     n, m = case.dim, case.inputs
     x, u, t = casadi.MX.sym("x", n), casadi.MX.sym("u", m), casadi.MX.sym("t")
@@ -223,7 +223,7 @@ class Rival:
     """A row of the table."""
 
     name: str
-    prepare: Callable[[Case], Begin]
+    prepare: Callable[[RivalPlant], Begin]
     packages: tuple[str, ...] = ()  # that it needs beside torch, by their distributions
     helpers: tuple[Callable[..., Any], ...] = ()  # that a user would write as well
     slow: bool = False  # tens of milliseconds a control of one state: fewer states

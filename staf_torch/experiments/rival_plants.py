@@ -32,7 +32,7 @@ class TorchMath:
 
 
 @dataclasses.dataclass(frozen=True)
-class Case:
+class RivalPlant:
     """A plant, its cost and its box of initial states.
 
     Attributes:
@@ -166,8 +166,8 @@ _CART = ((1.0, 1.0, 0.1, 0.1), (0.01,))
 CASES = {
     case.name: case
     for case in (
-        Case("double_integrator", mass, 0.1, 150, ((1.0, 1.0), (1.0,)), (-1.0,), (1.0,), (5.0, 1.0)),
-        Case(
+        RivalPlant("double_integrator", mass, 0.1, 150, ((1.0, 1.0), (1.0,)), (-1.0,), (1.0,), (5.0, 1.0)),
+        RivalPlant(
             "pendulum",
             pendulum,
             0.05,
@@ -180,9 +180,11 @@ CASES = {
             discrete=True,
             swing=True,
         ),
-        Case("cart_pole_10N", cart_pole, 0.02, 250, _CART, (-10.0,), (10.0,), (0.3,) * 4, periodic=(1,)),
-        Case("cart_pole_5N", cart_pole, 0.02, 250, _CART, (-5.0,), (5.0,), (0.3,) * 4, periodic=(1,)),
-        Case(
+        RivalPlant(
+            "cart_pole_10N", cart_pole, 0.02, 250, _CART, (-10.0,), (10.0,), (0.3,) * 4, periodic=(1,)
+        ),
+        RivalPlant("cart_pole_5N", cart_pole, 0.02, 250, _CART, (-5.0,), (5.0,), (0.3,) * 4, periodic=(1,)),
+        RivalPlant(
             "cart_pole_to_1m",
             cart_pole,
             1 / 15,
@@ -195,7 +197,7 @@ CASES = {
             periodic=(1,),
             horizon=20,
         ),
-        Case(
+        RivalPlant(
             "quadrotor",
             quadrotor,
             0.02,
@@ -206,7 +208,7 @@ CASES = {
             (0.4,) * 6,
             periodic=(2,),
         ),
-        Case(
+        RivalPlant(
             "figure_eight",
             small_quadrotor,
             0.02,
@@ -221,7 +223,7 @@ CASES = {
             rest=(0.5 * 0.027 * 9.81,) * 2,
             left=0.2,
         ),
-        Case(
+        RivalPlant(
             "cart_pole_swing_up",
             cart_pole,
             0.02,

@@ -15,7 +15,7 @@ from omegaconf import DictConfig
 from torch import Tensor
 
 from ..adp import BoxDDP, SampledProblem
-from ..figures.rivals import draw_rivals
+from ..figures.closed_loop import draw_rivals
 from ..numerics.checks import COMMAND_LINE, choice, integer
 from ..results.progress import SHOWN, Progress
 from ..results.run_directory import RunDirectory
@@ -23,7 +23,7 @@ from ..settings.chase import plain
 from ..tables.columns import significant
 from .registry import Metrics
 from .rival_methods import METHODS, Begin, Rival, UnsuitableError, ipopt_program
-from .rival_plants import CASES, Case
+from .rival_plants import CASES, RivalPlant
 from .study import Study, label_key
 
 _log = logging.getLogger(__name__)
@@ -79,7 +79,7 @@ def _chosen(what: str, names: object, known: Mapping[str, Any]) -> list[Any]:
     return [known[str(choice(COMMAND_LINE, f"rivals.{what}", name, tuple(known)))] for name in plain(names)]
 
 
-class Row(NamedTuple):
+class RivalRow(NamedTuple):
     """What a method reached on one plant."""
 
     method: str
@@ -88,8 +88,8 @@ class Row(NamedTuple):
 
 
 def compare(
-    case: Case, rivals: Sequence[Rival], x0: Tensor, calls: int, slow: int | None = None
-) -> list[Row]:
+    case: RivalPlant, rivals: Sequence[Rival], x0: Tensor, calls: int, slow: int | None = None
+) -> list[RivalRow]:
     """The rows of one plant; slow methods run from so many of the states and a fifth of the calls are timed,
     with a note of it; None: as many as the others."""
     problem = case.problem()
@@ -117,7 +117,7 @@ def compare(
         _log.info("%s, %s: mean cost %s", case.name, rival.name, significant(float(episode.cost.mean()), 5))
     best = best_known(case, problem, x0, list(episodes.values()))
     return [
-        Row(
+        RivalRow(
             rival.name,
             _measured(episodes.get(rival.name), best, case.left),
             _told(rival, episodes.get(rival.name), times.get(rival.name), notes.get(rival.name)),
@@ -158,7 +158,7 @@ def timed(problem: SampledProblem, begin: Begin, x: Tensor, calls: int) -> list[
     return taken[len(taken) // 10 :]
 
 
-def best_known(case: Case, problem: SampledProblem, x0: Tensor, episodes: list[Episode]) -> Tensor:
+def best_known(case: RivalPlant, problem: SampledProblem, x0: Tensor, episodes: list[Episode]) -> Tensor:
     """The lowest cost over the episode that anything reached: a method, from all states or the first ones,
     box-DDP from where it went, and where CasADi is installed IPOPT from the best of these: (B,)."""
     search = BoxDDP(problem, steps=case.steps, iterations=100)
@@ -181,7 +181,9 @@ def best_known(case: Case, problem: SampledProblem, x0: Tensor, episodes: list[E
     return best
 
 
-def _by_ipopt(case: Case, problem: SampledProblem, x0: Tensor, control: Tensor, state: Tensor) -> Tensor:
+def _by_ipopt(
+    case: RivalPlant, problem: SampledProblem, x0: Tensor, control: Tensor, state: Tensor
+) -> Tensor:
     import casadi
 
     solve = ipopt_program(casadi, case, problem, case.steps)

@@ -21,7 +21,7 @@ from ..adp import (
 )
 from ..adp.loop.setup import OptimumSettings
 from ..adp.safety.safety_filter import walls
-from ..figures.safety import BoxHistory, draw_box
+from ..figures.closed_loop import BoxHistory, draw_box
 from ..metrics.safety import constraint_metrics
 from ..numerics.checks import COMMAND_LINE, fail, flag, integer, positive_real
 from ..results.progress import SHOWN, Progress

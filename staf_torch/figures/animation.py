@@ -65,7 +65,7 @@ def animate(scene: Scene, kind: str) -> dict[str, bytes]:
 
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(WIDTH, 3.3), layout="constrained")
-        stage = Stage(figure, scene)
+        stage = AnimationStage(figure, scene)
         stage.show(0)
         figure.draw_without_rendering()
         figure.set_layout_engine("none")  # laid out once: nothing but the content moves
@@ -112,7 +112,7 @@ def _page(figure: Figure, show: Callable[[int], None], frames: int) -> bytes:
     return text.substitute(pictures=json.dumps(pictures), milliseconds=1000 // _FRAMES_PER_SECOND).encode()
 
 
-class Stage:
+class AnimationStage:
     """The three panels, and what of them moves."""
 
     def __init__(self, figure: Figure, scene: Scene) -> None:

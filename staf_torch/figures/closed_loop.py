@@ -1,13 +1,25 @@
-"""Figures of closed loops: one in the panels of the paper's section 8, a comparison, and tracking."""
+"""Figures of closed loops: the paper's panels, tracking, adaptation, constraints, comparisons."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from .style import WIDTH, colour, curves, dash, legend_above, letter, page, positive, subplots
+from .style import (
+    WIDTH,
+    colour,
+    curves,
+    dash,
+    legend_above,
+    legend_of_all,
+    letter,
+    marker,
+    page,
+    positive,
+    subplots,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -161,3 +173,237 @@ def _parameters(axes: Axes, history: TrackingHistory) -> None:
     axes.plot([], [], ":", color="0.2", label=r"$\theta$")
     axes.set_ylabel("drift parameters")
     legend_above(axes, 2)
+
+
+_EARLY = 2.0  # s: what happens to the estimates later is not seen at the scale of the truth
+
+
+class FaultPicture(NamedTuple):
+    """One trajectory of a case, under every policy."""
+
+    time: np.ndarray  # (T,) seconds
+    norms: dict[str, np.ndarray]  # policy -> |x|, (T,)
+    parameters: np.ndarray  # (T, p) theta^
+    truth: np.ndarray  # (T, p) theta
+    certain: np.ndarray  # (T,) bool: whether the redesigned policy had the control
+
+
+def draw_faults(cases: Mapping[str, FaultPicture]) -> Figure:
+    """A column a case: |x| under every policy above, the parameters below, shaded while uncertain."""
+    with page(WIDTH, 4.2) as figure:
+        grid = figure.subplots(2, len(cases), squeeze=False)
+        letter([*grid[0], *grid[1]], *cases, *[""] * len(cases))
+        for k, case in enumerate(cases.values()):
+            above, below = grid[0, k], grid[1, k]
+            for i, (policy, norm) in enumerate(case.norms.items()):
+                above.semilogy(case.time, positive(norm), dash(i), color=colour(i), label=policy)
+            for i in range(case.parameters.shape[1]):
+                below.plot(case.time, case.parameters[:, i], color=colour(i))
+                below.plot(case.time, case.truth[:, i], ":", color="0.2", linewidth=0.8)
+            low, high = _frame(case)
+            below.set_ylim(low, high)
+            below.fill_between(case.time, low, high, where=~case.certain, color="0.85", linewidth=0, zorder=0)
+            above.set_xlim(case.time[0], case.time[-1])
+            below.set_xlim(case.time[0], min(case.time[-1], _EARLY))
+            for axes in (above, below):
+                axes.set_xlabel("time (s)")
+        grid[0, 0].set_ylabel("$|x|$")
+        grid[1, 0].set_ylabel(r"$\hat\theta$ and $\theta$ (dotted)")
+        grid[0, 0].legend(loc="lower left")
+    return figure
+
+
+def _frame(case: FaultPicture) -> tuple[float, float]:
+    """Limits around the true parameters that show how the estimates come in, and no excursion."""
+    low, high = float(case.truth.min()), float(case.truth.max())
+    room = 0.3 * max(high - low, 1.0)
+    return low - room, high + room
+
+
+class GainSets(NamedTuple):
+    """Concurrent learning with many gains, from two sources of equations."""
+
+    time: np.ndarray  # (T,) seconds
+    parameters: np.ndarray  # (T, p) theta^ of one gain set
+    truth: np.ndarray  # (p,)
+    error: dict[str, np.ndarray]  # source -> RMS of e, (B,)
+    parameter_error: dict[str, np.ndarray]  # source -> RMS of theta^ - theta, (B,)
+    followed: dict[str, np.ndarray]  # source -> |e| of that gain set, (T,)
+
+
+def draw_gain_sets(sets: GainSets) -> Figure:
+    """theta^ and |e| of one gain set, and the RMS of both errors over all gain sets, sorted."""
+    with page(WIDTH, 4.4) as figure:
+        grid = list(figure.subplots(2, 2).flat)
+        letter(grid)
+        for i in range(sets.parameters.shape[1]):
+            grid[0].plot(sets.time, sets.parameters[:, i], color=colour(i))
+            grid[0].axhline(sets.truth[i], color="0.2", linestyle=":", linewidth=0.8)
+        grid[0].set_ylabel(r"$\hat\theta$ (integral), $\theta$ dotted")
+        for i, (name, values) in enumerate(sets.followed.items()):
+            grid[1].semilogy(sets.time, positive(values), color=colour(i), label=name, linewidth=0.7)
+        grid[1].set_ylabel("$|x - x_d|$")
+        legend_above(grid[1], 2)
+        for axes in grid[:2]:
+            axes.set_xlabel("time (s)")
+            axes.set_xlim(sets.time[0], sets.time[-1])
+        panels = (
+            (grid[2], sets.error, "RMS of $x - x_d$"),
+            (grid[3], sets.parameter_error, r"RMS of $\hat\theta - \theta$"),
+        )
+        for axes, errors, label in panels:
+            for i, (name, values) in enumerate(errors.items()):
+                share = np.arange(1, len(values) + 1) / len(values)
+                axes.step(np.sort(values), share, dash(i), where="post", color=colour(i), label=name)
+            axes.set_xscale("log")
+            axes.set_ylim(0, 1.02)
+            axes.set_xlabel(label)
+            axes.set_ylabel("share of gain sets")
+        legend_above(grid[2], 2)
+    return figure
+
+
+class BoxHistory(NamedTuple):
+    """One start under several methods, in a box."""
+
+    time: np.ndarray  # (T,) seconds
+    paths: Mapping[str, np.ndarray]  # method -> x, (T, n)
+    margins: Mapping[str, np.ndarray]  # method -> distance to the nearest wall, (T,)
+    costs: Mapping[str, np.ndarray]  # method -> cost so far, (T,)
+    barrier_state: np.ndarray  # s of the first method, (T, n)
+    low: np.ndarray  # (n,) -inf for none
+    high: np.ndarray  # (n,)
+
+
+def draw_box(history: BoxHistory) -> Figure:
+    """The first two coordinates with their walls, the distance to the nearest wall, s and the cost."""
+    with page(WIDTH, 4.6) as figure:
+        plane, margin, barrier, cost = figure.subplots(2, 2).flat
+        for i, (name, path) in enumerate(history.paths.items()):
+            plane.plot(path[:, 0], path[:, 1], dash(i), color=colour(i), label=name)
+            margin.plot(history.time, history.margins[name], dash(i), color=colour(i))
+            cost.plot(history.time, history.costs[name], dash(i), color=colour(i), label=name)
+        walls(plane, history.low, history.high)
+        plane.set(xlabel="$x_1$", ylabel="$x_2$")
+        legend_of_all(figure, plane, 3)
+        margin.set_ylabel("distance to the nearest wall")
+        margin.set_ylim(bottom=0)
+        curves(barrier, history.time, history.barrier_state, "$s_{%d}$")
+        barrier.set_ylabel("barrier coordinates")
+        legend_above(barrier, history.barrier_state.shape[1])
+        cost.set_ylabel("cost of $s$ so far")
+        cost.set_ylim(bottom=0)
+        for axes in (margin, barrier, cost):
+            axes.set(xlabel="time (s)", xlim=(history.time[0], history.time[-1]))
+        letter((plane, margin, barrier, cost))
+    return figure
+
+
+def walls(axes: Axes, low: np.ndarray, high: np.ndarray) -> None:
+    """Draw the walls of the first two coordinates, and shade what lies beyond."""
+    for k, ends in enumerate((axes.get_xlim(), axes.get_ylim())):
+        reach = 0.06 * (ends[1] - ends[0])
+        for wall, sign in ((low[k], -1), (high[k], 1)):
+            if np.isfinite(wall):
+                beyond = sorted((wall, wall + sign * reach))
+                if k == 0:
+                    axes.axvline(wall, color="0.2", linewidth=0.8)
+                    axes.axvspan(beyond[0], beyond[1], color="0.85", linewidth=0)
+                else:
+                    axes.axhline(wall, color="0.2", linewidth=0.8)
+                    axes.axhspan(beyond[0], beyond[1], color="0.85", linewidth=0)
+
+
+class AvoidanceHistory(NamedTuple):
+    """One scenario with moving discs under several methods, and the least distances of all scenarios."""
+
+    time: np.ndarray  # (T,) seconds
+    paths: Mapping[str, np.ndarray]  # method -> p, (T, 2)
+    discs: np.ndarray  # (T, K, 2) their centers
+    radius: float
+    distances: Mapping[str, np.ndarray]  # method -> distance to the nearest edge, (T,)
+    costs: Mapping[str, np.ndarray]  # method -> cost so far, (T,)
+    nearest: Mapping[str, np.ndarray]  # method -> least distance of every scenario, (B,)
+
+
+def draw_avoidance(history: AvoidanceHistory) -> Figure:
+    """The plane with the discs at some times, the distance, the least distances of all, and the cost."""
+    from matplotlib.patches import Circle
+
+    with page(WIDTH, 4.8) as figure:
+        plane, apart, share, cost = figure.subplots(2, 2).flat
+        last = int(np.argmax(history.time >= 0.5 * history.time[-1]))
+        shown = np.linspace(0, last, 5).round().astype(int)
+        for shade, at in zip(np.linspace(0.92, 0.6, len(shown)), shown, strict=True):
+            for center in history.discs[at]:
+                disc = Circle(
+                    tuple(center), history.radius, facecolor=f"{shade:.3f}", edgecolor="0.4", linewidth=0.4
+                )
+                plane.add_patch(disc)
+        for i, (name, path) in enumerate(history.paths.items()):
+            plane.plot(path[:, 0], path[:, 1], dash(i), color=colour(i), label=name)
+            plane.plot(path[shown, 0], path[shown, 1], ".", color=colour(i), markersize=4)
+            apart.plot(history.time, history.distances[name], dash(i), color=colour(i), label=name)
+            cost.plot(history.time, history.costs[name], dash(i), color=colour(i), label=name)
+            nearest = np.sort(history.nearest[name])
+            steps = np.arange(1, len(nearest) + 1) / len(nearest)
+            share.step(nearest, steps, dash(i), where="post", color=colour(i), label=name)
+        plane.set(xlabel="$p_1$ (m)", ylabel="$p_2$ (m)", aspect="equal")
+        legend_above(apart, 2)
+        for axes in (apart, share):
+            line = axes.axhline if axes is apart else axes.axvline
+            line(0.0, color="0.2", linewidth=0.8)
+        apart.set_ylabel("distance to the nearest disc (m)")
+        share.set(xlabel="least distance on the way (m)", ylabel="share of the scenarios", ylim=(0, 1.02))
+        cost.set_ylabel("cost so far")
+        cost.set_ylim(bottom=0)
+        for axes in (apart, cost):
+            axes.set(xlabel="time (s)", xlim=(history.time[0], history.time[-1]))
+        letter((plane, apart, share, cost))
+    return figure
+
+
+_COLUMNS = 3
+_LEAST = 1e-5  # excess cost that is drawn at the edge
+
+
+def draw_rivals(rows: Sequence[Mapping[str, Any]]) -> Figure:
+    """One panel a plant: median excess cost over the best known against microseconds a control.
+
+    A method that regulated some of the states alone is hollow; one that regulated none is not drawn.
+
+    Args:
+        rows: ``plant``, ``method``, ``ratio_median``, ``regulated``, ``us_median``; None where not measured.
+    """
+    plants = list(dict.fromkeys(row["plant"] for row in rows))
+    methods = list(dict.fromkeys(row["method"] for row in rows))
+    across = min(_COLUMNS, len(plants))
+    down = -(-len(plants) // across)
+    with page(2.4 * across + 1.6, 2.3 * down) as figure:
+        grid = figure.subplots(down, across, squeeze=False, sharex=True, sharey=True)
+        for axes, plant in zip(grid.flat, plants, strict=False):
+            for row in rows:
+                if row["plant"] == plant and row["ratio_median"] is not None:
+                    index = methods.index(row["method"])
+                    axes.plot(
+                        row["us_median"],
+                        max(row["ratio_median"] - 1, _LEAST),
+                        marker(index),
+                        color=colour(index),
+                        fillstyle="full" if row["regulated"] == 1 else "none",
+                        linestyle="none",
+                    )
+            axes.set_xscale("log")
+            axes.set_yscale("log")
+            axes.set_title(plant.replace("_", " "), fontsize="small")
+        for axes in list(grid.flat)[len(plants) :]:
+            axes.set_visible(False)
+        for axes in list(grid.flat)[: len(plants)][-across:]:  # with no panel below
+            axes.set_xlabel(r"$\mu$s a control")
+            axes.tick_params(labelbottom=True)
+        for axes in grid[:, 0]:
+            axes.set_ylabel("median excess cost")
+        for index, method in enumerate(methods):
+            grid[0, 0].plot([], [], marker(index), color=colour(index), linestyle="none", label=method)
+        figure.legend(loc="outside right center", title="hollow: not all regulated", title_fontsize="small")
+    return figure

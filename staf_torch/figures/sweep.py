@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from ..results.reader import Collection, Run, identity
+from ..results.reader import Collection, RecordedRun, identity
 from ..tables.aggregate import as_text, half_width, mean, rank
 from .style import WIDTH, colour, marker, page, subplots, ticks
 
@@ -134,33 +134,35 @@ def cost_against_accuracy(found: Collection) -> list[Panel]:
     return panels
 
 
-def _law(run: Run) -> str:
+def _law(run: RecordedRun) -> str:
     law, predictor = (str(run.setting(key)).replace("_", " ") for key in ("optimizer", "predictor"))
     return law if predictor in ("none", "None") else f"{law}, {predictor} predictor"
 
 
-def _radius(run: Run) -> str:
+def _radius(run: RecordedRun) -> str:
     return f"$r$ = {run.setting(RADIUS):g}"
 
 
-def _work(run: Run, by_count: bool) -> float:
+def _work(run: RecordedRun, by_count: bool) -> float:
     """Products with K a second, or the multiplications in them."""
     products, count = run.metrics[COST], run.setting(COUNT)
     assert products is not None
     return products * count**2 if by_count and isinstance(count, int) else products
 
 
-def _usable(found: Collection, metric: str) -> list[Run]:
+def _usable(found: Collection, metric: str) -> list[RecordedRun]:
     """The runs with a number that a logarithmic axis can show."""
     return [run for run in found.rows if (run.metrics.get(metric) or 0) > 0]
 
 
-def _several(runs: Sequence[Run], key: str) -> bool:
+def _several(runs: Sequence[RecordedRun], key: str) -> bool:
     numbers = {run.setting(key) for run in runs if isinstance(run.setting(key), int | float)}
     return len(numbers) > 1
 
 
-def _panels(found: Collection, runs: Sequence[Run], inside: Sequence[str]) -> list[tuple[str, list[Run]]]:
+def _panels(
+    found: Collection, runs: Sequence[RecordedRun], inside: Sequence[str]
+) -> list[tuple[str, list[RecordedRun]]]:
     """The runs by all that was swept but what a panel shows, with a title each."""
     outside = [key for key in found.swept if key not in inside]
     groups = _split(runs, lambda run: _agreeing(run, outside))
@@ -169,12 +171,12 @@ def _panels(found: Collection, runs: Sequence[Run], inside: Sequence[str]) -> li
     return [(_title(group[0], outside), group) for _, group in groups]
 
 
-def _agreeing(run: Run, keys: Sequence[str]) -> str:
+def _agreeing(run: RecordedRun, keys: Sequence[str]) -> str:
     """Equal texts for runs that agree in those settings."""
     return "|".join(identity(run.setting(key)) for key in keys)
 
 
-def _title(run: Run, keys: Sequence[str]) -> str:
+def _title(run: RecordedRun, keys: Sequence[str]) -> str:
     kernel = as_text(run.setting(KERNEL))
     if not keys:
         return f"{_NAMES.get(kernel, kernel)} kernel" if run.setting(KERNEL) else ""
@@ -183,15 +185,17 @@ def _title(run: Run, keys: Sequence[str]) -> str:
     return ", ".join(parts + [f"{key} = {as_text(run.setting(key))}" for key in named])
 
 
-def _split(runs: Sequence[Run], key: Callable[[Run], object]) -> list[tuple[object, list[Run]]]:
+def _split(
+    runs: Sequence[RecordedRun], key: Callable[[RecordedRun], object]
+) -> list[tuple[object, list[RecordedRun]]]:
     """By a key: numbers in order, then the others as they came."""
-    groups: dict[object, list[Run]] = {}
+    groups: dict[object, list[RecordedRun]] = {}
     for run in runs:
         groups.setdefault(key(run), []).append(run)
     return sorted(groups.items(), key=lambda item: rank(item[0]))  # type: ignore[arg-type]
 
 
-def _points(runs: Sequence[Run], key: str, metric: str) -> tuple[Point, ...]:
+def _points(runs: Sequence[RecordedRun], key: str, metric: str) -> tuple[Point, ...]:
     at: dict[float, list[float]] = {}
     for run in runs:
         x, error = run.setting(key), run.metrics.get(metric)
@@ -200,7 +204,7 @@ def _points(runs: Sequence[Run], key: str, metric: str) -> tuple[Point, ...]:
     return tuple(_point(x, errors) for x, errors in sorted(at.items()))
 
 
-def _costs(runs: Sequence[Run], by_count: bool) -> tuple[Point, ...]:
+def _costs(runs: Sequence[RecordedRun], by_count: bool) -> tuple[Point, ...]:
     points = []
     for _, group in _split(runs, lambda run: _agreeing(run, _OF_COST[:-1])):
         points.append(

@@ -70,16 +70,16 @@ class StreamState:
         """n, M and K."""
         return self.dim, self.count, self.outputs
 
-    def parts(self, table: Tensor) -> Parts:
+    def parts(self, table: Tensor) -> StateParts:
         """The rows of a table (..., S) by name: views, but for D."""
         n, m, k = self.dim, self.count, self.outputs
         anchor, last, mean, lower, errors, largest = table.split([n, n, k * m, m * (m + 1) // 2, k, 1])
         row, column = torch.tril_indices(m, m, device=table.device)
         learned = table.new_empty(m, m, *table.shape[1:])
         learned[row, column] = learned[column, row] = lower
-        return Parts(anchor, last, mean.unflatten(0, (k, m)), learned, errors, largest)
+        return StateParts(anchor, last, mean.unflatten(0, (k, m)), learned, errors, largest)
 
-    def whole(self, parts: Parts) -> Tensor:
+    def whole(self, parts: StateParts) -> Tensor:
         """The table with these rows."""
         row, column = torch.tril_indices(self.count, self.count, device=parts.learned.device)
         lower = parts._replace(learned=parts.learned[row, column])
@@ -101,7 +101,7 @@ class StreamState:
         return self.parts(self.table).learned
 
 
-class Parts(NamedTuple):
+class StateParts(NamedTuple):
     """The rows of a `StreamState`."""
 
     anchor: Tensor  # (n, S)
@@ -112,7 +112,7 @@ class Parts(NamedTuple):
     largest: Tensor  # (1, S)
 
 
-class _Sample(NamedTuple):
+class _Measured(NamedTuple):
     """What a stream learns from."""
 
     z: Tensor  # from the anchor, (n, S)
@@ -182,7 +182,7 @@ class LocalFilter:
         variance = torch.where(fresh, (1 + self.ratio) * self.base, variance)
         return mean.mT.to(state.blocks), variance.mT.to(state.blocks)
 
-    def _moments(self, old: Parts, z: Tensor, share: Tensor) -> tuple[Tensor, Tensor]:
+    def _moments(self, old: StateParts, z: Tensor, share: Tensor) -> tuple[Tensor, Tensor]:
         """Mean (K, S) and variance (S,) of the next y at z (n, S) from the anchor, before errors scale it;
         when it comes, this share of D is left."""
         local = self.functions.local(old.anchor, z)
@@ -234,7 +234,7 @@ class LocalFilter:
         none = torch.zeros_like(largest)
         since = torch.where(afresh, 0, since)
         held = torch.where(torch.isfinite(x), x, old.last)
-        moved = Parts(
+        moved = StateParts(
             anchor,
             held,
             mean * start,
@@ -243,14 +243,14 @@ class LocalFilter:
             torch.where(afresh, none, largest)[None],
         )
         most = torch.finfo(state.dtype).max
-        found, good = self._update(moved, since, _Sample(z, y, seen, lapse, fine, jumped, before, most))
+        found, good = self._update(moved, since, _Measured(z, y, seen, lapse, fine, jumped, before, most))
         faded = moved._replace(learned=moved.learned * self.forgetting**lapse)  # time passes in any case
         kept = [torch.where(good, new, old_) for new, old_ in zip(found, faded, strict=True)]
-        state.put(state.whole(Parts(*kept)))
+        state.put(state.whole(StateParts(*kept)))
         streak = torch.where(afresh & good, 0, streak)
         state.counts.copy_(torch.stack((samples + good, skipped + ~good, streak, since + good)))
 
-    def _update(self, old: Parts, samples: Tensor, sample: _Sample) -> tuple[Parts, Tensor]:
+    def _update(self, old: StateParts, samples: Tensor, sample: _Measured) -> tuple[StateParts, Tensor]:
         """The Kalman update at z from the anchor; and the streams whose result is finite."""
         z, y, seen, lapse, fine, moved, before, most = sample
         local = self.functions.local(old.anchor, z)
@@ -276,7 +276,7 @@ class LocalFilter:
         counted = torch.where(samples < STREAK, limited, torch.minimum(limited, SURPRISE * old.errors))
         errors = torch.where(seen, old.errors + rate * (counted - old.errors), old.errors)
         good = fine & (spread > 0) & (mean.abs().amax((0, 1)) <= most) & torch.isfinite(learned.sum((0, 1)))
-        return Parts(old.anchor, old.last, mean, learned, errors, largest), good
+        return StateParts(old.anchor, old.last, mean, learned, errors, largest), good
 
     def _scale(self, errors: Tensor, samples: Tensor) -> Tensor:
         """Running residual variance in units of the predicted: the prior's at first, then what errors say."""

@@ -15,7 +15,7 @@ _JUMP = 4.0  # radii: beyond, a kernel whose scale grows with the state says not
 _FAR = 1e8  # radii: beyond, no kernel does, and the squares of a user's kernel may overflow
 
 
-class Local(NamedTuple):
+class LocalValues(NamedTuple):
     """The local functions at a point of every stream: e^{log_factor} psi."""
 
     psi: Tensor  # (M, S)
@@ -91,14 +91,14 @@ class LocalFunctions(NamedTuple):
         """Whether k(x, x) is the same everywhere: then e^s goes into the functions, to spare passes."""
         return self.rate is not None and self.kernel.log_gain(self.offsets) is None
 
-    def local(self, x: Tensor, z: Tensor) -> Local:
+    def local(self, x: Tensor, z: Tensor) -> LocalValues:
         """What V is made of at x + z: (n, S), (n, S)."""
         if self.rate is None or self.shared is None or not self.stationary:
-            return Local(self.functions(x, z), self.log_factor(x, z))
+            return LocalValues(self.functions(x, z), self.log_factor(x, z))
         # exp(q z'd - q z'z / 2) from z - d: no difference of two large numbers, whatever z is.
         apart = (z.double() - self.offsets.unsqueeze(-1)).square().sum(1)
         exponent = self.rate / 2 * (self.offsets.square().sum(-1, keepdim=True) - apart)
-        return Local((self.shared.mT @ exponent.exp()).to(z), None)
+        return LocalValues((self.shared.mT @ exponent.exp()).to(z), None)
 
     def prior(self, x: Tensor, z: Tensor) -> Tensor | float:
         """The variance of V at x + z before any sample, in the units of `local`: (n, S), (n, S) -> (S,)."""

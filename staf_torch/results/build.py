@@ -22,7 +22,6 @@ from .files import RUN
 from .untrusted import UnreadableError, all_visible, open_regular
 
 _PACKAGE = Path(__file__).resolve().parent.parent
-_LOADER = "staf_torch.settings.chase.load"
 _MOST_MODULES = 200
 _CHUNK = 2**20
 _ABSENT = "nothing"
@@ -173,9 +172,12 @@ def _named(settings: Mapping[str, Any]) -> Iterator[str]:
     """The dotted paths outside the package that settings name."""
     for key, value in settings.items():
         group, _, last = key.rpartition(".")
-        loaded = last == "path" and settings.get(f"{group}._target_") == _LOADER
-        names = last == "_target_" or loaded or key == "task"
-        if names and isinstance(value, str) and "." in value and not value.startswith("staf_torch."):
+        target = str(settings.get(f"{group}._target_"))
+        loads = (
+            target.startswith(f"{_PACKAGE.name}.") and target.rpartition(".")[2].islower()
+        )  # a function of ours
+        names = last == "_target_" or key == "task" or (last == "path" and loads)
+        if names and isinstance(value, str) and "." in value and not value.startswith(f"{_PACKAGE.name}."):
             yield value
 
 

@@ -35,12 +35,12 @@ from .files import (
 )
 from .files import Value as Value
 from .metric_info import read_infos
-from .remarks import mixed, versions
 from .run import ABOUT as ABOUT
 from .run import Collection as Collection
-from .run import Run as Run
+from .run import RecordedRun as RecordedRun
 from .run import Skipped as Skipped
 from .run import identity as identity
+from .run import mixed, versions
 from .untrusted import UnreadableError, parse_object, read_lines, read_object, visible
 
 _LISTED = 8  # jobs that have not started, by their numbers
@@ -66,7 +66,7 @@ def collect(path: str | Path | Sequence[str | Path]) -> Collection:
         ValueError: if a path does not exist or no run is found.
     """
     paths = [Path(p) for p in ([path] if isinstance(path, str | Path) else path)]
-    rows: list[Run] = []
+    rows: list[RecordedRun] = []
     skipped: list[Skipped] = []
     others: list[Path] = []
     for start in paths:
@@ -123,7 +123,7 @@ def _natural(name: str) -> list[tuple[bool, int, str]]:
     return [(bool(n % 2), int(part) if n % 2 else 0, part) for n, part in enumerate(parts)]
 
 
-def _not_started(directory: Path, rows: Sequence[Run]) -> Iterator[Skipped]:
+def _not_started(directory: Path, rows: Sequence[RecordedRun]) -> Iterator[Skipped]:
     """The jobs that a sweep has announced and of which there is no run."""
     if not os.path.lexists(directory / SWEEP):
         return
@@ -146,7 +146,7 @@ def _identity(overrides: Mapping[str, Value]) -> tuple[tuple[str, str], ...]:
     return tuple(sorted((key, identity(value)) for key, value in overrides.items()))
 
 
-def read_run(directory: Path) -> list[Run]:
+def read_run(directory: Path) -> list[RecordedRun]:
     """Return the runs of a run directory: one, or one a member.
 
     Raises:
@@ -163,7 +163,7 @@ def read_run(directory: Path) -> list[Run]:
     return [*_members(run, partial_name(MEMBERS)), run] if begun else [run]
 
 
-def read_record(directory: Path) -> Run:
+def read_record(directory: Path) -> RecordedRun:
     """Return the run of a run directory as its `run.json` has it, also where there are members.
 
     Raises:
@@ -172,13 +172,13 @@ def read_record(directory: Path) -> Run:
     return _of_record(directory, read_object(directory / RUN))
 
 
-def _of_record(directory: Path, record: Mapping[str, Any]) -> Run:
+def _of_record(directory: Path, record: Mapping[str, Any]) -> RecordedRun:
     status, reason = _status(record)
     metrics, lost, unread = _measured(directory, record) if status == COMPLETED else ({}, {}, None)
     made_by = record.get("build")
     if unread is not None:
         status = UNFINISHED
-    return Run(
+    return RecordedRun(
         directory=directory,
         overrides=parse_overrides(_lines(record)),
         settings=_settings(record),
@@ -206,7 +206,7 @@ def _status(record: Mapping[str, Any]) -> tuple[str, str | None]:
     return COMPLETED, reason
 
 
-def _members(run: Run, name: str) -> list[Run]:
+def _members(run: RecordedRun, name: str) -> list[RecordedRun]:
     """One a member in a file of that name; its overrides come on top of the run's."""
     shared = {key: value for key, value in run.settings.items() if not _of_axis(key)}
     typed = {key: value for key, value in run.overrides.items() if not _of_axis(key)}
@@ -239,7 +239,7 @@ def read_members(directory: Path, name: str = MEMBERS) -> Iterator[Mapping[str, 
     raise UnreadableError(f"{MEMBERS} ends before its last row")
 
 
-def _member(run: Run, number: int, member: Mapping[str, Any]) -> Run:
+def _member(run: RecordedRun, number: int, member: Mapping[str, Any]) -> RecordedRun:
     status, reason = _status(member)
     own = parse_overrides(_lines(member))
     metrics, lost = _metrics(member.get("metrics")) if status == COMPLETED else ({}, {})

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import json
 from collections import ChainMap
 from collections.abc import Collection as Collection_
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
+from .._version import __version__
 from .files import Value
 from .metric_info import HEADLINES, OWN, MetricInfo
 from .untrusted import visible
@@ -16,10 +18,11 @@ from .untrusted import visible
 ABOUT = ("task", "status", "reason", "seconds", "version", "build", "directory", "member")
 """What can be a column of a table beside settings and metrics."""
 _SHOWN = 1  # headlines in the short form of a run
+_NAMED = 3  # values of a setting that a remark names
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
-class Run:
+class RecordedRun:
     """A run, or a member of a run of many: what it was, how it ended, what it measured.
 
     Example:
@@ -98,7 +101,7 @@ class Collection:
         Shown by `staf-table runs`.
     """
 
-    rows: tuple[Run, ...]  # in the order of the sweep
+    rows: tuple[RecordedRun, ...]  # in the order of the sweep
     skipped: tuple[Skipped, ...]  # what has no row, and why
     remarks: tuple[str, ...] = ()  # what a reader of the rows should know
 
@@ -140,7 +143,7 @@ class Collection:
         """
         overridden = dict.fromkeys(key for run in self.rows for key in run.overrides)
         words = [key for key in overridden if any(isinstance(run.setting(key), str) for run in self.rows)]
-        first: dict[tuple[str, ...], Run] = {}
+        first: dict[tuple[str, ...], RecordedRun] = {}
         seen: set[int] = set()
         found: dict[str, None] = {}
         for run in self.rows:
@@ -160,7 +163,7 @@ class Collection:
         return list({id(part): part for run in self.rows for part in layers(run.settings)}.values())
 
 
-def _differ(run: Run, other: Run) -> Iterator[str]:
+def _differ(run: RecordedRun, other: RecordedRun) -> Iterator[str]:
     """The settings in which two runs differ, where neither takes its value from an override of its own."""
     one, two = layers(run.settings)[-1], layers(other.settings)[-1]
     for key in {**one, **two}:
@@ -197,3 +200,26 @@ def identity(value: Value) -> str:
 def _typed(value: Value) -> str:
     """Return a value as the command line has it: false, not False."""
     return str(value).lower() if isinstance(value, bool) else "null" if value is None else str(value)
+
+
+def versions(rows: Sequence[RecordedRun]) -> Iterator[str]:
+    """Yield a remark for each other version of which there are runs."""
+    others = dict.fromkeys(run.version for run in rows if run.version not in (None, __version__))
+    for version in others:
+        those = [run for run in rows if run.version == version]
+        yield (
+            f"{len(those)} of {len(rows)} runs were written by staf_torch {version}, and this is "
+            f"{__version__}: their numbers may mean something else (the first is {those[0].directory})"
+        )
+
+
+def mixed(found: Collection) -> Iterator[str]:
+    """Yield a remark for each setting that differs although nobody swept it, and for different builds."""
+    for key in found.unswept:
+        values: dict[str, list[RecordedRun]] = {}
+        for run in found.rows:
+            value = run.value(key)
+            values.setdefault(value if isinstance(value, str) else json.dumps(value), []).append(run)
+        counts = [f"{value} in {len(runs)} (as {runs[0].directory})" for value, runs in values.items()]
+        more = f" and {len(counts) - _NAMED} others" if len(counts) > _NAMED else ""
+        yield f"`{key}` differs between runs although nobody swept it: {', '.join(counts[:_NAMED])}{more}"

@@ -20,7 +20,7 @@ from omegaconf import DictConfig, OmegaConf
 from ..numerics import COMMAND_LINE, fail
 from ..results import run_record as records
 from ..results.files import COMPLETED, PAGE
-from ..results.reader import Run, collect
+from ..results.reader import RecordedRun, collect
 from ..results.untrusted import links_in, visible
 from . import lock
 from .batching import sentence
@@ -49,7 +49,7 @@ class Tracker(ABC):
     """
 
     @abstractmethod
-    def record(self, run: Run) -> None:
+    def record(self, run: RecordedRun) -> None:
         """Take in a completed run, once: with many members, each of them."""
 
 
@@ -67,7 +67,7 @@ class TensorBoardTracker(Tracker):
                 "pip install 'staf_torch[tensorboard]'."
             )
 
-    def record(self, run: Run) -> None:
+    def record(self, run: RecordedRun) -> None:
         """One event file; a metric without a number is left out."""
         from torch.utils.tensorboard import SummaryWriter
         from torch.utils.tensorboard.summary import hparams

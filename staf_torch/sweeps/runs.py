@@ -29,7 +29,7 @@ Draw = Callable[["Run"], Mapping[str, "Figure"]]
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
-class Run(reader.Run):
+class Run(reader.RecordedRun):
     """A run in its directory: settings, metrics, history and figures.
 
     Example:
@@ -45,9 +45,11 @@ class Run(reader.Run):
     draw: Draw = dataclasses.field(kw_only=True, compare=False)
 
     @classmethod
-    def of(cls, record: reader.Run, draw: Draw) -> Run:
+    def of(cls, record: reader.RecordedRun, draw: Draw) -> Run:
         """Return what was read from a run directory, with a function that draws its figures."""
-        return cls(**{f.name: getattr(record, f.name) for f in dataclasses.fields(reader.Run)}, draw=draw)
+        return cls(
+            **{f.name: getattr(record, f.name) for f in dataclasses.fields(reader.RecordedRun)}, draw=draw
+        )
 
     @cached_property
     def history(self) -> History:
@@ -231,7 +233,7 @@ class Runs:
         table = arrow.Table.from_pandas(self.to_pandas(), preserve_index=False)
         return table.__arrow_c_stream__(requested_schema)
 
-    def _with(self, rows: Iterable[reader.Run]) -> Runs:
+    def _with(self, rows: Iterable[reader.RecordedRun]) -> Runs:
         return dataclasses.replace(self, found=dataclasses.replace(self.found, rows=tuple(rows)))
 
     def _known(self, key: str) -> None:

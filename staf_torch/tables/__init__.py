@@ -1,7 +1,7 @@
 """Tables of runs, and of rows that an experiment has computed. Nothing here needs torch."""
 
 from ..results.reader import Collection as Collection
-from ..results.reader import Run as Run
+from ..results.reader import RecordedRun as RecordedRun
 from ..results.reader import collect as collect
 from .aggregate import Layout as Layout
 from .aggregate import tabulate as tabulate
@@ -15,7 +15,7 @@ from .model import parquet_bytes as parquet_bytes
 __all__ = [
     "Collection",
     "Layout",
-    "Run",
+    "RecordedRun",
     "Style",
     "Table",
     "collect",

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from ..numerics import TABLE_COMMAND, fail
 from ..results.files import COMPLETED
 from ..results.metric_info import OWN
-from ..results.reader import Collection, Run, Value, identity
+from ..results.reader import Collection, RecordedRun, Value, identity
 from ..results.untrusted import visible
 from .columns import Column, Row, Style
 from .model import Table
@@ -239,14 +239,14 @@ def _grouped(found: Collection, layout: Layout, metrics: Sequence[str]) -> Table
     return Table(tuple(columns), tuple(rows), tuple(_notes(found.rows)))
 
 
-def _groups(runs: Sequence[Run], keys: Sequence[str]) -> Mapping[tuple[str, ...], list[Run]]:
-    groups: dict[tuple[str, ...], list[Run]] = {}
+def _groups(runs: Sequence[RecordedRun], keys: Sequence[str]) -> Mapping[tuple[str, ...], list[RecordedRun]]:
+    groups: dict[tuple[str, ...], list[RecordedRun]] = {}
     for run in runs:
         groups.setdefault(tuple(identity(run.value(key)) for key in keys), []).append(run)
     return groups
 
 
-def place(run: Run, keys: Sequence[str]) -> str:
+def place(run: RecordedRun, keys: Sequence[str]) -> str:
     """Return where a run stands among the columns: `key=value` of each."""
     return ", ".join(f"{key}={as_text(run.value(key))}" for key in keys)
 
@@ -262,10 +262,12 @@ def as_text(value: Value) -> str:
     return value if isinstance(value, str) else json.dumps(value)
 
 
-def _row(runs: Sequence[Run], keys: Sequence[str], spread: Sequence[str], columns: Sequence[Column]) -> Row:
+def _row(
+    runs: Sequence[RecordedRun], keys: Sequence[str], spread: Sequence[str], columns: Sequence[Column]
+) -> Row:
     cells: dict[str, Value] = {key: runs[0].value(key) for key in keys}
     reasons: dict[str, str] = {}
-    places: dict[str, list[Run]] = {}
+    places: dict[str, list[RecordedRun]] = {}
     for run in runs:
         places.setdefault(place(run, spread), []).append(run)
     for column in columns:
@@ -283,14 +285,14 @@ def _row(runs: Sequence[Run], keys: Sequence[str], spread: Sequence[str], column
     return Row(cells, reasons)
 
 
-def _why(runs: Sequence[Run], metric: str) -> str:
+def _why(runs: Sequence[RecordedRun], metric: str) -> str:
     if not runs:
         return "there is no such run"
     absent = dict.fromkeys(run.absence(metric) for run in runs if run.metrics.get(metric) is None)
     return "; ".join(absent) or "needs two runs or more"
 
 
-def _absences(runs: Sequence[Run], columns: Sequence[Column]) -> Iterator[str]:
+def _absences(runs: Sequence[RecordedRun], columns: Sequence[Column]) -> Iterator[str]:
     metrics = dict.fromkeys(column.metric for column in columns if column.metric is not None)
     for run in runs:
         for metric in metrics:
@@ -298,9 +300,9 @@ def _absences(runs: Sequence[Run], columns: Sequence[Column]) -> Iterator[str]:
                 yield run.absence(metric)
 
 
-def _notes(runs: Sequence[Run]) -> Iterator[str]:
+def _notes(runs: Sequence[RecordedRun]) -> Iterator[str]:
     """One note for each reason for which runs have no result, or a reader should look twice."""
-    reasons: dict[tuple[str, str], list[Run]] = {}
+    reasons: dict[tuple[str, str], list[RecordedRun]] = {}
     for run in runs:
         if run.reason is not None:
             reasons.setdefault((run.status, run.reason), []).append(run)

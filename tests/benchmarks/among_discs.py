@@ -27,7 +27,6 @@ from torch import Tensor
 
 from staf_torch import adp, systems
 from staf_torch.experiments import avoidance
-from staf_torch.experiments.vehicles import vehicle
 from staf_torch.sweeps.hydra_compat import Composer, config_loader
 
 DT, STEPS, AHEAD, RADIUS, DISCS = 0.1, 150, 40, 0.4, 3
@@ -154,7 +153,7 @@ def among(kind: str, count: int, seed: int) -> Loop:
     """The scenarios of `staf experiment=avoidance` with a period of 0.1 s."""
     given = ["experiment=avoidance", f"trajectories={count}", f"avoidance.vehicle={kind}", f"seed={seed}"]
     cfg = Composer(config_loader())([*given, f"dt={DT}"])
-    own, x0 = vehicle(cfg, DT), avoidance.scenarios(cfg)
+    own, x0 = avoidance.chosen_vehicle(cfg, DT), avoidance.scenarios(cfg)
     plant = avoidance.AmongDiscs(own, DISCS)
     cost = avoidance.vehicle_cost(cfg, own, int(plant.dim or 0))
     n, free = own.size, adp.QuadraticCost(1.0, 1.0, dim=4, inputs=2)

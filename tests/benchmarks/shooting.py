@@ -29,7 +29,7 @@ import torch
 from torch import Tensor
 
 from staf_torch import adp
-from staf_torch.experiments.rival_plants import CASES, Case
+from staf_torch.experiments.rival_plants import CASES, RivalPlant
 
 _SAME = 1e-4  # relative
 Row = dict[str, Any]
@@ -54,7 +54,7 @@ def short_period(m: Any, x: Sequence[Any], u: Sequence[Any]) -> Sequence[Any]:
     )
 
 
-_PENDULUM = Case(
+_PENDULUM = RivalPlant(
     "pendulum",
     hanging_pendulum,
     0.05,
@@ -77,7 +77,7 @@ class Shot:
         draws: whether random ones are solved from.
     """
 
-    case: Case
+    case: RivalPlant
     first: tuple[tuple[float, ...], ...] = ()
     draws: bool = True
     options: dict[str, Any] = dataclasses.field(default_factory=dict)
@@ -87,10 +87,12 @@ _DOWN = ((0.0, math.pi, 0.0, 0.0),)
 SHOTS = {
     "double integrator": Shot(CASES["double_integrator"], ((5.0, 0.0),)),
     "two states and a third": Shot(
-        Case("three", three_states, 0.1, 1, ((1.0,) * 3, (1.0,)), (-9.0,), (9.0,), (1.0,) * 3)
+        RivalPlant("three", three_states, 0.1, 1, ((1.0,) * 3, (1.0,)), (-9.0,), (9.0,), (1.0,) * 3)
     ),
     "short period": Shot(
-        Case("short_period", short_period, 0.1, 1, ((0.25, 0.25), (5.0,)), (-2.0,), (2.0,), (25.0, 10.0)),
+        RivalPlant(
+            "short_period", short_period, 0.1, 1, ((0.25, 0.25), (5.0,)), (-2.0,), (2.0,), (25.0, 10.0)
+        ),
         ((25.0, -10.0),),
     ),
     "cart-pole free": Shot(dataclasses.replace(CASES["cart_pole_10N"], low=(-1e3,), high=(1e3,))),
@@ -107,7 +109,7 @@ SHOTS = {
 class Peer:
     """IPOPT on the program that a `DirectShooting` solves on a mesh."""
 
-    def __init__(self, case: Case, shooting: adp.DirectShooting, lengths: Tensor) -> None:
+    def __init__(self, case: RivalPlant, shooting: adp.DirectShooting, lengths: Tensor) -> None:
         n, m, steps = case.dim, case.inputs, len(lengths)
         self.case, self.sizes = case, (n, m, steps)
         assert shooting.lqr is not None

@@ -14,7 +14,7 @@ from helpers_experiments import Ran, ran, run
 
 from staf_torch import adp, systems
 from staf_torch.experiments import adp_comparison
-from staf_torch.experiments.adp import ClosedLoop, LoopSolution, count_the_restless, held_radius, learner
+from staf_torch.experiments.adp import LoopSolution, Regulation, count_the_restless, held_radius, learner
 from staf_torch.results.progress import Progress
 from staf_torch.settings.adp import adp_problem
 
@@ -63,16 +63,16 @@ def test_alone_or_in_a_batch_a_closed_loop_has_the_same_metrics(tmp_path: Path) 
     ]
     cfgs = [settings(*SHORT, "trajectories=2", *member) for member in members]
     told: list[float] = []
-    *solved, wrong = ClosedLoop().solve(cfgs, Progress(told.append))
+    *solved, wrong = Regulation().solve(cfgs, Progress(told.append))
     assert told[-1] == 1
     assert isinstance(wrong, ValueError)
     for number, (cfg, solution) in enumerate(zip(cfgs, solved, strict=False)):
         assert isinstance(solution, LoopSolution)
         folder = tmp_path / str(number)
         folder.mkdir()
-        alone = ClosedLoop()(cfg, folder)
+        alone = Regulation()(cfg, folder)
         assert solution.metrics == pytest.approx(alone, rel=1e-9, abs=1e-12)
-    (alone_and_wrong,) = ClosedLoop().solve([settings(*SHORT, "animation=mp4")], Progress(told.append))
+    (alone_and_wrong,) = Regulation().solve([settings(*SHORT, "animation=mp4")], Progress(told.append))
     assert "animation" in str(alone_and_wrong)
 
 
@@ -88,7 +88,7 @@ def test_alone_or_in_a_batch_a_closed_loop_has_the_same_metrics(tmp_path: Path) 
 )
 def test_the_size_of_a_loop_is_that_of_its_records(given: dict[str, Any], size: int) -> None:
     known = {"trajectories": 3, "dt": 0.01, "duration": 1.0}
-    assert ClosedLoop().size(known | given) == pytest.approx(size)
+    assert Regulation().size(known | given) == pytest.approx(size)
 
 
 def test_walls_have_metrics_of_their_own(tmp_path: Path) -> None:

@@ -19,15 +19,15 @@ from torch import Tensor
 from staf_torch import adp
 from staf_torch.experiments import rival_methods, rivals
 from staf_torch.experiments.rival_methods import METHODS, Begin, Rival, UnsuitableError, ipopt_program
-from staf_torch.experiments.rival_plants import CASES, Case, TorchMath
+from staf_torch.experiments.rival_plants import CASES, RivalPlant, TorchMath
 
 SHORT = dataclasses.replace(CASES["double_integrator"], steps=60, horizon=20)
 
 
-def constant(value: float) -> Callable[[Case], Begin]:
+def constant(value: float) -> Callable[[RivalPlant], Begin]:
     """A method that always wants the same input."""
 
-    def prepare(case: Case) -> Begin:
+    def prepare(case: RivalPlant) -> Begin:
         """Two lines of code, without this one."""
         return lambda x0: lambda x: torch.full((len(x), case.inputs), value, dtype=x.dtype)
 
@@ -57,7 +57,7 @@ def test_rows_say_what_was_lost_violated_and_not_tried() -> None:
 
 
 def test_slow_methods_run_from_fewer_states_and_say_so() -> None:
-    def timid(case: Case) -> Begin:
+    def timid(case: RivalPlant) -> Begin:
         steer = rival_methods.discrete_lqr(case)(tensor([]))
         return lambda x0: lambda x: torch.where(x[:, :1].abs() > 1, 0.3, 1.0) * steer(x)
 
@@ -257,7 +257,7 @@ def test_an_angle_is_a_coordinate_that_may_turn_once_more_and_not_less(name: str
     assert set(case.periodic) == {k for k in range(case.dim) if k in case.plant().periodic}
 
 
-def program(case: Case, steps: int) -> tuple[Any, fake_casadi.Solver]:
+def program(case: RivalPlant, steps: int) -> tuple[Any, fake_casadi.Solver]:
     """What solves a case by IPOPT, and the solver behind it."""
     made: list[fake_casadi.Solver] = []
     return ipopt_program(fake_casadi.module(made), case, case.problem(), steps), made[0]

@@ -27,24 +27,22 @@ EXPERIMENTS: dict[str, tuple[str, ...]] = {
     "adp_tracking": ("experiment=adp_tracking",),
     "avoidance": ("experiment=avoidance",),
     "chase": (),
-    "exponential_bound": ("experiment=exponential_bound",),
     "faults": ("experiment=faults",),
-    "feasibility": ("experiment=feasibility",),
     "flat_limit": ("experiment=flat_limit",),
     "gradient_chase": (),
     "icl": ("experiment=icl",),
     "laws": ("experiment=laws",),
-    "layouts": ("experiment=layouts",),
+    "theorems": ("experiment=exponential_bound",),
     "memory": ("experiment=memory",),
     "rivals": ("experiment=rivals",),
     "safe_box": ("experiment=safe_box",),
     "registry": (),
     "scenes": (),
-    "vehicles": ("experiment=avoidance", "avoidance.vehicle=unicycle"),
 }
 """The settings that a file of experiments runs with."""
 
 OTHERS: dict[tuple[str, str], tuple[str, ...]] = {
+    ("avoidance", "avoidance.ahead"): ("experiment=avoidance", "avoidance.vehicle=unicycle"),
     ("chase", "centers.count"): ("centers=simplex",),
     ("chase", "centers.directions"): ("centers=directions", "centers.directions=[[0.0, 0.0]]"),
 }

@@ -17,9 +17,8 @@ from helpers_experiments import ran, run
 
 from staf_torch import adp, systems
 from staf_torch.experiments import avoidance, faults, icl, safe_box
-from staf_torch.experiments.avoidance import AmongDiscs
+from staf_torch.experiments.avoidance import AmongDiscs, Vehicle, chosen_vehicle
 from staf_torch.experiments.study import Study
-from staf_torch.experiments.vehicles import Vehicle, vehicle
 from staf_torch.results.run_directory import RunDirectory
 
 KINDS = ("mass", "unicycle")
@@ -60,7 +59,7 @@ RATES: dict[str, Callable[[np.ndarray, np.ndarray, np.ndarray], list[float]]] = 
 
 @pytest.mark.parametrize("name", RATES)
 def test_a_plant_with_a_fault_moves_as_its_text_says_and_is_drawn_by_the_seed_alone(name: str) -> None:
-    def made(rows: int) -> faults.Case:
+    def made(rows: int) -> faults.FaultCase:
         return faults.CASES[name](rows, torch.Generator().manual_seed(1))
 
     case = made(4)
@@ -169,7 +168,7 @@ def test_every_method_in_the_box_pays_for_the_barrier_coordinates() -> None:
 
 def made(kind: str, *more: str) -> tuple[Any, Vehicle]:
     cfg = settings("experiment=avoidance", f"avoidance.vehicle={kind}", *more)
-    return cfg, vehicle(cfg, 0.1)
+    return cfg, chosen_vehicle(cfg, 0.1)
 
 
 def test_a_mass_is_pushed_by_the_lqr_of_the_sampled_double_integrator() -> None:

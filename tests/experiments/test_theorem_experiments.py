@@ -15,7 +15,7 @@ from helpers_experiments import CASES, Ran, ran, run, words
 from truth import Truth, paper
 
 import staf_torch as st
-from staf_torch.experiments import exponential_bound, feasibility, flat_limit, layouts
+from staf_torch.experiments import flat_limit, theorems
 from staf_torch.experiments.registry import log_slope
 from staf_torch.settings.chase import LocalProblem
 
@@ -43,12 +43,12 @@ def test_the_local_basis_has_the_order_of_its_layout() -> None:
 
 @pytest.mark.parametrize("dim", [1, 2, 3])
 def test_a_layout_of_order_k_has_as_many_centers_as_polynomials_below_it(dim: int) -> None:
-    for each in layouts.layouts(dim):
+    for each in theorems.all_layouts(dim):
         assert each.directions.shape[1] == dim
         assert len(each.directions) <= 130
         if each.family in ("ball", "rings"):
             assert len(each.directions) == math.comb(dim + each.order - 1, dim)
-    families = {each.family for each in layouts.layouts(dim)}
+    families = {each.family for each in theorems.all_layouts(dim)}
     assert families == {"ball", "simplex", "cross_polytope"} | ({"rings", "polygon"} if dim == 2 else set())
 
 
@@ -62,13 +62,13 @@ def test_the_bound_of_the_paper_is_far_above_what_is_needed() -> None:
         assert float(row["error"]) <= float(row["epsilon"])
 
 
-def bounds(*more: str) -> exponential_bound.Bounds:
+def bounds(*more: str) -> theorems.Bounds:
     small = (
         "exponential_bound.states=5",
         "exponential_bound.radii=[0.1]",
         "exponential_bound.epsilons=[0.1]",
     )
-    return exponential_bound.solve(settings("experiment=exponential_bound", *small, *more))
+    return theorems.bounds(settings("experiment=exponential_bound", *small, *more))
 
 
 def test_the_bound_holds_in_space_too_and_has_no_numbers_where_no_degree_does() -> None:
@@ -99,7 +99,7 @@ def test_where_no_layout_is_good_enough_none_is_said_to_be() -> None:
     problem = LocalProblem(
         target=target, kernel=kernel, radius=0.3, states=states, time=torch.arange(2).double()
     )
-    found = feasibility.solve(problem, [0.3], [1e-300, 1e3])
+    found = theorems.needed_centers(problem, [0.3], [1e-300, 1e3])
     assert found.overall.tolist() == [[0, int(found.counts[0])]]
     assert found.pointwise[0, 0].tolist() == [0, 0]
 

@@ -20,8 +20,8 @@ from figures.drawing import (
 )
 from matplotlib.figure import Figure
 
-from staf_torch.figures import adaptation, chase, closed_loop, rivals, safety, sweep, theory
-from staf_torch.figures.animation import Curves, Scene, Stage
+from staf_torch.figures import chase, closed_loop, sweep, theory
+from staf_torch.figures.animation import AnimationStage, Curves, Scene
 from staf_torch.figures.style import positive
 
 pytestmark = pytest.mark.usefixtures("not_laid_out")
@@ -187,8 +187,8 @@ def test_a_box_has_its_walls_where_it_has_any() -> None:
         {name: wave(9, *size) + k for k, name in enumerate("ab")} for size in ((3,), (), ())
     )
     low, high = np.array([-1.0, -np.inf, 0.0]), np.array([np.inf, 4.0, 0.0])
-    history = safety.BoxHistory(T, paths, margins, costs, wave(9, 3), low, high)
-    figure = safety.draw_box(history)
+    history = closed_loop.BoxHistory(T, paths, margins, costs, wave(9, 3), low, high)
+    figure = closed_loop.draw_box(history)
     plane, margin, barrier, cost = visible(figure)
     curves: list[Curve] = [(name, path[:, 0], path[:, 1]) for name, path in paths.items()]
     holds(plane, [*curves, (None, [-1, -1], [0, 1]), (None, [0, 1], [4, 4])], ("$x_1$", "$x_2$"))
@@ -212,12 +212,12 @@ def test_a_box_has_its_walls_where_it_has_any() -> None:
 def test_a_fault_has_its_norms_above_and_its_parameters_below() -> None:
     certain = np.arange(9) > 3
     cases = {
-        name: adaptation.FaultPicture(
+        name: closed_loop.FaultPicture(
             T, {"a": wave(9) + k, "b": wave(9) + 2}, wave(9, 2), wave(9, 2) + k, certain
         )
         for k, name in enumerate(("loss", "gain"))
     }
-    figure = adaptation.draw_faults(cases)
+    figure = closed_loop.draw_faults(cases)
     titles = [axes.get_title(loc="left") for axes in figure.axes]
     assert titles == ["(a) loss", "(b) gain", "(c) ", "(d) "]
     for k, case in enumerate(cases.values()):
@@ -240,8 +240,8 @@ def test_a_fault_has_its_norms_above_and_its_parameters_below() -> None:
 
 def test_gain_sets_are_sorted_by_their_errors() -> None:
     two = lambda *shape: {name: wave(*shape) + k for k, name in enumerate(("integral", "derivative"))}  # noqa: E731
-    sets = adaptation.GainSets(T, wave(9, 3), wave(3), two(4), two(5), two(9))
-    theta, followed, error, parameter = visible(adaptation.draw_gain_sets(sets))
+    sets = closed_loop.GainSets(T, wave(9, 3), wave(3), two(4), two(5), two(9))
+    theta, followed, error, parameter = visible(closed_loop.draw_gain_sets(sets))
     curves: list[Curve] = []
     for i in range(3):
         curves += [(None, T, sets.parameters[:, i]), (None, [0, 1], [sets.truth[i]] * 2)]
@@ -270,7 +270,7 @@ def test_rivals_are_points_hollow_where_they_fail_from_some_states() -> None:
             ]
         )
     ]
-    figure = rivals.draw_rivals(rows)
+    figure = closed_loop.draw_rivals(rows)
     cart, mass = visible(figure)
     named = [("a", *EMPTY), ("b", *EMPTY)]
     names = r"$\mu$s a control", "median excess cost"
@@ -280,7 +280,7 @@ def test_rivals_are_points_hollow_where_they_fail_from_some_states() -> None:
     assert [axes.get_title() for axes in (cart, mass)] == ["cart pole", "mass"]
     assert legend(figure) == ["a", "b"]
     four = [row | {"plant": str(k)} for k, row in enumerate(rows)]
-    grid = rivals.draw_rivals(four).axes
+    grid = closed_loop.draw_rivals(four).axes
     assert [axes.get_visible() for axes in grid] == [True] * 4 + [False] * 2
     assert [axes.get_ylabel() for axes in grid[:4]] == ["median excess cost", "", "", "median excess cost"]
 
@@ -427,7 +427,7 @@ SCENE = Scene(
 @pytest.mark.parametrize("frame", [0, 4])
 def test_a_frame_shows_the_way_so_far_and_all_else_as_it_is_then(frame: int, relative: bool) -> None:
     scene, figure = Scene(*SCENE[:-1], relative), Figure()
-    Stage(figure, scene).show(frame)
+    AnimationStage(figure, scene).show(frame)
     plane, across, curves = figure.axes
     way = slice(0, frame + 1)
     names = [(None, *part) for part in (scene.state[way].T, scene.followed.T, scene.followed[[frame]].T)]

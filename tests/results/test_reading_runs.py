@@ -12,15 +12,17 @@ from sweep_runs import BAD_COUNT, typed, write_run, write_sweep
 
 from staf_torch import __version__
 from staf_torch.results.metric_info import OWN, MetricInfo, read_infos
-from staf_torch.results.reader import Collection, Run, collect, read_run
+from staf_torch.results.reader import Collection, RecordedRun, collect, read_run
 from staf_torch.results.untrusted import UnreadableError
 
 
-def run(name: str = "a", overrides: Any = None, settings: Any = None, **more: Any) -> Run:
-    return Run(Path(name), overrides or {}, settings or {}, more.pop("metrics", {}), "completed", **more)
+def run(name: str = "a", overrides: Any = None, settings: Any = None, **more: Any) -> RecordedRun:
+    return RecordedRun(
+        Path(name), overrides or {}, settings or {}, more.pop("metrics", {}), "completed", **more
+    )
 
 
-def found(*rows: Run) -> Collection:
+def found(*rows: RecordedRun) -> Collection:
     return Collection(rows, ())
 
 
@@ -104,7 +106,7 @@ def test_folders_are_read_in_the_order_of_their_numbers_and_no_link_is_followed(
     assert [each.setting("kernel") for each in both.rows] == ["run9", "run10"]
 
 
-def edited(place: Path, **more: Any) -> Run:
+def edited(place: Path, **more: Any) -> RecordedRun:
     record = json.loads((place / "run.json").read_text())
     (place / "run.json").write_text(json.dumps(record | more))
     (one,) = read_run(place)
@@ -161,7 +163,7 @@ def test_a_file_that_is_not_as_it_was_written_is_named(tmp_path: Path) -> None:
 # Members
 
 
-def rows_of(place: Path, *lines: str, name: str = "members.json", end: str = "]}\n") -> list[Run]:
+def rows_of(place: Path, *lines: str, name: str = "members.json", end: str = "]}\n") -> list[RecordedRun]:
     (place / name).write_text(f'{{"version": "1", "members": [\n{"".join(lines)}{end}')
     return read_run(place)
 

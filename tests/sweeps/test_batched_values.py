@@ -14,7 +14,7 @@ import pytest
 from composing import settings
 from omegaconf import DictConfig
 
-from staf_torch.experiments.adp import ClosedLoop, LoopSolution
+from staf_torch.experiments.adp import LoopSolution, Regulation
 from staf_torch.experiments.gradient_chase import ChaseSolution, GradientChase
 from staf_torch.results.progress import SHOWN
 from staf_torch.sweeps import batching
@@ -134,11 +134,11 @@ def test_a_closed_loop_in_a_batch_is_the_one_alone(name: str) -> None:
     cfgs = compose(["experiment=adp", *CLOSED, *base], lines)
     (group,) = groups(cfgs)
     assert group == list(range(len(cfgs)))
-    together = ClosedLoop().solve(cfgs, SHOWN)
+    together = Regulation().solve(cfgs, SHOWN)
     digits = 1e-9 if name != "single precision" else 1e-3
     apart = []
     for cfg, found in first_inner_last(cfgs, together):
-        (alone,) = ClosedLoop().solve([cfg], SHOWN)
+        (alone,) = Regulation().solve([cfg], SHOWN)
         if isinstance(found, Exception):
             raise found  # which may say that an extra is absent
         assert isinstance(found, LoopSolution)

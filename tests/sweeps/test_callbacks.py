@@ -28,7 +28,7 @@ from staf_torch.sweeps.callbacks import (
 )
 from staf_torch.sweeps.job import PRINTS
 from staf_torch.sweeps.lock import TakenError, give_back, held
-from staf_torch.tables import Run, collect
+from staf_torch.tables import RecordedRun, collect
 
 
 def settings(place: Path, *typed: str, **more: Any) -> DictConfig:
@@ -211,7 +211,7 @@ def test_a_report_that_cannot_be_written_or_read_is_no_sweep_gone_wrong(
 
 # Trackers
 
-recorded: list[Run] = []
+recorded: list[RecordedRun] = []
 
 
 class Kept(Tracker):
@@ -222,7 +222,7 @@ class Kept(Tracker):
             raise ValueError("in our own words")
         assert given is None or type(given) is dict  # plain values
 
-    def record(self, run: Run) -> None:
+    def record(self, run: RecordedRun) -> None:
         if run.metrics["ball_error"] == 9.0:
             raise RuntimeError("no connection")
         recorded.append(run)

@@ -13,7 +13,7 @@ from scipy.stats import t as student
 from sweep_runs import BAD_COUNT, error, write_run, write_sweep
 
 from staf_torch.results.metric_info import MetricInfo
-from staf_torch.results.reader import Collection, Run, collect
+from staf_torch.results.reader import Collection, RecordedRun, collect
 from staf_torch.tables import Layout, Style, Table, tabulate
 from staf_torch.tables.aggregate import AGGREGATES, student_quantile
 
@@ -31,13 +31,13 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> Collection:
     return collect(write_sweep(tmp_path_factory.mktemp("sweep") / "runs"))
 
 
-def run(number: int, metrics: Mapping[str, float | None], **settings: Any) -> Run:
+def run(number: int, metrics: Mapping[str, float | None], **settings: Any) -> RecordedRun:
     about = {k: settings.pop(k) for k in ("status", "reason", "member", "declared", "build") if k in settings}
     given = {"status": "completed", **about}
-    return Run(Path(f"/runs/{number}"), settings, {"base": 1, **settings}, metrics, **given)
+    return RecordedRun(Path(f"/runs/{number}"), settings, {"base": 1, **settings}, metrics, **given)
 
 
-def of(*runs: Run) -> Collection:
+def of(*runs: RecordedRun) -> Collection:
     return Collection(runs, ())
 
 

@@ -49,8 +49,8 @@ assert guess.shape == (1000,)
 print((guess - (2 * shifted[-1]).sin().sum(-1)).square().mean().sqrt())
 
 # %% [markdown]
-# Who does not know kernel, radius and noise lets the likelihood choose them; `MixtureRegressor` keeps samples and
-# predicts with several models, more accurate and slower.
+# Who does not know kernel, radius and noise lets the likelihood choose them; `MixtureRegressor` keeps samples
+# and predicts with several models, more accurate and slower.
 
 # %%
 tuned = StaFRegressor().tune(path, measured(path)).fit(path, measured(path))
