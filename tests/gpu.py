@@ -36,7 +36,7 @@ def compare(name: str, step: lanes.program.Step, dtype: torch.dtype, rows: int, 
         row = (torch.rand(rows, dtype=dtype), lanes.Shared(torch.tensor(2.0, dtype=dtype)))
     carry, now, row = (lanes.tree.moved(tree, "cuda") for tree in (carry, now, row))
     program = lanes.Program(step)
-    kernel = lanes.cuda.Kernel(program, carry, now, row)
+    kernel = lanes.cuda.CudaKernel(program, carry, now, row)
     found, wanted = kernel(carry, now, row), program.definition(carry, now, row)
     torch.cuda.synchronize()
     begin = time.perf_counter()

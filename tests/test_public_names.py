@@ -46,7 +46,10 @@ PACKAGES = [
 API = ("read_runs", "run", "sweep")  # not in `__all__`: they import Hydra
 TOP = re.findall(r"^(\w+):", (ROOT / "conf" / "config.yaml").read_text(encoding="utf-8"), re.MULTILINE)
 RUNS = ("results", "sweeps", "tables")  # examples of these rooms run simulations of hundreds of steps
-COMPILE = ("staf_torch.deploy.c_header.time_c", "staf_torch.lanes.function.ready")  # their examples do
+COMPILE = (
+    "staf_torch.deploy.c_header.time_c",
+    "staf_torch.lanes.compiled_methods.ready",
+)  # their examples do
 SHOWN = (
     "staf_torch.centers",
     "staf_torch.kernels",

@@ -15,8 +15,8 @@ from torch import Tensor, nn
 from ..approximation.basis import GramStructure, Target
 from ..lanes import Program
 from ..lanes.call import ordinary
-from ..lanes.compiling import worth
-from ..lanes.kept import Kept, number
+from ..lanes.compiled_methods import worth
+from ..lanes.shared_programs import SharedPrograms, number
 from ..optim.base import UpdateLaw
 from ..optim.objective import NativeError, Objective, Precomputed, ScaledError
 from .certificate import Certificate, certify, first_link
@@ -28,7 +28,7 @@ _SHORTEST = 16  # times of a chase that is worth a program, which takes some ten
 _UNROLLED = 8  # centers up to which the Gram matrix is formed; above it stays in its factors
 
 
-_kept = Kept("a chase")
+_kept = SharedPrograms("a chase")
 
 
 class RowCarry(NamedTuple):
@@ -132,7 +132,7 @@ def first_carry(problem: Problem, carry: Carry) -> RowCarry:
 def program(problem: Problem, states: Tensor, carry: RowCarry, *, everything: bool) -> Program | None:
     """Return the program of a chase, None where the definition serves.
 
-    One that differs from another in tensors and gains alone takes over its text: `lanes.kept`.
+    One that differs from another in tensors and gains alone takes over its text: `lanes.shared_programs`.
 
     Args:
         problem: what is chased.

@@ -1,8 +1,9 @@
 """Row programs: torch functions of one row, compiled with a row in every vector lane."""
 
-from .compiling import compiling as compiling
+from .compiled_methods import compiled as compiled
+from .compiled_methods import compiling as compiling
+from .compiled_methods import ready as ready
 from .emit import cuda as cuda
-from .function import ready as ready
 from .loops import each as each
 from .loops import reduce as reduce
 from .loops import repeat as repeat
@@ -10,4 +11,4 @@ from .loops import scan as scan
 from .program import Program as Program
 from .tree import Shared as Shared
 
-__all__ = ["Program", "Shared", "compiling", "each", "ready", "reduce", "repeat", "scan"]
+__all__ = ["Program", "Shared", "compiled", "compiling", "each", "ready", "reduce", "repeat", "scan"]

@@ -98,7 +98,7 @@ def load(path: Path, tensors: Sequence[Tensor]) -> Trace | None:
         used(path)
         if content[-_DIGEST:] != hashlib.sha256(content[:-_DIGEST]).digest():
             return None
-        found = Trace(*_Reader(io.BytesIO(zlib.decompress(content[:-_DIGEST])), tensors).load())
+        found = Trace(*_TraceReader(io.BytesIO(zlib.decompress(content[:-_DIGEST])), tensors).load())
     except _DAMAGED:
         return None
     numbers = found.recipe.again({id(tensor): tensor for tensor in tensors})
@@ -119,7 +119,7 @@ def save(path: Path, trace: Trace, tensors: Sequence[Tensor]) -> None:
     file = io.BytesIO()
     try:
         numberless = trace.recipe._replace(values=torch.empty(0, dtype=torch.float64))
-        _Writer(file, places, numberless).dump(tuple(trace._replace(recipe=numberless)))
+        _TraceWriter(file, places, numberless).dump(tuple(trace._replace(recipe=numberless)))
         content = zlib.compress(file.getvalue(), level=1)  # 100 kilobytes to 15
         # Under a name of its own first: another process may be writing the same.
         with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as scratch:
@@ -138,7 +138,7 @@ def _package() -> str:
     return digest.hexdigest()
 
 
-class _Writer(pickle.Pickler):
+class _TraceWriter(pickle.Pickler):
     """Writes tensors of the step as their numbers, those that follow from them by the order they came in."""
 
     def __init__(self, file: io.BytesIO, places: dict[int, int], recipe: Recipe) -> None:
@@ -163,8 +163,8 @@ class _Writer(pickle.Pickler):
         return "value", value.detach().numpy().copy()
 
 
-class _Reader(pickle.Unpickler):
-    """Reads what `_Writer` writes, and refuses every other class or function: a file is no program."""
+class _TraceReader(pickle.Unpickler):
+    """Reads what `_TraceWriter` writes, and refuses every other class or function: a file is no program."""
 
     def __init__(self, file: io.BytesIO, tensors: Sequence[Tensor]) -> None:
         super().__init__(file)

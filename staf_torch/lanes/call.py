@@ -60,7 +60,7 @@ class _Slot(ctypes.Structure):
     _fields_ = tuple((n, ctypes.c_int64) for n in ("row", "time", "entry", "entries"))
 
 
-class _Call(ctypes.Structure):
+class _CallRecord(ctypes.Structure):
     _fields_ = (
         *((n, ctypes.c_int64) for n in ("rows", "times", "every")),
         *((n, ctypes.c_void_p) for n in ("table", "slots", "parallel")),
@@ -106,7 +106,7 @@ def form(leaf: Any) -> Form:
     return tensor.shape, tensor.stride(), tensor.dtype, type(leaf) is Shared
 
 
-class Plan:
+class PlannedCall:
     """One call of a compiled program.
 
     Args:
@@ -155,7 +155,7 @@ class Plan:
                 self._large.append(k)
         self._packed = struct.Struct(f"{len(slots)}q").pack
         self._slots = (_Slot * max(len(slots), 1))(*slots)
-        self._call = _Call(rows, steps, every, compiled.table.data_ptr(), ctypes.addressof(self._slots))
+        self._call = _CallRecord(rows, steps, every, compiled.table.data_ptr(), ctypes.addressof(self._slots))
         self._call.parallel = _parallel()
         self._reference = ctypes.addressof(self._call)
 

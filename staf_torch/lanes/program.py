@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Hashable, Mapping, Sequence
-from types import FunctionType
 from typing import Any, NamedTuple
 
 import torch
@@ -12,18 +11,16 @@ from torch import Tensor
 
 from . import cache
 from .cache import Trace
-from .call import Compiled, Given, Plan, form, ordinary
+from .call import Compiled, Given, PlannedCall, form, ordinary
 from .compiler import machine_code
-from .content import reads_users_code, signature, skeleton
+from .contents import Contents, Derived, unpatched
 from .emit.c import Names, c_text
 from .emit.cpp import emit
-from .patches import unpatched
+from .loops import scan, tracing_now
 from .row_independence import doubt, undrawn
-from .surroundings import is_users
 from .trace.step import Step, trace
 from .trace.tracer import NotLoweredError
 from .tree import Shared, Tree, flatten, labels, plain, unflatten
-from .watch import Watch
 
 _log = logging.getLogger(__name__)
 _said: set[tuple[str, str]] = set()  # what has been logged
@@ -32,7 +29,7 @@ _LONGEST = 20_000  # lines that a compiler is asked to take: half a minute
 _PREPARED = 64  # calls of other shapes that a program remembers
 
 
-class Program:
+class Program(Derived):
     """A step of a row, taken at all times: carry, out_k = step(carry, now_k, row).
 
     Example:
@@ -78,20 +75,28 @@ class Program:
         self._prepared: dict[Hashable, Prepared] = {}
         self._model: tuple[Program, Mapping[int, Tensor]] | None = None
         self._described: tuple[bytes, Sequence[Tensor]] | None = None
-        self._watch: Watch | None = None  # of what the step of a user reads, once it is compiled
+        self._read: Contents | None = None  # what the step reads, once it is compiled
+        self._watched = True  # whether a change there is looked for
         self._of_users: bool | None = None  # whether the step is of a user, or reads what a user wrote
         self._asked = 0  # rows with which `doubt` was asked
         self._refused: str | None = None  # why its rows are not alone
 
+    def __getstate__(self) -> dict[str, Any]:
+        """What it is made of: a copy compiles by itself."""
+        return {"step": self.step, "name": self.name, "compile": self.compile, "copies": self.copies}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        Program.__init__(self, **state)
+
     def described(self, by: bytes | None, tensors: Sequence[Tensor]) -> None:
-        """Let traces go through the user's cache.
+        """Let traces go through the user's cache; whoever describes a step looks for changes himself.
 
         Args:
             by: tells steps apart, in any process, that differ in more than tensors; None where nothing does.
             tensors: all floating-point tensors that the step reads.
         """
         self._described = None if by is None else (by, tensors)
-        self._of_users = None if by is None else False
+        self._of_users, self._watched = (None if by is None else False), False
 
     def with_others(self, step: Step, others: Sequence[tuple[Tensor, Tensor]]) -> Program:
         """Return the program of a step that differs in captured tensors alone: nothing is traced again.
@@ -124,6 +129,8 @@ class Program:
         Returns:
             The carry, (B, ...), and the outputs, (B, ceil(T / every), ...).
         """
+        if tracing_now() and every == 1 and _loops_over(now):  # within a program that is traced
+            return scan(lambda carry, now: self.step(carry, now, row), carry, now)
         self._look_around()
         leaves, structure = flatten((row, now, carry))
         key = structure, tuple(map(form, leaves)), steps, every
@@ -236,7 +243,7 @@ class Program:
         rows = min(given.rows, 2)
         if self._asked < rows and self._of_users is not False:
             self._asked = rows
-            self._of_users = reads_users_code(self.step)
+            self._of_users = Contents(self.step).of_users
             if self._of_users:
                 self._refused = self._refused or doubt(self.step, given)
             if self._refused is not None:
@@ -245,10 +252,10 @@ class Program:
 
     def _look_around(self) -> None:
         """Forget what was compiled of a step that now reads something else."""
-        if self._watch is not None and not self._watch.unchanged():
+        if self._read is not None and not self._read.unchanged(library=False):
             self._compiled.clear()
             self._prepared.clear()
-            self._watch = self._model = self._refused = None
+            self._read = self._model = self._refused = None
             self._asked = 0
 
     def _again(self, key: Hashable) -> _Built | None:
@@ -264,9 +271,8 @@ class Program:
         return built._replace(compiled=compiled)
 
     def _build(self, given: Given, copies: int) -> _Built | None:
-        if self._watch is None and isinstance(self.step, FunctionType) and is_users(self.step):
-            watch = Watch(self.step)
-            self._watch = None if watch.blind else watch
+        if self._read is None and self._watched:
+            self._read = Contents(self.step)
         try:
             with undrawn():
                 made = self._known(given, copies)
@@ -278,14 +284,15 @@ class Program:
         except (NotLoweredError, OSError) as error:
             _say(self.name, str(error), "no build" if isinstance(error, OSError) else None)
             return None
+        if self._read is not None:
+            self._read.warn(self.name)
         table = made.text.numbers(made.recipe.values, made.real)
         shapes = tuple((leaf.shape[1:], leaf.dtype) for leaf in given.carry)
         return _Built(Compiled(call, table, made.real, shapes, made.outputs, made.structure), made)
 
     def _known(self, given: Given, copies: int) -> Trace:
         """What the step does with a single row, from the cache where it has been written down before."""
-        inputs = None if self._described is None else skeleton(given.key())
-        shapes = None if inputs is None else signature(inputs[0])
+        shapes = None if self._described is None else Contents(given.key()).signature()
         if self._described is None or shapes is None or not unpatched():
             return _written(self.step, given, copies)
         step, tensors = self._described
@@ -295,6 +302,12 @@ class Program:
             found = _written(self.step, given, copies)
             cache.save(path, found, tensors)
         return found
+
+
+def _loops_over(now: Tree) -> bool:
+    """Whether there are times, in tensors of which every row has its own."""
+    leaves = flatten(now)[0]
+    return bool(leaves) and not any(isinstance(leaf, Shared) for leaf in leaves)
 
 
 def _say(name: str, reason: str, kind: str | None = None) -> None:
@@ -340,7 +353,7 @@ class Prepared:
         leaves, self._structure = flatten(given.trees())
         self._forms = tuple(map(form, leaves))
         self._carries, self._carry = len(given.carry), given.structures["carry"]
-        self.plan: Plan | None = None
+        self.plan: PlannedCall | None = None
         self._refused = given.rows == 0 or given.times == 0
 
     def __call__(self, carry: Tree, now: Tree = (), row: Tree = ()) -> tuple[Tree, Tree]:
@@ -366,6 +379,8 @@ class Prepared:
                 self._refused = True
                 return self.run(leaves, carry, now, row)
             times = [False] * len(given.row) + [True] * len(given.now) + [False] * len(given.carry)
-            self.plan = Plan(compiled, leaves, times, rows=given.rows, steps=given.times, every=self._every)
+            self.plan = PlannedCall(
+                compiled, leaves, times, rows=given.rows, steps=given.times, every=self._every
+            )
         rooms = iter(self.plan(leaves))
         return unflatten(self._carry, rooms), unflatten(self.plan.structure, rooms)

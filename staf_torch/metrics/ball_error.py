@@ -10,14 +10,14 @@ from torch import Tensor
 from ..approximation.basis import StaFBasis, Target
 from ..centers import probe_points
 from ..lanes import Program, reduce
-from ..lanes.kept import Kept
+from ..lanes.shared_programs import SharedPrograms
 from ..local_basis import NewtonSpace, evaluate_scaled, scale
 from ..numerics.linalg import condition_number
 
 PROBES = 97  # points of the ball to take a supremum over; in the plane 64 of them on its edge
 _BLOCK = 2**18  # numbers in a temporary of plain torch, so that it stays in cache
 _PAYS = 30_000  # states in plain torch (some 30 us each) that take as long as to compile
-_kept = Kept("the errors on a ball")
+_kept = SharedPrograms("the errors on a ball")
 
 
 class StateErrors(NamedTuple):

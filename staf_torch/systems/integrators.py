@@ -8,15 +8,15 @@ import torch
 from torch import Tensor
 
 from ..lanes import Program
-from ..lanes.compiling import worth
-from ..lanes.kept import Kept
+from ..lanes.compiled_methods import worth
+from ..lanes.shared_programs import SharedPrograms
 from ..lanes.tree import Tree
 from ..numerics.checks import integer, positive_real, trailing
 from ..numerics.runge_kutta import runge_kutta_step
 from .base import ControlAffineSystem
 
 _PAYS = 10_000  # steps of a small batch in plain torch (some .1 ms each) that take as long as to compile
-_kept = Kept("a trajectory", 16)
+_kept = SharedPrograms("a trajectory", 16)
 
 
 def trajectory(

@@ -147,7 +147,7 @@ TEXTS: dict[str, Callable[[], str]] = {
         lambda x, u, _: (torch.where(x > 1, 0.5 * x.roll(1, -1), x) + u.unsqueeze(-1), x.sum(-1)), copies=2
     ).text(torch.ones(1, 65), torch.ones(1, 1)),
     "CUDA of a step": lambda: (
-        lanes.cuda.Kernel(
+        lanes.cuda.CudaKernel(
             lanes.Program(moved),
             *({"x": torch.ones(1, 2)}, torch.ones(1, 1, 2), {"gain": lanes.Shared(torch.ones(1))}),
             compile=lambda source, name: lambda *_: None,
@@ -169,7 +169,7 @@ def test_cuda_text_on_a_host_is_the_definition(dtype: torch.dtype, bound: float,
     """No device is needed: g++ compiles the kernel, a loop is the grid."""
     carry, u, row = given(37, dtype)
     program = lanes.Program(flow)
-    call = lanes.cuda.Kernel(program, carry, u, row, compile=host_compiler(tmp_path))
+    call = lanes.cuda.CudaKernel(program, carry, u, row, compile=host_compiler(tmp_path))
     for every in (1, 4):
         end, out = call(carry, u, row, every=every)
         wanted, outs = program.definition(carry, u, row, every=every)

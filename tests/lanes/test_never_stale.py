@@ -3,9 +3,11 @@ served by what was compiled of it."""
 
 from __future__ import annotations
 
+import copy
 import ctypes
 import itertools
 import math
+import pickle
 import sys
 import threading
 from collections.abc import Callable, Iterator
@@ -17,11 +19,11 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from staf_torch.lanes import ready
-from staf_torch.lanes.function import RowFunction
-from staf_torch.lanes.kept import Kept
+from staf_torch.lanes import compiled, ready
+from staf_torch.lanes.compiled_methods import CompiledMethod
+from staf_torch.lanes.contents import Contents
 from staf_torch.lanes.program import Program
-from staf_torch.lanes.watch import Watch
+from staf_torch.lanes.shared_programs import SharedPrograms
 from staf_torch.systems import simulate
 
 pytestmark = pytest.mark.needs_compiler
@@ -113,7 +115,7 @@ def notebook(monkeypatch: pytest.MonkeyPatch) -> Any:
     return module
 
 
-def of(kept: Kept, function: Callable[[Tensor], Tensor]) -> Any:
+def of(kept: SharedPrograms, function: Callable[[Tensor], Tensor]) -> Any:
     """The program of a function, as chases, loops and simulations ask for it."""
     program = kept.unchanged(function)
     if program is None:
@@ -128,7 +130,7 @@ def right(program: Any, function: Callable[[Tensor], Tensor]) -> None:
 
 @pytest.mark.parametrize("name", CHANGES)
 def test_a_function_is_computed_with_what_it_reads_at_the_moment(name: str, notebook: Any) -> None:
-    kept, function = Kept("a test"), notebook.FUNCTIONS[name]
+    kept, function = SharedPrograms("a test"), notebook.FUNCTIONS[name]
     own = Program(eval("lambda x, now, row: (x, f(x))", vars(notebook) | {"f": function}))
     before = [of(kept, function) for _ in range(4)]  # the last by what is watched
     assert all(program is before[0] for program in before)
@@ -145,7 +147,7 @@ def test_a_function_is_computed_with_what_it_reads_at_the_moment(name: str, note
 
 
 def test_closures_of_equal_content_share_a_program_and_others_do_not(notebook: Any) -> None:
-    kept = Kept("a test")
+    kept = SharedPrograms("a test")
     first = of(kept, notebook.closing(2.0))
     assert of(kept, notebook.closing(2.0)) is first
     assert of(kept, notebook.closing(3.0)) is not first
@@ -154,7 +156,7 @@ def test_closures_of_equal_content_share_a_program_and_others_do_not(notebook: A
 
 
 def test_a_function_that_an_editor_reloads_in_place_is_another(notebook: Any) -> None:
-    kept = Kept("a test")
+    kept = SharedPrograms("a test")
     right(of(kept, notebook.outer), notebook.outer)
     notebook.inner.__code__ = (lambda x: 7 * x).__code__
     right(of(kept, notebook.outer), lambda x: 7 * x)
@@ -174,6 +176,28 @@ class Held(nn.Module):
         return noted * self.gain * self.function(self.inner(x)) * (2 if self.training else 1)
 
 
+class Policy(nn.Module):
+    """Of a user, compiled by a line."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.inner, self.scale = Held(), 1.0
+
+    @compiled("a policy of a test")
+    def forward(self, x: Tensor) -> Tensor:
+        return self.scale * self.inner(x)
+
+    @compiled("another method")
+    def other(self, x: Tensor) -> Tensor:
+        return self.inner(x)
+
+
+class Noisy(nn.Module):
+    @compiled("a noisy test")
+    def forward(self, x: Tensor) -> Tensor:
+        return x + torch.randn(x.shape)
+
+
 PARTS: dict[str, Callable[[Held], Any]] = {
     "a number": lambda m: setattr(m, "setting", 2.0),
     "an entry of a list": lambda m: m.notes.__setitem__(0, 3.0),
@@ -191,14 +215,10 @@ PARTS: dict[str, Callable[[Held], Any]] = {
 }
 
 
-DEEP = ("an entry of a list", "an array", "a hook")
-"""Inside of what a module holds, where a `RowFunction` does not look: it watches attributes and tensors."""
-
-
 @pytest.mark.parametrize("part", PARTS)
 def test_a_module_is_computed_as_it_is_at_the_moment(part: str) -> None:
     module = Held()
-    row, kept = RowFunction(module.forward, module, "a test"), Kept("a test")
+    row, kept = CompiledMethod(module.forward, module, compiled("a test")), SharedPrograms("a test")
     row.hasten()
     for _ in range(3):
         torch.testing.assert_close(row(X), module(X), rtol=1e-13, atol=1e-14)
@@ -210,8 +230,7 @@ def test_a_module_is_computed_as_it_is_at_the_moment(part: str) -> None:
     PARTS[part](module)
     assert not torch.allclose(module(X), before)
     assert kept.unchanged(module) is None
-    if part not in DEEP:
-        torch.testing.assert_close(row(X), module(X), rtol=1e-13, atol=1e-14)
+    torch.testing.assert_close(row(X), module(X), rtol=1e-13, atol=1e-14)
     right(of(kept, module), module)
     for _ in range(2):  # the second time it is known again
         again = of(kept, module)
@@ -219,7 +238,7 @@ def test_a_module_is_computed_as_it_is_at_the_moment(part: str) -> None:
 
 
 def test_where_a_derivative_may_be_wanted_there_is_no_program(notebook: Any) -> None:
-    kept, function = Kept("a test"), notebook.FUNCTIONS["tensor"]
+    kept, function = SharedPrograms("a test"), notebook.FUNCTIONS["tensor"]
     for _ in range(3):
         assert of(kept, function) is not None
     notebook.tensor.requires_grad_()
@@ -235,7 +254,7 @@ def test_a_method_that_a_user_replaces_in_his_own_class_is_seen() -> None:
         def forward(self, x: Tensor) -> Tensor:
             return x * self.gain
 
-    module, kept = Own(), Kept("a test")
+    module, kept = Own(), SharedPrograms("a test")
     changes: list[Callable[[], Any]] = [
         lambda: None,
         lambda: setattr(Own, "gain", 3.0),
@@ -249,7 +268,7 @@ def test_a_method_that_a_user_replaces_in_his_own_class_is_seen() -> None:
 
 def test_a_function_of_rows_is_compiled_again_where_a_global_has_changed(notebook: Any) -> None:
     module = Held(notebook.outer)
-    row = RowFunction(module.forward, module, "a test")
+    row = CompiledMethod(module.forward, module, compiled("a test"))
     row.hasten()
     for gain in (2.0, 5.0):
         notebook.gain = gain
@@ -279,10 +298,10 @@ class Slots:
 def test_what_cannot_be_watched_is_read_at_every_call() -> None:
     small, large, part = np.zeros(10), np.zeros(100_000), Slots()
     part.number = 1.0
-    assert Watch(lambda x: x * small[0]).unchanged()
+    assert Contents(lambda x: x * small[0]).reason is None
     for value in (lambda x: x * large[0], part, (x for x in ())):
-        assert not Watch(value).unchanged()
-    kept = Kept("a test")
+        assert Contents(value).reason is not None
+    kept = SharedPrograms("a test")
     for number in (1.0, 1.0, 2.0):
         part.number = number
         program = kept.of(lambda x, _, __: (x, x * part.number), part, owners=(part,))
@@ -325,7 +344,7 @@ def test_whatever_a_function_names_a_call_goes_on_and_the_log_says_what_it_costs
     notebook.other = make()
     torch.testing.assert_close(Program(notebook.step)(X, steps=3)[0], 8 * X)
     caplog.clear()
-    kept = Kept("a test")
+    kept = SharedPrograms("a test")
     for _ in range(2):
         program = kept.of(notebook.step, notebook.step)
         assert program is not None
@@ -336,19 +355,39 @@ def test_whatever_a_function_names_a_call_goes_on_and_the_log_says_what_it_costs
 def test_a_policy_is_ready_before_its_loop_begins_or_says_that_it_cannot_be(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    module, holder = Held(), nn.Module()
-    row = RowFunction(module.forward, module, "a test")
-    holder.row, holder.forward = row, row.__call__
-    assert not row.compiled
-    assert ready(holder, X[0])
-    assert row.compiled
-    torch.testing.assert_close(row(X[0]), module(X[0]), rtol=1e-13, atol=1e-13)
+    module, policy = Held(), Policy()
+    assert not policy.forward.compiled
+    assert ready(policy, X[0])
+    assert policy.forward.compiled
+    torch.testing.assert_close(policy(X[0]), policy.inner(X[0]), rtol=1e-13, atol=1e-13)
     assert not ready(nn.Linear(2, 2).double(), X)
-    noisy = RowFunction(lambda x: module(x) + torch.randn(x.shape), module, "a noisy test")
-    holder.row, holder.inner, holder.forward = row, nn.Module(), lambda x: row(x) + noisy(x)
-    holder.inner.noisy = noisy
-    assert not ready(holder, X[0])
+    assert ready(nn.Sequential(policy, module), X[0])  # none of its other methods is asked
+    assert not ready(nn.Sequential(policy, Noisy()), X[0])
     assert "draws random numbers" in caplog.text
+
+
+@pytest.mark.parametrize(
+    "copied", [copy.copy, copy.deepcopy, lambda policy: pickle.loads(pickle.dumps(policy))]
+)
+def test_a_copy_of_a_policy_compiles_programs_of_its_own(copied: Callable[[nn.Module], Policy]) -> None:
+    policy = Policy()
+    assert ready(policy, X)
+    other = copied(policy)
+    assert not other.forward.compiled
+    other.scale = 3.0
+    assert ready(other, X)
+    torch.testing.assert_close(other(X), 3 * policy(X), rtol=1e-13, atol=1e-13)
+
+
+def test_what_cannot_be_watched_is_said_once_and_taken_as_it_stands(caplog: pytest.LogCaptureFixture) -> None:
+    policy = Policy()
+    policy.table = np.zeros(100_000)
+    for _ in range(2):
+        assert ready(policy, X)
+    assert [line for line in caplog.messages if "cannot be watched: an array of 800000 bytes" in line] == [
+        *caplog.messages
+    ]
+    assert len(caplog.messages) == 1
 
 
 @pytest.mark.parametrize("shape", [(2,), (1, 2), (5, 2), (3, 4, 2), (2, 1, 3, 2), (0, 2)])
@@ -363,7 +402,7 @@ def test_a_function_of_rows_takes_states_of_any_leading_dimensions(shape: tuple[
 
 
 MODULE = Held()
-ANY = RowFunction(MODULE.forward, MODULE, "a test")
+ANY = CompiledMethod(MODULE.forward, MODULE, compiled("a test"))
 ANY.hasten()
 
 
@@ -371,7 +410,7 @@ ANY.hasten()
 def test_a_function_is_compiled_once_its_calls_would_have_paid_for_it(rows: int, most: int) -> None:
     """A long batch pays for itself; a hundred calls of a single row do."""
     module = Held()
-    row, x = RowFunction(module.forward, module, "a test"), torch.ones(rows, 2).double()
+    row, x = CompiledMethod(module.forward, module, compiled("a test")), torch.ones(rows, 2).double()
     calls = 0
     while not row.compiled:
         row(x)

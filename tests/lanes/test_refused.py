@@ -16,8 +16,8 @@ from torch import Tensor
 import staf_torch as st
 from staf_torch import lanes
 from staf_torch.lanes import Program, Shared
-from staf_torch.lanes.content import reads_users_code
-from staf_torch.lanes.function import Rows
+from staf_torch.lanes.compiled_methods import Rows
+from staf_torch.lanes.contents import Contents
 from staf_torch.lanes.trace.tracer import NotLoweredError
 
 pytestmark = pytest.mark.needs_compiler
@@ -131,8 +131,8 @@ def test_code_of_a_user_is_found_inside_of_the_librarys(caplog: pytest.LogCaptur
     rows = Rows(Noisy(), "a test")
     assert len({float(rows(X)[0, 0, 0]) for _ in range(5)}) == 5
     assert "called again" in caplog.text
-    assert reads_users_code(Noisy().forward)
-    assert not reads_users_code(torch.nn.Linear(2, 2), st.GaussianKernel(), torch.tanh)
+    assert Contents(Noisy().forward).of_users
+    assert not Contents(torch.nn.Linear(2, 2), st.GaussianKernel(), torch.tanh).of_users
 
 
 def test_what_a_step_reads_now_is_asked_anew_of_a_single_row_too() -> None:

@@ -20,9 +20,9 @@ from torch import Tensor, nn
 from variants import KERNELS
 
 from staf_torch import StaFBasis, StateFollowingCenters, chase, kernels, lanes, optim, rings, targets
-from staf_torch.lanes import patches
-from staf_torch.lanes.kept import Kept
+from staf_torch.lanes.contents import unpatched
 from staf_torch.lanes.program import Program, Step
+from staf_torch.lanes.shared_programs import SharedPrograms
 
 pytestmark = pytest.mark.needs_compiler
 
@@ -150,7 +150,7 @@ def layer(seed: int) -> nn.Module:
     return nn.Sequential(nn.Linear(2, 3), nn.Tanh(), nn.Linear(3, 2)).double().requires_grad_(False)
 
 
-def of(kept: Kept, module: nn.Module, *settings: Any) -> tuple[Program, Made]:
+def of(kept: SharedPrograms, module: nn.Module, *settings: Any) -> tuple[Program, Made]:
     step = Made(module)
     found = kept.of(step, module, *settings)
     assert found is not None
@@ -164,7 +164,7 @@ def right(program: Program, x: Tensor = X) -> Tensor:
     return found
 
 
-def served(kept: Kept, module: nn.Module, *settings: Any) -> tuple[Tensor, bool]:
+def served(kept: SharedPrograms, module: nn.Module, *settings: Any) -> tuple[Tensor, bool]:
     """What the program of a module computes, and whether it had to be traced."""
     program, step = of(kept, module, *settings)
     assert program.compiles(X, steps=3)
@@ -173,7 +173,7 @@ def served(kept: Kept, module: nn.Module, *settings: Any) -> tuple[Tensor, bool]
 
 
 def test_other_tensors_are_the_same_program_with_other_numbers(cache: Path) -> None:
-    kept = Kept("a test")
+    kept = SharedPrograms("a test")
     first, traced = served(kept, layer(0))
     other, again = served(kept, layer(1))
     assert (traced, again) == (True, False)
@@ -186,13 +186,13 @@ def test_other_tensors_are_the_same_program_with_other_numbers(cache: Path) -> N
 
 
 def test_a_trace_comes_from_the_cache_to_the_bit_and_with_other_numbers(cache: Path) -> None:
-    first, traced = served(Kept("a test"), layer(0))
+    first, traced = served(SharedPrograms("a test"), layer(0))
     assert traced
     (path,) = traces(cache)
     os.utime(path, (1e9, 1e9))
-    again, traced = served(Kept("a test"), layer(0))  # as another process would
+    again, traced = served(SharedPrograms("a test"), layer(0))  # as another process would
     assert torch.equal(again, first)
-    other, traced_too = served(Kept("a test"), layer(1))
+    other, traced_too = served(SharedPrograms("a test"), layer(1))
     assert not torch.equal(other, first)
     assert not traced
     assert not traced_too
@@ -201,11 +201,11 @@ def test_a_trace_comes_from_the_cache_to_the_bit_and_with_other_numbers(cache: P
 
 
 def test_no_number_of_a_tensor_is_in_a_trace(cache: Path) -> None:
-    served(Kept("a test"), layer(0))
+    served(SharedPrograms("a test"), layer(0))
     (path,) = traces(cache)
     content = path.read_bytes()
     path.unlink()
-    served(Kept("a test"), layer(1))
+    served(SharedPrograms("a test"), layer(1))
     assert path.read_bytes() == content
 
 
@@ -229,7 +229,7 @@ DAMAGES: dict[str, Callable[[bytes, Path], bytes]] = {
     "something else": lambda content, _: sealed((1, 2)),
     "code": lambda content, place: sealed(Harm(place)),
     "code inside": lambda content, place: sealed((Harm(place), 1, 2, 3, 4)),
-    "a class of this package": lambda content, _: sealed((Kept("a test"),)),
+    "a class of this package": lambda content, _: sealed((SharedPrograms("a test"),)),
     "a function of Python": lambda content, _: sealed((os.getcwd,)),
 }
 
@@ -238,11 +238,11 @@ DAMAGES: dict[str, Callable[[bytes, Path], bytes]] = {
 def test_a_trace_that_is_none_is_written_again_and_nothing_in_it_is_run(
     damage: str, cache: Path, tmp_path: Path
 ) -> None:
-    first, _ = served(Kept("a test"), layer(0))
+    first, _ = served(SharedPrograms("a test"), layer(0))
     (path,) = traces(cache)
     content = path.read_bytes()
     path.write_bytes(DAMAGES[damage](content, tmp_path / "harm"))
-    again, traced = served(Kept("a test"), layer(0))
+    again, traced = served(SharedPrograms("a test"), layer(0))
     assert traced
     assert torch.equal(again, first)
     assert path.read_bytes() == content
@@ -250,14 +250,14 @@ def test_a_trace_that_is_none_is_written_again_and_nothing_in_it_is_run(
 
 
 def test_another_setting_shape_or_dtype_is_another_trace(cache: Path) -> None:
-    served(Kept("a test"), layer(0))
-    served(Kept("a test"), layer(0), "another setting")
-    right(of(Kept("a test"), layer(0))[0], X[:, None])
-    right(of(Kept("a test"), layer(0).float())[0], X.float())
+    served(SharedPrograms("a test"), layer(0))
+    served(SharedPrograms("a test"), layer(0), "another setting")
+    right(of(SharedPrograms("a test"), layer(0))[0], X[:, None])
+    right(of(SharedPrograms("a test"), layer(0).float())[0], X.float())
     before = torch.get_default_dtype()
     torch.set_default_dtype(torch.float64 if before == torch.float32 else torch.float32)
     try:
-        served(Kept("a test"), layer(0))
+        served(SharedPrograms("a test"), layer(0))
     finally:
         torch.set_default_dtype(before)
     assert len(traces(cache)) == 5
@@ -268,9 +268,9 @@ class Mine(nn.Linear):
 
 
 def test_code_of_a_user_and_tensors_that_nobody_named_keep_a_trace_out_of_the_cache(cache: Path) -> None:
-    served(Kept("a test"), nn.Sequential(Mine(2, 2)).double().requires_grad_(False))
+    served(SharedPrograms("a test"), nn.Sequential(Mine(2, 2)).double().requires_grad_(False))
     hidden = torch.tensor(2.0, dtype=torch.float64)
-    program = Kept("a test").of(lambda x, _, __: (x * hidden, x), "named")
+    program = SharedPrograms("a test").of(lambda x, _, __: (x * hidden, x), "named")
     assert program is not None
     right(program)
     assert not traces(cache)
@@ -279,7 +279,7 @@ def test_code_of_a_user_and_tensors_that_nobody_named_keep_a_trace_out_of_the_ca
 def test_a_number_that_the_step_reads_decides_whether_a_trace_serves(cache: Path) -> None:
     for number in (2.0, 3.0, -1.0):
         scale = torch.tensor(number, dtype=torch.float64)
-        program = Kept("a test").of(
+        program = SharedPrograms("a test").of(
             lambda x, _, __, scale=scale: (x * scale if bool(scale > 0) else -x, x), scale
         )
         assert program is not None
@@ -287,7 +287,7 @@ def test_a_number_that_the_step_reads_decides_whether_a_trace_serves(cache: Path
 
 
 def test_the_latest_programs_are_kept_and_no_more() -> None:
-    kept, modules = Kept("a test", most=2), [nn.Sequential(*[nn.Tanh()] * k) for k in (1, 2, 3)]
+    kept, modules = SharedPrograms("a test", most=2), [nn.Sequential(*[nn.Tanh()] * k) for k in (1, 2, 3)]
     one, two = (of(kept, module)[0] for module in modules[:2])
     assert of(kept, modules[0])[0] is one  # which is now the latest
     of(kept, modules[2])
@@ -307,22 +307,22 @@ def test_a_method_of_the_library_that_a_user_replaces_meets_no_old_trace_and_lea
     def step_of(kernel: nn.Module) -> nn.Module:
         return lambda x: kernel(x.unsqueeze(-2), torch.ones(1, 2).double()).squeeze(-2)  # type: ignore[return-value]
 
-    def program(kept: Kept, kernel: nn.Module) -> Program:
+    def program(kept: SharedPrograms, kernel: nn.Module) -> Program:
         found = kept.of(Made(step_of(kernel)), kernel, owners=(kernel,))
         assert found is not None
         return found
 
     def replaced() -> None:
-        kernel, kept = kernels.ExponentialKernel(), Kept("a test")
+        kernel, kept = kernels.ExponentialKernel(), SharedPrograms("a test")
         for _ in range(3):  # from the second on a watch says whether something has changed
             before = right(program(kept, kernel))
-        assert patches.unpatched()
+        assert unpatched()
         assert len(traces(cache)) == 1
         assert kept.unchanged(kernel) is not None
         kernels.ExponentialKernel.forward = twice  # type: ignore[method-assign]
-        assert not patches.unpatched()
+        assert not unpatched()
         assert kept.unchanged(kernel) is None
-        for other in (kept, Kept("a test")):
+        for other in (kept, SharedPrograms("a test")):
             assert not torch.allclose(right(program(other, kernel)), before)
         assert len(traces(cache)) == 1
 
@@ -330,13 +330,13 @@ def test_a_method_of_the_library_that_a_user_replaces_meets_no_old_trace_and_lea
     process.start()
     process.join(120)
     assert process.exitcode == 0
-    assert patches.unpatched()
+    assert unpatched()
 
 
 def test_no_module_of_the_package_looks_patched() -> None:
     for name in ("adp", "envs", "experiments", "metrics", "online", "theory"):
         importlib.import_module(f"staf_torch.{name}")
-    assert patches.unpatched()
+    assert unpatched()
 
 
 @pytest.mark.compiled

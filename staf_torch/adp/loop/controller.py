@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
-from ...lanes.surroundings import is_users
+from ...lanes.contents import is_users
 from ...numerics.checks import copied, real
 from ...numerics.linalg import riccati
 from ...systems import Plant

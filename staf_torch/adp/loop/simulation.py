@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ...lanes import Program
-from ...lanes.compiling import worth
+from ...lanes.compiled_methods import worth
 from ...lanes.tree import flatten, unflatten
 from ...numerics.checks import choice, fail, integer, trailing
 from ...systems import ControlAffineSystem, Plant

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from ...lanes import Program
-from ...lanes.kept import Kept, number
+from ...lanes.shared_programs import SharedPrograms, number
 from ...lanes.tree import flatten, unflatten
 from ...numerics.checks import choice, copied, fail, flag, positive_real
 from ...systems import Plant
@@ -18,7 +18,7 @@ from ..problem.cost import Cost
 from ..problem.held_plant import Holding, fewest_and_most
 from .controller import Carried, Controller, Feedback
 
-_kept = Kept("the closed loop", 16)
+_kept = SharedPrograms("the closed loop", 16)
 
 
 class LoopState(NamedTuple):
@@ -148,7 +148,7 @@ def program(loop: ClosedLoop, compile: bool) -> Program:
     """Return ``loop`` over many steps: it records the state before every step, and the control.
 
     Compiled loops that differ in tensors and in the controller's `numbers` alone share one text:
-    `lanes.kept`.
+    `lanes.shared_programs`.
 
     Args:
         loop: one step.

@@ -8,8 +8,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ...lanes import repeat, scan
-from ...lanes.function import RowFunction
+from ...lanes import compiled, repeat, scan
 from ...lanes.loops import tracing_now
 from ...numerics.angles import wrap
 from ...numerics.box import LARGEST, minimum_and_slopes
@@ -320,15 +319,13 @@ class DetourPlans(Controller):
         self.weight = positive_real("DetourPlans", "weight", weight)
         self._problem = PlanProblem(detours, cost, self.moved, self.weight)
         self._check_others()
-        self._rows = RowFunction(self._definition, self, "a plan around what moves")
-        self._begun = RowFunction(self._first_plan, self, "first plans around what moves")
 
     def init(self, x0: Tensor) -> CarriedPlan:
         """The best of the first plans from the states x0 (B, n), some 200 of each."""
         count, starts = len(x0), self._starts(x0)
         x, found = x0.repeat(len(starts), 1), starts.flatten(0, 1).flatten(1)
         for _ in range(self.first):
-            improved = self._begun(torch.cat((x, found), dim=-1))
+            improved = self._first_plan(torch.cat((x, found), dim=-1))
             found = improved[:, 1:]
         found = improved.unflatten(0, (len(starts), count))
         total = torch.where(torch.isfinite(found[..., 0]), found[..., 0], torch.inf)
@@ -340,7 +337,7 @@ class DetourPlans(Controller):
         if dt != self.hold:
             raise fail("DetourPlans", "dt", f"must be that of the loop, {dt:g} s", self.hold)
         control = carried.control
-        found = self._rows(torch.cat((x, control.flatten(1), carried.expected, carried.done), dim=-1))
+        found = self._next(torch.cat((x, control.flatten(1), carried.expected, carried.done), dim=-1))
         u, ahead, *rest = found.split((control.shape[-1], control[0].numel(), 1, 1), dim=-1)
         return u, CarriedPlan(ahead.unflatten(-1, control.shape[1:]), *rest)
 
@@ -376,13 +373,15 @@ class DetourPlans(Controller):
                 held[-1][:, :length] = u
         return torch.cat((starts, torch.stack(held)))
 
+    @compiled("first plans around what moves")
     def _first_plan(self, z: Tensor) -> Tensor:
         """Of rows of (x, controls) J and the controls of the plan after one step."""
         x, control = z.split((self.cost.dim, z.shape[-1] - self.cost.dim), dim=-1)
         _, _, _, control, total = self._improved(x, control, torch.zeros_like(x[:, :1]), 1)
         return torch.cat((total.unsqueeze(-1), control.flatten(1)), dim=-1)
 
-    def _definition(self, z: Tensor) -> Tensor:
+    @compiled("a plan around what moves")
+    def _next(self, z: Tensor) -> Tensor:
         """Of rows of (x, controls, J expected, periods so far) the control, and these for the next period."""
         flat = z.reshape(-1, z.shape[-1])
         n, problem = self.cost.dim, self._problem

@@ -9,8 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ...lanes import each, repeat
-from ...lanes.function import RowFunction
+from ...lanes import compiled, each, repeat
 from ...numerics.checks import fail, integer, non_negative, one_or_each, positive, positive_real, vector
 from ...systems import Plant, StepPlant
 from ..loop.controller import Controller, Policy, Value
@@ -131,7 +130,6 @@ class DetourRollout(Controller):
         self.fresh: Tensor  # (P, k + 1), the length last
         self.changes: Tensor  # (C, k + 1)
         self.holding = Holding("DetourRollout", plant, self.cost, self.stride * self.hold)
-        self._rows = RowFunction(self._definition, self, "a choice of detours")
 
     def init(self, x0: Tensor) -> Detour:
         return Detour(x0.new_zeros(len(x0), len(self.axes) + 1), x0.new_zeros(len(x0), 1))
@@ -139,11 +137,12 @@ class DetourRollout(Controller):
     def step(self, x: Tensor, carried: Detour, uniform: Tensor, dt: float) -> tuple[Tensor, Detour]:
         if dt != self.hold:
             raise fail("DetourRollout", "dt", f"must be that of the loop, {dt:g} s", self.hold)
-        found = self._rows(torch.cat((x, *carried), dim=-1))
+        found = self._chosen(torch.cat((x, *carried), dim=-1))
         u, way, done = found.split((self.plant.inputs, carried.way.shape[-1], 1), dim=-1)
         return u, Detour(way, done)
 
-    def _definition(self, z: Tensor) -> Tensor:
+    @compiled("a choice of detours")
+    def _chosen(self, z: Tensor) -> Tensor:
         """Of rows of (x, detour, periods so far) the control, and both for the next period."""
         k = len(self.axes)
         flat = z.reshape(-1, z.shape[-1])

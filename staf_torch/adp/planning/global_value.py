@@ -114,10 +114,11 @@ class GlobalValue(nn.Module):
         self.candidates = min(integer("GlobalValue", "candidates", candidates, least=1), len(self.entries))
         self.register_buffer("frame", self._frame())  # F with F F' = G, (n, n)
         self.frame: Tensor
+        self._judge = Program(self._judged, name="a global value", copies=1)
         self._ready()
 
     def _ready(self) -> None:
-        """Make what is not a tensor: the search tree, and the compiled rollouts."""
+        """Make what is not a tensor: the search tree."""
         from scipy.spatial import cKDTree  # a third of a second that no other import need pay
 
         n, h = self.problem.dim, self.lookahead
@@ -128,14 +129,9 @@ class GlobalValue(nn.Module):
         # Where every trajectory rests at the goal, under the linear feedback.
         self.resting = int(self.arrives.nonzero()[0]) * self.length + self.length - h - 1
         self.worst = float(self.models[self.entries, n].max())
-        self._judge = Program(
-            lambda carry, now, row: (carry, follow_plan(self.problem, self.region, self.worst, *row)),
-            name="a global value",
-            copies=1,
-        )
 
     def __getstate__(self) -> dict[str, Any]:
-        dropped = dict.fromkeys(("_tree", "_windows", "_judge"))
+        dropped = dict.fromkeys(("_tree", "_windows"))
         return {**vars(self), **dropped}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -227,6 +223,12 @@ class GlobalValue(nn.Module):
         found: tuple[Tensor, Tensor, Tensor]
         _, found = self._judge((), (), (x, self._windows.index_select(0, entries), ends), steps=1)
         return found
+
+    def _judged(
+        self, carry: tuple[()], now: tuple[()], row: tuple[Tensor, Tensor, Tensor]
+    ) -> tuple[tuple[()], tuple[Tensor, Tensor, Tensor]]:
+        """What becomes of candidates, as a step of a program."""
+        return carry, follow_plan(self.problem, self.region, self.worst, *row)
 
     def replay(self, x: Tensor, entries: Tensor, steps: int) -> tuple[Tensor, Reference]:
         """The stored control (B, T, m) to follow from x (B, n), and what it is a feedback around.

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import copy
+import math
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from ...lanes import Program, repeat
-from ...lanes.function import RowFunction
+from ...lanes import compiled, repeat
 from ...lanes.loops import tracing_now
 from ...numerics.checks import fail, flag, integer
 from ..loop.controller import Controller
@@ -92,18 +92,12 @@ class RecedingHorizon(Controller):
             raise fail("RecedingHorizon", "held", "must be False with a memory, which has plans", held)
         self.steps = integer("RecedingHorizon", "steps", steps, least=1)
         self.iterations = integer("RecedingHorizon", "iterations", iterations, least=0)
-        self.costly = self.iterations > 0
+        self.costly, self._compile = self.iterations > 0, compile
         self._first = BoxDDP(problem, steps=steps, compile=compile)
         self._search: BoxDDP | None = None
         if iterations:
             self._search = copy.copy(self._first)  # by the same programs: none is traced twice
             self._search.iterations = self.iterations
-        self._hastened = False
-        self._whole = Program(
-            lambda carry, now, row: (carry, self._improved(*row)),
-            name="a plan improved",
-            compile=compile,
-        )
 
     def hasten(self) -> None:
         """Let `step` be one program from its next call on, where it improves the plan of a period before.
@@ -111,7 +105,8 @@ class RecedingHorizon(Controller):
         Some seconds of a C++ compiler, and a control takes a tenth of the time: .13 ms of a cart-pole, 40
         periods ahead.
         """
-        self._hastened = self._search is not None and self.memory is None
+        if self._compile and self._search is not None and self.memory is None:
+            self._improved.hasten()
 
     def init(self, x0: Tensor) -> Following:
         """The first plan, from the states x0 (B, n)."""
@@ -132,11 +127,8 @@ class RecedingHorizon(Controller):
         """The first control of the improved plan (B, m), and the plan a step further on."""
         if self._search is None:
             return self._followed(x, carried)
-        row = x, carried
-        if self._hastened and not tracing_now() and self._whole.compiles((), (), row, steps=1):
-            _, (u, after) = self._whole((), (), row, steps=1)
-            return u[:, 0], Following(after.plan[:, 0], after.done[:, 0])
-        return self._improved(*row)
+        u, after = self._improved(x, carried)
+        return u, after
 
     def _begun(self, x: Tensor, carried: Following) -> tuple[Tensor, Reference]:
         """What a search begins from: the memory's plan, or the carried one."""
@@ -145,6 +137,7 @@ class RecedingHorizon(Controller):
         state, control, feedback = unpacked(self.problem, carried.plan)
         return control, Reference(state, feedback)
 
+    @compiled("a plan improved", pays=math.inf, copies=0)
     def _improved(self, x: Tensor, carried: Following) -> tuple[Tensor, Following]:
         """The first control of an improved plan, and the plan from the next step on, at its end the linear
         feedback of the goal near the last state."""
@@ -229,22 +222,16 @@ class BoundedPlans:
     Args:
         problem: plant, cost and bounds in steps.
         steps: T.
-        policy: whose base is the linear feedback; a program is kept by what the policy holds, as a problem
-            holds closures, which are not known again.
+        policy: whose base is the linear feedback.
     """
 
     def __init__(self, problem: SampledProblem, steps: int, policy: SampledRollout) -> None:
-        self.problem, self.steps = problem, steps
+        self.problem, self.steps, self.policy = problem, steps, policy
         self._search = BoxDDP(problem, steps=steps, iterations=_ITERATIONS)
-        self._strained = RowFunction(policy.meets_bound, policy, "whether a bound is met")
 
     def strained(self, x: Tensor) -> Tensor:
         """Whether the base, followed over the policy's horizon, meets a bound: (B, n) -> (B,) bool."""
-        return self._strained(x).reshape(-1) > 0
-
-    def hasten(self) -> None:
-        """Compile `strained` at its next call."""
-        self._strained.hasten()
+        return self.policy.meets_bound(x).reshape(-1) > 0
 
     def __call__(self, x: Tensor) -> Tensor:
         """u: (B, n) -> (B, m)."""
@@ -280,8 +267,8 @@ class StrainedPlans(Controller):
 
         After `lanes.ready` of the policy, what the loop may need is made and compiled here, too.
         """
-        if self.policy.compiled:
-            self._planner.hasten()
+        if self.policy.improved.compiled:
+            self.policy.meets_bound.hasten()
             self._begun.hasten()
             self._begun.step(x0, self._begun.idle(x0), x0, self.policy.period)
         carried, rows = self._without(x0), self._strained(x0).nonzero().squeeze(1)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import math
 from typing import Any
 
@@ -12,9 +11,9 @@ from torch import Tensor, nn
 from ...approximation.basis import StaFBasis
 from ...centers import Radius, StateFollowingCenters, ball, cross_polytope, rings
 from ...kernels import ExponentialKernel, GaussianKernel, Kernel
-from ...lanes import each, repeat
-from ...lanes.call import Plan
-from ...lanes.function import RowFunction, Rows
+from ...lanes import compiled, each, repeat
+from ...lanes.call import PlannedCall
+from ...lanes.compiled_methods import Rows
 from ...numerics.checks import fail, integer, positive_real
 from ...systems import Barrier, ControlAffineSystem
 from ..loop.controller import LQR, Policy, Value
@@ -91,7 +90,6 @@ class RolloutPolicy(nn.Module):
         self.steps = integer("RolloutPolicy", "steps", steps, least=1)
         self.depth = integer("RolloutPolicy", "depth", depth, least=1)
         self.period = None if period is None else positive_real("RolloutPolicy", "period", period)
-        self._compiled = RowFunction(self.control, self, _NAME, functools.partial(_TwoPrograms, self))
         self.base: Policy = base
         if depth > 1:
             settings = {"horizon": horizon, "steps": steps, "depth": depth - 1}
@@ -140,9 +138,10 @@ class RolloutPolicy(nn.Module):
         end = lqr.value if cost.end is None else lqr.cost.terminal
         return cls(basis, system, cost, lqr, end, horizon=horizon, steps=steps, depth=depth, period=period)
 
+    @compiled(_NAME, by=lambda policy: _TwoPrograms(policy))
     def forward(self, x: Tensor) -> Tensor:
         """u: (..., n) -> (..., m)."""
-        return self._compiled(x)
+        return self.control(x)
 
     def control(self, x: Tensor) -> Tensor:
         """`forward` in plain torch: (..., n) -> (..., m)."""
@@ -205,7 +204,7 @@ class _TwoPrograms:
             "improvement",
         )
 
-        self._one: dict[Any, tuple[Tensor, Plan, Plan]] = {}  # calls with one state
+        self._one: dict[Any, tuple[Tensor, PlannedCall, PlannedCall]] = {}  # calls with one state
 
     @property
     def compiled(self) -> bool:

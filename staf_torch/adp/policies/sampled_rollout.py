@@ -12,8 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from ...approximation.basis import StaFBasis
-from ...lanes import each, repeat, scan
-from ...lanes.function import RowFunction
+from ...lanes import compiled, each, repeat, scan
 from ...numerics.box import LARGEST, box_minimum
 from ...numerics.checks import fail, integer, positive_real
 from ...systems import Bounds, Plant, StepPlant
@@ -112,17 +111,16 @@ class SampledRollout(nn.Module):
         self.register_buffer("probe", _PROBE * torch.where(torch.isfinite(span), span, 1.0))  # (m,)
         self.probe: Tensor
         self.along = None if basis.dim == cost.dim else _along(basis)
-        self._compiled = RowFunction(self.control, self, "a sampled rollout") if plant.traceable else None
         self._followed = followed(plant, base, self.bounds, self.period)
 
     def forward(self, x: Tensor) -> Tensor:
         """u: (..., n) -> (..., m)."""
-        return self._compiled(x) if self._compiled is not None else self.control(x)
+        return self.improved(x) if self.plant.traceable else self.control(x)
 
-    @property
-    def compiled(self) -> bool:
-        """Whether a compiled program has served a call."""
-        return self._compiled is not None and self._compiled.compiled
+    @compiled("a sampled rollout")
+    def improved(self, x: Tensor) -> Tensor:
+        """`control`, compiled where that pays: (..., n) -> (..., m)."""
+        return self.control(x)
 
     def control(self, x: Tensor) -> Tensor:
         """`forward` in plain torch: (..., n) -> (..., m)."""
@@ -218,6 +216,7 @@ class SampledRollout(nn.Module):
         found: Tensor = each(whole, x, dim=x.dim() - 2) if x.dim() > 1 else whole(x)
         return Promise(found[..., 0], found[..., 1], found[..., 2] > 0)
 
+    @compiled("whether a bound is met")
     def meets_bound(self, x: Tensor) -> Tensor:
         """1 where the base, followed over the horizon, meets a bound, else 0: (..., n) -> (..., 1)."""
         low, high = self.bounds.low.to(x), self.bounds.high.to(x)

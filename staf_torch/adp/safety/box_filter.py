@@ -7,8 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from ...lanes import repeat
-from ...lanes.function import RowFunction
+from ...lanes import compiled, repeat
 from ...numerics.checks import fail, positive_real, trailing
 from ...numerics.runge_kutta import runge_kutta_mean, runge_kutta_stages
 from ...systems import Barrier, Bounds
@@ -99,7 +98,6 @@ class BoxFilter(nn.Module):
         table = cases(len(self.walls), self.bounds.low.tolist(), self.bounds.high.tolist())
         self.register_buffer("table", table)
         self.table: Tensor
-        self._rows = RowFunction(self._definition, self, "a box filter")
 
     def forward(self, s: Tensor) -> Tensor:
         """u: (..., n) -> (..., m)."""
@@ -131,9 +129,10 @@ class BoxFilter(nn.Module):
 
     def _asked(self, s: Tensor, hold: Tensor) -> Tensor:
         trailing("BoxFilter", "s", s, 1, self.box.dim)
-        return self._rows(torch.cat((s, hold.unsqueeze(-1)), dim=-1))
+        return self._nearest(torch.cat((s, hold.unsqueeze(-1)), dim=-1))
 
-    def _definition(self, z: Tensor) -> Tensor:
+    @compiled("a box filter")
+    def _nearest(self, z: Tensor) -> Tensor:
         """u and what is missing, of rows of (s, hold): (..., n + 1) -> (..., m + 1)."""
         rows = z.reshape(-1, z.shape[-1])
         s, hold = rows[:, :-1], rows[:, -1]

@@ -10,8 +10,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ...lanes import repeat
-from ...lanes.function import RowFunction
+from ...lanes import compiled, repeat
 from ...numerics.checks import fail, non_negative, one_or_each, positive, positive_real, trailing
 from ...numerics.runge_kutta import runge_kutta_step
 from ...systems import Bounds, Plant, StepPlant
@@ -146,7 +145,6 @@ class SafetyFilter(Controller):
         if bool((second & (self.decay * self.hold > 1)).any()):
             rule = f"must be at most 1/dt = {1 / self.hold:g} where the relative degree is two"
             raise fail("SafetyFilter", "decay", rule, decay)
-        self._rows = RowFunction(self._definition, self, "a safety filter")
 
     @property
     def label(self) -> str:
@@ -182,7 +180,7 @@ class SafetyFilter(Controller):
         if t is None and self.moving:
             raise fail("SafetyFilter", "t", "must be given: a constraint depends on the time", t)
         time = torch.as_tensor(0.0 if t is None else t).to(x).expand(x.shape[:-1])
-        found = self._rows(torch.cat((x, u, time.unsqueeze(-1)), dim=-1))
+        found = self._nearest(torch.cat((x, u, time.unsqueeze(-1)), dim=-1))
         control, margin, slack = found.split((u.shape[-1], len(self.constraints), 1), dim=-1)
         return Filtered(control, margin, slack.squeeze(-1))
 
@@ -246,7 +244,8 @@ class SafetyFilter(Controller):
         parts = [torch.func.vmap(row)(x.unsqueeze(1), u.unsqueeze(1), t) for row in rows]
         return [torch.stack(column, dim=1) for column in zip(*parts, strict=True)]
 
-    def _definition(self, z: Tensor) -> Tensor:
+    @compiled("a safety filter")
+    def _nearest(self, z: Tensor) -> Tensor:
         """u, margins and slack of rows of (x, u, t): (..., n + m + 1) -> (..., m + k + 1)."""
         n, m = self.plant.equilibrium().numel(), self.plant.inputs
         flat = z.reshape(-1, z.shape[-1])

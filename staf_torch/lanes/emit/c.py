@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from ..trace.graph import FLAG, REAL, ROW, STEP, WHOLE, WIDE, Graph
-from .schedule import Layout, Schedule
-from .statements import Writer
+from .schedule import Schedule, Sizes
+from .statements import StatementWriter
 
 _INFIX = {"add": "+", "sub": "-", "mul": "*", "div": "/", "lt": "<", "le": "<=", "eq": "==", "ne": "!="}
 _INFIX |= {"and": "&&", "or": "||", "xor": "!="}
@@ -31,8 +31,8 @@ class Names(NamedTuple):
     outputs: Sequence[str]
 
 
-class _ScalarWriter(Writer):
-    def __init__(self, graph: Graph, schedule: Schedule, layout: Layout, names: Names) -> None:
+class _ScalarWriter(StatementWriter):
+    def __init__(self, graph: Graph, schedule: Schedule, layout: Sizes, names: Names) -> None:
         self.real, self._suffix = ("float", "f") if graph.single else ("double", "")
         types = {REAL: self.real, WHOLE: self.real, WIDE: "double", FLAG: "int"}
         super().__init__(graph, schedule, layout, types)
@@ -142,7 +142,7 @@ class _CWriter(_ScalarWriter):
 
 def c_text(
     graph: Graph,
-    layout: Layout,
+    layout: Sizes,
     following: Sequence[int],
     outputs: Sequence[int],
     *,

@@ -13,8 +13,8 @@ from torch import Tensor
 
 from ..trace.graph import FLAG, NOW, REAL, ROW, STEP, WHOLE, Graph
 from ..trace.tracer import LARGE
-from .schedule import Layout, Schedule, ends_with, taken_over
-from .statements import Writer
+from .schedule import Schedule, Sizes, ends_with, taken_over
+from .statements import StatementWriter
 
 _FEW = 400  # nodes of a program of which two vectors fit the registers and caches side by side
 _WRITTEN_OUT = 8  # entries of an output that are stored one by one
@@ -44,7 +44,7 @@ class Text(NamedTuple):
         return table.to(real)
 
 
-def emit(graph: Graph, layout: Layout, following: Sequence[int], outputs: Sequence[int], copies: int) -> Text:
+def emit(graph: Graph, layout: Sizes, following: Sequence[int], outputs: Sequence[int], copies: int) -> Text:
     """Write a program.
 
     Args:
@@ -57,7 +57,7 @@ def emit(graph: Graph, layout: Layout, following: Sequence[int], outputs: Sequen
     schedule = Schedule(graph, following, outputs, ahead=True)
     if not _worth(graph, schedule):
         schedule = Schedule(graph, following, outputs)
-    writer = _Writer(graph, schedule, layout, copies or _copies(schedule))
+    writer = _CppWriter(graph, schedule, layout, copies or _copies(schedule))
     return writer.write(following, outputs)
 
 
@@ -74,8 +74,8 @@ def _copies(schedule: Schedule) -> int:
     return 2 if len(steps) < _FEW or shares else 1
 
 
-class _Writer(Writer):
-    def __init__(self, graph: Graph, schedule: Schedule, layout: Layout, copies: int) -> None:
+class _CppWriter(StatementWriter):
+    def __init__(self, graph: Graph, schedule: Schedule, layout: Sizes, copies: int) -> None:
         super().__init__(graph, schedule, layout, {REAL: "V", WHOLE: "V", FLAG: "M"}, copies)
         self._in_memory = {slot for slot, size in enumerate(layout.carries) if size > LARGE}
         self._taken_over = taken_over(graph, schedule)

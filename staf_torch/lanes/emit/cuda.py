@@ -17,7 +17,7 @@ from ..trace.graph import ROW, STEP, Graph
 from ..trace.step import trace
 from ..tree import Shared, Tree, flatten, plain, unflatten
 from .c import Names, _ScalarWriter
-from .schedule import Layout, Schedule
+from .schedule import Schedule, Sizes
 
 _KINDS = ("row", "now", "carry", "out")
 _BLOCK = 128
@@ -44,11 +44,11 @@ def device_compiler(source: str, name: str) -> Callable[..., None]:
     return kernel
 
 
-class Kernel:
+class CudaKernel:
     """A program compiled for a device, for inputs of the shapes and dtypes of these.
 
     Example:
-        >>> kernel = lanes.cuda.Kernel(program, x0, u, (gain,))  # tensors on the device
+        >>> kernel = lanes.cuda.CudaKernel(program, x0, u, (gain,))  # tensors on the device
         >>> x, history = kernel(x0, u, (gain,))
 
     Args:
@@ -94,7 +94,7 @@ class Kernel:
         """
         given = Given.of(carry, now, row, steps)
         if given.key() != self._key:
-            raise ValueError("`Kernel(...)` must be called with inputs of the shapes that it was made for.")
+            raise ValueError("`CudaKernel(...)` needs inputs of the shapes that it was made for.")
         rows, recorded = given.rows, -(-given.times // every)
         leaves = flatten((row, now, carry))[0]
         times = [0] * len(given.row) + [1] * len(given.now) + [0] * len(given.carry)
@@ -170,7 +170,7 @@ class _CudaWriter(_ScalarWriter):
 
 def cuda_text(
     graph: Graph,
-    layout: Layout,
+    layout: Sizes,
     following: Sequence[int],
     outputs: Sequence[int],
     *,

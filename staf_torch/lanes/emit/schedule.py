@@ -11,7 +11,7 @@ import numpy as np
 from ..trace.graph import FIXED, NOW, REAL, ROW, STEP, Graph
 
 
-class Layout(NamedTuple):
+class Sizes(NamedTuple):
     """How many entries a program reads and writes."""
 
     rows: Sequence[int]  # of every input that a row has once

@@ -11,12 +11,12 @@ import numpy as np
 
 from ..trace.graph import FIXED, Graph
 from ..trace.tracer import NotLoweredError
-from .schedule import Layout, Schedule, evenly, leaves
+from .schedule import Schedule, Sizes, evenly, leaves
 
 _SHORTEST = 4  # entries that are worth a loop
 
 
-class Run(NamedTuple):
+class EvenRun(NamedTuple):
     """Some entries of a list: those from ``begin`` on."""
 
     begin: int
@@ -25,13 +25,13 @@ class Run(NamedTuple):
     step: int | None = None  # from place to place; None where each is an entry of its own
 
 
-def runs(places: Sequence[tuple[Hashable, int]]) -> list[Run]:
+def runs(places: Sequence[tuple[Hashable, int]]) -> list[EvenRun]:
     """Split a list of entries into runs.
 
     Args:
         places: of every entry what it is read from, and where in it.
     """
-    found, k = list[Run](), 0
+    found, k = list[EvenRun](), 0
     while k < len(places):
         source, first = places[k]
         step, length = 0, 1
@@ -40,11 +40,11 @@ def runs(places: Sequence[tuple[Hashable, int]]) -> list[Run]:
         while k + length < len(places) and places[k + length] == (source, first + length * step):
             length += 1
         if length >= _SHORTEST:
-            found.append(Run(k, length, first, step))
+            found.append(EvenRun(k, length, first, step))
         else:
             length = 1
             alone = found.pop().length if found and found[-1].step is None else 0
-            found.append(Run(k - alone, alone + 1))
+            found.append(EvenRun(k - alone, alone + 1))
         k += length
     return found
 
@@ -53,7 +53,7 @@ _INPUTS = ("const", "param", "elem", "result", "results", "collect", "carry", "c
 _ARRAYS = ("pack", "map", "dot", "collect", "carrys", "results")
 
 
-class Writer(abc.ABC):
+class StatementWriter(abc.ABC):
     """Writes the statements of blocks and loops; a back end says how numbers are read and operations spelt.
 
     Args:
@@ -65,7 +65,7 @@ class Writer(abc.ABC):
     """
 
     def __init__(
-        self, graph: Graph, schedule: Schedule, layout: Layout, types: dict[str, str], copies: int = 1
+        self, graph: Graph, schedule: Schedule, layout: Sizes, types: dict[str, str], copies: int = 1
     ) -> None:
         self.types = types
         self.graph, self.schedule, self.layout, self.copies = graph, schedule, layout, copies

@@ -12,7 +12,7 @@ from torch._decomp import decomposition_table
 from torch.overrides import TorchFunctionMode
 
 from ..call import Given
-from ..emit.schedule import Layout
+from ..emit.schedule import Sizes
 from ..loops import tracing
 from ..tree import Shared, Tree, flatten, plain
 from . import reductions  # noqa: F401  its rules
@@ -83,7 +83,7 @@ Step = Callable[[Tree, Tree, Tree], tuple[Tree, Tree]]
 class Traced(NamedTuple):
     """A program as every back end takes it, and its outputs for one row."""
 
-    program: tuple[Graph, Layout, list[int], list[int]]
+    program: tuple[Graph, Sizes, list[int], list[int]]
     outputs: tuple[tuple[torch.Size, torch.dtype], ...]
     structure: Any
     recipe: Recipe
@@ -137,7 +137,7 @@ def trace(step: Step, given: Given, *, widened: bool = False, folded: bool = Fal
             raise NotLoweredError("an output of the step has no dimension of rows")
         following = [node for end in ends for node in tracer.nodes(end).ravel().tolist()]
         outputs = [node for leaf in leaves for node in tracer.nodes(leaf).ravel().tolist()]
-        layout = Layout(
+        layout = Sizes(
             [_entries(leaf, 1) for leaf in given.row],
             [_entries(leaf, 2) for leaf in given.now],
             [_entries(leaf, 1) for leaf in given.carry],

@@ -11,10 +11,9 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from .content import code, signature, skeleton, written
+from .contents import Contents
 from .program import Program
 from .trace.step import Step
-from .watch import Watch
 
 _log = logging.getLogger(__name__)
 
@@ -37,10 +36,10 @@ class _Model(NamedTuple):
     tensors: list[Tensor]  # of the last
     versions: list[int]
     signature: bytes | None
-    code: list[Any]  # what is in the classes of the step's objects
+    methods: list[Any]  # of the library's classes that the step's objects are of
 
 
-class Kept:
+class SharedPrograms:
     """The latest programs of one kind.
 
     A step that differs from another in floating-point tensors alone takes over its text, and nothing is
@@ -53,22 +52,22 @@ class Kept:
     """
 
     def __init__(self, name: str, most: int = 64) -> None:
-        self._name, self._most, self._told = name, most, False
+        self._name, self._most, self._warned = name, most, False
         self._models: dict[Hashable, _Model] = {}
-        self._latest: dict[Hashable, tuple[Program, Watch | None, tuple[Any, ...]]] = {}
+        self._latest: dict[Hashable, tuple[Program, Contents | None, tuple[Any, ...]]] = {}
 
     def unchanged(self, *owners: Any) -> Program | None:
         """Return the program that `of` last returned for these very objects, if they are as they were.
 
-        A twentieth of the time of `of`, which reads all of them again.
+        A fiftieth of the time of `of`, which reads all of them again.
 
         Args:
             owners: as given to `of`.
         """
-        program, watch, _ = self._latest.get(_identities(owners), (None, None, None))
-        if watch is None or not watch.unchanged():
+        program, read, _ = self._latest.get(_identities(owners), (None, None, None))
+        if read is None or read.reason is not None or not read.unchanged():
             return None
-        if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in watch.tensors):
+        if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in read.tensors):
             return None
         return program
 
@@ -82,47 +81,43 @@ class Kept:
             copies: as in `Program`.
             owners: objects and settings that decide what the parts are, for `unchanged`.
         """
-        found = skeleton(copies, *parts)
-        if found is None:
-            self._say_why(parts)
-            return Program(step, name=self._name, copies=copies)
-        key, tensors = found
-        inside = [value for part in code(key) for value in part.values()]
+        read = Contents(copies, *parts)
+        if read.key is None:
+            if not self._warned:
+                self._warned = True
+                told = "%s is traced again at every call: what it reads cannot be written down: %s"
+                _log.warning(told, self._name, read.reason)
+            new = Program(step, name=self._name, copies=copies)
+            new.described(None, ())
+            return new
+        tensors = read.tensors
         if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors):
             return None
         versions = [tensor._version for tensor in tensors]
-        held = self._models.pop(key, None)
-        if held is not None and not (len(held.code) == len(inside) and all(map(is_, held.code, inside))):
-            held = None  # a method was replaced
-        if held is None:
-            new, told = Program(step, name=self._name, copies=copies), signature(key)
-            new.described(told, tensors)
-            held = _Model(new, tensors, new, tensors, versions, told, inside)
-        elif held.versions != versions or any(a is not b for a, b in zip(held.tensors, tensors, strict=True)):
+        held = self._models.pop(read.key, None)
+        if held is None or read.replaced(held.methods):
+            new, signature = Program(step, name=self._name, copies=copies), read.signature()
+            new.described(signature, tensors)
+            held = _Model(new, tensors, new, tensors, versions, signature, read.methods())
+        elif held.versions != versions or not all(map(is_, held.tensors, tensors)):
             new = held.traced.with_others(step, list(zip(held.found, tensors, strict=True)))
             new.described(held.signature, tensors)
             held = held._replace(last=new, tensors=tensors, versions=versions)
-        self._models[key] = held
-        while len(self._models) > self._most:
-            del self._models[next(iter(self._models))]
+        self._models[read.key] = held
+        _forget(self._models, self._most)
         if owners:
             latest = _identities(owners)
-            again = self._latest.pop(latest, None) is not None  # a watch is worth its time from then on
-            watch = Watch(*owners) if again else None
-            self._latest[latest] = held.last, watch, owners  # kept: an address is used once
-            while len(self._latest) > self._most:
-                del self._latest[next(iter(self._latest))]
+            again = (
+                self._latest.pop(latest, None) is not None
+            )  # a second reading is worth its time from then on
+            self._latest[latest] = held.last, Contents(*owners) if again else None, owners  # kept: addresses
+            _forget(self._latest, self._most)
         return held.last
 
-    def _say_why(self, parts: tuple[Any, ...]) -> None:
-        if not self._told:
-            self._told = True
-            reason = written(parts)
-            _log.warning(
-                "%s is traced again at every call: what it reads cannot be written down: %s",
-                self._name,
-                reason,
-            )
+
+def _forget(held: dict[Hashable, Any], most: int) -> None:
+    while len(held) > most:
+        del held[next(iter(held))]
 
 
 def _identities(owners: tuple[Any, ...]) -> Hashable:

@@ -1,0 +1,295 @@
+"""Methods of a class that a program serves once their calls pay for it: `compiled`, `ready`, `compiling`.
+
+A policy is asked ten times in a test and a hundred thousand times in a control loop. Its class says in one
+line that a method may be compiled, ``@compiled("a policy")``; the method stays plain torch, which is what it
+means. Calls are counted, and from the hundredth on a program serves. It is made anew when anything that the
+owner holds has changed (`contents`), is no part of a pickle or a copy, and is out of the way where somebody
+traces or differentiates. To compile at construction would take seconds of every short test.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Callable, Iterator
+from types import MethodType
+from typing import Any, Protocol, overload
+
+import torch
+from torch import Tensor, nn
+
+from .call import PlannedCall, ordinary
+from .contents import BOUND, Contents
+from .loops import tracing_now
+from .program import Program
+from .shared_programs import SharedPrograms
+from .tree import Tree, flatten, unflatten
+
+_PAYS = 100  # calls of a small batch in plain torch (some 10 ms each) that take as long as to compile
+_KEPT = 64  # shapes of calls that are remembered
+_shared: dict[str, SharedPrograms] = {}  # by the name of the functions
+WHEN = ("auto", "always", "never")
+_when = "auto"
+
+
+@contextlib.contextmanager
+def compiling(when: str) -> Iterator[None]:
+    """Override, within the block, the automatic choice between compiled code and plain torch.
+
+    Chases, trajectories, closed loops (``compile="auto"``) and policies compile by themselves where a call is
+    long enough to pay for the compiler. A timed control loop wants ``"always"``, a debugger ``"never"``. An
+    explicit ``compile=True`` or ``False``, and a `Program` that is called directly, are not affected.
+
+    Example:
+        >>> x0 = torch.tensor([[1.0, 0.0]]).double()
+        >>> with lanes.compiling("never"):
+        ...     states = systems.simulate(systems.VanDerPol(), x0, dt=0.01, steps=1000)
+
+        Shown by `staf_torch/lanes/README.md`.
+
+    Args:
+        when: ``auto``, ``always`` (where it is possible at all) or ``never``; of the whole process.
+
+    Raises:
+        ValueError: for another word.
+    """
+    global _when
+    if when not in WHEN:
+        raise ValueError(f"`compiling(when=...)` must be one of {', '.join(WHEN)}; got {when!r}.")
+    before, _when = _when, when
+    try:
+        yield
+    finally:
+        _when = before
+
+
+def worth(pays: bool) -> bool:
+    """Return whether an automatic choice falls on compiled code.
+
+    Args:
+        pays: whether the call is long enough to pay for the compiler.
+    """
+    return pays if _when == "auto" else _when == "always"
+
+
+class Served(Protocol):
+    """What serves in the place of a method: (n,) or (B, n) to (B, 1, m), or trees of (B, ...) to such."""
+
+    @property
+    def compiled(self) -> bool: ...
+
+    def __call__(self, *given: Tree) -> Any: ...
+
+
+class compiled:  # noqa: N801
+    """Decorator of a method whose rows are alone, y = f(x) or trees of several: compiled where that pays.
+
+    Example:
+        >>> class Damping(torch.nn.Module):
+        ...     @lanes.compiled("a damping")
+        ...     def forward(self, x):
+        ...         return -x[..., 1:].tanh()
+        >>> lanes.ready(Damping(), torch.zeros(2))
+        True
+
+        Shown by `staf_torch/lanes/README.md`.
+
+    The method takes one tensor, (..., n) -> (..., m), or several trees of (B, ...) and returns such a tree.
+
+    Args:
+        name: in the log; programs of one name share texts.
+        by: makes what serves for an owner; one program of the method by default.
+        pays: calls of a small batch in plain torch that take as long as to compile; inf: never by itself.
+        copies: as in `Program`.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        *,
+        by: Callable[[Any], Served] | None = None,
+        pays: float = _PAYS,
+        copies: int = 1,
+    ) -> None:
+        self.name, self.by, self.pays, self.copies = name, by, pays, copies
+
+    def __call__(self, definition: Callable[..., Tree]) -> compiled:
+        self.definition, self.__doc__ = definition, definition.__doc__
+        return self
+
+    @overload
+    def __get__(self, owner: None, _: type) -> compiled: ...
+    @overload
+    def __get__(self, owner: Any, _: type) -> CompiledMethod: ...
+    def __get__(self, owner: Any, _: type) -> compiled | CompiledMethod:
+        if owner is None:
+            return self
+        bound = vars(owner).get(BOUND)
+        if bound is None or bound.owner is not owner:  # none, or that of which the owner is a shallow copy
+            bound = vars(owner)[BOUND] = _Bound(owner)
+        method: CompiledMethod | None = bound.get(self)
+        if method is None:
+            method = bound[self] = CompiledMethod(MethodType(self.definition, owner), owner, self)
+        return method
+
+
+class _Bound(dict[compiled, "CompiledMethod"]):
+    """The compiled methods of an object: none of a copy or of one that comes out of a pickle."""
+
+    def __init__(self, owner: Any = None) -> None:
+        self.owner = owner
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _Bound, ()
+
+
+class CompiledMethod:
+    """A method of an owner, by its definition or by a program.
+
+    Args:
+        definition: plain torch, of one row or many.
+        owner: that holds all that the definition reads.
+        settings: of the decorator.
+    """
+
+    def __init__(self, definition: Callable[..., Tree], owner: Any, settings: compiled) -> None:
+        self.definition, self.owner, self._settings = definition, owner, settings
+        self._asked, self._waits = 0.0, False
+        self._served: Served | None = None
+        self._read: Contents | None = None
+
+    def __call__(self, x: Tensor, *more: Tree) -> Any:
+        """y: (..., n) -> (..., m), or trees of (B, ...)."""
+        if not ordinary(flatten((x, *more))[0] if more else (x,)) or x.numel() == 0 or tracing_now():
+            return self.definition(x, *more)
+        rows = x.numel() / x.shape[-1]
+        if not worth(self._asked + rows / 200 >= self._settings.pays):  # a large batch pays for itself
+            self._asked += 1 + rows / 200
+            return self.definition(x, *more)
+        if self._served is None or self._read is None or not self._read.unchanged(library=False):
+            self._served = self._compile(trees=bool(more))
+        self._waits = False
+        if more:
+            return self._served(x, *more)
+        dims = x.dim()
+        y = self._served(x if dims <= 2 else x.reshape(-1, x.shape[-1]))
+        return y.view(-1) if dims == 1 else y.reshape(*x.shape[:-1], y.shape[-1])
+
+    @property
+    def compiled(self) -> bool:
+        """Whether a compiled program has served a call."""
+        return self._served is not None and self._served.compiled
+
+    @property
+    def waits(self) -> bool:
+        """Whether it was to be compiled and has not been called since."""
+        return self._waits
+
+    def hasten(self) -> None:
+        """Compile at the next call, whatever it pays."""
+        self._asked, self._waits = math.inf, True
+
+    def _compile(self, trees: bool) -> Served:
+        settings, self._read = self._settings, Contents(self.definition, self.owner)
+        self._read.warn(settings.name)
+        if settings.by is not None:
+            return settings.by(self.owner)
+        rows = Rows(self.definition, settings.name, self.definition, self.owner, copies=settings.copies)
+        return _Trees(rows) if trees else rows
+
+
+def ready(module: nn.Module, x: Tensor) -> bool:
+    """Compile now what serves calls like ``module(x)``: no control loop must wait for it at its 100th call.
+
+    Policies of `staf_torch.adp` run in plain torch until their calls would have paid for a compiler. It takes
+    one second to thirty, once; from the user's cache the machine code is there in milliseconds.
+
+    Example:
+        >>> plant, cost = systems.TwoState(), adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
+        >>> policy = adp.RolloutPolicy.of_lqr(plant, cost)
+        >>> lanes.ready(policy, torch.zeros(1, 2).double())  # now, not in the loop
+        True
+
+        Shown by `staf_torch/lanes/README.md`.
+
+    Args:
+        module: a policy, or one that holds policies.
+        x: a state (n,) or states (B, n) as they will come; every shape has a plan of its own.
+
+    Returns:
+        Whether compiled programs serve, all there are. False where there are none, or plain torch serves: the
+        log says why.
+    """
+    methods = [method for part in module.modules() for method in methods_of(part)]
+    for method in methods:
+        method.hasten()
+    with torch.no_grad():
+        module(x)
+    called = [method for method in methods if not method.waits]
+    return bool(called) and all(method.compiled for method in called)
+
+
+def methods_of(owner: Any) -> list[CompiledMethod]:
+    """Return the compiled methods of an object."""
+    kinds = [vars(kind).values() for kind in type(owner).__mro__]
+    return [
+        value.__get__(owner, type(owner)) for kind in kinds for value in kind if isinstance(value, compiled)
+    ]
+
+
+class Rows:
+    """y = function(a, b, ...), (B, ...) to (B, ...), where nobody traces or differentiates.
+
+    Args:
+        function: plain torch, in which no row sees another.
+        name: in the log.
+        parts: all that ``function`` reads, for `SharedPrograms`; none where nothing is to be shared.
+        copies: as in `Program`.
+    """
+
+    def __init__(self, function: Callable[..., Tree], name: str, *parts: Any, copies: int = 1) -> None:
+        def step(carry: Tree, _: Tree, row: Tree) -> tuple[Tree, Tree]:
+            return carry, function(*row)
+
+        shared = _shared.setdefault(name, SharedPrograms(name))
+        program = shared.of(step, *parts, copies=copies) if parts else None
+        self.program = Program(step, name=name, copies=copies) if program is None else program
+        self._plans: dict[Any, PlannedCall] = {}
+
+    @property
+    def compiled(self) -> bool:
+        """Whether a compiled program has served a call."""
+        return bool(self._plans)
+
+    def __call__(self, *given: Tensor) -> Tensor:
+        """Return y with a dimension of one time after the rows, (B, 1, ...); (n,) is one row."""
+        # Shapes alone: the caller has looked at the rest.
+        key = tuple([(x.shape, x.stride(), x.dtype) for x in given])
+        plan = self._plans.get(key)
+        if plan is not None:
+            return plan(given)[0]
+        rows = [x.unsqueeze(0) if x.dim() == 1 else x for x in given]
+        plan, found = self.planned(*rows)
+        if plan is not None:
+            if len(self._plans) >= _KEPT:
+                self._plans.clear()
+            self._plans[key] = plan
+        return found
+
+    def planned(self, *given: Tensor) -> tuple[PlannedCall | None, Tensor]:
+        """Return the plan of calls with such inputs, (B, ...), None where the definition runs; and y."""
+        prepared = self.program.prepare((), (), tuple(given), steps=1)
+        found: Tensor = prepared((), (), tuple(given))[1]
+        return prepared.plan, found
+
+
+class _Trees:
+    """As `Rows`, of trees (B, ...) to trees (B, ...)."""
+
+    def __init__(self, rows: Rows) -> None:
+        self._program, self.compiled = rows.program, False
+
+    def __call__(self, *given: Tree) -> Tree:
+        self.compiled = self.compiled or self._program.compiles((), (), given, steps=1)
+        leaves, structure = flatten(self._program((), (), given, steps=1)[1])
+        return unflatten(structure, iter([leaf[:, 0] for leaf in leaves]))

@@ -1,0 +1,443 @@
+"""What objects and functions hold and lead to, so that no program computes with a number that has changed.
+
+The objects are pickled, which walks through all that they hold; the text, with classes and functions by
+their identity and floating-point tensors by their order, is a key: equal keys compute the same. On the way
+every container, tensor and class is noted, so that `Contents.unchanged` needs no second walk: it compares
+identities, ten microseconds for a policy, where tracing a step anew takes .1 to .4 s and the policy thirty
+microseconds. A function of a user also counts with what it reads beside its arguments: closure, defaults,
+attributes, and every global that its code names, and so on through the functions and classes found there.
+The library's own code, Python's and that of installed packages stands as it is.
+"""
+
+from __future__ import annotations
+
+import copyreg
+import dis
+import functools
+import hashlib
+import io
+import logging
+import operator
+import pickle
+import sys
+import sysconfig
+from collections.abc import Callable, Iterable, Iterator
+from itertools import chain
+from operator import is_
+from pathlib import Path
+from types import BuiltinFunctionType, CellType, CodeType, FunctionType, MethodType, ModuleType
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+_PACKAGE = __name__.partition(".")[0]
+_OF_PYTHON = frozenset(sys.stdlib_module_names) - {"__main__"}
+_FOLDERS = tuple(Path(sysconfig.get_path(name)) for name in ("stdlib", "platstdlib", "purelib", "platlib"))
+_PACKAGES = frozenset(("site-packages", "dist-packages"))
+_VERSIONED = frozenset((_PACKAGE, "torch", "numpy", *_OF_PYTHON))  # other processes have the same
+_ATOMS = frozenset((str, int, float, bool, bytes, tuple, type(None)))  # and what an address alone tells apart
+_SMALL = 1 << 14  # bytes of an array that are compared at every call
+_FIXED = (
+    *(tuple, type, frozenset, complex, slice, range, np.generic, np.dtype, torch.dtype, torch.device),
+    *(FunctionType, BuiltinFunctionType, MethodType),
+)
+_SIMPLE = (int, float, complex, str, bytes, tuple, list, dict, set, frozenset, Tensor)
+_OF_EVERY_MODULE = frozenset(vars(nn.Module()))  # looked into by themselves
+_log = logging.getLogger(__name__)
+_said: set[tuple[str, str]] = set()  # what has been logged
+_MISSING = object()
+_EMPTY = object()  # in a cell whose name has no value yet
+BOUND = "_compiled_methods"
+"""Attribute in which an object holds its compiled methods: no part of what it is."""
+
+
+@functools.lru_cache(maxsize=4096)
+def installed(module: str) -> bool:
+    """Return whether a module's code stands: this library's, Python's own, what lies in a folder of packages.
+
+    What is left is a user's: a script, a notebook, files beside it.
+
+    Args:
+        module: its name; one that is not loaded counts as a user's.
+    """
+    root = module.partition(".")[0]
+    if root == _PACKAGE or root in _OF_PYTHON or root.startswith("namedtuple_"):
+        return True
+    file = getattr(sys.modules.get(module), "__file__", None)
+    if file is None:
+        return False
+    path = Path(file)
+    return bool(_PACKAGES & set(path.parts)) or any(path.is_relative_to(folder) for folder in _FOLDERS)
+
+
+def is_users(value: FunctionType | type) -> bool:
+    """Return whether a function or a class is of a user, and may read what changes between two calls."""
+    module = value.__globals__.get("__name__") if isinstance(value, FunctionType) else value.__module__
+    return not (isinstance(module, str) and installed(module))
+
+
+class Derived:
+    """Base of what follows from its recipe in a pickle, as programs do: nothing inside of it is watched."""
+
+
+class Contents:
+    """All that objects hold and lead to.
+
+    Args:
+        objects: modules, tensors, functions, anything that can be pickled.
+
+    Attributes:
+        key: of the settings inside; None where something cannot be written down (an open file, a lock).
+        tensors: the floating-point tensors that the key leaves out, in an order that equal keys share.
+        reason: why there is no key, or what cannot be watched; None where all can.
+        of_users: whether code of a user is among what objects hold or lead to, or nobody can say.
+    """
+
+    def __init__(self, *objects: Any) -> None:
+        walk = self._walk = _Walk(io.BytesIO())
+        self.key: tuple[bytes, tuple[object, ...]] | None = None
+        try:
+            for each in objects:
+                walk.dump(each)
+            walk.finish()
+            self.key = walk.file.getvalue(), tuple(walk.kept)
+            self.reason = walk.unwatched
+        except Exception as error:  # of any object that a function names: a lock, a deep list, a proxy
+            self.reason = f"{type(error).__name__}: {error}"
+        self.tensors, self.of_users = walk.tensors, walk.of_users or self.key is None
+        kinds = (kind for each in walk.kept if isinstance(each, type) for kind in each.__mro__)
+        classes = [kind for kind in dict.fromkeys(kinds) if kind is not object]
+        self._users = [vars(kind) for kind in classes if is_users(kind)]
+        self._library = [vars(kind) for kind in classes if not is_users(kind)]
+        self._changeable = [*walk.tensors, *walk.others]
+        self._versions = [tensor._version for tensor in self._changeable]
+        self._sets = [(part, set(part)) for part in walk.sets]
+        self._arrays = [(array, array.tobytes()) for array in walk.arrays]
+        self._lengths, self._inside = self._look()
+        self._methods = self.methods()
+
+    def warn(self, name: str) -> None:
+        """Log, once, what cannot be watched."""
+        if self.reason is not None and (name, self.reason) not in _said:
+            _said.add((name, self.reason))
+            _log.warning("%s takes as it stands what cannot be watched: %s", name, self.reason)
+
+    def unchanged(self, *, library: bool = True) -> bool:
+        """Return whether nothing of what can be watched has changed since.
+
+        Args:
+            library: whether to look for replaced methods of classes that are not a user's, too.
+        """
+        lengths, inside = self._look()  # all at once: a hundred containers in ten microseconds
+        return (
+            lengths == self._lengths
+            and not any(self._walk.empty)
+            and all(map(is_, inside, self._inside))
+            and [tensor._version for tensor in self._changeable] == self._versions
+            and all(now == then for now, then in self._sets)
+            and all(now.tobytes() == then for now, then in self._arrays)
+            and not (library and self.replaced(self._methods))
+        )
+
+    def methods(self) -> list[Any]:
+        """Return what is in the library's classes that were come upon, and in their bases."""
+        return [*chain.from_iterable(part.values() for part in self._library)]
+
+    def replaced(self, methods: list[Any]) -> bool:
+        """Return whether a method of the library's is not what it was among ``methods``."""
+        now = self.methods()
+        return len(now) != len(methods) or not all(map(is_, now, methods))
+
+    def signature(self) -> bytes | None:
+        """Return the key as bytes that mean the same in every process.
+
+        None where it names a class or function of which another process may have another version: all but
+        this library, torch and Python's own.
+        """
+        if self.key is None:
+            return None
+        text, kept = self.key
+        names = [text]
+        for value in kept:
+            if isinstance(value, CodeType | _Same):
+                return None
+            module, name = getattr(value, "__module__", None) or "", value.__qualname__  # type: ignore[attr-defined]
+            found: Any = sys.modules.get(module)
+            for part in name.split("."):
+                found = getattr(found, part, None)
+            if found is not value or module.partition(".")[0] not in _VERSIONED:
+                return None
+            names.append(f"{module}.{name}".encode())
+        return b"\0".join(names)
+
+    def _look(self) -> tuple[list[int], list[Any]]:
+        """The lengths of all containers, and what is in them."""
+        walk = self._walk
+        parts: list[Iterable[Any]] = [part.values() for part in (*walk.dicts, *self._users)]
+        parts += [read(attributes) for attributes, read in walk.modules]
+        parts += walk.lists
+        parts.append(lookup.value for lookup in walk.lookups)
+        parts.append(map(_content_of, walk.cells))
+        parts += ((part.__code__, part.__defaults__) for part in walk.functions)  # an editor may reload them
+        sized = (walk.dicts, self._users, walk.lists, (attributes for attributes, _ in walk.modules))
+        try:
+            return [*map(len, chain(*sized))], [*chain.from_iterable(parts)]
+        except KeyError:  # an attribute is gone
+            return [], []
+
+
+class _Same:
+    """An object as a key: equal to itself alone, and kept, so that its address is used once."""
+
+    __slots__ = ("value",)
+
+    def __init__(self, value: object) -> None:
+        self.value = value
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Same) and self.value is other.value
+
+    def __hash__(self) -> int:
+        return id(self.value)
+
+
+class _Lookup(NamedTuple):
+    """A name that code looks up in the globals of its module, or in a module that it found there."""
+
+    space: dict[str, Any]
+    name: str
+
+    @property
+    def value(self) -> Any:
+        return self.space.get(self.name, _MISSING)
+
+
+def _lookups(function: FunctionType) -> Iterator[_Lookup]:
+    """Yield what a function looks up by name: its globals, and attributes of modules there or in its closure.
+
+    An attribute counts for every module that the function knows; too many do no harm.
+    """
+    names, attributes = _names(function.__code__)
+    closed_over = map(_content_of, function.__closure__ or ())
+    spaces = [(function.__globals__, names)]
+    spaces += [(vars(part), attributes) for part in closed_over if isinstance(part, ModuleType)]
+    seen = {id(space) for space, _ in spaces}
+    while spaces:
+        space, names = spaces.pop()
+        for name in names:
+            if name in space:
+                value = space[name]
+                yield _Lookup(space, name)
+            else:
+                value = sys.modules.get(name)  # an import inside of the function
+            if isinstance(value, ModuleType) and id(vars(value)) not in seen:
+                seen.add(id(vars(value)))
+                spaces.append((vars(value), attributes))
+
+
+@functools.lru_cache(maxsize=4096)
+def _names(code: CodeType) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """The names that code and the code inside of it look up, and the attributes that it asks for."""
+    names, attributes = dict[str, None](), dict[str, None]()
+    for instruction in dis.get_instructions(code):
+        if instruction.opname in ("LOAD_GLOBAL", "LOAD_NAME", "IMPORT_NAME"):
+            names[instruction.argval.partition(".")[0]] = None
+        if instruction.opname in ("LOAD_ATTR", "LOAD_METHOD", "IMPORT_FROM", "IMPORT_NAME"):
+            attributes.update(dict.fromkeys(instruction.argval.split(".")))
+    for part in code.co_consts:
+        if isinstance(part, CodeType):
+            inner, asked = _names(part)
+            names.update(dict.fromkeys(inner))
+            attributes.update(dict.fromkeys(asked))
+    return tuple(names), tuple(attributes)
+
+
+def _content_of(cell: CellType) -> Any:
+    """What a function closes over, or `_EMPTY`."""
+    try:
+        return cell.cell_contents
+    except ValueError:
+        return _EMPTY
+
+
+class _Walk(pickle.Pickler):
+    """Writes everything but floating-point tensors, and notes what may change later."""
+
+    def __init__(self, file: io.BytesIO) -> None:
+        super().__init__(file)
+        self.file = file
+        self.kept: list[object] = []  # part of the key: an address is used once
+        self.tensors: list[Tensor] = []
+        self.others: list[Tensor] = []  # whose numbers are part of the key
+        self.dicts: list[dict[Any, Any]] = []
+        self.empty: list[dict[Any, Any]] = []  # most of them the hooks of a module
+        self.modules: list[tuple[dict[str, Any], Callable[[Any], tuple[Any, ...]]]] = []
+        self.lists: list[list[Any]] = []
+        self.sets: list[set[Any]] = []
+        self.arrays: list[np.ndarray[Any, Any]] = []
+        self.lookups: list[_Lookup] = []
+        self.cells: list[CellType] = []
+        self.functions: list[FunctionType] = []
+        self.of_users = False
+        self.unwatched: str | None = None
+        self._states: dict[int, Any] = {}  # containers that are noted, or made on the way
+        self._places: dict[int, int] = {}
+        self._waiting: list[FunctionType | type] = []  # whose surroundings are to be written
+        self._met: dict[int, int] = {}  # of a function or class of a user: its place among the kept
+
+    def finish(self) -> None:
+        """Write what the functions and classes of a user read that were come upon, and so on."""
+        while self._waiting:
+            met = self._waiting.pop()
+            self.dump(_class_parts(met) if isinstance(met, type) else self._function_parts(met))
+
+    def _function_parts(self, function: FunctionType) -> tuple[Any, ...]:
+        """What a function reads beside its arguments."""
+        parts: list[Any] = [function.__defaults__, function.__kwdefaults__, vars(function)]
+        for cell in function.__closure__ or ():
+            self.cells.append(cell)
+            content = _content_of(cell)
+            if content is _EMPTY or (isinstance(content, ModuleType) and is_users(function)):
+                self.kept.append(_Same(content))  # and what the function asks a module for, below
+            else:
+                parts.append(content)
+        for lookup in _lookups(function) if is_users(function) else ():
+            self.lookups.append(lookup)
+            value = lookup.value
+            parts.append(lookup.name)
+            if isinstance(value, ModuleType) or installed(str(lookup.space.get("__name__", ""))):
+                self.kept.append(_Same(value))
+            else:
+                parts.append(value)
+        return tuple(parts)
+
+    def reducer_override(self, value: Any) -> Any:
+        if isinstance(value, nn.Module):
+            # The keys of hooks count all hooks of the process, and those of state_dicts change no result.
+            state = {k: v for k, v in value.__getstate__().items() if "state_dict" not in k and k != BOUND}
+            hooks = {k: tuple(v.values()) for k, v in state.items() if k.endswith("_hooks") and v}
+            self.dicts += [state[k] for k in hooks]
+            state |= hooks
+            self._states[id(state)] = state
+            own = [k for k in state if k not in _OF_EVERY_MODULE]
+            self.modules.append((vars(value), operator.itemgetter("training", "training", *own)))
+            return copyreg.__newobj__, (type(value),), state  # type: ignore[attr-defined]
+        if BOUND in getattr(value, "__dict__", ()):
+            made = list(value.__reduce_ex__(2))
+            made[2] = {k: v for k, v in made[2].items() if k != BOUND}
+            self._states[id(made[2])] = made[2]
+            return tuple(made)
+        return NotImplemented
+
+    def persistent_id(self, value: Any) -> Any:
+        if type(value) in _ATOMS:  # most of all: asked for every object
+            return None
+        if isinstance(value, Tensor):
+            return self._tensor(value)
+        if isinstance(value, type | FunctionType | BuiltinFunctionType):
+            return self._code(value)
+        if isinstance(value, ModuleType):
+            if not installed(value.__name__):
+                raise pickle.PicklingError(f"the module {value.__name__}, which may change")
+            self.kept.append(_Same(value))
+            return len(self.kept)
+        if isinstance(value, np.ndarray) and not value.dtype.hasobject:
+            if value.nbytes <= _SMALL:
+                self.arrays.append(value)
+            else:
+                self.unwatched = f"an array of {value.nbytes} bytes"
+            # By their digest: keys stay small.
+            return str(value.dtype), value.shape, hashlib.blake2b(value.tobytes()).digest()
+        if type(value).__module__ == "itertools":  # Python 3.12 warns of it, 3.14 refuses
+            raise pickle.PicklingError(f"an iterator, {type(value).__name__}")
+        self._note(value)
+        return None
+
+    def _code(self, value: type | FunctionType | BuiltinFunctionType) -> int:
+        """Note a class or function; once where more than its address decides what it does."""
+        function = isinstance(value, FunctionType)
+        users = not isinstance(value, BuiltinFunctionType) and is_users(value)
+        if not users and not (function and value.__closure__ is not None):
+            self.kept.append(value)
+            return len(self.kept)
+        if id(value) not in self._met:
+            if function:
+                self.functions.append(value)
+            self.kept.append(value.__code__ if function else value)  # a lambda is often made anew
+            self.of_users = self.of_users or users
+            self._met[id(value)] = len(self.kept)
+            self._waiting.append(value)
+        return self._met[id(value)]
+
+    def _tensor(self, value: Tensor) -> Any:
+        if not value.is_floating_point():
+            self.others.append(value)
+            plain = value.detach().cpu()
+            return str(value.dtype), str(value.device), tuple(value.shape), plain.numpy().tobytes()
+        if id(value) not in self._places:
+            self._places[id(value)] = len(self.tensors)
+            self.tensors.append(value)
+        place = self._places[id(value)]
+        return place, str(value.dtype), str(value.device), tuple(value.shape), value.stride()
+
+    def _note(self, value: Any) -> None:
+        """Note what may change inside of an object; a module is noted in `reducer_override`."""
+        if isinstance(value, Derived):
+            return
+        if isinstance(value, list):
+            self.lists.append(value)
+        elif isinstance(value, set):
+            self.sets.append(value)
+        elif isinstance(value, dict):
+            self._note_dict(value)
+        if hasattr(value, "__dict__"):
+            if not isinstance(value, nn.Module):
+                self._note_dict(vars(value))
+        elif not isinstance(value, (list, set, dict, *_FIXED)):
+            self.unwatched = f"an object of {type(value).__qualname__}"
+
+    def _note_dict(self, value: dict[Any, Any]) -> None:
+        if id(value) not in self._states:
+            self._states[id(value)] = value
+            (self.dicts if value else self.empty).append(value)
+
+
+def _class_parts(kind: type) -> tuple[Any, ...]:
+    """What the classes of a user hold from which one is derived: functions, numbers, containers."""
+    users = [vars(each).items() for each in kind.__mro__ if is_users(each)]
+    return tuple(part for items in users for name, value in items for part in _attribute_parts(name, value))
+
+
+def _attribute_parts(name: str, value: Any) -> Iterable[Any]:
+    """What an attribute of a class holds that a step may read: functions, or itself."""
+    if isinstance(value, property):
+        return [part for part in (value.fget, value.fset, value.fdel) if part is not None]
+    value = getattr(value, "__func__", value)  # of a static or class method
+    known = (
+        FunctionType if name.startswith("__") else (FunctionType, *_SIMPLE)
+    )  # not annotations and the like
+    return [value] if isinstance(value, known) else []
+
+
+def unpatched() -> bool:
+    """Return whether no function of a user, nor a mock, stands in a module or class of this package.
+
+    No other process sees what was put there (`kernels.GaussianKernel.core = mine`), so that nothing may be
+    read from the cache or written to it.
+    """
+    modules = [m for name, m in list(sys.modules.items()) if name.partition(".")[0] == _PACKAGE]
+    values = [value for module in modules for value in vars(module).values()]
+    classes = [v for v in values if isinstance(v, type) and v.__module__.partition(".")[0] == _PACKAGE]
+    values += [value for each in dict.fromkeys(classes) for value in vars(each).values()]
+    return not any(map(_foreign, values))
+
+
+def _foreign(value: Any) -> bool:
+    while isinstance(value, property | staticmethod | classmethod | functools.partial):
+        value = (
+            getattr(value, "fget", None) or getattr(value, "__func__", None) or getattr(value, "func", None)
+        )
+    users = isinstance(value, FunctionType) and is_users(value)
+    return users or type(value).__module__.partition(".")[0] == "unittest"
