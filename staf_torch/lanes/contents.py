@@ -321,7 +321,7 @@ class _Walk(pickle.Pickler):
             self.dicts += [state[k] for k in hooks]
             state |= hooks
             self._states[id(state)] = state
-            own = [k for k in state if k not in _OF_EVERY_MODULE]
+            own = [k for k in vars(value) if k in state and k not in _OF_EVERY_MODULE]
             self.modules.append((vars(value), operator.itemgetter("training", "training", *own)))
             return copyreg.__newobj__, (type(value),), state  # type: ignore[attr-defined]
         if BOUND in getattr(value, "__dict__", ()):
