@@ -85,7 +85,7 @@ def inside(calls: int, seed: int, chosen: Sequence[str]) -> None:
 
     from staf_torch import lanes
     from staf_torch.online import StaFRegressor
-    from staf_torch.online.mixture.bank import Bank
+    from staf_torch.online.mixture.regressor import Bank
     from staf_torch.online.mixture.rules import RECENT, BankShape, Rules
 
     chance = random.Random(seed)

@@ -7,19 +7,20 @@ import inspect
 import pkgutil
 import sys
 from collections.abc import Mapping
-from typing import Any, TypeVar
+from typing import Any
 
-_T = TypeVar("_T")
+Kinds = dict[str, Any]
+"""Classes by name; `type[Base]` would not take a base that is abstract."""
 
 
-def variants(package: str, base: type[_T]) -> dict[str, type[_T]]:
+def variants(package: str, base: Any) -> Kinds:
     """Import every file of a package and return the public subclasses of a base, by class name.
 
     Args:
         package: its ``__name__``.
         base: itself among them.
     """
-    found: dict[str, type[_T]] = {}
+    found: Kinds = {}
     for file in pkgutil.iter_modules(sys.modules[package].__path__):
         module = importlib.import_module(f"{package}.{file.name}")
         for name, kind in vars(module).items():
@@ -29,17 +30,17 @@ def variants(package: str, base: type[_T]) -> dict[str, type[_T]]:
     return found
 
 
-def unlisted(names: Mapping[str, Any], base: type[_T]) -> dict[str, type[_T]]:
+def unlisted(names: Mapping[str, Any], base: Any) -> Kinds:
     """Return the variants of files of which a package has no name yet, as lines for type checkers give it."""
     listed = {kind.__module__ for kind in names.values() if inspect.isclass(kind)}
     found = variants(names["__name__"], base)
     return {name: kind for name, kind in found.items() if kind.__module__ not in listed}
 
 
-def without_arguments(kinds: Mapping[str, type[_T]]) -> dict[str, type[_T]]:
+def without_arguments(kinds: Kinds) -> Kinds:
     """Return the concrete ones of some classes that need no argument, by the name of their file."""
 
-    def needs_none(kind: type[Any]) -> bool:
+    def needs_none(kind: Any) -> bool:
         given = inspect.signature(kind).parameters.values()
         packed = inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD
         return all(each.default is not each.empty or each.kind in packed for each in given)

@@ -11,7 +11,7 @@ from torch import Tensor, inf, nan
 from variants import over
 
 import staf_torch as st
-from staf_torch.online.mixture.bank import Bank
+from staf_torch.online.mixture.regressor import Bank
 from staf_torch.online.mixture.rules import RECENT, BankShape
 
 needs_compiler = pytest.mark.needs_compiler

@@ -8,7 +8,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from staf_torch.online.mixture.bank import Bank
 from staf_torch.online.mixture.members import (
     Hyperparameters,
     Stretch,
@@ -17,6 +16,7 @@ from staf_torch.online.mixture.members import (
     search,
     sensitivity,
 )
+from staf_torch.online.mixture.regressor import Bank
 from staf_torch.online.mixture.rules import FADING, PLAIN, TURNED, TURNED_FADING, BankShape
 
 

@@ -1,16 +1,200 @@
-"""The bank of forecasters as a regressor for streams, with the conventions of scikit-learn."""
+"""The bank of forecasters, and the regressor for streams around it with the conventions of scikit-learn."""
 
 from __future__ import annotations
 
+import ctypes
+import functools
+import math
+from collections.abc import Callable
 from typing import Any, Self
 
+import torch
 from torch import Tensor
 
+from ...centers import simplex
+from ...kernels import GaussianKernel
+from ...lanes.compiler import compiled
 from ...numerics.checks import flag, integer, positive_real
+from ..compiled_filter import NATIVE, FunctionPointers
 from ..estimator import StreamEstimator
+from ..filter_streams import refuse_other, table_of
+from ..local_functions import LocalFunctions
 from ..samples import pair
-from .bank import Bank
-from .rules import RECENT, BankShape
+from .definition import BankDefinition
+from .rules import (
+    CARRIED_RADIUS,
+    CARRIED_WIDTH,
+    RECENT,
+    SEARCHED,
+    TRACKED,
+    BankShape,
+    Rules,
+    refuse_unwritten,
+    size,
+)
+
+_NUMBERS = len(Rules.of(1, True).numbers())
+
+
+class RulesInC(ctypes.Structure):
+    """`Rules` of _bank.hpp: numbers, then the local functions of the filters."""
+
+    _fields_ = (("numbers", ctypes.c_double * _NUMBERS), ("functions", FunctionPointers))
+
+
+class BankCall(ctypes.Structure):
+    """`Call` of _bank.cpp."""
+
+    _fields_ = (
+        ("streams", ctypes.c_int64),
+        ("mode", ctypes.c_int64),
+        *((name, ctypes.c_void_p) for name in ("table", "x", "y", "lapse", "mean", "deviation", "rules")),
+    )
+
+
+class Bank:
+    """Bounded memory, local Gaussian processes on it, and carried models, for many streams.
+
+    A stream keeps C samples: the latest `RECENT` and others spread in space, as a full store gives up the
+    older of the closest pair of those that are not recent. At x a linear model (recursive least squares)
+    predicts, and 24 Gaussian processes on k samples correct what it leaves: the k nearest, without and
+    with two rates of fading by age, and the k latest, each with three widths and two noises, amplitudes
+    y'K^-1 y / k. Beside them stand eight filters (`LocalFilter`, M = n + 1), eight models quadratic in x
+    (recursive least squares, five rates of forgetting), eight Gaussian processes on at most 95 samples of the
+    whole past that fade (`TrackerModels`; four learn width, noise, rate of fading and a metric), that linear
+    model and the last value.
+
+    Every member's variance is scaled by its running squared error. The members are mixed by discounted
+    scores, part Student-t likelihood with the member's variance, part with the common running error, at
+    three rates of discount, and the less the less certain they are; the three mixtures are mixed alike. With
+    what least squares on groups of members adds to that, and a mixture by squared errors over a long time,
+    they make a mean, and a map of that mean to what usually follows it (33 knots) makes another one, for
+    functions that saturate and targets of few values; the four are weighed by how they predict. The variance
+    follows the running squared error.
+
+    Args:
+        shape: sizes.
+        streams: S.
+        scaling: whether the units of x and y are learned, from the first 2, 5, 10, 20 and 40 samples.
+        doubtful: standard deviations beyond which a sample waits for the next one: if that is as far off,
+            both are learned, else the first is skipped. By default 30, and 8 for an error of more than 12
+            spreads of y. Where more than one in twenty is doubted, none waits.
+        compile: whether compiled code runs where there is a compiler; else the definition.
+    """
+
+    def __init__(
+        self,
+        shape: BankShape,
+        streams: int,
+        scaling: bool,
+        doubtful: float | None = None,
+        *,
+        compile: bool = True,
+    ) -> None:
+        assert shape.capacity >= RECENT  # a full store gives up a sample that is not recent
+        self.shape, self.scaling, self.dtype = shape, scaling, torch.float64
+        width = CARRIED_WIDTH * math.sqrt(shape.dim)
+        functions = LocalFunctions.of(GaussianKernel(width), CARRIED_RADIUS * width * simplex(shape.dim))
+        rules = Rules.of(shape.dim, scaling, doubtful)
+        pointers, self._held = FunctionPointers.of(functions)
+        self._rules = RulesInC((ctypes.c_double * _NUMBERS)(*rules.numbers()), pointers)
+        self._call, self._run = BankCall(), _built(shape) if compile else None
+        self.definition = BankDefinition(shape, rules, functions)
+        self.table = torch.zeros(0, size(shape), dtype=torch.float64)
+        self.add(streams)
+
+    @property
+    def compiled(self) -> bool:
+        """Whether compiled code runs, and not the definition."""
+        return self._run is not None
+
+    def add(self, streams: int) -> None:
+        """Begin further streams, behind the others."""
+        old = len(self.table)
+        self.replace(torch.cat((self.table, self.table.new_zeros(streams, self.table.shape[1]))))
+        self.clear(torch.arange(old, old + streams))
+
+    def replace(self, table: Tensor) -> None:
+        """Hold these streams, (S, size), instead."""
+        self.table = table.contiguous()
+        self._call.streams, self._call.table = len(table), self.table.data_ptr()
+        self._call.rules = ctypes.addressof(self._rules)
+
+    def clear(self, rows: Tensor) -> None:
+        """Let the streams with these numbers begin anew."""
+        part = self.table.new_zeros(len(rows), self.table.shape[1])  # what was counted included
+        for stream in self.definition.each(part):
+            self.definition.clear(stream)
+        self.table[rows] = part
+
+    @property
+    def count(self) -> int:
+        """S."""
+        return len(self.table)
+
+    def keep(self, rows: Tensor) -> None:
+        """Go on with the streams with these numbers alone."""
+        self.replace(self.table[rows])
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """A copy of all that learning changes."""
+        return {"table": self.table.clone()}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Take over what `state_dict` of as many streams has.
+
+        Raises:
+            ValueError: if the table has another shape, dtype or device, or numbers that no bank has written:
+                compiled code goes by them.
+        """
+        table = table_of(state)
+        refuse_other({"table": table}, {"table": self.table}, size(self.shape), table.shape[1])
+        refuse_unwritten(self.shape, table)
+        self.replace(table.clone())
+
+    @property
+    def learned(self) -> Tensor:
+        """Samples learned, (S,) int64."""
+        return self.table[:, 4].long()
+
+    @property
+    def skipped(self) -> Tensor:
+        """Samples skipped, (S,) int64."""
+        return self.table[:, 3].long()
+
+    def predict(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and standard deviation of the next y at x (S, n), contiguous float64: (S, K), (S, K)."""
+        shape = len(self.table), self.shape.outputs
+        mean, deviation = x.new_empty(shape), x.new_empty(shape)
+        if self._run is None:
+            for i, stream in enumerate(self.definition.each(self.table)):
+                mean[i], deviation[i] = self.definition.predict(stream, x[i])
+            return mean, deviation
+        call = self._call
+        call.mode, call.x, call.mean, call.deviation = 1, x.data_ptr(), mean.data_ptr(), deviation.data_ptr()
+        self._run(ctypes.byref(call))
+        return mean, deviation
+
+    def learn(self, x: Tensor, y: Tensor, lapse: Tensor | None = None) -> None:
+        """Learn one sample a stream: (S, n), (S, K), contiguous float64; time since the last sample, (S,)."""
+        if self._run is None:
+            lapses = [1.0] * len(x) if lapse is None else lapse.tolist()
+            for s, *sample in zip(self.definition.each(self.table), x, y, lapses, strict=True):
+                self.definition.learn(s, *sample)
+            return
+        call = self._call
+        call.mode, call.x, call.y = 2, x.data_ptr(), y.data_ptr()
+        call.lapse = None if lapse is None else lapse.data_ptr()
+        self._run(ctypes.byref(call))
+
+
+@functools.cache
+def _built(shape: BankShape) -> Callable[..., None] | None:
+    sizes = f"DIM={shape.dim}", f"COUNT={shape.dim + 1}", f"OUTPUTS={shape.outputs}"
+    kept = f"CAPACITY={shape.capacity}", f"NEIGHBOURS={shape.neighbours}"
+    trackers = f"TRACKED={TRACKED}", f"SEARCHED={SEARCHED}"
+    return compiled(NATIVE / "_bank.cpp", *sizes, *kept, *trackers)
+
 
 _NAME = "MixtureRegressor"
 

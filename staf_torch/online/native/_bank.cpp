@@ -1,7 +1,7 @@
 // A call of `Bank` on many streams, one after the other: what mixture/definition.py defines. The members of the bank are
 // the lanes. DIM, COUNT, OUTPUTS, CAPACITY, NEIGHBOURS are given on the command line of the compiler.
 
-#include "_mixture.hpp"
+#include "_bank.hpp"
 
 #include <cstring>
 
