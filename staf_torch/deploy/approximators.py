@@ -1,4 +1,4 @@
-"""What a device evaluates of a StaF approximation: the value and its gradient.
+"""A StaF approximation for a device: the value and its gradient.
 
 For kernels with an exponential core the constants are folded into a series: a few multiplications instead of
 a library. For every other kernel the library's own local basis is traced.
@@ -210,7 +210,7 @@ def _expand(space: GradedSpace, beta: Tensor, eps: float, reach: float) -> _Seri
 
 
 def _negligible(terms: list[Tensor], eps: float, reach: float) -> bool:
-    """Whether the last term and its derivative are below the rounding of the value where |tau| <= reach."""
+    """Return whether the last term and its slope are below the rounding of the value at |tau| <= reach."""
     last, p = float(terms[-1].abs().sum()), len(terms) - 1
     for at in (1.0, reach):
         size = max(float(term.abs().sum()) * at**q for q, term in enumerate(terms))

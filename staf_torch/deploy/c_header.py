@@ -33,14 +33,14 @@ _FREE = set("const elem result collect carry state row now load pack cast loop".
 
 
 class Source(NamedTuple):
-    """What one call of a header costs."""
+    """Cost of a call of a header."""
 
     constants: int  # numbers in it
     flops: int
     functions: int  # calls of exp and the like
 
     def work(self, entries: int, dtype: torch.dtype) -> Work:
-        """The same as `staf-export` says it.
+        """Return the cost in the words of `staf-export`.
 
         Args:
             entries: of all inputs and outputs.

@@ -1,4 +1,4 @@
-"""What a device computes of a controller: u from x, with what was learned held fixed."""
+"""A controller for a device: u from x, with what was learned held fixed."""
 
 from __future__ import annotations
 
@@ -185,7 +185,7 @@ class FoldedRollout(nn.Module):
 
 
 def foldable(policy: RolloutPolicy) -> bool:
-    """Whether `FoldedRollout` takes a policy: one scalar radius, a state-free core, a known factor."""
+    """Return whether `FoldedRollout` takes a policy: one scalar radius, a state-free core, a known factor."""
     kernel, radius = policy.basis.kernel, policy.basis.centers.radius
     bound = radius.bound()
     known = kernel.state_free and kernel.scale_slope in (0.0, 1.0)

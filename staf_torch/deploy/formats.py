@@ -190,5 +190,5 @@ def runner_package(path: Path) -> Run:
 
 
 def as_tuple(out: Tensor | tuple[Tensor, ...]) -> tuple[Tensor, ...]:
-    """One output or several, as a tuple."""
+    """Return an output, or several, as a tuple."""
     return (out,) if isinstance(out, Tensor) else tuple(out)

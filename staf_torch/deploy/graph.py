@@ -65,7 +65,7 @@ def trace(module: nn.Module, example: Tensor, *, batch: int | None = None) -> Ex
 
 
 def fold(graph: fx.GraphModule) -> fx.GraphModule:
-    """The same graph with every operation on constants alone done once, here."""
+    """Return the graph with every operation on constants alone done once, here."""
     known: dict[fx.Node, Any] = {}
     for node in graph.graph.nodes:
         if node.op == "get_attr":
@@ -123,7 +123,7 @@ _TENSOR: dict[Any, Any] = {
 
 
 def lift_numbers(graph: fx.GraphModule) -> fx.GraphModule:
-    """The same graph with the numbers that float32 does not hold exactly as constants of their own."""
+    """Return the graph with the numbers that float32 does not hold exactly as constants of their own."""
     count = 0
     for node in list(graph.graph.nodes):
         inexact = [at for at, value in enumerate(node.args) if isinstance(value, float) and _inexact(value)]

@@ -95,18 +95,18 @@ class RememberedPolicy(nn.Module):
         return chosen
 
     def follow(self, x: Tensor, window: Tensor, end: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """As `follow_plan`."""
+        """Follow a plan, as `follow_plan` does."""
         return follow_plan(self.problem, self.region, self.worst, x, window, end)
 
     def program(self) -> Program:
-        """One candidate from one state, (1, n), as a row program."""
+        """Evaluate a candidate from a state, (1, n), as a row program."""
         return Program(
             lambda carry, now, row: (carry, self.follow(row["x"], row["window"], row["end"])[:2]),
             name="a plan that is followed",
         )
 
     def row(self, x: Tensor) -> dict[str, Tensor]:
-        """What `program` reads, of the first candidate, for a state (1, n)."""
+        """Return the inputs of `program` for the first candidate and a state (1, n)."""
         window = self.plans[self.first[:1].expand(self.lookahead)].unsqueeze(0)
         return {"x": x, "window": window, "end": self.models[:1]}
 

@@ -1,4 +1,4 @@
-"""What an embedded programmer asks of an exported file: measured, and as text."""
+"""Data sheet of an exported file for an embedded programmer: measured, and as text."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Latency:
 
 @dataclasses.dataclass(frozen=True)
 class Work:
-    """One call with one row, by the operations of the program."""
+    """Return the cost of a call with a row, from the operations of the program."""
 
     parameters: int  # constants
     flops: int  # additions and multiplications one each, a division and a comparison too
@@ -68,7 +68,7 @@ _FREE |= {
 
 
 def work(program: ExportedProgram) -> Work:
-    """What one call costs: a program of `trace`, at one row."""
+    """Return the cost of a call of a program of `trace`, at a row."""
     flops = functions = 0
     for node in program.graph.nodes:
         out = node.meta.get("val")

@@ -64,7 +64,7 @@ def chase(
     """
     problem = Problem("chase", basis, target, law, inner_steps, predictor, certificate)
     problem.check_states(states)
-    run = _Run(problem, states, weights, everything=True)
+    run = _ChaseRun(problem, states, weights, everything=True)
     return concatenate([run.results(chunk) for chunk in run.chunks(states)])
 
 
@@ -91,10 +91,10 @@ def chase_pieces(
         Shown by `staf trajectories=100`.
     """
     problem = Problem("chase", basis, target, law, inner_steps, predictor, certificate)
-    run: _Run | None = None
+    run: _ChaseRun | None = None
     for states in pieces:
         problem.check_states(states)
-        run = _Run(problem, states, weights, everything=True) if run is None else run
+        run = _ChaseRun(problem, states, weights, everything=True) if run is None else run
         yield run.results(states)
 
 
@@ -133,11 +133,11 @@ def chase_weights(
     Source: Rosenfeld et al., section 6.
     """
     problem = Problem("chase_weights", basis, target, law, inner_steps, predictor)
-    run: _Run | None = None
+    run: _ChaseRun | None = None
     recorded: list[Tensor] = []  # (B, C, M) a chunk
     for piece in [states] if isinstance(states, Tensor) else states:
         problem.check_states(piece)
-        run = _Run(problem, piece, weights, everything=False) if run is None else run
+        run = _ChaseRun(problem, piece, weights, everything=False) if run is None else run
         for chunk in run.chunks(piece):
             found = run.weights(chunk, history)
             recorded += [found] if history else []
@@ -163,7 +163,7 @@ def chunk_length(batch: int, basis: StaFBasis, itemsize: int) -> int:
     return max(1, _WORKING_BYTES // (batch * numbers * itemsize))
 
 
-class _Run:
+class _ChaseRun:
     """The rows of a chase on their way through time.
 
     Args:

@@ -107,7 +107,7 @@ def start(
     return states.clone()
 
 
-class _Held(Controller):
+class _HeldControl(Controller):
     """u = what is carried: whoever steps the environment chooses it."""
 
     def init(self, x0: Tensor) -> Tensor:
@@ -160,7 +160,7 @@ class Episodes:
         penalty: float,
     ) -> None:
         positive_real("Episodes", "horizon", horizon)
-        self.loop = ClosedLoop(_Held(), system, cost, dt=dt, limit=limit)
+        self.loop = ClosedLoop(_HeldControl(), system, cost, dt=dt, limit=limit)
         self.steps = math.ceil(horizon / self.loop.dt - 1e-9)
         self.penalty = positive_real("Episodes", "penalty", penalty)
         self.state = cost.q.new_zeros(rows, cost.dim)

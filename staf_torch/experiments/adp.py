@@ -208,7 +208,7 @@ def simulate_together(
 
 
 def _stacked(controllers: Sequence[Controller], rows: Sequence[int]) -> Controller:
-    """One controller in place of several whose initial weights and gains differ."""
+    """Join several controllers whose initial weights and gains differ into one."""
     if len(controllers) == 1:
         return controllers[0]
     stacked = copy.deepcopy(controllers[0])

@@ -30,7 +30,7 @@ from .study import Method, Study, write_history
 
 
 class Vehicle(NamedTuple):
-    """What moves among the discs."""
+    """A mass or a unicycle among the discs."""
 
     label: str  # of the policy
     size: int  # states, of which the first two are the place
@@ -254,7 +254,7 @@ def apart(vehicle: Vehicle, k: int, radius: float) -> Constraint:
 
 
 def _still(vehicle: Vehicle, x: Tensor) -> Tensor:
-    """How far a vehicle is from rest at the origin, whatever its heading: (..., n) -> (...)."""
+    """Return the distance of a vehicle from rest at the origin, whatever its heading: (..., n) -> (...)."""
     own = x[..., : vehicle.size]
     moving = own[..., 2:] if vehicle.size == 4 else own[..., :0]
     far: Tensor = torch.cat((vehicle.point(own), moving), dim=-1).norm(dim=-1)

@@ -28,7 +28,7 @@ _DRAWN_TIMES = 4000  # more could not be told apart in print
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """What a gradient chase leaves behind in memory."""
+    """Result of a gradient chase in memory."""
 
     metrics: dict[str, float | None]
     drawn: dict[str, np.ndarray]  # the first trajectory, thinned: name -> (T', ...); empty where not wanted
@@ -168,7 +168,7 @@ class _Reach:
 
 
 class _BatchMember:
-    """One problem of a batch: what is kept of its rows."""
+    """A problem of a batch, with the metrics and records of its rows."""
 
     def __init__(self, problem: ChaseProblem, sink: Sink | None, drawn: bool) -> None:
         self.problem, self._sink = problem, sink
@@ -179,7 +179,7 @@ class _BatchMember:
 
     @property
     def keeps(self) -> bool:
-        """Whether somebody wants the history."""
+        """Return whether the history is wanted."""
         return self._sink is not None
 
     def take(self, result: ChaseResult, rows: slice, place: int, *, alone: bool) -> None:

@@ -53,7 +53,7 @@ _SETTLED = 1.0  # s at the end in which a regulated state stays near the origin
 
 
 class FaultCase(NamedTuple):
-    """One plant, what happens to it, and the policy that learns it."""
+    """A plant, its fault, and the policy that learns it."""
 
     model: ParametricPlant
     cost: Cost
@@ -216,7 +216,7 @@ class _Informed(torch.nn.Module):
 
 
 def _controllers(case: FaultCase) -> dict[str, Controller]:
-    """What the state and noise are measured for, by name: the last parameters are seen by who knows them."""
+    """Return the controllers by name, measured: the informed one sees the last parameters."""
     n, p = case.x0.shape[-1], case.model.parameters_count
     design = LQR(case.model.believing(_design(case)), case.cost, period=case.dt)
     later = [*range(n), *range(n + p, n + 2 * p)]

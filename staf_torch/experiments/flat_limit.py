@@ -1,4 +1,4 @@
-"""How many digits are left as the centers close in on the state: the flat limit.
+"""The flat limit: digits that are left as the centers close in on the state.
 
 The truth in high precision needs nothing but the standard library.
 """
@@ -65,7 +65,7 @@ def pivoted(basis: StaFBasis, target: Target, x: Tensor, z: Tensor) -> Tensor:
 
 
 def graded(basis: StaFBasis, target: Target, x: Tensor, z: Tensor) -> Tensor:
-    """What the library uses for these kernels."""
+    """The local basis that the library uses for these kernels."""
     space = basis.local(x)
     return space.evaluate(z, space.fit(basis.values(x, target)))
 
@@ -176,7 +176,7 @@ def _dot(a: Point, b: Point) -> Decimal:
 
 
 class FlatLimit(NamedTuple):
-    """What the settings describe, checked; all numbers such that float32 can hold them."""
+    """The checked settings, in numbers that float32 can hold."""
 
     kernel: Kernel
     target: Target

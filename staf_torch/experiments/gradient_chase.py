@@ -70,7 +70,7 @@ class ChaseSolution:
 
     @property
     def metrics(self) -> Metrics:
-        """What `metrics.json` will hold."""
+        """Return the content of `metrics.json`."""
         return {**self.outcome.metrics, "products_per_second": self.title.work}
 
 
@@ -238,7 +238,7 @@ def _wanted(cfg: DictConfig | PlainSettings, problem: ChaseProblem) -> tuple[boo
 
 
 def _finish(out: RunDirectory, solved: ChaseSolution, cfg: DictConfig) -> dict[str, float | None]:
-    """What follows the history: the log, the figure, the animation, the metrics."""
+    """Write what follows the history: the log, the figure, the animation, the metrics."""
     outcome = solved.outcome
     diverged = torch.where(outcome.diverged_at < 0, torch.inf, outcome.diverged_at * solved.title.dt)
     log_diverged(_log, solved.starts, diverged, "; its weights are frozen from there on")

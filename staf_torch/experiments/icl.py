@@ -36,7 +36,7 @@ _COLUMNS = {
 
 
 class SourceRun(NamedTuple):
-    """What the rows did with one source of the equations."""
+    """Closed loops of all gains with one source of the equations."""
 
     time: Tensor  # (T,) s
     error: Tensor  # (B, T, 2) of x

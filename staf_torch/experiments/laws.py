@@ -46,7 +46,7 @@ _HEADINGS = {
 
 
 class LawCase(NamedTuple):
-    """One row of the comparison."""
+    """A row of the comparison."""
 
     law: UpdateLaw
     iterations: int  # a time step
@@ -178,7 +178,7 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> dict[st
 def table(
     problem: ChaseProblem, compared: list[LawCase], errors: StateErrorPass, progress: Progress = SHOWN
 ) -> list[dict[str, str | float | None]]:
-    """One row a case: what it is, what it costs, and the metrics of its gradient chase."""
+    """Return a row a case: its law, its cost, and the metrics of its gradient chase."""
     rows: list[dict[str, str | float | None]] = []
     for case in progress.each(compared, "laws"):
         about: dict[str, str | float | None] = {
@@ -216,7 +216,7 @@ def sweep(
 
 
 def promises(problem: ChaseProblem, excess: float) -> dict[str, float | None]:
-    """What can be said before the run, about the paper's law at the problem's step and iterations: the
+    """Return the a-priori bounds for the paper's law at the problem's step and iterations: the
     a-priori excess, the step and the iterations that a wanted excess needs, and the paper's own step."""
     system, law = problem.system, optim.SteepestDescent()
     pieces = trajectory(system, problem.initial_states, dt=problem.dt, steps=problem.steps)

@@ -112,7 +112,7 @@ def remember(
 def errors(
     problem: ChaseProblem, memory: ExperienceMemory, states: Tensor, models: Tensor, index: Tensor
 ) -> Region:
-    """What the memory, the model of that time and the last model leave over the balls at some times."""
+    """Return the errors of the memory, of passing models and of the last one over balls at some times."""
     x = states[:, index]
     radius = problem.basis.centers.radius(x)[..., None, None].to(x)
     z = radius * probe_points(_PROBES, x.shape[-1]).to(x)
@@ -181,7 +181,7 @@ def _chase(problem: ChaseProblem, states: Tensor, weights: Tensor | None = None)
 
 
 def _shown(metrics: dict[str, float | None]) -> list[Table]:
-    """One table of the errors over the region, one of the revisits."""
+    """Return a table of the errors over the region, and one of the revisits."""
     region = [
         {"by": label, "rms": metrics[f"{key}_rms_error"], "max": metrics[f"{key}_max_error"]}
         for key, label in APPROXIMANTS.items()

@@ -1,4 +1,4 @@
-"""What an experiment is, and those that the setting `task` knows by name.
+"""The interface of experiments, and those that the setting `task` knows by name.
 
 An experiment of your own needs no change here. Write a function or a class in a module that Python can import
 (the working directory counts), and a YAML file that names it, in a folder of your own::
@@ -76,7 +76,7 @@ class Solution(Protocol):
 
     @property
     def metrics(self) -> Metrics:
-        """What `metrics.json` will hold."""
+        """Return the content of `metrics.json`."""
         ...
 
 

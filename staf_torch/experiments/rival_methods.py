@@ -78,7 +78,7 @@ def box_ddp(case: RivalPlant) -> Begin:
 
 
 def plan(case: RivalPlant) -> Begin:
-    """One plan of the whole episode by box-DDP, followed with its feedback."""
+    """Follow a plan of the whole episode by box-DDP with its feedback."""
     return steered(case, adp.RecedingHorizon(case.problem(), steps=case.steps, iterations=0))
 
 
@@ -245,7 +245,7 @@ class Rival:
 
     @property
     def megabytes(self) -> float:
-        """What the packages take on disk, beside torch and NumPy."""
+        """Return the size of the packages on disk, beside torch and NumPy."""
         return sum(_size(name) for name in self.packages) / 2**20
 
 

@@ -46,7 +46,7 @@ _COLUMNS = {
 
 @dataclasses.dataclass(frozen=True)
 class Episode:
-    """What a method did from every initial state."""
+    """Closed loops of a method from every initial state."""
 
     cost: Tensor  # with the LQR's value at the end, (B,); inf where a number is not finite
     control: Tensor  # (B, T, m)
@@ -80,7 +80,7 @@ def _chosen(what: str, names: object, known: Mapping[str, Any]) -> list[Any]:
 
 
 class RivalRow(NamedTuple):
-    """What a method reached on one plant."""
+    """A row of the table: a method on one plant."""
 
     method: str
     measured: dict[str, float | None]  # of its controls, for the metrics; None: it did not run

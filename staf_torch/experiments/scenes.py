@@ -1,4 +1,4 @@
-"""What moves in an animation: the scenes of a gradient chase and of closed loops."""
+"""Scenes of animations: of a gradient chase and of closed loops."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ _NAMED = 20  # diverged trajectories that the log lists by number
 
 
 class Method(NamedTuple):
-    """What a study compares: a controller, the plant that it steers, and what is paid there."""
+    """A method that a study compares: a controller, the plant that it steers, and the cost there."""
 
     controller: Controller
     plant: Plant

@@ -52,7 +52,7 @@ _BOUNDS = {
 
 
 class NamedLayout(NamedTuple):
-    """One layout of a family."""
+    """A layout of a family."""
 
     family: str
     directions: Tensor  # (M, n)

@@ -28,7 +28,7 @@ _PAGE = Path(__file__).with_name("animation.html")
 
 
 class Curves(NamedTuple):
-    """What the third panel shows over time."""
+    """Curves over time in the third panel."""
 
     title: str
     values: np.ndarray  # (F, K), drawn up to the present
@@ -36,7 +36,7 @@ class Curves(NamedTuple):
 
 
 class Scene(NamedTuple):
-    """What an animation of a trajectory shows, at F times. Of a state in R^n, the first two coordinates."""
+    """Content of an animation at F times; of a state in R^n, the first two coordinates."""
 
     title: str  # of the first panel
     time: np.ndarray  # (F,) seconds

@@ -17,7 +17,7 @@ _DECADES = 1e-6  # of its largest value a log axis shows at most
 
 
 class ChaseHistory(NamedTuple):
-    """One trajectory of a gradient chase."""
+    """A trajectory of a gradient chase."""
 
     time: np.ndarray  # (T,) seconds
     state: np.ndarray  # (T, n)
@@ -39,7 +39,7 @@ class ConvergenceCurve(NamedTuple):
 
 
 class MemoryPicture(NamedTuple):
-    """One trajectory and its memory."""
+    """A trajectory and its memory."""
 
     path: np.ndarray  # (T, n), settled
     stored: np.ndarray  # (N, n) states of the models
@@ -120,7 +120,7 @@ def draw_convergence(found: Sequence[ConvergenceCurve]) -> Figure:
 
 
 def draw_memory(picture: MemoryPicture) -> Figure:
-    """Where models are stored, the error over the visited region, the excess after a revisit."""
+    """Draw the states of stored models, the error over the visited region, the excess after a revisit."""
     with page(WIDTH, 3.1) as figure:
         grid = figure.subplots(1, 3)
         for axes, panel in zip(grid, (_map, _region, _revisits), strict=True):

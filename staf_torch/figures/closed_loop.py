@@ -31,7 +31,7 @@ _LEAST_EXCESS, _MOST_EXCESS = 1e-4, 1e2  # of the cost over the optimum, in the 
 
 
 class AdpHistory(NamedTuple):
-    """One trajectory of a closed loop."""
+    """A trajectory of a closed loop."""
 
     time: np.ndarray  # (T,) seconds
     state: np.ndarray  # (T, n)
@@ -45,7 +45,7 @@ class AdpHistory(NamedTuple):
 
 
 class TrackingHistory(NamedTuple):
-    """One trajectory, followed with an identified drift, and the errors of the other variants."""
+    """A trajectory, followed with an identified drift, and the errors of the other variants."""
 
     time: np.ndarray  # (T,) seconds
     state: np.ndarray  # (T, 4) of the identified run: e and xd
@@ -179,7 +179,7 @@ _EARLY = 2.0  # s: what happens to the estimates later is not seen at the scale 
 
 
 class FaultPicture(NamedTuple):
-    """One trajectory of a case, under every policy."""
+    """A trajectory of a case, under every policy."""
 
     time: np.ndarray  # (T,) seconds
     norms: dict[str, np.ndarray]  # policy -> |x|, (T,)
@@ -264,7 +264,7 @@ def draw_gain_sets(sets: GainSets) -> Figure:
 
 
 class BoxHistory(NamedTuple):
-    """One start under several methods, in a box."""
+    """A start under several methods, in a box."""
 
     time: np.ndarray  # (T,) seconds
     paths: Mapping[str, np.ndarray]  # method -> x, (T, n)
@@ -315,7 +315,7 @@ def walls(axes: Axes, low: np.ndarray, high: np.ndarray) -> None:
 
 
 class AvoidanceHistory(NamedTuple):
-    """One scenario with moving discs under several methods, and the least distances of all scenarios."""
+    """A scenario with moving discs under several methods, and the least distances of all scenarios."""
 
     time: np.ndarray  # (T,) seconds
     paths: Mapping[str, np.ndarray]  # method -> p, (T, 2)
@@ -368,7 +368,7 @@ _LEAST = 1e-5  # excess cost that is drawn at the edge
 
 
 def draw_rivals(rows: Sequence[Mapping[str, Any]]) -> Figure:
-    """One panel a plant: median excess cost over the best known against microseconds a control.
+    """Draw a panel a plant: median excess cost over the best known against microseconds a control.
 
     A method that regulated some of the states alone is hollow; one that regulated none is not drawn.
 

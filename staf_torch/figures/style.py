@@ -1,4 +1,4 @@
-"""One style for every figure: page, type, colours, dashes, legends, and the images of a finished figure.
+"""The style of all figures: page, type, colours, dashes, legends, and the images of a finished figure.
 
 matplotlib is imported when the first figure is drawn and not before: it takes a second, which runs without
 figures need not pay. pyplot, which keeps global state, is never used.

@@ -44,7 +44,7 @@ class Point(NamedTuple):
 
 
 class Curve(NamedTuple):
-    """One line of a panel."""
+    """A line of a panel."""
 
     label: str
     points: tuple[Point, ...]
@@ -52,7 +52,7 @@ class Curve(NamedTuple):
 
 
 class Panel(NamedTuple):
-    """One panel of a figure."""
+    """A panel of a figure."""
 
     title: str
     curves: tuple[Curve, ...]
@@ -308,7 +308,7 @@ def _frame(grid: Sequence[Axes], panels: Sequence[Panel]) -> None:
 
 
 def _far_below(panels: Sequence[Panel]) -> float:
-    """What is not above this would squeeze the errors into the top of the picture: it is left out."""
+    """Return the least value that is drawn: less would squeeze the errors into the top of the picture."""
     return 1e-9 / 3 * min(point.middle for point in _points_of(panels))
 
 

@@ -26,7 +26,7 @@ _FAILED = 1.0  # where the marks of failures stand
 
 
 class Feasibility(NamedTuple):
-    """How many centers are needed: T states, R radii, E values of epsilon; 0 where no layout does."""
+    """Numbers of centers that are needed: T states, R radii, E values of epsilon; 0 where no layout does."""
 
     time: np.ndarray  # (T,) seconds
     state: np.ndarray  # (T, n)
@@ -125,7 +125,7 @@ def draw_feasibility(found: Feasibility) -> Figure:
 
 
 def _place(found: Feasibility) -> tuple[np.ndarray, str]:
-    """Where on the trajectory: its angle where it is an arc around the origin of the plane, else time."""
+    """Return the place on the trajectory: the angle of an arc around the origin of the plane, else time."""
     norm = np.linalg.norm(found.state, axis=-1)
     if found.state.shape[-1] == 2 and norm.max() < 1.01 * norm.min():
         angle = np.unwrap(np.arctan2(found.state[:, 1], found.state[:, 0]))

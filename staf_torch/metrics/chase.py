@@ -89,16 +89,18 @@ class ChaseMetrics:
         self._members = members
         self._own = tuple(own)
         self._errors = StateErrorPass(basis, target) if errors is None else errors
-        self._rows = _Rows(0)
-        self._kept: _Rows | None = None  # of all rows, those before the ones that are taken in now filled in
+        self._rows = _RowRecord(0)
+        self._kept: _RowRecord | None = (
+            None  # of all rows, those before the ones that are taken in now filled in
+        )
 
     def next_rows(self) -> None:
         """Say that the next pieces begin at time 0 again, with further rows of the batch."""
         assert self._members is not None
         if self._kept is None:
-            self._kept = _Rows(0)
+            self._kept = _RowRecord(0)
         self._kept.fill(self._rows.finished(), sum(member.rows for member in self._members))
-        self._rows = _Rows(self._rows.first + len(self._rows.diverged))
+        self._rows = _RowRecord(self._rows.first + len(self._rows.diverged))
 
     def add(self, result: ChaseResult) -> None:
         """Take in the next piece of time."""
@@ -166,7 +168,7 @@ class ChaseMetrics:
         of_row = torch.searchsorted(ends, torch.arange(start, start + batch), right=True)
         return torch.tensor([member.first for member in self._members], dtype=torch.int64)[of_row]
 
-    def _gathered(self) -> _Rows:
+    def _gathered(self) -> _RowRecord:
         """All rows as one."""
         last = self._rows.finished()
         if self._kept is None:
@@ -174,7 +176,7 @@ class ChaseMetrics:
         self._kept.fill(last, len(self._kept.diverged))
         return self._kept
 
-    def _summary(self, member: Member, rows: slice, found: _Rows) -> dict[str, float | None]:
+    def _summary(self, member: Member, rows: slice, found: _RowRecord) -> dict[str, float | None]:
         kept = ~found.diverged[rows]
         metrics: dict[str, float | None] = dict.fromkeys((*_WORST, *(metric.name for metric in self._own)))
         any_time = found.time > member.first and bool(kept.any())
@@ -197,7 +199,7 @@ class ChaseMetrics:
         }
 
 
-class _Rows:
+class _RowRecord:
     """What is gathered of some rows that go through time together."""
 
     def __init__(self, first: int) -> None:
@@ -215,7 +217,7 @@ class _Rows:
             worst = torch.where(settled, quantity, -torch.inf).amax(dim=1)
             self.worst[name] = torch.maximum(self.worst[name], worst) if name in self.worst else worst
 
-    def finished(self) -> _Rows:
+    def finished(self) -> _RowRecord:
         """The same with numbers alone: the history of the excess has been read."""
         if self.early and self.worst:
             early = torch.cat(self.early, dim=1)
@@ -225,7 +227,7 @@ class _Rows:
         self.early = []
         return self
 
-    def fill(self, part: _Rows, total: int) -> None:
+    def fill(self, part: _RowRecord, total: int) -> None:
         """Take over the numbers of some finished rows of ``total``.
 
         Into tensors for all of them: many small ones that stay would leave holes in memory between them.

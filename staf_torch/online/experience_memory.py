@@ -148,7 +148,7 @@ class ExperienceMemory(nn.Module):
         return found
 
     def covered(self, y: Tensor) -> Tensor:
-        """Whether a stored model reaches y: (..., P, n) -> (..., P) bool."""
+        """Return whether a stored model reaches y: (..., P, n) -> (..., P) bool."""
         return (self._weights(y) > 0).any(-1)
 
     def start(self, x: Tensor) -> Tensor:
@@ -229,7 +229,7 @@ class ExperienceMemory(nn.Module):
         return there, found
 
     def _slot(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Where a model at x (..., n) goes, (...) int64; whether it is kept; whether it is a revisit."""
+        """Return the place of a model at x (..., n), int64; whether it is kept; whether it is a revisit."""
         closest, nearest = self._relative(x.unsqueeze(-2)).squeeze(-2).min(-1)
         near = closest < (self.spacing / self.reach) ** 2
         free = self.stored.logical_not()
@@ -243,7 +243,7 @@ class ExperienceMemory(nn.Module):
         return torch.where(near, nearest, elsewhere), ~near | other | still, near & other
 
     def _redundant(self) -> Tensor:
-        """Of the closest pair of states the one with the closer second neighbour: (...) int64."""
+        """Return which one of the closest pair of states has the closer second neighbour: (...) int64."""
         own = torch.eye(self.capacity, dtype=torch.bool, device=self.states.device)
         apart = torch.where(own, torch.inf, self._relative(self.states))
         # Symmetric, so that both of a pair are found: t is in units of the one's radius, or the other's.

@@ -126,7 +126,7 @@ class FilterStreams:
         self._watched = not bool(self._known.isfinite().all(1).any())
 
     def _far(self, both: Tensor) -> bool:
-        """Whether a stream is so far from what its units were learned from that these say nothing."""
+        """Return whether a stream is so far from the samples of its units that these say nothing."""
         away = (both - self.units[:, : both.shape[1]]).abs()
         return not self._watched or bool((away > self._reach).any())
 
@@ -292,7 +292,7 @@ class FilterStreams:
         return {name: tensor.clone() for name, tensor in (self._learned() | self._fixed()).items()}
 
     def _fixed(self) -> dict[str, Tensor]:
-        """What must not be another one: the centers, and the kernel at them."""
+        """Return the tensors that a loaded state must share: the centers, and the kernel at them."""
         functions = self.definition.functions
         zero, offsets = torch.zeros_like(functions.offsets[0]), functions.offsets
         return {"offsets": offsets, "gram": functions.kernel.core(zero, offsets, offsets).detach()}

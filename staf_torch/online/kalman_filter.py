@@ -19,7 +19,7 @@ STREAK = 8  # samples in a row that are out of all proportion before a stream st
 
 @dataclasses.dataclass
 class StreamState:
-    """What is kept of every stream, in place; streams are the last dimension.
+    """State of every stream, changed in place; streams are the last dimension.
 
     u is the mean of the weights, I - D their covariance: D, 0 <= D <= I, is what has been learned. The rows
     of the table: the anchor, x as last measured, u output by output, D's lower triangle row by row, and for
@@ -53,7 +53,7 @@ class StreamState:
 
     @property
     def dtype(self) -> torch.dtype:
-        """Of the table."""
+        """Return the dtype of the table."""
         return self.blocks.dtype
 
     @property
@@ -112,8 +112,8 @@ class StateParts(NamedTuple):
     largest: Tensor  # (1, S)
 
 
-class _Measured(NamedTuple):
-    """What a stream learns from."""
+class _NewSample(NamedTuple):
+    """A sample of every stream, judged."""
 
     z: Tensor  # from the anchor, (n, S)
     y: Tensor  # (K, S), 0 where it was not measured
@@ -243,14 +243,14 @@ class LocalFilter:
             torch.where(afresh, none, largest)[None],
         )
         most = torch.finfo(state.dtype).max
-        found, good = self._update(moved, since, _Measured(z, y, seen, lapse, fine, jumped, before, most))
+        found, good = self._update(moved, since, _NewSample(z, y, seen, lapse, fine, jumped, before, most))
         faded = moved._replace(learned=moved.learned * self.forgetting**lapse)  # time passes in any case
         kept = [torch.where(good, new, old_) for new, old_ in zip(found, faded, strict=True)]
         state.put(state.whole(StateParts(*kept)))
         streak = torch.where(afresh & good, 0, streak)
         state.counts.copy_(torch.stack((samples + good, skipped + ~good, streak, since + good)))
 
-    def _update(self, old: StateParts, samples: Tensor, sample: _Measured) -> tuple[StateParts, Tensor]:
+    def _update(self, old: StateParts, samples: Tensor, sample: _NewSample) -> tuple[StateParts, Tensor]:
         """The Kalman update at z from the anchor; and the streams whose result is finite."""
         z, y, seen, lapse, fine, moved, before, most = sample
         local = self.functions.local(old.anchor, z)

@@ -88,11 +88,11 @@ class LocalFunctions(NamedTuple):
 
     @property
     def stationary(self) -> bool:
-        """Whether k(x, x) is the same everywhere: then e^s goes into the functions, to spare passes."""
+        """Return whether k(x, x) is the same everywhere: e^s then goes into the functions."""
         return self.rate is not None and self.kernel.log_gain(self.offsets) is None
 
     def local(self, x: Tensor, z: Tensor) -> LocalValues:
-        """What V is made of at x + z: (n, S), (n, S)."""
+        """Return the local functions and the log factor at x + z: (n, S), (n, S)."""
         if self.rate is None or self.shared is None or not self.stationary:
             return LocalValues(self.functions(x, z), self.log_factor(x, z))
         # exp(q z'd - q z'z / 2) from z - d: no difference of two large numbers, whatever z is.
@@ -110,7 +110,7 @@ class LocalFunctions(NamedTuple):
         return None if scale is None else scale.squeeze(-1)
 
     def transfer(self, x: Tensor, step: Tensor) -> tuple[Tensor, Tensor | None]:
-        """What becomes of u when the state x moves by h: u' = e^f T u; T alone for what was known of it.
+        """Return the map u' = e^f T u of the weights as x moves by h; T alone maps what was learned.
 
         T = C'(x + h) diag(m) k0(h + d, d) C(x) with m_i = e^{s(x, h + d_i) - s(x + h, d_i) - f}, and
         f = (g(x + h) - g(x))/2: the local function at the new centers, fitted there. T is the compression of

@@ -35,7 +35,7 @@ HARDLY = 0.02  # widths of the other coordinates: one that covers less hardly mo
 
 
 class Tuning(NamedTuple):
-    """What a stretch says, a row a stream; the kernel's width is 1 in these units of x."""
+    """Hyperparameters from a stretch, a row a stream; the kernel's width is 1 in these units of x."""
 
     center: Tensor  # (S, n + K)
     spread: Tensor  # (S, n + K)
@@ -47,7 +47,7 @@ class Tuning(NamedTuple):
     unknown: Tensor  # (S, n) float64, 1 where the stretch says nothing about a width: it may grow
 
     def keep(self, rows: Tensor) -> Tuning:
-        """Of the streams with these numbers alone; the radius stays the one that serves all."""
+        """Keep the streams with these numbers alone; the radius stays the one that serves all."""
         return Tuning(*(part[rows] for part in self))._replace(radius=self.radius[:1].repeat(len(rows)))
 
     def add(self, streams: int) -> Tuning:
@@ -229,7 +229,7 @@ def _widened(width: Tensor, spread: Tensor, extent: Tensor, unknown: Tensor) -> 
 
 
 def _warn(covered: Tensor, width: Tensor, wider: Tensor) -> None:
-    """One line in the log if a coordinate covers little of a width: what comes later may be beyond.
+    """Log a line if a coordinate covers little of a width: what comes later may be beyond.
 
     Args:
         covered: in widths, (S, n).

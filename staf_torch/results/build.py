@@ -1,4 +1,4 @@
-"""What made the numbers of a run: settings, source, the user's own modules, torch and the compiler.
+"""The origin of a run's numbers: settings, source, the user's own modules, torch and the compiler.
 
 Two runs of one sweep may stand in one table only where these agree. Nothing here imports torch, and no module
 is imported to be looked at.
@@ -159,7 +159,7 @@ def short(build: Mapping[str, Any]) -> str:
 
 
 def _plain(value: Any) -> dict[str, Any]:
-    """As it is in a file."""
+    """Return a value as a JSON file has it."""
     return json.loads(json.dumps(value)) if isinstance(value, dict) else {}
 
 

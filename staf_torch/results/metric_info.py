@@ -1,4 +1,4 @@
-"""What a reader of numbers must know about a metric: its unit, and which way it is better. Without torch."""
+"""Units of metrics, and which way they are better. Nothing here needs torch."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How far a long loop is: a bar on a terminal, now and then a line in the log otherwise."""
+"""Progress of long loops: a bar on a terminal, now and then a line in the log otherwise."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _LINE_EVERY = 10.0  # s
 
 
 class Progress:
-    """What long loops of an experiment tell how far they are.
+    """Report how far long loops of an experiment are.
 
     Args:
         listener: is told the share of the loop that is done, and nothing is shown; None: a bar or log lines.

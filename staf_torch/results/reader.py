@@ -207,7 +207,7 @@ def _status(record: Mapping[str, Any]) -> tuple[str, str | None]:
 
 
 def _members(run: RecordedRun, name: str) -> list[RecordedRun]:
-    """One a member in a file of that name; its overrides come on top of the run's."""
+    """Return a run a member in a file of that name; its overrides come on top of the run's."""
     shared = {key: value for key, value in run.settings.items() if not _of_axis(key)}
     typed = {key: value for key, value in run.overrides.items() if not _of_axis(key)}
     base = dataclasses.replace(run, settings=shared, overrides=typed, seconds=None)
@@ -259,7 +259,7 @@ def _member(run: RecordedRun, number: int, member: Mapping[str, Any]) -> Recorde
 
 
 def _of_axis(key: str) -> bool:
-    """Whether a setting lists the members themselves."""
+    """Return whether a setting lists the members themselves."""
     return key == "members" or key.startswith("members.")
 
 

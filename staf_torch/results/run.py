@@ -112,7 +112,7 @@ class Collection:
 
     @functools.cached_property
     def infos(self) -> dict[str, MetricInfo]:
-        """What is declared of each metric: by the library, or by the runs for metrics of the user's own."""
+        """Return what the library, or the runs for metrics of the user's own, declare of each metric."""
         known = {info.name: info for info in OWN}
         for declared in {id(run.declared): run.declared for run in self.rows}.values():
             known |= declared
@@ -181,7 +181,7 @@ def _differ(run: RecordedRun, other: RecordedRun) -> Iterator[str]:
 
 
 def _explained(key: str, overridden: Collection_[str]) -> bool:
-    """Whether a key is overridden, or is above or below one that is."""
+    """Return whether a key is overridden, or is above or below one that is."""
     return any(key == o or key.startswith((f"{o}.", f"{o}/")) or o.startswith(f"{key}.") for o in overridden)
 
 

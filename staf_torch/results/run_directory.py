@@ -1,4 +1,4 @@
-"""What an experiment leaves behind: history, tables and figures in its directory, and at last the metrics."""
+"""Fill a run directory: history, tables and figures, and at last the metrics."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ T = TypeVar("T")
 
 
 class Printable(Protocol):
-    """What a directory needs of a table; `staf_torch.tables.Table` is one."""
+    """A table that a directory can write, such as `staf_torch.tables.Table`."""
 
     def markdown(self) -> str:
         """Return the table to be read by people."""

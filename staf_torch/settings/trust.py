@@ -1,4 +1,4 @@
-"""One rule: reading a run never runs code, and building what it describes needs `--trust` for foreign code.
+"""Trust: reading a run never runs code, and building what it describes needs `--trust` for foreign code.
 
 Reading is JSON, plain YAML and arrays without pickles. Settings that name nothing but this package's own
 classes may be built. Everything else (a class or function from elsewhere, a `task` of one's own, a resolver

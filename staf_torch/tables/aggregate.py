@@ -105,7 +105,7 @@ def _expansion(freedom: int) -> float:
 
 @dataclasses.dataclass(frozen=True)
 class Layout:
-    """What a table shall show; the options of `staf-table`.
+    """Layout of a table: the options of `staf-table`.
 
     Example:
         >>> Layout(rows=("kernel",), metrics=("ball_error",), sort=("ball_error:desc",)).rows
@@ -159,7 +159,7 @@ def tabulate(found: Collection, layout: Layout | None = None) -> Table:
 
 
 def _without_effect(found: Collection) -> Iterator[str]:
-    """One note for each swept setting that changed no metric, all others being equal."""
+    """Yield a note for each swept setting that changed no metric, all others being equal."""
     runs = [(run, frozenset(run.metrics.items())) for run in found.rows if run.metrics]
     values = {key: [identity(run.value(key)) for run, _ in runs] for key in found.swept}
     for key in found.swept:
@@ -301,7 +301,7 @@ def _absences(runs: Sequence[RecordedRun], columns: Sequence[Column]) -> Iterato
 
 
 def _notes(runs: Sequence[RecordedRun]) -> Iterator[str]:
-    """One note for each reason for which runs have no result, or a reader should look twice."""
+    """Yield a note for each reason for which runs have no result, or a reader should look twice."""
     reasons: dict[tuple[str, str], list[RecordedRun]] = {}
     for run in runs:
         if run.reason is not None:

@@ -16,7 +16,7 @@ _COUNTS = ("n", "failed")
 
 @dataclasses.dataclass(frozen=True)
 class Column:
-    """One column of plain values."""
+    """A column of plain values."""
 
     name: str  # unique: `centers.radius`, `ball_error`, `ball_error.mean`, `ball_error.mean[centers.count=3]`
     metric: str | None = None  # of which it is a number; None: a setting, or something about the run
@@ -29,7 +29,7 @@ class Column:
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """One row: a run, or the runs that agree in the settings of the row."""
+    """A row: a run, or the runs that agree in the settings of the row."""
 
     cells: Mapping[str, Value]  # by the names of the columns
     reasons: Mapping[str, str] = dataclasses.field(default_factory=dict)  # name of a column -> why it is None
@@ -37,7 +37,7 @@ class Row:
 
 @dataclasses.dataclass(frozen=True)
 class Style:
-    """How numbers are shown.
+    """Style of printed numbers.
 
     Example:
         >>> Style(digits=2, bold=True)
@@ -73,7 +73,7 @@ class PrintedColumn:
 
     @functools.cached_property
     def numeric(self) -> bool:
-        """Whether no cell is a text."""
+        """Return whether no cell is a text."""
         return not any(isinstance(cell, str) for cell in self.cells)
 
 
@@ -112,7 +112,7 @@ def _cell(value: Value) -> Number | str | None:
 
 
 def _aggregated(columns: Sequence[Column], rows: Sequence[Row], style: Style) -> Iterator[PrintedColumn]:
-    """One column for each metric, place and statistic; the spread joins the mean."""
+    """Yield a column for each metric, place and statistic; the spread joins the mean."""
     runs = [row.cells[column.name] for row in rows for column in columns if column.statistic == "n"]
     single = all(count in (0, 1) for count in runs)
     places: dict[tuple[str, str], dict[str | None, Column]] = {}

@@ -171,7 +171,7 @@ def latex_text(table: Table) -> str:
 
 
 def _headings(columns: list[PrintedColumn]) -> list[str]:
-    """One line, or two with a rule under what several columns share."""
+    """Return a line, or two with a rule under what several columns share."""
     lower = " & ".join(escape(column.heading) for column in columns) + r" \\"
     if not any(column.over for column in columns):
         return [lower]

@@ -7,29 +7,32 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from helpers_streams import REGRESSORS
+from variants import over
 
-from staf_torch.online.samples import lapse_of, lapses, pair, tensor_of
+import staf_torch as st
+
+KINDS_OF_NUMBERS = [
+    torch.tensor([1.0, 2.0]),
+    torch.tensor([1, 2]),
+    torch.tensor([1.0, 2.0], dtype=torch.float64, requires_grad=True),
+    torch.tensor([1.0, 2.0], dtype=torch.float16),
+    np.array([1.0, 2.0], np.float32),
+    np.array([1, 2.0], dtype=object),
+    [1, 2],
+    (1.0, 2.0),
+]
 
 
 @pytest.mark.parametrize(
-    ("value", "dtype"),
-    [
-        (torch.tensor([1.0, 2.0]), torch.float32),
-        (torch.tensor([1, 2]), torch.float64),
-        (torch.tensor([1.0, 2.0], dtype=torch.float64, requires_grad=True), torch.float64),
-        (torch.tensor([1.0, 2.0], dtype=torch.float16), torch.float16),
-        (np.array([1.0, 2.0], np.float32), torch.float32),
-        (np.array([1, 2]), torch.float64),
-        (np.array([1, 2.0], dtype=object), torch.float64),
-        ([1, 2], torch.float64),
-        ((1.0, 2.0), torch.float64),
-    ],
+    "value", KINDS_OF_NUMBERS, ids=lambda value: str(getattr(value, "dtype", type(value)))
 )
-def test_a_value_keeps_its_floats_and_integers_become_double(value: Any, dtype: torch.dtype) -> None:
-    found = tensor_of("call", "x", value)
-    assert found.dtype == dtype
-    assert found.tolist() == [1.0, 2.0]
-    assert not found.requires_grad
+def test_numbers_of_any_kind_are_samples(value: Any) -> None:
+    single = getattr(value, "dtype", None) in (torch.float32, np.float32)
+    model = st.StaFRegressor(radius=0.4).partial_fit(value, 3)
+    assert model.state_dict()["dtype"] == ("torch.float32" if single else "torch.float64")
+    assert float(model.predict(value)) == pytest.approx(3.0, rel=1e-3)
+    assert isinstance(model.predict(value), torch.Tensor if isinstance(value, torch.Tensor) else np.ndarray)
 
 
 class Sparse:
@@ -53,54 +56,32 @@ class Sparse:
 def test_what_are_no_numbers_is_refused_with_the_reason(
     value: Any, kind: type[Exception], message: str
 ) -> None:
-    with pytest.raises(
-        kind, match=rf"`call\(x=...\)` must be a tensor or an array of numbers.*{message}"
-    ) as told:
-        tensor_of("call", "x", value)
+    rule = rf"`StaFRegressor.partial_fit\(x=...\)` must be a tensor or an array of numbers.*{message}"
+    with pytest.raises(kind, match=rule) as told:
+        st.StaFRegressor().partial_fit(value, 1.0)
     assert type(told.value) is kind
 
 
-def shapes(*dims: int) -> torch.Tensor:
-    return torch.zeros(dims)
+FITS = [((5, 3), (5,)), ((5, 3), (5, 2)), ((5, 4, 3), (5, 4)), ((5, 4, 3), (5, 4, 2))]  # K outputs last
+DO_NOT = [((5, 3), (4,)), ((5, 4, 3), (5, 3)), ((5, 4, 3), (5, 4, 2, 1)), ((3,), ())]
 
 
-FITS = [
-    ((1, 2), (3,), ()),
-    ((1, 2), (3,), (2,)),  # K outputs
-    ((1, 2), (4, 3), (4,)),
-    ((1, 2), (4, 3), (4, 2)),
-    ((2, 3), (5, 3), (5,)),
-    ((2, 3), (5, 4, 3), (5, 4)),
-    ((2, 3), (5, 4, 3), (5, 4, 2)),
-]
-DO_NOT = [
-    ((1, 2), (), ()),
-    ((1, 2), (5, 4, 3), (5, 4)),
-    ((1, 2), (4, 3), (3,)),
-    ((1, 2), (3,), (2, 2)),
-    ((2, 3), (5, 3), (4,)),
-    ((2, 3), (5, 4, 3), (5, 3)),
-    ((2, 3), (5, 4, 3), (5, 4, 2, 1)),
-]
-
-
-@pytest.mark.parametrize(("dims", "of_x", "of_y"), FITS)
-def test_shapes_that_fit_are_taken(
-    dims: tuple[int, int], of_x: tuple[int, ...], of_y: tuple[int, ...]
+@over(REGRESSORS, "kind")
+@pytest.mark.parametrize(("of_x", "of_y"), [*FITS, *DO_NOT])
+def test_shapes_that_fit_are_taken_and_others_named(
+    kind: str, of_x: tuple[int, ...], of_y: tuple[int, ...]
 ) -> None:
-    x, y = pair("call", shapes(*of_x), np.zeros(of_y), dims)
-    assert (tuple(x.shape), tuple(y.shape)) == (of_x, of_y)
-
-
-@pytest.mark.parametrize(("dims", "of_x", "of_y"), DO_NOT)
-def test_shapes_that_do_not_fit_are_named(
-    dims: tuple[int, int], of_x: tuple[int, ...], of_y: tuple[int, ...]
-) -> None:
-    with pytest.raises(ValueError, match=r"`call\(x=...\)` must have the shape") as told:
-        pair("call", shapes(*of_x), shapes(*of_y), dims)
-    one, many = "(n,) or (S, n)", "(T, n) for one stream in time or (T, S, n) for S streams"
-    wanted = f"the shape {one if dims == (1, 2) else many}, and y that without n, or with K in its place"
-    assert f"{wanted}; got {of_x} and {of_y}." in str(told.value)
+    model, x, y = REGRESSORS[kind](), torch.zeros(of_x).double(), np.zeros(of_y)
+    if (of_x, of_y) in FITS:
+        assert model.fit(x, y).predict(x[-1]).shape == of_y[1:]
+        return
+    wanted = (
+        "the shape (T, n) for one stream in time or (T, S, n) for S streams, and y that without n, or with K"
+    )
+    for call in ("fit", "tune"):
+        with pytest.raises(ValueError, match=rf"Regressor.{call}\(x=...\)` must have the shape") as told:
+            getattr(model, call)(x, y)
+        assert f"{wanted} in its place; got {of_x} and {of_y}." in str(told.value)
 
 
 @pytest.mark.parametrize(
@@ -108,32 +89,16 @@ def test_shapes_that_do_not_fit_are_named(
     [
         ((0, 2), (0,), "0 sample(s) (shape=(0, 2))"),
         ((3, 0), (3,), "0 feature(s) (shape=(3, 0))"),
-        ((0,), (), "0 feature(s) (shape=(0,))"),
         ((4, 0, 2), (4, 0), "0 sample(s) (shape=(4, 0, 2))"),
     ],
 )
 def test_what_is_empty_is_named(of_x: tuple[int, ...], of_y: tuple[int, ...], what: str) -> None:
     with pytest.raises(ValueError, match="must not be empty") as told:
-        pair("call", shapes(*of_x), shapes(*of_y), (2, 3))
-    wanted = f"`call(x=...)` must not be empty: {what} while a minimum of 1 is required."
+        st.StaFRegressor().fit(torch.zeros(of_x), torch.zeros(of_y))
+    wanted = f"`StaFRegressor.fit(x=...)` must not be empty: {what} while a minimum of 1 is required."
     assert str(told.value) == wanted
-    with pytest.raises(ValueError, match=r"`call` requires y to be passed.*target y is None"):
-        pair("call", shapes(*of_x), None, (2, 3))
-
-
-def test_time_between_samples_is_1_before_the_first() -> None:
-    one, several = shapes(4, 2), shapes(4, 3, 2)
-    assert lapses("call", None, one) is None
-    found = lapses("call", [0, 0, 1.5, 2], one)
-    assert found is not None
-    assert found.tolist() == [[1.0], [0.0], [1.5], [0.5]]
-    assert found.dtype == torch.float64
-    each = lapses("call", np.arange(12.0).reshape(4, 3), several)
-    assert each is not None
-    assert each.tolist() == [[1.0] * 3, *[[3.0] * 3] * 3]
-    for_all = lapses("call", torch.tensor([3.0, 4.0, 7.0, 7.0]), several)
-    assert for_all is not None
-    assert for_all.tolist() == [[1.0], [1.0], [3.0], [0.0]]
+    with pytest.raises(ValueError, match=r"`StaFRegressor.fit` requires y to be passed.*target y is None"):
+        st.StaFRegressor().fit(torch.zeros(of_x), None)
 
 
 @pytest.mark.parametrize(
@@ -147,16 +112,19 @@ def test_time_between_samples_is_1_before_the_first() -> None:
     ],
 )
 def test_times_that_do_not_increase_are_refused(time: list[Any]) -> None:
-    with pytest.raises(ValueError, match=r"`call\(time=...\)` must be finite and increasing, \(4,\);"):
-        lapses("call", time, shapes(4, 2))
-    with pytest.raises(ValueError, match=r"must be finite and increasing, \(4,\) or \(4, 3\);"):
-        lapses("call", time, shapes(4, 3, 2))
+    for shape, form in (((4, 2), r"\(4,\);"), ((4, 3, 2), r"\(4,\) or \(4, 3\);")):
+        x, rule = (
+            torch.zeros(shape),
+            rf"`StaFRegressor.fit\(time=...\)` must be finite and increasing, {form}",
+        )
+        with pytest.raises(ValueError, match=rule):
+            st.StaFRegressor().fit(x, x[..., 0], time=time)
 
 
 @pytest.mark.parametrize(
-    "lapse", [-0.5, [0.0, -1e-9, 1.0], torch.inf, [1.0, torch.nan, 1.0], [1.0, 2.0], [[1.0]], [1.0] * 4]
+    "lapse", [-0.5, [0.0, -1e-9, 1.0], torch.inf, [1.0, torch.nan, 1.0], [1.0, 2.0], [[1.0]]]
 )
 def test_a_lapse_that_is_no_time_is_refused(lapse: Any) -> None:
-    rule = r"`call\(lapse=...\)` must be finite and not negative, \(\) or \(3,\);"
+    rule = r"`StaFRegressor.partial_fit\(lapse=...\)` must be finite and not negative, \(\) or \(3,\);"
     with pytest.raises(ValueError, match=rule):
-        lapse_of("call", lapse, 3)
+        st.StaFRegressor().partial_fit(torch.zeros(3, 2), torch.zeros(3), lapse=lapse)

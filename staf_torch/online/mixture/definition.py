@@ -1,4 +1,4 @@
-"""What `Bank` computes, in plain torch: the definition, and the fallback without a compiler.
+"""The bank in plain torch: the definition, and the fallback without a compiler.
 
 Streams are taken one by one, so that none can touch another; the members of the bank are a tensor dimension.
 """
@@ -21,7 +21,7 @@ _RESET = ("skipped", "learned")  # what a stream that begins anew keeps
 
 
 class Views(dict[str, Tensor]):
-    """One stream's part of the table, by name."""
+    """The part of the table that belongs to a stream, by name."""
 
     def number(self, name: str) -> float:
         """A part that is one number."""
@@ -102,7 +102,7 @@ class BankDefinition:
         return s["mean"] * spread + center, s["variance"].sqrt() * spread
 
     def _ask(self, s: Views, x: Tensor) -> None:
-        """What every member says at x, and their mixture."""
+        """Store the prediction of every member at x, and their mixture."""
         r, n = self.rules, self.shape.dim
         center, spread = self._units(s)
         u = torch.cat((torch.ones(1, dtype=torch.float64), (x - center[:n]) / spread[:n]))
@@ -354,7 +354,7 @@ class BankDefinition:
 
 
 def _tracked_at(s: Views, u: Tensor) -> Tensor:
-    """Where the trackers see u (n,), some of them in the coordinates of the metric: (n, L)."""
+    """Return u (n,) as the trackers see it, some of them in the coordinates of the metric: (n, L)."""
     found = u[:, None].repeat(1, TRACKERS)
     found[:, [TURNED, TURNED_FADING]] = (s["metric"].mT @ u)[:, None]
     return found

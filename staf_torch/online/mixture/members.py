@@ -161,7 +161,7 @@ class TrackerModels(NamedTuple):
             part.copy_(torch.where(broken, 0.0, part))
 
     def _drifted(self, inverse: Tensor, size: int, rate: Tensor, jitter: float, wrong: float) -> Tensor:
-        """Whether the inverse times a column of the kernels is wrong, at one place a sample: (L,)."""
+        """Return whether the inverse times a column of the kernels is wrong, at one place a sample: (L,)."""
         lanes = torch.arange(len(rate))
         at = torch.where(self.counts[2] < size, self.counts[2], 0.0).long()
         self.counts[2] = at + 1
@@ -224,7 +224,7 @@ class Stretch(NamedTuple):
 
 
 class Hyperparameters(NamedTuple):
-    """Of a process, and its log likelihood."""
+    """Hyperparameters of a process, and its log likelihood."""
 
     rate: float
     noise: float
@@ -233,7 +233,7 @@ class Hyperparameters(NamedTuple):
 
 
 class Learned(NamedTuple):
-    """Of the four trackers."""
+    """Hyperparameters of the four trackers that learn them."""
 
     turned: Hyperparameters  # in the coordinates of the metric
     plain: Hyperparameters

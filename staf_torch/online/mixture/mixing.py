@@ -1,4 +1,4 @@
-"""How the members of a bank are mixed and judged, in plain torch: the definition."""
+"""Mix and judge the members of a bank, in plain torch: the definition."""
 
 from __future__ import annotations
 

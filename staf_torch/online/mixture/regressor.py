@@ -105,7 +105,7 @@ class Bank:
 
     @property
     def compiled(self) -> bool:
-        """Whether compiled code runs, and not the definition."""
+        """Return whether compiled code runs, and not the definition."""
         return self._run is not None
 
     def add(self, streams: int) -> None:
