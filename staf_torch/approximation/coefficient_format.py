@@ -1,4 +1,4 @@
-"""What a state_dict says about the basis that its coefficients belong to, and how that is loaded."""
+"""The identification of a basis in a state_dict, by which stored coefficients are checked and loaded."""
 
 from __future__ import annotations
 

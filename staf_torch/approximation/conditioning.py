@@ -1,4 +1,4 @@
-"""How good an approximation at a state can be, and how well it can be computed."""
+"""Attainable accuracy of an approximation at a state, and its conditioning."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .basis import StaFBasis, Target
 
 
 class Conditioning(NamedTuple):
-    """What plain linear algebra would meet at the states x."""
+    """Conditioning of the Gram matrix that plain linear algebra would invert at the states x."""
 
     core_condition: Tensor  # kappa(K0), () or (...): the state-free part
     condition: Tensor  # kappa(K(c(x))), (...)

@@ -1,4 +1,4 @@
-"""How the ideal weights answer to the centers and to the state: implicit differentiation of K(c) W = V(c)."""
+"""Derivatives of the ideal weights in centers and state: implicit differentiation of K(c) W = V(c)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a gradient chase can vouch for, step by step."""
+"""Certificates of a gradient chase, step by step: contraction rate, excess and its bound."""
 
 from __future__ import annotations
 

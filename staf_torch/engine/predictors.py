@@ -1,4 +1,4 @@
-"""How the weights move between times, and the derivatives of V(c) and the Gram matrix that this takes."""
+"""Predictors of the weights from time to time, and the derivatives of V(c) and the Gram matrix they use."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ PredictorInputs = tuple[Tensor, ...]
 
 
 class Predictor(abc.ABC):
-    """How the weights move from one time to the next, before they are corrected there.
+    """Base class: the weights' step from one time to the next, before they are corrected there.
 
     Like a law it is pure and holds hyperparameters only. The weights of a chase at x_k are e^{g(x_k)} times
     the paper's, with g the kernel's `log_gain`.
@@ -48,7 +48,7 @@ class Predictor(abc.ABC):
     def prepare(
         self, basis: StaFBasis, target: Target, states: Tensor, start: int | Tensor
     ) -> PredictorInputs:
-        """What `predict` needs at the C arrivals of a chunk of time, in bulk.
+        """Compute in bulk the quantities that `predict` reads at the C arrivals of a chunk of time.
 
         Args:
             basis: kernel and centers.
@@ -108,7 +108,7 @@ class Secant(Predictor):
 
 
 class Tangent(Predictor):
-    """One step of w' = K^-1 (d/dt V(c) - K' w), the implicit derivative of K(c) w = V(c), from w = a_k.
+    """A step of w' = K^-1 (d/dt V(c) - K' w), the implicit derivative of K(c) w = V(c), from w = a_k.
 
     V(c) and K are differentiated along the trajectory by one forward-mode product. No model of the plant
     is asked for: x_{k+1} is known on arrival there, when the prediction is made. Both orders are affine

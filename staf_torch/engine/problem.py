@@ -1,4 +1,4 @@
-"""What a gradient chase is asked to do."""
+"""The problem of a gradient chase: basis, target, law, predictor and times."""
 
 from __future__ import annotations
 

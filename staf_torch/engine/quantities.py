@@ -1,4 +1,4 @@
-"""What a chase needs to know at states, and what follows from the weights there: rows and times alike.
+"""Quantities of a chase at states, before and after its weights are known: rows and times alike.
 
 Leading dimensions ... are (B, C), a chunk of time at once, or (B,), one time of a row program.
 """
@@ -22,7 +22,7 @@ from .result import ChaseResult
 
 
 class Known(NamedTuple):
-    """What is known at the states x (..., n) before any weights are."""
+    """Quantities at the states x (..., n) that do not depend on the weights."""
 
     state: Tensor
     structure: GramStructure

@@ -19,7 +19,7 @@ from .problem import Problem
 
 
 class Moment(NamedTuple):
-    """What the recursion reads at one time beside the objective."""
+    """Inputs of the recursion at one time, beside the objective."""
 
     log_gain: Tensor  # g(x), (B,)
     usable: Tensor  # (B,) bool: whether V(c) and K are finite
@@ -27,7 +27,7 @@ class Moment(NamedTuple):
 
 
 class Inputs(NamedTuple):
-    """What the recursion reads at the times of a chunk; nothing of it depends on the weights."""
+    """Inputs of the recursion at the times of a chunk; none depends on the weights."""
 
     gram: Tensor  # e^{-g} K(c(x_k)), (B, C, M, M)
     values: Tensor  # V(c(x_k)), (B, C, M)
@@ -53,7 +53,7 @@ class Inputs(NamedTuple):
 
 
 class Link(NamedTuple):
-    """What the certificate must know of the time before."""
+    """Quantities of the previous time that the certificate reads."""
 
     gram: Tensor  # (..., M, M) e^{-g} K
     log_gain: Tensor  # (...) g
@@ -61,7 +61,7 @@ class Link(NamedTuple):
 
 
 class Carry(NamedTuple):
-    """What passes from one time to the next. Weights are in units of e^{-log_gain}."""
+    """Carry of the recursion from one time to the next. Weights are in units of e^{-log_gain}."""
 
     weights: Tensor  # (B, M)
     law_state: LawState

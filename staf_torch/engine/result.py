@@ -1,4 +1,4 @@
-"""What a gradient chase returns."""
+"""The result of a gradient chase."""
 
 from __future__ import annotations
 

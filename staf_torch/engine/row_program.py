@@ -1,4 +1,4 @@
-"""One time of a chase as a step of a row program: what `recursion.py` defines, compiled by `lanes`.
+"""The step of a chase as a row program: the definition of `recursion.py`, compiled by `lanes`.
 
 Everything is evaluated in the step from the state x_k alone: kernel, V at the centers, local space,
 predictor, law and results. No matrix and no value at a center ever reaches memory.
@@ -32,7 +32,7 @@ _kept = SharedPrograms("a chase")
 
 
 class RowCarry(NamedTuple):
-    """What passes from one time to the next."""
+    """Carry of the compiled chase from one time to the next."""
 
     chase: Carry
     reach: Tensor  # (B,) the largest |x| nu(x) so far, which the kernel may warn of
@@ -40,7 +40,7 @@ class RowCarry(NamedTuple):
 
 
 class Outputs(NamedTuple):
-    """What is recorded of a time; None where nobody asks for it."""
+    """Outputs recorded at a time; None where they are not requested."""
 
     weights: Tensor | None = None  # the paper's w, (B, M)
     numbers: Numbers | None = None

@@ -94,7 +94,7 @@ class EnvironmentPlant(StepPlant):
 
 
 class _Stepped:
-    """One step of an environment for every row."""
+    """Step an environment once for every row."""
 
     def __init__(self, env: Any, read: Read, write: Write) -> None:
         self.env, self.read, self.write = env, read, write
@@ -112,7 +112,7 @@ class _Stepped:
 
 
 def _access(env: Any, named: object) -> tuple[Read, Write]:
-    """How to read and write the state of an environment of MuJoCo or of classic control."""
+    """Return the functions that read and write the state of an environment of MuJoCo or classic control."""
     if hasattr(env, "set_state") and hasattr(env, "data"):
         size = len(env.data.qpos)
 

@@ -1,4 +1,4 @@
-"""What a kernel is, and how it factors near a moving state."""
+"""Base class of kernels, and their factorisation near a moving state."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ class Kernel(nn.Module, abc.ABC):
         return None
 
     def follow(self, y: Tensor, step: Tensor) -> tuple[Tensor, Tensor] | None:
-        """Where the translation of all arguments by one step is a change of the point and a factor.
+        """Return the change of the point and the log factor that a translation of all arguments amounts to.
 
         k(y + step, c + step) = e^{p} k(y + q, c) with p and q that do not depend on c.
 

@@ -1,4 +1,4 @@
-"""What a local space offers, whatever basis it is held in."""
+"""Interface of a local space, independent of the basis that represents it."""
 
 from __future__ import annotations
 

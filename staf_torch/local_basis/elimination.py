@@ -23,7 +23,7 @@ class Elimination(NamedTuple):
 
 
 class Degrees(NamedTuple):
-    """What fixes the local basis of points for good, and every projective map of the points keeps."""
+    """The degrees that determine the local basis of points; every projective map of the points keeps them."""
 
     monomials: tuple[tuple[tuple[int, ...], ...], ...]
     """Exponents of as many monomials of degree 0, 1, ... as tell the points apart at that degree."""
@@ -37,7 +37,7 @@ class Degrees(NamedTuple):
         return cls(tuple(monomials), float(record["reach"]))
 
     def sizes(self) -> tuple[int, ...]:
-        """How many functionals each degree has."""
+        """Number of functionals of each degree."""
         return tuple(len(block) for block in self.monomials)
 
     def each(self) -> tuple[int, ...]:

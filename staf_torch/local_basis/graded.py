@@ -28,7 +28,7 @@ SERIES_BELOW = 1.0  # up to this r^2 the inverse is taken from its Chebyshev ser
 
 
 class GradedBasis(NamedTuple):
-    """What depends on the directions alone, in float64."""
+    """Quantities of the graded basis that depend on the directions alone, in float64."""
 
     directions: Tensor  # u, (M, n), in units of the reach
     reach: float  # the factor taken out of the directions
@@ -121,7 +121,7 @@ class Interpolation(NamedTuple):
         return cls(functionals, series, _chebyshev(2 * wide / upper - 1))
 
     def shared(self) -> bool:
-        """Whether one matrix serves all states."""
+        """Return whether one matrix is used at all states."""
         return self.inverse.dim() == 2
 
     def solve(self, values: Tensor) -> Tensor:

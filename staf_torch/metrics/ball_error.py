@@ -1,4 +1,4 @@
-"""How far a local approximation is from V around a state, and how near the ideal weights come."""
+"""Largest error of a local approximation in the ball around a state, and that of the ideal weights."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _kept = SharedPrograms("the errors on a ball")
 
 
 class StateErrors(NamedTuple):
-    """What is found at states (..., T, n)."""
+    """Errors and ball suprema at states (..., T, n)."""
 
     ball_error: Tensor  # (..., T) sup |V - V^| over the closed ball of radius nu(x)
     ball_floor_error: Tensor  # (..., T) that supremum with the ideal weights, in the local basis
@@ -139,7 +139,7 @@ def _gradient(function: Target, at: Tensor) -> Tensor:
 
 
 class _Fixed(NamedTuple):
-    """What all states share at the points of the ball; None where it depends on the state."""
+    """Quantities at the points of the ball that all states share; None where they depend on the state."""
 
     probes: Tensor  # (P, n) in units of the radius
     core: Tensor | None  # k0(z, d), (P, M), or (..., 1, P, M) where each row has its own

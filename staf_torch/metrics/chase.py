@@ -17,7 +17,7 @@ from .ball_error import StateErrorPass
 
 
 class Member(NamedTuple):
-    """One of several problems in a batch, with rows and a window of its own."""
+    """A problem of a batch, with rows and a window of its own."""
 
     rows: int  # trajectories, the next so many of the batch
     dt: float  # s
@@ -30,7 +30,7 @@ class Member(NamedTuple):
 
 
 class Chased(NamedTuple):
-    """What a `Metric` is told of a gradient chase beside its result."""
+    """Arguments of a `Metric` of a gradient chase beside the result."""
 
     basis: StaFBasis
     target: Target
@@ -200,7 +200,7 @@ class ChaseMetrics:
 
 
 class _RowRecord:
-    """What is gathered of some rows that go through time together."""
+    """Running reductions over rows that share their times."""
 
     def __init__(self, first: int) -> None:
         self.first = first  # index of the first of them in the batch
@@ -218,7 +218,7 @@ class _RowRecord:
             self.worst[name] = torch.maximum(self.worst[name], worst) if name in self.worst else worst
 
     def finished(self) -> _RowRecord:
-        """The same with numbers alone: the history of the excess has been read."""
+        """Return a copy without the history of the excess, which has been read."""
         if self.early and self.worst:
             early = torch.cat(self.early, dim=1)
             index = torch.arange(1, early.shape[1] + 1, device=early.device)

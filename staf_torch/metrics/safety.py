@@ -1,4 +1,4 @@
-"""What became of the constraints in a closed loop, as numbers."""
+"""Metrics of the constraints of a closed loop."""
 
 from __future__ import annotations
 

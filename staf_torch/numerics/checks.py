@@ -88,7 +88,7 @@ def flag(call: str, name: str, value: object) -> bool:
 
 
 def choice(call: str, name: str, value: object, allowed: Collection[object]) -> object:
-    """One of a few allowed values."""
+    """Return a value that must be one of a few."""
     if value not in allowed:
         listed = ", ".join(repr(a) for a in allowed)
         raise fail(call, name, f"must be one of {listed}", value)
@@ -110,7 +110,7 @@ def vector(call: str, name: str, value: object, length: int | None = None) -> li
 
 
 def one_or_each(call: str, name: str, value: object, count: int) -> Tensor:
-    """One finite number for all of ``count``, or one for each of them: (count,) float64."""
+    """Return a finite number for each of ``count``, given as one for all or one each: (count,) float64."""
     given = number(call, name, value).tolist() if isinstance(value, Tensor) else value  # type: ignore[union-attr]
     if not isinstance(given, Sequence):
         given = [real(call, name, given)] * count
@@ -139,7 +139,7 @@ def trailing(call: str, name: str, value: Tensor, dims: int, last: int | None = 
 
 
 def sampled(target: object, values: object, points: Tensor, outputs: int | None = None) -> Tensor:
-    """What a target returned at ``points`` (..., n): one value a point, (...), or k outputs, (..., k)."""
+    """Check a target's values at ``points`` (..., n): one a point, (...), or k outputs, (..., k)."""
     name = getattr(target, "__name__", type(target).__name__)
     if not isinstance(values, Tensor):
         raise ValueError(f"The target `{name}` must return a tensor; got {show(values)}.")

@@ -31,7 +31,7 @@ def riccati_step(
     cost_curvature: Tensor,
     minimum: Minimum,
 ) -> RiccatiStep:
-    """One step backward through x+ = F z, z = (x, u), that pays c'z + z'Wz/2.
+    """Riccati step backward through x+ = F z, z = (x, u), with the stage cost c'z + z'Wz/2.
 
     k need not be the minimum: the model is that of the control that is chosen, with all of its terms. All
     products are sums entry by entry, of which a compiled program leaves out what is 0.

@@ -17,7 +17,7 @@ def runge_kutta_step(
     dt: float | Tensor,
     displaced: Callable[[Tensor, Tensor], Tensor] = operator.add,
 ) -> Tensor:
-    """One step of the classical fourth-order Runge-Kutta method: (..., n) -> (..., n).
+    """Classical fourth-order Runge-Kutta step: (..., n) -> (..., n).
 
     Example:
         >>> x = systems.runge_kutta_step(lambda x: -x, torch.ones(1).double(), dt=0.1)

@@ -1,4 +1,4 @@
-"""What an update law is."""
+"""Base class of update laws."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class UpdateLaw(abc.ABC):
 
     @abc.abstractmethod
     def step(self, objective: Objective, weights: Tensor, state: LawState) -> tuple[Tensor, LawState]:
-        """One iteration: the new weights (..., M) and the new state."""
+        """Iterate once: the new weights (..., M) and the new state."""
 
     def iterate(
         self, objective: Objective, weights: Tensor, state: LawState, count: int
@@ -140,7 +140,7 @@ def line_search(objective: Objective, g: Tensor, direction: Tensor) -> Tensor:
 
 
 def worse_than_none(objective: Objective, weights: Tensor, g: Tensor) -> Tensor:
-    """Whether F(a) > F(0): the sign, seen from outside, that a law with momentum has lost its row.
+    """Return whether F(a) > F(0), by which a row is recognised that a law with momentum has lost.
 
     Args:
         objective: F.

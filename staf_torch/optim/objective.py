@@ -41,7 +41,7 @@ class Objective(Protocol):
 
 
 class Precomputed(NamedTuple):
-    """What has been computed of an objective in bulk, before the laws ask for it; None: not yet.
+    """Quantities of an objective that were computed in bulk for the laws; None where they were not.
 
     A law names in `needs` the fields that it will ask for.
     """

@@ -71,7 +71,7 @@ class ChaseOptimizer(Optimizer):
 
     @torch.no_grad()
     def step(self, closure: Callable[[], Tensor] | None = None) -> Tensor:  # type: ignore[override]
-        """One time step of the law.
+        """Take a time step of the law.
 
         Args:
             closure: returns the loss, a scalar or one number a row; it does not call ``backward``.

@@ -17,7 +17,7 @@ _NAMED = 20  # rows that an error lists
 
 
 class Barrier(ControlAffineSystem):
-    """The same plant in s, with every bounded coordinate of the state measured by
+    """A plant in barrier coordinates s: every bounded coordinate of its state is measured by
 
         s = ln( (x - low) (high - c) / ((high - x) (c - low)) ),  ds/dx = 1/(x - low) + 1/(high - x),
 
@@ -235,7 +235,7 @@ class Barrier(ControlAffineSystem):
 
 
 def wall_numbers(call: str, name: str, given: Wall, none: float, size: int) -> Tensor:
-    """One wall a coordinate, (n,) float64."""
+    """Return a wall for each coordinate, (n,) float64."""
     numbers = given.tolist() if isinstance(given, Tensor) else given
     listed = [numbers] * size if numbers is None or isinstance(numbers, int | float) else numbers
     if isinstance(listed, str) or not isinstance(listed, Sequence) or len(listed) != size:

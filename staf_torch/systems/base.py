@@ -1,4 +1,4 @@
-"""What a plant is."""
+"""Base class of plants."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ class Plant(nn.Module, abc.ABC):
 
     @property
     def traceable(self) -> bool:
-        """Whether the plant is torch all through, so that it can be differentiated and compiled."""
+        """Return whether the plant is torch all through, so that it can be differentiated and compiled."""
         return True
 
     def equilibrium(self) -> Tensor:
@@ -87,7 +87,7 @@ class Plant(nn.Module, abc.ABC):
         """x' in continuous time, x+ - x in discrete time: (..., n), (..., m) -> (..., n)."""
 
     def velocity(self, x: Tensor, u: Tensor) -> Tensor:
-        """What a closed loop integrates and hands to `displaced`: the motion, unless a plant knows better."""
+        """Return the velocity that a loop integrates and passes to `displaced`; by default the motion."""
         return self.motion(x, u)
 
     def displaced(self, x: Tensor, step: Tensor) -> Tensor:

@@ -126,7 +126,7 @@ class BlackBox:
         return Linearisation(a, b)
 
     def _traces(self, x: Tensor, u: Tensor) -> bool:
-        """Whether the function maps tensors to a tensor with a derivative, batched by `torch.func` too."""
+        """Return whether the function maps tensors to a tensor with a derivative, also under `torch.func`."""
         z = torch.cat((x, u)).expand(_PROBES, -1).clone().requires_grad_()
         try:
             with torch.enable_grad():

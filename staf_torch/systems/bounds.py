@@ -1,4 +1,4 @@
-"""What the inputs of a plant may be."""
+"""Bounds of the inputs of a plant."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Bounds:
 
     @property
     def present(self) -> bool:
-        """Whether any input is bounded."""
+        """Return whether any input is bounded."""
         return bool(torch.isfinite(self.low).any() or torch.isfinite(self.high).any())
 
     def clip(self, u: Tensor) -> Tensor:
@@ -49,7 +49,7 @@ class Bounds:
         return torch.minimum(torch.maximum(u, self.low.to(u)), self.high.to(u))
 
     def contain(self, u: Tensor) -> Tensor:
-        """Whether u is admissible: (..., m) -> (...) bool."""
+        """Return whether u is admissible: (..., m) -> (...) bool."""
         return ((u >= self.low.to(u)) & (u <= self.high.to(u))).all(-1)
 
     def inward(self, u: Tensor, slope: Tensor) -> Tensor:

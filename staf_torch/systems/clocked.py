@@ -11,7 +11,7 @@ from .user_plants import StepPlant
 
 
 class Clocked(Plant):
-    """The same plant in the state (x, t), t' = 1: what depends on the time then depends on the state.
+    """A plant in the state (x, t), t' = 1, so that a dependence on time is one on the state.
 
     Its `equilibrium` is that of the plant at t = 0: the clock itself never rests. A policy of (x, t) that
     follows a path is an `adp.LQR` or an `adp.RecedingHorizon` of an `adp.TrackingCost`.

@@ -1,4 +1,4 @@
-"""Where a plant rests: the input that holds it at a state, and the nearest equilibrium to a guess."""
+"""Equilibria of a plant: the input that holds it at a state, and the equilibrium nearest to a guess."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def find_equilibrium(plant: Plant, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor
 
 
 def _gauss_newton(motions: Callable[[Tensor], Tensor], z: Tensor) -> Tensor:
-    """Where nothing moves, by the smallest Gauss-Newton steps from z (k,): rows (B, k) -> (B, n)."""
+    """Solve motion = 0 by the smallest Gauss-Newton steps from z (k,): rows (B, k) -> (B, n)."""
     for _ in range(_STEPS):
         slopes, moves = central_slopes(motions, z), motions(z.unsqueeze(0))[0]
         step = torch.linalg.lstsq(slopes, -moves.unsqueeze(-1), driver="gelsd").solution[:, 0]
@@ -99,7 +99,7 @@ def _rests(plant: Plant, x: Tensor, u: Tensor) -> bool:
 
 
 def _scale(plant: Plant, x: Tensor, u: Tensor) -> float:
-    """What a unit of state or input changes in the motion at most, at least 1e-3."""
+    """Largest change of the motion per unit of state or input, at least 1e-3."""
     size, z = len(x), torch.cat((x, u))
     slopes = central_slopes(lambda v: _motions(plant, v[:, :size], v[:, size:]), z)
     return max(float(slopes.abs().max()), 1e-3)

@@ -85,7 +85,7 @@ class MujocoPlant(StepPlant):
 
 
 class _Simulation:
-    """One period of the model, for rows of states and controls."""
+    """Simulate a period of the model for rows of states and controls."""
 
     def __init__(self, model: Any, frames: int, threads: int) -> None:
         from mujoco import MjData, rollout

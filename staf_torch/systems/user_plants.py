@@ -17,7 +17,7 @@ Guess = Sequence[float] | Tensor | tuple[Sequence[float] | Tensor, Sequence[floa
 
 
 class FunctionPlant(Plant):
-    """What `StepPlant` and `RatePlant` have in common: the function, where it rests, its linearisation."""
+    """Base of `StepPlant` and `RatePlant`: the function, its equilibrium, its linearisation."""
 
     def __init__(
         self,

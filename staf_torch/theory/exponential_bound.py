@@ -1,4 +1,4 @@
-"""How many exponential kernels are enough: the theorem of the paper's section 4 and its proof, computed."""
+"""A sufficient number of exponential kernels: the theorem of the paper's section 4, its proof computed."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Construction:
 
     @property
     def degree(self) -> int:
-        """Of the product of the g_k."""
+        """Degree of the product of the g_k."""
         return sum(self.degrees)
 
     @property
@@ -83,7 +83,7 @@ class Functions(NamedTuple):
 
 
 class DomainProblem(NamedTuple):
-    """What the proof approximates, on the balls around the states of a domain."""
+    """The function that the proof approximates, on the balls around the states of a domain."""
 
     call: str
     target: Callable[[Tensor], Tensor]
@@ -218,7 +218,7 @@ class DomainProblem(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class ExponentialBound:
-    """What `exponential_bound` returns.
+    """Result of `exponential_bound`.
 
     Example:
         >>> found = theory.exponential_bound(targets.Paper(), theory.disc(), 0.1, 0.1)

@@ -1,4 +1,4 @@
-"""How many centers are needed in fact: the smallest layout whose ideal weights are accurate enough.
+"""The smallest layout of centers whose ideal weights reach an accuracy.
 
 The power function says how far a kernel function is from the span of the basis.
 """
@@ -27,7 +27,7 @@ _MOST_CENTERS = 500
 
 @dataclasses.dataclass(frozen=True)
 class MinimalCount:
-    """What `minimal_count` returns, over L layouts and the states (...) of a trajectory.
+    """Result of `minimal_count`, over L layouts and the states (...) of a trajectory.
 
     Example:
         >>> x = torch.tensor([[1.0, 0.5]]).double()

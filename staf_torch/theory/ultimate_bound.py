@@ -1,4 +1,4 @@
-"""How near a gradient chase comes, before it is run: by our constants, and by the paper's own."""
+"""A-priori ultimate bounds of a gradient chase: by our constants, and by the paper's own."""
 
 from __future__ import annotations
 
