@@ -20,7 +20,7 @@ from ..systems import Clocked, Plant
 from ..systems.bounds import Limit
 from .loop.controller import LQR, Controller, Feedback
 from .loop.simulation import simulate
-from .planning.receding_horizon import BoundedPlans, RecedingHorizon, StrainedPlans
+from .planning.receding_horizon import BoundedPlans, StrainedPlans
 from .planning.shooting import DirectShooting
 from .policies.rollout import ball_directions
 from .policies.sampled_rollout import SampledRollout
@@ -42,51 +42,60 @@ _REGULATED = 1e-2  # share of the distance from the set-point that is left
 
 
 class NearOptimal(SampledRollout):
-    """`SampledRollout` of an LQR as `near_optimal` makes it, with a report."""
+    """`SampledRollout` of an LQR as `near_optimal` makes it, with a report.
 
-    lqr: LQR
-    radius: float
-    substeps: int
-    planner: BoundedPlans | None = None
-    _planners: dict[Any, BoundedPlans]  # each has programs, which take seconds
-    _loops: dict[BoundedPlans, RecedingHorizon]
+    Args:
+        basis: as in `SampledRollout`, and so are ``plant``, ``steps`` and ``substeps``.
+        lqr: the base, made for the period for which a control is held.
+        radius: of the ball of centers, in units of the state.
+        plan: whether to plan where the LQR would meet a bound.
+    """
+
+    def __init__(
+        self,
+        basis: StaFBasis,
+        plant: Plant,
+        lqr: LQR,
+        *,
+        steps: int,
+        substeps: int,
+        radius: float,
+        plan: bool,
+    ) -> None:
+        assert lqr.period is not None
+        settings = {"period": lqr.period, "steps": steps, "substeps": substeps}
+        super().__init__(basis, plant, lqr.cost, lqr, lqr.value, lqr.p, **settings)  # type: ignore[arg-type]
+        self.lqr, self.radius, self.substeps, self.plan = lqr, radius, substeps, plan
+        self._planners: dict[Any, BoundedPlans] = {}  # each has programs, which take seconds
+
+    @property
+    def planner(self) -> BoundedPlans | None:
+        """What the policy as a function of x plans with; None where it does not plan."""
+        return self.plans() if self.plan else None
 
     def forward(self, x: Tensor) -> Tensor:
         """u: (..., n) -> (..., m)."""
-        u = super().forward(x)
-        if self.planner is None:
+        u, planner = super().forward(x), self.planner
+        if planner is None:
             return u
         rows, controls = x.reshape(-1, x.shape[-1]), u.reshape(-1, u.shape[-1])
-        strained = self.planner.strained(rows)
+        strained = planner.strained(rows)
         if not bool(strained.any()):  # saves work: a plan takes milliseconds
             return u
-        planned = self.planner(rows[strained])
+        planned = planner(rows[strained])
         return controls.index_copy(0, strained.nonzero().squeeze(1), planned).view(u.shape)
 
     def controller(self) -> Controller:
         """What a loop runs: the policy, and where inputs have bounds and the LQR, followed from the state,
         would meet one, a plan that is carried as long as this lasts. With ``plan`` a `RecedingHorizon` that
         carries its plan from control to control all the time, the first one the best of several."""
-        if self.planner is not None:
-            return self._carried(self.planner)
+        if (planner := self.planner) is not None:
+            return planner.loop
         planner = self.plans(_PLANNED)
-        return Feedback(self) if planner is None else StrainedPlans(self, planner, self._carried(planner))
-
-    def _carried(self, planner: BoundedPlans) -> RecedingHorizon:
-        """One for all controllers of a planner: it holds programs and nothing of a loop."""
-        known = self._loops.get(planner)
-        if known is None:
-            known = RecedingHorizon(planner.problem, steps=planner.steps, held=True)
-            self._loops[planner] = known
-        return known
+        return Feedback(self) if planner is None else StrainedPlans(self, planner)
 
     def __getstate__(self) -> dict[str, Any]:
-        made = {"planner": self.planner is not None, "_planners": {}, "_loops": {}}
-        return {**vars(self), **made}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        super().__setstate__(state)  # type: ignore[no-untyped-call]
-        self.planner = self.plans() if state["planner"] else None
+        return {**vars(self), "_planners": {}}
 
     def plans(self, constants: float | None = None) -> BoundedPlans | None:
         """What controls where the LQR would meet a bound; None without bounds or a plant in torch. It looks
@@ -137,7 +146,7 @@ class NearOptimal(SampledRollout):
         both = fine & also
         over_base = (ours / base)[both]
         over_optimum = self._over_optimum(x0, ours, fine) if optimum else ours[:0]
-        planner = self.plans() if self.planner is None else self.planner
+        planner = self.plans()
         return {
             "dt": self.period,
             "base": type(self.lqr).__name__,
@@ -266,12 +275,11 @@ def near_optimal(
         raise fail("near_optimal", "cost", rule, cost.end)
     placed = cost.bounded(low, high).around(plant)
     lqr = LQR(plant, placed, period=period)
-    seconds = (
-        (_PLANNED if flag("near_optimal", "plan", plan) else _DECAY) / _slowest(lqr, plant)
-        if horizon is None
-        else positive_real("near_optimal", "horizon", horizon)
-    )
-    steps = _periods(seconds, period) if horizon is None else round(seconds / period)
+    constants = _PLANNED if flag("near_optimal", "plan", plan) else _DECAY
+    if horizon is None:
+        steps = _periods(constants / _slowest(lqr, plant), period)
+    else:
+        steps = round(positive_real("near_optimal", "horizon", horizon) / period)
     substeps = 1
     if plant.period is None:
         a, _ = plant.linearisation(placed.target, placed.target_input)
@@ -280,20 +288,14 @@ def near_optimal(
     along = torch.cat((corners, torch.zeros_like(corners[:1])))
     directions = along if placed.inputs <= placed.dim else ball_directions(None, placed.dim)
     basis = StaFBasis(ExponentialKernel(), StateFollowingCenters(directions, radius))
-    policy = NearOptimal(
-        basis, plant, placed, lqr, lqr.value, lqr.p, period=period, steps=steps, substeps=substeps
-    )
-    policy.lqr, policy.radius, policy.substeps = lqr, radius, substeps
-    policy._planners, policy._loops = {}, {}
-    if flag("near_optimal", "plan", plan):
-        policy.planner = policy.plans()
+    policy = NearOptimal(basis, plant, lqr, steps=steps, substeps=substeps, radius=radius, plan=plan)
     if not plant.traceable:
         _warn_if_slow(policy)
     return policy
 
 
 def _periods(seconds: float, period: float) -> int:
-    """In a horizon: four quarters, of which a program has one."""
+    """Periods in a horizon, a multiple of four: a compiled rollout contains one quarter and loops over it."""
     return min(max(-(-round(seconds / period) // 4) * 4, _STEPS[0]), _STEPS[1])
 
 

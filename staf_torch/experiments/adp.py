@@ -25,7 +25,7 @@ from ..adp import (
     simulate,
 )
 from ..adp.loop.setup import AdpProblem
-from ..adp.planning.shooting.reference_optimum import Reference, compare
+from ..adp.planning.shooting.reference_optimum import LoopOptimum, compare
 from ..adp.problem.held_linear import HeldLoop
 from ..figures.animation import animate
 from ..figures.closed_loop import AdpHistory, draw_adp
@@ -52,7 +52,7 @@ class LoopSolution:
     """A closed loop that has been run and has left nothing on disk yet. It can be pickled."""
 
     result: LoopResult
-    optimum: Reference
+    optimum: LoopOptimum
     method: str  # plant and policy, for the log
     dt: float  # s
     steps: int

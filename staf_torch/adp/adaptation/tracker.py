@@ -14,9 +14,9 @@ from .history_stack import ConcurrentGradient, HistoryStack, Stack
 from .parametric import ParametricPlant
 from .windows import IntegralWindows, SlopeWindow, SlopeWindows, Window
 
-Reference = Callable[[Tensor], tuple[Tensor, Tensor]]
+DesiredMotion = Callable[[Tensor], tuple[Tensor, Tensor]]
 """xd and its rate from the state, (..., N) -> (..., m) and (..., m)."""
-Gain = float | Sequence[float] | Tensor
+GainOfRows = float | Sequence[float] | Tensor
 
 
 class Tracking(NamedTuple):
@@ -76,12 +76,12 @@ class ConcurrentTracker(Controller):
     def __init__(
         self,
         plant: ParametricPlant,
-        reference: Reference,
+        reference: DesiredMotion,
         *,
-        length: Gain,
-        feedback: Gain,
-        gain: Gain,
-        rate: Gain = 1.0,
+        length: GainOfRows,
+        feedback: GainOfRows,
+        gain: GainOfRows,
+        rate: GainOfRows = 1.0,
         source: str = "integral",
         size: int = 20,
         first: Sequence[float] | None = None,

@@ -14,8 +14,7 @@ from ...numerics.linalg import row_jacobian
 from ...numerics.riccati import product
 from ...systems import Plant, runge_kutta_step
 from ..loop.controller import Carried, Controller
-from ..problem.cost import matvec
-from .measurement import Output
+from ..problem.cost import Output, matvec
 
 
 class Belief(NamedTuple):

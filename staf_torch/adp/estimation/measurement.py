@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
 from ...numerics.checks import fail
 from ..loop.controller import Carried, Controller
-
-Output = Callable[[Tensor], Tensor]
-"""y from x: (..., n) -> (..., q)."""
+from ..problem.cost import Output
 
 
 def gaussian(uniform: Tensor, count: int) -> Tensor:

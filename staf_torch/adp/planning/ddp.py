@@ -67,7 +67,7 @@ class LocalModel(NamedTuple):
         return self.gradient + (self.curvature * d.unsqueeze(-2)).sum(-1)
 
 
-class Plan(NamedTuple):
+class CostedTrajectories(NamedTuple):
     """Trajectories without their models."""
 
     state: Tensor  # (B, T + 1, n)
@@ -75,9 +75,9 @@ class Plan(NamedTuple):
     cost: Tensor  # (B,)
     paid: Tensor  # of every step, and at last the terminal value, (B, T + 1)
 
-    def rows(self, index: Tensor) -> Plan:
+    def rows(self, index: Tensor) -> CostedTrajectories:
         """Some of the rows."""
-        return Plan(*(part[index] for part in self))
+        return CostedTrajectories(*(part[index] for part in self))
 
 
 def packed(state: Tensor, control: Tensor, feedback: Tensor) -> Tensor:
@@ -240,7 +240,7 @@ class BoxDDP:
         around = reference.state, control, torch.zeros_like(control), reference.feedback
         plan = self._followed(x0, around, x0.new_ones(len(x0), 1), terminal)
         going, ones = torch.isfinite(plan.cost).to(x0), torch.ones_like(plan.cost)
-        found = Progress(*plan, FIRST * ones, ones.clone(), going)
+        found = SearchState(*plan, FIRST * ones, ones.clone(), going)
         if tracing_now():  # a program of one row has no rows to leave out
             return self._models(
                 repeat(
@@ -269,7 +269,7 @@ class BoxDDP:
                     old[fresh] = fresher
         return self._models(found, terminal)
 
-    def _iterated(self, now: Progress, known: Derivatives, terminal: LocalModel) -> Progress:
+    def _iterated(self, now: SearchState, known: Derivatives, terminal: LocalModel) -> SearchState:
         """One iteration: a backward pass, the best length of its change, and what that says of the row."""
         end, (change, feedback, _, _) = self._backwards(now, known, now.mu, now.full, terminal)
         definite = end.definite > 0
@@ -277,14 +277,14 @@ class BoxDDP:
         tried = self._best(now.state[:, 0], around, terminal)
         better = definite & (tried.cost < now.cost)
         gain = (now.cost - tried.cost) / now.cost.abs().clamp(min=1e-300)
-        plan = chosen(better, tried, Plan(*now[:4]))
+        plan = chosen(better, tried, CostedTrajectories(*now[:4]))
         small = end.promised.abs() <= self.tolerance * plan.cost.abs()
         done = ((better & (gain <= self.tolerance)) | (definite & small)) & (now.mu <= TRUSTED)
         mu = torch.where(better, (now.mu * EASIER).clamp(min=LEAST), now.mu * HARDER)
         going = torch.where(done, CONVERGED, (mu <= MOST).to(mu))
-        return Progress(*plan, mu, torch.where(better, now.full, 1 - now.full), going)
+        return SearchState(*plan, mu, torch.where(better, now.full, 1 - now.full), going)
 
-    def _best(self, x0: Tensor, around: tuple[Tensor, ...], terminal: LocalModel) -> Plan:
+    def _best(self, x0: Tensor, around: tuple[Tensor, ...], terminal: LocalModel) -> CostedTrajectories:
         """The cheapest of five lengths of a change: side by side, but in a program one after the other."""
         lengths = x0.new_tensor(LENGTHS).expand(len(x0), -1)
         if not tracing_now():
@@ -301,7 +301,7 @@ class BoxDDP:
 
     def _followed(
         self, x0: Tensor, around: tuple[Tensor, ...], lengths: Tensor, terminal: LocalModel
-    ) -> Plan:
+    ) -> CostedTrajectories:
         """The best of u = control + length change + feedback (x - state) within the bounds.
 
         Args:
@@ -317,10 +317,10 @@ class BoxDDP:
         cost = torch.where(torch.isfinite(cost), cost, torch.inf)
         states, parts = torch.cat((x, end.unsqueeze(1)), dim=1), torch.cat((paid, last.unsqueeze(1)), dim=1)
         if lengths.shape[1] == 1:
-            return Plan(states.squeeze(2), u.squeeze(2), cost.squeeze(1), parts.squeeze(2))
+            return CostedTrajectories(states.squeeze(2), u.squeeze(2), cost.squeeze(1), parts.squeeze(2))
         best, at = cost.min(1)
         rows = torch.arange(len(x0))
-        return Plan(states[rows, :, at], u[rows, :, at], best, parts[rows, :, at])
+        return CostedTrajectories(states[rows, :, at], u[rows, :, at], best, parts[rows, :, at])
 
     def _along(self, program: Program, carry: Any, now: Any, row: Any) -> tuple[Any, Any]:
         """A step taken at all times: by its program, or as a loop of the program that is being traced."""
@@ -340,7 +340,7 @@ class BoxDDP:
         after, paid = self.problem.advance(x, u)
         return after, (x, u, paid)
 
-    def _derivatives(self, plan: Progress) -> Derivatives:
+    def _derivatives(self, plan: SearchState) -> Derivatives:
         """Along the trajectories: (B, T, ...)."""
         x, u = plan.state[:, :-1], plan.control
         if tracing_now():
@@ -349,7 +349,7 @@ class BoxDDP:
         return Derivatives(*(part[:, 0].unflatten(0, u.shape[:2]) for part in found))
 
     def _backwards(
-        self, plan: Progress, known: Derivatives, mu: Tensor, full: Tensor, terminal: LocalModel
+        self, plan: SearchState, known: Derivatives, mu: Tensor, full: Tensor, terminal: LocalModel
     ) -> tuple[Model, tuple[Tensor, ...]]:
         slope, bent = terminal.slope(self.problem, plan.state[:, -1]), terminal.curvature.contiguous()
         last = Model(slope, bent, torch.zeros_like(mu), torch.ones_like(mu))
@@ -381,7 +381,7 @@ class BoxDDP:
         model = Model(gradient, curvature, after.promised + promised, definite)
         return model, (change, feedback, gradient, curvature)
 
-    def _models(self, plan: Progress, terminal: LocalModel) -> Trajectories:
+    def _models(self, plan: SearchState, terminal: LocalModel) -> Trajectories:
         """The local models along finished trajectories, with as little regularisation as they bear."""
         known, small = self._derivatives(plan), torch.full_like(plan.cost, LEAST)
 
@@ -405,7 +405,7 @@ class BoxDDP:
         )
 
 
-class Progress(NamedTuple):
+class SearchState(NamedTuple):
     """Plans, and how the search goes on with each."""
 
     state: Tensor  # (B, T + 1, n)
@@ -416,9 +416,9 @@ class Progress(NamedTuple):
     full: Tensor  # 1 with the second derivatives of the plant, 0 without, (B,)
     going: Tensor  # 1 goes on, 0 has given up, `CONVERGED` has converged, (B,)
 
-    def rows(self, index: Tensor) -> Progress:
+    def rows(self, index: Tensor) -> SearchState:
         """Some of the rows."""
-        return Progress(*(part[index] for part in self))
+        return SearchState(*(part[index] for part in self))
 
 
 class Model(NamedTuple):

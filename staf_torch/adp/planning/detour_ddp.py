@@ -27,7 +27,7 @@ Chosen = Callable[[Tensor, Tensor, Any, Tensor], Tensor]
 """u from the moved states, the others, what the period brings, and the number of periods so far."""
 
 
-class Plan(NamedTuple):
+class DetourPlan(NamedTuple):
     """A plan over T periods."""
 
     states: Tensor  # of the states that the inputs move, (B, T + 1, p)
@@ -53,7 +53,7 @@ class PlanProblem:
     def improve(self, now: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
         """One step: the first of a few lengths that lowers J."""
         others, done, *parts = now
-        plan = Plan(*parts)
+        plan = DetourPlan(*parts)
         change, feedback = self._newton(plan, others, done)
         whole = torch.ones_like(plan.total)
 
@@ -75,7 +75,7 @@ class PlanProblem:
         found = repeat(_TRIES, attempt, (*plan, whole, whole), where=lambda now: now[-1] > 0)
         return others, done, *found[:3]
 
-    def follow(self, y: Tensor, others: Tensor, done: Tensor, inputs: Any, chosen: Chosen) -> Plan:
+    def follow(self, y: Tensor, others: Tensor, done: Tensor, inputs: Any, chosen: Chosen) -> DetourPlan:
         """Follow the plant over T periods, with the control that a function chooses at each."""
 
         def period(now: tuple[Tensor, ...], given: tuple[Tensor, Any]) -> tuple[tuple[Tensor, ...], Any]:
@@ -90,7 +90,7 @@ class PlanProblem:
         (end, k, total), (states, control) = scan(period, (y, none, none), (others[:, :-1], inputs))
         x = self.whole(end, others[:, -1])
         total = total + self.hold * self.penalty(x, (done[:, 0] + k) * self.hold) + self.detours.terminal(x)
-        return Plan(torch.cat((states, end.unsqueeze(1)), dim=1), control, total)
+        return DetourPlan(torch.cat((states, end.unsqueeze(1)), dim=1), control, total)
 
     def paid(self, x: Tensor, u: Tensor, t: Tensor) -> Tensor:
         """A period's part of J: (B, n), (B, m), (B,) -> (B,)."""
@@ -147,7 +147,7 @@ class PlanProblem:
             total = total + torch.where(short > 0, short.square(), 0.0 * short)
         return self.weight * total
 
-    def _newton(self, plan: Plan, others: Tensor, done: Tensor) -> tuple[Tensor, Tensor]:
+    def _newton(self, plan: DetourPlan, others: Tensor, done: Tensor) -> tuple[Tensor, Tensor]:
         """Changes of the controls (B, T, m) and their feedback (B, T, m, p), backward in time."""
         low, high = self.bounds(plan.control)
         bend = 2 * self.hold * self.cost.r.to(plan.control)
@@ -394,7 +394,7 @@ class DetourPlans(Controller):
         after = torch.cat((first, ahead.flatten(1), left.unsqueeze(-1), done + 1), dim=-1)
         return after.reshape(*z.shape[:-1], -1)
 
-    def _kept(self, x: Tensor, control: Tensor, expected: Tensor, done: Tensor) -> tuple[Tensor, Plan]:
+    def _kept(self, x: Tensor, control: Tensor, expected: Tensor, done: Tensor) -> tuple[Tensor, DetourPlan]:
         """Others, and the best plan: the improved one, or a detour where that costs more than expected."""
         problem = self._problem
         others, y = problem.others(x), x[:, : self.moved]
@@ -421,7 +421,7 @@ class DetourPlans(Controller):
         found = repeat(
             1 + _FRESH, attempt, (*carried, *carried, none, none + 1), where=lambda now: now[-1] > 0
         )
-        return others, Plan(*found[:3])
+        return others, DetourPlan(*found[:3])
 
     def _improved(self, x: Tensor, control: Tensor, done: Tensor, count: int) -> tuple[Tensor, ...]:
         """Others, periods so far, and the plan after so many steps of Gauss and Newton."""
@@ -431,7 +431,7 @@ class DetourPlans(Controller):
         found: tuple[Tensor, ...] = repeat(count, self._problem.improve, (others, done, *plan))
         return found
 
-    def _followed(self, y: Tensor, others: Tensor, tried: Tensor, done: Tensor) -> Plan:
+    def _followed(self, y: Tensor, others: Tensor, tried: Tensor, done: Tensor) -> DetourPlan:
         """What a detour (B, k + 1) does."""
 
         def wanted(y: Tensor, others: Tensor, _: Tensor, k: Tensor) -> Tensor:

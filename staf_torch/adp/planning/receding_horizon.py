@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import functools
 import math
 from typing import NamedTuple
 
@@ -233,6 +234,11 @@ class BoundedPlans:
         """Whether the base, followed over the policy's horizon, meets a bound: (B, n) -> (B,) bool."""
         return self.policy.meets_bound(x).reshape(-1) > 0
 
+    @functools.cached_property
+    def loop(self) -> RecedingHorizon:
+        """One for all controllers, as it holds programs and nothing of a loop."""
+        return RecedingHorizon(self.problem, steps=self.steps, held=True)
+
     def __call__(self, x: Tensor) -> Tensor:
         """u: (B, n) -> (B, m)."""
         return best_held(self._search, x).control[:, 0]
@@ -250,13 +256,12 @@ class StrainedPlans(Controller):
     Args:
         policy: of the other states; its base is the linear feedback.
         planner: of its plant, cost and bounds; it knows where bounds are met.
-        begun: what carries the plans, of the planner's problem.
     """
 
-    def __init__(self, policy: SampledRollout, planner: BoundedPlans, begun: RecedingHorizon) -> None:
+    def __init__(self, policy: SampledRollout, planner: BoundedPlans) -> None:
         super().__init__()
         self.policy, self.period = policy, policy.period
-        self._planner, self._begun = planner, begun
+        self._planner, self._begun = planner, planner.loop
 
     @property
     def label(self) -> str:

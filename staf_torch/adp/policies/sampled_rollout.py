@@ -27,7 +27,7 @@ _SHORTER = 0.75  # of the horizon, at which the promise of a control must hold a
 _MARGIN = 1e-9  # relative, by which a control must be better than the base's
 
 
-Stretch = tuple[Tensor, Tensor, Tensor]
+RolloutStretch = tuple[Tensor, Tensor, Tensor]
 """The state, what was paid, and what a cost still counts."""
 
 
@@ -197,12 +197,12 @@ class SampledRollout(nn.Module):
 
         stretches = x.new_zeros(self.steps // passes)
 
-        def step(now: Stretch) -> Stretch:
+        def step(now: RolloutStretch) -> RolloutStretch:
             at, spent, share = now
             after, paid = self.holding(at, self.bounds.clip(self.base(at)))
             return after, spent + share * paid, discount * share
 
-        def stretch(now: Stretch, _: Tensor) -> tuple[Stretch, Tensor]:
+        def stretch(now: RolloutStretch, _: Tensor) -> tuple[RolloutStretch, Tensor]:
             at, spent, share = repeat(passes, step, now)
             return (at, spent, share), spent + share * self.terminal(at)
 
@@ -271,7 +271,7 @@ def _along(basis: StaFBasis) -> Along:
 
 
 @dataclasses.dataclass(frozen=True)
-class Followed:
+class FollowedSimulator:
     """(x (..., n), T) -> states (..., T + 1, n) and controls (..., T, m) of a policy within its bounds."""
 
     plant: StepPlant
@@ -314,7 +314,7 @@ class Followed:
         return u
 
 
-def followed(plant: Plant, base: Policy, bounds: Bounds, period: float) -> Followed | None:
+def followed(plant: Plant, base: Policy, bounds: Bounds, period: float) -> FollowedSimulator | None:
     """What follows a policy through a simulator that a user brings; None of other plants, or where the plant
     does more than its function.
 
@@ -326,4 +326,4 @@ def followed(plant: Plant, base: Policy, bounds: Bounds, period: float) -> Follo
     """
     if plant.traceable or not isinstance(plant, StepPlant) or plant.period != period:
         return None
-    return Followed(plant, base, bounds) if type(plant).step is StepPlant.step else None
+    return FollowedSimulator(plant, base, bounds) if type(plant).step is StepPlant.step else None

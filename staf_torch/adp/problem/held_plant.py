@@ -28,7 +28,7 @@ def fewest_and_most(call: str, substeps: int | tuple[int, int]) -> tuple[int, in
     )
 
 
-Stage = tuple[Tensor, Tensor, Tensor]
+RungeKuttaSums = tuple[Tensor, Tensor, Tensor]
 """The slope of the last stage, the sum of what the slopes count, and what was paid."""
 
 
@@ -148,7 +148,7 @@ def runge_kutta_loop(
         x+ (..., n) and what was paid, (...).
     """
 
-    def stage(now: Stage, share: tuple[Tensor, Tensor, Tensor]) -> tuple[Stage, tuple[()]]:
+    def stage(now: RungeKuttaSums, share: tuple[Tensor, Tensor, Tensor]) -> tuple[RungeKuttaSums, tuple[()]]:
         slope, moved, paid = now
         ahead, count, value = share
         slope, rate = field(plant.displaced(x, ahead * slope))

@@ -22,7 +22,7 @@ from ...systems.bounds import Limit
 from .cost import Cost
 from .tracking_cost import Path, TrackingCost
 
-Step = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
+StepFunction = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 """(x (B, n), u (B, m)) -> (x+ (B, n), cost of the step (B,))."""
 _RESTS = 1e-6  # of the scale of the state: how far the goal may move in a step
 
@@ -66,7 +66,7 @@ class SampledProblem(nn.Module):
 
     def __init__(
         self,
-        step: Step,
+        step: StepFunction,
         *,
         dim: int,
         inputs: int,

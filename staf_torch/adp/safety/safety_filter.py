@@ -21,7 +21,7 @@ from .quadratic_program import cases, nearest_admissible
 
 Constraint = Callable[[Tensor, Tensor], Tensor]
 """h(x, t), kept at least 0: states (B, n) and a time, a number in a tensor (), to (B,)."""
-Rows = Callable[[Tensor, Tensor], Tensor]
+RowValue = Callable[[Tensor, Tensor], Tensor]
 """A function of one row (1, n) and a time () to a number ()."""
 INFEASIBLE = 1e-6  # slack, in units of the input, from which on a row counts as infeasible
 _PASSES, _MOST = 2, 8  # linearisations at least, the first at the wanted control; at most, until all is met
@@ -317,7 +317,7 @@ class SafetyFilter(Controller):
         plant = self.plant
         return runge_kutta_step(lambda at: plant.velocity(at, u), x, 0.5 * self.hold, plant.displaced)
 
-    def _level(self, k: int) -> Rows:
+    def _level(self, k: int) -> RowValue:
         """phi of one row: (1, n), () -> ()."""
         h = _number(self.constraints[k])
         if self.degree[k] == 1:
@@ -356,7 +356,7 @@ class SafetyFilter(Controller):
             )
         return tuple(found), moving
 
-    def _degree(self, h: Rows, x: Tensor, t: Tensor) -> int:
+    def _degree(self, h: RowValue, x: Tensor, t: Tensor) -> int:
         """1 or 2: which derivative of h the control moves at states (P, 1, n); 0 for neither."""
         rest = self.plant.resting_input().double().unsqueeze(0)
 
@@ -365,7 +365,7 @@ class SafetyFilter(Controller):
 
         for number, phi in ((1, h), (2, first)):
 
-            def rate(u: Tensor, x: Tensor, t: Tensor, phi: Rows = phi) -> Tensor:
+            def rate(u: Tensor, x: Tensor, t: Tensor, phi: RowValue = phi) -> Tensor:
                 return _rate(phi, self.plant, x, u, t)
 
             effect = torch.func.vmap(torch.func.grad(rate), in_dims=(None, 0, 0))(rest, x, t)
@@ -374,12 +374,12 @@ class SafetyFilter(Controller):
         return 0
 
 
-def _number(h: Constraint) -> Rows:
+def _number(h: Constraint) -> RowValue:
     """h of one row: (1, n), () -> ()."""
     return lambda x, t: h(x, t)[0]
 
 
-def _rate(phi: Rows, plant: Plant, x: Tensor, u: Tensor, t: Tensor) -> Tensor:
+def _rate(phi: RowValue, plant: Plant, x: Tensor, u: Tensor, t: Tensor) -> Tensor:
     """d phi / dt along the plant: (1, n), (1, m), () -> ()."""
     along_x, along_t = torch.func.grad(phi, argnums=(0, 1))(x, t)
     rate: Tensor = (along_x * plant.motion(x, u)).sum() + along_t

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from staf_torch import adp, systems
 from staf_torch.adp.critic.bellman import value_gradient
-from staf_torch.adp.planning.shooting.stage import Stage
+from staf_torch.adp.planning.shooting.stage import Interval
 
 DOUBLE = systems.Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
 LINEAR = systems.Linear([[0.0, 1.0], [2.0, -1.0]], [[0.0], [1.0]])
@@ -285,7 +285,7 @@ def test_the_gap_of_a_control_is_what_its_hamiltonian_exceeds_the_least_by(affin
         plant = systems.RatePlant(cubic, dim=2, inputs=1)
     cost = adp.QuadraticCost(1.0, 0.5, dim=2, inputs=1, low=-0.8, high=0.8)
     x, costate, v = random(50, 2, seed=1), 2 * random(50, 2, seed=2), 0.8 * random(50, 1, seed=3)
-    gap = Stage(plant, cost).gap(x, v, costate)
+    gap = Interval(plant, cost).gap(x, v, costate)
     slope = torch.func.vmap(torch.func.jacrev(lambda x, u: plant.motion(x[None], u[None])[0], argnums=1))(
         x, v
     )

@@ -14,9 +14,9 @@ from ....systems.bounds import Limit
 from ...loop.controller import LQR, Policy, Value
 from ...problem.cost import Cost
 from ..ddp import chosen
-from .newton import Plan, Solution, follow, minimise, replay
+from .newton import MeshPlan, NewtonSolution, follow, minimise, replay
 from .optimum import Optimum
-from .stage import Stage
+from .stage import Interval
 from .starts import agreement, guesses, guided, said
 
 _DECAY = 9.2  # time constants of the slowest mode in the horizon: it falls to 1e-4
@@ -119,7 +119,7 @@ class DirectShooting:
             raise fail("DirectShooting", "horizon", "must be given beside a terminal cost", None)
         if cost.discount:
             raise fail("DirectShooting", "cost", "must have no discount", cost.discount)
-        self.stage = Stage(system, cost)
+        self.stage = Interval(system, cost)
         rates = (1.0, 1.0)
         self.lqr: LQR | None = None
         if base is None or terminal is None or horizon is None or intervals is None:
@@ -197,7 +197,7 @@ class DirectShooting:
             plans.append(self._warm(warm, x0[rows], rows, time))
         plans = _cheapest(plans, self.starts, start.cost[rows])
         # All starts of all rows are one batch: what a step costs hardly depends on its size.
-        together = Plan(*(torch.cat(parts) for parts in zip(*plans, strict=True)))
+        together = MeshPlan(*(torch.cat(parts) for parts in zip(*plans, strict=True)))
         improved = self._improve(together, time, x0[rows].repeat(len(plans), 1), base)
         places = torch.arange(len(rows))
         several = [selected(improved, k * len(rows) + places) for k in range(len(plans))]
@@ -211,7 +211,7 @@ class DirectShooting:
         near = (ratio > _NEAR[0]) & (ratio < _NEAR[1]) & (followed <= _PLAIN * found.value)
         return found.converged & ((x0 == 0).all(-1) | near)
 
-    def _guessed(self, x0: Tensor, time: Tensor) -> list[Plan]:
+    def _guessed(self, x0: Tensor, time: Tensor) -> list[MeshPlan]:
         lengths, horizon = time.diff(), float(time[-1])
         plans = [follow(self, _always(base), x0, lengths) for base in self.bases]
         for base in self.bases:
@@ -219,7 +219,7 @@ class DirectShooting:
             plans += [follow(self, guided(guess, base), x0, lengths) for guess in several]
         return plans
 
-    def _warm(self, warm: Optimum, x0: Tensor, rows: Tensor, time: Tensor) -> Plan:
+    def _warm(self, warm: Optimum, x0: Tensor, rows: Tensor, time: Tensor) -> MeshPlan:
         """An earlier plan, held open loop on this mesh."""
         runner = warm.replay()
         runner.plan = runner.plan[rows]
@@ -232,7 +232,7 @@ class DirectShooting:
 
         return follow(self, control, x0, time.diff())
 
-    def _improve(self, start: Plan, time: Tensor, x0: Tensor, base: Policy) -> Optimum:
+    def _improve(self, start: MeshPlan, time: Tensor, x0: Tensor, base: Policy) -> Optimum:
         """Newton's method on two meshes from a plan on the coarse one."""
         coarse = minimise(self, start, time.diff())
         fine_start = self._finer(coarse, time.diff())
@@ -243,14 +243,14 @@ class DirectShooting:
             fine_start = chosen(~lower, fine_start, again)
         return self._optimum(minimise(self, fine_start, time.diff()), coarse, time)
 
-    def _finer(self, solution: Solution, lengths: Tensor) -> Plan:
+    def _finer(self, solution: NewtonSolution, lengths: Tensor) -> MeshPlan:
         """The same control on a mesh of half the intervals, with its cost there."""
         plan, feedback = split(self.stage, solution.plan, solution.feedback, lengths)
         halves = (0.5 * lengths).repeat_interleave(2)
         none = torch.zeros_like(plan.control)
         return replay(self.stage, plan, plan.state[:, 0], halves, self.terminal, feedback, none)
 
-    def _optimum(self, fine: Solution, coarse: Solution, time: Tensor) -> Optimum:
+    def _optimum(self, fine: NewtonSolution, coarse: NewtonSolution, time: Tensor) -> Optimum:
         x0, plan = fine.plan.state[:, 0], fine.plan
         value = self._finer(fine, time.diff()).cost  # the same control, more exactly integrated
         left = self._left(fine, time) / value
@@ -285,7 +285,7 @@ class DirectShooting:
             reason=tuple(_why(bool(known[b]), fine, float(left[b]), b) for b in range(len(x0))),
         )
 
-    def _left(self, solution: Solution, time: Tensor) -> Tensor:
+    def _left(self, solution: NewtonSolution, time: Tensor) -> Tensor:
         """int of the Hamiltonian over its minimum along a plan, (B,)."""
         state, costate, lengths = solution.plan.state, solution.costates, time.diff()
         first, last = solution.plan.control.chunk(2, dim=-1)
@@ -299,7 +299,7 @@ def _always(policy: Policy) -> Callable[[Tensor, float], Tensor]:
     return lambda x, t: policy(x)
 
 
-def _why(known: bool, solution: Solution, left: float, row: int) -> str:
+def _why(known: bool, solution: NewtonSolution, left: float, row: int) -> str:
     """Why a row has no optimum, in words; empty where it has."""
     if known:
         return ""
@@ -313,7 +313,7 @@ def _why(known: bool, solution: Solution, left: float, row: int) -> str:
     return f"the control misses the minimum of the Hamiltonian by {left:.2g} of the value: it is saturated"
 
 
-def _cheapest(plans: list[Plan], count: int, used: Tensor) -> list[Plan]:
+def _cheapest(plans: list[MeshPlan], count: int, used: Tensor) -> list[MeshPlan]:
     """The ``count`` cheapest of several plans that differ from each other and from one used, row by row.
 
     Two that cost the same are mirror images, or one and the same: they would find the same, and agree with
@@ -332,7 +332,7 @@ def _cheapest(plans: list[Plan], count: int, used: Tensor) -> list[Plan]:
     order = costs.argsort(dim=0, stable=True)[: min(count, len(plans))]
     rows = torch.arange(costs.shape[1])
     state, control = (torch.stack([getattr(p, name) for p in plans]) for name in ("state", "control"))
-    return [Plan(state[k, rows], control[k, rows], costs[k, rows]) for k in order]
+    return [MeshPlan(state[k, rows], control[k, rows], costs[k, rows]) for k in order]
 
 
 def selected(optimum: Optimum, rows: Tensor) -> Optimum:
@@ -407,7 +407,7 @@ def halved(time: Tensor) -> Tensor:
     return torch.cat((time[:1], torch.stack((middle, time[1:]), dim=-1).flatten()))
 
 
-def split(stage: Stage, plan: Plan, feedback: Tensor, lengths: Tensor) -> tuple[Plan, Tensor]:
+def split(stage: Interval, plan: MeshPlan, feedback: Tensor, lengths: Tensor) -> tuple[MeshPlan, Tensor]:
     """The same control on half intervals, and a feedback around it.
 
     Args:
@@ -426,4 +426,4 @@ def split(stage: Stage, plan: Plan, feedback: Tensor, lengths: Tensor) -> tuple[
     state = torch.stack((plan.state[:, :-1], between), dim=2).flatten(1, 2)
     state = torch.cat((state, plan.state[:, -1:]), dim=1)
     control = torch.stack((early, late), dim=2).flatten(1, 2)
-    return Plan(state, control, plan.cost), feedback.repeat_interleave(2, dim=1)
+    return MeshPlan(state, control, plan.cost), feedback.repeat_interleave(2, dim=1)

@@ -11,14 +11,14 @@ from torch import Tensor
 
 from ....numerics.riccati import riccati_step
 from ..ddp import chosen
-from .stage import Expansion, Stage, closed_stage
+from .stage import Expansion, Interval, closed_stage
 
 _ROUNDING = 1e-9  # relative promise below which a step that does not pay is one that rounding hides
 _LEAST_CURVATURE = 1e-6  # of its largest eigenvalue, that a convexified interval keeps
 _SHORTER = (0.5, 0.25, 0.1, 0.03, 0.01)  # shares of the Newton step, where the whole one does not pay
 
 
-class Plan(NamedTuple):
+class MeshPlan(NamedTuple):
     """Trajectories of the transcribed problem, a row each."""
 
     state: Tensor  # (B, N + 1, n)
@@ -110,8 +110,14 @@ def convexified(expansion: Expansion) -> Expansion:
 
 
 def replay(
-    stage: Stage, plan: Plan, x0: Tensor, lengths: Tensor, terminal: object, feedback: Tensor, offset: Tensor
-) -> Plan:
+    stage: Interval,
+    plan: MeshPlan,
+    x0: Tensor,
+    lengths: Tensor,
+    terminal: object,
+    feedback: Tensor,
+    offset: Tensor,
+) -> MeshPlan:
     """The plan's control with feedback around its states and an offset, from x0 (..., B, n)."""
 
     def control(x: Tensor, k: int) -> Tensor:
@@ -122,8 +128,12 @@ def replay(
 
 
 def _driven(
-    stage: Stage, control: Callable[[Tensor, int], Tensor], x0: Tensor, lengths: Tensor, terminal: object
-) -> Plan:
+    stage: Interval,
+    control: Callable[[Tensor, int], Tensor],
+    x0: Tensor,
+    lengths: Tensor,
+    terminal: object,
+) -> MeshPlan:
     """The trajectories from x0 (..., B, n) under a control v(x, interval), with what they cost."""
     x, states, controls, seen = x0, [x0], [], []
     for k, h in enumerate(lengths.unbind()):
@@ -136,12 +146,12 @@ def _driven(
     # What was paid, for all intervals at once: one by one that is a good part of the time of a replay.
     paid = stage.paid([torch.stack(part, dim=-2) for part in zip(*seen, strict=True)], v, lengths)
     cost = paid.sum(-1) + terminal(x)  # type: ignore[operator]
-    return Plan(torch.stack(states, dim=-2), v, torch.where(torch.isfinite(cost), cost, torch.inf))
+    return MeshPlan(torch.stack(states, dim=-2), v, torch.where(torch.isfinite(cost), cost, torch.inf))
 
 
 def improved(
-    stage: Stage, plan: Plan, lengths: Tensor, terminal: object, step: Direction
-) -> tuple[Plan, Tensor]:
+    stage: Interval, plan: MeshPlan, lengths: Tensor, terminal: object, step: Direction
+) -> tuple[MeshPlan, Tensor]:
     """The plan after the longest share of the step that lowers its cost, and which rows it lowered."""
     x0 = plan.state[:, 0]
     tried = replay(stage, plan, x0, lengths, terminal, step.feedback, step.offset)
@@ -154,25 +164,25 @@ def improved(
         tried = replay(stage, plan, several, lengths, terminal, step.feedback, offsets)
         cost, which = tried.cost.min(dim=0)
         rows = torch.arange(len(x0), device=x0.device)
-        shortened = Plan(tried.state[which, rows], tried.control[which, rows], cost)
+        shortened = MeshPlan(tried.state[which, rows], tried.control[which, rows], cost)
         pays = ~lower & (cost < plan.cost)
         best, lower = chosen(pays, shortened, best), lower | pays
     return best, lower
 
 
-class Problem(Protocol):
+class ShootingProblem(Protocol):
     """What the iteration needs to know; `DirectShooting` has it."""
 
-    stage: Stage
+    stage: Interval
     terminal: Callable[[Tensor], Tensor]
     tolerance: float
     iterations: int
 
 
-class Solution(NamedTuple):
+class NewtonSolution(NamedTuple):
     """Where the iteration ended, a row each."""
 
-    plan: Plan
+    plan: MeshPlan
     feedback: Tensor  # of the last expansion, (B, N, 2m, n)
     gradient: Tensor  # of the cost in x(0), (B, n)
     converged: Tensor  # (B,) bool
@@ -181,7 +191,9 @@ class Solution(NamedTuple):
     iterations: Tensor  # (B,)
 
 
-def follow(problem: Problem, control: Callable[[Tensor, float], Tensor], x0: Tensor, lengths: Tensor) -> Plan:
+def follow(
+    problem: ShootingProblem, control: Callable[[Tensor, float], Tensor], x0: Tensor, lengths: Tensor
+) -> MeshPlan:
     """The trajectories under a control u(x, t) on a mesh: (B, n), (N,)."""
     stage, times = problem.stage, [0.0, *itertools.accumulate(lengths.tolist())]
 
@@ -199,7 +211,7 @@ def _at(control: Callable[[Tensor, float], Tensor], t: float) -> Callable[[Tenso
     return lambda x: control(x, t)
 
 
-def minimise(problem: Problem, plan: Plan, lengths: Tensor) -> Solution:
+def minimise(problem: ShootingProblem, plan: MeshPlan, lengths: Tensor) -> NewtonSolution:
     """Newton's iteration from a plan on a mesh of interval lengths (N,)."""
     batch = len(plan.cost)
     done = torch.zeros(batch, dtype=torch.bool, device=plan.cost.device)
@@ -220,10 +232,12 @@ def minimise(problem: Problem, plan: Plan, lengths: Tensor) -> Solution:
         step, rough = _step(problem, plan, lengths, moving & ~lower)  # convexified where it did not pay
         kept = chosen(done | stuck, kept, step)
     promise = torch.where(kept.definite, kept.decrement / plan.cost, torch.inf)
-    return Solution(plan, kept.feedback, kept.gradient, done, kept.costates, promise, count)
+    return NewtonSolution(plan, kept.feedback, kept.gradient, done, kept.costates, promise, count)
 
 
-def _step(problem: Problem, plan: Plan, lengths: Tensor, rough: Tensor) -> tuple[Direction, Tensor]:
+def _step(
+    problem: ShootingProblem, plan: MeshPlan, lengths: Tensor, rough: Tensor
+) -> tuple[Direction, Tensor]:
     """The Newton step, of the convexified model in the rows ``rough`` and where it has no minimum."""
     slope, curvature = _derivatives(problem.terminal, plan.state[:, -1])
     batch, intervals = plan.control.shape[:2]

@@ -20,7 +20,7 @@ _log = logging.getLogger(__name__)
 _AT_ONCE = 4096  # states whose V^ is asked for at once
 
 
-class Reference(NamedTuple):
+class LoopOptimum(NamedTuple):
     """What is known of the optimum along a closed loop; None where nothing is."""
 
     cost: Tensor | None  # V*(x(0)), (B,)
@@ -41,7 +41,7 @@ def optimal_cost(problem: AdpProblem) -> Tensor | None:
     return None if found is None else found.value
 
 
-def compare(problem: AdpProblem, result: LoopResult) -> Reference:
+def compare(problem: AdpProblem, result: LoopResult) -> LoopOptimum:
     """A closed loop against the optimum, at all recorded times where a formula knows it, else at some."""
     start = result.state[:, 0]
     batch, times = result.state.shape[:2]
@@ -49,14 +49,14 @@ def compare(problem: AdpProblem, result: LoopResult) -> Reference:
     at = torch.arange(times) if formula else _chosen(times, problem.optimum.states // batch)
     found = optima(problem, result.state[:, at])
     if found is None:
-        return Reference(None, None, None)
+        return LoopOptimum(None, None, None)
     cost = found.value[:, 0]
     if len(at) < 2:
-        return Reference(cost, None, None)
+        return LoopOptimum(cost, None, None)
     off = (result.control[:, at] - found.control).norm(dim=-1)
     estimate = _estimates(problem, result, at)
     wrong = None if estimate is None else (found.value - estimate).abs()
-    return Reference(cost, _spread(off, at, times), None if wrong is None else _spread(wrong, at, times))
+    return LoopOptimum(cost, _spread(off, at, times), None if wrong is None else _spread(wrong, at, times))
 
 
 def optima(problem: AdpProblem, x: Tensor) -> Optima | None:

@@ -22,7 +22,7 @@ class Expansion(NamedTuple):
     curvature: Tensor  # d2/dz2 of l + lambda'F, (B, N, n + 2m, n + 2m)
 
 
-class Stage:
+class Interval:
     """x+ = F(x, v) and the cost l(x, v) of an interval on which the input runs linearly from v's first half
     to its second, by one Runge-Kutta step. A smoothly bounded input is the saturated v; a hard bound is one
     of v itself.
@@ -134,6 +134,6 @@ def _gradient(values: Tensor, z: Tensor) -> Tensor:
     return torch.autograd.grad(values.sum(), z, retain_graph=True, materialize_grads=True)[0]
 
 
-def closed_stage(stage: Stage, policy: Callable[[Tensor], Tensor], x: Tensor, h: Tensor) -> Tensor:
+def closed_stage(stage: Interval, policy: Callable[[Tensor], Tensor], x: Tensor, h: Tensor) -> Tensor:
     """x+ under a policy that sees the state all the time, by one Runge-Kutta step: (B, n), () -> (B, n)."""
     return runge_kutta_step(lambda at: stage.system.motion(at, policy(at)), x, float(h))

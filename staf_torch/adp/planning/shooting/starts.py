@@ -16,14 +16,16 @@ _KNOTS = 6  # of a random spline
 _REACH = 3.0  # times the largest control that the base asks for, where there is no bound
 
 
-class Guess(NamedTuple):
+class StartControl(NamedTuple):
     """A control over time: what is added to, or stands in place of, the base policy."""
 
     knots: Tensor  # (K, m) at equal times over the part of the horizon before the base takes over
     until: float  # s
 
 
-def guesses(cost: Cost, base: Policy, x0: Tensor, horizon: float, count: int, seed: int) -> list[Guess]:
+def guesses(
+    cost: Cost, base: Policy, x0: Tensor, horizon: float, count: int, seed: int
+) -> list[StartControl]:
     """Constant controls at both bounds for several times, none at all, and random splines.
 
     Args:
@@ -43,22 +45,22 @@ def guesses(cost: Cost, base: Policy, x0: Tensor, horizon: float, count: int, se
             torch.where(torch.isfinite(limit), limit, free)
             for limit, free in ((cost.bounds.low, low), (cost.bounds.high, high))
         )
-    found = [Guess(rest.expand(2, -1), 0.3 * horizon)]
+    found = [StartControl(rest.expand(2, -1), 0.3 * horizon)]
     for share in _SHARES:
         for i in range(cost.inputs):
             for end in (low, high):
                 level = rest.clone()
                 level[i] = end[i]
-                found.append(Guess(level.expand(2, -1), share * horizon))
+                found.append(StartControl(level.expand(2, -1), share * horizon))
     generator = torch.Generator().manual_seed(seed)
     for _ in range(count):
         knots = torch.rand(_KNOTS, cost.inputs, dtype=torch.float64, generator=generator)
         until = float(torch.rand((), dtype=torch.float32, generator=generator)) * 0.6 * horizon
-        found.append(Guess(low + (high - low) * (1.5 * knots - 0.25).clamp(0.0, 1.0), until))
+        found.append(StartControl(low + (high - low) * (1.5 * knots - 0.25).clamp(0.0, 1.0), until))
     return found
 
 
-def guided(guess: Guess, base: Policy) -> Callable[[Tensor, float], Tensor]:
+def guided(guess: StartControl, base: Policy) -> Callable[[Tensor, float], Tensor]:
     """u(x, t) of a guess, the base policy once its time is over."""
 
     def control(x: Tensor, t: float) -> Tensor:
