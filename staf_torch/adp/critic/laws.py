@@ -309,7 +309,7 @@ class PolicyIteration(ActorCriticLaw):
     Unlike `Information` it has no least-squares gain that remembers other states, which a basis that follows
     the state makes stale, and no actor force of the Lyapunov proof, which outweighs the critic where basis
     functions are steep. It has no proof either, and failed on plants whose drift is unstable (Van der Pol,
-    pendulum: adp/README.md).
+    pendulum: adp/critic/README.md).
 
     The points must determine the weights: M of them at least. The default gains are other than the published.
 
