@@ -70,10 +70,6 @@ def test_the_panels_of_a_chase_hold_its_history(count: int) -> None:
         scales=LINEAR_LOG,
         **inside,
     )
-    assert error.get_ylim()[0] > 1e-3
-    deep = chase.draw_chase(chase.ChaseHistory(T, *parts, np.where(excess > 0.5, excess, 1e-12)))
-    top = max(excess.max(), 0.1 * T.max())
-    assert deep.axes[3].get_ylim()[0] == pytest.approx(1e-6 * top)
 
 
 def test_the_curves_of_a_convergence_are_named_with_their_slopes() -> None:
@@ -104,10 +100,6 @@ def test_a_memory_is_drawn_where_it_is_with_the_balls_of_its_models(dim: int) ->
     holds(where, curves, ("$x_1$", f"$x_{second + 1}$"))
     (balls,) = where.collections
     np.testing.assert_allclose(balls.get_offsets(), places)
-    if hasattr(balls, "get_widths"):  # matplotlib 3.9
-        np.testing.assert_allclose(balls.get_widths(), 2 * picture.radius)
-        np.testing.assert_allclose(balls.get_heights(), 2 * picture.radius)
-    assert where.get_aspect() == 1
     names = "time at which the ball was visited (s)", r"$\max\,|V - \hat V|$ on the ball"
     holds(
         region, [(name, T, values) for name, values in errors.items()], names, scales=LINEAR_LOG, xlim=span(T)
@@ -192,13 +184,6 @@ def test_a_box_has_its_walls_where_it_has_any() -> None:
     plane, margin, barrier, cost = visible(figure)
     curves: list[Curve] = [(name, path[:, 0], path[:, 1]) for name, path in paths.items()]
     holds(plane, [*curves, (None, [-1, -1], [0, 1]), (None, [0, 1], [4, 4])], ("$x_1$", "$x_2$"))
-    left, above = (
-        patch.get_window_extent().transformed(plane.transData.inverted()) for patch in plane.patches
-    )
-    assert left.x1 == pytest.approx(-1)
-    assert above.y0 == pytest.approx(4)
-    assert left.x0 < -1
-    assert above.y1 > 4
     assert legend(figure) == ["a", "b"]
     names = "time (s)", "distance to the nearest wall"
     holds(margin, [(None, T, values) for values in margins.values()], names, xlim=span(T))
@@ -231,10 +216,6 @@ def test_a_fault_has_its_norms_above_and_its_parameters_below() -> None:
         limits = case.truth.min() - room, case.truth.max() + room
         names = "time (s)", "" if k else r"$\hat\theta$ and $\theta$ (dotted)"
         holds(below, curves, names, xlim=(T[0], 2.0), ylim=limits)
-        (shade,) = below.collections
-        x, y = shade.get_paths()[0].vertices.T
-        assert (x.min(), x.max()) == (T[0], T[3])
-        assert (y.min(), y.max()) == limits
     assert legend(figure.axes[0]) == ["a", "b"]
 
 
@@ -279,10 +260,6 @@ def test_rivals_are_points_hollow_where_they_fail_from_some_states() -> None:
     assert [line.get_fillstyle() for line in cart.get_lines()[:2]] == ["full", "none"]
     assert [axes.get_title() for axes in (cart, mass)] == ["cart pole", "mass"]
     assert legend(figure) == ["a", "b"]
-    four = [row | {"plant": str(k)} for k, row in enumerate(rows)]
-    grid = closed_loop.draw_rivals(four).axes
-    assert [axes.get_visible() for axes in grid] == [True] * 4 + [False] * 2
-    assert [axes.get_ylabel() for axes in grid[:4]] == ["median excess cost", "", "", "median excess cost"]
 
 
 @pytest.mark.parametrize("circle", [True, False])
@@ -385,8 +362,6 @@ def test_errors_of_a_sweep_are_drawn_with_their_bands(spread: float, rounding: f
     for shade, factor in zip(band, (1.0, 0.5), strict=False):
         y = shade.get_paths()[0].vertices[:, 1]
         assert (y.min(), y.max()) == pytest.approx((factor * 0.1 / spread, factor * 0.2 * spread))
-    low = min([0.05 / 3, 0.01 / 4, *([1e-3 / 4] if rounding == 1e-3 else [])])
-    assert grid[0].get_ylim() == pytest.approx((low, 0.6))
     said = ["3 centers", "6 centers", "ideal weights, local basis", *told]
     assert legend(figure) == said + (["95 % over seeds"] if spread > 1.2**0.5 else [])
     costly = sweep.draw_cost_against_accuracy(panels, "multiplications")
@@ -443,17 +418,6 @@ def test_a_frame_shows_the_way_so_far_and_all_else_as_it_is_then(frame: int, rel
     pair = ("$V^*$" if relative else "$V$", scene.value), (r"$\hat V$", scene.estimate)
     label = "place in the ball (radii, along the way)", "share of the largest" if relative else ""
     holds(across, [(n, scene.along, v[frame] / unit) for n, v in pair], label, xlim=(-1, 1))
-    low, high = scene.value.min(), scene.value.max()
-    want_y = (-0.15, 1.15) if relative else (low - 0.08 * (high - low), high + 0.08 * (high - low))
-    assert across.get_ylim() == pytest.approx(want_y)
     ideal = [(None, T, column) for column in scene.curves.ideal.T]
     now = [(None, T[way], column[way]) for column in scene.curves.values.T]
     holds(curves, [*ideal, *now], ("time (s)", ""), xlim=span(T))
-    span_of = scene.curves.values if relative else scene.curves.ideal
-    low, high = span_of.min(), span_of.max()
-    assert curves.get_ylim() == pytest.approx((low - 0.08 * (high - low), high + 0.08 * (high - low)))
-    both = np.concatenate((scene.state, scene.followed))
-    ends = [(part.min() - scene.radius.max(), part.max() + scene.radius.max()) for part in both.T]
-    want_x, want_y = ((low - 0.08 * (high - low), high + 0.08 * (high - low)) for low, high in ends)
-    assert plane.get_xlim() == pytest.approx(want_x)
-    assert plane.get_ylim() == pytest.approx(want_y)
