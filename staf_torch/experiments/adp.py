@@ -14,16 +14,7 @@ import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
-from ..adp import (
-    ActorCritic,
-    Controller,
-    Cost,
-    Gains,
-    LoopResult,
-    SafetyFilter,
-    Supervised,
-    simulate,
-)
+from ..adp import ActorCritic, Controller, Cost, Gains, LoopResult, SafetyFilter, Supervised, simulate
 from ..adp.loop.setup import AdpProblem
 from ..adp.planning.shooting.reference_optimum import LoopOptimum, compare
 from ..adp.problem.held_linear import HeldLoop

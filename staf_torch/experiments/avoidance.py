@@ -282,11 +282,7 @@ def _telling(distances: dict[str, Tensor]) -> int:
 
 
 def _drawn(
-    vehicle: Vehicle,
-    results: dict[str, LoopResult],
-    distances: dict[str, Tensor],
-    row: int,
-    radius: float,
+    vehicle: Vehicle, results: dict[str, LoopResult], distances: dict[str, Tensor], row: int, radius: float
 ) -> AvoidanceHistory:
     filtered = results[FILTERED]
     labels = {FILTERED: f"{vehicle.label}, filtered", BARE: vehicle.label}

@@ -119,9 +119,7 @@ def short_period(rows: int, generator: torch.Generator) -> FaultCase:
     law = LeastSquares([0.0] * 4 + [1.0] * 2, deviation=[10.0] * 4 + [1.0] * 2, floor=1e-5)
     # The plant is stable: where nothing is known, nothing is done but to probe.
     adaptive = AdaptiveLQR(
-        *(model, cost, IntegralWindows(model, 0.002), law),
-        robust=torch.zeros_like,
-        probe=1.0,
+        *(model, cost, IntegralWindows(model, 0.002), law), robust=torch.zeros_like, probe=1.0
     ).starting_from(first)
     known = true.expand(rows, 6)
     return FaultCase(

@@ -276,10 +276,7 @@ def _lines(swept: list[LawCurve], steps: list[float]) -> list[ConvergenceCurve]:
 
 
 def _summarise(
-    problem: ChaseProblem,
-    swept: list[LawCurve],
-    promised: dict[str, float | None],
-    excess: float,
+    problem: ChaseProblem, swept: list[LawCurve], promised: dict[str, float | None], excess: float
 ) -> None:
     _log.info("Excess before the correction ~ dt^slope:")
     for curve in swept:

@@ -97,11 +97,7 @@ def remember(
 ) -> ExperienceMemory:
     """A memory a trajectory, fed with the models (B, T, M) at the states (B, T, n) as they come."""
     memory = ExperienceMemory(
-        problem.basis,
-        settings.capacity,
-        (len(states),),
-        reach=settings.reach,
-        spacing=settings.spacing,
+        problem.basis, settings.capacity, (len(states),), reach=settings.reach, spacing=settings.spacing
     ).to(states)
     pairs = list(zip(states.unbind(1), kept.unbind(1), strict=True))
     for x, model in progress.each(pairs, "times"):

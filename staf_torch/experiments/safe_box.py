@@ -9,16 +9,7 @@ import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
-from ..adp import (
-    LQR,
-    BoxFilter,
-    Cost,
-    DirectShooting,
-    Feedback,
-    LoopResult,
-    QuadraticCost,
-    SafetyFilter,
-)
+from ..adp import LQR, BoxFilter, Cost, DirectShooting, Feedback, LoopResult, QuadraticCost, SafetyFilter
 from ..adp.loop.setup import OptimumSettings
 from ..adp.safety.safety_filter import walls
 from ..figures.closed_loop import BoxHistory, draw_box

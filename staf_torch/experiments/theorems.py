@@ -89,10 +89,7 @@ def all_layouts(dim: int) -> list[NamedLayout]:
             planar += [NamedLayout("polygon", polygon(m), 2) for m in (3, 4, 5, 6, 8, 10, 15, 21, 28)]
     sizes = [(k, math.comb(dim + k, dim)) for k in range(1, _DEGREES)]
     spread = [NamedLayout("ball", ball(m, dim), k + 1) for k, m in sizes if m <= _MOST_CENTERS]
-    corners = [
-        NamedLayout("simplex", simplex(dim), 2),
-        NamedLayout("cross_polytope", cross_polytope(dim), 2),
-    ]
+    corners = [NamedLayout("simplex", simplex(dim), 2), NamedLayout("cross_polytope", cross_polytope(dim), 2)]
     return [*planar, *spread, *corners]
 
 

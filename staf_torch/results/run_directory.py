@@ -225,10 +225,7 @@ class HistoryWriter:
         return self
 
     def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         for descriptor, _ in self._files.values():
             os.close(descriptor)
@@ -239,8 +236,7 @@ class HistoryWriter:
         shape = (self._batch, self._times, *piece.shape[2:])
         with path.open("wb") as file:
             np.lib.format.write_array_header_1_0(
-                file,
-                {"descr": piece.dtype.str, "fortran_order": False, "shape": shape},
+                file, {"descr": piece.dtype.str, "fortran_order": False, "shape": shape}
             )
             header = file.tell()
         return os.open(path, os.O_WRONLY), header

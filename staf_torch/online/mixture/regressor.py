@@ -235,12 +235,7 @@ class MixtureRegressor(StreamEstimator):
     """
 
     def __init__(
-        self,
-        memory: int = 1000,
-        neighbours: int = 56,
-        *,
-        robust: float | None = None,
-        scaling: bool = True,
+        self, memory: int = 1000, neighbours: int = 56, *, robust: float | None = None, scaling: bool = True
     ) -> None:
         self.memory = memory
         self.neighbours = neighbours
