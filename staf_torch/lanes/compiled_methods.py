@@ -99,7 +99,7 @@ class compiled:  # noqa: N801
     Args:
         name: in the log; programs of one name share texts.
         by: makes what serves for an owner; one program of the method by default.
-        pays: calls of a small batch in plain torch that take as long as to compile; inf: never by itself.
+        pays: calls of a small batch in plain torch that take as long as to compile; inf: not before `hasten`.
         copies: as in `Program`.
     """
 
@@ -162,9 +162,10 @@ class CompiledMethod:
         """y: (..., n) -> (..., m), or trees of (B, ...)."""
         if not ordinary(flatten((x, *more))[0] if more else (x,)) or x.numel() == 0 or tracing_now():
             return self.definition(x, *more)
-        rows = x.numel() / x.shape[-1]
-        if not worth(self._asked + rows / 200 >= self._settings.pays):  # a large batch pays for itself
-            self._asked += 1 + rows / 200
+        work, most = x.numel() / x.shape[-1] / 200, self._settings.pays  # a large batch pays for itself
+        pays = self._asked + work >= most
+        if not (worth(pays) if most < math.inf else pays):
+            self._asked += 1 + work
             return self.definition(x, *more)
         if self._served is None or self._read is None or not self._read.unchanged(library=False):
             self._served = self._compile(trees=bool(more))

@@ -141,6 +141,23 @@ class Program(Derived):
             prepared = self._prepared[key] = self.prepare(carry, now, row, steps=steps, every=every)
         return prepared.run(leaves, carry, now, row)
 
+    def over(self, points: tuple[Tensor, ...], fixed: tuple[Tensor, ...] = ()) -> Tree:
+        """The outputs of one step without a carry at many points of every row: (B, P, ...).
+
+        Each point is a row of the program, but a pass of a loop within a program that is traced.
+
+        Args:
+            points: inputs (B, P, ...) of the step.
+            fixed: inputs (B, ...) before them, the same at all points of a row.
+        """
+        if tracing_now():
+            return scan(lambda _, now: ((), self.step((), (), (*fixed, *now))[1]), (), points)[1]
+        shape = points[0].shape[:2]
+        spread = [part.unsqueeze(1).expand(*shape, *part.shape[1:]) for part in fixed]
+        rows = tuple(part.flatten(0, 1) for part in (*spread, *points))
+        leaves, structure = flatten(self((), (), rows, steps=1)[1])
+        return unflatten(structure, iter([leaf[:, 0].unflatten(0, shape) for leaf in leaves]))
+
     def prepare(
         self, carry: Tree, now: Tree = (), row: Tree = (), *, steps: int | None = None, every: int = 1
     ) -> Prepared:

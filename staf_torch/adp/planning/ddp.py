@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
@@ -311,7 +311,7 @@ class BoxDDP:
             terminal: V_T.
         """
         start = x0.unsqueeze(1).expand(-1, lengths.shape[1], -1).contiguous()
-        end, (x, u, paid) = self._along(self._forth, start, around, lengths)
+        end, (x, u, paid) = self._forth(start, around, lengths)
         last = terminal.at(self.problem, end)  # (B, L)
         cost = paid.sum(1) + last
         cost = torch.where(torch.isfinite(cost), cost, torch.inf)
@@ -321,12 +321,6 @@ class BoxDDP:
         best, at = cost.min(1)
         rows = torch.arange(len(x0))
         return CostedTrajectories(states[rows, :, at], u[rows, :, at], best, parts[rows, :, at])
-
-    def _along(self, program: Program, carry: Any, now: Any, row: Any) -> tuple[Any, Any]:
-        """A step taken at all times: by its program, or as a loop of the program that is being traced."""
-        if tracing_now():
-            return scan(lambda carry, now: program.step(carry, now, row), carry, now)
-        return program(carry, now, row)
 
     def forward(
         self, x: Tensor, now: tuple[Tensor, ...], lengths: Tensor
@@ -342,11 +336,7 @@ class BoxDDP:
 
     def _derivatives(self, plan: SearchState) -> Derivatives:
         """Along the trajectories: (B, T, ...)."""
-        x, u = plan.state[:, :-1], plan.control
-        if tracing_now():
-            return Derivatives(*scan(lambda _, now: ((), self.problem.derivatives(*now)), (), (x, u))[1])
-        _, found = self._expand((), (), (x.flatten(0, 1), u.flatten(0, 1)), steps=1)  # all times are rows
-        return Derivatives(*(part[:, 0].unflatten(0, u.shape[:2]) for part in found))
+        return Derivatives(*self._expand.over((plan.state[:, :-1], plan.control)))
 
     def _backwards(
         self, plan: SearchState, known: Derivatives, mu: Tensor, full: Tensor, terminal: LocalModel
@@ -354,7 +344,7 @@ class BoxDDP:
         slope, bent = terminal.slope(self.problem, plan.state[:, -1]), terminal.curvature.contiguous()
         last = Model(slope, bent, torch.zeros_like(mu), torch.ones_like(mu))
         reverse = tuple(part.flip(1) for part in (*known, plan.control))
-        end, out = self._along(self._back, last, reverse, (mu, full))
+        end, out = self._back(last, reverse, (mu, full))
         return end, tuple(part.flip(1) for part in out)
 
     def backward(

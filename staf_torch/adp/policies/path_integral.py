@@ -8,8 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ...lanes import Program, each, scan
-from ...lanes.loops import tracing_now
+from ...lanes import Program, scan
 from ...numerics.checks import fail, integer, one_or_each, positive, positive_real
 from ..loop.controller import Controller
 from ..problem.sampled import SampledProblem
@@ -131,13 +130,7 @@ class PathIntegral(Controller):
 
     def costs(self, x: Tensor, change: Tensor) -> Tensor:
         """What changes of the feedback cost, inf where that is not finite: (B, n), (B, S, T, m) -> (B, S)."""
-        if tracing_now():
-            cost = each(lambda some: self._paid(x, some.squeeze(1)).unsqueeze(1), change, together=1)
-        else:
-            shape = change.shape[:2]
-            start = x.unsqueeze(1).expand(*shape, -1).flatten(0, 1).contiguous()
-            _, cost = self._roll((), (), (start, change.flatten(0, 1)), steps=1)
-            cost = cost.view(shape)
+        cost = self._roll.over((change,), (x,))
         return torch.where(torch.isfinite(cost), cost, torch.inf)
 
     def _paid(self, x: Tensor, change: Tensor) -> Tensor:
