@@ -162,19 +162,25 @@ class CompiledMethod:
         """y: (..., n) -> (..., m), or trees of (B, ...)."""
         if not ordinary(flatten((x, *more))[0] if more else (x,)) or x.numel() == 0 or tracing_now():
             return self.definition(x, *more)
-        work, most = x.numel() / x.shape[-1] / 200, self._settings.pays  # a large batch pays for itself
-        pays = self._asked + work >= most
-        if not (worth(pays) if most < math.inf else pays):
-            self._asked += 1 + work
+        if (self._served is None or _when == "never") and not self._pays(x.numel() / x.shape[-1]):
             return self.definition(x, *more)
-        if self._served is None or self._read is None or not self._read.unchanged(library=False):
+        if self._read is None or not self._read.unchanged(library=False):
             self._served = self._compile(trees=bool(more))
         self._waits = False
+        assert self._served is not None
         if more:
             return self._served(x, *more)
         dims = x.dim()
         y = self._served(x if dims <= 2 else x.reshape(-1, x.shape[-1]))
         return y.view(-1) if dims == 1 else y.reshape(*x.shape[:-1], y.shape[-1])
+
+    def _pays(self, rows: float) -> bool:
+        """Whether a call pays for a compiler, with all calls before: a large batch does by itself."""
+        work, most = rows / 200, self._settings.pays
+        pays = self._asked + work >= most
+        pays = worth(pays) if most < math.inf else pays
+        self._asked += 0.0 if pays else 1 + work
+        return pays
 
     @property
     def compiled(self) -> bool:

@@ -45,6 +45,8 @@ _FIXED = (
 )
 _SIMPLE = (int, float, complex, str, bytes, tuple, list, dict, set, frozenset, Tensor)
 _OF_EVERY_MODULE = frozenset(vars(nn.Module()))  # looked into by themselves
+_READ = ("training", "_parameters", "_buffers", "_modules", "_forward_hooks", "_forward_pre_hooks")
+_IDLE = _OF_EVERY_MODULE - {*_READ}  # hooks of derivatives and of state_dicts, and what goes with other hooks
 _log = logging.getLogger(__name__)
 _said: set[tuple[str, str]] = set()  # what has been logged
 _MISSING = object()
@@ -115,7 +117,15 @@ class Contents:
         self._versions = [tensor._version for tensor in self._changeable]
         self._sets = [(part, set(part)) for part in walk.sets]
         self._arrays = [(array, array.tobytes()) for array in walk.arrays]
-        self._lengths, self._inside = self._look()
+        # Live views of all containers: what they lead to is compared at once, in ten microseconds a policy.
+        self._sized = [
+            *walk.dicts,
+            *self._users,
+            *walk.lists,
+            *(attributes for attributes, _ in walk.modules),
+        ]
+        self._views = [*(part.values() for part in (*walk.dicts, *self._users)), *walk.lists]
+        self._lengths, self._inside = [*map(len, self._sized)], [*self._look()]
         self._methods = self.methods()
 
     def warn(self, name: str) -> None:
@@ -130,16 +140,18 @@ class Contents:
         Args:
             library: whether to look for replaced methods of classes that are not a user's, too.
         """
-        lengths, inside = self._look()  # all at once: a hundred containers in ten microseconds
-        return (
-            lengths == self._lengths
-            and not any(self._walk.empty)
-            and all(map(is_, inside, self._inside))
-            and [tensor._version for tensor in self._changeable] == self._versions
-            and all(now == then for now, then in self._sets)
-            and all(now.tobytes() == then for now, then in self._arrays)
-            and not (library and self.replaced(self._methods))
-        )
+        try:
+            return (
+                [*map(len, self._sized)] == self._lengths
+                and not any(self._walk.empty)
+                and all(map(is_, self._look(), self._inside))
+                and [tensor._version for tensor in self._changeable] == self._versions
+                and all(now == then for now, then in self._sets)
+                and all(now.tobytes() == then for now, then in self._arrays)
+                and not (library and self.replaced(self._methods))
+            )
+        except KeyError:  # an attribute is gone
+            return False
 
     def methods(self) -> list[Any]:
         """Return what is in the library's classes that were come upon, and in their bases."""
@@ -172,20 +184,17 @@ class Contents:
             names.append(f"{module}.{name}".encode())
         return b"\0".join(names)
 
-    def _look(self) -> tuple[list[int], list[Any]]:
-        """The lengths of all containers, and what is in them."""
+    def _look(self) -> Iterator[Any]:
+        """What is in all containers, and what functions read beside."""
         walk = self._walk
-        parts: list[Iterable[Any]] = [part.values() for part in (*walk.dicts, *self._users)]
-        parts += [read(attributes) for attributes, read in walk.modules]
-        parts += walk.lists
-        parts.append(lookup.value for lookup in walk.lookups)
-        parts.append(map(_content_of, walk.cells))
-        parts += ((part.__code__, part.__defaults__) for part in walk.functions)  # an editor may reload them
-        sized = (walk.dicts, self._users, walk.lists, (attributes for attributes, _ in walk.modules))
-        try:
-            return [*map(len, chain(*sized))], [*chain.from_iterable(parts)]
-        except KeyError:  # an attribute is gone
-            return [], []
+        parts: list[Iterable[Any]] = [read(attributes) for attributes, read in walk.modules]
+        if walk.functions or walk.lookups or walk.cells:
+            parts.append(lookup.value for lookup in walk.lookups)
+            parts.append(map(_content_of, walk.cells))
+            parts += (
+                (part.__code__, part.__defaults__) for part in walk.functions
+            )  # an editor may reload them
+        return chain.from_iterable([*self._views, *parts])
 
 
 class _Same:
@@ -315,14 +324,14 @@ class _Walk(pickle.Pickler):
 
     def reducer_override(self, value: Any) -> Any:
         if isinstance(value, nn.Module):
-            # The keys of hooks count all hooks of the process, and those of state_dicts change no result.
-            state = {k: v for k, v in value.__getstate__().items() if "state_dict" not in k and k != BOUND}
+            state = {k: v for k, v in value.__getstate__().items() if k not in _IDLE and k != BOUND}
+            # The keys of hooks count all hooks of the process.
             hooks = {k: tuple(v.values()) for k, v in state.items() if k.endswith("_hooks") and v}
             self.dicts += [state[k] for k in hooks]
             state |= hooks
             self._states[id(state)] = state
             own = [k for k in vars(value) if k in state and k not in _OF_EVERY_MODULE]
-            self.modules.append((vars(value), operator.itemgetter("training", "training", *own)))
+            self.modules.append((vars(value), operator.itemgetter(*_READ, *own)))
             return copyreg.__newobj__, (type(value),), state  # type: ignore[attr-defined]
         if BOUND in getattr(value, "__dict__", ()):
             made = list(value.__reduce_ex__(2))
