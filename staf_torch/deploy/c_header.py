@@ -170,10 +170,7 @@ def _cost(graph: Graph, schedule: Schedule) -> tuple[int, int]:
     """Return the additions and the like, and the calls of exp and the like, of one call."""
     flops = functions = 0
     for node in schedule.live:
-        op, count, owner = graph.op[node], 1, schedule._owner.get(node)
-        while owner is not None:
-            count *= graph.loops[owner].count
-            owner = schedule._owner.get(graph.loops[owner].node)
+        op, count = graph.op[node], schedule.repeats(node)
         if op in ("map", "dot"):
             aux = graph.aux[node]
             count *= math.prod(aux[1]) if op == "map" else 2 * aux[0] * aux[1]

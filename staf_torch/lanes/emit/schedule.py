@@ -112,6 +112,14 @@ class Schedule:
         """Whether two nodes stand in the same block: of one loop, or of one depth outside of all."""
         return self._where[one] == self._where[other]
 
+    def repeats(self, node: int) -> int:
+        """Return how often a step computes a node: the product of the counts of the loops around it."""
+        count, owner = 1, self._owner.get(node)
+        while owner is not None:
+            count *= self._graph.loops[owner].count
+            owner = self._owner.get(self._graph.loops[owner].node)
+        return count
+
     def _once(self, node: int) -> bool:
         """Whether a node is found before the steps, be it inside a loop."""
         depth = self._graph.depth[node]
