@@ -1,4 +1,4 @@
-"""Variants from outside the package, one class and one YAML each: as in conf/README.md."""
+"""Variants from outside the package, one class and one YAML each: those of conf/README.md."""
 
 from __future__ import annotations
 
@@ -20,7 +20,13 @@ from staf_torch.cli import export, table
 from staf_torch.tables import collect
 
 PAGE = (ROOT / "conf" / "README.md").read_text(encoding="utf-8")
-FILES = dict(re.findall(r"^`([\w./]+)`\n\n```(?:python|yaml)\n(.*?)^```$", PAGE, re.DOTALL | re.MULTILINE))
+OWN = ROOT / "tests" / "examples" / "own"
+FILES = {
+    str(p.relative_to(OWN)): p.read_text(encoding="utf-8")
+    for p in OWN.rglob("*.*")
+    if "__pycache__" not in str(p)
+}
+SHOWN = dict(re.findall(r"^`([\w./]+)`\n\n```(?:python|yaml)\n(.*?)^```$", PAGE, re.DOTALL | re.MULTILINE))
 COMMANDS = re.search(r"^## Run them\n\n```\n(.*?)^```$", PAGE, re.DOTALL | re.MULTILINE)[1].splitlines()
 TABLE, SHEET = 3, 5  # which of the commands
 
@@ -71,6 +77,8 @@ def test_a_variant_is_one_class_and_one_yaml() -> None:
     groups = [Path(name).parent.name for name in FILES if name.endswith(".yaml")]
     assert sorted(groups) == ["experiment", "kernel", "metric", "optimizer", "system", "target"]
     assert len(modules) == len(groups)
+    assert set(SHOWN) == {"cauchy.py", "my_conf/kernel/cauchy.yaml"}
+    assert SHOWN.items() <= FILES.items()
 
 
 def test_own_variants_run_and_their_metric_is_declared_in_the_record(place: Path, said: list[str]) -> None:
