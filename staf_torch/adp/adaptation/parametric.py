@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from ...numerics.checks import fail, integer, number
+from ...numerics.checks import copied, fail, integer, number
 from ...systems import Barrier, Bounds, ControlAffineSystem
 from ..problem.cost import Cost
 
@@ -153,9 +152,7 @@ class ParametricPlant(ControlAffineSystem):
 
     def believing(self, theta: Tensor) -> ParametricPlant:
         """A copy with other parameters, (..., p); not checked, so that a row may go wrong alone."""
-        other = copy.copy(self)
-        other._buffers = {**self._buffers, "theta": theta}
-        return other
+        return copied(self, theta=theta)
 
     def rest_of(self, x: Tensor, u: Tensor) -> Tensor:
         """h(x, u): (..., n), (..., m) -> (..., n)."""
@@ -294,7 +291,6 @@ class ChangingPlant(ControlAffineSystem):
         """
         if cost.output is not None or cost.target is not None or self.periodic:
             raise fail("ChangingPlant", "cost", "must be of x itself at the origin, without angles", cost)
-        own, wide = self.own, copy.copy(cost)
-        wide._buffers, wide._modules = dict(cost._buffers), dict(cost._modules)
+        own, wide = self.own, copied(cost)
         wide.dim, wide.output = self.size, lambda z: z[..., :own]
         return wide

@@ -12,7 +12,7 @@ from torch import Tensor
 from ...numerics.checks import fail, positive_real, vector
 from ..loop.controller import Carried, Controller
 from ..safety.quadratic_program import nearest_admissible
-from ..safety.safety_filter import Constraint, SafetyFilter
+from ..safety.safety_filter import Constraint, SafetyFilter, listed
 from .least_squares import Estimate, LeastSquares
 from .parametric import ChangingPlant, ParametricPlant
 from .windows import IntegralWindows, Window
@@ -102,7 +102,7 @@ class RobustFilter(Controller):
             raise fail("RobustFilter", "theta_low", rule, theta_low)
         self.confidence = positive_real("RobustFilter", "confidence", confidence)
         self.controller, self.plant, self.windows, self.law = controller, plant, windows, law
-        several = [constraints] if callable(constraints) else list(constraints)
+        several = listed("RobustFilter", constraints)
         self.filter = SafetyFilter(
             lambda z: z[..., : plant.inputs] * 0,  # only its conditions are asked
             ChangingPlant(plant),

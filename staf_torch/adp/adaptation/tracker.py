@@ -12,7 +12,7 @@ from ...numerics.checks import choice, fail
 from ..loop.controller import Controller
 from .history_stack import ConcurrentGradient, HistoryStack, Stack
 from .parametric import ParametricPlant
-from .windows import IntegralWindows, SlopeWindow, SlopeWindows, Window
+from .windows import IntegralWindows, SlopeWindows, Window, Windows
 
 DesiredMotion = Callable[[Tensor], tuple[Tensor, Tensor]]
 """xd and its rate from the state, (..., N) -> (..., m) and (..., m)."""
@@ -26,7 +26,7 @@ class Tracking(NamedTuple):
     feedback: Tensor  # (...) K
     gain: Tensor  # (...) k_CL
     rate: Tensor  # (...) Gam
-    window: Window | SlopeWindow
+    window: Window
     stack: Stack
 
 
@@ -97,7 +97,7 @@ class ConcurrentTracker(Controller):
         self.plant, self.reference = plant, reference
         longest = float(self.gains[3].max())
         made = IntegralWindows if source == "integral" else SlopeWindows
-        self.windows: IntegralWindows | SlopeWindows = made(plant, longest)
+        self.windows: Windows = made(plant, longest)
         p = plant.parameters_count
         self.stack = HistoryStack(len(plant.rows), p, size)
         self.first = torch.zeros(p).double() if first is None else torch.tensor(first, dtype=torch.float64)
@@ -112,7 +112,7 @@ class ConcurrentTracker(Controller):
 
     def step(self, x: Tensor, now: Tracking, uniform: Tensor, dt: float) -> tuple[Tensor, Tracking]:
         m = self.plant.inputs
-        window, equation = self.windows.step(now.window, x, dt)  # type: ignore[arg-type]
+        window, equation = self.windows.step(now.window, x, dt)
         stack = self.stack.step(now.stack, equation)
         wanted, wanted_rate = self.reference(x)
         error = x[..., :m] - wanted
@@ -120,5 +120,5 @@ class ConcurrentTracker(Controller):
         push = (y * error.unsqueeze(-1)).sum(-2)
         theta = ConcurrentGradient(now.gain, now.rate).step(now.theta, stack.gram, stack.moment, dt, push)
         u = wanted_rate - (y * theta.unsqueeze(-2)).sum(-1) - now.feedback.unsqueeze(-1) * error
-        window = self.windows.holding(window, u)  # type: ignore[arg-type]
+        window = self.windows.holding(window, u)
         return u, now._replace(theta=theta, window=window, stack=stack)

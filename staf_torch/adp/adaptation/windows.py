@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import abc
 import math
 from collections.abc import Callable
 from typing import NamedTuple
@@ -23,9 +24,9 @@ class Equation(NamedTuple):
 
 
 class Window(NamedTuple):
-    """What is integrated of the window so far."""
+    """What is known of the window so far: integrals, or of `SlopeWindows` Y and h in its middle."""
 
-    x: Tensor  # (..., n) the state that was measured last
+    x: Tensor  # (..., n) the state that was measured last; of `SlopeWindows` at the beginning
     u: Tensor  # (..., m) the input held since
     s: Tensor  # (..., r, p)
     z: Tensor  # (..., r)
@@ -34,7 +35,47 @@ class Window(NamedTuple):
     longest: Tensor  # (...) s
 
 
-class IntegralWindows:
+class Windows(abc.ABC):
+    """Equations S theta = z, one a window of time."""
+
+    model: ParametricPlant
+    first: float  # s, length of the first window
+    length: float  # s, of the longest
+
+    def init(self, x: Tensor, length: Tensor | None = None) -> Window:
+        """Nothing measured yet, a row each of the states (..., n).
+
+        Args:
+            x: for the shape alone.
+            length: (...), of every row; the common one by default.
+        """
+        lead, count = x.shape[:-1], len(self.model.rows)
+        return Window(
+            torch.zeros_like(x),
+            x.new_zeros(*lead, self.model.inputs),
+            x.new_zeros(*lead, count, self.model.parameters_count),
+            x.new_zeros(*lead, count),
+            x.new_full(lead, -1.0),
+            x.new_full(lead, self.first) if length is None else length.to(x),
+            x.new_full(lead, self.length) if length is None else length.to(x),
+        )
+
+    @abc.abstractmethod
+    def step(self, state: Window, x: Tensor, dt: float) -> tuple[Window, Equation]:
+        """The window with the state measured now, and the equation where it is complete.
+
+        Args:
+            state: until the measurement before.
+            x: (..., n), measured now.
+            dt: s since the measurement before.
+        """
+
+    def holding(self, state: Window, u: Tensor) -> Window:
+        """The window with the input that is held from now on, (..., m)."""
+        return state._replace(u=u)
+
+
+class IntegralWindows(Windows):
     """Equations S theta = z from states alone, one a window of time, where x' is not measured:
 
         S = sum_k phi_k int_k Y dt,   z = sum_k phi_k (x_k+1 - x_k - int_k h dt),
@@ -93,32 +134,7 @@ class IntegralWindows:
         non_negative("IntegralWindows", "noise", noise)
         self.noise = real("IntegralWindows", "noise", noise)
 
-    def init(self, x: Tensor, length: Tensor | None = None) -> Window:
-        """Nothing measured yet, a row each of the states (..., n).
-
-        Args:
-            x: for the shape alone.
-            length: (...), of every row; the common one by default.
-        """
-        lead, count = x.shape[:-1], len(self.model.rows)
-        return Window(
-            torch.zeros_like(x),
-            x.new_zeros(*lead, self.model.inputs),
-            x.new_zeros(*lead, count, self.model.parameters_count),
-            x.new_zeros(*lead, count),
-            x.new_full(lead, -1.0),
-            x.new_full(lead, self.first) if length is None else length.to(x),
-            x.new_full(lead, self.length) if length is None else length.to(x),
-        )
-
     def step(self, state: Window, x: Tensor, dt: float) -> tuple[Window, Equation]:
-        """The window with the state measured now, and the equation where it is complete.
-
-        Args:
-            state: until the measurement before.
-            x: (..., n), measured now.
-            dt: s since the measurement before.
-        """
         x = x if self.states is None else self.states(x)
         begun = state.elapsed >= 0
         share = self._weight(state, dt) if self.smooth else torch.ones_like(state.elapsed)
@@ -143,10 +159,6 @@ class IntegralWindows:
         )
         return after, Equation(whole_s, whole_z, self._variance(state, dt), ready)
 
-    def holding(self, state: Window, u: Tensor) -> Window:
-        """The window with the input that is held from now on, (..., m)."""
-        return state._replace(u=u)
-
     def _weight(self, state: Window, dt: float) -> Tensor:
         """phi in the middle of the step."""
         return (math.pi * (state.elapsed + 0.5 * dt) / state.length).sin().square()
@@ -157,18 +169,7 @@ class IntegralWindows:
         return self.noise**2 * share
 
 
-class SlopeWindow(NamedTuple):
-    """What `SlopeWindows` remembers of the window so far."""
-
-    x: Tensor  # (..., n) at the window's beginning
-    u: Tensor  # (..., m) held since the last measurement
-    s: Tensor  # (..., r, p) Y in its middle
-    h: Tensor  # (..., r) h there
-    elapsed: Tensor  # (...) s; -1 before the first measurement
-    length: Tensor  # (...) s
-
-
-class SlopeWindows:
+class SlopeWindows(Windows):
     """Equations Y theta = x' - h in the middle of a window, with x' from the difference over the window.
 
     This is concurrent learning with a differentiated state, the rival of `IntegralWindows`: the same two
@@ -191,61 +192,19 @@ class SlopeWindows:
 
     def __init__(self, model: ParametricPlant, length: float) -> None:
         self.model = model
-        self.length = positive_real("SlopeWindows", "length", length)
+        self.first = self.length = positive_real("SlopeWindows", "length", length)
 
-    def init(self, x: Tensor, length: Tensor | None = None) -> SlopeWindow:
-        """As `IntegralWindows.init`."""
-        lead, count = x.shape[:-1], len(self.model.rows)
-        return SlopeWindow(
-            torch.zeros_like(x),
-            x.new_zeros(*lead, self.model.inputs),
-            x.new_zeros(*lead, count, self.model.parameters_count),
-            x.new_zeros(*lead, count),
-            x.new_full(lead, -1.0),
-            x.new_full(lead, self.length) if length is None else length.to(x),
-        )
-
-    def step(self, state: SlopeWindow, x: Tensor, dt: float) -> tuple[SlopeWindow, Equation]:
-        """As `IntegralWindows.step`."""
+    def step(self, state: Window, x: Tensor, dt: float) -> tuple[Window, Equation]:
         begun = state.elapsed >= 0
         elapsed = torch.where(begun, state.elapsed + dt, 0.0)
         half = 0.5 * state.length
         middle = begun & (elapsed > half - 0.5 * dt) & (elapsed <= half + 0.5 * dt)
         rows = self.model.rows
         s = torch.where(middle[..., None, None], self.model.regressor(x, state.u)[..., rows, :], state.s)
-        h = torch.where(middle.unsqueeze(-1), self.model.rest_of(x, state.u)[..., rows], state.h)
+        h = torch.where(middle.unsqueeze(-1), self.model.rest_of(x, state.u)[..., rows], state.z)
         ready = begun & (elapsed > state.length - 0.5 * dt)
         slope = self.model.difference(x, state.x)[..., rows] / elapsed.clamp(min=dt).unsqueeze(-1)
         begins = ~begun | ready
-        after = SlopeWindow(
-            torch.where(begins.unsqueeze(-1), x, state.x),
-            state.u,
-            s,
-            h,
-            torch.where(begins, 0.0, elapsed),
-            state.length,
-        )
+        first, since = torch.where(begins.unsqueeze(-1), x, state.x), torch.where(begins, 0.0, elapsed)
+        after = state._replace(x=first, s=s, z=h, elapsed=since)
         return after, Equation(s, slope - h, torch.zeros_like(elapsed), ready)
-
-    def holding(self, state: SlopeWindow, u: Tensor) -> SlopeWindow:
-        """As `IntegralWindows.holding`."""
-        return state._replace(u=u)
-
-
-def measured_rate(model: ParametricPlant, x: Tensor, u: Tensor, rate: Tensor, noise: float) -> Equation:
-    """Return the equation Y(x, u) theta = x' - h(x, u) of a measured rate.
-
-    Args:
-        model: the plant.
-        x: (..., n).
-        u: (..., m), held when x' was measured.
-        rate: x', (..., n).
-        noise: standard deviation of the measured x'.
-    """
-    lead = torch.zeros_like(x[..., 0])
-    return Equation(
-        model.regressor(x, u)[..., model.rows, :],
-        (rate - model.rest_of(x, u))[..., model.rows],
-        lead + noise**2,
-        torch.ones_like(lead).bool(),
-    )

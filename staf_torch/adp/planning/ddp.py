@@ -33,7 +33,7 @@ class Trajectories(NamedTuple):
 
     def rows(self, index: Tensor) -> Trajectories:
         """Some of the rows."""
-        return Trajectories(*(part[index] for part in self))
+        return rows_of(self, index)
 
 
 class Reference(NamedTuple):
@@ -50,10 +50,6 @@ class LocalModel(NamedTuple):
     value: Tensor  # v, (B,)
     gradient: Tensor  # g, (B, n)
     curvature: Tensor  # H, (B, n, n)
-
-    def rows(self, index: Tensor) -> LocalModel:
-        """Some of the rows."""
-        return LocalModel(*(part[index] for part in self))
 
     def at(self, problem: SampledProblem, x: Tensor) -> Tensor:
         """V at L states a row: (B, L, n) -> (B, L)."""
@@ -74,10 +70,6 @@ class CostedTrajectories(NamedTuple):
     control: Tensor  # (B, T, m)
     cost: Tensor  # (B,)
     paid: Tensor  # of every step, and at last the terminal value, (B, T + 1)
-
-    def rows(self, index: Tensor) -> CostedTrajectories:
-        """Some of the rows."""
-        return CostedTrajectories(*(part[index] for part in self))
 
 
 def packed(state: Tensor, control: Tensor, feedback: Tensor) -> Tensor:
@@ -105,6 +97,11 @@ def around(problem: SampledProblem, x: Tensor, step: Tensor) -> Tensor:
 
 
 Some = TypeVar("Some", bound=tuple[Tensor, ...])
+
+
+def rows_of(parts: Some, index: Tensor) -> Some:
+    """Some of the rows of a named tuple."""
+    return type(parts)(*(part[index] for part in parts))
 
 
 def chosen(rows: Tensor, new: Some, old: Some) -> Some:
@@ -252,7 +249,7 @@ class BoxDDP:
                 terminal,
             )
         rows = going.nonzero().squeeze(1)
-        now, ends, known = found.rows(rows), terminal.rows(rows), None
+        now, ends, known = rows_of(found, rows), rows_of(terminal, rows), None
         for _ in range(self.iterations):
             if not len(rows):
                 break
@@ -262,10 +259,10 @@ class BoxDDP:
                 part[rows] = current
             on = after.going > 0
             fresh = (after.cost < now.cost)[on]
-            known = Derivatives(*(part[on] for part in known))
-            rows, now, ends = rows[on], after.rows(on), ends.rows(on)
+            known = rows_of(known, on)
+            rows, now, ends = rows[on], rows_of(after, on), rows_of(ends, on)
             if bool(fresh.any()):  # saves work: rows that did not move keep their derivatives
-                for old, fresher in zip(known, self._derivatives(now.rows(fresh)), strict=True):
+                for old, fresher in zip(known, self._derivatives(rows_of(now, fresh)), strict=True):
                     old[fresh] = fresher
         return self._models(found, terminal)
 
@@ -405,10 +402,6 @@ class SearchState(NamedTuple):
     mu: Tensor  # regularisation, (B,)
     full: Tensor  # 1 with the second derivatives of the plant, 0 without, (B,)
     going: Tensor  # 1 goes on, 0 has given up, `CONVERGED` has converged, (B,)
-
-    def rows(self, index: Tensor) -> SearchState:
-        """Some of the rows."""
-        return SearchState(*(part[index] for part in self))
 
 
 class Model(NamedTuple):

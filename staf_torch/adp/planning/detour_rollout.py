@@ -11,11 +11,11 @@ from torch import Tensor
 
 from ...lanes import compiled, each, repeat
 from ...numerics.checks import fail, integer, non_negative, one_or_each, positive, positive_real, vector
-from ...systems import Plant, StepPlant
+from ...systems import Plant
 from ..loop.controller import Controller, Policy, Value
 from ..problem.cost import Cost
 from ..problem.held_plant import Holding
-from ..safety.safety_filter import Constraint
+from ..safety.safety_filter import Constraint, check_traceable, listed
 
 _AXES = 4  # at most: their combinations are 3^k - 1
 _AROUND = (0.2, 0.07)  # by which the detour of the period before is varied, in units of the axes
@@ -98,12 +98,9 @@ class DetourRollout(Controller):
         stride: int = 1,
     ) -> None:
         super().__init__()
-        if isinstance(plant, StepPlant) or not isinstance(plant, Plant) or not plant.traceable:
-            raise fail("DetourRollout", "plant", "must be in continuous time and torch all through", plant)
+        check_traceable("DetourRollout", plant)
         self.policy, self.plant, self.terminal, self.cost = policy, plant, terminal, cost.around(plant)
-        self.constraints = [constraints] if callable(constraints) else list(constraints)
-        if not self.constraints or not all(map(callable, self.constraints)):
-            raise fail("DetourRollout", "constraints", "must be h(x, t) or a list of them", constraints)
+        self.constraints = listed("DetourRollout", constraints)
         along = torch.as_tensor(axes, dtype=torch.float64)
         fits = along.dim() == 2 and along.shape[1] == cost.dim and 1 <= len(along) <= _AXES
         if not fits or not bool(torch.isfinite(along).all()):

@@ -16,7 +16,7 @@ from ...numerics.checks import fail, flag, integer
 from ..loop.controller import Controller
 from ..policies.sampled_rollout import SampledRollout
 from ..problem.sampled import SampledProblem
-from .ddp import BoxDDP, LocalModel, Reference, Trajectories, around, packed, resting, unpacked
+from .ddp import BoxDDP, LocalModel, Reference, Trajectories, around, packed, resting, rows_of, unpacked
 from .global_value import GlobalValue
 from .global_value_learning import best_from
 
@@ -290,8 +290,8 @@ class StrainedPlans(Controller):
             return self.policy(x), carried if bool(none.all()) else self._without(x)
         # The policy sees all rows, as each number of rows would be a program of its own.
         u = self.policy(x) if len(rows) < len(x) else x.new_empty(len(x), self.policy.cost.inputs)
-        mine = Following(*(part[rows] for part in carried))
-        planned, ahead = self._begun.step(x[rows], self._or_idle(x[rows], mine), uniform[rows], dt)
+        plans = self._or_idle(x[rows], rows_of(carried, rows))
+        planned, ahead = self._begun.step(x[rows], plans, uniform[rows], dt)
         return u.index_copy(0, rows, planned), _replaced(self._without(x), rows, ahead)
 
     def _traced(self, x: Tensor, carried: Following, uniform: Tensor, dt: float) -> tuple[Tensor, Following]:

@@ -115,15 +115,12 @@ class SafetyFilter(Controller):
         weight: Sequence[float] | None = None,
     ) -> None:
         super().__init__()
-        if isinstance(plant, StepPlant) or not isinstance(plant, Plant) or not plant.traceable:
-            raise fail("SafetyFilter", "plant", "must be in continuous time and torch all through", plant)
+        check_traceable("SafetyFilter", plant)
         self.controller = policy if isinstance(policy, Controller) else Feedback(policy)
         self.plant, self.draws = plant, self.controller.draws
         self.hold = positive_real("SafetyFilter", "dt", dt)
         self.period = self.hold
-        self.constraints = [constraints] if callable(constraints) else list(constraints)
-        if not self.constraints or not all(map(callable, self.constraints)):
-            raise fail("SafetyFilter", "constraints", "must be h(x, t) or a list of them", constraints)
+        self.constraints = listed("SafetyFilter", constraints)
         count = len(self.constraints)
         own = Bounds(low, high, plant.inputs)
         self.bounds = plant.bounds if not own.present and plant.bounds is not None else own
@@ -372,6 +369,20 @@ class SafetyFilter(Controller):
             if bool((effect.abs() > _NOTHING).any()):
                 return number
         return 0
+
+
+def listed(call: str, constraints: Constraint | Sequence[Constraint]) -> list[Constraint]:
+    """The constraints as a list, refused in the name of ``call`` where they are no functions."""
+    several = [constraints] if callable(constraints) else list(constraints)
+    if not several or not all(map(callable, several)):
+        raise fail(call, "constraints", "must be h(x, t) or a list of them", constraints)
+    return several
+
+
+def check_traceable(call: str, plant: Plant) -> None:
+    """Refuse a plant in discrete time, or with what torch cannot see into."""
+    if isinstance(plant, StepPlant) or not isinstance(plant, Plant) or not plant.traceable:
+        raise fail(call, "plant", "must be in continuous time and torch all through", plant)
 
 
 def _number(h: Constraint) -> RowValue:

@@ -16,7 +16,7 @@ from staf_torch.adp.adaptation import redesign
 from staf_torch.adp.adaptation.history_stack import ConcurrentGradient
 from staf_torch.adp.adaptation.least_squares import Estimate
 from staf_torch.adp.adaptation.redesign import riccati_rows
-from staf_torch.adp.adaptation.windows import Equation, measured_rate
+from staf_torch.adp.adaptation.windows import Equation
 from staf_torch.adp.estimation.kalman import Belief, KalmanFilter
 from staf_torch.adp.estimation.measurement import gaussian
 
@@ -123,7 +123,6 @@ CASES: dict[str, tuple[FOUND, tuple[Tensor, Tensor, Tensor]]] = {
         (X, OTHER, U),
     ),
     "slopes": (windowed(adp.SlopeWindows(PENDULUM, 0.25)), (X, OTHER, U)),
-    "a measured rate": (lambda x, rate, u: measured_rate(PENDULUM, x, u, rate, 0.2), (X, OTHER, U)),
     "a stack": (stacked, (X, OTHER, U)),
     "a gradient": (gradients, (X, OTHER, U)),
     "least squares": (squares, (X, OTHER, U)),

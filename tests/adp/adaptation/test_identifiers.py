@@ -12,7 +12,7 @@ from torch import Tensor
 
 from staf_torch import adp, systems
 from staf_torch.adp.adaptation.history_stack import ConcurrentGradient
-from staf_torch.adp.adaptation.windows import Equation, measured_rate
+from staf_torch.adp.adaptation.windows import Equation
 
 MODEL = PENDULUM.believing(tensor([7.0, 7.0]))  # theta of the model is not used
 
@@ -54,12 +54,6 @@ def test_the_noise_of_an_equation_has_the_variance_that_is_stated(shape: str) ->
     assert 0.9 < float(ratio) < 1.1  # of 4000 rows the variance is known to 2 %
     if shape == "smooth":
         assert float(equation.variance[0]) < 0.1 * 2e-6
-
-
-def test_a_measured_rate_gives_the_equation_exactly() -> None:
-    x, u = uniform(5, 2, seed=1), uniform(5, 1, seed=2)
-    equation = measured_rate(MODEL, x, u, PENDULUM.motion(x, u), 0.0)
-    torch.testing.assert_close(equation.s @ TRUE, equation.z, rtol=1e-14, atol=1e-14)
 
 
 def least(s: Tensor) -> float:
