@@ -336,8 +336,8 @@ REFUSED: list[tuple[Callable[[], Any], str]] = [
         "`AdaptiveLQR(law=...)` must have the model's 1 parameters",
     ),
     (
-        lambda: adp.AdaptiveLQR(ACTUATORS, COST, WINDOWS, ESTIMATE, doublings=4, a_step=3),
-        "`AdaptiveLQR(a_step=...)` must divide the 4 doublings",
+        lambda: adp.AdaptiveLQR(ACTUATORS, COST, WINDOWS, ESTIMATE, doublings=0),
+        "`AdaptiveLQR(doublings=...)` must be at least 1",
     ),
     (lambda: stream_drift(known=None), "`StreamDrift(known=...)` must be a ControlAffine"),
     (lambda: stream_drift(kernel=st.ExponentialKernel()), "`StreamDrift(kernel=...)` must be translation"),
@@ -370,8 +370,8 @@ EDGE: dict[str, tuple[object, ...]] = {"non_negative": (0.0,), "flag": (True, Fa
 ABSENT = {
     *("RBFGridBasis.width", "Supervised.momentum", "HeavyBall.momentum", "Nesterov.momentum"),
     *("HeavyBall.step", "RolloutPolicy.period", "DirectShooting.horizon", "StaF.out_features"),
-    *("IntegralWindows.first", "LeastSquares.alarm", "HistoryStack.outputs", "AdaptiveLQR.a_step"),
-    *("DriftLQR.a_step", "PlantEnv.bound", "DirectShooting.iterations", "DirectShooting.intervals"),
+    *("IntegralWindows.first", "LeastSquares.alarm", "HistoryStack.outputs"),
+    *("PlantEnv.bound", "DirectShooting.iterations", "DirectShooting.intervals"),
     *("simulate.seed", "trajectory.chunk", "near_optimal.dt", "near_optimal.horizon", "report.spread"),
     *("SafetyFilter.weight", "BoundedInputCost.bound", "PathIntegral.noise"),
 }

@@ -16,7 +16,7 @@ from ..problem.cost import Cost, matvec, quadratic
 from .consider import Considered, ConsiderFilter
 from .least_squares import Estimate, LeastSquares
 from .parametric import ParametricPlant
-from .redesign import Design, Redesign
+from .redesign import Redesign
 from .windows import IntegralWindows, Window
 
 
@@ -28,7 +28,7 @@ class Adaptation(NamedTuple):
     alarmed_at: Tensor  # (...) s, when the plant was last found to be another one; -1: never
     time: Tensor  # (...) s
     window: Window
-    design: Design
+    p: Tensor  # (..., n, n) of the design
     belief: Considered | None = None  # of the state, where it is filtered
 
 
@@ -41,10 +41,9 @@ class AdaptiveLQR(Controller):
     with C the covariance of theta^ and A_i, B_i the slopes of A and B in theta_i. Then e'Pe falls along the
     linearised loop for every theta within c standard deviations. Each row has its own model, gain and doubt.
 
-    The Riccati equation is solved by structured doubling, ``doublings`` steps a design and ``a_step`` of them
-    a control, so that a design is some controls old. With a ``rollout`` the LQR of the moment is its base and
-    the model of the moment its model. With a ``filter`` that LQR sees the filter's mean in place of what is
-    measured; the identifier and the robust policy see the measurement.
+    The Riccati equation is solved by structured doubling, anew at every control. With a ``rollout`` the LQR
+    of the moment is its base and the model of the moment its model. With a ``filter`` that LQR sees the
+    filter's mean in place of what is measured; the identifier and the robust policy see the measurement.
 
     Example:
         >>> def regressor(x, u):  # damping and inertia of an inverted pendulum
@@ -72,7 +71,6 @@ class AdaptiveLQR(Controller):
         probe: amplitude of a square wave that is added to every input while the model is uncertain, in its
             units, not negative: under a linear feedback alone not all parameters can be told apart.
         doublings: of a design, at least 1.
-        a_step: doublings a control; None for all of them at once.
         rollout: improves the LQR of the moment; its own model and base are not used.
         filter: of the measured state, for the policy of the model of the moment; None for none.
 
@@ -91,7 +89,6 @@ class AdaptiveLQR(Controller):
         confidence: float = 3.0,
         probe: float = 0.0,
         doublings: int = 14,
-        a_step: int | None = None,
         rollout: RolloutPolicy | None = None,
         filter: ConsiderFilter | None = None,
     ) -> None:
@@ -106,7 +103,7 @@ class AdaptiveLQR(Controller):
         self.confidence = positive_real("AdaptiveLQR", "confidence", confidence)
         non_negative("AdaptiveLQR", "probe", probe)
         self.probe = real("AdaptiveLQR", "probe", probe)
-        self.redesign = Redesign.of("AdaptiveLQR", self.cost, doublings, a_step)
+        self.redesign = Redesign("AdaptiveLQR", self.cost, doublings)
         self.family = model.family(self.cost.target, self.cost.target_input)
         self.robust: Policy = LQR(model.believing(law.first), cost) if robust is None else robust
         self.theta: Tensor | None = None
@@ -121,7 +118,8 @@ class AdaptiveLQR(Controller):
         zero, filter = x0.new_zeros(len(x0)), self.filter
         estimate, window = self.law.init(x0, self.theta), self.windows.init(x0)
         belief = None if filter is None else filter.init(x0)
-        return Adaptation(estimate, zero, zero - 1, zero.clone(), window, Design.init(x0), belief)
+        square = x0.new_zeros(*x0.shape, x0.shape[-1])
+        return Adaptation(estimate, zero, zero - 1, zero.clone(), window, square, belief)
 
     def recorded(self, carried: Adaptation) -> dict[str, Tensor]:
         own = {"certain": carried.certain, "alarmed_at": carried.alarmed_at}
@@ -131,8 +129,7 @@ class AdaptiveLQR(Controller):
         window, equation = self.windows.step(now.window, x, dt)
         estimate = self.law.step(now.estimate, equation, dt)
         a, b = self.family.at(estimate.theta)
-        design = self.redesign.step(now.design, a, b)
-        p = design.p
+        p = self.redesign.step(now.p, a, b)
         k = product(product(self.cost.r_inverse.to(b), b.mT), p)
         certain = self.redesign.solved(p, a, b) & (self.doubt(estimate.covariance, p, k) < 1)
         belief = now.belief
@@ -148,7 +145,7 @@ class AdaptiveLQR(Controller):
         alarmed = estimate.resets > now.estimate.resets
         alarmed_at = torch.where(alarmed, now.time, now.alarmed_at)
         window = self.windows.holding(window, u)
-        return u, Adaptation(estimate, certain.to(x), alarmed_at, now.time + dt, window, design, belief)
+        return u, Adaptation(estimate, certain.to(x), alarmed_at, now.time + dt, window, p, belief)
 
     def doubt(self, covariance: Tensor, p: Tensor, k: Tensor) -> Tensor:
         """c^2 sum_ij C_ij tr(W^-1 M_i W^-1 M_j) of a covariance and a design: below 1 it is certain, (...).

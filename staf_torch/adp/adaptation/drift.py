@@ -18,7 +18,7 @@ from ...systems import ControlAffineSystem
 from ..loop.controller import LQR, Controller, Policy
 from ..problem.cost import Cost, matvec, quadratic
 from .parametric import ParametricPlant
-from .redesign import Design, Redesign
+from .redesign import Redesign
 from .windows import Equation, IntegralWindows, Window
 
 _NODES = (0.06943184420297371, 0.33000947820757187, 0.6699905217924281, 0.9305681557970262)
@@ -247,7 +247,7 @@ class DriftAdaptation(NamedTuple):
     estimate: DriftEstimate
     certain: Tensor  # (...) 1 where the learned model has the control, 0 where the robust policy has it
     window: Window
-    design: Design
+    p: Tensor  # (..., n, n) of the design
 
 
 class DriftLQR(Controller):
@@ -277,7 +277,6 @@ class DriftLQR(Controller):
         robust: the policy in doubt; None for the LQR of what is known.
         confidence: c, positive.
         doublings: of a design, at least 1.
-        a_step: doublings a control; None for all of them at once.
 
     Raises:
         ValueError: if an argument breaks its rule.
@@ -294,17 +293,18 @@ class DriftLQR(Controller):
         robust: Policy | None = None,
         confidence: float = 2.0,
         doublings: int = 14,
-        a_step: int | None = None,
     ) -> None:
         super().__init__()
         self.drift, self.model, self.cost = drift, drift.known, cost.around(drift.known)
         self.confidence = positive_real("DriftLQR", "confidence", confidence)
-        self.redesign = Redesign.of("DriftLQR", self.cost, doublings, a_step)
+        self.redesign = Redesign("DriftLQR", self.cost, doublings)
         self.robust: Policy = LQR(drift.known, cost) if robust is None else robust
 
     def init(self, x0: Tensor) -> DriftAdaptation:
         windows = self.drift.windows.init(x0)
-        return DriftAdaptation(self.drift.init(x0), x0.new_zeros(len(x0)), windows, Design.init(x0))
+        return DriftAdaptation(
+            self.drift.init(x0), x0.new_zeros(len(x0)), windows, x0.new_zeros(*x0.shape, x0.shape[-1])
+        )
 
     def recorded(self, carried: DriftAdaptation) -> dict[str, Tensor]:
         return {"certain": carried.certain}
@@ -317,8 +317,7 @@ class DriftLQR(Controller):
         estimate = self.drift.step(now.estimate, equation, x, dt)
         a, covariance = self.drift.matrix(estimate, x)
         b = self.model.effectiveness(x)
-        design = self.redesign.step(now.design, a, b)
-        p = design.p
+        p = self.redesign.step(now.p, a, b)
         k = product(product(self.cost.r_inverse.to(b), b.mT), p)
         e = self.cost.deviation(x)
         # e'Pe falls by e'We a second, with d as it is believed; of d every row counts by 2 (Pe)_r.
@@ -330,4 +329,4 @@ class DriftLQR(Controller):
         u = torch.where(certain.unsqueeze(-1), wanted, self.robust(x))
         if self.cost.bounds is not None:  # what the actuator will give, which the window must know
             u = self.cost.bounds.clip(u)
-        return u, DriftAdaptation(estimate, certain.to(x), windows.holding(window, u), design)
+        return u, DriftAdaptation(estimate, certain.to(x), windows.holding(window, u), p)

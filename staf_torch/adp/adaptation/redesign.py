@@ -7,6 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from ...lanes import repeat
 from ...numerics.checks import fail, integer
 from ...numerics.riccati import product
 from ..problem.cost import Cost
@@ -43,82 +44,37 @@ def riccati_rows(a: Tensor, b: Tensor, q: Tensor, r_inverse: Tensor, *, doubling
     equations", Linear Algebra Appl. 396 (2005).
     """
     integer("riccati_rows", "doublings", doublings, least=1)
-    now = doubling_start(a, control_rate(b, r_inverse), q)
-    for _ in range(doublings):
-        now = doubling_step(now)
-    return now.h
-
-
-class Design(NamedTuple):
-    """The design that is used, and the one that is under way."""
-
-    p: Tensor  # P of the last one that was finished, (..., n, n)
-    doubling: Doubling  # of the one under way
-    stage: Tensor  # doublings done of it, (...); where it is 0 one begins with the model of now
-
-    @classmethod
-    def init(cls, x: Tensor) -> Design:
-        """None yet, a row each of (..., n)."""
-        square = x.new_zeros(*x.shape, x.shape[-1])
-        empty = Doubling(square, square.clone(), square.clone())
-        return cls(square.clone(), empty, x.new_zeros(x.shape[:-1]))
+    start = doubling_start(a, control_rate(b, r_inverse), q)
+    found: Doubling = repeat(doublings, doubling_step, start)
+    return found.h
 
 
 class Redesign:
-    """Riccati equations of rows solved while a loop runs: some doublings a control, one design after another.
+    """Riccati equations of rows, solved anew at every control of a loop.
 
     Args:
-        curvature: Q, (n, n).
-        r_inverse: R^-1, (m, m).
-        doublings: of a design.
-        a_step: of them a control, dividing them.
+        call: whose arguments these are, for messages.
+        cost: the cost rate, without discount.
+        doublings: of a design, at least 1.
+
+    Raises:
+        ValueError: if an argument breaks its rule.
     """
 
-    def __init__(self, curvature: Tensor, r_inverse: Tensor, doublings: int, a_step: int) -> None:
-        self.curvature, self.r_inverse = curvature, r_inverse
-        self.doublings, self.a_step = doublings, a_step
-
-    @classmethod
-    def of(cls, call: str, cost: Cost, doublings: int, a_step: int | None) -> Redesign:
-        """The designs of a cost without discount, in ``call``'s name; all doublings at once for None.
-
-        Raises:
-            ValueError: if an argument breaks its rule.
-        """
+    def __init__(self, call: str, cost: Cost, doublings: int) -> None:
         if cost.discount:
             raise fail(call, "cost", "must have no discount", cost.discount)
-        integer(call, "doublings", doublings, least=1)
-        each = doublings if a_step is None else integer(call, "a_step", a_step, least=1)
-        if doublings % each:
-            raise fail(call, "a_step", f"must divide the {doublings} doublings", a_step)
-        return cls(cost.state_curvature(), cost.r_inverse, doublings, each)
+        self.doublings = integer(call, "doublings", doublings, least=1)
+        self.curvature, self.r_inverse = cost.state_curvature(), cost.r_inverse
 
-    def step(self, design: Design, a: Tensor, b: Tensor) -> Design:
-        """The designs after ``a_step`` doublings more.
-
-        Args:
-            design: before them.
-            a: A of now, (..., n, n).
-            b: B of now, (..., n, m).
-        """
-        p, pair, stage = design
-        begins = (stage == 0)[..., None, None]
-        first = doubling_start(a, control_rate(b, self.r_inverse), self.curvature)
-        pair = Doubling(*(torch.where(begins, new, old) for new, old in zip(first, pair, strict=True)))
-        for _ in range(self.a_step):
-            pair = doubling_step(pair)
-        stage = stage + self.a_step
-        done = stage >= self.doublings
-        sound = done & torch.isfinite(pair.h).flatten(-2).all(-1)
-        p = torch.where(sound[..., None, None], pair.h, p)
-        # A design that went wrong must not end the row: its pair starts from zero.
-        pair = Doubling(
-            *(torch.where(torch.isfinite(part) & ~done[..., None, None], part, 0.0) for part in pair)
-        )
-        return Design(p, pair, torch.where(done, 0.0, stage))
+    def step(self, p: Tensor, a: Tensor, b: Tensor) -> Tensor:
+        """P of the model of now, or the one before, (..., n, n), where that is not finite: A, B as in
+        `riccati_rows`."""
+        found = riccati_rows(a, b, self.curvature, self.r_inverse, doublings=self.doublings)
+        return torch.where(torch.isfinite(found).flatten(-2).all(-1)[..., None, None], found, p)
 
     def solved(self, p: Tensor, a: Tensor, b: Tensor) -> Tensor:
-        """Whether P is of the model of now, (...) bool: a design may be older, or without a solution."""
+        """Return where P solves the equation of the model of now, (...) bool."""
         return riccati_residual(p, a, control_rate(b, self.r_inverse), self.curvature) < _SOLVED
 
 

@@ -58,9 +58,7 @@ def test_a_plant_of_unknown_parameters_is_learned_and_the_robust_policy_has_it_u
     robust = adp.LQR(PENDULUM, COST)
     law = adp.LeastSquares([0.2, 0.7], deviation=[0.2, 0.6], floor=1e-4)
     windows = adp.IntegralWindows(PENDULUM, 0.05)
-    control = adp.AdaptiveLQR(
-        PENDULUM, COST, windows, law, robust=lambda x: robust(x) + 0.25, doublings=12, a_step=3
-    )
+    control = adp.AdaptiveLQR(PENDULUM, COST, windows, law, robust=lambda x: robust(x) + 0.25, doublings=12)
     true = tensor([[0.05, 0.5], [0.2, 2.0], [0.1, 1.0]])
     z0 = CHANGING.start(tensor([[0.5, 0.0], [-0.5, 0.3], [0.2, -1.0]]), true)
     run = adp.simulate(
@@ -86,7 +84,7 @@ def test_a_plant_of_unknown_parameters_is_learned_and_the_robust_policy_has_it_u
 def test_a_change_is_found_when_it_happens() -> None:
     law = adp.LeastSquares([0.1, 1.0], deviation=[0.2, 0.6], floor=1e-4, alarm=8.0)
     windows = adp.IntegralWindows(PENDULUM, 0.02)
-    control = adp.AdaptiveLQR(PENDULUM, COST, windows, law, doublings=12, a_step=2)
+    control = adp.AdaptiveLQR(PENDULUM, COST, windows, law, doublings=12)
     z0 = CHANGING.start(tensor([[1.0, 0.0], [1.0, 0.0]]), TRUE, tensor([[0.1, 0.6], [0.1, 1.0]]), at=0.5)
     run = adp.simulate(
         adp.Measured(control, noise=0.0, dim=2),
@@ -104,7 +102,7 @@ def test_a_change_is_found_when_it_happens() -> None:
 
 def test_a_design_that_cannot_be_made_leaves_the_robust_policy_and_not_a_dead_row() -> None:
     law = adp.LeastSquares([0.1, 0.0], deviation=1.0)  # an input without effect
-    control = adp.AdaptiveLQR(PENDULUM, COST, WINDOWS, law, robust=lambda x: 0 * x[..., :1], a_step=7)
+    control = adp.AdaptiveLQR(PENDULUM, COST, WINDOWS, law, robust=lambda x: 0 * x[..., :1])
     run = adp.simulate(control, PENDULUM, COST, tensor([[0.1, 0.0]]), dt=0.01, steps=60, compile=False)
     assert not run.diverged.any()
     assert not run["certain"].any()
@@ -113,8 +111,8 @@ def test_a_design_that_cannot_be_made_leaves_the_robust_policy_and_not_a_dead_ro
 @pytest.mark.needs_compiler
 def test_compiled_steps_are_those_of_the_definition() -> None:
     more = {
-        "a_step": 2,
         "probe": 1.0,
+        "doublings": 4,
         "filter": adp.ConsiderFilter(PENDULUM, noise=0.01, process=0.01),
         "rollout": adp.RolloutPolicy.of_lqr(PENDULUM, COST, centers=3, steps=2),
     }
