@@ -289,20 +289,3 @@ def test_a_kernel_that_is_narrow_for_its_ball_is_told(
             assert caplog.messages[0].startswith(f"`StaFRegressor(radius={radius:g})`: half way to a center")
             assert f"explain {share:.2g} of the variance" in caplog.messages[0]
     assert told == ([False] * 4 if kernel == "polynomial" else [False, False, told[2], True])
-
-
-def test_bad_samples_are_named() -> None:
-    model = st.StaFRegressor(Cauchy())
-    with pytest.raises(ValueError, match="needs a first sample"):
-        model.predict(tensor([0.0]))
-    with pytest.raises(ValueError, match=r"must have the shape \(n,\) or \(S, n\)"):
-        model.partial_fit(uniform(3, 2), uniform(4))
-    with pytest.raises(ValueError, match=r"params.*must be one of"):
-        model.set_params(width=1.0)
-    model.partial_fit(uniform(3, 2), uniform(3))
-    with pytest.raises(ValueError, match=r"must have the shape \(3, 2\).*got the shape \(4, 2\)"):
-        model.partial_fit(uniform(4, 2), uniform(4))
-    with pytest.raises(ValueError, match=r"predict.*must have the shape \(3, 2\)"):
-        model.predict(uniform(3, 5))
-    with pytest.raises(ValueError, match="array of numbers"):
-        model.predict("no")
