@@ -36,21 +36,10 @@ _LONGEST_UNUSED = 60 * _DAY
 _temporary: dict[int, Path] = {}  # caches, by the process that made them
 _PACKAGE = Path(__file__).parent.parent
 _DIGEST = 32
-_ALLOWED = frozenset(
-    (
-        ("torch", "Size"),
-        ("torch", "device"),
-        ("builtins", "slice"),
-        ("builtins", "tuple"),
-        ("builtins", "complex"),
-        ("numpy", "dtype"),
-        ("numpy", "ndarray"),
-        ("numpy.core.multiarray", "_reconstruct"),
-        ("numpy._core.multiarray", "_reconstruct"),
-        ("numpy.core.numeric", "_frombuffer"),
-        ("numpy._core.numeric", "_frombuffer"),
-    )
-)
+_NUMPY = [(f"numpy.{core}.multiarray", "_reconstruct") for core in ("core", "_core")]
+_NUMPY += [(f"numpy.{core}.numeric", "_frombuffer") for core in ("core", "_core")]
+_ALLOWED = {("torch", "Size"), ("torch", "device"), ("numpy", "dtype"), ("numpy", "ndarray"), *_NUMPY}
+_ALLOWED |= {("builtins", name) for name in ("slice", "tuple", "complex")}
 _NAMED = (torch.dtype, torch.memory_format, torch.layout)
 _NAMESPACES = ("aten", "prims")
 _DAMAGED = (
@@ -58,7 +47,7 @@ _DAMAGED = (
     pickle.UnpicklingError,
     AttributeError,
     EOFError,
-    IndexError,
+    LookupError,
     ValueError,
     TypeError,
     zlib.error,

@@ -43,15 +43,6 @@ def fresh(like: Tensor, *shape: int) -> Tensor:
     return torch.frombuffer(memory, dtype=like.dtype, count=size // like.element_size()).view(shape)
 
 
-@functools.cache
-def openmp(name: str) -> Callable[..., None] | None:
-    """A function of it; None where there is none."""
-    try:
-        return getattr(ctypes.CDLL(torch._C.__file__), name, None)
-    except OSError:
-        return None
-
-
 Form = tuple[torch.Size, tuple[int, ...], torch.dtype, bool]
 """Shape, strides and dtype of an input, and whether all rows share it."""
 
@@ -214,8 +205,11 @@ def _even(shape: Sequence[int], strides: Sequence[int]) -> bool:
 @functools.cache
 def _parallel() -> int | None:
     """The OpenMP entry that torch itself runs on: a second pool of threads would fight for the same cores."""
-    entry = openmp("GOMP_parallel")
-    return None if entry is None else ctypes.cast(entry, ctypes.c_void_p).value  # type: ignore[arg-type]
+    try:
+        entry = getattr(ctypes.CDLL(torch._C.__file__), "GOMP_parallel", None)
+    except OSError:
+        return None
+    return None if entry is None else ctypes.cast(entry, ctypes.c_void_p).value
 
 
 class Given(NamedTuple):

@@ -104,12 +104,7 @@ class compiled:  # noqa: N801
     """
 
     def __init__(
-        self,
-        name: str,
-        *,
-        by: Callable[[Any], Served] | None = None,
-        pays: float = _PAYS,
-        copies: int = 1,
+        self, name: str, *, by: Callable[[Any], Served] | None = None, pays: float = _PAYS, copies: int = 1
     ) -> None:
         self.name, self.by, self.pays, self.copies = name, by, pays, copies
 

@@ -20,11 +20,7 @@ _FEW = 4  # passes of a loop that is only tried
 
 
 def repeat(
-    count: int,
-    body: Callable[[Tree], Tree],
-    carry: Tree,
-    *,
-    where: Callable[[Tree], Tensor] | None = None,
+    count: int, body: Callable[[Tree], Tree], carry: Tree, *, where: Callable[[Tree], Tensor] | None = None
 ) -> Tree:
     """body(...body(body(carry))), ``count`` times, or as often as a row asks for.
 

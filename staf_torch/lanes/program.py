@@ -62,14 +62,7 @@ class Program(Derived):
         copies: vectors of rows that advance side by side; 0 by the number of rows and the program.
     """
 
-    def __init__(
-        self,
-        step: Step,
-        *,
-        name: str = "program",
-        compile: bool = True,
-        copies: int = 0,
-    ) -> None:
+    def __init__(self, step: Step, *, name: str = "program", compile: bool = True, copies: int = 0) -> None:
         self.step, self.name, self.compile, self.copies = step, name, compile, copies
         self._compiled: dict[Hashable, _Built | None] = {}
         self._prepared: dict[Hashable, Prepared] = {}

@@ -129,14 +129,11 @@ class _CppWriter(StatementWriter):
         self._lines.append("static void ahead(const Frame &f) {")
         self._line("const REAL *const c = f.c, *const fixed = f.fixed;")
         self._line("(void)c, (void)fixed;")
-        self._line(f"for (int n = 0; n < {'f.times * f.rows' if stored else '0'}; n += W) {{")
-        self._level += 1
-        self._line("const REAL *const now = f.now + n;")
-        self._line("(void)now;")
-        self._block(self.schedule.block(NOW))
-        self._keep(stored, "f.now + n", "f.span")
-        self._level -= 1
-        self._line("}")
+        with self._braces(f"for (int n = 0; n < {'f.times * f.rows' if stored else '0'}; n += W)"):
+            self._line("const REAL *const now = f.now + n;")
+            self._line("(void)now;")
+            self._block(self.schedule.block(NOW))
+            self._keep(stored, "f.now + n", "f.span")
         self._lines.append("}")
 
     def _keep(self, stored: dict[int, tuple[str, int]], start: str, stride: str) -> None:
@@ -173,15 +170,12 @@ class _CppWriter(StatementWriter):
             kind = "" if loop else f"{self._type(node)} "
             self._line(f"{loop}{kind}{name} = {read}(f.carry + b + {place} * room + {j} * W);")
         self._line("Recorder recorder(f);")
-        self._line("for (int t = 0; t < f.times; ++t) {")
-        self._level += 1
-        self._line("const REAL *const now = f.now + t * f.rows + b;")
-        self._line("(void)now;")
-        self._steps(following)
-        self._outputs(outputs)
-        self._follow(slots)
-        self._level -= 1
-        self._line("}")
+        with self._braces("for (int t = 0; t < f.times; ++t)"):
+            self._line("const REAL *const now = f.now + t * f.rows + b;")
+            self._line("(void)now;")
+            self._steps(following)
+            self._outputs(outputs)
+            self._follow(slots)
         for name, loop, place, node, j in self._carried(slots):
             number = self._number(node, name)
             self._line(f"{loop}store(f.carry + b + {place} * room + {j} * W, {number});")
@@ -269,19 +263,16 @@ class _CppWriter(StatementWriter):
     def _outputs(self, outputs: Sequence[int]) -> None:
         if not outputs:
             return
-        self._line("if (recorder.due()) {")
-        self._level += 1
-        done = 0
-        for slot, size in enumerate(self.layout.outputs):
-            entries = outputs[done : done + size]
-            if size > _WRITTEN_OUT:
-                self._put_by_loop(slot, entries)
-            else:
-                for (e, node), j in itertools.product(enumerate(entries), range(self.copies)):
-                    self._line(self._put(slot, str(e), self._number(node, self._ref(node, j)), j))
-            done += size
-        self._level -= 1
-        self._line("}")
+        with self._braces("if (recorder.due())"):
+            done = 0
+            for slot, size in enumerate(self.layout.outputs):
+                entries = outputs[done : done + size]
+                if size > _WRITTEN_OUT:
+                    self._put_by_loop(slot, entries)
+                else:
+                    for (e, node), j in itertools.product(enumerate(entries), range(self.copies)):
+                        self._line(self._put(slot, str(e), self._number(node, self._ref(node, j)), j))
+                done += size
 
     def _put(self, slot: int, entry: str, value: str, j: int) -> str:
         return f"recorder.put({slot}, {entry}, b + {j} * W, rows - {j} * W, {value});"
@@ -291,13 +282,10 @@ class _CppWriter(StatementWriter):
         name, first = f"o{slot}", entries[0]
         self._line(f"{self._type(first)} {name}[{len(entries) * self.copies}];")
         self._fill(name, entries)
-        self._line(f"for (int p = 0; p < {len(entries)}; ++p) {{")
-        self._level += 1
-        for j in range(self.copies):
-            place = self._sum(["p"], [self.copies], j)
-            self._line(self._put(slot, "p", self._number(first, f"{name}[{place}]"), j))
-        self._level -= 1
-        self._line("}")
+        with self._braces(f"for (int p = 0; p < {len(entries)}; ++p)"):
+            for j in range(self.copies):
+                place = self._sum(["p"], [self.copies], j)
+                self._line(self._put(slot, "p", self._number(first, f"{name}[{place}]"), j))
 
     def _operation(self, op: str, values: Sequence[str], type: str) -> str:
         if op in _INFIX:

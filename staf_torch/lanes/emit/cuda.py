@@ -148,20 +148,17 @@ class _CudaWriter(_ScalarWriter):
             slot, entry = self._slot("state", place)
             value = self._typed(node, f"{names.carries[slot]}[{entry} * rows + r]")
             self._line(f"{self._type(node)} s{place} = {value};")
-        self._line("for (long long t = 0; t < times; ++t) {")
-        self._level += 1
-        self._block(self.schedule.block(STEP))
-        self._line("if (t % every == 0) {")
-        done = 0
-        for name, size in zip(names.outputs, self.layout.outputs, strict=True):
-            for e in range(size):
-                value = self._ref(outputs[done + e], 0)
-                self._line(f"    {name}[(t / every * {size} + {e}) * rows + r] = {value};")
-            done += size
-        self._line("}")
-        self._assign([(f"s{k}", node) for k, node in enumerate(following)])
-        self._level -= 1
-        self._line("}")
+        with self._braces("for (long long t = 0; t < times; ++t)"):
+            self._block(self.schedule.block(STEP))
+            self._line("if (t % every == 0) {")
+            done = 0
+            for name, size in zip(names.outputs, self.layout.outputs, strict=True):
+                for e in range(size):
+                    value = self._ref(outputs[done + e], 0)
+                    self._line(f"    {name}[(t / every * {size} + {e}) * rows + r] = {value};")
+                done += size
+            self._line("}")
+            self._assign([(f"s{k}", node) for k, node in enumerate(following)])
         for place in range(len(following)):
             slot, entry = self._slot("state", place)
             self._line(f"{names.carries[slot]}_end[{entry} * rows + r] = s{place};")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -66,29 +66,26 @@ class Schedule:
 
     def cut(self) -> list[int]:
         """What a row has once and the steps read."""
-        graph, read = self._graph, set(self._roots)
-        for node in self.live:
-            if not self._once(node):
-                read.update(self._arguments(node))
-        for number, loop in enumerate(graph.loops):
-            if loop.node in self.live and not self._once(loop.node):
-                read.update(self._ends(number))
-        arrays = {graph.args[n][0] for n in read if graph.op[n] == "elem"}
-        kept = (node for node in sorted((read | arrays) & self.live) if graph.depth[node] == ROW)
-        return [node for node in kept if graph.op[node] not in ("const", "param", "row", "elem", "loop")]
+        found = self._cut(ROW, self.live, lambda node: not self._once(node))
+        return [node for node in found if self._graph.op[node] not in ("const", "param", "row")]
 
     def cut_ahead(self) -> list[int]:
         """What times alone decide and the steps read."""
+        depth = self._graph.depth
+        found = self._cut(NOW, self.ahead, lambda node: node not in self.ahead and depth[node] != ROW)
+        return [node for node in found if self._graph.op[node] != "now"]
+
+    def _cut(self, depth: int, among: set[int], later: Callable[[int], bool]) -> list[int]:
+        """The nodes of a depth that others read, which are found later."""
         graph, read = self._graph, set(self._roots)
-        for node in self.live - self.ahead:
-            if graph.depth[node] != ROW:
-                read.update(self._arguments(node))
+        for node in filter(later, self.live):
+            read.update(self._arguments(node))
         for number, loop in enumerate(graph.loops):
-            if loop.node in self.live and loop.node not in self.ahead and graph.depth[loop.node] != ROW:
+            if loop.node in self.live and later(loop.node):
                 read.update(self._ends(number))
         arrays = {graph.args[n][0] for n in read if graph.op[n] == "elem"}
-        kept = (node for node in sorted((read | arrays) & self.ahead) if graph.depth[node] == NOW)
-        return [node for node in kept if graph.op[node] not in ("now", "elem", "loop")]
+        kept = (node for node in sorted((read | arrays) & among) if graph.depth[node] == depth)
+        return [node for node in kept if graph.op[node] not in ("elem", "loop")]
 
     def _find_ahead(self) -> set[int]:
         """Nodes without a row's own numbers in them: those of times, and the bodies of loops over these."""

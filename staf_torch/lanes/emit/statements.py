@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+import contextlib
 import math
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
@@ -126,6 +127,15 @@ class StatementWriter(abc.ABC):
     def _line(self, text: str) -> None:
         self._lines.append("    " * self._level + text)
 
+    @contextlib.contextmanager
+    def _braces(self, head: str) -> Iterator[None]:
+        """Write a loop or a branch around what is written inside of the context."""
+        self._line(f"{head} {{")
+        self._level += 1
+        yield
+        self._level -= 1
+        self._line("}")
+
     def _assign(self, pairs: Sequence[tuple[str, int]]) -> None:
         """Variables of a loop become other nodes, all at once."""
         for j in range(self.copies):
@@ -170,25 +180,22 @@ class StatementWriter(abc.ABC):
         for k in sorted(self.schedule.collected(number)):
             kind, size = self._type(loop.collected[k][0]), loop.count * len(loop.collected[k])
             self._line(f"{kind} y{number}_{k}[{size * self.copies}];")
-        self._line(f"for (int i{number} = 0; i{number} < {loop.count}; ++i{number}) {{")
-        self._level += 1
-        body = self.schedule.body(number)
-        if loop.going >= 0:
-            self._block([node for node in body if node <= loop.going])
-            self._line(f"if ({self._nobody(loop.going)}) break;")
-        self._block([node for node in body if node > loop.going])
-        for k in sorted(self.schedule.collected(number)):
-            size = len(loop.collected[k])
-            for e, node in enumerate(loop.collected[k]):
-                for j in range(self.copies):
-                    place = f"(i{number} * {size} + {e}) * {self.copies} + {j}"
-                    self._line(f"y{number}_{k}[{place}] = {self._ref(node, j)};")
-        self._assign([(f"l{number}_{k}", loop.following[k]) for k in live])
-        for k in arrays:
-            if loop.following[k] != loop.carry[k]:
-                self._copy_array(f"l{number}_{k}", loop.following[k])
-        self._level -= 1
-        self._line("}")
+        with self._braces(f"for (int i{number} = 0; i{number} < {loop.count}; ++i{number})"):
+            body = self.schedule.body(number)
+            if loop.going >= 0:
+                self._block([node for node in body if node <= loop.going])
+                self._line(f"if ({self._nobody(loop.going)}) break;")
+            self._block([node for node in body if node > loop.going])
+            for k in sorted(self.schedule.collected(number)):
+                size = len(loop.collected[k])
+                for e, node in enumerate(loop.collected[k]):
+                    for j in range(self.copies):
+                        place = f"(i{number} * {size} + {e}) * {self.copies} + {j}"
+                        self._line(f"y{number}_{k}[{place}] = {self._ref(node, j)};")
+            self._assign([(f"l{number}_{k}", loop.following[k]) for k in live])
+            for k in arrays:
+                if loop.following[k] != loop.carry[k]:
+                    self._copy_array(f"l{number}_{k}", loop.following[k])
 
     def _copy_array(self, name: str, array: int) -> None:
         size = self.graph.size(array)
@@ -252,20 +259,19 @@ class StatementWriter(abc.ABC):
         whole = all(index is not None for index in indices)
         if not whole:
             names, sizes = ["p"], [math.prod(sizes)]
-        for variable, size in zip(names, sizes, strict=True):
-            self._line(f"for (int {variable} = 0; {variable} < {size}; ++{variable}) {{")
-            self._level += 1
         target = self._sum(names, [math.prod(sizes[d + 1 :]) for d in range(len(sizes))], 0)
-        ats = [
-            self._sum(names, *index) if whole and index is not None else self._lookup(each)
-            for each, index in zip(places, indices, strict=True)
-        ]
-        for j in range(self.copies):
-            value = self._mapped(node, iter(ats), j)
-            self._line(f"{name}[({target}) * {self.copies} + {j}] = {value};")
-        for _ in names:
-            self._level -= 1
-            self._line("}")
+        with contextlib.ExitStack() as loops:
+            for variable, size in zip(names, sizes, strict=True):
+                loops.enter_context(
+                    self._braces(f"for (int {variable} = 0; {variable} < {size}; ++{variable})")
+                )
+            ats = [
+                self._sum(names, *index) if whole and index is not None else self._lookup(each)
+                for each, index in zip(places, indices, strict=True)
+            ]
+            for j in range(self.copies):
+                value = self._mapped(node, iter(ats), j)
+                self._line(f"{name}[({target}) * {self.copies} + {j}] = {value};")
 
     def _mapped(self, node: int, ats: Iterator[str], j: int) -> str:
         """The expression of one entry of a map, its `leaves` read at ``ats``."""
@@ -291,27 +297,20 @@ class StatementWriter(abc.ABC):
         for start, rows, passes in ((0, panel, full), (full * panel, outs % panel, 1)):
             if rows == 0 or passes == 0:
                 continue
-            self._line(f"for (int p = {start}; p < {start + rows * passes}; p += {rows}) {{")
-            self._level += 1
-            for r in range(rows):
-                for j in range(self.copies):
-                    self._line(
-                        f"{kind} r{r}{self._copy(j)} = {self._product(node, indices, places, r, '0', j)[2]};"
-                    )
-            self._line(f"for (int q = 1; q < {count}; ++q) {{")
-            self._level += 1
-            for r in range(rows):
-                for j in range(self.copies):
-                    a, b, _ = self._product(node, indices, places, r, "q", j)
-                    name = f"r{r}{self._copy(j)}"
-                    self._line(f"{name} = {self._fma(a, b, name)};")
-            self._level -= 1
-            self._line("}")
-            for r in range(rows):
-                for j in range(self.copies):
-                    self._line(f"a{node}[(p + {r}) * {self.copies} + {j}] = r{r}{self._copy(j)};")
-            self._level -= 1
-            self._line("}")
+            with self._braces(f"for (int p = {start}; p < {start + rows * passes}; p += {rows})"):
+                for r in range(rows):
+                    for j in range(self.copies):
+                        first = self._product(node, indices, places, r, "0", j)[2]
+                        self._line(f"{kind} r{r}{self._copy(j)} = {first};")
+                with self._braces(f"for (int q = 1; q < {count}; ++q)"):
+                    for r in range(rows):
+                        for j in range(self.copies):
+                            a, b, _ = self._product(node, indices, places, r, "q", j)
+                            name = f"r{r}{self._copy(j)}"
+                            self._line(f"{name} = {self._fma(a, b, name)};")
+                for r in range(rows):
+                    for j in range(self.copies):
+                        self._line(f"a{node}[(p + {r}) * {self.copies} + {j}] = r{r}{self._copy(j)};")
 
     def _product(self, node: int, indices: Any, places: Any, r: int, q: str, j: int) -> tuple[str, str, str]:
         count, values = self.graph.aux[node][1], []

@@ -10,16 +10,9 @@ import torch
 from torch import Tensor
 from torch.utils._python_dispatch import _disable_current_modes
 
-_LIKE = (
-    "zeros_like",
-    "ones_like",
-    "full_like",
-    "empty_like",
-    "rand_like",
-    "_new_zeros_with_same_feature_meta",
-)
-_NEW = ("new_zeros", "new_ones", "new_full", "new_empty", "new_empty_strided")
-_OF_NO_VALUES = frozenset((*_LIKE, *_NEW, "lift_fresh", "lift_fresh_copy"))
+_NO_VALUES = """zeros_like ones_like full_like empty_like rand_like _new_zeros_with_same_feature_meta
+    new_zeros new_ones new_full new_empty new_empty_strided lift_fresh lift_fresh_copy"""
+_OF_NO_VALUES = frozenset(_NO_VALUES.split())
 """Operations whose result does not depend on the numbers of their arguments."""
 
 

@@ -43,38 +43,13 @@ class Loop:
         return [self.going] if self.going >= 0 else []
 
 
-_FOLD: dict[str, Callable[..., Any]] = {
-    "add": np.add,
-    "sub": np.subtract,
-    "mul": np.multiply,
-    "div": np.divide,
-    "neg": np.negative,
-    "abs": np.abs,
-    "min": np.minimum,
-    "max": np.maximum,
-    "sqrt": np.sqrt,
-    "exp": np.exp,
-    "expm1": np.expm1,
-    "log": np.log,
-    "log1p": np.log1p,
-    "sin": np.sin,
-    "cos": np.cos,
-    "tan": np.tan,
-    "tanh": np.tanh,
-    "atan2": np.arctan2,
-    "floor": np.floor,
-    "ceil": np.ceil,
-    "trunc": np.trunc,
-    "round": np.rint,
-    "lt": np.less,
-    "le": np.less_equal,
-    "eq": np.equal,
-    "ne": np.not_equal,
-    "and": np.logical_and,
-    "or": np.logical_or,
-    "xor": np.logical_xor,
-    "not": np.logical_not,
-}
+_OPERATIONS = """add sub mul div neg abs min max sqrt exp expm1 log log1p sin cos tan tanh atan2
+    floor ceil trunc round lt le eq ne and or xor not"""
+_OF_NUMPY = """add subtract multiply divide negative abs minimum maximum sqrt exp expm1 log log1p sin cos tan
+    tanh arctan2 floor ceil trunc rint less less_equal equal not_equal logical_and logical_or logical_xor
+    logical_not"""
+_NAMES = zip(_OPERATIONS.split(), _OF_NUMPY.split(), strict=True)
+_FOLD: dict[str, Callable[..., Any]] = {op: getattr(np, name) for op, name in _NAMES}
 _COMMUTE = frozenset({"add", "mul", "eq", "ne", "and", "or", "xor"})
 _COMPARE = frozenset({"lt", "le", "eq", "ne"})
 

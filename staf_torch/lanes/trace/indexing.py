@@ -13,38 +13,11 @@ from ..loops import scan
 from .graph import WHOLE, Ids
 from .tracer import LARGE, NotLoweredError, Tracer
 
-MOVEMENTS = frozenset(
-    (
-        "cat",
-        "stack",
-        "index",
-        "index_select",
-        "gather",
-        "flip",
-        "roll",
-        "repeat",
-        "select_scatter",
-        "slice_scatter",
-        "index_put",
-        "scatter",
-        "constant_pad_nd",
-        "diag_embed",
-        "tril",
-        "triu",
-        "_unsafe_view",
-        "view_copy",
-        "expand_copy",
-        "unfold_copy",
-        "diagonal_scatter",
-        "as_strided_scatter",
-        "select_backward",
-        "slice_backward",
-        "diagonal_backward",
-        "index_copy",
-        "take",
-        "take_along_dim",
-    )
-)
+_MOVEMENTS = """cat stack index index_select gather flip roll repeat select_scatter slice_scatter index_put
+    scatter constant_pad_nd diag_embed tril triu _unsafe_view view_copy expand_copy unfold_copy
+    diagonal_scatter as_strided_scatter select_backward slice_backward diagonal_backward index_copy take
+    take_along_dim"""
+MOVEMENTS = frozenset(_MOVEMENTS.split())
 
 
 def moved(t: Tracer, func: Any, out: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> Any:

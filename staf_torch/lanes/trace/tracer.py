@@ -57,13 +57,7 @@ class Tracer(TorchDispatchMode):
     """
 
     def __init__(
-        self,
-        graph: Graph,
-        lower: Callable[..., Any],
-        *,
-        learning: bool,
-        widened: bool,
-        folded: bool,
+        self, graph: Graph, lower: Callable[..., Any], *, learning: bool, widened: bool, folded: bool
     ) -> None:
         super().__init__()  # type: ignore[no-untyped-call]
         self.graph, self._lower, self._learning, self._widened = graph, lower, learning, widened
