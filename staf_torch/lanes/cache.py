@@ -1,4 +1,9 @@
-"""Traces in the user's cache: what another process wrote down of a step is not traced again."""
+"""The user's cache: libraries, and traces, so that what another process wrote down is not traced again.
+
+A trace is pickled without the numbers of the step's tensors, which are given again when it is read. Reading
+runs no code: classes are those of an allow-list, operations those of torch's own namespaces, and a file ends
+with its digest. It spares a process .1 to .5 s a program; a library one to thirty seconds.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,10 @@
-"""Loops that a compiled program keeps as loops; everywhere else they are plain Python."""
+"""Loops that a compiled program keeps as loops; everywhere else they are plain Python.
+
+While a step is traced, the body of a loop runs once: its carry is new nodes, what it reads from outside stays
+where it is, and the nodes after the pass say what the next one begins with. The loop then stands as far
+outside as what it reads allows. Writing all passes out, as tracers do that do not see Python's loops, gives
+g++ a text that grows with the passes, and the processor one that fits no cache.
+"""
 
 from __future__ import annotations
 

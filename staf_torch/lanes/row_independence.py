@@ -1,4 +1,10 @@
-"""Whether a step does with a row alone what it does with it among others, and does it again."""
+"""Whether a step does with a row alone what it does with it among others, and does it again.
+
+A trace sees one row once. A mean over the batch, a branch on its size, random numbers, counters and clocks
+look like constants there. So the step of a user is called in plain torch with one row, again, and beside the
+row that differs most from it: numbers that change give it away. What only rounding decides is told apart by
+moving the inputs by a few units in the last place. No code is read: what a function may do cannot be.
+"""
 
 from __future__ import annotations
 

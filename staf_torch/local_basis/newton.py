@@ -7,7 +7,7 @@ from typing import NamedTuple
 from torch import Tensor
 
 from ..kernels import Kernel
-from ..lanes.pivoted_cholesky import PivotedCholesky, pivoted_cholesky
+from ..numerics.pivoted_cholesky import PivotedCholesky, pivoted_cholesky
 from .base import evaluate_scaled, from_scaled, scale, scaled_gradient, to_scaled, with_gradient
 
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ..kernels import Kernel
-from ..lanes.pivoted_cholesky import newton_basis
+from ..numerics.pivoted_cholesky import newton_basis
 
 _JUMP = 4.0  # radii: beyond, a kernel whose scale grows with the state says nothing about the new one
 _FAR = 1e8  # radii: beyond, no kernel does, and the squares of a user's kernel may overflow

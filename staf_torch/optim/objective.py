@@ -7,7 +7,7 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from ..lanes.pivoted_cholesky import pivoted_cholesky
+from ..numerics.pivoted_cholesky import pivoted_cholesky
 
 
 class Objective(Protocol):

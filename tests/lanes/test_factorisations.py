@@ -14,7 +14,6 @@ from hypothesis import given
 from torch import Tensor
 
 from staf_torch import lanes
-from staf_torch.lanes.pivoted_cholesky import pivoted_cholesky
 from staf_torch.lanes.trace.eigenvalues import eigen, eigenvalues
 from staf_torch.lanes.trace.factorisations import (
     cholesky,
@@ -28,6 +27,7 @@ from staf_torch.lanes.trace.factorisations import (
     triangular,
 )
 from staf_torch.numerics.linalg import condition_number
+from staf_torch.numerics.pivoted_cholesky import pivoted_cholesky
 
 LEADS = ((), (2,), (2, 3))
 SEEDS = st.integers(0, 2**31)

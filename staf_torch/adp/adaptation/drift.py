@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from ...kernels import Kernel
-from ...lanes.pivoted_cholesky import newton_basis
 from ...numerics.checks import fail, non_negative, positive_real, real
 from ...numerics.linalg import row_jacobian
+from ...numerics.pivoted_cholesky import newton_basis
 from ...numerics.riccati import product
 from ...systems import ControlAffineSystem
 from ..loop.controller import LQR, Controller, Policy

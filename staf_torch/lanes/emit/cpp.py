@@ -1,4 +1,9 @@
-"""A scalar program as C++: a row in every lane, the loops inside."""
+"""A scalar program as C++: a row in every lane of a vector register, tiles of rows, the times inside.
+
+Vectors of GCC and Clang (`V`) are the variables, so that g++ sees straight-line arithmetic: vectorising loops
+over rows is left to no optimiser. One or two vectors of rows advance side by side, as dependent steps of a
+recursion would leave the units idle. The driver that cuts tiles and threads is `_driver.hpp`.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,11 @@
-"""Which nodes of a scalar program are needed, where each is computed, which products become one rounding."""
+"""Which nodes of a scalar program are needed, where each is computed, which products become one rounding.
+
+A node is computed once a row, ahead for all times of a tile, in a step, or in the innermost loop whose carry
+it depends on: code motion by depth, which a tracer knows and a compiler would have to prove across buffers.
+A sum takes a product that nobody else reads into one fused multiplication; contraction is switched off in the
+compiler, so that the rounding is the same on all machines that have it. A loop over an array that one other
+loop reads is computed where it is read.
+"""
 
 from __future__ import annotations
 

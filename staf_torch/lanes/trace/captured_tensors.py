@@ -1,4 +1,11 @@
-"""Tensors that a step finds outside: numbers of a table, of which the text of a program knows nothing."""
+"""Tensors that a step finds outside: numbers of a table, of which the text of a program knows nothing.
+
+A width of 0.5 or 0.7 shall be the same machine code. What follows from tensors of outside alone (a Gram
+matrix of fixed centers, its factor) is computed by torch while tracing and enters the table; which operations
+led there is kept as a recipe, which makes the table again from other tensors in microseconds. What the code
+of a step states itself (`torch.eye(3)`), integers and flags are structure and part of the text. To make every
+captured number an input would compute the factor in every row and at every time.
+"""
 
 from __future__ import annotations
 

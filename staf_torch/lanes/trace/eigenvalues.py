@@ -1,4 +1,10 @@
-"""Eigenvalues and eigenvectors of small symmetric matrices in torch operations that have a scalar form."""
+"""Eigenvalues and eigenvectors of small symmetric matrices in torch operations that have a scalar form.
+
+With vectors: Jacobi's rotations, M/2 disjoint pairs a pass (Brent and Luk, 1985), a fixed number of sweeps.
+Values alone: Householder's tridiagonal form and bisection (Barth, Martin and Wilkinson, 1967), each value by
+itself. The QR iteration of LAPACK takes as many passes as a matrix needs, and shifts that a row chooses: in
+lanes all rows would wait for the slowest one, and branch.
+"""
 
 from __future__ import annotations
 

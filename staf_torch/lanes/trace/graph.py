@@ -1,4 +1,10 @@
-"""A scalar program: single numbers of one row, each an operation on others, no two of them equal."""
+"""A scalar program: single numbers of one row, each an operation on others, no two of them equal.
+
+Every node is looked up by operation, operands and type before it is made (value numbering by hashing: Cocke
+and Schwartz, 1970), so that a subexpression that torch computes twice is one number. A node knows its depth,
+what of a call it depends on, which later decides where it is computed. Only what keeps every bit is
+simplified, as compiled must equal the definition; a compiler's -ffast-math does more and promises less.
+"""
 
 from __future__ import annotations
 

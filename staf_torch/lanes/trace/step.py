@@ -1,4 +1,9 @@
-"""What a step does with a single row, written down."""
+"""What a step does with a single row: inputs become nodes, each operation is looked up among the rules.
+
+An operation has a rule in single numbers (`entrywise`, `reductions`), moves entries (`indexing`: torch itself
+moves the numbers of nodes), or is written in simpler operations of torch that are traced in its place: this
+library's (`factorisations`, `eigenvalues`, `decompositions`), else torch's own decomposition.
+"""
 
 from __future__ import annotations
 

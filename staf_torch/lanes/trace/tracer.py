@@ -1,4 +1,12 @@
-"""Tensor operations of one row, written down as a scalar program while they run."""
+"""Run a step once with a single row and write down what every number of it is.
+
+The step runs in torch, below autograd (`TorchDispatchMode`), on a batch of one row. Beside every storage lies
+an array of integers, the nodes of its entries; an operation on tensors becomes operations on nodes, so that
+views, broadcasting, writes in place, derivatives and `vmap` need no rules: torch has done them when an
+operation arrives here. A graph of tensor operations (`torch.fx`, what `torch.compile` starts from) would keep
+arrays of three numbers as arrays, in memory; as single numbers they are registers, equal ones are one, and
+constants fold. More than `LARGE` entries stay an array, as a text of a thousand lines takes g++ minutes.
+"""
 
 from __future__ import annotations
 

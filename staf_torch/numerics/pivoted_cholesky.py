@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from .loops import scan
+from ..lanes import scan
 
 _Elimination = tuple[Tensor, Tensor, Tensor, Tensor]
 _IN_REGISTERS = 8  # rows of a matrix that a compiled program writes out entry by entry
