@@ -48,7 +48,7 @@ TOP = re.findall(r"^(\w+):", (ROOT / "conf" / "config.yaml").read_text(encoding=
 RUNS = ("results", "sweeps", "tables")  # examples of these rooms run simulations of hundreds of steps
 COMPILE = (
     "staf_torch.deploy.c_header.time_c",
-    "staf_torch.lanes.compiled_methods.ready",
+    *(f"staf_torch.lanes.compiled_methods.{name}" for name in ("compiled", "ready")),
 )  # their examples do
 SHOWN = (
     "staf_torch.centers",

@@ -23,11 +23,13 @@ import time
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
+from types import FunctionType
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
+from .contents import is_users
 from .emit.cpp import Text
 from .trace.captured_tensors import Recipe
 from .trace.captured_tensors import tensors as tensors_of
@@ -39,7 +41,7 @@ _SCRATCH = tempfile.gettempprefix()  # of names under which a file is written at
 _DAY = 86_400.0
 _LONGEST_UNUSED = 60 * _DAY
 _temporary: dict[int, Path] = {}  # caches, by the process that made them
-_PACKAGE = Path(__file__).parent.parent
+_FOLDER = Path(__file__).parent.parent
 _DIGEST = 32
 _NUMPY = [(f"numpy.{core}.multiarray", "_reconstruct") for core in ("core", "_core")]
 _NUMPY += [(f"numpy.{core}.numeric", "_frombuffer") for core in ("core", "_core")]
@@ -127,7 +129,7 @@ def save(path: Path, trace: Trace, tensors: Sequence[Tensor]) -> None:
 def _package() -> str:
     """A digest of the source of this package."""
     digest = hashlib.sha256()
-    for path in sorted(_PACKAGE.rglob("*.py")):
+    for path in sorted(_FOLDER.rglob("*.py")):
         digest.update(path.read_bytes())
     return digest.hexdigest()
 
@@ -170,7 +172,7 @@ class _TraceReader(pickle.Unpickler):
         there: Any = sys.modules.get(module)  # nothing is imported here
         for part in name.split("."):
             there = getattr(there, part, None)
-        if module.partition(".")[0] == _PACKAGE.name and isinstance(there, type) and issubclass(there, tuple):
+        if module.partition(".")[0] == _FOLDER.name and isinstance(there, type) and issubclass(there, tuple):
             return there  # named tuples, which structures of outputs are
         raise pickle.UnpicklingError(f"{module}.{name} does not belong into a trace")
 
@@ -269,3 +271,25 @@ def _remove(folder: Path, process: int) -> None:
     """Remove a folder where its process ends; a fork of it ends by itself."""
     if os.getpid() == process:
         shutil.rmtree(folder, ignore_errors=True)
+
+
+def unpatched() -> bool:
+    """Return whether no function of a user, nor a mock, stands in a module or class of this package.
+
+    No other process sees what was put there (`kernels.GaussianKernel.core = mine`), so that nothing may be
+    read from the cache or written to it.
+    """
+    modules = [m for name, m in list(sys.modules.items()) if name.partition(".")[0] == _FOLDER.name]
+    values = [value for module in modules for value in vars(module).values()]
+    classes = [v for v in values if isinstance(v, type) and v.__module__.partition(".")[0] == _FOLDER.name]
+    values += [value for each in dict.fromkeys(classes) for value in vars(each).values()]
+    return not any(map(_foreign, values))
+
+
+def _foreign(value: Any) -> bool:
+    while isinstance(value, property | staticmethod | classmethod | functools.partial):
+        value = (
+            getattr(value, "fget", None) or getattr(value, "__func__", None) or getattr(value, "func", None)
+        )
+    users = isinstance(value, FunctionType) and is_users(value)
+    return users or type(value).__module__.partition(".")[0] == "unittest"

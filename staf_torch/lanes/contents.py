@@ -428,25 +428,3 @@ def _attribute_parts(name: str, value: Any) -> Iterable[Any]:
         FunctionType if name.startswith("__") else (FunctionType, *_SIMPLE)
     )  # not annotations and the like
     return [value] if isinstance(value, known) else []
-
-
-def unpatched() -> bool:
-    """Return whether no function of a user, nor a mock, stands in a module or class of this package.
-
-    No other process sees what was put there (`kernels.GaussianKernel.core = mine`), so that nothing may be
-    read from the cache or written to it.
-    """
-    modules = [m for name, m in list(sys.modules.items()) if name.partition(".")[0] == _PACKAGE]
-    values = [value for module in modules for value in vars(module).values()]
-    classes = [v for v in values if isinstance(v, type) and v.__module__.partition(".")[0] == _PACKAGE]
-    values += [value for each in dict.fromkeys(classes) for value in vars(each).values()]
-    return not any(map(_foreign, values))
-
-
-def _foreign(value: Any) -> bool:
-    while isinstance(value, property | staticmethod | classmethod | functools.partial):
-        value = (
-            getattr(value, "fget", None) or getattr(value, "__func__", None) or getattr(value, "func", None)
-        )
-    users = isinstance(value, FunctionType) and is_users(value)
-    return users or type(value).__module__.partition(".")[0] == "unittest"

@@ -13,7 +13,7 @@ from . import cache
 from .cache import Trace
 from .call import Compiled, Given, PlannedCall, form, ordinary
 from .compiler import machine_code
-from .contents import Contents, Derived, unpatched
+from .contents import Contents, Derived
 from .emit.c import Names, c_text
 from .emit.cpp import emit
 from .loops import scan, tracing_now
@@ -303,7 +303,7 @@ class Program(Derived):
     def _known(self, given: Given, copies: int) -> Trace:
         """What the step does with a single row, from the cache where it has been written down before."""
         shapes = None if self._described is None else Contents(given.key()).signature()
-        if self._described is None or shapes is None or not unpatched():
+        if self._described is None or shapes is None or not cache.unpatched():
             return _written(self.step, given, copies)
         step, tensors = self._described
         path = cache.place(step, shapes, copies)

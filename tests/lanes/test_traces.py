@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from variants import KERNELS
 
 from staf_torch import StaFBasis, StateFollowingCenters, chase, kernels, lanes, optim, rings, targets
-from staf_torch.lanes.contents import unpatched
+from staf_torch.lanes.cache import unpatched
 from staf_torch.lanes.program import Program, Step
 from staf_torch.lanes.shared_programs import SharedPrograms
 

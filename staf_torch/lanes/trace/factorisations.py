@@ -2,9 +2,9 @@
 
 LAPACK exchanges rows where a pivot asks for it. Rows in lanes have pivots of their own, so nothing may branch
 on one: a row is chosen by comparing and selecting, and places are compared in place of exchanged. Up to
-`LARGE` entries an elimination is written out and lives in registers; above, one pass is a loop's body, and the
-matrix moves up by a row and a column after it, so that the text knows the first pivot alone. Eliminations by
-columns: Golub and Van Loan, Matrix Computations, ch. 3 to 5.
+`LARGE` entries an elimination is written out and lives in registers; above, one pass is a loop's body, and
+the matrix moves up by a row and a column after it, so that the text knows the first pivot alone. Eliminations
+by columns: Golub and Van Loan, Matrix Computations, ch. 3 to 5.
 """
 
 from __future__ import annotations
