@@ -153,7 +153,11 @@ class CompiledMethod:
         self._served: Served | None = None
         self._read: Contents | None = None
 
-    def __call__(self, x: Tensor, *more: Tree) -> Any:
+    @overload
+    def __call__(self, x: Tensor, /) -> Tensor: ...
+    @overload
+    def __call__(self, x: Tensor, first: Tree, /, *more: Tree) -> Any: ...
+    def __call__(self, x: Tensor, /, *more: Tree) -> Any:
         """y: (..., n) -> (..., m), or trees of (B, ...)."""
         if not ordinary(flatten((x, *more))[0] if more else (x,)) or x.numel() == 0 or tracing_now():
             return self.definition(x, *more)

@@ -366,15 +366,16 @@ class _Walk(pickle.Pickler):
 
     def _code(self, value: type | FunctionType | BuiltinFunctionType) -> int:
         """Note a class or function; once where more than its address decides what it does."""
-        function = isinstance(value, FunctionType)
         users = not isinstance(value, BuiltinFunctionType) and is_users(value)
-        if not users and not (function and value.__closure__ is not None):
+        closes = isinstance(value, FunctionType) and value.__closure__ is not None
+        if isinstance(value, BuiltinFunctionType) or not (users or closes):
             self.kept.append(value)
             return len(self.kept)
         if id(value) not in self._met:
-            if function:
+            if isinstance(value, FunctionType):
                 self.functions.append(value)
-            self.kept.append(value.__code__ if function else value)  # a lambda is often made anew
+            # A lambda is often made anew, of the same code.
+            self.kept.append(value.__code__ if isinstance(value, FunctionType) else value)
             self.of_users = self.of_users or users
             self._met[id(value)] = len(self.kept)
             self._waiting.append(value)

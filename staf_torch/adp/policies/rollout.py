@@ -139,7 +139,7 @@ class RolloutPolicy(nn.Module):
         return cls(basis, system, cost, lqr, end, horizon=horizon, steps=steps, depth=depth, period=period)
 
     @compiled(_NAME, by=lambda policy: _TwoPrograms(policy))
-    def forward(self, x: Tensor) -> Tensor:
+    def forward(self, x: Tensor) -> Tensor:  # type: ignore[override]
         """u: (..., n) -> (..., m)."""
         return self.control(x)
 
