@@ -66,9 +66,9 @@ def pipe(run: Path) -> None:
     os.mkfifo(run / "metrics.json")
 
 
-def members(content: str) -> Callable[[Path], None]:
-    """A run of many members."""
-    return text("members.json", content)
+def table(content: str) -> Callable[[Path], None]:
+    """A table of rows."""
+    return text("rows.json", content)
 
 
 TABLES: dict[str, Callable[[Path], None]] = {
@@ -91,14 +91,12 @@ TABLES: dict[str, Callable[[Path], None]] = {
     "a link to a secret": link("metrics.json", "../../secret.json"),
     "a link that leads to itself": link("run.json", "run.json"),
     "a folder in place of a file": lambda run: (run / "run.json").mkdir(),
-    "members with num 1e999": members(
-        '{"version": "1", "members": [\n'
+    "rows with num 1e999": table(
+        '{"version": "1", "rows": [\n'
         '{"num": 1e999, "overrides": ["seed=1"], "status": "completed", "metrics": {}}\n]}\n'
     ),
-    "members that are cut off": members(
-        '{"version": "1", "members": [\n{"num": 0, "status": "completed"},\n'
-    ),
-    "members on one endless line": members('{"version": "1", "members": [\n' + "[" * (2**20 + 10)),
+    "rows that are cut off": table('{"version": "1", "rows": [\n{"num": 0, "status": "completed"},\n'),
+    "rows on one endless line": table('{"version": "1", "rows": [\n' + "[" * (2**20 + 10)),
     "escapes for the terminal": spoiled(
         reason=ESCAPE, version=ESCAPE, task=ESCAPE, overrides=[f"seed={ESCAPE}"]
     ),

@@ -25,7 +25,7 @@ from ..sweeps.hydra_compat import (
 )
 from ..sweeps.job import Refused, execute
 from ..sweeps.resume import command_line
-from ..sweeps.signals import name_and_code, stopped_by_signals, what_ended
+from ..sweeps.workers import name_and_code, stopped_by_signals, what_ended
 from . import doctor, reference, schema
 
 _WRITERS = {"schema": schema.main, "docs": reference.main}

@@ -13,7 +13,7 @@ import importlib.metadata
 import json
 import os
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -280,10 +280,12 @@ def damage(directory: Path, recorded: Mapping[str, Any], *, thorough: bool) -> s
     return None
 
 
-def checksums(directory: Path, but: frozenset[str]) -> dict[str, list[Any]]:
+def checksums(
+    directory: Path, but: frozenset[str] = frozenset(), patterns: Sequence[str] = ("**/*",)
+) -> dict[str, list[Any]]:
     """Return size and SHA-256 of every result file in and under a run directory, by their names there."""
     found: dict[str, list[Any]] = {}
-    for path in sorted(directory.rglob("*")):
+    for path in sorted(path for pattern in patterns for path in directory.glob(pattern)):
         name = path.relative_to(directory).as_posix()
         if path.is_symlink() or not path.is_file() or path.name in but or path.suffix == ".log":
             continue

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-RUN, METRICS, HISTORY, MEMBERS = "run.json", "metrics.json", "history.npz", "members.json"
+RUN, METRICS, HISTORY, ROWS = "run.json", "metrics.json", "history.npz", "rows.json"
 SWEEP, PAGE, TABLE = "sweep.json", "report.html", "table"
 FIGURES, HYDRA = "figures", ".hydra"
 COMPLETED, FAILED, RUNNING, UNFINISHED = "completed", "failed", "running", "unfinished"

@@ -23,8 +23,8 @@ from .files import (
     FAILED,
     FIGURES,
     HYDRA,
-    MEMBERS,
     METRICS,
+    ROWS,
     RUN,
     RUNNING,
     SWEEP,
@@ -114,7 +114,7 @@ def _directories(start: Path, skipped: list[Skipped]) -> Iterator[Path]:
 
 
 def _is_run(directory: Path) -> bool:
-    files = (RUN, MEMBERS, METRICS, f"{HYDRA}/overrides.yaml")
+    files = (RUN, ROWS, METRICS, f"{HYDRA}/overrides.yaml")
     return any(os.path.lexists(directory / name) for name in files)
 
 
@@ -147,7 +147,7 @@ def _identity(overrides: Mapping[str, Value]) -> tuple[tuple[str, str], ...]:
 
 
 def read_run(directory: Path) -> list[RecordedRun]:
-    """Return the runs of a run directory: one, or one a member.
+    """Return the runs of a run directory: one, or one a row of a table.
 
     Raises:
         UnreadableError: if its record cannot be read.
@@ -157,14 +157,14 @@ def read_run(directory: Path) -> list[RecordedRun]:
     wrong = damaged(directory, record, thorough=False)
     if wrong is not None:
         return [dataclasses.replace(run, status=UNFINISHED, reason=wrong, metrics={})]
-    if os.path.lexists(directory / MEMBERS):
-        return _members(run, MEMBERS)
-    begun = run.status != COMPLETED and os.path.lexists(directory / partial_name(MEMBERS))
-    return [*_members(run, partial_name(MEMBERS)), run] if begun else [run]
+    if os.path.lexists(directory / ROWS):
+        return _rows(run, ROWS)
+    begun = run.status != COMPLETED and os.path.lexists(directory / partial_name(ROWS))
+    return [*_rows(run, partial_name(ROWS)), run] if begun else [run]
 
 
 def read_record(directory: Path) -> RecordedRun:
-    """Return the run of a run directory as its `run.json` has it, also where there are members.
+    """Return the run of a run directory as its `run.json` has it, also where there are rows of a table.
 
     Raises:
         UnreadableError: if it cannot be read.
@@ -206,16 +206,14 @@ def _status(record: Mapping[str, Any]) -> tuple[str, str | None]:
     return COMPLETED, reason
 
 
-def _members(run: RecordedRun, name: str) -> list[RecordedRun]:
-    """Return a run a member in a file of that name; its overrides come on top of the run's."""
-    shared = {key: value for key, value in run.settings.items() if not _of_axis(key)}
-    typed = {key: value for key, value in run.overrides.items() if not _of_axis(key)}
-    base = dataclasses.replace(run, settings=shared, overrides=typed, seconds=None)
-    return [_member(base, number, member) for number, member in enumerate(read_members(run.directory, name))]
+def _rows(run: RecordedRun, name: str) -> list[RecordedRun]:
+    """Return one run a row of a table of that name; its overrides come on top of the sweep's."""
+    base = dataclasses.replace(run, seconds=None)
+    return [_row(base, number, row) for number, row in enumerate(read_rows(run.directory, name))]
 
 
-def read_members(directory: Path, name: str = MEMBERS) -> Iterator[Mapping[str, Any]]:
-    """Yield the rows of `members.json`, one after the other: one line each, as the library writes them.
+def read_rows(directory: Path, name: str = ROWS) -> Iterator[Mapping[str, Any]]:
+    """Yield the rows of `rows.json`, one after the other: one line each, as the library writes them.
 
     In a file that is not complete, which has another ``name``, the last line may be cut off.
 
@@ -223,44 +221,33 @@ def read_members(directory: Path, name: str = MEMBERS) -> Iterator[Mapping[str, 
         UnreadableError: if it has another form.
     """
     lines = read_lines(directory / name)
-    if name != MEMBERS:
+    if name != ROWS:
         yield from (parse_object(line[:-2], name) for line in lines if line.endswith(b"},\n"))
         return
-    if not re.fullmatch(rb'\{"version": "[^"]*", "members": \[\n', next(lines, b"")):
-        listed = read_object(directory / MEMBERS).get("members")
-        if not isinstance(listed, list) or not all(isinstance(member, dict) for member in listed):
-            raise UnreadableError(f"{MEMBERS} has no list of members")
-        yield from listed
-        return
+    if not re.fullmatch(rb'\{"version": "[^"]*", "rows": \[\n', next(lines, b"")):
+        raise UnreadableError(f"{ROWS} does not begin as a table of rows")
     for line in lines:
         if line == b"]}\n":
             return
-        yield parse_object(line.removesuffix(b"\n").removesuffix(b","), MEMBERS)
-    raise UnreadableError(f"{MEMBERS} ends before its last row")
+        yield parse_object(line.removesuffix(b"\n").removesuffix(b","), ROWS)
+    raise UnreadableError(f"{ROWS} ends before its last row")
 
 
-def _member(run: RecordedRun, number: int, member: Mapping[str, Any]) -> RecordedRun:
-    status, reason = _status(member)
-    own = parse_overrides(_lines(member))
-    metrics, lost = _metrics(member.get("metrics")) if status == COMPLETED else ({}, {})
-    stated = _settings(member)
-    place = member.get("num")
+def _row(run: RecordedRun, number: int, row: Mapping[str, Any]) -> RecordedRun:
+    status, reason = _status(row)
+    own = parse_overrides(_lines(row))
+    metrics, lost = _metrics(row.get("metrics")) if status == COMPLETED else ({}, {})
+    place = row.get("num")
     return dataclasses.replace(
         run,
         overrides={**run.overrides, **own},
-        settings={key: value for key, value in stated.items() if not _of_axis(key)}
-        or ChainMap(own, run.settings),  # type: ignore[arg-type]
+        settings=_settings(row) or ChainMap(own, run.settings),  # type: ignore[arg-type]
         metrics=metrics,
         status=status,
         reason=reason,
-        member=place if isinstance(place, int) and not isinstance(place, bool) else number,
+        row=place if isinstance(place, int) and not isinstance(place, bool) else number,
         lost=lost,
     )
-
-
-def _of_axis(key: str) -> bool:
-    """Return whether a setting lists the members themselves."""
-    return key == "members" or key.startswith("members.")
 
 
 def _measured(
@@ -268,9 +255,9 @@ def _measured(
 ) -> tuple[dict[str, float | None], dict[str, str], str | None]:
     """`_metrics` of a run, and why they cannot be read or believed."""
     files = found if isinstance(found := record.get("files"), dict) else {}
-    numbers = {name: about for name, about in files.items() if name in (METRICS, MEMBERS)}
+    numbers = {name: about for name, about in files.items() if name in (METRICS, ROWS)}
     wrong = damage(directory, numbers, thorough=True)
-    if wrong is not None:
+    if wrong is not None or ROWS in files:
         return {}, {}, wrong
     try:
         return *_metrics(read_object(directory / METRICS)), None

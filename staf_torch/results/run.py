@@ -15,7 +15,7 @@ from .files import Value
 from .metric_info import HEADLINES, OWN, MetricInfo
 from .untrusted import visible
 
-ABOUT = ("task", "status", "reason", "seconds", "version", "build", "directory", "member")
+ABOUT = ("task", "status", "reason", "seconds", "version", "build", "directory", "row")
 """What can be a column of a table beside settings and metrics."""
 _SHOWN = 1  # headlines in the short form of a run
 _NAMED = 3  # values of a setting that a remark names
@@ -23,7 +23,7 @@ _NAMED = 3  # values of a setting that a remark names
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class RecordedRun:
-    """A run, or a member of a run of many: what it was, how it ended, what it measured.
+    """A run, or a row of a sweep's table: what it was, how it ended, what it measured.
 
     Example:
         >>> done = sweep("centers.radius=0.1,0.2", "duration=0.1", "settle_time=0", "figures=false")
@@ -39,7 +39,7 @@ class RecordedRun:
     metrics: Mapping[str, float | None]  # None: nothing to report, or not finite
     status: str
     reason: str | None = None  # why there is no result, or something else that a reader should know
-    member: int | None = None  # its number among the members of a run of many
+    row: int | None = None  # its number in the table of a sweep
     version: str | None = None  # of the staf_torch that wrote it
     task: str | None = None
     seconds: float | None = None
@@ -148,7 +148,7 @@ class Collection:
         found: dict[str, None] = {}
         for run in self.rows:
             base = layers(run.settings)[-1]
-            if id(base) in seen or not base:  # members share theirs
+            if id(base) in seen or not base:  # rows of a table share theirs
                 continue
             seen.add(id(base))
             other = first.setdefault(tuple(identity(run.setting(key)) for key in words), run)
@@ -159,7 +159,7 @@ class Collection:
 
     @functools.cached_property
     def _settings(self) -> list[Mapping[str, Value]]:
-        """The settings of all runs, those that members share once."""
+        """The settings of all runs, those that rows of a table share once."""
         return list({id(part): part for run in self.rows for part in layers(run.settings)}.values())
 
 
@@ -186,7 +186,7 @@ def _explained(key: str, overridden: Collection_[str]) -> bool:
 
 
 def layers(settings: Mapping[str, Value]) -> Sequence[Mapping[str, Value]]:
-    """Return the settings of a member apart from those of its run, which all members share."""
+    """Return the settings of a row apart from those of its sweep, which all rows share."""
     return settings.maps if isinstance(settings, ChainMap) else [settings]
 
 

@@ -14,8 +14,9 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from .._version import __version__
+from ..numerics import COMMAND_LINE, fail
 from .build import build, checksums, damaged, differences, imported, record_checksum
-from .files import COMPLETED, METRICS, flatten, plain, write_text
+from .files import COMPLETED, METRICS, ROWS, flatten, plain, write_text
 from .files import RUN as RUN
 from .files import SWEEP as SWEEP
 from .metric_info import MetricInfo
@@ -51,6 +52,12 @@ class RunRecord:
             "build": build(settings, compiler),
         }
 
+        self._files = ("**/*",)
+
+    def covers(self, *patterns: str) -> None:
+        """Keep the checksums of files of these patterns alone, where others of the directory may change."""
+        self._files = patterns
+
     @property
     def made_by(self) -> str:
         """Hash of settings, overrides, source, modules, torch and compiler."""
@@ -73,7 +80,7 @@ class RunRecord:
             made_by = self._about["build"]
             further = imported(made_by["modules"])  # as the run has ended: it imported them on its way
             record["build"] = {**made_by, "imported": further} if further else made_by
-            record["files"] = checksums(directory, frozenset({RUN}))
+            record["files"] = checksums(directory, frozenset({RUN}), self._files)
         record["checksum"] = record_checksum(record)
         write_text(directory / RUN, json.dumps(record, indent=1, allow_nan=False) + "\n")
 
@@ -106,7 +113,7 @@ class RunRecord:
             return None
         if not anyway:
             self._compare(directory, record)
-        return read(directory / METRICS)
+        return {} if (directory / ROWS).exists() else read(directory / METRICS)
 
     def _compare(self, directory: Path, record: Mapping[str, Any]) -> None:
         told = self._differences(record)
@@ -118,15 +125,15 @@ class RunRecord:
             )
 
     def refuse_rows(self, directory: Path) -> NoReturn:
-        """Refuse to go on with rows of members that something else made.
+        """Refuse to go on with rows of a table that something else made.
 
         Raises:
             ValueError: with what differs.
         """
         told = self._differences(read(directory / RUN) or {}) or "its overrides were others"
         raise ValueError(
-            f"{directory} has rows of members that were not made as they would be now: {told}. One table of "
-            "both would mix them: run the job in another directory, or begin it anew by "
+            f"{directory} has rows that were not made as they would be now: {told}. One table of "
+            "both would mix them: run the sweep in another directory, or begin it anew by "
             "`sweep.resume_anyway=true`."
         )
 
@@ -172,6 +179,18 @@ def resumed(cfg: DictConfig) -> bool:
 def resumed_anyway(cfg: DictConfig) -> bool:
     """Return whether runs count that were made by other settings or another source than those of today."""
     return OmegaConf.select(cfg, f"{SETTINGS}.resume_anyway") is True
+
+
+def in_table(cfg: DictConfig) -> bool:
+    """Return whether the jobs of a sweep with these settings leave rows of one table.
+
+    Raises:
+        ValueError: if `sweep.records` is neither `directories` nor `table`.
+    """
+    chosen = OmegaConf.select(cfg, f"{SETTINGS}.records", default="directories")
+    if chosen not in ("directories", "table"):
+        raise fail(COMMAND_LINE, f"{SETTINGS}.records", "must be one of 'directories', 'table'", chosen)
+    return bool(chosen == "table")
 
 
 def begin_sweep(directory: Path, overrides: Sequence[str], hydra: Sequence[str]) -> None:

@@ -1,17 +1,17 @@
-"""Resolved settings as plain Python objects, for jobs of many members: OmegaConf's take milliseconds each."""
+"""Resolved settings as plain Python objects, for jobs by the thousand: OmegaConf's take milliseconds each."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, overload
 
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 
 class PlainSettings(dict[str, Any]):
     """Settings by name, nested, that are read as a `DictConfig` is: ``cfg.kernel``, ``cfg.get("dt")``.
 
-    Members share what is equal in their settings, so that nobody may change them.
+    Jobs share what is equal in their settings, so that nobody may change them.
     """
 
     def __getattr__(self, name: str) -> Any:
@@ -25,27 +25,30 @@ class PlainSettings(dict[str, Any]):
         """Return a tree of dictionaries as settings."""
         return cls({str(k): cls.of(v) if isinstance(v, dict) else v for k, v in tree.items()})
 
+    def hydras(self) -> DictConfig:
+        """Return the same settings as OmegaConf has them."""
+        found: DictConfig = OmegaConf.create(_dictionaries(self))
+        OmegaConf.set_struct(found, True)
+        return found
+
+
+def _dictionaries(value: Any) -> Any:
+    return {key: _dictionaries(each) for key, each in value.items()} if isinstance(value, dict) else value
+
 
 class ManySettings(Sequence[DictConfig]):
-    """The settings of many members: plain where that is possible, and Hydra's own when they are asked for.
+    """The settings of many jobs: plain where that is possible, and OmegaConf's where one asks for them.
 
     Args:
-        plain: of every member, None where only Hydra can make them.
-        flat: the same by dotted keys, as a run records them.
-        make: makes Hydra's own for a member, by its number.
+        settings: of every job.
     """
 
-    def __init__(
-        self,
-        plain: Sequence[PlainSettings | None],
-        flat: Sequence[Mapping[str, Any]],
-        make: Callable[[int], DictConfig],
-    ) -> None:
-        self._plain, self.flat, self._make = plain, flat, make
+    def __init__(self, settings: Sequence[DictConfig | PlainSettings]) -> None:
+        self._settings = list(settings)
         self._made: dict[int, DictConfig] = {}
 
     def __len__(self) -> int:
-        return len(self._plain)
+        return len(self._settings)
 
     @overload
     def __getitem__(self, index: int) -> DictConfig: ...
@@ -57,18 +60,18 @@ class ManySettings(Sequence[DictConfig]):
         if isinstance(index, slice):
             return self.of(range(*index.indices(len(self))))
         index = range(len(self))[index]
-        if index not in self._made:
-            self._made[index] = self._make(index)
-        return self._made[index]
+        found = self._settings[index]
+        if isinstance(found, PlainSettings):
+            found = self._made[index] = self._made.get(index) or found.hydras()
+        return found
 
     def of(self, indices: Sequence[int]) -> ManySettings:
-        """Return those of some members."""
-        plain, flat = [self._plain[i] for i in indices], [self.flat[i] for i in indices]
-        return ManySettings(plain, flat, lambda i: self._make(indices[i]))
+        """Return those of some jobs."""
+        return ManySettings([self._settings[i] for i in indices])
 
-    def read(self) -> list[DictConfig | PlainSettings]:
-        """Return the settings of every member, plain where that is possible."""
-        return [self[i] if plain is None else plain for i, plain in enumerate(self._plain)]
+    def read(self) -> Sequence[DictConfig | PlainSettings]:
+        """Return the settings of every job, plain where that is possible."""
+        return self._settings
 
 
 def to_read(cfgs: Sequence[DictConfig]) -> Sequence[DictConfig | PlainSettings]:

@@ -15,16 +15,15 @@ from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from ..experiments.registry import BatchedExperiment, Experiment, Metrics, Solution, experiment
-from ..results import run_record as records
 from ..results.progress import SHOWN, Progress
 from ..settings.plain import to_read
 from .workers import LostError
 
 _log = logging.getLogger(__name__)
 _KEPT_BYTES = 2**28
-"""What the members of a chunk may keep until they are written."""
+"""What the jobs of a chunk may keep until they are written."""
 _CHUNK = 128
-"""Members of a chunk where nobody says otherwise: what is done is written that much later."""
+"""Jobs of a chunk where nobody says otherwise: what is done is written that much later."""
 _UNREADABLE = (ValueError, TypeError, KeyError, AttributeError, OmegaConfBaseException)
 """What broken settings raise while they are grouped. The job itself says later what is wrong with it."""
 USER_ERRORS = (ValueError, HydraException, OmegaConfBaseException, OSError, LostError)
@@ -80,7 +79,7 @@ class Batch(NamedTuple):
 
     settings: Sequence[DictConfig]
     directories: list[str]  # of the runs
-    whole: Sequence[Experiment | None] = ()  # runs a job of many members in a worker; None for other jobs
+    measured: bool = False  # whether metrics are all that is wanted of those that a batch solves
 
 
 class Done(NamedTuple):
@@ -90,25 +89,17 @@ class Done(NamedTuple):
     seconds: float
 
 
-def flat_or_none(cfg: DictConfig) -> Flat | None:
-    """Return the settings of a job by dotted keys; None where they are broken, which the job says itself."""
-    try:
-        return records.flat(cfg)
-    except _UNREADABLE:
-        return None
-
-
-def groups(settings: Sequence[Flat | None]) -> list[list[int]]:
+def groups(settings: Sequence[Flat]) -> list[list[int]]:
     """Return the indices of the jobs that may share one tensor batch, in order of appearance."""
     found, _ = _grouped(settings)
     return found
 
 
-def batches(settings: Sequence[Flat | None], *, least: int = 1, most: int | None = None) -> list[list[int]]:
+def batches(settings: Sequence[Flat], *, least: int = 1, most: int | None = None) -> list[list[int]]:
     """Return the indices of every tensor batch, in order; what a batch keeps fits into memory together.
 
     Args:
-        settings: of all jobs, as `flat_or_none` has them, each of which is asked for once.
+        settings: of all jobs.
         least: so many batches at least, where that can be, to keep that many workers busy.
         most: jobs of a batch at most; None for as many as memory allows, 128 at most.
     """
@@ -121,12 +112,12 @@ def batches(settings: Sequence[Flat | None], *, least: int = 1, most: int | None
     return sorted(found)
 
 
-def _grouped(settings: Sequence[Flat | None]) -> tuple[list[list[int]], list[int]]:
+def _grouped(settings: Sequence[Flat]) -> tuple[list[list[int]], list[int]]:
     """The groups, and how many bytes each job keeps until it is written."""
     found: dict[str, list[int]] = {}
     sizes = []
-    for index in range(len(settings)):
-        key, size = _group_and_size(settings[index], index)
+    for index, one in enumerate(settings):
+        key, size = _group_and_size(one, index)
         found.setdefault(key, []).append(index)
         sizes.append(size)
     return list(found.values()), sizes
@@ -151,9 +142,8 @@ def solve(cfgs: Sequence[DictConfig], progress: Progress) -> list[Outcome]:
     Where the batch as a whole raises, its members are tried one by one, so that only the culprit fails.
     """
     try:
-        read = to_read(cfgs)
-        study = experiment(read[0].task)
-        if not isinstance(study, BatchedExperiment) or any(cfg.get("members") is not None for cfg in read):
+        study = experiment(to_read(cfgs)[0].task)
+        if not isinstance(study, BatchedExperiment):
             return [DEFERRED for _ in cfgs]
         solutions = study.solve(cfgs, progress)
         return [Failed(each) if isinstance(each, Exception) else Computed(each) for each in solutions]
@@ -183,15 +173,12 @@ def completion(cfg: DictConfig, outcome: Outcome) -> Experiment:
             return outcome.replay
 
 
-def _group_and_size(settings: Flat | None, index: int) -> tuple[str, int]:
+def _group_and_size(settings: Flat, index: int) -> tuple[str, int]:
     """A text that is equal for the members of a group, and the bytes that the solution keeps."""
     key, size = json.dumps(index), 0
-    if settings is None:
-        return key, size
     try:
         study = experiment(settings["task"])
-        # A job of many members makes batches of its own.
-        if isinstance(study, BatchedExperiment) and settings.get("members") is None:
+        if isinstance(study, BatchedExperiment):
             static = [[name, study.shared(name, value)] for name, value in settings.items()]
             key = json.dumps([study.shape(settings), *static])
             size = study.size(settings)

@@ -19,18 +19,19 @@ from omegaconf import DictConfig, OmegaConf
 
 from ..numerics import COMMAND_LINE, fail
 from ..results import run_record as records
-from ..results.files import COMPLETED, PAGE
+from ..results.files import COMPLETED, PAGE, ROWS
 from ..results.reader import RecordedRun, collect
 from ..results.untrusted import links_in, visible
 from . import lock
 from .batching import sentence
-from .hydra_compat import BrokenSweep, as_typed, breaking_off
+from .hydra_compat import BrokenSweep, as_typed, breaking_off, parse_override, sweep_size
 from .job import PRINTS
 from .report import write_report
 
 _log = logging.getLogger(__name__)
 
 _FOLDER = "tensorboard"
+MOST_JOBS = 10**6  # of a sweep: their lists are memory
 
 
 class Tracker(ABC):
@@ -50,7 +51,7 @@ class Tracker(ABC):
 
     @abstractmethod
     def record(self, run: RecordedRun) -> None:
-        """Take in a completed run, once: with many members, each of them."""
+        """Take in a completed run, once: of a table each row, when all are there."""
 
 
 class TensorBoardTracker(Tracker):
@@ -79,7 +80,7 @@ class TensorBoardTracker(Tracker):
             for key, value in (run.settings or run.overrides).items()
             if value is not None
         }
-        with SummaryWriter(str(folder if run.member is None else folder / str(run.member))) as writer:
+        with SummaryWriter(str(folder if run.row is None else folder / str(run.row))) as writer:
             for summary in hparams(known, numbers):
                 writer._get_file_writer().add_summary(summary)
             for name, number in numbers.items():
@@ -169,15 +170,24 @@ class TrackRuns(Callback):
 
     def on_job_end(self, config: DictConfig, job_return: Any, **_: Any) -> None:
         """Hand over a run, or a job of a sweep, that has ended."""
-        try:
-            found = tracker(config)
-            if found is None:
-                return
-            for run in collect(config.hydra.runtime.output_dir).rows:
+        _track(config, "hydra.runtime.output_dir")
+
+    def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
+        """Hand over the rows of a sweep that has a table of them."""
+        if (_directory(config) / ROWS).exists():
+            _track(config, "hydra.sweep.dir")
+
+
+def _track(config: DictConfig, directory: str) -> None:
+    """Hand the completed runs of the directory with that key to the tracker of the settings."""
+    try:
+        found = tracker(config)
+        if found is not None:
+            for run in collect(str(OmegaConf.select(config, directory))).rows:
                 if run.status == COMPLETED:
                     found.record(run)
-        except Exception as error:  # the results are on the disk
-            _log.warning("not tracked: %s: %s", type(error).__name__, error)
+    except Exception as error:  # the results are on the disk
+        _log.warning("not tracked: %s: %s", type(error).__name__, error)
 
 
 def tracker(config: DictConfig) -> Tracker | None:
@@ -206,11 +216,14 @@ def claim(config: DictConfig) -> None:
     A directory that was asked for on the command line is taken, or refused.
 
     Raises:
-        ValueError: if a directory that was asked for holds a sweep, belongs to one that goes on, or leads
-            elsewhere.
+        ValueError: if there are more than a million jobs, or a directory that was asked for holds a sweep,
+            belongs to one that goes on, or leads elsewhere.
         OSError: if it cannot be made.
     """
     wanted = str(config.hydra.sweep.dir)
+    size = sweep_size([parse_override(line) for line in as_typed(config.hydra.overrides.task)])
+    if size > MOST_JOBS:
+        raise ValueError(f"The sweep has {size:g} jobs, and {MOST_JOBS} are the most: make several of it.")
     if any(line.startswith("hydra.sweep.dir=") for line in as_typed(config.hydra.overrides.hydra)):
         place = Path(wanted)
         place.mkdir(parents=True, exist_ok=True)
@@ -296,8 +309,9 @@ def farewell(sweep: BrokenSweep | None, error: KeyboardInterrupt, said: str) -> 
         error: that broke it, with what a run has noted there.
         said: which signal it was.
     """
-    if sweep is None:
-        return "; ".join([f"staf: {said}", *getattr(error, "__notes__", ())])
+    notes = getattr(error, "__notes__", ())
+    if sweep is None or notes:
+        return "; ".join([f"staf: {said}", *notes])
     runs = list(_directory(sweep.config).glob(f"*/{records.RUN}"))
     if not runs:
         return f"staf: {said}"

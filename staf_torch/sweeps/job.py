@@ -21,12 +21,12 @@ from ..experiments.registry import Metrics, check_animation
 from ..lanes.compiler import compiler
 from ..numerics.checks import COMMAND_LINE, choice
 from ..results import run_record as records
-from ..results.files import MEMBERS, METRICS, partial_name
+from ..results.files import METRICS
 from ..results.progress import SHOWN, Progress
 from ..settings.chase import make_metrics
-from . import lock, members
-from .batching import DEFERRED, USER_ERRORS, Deferred, Outcome, completion, reason, sentence
-from .hydra_compat import SearchPaths, as_typed, searching
+from . import lock
+from .batching import DEFERRED, USER_ERRORS, Outcome, completion, reason, sentence
+from .hydra_compat import as_typed
 
 _log = logging.getLogger(__name__)
 
@@ -39,27 +39,12 @@ class Origin(NamedTuple):
 
     overrides: list[str]  # as typed
     choices: Mapping[str, str | None]  # the option chosen of each group of settings
-    config_name: str | None = "config"
-    search: tuple[str, ...] = ()  # overrides of Hydra's search path
 
     @classmethod
     def of(cls, node: Any) -> Origin:
         """Return where the settings of the job with that node of Hydra's come from."""
-        search = tuple(line for line in as_typed(node.overrides.hydra) if line.startswith("hydra.searchpath"))
         choices = {str(group): choice for group, choice in node.runtime.choices.items()}
-        return cls(as_typed(node.overrides.task), choices, node.job.config_name, search)
-
-
-class InWorker(NamedTuple):
-    """Runs a job of many members whole in a worker process, where no Hydra is running. It can be pickled."""
-
-    origin: Origin
-    paths: SearchPaths  # of the command, with those of `--config-dir`
-
-    def __call__(self, cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics:
-        """Run the job, from the rows on that an earlier try of it has left; see `run`."""
-        with searching(self.paths):
-            return run(cfg, directory, self.origin, DEFERRED, 0.0, progress, again=True)
+        return cls(as_typed(node.overrides.task), choices)
 
 
 class Refused(SystemExit):
@@ -82,6 +67,8 @@ def execute(
     """
     node = HydraConfig.get()
     directory = Path(node.runtime.output_dir)
+    if records.in_table(cfg):
+        raise _no_table(node.mode)
     origin = Origin.of(node)
     if records.resumed(cfg):
         record = records.RunRecord(cfg, origin.choices, origin.overrides, compiler())
@@ -103,6 +90,13 @@ def execute(
     return objective(cfg, metrics)
 
 
+def _no_table(mode: RunMode) -> BaseException:
+    error = ValueError(
+        "`sweep.records=table` needs a sweep (staf -m) whose launcher is hydra/launcher=batched."
+    )
+    return Refused(error) if mode == RunMode.RUN else error
+
+
 def run(
     cfg: DictConfig,
     directory: Path,
@@ -110,8 +104,6 @@ def run(
     outcome: Outcome = DEFERRED,
     seconds: float = 0.0,
     progress: Progress = SHOWN,
-    *,
-    again: bool = False,
 ) -> Metrics:
     """Run one job and fill its directory; `run.json` says how it ends.
 
@@ -122,28 +114,19 @@ def run(
         outcome: what was computed for the job already.
         seconds: that were spent on it.
         progress: shows how far long loops are.
-        again: whether rows of members in the directory are those of an earlier try of this very job.
 
     Raises:
         Exception: that of the experiment; the record has its reason.
     """
     record = records.RunRecord(cfg, origin.choices, origin.overrides, compiler())
-    with contextlib.ExitStack() as stack:
-        start = None
-        if cfg.get("members") is not None and isinstance(outcome, Deferred):
-            # before the record of the earlier start is overwritten
-            start = stack.enter_context(members.start_of(cfg, directory, record, again=again))
-        stack.enter_context(_recorded(record, directory, seconds))
+    with recorded(record, directory, seconds):
         check_animation(cfg)
         record.declare([metric.info for metric in make_metrics(cfg.get("metric"))])
-        if start is not None:
-            base = [*origin.search, *origin.overrides]
-            return members.run(cfg, directory, base, origin.config_name, start, progress)
         return completion(cfg, outcome)(cfg, directory, progress)
 
 
 @contextlib.contextmanager
-def _recorded(record: records.RunRecord, directory: Path, seconds: float) -> Iterator[None]:
+def recorded(record: records.RunRecord, directory: Path, seconds: float) -> Iterator[None]:
     """Write `run.json` at the beginning and at the end, and send warnings to the log in between."""
     record.add_seconds(seconds)
     try:
@@ -164,9 +147,7 @@ def _log_warning(message: Warning | str, *_: Any, **__: Any) -> None:
 
 def _take_back(directory: Path) -> None:
     """Remove what this run has written, and nothing else: the directory may be the user's own."""
-    # Results, the members so far, a directory that another process holds: those stay.
-    others = (METRICS, partial_name(MEMBERS), lock.NAME)
-    if any((directory / name).exists() for name in others):
+    if any((directory / name).exists() for name in (METRICS, lock.NAME)):  # of others: they stay
         return
     shutil.rmtree(directory / ".hydra", ignore_errors=True)
     for name in (records.RUN, "staf.log"):

@@ -1,5 +1,5 @@
 """The batched launcher at work: jobs that may share a tensor batch are solved together, then every job is
-replayed as Hydra runs one: with its directory, `.hydra/`, log, callbacks and status."""
+replayed as Hydra runs one, with directory, `.hydra/`, log, callbacks and status, or has a row in a table."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import sys
 import time
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from omegaconf import DictConfig
 from tqdm.auto import tqdm
@@ -19,21 +19,14 @@ from tqdm.auto import tqdm
 from ..lanes.compiler import compiler
 from ..numerics.checks import choice, integer
 from ..results import run_record as records
-from ..results.files import METRICS
+from ..results.files import METRICS, ROWS, RUN, partial_name
 from ..results.progress import Progress
-from . import lock, signals
-from .batching import Flat, Outcome, flat_or_none, reason
-from .executors import compute, executor
-from .hydra_compat import (
-    JobReturn,
-    JobStatus,
-    SweepJobs,
-    directory_of,
-    search_paths,
-    without_hydra_overrides,
-)
-from .job import PRINTS, InWorker, Origin, execute, objective, silence_terminal
-from .lazy import Lazy, T
+from . import lock, table, workers
+from .batching import Outcome, reason
+from .clusters import executor
+from .executors import Executor, compute
+from .hydra_compat import JobReturn, JobStatus, SweepJobs, directory_of, without_hydra_overrides
+from .job import PRINTS, execute, objective, silence_terminal
 
 _log = logging.getLogger(__name__)
 
@@ -42,8 +35,11 @@ _NOT_BATCHED = (
     "the jobs of this program cannot share tensor batches, which only the experiments of `staf` can; "
     "they run one by one. hydra/launcher=joblib runs them side by side"
 )
-_KEPT_JOBS = 128  # as many as a batch has
+_TOLD = 20  # failures that are told as they happen
 _BAR_EVERY, _LINE_EVERY = 0.2, 10.0  # s
+
+Tasks = Generator[tuple[int, Callable[[DictConfig], Any]], None, None]
+"""Number and task of one job after the other."""
 
 
 @contextlib.contextmanager
@@ -93,7 +89,8 @@ class SweepProgress:
         self._done, self._running = self._done + 1, 0.0
         if failure is not None:
             self._failed += 1
-            tqdm.write(f"{name} failed: {failure}", file=sys.stderr)
+            if self._failed <= _TOLD:
+                tqdm.write(f"{name} failed: {failure}", file=sys.stderr)
         self._show()
 
     def close(self) -> None:
@@ -128,19 +125,6 @@ class SweepProgress:
         self._bar.set_description_str(self.line)
 
 
-class Job(NamedTuple):
-    """A job that is to run."""
-
-    num: int
-    overrides: list[str]
-    settings: DictConfig  # as the task sees them, without Hydra's node
-
-    @property
-    def name(self) -> str:
-        """`job 3 (kernel=gaussian seed=1)`."""
-        return job_name(self.num, self.overrides)
-
-
 def job_name(num: int, overrides: Sequence[str]) -> str:
     """Return `job 3 (kernel=gaussian seed=1)`."""
     return f"job {num} ({' '.join(records.own(without_hydra_overrides(overrides)))})"
@@ -158,46 +142,96 @@ class Launch:
         self._jobs: SweepJobs = launcher.hydra_context.config_loader
         self._task: Callable[[DictConfig], Any] = launcher.task_function
         self._directory = Path(str(launcher.config.hydra.sweep.dir))
-        self._numbered = self._jobs.numbered
         self._directories: dict[int, Path] = {}  # of the jobs that ran
         if launcher.batch is not None:
             integer("hydra.launcher", "batch", launcher.batch, least=1)
         choice("hydra.launcher", "foreign", launcher.foreign, _FOREIGN)
-        if self._task is not execute and launcher.foreign == "refuse":
-            raise ValueError(f"`hydra.launcher.foreign=refuse`: {_NOT_BATCHED}")
+        self._in_table = records.in_table(self._jobs.master)
+        if self._task is not execute and (launcher.foreign == "refuse" or self._in_table):
+            why = "sweep.records=table" if self._in_table else "hydra.launcher.foreign=refuse"
+            raise ValueError(f"`{why}`: {_NOT_BATCHED}")
+        if self._in_table and not self._jobs.at_once:
+            raise ValueError(
+                "`sweep.records=table` needs all jobs at once: hydra/sweeper=basic without max_batch_size."
+            )
 
     @_collecting_seldom()
     def run(self, job_overrides: Sequence[Sequence[str]], first: int) -> list[JobReturn]:
-        """Run the jobs, numbered from ``first``, and return Hydra's records of them, in order."""
+        """Run the jobs, numbered from ``first``, and return Hydra's records of them, in order.
+
+        Where they leave rows of a table there are none of those records.
+
+        Raises:
+            ValueError: if a row failed, when all have ended.
+        """
         self._jobs.start()
         if not PRINTS.get():
             silence_terminal()
+        self._refuse_the_other_kind()
+        if self._in_table:
+            self._fill_table(job_overrides)
+            return []
+        return self._fill_directories({first + i: list(one) for i, one in enumerate(job_overrides)})
+
+    def _refuse_the_other_kind(self) -> None:
+        """Raise ValueError if a sweep of directories is resumed as a table, or the other way round."""
+        names = (ROWS, partial_name(ROWS))
+        rows = any((self._directory / name).exists() for name in names)
+        runs = next(self._directory.glob(f"*/{RUN}"), None) is not None
+        if (runs and self._in_table) or (rows and not self._in_table):
+            raise ValueError(f"{self._directory} was begun with the other `sweep.records`, which stays.")
+
+    def _executor(self) -> Executor:
+        about = self._launcher
+        return executor(about.executor, about.workers, about.arguments, self._directory)
+
+    def _fill_table(self, jobs: Sequence[Sequence[str]]) -> None:
+        progress = SweepProgress(len(jobs))
+        done, failed = 0, []
+
+        def ended(num: int, failure: str | None) -> None:
+            nonlocal done
+            done += 1
+            self._still_there(done, len(jobs))
+            name = "" if failure is None else job_name(num, jobs[num])
+            progress.ended(name, failure)
+            if failure is not None:
+                failed.append((num, failure))
+
+        with contextlib.closing(progress), self._executor() as executor:
+            most = self._launcher.batch
+            table.fill(
+                self._jobs, jobs, self._directory, executor, most=most, ended=ended, tell=progress.computed
+            )
+        _log.info("%d of %d jobs completed, %d failed", done - len(failed), len(jobs), len(failed))
+        if failed:
+            num, why = failed[0]
+            raise ValueError(f"{len(failed)} of {len(jobs)} jobs failed; {job_name(num, jobs[num])}: {why}")
+
+    def _fill_directories(self, numbered: Mapping[int, list[str]]) -> list[JobReturn]:
+        tasks = self._computed(numbered)
         self._directory.mkdir(parents=True, exist_ok=True)
-        numbered = {first + i: list(overrides) for i, overrides in enumerate(job_overrides)}
         records.list_jobs(self._directory, numbered)
         returns = self._finished(numbered)
         progress = SweepProgress(len(numbered), len(returns))
-        try:
-            with contextlib.closing(self._computed(numbered, set(returns), progress)) as computed:
-                for job, task in computed:
-                    signals.check()
-                    self._still_there(len(returns), len(numbered))
-                    ended = self._replay(job, task)
-                    failure = ended._return_value if ended.status == JobStatus.FAILED else None
-                    progress.ended(job.name, None if failure is None else reason(failure))
-                    returns[job.num] = ended
-        finally:
-            progress.close()
+        with contextlib.closing(progress), contextlib.closing(tasks(returns, progress)) as ending:
+            for num, task in ending:
+                workers.check()
+                self._still_there(len(returns), len(numbered))
+                returns[num] = self._replay(num, numbered[num], task)
+                failed = returns[num].status == JobStatus.FAILED
+                why = reason(returns[num]._return_value) if failed else None
+                progress.ended(job_name(num, numbered[num]), why)
         self._refuse_lost(numbered, returns)
         failed = sum(ended.status == JobStatus.FAILED for ended in returns.values())
         _log.info("%d of %d jobs completed, %d failed", len(numbered) - failed, len(numbered), failed)
         return [returns[num] for num in numbered]
 
-    def _replay(self, job: Job, task: Callable[[DictConfig], Any]) -> JobReturn:
+    def _replay(self, num: int, overrides: list[str], task: Callable[[DictConfig], Any]) -> JobReturn:
         """Run a job whose outcome is known as Hydra runs one, and keep no settings of it."""
-        config = self._jobs.whole(job.num, job.overrides)
-        self._directories[job.num] = self._place_of(job)
-        ended = self._jobs.run(task, config, job.settings)
+        config = self._jobs.whole(num, overrides)
+        self._directories[num] = directory_of(config)
+        ended = self._jobs.run(task, config, self._jobs.settings(overrides))
         ended.cfg = ended.hydra_cfg = None
         return ended
 
@@ -222,23 +256,6 @@ class Launch:
                 sys.stderr.write(f"{name} failed: {error}\n")
                 ended.status, ended.return_value = JobStatus.FAILED, error
 
-    def _whole(self, job: Job) -> InWorker | None:
-        """Return what runs a job of many members in a worker, None for other jobs."""
-        if job.settings.get("members") is None:
-            return None
-        config = self._jobs.whole(job.num, job.overrides)
-        return InWorker(Origin.of(config.hydra), search_paths())
-
-    def _flat(self, overrides: Sequence[str]) -> Flat | None:
-        """Return the settings of a job by dotted keys."""
-        return flat_or_none(self._jobs.settings(overrides))
-
-    def _place_of(self, job: Job) -> Path:
-        """Return the run directory of a job."""
-        if self._numbered and not any(line.lstrip("+~").startswith("hydra") for line in job.overrides):
-            return self._directory / str(job.num)
-        return directory_of(self._jobs.whole(job.num, job.overrides))
-
     def _finished(self, numbered: Mapping[int, list[str]]) -> dict[int, JobReturn]:
         """Return the jobs that an earlier start of this sweep completed."""
         found: dict[int, JobReturn] = {}
@@ -257,40 +274,37 @@ class Launch:
         return found
 
     def _computed(
-        self, numbered: Mapping[int, list[str]], finished: set[int], progress: SweepProgress
-    ) -> Generator[tuple[Job, Callable[[DictConfig], Any]], None, None]:
-        """Yield every job that is not finished with the task that ends it, as the tensor batches end."""
-        order, about = list(numbered), self._launcher
+        self, numbered: Mapping[int, list[str]]
+    ) -> Callable[[Mapping[int, JobReturn], SweepProgress], Tasks]:
+        """Return what yields the number and the task of every job that is not finished, as batches end.
 
-        @functools.lru_cache(_KEPT_JOBS)
-        def job(index: int) -> Job:
-            num = order[index]
-            return Job(num, numbered[num], self._jobs.settings(numbered[num]))
+        Raises:
+            hydra.errors.HydraException: if a job has settings that there are not.
+        """
+        order = list(numbered)
+        settings, flat = self._jobs.many([numbered[num] for num in order])
 
-        if self._task is not execute:
-            if about.foreign == "warn":
+        def place(index: int) -> Path:
+            return self._jobs.directory(order[index], numbered[order[index]])
+
+        def foreign(finished: Mapping[int, JobReturn], progress: SweepProgress) -> Tasks:
+            if self._launcher.foreign == "warn":
                 _log.warning("%s (hydra.launcher.foreign=run says nothing)", _NOT_BATCHED)
-            yield from ((job(index), self._task) for index in range(len(order)))
-            return
-        if len(finished) == len(order):
-            return
+            yield from ((num, self._task) for num in order)
 
-        def each(make: Callable[[int], T]) -> Lazy[T]:
-            return Lazy(len(order), make)
+        def batched(finished: Mapping[int, JobReturn], progress: SweepProgress) -> Tasks:
+            if len(finished) == len(order):
+                return
+            with self._executor() as executor:
+                for index, outcome, seconds in compute(
+                    *(settings, flat, place, executor),
+                    finished={i for i, num in enumerate(order) if num in finished},
+                    most=self._launcher.batch,
+                    tell=progress.computed,
+                ):
+                    yield order[index], _off_the_terminal(outcome, seconds, Progress(progress.running))
 
-        with executor(about.executor, about.workers, about.arguments, self._directory) as workers:
-            outcomes = compute(
-                each(lambda index: job(index).settings),
-                each(lambda index: self._place_of(job(index))),
-                workers,
-                flat=each(lambda index: self._flat(numbered[order[index]])),
-                finished={i for i, num in enumerate(order) if num in finished},
-                whole=() if about.executor == "inline" else each(lambda index: self._whole(job(index))),
-                most=about.batch,
-                tell=progress.computed,
-            )
-            for index, outcome, seconds in outcomes:
-                yield job(index), _off_the_terminal(outcome, seconds, Progress(progress.running))
+        return batched if self._task is execute else foreign
 
 
 def _off_the_terminal(outcome: Outcome, seconds: float, progress: Progress) -> Callable[[DictConfig], Any]:

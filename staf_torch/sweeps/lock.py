@@ -19,7 +19,7 @@ _BEAT, _STALE = 30.0, 300.0  # s: how often the owner touches the file, and when
 
 
 class TakenError(ValueError):
-    """Another sweep or run has the directory; the message says whose it is."""
+    """Another sweep has the directory; the message says whose it is."""
 
 
 class DirectoryLock:
@@ -29,16 +29,15 @@ class DirectoryLock:
     sharing locks, the owner touches the file every half a minute.
 
     Args:
-        directory: of the sweep, or of a run of many members; it exists.
-        what: has the directory: "sweep" or "run".
+        directory: of the sweep; it exists.
 
     Raises:
         TakenError: if another one has it.
         OSError: if the directory cannot be written.
     """
 
-    def __init__(self, directory: Path, what: str = "sweep") -> None:
-        self._path, self._what = directory / NAME, what
+    def __init__(self, directory: Path) -> None:
+        self._path = directory / NAME
         self._directory = directory.absolute()
         self._file = self._taken()
         self._inode = os.stat(self._directory)
@@ -109,9 +108,9 @@ class DirectoryLock:
     def _refused(self) -> TakenError:
         owner = self._owner()
         return TakenError(
-            f"{self._path.parent} belongs to a {self._what} that goes on: process {owner.get('pid', '?')} on "
+            f"{self._path.parent} belongs to a sweep that goes on: process {owner.get('pid', '?')} on "
             f"{owner.get('host', '?')}, since {owner.get('since', '?')}. Wait for its end, or choose another "
-            f"`hydra.{self._what}.dir`."
+            "`hydra.sweep.dir`."
         )
 
     def _beat(self) -> None:
@@ -124,12 +123,12 @@ _held: dict[str, DirectoryLock] = {}
 """The locks of this process, by the absolute paths of the directories."""
 
 
-def hold(directory: Path, what: str = "sweep") -> DirectoryLock:
-    """Take the lock of a directory for this process; arguments and errors as of `DirectoryLock`."""
+def hold(directory: Path) -> DirectoryLock:
+    """Take the lock of a directory for this process; errors as of `DirectoryLock`."""
     key = os.path.abspath(directory)
     if key in _held:
-        raise TakenError(f"{directory} belongs to a {what} that goes on in this process.")
-    _held[key] = DirectoryLock(directory, what)
+        raise TakenError(f"{directory} belongs to a sweep that goes on in this process.")
+    _held[key] = DirectoryLock(directory)
     return _held[key]
 
 

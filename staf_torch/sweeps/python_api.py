@@ -15,7 +15,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from ..figures.style import keep_figures
 from ..results import run_record as records
-from ..results.files import FAILED, FIGURES, MEMBERS, RUN
+from ..results.files import FAILED, FIGURES, RUN
 from ..results.reader import collect, read_record
 from . import callbacks
 from .batching import sentence
@@ -68,6 +68,8 @@ def run(*overrides: str, directory: str | Path | None = None) -> Run:
 
 def sweep(*overrides: str, directory: str | Path | None = None) -> Runs:
     """Run a sweep, as `staf -m` does with the same overrides: in tensor batches, a directory for each job.
+
+    With `"sweep.records=table"` there is one file of rows in place of directories.
 
     A job that fails has a row with its reason, and the others go on. `"sweep.resume=runs/<sweep>"` takes up a
     sweep that was interrupted.
@@ -132,8 +134,8 @@ def _kept(figures: Mapping[str, Figure], run: Run) -> Mapping[str, Figure]:
 def _draw_again(done: Run) -> Mapping[str, Figure]:
     """Compute a run once more, in a directory that is then removed, for its figures."""
     record = records.read(done.directory / RUN)
-    if record is None or done.member is not None or (done.directory / MEMBERS).exists():
-        raise ValueError(f"`Run.figures()` needs the {RUN} of a run without members; got {done.directory}.")
+    if record is None or done.row is not None:
+        raise ValueError(f"`Run.figures()` needs a run with its own {RUN}; got {done.directory}.")
     with tempfile.TemporaryDirectory() as folder:
         again = run(*record["overrides"], "figures=true", "history=false", "tracker=none", directory=folder)
         return again.figures()

@@ -5,20 +5,26 @@ from __future__ import annotations
 import base64
 import dataclasses
 import importlib.resources
+import itertools
 import logging
+from array import array
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 
+import numpy as np
+
 from ..figures.style import images
 from ..figures.sweep import SEED, SWEEP_FIGURES
-from ..results.files import COMPLETED, PAGE, TABLE
-from ..results.reader import Collection, Value, collect, identity
+from ..results.files import COMPLETED, PAGE, ROWS, TABLE, parse_overrides
+from ..results.reader import Collection, Value, collect, identity, read_record, read_rows
 from ..results.run_directory import RunDirectory
 from ..tables import Layout, Style, Table, latex_text, tabulate
 from ..tables.aggregate import as_text
 from ..tables.columns import PrintedColumn, show
 
 _log = logging.getLogger(__name__)
+_MOST_ROWS = 1000  # of a table that have a line of their own in the report
 _BOLD, _ON_THE_PAGE = Style(bold=True), Style(digits=4, bold=True)
 
 
@@ -29,6 +35,8 @@ def write_report(directory: Path, *, figures: bool = True) -> str:
     a run and all metrics, its directory as seen from the sweep's. A figure that cannot be drawn is a warning
     in the log.
 
+    Of a table with more than a thousand rows `table.md` and the page have the spread of each metric.
+
     Returns:
         The table in Markdown.
 
@@ -37,6 +45,8 @@ def write_report(directory: Path, *, figures: bool = True) -> str:
         OSError: if it cannot be written.
     """
     out = RunDirectory(directory)
+    if (directory / ROWS).exists() and next(itertools.islice(read_rows(directory), _MOST_ROWS, None), None):
+        return _write_spread(directory, out)
     found = collect(directory)
     inside = (dataclasses.replace(r, directory=r.directory.relative_to(directory)) for r in found.rows)
     found = dataclasses.replace(found, rows=tuple(inside))  # equal sweeps in two places have equal tables
@@ -46,6 +56,42 @@ def write_report(directory: Path, *, figures: bool = True) -> str:
     out.text(f"{TABLE}.tex", latex_text(table))
     drawn = draw_sweep(found, out) if figures else {}
     out.text(PAGE, page(found, table, drawn, f"Sweep {directory.resolve().name}"))
+    return text
+
+
+def _write_spread(directory: Path, out: RunDirectory) -> str:
+    """Write the report of a table of many rows: least, median and largest number of each metric."""
+    numbers: dict[str, array[float]] = {}
+    ended, diverged = Counter[str](), 0
+    for row in read_rows(directory):
+        metrics = row["metrics"]
+        ended[row["status"]] += 1
+        diverged += bool(metrics.get("diverged_fraction"))
+        for name, value in metrics.items():
+            if value is not None:
+                numbers.setdefault(name, array("d")).append(value)
+    names = {name: name for name in ("metric", "least", "median", "most", "rows")}
+    cells: list[dict[str, Value]] = [
+        {
+            "metric": name,
+            "least": min(found),
+            "median": float(np.median(found)),
+            "most": max(found),
+            "rows": len(found),
+        }
+        for name, found in numbers.items()
+    ]
+    table = Table.of(cells, names)
+    shown = (
+        f"{ended.total()} rows, {ended[COMPLETED]} completed, {diverged} diverged; `staf-table` shows each"
+    )
+    base = dataclasses.replace(read_record(directory), directory=Path())
+    swept = parse_overrides(next(read_rows(directory))["overrides"])
+    kept = {key: base.settings[key] for key in base.settings if not swept.keys() & {key, key.split(".")[0]}}
+    found = Collection((dataclasses.replace(base, settings=kept),), ())
+    text = f"{table.markdown()}\n{shown}\n"
+    out.text(f"{TABLE}.md", text)
+    out.text(PAGE, page(found, table, {}, f"Sweep {directory.resolve().name}", shown))
     return text
 
 
@@ -68,7 +114,9 @@ def draw_sweep(found: Collection, out: RunDirectory) -> dict[str, bytes]:
     return drawn
 
 
-def page(found: Collection, table: Table, figures: Mapping[str, bytes], title: str) -> str:
+def page(
+    found: Collection, table: Table, figures: Mapping[str, bytes], title: str, about: str | None = None
+) -> str:
     """Return `report.html`: one file without links with the table, the figures and the settings.
 
     Args:
@@ -76,6 +124,7 @@ def page(found: Collection, table: Table, figures: Mapping[str, bytes], title: s
         table: of them.
         figures: what each shows, and its PNG.
         title: heading of the page.
+        about: the line below it; None: how many runs of what there are.
     """
     import jinja2  # the callbacks of every run import this module
 
@@ -87,7 +136,7 @@ def page(found: Collection, table: Table, figures: Mapping[str, bytes], title: s
     skipped = [f"skipped {one.path}: {one.reason}" for one in found.skipped]
     return environment.from_string(source.read_text(encoding="utf-8")).render(
         title=title,
-        about=_about(found),
+        about=about or _about(found),
         notes=[*table.notes, *skipped, *found.remarks],
         headings=[_heading(column) for column in columns],
         rows=[[_cell(column, row) for column in columns] for row in range(len(table.rows))],

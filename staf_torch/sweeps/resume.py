@@ -1,4 +1,4 @@
-"""`sweep.resume=...`: the command line of a sweep, or of one run of many members, that is taken up again."""
+"""`sweep.resume=...`: the command line of a sweep that is taken up again."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from .. import __version__
 from ..results import run_record as records
 from ..results.untrusted import visible
 from ..settings.trust import may_run_code
+from .callbacks import MOST_JOBS
 from .hydra_compat import overrides_in, parse_override, sweep_size
-from .members import MOST_JOBS
 
 _RESUME = "sweep.resume="
 _ANYWAY = "sweep.resume_anyway=true"
@@ -39,10 +39,7 @@ def command_line(argv: Sequence[str]) -> list[str]:
     if not resumed or resumed[-1] == "null":
         return list(argv)
     directory = Path(resumed[-1].strip("'\""))
-    single = is_run_of_members(directory)
-    if single and {"-m", "--multirun"} & set(argv):
-        raise ValueError(f"{directory} is one run, of many members: resume it without -m.")
-    typed, hydra = (_of_run(directory), []) if single else recorded(directory, anyway=_ANYWAY in given)
+    typed, hydra = recorded(directory, anyway=_ANYWAY in given)
     if _YES not in argv:
         _check_length(directory, [line for line in (*typed, *hydra) if line not in given])
     _check_size(directory, typed)
@@ -57,11 +54,11 @@ def command_line(argv: Sequence[str]) -> list[str]:
     place = records.quoted(os.path.normpath(directory))
     flags = [word for word in argv if word not in given and word != _YES]
     return [
-        *(flags if single or {"-m", "--multirun"} & set(flags) else [*flags, "--multirun"]),
+        *(flags if {"-m", "--multirun"} & set(flags) else [*flags, "--multirun"]),
         *typed,
         *hydra,
         *filter(_ANYWAY.__eq__, given),
-        f"hydra.{'run' if single else 'sweep'}.dir={place}",
+        f"hydra.sweep.dir={place}",
         f"{_RESUME}{place}",
     ]
 
@@ -84,24 +81,6 @@ def _check_size(directory: Path, typed: Sequence[str]) -> None:
         return
     if size > MOST_JOBS:
         raise ValueError(f"{directory} has a sweep of {size:g} jobs, and {MOST_JOBS} are the most.")
-
-
-def is_run_of_members(directory: Path) -> bool:
-    """Return whether a directory is that of one run of `members=`, and not that of a sweep."""
-    settings = (records.read(directory / records.RUN) or {}).get("settings")
-    return (
-        not (directory / records.SWEEP).exists()
-        and isinstance(settings, dict)
-        and settings.get("members") is not None
-    )
-
-
-def _of_run(directory: Path) -> list[str]:
-    """Return the overrides of a run as they were typed; Hydra's own are not recorded."""
-    lines = (records.read(directory / records.RUN) or {}).get("overrides")
-    if not isinstance(lines, list) or not _texts(lines):
-        raise ValueError(f"`staf sweep.resume={directory}`: its {records.RUN} has no overrides.")
-    return lines
 
 
 def _confirm(directory: Path, foreign: Sequence[str]) -> None:

@@ -206,8 +206,8 @@ def _one_a_run(found: Collection, metrics: Sequence[str]) -> Table:
     columns = [Column(name) for name in found.swept]
     columns += [Column(name, metric=name, larger_is_better=name in larger) for name in metrics]
     columns += [*map(Column, about), Column("directory", shown=False)]
-    if any(run.member is not None for run in found.rows):
-        columns.append(Column("member"))
+    if any(run.row is not None for run in found.rows):
+        columns.append(Column("row"))
     rows = []
     for run in found.rows:
         cells = {c.name: run.metrics.get(c.name) if c.metric else run.value(c.name) for c in columns}

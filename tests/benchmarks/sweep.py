@@ -1,7 +1,7 @@
-"""A hundred jobs by `staf -m`, `staf_torch.sweep` and Hydra's basic launcher; a thousand members in one job.
+"""A hundred jobs by `staf -m`, `staf_torch.sweep` and Hydra's basic launcher; a thousand rows of a table.
 
 With nothing else running: `python tests/benchmarks/sweep.py [--json FILE] [--only batched,python]`. What
-many jobs and members cost beside their numbers (40 steps each): `--only jobs2000,members20000,members100000`.
+many jobs and rows cost beside their numbers (40 steps each): `--only jobs2000,rows20000,rows100000`.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ RADII, COUNTS = "centers.radius=0.05,0.1,0.15,0.2,0.3", "centers.count=3,6,10,15
 JOBS = ["-m", RADII, COUNTS, "seed=range(5)", "trajectories=2", *LENGTH]
 SHORT = ["trajectories=2", "duration=0.4", "settle_time=0.2", "figures=false", "history=false"]
 STAF = ["-m", "staf_torch"]
+TABLE = ["-m", "sweep.records=table", "hydra.sweep.dir=sweep"]
 PYTHON = f"import staf_torch; assert len(staf_torch.sweep(*{JOBS[1:]!r}, directory='sweep')) == 100"
 MEMORY = f"""
 import gc, pathlib, sys, staf_torch
@@ -39,9 +40,9 @@ COMMANDS = {
     "memory": ["-c", MEMORY],
     "basic": [*STAF, *JOBS, "hydra.sweep.dir=sweep", "hydra/launcher=basic"],
     "jobs2000": [*STAF, "-m", RADII, COUNTS, "seed=range(100)", *SHORT, "hydra.sweep.dir=sweep"],
-    "members20000": [*STAF, f"members=['{RADII}','{COUNTS}','seed=range(1000)']", *SHORT],
-    "members100000": [*STAF, f"members=['{RADII}','{COUNTS}','seed=range(5000)']", *SHORT],
-    "members": [*STAF, f"members=['{RADII}','{COUNTS}','seed=range(50)']", "trajectories=2", *LENGTH],
+    "rows20000": [*STAF, *TABLE, RADII, COUNTS, "seed=range(1000)", *SHORT],
+    "rows100000": [*STAF, *TABLE, RADII, COUNTS, "seed=range(5000)", *SHORT],
+    "rows": [*STAF, *TABLE, RADII, COUNTS, "seed=range(50)", "trajectories=2", *LENGTH],
 }
 
 

@@ -18,7 +18,6 @@ pytest.importorskip("ray", reason="the extra `ray` is not installed")
 
 SHORT = ["duration=0.05", "settle_time=0", "figures=false", "history=false", "trajectories=2"]
 GRID = ["kernel=gaussian,matern", "seed=0,1", *SHORT]
-MEMBERS = ["members=['kernel=gaussian,matern','seed=0,1'],['kernel=gaussian,matern','seed=2,3']", *SHORT]
 DYING = '''
 import os, signal
 from pathlib import Path
@@ -81,15 +80,15 @@ def test_a_sweep_on_two_nodes_ends_with_the_bits_of_one_that_is_not(cluster: str
     assert len(two) == 4
 
 
-def test_jobs_of_many_members_run_whole_on_a_node_with_the_same_bytes(cluster: str, place: Path) -> None:
+def test_rows_of_a_table_have_the_same_bytes_from_two_nodes(cluster: str, place: Path) -> None:
     ray = ["hydra.launcher.executor=ray", f"+hydra.launcher.ray.address='{cluster}'"]
-    for name, more in (("members_inline", []), ("members_two", ray)):
-        code, out = staf(place, *MEMBERS, *more, f"hydra.sweep.dir={name}")
+    for name, more in (("rows_inline", []), ("rows_two", ray)):
+        line = [*GRID, "sweep.records=table", "hydra.launcher.batch=2", *more]
+        code, out = staf(place, *line, f"hydra.sweep.dir={name}")
         assert code == 0, out
-    for job in "01":
-        rows = (place / "members_two" / job / "members.json").read_bytes()
-        assert rows == (place / "members_inline" / job / "members.json").read_bytes()
-        assert len(json.loads(rows)["members"]) == 4
+    rows = (place / "rows_two" / "rows.json").read_bytes()
+    assert rows == (place / "rows_inline" / "rows.json").read_bytes()
+    assert len(json.loads(rows)["rows"]) == 4
 
 
 def test_a_killed_worker_is_tried_once_more_and_fails_alone(cluster: str, place: Path) -> None:

@@ -21,8 +21,7 @@ pytest.importorskip("submitit", reason="the extra `slurm` is not installed")
 pytestmark = pytest.mark.skipif(missing() is not None, reason=missing() or "")
 
 SHORT = ["duration=0.05", "settle_time=0", "figures=false", "history=false"]
-MEMBERS = ["members=['kernel=gaussian,matern','seed=0,1'],['kernel=gaussian,matern','seed=2,3']"]
-MEMBERS += ["trajectories=2", *SHORT]
+GRID = ["kernel=gaussian,matern", "seed=0,1", "trajectories=2", *SHORT]
 SLURM = ["hydra.launcher.executor=submitit", "+hydra.launcher.submitit.cluster=slurm"]
 SLOW = '''
 import time
@@ -87,25 +86,22 @@ def running(node: SlurmNode, count: int) -> list[str]:
 
 
 def test_a_sweep_on_slurm_ends_with_the_bits_of_one_that_is_not(node: SlurmNode, place: Path) -> None:
-    grid = ["kernel=gaussian,matern", "seed=0,1", "trajectories=2", *SHORT]
     for name, more in (("inline", []), ("slurm", SLURM)):
-        out, _ = (run := staf(node, place, *grid, *more, f"hydra.sweep.dir={name}")).communicate(timeout=300)
+        out, _ = (run := staf(node, place, *GRID, *more, f"hydra.sweep.dir={name}")).communicate(timeout=300)
         assert run.returncode == 0, out
     one, two = (collect(place / name).rows for name in ("inline", "slurm"))
     assert [run.metrics for run in one] == [run.metrics for run in two]
     assert len(two) == 4
 
 
-def test_jobs_of_many_members_run_whole_on_slurm_with_the_same_bytes(node: SlurmNode, place: Path) -> None:
+def test_rows_of_a_table_have_the_same_bytes_from_slurm(node: SlurmNode, place: Path) -> None:
     for name, more in (("inline", []), ("slurm", SLURM)):
-        out, _ = (run := staf(node, place, *MEMBERS, *more, f"hydra.sweep.dir={name}")).communicate(
-            timeout=300
-        )
+        line = [*GRID, "sweep.records=table", "hydra.launcher.batch=2", *more, f"hydra.sweep.dir={name}"]
+        out, _ = (run := staf(node, place, *line)).communicate(timeout=300)
         assert run.returncode == 0, out
-    for job in "01":
-        rows = (place / "slurm" / job / "members.json").read_bytes()
-        assert rows == (place / "inline" / job / "members.json").read_bytes()
-        assert len(json.loads(rows)["members"]) == 4
+    rows = (place / "slurm" / "rows.json").read_bytes()
+    assert rows == (place / "inline" / "rows.json").read_bytes()
+    assert len(json.loads(rows)["rows"]) == 4
 
 
 def test_a_cancelled_job_fails_alone_and_is_told_in_a_line(node: SlurmNode, place: Path) -> None:

@@ -1,4 +1,4 @@
-"""Runs, members and sweeps in every state, read back: one bad run never costs the others."""
+"""Runs, tables and sweeps in every state, read back: one bad run never costs the others."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def test_a_spoiled_list_of_jobs_costs_no_row(content: str, tmp_path: Path) -> No
         ("metrics.json", "[]", "metrics.json holds no object"),
         ("run.json", '{"status": ', "run.json is not JSON"),
         ("run.json", '{"version": "9.9", "status": "superposed"}', "written by staf_torch 9.9"),
-        ("members.json", '{"members": 3}', "members.json has no list of members"),
+        ("rows.json", '{"rows": 3}', "rows.json does not begin as a table of rows"),
     ],
 )
 def test_a_damaged_run_is_named_and_spares_the_others(
@@ -160,43 +160,39 @@ def test_a_file_that_is_not_as_it_was_written_is_named(tmp_path: Path) -> None:
     assert edited(place, checksum="0").reason == "run.json is damaged: its checksum is another one"
 
 
-# Members
+# Rows of a table
 
 
-def rows_of(place: Path, *lines: str, name: str = "members.json", end: str = "]}\n") -> list[RecordedRun]:
-    (place / name).write_text(f'{{"version": "1", "members": [\n{"".join(lines)}{end}')
+def rows_of(place: Path, *lines: str, name: str = "rows.json", end: str = "]}\n") -> list[RecordedRun]:
+    (place / name).write_text(f'{{"version": "1", "rows": [\n{"".join(lines)}{end}')
     return read_run(place)
 
 
-def member(num: Any, **more: Any) -> dict[str, Any]:
+def row(num: Any, **more: Any) -> dict[str, Any]:
     return {"num": num, "overrides": [f"seed={num}"], "status": "completed", "metrics": {"ball": 1.0}} | more
 
 
-def test_members_are_rows_like_those_of_jobs(tmp_path: Path) -> None:
-    overrides = {"members": "x", "members.own": 1, "kernel": "a"}
-    place = write_run(tmp_path / "run", overrides, {"members": 2})
-    one, two = rows_of(place, json.dumps(member(5)) + ",\n", json.dumps(member(True, status="failed")) + "\n")
-    assert (one.member, two.member) == (5, 1)
+def test_rows_are_runs_like_those_of_jobs(tmp_path: Path) -> None:
+    place = write_run(tmp_path / "run", {"seed": "1,2", "kernel": "a"}, None)
+    one, two = rows_of(place, json.dumps(row(5)) + ",\n", json.dumps(row(True, status="failed")) + "\n")
+    assert (one.row, two.row) == (5, 1)
     assert dict(one.overrides) == {"kernel": "a", "seed": 5}
     assert (one.seconds, one.settings["seed"], one.settings["dt"]) == (None, 5, 0.01)
-    assert not {"members", "members.own"} & set(one.settings)
     assert (dict(one.metrics), dict(two.metrics)) == ({"ball": 1.0}, {})
     assert (two.status, two.reason) == ("failed", "no reason was left")
-    stated = member(0, settings={"dt": 3, "members": "x"})
-    assert dict(rows_of(place, json.dumps(stated) + "\n")[0].settings) == {"dt": 3}
-    with pytest.raises(UnreadableError, match=r"members.json ends before its last row"):
-        rows_of(place, json.dumps(member(5)) + ",\n", end="")
-    for odd in ('{"members": [1]}', '{"members": 1}', "[]"):
-        (place / "members.json").write_text(odd)
+    with pytest.raises(UnreadableError, match=r"rows.json ends before its last row"):
+        rows_of(place, json.dumps(row(5)) + ",\n", end="")
+    for odd in ('{"rows": [1]}', '{"rows": 1}', "[]"):
+        (place / "rows.json").write_text(odd)
         with pytest.raises(UnreadableError):
             read_run(place)
 
 
-def test_members_of_a_run_that_goes_on_come_with_it(tmp_path: Path) -> None:
-    place = write_run(tmp_path / "run", {"members": "x"}, None, status="running")
-    line = json.dumps(member(0)) + ",\n"
-    rows = rows_of(place, line, line.replace("0", "1"), line[:20], name=".members.json.partial", end="")
-    assert [(each.member, each.status) for each in rows] == [
+def test_rows_of_a_sweep_that_goes_on_come_with_it(tmp_path: Path) -> None:
+    place = write_run(tmp_path / "run", {"seed": "0,1"}, None, status="running")
+    line = json.dumps(row(0)) + ",\n"
+    rows = rows_of(place, line, line.replace("0", "1"), line[:20], name=".rows.json.partial", end="")
+    assert [(each.row, each.status) for each in rows] == [
         *((0, "completed"), (1, "completed"), (None, "running"))
     ]
 
@@ -205,10 +201,10 @@ def test_members_of_a_run_that_goes_on_come_with_it(tmp_path: Path) -> None:
 
 
 def test_a_run_is_shown_by_its_overrides_and_first_headline() -> None:
-    overrides = {"kernel": "gaussian", "figures": False, "members": None, "dt": 0.5}
+    overrides = {"kernel": "gaussian", "figures": False, "metric": None, "dt": 0.5}
     metrics = {"gradient_error": 2.0, "ball_error": 0.123456, "ball_floor_error": None, "own": 1.0}
     shown = repr(run(overrides=overrides, metrics=metrics))
-    assert shown == "<Run completed: kernel=gaussian figures=false members=null dt=0.5, ball_error=0.123>"
+    assert shown == "<Run completed: kernel=gaussian figures=false metric=null dt=0.5, ball_error=0.123>"
     assert repr(run()) == "<Run completed: no overrides>"
 
 
@@ -271,7 +267,7 @@ def test_settings_that_differ_although_nobody_swept_them_are_named(
     assert found(run("a", first, one), run("b", second, two, build="other")).unswept == (*named, "build")
 
 
-def test_members_share_the_settings_of_their_run() -> None:
+def test_rows_share_the_settings_of_their_sweep() -> None:
     shared = {"dt": 7, "seed": 0}
     one, two = (run(overrides={"seed": n}, settings=ChainMap({"seed": n}, shared)) for n in (1, 2))
     both = found(one, two)

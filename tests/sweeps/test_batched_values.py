@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import pickle
 import warnings
@@ -16,25 +17,35 @@ from omegaconf import DictConfig
 
 from staf_torch.experiments.adp import LoopSolution, Regulation
 from staf_torch.experiments.gradient_chase import ChaseSolution, GradientChase
+from staf_torch.results import run_record
 from staf_torch.results.progress import SHOWN
 from staf_torch.sweeps import batching
 from staf_torch.sweeps.batching import DEFERRED, Computed, Failed, Outcome
-from staf_torch.sweeps.hydra_compat import config_loader
-from staf_torch.sweeps.members import member_overrides
+from staf_torch.sweeps.hydra_compat import parse_override
 
 SHORT = ("dt=0.05", "duration=0.5", "settle_time=0.25", "figures=false")
 
 
 def compose(base: Sequence[str], lines: Sequence[str]) -> list[DictConfig]:
-    return [settings(*SHORT, *base, *job) for job in member_overrides(list(lines), config_loader())]
+    parsed = [parse_override(line) for line in lines]
+    swept = [
+        one.sweep_string_iterator() if one.is_sweep_override() else [one.get_value_element_as_str()]
+        for one in parsed
+    ]
+    keys = [one.get_key_element() for one in parsed]
+    jobs = (
+        [f"{key}={value}" for key, value in zip(keys, values, strict=True)]
+        for values in itertools.product(*swept)
+    )
+    return [settings(*SHORT, *base, *job) for job in jobs]
 
 
 def solve(cfgs: Sequence[DictConfig]) -> list[Outcome]:
     return batching.solve(cfgs, SHOWN)
 
 
-def flat(cfgs: Sequence[DictConfig]) -> list[batching.Flat | None]:
-    return [batching.flat_or_none(cfg) for cfg in cfgs]
+def flat(cfgs: Sequence[DictConfig]) -> list[batching.Flat]:
+    return [run_record.flat(cfg) for cfg in cfgs]
 
 
 def groups(cfgs: Sequence[DictConfig]) -> list[list[int]]:

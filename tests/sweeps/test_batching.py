@@ -24,7 +24,6 @@ from staf_torch.sweeps.batching import (
     Written,
     batches,
     completion,
-    flat_or_none,
     groups,
     reason,
     sentence,
@@ -122,19 +121,9 @@ def test_jobs_that_can_share_no_batch_stand_alone() -> None:
         {"task": ALONE, "seed": 1},
         {"task": "nowhere.at_all"},
         {"seed": 1},  # without a task
-        None,
-        *jobs(2, members=["seed=0,1"]),
     ]
-    assert groups([*lone, *jobs(2), *jobs(2, shape="other")]) == [*([n] for n in range(7)), [7, 8], [9, 10]]
-    assert groups([*jobs(2, members=None), *jobs(1)]) == [[0, 1], [2]]
-    assert batches(lone, least=1) == [[n] for n in range(7)]
-
-
-def test_settings_that_are_broken_have_no_flat_form() -> None:
-    assert flat_or_none(OmegaConf.create({"a": {"b": 1}, "c": [2]})) == {"a.b": 1, "c": [2]}
-    missing = flat_or_none(OmegaConf.create({"a": "${nowhere}"}))
-    assert missing == {"a": "${nowhere}"}
-    assert flat_or_none(3) is None  # type: ignore[arg-type]
+    assert groups([*lone, *jobs(2), *jobs(2, shape="other")]) == [*([n] for n in range(4)), [4, 5], [6, 7]]
+    assert batches(lone, least=1) == [[n] for n in range(4)]
 
 
 # What becomes of each
@@ -169,9 +158,6 @@ def test_a_batch_that_raises_is_tried_job_by_job_and_that_is_told(caplog: pytest
 
 def test_what_takes_no_part_in_batches_is_left_for_later() -> None:
     assert solve([OmegaConf.create({"task": ALONE})] * 2, SHOWN) == [DEFERRED] * 2
-    assert solve(cfgs(2, 4, members=None)[:1], SHOWN) != [DEFERRED]
-    mixed = [*cfgs(2), *cfgs(4, members=["seed=1"])]
-    assert solve(mixed, SHOWN) == [DEFERRED, DEFERRED]
     assert isinstance(DEFERRED, Deferred)
 
 

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import math
 import pickle
-from pathlib import Path
 
 import pytest
 from composing import compose
@@ -21,9 +19,6 @@ from staf_torch.sweeps.hydra_compat import (
     config_loader,
     find_launcher,
     parse_override,
-    product,
-    search_paths,
-    searching,
     sweep_size,
 )
 
@@ -157,22 +152,6 @@ def test_settings_are_flat_and_resolved() -> None:
     assert not any(name.startswith("hydra") for name in settings)
 
 
-def test_the_jobs_of_a_product_are_those_of_hydras_sweeper() -> None:
-    """The last list counts fastest; a key that comes twice has its first place and its last values."""
-    lines = {"a=1,2,3": None, "b=range(0,1,0.25)": ["0.0", "0.25", "0.5", "0.75"], "c=7": ["7"]}
-    lines |= {"a=4,5": ["4", "5"], "d=choice(x,y)": ["x", "y"], "e=range(5,0,-2)": ["5", "3", "1"]}
-    lines |= {"f=[1],[2,3]": ["[1]", "[2,3]"]}
-    found = product([parse_override(line) for line in lines])
-    lists = [[f"{key}={value}" for value in lines[line] or ()] for key, line in (
-        ("a", "a=4,5"), ("b", "b=range(0,1,0.25)"), ("c", "c=7"), ("d", "d=choice(x,y)"),
-        ("e", "e=range(5,0,-2)"), ("f", "f=[1],[2,3]"),
-    )]  # fmt: skip
-    expected = [list(job) for job in itertools.product(*lists)]
-    assert list(found) == expected
-    assert found[3:-5:7] == expected[3:-5:7]
-    assert found[-1] == expected[-1]
-
-
 @pytest.mark.parametrize(
     ("lines", "size"),
     [
@@ -193,32 +172,21 @@ def test_the_size_of_a_sweep_is_counted_and_not_written_out(lines: list[str], si
     assert sweep_size([parse_override(line) for line in lines]) == size
 
 
-def test_a_worker_looks_for_settings_where_the_command_does(tmp_path: Path) -> None:
-    *usual, schema = search_paths()
-    (tmp_path / "kernel").mkdir()
-    (tmp_path / "kernel" / "own.yaml").write_text("width: 1.5\n")
-    paths = (*usual, ("command-line", f"file://{tmp_path}"), schema)
-    with searching(paths):
-        assert search_paths() == paths
-        assert config_loader().load_configuration("config", ["kernel=own"], RunMode.RUN).kernel.width == 1.5
-    assert search_paths() == (*usual, schema)
-
-
 def test_plain_settings_are_those_of_hydra_and_nothing_that_refers_to_another_is_plain() -> None:
     lines = [
         ["dt=0.02", "trajectories=2", *job] for job in (*SAME_KEYS, *JOBS[:-2], ["seed=5", "spread=2.0"])
     ]
     composer = Composer(config_loader())
-    many = composer.many(lines)
+    many, flats = composer.many(lines)
     plain = []
-    for line, found, by_key in zip(lines, many.read(), many.flat, strict=True):
+    for line, found, by_key, cfg in zip(lines, many.read(), flats, many, strict=True):
         expected = composer(line)
         assert json.dumps(by_key) == json.dumps(flat(expected)), line
+        assert cfg == expected
+        assert OmegaConf.is_struct(cfg)
         if isinstance(found, PlainSettings):
             plain.append(line[2:])
             assert json.dumps(found) == json.dumps(OmegaConf.to_container(expected)), line
-        else:
-            assert found == expected
     assert [job for job in SAME_KEYS if job not in plain] == [*SAME_KEYS[5:7], *SAME_KEYS[9:11]]
     assert many[-1] == composer(lines[-1])
     assert many.of([2, 0])[1] == composer(lines[0])

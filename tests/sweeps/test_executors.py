@@ -21,10 +21,10 @@ import staf_torch
 from staf_torch.experiments.registry import Metrics
 from staf_torch.results.files import write_metrics
 from staf_torch.results.progress import SHOWN, Progress
+from staf_torch.settings.plain import ManySettings
 from staf_torch.sweeps.batching import Batch, Done, Failed, Outcome, Written, completion, solve
-from staf_torch.sweeps.executors import Executor, compute, executor, pack, solve_elsewhere, unpack
-from staf_torch.sweeps.executors.base import GivenUpError
-from staf_torch.sweeps.executors.slurm import Task
+from staf_torch.sweeps.clusters import Task, executor
+from staf_torch.sweeps.executors import Executor, GivenUpError, compute, pack, solve_elsewhere, unpack
 from staf_torch.sweeps.workers import LostError
 
 SHORT = ["duration=0.05", "settle_time=0", "figures=false", "history=false"]
@@ -113,10 +113,11 @@ def test_jobs_have_their_outcome_and_share_of_the_time_and_a_batch_of_some_finis
     None
 ):
     flat = [{"task": "gradient_chase", "dt": 0.1, "duration": 1.0, "seed": n} for n in range(6)]
-    settings, places = [OmegaConf.create(each) for each in flat], [Path("/", str(n)) for n in range(6)]
+    settings = ManySettings([OmegaConf.create(each) for each in flat])
     told: list[float] = []
     plan = Plan(1)
-    found = list(compute(settings, places, plan, finished={0, 1, 3}, most=2, tell=told.append))
+    given = settings, flat, lambda index: Path("/", str(index)), plan
+    found = list(compute(*given, finished={0, 1, 3}, most=2, tell=told.append))
     assert plan.notes == ["+/2", "-/2", "+/4", "-/4"]  # nothing is left to do of 0 and 1
     assert [(index, outcome.log[0][1], seconds) for index, outcome, seconds in found] == [  # type: ignore[union-attr]
         (2, "/2", 3.0),
@@ -125,7 +126,7 @@ def test_jobs_have_their_outcome_and_share_of_the_time_and_a_batch_of_some_finis
     ]
     assert told == sorted(told)
     assert told[-1] == 3
-    assert list(compute(settings, places, plan, finished=range(6), tell=told.append)) == []
+    assert list(compute(*given, finished=range(6), tell=told.append)) == []
 
 
 def test_an_executor_is_made_by_its_name_or_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -45,22 +45,21 @@ def test_a_lock_says_whose_it_is_and_leaves_nothing(tmp_path: Path) -> None:
     assert open_files() == before
 
 
-@pytest.mark.parametrize("what", ["sweep", "run"])
-def test_a_second_owner_is_told_of_the_first_in_this_process_or_another(what: str, tmp_path: Path) -> None:
+def test_a_second_owner_is_told_of_the_first_in_this_process_or_another(tmp_path: Path) -> None:
     first = hold(tmp_path)
     assert held(tmp_path) is first
-    with pytest.raises(TakenError, match=rf"^{tmp_path} belongs to a {what} that goes on in this process\.$"):
-        hold(tmp_path, what)
+    with pytest.raises(TakenError, match=rf"^{tmp_path} belongs to a sweep that goes on in this process\.$"):
+        hold(tmp_path)
     before = open_files()
-    told = rf"^{tmp_path} belongs to a {what} that goes on: process {os.getpid()} on .*`hydra.{what}.dir`"
+    told = rf"^{tmp_path} belongs to a sweep that goes on: process {os.getpid()} on .*`hydra.sweep.dir`"
     with pytest.raises(TakenError, match=told):
-        DirectoryLock(tmp_path, what)  # the kernel tells two files of one process apart, too
+        DirectoryLock(tmp_path)  # the kernel tells two files of one process apart, too
     assert open_files() == before
     give_back(tmp_path)
     give_back(tmp_path)
     assert held(tmp_path) is None
     assert not (tmp_path / NAME).exists()
-    hold(tmp_path, what)
+    hold(tmp_path)
 
 
 def test_a_directory_is_the_same_by_any_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -47,7 +47,10 @@ CONF = "--config-dir=../conf"
 JOBS = {
     "alone": [CONF, "experiment=energy", "initial_state=[2.0,1.0]"],
     "swept": ["-m", CONF, "experiment=energy", "initial_state=[1.0,0.0],[2.0,0.0]", "hydra.sweep.dir=runs/s"],
-    "members": ["hydra.searchpath=[file://../conf]", "experiment=squares", "members=['seed=range(4)']"],
+    "rows": [
+        *("-m", "hydra.searchpath=[file://../conf]", "experiment=squares", "seed=range(4)"),
+        *("sweep.records=table", "hydra.sweep.dir=runs/s"),
+    ],
     "one fails": ["-m", CONF, "experiment=squares", "seed=6,7", "hydra.sweep.dir=runs/s"],
     "elsewhere": [
         *("-m", CONF, "experiment=squares", "seed=1,2", "hydra.sweep.dir=runs/s"),
@@ -94,10 +97,9 @@ def test_a_class_shares_a_tensor_batch_in_another_process_too(outcomes: dict[str
     assert "square" in (sweep / "table.csv").read_text()
 
 
-def test_members_of_one_job_share_it_too(outcomes: dict[str, Outcome]) -> None:
-    assert outcomes["members"].code == 0, outcomes["members"]
-    (run,) = (outcomes["members"].folder / "runs").iterdir()
-    rows = json.loads((run / "members.json").read_text())["members"]
+def test_rows_of_a_table_share_it_too(outcomes: dict[str, Outcome]) -> None:
+    assert outcomes["rows"].code == 0, outcomes["rows"]
+    rows = json.loads((outcomes["rows"].folder / "runs" / "s" / "rows.json").read_text())["rows"]
     assert [row["metrics"]["square"] for row in rows] == [0.0, 1.0, 4.0, 9.0]
     assert {row["metrics"]["together"] for row in rows} == {4.0}
 

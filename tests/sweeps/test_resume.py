@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from staf_torch import __version__
-from staf_torch.sweeps.resume import command_line, is_run_of_members, recorded
+from staf_torch.sweeps.resume import command_line, recorded
 
 
 def sweep(place: Path, typed: Sequence[str] = ("seed=0,1",), hydra: Sequence[str] = (), **more: Any) -> Path:
@@ -21,15 +21,9 @@ def sweep(place: Path, typed: Sequence[str] = ("seed=0,1",), hydra: Sequence[str
     return place
 
 
-def run(place: Path, typed: Any = ("seed=3", "members=[x]"), **settings: Any) -> Path:
-    record = {"overrides": typed, "settings": {"members": ["x"], **settings}}
-    (place / "run.json").write_text(json.dumps(record))
-    return place
-
-
-def end(place: Path, kind: str = "sweep") -> list[str]:
+def end(place: Path) -> list[str]:
     """The last two words of the new command line."""
-    return [f"hydra.{kind}.dir={place}", f"sweep.resume={place}"]
+    return [f"hydra.sweep.dir={place}", f"sweep.resume={place}"]
 
 
 def lines(place: Path, *argv: str) -> list[str]:
@@ -64,36 +58,6 @@ def test_flags_stay_and_a_sweep_is_one(tmp_path: Path) -> None:
     place = sweep(tmp_path)
     for flags in (["-m"], ["--multirun"], ["-m", "--config-dir=conf"]):
         assert lines(place, *flags) == [*flags, "seed=0,1", *end(place)]
-
-
-def test_a_run_of_members_is_resumed_as_a_run(tmp_path: Path) -> None:
-    place = run(tmp_path)
-    assert is_run_of_members(place)
-    assert lines(place) == ["seed=3", "members=[x]", *end(place, "run")]
-    assert lines(place, "--config-dir=conf", "hydra.verbose=true") == [
-        "--config-dir=conf",
-        "seed=3",
-        "members=[x]",
-        "hydra.verbose=true",
-        *end(place, "run"),
-    ]
-    for flag in ("-m", "--multirun"):
-        with pytest.raises(
-            ValueError, match=rf"^{place} is one run, of many members: resume it without -m\.$"
-        ):
-            lines(place, flag)
-    for typed in (None, "seed=3", [1], ["seed=1", 2]):
-        run(tmp_path, typed)
-        with pytest.raises(ValueError, match=rf"`staf sweep.resume={place}`: its run.json has no overrides"):
-            lines(place)
-    run(tmp_path, members=None)
-    assert not is_run_of_members(place)
-    (tmp_path / "run.json").write_text(json.dumps({"settings": ["members"]}))
-    assert not is_run_of_members(place)
-    (tmp_path / "run.json").unlink()
-    assert not is_run_of_members(place)
-    sweep(run(tmp_path))
-    assert not is_run_of_members(place)
 
 
 def test_overrides_that_are_repeated_are_those_of_the_sweep_in_any_order(tmp_path: Path) -> None:

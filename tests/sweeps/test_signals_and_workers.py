@@ -11,9 +11,16 @@ from pathlib import Path
 import pytest
 import worker_tasks
 
-from staf_torch.sweeps import signals
-from staf_torch.sweeps.signals import Stopped, name_and_code, stopped_by_signals, what_ended
-from staf_torch.sweeps.workers import Worker, beginning, ready
+from staf_torch.sweeps.workers import (
+    Stopped,
+    Worker,
+    beginning,
+    check,
+    name_and_code,
+    ready,
+    stopped_by_signals,
+    what_ended,
+)
 
 NUMBERS = (signal.SIGTERM, signal.SIGHUP, signal.SIGINT)
 
@@ -43,9 +50,9 @@ def test_a_signal_stops_once_and_what_follows_is_let_be(number: signal.Signals) 
         assert stopped.value.number == number
         assert handlers() == [signal.SIG_IGN, signal.SIG_IGN, signal.default_int_handler]
         with pytest.raises(Stopped, match=str(int(number))):  # whoever loops asks again
-            signals.check()
+            check()
         assert isinstance(what_ended(AttributeError("left behind in a library")), Stopped)
-    signals.check()  # nothing is left of it
+    check()  # nothing is left of it
     assert handlers() == before
 
 

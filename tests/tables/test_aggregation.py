@@ -32,7 +32,7 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> Collection:
 
 
 def run(number: int, metrics: Mapping[str, float | None], **settings: Any) -> RecordedRun:
-    about = {k: settings.pop(k) for k in ("status", "reason", "member", "declared", "build") if k in settings}
+    about = {k: settings.pop(k) for k in ("status", "reason", "row", "declared", "build") if k in settings}
     given = {"status": "completed", **about}
     return RecordedRun(Path(f"/runs/{number}"), settings, {"base": 1, **settings}, metrics, **given)
 
@@ -116,7 +116,7 @@ def test_quantile_of_students_t_is_exact(freedom: int) -> None:
         ({}, ["status", "directory"]),
         ({"reason": "why"}, ["status", "reason", "directory"]),
         ({"status": "failed"}, ["status", "reason", "directory"]),
-        ({"member": 0}, ["status", "directory", "member"]),
+        ({"row": 0}, ["status", "directory", "row"]),
     ],
 )
 def test_a_table_of_runs_says_what_of_a_run_is_worth_it(more: dict[str, Any], about: list[str]) -> None:
@@ -127,7 +127,7 @@ def test_a_table_of_runs_says_what_of_a_run_is_worth_it(more: dict[str, Any], ab
     assert "directory" not in headings
     assert ("status" in headings) is ("status" in more)
     assert table.rows[1].cells["directory"] == "/runs/1"
-    assert table.rows[1].cells.get("member") == more.get("member")
+    assert table.rows[1].cells.get("row") == more.get("row")
 
 
 def test_headlines_are_ours_in_their_order_then_those_of_ones_own_else_the_first_six_metrics() -> None:

@@ -1,10 +1,10 @@
-"""What came last: plants of other libraries, slopes, kept traces, jobs of many members that go on."""
+"""What came last: plants of other libraries, slopes, kept traces, tables that go on."""
 
 from __future__ import annotations
 
-import json
 import os
 import pickle
+import shutil
 from pathlib import Path
 
 from arena import Arena, Attack, Call, attack
@@ -64,45 +64,42 @@ def traces_kept_where_the_runs_are(arena: Arena) -> Attack:
     return arena.line("hydra.launcher.executor=process")
 
 
-def killed_members(arena: Arena, members: list[str]) -> Attack:
-    """Make the one run a job of many members that was killed, and take it up again."""
-    path = arena.one / "run.json"
-    found = json.loads(path.read_text())
-    found["settings"]["members"] = members
-    found["overrides"].append(f"members={json.dumps(members)}")
-    path.write_text(json.dumps(found | {"status": "running"}))
-    (arena.one / "metrics.json").unlink()
-    return ["staf", f"sweep.resume={arena.one}"], None
+def killed_table(arena: Arena, *typed: str) -> Attack:
+    """Make the sweep one of a table that was killed, and take it up again."""
+    for job in range(3):
+        shutil.rmtree(arena.many / str(job))
+    arena.json("sweep.json", lambda found: found.update(jobs=[], overrides=list(typed) or found["overrides"]))
+    arena.line("sweep.records=table")
+    return ["staf", "-m", f"sweep.resume={arena.many}"], None
 
 
 @attack
-def members_that_are_written_through_a_link(arena: Arena) -> Attack:
-    for name in (".members.json.partial", ".members.json.sums", "members.json"):
-        (arena.one / name).symlink_to(arena.victim / "note.txt")
-    return killed_members(arena, ["seed=0,1"])
+def rows_that_are_written_through_a_link(arena: Arena) -> Attack:
+    for name in (".rows.json.partial", ".rows.json.sums", "rows.json"):
+        (arena.many / name).symlink_to(arena.victim / "note.txt")
+    return killed_table(arena)
 
 
 @attack
-def checksums_of_members_that_are_a_pipe(arena: Arena) -> Attack:
-    os.mkfifo(arena.one / ".members.json.sums")
-    (arena.one / ".members.json.partial").write_text('{"version": "0.1.0", "members": [\n')
-    return killed_members(arena, ["seed=0,1"])
+def checksums_of_rows_that_are_a_pipe(arena: Arena) -> Attack:
+    os.mkfifo(arena.many / ".rows.json.sums")
+    (arena.many / ".rows.json.partial").write_text('{"version": "0.1.0", "rows": [\n')
+    return killed_table(arena)
 
 
 @attack
-def a_folder_of_members_that_leads_elsewhere(arena: Arena) -> Attack:
-    (arena.one / "members").symlink_to(arena.victim, target_is_directory=True)
-    command, _ = killed_members(arena, ["seed=0,1"])
+def a_folder_of_rows_that_leads_elsewhere(arena: Arena) -> Attack:
+    (arena.many / "rows").symlink_to(arena.victim, target_is_directory=True)
+    command, _ = killed_table(arena)
     return [*command, "--trust"], None
 
 
 @attack
-def a_billion_members(arena: Arena) -> Attack:
-    return killed_members(arena, ["seed=range(1000000000)"])
+def a_billion_rows(arena: Arena) -> Attack:
+    return killed_table(arena, "seed=range(1000000000)")
 
 
 @attack
-def members_of_members(arena: Arena) -> Attack:
-    lines = ["members=['seed=0,1']", "hydra.run.dir=" + str(arena.victim), "task=evil_mod.V"]
+def rows_of_a_task_of_ones_own(arena: Arena) -> Attack:
     arena.module(arena.cwd)
-    return killed_members(arena, lines)
+    return killed_table(arena, "seed=0,1", f"hydra.sweep.dir={arena.victim}", "task=evil_mod.V")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 import socket
 import struct
 import zipfile
@@ -17,17 +18,15 @@ from typing import Any
 from arena import Arena, Attack, attack
 
 
-def members_cut_off(arena: Arena, rows: list[dict[str, Any]]) -> Attack:
-    """A killed job of many members with those rows on disk, taken up again."""
-    path = arena.one / "run.json"
-    found = json.loads(path.read_text())
-    found["overrides"].append("members=['seed=0,1']")
-    found["settings"]["members"] = ["seed=0,1"]
-    path.write_text(json.dumps(found | {"status": "running"}))
-    (arena.one / "metrics.json").unlink()
-    text = '{"version": "0.1.0", "members": [\n' + ",\n".join(json.dumps(row) for row in rows) + ",\n"
-    (arena.one / ".members.json.partial").write_text(text)
-    return ["staf", f"sweep.resume={arena.one}"], None
+def rows_cut_off(arena: Arena, rows: list[dict[str, Any]]) -> Attack:
+    """A sweep of a table that was killed with those rows on disk, taken up again."""
+    for job in range(3):
+        shutil.rmtree(arena.many / str(job))
+    arena.json("sweep.json", lambda found: found.update(jobs=[]))
+    text = '{"version": "0.1.0", "rows": [\n' + ",\n".join(json.dumps(row) for row in rows) + ",\n"
+    (arena.many / ".rows.json.partial").write_text(text)
+    arena.line("sweep.records=table")
+    return ["staf", "-m", f"sweep.resume={arena.many}"], None
 
 
 @attack
@@ -212,15 +211,15 @@ def a_lock_of_no_process(arena: Arena) -> Attack:
 
 
 @attack
-def rows_of_members_that_speak(arena: Arena) -> Attack:
-    """Rows that a killed job is said to have left: escapes, formulas, another member, numbers of any size."""
+def rows_that_speak(arena: Arena) -> Attack:
+    """Rows that a killed sweep is said to have left: escapes, formulas, numbers of any size."""
     evil = "\x1b]0;x\x07\u202e=cmd|'/C calc'!A0<script>alert(1)</script>"
     rows = [
-        {"number": 0, "overrides": [f"seed={evil}"], "status": "failed", "reason": evil, "metrics": {}},
-        {"number": 10**30, "overrides": ["seed=1"], "status": evil, "reason": None, "metrics": {evil: 1e308}},
-        {"number": -1, "overrides": [evil] * 3, "status": "completed", "metrics": {"ball_error": [1]}},
+        {"num": 0, "overrides": [f"seed={evil}"], "status": "failed", "reason": evil, "metrics": {}},
+        {"num": 10**30, "overrides": ["seed=1"], "status": evil, "reason": None, "metrics": {evil: 1e308}},
+        {"num": -1, "overrides": [evil] * 3, "status": "completed", "metrics": {"ball_error": [1]}},
     ]
-    command, _ = members_cut_off(arena, rows)
+    command, _ = rows_cut_off(arena, rows)
     return [*command, "--trust"], None
 
 

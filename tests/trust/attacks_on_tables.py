@@ -182,7 +182,7 @@ def folders_a_thousand_deep(arena: Arena) -> Attack:
 
 
 @attack
-def members_of_every_type(arena: Arena) -> Attack:
+def rows_of_every_type(arena: Arena) -> Attack:
     rows = [
         1,
         None,
@@ -204,8 +204,9 @@ def members_of_every_type(arena: Arena) -> Attack:
     rows += [
         {"number": 10**400, "overrides": "seed=1", "metrics": {"ball_error": 10**400, "b": "1e5", "c": True}}
     ]
-    (arena.many / "0" / "members.json").write_text(json.dumps(rows))
-    (arena.many / "1" / "members.json").write_text('{"members": ' + json.dumps(rows) + "}")
+    lines = "".join(json.dumps(row) + ",\n" for row in rows)
+    (arena.many / "0" / "rows.json").write_text(json.dumps(rows))
+    (arena.many / "1" / "rows.json").write_text('{"version": "1", "rows": [\n' + lines + "]}\n")
     return arena.table()[0], says("0.3")
 
 

@@ -64,8 +64,8 @@ def as_json(value: Any) -> bytes:
 FILES: dict[str, st.SearchStrategy[bytes]] = {
     "run.json": OBJECT.map(lambda found: as_json({**RECORD, **found})) | changed(as_json(WHOLE)),
     "metrics.json": OBJECT.map(as_json) | changed(b'{"ball_error": 0.5, "cost": null}'),
-    "members.json": VALUE.map(lambda rows: as_json({"members": rows}))
-    | changed(b'{"version": "1", "members": [\n{"num": 0, "status": "completed", "metrics": {}}\n]}\n'),
+    "rows.json": VALUE.map(lambda rows: as_json({"rows": rows}))
+    | changed(b'{"version": "1", "rows": [\n{"num": 0, "status": "completed", "metrics": {}}\n]}\n'),
     "../sweep.json": OBJECT.map(as_json) | changed(b'{"jobs": [{"num": 0, "overrides": ["seed=1"]}]}'),
 }
 

@@ -186,11 +186,11 @@ FOREIGN = [
     "kernel=../../../tmp/evil",
     "kernel=/tmp/evil",
     "tracker=custom",
-    "members=['kernel.path=evil.x']",
+    "target.path=evil.x,evil.y",
     "+kernel@hydra.callbacks.x=evil",
 ]
 HARMLESS = ["kernel=gaussian,matern", "centers.radius=0.1,0.2", "adp/policy=lqr", "seed=range(5)", "+new=1"]
-HARMLESS += ["members=['seed=range(9)']", "initial_state=[1.0,0.0]", "hydra.launcher.executor=process"]
+HARMLESS += ["sweep.records=table", "initial_state=[1.0,0.0]", "hydra.launcher.executor=process"]
 HARMLESS += [
     "hydra/sweeper=optuna",
     "+hydra.launcher.submitit.timeout_min=10",

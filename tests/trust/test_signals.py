@@ -12,7 +12,7 @@ import pytest
 from command_line import in_a_child, one
 
 from staf_torch.results.reader import collect
-from staf_torch.sweeps import signals
+from staf_torch.sweeps import workers
 
 SIGNALLED = '''
 import os, random, signal, sys, time
@@ -177,13 +177,13 @@ def test_a_signal_within_a_finaliser_is_not_lost(number: signal.Signals) -> None
 
     usual = signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL
     before = signal.signal(number, usual)  # a shell's background jobs ignore some
-    with signals.stopped_by_signals():
-        signals.check()
+    with workers.stopped_by_signals():
+        workers.check()
         Dying()  # Python prints what is raised there, and goes on
-        with pytest.raises(signals.Stopped) as stopped:
-            signals.check()
+        with pytest.raises(workers.Stopped) as stopped:
+            workers.check()
     assert stopped.value.number == number
-    signals.check()
+    workers.check()
     assert signal.getsignal(number) == usual
     signal.signal(number, before)
 
@@ -198,13 +198,13 @@ def test_an_error_that_a_signal_left_behind_in_a_library_is_reported_as_the_sign
             raise AttributeError("'NoneType' object has no attribute '_invalidate_flags_cache'")
 
     before = signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    with signals.stopped_by_signals():
+    with workers.stopped_by_signals():
         with pytest.raises(AttributeError) as found:
             compose()
-        assert isinstance(signals.what_ended(found.value), signals.Stopped)
+        assert isinstance(workers.what_ended(found.value), workers.Stopped)
     signal.signal(signal.SIGTERM, before)
     error = ValueError("of no signal")
-    assert signals.what_ended(error) is error
+    assert workers.what_ended(error) is error
 
 
 # Places that vanish or cannot be written

@@ -1,6 +1,5 @@
 """What knows Hydra 1.3 and 1.4 well; its inside is imported in `inside` alone."""
 
-from hydra.core.config_loader import ConfigLoader as ConfigLoader
 from hydra.core.utils import JobReturn as JobReturn
 from hydra.core.utils import JobStatus as JobStatus
 from hydra.core.utils import env_override as env_override
@@ -8,18 +7,14 @@ from hydra.core.utils import env_override as env_override
 from .composing import Composer as Composer
 from .composing import as_typed as as_typed
 from .composing import parse_override as parse_override
-from .inside import SearchPaths as SearchPaths
+from .composing import sweep_size as sweep_size
 from .inside import config_loader as config_loader
 from .inside import everything_trusted as everything_trusted
-from .inside import search_paths as search_paths
-from .inside import searching as searching
 from .inside import trusted as trusted
 from .inside import trusted_packages as trusted_packages
 from .jobs import SweepJobs as SweepJobs
 from .jobs import directory_of as directory_of
 from .jobs import without_hydra_overrides as without_hydra_overrides
-from .products import product as product
-from .products import sweep_size as sweep_size
 from .program import Application as Application
 from .program import BrokenSweep as BrokenSweep
 from .program import application as application

@@ -6,15 +6,16 @@ runs and jobs differ in values mostly. A test holds the results to Hydra's own, 
 
 from __future__ import annotations
 
+import math
 import os
 import pickle
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, cast
 
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Override, OverrideType
+from hydra.core.override_parser.types import Override, OverrideType, RangeSweep
 from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict, read_write
@@ -144,13 +145,16 @@ class Composer:
             _note_overrides(config.hydra, [line.override for line in lines])
         return config
 
-    def many(self, jobs: Sequence[Sequence[str]]) -> ManySettings:
-        """Return the settings of many jobs by their overrides; errors are those of a call.
+    def many(
+        self, jobs: Sequence[Sequence[str]], prepared: Callable[[DictConfig], DictConfig] = lambda cfg: cfg
+    ) -> tuple[ManySettings, list[Mapping[str, Any]]]:
+        """Return the settings of many jobs, and the same by dotted keys; errors are those of a call.
 
         They are plain dictionaries where no setting refers to another one and jobs set the same keys, each a
-        number, a text or a list at a place of its own: the first of such jobs alone is composed.
+        number, a text or a list at a place of its own: the first of such jobs alone is composed. The others
+        are ``prepared`` before anything in them is resolved.
         """
-        plain: list[PlainSettings | None] = []
+        found: list[DictConfig | PlainSettings] = []
         flat: list[Mapping[str, Any]] = []
         for overrides in jobs:
             lines = [line for line in self._read(overrides) if not (line.sets and line.of_hydra)]
@@ -160,13 +164,14 @@ class Composer:
                 self._bases[key] = self._base(overrides, lines, values)
             base = self._bases[key]
             if base is None or any(line.refers for line in values.values()):
-                plain.append(None)
-                flat.append(records.flat(self(overrides)))
+                config = prepared(self(overrides))
+                found.append(config)
+                flat.append(records.flat(config))
             else:
                 tree, by_key = base.with_values(values)
-                plain.append(tree)
+                found.append(tree)
                 flat.append(by_key)
-        return ManySettings(plain, flat, lambda i: self(jobs[i]))
+        return ManySettings(found), flat
 
     def _read(self, overrides: Sequence[str]) -> list[_Line]:
         searched = tuple(line for line in overrides if line.lstrip("+~").startswith("hydra.searchpath"))
@@ -302,3 +307,17 @@ def _note_overrides(node: Any, parsed: Sequence[Override]) -> None:
         style = node.job.config.override_dirname
         named = sorted(str(one.input_line) for one in task if one.key_or_group not in style.exclude_keys)
         node.job.override_dirname = style.item_sep.join(named).replace("=", style.kv_sep)
+
+
+def sweep_size(overrides: Sequence[Override]) -> float:
+    """Return how many jobs these overrides make; a range of a billion numbers is not written out for it."""
+    return math.prod(_length(one) for one in overrides if one.is_sweep_override())
+
+
+def _length(override: Override) -> float:
+    value = override._value
+    if not isinstance(value, RangeSweep):
+        return sum(1 for _ in override.sweep_string_iterator()) if override.is_discrete_sweep() else 1
+    start, stop, step = (float(number or 0) for number in (value.start, value.stop, value.step))
+    steps = (stop - start) / step if step else math.inf
+    return max(0, math.ceil(steps)) if math.isfinite(steps) else math.inf

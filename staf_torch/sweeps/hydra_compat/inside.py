@@ -6,15 +6,13 @@ import argparse
 import contextlib
 import inspect
 import os
-from collections.abc import Iterable, Iterator
-from contextvars import ContextVar
+from collections.abc import Iterable
 
 import hydra
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra._internal.utils import create_config_search_path, get_args_parser
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.config_search_path import SearchPathQuery
-from hydra.core.global_hydra import GlobalHydra
 from hydra.core.plugins import Plugins
 from hydra.errors import SearchPathException
 
@@ -35,7 +33,7 @@ def arguments(argv: Iterable[str]) -> argparse.Namespace:
     return words
 
 
-def loader(folder: str | None = None) -> ConfigLoader:
+def config_loader(folder: str | None = None) -> ConfigLoader:
     """Return Hydra's loader for `conf/`, and for the ``folder`` of `--config-dir`.
 
     Raises:
@@ -49,40 +47,6 @@ def loader(folder: str | None = None) -> ConfigLoader:
         place = f"file://{os.path.abspath(folder)}"
         searched.prepend("command-line", place, SearchPathQuery(provider="schema"))
     return ConfigLoaderImpl(searched)
-
-
-SearchPaths = tuple[tuple[str, str], ...]
-"""Provider and place of every folder in which Hydra looks for settings."""
-_PATHS: ContextVar[SearchPaths | None] = ContextVar("_PATHS", default=None)
-
-
-def config_loader() -> ConfigLoader:
-    """Return Hydra's loader: of the running program, else one for the paths of `searching` or `conf/`."""
-    if GlobalHydra.instance().is_initialized():
-        return GlobalHydra.instance().config_loader()
-    found, given = loader(), _PATHS.get()
-    if given is None:
-        return found
-    places = found.get_search_path()
-    places.get_path().clear()
-    for provider, place in given:
-        places.append(provider, place)
-    return ConfigLoaderImpl(places)
-
-
-def search_paths() -> SearchPaths:
-    """Return where the running program looks for settings."""
-    return tuple((each.provider, each.path) for each in config_loader().get_search_path().get_path())
-
-
-@contextlib.contextmanager
-def searching(paths: SearchPaths) -> Iterator[None]:
-    """Let `config_loader` look in those places where no program of Hydra's is running."""
-    token = _PATHS.set(paths)
-    try:
-        yield
-    finally:
-        _PATHS.reset(token)
 
 
 def trusted(packages: Iterable[str] = ()) -> contextlib.AbstractContextManager[object]:

@@ -6,7 +6,7 @@ import contextlib
 import functools
 import logging
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -28,7 +28,8 @@ from hydra.types import HydraContext
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 from omegaconf._utils import OmegaConfDumper
 
-from .composing import Composer, as_typed
+from ...settings.plain import ManySettings
+from .composing import Composer, as_typed, parse_override
 from .inside import HAS_WHITELIST
 
 
@@ -54,12 +55,38 @@ class SweepJobs:
         return getattr(self._loader, name)
 
     def load_sweep_config(self, master_config: DictConfig, sweep_overrides: Sequence[str]) -> DictConfig:
-        """Return `settings`: sweepers compose every job as a test, and the node takes as long again."""
-        return self.settings(sweep_overrides)
+        """Return the settings of the sweep: sweepers compose every job as a test, which the launcher does."""
+        return master_config
 
     def settings(self, overrides: Sequence[str]) -> DictConfig:
         """Return the settings of a job as its task sees them; the caller may change them."""
         return self._at_the_same_time(self._composer([*self._always, *overrides]))
+
+    def many(self, jobs: Sequence[Sequence[str]]) -> tuple[ManySettings, list[Mapping[str, Any]]]:
+        """Return what `Composer.many` returns for jobs of the sweep."""
+        return self._composer.many([[*self._always, *job] for job in jobs], self._at_the_same_time)
+
+    @property
+    def base(self) -> DictConfig:
+        """The settings of the sweep itself, without what is swept and without Hydra's node."""
+        names = [str(name) for name in self.master if name != "hydra"]
+        return self._at_the_same_time(OmegaConf.masked_copy(self.master, names))
+
+    @property
+    def typed(self) -> list[str]:
+        """The overrides that the sweep began with, but Hydra's own."""
+        return as_typed(self.master.hydra.overrides.task)
+
+    @property
+    def fixed(self) -> set[str]:
+        """Keys of those that are the same in all jobs, as the jobs' own overrides have them."""
+        parsed = [parse_override(line) for line in self.typed]
+        return {str(one.get_key_element()) for one in parsed if not one.is_sweep_override()}
+
+    @property
+    def choices(self) -> dict[str, str | None]:
+        """The option chosen of each group of settings."""
+        return {str(group): choice for group, choice in self.master.hydra.runtime.choices.items()}
 
     def whole(self, num: int, overrides: Sequence[str]) -> DictConfig:
         """Return the configuration of job ``num`` with Hydra's node; the caller may change it."""
@@ -75,10 +102,18 @@ class SweepJobs:
         return config
 
     @property
-    def numbered(self) -> bool:
-        """Whether the directories of jobs are their numbers, as they are where nobody says otherwise."""
-        node: Any = OmegaConf.to_container(self.master.hydra.sweep)
-        return bool(node["subdir"] == "${hydra.job.num}")
+    def at_once(self) -> bool:
+        """Whether the sweeper hands over all jobs at once."""
+        sweeper = self.master.hydra.sweeper
+        return self.choices.get("hydra/sweeper") == "basic" and sweeper.get("max_batch_size") is None
+
+    def directory(self, num: int, overrides: Sequence[str]) -> Path:
+        """Return the run directory of job ``num``: its number, where nobody says otherwise."""
+        sweep: Any = OmegaConf.to_container(self.master.hydra.sweep)
+        own = any(line.lstrip("+~").startswith("hydra") for line in overrides)
+        if own or sweep["subdir"] != "${hydra.job.num}":
+            return directory_of(self.whole(num, overrides))
+        return Path(str(self.master.hydra.sweep.dir), str(num))
 
     def start(self) -> None:
         """Register Hydra's resolvers and send the log to the sweep's own handlers."""

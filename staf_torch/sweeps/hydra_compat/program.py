@@ -27,7 +27,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from ...settings import config_directory
 from .composing import Composer
-from .inside import HAS_WHITELIST, TRUSTED, arguments, loader, trusted
+from .inside import HAS_WHITELIST, TRUSTED, arguments, config_loader, trusted
 from .jobs import handlers_aside
 
 _PACKAGE = Path(__file__).resolve().parents[2]
@@ -106,14 +106,16 @@ def application(argv: Sequence[str]) -> Iterator[Application]:
         stack.enter_context(trusted(named_packages(argv)))
         running: Any = GlobalHydra.instance().hydra
         changes = words.config_dir is not None or any(re.search(_OUTSIDE, line) for line in words.overrides)
-        running.config_loader = Composer(loader(words.config_dir), name) if changes else _composer(name)
+        running.config_loader = (
+            Composer(config_loader(words.config_dir), name) if changes else _composer(name)
+        )
         yield Application(running, name, tuple(words.overrides), words.multirun)
 
 
 @functools.cache
 def _composer(name: str) -> Composer:
     """Return the settings of the package alone, composed once a process: its files do not change."""
-    return Composer(loader(), name)
+    return Composer(config_loader(), name)
 
 
 def is_about_settings(argv: Sequence[str]) -> bool:

@@ -1,4 +1,4 @@
-"""Tensor batches as jobs of SLURM, or as processes of this machine, by submitit."""
+"""Tensor batches on clusters, by submitit (SLURM) and by Ray; and the choice among all executors."""
 
 from __future__ import annotations
 
@@ -12,13 +12,14 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from ...results.progress import Progress
-from ..batching import Batch, Done
-from ..signals import check
-from ..workers import LostError, beginning, end_with
-from .base import Executor, GivenUpError
-from .remote import pack, solve_elsewhere, unpack
+from ..numerics.checks import choice
+from ..results.progress import Progress
+from .batching import Batch, Done
+from .executors import Executor, GivenUpError, Inline, Process, pack, solve_elsewhere, unpack
+from .workers import LostError, beginning, check, end_with
 
+EXECUTORS = ("inline", "process", "submitit", "ray")
+_EXTRAS = {"submitit": "slurm", "ray": "ray"}
 _LOOK = 0.5  # s between two looks for results
 _FINAL = {  # states that nobody should try again, and what they mean
     "CANCELLED": "was cancelled",
@@ -26,6 +27,32 @@ _FINAL = {  # states that nobody should try again, and what they mean
     "DEADLINE": "did not end before its deadline",
     "OUT_OF_MEMORY": "had too little memory: give it more by hydra.launcher.submitit.mem_gb",
 }
+
+
+def executor(name: object, workers: int | None, arguments: Mapping[str, Any], directory: Path) -> Executor:
+    """Return the executor of that name in `hydra.launcher.executor`.
+
+    Args:
+        name: one of `EXECUTORS`.
+        workers: tensor batches at once; None for as many as suit the executor.
+        arguments: of the libraries behind them, by the name of the executor.
+        directory: of the sweep.
+
+    Raises:
+        ValueError: for another name, or where the library behind it is not installed.
+    """
+    choice("hydra.launcher", "executor", name, EXECUTORS)
+    try:
+        if name == "submitit":
+            return Submitit(workers, directory, arguments["submitit"])
+        if name == "ray":
+            return Ray(workers, arguments["ray"])
+    except ImportError as error:
+        extra = _EXTRAS[str(name)]
+        raise ValueError(
+            f"`hydra.launcher.executor={name}` needs the extra: pip install 'staf_torch[{extra}]' ({error})."
+        ) from error
+    return Process(workers) if name == "process" else Inline(workers)
 
 
 class Submitit(Executor):
@@ -153,3 +180,44 @@ def _last_of_trace(said: str) -> str:
     """Return the last line of a job's traceback, which submitit frames by dashes, with its logs below."""
     lines = said.partition("You can check full logs")[0].splitlines()
     return next((line.strip() for line in reversed(lines) if line.strip(" -")), "ended without a word")
+
+
+class Ray(Executor):
+    """One task of Ray a tensor batch and one core a task, on this machine or on a Ray cluster.
+
+    Args:
+        workers: tasks at once; None for as many as Ray has cores.
+        arguments: of `ray.init`.
+    """
+
+    def __init__(self, workers: int | None, arguments: Mapping[str, Any]) -> None:
+        super().__init__(workers)
+        import ray
+
+        self._ray: Any = ray
+        self._ours = not ray.is_initialized()
+        if self._ours:
+            try:
+                ray.init(**{"log_to_driver": False, "include_dashboard": False, **arguments})
+            except Exception as error:  # Ray raises plain ones where a daemon of its ends as it begins
+                said = " ".join(str(error).split())
+                raise LostError(f"Ray could not begin ({type(error).__name__}: {said})") from error
+        self._solve = ray.remote(max_retries=0)(solve_elsewhere)  # `map` tries once more
+
+    @property
+    def workers(self) -> int:
+        return self._asked or max(1, int(self._ray.cluster_resources().get("CPU", 1)))
+
+    def close(self, *, failed: bool) -> None:
+        if self._ours:
+            self._ray.shutdown()
+
+    def submit(self, batch: Batch, progress: Progress) -> Any:
+        return self._solve.remote(*pack(batch))
+
+    def wait(self, handles: dict[int, Any]) -> list[int]:
+        ready, _ = self._ray.wait(list(handles.values()), num_returns=1)
+        return [number for number, handle in handles.items() if handle in ready]
+
+    def result(self, handle: Any) -> Done:
+        return unpack(self._ray.get(handle))

@@ -1,0 +1,312 @@
+"""A sweep whose jobs leave one row each, `sweep.records=table`: more jobs than run directories are good for.
+
+`rows.json` has one line a row: number, overrides, status, reason and metrics, as the same job writes them
+into a directory of its own. It has another name until it is complete. A hidden file beside it has one line a
+row: the checksums of the row and of its history, and a hash of what made it. A sweep that was killed goes on
+from the rows that agree with theirs.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import logging
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from .. import __version__
+from ..experiments.registry import check_animation
+from ..lanes.build import compiler
+from ..results import run_record as records
+from ..results.build import checksums, damage, modules
+from ..results.files import ROWS, open_after, partial_name
+from ..results.progress import Progress
+from ..results.run_directory import RunDirectory
+from ..results.untrusted import UnreadableError, parse_object, read_lines
+from ..settings.chase import make_metrics
+from ..settings.plain import ManySettings
+from . import workers
+from .batching import Computed, Failed, Outcome, Written, completion, reason
+from .executors import Executor, compute
+from .hydra_compat import SweepJobs
+from .job import recorded
+from .workers import LostError
+
+_log = logging.getLogger(__name__)
+SUMS = f".{ROWS}.sums"
+FOLDER = "rows"
+_HEAD = f'{{"version": {json.dumps(__version__)}, "rows": [\n'
+_DIGITS = 16  # of the hash of what made a row: enough to tell two settings apart
+_PIECE = 1024  # jobs that are composed and written together: memory does not grow with their number
+_AHEAD = 8  # pieces that are composed together, at most, where several workers compute them
+_SILENT = Progress(lambda share: None)
+
+Write = Callable[[Sequence[Mapping[str, Any]], Sequence[str]], None]
+
+
+class Left(NamedTuple):
+    """What an earlier start of a sweep has left of its rows."""
+
+    made: list[str]  # what made each whole row, from the first row on
+    size: int = 0  # bytes of the rows' file up to the end of the last of them, without its comma
+    sums: int = 0  # bytes of the checksums' file up to the end of their line
+
+
+def fill(
+    jobs: SweepJobs,
+    overrides: Sequence[Sequence[str]],
+    directory: Path,
+    executor: Executor,
+    *,
+    most: int | None,
+    ended: Callable[[int, str | None], None],
+    tell: Callable[[float], None],
+) -> None:
+    """Compute the jobs that have no row yet, write their rows, and at last `rows.json` as a whole.
+
+    Args:
+        jobs: compose the settings.
+        overrides: of every job.
+        directory: of the sweep.
+        executor: computes tensor batches.
+        most: jobs of a batch at most.
+        ended: is told the number of every job that has a row, and why it failed, None where it did not.
+        tell: is told how many jobs are computed.
+
+    Raises:
+        ValueError, hydra.errors.HydraException: if settings name what is not there, or rows that are left
+            were made otherwise. What is wrong with one job alone fails it alone.
+        LostError: if rows lost their workers twice; `sweep.resume` computes them.
+    """
+    record = records.RunRecord(jobs.base, jobs.choices, jobs.typed, compiler())
+    record.covers(ROWS, f"{FOLDER}/**/*")
+    before = _before(directory, record, jobs.master)
+    if before is None:
+        _log.info("completed before: %s", os.path.relpath(directory))
+        for row in _rows(directory / ROWS, len(overrides)):
+            ended(row["num"], row["reason"])
+        return
+    keep = "history" in jobs.fixed and jobs.base.history is True
+    fixed = ("figures=false", f"history={str(keep).lower()}")
+    piece = max(_PIECE, most or 0) * min(_AHEAD, executor.workers)
+    shared, done, lost = jobs.fixed, len(before.made), 0
+
+    def composed(begin: int) -> tuple[ManySettings, list[Mapping[str, Any]]]:
+        return jobs.many([[*job, *fixed] for job in overrides[begin : begin + piece]])
+
+    first = composed(0)  # before anything is written: most wrong names are refused here
+    for begin in range(0, done, piece):
+        _, flat = composed(begin) if begin else first
+        _refuse_others(overrides, begin, flat, before.made[begin : begin + piece])
+    with (
+        _saying_how_to_resume(directory, len(overrides)) as completed,
+        recorded(record, directory, 0.0),
+        _writer(directory, record.made_by, len(overrides), before) as write,
+    ):
+        check_animation(jobs.base)
+        record.declare([metric.info for metric in make_metrics(jobs.base.get("metric"))])
+        for row in _rows(directory / partial_name(ROWS), done):
+            ended(row["num"], row["reason"])
+        for begin in range(done // piece * piece, len(overrides), piece):
+            cfgs, flat = composed(begin) if begin else first
+            written = max(0, done - begin)
+            made = [made_by(one) for one in flat]
+            rows: dict[int, dict[str, Any]] = {}  # of batches that ended before others
+            ready: list[dict[str, Any]] = []  # those that can be written next
+
+            def place(index: int, begin: int = begin) -> Path:
+                return directory / FOLDER / str(begin + index)
+
+            for index, outcome, _ in compute(
+                *(cfgs, flat, place, executor),
+                finished=range(written),
+                most=most,
+                measured=not keep,
+                tell=lambda count, begin=begin: tell(begin + count),
+            ):
+                workers.check()
+                own = [line for line in overrides[begin + index] if line.partition("=")[0] not in shared]
+                rows[index] = {"num": begin + index, "overrides": own}
+                rows[index] |= _result(cfgs, index, outcome, place(index), keep)
+                if isinstance(outcome, Failed) and isinstance(outcome.error, LostError):
+                    made[index], lost = "", lost + 1
+                ended(begin + index, rows[index]["reason"])
+                while written + len(ready) in rows:
+                    ready.append(rows.pop(written + len(ready)))
+                if len(ready) >= _PIECE or written + len(ready) == len(flat):
+                    write(ready, made[written : written + len(ready)])
+                    written, ready = written + len(ready), []
+                    completed[0] = begin + written
+        if lost:
+            raise LostError(f"{lost} of {len(overrides)} rows lost their workers; sweep.resume computes them")
+
+
+def _before(directory: Path, record: records.RunRecord, master: Any) -> Left | None:
+    """Return the rows that an earlier start of the sweep has left; None: all of them, and it is complete.
+
+    Raises:
+        ValueError: if they were made otherwise.
+    """
+    if not records.resumed(master):
+        return Left([])
+    anyway = records.resumed_anyway(master)
+    if record.finished(directory, anyway=anyway) is not None:
+        return None
+    found = left(directory, record.made_by)
+    if found is None and not anyway:
+        record.refuse_rows(directory)
+    if found is None:
+        _log.warning("the rows that %s has were made otherwise: all run again", directory)
+    found = found or Left([])
+    if found.made:
+        _log.info("%d jobs were completed before", len(found.made))
+    return found
+
+
+@contextlib.contextmanager
+def _saying_how_to_resume(directory: Path, total: int) -> Iterator[list[int]]:
+    """Yield a list of the number of rows; add it and the line that resumes to a Ctrl-C or another signal."""
+    done = [0]
+    try:
+        yield done
+    except KeyboardInterrupt as error:
+        place = os.path.relpath(directory)
+        error.add_note(
+            f"{done[0]} of {total} jobs are complete. Resume with:\n  staf -m sweep.resume={place}"
+        )
+        raise
+
+
+def _refuse_others(
+    jobs: Sequence[Sequence[str]], first: int, now: Sequence[Mapping[str, Any]], then: Sequence[str]
+) -> None:
+    """Raise ValueError if a row that is left was made by other settings than it would be now."""
+    for index, (settings, was) in enumerate(zip(now, then, strict=False)):
+        if made_by(settings) != was:
+            own = " ".join(records.own(jobs[first + index]))
+            raise ValueError(
+                f"job {first + index} ({own}) was not made as it would be now: its settings or the modules that "
+                "they name have changed. Run the sweep in another directory."
+            )
+
+
+def _result(cfgs: ManySettings, index: int, outcome: Outcome, directory: Path, keep: bool) -> dict[str, Any]:
+    """Return what a row says of the end of a job; its files are written where they are kept."""
+    try:
+        if isinstance(outcome, Written) or (isinstance(outcome, Computed) and not keep):
+            metrics = outcome.metrics
+        else:
+            if not isinstance(outcome, Failed):
+                directory.mkdir(parents=True, exist_ok=True)
+            metrics = completion(cfgs[index], outcome)(cfgs[index], directory, _SILENT)
+    except Exception as error:
+        return {"status": "failed", "reason": reason(error), "metrics": {}}
+    return {"status": "completed", "reason": None, "metrics": metrics}
+
+
+def made_by(settings: Mapping[str, Any]) -> str:
+    """Return a hash of the settings of a job, by dotted keys, and of the user's modules that they name."""
+    text = json.dumps([settings, modules(settings)], sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:_DIGITS]
+
+
+def left(directory: Path, run: str) -> Left | None:
+    """Return the rows that an earlier start has left, up to the first that is not whole or lost its worker.
+
+    Args:
+        directory: of the sweep.
+        run: hash of what makes the rows.
+
+    Returns:
+        The rows; None where something else made them.
+    """
+    partial, found = directory / partial_name(ROWS), Left([])
+    if not os.path.lexists(directory / SUMS) or not os.path.lexists(partial):
+        return found
+    try:
+        sums, rows = read_lines(directory / SUMS), read_lines(partial)
+        head = next(sums, b"")
+        if parse_object(head, SUMS).get("run") != run:
+            return None
+        if next(rows, b"") != _HEAD.encode():
+            return found
+        size, found = len(_HEAD), Left([], len(_HEAD), len(head))
+        for line, row in zip(sums, rows, strict=False):
+            about, text = parse_object(line, SUMS), row.removesuffix(b"\n").removesuffix(b",")
+            wrong = _damage(directory / FOLDER / str(len(found.made)), about, text)
+            if wrong is not None:
+                raise UnreadableError(wrong)
+            found.made.append(about["made"])
+            found = Left(found.made, size + len(text), found.sums + len(line))
+            size += len(row)
+    except UnreadableError as error:
+        _log.warning("%s; job %d and those after it run again", error, len(found.made))
+    return found
+
+
+def _damage(directory: Path, about: Mapping[str, Any], row: bytes) -> str | None:
+    """Return what is wrong with a row or with its history in a directory."""
+    if about.get("sha256") != hashlib.sha256(row).hexdigest() or not isinstance(about.get("made"), str):
+        return f"a row of {ROWS} is damaged or cut off"
+    if not about["made"]:
+        return f"a row of {ROWS} lost its worker"
+    files = about.get("files")
+    return damage(directory, files, thorough=True) if isinstance(files, dict) else None
+
+
+def _rows(path: Path, count: int) -> Iterator[dict[str, Any]]:
+    """Yield the first rows of a file of rows, complete or not."""
+    lines = read_lines(path) if count else iter(())
+    next(lines, None)
+    for _, row in zip(range(count), lines, strict=False):
+        yield parse_object(row.removesuffix(b"\n").removesuffix(b","), ROWS)
+
+
+@contextlib.contextmanager
+def _writer(directory: Path, run: str, total: int, before: Left) -> Iterator[Write]:
+    """Yield a function that appends rows to `rows.json`, with what made each of them.
+
+    Args:
+        directory: of the sweep.
+        run: hash of what makes the rows.
+        total: rows in the end.
+        before: rows that stay; what the files have after them is cut off.
+    """
+    done = len(before.made)
+
+    def ending(number: int) -> str:
+        return ",\n" if number < total else "\n]}\n"
+
+    with (
+        os.fdopen(open_after(directory / SUMS, before.sums), "wb") as sums,
+        RunDirectory(directory).lines(ROWS, keep=before.size) as write,
+    ):
+
+        def note(lines: Sequence[Mapping[str, Any]]) -> None:
+            sums.write("".join(json.dumps(line) + "\n" for line in lines).encode())
+            sums.flush()
+            os.fsync(sums.fileno())
+
+        if before.size == 0:
+            note([{"run": run}])
+            write(_HEAD)
+        elif done:
+            write(ending(done))
+
+        def add(rows: Sequence[Mapping[str, Any]], made: Sequence[str]) -> None:
+            nonlocal done
+            about, text = [], []
+            for row, by in zip(rows, made, strict=True):
+                line, done = json.dumps(row, allow_nan=False), done + 1
+                text.append(line + ending(done))  # one job a line
+                line_sum = hashlib.sha256(line.encode()).hexdigest()
+                files = checksums(directory / FOLDER / str(row["num"]))
+                about.append({"made": by, "sha256": line_sum} | ({"files": files} if files else {}))
+            write("".join(text))
+            note(about)
+
+        yield add
+    (directory / SUMS).unlink()
