@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 from .. import __version__
 from ..experiments.registry import check_animation
-from ..lanes.build import compiler
+from ..lanes.compiler import compiler
 from ..results import run_record as records
 from ..results.build import checksums, damage, modules
 from ..results.files import ROWS, open_after, partial_name
@@ -188,8 +188,8 @@ def _refuse_others(
         if made_by(settings) != was:
             own = " ".join(records.own(jobs[first + index]))
             raise ValueError(
-                f"job {first + index} ({own}) was not made as it would be now: its settings or the modules that "
-                "they name have changed. Run the sweep in another directory."
+                f"job {first + index} ({own}) was not made as it would be now: its settings or the modules "
+                "that they name have changed. Run the sweep in another directory."
             )
 
 
