@@ -134,9 +134,7 @@ class AdaptiveActorCritic(Controller):
         u = terms.control[..., 0, :]
         if self.robust is not None:
             u = torch.where(certain.unsqueeze(-1), u, self.robust(x))
-        bounds = self.learner.cost.bounds
-        if bounds is not None:  # what the actuator will give, which the window must know
-            u = bounds.clip(u)
+        u = self.learner.cost.admissible(u)  # what the actuator will give, which the window must know
         return u, LearnedModel(weights, estimate, certain.to(x), self.windows.holding(window, u))
 
     def value(self, x: Tensor, recorded: Mapping[str, Tensor]) -> Tensor:

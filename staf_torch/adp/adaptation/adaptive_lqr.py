@@ -139,9 +139,8 @@ class AdaptiveLQR(Controller):
         doubtful = self.robust(x)
         if self.probe:
             doubtful = doubtful + self._probing(now.time)
-        u = torch.where(certain.unsqueeze(-1), u, doubtful)
-        if self.cost.bounds is not None:  # what the actuator will give, which the window must know
-            u = self.cost.bounds.clip(u)
+        # What the actuator will give, which the window must know.
+        u = self.cost.admissible(torch.where(certain.unsqueeze(-1), u, doubtful))
         alarmed = estimate.resets > now.estimate.resets
         alarmed_at = torch.where(alarmed, now.time, now.alarmed_at)
         window = self.windows.holding(window, u)

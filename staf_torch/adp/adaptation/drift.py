@@ -71,7 +71,6 @@ class StreamDrift:
         noise: standard deviation of the noise of a measured state, not negative.
         floor: standard deviation of an error of an equation beside the noise, positive: that of the integral.
         forgetting: 1/s, not negative: the rate at which what was learned fades towards the prior.
-        smooth: whether windows weigh the integral by sin^2, as in `IntegralWindows`: for noise.
 
     Raises:
         ValueError: if an argument breaks its rule.
@@ -91,7 +90,6 @@ class StreamDrift:
         noise: float = 0.0,
         floor: float = 1e-4,
         forgetting: float = 0.0,
-        smooth: bool = False,
     ) -> None:
         if not isinstance(known, ControlAffineSystem) or known.dim is None:
             raise fail("StreamDrift", "known", "must be a ControlAffineSystem with `dim`", known)
@@ -120,8 +118,7 @@ class StreamDrift:
             rows=self.rows,
             periodic=known.periodic,
         )
-        shape = "smooth" if smooth else "box"
-        self.windows = IntegralWindows(plant, length, shape=shape, noise=noise)
+        self.windows = IntegralWindows(plant, length, noise=noise)
 
     def init(self, x: Tensor) -> DriftEstimate:
         """Nothing learned yet, around the states (..., n)."""
@@ -301,10 +298,8 @@ class DriftLQR(Controller):
         self.robust: Policy = LQR(drift.known, cost) if robust is None else robust
 
     def init(self, x0: Tensor) -> DriftAdaptation:
-        windows = self.drift.windows.init(x0)
-        return DriftAdaptation(
-            self.drift.init(x0), x0.new_zeros(len(x0)), windows, x0.new_zeros(*x0.shape, x0.shape[-1])
-        )
+        window, p = self.drift.windows.init(x0), x0.new_zeros(*x0.shape, x0.shape[-1])
+        return DriftAdaptation(self.drift.init(x0), x0.new_zeros(len(x0)), window, p)
 
     def recorded(self, carried: DriftAdaptation) -> dict[str, Tensor]:
         return {"certain": carried.certain}
@@ -326,7 +321,6 @@ class DriftLQR(Controller):
         spread = 2 * (lever * quadratic(covariance, e)).sqrt()
         certain = self.redesign.solved(p, a, b) & (self.confidence * spread < falls)
         wanted = self.cost.saturate(self.cost.input_of(-matvec(k, e)))
-        u = torch.where(certain.unsqueeze(-1), wanted, self.robust(x))
-        if self.cost.bounds is not None:  # what the actuator will give, which the window must know
-            u = self.cost.bounds.clip(u)
+        # What the actuator will give, which the window must know.
+        u = self.cost.admissible(torch.where(certain.unsqueeze(-1), wanted, self.robust(x)))
         return u, DriftAdaptation(estimate, certain.to(x), windows.holding(window, u), p)

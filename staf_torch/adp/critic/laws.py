@@ -112,9 +112,9 @@ class ActorCriticLaw(abc.ABC):
         self.gains = Gains() if gains is None else gains
         self.bound = None if bound is None else positive_real(type(self).__name__, "bound", bound)
 
-    @abc.abstractmethod
     def init(self, critic: Tensor, actor: Tensor, gain: Tensor) -> Weights:
         """Weights from Wc0 (..., M), Wa0 (..., M) and Gam0 (..., M, M)."""
+        return Weights(critic, actor, gain)
 
     @abc.abstractmethod
     def rates(self, sums: BellmanSums, weights: Weights) -> Weights:
@@ -185,9 +185,6 @@ class Published(ActorCriticLaw):
 
     Source: Kamalapurkar, Rosenfeld and Dixon, via MATH.md section 4.
     """
-
-    def init(self, critic: Tensor, actor: Tensor, gain: Tensor) -> Weights:
-        return Weights(critic, actor, gain)
 
     def rates(self, sums: BellmanSums, weights: Weights) -> Weights:
         gain = weights.gain
@@ -263,9 +260,6 @@ class Frozen(ActorCriticLaw):
 
         Shown by `staf experiment=adp adp/law=frozen`.
     """
-
-    def init(self, critic: Tensor, actor: Tensor, gain: Tensor) -> Weights:
-        return Weights(critic, actor, gain)
 
     def rates(self, sums: BellmanSums, weights: Weights) -> Weights:
         return Weights(*(0 * part for part in weights))
@@ -347,9 +341,6 @@ class PolicyIteration(ActorCriticLaw):
         super().__init__(gains, bound)
         self.damping = positive_real("PolicyIteration", "damping", damping)
         self.settling = positive_real("PolicyIteration", "settling", settling)
-
-    def init(self, critic: Tensor, actor: Tensor, gain: Tensor) -> Weights:
-        return Weights(critic, actor, gain)
 
     def rates(self, sums: BellmanSums, weights: Weights) -> Weights:
         gains = self.gains

@@ -106,8 +106,7 @@ class ClosedLoop(nn.Module):
                 f"`{type(self.controller).__name__}.step` must return a control (B, m), here {wanted}; "
                 f"got {tuple(u.shape)}."
             )
-        if self.cost.bounds is not None:  # an actuator that is asked for more gives its bound
-            u = self.cost.bounds.clip(u)
+        u = self.cost.admissible(u)
         x, spent = self._advance(state.x, u)
         good = torch.isfinite(spent) & (x.square().sum(-1) <= self.limit**2)
         parts, before = flatten(carried), flatten(state.carried)
@@ -132,12 +131,9 @@ class ClosedLoop(nn.Module):
         if self.euler:
             return x + self.dt * self.system.motion(x, u), self.dt * self.cost.rate(x, u)
         if self.renew and isinstance(self.controller, Feedback):
-            return self.holding(x, u, self._renewed)
+            policy = self.controller.policy
+            return self.holding(x, u, lambda at: self.cost.admissible(policy(at)))
         return self.holding(x, u)
-
-    def _renewed(self, x: Tensor) -> Tensor:
-        u = self.controller.policy(x)  # type: ignore[operator]
-        return u if self.cost.bounds is None else self.cost.bounds.clip(u)
 
 
 def _where(alive: Tensor, new: Tensor, old: Tensor) -> Tensor:

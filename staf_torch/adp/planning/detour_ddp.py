@@ -63,7 +63,7 @@ class PlanProblem:
             def wanted(y: Tensor, others: Tensor, given: tuple[Tensor, ...], k: Tensor) -> Tensor:
                 planned, u, change, feedback = given
                 u = u + length.unsqueeze(-1) * change + matvec(feedback, y - planned)
-                return self.clipped(u)
+                return self.cost.admissible(u)
 
             given = plan.states[:, :-1], plan.control, change, feedback
             found = self.follow(plan.states[:, 0], others, done, given, wanted)
@@ -135,9 +135,6 @@ class PlanProblem:
             none = like.new_full((self.cost.inputs,), torch.inf)
             return -none, none
         return self.cost.bounds.low.to(like), self.cost.bounds.high.to(like)
-
-    def clipped(self, u: Tensor) -> Tensor:
-        return u if self.cost.bounds is None else self.cost.bounds.clip(u)
 
     def penalty(self, x: Tensor, t: Tensor) -> Tensor:
         """weight sum_i max(0, margin_i - h_i)^2: (B, n), (B,) -> (B,)."""
@@ -388,7 +385,7 @@ class DetourPlans(Controller):
         x, control, expected, done = flat.split((n, flat.shape[-1] - n - 2, 1, 1), dim=-1)
         others, plan = self._kept(x, control, expected[:, 0], done)
         first, end = plan.control[:, 0], problem.whole(plan.states[:, -1], others[:, -1])
-        last = problem.clipped(self.detours.policy(end))
+        last = self.cost.admissible(self.detours.policy(end))
         ahead = torch.cat((plan.control[:, 1:], last.unsqueeze(1)), dim=1)
         left = plan.total - problem.paid(x, first, done[:, 0] * self.hold) + problem.longer(end, last)
         after = torch.cat((first, ahead.flatten(1), left.unsqueeze(-1), done + 1), dim=-1)

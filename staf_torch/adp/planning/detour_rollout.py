@@ -192,7 +192,7 @@ class DetourRollout(Controller):
         """The control k periods on: the policy's own where the detour is over."""
         s = (tried[..., :-1].unsqueeze(-1) * self.axes.to(x)).sum(-2)
         u = self.policy(torch.where((k < tried[..., -1]).unsqueeze(-1), x - s, x))
-        return u if self.cost.bounds is None else self.cost.bounds.clip(u)
+        return self.cost.admissible(u)
 
     def _missing(self, x: Tensor, t: Tensor) -> Tensor:
         """sum_i max(0, margin_i - h_i): (B, C, n), (B, C) -> (B, C)."""

@@ -153,12 +153,7 @@ class RolloutPolicy(nn.Module):
 
     def gradient_of(self, x: Tensor, values: Tensor) -> Tensor:
         """`gradient` from what the rollouts cost, (..., n), (..., M) -> (..., n)."""
-        space = self.basis.local(x)
-        coefficients = space.fit(values)
-        rise: Tensor = torch.func.grad(lambda z: space.evaluate(z.unsqueeze(-2), coefficients).sum())(
-            torch.zeros_like(x)
-        )
-        return rise
+        return fitted_slope(self.basis, x, values)
 
     def value(self, x: Tensor) -> Tensor:
         """V^(x): (..., n) -> (...)."""
@@ -230,6 +225,16 @@ class _TwoPrograms:
                 self._one.clear()
             self._one[key] = u, first, second
         return found
+
+
+def fitted_slope(basis: StaFBasis, x: Tensor, values: Tensor) -> Tensor:
+    """The slope at x of what fits the values at the centers there: (..., n), (..., M) -> (..., n)."""
+    space = basis.local(x)
+    coefficients = space.fit(values)
+    slope: Tensor = torch.func.grad(lambda z: space.evaluate(z.unsqueeze(-2), coefficients).sum())(
+        torch.zeros_like(x)
+    )
+    return slope
 
 
 def ball_directions(count: int | None, dim: int) -> Tensor:

@@ -20,6 +20,7 @@ from ...systems.black_box import Numbers
 from ..loop.controller import LQR, Policy, Value
 from ..problem.cost import Cost, QuadraticCost, matvec
 from ..problem.held_plant import Holding
+from .rollout import fitted_slope
 
 _SHARES = (1.0, 0.3)  # of the Newton step, that are tried
 _PROBE = 1e-3  # of the range of an input, or of 1, by which it is moved to find slopes
@@ -154,7 +155,7 @@ class SampledRollout(nn.Module):
         rise = (paid[..., :size] - paid[..., size:]) / width
         if self.along is None:
             known = self.rollout(self.basis.centers(after))
-            steep = matvec(slopes, _rise(self.basis, after, known.whole))
+            steep = matvec(slopes, fitted_slope(self.basis, after, known.whole))
         else:
             reach = slopes.square().sum(-1).sqrt()  # |B_j|, (..., m)
             units = slopes / torch.where(reach > 0, reach, 1.0).unsqueeze(-1)
@@ -176,7 +177,7 @@ class SampledRollout(nn.Module):
         """
         if self.along is not None:
             raise fail("SampledRollout", "basis", "must be of the states to know grad V^", self.basis.dim)
-        return _rise(self.basis, x, self.rollout(self.basis.centers(x)).whole)
+        return fitted_slope(self.basis, x, self.rollout(self.basis.centers(x)).whole)
 
     def _promise(self, after: Tensor, known: Promise) -> Promise:
         """What the base promises from (..., 1 + S, n), of which the first may be among the centers."""
@@ -252,20 +253,10 @@ class SampledRollout(nn.Module):
         return math.exp(-self.cost.discount * self.period)
 
 
-def _rise(basis: StaFBasis, z: Tensor, values: Tensor) -> Tensor:
-    """The slope at z of what fits the values at the centers there: (..., n), (..., M) -> (..., n)."""
-    space = basis.local(z)
-    coefficients = space.fit(values)
-    rise: Tensor = torch.func.grad(lambda d: space.evaluate(d.unsqueeze(-2), coefficients).sum())(
-        torch.zeros_like(z)
-    )
-    return rise
-
-
 def _along(basis: StaFBasis) -> Along:
     middle = basis.centers.directions.new_zeros(basis.count, basis.dim)
     places = basis.centers(middle[0])
-    weights = _rise(basis, middle, torch.eye(basis.count, dtype=middle.dtype)).mT  # a unit value a row
+    weights = fitted_slope(basis, middle, torch.eye(basis.count, dtype=middle.dtype)).mT  # a unit value a row
     at = (places == 0).all(-1).nonzero().flatten().tolist()
     return Along(places, weights, at[0] if at else None)
 

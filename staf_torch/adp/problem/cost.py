@@ -190,6 +190,10 @@ class Cost(nn.Module, abc.ABC):
     def saturate(self, v: Tensor) -> Tensor:
         """The admissible input that a free one stands for: (..., m) -> (..., m)."""
 
+    def admissible(self, u: Tensor) -> Tensor:
+        """What an actuator gives that is asked for u, (..., m): u within the bounds."""
+        return u if self.bounds is None else self.bounds.clip(u)
+
     def unsaturated(self, u: Tensor) -> Tensor:
         """A free input that `saturate` maps to u, or near to it at the edge: (..., m) -> (..., m)."""
         return u
@@ -253,7 +257,7 @@ class QuadraticCost(Cost):
         return self.input_of(box_minimum(2 * self.r.to(pull), pull, low, high, faces))
 
     def saturate(self, v: Tensor) -> Tensor:
-        return v if self.bounds is None else self.bounds.clip(v)
+        return self.admissible(v)
 
 
 class BoundedInputCost(Cost):
@@ -337,6 +341,10 @@ class BoundedInputCost(Cost):
         effort = self.effort(v)
         bound = self._side(effort)
         return self.input_of(bound * (effort / bound).tanh())
+
+    def admissible(self, u: Tensor) -> Tensor:
+        """What an actuator gives that is asked for u, (..., m): u within the bounds."""
+        return u if self.bounds is None else self.bounds.clip(u)
 
     def unsaturated(self, u: Tensor) -> Tensor:
         """b artanh(u / b), finite at the bound itself."""

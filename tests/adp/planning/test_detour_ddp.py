@@ -200,7 +200,7 @@ def test_a_first_plan_costs_less_than_every_detour_and_no_change_of_it_lowers_th
         assert bool(total(plans, x, torch.stack(control, dim=1), none) > found)
     others = best + 1e-3 * uniform(40, 6, 2, seed=1)
     x, still = BESIDE.expand(40, -1), torch.zeros(40, 1).double()
-    assert bool((total(plans, x, problem.clipped(others), still) > found).all())
+    assert bool((total(plans, x, problem.cost.admissible(others), still) > found).all())
 
 
 def test_a_plan_that_costs_more_than_expected_is_left_for_another_way() -> None:
@@ -412,7 +412,7 @@ def test_steps_within_bounds_end_where_no_admissible_change_lowers_j() -> None:
     others = plan.others(x)
     low, high = plan.bounds(x)
     assert (low.tolist(), high.tolist()) == ([-0.6, -0.1], [0.5, 0.4])
-    assert plan.clipped(tensor([9.0, -9.0])).tolist() == [0.5, -0.1]
+    assert plan.cost.admissible(tensor([9.0, -9.0])).tolist() == [0.5, -0.1]
     now: tuple[Tensor, ...] = (
         others,
         BEGUN,
