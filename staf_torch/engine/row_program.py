@@ -149,7 +149,7 @@ def program(problem: Problem, states: Tensor, carry: RowCarry, *, everything: bo
         problem = _numbers_as_tensors(problem)
         parts = problem.basis, problem.target, problem.law, problem.predictor
         made = _kept.of(Step(problem, everything), *parts, settings, owners=owners)
-    return made if made is not None and made.compiles(carry, states) else None
+    return made if made.compiles(carry, states) else None
 
 
 def _numbers_as_tensors(problem: Problem) -> Problem:

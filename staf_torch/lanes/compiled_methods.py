@@ -22,12 +22,11 @@ from .call import PlannedCall, ordinary
 from .contents import BOUND, Contents
 from .loops import tracing_now
 from .program import Program
-from .shared_programs import SharedPrograms
+from .shared_programs import shared_program
 from .tree import Tree, flatten, unflatten
 
 _PAYS = 100  # calls of a small batch in plain torch (some 10 ms each) that take as long as to compile
 _KEPT = 64  # shapes of calls that are remembered
-_shared: dict[str, SharedPrograms] = {}  # by the name of the functions
 WHEN = ("auto", "always", "never")
 _when = "auto"
 
@@ -249,7 +248,7 @@ class Rows:
     Args:
         function: plain torch, in which no row sees another.
         name: in the log.
-        parts: all that ``function`` reads, for `SharedPrograms`; none where nothing is to be shared.
+        parts: all that ``function`` reads, for `shared_program`; none where nothing is to be shared.
         copies: as in `Program`.
     """
 
@@ -257,9 +256,10 @@ class Rows:
         def step(carry: Tree, _: Tree, row: Tree) -> tuple[Tree, Tree]:
             return carry, function(*row)
 
-        shared = _shared.setdefault(name, SharedPrograms(name))
-        program = shared.of(step, *parts, copies=copies) if parts else None
-        self.program = Program(step, name=name, copies=copies) if program is None else program
+        if parts:
+            self.program = shared_program(name, step, *parts, copies=copies)
+        else:
+            self.program = Program(step, name=name, copies=copies)
         self._plans: dict[Any, PlannedCall] = {}
 
     @property

@@ -71,8 +71,8 @@ class SharedPrograms:
             return None
         return program
 
-    def of(self, step: Step, *parts: Any, copies: int = 0, owners: tuple[Any, ...] = ()) -> Program | None:
-        """Return the program of a step; None where a derivative with respect to its tensors may be wanted.
+    def of(self, step: Step, *parts: Any, copies: int = 0, owners: tuple[Any, ...] = ()) -> Program:
+        """Return the program of a step: plain torch where a derivative by one of its tensors may be wanted.
 
         Args:
             step: of a program.
@@ -92,7 +92,7 @@ class SharedPrograms:
             return new
         tensors = read.tensors
         if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors):
-            return None
+            return Program(step, name=self._name, compile=False)
         versions = [tensor._version for tensor in tensors]
         held = self._models.pop(read.key, None)
         if held is None or read.replaced(held.methods):
@@ -113,6 +113,27 @@ class SharedPrograms:
             self._latest[latest] = held.last, Contents(*owners) if again else None, owners  # kept: addresses
             _forget(self._latest, self._most)
         return held.last
+
+
+def shared_program(name: str, step: Step, *parts: Any, copies: int = 0) -> Program:
+    """Return the program of a step, shared with steps of the name that differ in tensors alone.
+
+    Example:
+        >>> def doubled(scale):
+        ...     return lanes.shared_program("doubled", lambda x, now, row: (x, scale * x), scale)
+        >>> doubled(torch.tensor(2.0))(torch.ones(1), steps=1)[1]
+        tensor([[2.]])
+
+        Shown by `staf_torch/lanes/README.md`.
+
+    Args:
+        name: in the log.
+        step, parts, copies: as in `SharedPrograms.of`.
+    """
+    return _kinds.setdefault(name, SharedPrograms(name)).of(step, *parts, copies=copies)
+
+
+_kinds: dict[str, SharedPrograms] = {}
 
 
 def _forget(held: dict[Hashable, Any], most: int) -> None:

@@ -9,15 +9,13 @@ from torch import Tensor
 
 from ..approximation.basis import StaFBasis, Target
 from ..centers import probe_points
-from ..lanes import Program, reduce
-from ..lanes.shared_programs import SharedPrograms
+from ..lanes import Program, reduce, shared_program
 from ..local_basis import NewtonSpace, evaluate_scaled, scale
 from ..numerics.linalg import condition_number
 
 PROBES = 97  # points of the ball to take a supremum over; in the plane 64 of them on its edge
 _BLOCK = 2**18  # numbers in a temporary of plain torch, so that it stays in cache
 _PAYS = 30_000  # states in plain torch (some 30 us each) that take as long as to compile
-_kept = SharedPrograms("the errors on a ball")
 
 
 class StateErrors(NamedTuple):
@@ -77,10 +75,11 @@ class StateErrorPass:
             row = tuple(part.reshape(-1, part.shape[-1]) for part in (x, coefficients, ideal))
             if self._program is None:
                 parts = self._basis, self._target, self._fixed
-                self._program = _kept.of(lambda _, __, row: ((), self._at(*row)), *parts)
-            self.compiled = self._program is not None and self._program.compiles((), (), row, steps=1)
+                self._program = shared_program(
+                    "the errors on a ball", lambda _, __, row: ((), self._at(*row)), *parts
+                )
+            self.compiled = self._program.compiles((), (), row, steps=1)
             if self.compiled:
-                assert self._program is not None
                 found: tuple[Tensor, ...] = self._program((), (), row, steps=1)[1]
                 return StateErrors(*(part.reshape(x.shape[:-1]) for part in found))
         width = self._points * self._basis.count

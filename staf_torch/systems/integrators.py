@@ -7,16 +7,14 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
-from ..lanes import Program
+from ..lanes import Program, shared_program
 from ..lanes.compiled_methods import worth
-from ..lanes.shared_programs import SharedPrograms
 from ..lanes.tree import Tree
 from ..numerics.checks import integer, positive_real, trailing
 from ..numerics.runge_kutta import runge_kutta_step
 from .base import ControlAffineSystem
 
 _PAYS = 10_000  # steps of a small batch in plain torch (some .1 ms each) that take as long as to compile
-_kept = SharedPrograms("a trajectory", 16)
 
 
 def trajectory(
@@ -85,8 +83,7 @@ def _program(system: ControlAffineSystem, dt: float, compile: bool) -> Program:
     def step(x: Tensor, now: Tree, row: Tree) -> tuple[Tensor, Tensor]:
         return runge_kutta_step(lambda at: _drift(system, at), x, dt), x
 
-    found = _kept.of(step, system, dt) if compile else None
-    return Program(step, name="a trajectory", compile=compile) if found is None else found
+    return shared_program("a trajectory", step, system, dt) if compile else Program(step, compile=False)
 
 
 def _drift(system: ControlAffineSystem, x: Tensor) -> Tensor:

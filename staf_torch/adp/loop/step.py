@@ -9,16 +9,14 @@ from typing import Any, NamedTuple, Self
 import torch
 from torch import Tensor, nn
 
-from ...lanes import Program
-from ...lanes.shared_programs import SharedPrograms, number
+from ...lanes import Program, shared_program
+from ...lanes.shared_programs import number
 from ...lanes.tree import flatten, unflatten
 from ...numerics.checks import choice, copied, fail, flag, positive_real
 from ...systems import Plant
 from ..problem.cost import Cost
 from ..problem.held_plant import Holding, fewest_and_most
 from .controller import Carried, Controller, Feedback
-
-_kept = SharedPrograms("the closed loop", 16)
 
 
 class LoopState(NamedTuple):
@@ -160,8 +158,7 @@ def program(loop: ClosedLoop, compile: bool) -> Program:
         return recorded(loop, state, uniform, {**shared, **dict(own)})
 
     parts = loop.with_numbers({**shared, **dict.fromkeys(row_numbers(loop))}) if numbers else loop
-    found = _kept.of(step, parts)
-    return Program(step, name="the closed loop") if found is None else found
+    return shared_program("the closed loop", step, parts)
 
 
 def row_numbers(loop: ClosedLoop) -> dict[str, Tensor]:
