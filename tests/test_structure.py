@@ -131,6 +131,15 @@ def classes() -> list[type]:
     ]
 
 
+def test_a_class_name_lives_in_one_module() -> None:
+    homes: dict[str, set[str]] = {}
+    for name, path in MODULES.items():
+        for node in nodes(path):
+            if isinstance(node, ast.ClassDef):
+                homes.setdefault(node.name.lstrip("_"), set()).add(name)
+    assert {name: found for name, found in homes.items() if len(found) > 1} == {}
+
+
 CHANGING = {"Loop": "a loop while it is traced", "StreamState": "a filter's, written in place"}
 
 

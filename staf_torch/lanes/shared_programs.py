@@ -27,7 +27,7 @@ def number(name: str, value: float) -> Tensor:
     return torch.tensor(value, dtype=torch.float64)
 
 
-class _Model(NamedTuple):
+class _KeptModel(NamedTuple):
     """A program that was traced, and the last one that followed from it."""
 
     traced: Program
@@ -53,7 +53,7 @@ class SharedPrograms:
 
     def __init__(self, name: str, most: int = 64) -> None:
         self._name, self._most, self._warned = name, most, False
-        self._models: dict[Hashable, _Model] = {}
+        self._models: dict[Hashable, _KeptModel] = {}
         self._latest: dict[Hashable, tuple[Program, Contents | None, tuple[Any, ...]]] = {}
 
     def unchanged(self, *owners: Any) -> Program | None:
@@ -98,7 +98,7 @@ class SharedPrograms:
         if held is None or read.replaced(held.methods):
             new, signature = Program(step, name=self._name, copies=copies), read.signature()
             new.described(signature, tensors)
-            held = _Model(new, tensors, new, tensors, versions, signature, read.methods())
+            held = _KeptModel(new, tensors, new, tensors, versions, signature, read.methods())
         elif held.versions != versions or not all(map(is_, held.tensors, tensors)):
             new = held.traced.with_others(step, list(zip(held.found, tensors, strict=True)))
             new.described(held.signature, tensors)
