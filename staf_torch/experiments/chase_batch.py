@@ -204,7 +204,7 @@ class _BatchMember:
 
 
 class _Thinned:
-    """The first trajectory at every so manieth time, for the figure."""
+    """The first trajectory, thinned to every k-th time, for the figure."""
 
     def __init__(self, times: int) -> None:
         self.stride = -(-times // _DRAWN_TIMES)
