@@ -1,4 +1,4 @@
-"""One call for a user: from a plant and a cost to a policy, and what is known of it."""
+"""Make a policy from a plant and a cost in one call, with a report."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class NearOptimal(SampledRollout):
 
     @property
     def planner(self) -> BoundedPlans | None:
-        """What the policy as a function of x plans with; None where it does not plan."""
+        """Planner of the policy as a function of x; None where it does not plan."""
         return self.plans() if self.plan else None
 
     def forward(self, x: Tensor) -> Tensor:
@@ -86,9 +86,9 @@ class NearOptimal(SampledRollout):
         return controls.index_copy(0, strained.nonzero().squeeze(1), planned).view(u.shape)
 
     def controller(self) -> Controller:
-        """What a loop runs: the policy, and where inputs have bounds and the LQR, followed from the state,
-        would meet one, a plan that is carried as long as this lasts. With ``plan`` a `RecedingHorizon` that
-        carries its plan from control to control all the time, the first one the best of several."""
+        """Return the controller for loops: the policy, and where the LQR, followed from the state, would meet a
+        bound of the inputs, a plan that is carried as long as this lasts. With ``plan`` a `RecedingHorizon`,
+        which carries its plan all the time, the first one the best of several."""
         if (planner := self.planner) is not None:
             return planner.loop
         planner = self.plans(_PLANNED)
@@ -98,8 +98,9 @@ class NearOptimal(SampledRollout):
         return {**vars(self), "_planners": {}}
 
     def plans(self, constants: float | None = None) -> BoundedPlans | None:
-        """What controls where the LQR would meet a bound; None without bounds or a plant in torch. It looks
-        so many time constants ahead, by default as far as the policy."""
+        """Return the planner for states where the LQR would meet a bound; None without bounds or torch.
+
+        It looks so many time constants ahead, by default as far as the policy."""
         limited = self.cost.bounds is not None and not self.cost.discount
         if not limited or not self.plant.traceable or self.plant.period not in (None, self.period):
             return None
@@ -116,7 +117,7 @@ class NearOptimal(SampledRollout):
     def report(
         self, *, states: int = 20, spread: float | None = None, optimum: bool = True, seed: int = 0
     ) -> dict[str, Any]:
-        """What was chosen, and how good it is from states drawn uniformly around the set-point.
+        """Report the choices, and the costs from states drawn uniformly around the set-point.
 
         Args:
             states: how many.
@@ -300,7 +301,7 @@ def _periods(seconds: float, period: float) -> int:
 
 
 def _warn_if_slow(policy: NearOptimal) -> None:
-    """One line in the log where a simulator leaves little of the period to anything else, or nothing."""
+    """Warn in the log where a simulator takes most of the period, or more."""
     x = policy.plant.equilibrium().unsqueeze(0)
     tries = list[float]()
     while len(tries) < 2 or (len(tries) < _TRIES and sum(tries) < _PATIENCE):

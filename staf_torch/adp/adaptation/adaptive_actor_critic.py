@@ -23,7 +23,7 @@ from .windows import IntegralWindows, Window
 
 
 class LearnedModel(NamedTuple):
-    """What an `AdaptiveActorCritic` carries, a row a trajectory."""
+    """Carried state of an `AdaptiveActorCritic`, a row a trajectory."""
 
     weights: Weights
     estimate: Estimate
@@ -143,7 +143,7 @@ class AdaptiveActorCritic(Controller):
     def certain(
         self, x: Tensor, critic: Tensor, uniform: Tensor, terms: BellmanTerms, estimate: Estimate
     ) -> Tensor:
-        """Whether V^ falls at all points nearly as it should for every theta that may be: (...) bool.
+        """Return where V^ falls at all points nearly as it should for every possible theta, (...) bool.
 
         Args:
             x: (..., n).
@@ -168,7 +168,7 @@ def _chosen(where: Tensor, one: Weights, other: Weights) -> Weights:
 
 
 class Identifying(NamedTuple):
-    """What an `IdentifyingTracker` carries."""
+    """Carried state of an `IdentifyingTracker`."""
 
     weights: Weights
     known: Identified

@@ -21,7 +21,7 @@ from .windows import IntegralWindows, Window
 
 
 class Adaptation(NamedTuple):
-    """What an adaptive controller knows and does, a row a trajectory."""
+    """Carried state of an `AdaptiveLQR`, a row a trajectory."""
 
     estimate: Estimate
     certain: Tensor  # (...) 1 where the redesigned policy has the control, 0 where the robust one has it

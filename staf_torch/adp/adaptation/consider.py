@@ -17,7 +17,7 @@ from .parametric import ParametricPlant
 
 
 class Considered(NamedTuple):
-    """What a `ConsiderFilter` knows: x = mean + e + sensitivity (theta - theta^), with Cov e = covariance."""
+    """Estimate of a `ConsiderFilter`: x = mean + e + sensitivity (theta - theta^), Cov e = covariance."""
 
     mean: Tensor  # (..., n)
     covariance: Tensor  # (..., n, n) of what noise and disturbances make
@@ -88,7 +88,7 @@ class ConsiderFilter:
         )
 
     def step(self, state: Considered, y: Tensor, u: Tensor, estimate: Estimate, dt: float) -> Considered:
-        """What is known with the measurement of now.
+        """Return the estimate with the present measurement.
 
         Args:
             state: after the measurement before.

@@ -27,7 +27,7 @@ _WEIGHTS = (0.17392742256872692, 0.32607257743127307, 0.32607257743127307, 0.173
 
 
 class DriftEstimate(NamedTuple):
-    """What a `StreamDrift` knows, a row a trajectory."""
+    """Estimate of a `StreamDrift`, a row a trajectory."""
 
     anchor: Tensor  # (..., n) the state that the centers surround
     mean: Tensor  # (..., r, M n) weights of the rows
@@ -121,7 +121,7 @@ class StreamDrift:
         self.windows = IntegralWindows(plant, length, noise=noise)
 
     def init(self, x: Tensor) -> DriftEstimate:
-        """Nothing learned yet, around the states (..., n)."""
+        """Return the prior around the states (..., n)."""
         count = self.offsets.numel()
         identity = torch.eye(count, dtype=x.dtype, device=x.device).expand(*x.shape[:-1], count, count)
         return DriftEstimate(
@@ -216,7 +216,7 @@ class StreamDrift:
         return places.unsqueeze(-1) * features.unsqueeze(-2)
 
     def _moved(self, now: DriftEstimate, x: Tensor, ready: Tensor) -> DriftEstimate:
-        """With the centers around x, where a window ended outside the ball."""
+        """Move the centers to x where a window ended outside the ball."""
         step = self.known.difference(x, now.anchor)
         moves = ready & (step.square().sum(-1) > self.radius**2)
         step = torch.where(moves.unsqueeze(-1), step, 0.0)
@@ -239,7 +239,7 @@ class StreamDrift:
 
 
 class DriftAdaptation(NamedTuple):
-    """What a `DriftLQR` knows and does, a row a trajectory."""
+    """Carried state of a `DriftLQR`, a row a trajectory."""
 
     estimate: DriftEstimate
     certain: Tensor  # (...) 1 where the learned model has the control, 0 where the robust policy has it

@@ -31,7 +31,7 @@ class Stack(NamedTuple):
 
 
 class HistoryStack:
-    """Of the equations S theta = z that come, the N whose sum of S'S has the largest least eigenvalue.
+    """Keep the N equations S theta = z whose sum of S'S has the largest least eigenvalue.
 
     Empty places are filled with what differs enough from the equation before. Then an equation takes the
     place with which the least eigenvalue grows most, if it grows. One place is tried a step: an equation is
@@ -112,7 +112,7 @@ class HistoryStack:
         return self._placed(_tried(state, equation, goes >= 0), goes, fills)
 
     def _fills(self, state: Stack, equation: Equation) -> Tensor:
-        """Whether the equation goes to an empty place: it differs enough from the one before."""
+        """Return where the equation takes an empty place: it differs enough from the one before."""
         change = (equation.s - state.tried_s).square().sum((-2, -1))
         new = change > self.novelty**2 * equation.s.square().sum((-2, -1))
         return equation.ready & (state.filled < self.size) & (new | (state.filled == 0))

@@ -21,7 +21,7 @@ class Estimate(NamedTuple):
     resets: Tensor  # (...) how often the covariance was opened again
 
     def recorded(self) -> dict[str, Tensor]:
-        """What a `LoopResult` keeps of it."""
+        """Return the parts that a `LoopResult` keeps."""
         return {"theta": self.theta, "theta_covariance": self.covariance, "resets": self.resets}
 
 

@@ -22,7 +22,7 @@ _PASSES = 2  # linearisations of the conditions in u
 
 
 class Guarded(NamedTuple):
-    """What a `RobustFilter` carries, a row a trajectory."""
+    """Carried state of a `RobustFilter`, a row a trajectory."""
 
     inner: Carried  # of the controller behind it
     estimate: Estimate

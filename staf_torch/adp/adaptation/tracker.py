@@ -20,7 +20,7 @@ GainOfRows = float | Sequence[float] | Tensor
 
 
 class Tracking(NamedTuple):
-    """What a `ConcurrentTracker` carries, a row a trajectory."""
+    """Carried state of a `ConcurrentTracker`, a row a trajectory."""
 
     theta: Tensor  # (..., p)
     feedback: Tensor  # (...) K

@@ -24,7 +24,7 @@ class Equation(NamedTuple):
 
 
 class Window(NamedTuple):
-    """What is known of the window so far: integrals, or of `SlopeWindows` Y and h in its middle."""
+    """Window so far: integrals, or of `SlopeWindows` Y and h in its middle."""
 
     x: Tensor  # (..., n) the state that was measured last; of `SlopeWindows` at the beginning
     u: Tensor  # (..., m) the input held since
@@ -43,7 +43,7 @@ class Windows(abc.ABC):
     length: float  # s, of the longest
 
     def init(self, x: Tensor, length: Tensor | None = None) -> Window:
-        """Nothing measured yet, a row each of the states (..., n).
+        """Return an empty window, a row each of the states (..., n).
 
         Args:
             x: for the shape alone.
@@ -164,7 +164,7 @@ class IntegralWindows(Windows):
         return (math.pi * (state.elapsed + 0.5 * dt) / state.length).sin().square()
 
     def _variance(self, state: Window, dt: float) -> Tensor:
-        """Of the noise of z: sum (phi_k - phi_k-1)^2 of the noise's."""
+        """Return the variance of the noise of z: sum (phi_k - phi_k-1)^2 of the noise's."""
         share = 0.5 * math.pi**2 * dt / state.length if self.smooth else torch.full_like(state.length, 2.0)
         return self.noise**2 * share
 

@@ -53,7 +53,7 @@ def hjb_residual(
 
 
 class BellmanTerms(NamedTuple):
-    """What the laws need at some points, with the actor's control there.
+    """Terms of the Bellman equation at some points, with the actor's control there.
 
     The Bellman error of the critic weights Wc is delta = rate + regressor'Wc.
     """

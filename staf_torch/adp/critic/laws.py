@@ -91,7 +91,7 @@ class BellmanSums(NamedTuple):
 
 
 class ActorCriticLaw(abc.ABC):
-    """How the weights move, given the Bellman terms.
+    """Law by which the weights move, given the Bellman terms.
 
     Example:
         >>> [issubclass(law, adp.ActorCriticLaw) for law in (adp.Information, adp.Published, adp.Frozen)]
@@ -127,7 +127,7 @@ class ActorCriticLaw(abc.ABC):
 
     @abc.abstractmethod
     def _move(self, sums: BellmanSums, weights: Weights, dt: float) -> Weights:
-        """The same without the projection."""
+        """Return the weights after ``dt`` seconds, not projected."""
 
     def _project(self, weights: Tensor) -> Tensor:
         if self.bound is None:

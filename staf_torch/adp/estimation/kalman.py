@@ -18,7 +18,7 @@ from ..problem.cost import Output, matvec
 
 
 class Belief(NamedTuple):
-    """What a Kalman filter knows of the state, a row a trajectory."""
+    """Mean and covariance of the state, a row a trajectory."""
 
     mean: Tensor  # (..., n)
     covariance: Tensor  # (..., n, n)
@@ -180,7 +180,7 @@ class UnscentedKalman(KalmanFilter):
 
 
 class Observing(NamedTuple):
-    """What `Observed` carries."""
+    """Carried state of `Observed`."""
 
     belief: Belief
     steps: Tensor  # (B,) measurements so far

@@ -66,11 +66,11 @@ class Controller(nn.Module, abc.ABC):
 
     @abc.abstractmethod
     def init(self, x0: Tensor) -> Carried:
-        """What is carried into the first step, a row each of the states x0 (B, n)."""
+        """Return the carried state for the first step, a row each of the states x0 (B, n)."""
 
     @abc.abstractmethod
     def step(self, x: Tensor, carried: Carried, uniform: Tensor, dt: float) -> tuple[Tensor, Carried]:
-        """The control to hold for ``dt`` seconds, and what is carried on after them.
+        """Return the control to hold for ``dt`` seconds, and the carried state after them.
 
         Args:
             x: (B, n).

@@ -13,7 +13,7 @@ from .controller import Controller
 
 @dataclasses.dataclass(frozen=True)
 class OptimumSettings:
-    """How the optimum is found where no formula knows it."""
+    """Settings of the search for the optimum where no formula knows it."""
 
     shooting: bool
     states: int  # recorded states, of all trajectories together, whose V* and u* are wanted
@@ -38,5 +38,5 @@ class AdpProblem:
     optimum: OptimumSettings
 
     def with_states(self, states: Tensor) -> AdpProblem:
-        """The same from other initial states (B, n)."""
+        """Return the problem with other initial states (B, n)."""
         return dataclasses.replace(self, initial_states=states)

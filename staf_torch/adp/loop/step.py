@@ -1,4 +1,4 @@
-"""One step of the closed loop, plant and controller together and all rows at once, and many of them."""
+"""Step of the closed loop, plant and controller together, all rows at once; its program over many steps."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class LoopState(NamedTuple):
 
 
 class ClosedLoop(nn.Module):
-    """One step of controller and plant: the control is computed at the state, clipped to the bounds of the
+    """Step of controller and plant: the control is computed at the state, clipped to the bounds of the
     cost or the plant, and held for dt.
 
     Args:
@@ -182,7 +182,7 @@ def recorded(
 
 
 class Record(NamedTuple):
-    """What is kept of one time."""
+    """Record of one time."""
 
     x: Tensor  # (B, n)
     u: Tensor  # (B, m)

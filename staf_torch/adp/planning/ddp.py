@@ -37,7 +37,7 @@ class Trajectories(NamedTuple):
 
 
 class Reference(NamedTuple):
-    """What a control is a feedback around."""
+    """Trajectory and feedback that a control is applied around."""
 
     state: Tensor  # (B, T, n)
     feedback: Tensor  # (B, T, m, n)
@@ -267,7 +267,7 @@ class BoxDDP:
         return self._models(found, terminal)
 
     def _iterated(self, now: SearchState, known: Derivatives, terminal: LocalModel) -> SearchState:
-        """One iteration: a backward pass, the best length of its change, and what that says of the row."""
+        """Take one iteration: a backward pass, the best length of its change, the row's regularisation."""
         end, (change, feedback, _, _) = self._backwards(now, known, now.mu, now.full, terminal)
         definite = end.definite > 0
         around = now.state[:, :-1], now.control, change, feedback
@@ -322,7 +322,7 @@ class BoxDDP:
     def forward(
         self, x: Tensor, now: tuple[Tensor, ...], lengths: Tensor
     ) -> tuple[Tensor, tuple[Tensor, ...]]:
-        """One step of all lengths: x (B, L, n), (B, n), (B, m), (B, m), (B, m, n), (B, L)."""
+        """Take one step of all lengths: x (B, L, n), (B, n), (B, m), (B, m), (B, m, n), (B, L)."""
         state, control, change, feedback = now
         apart = x - state.unsqueeze(1)
         u = control.unsqueeze(1) + lengths.unsqueeze(-1) * change.unsqueeze(1)
@@ -347,7 +347,7 @@ class BoxDDP:
     def backward(
         self, after: Model, now: tuple[Tensor, ...], row: tuple[Tensor, Tensor]
     ) -> tuple[Model, tuple[Tensor, ...]]:
-        """One step of the recursion, backward in time."""
+        """Take one step of the recursion, backward in time."""
         (first, second, cost_first, cost_second, control), (mu, full) = now, row
         n = self.problem.dim
         bent = (after.gradient[..., None, None] * second).sum(-3)

@@ -51,7 +51,7 @@ class PlanProblem:
         self.moved, self.weight = moved, weight
 
     def improve(self, now: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
-        """One step: the first of a few lengths that lowers J."""
+        """Take one step: the first of a few lengths that lowers J."""
         others, done, *parts = now
         plan = DetourPlan(*parts)
         change, feedback = self._newton(plan, others, done)
@@ -97,7 +97,7 @@ class PlanProblem:
         return self.hold * (self.cost.state_rate(x) + self.cost.input_rate(u) + self.penalty(x, t))
 
     def longer(self, x: Tensor, u: Tensor) -> Tensor:
-        """What a last period with u adds to J where no constraint is met: (B, n), (B, m) -> (B,)."""
+        """Return what a last period with u adds to J away from constraints: (B, n), (B, m) -> (B,)."""
         rates = self.cost.state_rate(x) + self.cost.input_rate(u)
         value = self.detours.terminal
         added: Tensor = self.hold * rates + value(self._advance(x, u)) - value(x)
@@ -241,7 +241,7 @@ _PROBES = 8  # states at which it is tried whether the inputs move what they mus
 
 
 class CarriedPlan(NamedTuple):
-    """What `DetourPlans` carries."""
+    """Carried state of `DetourPlans`."""
 
     control: Tensor  # (B, T, m)
     expected: Tensor  # J of it, (B, 1)
@@ -372,14 +372,14 @@ class DetourPlans(Controller):
 
     @compiled("first plans around what moves")
     def _first_plan(self, z: Tensor) -> Tensor:
-        """Of rows of (x, controls) J and the controls of the plan after one step."""
+        """Return J and the controls after one step, from rows of (x, controls)."""
         x, control = z.split((self.cost.dim, z.shape[-1] - self.cost.dim), dim=-1)
         _, _, _, control, total = self._improved(x, control, torch.zeros_like(x[:, :1]), 1)
         return torch.cat((total.unsqueeze(-1), control.flatten(1)), dim=-1)
 
     @compiled("a plan around what moves")
     def _next(self, z: Tensor) -> Tensor:
-        """Of rows of (x, controls, J expected, periods so far) the control, and these for the next period."""
+        """Return the control and the next carried numbers, from rows of (x, controls, J, periods)."""
         flat = z.reshape(-1, z.shape[-1])
         n, problem = self.cost.dim, self._problem
         x, control, expected, done = flat.split((n, flat.shape[-1] - n - 2, 1, 1), dim=-1)
@@ -429,7 +429,7 @@ class DetourPlans(Controller):
         return found
 
     def _followed(self, y: Tensor, others: Tensor, tried: Tensor, done: Tensor) -> DetourPlan:
-        """What a detour (B, k + 1) does."""
+        """Follow a detour (B, k + 1)."""
 
         def wanted(y: Tensor, others: Tensor, _: Tensor, k: Tensor) -> Tensor:
             x = self._problem.whole(y, others).unsqueeze(1)

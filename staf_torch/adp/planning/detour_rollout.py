@@ -22,7 +22,7 @@ _AROUND = (0.2, 0.07)  # by which the detour of the period before is varied, in 
 
 
 class Detour(NamedTuple):
-    """What a `DetourRollout` carries."""
+    """Carried state of a `DetourRollout`."""
 
     way: Tensor  # along each axis, and for how many periods, (B, k + 1)
     done: Tensor  # periods since the beginning, (B, 1)
@@ -140,7 +140,7 @@ class DetourRollout(Controller):
 
     @compiled("a choice of detours")
     def _chosen(self, z: Tensor) -> Tensor:
-        """Of rows of (x, detour, periods so far) the control, and both for the next period."""
+        """Return the control and the next carried numbers, from rows of (x, detour, periods so far)."""
         k = len(self.axes)
         flat = z.reshape(-1, z.shape[-1])
         x, before, done = flat.split((flat.shape[-1] - k - 2, k + 1, 1), dim=-1)
@@ -218,7 +218,7 @@ def _detours(count: int, sizes: Tensor, lengths: Sequence[int]) -> Tensor:
 
 
 def _changes(count: int) -> Tensor:
-    """Nothing, and small changes of a detour along each axis: (C, count + 1)."""
+    """Return no change, and small changes of a detour along each axis: (C, count + 1)."""
     unit = torch.eye(count, count + 1, dtype=torch.float64)
     steps = [sign * share * unit for share in _AROUND for sign in (1.0, -1.0)]
     return torch.cat((torch.zeros(1, count + 1, dtype=torch.float64), *steps))

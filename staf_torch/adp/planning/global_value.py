@@ -21,7 +21,7 @@ _ARRIVED = 0.01  # share of a trajectory's cost that may be the terminal value: 
 
 
 class Choice(NamedTuple):
-    """What the memory knows at states x."""
+    """Best candidates at states x."""
 
     control: Tensor  # u, (B, m)
     value: Tensor  # cost of the best candidate, (B,)
@@ -227,7 +227,7 @@ class GlobalValue(nn.Module):
     def _judged(
         self, carry: tuple[()], now: tuple[()], row: tuple[Tensor, Tensor, Tensor]
     ) -> tuple[tuple[()], tuple[Tensor, Tensor, Tensor]]:
-        """What becomes of candidates, as a step of a program."""
+        """Follow candidates, as a step of a program."""
         return carry, follow_plan(self.problem, self.region, self.worst, *row)
 
     def replay(self, x: Tensor, entries: Tensor, steps: int) -> tuple[Tensor, Reference]:
@@ -269,13 +269,13 @@ class GlobalValue(nn.Module):
         return frame
 
     def _plans(self) -> Tensor:
-        """What is followed: the library, and then the goal under its linear feedback."""
+        """Table of plans: the library, and then the goal under its linear feedback."""
         library, hold = self.library, resting(self.problem, self._goals()).unsqueeze(1)
         steps = packed(library.state[:, :-1], library.control, library.feedback)
         return torch.cat((steps, hold.expand(-1, self.lookahead + 1, -1)), dim=1).flatten(0, 1)
 
     def _models(self) -> Tensor:
-        """What is left to pay: along the library, and then at the goal."""
+        """Table of values: along the library, and then at the goal."""
         library, count, n = self.library, len(self.library.state), self.problem.dim
         parts = library.state, library.value.unsqueeze(-1), library.gradient, library.curvature.flatten(2)
         linear = torch.cat((torch.zeros(1 + n, dtype=torch.float64), 2 * self.problem.p.flatten()))

@@ -1,4 +1,4 @@
-"""How the memory of a global value grows: optimal trajectories from everywhere, each helping the others."""
+"""Fill the memory of a global value: optimal trajectories from everywhere, each helping the others."""
 
 from __future__ import annotations
 

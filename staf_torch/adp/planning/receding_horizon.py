@@ -132,7 +132,7 @@ class RecedingHorizon(Controller):
         return u, after
 
     def _begun(self, x: Tensor, carried: Following) -> tuple[Tensor, Reference]:
-        """What a search begins from: the memory's plan, or the carried one."""
+        """Return the start of a search: the memory's plan, or the carried one."""
         if self.memory is not None:
             return self._remembered(x)
         state, control, feedback = unpacked(self.problem, carried.plan)
@@ -231,12 +231,12 @@ class BoundedPlans:
         self._search = BoxDDP(problem, steps=steps, iterations=_ITERATIONS)
 
     def strained(self, x: Tensor) -> Tensor:
-        """Whether the base, followed over the policy's horizon, meets a bound: (B, n) -> (B,) bool."""
+        """Return where the base, followed over the policy's horizon, meets a bound: (B, n) -> (B,) bool."""
         return self.policy.meets_bound(x).reshape(-1) > 0
 
     @functools.cached_property
     def loop(self) -> RecedingHorizon:
-        """One for all controllers, as it holds programs and nothing of a loop."""
+        """Controller of all loops: it holds programs and nothing of a loop."""
         return RecedingHorizon(self.problem, steps=self.steps, held=True)
 
     def __call__(self, x: Tensor) -> Tensor:

@@ -129,12 +129,12 @@ class PathIntegral(Controller):
         return self.problem.steered(x, plan[:, 0]), ahead
 
     def costs(self, x: Tensor, change: Tensor) -> Tensor:
-        """What changes of the feedback cost, inf where that is not finite: (B, n), (B, S, T, m) -> (B, S)."""
+        """Return the costs of changes of the feedback, inf if not finite: (B, n), (B, S, T, m) -> (B, S)."""
         cost = self._roll.over((change,), (x,))
         return torch.where(torch.isfinite(cost), cost, torch.inf)
 
     def _paid(self, x: Tensor, change: Tensor) -> Tensor:
-        """What a change of the feedback costs, a row each: (R, n), (R, T, m) -> (R,)."""
+        """Return the cost of a change of the feedback, a row each: (R, n), (R, T, m) -> (R,)."""
 
         def step(now: tuple[Tensor, Tensor], change: Tensor) -> tuple[tuple[Tensor, Tensor], tuple[()]]:
             after, cost = self.problem.advance(now[0], self.problem.steered(now[0], change))
@@ -146,6 +146,6 @@ class PathIntegral(Controller):
 
 
 def _hats(steps: int, knots: int) -> Tensor:
-    """What each knot counts at each step, linear between the knots: (T, knots)."""
+    """Weights of the knots at each step, linear between the knots: (T, knots)."""
     place = torch.linspace(0, knots - 1, steps, dtype=torch.float64).unsqueeze(1)
     return (1 - (place - torch.arange(knots, dtype=torch.float64)).abs()).clamp(min=0)

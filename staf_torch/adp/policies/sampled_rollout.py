@@ -33,7 +33,7 @@ RolloutStretch = tuple[Tensor, Tensor, Tensor]
 
 
 class Promise(NamedTuple):
-    """What rollouts of the base say."""
+    """Costs that rollouts of the base promise."""
 
     whole: Tensor  # cost over the horizon and V_T at its end, (...)
     part: Tensor  # likewise over three quarters of it
@@ -180,7 +180,7 @@ class SampledRollout(nn.Module):
         return fitted_slope(self.basis, x, self.rollout(self.basis.centers(x)).whole)
 
     def _promise(self, after: Tensor, known: Promise) -> Promise:
-        """What the base promises from (..., 1 + S, n), of which the first may be among the centers."""
+        """Return the base's costs from (..., 1 + S, n), of which the first may be among the centers."""
         middle = None if self.along is None else self.along.middle
         if middle is None:
             return self.rollout(after)
@@ -189,7 +189,7 @@ class SampledRollout(nn.Module):
         return Promise(*(torch.cat(pair, dim=-1) for pair in zip(first, others, strict=True)))
 
     def rollout(self, x: Tensor) -> Promise:
-        """What the base costs from x on: (..., n)."""
+        """Return the base's costs from x on: (..., n)."""
         rest = max(1, self.steps - round(_SHORTER * self.steps))
         passes = math.gcd(self.steps, rest)  # of a stretch of which both are made: a program has one loop
         discount = self._discount()
@@ -245,7 +245,7 @@ class SampledRollout(nn.Module):
         return Promise(spent[..., -1] + share[-1] * self.terminal(end), part, free)
 
     def value(self, x: Tensor) -> Tensor:
-        """What the chosen control promises: (..., n) -> (...)."""
+        """Return the cost that the chosen control promises: (..., n) -> (...)."""
         after, paid = self.holding(x, self.control(x))
         return paid + self._discount() * self.rollout(after).whole
 
@@ -306,7 +306,7 @@ class FollowedSimulator:
 
 
 def followed(plant: Plant, base: Policy, bounds: Bounds, period: float) -> FollowedSimulator | None:
-    """What follows a policy through a simulator that a user brings; None of other plants, or where the plant
+    """Return what follows a policy through a user's simulator; None of other plants, or where the plant
     does more than its function.
 
     Args:

@@ -1,1 +1,1 @@
-"""What is controlled and what it costs: rates, set-points and paths, bounds, held controls."""
+"""Plants with their costs: rates, set-points and paths, bounds, held controls."""

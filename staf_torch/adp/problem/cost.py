@@ -1,4 +1,4 @@
-"""What a controller is paid for, and the policy that a value gradient implies."""
+"""Cost rates, and the policy that a value gradient implies."""
 
 from __future__ import annotations
 
@@ -146,7 +146,7 @@ class Cost(nn.Module, abc.ABC):
 
     @property
     def plain(self) -> bool:
-        """Whether this is x'Qx + U(u) at the origin: no set-point, output, bounds or discount."""
+        """True where this is x'Qx + U(u) at the origin: no set-point, output, bounds or discount."""
         stated = (self.target, self.target_input, self.output, self.bounds)
         return all(one is None for one in stated) and not self.discount
 
@@ -191,7 +191,7 @@ class Cost(nn.Module, abc.ABC):
         """The admissible input that a free one stands for: (..., m) -> (..., m)."""
 
     def admissible(self, u: Tensor) -> Tensor:
-        """What an actuator gives that is asked for u, (..., m): u within the bounds."""
+        """Return u within the bounds, as an actuator applies it: (..., m) -> (..., m)."""
         return u if self.bounds is None else self.bounds.clip(u)
 
     def unsaturated(self, u: Tensor) -> Tensor:
@@ -341,10 +341,6 @@ class BoundedInputCost(Cost):
         effort = self.effort(v)
         bound = self._side(effort)
         return self.input_of(bound * (effort / bound).tanh())
-
-    def admissible(self, u: Tensor) -> Tensor:
-        """What an actuator gives that is asked for u, (..., m): u within the bounds."""
-        return u if self.bounds is None else self.bounds.clip(u)
 
     def unsaturated(self, u: Tensor) -> Tensor:
         """b artanh(u / b), finite at the bound itself."""

@@ -70,7 +70,7 @@ def exact_hold(f: Tensor, g: Tensor, q: Tensor, r: Tensor, period: float, *, dis
 
 
 def periods(call: str, plant: Plant, dt: float) -> int:
-    """How many steps of a plant in discrete time make ``dt`` seconds.
+    """Return the number of steps of a plant in discrete time that make ``dt`` seconds.
 
     Raises:
         ValueError: if it is not a whole number, at least 1.
@@ -224,11 +224,11 @@ class HeldLoop(NamedTuple):
         return cls(system, basis.mT @ f @ basis, basis.mT @ g, slope @ basis, True)
 
     def spectral_radius(self, period: float) -> float:
-        """Of one period; NaN where something has no finite slope."""
+        """Return the spectral radius over one period; NaN where something has no finite slope."""
         return self._radius(*_held(self.plant, self.f, self.g, period)) if self.finite else math.nan
 
     def largest_period(self) -> float | None:
-        """As `HeldStability` says."""
+        """Return the largest stable period, as in `HeldStability`."""
         if not self.finite:
             return None
         if self.plant.period is not None:

@@ -189,7 +189,7 @@ class SampledProblem(nn.Module):
         return self.offset(x, torch.cat((self.path(x[..., -1]), x[..., -1:]), dim=-1))
 
     def terminal(self, x: Tensor) -> Tensor:
-        """What is paid where a plan ends: d'Pd of the linear feedback, or d'Sd: (..., n) -> (...)."""
+        """Return the cost at the end of a plan: d'Pd of the linear feedback, or d'Sd: (..., n) -> (...)."""
         d = self.away(x)
         return ((d.unsqueeze(-2) * self.end).sum(-1) * d).sum(-1)
 
@@ -268,7 +268,7 @@ class SampledProblem(nn.Module):
 
 
 class Derivatives(NamedTuple):
-    """Of x+ = F(z) and of the cost l(z) with respect to z = (x, u)."""
+    """Derivatives of x+ = F(z) and of the cost l(z) with respect to z = (x, u)."""
 
     first: Tensor  # dF/dz, (B, n, n + m)
     second: Tensor  # d2F/dz2, (B, n, n + m, n + m)

@@ -1,4 +1,4 @@
-"""What following a path costs: the distance from a state that moves with the time."""
+"""Cost of following a path: the distance from a state that moves with the time."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ _NOTHING = 1e-9  # slope below which there is none
 
 
 class Held(NamedTuple):
-    """What a held control does to a plant in a box."""
+    """Motion of a plant in a box under a held control."""
 
     middle: Tensor  # x(dt/2) - x, (B, n)
     end: Tensor  # x(dt) - x
@@ -183,7 +183,7 @@ class BoxFilter(nn.Module):
         return normal, (normal * u.unsqueeze(-2)).sum(-1) - value
 
     def _conditions(self, s: Tensor, u: Tensor, hold: Tensor, left: Tensor) -> Tensor:
-        """What the walls ask for, each met where it is >= 0: (B, W)."""
+        """Return the conditions of the walls, each met where it is >= 0: (B, W)."""
         held, apart = self._held(self.box.inverse(s), u, hold), self._apart(s)
         found = [
             self._condition(held, k, side, degree, apart[side][:, k], hold, left)
@@ -194,7 +194,7 @@ class BoxFilter(nn.Module):
     def _condition(
         self, held: Held, k: int, side: int, degree: int, apart: Tensor, hold: Tensor, left: Tensor
     ) -> Tensor:
-        """What a wall asks for, met where it is >= 0: (B,)."""
+        """Return the condition of a wall, met where it is >= 0: (B,)."""
         excursion = _excursion(held, k, side, hold)
         room = (1 - left) * apart
         if degree == 1:
@@ -221,7 +221,7 @@ class BoxFilter(nn.Module):
 
 
 def _excursion(held: Held, k: int, side: int, hold: Tensor) -> Tensor:
-    """How far a coordinate comes towards a wall, at least 0: (B,)."""
+    """Return how far a coordinate comes towards a wall, at least 0: (B,)."""
     middle, end = side * held.middle[:, k], side * held.end[:, k]
     start, half, last = (side * rate[:, k] for rate in held.rates)
     first = _summit(torch.zeros_like(middle), middle, start, half, 0.5 * hold)
@@ -245,7 +245,7 @@ def _summit(first: Tensor, last: Tensor, rise: Tensor, fall: Tensor, length: Ten
 
 
 def _degrees(box: Barrier) -> list[int]:
-    """Of every coordinate, 1 or 2: which derivative of x the inputs move; 0 for neither."""
+    """Return for every coordinate which derivative of x the inputs move, 1 or 2; 0 for neither."""
     plant, size = box.plant, box.dim or 0
     share = torch.rand(_PROBES, size, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     x = box.floor.cpu() + (box.ceiling - box.floor).cpu() * share

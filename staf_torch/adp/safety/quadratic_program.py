@@ -16,7 +16,7 @@ _ROUNDED, _OWN = 64, 2**20  # roundings by which a point may miss an inequality,
 
 
 class _Small(NamedTuple):
-    """What is small beside 1, and yet not lost in it."""
+    """Tolerances: small beside 1, and yet not lost in it."""
 
     firm: float  # shortfall of a unit normal's inequality a unit of its multiplier, where it holds
     soft: float  # the same, where it cannot hold
@@ -107,7 +107,7 @@ def nearest_admissible(
 
 
 def _interval(wanted: Tensor, unit: Tensor, far: Tensor, low: Tensor, high: Tensor) -> Tensor:
-    """One unknown: u >= c where a = 1, u <= -c where a = -1."""
+    """Solve for one unknown: u >= c where a = 1, u <= -c where a = -1."""
     slope = unit[..., 0]
     bottom = torch.where(slope <= 0, -torch.inf, far).amax(-1, keepdim=True)
     top = torch.where(slope >= 0, torch.inf, -far).amin(-1, keepdim=True)

@@ -31,7 +31,7 @@ _NOTHING = 1e-9  # of the slopes that make it, below which the effect of a contr
 
 
 class Filtered(NamedTuple):
-    """What a filter says at states x."""
+    """Result of a filter at states x."""
 
     control: Tensor  # (..., m)
     margin: Tensor  # h of every constraint now, (..., k)
@@ -39,7 +39,7 @@ class Filtered(NamedTuple):
 
 
 class Watched(NamedTuple):
-    """What a `SafetyFilter` carries; all but the first are recorded by these names."""
+    """Carried state of a `SafetyFilter`; all but the first are recorded by these names."""
 
     inner: Carried  # of the controller behind it
     filtered_steps: Tensor  # (B,)
@@ -162,7 +162,7 @@ class SafetyFilter(Controller):
         return self.restrain(x, self.controller.policy(x), t).control
 
     def restrain(self, x: Tensor, u: Tensor, t: float | Tensor | None = None) -> Filtered:
-        """What to apply in place of u: (..., n), (..., m).
+        """Return the control to apply in place of u: (..., n), (..., m).
 
         Args:
             x: (..., n).
@@ -210,7 +210,7 @@ class SafetyFilter(Controller):
         return torch.stack(columns, dim=-1).reshape(*x.shape[:-1], -1)
 
     def report(self, result: LoopResult) -> dict[str, Any]:
-        """What became of the constraints in a closed loop of this filter, at every step of it.
+        """Report the constraints in a closed loop of this filter, over all of its steps.
 
         Returns:
             ``minimum_margin``, the smallest h over rows and times; ``constraint_violations``, the number of
@@ -236,7 +236,7 @@ class SafetyFilter(Controller):
         return normal[:, :, 0], least, margin
 
     def _every(self, of: Callable[..., tuple[Tensor, ...]], x: Tensor, u: Tensor, t: Tensor) -> list[Tensor]:
-        """What a function of (k, x, u, t), one row, says of every constraint: (B, k, ...) each."""
+        """Evaluate a function of (k, x, u, t), one row, for every constraint: (B, k, ...) each."""
         rows = [functools.partial(of, k) for k in range(len(self.constraints))]
         parts = [torch.func.vmap(row)(x.unsqueeze(1), u.unsqueeze(1), t) for row in rows]
         return [torch.stack(column, dim=1) for column in zip(*parts, strict=True)]
@@ -282,12 +282,12 @@ class SafetyFilter(Controller):
         return torch.cat((u, margin, slack.unsqueeze(-1)), dim=-1).reshape(*z.shape[:-1], -1)
 
     def _shortfall(self, k: int, x: Tensor, u: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
-        """How far phi misses its condition with u held, and h now: (1, n), (1, m), () -> (), ()."""
+        """Return how far phi misses its condition with u held, and h now: (1, n), (1, m), () -> (), ()."""
         end, middle = self._held(k, x, u, t)
         return self._required(k, x, t, end, middle) - end, _number(self.constraints[k])(x, t)
 
     def _inequality(self, k: int, x: Tensor, u: Tensor, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Of one constraint and one row: (1, n), (1, m), () -> (1, m), (), ()."""
+        """Linearise one constraint for one row: (1, n), (1, m), () -> (1, m), (), ()."""
 
         def held(u: Tensor) -> tuple[Tensor, Tensor]:
             return self._held(k, x, u, t)
@@ -303,7 +303,7 @@ class SafetyFilter(Controller):
         return phi(self._advance(middle, u), t + self.hold), phi(middle, t + 0.5 * self.hold)
 
     def _required(self, k: int, x: Tensor, t: Tensor, end: Tensor, middle: Tensor) -> Tensor:
-        """What phi must be at the end."""
+        """Return the least phi at the end."""
         now = self._level(k)(x, t)
         dip = 0.5 * (now + end) - middle
         dip = torch.where(dip > 0, dip, 0.0)

@@ -244,7 +244,7 @@ class DirectShooting:
         return self._optimum(minimise(self, fine_start, time.diff()), coarse, time)
 
     def _finer(self, solution: NewtonSolution, lengths: Tensor) -> MeshPlan:
-        """The same control on a mesh of half the intervals, with its cost there."""
+        """Replay the control on intervals of half the length, with its cost there."""
         plan, feedback = split(self.stage, solution.plan, solution.feedback, lengths)
         halves = (0.5 * lengths).repeat_interleave(2)
         none = torch.zeros_like(plan.control)
@@ -343,7 +343,7 @@ def selected(optimum: Optimum, rows: Tensor) -> Optimum:
 
 
 def _tensors(optimum: Optimum) -> dict[str, Tensor]:
-    """What has a row a state."""
+    """Return the tensors with a row a state."""
     return {name: part for name, part in optimum._asdict().items() if name not in ("time", "reason")}
 
 
@@ -402,13 +402,13 @@ def graded(horizon: float, intervals: int) -> Tensor:
 
 
 def halved(time: Tensor) -> Tensor:
-    """The same times and those half-way: (N + 1,) -> (2N + 1,)."""
+    """Return the times and those half-way: (N + 1,) -> (2N + 1,)."""
     middle = 0.5 * (time[1:] + time[:-1])
     return torch.cat((time[:1], torch.stack((middle, time[1:]), dim=-1).flatten()))
 
 
 def split(stage: Interval, plan: MeshPlan, feedback: Tensor, lengths: Tensor) -> tuple[MeshPlan, Tensor]:
-    """The same control on half intervals, and a feedback around it.
+    """Split the intervals of a plan in half: the same control, and a feedback around it.
 
     Args:
         stage: of the problem.

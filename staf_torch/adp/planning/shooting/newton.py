@@ -101,7 +101,7 @@ def _boxed_step(
 
 
 def convexified(expansion: Expansion) -> Expansion:
-    """The same with every interval's curvature replaced by its absolute value: the model has a minimum."""
+    """Replace every interval's curvature by its absolute value, so that the model has a minimum."""
     finite = torch.where(torch.isfinite(expansion.curvature), expansion.curvature, 0.0)
     values, vectors = torch.linalg.eigh(finite)
     size = values.abs()
@@ -171,7 +171,7 @@ def improved(
 
 
 class ShootingProblem(Protocol):
-    """What the iteration needs to know; `DirectShooting` has it."""
+    """Settings of the iteration; `DirectShooting` has them."""
 
     stage: Interval
     terminal: Callable[[Tensor], Tensor]
@@ -180,7 +180,7 @@ class ShootingProblem(Protocol):
 
 
 class NewtonSolution(NamedTuple):
-    """Where the iteration ended, a row each."""
+    """End of the iteration, a row each."""
 
     plan: MeshPlan
     feedback: Tensor  # of the last expansion, (B, N, 2m, n)

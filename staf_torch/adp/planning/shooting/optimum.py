@@ -1,4 +1,4 @@
-"""What direct shooting found, and a controller that runs it."""
+"""Result of direct shooting, and a controller that runs it."""
 
 from __future__ import annotations
 

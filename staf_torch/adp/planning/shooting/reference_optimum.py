@@ -21,7 +21,7 @@ _AT_ONCE = 4096  # states whose V^ is asked for at once
 
 
 class LoopOptimum(NamedTuple):
-    """What is known of the optimum along a closed loop; None where nothing is."""
+    """Optimum along a closed loop; None where it is not known."""
 
     cost: Tensor | None  # V*(x(0)), (B,)
     control_error: Tensor | None  # |u - u*|, (B, T); NaN at times at which it was not computed

@@ -1,4 +1,4 @@
-"""One interval of a transcribed optimal-control problem, and its derivatives for all intervals at once."""
+"""Interval of a transcribed optimal-control problem, and its derivatives for all intervals at once."""
 
 from __future__ import annotations
 
@@ -46,11 +46,11 @@ class Interval:
         return torch.minimum(torch.maximum(v, self.box[0].to(v)), self.box[1].to(v))
 
     def room(self, v: Tensor) -> tuple[Tensor, Tensor] | None:
-        """How far v may fall and rise, (..., 2m) each; None without hard bounds."""
+        """Return how far v may fall and rise, (..., 2m) each; None without hard bounds."""
         return None if self.box is None else (self.box[0].to(v) - v, self.box[1].to(v) - v)
 
     def gap(self, x: Tensor, v: Tensor, costate: Tensor) -> Tensor:
-        """How much the Hamiltonian r + p'f of a control exceeds its minimum over the admissible ones.
+        """Return how much the Hamiltonian r + p'f of a control exceeds its minimum over the admissible ones.
 
         It is measured in u, so that a saturated control that should be another is seen, which the slope in v
         is not. Of a plant that is not affine in u it is measured along the slope there.

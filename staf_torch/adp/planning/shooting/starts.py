@@ -75,12 +75,12 @@ def guided(guess: StartControl, base: Policy) -> Callable[[Tensor, float], Tenso
 
 
 def agreement(values: Tensor, tolerance: float) -> Tensor:
-    """How many starts found the lowest value of a row: (S, B) -> (B,). Not finite: none."""
+    """Count the starts that found the lowest value of a row: (S, B) -> (B,). Not finite: none."""
     best = values.amin(0)
     return (values <= best * (1 + tolerance)).sum(0)
 
 
 def said(values: Sequence[float], best: float) -> str:
-    """What a row's starts found, in words."""
+    """Describe what a row's starts found."""
     most = max((value for value in values if value > best), default=best) / best
     return f"local: one start alone found it, others up to {most:.3g} times as much"
