@@ -86,7 +86,7 @@ class NearOptimal(SampledRollout):
         return controls.index_copy(0, strained.nonzero().squeeze(1), planned).view(u.shape)
 
     def controller(self) -> Controller:
-        """Return the controller for loops: the policy, and where the LQR, followed from the state, would meet a
+        """Return the controller for loops: the policy, and where the LQR, followed from there, would meet a
         bound of the inputs, a plan that is carried as long as this lasts. With ``plan`` a `RecedingHorizon`,
         which carries its plan all the time, the first one the best of several."""
         if (planner := self.planner) is not None:

@@ -59,7 +59,13 @@ class LoopResult:
     carried: Carried = ()  # by the controller at the end, (B, ...)
 
     def __getitem__(self, name: str) -> Tensor:
-        """(B, T, ...) of what the controller recorded."""
+        """(B, T, ...) of what the controller recorded.
+
+        Raises:
+            KeyError: if it records nothing of that name.
+        """
+        if name not in self.recorded:
+            raise KeyError(f"the controller records {', '.join(self.recorded) or 'nothing'}; got {name!r}")
         return self.recorded[name]
 
     @property

@@ -160,7 +160,7 @@ def runge_kutta_loop(
 
 
 def _shares(length: float | Tensor, discount: float, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return where the stages stand, and their weights of slopes and costs, s: (4, ..., 1) twice, (4, ...)."""
+    """Return where the stages stand, and weights of slopes and costs, s: (4, ..., 1) twice, (4, ...)."""
     if not isinstance(length, Tensor):
         h, left = length, math.exp(-0.5 * discount * length)  # what the middle still counts; the end, squared
         between = (h / 2, h / 3, left * h / 3)

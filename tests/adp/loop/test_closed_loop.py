@@ -365,10 +365,15 @@ class Hysteresis(adp.Controller):
         kept = {"mode": mode, "switches": carried["switches"] + changed.long(), "past": (x, changed)}
         return u.unsqueeze(-1), kept
 
+    def recorded(self, carried: Any) -> dict[str, Tensor]:
+        return {"switches": carried["switches"], "before": carried["past"][0]}
+
 
 @pytest.mark.needs_compiler
 @pytest.mark.compiled
-def test_a_state_of_ones_own_is_carried_row_by_row(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_state_of_ones_own_is_carried_row_by_row_and_recorded_by_name(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     x0 = torch.randn(18, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
     x0[4] = torch.nan
     runs = [
@@ -379,6 +384,14 @@ def test_a_state_of_ones_own_is_carried_row_by_row(caplog: pytest.LogCaptureFixt
     torch.testing.assert_close(runs[0].state, runs[1].state, rtol=1e-10, atol=1e-10, equal_nan=True)
     assert runs[0].diverged.tolist() == [row == 4 for row in range(18)]
     assert runs[0].critic_weights.shape == (18, 101, 0)
+    assert torch.equal(runs[0]["switches"], runs[1]["switches"])
+    assert torch.equal(runs[0]["before"][:4, 2:-1], runs[0].state[:4, 1:-2])
+    torch.testing.assert_close(runs[0].carried, runs[1].carried, rtol=1e-10, atol=1e-10, equal_nan=True)
+    first, rest = runs[0].split([5, 13])
+    assert torch.equal(rest["switches"], runs[0]["switches"][5:])
+    assert torch.equal(first.carried["mode"], runs[0].carried["mode"][:5])
+    with pytest.raises(KeyError, match="records switches, before; got 'weights'"):
+        runs[0]["weights"]
     alone = adp.simulate(Hysteresis(), TWO_STATE, COST, x0[2:11], dt=0.02, steps=100, compile=True)
     assert torch.equal(alone.state[0], runs[0].state[2])
     assert torch.equal(alone.state[3:], runs[0].state[5:11])
