@@ -27,8 +27,7 @@ from command_line import ROOT, environment
 import staf_torch
 from staf_torch.cli import reference
 from staf_torch.lanes import compiler
-from staf_torch.sweeps.python_api import sweep
-from staf_torch.sweeps.runs import Runs
+from staf_torch.sweeps.python_api import Runs, sweep
 
 CONTRACT = """
     StaF StaFBasis StaFRegressor ExperienceMemory

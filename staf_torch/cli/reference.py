@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 MODULES = (
-    *("staf_torch", "staf_torch.sweeps.python_api", "staf_torch.sweeps.runs"),
+    *("staf_torch", "staf_torch.sweeps.python_api"),
     *("staf_torch.approximation.conditioning", "staf_torch.approximation.sensitivity"),
     *("staf_torch.centers", "staf_torch.deploy", "staf_torch.engine", "staf_torch.envs"),
     *("staf_torch.kernels", "staf_torch.lanes", "staf_torch.metrics", "staf_torch.online"),

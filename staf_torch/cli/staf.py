@@ -10,14 +10,14 @@ import sys
 from collections.abc import Callable, Iterator
 from typing import NoReturn
 
+from omegaconf import DictConfig
+
 from ..settings import config_directory as config_directory
 from ..sweeps import callbacks
 from ..sweeps.batching import USER_ERRORS, sentence
 from ..sweeps.hydra_compat import (
     Application,
-    BrokenSweep,
     application,
-    broken_sweep,
     find_launcher,
     full_errors,
     is_about_settings,
@@ -72,14 +72,13 @@ def _run(app: Application, wants_trace: bool) -> None:
         else:
             app.run(execute)
     except (Exception, KeyboardInterrupt) as error:
-        sweep = broken_sweep(error)
-        if sweep is None:
+        if app.begun is None:
             raise
-        callbacks.close(sweep)
-        _end(error, wants_trace, sweep)
+        callbacks.close(app.begun)
+        _end(error, wants_trace, app.begun)
 
 
-def _end(error: BaseException, wants_trace: bool, sweep: BrokenSweep | None = None) -> NoReturn:
+def _end(error: BaseException, wants_trace: bool, sweep: DictConfig | None = None) -> NoReturn:
     """End the program as an error asks for: by a sentence, by the code of a signal, or by its trace."""
     ended_by = what_ended(error)
     if isinstance(ended_by, KeyboardInterrupt):
@@ -98,7 +97,7 @@ def _told_between_lines() -> Iterator[None]:
         _end_by_signal(None, error)
 
 
-def _end_by_signal(sweep: BrokenSweep | None, error: KeyboardInterrupt) -> NoReturn:
+def _end_by_signal(sweep: DictConfig | None, error: KeyboardInterrupt) -> NoReturn:
     """Say which signal ended the program and how to resume, and exit with the code that shells expect."""
     said, code = name_and_code(error)
     with contextlib.suppress(OSError):  # the terminal may be gone

@@ -52,7 +52,8 @@ class RunRecord:
             "build": build(settings, compiler),
         }
 
-        self._files = ("**/*",)
+        self._files: tuple[str, ...] = ("**/*",)
+        self._cfg = cfg
 
     def covers(self, *patterns: str) -> None:
         """Keep the checksums of files of these patterns alone, where others of the directory may change."""
@@ -84,8 +85,19 @@ class RunRecord:
         record["checksum"] = record_checksum(record)
         write_text(directory / RUN, json.dumps(record, indent=1, allow_nan=False) + "\n")
 
+    @property
+    def in_table(self) -> bool:
+        """Whether these are settings of a sweep whose jobs leave rows of one table."""
+        return in_table(self._cfg)
+
+    def finished_before(self, directory: Path) -> dict[str, float | None] | None:
+        """Return what `finished` returns where the settings resume a sweep, else None."""
+        if not resumed(self._cfg):
+            return None
+        return self.finished(directory, anyway=resumed_anyway(self._cfg))
+
     def finished(self, directory: Path, *, anyway: bool = False) -> dict[str, float | None] | None:
-        """Return the metrics of this very run where it was completed before, else None.
+        """Return the metrics of this very run where it was completed before, else None; of a table, nothing.
 
         A run whose files are damaged is none that was completed; a warning names the file.
 

@@ -14,7 +14,14 @@ from hydra.errors import HydraException, MissingConfigException
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
-from ..experiments.registry import BatchedExperiment, Experiment, Metrics, Solution, experiment
+from ..experiments.registry import (
+    BatchedExperiment,
+    Experiment,
+    Metrics,
+    Solution,
+    check_animation,
+    experiment,
+)
 from ..results.progress import SHOWN, Progress
 from ..settings.plain import to_read
 from .workers import LostError
@@ -158,8 +165,9 @@ def completion(cfg: DictConfig, outcome: Outcome) -> Experiment:
     """Return what is left to do for a job with that outcome, as a function like an experiment.
 
     Raises:
-        Exception: that of a job that failed.
+        Exception: that of a job that failed, or ValueError for an animation that the experiment has not.
     """
+    check_animation(cfg)
     study = experiment(cfg.task)
     match outcome:
         case Failed(error):

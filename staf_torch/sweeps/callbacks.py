@@ -24,7 +24,7 @@ from ..results.reader import RecordedRun, collect
 from ..results.untrusted import links_in, visible
 from . import lock
 from .batching import sentence
-from .hydra_compat import BrokenSweep, as_typed, breaking_off, parse_override, sweep_size
+from .hydra_compat import as_typed, end_sweep, parse_override, sweep_size
 from .job import PRINTS
 from .report import write_report
 
@@ -265,9 +265,9 @@ def _refuse_links(directory: Path) -> None:
         )
 
 
-def close(sweep: BrokenSweep) -> None:
+def close(config: DictConfig) -> None:
     """End a sweep that an exception broke: with its report, or without a trace where no job has begun."""
-    directory = _directory(sweep.config)
+    directory = _directory(config)
     own = lock.held(directory)
     if own is None:  # another sweep's, which refused us
         return
@@ -275,7 +275,7 @@ def close(sweep: BrokenSweep) -> None:
         lock.give_back(directory)
         return
     if _has_begun(directory):
-        sweep.end()
+        end_sweep(config)
         return
     _remove(directory)
     lock.give_back(directory)
@@ -286,10 +286,10 @@ def _has_begun(directory: Path) -> bool:
 
 
 def _in_vain(config: DictConfig) -> bool:
-    """Whether the sweep that ends now is ours, and was broken before its first job."""
+    """Return whether the sweep that ends now is ours, and was broken before its first job."""
     own = lock.held(_directory(config))
     ours = own is not None and not own.lost() and not records.resumed(config)
-    return ours and breaking_off() and not _has_begun(_directory(config))
+    return ours and not _has_begun(_directory(config))
 
 
 def _remove(directory: Path) -> None:
@@ -301,22 +301,22 @@ def _remove(directory: Path) -> None:
         directory.rmdir()
 
 
-def farewell(sweep: BrokenSweep | None, error: KeyboardInterrupt, said: str) -> str:
+def farewell(config: DictConfig | None, error: KeyboardInterrupt, said: str) -> str:
     """Return what to say after Ctrl-C or another signal.
 
     Args:
-        sweep: that was broken; None: a single run, or nothing had begun.
+        config: of the sweep that was broken; None: a single run, or nothing had begun.
         error: that broke it, with what a run has noted there.
         said: which signal it was.
     """
     notes = getattr(error, "__notes__", ())
-    if sweep is None or notes:
+    if config is None or notes:
         return "; ".join([f"staf: {said}", *notes])
-    runs = list(_directory(sweep.config).glob(f"*/{records.RUN}"))
+    runs = list(_directory(config).glob(f"*/{records.RUN}"))
     if not runs:
         return f"staf: {said}"
     complete = sum((records.read(path) or {}).get("status") == COMPLETED for path in runs)
-    place = os.path.relpath(_directory(sweep.config))
+    place = os.path.relpath(_directory(config))
     return f"staf: {said}; {complete} jobs are complete. Resume with:\n  staf -m sweep.resume={place}"
 
 

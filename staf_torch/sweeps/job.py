@@ -8,16 +8,16 @@ import math
 import os
 import shutil
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextvars import ContextVar
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from ..experiments.registry import Metrics, check_animation
+from ..experiments.registry import Metrics
 from ..lanes.compiler import compiler
 from ..numerics.checks import COMMAND_LINE, choice
 from ..results import run_record as records
@@ -29,22 +29,10 @@ from .batching import DEFERRED, USER_ERRORS, Outcome, completion, reason, senten
 from .hydra_compat import as_typed
 
 _log = logging.getLogger(__name__)
+_BATCHED = "a sweep (staf -m) whose launcher is hydra/launcher=batched"
 
 PRINTS: ContextVar[bool] = ContextVar("PRINTS", default=True)
 """Whether the table and the count of a sweep go to stdout: for a command they do, for Python they do not."""
-
-
-class Origin(NamedTuple):
-    """Where the settings of a job come from."""
-
-    overrides: list[str]  # as typed
-    choices: Mapping[str, str | None]  # the option chosen of each group of settings
-
-    @classmethod
-    def of(cls, node: Any) -> Origin:
-        """Return where the settings of the job with that node of Hydra's come from."""
-        choices = {str(group): choice for group, choice in node.runtime.choices.items()}
-        return cls(as_typed(node.overrides.task), choices)
 
 
 class Refused(SystemExit):
@@ -57,27 +45,34 @@ class Refused(SystemExit):
 def execute(
     cfg: DictConfig, outcome: Outcome = DEFERRED, seconds: float = 0.0, progress: Progress = SHOWN
 ) -> Metrics | float | tuple[float, ...]:
-    """Run the job that Hydra has prepared and return what the sweeper is told.
+    """Run the job that Hydra has prepared, fill its directory, and return what the sweeper is told.
+
+    `run.json` says how the job ends.
 
     Args:
         cfg: all settings but Hydra's.
         outcome: what was computed for the job already.
         seconds: that were spent on it.
         progress: shows how far long loops are.
+
+    Raises:
+        Exception: that of the experiment; the record has its reason.
     """
     node = HydraConfig.get()
     directory = Path(node.runtime.output_dir)
-    if records.in_table(cfg):
-        raise _no_table(node.mode)
-    origin = Origin.of(node)
-    if records.resumed(cfg):
-        record = records.RunRecord(cfg, origin.choices, origin.overrides, compiler())
-        finished = record.finished(directory, anyway=records.resumed_anyway(cfg))
-        if finished is not None:
-            _log.info("completed before: %s", os.path.relpath(directory))
-            return objective(cfg, finished)
+    choices = {str(group): choice for group, choice in node.runtime.choices.items()}
+    record = records.RunRecord(cfg, choices, as_typed(node.overrides.task), compiler())
     try:
-        metrics = run(cfg, directory, origin, outcome, seconds, progress)
+        if record.in_table:
+            raise ValueError(f"`sweep.records=table` needs {_BATCHED}.")
+        metrics = record.finished_before(directory)
+        if metrics is not None:
+            _log.info("completed before: %s", os.path.relpath(directory))
+        else:
+            with recorded(record, directory, seconds):
+                record.declare([metric.info for metric in make_metrics(cfg.get("metric"))])
+                metrics = completion(cfg, outcome)(cfg, directory, progress)
+            _log.info("  run directory: %s", os.path.relpath(directory))
     except BaseException as error:
         refused = isinstance(error, USER_ERRORS)
         if node.mode != RunMode.RUN:  # a job of a sweep keeps its log, and the sweep goes on
@@ -86,43 +81,7 @@ def execute(
             _take_back(directory)
             raise Refused(error) from error
         raise
-    _log.info("  run directory: %s", os.path.relpath(directory))
     return objective(cfg, metrics)
-
-
-def _no_table(mode: RunMode) -> BaseException:
-    error = ValueError(
-        "`sweep.records=table` needs a sweep (staf -m) whose launcher is hydra/launcher=batched."
-    )
-    return Refused(error) if mode == RunMode.RUN else error
-
-
-def run(
-    cfg: DictConfig,
-    directory: Path,
-    origin: Origin,
-    outcome: Outcome = DEFERRED,
-    seconds: float = 0.0,
-    progress: Progress = SHOWN,
-) -> Metrics:
-    """Run one job and fill its directory; `run.json` says how it ends.
-
-    Args:
-        cfg: all settings but Hydra's.
-        directory: the run directory; it exists.
-        origin: of the settings, for the record.
-        outcome: what was computed for the job already.
-        seconds: that were spent on it.
-        progress: shows how far long loops are.
-
-    Raises:
-        Exception: that of the experiment; the record has its reason.
-    """
-    record = records.RunRecord(cfg, origin.choices, origin.overrides, compiler())
-    with recorded(record, directory, seconds):
-        check_animation(cfg)
-        record.declare([metric.info for metric in make_metrics(cfg.get("metric"))])
-        return completion(cfg, outcome)(cfg, directory, progress)
 
 
 @contextlib.contextmanager

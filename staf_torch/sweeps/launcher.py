@@ -259,18 +259,14 @@ class Launch:
     def _finished(self, numbered: Mapping[int, list[str]]) -> dict[int, JobReturn]:
         """Return the jobs that an earlier start of this sweep completed."""
         found: dict[int, JobReturn] = {}
-        if not records.resumed(self._jobs.master):
-            return found
-        anyway = records.resumed_anyway(self._jobs.master)
-        for num, overrides in numbered.items():
-            settings = self._jobs.settings(overrides)
+        for num, overrides in numbered.items() if records.resumed(self._jobs.master) else ():
             config = self._jobs.whole(num, overrides)
-            record = records.RunRecord(settings, config.hydra.runtime.choices, overrides, compiler())
-            metrics = record.finished(directory_of(config), anyway=anyway)
+            settings, choices = self._jobs.settings(overrides), config.hydra.runtime.choices
+            record = records.RunRecord(settings, choices, overrides, compiler())
+            metrics = record.finished_before(directory_of(config))
             if metrics is not None:
-                ended = JobReturn(overrides=overrides, status=JobStatus.COMPLETED)
-                ended.return_value = objective(self._jobs.master, metrics)
-                found[num] = ended
+                found[num] = JobReturn(overrides=overrides, status=JobStatus.COMPLETED)
+                found[num].return_value = objective(self._jobs.master, metrics)
         return found
 
     def _computed(

@@ -152,10 +152,9 @@ def _before(directory: Path, record: records.RunRecord, master: Any) -> Left | N
     """
     if not records.resumed(master):
         return Left([])
-    anyway = records.resumed_anyway(master)
-    if record.finished(directory, anyway=anyway) is not None:
+    if record.finished_before(directory) is not None:
         return None
-    found = left(directory, record.made_by)
+    anyway, found = records.resumed_anyway(master), left(directory, record.made_by)
     if found is None and not anyway:
         record.refuse_rows(directory)
     if found is None:

@@ -286,7 +286,7 @@ def clusters(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Clusters:
     return notes
 
 
-def swept(name: str, *more: str) -> staf_torch.sweeps.runs.Runs:
+def swept(name: str, *more: str) -> staf_torch.sweeps.python_api.Runs:
     return staf_torch.sweep(*SHORT, f"hydra.launcher.executor={name}", *more, directory=name)
 
 

@@ -14,7 +14,7 @@ import pytest
 from sweep_runs import write_run
 
 from staf_torch.results.reader import collect
-from staf_torch.sweeps.runs import Run, Runs
+from staf_torch.sweeps.python_api import Run, Runs
 
 FIGURE: Any = object()
 notebook = operator.methodcaller("_repr_html_")

@@ -16,10 +16,8 @@ from .jobs import SweepJobs as SweepJobs
 from .jobs import directory_of as directory_of
 from .jobs import without_hydra_overrides as without_hydra_overrides
 from .program import Application as Application
-from .program import BrokenSweep as BrokenSweep
 from .program import application as application
-from .program import breaking_off as breaking_off
-from .program import broken_sweep as broken_sweep
+from .program import end_sweep as end_sweep
 from .program import find_launcher as find_launcher
 from .program import full_errors as full_errors
 from .program import is_about_settings as is_about_settings

@@ -10,10 +10,9 @@ import importlib.util
 import os
 import re
 import sys
-import traceback
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from types import FrameType
 from typing import Any, NamedTuple
 
 import hydra
@@ -23,6 +22,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.core.plugins import Plugins
 from hydra.core.utils import JobRuntime
 from hydra.types import RunMode
+from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from ...settings import config_directory
@@ -72,6 +72,7 @@ class Application(NamedTuple):
         Raises:
             BaseException: that of Hydra or of the task.
         """
+        self.hydra.config_loader.latest_sweep = None  # but the question whether this is one
         ended = self.hydra.run(self.name, task, [*self.overrides, "hydra.mode=RUN"])
         config: Any = ended.hydra_cfg
         return Path(config.hydra.runtime.output_dir)
@@ -82,8 +83,15 @@ class Application(NamedTuple):
         Raises:
             BaseException: that of Hydra, or of the first job that failed, after all jobs have ended.
         """
+        self.hydra.config_loader.latest_sweep = None
         self.hydra.multirun(self.name, task, [*self.overrides, "hydra.mode=MULTIRUN"])
         return Path(self.hydra.config_loader.latest_sweep.hydra.sweep.dir).absolute()
+
+    @property
+    def begun(self) -> DictConfig | None:
+        """The settings of the sweep that `sweep` has begun, None where it has not come so far."""
+        found: DictConfig | None = self.hydra.config_loader.latest_sweep
+        return found
 
 
 @contextlib.contextmanager
@@ -188,36 +196,13 @@ def full_errors() -> Iterator[bool]:
             os.environ["HYDRA_FULL_ERROR"] = before
 
 
-class BrokenSweep(NamedTuple):
-    """A sweep that an exception ended."""
-
-    config: DictConfig
-    callbacks: Any
-
-    def end(self) -> None:
-        """Tell the callbacks that the sweep is over, where Hydra does not: version 1.3 forgets it."""
-        if not HAS_WHITELIST:
-            self.callbacks.on_multirun_end(config=self.config, config_name=self.config.hydra.job.config_name)
-
-
-def breaking_off() -> bool:
-    """Return whether an exception ends the sweep that calls back now: version 1.4 calls back then too."""
-    broken = {id(frame) for frame, _ in traceback.walk_tb(sys.exc_info()[2])}
-    frame: FrameType | None = sys._getframe()
-    while frame is not None and frame.f_code.co_name != "multirun":
-        frame = frame.f_back
-    return frame is not None and id(frame) in broken
-
-
-def broken_sweep(error: BaseException) -> BrokenSweep | None:
-    """Return the sweep that ``error`` ended, None where no sweep had begun.
-
-    Hydra keeps both in local variables of `Hydra.multirun`, which the traceback leads to.
-    """
-    for frame, _ in traceback.walk_tb(error.__traceback__):
-        if frame.f_code.co_name == "multirun" and "callbacks" in frame.f_locals:
-            return BrokenSweep(frame.f_locals["cfg"], frame.f_locals["callbacks"])
-    return None
+def end_sweep(config: DictConfig) -> None:
+    """Tell the callbacks that a sweep is over which an exception ended: Hydra 1.3 forgets it."""
+    for settings in () if HAS_WHITELIST else reversed(list(config.hydra.callbacks.values())):
+        try:
+            instantiate(settings).on_multirun_end(config=config, config_name=config.hydra.job.config_name)
+        except Exception as error:  # as Hydra does it
+            warnings.warn(f"{settings._target_} raised {type(error).__name__}: {error}", stacklevel=2)
 
 
 @contextlib.contextmanager
