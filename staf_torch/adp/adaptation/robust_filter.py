@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -106,7 +106,7 @@ class RobustFilter(Controller):
         self.filter = SafetyFilter(
             lambda z: z[..., : plant.inputs] * 0,  # only its conditions are asked
             ChangingPlant(plant),
-            [_of_leading(h, n) for h in several],
+            [lambda z, t, h=h: h(z[:, :n], t) for h in several],  # of the first states alone
             dt=dt,
             decay=decay,
             degree=degree,
@@ -167,8 +167,3 @@ class RobustFilter(Controller):
             u, slack = nearest.point, nearest.shortfall
         assert met is not None
         return torch.where(met.unsqueeze(-1), wanted, u), margin, torch.where(met, 0.0, slack)
-
-
-def _of_leading(h: Constraint, count: int) -> Callable[[Tensor, Tensor], Tensor]:
-    """h of the first states alone."""
-    return lambda z, t: h(z[:, :count], t)

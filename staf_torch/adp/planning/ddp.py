@@ -31,10 +31,6 @@ class Trajectories(NamedTuple):
         """(B,)."""
         return self.value[:, 0]
 
-    def rows(self, index: Tensor) -> Trajectories:
-        """Some of the rows."""
-        return rows_of(self, index)
-
 
 class Reference(NamedTuple):
     """Trajectory and feedback that a control is applied around."""

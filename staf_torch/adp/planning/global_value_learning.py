@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ...numerics.checks import integer
 from ..problem.sampled import SampledProblem
-from .ddp import BoxDDP, Reference, Trajectories, chosen
+from .ddp import BoxDDP, Reference, Trajectories, chosen, rows_of
 from .global_value import GlobalValue
 
 _log = logging.getLogger(__name__)
@@ -125,7 +125,7 @@ def best_from(memory: GlobalValue, search: BoxDDP, x: Tensor, own: Tensor | None
     order = found.cost.argsort(descending=True, stable=True)
     best = torch.empty(len(x), dtype=torch.int64)
     best[guesses.owner[order]] = order  # the last one written is the cheapest
-    return found.rows(best)
+    return rows_of(found, best)
 
 
 def _first(search: BoxDDP, x: Tensor, generator: torch.Generator) -> Trajectories:
@@ -136,7 +136,7 @@ def _first(search: BoxDDP, x: Tensor, generator: torch.Generator) -> Trajectorie
     still = problem.rest.expand(len(x), steps, -1)
     found = search.solve(x.repeat(3, 1), torch.cat((still, random[:, :steps])))
     best = found.cost.unflatten(0, (3, -1)).argmin(0)
-    return found.rows(best * len(x) + torch.arange(len(x)))
+    return rows_of(found, best * len(x) + torch.arange(len(x)))
 
 
 def _guesses(memory: GlobalValue, steps: int, x: Tensor, own: Tensor | None) -> Guesses:

@@ -14,7 +14,7 @@ from ...numerics.checks import choice, fail, integer, positive_real
 from ...systems import Plant
 from ..problem.cost import Matrix, QuadraticCost
 from ..problem.sampled import SampledProblem
-from .ddp import BoxDDP, Reference, Trajectories, chosen
+from .ddp import BoxDDP, Reference, Trajectories, chosen, rows_of
 
 Obstacle = Callable[[Tensor], Tensor]
 """h(x), at least 0 outside: (..., n) -> (...)."""
@@ -190,4 +190,4 @@ def plan_around(
         best = now if best is None else best.or_cheaper(now)
     assert best is not None
     chosen = best.cost.reshape(len(x0), -1).argmin(-1) + torch.arange(len(x0)) * len(ways)
-    return AvoidancePlans(best.trajectories.rows(chosen), best.cost[chosen], best.margin[chosen])
+    return AvoidancePlans(rows_of(best.trajectories, chosen), best.cost[chosen], best.margin[chosen])

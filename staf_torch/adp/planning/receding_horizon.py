@@ -198,7 +198,7 @@ def best_held(search: BoxDDP, x: Tensor) -> Trajectories:
         Reference(goal.repeat(count, 1, 1), feedback.repeat_interleave(b, 0)),
     )
     cost = torch.where(torch.isfinite(found.cost), found.cost, torch.inf).view(count, b)
-    return found.rows(cost.argmin(0) * b + torch.arange(b))
+    return rows_of(found, cost.argmin(0) * b + torch.arange(b))
 
 
 def _guesses(problem: SampledProblem, steps: int) -> tuple[Tensor, Tensor]:

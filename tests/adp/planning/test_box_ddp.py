@@ -13,7 +13,7 @@ from helpers_swingup import cost_of, double_integrator, pendulum
 from torch import Tensor
 
 from staf_torch import adp, lanes, systems
-from staf_torch.adp.planning.ddp import Reference
+from staf_torch.adp.planning.ddp import Reference, rows_of
 from staf_torch.numerics.forward_mode import use_forward_mode
 
 use_forward_mode()
@@ -148,7 +148,7 @@ def test_a_row_is_found_alike_alone_and_beside_one_that_is_no_number(rows: list[
     whole, some = search.solve(x0, still(3, 12)), search.solve(x0[rows], still(len(rows), 12))
     assert whole.converged.tolist() == [False, True, True]
     assert not math.isfinite(float(whole.cost[0]))
-    for one, other in zip(some, whole.rows(torch.tensor(rows)), strict=True):
+    for one, other in zip(some, rows_of(whole, torch.tensor(rows)), strict=True):
         torch.testing.assert_close(one, other, rtol=1e-12, atol=1e-12, equal_nan=True)
 
 

@@ -15,7 +15,7 @@ from helpers_swingup import GRID, REGION, RESETS, double_integrator
 from torch import Tensor
 
 from staf_torch import adp, deploy
-from staf_torch.adp.planning.ddp import Trajectories
+from staf_torch.adp.planning.ddp import Trajectories, rows_of
 from staf_torch.adp.planning.global_value_learning import best_from, swept
 
 
@@ -47,7 +47,7 @@ def test_bellman_residual_is_small_where_the_memory_knows_the_optimum(memory: ad
 
 
 def test_gradient_is_the_slope_of_the_value(memory: adp.GlobalValue) -> None:
-    library = memory.library.rows(memory.library.converged & memory.arrives)
+    library = rows_of(memory.library, memory.library.converged & memory.arrives)
     x, h = library.state[library.cost.argsort()[[10, 30]], 3], 1e-5
     for i, e in enumerate(h * torch.eye(2, dtype=torch.float64)):
         rise = (memory.value(x + e) - memory.value(x - e)) / (2 * h)

@@ -17,7 +17,7 @@ from ..ddp import chosen
 from .newton import MeshPlan, NewtonSolution, follow, minimise, replay
 from .optimum import Optimum
 from .stage import Interval
-from .starts import agreement, guesses, guided, said
+from .starts import guesses, guided
 
 _DECAY = 9.2  # time constants of the slowest mode in the horizon: it falls to 1e-4
 _RESOLVED = 0.5  # mean interval in time constants of the fastest mode
@@ -351,7 +351,8 @@ def _merged(found: Optimum, rows: Tensor, several: list[Optimum]) -> Optimum:
     """The best of several starts in some rows, and the others as they were."""
     every = [selected(found, rows), *several]
     values = torch.stack([each.value.nan_to_num(nan=torch.inf) for each in every])  # (S, B')
-    best, count = values.argmin(0), agreement(values, _SAME)
+    best = values.argmin(0)
+    count = (values <= values.amin(0) * (1 + _SAME)).sum(0)  # starts that found the lowest value
     places = torch.arange(len(rows))
     columns = {}
     for name, whole in _tensors(found).items():
@@ -366,7 +367,9 @@ def _merged(found: Optimum, rows: Tensor, several: list[Optimum]) -> Optimum:
         if not finite:
             reasons[row] = found.reason[row]
         else:
-            reasons[row] = "" if bool(converged[row]) else said(finite, min(finite))
+            most = max(finite) / min(finite)
+            local = f"local: one start alone found it, others up to {most:.3g} times as much"
+            reasons[row] = "" if bool(converged[row]) else local
     columns["converged"] = converged
     return found._replace(**columns, reason=tuple(reasons))
 

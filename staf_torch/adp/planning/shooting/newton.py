@@ -199,16 +199,11 @@ def follow(
 
     def both(x: Tensor, k: int) -> Tensor:
         now, end, h = times[k], times[k + 1], lengths[k]
-        ahead = closed_stage(stage, _at(control, now), x, h)
+        ahead = closed_stage(stage, lambda at: control(at, now), x, h)
         v = [stage.cost.unsaturated(control(at, t)) for at, t in ((x, now), (ahead, end - 1e-9 * float(h)))]
         return stage.admitted(torch.cat(v, dim=-1))
 
     return _driven(stage, both, x0, lengths, problem.terminal)
-
-
-def _at(control: Callable[[Tensor, float], Tensor], t: float) -> Callable[[Tensor], Tensor]:
-    """The control of one time as a policy."""
-    return lambda x: control(x, t)
 
 
 def minimise(problem: ShootingProblem, plan: MeshPlan, lengths: Tensor) -> NewtonSolution:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -72,15 +72,3 @@ def guided(guess: StartControl, base: Policy) -> Callable[[Tensor, float], Tenso
         return level.to(x).expand(*x.shape[:-1], -1)
 
     return control
-
-
-def agreement(values: Tensor, tolerance: float) -> Tensor:
-    """Count the starts that found the lowest value of a row: (S, B) -> (B,). Not finite: none."""
-    best = values.amin(0)
-    return (values <= best * (1 + tolerance)).sum(0)
-
-
-def said(values: Sequence[float], best: float) -> str:
-    """Describe what a row's starts found."""
-    most = max((value for value in values if value > best), default=best) / best
-    return f"local: one start alone found it, others up to {most:.3g} times as much"
