@@ -14,7 +14,7 @@ from torch import Tensor
 
 from .. import systems
 from ..adp import Controller, Cost, Feedback, QuadraticCost
-from ..adp.loop.controller import Carried
+from ..adp.loop.controller import Carried, Policy
 from ..adp.loop.step import ClosedLoop, LoopState
 from ..numerics.checks import choice, fail, positive_real
 from ..systems import Bounds, ControlAffineSystem, Plant
@@ -188,10 +188,6 @@ class Episodes:
         self.age = self.age + 1
         reward = -torch.where(after.alive, after.cost, self.penalty)
         return reward, ~after.alive, self.age >= self.steps
-
-
-Policy = Callable[[Tensor], Tensor]
-"""u from x: (..., n) -> (..., m)."""
 
 
 class Agent:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 import torch
@@ -19,6 +19,7 @@ from ..adp import (
     StaFValueBasis,
     Supervised,
 )
+from ..adp.loop.controller import Value
 from ..adp.loop.setup import AdpProblem
 from ..adp.planning.shooting.reference_optimum import known_value
 from ..approximation.basis import StaFBasis
@@ -28,7 +29,6 @@ from ..settings.chase import ChaseProblem
 from ..settings.plain import PlainSettings
 
 _GRID, _ACROSS = 81, 41
-Value = Callable[[Tensor], Tensor]
 
 
 def animation_kind(cfg: DictConfig | PlainSettings, dim: int | None = None) -> str | None:

@@ -103,10 +103,14 @@ class RobustFilter(Controller):
         self.confidence = positive_real("RobustFilter", "confidence", confidence)
         self.controller, self.plant, self.windows, self.law = controller, plant, windows, law
         several = listed("RobustFilter", constraints)
+
+        def of_states(h: Constraint) -> Constraint:
+            return lambda z, t: h(z[:, :n], t)  # of the plant's states alone
+
         self.filter = SafetyFilter(
             lambda z: z[..., : plant.inputs] * 0,  # only its conditions are asked
             ChangingPlant(plant),
-            [lambda z, t, h=h: h(z[:, :n], t) for h in several],  # of the first states alone
+            [of_states(h) for h in several],
             dt=dt,
             decay=decay,
             degree=degree,
