@@ -142,11 +142,7 @@ FAULTS: dict[str, tuple[dict[str, str], str]] = {
 
 @pytest.mark.parametrize("fault", FAULTS)
 def test_where_nothing_can_be_built_plain_torch_serves_and_one_line_says_why(
-    fault: str,
-    cache: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
+    fault: str, cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     settings, reason = FAULTS[fault]
     hanging = script(tmp_path / "hanging", '[ "$1" = --version ] && exit 0', "exec sleep 60")

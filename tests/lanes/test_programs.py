@@ -168,9 +168,7 @@ def test_every_number_of_an_input_in_any_layout_reaches_its_row_and_time(every: 
     found, wanted = program(carry, now, row, every=every), program.definition(carry, now, row, every=every)
     assert list(found[0]) == ["x", "more"]
     for one, other in zip(
-        (*found[1], found[0]["x"], *found[0]["more"]),
-        (*wanted[1], carry["x"], *carry["more"]),
-        strict=True,
+        (*found[1], found[0]["x"], *found[0]["more"]), (*wanted[1], carry["x"], *carry["more"]), strict=True
     ):
         assert one.dtype == other.dtype
         assert torch.equal(one, other)
