@@ -52,8 +52,8 @@ class Program(Derived):
 
     What a function ``step`` finds elsewhere (globals, closures, tensors and attributes there) may change
     between calls: the program is then made anew. A constant is what cannot be watched (an object without a
-    ``__dict__``, an array of NumPy beyond 16 kB), and all of it for a call that was prepared. Rows never see
-    each other.
+    ``__dict__``, an array of NumPy beyond 16 kB), of which a line of the log tells, and all of it for a call
+    that was prepared. Rows never see each other.
 
     Args:
         step: maps (carry, now, row), trees of tensors (B, ...), to the next carry and the outputs (B, ...).
