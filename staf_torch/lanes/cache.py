@@ -21,7 +21,9 @@ import sys
 import tempfile
 import time
 import zlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from itertools import chain
+from operator import is_
 from pathlib import Path
 from types import FunctionType
 from typing import Any, NamedTuple
@@ -279,17 +281,30 @@ def unpatched() -> bool:
     No other process sees what was put there (`kernels.GaussianKernel.core = mine`), so that nothing may be
     read from the cache or written to it.
     """
-    modules = [m for name, m in list(sys.modules.items()) if name.partition(".")[0] == _FOLDER.name]
-    values = [value for module in modules for value in vars(module).values()]
-    classes = [v for v in values if isinstance(v, type) and v.__module__.partition(".")[0] == _FOLDER.name]
-    values += [value for each in dict.fromkeys(classes) for value in vars(each).values()]
-    return not any(map(_foreign, values))
+    global _last
+    spaces = list[Mapping[str, Any]]()
+    for name, module in list(sys.modules.items()):
+        if name.partition(".")[0] == _FOLDER.name:
+            spaces.append(vars(module))
+            kinds = (value for value in vars(module).values() if isinstance(value, type))
+            spaces += [vars(kind) for kind in kinds if kind.__module__ == name]
+    values = [*chain.from_iterable(space.values() for space in spaces)]
+    seen, own = _last
+    if len(values) != len(seen) or not all(
+        map(is_, values, seen)
+    ):  # looked at again only if something is new
+        own = not any(map(_foreign, values))
+        _last = values, own
+    return own
+
+
+_last: tuple[list[Any], bool] = [], True
 
 
 def _foreign(value: Any) -> bool:
     while isinstance(value, property | staticmethod | classmethod | functools.partial):
-        value = (
-            getattr(value, "fget", None) or getattr(value, "__func__", None) or getattr(value, "func", None)
-        )
-    users = isinstance(value, FunctionType) and is_users(value)
-    return users or type(value).__module__.partition(".")[0] == "unittest"
+        inner = (getattr(value, name, None) for name in ("fget", "__func__", "func"))
+        value = next(filter(None, inner), None)
+    if isinstance(value, FunctionType):
+        return is_users(value)
+    return type(value).__module__.partition(".")[0] == "unittest"
