@@ -1,4 +1,13 @@
-"""Box-constrained differential dynamic programming: optimal trajectories of many initial states at once."""
+"""Box-constrained differential dynamic programming: optimal trajectories of many initial states at once.
+
+Backward in time a quadratic model of the value is propagated through second-order expansions, the control
+of each step minimised over its box; forward the new control is tried at five lengths. A collocated program
+with a general solver has the same optima, but a row costs it a hundred times as much, and its plan has no
+feedback. In plain torch rows that are done leave the batch and all times are expanded at once; in a program
+of one row both are loops.
+
+Source: Tassa, Mansard and Todorov, "Control-limited differential dynamic programming", ICRA (2014).
+"""
 
 from __future__ import annotations
 
@@ -13,6 +22,13 @@ from ...numerics.box import minimum_and_slopes
 from ...numerics.checks import fail, integer, positive_real, trailing
 from ...numerics.riccati import riccati_step
 from ..problem.sampled import Derivatives, SampledProblem
+
+LENGTHS = (1.0, 0.5, 0.2, 0.07, 0.02)  # shares of a step that are tried side by side
+EASIER, HARDER = 0.4, 8.0  # what success and failure do to the regularisation of a row
+# Of the regularisation, in units of the cost's curvature in u:
+LEAST, FIRST, TRUSTED, MOST = 1e-9, 1e-3, 1.0, 1e9
+CONVERGED = -1.0
+_NUMBERS = 2**25  # second derivatives that are held at once
 
 
 class Trajectories(NamedTuple):
@@ -108,14 +124,6 @@ def chosen(rows: Tensor, new: Some, old: Some) -> Some:
 
     picked = map(pick, new, old)
     return type(new)(*picked) if hasattr(new, "_fields") else type(new)(picked)
-
-
-LENGTHS = (1.0, 0.5, 0.2, 0.07, 0.02)  # shares of a step that are tried side by side
-EASIER, HARDER = 0.4, 8.0  # what success and failure do to the regularisation of a row
-# Of the regularisation, in units of the cost's curvature in u:
-LEAST, FIRST, TRUSTED, MOST = 1e-9, 1e-3, 1.0, 1e9
-CONVERGED = -1.0
-_NUMBERS = 2**25  # second derivatives that are held at once
 
 
 class BoxDDP:

@@ -26,6 +26,11 @@ _TRIES, _SHORTER = 6, 0.3  # lengths of a step that are tried, each this share o
 Chosen = Callable[[Tensor, Tensor, Any, Tensor], Tensor]
 """u from the moved states, the others, what the period brings, and the number of periods so far."""
 
+_LENGTHS, _SHARES = (5, 15, 40), (0.3, 1.0)  # periods for which shares of the bounds are held, as starts
+_WORSE = 0.02  # share of J by which a carried plan may cost more than a period ago was expected
+_FRESH = 2  # rounds of iterations that a detour gets to be better than such a plan
+_PROBES = 8  # states at which it is tried whether the inputs move what they must not
+
 
 class DetourPlan(NamedTuple):
     """A plan over T periods."""
@@ -232,12 +237,6 @@ def _along(function: Callable[[Tensor], Tensor], z: Tensor) -> tuple[Tensor, Ten
     units = torch.eye(z.shape[-1], dtype=z.dtype, device=z.device)
     found = [torch.func.jvp(function, (z,), (unit.expand_as(z).clone(),)) for unit in units]
     return found[0][0], torch.stack([one[1] for one in found], dim=-1)
-
-
-_LENGTHS, _SHARES = (5, 15, 40), (0.3, 1.0)  # periods for which shares of the bounds are held, as starts
-_WORSE = 0.02  # share of J by which a carried plan may cost more than a period ago was expected
-_FRESH = 2  # rounds of iterations that a detour gets to be better than such a plan
-_PROBES = 8  # states at which it is tried whether the inputs move what they must not
 
 
 class CarriedPlan(NamedTuple):

@@ -21,6 +21,7 @@ from .global_value import GlobalValue
 from .global_value_learning import best_from
 
 _LENGTHS = (2, 4, 7, 12, 20, 30)  # periods for which a corner of the bounds is held before the feedback
+_ITERATIONS = 15  # of `BoxDDP`, for a plan that is made anew at every control
 
 
 class Following(NamedTuple):
@@ -211,9 +212,6 @@ def _guesses(problem: SampledProblem, steps: int) -> tuple[Tensor, Tensor]:
     for k, (length, u) in enumerate(held, 1):
         control[k, :length], feedback[k, :length] = u, 0.0
     return control, feedback
-
-
-_ITERATIONS = 15
 
 
 class BoundedPlans:

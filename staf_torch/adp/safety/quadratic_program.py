@@ -1,4 +1,16 @@
-"""The nearest point of a box that satisfies a few linear inequalities, exactly and row by row."""
+"""The nearest point of a box that satisfies a few linear inequalities, exactly and row by row.
+
+Every row solves a quadratic program of few unknowns and few inequalities at every control. The solution is
+found by enumeration: one unknown is an interval, of two the candidates are the feet and corners of all
+edges, of more the stationary points of all active sets; the candidate that meets the optimality conditions
+best is it. An active-set or interior-point iteration would do less work for one row, but how many passes it
+takes differs from row to row, and it stops near the solution; here the operations are the same for all
+rows, which a vector lane computes side by side, and a wanted point that is admissible comes back bit for
+bit.
+
+Source: the conditions of Karush, Kuhn and Tucker, in Nocedal and Wright, "Numerical Optimization" (2006),
+ch. 16.
+"""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from staf_torch import adp, systems
 from staf_torch.adp.critic.bellman import value_gradient
-from staf_torch.adp.planning.shooting.stage import Interval
+from staf_torch.adp.planning.shooting.newton import Interval
 
 DOUBLE = systems.Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
 LINEAR = systems.Linear([[0.0, 1.0], [2.0, -1.0]], [[0.0], [1.0]])

@@ -14,9 +14,8 @@ from ....systems.bounds import Limit
 from ...loop.controller import LQR, Policy, Value
 from ...problem.cost import Cost
 from ..ddp import chosen
-from .newton import MeshPlan, NewtonSolution, follow, minimise, replay
+from .newton import Interval, MeshPlan, NewtonSolution, follow, minimise, replay
 from .optimum import Optimum
-from .stage import Interval
 from .starts import guesses, guided
 
 _DECAY = 9.2  # time constants of the slowest mode in the horizon: it falls to 1e-4
