@@ -217,12 +217,7 @@ OTHERS = {
     *("PlanReplay", "RememberedPolicy", "AmongDiscs", "RecedingHorizon", "PathIntegral", "MujocoPlant"),
     *("EnvironmentPlant", "EnergyShaping", "NearOptimal", "SampledRollout", "StrainedPlans"),
     *("ParametricPlant", "ChangingPlant", "AdaptiveActorCritic", "AdaptiveLQR", "DriftLQR"),
-    *(
-        "ConcurrentTracker",
-        "Measured",
-        "RobustFilter",
-        "Observed",
-    ),
+    *("ConcurrentTracker", "Measured", "RobustFilter", "Observed"),
 }
 """What wraps a function of the user's own, or takes minutes to make: tested in its room."""
 

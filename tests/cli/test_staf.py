@@ -323,20 +323,8 @@ BAD: dict[str, tuple[str, tuple[str, ...]]] = {
     "unknown key of a group": ("kernel=gaussian kernel.wdth=2", ("wdth",)),
     "unknown argument": ("kernel=gaussian +kernel.wdth=2", ("wdth",)),
     "broken syntax": ("initial_state=[1.0", ("[1.0",)),
-    "figures is a word": (
-        "figures=maybe",
-        (
-            "figures",
-            "maybe",
-        ),
-    ),
-    "history is a word": (
-        "history=maybe",
-        (
-            "history",
-            "maybe",
-        ),
-    ),
+    "figures is a word": ("figures=maybe", ("figures", "maybe")),
+    "history is a word": ("history=maybe", ("history", "maybe")),
     "custom without a path": ("kernel=custom", ("path",)),
     "target of a wrong shape": (
         "target=custom target.path=plants.wrong",
@@ -346,13 +334,7 @@ BAD: dict[str, tuple[str, tuple[str, ...]]] = {
         "system=custom system.path=plants.Wrong",
         ("`Wrong.drift` must map (..., n) to (..., n)",),
     ),
-    "run directory under a file": (
-        "hydra.run.dir=blocked/run",
-        (
-            "cannot write",
-            "blocked",
-        ),
-    ),
+    "run directory under a file": ("hydra.run.dir=blocked/run", ("cannot write", "blocked")),
 }
 WRONG: dict[str, tuple[str, tuple[str, ...]]] = {  # refused by the library, whoever calls it
     "module that is not there": ("task=nowhere.at_all", ("`staf task=...` cannot be imported",)),
@@ -362,36 +344,15 @@ WRONG: dict[str, tuple[str, tuple[str, ...]]] = {  # refused by the library, who
     ),
     "too many polynomial centers": (
         "kernel=polynomial kernel.degree=1 centers.count=6",
-        (
-            "has 6 centers",
-            "has 3 dimensions: use at most 3 centers",
-        ),
+        ("has 6 centers", "has 3 dimensions: use at most 3 centers"),
     ),
-    "duration under dt": (
-        "duration=0.001",
-        (
-            "`staf duration=...` must be at least one step",
-            "0.001",
-        ),
-    ),
-    "device that is not there": (
-        "device=cuda:7",
-        (
-            "`staf device=...` cannot be used here",
-            "cuda:7",
-        ),
-    ),
+    "duration under dt": ("duration=0.001", ("`staf duration=...` must be at least one step", "0.001")),
+    "device that is not there": ("device=cuda:7", ("`staf device=...` cannot be used here", "cuda:7")),
     "path to nothing": (
         "target=custom target.path=nowhere.at_all",
         ("`custom(path=...)` cannot be imported",),
     ),
-    "unknown task": (
-        "task=nope",
-        (
-            "`staf task=...` must be one of",
-            "'nope'",
-        ),
-    ),
+    "unknown task": ("task=nope", ("`staf task=...` must be one of", "'nope'")),
 }
 
 

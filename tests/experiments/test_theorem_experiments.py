@@ -81,10 +81,7 @@ def test_the_bound_holds_in_space_too_and_has_no_numbers_where_no_degree_does() 
 
 def test_fewer_centers_are_needed_where_more_error_is_allowed_and_at_each_state_than_at_all() -> None:
     result = ran("feasibility")
-    assert result.metrics == {
-        "r0.1.eps0.1.count": 3,
-        "r0.1.eps0.01.count": 6,
-    }
+    assert result.metrics == {"r0.1.eps0.1.count": 3, "r0.1.eps0.01.count": 6}
     for row in result.rows("feasibility"):
         assert int(row["least_pointwise"]) <= int(row["count"])
         assert float(row["error"]) <= float(row["epsilon"])

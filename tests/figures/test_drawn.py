@@ -36,16 +36,10 @@ def test_the_panels_of_a_chase_hold_its_history(count: int) -> None:
     state, value, weights, error = visible(chase.draw_chase(history))
     inside = {"xlim": span(T)}
     holds(
-        state,
-        [(f"$x_{{{i + 1}}}$", T, history.state[:, i]) for i in range(2)],
-        ("", "state $x$"),
-        **inside,
+        state, [(f"$x_{{{i + 1}}}$", T, history.state[:, i]) for i in range(2)], ("", "state $x$"), **inside
     )
     holds(
-        value,
-        [("$V(x)$", T, history.value), (r"$\hat V(x)$", T, history.estimate)],
-        ("", "value"),
-        **inside,
+        value, [("$V(x)$", T, history.value), (r"$\hat V(x)$", T, history.estimate)], ("", "value"), **inside
     )
     pairs = [
         ((f"$a_{{{i + 1}}}$", T, history.weights[:, i]), (None, T, history.ideal_weights[:, i]))

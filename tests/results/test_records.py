@@ -48,11 +48,7 @@ CHANGES: list[tuple[dict[str, Any], dict[str, Any], list[str]]] = [
         record(),
         ["the module gone has changed", "the module own has changed"],
     ),
-    (
-        record(imported={"absent_module": "1"}),
-        record(),
-        ["the module absent_module has changed"],
-    ),
+    (record(imported={"absent_module": "1"}), record(), ["the module absent_module has changed"]),
 ]
 
 

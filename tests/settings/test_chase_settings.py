@@ -88,10 +88,7 @@ BAD: dict[str, tuple[str, tuple[str, ...]]] = {
     ),
     "radius is a word": ("centers.radius=abc", ("(radius=...)` must be a number; got 'abc'.",)),
     "long initial state": ("initial_state=[1,2,3]", ("initial_state=...` must have 2 entries",)),
-    "word in the initial state": (
-        "initial_state=[a,0.0]",
-        ("initial_state=...` must be a list of numbers",),
-    ),
+    "word in the initial state": ("initial_state=[a,0.0]", ("initial_state=...` must be a list of numbers",)),
     "initial state is a number": ("initial_state=5", ("initial_state=...` must be a list of numbers",)),
     "negative dt": ("dt=-0.01", ("`staf dt=...` must be positive; got -0.01.",)),
     "dt is null": ("dt=null", ("`staf dt=...` must be a number; got None.",)),
@@ -195,10 +192,7 @@ def test_centers_are_those_of_the_layout_and_the_radius(
 @pytest.mark.parametrize(
     ("given", "said"),
     [
-        (
-            {"layout": "no"},
-            "'simplex', 'cross_polytope', 'ball', 'directions'; got 'no'.",
-        ),
+        ({"layout": "no"}, "'simplex', 'cross_polytope', 'ball', 'directions'; got 'no'."),
         (
             {"layout": "polygon", "count": 3, "dim": 3},
             "`centers=polygon` lies in the plane, but the system has 3 states: use",
@@ -221,10 +215,7 @@ def test_centers_are_those_of_the_layout_and_the_radius(
             {"layout": "simplex", "dim": 2, "count": 4},
             "must be 3 (or null) for simplex with 2 states; got 4.",
         ),
-        (
-            {"layout": "simplex", "dim": 2, "count": "4"},
-            "centers.count=...` must be an integer; got '4'.",
-        ),
+        ({"layout": "simplex", "dim": 2, "count": "4"}, "centers.count=...` must be an integer; got '4'."),
         ({"layout": "simplex", "dim": 2, "count": 0}, "`staf centers.count=...` must be at least 1; got 0."),
     ],
 )
@@ -298,14 +289,8 @@ def test_a_path_is_a_class_that_is_called_or_a_thing_as_it_is() -> None:
     for path, said in (
         ("pi", "must be a dotted path `package.module.name`; got 'pi'."),
         (3, "must be a dotted path `package.module.name`; got 3."),
-        (
-            "math.no_such",
-            "cannot be imported (module 'math' has no attribute 'no_such')",
-        ),
-        (
-            "no_such_module.x",
-            "cannot be imported (No module named 'no_such_module'); got",
-        ),
+        ("math.no_such", "cannot be imported (module 'math' has no attribute 'no_such')"),
+        ("no_such_module.x", "cannot be imported (No module named 'no_such_module'); got"),
     ):
         with pytest.raises(ValueError, match=re.escape(f"`custom(path=...)` {said}")):
             chase.load(path)  # type: ignore[arg-type]

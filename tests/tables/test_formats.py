@@ -16,16 +16,7 @@ from sweep_runs import BAD_COUNT, write_run, write_sweep
 from tables.test_aggregation import PIVOT
 
 from staf_torch.results.reader import Collection, collect
-from staf_torch.tables import (
-    Layout,
-    Style,
-    Table,
-    html_text,
-    json_text,
-    latex_text,
-    parquet_bytes,
-    tabulate,
-)
+from staf_torch.tables import Layout, Style, Table, html_text, json_text, latex_text, parquet_bytes, tabulate
 from staf_torch.tables.columns import Column, Row, printed, significant
 from staf_torch.tables.model import data_frame, escape
 
@@ -100,15 +91,7 @@ def test_markdown_joins_mean_and_spread_and_marks_the_best(found: Collection) ->
     counts = ["centers.count=3", "centers.count=6", "centers.count=7"]
     assert heads == ["kernel", "centers.radius", *counts, "n", "failed"]
     cells = [cell.strip() for cell in lines[4].strip("|").split("|")]
-    assert cells == [
-        "exponential",
-        "0.05",
-        "**0.0128 ± 0.0003**",
-        "**0.00064 ± 1.5e-05**",
-        "-",
-        "0-3",
-        "0-3",
-    ]
+    assert cells == ["exponential", "0.05", "**0.0128 ± 0.0003**", "**0.00064 ± 1.5e-05**", "-", "0-3", "0-3"]
     assert "**" not in lines[5]
     assert f"12 of 36 failed: {BAD_COUNT}" in text
     assert len({len(line) for line in lines[2:8]}) == 1  # aligned

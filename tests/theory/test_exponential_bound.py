@@ -10,10 +10,7 @@ from helpers import tensor
 from helpers_theory import random_offsets
 from torch import Tensor
 
-from staf_torch import (
-    targets,
-    theory,
-)
+from staf_torch import targets, theory
 from staf_torch.theory.exponential_bound import DomainProblem
 
 PAPER = targets.Paper()

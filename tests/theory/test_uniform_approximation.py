@@ -10,9 +10,7 @@ from helpers import tensor, uniform
 from helpers_theory import random_offsets
 from torch import Tensor
 
-from staf_torch import (
-    theory,
-)
+from staf_torch import theory
 from staf_torch.centers import probe_points
 from staf_torch.centers.layouts import monomials
 from staf_torch.theory.uniform_approximation import ball_grid, near_best, supremum
