@@ -25,9 +25,9 @@ def without_dtype(nodes: Sequence[ast.AST]) -> Iterator[str]:
     for node in nodes:
         if (
             isinstance(node, ast.Call)
-            and id(node) not in cast
             and isinstance(node.func, ast.Attribute)
             and node.func.attr in _MAKERS
+            and id(node) not in cast
             and ast.unparse(node.func.value) == "torch"
             and not any(word.arg in ("dtype", "out", None) for word in node.keywords)
         ):
@@ -37,14 +37,20 @@ def without_dtype(nodes: Sequence[ast.AST]) -> Iterator[str]:
 def without_encoding(nodes: Sequence[ast.AST]) -> Iterator[str]:
     """Calls that read or write text in the encoding of the user's locale: by line."""
     for node in nodes:
-        if not isinstance(node, ast.Call) or any(word.arg in ("encoding", None) for word in node.keywords):
+        if not isinstance(node, ast.Call) or _called(node.func) not in ("open", *_TEXT):
             continue
-        name = ast.unparse(node.func)
+        if any(word.arg in ("encoding", None) for word in node.keywords):
+            continue
         modes = [each.value for each in ast.walk(node) if isinstance(each, ast.Constant)]
         binary = any(isinstance(mode, str) and "b" in mode for mode in modes)
-        opened = name.rpartition(".")[2] == "open" and name != "os.open" and not binary
+        opened = _called(node.func) == "open" and ast.unparse(node.func) != "os.open" and not binary
         if opened or (isinstance(node.func, ast.Attribute) and node.func.attr in _TEXT):
             yield f"{node.lineno}: {ast.unparse(node)[:80]}"
+
+
+def _called(function: ast.expr) -> str:
+    """The last part of the name of what is called; empty where it has none."""
+    return getattr(function, "attr", getattr(function, "id", ""))
 
 
 def looks_inside(nodes: Sequence[ast.AST]) -> Iterator[str]:
@@ -83,7 +89,7 @@ def _root(node: ast.AST) -> str | None:
 
 def _names_the_package(node: ast.AST) -> bool:
     """Whether it is a dotted name of the package, `import_module` of one, or an entry of `sys.modules`."""
-    if isinstance(node, ast.Call) and ast.unparse(node.func).endswith("import_module"):
+    if isinstance(node, ast.Call) and _called(node.func).endswith("import_module"):
         node = node.args[0]
     elif isinstance(node, ast.Subscript) and ast.unparse(node.value) == "sys.modules":
         node = node.slice
@@ -106,7 +112,7 @@ def _private(node: ast.AST) -> str | None:
         return f"imports {wanted[0]}" if wanted else None
     if isinstance(node, ast.Constant) and isinstance(node.value, str) and _PRIVATE.fullmatch(node.value):
         return f"names {node.value}"
-    if isinstance(node, ast.Call) and ast.unparse(node.func) in ("getattr", "hasattr") and len(node.args) > 1:
+    if isinstance(node, ast.Call) and _called(node.func) in ("getattr", "hasattr") and len(node.args) > 1:
         name = node.args[1]
         if isinstance(name, ast.Constant) and _is_private(str(name.value)):
             return f"reads {name.value}"
@@ -127,11 +133,11 @@ def _patched(node: ast.AST, ours: set[str], made: set[str]) -> str | None:
     """Of `monkeypatch`, `unittest.mock` or `setattr`, with a thing of the package or its dotted name."""
     if not isinstance(node, ast.Call) or not node.args:
         return None
-    of, target = ast.unparse(node.func), node.args[0]
-    called = of.rpartition(".")[2]
-    if called not in ("setattr", "delattr") and not (called in _PATCHES and "patch" in of):
+    called, target = _called(node.func), node.args[0]
+    if called not in _PATCHES or (called[3:] != "attr" and "patch" not in ast.unparse(node.func)):
         return None
-    known = ours if of == called else made  # `setattr(policy, "horizon", 1)` is a user's own
+    # `setattr(policy, "horizon", 1)` is a user's own.
+    known = ours if isinstance(node.func, ast.Name) else made
     return f"patches {ast.unparse(target)}" if _root(target) in known or _names_the_package(target) else None
 
 
@@ -145,7 +151,7 @@ def _assigned(node: ast.AST, ours: set[str]) -> str | None:
     for target in targets:
         if isinstance(target, ast.Subscript):
             inner = target.value
-            if isinstance(inner, ast.Call) and ast.unparse(inner.func) == "vars" and inner.args:
+            if isinstance(inner, ast.Call) and _called(inner.func) == "vars" and inner.args:
                 target = ast.Attribute(inner.args[0], "name")
             elif isinstance(inner, ast.Attribute):
                 target = inner
