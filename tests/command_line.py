@@ -9,6 +9,7 @@ import json
 import logging
 import multiprocessing
 import os
+import runpy
 import sys
 import traceback
 import warnings
@@ -30,10 +31,6 @@ class Escape(nn.Module):
     """x' = x^2: a user's plant without a flow, a dimension or a base class."""
     def drift(self, x):
         return x ** 2
-
-class Wrong(nn.Module):
-    def drift(self, x):
-        return x[..., :1]
 
 class Cauchy(Kernel):
     def __init__(self, width=1.0):
@@ -71,9 +68,6 @@ class Lines(Tracker):
 
 def bowl(x):
     return x.square().sum(-1)
-
-def wrong(x):
-    return x
 '''
 
 
@@ -141,8 +135,6 @@ def environment() -> dict[str, str]:
 
 def one(folder: str, argv: list[str]) -> tuple[int, str, str]:
     """One command line in this process: exit code, output, errors."""
-    from staf_torch.cli.staf import main
-
     os.chdir(folder)
     os.environ.pop("HYDRA_FULL_ERROR", None)
     sys.argv = ["staf", *argv]
@@ -150,7 +142,7 @@ def one(folder: str, argv: list[str]) -> tuple[int, str, str]:
     out, err, code = io.StringIO(), io.StringIO(), 0
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         try:
-            main()
+            runpy.run_module("staf_torch", run_name="__main__")
         except SystemExit as end:
             # As the interpreter does it: a text goes to stderr, and the code is 1.
             code = end.code if isinstance(end.code, int) else int(end.code is not None)

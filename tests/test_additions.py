@@ -10,7 +10,6 @@ import sys
 from pathlib import Path
 from typing import NamedTuple
 
-import pytest
 from command_line import ROOT
 
 
@@ -159,54 +158,52 @@ RUNS = {
     "controller": ("experiment=adp", "adp/policy=damping", "adp.compile=false", "system=duffing", "dt=0.01"),
 }
 PROPERTIES = ("test_variants.py", "test_modules.py", "test_rules.py", "kernels/test_kernels.py")
+PROGRAM = """
+import contextlib, io, json, runpy, sys, pytest
+import staf_torch as st
+from staf_torch.cli.table import main
 
+def said(run, *given):
+    with contextlib.redirect_stdout(io.StringIO()) as out, contextlib.suppress(SystemExit):
+        run(*given)
+    return out.getvalue()
 
-@pytest.fixture(scope="module")
-def tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A copy of this tree with all additions, each of three files."""
-    base = tmp_path_factory.mktemp("copy")
-    for room in ("staf_torch", "conf", "tests"):
-        shutil.copytree(ROOT / room, base / room, ignore=shutil.ignore_patterns("__pycache__"))
-    shutil.copy(ROOT / "pyproject.toml", base)
-    for addition in ADDITIONS.values():
-        assert len(addition.write(base)) == 3
-    return base
-
-
-def python(tree: Path, *words: str, into: Path | None = None) -> str:
-    """The output of a program of the copy."""
-    env = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tree), str(tree / "staf_torch" / "plugins")])}
-    ended = subprocess.run(
-        [sys.executable, *words], cwd=into or tree, env=env, capture_output=True, text=True, check=False
-    )
-    assert ended.returncode == 0, ended.stdout[-5000:] + ended.stderr[-5000:]
-    return ended.stdout
-
-
-def test_each_is_an_option_of_the_command_of_the_schema_and_of_tables(tree: Path, tmp_path: Path) -> None:
-    short = ("duration=0.05", "settle_time=0", "figures=false")
-    lines = {name: [*short, *words, f"hydra.run.dir=runs/{name}"] for name, words in RUNS.items()}
-    program = f"""
-import runpy, sys
-for words in {list(lines.values())!r}:
+def staf(*words):
     sys.argv = ["staf", *words]
-    runpy.run_module("staf_torch", run_name="__main__")
+    return said(lambda: runpy.run_module("staf_torch", run_name="__main__"))
+
+tests = said(pytest.main, ["-n", "0", "-p", "no:cacheprovider", "-k", SELECTED, *PROPERTIES])
+for line in LINES:
+    staf(*line)
+table = said(main, ["runs", "--format", "json"])
+names = [*st.kernels.__all__, *st.optim.__all__, *st.systems.__all__]
+print(json.dumps({"tests": tests, "table": table, "schema": staf("schema"), "names": names}))
 """
-    python(tree, "-c", program, into=tmp_path)
-    asked = "from staf_torch.cli.table import main; main(['runs', '--format', 'json'])"
-    table = json.loads(python(tree, "-c", asked, into=tmp_path))
-    assert len(table["rows"]) == len(RUNS)
-    assert {"cauchy", "cautious", "duffing", "damping"} <= {
-        str(v) for row in table["rows"] for v in row.values()
-    }
-    schema = python(tree, "-m", "staf_torch", "schema")
-    assert all(key in schema for key in ("CauchyKernel", "Cautious", "systems.Duffing", "Damping"))
 
 
-def test_each_is_held_to_the_properties_and_has_a_page(tree: Path) -> None:
-    words = " or ".join(("auchy", "autious", "uffing", "amping", "listed", "known_here"))
-    names = [str(Path("tests", name)) for name in PROPERTIES]
-    said = python(tree, "-m", "pytest", "-n", "0", "-p", "no:cacheprovider", *names, "-k", words)
-    assert int(said.split(" passed")[0].split()[-1]) > 40
-    pages = "import staf_torch as st; print(*st.kernels.__all__, *st.optim.__all__, *st.systems.__all__)"
-    assert {"CauchyKernel", "Cautious", "Duffing"} <= set(python(tree, "-c", pages).split())
+def test_each_has_the_properties_an_option_of_the_command_of_the_schema_and_of_tables_and_a_page(
+    tmp_path: Path,
+) -> None:
+    """In a copy of this tree with all additions, each of three files."""
+    for room in ("staf_torch", "conf", "tests"):
+        shutil.copytree(ROOT / room, tmp_path / room, ignore=shutil.ignore_patterns("benchmarks"))
+    shutil.copy(ROOT / "pyproject.toml", tmp_path)
+    for addition in ADDITIONS.values():
+        assert len(addition.write(tmp_path)) == 3
+    short = ("duration=0.05", "settle_time=0", "figures=false")
+    lines = [[*short, *words, f"hydra.run.dir=runs/{name}"] for name, words in RUNS.items()]
+    selected = " or ".join(("auchy", "autious", "uffing", "amping", "listed", "known_here"))
+    properties = [str(Path("tests", name)) for name in PROPERTIES]
+    given = f"LINES, SELECTED, PROPERTIES = {lines!r}, {selected!r}, {properties!r}"
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, (tmp_path, tmp_path / "staf_torch/plugins")))}
+    line = [sys.executable, "-c", given + PROGRAM]
+    ended = subprocess.run(line, cwd=tmp_path, env=env, capture_output=True, text=True, check=False)
+    assert ended.returncode == 0, ended.stdout[-5000:] + ended.stderr[-5000:]
+    found = json.loads(ended.stdout.splitlines()[-1])
+    assert " failed" not in found["tests"], found["tests"][-5000:]
+    assert int(found["tests"].split(" passed")[0].split()[-1]) > 40
+    rows = json.loads(found["table"])["rows"]
+    assert len(rows) == len(RUNS)
+    assert {"cauchy", "cautious", "duffing", "damping"} <= {str(v) for row in rows for v in row.values()}
+    assert all(key in found["schema"] for key in ("CauchyKernel", "Cautious", "systems.Duffing", "Damping"))
+    assert {"CauchyKernel", "Cautious", "Duffing"} <= set(found["names"])
