@@ -1,4 +1,7 @@
-"""A chase from settings: every option builds, every wrong value is named, equal settings share objects."""
+"""A chase from settings: every wrong value is named, equal settings share objects.
+
+That every option runs is in tests/cli/test_staf.py.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,6 @@ import math
 import re
 import warnings
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import composing
@@ -19,7 +21,6 @@ from torch import Tensor
 
 import staf_torch as st
 from staf_torch import StateFollowingCenters
-from staf_torch.cli.staf import config_directory
 from staf_torch.metrics import Metric
 from staf_torch.settings import chase
 from staf_torch.settings.chase import ChaseProblem, chase_problem, make, make_centers
@@ -27,13 +28,6 @@ from staf_torch.settings.plain import PlainSettings
 from staf_torch.sweeps.hydra_compat import named_packages, trusted
 
 GROUPS = ("kernel", "centers", "target", "system", "optimizer")
-OPTIONS = [
-    f"{group}={path.stem}"
-    for group in GROUPS
-    for path in sorted((Path(config_directory()) / group).glob("*.yaml"))
-    if path.stem
-    not in ("custom", "mujoco")  # of the user's own; the second in tests/settings/test_adp_groups.py
-]
 
 
 @functools.cache
@@ -54,22 +48,6 @@ def settings(line: str) -> DictConfig:
 
 def problem(line: str) -> ChaseProblem:
     return chase_problem(settings(line))
-
-
-NEEDS = {  # what some options cannot do without
-    "centers=directions": "centers.directions=[[0,1],[1,0],[-1,0]]",
-    "system=cart_pole": "centers=simplex initial_state=[0,0,0,0]",
-    "system=planar_quadrotor": "centers=simplex initial_state=[0,0,0,0,0,0]",
-    "system=two_link_robot": "centers=simplex initial_state=[0,0,0,0]",
-    "system=three_state": "centers=simplex initial_state=[0,0,0]",
-}
-
-
-@pytest.mark.parametrize("option", OPTIONS)
-def test_every_option_of_every_group_builds_its_problem(option: str) -> None:
-    built = problem(f"{option} {NEEDS.get(option, '')}")
-    assert built.initial_states.shape == (1, built.basis.dim)
-    assert built.basis.count >= 3
 
 
 @pytest.mark.parametrize(
