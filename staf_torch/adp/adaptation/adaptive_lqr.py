@@ -11,7 +11,7 @@ from torch import Tensor
 from ...numerics.checks import fail, non_negative, positive_real, real
 from ...numerics.riccati import product
 from ..loop.controller import LQR, Controller, Policy
-from ..policies.rollout import RolloutPolicy
+from ..policies.rollout import RolloutPolicy, fitted_slope
 from ..problem.cost import Cost, matvec, quadratic
 from .consider import Considered, ConsiderFilter
 from .least_squares import Estimate, LeastSquares
@@ -176,7 +176,8 @@ class AdaptiveLQR(Controller):
         policy.base = lambda x: self._linear(x, many_k)
         policy.terminal = lambda x: quadratic(many_p, self.cost.deviation(x))
         values = policy.rollout(policy.basis.centers(x))
-        return self.cost.policy(self.model.believing(theta).effectiveness(x), policy.gradient_of(x, values))
+        slope = fitted_slope(policy.basis, x, values)
+        return self.cost.policy(self.model.believing(theta).effectiveness(x), slope)
 
     def _linear(self, x: Tensor, k: Tensor) -> Tensor:
         return self.cost.saturate(self.cost.input_of(-matvec(k, self.cost.deviation(x))))

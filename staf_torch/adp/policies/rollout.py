@@ -149,11 +149,7 @@ class RolloutPolicy(nn.Module):
 
     def gradient(self, x: Tensor) -> Tensor:
         """grad V^ at x, the centers frozen: (..., n) -> (..., n)."""
-        return self.gradient_of(x, self.rollout(self.basis.centers(x)))
-
-    def gradient_of(self, x: Tensor, values: Tensor) -> Tensor:
-        """`gradient` from what the rollouts cost, (..., n), (..., M) -> (..., n)."""
-        return fitted_slope(self.basis, x, values)
+        return fitted_slope(self.basis, x, self.rollout(self.basis.centers(x)))
 
     def value(self, x: Tensor) -> Tensor:
         """V^(x): (..., n) -> (...)."""
@@ -165,8 +161,12 @@ class RolloutPolicy(nn.Module):
         """Cost of the base policy over the horizon, and the terminal value: (..., n) -> (...)."""
         length = self.horizon / self.steps
 
+        def field(x: Tensor) -> tuple[Tensor, Tensor]:
+            u = self.base(x)
+            return self.model.velocity(x, u), self.cost.rate(x, u)
+
         def step(now: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
-            after, paid = runge_kutta_loop(self.model, self._field, now[0], length)
+            after, paid = runge_kutta_loop(self.model, field, now[0], length)
             return after, now[1] + paid
 
         def whole(x: Tensor) -> Tensor:
@@ -175,10 +175,6 @@ class RolloutPolicy(nn.Module):
             return total
 
         return each(whole, x, dim=x.dim() - 2) if x.dim() > 1 else whole(x)
-
-    def _field(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        u = self.base(x)
-        return self.model.velocity(x, u), self.cost.rate(x, u)
 
 
 class _TwoPrograms:
@@ -192,7 +188,7 @@ class _TwoPrograms:
         )
         self._improve = Rows(
             lambda x, values: policy.cost.policy(
-                policy.model.effectiveness(x), policy.gradient_of(x, values)
+                policy.model.effectiveness(x), fitted_slope(policy.basis, x, values)
             ),
             _NAME,
             policy,

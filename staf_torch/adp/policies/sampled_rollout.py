@@ -169,16 +169,6 @@ class SampledRollout(nn.Module):
         low, high = self.bounds.low.to(x) - base, self.bounds.high.to(x) - base
         return box_minimum(curvature, pull, low, high), known
 
-    def gradient(self, x: Tensor) -> Tensor:
-        """grad V^ at x, of the base's cost fitted at the centers around it: (..., n) -> (..., n).
-
-        Raises:
-            ValueError: if the basis is of the inputs, along which alone V^ is then known.
-        """
-        if self.along is not None:
-            raise fail("SampledRollout", "basis", "must be of the states to know grad V^", self.basis.dim)
-        return fitted_slope(self.basis, x, self.rollout(self.basis.centers(x)).whole)
-
     def _promise(self, after: Tensor, known: Promise) -> Promise:
         """Return the base's costs from (..., 1 + S, n), of which the first may be among the centers."""
         middle = None if self.along is None else self.along.middle
