@@ -223,17 +223,13 @@ def _unsqueezed(tree: Tree, dim: int) -> Tree:
     return unflatten(structure, iter([leaf.unsqueeze(dim) for leaf in leaves]))
 
 
-class tracing:  # noqa: N801
-    """Context: the combinators of this thread write loops of ``tracer``."""
-
-    def __init__(self, tracer: Tracer) -> None:
-        self._tracer = tracer
-
-    def __enter__(self) -> Tracer:
-        _active.tracer = self._tracer
-        return self._tracer
-
-    def __exit__(self, *_: object) -> None:
+@contextmanager
+def tracing(tracer: Tracer) -> Iterator[None]:
+    """The combinators of this thread write loops of ``tracer``."""
+    _active.tracer = tracer
+    try:
+        yield
+    finally:
         _active.tracer = None
 
 

@@ -6,6 +6,7 @@ of a state or of a handful of centers, and order is found by comparing every pai
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -51,8 +52,10 @@ def kthvalue(x: Tensor, k: int, dim: int = -1, keepdim: bool = False) -> tuple[T
     return values, places
 
 
-def median_along(x: Tensor, dim: int, keepdim: bool = False) -> tuple[Tensor, Tensor]:
-    """The lower median and its place; NaN where there is one."""
+def median(x: Tensor, dim: int | None = None, keepdim: bool = False) -> Any:
+    """The lower median of all entries, or along a dimension with its place; NaN where there is one."""
+    if dim is None:
+        return median(x.reshape(-1), 0)[0]
     values, places = sort(x, dim)
     count = x.shape[dim]
     lost = values.narrow(dim, count - 1, 1).isnan()
@@ -60,16 +63,11 @@ def median_along(x: Tensor, dim: int, keepdim: bool = False) -> tuple[Tensor, Te
         torch.where(lost, part.narrow(dim, count - 1, 1), part.narrow(dim, (count - 1) // 2, 1))
         for part in (values, places)
     ]
-    value, place = found if keepdim else (part.squeeze(dim) for part in found)
-    return value, place
+    return tuple(found if keepdim else (part.squeeze(dim) for part in found))
 
 
-def median(x: Tensor, dim: int | None = None, keepdim: bool = False) -> Any:
-    """The lower median of all entries, or along a dimension with its place."""
-    return median_along(x.reshape(-1), 0)[0] if dim is None else median_along(x, dim, keepdim)
-
-
-def _running(x: Tensor, dim: int, beats: Callable[[Tensor, Tensor], Tensor]) -> tuple[Tensor, Tensor]:
+def _running(x: Tensor, dim: int, *, beats: Callable[[Tensor, Tensor], Tensor]) -> tuple[Tensor, Tensor]:
+    """The extreme entry so far and its place; NaN is the extreme of all."""
     parts = x.unbind(dim)
     best, place = parts[0], torch.zeros_like(parts[0], dtype=torch.int64)
     values, places = [best], [place]
@@ -79,16 +77,6 @@ def _running(x: Tensor, dim: int, beats: Callable[[Tensor, Tensor], Tensor]) -> 
         values.append(best)
         places.append(place)
     return torch.stack(values, dim), torch.stack(places, dim)
-
-
-def cummax(x: Tensor, dim: int) -> tuple[Tensor, Tensor]:
-    """The largest entry so far and its place."""
-    return _running(x, dim, torch.ge)
-
-
-def cummin(x: Tensor, dim: int) -> tuple[Tensor, Tensor]:
-    """The smallest entry so far and its place."""
-    return _running(x, dim, torch.le)
 
 
 def cumprod(x: Tensor, dim: int, *, dtype: torch.dtype | None = None) -> Tensor:
@@ -138,14 +126,9 @@ def searchsorted(
     return passed.sum(-1)
 
 
-def fmin(a: Tensor, b: Tensor) -> Tensor:
-    """The smaller of two; what is a number where the other is NaN."""
-    return torch.where(a.isnan(), b, torch.where(b.isnan(), a, torch.minimum(a, b)))
-
-
-def fmax(a: Tensor, b: Tensor) -> Tensor:
-    """The larger of two; what is a number where the other is NaN."""
-    return torch.where(a.isnan(), b, torch.where(b.isnan(), a, torch.maximum(a, b)))
+def _of_numbers(a: Tensor, b: Tensor, *, pick: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
+    """The extreme of two; what is a number where the other is NaN."""
+    return torch.where(a.isnan(), b, torch.where(b.isnan(), a, pick(a, b)))
 
 
 def erfinv(y: Tensor) -> Tensor:
@@ -171,8 +154,8 @@ REPLACEMENTS: dict[str, Callable[..., Any]] = {
     "topk": topk,
     "kthvalue": kthvalue,
     "median": median,
-    "cummax": cummax,
-    "cummin": cummin,
+    "cummax": functools.partial(_running, beats=torch.ge),
+    "cummin": functools.partial(_running, beats=torch.le),
     "cumprod": cumprod,
     "prims::prod": _product,
     "prims::sum": _sum,
@@ -180,6 +163,6 @@ REPLACEMENTS: dict[str, Callable[..., Any]] = {
     "searchsorted": searchsorted,
     "angle": angle,
     "prims::erf_inv": erfinv,
-    "fmin": fmin,
-    "fmax": fmax,
+    "fmin": functools.partial(_of_numbers, pick=torch.minimum),
+    "fmax": functools.partial(_of_numbers, pick=torch.maximum),
 }

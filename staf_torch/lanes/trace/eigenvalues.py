@@ -20,7 +20,7 @@ from .factorisations import in_memory
 def eigen(gram: Tensor, UPLO: str = "L", compute_v: bool = True) -> tuple[Tensor, Tensor]:
     """The eigenvalues of symmetric matrices, ascending, and eigenvectors in columns, by Jacobi's rotations.
 
-    Torch asks for vectors also where a caller wants none; see `InPlainTorch`.
+    Torch asks for vectors also where a caller wants none; see `step`.
 
     One pass rotates the pairs (0, 1), (2, 3), ... at once and then moves all indices but the first one
     place on, so that after size - 1 passes every pair has met: Brent and Luk (1985).

@@ -188,15 +188,14 @@ RULES["clamp_max"] = lambda t, out, a, high: _clamp(t, out, a, None, high)
 
 
 @rule("addcmul")
-def _addcmul(t: Tracer, out: Tensor, a: Tensor, b: Tensor, c: Tensor, value: float = 1) -> Ids:
+def _addcmul(
+    t: Tracer, out: Tensor, a: Tensor, b: Tensor, c: Tensor, value: float = 1, _name: str = "mul"
+) -> Ids:
     x, y, z, factor = numbers(t, t.kind(out.dtype), a, b, c, value)
-    return t.map("add", x, t.map("mul", factor, t.map("mul", y, z)))
+    return t.map("add", x, t.map("mul", factor, t.map(_name, y, z)))
 
 
-@rule("addcdiv")
-def _addcdiv(t: Tracer, out: Tensor, a: Tensor, b: Tensor, c: Tensor, value: float = 1) -> Ids:
-    x, y, z, factor = numbers(t, t.kind(out.dtype), a, b, c, value)
-    return t.map("add", x, t.map("mul", factor, t.map("div", y, z)))
+RULES["addcdiv"] = functools.partial(_addcmul, _name="div")
 
 
 @rule("lerp")

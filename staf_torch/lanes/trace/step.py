@@ -38,7 +38,7 @@ from .factorisations import (
 )
 from .graph import NOW, STEP, Graph
 from .indexing import CHOICES, MOVEMENTS, added_at, many, moved
-from .tracer import NoReading, NotLoweredError, Tracer
+from .tracer import NotLoweredError, Tracer
 
 RULES["scatter_add"] = added_at
 
@@ -123,7 +123,7 @@ def trace(step: Step, given: Given, *, widened: bool = False, folded: bool = Fal
         row = given.tree("row", inputs("row", given.row, 0, 0))
         now = given.tree("now", inputs("now", given.now, NOW, 1))
         carry = inputs("state", given.carry, STEP, 0)
-        with tracer, tracing(tracer), NoReading(tracer), InPlainTorch(tracer.traced):
+        with tracer, tracing(tracer), _Functions(tracer.traced):
             try:
                 after, out = step(given.tree("carry", carry), now, row)
             except NotLoweredError:
@@ -169,14 +169,13 @@ def _is_finite(x: Tensor) -> Tensor:
     return x.abs() < math.inf  # one comparison, where torch has two
 
 
-class InPlainTorch(TorchFunctionMode):
-    """Context: a few functions of a traced tensor are plain torch operations, where one cannot see any more
-    below, where operations are traced, what was asked for: `eigvalsh` looks like `eigh`, which takes many
-    times as long; the slope of a determinant reads the factors that torch keeps; `one_hot` reads its input;
-    `isfinite` compares twice.
+class _Functions(TorchFunctionMode):
+    """Context: what must be seen before a function of torch becomes operations, which are all a tracer sees.
 
-    Args:
-        traced: whether a tensor depends on an input of the program.
+    What takes the numbers of a row out of torch is refused, as nobody sees what becomes of them. A few
+    functions of a traced tensor are plain torch operations: `eigvalsh` looks like `eigh` below, which takes
+    many times as long; the slope of a determinant reads the factors that torch keeps; `one_hot` reads its
+    input; `isfinite` compares twice.
     """
 
     def __init__(self, traced: Callable[[Tensor], bool]) -> None:
@@ -186,8 +185,7 @@ class InPlainTorch(TorchFunctionMode):
     def __torch_function__(
         self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
     ) -> Any:
-        kwargs = kwargs or {}
-        plain = _PLAIN.get(func)
+        kwargs, plain, name = kwargs or {}, _PLAIN.get(func), getattr(func, "__name__", "")
         if plain is not None and args and isinstance(args[0], Tensor):
             wrapped = torch._C._functorch.is_functorch_wrapped_tensor(args[0])
             if plain is eigenvalues:  # a bisection has no derivative worth the name
@@ -196,9 +194,12 @@ class InPlainTorch(TorchFunctionMode):
                 chosen = wrapped or self._traced(args[0])
             if chosen:
                 return plain(*args, **kwargs)
+        if name in _LEAVES_TORCH and isinstance(args[0], Tensor) and self._traced(args[0]):
+            raise NotLoweredError(f"`Tensor.{name}` takes numbers of a row out of torch")
         return func(*args, **kwargs)
 
 
+_LEAVES_TORCH = ("numpy", "__array__", "tolist", "__dlpack__")
 _PLAIN: dict[Any, Callable[..., Any]] = {
     torch.linalg.eigvalsh: eigenvalues,
     torch.nn.functional.one_hot: _one_hot,

@@ -20,7 +20,6 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes
 
 from .captured_tensors import Captured
@@ -320,25 +319,6 @@ def _of_each(function: Callable[..., int], spread: Sequence[Ids]) -> Ids:
 def _own_generator(args: Sequence[Any], kwargs: dict[str, Any]) -> bool:
     """Whether random numbers come from a generator that was given: one seeded in a step repeats itself."""
     return any(isinstance(value, torch.Generator) for value in (*args, *kwargs.values()))
-
-
-class NoReading(TorchFunctionMode):
-    """Refuses what takes the numbers of a row out of torch, where nobody sees what becomes of them."""
-
-    def __init__(self, tracer: Tracer) -> None:
-        super().__init__()
-        self._tracer = tracer
-
-    def __torch_function__(
-        self, func: Any, types: Any, args: Sequence[Any] = (), kwargs: dict[str, Any] | None = None
-    ) -> Any:
-        name = getattr(func, "__name__", "")
-        if name in _LEAVES_TORCH and isinstance(args[0], Tensor) and self._tracer.traced(args[0]):
-            raise NotLoweredError(f"`Tensor.{name}` takes numbers of a row out of torch")
-        return func(*args, **(kwargs or {}))
-
-
-_LEAVES_TORCH = ("numpy", "__array__", "tolist", "__dlpack__")
 
 
 # Set here and not in the class, where torch would wrap the method and import its compiler, three seconds.
