@@ -14,7 +14,7 @@ from torch import Tensor
 from ..approximation.basis import StaFBasis
 from ..centers import StateFollowingCenters, cross_polytope
 from ..kernels import ExponentialKernel
-from ..lanes import ready
+from ..lanes import ready, where_rows
 from ..numerics.checks import fail, flag, positive_real
 from ..systems import Clocked, Plant
 from ..systems.bounds import Limit
@@ -79,11 +79,7 @@ class NearOptimal(SampledRollout):
         if planner is None:
             return u
         rows, controls = x.reshape(-1, x.shape[-1]), u.reshape(-1, u.shape[-1])
-        strained = planner.strained(rows)
-        if not bool(strained.any()):  # saves work: a plan takes milliseconds
-            return u
-        planned = planner(rows[strained])
-        return controls.index_copy(0, strained.nonzero().squeeze(1), planned).view(u.shape)
+        return where_rows(planner.strained(rows), planner, rows, controls).view(u.shape)
 
     def controller(self) -> Controller:
         """Return the controller for loops: the policy, and where the LQR, followed from there, would meet a

@@ -8,9 +8,10 @@ from .loops import each as each
 from .loops import reduce as reduce
 from .loops import repeat as repeat
 from .loops import scan as scan
+from .loops import where_rows as where_rows
 from .program import Program as Program
 from .shared_programs import shared_program as shared_program
 from .tree import Shared as Shared
 
 __all__ = ["Program", "Shared", "compiled", "compiling", "each", "ready", "reduce", "repeat", "scan"]
-__all__ += ["shared_program"]
+__all__ += ["shared_program", "where_rows"]

@@ -84,6 +84,37 @@ def _chosen(going: Tensor, after: Tree, before: Tree) -> Tree:
     return unflatten(structure, iter(picked))
 
 
+def where_rows(where: Tensor, body: Callable[[Tree], Tree], given: Tree, otherwise: Tree) -> Tree:
+    """body(given) in the rows where ``where`` holds, ``otherwise`` in the others.
+
+    Plain torch calls ``body`` with these rows alone, and not at all where there are none; so does a compiled
+    program with a vector of rows.
+
+    Example:
+        >>> where_rows(torch.tensor([True, False]), torch.exp, torch.zeros(2), torch.full((2,), 7.0))
+        tensor([1., 7.])
+
+        Shown by `staf_torch/lanes/README.md`.
+
+    Args:
+        where: (B,) bool.
+        body: of which no row sees another.
+        given: a tree of tensors (B, ...): all that ``body`` reads of a row.
+        otherwise: a tree of tensors (B, ...), as ``body`` returns it.
+    """
+    if _tracer((given, otherwise)) is not None:
+        return repeat(1, lambda now: (body(now[1]), now[1]), (otherwise, given), where=lambda _: where)[0]
+    if tracing_now() or torch._C._functorch.peek_interpreter_stack():
+        return _chosen(where, body(given), otherwise)
+    rows = where.nonzero().squeeze(1)
+    if not len(rows):
+        return otherwise
+    (leaves, structure), (others, shape) = flatten(given), flatten(otherwise)
+    found = flatten(body(unflatten(structure, iter([leaf[rows] for leaf in leaves]))))[0]
+    pairs = zip(others, found, strict=True)
+    return unflatten(shape, iter([old.index_copy(0, rows, new) for old, new in pairs]))
+
+
 def scan(
     body: Callable[[Tree, Tree], tuple[Tree, Tree]],
     carry: Tree,

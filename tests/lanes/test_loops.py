@@ -76,6 +76,29 @@ def test_nothing_is_computed_once_no_row_goes_on() -> None:
     assert len(asked) == 6
 
 
+def test_a_branch_of_some_rows_is_called_with_these_alone_also_compiled() -> None:
+    x, seen = torch.linspace(-1, 1, 10, dtype=torch.float64).view(5, 2), list[int]()
+
+    def body(now: tuple[Tensor, Tensor]) -> Tensor:
+        seen.append(len(now[0]))
+        return now[0].exp() + now[1]
+
+    def branched(x: Tensor, above: float = 0.0) -> Tensor:
+        found: Tensor = lanes.where_rows(x[:, 0] > above, body, (x, x), -x)
+        return found
+
+    expected = torch.where(x[:, :1] > 0, x.exp() + x, -x)
+    for found in (branched(x), torch.func.vmap(lambda row: branched(row[None])[0])(x)):
+        torch.testing.assert_close(found, expected)
+    assert seen[0] == 2
+    seen.clear()
+    assert torch.equal(branched(x, above=9.0), -x)
+    assert not seen
+    program = lanes.Program(lambda x, _, __: (branched(x), ()))
+    assert program.compiles(x, steps=1)
+    torch.testing.assert_close(program(x, steps=1)[0], expected)
+
+
 def test_a_tracer_of_torch_sees_all_passes() -> None:
     x, u = given(5)
     graph = make_fx(grown)(x, u[:, 0])
