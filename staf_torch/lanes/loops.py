@@ -11,7 +11,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 import torch
@@ -21,6 +21,7 @@ from .trace.graph import FLAG, STEP, Ids, Loop
 from .trace.tracer import LARGE, NotLoweredError, Tracer
 from .tree import Tree, flatten, unflatten
 
+Some = TypeVar("Some")
 _active = threading.local()
 _FEW = 4  # passes of a loop that is only tried
 
@@ -84,7 +85,7 @@ def _chosen(going: Tensor, after: Tree, before: Tree) -> Tree:
     return unflatten(structure, iter(picked))
 
 
-def where_rows(where: Tensor, body: Callable[[Tree], Tree], given: Tree, otherwise: Tree) -> Tree:
+def where_rows(where: Tensor, body: Callable[[Tree], Some], given: Tree, otherwise: Some) -> Some:
     """body(given) in the rows where ``where`` holds, ``otherwise`` in the others.
 
     Plain torch calls ``body`` with these rows alone, and not at all where there are none; so does a compiled
@@ -103,16 +104,20 @@ def where_rows(where: Tensor, body: Callable[[Tree], Tree], given: Tree, otherwi
         otherwise: a tree of tensors (B, ...), as ``body`` returns it.
     """
     if _tracer((given, otherwise)) is not None:
-        return repeat(1, lambda now: (body(now[1]), now[1]), (otherwise, given), where=lambda _: where)[0]
+        start = otherwise, given
+        chosen: Some = repeat(1, lambda now: (body(now[1]), now[1]), start, where=lambda _: where)[0]
+        return chosen
     if tracing_now() or torch._C._functorch.peek_interpreter_stack():
-        return _chosen(where, body(given), otherwise)
+        every: Some = _chosen(where, body(given), otherwise)
+        return every
     rows = where.nonzero().squeeze(1)
     if not len(rows):
         return otherwise
     (leaves, structure), (others, shape) = flatten(given), flatten(otherwise)
     found = flatten(body(unflatten(structure, iter([leaf[rows] for leaf in leaves]))))[0]
     pairs = zip(others, found, strict=True)
-    return unflatten(shape, iter([old.index_copy(0, rows, new) for old, new in pairs]))
+    some: Some = unflatten(shape, iter([old.index_copy(0, rows, new) for old, new in pairs]))
+    return some
 
 
 def scan(
