@@ -98,18 +98,14 @@ class _CppWriter(StatementWriter):
         ahead = self._function(lambda: self._ahead(found))
         self._stored, self.copies = stored | found, copies
         advance = self._function(lambda: self._advance(following, outputs))
-        counts = {
-            "ROWS": rows,
-            "FIXED": fixed,
-            "NOWS": sum(self.layout.nows),
-            "AHEAD": numbers,
-            "CARRIES": sum(self.layout.carries),
-            "SLOTS_ROW": len(self.layout.rows),
-            "SLOTS_NOW": len(self.layout.nows),
-            "SLOTS_CARRY": len(self.layout.carries),
-            "COPIES": self.copies,
-            "TILE": 64,
+        layout = self.layout
+        counts = {"ROWS": rows, "FIXED": fixed, "NOWS": sum(layout.nows), "AHEAD": numbers}
+        counts |= {
+            "CARRIES": sum(layout.carries),
+            "SLOTS_ROW": len(layout.rows),
+            "SLOTS_NOW": len(layout.nows),
         }
+        counts |= {"SLOTS_CARRY": len(layout.carries), "COPIES": self.copies, "TILE": 64}
         single = self.graph.single
         head = [f"#define LANES_SINGLE {int(single)}", f"#define REAL {'float' if single else 'double'}"]
         head += [

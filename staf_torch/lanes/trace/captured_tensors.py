@@ -62,8 +62,8 @@ class Captured:
     """
 
     def __init__(self) -> None:
-        self._stated: dict[int, Any] = {}  # storages, kept: an address is used once
-        self._derived: dict[int, Any] = {}
+        # Storages that the step made, and whether its code states their numbers; kept: an address is used once.
+        self._made: dict[int, tuple[Any, bool]] = {}
         self._places: dict[tuple[int, str], dict[int, int]] = {}
         self._operations: list[tuple[Any, Sequence[Any], dict[str, Any], Any]] = []
         self._reads: list[tuple[Tensor, np.ndarray[Any, Any]]] = []  # keeps them: an address is used once
@@ -78,17 +78,12 @@ class Captured:
         """Whether the numbers of a tensor are part of the text."""
         if not _in_memory(tensor):
             return True
-        address = tensor.untyped_storage().data_ptr()
-        if address in self._stated:
-            return True
-        return address not in self._derived and not tensor.is_floating_point()
+        _, stated = self._made.get(_address(tensor), (None, not tensor.is_floating_point()))
+        return stated
 
     def from_outside(self, tensor: Tensor) -> bool:
         """Whether a tensor was there before."""
-        if not _in_memory(tensor):
-            return False
-        address = tensor.untyped_storage().data_ptr()
-        return address not in self._stated and address not in self._derived
+        return _in_memory(tensor) and _address(tensor) not in self._made
 
     def ran(self, function: Any, args: Sequence[Any], kwargs: dict[str, Any], out: Any) -> None:
         """Note an operation on tensors of which no row has its own."""
@@ -107,28 +102,23 @@ class Captured:
             for tensor in given:
                 self._forget(tensor)
             self._repeats = self._repeats and stated
-        for tensor in tensors(out):
-            if _in_memory(tensor):
-                storage = tensor.untyped_storage()
-                known = storage.data_ptr() in self._stated or storage.data_ptr() in self._derived
-                if not stated:
-                    self._stated.pop(storage.data_ptr(), None)
-                    self._derived[storage.data_ptr()] = storage
-                    if not known and not function._schema.is_mutable:
-                        self._recognise(storage.data_ptr(), function, args, kwargs)
-                elif not known and not any(
-                    storage.data_ptr() == t.untyped_storage().data_ptr()
-                    for t in given
-                    if not t._is_zerotensor()
-                ):
-                    self._stated[storage.data_ptr()] = storage
+        before = set(map(_address, given))
+        for tensor in filter(_in_memory, tensors(out)):
+            address, storage = _address(tensor), tensor.untyped_storage()
+            known = address in self._made
+            if not stated:
+                self._made[address] = storage, False
+                if not known and not function._schema.is_mutable:
+                    self._recognise(address, function, args, kwargs)
+            elif not known and address not in before:
+                self._made[address] = storage, True
 
     def _written_here(self, fresh: Sequence[Tensor]) -> None:
         """What `torch.tensor` of Python's numbers made just now, not memory of an array of NumPy."""
         for tensor in fresh:
             storage = tensor.untyped_storage()
             if storage.resizable() and self.from_outside(tensor):
-                self._stated[storage.data_ptr()] = storage
+                self._made[storage.data_ptr()] = storage, True
 
     def numbers(self, tensor: Tensor, kind: str, new: Callable[[int], int]) -> np.ndarray[Any, Any]:
         """The nodes of a tensor's entries, one for every place in memory.
@@ -176,11 +166,11 @@ class Captured:
         return Recipe(_joined(self._values), operations, self._reads, numbers, self._checks)
 
     def _made_inside(self, tensor: Tensor) -> bool:
-        return not _in_memory(tensor) or tensor.untyped_storage().data_ptr() in self._stated
+        return not _in_memory(tensor) or self._made.get(_address(tensor), (None, False))[1]
 
     def _forget(self, tensor: Tensor) -> None:
         """New numbers stand in this memory."""
-        address = tensor.untyped_storage().data_ptr()
+        address = _address(tensor)
         for key in [key for key in self._places if key[0] == address]:
             del self._places[key]
         self._results = {key: result for key, result in self._results.items() if result != address}
@@ -188,8 +178,7 @@ class Captured:
 
     def _first(self, tensor: Tensor) -> int:
         """The storage of a tensor, or the earlier one that holds the same numbers."""
-        address = tensor.untyped_storage().data_ptr()
-        return self._same.get(address, address)
+        return self._same.get(_address(tensor), _address(tensor))
 
     def _recognise(self, address: int, function: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> None:
         """Let what an operation returned be what it returned before, of the same arguments.
@@ -240,6 +229,10 @@ def _read(tensor: Tensor, at: np.ndarray[Any, Any]) -> Tensor:
 
 def _joined(parts: Sequence[Tensor]) -> Tensor:
     return torch.cat(list(parts)) if parts else torch.zeros(0, dtype=torch.float64)
+
+
+def _address(tensor: Tensor) -> int:
+    return tensor.untyped_storage().data_ptr()
 
 
 def _in_memory(tensor: Tensor) -> bool:

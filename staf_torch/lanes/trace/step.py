@@ -20,22 +20,11 @@ from ..call import Given
 from ..emit.schedule import Sizes
 from ..loops import tracing
 from ..tree import Shared, Tree, flatten, plain
-from . import reductions  # noqa: F401  its rules
+from . import eigenvalues, factorisations
+from . import reductions as reductions  # its rules
 from .captured_tensors import Recipe
 from .decompositions import REPLACEMENTS
-from .eigenvalues import eigen, eigenvalues
 from .entrywise import RULES
-from .factorisations import (
-    cholesky,
-    cholesky_solve,
-    determinant,
-    inverse,
-    log_determinant,
-    log_of_determinant,
-    orthogonal,
-    solve,
-    triangular,
-)
 from .graph import NOW, STEP, Graph
 from .indexing import CHOICES, MOVEMENTS, added_at, many, moved
 from .tracer import NotLoweredError, Tracer
@@ -188,7 +177,7 @@ class _Functions(TorchFunctionMode):
         kwargs, plain, name = kwargs or {}, _PLAIN.get(func), getattr(func, "__name__", "")
         if plain is not None and args and isinstance(args[0], Tensor):
             wrapped = torch._C._functorch.is_functorch_wrapped_tensor(args[0])
-            if plain is eigenvalues:  # a bisection has no derivative worth the name
+            if plain is eigenvalues.eigenvalues:  # a bisection has no derivative worth the name
                 chosen = not wrapped and len(args) == 1 and not kwargs and self._traced(args[0])
             else:
                 chosen = wrapped or self._traced(args[0])
@@ -201,20 +190,20 @@ class _Functions(TorchFunctionMode):
 
 _LEAVES_TORCH = ("numpy", "__array__", "tolist", "__dlpack__")
 _PLAIN: dict[Any, Callable[..., Any]] = {
-    torch.linalg.eigvalsh: eigenvalues,
+    torch.linalg.eigvalsh: eigenvalues.eigenvalues,
     torch.nn.functional.one_hot: _one_hot,
     **dict.fromkeys((torch.isfinite, Tensor.isfinite), _is_finite),
-    **dict.fromkeys((torch.linalg.det, torch.det, Tensor.det), determinant),
-    **dict.fromkeys((torch.linalg.slogdet, torch.slogdet, Tensor.slogdet), log_determinant),
-    **dict.fromkeys((torch.logdet, Tensor.logdet), log_of_determinant),
+    **dict.fromkeys((torch.linalg.det, torch.det, Tensor.det), factorisations.determinant),
+    **dict.fromkeys((torch.linalg.slogdet, torch.slogdet, Tensor.slogdet), factorisations.log_determinant),
+    **dict.fromkeys((torch.logdet, Tensor.logdet), factorisations.log_of_determinant),
 }
 
 FACTORISATIONS: dict[str, Callable[..., Any]] = {
-    "linalg_cholesky_ex": cholesky,
-    "linalg_solve_triangular": triangular,
-    "cholesky_solve": cholesky_solve,
-    "linalg_inv_ex": inverse,
-    "_linalg_solve_ex": solve,
-    "linalg_qr": orthogonal,
-    "_linalg_eigh": eigen,
+    "linalg_cholesky_ex": factorisations.cholesky,
+    "linalg_solve_triangular": factorisations.triangular,
+    "cholesky_solve": factorisations.cholesky_solve,
+    "linalg_inv_ex": factorisations.inverse,
+    "_linalg_solve_ex": factorisations.solve,
+    "linalg_qr": factorisations.orthogonal,
+    "_linalg_eigh": eigenvalues.eigen,
 }
