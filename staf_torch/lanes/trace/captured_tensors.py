@@ -62,7 +62,7 @@ class Captured:
     """
 
     def __init__(self) -> None:
-        # Storages that the step made, kept (an address is used once), and whether its code states the numbers.
+        # Storages that the step made, kept as an address is used once, and whether its code states numbers.
         self._made: dict[int, tuple[Any, bool]] = {}
         self._places: dict[tuple[int, str], dict[int, int]] = {}
         self._operations: list[tuple[Any, Sequence[Any], dict[str, Any], Any]] = []
