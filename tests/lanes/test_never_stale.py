@@ -115,12 +115,10 @@ def notebook(monkeypatch: pytest.MonkeyPatch) -> Any:
     return module
 
 
-def of(kept: SharedPrograms, function: Callable[[Tensor], Tensor]) -> Any:
+def of(kept: SharedPrograms, function: Callable[[Tensor], Tensor]) -> Program:
     """The program of a function, as chases, loops and simulations ask for it."""
-    program = kept.unchanged(function)
-    if program is None:
-        program = kept.of(lambda x, _, __: (x, function(x)), function, owners=(function,))
-    return program
+    made = kept.unchanged(function)
+    return made or kept.of(lambda x, _, __: (x, function(x)), function, owners=(function,))
 
 
 def right(program: Any, function: Callable[[Tensor], Tensor]) -> None:

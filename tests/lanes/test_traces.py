@@ -152,8 +152,7 @@ def layer(seed: int) -> nn.Module:
 
 def of(kept: SharedPrograms, module: nn.Module, *settings: Any) -> tuple[Program, Made]:
     step = Made(module)
-    found = kept.of(step, module, *settings)
-    return found, step
+    return kept.of(step, module, *settings), step
 
 
 def right(program: Program, x: Tensor = X) -> Tensor:
