@@ -101,9 +101,9 @@ def test_plan_that_is_carried_is_a_structure_in_c(kind: str, tmp_path: Path) -> 
     make: dict[str, Callable[[], adp.Controller]] = {
         "followed": lambda: adp.RecedingHorizon(problem, steps=12, iterations=0, compile=False),
         "sampled": lambda: adp.PathIntegral(problem, steps=6, samples=4, knots=3, compile=False),
-        "where a bound is met": adp.near_optimal(
+        "where a bound is met": lambda: adp.near_optimal(
             plant, cost, dt=0.1, low=-1.0, high=1.0, horizon=0.4
-        ).controller,
+        ).controller(),
     }
     controller = make[kind]()
     x0 = torch.tensor([[2.0, 0.5]], dtype=torch.float64)
