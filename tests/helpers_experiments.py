@@ -24,13 +24,13 @@ CASES: dict[str, str] = {
     "adp_initial_weights": "experiment=adp_initial_weights duration=0.5 dt=0.02 trajectories=5 "
     "initial_weights=[0.1,1.0]",
     "adp_tracking": "experiment=adp_tracking duration=0.3 dt=0.01",
-    "avoidance": "experiment=avoidance trajectories=3 duration=2.0 dt=0.1 adp.compile=false",
-    "avoidance of a unicycle": "experiment=avoidance avoidance.vehicle=unicycle trajectories=2 "
-    "duration=1.0 dt=0.1 adp.compile=false",
+    "avoidance": "experiment=avoidance trajectories=3 duration=2.0 dt=0.2 adp.compile=false",
+    "avoidance of a unicycle": "experiment=avoidance avoidance.vehicle=unicycle avoidance.discs=2 "
+    "trajectories=6 duration=4.0 dt=0.2 adp.compile=false",
     "exponential_bound": "experiment=exponential_bound exponential_bound.states=9 "
     "exponential_bound.radii=[0.1]",
     "faults": "experiment=faults trajectories=3 duration=0.6 faults.cases=[unstable]",
-    "faults from the start": "experiment=faults trajectories=3 duration=0.05 "
+    "faults from the start": "experiment=faults trajectories=2 duration=0.05 "
     "faults.cases=[short_period,mass]",
     "feasibility": "experiment=feasibility feasibility.states=16 feasibility.radii=[0.1] "
     "feasibility.epsilons=[0.1,0.01]",
@@ -43,8 +43,9 @@ CASES: dict[str, str] = {
     "memory": "experiment=memory duration=8 dt=0.02 memory.steps=30 memory.revisits=6 memory.states=40",
     "rivals": "experiment=rivals rivals.plants=[double_integrator] rivals.methods=[LQR,discrete~LQR,IPOPT] "
     "rivals.states=1 rivals.calls=10",
-    "safe_box": "experiment=safe_box duration=0.1 dt=0.01 trajectories=2 safe_box.states=4 safe_box.decay=20 "
-    "safe_box.substeps=2 safe_box.followed=0.03 adp.optimum.horizon=0.5 adp.optimum.intervals=8",
+    "safe_box": "experiment=safe_box duration=0.05 dt=0.01 trajectories=2 safe_box.states=4 "
+    "safe_box.decay=20 safe_box.substeps=2 safe_box.followed=0.03 adp.optimum.horizon=0.5 "
+    "adp.optimum.intervals=8",
 }
 
 

@@ -47,7 +47,7 @@ def test_an_animation_has_a_frame_a_time_and_what_moves_moves(tmp_path: Path) ->
 
 
 def test_a_page_holds_its_frames_and_asks_no_server(tmp_path: Path) -> None:
-    words = ("experiment=adp", "adp/policy=lqr", "duration=0.02", "dt=0.01", "figures=false", "animation=html")
+    words = ("experiment=adp", "adp/policy=lqr", "duration=0.02", "dt=0.01", "animation=html", SHORT[2])
     path = drawn(tmp_path / "run", *words)
     assert path.suffix == ".html"
     text = path.read_text()

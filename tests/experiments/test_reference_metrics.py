@@ -1,6 +1,6 @@
 """Every experiment, run short, has its golden metrics, its files and its figures.
 
-    python tests/experiments/test_reference_metrics.py  # records the golden metrics anew; minutes
+    python tests/experiments/test_reference_metrics.py [CASE ...]  # records the golden metrics anew; minutes
 
 A golden metric is one of `GOLDEN` that moves by less than 1e-7 of itself while the initial state moves by
 1e-12 of itself and while torch and compiled loops use AVX-512, AVX2 or neither; what moves more is bounded
@@ -74,10 +74,10 @@ def test_a_run_leaves_a_figure_with_named_axes_and_tells_its_progress(name: str)
     assert not result.progress or result.progress[-1] == pytest.approx(1)
 
 
-def measured() -> dict[str, dict[str, float | None]]:
-    """The metrics of every case, of an initial state that is perturbed by as much as the environment says."""
+def measured(names: list[str]) -> dict[str, dict[str, float | None]]:
+    """The metrics of cases, of an initial state that is perturbed by as much as the environment says."""
     found = {}
-    for name in CASES:
+    for name in names:
         given = words(name)
         share = float(os.environ.get("PERTURBED", 0))
         if share:
@@ -103,11 +103,12 @@ def stable(all_found: list[dict[str, float | None]], names: str) -> dict[str, fl
 
 
 if __name__ == "__main__":
+    chosen = [word for word in sys.argv[1:] if not word.startswith("--")] or list(CASES)
     if "--print" in sys.argv:
         from staf_torch import lanes
 
         with lanes.compiling("auto" if "--compiled" in sys.argv else "never"):
-            print(json.dumps(measured()))
+            print(json.dumps(measured(chosen)))
     else:
         variants = [
             ({}, ()),
@@ -118,12 +119,13 @@ if __name__ == "__main__":
         ]
         everything = []
         for environment, flags in variants:
-            command = [sys.executable, __file__, "--print", *flags]
+            command = [sys.executable, __file__, "--print", *flags, *chosen]
             output = subprocess.run(command, env=os.environ | environment, stdout=subprocess.PIPE, check=True)
             everything.append(json.loads(output.stdout.splitlines()[-1]))
-        text = {name: stable([found[name] for found in everything], GOLDEN.get(name, "")) for name in CASES}
-        for name in CASES:
+        text = json.loads(RECORDED.read_text())
+        for name in chosen:
+            text[name] = stable([found[name] for found in everything], GOLDEN.get(name, ""))
             lost = {*everything[0][name]} - {*text[name]}
             print(name, len(text[name]), "recorded; left out:", *sorted(lost)[:40])
-        lines = [f" {json.dumps(name)}: {json.dumps(numbers)}" for name, numbers in text.items()]
+        lines = [f" {json.dumps(name)}: {json.dumps(text[name])}" for name in CASES]
         RECORDED.write_text("{\n" + ",\n".join(lines) + "\n}\n")

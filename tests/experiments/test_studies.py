@@ -247,14 +247,13 @@ def test_discs_move_straight_on_and_neither_their_state_nor_their_speed_is_paid_
     torch.testing.assert_close(avoidance.distance(x, 0.4, one.size), nearest - 0.4)
 
 
-def test_behind_the_filter_a_unicycle_keeps_off_the_discs_that_its_policy_drives_into(tmp_path: Path) -> None:
-    short = ("duration=4", "dt=0.2", "trajectories=6", "figures=false", "adp.compile=false")
-    result = run(tmp_path, "experiment=avoidance", "avoidance.vehicle=unicycle", "avoidance.discs=2", *short)
+def test_behind_the_filter_a_unicycle_keeps_off_the_discs_that_its_policy_drives_into() -> None:
+    result = ran("avoidance of a unicycle")
     metrics = result.metrics
     assert metrics["constraint_violations"] == 0 < metrics["lookahead_constraint_violations"]
     assert metrics["minimum_margin"] > 0 > metrics["lookahead_minimum_margin"]
     assert [row["method"] for row in result.rows("avoidance")] == ["lookahead, filtered", "lookahead"]
-    with np.load(tmp_path / "history.npz") as history:
+    with np.load(result.directory / "history.npz") as history:
         assert history["state"].shape == (6, 21, 11)
         assert float(history["distance"].min()) == pytest.approx(metrics["minimum_margin"])
         assert float(history["lookahead_distance"].min()) == pytest.approx(
