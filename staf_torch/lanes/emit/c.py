@@ -6,15 +6,12 @@ import bisect
 import math
 import re
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 from ..trace.graph import FLAG, REAL, ROW, STEP, WHOLE, WIDE, Graph
 from .schedule import Schedule, Sizes
 from .statements import StatementWriter
 
-_INFIX = {"add": "+", "sub": "-", "mul": "*", "div": "/", "lt": "<", "le": "<=", "eq": "==", "ne": "!="}
-_INFIX |= {"and": "&&", "or": "||", "xor": "!="}
-_PREFIX = {"neg": "-", "not": "!", "copy": ""}
 _NAMES = {"abs": "fabs", "round": "rint"}
 
 
@@ -32,18 +29,16 @@ class Names(NamedTuple):
 
 
 class _ScalarWriter(StatementWriter):
+    _infix: ClassVar[dict[str, str]] = StatementWriter._infix | {"and": "&&", "or": "||", "xor": "!="}
+    _prefix: ClassVar[dict[str, str]] = StatementWriter._prefix | {"not": "!"}
+
     def __init__(self, graph: Graph, schedule: Schedule, layout: Sizes, names: Names) -> None:
         self.real, self._suffix = ("float", "f") if graph.single else ("double", "")
         types = {REAL: self.real, WHOLE: self.real, WIDE: "double", FLAG: "int"}
         super().__init__(graph, schedule, layout, types)
         self._names = {"row": names.rows, "now": names.nows, "state": names.carries}
 
-    def _operation(self, op: str, values: Sequence[str], type: str) -> str:
-        wide = type == WIDE
-        if op in _INFIX:
-            return f"{values[0]} {_INFIX[op]} {values[1]}"
-        if op in _PREFIX:
-            return f"{_PREFIX[op]}{values[0]}"
+    def _call(self, op: str, values: Sequence[str], type: str) -> str:
         if op == "cast":
             return f"({self.types[type]}){values[0]}"
         if op == "where":
@@ -51,7 +46,7 @@ class _ScalarWriter(StatementWriter):
         if op in ("min", "max"):
             a, b = values  # NaN wins
             return f"{a} {'<' if op == 'min' else '>'} {b} || {a} != {a} ? {a} : {b}"
-        return f"{_NAMES.get(op, op)}{'' if wide else self._suffix}({', '.join(values)})"
+        return f"{_NAMES.get(op, op)}{'' if type == WIDE else self._suffix}({', '.join(values)})"
 
     def _nobody(self, mask: int) -> str:
         return f"!({self._ref(mask, 0)})"

@@ -11,7 +11,7 @@ import itertools
 import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
@@ -28,9 +28,6 @@ _COSTLY, _MEMORY = 20, 4  # operations that a function takes, and that a number 
 _FUNCTIONS = frozenset(
     ("exp", "expm1", "log", "log1p", "sin", "cos", "tan", "tanh", "atan2", "pow", "sqrt", "div")
 )
-_INFIX = {"add": "+", "sub": "-", "mul": "*", "div": "/", "lt": "<", "le": "<=", "eq": "==", "ne": "!="}
-_INFIX |= {"and": "&", "or": "|", "xor": "^"}
-_PREFIX = {"neg": "-", "not": "~", "cast": "", "copy": ""}
 
 
 class Text(NamedTuple):
@@ -80,6 +77,9 @@ def _copies(schedule: Schedule) -> int:
 
 
 class _CppWriter(StatementWriter):
+    _infix: ClassVar[dict[str, str]] = StatementWriter._infix | {"and": "&", "or": "|", "xor": "^"}
+    _prefix: ClassVar[dict[str, str]] = StatementWriter._prefix | {"not": "~", "cast": ""}
+
     def __init__(self, graph: Graph, schedule: Schedule, layout: Sizes, copies: int) -> None:
         super().__init__(graph, schedule, layout, {REAL: "V", WHOLE: "V", FLAG: "M"}, copies)
         self._in_memory = {slot for slot, size in enumerate(layout.carries) if size > LARGE}
@@ -287,13 +287,6 @@ class _CppWriter(StatementWriter):
             for j in range(self.copies):
                 place = self._sum(["p"], [self.copies], j)
                 self._line(self._put(slot, "p", self._number(first, f"{name}[{place}]"), j))
-
-    def _operation(self, op: str, values: Sequence[str], type: str) -> str:
-        if op in _INFIX:
-            return f"{values[0]} {_INFIX[op]} {values[1]}"
-        if op in _PREFIX:
-            return f"{_PREFIX[op]}{values[0]}"
-        return f"{op}({', '.join(values)})"
 
     def _expression(self, node: int, j: int) -> str:
         """An exponential of -x as one of x: the compiler finds once what it has in common with e^x."""

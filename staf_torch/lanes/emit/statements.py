@@ -6,7 +6,7 @@ import abc
 import contextlib
 import math
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -51,6 +51,7 @@ def runs(places: Sequence[tuple[Hashable, int]]) -> list[EvenRun]:
 
 
 _INPUTS = ("const", "param", "elem", "result", "results", "collect", "carry", "carrys", "state", "row", "now")
+_INFIX = {"add": "+", "sub": "-", "mul": "*", "div": "/", "lt": "<", "le": "<=", "eq": "==", "ne": "!="}
 _ARRAYS = ("pack", "map", "dot", "collect", "carrys", "results")
 
 
@@ -64,6 +65,9 @@ class StatementWriter(abc.ABC):
         types: how the types of nodes are spelt.
         copies: independent copies of every variable that advance side by side.
     """
+
+    _infix: ClassVar[dict[str, str]] = _INFIX
+    _prefix: ClassVar[dict[str, str]] = {"copy": "", "neg": "-"}
 
     def __init__(
         self, graph: Graph, schedule: Schedule, layout: Sizes, types: dict[str, str], copies: int = 1
@@ -85,9 +89,14 @@ class StatementWriter(abc.ABC):
 
     # What a back end says.
 
-    @abc.abstractmethod
     def _operation(self, op: str, values: Sequence[str], type: str) -> str:
         """The expression of an operation."""
+        if op in self._infix:
+            return f"{values[0]} {self._infix[op]} {values[1]}"
+        return f"{self._prefix[op]}{values[0]}" if op in self._prefix else self._call(op, values, type)
+
+    def _call(self, op: str, values: Sequence[str], type: str) -> str:
+        return f"{op}({', '.join(values)})"
 
     @abc.abstractmethod
     def _fma(self, a: str, b: str, c: str) -> str:
