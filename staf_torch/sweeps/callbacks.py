@@ -10,9 +10,11 @@ import os
 import shutil
 import sys
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from hydra.errors import HydraException
 from hydra.experimental.callback import Callback
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
@@ -221,9 +223,7 @@ def claim(config: DictConfig) -> None:
         OSError: if it cannot be made.
     """
     wanted = str(config.hydra.sweep.dir)
-    size = sweep_size([parse_override(line) for line in as_typed(config.hydra.overrides.task)])
-    if size > MOST_JOBS:
-        raise ValueError(f"The sweep has {size:g} jobs, and {MOST_JOBS} are the most: make several of it.")
+    refuse_many(wanted, as_typed(config.hydra.overrides.task))
     if any(line.startswith("hydra.sweep.dir=") for line in as_typed(config.hydra.overrides.hydra)):
         place = Path(wanted)
         place.mkdir(parents=True, exist_ok=True)
@@ -248,6 +248,14 @@ def claim(config: DictConfig) -> None:
     if attempt > 1:  # also for the jobs, whose settings are composed anew
         config.hydra.sweep.dir = str(directory)
         config.hydra.overrides.hydra.append(f"hydra.sweep.dir={records.quoted(str(directory))}")
+
+
+def refuse_many(directory: str | Path, typed: Sequence[str]) -> None:
+    """Raise ValueError for a sweep of more jobs than memory has room for, before anybody lists them."""
+    with contextlib.suppress(HydraException):  # whoever composes the jobs says so
+        size = sweep_size([parse_override(line) for line in typed])
+        if size > MOST_JOBS:
+            raise ValueError(f"{directory} has a sweep of {size:g} jobs, and {MOST_JOBS} are the most.")
 
 
 def _refuse_links(directory: Path) -> None:

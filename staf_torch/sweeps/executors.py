@@ -56,7 +56,12 @@ def compute(
     """
     planned = batches(flat, least=workers.pieces, most=most)
     planned = [batch for batch in planned if not set(finished).issuperset(batch)]
-    _log.info("%d jobs in %d tensor batches", len(settings), len(planned))
+    _log.log(
+        logging.DEBUG if measured else logging.INFO,
+        "%d jobs in %d tensor batches",
+        len(settings),
+        len(planned),
+    )
     # Absolute, since a worker may have another working directory.
     made = [
         Batch(settings.of(jobs), [os.path.abspath(directories(i)) for i in jobs], measured)

@@ -58,7 +58,7 @@ def execute(
     Raises:
         Exception: that of the experiment; the record has its reason.
     """
-    node = HydraConfig.get()
+    node: Any = HydraConfig.get()
     directory = Path(node.runtime.output_dir)
     choices = {str(group): choice for group, choice in node.runtime.choices.items()}
     record = records.RunRecord(cfg, choices, as_typed(node.overrides.task), compiler())
@@ -129,14 +129,9 @@ def objective(cfg: DictConfig, metrics: Metrics) -> Metrics | float | tuple[floa
         ValueError: if there is no metric of that name.
     """
     named = OmegaConf.select(cfg, "sweep.objective")
-    if named is None:
-        return metrics
-    if isinstance(named, str):
-        return _number(named, metrics)
-    return tuple(_number(name, metrics) for name in named)
-
-
-def _number(name: str, metrics: Metrics) -> float:
-    choice(COMMAND_LINE, "sweep.objective", name, tuple(metrics))
-    value = metrics[name]
-    return math.inf if value is None else float(value)  # null: there is no finite number
+    names = [named] if isinstance(named, str) else list(named or ())
+    for name in names:
+        choice(COMMAND_LINE, "sweep.objective", name, tuple(metrics))
+    values = [metrics[name] for name in names]
+    numbers = tuple(math.inf if value is None else float(value) for value in values)  # null: it is not finite
+    return metrics if named is None else numbers[0] if isinstance(named, str) else numbers

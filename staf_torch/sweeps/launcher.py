@@ -21,8 +21,9 @@ from ..numerics.checks import choice, integer
 from ..results import run_record as records
 from ..results.files import METRICS, ROWS, RUN, partial_name
 from ..results.progress import Progress
+from ..settings.plain import ManySettings
 from . import lock, table, workers
-from .batching import Outcome, reason
+from .batching import Flat, Outcome, reason
 from .clusters import executor
 from .executors import Executor, compute
 from .hydra_compat import JobReturn, JobStatus, SweepJobs, directory_of, without_hydra_overrides
@@ -37,9 +38,6 @@ _NOT_BATCHED = (
 )
 _TOLD = 20  # failures that are told as they happen
 _BAR_EVERY, _LINE_EVERY = 0.2, 10.0  # s
-
-Tasks = Generator[tuple[int, Callable[[DictConfig], Any]], None, None]
-"""Number and task of one job after the other."""
 
 
 @contextlib.contextmanager
@@ -209,18 +207,19 @@ class Launch:
             raise ValueError(f"{len(failed)} of {len(jobs)} jobs failed; {job_name(num, jobs[num])}: {why}")
 
     def _fill_directories(self, numbered: Mapping[int, list[str]]) -> list[JobReturn]:
-        tasks = self._computed(numbered)
+        plan = self._jobs.many(list(numbered.values()))  # before anything is written
         self._directory.mkdir(parents=True, exist_ok=True)
         records.list_jobs(self._directory, numbered)
         returns = self._finished(numbered)
         progress = SweepProgress(len(numbered), len(returns))
-        with contextlib.closing(progress), contextlib.closing(tasks(returns, progress)) as ending:
-            for num, task in ending:
+        tasks = self._tasks(numbered, *plan, set(returns), progress)
+        with contextlib.closing(progress), contextlib.closing(tasks):
+            for num, task in tasks:
                 workers.check()
                 self._still_there(len(returns), len(numbered))
                 returns[num] = self._replay(num, numbered[num], task)
-                failed = returns[num].status == JobStatus.FAILED
-                why = reason(returns[num]._return_value) if failed else None
+                wrong = returns[num].status == JobStatus.FAILED
+                why = reason(returns[num]._return_value) if wrong else None
                 progress.ended(job_name(num, numbered[num]), why)
         self._refuse_lost(numbered, returns)
         failed = sum(ended.status == JobStatus.FAILED for ended in returns.values())
@@ -269,38 +268,31 @@ class Launch:
                 found[num].return_value = objective(self._jobs.master, metrics)
         return found
 
-    def _computed(
-        self, numbered: Mapping[int, list[str]]
-    ) -> Callable[[Mapping[int, JobReturn], SweepProgress], Tasks]:
-        """Return what yields the number and the task of every job that is not finished, as batches end.
-
-        Raises:
-            hydra.errors.HydraException: if a job has settings that there are not.
-        """
-        order = list(numbered)
-        settings, flat = self._jobs.many([numbered[num] for num in order])
-
-        def place(index: int) -> Path:
-            return self._jobs.directory(order[index], numbered[order[index]])
-
-        def foreign(finished: Mapping[int, JobReturn], progress: SweepProgress) -> Tasks:
-            if self._launcher.foreign == "warn":
+    def _tasks(
+        self,
+        numbered: Mapping[int, list[str]],
+        settings: ManySettings,
+        flat: Sequence[Flat],
+        finished: set[int],
+        progress: SweepProgress,
+    ) -> Generator[tuple[int, Callable[[DictConfig], Any]], None, None]:
+        """Yield number and task of every job that is not finished, as the tensor batches end."""
+        order, about = list(numbered), self._launcher
+        if self._task is not execute:
+            if about.foreign == "warn":
                 _log.warning("%s (hydra.launcher.foreign=run says nothing)", _NOT_BATCHED)
             yield from ((num, self._task) for num in order)
-
-        def batched(finished: Mapping[int, JobReturn], progress: SweepProgress) -> Tasks:
-            if len(finished) == len(order):
-                return
+        elif len(finished) < len(order):
             with self._executor() as executor:
                 for index, outcome, seconds in compute(
-                    *(settings, flat, place, executor),
+                    *(settings, flat),
+                    lambda index: self._jobs.directory(order[index], numbered[order[index]]),
+                    executor,
                     finished={i for i, num in enumerate(order) if num in finished},
-                    most=self._launcher.batch,
+                    most=about.batch,
                     tell=progress.computed,
                 ):
                     yield order[index], _off_the_terminal(outcome, seconds, Progress(progress.running))
-
-        return batched if self._task is execute else foreign
 
 
 def _off_the_terminal(outcome: Outcome, seconds: float, progress: Progress) -> Callable[[DictConfig], Any]:

@@ -7,14 +7,12 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from hydra.errors import HydraException
-
 from .. import __version__
 from ..results import run_record as records
 from ..results.untrusted import visible
 from ..settings.trust import may_run_code
-from .callbacks import MOST_JOBS
-from .hydra_compat import overrides_in, parse_override, sweep_size
+from .callbacks import refuse_many
+from .hydra_compat import overrides_in
 
 _RESUME = "sweep.resume="
 _ANYWAY = "sweep.resume_anyway=true"
@@ -42,7 +40,7 @@ def command_line(argv: Sequence[str]) -> list[str]:
     typed, hydra = recorded(directory, anyway=_ANYWAY in given)
     if _YES not in argv:
         _check_length(directory, [line for line in (*typed, *hydra) if line not in given])
-    _check_size(directory, typed)
+    refuse_many(directory, typed)
     own = [line for line in given if not _is_hydra(line) and line in records.own([line])]
     if own and sorted(own) != sorted(typed):
         raise ValueError(_difference(directory, own, typed))
@@ -71,16 +69,6 @@ def _check_length(directory: Path, lines: Sequence[str]) -> None:
             f"{directory} was started with lines of {length} characters, and {_LONGEST} are the most that "
             f"are read unasked: longer ones may take minutes. If you know them, add {_YES}."
         )
-
-
-def _check_size(directory: Path, typed: Sequence[str]) -> None:
-    """Raise ValueError for a sweep of more jobs than memory has room for, before anybody lists them."""
-    try:
-        size = sweep_size([parse_override(line) for line in typed])
-    except HydraException:  # whoever composes the jobs says so
-        return
-    if size > MOST_JOBS:
-        raise ValueError(f"{directory} has a sweep of {size:g} jobs, and {MOST_JOBS} are the most.")
 
 
 def _confirm(directory: Path, foreign: Sequence[str]) -> None:

@@ -112,36 +112,59 @@ def fill(
             ended(row["num"], row["reason"])
         for begin in range(done // piece * piece, len(overrides), piece):
             cfgs, flat = composed(begin) if begin else first
-            written = max(0, done - begin)
-            made = [made_by(one) for one in flat]
-            rows: dict[int, dict[str, Any]] = {}  # of batches that ended before others
-            ready: list[dict[str, Any]] = []  # those that can be written next
+            rows = _InOrder(write, [made_by(one) for one in flat], max(0, done - begin))
 
             def place(index: int, begin: int = begin) -> Path:
                 return directory / FOLDER / str(begin + index)
 
+            def told(count: float, begin: int = begin) -> None:
+                tell(begin + count)
+
             for index, outcome, _ in compute(
                 *(cfgs, flat, place, executor),
-                finished=range(written),
+                finished=range(rows.written),
                 most=most,
                 measured=not keep,
-                tell=lambda count, begin=begin: tell(begin + count),
+                tell=told,
             ):
                 workers.check()
                 own = [line for line in overrides[begin + index] if line.partition("=")[0] not in shared]
-                rows[index] = {"num": begin + index, "overrides": own}
-                rows[index] |= _result(cfgs, index, outcome, place(index), keep)
-                if isinstance(outcome, Failed) and isinstance(outcome.error, LostError):
-                    made[index], lost = "", lost + 1
-                ended(begin + index, rows[index]["reason"])
-                while written + len(ready) in rows:
-                    ready.append(rows.pop(written + len(ready)))
-                if len(ready) >= _PIECE or written + len(ready) == len(flat):
-                    write(ready, made[written : written + len(ready)])
-                    written, ready = written + len(ready), []
-                    completed[0] = begin + written
+                row = {"num": begin + index, "overrides": own}
+                row |= _result(cfgs, index, outcome, place(index), keep)
+                gone = isinstance(outcome, Failed) and isinstance(outcome.error, LostError)
+                lost += gone
+                rows.add(index, row, gone)
+                completed[0] = begin + rows.written
+                ended(begin + index, row["reason"])
         if lost:
             raise LostError(f"{lost} of {len(overrides)} rows lost their workers; sweep.resume computes them")
+
+
+class _InOrder:
+    """Writes the rows of a piece in their order, a thousand at a time; batches may end in another one.
+
+    Args:
+        write: appends rows.
+        made: what made each row of the piece.
+        written: rows of it that are written already.
+    """
+
+    def __init__(self, write: Write, made: list[str], written: int) -> None:
+        self._write, self._made, self.written = write, made, written
+        self._rows: dict[int, Mapping[str, Any]] = {}  # of batches that ended before others
+        self._next: list[Mapping[str, Any]] = []
+
+    def add(self, index: int, row: Mapping[str, Any], lost: bool) -> None:
+        """Take in a row; one that ``lost`` its worker is marked, so that it is computed when resumed."""
+        self._rows[index] = row
+        if lost:
+            self._made[index] = ""
+        while self.written + len(self._next) in self._rows:
+            self._next.append(self._rows.pop(self.written + len(self._next)))
+        end = self.written + len(self._next)
+        if len(self._next) >= _PIECE or end == len(self._made):
+            self._write(self._next, self._made[self.written : end])
+            self.written, self._next = end, []
 
 
 def _before(directory: Path, record: records.RunRecord, master: Any) -> Left | None:

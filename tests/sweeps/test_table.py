@@ -86,7 +86,7 @@ def test_experiments_without_batches_run_one_by_one(executor: str) -> None:
         (f"{TABLE} hydra/launcher=basic", "needs a sweep (staf -m) whose launcher is hydra/launcher=batched"),
         (f"{TABLE} hydra.sweeper.max_batch_size=1", "needs all jobs at once"),
         (f"{TABLE} centers.raduis=0.1,0.2", "there is no setting `centers.raduis`"),
-        (f"{TABLE} seed=range(1000001)", "has 2e+06 jobs, and 1000000 are the most"),
+        (f"{TABLE} seed=range(1000001)", "a sweep of 2e+06 jobs, and 1000000 are the most"),
     ],
 )
 def test_what_has_no_table_is_refused_in_a_sentence(line: str, words: str) -> None:

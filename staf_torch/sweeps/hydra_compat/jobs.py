@@ -45,9 +45,10 @@ class SweepJobs:
         node = master.hydra
         self.master, self._context, self._loader = master, context, context.config_loader
         self._always = as_typed(node.overrides.hydra)
-        own = isinstance(self._loader, Composer)
-        self._composer: Composer = (
-            self._loader if own else Composer(self._loader, node.job.config_name, as_typed(node.searchpath))
+        self._composer = (
+            self._loader
+            if isinstance(self._loader, Composer)
+            else Composer(self._loader, node.job.config_name, as_typed(node.searchpath))
         )
         context.config_loader = cast(ConfigLoader, self)
 
