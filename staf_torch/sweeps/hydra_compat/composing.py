@@ -86,6 +86,7 @@ class Composer:
         self._lines: dict[str, _Line] = {}
         self._groups: dict[tuple[str, ...], bool] = {}
         self._composed: dict[tuple[str, ...], _Composed] = {}
+        self._nodes: dict[tuple[str, ...], bytes] = {}  # the same with Hydra's own values
         self._bases: dict[tuple[tuple[str, ...], ...], _Base | None] = {}
         self.latest_sweep: DictConfig | None = None
         """What `load_configuration` returned last for a sweep."""
@@ -142,7 +143,7 @@ class Composer:
         config = self._with_values(applied, hydra_node=True)
         with read_write(config.hydra):
             config.hydra.runtime.cwd = os.getcwd()
-            _note_overrides(config.hydra, [line.override for line in lines])
+            _note_overrides(config.hydra, [line.override for line in lines if not line.of_hydra])
         return config
 
     def many(
@@ -202,14 +203,31 @@ class Composer:
         overrides = [str(line.override.input_line) for line in lines]
         if any(_overlap(one, other) for one in others for other in values):
             return self._copy(overrides, hydra_node)  # their order counts
-        config = self._copy(_others(lines), hydra_node)
         try:
+            config = self._with_node(lines) if hydra_node else self._copy(_others(lines), False)
             for line in values:
-                if hydra_node or not line.of_hydra:
+                if not line.of_hydra:
                     OmegaConf.update(config, line.key, line.value, merge=True)
         except OmegaConfBaseException:
             return self._copy(overrides, hydra_node)  # which raises in Hydra's words
         return config
+
+    def _with_node(self, lines: Sequence[_Line]) -> DictConfig:
+        """Return a copy whose node has Hydra's own values of these overrides, and has noted them."""
+        own = [line for line in lines if line.of_hydra]
+        texts = [str(line.override.input_line) for line in own]
+        key = (*_others(lines), "", *texts)
+        if key not in self._nodes:
+            config = self._copy(_others(lines), True)
+            for line in own:
+                if line.sets:
+                    OmegaConf.update(config, line.key, line.value, merge=True)
+            with read_write(config.hydra):
+                config.hydra.overrides.hydra = texts
+            if len(self._nodes) >= _MOST_COMPOSED:
+                self._nodes.clear()
+            self._nodes[key] = pickle.dumps(config)
+        return cast(DictConfig, pickle.loads(self._nodes[key]))
 
     def _copy(self, overrides: Sequence[str], hydra_node: bool) -> DictConfig:
         """Return a copy of what Hydra composes of these overrides."""
@@ -296,16 +314,14 @@ def _refers(value: Any) -> bool:
 
 
 def _note_overrides(node: Any, parsed: Sequence[Override]) -> None:
-    """Write into Hydra's node what Hydra notes there of all overrides."""
-    task = [one for one in parsed if not one.is_hydra_override()]
-    lines = [str(one.input_line) for one in task]
-    node.overrides.hydra = [str(one.input_line) for one in parsed if one.is_hydra_override()]
+    """Write into Hydra's node what Hydra notes there of all overrides but its own."""
+    lines = [str(one.input_line) for one in parsed]
     if as_typed(node.overrides.task) == lines:
         return
     node.overrides.task = lines
     if not OmegaConf.is_interpolation(node.job, "override_dirname"):  # it is one in Hydra 1.4
         style = node.job.config.override_dirname
-        named = sorted(str(one.input_line) for one in task if one.key_or_group not in style.exclude_keys)
+        named = sorted(str(one.input_line) for one in parsed if one.key_or_group not in style.exclude_keys)
         node.job.override_dirname = style.item_sep.join(named).replace("=", style.kv_sep)
 
 
