@@ -112,7 +112,7 @@ def trace(step: Step, given: Given, *, widened: bool = False, folded: bool = Fal
         row = given.tree("row", inputs("row", given.row, 0, 0))
         now = given.tree("now", inputs("now", given.now, NOW, 1))
         carry = inputs("state", given.carry, STEP, 0)
-        with tracer, tracing(tracer), _Functions(tracer.traced):
+        with tracer, tracing(tracer), _TorchFunctions(tracer.traced):
             try:
                 after, out = step(given.tree("carry", carry), now, row)
             except NotLoweredError:
@@ -158,7 +158,7 @@ def _is_finite(x: Tensor) -> Tensor:
     return x.abs() < math.inf  # one comparison, where torch has two
 
 
-class _Functions(TorchFunctionMode):
+class _TorchFunctions(TorchFunctionMode):
     """Context: what must be seen before a function of torch becomes operations, which are all a tracer sees.
 
     What takes the numbers of a row out of torch is refused, as nobody sees what becomes of them. A few
