@@ -82,10 +82,6 @@ def edit(path: str, before: str, after: str) -> Callable[[Path], None]:
 
 EDITS: dict[str, tuple[Callable[[Path], None], str]] = {
     "a setting": (edit("conf/experiment/mine.yaml", "0.5", "2.5"), "spread was 0.5 and is now 2.5"),
-    "a further setting": (
-        edit("conf/experiment/mine.yaml", "spread", "seed: 0\ndt: 0.025\nspread"),
-        "dt was 0.01",
-    ),
     "a module": (edit("bowls.py", "SCALE *", "2 * SCALE *"), "the module bowls has changed"),
     "a module of a made-up name": (edit("bowl_extra.py", "1.0", "3.0"), "the module bowl_extra has changed"),
     "a module of a module": (edit("bowl_helper.py", "1.0", "3.0"), "the module bowl_helper has changed"),
@@ -103,17 +99,15 @@ def test_an_edit_between_start_and_resume_is_told(name: str, place: Path) -> Non
     assert not (place / "sweep" / "2").exists()
 
 
-@pytest.mark.parametrize(
-    ("key", "said"), [("source", "the source of staf_torch was 0"), ("torch", "torch was 0")]
-)
-def test_another_source_or_torch_is_reported(key: str, said: str, place: Path) -> None:
+def test_another_source_or_torch_is_reported(place: Path) -> None:
     path = place / "sweep" / "1" / "run.json"
     about = json.loads(path.read_text())
-    about["build"][key] = "0"
+    about["build"] |= {"source": "0", "torch": "0"}
     path.write_text(json.dumps(about | {"checksum": build.record_checksum(about)}))
     code, _, err = resume(place)
     assert code == 1
-    assert said in err
+    assert "the source of staf_torch was 0" in err
+    assert "torch was 0" in err
 
 
 def test_what_is_mixed_all_the_same_stands_apart(place: Path) -> None:
@@ -148,23 +142,26 @@ def cut(path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("file", "spoil"), [("metrics.json", flip), ("history.npz", cut), ("run.json", flip)]
+    "spoilt", [{"0/metrics.json": flip, "1/history.npz": cut}, {"1/run.json": flip}], ids=["result", "record"]
 )
 def test_a_damaged_file_is_named_and_made_again(
-    file: str, spoil: Callable[[Path], None], place: Path, whole: Path
+    spoilt: dict[str, Callable[[Path], None]], place: Path, whole: Path
 ) -> None:
-    spoil(place / "sweep" / "1" / file)
-    (bad,) = (run for run in collect(place / "sweep").rows if run.directory.name == "1")
-    assert bad.metrics == {}
-    assert f"{file} is damaged" in str(bad.reason)
+    for file, spoil in spoilt.items():
+        spoil(place / "sweep" / file)
+        job, _, name = file.partition("/")
+        (bad,) = (run for run in collect(place / "sweep").rows if run.directory.name == job)
+        assert bad.metrics == {}
+        assert f"{name} is damaged" in str(bad.reason)
     code, out, err = resume(place)
     assert code == 0, err
-    assert f"{file} is damaged" in out + err
-    again, before = (read_run(folder / "sweep" / "1")[0] for folder in (place, whole))
-    assert again.metrics == before.metrics
-    histories = [History(run.directory / "history.npz") for run in (again, before)]
-    for key in histories[1]:
-        np.testing.assert_array_equal(histories[0][key], histories[1][key])
+    for job, _, name in (file.partition("/") for file in spoilt):
+        assert f"{name} is damaged" in out + err
+        again, before = (read_run(folder / "sweep" / job)[0] for folder in (place, whole))
+        assert again.metrics == before.metrics
+        histories = [History(run.directory / "history.npz") for run in (again, before)]
+        for key in histories[1]:
+            np.testing.assert_array_equal(histories[0][key], histories[1][key])
 
 
 FOREIGN = [
@@ -237,10 +234,10 @@ def test_a_line_that_would_take_for_ever_is_refused_before_it_is_read(line: str,
         command_line(["-m", f"sweep.resume={tmp_path}"])
 
 
-@pytest.mark.parametrize("name", [".table.md.partial", "1/staf.log", "2", "figures", ".lock"])
+@pytest.mark.parametrize("name", ["1/staf.log", "2", ".lock"])
 def test_a_planted_link_is_not_written_through(name: str, place: Path, tmp_path: Path) -> None:
     victim = tmp_path / "victim"
-    folder = name in ("2", "figures", "1/.hydra")
+    folder = name == "2"
     victim.mkdir() if folder else victim.write_text("mine")
     planted = place / "sweep" / name
     shutil.rmtree(planted) if planted.is_dir() else planted.unlink(missing_ok=True)
@@ -251,13 +248,10 @@ def test_a_planted_link_is_not_written_through(name: str, place: Path, tmp_path:
     assert list(victim.iterdir()) == [] if folder else victim.read_text() == "mine"
 
 
-@pytest.mark.parametrize("name", ["table.md", ".lock"])
-def test_a_second_name_of_a_file_elsewhere_is_not_written_through(
-    name: str, place: Path, tmp_path: Path
-) -> None:
+def test_a_second_name_of_a_file_elsewhere_is_not_written_through(place: Path, tmp_path: Path) -> None:
     (tmp_path / "victim").write_text("mine")
-    (place / "sweep" / name).unlink(missing_ok=True)
-    (place / "sweep" / name).hardlink_to(tmp_path / "victim")
+    (place / "sweep" / "table.md").unlink()
+    (place / "sweep" / "table.md").hardlink_to(tmp_path / "victim")
     code, _, err = resume(place)
     assert code == 1
     assert "hard link" in err
