@@ -25,7 +25,10 @@ LOWEST = "torch==2.6.0 numpy==1.26.0 hydra-core==1.3.8 matplotlib==3.8.0 jinja2=
 VERSIONS = {
     "lowest": ("3.11", f"{LOWEST} {TOOLS} {EXTRAS}"),
     "python312": ("3.12", f"torch==2.9.1 hydra-core<1.4 {CORE} {TOOLS} {EXTRAS}"),
-    "newest": ("3.13", f"torch hydra-core==1.4.0rc3 {CORE} {TOOLS} {EXTRAS} onnx onnxscript onnxruntime"),
+    "newest": (
+        "3.13",
+        f"torch hydra-core==1.4.0rc3 {CORE} {TOOLS} {EXTRAS} onnx onnxscript onnxruntime casadi",
+    ),
     "no_extras": ("3.11", f"torch==2.13.0 hydra-core<1.4 {CORE} {TOOLS}"),
 }
 PROCESSORS = {  # what programs are compiled for; what torch's own loops use; what its linear algebra does

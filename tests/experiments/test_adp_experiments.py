@@ -206,22 +206,16 @@ def test_an_identified_drift_comes_nearer_to_the_true_one() -> None:
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (["adp.policy=ppo"], r"`staf adp.policy=...` must be an option of the group"),
         (["adp.extrapolated_around=0"], r"`RandomPoints\(around=...\)` must be one of 'state', 'origin'"),
         (["adp.extrapolated_around=origin"], r"`RandomPoints\(half_width=...\)` must be constant"),
         (["adp.rbf_grid.flat=1", "adp/basis=rbf_grid"], r"`RBFGridBasis\(flat=...\)` must be true or false"),
-        (["adp.optimum.shooting=1"], r"`staf adp.optimum.shooting=...` must be true or false"),
-        (["adp.optimum.states=-1"], r"`staf adp.optimum.states=...` must be at least 0"),
         (["adp.law=newton"], r"`staf adp.law=...` must be an option of the group"),
-        (["adp.basis=fourier"], r"`staf adp.basis=...` must be an option of the group"),
-        (["adp.extrapolation=grid"], r"`staf adp.extrapolation=...` must be an option of the group"),
         (["adp.cost.state=[[1,0],[0,-1]]"], r"`QuadraticCost\(state=...\)` must be positive semidefinite"),
         (["adp.cost.control=0"], r"`QuadraticCost\(control=...\)` must be positive"),
         (["system=oscillator"], r"`staf system=...` must be a plant with inputs; got 'Oscillator'"),
         (["initial_state=[1,2,3]"], r"`staf initial_state=...` must have 2 entries"),
         (["duration=1e-9"], r"`staf duration=...` must be at least one step"),
         (["experiment=adp_initial_weights", "initial_weights=[]"], r"must have at least one entry"),
-        (["experiment=adp_initial_weights", "initial_weights=1"], r"initial_weights=...` must be a list"),
     ],
 )
 def test_bad_setting_is_refused_by_name(overrides: list[str], message: str, tmp_path: Path) -> None:

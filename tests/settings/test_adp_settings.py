@@ -158,22 +158,6 @@ def test_of_many_states_so_few_are_recorded_that_they_fit(steps: int, batch: int
     assert problem(*line, "adp.record_every=7").every == 7
 
 
-@pytest.mark.parametrize(
-    ("wrong", "said"),
-    [
-        ("record_every=0", "must be at least 1; got 0"),
-        ("record_every=a", "must be an integer; got 'a'"),
-        ("optimum.shooting=1", "must be true or false"),
-        ("optimum.states=-1", "must be at least 0"),
-        ("optimum.horizon=0", "must be positive"),
-        ("optimum.intervals=3", "must be at least 4"),
-    ],
-)
-def test_a_wrong_number_below_adp_is_named(wrong: str, said: str) -> None:
-    with pytest.raises(ValueError, match=f"`staf adp.{wrong.partition('=')[0]}=...` {said}"):
-        problem("adp/policy=lqr", f"adp.{wrong}")
-
-
 def looped(*overrides: str) -> Any:
     return loops.adp_problem(composing.settings("experiment=adp", "adp/policy=lqr", *overrides))
 
