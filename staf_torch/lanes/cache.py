@@ -74,23 +74,14 @@ class Trace(NamedTuple):
 
 
 def place(*described: object) -> Path:
-    """Return the file of a trace.
-
-    Args:
-        described: all that it depends on beside this package, torch and Python: bytes, numbers, strings.
-    """
+    """Return the file of a trace, by all that it depends on beside this package, torch and Python."""
     around = _package(), torch.__version__, platform.python_version(), str(torch.get_default_dtype())
     digest = hashlib.sha256(repr((*around, *described)).encode()).hexdigest()
     return cache() / f"trace-{digest[:24]}"
 
 
 def load(path: Path, tensors: Sequence[Tensor]) -> Trace | None:
-    """Return a trace with the numbers that follow from other tensors; None where there is none.
-
-    Args:
-        path: of `place`.
-        tensors: what the step reads, in the order in which `save` was given them.
-    """
+    """Return a trace with the numbers that follow from other tensors, in the order of `save`; None without."""
     try:
         content = path.read_bytes()
         used(path)
@@ -104,13 +95,7 @@ def load(path: Path, tensors: Sequence[Tensor]) -> Trace | None:
 
 
 def save(path: Path, trace: Trace, tensors: Sequence[Tensor]) -> None:
-    """Write a trace, unless its numbers follow from more than these tensors.
-
-    Args:
-        path: of `place`.
-        trace: of a step.
-        tensors: what the step reads.
-    """
+    """Write a trace, unless its numbers follow from more than these tensors."""
     places = {id(tensor): k for k, tensor in enumerate(tensors)}
     if any(id(tensor) not in places for tensor in trace.recipe.found):
         return

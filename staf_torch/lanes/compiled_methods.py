@@ -63,11 +63,7 @@ def compiling(when: str) -> Iterator[None]:
 
 
 def worth(pays: bool) -> bool:
-    """Return whether an automatic choice falls on compiled code.
-
-    Args:
-        pays: whether the call is long enough to pay for the compiler.
-    """
+    """Return whether an automatic choice falls on compiled code, where a call would pay or not."""
     return pays if _when == "auto" else _when == "always"
 
 
@@ -148,7 +144,7 @@ class CompiledMethod:
 
     def __init__(self, definition: Callable[..., Tree], owner: Any, settings: compiled) -> None:
         self.definition, self.owner, self._settings = definition, owner, settings
-        self._asked, self._waits = 0.0, False
+        self._asked, self.waits = 0.0, False  # whether it was to be compiled, and has not been called since
         self._served: Served | None = None
         self._read: Contents | None = None
 
@@ -164,7 +160,7 @@ class CompiledMethod:
             return self.definition(x, *more)
         if self._read is None or not self._read.unchanged(library=False):
             self._served = self._compile(trees=bool(more))
-        self._waits = False
+        self.waits = False
         assert self._served is not None
         if more:
             return self._served(x, *more)
@@ -185,14 +181,9 @@ class CompiledMethod:
         """Whether a compiled program has served a call."""
         return self._served is not None and self._served.compiled
 
-    @property
-    def waits(self) -> bool:
-        """Whether it was to be compiled and has not been called since."""
-        return self._waits
-
     def hasten(self) -> None:
         """Compile at the next call, whatever it pays."""
-        self._asked, self._waits = math.inf, True
+        self._asked, self.waits = math.inf, True
 
     def _compile(self, trees: bool) -> Served:
         settings, self._read = self._settings, Contents(self.definition, self.owner)

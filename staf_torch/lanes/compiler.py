@@ -81,14 +81,7 @@ def machine_code(text: str) -> Callable[..., None]:
 
 
 def _library(name: str, text: str, options: tuple[str, ...], folder: Path) -> Path:
-    """Return the path of a shared object, built if it is not in the cache.
-
-    Args:
-        name: its file begins with.
-        text: C++.
-        options: of the compiler.
-        folder: with headers, beside this one.
-    """
+    """Return the path of a shared object, built if it is not in the cache."""
     program = find_compiler()
     if program is None:
         raise FileNotFoundError(f"none of {', '.join(COMPILERS)} is on the path")

@@ -60,9 +60,6 @@ def installed(module: str) -> bool:
     """Return whether a module's code stands: this library's, Python's own, what lies in a folder of packages.
 
     What is left is a user's: a script, a notebook, files beside it.
-
-    Args:
-        module: its name; one that is not loaded counts as a user's.
     """
     root = module.partition(".")[0]
     if root == _PACKAGE or root in _OF_PYTHON or root.startswith("namedtuple_"):

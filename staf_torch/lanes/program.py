@@ -374,12 +374,7 @@ class Prepared:
         return self.run(leaves, carry, now, row)
 
     def run(self, leaves: Sequence[Any], carry: Tree, now: Tree, row: Tree) -> tuple[Tree, Tree]:
-        """The same for inputs that are known to fit.
-
-        Args:
-            leaves: of (row, now, carry).
-            carry, now, row: as in a call.
-        """
+        """The same for inputs that are known to fit."""
         if self._refused or not ordinary(leaves):
             return self._program.definition(carry, now, row, steps=self._steps, every=self._every)
         if self.plan is None:

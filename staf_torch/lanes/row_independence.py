@@ -30,10 +30,6 @@ def doubt(step: Callable[..., Any], given: Given) -> str | None:
 
     It is called with one row, again, and with that row beside the one that differs most from it. What draws
     random numbers, counts its calls, reads a clock or takes a mean over the batch gives itself away.
-
-    Args:
-        step: plain torch, of all rows.
-        given: inputs, of which the first time is taken.
     """
     first, other = [0], [_farthest(given)]
     with undrawn(), torch.no_grad():
@@ -103,11 +99,7 @@ def _farthest(given: Given) -> int:
 def _called(step: Callable[..., Any], given: Given, rows: Sequence[int], bits: int = 0) -> list[Tensor]:
     """All leaves of what a step makes of some rows at the first time; the inputs are copies.
 
-    Args:
-        step: plain torch.
-        given: the inputs.
-        rows: which.
-        bits: units in the last place by which all numbers are moved.
+    ``bits`` are units in the last place by which all numbers are moved.
     """
 
     def few(leaf: Any, time: bool) -> Any:

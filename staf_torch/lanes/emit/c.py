@@ -151,13 +151,6 @@ def c_text(
     The carry is ``struct NAME_state``, which ``NAME_start`` sets to its first numbers and ``NAME`` advances.
     All numbers, flags and integers too, are double (float for a program of float32).
 
-    Args:
-        graph, layout, following, outputs: as in `cpp.emit`.
-        name: of the function.
-        names: of its arguments.
-        start: the numbers that the carry starts with.
-        note: lines for the comment at its head.
-
     Raises:
         ValueError: if a name is not one of C, or is there twice.
     """

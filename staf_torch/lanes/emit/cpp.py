@@ -47,14 +47,9 @@ class Text(NamedTuple):
 
 
 def emit(graph: Graph, layout: Sizes, following: Sequence[int], outputs: Sequence[int], copies: int) -> Text:
-    """Write a program.
+    """Write a program of nodes: ``following`` are the carry after a step, ``outputs`` what it puts out.
 
-    Args:
-        graph: the nodes.
-        layout: of inputs and outputs.
-        following: nodes of the carry after a step.
-        outputs: nodes of what a step puts out.
-        copies: vectors that advance side by side; 0 for as many as suit many rows.
+    ``copies`` vectors advance side by side; 0 for as many as suit many rows.
     """
     schedule = Schedule(graph, following, outputs, ahead=True)
     if not _worth(graph, schedule):

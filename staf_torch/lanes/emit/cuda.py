@@ -178,12 +178,7 @@ def cuda_text(
 
     ``NAME(row_count, time_count, period, row..., now..., carry..., carry_end..., out...)``; the numbers of a
     time lie together, entry after entry, a row beside the other: (times, entries, rows), without rows where
-    shared.
-
-    Args:
-        graph, layout, following, outputs: as in `cpp.emit`.
-        name: of the kernel.
-        shared: which of row0, row1, ..., now0, ... all rows share.
+    shared: row0, now1, ...
     """
     names = Names(
         *([f"{kind}{k}" for k in range(len(sizes))] for kind, sizes in zip(_KINDS, layout, strict=True))

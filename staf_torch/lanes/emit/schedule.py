@@ -221,12 +221,7 @@ Places = Any
 
 
 def taken_over(graph: Graph, schedule: Schedule) -> set[int]:
-    """Find the maps that one other map reads, hardly an entry twice: it computes them where it reads.
-
-    Args:
-        graph: the nodes.
-        schedule: of the same program.
-    """
+    """Find the maps that one other map reads, hardly an entry twice: it computes them where it reads."""
     readers, counts = defaultdict[int, set[int]](set), Counter[int]()
     for node in schedule.live:
         for argument in graph.args[node] if graph.op[node] != "loop" else ():
@@ -261,11 +256,7 @@ def leaves(
 ) -> Iterator[tuple[int, Places]]:
     """What a map reads, that of the maps it takes over included: each operand, and the places in it.
 
-    Args:
-        graph: the nodes.
-        taken: maps that are computed where they are read.
-        node: the map.
-        at: its entries that are wanted; None for all.
+    ``at`` are the entries of the map that are wanted; None for all.
     """
     for operand, own in zip(graph.args[node], graph.aux[node][2:], strict=True):
         places = own if at is None or own is None else tuple(own[k] for k in at)

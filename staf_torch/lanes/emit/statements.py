@@ -27,11 +27,7 @@ class EvenRun(NamedTuple):
 
 
 def runs(places: Sequence[tuple[Hashable, int]]) -> list[EvenRun]:
-    """Split a list of entries into runs.
-
-    Args:
-        places: of every entry what it is read from, and where in it.
-    """
+    """Split a list of entries into runs."""
     found, k = list[EvenRun](), 0
     while k < len(places):
         source, first = places[k]

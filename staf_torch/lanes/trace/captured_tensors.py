@@ -35,11 +35,7 @@ class Recipe(NamedTuple):
     checks: list[tuple[Tensor, Any]]  # numbers that the step itself read, and so depends on
 
     def again(self, others: Mapping[int, Tensor]) -> Tensor | None:
-        """The numbers with other tensors in place of those found; None where the program would be another.
-
-        Args:
-            others: by the identity of the tensor that each replaces: all that are floating-point.
-        """
+        """The numbers with other tensors in place of those found; None where the program would be another."""
         if any(id(tensor) not in others for tensor in self.found):
             return None
         known = dict(others)
@@ -121,13 +117,7 @@ class Captured:
                 self._made[storage.data_ptr()] = storage, True
 
     def numbers(self, tensor: Tensor, kind: str, new: Callable[[int], int]) -> np.ndarray[Any, Any]:
-        """The nodes of a tensor's entries, one for every place in memory.
-
-        Args:
-            tensor: captured.
-            kind: of the nodes.
-            new: makes a node of the number of a parameter.
-        """
+        """The nodes of a tensor's entries, one for every place in memory."""
         strides = tensor.stride()
         at = np.full(tensor.shape, 0, dtype=np.int64)
         for axis, (size, stride) in enumerate(zip(tensor.shape, strides, strict=True)):

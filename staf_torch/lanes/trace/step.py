@@ -35,13 +35,6 @@ RULES["scatter_add"] = added_at
 def lower(t: Tracer, func: Any, name: str, out: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> Any:
     """The nodes of what an operation returns: an array, or a list of them.
 
-    Args:
-        t: knows the nodes of the arguments.
-        func: the operation.
-        name: its name without overload.
-        out: what torch returned, for shapes and dtypes.
-        args, kwargs: of the operation.
-
     Raises:
         NotLoweredError: if there is no rule.
     """
