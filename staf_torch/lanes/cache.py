@@ -81,7 +81,7 @@ def place(*described: object) -> Path:
 
 
 def load(path: Path, tensors: Sequence[Tensor]) -> Trace | None:
-    """Return a trace with the numbers that follow from other tensors, in the order of `save`; None without."""
+    """Return a trace with the numbers that follow from other tensors, as `save` had them; None without."""
     try:
         content = path.read_bytes()
         used(path)
