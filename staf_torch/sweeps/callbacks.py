@@ -277,27 +277,16 @@ def close(config: DictConfig) -> None:
     """End a sweep that an exception broke: with its report, or without a trace where no job has begun."""
     directory = _directory(config)
     own = lock.held(directory)
-    if own is None:  # another sweep's, which refused us
-        return
-    if own.lost():
-        lock.give_back(directory)
-        return
-    if _has_begun(directory):
+    if own is not None and not own.lost():  # else it is another sweep's, which refused us, or has gone
         end_sweep(config)
-        return
-    _remove(directory)
     lock.give_back(directory)
-
-
-def _has_begun(directory: Path) -> bool:
-    return any(directory.glob(f"**/{records.RUN}"))
 
 
 def _in_vain(config: DictConfig) -> bool:
     """Return whether the sweep that ends now is ours, and was broken before its first job."""
     own = lock.held(_directory(config))
     ours = own is not None and not own.lost() and not records.resumed(config)
-    return ours and not _has_begun(_directory(config))
+    return ours and not any(_directory(config).glob(f"**/{records.RUN}"))
 
 
 def _remove(directory: Path) -> None:

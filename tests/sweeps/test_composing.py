@@ -85,6 +85,16 @@ def test_the_configuration_of_a_sweep_is_the_one_that_hydra_composes(line: str, 
         assert OmegaConf.is_readonly(found.hydra) == OmegaConf.is_readonly(expected.hydra)
 
 
+def test_jobs_of_other_launchers_have_the_configuration_that_hydra_composes() -> None:
+    loader = config_loader()
+    lines = ["seed=1,2", "kernel=matern,gaussian", "hydra.sweep.dir=here", "hydra/launcher=basic"]
+    master = loader.load_configuration("config", lines, RunMode.MULTIRUN)
+    composer = Composer(loader)
+    for job in (["seed=1", "kernel=matern"], ["seed=2", "kernel=matern"], ["seed=2", "kernel=gaussian"]):
+        expected, found = (each.load_sweep_config(master, job) for each in (loader, composer))
+        assert OmegaConf.to_yaml(found) == OmegaConf.to_yaml(expected)
+
+
 @pytest.mark.parametrize("line", ["seed=1,2", "hydra.launcher.batch=1,2", "kernle=a"])
 def test_a_sweep_is_refused_where_a_run_was_asked_for(line: str) -> None:
     loader = config_loader()

@@ -112,6 +112,14 @@ class Composer:
             self.latest_sweep = found
         return found
 
+    def load_sweep_config(self, master_config: DictConfig, sweep_overrides: Sequence[str]) -> DictConfig:
+        """Return the configuration of a job, as the method of Hydra's loader does for other launchers."""
+        node = master_config.hydra
+        lines = [*as_typed(node.overrides.hydra), *sweep_overrides]
+        config = self.load_configuration(node.job.config_name, lines, RunMode.RUN)
+        OmegaConf.copy_cache(from_config=master_config, to_config=config)
+        return config
+
     def _alike(self, name: str | None, overrides: Sequence[str], mode: RunMode) -> DictConfig | None:
         """Return the configuration of a run or a sweep from one with the same groups; None: it has none."""
         try:
