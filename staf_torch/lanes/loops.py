@@ -8,6 +8,7 @@ g++ a text that grows with the passes, and the processor one that fits no cache.
 
 from __future__ import annotations
 
+import functools
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -276,6 +277,31 @@ def tracing_now() -> bool:
         or torch._C._len_torch_dispatch_stack() > 0
         or torch.compiler.is_compiling()
     )
+
+
+def traced_as(spelling: Callable[..., Some]) -> Callable[[Callable[..., Some]], Callable[..., Some]]:
+    """Decorator: in a program that is traced a function is spelt otherwise, as what is fast there is another.
+
+    Example:
+        >>> def in_turn(points): return scan(lambda s, x: (s + x, ()), torch.zeros(1), points)[0]
+        >>> total = traced_as(in_turn)(lambda points: points.sum(1))
+        >>> total(torch.ones(1, 3))
+        tensor([3.])
+
+        Shown by `staf_torch/lanes/README.md`.
+
+    Args:
+        spelling: a function of the same arguments and, up to rounding, results.
+    """
+
+    def decorated(plain: Callable[..., Some]) -> Callable[..., Some]:
+        @functools.wraps(plain)
+        def either(*args: Any, **kwargs: Any) -> Some:
+            return (spelling if tracing_now() else plain)(*args, **kwargs)
+
+        return either
+
+    return decorated
 
 
 def _tracer(tree: Tree) -> Tracer | None:

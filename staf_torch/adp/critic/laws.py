@@ -10,7 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ...lanes.loops import tracing_now
+from ...lanes import traced_as
 from ...lanes.trace import factorisations
 from ...numerics.checks import fail, number, positive_real
 from ..problem.cost import matvec
@@ -268,6 +268,7 @@ class Frozen(ActorCriticLaw):
         return weights
 
 
+@traced_as(factorisations.solve_definite)
 def solve_definite(matrix: Tensor, right: Tensor) -> Tensor:
     """M^-1 b for M positive definite: (..., M, M), (..., M) -> (..., M).
 
@@ -277,8 +278,6 @@ def solve_definite(matrix: Tensor, right: Tensor) -> Tensor:
     matrix decides.
     """
     size = right.shape[-1]
-    if tracing_now():
-        return factorisations.solve_definite(matrix, right)
     if size > _UNROLLED:
         solution: Tensor = torch.linalg.solve_ex(matrix, right.unsqueeze(-1))[0].squeeze(-1)
         return solution

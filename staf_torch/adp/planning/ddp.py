@@ -16,7 +16,7 @@ from typing import NamedTuple, TypeVar
 import torch
 from torch import Tensor
 
-from ...lanes import Program, repeat, scan
+from ...lanes import Program, repeat, scan, traced_as
 from ...lanes.loops import tracing_now
 from ...numerics.box import minimum_and_slopes
 from ...numerics.checks import fail, integer, positive_real, trailing
@@ -285,11 +285,11 @@ class BoxDDP:
         going = torch.where(done, CONVERGED, (mu <= MOST).to(mu))
         return SearchState(*plan, mu, torch.where(better, now.full, 1 - now.full), going)
 
-    def _best(self, x0: Tensor, around: tuple[Tensor, ...], terminal: LocalModel) -> CostedTrajectories:
-        """The cheapest of five lengths of a change: side by side, but in a program one after the other."""
+    def _best_in_turn(
+        self, x0: Tensor, around: tuple[Tensor, ...], terminal: LocalModel
+    ) -> CostedTrajectories:
+        """`_best` of a program: one length after the other."""
         lengths = x0.new_tensor(LENGTHS).expand(len(x0), -1)
-        if not tracing_now():
-            return self._followed(x0, around, lengths.contiguous(), terminal)
 
         def attempt(now: tuple[Tensor, Tensor], length: Tensor) -> tuple[tuple[Tensor, Tensor], tuple[()]]:
             cost = self._followed(x0, around, length.unsqueeze(1), terminal).cost
@@ -299,6 +299,12 @@ class BoxDDP:
         none = torch.zeros_like(x0[:, 0])
         (_, length), _ = scan(attempt, (none + torch.inf, none), lengths)
         return self._followed(x0, around, length.unsqueeze(1), terminal)
+
+    @traced_as(_best_in_turn)
+    def _best(self, x0: Tensor, around: tuple[Tensor, ...], terminal: LocalModel) -> CostedTrajectories:
+        """The cheapest of five lengths of a change, side by side."""
+        lengths = x0.new_tensor(LENGTHS).expand(len(x0), -1)
+        return self._followed(x0, around, lengths.contiguous(), terminal)
 
     def _followed(
         self, x0: Tensor, around: tuple[Tensor, ...], lengths: Tensor, terminal: LocalModel

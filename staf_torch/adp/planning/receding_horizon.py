@@ -10,8 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ...lanes import compiled, where_rows
-from ...lanes.loops import tracing_now
+from ...lanes import compiled, traced_as, where_rows
 from ...numerics.checks import fail, flag, integer
 from ..loop.controller import Controller
 from ..policies.sampled_rollout import SampledRollout
@@ -162,16 +161,21 @@ class RecedingHorizon(Controller):
             x, _ = self.problem.advance(x, around(self.problem, x, step))
         return self.memory.model(x)
 
+    def _looked_up(self, x: Tensor, carried: Following) -> tuple[Tensor, Following]:
+        """`_followed` of a program, which cannot ask for a number: it looks up the row of the plan."""
+        plan, done = carried
+        last = self.steps - 1
+        at = done.clamp(max=last).long()[:, None, None].expand(-1, -1, plan.shape[-1])
+        planned = around(self.problem, x, plan.gather(1, at).squeeze(1))
+        u = torch.where((done > last).unsqueeze(-1), self.problem.linear_feedback(x), planned)
+        return u, Following(plan, done + 1)
+
+    @traced_as(_looked_up)
     def _followed(self, x: Tensor, carried: Following) -> tuple[Tensor, Following]:
         """The control of a plan that is not improved, and the plan with one step more done."""
         plan, done = carried
-        last, after = self.steps - 1, Following(plan, done + 1)
-        if tracing_now():  # a program cannot ask for a number: it looks up the row of the plan
-            at = done.clamp(max=last).long()[:, None, None].expand(-1, -1, plan.shape[-1])
-            planned = around(self.problem, x, plan.gather(1, at).squeeze(1))
-            return torch.where((done > last).unsqueeze(-1), self.problem.linear_feedback(x), planned), after
-        begun = int(done[0])  # all rows began together
-        if begun > last:
+        begun, after = int(done[0]), Following(plan, done + 1)  # all rows began together
+        if begun >= self.steps:
             return self.problem.linear_feedback(x), after
         return around(self.problem, x, plan[:, begun]), after
 

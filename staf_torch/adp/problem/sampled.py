@@ -10,8 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
-from ...lanes import each
-from ...lanes.loops import tracing_now
+from ...lanes import each, traced_as
 from ...numerics.angles import wrap
 from ...numerics.checks import fail, integer, positive_real, trailing
 from ...numerics.forward_mode import use_forward_mode
@@ -225,7 +224,7 @@ class SampledProblem(nn.Module):
             after, paid = self.advance(z[..., :n], z[..., n:])
             return torch.cat((after, paid.unsqueeze(-1)), dim=-1)
 
-        first, second = (_in_pairs if tracing_now() else _backwards)(both, z, n + 1)
+        first, second = _slopes_and_bends(both, z, n + 1)
         return Derivatives(first[:, :n], second[:, :n], first[:, n], second[:, n])
 
     def _check(self) -> None:
@@ -295,7 +294,8 @@ def _in_pairs(function: Callable[[Tensor], Tensor], z: Tensor, count: int) -> tu
     return slope[:, rows == columns].mT, bend[:, place.flatten()].mT.unflatten(-1, place.shape)
 
 
-def _backwards(function: Callable[[Tensor], Tensor], z: Tensor, count: int) -> tuple[Tensor, Tensor]:
+@traced_as(_in_pairs)
+def _slopes_and_bends(function: Callable[[Tensor], Tensor], z: Tensor, count: int) -> tuple[Tensor, Tensor]:
     """`_in_pairs` by the slope of slopes: a row of a batch has d copies for each of its values.
 
     Of few rows it is passes that take time: these are two, `row_jacobian` of itself makes ``count`` d.
