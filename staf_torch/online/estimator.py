@@ -5,6 +5,7 @@ from __future__ import annotations
 import abc
 import inspect
 import numbers
+import sys
 from typing import Any, Protocol, Self
 
 import numpy as np
@@ -19,13 +20,9 @@ from .samples import lapse_of, lapses, like_given, pair, tensor_of
 class ScikitEstimator:
     """Parameters by name, those of a kernel as ``kernel__width``; tags; score."""
 
-    @classmethod
-    def _parameters(cls) -> list[str]:
-        return [name for name in inspect.signature(cls.__init__).parameters if name != "self"]
-
     def get_params(self, deep: bool = True) -> dict[str, Any]:
         """The arguments of the constructor, by name; with ``deep`` those of the kernel too."""
-        found = {name: getattr(self, name) for name in self._parameters()}
+        found = {name: getattr(self, name) for name in _parameters(type(self))}
         kernel = found.get("kernel")
         if deep and isinstance(kernel, Kernel):
             found |= {f"kernel__{name}": value for name, value in _arguments(kernel).items()}
@@ -39,21 +36,19 @@ class ScikitEstimator:
         """
         for name, value in params.items():
             own, _, nested = name.partition("__")
-            choice(f"{type(self).__name__}.set_params", "params", own, self._parameters())
+            choice(f"{type(self).__name__}.set_params", "params", own, _parameters(type(self)))
             if nested:
-                self._set_nested(name, own, nested, value)
-            else:
-                setattr(self, name, value)
+                kernel = getattr(self, own)
+                if isinstance(kernel, str) and kernel in NAMED:
+                    kernel = NAMED[kernel]()
+                known = _arguments(kernel) if isinstance(kernel, Kernel) else {}
+                if nested not in known:
+                    raise fail(
+                        f"{type(self).__name__}.set_params", "params", f"must be one of {[*known]}", name
+                    )
+                value = type(kernel)(**(known | {nested: value}))
+            setattr(self, own, value)
         return self
-
-    def _set_nested(self, name: str, own: str, nested: str, value: Any) -> None:
-        kernel = getattr(self, own)
-        if isinstance(kernel, str) and kernel in NAMED:
-            kernel = NAMED[kernel]()
-        known = _arguments(kernel) if isinstance(kernel, Kernel) else {}
-        if nested not in known:
-            raise fail(f"{type(self).__name__}.set_params", "params", f"must be one of {[*known]}", name)
-        setattr(self, own, type(kernel)(**(known | {nested: value})))
 
     def score(self, x: Any, y: Any, sample_weight: Any = None) -> float:
         """R^2 of the prediction at x, (P, n), as scikit-learn's regressors have it.
@@ -91,22 +86,14 @@ class NotFittedError(ValueError, AttributeError):
     """Nothing was learned yet: the bases of scikit-learn's error of that name."""
 
 
-def not_fitted(message: str) -> Exception:
-    """scikit-learn's own `NotFittedError` where it is in use, else the one of this module."""
-    import sys
-
-    exceptions = sys.modules.get("sklearn.exceptions")
-    return NotFittedError(message) if exceptions is None else exceptions.NotFittedError(message)
-
-
 def _arguments(kernel: Kernel) -> dict[str, Any]:
     """The arguments that a kernel was made with, as far as it keeps them by their names."""
-    names = [name for name in inspect.signature(type(kernel).__init__).parameters if name != "self"]
-    return {name: _plain(getattr(kernel, name)) for name in names if hasattr(kernel, name)}
+    found = {name: getattr(kernel, name) for name in _parameters(type(kernel)) if hasattr(kernel, name)}
+    return {k: float(v) if isinstance(v, Tensor) and v.dim() == 0 else v for k, v in found.items()}
 
 
-def _plain(value: Any) -> Any:
-    return float(value) if isinstance(value, Tensor) and value.dim() == 0 else value
+def _parameters(kind: type) -> list[str]:
+    return [*inspect.signature(kind).parameters]
 
 
 _ABOUT = ("n_features_in_", "n_streams_", "n_outputs_")
@@ -201,7 +188,7 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
         return self._learn(states, values, steps)
 
     def _learn(self, states: Tensor, values: Tensor, lapse: Tensor | None) -> Self:
-        if not self._is_fitted():
+        if not self.__sklearn_is_fitted__():
             self._prepare(states, values)
         streams = self._streams_
         if states.shape != self._shape_ or (values.dim() == states.dim()) != (self.n_outputs_ is not None):
@@ -292,11 +279,10 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
 
     def add(self, streams: int = 1) -> Self:
         """Begin further streams, numbered behind the others."""
+        call = self._call("add")
         if self._fitted("add").n_streams_ is None:
-            raise ValueError(
-                f"`{self._call('add')}` needs streams side by side, x (S, n); this is a single one."
-            )
-        self._streams_.add(integer(self._call("add"), "streams", streams, least=1))
+            raise ValueError(f"`{call}` needs streams side by side, x (S, n); this is a single one.")
+        self._streams_.add(integer(call, "streams", streams, least=1))
         return self._resized()
 
     def drop(self, streams: Any) -> Self:
@@ -331,13 +317,12 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
         """Return a method's name in messages."""
         return f"{type(self).__name__}.{method}"
 
-    def _is_fitted(self) -> bool:
-        return "_streams_" in self.__dict__
-
     def _fitted(self, call: str) -> Self:
-        if not self._is_fitted():
-            raise not_fitted(f"`{self._call(call)}` needs a first sample: call `fit` or `partial_fit`.")
-        return self
+        if self.__sklearn_is_fitted__():
+            return self
+        exceptions = sys.modules.get("sklearn.exceptions")  # scikit-learn's own error where it is in use
+        kind = NotFittedError if exceptions is None else exceptions.NotFittedError
+        raise kind(f"`{self._call(call)}` needs a first sample: call `fit` or `partial_fit`.")
 
     def state_dict(self) -> dict[str, Any]:
         """Return all that was learned, as tensors, numbers and strings, which ``weights_only=True`` loads."""
@@ -355,8 +340,8 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
     def _plain_arguments(self) -> dict[str, Any]:
         """Return decisive arguments that are numbers, flags or None; floats, as a search's may be NumPy's."""
         found = {name: getattr(self, name) for name in self._decisive()}
-        plain = {k: v for k, v in found.items() if v is None or isinstance(v, numbers.Real | np.bool_)}
-        return {k: v if v is None else float(v) for k, v in plain.items()}
+        real = {k: float(v) for k, v in found.items() if isinstance(v, numbers.Real | np.bool_)}
+        return {k: real.get(k) for k, v in found.items() if v is None or k in real}
 
     def load_state_dict(self, state: dict[str, Any]) -> Self:
         """Go on from a `state_dict` of a regressor with the same arguments, bit for bit.
@@ -375,11 +360,10 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
         twin._take_extra(state)
         own, given = twin._plain_arguments(), state["arguments"]
         for key in [*own, *given]:
-            if own.get(key, "none") != given.get(key, "none"):
-                told = (
-                    f"must be of a regressor with the same arguments: it has {key}={given.get(key, 'none')}"
-                )
-                raise ValueError(f"`{name}(state=...)` {told}, this one {own.get(key, 'none')}.")
+            mine, its = own.get(key, "none"), given.get(key, "none")
+            if mine != its:
+                told = f"must be of a regressor with the same arguments: it has {key}={its}, this one {mine}"
+                raise ValueError(f"`{name}(state=...)` {told}.")
         leading = () if streams is None else (streams,)
         x = torch.zeros(*leading, state["n_features_in_"], dtype=dtype)
         twin._prepare(x, x.new_zeros((*leading, *(() if outputs is None else (outputs,)))))
@@ -389,13 +373,12 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
         return self
 
     def __getstate__(self) -> dict[str, Any]:
-        given = {name: getattr(self, name) for name in self._parameters()}
-        learned = {"learned": self.state_dict()} if self._is_fitted() else {}
-        return given | self._extra_state() | learned
+        learned = {"learned": self.state_dict()} if self.__sklearn_is_fitted__() else {}
+        return self.get_params(deep=False) | self._extra_state() | learned
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         learned = state.pop("learned", None)
-        vars(self).update({name: state[name] for name in self._parameters()})
+        vars(self).update({name: state[name] for name in _parameters(type(self))})
         self._take_extra(state)
         if learned is not None:
             self.load_state_dict(learned)
@@ -407,7 +390,8 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
         found = found.long() if found.numel() == 0 else found  # an empty list is of floats
         wrong = found.is_floating_point() or found.dtype == torch.bool
         if wrong or not bool(((found >= 0) & (found < most)).all()):
-            rule = f"must be numbers of streams from 0 to {most - 1}"
-            raise fail(self._call(call), "streams", rule, streams)
+            raise fail(
+                self._call(call), "streams", f"must be numbers of streams from 0 to {most - 1}", streams
+            )
         rows: Tensor = found.long().unique()
         return rows

@@ -79,23 +79,17 @@ class ExperienceMemory(nn.Module):
         self.register_buffer("states", like.new_zeros(*batch_shape, capacity, basis.dim))
         self.register_buffer("coefficients", like.new_zeros(*batch_shape, capacity, basis.count))
         self.register_buffer("stored", torch.zeros(*batch_shape, capacity, dtype=torch.bool))
-        self.register_buffer(
-            "latest", torch.full(batch_shape, -1, dtype=torch.int64)
-        )  # the place written last
-        self.register_buffer("origin", like.new_zeros(*batch_shape, basis.dim))  # where it was first stored
-        self.register_buffer(
-            "averaged", torch.zeros(*batch_shape, capacity, dtype=torch.int64)
-        )  # models in one
-        self.register_buffer(
-            "scatter", like.new_zeros(*batch_shape, capacity)
-        )  # usual distance to the average
-        self.averaged: Tensor
-        self.scatter: Tensor
-        self.latest: Tensor
-        self.origin: Tensor
+        self.register_buffer("latest", torch.full(batch_shape, -1, dtype=torch.int64))
+        self.register_buffer("origin", like.new_zeros(*batch_shape, basis.dim))
+        self.register_buffer("averaged", torch.zeros(*batch_shape, capacity, dtype=torch.int64))
+        self.register_buffer("scatter", like.new_zeros(*batch_shape, capacity))
         self.states: Tensor
         self.coefficients: Tensor
         self.stored: Tensor
+        self.latest: Tensor  # the place written last
+        self.origin: Tensor  # where it was first stored
+        self.averaged: Tensor  # models in one
+        self.scatter: Tensor  # usual distance to the average
 
     @property
     def count(self) -> Tensor:
@@ -212,10 +206,10 @@ class ExperienceMemory(nn.Module):
         there, old = (pick * self.states).sum(-2), (pick * self.coefficients).sum(-2)
         there = torch.where(joins.unsqueeze(-1), there, x)
         offsets = self.basis.centers(there) - x.unsqueeze(-2)
-        fresh = self.basis.local(there).fit(self.basis.local(x).evaluate(offsets, model))
-        scale = self.basis.local(there)
+        space = self.basis.local(there)
+        fresh = space.fit(self.basis.local(x).evaluate(offsets, model))
         inside = self.basis.centers(there) - there.unsqueeze(-2)
-        distance = (scale.evaluate(inside, fresh) - scale.evaluate(inside, old)).square().mean(-1).sqrt()
+        distance = (space.evaluate(inside, fresh) - space.evaluate(inside, old)).square().mean(-1).sqrt()
         usual, count = (place * self.scatter).sum(-1), (place * self.averaged).sum(-1)
         drifted = (count >= 2) & (distance > _DRIFT * usual)
         again = joins & (usual > 0) & (distance <= _DRIFT * usual)  # one more of the same function

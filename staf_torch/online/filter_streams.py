@@ -103,14 +103,20 @@ class FilterStreams:
             return
         n, both = self.state.dim, torch.cat((x, y), 1).double()
         calm = self._calm and bool(both.isfinite().all()) and not self._far(both)
-        due = None if calm else self._looked_at(x, both, lapse)
+        due = None
+        if not calm:
+            self._leave(x, both)
+            due = self._remember(both, lapse)
         rest = (y - self._center[:, n:]) / self._spread[:, n:]
         if due is not None:
             rest = torch.where(due.unsqueeze(1), torch.nan, rest)
         self._filter.learn(self.state, (x - self._center[:, :n]) / self._spread[:, :n], rest, lapse)
-        if calm:
-            self._keep_all(both, lapse)
-        elif due is not None and bool(due.any()):
+        if due is None:  # no stream is young and all of the sample is measured
+            self.first[:, self._even, :-1] = both
+            self.first[:, self._even, -1] = 1.0 if lapse is None else lapse
+            self._even = (self._even + 1) % LEARNED_AT[-1]
+            self.turn.fill_(self._even)
+        elif bool(due.any()):
             self.state.counts[1] -= due.long()  # not skipped: it is learned with the others
             self._learn_units(due)
         if not calm or self._even % LOOKED_AT == 0:
@@ -129,18 +135,6 @@ class FilterStreams:
         """Return whether a stream is so far from the samples of its units that these say nothing."""
         away = (both - self.units[:, : both.shape[1]]).abs()
         return not self._watched or bool((away > self._reach).any())
-
-    def _keep_all(self, both: Tensor, lapse: Tensor | None) -> None:
-        """`_remember` where no stream is young and all of a sample is measured."""
-        self.first[:, self._even, :-1] = both
-        self.first[:, self._even, -1] = 1.0 if lapse is None else lapse
-        self._even = (self._even + 1) % LEARNED_AT[-1]
-        self.turn.fill_(self._even)
-
-    def _looked_at(self, x: Tensor, both: Tensor, lapse: Tensor | None) -> Tensor:
-        """Which streams are due to learn their units, (S,), with the sample kept."""
-        self._leave(x, both)
-        return self._remember(both, lapse)
 
     def _remember(self, both: Tensor, lapse: Tensor | None) -> Tensor:
         """Keep the latest samples of every stream; which streams learn their units from the first, (S,)."""
@@ -225,20 +219,16 @@ class FilterStreams:
         self._center, self._spread = self.units.to(self.dtype).split(wide, dim=1)
         center, spread = self.units[rows].unsqueeze(1).split(wide, dim=-1)
         u = ((samples[..., :wide] - center) / spread).to(self.dtype)
-        alone = StreamState.empty(self.state.blocks, len(rows), n, self.state.count, self.state.outputs)
+        alone = StreamState.empty(self.state.blocks, len(rows), *self.state.sizes)
         law = self.definition.with_law(self.definition.ratio[rows], self.definition.forgetting[rows])
         filter_ = CompiledFilter.build(law, alone)
-        before = alone.counts[0].clone()
         for k in range(u.shape[1]):
             before = alone.counts[0].clone()
             at, lapse = u[:, k], samples[:, k, -1].clone()
             filter_.learn(alone, at[:, :n].contiguous(), at[:, n:].contiguous(), lapse)
         latest = alone.counts[0] - before  # 1 if the latest sample was learned
         counts = self.state.counts[:2, rows].clone()
-        table = self.state.table
-        table[:, rows] = alone.table
-        self.state.put(table)
-        self.state.counts[:, rows] = alone.counts
+        self.state.replace(rows, alone)
         self.state.counts[0, rows] = torch.maximum(counts[0] + added * latest, alone.counts[0])
         self.state.counts[1, rows] = counts[1] + added * (1 - latest)
 
@@ -254,9 +244,7 @@ class FilterStreams:
     def clear(self, rows: Tensor) -> None:
         """Let the streams with these numbers begin anew."""
         fresh = StreamState.empty(self.state.blocks, len(rows), *self.state.sizes)
-        table = self.state.table
-        table[:, rows], self.state.counts[:, rows] = fresh.table, fresh.counts
-        self.state.put(table)
+        self.state.replace(rows, fresh)
         self._begin(rows)
         self._center, self._spread = self.units.to(self.dtype).chunk(2, dim=1)
         self._calm = False
@@ -299,15 +287,9 @@ class FilterStreams:
 
     def _learned(self) -> dict[str, Tensor]:
         """All tensors that learning changes."""
-        kept = {
-            "table": self.state.table,
-            "counts": self.state.counts,
-            "units": self.units,
-            "clock": self.clock,
-            "turn": self.turn,
-        }
-        law = {"first": self.first, "ratio": self.definition.ratio, "forgetting": self.definition.forgetting}
-        return kept | law
+        own = {name: getattr(self, name) for name in ("units", "clock", "turn", "first")}
+        law = {"ratio": self.definition.ratio, "forgetting": self.definition.forgetting}
+        return {"table": self.state.table, "counts": self.state.counts} | own | law
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take over what `state_dict` of as many streams has.

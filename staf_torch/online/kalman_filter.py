@@ -70,6 +70,12 @@ class StreamState:
         """n, M and K."""
         return self.dim, self.count, self.outputs
 
+    def replace(self, rows: Tensor, other: StreamState) -> None:
+        """Take the numbers of another state for the streams with these numbers."""
+        table = self.table
+        table[:, rows], self.counts[:, rows] = other.table, other.counts
+        self.put(table)
+
     def parts(self, table: Tensor) -> StateParts:
         """The rows of a table (..., S) by name: views, but for D."""
         n, m, k = self.dim, self.count, self.outputs
@@ -125,6 +131,7 @@ class _NewSample(NamedTuple):
     most: float  # the largest number of the table
 
 
+@dataclasses.dataclass(eq=False)
 class LocalFilter:
     """y_k = V_k(x_k) + e_k, e ~ N(0, rho), with V a Gaussian process of unit amplitude around the state.
 
@@ -148,23 +155,22 @@ class LocalFilter:
         base: variance of the process in the units of y, before there are errors to tell.
     """
 
-    def __init__(
-        self,
-        functions: LocalFunctions,
-        ratio: Tensor,
-        forgetting: Tensor,
-        slack: float,
-        robust: float = math.inf,
-        base: float = 1.0,
-    ) -> None:
-        self.functions, self.slack = functions, slack
-        self.ratio, self.forgetting = ratio.contiguous(), forgetting.contiguous()  # compiled code reads them
-        self.robust, self.base = robust, base
+    functions: LocalFunctions
+    ratio: Tensor
+    forgetting: Tensor
+    slack: float
+    robust: float = math.inf
+    base: float = 1.0
+
+    def __post_init__(self) -> None:
+        self.ratio, self.forgetting = (
+            self.ratio.contiguous(),
+            self.forgetting.contiguous(),
+        )  # for compiled code
 
     def with_law(self, ratio: Tensor, forgetting: Tensor) -> LocalFilter:
         """The filter for other streams, with these rho and lambda (S,)."""
-        law = ratio, forgetting
-        return LocalFilter(self.functions, *law, self.slack, self.robust, self.base)
+        return dataclasses.replace(self, ratio=ratio, forgetting=forgetting)
 
     def predict(self, state: StreamState, x: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and standard deviation of the next y at x (S, n): (S, K), (S, K)."""
@@ -189,7 +195,8 @@ class LocalFilter:
         prior = self.functions.prior(old.anchor, z)
         factor: Tensor | float = 1.0 if local.log_factor is None else local.log_factor.exp()
         mean = (local.psi * old.mean).sum(-2) * factor
-        return mean, (prior - share * _quadratic(old.learned, local.psi)) * factor**2 + self.ratio
+        known = (local.psi * _apply(old.learned, local.psi)).sum(0)  # psi'D psi
+        return mean, (prior - share * known) * factor**2 + self.ratio
 
     def learn(self, state: StreamState, x: Tensor, y: Tensor, lapse: Tensor | None = None) -> None:
         """Learn one sample a stream, in place, computed in float64.
@@ -225,23 +232,15 @@ class LocalFilter:
         jumped = moves & ~afresh & torch.isfinite(before)
         anchor = torch.where(moves, x, old.anchor)
         start = torch.where(afresh, 0.0, 1.0).double()
-        transfer, factor = self.functions.transfer(
-            torch.where(afresh, x, old.anchor), torch.where(moves, z, 0.0)
-        )
+        left = torch.where(afresh, x, old.anchor)
+        transfer, factor = self.functions.transfer(left, torch.where(moves, z, 0.0))
         mean = torch.where(moves, _apply(transfer, old.mean) * (1.0 if factor is None else factor), old.mean)
         learned = torch.where(moves, _congruence(transfer, old.learned), old.learned)
         z = torch.where(moves, 0.0, z)
-        none = torch.zeros_like(largest)
         since = torch.where(afresh, 0, since)
         held = torch.where(torch.isfinite(x), x, old.last)
-        moved = StateParts(
-            anchor,
-            held,
-            mean * start,
-            learned * start,
-            old.errors * start,
-            torch.where(afresh, none, largest)[None],
-        )
+        largest = torch.where(afresh, 0.0, largest)[None]
+        moved = StateParts(anchor, held, mean * start, learned * start, old.errors * start, largest)
         most = torch.finfo(state.dtype).max
         found, good = self._update(moved, since, _NewSample(z, y, seen, lapse, fine, jumped, before, most))
         faded = moved._replace(learned=moved.learned * self.forgetting**lapse)  # time passes in any case
@@ -304,11 +303,6 @@ def _congruence(transfer: Tensor, matrix: Tensor) -> Tensor:
     """T D T' with the batch last: (M, M, S), (M, M, S) -> (M, M, S)."""
     half = _apply(transfer, matrix.transpose(0, 1))  # rows of D T'
     return _apply(transfer, half.transpose(0, 1))
-
-
-def _quadratic(matrix: Tensor, vector: Tensor) -> Tensor:
-    """v'A v with the batch last: (M, M, S), (M, S) -> (S,)."""
-    return (vector * _apply(matrix, vector)).sum(0)
 
 
 def smooth_record(

@@ -154,10 +154,8 @@ class LocalFunctions(NamedTuple):
             left = self._newton(moved).mT
         else:  # all points around one state
             zero = torch.zeros_like(d[0])
-            core = (self.kernel.core(zero, points.flatten(0, 1), d) @ self.shared).unflatten(
-                0, points.shape[:2]
-            )
-            left = self.shared.mT
+            core = self.kernel.core(zero, points.flatten(0, 1), d) @ self.shared
+            core, left = core.unflatten(0, points.shape[:2]), self.shared.mT
         if here is not None and there is not None:
             core = core * (here - there).exp().unsqueeze(-1)
         if half is not None:

@@ -153,16 +153,12 @@ class StaFRegressor(StreamEstimator):
         rows = (len(states), streams.count, -1)
         whole = torch.ones(rows[:2], dtype=torch.float64) if steps is None else steps.expand(rows[:2])
         both = torch.cat((states.double().reshape(rows), values.double().reshape(rows)), -1)
-        center, spread = (
-            part.split((states.shape[-1], both.shape[-1] - states.shape[-1]), 1)
-            for part in streams.units_for(both)
+        n, (center, spread) = states.shape[-1], streams.units_for(both)
+        units = (both - center) / spread
+        mean, deviation = smooth_record(
+            streams.definition, streams.state, units[..., :n], units[..., n:], whole
         )
-        local = [
-            (part.double().reshape(rows) - c) / s
-            for part, c, s in zip((states, values), center, spread, strict=True)
-        ]
-        mean, deviation = smooth_record(streams.definition, streams.state, local[0], local[1], whole)
-        found = mean * spread[1] + center[1], deviation * spread[1]
+        found = mean * spread[:, n:] + center[:, n:], deviation * spread[:, n:]
         return like_given(y, found[0].reshape(values.shape)), like_given(y, found[1].reshape(values.shape))
 
     def _begin(self, streams: int, outputs: int, like: Tensor) -> FilterStreams:
@@ -183,10 +179,8 @@ class StaFRegressor(StreamEstimator):
             raise fail(_NAME, "kernel", "must have one value a hyperparameter for all streams", self.kernel)
         functions = LocalFunctions.of(kernel, offsets)
         _check_reach(functions, radius)
-        ratio, forgetting = law.unsqueeze(1).repeat(1, streams)
-        filter_ = LocalFilter(
-            functions, ratio, forgetting, follow * radius, robust, float(self.amplitude) ** 2
-        )
+        law = law.unsqueeze(1).repeat(1, streams)
+        filter_ = LocalFilter(functions, *law, follow * radius, robust, float(self.amplitude) ** 2)
         return FilterStreams(filter_, StreamState.empty(like, streams, dim, len(offsets), outputs), scaling)
 
     def _law(self, dtype: torch.dtype) -> tuple[float, float]:
@@ -209,10 +203,8 @@ class StaFRegressor(StreamEstimator):
             count = integer(_NAME, "count", count, least=1)
             return rings(count) if dim == 2 and count in RING_COUNTS else ball(count, dim)
         found = tensor_of(_NAME, "centers", self.centers).double()
-        inside = (
-            found.dim() == 2 and found.shape[1] == dim and float(found.square().sum(1).amax()) <= 1 + 1e-9
-        )
-        if not inside:
+        fits = found.dim() == 2 and found.shape[1] == dim
+        if not (fits and float(found.square().sum(1).amax()) <= 1 + 1e-9):
             rule = f"must be directions (M, {dim}) in the closed unit ball"
             raise fail(_NAME, "centers", rule, self.centers)
         return found

@@ -20,11 +20,7 @@ WIDTHS = (0.5, 1.0, 2.0, 4.0, 8.0)  # in standard deviations of x, times sqrt(n)
 NOISES = (1e-3, 1e-2, 0.1, 0.4)  # in standard deviations of y
 FORGETTING = (1.0, 0.999, 0.99, 0.97)
 RADII = (0.25, 0.5)  # in widths
-DEFAULT = (
-    1.0,
-    1e-2,
-    0.999,
-)  # width, noise, forgetting of a regressor that nobody tuned: among the candidates
+DEFAULT = (1.0, 1e-2, 0.999)  # width, noise, forgetting of a regressor not tuned: among the candidates
 ROUNDS = (0.6, 0.3)  # spread of the logarithms of the candidates around the best so far
 AROUND = 48  # of these candidates a round
 SHORT = 0.35  # widths / sqrt(n), nearly what all of x covers of the widest: a coordinate with less is logged
@@ -82,9 +78,8 @@ def tuning(x: Tensor, y: Tensor, directions: Tensor) -> Tuning:
     samples = (both - center) / spread
     n, streams = x.shape[-1], x.shape[1]
     widths = torch.tensor(WIDTHS, dtype=torch.float64) * math.sqrt(n)
-    rows = torch.cartesian_prod(
-        widths, *(torch.tensor(each, dtype=torch.float64) for each in (NOISES, FORGETTING))
-    )
+    laws = (torch.tensor(each, dtype=torch.float64) for each in (NOISES, FORGETTING))
+    rows = torch.cartesian_prod(widths, *laws)
     rows = torch.cat((rows, torch.tensor([DEFAULT], dtype=torch.float64)))
     first = _Candidates(*(rows[:, k].expand(streams, -1) for k in range(3)))
     first = first._replace(width=first.width.unsqueeze(-1).expand(-1, -1, n))
@@ -100,26 +95,17 @@ def tuning(x: Tensor, y: Tensor, directions: Tensor) -> Tuning:
         found.append((score, best, _unknown(best, score, samples, n, radius * directions)))
     which = torch.stack([score for score, *_ in found]).argmax(0)
     one = which == 1
-    kept = _Candidates(
-        *(_choose(one, b, a).squeeze(1) for a, b in zip(found[0][1], found[1][1], strict=True))
-    )
-    unknown = _choose(one, found[1][2], found[0][2])
+    (small_score, small, small_unknown), (wide_score, wide_best, wide_unknown) = found
+    kept = _Candidates(*(_choose(one, b, a).squeeze(1) for a, b in zip(small, wide_best, strict=True)))
+    unknown = _choose(one, wide_unknown, small_unknown)
+    score = torch.where(one, wide_score, small_score) / (len(samples) - len(samples) // 3)
     path = torch.where(seen, both, center)[..., :n]
     extent = path.amax(0) - path.amin(0)
     width, stretch, wider = _widened(kept.width, spread[:, :n], extent, unknown)
     _warn(extent / width, width, wider)
     units = torch.cat((width, spread[:, n:]), 1)
     radii = torch.tensor(RADII, dtype=torch.float64)[which]
-    return Tuning(
-        center,
-        units,
-        kept.noise**2,
-        kept.forgetting,
-        radii,
-        torch.where(one, found[1][0], found[0][0]) / (len(samples) - len(samples) // 3),
-        stretch,
-        unknown.double(),
-    )
+    return Tuning(center, units, kept.noise**2, kept.forgetting, radii, score, stretch, unknown.double())
 
 
 def tuned_streams(
@@ -127,11 +113,10 @@ def tuned_streams(
 ) -> FilterStreams:
     """Streams with these hyperparameters; the radius of the first serves all."""
     n, outputs = directions.shape[1], found.center.shape[1] - directions.shape[1]
-    offsets = found.radius[0] * directions
-    functions = LocalFunctions.of(GaussianKernel(1.0), offsets)
+    functions = LocalFunctions.of(GaussianKernel(1.0), found.radius[0] * directions)
     law = found.ratio.clone(), found.forgetting.clone()
     filter_ = LocalFilter(functions, *law, follow * float(found.radius[0]), robust)
-    state = StreamState.empty(torch.zeros(0, dtype=dtype), len(found.ratio), n, len(offsets), outputs)
+    state = StreamState.empty(torch.zeros(0, dtype=dtype), len(found.ratio), n, len(directions), outputs)
     stretch = torch.cat((found.width, found.width.new_ones(len(found.width), outputs)), 1)
     units = torch.cat((found.center, found.spread), 1)
     return FilterStreams(filter_, state, True, units, stretch, found.unknown)

@@ -212,12 +212,7 @@ class BankDefinition:
         samples = (torch.cat((s["x"], s["y"]), 1)[usable] - center) / spread
         found = learn_hyperparameters(Stretch(samples[:, :n], samples[:, n:], s["when"][usable]))
         s["metric"].copy_(found.metric)
-        for lane, choice in (
-            (TURNED, found.turned),
-            (PLAIN, found.plain),
-            (FADING, found.fading),
-            (TURNED_FADING, found.turned_fading),
-        ):
+        for lane, choice in zip((TURNED, PLAIN, FADING, TURNED_FADING), found[:-1], strict=True):
             s["tracker_rate"][lane], s["tracker_noise"][lane] = choice.rate, choice.noise
             s["tracker_forgetting"][lane] = math.exp(-2 * choice.fade)
 
@@ -251,9 +246,8 @@ class BankDefinition:
         s["x"][slot], s["y"][slot], s["when"][slot] = x, y, time
         order[slot], gap[slot] = s["clock"], torch.inf
         for i in (order == old + 1).nonzero().flatten().tolist():
-            distance = torch.where(
-                (order <= old) & (order >= 0), self._apart(s, s["x"], s["x"][i]), torch.inf
-            )
+            among = (order <= old) & (order >= 0)
+            distance = torch.where(among, self._apart(s, s["x"], s["x"][i]), torch.inf)
             gap[i] = torch.minimum(gap[i], distance.min())
             torch.minimum(gap, distance, out=gap)
 
@@ -264,10 +258,8 @@ class BankDefinition:
         for name in ("time", "unlearned"):
             s[name].add_(lapse)
         seen = ~torch.isnan(told)
-        sound = bool(
-            torch.isfinite(x).all() & seen.any() & ~torch.isnan(given).all() & ~torch.isinf(told).any()
-        )
-        if not sound:
+        sound = torch.isfinite(x).all() & seen.any() & ~torch.isnan(given).all() & ~torch.isinf(told).any()
+        if not bool(sound):
             s["skipped"].add_(1)
             return
         known = s.number("count") > 0

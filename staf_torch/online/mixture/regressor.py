@@ -99,14 +99,10 @@ class Bank:
         pointers, self._held = FunctionPointers.of(functions)
         self._rules = RulesInC((ctypes.c_double * _NUMBERS)(*rules.numbers()), pointers)
         self._call, self._run = BankCall(), _built(shape) if compile else None
+        self.compiled = self._run is not None  # and not the definition
         self.definition = BankDefinition(shape, rules, functions)
         self.table = torch.zeros(0, size(shape), dtype=torch.float64)
         self.add(streams)
-
-    @property
-    def compiled(self) -> bool:
-        """Return whether compiled code runs, and not the definition."""
-        return self._run is not None
 
     def add(self, streams: int) -> None:
         """Begin further streams, behind the others."""

@@ -55,22 +55,11 @@ class Rules(NamedTuple):
     scaling: bool
     carried_slack: float  # distance at which the filters' centers follow
     fade_rates: tuple[float, ...] = (1e-4, 1e-6)  # by age
-    noise: tuple[float, ...] = (
-        0.09,
-        1e-8,
-        9e-4,
-        1e-12,
-        0.09,
-        1e-8,
-    ) * 4  # variances, in units of a local process's amplitude
+    noise: tuple[float, ...] = (0.09, 1e-8, 9e-4, 1e-12, 0.09, 1e-8) * 4  # in units of a process's amplitude
     discounts: tuple[float, ...] = (0.9, 0.97, 0.995)  # of the scores in the three mixtures
     discount: float = 0.98  # of the scores of the mixtures
     share: float = 0.001  # of the weights that is equal
-    doubts: tuple[float, ...] = (
-        1.0,
-        0.5,
-        0.25,
-    )  # powers of a doubted variance that weights fall with, a mixture each
+    doubts: tuple[float, ...] = (1.0, 0.5, 0.25)  # powers of a doubted variance that weights fall with
     doubt: float = 0.5  # ... by squared errors
     drop: float = 0.02  # members below this part of the largest weight are left out
     heavy: float = 8.0  # degrees of freedom
@@ -91,16 +80,7 @@ class Rules(NamedTuple):
     doubted_rate: float = 0.01  # of this running share
     settled: float = 10.0  # samples before which none waits
     outlying: float = 30.0  # median deviations beyond which a value has no say in the units
-    learned_at: tuple[int, ...] = (
-        2,
-        5,
-        10,
-        20,
-        40,
-        80,
-        160,
-        320,
-    )  # samples after which units are learned: all are kept
+    learned_at: tuple[int, ...] = (2, 5, 10, 20, 40, 80, 160, 320)  # samples after which units are learned
     carried_forgetting: tuple[float, ...] = (0.9, 0.95, 0.97, 0.98, 0.99, 0.995, 0.999, 1.0)  # of the filters
     carried_ratio: float = 1e-6  # variance of their noise
     quadratic_forgetting: tuple[float, ...] = (0.9999, 0.9999, 0.9999, 0.9999, 0.998, 0.99, 0.99, 0.97)
@@ -148,31 +128,20 @@ def layout(shape: BankShape) -> list[tuple[str, tuple[int, ...]]]:
         *((name, ()) for name in ("clock", "count", "far", "skipped", "learned", "time")),
         *(("last_x", (n,)), ("last_y", (k,)), ("asked", (n,)), ("answered", ())),
         *((name, ()) for name in ("waiting", "trust", "doubted", "waiting_time", "waiting_lapse")),
-        *(
-            ("waiting_x", (n,)),
-            ("waiting_y", (k,)),
-        ),  # a sample that nobody expected, until the next one tells
+        *(("waiting_x", (n,)), ("waiting_y", (k,))),  # an unexpected sample, until the next one tells
         *(("center", (n + k,)), ("spread", (n + k,))),
         *(("covariance", (n + 1, n + 1)), ("linear", (k, n + 1))),
         ("filters", (filters, CARRIED)),  # the rows of a `StreamState`, and the samples since it began
-        (
-            "factor",
-            (d * (d + 1) // 2, QUADRATIC),
-        ),  # of the quadratics' covariances U D U': columns of U, D last
+        ("factor", (d * (d + 1) // 2, QUADRATIC)),  # of covariances U D U': columns of U, D last
         *(("quadratic", (k, d, QUADRATIC)), ("quadratic_error", (k, QUADRATIC))),  # coefficients
-        *(
-            ("tracked", (TRACKED, n, TRACKERS)),
-            ("tracker_weights", (k, TRACKED, TRACKERS)),
-        ),  # parts of `TrackerModels`
+        ("tracked", (TRACKED, n, TRACKERS)),  # this and the next four: parts of `TrackerModels`
+        ("tracker_weights", (k, TRACKED, TRACKERS)),
         *((f"tracker_{name}", (TRACKED * (TRACKED + 1) // 2, TRACKERS)) for name in ("known", "inverse")),
         ("tracker_counts", (3, TRACKERS)),
         *((f"tracker_{name}", (TRACKERS,)) for name in ("rate", "noise", "forgetting")),
         ("metric", (n, n)),  # A: two trackers see A'x
         *(("weights", (k, CLOCKS, MEMBERS)), ("clock_weights", (k, CLOCKS))),  # logarithms
-        *(
-            ("excess", (k, MEMBERS)),
-            ("usual", (k, MEMBERS)),
-        ),  # running scales; logarithms of the members' variances
+        *(("excess", (k, MEMBERS)), ("usual", (k, MEMBERS))),  # running scales; logarithms of variances
         ("squares", (k, MEMBERS)),  # logarithms of the weights by squared errors
         *((name, (k,)) for name in ("error", "pace", "own", "best", "low", "high", "calibration")),
         *(("correction_covariance", (k, GROUPS, GROUPS)), ("correction", (k, GROUPS))),  # coefficients
