@@ -71,7 +71,7 @@ class FilterStreams:
         self._filter = CompiledFilter.build(definition, state)
         self.compiled = isinstance(self._filter, CompiledFilter) and not self.scaling
         self._center, self._spread = self.units.to(self.dtype).split(state.dim + state.outputs, dim=1)
-        self._calm = False  # until `_see`
+        self._calm, self._even = False, 0  # until `_see`
 
     @property
     def count(self) -> int:

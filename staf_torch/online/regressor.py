@@ -179,8 +179,9 @@ class StaFRegressor(StreamEstimator):
             raise fail(_NAME, "kernel", "must have one value a hyperparameter for all streams", self.kernel)
         functions = LocalFunctions.of(kernel, offsets)
         _check_reach(functions, radius)
-        law = law.unsqueeze(1).repeat(1, streams)
-        filter_ = LocalFilter(functions, *law, follow * radius, robust, float(self.amplitude) ** 2)
+        ratio, forgetting = law.unsqueeze(1).repeat(1, streams)
+        base = float(self.amplitude) ** 2
+        filter_ = LocalFilter(functions, ratio, forgetting, follow * radius, robust, base)
         return FilterStreams(filter_, StreamState.empty(like, streams, dim, len(offsets), outputs), scaling)
 
     def _law(self, dtype: torch.dtype) -> tuple[float, float]:
