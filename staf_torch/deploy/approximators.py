@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import copy
 import math
-from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -18,13 +17,6 @@ from ..local_basis import GradedSpace
 from ..numerics.checks import positive_real
 
 _HIGHEST = 60  # degree: beyond it the ball is too wide, in units of the kernel's width, for a series
-
-
-class _Series(NamedTuple):
-    """sum_i sum_p c_ip tau_i^p, all in float64."""
-
-    coefficients: Tensor  # c, (P + 1, M)
-    directions: Tensor  # u_i / nu, (M, n): tau = directions z
 
 
 class RidgeApproximator(nn.Module):
@@ -74,8 +66,8 @@ class RidgeApproximator(nn.Module):
                 f"kernel of one width; got {staf}."
             )
         self.radius, self.reach = float(space.radius), float(reach)
-        series = _expand(space, staf.coefficients.detach().double(), torch.finfo(dtype).eps, reach)
-        c, directions = series
+        c = _expand(space, staf.coefficients.detach().double(), torch.finfo(dtype).eps, reach)
+        directions = space.basis.directions / self.radius  # (M, n): tau = directions z
         self.degree = len(c) - 1
         moving = staf.basis.kernel.log_gain(x) is not None  # the exponential kernel: s(z) = x'z
         self.rate = None if moving else float(space.rate)
@@ -188,8 +180,8 @@ def approximator(staf: StaF, dtype: torch.dtype = torch.float64, reach: float = 
     return LocalApproximator(staf, dtype)
 
 
-def _expand(space: GradedSpace, beta: Tensor, eps: float, reach: float) -> _Series:
-    """c_ip = sum_{k <= p} (q_ij / sigma_j) beta_j k! r^(2 (p - k)) / p!, j of degree k."""
+def _expand(space: GradedSpace, beta: Tensor, eps: float, reach: float) -> Tensor:
+    """c_ip = sum_{k <= p} (q_ij / sigma_j) beta_j k! r^(2 (p - k)) / p!, j of degree k: (P + 1, M)."""
     basis, nu = space.basis, float(space.radius)
     r2 = float(space.rate) * nu**2
     apart = (beta @ basis.weights.flatten(0, 1).mT).unflatten(-1, basis.weights.shape[:2])  # (M, K)
@@ -202,7 +194,7 @@ def _expand(space: GradedSpace, beta: Tensor, eps: float, reach: float) -> _Seri
         ]
         terms.append(torch.stack(shares).sum(0) if shares else torch.zeros_like(apart[:, 0]))
         if p > basis.degrees[-1] and _negligible(terms, eps, reach):
-            return _Series(torch.stack(terms), basis.directions / nu)
+            return torch.stack(terms)
     raise ValueError(
         f"`RidgeApproximator(reach=...)` must be smaller: over {reach:g} radii of {nu:g} the kernel's series "
         f"needs more than {_HIGHEST} terms; got {reach!r}."

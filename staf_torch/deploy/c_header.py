@@ -19,7 +19,7 @@ from ..adp import Controller
 from ..lanes import Program
 from ..lanes.call import Given
 from ..lanes.emit.schedule import Schedule
-from ..lanes.trace.graph import WIDE, Graph
+from ..lanes.trace.graph import WIDE
 from ..lanes.trace.step import trace
 from ..lanes.trace.tracer import NotLoweredError
 from ..lanes.tree import Tree
@@ -156,21 +156,10 @@ def _counted(program: Program, carry: Tree, row: Tree) -> Source:
     if graph.single and WIDE in graph.type:
         raise ValueError("This needs float64 inside, or float32 loses its digits: use --dtype float64.")
     schedule = Schedule(graph, following, ends)
-    constants = sum(graph.op[node] == "const" for node in schedule.live)
-    return Source(constants, *_cost(graph, schedule))
-
-
-def _said(note: str, source: Source, takes: str) -> str:
-    """The note and what a call costs: loops have fixed lengths, and both sides of a choice are computed."""
-    most = f"A call {takes} {source.flops} additions and the like,"
-    return f"{note}\n{most}\n{source.functions} calls of exp and the like, whatever the state is.".lstrip()
-
-
-def _cost(graph: Graph, schedule: Schedule) -> tuple[int, int]:
-    """Return the additions and the like, and the calls of exp and the like, of one call."""
-    flops = functions = 0
+    constants = flops = functions = 0
     for node in schedule.live:
         op, count = graph.op[node], schedule.repeats(node)
+        constants += op == "const"
         if op in ("map", "dot"):
             aux = graph.aux[node]
             count *= math.prod(aux[1]) if op == "map" else 2 * aux[0] * aux[1]
@@ -179,7 +168,13 @@ def _cost(graph: Graph, schedule: Schedule) -> tuple[int, int]:
             flops += count
         elif op not in _FREE:
             functions += count
-    return flops, functions
+    return Source(constants, flops, functions)
+
+
+def _said(note: str, source: Source, takes: str) -> str:
+    """The note and what a call costs: loops have fixed lengths, and both sides of a choice are computed."""
+    most = f"A call {takes} {source.flops} additions and the like,"
+    return f"{note}\n{most}\n{source.functions} calls of exp and the like, whatever the state is.".lstrip()
 
 
 def runner_c(path: Path, sizes: Sequence[int | None], dtype: torch.dtype) -> Run:
@@ -295,8 +290,7 @@ def _built(path: Path, function: str, head: str = "") -> Callable[..., object]:
         (Path(folder) / "call.c").write_text(source, encoding="utf-8")
         line = [need_c_compiler(), "-O2", "-shared", "-fPIC", "-x", "c", "call.c", "-o", "call.so", "-lm"]
         subprocess.run(line, cwd=folder, check=True, capture_output=True)
-        call: Callable[..., object] = ctypes.CDLL(str(Path(folder) / "call.so")).call
-        return call
+        return ctypes.CDLL(str(Path(folder) / "call.so")).call
 
 
 def need_c_compiler() -> str:

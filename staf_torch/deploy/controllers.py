@@ -118,8 +118,7 @@ class FilteredPolicy(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """u: (..., n), or (..., n + 1) with the time, -> (..., m)."""
-        moving = self.filter.moving
-        u: Tensor = self.filter(x[..., :-1], x[..., -1]) if moving else self.filter(x)
+        u: Tensor = self.filter(x[..., :-1], x[..., -1]) if self.filter.moving else self.filter(x)
         return u
 
 
@@ -223,8 +222,7 @@ def _policy_of(controller: Controller | nn.Module, weights: Tensor | None) -> nn
     if isinstance(controller, SafetyFilter):
         return FilteredPolicy(_policy_of(controller.controller, weights), controller)
     if isinstance(controller, ActorCritic):
-        chosen = controller.actor if weights is None else weights
-        return ActorPolicy(controller, chosen)
+        return ActorPolicy(controller, controller.actor if weights is None else weights)
     if weights is not None:
         raise fail("policy_of", "weights", f"must be None for {type(controller).__name__}", weights)
     if isinstance(controller, Feedback):

@@ -73,8 +73,7 @@ def export_onnx(program: ExportedProgram, path: Path, inputs: list[str], outputs
         ValueError: if the extra ``onnx`` is not installed.
     """
     need_onnx()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         model = torch.onnx.export(
             program, dynamo=True, input_names=inputs, output_names=outputs, verbose=False, optimize=True
         )
@@ -119,14 +118,12 @@ def load_program(path: str | Path) -> tuple[ExportedProgram, dict[str, object]]:
     """
     note = {_NOTE: ""}
     try:
-        with warnings.catch_warnings():  # torch 2.9 warns of a file that it then refuses
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(action="ignore"):  # torch 2.9 warns of a file that it then refuses
             program = torch.export.load(path, extra_files=note)
     except Exception as error:  # torch raises errors of all sorts for what is no archive
         reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise fail(
-            "load_program", "path", f"must be a .pt2 file of staf-export ({reason})", str(path)
-        ) from error
+        rule = f"must be a .pt2 file of staf-export ({reason})"
+        raise fail("load_program", "path", rule, str(path)) from error
     if not note[_NOTE]:
         raise fail("load_program", "path", "must have been written by staf-export", str(path))
     said = json.loads(note[_NOTE])
@@ -154,8 +151,7 @@ def export_package(program: ExportedProgram, path: Path) -> None:
         ValueError: if there is no C++ compiler.
     """
     need_compiler()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         torch._inductor.aoti_compile_and_package(
             program, package_path=str(path), inductor_configs={"cpp.threads": 1}
         )

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import struct
+import math
+import operator
 import warnings
 from typing import Any, Literal
 
@@ -46,8 +47,7 @@ def trace(module: nn.Module, example: Tensor, *, batch: int | None = None) -> Ex
     x = example[:1].detach().expand(rows, -1).clone()
     shapes = ({0: Dim("batch", min=1)},) if batch is None else None
     module = module.eval().requires_grad_(False)
-    with warnings.catch_warnings(), torch.no_grad():
-        warnings.simplefilter("ignore")  # of the tracer, about its own internals
+    with warnings.catch_warnings(action="ignore"), torch.no_grad():  # of the tracer, about its own internals
         try:
             # First to operations, derivatives and all, which `torch.export` alone does not take.
             mode: Literal["symbolic", "real"] = "symbolic" if batch is None else "real"
@@ -69,7 +69,7 @@ def fold(graph: fx.GraphModule) -> fx.GraphModule:
     known: dict[fx.Node, Any] = {}
     for node in graph.graph.nodes:
         if node.op == "get_attr":
-            known[node] = _attribute(graph, str(node.target))
+            known[node] = operator.attrgetter(str(node.target))(graph)
         elif node.op == "call_function" and all(parent in known for parent in node.all_input_nodes):
             if not node.all_input_nodes and not _returns_tensor(node):
                 continue
@@ -77,9 +77,8 @@ def fold(graph: fx.GraphModule) -> fx.GraphModule:
             assert callable(node.target)
             known[node] = node.target(*args, **kwargs)
     for number, (node, value) in enumerate(known.items()):
-        if node.op == "get_attr" or not isinstance(value, Tensor):
-            continue
-        if all(user in known for user in node.users):
+        used_here = all(user in known for user in node.users)
+        if node.op == "get_attr" or not isinstance(value, Tensor) or used_here:
             continue
         name = f"folded_{number}"
         graph.register_buffer(name, value.detach().clone())
@@ -97,13 +96,6 @@ def fold(graph: fx.GraphModule) -> fx.GraphModule:
             delattr(graph, name)
     graph.recompile()
     return graph
-
-
-def _attribute(graph: fx.GraphModule, path: str) -> Any:
-    found: Any = graph
-    for part in path.split("."):
-        found = getattr(found, part)
-    return found
 
 
 def _returns_tensor(node: fx.Node) -> bool:
@@ -146,10 +138,4 @@ def lift_numbers(graph: fx.GraphModule) -> fx.GraphModule:
 
 
 def _inexact(value: float) -> bool:
-    if value != value or value in (float("inf"), float("-inf")):
-        return False
-    try:
-        rounded: float = struct.unpack("f", struct.pack("f", value))[0]
-    except OverflowError:
-        return True
-    return rounded != value
+    return math.isfinite(value) and torch.tensor(value, dtype=torch.float32).item() != value

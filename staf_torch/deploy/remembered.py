@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from ..adp import GlobalValue
 from ..adp.planning.global_value import follow_plan
 from ..lanes import Program
+from ..lanes.tree import Tree
 
 
 class RememberedPolicy(nn.Module):
@@ -64,10 +65,8 @@ class RememberedPolicy(nn.Module):
             "plans": memory.plans[kept.flatten()],
             "models": memory.models[models],
         }
+        tables |= {"first": place * (steps + 1) + time, "last": place * (steps + 1) + steps, "end": end}
         for name, table in tables.items():
-            self.register_buffer(name, table)
-        integers = {"first": place * (steps + 1) + time, "last": place * (steps + 1) + steps, "end": end}
-        for name, table in integers.items():
             self.register_buffer(name, table)
         self.region: Tensor
         self.frame: Tensor
@@ -88,22 +87,21 @@ class RememberedPolicy(nn.Module):
         ahead = self.first[at].unsqueeze(1) + torch.arange(self.lookahead)
         window = self.plans[torch.minimum(ahead, self.last[at].unsqueeze(1))]
         rows = x.unsqueeze(1).expand(-1, count, -1).flatten(0, 1)
-        cost, control, _ = self.follow(rows, window, self.models[self.end[at]])
+        end = self.models[self.end[at]]
+        cost, control, _ = follow_plan(self.problem, self.region, self.worst, rows, window, end)
         best = cost.unflatten(0, (-1, count)).argmin(1, keepdim=True)
         u = control.unflatten(0, (-1, count)).gather(1, best[..., None].expand(-1, -1, control.shape[-1]))
         chosen: Tensor = u.squeeze(1)
         return chosen
 
-    def follow(self, x: Tensor, window: Tensor, end: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Follow a plan, as `follow_plan` does."""
-        return follow_plan(self.problem, self.region, self.worst, x, window, end)
-
     def program(self) -> Program:
         """Evaluate a candidate from a state, (1, n), as a row program."""
-        return Program(
-            lambda carry, now, row: (carry, self.follow(row["x"], row["window"], row["end"])[:2]),
-            name="a plan that is followed",
-        )
+
+        def step(carry: Tree, now: Tree, row: Tree) -> tuple[Tree, Tree]:
+            given = row["x"], row["window"], row["end"]
+            return carry, follow_plan(self.problem, self.region, self.worst, *given)[:2]
+
+        return Program(step, name="a plan that is followed")
 
     def row(self, x: Tensor) -> dict[str, Tensor]:
         """Return the inputs of `program` for the first candidate and a state (1, n)."""
@@ -121,12 +119,10 @@ class RememberedPolicy(nn.Module):
         sizes = {
             **{"REAL": real, "N": n, "M": m, "WIDTH": self.plans.shape[1], "MODEL": self.models.shape[1]},
             **{"S": len(self.searched), "J": len(self.first) - 1, "K": self.candidates, "H": self.lookahead},
-            **{"ROUND": "rint", "CONTROL": outputs[0]},
+            **{"ROUND": "rintf" if real == "float" else "rint", "CONTROL": outputs[0]},
             "GOAL": ", ".join(repr(float(g)) for g in self.problem.goal),
             "PERIOD": ", ".join(repr(2 * math.pi) if i in self.problem.periodic else "0" for i in range(n)),
         }
-        if real == "float":
-            sizes["ROUND"] = "rintf"
         text = _SEARCH
         for name, value in sizes.items():
             text = text.replace(f"@{name}@", str(value))
@@ -136,13 +132,9 @@ class RememberedPolicy(nn.Module):
 
 
 def _table(kind: str, name: str, table: Tensor, single: bool) -> str:
-    digits = (f"{x:.9g}" if single else repr(x) for x in table.flatten().tolist())
-    return f"static const {kind} {name}[{table.numel()}] = {{\n{_broken(list(digits))}\n}};\n"
-
-
-def _broken(numbers: list[str]) -> str:
-    """Numbers of C, eight a line."""
-    return ",\n".join(", ".join(numbers[k : k + 8]) for k in range(0, len(numbers), 8))
+    digits = [f"{x:.9g}" if single else repr(x) for x in table.flatten().tolist()]
+    lines = ",\n".join(", ".join(digits[k : k + 8]) for k in range(0, len(digits), 8))
+    return f"static const {kind} {name}[{table.numel()}] = {{\n{lines}\n}};\n"
 
 
 _SEARCH = """static inline void staf(const @REAL@ state[@N@], @REAL@ @CONTROL@[@M@])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import math
 import os
 import platform
 import time
@@ -87,9 +88,8 @@ def work(program: ExportedProgram) -> Work:
             flops += _count(node.args[0].meta["val"]) - _count(out)
         else:
             flops += _count(out)
-    constants = [
-        t for t in (*program.state_dict.values(), *program.constants.values()) if isinstance(t, Tensor)
-    ]
+    held = (*program.state_dict.values(), *program.constants.values())
+    constants = [t for t in held if isinstance(t, Tensor)]
     placeholders = [n for n in program.graph.nodes if n.op == "placeholder"]
     fed = set(program.graph_signature.user_inputs)
     given = set(program.graph_signature.user_outputs)
@@ -106,10 +106,7 @@ def work(program: ExportedProgram) -> Work:
 
 def _count(value: Tensor) -> int:
     """Entries of a tensor for a batch of one row."""
-    total = 1
-    for size in value.shape:
-        total *= 1 if isinstance(size, torch.SymInt) else int(size)
-    return total
+    return math.prod(int(size) for size in value.shape if not isinstance(size, torch.SymInt))
 
 
 def latency(run: Callable[[Tensor], object], x: Tensor, calls: int = CALLS) -> Latency:
