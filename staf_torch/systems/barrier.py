@@ -58,22 +58,20 @@ class Barrier(ControlAffineSystem):
             raise fail("Barrier", "plant", "must be a ControlAffineSystem with `dim`", plant)
         super().__init__()
         center = plant.equilibrium().double()
-        lows, highs = (
-            wall_numbers("Barrier", "low", low, -math.inf, plant.dim),
-            wall_numbers("Barrier", "high", high, math.inf, plant.dim),
-        )
-        for name, wall, wrong in (("low", lows, lows >= center), ("high", highs, highs <= center)):
+        lows = wall_numbers("Barrier", "low", low, -math.inf, plant.dim)
+        highs = wall_numbers("Barrier", "high", high, math.inf, plant.dim)
+        sides = ("low", lows, lows >= center, "below"), ("high", highs, highs <= center, "above")
+        for name, wall, wrong, side in sides:
             if bool(wrong.any()):
-                side = "below" if name == "low" else "above"
                 rule = f"must be {side} the equilibrium {center.tolist()} in every coordinate"
                 raise fail("Barrier", name, rule, wall.tolist())
         self.plant = plant
         self.dim, self.inputs, self.bounds = plant.dim, plant.inputs, plant.bounds
-        free = (torch.isinf(lows) & torch.isinf(highs)).tolist()
+        unbounded = torch.isinf(lows) & torch.isinf(highs)
+        free = unbounded.tolist()
         self.periodic = tuple(k for k in plant.periodic if free[k % plant.dim])
         self._turning = tuple(k for k in plant.periodic if not free[k % plant.dim])
         below, above = 1 / (center - lows), 1 / (highs - center)  # 0 for a wall that is not there
-        unbounded = (below == 0) & (above == 0)
         buffers = {
             "low": lows,
             "high": highs,
@@ -111,8 +109,7 @@ class Barrier(ControlAffineSystem):
             ValueError: if a state is not strictly inside the box; the message names its row.
         """
         low, high, center = self.low.to(x), self.high.to(x), self.center.to(x)
-        if self._turning:
-            x = center + wrap(x - center, self._turning)
+        x = center + wrap(x - center, self._turning) if self._turning else x
         outside = ~((x > low) & (x < high)).all(-1)
         if bool(outside.any()):
             rows = outside.flatten().nonzero().flatten().tolist()
@@ -127,8 +124,7 @@ class Barrier(ControlAffineSystem):
     def coordinates(self, x: Tensor) -> Tensor:
         """`transform` without its check, NaN outside the box, for compiled loops: (..., n) -> (..., n)."""
         center = self.center.to(x)
-        if self._turning:
-            x = center + wrap(x - center, self._turning)
+        x = center + wrap(x - center, self._turning) if self._turning else x
         down = torch.where(self.walled[0], (x - self.floor.to(x)) * self.below.to(x), 1.0)
         up = torch.where(self.walled[1], (self.ceiling.to(x) - x) * self.above.to(x), 1.0)
         return self._coordinate(x - center, down, up)
@@ -137,17 +133,16 @@ class Barrier(ControlAffineSystem):
         """x from s: (..., n) -> (..., n), in the box up to rounding: 1e-17 beside a wall x is the wall."""
         apart, down, up = self._shares(s)
         # From the wall where that is near, from the middle where s is small: no digit is lost in either.
-        x = torch.where((up < 0.5) & self.walled[1], self._from_high(s, up), self.center.to(s) + apart)
-        return torch.where((down < 0.5) & self.walled[0], self._from_low(s, down), x)
+        from_low = self.floor.to(s) + down * (self.center - self.floor).to(s)
+        from_high = self.ceiling.to(s) - up * (self.ceiling - self.center).to(s)
+        x = torch.where((up < 0.5) & self.walled[1], from_high, self.center.to(s) + apart)
+        return torch.where((down < 0.5) & self.walled[0], from_low, x)
 
     def walls(self, s: Tensor) -> tuple[Tensor, Tensor]:
         """x - low and high - x with all digits, inf where there is no wall: (..., n) -> two (..., n)."""
         _, down, up = self._shares(s)
         to_low, to_high = down * (self.center - self.floor).to(s), up * (self.ceiling - self.center).to(s)
-        return (
-            torch.where(self.walled[0], to_low, torch.inf),
-            torch.where(self.walled[1], to_high, torch.inf),
-        )
+        return torch.where(self.walled[0], to_low, torch.inf), torch.where(self.walled[1], to_high, torch.inf)
 
     def margin(self, s: Tensor) -> Tensor:
         """The distance to the nearest wall, in the units of its coordinate: (..., n) -> (...)."""
@@ -194,18 +189,11 @@ class Barrier(ControlAffineSystem):
         s = self.equilibrium() if x is None else x
         found = self.plant.linearisation(self.inverse(s), u)
         scale = self.stretch(s).to(found.matrix)
-        return Linearisation(
-            scale.unsqueeze(-1) * found.matrix / scale, scale.unsqueeze(-1) * found.input_matrix
-        )
+        rows = scale.unsqueeze(-1)
+        return Linearisation(rows * found.matrix / scale, rows * found.input_matrix)
 
     def extra_repr(self) -> str:
         return f"low={self.low.tolist()}, high={self.high.tolist()}"
-
-    def _from_low(self, s: Tensor, down: Tensor) -> Tensor:
-        return self.floor.to(s) + down * (self.center - self.floor).to(s)
-
-    def _from_high(self, s: Tensor, up: Tensor) -> Tensor:
-        return self.ceiling.to(s) - up * (self.ceiling - self.center).to(s)
 
     def _shares(self, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """x - c, (x - low)/(c - low) and (high - x)/(high - c), the last two 1 where there is no wall."""
@@ -223,12 +211,8 @@ class Barrier(ControlAffineSystem):
     def _coordinate(self, apart: Tensor, down: Tensor, up: Tensor) -> Tensor:
         """s by log1p of what the nearer wall's share is short of the other, which loses no digit."""
         left = apart < 0
-        excess = (
-            torch.where(left, -apart, apart)
-            * (self.below + self.above).to(apart)
-            / torch.where(left, down, up)
-        )
-        s = excess.log1p()
+        whole = (self.below + self.above).to(apart)
+        s = (torch.where(left, -apart, apart) * whole / torch.where(left, down, up)).log1p()
         s = torch.where(left, -s, s)
         # The far wall has no part in s, but a step may lead through it.
         return torch.where(self.free, apart, torch.where((down > 0) & (up > 0), s, torch.nan))

@@ -57,8 +57,7 @@ class BlackBox:
             lead = np.broadcast_shapes(lead, u.shape[:-1])
         rows = x.expand(*lead, -1).reshape(-1, x.shape[-1]), u.expand(*lead, -1).reshape(-1, u.shape[-1])
         after = self._function(*rows) if self.torch else self._numpy(*rows)
-        moved: Tensor = after.reshape(*lead, x.shape[-1])
-        return moved
+        return after.reshape(*lead, x.shape[-1])
 
     def follow(
         self, x: Numbers, feedback: Callable[[Numbers], Numbers], steps: int
@@ -116,10 +115,9 @@ class BlackBox:
         found = slopes(x.detach().cpu().numpy(), u.detach().cpu().numpy())
         a, b = (torch.as_tensor(np.asarray(part, dtype=np.float64)) for part in found)
         if a.shape != (len(x), len(x)) or b.shape != (len(x), len(u)):
-            shapes = tuple(a.shape), tuple(b.shape)
             raise ValueError(
                 f"the `slopes` of `{self._call}` must have the shapes {(len(x), len(x))} and "
-                f"{(len(x), len(u))}; got {shapes[0]} and {shapes[1]}."
+                f"{(len(x), len(u))}; got {tuple(a.shape)} and {tuple(b.shape)}."
             )
         if not bool(torch.isfinite(torch.cat((a, b), dim=1)).all()):
             raise ValueError(f"the `slopes` of `{self._call}` are not finite at the state {x.tolist()}.")
@@ -143,7 +141,6 @@ class BlackBox:
         generator = torch.Generator().manual_seed(0)
         away = 0.1 * torch.randn(_PROBES, len(x) + 2 * len(u), dtype=torch.float64, generator=generator)
         states, inputs = x + away[:, : len(x)], u + away[:, len(x) : len(x) + len(u)]
-        shape = (tuple(states.shape), tuple(inputs.shape))
         try:
             with torch.no_grad():
                 both = states.repeat(2, 1), torch.cat((inputs, inputs + away[:, -len(u) :]))
@@ -152,7 +149,8 @@ class BlackBox:
             said = str(error).splitlines()[0] if str(error) else ""
             raise ValueError(
                 f"`{self._call}` raised {type(error).__name__} ({said}) at x and u of the shapes "
-                f"{shape[0]} and {shape[1]}, as torch tensors and as NumPy arrays. It must map rows to rows."
+                f"{tuple(states.shape)} and {tuple(inputs.shape)}, as torch tensors and as NumPy arrays. "
+                "It must map rows to rows."
             ) from error
         if not isinstance(after, Tensor) or after.shape != both[0].shape:
             got = tuple(after.shape) if isinstance(after, Tensor) else type(after).__name__
@@ -164,6 +162,5 @@ class BlackBox:
             raise ValueError(f"`{self._call}` returned values that are not finite near x = {x.tolist()}.")
         first, second = after.chunk(2)
         if torch.equal(first, second):
-            raise ValueError(
-                f"`{self._call}` ignores u: another input changes nothing near x = {x.tolist()}."
-            )
+            rule = "ignores u: another input changes nothing"
+            raise ValueError(f"`{self._call}` {rule} near x = {x.tolist()}.")

@@ -94,15 +94,10 @@ def _gauss_newton(motions: Callable[[Tensor], Tensor], z: Tensor) -> Tensor:
 
 
 def _rests(plant: Plant, x: Tensor, u: Tensor) -> bool:
-    moves = _motion(plant, x, u)
-    return bool((moves.abs() <= _REST * _scale(plant, x, u)).all())
-
-
-def _scale(plant: Plant, x: Tensor, u: Tensor) -> float:
-    """Largest change of the motion per unit of state or input, at least 1e-3."""
-    size, z = len(x), torch.cat((x, u))
-    slopes = central_slopes(lambda v: _motions(plant, v[:, :size], v[:, size:]), z)
-    return max(float(slopes.abs().max()), 1e-3)
+    moves, size = _motion(plant, x, u), len(x)
+    slopes = central_slopes(lambda v: _motions(plant, v[:, :size], v[:, size:]), torch.cat((x, u)))
+    largest = max(float(slopes.abs().max()), 1e-3)  # change of the motion per unit of state or input
+    return bool((moves.abs() <= _REST * largest).all())
 
 
 def _motions(plant: Plant, x: Tensor, u: Tensor) -> Tensor:

@@ -40,9 +40,8 @@ class Linear(ControlAffineSystem):
         self.dim = len(rows)
         self.register_buffer("matrix", _stack("matrix", rows, self.dim))
         self.matrix: Tensor
-        given = _rows(
-            "input_matrix", [[]] * self.dim if input_matrix is None else input_matrix, "must be (n, m)"
-        )
+        inputs = [[]] * self.dim if input_matrix is None else input_matrix
+        given = _rows("input_matrix", inputs, "must be (n, m)")
         if len(given) != self.dim:
             raise fail("Linear", "input_matrix", f"must have {self.dim} rows, one a state", input_matrix)
         self.register_buffer("input_matrix", _stack("input_matrix", given, len(given[0])))
@@ -58,8 +57,7 @@ class Linear(ControlAffineSystem):
     def flow(self, x: Tensor, time: Tensor) -> Tensor:
         propagators = exponential(time[:, None, None] * self.matrix.to(time))
         # Row by row, so that the bits of a trajectory do not depend on the batch.
-        states: Tensor = (propagators.to(x) * x[..., None, None, :]).sum(-1)
-        return states
+        return (propagators.to(x) * x[..., None, None, :]).sum(-1)
 
     def optimal_value(self, x: Tensor, state_cost: Tensor, input_cost: Tensor) -> Tensor | None:
         """x'Px with P from the Riccati equation: (..., n) -> (...)."""

@@ -92,9 +92,7 @@ class _Simulation:
 
         self.model, self.frames, self._rollout = model, frames, rollout.rollout
         self.data = [MjData(model) for _ in range(threads)]
-        self._followers: list[
-            tuple[Any, Numbers, Numbers]
-        ] = []  # a simulation a row, its inputs and warm start
+        self._followers: list[Any] = []  # for each row a simulation, its inputs and its warm start
 
     def __getstate__(self) -> dict[str, Any]:
         return {**vars(self), "_followers": []}
@@ -213,9 +211,9 @@ def _check(mujoco: ModuleType, model: Any) -> None:
 
 
 def _frames(model: Any, dt: float | None) -> int:
-    step = float(model.opt.timestep)
     if dt is None:
         return 1
+    step = float(model.opt.timestep)
     count = round(positive_real("MujocoPlant", "dt", dt) / step)
     if count < 1 or abs(count * step - dt) > 1e-9 * dt:
         raise fail("MujocoPlant", "dt", f"must be a multiple of the model's timestep of {step:g} s", dt)

@@ -40,9 +40,8 @@ class Pendulum(ControlAffineSystem):
         self, mass: float = 1.0, length: float = 1.0, damping: float = 0.1, gravity: float = 9.81
     ) -> None:
         super().__init__()
-        self.inertia = (
-            positive_real("Pendulum", "mass", mass) * positive_real("Pendulum", "length", length) ** 2
-        )
+        mass = positive_real("Pendulum", "mass", mass)
+        self.inertia = mass * positive_real("Pendulum", "length", length) ** 2
         non_negative("Pendulum", "damping", damping)
         self.damping = real("Pendulum", "damping", damping)
         self.stiffness = positive_real("Pendulum", "gravity", gravity) / length  # 1/s^2

@@ -37,12 +37,12 @@ class TwoState(ControlAffineSystem):
 
     def drift(self, x: Tensor) -> Tensor:
         x1, x2 = x.unbind(-1)
-        square = _gain(x1).square()
+        square = input_gain(x1).square()
         damping = square if self.as_printed else 1 - square
         return torch.stack((x2 - x1, -0.5 * x1 - 0.5 * x2 * damping), dim=-1)
 
     def effectiveness(self, x: Tensor) -> Tensor:
-        gain = _gain(x[..., 0])
+        gain = input_gain(x[..., 0])
         return torch.stack((torch.zeros_like(gain), gain), dim=-1).unsqueeze(-1)
 
     def optimal_value(self, x: Tensor, state_cost: Tensor, input_cost: Tensor) -> Tensor | None:
@@ -57,5 +57,6 @@ class TwoState(ControlAffineSystem):
         return f"as_printed={self.as_printed}"
 
 
-def _gain(x1: Tensor) -> Tensor:
+def input_gain(x1: Tensor) -> Tensor:
+    """h = cos 2 x1 + 2, the second entry of g, also of the plant's two successors."""
     return (2 * x1).cos() + 2

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from ..numerics.checks import vector
 from .base import ControlAffineSystem
+from .two_state import input_gain
 
 
 class TwoStateChain(ControlAffineSystem):
@@ -43,15 +44,11 @@ class TwoStateChain(ControlAffineSystem):
     def drift(self, x: Tensor) -> Tensor:
         a, b, c, d = self.theta.to(x).unbind(-1)
         x1, x2 = x.unbind(-1)
-        return torch.stack((a * x2, b * x1 + c * x2 + d * x2 * _gain(x1).square()), dim=-1)
+        return torch.stack((a * x2, b * x1 + c * x2 + d * x2 * input_gain(x1).square()), dim=-1)
 
     def effectiveness(self, x: Tensor) -> Tensor:
-        gain = _gain(x[..., 0])
+        gain = input_gain(x[..., 0])
         return torch.stack((torch.zeros_like(gain), gain), dim=-1).unsqueeze(-1)
 
     def extra_repr(self) -> str:
         return f"theta={self.theta.tolist()}"
-
-
-def _gain(x1: Tensor) -> Tensor:
-    return (2 * x1).cos() + 2

@@ -6,7 +6,8 @@ import torch
 from torch import Tensor
 
 from ..numerics.checks import copied, fail, number
-from ..systems import ControlAffineSystem
+from .base import ControlAffineSystem
+from .two_state import input_gain
 
 _TRUE = ((-1.0, -0.5), (1.0, 0.0), (0.0, -0.5))
 
@@ -81,11 +82,6 @@ def regressor(x: Tensor) -> Tensor:
 def parametric_drift(theta: Tensor, x: Tensor) -> Tensor:
     """theta's(x): (..., 3, 2), (..., 2) -> (..., 2)."""
     return (theta.to(x) * regressor(x).unsqueeze(-1)).sum(-2)
-
-
-def input_gain(x1: Tensor) -> Tensor:
-    """cos 2 x1 + 2, the second entry of g."""
-    return (2 * x1).cos() + 2
 
 
 def desired_rate(desired: Tensor) -> Tensor:

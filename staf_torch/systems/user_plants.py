@@ -163,12 +163,11 @@ def _guess(call: str, given: Guess, dim: int, inputs: int) -> tuple[Tensor, Tens
         return x, u
     pair = isinstance(given, tuple) and len(given) == 2 and isinstance(given[0], Sequence | Tensor)
     state, held = given if pair else (given, u)
-    sizes = (("equilibrium", state, dim), ("equilibrium", held, inputs))
     points = []
-    for name, value, size in sizes:
-        numbers = value.tolist() if isinstance(value, Tensor) else value
-        numbers = vector(call, name, numbers)
+    for value, size in ((state, dim), (held, inputs)):
+        numbers = vector(call, "equilibrium", value.tolist() if isinstance(value, Tensor) else value)
         if len(numbers) != size:
-            raise fail(call, name, f"must be {dim} numbers, or those and {inputs} of the input", given)
+            rule = f"must be {dim} numbers, or those and {inputs} of the input"
+            raise fail(call, "equilibrium", rule, given)
         points.append(torch.tensor(numbers, dtype=torch.float64))
     return points[0], points[1]
