@@ -78,8 +78,14 @@ class Functions(NamedTuple):
     """Functions on the balls, one a state, to approximate in a weighted uniform norm."""
 
     what: str
-    evaluate: Callable[[Tensor], tuple[Tensor, Tensor]]  # offsets (P, n) or (D, P, n) -> both (D, P)
+    values: Callable[[Tensor], Tensor]  # offsets (P, n) or (D, P, n) -> (D, P)
     tolerance: Tensor  # (D,) weighted errors to stay within
+    weight: Callable[[Tensor], Tensor] | None = None  # likewise; None for ones
+
+    def evaluate(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        """Values and weights, (D, P)."""
+        values = self.values(z)
+        return values, torch.ones_like(values) if self.weight is None else self.weight(z)
 
 
 class DomainProblem(NamedTuple):
@@ -118,49 +124,29 @@ class DomainProblem(NamedTuple):
         """x'z: (P, n) or (D, P, n) -> (D, P)."""
         return (z @ self.states.unsqueeze(-1)).squeeze(-1)
 
-    def norms(self) -> tuple[float, Tensor]:
-        """|V| and log e^{x'y}, both largest over y in N_r(x), the latter for each state: (), (D,)."""
+    def factors(self) -> tuple[Functions, Functions]:
+        """V, to eps' / (2 A), and e^{-x'y}, to eps' / (2 A |V|), with eps' + eps'^2 / (4 A |V|) = epsilon.
+
+        The latter is e^{-x'x} e^{-x'z}: both sides are divided by e^{-x'x}, which can underflow.
+        """
         # Where V is smaller than epsilon, the larger number keeps V = 0 from dividing anything.
-        size = max(float(self.values(self.offsets(4, 2)).abs().max()), self.epsilon)
+        size = max(float(self.values(self.offsets(4, 2)).abs().max()), self.epsilon)  # |V|
         norm = self.states.norm(dim=-1)
-        return size, norm * (norm + self.radius)
-
-    def split(self) -> float:
-        """eps' with eps' + eps'^2 / (4 A |V|) = epsilon."""
-        size, growth = self.norms()
-        k = math.exp(-float(growth.max())) / (4 * size)
-        return 2 * self.epsilon / (1 + math.sqrt(1 + 4 * k * self.epsilon))
-
-    def value(self) -> Functions:
-        """V, to eps' / (2 A)."""
-        _, growth = self.norms()
-        tolerance = 0.5 * self.split() * (-growth.max()).exp()
-
-        def evaluate(z: Tensor) -> tuple[Tensor, Tensor]:
-            values = self.values(z)
-            return values, torch.ones_like(values)
-
-        return Functions("V", evaluate, tolerance.expand(len(self.states)))
-
-    def exponential(self) -> Functions:
-        """e^{-x'y} = e^{-x'x} e^{-x'z}, to eps' / (2 A |V|): divided by e^{-x'x}, which can underflow."""
-        size, growth = self.norms()
-        tolerance = 0.5 * self.split() / size * (self.states.square().sum(-1) - growth.max()).exp()
-
-        def evaluate(z: Tensor) -> tuple[Tensor, Tensor]:
-            values = (-self.exponent(z)).exp()
-            return values, torch.ones_like(values)
-
-        return Functions("e^{-x'y}", evaluate, tolerance)
+        growth = (norm * (norm + self.radius)).max()  # log A
+        k = math.exp(-float(growth)) / (4 * size)
+        half = 0.5 * (2 * self.epsilon / (1 + math.sqrt(1 + 4 * k * self.epsilon)))  # eps' / 2
+        unweighted = Functions("V", self.values, (half * (-growth).exp()).expand(len(self.states)))
+        share = half / size * (self.states.square().sum(-1) - growth).exp()
+        return unweighted, Functions("e^{-x'y}", lambda z: (-self.exponent(z)).exp(), share)
 
     def product(self) -> Functions:
         """V(y) e^{-x'z} in the norm weighted by e^{x'z}, to epsilon."""
+        tolerance = self.states.new_full((len(self.states),), self.epsilon)
 
-        def evaluate(z: Tensor) -> tuple[Tensor, Tensor]:
-            growth = self.exponent(z).exp()
-            return self.values(z) / growth, growth
+        def weight(z: Tensor) -> Tensor:
+            return self.exponent(z).exp()
 
-        return Functions("V(y) e^{-x'y}", evaluate, self.states.new_full((len(self.states),), self.epsilon))
+        return Functions("V(y) e^{-x'y}", lambda z: self.values(z) / weight(z), tolerance, weight)
 
     def smallest_degree(self, functions: Functions) -> tuple[int, Tensor]:
         """The smallest degree that meets the tolerance at all states, and the coefficients (D, C)."""
@@ -295,8 +281,9 @@ def exponential_bound(
     """
     problem = _problem("exponential_bound", target, domain, radius, epsilon, max_degree)
     with torch.no_grad():
-        N, p = problem.smallest_degree(problem.value())
-        S, q = problem.smallest_degree(problem.exponential())
+        value, exponential = problem.factors()
+        N, p = problem.smallest_degree(value)
+        S, q = problem.smallest_degree(exponential)
         return ExponentialBound(N, S, problem.construct((p, q), (N, S)), problem.one_polynomial())
 
 

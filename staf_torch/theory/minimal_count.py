@@ -161,10 +161,8 @@ def layout_errors(
     grid = extent * ball_grid(dim, _SHELLS, _DIRECTIONS.get(dim, 256)).to(states)
     rows = states.reshape(-1, dim)
     with torch.no_grad():
-        errors = [
-            torch.cat(list(_errors(target, StaFBasis(kernel, StateFollowingCenters(u, extent)), rows, grid)))
-            for u in layouts
-        ]
+        bases = [StaFBasis(kernel, StateFollowingCenters(u, extent)) for u in layouts]
+        errors = [torch.cat(list(_errors(target, basis, rows, grid))) for basis in bases]
     return torch.stack(errors).reshape(len(errors), *states.shape[:-1])
 
 
@@ -272,9 +270,8 @@ def _graded_square(space: GradedSpace, z: Tensor) -> Tensor:
         high = max(order, degree)
         members = graded.weights[:, index, graded.degree == degree].to(zeta)
         scale = math.sqrt(math.factorial(degree) * math.factorial(order)) / math.factorial(high)
-        pairs.append(
-            scale * rho ** (2 * high - degree - order) * ((across[high] - reproduce @ among[high]) @ members)
-        )
+        power = rho ** (2 * high - degree - order)
+        pairs.append(scale * power * ((across[high] - reproduce @ among[high]) @ members))
         weights.append(members)
     gram = _graded_gram(graded, weights, among, rho)
     b = torch.cat(pairs, dim=-1)

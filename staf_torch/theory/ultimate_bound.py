@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import torch
 from torch import Tensor
@@ -85,11 +86,10 @@ def drift_constants(basis: StaFBasis, target: Target, states: Tensor, velocities
     factor, failed = torch.linalg.cholesky_ex(rates.gram)
     if bool((failed > 0).any()) or not bool(torch.isfinite(rates.gram).all()):
         raise fail("drift_constants", "states", "must have a positive definite K(c(x)) each", states)
-    gain, gain_rate = _gain(basis, states, velocities)
-
-    def lower(right: Tensor) -> Tensor:
-        solved: Tensor = torch.linalg.solve_triangular(factor, right, upper=False)
-        return solved
+    gain = gain_rate = states.new_zeros(states.shape[:-1])  # g(x), and its derivative along the velocity
+    if basis.kernel.log_gain(states) is not None:
+        gain, gain_rate = along(lambda x: cast(Tensor, basis.kernel.log_gain(x)), states, velocities)
+    lower = functools.partial(torch.linalg.solve_triangular, factor, upper=False)
 
     # With L L' = e^{-g} K, in orthonormal coordinates L'v: K^-1 K' is L^-1 gram' L^-T + g', and
     # w' = e^{-g} (gram^-1 (V' - gram' w~) - g' w~), w~ = e^g w = gram^-1 V.
@@ -141,13 +141,11 @@ def ultimate_bound(
     """
     positive_real("ultimate_bound", "dt", dt)
     q = _contraction("ultimate_bound", constants, law, inner_steps)
-    if constants.growth * dt > 700:
-        return UltimateBound(math.inf, math.inf)
-    left = 1 - q * math.exp(constants.growth * dt)
+    growth = constants.growth * dt
+    left = 1 - q * math.exp(growth) if growth <= 700 else 0.0
     if left <= 0:
         return UltimateBound(math.inf, math.inf)
-    growth = constants.growth * dt
-    way = constants.speed * dt * (math.expm1(growth) / growth if growth > 0 else 1.0)
+    way = _way(constants, dt)
     before, after = way / left, q * way / left
     return UltimateBound(before * before, after * after)  # inf past the largest number, where ** raises
 
@@ -205,14 +203,12 @@ def steps_for_bound(
     one = _contraction("steps_for_bound", constants, law, 1)
     if growth > 700:
         return None
-    way = constants.speed * dt * (math.expm1(growth) / growth if growth > 0 else 1.0)
+    way = _way(constants, dt)
     # The largest contraction of a whole step that will do.
     q = (1 - way / radius) * math.exp(-growth) if before else radius / (way + radius * math.exp(growth))
     if q <= 0 or one >= 1:
         return None
-    if one <= q:
-        return 1
-    return math.ceil(math.log(q) / math.log(one) - 1e-12)
+    return 1 if one <= q else math.ceil(math.log(q) / math.log(one) - 1e-12)
 
 
 def _contraction(call: str, constants: DriftConstants, law: UpdateLaw, inner_steps: int) -> float:
@@ -224,18 +220,10 @@ def _contraction(call: str, constants: DriftConstants, law: UpdateLaw, inner_ste
     return math.pow(float(rate), inner_steps / 2)
 
 
-def _gain(basis: StaFBasis, x: Tensor, velocity: Tensor) -> tuple[Tensor, Tensor]:
-    """g(x) and its derivative along the velocity: (...), (...)."""
-    zero = x.new_zeros(x.shape[:-1])
-    if basis.kernel.log_gain(x) is None:
-        return zero, zero
-
-    def gain(at: Tensor) -> Tensor:
-        log_gain = basis.kernel.log_gain(at)
-        assert log_gain is not None
-        return log_gain
-
-    return along(gain, x, velocity)
+def _way(constants: DriftConstants, dt: float) -> float:
+    """D = W (e^{G dt} - 1) / G."""
+    growth = constants.growth * dt
+    return constants.speed * dt * (math.expm1(growth) / growth if growth > 0 else 1.0)
 
 
 class PaperStep(NamedTuple):
@@ -318,9 +306,8 @@ def paper_step(
         gradient: Tensor = torch.func.grad(error)(centers.expand(*a.shape, -1)).flatten(-2).norm(dim=-1)
         return gradient
 
-    delta = float(
-        SteepestDescent().contraction(condition_number(basis.gram_structure(states).scaled()).max())
-    )
+    kappa = condition_number(basis.gram_structure(states).scaled()).max()
+    delta = float(SteepestDescent().contraction(kappa))
     speed = float(moving.flatten(-2).norm(dim=-1).max())
     largest, ideal = float(_ascend(slope, weights, radius)), float(slope(weights).max())
     dt = excess * (1 - delta) / (2 * speed * max(largest, ideal)) if speed > 0 else torch.inf
