@@ -18,7 +18,7 @@ from ..lanes.call import ordinary
 from ..lanes.compiled_methods import worth
 from ..lanes.shared_programs import SharedPrograms, number
 from ..optim.base import UpdateLaw
-from ..optim.objective import NativeError, Objective, Precomputed, ScaledError
+from ..optim.objective import NativeError, Objective, Precomputed
 from .certificate import Certificate, certify, first_link
 from .problem import Problem
 from .quantities import Known, Numbers, know, numbers, precompute, unless
@@ -194,5 +194,5 @@ def _usable(structure: GramStructure, gram: Tensor, values: Tensor) -> Tensor:
 
 def _objective(structure: GramStructure, gram: Tensor, values: Tensor, found: Precomputed) -> Objective:
     if structure.core.dim() == 2 and values.shape[-1] > _UNROLLED:
-        return ScaledError(_symmetric(structure.core), structure.scale, values, gram, found)
+        return NativeError(gram, values, found, _symmetric(structure.core), structure.scale)
     return NativeError(gram, values, found)

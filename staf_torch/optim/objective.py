@@ -60,16 +60,24 @@ class Precomputed(NamedTuple):
 class NativeError(NamedTuple):
     """F(a, c) = ||V - sum_i a_i k(., c_i)||^2 = ||V||^2 - 2 V(c)'a + a'K a, up to ||V||^2.
 
+    Where K = S K0 S with one K0 for all rows, products may go through the factors: rows of many centers then
+    share M^2 numbers, in place of M^2 numbers each.
+
     Source: Rosenfeld et al., section 6.
     """
 
     gram: Tensor  # K, (..., M, M)
     values: Tensor  # V(c), (..., M)
     precomputed: Precomputed = Precomputed()
+    core: Tensor | None = None  # K0, (M, M); None for products with K itself
+    scale: Tensor | None = None  # S, (..., M); None for ones
 
     def curvature(self, direction: Tensor) -> Tensor:
         """K v: (..., M) -> (..., M). Row by row, so that a row's bits do not depend on the batch."""
-        return (self.gram * direction.unsqueeze(-2)).sum(-1)
+        matrix = self.gram if self.core is None else self.core
+        if self.scale is None:
+            return (matrix * direction.unsqueeze(-2)).sum(-1)
+        return self.scale * (matrix * (self.scale * direction).unsqueeze(-2)).sum(-1)
 
     def descent(self, weights: Tensor) -> Tensor:
         """g = 2 V(c) - 2 K a: (..., M) -> (..., M)."""
@@ -110,48 +118,6 @@ class NativeError(NamedTuple):
                 "fields `row` and `sampled`; got None."
             )
         return row, sampled
-
-
-class ScaledError(NamedTuple):
-    """`NativeError` of K = S K0 S with one K0 for all rows: products go through the factors.
-
-    For many centers: the rows then share M^2 numbers, in place of M^2 numbers each.
-    """
-
-    core: Tensor  # K0, (M, M)
-    scale: Tensor | None  # S, (..., M); None for ones
-    values: Tensor  # V(c), (..., M)
-    gram: Tensor  # K, (..., M, M), for those who ask
-    precomputed: Precomputed = Precomputed()
-
-    def curvature(self, direction: Tensor) -> Tensor:
-        """K v: (..., M) -> (..., M)."""
-        if self.scale is None:
-            return (self.core * direction.unsqueeze(-2)).sum(-1)
-        return self.scale * (self.core * (self.scale * direction).unsqueeze(-2)).sum(-1)
-
-    def descent(self, weights: Tensor) -> Tensor:
-        """g = 2 V(c) - 2 K a: (..., M) -> (..., M)."""
-        return 2 * (self.values - self.curvature(weights))
-
-    def spectrum(self) -> tuple[Tensor, Tensor]:
-        """The smallest and the largest eigenvalue of K: (...), (...)."""
-        return self._plain().spectrum()
-
-    def solve(self, values: Tensor) -> Tensor:
-        """K^-1 v: (..., M) -> (..., M)."""
-        return self._plain().solve(values)
-
-    def minimiser(self) -> Tensor:
-        """K^-1 V: (..., M)."""
-        return self._plain().minimiser()
-
-    def sample(self) -> tuple[Tensor, Tensor]:
-        """k(x, c_i) and V(x) at the state."""
-        return self._plain().sample()
-
-    def _plain(self) -> NativeError:
-        return NativeError(self.gram, self.values, self.precomputed)
 
 
 def extremes(gram: Tensor) -> Tensor:

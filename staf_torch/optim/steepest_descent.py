@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from ..lanes import repeat
-from .base import LawState, UpdateLaw
+from .base import LawState, UpdateLaw, line_search
 from .objective import Objective
 
 
@@ -30,11 +30,7 @@ class SteepestDescent(UpdateLaw):
 
     def step(self, objective: Objective, weights: Tensor, state: LawState) -> tuple[Tensor, LawState]:
         g = objective.descent(weights)
-        slope = torch.linalg.vecdot(g, g)
-        curvature = torch.linalg.vecdot(g, objective.curvature(g))
-        usable = curvature > 0
-        length = torch.where(usable, slope / (2 * torch.where(usable, curvature, 1.0)), 0.0)
-        return weights + length.unsqueeze(-1) * g, state
+        return weights + line_search(objective, g, g) * g, state
 
     def iterate(
         self, objective: Objective, weights: Tensor, state: LawState, count: int
