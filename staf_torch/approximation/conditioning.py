@@ -41,10 +41,8 @@ def cardinal_functions(basis: StaFBasis, x: Tensor, z: Tensor) -> Tensor:
     """l_i(z) with V^(x + z) = sum_i l_i(z) V(c_i): (..., n), (..., P, n) -> (..., P, M)."""
     space = basis.local(x)
     identity = torch.eye(basis.count, dtype=x.dtype, device=x.device)
-    columns = [
-        space.evaluate(z, space.fit(row.expand(*x.shape[:-1], basis.count))) for row in identity.unbind(0)
-    ]
-    return torch.stack(columns, dim=-1)
+    fits = [space.fit(row.expand(*x.shape[:-1], basis.count)) for row in identity.unbind(0)]
+    return torch.stack([space.evaluate(z, fit) for fit in fits], dim=-1)
 
 
 def lebesgue_constant(basis: StaFBasis, x: Tensor, points: int = 500) -> Tensor:
@@ -56,8 +54,7 @@ def lebesgue_constant(basis: StaFBasis, x: Tensor, points: int = 500) -> Tensor:
         ValueError: if ``points`` is not an integer of at least 2.
     """
     z = _ball(basis, x, integer("lebesgue_constant", "points", points, least=2))
-    constant: Tensor = cardinal_functions(basis, x, z).abs().sum(-1).amax(-1)
-    return constant
+    return cardinal_functions(basis, x, z).abs().sum(-1).amax(-1)
 
 
 def sup_error(basis: StaFBasis, x: Tensor, target: Target, points: int = 500) -> Tensor:
@@ -71,8 +68,7 @@ def sup_error(basis: StaFBasis, x: Tensor, target: Target, points: int = 500) ->
     z = _ball(basis, x, integer("sup_error", "points", points, least=2))
     space = basis.local(x)
     estimate = space.evaluate(z, space.fit(basis.values(x, target)))
-    error: Tensor = (target(x.unsqueeze(-2) + z) - estimate).abs().amax(-1)
-    return error
+    return (target(x.unsqueeze(-2) + z) - estimate).abs().amax(-1)
 
 
 def _ball(basis: StaFBasis, x: Tensor, points: int) -> Tensor:

@@ -279,16 +279,14 @@ class StaF(nn.Module):
 
     def _weights(self, leading: int = 0) -> Tensor:
         """w, outputs first: NaN in a row where it cannot be represented."""
-        weights: Tensor = self.basis.local(self.state).weights(self._outputs_first(leading))
-        return weights
+        return self.basis.local(self.state).weights(self._outputs_first(leading))
 
     def _outputs_first(self, leading: int) -> Tensor:
         """The coefficients as (k, ..., M) with at least ``leading`` dimensions between, or as they are."""
         if self.out_features is None:
             return self.coefficients
         missing = max(0, leading - len(self.batch_shape))
-        first: Tensor = self.coefficients.movedim(-2, 0)[(slice(None), *[None] * missing)]
-        return first
+        return self.coefficients.movedim(-2, 0)[(slice(None), *[None] * missing)]
 
     def _outputs_last(self, values: Tensor) -> Tensor:
         return values if self.out_features is None else values.movedim(0, -1)

@@ -115,23 +115,11 @@ def _access(env: Any, named: object) -> tuple[Read, Write]:
     """Return the functions that read and write the state of an environment of MuJoCo or classic control."""
     if hasattr(env, "set_state") and hasattr(env, "data"):
         size = len(env.data.qpos)
-
-        def read_mujoco(env: Any) -> Numbers:
-            return np.concatenate((env.data.qpos, env.data.qvel))
-
-        def write_mujoco(env: Any, x: Numbers) -> None:
-            env.set_state(x[:size], x[size:])
-
-        return read_mujoco, write_mujoco
+        return (
+            lambda env: np.concatenate((env.data.qpos, env.data.qvel)),
+            lambda env, x: env.set_state(x[:size], x[size:]),
+        )
     if hasattr(env, "state"):
-
-        def read_state(env: Any) -> Numbers:
-            return np.array(env.state)
-
-        def write_state(env: Any, x: Numbers) -> None:
-            env.state = np.array(x)
-
-        return read_state, write_state
-    raise fail(
-        "EnvironmentPlant", "read", "and write must be given: how to set the state is not known", named
-    )
+        return lambda env: np.array(env.state), lambda env, x: setattr(env, "state", np.array(x))
+    rule = "and write must be given: how to set the state is not known"
+    raise fail("EnvironmentPlant", "read", rule, named)

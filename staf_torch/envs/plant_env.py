@@ -102,8 +102,7 @@ class PlantEnv(gymnasium.Env):
         return self._observation(), float(reward), bool(terminated), bool(truncated), {}
 
     def _observation(self) -> Numbers:
-        seen: Numbers = self.episodes.state[0].numpy().copy()
-        return seen
+        return self.episodes.state[0].numpy().copy()
 
 
 class PlantVectorEnv(VectorEnv):
@@ -202,9 +201,8 @@ class PlantVectorEnv(VectorEnv):
         # A row draws from its own generator, and only when it begins: no row depends on another.
         dim = self.episodes.state.shape[1]
         chosen = rows.nonzero().flatten().tolist()
-        stated = options is not None and options.get("state") is not None
         x0 = self.episodes.state.clone()
-        if stated:
+        if options is not None and options.get("state") is not None:
             x0 = start(options, self._generators, self.spread, dim)
         elif chosen:
             x0[rows] = start(None, [self._generators[row] for row in chosen], self.spread, dim)
@@ -212,8 +210,7 @@ class PlantVectorEnv(VectorEnv):
         self._over = self._over & ~rows
 
     def _observation(self) -> Numbers:
-        seen: Numbers = self.episodes.state.numpy().copy()
-        return seen
+        return self.episodes.state.numpy().copy()
 
 
 PLANTS = {f"staf_torch/{name}-v0": name for name in NAMES}

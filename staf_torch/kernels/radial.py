@@ -53,8 +53,7 @@ class RadialKernel(Kernel):
         slope = self.slope(squared_distance(x1, x2) / scale)
         if slope is None:
             return None
-        total: Tensor = weighted_differences(slope * b.unsqueeze(-2), x2, x1) * (-2 / scale)
-        return total
+        return weighted_differences(slope * b.unsqueeze(-2), x2, x1) * (-2 / scale)
 
     def core_gradient(self, x: Tensor, z: Tensor, d: Tensor, b: Tensor) -> Tensor | None:
         return self.gradient(z, d, b)

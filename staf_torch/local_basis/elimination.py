@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -112,7 +113,8 @@ def functionals_of(points: Tensor, degrees: Degrees) -> Elimination:
         points: u, (..., M, n), as many as the degrees were found for.
         degrees: which monomials.
     """
-    q, r = torch.linalg.qr(_chosen(points, degrees))
+    chosen = [row for block in degrees.monomials for row in block]
+    q, r = torch.linalg.qr(_monomials(points, chosen))
     diagonal = r.diagonal(dim1=-2, dim2=-1)
     q = torch.where(diagonal.unsqueeze(-2) < 0, -q, q)
     strengths, start = [], 0
@@ -122,19 +124,6 @@ def functionals_of(points: Tensor, degrees: Degrees) -> Elimination:
         strengths.append(block.norm(dim=-1) if size > 1 else block.abs().squeeze(-1))
         start += size
     return Elimination(q, torch.cat(strengths, dim=-1), degrees.each())
-
-
-def _chosen(points: Tensor, degrees: Degrees) -> Tensor:
-    """u_i^alpha sqrt(k! / alpha!) for the chosen alpha, by ascending degree: (..., M, n) -> (..., M, M)."""
-    alpha = [row for block in degrees.monomials for row in block]
-    norm = [
-        math.sqrt(math.factorial(sum(row)) / math.prod([math.factorial(a) for a in row])) for row in alpha
-    ]
-    table = _powers(points, len(degrees.monomials) - 1)
-    monomials = torch.tensor(norm, dtype=points.dtype, device=points.device)
-    for axis in range(points.shape[-1]):
-        monomials = monomials * table[..., axis, [row[axis] for row in alpha]]
-    return monomials
 
 
 def _independent(matrix: Tensor, count: int) -> tuple[int, ...]:
@@ -152,12 +141,17 @@ def _independent(matrix: Tensor, count: int) -> tuple[int, ...]:
 
 def homogeneous(directions: Tensor, degree: int) -> Tensor:
     """u_i^alpha sqrt(k! / alpha!) for all |alpha| = k, so that rows have the norm |u_i|^k: (..., M, C)."""
-    alpha = exponents(directions.shape[-1], degree)
-    norm = [math.sqrt(math.factorial(degree) / math.prod(map(math.factorial, row))) for row in alpha.tolist()]
-    table = _powers(directions, degree)
-    monomials = torch.tensor(norm, dtype=directions.dtype, device=directions.device)
-    for axis, exponent in enumerate(alpha.unbind(-1)):
-        monomials = monomials * table[..., axis, exponent.to(directions.device)]
+    return _monomials(directions, exponents(directions.shape[-1], degree).tolist())
+
+
+def _monomials(points: Tensor, alpha: Sequence[Sequence[int]]) -> Tensor:
+    """u_i^alpha sqrt(k! / alpha!), k = |alpha|: (..., M, n) -> (..., M, C)."""
+    factorials = [math.prod([math.factorial(a) for a in row]) for row in alpha]
+    norm = [math.sqrt(math.factorial(sum(row)) / alike) for row, alike in zip(alpha, factorials, strict=True)]
+    table = _powers(points, max([sum(row) for row in alpha]))
+    monomials = torch.tensor(norm, dtype=points.dtype, device=points.device)
+    for axis in range(points.shape[-1]):
+        monomials = monomials * table[..., axis, [row[axis] for row in alpha]]
     return monomials
 
 

@@ -138,14 +138,12 @@ class Interpolation(NamedTuple):
                 columns if columns.dim() == 2 else columns.squeeze(-3)
             )  # a row's own, for all its states
             terms: Tensor = (vector @ columns).unflatten(-1, self.inverse.shape[-3:-1])
-            total: Tensor = (terms * self.chebyshev.unsqueeze(-1)).sum(-2)
-            return total
+            return (terms * self.chebyshev.unsqueeze(-1)).sum(-2)
         if self.inverse.dim() == 2:
             return vector @ self.inverse.mT
         if self.inverse.dim() == vector.dim() + 1 and self.inverse.shape[-3] == 1:
             return vector @ self.inverse.squeeze(-3).mT  # a row's own, for all its states
-        product: Tensor = (self.inverse @ vector.unsqueeze(-1)).squeeze(-1)
-        return product
+        return (self.inverse @ vector.unsqueeze(-1)).squeeze(-1)
 
 
 def _chebyshev(at: Tensor) -> Tensor:
@@ -262,13 +260,11 @@ class GradedSpace(NamedTuple):
         """sum_j (q_ij / sigma_j) beta_j, apart for each degree: (..., M) -> K of (..., 1, M)."""
         count = len(self.basis.degrees)
         together = rows_last(self.spread.to(coefficients), coefficients)
-        apart: tuple[Tensor, ...] = together.unsqueeze(-2).chunk(count, -1)
-        return apart
+        return together.unsqueeze(-2).chunk(count, -1)
 
     def _unscale(self) -> Tensor:
         """k_j! r^(-2 k_j): (..., M)."""
-        factor: Tensor = self.basis.factorial.to(self.nu) * self._r2().unsqueeze(-1) ** -self.basis.degree
-        return factor
+        return self.basis.factorial.to(self.nu) * self._r2().unsqueeze(-1) ** -self.basis.degree
 
 
 def over_points(value: Tensor) -> Tensor:

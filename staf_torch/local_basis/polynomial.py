@@ -128,8 +128,7 @@ class PolynomialSpace(NamedTuple):
         p, like = self.kernel.degree, self.radius
         degree = torch.tensor(self.degrees, dtype=torch.int64, device=like.device)
         binomial = torch.tensor([math.comb(p, k) for k in self.degrees], dtype=like.dtype, device=like.device)
-        unscale: Tensor = self.radius.square().unsqueeze(-1) ** -degree / binomial
-        return unscale
+        return self.radius.square().unsqueeze(-1) ** -degree / binomial
 
 
 def polynomial_space(
@@ -176,11 +175,9 @@ def _root(kernel: PolynomialKernel, x: Tensor, z: Tensor) -> Tensor:
     s = _square(kernel, x)
     ratio = (kernel.bias.to(x) / s).sqrt()
     along = (z * x.unsqueeze(-2)).sum(-1) / (s * (1 + ratio)).unsqueeze(-1)
-    root: Tensor = (z - along.unsqueeze(-1) * x.unsqueeze(-2)) / s.sqrt()[..., None, None]
-    return root
+    return (z - along.unsqueeze(-1) * x.unsqueeze(-2)) / s.sqrt()[..., None, None]
 
 
 def _apply(matrix: Tensor, vector: Tensor) -> Tensor:
     """(..., P, M), (..., M) -> (..., P)."""
-    product: Tensor = (matrix @ vector.unsqueeze(-1)).squeeze(-1)
-    return product
+    return (matrix @ vector.unsqueeze(-1)).squeeze(-1)

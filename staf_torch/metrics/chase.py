@@ -90,9 +90,7 @@ class ChaseMetrics:
         self._own = tuple(own)
         self._errors = StateErrorPass(basis, target) if errors is None else errors
         self._rows = _RowRecord(0)
-        self._kept: _RowRecord | None = (
-            None  # of all rows, those before the ones that are taken in now filled in
-        )
+        self._kept: _RowRecord | None = None  # of all rows, the ones before those taken in now filled in
 
     def next_rows(self) -> None:
         """Say that the next pieces begin at time 0 again, with further rows of the batch."""
@@ -121,6 +119,7 @@ class ChaseMetrics:
         x, excess, before = result.state[:, at], result.excess[:, at], result.excess_before[:, at]
         value = result.value[:, at]
         errors = self._errors(x, result.coefficients[:, at], result.ideal_weights[:, at])
+        chased = Chased(self._basis, self._target, self._law)
         rows.keep_worst(
             settled,
             ultimate_error=(value - result.estimate[:, at]).abs(),
@@ -133,7 +132,7 @@ class ChaseMetrics:
             rounding_floor=torch.finfo(value.dtype).eps * value.abs(),
             gradient_error=errors.gradient_error,
             condition_number=errors.condition_number,
-            **{metric.name: self._badness(metric, result)[:, at] for metric in self._own},
+            **{metric.name: metric.badness(result, chased)[:, at] for metric in self._own},
         )
         rate = self._law.contraction(errors.condition_number)
         if rate is None:
@@ -156,9 +155,6 @@ class ChaseMetrics:
             summaries.append(self._summary(member, slice(start, start + member.rows), found))
             start += member.rows
         return summaries
-
-    def _badness(self, metric: Metric, result: ChaseResult) -> Tensor:
-        return metric.badness(result, Chased(self._basis, self._target, self._law))
 
     def _firsts(self, start: int, batch: int) -> Tensor:
         """The index of the first settled time of each of the rows from ``start`` on: (B,)."""
@@ -185,18 +181,15 @@ class ChaseMetrics:
         for metric in self._own:
             worst = metrics[metric.name]
             metrics[metric.name] = None if worst is None else metric.from_badness(worst)
-        metrics["settling_time"] = None
-        if any_time:
-            last = 0.0 if member.first <= 0 else _largest(found.last_above, rows, kept)
-            metrics["settling_time"] = last * member.dt
+        last = 0.0
+        if any_time and member.first > 0 and found.last_above is not None:
+            last = float(found.last_above[rows][kept].max())
+        metrics["settling_time"] = last * member.dt if any_time else None
         metrics["contraction_violations"] = _count(found.violations, rows, kept) if any_time else None
         if found.uncertified is not None and found.time > member.first:
             metrics["certificate_violations"] = _count(found.uncertified, rows, kept)
         metrics["diverged_fraction"] = float(found.diverged[rows].double().mean())
-        return {
-            name: number if number is not None and math.isfinite(number) else None
-            for name, number in metrics.items()
-        }
+        return {k: v if v is not None and math.isfinite(v) else None for k, v in metrics.items()}
 
 
 class _RowRecord:
@@ -256,10 +249,6 @@ def _more(count: Tensor | None, happened: Tensor) -> Tensor:
 
 def _count(violations: Tensor | None, rows: slice, kept: Tensor) -> float | None:
     return None if violations is None or not bool(kept.any()) else float(violations[rows][kept].sum())
-
-
-def _largest(numbers: Tensor | None, rows: slice, kept: Tensor) -> float:
-    return 0.0 if numbers is None else float(numbers[rows][kept].max())
 
 
 _WORST = (

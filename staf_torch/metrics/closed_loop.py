@@ -61,16 +61,11 @@ def adp_metrics(
     return {k: v if v is not None and math.isfinite(v) else None for k, v in metrics.items()}
 
 
-def _settled(errors: Tensor) -> Tensor:
-    """The second half of the recorded times, without the last, at which no control starts."""
-    return errors[:, errors.shape[1] // 2 : -1]
-
-
 def _worst_known(errors: Tensor | None, kept: Tensor) -> float | None:
     """The largest settled error of the rows ``kept``, of those that were computed (not NaN)."""
     if errors is None:
         return None
-    settled = _settled(errors)[kept]
+    settled = errors[:, errors.shape[1] // 2 : -1][kept]  # not the last time, at which no control starts
     return _worst(settled[~settled.isnan()])
 
 

@@ -105,8 +105,7 @@ def slopes_of_minimum(hessian: Tensor, cross: Tensor, free: Tensor) -> Tensor:
     share = free.to(hessian)
     masked = hessian * share.unsqueeze(-1) * share.unsqueeze(-2) + torch.diag_embed(1 - share)
     inverse = 1 / masked if masked.shape[-1] == 1 else torch.linalg.inv(masked)
-    turn: Tensor = -(inverse.unsqueeze(-1) * (share.unsqueeze(-1) * cross).unsqueeze(-3)).sum(-2)
-    return turn
+    return -(inverse.unsqueeze(-1) * (share.unsqueeze(-1) * cross).unsqueeze(-3)).sum(-2)
 
 
 def _clip(u: Tensor, low: Tensor, high: Tensor) -> Tensor:

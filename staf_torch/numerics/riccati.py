@@ -16,9 +16,7 @@ class RiccatiStep(NamedTuple):
 
     gradient: Tensor  # g, (B, n)
     curvature: Tensor  # H, (B, n, n)
-    promised: (
-        Tensor  # the value at x = 0, without that after the step: at most 0 where k is the minimum, (B,)
-    )
+    promised: Tensor  # value at x = 0 without that after the step: at most 0 where k is the minimum, (B,)
     change: Tensor  # k, (B, m)
     feedback: Tensor  # K, (B, m, n)
 
@@ -59,5 +57,4 @@ def riccati_step(
 
 def product(a: Tensor, b: Tensor) -> Tensor:
     """(..., i, j), (..., j, k) -> (..., i, k), entry by entry."""
-    total: Tensor = (a.unsqueeze(-1) * b.unsqueeze(-3)).sum(-2)
-    return total
+    return (a.unsqueeze(-1) * b.unsqueeze(-3)).sum(-2)
