@@ -17,7 +17,6 @@ import torch
 from torch import Tensor
 
 from ...lanes import Program, repeat, scan, traced_as
-from ...lanes.loops import tracing_now
 from ...numerics.box import minimum_and_slopes
 from ...numerics.checks import fail, integer, positive_real, trailing
 from ...numerics.riccati import riccati_step
@@ -241,18 +240,22 @@ class BoxDDP:
         around = reference.state, control, torch.zeros_like(control), reference.feedback
         plan = self._followed(x0, around, x0.new_ones(len(x0), 1), terminal)
         going, ones = torch.isfinite(plan.cost).to(x0), torch.ones_like(plan.cost)
-        found = SearchState(*plan, FIRST * ones, ones.clone(), going)
-        if tracing_now():  # a program of one row has no rows to leave out
-            return self._models(
-                repeat(
-                    self.iterations,
-                    lambda now: self._iterated(now, self._derivatives(now), terminal),
-                    found,
-                    where=lambda now: now.going > 0,
-                ),
-                terminal,
-            )
-        rows = going.nonzero().squeeze(1)
+        begun = SearchState(*plan, FIRST * ones, ones.clone(), going)
+        return self._models(self._searched(begun, terminal), terminal)
+
+    def _searched_alone(self, begun: SearchState, terminal: LocalModel) -> SearchState:
+        """`_searched` of a program: a single row has no rows to leave out."""
+
+        def iterated(now: SearchState) -> SearchState:
+            return self._iterated(now, self._derivatives(now), terminal)
+
+        found: SearchState = repeat(self.iterations, iterated, begun, where=lambda now: now.going > 0)
+        return found
+
+    @traced_as(_searched_alone)
+    def _searched(self, found: SearchState, terminal: LocalModel) -> SearchState:
+        """The state of the search after all iterations, of each the rows that go on."""
+        rows = found.going.nonzero().squeeze(1)
         now, ends, known = rows_of(found, rows), rows_of(terminal, rows), None
         for _ in range(self.iterations):
             if not len(rows):
@@ -268,7 +271,7 @@ class BoxDDP:
             if bool(fresh.any()):  # saves work: rows that did not move keep their derivatives
                 for old, fresher in zip(known, self._derivatives(rows_of(now, fresh)), strict=True):
                     old[fresh] = fresher
-        return self._models(found, terminal)
+        return found
 
     def _iterated(self, now: SearchState, known: Derivatives, terminal: LocalModel) -> SearchState:
         """Take one iteration: a backward pass, the best length of its change, the row's regularisation."""
