@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
 import numpy as np
 import pytest
 from figures.drawing import (
@@ -27,43 +30,134 @@ from staf_torch.figures.style import positive
 pytestmark = pytest.mark.usefixtures("not_laid_out")
 
 
-@pytest.mark.parametrize("count", [2, 7])
-def test_the_panels_of_a_chase_hold_its_history(count: int) -> None:
+class Drawn(NamedTuple):
+    """A figure, and what it must show."""
+
+    figure: Figure
+    curves: list[tuple[Any, Any]]  # times and values: (T,), or (T, k) for a curve a column
+    panels: list[str]  # names of their vertical axes
+    names: list[str]  # of curves, in their order
+
+
+def of_a_chase(count: int) -> Drawn:
     parts = [wave(9, 2), wave(9), wave(9) + 0.1 * T, wave(9) + 0.01 * T, wave(9, count), wave(9, count) + 1]
-    excess = wave(9)
-    excess[3] = 0.0
-    history = chase.ChaseHistory(T, *parts, excess)
-    state, value, weights, error = visible(chase.draw_chase(history))
-    inside = {"xlim": span(T)}
-    holds(
-        state, [(f"$x_{{{i + 1}}}$", T, history.state[:, i]) for i in range(2)], ("", "state $x$"), **inside
+    excess = np.where(np.arange(9) == 3, 0.0, wave(9))
+    errors = [0.1 * T, 0.01 * T, positive(excess)]  # on a logarithmic axis
+    names = ["$x_{1}$", "$x_{2}$", "$V(x)$", r"$\hat V(x)$", *(f"$a_{{{i + 1}}}$" for i in range(count))]
+    names += ["ideal", r"$|V - \hat V|$", "ideal weights (floor)", "excess $F(a) - F(w)$"]
+    figure = chase.draw_chase(chase.ChaseHistory(T, *parts, excess))
+    shown = [(T, values) for values in (*parts[:3], *parts[4:], *errors)]
+    return Drawn(figure, shown, ["state $x$", "value", "weights", "error at $x$; excess"], names)
+
+
+def of_a_memory(dim: int) -> Drawn:
+    errors, excess = {"kept": wave(9), "fresh": wave(9) + 1}, {"zero": wave(4), "stored": wave(4) + 1}
+    picture = chase.MemoryPicture(wave(9, dim), wave(5, dim) + 1, wave(5), T, errors, excess, 0.3)
+    figure = chase.draw_memory(picture)
+    np.testing.assert_allclose(figure.axes[0].collections[0].get_offsets()[:, 0], picture.stored[:, 0])
+    shown = [(part[:, 0], part[:, min(dim, 2) - 1]) for part in (picture.path, picture.stored)]
+    shown += [(T, values) for values in errors.values()]
+    shown += [(np.arange(1, 5), values) for values in excess.values()] + [([0, 1], np.array([0.3, 0.3]))]
+    panels = [f"$x_{min(dim, 2)}$", r"$\max\,|V - \hat V|$ on the ball", "largest excess $F(a) - F(w)$"]
+    names = ["path", "stored model", "ball of its centers", *errors, *excess, "settled chase"]
+    return Drawn(figure, shown, panels, names)
+
+
+def of_a_loop(weights: int, shooting: bool) -> Drawn:
+    known = np.where(np.arange(9) % 2, wave(9), np.nan) if shooting else np.linspace(1, 2, 9)
+    parts = [wave(9, 2), wave(9, 1), wave(9, weights), wave(9, weights) + 1, wave(9)]
+    figure = closed_loop.draw_adp(
+        closed_loop.AdpHistory(T, *parts, known, known + 1, 0.7 if shooting else None)
     )
-    holds(
-        value, [("$V(x)$", T, history.value), (r"$\hat V(x)$", T, history.estimate)], ("", "value"), **inside
+    at = np.isfinite(known)
+    shown = [(T, parts[0]), *((T, part) for part in (parts[2:4] if weights else parts[1:2])), (T, parts[4])]
+    shown += [(T[at], known[at]), (T[at], known[at] + 1)] + [([0, 1], np.array([0.7, 0.7]))] * shooting
+    middle = [r"actor $\hat W_a$", r"critic $\hat W_c$"] if weights else ["control $u$"]
+    names = [rf"$\hat W_{{{kind},{i + 1}}}$" for kind in "ac" for i in range(weights)] or ["$u_{1}$"]
+    names = ["$x_{1}$", "$x_{2}$", *names, "so far", *(["optimal, $V^*(x(0))$"] if shooting else [])]
+    return Drawn(figure, shown, ["state $x$", *middle, "$|u - u^*|$", r"$|V^* - \hat V|$", "cost"], names)
+
+
+def of_a_tracked_path() -> Drawn:
+    errors = {"identified": wave(9), "exact": wave(9) + 1}
+    parts = wave(9, 4), errors, wave(9, 6), wave(6), wave(9, 3)
+    figure = closed_loop.draw_tracking(closed_loop.TrackingHistory(T, *parts))
+    error, desired = parts[0][:, :2], parts[0][:, 2:]
+    shown = [(T, part) for part in (error + desired, desired, *errors.values(), parts[2], parts[4])]
+    shown += [([0, 1], np.array([parts[3], parts[3]]))]
+    names = ["$x_1$", "$x_2$", "desired", *errors, r"$\hat\theta$, one colour an entry", r"$\theta$"]
+    names += [rf"$\hat W_{{c,{i + 1}}}$" for i in range(3)]
+    panels = ["state", "$|x - x_d|$", "drift parameters", r"critic $\hat W_c$"]
+    return Drawn(figure, shown, panels, names)
+
+
+def of_a_box() -> Drawn:
+    paths, margins, costs = (
+        {name: wave(9, *size) + k for k, name in enumerate("ab")} for size in ((3,), (), ())
     )
-    pairs = [
-        ((f"$a_{{{i + 1}}}$", T, history.weights[:, i]), (None, T, history.ideal_weights[:, i]))
-        for i in range(count)
-    ]
-    holds(
-        weights,
-        [*(curve for pair in pairs for curve in pair), ("ideal", *EMPTY)],
-        ("time (s)", "weights"),
-        **inside,
+    walls = np.array([-1.0, -np.inf, 0.0]), np.array([np.inf, 4.0, 0.0])
+    figure = closed_loop.draw_box(closed_loop.BoxHistory(T, paths, margins, costs, wave(9, 3), *walls))
+    shown = [(path[:, 0], path[:, 1]) for path in paths.values()]
+    shown += [(T, values) for values in (*margins.values(), *costs.values(), wave(9, 3))]
+    shown += [([-1, -1], np.array([0, 1])), ([0, 1], np.array([4, 4]))]  # the walls that there are
+    panels = ["$x_2$", "distance to the nearest wall", "barrier coordinates", "cost of $s$ so far"]
+    return Drawn(figure, shown, panels, ["a", "b", *(f"$s_{{{i + 1}}}$" for i in range(3)), "a", "b"])
+
+
+def of_faults() -> Drawn:
+    cases = {
+        name: closed_loop.FaultPicture(
+            T, {"a": wave(9) + k, "b": wave(9) + 2}, wave(9, 2), wave(9, 2) + k, np.arange(9) > 3
+        )
+        for k, name in enumerate(("loss", "gain"))
+    }
+    figure = closed_loop.draw_faults(cases)
+    assert [axes.get_title(loc="left") for axes in figure.axes[:2]] == ["(a) loss", "(b) gain"]
+    each = [(*case.norms.values(), case.parameters, case.truth) for case in cases.values()]
+    panels = ["$|x|$", "", r"$\hat\theta$ and $\theta$ (dotted)", ""]
+    return Drawn(figure, [(T, values) for case in each for values in case], panels, ["a", "b"] * 2)
+
+
+def of_gain_sets() -> Drawn:
+    theta, followed, error, parameter = (
+        {name: wave(*shape) + k for k, name in enumerate(("integral", "derivative"))}
+        for shape in ((9, 3), (9,), (4,), (5,))
     )
-    assert legend(weights) == [*([f"$a_{{{i + 1}}}$" for i in range(count)] if count < 7 else []), "ideal"]
-    drawn = np.where(excess > 0, excess, np.nan)
-    holds(
-        error,
-        [
-            (r"$|V - \hat V|$", T, 0.1 * T),
-            ("ideal weights (floor)", T, 0.01 * T),
-            ("excess $F(a) - F(w)$", T, drawn),
-        ],
-        ("time (s)", "error at $x$; excess"),
-        scales=LINEAR_LOG,
-        **inside,
-    )
+    sets = closed_loop.GainSets(T, theta["integral"], wave(3), error, parameter, followed)
+    shown = [(T, theta["integral"]), ([0, 1], np.array([wave(3), wave(3)]))]
+    shown += [(T, values) for values in followed.values()]
+    for values in (*error.values(), *parameter.values()):  # sorted, as a share of the sets
+        shown.append((np.sort(values), np.arange(1, len(values) + 1) / len(values)))
+    panels = [r"$\hat\theta$ (integral), $\theta$ dotted", "$|x - x_d|$", *["share of gain sets"] * 2]
+    return Drawn(closed_loop.draw_gain_sets(sets), shown, panels, ["integral", "derivative"] * 3)
+
+
+FIGURES: dict[str, Callable[[], Drawn]] = {
+    "a chase": lambda: of_a_chase(2),
+    "a chase of many centers": lambda: of_a_chase(7),
+    "a memory on a line": lambda: of_a_memory(1),
+    "a memory in space": lambda: of_a_memory(3),
+    "a loop that learns": lambda: of_a_loop(3, True),
+    "a loop of many functions": lambda: of_a_loop(7, False),
+    "a feedback": lambda: of_a_loop(0, False),
+    "a tracked path": of_a_tracked_path,
+    "a box": of_a_box,
+    "faults": of_faults,
+    "gain sets": of_gain_sets,
+}
+
+
+@pytest.mark.parametrize("name", FIGURES)
+def test_a_figure_has_a_curve_for_all_that_it_was_given_and_names_it(name: str) -> None:
+    found = FIGURES[name]()
+    panels = visible(found.figure)
+    drawn = [line for axes in panels for line in lines(axes)]
+    assert [axes.get_ylabel() for axes in panels] == found.panels
+    assert [name for name, _, _ in drawn if name is not None] == found.names
+    for x, values in found.curves:
+        for y in np.asarray(values).reshape(len(values), -1).T:
+            here = [line for line in drawn if len(line[1]) == len(x) and np.allclose(line[1], x)]
+            assert any(np.allclose(line[2], y, equal_nan=True) for line in here), y
 
 
 def test_the_curves_of_a_convergence_are_named_with_their_slopes() -> None:
@@ -79,63 +173,6 @@ def test_the_curves_of_a_convergence_are_named_with_their_slopes() -> None:
     assert legend(axes) == ["a: 2.0", "b: -"]
 
 
-@pytest.mark.parametrize("dim", [1, 3])
-def test_a_memory_is_drawn_where_it_is_with_the_balls_of_its_models(dim: int) -> None:
-    errors, excess = {"kept": wave(9), "fresh": wave(9) + 1}, {"zero": wave(4), "stored": wave(4) + 1}
-    picture = chase.MemoryPicture(wave(9, dim), wave(5, dim) + 1, wave(5), T, errors, excess, 0.3)
-    where, region, revisits = visible(chase.draw_memory(picture))
-    second = min(dim, 2) - 1
-    places = picture.stored[:, [0, second]]
-    curves = [
-        ("path", *picture.path[:, [0, second]].T),
-        ("stored model", *places.T),
-        ("ball of its centers", *EMPTY),
-    ]
-    holds(where, curves, ("$x_1$", f"$x_{second + 1}$"))
-    (balls,) = where.collections
-    np.testing.assert_allclose(balls.get_offsets(), places)
-    names = "time at which the ball was visited (s)", r"$\max\,|V - \hat V|$ on the ball"
-    holds(
-        region, [(name, T, values) for name, values in errors.items()], names, scales=LINEAR_LOG, xlim=span(T)
-    )
-    curves = [(name, range(1, 5), values) for name, values in excess.items()]
-    names = "steps after the revisit", "largest excess $F(a) - F(w)$"
-    holds(revisits, [*curves, ("settled chase", [0, 1], [0.3, 0.3])], names, scales=LOG)
-
-
-@pytest.mark.parametrize(("weights", "shooting"), [(3, True), (7, False), (0, False)])
-def test_the_panels_of_a_closed_loop_hold_its_history(weights: int, shooting: bool) -> None:
-    known = wave(9)
-    known[::2] = np.nan
-    known = known if shooting else np.linspace(1, 2, 300)
-    time = T if shooting else np.linspace(0.5, 4.5, 300)
-    size = len(time)
-    history = closed_loop.AdpHistory(
-        *(time, wave(size, 2), wave(size, 1), wave(size, weights), wave(size, weights) + 1, wave(size)),
-        *(known, known + 1, 0.7 if shooting else None),
-    )
-    panels = visible(closed_loop.draw_adp(history))
-    shown: list[tuple[str, str, np.ndarray]] = [("state $x$", "$x_{%d}$", history.state)]
-    if weights:
-        shown.append((r"actor $\hat W_a$", r"$\hat W_{a,%d}$", history.actor_weights))
-        shown.append((r"critic $\hat W_c$", r"$\hat W_{c,%d}$", history.critic_weights))
-    else:
-        shown.append(("control $u$", "$u_{%d}$", history.control))
-    for axes, (name, label, values) in zip(panels, shown, strict=False):
-        curves = [(label % (i + 1), time, column) for i, column in enumerate(values.T)]
-        holds(axes, curves, ("time (s)", name), xlim=span(time))
-        assert legend(axes) == [curve[0] for curve in curves]
-    at = np.isfinite(known)
-    errors = (r"$|u - u^*|$", known), (r"$|V^* - \hat V|$", known + 1)
-    for axes, (name, values) in zip(panels[len(shown) :], errors, strict=False):
-        holds(axes, [(None, time[at], values[at])], ("time (s)", name), scales=LINEAR_LOG, xlim=span(time))
-    curves = [("so far", time, history.running_cost)]
-    curves += [("optimal, $V^*(x(0))$", [0, 1], [0.7, 0.7])] if shooting else []
-    holds(panels[-1], curves, ("time (s)", "cost"), xlim=span(time))
-    assert panels[-1].get_ylim()[0] == 0
-    assert [axes.get_title(loc="left") for axes in panels] == [f"({chr(97 + i)})" for i in range(len(panels))]
-
-
 def test_a_comparison_counts_states_up_to_a_multiple_of_the_optimal_cost() -> None:
     (axes,) = visible(
         closed_loop.draw_comparison({"a": np.array([3.0, 1.0, np.inf, 1.5]), "b": np.array([2.0])})
@@ -144,93 +181,6 @@ def test_a_comparison_counts_states_up_to_a_multiple_of_the_optimal_cost() -> No
     names = "excess cost $J/J^* - 1$", "share of initial states regulated"
     holds(axes, curves, names, scales=LOG_LINEAR, xlim=(1e-4, 1e2), ylim=(0, 1.02))
     assert legend(axes) == ["a", "b"]
-
-
-def test_a_tracked_path_is_the_error_and_the_desired_state_together() -> None:
-    errors = {"identified": wave(9), "exact": wave(9) + 1}
-    history = closed_loop.TrackingHistory(T, wave(9, 4), errors, wave(9, 6), wave(6), wave(9, 3))
-    followed, error, parameters, critic = visible(closed_loop.draw_tracking(history))
-    curves: list[Curve] = []
-    for i in range(2):
-        curves.append((f"$x_{i + 1}$", T, history.state[:, i] + history.state[:, 2 + i]))
-        curves.append(("desired" if i else None, T, history.state[:, 2 + i]))
-    holds(followed, curves, ("time (s)", "state"), xlim=span(T))
-    names = "time (s)", "$|x - x_d|$"
-    holds(
-        error, [(name, T, values) for name, values in errors.items()], names, scales=LINEAR_LOG, xlim=span(T)
-    )
-    curves = []
-    for i in range(6):
-        curves += [(None, T, history.parameters[:, i]), (None, [0, 1], [history.truth[i]] * 2)]
-    curves += [(r"$\hat\theta$, one colour an entry", *EMPTY), (r"$\theta$", *EMPTY)]
-    holds(parameters, curves, ("time (s)", "drift parameters"), xlim=span(T))
-    curves = [(rf"$\hat W_{{c,{i + 1}}}$", T, history.critic_weights[:, i]) for i in range(3)]
-    holds(critic, curves, ("time (s)", r"critic $\hat W_c$"), xlim=span(T))
-
-
-def test_a_box_has_its_walls_where_it_has_any() -> None:
-    paths, margins, costs = (
-        {name: wave(9, *size) + k for k, name in enumerate("ab")} for size in ((3,), (), ())
-    )
-    low, high = np.array([-1.0, -np.inf, 0.0]), np.array([np.inf, 4.0, 0.0])
-    history = closed_loop.BoxHistory(T, paths, margins, costs, wave(9, 3), low, high)
-    figure = closed_loop.draw_box(history)
-    plane, margin, barrier, cost = visible(figure)
-    curves: list[Curve] = [(name, path[:, 0], path[:, 1]) for name, path in paths.items()]
-    holds(plane, [*curves, (None, [-1, -1], [0, 1]), (None, [0, 1], [4, 4])], ("$x_1$", "$x_2$"))
-    assert legend(figure) == ["a", "b"]
-    names = "time (s)", "distance to the nearest wall"
-    holds(margin, [(None, T, values) for values in margins.values()], names, xlim=span(T))
-    curves = [(f"$s_{{{i + 1}}}$", T, history.barrier_state[:, i]) for i in range(3)]
-    holds(barrier, curves, ("time (s)", "barrier coordinates"), xlim=span(T))
-    names = "time (s)", "cost of $s$ so far"
-    holds(cost, [(name, T, values) for name, values in costs.items()], names, xlim=span(T))
-    assert margin.get_ylim()[0] == cost.get_ylim()[0] == 0
-
-
-def test_a_fault_has_its_norms_above_and_its_parameters_below() -> None:
-    certain = np.arange(9) > 3
-    cases = {
-        name: closed_loop.FaultPicture(
-            T, {"a": wave(9) + k, "b": wave(9) + 2}, wave(9, 2), wave(9, 2) + k, certain
-        )
-        for k, name in enumerate(("loss", "gain"))
-    }
-    figure = closed_loop.draw_faults(cases)
-    titles = [axes.get_title(loc="left") for axes in figure.axes]
-    assert titles == ["(a) loss", "(b) gain", "(c) ", "(d) "]
-    for k, case in enumerate(cases.values()):
-        above, below = figure.axes[k], figure.axes[2 + k]
-        names = "time (s)", "" if k else "$|x|$"
-        holds(above, [(n, T, v) for n, v in case.norms.items()], names, scales=LINEAR_LOG, xlim=span(T))
-        curves: list[Curve] = []
-        for i in range(2):
-            curves += [(None, T, case.parameters[:, i]), (None, T, case.truth[:, i])]
-        room = 0.3 * max(case.truth.max() - case.truth.min(), 1.0)
-        limits = case.truth.min() - room, case.truth.max() + room
-        names = "time (s)", "" if k else r"$\hat\theta$ and $\theta$ (dotted)"
-        holds(below, curves, names, xlim=(T[0], 2.0), ylim=limits)
-    assert legend(figure.axes[0]) == ["a", "b"]
-
-
-def test_gain_sets_are_sorted_by_their_errors() -> None:
-    two = lambda *shape: {name: wave(*shape) + k for k, name in enumerate(("integral", "derivative"))}  # noqa: E731
-    sets = closed_loop.GainSets(T, wave(9, 3), wave(3), two(4), two(5), two(9))
-    theta, followed, error, parameter = visible(closed_loop.draw_gain_sets(sets))
-    curves: list[Curve] = []
-    for i in range(3):
-        curves += [(None, T, sets.parameters[:, i]), (None, [0, 1], [sets.truth[i]] * 2)]
-    holds(theta, curves, ("time (s)", r"$\hat\theta$ (integral), $\theta$ dotted"), xlim=span(T))
-    names = "time (s)", "$|x - x_d|$"
-    holds(followed, [(n, T, v) for n, v in sets.followed.items()], names, scales=LINEAR_LOG, xlim=span(T))
-    shown = (
-        (error, sets.error, "RMS of $x - x_d$"),
-        (parameter, sets.parameter_error, r"RMS of $\hat\theta - \theta$"),
-    )
-    for axes, values, label in shown:
-        curves = [(n, np.sort(v), np.arange(1, len(v) + 1) / len(v)) for n, v in values.items()]
-        holds(axes, curves, (label, "share of gain sets"), scales=LOG_LINEAR, ylim=(0, 1.02))
-    assert legend(error) == ["integral", "derivative"]
 
 
 def test_rivals_are_points_hollow_where_they_fail_from_some_states() -> None:
