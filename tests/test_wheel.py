@@ -27,6 +27,17 @@ def _run(*line: str | Path, cwd: Path) -> str:
     return ended.stdout
 
 
+PROGRAM = """
+import contextlib, runpy, sys
+staf = sys.executable.replace("python", "staf")
+sys.argv = [staf, "duration=0.1", "settle_time=0", "figures=false"]
+with contextlib.suppress(SystemExit):
+    runpy.run_path(staf, run_name="__main__")
+sys.argv = ["own_app.py", "-m", "kernel=gaussian,matern", "steps=2", "hydra/launcher=batched"]
+runpy.run_path("own_app.py", run_name="__main__")
+"""
+
+
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("wheel")
@@ -87,24 +98,16 @@ def test_wheel_runs_in_a_clean_environment_from_any_directory(
     install = ("-m", "pip", "install", "--quiet", "--no-deps", "--no-index", "--no-compile")
     _run(home / "bin" / "python", *install, wheel, cwd=home)
     assert _imported(home, tmp_path).is_relative_to(home.resolve())
-    said = _run(home / "bin" / "staf", "duration=0.1", "settle_time=0", "figures=false", cwd=tmp_path)
+    for path in (ROOT / "tests" / "examples").glob("own_app.*"):  # somebody's application
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    # The command, and that application swept by our launcher.
+    said = _run(home / "bin" / "python", "-W", "error", "-c", PROGRAM, cwd=tmp_path)
     assert "Gradient chase" in said
     (run,) = (tmp_path / "runs").iterdir()
-    assert {path.name for path in run.iterdir()} == {
-        ".hydra",
-        "run.json",
-        "staf.log",
-        "metrics.json",
-        "history.npz",
-    }
+    files = {".hydra", "run.json", "staf.log", "metrics.json", "history.npz"}
+    assert {path.name for path in run.iterdir()} == files
     assert json.loads((run / "metrics.json").read_text())["diverged_fraction"] == 0
-    table = _run(home / "bin" / "staf-table", "runs", "--format", "csv", cwd=tmp_path)
-    assert "ball_error" in table.splitlines()[0]
-    for path in (ROOT / "tests" / "examples").glob(
-        "own_app.*"
-    ):  # somebody's application, swept by our launcher
-        (tmp_path / path.name).write_bytes(path.read_bytes())
-    line = ["-m", "kernel=gaussian,matern", "steps=2", "hydra/launcher=batched"]
-    said = _run(home / "bin" / "python", "-W", "error", "own_app.py", *line, cwd=tmp_path)
     assert said.count("loss=") == 2
     assert "not available" not in said
+    table = _run(home / "bin" / "staf-table", "runs", "--format", "csv", cwd=tmp_path)
+    assert "ball_error" in table.splitlines()[0]

@@ -150,16 +150,6 @@ def test_damage_is_reported_of_the_first_file_that_has_some(tmp_path: Path) -> N
     assert damaged(tmp_path, {"a": 2, "checksum": record_checksum({"a": 1})}, thorough=True) is not None
 
 
-@pytest.mark.parametrize("name", ["metrics.json", "history.npz", "table.csv", "figure.png", "table.md"])
-def test_a_file_that_is_gone_is_missed_where_it_holds_numbers(name: str, tmp_path: Path) -> None:
-    (tmp_path / name).write_bytes(b"1")
-    recorded = {name: [1, build.digest(tmp_path / name)]}
-    (tmp_path / name).unlink()
-    missing = f"{name} is missing" if name.endswith(("json", "npz", "csv")) else None
-    assert damage(tmp_path, recorded, thorough=True) == missing
-    assert damage(tmp_path, recorded, thorough=False) is None
-
-
 def test_result_files_have_checksums_and_logs_links_and_hidden_ones_none(tmp_path: Path) -> None:
     for name in ("metrics.json", "run.json", "staf.log", ".hidden", ".hydra/c.yaml", "figures/a.png"):
         (tmp_path / name).parent.mkdir(exist_ok=True)

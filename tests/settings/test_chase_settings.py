@@ -59,18 +59,9 @@ def test_number_of_steps_survives_rounding(dt: float, duration: float, steps: in
 
 
 BAD: dict[str, tuple[str, tuple[str, ...]]] = {
-    "count of a simplex": ("centers=simplex centers.count=7", ("must be 3 (or null) for simplex", "got 7")),
-    "count of a ball": (
-        "centers=ball centers.count=null",
-        ("`ball(count=...)` must be an integer; got None.",),
-    ),
     "radius is a word": ("centers.radius=abc", ("(radius=...)` must be a number; got 'abc'.",)),
     "long initial state": ("initial_state=[1,2,3]", ("initial_state=...` must have 2 entries",)),
     "unknown device": ("device=nope", ("`staf device=...` cannot be used here",)),
-    "planar layout in space": (
-        "system=linear system.matrix=[[0,1,0],[0,0,1],[-1,-1,-1]] initial_state=[1,0,0]",
-        ("`centers=rings` lies in the plane, but the system has 3 states",),
-    ),
     "path without a module": ("target=custom target.path=bowl", ("must be a dotted path",)),
     "arguments of a function": (
         "target=custom target.path=math.cos +target.arguments.a=1",

@@ -43,7 +43,7 @@ def test_a_lost_worker_says_how_it_ended(what: str, tmp_path: Path) -> None:
     worker.end()
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGHUP])
 def test_workers_end_with_their_parent_however_it_ends(number: signal.Signals, tmp_path: Path) -> None:
     line = [sys.executable, worker_tasks.__file__, str(tmp_path / "note")]
     with subprocess.Popen(line, env=environment(), stdout=subprocess.PIPE, text=True) as parent:
