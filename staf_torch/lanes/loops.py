@@ -195,18 +195,17 @@ def reduce(
     leaves, structure = flatten(points)
     count = leaves[0].shape[dim]
     if count > 1 and (tracer := _tracer(points)) is not None:
-        first = _reduced(body(_slice(leaves, structure, dim, 0)), operation, dim)
+        begin = unflatten(structure, iter([leaf.narrow(dim, 0, 1) for leaf in leaves]))
+        first = _reduced(body(begin), operation, dim)
 
         def step(carry: Tensor, now: Tree) -> tuple[Tensor, tuple[()]]:
             one = _reduced(body(_unsqueezed(now, dim)), operation, dim)
             return _COMBINE[operation](carry, one), ()
 
         rest = unflatten(structure, iter([leaf.narrow(dim, 1, count - 1) for leaf in leaves]))
-        return (
-            _loop(tracer, count - 1, step, first, rest, dim)[0]
-            if count > 2
-            else step(first, unflatten(structure, iter([leaf.select(dim, 1) for leaf in leaves])))[0]
-        )
+        if count > 2:
+            return _loop(tracer, count - 1, step, first, rest, dim)[0]
+        return step(first, unflatten(structure, iter([leaf.select(dim, 1) for leaf in leaves])))[0]
     return _reduced(body(points), operation, dim)
 
 
@@ -240,19 +239,11 @@ def each(body: Callable[[Tensor], Tensor], points: Tensor, *, dim: int = 1, toge
     return done.flatten(dim, dim + 1).narrow(dim, 0, count)
 
 
-_COMBINE: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
-    "sum": torch.add,
-    "max": torch.maximum,
-    "min": torch.minimum,
-}
+_COMBINE = {"sum": torch.add, "max": torch.maximum, "min": torch.minimum}
 
 
 def _reduced(values: Tensor, operation: str, dim: int) -> Tensor:
     return values.sum(dim) if operation == "sum" else getattr(values, f"a{operation}")(dim)
-
-
-def _slice(leaves: list[Tensor], structure: Any, dim: int, k: int) -> Tree:
-    return unflatten(structure, iter([leaf.narrow(dim, k, 1) for leaf in leaves]))
 
 
 def _unsqueezed(tree: Tree, dim: int) -> Tree:
