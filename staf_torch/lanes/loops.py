@@ -204,7 +204,8 @@ def reduce(
 
         rest = unflatten(structure, iter([leaf.narrow(dim, 1, count - 1) for leaf in leaves]))
         if count > 2:
-            return _loop(tracer, count - 1, step, first, rest, dim)[0]
+            total: Tensor = _loop(tracer, count - 1, step, first, rest, dim)[0]
+            return total
         return step(first, unflatten(structure, iter([leaf.select(dim, 1) for leaf in leaves])))[0]
     return _reduced(body(points), operation, dim)
 
@@ -239,7 +240,7 @@ def each(body: Callable[[Tensor], Tensor], points: Tensor, *, dim: int = 1, toge
     return done.flatten(dim, dim + 1).narrow(dim, 0, count)
 
 
-_COMBINE = {"sum": torch.add, "max": torch.maximum, "min": torch.minimum}
+_COMBINE: dict[str, Callable[..., Tensor]] = {"sum": torch.add, "max": torch.maximum, "min": torch.minimum}
 
 
 def _reduced(values: Tensor, operation: str, dim: int) -> Tensor:
