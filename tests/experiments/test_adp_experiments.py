@@ -14,7 +14,7 @@ from helpers_experiments import Ran, ran, run
 
 from staf_torch import adp, systems
 from staf_torch.experiments import adp_comparison
-from staf_torch.experiments.adp import LoopSolution, Regulation, count_the_restless, held_radius, learner
+from staf_torch.experiments.adp import LoopSolution, Regulation, count_the_restless, held_radius
 from staf_torch.results.progress import Progress
 from staf_torch.settings.adp import adp_problem
 
@@ -86,8 +86,6 @@ def test_alone_or_in_a_batch_a_closed_loop_has_the_same_metrics(tmp_path: Path) 
     [
         ({}, 8 * 40 * 300),
         ({"trajectories": 10**6}, 8 * 40 * 200_000),
-        ({"dt": 0}, 0),
-        ({"duration": None}, 0),
         ({"trajectories": "no"}, 0),
     ],
 )
@@ -222,11 +220,3 @@ def test_bad_setting_is_refused_by_name(overrides: list[str], message: str, tmp_
     with pytest.raises(ValueError, match=message):
         run(tmp_path, *(() if "experiment" in overrides[0] else ("experiment=adp",)), *overrides)
     assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize("points", ["random", "quadrature"])
-def test_a_loop_learns_at_points_of_either_kind(points: str) -> None:
-    learning = learner(adp_problem(settings(*SHORT, f"adp/extrapolation={points}")).controller)
-    assert isinstance(learning, adp.ActorCritic)
-    kind = {"random": adp.RandomPoints, "quadrature": adp.QuadraturePoints}[points]
-    assert isinstance(learning.extrapolation, kind)

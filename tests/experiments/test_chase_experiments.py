@@ -245,7 +245,6 @@ def test_a_trajectory_that_diverges_is_named_with_its_time(tmp_path: Path) -> No
         ({}, 10, 16),
         ({"history": False}, 10, 1),
         ({"duration": 0.3}, 3, 16),  # 2.9999999999999996 steps
-        ({"dt": 0}, "none", 0),
         ({"duration": float("inf")}, "none", 0),
         ({"trajectories": "many"}, 10, 0),
     ],

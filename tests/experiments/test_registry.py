@@ -8,12 +8,10 @@ from typing import Any, ClassVar
 
 import pytest
 import torch
-from omegaconf import OmegaConf
 
 from staf_torch.experiments.registry import (
     EXPERIMENTS,
     BatchedExperiment,
-    check_animation,
     experiment,
     finite,
 )
@@ -32,12 +30,6 @@ class Mine(BatchedExperiment[Any]):
 
     def write(self, cfg: Any, directory: Path, solution: Any) -> dict[str, float | None]:
         return {}
-
-
-class Moving(Mine):
-    """Has something that moves."""
-
-    animates = True
 
 
 not_callable = 3
@@ -107,33 +99,6 @@ def test_a_batch_shares_all_of_a_setting_but_the_numbers_that_may_differ(
     name: str, value: object, shared: object
 ) -> None:
     assert Mine().shared(name, value) == shared
-
-
-@pytest.mark.parametrize(
-    ("task", "wanted", "refused"),
-    [
-        ("Moving", True, False),
-        ("Moving", "html", False),
-        ("Mine", False, False),
-        ("Mine", None, True),
-        ("plain", True, True),
-        ("plain", False, False),
-    ],
-)
-def test_an_animation_is_refused_where_nothing_moves(task: str, wanted: object, refused: bool) -> None:
-    cfg = OmegaConf.create({"task": f"{__name__}.{task}", "animation": wanted})
-    if not refused:
-        check_animation(cfg)
-        return
-    with pytest.raises(
-        ValueError, match=r"`staf animation=...` must be false for the task .*which has no animation"
-    ):
-        check_animation(cfg)
-
-
-def test_without_the_setting_there_is_no_animation() -> None:
-    check_animation(OmegaConf.create({"task": "laws"}))
-    check_animation(OmegaConf.create({"task": "no such one", "animation": False}))  # which is not asked for
 
 
 def test_what_is_not_finite_is_none() -> None:

@@ -11,7 +11,7 @@ import pytest
 import torch
 from composing import settings
 from helpers import tensor, uniform
-from helpers_experiments import CASES, Ran, ran, run, words
+from helpers_experiments import CASES, ran, run, words
 from truth import Truth, paper
 
 import staf_torch as st
@@ -230,22 +230,3 @@ def test_a_slope_is_of_the_points_that_are_known_and_above_the_floor() -> None:
     assert log_slope(x, [None, *cubes[1:3], 0.0, None]) == pytest.approx(3.0)
     assert log_slope(x, [1e-3, *cubes[1:]], above=2e-3) == pytest.approx(3.0)  # of what is above alone
     assert log_slope(x, [None, None, None, None, 1.0]) is None
-
-
-def test_the_case_of_every_theorem_leaves_its_table() -> None:
-    for name in ("exponential_bound", "feasibility", "layouts", "flat_limit"):
-        result: Ran = ran(name)
-        assert len((result.directory / f"{name}.md").read_text().splitlines()) >= 3
-        assert result.log.count("\n") >= 3
-
-
-def test_blocks_of_rows_change_nothing() -> None:
-    basis = st.StaFBasis(st.ExponentialKernel(), st.StateFollowingCenters(st.rings(6), 0.1))
-    x = uniform(3, 2000, 2, seed=1).requires_grad_()
-    values = uniform(2, 1, 2000, 6, seed=2)  # broadcasts against the states
-    together = basis.local(x).fit(values)
-    assert together.shape == (2, 3, 2000, 6)
-    torch.testing.assert_close(together[1, 2], basis.local(x[2]).fit(values[1, 0]), rtol=1e-13, atol=1e-14)
-    (slope,) = torch.autograd.grad(together[:, 1, 40:50].sum(), x)
-    assert bool((slope[1, 40:50] != 0).all())
-    assert float(slope.norm()) == pytest.approx(float(slope[1, 40:50].norm()))

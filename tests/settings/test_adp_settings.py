@@ -190,19 +190,6 @@ def test_a_problem_is_where_and_as_precise_as_the_settings_say() -> None:
         assert (each.device.type, each.dtype) == ("meta", torch.float32)
 
 
-def test_walls_put_a_filter_before_the_policy() -> None:
-    assert not isinstance(looped().controller, adp.SafetyFilter)
-    for low, high in (("null", "[2.0,3.0]"), ("[-2.0,null]", "null")):
-        built = looped(f"adp.walls.low={low}", f"adp.walls.high={high}", "adp.walls.decay=3.0", "dt=0.02")
-        assert isinstance(built.controller, adp.SafetyFilter)
-
-
-def test_a_policy_that_learns_is_supervised_where_it_is_trusted_only_so_far() -> None:
-    for trust, kind in (("null", adp.ActorCritic), ("0.5", adp.Supervised)):
-        cfg = composing.settings("experiment=adp", f"adp.trust={trust}")
-        assert type(loops.adp_problem(cfg).controller) is kind
-
-
 def test_options_of_groups_are_exchanged_by_name_and_numbers_as_they_are() -> None:
     cfg = composing.settings("experiment=adp")
     new = loops.changed(cfg, {"policy": "lqr", "trust": 3.0})

@@ -6,27 +6,7 @@ import json
 import os
 import socket
 
-from arena import Arena, Attack, attack
-
-
-@attack
-def another_directory_of_the_sweep(arena: Arena) -> Attack:
-    return arena.line(f"hydra.sweep.dir={arena.victim}")
-
-
-@attack
-def another_subdirectory(arena: Arena) -> Attack:
-    return arena.line("hydra.sweep.subdir=../../victim/${hydra.job.num}")
-
-
-@attack
-def a_log_file_elsewhere(arena: Arena) -> Attack:
-    return arena.line(f"hydra.job_logging.handlers.file.filename={arena.victim}/note.txt")
-
-
-@attack
-def settings_elsewhere(arena: Arena) -> Attack:
-    return arena.line(f"hydra.output_subdir={arena.victim}")
+from arena import ATTACKS, Arena, Attack, attack
 
 
 @attack
@@ -135,3 +115,15 @@ def modules_of_the_library_beside_the_runs(arena: Arena) -> Attack:
 def a_lock_of_everybody(arena: Arena) -> Attack:
     (arena.many / ".lock").write_text(json.dumps({"host": socket.gethostname(), "pid": -1, "token": "x"}) * 2)
     return arena.resume()
+
+
+ATTACKS.update(
+    {
+        "another_directory_of_the_sweep": lambda arena: arena.line(f"hydra.sweep.dir={arena.victim}"),
+        "another_subdirectory": lambda arena: arena.line("hydra.sweep.subdir=../../victim/${hydra.job.num}"),
+        "a_log_file_elsewhere": lambda arena: arena.line(
+            f"hydra.job_logging.handlers.file.filename={arena.victim}/note.txt"
+        ),
+        "settings_elsewhere": lambda arena: arena.line(f"hydra.output_subdir={arena.victim}"),
+    }
+)
