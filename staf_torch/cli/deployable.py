@@ -1,4 +1,4 @@
-"""What a run holds that a device can compute: read, built anew, and compared with what was recorded."""
+"""The deployable part of a run: read, built anew, and compared with what was recorded."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _READ = ("state", "weights", "estimate", "actor_weights", "control")  # of the h
 
 @dataclasses.dataclass(frozen=True)
 class Deployable:
-    """What is exported of a run."""
+    """The part of a run that is exported."""
 
     kind: str  # approximator, controller
     what: str  # one sentence
@@ -51,7 +51,7 @@ class Deployable:
 
 
 def deployable(run: Path, row: int = 0, *, trust: bool = False) -> Deployable:
-    """What a device needs of one trajectory of a run: its controller, or its approximation at the last time.
+    """Return the deployable part of one trajectory: its controller, or its approximation at the last time.
 
     The objects are built anew from the run's settings, and must reproduce what the run recorded.
 

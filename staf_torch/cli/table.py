@@ -44,7 +44,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _going_on(paths: Sequence[Path]) -> bool:
-    """Whether a run has not ended, or a job of a sweep has not begun."""
+    """Return whether a run has not ended, or a job of a sweep has not begun."""
     try:
         found = collect(paths)
     except ValueError:  # nothing is there so far

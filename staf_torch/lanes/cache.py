@@ -64,7 +64,7 @@ _DAMAGED = (
 
 
 class Trace(NamedTuple):
-    """What is left of a step once it has been written down."""
+    """The record of a traced step."""
 
     text: Text
     recipe: Recipe

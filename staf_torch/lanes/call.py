@@ -98,7 +98,7 @@ def form(leaf: Any) -> Form:
 
 
 class PlannedCall:
-    """One call of a compiled program.
+    """A prepared call of a compiled program.
 
     Args:
         compiled: the program.
@@ -197,7 +197,7 @@ def _inner(shape: Sequence[int], unit: int) -> tuple[int, ...]:
 
 
 def _even(shape: Sequence[int], strides: Sequence[int]) -> bool:
-    """Whether entries in their order lie equally far apart."""
+    """Return whether entries in their order lie equally far apart."""
     longer = [(size, stride) for size, stride in zip(shape, strides, strict=True) if size > 1]
     return all(a[1] == b[0] * b[1] for a, b in itertools.pairwise(longer))
 
@@ -261,7 +261,7 @@ class Given(NamedTuple):
         return tuple(parts), tuple(self.structures.values())
 
     def ordinary(self) -> bool:
-        """Whether all tensors are ordinary ones on the CPU of which nobody wants a derivative."""
+        """Return whether all tensors are ordinary ones on the CPU of which nobody wants a derivative."""
         if self.rows == 0 or self.times == 0:
             return False
         return ordinary((*self.carry, *self.now, *self.row))

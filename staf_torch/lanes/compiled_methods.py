@@ -68,7 +68,7 @@ def worth(pays: bool) -> bool:
 
 
 class Served(Protocol):
-    """What serves in the place of a method: (n,) or (B, n) to (B, 1, m), or trees of (B, ...) to such."""
+    """The callable in the place of a method: (n,) or (B, n) to (B, 1, m), or trees of (B, ...) to such."""
 
     @property
     def compiled(self) -> bool: ...
@@ -169,7 +169,7 @@ class CompiledMethod:
         return y.view(-1) if dims == 1 else y.reshape(*x.shape[:-1], y.shape[-1])
 
     def _pays(self, rows: float) -> bool:
-        """Whether a call pays for a compiler, with all calls before: a large batch does by itself."""
+        """Return whether the calls so far and this one repay a compiler: a large batch does by itself."""
         work, most = rows / 200, self._settings.pays
         pays = self._asked + work >= most
         pays = worth(pays) if most < math.inf else pays
@@ -178,7 +178,7 @@ class CompiledMethod:
 
     @property
     def compiled(self) -> bool:
-        """Whether a compiled program has served a call."""
+        """Return whether a compiled program has served a call."""
         return self._served is not None and self._served.compiled
 
     def hasten(self) -> None:
@@ -255,7 +255,7 @@ class Rows:
 
     @property
     def compiled(self) -> bool:
-        """Whether a compiled program has served a call."""
+        """Return whether a compiled program has served a call."""
         return bool(self._plans)
 
     def __call__(self, *given: Tensor) -> Tensor:
@@ -281,7 +281,7 @@ class Rows:
 
 
 class _Trees:
-    """As `Rows`, of trees (B, ...) to trees (B, ...)."""
+    """The variant of `Rows` that maps trees (B, ...) to trees (B, ...)."""
 
     def __init__(self, rows: Rows) -> None:
         self._program, self.compiled = rows.program, False

@@ -1,4 +1,4 @@
-"""What objects and functions hold and lead to, so that no program computes with a number that has changed.
+"""The contents of objects and functions, watched so that no program computes with a number that has changed.
 
 The objects are pickled, which walks through all that they hold; the text, with classes and functions by
 their identity and floating-point tensors by their order, is a key: equal keys compute the same. On the way
@@ -182,7 +182,7 @@ class Contents:
         return b"\0".join(names)
 
     def _look(self) -> Iterator[Any]:
-        """What is in all containers, and what functions read beside."""
+        """Look into all containers, and at what functions read beside."""
         walk = self._walk
         parts: list[Iterable[Any]] = [read(attributes) for attributes, read in walk.modules]
         if walk.functions or walk.lookups or walk.cells:
@@ -261,7 +261,7 @@ def _names(code: CodeType) -> tuple[tuple[str, ...], tuple[str, ...]]:
 
 
 def _content_of(cell: CellType) -> Any:
-    """What a function closes over, or `_EMPTY`."""
+    """Return the content of a closure's cell, or `_EMPTY`."""
     try:
         return cell.cell_contents
     except ValueError:
@@ -300,7 +300,7 @@ class _Walk(pickle.Pickler):
             self.dump(_class_parts(met) if isinstance(met, type) else self._function_parts(met))
 
     def _function_parts(self, function: FunctionType) -> tuple[Any, ...]:
-        """What a function reads beside its arguments."""
+        """Return what a function reads beside its arguments."""
         parts: list[Any] = [function.__defaults__, function.__kwdefaults__, vars(function)]
         for cell in function.__closure__ or ():
             self.cells.append(cell)
@@ -412,13 +412,13 @@ class _Walk(pickle.Pickler):
 
 
 def _class_parts(kind: type) -> tuple[Any, ...]:
-    """What the classes of a user hold from which one is derived: functions, numbers, containers."""
+    """Return what a user's base classes hold: functions, numbers, containers."""
     users = [vars(each).items() for each in kind.__mro__ if is_users(each)]
     return tuple(part for items in users for name, value in items for part in _attribute_parts(name, value))
 
 
 def _attribute_parts(name: str, value: Any) -> Iterable[Any]:
-    """What an attribute of a class holds that a step may read: functions, or itself."""
+    """Return the parts of a class attribute that a step may read: functions, or itself."""
     if isinstance(value, property):
         return [part for part in (value.fget, value.fset, value.fdel) if part is not None]
     value = getattr(value, "__func__", value)  # of a static or class method

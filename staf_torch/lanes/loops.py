@@ -211,7 +211,7 @@ def reduce(
 
 
 def each(body: Callable[[Tensor], Tensor], points: Tensor, *, dim: int = 1, together: int = 4) -> Tensor:
-    """What ``body`` computes at every point: (..., P, ...) to (..., P, ...), P in the place ``dim``.
+    """Apply ``body`` at every point: (..., P, ...) to (..., P, ...), P in the place ``dim``.
 
     Plain torch calls ``body`` once with all points; a compiled program goes through them, some at a time, so
     that its text is short.
@@ -305,7 +305,7 @@ def _tracer(tree: Tree) -> Tracer | None:
 
 
 def _fixed(tracer: Tracer, given: Tree, first: Callable[[], Tree]) -> bool:
-    """Whether no row has numbers of its own in what a first pass is given, and makes none."""
+    """Return whether no row has numbers of its own in the inputs of a first pass, and it makes none."""
     if any(tracer.traced(leaf) for leaf in flatten(given)[0]):
         return False
     return not any(tracer.traced(leaf) for leaf in flatten(first())[0])
@@ -428,7 +428,7 @@ def _collected(tracer: Tracer, leaf: Tensor, dim: int, loop: Loop, number: int, 
 
 
 def _place(tracer: Tracer, loop: Loop, number: int) -> None:
-    """Where the loop stands: as far outside as what it needs allows."""
+    """Return the loop's place: as far outside as its inputs allow."""
     graph = tracer.graph
     ends = [*loop.following, *(node for part in loop.collected for node in part), *loop.condition]
     free, seen, stack = set(loop.initial), set(), ends

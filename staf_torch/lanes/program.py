@@ -75,7 +75,7 @@ class Program(Derived):
         self._refused: str | None = None  # why its rows are not alone
 
     def __getstate__(self) -> dict[str, Any]:
-        """What it is made of: a copy compiles by itself."""
+        """Return the parts that a copy is made of: it compiles by itself."""
         return {"step": self.step, "name": self.name, "compile": self.compile, "copies": self.copies}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -166,7 +166,7 @@ class Program(Derived):
     def definition(
         self, carry: Tree, now: Tree = (), row: Tree = (), *, steps: int | None = None, every: int = 1
     ) -> tuple[Tree, Tree]:
-        """The same in plain torch."""
+        """Compute in plain torch."""
         given = Given.of(carry, now, row, steps)
         fixed = given.tree("row", [plain(leaf) for leaf in given.row])
         columns: list[list[Tensor]] = []
@@ -181,7 +181,7 @@ class Program(Derived):
         return carry, unflatten(shape, iter(stacked))
 
     def compiles(self, carry: Tree, now: Tree = (), row: Tree = (), *, steps: int | None = None) -> bool:
-        """Whether the compiled program serves these inputs."""
+        """Return whether the compiled program serves these inputs."""
         self._look_around()
         leaves, structure = flatten((row, now, carry))
         prepared = self._prepared.get((structure, tuple(map(form, leaves)), steps, 1))
@@ -249,7 +249,7 @@ class Program(Derived):
         return None if built is None or not self._alone(given) else built.compiled
 
     def _alone(self, given: Given) -> bool:
-        """Whether a step of a user may be written down with a single row: asked for one row, and for more."""
+        """Return whether a user's step may be traced with a single row, by calls with one row and more."""
         rows = min(given.rows, 2)
         if self._asked < rows and self._of_users is not False:
             self._asked = rows
@@ -301,7 +301,7 @@ class Program(Derived):
         return _Built(Compiled(call, table, made.real, shapes, made.outputs, made.structure), made)
 
     def _known(self, given: Given, copies: int) -> Trace:
-        """What the step does with a single row, from the cache where it has been written down before."""
+        """Return the trace of the step with a single row, from the cache where it has been traced before."""
         shapes = None if self._described is None else Contents(given.key()).signature()
         if self._described is None or shapes is None or not cache.unpatched():
             return _written(self.step, given, copies)
@@ -315,7 +315,7 @@ class Program(Derived):
 
 
 def _loops_over(now: Tree) -> bool:
-    """Whether there are times, in tensors of which every row has its own."""
+    """Return whether there are times, in tensors of which every row has its own."""
     leaves = flatten(now)[0]
     return bool(leaves) and not any(isinstance(leaf, Shared) for leaf in leaves)
 
@@ -374,7 +374,7 @@ class Prepared:
         return self.run(leaves, carry, now, row)
 
     def run(self, leaves: Sequence[Any], carry: Tree, now: Tree, row: Tree) -> tuple[Tree, Tree]:
-        """The same for inputs that are known to fit."""
+        """Run with inputs that are known to fit."""
         if self._refused or not ordinary(leaves):
             return self._program.definition(carry, now, row, steps=self._steps, every=self._every)
         if self.plan is None:

@@ -1,4 +1,4 @@
-"""Whether a step does with a row alone what it does with it among others, and does it again.
+"""The check that a step treats a row alone as among others, and reproducibly.
 
 A trace sees one row once. A mean over the batch, a branch on its size, random numbers, counters and clocks
 look like constants there. So the step of a user is called in plain torch with one row, again, and beside the
@@ -53,7 +53,7 @@ def doubt(step: Callable[..., Any], given: Given) -> str | None:
 
 
 def _alike(step: Callable[..., Any], given: Given, rows: Sequence[int], beside: Sequence[Tensor]) -> bool:
-    """Whether a row alone is what it is beside another, as far as rounding leaves its numbers any meaning.
+    """Return whether a row alone equals that beside another, as far as rounding lets numbers mean anything.
 
     One row and two are not summed in the same order. What then changes by more than a hundredth, a matrix
     that is singular to rounding, changes with the last bits of the inputs, too, and says nothing.

@@ -20,7 +20,7 @@ _OWN = re.compile(r"([a-z]\d+(_\d+)?)|double|float|int|const|static|inline|void|
 
 
 class Names(NamedTuple):
-    """What the arguments of a function are called."""
+    """Names of the arguments of a function."""
 
     rows: Sequence[str]
     nows: Sequence[str]

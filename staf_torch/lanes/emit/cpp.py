@@ -59,13 +59,13 @@ def emit(graph: Graph, layout: Sizes, following: Sequence[int], outputs: Sequenc
 
 
 def _worth(graph: Graph, schedule: Schedule) -> bool:
-    """Whether to find ahead what times alone decide: it goes through memory."""
+    """Return whether to compute ahead what times alone decide, although it goes through memory."""
     work = sum(_COSTLY if graph.op[n] in _FUNCTIONS else 1 for n in schedule.ahead if graph.op[n] != "now")
     return work > _MEMORY * len(schedule.cut_ahead())
 
 
 def _copies(schedule: Schedule) -> int:
-    """How many vectors advance side by side, so that the processor always has something to do."""
+    """Return the number of vectors that advance side by side, so that the processor is never idle."""
     steps = schedule.live - schedule.ahead
     shares = len(steps) < _MANY and any(schedule.shares_a_matrix(node) for node in steps)
     return 2 if len(steps) < _FEW or shares else 1
@@ -113,7 +113,7 @@ class _CppWriter(StatementWriter):
     def _places(
         self, buffer: str, nodes: Sequence[int], start: int
     ) -> tuple[dict[int, tuple[str, int]], int]:
-        """Where nodes are kept in a buffer, and how many numbers they take."""
+        """Return the nodes' places in a buffer, and how many numbers they take."""
         places, taken = dict[int, tuple[str, int]](), 0
         for node in nodes:
             if self._in_place(node) is None:

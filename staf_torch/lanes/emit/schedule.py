@@ -19,7 +19,7 @@ from ..trace.graph import FIXED, NOW, REAL, ROW, STEP, Graph
 
 
 class Sizes(NamedTuple):
-    """How many entries a program reads and writes."""
+    """Numbers of entries that a program reads and writes."""
 
     rows: Sequence[int]  # of every input that a row has once
     nows: Sequence[int]  # of every input of a time
@@ -28,7 +28,7 @@ class Sizes(NamedTuple):
 
 
 class Schedule:
-    """What a program computes, block by block.
+    """The computation of a program, block by block.
 
     Args:
         graph: the nodes.
@@ -72,12 +72,12 @@ class Schedule:
         return self._blocks.get((loop, self._graph.loops[loop].depth), [])
 
     def cut(self) -> list[int]:
-        """What a row has once and the steps read."""
+        """Return the nodes that a row has once and the steps read."""
         found = self._cut(ROW, self.live, lambda node: not self._once(node))
         return [node for node in found if self._graph.op[node] not in ("const", "param", "row")]
 
     def cut_ahead(self) -> list[int]:
-        """What times alone decide and the steps read."""
+        """Return the nodes that times alone decide and the steps read."""
         depth = self._graph.depth
         found = self._cut(NOW, self.ahead, lambda node: node not in self.ahead and depth[node] != ROW)
         return [node for node in found if self._graph.op[node] != "now"]
@@ -107,13 +107,13 @@ class Schedule:
         return found
 
     def shares_a_matrix(self, node: int) -> bool:
-        """Whether a node is a product with a matrix that all rows share: each number is then read for all."""
+        """Return whether a node multiplies by a matrix that all rows share: numbers are read for all."""
         graph = self._graph
         packs = [a for a in graph.args[node] if graph.op[a] == "pack"] if graph.op[node] == "dot" else []
         return any(graph.op[graph.args[pack][0]] in FIXED for pack in packs)
 
     def together(self, one: int, other: int) -> bool:
-        """Whether two nodes stand in the same block: of one loop, or of one depth outside of all."""
+        """Return whether two nodes stand in the same block: of one loop, or of one depth outside of all."""
         return self._where[one] == self._where[other]
 
     def repeats(self, node: int) -> int:
@@ -125,7 +125,7 @@ class Schedule:
         return count
 
     def _once(self, node: int) -> bool:
-        """Whether a node is found before the steps, be it inside a loop."""
+        """Return whether a node is computed before the steps, be it inside a loop."""
         depth = self._graph.depth[node]
         if depth <= STEP:
             return depth == ROW
@@ -139,7 +139,7 @@ class Schedule:
         return () if self._graph.op[node] == "loop" else self._graph.args[node]
 
     def _ends(self, loop: int) -> list[int]:
-        """What a loop starts and goes on with, as far as it is needed."""
+        """Return the nodes that a loop starts and goes on with, as far as they are needed."""
         here = self._graph.loops[loop]
         ends = [part[k] for k in self.carries.get(loop, ()) for part in (here.initial, here.following)]
         ends += [node for k in self.collected(loop) for node in here.collected[k]]
@@ -254,7 +254,7 @@ def taken_over(graph: Graph, schedule: Schedule) -> set[int]:
 def leaves(
     graph: Graph, taken: Collection[int], node: int, at: Places = None
 ) -> Iterator[tuple[int, Places]]:
-    """What a map reads, that of the maps it takes over included: each operand, and the places in it.
+    """Return what a map reads, including the maps it takes over: each operand, and the places in it.
 
     ``at`` are the entries of the map that are wanted; None for all.
     """

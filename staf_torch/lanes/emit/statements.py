@@ -227,7 +227,7 @@ class StatementWriter(abc.ABC):
                 self._line(f"for (int p = 0; p < {run.length}; ++p) {name}[{target}] = {value};")
 
     def _place_in_array(self, entry: int) -> tuple[Any, int]:
-        """What an entry is read from, equal for entries of one array or buffer, and the place in it."""
+        """Return the source of an entry, equal for entries of one array or buffer, and the place in it."""
         graph, op = self.graph, self.graph.op[entry]
         if op == "elem":
             return graph.args[entry][0], graph.aux[entry]
@@ -237,7 +237,7 @@ class StatementWriter(abc.ABC):
         return ("same", entry), 0
 
     def _read_like(self, entry: int, at: str, j: int) -> str:
-        """What stands at another place of what an entry is read from."""
+        """Return the text that reads another place of an entry's source."""
         graph, op = self.graph, self.graph.op[entry]
         if op == "elem":
             return self._read(graph.args[entry][0], at, j)
@@ -405,7 +405,7 @@ class StatementWriter(abc.ABC):
         return f"{name}[{at}]" if self.copies == 1 else f"{name}[({at}) * {self.copies} + {j}]"
 
     def _in_place(self, pack: int) -> tuple[str, int] | None:
-        """Where in a buffer of inputs the entries of a pack lie one after the other already."""
+        """Return the place in a buffer of inputs where the entries of a pack lie in order already."""
         graph = self.graph
         if graph.op[pack] != "pack":
             return None

@@ -24,7 +24,7 @@ _OF_NO_VALUES = frozenset(_NO_VALUES.split())
 
 
 class Recipe(NamedTuple):
-    """How the numbers of a table follow from the tensors that a step found outside."""
+    """The recipe by which the numbers of a table follow from the tensors that a step captured."""
 
     values: Tensor  # the numbers as they were, float64
     operations: list[
@@ -71,14 +71,14 @@ class Captured:
         self.count = 0
 
     def stated(self, tensor: Tensor) -> bool:
-        """Whether the numbers of a tensor are part of the text."""
+        """Return whether the numbers of a tensor are part of the text."""
         if not _in_memory(tensor):
             return True
         _, stated = self._made.get(_address(tensor), (None, not tensor.is_floating_point()))
         return stated
 
     def from_outside(self, tensor: Tensor) -> bool:
-        """Whether a tensor was there before."""
+        """Return whether a tensor existed before the trace."""
         return _in_memory(tensor) and _address(tensor) not in self._made
 
     def ran(self, function: Any, args: Sequence[Any], kwargs: dict[str, Any], out: Any) -> None:
@@ -110,7 +110,7 @@ class Captured:
                 self._made[address] = storage, True
 
     def _written_here(self, fresh: Sequence[Tensor]) -> None:
-        """What `torch.tensor` of Python's numbers made just now, not memory of an array of NumPy."""
+        """Return whether `torch.tensor` just made it of Python's numbers, not of memory of NumPy."""
         for tensor in fresh:
             storage = tensor.untyped_storage()
             if storage.resizable() and self.from_outside(tensor):
@@ -137,7 +137,7 @@ class Captured:
         return nodes.reshape(tensor.shape)
 
     def recipe(self) -> Recipe:
-        """How the table came about: no operation that it does not need."""
+        """Return the recipe of the table, without operations that it does not need."""
         wanted = {id(t) for t, _ in self._reads} | {id(t) for t, _ in self._checks}
         operations, made = [], set[int]()
         for operation in reversed(self._operations):

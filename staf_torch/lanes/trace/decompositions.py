@@ -117,7 +117,7 @@ def searchsorted(
     side: str | None = None,
     sorter: Tensor | None = None,
 ) -> Tensor:
-    """How many boundaries stand before x; NaN is above all."""
+    """Count the boundaries before x; NaN is above all."""
     if not isinstance(x, Tensor) or sorter is not None:
         raise NotLoweredError("`searchsorted` of a number or with a sorter has no scalar form here")
     at = x.unsqueeze(-1)

@@ -18,7 +18,7 @@ from .tracer import LARGE
 
 
 def in_memory(matrix: Tensor) -> bool:
-    """Whether a matrix is one that stays in memory."""
+    """Return whether a matrix stays in memory."""
     return matrix.shape[-1] * matrix.shape[-2] > LARGE
 
 

@@ -160,7 +160,7 @@ class Graph:
         return self.add("where", (chosen, a, b), self.type[a])
 
     def convert(self, node: int, type: str) -> int:
-        """The same number as another type."""
+        """Convert a number to another type."""
         old = self.type[node]
         if old == type:
             return node

@@ -136,7 +136,7 @@ def _chosen(t: Tracer, x: Ids, at: Ids) -> Ids:
 
 
 def many(name: str, a: Tensor, dim: object, index: object) -> bool:
-    """Whether so many choices are left that they stay a loop: of one of `CHOICES` along a dimension."""
+    """Return whether so many choices are left that they stay a loop: one of `CHOICES` along a dimension."""
     if name not in CHOICES or not isinstance(dim, int) or not isinstance(index, Tensor) or a.dim() == 0:
         return False
     others = 1 if name != "index_select" else a.numel() // max(1, a.shape[dim])

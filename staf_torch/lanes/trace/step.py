@@ -1,4 +1,4 @@
-"""What a step does with a single row: inputs become nodes, each operation is looked up among the rules.
+"""Tracing of a step with a single row: inputs become nodes, each operation is looked up among the rules.
 
 An operation has a rule in single numbers (`entrywise`, `reductions`), moves entries (`indexing`: torch itself
 moves the numbers of nodes), or is written in simpler operations of torch that are traced in its place: this

@@ -107,7 +107,7 @@ class Tracer(TorchDispatchMode):
         return self.attach(tensor, np.array(new, dtype=np.int64).reshape(tensor.shape))
 
     def traced(self, tensor: Tensor) -> bool:
-        """Whether anything of it depends on an input."""
+        """Return whether anything of it depends on an input."""
         if tensor.numel() == 0 or tensor._is_zerotensor():  # of forward mode: zeros without memory
             return False
         return tensor.untyped_storage().data_ptr() in self._storages
@@ -196,7 +196,7 @@ class Tracer(TorchDispatchMode):
         return all(op[n] == "const" for array in arrays for n in set(array.reshape(-1).tolist()))
 
     def _operand(self, flat: Ids) -> tuple[int, tuple[int, ...] | None]:
-        """What a loop over these nodes reads: one node for all, or an array and the places in it."""
+        """Return what a loop over these nodes reads: one node for all, or an array and the places in it."""
         if (flat == flat[0]).all():
             return int(flat[0]), None
         array, places = self.array(flat, self.graph.type[int(flat[0])])
@@ -228,7 +228,7 @@ class Tracer(TorchDispatchMode):
         return np.array(new, dtype=np.int64)
 
     def stated(self, tensor: Tensor) -> bool:
-        """Whether the numbers of a tensor that no row has its own of may shape the text."""
+        """Return whether the values of a tensor shared by all rows may be written into the generated code."""
         return self._folded or self.captured.stated(tensor)
 
     def _parameters(self, tensor: Tensor, kind: str) -> Ids:
@@ -317,7 +317,7 @@ def _of_each(function: Callable[..., int], spread: Sequence[Ids]) -> Ids:
 
 
 def _own_generator(args: Sequence[Any], kwargs: dict[str, Any]) -> bool:
-    """Whether random numbers come from a generator that was given: one seeded in a step repeats itself."""
+    """Return whether random numbers come from a given generator: one seeded in a step repeats itself."""
     return any(isinstance(value, torch.Generator) for value in (*args, *kwargs.values()))
 
 
