@@ -245,9 +245,9 @@ def solve_elsewhere(pickled: bytes, path: Sequence[str], packages: Sequence[str]
     with trusted(packages):
         batch: Batch = pickle.loads(pickled)
         outcomes = solve(batch.settings, SHOWN)
-        for i, (outcome, cfg) in enumerate(zip(outcomes, batch.settings, strict=True)):
+        for i, outcome in enumerate(outcomes):
             if isinstance(outcome, Deferred):
-                outcomes[i] = _run_whole(cfg, Path(batch.directories[i]))
+                outcomes[i] = _run_whole(batch.settings[i], Path(batch.directories[i]))
             elif isinstance(outcome, Computed) and batch.measured:
                 outcomes[i] = Written(outcome.metrics, ())
         portable = [_portable(outcome) for outcome in outcomes]
@@ -268,7 +268,8 @@ def _run_whole(cfg: DictConfig, directory: Path) -> Outcome:
 def _kept_log() -> Iterator[list[tuple[int, str]]]:
     """Collect level and text of log messages and warnings in a list."""
     lines: list[tuple[int, str]] = []
-    handler, root = _Collecting(lambda level, text: lines.append((level, text))), logging.getLogger()
+    handler, root = logging.Handler(), logging.getLogger()
+    handler.emit = lambda record: lines.append((record.levelno, record.getMessage()))  # type: ignore[method-assign]
     root.setLevel(logging.INFO)
     root.addHandler(handler)
     try:
@@ -277,15 +278,6 @@ def _kept_log() -> Iterator[list[tuple[int, str]]]:
             yield lines
     finally:
         root.removeHandler(handler)
-
-
-class _Collecting(logging.Handler):
-    def __init__(self, take: Callable[[int, str], None]) -> None:
-        super().__init__()
-        self._take = take
-
-    def emit(self, record: logging.LogRecord) -> None:
-        self._take(record.levelno, record.getMessage())
 
 
 def _portable(outcome: Outcome) -> Outcome:

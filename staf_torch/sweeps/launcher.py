@@ -5,11 +5,10 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import gc
 import logging
 import sys
 import time
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -38,22 +37,6 @@ _NOT_BATCHED = (
 )
 _TOLD = 20  # failures that are told as they happen
 _BAR_EVERY, _LINE_EVERY = 0.2, 10.0  # s
-
-
-@contextlib.contextmanager
-def _collecting_seldom() -> Iterator[None]:
-    """Collect garbage seldom: configurations refer to their parents, and a sweep makes some hundred thousand
-    objects of them; Python would look through all of torch's after every few, a fifth of the sweep's time."""
-    before, frozen = gc.get_threshold(), gc.get_freeze_count() > 0
-    if not frozen:  # what a program has frozen itself cannot be told apart afterwards
-        gc.freeze()
-    gc.set_threshold(20_000, 5, 5)
-    try:
-        yield
-    finally:
-        gc.set_threshold(*before)
-        if not frozen:
-            gc.unfreeze()
 
 
 class SweepProgress:
@@ -153,7 +136,6 @@ class Launch:
                 "`sweep.records=table` needs all jobs at once: hydra/sweeper=basic without max_batch_size."
             )
 
-    @_collecting_seldom()
     def run(self, job_overrides: Sequence[Sequence[str]], first: int) -> list[JobReturn]:
         """Run the jobs, numbered from ``first``, and return Hydra's records of them, in order.
 
