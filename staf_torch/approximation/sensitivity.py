@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from ..numerics.checks import trailing
+from ..numerics.linalg import row_jacobian
 from .basis import StaFBasis, Target
 
 
@@ -65,19 +66,14 @@ def _sources(basis: StaFBasis, x: Tensor, target: Target) -> Tensor:
     """dV - dK W for every movement of a center: (..., M, M, n), the row of K first."""
     centers = basis.centers(x)
     weights = basis.ideal_weights(x, target)
-    slopes = _first_argument(basis, centers)  # (..., i, j, l)
+    slopes = row_jacobian(lambda at: basis.kernel(at, centers), centers)[
+        1
+    ]  # d_{1,l} k(c_i, c_j), (..., i, j, l)
     direct = torch.func.grad(lambda at: target(at).sum())(centers)
     own = direct - (slopes * weights[..., None, :, None]).sum(-2)  # (..., i, l)
     identity = torch.eye(basis.count, dtype=x.dtype, device=x.device).unsqueeze(-1)
     sources: Tensor = identity * own.unsqueeze(-3) - (slopes * weights[..., None, None]).transpose(-3, -2)
     return sources
-
-
-def _first_argument(basis: StaFBasis, centers: Tensor) -> Tensor:
-    """d_{1,l} k(c_i, c_j): (..., M, n) -> (..., M, M, n), a column j at a time."""
-    gram, pull = torch.func.vjp(lambda at: basis.kernel(at, centers), centers)[:2]
-    columns = torch.eye(basis.count, dtype=gram.dtype, device=gram.device)
-    return torch.stack([pull(column.expand_as(gram))[0] for column in columns.unbind(0)], dim=-2)
 
 
 def _solve(basis: StaFBasis, x: Tensor, sources: Tensor) -> Tensor:

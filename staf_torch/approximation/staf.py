@@ -67,10 +67,10 @@ class StaF(nn.Module):
         outputs = () if out_features is None else (out_features,)
         like = basis.centers.directions.detach().new_empty((), dtype=dtype, device=device)
         zero = like.new_zeros(*self.batch_shape, *outputs, basis.count)
-        hold(self, "coefficients", nn.Parameter(zero) if flag("StaF", "learnable", learnable) else zero)
-        self.register_buffer("state", like.new_zeros(*self.batch_shape, basis.dim))
-        self.coefficients: Tensor
-        self.state: Tensor
+        self.coefficients = hold(
+            self, "coefficients", nn.Parameter(zero) if flag("StaF", "learnable", learnable) else zero
+        )
+        self.state = hold(self, "state", like.new_zeros(*self.batch_shape, basis.dim))
         self._target: Target | None
         self._remember(None)
 

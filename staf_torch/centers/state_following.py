@@ -54,8 +54,7 @@ class ConstantRadius(Radius):
 
     def __init__(self, radius: float | Tensor) -> None:
         super().__init__()
-        hold(self, "radius", positive("ConstantRadius", "radius", radius))
-        self.radius: Tensor
+        self.radius = hold(self, "radius", positive("ConstantRadius", "radius", radius))
 
     def bound(self) -> Tensor:
         return self.radius
@@ -87,12 +86,9 @@ class StateRadius(Radius):
 
     def __init__(self, radius: float | Tensor, offset: float | Tensor, gain: float | Tensor = 1.0) -> None:
         super().__init__()
-        hold(self, "radius", positive("StateRadius", "radius", radius))
-        hold(self, "offset", non_negative("StateRadius", "offset", offset))
-        hold(self, "gain", positive("StateRadius", "gain", gain))
-        self.radius: Tensor
-        self.offset: Tensor
-        self.gain: Tensor
+        self.radius = hold(self, "radius", positive("StateRadius", "radius", radius))
+        self.offset = hold(self, "offset", non_negative("StateRadius", "offset", offset))
+        self.gain = hold(self, "gain", positive("StateRadius", "gain", gain))
 
     def bound(self) -> Tensor:
         # nu is monotone in x'x, between radius * offset at the origin and radius / gain far out.
@@ -127,8 +123,7 @@ class StateFollowingCenters(nn.Module):
 
     def __init__(self, directions: Tensor, radius: float | Tensor | Radius) -> None:
         super().__init__()
-        hold(self, "directions", _checked(directions))
-        self.directions: Tensor
+        self.directions = hold(self, "directions", _checked(directions))
         self.radius = radius if isinstance(radius, Radius) else ConstantRadius(radius)
 
     @property

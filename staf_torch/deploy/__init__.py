@@ -19,22 +19,4 @@ from .formats import load_program as load_program
 from .graph import trace as trace
 from .remembered import RememberedPolicy as RememberedPolicy
 
-__all__ = [
-    "ActorPolicy",
-    "FilteredPolicy",
-    "FoldedRollout",
-    "LocalApproximator",
-    "RememberedPolicy",
-    "RidgeApproximator",
-    "SupervisedPolicy",
-    "approximator",
-    "export_c",
-    "export_learning_c",
-    "export_onnx",
-    "export_package",
-    "export_program",
-    "load_program",
-    "policy_of",
-    "time_c",
-    "trace",
-]
+__all__ = [name for name, value in globals().items() if callable(value) and not name.startswith("_")]

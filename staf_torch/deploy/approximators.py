@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from ..approximation.staf import StaF
 from ..local_basis import GradedSpace
-from ..numerics.checks import positive_real
+from ..numerics.checks import hold, positive_real
 
 _HIGHEST = 60  # degree: beyond it the ball is too wide, in units of the kernel's width, for a series
 
@@ -75,14 +75,10 @@ class RidgeApproximator(nn.Module):
         if moving:
             slope = slope + c.unsqueeze(-1) * x
         table = torch.cat((c.unsqueeze(-1), slope), dim=-1)  # (P + 1, M, 1 + n)
-        self.register_buffer("state", x.to(dtype))
-        self.register_buffer("directions", directions.mT.contiguous().to(dtype))  # (n, M)
-        self.register_buffer("constant", table[0].sum(0).to(dtype))  # (1 + n,)
-        self.register_buffer("table", table[1:].flatten(0, 1).to(dtype))  # (P M, 1 + n)
-        self.state: Tensor
-        self.directions: Tensor
-        self.constant: Tensor
-        self.table: Tensor
+        self.state = hold(self, "state", x.to(dtype))
+        self.directions = hold(self, "directions", directions.mT.contiguous().to(dtype))  # (n, M)
+        self.constant = hold(self, "constant", table[0].sum(0).to(dtype))  # (1 + n,)
+        self.table = hold(self, "table", table[1:].flatten(0, 1).to(dtype))  # (P M, 1 + n)
 
     def forward(self, y: Tensor) -> tuple[Tensor, Tensor]:
         """V^ and grad V^: (B, n) -> (B,), (B, n)."""

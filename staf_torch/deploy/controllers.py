@@ -21,7 +21,7 @@ from ..adp import (
 from ..adp.near_optimal import NearOptimal
 from ..adp.planning.receding_horizon import StrainedPlans
 from ..adp.planning.shooting.optimum import PlanReplay
-from ..numerics.checks import fail, trailing
+from ..numerics.checks import fail, hold, trailing
 from .remembered import RememberedPolicy
 
 
@@ -55,8 +55,7 @@ class ActorPolicy(nn.Module):
         if weights.dim() != 1 or not bool(torch.isfinite(weights).all()):
             raise fail("ActorPolicy", "weights", f"must be {learner.basis.count} finite numbers", weights)
         self.basis, self.model, self.cost = copy.deepcopy((learner.basis, learner.model, learner.cost))
-        self.register_buffer("weights", weights.detach().clone())
-        self.weights: Tensor
+        self.weights = hold(self, "weights", weights.detach().clone())
 
     def forward(self, x: Tensor) -> Tensor:
         """u: (..., n) -> (..., m)."""
@@ -166,10 +165,8 @@ class FoldedRollout(nn.Module):
         self.policy = copy.deepcopy(policy)
         if isinstance(policy.base, RolloutPolicy):
             self.policy.base = FoldedRollout(policy.base)
-        self.register_buffer("offsets", basis.centers.offsets(zero).detach().clone())  # (M, n)
-        self.register_buffer("fit", torch.cat((value.unsqueeze(-1), slope), dim=-1).detach())  # (M, 1 + n)
-        self.offsets: Tensor
-        self.fit: Tensor
+        self.offsets = hold(self, "offsets", basis.centers.offsets(zero).detach().clone())  # (M, n)
+        self.fit = hold(self, "fit", torch.cat((value.unsqueeze(-1), slope), dim=-1).detach())  # (M, 1 + n)
 
     def forward(self, x: Tensor) -> Tensor:
         """u: (..., n) -> (..., m)."""

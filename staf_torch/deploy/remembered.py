@@ -13,6 +13,7 @@ from ..adp import GlobalValue
 from ..adp.planning.global_value import follow_plan
 from ..lanes import Program
 from ..lanes.tree import Tree
+from ..numerics.checks import hold
 
 
 class RememberedPolicy(nn.Module):
@@ -58,24 +59,14 @@ class RememberedPolicy(nn.Module):
         kept = used.unsqueeze(1) * length + torch.arange(steps + 1)
         ends = which * length + (time + self.lookahead).clamp(max=steps)
         models, end = ends.unique(return_inverse=True)
-        tables = {
-            "region": memory.region.clone(),
-            "frame": memory.frame.clone(),
-            "searched": memory.images(),
-            "plans": memory.plans[kept.flatten()],
-            "models": memory.models[models],
-        }
-        tables |= {"first": place * (steps + 1) + time, "last": place * (steps + 1) + steps, "end": end}
-        for name, table in tables.items():
-            self.register_buffer(name, table)
-        self.region: Tensor
-        self.frame: Tensor
-        self.searched: Tensor
-        self.plans: Tensor
-        self.models: Tensor
-        self.first: Tensor
-        self.last: Tensor
-        self.end: Tensor
+        self.region = hold(self, "region", memory.region.clone())
+        self.frame = hold(self, "frame", memory.frame.clone())
+        self.searched = hold(self, "searched", memory.images())
+        self.plans = hold(self, "plans", memory.plans[kept.flatten()])
+        self.models = hold(self, "models", memory.models[models])
+        self.first = hold(self, "first", place * (steps + 1) + time)
+        self.last = hold(self, "last", place * (steps + 1) + steps)
+        self.end = hold(self, "end", end)
 
     def forward(self, x: Tensor) -> Tensor:
         """u: (B, n) -> (B, m)."""

@@ -15,6 +15,7 @@ from torch import Tensor
 from .. import systems
 from ..adp import Controller, Cost, Feedback, QuadraticCost
 from ..adp.loop.controller import Carried, Policy
+from ..adp.loop.simulation import uniform_numbers
 from ..adp.loop.step import ClosedLoop, LoopState
 from ..numerics.checks import choice, fail, positive_real
 from ..systems import Bounds, ControlAffineSystem, Plant
@@ -245,14 +246,7 @@ class Agent:
             if self._carried is None:
                 self._carried = self.controller.init(x)
                 self._generators = [torch.Generator().manual_seed(self.seed + row) for row in range(len(x))]
-            u, self._carried = self.controller.step(x, self._carried, self._uniform(x), self.dt)
+            uniform = uniform_numbers(x, 1, self.controller.draws, self._generators)[:, 0]
+            u, self._carried = self.controller.step(x, self._carried, uniform, self.dt)
         control: Numbers = u.reshape(*seen.shape[:-1], -1).numpy()
         return control if self.action is None else self.action(control)
-
-    def _uniform(self, x: Tensor) -> Tensor:
-        draws = self.controller.draws
-        if not draws:
-            return x.new_zeros(len(x), 0, x.shape[-1])
-        shape = (draws, x.shape[-1])
-        rows = [torch.rand(*shape, dtype=x.dtype, generator=generator) for generator in self._generators]
-        return 2 * torch.stack(rows) - 1

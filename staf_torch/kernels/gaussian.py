@@ -35,8 +35,7 @@ class GaussianKernel(Kernel):
 
     def __init__(self, width: float | Tensor = 1.0) -> None:
         super().__init__()
-        hold(self, "width", positive("GaussianKernel", "width", width))
-        self.width: Tensor
+        self.width = hold(self, "width", positive("GaussianKernel", "width", width))
 
     def forward(self, x1: Tensor, x2: Tensor) -> Tensor:
         return (squared_distance(x1, x2) * (-0.5 * per_entry(self.exponent_rate(), 2))).exp()

@@ -34,8 +34,7 @@ class PolynomialKernel(Kernel):
     def __init__(self, degree: int = 2, bias: float | Tensor = 1.0) -> None:
         super().__init__()
         self.degree = integer("PolynomialKernel", "degree", degree, least=1)
-        hold(self, "bias", non_negative("PolynomialKernel", "bias", bias))
-        self.bias: Tensor
+        self.bias = hold(self, "bias", non_negative("PolynomialKernel", "bias", bias))
         self.full = self.bias.is_meta or bool((self.bias > 0).all())
         """Whether the space holds all polynomials of the degree, not the homogeneous ones alone."""
 

@@ -28,8 +28,9 @@ class RadialKernel(Kernel):
 
     def __init__(self, length_scale: float | Tensor = 1.0) -> None:
         super().__init__()
-        hold(self, "length_scale", positive(type(self).__name__, "length_scale", length_scale))
-        self.length_scale: Tensor
+        self.length_scale = hold(
+            self, "length_scale", positive(type(self).__name__, "length_scale", length_scale)
+        )
 
     @abc.abstractmethod
     def profile(self, s: Tensor) -> Tensor:

@@ -31,8 +31,7 @@ class RationalQuadraticKernel(RadialKernel):
 
     def __init__(self, alpha: float | Tensor = 1.0, length_scale: float | Tensor = 1.0) -> None:
         super().__init__(length_scale)
-        hold(self, "alpha", positive("RationalQuadraticKernel", "alpha", alpha))
-        self.alpha: Tensor
+        self.alpha = hold(self, "alpha", positive("RationalQuadraticKernel", "alpha", alpha))
 
     def profile(self, s: Tensor) -> Tensor:
         alpha = per_entry(self.alpha, 2)

@@ -139,9 +139,9 @@ class ChaseMetrics:
             return
         rounding = 1e3 * torch.finfo(x.dtype).eps * errors.native_square.abs()
         broken = excess > rate**self._inner_steps * before * (1 + 1e-9) + rounding
-        rows.violations = _more(rows.violations, broken & settled)
+        rows.count("contraction_violations", broken & settled)
         if result.certificate is not None:
-            rows.uncertified = _more(rows.uncertified, result.certificate.violated[:, at] & settled)
+            rows.count("certificate_violations", result.certificate.violated[:, at] & settled)
 
     def summary(self) -> dict[str, float | None]:
         """Name to number over all rows; None where there is nothing to report."""
@@ -181,13 +181,14 @@ class ChaseMetrics:
         for metric in self._own:
             worst = metrics[metric.name]
             metrics[metric.name] = None if worst is None else metric.from_badness(worst)
-        last = 0.0
-        if any_time and member.first > 0 and found.last_above is not None:
-            last = float(found.last_above[rows][kept].max())
-        metrics["settling_time"] = last * member.dt if any_time else None
-        metrics["contraction_violations"] = _count(found.violations, rows, kept) if any_time else None
-        if found.uncertified is not None and found.time > member.first:
-            metrics["certificate_violations"] = _count(found.uncertified, rows, kept)
+        metrics |= {"settling_time": None, "contraction_violations": None}
+        if found.time > member.first:
+            for name, count in found.counts.items():
+                metrics[name] = float(count[rows][kept].sum()) if any_time else None
+        if any_time:
+            last = found.counts.get("settling_time")
+            above = 0.0 if last is None or member.first <= 0 else float(last[rows][kept].max())
+            metrics["settling_time"] = above * member.dt
         metrics["diverged_fraction"] = float(found.diverged[rows].double().mean())
         return {k: v if v is not None and math.isfinite(v) else None for k, v in metrics.items()}
 
@@ -199,11 +200,14 @@ class _RowRecord:
         self.first = first  # index of the first of them in the batch
         self.time = 0
         self.worst: dict[str, Tensor] = {}  # name -> (B,)
+        self.counts: dict[str, Tensor] = {}  # name -> (B,) int64; times until the excess settles among them
         self.early: list[Tensor] = []  # excess before the window, -inf in it, (B, C) a piece
-        self.last_above: Tensor | None = None  # (B,) times until the excess stays below that of the window
-        self.violations: Tensor | None = None  # (B,) int64
-        self.uncertified: Tensor | None = None  # (B,) int64, of the certificate
         self.diverged = torch.zeros(0, dtype=torch.bool)
+
+    def count(self, name: str, happened: Tensor) -> None:
+        """Add the times of a piece (B, C) at which something happened."""
+        new = happened.sum(dim=1)
+        self.counts[name] = self.counts[name] + new if name in self.counts else new
 
     def keep_worst(self, settled: Tensor, **quantities: Tensor) -> None:
         for name, quantity in quantities.items():
@@ -216,7 +220,7 @@ class _RowRecord:
             early = torch.cat(self.early, dim=1)
             index = torch.arange(1, early.shape[1] + 1, device=early.device)
             above = early > self.worst["ultimate_excess"].unsqueeze(-1)
-            self.last_above = torch.where(above, index, 0).amax(dim=1)
+            self.counts["settling_time"] = torch.where(above, index, 0).amax(dim=1)
         self.early = []
         return self
 
@@ -228,27 +232,12 @@ class _RowRecord:
         rows = slice(part.first, part.first + len(part.diverged))
         self.time = part.time
         for name, worst in part.worst.items():
-            if name not in self.worst:
-                self.worst[name] = worst.new_full((total,), -torch.inf)
-            self.worst[name][rows] = worst
-        for name in ("last_above", "violations", "uncertified", "diverged"):
-            found, whole = getattr(part, name), getattr(self, name)
-            if found is None:
-                continue
-            if whole is None or len(whole) < total:
-                whole = found.new_zeros(total)
-                setattr(self, name, whole)
-            whole[rows] = found
-
-
-def _more(count: Tensor | None, happened: Tensor) -> Tensor:
-    """The count of each row (B,) with the times of a piece (B, C) at which it happened."""
-    new = happened.sum(dim=1)
-    return new if count is None else count + new
-
-
-def _count(violations: Tensor | None, rows: slice, kept: Tensor) -> float | None:
-    return None if violations is None or not bool(kept.any()) else float(violations[rows][kept].sum())
+            self.worst.setdefault(name, worst.new_full((total,), -torch.inf))[rows] = worst
+        for name, count in part.counts.items():
+            self.counts.setdefault(name, count.new_zeros(total))[rows] = count
+        if len(self.diverged) < total:
+            self.diverged = part.diverged.new_zeros(total)
+        self.diverged[rows] = part.diverged
 
 
 _WORST = (

@@ -153,12 +153,16 @@ def sampled(target: object, values: object, points: Tensor, outputs: int | None 
     return values
 
 
-def hold(module: nn.Module, name: str, value: Tensor) -> None:
-    """Keep a hyperparameter: an `nn.Parameter` as one, to be learned; any other tensor as a fixed buffer."""
+def hold(module: nn.Module, name: str, value: Tensor) -> Tensor:
+    """Keep a hyperparameter: an `nn.Parameter` as one, to be learned; any other tensor as a fixed buffer.
+
+    It is returned, so that ``self.width = hold(self, "width", width)`` gives the attribute its type.
+    """
     if isinstance(value, nn.Parameter):
         module.register_parameter(name, value)
     else:
         module.register_buffer(name, value)
+    return value
 
 
 def copied(module: Module, **buffers: Tensor) -> Module:

@@ -9,6 +9,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from .linalg import row_jacobian
+
 
 @functools.cache
 def use_forward_mode() -> None:
@@ -35,6 +37,4 @@ def jacobian(function: Callable[[Tensor], Tensor], y: Tensor) -> Tensor:
                 return torch.stack([first, *rest], dim=-1)
         except RuntimeError:  # NotImplementedError is one; what else is wrong is so backwards, too
             pass
-    values, pull = torch.func.vjp(function, y)[:2]
-    selectors = torch.eye(values.shape[-1], dtype=values.dtype, device=values.device)
-    return torch.stack([pull(selector.expand(values.shape))[0] for selector in selectors], dim=-2)
+    return row_jacobian(function, y)[1]

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from ..approximation.basis import StaFBasis
-from ..numerics.checks import integer, positive_real, trailing
+from ..numerics.checks import hold, integer, positive_real, trailing
 
 _DRIFT = 4.0  # usual distances between a model and the average of those before it
 _NEAREST = 1e-4  # of the reach, squared: closer than that a model counts alone, and the weights stay smooth
@@ -76,20 +76,15 @@ class ExperienceMemory(nn.Module):
         self.spacing = positive_real("ExperienceMemory", "spacing", spacing)
         self.visits = integer("ExperienceMemory", "visits", visits, least=1)
         like = basis.centers.directions
-        self.register_buffer("states", like.new_zeros(*batch_shape, capacity, basis.dim))
-        self.register_buffer("coefficients", like.new_zeros(*batch_shape, capacity, basis.count))
-        self.register_buffer("stored", torch.zeros(*batch_shape, capacity, dtype=torch.bool))
-        self.register_buffer("latest", torch.full(batch_shape, -1, dtype=torch.int64))
-        self.register_buffer("origin", like.new_zeros(*batch_shape, basis.dim))
-        self.register_buffer("averaged", torch.zeros(*batch_shape, capacity, dtype=torch.int64))
-        self.register_buffer("scatter", like.new_zeros(*batch_shape, capacity))
-        self.states: Tensor
-        self.coefficients: Tensor
-        self.stored: Tensor
-        self.latest: Tensor  # the place written last
-        self.origin: Tensor  # where it was first stored
-        self.averaged: Tensor  # models in one
-        self.scatter: Tensor  # usual distance to the average
+        self.states = hold(self, "states", like.new_zeros(*batch_shape, capacity, basis.dim))
+        self.coefficients = hold(self, "coefficients", like.new_zeros(*batch_shape, capacity, basis.count))
+        self.stored = hold(self, "stored", torch.zeros(*batch_shape, capacity, dtype=torch.bool))
+        self.latest = hold(self, "latest", torch.full(batch_shape, -1, dtype=torch.int64))  # written last
+        self.origin = hold(
+            self, "origin", like.new_zeros(*batch_shape, basis.dim)
+        )  # where it was first stored
+        self.averaged = hold(self, "averaged", torch.zeros(*batch_shape, capacity, dtype=torch.int64))
+        self.scatter = hold(self, "scatter", like.new_zeros(*batch_shape, capacity))  # usual distance
 
     @property
     def count(self) -> Tensor:
@@ -127,14 +122,12 @@ class ExperienceMemory(nn.Module):
             self.latest.copy_(torch.where(fine, slot, self.latest))
         return self
 
-    def forward(self, y: Tensor) -> Tensor:
-        """`query`."""
-        return self.query(y)
-
     def query(self, y: Tensor) -> Tensor:
         """V^(y): (..., P, n) -> (..., P); NaN where no stored model reaches."""
         weights = self._weights(y)
         return (weights * self._local(y)).sum(-1) / weights.sum(-1)  # 0 / 0 where none reaches
+
+    forward = query
 
     def gradient(self, y: Tensor) -> Tensor:
         """Gradient of the blend at y: (..., P, n) -> (..., P, n)."""

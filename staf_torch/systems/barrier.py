@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ..numerics.angles import wrap
-from ..numerics.checks import fail
+from ..numerics.checks import fail, hold
 from .base import ControlAffineSystem, Linearisation
 
 Wall = float | Sequence[float | None] | Tensor | None
@@ -72,28 +72,17 @@ class Barrier(ControlAffineSystem):
         self.periodic = tuple(k for k in plant.periodic if free[k % plant.dim])
         self._turning = tuple(k for k in plant.periodic if not free[k % plant.dim])
         below, above = 1 / (center - lows), 1 / (highs - center)  # 0 for a wall that is not there
-        buffers = {
-            "low": lows,
-            "high": highs,
-            "center": center,
-            "below": torch.where(unbounded, 0.5, below),  # any number: what it makes is not used
-            "above": torch.where(unbounded, 0.5, above),
-            "free": unbounded,
-            "floor": torch.where(torch.isinf(lows), center - 1, lows),
-            "ceiling": torch.where(torch.isinf(highs), center + 1, highs),
-            "walled": torch.stack((torch.isfinite(lows), torch.isfinite(highs))),
-        }
-        for name, buffer in buffers.items():
-            self.register_buffer(name, buffer)
-        self.low: Tensor  # (n,)
-        self.high: Tensor
-        self.center: Tensor
-        self.below: Tensor  # 1/(c - low)
-        self.above: Tensor  # 1/(high - c)
-        self.free: Tensor  # (n,) bool: no wall at all
-        self.floor: Tensor  # low, or a number in its place
-        self.ceiling: Tensor
-        self.walled: Tensor  # (2, n) bool: has a low wall, a high wall
+        self.low = hold(self, "low", lows)  # (n,)
+        self.high = hold(self, "high", highs)
+        self.center = hold(self, "center", center)
+        # 1/(c - low) and 1/(high - c); where there is no wall at all any number: what it makes is not used.
+        self.below = hold(self, "below", torch.where(unbounded, 0.5, below))
+        self.above = hold(self, "above", torch.where(unbounded, 0.5, above))
+        self.free = hold(self, "free", unbounded)  # (n,) bool: no wall at all
+        # The walls, or a number in their place; and which there are, (2, n) bool: a low, a high one.
+        self.floor = hold(self, "floor", torch.where(torch.isinf(lows), center - 1, lows))
+        self.ceiling = hold(self, "ceiling", torch.where(torch.isinf(highs), center + 1, highs))
+        self.walled = hold(self, "walled", torch.stack((torch.isfinite(lows), torch.isfinite(highs))))
 
     @property
     def traceable(self) -> bool:

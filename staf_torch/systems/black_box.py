@@ -63,7 +63,7 @@ class BlackBox:
         self, x: Numbers, feedback: Callable[[Numbers], Numbers], steps: int
     ) -> tuple[Numbers, Numbers]:
         """Every state and control under a feedback, of a function in NumPy that is a step: by the function's
-        own ``follow_feedback``, where it has one, else a call a step.
+        own ``follow_feedback``, where it has one that does not return None, else a call a step.
 
         Args:
             x: (B, n).
@@ -74,8 +74,8 @@ class BlackBox:
             (B, T + 1, n), (B, T, m).
         """
         whole = getattr(self._function, "follow_feedback", None)
-        if callable(whole):
-            found: tuple[Numbers, Numbers] = whole(x, feedback, steps)
+        found: tuple[Numbers, Numbers] | None = whole(x, feedback, steps) if callable(whole) else None
+        if found is not None:
             return found
         states, controls = [x], []
         for _ in range(steps):

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ..numerics.checks import fail, vector
+from ..numerics.checks import fail, hold, vector
 from ..numerics.linalg import exponential, riccati
 from .base import ControlAffineSystem
 
@@ -38,14 +38,12 @@ class Linear(ControlAffineSystem):
         super().__init__()
         rows = _rows("matrix", matrix, "must be (n, n)")
         self.dim = len(rows)
-        self.register_buffer("matrix", _stack("matrix", rows, self.dim))
-        self.matrix: Tensor
+        self.matrix = hold(self, "matrix", _stack("matrix", rows, self.dim))
         inputs = [[]] * self.dim if input_matrix is None else input_matrix
         given = _rows("input_matrix", inputs, "must be (n, m)")
         if len(given) != self.dim:
             raise fail("Linear", "input_matrix", f"must have {self.dim} rows, one a state", input_matrix)
-        self.register_buffer("input_matrix", _stack("input_matrix", given, len(given[0])))
-        self.input_matrix: Tensor
+        self.input_matrix = hold(self, "input_matrix", _stack("input_matrix", given, len(given[0])))
         self.inputs = self.input_matrix.shape[1]
 
     def drift(self, x: Tensor) -> Tensor:

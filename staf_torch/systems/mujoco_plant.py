@@ -124,15 +124,11 @@ class _Simulation:
 
     def follow_feedback(
         self, x: Numbers, feedback: Callable[[Numbers], Numbers], steps: int
-    ) -> tuple[Numbers, Numbers]:
+    ) -> tuple[Numbers, Numbers] | None:
         """`BlackBox.follow`: a simulation a row that goes on, which no period sets up anew. The same bits."""
+        if len(self.data) > 1:
+            return None  # rows of a period side by side
         mujoco, model = _mujoco(), self.model
-        if len(self.data) > 1:  # rows of a period side by side
-            states, controls = [x], []
-            for _ in range(steps):
-                controls.append(feedback(states[-1]))
-                states.append(self(states[-1], controls[-1]))
-            return np.stack(states, axis=1), np.stack(controls, axis=1)
         kind, rows = int(mujoco.mjtState.mjSTATE_FULLPHYSICS), len(x)
         while len(self._followers) < rows:
             data = mujoco.MjData(model)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ..numerics.checks import positive_real, vector
+from ..numerics.checks import hold, positive_real, vector
 from .base import ControlAffineSystem, Units
 
 
@@ -50,11 +50,9 @@ class TwoLinkRobot(ControlAffineSystem):
         positive_real("TwoLinkRobot", "inertia", p2)
         # det M = p1 p2 - p2^2 - p3^2 cos^2 q2, least at q2 = 0.
         positive_real("TwoLinkRobot", "inertia", p2 * (p1 - p2) - p3 * p3)
-        self.register_buffer("inertia", torch.tensor([p1, p2, p3], dtype=torch.float64))
+        self.inertia = hold(self, "inertia", torch.tensor([p1, p2, p3], dtype=torch.float64))
         given = vector("TwoLinkRobot", "friction", list(friction), 4)
-        self.register_buffer("friction", torch.tensor(given, dtype=torch.float64))
-        self.inertia: Tensor
-        self.friction: Tensor
+        self.friction = hold(self, "friction", torch.tensor(given, dtype=torch.float64))
 
     def drift(self, x: Tensor) -> Tensor:
         p3 = self.inertia.to(x)[2]

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ..numerics.checks import vector
+from ..numerics.checks import hold, vector
 from .base import ControlAffineSystem
 from .two_state import input_gain
 
@@ -38,8 +38,7 @@ class TwoStateChain(ControlAffineSystem):
         super().__init__()
         given = theta.tolist() if isinstance(theta, Tensor) else list(theta)
         numbers = vector("TwoStateChain", "theta", given, 4)
-        self.register_buffer("theta", torch.tensor(numbers, dtype=torch.float64))
-        self.theta: Tensor
+        self.theta = hold(self, "theta", torch.tensor(numbers, dtype=torch.float64))
 
     def drift(self, x: Tensor) -> Tensor:
         a, b, c, d = self.theta.to(x).unbind(-1)
