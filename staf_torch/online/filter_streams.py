@@ -258,20 +258,16 @@ class FilterStreams:
         self.units, self._known = torch.cat((self.units, new)), torch.cat((self._known, new))
         self.first = torch.cat((self.first, self.first.new_zeros(streams, *self.first.shape[1:])))
         self.clock, self.turn = (torch.cat((a, a.new_zeros(streams))) for a in (self.clock, self.turn))
-        grows = _typical(self._may_grow).expand(streams, -1)
-        self._may_grow = torch.cat((self._may_grow, grows))
-        self._stretch = torch.cat((self._stretch, _typical(self._stretch).expand(streams, -1)))
+        self._may_grow, self._stretch = (_joined(a, streams) for a in (self._may_grow, self._stretch))
         self._begin(torch.arange(self.count, self.count + streams))
-        old = self.definition
-        ratio, forgetting = (torch.cat((a, _typical(a).expand(streams))) for a in (old.ratio, old.forgetting))
-        self._hold(old.with_law(ratio, forgetting), state)
+        law = (_joined(a, streams) for a in (self.definition.ratio, self.definition.forgetting))
+        self._hold(self.definition.with_law(*law), state)
 
     def keep(self, rows: Tensor) -> None:
         """Go on with the streams with these numbers alone."""
         state = self.state.with_table(self.state.table[:, rows], self.state.counts[:, rows])
-        self.units, self.first, self.clock = self.units[rows], self.first[rows], self.clock[rows]
-        self._known, self._stretch = self._known[rows], self._stretch[rows]
-        self.turn, self._may_grow = self.turn[rows], self._may_grow[rows]
+        for name in ("units", "first", "clock", "turn", "_known", "_stretch", "_may_grow"):
+            setattr(self, name, getattr(self, name)[rows])
         old = self.definition
         self._hold(old.with_law(old.ratio[rows], old.forgetting[rows]), state)
 
@@ -312,9 +308,9 @@ class FilterStreams:
         self._hold(self.definition.with_law(state["ratio"].clone(), state["forgetting"].clone()), kept)
 
 
-def _typical(values: Tensor) -> Tensor:
-    """The lower median of every column, which streams that are added begin with: (S, ...) -> (1, ...)."""
-    return values.median(0).values[None]
+def _joined(values: Tensor, streams: int) -> Tensor:
+    """With the lower median of every column for streams that are added: (S, ...) -> (S + streams, ...)."""
+    return torch.cat((values, values.median(0).values.expand(streams, *values.shape[1:])))
 
 
 def table_of(state: dict[str, Any]) -> Tensor:

@@ -191,11 +191,11 @@ class LocalFilter:
     def _moments(self, old: StateParts, z: Tensor, share: Tensor) -> tuple[Tensor, Tensor]:
         """Mean (K, S) and variance (S,) of the next y at z (n, S) from the anchor, before errors scale it;
         when it comes, this share of D is left."""
-        local = self.functions.local(old.anchor, z)
+        psi, log_factor = self.functions.local(old.anchor, z)
         prior = self.functions.prior(old.anchor, z)
-        factor: Tensor | float = 1.0 if local.log_factor is None else local.log_factor.exp()
-        mean = (local.psi * old.mean).sum(-2) * factor
-        known = (local.psi * _apply(old.learned, local.psi)).sum(0)  # psi'D psi
+        factor: Tensor | float = 1.0 if log_factor is None else log_factor.exp()
+        mean = (psi * old.mean).sum(-2) * factor
+        known = (psi * _apply(old.learned, psi)).sum(0)  # psi'D psi
         return mean, (prior - share * known) * factor**2 + self.ratio
 
     def learn(self, state: StreamState, x: Tensor, y: Tensor, lapse: Tensor | None = None) -> None:
@@ -235,7 +235,8 @@ class LocalFilter:
         left = torch.where(afresh, x, old.anchor)
         transfer, factor = self.functions.transfer(left, torch.where(moves, z, 0.0))
         mean = torch.where(moves, _apply(transfer, old.mean) * (1.0 if factor is None else factor), old.mean)
-        learned = torch.where(moves, _congruence(transfer, old.learned), old.learned)
+        half = _apply(transfer, old.learned.transpose(0, 1))  # rows of D T'
+        learned = torch.where(moves, _apply(transfer, half.transpose(0, 1)), old.learned)
         z = torch.where(moves, 0.0, z)
         since = torch.where(afresh, 0, since)
         held = torch.where(torch.isfinite(x), x, old.last)
@@ -252,12 +253,11 @@ class LocalFilter:
     def _update(self, old: StateParts, samples: Tensor, sample: _NewSample) -> tuple[StateParts, Tensor]:
         """The Kalman update at z from the anchor; and the streams whose result is finite."""
         z, y, seen, lapse, fine, moved, before, most = sample
-        local = self.functions.local(old.anchor, z)
-        psi, noise = local.psi, self.ratio
+        (psi, log_factor), noise = self.functions.local(old.anchor, z), self.ratio
         largest = torch.maximum(old.largest, y.abs().amax(0))
         prior = torch.zeros_like(lapse) + self.functions.prior(old.anchor, z)
-        if local.log_factor is not None:
-            shrink = (-local.log_factor).exp()
+        if log_factor is not None:
+            shrink = (-log_factor).exp()
             y, noise = y * shrink, noise * shrink.square()
         share = self.forgetting**lapse
         known = _apply(old.learned, psi) * share
@@ -297,12 +297,6 @@ def _apply(matrix: Tensor, vector: Tensor) -> Tensor:
     for k in range(1, len(matrix)):
         total = total + matrix[:, k] * vector[..., k : k + 1, :]
     return total
-
-
-def _congruence(transfer: Tensor, matrix: Tensor) -> Tensor:
-    """T D T' with the batch last: (M, M, S), (M, M, S) -> (M, M, S)."""
-    half = _apply(transfer, matrix.transpose(0, 1))  # rows of D T'
-    return _apply(transfer, half.transpose(0, 1))
 
 
 def smooth_record(
@@ -372,9 +366,9 @@ def _backwards(filter_: LocalFilter, record: tuple[list[Tensor], ...], x: Tensor
             u = means[k] + gain @ (u - expected[k + 1])
             p = covariances[k] + gain @ (p - predicted[k + 1]) @ gain.mT
         z = x[k].mT - anchors[k]
-        local = filter_.functions.local(anchors[k], z)
-        psi = local.psi.mT.unsqueeze(-1)  # (S, M, 1)
-        factor = torch.ones_like(z[0]) if local.log_factor is None else local.log_factor.exp()
+        functions, log_factor = filter_.functions.local(anchors[k], z)
+        psi = functions.mT.unsqueeze(-1)  # (S, M, 1)
+        factor = torch.ones_like(z[0]) if log_factor is None else log_factor.exp()
         prior = torch.zeros_like(z[0]) + filter_.functions.prior(anchors[k], z)
         rest = prior - psi.square().sum((1, 2))
         variance = (rest + (psi.mT @ p @ psi).squeeze(-1).squeeze(-1)) * factor.square()

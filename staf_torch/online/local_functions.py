@@ -15,13 +15,6 @@ _JUMP = 4.0  # radii: beyond, a kernel whose scale grows with the state says not
 _FAR = 1e8  # radii: beyond, no kernel does, and the squares of a user's kernel may overflow
 
 
-class LocalValues(NamedTuple):
-    """The local functions at a point of every stream: e^{log_factor} psi."""
-
-    psi: Tensor  # (M, S)
-    log_factor: Tensor | None  # (S,), None for zeros
-
-
 class LocalFunctions(NamedTuple):
     """An orthonormal basis psi(z) = k0(z, d) C of the span of the kernels at the centers x + d.
 
@@ -91,14 +84,15 @@ class LocalFunctions(NamedTuple):
         """Return whether k(x, x) is the same everywhere: e^s then goes into the functions."""
         return self.rate is not None and self.kernel.log_gain(self.offsets) is None
 
-    def local(self, x: Tensor, z: Tensor) -> LocalValues:
-        """Return the local functions and the log factor at x + z: (n, S), (n, S)."""
+    def local(self, x: Tensor, z: Tensor) -> tuple[Tensor, Tensor | None]:
+        """Return psi (M, S) and the log factor (S,), None for zeros, at x + z: (n, S), (n, S); the local
+        functions are e^{log_factor} psi."""
         if self.rate is None or self.shared is None or not self.stationary:
-            return LocalValues(self.functions(x, z), self.log_factor(x, z))
+            return self.functions(x, z), self.log_factor(x, z)
         # exp(q z'd - q z'z / 2) from z - d: no difference of two large numbers, whatever z is.
         apart = (z.double() - self.offsets.unsqueeze(-1)).square().sum(1)
         exponent = self.rate / 2 * (self.offsets.square().sum(-1, keepdim=True) - apart)
-        return LocalValues((self.shared.mT @ exponent.exp()).to(z), None)
+        return (self.shared.mT @ exponent.exp()).to(z), None
 
     def prior(self, x: Tensor, z: Tensor) -> Tensor | float:
         """The variance of V at x + z before any sample, in the units of `local`: (n, S), (n, S) -> (S,)."""

@@ -69,8 +69,7 @@ def test_a_moving_filter_is_the_dense_recursion(kernel: str, forgetting: float) 
             move = transfer[..., 0]
             mean = move @ mean * (1.0 if factor is None else factor[0])
             learned = move @ learned @ move.mT
-        at = functions.local(x, torch.zeros_like(x))
-        psi = at.psi[:, 0]
+        psi = functions.local(x, torch.zeros_like(x))[0][:, 0]
         left = functions.prior(x, torch.zeros_like(x)) - psi @ psi  # variance that no weight explains
         covariance = identity - forgetting * learned
         spread = psi @ covariance @ psi + left + ratio

@@ -30,10 +30,10 @@ def dense(x: Tensor, y: Tensor, follow: float) -> tuple[Tensor, Tensor]:
         if not torch.isnan(value) and float((point - anchor).norm()) > follow * RADIUS:
             move = functions.transfer(anchor[:, None], (point - anchor)[:, None])[0][..., 0]
             anchor = point
-        at = functions.local(anchor[:, None], (point - anchor)[:, None])
+        values = functions.local(anchor[:, None], (point - anchor)[:, None])[0][:, 0]
         moves.append(move)
-        psi.append(at.psi[:, 0])
-        rest.append(1 - float(at.psi[:, 0].square().sum()))
+        psi.append(values)
+        rest.append(1 - float(values.square().sum()))
     steps = len(x)
     weights = torch.zeros(steps, steps, 3, 3, dtype=torch.float64)  # covariance of u_j and u_k
     for k in range(steps):

@@ -20,12 +20,8 @@ from .rules import FADING, GROUPS, PLAIN, SEARCHED, TRACKERS, TURNED, TURNED_FAD
 _RESET = ("skipped", "learned")  # what a stream that begins anew keeps
 
 
-class Views(dict[str, Tensor]):
-    """The part of the table that belongs to a stream, by name."""
-
-    def number(self, name: str) -> float:
-        """A part that is one number."""
-        return float(self[name])
+Views = dict[str, Tensor]
+"""The part of the table that belongs to a stream, by name."""
 
 
 class BankDefinition:
@@ -47,7 +43,7 @@ class BankDefinition:
 
     def each(self, table: Tensor) -> list[Views]:
         """Return the streams of a table."""
-        return [Views(parts(self.shape, row)) for row in table]
+        return [parts(self.shape, row) for row in table]
 
     def clear(self, s: Views) -> None:
         """Begin anew."""
@@ -95,7 +91,7 @@ class BankDefinition:
     def predict(self, s: Views, x: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and standard deviation at x (n,): (K,), (K,)."""
         x = torch.where(torch.isnan(x), s["last_x"], x)
-        if s.number("count") == 0:
+        if float(s["count"]) == 0:
             return torch.zeros_like(s["mean"]), torch.ones_like(s["mean"])
         self._ask(s, x)
         center, spread = (part[self.shape.dim :] for part in self._units(s))
@@ -109,7 +105,7 @@ class BankDefinition:
         line = (s["linear"] * u).sum(-1)
         process = self._local_processes(s, x, u[1:], line)
         carried = self.filter.moments(self._filters(s), u[1:].expand(len(r.carried_forgetting), -1))
-        latest = s["waiting_y" if s.number("waiting") == 1 else "last_y"]
+        latest = s["waiting_y" if float(s["waiting"]) == 1 else "last_y"]
         last = ((latest - center[n:]) / spread[n:])[:, None]
         common = (1 + (u * (s["covariance"] * u).sum(-1)).sum()).expand_as(last)
         features = quadratic_features(u[1:], self.shape.features)
@@ -139,7 +135,7 @@ class BankDefinition:
 
     def _local_processes(self, s: Views, x: Tensor, u: Tensor, line: Tensor) -> tuple[Tensor, Tensor]:
         """Means and variances of the 24 local processes of what the linear model leaves: (K, 24), (K, 24)."""
-        r, n, count = self.rules, self.shape.dim, int(s.number("count"))
+        r, n, count = self.rules, self.shape.dim, int(float(s["count"]))
         latest = s["order"][:count].argsort(descending=True)
         nearest = latest[self._apart(s, s["x"][:count][latest], x).argsort(stable=True)]
         center, spread = self._units(s)
@@ -185,7 +181,7 @@ class BankDefinition:
 
     def _rescale(self, s: Views) -> None:
         """Units from the samples in the store, which has all of them; the carried models relearn."""
-        count = int(s.number("count"))
+        count = int(float(s["count"]))
         samples = torch.cat((s["x"], s["y"]), 1)[:count]
         center, spread = units_of(samples)
         spread = torch.where(spread > 1e-150, spread, 1.0)
@@ -221,13 +217,13 @@ class BankDefinition:
         if not bool((both.abs() < 1e150).all()):
             return True
         # young units may be tiny: squares must be numbers
-        most = self.rules.far if s.number("clock") >= 40 else 1e100
+        most = self.rules.far if float(s["clock"]) >= 40 else 1e100
         near = (both - s["center"]).abs() < most * s["spread"]
-        return s.number("clock") >= 2 and not bool(near.all())
+        return float(s["clock"]) >= 2 and not bool(near.all())
 
     def _keep(self, s: Views, x: Tensor, y: Tensor, time: float) -> None:
         """Keep (x, y). A full store gives up the older of the closest pair of those that are not recent."""
-        old, count = s.number("clock") - self.rules.recent, int(s.number("count"))
+        old, count = float(s["clock"]) - self.rules.recent, int(float(s["count"]))
         order, gap = s["order"], s["gap"]
         if count < self.shape.capacity:
             slot, count = count, count + 1
@@ -262,8 +258,8 @@ class BankDefinition:
         if not bool(sound):
             s["skipped"].add_(1)
             return
-        known = s.number("count") > 0
-        if known and not (s.number("answered") and bool((x == s["asked"]).all())):
+        known = float(s["count"]) > 0
+        if known and not (float(s["answered"]) and bool((x == s["asked"]).all())):
             self._ask(s, x)
         center, spread = (part[self.shape.dim :] for part in self._units(s))
         # the first value of an output says nothing of predictions
@@ -272,29 +268,29 @@ class BankDefinition:
         y = torch.where(judged, told, s["mean"] * spread + center)
         s["answered"].zero_()
         s["far"].copy_(s["far"] + 1 if self._beyond(s, x, y) else 0 * s["far"])
-        if s.number("far") >= STREAK:  # the stream has gone elsewhere for good
+        if float(s["far"]) >= STREAK:  # the stream has gone elsewhere for good
             time = s["time"].clone()
             self.clear(s)
             s["last_x"].copy_(x)
             s["time"].copy_(time)
             s["far"].fill_(float(STREAK) if self._beyond(s, x, y) else 0.0)
-        elif known and s.number("far") == 0:
-            lapse = s.number("unlearned")
+        elif known and float(s["far"]) == 0:
+            lapse = float(s["unlearned"])
             s["unlearned"].zero_()
             since = self._waits(s, x, y, judged, lapse)
             if since is None:
                 return
             lapse = since
-            judge(self.rules, s, (y - center) / spread, judged, s.number("clock"))
-        if s.number("far") > 0:
+            judge(self.rules, s, (y - center) / spread, judged, float(s["clock"]))
+        if float(s["far"]) > 0:
             s["skipped"].add_(1)
             return
         s["unlearned"].zero_()
         # until now nothing was known of these: they count as if they had always been so
         y = torch.where(first, told, y)
-        s["y"][: int(s.number("count"))] = torch.where(first, told, s["y"][: int(s.number("count"))])
+        s["y"][: int(float(s["count"]))] = torch.where(first, told, s["y"][: int(float(s["count"]))])
         self._notice(s, y, seen)
-        self._accept(s, x, y, s.number("time"), lapse, anew=bool(first.any()))
+        self._accept(s, x, y, float(s["time"]), lapse, anew=bool(first.any()))
 
     def _waits(self, s: Views, x: Tensor, y: Tensor, seen: Tensor, lapse: float) -> float | None:
         """Time since the last sample that was learned, or None where this one waits.
@@ -306,10 +302,10 @@ class BankDefinition:
         away = ((y - center) / spread - s["mean"]).abs()
         most = torch.where(away > r.outside, r.doubtful_outside, r.doubtful).to(away)
         doubtful = bool((seen & (away > most * torch.maximum(s["variance"], s["pace"]).sqrt())).any())
-        waiting, rare = s.number("waiting") == 1, s.number("doubted") < r.rare
+        waiting, rare = float(s["waiting"]) == 1, float(s["doubted"]) < r.rare
         s["waiting"].zero_()
         s["doubted"].add_(r.doubted_rate * (float(doubtful) - s["doubted"]))
-        if doubtful and rare and s.number("clock") >= r.settled and s.number("trust") == 0:
+        if doubtful and rare and float(s["clock"]) >= r.settled and float(s["trust"]) == 0:
             if not waiting:
                 for name, value in (("x", x), ("y", y), ("time", s["time"])):
                     s[f"waiting_{name}"].copy_(value)
@@ -318,14 +314,14 @@ class BankDefinition:
                 return None
             s["trust"].fill_(float(STREAK))
             self._notice(s, s["waiting_y"], torch.zeros_like(seen))
-            when = s.number("waiting_time"), s.number("waiting_lapse")
+            when = float(s["waiting_time"]), float(s["waiting_lapse"])
             self._accept(s, s["waiting_x"].clone(), s["waiting_y"].clone(), *when)
             return lapse
         s["trust"].sub_(1.0).clamp_(min=0.0)
         if not waiting:
             return lapse
         s["skipped"].add_(1)
-        return s.number("waiting_lapse") + lapse
+        return float(s["waiting_lapse"]) + lapse
 
     def _notice(self, s: Views, y: Tensor, measured: Tensor) -> None:
         """The range of y, of outputs that are measured now or have been before."""
@@ -338,8 +334,8 @@ class BankDefinition:
         s["clock"].add_(1)
         s["learned"].add_(1)
         self._keep(s, x, y, time)
-        anew = anew or s.number("clock") in self.rules.learned_at
-        if anew and s.number("clock") <= self.shape.capacity:
+        anew = anew or float(s["clock"]) in self.rules.learned_at
+        if anew and float(s["clock"]) <= self.shape.capacity:
             self._rescale(s)
         else:
             self._carry(s, x, y, lapse)
