@@ -212,7 +212,7 @@ MODULES: dict[str, Case] = {
     "FoldedRollout": Case(lambda s: FoldedRollout(rollout(s))),
 }
 OTHERS = {
-    *("ConventionModule", "FunctionPlant", "StepPlant", "RatePlant", "SampledProblem"),
+    *("FunctionPlant", "StepPlant", "RatePlant", "SampledProblem"),
     *("GlobalValue", "BoxFilter", "SafetyFilter", "DetourPlans", "DetourRollout", "FilteredPolicy"),
     *("PlanReplay", "RememberedPolicy", "AmongDiscs", "RecedingHorizon", "PathIntegral", "MujocoPlant"),
     *("EnvironmentPlant", "EnergyShaping", "NearOptimal", "SampledRollout", "StrainedPlans"),

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from ..centers import StateFollowingCenters
 from ..kernels import Kernel
 from ..local_basis import Degrees, LocalBasis, LocalSpace
 from ..numerics.checks import sampled, trailing
-from .coefficient_format import ConventionModule, record
+from .coefficient_format import compare, decode, encode, record
 
 Target = Callable[[Tensor], Tensor]
 """A function V to approximate: points (..., n) to values (...)."""
@@ -52,7 +52,7 @@ class GramStructure(NamedTuple):
         return quadratic
 
 
-class StaFBasis(ConventionModule):
+class StaFBasis(nn.Module):
     """The StaF basis sigma_i(y; x) = k(y, c_i(x)), i = 1..M.
 
     Example:
@@ -64,7 +64,9 @@ class StaFBasis(ConventionModule):
         Shown by `staf experiment=gradient_chase`.
 
     Hyperparameters that kernel, centers and radius were given as `nn.Parameter` are learned, others fixed.
-    A buffer named convention says in a state_dict what coefficients beside it mean.
+    A buffer named convention says in a state_dict what coefficients beside it mean: one with a convention is
+    loaded where it means the module's own functions; one without, of directions alone, makes the module
+    choose its local basis anew.
 
     Args:
         kernel: the kernel k.
@@ -76,6 +78,9 @@ class StaFBasis(ConventionModule):
 
     Source: Rosenfeld et al., section 2.
     """
+
+    _choose_again = False  # whether directions came without what fixes their local basis
+    convention: Tensor
 
     def __init__(self, kernel: Kernel, centers: StateFollowingCenters) -> None:
         super().__init__()
@@ -93,7 +98,8 @@ class StaFBasis(ConventionModule):
         self.kernel = kernel
         self.centers = centers
         self._local_basis = LocalBasis(kernel, centers.directions)
-        self._keep_convention()
+        self.register_buffer("convention", encode(self._record()))
+        self.register_load_state_dict_post_hook(StaFBasis._after_loading)  # type: ignore[no-untyped-call]
         self._prepare()
 
     @property
@@ -181,14 +187,49 @@ class StaFBasis(ConventionModule):
         excess: Tensor = torch.linalg.vecdot(difference, product)
         return excess
 
+    def check_convention(self, call: str, stored: Tensor) -> None:
+        """Refuse coefficients that were saved with a `convention` in which they mean another function.
+
+        Args:
+            call: the function that was called, for the message.
+            stored: the `convention` that was saved.
+
+        Raises:
+            ValueError: if they mean another function here, and why.
+        """
+        compare(call, decode(call, stored), self._record())
+
     def _record(self) -> dict[str, Any]:
         return record(self.kernel, self.centers, self._local_basis.kind, self._local_basis.degrees)
 
-    def _adopt(self, saved: dict[str, Any] | None) -> None:
-        if saved is None:
-            self._local_basis = LocalBasis(self.kernel, self.centers.directions)
-        elif "degrees" in saved:
-            self._local_basis.degrees = Degrees.of(saved["degrees"])
-
     def _prepare(self) -> None:
+        """Set up what depends on fixed tensors alone, again whenever others are loaded."""
         self._local_basis.prepare(self.kernel, self.centers)
+
+    def _load_from_state_dict(
+        self, state_dict: dict[str, Any], prefix: str, *arguments: Any, **keywords: Any
+    ) -> None:
+        key = f"{prefix}convention"
+        self._choose_again = key not in state_dict and f"{prefix}centers.directions" in state_dict
+        if key in state_dict:
+            call, stored = f"{type(self).__name__}.load_state_dict", state_dict[key]
+            self.check_convention(call, stored)
+            saved = decode(call, stored)
+            if "degrees" in saved:
+                self._local_basis.degrees = Degrees.of(saved["degrees"])
+            device = stored.device if self.convention.is_meta else self.convention.device
+            state_dict[key] = self.convention = encode(saved).to(device)
+        super()._load_from_state_dict(state_dict, prefix, *arguments, **keywords)
+
+    @staticmethod
+    def _after_loading(module: nn.Module, _: object) -> None:
+        assert isinstance(module, StaFBasis)
+        if module._choose_again:
+            module._local_basis = LocalBasis(module.kernel, module.centers.directions)
+            module.convention = encode(module._record()).to(module.convention.device)
+        module._prepare()
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
+        self._prepare()  # in the new dtype, on the new device
+        return self

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import abc
 import json
-from collections.abc import Callable
-from typing import Any, Self
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -24,74 +22,6 @@ _COMPARED = {
     "centers": "number of centers and states",
     "basis": "local basis",
 }
-
-
-class ConventionModule(nn.Module, abc.ABC):
-    """A module whose buffer `convention` says in a state_dict what coefficients beside it mean.
-
-    A state_dict with a convention is loaded where it means the module's own functions; one without, of
-    directions alone, makes the module choose its local basis anew.
-    """
-
-    _choose_again = False  # whether directions came without what fixes their local basis
-    convention: Tensor
-
-    @abc.abstractmethod
-    def _record(self) -> dict[str, Any]:
-        """Return what coefficients mean here: see `record`."""
-
-    @abc.abstractmethod
-    def _adopt(self, saved: dict[str, Any] | None) -> None:
-        """Take over the local basis of a saved record; None: choose the one of the present directions."""
-
-    @abc.abstractmethod
-    def _prepare(self) -> None:
-        """Set up what depends on fixed tensors alone, again whenever others are loaded."""
-
-    def check_convention(self, call: str, stored: Tensor) -> None:
-        """Refuse coefficients that were saved with a `convention` in which they mean another function.
-
-        Args:
-            call: the function that was called, for the message.
-            stored: the `convention` that was saved.
-
-        Raises:
-            ValueError: if they mean another function here, and why.
-        """
-        compare(call, decode(call, stored), self._record())
-
-    def _keep_convention(self) -> None:
-        """Register the buffer, once everything that the record tells is there."""
-        self.register_buffer("convention", encode(self._record()))
-        self.register_load_state_dict_post_hook(ConventionModule._after_loading)  # type: ignore[no-untyped-call]
-
-    def _load_from_state_dict(
-        self, state_dict: dict[str, Any], prefix: str, *arguments: Any, **keywords: Any
-    ) -> None:
-        key = f"{prefix}convention"
-        self._choose_again = key not in state_dict and f"{prefix}centers.directions" in state_dict
-        if key in state_dict:
-            call = f"{type(self).__name__}.load_state_dict"
-            self.check_convention(call, state_dict[key])
-            saved = decode(call, state_dict[key])
-            self._adopt(saved)
-            stored = state_dict[key]
-            device = stored.device if self.convention.is_meta else self.convention.device
-            state_dict[key] = self.convention = encode(saved).to(device)
-        super()._load_from_state_dict(state_dict, prefix, *arguments, **keywords)
-
-    @staticmethod
-    def _after_loading(module: nn.Module, _: object) -> None:
-        assert isinstance(module, ConventionModule)
-        if module._choose_again:
-            module._adopt(None)
-            module.convention = encode(module._record()).to(module.convention.device)
-        module._prepare()
-
-    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
-        super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
-        self._prepare()  # in the new dtype, on the new device
-        return self
 
 
 def record(
