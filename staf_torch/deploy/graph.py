@@ -71,7 +71,9 @@ def fold(graph: fx.GraphModule) -> fx.GraphModule:
         if node.op == "get_attr":
             known[node] = operator.attrgetter(str(node.target))(graph)
         elif node.op == "call_function" and all(parent in known for parent in node.all_input_nodes):
-            if not node.all_input_nodes and not _returns_tensor(node):
+            made = node.meta.get("val")
+            fixed = isinstance(made, Tensor) and not any(isinstance(n, torch.SymInt) for n in made.shape)
+            if not node.all_input_nodes and not fixed:
                 continue
             args, kwargs = fx.map_arg((node.args, node.kwargs), known.__getitem__)
             assert callable(node.target)
@@ -96,12 +98,6 @@ def fold(graph: fx.GraphModule) -> fx.GraphModule:
             delattr(graph, name)
     graph.recompile()
     return graph
-
-
-def _returns_tensor(node: fx.Node) -> bool:
-    return isinstance(node.meta.get("val"), Tensor) and not any(
-        isinstance(size, torch.SymInt) for size in node.meta["val"].shape
-    )
 
 
 _ATEN = torch.ops.aten

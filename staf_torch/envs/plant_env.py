@@ -13,7 +13,6 @@ from torch import Tensor
 
 from ..adp import Cost
 from ..numerics.checks import integer, positive_real
-from ..systems import ControlAffineSystem
 from .episodes import (
     NAMES,
     Episodes,
@@ -80,7 +79,7 @@ class PlantEnv(gymnasium.Env):
         self.episodes = Episodes(
             self.plant, self.cost, 1, dt=dt, horizon=horizon, limit=limit, penalty=penalty
         )
-        self.spread = _spread("PlantEnv", self.plant, spread)
+        self.spread = positive_real("PlantEnv", "spread", self.plant.spread if spread is None else spread)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -156,7 +155,9 @@ class PlantVectorEnv(VectorEnv):
         self.episodes = Episodes(
             self.plant, self.cost, num_envs, dt=dt, horizon=horizon, limit=limit, penalty=penalty
         )
-        self.spread = _spread("PlantVectorEnv", self.plant, spread)
+        self.spread = positive_real(
+            "PlantVectorEnv", "spread", self.plant.spread if spread is None else spread
+        )
         self._generators: list[np.random.Generator] = []
         self._over = torch.zeros(num_envs, dtype=torch.bool)
 
@@ -238,7 +239,3 @@ def register_plants() -> None:
                 vector_entry_point="staf_torch.envs:PlantVectorEnv",
                 kwargs={} if plant is None else {"plant": plant},
             )
-
-
-def _spread(call: str, plant: ControlAffineSystem, stated: float | None) -> float:
-    return positive_real(call, "spread", plant.spread if stated is None else stated)

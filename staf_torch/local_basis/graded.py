@@ -178,7 +178,8 @@ class GradedSpace(NamedTuple):
     @property
     def offsets(self) -> Tensor:
         """d = nu u, (..., M, n), or (M, n) for all states."""
-        return self._offsets()
+        # As centers.offsets: a compiler then knows them equal.
+        return self.nu[..., None, None] * self.directions
 
     @property
     def rank(self) -> Tensor:
@@ -192,7 +193,7 @@ class GradedSpace(NamedTuple):
         if bound is not None:
             bound = self.rate * (bound * self.basis.reach).square()
         interpolation = Interpolation.of(self.basis, self._r2(), bound)
-        offsets = self._offsets()
+        offsets = self.offsets
 
         def solve(values: Tensor, state: Tensor) -> Tensor:
             return interpolation.solve(scale(self.kernel, state, offsets, -1.0) * values)
@@ -223,7 +224,7 @@ class GradedSpace(NamedTuple):
         Not finite where r^(-2 k_j) is not.
         """
         b = (coefficients * self._unscale()) @ self.basis.functionals.to(coefficients).mT
-        return b * scale(self.kernel, self.state, self._offsets(), -1.0)
+        return b * scale(self.kernel, self.state, self.offsets, -1.0)
 
     def weights(self, coefficients: Tensor) -> Tensor:
         """The paper's w: (..., M) -> (..., M); NaN in a row where it cannot be represented."""
@@ -231,14 +232,10 @@ class GradedSpace(NamedTuple):
 
     def coefficients(self, weights: Tensor) -> Tensor:
         """beta from the paper's w: (..., M) -> (..., M)."""
-        b = to_scaled(self.kernel, self.state, weights) * scale(self.kernel, self.state, self._offsets())
+        b = to_scaled(self.kernel, self.state, weights) * scale(self.kernel, self.state, self.offsets)
         full = self.basis.functionals  # orthogonal columns
         inverse = full / full.square().sum(0)
         return b @ inverse.to(b) / self._unscale()
-
-    def _offsets(self) -> Tensor:
-        # As centers.offsets: a compiler then knows them equal.
-        return self.nu[..., None, None] * self.directions
 
     def _r2(self) -> Tensor:
         """r^2 = q nu^2, (...) or ()."""

@@ -110,20 +110,18 @@ class StateErrorPass:
 
         worst = reduce(errors, fixed.over(x), "max", dim=x.dim() - 1)
         kappa = condition_number(basis.gram_structure(x).scaled())
+
+        def local(z: Tensor) -> Tensor:
+            return evaluate_scaled(basis.kernel, offsets, x, z.unsqueeze(-2), coefficients)
+
+        approximate, exact = _gradient(local, torch.zeros_like(x)), _gradient(target, x.detach())
         return StateErrors(
             ball_error=worst[..., 0],
             ball_floor_error=worst[..., 1],
-            gradient_error=self._gradient_error(x, offsets, coefficients),
+            gradient_error=(exact - approximate).square().sum(-1).sqrt(),
             condition_number=kappa.expand(x.shape[:-1]),
             native_square=(ideal * values).sum(-1),
         )
-
-    def _gradient_error(self, x: Tensor, offsets: Tensor, coefficients: Tensor) -> Tensor:
-        def estimate(z: Tensor) -> Tensor:
-            return evaluate_scaled(self._basis.kernel, offsets, x, z.unsqueeze(-2), coefficients)
-
-        approximate, exact = _gradient(estimate, torch.zeros_like(x)), _gradient(self._target, x.detach())
-        return (exact - approximate).square().sum(-1).sqrt()
 
 
 def _gradient(function: Target, at: Tensor) -> Tensor:

@@ -50,8 +50,12 @@ def trajectory(
     total = integer("trajectory", "steps", steps, least=0) + 1
     size = total if chunk is None else integer("trajectory", "chunk", chunk, least=1)
     flow = getattr(system, "flow", None)  # a user's module need not have one
-    x = x0
-    program = _program(system, dt, compile=worth(total * (1 + len(x0) / 200) >= _PAYS))
+
+    def step(x: Tensor, now: Tree, row: Tree) -> tuple[Tensor, Tensor]:
+        return runge_kutta_step(lambda at: _drift(system, at), x, dt), x  # the state before every step
+
+    pays, x = worth(total * (1 + len(x0) / 200) >= _PAYS), x0
+    program = shared_program("a trajectory", step, system, dt) if pays else Program(step, compile=False)
     for start in range(0, total, size):
         stop = min(start + size, total)
         time = torch.arange(start, stop, dtype=torch.float64) * dt
@@ -75,15 +79,6 @@ def simulate(system: ControlAffineSystem, x0: Tensor, *, dt: float, steps: int) 
     """
     (states,) = trajectory(system, x0, dt=dt, steps=steps)
     return states
-
-
-def _program(system: ControlAffineSystem, dt: float, compile: bool) -> Program:
-    """Return the Runge-Kutta steps of a plant, which record the state before every step."""
-
-    def step(x: Tensor, now: Tree, row: Tree) -> tuple[Tensor, Tensor]:
-        return runge_kutta_step(lambda at: _drift(system, at), x, dt), x
-
-    return shared_program("a trajectory", step, system, dt) if compile else Program(step, compile=False)
 
 
 def _drift(system: ControlAffineSystem, x: Tensor) -> Tensor:
