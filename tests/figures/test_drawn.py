@@ -132,6 +132,29 @@ def of_gain_sets() -> Drawn:
     return Drawn(closed_loop.draw_gain_sets(sets), shown, panels, ["integral", "derivative"] * 3)
 
 
+def of_a_convergence() -> Drawn:
+    step, values = np.array([0.01, 0.02, 0.05]), (wave(3), wave(3) + 1)
+    slopes = zip("ab", values, (1.97, None), strict=True)
+    figure = chase.draw_convergence([chase.ConvergenceCurve(n, step, v, slope) for n, v, slope in slopes])
+    panels = ["ultimate excess before the correction"]
+    return Drawn(figure, [(step, each) for each in values], panels, ["a: 2.0", "b: -"])
+
+
+def of_layouts() -> Drawn:
+    """By family, and the first four of one against the radius."""
+    tried = [*(("rings", count) for count in (3, 6, 10, 15, 21)), ("polygon", 3), ("simplex", 3)]
+    radii, errors = np.array([0.1, 0.2]), [wave(2) + k for k in range(7)]
+    found = [
+        theory.LayoutCurve(*each, 2, 1e-3 * (k + 1), errors[k], None if k else 2.0)
+        for k, each in enumerate(tried)
+    ]
+    shown = [([3, 6, 10, 15, 21], 1e-3 * np.arange(1, 6)), ([3], np.array([6e-3])), ([3], np.array([7e-3]))]
+    shown += [(radii, errors[k]) for k in (0, 1, 2, 3, 5)]
+    names = ["rings", "polygon", "simplex", "rings, 3: 2.00", *(f"rings, {n}: -" for n in (6, 10, 15))]
+    panels = [r"$\sup\,|V - \hat V|$ on the ball", ""]
+    return Drawn(theory.draw_layouts(found, 0.2, radii), shown, panels, [*names, "polygon, 3: -"])
+
+
 FIGURES: dict[str, Callable[[], Drawn]] = {
     "a chase": lambda: of_a_chase(2),
     "a chase of many centers": lambda: of_a_chase(7),
@@ -144,6 +167,8 @@ FIGURES: dict[str, Callable[[], Drawn]] = {
     "a box": of_a_box,
     "faults": of_faults,
     "gain sets": of_gain_sets,
+    "a convergence": of_a_convergence,
+    "layouts": of_layouts,
 }
 
 
@@ -158,19 +183,6 @@ def test_a_figure_has_a_curve_for_all_that_it_was_given_and_names_it(name: str) 
         for y in np.asarray(values).reshape(len(values), -1).T:
             here = [line for line in drawn if len(line[1]) == len(x) and np.allclose(line[1], x)]
             assert any(np.allclose(line[2], y, equal_nan=True) for line in here), y
-
-
-def test_the_curves_of_a_convergence_are_named_with_their_slopes() -> None:
-    step = np.array([0.01, 0.02, 0.05])
-    found = [
-        chase.ConvergenceCurve("a", step, wave(3), 1.97),
-        chase.ConvergenceCurve("b", step, wave(3) + 1, None),
-    ]
-    (axes,) = visible(chase.draw_convergence(found))
-    names = "step $\\Delta t$ (s)", "ultimate excess before the correction"
-    holds(axes, [("a: 2.0", step, wave(3)), ("b: -", step, wave(3) + 1)], names, scales=LOG)
-    assert [label.get_text() for label in axes.get_xticklabels()] == ["0.01", "0.02", "0.05"]
-    assert legend(axes) == ["a: 2.0", "b: -"]
 
 
 def test_a_comparison_counts_states_up_to_a_multiple_of_the_optimal_cost() -> None:
@@ -228,35 +240,6 @@ def test_feasibility_is_drawn_along_the_arc_or_over_time(circle: bool) -> None:
     titles = [axes.get_title(loc="left") for axes in (left, right)]
     assert titles == ["(a) at each state, $r = 0.5$", "(b) along the whole trajectory"]
     assert legend(figure) == list(labels)
-
-
-def test_layouts_are_drawn_by_family_and_the_first_four_against_the_radius() -> None:
-    radii = np.array([0.1, 0.2])
-    tried = [
-        ("rings", 3),
-        ("rings", 6),
-        ("rings", 10),
-        ("rings", 15),
-        ("rings", 21),
-        ("polygon", 3),
-        ("simplex", 3),
-    ]
-    found = [
-        theory.LayoutCurve(family, count, 2, 1e-3 * (k + 1), wave(2) + k, None if k else 2.0)
-        for k, (family, count) in enumerate(tried)
-    ]
-    left, right = visible(theory.draw_layouts(found, 0.2, radii))
-    rings = [3, 6, 10, 15, 21], [1e-3, 2e-3, 3e-3, 4e-3, 5e-3]
-    names = "centers $M$", r"$\sup\,|V - \hat V|$ on the ball"
-    holds(left, [("rings", *rings), ("polygon", [3], [6e-3]), ("simplex", [3], [7e-3])], names, scales=LOG)
-    curves = [
-        (f"{family}, {count}: {'-' if k else '2.00'}", radii, wave(2) + k)
-        for k, (family, count) in enumerate(tried)
-        if k not in (4, 6)
-    ]
-    holds(right, curves, ("radius $r$ of the ball", ""), scales=LOG)
-    assert [axes.get_title(loc="left") for axes in (left, right)] == ["(a) $r = 0.2$", "(b) slopes in $r$"]
-    assert [label.get_text() for label in left.get_xticklabels()] == ["3", "6", "10", "15", "21"]
 
 
 def test_a_failure_is_a_mark_and_an_exact_result_a_tenth_of_rounding() -> None:

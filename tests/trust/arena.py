@@ -78,6 +78,14 @@ class Arena:
         change(found)
         (self.many / path).write_text(json.dumps(found))
 
+    def override(self, job: int, text: str) -> None:
+        """One more override of a job."""
+        self.json(f"{job}/run.json", lambda found: found["overrides"].append(text))
+
+    def swept(self, *texts: str) -> None:
+        """More overrides of the sweep."""
+        self.json("sweep.json", lambda found: found["overrides"].extend(texts))
+
     def line(self, text: str) -> Attack:
         """One more of Hydra's own lines in the sweep, and the sweep taken up again."""
         self.json("sweep.json", lambda found: found["hydra"].append(text))

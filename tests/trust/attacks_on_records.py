@@ -68,25 +68,21 @@ def settings_nine_hundred_deep(arena: Arena) -> Attack:
 def a_group_in_the_place_of_a_callback(arena: Arena) -> Attack:
     """Hydra's packages put a group of settings where its own callbacks stand, without a word of `hydra.`."""
     arena.module(arena.cwd)
-    arena.json("sweep.json", lambda found: found["overrides"].append("+target@hydra.callbacks.more=custom"))
+    arena.swept("+target@hydra.callbacks.more=custom")
     return arena.line("hydra.callbacks={more: {_target_: evil_mod.V}, staf: {_target_: evil_mod.V}}")
 
 
 @attack
 def a_grammar_that_takes_for_ever(arena: Arena) -> Attack:
     deep = "[" * 4000 + "]" * 4000
-    arena.json("sweep.json", lambda found: found["overrides"].append(f"+note={deep}"))
-    arena.json(
-        "sweep.json", lambda found: found["overrides"].append("+more=" + "sort(" * 400 + "1" + ")" * 400)
-    )
+    arena.swept(f"+note={deep}")
+    arena.swept("+more=" + "sort(" * 400 + "1" + ")" * 400)
     return arena.resume()
 
 
 @attack
 def a_product_of_forty_choices(arena: Arena) -> Attack:
-    arena.json(
-        "sweep.json", lambda found: found["overrides"].extend(f"+key{k}=choice(0,1,2,3)" for k in range(40))
-    )
+    arena.swept(*(f"+key{k}=choice(0,1,2,3)" for k in range(40)))
     return arena.resume()
 
 

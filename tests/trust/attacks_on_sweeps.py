@@ -45,7 +45,7 @@ def overrides_of_a_job_alone(arena: Arena) -> Attack:
 
 @attack
 def the_environment_in_an_override(arena: Arena) -> Attack:
-    arena.json("sweep.json", lambda found: found["overrides"].append("+note=${oc.env:STAF_SECRET}"))
+    arena.swept("+note=${oc.env:STAF_SECRET}")
     return arena.resume()
 
 
@@ -55,7 +55,7 @@ def a_path_as_the_experiment(arena: Arena) -> Attack:
     folder = arena.many / "conf"
     folder.mkdir()
     (folder / "x.yaml").write_text("# @package _global_\ntask: evil_mod.V\n")
-    arena.json("sweep.json", lambda found: found["overrides"].append(f"experiment=../../..{folder}/x"))
+    arena.swept(f"experiment=../../..{folder}/x")
     return arena.resume()
 
 

@@ -44,9 +44,7 @@ def formulas_of_every_kind(arena: Arena) -> Attack:
         " =1+1",
     )
     for job in range(3):
-        arena.json(
-            f"{job}/run.json", lambda found, job=job: found["overrides"].append(f"kernel={values[job]}")
-        )
+        arena.override(job, f"kernel={values[job]}")
         arena.json(f"{job}/metrics.json", lambda found, job=job: found.__setitem__(values[job + 3], 1.0))
     arena.json("2/run.json", lambda found: found.update(status="failed", reason=values[6]))
 
@@ -64,9 +62,7 @@ def formulas_of_every_kind(arena: Arena) -> Attack:
 def tex_in_caret_notation(arena: Arena) -> Attack:
     values = (r"^^5cinput{/etc/passwd}", r"\write18{touch x}", "%\n\\input{/etc/passwd}")
     for job in range(3):
-        arena.json(
-            f"{job}/run.json", lambda found, job=job: found["overrides"].append(f"kernel={values[job]}")
-        )
+        arena.override(job, f"kernel={values[job]}")
     arena.json("0/run.json", lambda found: found.update(status="failed", reason="x\n\\input{/etc/passwd}"))
 
     def check(arena: Arena, result: Any) -> str | None:
@@ -81,9 +77,7 @@ def tex_in_caret_notation(arena: Arena) -> Attack:
 def links_and_scripts_in_markdown(arena: Arena) -> Attack:
     values = ("[x](javascript:alert(1))", "![x](http://h.example/p.png)", "<img src=x onerror=alert(1)>")
     for job in range(3):
-        arena.json(
-            f"{job}/run.json", lambda found, job=job: found["overrides"].append(f"kernel={values[job]}")
-        )
+        arena.override(job, f"kernel={values[job]}")
     arena.json("0/metrics.json", lambda found: found.__setitem__("a|b\n\n<script>alert(1)</script>\n", 1.0))
     arena.json(
         "1/run.json",
