@@ -37,13 +37,15 @@ def test_the_local_basis_has_the_order_of_its_layout() -> None:
 
 @pytest.mark.parametrize("dim", [1, 2, 3])
 def test_a_layout_of_order_k_has_as_many_centers_as_polynomials_below_it(dim: int) -> None:
-    for each in theorems.all_layouts(dim):
+    layouts = theorems.all_layouts(dim)
+    for each in layouts:
         assert each.directions.shape[1] == dim
         assert len(each.directions) <= 130
         if each.family in ("ball", "rings"):
             assert len(each.directions) == math.comb(dim + each.order - 1, dim)
-    families = {each.family for each in theorems.all_layouts(dim)}
-    assert families == {"ball", "simplex", "cross_polytope"} | ({"rings", "polygon"} if dim == 2 else set())
+    assert {each.family for each in layouts} == {"ball", "simplex", "cross_polytope"} | (
+        {"rings", "polygon"} if dim == 2 else set()
+    )
 
 
 def test_the_bound_of_the_paper_is_far_above_what_is_needed() -> None:
