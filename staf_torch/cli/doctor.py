@@ -54,11 +54,7 @@ def _findings() -> Iterator[tuple[str, str, bool]]:
     set_by = os.environ.get("OMP_NUM_THREADS", "not set")
     yield "threads", f"{torch.get_num_threads()} of torch, {cores} cores, OMP_NUM_THREADS {set_by}", True
     yield "gpu", torch.cuda.get_device_name(0) if torch.cuda.is_available() else "none", True
-    for name, place in (
-        ("cache", cache()),
-        ("runs", Path("runs")),
-        ("scratch", Path(tempfile.gettempdir())),
-    ):
+    for name, place in (("cache", cache()), ("runs", Path("runs")), ("scratch", Path(tempfile.gettempdir()))):
         yield name, *_place(place)
     yield "self-test", *_self_test()
 

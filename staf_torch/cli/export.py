@@ -24,12 +24,7 @@ from ..settings.chase import DTYPES
 from .deployable import Deployable, Learner, deployable, learning
 
 ENDINGS = {"onnx": ".onnx", "pt2": ".pt2", "aoti": ".aoti.pt2", "c": ".h"}
-_RUNTIMES = {
-    "onnx": "onnxruntime",
-    "pt2": "eager torch",
-    "aoti": "AOTInductor",
-    "c": "C by ctypes",
-}
+_RUNTIMES = {"onnx": "onnxruntime", "pt2": "eager torch", "aoti": "AOTInductor", "c": "C by ctypes"}
 _NEEDS: dict[str, Callable[[], object]] = {
     "onnx": formats.need_onnx,
     "aoti": formats.need_compiler,
@@ -180,11 +175,7 @@ def _page(
 
 
 def _write(
-    program: torch.export.ExportedProgram,
-    path: Path,
-    to: str,
-    found: Deployable,
-    origin: dict[str, object],
+    program: torch.export.ExportedProgram, path: Path, to: str, found: Deployable, origin: dict[str, object]
 ) -> formats.Run:
     names = [port.name for port in found.outputs]
     if to == "onnx":
@@ -210,12 +201,7 @@ def _write_c(
 
 
 def _measure(
-    call: formats.Run,
-    module: torch.nn.Module,
-    found: Deployable,
-    dtype: str,
-    batch: int | None,
-    calls: int,
+    call: formats.Run, module: torch.nn.Module, found: Deployable, dtype: str, batch: int | None, calls: int
 ) -> dict[str, Any]:
     names = [port.name for port in found.outputs]
     points = found.points.to(DTYPES[dtype])
