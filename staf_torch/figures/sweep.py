@@ -5,14 +5,17 @@ First the curves that the swept settings allow, and their points; then the pictu
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from ..results.files import grouped
 from ..results.reader import Collection, RecordedRun, identity
-from ..tables.aggregate import as_text, half_width, mean, rank
+from ..results.run import as_text
+from ..tables.aggregate import half_width, mean, rank
 from .style import WIDTH, colour, marker, page, subplots, ticks
 
 if TYPE_CHECKING:
@@ -89,7 +92,7 @@ def error_against_radius(found: Collection) -> list[Panel]:
 
 def rounding_floor(found: Collection) -> float | None:
     """Return the largest error that rounding of V alone explains in any of the runs."""
-    floors = [run.metrics.get(ROUNDING) for run in found.rows]
+    floors = (run.metrics.get(ROUNDING) for run in found.rows)
     return max((floor for floor in floors if floor is not None), default=None)
 
 
@@ -98,10 +101,7 @@ def heat_maps(found: Collection) -> list[HeatMap]:
     runs = _usable(found, METRIC)
     if not _several(runs, RADIUS) or not _several(runs, COUNT):
         return []
-    radii = tuple(
-        sorted({float(r) for run in found.rows if isinstance(r := run.setting(RADIUS), int | float)})
-    )
-    counts = tuple(sorted({c for run in found.rows if isinstance(c := run.setting(COUNT), int)}))
+    radii, counts = _values(found.rows, RADIUS), _values(found.rows, COUNT)
     maps = []
     for title, group in _panels(found, runs, (RADIUS, COUNT, SEED)):
         cells = []
@@ -109,7 +109,7 @@ def heat_maps(found: Collection) -> list[HeatMap]:
             row = _points([run for run in group if run.setting(COUNT) == count], RADIUS, METRIC)
             at = {point.x: point.middle for point in row}
             cells.append(tuple(at.get(radius) for radius in radii))
-        maps.append(HeatMap(title, radii, counts, tuple(cells)))
+        maps.append(HeatMap(title, tuple(radii), tuple(map(int, counts)), tuple(cells)))
     return maps
 
 
@@ -156,8 +156,12 @@ def _usable(found: Collection, metric: str) -> list[RecordedRun]:
 
 
 def _several(runs: Sequence[RecordedRun], key: str) -> bool:
-    numbers = {run.setting(key) for run in runs if isinstance(run.setting(key), int | float)}
-    return len(numbers) > 1
+    return len(_values(runs, key)) > 1
+
+
+def _values(runs: Sequence[RecordedRun], key: str) -> list[float]:
+    """The numbers that a setting has, in order."""
+    return sorted({value for run in runs if isinstance(value := run.setting(key), int | float)})
 
 
 def _panels(
@@ -178,21 +182,16 @@ def _agreeing(run: RecordedRun, keys: Sequence[str]) -> str:
 
 def _title(run: RecordedRun, keys: Sequence[str]) -> str:
     kernel = as_text(run.setting(KERNEL))
-    if not keys:
-        return f"{_NAMES.get(kernel, kernel)} kernel" if run.setting(KERNEL) else ""
-    named = [key for key in keys if key != KERNEL]
-    parts = [f"{_NAMES.get(kernel, kernel)} kernel"] if KERNEL in keys else []
-    return ", ".join(parts + [f"{key} = {as_text(run.setting(key))}" for key in named])
+    named = KERNEL in keys or (not keys and run.setting(KERNEL))
+    parts = [f"{_NAMES.get(kernel, kernel)} kernel"] if named else []
+    return ", ".join(parts + [f"{key} = {as_text(run.setting(key))}" for key in keys if key != KERNEL])
 
 
 def _split(
     runs: Sequence[RecordedRun], key: Callable[[RecordedRun], object]
 ) -> list[tuple[object, list[RecordedRun]]]:
     """By a key: numbers in order, then the others as they came."""
-    groups: dict[object, list[RecordedRun]] = {}
-    for run in runs:
-        groups.setdefault(key(run), []).append(run)
-    return sorted(groups.items(), key=lambda item: rank(item[0]))  # type: ignore[arg-type]
+    return sorted(grouped(runs, key).items(), key=lambda item: rank(item[0]))  # type: ignore[arg-type]
 
 
 def _points(runs: Sequence[RecordedRun], key: str, metric: str) -> tuple[Point, ...]:
@@ -205,15 +204,10 @@ def _points(runs: Sequence[RecordedRun], key: str, metric: str) -> tuple[Point, 
 
 
 def _costs(runs: Sequence[RecordedRun], by_count: bool) -> tuple[Point, ...]:
-    points = []
-    for _, group in _split(runs, lambda run: _agreeing(run, _OF_COST[:-1])):
-        points.append(
-            _point(
-                _work(group[0], by_count),
-                [error for run in group if (error := run.metrics[METRIC]) is not None],
-            )
-        )
-    return tuple(sorted(points))
+    groups = grouped(runs, lambda run: _agreeing(run, _OF_COST[:-1])).values()
+    errors = [[error for run in group if (error := run.metrics[METRIC]) is not None] for group in groups]
+    works = [_work(group[0], by_count) for group in groups]
+    return tuple(sorted(map(_point, works, errors)))
 
 
 def _point(x: float, errors: Sequence[float]) -> Point:
@@ -233,10 +227,8 @@ def draw_error_against_radius(panels: Sequence[Panel], rounding: float | None) -
         rounding: the error that rounding of V alone explains; a line, where it is not far below the data,
             and in the legend with its number.
     """
-    with page(*_size(len(panels))) as figure:
-        grid = subplots(figure, len(panels), min(len(panels), _COLUMNS), sharey=True)
+    with _errors(panels) as (figure, grid):
         for axes, shown in zip(grid, panels, strict=True):
-            _lines(axes, shown)
             ticks(axes, "x", sorted({point.x for curve in shown.curves for point in curve.points}))
             axes.set_xlabel("radius $r$ of the ball")
         if any(curve.floor for shown in panels for curve in shown.curves):
@@ -246,7 +238,6 @@ def draw_error_against_radius(panels: Sequence[Panel], rounding: float | None) -
             for axes in grid:
                 floor = axes.axhline(rounding, color="0.4", linestyle=_ROUNDING, linewidth=0.9)
                 floor.set_label(rf"rounding, $\varepsilon\,\max|V|$ = {rounding:.0e}{far}")
-        _finish(figure, grid, panels)
     return figure
 
 
@@ -257,12 +248,8 @@ def draw_cost_against_accuracy(panels: Sequence[Panel], work: str = "products") 
         panels: of `cost_against_accuracy`.
         work: what the work is counted in.
     """
-    with page(*_size(len(panels))) as figure:
-        grid = subplots(figure, len(panels), min(len(panels), _COLUMNS), sharey=True)
-        for axes, shown in zip(grid, panels, strict=True):
-            _lines(axes, shown)
+    with _errors(panels) as (figure, _):
         figure.supxlabel(f"{work} with $K$ a second of trajectory", size="medium")  # too long for a panel
-        _finish(figure, grid, panels)
     return figure
 
 
@@ -282,20 +269,26 @@ def _lines(axes: Axes, shown: Panel) -> None:
             axes.plot([point.x for point in curve.floor], floor, ":", color=colour(i), linewidth=0.9)
 
 
-def _finish(figure: Figure, grid: Sequence[Axes], panels: Sequence[Panel]) -> None:
-    """The frame of the errors, and one legend for all panels."""
+@contextlib.contextmanager
+def _errors(panels: Sequence[Panel]) -> Iterator[tuple[Figure, list[Axes]]]:
+    """Yield a page with the lines of all panels; in the end it gets limits and one legend."""
     from matplotlib.patches import Patch
 
-    _label_left(grid)
-    _frame(grid, panels)
-    # The same label has the same line in every panel: one legend serves them all.
-    lines: dict[str, Artist] = {str(line.get_label()): line for axes in grid for line in axes.get_lines()}
-    handles = [line for label, line in lines.items() if not label.startswith("_")]
-    if any(point.high > _VISIBLE * point.low for point in _points_of(panels)):
-        handles.append(Patch(color="0.4", alpha=0.25, linewidth=0, label="95 % over seeds"))
-    lines_of_legend = -(-len(handles) // (6 if len(panels) > 1 else 3))
-    columns = -(-len(handles) // lines_of_legend)
-    figure.legend(handles=handles, loc="outside upper center", ncols=columns, handlelength=2.6)
+    with page(*_size(len(panels))) as figure:
+        grid = subplots(figure, len(panels), min(len(panels), _COLUMNS), sharey=True)
+        for axes, shown in zip(grid, panels, strict=True):
+            _lines(axes, shown)
+        yield figure, grid
+        _label_left(grid)
+        _frame(grid, panels)
+        # The same label has the same line in every panel: one legend serves them all.
+        lines: dict[str, Artist] = {str(line.get_label()): line for axes in grid for line in axes.get_lines()}
+        handles = [line for label, line in lines.items() if not label.startswith("_")]
+        if any(point.high > _VISIBLE * point.low for point in _points_of(panels)):
+            handles.append(Patch(color="0.4", alpha=0.25, linewidth=0, label="95 % over seeds"))
+        rows = -(-len(handles) // (6 if len(panels) > 1 else 3))
+        columns = -(-len(handles) // rows)
+        figure.legend(handles=handles, loc="outside upper center", ncols=columns, handlelength=2.6)
 
 
 def _frame(grid: Sequence[Axes], panels: Sequence[Panel]) -> None:

@@ -8,9 +8,9 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard, TypeVar
 
 RUN, METRICS, HISTORY, ROWS = "run.json", "metrics.json", "history.npz", "rows.json"
 SWEEP, PAGE, TABLE = "sweep.json", "report.html", "table"
@@ -21,6 +21,22 @@ COMPLETED, FAILED, RUNNING, UNFINISHED = "completed", "failed", "running", "unfi
 Value = str | float | int | bool | list[Any] | None
 """What a setting holds; a list may hold lists."""
 _WORDS: Mapping[str, Value] = {"null": None, "none": None, "true": True, "false": False}
+
+
+Item, Key = TypeVar("Item"), TypeVar("Key")
+
+
+def grouped(items: Iterable[Item], key: Callable[[Item], Key]) -> dict[Key, list[Item]]:
+    """Return the items by a key, groups and items in the order in which they came."""
+    groups: dict[Key, list[Item]] = {}
+    for item in items:
+        groups.setdefault(key(item), []).append(item)
+    return groups
+
+
+def is_number(value: object) -> TypeGuard[int | float]:
+    """Return whether a value is a number, which a truth value is not."""
+    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def write_text(path: Path, text: str) -> None:

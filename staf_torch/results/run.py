@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from .._version import __version__
-from .files import Value
+from .files import Value, is_number
 from .metric_info import HEADLINES, OWN, MetricInfo
 from .untrusted import visible
 
@@ -45,9 +45,7 @@ class RecordedRun:
     seconds: float | None = None
     declared: Mapping[str, MetricInfo] = dataclasses.field(default_factory=dict)  # of the user's own metrics
     lost: Mapping[str, str] = dataclasses.field(default_factory=dict)  # metric -> what stood there instead
-    build: str | None = (
-        None  # what made the numbers besides the settings: source, torch, compiler, own modules
-    )
+    build: str | None = None  # what else made the numbers: source, torch, compiler, own modules
 
     def __repr__(self) -> str:
         """`<Run completed: kernel=gaussian, ball_error=0.0762>`: overrides and the first headlines."""
@@ -121,18 +119,19 @@ class Collection:
     @functools.cached_property
     def keys(self) -> tuple[str, ...]:
         """The names of everything but metrics that can be a column."""
-        named = dict.fromkeys(key for run in self.rows for key in run.overrides)
-        for settings in self._settings:
-            named |= dict.fromkeys(settings)
-        return (*named, *ABOUT)
+        settings = dict.fromkeys(key for settings in self._settings for key in settings)
+        return (*(self._overridden | settings), *ABOUT)
+
+    @functools.cached_property
+    def _overridden(self) -> dict[str, None]:
+        return dict.fromkeys(key for run in self.rows for key in run.overrides)
 
     @functools.cached_property
     def swept(self) -> tuple[str, ...]:
         """The overridden settings that differ between runs; of a single run, those that were overridden."""
-        overridden = dict.fromkeys(key for run in self.rows for key in run.overrides)
         if len(self.rows) == 1:
-            return tuple(overridden)
-        found = [key for key in overridden if len({identity(run.setting(key)) for run in self.rows}) > 1]
+            return tuple(self._overridden)
+        found = [k for k in self._overridden if len({identity(run.setting(k)) for run in self.rows}) > 1]
         return (*found, *self.unswept)
 
     @functools.cached_property
@@ -141,7 +140,7 @@ class Collection:
 
         Somebody edited a file between two of the runs. What an interpolation takes from an override is none.
         """
-        overridden = dict.fromkeys(key for run in self.rows for key in run.overrides)
+        overridden = self._overridden
         words = [key for key in overridden if any(isinstance(run.setting(key), str) for run in self.rows)]
         first: dict[tuple[str, ...], RecordedRun] = {}
         seen: set[int] = set()
@@ -168,15 +167,11 @@ def _differ(run: RecordedRun, other: RecordedRun) -> Iterator[str]:
     one, two = layers(run.settings)[-1], layers(other.settings)[-1]
     for key in {**one, **two}:
         if one.get(key) != two.get(key):
-            entries = [
-                value if isinstance(value, list) else [value] for value in (one.get(key), two.get(key))
-            ]
-            if len(entries[0]) != len(entries[1]):
-                yield key
-                continue
-            pairs = zip(*entries, strict=True)
-            typed = [list(each.overrides.values()) for each in (run, other)]
-            if any(a != b and a not in typed[0] and b not in typed[1] for a, b in pairs):
+            ours, theirs = (v if isinstance(v, list) else [v] for v in (one.get(key), two.get(key)))
+            mine, others = (list(each.overrides.values()) for each in (run, other))
+            if len(ours) != len(theirs) or any(
+                a != b and a not in mine and b not in others for a, b in zip(ours, theirs, strict=True)
+            ):
                 yield key
 
 
@@ -192,9 +187,12 @@ def layers(settings: Mapping[str, Value]) -> Sequence[Mapping[str, Value]]:
 
 def identity(value: Value) -> str:
     """Return equal texts for values that are the same in a table: 1 and 1.0 are, 1 and "1" are not."""
-    if isinstance(value, int | float) and not isinstance(value, bool):
-        return repr(float(value))
-    return f"{type(value).__name__} {value!r}"
+    return repr(float(value)) if is_number(value) else f"{type(value).__name__} {value!r}"
+
+
+def as_text(value: Value) -> str:
+    """Return a value as it would be typed."""
+    return value if isinstance(value, str) else json.dumps(value)
 
 
 def _typed(value: Value) -> str:
@@ -218,8 +216,7 @@ def mixed(found: Collection) -> Iterator[str]:
     for key in found.unswept:
         values: dict[str, list[RecordedRun]] = {}
         for run in found.rows:
-            value = run.value(key)
-            values.setdefault(value if isinstance(value, str) else json.dumps(value), []).append(run)
+            values.setdefault(as_text(run.value(key)), []).append(run)
         counts = [f"{value} in {len(runs)} (as {runs[0].directory})" for value, runs in values.items()]
         more = f" and {len(counts) - _NAMED} others" if len(counts) > _NAMED else ""
         yield f"`{key}` differs between runs although nobody swept it: {', '.join(counts[:_NAMED])}{more}"

@@ -18,9 +18,9 @@ from ..figures.style import images
 from ..figures.sweep import SEED, SWEEP_FIGURES
 from ..results.files import COMPLETED, PAGE, ROWS, TABLE, parse_overrides
 from ..results.reader import Collection, Value, collect, identity, read_record, read_rows
+from ..results.run import as_text
 from ..results.run_directory import RunDirectory
 from ..tables import Layout, Style, Table, latex_text, tabulate
-from ..tables.aggregate import as_text
 from ..tables.columns import PrintedColumn, show
 
 _log = logging.getLogger(__name__)

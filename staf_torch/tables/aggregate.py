@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import json
 import math
 import statistics
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
 from ..numerics import TABLE_COMMAND, fail
-from ..results.files import COMPLETED
+from ..results.files import COMPLETED, grouped, is_number
 from ..results.metric_info import OWN
 from ..results.reader import Collection, RecordedRun, Value, identity
+from ..results.run import as_text
 from ..results.untrusted import visible
 from .columns import Column, Row, Style
 from .model import Table
@@ -39,10 +39,8 @@ def deviation(numbers: Sequence[float]) -> float | None:
 
 def half_width(numbers: Sequence[float]) -> float | None:
     """Half the width of the 95 % confidence interval of the mean, t s / sqrt(n); None for a single number."""
-    s = deviation(numbers)
-    if s is None:
-        return None
-    return student_quantile(len(numbers) - 1) * s / math.sqrt(len(numbers))
+    s, n = deviation(numbers), len(numbers)
+    return None if s is None else student_quantile(n - 1) * s / math.sqrt(n)
 
 
 AGGREGATES: Mapping[str, Callable[[Sequence[float]], float | None]] = {
@@ -240,10 +238,7 @@ def _grouped(found: Collection, layout: Layout, metrics: Sequence[str]) -> Table
 
 
 def _groups(runs: Sequence[RecordedRun], keys: Sequence[str]) -> Mapping[tuple[str, ...], list[RecordedRun]]:
-    groups: dict[tuple[str, ...], list[RecordedRun]] = {}
-    for run in runs:
-        groups.setdefault(tuple(identity(run.value(key)) for key in keys), []).append(run)
-    return groups
+    return grouped(runs, lambda run: tuple(identity(run.value(key)) for key in keys))
 
 
 def place(run: RecordedRun, keys: Sequence[str]) -> str:
@@ -253,13 +248,7 @@ def place(run: RecordedRun, keys: Sequence[str]) -> str:
 
 def rank(value: Value) -> tuple[bool, float]:
     """Return a sorting key: numbers in order, everything else after them as it came."""
-    number = isinstance(value, int | float) and not isinstance(value, bool)
-    return (not number, float(value) if number else 0.0)  # type: ignore[arg-type]
-
-
-def as_text(value: Value) -> str:
-    """Return a value as it would be typed."""
-    return value if isinstance(value, str) else json.dumps(value)
+    return (False, float(value)) if is_number(value) else (True, 0.0)
 
 
 def _row(
@@ -267,9 +256,7 @@ def _row(
 ) -> Row:
     cells: dict[str, Value] = {key: runs[0].value(key) for key in keys}
     reasons: dict[str, str] = {}
-    places: dict[str, list[RecordedRun]] = {}
-    for run in runs:
-        places.setdefault(place(run, spread), []).append(run)
+    places = grouped(runs, lambda run: place(run, spread))
     for column in columns:
         if column.metric is None or column.statistic is None:
             continue
@@ -302,11 +289,8 @@ def _absences(runs: Sequence[RecordedRun], columns: Sequence[Column]) -> Iterato
 
 def _notes(runs: Sequence[RecordedRun]) -> Iterator[str]:
     """Yield a note for each reason for which runs have no result, or a reader should look twice."""
-    reasons: dict[tuple[str, str], list[RecordedRun]] = {}
-    for run in runs:
-        if run.reason is not None:
-            reasons.setdefault((run.status, run.reason), []).append(run)
-    for (status, reason), those in reasons.items():
+    troubled = [run for run in runs if run.reason is not None]
+    for (status, reason), those in grouped(troubled, lambda run: (run.status, run.reason)).items():
         shown = ", ".join(visible(str(run.directory)) for run in those[:_NAMED])
         more = f" and {len(those) - _NAMED} more" if len(those) > _NAMED else ""
         yield f"{len(those)} of {len(runs)} {status}: {reason} (in {shown}{more})"
@@ -316,8 +300,7 @@ def _sorted(table: Table, names: Sequence[str]) -> list[Row]:
     """By columns, the first counts most; numbers before texts, what is missing last in either direction."""
     rows = list(table.rows)
     for name in reversed(names):  # stable: the last sort is by the first name
-        column = _column(table, name.removesuffix(_ASCENDING).removesuffix(_DESCENDING))
-        largest = any(c.name == column and c.larger_is_better for c in table.columns)
+        column, largest = _column(table, name.removesuffix(_ASCENDING).removesuffix(_DESCENDING))
         descending = name.endswith(_DESCENDING) or (largest and not name.endswith(_ASCENDING))
         present = [row for row in rows if row.cells.get(column) is not None]
         missing = [row for row in rows if row.cells.get(column) is None]
@@ -326,11 +309,11 @@ def _sorted(table: Table, names: Sequence[str]) -> list[Row]:
     return rows
 
 
-def _column(table: Table, name: str) -> str:
-    """The column of that name, or the first of that metric."""
-    for known in (table.names, [column.metric for column in table.columns]):
-        if name in known:
-            return table.names[known.index(name)]
+def _column(table: Table, name: str) -> tuple[str, bool]:
+    """The column of that name, or the first of that metric, and whether its largest number is the best."""
+    for column in sorted(table.columns, key=lambda column: column.name != name):
+        if name in (column.name, column.metric):
+            return column.name, column.larger_is_better
     raise fail(TABLE_COMMAND, "sort", _one_of(table.names), name)
 
 

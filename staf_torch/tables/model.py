@@ -10,7 +10,7 @@ import io
 import itertools
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from json import dumps
 from typing import Any
 
@@ -18,15 +18,8 @@ from ..results.reader import Value
 from ..results.untrusted import visible
 from .columns import Column, Number, PrintedColumn, Row, Style, printed, show, significant
 
-_SPECIAL = {
+_SPECIAL = {character: f"\\{character}" for character in "{}$&#_%"} | {
     "\\": r"\textbackslash{}",
-    "{": r"\{",
-    "}": r"\}",
-    "$": r"\$",
-    "&": r"\&",
-    "#": r"\#",
-    "_": r"\_",
-    "%": r"\%",
     "^": r"\textasciicircum{}",
     "~": r"\textasciitilde{}",
     "<": r"\textless{}",
@@ -42,9 +35,8 @@ _SPECIAL = {
     "±": r"\ensuremath{\pm}",
 }
 _LINK = re.compile(r"\]\s*[(\[:]")
-_FORMULA = re.compile(
-    "\\s*[=+\\-@|%\uff1d\uff0b\uff0d\uff20]|[\\t\\r]"
-)  # what a spreadsheet computes, wide letters too
+# What a spreadsheet computes, wide letters too.
+_FORMULA = re.compile("\\s*[=+\\-@|%\uff1d\uff0b\uff0d\uff20]|[\\t\\r]")
 _BLOCK = re.compile(r"^(?:#{1,6} |> ?|[-+=~]{3,}|[-+] )")  # of Markdown, at the begin of a line
 
 
@@ -92,7 +84,7 @@ class Table:
         over = {column.over for column in columns if column.over}
         title = f"{_escaped(over.pop())}\n\n" if len(over) == 1 else ""
         heads = [_escaped(f"{c.over}, {c.heading}" if c.over and not title else c.heading) for c in columns]
-        lines = [[self._shown(column, row) for column in columns] for row in range(len(self.rows))]
+        lines = self.texts(_escaped, lambda number: show(number, self.style.digits), "-", "**{}**")
         widths = [max(3, *(len(line[k]) for line in [heads, *lines])) for k in range(len(columns))]
 
         def joined(cells: list[str]) -> str:
@@ -116,12 +108,26 @@ class Table:
             writer.writerow([_csv_cell(row.cells.get(name)) for name in self.names])
         return text.getvalue()
 
-    def _shown(self, column: PrintedColumn, row: int) -> str:
-        cell = column.cells[row]
-        if not isinstance(cell, Number):
-            return "-" if cell is None else _escaped(cell)
-        text = show(cell, self.style.digits)
-        return f"**{text}**" if row in column.best else text
+    def texts(
+        self, escape: Callable[[str], str], number: Callable[[Number], str], missing: str, bold: str
+    ) -> list[list[str]]:
+        """Return the cells row by row as a format for people writes them.
+
+        Args:
+            escape: of a text.
+            number: writes a number.
+            missing: what stands for None.
+            bold: with braces for the best number of a column.
+        """
+
+        def text(column: PrintedColumn, row: int) -> str:
+            cell = column.cells[row]
+            if not isinstance(cell, Number):
+                return missing if cell is None else escape(cell)
+            return bold.format(number(cell)) if row in column.best else number(cell)
+
+        columns = self.printed()
+        return [[text(column, row) for column in columns] for row in range(len(self.rows))]
 
 
 def _csv_cell(value: Value) -> Value:
@@ -163,8 +169,8 @@ def latex_text(table: Table) -> str:
     columns, digits = table.printed(), table.style.digits
     align = "".join("r" if column.numeric else "l" for column in columns)
     lines = [r"\begin{tabular}{" + align + "}", r"\toprule", *_headings(columns), r"\midrule"]
-    rows = range(len(table.rows))
-    lines += [" & ".join(_cell(column, row, digits) for column in columns) + r" \\" for row in rows]
+    cells = table.texts(escape, lambda number: _number(number, digits), "--", r"\boldmath\textbf{{{}}}")
+    lines += [" & ".join(row) + r" \\" for row in cells]
     lines += [r"\bottomrule", r"\end{tabular}"]
     lines += ["% " + " ".join(visible(note).split()) for note in table.notes]
     return "\n".join(lines) + "\n"
@@ -185,16 +191,6 @@ def _headings(columns: list[PrintedColumn]) -> list[str]:
             upper += [""] * width
         at += width
     return [" & ".join(upper) + r" \\", "".join(rules), lower]
-
-
-def _cell(column: PrintedColumn, row: int, digits: int) -> str:
-    cell = column.cells[row]
-    if cell is None:
-        return "--"
-    if isinstance(cell, str):
-        return escape(cell)
-    text = _number(cell, digits)
-    return rf"\boldmath\textbf{{{text}}}" if row in column.best else text
 
 
 def _number(number: Number, digits: int) -> str:
@@ -227,11 +223,7 @@ def json_text(table: Table) -> str:
 
         Shown by `staf-table runs --format json`.
     """
-    content = {
-        "columns": list(table.names),
-        "rows": [_json_row(row) for row in table.rows],
-        "notes": list(table.notes),
-    }
+    content = {"columns": table.names, "rows": [*map(_json_row, table.rows)], "notes": table.notes}
     return dumps(content, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
 
 
@@ -297,24 +289,14 @@ def html_text(table: Table) -> str:
 
         Shown by `staf experiment=ablation`.
     """
-    columns = table.printed()
     heads = "".join(
-        f"<th>{html.escape(f'{c.over}, {c.heading}' if c.over else c.heading)}</th>" for c in columns
+        f"<th>{html.escape(f'{c.over}, {c.heading}' if c.over else c.heading)}</th>" for c in table.printed()
     )
-    rows = "".join(
-        "<tr>" + "".join(_html_cell(column, row, table.style.digits) for column in columns) + "</tr>"
-        for row in range(len(table.rows))
-    )
+    digits = table.style.digits
+    cells = table.texts(html.escape, lambda number: html.escape(show(number, digits)), "-", "<b>{}</b>")
+    rows = "".join("<tr>" + "".join(f"<td>{text}</td>" for text in row) + "</tr>" for row in cells)
     notes = "".join(f"<p>{html.escape(note)}</p>" for note in table.notes)
     return f"<table><thead><tr>{heads}</tr></thead><tbody>{rows}</tbody></table>{notes}"
-
-
-def _html_cell(column: PrintedColumn, row: int, digits: int) -> str:
-    cell = column.cells[row]
-    if not isinstance(cell, Number):
-        return f"<td>{'-' if cell is None else html.escape(cell)}</td>"
-    text = html.escape(show(cell, digits))
-    return f"<td><b>{text}</b></td>" if row in column.best else f"<td>{text}</td>"
 
 
 def _uniform(cells: Sequence[Value], number: bool) -> list[Any]:
