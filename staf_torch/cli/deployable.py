@@ -103,7 +103,7 @@ def learning(run: Path, row: int = 0, *, trust: bool = False) -> Learner:
 @contextlib.contextmanager
 def _opened(
     run: Path, row: int, tasks: Mapping[str, object], trust: bool
-) -> Iterator[tuple[DictConfig, dict[str, np.ndarray], bool, str | None]]:
+) -> Iterator[tuple[DictConfig, dict[str, Tensor], bool, str | None]]:
     """Context: settings in float64, history of one trajectory, whether it is as precise, and who wrote it."""
     integer("staf-export", "row", row, least=0)
     record = records.read(run / records.RUN) or {}
@@ -158,7 +158,7 @@ def _settings(run: Path, trust: bool) -> DictConfig:
     return cfg
 
 
-def _history(run: Path, row: int) -> dict[str, np.ndarray]:
+def _history(run: Path, row: int) -> dict[str, Tensor]:
     """Return the arrays of a history, (T, ...) of one trajectory where they have trajectories."""
     path = run / HISTORY
     if not path.exists():
@@ -170,16 +170,15 @@ def _history(run: Path, row: int) -> dict[str, np.ndarray]:
         raise UnreadableError(f"{path} has no states of trajectories")
     if row >= len(history["state"]):
         raise fail("staf-export", "row", f"must be below the run's {len(history['state'])} trajectories", row)
-    return {name: history[name][row] for name in _READ if name in history}
+    found = {name: history[name][row].astype(np.float64) for name in _READ if name in history}
+    return {name: torch.from_numpy(array) for name, array in found.items()}
 
 
-def _reproduced(name: str, found: Tensor, recorded: np.ndarray, precise: bool) -> None:
+def _reproduced(name: str, found: Tensor, wanted: Tensor, precise: bool) -> None:
     """Whatever wrote the run: what is built from it must give the recorded numbers."""
-    wanted = torch.from_numpy(np.asarray(recorded, dtype=np.float64))
     if not bool(torch.isfinite(wanted).all()):
-        raise fail(
-            "staf-export", "row", "must be a trajectory that did not diverge", f"a recorded {name} of NaN"
-        )
+        rule = "must be a trajectory that did not diverge"
+        raise fail("staf-export", "row", rule, f"a recorded {name} of NaN")
     worst = float((found - wanted).abs().max() / wanted.abs().max().clamp(min=1e-3))
     if not worst <= (1e-8 if precise else 1e-3):
         raise ValueError(
@@ -188,10 +187,9 @@ def _reproduced(name: str, found: Tensor, recorded: np.ndarray, precise: bool) -
         )
 
 
-def _approximation(cfg: DictConfig, history: dict[str, np.ndarray], precise: bool) -> Deployable:
+def _approximation(cfg: DictConfig, history: dict[str, Tensor], precise: bool) -> Deployable:
     problem = chase_problem(cfg)
-    x = torch.from_numpy(history["state"][-1].astype(np.float64))
-    weights = torch.from_numpy(history["weights"][-1].astype(np.float64))
+    x, weights = history["state"][-1], history["weights"][-1]
     if not bool(torch.isfinite(weights).all()):
         raise fail("staf-export", "row", "must be a trajectory whose weights can be represented", "NaN")
     staf = StaF(problem.basis)
@@ -221,10 +219,9 @@ def _approximation(cfg: DictConfig, history: dict[str, np.ndarray], precise: boo
     )
 
 
-def _controller(cfg: DictConfig, history: dict[str, np.ndarray], precise: bool) -> Deployable:
+def _controller(cfg: DictConfig, history: dict[str, Tensor], precise: bool) -> Deployable:
     problem = adp_problem(cfg)
-    states = torch.from_numpy(history["state"].astype(np.float64))
-    weights = torch.from_numpy(history["actor_weights"].astype(np.float64))
+    states, weights = history["state"], history["actor_weights"]
     learns = learner(problem.controller) is not None
     last = policy_of(problem.controller, weights[-2] if learns else None)
     _reproduced("control", last(states[-2:-1])[0], history["control"][-2], precise)
@@ -245,7 +242,7 @@ def _controller(cfg: DictConfig, history: dict[str, np.ndarray], precise: bool) 
     )
 
 
-def _learner(cfg: DictConfig, history: dict[str, np.ndarray], precise: bool, row: int) -> Learner:
+def _learner(cfg: DictConfig, history: dict[str, Tensor], precise: bool, row: int) -> Learner:
     problem = adp_problem(cfg)
     if learner(problem.controller) is None:
         what = type(problem.controller).__name__
@@ -263,9 +260,8 @@ def _learner(cfg: DictConfig, history: dict[str, np.ndarray], precise: bool, row
         integrator=problem.integrator,
         compile=False,
     )
-    times = slice(0, steps, problem.every)
     recorded = history["control"][: steps // problem.every]
-    _reproduced("control", found.control[0, times], recorded, precise)
+    _reproduced("control", found.control[0, 0 : steps : problem.every], recorded, precise)
     generators = [torch.Generator().manual_seed(seed)] if problem.controller.draws else []
     uniform = uniform_numbers(x0, steps, problem.controller.draws, generators)[0]
     unit, size = problem.system.units, x0.shape[-1]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import os
 import platform
 import sys
@@ -21,7 +20,7 @@ from ..kernels import ExponentialKernel
 from ..lanes.cache import cache
 from ..lanes.compiler import find_compiler
 from ..optim import SteepestDescent
-from ..results.build import source
+from ..results.build import installed, source
 from ..systems import Oscillator, simulate
 from ..targets import Paper
 
@@ -48,7 +47,7 @@ def main() -> int:
 def _findings() -> Iterator[tuple[str, str, bool]]:
     yield "staf_torch", f"{__version__} in {Path(__file__).resolve().parent.parent}", True
     yield "python", f"{platform.python_version()}, {platform.platform()}", True
-    yield "packages", ", ".join(f"{name} {_installed(name)}" for name in _PACKAGES), True
+    yield "packages", ", ".join(f"{name} {installed(name) or '-'}" for name in _PACKAGES), True
     yield "compiler", find_compiler() or "none: everything runs in plain torch, slower", True
     cores = os.cpu_count()
     set_by = os.environ.get("OMP_NUM_THREADS", "not set")
@@ -57,13 +56,6 @@ def _findings() -> Iterator[tuple[str, str, bool]]:
     for name, place in (("cache", cache()), ("runs", Path("runs")), ("scratch", Path(tempfile.gettempdir()))):
         yield name, *_place(place)
     yield "self-test", *_self_test()
-
-
-def _installed(name: str) -> str:
-    try:
-        return importlib.metadata.version(name)
-    except importlib.metadata.PackageNotFoundError:
-        return "-"
 
 
 def _place(folder: Path) -> tuple[str, bool]:

@@ -196,7 +196,7 @@ def _write_c(
     note = f"{found.what}\nFrom {origin['run']}, trajectory {origin['row']}, staf_torch {__version__}."
     example = found.points.to(dtype)
     made = c_header.export_c(module, example, path, names, note=note)
-    entries = example.shape[1] + sum(1 if size is None else size for size in sizes)
+    entries = example.shape[1] + sum(size or 1 for size in sizes)
     return c_header.runner_c(path, sizes, dtype), made.work(entries, dtype)
 
 
@@ -205,26 +205,21 @@ def _measure(
 ) -> dict[str, Any]:
     names = [port.name for port in found.outputs]
     points = found.points.to(DTYPES[dtype])
-    pieces = points.split(len(points) if batch is None else batch)
-    pieces = tuple(piece for piece in pieces if batch is None or len(piece) == batch)
+    pieces = [piece for piece in points.split(batch or len(points)) if batch is None or len(piece) == batch]
     single = found.points.float()
     with torch.no_grad():
         made = formats.as_tuple(module(torch.cat(pieces)))
         got = [call(piece) for piece in pieces]
         rough = formats.as_tuple(found.module(torch.float32)(single))
         exact = formats.as_tuple(found.module(torch.float64)(single.double()))
-    equality = sheet.worst_difference(_joined(got), made)
+    equality = sheet.worst_difference(tuple(map(torch.cat, zip(*got, strict=True))), made)
     error = sheet.worst_difference(rough, exact)
-    late = sheet.latency(call, points[: 1 if batch is None else batch].clone(), calls)
+    late = sheet.latency(call, points[: batch or 1].clone(), calls)
     return {
         "latency": dataclasses.asdict(late),
         "equality": dict(zip(names, equality, strict=True)),
         "float32_error": dict(zip(names, error, strict=True)),
     }
-
-
-def _joined(pieces: list[tuple[torch.Tensor, ...]]) -> tuple[torch.Tensor, ...]:
-    return tuple(torch.cat(column) for column in zip(*pieces, strict=True))
 
 
 def parser() -> argparse.ArgumentParser:
@@ -254,20 +249,14 @@ def main(arguments: list[str] | None = None) -> None:
     # The exporter warns that torchvision is not there, for operators that nothing here has.
     logging.getLogger("torch.onnx._internal.exporter._registration").setLevel(logging.ERROR)
     try:
-        if given.pop("learning"):
-            page = export_learning(given.pop("run"), **_of_learning(given))
-        else:
+        if not given.pop("learning"):
             page = export(**given)
+        elif (to := given.pop("to")) != "c":
+            raise fail("staf-export", "learning", "must go with --to c: the other formats have no state", to)
+        elif (batch := given.pop("batch")) not in (None, 1):
+            raise fail("staf-export", "batch", "must be 1 for a controller that learns", batch)
+        else:
+            page = export_learning(**given)
     except (ValueError, OSError) as error:
         sys.exit(f"staf-export: {visible(str(error))}")
     sys.stdout.write(sheet.markdown(page))
-
-
-def _of_learning(given: dict[str, Any]) -> dict[str, Any]:
-    """The arguments that a learning controller has."""
-    to, batch = given.pop("to"), given.pop("batch")
-    if to != "c":
-        raise fail("staf-export", "learning", "must go with --to c: the other formats have no state", to)
-    if batch not in (None, 1):
-        raise fail("staf-export", "batch", "must be 1 for a controller that learns", batch)
-    return given

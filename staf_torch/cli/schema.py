@@ -47,11 +47,7 @@ _SAID: Mapping[str, Node] = {  # what neither values nor signatures say
     "dtype": {"enum": list(DTYPES)},
     "animation": {"enum": [False, True, "gif", "html"]},
     "adp.compile": {"enum": [True, False, "auto"]},
-    "adp.critic": {"type": ["number", "array"]},
-    "adp.actor": {"type": ["number", "array"]},
-    "adp.q": {"type": ["number", "array"]},
-    "adp.r": {"type": ["number", "array"]},
-}
+} | {f"adp.{name}": {"type": ["number", "array"]} for name in ("critic", "actor", "q", "r")}
 
 
 def main(words: Sequence[str]) -> str:
@@ -78,9 +74,8 @@ def schema() -> Node:
     groups = [path.relative_to(conf) for path in sorted(conf.rglob("*")) if path.is_dir()]
     groups = [path for path in groups if path.parts[0] not in _NO_GROUPS and "__pycache__" not in path.parts]
     examples = sorted((conf / "adp").glob("*.yaml"))  # settings of a whole task, which no class takes
-    defs = {
-        ".".join(group.parts): _options(conf / group, str(group)) for group in groups if str(group) != "adp"
-    }
+    groups = [group for group in groups if str(group) != "adp"]
+    defs = {".".join(group.parts): _options(conf / group, str(group)) for group in groups}
     inner = {name.removeprefix("adp."): _ref(name) for name in defs if name.startswith("adp.")}
     experiments = [_read(path) for path in files]
     adp = [_read(path) for path in examples] + [each.pop("adp") for each in experiments if "adp" in each]
@@ -98,11 +93,8 @@ def _ref(name: str) -> Node:
 
 
 def _closed(properties: Node) -> Node:
-    return {
-        "type": "object",
-        "properties": {"defaults": _DEFAULTS} | properties,
-        "additionalProperties": False,
-    }
+    keys = {"defaults": _DEFAULTS} | properties
+    return {"type": "object", "properties": keys, "additionalProperties": False}
 
 
 def _read(path: Path) -> Node:
@@ -110,9 +102,7 @@ def _read(path: Path) -> Node:
 
 
 def _without(node: Node, names: Mapping[str, object]) -> Node:
-    return {
-        key: value for key, value in node.items() if key not in names and key not in ("defaults", "hydra")
-    }
+    return {key: value for key, value in node.items() if key not in {*names, "defaults", "hydra"}}
 
 
 def _options(folder: Path, group: str) -> Node:

@@ -31,7 +31,7 @@ from ..settings.chase import make_metrics
 from ..tables.columns import significant
 from .registry import BatchedExperiment, Metrics
 from .scenes import animation_kind, loop_scene
-from .study import log_diverged, write_history
+from .study import log_diverged, trajectories, write_history
 
 _log = logging.getLogger(__name__)
 _LINEARISED = 8  # rows of a learning controller whose loop is linearised
@@ -57,11 +57,7 @@ class Regulation(BatchedExperiment[LoopSolution]):
     animates = True
     batchable = frozenset(
         {"seed", "initial_state", "spread", "adp.critic", "adp.actor", "adp.gain", "adp.policy.gain"}
-        | {
-            f"adp.{node}.{field.name}"
-            for node in ("gains", "law.gains")
-            for field in dataclasses.fields(Gains)
-        }
+        | {f"adp.{node}.{each.name}" for node in ("gains", "law.gains") for each in dataclasses.fields(Gains)}
     )
 
     def __call__(self, cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics:
@@ -142,12 +138,13 @@ def _solved(cfg: DictConfig, problem: AdpProblem, result: LoopResult) -> LoopSol
 def held_radius(problem: AdpProblem, result: LoopResult) -> float | None:
     """The spectral radius of the linearised loop over one dt with the control held, with the weights of the
     end; of a controller with weights the largest of the first rows. None where something has no slope."""
-    rows = range(min(_LINEARISED, len(result.state)) if result.actor_weights.shape[-1] else 1)
     at = problem.cost.around(problem.system).target
-    radii = [
-        HeldLoop.of(_frozen(problem, result, row), problem.system, at=at).spectral_radius(problem.dt)
-        for row in rows
-    ]
+
+    def radius(row: int) -> float:
+        return HeldLoop.of(_frozen(problem, result, row), problem.system, at=at).spectral_radius(problem.dt)
+
+    rows = range(min(_LINEARISED, len(result.state)) if result.actor_weights.shape[-1] else 1)
+    radii = [radius(row) for row in rows]
     return max(radii) if all(map(math.isfinite, radii)) else None
 
 
@@ -181,6 +178,9 @@ def simulate_together(
     """
     first = problems[0]
     rows = [len(problem.initial_states) for problem in problems]
+    seeds = [
+        problem.seed + row for problem, batch in zip(problems, rows, strict=True) for row in range(batch)
+    ]
     return simulate(
         _stacked([problem.controller for problem in problems], rows),
         first.system,
@@ -189,9 +189,7 @@ def simulate_together(
         dt=first.dt,
         steps=first.steps,
         every=first.every,
-        seed=[
-            problem.seed + row for problem, batch in zip(problems, rows, strict=True) for row in range(batch)
-        ],
+        seed=seeds,
         integrator=first.integrator,
         compile=first.compile,
         progress=progress,
@@ -217,12 +215,13 @@ def _stacked(controllers: Sequence[Controller], rows: Sequence[int]) -> Controll
 
 def _gains(gains: Sequence[Gains], counts: Tensor, like: Tensor) -> Gains:
     """Numbers where all agree, else (B, 1) of the dtype and on the device of ``like``."""
-    given: dict[str, float | Tensor] = {}
-    for field in dataclasses.fields(Gains):
-        values = [getattr(each, field.name) for each in gains]
+
+    def joined(values: list[float]) -> float | Tensor:
         rows = torch.tensor(values, dtype=torch.float64).repeat_interleave(counts).to(like)
-        given[field.name] = values[0] if len(set(values)) == 1 else rows.unsqueeze(-1)
-    return Gains(**given)
+        return values[0] if len(set(values)) == 1 else rows.unsqueeze(-1)
+
+    names = [field.name for field in dataclasses.fields(Gains)]
+    return Gains(**{name: joined([getattr(each, name) for each in gains]) for name in names})
 
 
 def learner(controller: Controller) -> ActorCritic | None:
@@ -257,15 +256,8 @@ def _summarise(solved: LoopSolution) -> None:
     def show(name: str) -> str:
         return significant(solved.metrics[name], 5)
 
-    batch = len(solved.result.state)
-    _log.info(
-        "Closed loop: %s, %d %s, %g s in steps of %g s",
-        solved.method,
-        batch,
-        "trajectory" if batch == 1 else "trajectories",
-        solved.steps * solved.dt,
-        solved.dt,
-    )
+    about = solved.method, trajectories(len(solved.result.state)), solved.steps * solved.dt, solved.dt
+    _log.info("Closed loop: %s, %s, %g s in steps of %g s", *about)
     _log.info("  cost %s, optimal %s, ratio %s", *map(show, ("cost", "optimal_cost", "cost_ratio")))
     _log.info("  second half: |u - u*| <= %s, |V - V^| <= %s", *map(show, ("control_error", "value_error")))
     names = ("final_state_norm", "regulated_fraction", "diverged_fraction", "held_spectral_radius")

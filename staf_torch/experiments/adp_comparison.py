@@ -24,6 +24,7 @@ from ..settings.adp import adp_problem, changed
 from ..settings.chase import plain
 from ..tables import Table
 from .adp import learner, solve
+from .registry import Metrics
 from .study import Study, label_key
 
 _log = logging.getLogger(__name__)
@@ -62,7 +63,7 @@ _COLUMNS = {
 }
 
 
-def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> dict[str, float | None]:
+def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics:
     """Run every method and fill the run directory; `metrics.json` comes last."""
     study = Study("comparison", _COLUMNS, ("ratio_median", "ratio_max", "regulated"), _log, digits=4)
     ratios: dict[str, np.ndarray] = {}
@@ -119,27 +120,24 @@ def _size(controller: Controller) -> tuple[int, int]:
     return 0, 0
 
 
-def initial_weights(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> dict[str, float | None]:
+def initial_weights(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics:
     """Run every law from every pair of weights and state: a row a law; `metrics.json` comes last."""
     weights = _weights(cfg)
     headings = [*(f"W0 = {w:g}" for w in weights), "all"]
-    metrics: dict[str, float | None] = {}
+    metrics: Metrics = {}
     table: list[dict[str, str]] = []
     for name, changes in _LAWS.items():
         problem = _from_weights(variant(cfg, changes), weights, cfg.adp.actor / cfg.adp.critic)
         result = solve(problem, progress)
         shares = regulated(result).double().reshape(len(weights), -1).mean(-1).tolist()
+        overall, diverged = sum(shares) / len(shares), float(result.diverged.double().mean())
         metrics |= {f"{name}_regulated_W{w:g}": share for w, share in zip(weights, shares, strict=True)}
-        metrics[f"{name}_regulated_fraction"] = sum(shares) / len(shares)
-        metrics[f"{name}_diverged_fraction"] = float(result.diverged.double().mean())
-        shown = [*shares, sum(shares) / len(shares)]
-        table.append({"law": name} | {h: f"{share:.4g}" for h, share in zip(headings, shown, strict=True)})
+        metrics |= {f"{name}_regulated_fraction": overall, f"{name}_diverged_fraction": diverged}
+        shown = zip(headings, [*shares, overall], strict=True)
+        table.append({"law": name} | {heading: f"{share:.4g}" for heading, share in shown})
         _log.info(
             "%-12s regulated %.4g of all, %.4g at the worst W0, diverged %.4g",
-            name,
-            metrics[f"{name}_regulated_fraction"],
-            min(shares),
-            metrics[f"{name}_diverged_fraction"],
+            *(name, overall, min(shares), diverged),
         )
     out = RunDirectory(directory)
     out.table(cfg.task, Table.of(table))

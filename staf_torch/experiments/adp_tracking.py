@@ -29,14 +29,14 @@ from ..figures.animation import animate
 from ..figures.closed_loop import TrackingHistory, draw_tracking
 from ..figures.style import images
 from ..metrics.closed_loop import tracking_metrics
-from ..numerics.checks import COMMAND_LINE, integer, positive_real
 from ..results.progress import SHOWN, Progress
 from ..results.run_directory import RunDirectory
 from ..settings.adp import build, value_basis
-from ..settings.chase import initial_states, placement, plain
+from ..settings.chase import horizon, initial_states, placement, plain, seed_of
 from ..systems import TwoState, TwoStateTracking
 from ..tables.columns import significant
 from .adp import recorded
+from .registry import Metrics
 from .scenes import animation_kind, tracking_scene
 from .study import Method, write_history
 
@@ -44,36 +44,32 @@ _log = logging.getLogger(__name__)
 _HORIZON, _INTERVALS = 8.0, 160  # of direct shooting: the error has fallen to 1e-5 of itself
 
 
-def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> dict[str, float | None]:
+def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics:
     """Run the three variants and fill the run directory; `metrics.json` comes last."""
     device, dtype = placement(cfg.device, cfg.dtype)
     plant = TwoStateTracking().to(device)
     weights = plain(cfg.adp.cost)
     cost = tracking_cost(weights["state"], weights["control"]).to(device)
     x0 = initial_states(cfg, plant.dim).to(device=device, dtype=dtype)
-    dt = positive_real(COMMAND_LINE, "dt", cfg.dt)
-    steps = max(1, round(positive_real(COMMAND_LINE, "duration", cfg.duration) / dt))
+    dt, steps = horizon(cfg)
     controllers = _controllers(cfg, plant, cost)
-    shared = {"dt": dt, "steps": steps, "seed": integer(COMMAND_LINE, "seed", cfg.seed, least=0)}
+    shared = {"dt": dt, "steps": steps, "seed": seed_of(cfg)}
     shared |= {"integrator": cfg.adp.integrator, "compile": cfg.adp.compile}
     results = {
         name: Method(controller.to(device), plant, cost).run(x0, **shared)
         for name, controller in controllers.items()
     }
     best = _optimal_cost(plant, cost, x0)
-    metrics: dict[str, float | None] = {"optimal_cost": None if best is None else float(best.nanmedian())}
+    metrics: Metrics = {"optimal_cost": None if best is None else float(best.nanmedian())}
     for name, result in results.items():
-        measured = tracking_metrics(result, _parameters(result), plant.theta, best)
+        measured = tracking_metrics(result, result.recorded.get("theta"), plant.theta, best)
         metrics |= {f"{name}_{key}": value for key, value in measured.items()}
-        shown = [significant(value, 4) for value in measured.values()]
         _log.info(
             "%-11s cost %s, over the optimum %s, final |e| %s, final |theta error| %s, diverged %s",
-            name,
-            *shown,
+            *(name, *(significant(value, 4) for value in measured.values())),
         )
     out, identified = RunDirectory(directory), results["identified"]
-    parameters = _parameters(identified)
-    assert parameters is not None
+    parameters = identified["theta"]  # (B, T, 3, 2)
     if cfg.history:
         write_history(out, identified.time, recorded(identified) | {"parameters": parameters})
     kind = animation_kind(cfg)
@@ -127,11 +123,6 @@ def _controllers(cfg: DictConfig, plant: TwoStateTracking, cost: QuadraticCost) 
         "identified": IdentifyingTracker(learner, plant, learning, theta),
         "unidentified": IdentifyingTracker(learner, plant, frozen, theta),
     }
-
-
-def _parameters(result: LoopResult) -> Tensor | None:
-    """theta^ at the recorded times, (B, T, 3, 2); None where nothing is identified."""
-    return result.recorded.get("theta")
 
 
 def _errors(result: LoopResult) -> Tensor:

@@ -16,16 +16,16 @@ from torch import Tensor
 from ..adp import LQR, Feedback, LoopResult, QuadraticCost, SafetyFilter
 from ..adp.loop.controller import Policy
 from ..adp.safety.safety_filter import Constraint
-from ..figures.animation import FRAMES, Curves, Scene, animate
+from ..figures.animation import Curves, Scene, animate
 from ..figures.closed_loop import AvoidanceHistory, draw_avoidance
 from ..metrics.safety import constraint_metrics
 from ..numerics.checks import COMMAND_LINE, choice, integer, positive_real
 from ..results.progress import SHOWN, Progress
 from ..results.run_directory import RunDirectory
-from ..settings.chase import placement
+from ..settings.chase import generator_of, horizon, placement
 from ..systems import ControlAffineSystem, Linear
 from .registry import Metrics, finite
-from .scenes import animation_kind
+from .scenes import animation_kind, frames
 from .study import Method, Study, write_history
 
 
@@ -39,6 +39,7 @@ class Vehicle(NamedTuple):
     bounds: tuple[float, float]  # of the two inputs
     point: Callable[[Tensor], Tensor]  # that is kept away from the discs: (..., size) -> (..., 2)
     reach: float  # m, of the vehicle from that point
+    paid: Callable[[Tensor], Tensor]  # that is to come to the origin: (..., size) -> (..., k)
 
 
 def _mass(cfg: DictConfig, dt: float, bound: float) -> Vehicle:
@@ -51,7 +52,7 @@ def _mass(cfg: DictConfig, dt: float, bound: float) -> Vehicle:
     def rate(x: Tensor, u: Tensor) -> Tensor:
         return torch.cat((x[..., 2:], u), dim=-1)
 
-    return Vehicle("LQR", 4, rate, lqr, (bound, bound), lambda x: x[..., :2], 0.0)
+    return Vehicle("LQR", 4, rate, lqr, (bound, bound), lambda x: x[..., :2], 0.0, lambda x: x)
 
 
 def _unicycle(cfg: DictConfig, dt: float, bound: float) -> Vehicle:
@@ -78,7 +79,7 @@ def _unicycle(cfg: DictConfig, dt: float, bound: float) -> Vehicle:
         aside = along[..., 0] * wanted[..., 1] - along[..., 1] * wanted[..., 0]
         return torch.stack((forward, aside / ahead), dim=-1)
 
-    return Vehicle("lookahead", 3, rate, policy, (bound, bound / ahead), point, ahead)
+    return Vehicle("lookahead", 3, rate, policy, (bound, bound / ahead), point, ahead, point)
 
 
 VEHICLES = {"mass": _mass, "unicycle": _unicycle}
@@ -144,8 +145,7 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
     kind = animation_kind(cfg)
     x0 = scenarios(cfg).to(device=device, dtype=dtype)
     radius = positive_real(COMMAND_LINE, "avoidance.radius", chosen.radius)
-    dt = positive_real(COMMAND_LINE, "dt", cfg.dt)
-    steps = max(1, round(positive_real(COMMAND_LINE, "duration", cfg.duration) / dt))
+    dt, steps = horizon(cfg)
     vehicle = chosen_vehicle(cfg, dt)
     discs = (x0.shape[-1] - vehicle.size) // 4
     system = AmongDiscs(vehicle, discs).to(device)
@@ -165,18 +165,17 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
         decay=positive_real(COMMAND_LINE, "avoidance.decay", chosen.decay),
         margin=float(chosen.margin),
     ).to(device)
-    methods = {
-        name: Method(each, system, cost) for name, each in ((FILTERED, guard), (BARE, Feedback(wanted)))
-    }
     results = {
-        name: method.run(x0, dt=dt, steps=steps, compile=cfg.adp.compile) for name, method in methods.items()
+        name: Method(each, system, cost).run(x0, dt=dt, steps=steps, compile=cfg.adp.compile)
+        for name, each in ((FILTERED, guard), (BARE, Feedback(wanted)))
     }
     distances = {name: distance(result.state, radius, vehicle.size) for name, result in results.items()}
     study = Study("avoidance", _COLUMNS, ("cost_mean", "minimum_margin", "constraint_violations"), _log)
     for name, result in results.items():
         measured = constraint_metrics(result, distances[name])
-        measured["cost"], measured["cost_mean"] = finite(result.cost.median()), finite(result.cost.mean())
-        measured["final_state_norm"] = finite(_still(vehicle, result.state[:, -1]).median())
+        measured |= {"cost": finite(result.cost.median()), "cost_mean": finite(result.cost.mean())}
+        far = vehicle.paid(result.state[:, -1, : vehicle.size]).norm(dim=-1)
+        measured["final_state_norm"] = finite(far.median())
         if name == BARE:
             study.add(f"{vehicle.label.lower()}_", measured, method=vehicle.label)
             continue
@@ -186,14 +185,11 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
             _log.info("scenario %d: at a time no admissible control met the condition", row)
         study.add("", measured, method=f"{vehicle.label}, filtered")
     out, filtered = RunDirectory(directory), results[FILTERED]
-    shown = _drawn(vehicle, results, distances, _telling(distances), radius)
+    shown = _drawn(vehicle, results, distances, radius)
     if cfg.history:
         arrays = {"state": filtered.state, "control": filtered.control, "distance": distances[FILTERED]}
-        arrays |= {
-            f"{vehicle.label.lower()}_distance": distances[BARE],
-            "running_cost": filtered.running_cost,
-        }
-        write_history(out, filtered.time, arrays)
+        arrays[f"{vehicle.label.lower()}_distance"] = distances[BARE]
+        write_history(out, filtered.time, arrays | {"running_cost": filtered.running_cost})
     if kind is not None:
         out.figure("avoidance", animate(_scene(vehicle, shown), kind))
     return study.write(out, (lambda: draw_avoidance(shown)) if cfg.figures else None)
@@ -210,14 +206,12 @@ def scenarios(cfg: DictConfig) -> Tensor:
         ValueError: if a setting breaks its rule, or no discs leave room for a start.
     """
     chosen = cfg.avoidance
-    count, discs = (
-        integer(COMMAND_LINE, "trajectories", cfg.trajectories, 1),
-        integer(COMMAND_LINE, "avoidance.discs", chosen.discs, 1),
-    )
+    count = integer(COMMAND_LINE, "trajectories", cfg.trajectories, least=1)
+    discs = integer(COMMAND_LINE, "avoidance.discs", chosen.discs, least=1)
     clear = positive_real(COMMAND_LINE, "avoidance.radius", chosen.radius) + _CLEAR
     away = positive_real(COMMAND_LINE, "avoidance.distance", chosen.distance)
     speed = positive_real(COMMAND_LINE, "avoidance.speed", chosen.speed)
-    generator = torch.Generator().manual_seed(integer(COMMAND_LINE, "seed", cfg.seed, least=0))
+    generator = generator_of(cfg)
     turns = choice(COMMAND_LINE, "avoidance.vehicle", chosen.vehicle, tuple(VEHICLES)) == "unicycle"
 
     def at_rest() -> Tensor:
@@ -253,38 +247,23 @@ def apart(vehicle: Vehicle, k: int, radius: float) -> Constraint:
     return lambda x, t: (vehicle.point(x[:, : vehicle.size]) - x[:, at : at + 2]).square().sum(-1) - far**2
 
 
-def _still(vehicle: Vehicle, x: Tensor) -> Tensor:
-    """Return the distance of a vehicle from rest at the origin, whatever its heading: (..., n) -> (...)."""
-    own = x[..., : vehicle.size]
-    moving = own[..., 2:] if vehicle.size == 4 else own[..., :0]
-    far: Tensor = torch.cat((vehicle.point(own), moving), dim=-1).norm(dim=-1)
-    return far
-
-
 def vehicle_cost(cfg: DictConfig, vehicle: Vehicle, dim: int) -> QuadraticCost:
     """x'Qx and u'Ru of the vehicle, of a unicycle of its point; the discs cost nothing."""
     low, high = [-bound for bound in vehicle.bounds], list(vehicle.bounds)
-    if vehicle.size == 4:
-        return QuadraticCost(cfg.adp.q, cfg.adp.r, dim, 2, low=low, high=high, output=lambda x: x[..., :4])
-    home = [-vehicle.reach] + [0.0] * (dim - 1)  # where the point is at the origin
+    home = [-vehicle.reach, *[0.0] * (dim - 1)] if vehicle.reach else None  # where the point is at the origin
 
     def output(x: Tensor) -> Tensor:
-        return vehicle.point(x[..., : vehicle.size])
+        return vehicle.paid(x[..., : vehicle.size])
 
     return QuadraticCost(cfg.adp.q, cfg.adp.r, dim, 2, low=low, high=high, target=home, output=output)
 
 
-def _telling(distances: dict[str, Tensor]) -> int:
-    """The scenario to be shown: among those in which the LQR collides, where the filter comes nearest."""
-    nearest = distances[FILTERED].amin(-1)
-    collides = distances[BARE].amin(-1) < 0
-    return int(torch.where(collides, nearest, nearest + 100).argmin())
-
-
 def _drawn(
-    vehicle: Vehicle, results: dict[str, LoopResult], distances: dict[str, Tensor], row: int, radius: float
+    vehicle: Vehicle, results: dict[str, LoopResult], distances: dict[str, Tensor], radius: float
 ) -> AvoidanceHistory:
-    filtered = results[FILTERED]
+    """The scenario to be shown: among those in which the LQR collides, where the filter comes nearest."""
+    filtered, nearest = results[FILTERED], distances[FILTERED].amin(-1)
+    row = int(torch.where(distances[BARE].amin(-1) < 0, nearest, nearest + 100).argmin())
     labels = {FILTERED: f"{vehicle.label}, filtered", BARE: vehicle.label}
     return AvoidanceHistory(
         time=filtered.time.numpy(),
@@ -301,7 +280,7 @@ def _scene(vehicle: Vehicle, drawn: AvoidanceHistory) -> Scene:
     """The scenario in motion: the vehicle under the filter, the discs, and the distance to the nearest."""
     names = f"{vehicle.label}, filtered", vehicle.label
     # Nothing moves to look at once the mass is home: two thirds of the time are shown.
-    at = np.unique(np.linspace(0, 2 * (len(drawn.time) - 1) // 3, FRAMES).round().astype(int))
+    at = frames(2 * (len(drawn.time) - 1) // 3)
     both = np.stack([drawn.distances[name][at] for name in names], axis=1)
     edges = np.full((*drawn.discs[at].shape[:2], 1), drawn.radius)
     return Scene(

@@ -10,10 +10,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..approximation.basis import REACH, StaFBasis
+from ..approximation.basis import REACH
 from ..engine import ChaseResult, chase_pieces, chunk_length
 from ..metrics.ball_error import StateErrorPass
 from ..metrics.chase import ChaseMetrics, Member
+from ..results.files import grouped
 from ..settings.chase import ChaseProblem
 from ..systems import trajectory
 
@@ -59,13 +60,13 @@ def simulate(
     Returns:
         In the order of the problems.
     """
-    alike: dict[tuple[object, ...], list[int]] = {}
-    for i, problem in enumerate(problems):
-        shared = (problem.basis, problem.target, problem.law, *problem.metrics)
-        key = (*map(id, shared), problem.dt)
-        alike.setdefault(key, []).append(i)
+
+    def shared(i: int) -> tuple[object, ...]:
+        one = problems[i]
+        return (*map(id, (one.basis, one.target, one.law, *one.metrics)), one.dt)
+
     found: dict[int, Outcome] = {}
-    for indices in alike.values():
+    for indices in grouped(range(len(problems)), shared).values():
         members = [_BatchMember(problems[i], sinks[i], drawn[i]) for i in indices]
         found |= zip(indices, _run(members, advance, errors, alone=len(problems) == 1), strict=True)
     return [found[i] for i in range(len(problems))]
@@ -93,17 +94,16 @@ def _run(
         own=first.metrics,
         errors=errors,
     )
-    told = _Told(advance, len(starts), times, len(members))
+    tell = _of_whole_problems(advance, len(starts), len(members))
     # What a history holds of a time, it holds of all rows.
-    together = len(starts) if any(member.keeps for member in members) else _ROWS
+    together = len(starts) if any(member.sink is not None for member in members) else _ROWS
     blocks = starts.split(together)
     chunk = chunk_length(min(together, len(starts)), first.basis, starts.element_size())
     # Some twenty pieces of a long run, so that progress is seen; the results do not depend on it.
     chunk = max(1, min(chunk, max(64, -(-times // 20))))
-    reach = _Reach(first.basis) if len(blocks) > 1 else None
-    done = 0
+    done, reach = 0, 0.0  # rows, and the largest |x| nu(x): blocks give one warning at the end
     with torch.no_grad(), warnings.catch_warnings():
-        if reach is not None or not alone:
+        if len(blocks) > 1 or not alone:
             warnings.filterwarnings("ignore", message=REACH)
         for block in blocks:
             if done:
@@ -119,13 +119,13 @@ def _run(
             )
             for result in chased:
                 metrics.add(result)
-                if reach is not None:
-                    reach.see(result.state)
+                if len(blocks) > 1:
+                    reach = max(reach, first.basis.largest_reach(result.state))
                 _distribute(result, done, members, alone=alone)
-                told.more(result.state.shape[0] * result.state.shape[1])
+                tell(result.state.shape[0] * result.state.shape[1])
             done += len(block)
-    if reach is not None and alone:
-        reach.warn()
+    if len(blocks) > 1 and alone:
+        first.basis.warn_reach(reach, stacklevel=2)
     return [member.outcome(found) for member, found in zip(members, metrics.summaries(), strict=True)]
 
 
@@ -139,55 +139,39 @@ def _distribute(result: ChaseResult, first: int, members: Sequence[_BatchMember]
         start += member.rows
 
 
-class _Told:
-    """Turns rows and times that are done into times of whole problems, for a display of progress."""
+def _of_whole_problems(
+    advance: Callable[[int], None] | None, rows: int, problems: int
+) -> Callable[[int], None]:
+    """Return a function that turns times of rows into times of whole problems, for a display of progress."""
+    done = told = 0
 
-    def __init__(self, advance: Callable[[int], None] | None, rows: int, times: int, problems: int) -> None:
-        self._advance, self._all, self._shown = advance, rows * times, times * problems
-        self._done = self._told = 0
+    def tell(count: int) -> None:
+        nonlocal done, told
+        done += count
+        new = done * problems // rows - told
+        told += new
+        if advance is not None and new:
+            advance(new)
 
-    def more(self, count: int) -> None:
-        self._done += count
-        new = self._done * self._shown // self._all - self._told
-        self._told += new
-        if self._advance is not None and new:
-            self._advance(new)
-
-
-class _Reach:
-    """The largest |x| nu(x) of a run in blocks of rows, for one warning at its end."""
-
-    def __init__(self, basis: StaFBasis) -> None:
-        self._basis, self._worst = basis, 0.0
-
-    def see(self, states: Tensor) -> None:
-        self._worst = max(self._worst, self._basis.largest_reach(states))
-
-    def warn(self) -> None:
-        self._basis.warn_reach(self._worst, stacklevel=3)
+    return tell
 
 
 class _BatchMember:
     """A problem of a batch, with the metrics and records of its rows."""
 
     def __init__(self, problem: ChaseProblem, sink: Sink | None, drawn: bool) -> None:
-        self.problem, self._sink = problem, sink
+        self.problem, self.sink = problem, sink
         self.rows = len(problem.initial_states)
         self._thinned = _Thinned(problem.steps + 1) if drawn else None
         self._warnings: list[str] = []
         self._diverged_at = torch.full((self.rows,), -1, dtype=torch.int64)
 
-    @property
-    def keeps(self) -> bool:
-        """Return whether the history is wanted."""
-        return self._sink is not None
-
     def take(self, result: ChaseResult, rows: slice, place: int, *, alone: bool) -> None:
         """Take in ``rows`` of a piece of time, which are this problem's from ``place`` on."""
         if self._thinned is not None and place == 0:
             self._thinned.add(result, rows.start)
-        if self._sink is not None:
-            self._sink({name: getattr(result, name)[rows].cpu().numpy() for name in HISTORY})
+        if self.sink is not None:
+            self.sink({name: getattr(result, name)[rows].cpu().numpy() for name in HISTORY})
         self._diverged_at[place : place + rows.stop - rows.start] = result.diverged_at[rows].cpu()
         if not alone and not self._warnings:
             with warnings.catch_warnings(record=True) as given:

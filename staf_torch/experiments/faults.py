@@ -32,7 +32,7 @@ from ..figures.closed_loop import FaultPicture, draw_faults
 from ..numerics.checks import COMMAND_LINE, choice, flag, integer, positive_real
 from ..results.progress import SHOWN, Progress
 from ..results.run_directory import RunDirectory
-from ..settings.chase import plain
+from ..settings.chase import generator_of, plain
 from .registry import Metrics
 from .study import Method, Study
 
@@ -73,25 +73,20 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
     figures = flag(COMMAND_LINE, "figures", cfg.figures)
     rows = integer(COMMAND_LINE, "trajectories", cfg.trajectories, least=1)
     duration = positive_real(COMMAND_LINE, "duration", cfg.duration)
-    generator = torch.Generator().manual_seed(integer(COMMAND_LINE, "seed", cfg.seed, least=0))
+    generator = generator_of(cfg)
     study = Study("faults", _COLUMNS, ("cost_median", "cost_max", "regulated"), _log, digits=5)
     pictures: dict[str, FaultPicture] = {}
     for name in plain(cfg.faults.cases):
         choice(COMMAND_LINE, "faults.cases", name, tuple(CASES))
-        case = CASES[name](rows, generator)
+        case, label = CASES[name](rows, generator), name.replace("_", " ")
         results = {method: _run(case, control, duration) for method, control in _controllers(case).items()}
         best = case.optimum()
         for method, result in results.items():
             measured = _measured(case, result, best)
             if method == "adaptive":
                 measured |= _learned(case, result)
-            study.add(
-                f"{name}_{method.replace(' ', '_')}_",
-                {what: value for what, value in measured.items() if value is not None},
-                case=name.replace("_", " "),
-                method=method,
-            )
-        pictures[name.replace("_", " ")] = _picture(case, results)
+            study.add(f"{name}_{method.replace(' ', '_')}_", measured, case=label, method=method)
+        pictures[label] = _picture(case, results)
     return study.write(RunDirectory(directory), (lambda: draw_faults(pictures)) if figures else None)
 
 
@@ -204,10 +199,8 @@ class _Informed(torch.nn.Module):
         self.count = case.model.parameters_count
 
     def forward(self, z: Tensor) -> Tensor:
-        u: Tensor
-        n = z.shape[-1] - self.count
-        x, theta = z[..., :n], z[..., n:]
-        u = self.laws[0](x)
+        x, theta = z[..., : -self.count], z[..., -self.count :]
+        u: Tensor = self.laws[0](x)
         for law, own in zip(self.laws[1:], self.own[1:], strict=True):
             u = torch.where((theta == own.to(theta)).all(-1, keepdim=True), law(x), u)
         return u
@@ -246,21 +239,18 @@ def _run(case: FaultCase, controller: Controller, duration: float) -> LoopResult
     return Method(controller, plant, plant.cost(case.cost)).run(z0, dt=case.dt, steps=steps, every=every)
 
 
-def _measured(case: FaultCase, result: LoopResult, best: Tensor | None) -> dict[str, float | None]:
+def _measured(case: FaultCase, result: LoopResult, best: Tensor | None) -> Metrics:
     late = result.time >= result.time[-1] - _SETTLED
     norm = result.state[:, late, : case.x0.shape[-1]].norm(dim=-1)
     regulated = (norm < case.near).all(-1) & ~result.diverged
-    ratio = None if best is None else torch.where(result.diverged, torch.inf, result.cost / best)
-    return {
-        "cost_median": float(result.cost.median()),
-        "cost_max": float(result.cost.max()),
-        "ratio_median": None if ratio is None else float(ratio.median()),
-        "ratio_max": None if ratio is None else float(ratio.max()),
-        "regulated": float(regulated.double().mean()),
-    }
+    measured = {"cost_median": float(result.cost.median()), "cost_max": float(result.cost.max())}
+    if best is not None:
+        ratio = torch.where(result.diverged, torch.inf, result.cost / best)
+        measured |= {"ratio_median": float(ratio.median()), "ratio_max": float(ratio.max())}
+    return measured | {"regulated": float(regulated.double().mean())}
 
 
-def _learned(case: FaultCase, result: LoopResult) -> dict[str, float | None]:
+def _learned(case: FaultCase, result: LoopResult) -> dict[str, float]:
     """When the adaptive policy had found the plant, in the median, and its largest error at the end."""
     if case.adaptive.law.alarm is None:  # found: the model is certain enough for the first time
         found = (result["certain"].cumsum(1) == 0).sum(1) * (result.time[1] - result.time[0])

@@ -24,13 +24,14 @@ from ..figures.theory import ErrorPanel, draw_errors
 from ..kernels import ExponentialKernel, GaussianKernel, Kernel
 from ..local_basis import evaluate_scaled, newton_space
 from ..numerics.checks import COMMAND_LINE, fail, flag, integer, positive_real
+from ..results.files import grouped
 from ..results.progress import SHOWN, Progress
 from ..results.reader import Value
 from ..results.run_directory import RunDirectory
 from ..settings.chase import DTYPES, chase_problem, plain
 from ..tables import Table
 from ..targets import Paper
-from .registry import finite
+from .registry import Metrics, finite
 from .study import report
 
 _log = logging.getLogger(__name__)
@@ -195,18 +196,17 @@ class FlatLimitErrors(NamedTuple):
     error: dict[str, float]  # a method; inf where it fails
 
 
-def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> dict[str, float | None]:
+def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics:
     """Run what the settings describe and fill the run directory; `metrics.json` comes last."""
     problem = problem_of(cfg)
     figures = flag(COMMAND_LINE, "figures", cfg.figures)
     samples = solve(problem, progress)
-    found = summary(samples)
     out = RunDirectory(directory)
     drawing = (lambda: draw_errors(_panels(samples), rows=len(DTYPES))) if figures else None
     heading = f"Relative value error against the radius, {type(problem.kernel).__name__}:"
     shown = _shown(problem, samples)
     report(out, _log, "flat_limit", _every(samples), drawing, shown=shown, heading=heading)
-    return out.metrics(found)
+    return out.metrics(summary(samples))
 
 
 def problem_of(cfg: DictConfig) -> FlatLimit:
@@ -236,33 +236,28 @@ def solve(problem: FlatLimit, progress: Progress = SHOWN) -> list[FlatLimitError
     found = []
     pairs = list(itertools.product(problem.counts, problem.radii))
     for count, radius in progress.each(pairs, "radii and counts"):
-        directions = rings(count)
-        truth = interpolant(directions, radius, problem.state, zeta, width)
+        centers = StateFollowingCenters(rings(count), radius)
+        truth = interpolant(rings(count), radius, problem.state, zeta, width)
         for name, dtype in DTYPES.items():
-            kernel = copy.deepcopy(problem.kernel)
-            basis = StaFBasis(kernel, StateFollowingCenters(directions, radius)).to(dtype)
-            x, z = problem.state.to(dtype), (radius * zeta).to(dtype)
-            error = {
-                key: relative_error(method(basis, problem.target, x, z), truth)
-                for key, (_, method) in METHODS.items()
-            }
+            basis = copy.deepcopy(StaFBasis(problem.kernel, centers)).to(dtype)
+            about = basis, problem.target, problem.state.to(dtype), (radius * zeta).to(dtype)
+            error = {key: relative_error(method(*about), truth) for key, (_, method) in METHODS.items()}
             found.append(FlatLimitErrors(count, name, radius, error))
     return found
 
 
-def summary(samples: list[FlatLimitErrors]) -> dict[str, float | None]:
+def summary(samples: list[FlatLimitErrors]) -> Metrics:
     """By method and dtype: the worst error (null where it fails somewhere), over all counts and at each,
     and the largest radius at which it fails (null where it never does)."""
-    found: dict[str, float | None] = {}
+    found: Metrics = {}
     for key in METHODS:
         for dtype in DTYPES:
             chosen = [s for s in samples if s.dtype == dtype]
             found[f"{key}_error_{dtype}"] = finite(max(s.error[key] for s in chosen))
-            for count in sorted({s.centers for s in chosen}):
-                rows = [s for s in chosen if s.centers == count]
-                failed = [s.radius for s in rows if not math.isfinite(s.error[key])]
+            for count, rows in sorted(grouped(chosen, lambda s: s.centers).items()):
+                failed = (s.radius for s in rows if not math.isfinite(s.error[key]))
                 found[f"{key}_error_{dtype}_{count}"] = finite(max(s.error[key] for s in rows))
-                found[f"{key}_fails_at_{dtype}_{count}"] = max(failed) if failed else None
+                found[f"{key}_fails_at_{dtype}_{count}"] = max(failed, default=None)
     return found
 
 
@@ -293,22 +288,23 @@ def _shown(problem: FlatLimit, samples: list[FlatLimitErrors]) -> Table:
     headings = {"dtype": "dtype", "centers": "centers", "method": "method"}
     headings |= {f"{radius:.0e}": f"r = {radius:.0e}" for radius in shown} | {"worst": "worst"}
     rows = []
-    for dtype in DTYPES:
-        for count in problem.counts:
-            chosen = [s for s in samples if (s.dtype, s.centers) == (dtype, count)]
-            for key, (label, _) in METHODS.items():
-                row: dict[str, Value] = {"dtype": dtype, "centers": count, "method": label}
-                row |= {f"{s.radius:.0e}": _cell(s.error[key]) for s in chosen if s.radius in shown}
-                rows.append(row | {"worst": _cell(max(s.error[key] for s in chosen))})
+    for dtype, count in itertools.product(DTYPES, problem.counts):
+        chosen = [s for s in samples if (s.dtype, s.centers) == (dtype, count)]
+        for key, (label, _) in METHODS.items():
+            row: dict[str, Value] = {"dtype": dtype, "centers": count, "method": label}
+            row |= {f"{s.radius:.0e}": _cell(s.error[key]) for s in chosen if s.radius in shown}
+            rows.append(row | {"worst": _cell(max(s.error[key] for s in chosen))})
     return Table.of(rows, headings)
 
 
 def _every(samples: list[FlatLimitErrors]) -> Table:
-    rows: list[dict[str, Value]] = []
-    for s in samples:
-        about: dict[str, Value] = {"dtype": s.dtype, "centers": s.centers, "radius": s.radius}
-        rows.append(about | {key: finite(error) for key, error in s.error.items()})
-    return Table.of(rows)
+    return Table.of(
+        [
+            {"dtype": s.dtype, "centers": s.centers, "radius": s.radius}
+            | {key: finite(error) for key, error in s.error.items()}
+            for s in samples
+        ]
+    )
 
 
 def _cell(error: float) -> str:
@@ -317,16 +313,13 @@ def _cell(error: float) -> str:
 
 def _panels(samples: list[FlatLimitErrors]) -> list[ErrorPanel]:
     """A panel for each dtype and count."""
+    groups = grouped(samples, lambda s: (s.dtype, s.centers))
     return [
         ErrorPanel(
             title=f"{count} centers, {name}",
-            rounding=torch.finfo(dtype).eps,
-            radius=[s.radius for s in samples if (s.centers, s.dtype) == (count, name)],
-            error={
-                label: [s.error[key] for s in samples if (s.centers, s.dtype) == (count, name)]
-                for key, (label, _) in METHODS.items()
-            },
+            rounding=torch.finfo(DTYPES[name]).eps,
+            radius=[s.radius for s in chosen],
+            error={label: [s.error[key] for s in chosen] for key, (label, _) in METHODS.items()},
         )
-        for name, dtype in DTYPES.items()
-        for count in dict.fromkeys(s.centers for s in samples)
+        for (name, count), chosen in sorted(groups.items(), key=lambda item: list(DTYPES).index(item[0][0]))
     ]

@@ -27,7 +27,7 @@ from ..tables.columns import significant
 from .chase_batch import Outcome, simulate
 from .registry import BatchedExperiment, Metrics
 from .scenes import animation_kind, chase_scene
-from .study import log_diverged
+from .study import log_diverged, trajectories
 
 _log = logging.getLogger(__name__)
 
@@ -45,17 +45,15 @@ class Title:
 
     @classmethod
     def of(cls, problem: ChaseProblem) -> Title:
-        predictor = problem.predictor
-        method = (
-            f"{problem.basis.count} centers, {type(problem.basis.kernel).__name__}, "
-            f"{type(problem.law).__name__} x {problem.inner_steps}"
-            + ("" if predictor is None else f", {type(predictor).__name__.lower()} predictor")
-        )
-        batch = len(problem.initial_states)
-        count = problem.basis.count
+        predictor, count = problem.predictor, problem.basis.count
+        method = f"{count} centers, {type(problem.basis.kernel).__name__}, "
+        method += f"{type(problem.law).__name__} x {problem.inner_steps}"
         work = problem.law.products(count, problem.inner_steps)
-        work += 0 if predictor is None else predictor.products(count)
-        return cls(batch, problem.steps + 1, problem.dt, problem.settle_time, method, work / problem.dt)
+        if predictor is not None:
+            method += f", {type(predictor).__name__.lower()} predictor"
+            work += predictor.products(count)
+        batch, times = len(problem.initial_states), problem.steps + 1
+        return cls(batch, times, problem.dt, problem.settle_time, method, work / problem.dt)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -105,20 +103,14 @@ class GradientChase(BatchedExperiment[ChaseSolution]):
         """
         problem = chase_problem(cfg)
         figures, history = _wanted(cfg, problem)
-        batch, times = problem.initial_states.shape[0], problem.steps + 1
-        out = RunDirectory(directory)
+        out, title = RunDirectory(directory), Title.of(problem)
         with contextlib.ExitStack() as stack:
-            writer = None
-            if history:
-                writer = stack.enter_context(out.history(batch, times))
-            advance = stack.enter_context(progress.over(times, "times"))
-            sink = None if writer is None else writer.add
-            (outcome,) = simulate([problem], [sink], [figures], advance)
+            writer = stack.enter_context(out.history(title.rows, title.times)) if history else None
+            advance = stack.enter_context(progress.over(title.times, "times"))
+            outcome = solve(problem, writer, advance, drawn=figures)
             if writer is not None:
-                writer.close(time=_times(Title.of(problem)))
-        return _finish(
-            out, ChaseSolution(Title.of(problem), outcome, problem.initial_states.cpu().numpy()), cfg
-        )
+                writer.close(time=_times(title))
+        return _finish(out, ChaseSolution(title, outcome, problem.initial_states.cpu().numpy()), cfg)
 
     def solve(self, cfgs: Sequence[DictConfig], progress: Progress) -> list[ChaseSolution | Exception]:
         """Solve several configurations of one group as one tensor batch."""
@@ -126,20 +118,14 @@ class GradientChase(BatchedExperiment[ChaseSolution]):
         prepared = [_prepared(cfg, parts) for cfg in to_read(cfgs)]
         ready = [member for member in prepared if isinstance(member, _Ready)]
         common: list[str] = []
-        outcomes: list[Outcome] = []
+        left: Iterator[Outcome] = iter(())
         if ready:
-            times = sum(member.problem.steps + 1 for member in ready)
+            problems, drawn = [member.problem for member in ready], [member.figures for member in ready]
+            sinks = [None if member.memory is None else member.memory.add for member in ready]
+            times = sum(problem.steps + 1 for problem in problems)
             with _recorded(common), progress.over(times, "times") as advance:
-                outcomes = simulate(
-                    [member.problem for member in ready],
-                    [None if member.memory is None else member.memory.add for member in ready],
-                    [member.figures for member in ready],
-                    advance,
-                )
-        left = iter(outcomes)
-        return [
-            member.solved(next(left), common) if isinstance(member, _Ready) else member for member in prepared
-        ]
+                left = iter(simulate(problems, sinks, drawn, advance))
+        return [each.solved(next(left), common) if isinstance(each, _Ready) else each for each in prepared]
 
     def write(self, cfg: DictConfig, directory: Path, solution: ChaseSolution) -> Metrics:
         """Fill the run directory with what was solved; `metrics.json` comes last."""
@@ -207,8 +193,7 @@ def _prepared(cfg: DictConfig | PlainSettings, parts: Parts) -> _Ready | Excepti
 @contextlib.contextmanager
 def _recorded(messages: list[str]) -> Iterator[None]:
     """Warnings go to the list."""
-    with warnings.catch_warnings(record=True) as given:
-        warnings.simplefilter("always")
+    with warnings.catch_warnings(record=True, action="always") as given:
         yield
     messages += [str(warning.message) for warning in given]
 
@@ -221,12 +206,11 @@ class _Memory:
         self.arrays: dict[str, np.ndarray] = {}
 
     def add(self, pieces: Mapping[str, np.ndarray]) -> None:
-        length = 0
+        start, length = self._done, next(iter(pieces.values())).shape[1]
         for name, piece in pieces.items():
-            length = piece.shape[1]
             if name not in self.arrays:
                 self.arrays[name] = np.empty((*self._shape, *piece.shape[2:]), piece.dtype)
-            self.arrays[name][:, self._done : self._done + length] = piece
+            self.arrays[name][:, start : start + length] = piece
         self._done += length
 
 
@@ -237,7 +221,7 @@ def _wanted(cfg: DictConfig | PlainSettings, problem: ChaseProblem) -> tuple[boo
     return drawn or moving, flag(COMMAND_LINE, "history", cfg.history)
 
 
-def _finish(out: RunDirectory, solved: ChaseSolution, cfg: DictConfig) -> dict[str, float | None]:
+def _finish(out: RunDirectory, solved: ChaseSolution, cfg: DictConfig) -> Metrics:
     """Write what follows the history: the log, the figure, the animation, the metrics."""
     outcome = solved.outcome
     diverged = torch.where(outcome.diverged_at < 0, torch.inf, outcome.diverged_at * solved.title.dt)
@@ -259,16 +243,13 @@ def _summarise(title: Title, metrics: dict[str, float | None]) -> None:
     def show(name: str) -> str:
         return significant(metrics[name], 4)
 
-    _log.info(
-        "Gradient chase: %d %s, %d times, dt = %g s, %s",
-        title.rows,
-        "trajectory" if title.rows == 1 else "trajectories",
-        title.times,
-        title.dt,
-        title.method,
-    )
+    about = trajectories(title.rows), title.times, title.dt, title.method
+    _log.info("Gradient chase: %s, %d times, dt = %g s, %s", *about)
     if metrics["ultimate_error"] is None:
-        _log.warning("nothing to report: %s", _why_nothing(title))
+        end, first = (title.times - 1) * title.dt, f"settle_time = {title.settle_time:g} s"
+        ends = f"the run ends at {end:g} s, and metrics begin at {first}"
+        why = ends if end < title.settle_time else f"no trajectory is finite at a time t >= {first}"
+        _log.warning("nothing to report: %s", why)
     row = "  %-22s %12s %12s %12s"
     _log.info(row, f"worst, t >= {title.settle_time:g} s", "corrected", "before", "ideal weights")
     names = ("ultimate_error", "ultimate_error_before", "floor_error")
@@ -281,10 +262,3 @@ def _summarise(title: Title, metrics: dict[str, float | None]) -> None:
         *map(show, ("condition_number", "settling_time")),
         *map(show, ("contraction_violations", "diverged_fraction")),
     )
-
-
-def _why_nothing(title: Title) -> str:
-    end = (title.times - 1) * title.dt
-    if end < title.settle_time:
-        return f"the run ends at {end:g} s, and metrics begin at settle_time = {title.settle_time:g} s"
-    return f"no trajectory is finite at a time t >= settle_time = {title.settle_time:g} s"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from omegaconf import DictConfig
@@ -15,7 +15,7 @@ from ..figures.closed_loop import GainSets, draw_gain_sets
 from ..numerics.checks import COMMAND_LINE, fail, flag, integer, non_negative, positive_real, real, vector
 from ..results.progress import SHOWN, Progress
 from ..results.run_directory import RunDirectory
-from ..settings.chase import plain
+from ..settings.chase import generator_of, plain, seed_of
 from .registry import Metrics
 from .study import Method, Study
 
@@ -54,25 +54,26 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
     late = time >= settle
     if not bool(late.any()):
         raise fail(COMMAND_LINE, "settle_time", "must be before the end", cfg.settle_time)
-    rms = {name: _rms(each.error[:, late]) for name, each in found.items()}
-    rms_theta = {name: _rms(each.theta[:, late] - plant.theta) for name, each in found.items()}
+    rms = {
+        "error": {name: _rms(each.error[:, late]) for name, each in found.items()},
+        "parameter_error": {name: _rms(each.theta[:, late] - plant.theta) for name, each in found.items()},
+    }
     study = Study("icl", _COLUMNS, ("error_median", "parameter_error_median"), _log, digits=4)
     for name, each in found.items():
         measured = {"diverged": float(each.diverged)}
-        for what, values in (("error", rms[name]), ("parameter_error", rms_theta[name])):
-            parts = {"median": values.median(), "best": values.min(), "worst": values.max()}
+        for what, of in rms.items():
+            parts = {"median": of[name].median(), "best": of[name].min(), "worst": of[name].max()}
             measured |= {f"{what}_{key}": float(value) for key, value in parts.items()}
         study.add(f"{name}_", measured, method=name)
-    for what, values_of in (("error", rms), ("parameter_error", rms_theta)):
-        better = (values_of["integral"] < values_of["derivative"]).double().mean()
-        study.metrics[f"integral_better_{what}"] = float(better)
-    shown = int(rms_theta["integral"].argmin())
+    for what, of in rms.items():
+        study.metrics[f"integral_better_{what}"] = float((of["integral"] < of["derivative"]).double().mean())
+    shown = int(rms["parameter_error"]["integral"].argmin())
     picture = GainSets(
         time=time.numpy(),
         parameters=found["integral"].theta[shown].numpy(),
         truth=plant.theta.numpy(),
-        error={name: values.numpy() for name, values in rms.items()},
-        parameter_error={name: values.numpy() for name, values in rms_theta.items()},
+        error={name: values.numpy() for name, values in rms["error"].items()},
+        parameter_error={name: values.numpy() for name, values in rms["parameter_error"].items()},
         followed={name: each.error[shown].norm(dim=-1).numpy() for name, each in found.items()},
     )
     return study.write(RunDirectory(directory), (lambda: draw_gain_sets(picture)) if figures else None)
@@ -86,8 +87,7 @@ def _followed(cfg: DictConfig, plant: ParametricPlant, gains: dict[str, Tensor],
     noise = real(COMMAND_LINE, "icl.noise", cfg.icl.noise)
     size = integer(COMMAND_LINE, "icl.size", cfg.icl.size, 1)
     start = [*vector(COMMAND_LINE, "initial_state", plain(cfg.initial_state), 2), 1.0, 0.0, 1.0]
-    given: dict[str, Any] = dict(gains)
-    tracker = ConcurrentTracker(plant, reference, source=source, size=size, **given)
+    tracker = ConcurrentTracker(plant, reference, source=source, size=size, **gains)
     method = Method(
         Measured(tracker, noise=[noise, noise, 0.0, 0.0, 0.0], dim=5),
         plant,
@@ -98,11 +98,10 @@ def _followed(cfg: DictConfig, plant: ParametricPlant, gains: dict[str, Tensor],
         dt=dt,
         steps=every * max(1, round(duration / dt / every)),
         every=every,
-        seed=integer(COMMAND_LINE, "seed", cfg.seed, least=0),
+        seed=seed_of(cfg),
     )
-    theta = result["theta"]
     error = result.state[..., :2] - reference(result.state)[0]
-    return SourceRun(result.time, error, theta, int(result.diverged.sum()))
+    return SourceRun(result.time, error, result["theta"], int(result.diverged.sum()))
 
 
 def published() -> ParametricPlant:
@@ -130,25 +129,24 @@ def reference(z: Tensor) -> tuple[Tensor, Tensor]:
     _, _, decay, s, c = z.unbind(-1)
     sine, cosine = 2 * s * c, c * c - s * s  # of 2t
     sine3, cosine3 = 3 * s - 4 * s**3, 4 * c**3 - 3 * c
-    wide, growth = 10 * (1 - decay), decay
+    wide = 10 * (1 - decay)
     wanted = torch.stack((wide * sine, 0.4 * wide * cosine3), dim=-1)
-    first = growth * sine + 2 * wide * cosine
-    second = 0.4 * (growth * cosine3 - 3 * wide * sine3)
+    first = decay * sine + 2 * wide * cosine
+    second = 0.4 * (decay * cosine3 - 3 * wide * sine3)
     return wanted, torch.stack((first, second), dim=-1)
 
 
 def _gains(cfg: DictConfig) -> dict[str, Tensor]:
     """Gains of every row, uniform in their ranges."""
     rows = integer(COMMAND_LINE, "trajectories", cfg.trajectories, least=1)
-    generator = torch.Generator().manual_seed(integer(COMMAND_LINE, "seed", cfg.seed, least=0))
+    generator = generator_of(cfg)
     drawn = torch.rand(rows, 4, generator=generator, dtype=torch.float64)
     found = {}
     for k, name in enumerate(("feedback", "gain", "rate", "length")):
         low, high = vector(COMMAND_LINE, f"icl.{name}", plain(cfg.icl[name]), 2)
         if not 0 < low <= high:
-            raise fail(
-                COMMAND_LINE, f"icl.{name}", "must be two positive numbers, the smaller first", [low, high]
-            )
+            rule = "must be two positive numbers, the smaller first"
+            raise fail(COMMAND_LINE, f"icl.{name}", rule, [low, high])
         found[name] = low + (high - low) * drawn[:, k]
     return found
 

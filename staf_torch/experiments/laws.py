@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import torch
 from omegaconf import DictConfig
 
 from .. import optim, theory
@@ -22,10 +21,10 @@ from ..optim import UpdateLaw
 from ..results.progress import SHOWN, Progress
 from ..results.run_directory import RunDirectory
 from ..settings.chase import ChaseProblem, chase_problem, plain
-from ..systems import trajectory
+from ..systems import simulate
 from ..tables import Table
 from .gradient_chase import solve
-from .registry import finite, log_slope
+from .registry import Metrics, finite, log_slope
 from .study import report
 
 _log = logging.getLogger(__name__)
@@ -81,39 +80,31 @@ def cases(work: int, count: int) -> list[LawCase]:
         count: M.
     """
     many = work - 1
-    rows = [
-        _case(law, iterations, None, count)
-        for law, iterations in (
-            (optim.FixedStep(), 1),
-            (optim.FixedStep(), many),
-            (optim.SteepestDescent(), 1),
-            (optim.SteepestDescent(), many),
-            (optim.PreconditionedDescent("jacobi"), many),
-            (optim.BarzilaiBorwein(), many),
-            (optim.HeavyBall(), many),
-            (optim.Nesterov(), many),
-            (optim.ConjugateGradient(), min(2, count)),
-            (optim.ConjugateGradient(), min(count, many)),
-            (optim.PreconditionedDescent("core"), 1),
-            (optim.Exact(), 1),
-            (optim.RecursiveLeastSquares(), 1),
-            (optim.NormalisedLMS(), 1),
-        )
+    chosen: list[tuple[UpdateLaw, int, Predictor | None]] = [
+        (optim.FixedStep(), 1, None),
+        (optim.FixedStep(), many, None),
+        (optim.SteepestDescent(), 1, None),
+        (optim.SteepestDescent(), many, None),
+        (optim.PreconditionedDescent("jacobi"), many, None),
+        (optim.BarzilaiBorwein(), many, None),
+        (optim.HeavyBall(), many, None),
+        (optim.Nesterov(), many, None),
+        (optim.ConjugateGradient(), min(2, count), None),
+        (optim.ConjugateGradient(), min(count, many), None),
+        (optim.PreconditionedDescent("core"), 1, None),
+        (optim.Exact(), 1, None),
+        (optim.RecursiveLeastSquares(), 1, None),
+        (optim.NormalisedLMS(), 1, None),
     ]
     for predictor in (Secant(), Tangent(order=1), Tangent(order=2)):
         rest = max(1, many - predictor.products(count))
-        for law, iterations in (
-            (optim.SteepestDescent(), 1),
-            (optim.SteepestDescent(), rest),
-            (optim.Exact(), 1),
-        ):
-            rows.append(_case(law, iterations, predictor, count))
+        chosen += [(optim.SteepestDescent(), iterations, predictor) for iterations in (1, rest)]
+        chosen.append((optim.Exact(), 1, predictor))
+    rows = []
+    for law, iterations, predictor in chosen:
+        products = law.products(count, iterations) + (predictor.products(count) if predictor else 0)
+        rows.append(LawCase(law, iterations, predictor, products))
     return list({case.key: case for case in rows}.values())  # with two centers a row would repeat itself
-
-
-def _case(law: UpdateLaw, iterations: int, predictor: Predictor | None, count: int) -> LawCase:
-    extra = 0 if predictor is None else predictor.products(count)
-    return LawCase(law, iterations, predictor, law.products(count, iterations) + extra)
 
 
 def curves(work: int, count: int) -> list[LawCase]:
@@ -136,7 +127,7 @@ class LawCurve(NamedTuple):
     slope: float | None  # d log(excess) / d log(dt), least squares
 
 
-def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> dict[str, float | None]:
+def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics:
     """Run what the settings describe and fill the run directory; `metrics.json` comes last."""
     problem = dataclasses.replace(chase_problem(cfg), certificate=True)
     work = integer(COMMAND_LINE, "laws.work", cfg.laws.work, least=2)
@@ -152,45 +143,31 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> dict[st
     out = RunDirectory(directory)
     every = Table.of([{name: value for name, value in row.items() if name != "key"} for row in rows])
     out.text("laws.json", json.dumps(rows, indent=2, allow_nan=False) + "\n")
-    report(
-        *(
-            out,
-            _log,
-            "laws",
-            every,
-            (lambda: draw_convergence(_lines(swept, steps))) if cfg.figures else None,
-        ),
-        shown=Table.of(rows, _HEADINGS),
-        heading=f"Worst over t >= {problem.settle_time:g} s, dt = {problem.dt:g} s, "
-        f"{problem.basis.count} centers:",
-    )
+    drawing = (lambda: draw_convergence(_lines(swept, steps))) if cfg.figures else None
+    about = f"t >= {problem.settle_time:g} s, dt = {problem.dt:g} s, {problem.basis.count} centers"
+    heading = f"Worst over {about}:"
+    report(out, _log, "laws", every, drawing, shown=Table.of(rows, _HEADINGS), heading=heading)
     _summarise(problem, swept, promised, excess)
-    metrics = {
-        f"{row['key']}.{name}": value
-        for row in rows
-        for name, value in row.items()
-        if not isinstance(value, str)
-    }
-    metrics |= {f"{curve.case.key}.slope": curve.slope for curve in swept} | promised
-    return out.metrics(metrics)
+    numbers = {(row["key"], name): x for row in rows for name, x in row.items() if not isinstance(x, str)}
+    numbers |= {(curve.case.key, "slope"): curve.slope for curve in swept}
+    return out.metrics({f"{key}.{name}": value for (key, name), value in numbers.items()} | promised)
 
 
 def table(
     problem: ChaseProblem, compared: list[LawCase], errors: StateErrorPass, progress: Progress = SHOWN
 ) -> list[dict[str, str | float | None]]:
     """Return a row a case: its law, its cost, and the metrics of its gradient chase."""
-    rows: list[dict[str, str | float | None]] = []
-    for case in progress.each(compared, "laws"):
-        about: dict[str, str | float | None] = {
+    return [
+        {
             "key": case.key,
             "law": case.name,
             "iterations": case.iterations,
             "predictor": case.predicted,
             "products": case.products / problem.dt,
         }
-        about.update(solve(_with(problem, case), errors=errors).metrics)
-        rows.append(about)
-    return rows
+        | solve(_with(problem, case), errors=errors).metrics
+        for case in progress.each(compared, "laws")
+    ]
 
 
 def sweep(
@@ -202,32 +179,30 @@ def sweep(
 ) -> list[LawCurve]:
     """Each case over the same horizon at every step."""
     duration = problem.dt * problem.steps
-    counts = [math.floor(duration / dt + 1e-9) for dt in steps]
+
+    def excess(case: LawCase, dt: float) -> float | None:
+        refined = dataclasses.replace(_with(problem, case), dt=dt, steps=math.floor(duration / dt + 1e-9))
+        return solve(refined, errors=errors).metrics["ultimate_excess_before"]
+
     found = []
     for case in progress.each(drawn, "laws over all dt"):
-        excess = [
-            solve(dataclasses.replace(_with(problem, case), dt=dt, steps=count), errors=errors).metrics[
-                "ultimate_excess_before"
-            ]
-            for dt, count in zip(steps, counts, strict=True)
-        ]
-        found.append(LawCurve(case, excess, log_slope(steps, excess)))
+        curve = [excess(case, dt) for dt in steps]
+        found.append(LawCurve(case, curve, log_slope(steps, curve)))
     return found
 
 
-def promises(problem: ChaseProblem, excess: float) -> dict[str, float | None]:
+def promises(problem: ChaseProblem, excess: float) -> Metrics:
     """Return the a-priori bounds for the paper's law at the problem's step and iterations: the
     a-priori excess, the step and the iterations that a wanted excess needs, and the paper's own step."""
     system, law = problem.system, optim.SteepestDescent()
-    pieces = trajectory(system, problem.initial_states, dt=problem.dt, steps=problem.steps)
-    states = torch.cat(list(pieces), dim=1).flatten(0, 1)
+    states = simulate(system, problem.initial_states, dt=problem.dt, steps=problem.steps).flatten(0, 1)
     states = states[:: -(-states.shape[0] // _STATES)]
     its, dt = problem.inner_steps, problem.dt
     try:
         velocities = system.drift(states)
         constants = theory.drift_constants(problem.basis, problem.target, states, velocities)
         bound = theory.ultimate_bound(constants, law, dt=dt, inner_steps=its)
-        found: dict[str, float | None] = {
+        found: Metrics = {
             "a_priori.ultimate_excess_before": bound.before,
             "a_priori.ultimate_excess": bound.after,
             "a_priori.step": theory.step_for_bound(constants, law, excess=excess, inner_steps=its),
@@ -247,18 +222,12 @@ def _with(problem: ChaseProblem, case: LawCase) -> ChaseProblem:
 
 
 def _steps(cfg: DictConfig, problem: ChaseProblem) -> list[float]:
-    steps = [
-        positive_real(COMMAND_LINE, "laws.steps", dt)
-        for dt in vector(COMMAND_LINE, "laws.steps", plain(cfg.laws.steps))
-    ]
-    duration = problem.dt * problem.steps
+    name, duration = "laws.steps", problem.dt * problem.steps
+    listed = vector(COMMAND_LINE, name, plain(cfg.laws.steps))
+    steps = [positive_real(COMMAND_LINE, name, dt) for dt in listed]
     if len(steps) < 2 or max(steps) > duration:
-        raise fail(
-            COMMAND_LINE,
-            "laws.steps",
-            f"must be two or more steps within the duration ({duration:g} s)",
-            steps,
-        )
+        rule = f"must be two or more steps within the duration ({duration:g} s)"
+        raise fail(COMMAND_LINE, name, rule, steps)
     return steps
 
 
@@ -268,7 +237,7 @@ def _lines(swept: list[LawCurve], steps: list[float]) -> list[ConvergenceCurve]:
             label=f"{curve.case.name} x{curve.case.iterations}"
             + (f", {curve.case.predicted}" if curve.case.predictor is not None else ""),
             step=np.array(steps),
-            excess=np.array([np.nan if e is None else e for e in curve.excess]),
+            excess=np.array(curve.excess, dtype=float),  # None: NaN
             slope=curve.slope,
         )
         for curve in swept
@@ -288,15 +257,10 @@ def _summarise(
         show = {name: "none" if value is None else f"{value:.3g}" for name, value in promised.items()}
         _log.info(
             "A priori bound, steepest descent x%d at dt = %g s: excess %s before and %s after the correction",
-            problem.inner_steps,
-            problem.dt,
-            show["a_priori.ultimate_excess_before"],
-            show["a_priori.ultimate_excess"],
+            *(problem.inner_steps, problem.dt),
+            *(show["a_priori.ultimate_excess_before"], show["a_priori.ultimate_excess"]),
         )
         _log.info(
             "For an excess of %g: dt = %s s, or %s iterations; by the paper's own constants, dt = %s s",
-            excess,
-            show["a_priori.step"],
-            show["a_priori.iterations"],
-            show["a_priori.paper_step"],
+            *(excess, show["a_priori.step"], show["a_priori.iterations"], show["a_priori.paper_step"]),
         )

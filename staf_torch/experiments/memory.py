@@ -18,9 +18,9 @@ from ..online.experience_memory import ExperienceMemory
 from ..results.progress import SHOWN, Progress
 from ..results.run_directory import RunDirectory
 from ..settings.chase import ChaseProblem, chase_problem
-from ..systems import trajectory
+from ..systems import simulate
 from ..tables import Table
-from .registry import finite
+from .registry import Metrics, finite
 from .study import report
 
 _log = logging.getLogger(__name__)
@@ -54,16 +54,14 @@ class Revisits(NamedTuple):
     settled: Tensor  # the largest excess of the settled chase, (B,)
 
 
-def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> dict[str, float | None]:
+def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics:
     """Run what the settings describe and fill the run directory; `metrics.json` comes last."""
     problem, settings = chase_problem(cfg), settings_of(cfg)
     figures = flag(COMMAND_LINE, "figures", cfg.figures)
     first = round(problem.settle_time / problem.dt)
     if not 0 <= first < problem.steps:
         raise fail(COMMAND_LINE, "settle_time", "must lie within the duration", problem.settle_time)
-    states = torch.cat(
-        list(trajectory(problem.system, problem.initial_states, dt=problem.dt, steps=problem.steps)), dim=1
-    )
+    states = simulate(problem.system, problem.initial_states, dt=problem.dt, steps=problem.steps)
     found = _chase(problem, states)
     coefficients = problem.basis.local(states).coefficients(found.weights)
     memory = remember(problem, settings, states[:, first:], coefficients[:, first:], progress)
@@ -99,9 +97,8 @@ def remember(
     memory = ExperienceMemory(
         problem.basis, settings.capacity, (len(states),), reach=settings.reach, spacing=settings.spacing
     ).to(states)
-    pairs = list(zip(states.unbind(1), kept.unbind(1), strict=True))
-    for x, model in progress.each(pairs, "times"):
-        memory.add(x, model)
+    for k in progress.each(range(states.shape[1]), "times"):
+        memory.add(states[:, k], kept[:, k])
     return memory
 
 
@@ -146,9 +143,9 @@ def revisits(
     return Revisits(excess, found.excess[:, first:].amax(-1))
 
 
-def summary(memory: ExperienceMemory, region: Region, again: Revisits) -> dict[str, float | None]:
+def summary(memory: ExperienceMemory, region: Region, again: Revisits) -> Metrics:
     """The worst over trajectories."""
-    found: dict[str, float | None] = {"models": float(memory.count.max())}
+    found: Metrics = {"models": float(memory.count.max())}
     found["covered_fraction"] = float((~region.errors["memory"].isnan()).double().mean())
     for name, error in region.errors.items():
         covered = ~error.isnan()

@@ -17,6 +17,7 @@ from torch import Tensor
 from .. import adp
 from ..adp import SampledProblem
 from ..numerics.runge_kutta import SHARES, runge_kutta_mean, runge_kutta_stages
+from ..results.build import installed
 from .rival_plants import RivalPlant
 
 Steer = Callable[[Tensor], Tensor]
@@ -236,12 +237,7 @@ class Rival:
     @property
     def missing(self) -> str | None:
         """The first package that is not installed."""
-        for name in self.packages:
-            try:
-                metadata.distribution(name)
-            except metadata.PackageNotFoundError:
-                return name
-        return None
+        return next((name for name in self.packages if installed(name) is None), None)
 
     @property
     def megabytes(self) -> float:

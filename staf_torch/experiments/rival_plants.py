@@ -21,14 +21,7 @@ class TorchMath:
     """The functions that equations use, under CasADi's names."""
 
     sin, cos = staticmethod(torch.sin), staticmethod(torch.cos)
-
-    @staticmethod
-    def fmin(x: Tensor, limit: float) -> Tensor:
-        return x.clamp(max=limit)
-
-    @staticmethod
-    def fmax(x: Tensor, limit: float) -> Tensor:
-        return x.clamp(min=limit)
+    fmin, fmax = staticmethod(torch.clamp_max), staticmethod(torch.clamp_min)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -162,50 +155,36 @@ def figure_eight(m: Any, t: Any) -> Sequence[Any]:
     return 0.75 * sine, across, 0.75 * sine * cosine + 1.0, up, 0 * t, 0 * t
 
 
-_CART = ((1.0, 1.0, 0.1, 0.1), (0.01,))
+_CART_POLE = RivalPlant(
+    *("cart_pole_10N", cart_pole, 0.02, 250, ((1.0, 1.0, 0.1, 0.1), (0.01,))),
+    *((-10.0,), (10.0,), (0.3,) * 4),
+    periodic=(1,),
+)
 CASES = {
     case.name: case
     for case in (
         RivalPlant("double_integrator", mass, 0.1, 150, ((1.0, 1.0), (1.0,)), (-1.0,), (1.0,), (5.0, 1.0)),
         RivalPlant(
-            "pendulum",
-            pendulum,
-            0.05,
-            200,
-            ((20.0, 2.0), (0.02,)),
-            (-2.0,),
-            (2.0,),
-            (math.pi, 1.0),
+            *("pendulum", pendulum, 0.05, 200, ((20.0, 2.0), (0.02,)), (-2.0,), (2.0,), (math.pi, 1.0)),
             periodic=(0,),
             discrete=True,
             swing=True,
         ),
-        RivalPlant(
-            "cart_pole_10N", cart_pole, 0.02, 250, _CART, (-10.0,), (10.0,), (0.3,) * 4, periodic=(1,)
-        ),
-        RivalPlant("cart_pole_5N", cart_pole, 0.02, 250, _CART, (-5.0,), (5.0,), (0.3,) * 4, periodic=(1,)),
-        RivalPlant(
-            "cart_pole_to_1m",
-            cart_pole,
-            1 / 15,
-            90,
-            ((5.0, 5.0, 0.1, 0.1), (0.1,)),
-            (-10.0,),
-            (10.0,),
-            (1.0, 0.2, 0.2, 0.2),
+        _CART_POLE,
+        dataclasses.replace(_CART_POLE, name="cart_pole_5N", low=(-5.0,), high=(5.0,)),
+        dataclasses.replace(
+            _CART_POLE,
+            name="cart_pole_to_1m",
+            dt=1 / 15,
+            steps=90,
+            weights=((5.0, 5.0, 0.1, 0.1), (0.1,)),
+            box=(1.0, 0.2, 0.2, 0.2),
             target=(1.0, 0.0, 0.0, 0.0),
-            periodic=(1,),
             horizon=20,
         ),
         RivalPlant(
-            "quadrotor",
-            quadrotor,
-            0.02,
-            200,
-            ((1.0,) * 6, (1.0, 1.0)),
-            (-9.81, -1.0),
-            (9.81, 1.0),
-            (0.4,) * 6,
+            *("quadrotor", quadrotor, 0.02, 200, ((1.0,) * 6, (1.0, 1.0))),
+            *((-9.81, -1.0), (9.81, 1.0), (0.4,) * 6),
             periodic=(2,),
         ),
         RivalPlant(
@@ -223,16 +202,11 @@ CASES = {
             rest=(0.5 * 0.027 * 9.81,) * 2,
             left=0.2,
         ),
-        RivalPlant(
-            "cart_pole_swing_up",
-            cart_pole,
-            0.02,
-            300,
-            _CART,
-            (-10.0,),
-            (10.0,),
-            (1.0, math.pi, 1.0, 2.0),
-            periodic=(1,),
+        dataclasses.replace(
+            _CART_POLE,
+            name="cart_pole_swing_up",
+            steps=300,
+            box=(1.0, math.pi, 1.0, 2.0),
             swing=True,
             horizon=120,
         ),

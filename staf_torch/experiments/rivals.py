@@ -19,7 +19,7 @@ from ..figures.closed_loop import draw_rivals
 from ..numerics.checks import COMMAND_LINE, choice, integer
 from ..results.progress import SHOWN, Progress
 from ..results.run_directory import RunDirectory
-from ..settings.chase import plain
+from ..settings.chase import plain, seed_of
 from ..tables.columns import significant
 from .registry import Metrics
 from .rival_methods import METHODS, Begin, Rival, UnsuitableError, ipopt_program
@@ -64,7 +64,7 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
     states = integer(COMMAND_LINE, "rivals.states", settings.states, least=1)
     slow = min(states, integer(COMMAND_LINE, "rivals.slow", settings.slow, least=1))
     calls = integer(COMMAND_LINE, "rivals.calls", settings.calls, least=1)
-    seed = integer(COMMAND_LINE, "seed", cfg.seed, least=0)
+    seed = seed_of(cfg)
     study, out = Study("rivals", _COLUMNS, (), _log, digits=5), RunDirectory(directory)
     with progress.over(len(cases), "plants") as advance:
         for case in cases:
@@ -116,14 +116,12 @@ def compare(
         times[rival.name] = timed(problem, begin, x0[:1], -(-calls // 5) if few else calls)
         _log.info("%s, %s: mean cost %s", case.name, rival.name, significant(float(episode.cost.mean()), 5))
     best = best_known(case, problem, x0, list(episodes.values()))
-    return [
-        RivalRow(
-            rival.name,
-            _measured(episodes.get(rival.name), best, case.left),
-            _told(rival, episodes.get(rival.name), times.get(rival.name), notes.get(rival.name)),
-        )
-        for rival in rivals
-    ]
+    rows = []
+    for rival in rivals:
+        episode, note = episodes.get(rival.name), notes.get(rival.name)
+        more = _told(rival, episode, times.get(rival.name), note)
+        rows.append(RivalRow(rival.name, _measured(episode, best, case.left), more))
+    return rows
 
 
 @torch.no_grad()
@@ -195,7 +193,7 @@ def _by_ipopt(
     return torch.tensor(found, dtype=torch.float64)
 
 
-def _measured(episode: Episode | None, best: Tensor, share: float) -> dict[str, float | None]:
+def _measured(episode: Episode | None, best: Tensor, share: float) -> Metrics:
     if episode is None:
         return dict.fromkeys(("ratio_median", "ratio_max", "regulated", "violations"))
     best = best[: len(episode.cost)]

@@ -18,7 +18,7 @@ from ..numerics.checks import COMMAND_LINE, fail, flag, integer, positive_real
 from ..results.progress import SHOWN, Progress
 from ..results.run_directory import RunDirectory
 from ..settings.adp import make_cost, optimum_settings, plant
-from ..settings.chase import initial_states, placement, plain
+from ..settings.chase import generator_of, horizon, initial_states, placement, plain, seed_of
 from ..systems import Barrier, ControlAffineSystem, Plant
 from .registry import Metrics, finite
 from .study import Method, Study, label_key, write_history
@@ -48,8 +48,7 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
     x0 = initial_states(cfg, system.dim).to(device=device, dtype=torch.float64)
     shooting = optimum_settings(cfg.adp.optimum)
     others = {"left": _anywhere(cfg, box), "left_near": _beside_walls(cfg, box)}
-    dt = positive_real(COMMAND_LINE, "dt", cfg.dt)
-    steps = max(1, round(positive_real(COMMAND_LINE, "duration", cfg.duration) / dt))
+    dt, steps = horizon(cfg)
     followed = max(1, round(positive_real(COMMAND_LINE, "safe_box.followed", cfg.safe_box.followed) / dt))
     every = next(k for k in range(max(1, steps // 2000), steps + 1) if steps % k == 0)
     study = Study("safe_box", _COLUMNS, ("cost", "minimum_margin", "constraint_violations"), _log)
@@ -87,11 +86,9 @@ def methods(cfg: DictConfig, box: Barrier, cost: Cost) -> dict[str, Method]:
     lqr = LQR(system, QuadraticCost(cost.q, cost.r, size, cost.inputs))
     found = {"LQR of s": Method(Feedback(of_s), box, cost)}
     if flag(COMMAND_LINE, "safe_box.filter", cfg.safe_box.filter):
-        held, renewed = (BoxFilter(of_s, box, dt=dt, renewed=renewed) for renewed in (False, True))
-        found["LQR of s, filtered"] = Method(Feedback(held), box, cost, substeps)
-        found["LQR of s, filtered, renewed"] = Method(
-            Feedback(renewed), box, cost, substeps | {"renew": True}
-        )
+        for renewed, name in ((False, "LQR of s, filtered"), (True, "LQR of s, filtered, renewed")):
+            steps = substeps | ({"renew": True} if renewed else {})
+            found[name] = Method(Feedback(BoxFilter(of_s, box, dt=dt, renewed=renewed)), box, cost, steps)
         kept = walls(box.low.tolist(), box.high.tolist())
         guard = SafetyFilter(lqr, system, kept, dt=dt, decay=float(cfg.safe_box.decay))
         found["LQR of x, filtered"] = Method(guard, system, paid)
@@ -104,18 +101,18 @@ def methods(cfg: DictConfig, box: Barrier, cost: Cost) -> dict[str, Method]:
 
 def _run(cfg: DictConfig, method: Method, box: Barrier, x0: Tensor, steps: int, every: int) -> LoopResult:
     """Run one method from states x of the box; every ``every``-th step is recorded."""
-    seed = integer(COMMAND_LINE, "seed", cfg.seed, least=0)
     start = box.transform(x0.double()).to(x0) if method.plant is box else x0
-    return method.run(start, dt=float(cfg.dt), steps=steps, every=every, seed=seed, compile=cfg.adp.compile)
+    shared = {"dt": float(cfg.dt), "steps": steps, "every": every, "compile": cfg.adp.compile}
+    return method.run(start, **shared, seed=seed_of(cfg))
 
 
-def _measured(result: LoopResult, margin: Tensor, best: float | None) -> dict[str, float | None]:
-    measured = constraint_metrics(result, margin)
+def _measured(result: LoopResult, margin: Tensor, best: float | None) -> Metrics:
     paid = None if bool(result.diverged[0]) else finite(result.cost[0])
-    measured["cost"] = paid
-    measured["cost_ratio"] = None if best is None or paid is None else paid / best
-    measured["largest_control"] = finite(result.control[0, :-1].abs().max())
-    return measured
+    return constraint_metrics(result, margin) | {
+        "cost": paid,
+        "cost_ratio": None if best is None or paid is None else paid / best,
+        "largest_control": finite(result.control[0, :-1].abs().max()),
+    }
 
 
 def _unavoidable(cfg: DictConfig, box: Barrier, cost: Cost, starts: dict[str, Tensor]) -> Metrics:
@@ -138,8 +135,7 @@ def _unavoidable(cfg: DictConfig, box: Barrier, cost: Cost, starts: dict[str, Te
 def _anywhere(cfg: DictConfig, box: Barrier) -> Tensor:
     """States drawn uniformly from the box, from [-1, 1] around its middle where a wall is missing: (B, n)."""
     count = integer(COMMAND_LINE, "safe_box.states", cfg.safe_box.states, least=1)
-    generator = torch.Generator().manual_seed(integer(COMMAND_LINE, "seed", cfg.seed, least=0))
-    share = torch.rand(count, len(box.low), dtype=torch.float64, generator=generator)
+    share = torch.rand(count, len(box.low), dtype=torch.float64, generator=generator_of(cfg))
     return (box.floor + (box.ceiling - box.floor) * share).clamp(box.low + 1e-9, box.high - 1e-9)
 
 
@@ -147,12 +143,11 @@ def _beside_walls(cfg: DictConfig, box: Barrier) -> Tensor:
     """States of `_anywhere`, each moved to ``safe_box.near`` from one of the walls: (B, n)."""
     near = positive_real(COMMAND_LINE, "safe_box.near", cfg.safe_box.near)
     x = _anywhere(cfg, box)
-    generator = torch.Generator().manual_seed(integer(COMMAND_LINE, "seed", cfg.seed, least=0))
     walls = [(k, side) for k in range(len(box.low)) for side in (0, 1) if bool(box.walled[side, k])]
-    chosen = torch.randint(len(walls), (len(x),), generator=generator)
+    chosen = torch.randint(len(walls), (len(x),), generator=generator_of(cfg)).to(x.device)
     for number, (k, side) in enumerate(walls):
         beside = box.high[k] - near if side else box.low[k] + near
-        x[:, k] = torch.where(chosen.to(x.device) == number, beside, x[:, k])
+        x[:, k] = torch.where(chosen == number, beside, x[:, k])
     return x
 
 
@@ -175,13 +170,11 @@ def _drawn(
 ) -> BoxHistory:
     """The first trajectory of every method."""
     of_s = results["LQR of s"]
-    paths = {
-        name: (box.inverse(r.state[0]) if compared[name].plant is box else r.state[0]).cpu().numpy()
-        for name, r in results.items()
-    }
+    states = {name: result.state[0] for name, result in results.items()}
+    paths = {name: box.inverse(x) if compared[name].plant is box else x for name, x in states.items()}
     return BoxHistory(
         time=of_s.time.numpy(),
-        paths=paths,
+        paths={name: path.cpu().numpy() for name, path in paths.items()},
         margins={name: margin[0].cpu().numpy() for name, margin in margins.items()},
         costs={name: result.running_cost[0].cpu().numpy() for name, result in results.items()},
         barrier_state=of_s.state[0].cpu().numpy(),

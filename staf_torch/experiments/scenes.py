@@ -52,7 +52,7 @@ def animation_kind(cfg: DictConfig | PlainSettings, dim: int | None = None) -> s
 
 def chase_scene(problem: ChaseProblem, drawn: Mapping[str, np.ndarray]) -> Scene:
     """Return the first trajectory of a chase, thinned, as `Outcome.drawn` has it."""
-    at = np.unique(np.linspace(0, len(drawn["time"]) - 1, FRAMES).round().astype(int))
+    at = frames(len(drawn["time"]) - 1)
     like = problem.initial_states
     x, weights = (torch.as_tensor(drawn[name][at]).to(like) for name in ("state", "weights"))
     radius = problem.basis.centers.radius(x).expand(len(at))
@@ -64,9 +64,7 @@ def chase_scene(problem: ChaseProblem, drawn: Mapping[str, np.ndarray]) -> Scene
         plane = x.shape[-1] == 2
         grid = _levels(problem.target, float(x.abs().max() + 1.4 * radius.max()), like) if plane else None
     return Scene(
-        title="level lines of $V$; the centers move with the state"
-        if plane
-        else "the centers move with the state",
+        title=f"{'level lines of $V$; ' if plane else ''}the centers move with the state",
         time=drawn["time"][at],
         state=_array(x[:, :2]),
         centers=_array(centers),
@@ -79,18 +77,28 @@ def chase_scene(problem: ChaseProblem, drawn: Mapping[str, np.ndarray]) -> Scene
     )
 
 
+def frames(last: int, power: int = 1) -> np.ndarray:
+    """Return the indices of the times that are shown, up to the last; with a power, more early ones."""
+    return np.unique((np.linspace(0, 1, FRAMES) ** power * last).round().astype(int))
+
+
 def loop_scene(problem: AdpProblem, result: LoopResult) -> Scene:
     """Return the first trajectory of a closed loop: V is the optimal value, where a formula knows it."""
-    known = known_value(problem, problem.initial_states) is not None
-    optimum: Value | None = (lambda x: _known(problem, x)) if known else None
+
+    def known(x: Tensor) -> Tensor:
+        value = known_value(problem, x)
+        assert value is not None
+        return value
+
+    optimum = None if known_value(problem, problem.initial_states) is None else known
     # The state is fast at first and then rests: half of the frames are of the first quarter of the time.
-    at = np.unique((np.linspace(0, 1, FRAMES) ** 2 * _moves_until(result.state[0])).round().astype(int))
+    at = frames(_moves_until(result.state[0]), 2)
     return _scene(problem.controller, result, at, optimum)
 
 
 def tracking_scene(controller: Controller, result: LoopResult) -> Scene:
     """Return the first trajectory of a tracking loop with the states (e, xd), in the plane of x = e + xd."""
-    at = np.unique(np.linspace(0, len(result.time) - 1, FRAMES).round().astype(int))
+    at = frames(len(result.time) - 1)
     scene = _scene(controller, result, at, None)
     followed = _array(result.state[0, at, 2:4])
     return scene._replace(
@@ -112,19 +120,17 @@ def _scene(controller: Controller, result: LoopResult, at: np.ndarray, optimum: 
     x, critic = path[at], result.critic_weights[0, at]
     basis = _moving(controller)
     with torch.no_grad():
-        if basis is None:
-            radius = (0.1 * path.norm(dim=-1).max()).expand(len(at))
-            centers = x.new_zeros(len(at), 0, 2)
-        else:
-            radius = basis.centers.radius(x[:, : basis.dim]).expand(len(at))
-            centers = basis.centers(x[:, : basis.dim])[..., :2]
+        radius, centers = 0.1 * path.norm(dim=-1).max(), x.new_zeros(len(at), 0, 2)
+        if basis is not None:
+            followed = x[:, : basis.dim]
+            radius, centers = basis.centers.radius(followed), basis.centers(followed)[..., :2]
+        radius = radius.expand(len(at))
         along, points = _across(path, at, radius)
         estimate = _estimate(controller, points, x, critic)
         plane = optimum is not None and x.shape[-1] == 2
         reach = float(x.abs().max() + 1.4 * radius.max())
         return Scene(
-            title=("level lines of $V^*$" if plane else "the state")
-            + ("" if basis is None else " and the centers"),
+            title=("level lines of $V^*$" if plane else "the state") + (" and the centers" if basis else ""),
             time=result.time.numpy()[at],
             state=_array(x[:, :2]),
             centers=_array(centers),
@@ -159,14 +165,12 @@ def _inner(controller: Controller) -> Controller:
 
 def _moving(controller: Controller) -> StaFBasis | None:
     """Return kernel and centers of what follows the state in a controller."""
-    inner = _inner(controller)
+    inner, basis = _inner(controller), None
     if isinstance(inner, Feedback):
         basis = getattr(inner.policy, "basis", None)
     elif isinstance(inner, ActorCritic):
         value = inner.basis.basis if isinstance(inner.basis, LeadingCoordinates) else inner.basis
         basis = value.basis if isinstance(value, StaFValueBasis) else None
-    else:
-        basis = None
     return basis if isinstance(basis, StaFBasis) else None
 
 
@@ -178,12 +182,6 @@ def _estimate(controller: Controller, points: Tensor, x: Tensor, critic: Tensor)
         estimate: Tensor = (inner.basis(points, around) * critic.unsqueeze(-2)).sum(-1)
         return estimate
     return inner.value(points, {})
-
-
-def _known(problem: AdpProblem, x: Tensor) -> Tensor:
-    value = known_value(problem, x)
-    assert value is not None
-    return value
 
 
 def _across(path: Tensor, at: np.ndarray, radius: Tensor) -> tuple[Tensor, Tensor]:

@@ -114,10 +114,15 @@ def report(
 ) -> None:
     """Write a table and the figure of the same name, and log the table below a heading."""
     text = out.table(name, table, shown=shown)
-    for line in [heading, *text.splitlines()] if heading else text.splitlines():
+    for line in [*filter(None, [heading]), *text.splitlines()]:
         log.info("%s", line)
     if drawing is not None:
         out.figure(name, images(drawing()))
+
+
+def trajectories(count: int) -> str:
+    """Return a number of trajectories in words, for the log."""
+    return f"{count} {'trajectory' if count == 1 else 'trajectories'}"
 
 
 def label_key(label: str) -> str:

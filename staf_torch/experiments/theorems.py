@@ -6,7 +6,7 @@ import logging
 import math
 import warnings
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -20,7 +20,7 @@ from ..kernels import ExponentialKernel
 from ..numerics.checks import COMMAND_LINE, fail, integer, positive_real
 from ..results.progress import SHOWN, Progress
 from ..results.run_directory import RunDirectory
-from ..settings.chase import ChaseProblem, LocalProblem, case_name, chase_problem, local_problem, numbers
+from ..settings.chase import ChaseProblem, LocalProblem, chase_problem, local_problem, numbers
 from ..tables import Table
 from .registry import Metrics, finite, log_slope
 from .study import report
@@ -30,6 +30,7 @@ _DEGREES = 7  # of `ball`: C(n + k, n) points for k = 0 .. 6
 _MOST_CENTERS = 130
 _RESOLVED = 100  # rounding errors of V: what is below says nothing about the slope
 _LAYOUTS = {"layout": "layout", "count": "M", "error": "error", "order": "order", "slope": "slope"}
+_MEASURED = ("error", "slope")  # of these, for the metrics
 
 Rows = list[dict[str, float | int | None]]
 Bounds = dict[tuple[float, float], dict[str, float | None]]
@@ -59,31 +60,25 @@ class NamedLayout(NamedTuple):
     order: int  # k + 1: the error is O(r^{k+1})
 
 
-def layouts(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> dict[str, float | None]:
+def layouts(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics:
     """Write the errors that all layouts leave, and their slopes in r; `metrics.json` comes last."""
     problem = local_problem(cfg, "layouts.states")
     radii = numbers(cfg, "layouts.radii")
     found = layout_curves(problem, radii, progress)
     out = RunDirectory(directory)
-    rows = _layout_rows(found, radii)
+    rows = [_layout_row(curve, radii) for curve in found]
     drawing = (lambda: draw_layouts(found, problem.radius, np.array(radii))) if cfg.figures else None
     heading = f"sup |V - V^| on the ball, r = {problem.radius:g}, ideal weights, and its slope in r:"
     shown = Table.of(rows, _LAYOUTS)
     report(out, _log, "layouts", Table.of(rows), drawing, shown=shown, heading=heading)
-    metrics: dict[str, float | None] = {}
-    for curve in found:
-        key = f"{curve.family}{curve.centers}"
-        metrics |= {f"{key}.error": finite(curve.error), f"{key}.slope": curve.slope}
-    return out.metrics(metrics)
+    return out.metrics({f"{r['layout']}{r['count']}.{name}": r[name] for r in rows for name in _MEASURED})
 
 
 def all_layouts(dim: int) -> list[NamedLayout]:
     """Return every layout of the library in that dimension, the ones of a family in growing size."""
     planar = []
     if dim == 2:
-        planar = [
-            NamedLayout("rings", rings(m), k + 1) for k, m in enumerate((3, 6, 10, 15, 21, 28), start=1)
-        ]
+        planar = [NamedLayout("rings", rings(m), k) for k, m in enumerate((3, 6, 10, 15, 21, 28), start=2)]
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # that a polygon stays second order is what is shown here
             planar += [NamedLayout("polygon", polygon(m), 2) for m in (3, 4, 5, 6, 8, 10, 15, 21, 28)]
@@ -112,13 +107,10 @@ def layout_curves(problem: LocalProblem, radii: list[float], progress: Progress 
     return found
 
 
-def _layout_rows(found: list[LayoutCurve], radii: list[float]) -> list[dict[str, str | float | None]]:
-    rows: list[dict[str, str | float | None]] = []
-    for curve in found:
-        row: dict[str, str | float | None] = {"layout": curve.family, "count": curve.centers}
-        row |= {"error": finite(curve.error), "order": curve.order, "slope": curve.slope}
-        rows.append(row | {f"r{r:g}": finite(e) for r, e in zip(radii, curve.errors, strict=True)})
-    return rows
+def _layout_row(curve: LayoutCurve, radii: list[float]) -> dict[str, Any]:
+    row = {"layout": curve.family, "count": curve.centers, "error": finite(curve.error)}
+    row |= {"order": curve.order, "slope": curve.slope}
+    return row | {f"r{r:g}": finite(e) for r, e in zip(radii, curve.errors, strict=True)}
 
 
 class Needed(NamedTuple):
@@ -130,7 +122,7 @@ class Needed(NamedTuple):
     overall: Tensor  # (R, E) the smallest M for all states, 0 if none does
 
 
-def feasibility(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> dict[str, float | None]:
+def feasibility(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics:
     """Write the smallest number of centers that keeps within epsilon; `metrics.json` comes last."""
     problem = local_problem(cfg, "feasibility.states")
     radii = numbers(cfg, "feasibility.radii")
@@ -140,15 +132,28 @@ def feasibility(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) ->
     out = RunDirectory(directory)
     rows, wide, metrics = _counted(needed, shown, epsilons)
     headings = {"radius": "r"} | {f"{epsilon:g}": f"eps = {epsilon:g}" for epsilon in epsilons}
-    drawing = (
-        (lambda: draw_feasibility(_feasibility(problem, needed, shown, epsilons))) if cfg.figures else None
+    pointwise = needed.pointwise[shown.index(problem.radius)]  # (E, T)
+    picture = Feasibility(
+        time=problem.time.cpu().numpy(),
+        state=problem.states.cpu().numpy(),
+        radius=problem.radius,
+        radii=np.array(shown),
+        epsilons=np.array(epsilons),
+        counts=needed.counts.numpy(),
+        pointwise=pointwise.numpy(),
+        overall=needed.overall.numpy(),
     )
     report(
-        *(out, _log, "feasibility", Table.of(rows), drawing),
+        *(
+            out,
+            _log,
+            "feasibility",
+            Table.of(rows),
+            (lambda: draw_feasibility(picture)) if cfg.figures else None,
+        ),
         shown=Table.of(wide, headings),
         heading="Smallest M with sup |V - V^| <= eps on the ball along the trajectory, ideal weights:",
     )
-    pointwise = needed.pointwise[shown.index(problem.radius)]  # (E, T)
     out.text("feasibility_pointwise.csv", _pointwise(problem, pointwise, epsilons).csv())
     return out.metrics(metrics)
 
@@ -158,14 +163,13 @@ def needed_centers(
 ) -> Needed:
     """All counts. One pass over the layouts a radius serves every epsilon."""
     layouts = theory.standard_layouts(problem.states.shape[-1])
-    found = []
-    for radius in progress.each(radii, "radii"):
-        of_layouts = [
-            theory.layout_errors(problem.target, problem.kernel, problem.states, radius, [layout])[0]
-            for layout in layouts
+    about = problem.target, problem.kernel, problem.states
+    errors = torch.stack(  # (R, L, T)
+        [
+            torch.cat([theory.layout_errors(*about, radius, [layout]) for layout in layouts])
+            for radius in progress.each(radii, "radii")
         ]
-        found.append(torch.stack(of_layouts))
-    errors = torch.stack(found).cpu()  # (R, L, T)
+    ).cpu()
     counts = torch.tensor([len(layout) for layout in layouts], dtype=torch.int64)
     allowed = torch.tensor(epsilons, dtype=errors.dtype)
     good = errors.unsqueeze(1) <= allowed[:, None, None]  # (R, E, L, T)
@@ -190,7 +194,7 @@ def _counted(needed: Needed, radii: list[float], epsilons: list[float]) -> tuple
             error = float(needed.errors[i, layout].max()) if layout is not None else None
             row = {"radius": radius, "epsilon": epsilon, "count": count}
             rows.append(row | {"least_pointwise": least, "error": error})
-            wide[-1][f"{epsilon:g}"] = metrics[f"{case_name(radius, epsilon)}.count"] = count
+            wide[-1][f"{epsilon:g}"] = metrics[f"r{radius:g}.eps{epsilon:g}.count"] = count
     return rows, wide, metrics
 
 
@@ -203,34 +207,16 @@ def _pointwise(problem: LocalProblem, pointwise: Tensor, epsilons: list[float]) 
     return Table.of([dict(zip(names, row, strict=True)) for row in rows])
 
 
-def _feasibility(
-    problem: LocalProblem, needed: Needed, radii: list[float], epsilons: list[float]
-) -> Feasibility:
-    return Feasibility(
-        time=problem.time.cpu().numpy(),
-        state=problem.states.cpu().numpy(),
-        radius=problem.radius,
-        radii=np.array(radii),
-        epsilons=np.array(epsilons),
-        counts=needed.counts.numpy(),
-        pointwise=needed.pointwise[radii.index(problem.radius)].numpy(),
-        overall=needed.overall.numpy(),
-    )
-
-
-def exponential_bound(
-    cfg: DictConfig, directory: Path, progress: Progress = SHOWN
-) -> dict[str, float | None]:
+def exponential_bound(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics:
     """Write what the theorem says is enough, beside what is; `metrics.json` comes last."""
     found = bounds(cfg, progress)
     rows = [{"radius": radius, "epsilon": epsilon, **row} for (radius, epsilon), row in found.items()]
     out = RunDirectory(directory)
     drawing = (lambda: draw_exponential_bound(found)) if cfg.figures else None
     report(out, _log, "exponential_bound", Table.of(rows, _BOUNDS), drawing)
-    metrics = {
-        f"{case_name(*case)}.{name}": value for case, row in found.items() for name, value in row.items()
-    }
-    return out.metrics(metrics)
+    return out.metrics(
+        {f"r{r:g}.eps{e:g}.{name}": value for (r, e), row in found.items() for name, value in row.items()}
+    )
 
 
 def bounds(cfg: DictConfig, progress: Progress = SHOWN) -> Bounds:
@@ -263,10 +249,8 @@ def bounds(cfg: DictConfig, progress: Progress = SHOWN) -> Bounds:
     return found
 
 
-def _bound(
-    problem: ChaseProblem, domain: torch.Tensor, radius: float, epsilon: float, most: int
-) -> dict[str, float | None]:
-    found: dict[str, float | None] = dict.fromkeys(list(_BOUNDS)[2:])
+def _bound(problem: ChaseProblem, domain: torch.Tensor, radius: float, epsilon: float, most: int) -> Metrics:
+    found: Metrics = dict.fromkeys(list(_BOUNDS)[2:])
     about = (problem.target, domain, radius, epsilon)
     try:
         one = theory.one_polynomial_bound(*about, max_degree=most)

@@ -138,7 +138,8 @@ class AnimationStage:
         if scene.followed is not None:
             axes.plot(*scene.followed.T, ":", color="0.2", linewidth=0.8)
             (self._goal,) = axes.plot([], [], "x", color="0.2", markersize=5)
-        self._discs = [Circle((0, 0), 1.0, facecolor="0.8", edgecolor="0.4") for _ in self._at(0)]
+        discs = () if scene.discs is None else scene.discs[0]
+        self._discs = [Circle((0, 0), 1.0, facecolor="0.8", edgecolor="0.4") for _ in discs]
         for disc in self._discs:
             axes.add_patch(disc)
         self._ball = Circle((0, 0), 1.0, facecolor=colour(4), alpha=0.35, edgecolor=colour(0))
@@ -147,13 +148,8 @@ class AnimationStage:
         (self._state,) = axes.plot([], [], "o", color=colour(1), markersize=4)
         if scene.grid is None:
             seen = scene.state if scene.followed is None else np.concatenate([scene.state, scene.followed])
-            reach = float(scene.radius.max())
-            axes.set_xlim(*_limits(seen[:, 0], reach))
-            axes.set_ylim(*_limits(seen[:, 1], reach))
-
-    def _at(self, frame: int) -> np.ndarray:
-        """Centers and radii of the discs, (K, 3)."""
-        return np.zeros((0, 3)) if self._scene.discs is None else self._scene.discs[frame]
+            across, up = (_limits(column, float(scene.radius.max())) for column in seen.T)
+            axes.set(xlim=across, ylim=up)
 
     def _draw_across(self, axes: Axes) -> None:
         scene = self._scene
@@ -189,8 +185,9 @@ class AnimationStage:
         """Put everything where it is at that frame."""
         scene = self._scene
         self._path.set_data(scene.state[: frame + 1, 0], scene.state[: frame + 1, 1])
-        for disc, (x, y, radius) in zip(self._discs, self._at(frame), strict=True):
-            disc.set(center=(x, y), radius=radius)
+        if scene.discs is not None:
+            for disc, (x, y, radius) in zip(self._discs, scene.discs[frame], strict=True):
+                disc.set(center=(x, y), radius=radius)
         self._ball.set(center=tuple(scene.state[frame]), radius=float(scene.radius[frame]))
         self._centers.set_data(scene.centers[frame, :, 0], scene.centers[frame, :, 1])
         self._state.set_data(scene.state[frame, :1], scene.state[frame, 1:])

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from .style import WIDTH, colour, curves, dash, legend_above, letter, marker, page, positive, ticks
+from .style import WIDTH, colour, curves, dash, legend_above, letter, marker, named, page, positive, ticks
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -159,17 +159,16 @@ def _map(axes: Axes, picture: MemoryPicture) -> None:
 
 
 def _region(axes: Axes, picture: MemoryPicture) -> None:
-    for i, (name, error) in enumerate(picture.errors.items()):
-        axes.semilogy(picture.time, positive(error), dash(i), color=colour(i), label=name)
+    named(axes, picture.time, picture.errors, log=True)
     axes.set_xlabel("time at which the ball was visited (s)")
     axes.set_ylabel(r"$\max\,|V - \hat V|$ on the ball")
     axes.margins(x=0)
 
 
 def _revisits(axes: Axes, picture: MemoryPicture) -> None:
-    for i, (name, excess) in enumerate(picture.excess.items()):
-        steps = np.arange(1, len(excess) + 1)
-        axes.loglog(steps, positive(excess), dash(i), color=colour(i), label=name)
+    steps = len(next(iter(picture.excess.values())))
+    named(axes, np.arange(1, steps + 1), picture.excess, log=True)
+    axes.set_xscale("log")
     axes.axhline(picture.settled, color="0.2", linestyle=":", linewidth=0.8, label="settled chase")
     axes.set_xlabel("steps after the revisit")
     axes.set_ylabel("largest excess $F(a) - F(w)$")

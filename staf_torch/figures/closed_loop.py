@@ -9,15 +9,19 @@ import numpy as np
 
 from .style import (
     WIDTH,
+    against_time,
     colour,
     curves,
     dash,
+    estimates,
     legend_above,
     legend_of_all,
     letter,
     marker,
+    named,
     page,
     positive,
+    shares,
     subplots,
 )
 
@@ -77,15 +81,9 @@ def draw_adp(history: AdpHistory) -> Figure:
         for name, error in known.items():
             _logarithmic(next(left), history.time, error, name)
         _cost(next(left), history)
-        _against_time(grid, history.time)
+        letter(grid)
+        against_time(grid, history.time)
     return figure
-
-
-def _against_time(grid: list[Axes], time: np.ndarray) -> None:
-    letter(grid)
-    for axes in grid:
-        axes.set_xlim(time[0], time[-1])
-        axes.set_xlabel("time (s)")
 
 
 def _lines(axes: Axes, time: np.ndarray, values: np.ndarray, name: str, label: str) -> None:
@@ -145,7 +143,8 @@ def draw_tracking(history: TrackingHistory) -> Figure:
         for axes, panel in zip(grid, (_followed, _tracking_errors, _parameters), strict=False):
             panel(axes, history)
         _lines(grid[3], history.time, history.critic_weights, *_CRITIC)
-        _against_time(grid, history.time)
+        letter(grid)
+        against_time(grid, history.time)
     return figure
 
 
@@ -159,16 +158,13 @@ def _followed(axes: Axes, history: TrackingHistory) -> None:
 
 
 def _tracking_errors(axes: Axes, history: TrackingHistory) -> None:
-    for i, (name, error) in enumerate(history.errors.items()):
-        axes.semilogy(history.time, positive(error), dash(i), color=colour(i), label=name)
+    named(axes, history.time, history.errors, log=True)
     axes.set_ylabel("$|x - x_d|$")
     legend_above(axes, 3)
 
 
 def _parameters(axes: Axes, history: TrackingHistory) -> None:
-    for i in range(history.parameters.shape[1]):
-        axes.plot(history.time, history.parameters[:, i], color=colour(i))
-        axes.axhline(history.truth[i], color="0.2", linestyle=":", linewidth=0.8)
+    estimates(axes, history.time, history.parameters, history.truth)
     axes.plot([], [], color="0.3", label=r"$\hat\theta$, one colour an entry")
     axes.plot([], [], ":", color="0.2", label=r"$\theta$")
     axes.set_ylabel("drift parameters")
@@ -195,18 +191,13 @@ def draw_faults(cases: Mapping[str, FaultPicture]) -> Figure:
         letter([*grid[0], *grid[1]], *cases, *[""] * len(cases))
         for k, case in enumerate(cases.values()):
             above, below = grid[0, k], grid[1, k]
-            for i, (policy, norm) in enumerate(case.norms.items()):
-                above.semilogy(case.time, positive(norm), dash(i), color=colour(i), label=policy)
-            for i in range(case.parameters.shape[1]):
-                below.plot(case.time, case.parameters[:, i], color=colour(i))
-                below.plot(case.time, case.truth[:, i], ":", color="0.2", linewidth=0.8)
+            named(above, case.time, case.norms, log=True)
+            estimates(below, case.time, case.parameters, case.truth)
             low, high = _frame(case)
             below.set_ylim(low, high)
             below.fill_between(case.time, low, high, where=~case.certain, color="0.85", linewidth=0, zorder=0)
-            above.set_xlim(case.time[0], case.time[-1])
+            against_time((above, below), case.time)
             below.set_xlim(case.time[0], min(case.time[-1], _EARLY))
-            for axes in (above, below):
-                axes.set_xlabel("time (s)")
         grid[0, 0].set_ylabel("$|x|$")
         grid[1, 0].set_ylabel(r"$\hat\theta$ and $\theta$ (dotted)")
         grid[0, 0].legend(loc="lower left")
@@ -236,29 +227,18 @@ def draw_gain_sets(sets: GainSets) -> Figure:
     with page(WIDTH, 4.4) as figure:
         grid = list(figure.subplots(2, 2).flat)
         letter(grid)
-        for i in range(sets.parameters.shape[1]):
-            grid[0].plot(sets.time, sets.parameters[:, i], color=colour(i))
-            grid[0].axhline(sets.truth[i], color="0.2", linestyle=":", linewidth=0.8)
+        estimates(grid[0], sets.time, sets.parameters, sets.truth)
         grid[0].set_ylabel(r"$\hat\theta$ (integral), $\theta$ dotted")
         for i, (name, values) in enumerate(sets.followed.items()):
             grid[1].semilogy(sets.time, positive(values), color=colour(i), label=name, linewidth=0.7)
         grid[1].set_ylabel("$|x - x_d|$")
         legend_above(grid[1], 2)
-        for axes in grid[:2]:
-            axes.set_xlabel("time (s)")
-            axes.set_xlim(sets.time[0], sets.time[-1])
-        panels = (
-            (grid[2], sets.error, "RMS of $x - x_d$"),
-            (grid[3], sets.parameter_error, r"RMS of $\hat\theta - \theta$"),
-        )
-        for axes, errors, label in panels:
-            for i, (name, values) in enumerate(errors.items()):
-                share = np.arange(1, len(values) + 1) / len(values)
-                axes.step(np.sort(values), share, dash(i), where="post", color=colour(i), label=name)
-            axes.set_xscale("log")
-            axes.set_ylim(0, 1.02)
-            axes.set_xlabel(label)
-            axes.set_ylabel("share of gain sets")
+        against_time(grid[:2], sets.time)
+        shares(grid[2], sets.error)
+        shares(grid[3], sets.parameter_error)
+        labels = "RMS of $x - x_d$", r"RMS of $\hat\theta - \theta$"
+        for axes, label in zip(grid[2:], labels, strict=True):
+            axes.set(xscale="log", xlabel=label, ylabel="share of gain sets")
         legend_above(grid[2], 2)
     return figure
 
@@ -281,20 +261,19 @@ def draw_box(history: BoxHistory) -> Figure:
         plane, margin, barrier, cost = figure.subplots(2, 2).flat
         for i, (name, path) in enumerate(history.paths.items()):
             plane.plot(path[:, 0], path[:, 1], dash(i), color=colour(i), label=name)
-            margin.plot(history.time, history.margins[name], dash(i), color=colour(i))
-            cost.plot(history.time, history.costs[name], dash(i), color=colour(i), label=name)
+        named(margin, history.time, history.margins)
+        named(cost, history.time, history.costs)
         walls(plane, history.low, history.high)
         plane.set(xlabel="$x_1$", ylabel="$x_2$")
         legend_of_all(figure, plane, 3)
         margin.set_ylabel("distance to the nearest wall")
-        margin.set_ylim(bottom=0)
         curves(barrier, history.time, history.barrier_state, "$s_{%d}$")
         barrier.set_ylabel("barrier coordinates")
         legend_above(barrier, history.barrier_state.shape[1])
         cost.set_ylabel("cost of $s$ so far")
-        cost.set_ylim(bottom=0)
-        for axes in (margin, barrier, cost):
-            axes.set(xlabel="time (s)", xlim=(history.time[0], history.time[-1]))
+        for axes in (margin, cost):
+            axes.set_ylim(bottom=0)
+        against_time((margin, barrier, cost), history.time)
         letter((plane, margin, barrier, cost))
     return figure
 
@@ -303,15 +282,11 @@ def walls(axes: Axes, low: np.ndarray, high: np.ndarray) -> None:
     """Draw the walls of the first two coordinates, and shade what lies beyond."""
     for k, ends in enumerate((axes.get_xlim(), axes.get_ylim())):
         reach = 0.06 * (ends[1] - ends[0])
+        line, span = (axes.axhline, axes.axhspan) if k else (axes.axvline, axes.axvspan)
         for wall, sign in ((low[k], -1), (high[k], 1)):
             if np.isfinite(wall):
-                beyond = sorted((wall, wall + sign * reach))
-                if k == 0:
-                    axes.axvline(wall, color="0.2", linewidth=0.8)
-                    axes.axvspan(beyond[0], beyond[1], color="0.85", linewidth=0)
-                else:
-                    axes.axhline(wall, color="0.2", linewidth=0.8)
-                    axes.axhspan(beyond[0], beyond[1], color="0.85", linewidth=0)
+                line(wall, color="0.2", linewidth=0.8)
+                span(*sorted((wall, wall + sign * reach)), color="0.85", linewidth=0)
 
 
 class AvoidanceHistory(NamedTuple):
@@ -336,29 +311,23 @@ def draw_avoidance(history: AvoidanceHistory) -> Figure:
         shown = np.linspace(0, last, 5).round().astype(int)
         for shade, at in zip(np.linspace(0.92, 0.6, len(shown)), shown, strict=True):
             for center in history.discs[at]:
-                disc = Circle(
-                    tuple(center), history.radius, facecolor=f"{shade:.3f}", edgecolor="0.4", linewidth=0.4
-                )
-                plane.add_patch(disc)
+                grey = {"facecolor": f"{shade:.3f}", "edgecolor": "0.4", "linewidth": 0.4}
+                plane.add_patch(Circle(tuple(center), history.radius, **grey))
         for i, (name, path) in enumerate(history.paths.items()):
             plane.plot(path[:, 0], path[:, 1], dash(i), color=colour(i), label=name)
             plane.plot(path[shown, 0], path[shown, 1], ".", color=colour(i), markersize=4)
-            apart.plot(history.time, history.distances[name], dash(i), color=colour(i), label=name)
-            cost.plot(history.time, history.costs[name], dash(i), color=colour(i), label=name)
-            nearest = np.sort(history.nearest[name])
-            steps = np.arange(1, len(nearest) + 1) / len(nearest)
-            share.step(nearest, steps, dash(i), where="post", color=colour(i), label=name)
+        named(apart, history.time, history.distances)
+        named(cost, history.time, history.costs)
+        shares(share, history.nearest)
         plane.set(xlabel="$p_1$ (m)", ylabel="$p_2$ (m)", aspect="equal")
         legend_above(apart, 2)
-        for axes in (apart, share):
-            line = axes.axhline if axes is apart else axes.axvline
-            line(0.0, color="0.2", linewidth=0.8)
+        apart.axhline(0.0, color="0.2", linewidth=0.8)
+        share.axvline(0.0, color="0.2", linewidth=0.8)
         apart.set_ylabel("distance to the nearest disc (m)")
-        share.set(xlabel="least distance on the way (m)", ylabel="share of the scenarios", ylim=(0, 1.02))
+        share.set(xlabel="least distance on the way (m)", ylabel="share of the scenarios")
         cost.set_ylabel("cost so far")
         cost.set_ylim(bottom=0)
-        for axes in (apart, cost):
-            axes.set(xlabel="time (s)", xlim=(history.time[0], history.time[-1]))
+        against_time((apart, cost), history.time)
         letter((plane, apart, share, cost))
     return figure
 
@@ -380,30 +349,22 @@ def draw_rivals(rows: Sequence[Mapping[str, Any]]) -> Figure:
     across = min(_COLUMNS, len(plants))
     down = -(-len(plants) // across)
     with page(2.4 * across + 1.6, 2.3 * down) as figure:
-        grid = figure.subplots(down, across, squeeze=False, sharex=True, sharey=True)
-        for axes, plant in zip(grid.flat, plants, strict=False):
+        grid = subplots(figure, len(plants), across, sharex=True, sharey=True)
+        for axes, plant in zip(grid, plants, strict=True):
             for row in rows:
                 if row["plant"] == plant and row["ratio_median"] is not None:
                     index = methods.index(row["method"])
-                    axes.plot(
-                        row["us_median"],
-                        max(row["ratio_median"] - 1, _LEAST),
-                        marker(index),
-                        color=colour(index),
-                        fillstyle="full" if row["regulated"] == 1 else "none",
-                        linestyle="none",
-                    )
-            axes.set_xscale("log")
-            axes.set_yscale("log")
+                    excess = max(row["ratio_median"] - 1, _LEAST)
+                    (point,) = axes.plot(row["us_median"], excess, marker(index), color=colour(index))
+                    point.set(fillstyle="full" if row["regulated"] == 1 else "none", linestyle="none")
+            axes.set(xscale="log", yscale="log")
             axes.set_title(plant.replace("_", " "), fontsize="small")
-        for axes in list(grid.flat)[len(plants) :]:
-            axes.set_visible(False)
-        for axes in list(grid.flat)[: len(plants)][-across:]:  # with no panel below
+        for axes in grid[-across:]:  # with no panel below
             axes.set_xlabel(r"$\mu$s a control")
             axes.tick_params(labelbottom=True)
-        for axes in grid[:, 0]:
+        for axes in grid[::across]:
             axes.set_ylabel("median excess cost")
         for index, method in enumerate(methods):
-            grid[0, 0].plot([], [], marker(index), color=colour(index), linestyle="none", label=method)
+            grid[0].plot([], [], marker(index), color=colour(index), linestyle="none", label=method)
         figure.legend(loc="outside right center", title="hollow: not all regulated", title_fontsize="small")
     return figure

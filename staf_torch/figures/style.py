@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import io
 import logging
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextvars import ContextVar
 from typing import TYPE_CHECKING, Any
 
@@ -158,6 +158,35 @@ def curves(axes: Axes, x: np.ndarray, values: np.ndarray, label: str) -> None:
     """Draw each column of values (T, k) against x (T,); ``label % i`` names column i, from 1 on."""
     for i, column in enumerate(values.T):
         axes.plot(x, column, dash(i), color=colour(i), label=label % (i + 1))
+
+
+def named(axes: Axes, x: np.ndarray, values: Mapping[str, np.ndarray], *, log: bool = False) -> None:
+    """Draw a labelled curve a name against x (T,); ``log``: on a logarithmic axis, with gaps at zeros."""
+    for i, (name, curve) in enumerate(values.items()):
+        axes.plot(x, positive(curve) if log else curve, dash(i), color=colour(i), label=name)
+    if log:
+        axes.set_yscale("log")
+
+
+def shares(axes: Axes, values: Mapping[str, np.ndarray]) -> None:
+    """Draw the share of the values (B,) up to each, a labelled step function a name."""
+    for i, (name, each) in enumerate(values.items()):
+        share = np.arange(1, len(each) + 1) / len(each)
+        axes.step(np.sort(each), share, dash(i), where="post", color=colour(i), label=name)
+    axes.set_ylim(0, 1.02)
+
+
+def estimates(axes: Axes, time: np.ndarray, found: np.ndarray, truth: np.ndarray) -> None:
+    """Draw parameters (T, p), a colour each, and the true ones dotted, (p,) or (T, p)."""
+    for i, (estimate, true) in enumerate(zip(found.T, np.broadcast_to(truth, found.shape).T, strict=True)):
+        axes.plot(time, estimate, color=colour(i))
+        axes.plot(time, true, ":", color="0.2", linewidth=0.8)
+
+
+def against_time(grid: Iterable[Axes], time: np.ndarray) -> None:
+    """Give the axes of panels the whole of a time, (T,) seconds."""
+    for axes in grid:
+        axes.set(xlabel="time (s)", xlim=(time[0], time[-1]))
 
 
 def ticks(axes: Axes, name: str, values: Iterable[float]) -> None:

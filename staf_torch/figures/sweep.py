@@ -318,7 +318,7 @@ def draw_heat_maps(maps: Sequence[HeatMap]) -> Figure:
     with page(*_size(len(maps), 0.9 + 0.33 * max(len(m.counts) for m in maps))) as figure:
         grid = subplots(figure, len(maps), min(len(maps), _COLUMNS))
         for axes, shown in zip(grid, maps, strict=True):
-            values = np.array([[np.nan if e is None else e for e in row] for row in shown.errors])
+            values = np.array(shown.errors, dtype=float)  # None: NaN
             axes.set_facecolor("0.92")
             image = axes.imshow(values, norm=norm, cmap="viridis", origin="lower", aspect="auto")
             axes.grid(False)

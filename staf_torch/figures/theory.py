@@ -66,15 +66,14 @@ def draw_exponential_bound(found: Mapping[tuple[float, float], Mapping[str, floa
     """
     radii = sorted({radius for radius, _ in found})
     columns = min(len(radii), 4)
-    lines = -(-len(radii) // columns)
-    with page(WIDTH, 0.5 + 2.1 * lines) as figure:
+    with page(WIDTH, 0.5 + 2.1 * -(-len(radii) // columns)) as figure:
         grid = subplots(figure, len(radii), columns, sharex=True, sharey=True)
         for axes, radius in zip(grid, radii, strict=True):
             _bounds(axes, {epsilon: row for (r, epsilon), row in found.items() if r == radius})
             axes.set_title(f"$r = {radius:g}$")
         for axes in grid[::columns]:
             axes.set_ylabel("kernels $M$")
-        for axes in grid[max(0, len(radii) - columns) :]:
+        for axes in grid[-columns:]:
             axes.set_xlabel(r"largest error $\epsilon$")
             axes.tick_params(labelbottom=True)
         _plain_ticks(grid[0], found)
@@ -95,8 +94,7 @@ def _plain_ticks(axes: Axes, found: Mapping[tuple[float, float], Mapping[str, fl
 def _bounds(axes: Axes, rows: Mapping[float, Mapping[str, float | None]]) -> None:
     epsilon = list(rows)
     for i, (name, label) in enumerate(_BOUNDS.items()):
-        values = [row[name] for row in rows.values()]
-        counts = [np.nan if value is None else value for value in values]
+        counts = np.array([row[name] for row in rows.values()], dtype=float)  # None: NaN
         axes.loglog(epsilon, counts, dash(i), color=colour(i), marker=marker(i), markersize=4, label=label)
     axes.set_xlim(max(epsilon) * 1.5, min(epsilon) / 1.5)  # what is asked grows to the right
 
@@ -138,8 +136,7 @@ def draw_layouts(found: Sequence[LayoutCurve], radius: float, radii: np.ndarray)
     with page(WIDTH, 3.6) as figure:
         left, right = figure.subplots(1, 2)
         for axes in (left, right):
-            axes.set_xscale("log")
-            axes.set_yscale("log")
+            axes.set(xscale="log", yscale="log")
         for family in _FAMILIES:
             _family(left, [curve for curve in found if curve.family == family])
         ticks(left, "x", sorted({curve.centers for curve in found if curve.family in ("rings", "ball")}))

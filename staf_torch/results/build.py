@@ -23,7 +23,6 @@ from .untrusted import UnreadableError, all_visible, open_regular
 
 _PACKAGE = Path(__file__).resolve().parent.parent
 _MOST_MODULES = 200
-_CHUNK = 2**20
 _ABSENT = "nothing"
 
 
@@ -33,11 +32,17 @@ def digest(path: Path) -> str:
     Raises:
         UnreadableError: if there is none.
     """
-    found = hashlib.sha256()
     with open_regular(path) as file:
-        while piece := file.read(_CHUNK):
-            found.update(piece)
-    return found.hexdigest()
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+@functools.cache
+def installed(package: str) -> str | None:
+    """Return the version of a package; None where it is not installed."""
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
 
 
 @functools.cache
@@ -63,30 +68,17 @@ def build(settings: Mapping[str, Any], compiler: str) -> dict[str, Any]:
     return {
         "version": __version__,
         "source": source(),
-        "torch": _torch(),
+        "torch": installed("torch") or "of unknown version",
         "compiler": compiler,
         "modules": modules(settings),
     }
-
-
-@functools.cache
-def _torch() -> str:
-    try:
-        return importlib.metadata.version("torch")
-    except importlib.metadata.PackageNotFoundError:
-        return "of unknown version"
 
 
 def modules(settings: Mapping[str, Any]) -> dict[str, str]:
     """Return a hash of every module of the user's own that settings name, and of those that it imports."""
     found: dict[str, str] = {}
     for path in _named(settings):
-        parts = path.split(".")
-        for length in range(len(parts) - 1, 0, -1):
-            place = _locate(tuple(parts[:length]), tuple(sys.path), os.getcwd())
-            if place is not None:
-                _collect(".".join(parts[:length]), *place, found)
-                break
+        _collect_first(path.rpartition(".")[0], tuple(sys.path), found)
     return dict(sorted(found.items()))
 
 
@@ -98,7 +90,7 @@ def imported(own: Mapping[str, str]) -> dict[str, str]:
     Args:
         own: what `modules` found.
     """
-    places = (_locate(tuple(name.split(".")), tuple(sys.path), os.getcwd()) for name in own)
+    places = (_place(name, tuple(sys.path)) for name in own)
     bases = tuple(f"{base}{os.sep}" for _, base in filter(None, places) if not _installed(base))
     standard = os.path.dirname(os.__file__)  # may lie below a working directory
     found: dict[str, str | None] = {}
@@ -117,7 +109,7 @@ def _installed(folder: Path) -> bool:
 
 def _hash(name: str) -> str | None:
     """The hash of a module's file as it is now, None: there is none."""
-    place = _locate(tuple(name.split(".")), tuple(sys.path), os.getcwd())
+    place = _place(name, tuple(sys.path))
     if place is None or not place[0].is_file():
         return None
     stamp = place[0].stat()
@@ -132,10 +124,10 @@ def differences(then: Mapping[str, Any], now: Mapping[str, Any]) -> Iterator[str
         now: the same of a run of today.
     """
     was, will = _plain(then.get("settings")), _plain(now.get("settings"))
-    if was:
-        for key in sorted({*was, *will}):
-            if was.get(key, _ABSENT) != will.get(key, _ABSENT):
-                yield f"{key} was {_shown(was.get(key, _ABSENT))} and is now {_shown(will.get(key, _ABSENT))}"
+    for key in sorted({*was, *will}) if was else ():
+        before, after = was.get(key, _ABSENT), will.get(key, _ABSENT)
+        if before != after:
+            yield f"{key} was {_shown(before)} and is now {_shown(after)}"
     was, will = _plain(then.get("build")), _plain(now.get("build"))
     for key in ("source", "torch", "compiler") if was else ():
         if was.get(key) != will.get(key):
@@ -143,12 +135,9 @@ def differences(then: Mapping[str, Any], now: Mapping[str, Any]) -> Iterator[str
             yield f"{what} was {_shown(was.get(key))} and is now {_shown(will.get(key))}"
     others = _plain(was.get("imported"))
     was, will = _plain(was.get("modules")), _plain(will.get("modules"))
-    for name in sorted({*was, *will}):
-        if was.get(name) != will.get(name):
-            yield f"the module {name} has changed"
-    for name in sorted({*others} - {*was, *will}):
-        if others[name] != _hash(name):
-            yield f"the module {name} has changed"
+    changed = [name for name in sorted({*was, *will}) if was.get(name) != will.get(name)]
+    changed += [name for name in sorted({*others} - {*was, *will}) if others[name] != _hash(name)]
+    yield from (f"the module {name} has changed" for name in changed)
 
 
 def short(build: Mapping[str, Any]) -> str:
@@ -173,20 +162,24 @@ def _named(settings: Mapping[str, Any]) -> Iterator[str]:
     for key, value in settings.items():
         group, _, last = key.rpartition(".")
         target = str(settings.get(f"{group}._target_"))
-        loads = (
-            target.startswith(f"{_PACKAGE.name}.") and target.rpartition(".")[2].islower()
-        )  # a function of ours
+        ours = f"{_PACKAGE.name}."
+        loads = target.startswith(ours) and target.rpartition(".")[2].islower()  # a function of ours
         names = last == "_target_" or key == "task" or (last == "path" and loads)
-        if names and isinstance(value, str) and "." in value and not value.startswith(f"{_PACKAGE.name}."):
+        if names and isinstance(value, str) and "." in value and not value.startswith(ours):
             yield value
 
 
-@functools.lru_cache(1000)
-def _locate(parts: tuple[str, ...], path: tuple[str, ...], here: str) -> tuple[Path, Path] | None:
+def _place(name: str, path: tuple[str, ...]) -> tuple[Path, Path] | None:
     """The file of a module, and the entry of Python's path that leads there."""
+    return _locate(name, path, os.getcwd())
+
+
+@functools.lru_cache(1000)
+def _locate(name: str, path: tuple[str, ...], here: str) -> tuple[Path, Path] | None:
     for entry in path:
         base = Path(here, entry)
-        for file in (base.joinpath(*parts).with_suffix(".py"), base.joinpath(*parts, "__init__.py")):
+        stem = base.joinpath(*name.split("."))
+        for file in (stem.with_suffix(".py"), stem / "__init__.py"):
             if file.is_file():
                 return file, base
     return None
@@ -201,14 +194,18 @@ def _collect(name: str, file: Path, base: Path, found: dict[str, str]) -> None:
     installed = _installed(base)
     for other in imported:
         absolute = _absolute(name, other, file.name == "__init__.py")
-        if installed and absolute.partition(".")[0] != name.partition(".")[0]:
-            continue
-        parts = absolute.split(".")
-        for length in range(len(parts), 0, -1):
-            place = _locate(tuple(parts[:length]), (str(base),), os.getcwd())
-            if place is not None:
-                _collect(".".join(parts[:length]), *place, found)
-                break
+        if not installed or absolute.partition(".")[0] == name.partition(".")[0]:
+            _collect_first(absolute, (str(base),), found)
+
+
+def _collect_first(name: str, path: tuple[str, ...], found: dict[str, str]) -> None:
+    """Add the module of a dotted name: the longest beginning of the name that has a file."""
+    while name:
+        place = _place(name, path)
+        if place is not None:
+            _collect(name, *place, found)
+            return
+        name = name.rpartition(".")[0]
 
 
 def _absolute(name: str, other: str, package: bool) -> str:

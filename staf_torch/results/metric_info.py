@@ -27,11 +27,8 @@ class MetricInfo(NamedTuple):
 
 
 OWN = (
-    MetricInfo("ultimate_error"),
-    MetricInfo("ultimate_error_before"),
-    MetricInfo("floor_error"),
-    MetricInfo("ultimate_excess"),
-    MetricInfo("ultimate_excess_before"),
+    *map(MetricInfo, ("ultimate_error", "ultimate_error_before", "floor_error")),
+    *map(MetricInfo, ("ultimate_excess", "ultimate_excess_before")),
     MetricInfo("ball_error", headline=True),
     MetricInfo("ball_floor_error", headline=True),
     MetricInfo("rounding_floor"),
@@ -46,11 +43,7 @@ OWN = (
     MetricInfo("cost_ratio", unit="1", headline=True),
     MetricInfo("cost_ratio_mean", unit="1"),
     MetricInfo("cost_ratio_max", unit="1"),
-    MetricInfo("final_state_norm"),
-    MetricInfo("final_error"),
-    MetricInfo("parameter_error"),
-    MetricInfo("control_error"),
-    MetricInfo("value_error"),
+    *map(MetricInfo, ("final_state_norm", "final_error", "parameter_error", "control_error", "value_error")),
     MetricInfo("regulated_fraction", unit="1", larger_is_better=True, headline=True),
     MetricInfo("diverged_fraction", unit="1"),
 )
@@ -62,13 +55,9 @@ def read_infos(recorded: object) -> dict[str, MetricInfo]:
     """Return the metrics that a record of a run declares, by name; anything malformed is passed over."""
     if not isinstance(recorded, Mapping):
         return {}
+    found = {str(name): about for name, about in recorded.items() if isinstance(about, Mapping)}
+    flags = "larger_is_better", "headline"
     return {
-        str(name): MetricInfo(
-            str(name),
-            str(about.get("unit", "")),
-            about.get("larger_is_better") is True,
-            about.get("headline") is True,
-        )
-        for name, about in recorded.items()
-        if isinstance(about, Mapping)
+        name: MetricInfo(name, str(about.get("unit", "")), *(about.get(flag) is True for flag in flags))
+        for name, about in found.items()
     }

@@ -29,6 +29,7 @@ from .files import (
     RUNNING,
     SWEEP,
     UNFINISHED,
+    is_number,
     parse_overrides,
     partial_name,
     plain,
@@ -44,6 +45,8 @@ from .run import mixed, versions
 from .untrusted import UnreadableError, parse_object, read_lines, read_object, visible
 
 _LISTED = 8  # jobs that have not started, by their numbers
+_UNSAID = {RUNNING: "has not ended: it goes on, or was killed", FAILED: "no reason was left", COMPLETED: None}
+"""Statuses, and what is said of one without a reason."""
 
 
 def collect(path: str | Path | Sequence[str | Path]) -> Collection:
@@ -175,16 +178,16 @@ def read_record(directory: Path) -> RecordedRun:
 def _of_record(directory: Path, record: Mapping[str, Any]) -> RecordedRun:
     status, reason = _status(record)
     metrics, lost, unread = _measured(directory, record) if status == COMPLETED else ({}, {}, None)
-    made_by = record.get("build")
     if unread is not None:
-        status = UNFINISHED
+        status, reason = UNFINISHED, unread
+    made_by = record.get("build")
     return RecordedRun(
         directory=directory,
         overrides=parse_overrides(_lines(record)),
         settings=_settings(record),
         metrics=metrics,
         status=status,
-        reason=reason if unread is None else unread,
+        reason=reason,
         version=_text(record.get("version")),
         task=_text(record.get("task")),
         seconds=_number(record.get("seconds")),
@@ -196,20 +199,15 @@ def _of_record(directory: Path, record: Mapping[str, Any]) -> RecordedRun:
 
 def _status(record: Mapping[str, Any]) -> tuple[str, str | None]:
     status, reason = record.get("status"), _text(record.get("reason"))
-    if status == RUNNING:
-        return RUNNING, reason or "has not ended: it goes on, or was killed"
-    if status == FAILED:
-        return FAILED, reason or "no reason was left"
-    if status != COMPLETED:
+    if not isinstance(status, str) or status not in _UNSAID:
         by = f", written by staf_torch {record.get('version', 'of an unknown version')}"
         raise UnreadableError(f"{RUN}{by}: the status {status!r} is not known here")
-    return COMPLETED, reason
+    return status, reason or _UNSAID[status]
 
 
 def _rows(run: RecordedRun, name: str) -> list[RecordedRun]:
     """Return one run a row of a table of that name; its overrides come on top of the sweep's."""
-    base = dataclasses.replace(run, seconds=None)
-    return [_row(base, number, row) for number, row in enumerate(read_rows(run.directory, name))]
+    return [_row(run, number, row) for number, row in enumerate(read_rows(run.directory, name))]
 
 
 def read_rows(directory: Path, name: str = ROWS) -> Iterator[Mapping[str, Any]]:
@@ -246,6 +244,7 @@ def _row(run: RecordedRun, number: int, row: Mapping[str, Any]) -> RecordedRun:
         status=status,
         reason=reason,
         row=place if isinstance(place, int) and not isinstance(place, bool) else number,
+        seconds=None,
         lost=lost,
     )
 
@@ -270,12 +269,10 @@ def _metrics(found: object) -> tuple[dict[str, float | None], dict[str, str]]:
     metrics: dict[str, float | None] = {}
     lost: dict[str, str] = {}
     for name, value in found.items() if isinstance(found, dict) else ():
-        if value is None or (isinstance(value, int) and not isinstance(value, bool)):
+        if is_number(value) and not math.isfinite(value):
+            metrics[sys.intern(name)], lost[name] = None, repr(value)
+        elif value is None or is_number(value):
             metrics[sys.intern(name)] = value
-        elif isinstance(value, float):
-            metrics[sys.intern(name)] = value if math.isfinite(value) else None
-            if not math.isfinite(value):
-                lost[name] = repr(value)
     return metrics, lost
 
 
@@ -289,17 +286,12 @@ def _settings(record: Mapping[str, Any]) -> dict[str, Value]:
     if not isinstance(found, dict):
         return {}
     # One object for equal names and words: the settings of a thousand runs take a third of the memory.
-    return {sys.intern(key): _shared(_setting(value)) for key, value in found.items()}
-
-
-def _shared(value: Value) -> Value:
-    return sys.intern(value) if isinstance(value, str) else value
+    return {sys.intern(key): _setting(value) for key, value in found.items()}
 
 
 def _setting(value: Any) -> Value:
-    if isinstance(value, float) and not math.isfinite(value):
-        return repr(value)
-    return json.dumps(value) if isinstance(value, dict) else plain(value)
+    known: Value = json.dumps(value) if isinstance(value, dict) else plain(value)
+    return sys.intern(known) if isinstance(known, str) else known
 
 
 def _text(value: object) -> str | None:
@@ -307,5 +299,4 @@ def _text(value: object) -> str | None:
 
 
 def _number(value: object) -> float | None:
-    number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-    return value if number else None  # type: ignore[return-value]
+    return value if is_number(value) and math.isfinite(value) else None

@@ -11,7 +11,6 @@ import tempfile
 import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import Protocol, TypeVar
 
 import numpy as np
@@ -151,15 +150,12 @@ class History(Mapping[str, np.ndarray]):
         return self._read[name]
 
     def __iter__(self) -> Iterator[str]:
-        """Yield the names."""
         return iter(self._names)
 
     def __len__(self) -> int:
-        """Return the number of arrays."""
         return len(self._names)
 
     def __repr__(self) -> str:
-        """Return the names."""
         return visible(f"<History {', '.join(self._names)}>")
 
     def _of_archive(self, read: Callable[[NpzFile], T]) -> T:
@@ -224,9 +220,7 @@ class HistoryWriter:
     def __enter__(self) -> HistoryWriter:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *raised: object) -> None:
         for descriptor, _ in self._files.values():
             os.close(descriptor)
         shutil.rmtree(self._scratch, ignore_errors=True)

@@ -85,11 +85,6 @@ class RunRecord:
         record["checksum"] = record_checksum(record)
         write_text(directory / RUN, json.dumps(record, indent=1, allow_nan=False) + "\n")
 
-    @property
-    def in_table(self) -> bool:
-        """Whether these are settings of a sweep whose jobs leave rows of one table."""
-        return in_table(self._cfg)
-
     def finished_before(self, directory: Path) -> dict[str, float | None] | None:
         """Return what `finished` returns where the settings resume a sweep, else None."""
         if not resumed(self._cfg):
@@ -123,18 +118,13 @@ class RunRecord:
         if wrong is not None:
             _log.warning("%s: %s; it is run again", directory, wrong)
             return None
-        if not anyway:
-            self._compare(directory, record)
-        return {} if (directory / ROWS).exists() else read(directory / METRICS)
-
-    def _compare(self, directory: Path, record: Mapping[str, Any]) -> None:
-        told = self._differences(record)
-        if told:
+        if not anyway and (told := self._differences(record)):
             raise ValueError(
                 f"{directory} was not made as it would be now: {told}. Numbers may "
                 "differ: run the sweep anew, or keep what is there by `sweep.resume_anyway=true`; tables "
                 "tell the two apart."
             )
+        return {} if (directory / ROWS).exists() else read(directory / METRICS)
 
     def refuse_rows(self, directory: Path) -> NoReturn:
         """Refuse to go on with rows of a table that something else made.
@@ -230,9 +220,8 @@ def quoted(value: str) -> str:
     if re.fullmatch(r"[A-Za-z0-9_./@+-]+", value) and not _is_other(value):
         return value
     # Backslashes count there before a quote alone.
-    return (
-        "'" + re.sub(r"(\\*)('|\Z)", lambda found: 2 * found[1] + found[2].replace("'", "\\'"), value) + "'"
-    )
+    inner = re.sub(r"(\\*)('|\Z)", lambda found: 2 * found[1] + found[2].replace("'", "\\'"), value)
+    return f"'{inner}'"
 
 
 def _is_other(word: str) -> bool:

@@ -32,7 +32,7 @@ from ..numerics.checks import COMMAND_LINE, choice, fail, flag, integer, positiv
 from ..systems import ControlAffineSystem, Plant
 from ..systems.barrier import wall_numbers
 from . import config_directory
-from .chase import initial_states, make, make_centers, placement, plain
+from .chase import initial_states, make, make_centers, placement, plain, seed_of
 
 _GROUPS = ("policy", "law", "basis", "extrapolation")  # config groups below `adp` that `changed` can exchange
 _RECORDED = 200_000  # states of all trajectories together that are recorded unless asked for
@@ -66,7 +66,7 @@ def adp_problem(cfg: DictConfig) -> AdpProblem:
         dt=dt,
         steps=steps,
         every=_every(cfg.adp.record_every, steps, len(x0)),
-        seed=integer(COMMAND_LINE, "seed", cfg.seed, least=0),
+        seed=seed_of(cfg),
         integrator=cfg.adp.integrator,
         compile=cfg.adp.compile,
         optimum=optimum_settings(cfg.adp.optimum),
@@ -158,24 +158,17 @@ def controller(cfg: DictConfig, system: Plant, cost: Cost) -> Controller:
 
 def _behind_walls(cfg: DictConfig, system: Plant, control: Controller, dt: float) -> Controller:
     """The controller behind a `SafetyFilter` that keeps the box of `adp.walls`; itself without walls."""
-    size = system.dim or 0
-    low, high = (
-        wall_numbers("adp.walls", name, plain(cfg.adp.walls[name]), none, size).tolist()
-        for name, none in (("low", -math.inf), ("high", math.inf))
-    )
-    kept = walls(low, high)
-    if not kept:
-        return control
-    return SafetyFilter(control, system, kept, dt=dt, decay=plain(cfg.adp.walls.decay))
+    given, size = plain(cfg.adp.walls), system.dim or 0
+    low = wall_numbers("adp.walls", "low", given["low"], -math.inf, size)
+    high = wall_numbers("adp.walls", "high", given["high"], math.inf, size)
+    kept = walls(low.tolist(), high.tolist())
+    return SafetyFilter(control, system, kept, dt=dt, decay=given["decay"]) if kept else control
 
 
 def value_basis(cfg: DictConfig, dim: int) -> ValueBasis:
     """Build the basis of the group `adp/basis`; one that asks for ``basis`` gets kernel and centers."""
-
-    def kernel_and_centers() -> StaFBasis:
-        return StaFBasis(make(cfg.kernel), make_centers(cfg.centers, dim))
-
-    basis: ValueBasis = build(cfg, "basis", ValueBasis, dim=lambda: dim, basis=kernel_and_centers)
+    known = {"dim": lambda: dim, "basis": lambda: StaFBasis(make(cfg.kernel), make_centers(cfg.centers, dim))}
+    basis: ValueBasis = build(cfg, "basis", ValueBasis, **known)
     return basis
 
 
@@ -189,9 +182,8 @@ def changed(cfg: DictConfig, changes: Mapping[str, Any]) -> DictConfig:
     with open_dict(new):
         for name, value in changes.items():
             if name in _GROUPS:
-                options = {
-                    path.stem: path for path in sorted(Path(config_directory(), "adp", name).glob("*.yaml"))
-                }
+                folder = Path(config_directory(), "adp", name)
+                options = {path.stem: path for path in sorted(folder.glob("*.yaml"))}
                 choice(COMMAND_LINE, f"adp.{name}", value, tuple(options))
                 new.adp[name] = OmegaConf.load(options[value])
             else:
@@ -201,15 +193,12 @@ def changed(cfg: DictConfig, changes: Mapping[str, Any]) -> DictConfig:
 
 def optimum_settings(cfg: DictConfig) -> OptimumSettings:
     """Return the settings `adp.optimum`, checked."""
+    wanted, count = cfg.horizon, cfg.intervals
     return OptimumSettings(
         shooting=flag(COMMAND_LINE, "adp.optimum.shooting", cfg.shooting),
         states=integer(COMMAND_LINE, "adp.optimum.states", cfg.states, least=0),
-        horizon=None
-        if cfg.horizon is None
-        else positive_real(COMMAND_LINE, "adp.optimum.horizon", cfg.horizon),
-        intervals=None
-        if cfg.intervals is None
-        else integer(COMMAND_LINE, "adp.optimum.intervals", cfg.intervals, 4),
+        horizon=None if wanted is None else positive_real(COMMAND_LINE, "adp.optimum.horizon", wanted),
+        intervals=None if count is None else integer(COMMAND_LINE, "adp.optimum.intervals", count, 4),
     )
 
 

@@ -33,8 +33,8 @@ from ..metrics import Metric
 from ..numerics.checks import COMMAND_LINE, choice, fail, flag, integer, positive_real, real, vector
 from ..optim import UpdateLaw
 from ..results.metric_info import OWN
-from ..systems import ControlAffineSystem, trajectory
-from .plain import PlainSettings
+from ..systems import ControlAffineSystem, simulate
+from .plain import PlainSettings, plain
 
 _CENTERS = "staf_torch.settings.chase.centers_of"
 DTYPES = {"float64": torch.float64, "float32": torch.float32}
@@ -170,13 +170,6 @@ def _dimension(system: ControlAffineSystem, initial_state: object) -> int:
     return len(vector(COMMAND_LINE, "initial_state", plain(initial_state)))
 
 
-def plain(value: Any) -> Any:
-    """Return a setting as Python has it: a list or dictionary, resolved, in place of OmegaConf's."""
-    if isinstance(value, PlainSettings):
-        return {key: plain(inner) for key, inner in value.items()}
-    return OmegaConf.to_container(value, resolve=True) if OmegaConf.is_config(value) else value
-
-
 def make(cfg: DictConfig | PlainSettings) -> Any:
     """Build the object that a group of settings names by ``_target_``.
 
@@ -298,7 +291,7 @@ def centers_of(
             raise fail(COMMAND_LINE, "centers.count", rule, count)
     else:
         points = ball(count, dim)  # type: ignore[arg-type]
-    shrinking = dict(shrink or {})
+    shrinking = shrink or {}
     size = make_radius(radius, shrinking.get("offset"), shrinking.get("gain", 1.0))
     return StateFollowingCenters(points, size)
 
@@ -325,8 +318,7 @@ def initial_states(cfg: DictConfig | PlainSettings, dim: int) -> Tensor:
     first = torch.tensor(stated, dtype=torch.float64)
     batch = integer(COMMAND_LINE, "trajectories", cfg.trajectories, least=1)
     spread = positive_real(COMMAND_LINE, "spread", cfg.spread)
-    generator = torch.Generator().manual_seed(integer(COMMAND_LINE, "seed", cfg.seed, least=0))
-    rows = torch.rand(batch - 1, dim, dtype=torch.float64, generator=generator)
+    rows = torch.rand(batch - 1, dim, dtype=torch.float64, generator=generator_of(cfg))
     return torch.cat((first.unsqueeze(0), first + spread * (2 * rows - 1)))
 
 
@@ -355,8 +347,7 @@ def local_problem(cfg: DictConfig, states: str) -> LocalProblem:
         rule = "must be null here: the experiment is about balls of a constant radius"
         raise fail(COMMAND_LINE, "centers.shrink.offset", rule, cfg.centers.shrink.offset)
     count = integer(COMMAND_LINE, states, OmegaConf.select(cfg, states), least=1)
-    pieces = trajectory(problem.system, problem.initial_states[:1], dt=problem.dt, steps=problem.steps)
-    path = torch.cat(list(pieces), dim=1)[0]
+    path = simulate(problem.system, problem.initial_states[:1], dt=problem.dt, steps=problem.steps)[0]
     # Without the last one: over one period that is the first again.
     index = (torch.arange(min(count, problem.steps)) * problem.steps) // min(count, problem.steps)
     radius = positive_real(COMMAND_LINE, "centers.radius", cfg.centers.radius)
@@ -377,6 +368,17 @@ def numbers(cfg: DictConfig, name: str) -> list[float]:
     return sorted({positive_real(COMMAND_LINE, name, number) for number in listed})
 
 
-def case_name(radius: float, epsilon: float) -> str:
-    """Return the end of a metric's name: the radius and the epsilon that the metric belongs to."""
-    return f"r{radius:g}.eps{epsilon:g}"
+def generator_of(cfg: DictConfig | PlainSettings) -> torch.Generator:
+    """Return a generator of random numbers that begins with the setting `seed`."""
+    return torch.Generator().manual_seed(seed_of(cfg))
+
+
+def seed_of(cfg: DictConfig | PlainSettings) -> int:
+    """Return the setting `seed`, checked."""
+    return integer(COMMAND_LINE, "seed", cfg.seed, least=0)
+
+
+def horizon(cfg: DictConfig) -> tuple[float, int]:
+    """Return the step of the setting `dt`, s, and the number of steps in `duration`, at least 1."""
+    dt = positive_real(COMMAND_LINE, "dt", cfg.dt)
+    return dt, max(1, round(positive_real(COMMAND_LINE, "duration", cfg.duration) / dt))

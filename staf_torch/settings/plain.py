@@ -27,13 +27,16 @@ class PlainSettings(dict[str, Any]):
 
     def hydras(self) -> DictConfig:
         """Return the same settings as OmegaConf has them."""
-        found: DictConfig = OmegaConf.create(_dictionaries(self))
+        found: DictConfig = OmegaConf.create(plain(self))
         OmegaConf.set_struct(found, True)
         return found
 
 
-def _dictionaries(value: Any) -> Any:
-    return {key: _dictionaries(each) for key, each in value.items()} if isinstance(value, dict) else value
+def plain(value: Any) -> Any:
+    """Return a setting as Python has it: a list or dictionary, resolved, in place of OmegaConf's."""
+    if isinstance(value, PlainSettings):
+        return {key: plain(inner) for key, inner in value.items()}
+    return OmegaConf.to_container(value, resolve=True) if OmegaConf.is_config(value) else value
 
 
 class ManySettings(Sequence[DictConfig]):

@@ -74,14 +74,8 @@ def constructors() -> frozenset[str]:
         *(adp.ActorCriticLaw, adp.Controller, adp.Cost, adp.Extrapolation, adp.Gains, adp.ValueBasis),
         *(adp.LQR, adp.RolloutPolicy, targets.Paper, targets.Quadratic, targets.Cosine),
     )
-    rooms = {
-        **dict.fromkeys(("staf_torch.kernels", "staf_torch"), kernels),
-        "staf_torch.optim": optim,
-        "staf_torch.systems": systems,
-        "staf_torch.targets": targets,
-        "staf_torch.adp": adp,
-        **dict.fromkeys(("staf_torch.predictors", "staf_torch.engine.predictors"), predictors),
-    }
+    rooms = {module.__name__: module for module in (kernels, optim, systems, targets, adp, predictors)}
+    rooms |= {"staf_torch": kernels, "staf_torch.predictors": predictors}
     found = {
         target
         for path in Path(config_directory()).rglob("*.yaml")

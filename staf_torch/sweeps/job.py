@@ -63,7 +63,7 @@ def execute(
     choices = {str(group): choice for group, choice in node.runtime.choices.items()}
     record = records.RunRecord(cfg, choices, as_typed(node.overrides.task), compiler())
     try:
-        if record.in_table:
+        if records.in_table(cfg):
             raise ValueError(f"`sweep.records=table` needs {_BATCHED}.")
         metrics = record.finished_before(directory)
         if metrics is not None:

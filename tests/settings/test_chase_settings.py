@@ -282,7 +282,6 @@ def test_a_list_of_numbers_is_sorted_and_has_no_number_twice() -> None:
     ):
         with pytest.raises(ValueError, match=re.escape(f"`staf {name}=...` {said}")):
             chase.numbers(cfg, name)
-    assert chase.case_name(0.10, 1e-3) == "r0.1.eps0.001"
 
 
 @pytest.mark.parametrize(
@@ -295,9 +294,7 @@ def test_states_of_a_trajectory_are_equally_spaced_without_the_last(states: int,
     OmegaConf.update(cfg, "experiment.states", states, force_add=True)
     found = chase.local_problem(cfg, "experiment.states")
     problem = chase.chase_problem(cfg)
-    path = torch.cat(
-        list(chase.trajectory(problem.system, problem.initial_states[:1], dt=0.1, steps=10)), dim=1
-    )[0]
+    path = chase.simulate(problem.system, problem.initial_states[:1], dt=0.1, steps=10)[0]
     torch.testing.assert_close(found.states, path[index])
     torch.testing.assert_close(found.time, 0.1 * torch.tensor(index).double())
     assert found.radius == 0.25
