@@ -11,20 +11,8 @@ import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
-from ..adp import (
-    LQR,
-    ActorCritic,
-    ActorCriticLaw,
-    ConcurrentLearning,
-    Controller,
-    DirectShooting,
-    Extrapolation,
-    IdentifyingTracker,
-    LeadingCoordinates,
-    LoopResult,
-    QuadraticCost,
-    tracking_cost,
-)
+from .. import adp
+from ..adp import ConcurrentLearning, Controller, IdentifyingTracker, LoopResult, QuadraticCost
 from ..figures.animation import animate
 from ..figures.closed_loop import TrackingHistory, draw_tracking
 from ..figures.style import images
@@ -49,7 +37,7 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
     device, dtype = placement(cfg.device, cfg.dtype)
     plant = TwoStateTracking().to(device)
     weights = plain(cfg.adp.cost)
-    cost = tracking_cost(weights["state"], weights["control"]).to(device)
+    cost = adp.tracking_cost(weights["state"], weights["control"]).to(device)
     x0 = initial_states(cfg, plant.dim).to(device=device, dtype=dtype)
     dt, steps = horizon(cfg)
     controllers = _controllers(cfg, plant, cost)
@@ -87,11 +75,11 @@ def _optimal_cost(plant: TwoStateTracking, cost: QuadraticCost, x0: Tensor) -> T
     """V*(x(0)) of the known plant by direct shooting, (B,); None without SciPy."""
     error_cost = QuadraticCost(cost.q[:2, :2], cost.r, 2, 1)
     try:
-        lqr = LQR(TwoState(), error_cost).to(x0.device)
+        lqr = adp.LQR(TwoState(), error_cost).to(x0.device)
     except ValueError as error:
         _log.warning("the optimum is not known: %s", error)
         return None
-    shooting = DirectShooting(
+    shooting = adp.DirectShooting(
         TwoStateTracking().to(x0.device),
         copy.deepcopy(cost).double(),
         base=lambda x: lqr(x[..., :2]),
@@ -108,12 +96,12 @@ def _controllers(cfg: DictConfig, plant: TwoStateTracking, cost: QuadraticCost) 
     # 1e-300 keeps the first estimate: the same code without learning.
     learning = ConcurrentLearning(3, 2, chosen.size, chosen.gain)
     frozen = ConcurrentLearning(3, 2, chosen.size, 1e-300)
-    learner = ActorCritic(
-        LeadingCoordinates(value_basis(cfg, 2), plant.dim),
+    learner = adp.ActorCritic(
+        adp.LeadingCoordinates(value_basis(cfg, 2), plant.dim),
         plant,
         cost,
-        build(cfg, "extrapolation", Extrapolation, dim=lambda: plant.dim),
-        build(cfg, "law", ActorCriticLaw),
+        build(cfg, "extrapolation", adp.Extrapolation, dim=lambda: plant.dim),
+        build(cfg, "law", adp.ActorCriticLaw),
         critic=cfg.adp.critic,
         actor=cfg.adp.actor,
         gain=cfg.adp.gain,

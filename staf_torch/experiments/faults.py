@@ -11,23 +11,8 @@ import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
-from ..adp import (
-    LQR,
-    AdaptiveLQR,
-    BoundedInputCost,
-    ChangingPlant,
-    ConsiderFilter,
-    Controller,
-    Cost,
-    DirectShooting,
-    Feedback,
-    IntegralWindows,
-    LeastSquares,
-    LoopResult,
-    Measured,
-    ParametricPlant,
-    QuadraticCost,
-)
+from .. import adp
+from ..adp import LQR, AdaptiveLQR, Cost, IntegralWindows, LeastSquares, LoopResult, Measured, ParametricPlant
 from ..figures.closed_loop import FaultPicture, draw_faults
 from ..numerics.checks import COMMAND_LINE, choice, flag, integer, positive_real
 from ..results.progress import SHOWN, Progress
@@ -107,7 +92,7 @@ def short_period(rows: int, generator: torch.Generator) -> FaultCase:
 
     true = torch.cat((drift, torch.tensor([0.7, 0.0], dtype=torch.float64)))
     model = ParametricPlant(regressor, dim=2, inputs=2, theta=true)
-    cost = BoundedInputCost(0.25, 5.0, dim=2, inputs=2, bound=2.0)
+    cost = adp.BoundedInputCost(0.25, 5.0, dim=2, inputs=2, bound=2.0)
     x0 = torch.tensor([[25.0, -10.0]], dtype=torch.float64).repeat(rows, 1)
     first = torch.ones(rows, 6, dtype=torch.float64)
     first[:, :4] = 10 * torch.rand(rows, 4, generator=generator, dtype=torch.float64) - 5
@@ -119,7 +104,7 @@ def short_period(rows: int, generator: torch.Generator) -> FaultCase:
     known = true.expand(rows, 6)
     return FaultCase(
         *(model, cost, x0, known, known, x0.new_zeros(rows), 0.001, 0.0, 1e-2, adaptive),
-        lambda: DirectShooting(model, cost).solve(x0[:1]).value.expand(rows),
+        lambda: adp.DirectShooting(model, cost).solve(x0[:1]).value.expand(rows),
     )
 
 
@@ -135,7 +120,7 @@ def unstable(rows: int, generator: torch.Generator) -> FaultCase:
         return torch.stack((x[..., 1], 25 * x[..., 0]), dim=-1)
 
     model = ParametricPlant(regressor, known, dim=2, inputs=2, theta=[1.0, 1.0], rows=[1])
-    cost = QuadraticCost(1.0, 1.0, dim=2, inputs=2)
+    cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=2)
     x0 = 2 * torch.rand(rows, 2, generator=generator, dtype=torch.float64) - 1
     at = 0.1 + 0.4 * torch.rand(rows, generator=generator, dtype=torch.float64)
     law = LeastSquares([1.0, 1.0], deviation=[0.3, 0.05], floor=1e-3, forgetting=0.2, alarm=5.0)
@@ -158,7 +143,7 @@ def mass(rows: int, generator: torch.Generator) -> FaultCase:
         return torch.stack((x[..., 1], 9.81 * x[..., 0].sin()), dim=-1)
 
     model = ParametricPlant(regressor, known, dim=2, inputs=1, theta=[1.0], rows=[1])
-    cost = QuadraticCost(1.0, 1.0, dim=2, inputs=1)
+    cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
     drawn = torch.rand(rows, 2, generator=generator, dtype=torch.float64)
     side = torch.where(torch.rand(rows, dtype=torch.float32, generator=generator) < 0.5, -1.0, 1.0)
     x0 = torch.stack((side * (0.5 + drawn[:, 0]), 2 * drawn[:, 1] - 1), dim=-1)
@@ -168,14 +153,14 @@ def mass(rows: int, generator: torch.Generator) -> FaultCase:
     # Between the masses that are possible: too much push is dearer than too little, for so short a time.
     robust = LQR(model.believing(torch.tensor([1.15], dtype=torch.float64)), cost)
     # Noise times a gain of 40 costs 1.7 in 10 s, where the cheapest starts cost 9.
-    filter = ConsiderFilter(model, noise=0.01, process=0.01)
+    filter = adp.ConsiderFilter(model, noise=0.01, process=0.01)
     adaptive = AdaptiveLQR(model, cost, windows, law, robust=robust, confidence=2.0, filter=filter)
 
     def optimum() -> Tensor:
         best = torch.full((rows,), torch.nan, dtype=torch.float64)
         for inverse in true.unique():
             same = true[:, 0] == inverse
-            shooting = DirectShooting(model.believing(inverse.unsqueeze(0)), cost)
+            shooting = adp.DirectShooting(model.believing(inverse.unsqueeze(0)), cost)
             best[same] = shooting.solve(x0[same]).value
         return best
 
@@ -206,15 +191,15 @@ class _Informed(torch.nn.Module):
         return u
 
 
-def _controllers(case: FaultCase) -> dict[str, Controller]:
+def _controllers(case: FaultCase) -> dict[str, adp.Controller]:
     """Return the controllers by name, measured: the informed one sees the last parameters."""
     n, p = case.x0.shape[-1], case.model.parameters_count
     design = LQR(case.model.believing(_design(case)), case.cost, period=case.dt)
     later = [*range(n), *range(n + p, n + 2 * p)]
     return {
-        "ignorant LQR": Measured(Feedback(design), noise=case.noise, dim=n),
+        "ignorant LQR": Measured(adp.Feedback(design), noise=case.noise, dim=n),
         "informed LQR": Measured(
-            Feedback(_Informed(case)),
+            adp.Feedback(_Informed(case)),
             noise=[case.noise] * n + [0.0] * p,
             dim=n + p,
             output=lambda z: z[..., later],
@@ -231,8 +216,8 @@ def _design(case: FaultCase) -> Tensor:
     return theta
 
 
-def _run(case: FaultCase, controller: Controller, duration: float) -> LoopResult:
-    plant = ChangingPlant(case.model)
+def _run(case: FaultCase, controller: adp.Controller, duration: float) -> LoopResult:
+    plant = adp.ChangingPlant(case.model)
     z0 = plant.start(case.x0, case.before, case.after, case.at)
     every = max(1, round(_RECORDED / case.dt))
     steps = every * max(1, round(duration / case.dt / every))

@@ -9,16 +9,8 @@ import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
-from ..adp import (
-    ActorCritic,
-    Controller,
-    Feedback,
-    IdentifyingTracker,
-    LeadingCoordinates,
-    LoopResult,
-    StaFValueBasis,
-    Supervised,
-)
+from .. import adp
+from ..adp import ActorCritic, Controller, LoopResult
 from ..adp.loop.controller import Value
 from ..adp.loop.setup import AdpProblem
 from ..adp.planning.shooting.reference_optimum import known_value
@@ -158,19 +150,19 @@ def _curves(result: LoopResult, at: np.ndarray) -> Curves:
 
 def _inner(controller: Controller) -> Controller:
     """Return what a supervisor or an identifying tracker holds."""
-    if isinstance(controller, Supervised):
+    if isinstance(controller, adp.Supervised):
         return controller.controller
-    return controller.learner if isinstance(controller, IdentifyingTracker) else controller
+    return controller.learner if isinstance(controller, adp.IdentifyingTracker) else controller
 
 
 def _moving(controller: Controller) -> StaFBasis | None:
     """Return kernel and centers of what follows the state in a controller."""
     inner, basis = _inner(controller), None
-    if isinstance(inner, Feedback):
+    if isinstance(inner, adp.Feedback):
         basis = getattr(inner.policy, "basis", None)
     elif isinstance(inner, ActorCritic):
-        value = inner.basis.basis if isinstance(inner.basis, LeadingCoordinates) else inner.basis
-        basis = value.basis if isinstance(value, StaFValueBasis) else None
+        value = inner.basis.basis if isinstance(inner.basis, adp.LeadingCoordinates) else inner.basis
+        basis = value.basis if isinstance(value, adp.StaFValueBasis) else None
     return basis if isinstance(basis, StaFBasis) else None
 
 

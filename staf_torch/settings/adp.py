@@ -13,17 +13,8 @@ import torch
 from hydra.utils import get_object, instantiate
 from omegaconf import DictConfig, OmegaConf, open_dict
 
-from ..adp import (
-    LQR,
-    ActorCriticLaw,
-    Controller,
-    Cost,
-    Extrapolation,
-    Feedback,
-    SafetyFilter,
-    Supervised,
-    ValueBasis,
-)
+from .. import adp
+from ..adp import LQR, Controller, Cost, Feedback, ValueBasis
 from ..adp.loop.setup import AdpProblem, OptimumSettings
 from ..adp.near_optimal import NearOptimal
 from ..adp.safety.safety_filter import walls
@@ -142,8 +133,8 @@ def controller(cfg: DictConfig, system: Plant, cost: Cost) -> Controller:
         inputs=lambda: _inputs(system),
         lqr=lambda: LQR(system, cost),
         basis=basis,
-        extrapolation=lambda: build(cfg, "extrapolation", Extrapolation, dim=lambda: system.dim),
-        law=lambda: build(cfg, "law", ActorCriticLaw),
+        extrapolation=lambda: build(cfg, "extrapolation", adp.Extrapolation, dim=lambda: system.dim),
+        law=lambda: build(cfg, "law", adp.ActorCriticLaw),
         critic=lambda: start(cfg.adp.critic),
         actor=lambda: start(cfg.adp.actor),
     )
@@ -153,7 +144,7 @@ def controller(cfg: DictConfig, system: Plant, cost: Cost) -> Controller:
         return Feedback(policy, getattr(policy, "value", None))
     if cfg.adp.trust is None:
         return policy
-    return Supervised(policy, LQR(system, cost), cost, cfg.adp.trust)
+    return adp.Supervised(policy, LQR(system, cost), cost, cfg.adp.trust)
 
 
 def _behind_walls(cfg: DictConfig, system: Plant, control: Controller, dt: float) -> Controller:
@@ -162,7 +153,7 @@ def _behind_walls(cfg: DictConfig, system: Plant, control: Controller, dt: float
     low = wall_numbers("adp.walls", "low", given["low"], -math.inf, size)
     high = wall_numbers("adp.walls", "high", given["high"], math.inf, size)
     kept = walls(low.tolist(), high.tolist())
-    return SafetyFilter(control, system, kept, dt=dt, decay=given["decay"]) if kept else control
+    return adp.SafetyFilter(control, system, kept, dt=dt, decay=given["decay"]) if kept else control
 
 
 def value_basis(cfg: DictConfig, dim: int) -> ValueBasis:
