@@ -47,7 +47,8 @@ _SAID: Mapping[str, Node] = {  # what neither values nor signatures say
     "dtype": {"enum": list(DTYPES)},
     "animation": {"enum": [False, True, "gif", "html"]},
     "adp.compile": {"enum": [True, False, "auto"]},
-} | {f"adp.{name}": {"type": ["number", "array"]} for name in ("critic", "actor", "q", "r")}
+    **{f"adp.{name}": {"type": ["number", "array"]} for name in ("critic", "actor", "q", "r")},
+}
 
 
 def main(words: Sequence[str]) -> str:

@@ -18,7 +18,6 @@ from ..adp import ActorCritic, Controller, Cost, Gains, LoopResult, SafetyFilter
 from ..adp.loop.setup import AdpProblem
 from ..adp.planning.shooting.reference_optimum import LoopOptimum, compare
 from ..adp.problem.held_linear import HeldLoop
-from ..figures.animation import animate
 from ..figures.closed_loop import AdpHistory, draw_adp
 from ..figures.style import images
 from ..lanes.tree import flatten, unflatten
@@ -30,7 +29,7 @@ from ..settings.adp import adp_problem
 from ..settings.chase import make_metrics
 from ..tables.columns import significant
 from .registry import BatchedExperiment, Metrics
-from .scenes import animation_kind, loop_scene
+from .scenes import animation_kind, loop_scene, write_animation
 from .study import log_diverged, trajectories, write_history
 
 _log = logging.getLogger(__name__)
@@ -84,9 +83,7 @@ class Regulation(BatchedExperiment[LoopSolution]):
         if cfg.history:
             write_history(out, solution.result.time, recorded(solution.result))
         log_diverged(_log, solution.result.state[:, 0], solution.result.frozen_at)
-        kind = animation_kind(cfg)
-        if kind is not None:
-            out.figure("closed_loop", animate(loop_scene(adp_problem(cfg), solution.result), kind))
+        write_animation(cfg, out, "closed_loop", lambda: loop_scene(adp_problem(cfg), solution.result))
         if cfg.figures:
             out.figure(cfg.task, images(draw_adp(_drawn(solution))))
         _summarise(solution)

@@ -13,7 +13,6 @@ from torch import Tensor
 
 from .. import adp
 from ..adp import ConcurrentLearning, Controller, IdentifyingTracker, LoopResult, QuadraticCost
-from ..figures.animation import animate
 from ..figures.closed_loop import TrackingHistory, draw_tracking
 from ..figures.style import images
 from ..metrics.closed_loop import tracking_metrics
@@ -25,7 +24,7 @@ from ..systems import TwoState, TwoStateTracking
 from ..tables.columns import significant
 from .adp import recorded
 from .registry import Metrics
-from .scenes import animation_kind, tracking_scene
+from .scenes import tracking_scene, write_animation
 from .study import Method, write_history
 
 _log = logging.getLogger(__name__)
@@ -60,9 +59,7 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
     parameters = identified["theta"]  # (B, T, 3, 2)
     if cfg.history:
         write_history(out, identified.time, recorded(identified) | {"parameters": parameters})
-    kind = animation_kind(cfg)
-    if kind is not None:
-        out.figure("tracking", animate(tracking_scene(controllers["identified"], identified), kind))
+    write_animation(cfg, out, "tracking", lambda: tracking_scene(controllers["identified"], identified))
     if cfg.figures:
         out.figure("adp_tracking", images(draw_tracking(_drawn(results, parameters, plant.theta))))
     return out.metrics(metrics)

@@ -16,7 +16,7 @@ from torch import Tensor
 from ..adp import LQR, Feedback, LoopResult, QuadraticCost, SafetyFilter
 from ..adp.loop.controller import Policy
 from ..adp.safety.safety_filter import Constraint
-from ..figures.animation import Curves, Scene, animate
+from ..figures.animation import Curves, Scene
 from ..figures.closed_loop import AvoidanceHistory, draw_avoidance
 from ..metrics.safety import constraint_metrics
 from ..numerics.checks import COMMAND_LINE, choice, integer, positive_real
@@ -25,7 +25,7 @@ from ..results.run_directory import RunDirectory
 from ..settings.chase import generator_of, horizon, placement
 from ..systems import ControlAffineSystem, Linear
 from .registry import Metrics, finite
-from .scenes import animation_kind, frames
+from .scenes import animation_kind, frames, write_animation
 from .study import Method, Study, write_history
 
 
@@ -142,7 +142,7 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
     """Run both methods in every scenario and fill the run directory; `metrics.json` comes last."""
     device, dtype = placement(cfg.device, cfg.dtype)
     chosen = cfg.avoidance
-    kind = animation_kind(cfg)
+    animation_kind(cfg)  # refuses other values before anything takes time
     x0 = scenarios(cfg).to(device=device, dtype=dtype)
     radius = positive_real(COMMAND_LINE, "avoidance.radius", chosen.radius)
     dt, steps = horizon(cfg)
@@ -190,8 +190,7 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
         arrays = {"state": filtered.state, "control": filtered.control, "distance": distances[FILTERED]}
         arrays[f"{vehicle.label.lower()}_distance"] = distances[BARE]
         write_history(out, filtered.time, arrays | {"running_cost": filtered.running_cost})
-    if kind is not None:
-        out.figure("avoidance", animate(_scene(vehicle, shown), kind))
+    write_animation(cfg, out, "avoidance", lambda: _scene(vehicle, shown))
     return study.write(out, (lambda: draw_avoidance(shown)) if cfg.figures else None)
 
 

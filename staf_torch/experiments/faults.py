@@ -19,7 +19,7 @@ from ..results.progress import SHOWN, Progress
 from ..results.run_directory import RunDirectory
 from ..settings.chase import generator_of, plain
 from .registry import Metrics
-from .study import Method, Study
+from .study import Method, Study, recorded_times
 
 _log = logging.getLogger(__name__)
 _COLUMNS = {
@@ -219,12 +219,11 @@ def _design(case: FaultCase) -> Tensor:
 def _run(case: FaultCase, controller: adp.Controller, duration: float) -> LoopResult:
     plant = adp.ChangingPlant(case.model)
     z0 = plant.start(case.x0, case.before, case.after, case.at)
-    every = max(1, round(_RECORDED / case.dt))
-    steps = every * max(1, round(duration / case.dt / every))
-    return Method(controller, plant, plant.cost(case.cost)).run(z0, dt=case.dt, steps=steps, every=every)
+    times = recorded_times(duration, case.dt, _RECORDED)
+    return Method(controller, plant, plant.cost(case.cost)).run(z0, dt=case.dt, **times)
 
 
-def _measured(case: FaultCase, result: LoopResult, best: Tensor | None) -> Metrics:
+def _measured(case: FaultCase, result: LoopResult, best: Tensor | None) -> dict[str, float]:
     late = result.time >= result.time[-1] - _SETTLED
     norm = result.state[:, late, : case.x0.shape[-1]].norm(dim=-1)
     regulated = (norm < case.near).all(-1) & ~result.diverged

@@ -298,13 +298,12 @@ def _shown(problem: FlatLimit, samples: list[FlatLimitErrors]) -> Table:
 
 
 def _every(samples: list[FlatLimitErrors]) -> Table:
-    return Table.of(
-        [
-            {"dtype": s.dtype, "centers": s.centers, "radius": s.radius}
-            | {key: finite(error) for key, error in s.error.items()}
-            for s in samples
-        ]
-    )
+
+    def row(s: FlatLimitErrors) -> dict[str, Value]:
+        errors = {key: finite(error) for key, error in s.error.items()}
+        return {"dtype": s.dtype, "centers": s.centers, "radius": s.radius, **errors}
+
+    return Table.of([row(s) for s in samples])
 
 
 def _cell(error: float) -> str:

@@ -14,7 +14,6 @@ import numpy as np
 import torch
 from omegaconf import DictConfig
 
-from ..figures.animation import animate
 from ..figures.chase import ChaseHistory, draw_chase
 from ..figures.style import images
 from ..metrics.ball_error import StateErrorPass
@@ -26,7 +25,7 @@ from ..settings.plain import PlainSettings, to_read
 from ..tables.columns import significant
 from .chase_batch import Outcome, simulate
 from .registry import BatchedExperiment, Metrics
-from .scenes import animation_kind, chase_scene
+from .scenes import animation_kind, chase_scene, write_animation
 from .study import log_diverged, trajectories
 
 _log = logging.getLogger(__name__)
@@ -226,9 +225,7 @@ def _finish(out: RunDirectory, solved: ChaseSolution, cfg: DictConfig) -> Metric
     outcome = solved.outcome
     diverged = torch.where(outcome.diverged_at < 0, torch.inf, outcome.diverged_at * solved.title.dt)
     log_diverged(_log, solved.starts, diverged, "; its weights are frozen from there on")
-    kind = animation_kind(cfg)
-    if kind is not None:
-        out.figure("chase", animate(chase_scene(chase_problem(cfg), outcome.drawn), kind))
+    write_animation(cfg, out, "chase", lambda: chase_scene(chase_problem(cfg), outcome.drawn))
     if cfg.figures:
         out.figure("gradient_chase", images(draw_chase(ChaseHistory(**outcome.drawn))))
     _summarise(solved.title, outcome.metrics)

@@ -17,7 +17,7 @@ from ..results.progress import SHOWN, Progress
 from ..results.run_directory import RunDirectory
 from ..settings.chase import generator_of, plain, seed_of
 from .registry import Metrics
-from .study import Method, Study
+from .study import Method, Study, recorded_times
 
 _log = logging.getLogger(__name__)
 SOURCES = {"integral": "integral", "slope": "derivative"}
@@ -83,11 +83,10 @@ def _followed(cfg: DictConfig, plant: ParametricPlant, gains: dict[str, Tensor],
     """The closed loops of all gains with the equations of one source."""
     dt = positive_real(COMMAND_LINE, "dt", cfg.dt)
     duration = positive_real(COMMAND_LINE, "duration", cfg.duration)
-    every = max(1, round(min(_RECORDED, duration / 20) / dt))
     noise = real(COMMAND_LINE, "icl.noise", cfg.icl.noise)
     size = integer(COMMAND_LINE, "icl.size", cfg.icl.size, 1)
     start = [*vector(COMMAND_LINE, "initial_state", plain(cfg.initial_state), 2), 1.0, 0.0, 1.0]
-    tracker = ConcurrentTracker(plant, reference, source=source, size=size, **gains)
+    tracker = ConcurrentTracker(plant, reference, source=source, size=size, **gains)  # type: ignore[arg-type]
     method = Method(
         Measured(tracker, noise=[noise, noise, 0.0, 0.0, 0.0], dim=5),
         plant,
@@ -96,9 +95,8 @@ def _followed(cfg: DictConfig, plant: ParametricPlant, gains: dict[str, Tensor],
     result = method.run(
         torch.tensor([start], dtype=torch.float64).repeat(len(gains["rate"]), 1),
         dt=dt,
-        steps=every * max(1, round(duration / dt / every)),
-        every=every,
         seed=seed_of(cfg),
+        **recorded_times(duration, dt, min(_RECORDED, duration / 20)),
     )
     error = result.state[..., :2] - reference(result.state)[0]
     return SourceRun(result.time, error, result["theta"], int(result.diverged.sum()))

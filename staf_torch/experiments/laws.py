@@ -101,9 +101,9 @@ def cases(work: int, count: int) -> list[LawCase]:
         chosen += [(optim.SteepestDescent(), iterations, predictor) for iterations in (1, rest)]
         chosen.append((optim.Exact(), 1, predictor))
     rows = []
-    for law, iterations, predictor in chosen:
-        products = law.products(count, iterations) + (predictor.products(count) if predictor else 0)
-        rows.append(LawCase(law, iterations, predictor, products))
+    for law, iterations, ahead in chosen:
+        products = law.products(count, iterations) + (0 if ahead is None else ahead.products(count))
+        rows.append(LawCase(law, iterations, ahead, products))
     return list({case.key: case for case in rows}.values())  # with two centers a row would repeat itself
 
 
@@ -164,8 +164,8 @@ def table(
             "iterations": case.iterations,
             "predictor": case.predicted,
             "products": case.products / problem.dt,
+            **solve(_with(problem, case), errors=errors).metrics,
         }
-        | solve(_with(problem, case), errors=errors).metrics
         for case in progress.each(compared, "laws")
     ]
 

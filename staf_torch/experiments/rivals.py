@@ -118,9 +118,9 @@ def compare(
     best = best_known(case, problem, x0, list(episodes.values()))
     rows = []
     for rival in rivals:
-        episode, note = episodes.get(rival.name), notes.get(rival.name)
-        more = _told(rival, episode, times.get(rival.name), note)
-        rows.append(RivalRow(rival.name, _measured(episode, best, case.left), more))
+        played = episodes.get(rival.name)
+        more = _told(rival, played, times.get(rival.name), notes.get(rival.name))
+        rows.append(RivalRow(rival.name, _measured(played, best, case.left), more))
     return rows
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 import torch
@@ -15,8 +15,9 @@ from ..adp.loop.controller import Value
 from ..adp.loop.setup import AdpProblem
 from ..adp.planning.shooting.reference_optimum import known_value
 from ..approximation.basis import StaFBasis
-from ..figures.animation import FRAMES, KINDS, Curves, Scene
+from ..figures.animation import FRAMES, KINDS, Curves, Scene, animate
 from ..numerics.checks import COMMAND_LINE, choice, fail
+from ..results.run_directory import RunDirectory
 from ..settings.chase import ChaseProblem
 from ..settings.plain import PlainSettings
 
@@ -40,6 +41,13 @@ def animation_kind(cfg: DictConfig | PlainSettings, dim: int | None = None) -> s
     if dim is not None and dim < 2:
         raise fail(COMMAND_LINE, "animation", "needs a state of two coordinates or more", dim)
     return kind
+
+
+def write_animation(cfg: DictConfig, out: RunDirectory, name: str, scene: Callable[[], Scene]) -> None:
+    """Write a scene as the setting `animation` asks for; nothing for no animation."""
+    kind = animation_kind(cfg)
+    if kind is not None:
+        out.figure(name, animate(scene(), kind))
 
 
 def chase_scene(problem: ChaseProblem, drawn: Mapping[str, np.ndarray]) -> Scene:

@@ -120,6 +120,12 @@ def report(
         out.figure(name, images(drawing()))
 
 
+def recorded_times(duration: float, dt: float, between: float) -> dict[str, int]:
+    """Return `steps` and `every` of `simulate` for records about ``between`` seconds apart."""
+    every = max(1, round(between / dt))
+    return {"steps": every * max(1, round(duration / dt / every)), "every": every}
+
+
 def trajectories(count: int) -> str:
     """Return a number of trajectories in words, for the log."""
     return f"{count} {'trajectory' if count == 1 else 'trajectories'}"

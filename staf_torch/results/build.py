@@ -33,7 +33,7 @@ def digest(path: Path) -> str:
         UnreadableError: if there is none.
     """
     with open_regular(path) as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+        return hashlib.file_digest(file, "sha256").hexdigest()  # type: ignore[arg-type]
 
 
 @functools.cache

@@ -21,9 +21,8 @@ COMPLETED, FAILED, RUNNING, UNFINISHED = "completed", "failed", "running", "unfi
 Value = str | float | int | bool | list[Any] | None
 """What a setting holds; a list may hold lists."""
 _WORDS: Mapping[str, Value] = {"null": None, "none": None, "true": True, "false": False}
-
-
-Item, Key = TypeVar("Item"), TypeVar("Key")
+Item = TypeVar("Item")
+Key = TypeVar("Key")
 
 
 def grouped(items: Iterable[Item], key: Callable[[Item], Key]) -> dict[Key, list[Item]]:

@@ -34,7 +34,8 @@ from ..numerics.checks import COMMAND_LINE, choice, fail, flag, integer, positiv
 from ..optim import UpdateLaw
 from ..results.metric_info import OWN
 from ..systems import ControlAffineSystem, simulate
-from .plain import PlainSettings, plain
+from .plain import PlainSettings
+from .plain import plain as plain
 
 _CENTERS = "staf_torch.settings.chase.centers_of"
 DTYPES = {"float64": torch.float64, "float32": torch.float32}
