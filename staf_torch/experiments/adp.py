@@ -8,8 +8,8 @@ import logging
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
-import numpy as np
 import torch
 from omegaconf import DictConfig
 from torch import Tensor
@@ -240,8 +240,7 @@ def count_the_restless(cost: Cost, result: LoopResult) -> None:
     rate = cost.state_rate(result.state)  # (B, T)
     late = rate[:, -max(1, rate.shape[1] // 4) :].amin(1)
     moving = (rate[:, 0] > 0) & (late > _SETTLING * rate[:, 0])
-    restless = int((moving & ~result.diverged).sum())
-    if restless:
+    if restless := int((moving & ~result.diverged).sum()):
         _log.warning(
             "%d of %d trajectories are not regulated: in the last quarter of the %.4g s their state never "
             "paid less than a quarter of its first cost rate",
@@ -265,17 +264,9 @@ def _drawn(solution: LoopSolution) -> AdpHistory:
     """The first trajectory, its angles in [-pi, pi]."""
     result, optimum = solution.result, solution.optimum
 
-    def first(rows: Tensor | None) -> np.ndarray | None:
-        return None if rows is None else rows[0].cpu().numpy()
-
-    return AdpHistory(
-        time=result.time.numpy(),
-        state=wrap(result.state[0], solution.periodic).cpu().numpy(),
-        control=result.control[0].cpu().numpy(),
-        actor_weights=result.actor_weights[0].cpu().numpy(),
-        critic_weights=result.critic_weights[0].cpu().numpy(),
-        running_cost=result.running_cost[0].cpu().numpy(),
-        control_error=first(optimum.control_error),
-        value_error=first(optimum.value_error),
-        optimal_cost=None if optimum.cost is None else float(optimum.cost[0]),
-    )
+    errors = {"control_error": optimum.control_error, "value_error": optimum.value_error}
+    first: dict[str, Any] = {name: rows[0].cpu().numpy() for name, rows in recorded(result).items()}
+    first |= {name: None if rows is None else rows[0].cpu().numpy() for name, rows in errors.items()}
+    first["state"] = wrap(result.state[0], solution.periodic).cpu().numpy()
+    best = None if optimum.cost is None else float(optimum.cost[0])
+    return AdpHistory(time=result.time.numpy(), optimal_cost=best, **first)

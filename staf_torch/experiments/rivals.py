@@ -66,12 +66,10 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
     calls = integer(COMMAND_LINE, "rivals.calls", settings.calls, least=1)
     seed = seed_of(cfg)
     study, out = Study("rivals", _COLUMNS, (), _log, digits=5), RunDirectory(directory)
-    with progress.over(len(cases), "plants") as advance:
-        for case in cases:
-            for method, measured, more in compare(case, chosen, case.states(states, seed), calls, slow):
-                study.add(f"{case.name}_{label_key(method)}_", measured, more, plant=case.name, method=method)
-            study.write_table(out)
-            advance(1)
+    for case in progress.each(cases, "plants"):
+        for method, measured, more in compare(case, chosen, case.states(states, seed), calls, slow):
+            study.add(f"{case.name}_{label_key(method)}_", measured, more, plant=case.name, method=method)
+        study.write_table(out)
     return study.write(out, (lambda: draw_rivals(study.rows)) if cfg.figures else None)
 
 

@@ -140,8 +140,11 @@ def draw_tracking(history: TrackingHistory) -> Figure:
     """State against desired state, |e| of every variant, theta^ against theta, critic weights."""
     with page(WIDTH, 4.4) as figure:
         grid = list(figure.subplots(2, 2).flat)
-        for axes, panel in zip(grid, (_followed, _tracking_errors, _parameters), strict=False):
-            panel(axes, history)
+        _followed(grid[0], history)
+        named(grid[1], history.time, history.errors, log=True)
+        grid[1].set_ylabel("$|x - x_d|$")
+        legend_above(grid[1], 3)
+        _parameters(grid[2], history)
         _lines(grid[3], history.time, history.critic_weights, *_CRITIC)
         letter(grid)
         against_time(grid, history.time)
@@ -154,12 +157,6 @@ def _followed(axes: Axes, history: TrackingHistory) -> None:
         axes.plot(history.time, history.state[:, i] + desired, color=colour(i), label=f"$x_{i + 1}$")
         axes.plot(history.time, desired, ":", color="0.2", label="desired" if i else None)
     axes.set_ylabel("state")
-    legend_above(axes, 3)
-
-
-def _tracking_errors(axes: Axes, history: TrackingHistory) -> None:
-    named(axes, history.time, history.errors, log=True)
-    axes.set_ylabel("$|x - x_d|$")
     legend_above(axes, 3)
 
 

@@ -45,7 +45,7 @@ class Progress:
             total: number of steps.
             what: what is counted, for the message.
         """
-        tell = _LogLines(total, what) if self._listener is None else self._listener
+        tell = self._listener or _log_lines(total, what)
         done = 0
         hidden = None if self._listener is None else True  # None: shown where stderr is a terminal
         with tqdm(total=total, unit=f" {what}", delay=_QUIET, leave=False, disable=hidden) as bar:
@@ -64,18 +64,16 @@ SHOWN = Progress()
 """Bars and log lines: what a program that asks for nothing else gets."""
 
 
-class _LogLines:
-    """A line in the log every ten seconds, the first after two."""
+def _log_lines(total: int, what: str) -> Callable[[float], None]:
+    """Return a function that logs the share that is done, a line every ten seconds, the first after two."""
+    start = time.monotonic()
+    said = start + _QUIET - _LINE_EVERY
 
-    def __init__(self, total: int, what: str) -> None:
-        self._total, self._what = total, what
-        self._start = time.monotonic()
-        self._said = self._start + _QUIET - _LINE_EVERY
-
-    def __call__(self, share: float) -> None:
+    def tell(share: float) -> None:
+        nonlocal said
         now = time.monotonic()
-        if now - self._said < _LINE_EVERY:
-            return
-        self._said = now
-        left = (now - self._start) * (1 - share) / share
-        _log.info("%.0f %% of %d %s, %.0f s left", 100 * share, self._total, self._what, left)
+        if now - said >= _LINE_EVERY:
+            said, left = now, (now - start) * (1 - share) / share
+            _log.info("%.0f %% of %d %s, %.0f s left", 100 * share, total, what, left)
+
+    return tell
