@@ -84,7 +84,7 @@ def of_a_tracked_path() -> Drawn:
     figure = closed_loop.draw_tracking(closed_loop.TrackingHistory(T, *parts))
     error, desired = parts[0][:, :2], parts[0][:, 2:]
     shown = [(T, part) for part in (error + desired, desired, *errors.values(), parts[2], parts[4])]
-    shown += [([0, 1], np.array([parts[3], parts[3]]))]
+    shown += [(T, np.tile(parts[3], (9, 1)))]
     names = ["$x_1$", "$x_2$", "desired", *errors, r"$\hat\theta$, one colour an entry", r"$\theta$"]
     names += [rf"$\hat W_{{c,{i + 1}}}$" for i in range(3)]
     panels = ["state", "$|x - x_d|$", "drift parameters", r"critic $\hat W_c$"]
@@ -101,7 +101,7 @@ def of_a_box() -> Drawn:
     shown += [(T, values) for values in (*margins.values(), *costs.values(), wave(9, 3))]
     shown += [([-1, -1], np.array([0, 1])), ([0, 1], np.array([4, 4]))]  # the walls that there are
     panels = ["$x_2$", "distance to the nearest wall", "barrier coordinates", "cost of $s$ so far"]
-    return Drawn(figure, shown, panels, ["a", "b", *(f"$s_{{{i + 1}}}$" for i in range(3)), "a", "b"])
+    return Drawn(figure, shown, panels, [*"abab", *(f"$s_{{{i + 1}}}$" for i in range(3)), *"ab"])
 
 
 def of_faults() -> Drawn:
@@ -124,7 +124,7 @@ def of_gain_sets() -> Drawn:
         for shape in ((9, 3), (9,), (4,), (5,))
     )
     sets = closed_loop.GainSets(T, theta["integral"], wave(3), error, parameter, followed)
-    shown = [(T, theta["integral"]), ([0, 1], np.array([wave(3), wave(3)]))]
+    shown = [(T, theta["integral"]), (T, np.tile(wave(3), (9, 1)))]
     shown += [(T, values) for values in followed.values()]
     for values in (*error.values(), *parameter.values()):  # sorted, as a share of the sets
         shown.append((np.sort(values), np.arange(1, len(values) + 1) / len(values)))
