@@ -327,6 +327,7 @@ BAD: dict[str, tuple[str, tuple[str, ...]]] = {
     "figures is a word": ("figures=maybe", ("figures", "maybe")),
     "negative radius": ("centers.radius=-0.1", ("must be positive; got -0.1.",)),
     "run directory under a file": ("hydra.run.dir=blocked/run", ("cannot write", "blocked")),
+    "sweep directory under a file": ("-m seed=0,1 hydra.sweep.dir=blocked/sweep", ("cannot write blocked",)),
 }
 
 

@@ -174,11 +174,6 @@ def test_tolerances_are_those_of_the_proof(states: Tensor, epsilon: float) -> No
         torch.testing.assert_close(functions.evaluate(z), (values, weight))
 
 
-def test_a_target_of_no_size_divides_nothing() -> None:
-    zero = problem(lambda y: 0 * y[..., 0])
-    assert bool(torch.isfinite(zero.factors()[1].tolerance).all())
-
-
 def test_the_last_degree_that_is_allowed_is_tried() -> None:
     bound = theory.exponential_bound(PAPER, STATES, 0.1, 1e-2)
     assert (bound.N, bound.S) == (2, 2)

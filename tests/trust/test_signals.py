@@ -255,11 +255,3 @@ def test_a_disk_that_takes_no_file_fails_what_it_hits_and_resume_ends_the_sweep(
     line = ["-m", "sweep.resume=sweep", "--trust"]
     assert in_a_child(lambda: one(str(tmp_path), line), tmp_path)[0] == 0
     assert [run.status for run in collect(tmp_path / "sweep").rows] == ["completed"] * 3
-
-
-def test_a_place_that_cannot_be_written_is_said_at_once(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    line = [*SWEEP[:5], "hydra.sweep.dir=file/sweep"]
-    code, _, err = in_a_child(lambda: one(str(tmp_path), line), tmp_path)
-    assert code == 1
-    assert err.startswith("staf: cannot write file")
