@@ -78,7 +78,7 @@ def test_two_steps_within_the_duration_are_needed(steps: str, tmp_path: Path) ->
 def test_there_is_an_option_for_every_law_and_for_every_predictor() -> None:
     made = [instantiate(OmegaConf.load(path)) for path in options("optimizer").values()]
     assert {type(law) for law in made} == {type(law) for law in LAWS.values()}
-    kinds = {name: OmegaConf.load(path)._target_ for name, path in options("predictor").items()}
+    kinds = {name: OmegaConf.load(path)["_target_"] for name, path in options("predictor").items()}
     assert kinds.pop("none") is None
     assert {name: type(chase_problem(settings(f"predictor={name}")).predictor) for name in kinds} == {
         "secant": predictors.Secant,
