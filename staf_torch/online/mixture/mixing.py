@@ -99,14 +99,17 @@ def judge(r: Rules, s: dict[str, Tensor], value: Tensor, told: Tensor, t: float)
         told: (K,) bool.
         t: samples learned so far.
     """
+
+    def put(name: str, new: Tensor) -> None:
+        s[name].copy_(torch.where(told.view(-1, *[1] * (new.dim() - 1)), new, s[name]))
+
     error, blended = value - s["mean"], value - s["blend"][:, 0]
     _learn_correction(r, s, blended, told)
     _learn_map(r, s, value, told)
-    z2 = error.square() / (s["variance"] / s["calibration"]).clamp(min=1e-300)
-    before, since = s["calibration"].clone(), t - r.uncalibrated
+    old, since = s["calibration"], t - r.uncalibrated
+    z2 = error.square() / (s["variance"] / old).clamp(min=1e-300)
     rate = max(r.error_rate, 1 / (since + 5)) if since > 0 else 0.0
-    found = before + rate * (torch.minimum(z2, SURPRISE * before) - before)
-    s["calibration"].copy_(torch.where(told, found.clamp(1e-6, 1e2), before))
+    put("calibration", (old + rate * (torch.minimum(z2, SURPRISE * old) - old)).clamp(1e-6, 1e2))
     of_blends = (value[:, None] - s["blend"]).square()
     scores = _student(r, of_blends.sqrt(), s["own"].clamp(min=_LEAST)[:, None])
     corrected = _reweighed(r.correction_share, r.correction_discount * s["corrected"] + scores)
@@ -118,30 +121,23 @@ def judge(r: Rules, s: dict[str, Tensor], value: Tensor, told: Tensor, t: float)
         ("own", error.square(), r.own_rate, r.largest),
         ("best", of_blends.amin(-1), r.best_rate, r.largest),
     ):
-        old = s[name].clone()
-        change = max(rate, 1 / (t + 1)) * (torch.minimum(found, most * old) - old)
-        s[name].copy_(torch.where(told, old + change, old))
+        old = s[name]
+        put(name, old + max(rate, 1 / (t + 1)) * (torch.minimum(found, most * old) - old))
     away, v = value[:, None] - s["means"], s["variances"]
     score = _scores(r, away, v * s["excess"], s["error"][:, None])
     over = _scores(r, value[:, None] - s["mixed"], s["mixed_variance"], s["error"][:, None])
-    usual, rate = s["excess"].clone(), max(r.members_rate, 1 / (t + 3))
-    ratio = away.square() / v.clamp(min=_LEAST)
-    excess = (usual + rate * (torch.minimum(ratio, SURPRISE * usual) - usual)).clamp(r.least, 1e8)
-    logs, before = v.clamp(min=_LEAST).log(), s["usual"].clone()
-    usual_log = before + max(r.members_rate, 1 / (t + 1)) * (logs - before)
-    size, of = s["quadratic_error"].clone(), slice(LOCAL + CARRIED, LOCAL + CARRIED + QUADRATIC)
+    old, rate = s["excess"], max(r.members_rate, 1 / (t + 3))
+    ratio, logs = away.square() / v.clamp(min=_LEAST), v.clamp(min=_LEAST).log()
+    put("excess", (old + rate * (torch.minimum(ratio, SURPRISE * old) - old)).clamp(r.least, 1e8))
+    put("usual", s["usual"] + max(r.members_rate, 1 / (t + 1)) * (logs - s["usual"]))
+    of = slice(LOCAL + CARRIED, LOCAL + CARRIED + QUADRATIC)
     factor = 1 + max(r.pace, 1 / (t + 2)) * (ratio[:, of].clamp(max=SURPRISE) - 1)
+    put("quadratic_error", (s["quadratic_error"] * factor).clamp(min=1e-26))
     discounts = torch.tensor(r.discounts, dtype=torch.float64)[:, None]
-    weights = _reweighed(r.share, discounts * s["weights"] + score[:, None])
-    clocks = _reweighed(r.share, r.discount * s["clock_weights"] + over)
-    mark = told[:, None]
-    s["quadratic_error"].copy_(torch.where(mark, (size * factor).clamp(min=1e-26), size))
-    s["usual"].copy_(torch.where(mark, usual_log, before))
-    s["excess"].copy_(torch.where(mark, excess, usual))
-    s["weights"].copy_(torch.where(mark[..., None], weights, s["weights"]))
-    s["clock_weights"].copy_(torch.where(mark, clocks, s["clock_weights"]))
-    s["corrected"].copy_(torch.where(mark, corrected, s["corrected"]))
-    s["squares"].copy_(torch.where(mark, squares, s["squares"]))
+    put("weights", _reweighed(r.share, discounts * s["weights"] + score[:, None]))
+    put("clock_weights", _reweighed(r.share, r.discount * s["clock_weights"] + over))
+    put("corrected", corrected)
+    put("squares", squares)
 
 
 def _learn_correction(r: Rules, s: dict[str, Tensor], blended: Tensor, told: Tensor) -> None:
