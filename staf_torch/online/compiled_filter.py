@@ -77,14 +77,12 @@ class CompiledFilter:
 
     def __init__(self, definition: LocalFilter, state: StreamState, call: Callable[..., None]) -> None:
         pointers, self._held = FunctionPointers.of(definition.functions)
-        self._held += [state.blocks, state.counts, definition.ratio, definition.forgetting]
+        ratio, forgetting = definition.ratio.contiguous(), definition.forgetting.contiguous()
+        self._held += [state.blocks, state.counts, ratio, forgetting]
         streams = state.streams
         self._call = FilterCall(streams=streams, stride=streams, functions=pointers)
         self._call.table, self._call.counts = state.blocks.data_ptr(), state.counts.data_ptr()
-        self._call.ratio, self._call.forgetting = (
-            definition.ratio.data_ptr(),
-            definition.forgetting.data_ptr(),
-        )
+        self._call.ratio, self._call.forgetting = ratio.data_ptr(), forgetting.data_ptr()
         self._call.slack2, self._call.robust = definition.slack**2, definition.robust
         numbers = torch.finfo(state.dtype)
         self._call.base, self._call.tiny, self._call.most = definition.base, numbers.eps**0.5, numbers.max

@@ -131,7 +131,7 @@ class _NewSample(NamedTuple):
     most: float  # the largest number of the table
 
 
-@dataclasses.dataclass(eq=False)
+@dataclasses.dataclass(frozen=True, eq=False)
 class LocalFilter:
     """y_k = V_k(x_k) + e_k, e ~ N(0, rho), with V a Gaussian process of unit amplitude around the state.
 
@@ -161,12 +161,6 @@ class LocalFilter:
     slack: float
     robust: float = math.inf
     base: float = 1.0
-
-    def __post_init__(self) -> None:
-        self.ratio, self.forgetting = (
-            self.ratio.contiguous(),
-            self.forgetting.contiguous(),
-        )  # for compiled code
 
     def with_law(self, ratio: Tensor, forgetting: Tensor) -> LocalFilter:
         """The filter for other streams, with these rho and lambda (S,)."""
