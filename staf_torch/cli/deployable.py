@@ -47,7 +47,7 @@ class Deployable:
     points: Tensor  # (P, n) of the region, float64
     input: Port
     outputs: tuple[Port, ...]
-    written_by: str | None  # the version that made the run, where it says
+    written_by: str | None = None  # the version that made the run, where it says
 
 
 def deployable(run: Path, row: int = 0, *, trust: bool = False) -> Deployable:
@@ -80,7 +80,7 @@ class Learner:
     uniform: Tensor  # (K, draws, n) random numbers of [-1, 1]
     inputs: tuple[Port, ...]
     outputs: tuple[Port, ...]
-    written_by: str | None
+    written_by: str | None = None
 
     def copied(self, dtype: torch.dtype) -> Controller:
         """Return the controller in a dtype."""
@@ -215,7 +215,6 @@ def _approximation(cfg: DictConfig, history: dict[str, Tensor], precise: bool) -
             Port("value", None, "that of V", "V^; NaN far outside the region, where it has no digits left"),
             Port("gradient", len(x), "that of V per state", "grad V^"),
         ),
-        None,
     )
 
 
@@ -238,7 +237,6 @@ def _controller(cfg: DictConfig, history: dict[str, Tensor], precise: bool) -> D
         points,
         Port("state", len(low), unit.state, f"visited: {box}"),
         (Port("control", history["control"].shape[-1], unit.input, f"to be held for {problem.dt:g} s"),),
-        None,
     )
 
 
@@ -279,5 +277,4 @@ def _learner(cfg: DictConfig, history: dict[str, Tensor], precise: bool, row: in
         uniform,
         tuple(inputs),
         (Port("u", found.control.shape[-1], unit.input, f"to be held for {problem.dt:g} s"),),
-        None,
     )

@@ -15,7 +15,7 @@ from ..engine import ChaseResult, chase_pieces, chunk_length
 from ..metrics.ball_error import StateErrorPass
 from ..metrics.chase import ChaseMetrics, Member
 from ..results.files import grouped
-from ..settings.chase import ChaseProblem
+from ..settings.chase import ChaseProblem, warnings_to
 from ..systems import trajectory
 
 Sink = Callable[[Mapping[str, np.ndarray]], None]
@@ -174,10 +174,8 @@ class _BatchMember:
             self.sink({name: getattr(result, name)[rows].cpu().numpy() for name in HISTORY})
         self._diverged_at[place : place + rows.stop - rows.start] = result.diverged_at[rows].cpu()
         if not alone and not self._warnings:
-            with warnings.catch_warnings(record=True) as given:
-                warnings.simplefilter("always")
+            with warnings_to(self._warnings):
                 self.problem.basis.check_reach(result.state[rows])
-            self._warnings += [str(warning.message) for warning in given]
 
     def outcome(self, metrics: dict[str, float | None]) -> Outcome:
         drawn = {}

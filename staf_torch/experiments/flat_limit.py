@@ -6,6 +6,7 @@ The truth in high precision needs nothing but the standard library.
 from __future__ import annotations
 
 import copy
+import functools
 import itertools
 import logging
 import math
@@ -37,7 +38,6 @@ from .study import report
 _log = logging.getLogger(__name__)
 _POINTS = 9  # of the ball at which the approximants are compared
 
-JITTER = 1e-12
 Method = Callable[[StaFBasis, Target, Tensor, Tensor], Tensor]
 """Basis, V, x (n,), offsets z (P, n) to V^(x + z) (P,): not finite where the method fails."""
 
@@ -54,11 +54,6 @@ def cholesky(basis: StaFBasis, target: Target, x: Tensor, z: Tensor, jitter: flo
     return torch.where(info == 0, value, torch.nan)
 
 
-def jittered(basis: StaFBasis, target: Target, x: Tensor, z: Tensor) -> Tensor:
-    """The usual remedy: the diagonal of K0 raised by 1e-12."""
-    return cholesky(basis, target, x, z, JITTER)
-
-
 def pivoted(basis: StaFBasis, target: Target, x: Tensor, z: Tensor) -> Tensor:
     """The library's Newton basis, cut off at the numerical rank of K0."""
     space = newton_space(basis.kernel, x, basis.centers.offsets(x))
@@ -73,7 +68,7 @@ def graded(basis: StaFBasis, target: Target, x: Tensor, z: Tensor) -> Tensor:
 
 METHODS: dict[str, tuple[str, Method]] = {
     "cholesky": ("Cholesky", cholesky),
-    "jitter": ("Cholesky, jitter 1e-12", jittered),
+    "jitter": ("Cholesky, jitter 1e-12", functools.partial(cholesky, jitter=1e-12)),  # the usual remedy
     "pivoted": ("pivoted Cholesky", pivoted),
     "graded": ("graded basis", graded),
 }

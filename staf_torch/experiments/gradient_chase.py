@@ -20,7 +20,7 @@ from ..metrics.ball_error import StateErrorPass
 from ..numerics.checks import COMMAND_LINE, flag
 from ..results.progress import SHOWN, Progress
 from ..results.run_directory import HistoryWriter, RunDirectory
-from ..settings.chase import ChaseProblem, Parts, chase_problem
+from ..settings.chase import ChaseProblem, Parts, chase_problem, warnings_to
 from ..settings.plain import PlainSettings, to_read
 from ..tables.columns import significant
 from .chase_batch import Outcome, simulate
@@ -122,7 +122,7 @@ class GradientChase(BatchedExperiment[ChaseSolution]):
             problems, drawn = [member.problem for member in ready], [member.figures for member in ready]
             sinks = [None if member.memory is None else member.memory.add for member in ready]
             times = sum(problem.steps + 1 for problem in problems)
-            with _recorded(common), progress.over(times, "times") as advance:
+            with warnings_to(common), progress.over(times, "times") as advance:
                 left = iter(simulate(problems, sinks, drawn, advance))
         return [each.solved(next(left), common) if isinstance(each, _Ready) else each for each in prepared]
 
@@ -180,21 +180,13 @@ class _Ready:
 def _prepared(cfg: DictConfig | PlainSettings, parts: Parts) -> _Ready | Exception:
     said: list[str] = []
     try:
-        with _recorded(said):
+        with warnings_to(said):
             problem = chase_problem(cfg, parts)
             figures, history = _wanted(cfg, problem)
     except Exception as error:  # of this member alone
         return error
     memory = _Memory(len(problem.initial_states), problem.steps + 1) if history else None
     return _Ready(problem, figures, memory, said)
-
-
-@contextlib.contextmanager
-def _recorded(messages: list[str]) -> Iterator[None]:
-    """Warnings go to the list."""
-    with warnings.catch_warnings(record=True, action="always") as given:
-        yield
-    messages += [str(warning.message) for warning in given]
 
 
 class _Memory:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import importlib
 import json
 import math
 import re
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -82,6 +83,14 @@ def load(path: str, arguments: dict[str, Any] | None = None, *, inner_steps: int
     return named
 
 
+@contextlib.contextmanager
+def warnings_to(messages: list[str]) -> Iterator[None]:
+    """Append the warnings that are given meanwhile to a list, and show none."""
+    with warnings.catch_warnings(record=True, action="always") as given:
+        yield
+    messages += [str(warning.message) for warning in given]
+
+
 class Parts:
     """Cache: equal settings share one constructed object.
 
@@ -95,10 +104,9 @@ class Parts:
         """``make(*arguments)``; arguments are settings, or objects that come from here."""
         key = (make, *map(_key, arguments))
         if key not in self._made:
-            with warnings.catch_warnings(record=True) as given:
-                warnings.simplefilter("always")
-                made = make(*arguments)
-            self._made[key] = made, [str(warning.message) for warning in given]
+            said: list[str] = []
+            with warnings_to(said):
+                self._made[key] = make(*arguments), said
         made, said = self._made[key]
         for message in said:
             warnings.warn(message, stacklevel=2)
