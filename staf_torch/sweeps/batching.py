@@ -45,7 +45,7 @@ class Computed:
 
     @property
     def metrics(self) -> Metrics:
-        """What `metrics.json` will hold."""
+        """Contents of `metrics.json`."""
         return self.solution.metrics
 
 
@@ -215,7 +215,7 @@ def sentence(error: BaseException) -> str:
 
 
 def reason(error: BaseException) -> str:
-    """One line for the records: the sentence, and the type of an error that is a defect."""
+    """Return one line for the records: the sentence, and the type of an error that is a defect."""
     if isinstance(error, KeyboardInterrupt):
         return "interrupted"
     said = " ".join(sentence(error).split())

@@ -71,7 +71,7 @@ class TensorBoardTracker(Tracker):
             )
 
     def record(self, run: RecordedRun) -> None:
-        """One event file; a metric without a number is left out."""
+        """Write an event file; a metric without a number is left out."""
         from torch.utils.tensorboard import SummaryWriter
         from torch.utils.tensorboard.summary import hparams
 

@@ -56,7 +56,7 @@ def executor(name: object, workers: int | None, arguments: Mapping[str, Any], di
 
 
 class Submitit(Executor):
-    """One job of SLURM a tensor batch, or one process of this machine (``cluster=local``).
+    """Run a tensor batch as a job of SLURM, or as a process of this machine (``cluster=local``).
 
     Args:
         workers: jobs at once; None: one a core on this machine, any number on a cluster.
@@ -183,7 +183,7 @@ def _last_of_trace(said: str) -> str:
 
 
 class Ray(Executor):
-    """One task of Ray a tensor batch and one core a task, on this machine or on a Ray cluster.
+    """Run a tensor batch as a task of Ray with one core, on this machine or on a Ray cluster.
 
     Args:
         workers: tasks at once; None for as many as Ray has cores.

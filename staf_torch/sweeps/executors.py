@@ -1,4 +1,4 @@
-"""Where the tensor batches of a sweep are computed: in this process or in others; `clusters` has the rest."""
+"""Executors of a sweep's tensor batches: in this process or in others; `clusters` has the rest."""
 
 from __future__ import annotations
 
@@ -161,14 +161,14 @@ def _failed(batch: Batch, why: str) -> Done:
 
 
 def _words(error: Exception) -> str:
-    """One line of at most a few hundred characters."""
+    """Shorten to one line of at most a few hundred characters."""
     said = " ".join(str(error).split())
     said = said if isinstance(error, LostError | GivenUpError) else f"{type(error).__name__}: {said}"
     return said if len(said) <= _MOST else f"{said[: _MOST - 3]}..."
 
 
 class Inline(Executor):
-    """One tensor batch after the other, in this process, each with all the threads of torch."""
+    """Compute the tensor batches one after the other in this process, each with all the threads of torch."""
 
     @property
     def workers(self) -> int:

@@ -1,4 +1,4 @@
-"""One job, from its settings to the end of its run directory: what Hydra calls, whatever the launcher."""
+"""A job, from its settings to the end of its run directory: the function that Hydra calls."""
 
 from __future__ import annotations
 

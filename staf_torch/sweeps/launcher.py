@@ -112,7 +112,7 @@ def job_name(num: int, overrides: Sequence[str]) -> str:
 
 
 class Launch:
-    """One call of Hydra's: a list of jobs to run.
+    """A call by Hydra: a list of jobs to run.
 
     Args:
         launcher: the plugin, with its settings and what Hydra set up.

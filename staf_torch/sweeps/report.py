@@ -1,4 +1,4 @@
-"""What a sweep ends with: its table, its figures and one page with both, in its directory."""
+"""The report of a sweep: its table, its figures and one page with both, in its directory."""
 
 from __future__ import annotations
 

@@ -48,7 +48,7 @@ Write = Callable[[Sequence[Mapping[str, Any]], Sequence[str]], None]
 
 
 class Left(NamedTuple):
-    """What an earlier start of a sweep has left of its rows."""
+    """Rows that an earlier start of a sweep has left."""
 
     made: list[str]  # what made each whole row, from the first row on
     size: int = 0  # bytes of the rows' file up to the end of the last of them, without its comma

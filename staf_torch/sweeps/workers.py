@@ -109,7 +109,7 @@ class Worker:
 
     @property
     def signs(self) -> list[Any]:
-        """What becomes ready when a result is there or the process has ended."""
+        """Return the handles that become ready when a result is there or the process has ended."""
         return [self._ours, self._process.sentinel]
 
     def begin(self, *arguments: Any) -> None:
@@ -133,7 +133,7 @@ class Worker:
         return bytes(found)
 
     def alive(self) -> bool:
-        """Whether the process can take more work."""
+        """Return whether the process can take more work."""
         return self._process.is_alive()
 
     def end(self) -> None:

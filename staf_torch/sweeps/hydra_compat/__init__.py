@@ -1,4 +1,4 @@
-"""What knows Hydra 1.3 and 1.4 well; its inside is imported in `inside` alone."""
+"""The interface to Hydra 1.3 and 1.4; Hydra's inside is imported in `inside` alone."""
 
 from hydra.core.utils import JobReturn as JobReturn
 from hydra.core.utils import JobStatus as JobStatus

@@ -50,7 +50,7 @@ def as_typed(lines: ListConfig) -> list[str]:
 
 
 class _Line(NamedTuple):
-    """One override."""
+    """A parsed override."""
 
     override: Override
     key: str

@@ -1,4 +1,4 @@
-"""One job of a sweep, as Hydra's launchers run it."""
+"""A job of a sweep, as Hydra's launchers run it."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ class SweepJobs:
 
     @property
     def at_once(self) -> bool:
-        """Whether the sweeper hands over all jobs at once."""
+        """Return whether the sweeper hands over all jobs at once."""
         sweeper = self.master.hydra.sweeper
         return self.choices.get("hydra/sweeper") == "basic" and sweeper.get("max_batch_size") is None
 
