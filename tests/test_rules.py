@@ -371,7 +371,8 @@ ABSENT = {
     *("RBFGridBasis.width", "Supervised.momentum", "HeavyBall.momentum", "Nesterov.momentum"),
     *("HeavyBall.step", "RolloutPolicy.period", "DirectShooting.horizon", "StaF.out_features"),
     *("IntegralWindows.first", "LeastSquares.alarm", "HistoryStack.outputs"),
-    *("PlantEnv.bound", "DirectShooting.iterations", "DirectShooting.intervals"),
+    *("PlantEnv.bound", "PlantEnv.spread", "PlantVectorEnv.spread"),
+    *("DirectShooting.iterations", "DirectShooting.intervals"),
     *("simulate.seed", "trajectory.chunk", "near_optimal.dt", "near_optimal.horizon", "report.spread"),
     *("SafetyFilter.weight", "BoundedInputCost.bound", "PathIntegral.noise"),
 }
