@@ -16,7 +16,6 @@ from ..settings import config_directory as config_directory
 from ..sweeps import callbacks
 from ..sweeps.batching import USER_ERRORS, sentence
 from ..sweeps.hydra_compat import (
-    Application,
     application,
     find_launcher,
     full_errors,
@@ -53,7 +52,16 @@ def main() -> None:
                 _showing()
                 return
             with application(argv) as app:
-                _run(app, wants_trace)
+                try:
+                    if app.multirun or app.is_sweep():
+                        app.sweep(execute)
+                    else:
+                        app.run(execute)
+                except (Exception, KeyboardInterrupt) as error:
+                    if app.begun is None:
+                        raise
+                    callbacks.close(app.begun)
+                    _end(error, wants_trace, app.begun)
         except Refused as refused:
             if wants_trace and refused.__cause__ is not None:
                 raise refused.__cause__ from None
@@ -62,20 +70,6 @@ def main() -> None:
             _end(error, wants_trace)
         finally:
             sys.argv = typed
-
-
-def _run(app: Application, wants_trace: bool) -> None:
-    """Run the job or the sweep of a command line, and end a sweep that breaks."""
-    try:
-        if app.multirun or app.is_sweep():
-            app.sweep(execute)
-        else:
-            app.run(execute)
-    except (Exception, KeyboardInterrupt) as error:
-        if app.begun is None:
-            raise
-        callbacks.close(app.begun)
-        _end(error, wants_trace, app.begun)
 
 
 def _end(error: BaseException, wants_trace: bool, sweep: DictConfig | None = None) -> NoReturn:

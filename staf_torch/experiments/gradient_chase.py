@@ -7,7 +7,7 @@ import dataclasses
 import logging
 import math
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -16,10 +16,9 @@ from omegaconf import DictConfig
 
 from ..figures.chase import ChaseHistory, draw_chase
 from ..figures.style import images
-from ..metrics.ball_error import StateErrorPass
 from ..numerics.checks import COMMAND_LINE, flag
 from ..results.progress import SHOWN, Progress
-from ..results.run_directory import HistoryWriter, RunDirectory
+from ..results.run_directory import RunDirectory
 from ..settings.chase import ChaseProblem, Parts, chase_problem, warnings_to
 from ..settings.plain import PlainSettings, to_read
 from ..tables.columns import significant
@@ -71,19 +70,6 @@ class ChaseSolution:
         return {**self.outcome.metrics, "products_per_second": self.title.work}
 
 
-def solve(
-    problem: ChaseProblem,
-    writer: HistoryWriter | None = None,
-    advance: Callable[[int], None] | None = None,
-    *,
-    drawn: bool = True,
-    errors: StateErrorPass | None = None,
-) -> Outcome:
-    """Run the simulation itself, in pieces of time; ``errors`` as in `simulate`."""
-    (outcome,) = simulate([problem], [None if writer is None else writer.add], [drawn], advance, errors)
-    return outcome
-
-
 class GradientChase(BatchedExperiment[ChaseSolution]):
     """The chase of the ideal weights; initial states and scalar hyperparameters share a tensor batch."""
 
@@ -106,7 +92,8 @@ class GradientChase(BatchedExperiment[ChaseSolution]):
         with contextlib.ExitStack() as stack:
             writer = stack.enter_context(out.history(title.rows, title.times)) if history else None
             advance = stack.enter_context(progress.over(title.times, "times"))
-            outcome = solve(problem, writer, advance, drawn=figures)
+            sink = None if writer is None else writer.add
+            (outcome,) = simulate([problem], [sink], [figures], advance)
             if writer is not None:
                 writer.close(time=_times(title))
         return _finish(out, ChaseSolution(title, outcome, problem.initial_states.cpu().numpy()), cfg)

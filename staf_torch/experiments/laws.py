@@ -23,7 +23,7 @@ from ..results.run_directory import RunDirectory
 from ..settings.chase import ChaseProblem, chase_problem, plain
 from ..systems import simulate
 from ..tables import Table
-from .gradient_chase import solve
+from . import chase_batch
 from .registry import Metrics, finite, log_slope
 from .study import report
 
@@ -164,10 +164,15 @@ def table(
             "iterations": case.iterations,
             "predictor": case.predicted,
             "products": case.products / problem.dt,
-            **solve(_with(problem, case), errors=errors).metrics,
+            **_metrics(_with(problem, case), errors),
         }
         for case in progress.each(compared, "laws")
     ]
+
+
+def _metrics(problem: ChaseProblem, errors: StateErrorPass) -> Metrics:
+    (outcome,) = chase_batch.simulate([problem], [None], [False], errors=errors)
+    return outcome.metrics
 
 
 def sweep(
@@ -182,7 +187,7 @@ def sweep(
 
     def excess(case: LawCase, dt: float) -> float | None:
         refined = dataclasses.replace(_with(problem, case), dt=dt, steps=math.floor(duration / dt + 1e-9))
-        return solve(refined, errors=errors).metrics["ultimate_excess_before"]
+        return _metrics(refined, errors)["ultimate_excess_before"]
 
     found = []
     for case in progress.each(drawn, "laws over all dt"):
