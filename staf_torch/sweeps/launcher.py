@@ -5,10 +5,11 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import gc
 import logging
 import sys
 import time
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +38,21 @@ _NOT_BATCHED = (
 )
 _TOLD = 20  # failures that are told as they happen
 _BAR_EVERY, _LINE_EVERY = 0.2, 10.0  # s
+
+
+@contextlib.contextmanager
+def _collecting_seldom() -> Iterator[None]:
+    """Search for garbage rarely: a job copies settings a dozen times, and searches are a tenth of a sweep."""
+    before, frozen = gc.get_threshold(), gc.get_freeze_count()
+    if not frozen:
+        gc.freeze()  # torch's half a million objects stay anyway
+    gc.set_threshold(20_000, 5, 5)
+    try:
+        yield
+    finally:
+        gc.set_threshold(*before)
+        if not frozen:
+            gc.unfreeze()
 
 
 class SweepProgress:
@@ -195,7 +211,7 @@ class Launch:
         returns = self._finished(numbered)
         progress = SweepProgress(len(numbered), len(returns))
         tasks = self._tasks(numbered, *plan, set(returns), progress)
-        with contextlib.closing(progress), contextlib.closing(tasks):
+        with contextlib.closing(progress), contextlib.closing(tasks), _collecting_seldom():
             for num, task in tasks:
                 workers.check()
                 self._still_there(len(returns), len(numbered))
