@@ -249,6 +249,10 @@ REFUSED: dict[str, tuple[Callable[[Tensor], Any], str]] = {
         lambda x: x.scatter_reduce(1, x.argsort(), x, reduce="amax"),
         "scatter_reduce",
     ),
+    "a scatter that multiplies": (
+        lambda x: x.scatter(1, x.argsort(), x, reduce="multiply"),
+        "`scatter` with reduce=",
+    ),
     "added at an index of a row": (
         lambda x: x.index_put((torch.tensor([0]), x.argmax(-1)), x[:, 0], accumulate=True),
         "`aten.index_put` at an index that the row computes",

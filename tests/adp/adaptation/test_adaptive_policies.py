@@ -211,7 +211,7 @@ def test_weights_wait_in_doubt_and_every_state_is_regulated_near_the_optimum() -
 
 
 def test_where_the_model_is_certain_v_falls_for_every_theta_within_the_deviations() -> None:
-    control = adaptive(confidence=2.0, share=1.0)
+    control = adaptive(confidence=3.0, share=1.0)
     x, critic = tensor([[1.0, -0.5]]), tensor([[0.6, 0.1, 0.9]])
     uniforms = x.new_zeros(1, control.draws, 2)
     terms = LEARNER.terms(x, critic, uniforms, MODEL.believing(TRUE))
@@ -227,7 +227,7 @@ def test_where_the_model_is_certain_v_falls_for_every_theta_within_the_deviation
         low, high = (middle, high) if certain(middle) else (low, middle)
     slope, points = LEARNER.value_gradient(x, critic, uniforms), LEARNER.points(x, uniforms)
     directions = uniform(2000, 6, seed=1)
-    errors = 2.0 * directions / directions.norm(dim=-1, keepdim=True) * (low * shape.diagonal()).sqrt()
+    errors = 3.0 * directions / directions.norm(dim=-1, keepdim=True) * (low * shape.diagonal()).sqrt()
     off = (both_rows(points, terms.control) @ errors[:, None, :, None]).squeeze(-1)  # (2000, P, 2)
     falls = -terms.rate + (slope * off).sum(-1)  # of V^, where the Bellman equation holds for theta^
     assert float(falls.max()) < 0
