@@ -206,6 +206,7 @@ class Launch:
 
     def _fill_directories(self, numbered: Mapping[int, list[str]]) -> list[JobReturn]:
         plan = self._jobs.many(list(numbered.values()))  # before anything is written
+        self._jobs.refuse_shared(numbered)
         self._directory.mkdir(parents=True, exist_ok=True)
         records.list_jobs(self._directory, numbered)
         returns = self._finished(numbered)

@@ -234,6 +234,27 @@ def test_hydra_knows_of_a_job_while_it_runs_and_what_was_typed_is_kept_as_typed(
     assert "3 of 3 jobs completed" in out, err
 
 
+@pytest.mark.parametrize("launcher", ["batched", "basic"])
+def test_a_directory_is_one_jobs(place: Path, launcher: str) -> None:
+    name, chosen = f"places_{launcher}", f"hydra/launcher={launcher}"
+    for text in ("same", "r_${centers.radius}", "${now:%Y}"):
+        subdir = f"hydra.sweep.subdir={text}"
+        directory, said = sweep(
+            place, name, *OWN, chosen, "seed=1,2", "centers.radius=0.1,0.2", subdir, code=1
+        )
+        assert f"gives two jobs one directory, runs/{name}/" in said
+        assert not directory.exists()
+    for number, text in enumerate(("r_${centers.radius}_${seed}", "${hydra.job.override_dirname}")):
+        subdir, coupled = (
+            f"hydra.sweep.subdir={text}",
+            ["+pair={r:0.1,s:1},{r:0.2,s:2}", "centers.radius=${pair.r}"],
+        )
+        directory, _ = sweep(place, f"{name}_{number}", *OWN, chosen, *coupled, "seed=${pair.s}", subdir)
+        found = {record(path.parent)["settings"]["seed"] for path in directory.glob("*/run.json")}
+        assert found == {1, 2}
+        assert number or {path.name for path in directory.glob("r_*")} == {"r_0.1_1", "r_0.2_2"}
+
+
 def test_a_defect_keeps_its_trace_and_spares_the_others(place: Path) -> None:
     directory, said = sweep(place, "defect", *OWN, "seed=range(3)", "+harm=defect", code=99)
     assert "RuntimeError: the second seed is unlucky" in said

@@ -11,6 +11,7 @@ import os
 import pickle
 import re
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple, cast
 
 from hydra.core.config_loader import ConfigLoader
@@ -28,6 +29,25 @@ from ...settings.plain import ManySettings, PlainSettings
 _MOST_LINES = 10_000  # that are kept: a million seeds are a million lines
 _MOST_COMPOSED = 1000  # configurations that are kept
 _READ_BY_HYDRA = ("hydra.searchpath", "hydra.job.", "hydra.overrides", "hydra.runtime")  # while it composes
+
+
+def directory_of(config: DictConfig) -> Path:
+    """Return the run directory of a job whose configuration has Hydra's node."""
+    return Path(str(config.hydra.sweep.dir), str(config.hydra.sweep.subdir))
+
+
+def take_directory(taken: dict[str, str], directory: Path, job: str) -> None:
+    """Note that this is the directory of a job.
+
+    Raises:
+        ValueError: if it is another job's.
+    """
+    other = taken.setdefault(os.path.abspath(directory), job)
+    if other != job:
+        raise ValueError(
+            f"`hydra.sweep.subdir` gives two jobs one directory, {directory}: {other} and {job}. "
+            "Name there all that is swept, or ${hydra.job.num}."
+        )
 
 
 def parse_override(line: str, loader: ConfigLoader | None = None) -> Override:
@@ -88,6 +108,7 @@ class Composer:
         self._composed: dict[tuple[str, ...], _Composed] = {}
         self._nodes: dict[tuple[str, ...], bytes] = {}  # the same with Hydra's own values
         self._bases: dict[tuple[tuple[str, ...], ...], _Base | None] = {}
+        self._taken: dict[str, str] = {}  # directories of the latest sweep's jobs, by other launchers
         self.latest_sweep: DictConfig | None = None
         """What `load_configuration` returned last for a sweep."""
 
@@ -109,15 +130,24 @@ class Composer:
                 config_name, list(overrides), run_mode, from_shell, validate_sweep_overrides
             )
         if run_mode == RunMode.MULTIRUN:
-            self.latest_sweep = found
+            self.latest_sweep, self._taken = found, {}
         return found
 
     def load_sweep_config(self, master_config: DictConfig, sweep_overrides: Sequence[str]) -> DictConfig:
-        """Return the configuration of a job, as the method of Hydra's loader does for other launchers."""
+        """Return the configuration of a job, as the method of Hydra's loader does for other launchers.
+
+        Raises:
+            ValueError: if another job of the sweep has its directory.
+        """
         node = master_config.hydra
         lines = [*as_typed(node.overrides.hydra), *sweep_overrides]
         config = self.load_configuration(node.job.config_name, lines, RunMode.RUN)
         OmegaConf.copy_cache(from_config=master_config, to_config=config)
+        try:
+            directory = directory_of(config)
+        except OmegaConfBaseException:  # it has the number of the job, which Hydra sets later
+            return config
+        take_directory(self._taken, directory, " ".join(sweep_overrides))
         return config
 
     def _alike(self, name: str | None, overrides: Sequence[str], mode: RunMode) -> DictConfig | None:

@@ -6,7 +6,7 @@ import contextlib
 import functools
 import logging
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -29,7 +29,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 from omegaconf._utils import OmegaConfDumper
 
 from ...settings.plain import ManySettings
-from .composing import Composer, as_typed, parse_override
+from .composing import Composer, as_typed, directory_of, parse_override, take_directory
 from .inside import HAS_WHITELIST
 
 
@@ -110,11 +110,22 @@ class SweepJobs:
 
     def directory(self, num: int, overrides: Sequence[str]) -> Path:
         """Return the run directory of job ``num``: its number, where nobody says otherwise."""
+        if self._numbered([overrides]):
+            return Path(str(self.master.hydra.sweep.dir), str(num))
+        return directory_of(self.whole(num, overrides))
+
+    def refuse_shared(self, numbered: Mapping[int, Sequence[str]]) -> None:
+        """Raise ValueError if two jobs have one directory."""
+        taken: dict[str, str] = {}
+        for num, job in () if self._numbered(numbered.values()) else numbered.items():
+            name = " ".join(without_hydra_overrides(job))
+            take_directory(taken, self.directory(num, job), f"job {num} ({name})")
+
+    def _numbered(self, jobs: Iterable[Sequence[str]]) -> bool:
+        """Return whether the directories of these jobs are their numbers."""
         sweep: Any = OmegaConf.to_container(self.master.hydra.sweep)
-        own = any(line.lstrip("+~").startswith("hydra") for line in overrides)
-        if own or sweep["subdir"] != "${hydra.job.num}":
-            return directory_of(self.whole(num, overrides))
-        return Path(str(self.master.hydra.sweep.dir), str(num))
+        own = any(line.lstrip("+~").startswith("hydra") for job in jobs for line in job)
+        return not own and sweep["subdir"] == "${hydra.job.num}"
 
     def start(self) -> None:
         """Register Hydra's resolvers and send the log to the sweep's own handlers."""
@@ -136,11 +147,6 @@ class SweepJobs:
             if not HAS_WHITELIST and not config.hydra.job.chdir:
                 return _run_job(self._context.callbacks, task, config, settings)
             return run_job(task, config, "hydra.sweep.dir", "hydra.sweep.subdir", self._context)
-
-
-def directory_of(config: DictConfig) -> Path:
-    """Return the run directory of a job whose configuration has Hydra's node."""
-    return Path(str(config.hydra.sweep.dir), str(config.hydra.sweep.subdir))
 
 
 def _run_job(
