@@ -79,6 +79,16 @@ INLINE V sign_of(V x) { return real(bits(x) & bits(splat(-REAL(0)))); }
 INLINE V abs(V x) { return real(bits(x) & ~bits(splat(-REAL(0)))); }
 INLINE V with_sign(V x, V s) { return real(bits(x) | bits(sign_of(s))); }
 
+// To float32 and back. A sum, product, quotient or root of two floats, rounded to double first, is that of float.
+INLINE V narrowed(V x) {
+#if LANES_SINGLE
+    return x;
+#else
+    typedef float Narrow __attribute__((vector_size(LANES_BYTES / 2)));
+    return __builtin_convertvector(__builtin_convertvector(x, Narrow), V);
+#endif
+}
+
 INLINE bool any(M m) {
 #if LANES_512 && LANES_SINGLE
     return __builtin_ia32_ptestmd512((VB)m, (VB)m, -1) != 0;

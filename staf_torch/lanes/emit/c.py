@@ -8,7 +8,7 @@ import re
 from collections.abc import Sequence
 from typing import ClassVar, NamedTuple
 
-from ..trace.graph import FLAG, REAL, ROW, STEP, WHOLE, WIDE, Graph
+from ..trace.graph import FLAG, NARROW, REAL, ROW, STEP, WHOLE, WIDE, Graph
 from .schedule import Schedule, Sizes
 from .statements import StatementWriter
 
@@ -34,7 +34,7 @@ class _ScalarWriter(StatementWriter):
 
     def __init__(self, graph: Graph, schedule: Schedule, layout: Sizes, names: Names) -> None:
         self.real, self._suffix = ("float", "f") if graph.single else ("double", "")
-        types = {REAL: self.real, WHOLE: self.real, WIDE: "double", FLAG: "int"}
+        types = {REAL: self.real, WHOLE: self.real, WIDE: "double", NARROW: "double", FLAG: "int"}
         super().__init__(graph, schedule, layout, types)
         self._names = {"row": names.rows, "now": names.nows, "state": names.carries}
 
@@ -50,6 +50,9 @@ class _ScalarWriter(StatementWriter):
 
     def _nobody(self, mask: int) -> str:
         return f"!({self._ref(mask, 0)})"
+
+    def _narrowed(self, text: str) -> str:
+        return f"(double)(float)({text})"
 
     def _fma(self, a: str, b: str, c: str) -> str:
         return f"{a} * {b} - {c[1:]}" if c.startswith("-") else f"{a} * {b} + {c}"

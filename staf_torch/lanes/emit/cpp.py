@@ -16,7 +16,7 @@ from typing import ClassVar, NamedTuple
 import torch
 from torch import Tensor
 
-from ..trace.graph import FLAG, NOW, REAL, ROW, STEP, WHOLE, Graph
+from ..trace.graph import FLAG, NARROW, NOW, REAL, ROW, STEP, WHOLE, Graph
 from ..trace.tracer import LARGE
 from .schedule import Schedule, Sizes, ends_with, taken_over
 from .statements import StatementWriter
@@ -76,7 +76,7 @@ class _CppWriter(StatementWriter):
     _prefix: ClassVar[dict[str, str]] = StatementWriter._prefix | {"not": "~", "cast": ""}
 
     def __init__(self, graph: Graph, schedule: Schedule, layout: Sizes, copies: int) -> None:
-        super().__init__(graph, schedule, layout, {REAL: "V", WHOLE: "V", FLAG: "M"}, copies)
+        super().__init__(graph, schedule, layout, {REAL: "V", NARROW: "V", WHOLE: "V", FLAG: "M"}, copies)
         self._in_memory = {slot for slot, size in enumerate(layout.carries) if size > LARGE}
         self._taken_over = taken_over(graph, schedule)
         self._ends = dict[int, int]()  # slots that a map makes where they were
@@ -286,12 +286,16 @@ class _CppWriter(StatementWriter):
     def _expression(self, node: int, j: int) -> str:
         """An exponential of -x as one of x: the compiler finds once what it has in common with e^x."""
         graph = self.graph
-        if graph.op[node] == "exp" and graph.op[graph.args[node][0]] == "neg":
+        of_minus = graph.op[node] == "exp" and graph.op[graph.args[node][0]] == "neg"
+        if of_minus and graph.type[node] != NARROW:
             return f"exp_of_minus({self._ref(graph.args[graph.args[node][0]][0], j)})"
         return super()._expression(node, j)
 
     def _nobody(self, mask: int) -> str:
         return f"!any({' | '.join(self._ref(mask, j) for j in range(self.copies))})"
+
+    def _narrowed(self, text: str) -> str:
+        return f"narrowed({text})"
 
     def _fma(self, a: str, b: str, c: str) -> str:
         return f"fma({a}, {b}, {c})"

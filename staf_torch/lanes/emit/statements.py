@@ -10,7 +10,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from ..trace.graph import FIXED, Graph
+from ..trace.graph import EXACT, FIXED, NARROW, Graph
 from ..trace.tracer import NotLoweredError
 from .schedule import Schedule, Sizes, evenly, leaves
 
@@ -88,11 +88,17 @@ class StatementWriter(abc.ABC):
     def _operation(self, op: str, values: Sequence[str], type: str) -> str:
         """The expression of an operation."""
         if op in self._infix:
-            return f"{values[0]} {self._infix[op]} {values[1]}"
-        return f"{self._prefix[op]}{values[0]}" if op in self._prefix else self._call(op, values, type)
+            text = f"{values[0]} {self._infix[op]} {values[1]}"
+        else:
+            text = f"{self._prefix[op]}{values[0]}" if op in self._prefix else self._call(op, values, type)
+        return self._narrowed(text) if type == NARROW and op not in EXACT else text
 
     def _call(self, op: str, values: Sequence[str], type: str) -> str:
         return f"{op}({', '.join(values)})"
+
+    @abc.abstractmethod
+    def _narrowed(self, text: str) -> str:
+        """The expression of a number rounded to float32, in a program of float64."""
 
     @abc.abstractmethod
     def _fma(self, a: str, b: str, c: str) -> str:
@@ -294,6 +300,7 @@ class StatementWriter(abc.ABC):
         """Sums of products, some rows of them in registers at once."""
         outs, count, *places = self.graph.aux[node]
         kind = self._type(node)
+        rounded = self._narrowed if self.graph.type[node] == NARROW else str
         self._declare(node)
         indices = [evenly(place, [outs, count]) for place in places]
         widths = range(4, 1 + (6 if self.copies > 1 else 8))
@@ -306,13 +313,13 @@ class StatementWriter(abc.ABC):
                 for r in range(rows):
                     for j in range(self.copies):
                         first = self._product(node, indices, places, r, "0", j)[2]
-                        self._line(f"{kind} r{r}{self._copy(j)} = {first};")
+                        self._line(f"{kind} r{r}{self._copy(j)} = {rounded(first)};")
                 with self._braces(f"for (int q = 1; q < {count}; ++q)"):
                     for r in range(rows):
                         for j in range(self.copies):
                             a, b, _ = self._product(node, indices, places, r, "q", j)
                             name = f"r{r}{self._copy(j)}"
-                            self._line(f"{name} = {self._fma(a, b, name)};")
+                            self._line(f"{name} = {rounded(self._fma(a, b, name))};")
                 for r in range(rows):
                     for j in range(self.copies):
                         self._line(f"a{node}[(p + {r}) * {self.copies} + {j}] = r{r}{self._copy(j)};")

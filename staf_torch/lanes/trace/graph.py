@@ -18,8 +18,13 @@ import numpy as np
 Ids = np.ndarray[Any, np.dtype[np.int64]]
 """Numbers of a tensor: the nodes of its entries."""
 
-REAL, WIDE, FLAG, WHOLE = "real", "wide", "flag", "whole"
-"""Types of a node: the program's float, float64 within a program of float32, bool, integer."""
+REAL, WIDE, NARROW, FLAG, WHOLE = "real", "wide", "narrow", "flag", "whole"
+"""Types of a node: the program's float, float64 within a program of float32, float32 within one of float64
+(held in double; an operation is rounded to float32 after it), bool, integer."""
+
+_EXACT = "neg abs min max where floor ceil trunc round copysign fmod copy"
+EXACT = frozenset(_EXACT.split())
+"""Operations on numbers of float32 whose result is one: there is nothing to round."""
 
 FIXED = ("const", "param")
 """Operations of nodes that are the same for all rows and times."""
@@ -101,7 +106,7 @@ class Graph:
         if type == FLAG:
             return self.add("const", (), type, bool(value))
         number = float(value)
-        if type == REAL and self.single:
+        if type == NARROW or (type == REAL and self.single):
             with np.errstate(all="ignore"):
                 number = float(np.float32(number))
         # 0 and -0 are equal and NaN is not equal to itself: the sign and the text tell them apart.
@@ -178,10 +183,13 @@ class Graph:
             return self.apply("ne", node, self.constant(0.0, old))
         if type == WHOLE and old != WHOLE:
             node = self.apply("trunc", node)
+        if type == NARROW and self.op[node] == "cast" and self.type[self.args[node][0]] == NARROW:
+            return self.args[node][0]  # it was float32 before
         return self.add("cast", (node,), type)
 
     def _fold(self, op: str, type: str, values: Sequence[Any]) -> Any:
-        kind: Any = bool if type == FLAG else np.float32 if type == REAL and self.single else np.float64
+        narrow = type == NARROW or (type == REAL and self.single)
+        kind: Any = bool if type == FLAG else np.float32 if narrow else np.float64
         with np.errstate(all="ignore"):
             return _FOLD[op](*(kind(v) for v in values)).item()
 

@@ -10,7 +10,7 @@ import numpy as np
 from torch import Tensor
 
 from .entrywise import RULES, numbers, rule, zeros
-from .graph import FLAG, WHOLE, Ids
+from .graph import FLAG, NARROW, REAL, WHOLE, Ids
 from .tracer import LARGE, NotLoweredError, Tracer
 
 _FEW = 8  # numbers that need no loop
@@ -108,11 +108,12 @@ _extreme("min", "min")
 
 @rule("cumsum")
 def _cumsum(t: Tracer, out: Tensor, a: Tensor, dim: int, **_: Any) -> Ids:
-    moved = np.moveaxis(t.nodes(a, t.kind(out.dtype)), dim, 0)
+    kind = t.kind(out.dtype)
+    moved = np.moveaxis(t.nodes(a, REAL if kind == NARROW else kind), dim, 0)  # torch sums floats in double
     parts = [moved[0]]
     for part in moved[1:]:
         parts.append(t.map("add", parts[-1], part))
-    return np.moveaxis(np.stack(parts), 0, dim)
+    return t.cast(np.moveaxis(np.stack(parts), 0, dim), kind)
 
 
 @rule("linalg_vector_norm")

@@ -24,7 +24,7 @@ from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_mod
 
 from .captured_tensors import Captured
 from .captured_tensors import tensors as _tensors
-from .graph import FLAG, REAL, ROW, WHOLE, WIDE, Graph, Ids
+from .graph import FLAG, NARROW, REAL, ROW, WHOLE, WIDE, Graph, Ids
 
 _OWN = (str(Path(__file__).parent.parent), str(Path(torch.__file__).parent))
 LARGE = 64  # entries above which an operation on a tensor stays a loop over an array in memory
@@ -80,15 +80,19 @@ class Tracer(TorchDispatchMode):
         """
         if dtype == torch.bool:
             return FLAG
-        if not dtype.is_floating_point and not dtype.is_complex:
-            return WHOLE
-        if dtype == (torch.float32 if self.graph.single else torch.float64):
-            return REAL
-        if dtype == torch.float32 and self._widened:  # a float32 program whose numbers are carried in double
-            return REAL
         if dtype == torch.float64:
-            return WIDE
-        raise NotLoweredError(f"{dtype} has no lanes here")
+            return WIDE if self.graph.single else REAL
+        if dtype == torch.float32:  # widened: a float32 program whose numbers are carried in double
+            return REAL if self.graph.single or self._widened else NARROW
+        if dtype.is_complex:
+            raise NotLoweredError(
+                f"{dtype} has no lanes here: write the real and the imaginary part as two real tensors"
+            )
+        if dtype.is_floating_point:
+            raise NotLoweredError(
+                f"{dtype} has no lanes here: compute in float32 or float64, `.float()` or `.to(x.dtype)`"
+            )
+        return WHOLE
 
     def attach(self, tensor: Tensor, nodes: Ids) -> Tensor:
         """Let the entries of a new tensor be these nodes."""
@@ -116,14 +120,15 @@ class Tracer(TorchDispatchMode):
         """The nodes of a tensor's or number's entries, as one type."""
         if isinstance(value, Tensor):
             traced = self.traced(value)
-            # A constant of float32, `torch.eye(3)` say, is a number of a float64 program as well.
-            own = REAL if value.dtype == torch.float32 and not traced else self.kind(value.dtype)
+            half = value.dtype in (torch.float16, torch.bfloat16) and not traced  # numbers of float32 too
+            own = self.kind(torch.float32 if half else value.dtype)
             if traced:
                 found = self._view(self._storages[value.untyped_storage().data_ptr()][1], value)
             elif self.stated(value):
                 found = self._constants(value, own)
             else:
-                direct = kind is not None and (own == FLAG or {own, kind} <= {REAL, WIDE})
+                # A number of float32 is one of float64: the table needs it once.
+                direct = kind is not None and (own in (FLAG, NARROW) or {own, kind} <= {REAL, WIDE})
                 own = kind if direct and kind is not None else own
                 found = self._parameters(value, own)
         else:
@@ -182,7 +187,13 @@ class Tracer(TorchDispatchMode):
         a, b = np.broadcast_arrays(a, b)
         if a.size > LARGE and a.shape[-1] > 1 and not self._folds((a, b)):
             return self._dot(*self._operand(a.reshape(-1)), *self._operand(b.reshape(-1)), a.shape)
-        return self.total(self.map("mul", a, b))
+        if self.graph.type[int(b.flat[0])] != NARROW:
+            return self.total(self.map("mul", a, b))
+        total = np.array(self.graph.constant(-0.0, REAL))
+        for k in range(a.shape[-1]):  # of float32: products are exact in double, every sum is rounded
+            product = self.map("mul", *(self.cast(part[..., k], REAL) for part in (a, b)))
+            total = self.cast(self.cast(self.map("add", product, total), NARROW), REAL)
+        return self.cast(total, NARROW)
 
     def _dot(self, a: int, at: Any, b: int, by: Any, shape: Sequence[int]) -> Ids:
         """Sums of products as a loop: shape (..., K), summed over K."""
