@@ -124,15 +124,32 @@ def test_all_lists_what_a_package_hands_on(package: str) -> None:
             {"staf_torch"},
             {"torch", "numpy", "hydra", "omegaconf", "matplotlib", "pandas", "jinja2"},
         ),
+        *(
+            (
+                f"import sys; sys.argv = ['staf', *{words}]; from staf_torch.cli.staf import main\n"
+                "try: main()\nexcept SystemExit: pass",
+                {"staf_torch"},
+                {"torch", "matplotlib", "pandas"},
+            )
+            for words in (
+                ["--version"],
+                ["--help"],
+                ["doctro"],
+                ["-sc", "query=bash"],
+                ["--cfg", "job", "dt=0.1"],
+            )
+        ),
     ],
-    ids=["library", "staf-table"],
+    ids=["library", "staf-table", "version", "help", "no command", "completion", "settings"],
 )
 def test_an_import_brings_nothing_that_it_does_not_need(
     program: str, wanted: set[str], unwanted: set[str]
 ) -> None:
     program += "\nimport sys; print('loaded:', *{name.partition('.')[0] for name in sys.modules})"
     line = [sys.executable, "-W", "error", "-c", program]
-    ended = subprocess.run(line, env=environment(), capture_output=True, text=True, check=True)
+    ended = subprocess.run(
+        line, env=environment() | {"COMP_LINE": "staf ker"}, capture_output=True, text=True, check=True
+    )
     loaded = set(ended.stdout.rpartition("loaded:")[2].split())
     assert wanted <= loaded
     assert loaded.isdisjoint(unwanted)

@@ -7,7 +7,7 @@ import platform
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import torch
@@ -20,7 +20,7 @@ from ..kernels import ExponentialKernel
 from ..lanes.cache import cache
 from ..lanes.compiler import find_compiler
 from ..optim import SteepestDescent
-from ..results.build import installed, source
+from ..results.build import installed
 from ..systems import Oscillator, simulate
 from ..targets import Paper
 
@@ -30,13 +30,14 @@ _EXPECTED = 6.23712254984
 _TOLERANCE = 1e-6  # relative
 
 
-def version() -> str:
-    """Return what `staf --version` prints: the version and, as `run.json` has it, a hash of the source."""
-    return f"staf_torch {__version__} (source {source()})"
+def main(words: Sequence[str] = ()) -> int:
+    """Print one line a finding; return 0 if the self-test has its number and all places can be written.
 
-
-def main() -> int:
-    """Print one line a finding; return 0 if the self-test has its number and all places can be written."""
+    Raises:
+        ValueError: if there are words: it takes none.
+    """
+    if words:
+        raise ValueError(f"`staf doctor` takes nothing; got {words[0]!r}.")
     sound = True
     for name, found, good in _findings():
         sys.stdout.write(f"{name + ':':<12}{found}{'' if good else '   <- problem'}\n")

@@ -1,35 +1,30 @@
-"""The command `staf`: a Hydra application over `conf/`, whose task is `staf_torch.sweeps.job.execute`.
-
-`staf -m sweep.resume=runs/<sweep>` becomes the command line of the sweep that is taken up again.
-"""
+"""The command `staf`: which of its parts a command line asks for. Only what runs something imports torch."""
 
 from __future__ import annotations
 
-import contextlib
+import difflib
+import importlib
+import re
+import string
 import sys
-from collections.abc import Callable, Iterator
-from typing import NoReturn
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
-from omegaconf import DictConfig
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
 
-from ..settings import config_directory as config_directory
-from ..sweeps import callbacks
-from ..sweeps.batching import USER_ERRORS, sentence
-from ..sweeps.hydra_compat import (
-    application,
-    find_launcher,
-    full_errors,
-    is_about_settings,
-    program,
-)
-from ..sweeps.job import Refused, execute
-from ..sweeps.resume import command_line
-from ..sweeps.workers import name_and_code, stopped_by_signals, what_ended
-from . import doctor, reference, schema
+from .. import __version__
+from ..results.build import source
+from ..settings import config_directory
+from ..sweeps.hydra_compat import VERSION, find_launcher, full_errors, is_about_settings, program
 
-_WRITERS = {"schema": schema.main, "docs": reference.main}
 find_launcher()
-_showing = program(execute)
+_PARTS = {
+    "doctor": "staf_torch.cli.doctor",
+    "schema": "staf_torch.cli.schema",
+    "docs": "staf_torch.cli.reference",
+}
 
 
 def main() -> None:
@@ -37,72 +32,60 @@ def main() -> None:
 
     `staf doctor`, `staf schema`, `staf docs` and `staf --version` are no runs, and Hydra is not asked.
     """
-    if sys.argv[1:] == ["--version"]:
-        sys.exit(print(doctor.version()))
-    if sys.argv[1:] == ["doctor"]:
-        sys.exit(doctor.main())
-    if sys.argv[1:2] and sys.argv[1] in _WRITERS:
-        sys.exit(_written(_WRITERS[sys.argv[1]], sys.argv[2:]))
-    typed = sys.argv
-    with _told_between_lines(), full_errors() as wants_trace, stopped_by_signals():
-        try:
-            argv = command_line(typed[1:])
-            if is_about_settings(argv):
-                sys.argv = [typed[0], *argv]
+    words = sys.argv[1:]
+    if words == ["--version"]:
+        sys.exit(print(f"staf_torch {__version__} (source {source()})"))
+    if words and words[0] in _PARTS:
+        sys.exit(_ended(importlib.import_module(_PARTS[words[0]]).main, words[1:]))
+    if words and re.fullmatch(r"[A-Za-z_]\w*", words[0]):  # Hydra's grammar would say what is missing at EOF
+        sys.exit(f"staf: {_unknown(words[0])}")
+    if words in (["--help"], ["-h"]):
+        sys.exit(print(_help()))
+    try:
+        if not any(word.startswith("sweep.resume=") for word in words) and is_about_settings(words):
+            with full_errors():
                 _showing()
-                return
-            with application(argv) as app:
-                try:
-                    if app.multirun or app.is_sweep():
-                        app.sweep(execute)
-                    else:
-                        app.run(execute)
-                except (Exception, KeyboardInterrupt) as error:
-                    if app.begun is None:
-                        raise
-                    callbacks.close(app.begun)
-                    _end(error, wants_trace, app.begun)
-        except Refused as refused:
-            if wants_trace and refused.__cause__ is not None:
-                raise refused.__cause__ from None
-            raise
-        except (Exception, KeyboardInterrupt) as error:
-            _end(error, wants_trace)
-        finally:
-            sys.argv = typed
+            return
+    except Exception:  # what a user got wrong, in the words of the command that runs something
+        pass
+    importlib.import_module("staf_torch.cli.running").main()
 
 
-def _end(error: BaseException, wants_trace: bool, sweep: DictConfig | None = None) -> NoReturn:
-    """End the program as an error asks for: by a sentence, by the code of a signal, or by its trace."""
-    ended_by = what_ended(error)
-    if isinstance(ended_by, KeyboardInterrupt):
-        _end_by_signal(sweep, ended_by)
-    if wants_trace or not isinstance(error, USER_ERRORS):
-        raise error
-    sys.exit(f"staf: {sentence(error)}")
+def _help() -> str:
+    """Return what Hydra prints for `--help`, which copies all options of all groups twice: half a second."""
+    folder = Path(config_directory())
+    with initialize_config_dir(str(folder), "staf", **VERSION):
+        config = compose("config", return_hydra_config=True)
+        template = str(config.hydra.help.template)
+    groups: dict[str, list[str]] = {}
+    for path in sorted(folder.rglob("*.yaml")):
+        group = path.parent.relative_to(folder).as_posix()
+        if group.partition("/")[0] not in (".", "hydra"):
+            groups.setdefault(group, []).append(path.stem)
+    lines = "".join(f"{group}: {', '.join(options)}\n" for group, options in sorted(groups.items()))
+    names = [str(name) for name in config if name != "hydra"]
+    settings = OmegaConf.to_yaml(OmegaConf.masked_copy(config, names))
+    return string.Template(template).safe_substitute(APP_CONFIG_GROUPS=lines, CONFIG=settings)
 
 
-@contextlib.contextmanager
-def _told_between_lines() -> Iterator[None]:
-    """End in a sentence also where a signal comes before the program has begun, or after it has ended."""
+def _ended(part: Callable[[list[str]], str | int], words: list[str]) -> str | int | None:
+    """Print what a command that is no run returns; return its exit code, or what to say where it cannot."""
     try:
-        yield
-    except KeyboardInterrupt as error:
-        _end_by_signal(None, error)
-
-
-def _end_by_signal(sweep: DictConfig | None, error: KeyboardInterrupt) -> NoReturn:
-    """Say which signal ended the program and how to resume, and exit with the code that shells expect."""
-    said, code = name_and_code(error)
-    with contextlib.suppress(OSError):  # the terminal may be gone
-        sys.stderr.write(callbacks.farewell(sweep, error, said) + "\n")
-    sys.exit(code)
-
-
-def _written(write: Callable[[list[str]], str], words: list[str]) -> str | None:
-    """Print what a command that is no run returns; return what to say where it cannot."""
-    try:
-        sys.stdout.write(write(words) + "\n")
+        found = part(words)
     except ValueError as error:
         return f"staf: {error}"
-    return None
+    return found if isinstance(found, int) else print(found)
+
+
+def _unknown(word: str) -> str:
+    """Return what to say of a word that is neither a command nor a setting."""
+    near = difflib.get_close_matches(word, _PARTS, n=1)
+    meant = f"did you mean `{near[0]}`?" if near else f"there are {', '.join(_PARTS)}."
+    return f"there is no command `{word}`; {meant} A setting is written `{word}=value`."
+
+
+def _execute(cfg: Any) -> Any:
+    return importlib.import_module("staf_torch.sweeps.job").execute(cfg)
+
+
+_showing = program(_execute)

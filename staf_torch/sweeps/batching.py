@@ -24,6 +24,7 @@ from ..experiments.registry import (
 )
 from ..results.progress import SHOWN, Progress
 from ..settings.plain import to_read
+from ..settings.suggestions import without_setting
 from .workers import LostError
 
 _log = logging.getLogger(__name__)
@@ -206,7 +207,7 @@ def sentence(error: BaseException) -> str:
         return f"cannot write {error.filename}: {error.strerror}"
     unknown = re.match(r"Could not override '(.+?)'", str(error))
     if unknown:
-        return f"there is no setting `{unknown[1]}`; `staf --help` lists them."
+        return without_setting(unknown[1])
     if isinstance(error, MissingConfigException) and error.options:
         name = (error.missing_cfg_file or "").removesuffix(".yaml")
         more = "; others come with the extras joblib, slurm, ray and optuna" if "hydra/" in name else ""

@@ -20,8 +20,8 @@ from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
 import staf_torch
-from staf_torch.cli.staf import config_directory
 from staf_torch.experiments.registry import experiment
+from staf_torch.settings import config_directory
 
 KEYS = {
     "ultimate_error",
@@ -321,8 +321,18 @@ BAD: dict[str, tuple[str, tuple[str, ...]]] = {
             "extras joblib, slurm, ray and optuna.",
         ),
     ),
-    "unknown key": ("nonsense=1", ("nonsense",)),
-    "unknown key of a group": ("kernel=gaussian kernel.wdth=2", ("wdth",)),
+    "unknown key": ("nonsense=1", ("nonsense", "`staf --help` lists them.")),
+    "unknown key of a group": ("kernel=gaussian kernel.wdth=2", ("did you mean `kernel.width`?",)),
+    "unknown group": ("sytem=pendulum", ("did you mean `system`?",)),
+    "key of another choice": (
+        "kernel.width=0.5",
+        ("`kernel.width` with what is chosen; kernel=gaussian has it.",),
+    ),
+    "swept choices of which one has a key": (
+        "-m kernel=gaussian,custom kernel.path=a.B",
+        ("`kernel.path` with what is chosen; kernel=custom has it.",),
+    ),
+    "unknown command": ("doctro", ("there is no command `doctro`; did you mean `doctor`?",)),
     "broken syntax": ("initial_state=[1.0", ("[1.0",)),
     "figures is a word": ("figures=maybe", ("figures", "maybe")),
     "negative radius": ("centers.radius=-0.1", ("must be positive; got -0.1.",)),

@@ -14,8 +14,8 @@ from torch import nn
 
 from staf_torch import adp
 from staf_torch.adp.loop.setup import AdpProblem
-from staf_torch.cli.staf import config_directory
 from staf_torch.settings import adp as loops
+from staf_torch.settings import config_directory
 from staf_torch.settings.adp import adp_problem
 from staf_torch.settings.chase import chase_problem
 from staf_torch.sweeps.hydra_compat import trusted

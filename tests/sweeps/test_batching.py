@@ -214,7 +214,7 @@ OTHERS = "; others come with the extras joblib, slurm, ray and optuna"
         (chained(RuntimeError("theirs"), DISK), "theirs"),
         (
             ConfigKeyError("Could not override 'centers.raduis'.\nKey is not there"),
-            "there is no setting `centers.raduis`; `staf --help` lists them.",
+            "there is no setting `centers.raduis`; did you mean `centers.radius`?",
         ),
         (HydraException("it Could not override 'a'"), "it Could not override 'a'"),
         (missing("kernel/gauss", ["a", "b"]), "there is no `kernel/gauss`; there are a, b."),

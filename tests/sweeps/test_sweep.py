@@ -180,7 +180,7 @@ def test_an_unknown_swept_key_starts_nothing(place: Path) -> None:
     before = set((place / "runs").iterdir())
     code, _, err = one(str(place), ["-m", "centers.raduis=0.1,0.2", *SHORT])
     assert code == 1
-    assert err == "staf: there is no setting `centers.raduis`; `staf --help` lists them.\n"
+    assert err == "staf: there is no setting `centers.raduis`; did you mean `centers.radius`?\n"
     assert set((place / "runs").iterdir()) == before
 
 

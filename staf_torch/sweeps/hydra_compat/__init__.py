@@ -6,6 +6,7 @@ from hydra.core.utils import env_override as env_override
 
 from .composing import Composer as Composer
 from .composing import as_typed as as_typed
+from .composing import directory_of as directory_of
 from .composing import parse_override as parse_override
 from .composing import sweep_size as sweep_size
 from .inside import config_loader as config_loader
@@ -13,8 +14,8 @@ from .inside import everything_trusted as everything_trusted
 from .inside import trusted as trusted
 from .inside import trusted_packages as trusted_packages
 from .jobs import SweepJobs as SweepJobs
-from .jobs import directory_of as directory_of
 from .jobs import without_hydra_overrides as without_hydra_overrides
+from .program import VERSION as VERSION
 from .program import Application as Application
 from .program import application as application
 from .program import end_sweep as end_sweep

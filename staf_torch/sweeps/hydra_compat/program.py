@@ -43,7 +43,7 @@ _SHOWING = (
     "config_path",
     "experimental_rerun",
 )
-_VERSION: dict[str, str] = {} if HAS_WHITELIST else {"version_base": "1.3"}  # 1.4 warns of it
+VERSION: dict[str, str] = {} if HAS_WHITELIST else {"version_base": "1.3"}  # 1.4 warns of it
 _RESOLVERS = ("now", "hydra", "python_version", "hydra_override_dirname", "hydra_deprecated_override_dirname")
 """Hydra's own, which it registers where it begins."""
 
@@ -110,7 +110,7 @@ def application(argv: Sequence[str]) -> Iterator[Application]:
             "hydra_plugins.staf_batched"
         )  # Hydra may have looked for plugins before
         Plugins.instance().register(plugin.BatchedLauncher)
-        stack.enter_context(initialize_config_dir(config_directory(), "staf", **_VERSION))
+        stack.enter_context(initialize_config_dir(config_directory(), "staf", **VERSION))
         stack.enter_context(trusted(named_packages(argv)))
         running: Any = GlobalHydra.instance().hydra
         changes = words.config_dir is not None or any(re.search(_OUTSIDE, line) for line in words.overrides)
@@ -136,7 +136,7 @@ def is_about_settings(argv: Sequence[str]) -> bool:
 
 def program(task: Callable[[DictConfig], Any]) -> Callable[[], None]:
     """Return ``task`` as Hydra's own program over `conf/`, which reads `sys.argv`."""
-    options = {"execution_whitelist": TRUSTED} if HAS_WHITELIST else _VERSION
+    options = {"execution_whitelist": TRUSTED} if HAS_WHITELIST else VERSION
     decorate: Any = hydra.main
     decorated: Callable[[], None] = decorate(config_path=config_directory(), config_name="config", **options)(
         task
