@@ -23,7 +23,7 @@ from ..numerics.checks import COMMAND_LINE, choice, fail, flag, integer, positiv
 from ..systems import ControlAffineSystem, Plant
 from ..systems.barrier import wall_numbers
 from . import config_directory
-from .chase import initial_states, make, make_centers, placement, plain, seed_of
+from .chase import initial_states, make, make_centers, make_system, placement, plain, seed_of
 
 _GROUPS = ("policy", "law", "basis", "extrapolation")  # config groups below `adp` that `changed` can exchange
 _RECORDED = 200_000  # states of all trajectories together that are recorded unless asked for
@@ -92,7 +92,7 @@ def build(cfg: DictConfig, group: str, kind: type, **known: Callable[[], Any]) -
 
 def plant(cfg: DictConfig) -> Plant:
     """Build the plant, which must have inputs."""
-    system = make(cfg.system)
+    system = make_system(cfg.system)
     if not isinstance(system, Plant) or system.dim is None:
         raise fail(COMMAND_LINE, "system", "must be a `systems.Plant` with `dim`", system)
     if _inputs(system) == 0:

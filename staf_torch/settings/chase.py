@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import importlib
+import inspect
 import json
 import math
 import re
@@ -13,7 +14,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import torch
-from hydra.utils import instantiate
+from hydra.utils import get_object, instantiate
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor, nn
 
@@ -63,11 +64,11 @@ class ChaseProblem:
 def load(path: str, arguments: dict[str, Any] | None = None, *, inner_steps: int | None = None) -> Any:
     """Return the object at a dotted path, for classes and functions outside the package.
 
-    A class is called with ``arguments``; anything else is returned as it is. ``inner_steps`` is not used
-    here: it stands beside an update law in the settings and belongs to the chase.
+    A class is called, a function where there are ``arguments``; anything else is returned as it is.
+    ``inner_steps`` is not used here: it stands beside an update law in the settings and belongs to the chase.
 
     Raises:
-        ValueError: if nothing is there, or arguments are given to something that is not a class.
+        ValueError: if nothing is there, or arguments are given to something that takes none.
     """
     module, _, name = path.rpartition(".") if isinstance(path, str) else ("", "", "")
     if not module:
@@ -76,10 +77,10 @@ def load(path: str, arguments: dict[str, Any] | None = None, *, inner_steps: int
         named = getattr(importlib.import_module(module), name)
     except (ImportError, AttributeError) as error:
         raise fail("custom", "path", f"cannot be imported ({error})", path) from error
-    if isinstance(named, type):
+    if isinstance(named, type) or (arguments and inspect.isfunction(named)):
         return named(**(arguments or {}))
     if arguments:
-        raise fail("custom", "arguments", f"needs a class at {path}, which is none", arguments)
+        raise fail("custom", "arguments", f"needs a class or a function at {path}, which is none", arguments)
     return named
 
 
@@ -135,7 +136,7 @@ def chase_problem(cfg: DictConfig | PlainSettings, parts: Parts | None = None) -
     parts = Parts() if parts is None else parts
     device, dtype = placement(cfg.device, cfg.dtype)
     where = str(cfg.device), str(cfg.dtype)
-    system = parts(_placed, parts(make, cfg.system), *where)
+    system = parts(_placed, parts(make_system, cfg.system), *where)
     if not callable(getattr(system, "drift", None)):
         raise fail(COMMAND_LINE, "system", "must be a plant with a method `drift`", system)
     dim = _dimension(system, cfg.initial_state)
@@ -182,11 +183,15 @@ def _dimension(system: ControlAffineSystem, initial_state: object) -> int:
 def make(cfg: DictConfig | PlainSettings) -> Any:
     """Build the object that a group of settings names by ``_target_``.
 
+    A user's function that needs more than the settings give is itself what is asked for, as a target
+    V(x) (..., n) -> (...): it is returned with the settings as its keyword arguments.
+
     Raises:
         ValueError: if its constructor has no such argument, or needs one that is not there.
     """
     try:
-        return instantiate(cfg, _convert_="all")
+        partial = {"_partial_": True} if _lacks_arguments(cfg) else {}
+        return instantiate(cfg, _convert_="all", **partial)
     except Exception as error:
         cause = error if isinstance(error, TypeError) else error.__cause__  # Hydra 1.3 wraps, 1.4 does not
         if isinstance(cause, TypeError) and re.search(
@@ -194,6 +199,24 @@ def make(cfg: DictConfig | PlainSettings) -> Any:
         ):
             raise ValueError(f"`{cfg._target_}` cannot be built from these settings: {cause}.") from error
         raise
+
+
+def _lacks_arguments(cfg: DictConfig | PlainSettings) -> bool:
+    """Return whether a user's function is named and the settings lack an argument that it needs."""
+    named: Any = get_object(str(cfg._target_)) if cfg.get("_target_") else None
+    if not inspect.isfunction(named) or named.__module__.partition(".")[0] == "staf_torch":
+        return False
+    rest = inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD
+    needed = inspect.signature(named).parameters.values()
+    return any(
+        each.default is each.empty and each.name not in cfg and each.kind not in rest for each in needed
+    )
+
+
+def make_system(cfg: DictConfig | PlainSettings) -> Any:
+    """Build the plant that the settings name: by its class, or by a function of nothing that makes it."""
+    made = make(cfg)
+    return made() if inspect.isfunction(made) else made
 
 
 def make_metrics(cfg: DictConfig | PlainSettings | None) -> tuple[Metric, ...]:

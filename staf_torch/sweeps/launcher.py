@@ -9,7 +9,7 @@ import gc
 import logging
 import sys
 import time
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +36,8 @@ _NOT_BATCHED = (
     "the jobs of this program cannot share tensor batches, which only the experiments of `staf` can; "
     "they run one by one. hydra/launcher=joblib runs them side by side"
 )
-_TOLD = 20  # failures that are told as they happen
+_TOLD = 20  # failures of different reasons that are told as they happen
+_ALIKE = 8  # jobs that fail alike, whatever is swept, end a sweep
 _BAR_EVERY, _LINE_EVERY = 0.2, 10.0  # s
 
 
@@ -65,6 +66,7 @@ class SweepProgress:
 
     def __init__(self, total: int, done: int = 0) -> None:
         self._total, self._before, self._done, self._failed = total, done, done, 0
+        self._reasons: dict[str, tuple[str, int]] = {}  # the first job that failed so, and how many more did
         self._computed, self._running = 0.0, 0.0
         self._start = self._shown = time.monotonic()
         # Not the log: while a job is replayed, that is the job's own.
@@ -86,13 +88,19 @@ class SweepProgress:
         self._done, self._running = self._done + 1, 0.0
         if failure is not None:
             self._failed += 1
-            if self._failed <= _TOLD:
+            first, more = self._reasons.get(failure, (name, -1))
+            if more >= 0 or len(self._reasons) < _TOLD:
+                self._reasons[failure] = first, more + 1
+            if more < 0 and failure in self._reasons:
                 tqdm.write(f"{name} failed: {failure}", file=sys.stderr)
         self._show()
 
     def close(self) -> None:
-        """Wipe the bar."""
+        """Wipe the bar, and say how many jobs failed like one that was told."""
         self._bar.close()
+        for first, more in self._reasons.values():
+            if more:
+                sys.stderr.write(f"{more} more failed like {first}\n")
 
     @property
     def line(self) -> str:
@@ -125,6 +133,52 @@ class SweepProgress:
 def job_name(num: int, overrides: Sequence[str]) -> str:
     """Return `job 3 (kernel=gaussian seed=1)`."""
     return f"job {num} ({' '.join(records.own(without_hydra_overrides(overrides)))})"
+
+
+class AlikeFailures:
+    """Failures that have nothing to do with what is swept: all jobs so far have one reason.
+
+    Args:
+        jobs: the overrides of all jobs.
+        first: the number of the first.
+    """
+
+    def __init__(self, jobs: Sequence[Sequence[str]], first: int = 0) -> None:
+        self._jobs, self._first = jobs, first
+        self._reason: str | None = None
+        self._failed = list[int]()
+        self._possible = True
+
+    def ended(self, num: int, failure: str | None) -> None:
+        """Note the end of a job.
+
+        Raises:
+            ValueError: if `_ALIKE` jobs failed with this reason, no other has ended, and each override that
+                differs among the jobs differs among those; others are left.
+        """
+        self._possible = self._possible and failure is not None and self._reason in (None, failure)
+        if not self._possible:  # one job went well, or failed otherwise
+            return
+        self._reason = failure
+        self._failed.append(num - self._first)
+        if len(self._failed) % _ALIKE or len(self._failed) == len(self._jobs):
+            return
+        if _differing(self._jobs) == _differing(self._jobs[failed] for failed in self._failed):
+            left = len(self._jobs) - len(self._failed)
+            raise ValueError(
+                f"{len(self._failed)} jobs failed alike, {left} are left as they were: {failure}"
+            )
+
+
+def _differing(jobs: Iterable[Sequence[str]]) -> set[int]:
+    """Return which places of the overrides hold more than one text."""
+    values: list[set[str]] = []
+    for job in jobs:
+        values += [set() for _ in job[len(values) :]]
+        for seen, line in zip(values, job, strict=False):
+            if len(seen) < 2:
+                seen.add(line)
+    return {place for place, seen in enumerate(values) if len(seen) > 1}
 
 
 class Launch:
@@ -183,7 +237,7 @@ class Launch:
 
     def _fill_table(self, jobs: Sequence[Sequence[str]]) -> None:
         progress = SweepProgress(len(jobs))
-        done, failed = 0, []
+        done, failed, alike = 0, [], AlikeFailures(jobs)
 
         def ended(num: int, failure: str | None) -> None:
             nonlocal done
@@ -191,6 +245,7 @@ class Launch:
             self._still_there(done, len(jobs))
             name = "" if failure is None else job_name(num, jobs[num])
             progress.ended(name, failure)
+            alike.ended(num, failure)
             if failure is not None:
                 failed.append((num, failure))
 
@@ -212,6 +267,9 @@ class Launch:
         returns = self._finished(numbered)
         progress = SweepProgress(len(numbered), len(returns))
         tasks = self._tasks(numbered, *plan, set(returns), progress)
+        alike = AlikeFailures(list(numbered.values()), min(numbered, default=0))
+        if returns:
+            alike.ended(min(returns), None)
         with contextlib.closing(progress), contextlib.closing(tasks), _collecting_seldom():
             for num, task in tasks:
                 workers.check()
@@ -220,6 +278,7 @@ class Launch:
                 wrong = returns[num].status == JobStatus.FAILED
                 why = reason(returns[num]._return_value) if wrong else None
                 progress.ended(job_name(num, numbered[num]), why)
+                alike.ended(num, why)
         self._refuse_lost(numbered, returns)
         failed = sum(ended.status == JobStatus.FAILED for ended in returns.values())
         _log.info("%d of %d jobs completed, %d failed", len(numbered) - failed, len(numbered), failed)

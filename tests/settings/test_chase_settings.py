@@ -65,7 +65,7 @@ BAD: dict[str, tuple[str, tuple[str, ...]]] = {
     "path without a module": ("target=custom target.path=bowl", ("must be a dotted path",)),
     "arguments of a function": (
         "target=custom target.path=math.cos +target.arguments.a=1",
-        ("needs a class at math.cos",),
+        ("needs a class or a function at math.cos",),
     ),
     "kernel that is none": ("kernel=custom kernel.path=math.cos", ("(kernel=...)` must be a Kernel",)),
     "system that is none": ("system=custom system.path=math.cos", ("must be a plant with a method `drift`",)),
@@ -255,8 +255,28 @@ def test_a_path_is_a_class_that_is_called_or_a_thing_as_it_is() -> None:
     ):
         with pytest.raises(ValueError, match=re.escape(f"`custom(path=...)` {said}")):
             chase.load(path)  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match=re.escape("`custom(arguments=...)` needs a class at math.pi")):
+    with pytest.raises(
+        ValueError, match=re.escape("`custom(arguments=...)` needs a class or a function at math.pi")
+    ):
         chase.load("math.pi", {"a": 1})
+
+
+def bowl(x: Tensor, scale: float = 1.0) -> Tensor:
+    return scale * x.square().sum(-1)
+
+
+def made_plant(rate: float = 1.0) -> st.systems.Plant:
+    return st.systems.Linear([[0.0, rate], [-rate, 0.0]], [[0.0], [1.0]])
+
+
+def test_a_function_is_a_target_or_makes_a_plant() -> None:
+    x = torch.rand(5, 2, dtype=torch.float64)
+    for given, scale in ({}, 1.0), ({"scale": 3.0}, 3.0):
+        target = chase.make(OmegaConf.create({"_target_": f"{__name__}.bowl", **given}))
+        assert target(x).equal(bowl(x, scale))
+    own = f"system=custom system.path={__name__}.made_plant"
+    for line, rate in (own, 1.0), (f"{own} system.arguments={{rate:2.0}}", 2.0):
+        assert problem(line).system.drift(x).equal(made_plant(rate).drift(x))
 
 
 @pytest.mark.parametrize("spread", [0.5, 2.0])

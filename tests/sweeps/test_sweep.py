@@ -234,6 +234,19 @@ def test_hydra_knows_of_a_job_while_it_runs_and_what_was_typed_is_kept_as_typed(
     assert "3 of 3 jobs completed" in out, err
 
 
+def test_equal_failures_are_told_once_and_end_a_sweep_where_nothing_swept_matters(place: Path) -> None:
+    wrong = ["centers.count=4", "seed=range(20)", "kernel=exponential,gaussian", *SHORT]
+    directory, said = sweep(place, "alike", *wrong, code=1)
+    assert said.count(f"failed: {BAD}") == 2  # as it happened, and in the table's note
+    assert "23 more failed like job 0 (" in said
+    assert said.endswith(f"staf: 24 jobs failed alike, 16 are left as they were: {BAD}\n")
+    assert len(list(directory.glob("*/run.json"))) == 24
+    _, said = sweep(place, "alike_here", "centers.count=4,3", "seed=range(10)", *SHORT, code=1)
+    assert "20 of 20 jobs" not in said
+    assert "9 more failed like job 0 (" in said
+    assert len(rows(place / "runs" / "alike_here")) == 20  # the other half went well
+
+
 @pytest.mark.parametrize("launcher", ["batched", "basic"])
 def test_a_directory_is_one_jobs(place: Path, launcher: str) -> None:
     name, chosen = f"places_{launcher}", f"hydra/launcher={launcher}"
